@@ -1,0 +1,27 @@
+"""The errors that a user sees: one sentence each, with the exit code that goes with it."""
+
+from __future__ import annotations
+
+__all__ = ["EXIT_BAD_INPUT", "EXIT_DONE", "EXIT_POOR", "EXIT_USAGE", "BadInputError", "CalibError", "UsageError"]
+
+EXIT_DONE = 0
+EXIT_POOR = 1
+"""Done and written, but the result fails its quality gate."""
+EXIT_USAGE = 2
+EXIT_BAD_INPUT = 3
+
+
+class CalibError(Exception):
+    """Base of the errors that end a command with one sentence instead of a traceback."""
+
+    exit_code = EXIT_BAD_INPUT
+
+
+class BadInputError(CalibError):
+    """Something that was read is not what it has to be; the message names file, line or key."""
+
+
+class UsageError(CalibError):
+    """The words of the command line do not fit together."""
+
+    exit_code = EXIT_USAGE
