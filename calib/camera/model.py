@@ -88,9 +88,7 @@ def _distort_jacobian(
     numerator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
     denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
     radial = numerator / denominator
-    slope = (
-        k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))
-    ) / denominator
+    slope = (k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / denominator
     cross = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
     xx = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
     yy = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
