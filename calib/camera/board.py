@@ -32,7 +32,7 @@ class Board:
 
     @property
     def half_turn_looks_the_same(self) -> bool:
-        """Whether the colours repeat after half a turn, so that no picture tells the first corner from the last.
+        """Whether the colours repeat after half a turn: no picture tells the first corner from the last.
 
         The square at (i, j) of columns + 1 by rows + 1 squares has the colour (i + j) mod 2; half a
         turn moves it to a square of colour (columns + rows - i - j) mod 2.

@@ -54,6 +54,10 @@ LOSSES = ("none", "huber", "cauchy")
 
 _DECREMENT = 1e-6
 _MAX_ITERATIONS = 300
+_ENOUGH = 1e-2
+"""Tolerance where only the residuals count: they are then right to a part in 10^4."""
+_FINEST_PX = 1e-4
+"""Residuals of made-up data can be zero; rounding is then the only noise, well below this."""
 _ROUNDING = 1.0 + 1e-12
 """A cost that differs by less is the same cost."""
 _CHUNK = 40_000
@@ -112,6 +116,11 @@ class Calibration:
     def rms_px(self) -> float:
         """sqrt(mean |residual vector|^2) over points, as OpenCV reports it."""
         return float(np.sqrt(self.squared_sum / self.observations.points))
+
+    @property
+    def view_rms_px(self) -> FloatArray:
+        """RMS of each view, (N,)."""
+        return np.asarray(np.sqrt(np.nanmean(np.sum(self.residuals_px**2, axis=2), axis=1)))
 
     @property
     def mean_error_px(self) -> float:
@@ -274,8 +283,12 @@ def minimise(
     loss: str = "none",
     scale_px: float = 1.0,
     max_iterations: int = _MAX_ITERATIONS,
+    tolerance: float = _DECREMENT,
 ) -> Minimum:
-    """Levenberg-Marquardt from `block`; the problem linearised where it stopped comes with the answer."""
+    """Levenberg-Marquardt from `block`; the problem linearised where it stopped comes with the answer.
+
+    `tolerance` is the relative Newton decrement to reach, in standard deviations.
+    """
     G = len(free) + (0 if basis is None else len(basis))
     freedom = max(2 * observations.points - G - 6 * observations.views, 1)
     at = linearise(block, observations, free, basis, loss, scale_px)
@@ -286,11 +299,11 @@ def minimise(
         step = _solve_step(at, G, damping)
         if step is not None:
             decrement = _decrement(at, G, step, freedom)
-            if decrement < _DECREMENT and damping > 0.0:
+            if decrement < tolerance and damping > 0.0:
                 # Damping shortens steps along flat valleys, so the test is made without it.
                 undamped = _solve_step(at, G, 0.0)
                 decrement = np.inf if undamped is None else _decrement(at, G, undamped, freedom)
-            if decrement < _DECREMENT:
+            if decrement < tolerance:
                 return Minimum(block, at, "converged", evaluations, decrement)
         if evaluations >= max_iterations:
             return Minimum(block, at, "iterations", evaluations, decrement)
@@ -313,8 +326,8 @@ def minimise(
 def _decrement(at: Linearised, G: int, step: tuple[FloatArray, FloatArray], freedom: int) -> float:
     """Newton decrement over the residuals' standard deviation; infinite where the step is uphill."""
     slope = at.gradient[:, :G].sum(axis=0) @ step[0] + np.vdot(at.gradient[:, G:], step[1])
-    # Residuals of exactly zero (made-up data) leave rounding as the only noise.
-    return float(np.sqrt(-slope / max(at.cost / freedom, 1e-20))) if slope <= 0.0 else np.inf
+    variance = max(at.cost / freedom, _FINEST_PX**2)
+    return float(np.sqrt(-slope / variance)) if slope <= 0.0 else np.inf
 
 
 def starting_block(observations: Observations, image_size_px: tuple[int, int], skew: bool) -> Block:
@@ -336,6 +349,7 @@ def calibrate(
     loss: str = "none",
     start: Block | None = None,
     max_iterations: int = _MAX_ITERATIONS,
+    tolerance: float = _DECREMENT,
 ) -> Calibration:
     """Fit a camera to views of a target.
 
@@ -347,6 +361,7 @@ def calibrate(
     basis : (K, 3, M) deformation of the target, which then has to be the same in all views.
     loss : one of `LOSSES`; its scale is the median of the plain fit's residuals.
     start : where to start; Zhang's closed form by default.
+    tolerance : see `minimise`.
     """
     free = free_intrinsics(model, skew, fixed)
     if start is None:
@@ -355,7 +370,9 @@ def calibrate(
         start = Block(start.intrinsics, start.R_CT, start.t_CT_m, np.zeros(len(basis)))
     if basis is None and len(start.deformation):
         start = Block(start.intrinsics, start.R_CT, start.t_CT_m, np.zeros(0))
-    found = minimise(start, observations, free, basis, max_iterations=max_iterations)
+    found = minimise(
+        start, observations, free, basis, max_iterations=max_iterations, tolerance=tolerance
+    )
     evaluations, scale_px = found.evaluations, 1.0
     if loss != "none":
         for _ in range(3):
@@ -364,7 +381,9 @@ def calibrate(
             distance = np.hypot(found.at.residuals[:, 0], found.at.residuals[:, 1])
             # The median of a Rayleigh distribution is 1.1774 sigma.
             scale_px = max(float(np.median(distance[observations.present])) / 1.1774, 1e-9)
-            found = minimise(found.block, observations, free, basis, loss, scale_px, max_iterations)
+            found = minimise(
+                found.block, observations, free, basis, loss, scale_px, max_iterations, tolerance
+            )
             evaluations += found.evaluations
     camera = camera_from_vector(model, image_size_px, found.block.intrinsics)
     G, M = len(free) + len(found.block.deformation), observations.pixels.shape[1]
@@ -404,7 +423,7 @@ def refit_poses(calibration: Calibration, observations: Observations) -> FloatAr
         shape = np.tensordot(calibration.block.deformation, calibration.basis, axes=1)
         seen = seen.displaced(shape.T)
     start = Block(vector_from_camera(calibration.camera), R_CT[usable], t_CT_m[usable], np.zeros(0))
-    found = minimise(start, seen, np.zeros(0, dtype=np.int64))
+    found = minimise(start, seen, np.zeros(0, dtype=np.int64), tolerance=_ENOUGH)
     if found.at is not None:
         residuals[usable] = np.where(seen.present[..., None], found.at.residuals.transpose(0, 2, 1), np.nan)
     return residuals

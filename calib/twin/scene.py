@@ -216,7 +216,8 @@ def _illumination(light: Light, size_px: tuple[int, int]) -> FloatArray:
     spot = light.spot * np.exp(-0.5 * (dx * dx + dy * dy) / (light.spot_radius * light.spot_radius))
     radius2 = (x * x + y * y * (ratio * ratio)) / (1.0 + ratio * ratio)
     even = 1.0 + light.gradient[0] * x + light.gradient[1] * y + spot
-    return light.level * even * (1.0 - light.vignetting * radius2)
+    light_there: FloatArray = light.level * even * (1.0 - light.vignetting * radius2)
+    return light_there
 
 
 def expose(

@@ -1,0 +1,75 @@
+"""What all verbs share: options, narration, progress and the JSON document."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, Protocol
+
+import typer
+
+__all__ = ["JsonOption", "ProgressCall", "RigOption", "document", "narrate", "progress_bar", "say", "table"]
+
+RigOption = Annotated[Path, typer.Option("--rig", help="The rig's file, read and written.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of words.")]
+
+
+class ProgressCall(Protocol):
+    """Reports how much is done."""
+
+    def __call__(self, done: int, total: int) -> None: ...
+
+
+def narrate(message: str) -> None:
+    """A line for the person who watches, on stderr."""
+    sys.stderr.write(message + "\n")
+
+
+def say(message: str = "") -> None:
+    """A line of the result, on stdout."""
+    sys.stdout.write(message + "\n")
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, dict):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return value
+
+
+def document(verb: str, sections: dict[str, Any]) -> None:
+    """Print the JSON document of a verb; what is not finite becomes null."""
+    whole = {"schema": 1, "verb": verb, **sections}
+    sys.stdout.write(json.dumps(_finite(whole), indent=1, allow_nan=False, ensure_ascii=True) + "\n")
+
+
+@contextmanager
+def progress_bar(label: str) -> Iterator[ProgressCall]:
+    """A bar on stderr while a person watches, nothing otherwise."""
+    if not sys.stderr.isatty():
+        yield lambda done, total: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(label, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def table(head: list[str], rows: list[list[str]]) -> list[str]:
+    """Lines of a table, the first column to the left and the others to the right."""
+    widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]
+    out = []
+    for row in [head, *rows]:
+        cells = [row[0].ljust(widths[0])] + [c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True)]
+        out.append("  " + "  ".join(cells).rstrip())
+    return out

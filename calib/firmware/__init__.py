@@ -1,0 +1,1 @@
+"""The constants of rig.yaml as C for a microcontroller."""

@@ -1,0 +1,269 @@
+"""rig.yaml: the one file that holds what was learnt about a rig.
+
+Each verb reads the sections that it needs and writes its own. Every key carries its unit, every
+estimated value has its standard deviation under `sigma`, and `provenance` names the inputs by their
+SHA-256, so that the same inputs give the same bytes. A standard deviation that the data do not
+bound is null.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from calib import __version__
+from calib.errors import BadInputError
+from calib.files import read_bytes, read_yaml_mapping, sha256, shown, write_atomically
+
+__all__ = [
+    "Camera",
+    "CovarianceTable",
+    "Distortion",
+    "Geometry",
+    "Plane",
+    "Provenance",
+    "Rig",
+    "identity",
+    "read_rig",
+    "rig_text",
+    "section_json",
+    "validation_sentence",
+    "write_rig",
+]
+
+Verdict = Literal["ok", "poor", "unidentifiable", "inconsistent"]
+Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
+Sigma = dict[str, Annotated[float, Field(ge=0, allow_inf_nan=False)] | None]
+Row3 = Annotated[list[Number], Field(min_length=3, max_length=3)]
+Matrix3 = Annotated[list[Row3], Field(min_length=3, max_length=3)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class Geometry(_Section):
+    """What a person knows of the rig. Defaults: the nominal actuator."""
+
+    workspace_m: Annotated[list[Number], Field(min_length=4, max_length=4)] = [-0.06, 0.04, 0.06, 0.11]
+    """Where the marker can be, world metres: least x, least y, greatest x, greatest y."""
+
+    @field_validator("workspace_m")
+    @classmethod
+    def _ordered(cls, value: list[float]) -> list[float]:
+        if value[0] >= value[2] or value[1] >= value[3]:
+            raise ValueError("expected [least x, least y, greatest x, greatest y]")
+        return value
+
+
+class Distortion(_Section):
+    """Coefficients of `calib.camera.model`; absent ones are zero."""
+
+    k1: Number = 0.0
+    k2: Number = 0.0
+    p1: Number = 0.0
+    p2: Number = 0.0
+    k3: Number = 0.0
+    k4: Number = 0.0
+    k5: Number = 0.0
+    k6: Number = 0.0
+
+
+class CovarianceTable(_Section):
+    """A covariance matrix with the names of its rows."""
+
+    order: list[str]
+    values: list[list[Number]]
+
+    @model_validator(mode="after")
+    def _square(self) -> CovarianceTable:
+        if len(self.values) != len(self.order) or any(len(row) != len(self.order) for row in self.values):
+            raise ValueError(f"expected {len(self.order)} rows and columns, as many as names in order")
+        return self
+
+
+class Camera(_Section):
+    """Intrinsics, what they are worth, and why."""
+
+    model: Literal["pinhole", "radial2", "radial3", "brown5", "rational8"]
+    image_size_px: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=2, max_length=2)]
+    fx_px: Positive
+    fy_px: Positive
+    skew_px: Number = 0.0
+    cx_px: Number
+    cy_px: Number
+    distortion: Distortion = Distortion()
+    sigma: Sigma = {}
+    covariance: CovarianceTable | None = None
+    rms_px: Annotated[float, Field(ge=0)] | None = None
+    mean_error_px: Annotated[float, Field(ge=0)] | None = None
+    projection_sigma_px: Sigma = {}
+    views: Annotated[int, Field(ge=0)] = 0
+    points: Annotated[int, Field(ge=0)] = 0
+    board: str | None = None
+    loss: str | None = None
+    termination: str | None = None
+    rejected: list[str] = []
+    verdict: Verdict
+    reasons: list[str] = []
+    advice: list[str] = []
+
+
+class Plane(_Section):
+    """The actuator's plane seen by the camera: A maps world metres to pixels (2.9 with K)."""
+
+    R_CW: Matrix3
+    t_CW_m: Row3
+    A_px_per_m: Matrix3
+    A_inverse: Matrix3
+    sigma: Sigma = {}
+    rms_px: Annotated[float, Field(ge=0)]
+    rms_mm: Annotated[float, Field(ge=0)]
+    sigma_marker_mm: Sigma = {}
+    without_intrinsics: dict[str, Number] = {}
+    pictures: Annotated[int, Field(ge=0)] = 0
+    points: Annotated[int, Field(ge=0)] = 0
+    orientation: str = ""
+    verdict: Verdict
+    reasons: list[str] = []
+
+
+class LensReport(_Section):
+    """What lens distortion costs, and the polynomial that undoes it."""
+
+    kind: str
+    max_px: Number
+    mean_px: Number
+    roi_px: Annotated[list[Number], Field(min_length=4, max_length=4)]
+    roi_max_px: Number
+    roi_mean_px: Number
+    plane_max_mm: Number | None = None
+    plane_mean_mm: Number | None = None
+    inverse_radial: list[Number] = []
+    inverse_max_error_px: Number | None = None
+    monotonic: bool
+    verdict: Literal["negligible", "matters"]
+    reasons: list[str] = []
+
+
+class Provenance(_Section):
+    """Version and the SHA-256 of each input by section and name."""
+
+    version: str = __version__
+    inputs: dict[str, dict[str, str]] = {}
+
+
+class Rig(BaseModel):
+    """The whole file. Sections of later versions are kept as they are."""
+
+    model_config = ConfigDict(extra="allow")
+
+    geometry: Geometry | None = None
+    camera: Camera | None = None
+    plane: Plane | None = None
+    lens: LensReport | None = None
+    provenance: Provenance = Provenance()
+
+
+def validation_sentence(path: Path, error: ValidationError) -> str:
+    """One sentence for the first thing that is wrong: file, key, value, and what was expected."""
+    first = error.errors()[0]
+    key = ".".join(str(part) for part in first["loc"])
+    value = first.get("input")
+    found = "is missing" if first["type"] == "missing" else f"is {_short(value)}"
+    message = first["msg"]
+    expected = message[0].lower() + message[1:]
+    expected = expected.removeprefix("value error, ").removeprefix("input should be ")
+    if first["type"] == "missing":
+        return f"{shown(path)}: {key} is missing"
+    if first["type"] == "extra_forbidden":
+        return f"{shown(path)}: {key} is not a key that is known here"
+    return f"{shown(path)}: {key} {found}, expected {expected.removeprefix('expected ')}"
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def read_rig(path: Path) -> Rig:
+    """The rig in this file, an empty one where there is no file. Raises `BadInputError`."""
+    if not path.exists() and not path.is_symlink():
+        return Rig()
+    document = read_yaml_mapping(path)
+    try:
+        return Rig.model_validate(document)
+    except ValidationError as error:
+        raise BadInputError(validation_sentence(path, error)) from error
+
+
+def section_json(section: BaseModel) -> dict[str, Any]:
+    """A section as plain values, unset optional parts left out."""
+    return {
+        key: value
+        for key, value in section.model_dump(mode="json").items()
+        if value is not None and value != {} and not (key in ("rejected", "advice") and value == [])
+    }
+
+
+def _plain(rig: Rig) -> dict[str, Any]:
+    order = [
+        "geometry",
+        "camera",
+        "plane",
+        "lens",
+        "imu",
+        "orientation_filter",
+        "lowpass",
+        "align",
+        "actuator",
+        "pump",
+        "estimator",
+        "controller",
+    ]
+    extra = rig.model_extra or {}
+    out: dict[str, Any] = {}
+    for name in order:
+        section = getattr(rig, name, None)
+        if isinstance(section, BaseModel):
+            out[name] = section_json(section)
+        elif name in extra:
+            out[name] = extra[name]
+    for name, section in extra.items():
+        out.setdefault(name, section)
+    out["provenance"] = section_json(rig.provenance)
+    return out
+
+
+def rig_text(rig: Rig) -> str:
+    """The file's text; the same rig gives the same text."""
+    return yaml.safe_dump(_plain(rig), sort_keys=False, default_flow_style=None, width=110, allow_unicode=True)
+
+
+def identity(section: BaseModel) -> str:
+    """SHA-256 of a section's values, to tell later whether something was computed from them."""
+    return sha256(yaml.safe_dump(section_json(section), sort_keys=True).encode())
+
+
+def write_rig(path: Path, rig: Rig, inputs: dict[str, dict[str, str]]) -> Rig:
+    """Replace the file atomically; `inputs` holds the SHA-256 of each input by section and name."""
+    merged = {**rig.provenance.inputs, **inputs}
+    ordered = {section: dict(sorted(merged[section].items())) for section in sorted(merged)}
+    rig = rig.model_copy(update={"provenance": Provenance(inputs=ordered)})
+    write_atomically(path, rig_text(rig))
+    return rig
+
+
+def finite_or_none(value: float) -> float | None:
+    """A standard deviation for the file: null where the data do not bound it."""
+    return float(value) if math.isfinite(value) else None
+
+
+def hash_of(path: Path) -> str:
+    """SHA-256 of a file."""
+    return sha256(read_bytes(path))

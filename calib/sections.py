@@ -1,0 +1,173 @@
+"""Results of the calculations as sections of rig.yaml, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from calib import rig
+from calib.arrays import FloatArray
+from calib.camera.covariance import Covariance, projection_sigma_px
+from calib.camera.intrinsics import Intrinsics
+from calib.camera.model import COEFFICIENTS, MODELS, Camera
+from calib.camera.plane import Plane
+from calib.camera.projection import INTRINSICS
+from calib.errors import BadInputError
+from calib.files import shown
+
+__all__ = ["camera_covariance", "camera_from_section", "camera_section", "image_grid", "plane_section"]
+
+
+def image_grid(image_size_px: tuple[int, int], columns: int = 17, rows: int = 13) -> FloatArray:
+    """Pixels (rows * columns, 2) spread over the whole picture, its borders included."""
+    u, v = np.meshgrid(
+        np.linspace(0, image_size_px[0] - 1, columns), np.linspace(0, image_size_px[1] - 1, rows)
+    )
+    return np.stack([u.ravel(), v.ravel()], axis=1)
+
+
+def _covariance_table(covariance: Covariance) -> rig.CovarianceTable | None:
+    if not np.all(np.isfinite(covariance.intrinsics)):
+        return None
+    return rig.CovarianceTable(order=list(covariance.names), values=covariance.intrinsics.tolist())
+
+
+def camera_section(result: Intrinsics) -> rig.Camera:
+    """The `camera` section of a calibration."""
+    fit, camera = result.calibration, result.calibration.camera
+    sigma_px = projection_sigma_px(fit, result.covariance, image_grid(camera.image_size_px))
+    seen = sigma_px[np.isfinite(sigma_px)]
+    projection = {
+        "distance_m": result.covariance.distance_m,
+        "median": float(np.median(seen)) if len(seen) else None,
+        "max": float(seen.max()) if len(seen) == len(sigma_px) else None,
+    }
+    named = dict(zip(COEFFICIENTS, camera.distortion.tolist(), strict=True))
+    coefficients = {n: v for n, v in named.items() if n in (*MODELS["brown5"], *MODELS[camera.model])}
+    finite = bool(np.isfinite(fit.rms_px))
+    return rig.Camera(
+        model=camera.model,
+        image_size_px=list(camera.image_size_px),
+        fx_px=camera.fx_px,
+        fy_px=camera.fy_px,
+        skew_px=camera.skew_px,
+        cx_px=camera.cx_px,
+        cy_px=camera.cy_px,
+        distortion=rig.Distortion(**coefficients),
+        sigma={name: rig.finite_or_none(value) for name, value in result.covariance.sigma().items()},
+        covariance=_covariance_table(result.covariance),
+        rms_px=fit.rms_px if finite else None,
+        mean_error_px=fit.mean_error_px if finite else None,
+        projection_sigma_px=projection,
+        views=fit.observations.views,
+        points=fit.observations.points,
+        board=result.board,
+        loss=fit.loss,
+        termination=fit.termination,
+        rejected=list(result.rejected),
+        verdict=result.judgement.verdict,
+        reasons=list(result.judgement.reasons),
+        advice=list(result.judgement.advice),
+    )
+
+
+def camera_from_section(section: rig.Camera) -> Camera:
+    """The camera that a `camera` section describes."""
+    coefficients = section.distortion.model_dump()
+    width, height = section.image_size_px
+    return Camera(
+        section.model,
+        (width, height),
+        section.fx_px,
+        section.fy_px,
+        section.skew_px,
+        section.cx_px,
+        section.cy_px,
+        np.array([coefficients[name] for name in COEFFICIENTS]),
+    )
+
+
+def camera_covariance(section: rig.Camera, source: str) -> FloatArray | None:
+    """Covariance (13, 13) in the order of `projection.INTRINSICS`, None where it is not known.
+
+    Raises `BadInputError` for a table that is no covariance.
+    """
+    if section.covariance is None:
+        return None
+    unknown = [name for name in section.covariance.order if name not in INTRINSICS]
+    if unknown:
+        raise BadInputError(f"{shown(source)}: camera.covariance.order has {unknown[0]!r}, expected intrinsics")
+    index = [INTRINSICS.index(name) for name in section.covariance.order]
+    values = np.array(section.covariance.values, dtype=np.float64)
+    scale = np.sqrt(np.abs(np.diag(values)))
+    normal = values / np.where(scale > 0, scale, 1.0) / np.where(scale > 0, scale, 1.0)[:, None]
+    if not np.allclose(normal, normal.T, atol=1e-6) or np.linalg.eigvalsh(normal)[0] < -1e-6:
+        raise BadInputError(f"{shown(source)}: camera.covariance.values is not a covariance matrix")
+    whole = np.zeros((len(INTRINSICS), len(INTRINSICS)))
+    whole[np.ix_(index, index)] = values
+    return whole
+
+
+def plane_section(plane: Plane, orientation: Sequence[str]) -> rig.Plane:
+    """The `plane` section of a calibrated plane."""
+    sigma = np.sqrt(np.diag(plane.covariance))
+    names = ("rotation_x_rad", "rotation_y_rad", "rotation_z_rad", "tx_m", "ty_m", "tz_m")
+
+    def largest(values: FloatArray | None) -> float | None:
+        if values is None or not np.isfinite(values).any():
+            return None
+        return float(np.nanmax(np.linalg.norm(values, axis=1)))
+
+    marker = {
+        "intrinsics_max": largest(plane.sigma.intrinsics_mm),
+        "plane_max": largest(plane.sigma.plane_mm),
+        "calibration_max": largest(plane.sigma.calibration_mm),
+        "quantisation_max": largest(plane.sigma.quantisation_mm),
+        "total_max": largest(plane.sigma.total_mm),
+    }
+    difference = plane.direct_difference_mm[np.isfinite(plane.direct_difference_mm)]
+    without = (
+        {
+            "rms_px": float(plane.direct.rms_px),
+            "difference_max_mm": float(difference.max()),
+            "difference_mean_mm": float(difference.mean()),
+        }
+        if len(difference)
+        else {}
+    )
+    return rig.Plane(
+        R_CW=plane.R_CW.tolist(),
+        t_CW_m=plane.t_CW_m.tolist(),
+        A_px_per_m=plane.A.tolist(),
+        A_inverse=plane.A_inverse.tolist(),
+        sigma=dict(zip(names, (rig.finite_or_none(s) for s in sigma), strict=True)),
+        rms_px=plane.rms_px,
+        rms_mm=plane.rms_mm,
+        sigma_marker_mm=marker,
+        without_intrinsics=without,
+        pictures=len(plane.pictures),
+        points=plane.points,
+        orientation=" ".join(orientation),
+        verdict=plane.verdict,
+        reasons=[*plane.reasons, *plane.notes],
+    )
+
+
+def imported_camera_section(camera: Camera, source: str) -> rig.Camera:
+    """The `camera` section of a camera that another tool calibrated: values without error bars."""
+    named = dict(zip(COEFFICIENTS, camera.distortion.tolist(), strict=True))
+    return rig.Camera(
+        model=camera.model,
+        image_size_px=list(camera.image_size_px),
+        fx_px=camera.fx_px,
+        fy_px=camera.fy_px,
+        skew_px=camera.skew_px,
+        cx_px=camera.cx_px,
+        cy_px=camera.cy_px,
+        distortion=rig.Distortion(
+            **{n: v for n, v in named.items() if n in (*MODELS["brown5"], *MODELS[camera.model])}
+        ),
+        verdict="poor",
+        reasons=[f"Imported from a {source} file, which holds no error bars and no views to judge by."],
+    )

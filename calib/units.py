@@ -1,0 +1,74 @@
+"""Quantities as people type them: a number with its unit, read into SI."""
+
+from __future__ import annotations
+
+import math
+import re
+
+from calib.errors import UsageError
+
+__all__ = ["parse_angle_rad", "parse_corners", "parse_frequency_hz", "parse_image_size", "parse_length_m"]
+
+_LENGTHS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
+_FREQUENCIES = {"hz": 1.0, "khz": 1e3}
+_ANGLES = {"deg": math.pi / 180.0, "rad": 1.0}
+_QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-zA-Z]*)\s*")
+_PAIR = re.compile(r"\s*(\d{1,6})\s*[xX\u00d7,]\s*(\d{1,6})\s*")
+
+
+def _quantity(text: str, units: dict[str, float], what: str, example: str) -> float:
+    found = _QUANTITY.fullmatch(text)
+    if found is None:
+        raise UsageError(f"{what}: {text!r} is not a number with a unit, expected for instance {example}")
+    number, unit = found.groups()
+    if unit.lower() not in units:
+        has = f"the unit {unit!r}" if unit else "no unit"
+        raise UsageError(f"{what}: {text!r} has {has}, expected one of {', '.join(units)}, for instance {example}")
+    value = float(number) * units[unit.lower()]
+    if not math.isfinite(value):
+        raise UsageError(f"{what}: {text!r} is too large")
+    return value
+
+
+def parse_length_m(text: str, what: str) -> float:
+    """Metres from '20mm', '2 cm', '0.02m' or '1in'; positive."""
+    value = _quantity(text, _LENGTHS, what, "20mm")
+    if value <= 0.0:
+        raise UsageError(f"{what}: {text!r} is not positive")
+    return value
+
+
+def parse_frequency_hz(text: str, what: str) -> float:
+    """Hertz from '60Hz' or '1.5 kHz'; positive."""
+    value = _quantity(text, _FREQUENCIES, what, "60Hz")
+    if value <= 0.0:
+        raise UsageError(f"{what}: {text!r} is not positive")
+    return value
+
+
+def parse_angle_rad(text: str, what: str) -> float:
+    """Radians from '30deg' or '0.5rad'."""
+    return _quantity(text, _ANGLES, what, "30deg")
+
+
+def _pair(text: str, what: str, example: str) -> tuple[int, int]:
+    found = _PAIR.fullmatch(text)
+    if found is None:
+        raise UsageError(f"{what}: {text!r} is not two whole numbers, expected for instance {example}")
+    return int(found.group(1)), int(found.group(2))
+
+
+def parse_corners(text: str, what: str = "--corners") -> tuple[int, int]:
+    """Inner corners, columns and rows, from '9x6'; at least 3 x 3, at most 200 x 200."""
+    columns, rows = _pair(text, what, "9x6")
+    if not (3 <= min(columns, rows) and max(columns, rows) <= 200):
+        raise UsageError(f"{what}: {text!r} is not between 3x3 and 200x200 inner corners")
+    return columns, rows
+
+
+def parse_image_size(text: str, what: str = "--image-size") -> tuple[int, int]:
+    """Width and height in pixels from '640x480'."""
+    width, height = _pair(text, what, "640x480")
+    if min(width, height) < 1:
+        raise UsageError(f"{what}: {text!r} is not a picture's size")
+    return width, height
