@@ -56,6 +56,8 @@ _DECREMENT = 1e-6
 _MAX_ITERATIONS = 300
 _ENOUGH = 1e-2
 """Tolerance where only the residuals count: they are then right to a part in 10^4."""
+_LEVEL_STEPS = 4
+"""Steps in a row that may leave the cost as it is."""
 _FINEST_PX = 1e-4
 """Residuals of made-up data can be zero; rounding is then the only noise, well below this."""
 _ROUNDING = 1.0 + 1e-12
@@ -294,15 +296,15 @@ def minimise(
     at = linearise(block, observations, free, basis, loss, scale_px)
     if at is None:
         return Minimum(block, None, "behind the camera", 1, np.inf)
-    damping, evaluations, decrement = 1e-6, 1, np.inf
+    damping, evaluations, decrement, level = 1e-6, 1, np.inf, 0
     while True:
         step = _solve_step(at, G, damping)
         if step is not None:
             decrement = _decrement(at, G, step, freedom)
             if decrement < tolerance and damping > 0.0:
                 # Damping shortens steps along flat valleys, so the test is made without it.
-                undamped = _solve_step(at, G, 0.0)
-                decrement = np.inf if undamped is None else _decrement(at, G, undamped, freedom)
+                step, damping = _solve_step(at, G, 0.0), 0.0
+                decrement = np.inf if step is None else _decrement(at, G, step, freedom)
             if decrement < tolerance:
                 return Minimum(block, at, "converged", evaluations, decrement)
         if evaluations >= max_iterations:
@@ -313,21 +315,24 @@ def minimise(
             accepted = linearise(trial, observations, free, basis, loss, scale_px)
             evaluations += 1
         if accepted is not None and np.isfinite(accepted.cost) and accepted.cost <= at.cost * _ROUNDING:
+            level = level + 1 if accepted.cost >= at.cost else 0
             block, at = trial, accepted
             damping = damping * 0.01 if damping > 1e-9 else 0.0
-            continue
-        damping = max(10.0 * damping, 1e-9)
-        if damping > 1e10:
+        else:
+            damping = max(10.0 * damping, 1e-9)
+        if damping > 1e10 or level > _LEVEL_STEPS:
             # No step lowers the cost: rounding is reached, or there is no minimum to be found.
             reason = "converged" if decrement < 1e-3 else "singular" if step is None else "stalled"
             return Minimum(block, at, reason, evaluations, decrement)
 
 
 def _decrement(at: Linearised, G: int, step: tuple[FloatArray, FloatArray], freedom: int) -> float:
-    """Newton decrement over the residuals' standard deviation; infinite where the step is uphill."""
+    """Newton decrement over the residuals' standard deviation.
+
+    The sign is dropped: with a nearly singular normal matrix rounding can turn it.
+    """
     slope = at.gradient[:, :G].sum(axis=0) @ step[0] + np.vdot(at.gradient[:, G:], step[1])
-    variance = max(at.cost / freedom, _FINEST_PX**2)
-    return float(np.sqrt(-slope / variance)) if slope <= 0.0 else np.inf
+    return float(np.sqrt(abs(slope) / max(at.cost / freedom, _FINEST_PX**2)))
 
 
 def starting_block(observations: Observations, image_size_px: tuple[int, int], skew: bool) -> Block:
