@@ -57,7 +57,7 @@ _MAX_ITERATIONS = 300
 _ENOUGH = 1e-2
 """Tolerance where only the residuals count: they are then right to a part in 10^4."""
 _LEVEL_STEPS = 4
-"""Steps in a row that may leave the cost as it is."""
+"""Steps that may leave the cost as it is."""
 _FINEST_PX = 1e-4
 """Residuals of made-up data can be zero; rounding is then the only noise, well below this."""
 _ROUNDING = 1.0 + 1e-12
@@ -315,10 +315,12 @@ def minimise(
             accepted = linearise(trial, observations, free, basis, loss, scale_px)
             evaluations += 1
         if accepted is not None and np.isfinite(accepted.cost) and accepted.cost <= at.cost * _ROUNDING:
-            level = level + 1 if accepted.cost >= at.cost else 0
+            level += accepted.cost >= at.cost * (2.0 - _ROUNDING)
             block, at = trial, accepted
             damping = damping * 0.01 if damping > 1e-9 else 0.0
         else:
+            # So near, a full step only fails to lower the cost where rounding is reached.
+            level += damping == 0.0 and decrement < 1e-3
             damping = max(10.0 * damping, 1e-9)
         if damping > 1e10 or level > _LEVEL_STEPS:
             # No step lowers the cost: rounding is reached, or there is no minimum to be found.
