@@ -1,0 +1,102 @@
+"""Which files are pictures, which are whole, and what their pixels are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from calib.errors import BadInputError
+from calib.pictures import list_pictures, read_picture, same_size
+
+GRAY = (np.add.outer(np.arange(40), np.arange(60)) * 2).astype(np.uint8)
+
+
+def _png(image: np.ndarray) -> bytes:
+    return cv2.imencode(".png", image)[1].tobytes()
+
+
+def _jpg(image: np.ndarray) -> bytes:
+    return cv2.imencode(".jpg", image)[1].tobytes()
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "says"),
+    [
+        ("empty.png", b"", "is empty"),
+        ("text.png", b"this is no picture\n", "not a picture"),
+        ("short.png", _png(GRAY)[:-30], "truncated PNG"),
+        ("header.png", _png(GRAY)[:20], "truncated PNG"),
+        ("flipped.png", _png(GRAY)[:60] + b"\x00" + _png(GRAY)[61:], "PNG"),
+        ("short.jpg", _jpg(GRAY)[:-40], "truncated JPEG"),
+        ("head.jpg", _jpg(GRAY)[:10], "not a picture"),
+    ],
+)
+def test_what_is_not_a_whole_picture(tmp_path: Path, name: str, data: bytes, says: str) -> None:
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(BadInputError, match=says) as caught:
+        read_picture(tmp_path / name)
+    assert name in str(caught.value)
+
+
+def test_a_picture_that_declares_gigabytes_is_not_decoded(tmp_path: Path) -> None:
+    import struct
+    import zlib
+
+    def part(kind: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    header = part(b"IHDR", struct.pack(">IIBBBBB", 60000, 60000, 8, 0, 0, 0, 0))
+    bomb = b"\x89PNG\r\n\x1a\n" + header + part(b"IDAT", zlib.compress(bytes(1000))) + part(b"IEND", b"")
+    (tmp_path / "bomb.png").write_bytes(bomb)
+    with pytest.raises(BadInputError, match="million pixels"):
+        read_picture(tmp_path / "bomb.png")
+
+
+def test_depths_and_channels_become_grey(tmp_path: Path) -> None:
+    deep = GRAY.astype(np.uint16) * 64
+    (tmp_path / "deep.png").write_bytes(_png(deep))
+    (tmp_path / "alpha.png").write_bytes(_png(np.dstack([GRAY, GRAY, GRAY, np.full_like(GRAY, 9)])))
+    (tmp_path / "colour.png").write_bytes(_png(np.dstack([GRAY] * 3)))
+    (tmp_path / "tiny.png").write_bytes(_png(GRAY[:1, :1]))
+    gray = read_picture(tmp_path / "deep.png").gray
+    assert gray.dtype == np.uint8
+    white = np.percentile(GRAY, 99.9)
+    assert np.abs(gray.astype(int) - np.clip(GRAY * (255 / white), 0, 255)).max() <= 1
+    np.testing.assert_array_equal(read_picture(tmp_path / "alpha.png").gray, GRAY)
+    np.testing.assert_array_equal(read_picture(tmp_path / "colour.png").gray, GRAY)
+    assert read_picture(tmp_path / "tiny.png").size_px == (1, 1)
+
+
+def test_exif_orientation_is_left_alone(tmp_path: Path) -> None:
+    plain = _jpg(GRAY)
+    exif = (
+        b"\xff\xe1\x00\x22Exif\x00\x00MM\x00\x2a\x00\x00\x00\x08\x00\x01"
+        b"\x01\x12\x00\x03\x00\x00\x00\x01\x00\x06\x00\x00\x00\x00\x00\x00"
+    )
+    (tmp_path / "turned.jpg").write_bytes(plain[:2] + exif + plain[2:])
+    assert read_picture(tmp_path / "turned.jpg").size_px == (60, 40)
+
+
+def test_folders_are_listed_in_natural_order_without_sub_folders(tmp_path: Path) -> None:
+    for name in ("view10.png", "view2.PNG", "notes.txt", ".hidden.png", "view1.jpg"):
+        (tmp_path / name).write_bytes(b"x")
+    (tmp_path / "plane").mkdir()
+    (tmp_path / "plane" / "plane01.png").write_bytes(b"x")
+    assert [p.name for p in list_pictures([tmp_path])] == ["view1.jpg", "view2.PNG", "view10.png"]
+
+
+def test_nothing_to_list(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="holds no pictures"):
+        list_pictures([tmp_path])
+    with pytest.raises(BadInputError, match="does not exist"):
+        list_pictures([tmp_path / "gone"])
+
+
+def test_mixed_sizes_name_both(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(_png(GRAY))
+    (tmp_path / "b.png").write_bytes(_png(GRAY[:30]))
+    with pytest.raises(BadInputError, match=r"b\.png: is 60x30 px, but a\.png is 60x40 px"):
+        same_size([read_picture(tmp_path / n) for n in ("a.png", "b.png")])

@@ -1,0 +1,72 @@
+"""rig.yaml: round trips, the same bytes, and sentences for what is wrong in it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from calib.errors import BadInputError
+from calib.rig import Camera, Rig, identity, read_rig, rig_text, write_rig
+
+CAMERA = Camera(
+    model="radial2",
+    image_size_px=[316, 208],
+    fx_px=273.4,
+    fy_px=272.6,
+    cx_px=160.7,
+    cy_px=101.9,
+    sigma={"fx_px": 0.4, "fy_px": None},
+    verdict="ok",
+)
+
+
+def test_round_trip_and_same_bytes(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    write_rig(path, Rig(camera=CAMERA), {"camera": {"b.png": "2", "a.png": "1"}})
+    first = path.read_bytes()
+    again = read_rig(path)
+    assert again.camera == CAMERA
+    write_rig(path, again, {"camera": {"a.png": "1", "b.png": "2"}})
+    assert path.read_bytes() == first
+    assert identity(CAMERA) == identity(again.camera or CAMERA)
+
+
+def test_sections_of_later_versions_survive(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    path.write_text("imu: {gyro_bias_radps: [0.1, 0.2, 0.3]}\nfuture: {a: 1}\n")
+    write_rig(path, read_rig(path).model_copy(update={"camera": CAMERA}), {})
+    text = path.read_text()
+    assert "gyro_bias_radps: [0.1, 0.2, 0.3]" in text
+    assert "future: {a: 1}" in text
+    assert text.index("camera:") < text.index("imu:") < text.index("provenance:")
+
+
+def test_no_file_is_an_empty_rig(tmp_path: Path) -> None:
+    assert read_rig(tmp_path / "rig.yaml").camera is None
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (("fx_px: 273.4", "fx_px: 273px"), r"camera\.fx_px is '273px', expected a valid number"),
+        (("fx_px: 273.4", "fx_px: -3.0"), r"camera\.fx_px is -3\.0, expected greater than 0"),
+        (("fx_px: 273.4", "fx_px: .nan"), r"camera\.fx_px is nan"),
+        (("fx_px: 273.4", "fx_mm: 3.0"), r"camera\.fx_px is missing"),
+        (("verdict: ok", "verdict: fine"), r"camera\.verdict is 'fine'"),
+        (("[316, 208]", "[316]"), r"camera\.image_size_px"),
+        (("cx_px: 160.7", "cx_px: 160.7\n  colour: red"), r"camera\.colour is not a key"),
+        (("camera:", "camera: 7\nother:"), r"camera is 7"),
+    ],
+)
+def test_wrong_values_name_file_key_value_and_what_was_expected(
+    tmp_path: Path, change: tuple[str, str], says: str
+) -> None:
+    path = tmp_path / "rig.yaml"
+    text = rig_text(Rig(camera=CAMERA))
+    assert change[0] in text
+    path.write_text(text.replace(*change))
+    with pytest.raises(BadInputError, match=says) as caught:
+        read_rig(path)
+    assert "rig.yaml" in str(caught.value)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,46 @@
+"""Quantities with units, and what is said of wrong ones."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calib.errors import UsageError
+from calib.units import parse_angle_rad, parse_corners, parse_frequency_hz, parse_image_size, parse_length_m
+
+
+@pytest.mark.parametrize(
+    ("text", "metres"), [("20mm", 0.02), ("2 cm", 0.02), ("0.02m", 0.02), ("1in", 0.0254), ("2e1mm", 0.02)]
+)
+def test_lengths(text: str, metres: float) -> None:
+    assert parse_length_m(text, "--square") == pytest.approx(metres, rel=1e-15)
+
+
+@pytest.mark.parametrize("text", ["20", "mm", "-20mm", "0mm", "20px", "nan mm", "1e999mm", "", "20 mm mm"])
+def test_wrong_lengths_name_the_option(text: str) -> None:
+    with pytest.raises(UsageError, match="--square"):
+        parse_length_m(text, "--square")
+
+
+def test_other_quantities() -> None:
+    assert parse_frequency_hz("1.5kHz", "--rate") == 1500.0
+    assert parse_angle_rad("180deg", "--angle") == pytest.approx(math.pi)
+    assert parse_image_size("640x480") == (640, 480)
+    with pytest.raises(UsageError):
+        parse_frequency_hz("0Hz", "--rate")
+    with pytest.raises(UsageError):
+        parse_image_size("0x480")
+
+
+@given(st.integers(3, 200), st.integers(3, 200), st.sampled_from(["x", "X", ",", " x "]))
+def test_corners(columns: int, rows: int, by: str) -> None:
+    assert parse_corners(f"{columns}{by}{rows}") == (columns, rows)
+
+
+@pytest.mark.parametrize("text", ["7", "7x", "2x9", "7.5x5", "7x5x3", "999x999", "x", "7 5"])
+def test_wrong_corners(text: str) -> None:
+    with pytest.raises(UsageError, match="--corners"):
+        parse_corners(text)
