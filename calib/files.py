@@ -11,7 +11,7 @@ from typing import Any
 
 from calib.errors import BadInputError
 
-__all__ = ["check_writable", "read_bytes", "read_text", "read_yaml_mapping", "sha256", "shown", "write_atomically"]
+__all__ = ["check_writable", "make_folder", "read_bytes", "read_text", "read_yaml_mapping", "sha256", "shown", "write_atomically"]
 
 _MAX_YAML_BYTES = 4_000_000
 _MAX_YAML_NODES = 200_000
@@ -90,6 +90,14 @@ def check_writable(path: Path) -> None:
         raise BadInputError(f"{shown(path)}: cannot be written: there is no folder {shown(parent)}")
     if not os.access(parent, os.W_OK):
         raise BadInputError(f"{shown(path)}: cannot be written: no permission in {shown(parent.resolve())}")
+
+
+def make_folder(path: Path) -> None:
+    """Create a folder to write into, or a `BadInputError` that says why not."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadInputError(f"{shown(path)}: cannot be made a folder: {error.strerror or error}") from error
 
 
 def write_atomically(path: Path, data: bytes | str) -> None:

@@ -24,9 +24,13 @@ __all__ = [
     "CovarianceTable",
     "Distortion",
     "Geometry",
+    "InverseLens",
+    "Lens",
     "Plane",
     "Provenance",
     "Rig",
+    "finite_or_none",
+    "hash_of",
     "identity",
     "read_rig",
     "rig_text",
@@ -35,7 +39,8 @@ __all__ = [
     "write_rig",
 ]
 
-Verdict = Literal["ok", "poor", "unidentifiable", "inconsistent"]
+Verdict = Annotated[str, Field(pattern="^(ok|poor|unidentifiable|inconsistent)$")]
+Model = Annotated[str, Field(pattern="^(pinhole|radial2|radial3|brown5|rational8)$")]
 Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
 Sigma = dict[str, Annotated[float, Field(ge=0, allow_inf_nan=False)] | None]
@@ -90,7 +95,7 @@ class CovarianceTable(_Section):
 class Camera(_Section):
     """Intrinsics, what they are worth, and why."""
 
-    model: Literal["pinhole", "radial2", "radial3", "brown5", "rational8"]
+    model: Model
     image_size_px: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=2, max_length=2)]
     fx_px: Positive
     fy_px: Positive
@@ -111,6 +116,7 @@ class Camera(_Section):
     rejected: list[str] = []
     verdict: Verdict
     reasons: list[str] = []
+    remarks: list[str] = []
     advice: list[str] = []
 
 
@@ -133,20 +139,31 @@ class Plane(_Section):
     reasons: list[str] = []
 
 
-class LensReport(_Section):
-    """What lens distortion costs, and the polynomial that undoes it."""
+class InverseLens(_Section):
+    """The polynomial of `calib.camera.undistortion`."""
+
+    radial: list[Number]
+    decentering_steps: Annotated[int, Field(ge=0)]
+    max_error_px: Annotated[float, Field(ge=0)]
+    covered: Annotated[float, Field(ge=0, le=1)]
+
+
+class Lens(_Section):
+    """What lens distortion does over the picture and costs on the plane."""
 
     kind: str
     max_px: Number
     mean_px: Number
-    roi_px: Annotated[list[Number], Field(min_length=4, max_length=4)]
-    roi_max_px: Number
-    roi_mean_px: Number
+    region_px: Annotated[list[Number], Field(min_length=4, max_length=4)]
+    region_max_px: Number
+    region_mean_px: Number
+    region_sigma_px: Number | None = None
+    monotonic: bool
     plane_max_mm: Number | None = None
     plane_mean_mm: Number | None = None
-    inverse_radial: list[Number] = []
-    inverse_max_error_px: Number | None = None
-    monotonic: bool
+    refitted_max_mm: Number | None = None
+    refitted_mean_mm: Number | None = None
+    inverse: InverseLens
     verdict: Literal["negligible", "matters"]
     reasons: list[str] = []
 
@@ -166,7 +183,7 @@ class Rig(BaseModel):
     geometry: Geometry | None = None
     camera: Camera | None = None
     plane: Plane | None = None
-    lens: LensReport | None = None
+    lens: Lens | None = None
     provenance: Provenance = Provenance()
 
 
@@ -207,7 +224,7 @@ def section_json(section: BaseModel) -> dict[str, Any]:
     return {
         key: value
         for key, value in section.model_dump(mode="json").items()
-        if value is not None and value != {} and not (key in ("rejected", "advice") and value == [])
+        if value is not None and value != {} and not (key in ("rejected", "remarks", "advice") and value == [])
     }
 
 

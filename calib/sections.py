@@ -9,14 +9,28 @@ import numpy as np
 from calib import rig
 from calib.arrays import FloatArray
 from calib.camera.covariance import Covariance, projection_sigma_px
+from calib.camera.distortion import DistortionReport, PlaneView
 from calib.camera.intrinsics import Intrinsics
 from calib.camera.model import COEFFICIENTS, MODELS, Camera
 from calib.camera.plane import Plane
 from calib.camera.projection import INTRINSICS
+from calib.camera.undistortion import fit_inverse
 from calib.errors import BadInputError
 from calib.files import shown
+from calib.firmware.header import CameraConstants, camera_constants
 
-__all__ = ["camera_covariance", "camera_from_section", "camera_section", "image_grid", "plane_section"]
+__all__ = [
+    "camera_covariance",
+    "camera_from_section",
+    "camera_section",
+    "current_plane",
+    "firmware_constants",
+    "image_grid",
+    "imported_camera_section",
+    "lens_section",
+    "plane_section",
+    "plane_view",
+]
 
 
 def image_grid(image_size_px: tuple[int, int], columns: int = 17, rows: int = 13) -> FloatArray:
@@ -68,6 +82,7 @@ def camera_section(result: Intrinsics) -> rig.Camera:
         rejected=list(result.rejected),
         verdict=result.judgement.verdict,
         reasons=list(result.judgement.reasons),
+        remarks=list(result.judgement.remarks),
         advice=list(result.judgement.advice),
     )
 
@@ -170,4 +185,74 @@ def imported_camera_section(camera: Camera, source: str) -> rig.Camera:
         ),
         verdict="poor",
         reasons=[f"Imported from a {source} file, which holds no error bars and no views to judge by."],
+    )
+
+
+def current_plane(whole: rig.Rig, source: str) -> rig.Plane | None:
+    """The rig's plane; `BadInputError` where it was calibrated with another camera than the rig's."""
+    if whole.plane is None or whole.camera is None:
+        return None
+    known = whole.provenance.inputs.get("plane", {}).get("camera")
+    if known is not None and known != rig.identity(whole.camera):
+        raise BadInputError(
+            f"{shown(source)}: plane was calibrated with another camera than the one in camera; "
+            "run calib extrinsics again"
+        )
+    return whole.plane
+
+
+def plane_view(plane: rig.Plane, geometry: rig.Geometry) -> PlaneView:
+    """What the distortion's cost needs of a plane."""
+    x0, y0, x1, y1 = geometry.workspace_m
+    sigma = plane.sigma_marker_mm.get("calibration_max")
+    return PlaneView(np.array(plane.R_CW), np.array(plane.t_CW_m), (x0, y0, x1, y1), sigma)
+
+
+def lens_section(report: DistortionReport) -> rig.Lens:
+    """The `lens` section of an analysis of distortion."""
+    cost, inverse = report.plane, report.inverse
+    return rig.Lens(
+        kind=report.kind,
+        max_px=report.max_px,
+        mean_px=report.mean_px,
+        region_px=[float(value) for value in report.region_px],
+        region_max_px=report.region_max_px,
+        region_mean_px=report.region_mean_px,
+        region_sigma_px=report.region_sigma_px,
+        monotonic=report.monotonic,
+        plane_max_mm=None if cost is None else cost.max_mm,
+        plane_mean_mm=None if cost is None else cost.mean_mm,
+        refitted_max_mm=None if cost is None else cost.refitted_max_mm,
+        refitted_mean_mm=None if cost is None else cost.refitted_mean_mm,
+        inverse=rig.InverseLens(
+            radial=list(inverse.radial),
+            decentering_steps=inverse.decentering_steps,
+            max_error_px=inverse.max_error_px,
+            covered=inverse.covered,
+        ),
+        verdict="negligible" if report.verdict == "negligible" else "matters",
+        reasons=list(report.reasons),
+    )
+
+
+def firmware_constants(camera: rig.Camera, plane: rig.Plane | None) -> CameraConstants:
+    """The constants of the header, the inverse lens fitted to this camera."""
+    seen = camera_from_section(camera)
+    named = dict(zip(COEFFICIENTS, seen.distortion.tolist(), strict=True))
+    intrinsics = {
+        "fx_px": camera.fx_px,
+        "fy_px": camera.fy_px,
+        "skew_px": camera.skew_px,
+        "cx_px": camera.cx_px,
+        "cy_px": camera.cy_px,
+        **{name: named[name] for name in MODELS[camera.model]},
+    }
+    return camera_constants(
+        seen.image_size_px,
+        camera.model,
+        camera.verdict,
+        intrinsics,
+        fit_inverse(seen),
+        None if plane is None else np.array(plane.A_inverse),
+        "" if plane is None else plane.verdict,
     )

@@ -11,8 +11,8 @@ target's deformation if it has one) and one pose z_i for each view. The normal m
 so the poses are eliminated, (U - sum_i W_i V_i^-1 W_i') ds = -(g_s - sum_i W_i V_i^-1 g_i), and the
 cost of an iteration is linear in the number of views.
 
-The search ends when the Newton decrement sqrt(g' H^-1 g) is below a millionth of the residuals'
-standard deviation: the step that is left is then a millionth of a standard deviation in every
+The search ends when the Newton decrement sqrt(g' H^-1 g) is below 10^-5 of the residuals' standard
+deviation: the step that is left is then a hundred-thousandth of a standard deviation in every
 direction of the parameter space, flat or steep. A limit on iterations is a failure, and named so.
 
 A robust loss is minimised by the same iteration with the weights rho'(r^2) of its points.
@@ -52,18 +52,19 @@ __all__ = [
 
 LOSSES = ("none", "huber", "cauchy")
 
-_DECREMENT = 1e-6
+_DECREMENT = 1e-5
 _MAX_ITERATIONS = 300
 _ENOUGH = 1e-2
 """Tolerance where only the residuals count: they are then right to a part in 10^4."""
+_WELL_CONDITIONED = 1e6
 _LEVEL_STEPS = 4
 """Steps that may leave the cost as it is."""
 _FINEST_PX = 1e-4
 """Residuals of made-up data can be zero; rounding is then the only noise, well below this."""
 _ROUNDING = 1.0 + 1e-12
 """A cost that differs by less is the same cost."""
-_CHUNK = 40_000
-"""Jacobian entries of a chunk of views, halved: about 640 kB."""
+_CHUNK = 80_000
+"""Jacobian entries of a chunk of views, halved: about 1.3 MB."""
 _TUNING = {"huber": 1.345, "cauchy": 2.385}
 """95 % efficiency on Gaussian residuals."""
 
@@ -317,11 +318,11 @@ def minimise(
         if accepted is not None and np.isfinite(accepted.cost) and accepted.cost <= at.cost * _ROUNDING:
             level += accepted.cost >= at.cost * (2.0 - _ROUNDING)
             block, at = trial, accepted
-            damping = damping * 0.01 if damping > 1e-9 else 0.0
+            damping = damping * 0.01 if damping > 1e-13 else 0.0
         else:
             # So near, a full step only fails to lower the cost where rounding is reached.
             level += damping == 0.0 and decrement < 1e-3
-            damping = max(10.0 * damping, 1e-9)
+            damping = max(10.0 * damping, 1e-13)
         if damping > 1e10 or level > _LEVEL_STEPS:
             # No step lowers the cost: rounding is reached, or there is no minimum to be found.
             reason = "converged" if decrement < 1e-3 else "singular" if step is None else "stalled"
@@ -337,12 +338,25 @@ def _decrement(at: Linearised, G: int, step: tuple[FloatArray, FloatArray], free
     return float(np.sqrt(abs(slope) / max(at.cost / freedom, _FINEST_PX**2)))
 
 
-def starting_block(observations: Observations, image_size_px: tuple[int, int], skew: bool) -> Block:
-    """Zhang's closed form as a start, with no distortion."""
+def starting_block(
+    observations: Observations, image_size_px: tuple[int, int], skew: bool, free: IntArray | None = None
+) -> Block:
+    """Zhang's closed form as a start, with k1 and k2 by linear least squares where they are free."""
     guess = initial_guess(observations, image_size_px, skew)
     intrinsics = np.zeros(len(INTRINSICS))
     intrinsics[:5] = guess.K[0, 0], guess.K[1, 1], guess.K[0, 2], guess.K[1, 2], guess.K[0, 1]
-    return Block(intrinsics, guess.R_CT, guess.t_CT_m, np.zeros(0))
+    start = Block(intrinsics, guess.R_CT, guess.t_CT_m, np.zeros(0))
+    lens = np.array([INTRINSICS.index("k1"), INTRINSICS.index("k2")])
+    if free is None or not np.isin(lens, free).all():
+        return start
+    at = linearise(start, observations, lens, None)
+    if at is None:
+        return start
+    normal, gradient = at.normal[:, :2, :2].sum(axis=0), at.gradient[:, :2].sum(axis=0)
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    if np.linalg.cond(normal / scale / scale[:, None]) < _WELL_CONDITIONED:
+        intrinsics[lens] = -np.linalg.solve(normal, gradient)
+    return start
 
 
 def calibrate(
@@ -372,14 +386,12 @@ def calibrate(
     """
     free = free_intrinsics(model, skew, fixed)
     if start is None:
-        start = starting_block(observations, image_size_px, skew)
+        start = starting_block(observations, image_size_px, skew, free)
     if basis is not None and len(start.deformation) != len(basis):
         start = Block(start.intrinsics, start.R_CT, start.t_CT_m, np.zeros(len(basis)))
     if basis is None and len(start.deformation):
         start = Block(start.intrinsics, start.R_CT, start.t_CT_m, np.zeros(0))
-    found = minimise(
-        start, observations, free, basis, max_iterations=max_iterations, tolerance=tolerance
-    )
+    found = minimise(start, observations, free, basis, max_iterations=max_iterations, tolerance=tolerance)
     evaluations, scale_px = found.evaluations, 1.0
     if loss != "none":
         for _ in range(3):

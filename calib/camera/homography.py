@@ -21,7 +21,9 @@ __all__ = ["Homography", "apply_homography", "fit_homography", "grouped_variance
 
 _MAX_ITERATIONS = 50
 _STEP_PX = 1e-10
-"""A step that moves no point by more than this ends the iteration."""
+"""Where the Gauss-Newton step moves no point by more than this, the minimum is reached."""
+_ROUNDING = 1e-12
+"""Rounding in the sum of squares must not stop a step that the gradient asks for."""
 
 
 @dataclass(frozen=True)
@@ -116,9 +118,7 @@ def _residuals(h: FloatArray, X: FloatArray, pixels: FloatArray) -> tuple[FloatA
     return (image - pixels).T.ravel(), J
 
 
-def fit_homography(
-    points: FloatArray, pixels: FloatArray, groups: IntArray | None = None
-) -> Homography:
+def fit_homography(points: FloatArray, pixels: FloatArray, groups: IntArray | None = None) -> Homography:
     """Homography from points of a plane to pixels that minimises the distances in pixels.
 
     Parameters
@@ -145,27 +145,29 @@ def fit_homography(
     h = _direct_linear(X[:, :2], scaled).ravel()
     now = _residuals(h, X, scaled)
     if now is None:
-        raise BadInputError("the points do not fix a homography: some would lie beyond the horizon of the others")
+        raise BadInputError(
+            "the points do not fix a homography: some would lie beyond the horizon of the others"
+        )
     damping = 1e-3
     for _ in range(_MAX_ITERATIONS):
         r, J = now
         normal, gradient = J.T @ J, J.T @ r
         # h h^T fills the one direction in which nothing changes.
         filled = normal + np.trace(normal) * np.outer(h, h)
+        if np.abs(J @ np.linalg.solve(filled, gradient)).max() < _STEP_PX * px:
+            break
         accepted = None
         while accepted is None and damping < 1e9:
             step = -np.linalg.solve(filled + damping * np.diag(np.diag(normal)), gradient)
             h_trial = (h + step) / np.linalg.norm(h + step)
             trial = _residuals(h_trial, X, scaled)
-            if trial is not None and trial[0] @ trial[0] <= r @ r:
+            if trial is not None and trial[0] @ trial[0] <= (r @ r) * (1 + _ROUNDING):
                 accepted = trial
             else:
                 damping *= 8.0
         if accepted is None:
             break
         h, now, damping = h_trial, accepted, max(0.1 * damping, 1e-12)
-        if np.abs(J @ step).max() < _STEP_PX * px:
-            break
     return _scaled_to_centroid(h, now, X, from_points, from_pixels, groups)
 
 
@@ -182,7 +184,10 @@ def _scaled_to_centroid(
     residuals = r.reshape(2, -1).T / from_pixels[0, 0]
     own = np.arange(len(X)) if groups is None else groups
     variance = grouped_variance(residuals, own, 8)
-    covariance = np.linalg.pinv(J.T @ J, rcond=1e-14, hermitian=True) * variance * from_pixels[0, 0] ** 2
+    # The direction h that fills the null space is removed again by the scaling below.
+    normal = J.T @ J
+    inverse = np.linalg.inv(normal + np.trace(normal) * np.outer(h, h))
+    covariance = inverse * variance * from_pixels[0, 0] ** 2
     # vec(T H S) = (T kron S^T) vec(H) row by row; then the scale, h / (g . h) with g . h the depth.
     linear = np.kron(np.linalg.inv(from_pixels), from_points.T)
     h = linear @ h

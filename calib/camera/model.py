@@ -147,5 +147,6 @@ def undistort(camera: Camera, pixels: FloatArray, iterations: int = 30) -> Float
         xd_now, yd_now = distort(x, y, camera.distortion)
         solved = np.hypot(xd - xd_now, yd - yd_now) < 1e-10
         xx, xy, yx, yy = _distort_jacobian(x, y, camera.distortion)
-        solved &= xx * yy - xy * yx > 0.0
+        # Both eigenvalues positive: beyond the fold the picture of the point's antipode has none.
+        solved &= (xx * yy - xy * yx > 0.0) & (xx + yy > 0.0)
     return np.where(solved[..., None], np.stack([x, y], axis=-1), np.nan)

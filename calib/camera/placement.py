@@ -115,15 +115,20 @@ def settle_orientation(
     """
     if pixels.shape != (board.corners, 2) or not np.all(np.isfinite(pixels)):
         raise BadInputError(
-            f"{name}: expected {board.columns}x{board.rows} finite corners, got an array of shape {pixels.shape}"
+            f"{name}: expected {board.columns}x{board.rows} finite corners, got an array of shape "
+            f"{pixels.shape}"
         )
     if min(board.columns, board.rows) < 2:
         raise BadInputError(
-            f"{name}: a board of {board.columns}x{board.rows} inner corners shows no direction; 2x2 is the least"
+            f"{name}: a board of {board.columns}x{board.rows} inner corners shows no direction; 2x2 is the "
+            "least"
         )
     points = board.points_m()
     if np.linalg.det(np.linalg.lstsq(points - points.mean(0), pixels - pixels.mean(0), rcond=None)[0]) <= 0:
-        raise BadInputError(f"{name}: the grid of corners is mirrored; the rows axis must turn clockwise from the columns axis")
+        raise BadInputError(
+            f"{name}: the grid of corners is mirrored; the rows axis must turn clockwise from the columns "
+            "axis"
+        )
     candidates = _turned(pixels, board)
     if first_corner_px is not None:
         return _settle_by_pixel(candidates, board, angle_rad, first_corner_px, name)
@@ -136,15 +141,16 @@ def settle_orientation(
     degrees = _wrapped_deg(directions[best])
     if off[order[1]] - off[best] < 2 * _UNDECIDED_DEG:
         raise BadInputError(
-            f"{name}: the world's x axis would point {degrees:.1f} or {_wrapped_deg(directions[int(order[1])]):.1f} degrees "
-            "from the picture's right, so the first corner cannot be told; give first_corner_px: [u, v] in board.yaml"
+            f"{name}: the world's x axis would point {degrees:.1f} or "
+            f"{_wrapped_deg(directions[int(order[1])]):.1f} degrees "
+            "from the picture's right, so the first corner cannot be told; give first_corner_px: [u, v] in "
+            "board.yaml"
         )
     limit = 90 if len(candidates) == 2 else 45
-    looks = (
-        "looks the same after a quarter turn" if limit == 45 else "can be read from either end"
-    )
+    looks = "looks the same after a quarter turn" if limit == 45 else "can be read from either end"
     how = (
-        f"The board {looks}; corner (0, 0) was taken at pixel ({chosen[0, 0]:.1f}, {chosen[0, 1]:.1f}), so that the world's "
+        f"The board {looks}; corner (0, 0) was taken at pixel ({chosen[0, 0]:.1f}, {chosen[0, 1]:.1f}), so "
+        "that the world's "
         f"x axis points {_words(degrees)} in the picture (rule: right to within {limit} degrees)."
     )
     return Placement(chosen, turn, degrees, how)
@@ -173,12 +179,15 @@ def _settle_by_pixel(
     if distances[best] > limit:
         seen = ", ".join(f"({turned[0, 0]:.1f}, {turned[0, 1]:.1f})" for _, turned in candidates)
         raise BadInputError(
-            f"{name}: first_corner_px is [{wanted[0]:g}, {wanted[1]:g}], but the corners that can be the first are seen at "
+            f"{name}: first_corner_px is [{wanted[0]:g}, {wanted[1]:g}], but the corners that can be the "
+            "first are seen at "
             f"{seen}; expected one within half a square ({limit:.1f} px)"
         )
     degrees = _wrapped_deg(_world_x_direction(chosen, board, angle_rad))
     how = (
-        f"Corner (0, 0) was taken at pixel ({chosen[0, 0]:.1f}, {chosen[0, 1]:.1f}), {distances[best]:.1f} px from "
-        f"first_corner_px; the world's x axis points {degrees:.1f} degrees from the picture's right (positive is down)."
+        f"Corner (0, 0) was taken at pixel ({chosen[0, 0]:.1f}, {chosen[0, 1]:.1f}), {distances[best]:.1f} "
+        "px from "
+        f"first_corner_px; the world's x axis points {degrees:.1f} degrees from the picture's right "
+        "(positive is down)."
     )
     return Placement(chosen, turn, degrees, how)

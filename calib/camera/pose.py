@@ -25,11 +25,20 @@ from calib.camera.homography import apply_homography, fit_homography, grouped_va
 from calib.camera.model import Camera, undistort
 from calib.errors import BadInputError
 
-__all__ = ["Pose", "fit_pose", "projection_with_derivatives", "rotation"]
+__all__ = [
+    "Pose",
+    "fit_pose",
+    "plane_map",
+    "pose_derivatives",
+    "projection_with_derivatives",
+    "rotation",
+]
 
 _MAX_ITERATIONS = 100
 _STEP_PX = 1e-9
-"""A step that moves no point by more than this ends the iteration."""
+"""Where the Gauss-Newton step moves no point by more than this, the minimum is reached."""
+_ROUNDING = 1e-12
+"""Rounding in the sum of squares must not stop a step that the gradient asks for."""
 
 
 @dataclass(frozen=True)
@@ -137,9 +146,7 @@ def pose_derivatives(
     return pixels, by_point @ R_CW[:, :2], np.concatenate([by_w, by_point], axis=2), by_camera
 
 
-def fit_pose(
-    camera: Camera, world_m: FloatArray, pixels: FloatArray, groups: IntArray | None = None
-) -> Pose:
+def fit_pose(camera: Camera, world_m: FloatArray, pixels: FloatArray, groups: IntArray | None = None) -> Pose:
     """Pose of the world's plane Z = 0 that minimises the reprojection error of all points together.
 
     Parameters
@@ -166,7 +173,8 @@ def fit_pose(
         other = (found[1].cost, found[1].R, found[1].t)
     _, _, by_pose, by_camera = pose_derivatives(camera, best.R, best.t, world_m)
     J, C = by_pose.reshape(-1, 6), by_camera.reshape(-1, 13)
-    inverse = np.linalg.pinv(J.T @ J, hermitian=True)
+    unit = 1.0 / np.linalg.norm(J, axis=0)
+    inverse = np.linalg.inv((J * unit).T @ (J * unit)) * unit * unit[:, None]
     own = np.arange(len(world_m)) if groups is None else groups
     variance = grouped_variance(best.residuals, own, 6)
     return Pose(
@@ -234,12 +242,16 @@ def _minimise(
     for _ in range(_MAX_ITERATIONS):
         r, J = now
         normal, gradient = J.T @ J, J.T @ r
+        if np.abs(J @ np.linalg.solve(normal, gradient)).max() < _STEP_PX:
+            termination = "converged"
+            break
         accepted = None
         while accepted is None and damping < 1e12:
-            step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
+            damped = normal + damping * np.diag(np.diag(normal))
+            step = np.asarray(-np.linalg.solve(damped, gradient), dtype=np.float64)
             R_trial, t_trial = rotation(step[:3]) @ R, t + step[3:]
             trial = evaluate(R_trial, t_trial)
-            if trial is not None and trial[0] @ trial[0] <= r @ r:
+            if trial is not None and trial[0] @ trial[0] <= (r @ r) * (1 + _ROUNDING):
                 accepted = trial
             else:
                 damping *= 8.0
@@ -247,9 +259,6 @@ def _minimise(
             termination = "no lower cost"
             break
         R, t, now, damping = R_trial, t_trial, accepted, max(0.1 * damping, 1e-15)
-        if np.abs(J @ step).max() < _STEP_PX:
-            termination = "converged"
-            break
     residuals = now[0].reshape(-1, 2)
     # Products of many rotations drift from orthonormality by rounding only; remove even that.
     U, _, Vt = np.linalg.svd(R)

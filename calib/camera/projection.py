@@ -134,19 +134,33 @@ def jacobian(
             v[:] = yd if name == "fy_px" else 1.0
         else:
             dx, dy = _by_coefficient(name, x, y, xx, yy, xy, r2, over, radial)
-            u[:] = fx * dx + skew * dy if skew else fx * dx
-            v[:] = fy * dy
+            np.multiply(fx, dx, out=u)
+            if skew:
+                u += skew * dy
+            np.multiply(fy, dy, out=v)
     pose = out[:, shared : shared + 6]
+    q1, q2, q3 = rotated[:, 0], rotated[:, 1], rotated[:, 2]
+    u_scale, v_scale = fx * inverse, fy * inverse
     for side in (0, 1):
-        by_x = fx * xd_x + skew * cross if side == 0 else fy * cross
-        by_y = fx * cross + skew * yd_y if side == 0 else fy * yd_y
-        a1, a2 = by_x * inverse, by_y * inverse
-        a3 = -(x * a1 + y * a2)
-        q1, q2, q3 = rotated[:, 0], rotated[:, 1], rotated[:, 2]
-        np.subtract(q2 * a3, q3 * a2, out=pose[:, 0, side])
-        np.subtract(q3 * a1, q1 * a3, out=pose[:, 1, side])
-        np.subtract(q1 * a2, q2 * a1, out=pose[:, 2, side])
-        pose[:, 3, side], pose[:, 4, side], pose[:, 5, side] = a1, a2, a3
+        turn1, turn2, turn3, a1, a2, a3 = (pose[:, row, side] for row in range(6))
+        if side == 0:
+            np.multiply(xd_x, u_scale, out=a1)
+            np.multiply(cross, u_scale, out=a2)
+            if skew:
+                a1 += skew * inverse * cross
+                a2 += skew * inverse * yd_y
+        else:
+            np.multiply(cross, v_scale, out=a1)
+            np.multiply(yd_y, v_scale, out=a2)
+        np.multiply(x, a1, out=a3)
+        a3 += y * a2
+        np.negative(a3, out=a3)
+        np.multiply(q2, a3, out=turn1)
+        turn1 -= q3 * a2
+        np.multiply(q3, a1, out=turn2)
+        turn2 -= q1 * a3
+        np.multiply(q1, a2, out=turn3)
+        turn3 -= q2 * a1
         if basis is not None:
             in_target = np.einsum("ncm,ncd->ndm", pose[:, 3:, side], block.R_CT)
             out[:, len(free) : shared, side] = np.einsum("ndm,kdm->nkm", in_target, basis)

@@ -51,7 +51,7 @@ def homographies(observations: Observations) -> FloatArray:
 
     Hartley's normalisation makes h33 of the normalised homography the depth of the target's
     centroid, never zero for a target that was seen, so the eight other entries follow from normal
-    equations. A second pass weights the algebraic error by the depth, which makes it geometric.
+    equations.
     """
     present = observations.present.astype(np.float64)
     views = observations.views
@@ -68,17 +68,14 @@ def homographies(observations: Observations) -> FloatArray:
     design[:, 6, 0], design[:, 6, 1] = -u * x, -v * x
     design[:, 7, 0], design[:, 7, 1] = -u * y, -v * y
     design[:, 8, 0], design[:, 8, 1] = u, v
-    weight = present
-    h = np.zeros((views, 9))
-    for _ in range(2):
-        weighted = (design * weight[:, None, None]).reshape(views, 9, -1)
-        normal = weighted @ weighted.transpose(0, 2, 1)
-        ridge = 1e-15 * np.trace(normal[:, :8, :8], axis1=1, axis2=2)
-        left = normal[:, :8, :8] + ridge[:, None, None] * np.eye(8)
-        h[:, :8] = np.linalg.solve(left, normal[:, :8, 8:])[..., 0]
-        h[:, 8] = 1.0
-        depth = h[:, 6, None] * x + h[:, 7, None] * y + 1.0
-        weight = present / np.where(np.abs(depth) > 1e-3, depth, 1e-3)
+    if not observations.complete:
+        design *= present[:, None, None]
+    rows = design.reshape(views, 9, -1)
+    normal = rows @ rows.transpose(0, 2, 1)
+    ridge = 1e-15 * np.trace(normal[:, :8, :8], axis1=1, axis2=2)
+    left = normal[:, :8, :8] + ridge[:, None, None] * np.eye(8)
+    h = np.ones((views, 9))
+    h[:, :8] = np.linalg.solve(left, normal[:, :8, 8:])[..., 0]
     H = h.reshape(views, 3, 3)
     to_pixels = np.zeros((views, 3, 3))
     to_pixels[:, 0, 0] = to_pixels[:, 1, 1] = 1.0 / scale_p

@@ -197,6 +197,8 @@ def _print(section: Camera, result: Intrinsics, without: Sequence[str], rig: Pat
     say(f"verdict: {section.verdict}")
     for reason in section.reasons:
         say(f"  - {reason}")
+    for remark in section.remarks:
+        say(f"  (remark) {remark}")
     for advice in section.advice:
         say(f"  next: {advice}")
     narrate(f"camera written to {rig}")

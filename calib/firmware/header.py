@@ -16,6 +16,7 @@ import numpy as np
 
 from calib import __version__
 from calib.arrays import FloatArray
+from calib.camera.undistortion import InversePolynomial
 from calib.errors import BadInputError
 
 __all__ = ["SCHEMA", "CameraConstants", "Constant", "camera_constants", "comment_text", "float_literal", "header_text"]
@@ -45,7 +46,7 @@ class CameraConstants:
     image_size_px : width and height.
     model, verdict : of the camera.
     intrinsics : pinhole and distortion.
-    inverse_lens : polynomial that undistorts.
+    inverse_lens, inverse : coefficients of the polynomial that undistorts, and all about it.
     plane : inverse homography of (2.11) and (2.12), row by row; empty without a plane.
     """
 
@@ -54,6 +55,7 @@ class CameraConstants:
     verdict: str
     intrinsics: tuple[Constant, ...]
     inverse_lens: tuple[Constant, ...]
+    inverse: InversePolynomial
     plane: tuple[Constant, ...]
     plane_verdict: str
 
@@ -80,7 +82,8 @@ def float_literal(value: float, key: str) -> str:
 def comment_text(text: str) -> str:
     """Text that cannot end a C comment or start a trigraph, whatever it was: one line of ASCII."""
     plain = text.encode("unicode_escape").decode("ascii")
-    return plain.replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?").replace("\\", "/")
+    # A backslash would continue a line or, with trigraphs, mean something else.
+    return plain.replace("\\", "|").replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?")
 
 
 def camera_constants(
@@ -88,8 +91,7 @@ def camera_constants(
     model: str,
     verdict: str,
     intrinsics: dict[str, float],
-    inverse_radial: tuple[float, ...],
-    inverse_error_px: float,
+    inverse: InversePolynomial,
     A_inverse: FloatArray | None,
     plane_verdict: str,
 ) -> CameraConstants:
@@ -98,7 +100,7 @@ def camera_constants(
     Parameters
     ----------
     intrinsics : by the names of rig.yaml (fx_px ... k1 ...).
-    inverse_radial : coefficients c1, c2, ... of `calib.camera.distortion`'s inverse polynomial.
+    inverse : polynomial that undoes the lens.
     A_inverse : (3, 3) of (2.11), ideal pixels to metres.
     """
     what = {
@@ -112,17 +114,16 @@ def camera_constants(
         Constant(f"CALIB_CAMERA_{name.upper()}", value, what.get(name, "lens, dimensionless, OpenCV's order and signs"))
         for name, value in intrinsics.items()
     ]
-    inverse = [
+    radial = [
         Constant(
             f"CALIB_LENS_INVERSE_C{i}",
             value,
-            f"x = xd * (1 + c1 r2 + c2 r2^2 + ...), r2 = xd^2 + yd^2; error <= {inverse_error_px:.4f} px",
+            f"coefficient of r2^{i}, dimensionless",
         )
-        for i, value in enumerate(inverse_radial, start=1)
+        for i, value in enumerate(inverse.radial, start=1)
     ]
     plane = []
     if A_inverse is not None:
-        # The scale of a homography is free; the largest entry of the last row is made one digit.
         for i in range(3):
             for j in range(3):
                 plane.append(
@@ -133,7 +134,7 @@ def camera_constants(
                     )
                 )
     return CameraConstants(
-        image_size_px, model, verdict, tuple(rows), tuple(inverse), tuple(plane), plane_verdict
+        image_size_px, model, verdict, tuple(rows), tuple(radial), inverse, tuple(plane), plane_verdict
     )
 
 

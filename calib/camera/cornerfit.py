@@ -1,0 +1,299 @@
+"""The blurred corner itself, fitted to the grey levels around it, many corners at once.
+
+Around a corner at (u0, v0) the edges along the rows and along the columns of the board have the
+directions alpha and beta and the curvatures kappa and lambda, which distortion gives them. With
+(x, y) the offset from the corner, c = cos, s = sin,
+
+    t1 =  c(alpha) x + s(alpha) y      d1 = -s(alpha) x + c(alpha) y - kappa t1^2 / 2
+    t2 =  c(beta)  x + s(beta)  y      d2 =  s(beta)  x - c(beta)  y + lambda t2^2 / 2
+
+d1 and d2 are the distances from the two edges, growing with row and column, t1 and t2 the way along
+them. Blur and the pixel's aperture make an error function of each step:
+
+    I = (1 + g_x x + g_y y) (b + a erf(d1 / w) erf(d2 / w))
+
+Light that is not even scales dark and bright alike, hence one gradient g. The ten parameters u0, v0,
+alpha, beta, w, b, a, g_x, g_y ... of each corner are found by Levenberg-Marquardt; the curvatures
+are given. The window is a parallelogram along the board, so that the model holds in all of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from calib.arrays import BoolArray, FloatArray, IntArray
+
+__all__ = ["Frames", "LocalFit", "fit_corners", "frames_of"]
+
+WINDOW = 0.45
+"""Half the window's width over the local square: the next corner must not come in."""
+_REACH_PX = 16
+_LEAST_REACH_PX = 2.5
+_ITERATIONS = 25
+_STEP_PX = 1e-3
+_STEP_SIGMA = 0.05
+_START_WIDTH_PX = 1.2
+_WIDTH_PX = (0.3, 12.0)
+_PARAMETERS = 9
+_EDGE_SLOPE = 2.0 / np.sqrt(np.pi)
+
+_Float32 = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Frames:
+    """What the grid says of the surroundings of each of N corners.
+
+    Attributes
+    ----------
+    along, across : (N, 2) steps to the next column and row, pixels.
+    bend_along, bend_across : (N,) curvatures of the edges along rows and columns, 1 / px.
+    """
+
+    along: FloatArray
+    across: FloatArray
+    bend_along: FloatArray
+    bend_across: FloatArray
+
+    def take(self, chosen: IntArray) -> Frames:
+        """The frames of some corners."""
+        return Frames(
+            self.along[chosen], self.across[chosen], self.bend_along[chosen], self.bend_across[chosen]
+        )
+
+
+@dataclass(frozen=True)
+class LocalFit:
+    """Fitted corners.
+
+    Attributes
+    ----------
+    points : (N, 2) pixels.
+    sigma_px : (N,) standard deviation of one coordinate, from the fit's residuals.
+    amplitude : (N,) half the step from dark to bright, positive where the square between growing
+        column and growing row is bright, grey levels.
+    residual : (N,) RMS of the fit over |amplitude|.
+    width_px : (N,) sqrt(2) times the standard deviation of the blur.
+    converged : (N,) whether the last step was small and the window held enough of the corner.
+    """
+
+    points: FloatArray
+    sigma_px: FloatArray
+    amplitude: FloatArray
+    residual: FloatArray
+    width_px: FloatArray
+    converged: BoolArray
+
+
+@dataclass(frozen=True)
+class _Windows:
+    """Pixels around N corners, (N, M) each, with weights 0 or 1; x and y from `centre` (N, 2)."""
+
+    centre: FloatArray
+    x: _Float32
+    y: _Float32
+    grey: _Float32
+    weight: _Float32
+    bend_along: _Float32
+    bend_across: _Float32
+
+    def take(self, chosen: IntArray) -> _Windows:
+        return _Windows(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
+
+
+def _derivatives_along(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """First and second derivative by the index of curves (..., n, 2), from a low polynomial."""
+    n = points.shape[-2]
+    degree = 1 if n < 3 else 2 if n < 5 else 3
+    t = np.arange(n) - (n - 1) / 2.0
+    powers = np.vander(t, degree + 1, increasing=True)
+    coefficients = np.linalg.pinv(powers) @ points
+    first, second = np.zeros_like(powers), np.zeros_like(powers)
+    for m in range(1, degree + 1):
+        first[:, m] = m * t ** (m - 1)
+        second[:, m] = m * (m - 1) * t ** max(m - 2, 0)
+    return first @ coefficients, second @ coefficients
+
+
+def frames_of(points: FloatArray) -> Frames:
+    """Steps and curvatures of a grid of corners, (rows, columns, 2) pixels, at least 2 x 2.
+
+    Perspective keeps lines straight, so the curvature of a row of corners is that of its edges.
+    """
+    along, across = np.gradient(points, axis=1), np.gradient(points, axis=0)
+    bends = []
+    for curves in (points, points.transpose(1, 0, 2)):
+        first, second = _derivatives_along(curves)
+        speed = np.maximum(np.hypot(first[..., 0], first[..., 1]), 1e-9)
+        bends.append((first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]) / speed**3)
+    return Frames(along.reshape(-1, 2), across.reshape(-1, 2), bends[0].ravel(), bends[1].T.ravel())
+
+
+def _windows(image: _Float32, points: FloatArray, frames: Frames) -> _Windows:
+    height, width = image.shape
+    centre = np.rint(points)
+    extent = WINDOW * (np.abs(frames.along) + np.abs(frames.across))
+    reach = int(np.clip(np.ceil(extent.max(initial=3.0)), np.ceil(_LEAST_REACH_PX), _REACH_PX))
+    offset = np.arange(-reach, reach + 1)
+    dx, dy = (o.ravel() for o in np.meshgrid(offset, offset))
+    x = dx - (points - centre)[:, :1]
+    y = dy - (points - centre)[:, 1:]
+    (ax, ay), (bx, by) = frames.along.T[:, :, None], frames.across.T[:, :, None]
+    area = np.maximum(np.abs(ax * by - ay * bx), 1e-9)
+    inside = (np.abs(by * x - bx * y) <= WINDOW * area) & (np.abs(ax * y - ay * x) <= WINDOW * area)
+    # The smallest squares leave too few pixels; there the next edge is let in.
+    inside |= (np.abs(x) <= _LEAST_REACH_PX) & (np.abs(y) <= _LEAST_REACH_PX)
+    u, v = centre[:, :1] + dx, centre[:, 1:] + dy
+    inside &= (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    # Pack the pixels that count to the left.
+    most = max(int(inside.sum(axis=1).max(initial=1)), 1)
+    packed = np.argsort(~inside, axis=1, kind="stable")[:, :most]
+    weight = np.take_along_axis(inside, packed, axis=1)
+    u = np.clip(np.take_along_axis(u, packed, axis=1), 0, width - 1).astype(np.intp)
+    v = np.clip(np.take_along_axis(v, packed, axis=1), 0, height - 1).astype(np.intp)
+    return _Windows(
+        centre,
+        dx[packed].astype(np.float32),
+        dy[packed].astype(np.float32),
+        image[v, u],
+        weight.astype(np.float32),
+        frames.bend_along.astype(np.float32)[:, None],
+        frames.bend_across.astype(np.float32)[:, None],
+    )
+
+
+def _edge(d: _Float32, w: _Float32) -> tuple[_Float32, _Float32, _Float32]:
+    """erf(d / w) and its derivatives by d and by w (Abramowitz and Stegun 7.1.26, error below 2e-7)."""
+    z = d / w
+    bell = np.exp(-z * z)
+    t = 1.0 / (1.0 + np.float32(0.3275911) * np.abs(z))
+    series = np.float32(1.061405429) * t
+    for c in (-1.453152027, 1.421413741, -0.284496736, 0.254829592):
+        series = (series + np.float32(c)) * t
+    slope = np.float32(_EDGE_SLOPE) * bell / w
+    return np.copysign(1.0 - series * bell, z), slope, -slope * z
+
+
+def _model(q: _Float32, win: _Windows) -> tuple[_Float32, _Float32]:
+    """Residuals (N, M) and the Jacobian of the model (N, 9, M), both zero outside the window."""
+    u0, v0, alpha, beta, w, b, a, gx, gy = (q[:, k, None] for k in range(_PARAMETERS))
+    x, y = win.x - u0, win.y - v0
+    c1, s1, c2, s2 = np.cos(alpha), np.sin(alpha), np.cos(beta), np.sin(beta)
+    t1, t2 = c1 * x + s1 * y, c2 * x + s2 * y
+    n1, n2 = c1 * y - s1 * x, s2 * x - c2 * y
+    k1t, k2t = win.bend_along * t1, win.bend_across * t2
+    E1, G1, W1 = _edge(n1 - 0.5 * k1t * t1, w)
+    E2, G2, W2 = _edge(n2 + 0.5 * k2t * t2, w)
+    light = (1.0 + gx * x + gy * y) * win.weight
+    P = E1 * E2
+    tone = b + a * P
+    J = np.empty((len(q), _PARAMETERS, x.shape[1]), dtype=np.float32)
+    by_d1, by_d2 = a * light * G1 * E2, a * light * E1 * G2
+    toned = win.weight * tone
+    J[:, 0] = by_d1 * (s1 + k1t * c1) - by_d2 * (s2 + k2t * c2) - gx * toned
+    J[:, 1] = by_d1 * (k1t * s1 - c1) + by_d2 * (c2 - k2t * s2) - gy * toned
+    J[:, 2] = by_d1 * (-t1 - k1t * n1)
+    J[:, 3] = by_d2 * (t2 - k2t * n2)
+    J[:, 4] = a * light * (W1 * E2 + E1 * W2)
+    J[:, 5] = light
+    J[:, 6] = light * P
+    J[:, 7] = x * toned
+    J[:, 8] = y * toned
+    return win.grey * win.weight - light * tone, J
+
+
+def _start(points: FloatArray, frames: Frames, win: _Windows) -> FloatArray:
+    """Parameters (N, 9) with position and directions of the grid, and the grey levels that fit them."""
+    q = np.zeros((len(points), _PARAMETERS))
+    q[:, :2] = points - win.centre
+    q[:, 2] = np.arctan2(frames.along[:, 1], frames.along[:, 0])
+    q[:, 3] = np.arctan2(frames.across[:, 1], frames.across[:, 0])
+    q[:, 4] = _START_WIDTH_PX
+    _, J = _model(q.astype(np.float32), win)
+    ones, P = J[:, 5].astype(np.float64), J[:, 6].astype(np.float64)
+    grey = win.grey * win.weight
+    n, sum_p, sum_pp = ones.sum(axis=1), P.sum(axis=1), (P * P).sum(axis=1)
+    sum_g, sum_gp = grey.sum(axis=1), (grey * P).sum(axis=1)
+    det = np.maximum(n * sum_pp - sum_p**2, 1e-9)
+    q[:, 6] = (n * sum_gp - sum_p * sum_g) / det
+    q[:, 5] = (sum_pp * sum_g - sum_p * sum_gp) / det
+    return q
+
+
+def fit_corners(image: _Float32, points: FloatArray, frames: Frames, iterations: int = _ITERATIONS) -> LocalFit:
+    """Fit the blurred corner around each of N points.
+
+    Parameters
+    ----------
+    image : (H, W) grey levels.
+    points : (N, 2) where to start, pixels.
+    frames : steps and curvatures of the grid at the N points.
+    """
+    N = len(points)
+    win = _windows(image, points, frames)
+    q = _start(points, frames, win)
+    damping = np.full(N, 1e-3)
+    r, J = _model(q.astype(np.float32), win)
+    normal, gradient = _normal(J, r)
+    cost = np.einsum("nm,nm->n", r, r, dtype=np.float64)
+    converged = np.zeros(N, dtype=bool)
+    active = np.arange(N)
+    diagonal = np.arange(_PARAMETERS)
+    freedom = np.maximum(win.weight.sum(axis=1).astype(np.float64) - _PARAMETERS, 1.0)
+    for _ in range(iterations):
+        N_a, g_a = normal[active], gradient[active]
+        A = N_a.copy()
+        A[:, diagonal, diagonal] *= 1.0 + damping[active, None]
+        A[:, diagonal, diagonal] += 1e-6
+        step = np.linalg.solve(A, g_a[:, :, None])[:, :, 0]
+        length = np.hypot(step[:, 0], step[:, 1])
+        step /= np.maximum(1.0, np.maximum(length, 4.0 * np.abs(step[:, 2:4]).max(axis=1)))[:, None]
+        foreseen = np.einsum("ni,ni->n", step, 2.0 * g_a - np.einsum("nij,nj->ni", N_a, step))
+        trial = q[active] + step
+        trial[:, 4] = np.clip(trial[:, 4], *_WIDTH_PX)
+        r, J = _model(trial.astype(np.float32), win.take(active) if len(active) < N else win)
+        trial_cost = np.einsum("nm,nm->n", r, r, dtype=np.float64)
+        gain = (cost[active] - trial_cost) / np.maximum(foreseen, 1e-9)
+        better = trial_cost <= cost[active] * (1 + 1e-6)
+        # A step is small when it is so in pixels, or against the fit's own uncertainty.
+        settled = (length < _STEP_PX) | (foreseen * freedom[active] < _STEP_SIGMA**2 * cost[active])
+        won = active[better]
+        q[won], cost[won] = trial[better], trial_cost[better]
+        normal[won], gradient[won] = _normal(J[better], r[better])
+        factor = np.where(gain > 0.75, 0.1, np.where(gain > 0.25, 1.0, 6.0))
+        damping[active] = np.clip(damping[active] * factor, 1e-7, 1e8)
+        converged[active] = better & settled & (damping[active] < 1e3)
+        active = active[~converged[active]]
+        if len(active) == 0:
+            break
+    return _result(q, win, normal, cost, converged)
+
+
+def _normal(J: _Float32, r: _Float32) -> tuple[FloatArray, FloatArray]:
+    normal = (J @ J.transpose(0, 2, 1)).astype(np.float64)
+    return normal, (J @ r[:, :, None])[:, :, 0].astype(np.float64)
+
+
+def _result(
+    q: FloatArray, win: _Windows, normal: FloatArray, cost: FloatArray, converged: BoolArray
+) -> LocalFit:
+    freedom = np.maximum(win.weight.sum(axis=1).astype(np.float64) - _PARAMETERS, 1.0)
+    scale = np.sqrt(np.maximum(np.einsum("nii->ni", normal), 1e-12))
+    scaled = normal / (scale[:, :, None] * scale[:, None, :]) + 1e-7 * np.eye(_PARAMETERS)
+    inverse = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
+    variance = cost / freedom
+    sigma = np.sqrt(0.5 * (inverse[:, 0, 0] + inverse[:, 1, 1]) * variance)
+    amplitude = q[:, 6]
+    residual = np.sqrt(variance) / np.maximum(np.abs(amplitude), 1e-9)
+    finite = np.all(np.isfinite(q), axis=1) & np.isfinite(sigma)
+    return LocalFit(
+        points=q[:, :2] + win.centre,
+        sigma_px=sigma,
+        amplitude=amplitude,
+        residual=residual,
+        width_px=q[:, 4],
+        converged=converged & finite & (freedom > _PARAMETERS),
+    )

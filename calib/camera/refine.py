@@ -1,0 +1,196 @@
+"""Sub-pixel refinement of a grid of corners.
+
+Each corner is fitted on its own (`cornerfit`). Then the corners check each other (`gridmodel`): one that
+did not converge, has the wrong colours or disagrees with the others is fitted again from where the
+others place it. A corner that still fails is not a measurement: it is reported at its predicted place,
+with a large sigma and `refined` false, and never at the place where the search began.
+
+Where squares are large the picture is averaged over blocks of k x k pixels first: the window then
+covers the same share of the square, and averaging loses nothing that the blur has not lost.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from calib.arrays import BoolArray, FloatArray, GrayImage, IntArray
+from calib.camera.cornerfit import LocalFit, fit_corners, frames_of
+from calib.camera.gridmodel import Prediction, predict
+
+__all__ = ["Refined", "reduced_around", "refine", "square_px"]
+
+_SQUARE_PX = 40.0
+"""Squares of twice this size and more are averaged down to it."""
+_FIRST_ITERATIONS = 4
+_LARGEST_RESIDUAL = 0.4
+"""RMS of a fit over the amplitude; clutter is above it."""
+_LEAST_SHARE = 0.2
+"""Least amplitude of a corner over the picture's median."""
+_FAR = 0.2
+"""Share of a square that no corner may be away from its prediction."""
+_UNKNOWN_SIGMA = 0.25
+"""Sigma of a corner that was not refined, in squares."""
+_RESCUES = 3
+_LEAST_PICTURE_PX = 4
+
+_Float32 = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Refined:
+    """A refined grid; arrays are (rows, columns) and `points` has two pixel coordinates more.
+
+    Attributes
+    ----------
+    points : pixels.
+    sigma_px : standard deviation of one coordinate of a corner, from the residuals of its fit.
+    amplitude : half the step from dark to bright, positive where the square between growing column
+        and growing row is bright, grey levels.
+    residual : RMS of the fit over |amplitude|.
+    refined : False where a corner could not be measured and its predicted place is given.
+    misfit_px : typical distance of a corner from where the others place it.
+    """
+
+    points: FloatArray
+    sigma_px: FloatArray
+    amplitude: FloatArray
+    residual: FloatArray
+    refined: BoolArray
+    misfit_px: float
+
+    @property
+    def sign(self) -> int:
+        """+1 where the square between growing column and row of corner (0, 0) is bright, else -1."""
+        i, j = np.indices(self.amplitude.shape)
+        return 1 if np.sum(np.sign(self.amplitude) * (1 - 2 * ((i + j) % 2))) >= 0 else -1
+
+
+def square_px(points: FloatArray) -> float:
+    """Median length of the sides of the squares."""
+    along = np.linalg.norm(np.diff(points, axis=1), axis=-1)
+    across = np.linalg.norm(np.diff(points, axis=0), axis=-1)
+    return float(np.median(np.concatenate([along.ravel(), across.ravel()])))
+
+
+def reduced_around(gray: GrayImage, points: FloatArray) -> tuple[_Float32, FloatArray, int, FloatArray]:
+    """The part of the picture around the grid, averaged over k x k pixels; the grid in it; k; its origin."""
+    k = max(1, int(square_px(points) // _SQUARE_PX))
+    height, width = gray.shape
+    square = float(np.max(np.abs(np.gradient(points, axis=0)) + np.abs(np.gradient(points, axis=1))))
+    low = np.floor((points.reshape(-1, 2).min(axis=0) - square) / k).astype(int) * k
+    high = np.ceil(points.reshape(-1, 2).max(axis=0) + square).astype(int)
+    u0, v0 = max(int(low[0]), 0), max(int(low[1]), 0)
+    u1, v1 = min(int(high[0]), width), min(int(high[1]), height)
+    part = gray[v0:v1, u0:u1]
+    if k > 1:
+        part = part[: part.shape[0] // k * k, : part.shape[1] // k * k]
+        image = cv2.resize(
+            part.astype(np.float32), (part.shape[1] // k, part.shape[0] // k), interpolation=cv2.INTER_AREA
+        )
+    else:
+        image = part.astype(np.float32)
+    origin = np.array([u0, v0], dtype=np.float64)
+    return np.asarray(image), (points - origin - 0.5 * (k - 1)) / k, k, origin
+
+
+def _colours(fit: LocalFit, shape: tuple[int, int]) -> FloatArray:
+    """Amplitude (N,), positive where a corner has the colours that most corners give it."""
+    j, i = np.indices(shape)
+    signed = fit.amplitude * (1.0 - 2.0 * ((i + j) % 2)).ravel()
+    return signed * (1.0 if np.sum(np.sign(signed)) >= 0 else -1.0)
+
+
+def _sound(fit: LocalFit, shape: tuple[int, int]) -> BoolArray:
+    """Which fits (N,) are of a corner with the right colours, converged or not yet."""
+    amplitude = _colours(fit, shape)
+    enough = amplitude > _LEAST_SHARE * np.median(np.abs(amplitude))
+    return np.asarray(enough & (fit.residual < _LARGEST_RESIDUAL) & np.isfinite(fit.points[:, 0]))
+
+
+def _trusted(fit: LocalFit, shape: tuple[int, int]) -> BoolArray:
+    """Which fits (N,) are measurements."""
+    return np.asarray(fit.converged & _sound(fit, shape))
+
+
+def _merged(fit: LocalFit, again: LocalFit, where: IntArray, use: BoolArray) -> LocalFit:
+    """`fit` with the corners `where` (indices) replaced by those of `again` that are to be used."""
+    values = {}
+    for name in LocalFit.__dataclass_fields__:
+        merged = getattr(fit, name).copy()
+        merged[where[use]] = getattr(again, name)[use]
+        values[name] = merged
+    return LocalFit(**values)
+
+
+def _rescued(image: _Float32, fit: LocalFit, shape: tuple[int, int]) -> tuple[LocalFit, BoolArray, Prediction | None]:
+    """Fit again, from where the others place them, the corners that failed or disagree."""
+    good = _trusted(fit, shape)
+    for _ in range(_RESCUES):
+        prediction = predict(fit.points.reshape(*shape, 2), good.reshape(shape))
+        if prediction is None:
+            return fit, good, None
+        placed = prediction.points.reshape(-1, 2)
+        frames = frames_of(np.where(good[:, None], fit.points, placed).reshape(*shape, 2))
+        far = _FAR * np.minimum(np.linalg.norm(frames.along, axis=1), np.linalg.norm(frames.across, axis=1))
+        away = np.linalg.norm(fit.points - placed, axis=1)
+        limit = np.minimum(prediction.limit_px.ravel(), far)
+        doubtful = np.flatnonzero(~good | ~(away < limit))
+        if len(doubtful) == 0:
+            break
+        again = fit_corners(image, placed[doubtful], frames.take(doubtful))
+        trial = _merged(fit, again, doubtful, np.ones(len(doubtful), dtype=np.bool_))
+        near = np.linalg.norm(again.points - placed[doubtful], axis=1)
+        moved = np.linalg.norm(again.points - fit.points[doubtful], axis=1)
+        use = _trusted(trial, shape)[doubtful] & (near < far[doubtful])
+        use &= ~good[doubtful] | (near < away[doubtful])
+        fit = _merged(fit, again, doubtful, use)
+        good = _trusted(fit, shape) & (np.linalg.norm(fit.points - placed, axis=1) < far)
+        if not np.any(use & ~(moved < 0.01)):
+            break
+    return fit, good, predict(fit.points.reshape(*shape, 2), good.reshape(shape))
+
+
+def refine(gray: GrayImage, points: FloatArray) -> Refined | None:
+    """Refine a grid of corners to a small fraction of a pixel.
+
+    Parameters
+    ----------
+    gray : (H, W) grey levels.
+    points : (rows, columns, 2) pixels, off by less than a third of a square, at least 3 x 3.
+
+    Returns
+    -------
+    None where fewer than six corners could be fitted.
+    """
+    shape = (points.shape[0], points.shape[1])
+    image, start, k, origin = reduced_around(gray, points)
+    if min(image.shape) < 2 * _LEAST_PICTURE_PX:
+        return None
+    first = fit_corners(image, start.reshape(-1, 2), frames_of(start), _FIRST_ITERATIONS)
+    # A misplaced corner would spoil the curvatures of its row and column.
+    sound = _sound(first, shape)
+    rough = predict(first.points.reshape(start.shape), sound.reshape(shape))
+    if rough is None:
+        return None
+    away = np.linalg.norm(first.points - rough.points.reshape(-1, 2), axis=1)
+    stays = sound & (away < rough.limit_px.ravel())
+    moved = np.where(stays[:, None], first.points, rough.points.reshape(-1, 2)).reshape(start.shape)
+    fit = fit_corners(image, moved.reshape(-1, 2), frames_of(moved))
+    fit, good, prediction = _rescued(image, fit, shape)
+    if prediction is None:
+        return None
+    placed = prediction.points.reshape(-1, 2)
+    unknown = _UNKNOWN_SIGMA * square_px(prediction.points)
+    found = np.where(good[:, None], fit.points, placed).reshape(*shape, 2)
+    return Refined(
+        points=found * k + 0.5 * (k - 1) + origin,
+        sigma_px=k * np.where(good, fit.sigma_px, unknown).reshape(shape),
+        amplitude=fit.amplitude.reshape(shape),
+        residual=fit.residual.reshape(shape),
+        refined=good.reshape(shape),
+        misfit_px=k * prediction.spread_px,
+    )

@@ -1,0 +1,163 @@
+"""Candidates for a checkerboard, stage by stage, the cheap and sure stages first.
+
+The first stages look for grids of saddle points in copies of the picture, from a small one, where
+large squares stay and noise goes, up to one of twice the size for squares of a few pixels. OpenCV's
+finders follow: the classic one, the sector-based one (SB) and SB with an exhaustive search, the last
+two also on an enlarged copy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from calib.arrays import FloatArray, GrayImage
+from calib.camera.gridmodel import predict
+from calib.camera.lattice import Lattice, find_lattices
+from calib.camera.saddles import find_saddles
+
+__all__ = ["Level", "Stage", "complete", "fallback_stages", "lattice_levels", "lattice_stages", "resized"]
+
+_COARSE_PIXELS = 120_000
+_LARGEST_PIXELS = 6_000_000
+_ENLARGE_BELOW_PIXELS = 700_000
+_ENLARGE_TWICE_BELOW_PIXELS = 90_000
+_OPENCV_PIXELS = 1_300_000
+_SEEN_SHARE = 0.8
+"""Least share of a grid's corners that must be seen; the others are looked for where they should be."""
+_MIN_SIDE_PX = 16
+
+
+@dataclass(frozen=True)
+class Level:
+    """A copy of the picture, `zoom` times its size; u = (x + 1/2) / zoom - 1/2."""
+
+    image: GrayImage
+    zoom: float
+
+    def to_picture(self, points: FloatArray) -> FloatArray:
+        """Pixels of the picture from pixels of the copy."""
+        return np.asarray((points + 0.5) / self.zoom - 0.5)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One way of looking: its name and a function that yields grids (r, c, 2) of the picture."""
+
+    name: str
+    search: Callable[[], Iterator[FloatArray]]
+
+
+def resized(gray: GrayImage, zoom: float) -> Level:
+    """A copy of the picture; `zoom` is 1 / n or n for a whole n."""
+    if zoom == 1.0:
+        return Level(gray, 1.0)
+    if zoom > 1.0:
+        copy = cv2.resize(gray, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC)
+        return Level(np.asarray(copy, dtype=np.uint8), zoom)
+    n = round(1.0 / zoom)
+    height, width = gray.shape[0] // n, gray.shape[1] // n
+    copy = cv2.resize(gray[: height * n, : width * n], (width, height), interpolation=cv2.INTER_AREA)
+    return Level(np.asarray(copy, dtype=np.uint8), zoom)
+
+
+def lattice_levels(gray: GrayImage) -> list[float]:
+    """Zooms at which to look for grids of saddle points, in order."""
+    zooms: list[float] = []
+    n = 1
+    while gray.size / n**2 > _COARSE_PIXELS:
+        n *= 2
+    while n >= 1:
+        if gray.size / n**2 <= _LARGEST_PIXELS:
+            zooms.append(1.0 / n)
+        n //= 2
+    if gray.size < _ENLARGE_BELOW_PIXELS:
+        zooms.append(2.0)
+    if gray.size < _ENLARGE_TWICE_BELOW_PIXELS:
+        zooms.append(4.0)
+    return zooms
+
+
+def complete(lattice: Lattice) -> FloatArray | None:
+    """Points of a lattice with the few unseen corners where the others place them, or None."""
+    seen = lattice.seen
+    if seen.all():
+        return lattice.points
+    if seen.mean() < _SEEN_SHARE:
+        return None
+    prediction = predict(lattice.points, seen)
+    if prediction is None:
+        return None
+    return np.where(seen[..., None], lattice.points, prediction.points)
+
+
+def lattice_stages(gray: GrayImage, columns: int, rows: int) -> list[Stage]:
+    """Stages that join saddle points of copies of the picture."""
+
+    def stage(zoom: float) -> Stage:
+        def search() -> Iterator[FloatArray]:
+            level = resized(gray, zoom)
+            for lattice in find_lattices(find_saddles(level.image), least=max(4, columns * rows // 4)):
+                if sorted(lattice.points.shape[:2]) == sorted((rows, columns)):
+                    points = complete(lattice)
+                    if points is not None:
+                        yield level.to_picture(points)
+
+        return Stage(f"saddles x{zoom:g}", search)
+
+    return [stage(zoom) for zoom in lattice_levels(gray)]
+
+
+def _classic(image: GrayImage, size: tuple[int, int]) -> FloatArray | None:
+    found, corners = cv2.findChessboardCorners(
+        image, size, flags=cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+    )
+    return np.asarray(corners, dtype=np.float64) if found else None
+
+
+def _sector_based(image: GrayImage, size: tuple[int, int], flags: int = 0) -> FloatArray | None:
+    found, corners = cv2.findChessboardCornersSB(image, size, flags=flags)
+    return np.asarray(corners, dtype=np.float64) if found else None
+
+
+def _exhaustive(image: GrayImage, size: tuple[int, int]) -> FloatArray | None:
+    return _sector_based(
+        image, size, cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
+    )
+
+
+def fallback_stages(gray: GrayImage, columns: int, rows: int) -> list[Stage]:
+    """OpenCV's finders, on the picture or a copy of a size that they can do quickly."""
+    if min(gray.shape) < _MIN_SIDE_PX or min(columns, rows) < 3:
+        return []
+    n = 1
+    while gray.size / n**2 > _OPENCV_PIXELS:
+        n += 1
+    plain = 1.0 / n
+    finders = (("classic", _classic), ("SB", _sector_based), ("SB exhaustive", _exhaustive))
+    zooms = [plain] + ([2.0] if gray.size < _ENLARGE_BELOW_PIXELS / 2 else [])
+
+    def stage(name: str, finder: Callable[[GrayImage, tuple[int, int]], FloatArray | None], zoom: float) -> Stage:
+        def search() -> Iterator[FloatArray]:
+            level = resized(gray, zoom)
+            try:
+                corners = finder(level.image, (columns, rows))
+            except cv2.error:
+                # Some sizes of picture are too small for a finder's own filters.
+                return
+            if corners is not None and corners.size == 2 * columns * rows:
+                grid = corners.reshape(rows, columns, 2)
+                yield level.to_picture(_not_mirrored(grid))
+
+        return Stage(f"{name} x{zoom:g}", search)
+
+    return [stage(name, finder, zoom) for zoom in zooms for name, finder in finders]
+
+
+def _not_mirrored(grid: FloatArray) -> FloatArray:
+    along, across = grid[:, -1] - grid[:, 0], grid[-1] - grid[0]
+    a, b = along.mean(axis=0), across.mean(axis=0)
+    return grid if a[0] * b[1] - a[1] * b[0] > 0 else np.asarray(grid[:, ::-1])

@@ -1,0 +1,219 @@
+"""Whether the minimum that was found is the minimum: other starts, and the profile over focal length.
+
+The local covariance of a calibration is a statement about the bottom of one valley. Two things it
+cannot see: another valley as deep, and a valley that is flat and curved, along which the focal length
+runs away. Both are looked for by minimising again.
+
+The profile is the cost as a function of fx with everything else minimised. The interval of fx in
+which it rises by less than 3.84 sigma^2 holds the truth with 95 % probability (Wilks) however
+lopsided it is.
+
+The denominator of the rational model is left at zero in the starts and at its values in the profile:
+it trades with the numerator at next to no cost, and the searches would never end.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.arrays import FloatArray, IntArray
+from calib.camera.bundle import Calibration, calibrate, minimise
+from calib.camera.projection import INTRINSICS, Block, free_intrinsics
+from calib.camera.zhang import homographies, poses_from_homographies
+
+__all__ = ["FocalInterval", "Start", "best_of_starts", "focal_interval", "held", "other_starts", "resolved"]
+
+FOCAL_STARTS = (0.4, 0.7, 1.1, 1.8, 4.0)
+"""Focal lengths of the starts, over the longer side of the image."""
+
+_CHI2_95 = 3.84
+_MAX_ITERATIONS = 60
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where one start ended.
+
+    Attributes
+    ----------
+    focal_px : focal length that it began with.
+    block : where it ended.
+    cost : sum of squared residuals there, pixels squared.
+    termination : as `Calibration.termination`.
+    """
+
+    focal_px: float
+    block: Block
+    cost: float
+    termination: str
+
+
+def resolved(calibration: Calibration, index: IntArray) -> Calibration:
+    """The calibration from some of its views only, same model and loss, started where it is."""
+    camera, block = calibration.camera, calibration.block
+    start = Block(block.intrinsics, block.R_CT[index], block.t_CT_m[index], block.deformation)
+    return calibrate(
+        calibration.observations.select(index),
+        camera.image_size_px,
+        camera.model,
+        skew=INTRINSICS.index("skew_px") in calibration.free,
+        fixed=held(calibration),
+        basis=calibration.basis,
+        loss=calibration.loss,
+        start=start,
+    )
+
+
+def held(calibration: Calibration) -> tuple[str, ...]:
+    """Names of intrinsics that the model has and the calibration does not estimate."""
+    every = free_intrinsics(calibration.camera.model, True)
+    return tuple(INTRINSICS[i] for i in every if i not in calibration.free)
+
+
+def other_starts(calibration: Calibration, seed: int = 0) -> list[Start]:
+    """Minima reached from focal lengths of 0.4 to 4 image widths and principal points about the centre."""
+    rng = np.random.default_rng(seed)
+    observations, camera = calibration.observations, calibration.camera
+    width, height = camera.image_size_px
+    H = homographies(observations)
+    free = _well_determined(calibration.free)
+    ends = []
+    for share in FOCAL_STARTS:
+        focal = share * max(width, height)
+        jitter = rng.uniform(-0.08, 0.08, 2) * (width, height)
+        guess = calibration.block.intrinsics.copy()
+        guess[calibration.free] = 0.0
+        for name, value in zip(
+            ("fx_px", "fy_px", "cx_px", "cy_px"),
+            (focal, focal, 0.5 * (width - 1) + jitter[0], 0.5 * (height - 1) + jitter[1]),
+            strict=True,
+        ):
+            index = INTRINSICS.index(name)
+            if index in free:
+                guess[index] = value
+        K = np.array([[guess[0], guess[4], guess[2]], [0.0, guess[1], guess[3]], [0.0, 0.0, 1.0]])
+        R_CT, t_CT_m = poses_from_homographies(K, H)
+        if not (np.all(np.isfinite(R_CT)) and np.all(np.isfinite(t_CT_m))):
+            continue
+        start = Block(guess, R_CT, t_CT_m, np.zeros(0))
+        found = minimise(start, observations, free, max_iterations=_MAX_ITERATIONS)
+        if found.at is not None:
+            ends.append(Start(focal, found.block, found.at.cost, found.reason))
+    return ends
+
+
+def best_of_starts(calibration: Calibration) -> Calibration:
+    """The calibration, or the one that another start leads to if its cost is lower by more than chance.
+
+    More than chance: by more than 3.84 times the residuals' variance.
+    """
+    if calibration.basis is not None or calibration.loss != "none":
+        return calibration
+    ends = other_starts(calibration)
+    if not ends:
+        return calibration
+    best = min(ends, key=lambda end: end.cost)
+    own = calibration.squared_sum
+    if np.isfinite(own) and best.cost > own - _CHI2_95 * calibration.sigma_px**2:
+        return calibration
+    camera = calibration.camera
+    found = calibrate(
+        calibration.observations,
+        camera.image_size_px,
+        camera.model,
+        skew=INTRINSICS.index("skew_px") in calibration.free,
+        fixed=held(calibration),
+        start=best.block,
+    )
+    return found if found.squared_sum < own or not np.isfinite(own) else calibration
+
+
+@dataclass(frozen=True)
+class FocalInterval:
+    """Interval of fx that the data allow.
+
+    Attributes
+    ----------
+    low_px, high_px : ends; 0 and infinity where the cost does not rise enough.
+    fx_px : where the minimum lies.
+    lower_cost : a cost below the minimum was met on the way.
+    """
+
+    low_px: float
+    high_px: float
+    fx_px: float
+    lower_cost: bool
+
+    @property
+    def half_width_share(self) -> float:
+        """Half the width over fx; infinite where the interval is unbounded."""
+        if self.low_px <= 0.0 or not np.isfinite(self.high_px):
+            return float("inf")
+        return 0.5 * (self.high_px - self.low_px) / self.fx_px
+
+    @property
+    def lopsidedness(self) -> float:
+        """Longer side over shorter side."""
+        up, down = self.high_px - self.fx_px, self.fx_px - self.low_px
+        return max(up, down) / max(min(up, down), 1e-9)
+
+
+def focal_interval(calibration: Calibration, sigma_fx_px: float, inflation: float) -> FocalInterval:
+    """95 % interval of fx from the profile of the cost.
+
+    Parameters
+    ----------
+    sigma_fx_px : standard deviation of fx from the covariance, without inflation; sets the first step.
+    inflation : factor on standard deviations for residuals that are not white.
+    """
+    fx = calibration.camera.fx_px
+    own = calibration.squared_sum
+    target = _CHI2_95 * (inflation * calibration.sigma_px) ** 2
+    free = _well_determined(calibration.free)
+    free = free[free != INTRINSICS.index("fx_px")]
+    first = min(1.96 * sigma_fx_px * inflation, 0.15 * fx) if np.isfinite(sigma_fx_px) else 0.1 * fx
+    first = max(first, 1e-9 * fx)
+    lower = False
+    ends = []
+    for sign in (-1.0, 1.0):
+        at, block, rise, here = 0.0, calibration.block, 0.0, first
+        end = np.inf
+        for _ in range(8):
+            trial = fx + sign * here
+            if not 0.15 * fx < trial < 7.0 * fx:
+                break
+            moved = _with_fx(block, trial, INTRINSICS.index("fy_px") in free)
+            found = minimise(moved, calibration.observations, free, max_iterations=30)
+            if found.at is None or not np.isfinite(found.at.cost):
+                break
+            now = found.at.cost - own
+            if now < -0.1 * target:
+                lower = True
+                break
+            if now >= target:
+                # The rise is close to a parabola between two points of its root.
+                root_at, root_now = np.sqrt(max(rise, 0.0)), np.sqrt(now)
+                end = at + (here - at) * (np.sqrt(target) - root_at) / max(root_now - root_at, 1e-300)
+                break
+            at, block, rise = here, found.block, now
+            # Where the parabola would reach the target, at least a tenth and at most three times on.
+            here *= float(np.clip(1.05 * np.sqrt(target / max(now, 1e-3 * target)), 1.1, 3.0))
+        ends.append(fx + sign * end)
+    return FocalInterval(max(ends[0], 0.0), ends[1], fx, lower)
+
+
+def _well_determined(free: IntArray) -> IntArray:
+    """Without the rational model's denominator, which trades with the numerator at no cost."""
+    return free[~np.isin(free, [INTRINSICS.index(name) for name in ("k4", "k5", "k6")])]
+
+
+def _with_fx(block: Block, fx_px: float, with_fy: bool) -> Block:
+    """Another fx, with distances and fy following it, which keeps the pictures nearly the same."""
+    ratio = fx_px / block.intrinsics[0]
+    intrinsics: FloatArray = block.intrinsics.copy()
+    intrinsics[: 2 if with_fy else 1] *= ratio
+    # The boards' distances are proportional to the focal length.
+    t = block.t_CT_m * np.array([1.0, 1.0, ratio])
+    return replace(block, intrinsics=intrinsics, t_CT_m=t)

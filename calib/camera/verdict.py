@@ -1,0 +1,272 @@
+"""Whether a calibration can be trusted: one of four verdicts, with reasons and advice.
+
+A low RMS says that the model can be bent to the data, not that the data fix the model. `judge` asks
+what the data would have to say if the answer were wrong, and refuses where they cannot object:
+
+ok              the views determine the camera and agree with it
+poor            a camera, but known too badly, or over too little of the picture
+inconsistent    the views contradict each other or the board's description
+unidentifiable  the views do not determine a camera; its numbers mean nothing
+
+The worst finding decides. Remarks never do. All checks run on the unique views, without robust loss
+(points it rejects are left out) and with the target rigid in the shape that was found for it.
+Above 100 views the searches (other starts, profile, two cameras) run on an even sample of 100.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from calib.arrays import FloatArray, IntArray
+from calib.camera import reasons
+from calib.camera.board_shape import target_shape
+from calib.camera.bundle import Calibration
+from calib.camera.covariance import Covariance, covariance, projection_sigma_px
+from calib.camera.coverage import Coverage, coverage, inside_hull, lens_shape, repeated_views
+from calib.camera.evidence import evidence, overdispersion
+from calib.camera.finding import OK, REMARK, UNIDENTIFIABLE, VERDICTS, Finding
+from calib.camera.limits import Limits
+from calib.camera.misfit import misfit
+from calib.camera.next_view import best_next_view
+from calib.camera.screening import screen
+from calib.camera.starts import focal_interval, other_starts, resolved
+from calib.camera.two_cameras import best_change, best_split, widened
+
+__all__ = ["Judgement", "judge"]
+
+_SAMPLE = 100
+_LEFT_OUT_WEIGHT = 0.5
+"""Points that a robust loss weighs less are left out of the checks."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Verdict on a calibration.
+
+    Attributes
+    ----------
+    verdict : "ok", "poor", "inconsistent" or "unidentifiable".
+    reasons : sentences that explain a verdict other than ok, the worst first.
+    remarks : sentences about what does not matter enough.
+    advice : what to do, in order; last the picture to take next.
+    numbers : what the sentences are made from, by name.
+    """
+
+    verdict: str
+    reasons: tuple[str, ...]
+    remarks: tuple[str, ...]
+    advice: tuple[str, ...]
+    numbers: dict[str, float] = field(default_factory=dict)
+
+
+def judge(
+    calibration: Calibration, found: Covariance | None = None, limits: Limits | None = None
+) -> Judgement:
+    """Judge a calibration by its views alone.
+
+    Parameters
+    ----------
+    found : its covariance, for the ratio of standard deviations that copies of views make; optional.
+    """
+    limits = Limits() if limits is None else limits
+    observations = calibration.observations
+    numbers: dict[str, float] = {"views": observations.views}
+    findings = reasons.of_screening(screen(observations), observations.names)
+    if not np.all(np.isfinite(calibration.block.intrinsics)) or not np.all(np.isfinite(calibration.normal)):
+        findings += reasons.of_solution(calibration, observations.views, limits)
+        if not any(one.kind == UNIDENTIFIABLE for one in findings):
+            findings.append(Finding(UNIDENTIFIABLE, "The solver found no camera that fits the views."))
+        return _concluded(findings, None, numbers)
+    fit, copies = _without_copies(_plain(calibration), found, limits, numbers)
+    findings += copies + reasons.of_solution(calibration, fit.observations.views, limits)
+    covered = coverage(fit)
+    findings += reasons.of_coverage(covered, fit, limits)
+    if fit.degrees_of_freedom <= 0 or fit.observations.views < 2 or not np.all(np.isfinite(fit.normal)):
+        return _concluded(findings, None, numbers)
+    findings += reasons.of_misfit(
+        misfit(fit, limits.view_bad, limits.point_factor, limits.point_floor_px), fit, limits
+    )
+    findings += _uncertainty(fit, covered, limits, numbers)
+    findings += _contradictions(fit, limits, numbers)
+    return _concluded(findings, fit, numbers)
+
+
+def _plain(calibration: Calibration) -> Calibration:
+    """The same fit by least squares: a robust loss turned into points left out, the target rigid."""
+    observations = calibration.observations
+    if calibration.basis is None and calibration.loss == "none":
+        return calibration
+    if calibration.loss != "none":
+        observations = observations.without(calibration.weights < _LEFT_OUT_WEIGHT)
+        kept = np.flatnonzero(observations.present.sum(axis=1) >= 4)
+        observations = observations.select(kept)
+    else:
+        kept = np.arange(observations.views)
+    if calibration.basis is not None:
+        observations = observations.displaced(
+            np.tensordot(calibration.block.deformation, calibration.basis, axes=1).T
+        )
+    block = calibration.block
+    start = replace(block, R_CT=block.R_CT[kept], t_CT_m=block.t_CT_m[kept], deformation=np.zeros(0))
+    bare = replace(
+        calibration,
+        observations=observations,
+        block=start,
+        basis=None,
+        loss="none",
+    )
+    return resolved(bare, np.arange(len(kept)))
+
+
+def _without_copies(
+    fit: Calibration, found: Covariance | None, limits: Limits, numbers: dict[str, float]
+) -> tuple[Calibration, list[Finding]]:
+    """One view of each place, refitted."""
+    width = fit.camera.image_size_px[0]
+    first = repeated_views(fit, float(np.clip(2 * fit.sigma_px, 0.3, 0.004 * width)))
+    unique = np.flatnonzero(first == np.arange(len(first)))
+    numbers["unique_views"] = len(unique)
+    if len(unique) == len(first):
+        return fit, []
+    single = resolved(fit, unique)
+    ratio = np.nan
+    if found is not None and "fx_px" in found.names and single.degrees_of_freedom > 0:
+        ratio = covariance(single).sigma()["fx_px"] / found.sigma()["fx_px"]
+    return single, reasons.of_copies(first, fit.observations.names, ratio, limits)
+
+
+def _uncertainty(
+    fit: Calibration, covered: Coverage, limits: Limits, numbers: dict[str, float]
+) -> list[Finding]:
+    """Standard deviations, profile, starts, lens."""
+    known = covariance(fit)
+    inflation = overdispersion(evidence(fit))
+    sigma = known.sigma()
+    focal = {name: value for name, value in sigma.items() if name in ("fx_px", "fy_px")}
+    share = max((inflation * value / getattr(fit.camera, name) for name, value in focal.items()), default=0.0)
+    width = max(fit.camera.image_size_px)
+    inside = _inside(fit, covered)
+    projection = (
+        float(np.nanmedian(inflation * projection_sigma_px(fit, known, inside))) if len(inside) else np.inf
+    )
+    some, _ = _sampled(fit)
+    interval = None
+    findings = []
+    if "fx_px" in sigma:
+        own = covariance(some).sigma()["fx_px"] if some is not fit else sigma["fx_px"]
+        interval = focal_interval(some, own, inflation)
+        findings += reasons.of_starts(other_starts(some), some, own, inflation, limits)
+        numbers["fx_low_px"], numbers["fx_high_px"] = interval.low_px, interval.high_px
+    findings += reasons.of_focal(share, interval, projection, width, limits)
+    lens = lens_shape(fit)
+    findings += reasons.of_lens(lens, fit, covered.radius_share)
+    numbers.update(
+        rms_px=fit.rms_px,
+        sigma_inflation=inflation,
+        focal_sigma_share=share,
+        projection_sigma_px=projection,
+        tilt_spread_deg=covered.spread_deg,
+        weaker_tilt_spread_deg=covered.weaker_spread_deg,
+        tilt_median_deg=float(np.median(covered.tilts_deg)),
+        distance_ratio=float(covered.distances_m.max() / max(covered.distances_m.min(), 1e-12)),
+        area_share=covered.area_share,
+        cells_share=covered.cells_share,
+        radius_share=covered.radius_share,
+        lens_least_slope=lens.image_slope,
+    )
+    return findings
+
+
+def _contradictions(fit: Calibration, limits: Limits, numbers: dict[str, float]) -> list[Finding]:
+    """Two cameras, a refocused lens, a board that is not what it is said to be."""
+    findings = []
+    shape = target_shape(fit)
+    findings += reasons.of_target(shape, fit, limits)
+    if shape is not None:
+        numbers.update(
+            board_aspect=1 + shape.aspect,
+            board_aspect_sigma=shape.aspect_sigma,
+            board_bow_m=shape.bow_m,
+            focal_share_per_half_percent_bow=shape.focal_per_bow,
+        )
+    some, index = _sampled(fit)
+    bent = None if shape is None else shape.displacement_m
+    wide = widened(some, bent if bent is None or len(bent) == 1 else bent[index])
+    change, split = best_change(wide), best_split(wide)
+    if change is not None:
+        numbers["change_ratio"] = change.ratio
+    if split is not None:
+        numbers["split_ratio"] = split.ratio
+    late = reasons.of_split(change, True, wide, limits)
+    mixed = reasons.of_split(split, False, wide, limits)
+    # A split in order is found by both; the one that explains more is told.
+    if late and mixed and change is not None and split is not None:
+        if split.statistic > 1.1 * change.statistic:
+            late = []
+        else:
+            mixed = []
+    return findings + late + mixed
+
+
+def _sampled(fit: Calibration) -> tuple[Calibration, IntArray]:
+    views = fit.observations.views
+    if views <= _SAMPLE:
+        return fit, np.arange(views)
+    index: IntArray = np.unique(np.linspace(0, views - 1, _SAMPLE).astype(np.int64))
+    return resolved(fit, index), index
+
+
+def _inside(fit: Calibration, covered: Coverage) -> FloatArray:
+    """Grid of pixels inside of the hull of what was seen."""
+    low, high = covered.hull_px.min(axis=0), covered.hull_px.max(axis=0)
+    u, v = np.meshgrid(np.linspace(low[0], high[0], 14), np.linspace(low[1], high[1], 12))
+    grid = np.stack([u.ravel(), v.ravel()], axis=1)
+    return grid[inside_hull(grid, covered.hull_px)]
+
+
+def _concluded(findings: list[Finding], fit: Calibration | None, numbers: dict[str, float]) -> Judgement:
+    """The worst finding decides; reasons in order of weight."""
+    weights = [VERDICTS.index(one.kind) for one in findings if one.kind != REMARK]
+    verdict = VERDICTS[max(weights, default=0)]
+    failing = sorted((f for f in findings if f.kind != REMARK), key=lambda f: -VERDICTS.index(f.kind))
+    advice: list[str] = []
+    for one in [*failing, *(f for f in findings if f.kind == REMARK)]:
+        if one.advice and one.advice not in advice:
+            advice.append(one.advice)
+    if fit is not None:
+        advice.extend(_next_picture(fit, verdict))
+    return Judgement(
+        verdict,
+        tuple(f.text for f in failing),
+        tuple(f.text for f in findings if f.kind == REMARK),
+        tuple(advice),
+        numbers,
+    )
+
+
+def _next_picture(fit: Calibration, verdict: str) -> list[str]:
+    S = evidence(fit).S.sum(axis=0)
+    best = best_next_view(fit, S)
+    if best is None:
+        return []
+    lean = (
+        f"tilted by {best.tilt_deg:.0f} degrees with its {best.away} edge away from the camera"
+        if best.away
+        else "parallel to the picture"
+    )
+    size = (
+        "close, so that it spans about 60 % of the picture"
+        if best.span_share > 0.5
+        else "at about a third of the picture's size"
+    )
+    gain = 100 * (1 - best.remaining)
+    word = (
+        "The picture that would help most"
+        if verdict != OK
+        else "If you take another picture, the most useful"
+    )
+    return [
+        f"{word}: the board in {best.where}, {lean}, {size}; it would lower the uncertainty by about {gain:.0f} %."
+    ]

@@ -1,0 +1,57 @@
+"""`calib firmware`: the constants of rig.yaml as a C header."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calib.cli.common import JsonOption, RigOption, document, narrate, say
+from calib.errors import EXIT_POOR, BadInputError
+
+__all__ = ["firmware"]
+
+
+def firmware(
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write into.")] = Path(
+        "firmware_constants"
+    ),
+    rig: RigOption = Path("rig.yaml"),
+    as_json: JsonOption = False,
+) -> None:
+    """Write calib_constants.h with the camera's and the plane's constants."""
+    from calib.files import make_folder, shown, write_atomically
+    from calib.firmware.header import header_text
+    from calib.rig import read_rig
+    from calib.sections import current_plane, firmware_constants
+
+    whole = read_rig(rig)
+    if whole.camera is None:
+        raise BadInputError(f"{shown(rig)}: has no camera yet; run calib intrinsics first")
+    plane = current_plane(whole, str(rig))
+    inputs = {
+        f"{section}/{name}": digest
+        for section in ("camera", "plane")
+        for name, digest in whole.provenance.inputs.get(section, {}).items()
+        if section == "camera" or plane is not None
+    }
+    constants = firmware_constants(whole.camera, plane)
+    text = header_text(constants, inputs)
+    make_folder(output)
+    path = output / "calib_constants.h"
+    write_atomically(path, text)
+    count = len(constants.intrinsics) + len(constants.inverse_lens) + len(constants.plane)
+    weak = [
+        f"{name} is {section.verdict}"
+        for name, section in (("camera", whole.camera), ("plane", plane))
+        if section is not None and section.verdict != "ok"
+    ]
+    if as_json:
+        document("firmware", {"files": [path.name], "constants": count, "gate": "passed" if not weak else weak})
+    else:
+        say(f"{path}: {count} constants" + ("" if plane else ", no plane yet (calib extrinsics)"))
+    for what in weak:
+        narrate(f"{what}; the header says so in CALIB_CAMERA_OK and CALIB_PLANE_OK, do not flash it unread")
+    if weak:
+        raise typer.Exit(EXIT_POOR)

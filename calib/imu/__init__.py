@@ -1,0 +1,1 @@
+"""The inertial sensor: its angle filter and its errors."""
