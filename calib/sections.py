@@ -112,7 +112,9 @@ def camera_covariance(section: rig.Camera, source: str) -> FloatArray | None:
         return None
     unknown = [name for name in section.covariance.order if name not in INTRINSICS]
     if unknown:
-        raise BadInputError(f"{shown(source)}: camera.covariance.order has {unknown[0]!r}, expected intrinsics")
+        raise BadInputError(
+            f"{shown(source)}: camera.covariance.order has {unknown[0]!r}, expected intrinsics"
+        )
     index = [INTRINSICS.index(name) for name in section.covariance.order]
     values = np.array(section.covariance.values, dtype=np.float64)
     scale = np.sqrt(np.abs(np.diag(values)))

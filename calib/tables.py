@@ -90,6 +90,8 @@ def _number(text: str, path: Path, line: int, column: str) -> float:
 
 
 def _cells(text: str, path: Path, line: int) -> list[str]:
+    if '"' not in text:
+        return text.split(",")
     try:
         return next(csv.reader([text], strict=True, skipinitialspace=True), [])
     except csv.Error as error:

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from calib.arrays import BoolArray, FloatArray, GrayImage
 from calib.camera.cornerfit import fit_corners, frames_of
-from calib.camera.lattice import extrapolated
+from calib.camera.lattice import extrapolated, looks_like_corners
 from calib.camera.refine import Refined, reduced_around, square_px
 from calib.camera.saddles import sample
 
@@ -20,6 +20,10 @@ _MISFIT = 0.08
 _MEDIAN_RESIDUAL = 0.25
 _LEAST_AMPLITUDE = 2.5
 """Grey levels."""
+_CONTINUES = 0.4
+"""Least amplitude of a further corner over the median of the grid."""
+_WORST_RESIDUAL = 0.3
+_REACH_PX = 10
 _FLAT = 0.6
 """Largest difference between the quarters of a square, over the step from dark to bright."""
 
@@ -103,16 +107,19 @@ def continuing_sides(gray: GrayImage, grid: Refined) -> tuple[bool, bool, bool, 
     outside[::rows - 1, :: columns - 1] = False
     low, high = np.array([1.0, 1.0]), np.array(image.shape[::-1]) - 2.0
     inside = outside & np.all((local > low) & (local < high), axis=-1)
-    chosen = np.flatnonzero(inside.ravel())
+    i, j = np.indices((rows, columns))
+    parity = (1.0 - 2.0 * ((i + j) % 2)) * grid.sign
+    least = _CONTINUES * float(np.median(np.abs(grid.amplitude)))
+    along, across = frames.along.reshape(local.shape), frames.across.reshape(local.shape)
+    half_step, unlike = looks_like_corners(image, local, along, across)
+    chosen = np.flatnonzero((inside & (parity * half_step > 0.5 * least) & (unlike < 1.0)).ravel())
     found: BoolArray = np.zeros(rows * columns, dtype=np.bool_)
     if len(chosen):
-        fit = fit_corners(image, local.reshape(-1, 2)[chosen], frames.take(chosen))
-        i, j = np.indices((rows, columns))
-        parity = (1.0 - 2.0 * ((i + j) % 2)).ravel()[chosen] * grid.sign
-        square = np.minimum(np.linalg.norm(frames.along, axis=1), np.linalg.norm(frames.across, axis=1))[chosen]
-        near = np.linalg.norm(fit.points - local.reshape(-1, 2)[chosen], axis=1) < 0.3 * square
-        strong = parity * fit.amplitude > 0.4 * np.median(np.abs(grid.amplitude))
-        found[chosen] = fit.converged & near & strong & (fit.residual < 0.3)
+        fit = fit_corners(image, local.reshape(-1, 2)[chosen], frames.take(chosen), reach_px=_REACH_PX)
+        square = np.minimum(np.linalg.norm(frames.along, axis=1), np.linalg.norm(frames.across, axis=1))
+        near = np.linalg.norm(fit.points - local.reshape(-1, 2)[chosen], axis=1) < 0.3 * square[chosen]
+        strong = parity.ravel()[chosen] * fit.amplitude > least
+        found[chosen] = fit.converged & near & strong & (fit.residual < _WORST_RESIDUAL)
     hit, seen = found.reshape(rows, columns), inside
     sides = []
     for line in (np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1]):

@@ -30,7 +30,7 @@ __all__ = ["Frames", "LocalFit", "fit_corners", "frames_of"]
 
 WINDOW = 0.45
 """Half the window's width over the local square: the next corner must not come in."""
-_REACH_PX = 16
+REACH_PX = 16
 _LEAST_REACH_PX = 2.5
 _ITERATIONS = 25
 _STEP_PX = 1e-3
@@ -132,11 +132,11 @@ def frames_of(points: FloatArray) -> Frames:
     return Frames(along.reshape(-1, 2), across.reshape(-1, 2), bends[0].ravel(), bends[1].T.ravel())
 
 
-def _windows(image: _Float32, points: FloatArray, frames: Frames) -> _Windows:
+def _windows(image: _Float32, points: FloatArray, frames: Frames, most_px: int = REACH_PX) -> _Windows:
     height, width = image.shape
     centre = np.rint(points)
     extent = WINDOW * (np.abs(frames.along) + np.abs(frames.across))
-    reach = int(np.clip(np.ceil(extent.max(initial=3.0)), np.ceil(_LEAST_REACH_PX), _REACH_PX))
+    reach = int(np.clip(np.ceil(extent.max(initial=3.0)), np.ceil(_LEAST_REACH_PX), most_px))
     offset = np.arange(-reach, reach + 1)
     dx, dy = (o.ravel() for o in np.meshgrid(offset, offset))
     x = dx - (points - centre)[:, :1]
@@ -223,7 +223,13 @@ def _start(points: FloatArray, frames: Frames, win: _Windows) -> FloatArray:
     return q
 
 
-def fit_corners(image: _Float32, points: FloatArray, frames: Frames, iterations: int = _ITERATIONS) -> LocalFit:
+def fit_corners(
+    image: _Float32,
+    points: FloatArray,
+    frames: Frames,
+    iterations: int = _ITERATIONS,
+    reach_px: int = REACH_PX,
+) -> LocalFit:
     """Fit the blurred corner around each of N points.
 
     Parameters
@@ -231,9 +237,10 @@ def fit_corners(image: _Float32, points: FloatArray, frames: Frames, iterations:
     image : (H, W) grey levels.
     points : (N, 2) where to start, pixels.
     frames : steps and curvatures of the grid at the N points.
+    reach_px : most pixels that a window reaches to each side of its corner.
     """
     N = len(points)
-    win = _windows(image, points, frames)
+    win = _windows(image, points, frames, reach_px)
     q = _start(points, frames, win)
     damping = np.full(N, 1e-3)
     r, J = _model(q.astype(np.float32), win)
@@ -285,7 +292,7 @@ def _result(
     scaled = normal / (scale[:, :, None] * scale[:, None, :]) + 1e-7 * np.eye(_PARAMETERS)
     inverse = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
     variance = cost / freedom
-    sigma = np.sqrt(0.5 * (inverse[:, 0, 0] + inverse[:, 1, 1]) * variance)
+    sigma = np.sqrt(np.maximum(0.5 * (inverse[:, 0, 0] + inverse[:, 1, 1]) * variance, 0.0))
     amplitude = q[:, 6]
     residual = np.sqrt(variance) / np.maximum(np.abs(amplitude), 1e-9)
     finite = np.all(np.isfinite(q), axis=1) & np.isfinite(sigma)

@@ -89,7 +89,7 @@ def hull(points: FloatArray) -> FloatArray:
     angle = np.linspace(0.0, 2 * np.pi, _DIRECTIONS, endpoint=False)
     extreme = np.argmax(np.stack([np.cos(angle), np.sin(angle)], axis=1) @ points.T, axis=1)
     kept = np.flatnonzero(np.diff(extreme, prepend=extreme[-1]) != 0)
-    return points[extreme[kept]] if len(kept) else points[extreme[:1]]
+    return np.asarray(points[extreme[kept]] if len(kept) else points[extreme[:1]])
 
 
 def _area(corners: FloatArray) -> float:

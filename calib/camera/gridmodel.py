@@ -16,7 +16,7 @@ from calib.arrays import BoolArray, FloatArray
 
 __all__ = ["Prediction", "predict"]
 
-_DEGREES = (1, 2, 3, 4, 5)
+_DEGREES = (1, 2, 3, 5)
 _FREEDOM = 1.6
 """Corners for each coefficient that a degree must have."""
 _ROUNDS = 4
@@ -85,8 +85,8 @@ def predict(points: FloatArray, known: BoolArray) -> Prediction | None:
     best: Prediction | None = None
     for degree in _DEGREES:
         basis = _basis(flat, degree, columns, rows)
-        if degree > 1 and (used.sum() < _FREEDOM * basis.shape[1] or basis.shape[1] == 4):
-            continue
+        if degree > 1 and used.sum() < _FREEDOM * basis.shape[1]:
+            break
         candidate = _fitted(pixels, used, weights, plane, basis, (rows, columns))
         if candidate is not None and (best is None or candidate.spread_px < best.spread_px):
             best = candidate
@@ -127,7 +127,9 @@ def _fitted(
         power = np.einsum("np,pq,nq->n", basis, inverse, basis)
         leverage = np.clip(weights * power, 0.0, 0.95)
         apart = np.linalg.norm(pixels - smooth, axis=1)
-        weights = _weights(apart / np.sqrt(1.0 - leverage), used, 1e-3)
+        before, weights = weights, _weights(apart / np.sqrt(1.0 - leverage), used, 1e-3)
+        if np.max(np.abs(weights - before)) < 0.05:
+            break
     without = np.where(used[:, None], pixels - (pixels - smooth) / (1.0 - leverage)[:, None], smooth)
     spread = float(np.median((apart / (1.0 - leverage))[used]))
     # A prediction is as uncertain as the corners, and as its leverage makes it.

@@ -87,12 +87,12 @@ def _refuse_unusable(views: Sequence[View], choices: Choices) -> None:
             spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
             if spread[1] <= 1e-6 * spread[0]:
                 raise BadInputError(f"view {view.name}: all its points lie on one line {where}")
-    points = sum(len(view.pixels) for view in views)
+    total = sum(len(view.pixels) for view in views)
     if choices.model != "auto":
         unknown = len(free_intrinsics(choices.model, choices.skew)) + 6 * len(views)
-        if 2 * points <= unknown:
+        if 2 * total <= unknown:
             raise BadInputError(
-                f"{len(views)} views with {points} points cannot fix the {unknown} unknowns of the model "
+                f"{len(views)} views with {total} points cannot fix the {unknown} unknowns of the model "
                 f"{choices.model}"
             )
 
@@ -127,7 +127,8 @@ def _outliers(fit: Calibration) -> tuple[BoolArray, list[str]]:
         if share[i] > _REJECT_SHARE:
             far[i] = present[i]
             sentences.append(
-                f"{name}: left out whole; {share[i]:.0%} of its points lie more than {_REJECT_SIGMAS:g} sigma off"
+                f"{name}: left out whole; {share[i]:.0%} of its points lie more than "
+                f"{_REJECT_SIGMAS:g} sigma off"
             )
             continue
         for j in np.flatnonzero(far[i]):
@@ -159,9 +160,7 @@ def calibrate_camera(
     rejected: list[str] = []
     if choices.reject:
         model = "radial2" if choices.model == "auto" else choices.model
-        robust = calibrate(
-            observations, image_size_px, model, skew=choices.skew, fixed=fixed, loss="cauchy"
-        )
+        robust = calibrate(observations, image_size_px, model, skew=choices.skew, fixed=fixed, loss="cauchy")
         far, rejected = _outliers(robust)
         observations = _without(observations, far)
         if observations.views < 1:
@@ -176,7 +175,8 @@ def calibrate_camera(
         loss=choices.loss,
         start=None if start is None else start.block,
     )
-    board, boards = choices.board, ()
+    board = choices.board
+    boards: tuple[Candidate, ...] = ()
     if board != "rigid":
         fit, board, boards = _with_board(fit, choices)
     solved = time.perf_counter()
@@ -188,9 +188,7 @@ def calibrate_camera(
     return Intrinsics(fit, sigma, judgement, models, boards, board, tuple(rejected), seconds)
 
 
-def _with_board(
-    rigid: Calibration, choices: Choices
-) -> tuple[Calibration, str, tuple[Candidate, ...]]:
+def _with_board(rigid: Calibration, choices: Choices) -> tuple[Calibration, str, tuple[Candidate, ...]]:
     """The same camera with the board model that was asked for, or that views held back prefer."""
     if not rigid.observations.same_target:
         raise BadInputError(f"--board {choices.board} needs the same points of the target in every view")

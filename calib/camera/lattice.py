@@ -13,6 +13,7 @@ from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from calib.arrays import BoolArray, FloatArray, IntArray
@@ -213,7 +214,7 @@ def _axes(points: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def looks_like_corners(
-    smooth: FloatArray, points: FloatArray, along: FloatArray, across: FloatArray
+    smooth: npt.NDArray[np.float32], points: FloatArray, along: FloatArray, across: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Contrast of the four squares around each of (..., 2) points, and how far it misses a corner's symmetry.
 
@@ -228,7 +229,7 @@ def looks_like_corners(
     the largest difference between squares of the same colour over the step. Shapes (...).
     """
     values = [
-        sample(smooth.astype(np.float32, copy=False), points + 0.28 * (p * along + q * across))
+        sample(smooth, points + 0.28 * (p * along + q * across))
         for p, q in ((1, 1), (-1, -1), (1, -1), (-1, 1))
     ]
     half_step = 0.25 * (values[0] + values[1] - values[2] - values[3])

@@ -81,7 +81,7 @@ def _median_distance(distance: FloatArray, fine: BoolArray) -> FloatArray:
     own = np.full(len(distance), everything)
     some = fine.any(axis=1)
     own[some] = np.nanmedian(hidden[some], axis=1)
-    return np.maximum(own, everything)
+    return np.asarray(np.maximum(own, everything))
 
 
 def _repeated(calibration: Calibration) -> float:

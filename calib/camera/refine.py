@@ -26,6 +26,7 @@ __all__ = ["Refined", "reduced_around", "refine", "square_px"]
 _SQUARE_PX = 40.0
 """Squares of twice this size and more are averaged down to it."""
 _FIRST_ITERATIONS = 4
+_FIRST_REACH_PX = 8
 _LARGEST_RESIDUAL = 0.4
 """RMS of a fit over the amplitude; clutter is above it."""
 _LEAST_SHARE = 0.2
@@ -140,7 +141,7 @@ def _rescued(image: _Float32, fit: LocalFit, shape: tuple[int, int]) -> tuple[Lo
         limit = np.minimum(prediction.limit_px.ravel(), far)
         doubtful = np.flatnonzero(~good | ~(away < limit))
         if len(doubtful) == 0:
-            break
+            return fit, good, prediction
         again = fit_corners(image, placed[doubtful], frames.take(doubtful))
         trial = _merged(fit, again, doubtful, np.ones(len(doubtful), dtype=np.bool_))
         near = np.linalg.norm(again.points - placed[doubtful], axis=1)
@@ -170,7 +171,7 @@ def refine(gray: GrayImage, points: FloatArray) -> Refined | None:
     image, start, k, origin = reduced_around(gray, points)
     if min(image.shape) < 2 * _LEAST_PICTURE_PX:
         return None
-    first = fit_corners(image, start.reshape(-1, 2), frames_of(start), _FIRST_ITERATIONS)
+    first = fit_corners(image, start.reshape(-1, 2), frames_of(start), _FIRST_ITERATIONS, _FIRST_REACH_PX)
     # A misplaced corner would spoil the curvatures of its row and column.
     sound = _sound(first, shape)
     rough = predict(first.points.reshape(start.shape), sound.reshape(shape))

@@ -13,13 +13,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.arrays import FloatArray
+from calib.arrays import FloatArray, IntArray
 from calib.camera.bundle import Calibration, calibrate, refit_poses
 from calib.camera.model import MODELS
 from calib.camera.projection import Block, free_intrinsics
 from calib.camera.views import Observations
 
-__all__ = ["BOARDS", "Candidate", "board_basis", "candidates_by_board", "candidates_by_model", "simplest_good"]
+__all__ = [
+    "BOARDS",
+    "Candidate",
+    "board_basis",
+    "candidates_by_board",
+    "candidates_by_model",
+    "simplest_good",
+]
 
 BOARDS = ("rigid", "warp", "released")
 """Board models: flat with nominal corners; a paraboloid of two bows; every corner free."""
@@ -83,19 +90,23 @@ def board_basis(target_m: FloatArray, kind: str) -> FloatArray | None:
     return kept.reshape(-1, M, 3).transpose(0, 2, 1)
 
 
-def _folds(views: int) -> list[FloatArray]:
+def _folds(views: int) -> list[IntArray]:
     """Indices of the views held back in each fold, interleaved so that a sequence is spread over folds."""
     count = min(_FOLDS, views)
-    return [np.arange(first, views, count) for first in range(count)]
+    return [np.arange(first, views, count, dtype=np.int64) for first in range(count)]
 
 
 def _on_held_back(
-    whole: Calibration, observations: Observations, image_size_px: tuple[int, int], skew: bool, fixed: tuple[str, ...]
+    whole: Calibration,
+    observations: Observations,
+    image_size_px: tuple[int, int],
+    skew: bool,
+    fixed: tuple[str, ...],
 ) -> FloatArray:
     """Mean squared residual vector (N,) of each view by a camera that has not seen it."""
     squared = np.full(observations.views, np.nan)
     for held in _folds(observations.views):
-        kept = np.setdiff1d(np.arange(observations.views), held)
+        kept = np.setdiff1d(np.arange(observations.views, dtype=np.int64), held)
         start = Block(
             whole.block.intrinsics, whole.block.R_CT[kept], whole.block.t_CT_m[kept], whole.block.deformation
         )

@@ -147,9 +147,14 @@ class FocalInterval:
     lower_cost: bool
 
     @property
+    def bounded(self) -> bool:
+        """Whether both ends were found."""
+        return self.low_px > 0.0 and bool(np.isfinite(self.high_px))
+
+    @property
     def half_width_share(self) -> float:
         """Half the width over fx; infinite where the interval is unbounded."""
-        if self.low_px <= 0.0 or not np.isfinite(self.high_px):
+        if not self.bounded:
             return float("inf")
         return 0.5 * (self.high_px - self.low_px) / self.fx_px
 

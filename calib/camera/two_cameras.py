@@ -114,7 +114,7 @@ def _groups(problem: _Problem, second: BoolArray) -> tuple[FloatArray, FloatArra
     S = (flat @ problem.S.reshape(N, -1)).reshape(-1, 2, G, G)
     b = (flat @ problem.b).reshape(-1, 2, G)
     d = -np.linalg.solve(S + np.eye(G), b[..., None])[..., 0]
-    return S, b, d
+    return S, b, np.asarray(d, dtype=np.float64)
 
 
 def _reassigned(problem: _Problem, second: BoolArray) -> BoolArray:

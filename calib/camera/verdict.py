@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from calib.arrays import FloatArray, IntArray
-from calib.camera import reasons
+from calib.camera import reasons, reasons_fit
 from calib.camera.board_shape import target_shape
 from calib.camera.bundle import Calibration
 from calib.camera.covariance import Covariance, covariance, projection_sigma_px
@@ -75,12 +75,12 @@ def judge(
     numbers: dict[str, float] = {"views": observations.views}
     findings = reasons.of_screening(screen(observations), observations.names)
     if not np.all(np.isfinite(calibration.block.intrinsics)) or not np.all(np.isfinite(calibration.normal)):
-        findings += reasons.of_solution(calibration, observations.views, limits)
+        findings += reasons_fit.of_solution(calibration, observations.views, limits)
         if not any(one.kind == UNIDENTIFIABLE for one in findings):
             findings.append(Finding(UNIDENTIFIABLE, "The solver found no camera that fits the views."))
         return _concluded(findings, None, numbers)
     fit, copies = _without_copies(_plain(calibration), found, limits, numbers)
-    findings += copies + reasons.of_solution(calibration, fit.observations.views, limits)
+    findings += copies + reasons_fit.of_solution(calibration, fit.observations.views, limits)
     covered = coverage(fit)
     findings += reasons.of_coverage(covered, fit, limits)
     if fit.degrees_of_freedom <= 0 or fit.observations.views < 2 or not np.all(np.isfinite(fit.normal)):
@@ -147,7 +147,7 @@ def _uncertainty(
     focal = {name: value for name, value in sigma.items() if name in ("fx_px", "fy_px")}
     share = max((inflation * value / getattr(fit.camera, name) for name, value in focal.items()), default=0.0)
     width = max(fit.camera.image_size_px)
-    inside = _inside(fit, covered)
+    inside = _inside(covered)
     projection = (
         float(np.nanmedian(inflation * projection_sigma_px(fit, known, inside))) if len(inside) else np.inf
     )
@@ -157,11 +157,12 @@ def _uncertainty(
     if "fx_px" in sigma:
         own = covariance(some).sigma()["fx_px"] if some is not fit else sigma["fx_px"]
         interval = focal_interval(some, own, inflation)
-        findings += reasons.of_starts(other_starts(some), some, own, inflation, limits)
+        findings += reasons_fit.of_starts(other_starts(some), some, own, inflation, limits)
         numbers["fx_low_px"], numbers["fx_high_px"] = interval.low_px, interval.high_px
-    findings += reasons.of_focal(share, interval, projection, width, limits)
+    findings += reasons_fit.of_focal(share, interval, limits)
+    findings += reasons_fit.of_projection(projection, width, limits)
     lens = lens_shape(fit)
-    findings += reasons.of_lens(lens, fit, covered.radius_share)
+    findings += reasons_fit.of_lens(lens, fit, covered.radius_share)
     numbers.update(
         rms_px=fit.rms_px,
         sigma_inflation=inflation,
@@ -218,7 +219,7 @@ def _sampled(fit: Calibration) -> tuple[Calibration, IntArray]:
     return resolved(fit, index), index
 
 
-def _inside(fit: Calibration, covered: Coverage) -> FloatArray:
+def _inside(covered: Coverage) -> FloatArray:
     """Grid of pixels inside of the hull of what was seen."""
     low, high = covered.hull_px.min(axis=0), covered.hull_px.max(axis=0)
     u, v = np.meshgrid(np.linspace(low[0], high[0], 14), np.linspace(low[1], high[1], 12))
@@ -268,5 +269,6 @@ def _next_picture(fit: Calibration, verdict: str) -> list[str]:
         else "If you take another picture, the most useful"
     )
     return [
-        f"{word}: the board in {best.where}, {lean}, {size}; it would lower the uncertainty by about {gain:.0f} %."
+        f"{word}: the board in {best.where}, {lean}, {size}; "
+        f"it would lower the uncertainty by about {gain:.0f} %."
     ]

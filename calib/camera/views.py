@@ -65,7 +65,7 @@ class Observations:
     @property
     def same_target(self) -> bool:
         """Whether the target's points are the same in every view."""
-        return self.target_m.shape[0] == 1
+        return bool(self.target_m.shape[0] == 1)
 
     def select(self, index: IntArray | Sequence[int]) -> Observations:
         """The views at these indices, in this order."""

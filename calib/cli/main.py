@@ -13,7 +13,12 @@ os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")
 import typer
 
 from calib import __version__
-from calib.cli import board, distortion, exchange, extrinsics, firmware, intrinsics
+from calib.cli.board import board
+from calib.cli.distortion import distortion
+from calib.cli.exchange import export_camera, import_camera
+from calib.cli.extrinsics import extrinsics
+from calib.cli.firmware import firmware
+from calib.cli.intrinsics import intrinsics
 from calib.errors import EXIT_BAD_INPUT, CalibError
 
 __all__ = ["app", "main"]
@@ -43,13 +48,13 @@ def _options(
     pass
 
 
-app.command("intrinsics")(intrinsics.intrinsics)
-app.command("extrinsics")(extrinsics.extrinsics)
-app.command("distortion")(distortion.distortion)
-app.command("firmware")(firmware.firmware)
-app.command("board")(board.board)
-app.command("export")(exchange.export_camera)
-app.command("import")(exchange.import_camera)
+app.command("intrinsics")(intrinsics)
+app.command("extrinsics")(extrinsics)
+app.command("distortion")(distortion)
+app.command("firmware")(firmware)
+app.command("board")(board)
+app.command("export")(export_camera)
+app.command("import")(import_camera)
 
 
 def _say(message: str) -> None:

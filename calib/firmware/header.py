@@ -19,7 +19,15 @@ from calib.arrays import FloatArray
 from calib.camera.undistortion import InversePolynomial
 from calib.errors import BadInputError
 
-__all__ = ["SCHEMA", "CameraConstants", "Constant", "camera_constants", "comment_text", "float_literal", "header_text"]
+__all__ = [
+    "SCHEMA",
+    "CameraConstants",
+    "Constant",
+    "camera_constants",
+    "comment_text",
+    "float_literal",
+    "header_text",
+]
 
 SCHEMA = 1
 """Raised when a constant changes its name, unit or meaning."""
@@ -111,7 +119,11 @@ def camera_constants(
         "cy_px": "principal point, px from the centre of the top row; nu_0 of (2.5)",
     }
     rows = [
-        Constant(f"CALIB_CAMERA_{name.upper()}", value, what.get(name, "lens, dimensionless, OpenCV's order and signs"))
+        Constant(
+            f"CALIB_CAMERA_{name.upper()}",
+            value,
+            what.get(name, "lens, dimensionless, OpenCV's order and signs"),
+        )
         for name, value in intrinsics.items()
     ]
     radial = [
@@ -122,17 +134,19 @@ def camera_constants(
         )
         for i, value in enumerate(inverse.radial, start=1)
     ]
-    plane = []
-    if A_inverse is not None:
-        for i in range(3):
-            for j in range(3):
-                plane.append(
-                    Constant(
-                        f"CALIB_PLANE_INVERSE_{i + 1}{j + 1}",
-                        float(A_inverse[i, j]),
-                        "entry of A^-1, undistorted px to m; (2.11), the last row gives 1/s of (2.12)",
-                    )
-                )
+    plane = (
+        []
+        if A_inverse is None
+        else [
+            Constant(
+                f"CALIB_PLANE_INVERSE_{i + 1}{j + 1}",
+                float(A_inverse[i, j]),
+                "entry of A^-1, undistorted px to m; (2.11), the last row gives 1/s of (2.12)",
+            )
+            for i in range(3)
+            for j in range(3)
+        ]
+    )
     return CameraConstants(
         image_size_px, model, verdict, tuple(rows), tuple(radial), inverse, tuple(plane), plane_verdict
     )

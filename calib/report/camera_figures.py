@@ -166,6 +166,8 @@ def _cloud(axes: Axes, fit: Calibration, colours: Sequence[tuple[float, ...]]) -
     limit = max(3.5 * sigma, min(1.08 * largest, 7.0 * sigma)) or 1.0
     axes.set_xlim(-limit, limit)
     axes.set_ylim(limit, -limit)
+    axes.xaxis.set_major_locator(MaxNLocator(5))
+    axes.yaxis.set_major_locator(MaxNLocator(5))
     axes.grid()
     size = float(np.clip(6000.0 / len(residuals), 1.5, 16.0))
     axes.scatter(
@@ -286,8 +288,8 @@ def _principal_point(frame: Axes, axes: Axes, fit: Calibration, sigma: Covarianc
     axes.grid()
     axes.xaxis.set_major_locator(MaxNLocator(4))
     axes.yaxis.set_major_locator(MaxNLocator(4))
-    axes.set_xlabel(f"cx = {camera.cx_px:.2f}, {SIGMA} {number(float(deviation[0]), digits=2)} (px)")
-    axes.set_ylabel(f"cy = {camera.cy_px:.2f}, {SIGMA} {number(float(deviation[1]), digits=2)}")
+    axes.set_xlabel(f"cx = {camera.cx_px:.2f} ± {number(float(deviation[0]), digits=2)} px")
+    axes.set_ylabel(f"cy = {camera.cy_px:.2f} ± {number(float(deviation[1]), digits=2)} px")
 
 
 def _radii(axes: Axes, fit: Calibration, pixels: FloatArray) -> None:
@@ -308,7 +310,7 @@ def _radii(axes: Axes, fit: Calibration, pixels: FloatArray) -> None:
     axes.set_xlim(0.0, max(last, seen))
     axes.set_xlabel("distance from the principal point (px)")
     axes.set_ylabel("points")
-    axes.set_title(f"Seen out to {100 * min(seen / last, 1.0):.0f} % of the farthest corner")
+    axes.set_title(f"Points reach {100 * min(seen / last, 1.0):.0f} % of the radius")
 
 
 def _residuals(fit: Calibration, verdict: str) -> Figure:

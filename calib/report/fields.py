@@ -7,8 +7,8 @@ import math
 import numpy as np
 from matplotlib import patheffects
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
 from matplotlib.colors import BoundaryNorm
+from matplotlib.contour import ContourSet, QuadContourSet
 from matplotlib.patches import Ellipse, Rectangle
 from matplotlib.ticker import MaxNLocator
 
@@ -151,7 +151,7 @@ def contour_map(
     levels: FloatArray | None = None,
     even: bool = False,
     labelled: bool = True,
-) -> ScalarMappable | None:
+) -> ContourSet | None:
     """Filled contours of values (rows, columns) over x, y, hatched where unknown.
 
     Parameters
@@ -194,20 +194,35 @@ def contour_map(
     inside = levels[(levels > finite.min()) & (levels < finite.max())]
     if len(inside) and labelled:
         lines = axes.contour(x, y, known, levels=inside, colors=INK, linewidths=0.7, zorder=2)
-        for label in axes.clabel(lines, fontsize=9, fmt=lambda value: f"{value:g}", inline_spacing=3):
-            label.set_path_effects([patheffects.withStroke(linewidth=2.2, foreground="white")])
-            label.set_color(INK)
-            label.set_zorder(3)
+        _label(axes, lines)
     return filled
 
 
-def colour_bar(axes: Axes | list[Axes], mappable: ScalarMappable, label: str) -> None:
+def _label(axes: Axes, lines: QuadContourSet) -> None:
+    """Values on contour lines, left out where they would run into each other or over the border."""
+    corner, other = axes.transAxes.transform([(0.0, 0.0), (1.0, 1.0)])
+    kept: list[tuple[float, float]] = []
+    for text in axes.clabel(lines, inline=False, fontsize=9, fmt=lambda value: f"{value:g}"):
+        at = axes.transData.transform(text.get_position())
+        # As a share of the panel, which the layout moves but hardly reshapes.
+        u, v = (at - corner) / (other - corner)
+        if not (0.06 < u < 0.94 and 0.06 < v < 0.94) or any(
+            abs(u - a) < 0.07 and abs(v - b) < 0.06 for a, b in kept
+        ):
+            text.remove()
+            continue
+        kept.append((u, v))
+        text.set_path_effects([patheffects.withStroke(linewidth=3.0, foreground="white")])
+        text.set_color(INK)
+        text.set_zorder(3)
+
+
+def colour_bar(axes: Axes | list[Axes], drawn: ContourSet, label: str) -> None:
     """A colour bar to the right with every level named."""
     figure = (axes[0] if isinstance(axes, list) else axes).figure
-    bar = figure.colorbar(
-        mappable, ax=axes, fraction=0.045, pad=0.02, shrink=0.92, format="%g", ticks=mappable.norm.boundaries
+    figure.colorbar(
+        drawn, ax=axes, fraction=0.045, pad=0.02, shrink=0.92, format="%g", ticks=drawn.levels, label=label
     )
-    bar.set_label(label)
 
 
 def ellipse(

@@ -79,9 +79,10 @@ def distortion_figure(
         note = "This camera model has no distortion."
     else:
         note = (
-            f"{plain(distortion_kind(camera)).capitalize()} distortion: up to {number(float(length.max()), 'px')}, "
+            f"{distortion_kind(camera).capitalize()} distortion: up to {number(float(length.max()), 'px')}, "
             f"{number(float(length.mean()), 'px')} on average over the picture. Arrows lead from where a lens "
-            "without distortion shows a point to where this one does. Shaded: beyond all corners seen."
+            "without distortion shows a point to where this one does. Dashed, shaded: where corners were seen, and "
+            "where none were."
         )
     figure = _sheet(camera, "How far lens distortion moves what is seen", note, verdict)
     left, right = figure.subplots(1, 2, width_ratios=[1.55, 1.0])

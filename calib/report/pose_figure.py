@@ -22,7 +22,7 @@ from calib.report.style import BLUE, GREY, INK, sheet, view_colours
 
 __all__ = ["pose_figure"]
 
-_HEIGHT_IN = 5.6
+_HEIGHT_IN = 5.3
 _LEFT = 0.62
 """Share of the width that the boards take."""
 
@@ -130,7 +130,7 @@ def _scene(
     axes.set_xlim(low[0] - pad, high[0] + pad)
     axes.set_ylim(low[1] - pad, high[1] + pad)
     axes.set_zlim(low[2] - pad, high[2] + pad)
-    axes.set_box_aspect(high - low + 2 * pad, zoom=0.98)
+    axes.set_box_aspect(high - low + 2 * pad, zoom=1.02)
     axes.set_proj_type("ortho")
     axes.view_init(elev=22.0, azim=-62.0)
     axes.set_xlabel("x, right (m)")

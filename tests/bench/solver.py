@@ -62,7 +62,8 @@ def main(extended: bool) -> None:
         found = plain()
         assert abs(found[0] - rms) < 1e-3 * rms and abs(found[1][0, 0] - fx) < 0.05
         times.append(median(ours))
-        line = f"{count:6d} {1e3 * times[-1]:9.1f} {1e3 * median(theirs):11.1f} {median(theirs) / times[-1]:6.1f}"
+        opencv = median(theirs)
+        line = f"{count:6d} {1e3 * times[-1]:9.1f} {1e3 * opencv:11.1f} {opencv / times[-1]:6.1f}"
         if extended and count <= 400:
             slow = _seconds(
                 lambda target=target, pixels=pixels: cv2.calibrateCameraExtended(

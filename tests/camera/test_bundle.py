@@ -38,7 +38,7 @@ def test_exact_views_give_back_the_camera(model: str, skew: float) -> None:
 
 @pytest.mark.parametrize("skew", [0.0, 2.5])
 def test_rational_lens_is_recovered_within_its_sigma(skew: float) -> None:
-    # Its numerator and denominator all but cancel, so exact views leave a valley that rounding cannot fall down.
+    # Its numerator and denominator all but cancel: exact views leave a valley too flat for rounding.
     camera = _camera("rational8", skew)
     views = views_of(12, seed=3, camera=camera, noise_px=0.05)
     fit = calibrate(pack(views), (640, 480), "rational8", skew=skew != 0.0)

@@ -40,8 +40,10 @@ def test_blocks_equal_the_dense_inverse() -> None:
 def test_singular_problem_has_no_finite_sigma() -> None:
     view = views_of(1, 3)[0]
     fit = calibrate(pack([view]), (640, 480), "brown5")
-    assert not fit.converged or not np.isfinite(covariance(fit, 0.01).intrinsics).all() or (
-        covariance(fit, 0.01).sigma()["fx_px"] > 20.0
+    assert (
+        not fit.converged
+        or not np.isfinite(covariance(fit, 0.01).intrinsics).all()
+        or (covariance(fit, 0.01).sigma()["fx_px"] > 20.0)
     )
 
 

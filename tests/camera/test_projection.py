@@ -31,7 +31,9 @@ def _observations() -> Observations:
     return pack(shared)
 
 
-def _shifted(block: Block, free: np.ndarray, row: int, view: int, step: float, basis: np.ndarray | None) -> Block:
+def _shifted(
+    block: Block, free: np.ndarray, row: int, view: int, step: float, basis: np.ndarray | None
+) -> Block:
     G = len(free) + (0 if basis is None else len(basis))
     intrinsics, R, t = block.intrinsics.copy(), block.R_CT.copy(), block.t_CT_m.copy()
     deformation = block.deformation.copy()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -33,7 +34,7 @@ def test_the_true_lens_is_chosen(truth: str) -> None:
     names = [candidate.name for candidate, _ in found]
     assert names == ["pinhole", "radial2", "radial3", "brown5", "rational8"]
     fitted = [candidate.fitted_rms_px for candidate, _ in found]
-    assert all(b <= a * (1 + 1e-4) for a, b in zip(fitted[:4], fitted[1:4], strict=False))
+    assert all(b <= a * (1 + 1e-4) for a, b in pairwise(fitted[:4]))
     assert names[simplest_good([candidate for candidate, _ in found])] == truth
 
 

@@ -77,6 +77,4 @@ def test_one_view_gives_a_start() -> None:
 def test_padding_changes_nothing() -> None:
     views = views_of(3, 6)
     short = [View(views[0].name, views[0].target_m[:20], views[0].pixels[:20]), *views[1:]]
-    np.testing.assert_allclose(
-        homographies(pack(short))[1:], homographies(pack(views))[1:], rtol=1e-9
-    )
+    np.testing.assert_allclose(homographies(pack(short))[1:], homographies(pack(views))[1:], rtol=1e-9)

@@ -29,7 +29,15 @@ def _header(inputs: dict[str, str] | None = None) -> str:
         (316, 208),
         "radial2",
         "ok",
-        {"fx_px": 273.4, "fy_px": 272.6, "skew_px": 0.0, "cx_px": 160.7, "cy_px": 101.9, "k1": -0.22, "k2": 0.55},
+        {
+            "fx_px": 273.4,
+            "fy_px": 272.6,
+            "skew_px": 0.0,
+            "cx_px": 160.7,
+            "cy_px": 101.9,
+            "k1": -0.22,
+            "k2": 0.55,
+        },
         InversePolynomial((0.22, -0.4, 0.1), 0.0, 0.0, 0, 0.004, 1.0, 0.01),
         np.array([[1e-3, 2e-5, -0.1], [-2e-5, 1e-3, -0.05], [1e-5, 3e-5, 3.4]]),
         "ok",
@@ -91,15 +99,17 @@ HOSTILE = {"*/ int x; /*": "1", "??/\n#error": "2", 'quote".png': "3", "ünï\u2
 
 
 @pytest.mark.parametrize(("compiler", "flags"), _compilers(), ids=lambda v: v if isinstance(v, str) else v[0])
-def test_every_constant_compiles_to_the_bits_of_numpy(tmp_path: Path, compiler: str, flags: list[str]) -> None:
+def test_every_constant_compiles_to_the_bits_of_numpy(
+    tmp_path: Path, compiler: str, flags: list[str]
+) -> None:
     _need(compiler)
     text = _header(HOSTILE)
     (tmp_path / "calib_constants.h").write_text(text)
     names = re.findall(r"#define (CALIB_\w+) (-?\d+\.\d+(?:e[+-]\d+)?)f", text)
     assert len(names) == 7 + 3 + 9
     body = ",\n".join(name for name, _ in names)
-    source = f'#include "calib_constants.h"\nextern const float values[];\nconst float values[] = {{\n{body}\n}};\n'
-    (tmp_path / "values.c").write_text(source)
+    declared = '#include "calib_constants.h"\nextern const float values[];\n'
+    (tmp_path / "values.c").write_text(f"{declared}const float values[] = {{\n{body}\n}};\n")
     compiled = subprocess.run(
         [compiler, *flags, *WARNINGS, "-c", "values.c", "-o", "values.o"],
         cwd=tmp_path,
@@ -116,8 +126,6 @@ def test_another_schema_does_not_compile(tmp_path: Path) -> None:
     _need("gcc")
     (tmp_path / "calib_constants.h").write_text(_header())
     (tmp_path / "a.c").write_text('#define CALIB_EXPECT_SCHEMA 99\n#include "calib_constants.h"\n')
-    compiled = subprocess.run(
-        ["gcc", "-c", "a.c"], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
+    compiled = subprocess.run(["gcc", "-c", "a.c"], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert compiled.returncode != 0
     assert "another schema" in compiled.stderr
