@@ -111,23 +111,24 @@ def _errors(fit: Calibration, verdict: str) -> Figure:
     """RMS of each view as bars, and all residuals as a cloud in the same colours."""
     observations = fit.observations
     views = observations.views
+    rms = _view_rms(fit)
+    bars = np.nan_to_num(rms)
+    worst = int(np.argmax(bars))
     note = (
-        f"RMS {number(fit.rms_px, 'px')} over {observations.points} points in {_views(views)}. "
-        f"Standard deviation of one coordinate: {number(fit.sigma_px, 'px')}; rings at 1, 2 and 3 of it. "
-        "Pure chance puts 39, 86 and 99 % of the points inside."
+        f"RMS {number(fit.rms_px, 'px')} over {observations.points} points in {_views(views)}, at worst "
+        f"{number(float(bars[worst]), 'px')} in {plain(observations.names[worst], 24)}. Rings: 1, 2 and 3 standard "
+        f"deviations of a coordinate, {number(fit.sigma_px, 'px')}; chance puts 39, 86 and 99 % inside."
     )
     named = views <= _MOST_NAMED
     height = max(4.4, 0.2 * views + 1.0) if named else 4.6
     figure = sheet(height, "How far the corners lie from where the fitted camera puts them", note, verdict)
     left, right = figure.subplots(1, 2, width_ratios=[1.12, 1.0])
     colours = view_colours(views)
-    rms = _view_rms(fit)
-    bars = np.nan_to_num(rms)
     places = np.arange(1, views + 1)
     if named:
         left.barh(places, bars, color=colours, height=0.78)
         left.set_yticks(places, [plain(name, 24) for name in observations.names])
-        left.set_ylim(views + 0.6, 0.4)
+        left.set_ylim(max(views, 6) + 0.6, 0.4)
         left.tick_params(axis="y", length=0)
         left.set_xlabel("RMS of the view (px)")
         left.grid(axis="x")
@@ -139,8 +140,7 @@ def _errors(fit: Calibration, verdict: str) -> Figure:
         left.set_ylabel("RMS of the view (px)")
         left.grid(axis="y")
         left.axhline(fit.rms_px, color=INK, linewidth=1.3, linestyle="--")
-    worst = int(np.argmax(bars))
-    left.set_title(f"Each view (dashed: all together). Worst: {plain(observations.names[worst], 18)}")
+    left.set_title("Each view; dashed: all together")
     _cloud(right, fit, colours)
     right.set_title("Each point, coloured as its view")
     return figure
@@ -265,13 +265,13 @@ def _principal_point(frame: Axes, axes: Axes, fit: Calibration, sigma: Covarianc
     names = ("cx_px", "cy_px")
     if not all(name in sigma.names for name in names):
         axes.set_axis_off()
-        empty(axes, f"held at ({camera.cx_px:.1f}, {camera.cy_px:.1f}) px, not estimated")
+        empty(axes, f"held at ({camera.cx_px:.1f}, {camera.cy_px:.1f}) px, not estimated", 24)
         return
     index = [sigma.names.index(name) for name in names]
     covariance = sigma.intrinsics[np.ix_(index, index)]
     if not np.all(np.isfinite(covariance)):
         axes.set_axis_off()
-        empty(axes, "its standard deviation is not bounded by these views")
+        empty(axes, "its standard deviation is not bounded by these views", 24)
         return
     centre = (camera.cx_px, camera.cy_px)
     frame.add_patch(ellipse(centre, covariance, 1.0, VERMILLION))
@@ -319,7 +319,8 @@ def _residuals(fit: Calibration, verdict: str) -> Figure:
     present = np.isfinite(fit.residuals_px).all(axis=2)
     point, view = np.nonzero(present.T)
     at, vectors = fit.observations.pixels[view, point], fit.residuals_px[view, point]
-    step = max(1, math.ceil(len(at) / _MOST_ARROWS))
+    # An even step would pick the same views again and again.
+    some = np.sort(np.random.default_rng(0).permutation(len(at))[:_MOST_ARROWS])
     means = _cell_means(fit, at, vectors)
     note = (
         "Errors of chance point every way, and 95 % of the cells' means stay in their discs. Arrows that "
@@ -339,8 +340,8 @@ def _residuals(fit: Calibration, verdict: str) -> Figure:
         for axes in (left, right):
             empty(axes, f"no residuals: the fit ended as {fit.termination!r}")
         return figure
-    times = arrows(left, at[::step], vectors[::step], 0.08 * max(camera.image_size_px))
-    which = "Each point" if step == 1 else f"1 point in {step}"
+    times = arrows(left, at[some], vectors[some], 0.08 * max(camera.image_size_px))
+    which = "Each point" if len(some) == len(at) else f"{len(some)} of {len(at)} points"
     left.set_title(f"{which}, drawn {times:g} times")
     if len(means.at) == 0:
         empty(right, f"no cell of the picture holds {_LEAST_IN_CELL} points or more")
@@ -403,8 +404,10 @@ def _projection_sigma(fit: Calibration, sigma: Covariance, verdict: str) -> Figu
     u, v = grid_over(camera.image_size_px, 97)
     pixels = np.stack(np.meshgrid(u, v), axis=-1)
     values = projection_sigma_px(fit, sigma, pixels.reshape(-1, 2)).reshape(len(v), len(u))
-    finite = values[np.isfinite(values)]
-    found = "not bounded" if len(finite) == 0 else f"median {number(float(np.median(finite)), 'px')}"
+    # What moves by more than the picture's size is not known at all.
+    values[values > math.hypot(*camera.image_size_px)] = np.inf
+    median = float(np.median(values[~np.isnan(values)])) if not np.isnan(values).all() else np.nan
+    found = f"median {number(median, 'px')}"
     note = (
         f"Standard deviation of where the camera puts a point {number(sigma.distance_m, 'm')} away, had the "
         f"pictures been taken again; worst direction, {found}. Dashed: hull of the corners seen; beyond it "

@@ -47,7 +47,7 @@ def picture_frame(axes: Axes, image_size_px: tuple[int, int], margin: float = 0.
     axes.add_patch(Rectangle((-0.5, -0.5), width, height, fill=False, edgecolor=INK, linewidth=1.1, zorder=4))
     axes.set_xlim(-0.5 - pad, width - 0.5 + pad)
     axes.set_ylim(height - 0.5 + pad, -0.5 - pad)
-    axes.set_aspect("equal")
+    axes.set_aspect("equal", anchor="N")
     steps = [1, 2, 2.5, 5, 10]
     axes.xaxis.set_major_locator(MaxNLocator(5 if width >= 0.5 * height else 3, steps=steps))
     axes.yaxis.set_major_locator(MaxNLocator(5 if height >= 0.5 * width else 3, steps=steps))

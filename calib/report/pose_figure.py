@@ -110,7 +110,8 @@ def _scene(
         flat = np.column_stack([outline, np.zeros(len(outline))])
         boards.append(_drawn(flat @ block.R_CT[i].T + block.t_CT_m[i]))
     depth = float(np.median([board[:, 1].mean() for board in boards]))
-    cone = _drawn(0.3 * depth * rays)
+    # A focal length that means nothing can open the cone to almost a half space.
+    cone = _drawn(0.3 * depth * rays / max(1.0, float(np.abs(rays).max())))
     faint = 0.28 if len(boards) <= 40 else 0.08
     axes.add_collection3d(
         Poly3DCollection(
@@ -126,11 +127,14 @@ def _scene(
     axes.add_collection3d(Poly3DCollection([cone], facecolors=[(0.3, 0.35, 0.4, 0.15)]))
     everything = np.concatenate([*boards, cone, np.zeros((1, 3))])
     low, high = everything.min(axis=0), everything.max(axis=0)
-    pad = 0.03 * float((high - low).max())
-    axes.set_xlim(low[0] - pad, high[0] + pad)
-    axes.set_ylim(low[1] - pad, high[1] + pad)
-    axes.set_zlim(low[2] - pad, high[2] + pad)
-    axes.set_box_aspect(high - low + 2 * pad, zoom=1.02)
+    # Ticks of a flat scene would lie on top of each other.
+    widest = float((high - low).max())
+    spare = np.maximum(0.25 * widest - (high - low), 0.0) / 2 + 0.03 * widest
+    low, high = low - spare, high + spare
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    axes.set_zlim(low[2], high[2])
+    axes.set_box_aspect(high - low, zoom=1.02)
     axes.set_proj_type("ortho")
     axes.view_init(elev=22.0, azim=-62.0)
     axes.set_xlabel("x, right (m)")

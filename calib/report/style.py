@@ -118,7 +118,7 @@ def sheet(height_in: float, title: str, note: str = "", verdict: str = "ok") -> 
     height_in : height of the panels together, without title and note.
     verdict : anything but "ok" is shown in the corner, so that the figure cannot be taken for a good one.
     """
-    titles = textwrap.wrap(title, _TITLE_CHARACTERS if verdict == "ok" else _TITLE_CHARACTERS - 28)
+    titles = textwrap.wrap(title, _TITLE_CHARACTERS if verdict == "ok" else _TITLE_CHARACTERS - 20)
     notes = textwrap.wrap(note, _NOTE_CHARACTERS)
     head_in = 0.26 + 0.235 * len(titles) + _LINE_IN * len(notes)
     whole_in = height_in + head_in
@@ -226,12 +226,12 @@ def view_colours(count: int) -> list[tuple[float, float, float, float]]:
     return [shades(0.86 * i / max(count - 1, 1)) for i in range(count)]
 
 
-def empty(axes: Axes, sentence: str) -> None:
+def empty(axes: Axes, sentence: str, width: int = 40) -> None:
     """A panel with nothing to draw says why."""
     axes.text(
         0.5,
         0.5,
-        "\n".join(textwrap.wrap(sentence, 44)),
+        "\n".join(textwrap.wrap(sentence, width)),
         transform=axes.transAxes,
         ha="center",
         va="center",
