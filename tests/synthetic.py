@@ -6,7 +6,7 @@ import numpy as np
 
 from calib.arrays import FloatArray
 from calib.camera.board import Board
-from calib.camera.bundle import rotation_exp
+from calib.camera.levenberg import rotation_exp
 from calib.camera.model import Camera, project
 from calib.camera.views import View
 

@@ -1,6 +1,6 @@
 """Standard deviations of a calibration: intrinsics, poses, and projection over the image.
 
-With the normal matrix H of `calib.camera.bundle` and the residuals' variance sigma^2, the covariance of
+With the normal matrix H of `calib.camera.levenberg` and the residuals' variance sigma^2, the covariance of
 all parameters is sigma^2 H^-1. Its block of the intrinsics is the inverse of the Schur complement S,
 and for view i
 
@@ -26,7 +26,7 @@ import numpy as np
 from calib.arrays import FloatArray
 from calib.camera.bundle import Calibration
 from calib.camera.model import undistort
-from calib.camera.projection import INTRINSICS, Block, jacobian
+from calib.camera.projection import Block, jacobian
 from calib.camera.views import Observations
 
 __all__ = ["Covariance", "covariance", "joint_jacobian", "projection_sigma_px", "residual_inflation"]
@@ -188,8 +188,3 @@ def residual_inflation(calibration: Calibration) -> float:
     except np.linalg.LinAlgError:
         return 1.0
     return float(np.sqrt(max(ratio, 1.0)))
-
-
-def named(intrinsics: FloatArray) -> dict[str, float]:
-    """The vector of intrinsics by name."""
-    return dict(zip(INTRINSICS, intrinsics.tolist(), strict=True))

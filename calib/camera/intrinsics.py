@@ -39,7 +39,7 @@ class Choices:
     ----------
     model : a key of `model.MODELS`, or "auto" for the choice by views held back.
     skew : estimate the skew.
-    loss : one of `bundle.LOSSES`.
+    loss : one of `levenberg.LOSSES`.
     board : one of `selection.BOARDS`, or "auto" for the choice by views held back.
     reject : leave out points that lie far off, and say which.
     """

@@ -19,7 +19,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.arrays import FloatArray, IntArray
-from calib.camera.bundle import Calibration, calibrate, minimise
+from calib.camera.bundle import Calibration, calibrate
+from calib.camera.levenberg import minimise
 from calib.camera.projection import INTRINSICS, Block, free_intrinsics
 from calib.camera.zhang import homographies, poses_from_homographies
 

@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from calib.camera.bundle import calibrate, linearise, refit_poses, rotation_exp
+from calib.camera.bundle import calibrate, refit_poses
 from calib.camera.covariance import covariance
+from calib.camera.levenberg import linearise, rotation_exp
 from calib.camera.model import COEFFICIENTS, MODELS, Camera
 from calib.camera.projection import Block
 from calib.camera.views import View, pack

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calib.camera.bundle import rotation_exp
+from calib.camera.levenberg import rotation_exp
 from calib.camera.model import MODELS
 from calib.camera.projection import INTRINSICS, Block, free_intrinsics, jacobian
 from calib.camera.selection import board_basis
