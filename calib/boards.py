@@ -5,31 +5,43 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import cv2
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from calib.arrays import GrayImage
 from calib.camera.board import Board
 from calib.camera.corners import Detection, detect, find_size
 from calib.camera.views import View
 from calib.errors import BadInputError
 from calib.files import read_yaml_mapping, shown
 from calib.pictures import Picture, read_picture, same_size
-from calib.rig import validation_sentence
+from calib.rig import hash_of, validation_sentence
 
-__all__ = ["BoardFile", "BoardSearch", "find_boards", "read_board_file"]
+__all__ = [
+    "BOARD_FILE",
+    "BoardFile",
+    "BoardSearch",
+    "board_of",
+    "find_boards",
+    "processors",
+    "read_board_file",
+]
 
 Count = Annotated[int, Field(ge=3, le=200, strict=True)]
-Metres = Annotated[float, Field(gt=0, lt=10, allow_inf_nan=False, strict=True)]
+Metres = Annotated[float, Field(ge=1e-5, lt=10, allow_inf_nan=False, strict=True)]
 Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
 
+BOARD_FILE = "board.yaml"
 _SIZE_SAMPLE = 5
 """Pictures that are asked for the size of an unknown board."""
+_KEPT_PIXELS = 250_000_000
+"""Pixels that are kept in memory; further pictures are read twice."""
 
 
 class BoardFile(BaseModel):
@@ -51,13 +63,34 @@ class BoardFile(BaseModel):
 
 def read_board_file(folder: Path) -> BoardFile:
     """board.yaml of a folder, all unset where there is none. Raises `BadInputError`."""
-    path = folder / "board.yaml"
-    if not path.is_file():
+    path = folder / BOARD_FILE
+    if not path.exists() and not path.is_symlink():
         return BoardFile()
     try:
         return BoardFile.model_validate(read_yaml_mapping(path))
     except ValidationError as error:
         raise BadInputError(validation_sentence(path, error)) from error
+
+
+def board_of(sources: Sequence[Path]) -> tuple[BoardFile, dict[str, str]]:
+    """What board.yaml tells of the board in these folders or single pictures, and its SHA-256.
+
+    Raises `BadInputError` where two folders tell different boards.
+    """
+    told, hashes, where = BoardFile(), dict[str, str](), Path()
+    for folder in dict.fromkeys(source if source.is_dir() else source.parent for source in sources):
+        file = read_board_file(folder)
+        if file == BoardFile():
+            continue
+        if hashes and (file.corners, file.square_m) != (told.corners, told.square_m):
+            raise BadInputError(
+                f"{shown(folder / BOARD_FILE)}: tells another board than {shown(where / BOARD_FILE)}; "
+                "pictures of different boards cannot be calibrated together"
+            )
+        if not hashes:
+            told, where = file, folder
+            hashes[BOARD_FILE] = hash_of(folder / BOARD_FILE)
+    return told, hashes
 
 
 @dataclass(frozen=True)
@@ -87,6 +120,7 @@ def find_boards(
     corners: tuple[int, int] | None,
     square_m: float,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    image_size_px: tuple[int, int] | None = None,
 ) -> BoardSearch:
     """Decode pictures and find the board in each, several at a time.
 
@@ -95,63 +129,130 @@ def find_boards(
     corners : inner corners, columns and rows; found in the pictures when None.
     square_m : length of a square.
     progress : called with pictures done and pictures in all.
+    image_size_px : the size that the pictures have to have, if that is known.
 
     Raises
     ------
     BadInputError : a picture that cannot be read, pictures of several sizes, or no board in any; when
         another board is there the message says which.
     """
-    workers = max(1, min(len(paths), os.cpu_count() or 1))
-    total = len(paths)
+    workers = max(1, min(len(paths), processors()))
     # One picture for each thread; OpenCV's own threads would only get in each other's way.
     threads = cv2.getNumThreads()
-    cv2.setNumThreads(1 if workers > 1 else threads)
+    cv2.setNumThreads(1)
+    pool = ThreadPoolExecutor(workers)
     try:
-        with ThreadPoolExecutor(workers) as pool:
-            pictures = list(pool.map(read_picture, paths))
-            size = same_size(pictures)
-            found_size = corners or _common_size(pool, pictures)
-            if found_size is None:
-                raise BadInputError(f"{_names(pictures)}: no checkerboard found in any picture")
-            detections: list[Detection | None] = []
-            for done, detection in enumerate(
-                pool.map(lambda picture: detect(picture.gray, *found_size), pictures), start=1
-            ):
-                detections.append(detection)
-                progress(done, total)
-            if not any(detections):
-                other = _common_size(pool, pictures)
-                wanted = f"no board with {found_size[0]}x{found_size[1]} inner corners found"
-                instead = "and no other either" if other is None else f"but one with {other[0]}x{other[1]} was"
-                raise BadInputError(f"{_names(pictures)}: {wanted} in {_count(total)}, {instead}")
+        return _Search(pool, paths, square_m, progress).run(corners, image_size_px)
     finally:
+        # After an error or Ctrl-C nobody waits for the pictures still being searched.
+        pool.shutdown(wait=False, cancel_futures=True)
         cv2.setNumThreads(threads)
-    board = Board(found_size[0], found_size[1], square_m)
-    target = board.points_m()
-    pairs = [(p, d) for p, d in zip(pictures, detections, strict=True) if d is not None]
-    return BoardSearch(
-        board=board,
-        image_size_px=size,
-        views=tuple(View(p.name, target, d.pixels) for p, d in pairs),
-        detections=tuple(d for _, d in pairs),
-        without=tuple(p.name for p, d in zip(pictures, detections, strict=True) if d is None),
-        hashes={p.name: p.sha256 for p in pictures},
+
+
+def processors() -> int:
+    """How many processors this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@dataclass
+class _Search:
+    """The work of `find_boards`."""
+
+    pool: Executor
+    paths: Sequence[Path]
+    square_m: float
+    progress: Callable[[int, int], None]
+    done: int = 0
+    sizes: dict[int, tuple[int, int] | None] = field(default_factory=dict)
+
+    def run(self, corners: tuple[int, int] | None, expected_px: tuple[int, int] | None) -> BoardSearch:
+        pictures = self._pictures()
+        size_px = same_size(pictures)
+        if expected_px is not None and size_px != expected_px:
+            raise BadInputError(
+                f"{_names(pictures)}: {_is_or_are(pictures)} {size_px[0]}x{size_px[1]} px, "
+                f"expected {expected_px[0]}x{expected_px[1]} px"
+            )
+        count = len(pictures)
+        sample = list(range(0, count, max(1, count // _SIZE_SAMPLE)))
+        wanted = corners or self._common_size(pictures, sample) or self._common_size(pictures, range(count))
+        if wanted is None:
+            raise BadInputError(f"{_names(pictures)}: no checkerboard found in {_count(count)}")
+        found: dict[int, Detection | None] = {}
+        # A wrong size is known after a few pictures; looking for it in all of them would take long.
+        for part, share in ((sample[:2], 1.0), (sample[2:], 0.5)):
+            found |= self._detect(pictures, part, wanted)
+            other = None if any(found.values()) else self._common_size(pictures, sample, share)
+            if other is not None and sorted(other) != sorted(wanted):
+                raise BadInputError(_not_found(pictures, wanted, other))
+        found |= self._detect(pictures, [i for i in range(count) if i not in found], wanted)
+        if not any(found.values()):
+            raise BadInputError(_not_found(pictures, wanted, self._common_size(pictures, sample)))
+        board = Board(*wanted, self.square_m)
+        target = board.points_m()
+        seen = [(picture, detection) for i, picture in enumerate(pictures) if (detection := found[i])]
+        return BoardSearch(
+            board=board,
+            image_size_px=size_px,
+            views=tuple(View(picture.name, target, detection.pixels) for picture, detection in seen),
+            detections=tuple(detection for _, detection in seen),
+            without=tuple(picture.name for i, picture in enumerate(pictures) if found[i] is None),
+            hashes={picture.name: picture.sha256 for picture in pictures},
+        )
+
+    def _pictures(self) -> list[Picture]:
+        """All pictures; the pixels only of as many as memory surely has room for."""
+        kept, pictures = 0, []
+        for picture in self.pool.map(read_picture, self.paths):
+            kept += picture.gray.size
+            pictures.append(picture if kept <= _KEPT_PIXELS else picture.without_pixels())
+        return pictures
+
+    def _gray(self, pictures: Sequence[Picture], i: int) -> GrayImage:
+        if pictures[i].gray.size:
+            return pictures[i].gray
+        again = read_picture(self.paths[i])
+        if again.sha256 != pictures[i].sha256:
+            raise BadInputError(f"{pictures[i].name}: has changed since the work began")
+        return again.gray
+
+    def _detect(
+        self, pictures: Sequence[Picture], which: Sequence[int], corners: tuple[int, int]
+    ) -> dict[int, Detection | None]:
+        found: dict[int, Detection | None] = {}
+        detections = self.pool.map(lambda i: detect(self._gray(pictures, i), *corners), which)
+        for i, detection in zip(which, detections, strict=True):
+            found[i] = detection
+            self.done += 1
+            self.progress(self.done, len(pictures))
+        return found
+
+    def _common_size(
+        self, pictures: Sequence[Picture], which: Sequence[int], share: float = 0.0
+    ) -> tuple[int, int] | None:
+        """The size of board that most of these pictures show, if a share of them does; the larger in a tie.
+
+        Seen upright and lying, a board counts the same.
+        """
+        new = [i for i in which if i not in self.sizes]
+        self.sizes |= zip(new, self.pool.map(lambda i: find_size(self._gray(pictures, i)), new), strict=True)
+        counts = Counter((max(s), min(s)) for i in which if (s := self.sizes[i]) is not None)
+        most = max(counts, key=lambda s: (counts[s], s[0] * s[1]), default=None)
+        return None if most is None or counts[most] < share * len(which) else most
+
+
+def _not_found(pictures: Sequence[Picture], wanted: tuple[int, int], other: tuple[int, int] | None) -> str:
+    instead = "and no other either" if other is None else f"but one with {other[0]}x{other[1]} was"
+    return (
+        f"{_names(pictures)}: no board with {wanted[0]}x{wanted[1]} inner corners found in "
+        f"{_count(len(pictures))}, {instead}"
     )
 
 
-def _common_size(pool: ThreadPoolExecutor, pictures: Sequence[Picture]) -> tuple[int, int] | None:
-    """The size of board that most of a few pictures show; the larger one in a tie.
-
-    Seen upright and lying, a board counts the same.
-    """
-    step = max(1, len(pictures) // _SIZE_SAMPLE)
-    sizes = [s for s in pool.map(lambda p: find_size(p.gray), pictures[::step]) if s is not None]
-    if not sizes and step > 1:
-        sizes = [s for s in pool.map(lambda p: find_size(p.gray), pictures) if s is not None]
-    if not sizes:
-        return None
-    counts = Counter((max(s), min(s)) for s in sizes)
-    return max(counts, key=lambda s: (counts[s], s[0] * s[1]))
+def _is_or_are(pictures: Sequence[Picture]) -> str:
+    return "is" if len(pictures) == 1 else "are"
 
 
 def _count(pictures: int) -> str:
@@ -159,5 +260,5 @@ def _count(pictures: int) -> str:
 
 
 def _names(pictures: Sequence[Picture]) -> str:
-    first, last = shown(pictures[0].name), shown(pictures[-1].name)
+    first, last = pictures[0].name, pictures[-1].name
     return first if len(pictures) == 1 else f"{first} ... {last}"

@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
-__all__ = ["EXIT_BAD_INPUT", "EXIT_DONE", "EXIT_POOR", "EXIT_USAGE", "BadInputError", "CalibError", "UsageError"]
+__all__ = [
+    "EXIT_BAD_INPUT",
+    "EXIT_DONE",
+    "EXIT_INTERNAL",
+    "EXIT_POOR",
+    "EXIT_USAGE",
+    "BadInputError",
+    "CalibError",
+    "UsageError",
+]
 
 EXIT_DONE = 0
 EXIT_POOR = 1
 """Done and written, but the result fails its quality gate."""
 EXIT_USAGE = 2
 EXIT_BAD_INPUT = 3
+EXIT_INTERNAL = 70
+"""A mistake of the program's own; nothing that a user can put right."""
 
 
 class CalibError(Exception):

@@ -3,66 +3,120 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import os
-import tempfile
+import stat
 from pathlib import Path
 from typing import Any
 
 from calib.errors import BadInputError
 
-__all__ = ["check_writable", "make_folder", "read_bytes", "read_text", "read_yaml_mapping", "sha256", "shown", "write_atomically"]
+__all__ = [
+    "as_text",
+    "check_folder",
+    "check_readable",
+    "check_writable",
+    "make_folder",
+    "one_line",
+    "read_bytes",
+    "read_text",
+    "read_yaml_mapping",
+    "sha256",
+    "shown",
+    "write_atomically",
+]
 
-_MAX_YAML_BYTES = 4_000_000
+_MAX_BYTES = 500_000_000
+_MAX_YAML_BYTES = 1_000_000
 _MAX_YAML_NODES = 200_000
+_MAX_YAML_DEPTH = 40
+
+
+def one_line(text: str) -> str:
+    """Text as a terminal may get it: line breaks and other control characters escaped."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
 def shown(path: Path | str) -> str:
-    """A path as an error message shows it: line breaks and other control characters escaped."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in str(path))
+    """A path as an error message shows it, see `one_line`."""
+    return one_line(str(path))
 
 
-def read_bytes(path: Path) -> bytes:
-    """Contents of a file, or a `BadInputError` that says why not."""
+def check_readable(path: Path) -> int:
+    """Size in bytes of a regular file. Raises `BadInputError` for all else: a pipe may never end."""
     try:
-        return path.read_bytes()
+        status = path.stat()
     except OSError as error:
         raise BadInputError(f"{shown(path)}: cannot be read: {error.strerror or error}") from error
+    if stat.S_ISDIR(status.st_mode):
+        raise BadInputError(f"{shown(path)}: is a folder, expected a file")
+    if not stat.S_ISREG(status.st_mode):
+        raise BadInputError(f"{shown(path)}: is a pipe or a device, expected a file")
+    return status.st_size
 
 
-def read_text(path: Path) -> str:
-    """Text of a UTF-8 file, without a byte-order mark."""
+def read_bytes(path: Path, most: int = _MAX_BYTES) -> bytes:
+    """Contents of a file of at most `most` bytes, or a `BadInputError` that says why not."""
+    size = check_readable(path)
+    data = b""
+    if size <= most:
+        try:
+            with path.open("rb") as stream:
+                data = stream.read(most + 1)
+        except OSError as error:
+            raise BadInputError(f"{shown(path)}: cannot be read: {error.strerror or error}") from error
+    if max(size, len(data)) > most:
+        raise BadInputError(f"{shown(path)}: is larger than {most / 1e6:g} MB")
+    return data
+
+
+def read_text(path: Path, most: int = _MAX_BYTES) -> str:
+    """Text of a UTF-8 file of at most `most` bytes, without a byte-order mark."""
+    return as_text(path, read_bytes(path, most))
+
+
+def as_text(path: Path, data: bytes) -> str:
+    """What a UTF-8 file holds as text, without a byte-order mark."""
     try:
-        return read_bytes(path).decode("utf-8-sig")
+        return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise BadInputError(f"{shown(path)}: is not UTF-8 text (byte {error.start})") from error
 
 
 def sha256(data: bytes) -> str:
     """SHA-256 in hexadecimal."""
+    import hashlib
+
     return hashlib.sha256(data).hexdigest()
 
 
 def read_yaml_mapping(path: Path) -> dict[str, Any]:
-    """A YAML file whose top level is a mapping; bounded in size, aliases included."""
+    """A YAML file whose top level is a mapping; bounded in size and depth, aliases included.
+
+    Raises `BadInputError`, also for a key that is given twice: YAML's readers would keep the last.
+    """
     import yaml
 
-    if path.exists() and path.stat().st_size > _MAX_YAML_BYTES:
-        raise BadInputError(f"{shown(path)}: is larger than {_MAX_YAML_BYTES // 1_000_000} MB, expected a short file")
-    text = read_text(path)
+    text = read_text(path, _MAX_YAML_BYTES)
+    # The reader in C is ten times as fast.
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
-        document = yaml.safe_load(text)
+        problem = _yaml_problem(yaml.parse(text, Loader=loader))
+        if problem is not None:
+            raise BadInputError(f"{shown(path)}, {problem}")
+        document = yaml.load(text, Loader=loader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark is not None else ""
-        problem = " ".join(str(getattr(error, "problem", None) or "not readable").split())
-        raise BadInputError(f"{shown(path)}{where}: is not YAML: {problem}") from error
+        said = getattr(error, "problem", None) or getattr(error, "reason", None) or "not readable"
+        raise BadInputError(f"{shown(path)}{where}: is not YAML: {' '.join(str(said).split())}") from error
     except (RecursionError, ValueError) as error:
         raise BadInputError(f"{shown(path)}: is not YAML that can be read: {error}") from error
     if not isinstance(document, dict):
         found = "nothing" if document is None else f"a {type(document).__name__}"
         raise BadInputError(f"{shown(path)}: holds {found}, expected keys with values")
-    if _nodes(document, _MAX_YAML_NODES) < 0:
+    if _expands_beyond(document, _MAX_YAML_NODES):
         raise BadInputError(f"{shown(path)}: expands to more than {_MAX_YAML_NODES} values")
     wrong = next((key for key in document if not isinstance(key, str)), None)
     if wrong is not None:
@@ -70,26 +124,90 @@ def read_yaml_mapping(path: Path) -> dict[str, Any]:
     return document
 
 
-def _nodes(value: Any, left: int) -> int:
-    """`left` less the values below this one, each alias counted; negative when there are too many."""
-    left -= 1
-    children = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
-    for child in children:
-        if left < 0:
-            return left
-        left = _nodes(child, left)
-    return left
+def _yaml_problem(events: Any) -> str | None:
+    """What forbids to load these parsing events, with its line, or None.
+
+    Depth has to be known before loading: the reader in C recurses without a limit.
+    """
+    open_keys: list[set[str] | None] = []
+    expects_key: list[bool] = []
+    for count, event in enumerate(events):
+        kind = type(event).__name__
+        where = f"line {event.start_mark.line + 1}"
+        if count > _MAX_YAML_NODES:
+            return f"{where}: has more than {_MAX_YAML_NODES} values before it"
+        if kind in ("MappingEndEvent", "SequenceEndEvent"):
+            open_keys.pop()
+            expects_key.pop()
+        if kind in ("ScalarEvent", "AliasEvent", "MappingStartEvent", "SequenceStartEvent") and open_keys:
+            keys = open_keys[-1]
+            if keys is not None:
+                if expects_key[-1] and kind == "ScalarEvent" and event.value != "<<":
+                    if event.value in keys:
+                        return f"{where}: the key {one_line(event.value)[:60]} was given before"
+                    keys.add(event.value)
+                expects_key[-1] = not expects_key[-1]
+        if kind in ("MappingStartEvent", "SequenceStartEvent"):
+            open_keys.append(set() if kind == "MappingStartEvent" else None)
+            expects_key.append(kind == "MappingStartEvent")
+            if len(open_keys) > _MAX_YAML_DEPTH:
+                return f"{where}: is not YAML that can be read: nested more than {_MAX_YAML_DEPTH} deep"
+    return None
+
+
+def _expands_beyond(document: Any, most: int) -> bool:
+    """Whether there are more than `most` values below, each alias counted where it stands."""
+    waiting = [document]
+    while waiting:
+        value = waiting.pop()
+        children = value.values() if isinstance(value, dict) else value
+        most -= len(children)
+        if most < 0:
+            return True
+        waiting += [child for child in children if isinstance(child, dict | list)]
+    return False
+
+
+def _target(path: Path) -> Path:
+    """The file that a path stands for, symbolic links followed."""
+    if not path.is_symlink():
+        return path
+    target = Path(os.path.realpath(path))
+    if target.is_symlink():
+        raise BadInputError(f"{shown(path)}: is a symbolic link that leads back to itself")
+    return target
 
 
 def check_writable(path: Path) -> None:
     """Fail before long work when `path` cannot be written afterwards."""
-    parent = path.parent
-    if path.is_dir():
+    target = _target(path)
+    parent = target.parent
+    if target.is_dir():
         raise BadInputError(f"{shown(path)}: is a folder, expected a file to write")
     if not parent.is_dir():
         raise BadInputError(f"{shown(path)}: cannot be written: there is no folder {shown(parent)}")
-    if not os.access(parent, os.W_OK):
+    if target.exists() and not (target.stat().st_mode & 0o222 and os.access(target, os.W_OK)):
+        raise BadInputError(f"{shown(path)}: cannot be written: it is read-only")
+    if _is_device(target):
+        return
+    if not os.access(parent, os.W_OK | os.X_OK):
         raise BadInputError(f"{shown(path)}: cannot be written: no permission in {shown(parent.resolve())}")
+
+
+def check_folder(path: Path) -> None:
+    """Fail before long work when `make_folder` or writing into this folder cannot succeed afterwards."""
+    there = path
+    while not there.exists() and there != there.parent:
+        there = there.parent
+    if not there.is_dir():
+        raise BadInputError(f"{shown(path)}: cannot be made a folder: {shown(there)} is a file")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise BadInputError(f"{shown(path)}: cannot be written: no permission in {shown(there.resolve())}")
+
+
+def _is_device(path: Path) -> bool:
+    """Whether this is there and can only be written through, as /dev/null or a pipe."""
+    return path.exists() and not path.is_file() and not path.is_dir()
 
 
 def make_folder(path: Path) -> None:
@@ -103,21 +221,28 @@ def make_folder(path: Path) -> None:
 def write_atomically(path: Path, data: bytes | str) -> None:
     """Replace a file so that at every moment either the old or the new contents are there whole.
 
-    A temporary file beside it is written, flushed to the disk and renamed. Raises `BadInputError`
-    when the disk is full or the place cannot be written; the old file then survives.
+    A temporary file beside it is written, flushed to the disk and renamed; devices and pipes are
+    written through. Raises `BadInputError` when the disk is full or the place cannot be written; the
+    old file then survives.
     """
-    raw = data.encode("utf-8") if isinstance(data, str) else data
+    import tempfile
+
+    raw = data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data
     check_writable(path)
-    target = path.resolve() if path.is_symlink() else path
+    target = _target(path)
     temporary: str | None = None
     try:
-        descriptor, temporary = tempfile.mkstemp(prefix=f".{target.name[:40]}.", suffix=".tmp", dir=target.parent)
+        if _is_device(target):
+            target.write_bytes(raw)
+            return
+        descriptor, temporary = tempfile.mkstemp(
+            prefix=f".{target.name[:40]}.", suffix=".tmp", dir=target.parent
+        )
         with os.fdopen(descriptor, "wb") as stream:
             stream.write(raw)
             stream.flush()
             os.fsync(stream.fileno())
-        mode = target.stat().st_mode & 0o777 if target.exists() else 0o666 & ~_umask()
-        Path(temporary).chmod(mode)
+        _take_over(target, Path(temporary))
         Path(temporary).replace(target)
     except OSError as error:
         raise BadInputError(f"{shown(path)}: cannot be written: {error.strerror or error}") from error
@@ -131,6 +256,17 @@ def write_atomically(path: Path, data: bytes | str) -> None:
             os.fsync(folder)
         finally:
             os.close(folder)
+
+
+def _take_over(old: Path, new: Path) -> None:
+    """Give a file the mode and, where allowed, the owner of the one that it replaces."""
+    if not old.exists():
+        new.chmod(0o666 & ~_umask())
+        return
+    status = old.stat()
+    with contextlib.suppress(OSError):
+        os.chown(new, status.st_uid, status.st_gid)
+    new.chmod(status.st_mode & 0o777)
 
 
 def _umask() -> int:

@@ -9,9 +9,12 @@ from __future__ import annotations
 import os
 import re
 import struct
+import tempfile
+import threading
 import zlib
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,34 +24,51 @@ from calib.errors import BadInputError
 from calib.files import read_bytes, sha256, shown
 
 os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")
+# What a header declares is allocated before anything of it is decoded.
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", "200000000")
 import cv2
 
 __all__ = ["SUFFIXES", "Picture", "list_pictures", "read_picture", "same_size"]
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm")
-_MAX_FILE_BYTES = 500_000_000
 _MAX_PIXELS = 200_000_000
 _PNG = b"\x89PNG\r\n\x1a\n"
+_JPEG = b"\xff\xd8"
+_JPEG_DAMAGE = ("premature end", "bad huffman", "bad arithmetic", "found marker", "inconsistent progression")
+"""Complaints of libjpeg after which parts of the picture are made up. Extraneous bytes are not among
+them: many cameras pad their pictures."""
+_STDERR = threading.Lock()
+"""Held while file descriptor 2, which belongs to the whole process, leads elsewhere."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A decoded picture: its name, SHA-256 of the file, and grey values (height, width)."""
+    """A decoded picture.
+
+    Attributes
+    ----------
+    name : of the file, control characters escaped.
+    sha256 : of the file.
+    gray : (height, width) grey values.
+    size_px : width and height.
+    """
 
     name: str
     sha256: str
     gray: GrayImage
+    size_px: tuple[int, int]
 
-    @property
-    def size_px(self) -> tuple[int, int]:
-        """Width and height."""
-        return self.gray.shape[1], self.gray.shape[0]
+    def without_pixels(self) -> Picture:
+        """The same without its grey values, which take the memory."""
+        return replace(self, gray=np.empty((0, 0), dtype=np.uint8))
 
 
 def _natural(path: Path) -> tuple[object, ...]:
     """Sorting key under which view2 comes before view10."""
     parts = re.split(r"(\d+)", path.name.lower())
-    return tuple((0, int(p), "") if p.isdigit() else (1, 0, p) for p in parts)
+    key = ((0, int(p), "") if i % 2 else (1, 0, p) for i, p in enumerate(parts))
+    # The name itself decides between view1 and view01: folders are listed in no certain order.
+    return (*key, (2, 0, path.name))
 
 
 def list_pictures(sources: Sequence[Path]) -> list[Path]:
@@ -60,22 +80,28 @@ def list_pictures(sources: Sequence[Path]) -> list[Path]:
     for source in sources:
         if source.is_dir():
             try:
-                inside = [p for p in source.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file()]
+                inside = [p for p in source.iterdir() if _is_picture_file(p)]
             except OSError as error:
                 raise BadInputError(f"{shown(source)}: cannot be listed: {error.strerror}") from error
             if not inside:
                 kinds = ", ".join(suffix[1:] for suffix in SUFFIXES)
                 raise BadInputError(f"{shown(source)}: holds no pictures, expected files of {kinds}")
-            found += sorted((p for p in inside if not p.name.startswith(".")), key=_natural)
+            found += sorted(inside, key=_natural)
         elif source.exists():
             found.append(source)
         else:
             raise BadInputError(f"{shown(source)}: does not exist")
-    names = [path.name for path in found]
-    twice = next((name for name in names if names.count(name) > 1), None)
+    twice = next((name for name, n in Counter(shown(path.name) for path in found).items() if n > 1), None)
     if twice is not None:
-        raise BadInputError(f"{shown(twice)}: two pictures have this name")
+        raise BadInputError(f"{twice}: two pictures have this name; views are told apart by their names")
     return found
+
+
+def _is_picture_file(path: Path) -> bool:
+    """Whether a folder's entry is to be read; a link that leads nowhere is, so that it is complained of."""
+    if path.suffix.lower() not in SUFFIXES or path.name.startswith("."):
+        return False
+    return path.is_file() or (path.is_symlink() and not path.exists())
 
 
 def _incomplete(data: bytes) -> str | None:
@@ -93,9 +119,6 @@ def _incomplete(data: bytes) -> str | None:
                 return None
             at = end
         return "is a truncated PNG"
-    # Entropy-coded data escape the byte FF, so the last start-of-scan is the picture's own.
-    if data.startswith(b"\xff\xd8") and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
-        return "is a truncated JPEG"
     return None
 
 
@@ -104,7 +127,7 @@ def _declared_pixels(data: bytes) -> int:
     if data.startswith(_PNG) and len(data) >= 24:
         width, height = struct.unpack(">II", data[16:24])
         return int(width) * int(height)
-    if data.startswith(b"\xff\xd8"):
+    if data.startswith(_JPEG):
         at = 2
         while at + 9 < len(data) and data[at] == 0xFF:
             marker, length = data[at + 1], struct.unpack(">H", data[at + 2 : at + 4])[0]
@@ -121,8 +144,6 @@ def read_picture(path: Path) -> Picture:
     Colour is averaged as OpenCV does, an alpha channel is dropped, and deeper pictures are scaled so
     that their brightest 0.1 % are white. Raises `BadInputError` for what is not a whole picture.
     """
-    if path.exists() and path.stat().st_size > _MAX_FILE_BYTES:
-        raise BadInputError(f"{shown(path)}: is larger than {_MAX_FILE_BYTES // 1_000_000} MB")
     data = read_bytes(path)
     if not data:
         raise BadInputError(f"{shown(path)}: is empty, expected a picture")
@@ -131,24 +152,60 @@ def read_picture(path: Path) -> Picture:
         raise BadInputError(f"{shown(path)}: {problem}")
     if _declared_pixels(data) > _MAX_PIXELS:
         raise BadInputError(f"{shown(path)}: has more than {_MAX_PIXELS // 1_000_000} million pixels")
-    flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-    try:
-        decoded = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
-    except cv2.error:
-        decoded = None
+    if data.startswith(_JPEG):
+        decoded, complaints = _decoded_with_complaints(data)
+        damage = next((line for line in complaints.splitlines() if _tells_of_damage(line)), None)
+        if decoded is None or damage is not None:
+            why = "" if damage is None else f" ({damage.removeprefix('Corrupt JPEG data: ')[:80]})"
+            raise BadInputError(f"{shown(path)}: is a truncated or damaged JPEG{why}")
+    else:
+        decoded = _decoded(data)
     if decoded is None or decoded.size == 0:
         raise BadInputError(f"{shown(path)}: is not a picture that can be decoded")
-    return Picture(path.name, sha256(data), _eight_bits(decoded))
+    height, width = decoded.shape[:2]
+    return Picture(shown(path.name), sha256(data), _eight_bits(decoded), (width, height))
+
+
+def _decoded(data: bytes) -> AnyArray | None:
+    flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        return cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
+    except cv2.error:
+        return None
+
+
+def _decoded_with_complaints(data: bytes) -> tuple[AnyArray | None, str]:
+    """A decoded picture and what the decoder wrote to stderr, the only place where it tells of damage."""
+    with _STDERR, tempfile.TemporaryFile() as heard:
+        before = os.dup(2)
+        try:
+            os.dup2(heard.fileno(), 2)
+            decoded = _decoded(data)
+        finally:
+            os.dup2(before, 2)
+            os.close(before)
+        heard.seek(0)
+        return decoded, heard.read(10_000).decode("utf-8", "replace")
+
+
+def _tells_of_damage(complaint: str) -> bool:
+    return any(word in complaint.lower() for word in _JPEG_DAMAGE)
 
 
 def _eight_bits(decoded: AnyArray) -> GrayImage:
     if decoded.dtype == np.uint8:
         return np.ascontiguousarray(decoded, dtype=np.uint8)
-    values = np.nan_to_num(decoded.astype(np.float64))
+    values = decoded.astype(np.float32)
+    finite = np.isfinite(values)
+    if not finite.all():
+        values = np.where(finite, values, np.float32(0.0))
     low = min(float(values.min()), 0.0)
     white = float(np.percentile(values, 99.9))
-    scaled = (values - low) * (255.0 / max(white - low, 1e-12))
-    return np.clip(np.rint(scaled), 0, 255).astype(np.uint8)
+    if not 1e-12 < white - low < 1e30:
+        return np.zeros(values.shape, dtype=np.uint8)
+    values -= np.float32(low)
+    values *= np.float32(255.0 / (white - low))
+    return np.clip(np.rint(values, out=values), 0, 255, out=values).astype(np.uint8)
 
 
 def same_size(pictures: Sequence[Picture]) -> tuple[int, int]:

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from calib import __version__
 from calib.errors import BadInputError
-from calib.files import read_bytes, read_yaml_mapping, sha256, shown, write_atomically
+from calib.files import one_line, read_bytes, read_yaml_mapping, sha256, shown, write_atomically
 
 __all__ = [
     "Camera",
@@ -39,11 +39,32 @@ __all__ = [
     "write_rig",
 ]
 
+SECTIONS = (
+    "geometry",
+    "camera",
+    "plane",
+    "lens",
+    "imu",
+    "orientation_filter",
+    "lowpass",
+    "align",
+    "actuator",
+    "pump",
+    "estimator",
+    "controller",
+    "twin",
+    "provenance",
+)
+"""Sections in the order of the file."""
+
 Verdict = Annotated[str, Field(pattern="^(ok|poor|unidentifiable|inconsistent)$")]
 Model = Annotated[str, Field(pattern="^(pinhole|radial2|radial3|brown5|rational8)$")]
 Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
-Sigma = dict[str, Annotated[float, Field(ge=0, allow_inf_nan=False)] | None]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
+Count = Annotated[int, Field(ge=0, strict=True)]
+Side = Annotated[int, Field(ge=1, le=100_000, strict=True)]
+Sigma = dict[str, NotNegative | None]
 Row3 = Annotated[list[Number], Field(min_length=3, max_length=3)]
 Matrix3 = Annotated[list[Row3], Field(min_length=3, max_length=3)]
 
@@ -96,7 +117,7 @@ class Camera(_Section):
     """Intrinsics, what they are worth, and why."""
 
     model: Model
-    image_size_px: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=2, max_length=2)]
+    image_size_px: Annotated[list[Side], Field(min_length=2, max_length=2)]
     fx_px: Positive
     fy_px: Positive
     skew_px: Number = 0.0
@@ -105,11 +126,11 @@ class Camera(_Section):
     distortion: Distortion = Distortion()
     sigma: Sigma = {}
     covariance: CovarianceTable | None = None
-    rms_px: Annotated[float, Field(ge=0)] | None = None
-    mean_error_px: Annotated[float, Field(ge=0)] | None = None
+    rms_px: NotNegative | None = None
+    mean_error_px: NotNegative | None = None
     projection_sigma_px: Sigma = {}
-    views: Annotated[int, Field(ge=0)] = 0
-    points: Annotated[int, Field(ge=0)] = 0
+    views: Count = 0
+    points: Count = 0
     board: str | None = None
     loss: str | None = None
     termination: str | None = None
@@ -128,12 +149,12 @@ class Plane(_Section):
     A_px_per_m: Matrix3
     A_inverse: Matrix3
     sigma: Sigma = {}
-    rms_px: Annotated[float, Field(ge=0)]
-    rms_mm: Annotated[float, Field(ge=0)]
+    rms_px: NotNegative
+    rms_mm: NotNegative
     sigma_marker_mm: Sigma = {}
     without_intrinsics: dict[str, Number] = {}
-    pictures: Annotated[int, Field(ge=0)] = 0
-    points: Annotated[int, Field(ge=0)] = 0
+    pictures: Count = 0
+    points: Count = 0
     orientation: str = ""
     verdict: Verdict
     reasons: list[str] = []
@@ -143,8 +164,8 @@ class InverseLens(_Section):
     """The polynomial of `calib.camera.undistortion`."""
 
     radial: list[Number]
-    decentering_steps: Annotated[int, Field(ge=0)]
-    max_error_px: Annotated[float, Field(ge=0)]
+    decentering_steps: Count
+    max_error_px: NotNegative
     covered: Annotated[float, Field(ge=0, le=1)]
 
 
@@ -187,36 +208,91 @@ class Rig(BaseModel):
     provenance: Provenance = Provenance()
 
 
+_EXPECTED = {
+    "bool_type": "true or false",
+    "dict_type": "keys with values",
+    "finite_number": "a finite number",
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "list_type": "a list",
+    "model_attributes_type": "keys with values",
+    "model_type": "keys with values",
+    "string_type": "text",
+}
+"""What pydantic's kinds of error ask for, in words."""
+
+
 def validation_sentence(path: Path, error: ValidationError) -> str:
     """One sentence for the first thing that is wrong: file, key, value, and what was expected."""
     first = error.errors()[0]
-    key = ".".join(str(part) for part in first["loc"])
-    value = first.get("input")
-    found = "is missing" if first["type"] == "missing" else f"is {_short(value)}"
+    kind, value = first["type"], first.get("input")
+    key = one_line(".".join(str(part) for part in first["loc"]))
+    if kind == "missing":
+        return f"{shown(path)}: {key} is missing"
+    if kind == "extra_forbidden":
+        return f"{shown(path)}: {key} is not a key that is known here"
     message = first["msg"]
     expected = message[0].lower() + message[1:]
-    expected = expected.removeprefix("value error, ").removeprefix("input should be ")
-    if first["type"] == "missing":
-        return f"{shown(path)}: {key} is missing"
-    if first["type"] == "extra_forbidden":
-        return f"{shown(path)}: {key} is not a key that is known here"
-    return f"{shown(path)}: {key} {found}, expected {expected.removeprefix('expected ')}"
+    expected = (
+        expected.removeprefix("value error, ").removeprefix("input should be ").removeprefix("expected ")
+    )
+    expected = _EXPECTED.get(kind, expected)
+    if kind in ("too_short", "too_long"):
+        limit = first["ctx"].get("min_length", first["ctx"].get("max_length"))
+        expected = f"{limit} values"
+    hint = ""
+    if isinstance(value, str) and kind in ("float_type", "int_type") and _reads_as_number(value):
+        hint = " (without quotes, and in YAML an exponent needs a point and a sign, as 2.0e-2)"
+    return f"{shown(path)}: {key} is {_short(value)}, expected {expected}{hint}"
+
+
+def _reads_as_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _short(value: Any) -> str:
-    text = repr(value)
+    text = one_line(repr(value))
     return text if len(text) <= 60 else text[:57] + "..."
 
 
 def read_rig(path: Path) -> Rig:
-    """The rig in this file, an empty one where there is no file. Raises `BadInputError`."""
-    if not path.exists() and not path.is_symlink():
+    """The rig in this file, an empty one where there is no file.
+
+    Raises `BadInputError`, also for a file of another kind (it would be written over) and for a plane
+    whose matrices contradict each other.
+    """
+    if not path.exists():
         return Rig()
     document = read_yaml_mapping(path)
+    if not any(name in document for name in SECTIONS):
+        found = ", ".join(_short(name) for name in list(document)[:3]) or "nothing"
+        raise BadInputError(
+            f"{shown(path)}: is not a rig.yaml: it has {found}, expected sections as camera or provenance"
+        )
     try:
-        return Rig.model_validate(document)
+        rig = Rig.model_validate(document)
     except ValidationError as error:
         raise BadInputError(validation_sentence(path, error)) from error
+    if rig.plane is not None:
+        _check_plane(path, rig.plane)
+    return rig
+
+
+def _check_plane(path: Path, plane: Plane) -> None:
+    import numpy as np
+
+    R, A, A_inverse = np.array(plane.R_CW), np.array(plane.A_px_per_m), np.array(plane.A_inverse)
+    if not np.allclose(R @ R.T, np.eye(3), atol=1e-6) or np.linalg.det(R) < 0:
+        raise BadInputError(f"{shown(path)}: plane.R_CW is not a rotation")
+    if not any(plane.t_CW_m):
+        raise BadInputError(f"{shown(path)}: plane.t_CW_m is zero, expected the way from camera to plane")
+    if not np.allclose(A_inverse @ A, np.eye(3), atol=1e-6):
+        raise BadInputError(f"{shown(path)}: plane.A_inverse is not the inverse of plane.A_px_per_m")
 
 
 def section_json(section: BaseModel) -> dict[str, Any]:
@@ -224,28 +300,16 @@ def section_json(section: BaseModel) -> dict[str, Any]:
     return {
         key: value
         for key, value in section.model_dump(mode="json").items()
-        if value is not None and value != {} and not (key in ("rejected", "remarks", "advice") and value == [])
+        if value is not None
+        and value != {}
+        and not (key in ("rejected", "remarks", "advice") and value == [])
     }
 
 
 def _plain(rig: Rig) -> dict[str, Any]:
-    order = [
-        "geometry",
-        "camera",
-        "plane",
-        "lens",
-        "imu",
-        "orientation_filter",
-        "lowpass",
-        "align",
-        "actuator",
-        "pump",
-        "estimator",
-        "controller",
-    ]
     extra = rig.model_extra or {}
     out: dict[str, Any] = {}
-    for name in order:
+    for name in SECTIONS:
         section = getattr(rig, name, None)
         if isinstance(section, BaseModel):
             out[name] = section_json(section)
@@ -253,13 +317,16 @@ def _plain(rig: Rig) -> dict[str, Any]:
             out[name] = extra[name]
     for name, section in extra.items():
         out.setdefault(name, section)
-    out["provenance"] = section_json(rig.provenance)
+    # The provenance comes last.
+    out["provenance"] = out.pop("provenance")
     return out
 
 
 def rig_text(rig: Rig) -> str:
     """The file's text; the same rig gives the same text."""
-    return yaml.safe_dump(_plain(rig), sort_keys=False, default_flow_style=None, width=110, allow_unicode=True)
+    return yaml.safe_dump(
+        _plain(rig), sort_keys=False, default_flow_style=None, width=110, allow_unicode=True
+    )
 
 
 def identity(section: BaseModel) -> str:

@@ -28,6 +28,7 @@ __all__ = [
     "image_grid",
     "imported_camera_section",
     "lens_section",
+    "outdated",
     "plane_section",
     "plane_view",
 ]
@@ -201,6 +202,25 @@ def current_plane(whole: rig.Rig, source: str) -> rig.Plane | None:
             "run calib extrinsics again"
         )
     return whole.plane
+
+
+def outdated(whole: rig.Rig) -> list[str]:
+    """Sentences for sections that were computed from others than the rig now has."""
+    inputs = whole.provenance.inputs
+    now = {
+        name: rig.identity(section)
+        for name, section in (("camera", whole.camera), ("plane", whole.plane))
+        if section is not None
+    }
+    sentences = []
+    for name, verb in (("plane", "extrinsics"), ("lens", "distortion")):
+        known = inputs.get(name, {})
+        changed = [other for other in now if other in known and known[other] != now[other]]
+        if getattr(whole, name) is not None and changed:
+            sentences.append(
+                f"{name} in the file is of an earlier {' and '.join(changed)}; run calib {verb} again"
+            )
+    return sentences
 
 
 def plane_view(plane: rig.Plane, geometry: rig.Geometry) -> PlaneView:

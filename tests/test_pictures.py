@@ -30,8 +30,8 @@ def _jpg(image: np.ndarray) -> bytes:
         ("short.png", _png(GRAY)[:-30], "truncated PNG"),
         ("header.png", _png(GRAY)[:20], "truncated PNG"),
         ("flipped.png", _png(GRAY)[:60] + b"\x00" + _png(GRAY)[61:], "PNG"),
-        ("short.jpg", _jpg(GRAY)[:-40], "truncated JPEG"),
-        ("head.jpg", _jpg(GRAY)[:10], "not a picture"),
+        ("short.jpg", _jpg(GRAY)[:-40], "truncated or damaged JPEG"),
+        ("head.jpg", _jpg(GRAY)[:10], "truncated or damaged JPEG"),
     ],
 )
 def test_what_is_not_a_whole_picture(tmp_path: Path, name: str, data: bytes, says: str) -> None:

@@ -9,7 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calib.errors import UsageError
-from calib.units import parse_angle_rad, parse_corners, parse_frequency_hz, parse_image_size, parse_length_m
+from calib.units import (
+    parse_angle_rad,
+    parse_corners,
+    parse_duration_s,
+    parse_frequency_hz,
+    parse_image_size,
+    parse_length_m,
+)
 
 
 @pytest.mark.parametrize(
@@ -23,6 +30,15 @@ def test_lengths(text: str, metres: float) -> None:
 def test_wrong_lengths_name_the_option(text: str) -> None:
     with pytest.raises(UsageError, match="--square"):
         parse_length_m(text, "--square")
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"), [("10s", 10.0), ("500 ms", 0.5), ("2min", 120.0), ("1.5h", 5400.0)]
+)
+def test_durations(text: str, seconds: float) -> None:
+    assert parse_duration_s(text, "--duration") == pytest.approx(seconds, rel=1e-15)
+    with pytest.raises(UsageError, match="--duration"):
+        parse_duration_s(f"-{text}", "--duration")
 
 
 def test_other_quantities() -> None:

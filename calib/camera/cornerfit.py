@@ -12,9 +12,11 @@ them. Blur and the pixel's aperture make an error function of each step:
 
     I = (1 + g_x x + g_y y) (b + a erf(d1 / w) erf(d2 / w))
 
-Light that is not even scales dark and bright alike, hence one gradient g. The ten parameters u0, v0,
-alpha, beta, w, b, a, g_x, g_y ... of each corner are found by Levenberg-Marquardt; the curvatures
-are given. The window is a parallelogram along the board, so that the model holds in all of it.
+Light that is not even scales dark and bright alike, hence one gradient g. The eleven parameters u0, v0,
+alpha, beta, w, b, a, g_x, g_y, kappa, lambda of each corner are found by Levenberg-Marquardt. The
+curvatures are measured much better by the row and column of corners than by a single window: that
+value and its standard deviation enter as one more observation. The window is a parallelogram along
+the board, so that the model holds in all of it.
 """
 
 from __future__ import annotations
@@ -35,9 +37,13 @@ _LEAST_REACH_PX = 2.5
 _ITERATIONS = 25
 _STEP_PX = 1e-3
 _STEP_SIGMA = 0.05
+_NOISE, _LEAST_NOISE = 0.04, 1.0
+_LEAST_BEND_SIGMA = 1e-6
 _START_WIDTH_PX = 1.2
 _WIDTH_PX = (0.3, 12.0)
-_PARAMETERS = 9
+_PARAMETERS = 11
+_BENDS = slice(9, 11)
+_UNKNOWN_BEND = 3e-3
 _EDGE_SLOPE = 2.0 / np.sqrt(np.pi)
 
 _Float32 = npt.NDArray[np.float32]
@@ -50,19 +56,18 @@ class Frames:
     Attributes
     ----------
     along, across : (N, 2) steps to the next column and row, pixels.
-    bend_along, bend_across : (N,) curvatures of the edges along rows and columns, 1 / px.
+    bends : (N, 2) curvatures of the edges along the row and along the column, 1 / px.
+    bend_sigmas : (N, 2) standard deviations of `bends`.
     """
 
     along: FloatArray
     across: FloatArray
-    bend_along: FloatArray
-    bend_across: FloatArray
+    bends: FloatArray
+    bend_sigmas: FloatArray
 
     def take(self, chosen: IntArray) -> Frames:
         """The frames of some corners."""
-        return Frames(
-            self.along[chosen], self.across[chosen], self.bend_along[chosen], self.bend_across[chosen]
-        )
+        return Frames(self.along[chosen], self.across[chosen], self.bends[chosen], self.bend_sigmas[chosen])
 
 
 @dataclass(frozen=True)
@@ -97,39 +102,54 @@ class _Windows:
     y: _Float32
     grey: _Float32
     weight: _Float32
-    bend_along: _Float32
-    bend_across: _Float32
 
     def take(self, chosen: IntArray) -> _Windows:
         return _Windows(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
 
 
-def _derivatives_along(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """First and second derivative by the index of curves (..., n, 2), from a low polynomial."""
-    n = points.shape[-2]
-    degree = 1 if n < 3 else 2 if n < 5 else 3
-    t = np.arange(n) - (n - 1) / 2.0
-    powers = np.vander(t, degree + 1, increasing=True)
-    coefficients = np.linalg.pinv(powers) @ points
-    first, second = np.zeros_like(powers), np.zeros_like(powers)
-    for m in range(1, degree + 1):
-        first[:, m] = m * t ** (m - 1)
-        second[:, m] = m * (m - 1) * t ** max(m - 2, 0)
-    return first @ coefficients, second @ coefficients
+def _curvatures(curves: FloatArray, degree: int) -> FloatArray:
+    """Curvature (m, n) of m curves of n points, (m, n, 2), each a polynomial over its own chord.
+
+    Perspective keeps lines straight, so the polynomial has to follow the lens only.
+    """
+    chord = curves[:, -1] - curves[:, 0]
+    length = np.maximum(np.linalg.norm(chord, axis=1), 1e-9)[:, None]
+    c, s = (chord / length).T[:, :, None]
+    offset = curves - curves.mean(axis=1, keepdims=True)
+    t = (c * offset[..., 0] + s * offset[..., 1]) * (2.0 / length)
+    height = c * offset[..., 1] - s * offset[..., 0]
+    powers = t[..., None] ** np.arange(degree + 1)
+    normal = powers.transpose(0, 2, 1) @ powers + 1e-9 * np.eye(degree + 1)
+    k = np.linalg.solve(normal, powers.transpose(0, 2, 1) @ height[..., None])[..., 0]
+    m = np.arange(degree + 1)
+    slope = np.einsum("mnd,md->mn", powers[..., :-1], (k * m)[:, 1:]) * (2.0 / length)
+    bend = np.einsum("mnd,md->mn", powers[..., :-2], (k * m * (m - 1))[:, 2:]) * (2.0 / length) ** 2
+    return np.asarray(bend / (1.0 + slope**2) ** 1.5)
+
+
+def _bends(curves: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Curvatures and their standard deviations, (m, n): half of what one degree more or less would change."""
+    n = curves.shape[1]
+    if n < 3:
+        return np.zeros(curves.shape[:2]), np.full(curves.shape[:2], _UNKNOWN_BEND)
+    degree = 2 if n < 5 else 3 if n < 7 else 4
+    bend = _curvatures(curves, degree)
+    lower = _curvatures(curves, degree - 1) if degree > 2 else np.zeros_like(bend)
+    change = 0.5 * np.abs(bend - lower)
+    # Alike along the curve, but for the ends, where the polynomials differ most.
+    sigma = np.maximum(change, np.sqrt(np.mean(change**2, axis=1, keepdims=True)))
+    return bend, sigma
 
 
 def frames_of(points: FloatArray) -> Frames:
-    """Steps and curvatures of a grid of corners, (rows, columns, 2) pixels, at least 2 x 2.
-
-    Perspective keeps lines straight, so the curvature of a row of corners is that of its edges.
-    """
+    """Steps and curvatures of a grid of corners, (rows, columns, 2) pixels, at least 2 x 2."""
     along, across = np.gradient(points, axis=1), np.gradient(points, axis=0)
-    bends = []
-    for curves in (points, points.transpose(1, 0, 2)):
-        first, second = _derivatives_along(curves)
-        speed = np.maximum(np.hypot(first[..., 0], first[..., 1]), 1e-9)
-        bends.append((first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]) / speed**3)
-    return Frames(along.reshape(-1, 2), across.reshape(-1, 2), bends[0].ravel(), bends[1].T.ravel())
+    by_row, by_column = _bends(points), _bends(points.transpose(1, 0, 2))
+    bends, sigmas = (
+        np.stack([row.ravel(), column.T.ravel()], axis=1)
+        for row, column in zip(by_row, by_column, strict=True)
+    )
+    return Frames(along.reshape(-1, 2), across.reshape(-1, 2), bends, sigmas)
 
 
 def _windows(image: _Float32, points: FloatArray, frames: Frames, most_px: int = REACH_PX) -> _Windows:
@@ -160,8 +180,6 @@ def _windows(image: _Float32, points: FloatArray, frames: Frames, most_px: int =
         dy[packed].astype(np.float32),
         image[v, u],
         weight.astype(np.float32),
-        frames.bend_along.astype(np.float32)[:, None],
-        frames.bend_across.astype(np.float32)[:, None],
     )
 
 
@@ -178,13 +196,13 @@ def _edge(d: _Float32, w: _Float32) -> tuple[_Float32, _Float32, _Float32]:
 
 
 def _model(q: _Float32, win: _Windows) -> tuple[_Float32, _Float32]:
-    """Residuals (N, M) and the Jacobian of the model (N, 9, M), both zero outside the window."""
-    u0, v0, alpha, beta, w, b, a, gx, gy = (q[:, k, None] for k in range(_PARAMETERS))
+    """Residuals (N, M) and the Jacobian of the model (N, 11, M), both zero outside the window."""
+    u0, v0, alpha, beta, w, b, a, gx, gy, kappa, lam = (q[:, k, None] for k in range(_PARAMETERS))
     x, y = win.x - u0, win.y - v0
     c1, s1, c2, s2 = np.cos(alpha), np.sin(alpha), np.cos(beta), np.sin(beta)
     t1, t2 = c1 * x + s1 * y, c2 * x + s2 * y
     n1, n2 = c1 * y - s1 * x, s2 * x - c2 * y
-    k1t, k2t = win.bend_along * t1, win.bend_across * t2
+    k1t, k2t = kappa * t1, lam * t2
     E1, G1, W1 = _edge(n1 - 0.5 * k1t * t1, w)
     E2, G2, W2 = _edge(n2 + 0.5 * k2t * t2, w)
     light = (1.0 + gx * x + gy * y) * win.weight
@@ -202,16 +220,19 @@ def _model(q: _Float32, win: _Windows) -> tuple[_Float32, _Float32]:
     J[:, 6] = light * P
     J[:, 7] = x * toned
     J[:, 8] = y * toned
+    J[:, 9] = by_d1 * (-0.5 * t1 * t1)
+    J[:, 10] = by_d2 * (0.5 * t2 * t2)
     return win.grey * win.weight - light * tone, J
 
 
 def _start(points: FloatArray, frames: Frames, win: _Windows) -> FloatArray:
-    """Parameters (N, 9) with position and directions of the grid, and the grey levels that fit them."""
+    """Parameters (N, 11) with position and directions of the grid, and the grey levels that fit them."""
     q = np.zeros((len(points), _PARAMETERS))
     q[:, :2] = points - win.centre
     q[:, 2] = np.arctan2(frames.along[:, 1], frames.along[:, 0])
     q[:, 3] = np.arctan2(frames.across[:, 1], frames.across[:, 0])
     q[:, 4] = _START_WIDTH_PX
+    q[:, _BENDS] = frames.bends
     _, J = _model(q.astype(np.float32), win)
     ones, P = J[:, 5].astype(np.float64), J[:, 6].astype(np.float64)
     grey = win.grey * win.weight
@@ -242,14 +263,15 @@ def fit_corners(
     N = len(points)
     win = _windows(image, points, frames, reach_px)
     q = _start(points, frames, win)
-    damping = np.full(N, 1e-3)
+    freedom = np.maximum(win.weight.sum(axis=1).astype(np.float64) - _PARAMETERS, 1.0)
+    damping, converged = np.full(N, 1e-3), np.zeros(N, dtype=bool)
+    # Weight of the curvatures' own observation, for residuals of the size that the fit will leave.
+    noise = np.maximum(_NOISE * np.abs(q[:, 6]), _LEAST_NOISE)
+    prior = (noise[:, None] / np.maximum(frames.bend_sigmas, _LEAST_BEND_SIGMA)) ** 2
     r, J = _model(q.astype(np.float32), win)
-    normal, gradient = _normal(J, r)
-    cost = np.einsum("nm,nm->n", r, r, dtype=np.float64)
-    converged = np.zeros(N, dtype=bool)
+    normal, gradient, cost = _equations(q, r, J, prior, frames.bends)
     active = np.arange(N)
     diagonal = np.arange(_PARAMETERS)
-    freedom = np.maximum(win.weight.sum(axis=1).astype(np.float64) - _PARAMETERS, 1.0)
     for _ in range(iterations):
         N_a, g_a = normal[active], gradient[active]
         A = N_a.copy()
@@ -262,32 +284,45 @@ def fit_corners(
         trial = q[active] + step
         trial[:, 4] = np.clip(trial[:, 4], *_WIDTH_PX)
         r, J = _model(trial.astype(np.float32), win.take(active) if len(active) < N else win)
-        trial_cost = np.einsum("nm,nm->n", r, r, dtype=np.float64)
-        gain = (cost[active] - trial_cost) / np.maximum(foreseen, 1e-9)
-        better = trial_cost <= cost[active] * (1 + 1e-6)
+        equations = _equations(trial, r, J, prior[active], frames.bends[active])
+        gain = (cost[active] - equations[2]) / np.maximum(foreseen, 1e-9)
+        better = equations[2] <= cost[active] * (1 + 1e-6)
         # A step is small when it is so in pixels, or against the fit's own uncertainty.
         settled = (length < _STEP_PX) | (foreseen * freedom[active] < _STEP_SIGMA**2 * cost[active])
         won = active[better]
-        q[won], cost[won] = trial[better], trial_cost[better]
-        normal[won], gradient[won] = _normal(J[better], r[better])
+        q[won] = trial[better]
+        normal[won], gradient[won], cost[won] = (part[better] for part in equations)
         factor = np.where(gain > 0.75, 0.1, np.where(gain > 0.25, 1.0, 6.0))
         damping[active] = np.clip(damping[active] * factor, 1e-7, 1e8)
         converged[active] = better & settled & (damping[active] < 1e3)
         active = active[~converged[active]]
         if len(active) == 0:
             break
-    return _result(q, win, normal, cost, converged)
+    return _result(q, win, normal, cost, freedom, converged)
 
 
-def _normal(J: _Float32, r: _Float32) -> tuple[FloatArray, FloatArray]:
+def _equations(
+    q: FloatArray, r: _Float32, J: _Float32, prior: FloatArray, bends: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Normal matrix (N, 11, 11), right side (N, 11) and cost (N,), with the observed curvatures."""
     normal = (J @ J.transpose(0, 2, 1)).astype(np.float64)
-    return normal, (J @ r[:, :, None])[:, :, 0].astype(np.float64)
+    gradient = (J @ r[:, :, None])[:, :, 0].astype(np.float64)
+    cost = np.einsum("nm,nm->n", r, r, dtype=np.float64)
+    off = bends - q[:, _BENDS]
+    both = np.arange(_PARAMETERS)[_BENDS]
+    normal[:, both, both] += prior
+    gradient[:, _BENDS] += prior * off
+    return normal, gradient, cost + np.sum(prior * off**2, axis=1)
 
 
 def _result(
-    q: FloatArray, win: _Windows, normal: FloatArray, cost: FloatArray, converged: BoolArray
+    q: FloatArray,
+    win: _Windows,
+    normal: FloatArray,
+    cost: FloatArray,
+    freedom: FloatArray,
+    converged: BoolArray,
 ) -> LocalFit:
-    freedom = np.maximum(win.weight.sum(axis=1).astype(np.float64) - _PARAMETERS, 1.0)
     scale = np.sqrt(np.maximum(np.einsum("nii->ni", normal), 1e-12))
     scaled = normal / (scale[:, :, None] * scale[:, None, :]) + 1e-7 * np.eye(_PARAMETERS)
     inverse = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])

@@ -28,19 +28,25 @@ class Limits:
         outlier; share of outliers.
     repeat_share : share of unique views below which the copies rule the answer.
     decrement : standard deviations that the solver may stop short of a minimum.
-    split_ratio, split_sigma, split_least : two cameras: the statistic over what chance reaches, the
-        largest difference of an intrinsic over its standard deviation, and the difference of focal
-        length or principal point, as a share of the focal length or width, that matters.
+    split_ratio, change_ratio : two cameras, in any order and one after the other: the statistic over
+        what chance reaches. One camera reaches 1.2 in a hundred sets, two that differ by three
+        percent 2 to 50.
+    split_sigma, split_least : largest difference of an intrinsic over its standard deviation, and
+        the difference of focal length or principal point, as a share of the focal length or
+        width, that matters.
     aspect_bad, aspect_remark, aspect_sigma : squares that are not square, as a share, and over its
         standard deviation. Printers stretch by up to half a percent.
     pixel_aspect : fx over fy where the board cannot tell whether it is to blame.
-    bow_bad, bow_remark, bow_sigma : departure from flatness over the board's size.
+    bow_bad, bow_remark, bow_sigma : departure from flatness over the board's size, and over its
+        standard deviation.
+    bow_focal, fragile : share by which a bend that is there, or one of half a percent of the size,
+        may move the focal length.
     rival_cost, rival_focal : another minimum with a cost up to this much higher and a focal length
         this share away is a rival.
     """
 
     views: int = 4
-    focal_poor: float = 0.025
+    focal_poor: float = 0.02
     focal_free: float = 0.10
     spread_poor_deg: float = 10.0
     spread_free_deg: float = 4.0
@@ -57,7 +63,8 @@ class Limits:
     points_poor: float = 0.01
     repeat_share: float = 0.5
     decrement: float = 2.0
-    split_ratio: float = 1.3
+    split_ratio: float = 1.4
+    change_ratio: float = 1.3
     split_sigma: float = 4.0
     split_least: float = 0.007
     aspect_bad: float = 0.007
@@ -67,5 +74,7 @@ class Limits:
     bow_bad: float = 0.010
     bow_remark: float = 0.005
     bow_sigma: float = 4.0
+    bow_focal: float = 0.02
+    fragile: float = 0.03
     rival_cost: float = 1.10
     rival_focal: float = 0.10

@@ -73,7 +73,7 @@ def best_next_view(calibration: Calibration, information: FloatArray) -> Candida
     camera = calibration.camera
     width, height = camera.image_size_px
     box = target_box(calibration)
-    middle, extent = box.mean(axis=0), box.max(axis=0) - box.min(axis=0)
+    extent = box.max(axis=0) - box.min(axis=0)
     across, along = np.meshgrid(np.linspace(-0.5, 0.5, _GRID), np.linspace(-0.5, 0.5, _GRID))
     target = np.stack([across.ravel() * extent[0], along.ravel() * extent[1], np.zeros(_GRID**2)], axis=1)
     diagonal = float(np.hypot(extent[0], extent[1]))

@@ -58,7 +58,8 @@ def of_copies(first: IntArray, names: tuple[str, ...], ratio: float, limits: Lim
         return []
     who = listed([f"{names[i]} (as {names[first[i]]})" for i in copies], 4)
     one = len(copies) == 1
-    text = f"{who} {'shows' if one else 'show'} the board where another view does and {'counts' if one else 'count'} once"
+    verbs = ("shows", "counts") if one else ("show", "count")
+    text = f"{who} {verbs[0]} the board where another view does and {verbs[1]} once"
     if ratio > 1.05:
         text += f"; with the copies the standard deviations come out {ratio:.1f} times too small"
     many = len(first) - len(copies) <= limits.repeat_share * len(first)
@@ -72,8 +73,8 @@ def of_coverage(found: Coverage, calibration: Calibration, limits: Limits) -> li
         to = "the picture" if float(found.tilts_deg.max()) < limits.spread_poor_deg else "each other"
         text = (
             f"All views show the board nearly parallel to {to}: no two differ in tilt by more than "
-            f"{found.spread_deg:.1f} degrees (at least {limits.spread_poor_deg:.0f} are needed), and focal length "
-            "shows only in boards that are tilted differently."
+            f"{found.spread_deg:.1f} degrees (at least {limits.spread_poor_deg:.0f} are needed), and focal "
+            "length shows only in boards that are tilted differently."
         )
         kind = UNIDENTIFIABLE if found.spread_deg < limits.spread_free_deg else POOR
         out.append(Finding(kind, text, MORE_TILT))
@@ -105,8 +106,8 @@ def _of_order(found: Coverage, calibration: Calibration) -> list[Finding]:
     fewer = found.mirrored if found.mirrored.mean() <= 0.5 else ~found.mirrored
     names = [calibration.observations.names[i] for i in np.flatnonzero(fewer)]
     text = (
-        f"{listed(names)} {'shows' if len(names) == 1 else 'show'} the board mirrored with respect to the other "
-        "views: the points are listed in another order."
+        f"{listed(names)} {'shows' if len(names) == 1 else 'show'} the board mirrored with respect to the "
+        "other views: the points are listed in another order."
     )
     return [Finding(INCONSISTENT, text, "Give the points of all views in the same order.")]
 
@@ -129,14 +130,10 @@ def _of_frame(found: Coverage, calibration: Calibration, limits: Limits) -> list
     )
     if off > limits.centre_remark:
         swapped = bool(found.mirrored.all()) and width != height
-        why = (
-            "u and v may be swapped"
-            if swapped
-            else "the picture is cropped, its size is wrong, or it is not fixed"
-        )
+        why = "u and v may be swapped" if swapped else "the picture is cropped, or its size is wrong"
         text = (
-            f"The principal point ({camera.cx_px:.0f}, {camera.cy_px:.0f}) is {100 * off:.0f} % of the picture's side "
-            f"away from its centre (up to {100 * limits.centre_poor:.0f} is usual): {why}."
+            f"The principal point ({camera.cx_px:.0f}, {camera.cy_px:.0f}) is {100 * off:.0f} % of the "
+            f"picture's side away from its centre (up to {100 * limits.centre_poor:.0f} is usual): {why}."
         )
         out.append(Finding(POOR if off > limits.centre_poor or swapped else REMARK, text))
     return out
@@ -153,8 +150,8 @@ def of_misfit(found: Misfit, calibration: Calibration, limits: Limits) -> list[F
         good = float(np.median(rest)) if len(rest) else found.typical_px
         detail = listed([f"{names[i]} ({found.view_rms_px[i]:.2f} px)" for i in worse], 4)
         text = (
-            f"{detail} {'does' if len(worse) == 1 else 'do'} not fit the other views, whose RMS is {good:.2f} px: "
-            "misplaced corners, another board, or motion during the exposure."
+            f"{detail} {'does' if len(worse) == 1 else 'do'} not fit the other views, whose RMS is "
+            f"{good:.2f} px: misplaced corners, another board, or motion during the exposure."
         )
         advice = f"Leave out {listed([names[i] for i in worse], 4)}, or look at the corners there."
         out.append(Finding(INCONSISTENT, text, advice))
@@ -170,8 +167,8 @@ def of_misfit(found: Misfit, calibration: Calibration, limits: Limits) -> list[F
     limit = limits.rms_px * max(1.0, max(calibration.camera.image_size_px) / 1000)
     if found.typical_px > limit:
         text = (
-            f"The RMS error of a typical view is {found.typical_px:.2f} px (at most {limit:.1f} is good): the corners, "
-            "the board's description or the lens model is wrong."
+            f"The RMS error of a typical view is {found.typical_px:.2f} px (at most {limit:.1f} is good): "
+            "the corners, the board's description or the lens model is wrong."
         )
         advice = "Look at the corners, check the number of squares and try a richer lens model."
         out.append(Finding(INCONSISTENT if found.typical_px > 3 * limit else POOR, text, advice))
@@ -180,8 +177,9 @@ def of_misfit(found: Misfit, calibration: Calibration, limits: Limits) -> list[F
         share = count / max(found.points, 1)
         where = listed([names[i] for i in np.flatnonzero(found.bad_points.any(axis=1))])
         text = (
-            f"{count} point{'s lie' if count > 1 else ' lies'} more than {limits.point_factor:.0f} times the median "
-            f"error off, in {where} ({100 * share:.1f} % of all; at most {100 * limits.points_poor:.0f} is good)."
+            f"{count} point{'s lie' if count > 1 else ' lies'} more than {limits.point_factor:.0f} times the "
+            f"median error off, in {where} ({100 * share:.1f} % of all; at most "
+            f"{100 * limits.points_poor:.0f} is good)."
         )
         many = share > limits.points_poor
         out.append(
@@ -196,7 +194,7 @@ def of_misfit(found: Misfit, calibration: Calibration, limits: Limits) -> list[F
 
 def of_split(found: Split | None, in_order: bool, calibration: Calibration, limits: Limits) -> list[Finding]:
     """One camera, or two."""
-    if found is None or found.ratio < limits.split_ratio:
+    if found is None or found.ratio < (limits.change_ratio if in_order else limits.split_ratio):
         return []
     shift = {name: found.difference[name] / max(found.sigma[name], 1e-300) for name in found.difference}
     strongest = max(shift, key=lambda name: abs(shift[name]))
@@ -213,14 +211,15 @@ def of_split(found: Split | None, in_order: bool, calibration: Calibration, limi
         if name in shift
     )
     sure = (
-        f"({by}; {strongest.removesuffix('_px')} by {abs(shift[strongest]):.0f} standard deviations; the RMS falls "
-        f"from {found.rms_px:.3f} to {found.split_rms_px:.3f} px, {found.ratio:.1f} times what chance explains)"
+        f"({by}; {strongest.removesuffix('_px')} by {abs(shift[strongest]):.0f} standard deviations; the RMS "
+        f"falls from {found.rms_px:.3f} to {found.split_rms_px:.3f} px, {found.ratio:.1f} times what chance "
+        "explains)"
     )
     second = np.flatnonzero(found.second)
     if in_order:
         text = (
-            f"From {names[int(second[0])]} on the camera differs from the one before {sure}: the lens was refocused "
-            "or zoomed, or the camera changed."
+            f"From {names[int(second[0])]} on the camera differs from the one before {sure}: the lens was "
+            "refocused or zoomed, or the camera changed."
         )
     else:
         text = (
@@ -256,13 +255,25 @@ def of_target(found: TargetShape | None, calibration: Calibration, limits: Limit
         )
         advice = "" if cleared else "Take pictures with the board turned by 90 degrees in its plane."
         out.append(Finding(REMARK if cleared else POOR, text, advice))
-    bend = found.bow_m / found.size_m
-    if bend > limits.bow_remark and found.bow_significance > limits.bow_sigma:
+    return out + _of_flatness(found, limits)
+
+
+def _of_flatness(found: TargetShape, limits: Limits) -> list[Finding]:
+    """A bend that is there, or views that could not bear one."""
+    bend, moved = found.bow_m / found.size_m, abs(found.focal_shift)
+    certain = found.bow_significance > limits.bow_sigma
+    if certain and (bend > limits.bow_remark or moved > limits.bow_focal):
         text = (
-            f"The board is not flat: it is bent by about {1e3 * found.bow_m:.1f} mm over {1e3 * found.size_m:.0f} mm "
-            f"({found.bow_significance:.0f} standard deviations; up to {100 * limits.bow_bad:.0f} % is good), which "
-            f"moves the focal length by {100 * abs(found.focal_shift):.1f} %."
+            f"The board is not flat: it is bent by about {1e3 * found.bow_m:.1f} mm over "
+            f"{1e3 * found.size_m:.0f} mm ({found.bow_significance:.0f} standard deviations; up to "
+            f"{100 * limits.bow_bad:.0f} % is good), which moves the focal length by {100 * moved:.1f} %."
         )
-        kind = INCONSISTENT if bend > limits.bow_bad else REMARK
-        out.append(Finding(kind, text, "Glue the board to a flat plate."))
-    return out
+        kind = INCONSISTENT if bend > limits.bow_bad else POOR if moved > limits.bow_focal else REMARK
+        return [Finding(kind, text, "Glue the board to a flat plate.")]
+    if found.focal_per_bow > limits.fragile:
+        text = (
+            "The focal length hangs on the board's flatness: a bend of half a percent of its size "
+            f"({5 * found.size_m:.1f} mm) would move it by {100 * found.focal_per_bow:.1f} %."
+        )
+        return [Finding(REMARK, text, MORE_TILT)]
+    return []

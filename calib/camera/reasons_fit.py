@@ -14,7 +14,7 @@ from calib.camera.finding import POOR, REMARK, UNIDENTIFIABLE, Finding
 from calib.camera.limits import Limits
 from calib.camera.starts import FocalInterval, Start
 
-__all__ = ["MORE_TILT", "of_focal", "of_lens", "of_projection", "of_solution", "of_starts"]
+__all__ = ["MORE_TILT", "of_denominator", "of_focal", "of_lens", "of_projection", "of_solution", "of_starts"]
 
 MORE_TILT = "Tilt the board by 30 degrees or more, about its long and its short side in turn."
 _MORE_VIEWS = "Take at least ten pictures with the board tilted in different directions."
@@ -39,8 +39,8 @@ def of_solution(calibration: Calibration, unique: int, limits: Limits) -> list[F
     elif not calibration.converged and not short < 0.1:
         text = (
             f"The solver stopped ({calibration.termination}) after {calibration.evaluations} evaluations, "
-            f"{short:.2g} standard deviations short of a minimum (up to {limits.decrement:g} does not matter): "
-            "the views leave a direction nearly free."
+            f"{short:.2g} standard deviations short of a minimum (up to {limits.decrement:g} does not "
+            "matter): the views leave a direction nearly free."
         )
         out.append(Finding(REMARK if short < limits.decrement else UNIDENTIFIABLE, text))
     if calibration.degrees_of_freedom <= 0:
@@ -99,7 +99,8 @@ def of_focal(sigma_share: float, interval: FocalInterval | None, limits: Limits)
         known = f"{100 * sigma_share:.1f} %" if sigma_share < 2 else "no better than a factor of two"
         text = (
             f"The focal length is known to {known} (one standard deviation, residuals that are not white "
-            f"considered; {100 * limits.focal_poor:.1f} is good, {100 * limits.focal_free:.0f} means that it is free)."
+            f"considered; up to {100 * limits.focal_poor:.0f} is good, {100 * limits.focal_free:.0f} means "
+            "that it is free)."
         )
         out.append(Finding(POOR if sigma_share < limits.focal_free else UNIDENTIFIABLE, text, MORE_TILT))
     if interval is None:
@@ -109,14 +110,14 @@ def of_focal(sigma_share: float, interval: FocalInterval | None, limits: Limits)
         out.append(Finding(UNIDENTIFIABLE, text, MORE_TILT))
     elif not interval.bounded:
         text = (
-            f"The views fit a focal length of {_range(interval)} about as well as the {interval.fx_px:.0f} px "
-            "found: its 95 % interval has no end."
+            f"The views fit a focal length of {_range(interval)} about as well as the "
+            f"{interval.fx_px:.0f} px found: its 95 % interval has no end."
         )
         out.append(Finding(UNIDENTIFIABLE, text, MORE_TILT))
     elif interval.half_width_share > 2 * limits.focal_poor:
         text = (
-            f"Focal lengths from {interval.low_px:.1f} to {interval.high_px:.1f} px fit the views about equally "
-            f"well (95 % interval; {200 * limits.focal_poor:.0f} % to either side is good)."
+            f"Focal lengths from {interval.low_px:.1f} to {interval.high_px:.1f} px fit the views about "
+            f"equally well (95 % interval; {200 * limits.focal_poor:.0f} % to either side is good)."
         )
         free = interval.half_width_share > 2 * limits.focal_free
         out.append(Finding(UNIDENTIFIABLE if free else POOR, text, MORE_TILT))
@@ -127,6 +128,18 @@ def _range(interval: FocalInterval) -> str:
     if interval.low_px > 0.0:
         return f"any value above {interval.low_px:.0f} px"
     return f"any value below {interval.high_px:.0f} px" if np.isfinite(interval.high_px) else "any value"
+
+
+def of_denominator(sigma_share: float, limits: Limits) -> list[Finding]:
+    """What the rational model's denominator costs the focal length when it is free as well."""
+    if sigma_share < limits.focal_poor:
+        return []
+    known = f"{100 * sigma_share:.1f} %" if sigma_share < 2 else "no better than a factor of two"
+    text = (
+        f"The coefficients k4, k5 and k6 are not determined; with them free the focal length is known to "
+        f"{known} (up to {100 * limits.focal_free:.0f} does not matter, as distortion makes up for it)."
+    )
+    return [Finding(REMARK if sigma_share < limits.focal_free else POOR, text, "Use a simpler lens model.")]
 
 
 def of_projection(sigma_px: float, width: int, limits: Limits) -> list[Finding]:

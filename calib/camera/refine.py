@@ -36,6 +36,9 @@ _FAR = 0.2
 _UNKNOWN_SIGMA = 0.25
 """Sigma of a corner that was not refined, in squares."""
 _RESCUES = 3
+_PASSES = 3
+_STEADY_PX = 0.1
+"""Corners that moved farther are fitted again, with the curvatures of where they are now."""
 _LEAST_PICTURE_PX = 4
 
 _Float32 = npt.NDArray[np.float32]
@@ -180,7 +183,13 @@ def refine(gray: GrayImage, points: FloatArray) -> Refined | None:
     away = np.linalg.norm(first.points - rough.points.reshape(-1, 2), axis=1)
     stays = sound & (away < rough.limit_px.ravel())
     moved = np.where(stays[:, None], first.points, rough.points.reshape(-1, 2)).reshape(start.shape)
-    fit = fit_corners(image, moved.reshape(-1, 2), frames_of(moved))
+    for _ in range(_PASSES):
+        fit = fit_corners(image, moved.reshape(-1, 2), frames_of(moved))
+        before, moved = moved, np.where(_sound(fit, shape)[:, None], fit.points, moved.reshape(-1, 2)).reshape(
+            start.shape
+        )
+        if np.max(np.abs(moved - before)) < _STEADY_PX:
+            break
     fit, good, prediction = _rescued(image, fit, shape)
     if prediction is None:
         return None

@@ -8,8 +8,8 @@ The profile is the cost as a function of fx with everything else minimised. The 
 which it rises by less than 3.84 sigma^2 holds the truth with 95 % probability (Wilks) however
 lopsided it is.
 
-The denominator of the rational model is left at zero in the starts and at its values in the profile:
-it trades with the numerator at next to no cost, and the searches would never end.
+The rational model comes here `conditioned`: its denominator trades with the numerator at next to no
+cost, and the searches would never end.
 """
 
 from __future__ import annotations
@@ -24,13 +24,24 @@ from calib.camera.levenberg import minimise
 from calib.camera.projection import INTRINSICS, Block, free_intrinsics
 from calib.camera.zhang import homographies, poses_from_homographies
 
-__all__ = ["FocalInterval", "Start", "best_of_starts", "focal_interval", "held", "other_starts", "resolved"]
+__all__ = [
+    "FocalInterval",
+    "Start",
+    "best_of_starts",
+    "conditioned",
+    "focal_interval",
+    "held",
+    "other_starts",
+    "resolved",
+]
 
 FOCAL_STARTS = (0.4, 0.7, 1.1, 1.8, 4.0)
 """Focal lengths of the starts, over the longer side of the image."""
 
 _CHI2_95 = 3.84
 _MAX_ITERATIONS = 60
+_NEARLY = 1.05
+"""Cost of five coefficients over that of the rational model below which they do."""
 
 
 @dataclass(frozen=True)
@@ -73,13 +84,44 @@ def held(calibration: Calibration) -> tuple[str, ...]:
     return tuple(INTRINSICS[i] for i in every if i not in calibration.free)
 
 
+def conditioned(calibration: Calibration) -> Calibration:
+    """The same views without the freedom of the rational model's denominator; other models as they are.
+
+    The denominator trades with the numerator at next to no cost, so that what it leaves undetermined
+    says nothing about the camera. Where five coefficients do nearly as well they take its place, else
+    the denominator is held at its values.
+    """
+    loose = [INTRINSICS.index(name) for name in ("k4", "k5", "k6")]
+    kept = np.flatnonzero(~np.isin(calibration.free, loose))
+    if len(kept) == len(calibration.free):
+        return calibration
+    if all(name in calibration.free_names for name in ("k1", "k2", "p1", "p2", "k3")):
+        block, camera = calibration.block, calibration.camera
+        intrinsics = block.intrinsics.copy()
+        intrinsics[INTRINSICS.index("k1") :] = 0.0
+        simpler = calibrate(
+            calibration.observations,
+            camera.image_size_px,
+            "brown5",
+            skew="skew_px" in calibration.free_names,
+            fixed=tuple(name for name in held(calibration) if name != "skew_px"),
+            start=replace(block, intrinsics=intrinsics),
+            max_iterations=_MAX_ITERATIONS,
+        )
+        if simpler.converged and simpler.squared_sum < _NEARLY * calibration.squared_sum:
+            return simpler
+    rows = np.concatenate([kept, np.arange(len(calibration.free), calibration.normal.shape[1])])
+    normal = calibration.normal[:, rows][:, :, rows]
+    return replace(calibration, free=calibration.free[kept], normal=normal)
+
+
 def other_starts(calibration: Calibration, seed: int = 0) -> list[Start]:
     """Minima reached from focal lengths of 0.4 to 4 image widths and principal points about the centre."""
     rng = np.random.default_rng(seed)
     observations, camera = calibration.observations, calibration.camera
     width, height = camera.image_size_px
     H = homographies(observations)
-    free = _well_determined(calibration.free)
+    free = calibration.free
     ends = []
     for share in FOCAL_STARTS:
         focal = share * max(width, height)
@@ -177,7 +219,7 @@ def focal_interval(calibration: Calibration, sigma_fx_px: float, inflation: floa
     fx = calibration.camera.fx_px
     own = calibration.squared_sum
     target = _CHI2_95 * (inflation * calibration.sigma_px) ** 2
-    free = _well_determined(calibration.free)
+    free = calibration.free
     free = free[free != INTRINSICS.index("fx_px")]
     first = min(1.96 * sigma_fx_px * inflation, 0.15 * fx) if np.isfinite(sigma_fx_px) else 0.1 * fx
     first = max(first, 1e-9 * fx)
@@ -208,11 +250,6 @@ def focal_interval(calibration: Calibration, sigma_fx_px: float, inflation: floa
             here *= float(np.clip(1.05 * np.sqrt(target / max(now, 1e-3 * target)), 1.1, 3.0))
         ends.append(fx + sign * end)
     return FocalInterval(max(ends[0], 0.0), ends[1], fx, lower)
-
-
-def _well_determined(free: IntArray) -> IntArray:
-    """Without the rational model's denominator, which trades with the numerator at no cost."""
-    return free[~np.isin(free, [INTRINSICS.index(name) for name in ("k4", "k5", "k6")])]
 
 
 def _with_fx(block: Block, fx_px: float, with_fy: bool) -> Block:

@@ -13,8 +13,8 @@ has to be compared with what it would be by chance. With the quadratic evidence 
 3. the same search on made-up scores of one camera, drawn from each view's own information, tells what
    T2 chance reaches.
 
-The lens model is first widened to five coefficients and the target takes the shape that fits best: a
-lens that the model cannot follow, or a bent board, makes views disagree by where and how the board
+The lens model is first widened to five coefficients, where that helps, and the target takes the shape
+that fits best: a lens that the model cannot follow, or a bent board, makes views disagree by where and how the board
 lies in them, which is not a second camera.
 """
 
@@ -36,6 +36,9 @@ _QUANTILE = 3.5
 """Standard deviations above the replicates' mean that chance is said to reach."""
 _STARTS = 10
 _ROUNDS = 15
+_MAX_ITERATIONS = 40
+_WORTH = 3.0
+"""Fall of the cost, in variances, that a coefficient has to bring."""
 _LEAST = 3
 """Views that a group needs."""
 _PRIOR = {"fx_px": 0.3, "fy_px": 0.3, "cx_px": 0.15, "cy_px": 0.15, "skew_px": 0.05}
@@ -71,29 +74,38 @@ class Split:
 
 
 def widened(calibration: Calibration, displacement_m: FloatArray | None = None) -> Calibration:
-    """The same views with k1, k2, p1, p2 and k3 free, unless the model is richer or intrinsics are held.
+    """The same views with k1, k2, p1, p2 and k3 free, where the model is poorer and that helps.
 
     Parameters
     ----------
     displacement_m : (1 or N, M, 3) deformation of the target to take out first.
     """
-    camera, observations = calibration.camera, calibration.observations
+    camera, fixed = calibration.camera, held(calibration)
+    skew = "skew_px" in calibration.free_names
+    own = calibration
     if displacement_m is not None:
-        observations = observations.displaced(displacement_m)
-    fixed = held(calibration)
-    rich = camera.model in ("brown5", "rational8") or fixed not in ((), ("skew_px",))
-    if rich and displacement_m is None:
-        return calibration
-    found = calibrate(
-        observations,
+        own = calibrate(
+            calibration.observations.displaced(displacement_m),
+            camera.image_size_px,
+            camera.model,
+            skew=skew,
+            fixed=fixed,
+            start=calibration.block,
+            max_iterations=_MAX_ITERATIONS,
+        )
+    if camera.model in ("brown5", "rational8") or fixed not in ((), ("skew_px",)):
+        return own
+    rich = calibrate(
+        own.observations,
         camera.image_size_px,
-        camera.model if rich else "brown5",
-        skew="skew_px" in calibration.free_names,
-        fixed=fixed if rich else (),
-        start=calibration.block,
-        max_iterations=40,
+        "brown5",
+        skew=skew,
+        start=own.block,
+        max_iterations=_MAX_ITERATIONS,
     )
-    return found if found.squared_sum <= calibration.squared_sum else calibration
+    # Coefficients that explain nothing only blur the difference of two cameras.
+    worth = _WORTH * (len(rich.free) - len(own.free)) * own.sigma_px**2
+    return rich if rich.squared_sum < own.squared_sum - worth else own
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ from calib.camera.limits import Limits
 from calib.camera.misfit import misfit
 from calib.camera.next_view import best_next_view
 from calib.camera.screening import screen
-from calib.camera.starts import focal_interval, other_starts, resolved
+from calib.camera.starts import conditioned, focal_interval, other_starts, resolved
 from calib.camera.two_cameras import best_change, best_split, widened
 
 __all__ = ["Judgement", "judge"]
@@ -88,9 +88,16 @@ def judge(
     findings += reasons.of_misfit(
         misfit(fit, limits.view_bad, limits.point_factor, limits.point_floor_px), fit, limits
     )
-    findings += _uncertainty(fit, covered, limits, numbers)
-    findings += _contradictions(fit, limits, numbers)
-    return _concluded(findings, fit, numbers)
+    sturdy = conditioned(fit)
+    if sturdy is not fit:
+        share = _focal_share(fit, covariance(fit), 1.0)
+        findings += reasons_fit.of_denominator(share, limits)
+    findings += _uncertainty(sturdy, covered, limits, numbers)
+    findings += _contradictions(sturdy, limits, numbers)
+    lens = lens_shape(fit)
+    findings += reasons_fit.of_lens(lens, fit, covered.radius_share)
+    numbers.update(rms_px=fit.rms_px, lens_least_slope=lens.image_slope)
+    return _concluded(findings, sturdy, numbers)
 
 
 def _plain(calibration: Calibration) -> Calibration:
@@ -140,31 +147,26 @@ def _without_copies(
 def _uncertainty(
     fit: Calibration, covered: Coverage, limits: Limits, numbers: dict[str, float]
 ) -> list[Finding]:
-    """Standard deviations, profile, starts, lens."""
+    """Standard deviations, profile, starts."""
     known = covariance(fit)
     inflation = overdispersion(evidence(fit))
-    sigma = known.sigma()
-    focal = {name: value for name, value in sigma.items() if name in ("fx_px", "fy_px")}
-    share = max((inflation * value / getattr(fit.camera, name) for name, value in focal.items()), default=0.0)
+    share = _focal_share(fit, known, inflation)
     width = max(fit.camera.image_size_px)
     inside = _inside(covered)
-    projection = (
-        float(np.nanmedian(inflation * projection_sigma_px(fit, known, inside))) if len(inside) else np.inf
-    )
-    some, _ = _sampled(fit)
-    interval = None
+    projection = np.inf
+    if len(inside):
+        projection = float(np.nanmedian(inflation * projection_sigma_px(fit, known, inside)))
     findings = []
-    if "fx_px" in sigma:
-        own = covariance(some).sigma()["fx_px"] if some is not fit else sigma["fx_px"]
+    interval = None
+    if "fx_px" in known.names:
+        some, _ = _sampled(fit)
+        own = covariance(some).sigma()["fx_px"]
         interval = focal_interval(some, own, inflation)
         findings += reasons_fit.of_starts(other_starts(some), some, own, inflation, limits)
         numbers["fx_low_px"], numbers["fx_high_px"] = interval.low_px, interval.high_px
     findings += reasons_fit.of_focal(share, interval, limits)
     findings += reasons_fit.of_projection(projection, width, limits)
-    lens = lens_shape(fit)
-    findings += reasons_fit.of_lens(lens, fit, covered.radius_share)
     numbers.update(
-        rms_px=fit.rms_px,
         sigma_inflation=inflation,
         focal_sigma_share=share,
         projection_sigma_px=projection,
@@ -175,9 +177,15 @@ def _uncertainty(
         area_share=covered.area_share,
         cells_share=covered.cells_share,
         radius_share=covered.radius_share,
-        lens_least_slope=lens.image_slope,
     )
     return findings
+
+
+def _focal_share(fit: Calibration, known: Covariance, inflation: float) -> float:
+    """Larger relative standard deviation of the focal lengths, inflated; zero where they are held."""
+    sigma = known.sigma()
+    shares = [sigma[name] / getattr(fit.camera, name) for name in ("fx_px", "fy_px") if name in sigma]
+    return inflation * float(max(shares, default=0.0))
 
 
 def _contradictions(fit: Calibration, limits: Limits, numbers: dict[str, float]) -> list[Finding]:

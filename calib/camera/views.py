@@ -22,11 +22,14 @@ class View:
     target_m : (M, 2) points on the target's plane, metres.
     pixels : (M, 2) where the picture shows them, distorted pixels, (0, 0) at the centre of the
         top-left pixel, u right, v down.
+    measured : (M,) False for points that the picture does not show well enough to count; all True
+        when None. They keep their place, so that views of one board stay comparable.
     """
 
     name: str
     target_m: FloatArray
     pixels: FloatArray
+    measured: BoolArray | None = None
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,7 @@ class Observations:
     target_m : (1, M, 3) when every view shows the same points, else (N, M, 3); z is zero on a flat
         target.
     pixels : (N, M, 2).
-    present : (N, M), False for padding and for rejected points.
+    present : (N, M), False for padding and for points that were not measured or were rejected.
     """
 
     names: tuple[str, ...]
@@ -102,7 +105,7 @@ def pack(views: Sequence[View]) -> Observations:
     target = np.zeros((1 if shared else len(views), size, 3))
     for i, view in enumerate(views):
         pixels[i, : counts[i]] = view.pixels
-        present[i, : counts[i]] = True
+        present[i, : counts[i]] = True if view.measured is None else view.measured
         if not shared or i == 0:
             target[0 if shared else i, : counts[i], :2] = view.target_m
     return Observations(tuple(v.name for v in views), target, pixels, present)

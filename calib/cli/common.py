@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import sys
@@ -12,10 +13,27 @@ from typing import Annotated, Any, Protocol
 
 import typer
 
-__all__ = ["JsonOption", "ProgressCall", "RigOption", "document", "narrate", "progress_bar", "say", "table"]
+from calib.files import one_line
 
-RigOption = Annotated[Path, typer.Option("--rig", help="The rig's file, read and written.")]
+__all__ = [
+    "FiguresOption",
+    "JsonOption",
+    "ProgressCall",
+    "ReaderGoneError",
+    "RigOption",
+    "document",
+    "emit",
+    "narrate",
+    "progress_bar",
+    "say",
+    "table",
+]
+
+RigOption = Annotated[Path, typer.Option("--rig", help="The rig's file.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of words.")]
+FiguresOption = Annotated[
+    Path | None, typer.Option("--figures", help="Folder to draw figures into, made if needed.")
+]
 
 
 class ProgressCall(Protocol):
@@ -24,14 +42,28 @@ class ProgressCall(Protocol):
     def __call__(self, done: int, total: int) -> None: ...
 
 
+class ReaderGoneError(Exception):
+    """Nobody reads stdout any more, as when `head` has seen enough."""
+
+
 def narrate(message: str) -> None:
-    """A line for the person who watches, on stderr."""
-    sys.stderr.write(message + "\n")
+    """A line for the person who watches, on stderr; whether it arrives changes nothing."""
+    with contextlib.suppress(OSError):
+        sys.stderr.write(one_line(message) + "\n")
+        sys.stderr.flush()
 
 
 def say(message: str = "") -> None:
     """A line of the result, on stdout."""
-    sys.stdout.write(message + "\n")
+    emit(one_line(message) + "\n")
+
+
+def emit(text: str) -> None:
+    """Text of the result as it is, on stdout."""
+    try:
+        sys.stdout.write(text)
+    except BrokenPipeError as error:
+        raise ReaderGoneError from error
 
 
 def _finite(value: Any) -> Any:
@@ -47,7 +79,7 @@ def _finite(value: Any) -> Any:
 def document(verb: str, sections: dict[str, Any]) -> None:
     """Print the JSON document of a verb; what is not finite becomes null."""
     whole = {"schema": 1, "verb": verb, **sections}
-    sys.stdout.write(json.dumps(_finite(whole), indent=1, allow_nan=False, ensure_ascii=True) + "\n")
+    emit(json.dumps(_finite(whole), indent=1, allow_nan=False, ensure_ascii=True) + "\n")
 
 
 @contextmanager

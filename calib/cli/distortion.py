@@ -7,27 +7,39 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.common import JsonOption, RigOption, document, narrate, say, table
-from calib.errors import BadInputError, UsageError
+from calib.cli.common import FiguresOption, JsonOption, RigOption, document, narrate, say, table
+from calib.errors import BadInputError
 
 __all__ = ["distortion"]
 
 
 def distortion(
     region: Annotated[
-        str | None, typer.Option(help="Region of interest in pixels, as 78,52,238,156 (u0,v0,u1,v1).")
+        str | None,
+        typer.Option(
+            metavar="U0,V0,U1,V1",
+            help="Region of interest in px, as 78,52,238,156. [default: around the plane's workspace, "
+            "without a plane the middle]",
+        ),
     ] = None,
-    figures: Annotated[Path | None, typer.Option(help="Folder to draw figures into.")] = None,
+    figures: FiguresOption = None,
     rig: RigOption = Path("rig.yaml"),
     as_json: JsonOption = False,
 ) -> None:
-    """Say what lens distortion costs, and find the polynomial that undoes it."""
+    """Say what lens distortion costs, and find the polynomial that undoes it.
+
+    Needs the section camera of the rig's file, uses the section plane, and writes the section lens.
+    """
     from calib.camera.distortion import analyse_distortion
-    from calib.files import check_writable, shown
+    from calib.files import check_folder, check_writable, shown
     from calib.rig import Geometry, identity, read_rig, section_json, write_rig
     from calib.sections import camera_covariance, camera_from_section, current_plane, lens_section, plane_view
+    from calib.units import parse_region_px
 
+    region_px = parse_region_px(region) if region else None
     check_writable(rig)
+    if figures is not None:
+        check_folder(figures)
     before = read_rig(rig)
     if before.camera is None:
         raise BadInputError(f"{shown(rig)}: has no camera yet; run calib intrinsics first")
@@ -35,7 +47,7 @@ def distortion(
     plane = current_plane(before, str(rig))
     view = None if plane is None else plane_view(plane, before.geometry or Geometry())
     report = analyse_distortion(
-        camera, camera_covariance(before.camera, str(rig)), plane=view, region_px=_region(region)
+        camera, camera_covariance(before.camera, str(rig)), plane=view, region_px=region_px
     )
     section = lens_section(report)
     hashes = {"camera": identity(before.camera)} | ({} if plane is None else {"plane": identity(plane)})
@@ -45,6 +57,9 @@ def distortion(
 
         write_lens_figures(figures, camera, report)
         narrate(f"figures in {figures}")
+    if before.camera.verdict != "ok":
+        narrate(f"the camera's own verdict is {before.camera.verdict}; what follows is no better than that")
+    narrate(f"lens written to {shown(rig)}")
     if as_json:
         document("distortion", {"lens": section_json(section)})
         return
@@ -69,22 +84,11 @@ def distortion(
             say(line)
     inverse = section.inverse
     say(
-        f"inverse polynomial: {len(inverse.radial)} coefficients, {inverse.decentering_steps} decentering steps, "
-        f"error at most {inverse.max_error_px:.4f} px over {inverse.covered:.0%} of the picture"
+        f"inverse polynomial: {len(inverse.radial)} coefficients, {inverse.decentering_steps} decentering "
+        f"steps, error at most {inverse.max_error_px:.4f} px over {inverse.covered:.0%} of the picture"
     )
     for i, value in enumerate(inverse.radial, start=1):
         say(f"  c{i} = {value:.9g}")
     say(f"verdict: {section.verdict}")
     for reason in section.reasons:
         say(f"  - {reason}")
-    narrate(f"lens written to {rig}")
-
-
-def _region(text: str | None) -> tuple[float, float, float, float] | None:
-    if text is None:
-        return None
-    try:
-        u0, v0, u1, v1 = (float(part) for part in text.split(","))
-    except ValueError as error:
-        raise UsageError(f"--region: {text!r} is not four numbers, expected u0,v0,u1,v1 in pixels") from error
-    return u0, v0, u1, v1

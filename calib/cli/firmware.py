@@ -20,12 +20,16 @@ def firmware(
     rig: RigOption = Path("rig.yaml"),
     as_json: JsonOption = False,
 ) -> None:
-    """Write calib_constants.h with the camera's and the plane's constants."""
-    from calib.files import make_folder, shown, write_atomically
+    """Write calib_constants.h with the camera's and the plane's constants.
+
+    Exits 1 when the verdict of either is not ok; the header is written and says so.
+    """
+    from calib.files import check_folder, make_folder, shown, write_atomically
     from calib.firmware.header import header_text
     from calib.rig import read_rig
     from calib.sections import current_plane, firmware_constants
 
+    check_folder(output)
     whole = read_rig(rig)
     if whole.camera is None:
         raise BadInputError(f"{shown(rig)}: has no camera yet; run calib intrinsics first")
@@ -48,9 +52,9 @@ def firmware(
         if section is not None and section.verdict != "ok"
     ]
     if as_json:
-        document("firmware", {"files": [path.name], "constants": count, "gate": "passed" if not weak else weak})
+        document("firmware", {"files": [path.name], "constants": count, "gate": weak or "passed"})
     else:
-        say(f"{path}: {count} constants" + ("" if plane else ", no plane yet (calib extrinsics)"))
+        say(f"{shown(path)}: {count} constants" + ("" if plane else ", no plane yet (calib extrinsics)"))
     for what in weak:
         narrate(f"{what}; the header says so in CALIB_CAMERA_OK and CALIB_PLANE_OK, do not flash it unread")
     if weak:

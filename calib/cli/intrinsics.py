@@ -4,65 +4,95 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from calib.cli.common import JsonOption, RigOption, document, narrate, progress_bar, say, table
-from calib.errors import EXIT_POOR, UsageError
+from calib.cli.common import FiguresOption, JsonOption, RigOption, document, narrate, progress_bar, say, table
+from calib.errors import EXIT_POOR
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from calib.camera.intrinsics import Intrinsics
-    from calib.camera.views import View
     from calib.rig import Camera
 
 __all__ = ["intrinsics"]
-
-_MODELS = "auto, pinhole, radial2, radial3, brown5, rational8"
 
 
 def intrinsics(
     sources: Annotated[
         list[Path],
-        typer.Argument(help="A folder of pictures, single pictures, a table of correspondences, or a .vnl file."),
+        typer.Argument(
+            help="A folder of pictures (its sub-folders are not read) or single pictures; or a table of "
+            "correspondences view,x_m,y_m,u_px,v_px (.csv); or corners of mrgingham or mrcal (.vnl).",
+        ),
     ],
-    corners: Annotated[str | None, typer.Option(help="Inner corners, columns x rows, as 7x5.")] = None,
-    square: Annotated[str | None, typer.Option(help="Length of a square, as 20mm.")] = None,
-    image_size: Annotated[
-        str | None, typer.Option("--image-size", help="Picture size for tables, as 640x480.")
+    corners: Annotated[
+        str | None,
+        typer.Option(
+            metavar="CxR", help="Inner corners, columns x rows, as 7x5. [default: board.yaml, else found]"
+        ),
     ] = None,
-    model: Annotated[str, typer.Option(help=f"Lens model: {_MODELS}.")] = "auto",
+    square: Annotated[
+        str | None,
+        typer.Option(metavar="LENGTH", help="Side of a square with its unit, as 20mm. [default: board.yaml]"),
+    ] = None,
+    image_size: Annotated[
+        str | None,
+        typer.Option(
+            "--image-size", metavar="WxH", help="Size of the pictures in px, for tables, as 640x480."
+        ),
+    ] = None,
+    model: Annotated[
+        Literal["auto", "pinhole", "radial2", "radial3", "brown5", "rational8"],
+        typer.Option(help="Lens model; auto compares all on views held back."),
+    ] = "auto",
     skew: Annotated[bool, typer.Option("--skew", help="Estimate the skew as well.")] = False,
-    loss: Annotated[str, typer.Option(help="Loss: none, huber or cauchy.")] = "none",
-    board: Annotated[str, typer.Option(help="Board: rigid, warp, released, or auto.")] = "rigid",
-    reject: Annotated[bool, typer.Option("--reject", help="Leave out points that lie far off.")] = False,
-    figures: Annotated[Path | None, typer.Option(help="Folder to draw figures into.")] = None,
+    loss: Annotated[
+        Literal["none", "huber", "cauchy"], typer.Option(help="Robust loss of the residuals.")
+    ] = "none",
+    board: Annotated[
+        Literal["rigid", "warp", "released", "auto"],
+        typer.Option(help="The board: flat, bent by two parameters, with free corners, or compared."),
+    ] = "rigid",
+    reject: Annotated[
+        bool, typer.Option("--reject", help="Leave out points that lie far off, and say which.")
+    ] = False,
+    figures: FiguresOption = None,
     rig: RigOption = Path("rig.yaml"),
     as_json: JsonOption = False,
 ) -> None:
-    """Calibrate the camera from views of a checkerboard."""
-    from calib.camera.intrinsics import Choices, calibrate_camera
-    from calib.files import check_writable
-    from calib.rig import read_rig, section_json, write_rig
-    from calib.sections import camera_section
+    """Calibrate the camera from views of a checkerboard.
 
-    choices = Choices(
-        model=_one_of("--model", model, _MODELS.split(", ")),
-        skew=skew,
-        loss=_one_of("--loss", loss, ["none", "huber", "cauchy"]),
-        board=_one_of("--board", board, ["rigid", "warp", "released", "auto"]),
-        reject=reject,
+    Writes the section camera of the rig's file. Exits 1 when the verdict is not ok.
+    """
+    from calib.camera.intrinsics import Choices, calibrate_camera
+    from calib.files import check_folder, check_writable, shown
+    from calib.inputs import Told, read_views
+    from calib.rig import read_rig, section_json, write_rig
+    from calib.sections import camera_section, outdated
+    from calib.units import parse_corners, parse_image_size, parse_square_m
+
+    told = Told(
+        parse_corners(corners) if corners else None,
+        parse_square_m(square) if square else None,
+        parse_image_size(image_size) if image_size else None,
     )
     check_writable(rig)
+    if figures is not None:
+        check_folder(figures)
     before = read_rig(rig)
     began = time.perf_counter()
-    views, size, hashes, without = _views(sources, corners, square, image_size)
+    with progress_bar("finding boards") as progress:
+        seen = read_views(sources, told, progress)
+    for remark in seen.remarks:
+        narrate(remark)
     detected = time.perf_counter()
-    result = calibrate_camera(views, size, choices)
+    choices = Choices(model=model, skew=skew, loss=loss, board=board, reject=reject)
+    result = calibrate_camera(seen.views, seen.image_size_px, choices)
     section = camera_section(result)
-    write_rig(rig, before.model_copy(update={"camera": section}), {"camera": hashes})
+    after = write_rig(rig, before.model_copy(update={"camera": section}), {"camera": seen.hashes})
     seconds = {"detect": detected - began, **result.seconds}
     if figures is not None:
         from calib.report.camera_figures import write_camera_figures
@@ -76,65 +106,18 @@ def intrinsics(
                 "camera": section_json(section),
                 "models": _comparison(result.models),
                 "boards": _comparison(result.boards),
-                "pictures_without_board": list(without),
+                "pictures_without_board": list(seen.without),
                 "per_view": _per_view(result),
                 "seconds": seconds,
             },
         )
     else:
-        _print(section, result, without, rig)
+        _print(section, result, seen.without)
+    narrate(f"camera written to {shown(rig)}")
+    for sentence in outdated(after):
+        narrate(sentence)
     if section.verdict != "ok":
         raise typer.Exit(EXIT_POOR)
-
-
-def _one_of(option: str, value: str, allowed: list[str]) -> str:
-    if value not in allowed:
-        raise UsageError(f"{option}: {value!r} is not one of {', '.join(allowed)}")
-    return value
-
-
-def _views(
-    sources: list[Path], corners: str | None, square: str | None, image_size: str | None
-) -> tuple[Sequence[View], tuple[int, int], dict[str, str], tuple[str, ...]]:
-    """Views, picture size, SHA-256 of each input, and pictures without a board."""
-    from calib.units import parse_corners, parse_image_size, parse_length_m
-
-    size = parse_corners(corners) if corners else None
-    square_m = parse_length_m(square, "--square") if square else None
-    first = sources[0]
-    if first.suffix.lower() in (".csv", ".vnl") and not first.is_dir():
-        from calib.rig import hash_of
-        from calib.tables import read_table, read_vnl
-
-        if len(sources) > 1:
-            raise UsageError("give one table, or pictures, not several tables")
-        if image_size is None:
-            raise UsageError(f"{first.name}: a table does not tell the picture's size; give --image-size 640x480")
-        if first.suffix.lower() == ".csv":
-            views = read_table(first)
-        else:
-            if size is None:
-                raise UsageError(f"{first.name}: a .vnl file does not tell the board; give --corners and --square")
-            views = read_vnl(first, *size, square_m if square_m is not None else 1.0)
-        return views, parse_image_size(image_size), {first.name: hash_of(first)}, ()
-    from calib.boards import find_boards, read_board_file
-    from calib.pictures import list_pictures
-
-    paths = list_pictures(sources)
-    told = read_board_file(first if first.is_dir() else first.parent)
-    if size is None and told.corners is not None:
-        size = (told.corners[0], told.corners[1])
-    if square_m is None:
-        square_m = told.square_m
-    if square_m is None:
-        narrate("the square's length is not given; intrinsics do not depend on it, lengths are in squares")
-    with progress_bar("finding boards") as progress:
-        found = find_boards(paths, size, square_m if square_m is not None else 1.0, progress)
-    board = found.board
-    if size is None:
-        narrate(f"found a board with {board.columns}x{board.rows} inner corners")
-    narrate(f"board found in {len(found.views)} of {len(paths)} pictures")
-    return found.views, found.image_size_px, found.hashes, found.without
 
 
 def _comparison(candidates: Sequence[Any]) -> list[dict[str, Any]]:
@@ -161,7 +144,7 @@ def _per_view(result: Intrinsics) -> list[dict[str, Any]]:
     ]
 
 
-def _print(section: Camera, result: Intrinsics, without: Sequence[str], rig: Path) -> None:
+def _print(section: Camera, result: Intrinsics, without: Sequence[str]) -> None:
     for what, candidates in (("model", result.models), ("board", result.boards)):
         if candidates:
             rows = [
@@ -201,4 +184,3 @@ def _print(section: Camera, result: Intrinsics, without: Sequence[str], rig: Pat
         say(f"  (remark) {remark}")
     for advice in section.advice:
         say(f"  next: {advice}")
-    narrate(f"camera written to {rig}")

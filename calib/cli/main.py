@@ -2,26 +2,36 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
+import re
 import sys
+import threading
+import warnings
 from typing import NoReturn
 
 # Small matrices gain nothing from BLAS threads, and sums then do not depend on their number.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
 os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")
 
 import typer
 
 from calib import __version__
 from calib.cli.board import board
+from calib.cli.common import ReaderGoneError, narrate
 from calib.cli.distortion import distortion
 from calib.cli.exchange import export_camera, import_camera
 from calib.cli.extrinsics import extrinsics
 from calib.cli.firmware import firmware
 from calib.cli.intrinsics import intrinsics
-from calib.errors import EXIT_BAD_INPUT, CalibError
+from calib.cli.simulate import simulate
+from calib.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERNAL, CalibError, UsageError
 
 __all__ = ["app", "main"]
+
+_EXIT_INTERRUPTED = 130
+_EXIT_READER_GONE = 141
 
 app = typer.Typer(
     name="calib",
@@ -53,33 +63,116 @@ app.command("extrinsics")(extrinsics)
 app.command("distortion")(distortion)
 app.command("firmware")(firmware)
 app.command("board")(board)
+app.command("simulate")(simulate)
 app.command("export")(export_camera)
 app.command("import")(import_camera)
 
 
-def _say(message: str) -> None:
-    sys.stderr.write(f"calib: {' '.join(message.split())}\n")
-
-
 def main() -> NoReturn:
-    """Run the command; every foreseen failure is one sentence on stderr and an exit code."""
+    """Run the command; every failure is one sentence on stderr and an exit code.
+
+    With CALIB_DEBUG=1 in the environment an unforeseen failure shows where it happened, and what
+    libraries write to stderr is not held back.
+    """
+    debug = os.environ.get("CALIB_DEBUG") == "1"
+    _prepare_streams(debug)
+    with warnings.catch_warnings():
+        if not sys.warnoptions and not debug:
+            warnings.simplefilter("ignore")
+        code = _flushed(_run(debug))
+    if threading.active_count() > 1 and code == _EXIT_INTERRUPTED:
+        # Pictures are still being searched; nothing waits for them any more.
+        os._exit(code)
+    sys.exit(code)
+
+
+def _run(debug: bool) -> int:
     try:
+        empty = next((word for word in sys.argv[1:] if not word or re.fullmatch(r"--[a-z-]+=", word)), None)
+        if empty is not None:
+            raise UsageError(f"an argument is empty: {empty!r}")
         app()
+    except SystemExit as leaving:
+        code = leaving.code if isinstance(leaving.code, int) else EXIT_DONE
+        if code == _EXIT_INTERRUPTED:
+            return _interrupted()
+        return code
     except CalibError as error:
-        _say(str(error))
-        sys.exit(error.exit_code)
+        return _ended(str(error), error.exit_code)
     except KeyboardInterrupt:
-        _say("interrupted; files that were there before are unchanged")
-        sys.exit(130)
-    except BrokenPipeError:
-        # The reader of stdout went away, as `head` does.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(141)
+        return _interrupted()
+    except ReaderGoneError:
+        return _EXIT_READER_GONE
     except MemoryError:
-        _say("out of memory; the input is larger than this machine can hold")
-        sys.exit(EXIT_BAD_INPUT)
+        return _ended("out of memory; the input is larger than this machine can hold", EXIT_BAD_INPUT)
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
-        _say(f"{where}{error.strerror or error}")
-        sys.exit(EXIT_BAD_INPUT)
-    sys.exit(0)
+        return _ended(f"{where}{error.strerror or error}", EXIT_BAD_INPUT)
+    except Exception as error:
+        if debug:
+            raise
+        return _ended(
+            f"internal error: {_described(error)}; please report it (CALIB_DEBUG=1 shows more)", EXIT_INTERNAL
+        )
+    return EXIT_DONE
+
+
+def _ended(message: str, code: int) -> int:
+    narrate(f"calib: {' '.join(message.split())}")
+    return code
+
+
+def _interrupted() -> int:
+    return _ended("interrupted; files that were there before are unchanged or whole", _EXIT_INTERRUPTED)
+
+
+def _described(error: BaseException) -> str:
+    """Kind and words of an exception, and where in this package it came from."""
+    where = ""
+    trace = error.__traceback__
+    while trace is not None:
+        module = str(trace.tb_frame.f_globals.get("__name__", ""))
+        if module.startswith("calib."):
+            where = f" ({module}, line {trace.tb_lineno})"
+        trace = trace.tb_next
+    words = " ".join(str(error).split())[:200]
+    return f"{type(error).__name__}{': ' if words else ''}{words}{where}"
+
+
+def _prepare_streams(debug: bool) -> None:
+    """Standard streams that exist, take any text, and are not written to by libraries in C."""
+    for descriptor in (0, 1, 2):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
+    if sys.stdout is None:
+        sys.stdout = open(1, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
+    if sys.stderr is None:
+        sys.stderr = open(2, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # A file's name may hold what the terminal's encoding has not.
+        sys.stdout.reconfigure(errors="backslashreplace")
+    if not debug and sys.stderr is sys.__stderr__ and isinstance(sys.stderr, io.TextIOWrapper):
+        # libpng and libjpeg print their complaints; ours go to a descriptor of our own.
+        own = os.dup(2)
+        encoding = sys.stderr.encoding
+        sys.stderr = open(own, "w", buffering=1, encoding=encoding, errors="backslashreplace")  # noqa: SIM115, PTH123
+        nothing = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nothing, 2)
+        os.close(nothing)
+
+
+def _flushed(code: int) -> int:
+    """Exit code after all of stdout has been written, or could not be."""
+    try:
+        sys.stdout.flush()
+        return code
+    except BrokenPipeError:
+        code = code or _EXIT_READER_GONE
+    except OSError as error:
+        code = _ended(f"standard output: cannot be written: {error.strerror or error}", EXIT_BAD_INPUT)
+    # What is left in the buffer would be tried again, and complained of, at the interpreter's end.
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return code

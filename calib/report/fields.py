@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib import patheffects
 from matplotlib.axes import Axes
-from matplotlib.colors import BoundaryNorm
+from matplotlib.colors import BoundaryNorm, Normalize
 from matplotlib.contour import ContourSet, QuadContourSet
 from matplotlib.patches import Ellipse, Rectangle
 from matplotlib.ticker import MaxNLocator
+from matplotlib.transforms import ScaledTranslation
 
 from calib.arrays import FloatArray
 from calib.report.style import BLUE, INK, RISING, SHADE, empty, number, round_down
@@ -27,7 +29,7 @@ __all__ = [
     "picture_frame",
 ]
 
-_LEAST_IN, _MOST_IN = 2.6, 7.4
+_LEAST_IN, _MOST_IN = 1.6, 7.4
 _NEARLY_FLAT = 1e-3
 """A map whose values differ by less than this share has no contours worth drawing."""
 _STEEP = 12.0
@@ -69,9 +71,10 @@ def arrows(
     reach: float,
     unit: str = "px",
     *,
-    colour: str = BLUE,
+    colour: Any = BLUE,
     pivot: str = "tail",
     magnification: float | None = None,
+    keyed: bool = True,
 ) -> float:
     """Arrows at (n, 2) for vectors (n, 2) in the axes' own unit, with a key above the upper right corner.
 
@@ -79,6 +82,7 @@ def arrows(
     ----------
     reach : length in the axes' unit that the longer vectors should get.
     magnification : to use instead of the one that follows from `reach`.
+    keyed : draw the key.
 
     Returns
     -------
@@ -90,7 +94,7 @@ def arrows(
     longest = float(np.quantile(length, 0.98)) if len(length) else 0.0
     if magnification is None:
         magnification = magnified(reach, longest)
-    drawn = axes.quiver(
+    axes.quiver(
         at[:, 0],
         at[:, 1],
         vectors[:, 0],
@@ -108,13 +112,23 @@ def arrows(
         color=colour,
         zorder=5,
     )
-    if longest > 0.0:
-        # At least a readable shaft: the key is the round length next below the longer arrows.
-        low, high = sorted(axes.get_xlim())
-        key = round_down(1.3 * reach / magnification)
-        share = key * magnification / (high - low)
-        axes.quiverkey(drawn, 1.0 - share, 1.035, key, f"{key:g} {unit}", labelpos="W", labelsep=0.06)
+    if longest > 0.0 and keyed:
+        _key(axes, round_down(1.3 * reach / magnification), magnification, unit, colour)
     return magnification
+
+
+def _key(axes: Axes, length: float, magnification: float, unit: str, colour: Any) -> None:
+    """An arrow of known length above the upper right corner, level with the panel's title."""
+    (left, end), (bottom, top) = sorted(axes.get_xlim()), sorted(axes.get_ylim())
+    start = end - length * magnification
+    # Above a narrow panel there is no room beside the title.
+    lift = 10.0 if end - left > 0.7 * (top - bottom) else 28.0
+    above = ScaledTranslation(0.0, lift / 72.0, axes.figure.dpi_scale_trans)
+    place = axes.get_xaxis_transform() + above
+    arrow = {"arrowstyle": "-|>", "color": colour, "linewidth": 1.3, "shrinkA": 0.0, "shrinkB": 0.0}
+    axes.annotate("", (end, 1.0), xytext=(start, 1.0), xycoords=place, textcoords=place, arrowprops=arrow)
+    room = 0.015 * (end - left)
+    axes.text(start - room, 1.0, f"{length:g} {unit}", transform=place, ha="right", va="center_baseline")
 
 
 def magnified(reach: float, longest: float) -> float:
@@ -133,7 +147,8 @@ def contour_levels(values: FloatArray, *, even: bool = False) -> FloatArray:
     if low > 0.0 and high > _STEEP * low and not even:
         first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
         steps = ("1", "2", "5") if high / low < 3e3 else ("1",)
-        levels = [float(f"{step}e{k}") for k in range(first, last + 1) for step in steps]
+        # One decade more on both sides: logarithms of round numbers may be off by their last digit.
+        levels = [float(f"{step}e{k}") for k in range(first - 1, last + 2) for step in steps]
         inside = [level for level in levels if low < level < high]
         under = [level for level in levels if level <= low]
         over = [level for level in levels if level >= high]
@@ -148,15 +163,16 @@ def contour_map(
     values: FloatArray,
     unit: str,
     *,
-    levels: FloatArray | None = None,
     even: bool = False,
+    norm: Normalize | None = None,
     labelled: bool = True,
 ) -> ContourSet | None:
     """Filled contours of values (rows, columns) over x, y, hatched where unknown.
 
     Parameters
     ----------
-    levels : of the contours; see `contour_levels` by default, which takes `even`.
+    even : see `contour_levels`.
+    norm : colours by value, for panels that are to be compared; by default each level has its own.
     labelled : draw the lines between the levels and write their values on them.
 
     Returns what a colour bar needs, None where the map has no contours (nothing known, or all alike);
@@ -187,9 +203,8 @@ def contour_map(
         )
         empty(axes, f"{number(float(finite.mean()), unit)} everywhere")
         return None
-    if levels is None:
-        levels = contour_levels(finite, even=even)
-    norm = BoundaryNorm(levels, RISING.N)
+    levels = contour_levels(finite, even=even)
+    norm = BoundaryNorm(levels, RISING.N) if norm is None else norm
     filled = axes.contourf(x, y, known, levels=levels, cmap=RISING, norm=norm, zorder=1)
     inside = levels[(levels > finite.min()) & (levels < finite.max())]
     if len(inside) and labelled:
@@ -217,12 +232,16 @@ def _label(axes: Axes, lines: QuadContourSet) -> None:
         text.set_zorder(3)
 
 
-def colour_bar(axes: Axes | list[Axes], drawn: ContourSet, label: str) -> None:
-    """A colour bar to the right with every level named."""
-    figure = (axes[0] if isinstance(axes, list) else axes).figure
-    figure.colorbar(
-        drawn, ax=axes, fraction=0.045, pad=0.02, shrink=0.92, format="%g", ticks=drawn.levels, label=label
-    )
+def colour_bar(
+    axes: Axes, drawn: ContourSet, label: str, where: Literal["right", "bottom"] = "right"
+) -> None:
+    """A colour bar with its levels named."""
+    bar = axes.figure.colorbar(drawn, ax=axes, location=where, fraction=0.045, pad=0.02, shrink=0.92)
+    levels = list(drawn.levels)
+    if where == "bottom":
+        levels = levels[:: math.ceil(len(levels) / 5)]
+    bar.set_ticks(levels, labels=[f"{level:g}" for level in levels])
+    bar.set_label(label)
 
 
 def ellipse(

@@ -19,6 +19,7 @@ from calib.camera.projection import INTRINSICS, camera_from_vector, vector_from_
 from calib.camera.undistortion import (
     InversePolynomial,
     distorted_normalised,
+    exact_inverse,
     fold_radius,
     pixel_grid,
     undistort_by_polynomial,
@@ -44,8 +45,8 @@ from calib.report.style import (
 
 __all__ = ["distortion_figure", "write_lens_figures"]
 
-_SAMPLE = 6000
-"""Pixels at which the inverse polynomial is compared with the exact inverse."""
+_SAMPLE = 40_000
+"""Pixels over which the displacement is averaged."""
 
 
 def write_lens_figures(folder: Path, camera: Camera, report: DistortionReport) -> list[Path]:
@@ -79,10 +80,10 @@ def distortion_figure(
         note = "This camera model has no distortion."
     else:
         note = (
-            f"{distortion_kind(camera).capitalize()} distortion: up to {number(float(length.max()), 'px')}, "
-            f"{number(float(length.mean()), 'px')} on average over the picture. Arrows lead from where a lens "
-            "without distortion shows a point to where this one does. Dashed, shaded: where corners were seen, and "
-            "where none were."
+            f"Kind: {distortion_kind(camera)}; up to {number(float(length.max()), 'px')}, mean "
+            f"{number(float(length.mean()), 'px')} over the picture. Arrows lead from where a lens without "
+            "distortion shows a point to where this one does. Dashed: hull of the corners seen; shaded: none "
+            "seen."
         )
     figure = _sheet(camera, "How far lens distortion moves what is seen", note, verdict)
     left, right = figure.subplots(1, 2, width_ratios=[1.55, 1.0])
@@ -215,38 +216,46 @@ def _radial_curve(
                 reached, last, facecolor="#fdeccc", edgecolor=ORANGE, hatch="//", linewidth=0.5, zorder=0
             )
     if fold < last:
-        axes.axvline(fold, color=VERMILLION, linewidth=1.4)
-        title = "Along the radius; the model folds over at the red line"
+        axes.axvline(fold, color=INK, linewidth=1.4, linestyle=":")
+        title = "Along the radius, to where the model folds over"
     axes.grid()
     axes.set_title(title)
 
 
 def _displacement(camera: Camera, report: DistortionReport) -> Figure:
     """The map of Fig. B.2 with the region of interest, and the radial curve."""
+    most, mean = number(report.max_px, "px"), number(report.mean_px, "px")
+    region_most, region_mean = number(report.region_max_px, "px"), number(report.region_mean_px, "px")
     note = (
-        f"{plain(report.kind).capitalize()} distortion. Whole picture: up to {number(report.max_px, 'px')}, mean "
-        f"{number(report.mean_px, 'px')}. Region of interest (box): up to {number(report.region_max_px, 'px')}, "
-        f"mean {number(report.region_mean_px, 'px')}."
+        f"Kind: {plain(report.kind)}; verdict: {plain(report.verdict)}. Whole picture: up to {most}, mean "
+        f"{mean}. Region of interest (box): up to {region_most}, mean {region_mean}."
     )
     if report.plane is not None:
+        read, fitted = number(report.plane.max_mm, "mm"), number(report.plane.refitted_max_mm, "mm")
         note += (
-            f" On the plane, reading without the lens costs up to {number(report.plane.max_mm, 'mm')}; the best "
-            f"map without a lens {number(report.plane.refitted_max_mm, 'mm')}."
+            f" On the plane, reading without the lens costs up to {read}, with the best map that knows no "
+            f"lens {fitted}."
         )
-    figure = _sheet(camera, f"What lens distortion does to the picture: {plain(report.verdict)}", note, "ok")
+    if not report.monotonic:
+        note += " Beyond the dotted line the model folds over."
+    figure = _sheet(camera, "What lens distortion does to the picture", note, "ok")
     left, right = figure.subplots(1, 2, width_ratios=[1.55, 1.0])
     _map(left, camera, report.region_px)
     _radial_curve(right, camera)
+    u0, v0, u1, v1 = report.region_px
+    corners = np.array([[u0, v0], [u1, v0], [u1, v1], [u0, v1]]) - [camera.cx_px, camera.cy_px]
+    right.axvline(float(np.linalg.norm(corners, axis=1).max()), color=VERMILLION, linewidth=1.8)
+    right.set_title("Along the radius; red: end of the region")
     return figure
 
 
 def _inverse(camera: Camera, inverse: InversePolynomial) -> Figure:
     """Distance between the polynomial's answer and the exact one, over the picture and the radius."""
     count = len(inverse.radial)
+    most, asked = number(inverse.max_error_px, "px"), number(inverse.tolerance_px, "px", 1)
     note = (
-        f"{count} radial coefficient{'' if count == 1 else 's'}; largest error "
-        f"{number(inverse.max_error_px, 'px')}, asked for {number(inverse.tolerance_px, 'px', 1)} (dashed line). "
-        f"It holds over {100 * inverse.covered:.0f} % of the picture."
+        f"{count} radial coefficient{'' if count == 1 else 's'}; largest error {most} where {asked} is asked "
+        f"for, over the {100 * inverse.covered:.0f} % of the picture that the lens model can show."
     )
     figure = _sheet(camera, "How well the firmware's polynomial undoes the lens", note, "ok")
     left, right = figure.subplots(1, 2, width_ratios=[1.55, 1.0])
@@ -254,16 +263,18 @@ def _inverse(camera: Camera, inverse: InversePolynomial) -> Figure:
     u, v = grid_over(camera.image_size_px, 121)
     pixels = np.stack(np.meshgrid(u, v), axis=-1)
     error = _inverse_error(camera, inverse, pixels.reshape(-1, 2))
-    drawn = contour_map(left, u, v, error.reshape(pixels.shape[:2]), "px", labelled=False)
+    drawn = contour_map(left, u, v, error.reshape(pixels.shape[:2]), "px", even=True, labelled=False)
     if drawn is not None:
-        colour_bar(left, drawn, "error (px)")
+        colour_bar(left, drawn, "error (px)", "bottom")
     left.set_title("Error over the picture")
     radius = np.linalg.norm(pixels.reshape(-1, 2) - [camera.cx_px, camera.cy_px], axis=1)
     right.scatter(radius, error, s=2.5, color=BLUE, linewidths=0, zorder=3)
-    right.axhline(inverse.tolerance_px, color=VERMILLION, linewidth=1.6, linestyle="--", zorder=4)
     finite = error[np.isfinite(error)]
     largest = float(finite.max()) if len(finite) else 0.0
-    right.set_ylim(0.0, 1.15 * max(largest, inverse.tolerance_px))
+    shown = inverse.tolerance_px <= 4.0 * largest or largest == 0.0
+    if shown:
+        right.axhline(inverse.tolerance_px, color=VERMILLION, linewidth=1.6, linestyle="--", zorder=4)
+    right.set_ylim(0.0, 1.15 * max(largest, inverse.tolerance_px if shown else 0.0))
     right.set_xlim(0.0, float(radius.max()))
     right.grid()
     right.set_xlabel("distance from the principal point (px)")
@@ -274,7 +285,7 @@ def _inverse(camera: Camera, inverse: InversePolynomial) -> Figure:
 
 def _inverse_error(camera: Camera, inverse: InversePolynomial, pixels: FloatArray) -> FloatArray:
     """Distance in pixels (n,) between both inverses, NaN where the lens model has none."""
-    exact = undistort(camera, pixels)
-    exact[~(np.hypot(exact[:, 0], exact[:, 1]) < fold_radius(camera)[0])] = np.nan
+    exact, shown = exact_inverse(camera, pixels)
     found = undistort_by_polynomial(inverse, distorted_normalised(camera, pixels))
-    return np.asarray(np.linalg.norm((found - exact) @ camera.K[:2, :2].T, axis=1))
+    error = np.linalg.norm((found - exact) @ camera.K[:2, :2].T, axis=1)
+    return np.asarray(np.where(shown, error, np.nan))

@@ -51,6 +51,7 @@ def _tilts(axes: Axes, normals: FloatArray) -> None:
     tilt = np.degrees(np.arccos(np.clip(normals[:, 2], 0.0, 1.0)))
     axes.hist(tilt, bins=18, range=(0.0, 90.0), color=BLUE, edgecolor="white", linewidth=0.6)
     axes.set_xlim(0.0, max(60.0, 5.0 * np.ceil(tilt.max() / 5.0)) if len(tilt) else 60.0)
+    axes.set_ylim(0.0, None if len(tilt) else 1.0)
     axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
     axes.set_xlabel("angle to the picture's plane (degrees)")
     axes.set_ylabel("views")
@@ -140,7 +141,7 @@ def _scene(
     axes.set_xlabel("x, right (m)")
     axes.set_ylabel("z, forward (m)")
     axes.set_zlabel("-y, up (m)")
-    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+    for axis, extent in zip((axes.xaxis, axes.yaxis, axes.zaxis), high - low, strict=True):
         axis.pane.set_facecolor("#f7f8f9")
         axis.pane.set_edgecolor("#d3d8dd")
-        axis.set_major_locator(MaxNLocator(5))
+        axis.set_major_locator(MaxNLocator(int(np.clip(round(6 * extent / widest), 2, 5))))

@@ -24,8 +24,10 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
 from matplotlib.ft2font import FT2Font
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.textpath import text_to_path
 
 from calib.errors import BadInputError
 from calib.files import shown, write_atomically
@@ -59,15 +61,16 @@ BLUE, VERMILLION, GREEN = "#0072B2", "#D55E00", "#009E73"
 ORANGE, SKY, PURPLE = "#E69F00", "#56B4E9", "#CC79A7"
 
 RISING = LinearSegmentedColormap.from_list(
-    "rising", ["#f6fafd", "#d7e8f3", "#a9cfe6", "#6fb0d8", "#358bc0", "#0f659c", "#083f6b"]
+    "rising", ["#f6fafd", "#dfecf5", "#c0dbec", "#98c5e1", "#68a9d1", "#3f8dc0", "#2173ad"]
 )
-"""From light to dark with the value."""
+"""From light to dark with the value, never so dark that black lines drown in it."""
 
 SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 WIDTH_IN = 9.2
 _DPI = 130
 _LINE_IN = 0.19
-_TITLE_CHARACTERS, _NOTE_CHARACTERS = 84, 128
+_TAG_IN = 2.15
+"""Width that is kept free for the verdict."""
 
 _LOOK: dict[Any, Any] = {
     # Names of pictures may hold what looks like a formula.
@@ -118,8 +121,13 @@ def sheet(height_in: float, title: str, note: str = "", verdict: str = "ok") -> 
     height_in : height of the panels together, without title and note.
     verdict : anything but "ok" is shown in the corner, so that the figure cannot be taken for a good one.
     """
-    titles = textwrap.wrap(title, _TITLE_CHARACTERS if verdict == "ok" else _TITLE_CHARACTERS - 20)
-    notes = textwrap.wrap(note, _NOTE_CHARACTERS)
+    wide_in = WIDTH_IN - 0.3
+    titles = _lines(
+        title,
+        FontProperties(family="DejaVu Sans", size=13, weight="bold"),
+        wide_in - (verdict != "ok") * _TAG_IN,
+    )
+    notes = _lines(note, FontProperties(family="DejaVu Sans", size=10), wide_in)
     head_in = 0.26 + 0.235 * len(titles) + _LINE_IN * len(notes)
     whole_in = height_in + head_in
     below = (0.008, 0.008, 0.984, 1.0 - head_in / whole_in - 0.008)
@@ -151,6 +159,21 @@ def sheet(height_in: float, title: str, note: str = "", verdict: str = "ok") -> 
             bbox={"facecolor": VERMILLION, "edgecolor": "none", "boxstyle": "round,pad=0.3"},
         )
     return figure
+
+
+def _lines(words: str, font: FontProperties, width_in: float) -> list[str]:
+    """The words broken into lines that fit into a width, as the font is drawn."""
+    lines: list[str] = []
+    for word in words.split():
+        longer = f"{lines[-1]} {word}" if lines else word
+        if (
+            lines
+            and text_to_path.get_text_width_height_descent(longer, font, ismath=False)[0] > 72.0 * width_in
+        ):
+            lines.append(word)
+        else:
+            lines[-1:] = [longer]
+    return lines
 
 
 def save(figure: Figure, path: Path) -> Path:

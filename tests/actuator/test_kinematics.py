@@ -1,0 +1,190 @@
+"""Spaces of one section: inverses, derivatives, frames and signs."""
+
+from __future__ import annotations
+
+from math import copysign
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calib.actuator import kinematics as kin
+from calib.arrays import FloatArray
+from calib.errors import BadInputError
+
+R_B = 0.0126
+BELLOWS = st.floats(0.04, 0.1)
+LENGTHS = st.floats(0.03, 0.12)
+SIGNS = st.sampled_from([-1.0, 1.0])
+# Exponents down to 1e-300 are as likely as ordinary angles.
+TINY = st.builds(lambda s, m, e: s * m * 10.0**e, SIGNS, st.floats(1.0, 9.9), st.integers(-300, -1))
+ANGLES = st.one_of(st.floats(-6.0, 6.0), TINY, st.just(0.0))
+
+
+def random_bellows(seed: int, count: int) -> FloatArray:
+    return np.random.default_rng(seed).uniform(0.04, 0.1, (count, 2))
+
+
+@given(BELLOWS, BELLOWS)
+def test_inverse_of_forward_over_the_workspace(q1: float, q2: float) -> None:
+    q = np.array([q1, q2])
+    assert kin.inverse(kin.forward(q, R_B), R_B) == pytest.approx(q, abs=2e-16, rel=1e-14)
+
+
+@given(ANGLES, LENGTHS)
+def test_configuration_survives_task_space_at_any_curvature(phi: float, length: float) -> None:
+    k = np.array([phi / length, length])
+    back = kin.configuration_from_pose(kin.pose_from_configuration(k))
+    # Relative precision in the curvature, down to the smallest normal numbers.
+    assert back[0] == pytest.approx(k[0], rel=4e-14, abs=0.0)
+    assert back[1] == pytest.approx(k[1], rel=2e-14)
+    assert copysign(1.0, back[0]) == copysign(1.0, k[0])
+
+
+@given(TINY, LENGTHS)
+def test_head_of_a_nearly_straight_arc(phi: float, length: float) -> None:
+    """x = l phi / 2 and y = l to first order; x keeps its relative precision."""
+    x, y, angle = kin.pose_from_configuration(np.array([phi / length, length]))
+    assert angle == pytest.approx(phi, rel=1e-15, abs=0.0)
+    if abs(phi) < 1e-8:
+        assert x == pytest.approx(0.5 * length * phi, rel=1e-14, abs=0.0)
+        assert y == pytest.approx(length, rel=1e-15)
+
+
+@given(BELLOWS, BELLOWS)
+def test_configuration_and_bellows(q1: float, q2: float) -> None:
+    q = np.array([q1, q2])
+    k = kin.configuration(q, R_B)
+    assert k[0] == pytest.approx((q1 - q2) / ((q1 + q2) * R_B), rel=1e-12, abs=1e-15)
+    assert kin.bellows_from_configuration(k, R_B) == pytest.approx(q, rel=1e-14)
+    assert kin.pose_from_configuration(k) == pytest.approx(kin.forward(q, R_B), abs=1e-15)
+
+
+def test_smooth_through_zero() -> None:
+    """No switch: the second difference of the head's path is that of a smooth curve, not of noise."""
+    h = 1e-4
+    phi = h * np.arange(-50, 51)
+    pose = kin.pose_from_configuration(np.stack([phi / 0.065, np.full_like(phi, 0.065)], axis=1))
+    bends = np.diff(pose[:, 1], 2) / h**2
+    assert bends == pytest.approx(np.full(99, -0.065 / 3), rel=1e-4)
+
+
+def test_signs_and_frames() -> None:
+    """Bellows 1 longer: phi > 0, the head goes to +x, its tangent is (sin phi, cos phi)."""
+    q = np.array([0.07, 0.06])
+    x, y, phi = kin.forward(q, R_B)
+    assert phi > 0 and x > 0 and y > 0
+    H = kin.transform(phi, kin.length(q))
+    assert H[:2, 1] == pytest.approx([np.sin(phi), np.cos(phi)])
+    assert H[:2, :2] @ H[:2, :2].T == pytest.approx(np.eye(2), abs=1e-15)
+    assert np.linalg.det(H) == pytest.approx(1.0)
+    assert H[:2, 2] == pytest.approx([x, y])
+
+
+def test_tangent_of_the_arc_is_the_heads_axis() -> None:
+    """The printed (3.6) turns the other way; the path along the arc decides."""
+    kappa, length, h = 9.0, 0.07, 1e-6
+    before = kin.pose_from_configuration(np.array([kappa, length - h]))
+    after = kin.pose_from_configuration(np.array([kappa, length + h]))
+    tangent = (after - before)[:2] / (2 * h)
+    assert tangent == pytest.approx(kin.transform(kappa * length, length)[:2, 1], abs=1e-9)
+
+
+def test_bellows_end_beside_the_head() -> None:
+    """Bellows at -+r_B in the head's frame are arcs of their own lengths about the same centre."""
+    q = np.array([0.08, 0.06])
+    kappa, length = kin.configuration(q, R_B)
+    H = kin.transform(kappa * length, length)
+    centre = np.array([1 / kappa, 0.0])
+    for side, arc in ((-R_B, q[0]), (R_B, q[1])):
+        end = H @ np.array([side, 0.0, 1.0])
+        radius = float(np.linalg.norm(end[:2] - centre))
+        assert radius * kappa * length == pytest.approx(arc, rel=1e-12)
+
+
+def numeric(function: object, at: FloatArray, h: float = 1e-6) -> FloatArray:
+    columns = []
+    for i in range(len(at)):
+        step = np.zeros(len(at))
+        step[i] = h
+        columns.append((function(at + step) - function(at - step)) / (2 * h))  # type: ignore[operator]
+    return np.stack(columns, axis=-1)
+
+
+@pytest.mark.parametrize(
+    "q", [*random_bellows(1, 6), np.array([0.065, 0.065]), np.array([0.065, 0.065 + 1e-9])]
+)
+def test_jacobians_against_differences(q: FloatArray) -> None:
+    assert kin.forward_jacobian(q, R_B) == pytest.approx(numeric(lambda p: kin.forward(p, R_B), q), abs=2e-8)
+    assert kin.configuration_jacobian(q, R_B) == pytest.approx(
+        numeric(lambda p: kin.configuration(p, R_B), q), rel=1e-6, abs=1e-5
+    )
+    pose = kin.forward(q, R_B)
+    assert kin.inverse_jacobian(pose, R_B) == pytest.approx(
+        numeric(lambda p: kin.inverse(p, R_B), pose), abs=1e-8
+    )
+
+
+@given(BELLOWS, BELLOWS)
+def test_inverse_jacobian_undoes_the_forward_one(q1: float, q2: float) -> None:
+    q = np.array([q1, q2])
+    product = kin.inverse_jacobian(kin.forward(q, R_B), R_B) @ kin.forward_jacobian(q, R_B)
+    assert product == pytest.approx(np.eye(2), abs=1e-12)
+
+
+@pytest.mark.parametrize("q", [*random_bellows(2, 5), np.array([0.07, 0.07])])
+def test_jacobian_rate_and_the_identity_323(q: FloatArray) -> None:
+    """dJ/dt by the chain rule, and d(dx/dt)/dq = d/dt(dx/dq), which (3.35) rests on."""
+    dq = np.array([0.3, -0.2])
+    rate = kin.forward_jacobian_rate(q, dq, R_B)
+    h = 1e-6
+    along = (kin.forward_jacobian(q + h * dq, R_B) - kin.forward_jacobian(q - h * dq, R_B)) / (2 * h)
+    assert rate == pytest.approx(along, abs=1e-6)
+    swapped = numeric(lambda p: kin.forward_jacobian(p, R_B) @ dq, q)
+    assert rate == pytest.approx(swapped, abs=1e-6)
+
+
+@given(st.floats(-0.1, 0.1), st.floats(0.0, 0.12), st.floats(-3.0, 3.0))
+def test_marker_and_head(x: float, y: float, phi: float) -> None:
+    head = np.array([x, y])
+    marker = kin.marker_from_head(head, np.array(phi))
+    assert marker == pytest.approx([x + 0.015 * np.sin(phi), y + 0.015 * np.cos(phi)], abs=1e-16)
+    assert kin.head_from_marker(marker, np.array(phi)) == pytest.approx(head, abs=1e-16)
+
+
+def test_marker_lies_on_the_heads_tangent() -> None:
+    q = np.array([0.08, 0.07])
+    x, y, phi = kin.forward(q, R_B)
+    H = kin.transform(phi, kin.length(q))
+    placed = (H @ np.array([0.0, kin.MARKER_OFFSET_M, 1.0]))[:2]
+    assert kin.marker_from_head(np.array([x, y]), phi) == pytest.approx(placed, abs=1e-16)
+
+
+def test_arrays_of_any_shape() -> None:
+    q = random_bellows(3, 24).reshape(2, 3, 4, 2)
+    pose = kin.forward(q, R_B)
+    assert pose.shape == (2, 3, 4, 3)
+    assert kin.forward_jacobian(q, R_B).shape == (2, 3, 4, 3, 2)
+    assert kin.inverse_jacobian(pose, R_B).shape == (2, 3, 4, 2, 3)
+    assert kin.transform(pose[..., 2], kin.length(q)).shape == (2, 3, 4, 3, 3)
+    assert pose[1, 2, 3] == pytest.approx(kin.forward(q[1, 2, 3], R_B))
+
+
+def test_length_is_symmetric_in_the_sign_of_the_angle() -> None:
+    pose = np.array([0.02, 0.06, 0.6])
+    mirrored = pose * np.array([-1.0, 1.0, -1.0])
+    assert kin.inverse(pose, R_B) == pytest.approx(kin.inverse(mirrored, R_B)[::-1])
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: kin.inverse(np.array([0.0, 0.06, 6.3]), R_B), "less than a full circle"),
+        (lambda: kin.forward(np.array([0.06, 0.06, 0.06]), R_B), r"expected \(..., 2\)"),
+        (lambda: kin.configuration_from_pose(np.array([0.0, 0.06])), r"expected \(..., 3\)"),
+    ],
+)
+def test_bad_input(call: object, words: str) -> None:
+    with pytest.raises(BadInputError, match=words):
+        call()  # type: ignore[operator]

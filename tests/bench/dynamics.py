@@ -1,0 +1,166 @@
+"""Speed of the dynamics, as a script: `python tests/bench/dynamics.py [--repeats N]`.
+
+Every figure is simulated time over wall time, the best of the repeats, together with the error in the
+bellows' lengths against DOP853 at 1e-12.
+
+- one core: 1 ms steps with both pumps, random commands at every tick, the kernel and the public call;
+- batch: 200 parameter sets of 10 s on two threads;
+- against a usual implementation: the same free swing by `solve_ivp` (RK45, 1e-3, 1e-6, the settings of
+  ode45) on M, C and N that sympy derived and lambdified.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import sympy
+from scipy.integrate import solve_ivp
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from calib.actuator.adaptive import simulate_adaptive, swing_adaptive
+from calib.actuator.dynamics import coefficients
+from calib.actuator.integrate import rig_at_rest, simulate, simulate_batch, state_row, swing
+from calib.actuator.kernel import run
+from calib.actuator.parameters import Plant, Stiffness, free_swing, pumps_connected
+from calib.actuator.pump import Orifice, Pump, delayed, pump_coefficients, static_force_N
+from calib.arrays import FloatArray
+
+STEPS_PER_TICK = 17
+PUMP = Pump(tick_s=STEPS_PER_TICK * 1e-3)
+"""Ticks of 17 ms, so that the steps are exactly 1 ms."""
+
+
+def best(work: Callable[[], object], repeats: int, clock: Callable[[], float] = time.perf_counter) -> float:
+    """Least time [s]: others may share the machine."""
+    times = []
+    for _ in range(repeats):
+        start = clock()
+        work()
+        times.append(clock() - start)
+    return min(times)
+
+
+def commands(ticks: int, seed: int) -> FloatArray:
+    return np.random.default_rng(seed).uniform(0, 255, (ticks, 2))
+
+
+def one_core(pump: Pump, repeats: int) -> tuple[float, float, float]:
+    """Times real time of the kernel and of `simulate`, and the largest error [m]."""
+    plant, pwm = pumps_connected(), commands(600, 1)
+    c, p = coefficients(plant), pump_coefficients(pump)
+    start = rig_at_rest(plant, pump).row
+    static = static_force_N(pump, delayed(pump, pwm))
+    out = np.empty((len(pwm), 10))
+    simulated = len(pwm) * pump.tick_s
+
+    def kernel() -> None:
+        run(c, p, start, static, pump.tick_s, STEPS_PER_TICK, STEPS_PER_TICK, out)
+
+    def public() -> None:
+        simulate(plant, pump, pwm, substeps=STEPS_PER_TICK)
+
+    public()
+    bare, whole = best(kernel, 20 * repeats), best(public, 20 * repeats)
+    few = pwm[:120]
+    exact = simulate_adaptive(plant, pump, few, rtol=1e-12, atol=1e-14)
+    error = np.abs(simulate(plant, pump, few, substeps=STEPS_PER_TICK).q_m - exact.q_m).max()
+    return simulated / bare, simulated / whole, float(error)
+
+
+def batch(sets: int, threads: int, repeats: int) -> tuple[float, float]:
+    """Times real time, all sets together, by the wall and by the processor time of one core."""
+    rng, pwm = np.random.default_rng(2), commands(589, 3)
+    plants = [
+        replace(pumps_connected(), stiffness=Stiffness((float(k), 1092.9))) for k in rng.uniform(40, 55, sets)
+    ]
+    start = state_row(plants[0])
+
+    def work() -> None:
+        simulate_batch(plants, [PUMP] * sets, pwm, start, STEPS_PER_TICK, threads)
+
+    simulated = sets * len(pwm) * PUMP.tick_s
+    return simulated / best(work, repeats), simulated / best(work, repeats, time.process_time)
+
+
+def usual(plant: Plant) -> Callable[[float, FloatArray], FloatArray]:
+    """Right-hand side from sympy's M, C and N, lambdified, with the matrices solved by numpy."""
+    q1, q2, v1, v2 = sympy.symbols("q1 q2 v1 v2", real=True)
+    q, v, r = sympy.Matrix([q1, q2]), sympy.Matrix([v1, v2]), plant.bellows_radius_m
+    phi, ell = (q1 - q2) / (2 * r), (q1 + q2) / 2
+    # The series (3.10) up to the seventh order, as the source has them.
+    odd = sum((-1) ** n * phi ** (2 * n + 1) / sympy.factorial(2 * n + 2) for n in range(4))
+    even = sum((-1) ** n * phi ** (2 * n) / sympy.factorial(2 * n + 1) for n in range(4))
+    Jp = sympy.Matrix([ell * odd, ell * even]).jacobian(q)
+    rate = Jp.diff(q1) * v1 + Jp.diff(q2) * v2
+    turning = plant.inertia_kgm2 / (4 * r**2) * sympy.Matrix([[1, -1], [-1, 1]])
+    M, C = plant.mass_kg * Jp.T * Jp + turning, plant.mass_kg * Jp.T * rate
+    k0, k1, _, _ = plant.stiffness.padded
+    k = [k0 + k1 * sympy.Max(x - plant.rest_length_m, 0) for x in q]
+    damping = plant.damping_Ns_per_sqrt_N_per_m
+    bent = plant.bending_N_per_rad2 * phi * sympy.Abs(phi)
+    N = sympy.Matrix(
+        [
+            k[i] * (q[i] - plant.rest_length_m) + damping * sympy.sqrt(k[i]) * v[i] + (-1) ** i * bent
+            for i in range(2)
+        ]
+    )
+    matrices = sympy.lambdify((q1, q2, v1, v2), (M, C, N), "numpy", cse=True)
+    l1, l2, l3 = plant.creep_rates
+
+    def slope(_: float, y: FloatArray) -> FloatArray:
+        mass, coriolis, forces = matrices(*y[:4])
+        ddq = np.linalg.solve(mass, l3 * y[4:] - coriolis @ y[2:4] - forces[:, 0])
+        return np.concatenate([y[2:4], ddq, -l1 * y[4:] + l2 * y[2:4]])
+
+    return slope
+
+
+def against_usual(repeats: int) -> tuple[float, float, float, float]:
+    """Times real time of the usual way and of `swing` with the whole call, and both errors [m]."""
+    plant, duration = free_swing(), 4.0
+    start = state_row(plant, 0.5)
+    slope, times = usual(plant), np.linspace(0.0, duration, 401)
+
+    def ode45() -> FloatArray:
+        found = solve_ivp(slope, (0, duration), start[:6], t_eval=times, rtol=1e-3, atol=1e-6)
+        return np.asarray(found.y[:2].T)
+
+    def ours() -> FloatArray:
+        return swing(plant, start, duration, 1e-3, every=10).q_m
+
+    exact = swing_adaptive(plant, start, times, rtol=1e-12, atol=1e-14).q_m
+    errors = [float(np.abs(f() - exact).max()) for f in (ode45, ours)]
+    return duration / best(ode45, repeats), duration / best(ours, 20 * repeats), errors[0], errors[1]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--repeats", type=int, default=10)
+    repeats = parser.parse_args().repeats
+    began = time.perf_counter()
+    simulate(pumps_connected(), PUMP, np.zeros((1, 2)))
+    print(f"first call, compiled or loaded: {time.perf_counter() - began:.2f} s")
+    for name, pump in (("rate limit", PUMP), ("orifice", replace(PUMP, deflation=Orifice()))):
+        bare, whole, error = one_core(pump, repeats)
+        print(f"one core, 1 ms, pumps with {name}: kernel {bare:.0f}, simulate() {whole:.0f} times real time")
+        print(f"    largest error {error:.1e} m (target 8000 times, 1e-6 m)")
+    for threads in (1, 2):
+        wall, core = batch(200, threads, repeats)
+        print(f"batch of 200 sets, {threads} threads: {wall:.0f} times real time, {core:.0f} per core in use")
+    print("    target 18000 on two free cores")
+    slow, fast, rough, fine = against_usual(repeats)
+    print(f"free swing: lambdified solve_ivp RK45 {slow:.1f}, swing() {fast:.0f} times real time")
+    print(f"    {fast / slow:.0f} times as fast (target 50), errors {rough:.1e} and {fine:.1e} m")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,78 @@
+"""Whether a figure can be read: its words are on the sheet, large enough, and not on top of each other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import combinations
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+WIDTH_PX, SMALLEST_PX = 1000.0, 11.5
+"""Width at which a figure has to be legible, and the size of letters that still is."""
+
+
+@contextmanager
+def kept(monkeypatch: pytest.MonkeyPatch, module: ModuleType) -> Iterator[dict[str, Figure]]:
+    """The figures that a module would save, by name, instead of files."""
+    figures: dict[str, Figure] = {}
+
+    def keep(figure: Figure, path: Path) -> Path:
+        figures[path.name] = figure
+        return path
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "save", keep)
+        yield figures
+
+
+def drawn_texts(figure: Figure) -> list[Text]:
+    """All texts that reach the sheet when the figure is drawn."""
+    found: list[Text] = []
+    draw = Text.draw
+
+    def noted(self: Text, renderer: Any) -> None:
+        if self.get_visible() and self.get_text().strip():
+            found.append(self)
+        draw(self, renderer)
+
+    Text.draw = noted
+    try:
+        FigureCanvasAgg(figure).draw()
+    finally:
+        Text.draw = draw
+    return found
+
+
+def _box(text: Text) -> tuple[float, float, float, float]:
+    """Left, bottom, right, top in pixels; of a slanted text only a square in its middle."""
+    box = text.get_window_extent()
+    if abs(text.get_rotation() % 90.0) > 1.0:
+        u, v = 0.5 * (box.x0 + box.x1), 0.5 * (box.y0 + box.y1)
+        return u - 6.0, v - 6.0, u + 6.0, v + 6.0
+    return box.x0, box.y0, box.x1, box.y1
+
+
+def complaints(figure: Figure) -> list[str]:
+    """What makes the words of a figure hard to read, empty where nothing does."""
+    texts = drawn_texts(figure)
+    width, height = figure.bbox.width, figure.bbox.height
+    out = []
+    boxes = [_box(text) for text in texts]
+    for text, (left, bottom, right, top) in zip(texts, boxes, strict=True):
+        if left < -1 or bottom < -1 or right > width + 1 or top > height + 1:
+            out.append(f"{text.get_text()!r} runs off the sheet")
+        if text.get_fontsize() * figure.dpi / 72.0 * WIDTH_PX / width < SMALLEST_PX:
+            out.append(f"{text.get_text()!r} is too small")
+    for (one, a), (other, b) in combinations(zip(texts, boxes, strict=True), 2):
+        across = min(a[2], b[2]) - max(a[0], b[0])
+        down = min(a[3], b[3]) - max(a[1], b[1])
+        if across > 2.0 and down > 2.0:
+            out.append(f"{one.get_text()!r} lies on {other.get_text()!r}")
+    return out

@@ -1,0 +1,110 @@
+"""A whole rig folder: its files, that calibrating it finds the truth, and that it is the same every time."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.boards import read_board_file
+from calib.camera.model import Camera, project
+from calib.errors import BadInputError
+from calib.logs import check_time, read_log
+from calib.pictures import list_pictures
+from calib.twin.camera_sensor import View
+from calib.twin.rig import SimulatedRig, nominal_view
+from calib.twin.rig_folder import LOGS, write_rig_folder
+
+RIG = SimulatedRig()
+
+
+def _hashes(folder: Path) -> dict[str, str]:
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+@pytest.mark.slow
+def test_the_folder_holds_pictures_plane_and_logs(tmp_path: Path, project_root: Path) -> None:
+    done: list[tuple[int, int]] = []
+    logs = write_rig_folder(tmp_path / "rig", RIG, progress=lambda i, n: done.append((i, n)))
+    assert done[-1] == (len(LOGS), len(LOGS))
+    assert [path.stem for path in logs] == list(LOGS)
+    assert len(list_pictures([tmp_path / "rig" / "images"])) == 17
+    assert len(list_pictures([tmp_path / "rig" / "images" / "plane"])) == 1
+    # The nominal camera's pictures are the shipped ones.
+    shipped = _hashes(project_root / "images")
+    assert shipped == _hashes(tmp_path / "rig" / "images")
+    assert any(path.name.startswith("static") for path in logs)
+    for path in logs:
+        log = read_log(path)
+        check_time(log)
+        assert log.unknown == ()
+        assert len(log.sampled("u_px", "v_px")) > 0.9 * len(log.sampled("pwm1"))
+        assert len(log.sampled("true_phi_rad")) == len(log)
+        at_rest = np.ptp(log.columns["true_q1_m"]) == 0.0
+        assert at_rest == path.name.startswith("static")
+    truth = json.loads((tmp_path / "rig" / "truth.json").read_text())
+    assert truth["tracker"]["latency_s"] == RIG.tracker.latency_s
+    assert truth["plant"]["mass_kg"] == RIG.plant.mass_kg
+    assert truth["view"]["camera"]["fx_px"] == RIG.view.camera.fx_px
+    again = tmp_path / "again"
+    write_rig_folder(again, RIG)
+    assert _hashes(again) == _hashes(tmp_path / "rig")
+
+
+@pytest.mark.slow
+def test_another_cameras_pictures_show_the_board_where_it_says(tmp_path: Path) -> None:
+    from calib.boards import find_boards
+
+    nominal = nominal_view()
+    camera = Camera(
+        "brown5",
+        (640, 480),
+        520.0,
+        522.0,
+        0.0,
+        325.0,
+        236.0,
+        np.array([-0.1, 0.05, 1e-3, -5e-4, 0.0, 0.0, 0.0, 0.0]),
+    )
+    rig = replace(RIG, view=View(camera, nominal.R_CW, nominal.t_CW_m))
+    write_rig_folder(tmp_path, rig)
+    told = read_board_file(tmp_path / "images" / "plane")
+    assert told.corners and told.square_m and told.first_corner_m
+    found = find_boards(list_pictures([tmp_path / "images"]), (7, 5), told.square_m)
+    assert len(found.views) == 17
+    assert found.image_size_px == (640, 480)
+    plane = find_boards(list_pictures([tmp_path / "images" / "plane"]), (7, 5), told.square_m)
+    turn, (x0, y0) = told.angle_rad or 0.0, told.first_corner_m
+    i, j = np.meshgrid(np.arange(7), np.arange(5))
+    bx, by = told.square_m * i.ravel(), told.square_m * j.ravel()
+    world = np.stack(
+        [x0 + np.cos(turn) * bx - np.sin(turn) * by, y0 + np.sin(turn) * bx + np.cos(turn) * by], axis=1
+    )
+    expected = project(camera, world @ nominal.R_CW[:, :2].T + nominal.t_CW_m)
+    corners = plane.views[0].pixels
+    nearest = np.linalg.norm(corners[:, None] - expected[None], axis=2).min(axis=1)
+    assert nearest.max() < 0.3
+
+
+def test_a_folder_that_holds_something_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(BadInputError, match="is there already, expected a new or an empty folder"):
+        write_rig_folder(tmp_path, RIG)
+    with pytest.raises(BadInputError, match="is there already"):
+        write_rig_folder(tmp_path / "mine.txt", RIG)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_a_camera_that_does_not_see_the_plane_is_refused(tmp_path: Path) -> None:
+    nominal = nominal_view()
+    away = View(nominal.camera, nominal.R_CW, nominal.t_CW_m + np.array([0.5, 0.0, 0.0]))
+    with pytest.raises(BadInputError, match="does not see a whole board"):
+        write_rig_folder(tmp_path / "rig", replace(RIG, view=away))
