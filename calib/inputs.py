@@ -95,7 +95,7 @@ def _from_table(path: Path, told: Told) -> ViewSet:
     for view in views:
         _check_inside(path, view, told.image_size_px)
         _check_extent(path, view)
-    return ViewSet(tuple(views), told.image_size_px, {shown(path.name): digest}, (), remarks)
+    return ViewSet(_near_origin(views), told.image_size_px, {shown(path.name): digest}, (), remarks)
 
 
 def _check_inside(path: Path, view: View, image_size_px: tuple[int, int]) -> None:
@@ -119,6 +119,18 @@ def _check_extent(path: Path, view: View) -> None:
             f"{shown(path)}: view {shown(view.name)}: its target {what}, expected metres, "
             f"from {_SMALLEST_M:g} to {_LARGEST_M:g}"
         )
+
+
+def _near_origin(views: Sequence[View]) -> tuple[View, ...]:
+    """The same views; a target that lies far from its own origin is moved there, which changes no camera.
+
+    Rotating about a distant origin would cost the digits that tell the points apart.
+    """
+    every = np.concatenate([view.target_m for view in views])
+    middle = 0.5 * (every.min(axis=0) + every.max(axis=0))
+    if np.abs(middle).max() < 10.0 * np.ptp(every, axis=0).max():
+        return tuple(views)
+    return tuple(View(view.name, view.target_m - middle, view.pixels) for view in views)
 
 
 def _from_pictures(sources: Sequence[Path], told: Told, progress: Callable[[int, int], None]) -> ViewSet:

@@ -8,8 +8,8 @@ An arc of length l that turns by phi has the chord l S(phi) in the direction phi
 The second derivative follows from the differential equation of the spherical Bessel function j0.
 S and D are entire and even, so both are power series in w = phi^2 without any singularity: there is
 nothing to switch at zero curvature, and (3.9) holds by itself. D has no closed form that does not
-cancel at zero; `chord_ratio_w` and `chord_decay_w` sum the series to the last bit for
-|phi| <= 2 pi, where the arc closes on itself and the model ends.
+cancel at zero; `chord_ratio_w` and `chord_decay_w` sum the series, to the last bit for |phi| <= 4 and
+within 1e-15 up to 2 pi, where the arc closes on itself and the model ends.
 
 With them H13 = l S sin(phi / 2) and H23 = l S cos(phi / 2) in (3.6), f = 2 / S in (3.13).
 

@@ -24,6 +24,8 @@ _CONTINUES = 0.4
 """Least amplitude of a further corner over the median of the grid."""
 _WORST_RESIDUAL = 0.3
 _REACH_PX = 10
+_UNEVEN_SHARE = 0.4
+"""Largest share of squares that a shadow's edge may cross."""
 _FLAT = 0.6
 """Largest difference between the quarters of a square, over the step from dark to bright."""
 
@@ -60,7 +62,7 @@ def _squares_are_plain(smooth: _Float32, grid: Refined) -> bool:
         if min(across.min(initial=np.inf), down.min(initial=np.inf)) < 0.3 * float(local.min()):
             return False
     uneven = quarters.max(axis=0) - quarters.min(axis=0)
-    return bool(np.mean(uneven > _FLAT * np.maximum(local, 0.25 * step)) < 0.1)
+    return bool(np.mean(uneven > _FLAT * np.maximum(local, 0.25 * step)) < _UNEVEN_SHARE)
 
 
 def fault_of(gray: GrayImage, grid: Refined) -> str | None:

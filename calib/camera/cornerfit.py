@@ -152,10 +152,10 @@ def frames_of(points: FloatArray) -> Frames:
     return Frames(along.reshape(-1, 2), across.reshape(-1, 2), bends, sigmas)
 
 
-def _windows(image: _Float32, points: FloatArray, frames: Frames, most_px: int = REACH_PX) -> _Windows:
+def _windows(image: _Float32, points: FloatArray, frames: Frames, window: float, most_px: int) -> _Windows:
     height, width = image.shape
     centre = np.rint(points)
-    extent = WINDOW * (np.abs(frames.along) + np.abs(frames.across))
+    extent = window * (np.abs(frames.along) + np.abs(frames.across))
     reach = int(np.clip(np.ceil(extent.max(initial=3.0)), np.ceil(_LEAST_REACH_PX), most_px))
     offset = np.arange(-reach, reach + 1)
     dx, dy = (o.ravel() for o in np.meshgrid(offset, offset))
@@ -163,7 +163,7 @@ def _windows(image: _Float32, points: FloatArray, frames: Frames, most_px: int =
     y = dy - (points - centre)[:, 1:]
     (ax, ay), (bx, by) = frames.along.T[:, :, None], frames.across.T[:, :, None]
     area = np.maximum(np.abs(ax * by - ay * bx), 1e-9)
-    inside = (np.abs(by * x - bx * y) <= WINDOW * area) & (np.abs(ax * y - ay * x) <= WINDOW * area)
+    inside = (np.abs(by * x - bx * y) <= window * area) & (np.abs(ax * y - ay * x) <= window * area)
     # The smallest squares leave too few pixels; there the next edge is let in.
     inside |= (np.abs(x) <= _LEAST_REACH_PX) & (np.abs(y) <= _LEAST_REACH_PX)
     u, v = centre[:, :1] + dx, centre[:, 1:] + dy
@@ -250,6 +250,7 @@ def fit_corners(
     frames: Frames,
     iterations: int = _ITERATIONS,
     reach_px: int = REACH_PX,
+    window: float = WINDOW,
 ) -> LocalFit:
     """Fit the blurred corner around each of N points.
 
@@ -259,9 +260,10 @@ def fit_corners(
     points : (N, 2) where to start, pixels.
     frames : steps and curvatures of the grid at the N points.
     reach_px : most pixels that a window reaches to each side of its corner.
+    window : half the width of a window over the local square.
     """
     N = len(points)
-    win = _windows(image, points, frames, reach_px)
+    win = _windows(image, points, frames, window, reach_px)
     q = _start(points, frames, win)
     freedom = np.maximum(win.weight.sum(axis=1).astype(np.float64) - _PARAMETERS, 1.0)
     damping, converged = np.full(N, 1e-3), np.zeros(N, dtype=bool)

@@ -179,6 +179,11 @@ def calibrate_camera(
     boards: tuple[Candidate, ...] = ()
     if board != "rigid":
         fit, board, boards = _with_board(fit, choices)
+    if fit.termination == "behind the camera":
+        raise BadInputError(
+            "no camera fits these views: a solution has points behind the camera; expected views of one flat "
+            "target, each point with its own pixel"
+        )
     solved = time.perf_counter()
     sigma = covariance(fit)
     covered = time.perf_counter()

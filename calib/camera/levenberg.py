@@ -212,7 +212,10 @@ def minimise(
             if decrement < tolerance and damping > 0.0:
                 # Damping shortens steps along flat valleys, so the test is made without it.
                 step, damping = _solve_step(at, G, 0.0), 0.0
-                decrement = np.inf if step is None else _decrement(at, G, step, freedom)
+                if step is None:
+                    # Damped again the same would follow, without an end.
+                    return Minimum(block, at, "singular", evaluations, decrement)
+                decrement = _decrement(at, G, step, freedom)
             if decrement < tolerance:
                 return Minimum(block, at, "converged", evaluations, decrement)
         if evaluations >= max_iterations:

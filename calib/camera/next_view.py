@@ -33,7 +33,7 @@ class Candidate:
 
     Attributes
     ----------
-    where : part of the picture, in words.
+    where : part of the picture, in words with a preposition.
     tilt_deg : angle between the board and the picture's plane.
     away : edge of the board (as the picture shows it) that leans away, or "" without tilt.
     span_share : diagonal of the board over the diagonal of the picture.
@@ -50,10 +50,10 @@ class Candidate:
 def _words(column: int, row: int) -> str:
     across, down = ("left", "", "right")[column], ("top", "", "bottom")[row]
     if not across and not down:
-        return "the middle of the picture"
+        return "in the middle of the picture"
     if across and down:
-        return f"the {down} {across} corner of the picture"
-    return f"the {across or down} edge of the picture"
+        return f"in the {down} {across} corner of the picture"
+    return f"at the {across or down} edge of the picture"
 
 
 def _rotation(tilt: float, azimuth: float) -> FloatArray:

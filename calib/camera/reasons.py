@@ -216,6 +216,12 @@ def of_split(found: Split | None, in_order: bool, calibration: Calibration, limi
         "explains)"
     )
     second = np.flatnonzero(found.second)
+    if apart < limits.split_least:
+        text = (
+            f"{listed([names[i] for i in second], 20)} would have a camera of their own {sure}, but it "
+            f"differs by less than {100 * limits.split_least:.1f} %, too little to matter."
+        )
+        return [Finding(REMARK, text)]
     if in_order:
         text = (
             f"From {names[int(second[0])]} on the camera differs from the one before {sure}: the lens was "
@@ -227,7 +233,7 @@ def of_split(found: Split | None, in_order: bool, calibration: Calibration, limi
             f"the other views from another {sure}."
         )
     advice = "Calibrate the two groups separately, with focus and zoom locked."
-    return [Finding(REMARK if apart < limits.split_least else INCONSISTENT, text, advice)]
+    return [Finding(INCONSISTENT, text, advice)]
 
 
 def of_target(found: TargetShape | None, calibration: Calibration, limits: Limits) -> list[Finding]:

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calib.arrays import BoolArray, FloatArray, GrayImage, IntArray
-from calib.camera.cornerfit import LocalFit, fit_corners, frames_of
+from calib.camera.cornerfit import Frames, LocalFit, fit_corners, frames_of
 from calib.camera.gridmodel import Prediction, predict
 
 __all__ = ["Refined", "reduced_around", "refine", "square_px"]
@@ -37,6 +37,8 @@ _UNKNOWN_SIGMA = 0.25
 """Sigma of a corner that was not refined, in squares."""
 _RESCUES = 3
 _PASSES = 3
+_CLOSE_WINDOW = 0.28
+_DISTURBED = 1.5
 _STEADY_PX = 0.1
 """Corners that moved farther are fitted again, with the curvatures of where they are now."""
 _LEAST_PICTURE_PX = 4
@@ -146,6 +148,7 @@ def _rescued(image: _Float32, fit: LocalFit, shape: tuple[int, int]) -> tuple[Lo
         if len(doubtful) == 0:
             return fit, good, prediction
         again = fit_corners(image, placed[doubtful], frames.take(doubtful))
+        again = _closer_looked(image, again, frames.take(doubtful))
         trial = _merged(fit, again, doubtful, np.ones(len(doubtful), dtype=np.bool_))
         near = np.linalg.norm(again.points - placed[doubtful], axis=1)
         moved = np.linalg.norm(again.points - fit.points[doubtful], axis=1)
@@ -156,6 +159,17 @@ def _rescued(image: _Float32, fit: LocalFit, shape: tuple[int, int]) -> tuple[Lo
         if not np.any(use & ~(moved < 0.01)):
             break
     return fit, good, predict(fit.points.reshape(*shape, 2), good.reshape(shape))
+
+
+def _closer_looked(image: _Float32, fit: LocalFit, frames: Frames) -> LocalFit:
+    """Fit with a smaller window the corners that something near them disturbs: a margin, a shadow, a hand."""
+    typical = float(np.median(fit.residual))
+    doubtful = np.flatnonzero((fit.residual > _DISTURBED * typical + 0.02) | ~fit.converged)
+    if len(doubtful) == 0:
+        return fit
+    again = fit_corners(image, fit.points[doubtful], frames.take(doubtful), window=_CLOSE_WINDOW)
+    use = again.converged & (again.residual < np.where(fit.converged, 0.7 * fit.residual, np.inf)[doubtful])
+    return _merged(fit, again, doubtful, use)
 
 
 def refine(gray: GrayImage, points: FloatArray) -> Refined | None:
@@ -190,6 +204,7 @@ def refine(gray: GrayImage, points: FloatArray) -> Refined | None:
         )
         if np.max(np.abs(moved - before)) < _STEADY_PX:
             break
+    fit = _closer_looked(image, fit, frames_of(moved))
     fit, good, prediction = _rescued(image, fit, shape)
     if prediction is None:
         return None

@@ -21,8 +21,8 @@ import numpy as np
 from calib.arrays import FloatArray, IntArray
 from calib.camera.bundle import Calibration, calibrate
 from calib.camera.levenberg import minimise
-from calib.camera.projection import INTRINSICS, Block, free_intrinsics
-from calib.camera.zhang import homographies, poses_from_homographies
+from calib.camera.projection import INTRINSICS, Block, camera_from_vector, free_intrinsics
+from calib.camera.zhang import homographies, poses_from_homographies, poses_with_camera
 
 __all__ = [
     "FocalInterval",
@@ -40,6 +40,7 @@ FOCAL_STARTS = (0.4, 0.7, 1.1, 1.8, 4.0)
 
 _CHI2_95 = 3.84
 _MAX_ITERATIONS = 60
+_MAX_VIEWS = 60
 _NEARLY = 1.05
 """Cost of five coefficients over that of the rational model below which they do."""
 
@@ -150,27 +151,38 @@ def other_starts(calibration: Calibration, seed: int = 0) -> list[Start]:
 def best_of_starts(calibration: Calibration) -> Calibration:
     """The calibration, or the one that another start leads to if its cost is lower by more than chance.
 
-    More than chance: by more than 3.84 times the residuals' variance.
+    More than chance: by more than 3.84 times the residuals' variance. Above 60 views the starts are
+    tried on an even sample of them. A robust loss or a deformed target is returned as it is.
     """
     if calibration.basis is not None or calibration.loss != "none":
         return calibration
-    ends = other_starts(calibration)
+    views = calibration.observations.views
+    some = calibration
+    if views > _MAX_VIEWS:
+        some = resolved(calibration, np.unique(np.linspace(0, views - 1, _MAX_VIEWS).astype(np.int64)))
+    ends = other_starts(some)
     if not ends:
         return calibration
     best = min(ends, key=lambda end: end.cost)
-    own = calibration.squared_sum
-    if np.isfinite(own) and best.cost > own - _CHI2_95 * calibration.sigma_px**2:
+    if np.isfinite(some.squared_sum) and best.cost > some.squared_sum - _CHI2_95 * some.sigma_px**2:
         return calibration
-    camera = calibration.camera
-    found = calibrate(
+    camera, start = calibration.camera, best.block
+    if some is not calibration:
+        found = camera_from_vector(camera.model, camera.image_size_px, start.intrinsics)
+        R_CT, t_CT_m = poses_with_camera(found, calibration.observations)
+        if not (np.all(np.isfinite(R_CT)) and np.all(np.isfinite(t_CT_m))):
+            return calibration
+        start = Block(start.intrinsics, R_CT, t_CT_m, np.zeros(0))
+    better = calibrate(
         calibration.observations,
         camera.image_size_px,
         camera.model,
         skew=INTRINSICS.index("skew_px") in calibration.free,
         fixed=held(calibration),
-        start=best.block,
+        start=start,
     )
-    return found if found.squared_sum < own or not np.isfinite(own) else calibration
+    own = calibration.squared_sum
+    return better if better.squared_sum < own or not np.isfinite(own) else calibration
 
 
 @dataclass(frozen=True)

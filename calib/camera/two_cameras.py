@@ -14,8 +14,8 @@ has to be compared with what it would be by chance. With the quadratic evidence 
    T2 chance reaches.
 
 The lens model is first widened to five coefficients, where that helps, and the target takes the shape
-that fits best: a lens that the model cannot follow, or a bent board, makes views disagree by where and how the board
-lies in them, which is not a second camera.
+that fits best: a lens that the model cannot follow, or a bent board, makes views disagree by where and
+how the board lies in them, which is not a second camera.
 """
 
 from __future__ import annotations

@@ -92,7 +92,11 @@ def judge(
     if sturdy is not fit:
         share = _focal_share(fit, covariance(fit), 1.0)
         findings += reasons_fit.of_denominator(share, limits)
-    findings += _uncertainty(sturdy, covered, limits, numbers)
+    # A target that was deformed to fit costs certainty, which the rigid target in its shape hides.
+    least = 0.0
+    if calibration.basis is not None:
+        least = _focal_share(calibration, covariance(calibration) if found is None else found, 1.0)
+    findings += _uncertainty(sturdy, covered, least, limits, numbers)
     findings += _contradictions(sturdy, limits, numbers)
     lens = lens_shape(fit)
     findings += reasons_fit.of_lens(lens, fit, covered.radius_share)
@@ -145,12 +149,16 @@ def _without_copies(
 
 
 def _uncertainty(
-    fit: Calibration, covered: Coverage, limits: Limits, numbers: dict[str, float]
+    fit: Calibration,
+    covered: Coverage,
+    least_share: float,
+    limits: Limits,
+    numbers: dict[str, float],
 ) -> list[Finding]:
     """Standard deviations, profile, starts."""
     known = covariance(fit)
     inflation = overdispersion(evidence(fit))
-    share = _focal_share(fit, known, inflation)
+    share = max(_focal_share(fit, known, inflation), inflation * least_share)
     width = max(fit.camera.image_size_px)
     inside = _inside(covered)
     projection = np.inf
@@ -210,12 +218,11 @@ def _contradictions(fit: Calibration, limits: Limits, numbers: dict[str, float])
         numbers["split_ratio"] = split.ratio
     late = reasons.of_split(change, True, wide, limits)
     mixed = reasons.of_split(split, False, wide, limits)
-    # A split in order is found by both; the one that explains more is told.
+    # A split in order is found by both; what matters is told, and then what explains more.
     if late and mixed and change is not None and split is not None:
-        if split.statistic > 1.1 * change.statistic:
-            late = []
-        else:
-            mixed = []
+        if late[0].kind != mixed[0].kind:
+            return findings + [one for one in late + mixed if one.kind != REMARK]
+        return findings + (mixed if split.statistic > 1.1 * change.statistic else late)
     return findings + late + mixed
 
 
@@ -277,6 +284,6 @@ def _next_picture(fit: Calibration, verdict: str) -> list[str]:
         else "If you take another picture, the most useful"
     )
     return [
-        f"{word}: the board in {best.where}, {lean}, {size}; "
+        f"{word}: the board {best.where}, {lean}, {size}; "
         f"it would lower the uncertainty by about {gain:.0f} %."
     ]

@@ -67,8 +67,11 @@ def simulate(
     machine = SimulatedRig()
     if rig is not None:
         from calib.rig import read_rig
+        from calib.sections import camera_from_section
 
-        machine = rig_from_file(read_rig(rig), str(rig))
+        known = read_rig(rig)
+        camera = None if known.camera is None else camera_from_section(known.camera)
+        machine = rig_from_file(known, str(rig), camera)
     told: dict[str, Any] = {"scenario": scenario, "seed": seed, "feedback": feedback}
     if scenario == "rig":
         if options or duration_s is not None:

@@ -38,6 +38,7 @@ from calib.actuator.parameters import (
 )
 from calib.actuator.pump import ElongationForce, Orifice, Pump, RateLimit
 from calib.arrays import FloatArray
+from calib.camera.model import Camera, project
 from calib.errors import BadInputError
 from calib.files import shown
 from calib.twin.camera_sensor import Tracker, View
@@ -94,7 +95,6 @@ def workspace_homography(view: View) -> FloatArray:
     Raises `BadInputError` where the camera does not see the workspace.
     """
     from calib.camera.homography import fit_homography
-    from calib.camera.model import project
 
     x, y = np.meshgrid(np.linspace(-0.06, 0.06, 9), np.linspace(0.05, 0.11, 7))
     world = np.stack([x.ravel(), y.ravel()], axis=1)
@@ -308,19 +308,22 @@ def _mapping(source: str, name: str, value: object) -> _Keys:
     return _Keys(source, name, value)
 
 
-def rig_from_file(rig: Rig, path: str) -> SimulatedRig:
-    """The nominal rig with what a rig.yaml says of it; `path` is for messages.
+def rig_from_file(rig: Rig, path: str, camera: Camera | None = None) -> SimulatedRig:
+    """The nominal rig with what a rig.yaml says of it.
+
+    Parameters
+    ----------
+    path : of the file, for messages.
+    camera : that of its `camera` section, the nominal one without.
 
     Raises `BadInputError` for keys that are not known, values in another unit or out of all
     proportion, and parameters that describe an unstable plant.
     """
-    from calib.sections import camera_from_section
-
     source, extra = shown(path), rig.model_extra or {}
     made = SimulatedRig()
     view = made.view
-    if rig.camera is not None:
-        view = replace(view, camera=camera_from_section(rig.camera))
+    if camera is not None:
+        view = replace(view, camera=camera)
     if rig.plane is not None:
         view = replace(view, R_CW=np.array(rig.plane.R_CW), t_CW_m=np.array(rig.plane.t_CW_m))
     made = replace(made, view=view)

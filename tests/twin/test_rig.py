@@ -12,6 +12,7 @@ from calib.camera.homography import apply_homography
 from calib.camera.model import Camera, project
 from calib.errors import BadInputError
 from calib.rig import read_rig
+from calib.sections import camera_from_section
 from calib.twin.camera_sensor import View
 from calib.twin.rig import SimulatedRig, nominal_view, rig_from_file, workspace_homography
 
@@ -21,7 +22,9 @@ def rig(tmp_path: Path):
     def _rig(text: str) -> SimulatedRig:
         path = tmp_path / "rig.yaml"
         path.write_text(text)
-        return rig_from_file(read_rig(path), "rig.yaml")
+        read = read_rig(path)
+        camera = None if read.camera is None else camera_from_section(read.camera)
+        return rig_from_file(read, "rig.yaml", camera)
 
     return _rig
 
