@@ -196,7 +196,7 @@ class _Search:
         return BoardSearch(
             board=board,
             image_size_px=size_px,
-            views=tuple(View(picture.name, target, detection.pixels) for picture, detection in seen),
+            views=tuple(View(p.name, target, d.pixels, d.refined) for p, d in seen),
             detections=tuple(detection for _, detection in seen),
             without=tuple(picture.name for i, picture in enumerate(pictures) if found[i] is None),
             hashes={picture.name: picture.sha256 for picture in pictures},

@@ -37,6 +37,7 @@ _LEAST_REACH_PX = 2.5
 _ITERATIONS = 25
 _STEP_PX = 1e-3
 _STEP_SIGMA = 0.05
+_WHITE = np.float32(255.0)
 _NOISE, _LEAST_NOISE = 0.04, 1.0
 _LEAST_BEND_SIGMA = 1e-6
 _START_WIDTH_PX = 1.2
@@ -222,7 +223,13 @@ def _model(q: _Float32, win: _Windows) -> tuple[_Float32, _Float32]:
     J[:, 8] = y * toned
     J[:, 9] = by_d1 * (-0.5 * t1 * t1)
     J[:, 10] = by_d2 * (0.5 * t2 * t2)
-    return win.grey * win.weight - light * tone, J
+    shown = light * tone
+    # A sensor that is full shows white, whatever the light: nothing there to learn from.
+    full = (shown >= _WHITE) | (shown < 0.0)
+    if np.any(full):
+        J *= ~full[:, None, :]
+        shown = np.clip(shown, 0.0, _WHITE)
+    return win.grey * win.weight - shown, J
 
 
 def _start(points: FloatArray, frames: Frames, win: _Windows) -> FloatArray:

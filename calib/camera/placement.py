@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.arrays import FloatArray
+from calib.arrays import BoolArray, FloatArray
 from calib.camera.board import Board
 from calib.camera.homography import fit_homography, map_jacobian
 from calib.errors import BadInputError
@@ -45,6 +45,10 @@ class Placement:
     quarter_turns: int
     x_axis_deg: float
     how: str
+
+    def reordered(self, values: BoolArray, board: Board) -> BoolArray:
+        """Values (columns * rows,) of the detected corners in the order of `pixels`."""
+        return np.rot90(values.reshape(board.rows, board.columns), self.quarter_turns).ravel()
 
 
 def world_points_m(board: Board, first_corner_m: Sequence[float], angle_rad: float) -> FloatArray:

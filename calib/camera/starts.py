@@ -164,7 +164,7 @@ def best_of_starts(calibration: Calibration) -> Calibration:
     if not ends:
         return calibration
     best = min(ends, key=lambda end: end.cost)
-    if np.isfinite(some.squared_sum) and best.cost > some.squared_sum - _CHI2_95 * some.sigma_px**2:
+    if best.cost > _cost(some) - _CHI2_95 * some.sigma_px**2:
         return calibration
     camera, start = calibration.camera, best.block
     if some is not calibration:
@@ -181,8 +181,12 @@ def best_of_starts(calibration: Calibration) -> Calibration:
         fixed=held(calibration),
         start=start,
     )
-    own = calibration.squared_sum
-    return better if better.squared_sum < own or not np.isfinite(own) else calibration
+    return better if _cost(better) < _cost(calibration) else calibration
+
+
+def _cost(calibration: Calibration) -> float:
+    """Sum of squared residuals, infinite where the fit has none."""
+    return calibration.squared_sum if np.all(np.isfinite(calibration.normal)) else float("inf")
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,8 @@ def extrinsics(
     views, orientation = [], []
     for view in found.views:
         placed = settle_orientation(view.pixels, found.board, told.angle_rad, told.first_corner_px, view.name)
-        views.append(View(view.name, world_m, placed.pixels))
+        kept = slice(None) if view.measured is None else placed.reordered(view.measured, found.board)
+        views.append(View(view.name, world_m[kept], placed.pixels[kept]))
         orientation.append(f"{view.name}: {placed.how}")
     workspace = (before.geometry or Geometry()).workspace_m
     plane = calibrate_plane(

@@ -149,3 +149,15 @@ def test_mirrored_and_incomplete_grids_are_refused() -> None:
         settle_orientation(np.where(truth == truth[3], np.nan, truth), THESIS, 0.0)
     with pytest.raises(BadInputError, match="shows no direction"):
         settle_orientation(truth[:7], Board(7, 1, 0.02), 0.0)
+
+
+@pytest.mark.parametrize("turn", [0, 2])
+def test_flags_of_corners_follow_their_corners(turn: int) -> None:
+    board = Board(4, 3, 0.01)
+    flags = np.arange(12) % 5 == 0
+    pixels = 20.0 * np.stack([np.tile(np.arange(4), 3), np.repeat(np.arange(3), 4)], axis=1) + 50.0
+    given = np.rot90(pixels.reshape(3, 4, 2), turn).reshape(-1, 2)
+    given_flags = np.rot90(flags.reshape(3, 4), turn).ravel()
+    placed = settle_orientation(given, board, 0.0)
+    np.testing.assert_array_equal(placed.pixels, pixels)
+    np.testing.assert_array_equal(placed.reordered(given_flags, board), flags)
