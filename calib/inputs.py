@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -130,7 +130,7 @@ def _near_origin(views: Sequence[View]) -> tuple[View, ...]:
     middle = 0.5 * (every.min(axis=0) + every.max(axis=0))
     if np.abs(middle).max() < 10.0 * np.ptp(every, axis=0).max():
         return tuple(views)
-    return tuple(View(view.name, view.target_m - middle, view.pixels) for view in views)
+    return tuple(replace(view, target_m=view.target_m - middle) for view in views)
 
 
 def _from_pictures(sources: Sequence[Path], told: Told, progress: Callable[[int, int], None]) -> ViewSet:

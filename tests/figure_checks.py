@@ -70,6 +70,7 @@ def complaints(figure: Figure) -> list[str]:
             out.append(f"{text.get_text()!r} runs off the sheet")
         if text.get_fontsize() * figure.dpi / 72.0 * WIDTH_PX / width < SMALLEST_PX:
             out.append(f"{text.get_text()!r} is too small")
+    out += [f"{text.get_text()!r} is a formula in the raw" for text in texts if "\\math" in text.get_text()]
     for (one, a), (other, b) in combinations(zip(texts, boxes, strict=True), 2):
         across = min(a[2], b[2]) - max(a[0], b[0])
         down = min(a[3], b[3]) - max(a[1], b[1])

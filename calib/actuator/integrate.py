@@ -13,8 +13,6 @@ that leaves the model is refused when it does, never returned as NaN.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -25,7 +23,7 @@ from calib.actuator.dynamics import coefficients, linearised
 from calib.actuator.kernel import STATE, run
 from calib.actuator.parameters import Plant
 from calib.actuator.pump import Pump, delayed, pump_at_rest, pump_coefficients, static_force_N
-from calib.arrays import FloatArray, IntArray
+from calib.arrays import FloatArray
 from calib.errors import BadInputError
 
 __all__ = [
@@ -36,7 +34,6 @@ __all__ = [
     "largest_step_s",
     "rig_at_rest",
     "simulate",
-    "simulate_batch",
     "state_row",
     "swing",
     "tick",
@@ -257,50 +254,3 @@ def swing(plant: Plant, start: FloatArray, duration_s: float, step_s: float = 1e
     held = np.concatenate([start[:6], start[8:10], start[8:10]])
     states = _run(plant, Pump(), held, static, step_s, 1, every)
     return Motion(step_s * every * np.arange(len(states) + 1, dtype=np.float64), np.vstack([held, states]))
-
-
-def simulate_batch(
-    plants: Sequence[Plant],
-    pumps: Sequence[Pump],
-    pwm: FloatArray,
-    start: FloatArray,
-    substeps: int = SUBSTEPS,
-    threads: int = 2,
-) -> tuple[FloatArray, IntArray]:
-    """The same commands for many parameter sets at once.
-
-    Parameters
-    ----------
-    plants, pumps : one pair per set; the pumps' ticks are alike.
-    pwm : (n, 2) commands; those before are zero.
-    start : (10,) or (sets, 10) rows of `kernel.STATE`.
-    threads : the kernel releases the interpreter, so threads share the work.
-
-    Returns
-    -------
-    states (sets, n, 10), one row at the end of each tick, and (sets,) the step in which a set left
-    the model, -1 where it did not; the states of such a set are NaN. The step is not checked
-    beforehand: an unstable one leaves the model.
-    """
-    if len(plants) != len(pumps):
-        raise BadInputError(f"batch: found {len(plants)} plants and {len(pumps)} pumps, expected as many")
-    rows = np.ascontiguousarray(np.broadcast_to(start, (len(plants), len(STATE))), dtype=np.float64)
-    _check_counts(substeps, 1, len(pwm))
-    states = np.empty((len(plants), len(pwm), len(STATE)))
-    stopped = np.full(len(plants), -1, dtype=np.int64)
-
-    @lru_cache(maxsize=8)
-    def forces(pump: Pump) -> FloatArray:
-        return static_force_N(pump, delayed(pump, pwm))
-
-    def chunk(indices: range) -> None:
-        for i in indices:
-            plant, pump = plants[i], pumps[i]
-            c, p = coefficients(plant), pump_coefficients(pump)
-            stopped[i] = run(c, p, rows[i], forces(pump), pump.tick_s, substeps, substeps, states[i])
-            if stopped[i] >= 0:
-                states[i] = np.nan
-
-    with ThreadPoolExecutor(max_workers=max(threads, 1)) as pool:
-        list(pool.map(chunk, [range(k, len(plants), threads) for k in range(max(threads, 1))]))
-    return states, stopped

@@ -53,6 +53,7 @@ FORCE_PROJECTIONS = ("virtual_work", "head")
 LONGEST_ELONGATION_M = 0.04
 """Up to here a stiffness law has to stay positive; 12 V reach 0.0266 m."""
 
+_ELONGATIONS_M = np.linspace(0.0, LONGEST_ELONGATION_M, 81)
 _GRAVITY_LIMIT_MPS2 = 100.0
 
 
@@ -95,7 +96,7 @@ class Stiffness:
             raise BadInputError(f"stiffness: found {len(self.coefficients)} coefficients, expected 1 to 4")
         for i, value in enumerate(self.coefficients):
             _finite(f"stiffness k{i}", value)
-        softest = min(self.secant(eps) for eps in np.linspace(0.0, LONGEST_ELONGATION_M, 81).tolist())
+        softest = float(np.polyval(self.coefficients[::-1], _ELONGATIONS_M).min())
         if softest <= 0.0:
             raise BadInputError(
                 f"stiffness: found {softest:g} N/m between 0 and {LONGEST_ELONGATION_M:g} m of elongation, "
@@ -292,7 +293,9 @@ def growth_rate_per_s(plant: Plant) -> float:
     Stretching and bending decouple there. With mu = m / 2 for stretching and J_0 / (2 r_B^2),
     J_0 = m l0^2 / 4 + J, for bending, both follow
 
-        (mu s^2 + c s + k)(s + lambda1) = lambda2 lambda3 s.
+        (mu s^2 + c s + k)(s + lambda1) = lambda2 lambda3 s,
+
+    which has no growing root when its coefficients pass the test of Routh and Hurwitz.
     """
     k = plant.stiffness_scale * plant.stiffness.secant(0.0)
     c = plant.damping_Ns_per_sqrt_N_per_m * math.sqrt(plant.stiffness.secant(0.0))
@@ -300,7 +303,10 @@ def growth_rate_per_s(plant: Plant) -> float:
     J0 = 0.25 * plant.mass_kg * plant.rest_length_m**2 + plant.inertia_kgm2
     worst = 0.0
     for mu in (0.5 * plant.mass_kg, 0.5 * J0 / plant.bellows_radius_m**2):
-        roots = np.roots([mu, c + mu * l1, k + c * l1 - l2 * l3, k * l1])
+        a3, a2, a1, a0 = mu, c + mu * l1, k + c * l1 - l2 * l3, k * l1
+        if min(a2, a1, a0) >= 0.0 and a2 * a1 >= a3 * a0:
+            continue
+        roots = np.roots([a3, a2, a1, a0])
         growth = float(roots.real.max())
         # Rounding puts the roots of an undamped plant on either side of the axis.
         if growth > 1e-9 * float(np.abs(roots).max()):

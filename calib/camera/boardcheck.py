@@ -14,7 +14,7 @@ from calib.camera.saddles import sample
 
 __all__ = ["continuing_sides", "fault_of"]
 
-_UNREFINED_SHARE = 0.05
+_UNREFINED_SHARE = 0.1
 _MISFIT = 0.08
 """Largest typical distance of a corner from where the others place it, in squares."""
 _MEDIAN_RESIDUAL = 0.25

@@ -96,9 +96,8 @@ def _best_of(gray: GrayImage, stage: Stage) -> Refined | None:
 def detect(gray: GrayImage, columns: int, rows: int) -> Detection | None:
     """Find a board of `columns` x `rows` inner corners, at any angle, to a small fraction of a pixel.
 
-    The first stage whose grid is whole and passes the tests ends the search; when corners of it could
-    not be measured the other stages are asked too, and the grid with the most measured corners is
-    kept.
+    The first stage whose grid is whole and passes the tests ends the search. Refinement starts each
+    corner anew from where the others place it, so it matters little which stage that is.
 
     Parameters
     ----------
@@ -118,17 +117,11 @@ def detect(gray: GrayImage, columns: int, rows: int) -> Detection | None:
         raise BadInputError(f"a board of {columns}x{rows} inner corners cannot be found; expected at least 3x3")
     if not _checked(gray):
         return None
-    best: tuple[int, Refined, str] | None = None
     for stage in lattice_stages(gray, columns, rows) + fallback_stages(gray, columns, rows):
         grid = _best_of(gray, stage)
-        if grid is None:
-            continue
-        measured = int(grid.refined.sum())
-        if best is None or measured > best[0]:
-            best = (measured, grid, stage.name)
-        if measured == columns * rows:
-            break
-    return None if best is None else _ordered(best[1], columns, rows, best[2])
+        if grid is not None:
+            return _ordered(grid, columns, rows, stage.name)
+    return None
 
 
 def find_size(gray: GrayImage | Sequence[GrayImage]) -> tuple[int, int] | None:

@@ -35,7 +35,8 @@ _FAR = 0.2
 """Share of a square that no corner may be away from its prediction."""
 _UNKNOWN_SIGMA = 0.25
 """Sigma of a corner that was not refined, in squares."""
-_RESCUES = 3
+_RESCUE_WINDOWS = (0.45, 0.28, 0.2)
+_SIGMAS = 6.0
 _PASSES = 3
 _CLOSE_WINDOW = 0.28
 _DISTURBED = 1.5
@@ -132,35 +133,6 @@ def _merged(fit: LocalFit, again: LocalFit, where: IntArray, use: BoolArray) -> 
     return LocalFit(**values)
 
 
-def _rescued(image: _Float32, fit: LocalFit, shape: tuple[int, int]) -> tuple[LocalFit, BoolArray, Prediction | None]:
-    """Fit again, from where the others place them, the corners that failed or disagree."""
-    good = _trusted(fit, shape)
-    for _ in range(_RESCUES):
-        prediction = predict(fit.points.reshape(*shape, 2), good.reshape(shape))
-        if prediction is None:
-            return fit, good, None
-        placed = prediction.points.reshape(-1, 2)
-        frames = frames_of(np.where(good[:, None], fit.points, placed).reshape(*shape, 2))
-        far = _FAR * np.minimum(np.linalg.norm(frames.along, axis=1), np.linalg.norm(frames.across, axis=1))
-        away = np.linalg.norm(fit.points - placed, axis=1)
-        limit = np.minimum(prediction.limit_px.ravel(), far)
-        doubtful = np.flatnonzero(~good | ~(away < limit))
-        if len(doubtful) == 0:
-            return fit, good, prediction
-        again = fit_corners(image, placed[doubtful], frames.take(doubtful))
-        again = _closer_looked(image, again, frames.take(doubtful))
-        trial = _merged(fit, again, doubtful, np.ones(len(doubtful), dtype=np.bool_))
-        near = np.linalg.norm(again.points - placed[doubtful], axis=1)
-        moved = np.linalg.norm(again.points - fit.points[doubtful], axis=1)
-        use = _trusted(trial, shape)[doubtful] & (near < far[doubtful])
-        use &= ~good[doubtful] | (near < away[doubtful])
-        fit = _merged(fit, again, doubtful, use)
-        good = _trusted(fit, shape) & (np.linalg.norm(fit.points - placed, axis=1) < far)
-        if not np.any(use & ~(moved < 0.01)):
-            break
-    return fit, good, predict(fit.points.reshape(*shape, 2), good.reshape(shape))
-
-
 def _closer_looked(image: _Float32, fit: LocalFit, frames: Frames) -> LocalFit:
     """Fit with a smaller window the corners that something near them disturbs: a margin, a shadow, a hand."""
     typical = float(np.median(fit.residual))
@@ -170,6 +142,56 @@ def _closer_looked(image: _Float32, fit: LocalFit, frames: Frames) -> LocalFit:
     again = fit_corners(image, fit.points[doubtful], frames.take(doubtful), window=_CLOSE_WINDOW)
     use = again.converged & (again.residual < np.where(fit.converged, 0.7 * fit.residual, np.inf)[doubtful])
     return _merged(fit, again, doubtful, use)
+
+
+@dataclass(frozen=True)
+class _Check:
+    """What the other corners say of each of N fits: the place, the distance to it and how far is too far."""
+
+    placed: FloatArray
+    away: FloatArray
+    bound: FloatArray
+    frames: Frames
+
+
+def _checked(fit: LocalFit, good: BoolArray, shape: tuple[int, int]) -> tuple[_Check, Prediction] | None:
+    prediction = predict(fit.points.reshape(*shape, 2), good.reshape(shape))
+    if prediction is None:
+        return None
+    placed = prediction.points.reshape(-1, 2)
+    frames = frames_of(np.where(good[:, None], fit.points, placed).reshape(*shape, 2))
+    square = np.minimum(np.linalg.norm(frames.along, axis=1), np.linalg.norm(frames.across, axis=1))
+    away = np.linalg.norm(fit.points - placed, axis=1)
+    bound = np.minimum(np.maximum(prediction.limit_px.ravel(), _SIGMAS * fit.sigma_px), _FAR * square)
+    return _Check(placed, away, bound, frames), prediction
+
+
+def _rescued(image: _Float32, fit: LocalFit, shape: tuple[int, int]) -> tuple[LocalFit, BoolArray, Prediction] | None:
+    """Fit again, from where the others place them, the corners that failed or disagree with the others."""
+    good = _trusted(fit, shape)
+    for window in _RESCUE_WINDOWS:
+        checked = _checked(fit, good, shape)
+        if checked is None:
+            return None
+        check, prediction = checked
+        doubtful = np.flatnonzero(~good | ~(check.away < check.bound))
+        if len(doubtful) == 0:
+            return fit, good, prediction
+        again = fit_corners(image, check.placed[doubtful], check.frames.take(doubtful), window=window)
+        trial = _merged(fit, again, doubtful, np.ones(len(doubtful), dtype=np.bool_))
+        near = np.linalg.norm(again.points - check.placed[doubtful], axis=1)
+        use = _trusted(trial, shape)[doubtful] & (~good[doubtful] | (near < 0.7 * check.away[doubtful]))
+        fit = _merged(fit, again, doubtful, use)
+        good[doubtful[use]] = True
+    checked = _checked(fit, good, shape)
+    if checked is None:
+        return None
+    check = checked[0]
+    # A clean fit may contradict the others: the board need not be flat. A disturbed one may not.
+    clean = fit.residual < _DISTURBED * np.median(fit.residual) + 0.02
+    good &= check.away < np.where(clean, 2.0, 1.0) * check.bound
+    prediction = predict(fit.points.reshape(*shape, 2), good.reshape(shape))
+    return None if prediction is None else (fit, good, prediction)
 
 
 def refine(gray: GrayImage, points: FloatArray) -> Refined | None:
@@ -205,9 +227,10 @@ def refine(gray: GrayImage, points: FloatArray) -> Refined | None:
         if np.max(np.abs(moved - before)) < _STEADY_PX:
             break
     fit = _closer_looked(image, fit, frames_of(moved))
-    fit, good, prediction = _rescued(image, fit, shape)
-    if prediction is None:
+    rescued = _rescued(image, fit, shape)
+    if rescued is None:
         return None
+    fit, good, prediction = rescued
     placed = prediction.points.reshape(-1, 2)
     unknown = _UNKNOWN_SIGMA * square_px(prediction.points)
     found = np.where(good[:, None], fit.points, placed).reshape(*shape, 2)

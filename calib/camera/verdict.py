@@ -218,11 +218,11 @@ def _contradictions(fit: Calibration, limits: Limits, numbers: dict[str, float])
         numbers["split_ratio"] = split.ratio
     late = reasons.of_split(change, True, wide, limits)
     mixed = reasons.of_split(split, False, wide, limits)
-    # A split in order is found by both; what matters is told, and then what explains more.
+    # A split in order is found by both; what matters is told, and then what chance explains less.
     if late and mixed and change is not None and split is not None:
         if late[0].kind != mixed[0].kind:
             return findings + [one for one in late + mixed if one.kind != REMARK]
-        return findings + (mixed if split.statistic > 1.1 * change.statistic else late)
+        return findings + (mixed if split.ratio > change.ratio else late)
     return findings + late + mixed
 
 

@@ -21,7 +21,15 @@ from calib.camera.model import Camera
 from calib.camera.plane import Plane, to_pixels
 from calib.camera.plane_sigma import visible
 from calib.camera.undistortion import fold_radius
-from calib.report.fields import arrows, colour_bar, contour_map, magnified, panel_height_in, picture_frame
+from calib.report.fields import (
+    arrows,
+    colour_bar,
+    contour_levels,
+    contour_map,
+    magnified,
+    panel_height_in,
+    picture_frame,
+)
 from calib.report.style import (
     BLUE,
     GREEN,
@@ -135,16 +143,11 @@ def _sigma(plane: Plane) -> Figure:
         x, y, table = _grid(plane, length)
         contour_map(axes, x, y, table, "mm", even=True, norm=norm)
     if len(finite):
-        colours = ScalarMappable(norm, RISING)
-        figure.colorbar(
-            colours,
-            ax=panels,
-            fraction=0.04,
-            pad=0.02,
-            shrink=0.9,
-            label="standard deviation (mm)",
-            format="%g",
-        )
+        ticks = [level for level in contour_levels(finite) if norm.vmin <= level <= norm.vmax]
+        bar = figure.colorbar(ScalarMappable(norm, RISING), ax=panels, fraction=0.04, pad=0.02, shrink=0.9)
+        bar.minorticks_off()
+        bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
+        bar.set_label("standard deviation (mm)")
     return figure
 
 

@@ -138,9 +138,9 @@ def _scene(
     axes.set_box_aspect(high - low, zoom=1.02)
     axes.set_proj_type("ortho")
     axes.view_init(elev=22.0, azim=-62.0)
-    axes.set_xlabel("x, right (m)")
-    axes.set_ylabel("z, forward (m)")
-    axes.set_zlabel("-y, up (m)")
+    axes.set_xlabel("x, right (m)", labelpad=7.0)
+    axes.set_ylabel("z, forward (m)", labelpad=9.0)
+    axes.set_zlabel("-y, up (m)", labelpad=7.0)
     for axis, extent in zip((axes.xaxis, axes.yaxis, axes.zaxis), high - low, strict=True):
         axis.pane.set_facecolor("#f7f8f9")
         axis.pane.set_edgecolor("#d3d8dd")

@@ -19,7 +19,6 @@ from calib.actuator.integrate import (
     largest_step_s,
     rig_at_rest,
     simulate,
-    simulate_batch,
     state_row,
     swing,
     tick,
@@ -222,29 +221,6 @@ def test_motion_stays_under_constant_forces() -> None:
     assert np.abs(motion.q_m - q).max() < 1e-14
 
 
-@pytest.mark.parametrize("threads", [1, 2, 3])
-def test_batch_is_the_single_runs(threads: int) -> None:
-    rng, pwm = np.random.default_rng(6), random_commands(7, 3)
-    plants = [replace(PUMPED, stiffness=Stiffness((float(k), 1000.0))) for k in rng.uniform(40, 60, 5)]
-    pumps = [Pump(lag_s=float(t)) for t in rng.uniform(0.5, 0.9, 5)]
-    states, stopped = simulate_batch(plants, pumps, pwm, state_row(PUMPED, 0.2), threads=threads)
-    assert states.shape == (5, len(pwm), len(STATE))
-    assert np.all(stopped == -1)
-    for plant, pump, rows in zip(plants, pumps, states, strict=True):
-        alone = simulate(plant, pump, pwm, rig_at_rest(plant, pump, 0.2))
-        assert np.array_equal(alone.states[1:], rows)
-
-
-def test_batch_marks_a_set_that_leaves_the_model() -> None:
-    hard = replace(PUMPED, stiffness=Stiffness((1e6,)))
-    states, stopped = simulate_batch(
-        [PUMPED, hard, PUMPED], [Pump()] * 3, np.full((20, 2), 100.0), state_row(PUMPED, 0.3)
-    )
-    assert stopped[0] == stopped[2] == -1
-    assert stopped[1] >= 0
-    assert np.all(np.isnan(states[1])) and np.all(np.isfinite(states[[0, 2]]))
-
-
 @pytest.mark.parametrize("plant", [UNDAMPED, free_swing(), PUMPED, replace(PUMPED, damping_scale=60.0)])
 def test_largest_step_is_where_runge_kutta_turns(plant: Plant) -> None:
     """Just below it small motion dies down, just above it grows; both refused beyond."""
@@ -278,7 +254,6 @@ def test_leaving_the_model_is_told_not_returned() -> None:
         (lambda: simulate(PUMPED, Pump(), np.zeros((0, 2))), "pwm: found no rows"),
         (lambda: simulate(PUMPED, Pump(), np.zeros((5, 2)), substeps=0), "found 0 per tick"),
         (lambda: simulate(PUMPED, Pump(), np.zeros((5, 2)), substeps=1), None),
-        (lambda: simulate_batch([PUMPED], [], np.zeros((5, 2)), state_row(PUMPED)), "1 plants and 0 pumps"),
     ],
 )
 def test_bad_input(call: object, words: str | None) -> None:
