@@ -7,9 +7,11 @@ __all__ = [
     "EXIT_DONE",
     "EXIT_INTERNAL",
     "EXIT_POOR",
+    "EXIT_READER_GONE",
     "EXIT_USAGE",
     "BadInputError",
     "CalibError",
+    "ReaderGoneError",
     "UsageError",
 ]
 
@@ -20,6 +22,7 @@ EXIT_USAGE = 2
 EXIT_BAD_INPUT = 3
 EXIT_INTERNAL = 70
 """A mistake of the program's own; nothing that a user can put right."""
+EXIT_READER_GONE = 141
 
 
 class CalibError(Exception):
@@ -36,3 +39,9 @@ class UsageError(CalibError):
     """The words of the command line do not fit together."""
 
     exit_code = EXIT_USAGE
+
+
+class ReaderGoneError(CalibError):
+    """Nobody reads stdout any more, as when `head` has seen enough; there is no one to tell."""
+
+    exit_code = EXIT_READER_GONE

@@ -170,7 +170,7 @@ def _expands_beyond(document: Any, most: int) -> bool:
 
 def _target(path: Path) -> Path:
     """The file that a path stands for, symbolic links followed."""
-    if not path.is_symlink():
+    if not path.is_symlink() or _is_device(path):
         return path
     target = Path(os.path.realpath(path))
     if target.is_symlink():

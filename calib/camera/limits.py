@@ -39,17 +39,17 @@ class Limits:
     pixel_aspect : fx over fy where the board cannot tell whether it is to blame.
     bow_bad, bow_remark, bow_sigma : departure from flatness over the board's size, and over its
         standard deviation.
-    bow_focal, fragile : share by which a bend that is there, or one of half a percent of the size,
-        may move the focal length.
+    bow_focal, bow_focal_remark : share by which a bend that is there may move the focal length.
+    fragile : share by which a bend of half a percent of the size may do so.
     rival_cost, rival_focal : another minimum with a cost up to this much higher and a focal length
         this share away is a rival.
     """
 
     views: int = 4
-    focal_poor: float = 0.02
+    focal_poor: float = 0.03
     focal_free: float = 0.10
-    spread_poor_deg: float = 10.0
-    spread_free_deg: float = 4.0
+    spread_poor_deg: float = 12.0
+    spread_free_deg: float = 5.0
     area_poor: float = 0.20
     view_poor: float = 0.01
     projection_share: float = 0.002
@@ -74,7 +74,8 @@ class Limits:
     bow_bad: float = 0.010
     bow_remark: float = 0.005
     bow_sigma: float = 4.0
-    bow_focal: float = 0.02
+    bow_focal: float = 0.015
+    bow_focal_remark: float = 0.005
     fragile: float = 0.03
     rival_cost: float = 1.10
     rival_focal: float = 0.10

@@ -268,14 +268,16 @@ def _of_flatness(found: TargetShape, limits: Limits) -> list[Finding]:
     """A bend that is there, or views that could not bear one."""
     bend, moved = found.bow_m / found.size_m, abs(found.focal_shift)
     certain = found.bow_significance > limits.bow_sigma
-    if certain and (bend > limits.bow_remark or moved > limits.bow_focal):
+    if certain and (bend > limits.bow_remark or moved > limits.bow_focal_remark):
         text = (
             f"The board is not flat: it is bent by about {1e3 * found.bow_m:.1f} mm over "
             f"{1e3 * found.size_m:.0f} mm ({found.bow_significance:.0f} standard deviations; up to "
             f"{100 * limits.bow_bad:.0f} % is good), which moves the focal length by {100 * moved:.1f} %."
         )
         kind = INCONSISTENT if bend > limits.bow_bad else POOR if moved > limits.bow_focal else REMARK
-        return [Finding(kind, text, "Glue the board to a flat plate.")]
+        return [
+            Finding(kind, text, "Glue the board to a flat plate, or let its shape be fitted (--board warp).")
+        ]
     if found.focal_per_bow > limits.fragile:
         text = (
             "The focal length hangs on the board's flatness: a bend of half a percent of its size "

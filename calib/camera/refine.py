@@ -146,11 +146,16 @@ def _closer_looked(image: _Float32, fit: LocalFit, frames: Frames) -> LocalFit:
 
 @dataclass(frozen=True)
 class _Check:
-    """What the other corners say of each of N fits: the place, the distance to it and how far is too far."""
+    """What the other corners say of each of N fits.
+
+    Its place, the distance to it, the distance that is doubtful and the distance that is out of the
+    question.
+    """
 
     placed: FloatArray
     away: FloatArray
     bound: FloatArray
+    far: FloatArray
     frames: Frames
 
 
@@ -162,8 +167,9 @@ def _checked(fit: LocalFit, good: BoolArray, shape: tuple[int, int]) -> tuple[_C
     frames = frames_of(np.where(good[:, None], fit.points, placed).reshape(*shape, 2))
     square = np.minimum(np.linalg.norm(frames.along, axis=1), np.linalg.norm(frames.across, axis=1))
     away = np.linalg.norm(fit.points - placed, axis=1)
-    bound = np.minimum(np.maximum(prediction.limit_px.ravel(), _SIGMAS * fit.sigma_px), _FAR * square)
-    return _Check(placed, away, bound, frames), prediction
+    far = _FAR * square
+    bound = np.minimum(np.maximum(prediction.limit_px.ravel(), _SIGMAS * fit.sigma_px), far)
+    return _Check(placed, away, bound, far, frames), prediction
 
 
 def _rescued(image: _Float32, fit: LocalFit, shape: tuple[int, int]) -> tuple[LocalFit, BoolArray, Prediction] | None:
@@ -187,9 +193,9 @@ def _rescued(image: _Float32, fit: LocalFit, shape: tuple[int, int]) -> tuple[Lo
     if checked is None:
         return None
     check = checked[0]
-    # A clean fit may contradict the others: the board need not be flat. A disturbed one may not.
+    # A clean fit may contradict the others: neither board nor lens need be smooth. A disturbed one may not.
     clean = fit.residual < _DISTURBED * np.median(fit.residual) + 0.02
-    good &= check.away < np.where(clean, 2.0, 1.0) * check.bound
+    good &= check.away < np.where(clean, check.far, check.bound)
     prediction = predict(fit.points.reshape(*shape, 2), good.reshape(shape))
     return None if prediction is None else (fit, good, prediction)
 

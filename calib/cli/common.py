@@ -13,13 +13,13 @@ from typing import Annotated, Any, Protocol
 
 import typer
 
+from calib.errors import CalibError, ReaderGoneError
 from calib.files import one_line
 
 __all__ = [
     "FiguresOption",
     "JsonOption",
     "ProgressCall",
-    "ReaderGoneError",
     "RigOption",
     "document",
     "emit",
@@ -42,10 +42,6 @@ class ProgressCall(Protocol):
     def __call__(self, done: int, total: int) -> None: ...
 
 
-class ReaderGoneError(Exception):
-    """Nobody reads stdout any more, as when `head` has seen enough."""
-
-
 def narrate(message: str) -> None:
     """A line for the person who watches, on stderr; whether it arrives changes nothing."""
     with contextlib.suppress(OSError):
@@ -63,7 +59,9 @@ def emit(text: str) -> None:
     try:
         sys.stdout.write(text)
     except BrokenPipeError as error:
-        raise ReaderGoneError from error
+        raise ReaderGoneError("") from error
+    except OSError as error:
+        raise CalibError(f"standard output: cannot be written: {error.strerror or error}") from error
 
 
 def _finite(value: Any) -> Any:

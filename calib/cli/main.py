@@ -1,4 +1,7 @@
-"""The command `calib`: its verbs, and how errors end it."""
+"""The command `calib`: what it sets up, and how errors end it.
+
+The verbs are imported once all that is in place, so that Ctrl-C is answered early, too.
+"""
 
 from __future__ import annotations
 
@@ -8,64 +11,20 @@ import os
 import re
 import sys
 import threading
+import traceback
 import warnings
 from typing import NoReturn
+
+from calib.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERNAL, EXIT_READER_GONE, CalibError, UsageError
+from calib.files import one_line
+
+__all__ = ["main"]
 
 # Small matrices gain nothing from BLAS threads, and sums then do not depend on their number.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")
 
-import typer
-
-from calib import __version__
-from calib.cli.board import board
-from calib.cli.common import ReaderGoneError, narrate
-from calib.cli.distortion import distortion
-from calib.cli.exchange import export_camera, import_camera
-from calib.cli.extrinsics import extrinsics
-from calib.cli.firmware import firmware
-from calib.cli.intrinsics import intrinsics
-from calib.cli.simulate import simulate
-from calib.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERNAL, CalibError, UsageError
-
-__all__ = ["app", "main"]
-
 _EXIT_INTERRUPTED = 130
-_EXIT_READER_GONE = 141
-
-app = typer.Typer(
-    name="calib",
-    help="Calibrate a cheap camera and an IMU on a machine, down to the constants in its firmware.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-
-
-def _show_version(value: bool) -> None:
-    if value:
-        sys.stdout.write(f"calib {__version__}\n")
-        raise typer.Exit
-
-
-@app.callback()
-def _options(
-    version: bool = typer.Option(
-        False, "--version", help="Show the version and leave.", callback=_show_version, is_eager=True
-    ),
-) -> None:
-    pass
-
-
-app.command("intrinsics")(intrinsics)
-app.command("extrinsics")(extrinsics)
-app.command("distortion")(distortion)
-app.command("firmware")(firmware)
-app.command("board")(board)
-app.command("simulate")(simulate)
-app.command("export")(export_camera)
-app.command("import")(import_camera)
 
 
 def main() -> NoReturn:
@@ -88,6 +47,8 @@ def main() -> NoReturn:
 
 def _run(debug: bool) -> int:
     try:
+        from calib.cli.app import app
+
         empty = next((word for word in sys.argv[1:] if not word or re.fullmatch(r"--[a-z-]+=", word)), None)
         if empty is not None:
             raise UsageError(f"an argument is empty: {empty!r}")
@@ -101,8 +62,6 @@ def _run(debug: bool) -> int:
         return _ended(str(error), error.exit_code)
     except KeyboardInterrupt:
         return _interrupted()
-    except ReaderGoneError:
-        return _EXIT_READER_GONE
     except MemoryError:
         return _ended("out of memory; the input is larger than this machine can hold", EXIT_BAD_INPUT)
     except OSError as error:
@@ -110,7 +69,7 @@ def _run(debug: bool) -> int:
         return _ended(f"{where}{error.strerror or error}", EXIT_BAD_INPUT)
     except Exception as error:
         if debug:
-            raise
+            traceback.print_exc()
         return _ended(
             f"internal error: {_described(error)}; please report it (CALIB_DEBUG=1 shows more)", EXIT_INTERNAL
         )
@@ -118,7 +77,9 @@ def _run(debug: bool) -> int:
 
 
 def _ended(message: str, code: int) -> int:
-    narrate(f"calib: {' '.join(message.split())}")
+    if message:
+        with contextlib.suppress(OSError):
+            sys.stderr.write(f"calib: {one_line(' '.join(message.split()))}\n")
     return code
 
 
@@ -146,6 +107,7 @@ def _prepare_streams(debug: bool) -> None:
             os.fstat(descriptor)
         except OSError:
             os.open(os.devnull, os.O_RDWR)
+    # These stay open as long as the process lives, hence no `with`.
     if sys.stdout is None:
         sys.stdout = open(1, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
     if sys.stderr is None:
@@ -169,7 +131,7 @@ def _flushed(code: int) -> int:
         sys.stdout.flush()
         return code
     except BrokenPipeError:
-        code = code or _EXIT_READER_GONE
+        code = code or EXIT_READER_GONE
     except OSError as error:
         code = _ended(f"standard output: cannot be written: {error.strerror or error}", EXIT_BAD_INPUT)
     # What is left in the buffer would be tried again, and complained of, at the interpreter's end.

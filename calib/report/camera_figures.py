@@ -170,8 +170,8 @@ def _principal_point(frame: Axes, axes: Axes, fit: Calibration, sigma: Covarianc
     axes.invert_yaxis()
     axes.set_aspect("equal", adjustable="datalim")
     axes.grid()
-    axes.xaxis.set_major_locator(MaxNLocator(4))
-    axes.yaxis.set_major_locator(MaxNLocator(4))
+    axes.xaxis.set_major_locator(MaxNLocator(5, prune="both"))
+    axes.yaxis.set_major_locator(MaxNLocator(4, prune="both"))
     axes.set_xlabel(f"cx = {camera.cx_px:.2f} ± {number(float(deviation[0]), digits=2)} px")
     axes.set_ylabel(f"cy = {camera.cy_px:.2f} ± {number(float(deviation[1]), digits=2)} px")
 
@@ -185,8 +185,10 @@ def _radii(axes: Axes, fit: Calibration, pixels: FloatArray) -> None:
     last = float(np.linalg.norm(corners - centre, axis=1).max())
     radius = np.linalg.norm(pixels - centre, axis=1)
     if not (math.isfinite(last) and np.isfinite(radius).all()):
-        axes.set_xlabel(" ")
-        axes.tick_params(length=0.0, labelcolor="none")
+        axes.set_xticks([])
+        axes.set_yticks([])
+        # Keeps the room below that the picture's own labels need.
+        axes.set_xlabel(" ", labelpad=24.0)
         empty(axes, "the principal point is not known", 24)
         return
     seen = float(radius.max())

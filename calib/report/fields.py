@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from matplotlib import patheffects
 from matplotlib.axes import Axes
-from matplotlib.colors import BoundaryNorm, Normalize
+from matplotlib.colors import BoundaryNorm, LogNorm, Normalize
 from matplotlib.contour import ContourSet, QuadContourSet
 from matplotlib.patches import Ellipse, Rectangle
 from matplotlib.ticker import MaxNLocator
@@ -204,7 +204,10 @@ def contour_map(
         empty(axes, f"{number(float(finite.mean()), unit)} everywhere")
         return None
     levels = contour_levels(finite, even=even)
-    norm = BoundaryNorm(levels, RISING.N) if norm is None else norm
+    if norm is None:
+        norm = BoundaryNorm(levels, RISING.N)
+    elif isinstance(norm, LogNorm) and norm.vmin is not None:
+        levels = np.maximum(levels, 0.5 * norm.vmin)
     filled = axes.contourf(x, y, known, levels=levels, cmap=RISING, norm=norm, zorder=1)
     inside = levels[(levels > finite.min()) & (levels < finite.max())]
     if len(inside) and labelled:

@@ -148,6 +148,12 @@ def _exact() -> Intrinsics:
     return result_of(views_of(4), verdict="poor")
 
 
+def _precise() -> Intrinsics:
+    """So precise that the principal point needs many digits."""
+    camera = replace(CAMERA, image_size_px=(316, 208), fx_px=273.4, fy_px=272.6, cx_px=160.67, cy_px=101.87)
+    return result_of(views_of(17, noise_px=0.007, camera=camera), (316, 208))
+
+
 def _outliers() -> Intrinsics:
     views = views_of(5, noise_px=0.05)
     views[2].pixels[7] += [40.0, -25.0]
@@ -166,6 +172,7 @@ CASES = {
     "not finite": _not_finite,
     "no residuals": _exact,
     "outliers": _outliers,
+    "precise": _precise,
 }
 
 

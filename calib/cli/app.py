@@ -1,0 +1,52 @@
+"""The verbs of `calib`."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from calib import __version__
+from calib.cli.board import board
+from calib.cli.distortion import distortion
+from calib.cli.exchange import export_camera, import_camera
+from calib.cli.extrinsics import extrinsics
+from calib.cli.firmware import firmware
+from calib.cli.intrinsics import intrinsics
+from calib.cli.simulate import simulate
+
+__all__ = ["app"]
+
+app = typer.Typer(
+    name="calib",
+    help="Calibrate a cheap camera and an IMU on a machine, down to the constants in its firmware.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _show_version(value: bool) -> None:
+    if value:
+        sys.stdout.write(f"calib {__version__}\n")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: bool = typer.Option(
+        False, "--version", help="Show the version and leave.", callback=_show_version, is_eager=True
+    ),
+) -> None:
+    pass
+
+
+app.command("intrinsics")(intrinsics)
+app.command("extrinsics")(extrinsics)
+app.command("distortion")(distortion)
+app.command("firmware")(firmware)
+app.command("board")(board)
+app.command("simulate")(simulate)
+app.command("export")(export_camera)
+app.command("import")(import_camera)
