@@ -67,7 +67,9 @@ class Calibration:
 
     @property
     def squared_sum(self) -> float:
-        """Sum of squared residuals, pixels squared, without weights."""
+        """Sum of squared residuals, pixels squared, without weights; NaN where no camera was found."""
+        if not np.isfinite(self.residuals_px).any():
+            return float("nan")
         return float(np.nansum(self.residuals_px**2))
 
     @property

@@ -14,8 +14,8 @@ class Limits:
     Attributes
     ----------
     views : unique views below which nothing is left over to check the answer with.
-    focal_poor, focal_free : relative standard deviation of a focal length. Lengths measured with the
-        camera are off by the same share.
+    focal_remark, focal_poor, focal_free : relative standard deviation of a focal length. Distances
+        told by the camera are off by the same share.
     spread_poor_deg, spread_free_deg : largest angle between two boards. Focal length comes from
         perspective alone, which goes with the tilt.
     area_poor : share of the image that the points span.
@@ -46,6 +46,7 @@ class Limits:
     """
 
     views: int = 4
+    focal_remark: float = 0.015
     focal_poor: float = 0.03
     focal_free: float = 0.10
     spread_poor_deg: float = 12.0

@@ -95,14 +95,15 @@ def of_lens(found: Lens, calibration: Calibration, reach: float) -> list[Finding
 def of_focal(sigma_share: float, interval: FocalInterval | None, limits: Limits) -> list[Finding]:
     """Standard deviation of the focal length, inflated, and its interval from the profile."""
     out = []
-    if not sigma_share < limits.focal_poor:
+    if not sigma_share < limits.focal_remark:
         known = f"{100 * sigma_share:.1f} %" if sigma_share < 2 else "no better than a factor of two"
         text = (
             f"The focal length is known to {known} (one standard deviation, residuals that are not white "
             f"considered; up to {100 * limits.focal_poor:.0f} is good, {100 * limits.focal_free:.0f} means "
             "that it is free)."
         )
-        out.append(Finding(POOR if sigma_share < limits.focal_free else UNIDENTIFIABLE, text, MORE_TILT))
+        kind = REMARK if sigma_share < limits.focal_poor else POOR
+        out.append(Finding(kind if sigma_share < limits.focal_free else UNIDENTIFIABLE, text, MORE_TILT))
     if interval is None:
         return out
     if interval.lower_cost:

@@ -177,7 +177,7 @@ CASES = {
 
 
 SLOW = pytest.mark.slow
-QUICK = ("one view", "sigma not bounded", "no distortion, odd names", "not finite")
+QUICK = ("sigma not bounded", "no distortion, odd names")
 
 
 @pytest.mark.parametrize("case", [c if c in QUICK else pytest.param(c, marks=SLOW) for c in CASES])
