@@ -34,8 +34,11 @@ __all__ = [
 
 Count = Annotated[int, Field(ge=3, le=200, strict=True)]
 Metres = Annotated[float, Field(ge=1e-5, lt=10, allow_inf_nan=False, strict=True)]
+Place = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False, strict=True)]
 Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
-Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
+Position = Annotated[list[Place], Field(min_length=2, max_length=2)]
+Pixel = Annotated[list[Number], Field(min_length=2, max_length=2)]
+Angle = Annotated[float, Field(ge=-6.2832, le=6.2832, allow_inf_nan=False, strict=True)]
 
 BOARD_FILE = "board.yaml"
 _SIZE_SAMPLE = 5
@@ -56,9 +59,9 @@ class BoardFile(BaseModel):
 
     corners: Annotated[list[Count], Field(min_length=2, max_length=2)] | None = None
     square_m: Metres | None = None
-    first_corner_m: Pair | None = None
-    angle_rad: Number | None = None
-    first_corner_px: Pair | None = None
+    first_corner_m: Position | None = None
+    angle_rad: Angle | None = None
+    first_corner_px: Pixel | None = None
 
 
 def read_board_file(folder: Path) -> BoardFile:

@@ -60,7 +60,10 @@ SECTIONS = (
 Verdict = Annotated[str, Field(pattern="^(ok|poor|unidentifiable|inconsistent)$")]
 Model = Annotated[str, Field(pattern="^(pinhole|radial2|radial3|brown5|rational8)$")]
 Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
+Focal = Annotated[float, Field(ge=1e-3, le=1e7, allow_inf_nan=False, strict=True)]
+Pixels = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False, strict=True)]
+Coefficient = Annotated[float, Field(ge=-1e30, le=1e30, allow_inf_nan=False, strict=True)]
+Metres = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False, strict=True)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
 Count = Annotated[int, Field(ge=0, strict=True)]
 Side = Annotated[int, Field(ge=1, le=100_000, strict=True)]
@@ -76,7 +79,7 @@ class _Section(BaseModel):
 class Geometry(_Section):
     """What a person knows of the rig. Defaults: the nominal actuator."""
 
-    workspace_m: Annotated[list[Number], Field(min_length=4, max_length=4)] = [-0.06, 0.04, 0.06, 0.11]
+    workspace_m: Annotated[list[Metres], Field(min_length=4, max_length=4)] = [-0.06, 0.04, 0.06, 0.11]
     """Where the marker can be, world metres: least x, least y, greatest x, greatest y."""
 
     @field_validator("workspace_m")
@@ -90,14 +93,14 @@ class Geometry(_Section):
 class Distortion(_Section):
     """Coefficients of `calib.camera.model`; absent ones are zero."""
 
-    k1: Number = 0.0
-    k2: Number = 0.0
-    p1: Number = 0.0
-    p2: Number = 0.0
-    k3: Number = 0.0
-    k4: Number = 0.0
-    k5: Number = 0.0
-    k6: Number = 0.0
+    k1: Coefficient = 0.0
+    k2: Coefficient = 0.0
+    p1: Coefficient = 0.0
+    p2: Coefficient = 0.0
+    k3: Coefficient = 0.0
+    k4: Coefficient = 0.0
+    k5: Coefficient = 0.0
+    k6: Coefficient = 0.0
 
 
 class CovarianceTable(_Section):
@@ -118,11 +121,11 @@ class Camera(_Section):
 
     model: Model
     image_size_px: Annotated[list[Side], Field(min_length=2, max_length=2)]
-    fx_px: Positive
-    fy_px: Positive
-    skew_px: Number = 0.0
-    cx_px: Number
-    cy_px: Number
+    fx_px: Focal
+    fy_px: Focal
+    skew_px: Pixels = 0.0
+    cx_px: Pixels
+    cy_px: Pixels
     distortion: Distortion = Distortion()
     sigma: Sigma = {}
     covariance: CovarianceTable | None = None
@@ -165,7 +168,7 @@ class InverseLens(_Section):
 
     radial: list[Number]
     decentering_steps: Count
-    max_error_px: NotNegative
+    max_error_px: NotNegative | None
     covered: Annotated[float, Field(ge=0, le=1)]
 
 
@@ -263,8 +266,8 @@ def _short(value: Any) -> str:
 def read_rig(path: Path) -> Rig:
     """The rig in this file, an empty one where there is no file.
 
-    Raises `BadInputError`, also for a file of another kind (it would be written over) and for a plane
-    whose matrices contradict each other.
+    Raises `BadInputError`, also for a file of another kind (it would be written over) and for values
+    that contradict each other.
     """
     if not path.exists():
         return Rig()
@@ -278,9 +281,22 @@ def read_rig(path: Path) -> Rig:
         rig = Rig.model_validate(document)
     except ValidationError as error:
         raise BadInputError(validation_sentence(path, error)) from error
+    if rig.camera is not None:
+        _check_camera(path, rig.camera)
     if rig.plane is not None:
         _check_plane(path, rig.plane)
     return rig
+
+
+def _check_camera(path: Path, camera: Camera) -> None:
+    from calib.camera.model import COEFFICIENTS, MODELS
+
+    for name in COEFFICIENTS:
+        value = getattr(camera.distortion, name)
+        if value != 0.0 and name not in MODELS[camera.model]:
+            raise BadInputError(
+                f"{shown(path)}: camera.distortion.{name} is {value:g}, but {camera.model} has no {name}"
+            )
 
 
 def _check_plane(path: Path, plane: Plane) -> None:

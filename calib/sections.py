@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
+from typing import ParamSpec, TypeVar
 
 import numpy as np
+from pydantic import ValidationError
 
 from calib import rig
 from calib.arrays import FloatArray
@@ -33,6 +36,30 @@ __all__ = [
     "plane_view",
 ]
 
+_INVERSE_PX = 0.1
+_INVERSE_SHARE = 0.9
+"""A header is marked when its polynomial undoes the lens worse than this, or in less of the picture."""
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def _with_sane_values(make: Callable[P, T]) -> Callable[P, T]:
+    """Let a section that the schema refuses end in a sentence: a fit to nonsense can end anywhere."""
+
+    @functools.wraps(make)
+    def checked(*args: P.args, **kwargs: P.kwargs) -> T:
+        try:
+            return make(*args, **kwargs)
+        except ValidationError as error:
+            first = error.errors()[0]
+            key = ".".join(str(part) for part in first["loc"])
+            raise BadInputError(
+                f"no useful answer follows from this input: {key} came out as {first['input']!r:.40}"
+            ) from error
+
+    return checked
+
 
 def image_grid(image_size_px: tuple[int, int], columns: int = 17, rows: int = 13) -> FloatArray:
     """Pixels (rows * columns, 2) spread over the whole picture, its borders included."""
@@ -48,6 +75,7 @@ def _covariance_table(covariance: Covariance) -> rig.CovarianceTable | None:
     return rig.CovarianceTable(order=list(covariance.names), values=covariance.intrinsics.tolist())
 
 
+@_with_sane_values
 def camera_section(result: Intrinsics) -> rig.Camera:
     """The `camera` section of a calibration."""
     fit, camera = result.calibration, result.calibration.camera
@@ -109,14 +137,15 @@ def camera_covariance(section: rig.Camera, source: str) -> FloatArray | None:
 
     Raises `BadInputError` for a table that is no covariance.
     """
-    if section.covariance is None:
+    if section.covariance is None or not section.covariance.order:
         return None
-    unknown = [name for name in section.covariance.order if name not in INTRINSICS]
-    if unknown:
+    order = section.covariance.order
+    wrong = next((name for name in order if name not in INTRINSICS or order.count(name) > 1), None)
+    if wrong is not None:
         raise BadInputError(
-            f"{shown(source)}: camera.covariance.order has {unknown[0]!r}, expected intrinsics"
+            f"{shown(source)}: camera.covariance.order has {wrong!r}, expected intrinsics, each once"
         )
-    index = [INTRINSICS.index(name) for name in section.covariance.order]
+    index = [INTRINSICS.index(name) for name in order]
     values = np.array(section.covariance.values, dtype=np.float64)
     scale = np.sqrt(np.abs(np.diag(values)))
     normal = values / np.where(scale > 0, scale, 1.0) / np.where(scale > 0, scale, 1.0)[:, None]
@@ -127,8 +156,9 @@ def camera_covariance(section: rig.Camera, source: str) -> FloatArray | None:
     return whole
 
 
-def plane_section(plane: Plane, orientation: Sequence[str]) -> rig.Plane:
-    """The `plane` section of a calibrated plane."""
+@_with_sane_values
+def plane_section(plane: Plane, orientation: Sequence[str], camera_verdict: str) -> rig.Plane:
+    """The `plane` section of a calibrated plane, which is no better than its camera."""
     sigma = np.sqrt(np.diag(plane.covariance))
     names = ("rotation_x_rad", "rotation_y_rad", "rotation_z_rad", "tx_m", "ty_m", "tz_m")
 
@@ -154,6 +184,11 @@ def plane_section(plane: Plane, orientation: Sequence[str]) -> rig.Plane:
         if len(difference)
         else {}
     )
+    camera_reasons = (
+        []
+        if camera_verdict == "ok"
+        else [f"The camera's own verdict is {camera_verdict}, and the plane is no better than that."]
+    )
     return rig.Plane(
         R_CW=plane.R_CW.tolist(),
         t_CW_m=plane.t_CW_m.tolist(),
@@ -167,11 +202,12 @@ def plane_section(plane: Plane, orientation: Sequence[str]) -> rig.Plane:
         pictures=len(plane.pictures),
         points=plane.points,
         orientation=" ".join(orientation),
-        verdict=plane.verdict,
-        reasons=[*plane.reasons, *plane.notes],
+        verdict=plane.verdict if camera_verdict == "ok" else "poor",
+        reasons=[*camera_reasons, *plane.reasons, *plane.notes],
     )
 
 
+@_with_sane_values
 def imported_camera_section(camera: Camera, source: str) -> rig.Camera:
     """The `camera` section of a camera that another tool calibrated: values without error bars."""
     named = dict(zip(COEFFICIENTS, camera.distortion.tolist(), strict=True))
@@ -230,6 +266,7 @@ def plane_view(plane: rig.Plane, geometry: rig.Geometry) -> PlaneView:
     return PlaneView(np.array(plane.R_CW), np.array(plane.t_CW_m), (x0, y0, x1, y1), sigma)
 
 
+@_with_sane_values
 def lens_section(report: DistortionReport) -> rig.Lens:
     """The `lens` section of an analysis of distortion."""
     cost, inverse = report.plane, report.inverse
@@ -249,7 +286,7 @@ def lens_section(report: DistortionReport) -> rig.Lens:
         inverse=rig.InverseLens(
             radial=list(inverse.radial),
             decentering_steps=inverse.decentering_steps,
-            max_error_px=inverse.max_error_px,
+            max_error_px=rig.finite_or_none(inverse.max_error_px),
             covered=inverse.covered,
         ),
         verdict="negligible" if report.verdict == "negligible" else "matters",
@@ -258,8 +295,13 @@ def lens_section(report: DistortionReport) -> rig.Lens:
 
 
 def firmware_constants(camera: rig.Camera, plane: rig.Plane | None) -> CameraConstants:
-    """The constants of the header, the inverse lens fitted to this camera."""
+    """The constants of the header, the inverse lens fitted to this camera.
+
+    A lens that the firmware could not undo makes the camera's verdict in the header poor.
+    """
     seen = camera_from_section(camera)
+    inverse = fit_inverse(seen)
+    undone = inverse.max_error_px <= _INVERSE_PX and inverse.covered >= _INVERSE_SHARE
     named = dict(zip(COEFFICIENTS, seen.distortion.tolist(), strict=True))
     intrinsics = {
         "fx_px": camera.fx_px,
@@ -272,9 +314,9 @@ def firmware_constants(camera: rig.Camera, plane: rig.Plane | None) -> CameraCon
     return camera_constants(
         seen.image_size_px,
         camera.model,
-        camera.verdict,
+        camera.verdict if undone or camera.verdict != "ok" else "poor",
         intrinsics,
-        fit_inverse(seen),
+        inverse,
         None if plane is None else np.array(plane.A_inverse),
         "" if plane is None else plane.verdict,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +19,8 @@ __all__ = ["BAD", "SIZES", "Recipe", "camera_of", "good_set", "take"]
 
 SIZES = ((316, 208), (320, 240), (640, 480), (752, 480), (1280, 720), (1280, 960), (1920, 1080))
 _SMALL = Board(7, 5, 0.020)
+
+Maker = Callable[[np.random.Generator], tuple[list[View], Camera]]
 
 
 @dataclass(frozen=True)
@@ -168,15 +171,15 @@ def _any(rng: np.random.Generator) -> Camera:
     return camera_of(size, rng.uniform(50, 75), (rng.uniform(-0.25, 0.0), rng.uniform(0.0, 0.1)))
 
 
-def _shot(count: int = 17, **recipe: object) -> Callable[[np.random.Generator], tuple[list[View], Camera]]:
+def _shot(count: int = 17, **recipe: Any) -> Maker:
     def made(rng: np.random.Generator) -> tuple[list[View], Camera]:
         camera = _any(rng)
-        return take(rng, camera, count, recipe=Recipe(**recipe)), camera  # type: ignore[arg-type]
+        return take(rng, camera, count, recipe=Recipe(**recipe)), camera
 
     return made
 
 
-def _two(zoom: float, shift_px: float, counts: tuple[int, int], mixed: bool):  # type: ignore[no-untyped-def]
+def _two(zoom: float, shift_px: float, counts: tuple[int, int], mixed: bool) -> Maker:
     def made(rng: np.random.Generator) -> tuple[list[View], Camera]:
         camera = camera_of()
         views = take(rng, camera, counts[0]) + take(
@@ -188,7 +191,7 @@ def _two(zoom: float, shift_px: float, counts: tuple[int, int], mixed: bool):  #
     return made
 
 
-def _changed(change: Callable[[int, FloatArray, np.random.Generator], FloatArray]):  # type: ignore[no-untyped-def]
+def _changed(change: Callable[[int, FloatArray, np.random.Generator], FloatArray]) -> Maker:
     """Good views whose list of pixels was changed, view by view."""
 
     def made(rng: np.random.Generator) -> tuple[list[View], Camera]:
@@ -210,7 +213,7 @@ def _noisy_copies(rng: np.random.Generator) -> tuple[list[View], Camera]:
     return [replace(v, pixels=v.pixels + 0.1 * rng.standard_normal(v.pixels.shape)) for v in views], camera
 
 
-def _resized(size_px: tuple[int, int]):  # type: ignore[no-untyped-def]
+def _resized(size_px: tuple[int, int]) -> Maker:
     def made(rng: np.random.Generator) -> tuple[list[View], Camera]:
         camera = camera_of()
         return take(rng, camera, 17), replace(camera, image_size_px=size_px)
@@ -229,7 +232,7 @@ def _outliers(_: int, pixels: FloatArray, rng: np.random.Generator) -> FloatArra
 
 _NO = "unidentifiable"
 _CONTRADICTS = "inconsistent"
-BAD: dict[str, tuple[Callable[[np.random.Generator], tuple[list[View], Camera]], tuple[str, ...]]] = {
+BAD: dict[str, tuple[Maker, tuple[str, ...]]] = {
     "parallel to the picture, 0 degrees": (_shot(tilt_deg=(0.0, 0.1)), (_NO,)),
     "parallel to the picture, 3 degrees": (_shot(tilt_deg=(0.0, 3.0)), (_NO, "poor")),
     "parallel to the picture, 3 degrees, little noise": (

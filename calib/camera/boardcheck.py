@@ -9,7 +9,7 @@ import numpy.typing as npt
 from calib.arrays import BoolArray, FloatArray, GrayImage
 from calib.camera.cornerfit import fit_corners, frames_of
 from calib.camera.lattice import extrapolated, looks_like_corners
-from calib.camera.refine import Refined, reduced_around, square_px
+from calib.camera.refine import Refined, misshape, part_around, square_px
 from calib.camera.saddles import sample
 
 __all__ = ["continuing_sides", "fault_of"]
@@ -101,12 +101,15 @@ def continuing_sides(gray: GrayImage, grid: Refined) -> tuple[bool, bool, bool, 
     for v, v1 in ((0, 1), (-1, -2)):
         for u, u1 in ((0, 1), (-1, -2)):
             place[v, u] = place[v, u1] + place[v1, u] - place[v1, u1]
-    image, local, _, _ = reduced_around(gray, place)
+    part = part_around(gray, place)
+    if part is None:
+        return False, False, False, False
+    image, local = part.image, part.points
     frames = frames_of(local)
     rows, columns = local.shape[:2]
     outside = np.ones((rows, columns), dtype=np.bool_)
     outside[1:-1, 1:-1] = False
-    outside[::rows - 1, :: columns - 1] = False
+    outside[:: rows - 1, :: columns - 1] = False
     low, high = np.array([1.0, 1.0]), np.array(image.shape[::-1]) - 2.0
     inside = outside & np.all((local > low) & (local < high), axis=-1)
     i, j = np.indices((rows, columns))
@@ -121,7 +124,7 @@ def continuing_sides(gray: GrayImage, grid: Refined) -> tuple[bool, bool, bool, 
         square = np.minimum(np.linalg.norm(frames.along, axis=1), np.linalg.norm(frames.across, axis=1))
         near = np.linalg.norm(fit.points - local.reshape(-1, 2)[chosen], axis=1) < 0.3 * square[chosen]
         strong = parity.ravel()[chosen] * fit.amplitude > least
-        found[chosen] = fit.converged & near & strong & (fit.residual < _WORST_RESIDUAL)
+        found[chosen] = fit.converged & near & strong & (misshape(fit, part.noise) < _WORST_RESIDUAL)
     hit, seen = found.reshape(rows, columns), inside
     sides = []
     for line in (np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1]):

@@ -114,7 +114,9 @@ def detect(gray: GrayImage, columns: int, rows: int) -> Detection | None:
         On a board of fewer than 3 x 3 corners or a picture that is not (H, W) of uint8.
     """
     if min(columns, rows) < 3:
-        raise BadInputError(f"a board of {columns}x{rows} inner corners cannot be found; expected at least 3x3")
+        raise BadInputError(
+            f"a board of {columns}x{rows} inner corners cannot be found; expected at least 3x3"
+        )
     if not _checked(gray):
         return None
     for stage in lattice_stages(gray, columns, rows) + fallback_stages(gray, columns, rows):

@@ -295,7 +295,9 @@ def _trimmed(lattice: Lattice) -> Lattice:
         side = int(np.argmin(shares))
         if shares[side] >= _OCCUPIED:
             break
-        points = [lattice.points[1:], lattice.points[:-1], lattice.points[:, 1:], lattice.points[:, :-1]][side]
+        points = [lattice.points[1:], lattice.points[:-1], lattice.points[:, 1:], lattice.points[:, :-1]][
+            side
+        ]
         lattice = replace(lattice, points=points, sign=lattice.sign * (-1 if side in (0, 2) else 1))
     return lattice
 

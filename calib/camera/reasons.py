@@ -12,11 +12,9 @@ from calib.arrays import IntArray
 from calib.camera.board_shape import TargetShape
 from calib.camera.bundle import Calibration
 from calib.camera.coverage import Coverage
-from calib.camera.finding import INCONSISTENT, POOR, REMARK, UNIDENTIFIABLE, Finding, listed
-from calib.camera.limits import Limits
-from calib.camera.misfit import Misfit
+from calib.camera.findings import INCONSISTENT, POOR, REMARK, UNIDENTIFIABLE, Finding, Limits, listed
+from calib.camera.misfit import Misfit, Screening
 from calib.camera.reasons_fit import MORE_TILT
-from calib.camera.screening import Screening
 from calib.camera.two_cameras import Split
 
 __all__ = ["of_copies", "of_coverage", "of_misfit", "of_screening", "of_split", "of_target"]
@@ -182,13 +180,26 @@ def of_misfit(found: Misfit, calibration: Calibration, limits: Limits) -> list[F
             f"{100 * limits.points_poor:.0f} is good)."
         )
         many = share > limits.points_poor
-        out.append(
-            Finding(
-                POOR if many else REMARK,
-                text,
-                "Use a robust loss, or look at these corners." if many else "",
-            )
+        advice = "Use a robust loss, or look at these corners." if many else ""
+        out.append(Finding(POOR if many else REMARK, text, advice))
+    return out + _of_pattern(found, limits)
+
+
+def _of_pattern(found: Misfit, limits: Limits) -> list[Finding]:
+    """Residuals that are not what independent normal noise leaves."""
+    out = []
+    if found.repeated > limits.repeated_remark:
+        text = (
+            f"Errors repeat at the same corners of the board from view to view, {found.repeated:.1f} times "
+            "what independent errors would leave: the printed board is not exactly as described."
         )
+        out.append(Finding(REMARK, text))
+    if found.heavy_share > limits.heavy_remark:
+        text = (
+            f"The worst percent of the points holds {100 * found.heavy_share:.0f} % of the squared error "
+            "(five is normal)."
+        )
+        out.append(Finding(REMARK, text, "Use a robust loss, or look at these corners."))
     return out
 
 

@@ -10,11 +10,19 @@ import numpy as np
 
 from calib.camera.bundle import Calibration
 from calib.camera.coverage import Lens
-from calib.camera.finding import POOR, REMARK, UNIDENTIFIABLE, Finding
-from calib.camera.limits import Limits
+from calib.camera.findings import POOR, REMARK, UNIDENTIFIABLE, Finding, Limits
 from calib.camera.starts import FocalInterval, Start
 
-__all__ = ["MORE_TILT", "of_denominator", "of_focal", "of_lens", "of_projection", "of_solution", "of_starts"]
+__all__ = [
+    "MORE_TILT",
+    "of_denominator",
+    "of_focal",
+    "of_lens",
+    "of_projection",
+    "of_richer",
+    "of_solution",
+    "of_starts",
+]
 
 MORE_TILT = "Tilt the board by 30 degrees or more, about its long and its short side in turn."
 _MORE_VIEWS = "Take at least ten pictures with the board tilted in different directions."
@@ -141,6 +149,19 @@ def of_denominator(sigma_share: float, limits: Limits) -> list[Finding]:
         f"{known} (up to {100 * limits.focal_free:.0f} does not matter, as distortion makes up for it)."
     )
     return [Finding(REMARK if sigma_share < limits.focal_free else POOR, text, "Use a simpler lens model.")]
+
+
+def of_richer(fit: Calibration, wide: Calibration, limits: Limits) -> list[Finding]:
+    """Errors that the lens model leaves and five coefficients take away."""
+    drop = 1.0 - wide.rms_px / max(fit.rms_px, 1e-300)
+    if drop < limits.lens_remark:
+        return []
+    text = (
+        f"The lens model {fit.camera.model} leaves errors that five coefficients take away: "
+        f"the RMS falls from {fit.rms_px:.3f} to {wide.rms_px:.3f} px."
+    )
+    serious = drop > limits.lens_poor and fit.rms_px - wide.rms_px > limits.lens_poor_px
+    return [Finding(POOR if serious else REMARK, text, "Use a richer lens model.")]
 
 
 def of_projection(sigma_px: float, width: int, limits: Limits) -> list[Finding]:

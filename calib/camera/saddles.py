@@ -124,7 +124,9 @@ def find_saddles(gray: GrayImage | _Float32) -> Saddles:
     gray : (H, W) grey levels.
     """
     smooth = np.asarray(
-        cv2.GaussianBlur(np.asarray(gray, dtype=np.float32), (0, 0), _BLUR_PX, borderType=cv2.BORDER_REPLICATE)
+        cv2.GaussianBlur(
+            np.asarray(gray, dtype=np.float32), (0, 0), _BLUR_PX, borderType=cv2.BORDER_REPLICATE
+        )
     )
     points = _extrema(smooth)
     angle = np.arange(_RING_POINTS) * (2 * np.pi / _RING_POINTS)

@@ -140,7 +140,9 @@ def fallback_stages(gray: GrayImage, columns: int, rows: int) -> list[Stage]:
     finders = (("classic", _classic), ("SB", _sector_based), ("SB exhaustive", _exhaustive))
     zooms = [plain] + ([2.0] if gray.size < _ENLARGE_BELOW_PIXELS / 2 else [])
 
-    def stage(name: str, finder: Callable[[GrayImage, tuple[int, int]], FloatArray | None], zoom: float) -> Stage:
+    def stage(
+        name: str, finder: Callable[[GrayImage, tuple[int, int]], FloatArray | None], zoom: float
+    ) -> Stage:
         def search() -> Iterator[FloatArray]:
             level = resized(gray, zoom)
             try:

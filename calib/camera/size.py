@@ -40,7 +40,9 @@ def _whole(gray: GrayImage, points: FloatArray) -> Refined | None:
             for u, u1 in ((0, 1), (-1, -2)):
                 wide[v, u] = wide[v, u1] + wide[v1, u] - wide[v1, u1]
         rows, columns = wide.shape[:2]
-        points = wide[0 if top else 1 : rows - (0 if bottom else 1), 0 if left else 1 : columns - (0 if right else 1)]
+        points = wide[
+            0 if top else 1 : rows - (0 if bottom else 1), 0 if left else 1 : columns - (0 if right else 1)
+        ]
     return None
 
 

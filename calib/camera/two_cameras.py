@@ -29,7 +29,7 @@ from calib.camera.bundle import Calibration, calibrate
 from calib.camera.evidence import Evidence, evidence, scaled_inverse
 from calib.camera.starts import held
 
-__all__ = ["Split", "best_change", "best_split", "widened"]
+__all__ = ["Split", "best_change", "best_split", "straightened", "widened"]
 
 _REPLICATES = 16
 _QUANTILE = 3.5
@@ -73,39 +73,35 @@ class Split:
         return self.statistic / max(self.chance, 1e-9)
 
 
-def widened(calibration: Calibration, displacement_m: FloatArray | None = None) -> Calibration:
-    """The same views with k1, k2, p1, p2 and k3 free, where the model is poorer and that helps.
-
-    Parameters
-    ----------
-    displacement_m : (1 or N, M, 3) deformation of the target to take out first.
-    """
+def widened(calibration: Calibration) -> Calibration:
+    """The same views with k1, k2, p1, p2 and k3 free, where the model is poorer and that helps."""
     camera, fixed = calibration.camera, held(calibration)
-    skew = "skew_px" in calibration.free_names
-    own = calibration
-    if displacement_m is not None:
-        own = calibrate(
-            calibration.observations.displaced(displacement_m),
-            camera.image_size_px,
-            camera.model,
-            skew=skew,
-            fixed=fixed,
-            start=calibration.block,
-            max_iterations=_MAX_ITERATIONS,
-        )
     if camera.model in ("brown5", "rational8") or fixed not in ((), ("skew_px",)):
-        return own
+        return calibration
     rich = calibrate(
-        own.observations,
+        calibration.observations,
         camera.image_size_px,
         "brown5",
-        skew=skew,
-        start=own.block,
+        skew="skew_px" in calibration.free_names,
+        start=calibration.block,
         max_iterations=_MAX_ITERATIONS,
     )
     # Coefficients that explain nothing only blur the difference of two cameras.
-    worth = _WORTH * (len(rich.free) - len(own.free)) * own.sigma_px**2
-    return rich if rich.squared_sum < own.squared_sum - worth else own
+    worth = _WORTH * (len(rich.free) - len(calibration.free)) * calibration.sigma_px**2
+    return rich if rich.squared_sum < calibration.squared_sum - worth else calibration
+
+
+def straightened(calibration: Calibration, displacement_m: FloatArray) -> Calibration:
+    """The same views of a target whose points are moved by `displacement_m` (1 or N, M, 3)."""
+    return calibrate(
+        calibration.observations.displaced(displacement_m),
+        calibration.camera.image_size_px,
+        calibration.camera.model,
+        skew="skew_px" in calibration.free_names,
+        fixed=held(calibration),
+        start=calibration.block,
+        max_iterations=_MAX_ITERATIONS,
+    )
 
 
 @dataclass(frozen=True)
@@ -233,7 +229,7 @@ def best_split(calibration: Calibration, seed: int = 0) -> Split | None:
 
     Parameters
     ----------
-    calibration : best `widened`, without loss and deformation.
+    calibration : best `widened` and `straightened`, without robust loss.
     seed : of the random starts and the replicates.
     """
     if calibration.observations.views < 2 * _LEAST:

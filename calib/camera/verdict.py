@@ -26,13 +26,11 @@ from calib.camera.bundle import Calibration
 from calib.camera.covariance import Covariance, covariance, projection_sigma_px
 from calib.camera.coverage import Coverage, coverage, inside_hull, lens_shape, repeated_views
 from calib.camera.evidence import evidence, overdispersion
-from calib.camera.finding import OK, REMARK, UNIDENTIFIABLE, VERDICTS, Finding
-from calib.camera.limits import Limits
-from calib.camera.misfit import misfit
+from calib.camera.findings import OK, REMARK, UNIDENTIFIABLE, VERDICTS, Finding, Limits
+from calib.camera.misfit import misfit, screen
 from calib.camera.next_view import best_next_view
-from calib.camera.screening import screen
 from calib.camera.starts import conditioned, focal_interval, other_starts, resolved
-from calib.camera.two_cameras import best_change, best_split, widened
+from calib.camera.two_cameras import best_change, best_split, straightened, widened
 
 __all__ = ["Judgement", "judge"]
 
@@ -85,9 +83,8 @@ def judge(
     findings += reasons.of_coverage(covered, fit, limits)
     if fit.degrees_of_freedom <= 0 or fit.observations.views < 2 or not np.all(np.isfinite(fit.normal)):
         return _concluded(findings, None, numbers)
-    findings += reasons.of_misfit(
-        misfit(fit, limits.view_bad, limits.point_factor, limits.point_floor_px), fit, limits
-    )
+    left = misfit(fit, limits.view_bad, limits.point_factor, limits.point_floor_px)
+    findings += reasons.of_misfit(left, fit, limits)
     sturdy = conditioned(fit)
     if sturdy is not fit:
         share = _focal_share(fit, covariance(fit), 1.0)
@@ -100,7 +97,12 @@ def judge(
     findings += _contradictions(sturdy, limits, numbers)
     lens = lens_shape(fit)
     findings += reasons_fit.of_lens(lens, fit, covered.radius_share)
-    numbers.update(rms_px=fit.rms_px, lens_least_slope=lens.image_slope)
+    numbers.update(
+        rms_px=fit.rms_px,
+        worst_view_rms_px=float(left.view_rms_px.max()),
+        repeated_error=left.repeated,
+        lens_least_slope=lens.image_slope,
+    )
     return _concluded(findings, sturdy, numbers)
 
 
@@ -198,9 +200,12 @@ def _focal_share(fit: Calibration, known: Covariance, inflation: float) -> float
 
 def _contradictions(fit: Calibration, limits: Limits, numbers: dict[str, float]) -> list[Finding]:
     """Two cameras, a refocused lens, a board that is not what it is said to be."""
-    findings = []
-    shape = target_shape(fit)
-    findings += reasons.of_target(shape, fit, limits)
+    some, _ = _sampled(fit)
+    # The lens first: a target would bend to make up for a lens that the model cannot follow.
+    wide = widened(some)
+    findings = reasons_fit.of_richer(some, wide, limits)
+    shape = target_shape(wide)
+    findings += reasons.of_target(shape, wide, limits)
     if shape is not None:
         numbers.update(
             board_aspect=1 + shape.aspect,
@@ -208,9 +213,7 @@ def _contradictions(fit: Calibration, limits: Limits, numbers: dict[str, float])
             board_bow_m=shape.bow_m,
             focal_share_per_half_percent_bow=shape.focal_per_bow,
         )
-    some, index = _sampled(fit)
-    bent = None if shape is None else shape.displacement_m
-    wide = widened(some, bent if bent is None or len(bent) == 1 else bent[index])
+        wide = straightened(wide, shape.displacement_m)
     change, split = best_change(wide), best_split(wide)
     if change is not None:
         numbers["change_ratio"] = change.ratio

@@ -83,9 +83,10 @@ def distortion(
         for line in table(["error over the workspace, mm", "max", "mean"], rows):
             say(line)
     inverse = section.inverse
+    error = "without bound" if inverse.max_error_px is None else f"at most {inverse.max_error_px:.4f} px"
     say(
         f"inverse polynomial: {len(inverse.radial)} coefficients, {inverse.decentering_steps} decentering "
-        f"steps, error at most {inverse.max_error_px:.4f} px over {inverse.covered:.0%} of the picture"
+        f"steps, error {error} over {inverse.covered:.0%} of the picture"
     )
     for i, value in enumerate(inverse.radial, start=1):
         say(f"  c{i} = {value:.9g}")

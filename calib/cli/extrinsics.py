@@ -72,7 +72,7 @@ def extrinsics(
         workspace_m=(workspace[0], workspace[1], workspace[2], workspace[3]),
         camera_rms_px=before.camera.rms_px,
     )
-    section = plane_section(plane, orientation)
+    section = plane_section(plane, orientation, before.camera.verdict)
     hashes = {**found.hashes, **board_hash, "camera": identity(before.camera)}
     after = write_rig(rig, before.model_copy(update={"plane": section}), {"plane": hashes})
     if figures is not None:
@@ -107,8 +107,6 @@ def extrinsics(
             say(sentence)
         for name in found.without:
             say(f"no board in {name}")
-        if before.camera.verdict != "ok":
-            say(f"the camera's own verdict is {before.camera.verdict}; the plane is no better than that")
         say(f"verdict: {section.verdict}")
         for reason in section.reasons:
             say(f"  - {reason}")

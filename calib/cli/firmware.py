@@ -46,16 +46,15 @@ def firmware(
     path = output / "calib_constants.h"
     write_atomically(path, text)
     count = len(constants.intrinsics) + len(constants.inverse_lens) + len(constants.plane)
-    weak = [
-        f"{name} is {section.verdict}"
-        for name, section in (("camera", whole.camera), ("plane", plane))
-        if section is not None and section.verdict != "ok"
-    ]
+    verdicts = (("camera", constants.verdict), ("plane", constants.plane_verdict))
+    weak = [f"{name} is {verdict}" for name, verdict in verdicts if verdict not in ("ok", "")]
+    if constants.verdict != whole.camera.verdict:
+        error, covered = constants.inverse.max_error_px, constants.inverse.covered
+        weak.append(f"the lens is undone to {error:.3g} px only, over {covered:.0%} of the picture")
     if as_json:
         document("firmware", {"files": [path.name], "constants": count, "gate": weak or "passed"})
     else:
         say(f"{shown(path)}: {count} constants" + ("" if plane else ", no plane yet (calib extrinsics)"))
-    for what in weak:
-        narrate(f"{what}; the header says so in CALIB_CAMERA_OK and CALIB_PLANE_OK, do not flash it unread")
     if weak:
+        narrate(f"{', '.join(weak)}: see CALIB_CAMERA_OK and CALIB_PLANE_OK, do not flash it unread")
         raise typer.Exit(EXIT_POOR)

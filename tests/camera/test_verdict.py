@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,10 +13,14 @@ from sets import BAD, Recipe, camera_of, good_set, take
 
 from calib.camera.board import Board
 from calib.camera.bundle import Calibration, calibrate
+from calib.camera.corners import detect
 from calib.camera.covariance import covariance
-from calib.camera.model import MODELS
+from calib.camera.model import MODELS, Camera
+from calib.camera.pose import fit_pose
 from calib.camera.verdict import Judgement, judge
 from calib.camera.views import View, pack
+from calib.twin.pictures import BOARD, CAMERA
+from calib.twin.scene import Pose, PrintedBoard, render
 
 
 def _judged(views: list[View], size_px: tuple[int, int], model: str) -> tuple[Calibration, Judgement]:
@@ -71,6 +76,14 @@ def test_pixels_that_are_not_square_are_no_fault() -> None:
     _, found = _judged(take(np.random.default_rng(2), camera, 17), (640, 480), "radial2")
     assert found.verdict == "ok"
     assert any("the pixels, not the squares" in sentence for sentence in found.remarks)
+
+
+def test_a_lens_model_that_is_too_poor_is_said_and_not_taken_for_a_bent_board() -> None:
+    views = take(np.random.default_rng(2), camera_of(lens=(-0.25, 0.08)), 17)
+    _, found = _judged(views, (640, 480), "pinhole")
+    assert found.verdict == "poor"
+    assert any("leaves errors that five coefficients take away" in sentence for sentence in found.reasons)
+    assert not any("not flat" in sentence for sentence in found.reasons)
 
 
 def test_a_few_copies_count_once_and_are_named() -> None:
@@ -248,3 +261,55 @@ def test_the_real_camera_mixed_with_another_is_refused(shared_data: Path) -> Non
     assert fit.rms_px < 0.26
     assert found.verdict == "inconsistent"
     assert found.reasons[0].startswith("From other00 on the camera differs")
+
+
+def _pictured(
+    rng: np.random.Generator, camera: Camera, count: int, printed: PrintedBoard, **recipe: Any
+) -> list[View]:
+    """Rendered pictures of a real board, as the detector reads them."""
+    poses = Recipe(noise_px=0.0, **recipe)
+    views: list[View] = []
+    while len(views) < count:
+        view = take(rng, camera, 1, printed.board.points_m(), poses, prefix=f"p{len(views):02d}-")[0]
+        fit = fit_pose(camera, view.target_m, view.pixels)
+        picture = render(camera, printed, Pose(fit.R_CW, fit.t_CW_m), seed=int(rng.integers(1 << 30)))
+        seen = detect(picture, printed.board.columns, printed.board.rows)
+        if seen is not None:
+            views.append(replace(view, pixels=seen.pixels))
+    return views
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "right"),
+    [
+        ("good", ("ok",)),
+        ("parallel", ("unidentifiable", "poor")),
+        ("two cameras", ("inconsistent",)),
+        ("aspect", ("inconsistent",)),
+        ("copies", ("unidentifiable",)),
+        ("curved", ("inconsistent",)),
+    ],
+)
+def test_pictures_of_each_failure(name: str, right: tuple[str, ...]) -> None:
+    rng = np.random.default_rng(1)
+    printed = PrintedBoard(BOARD)
+    if name == "parallel":
+        views = _pictured(rng, CAMERA, 17, printed, tilt_deg=(0.0, 3.0))
+    elif name == "two cameras":
+        other = replace(CAMERA, fx_px=1.04 * CAMERA.fx_px, fy_px=1.04 * CAMERA.fy_px)
+        views = _pictured(rng, CAMERA, 9, printed) + _pictured(rng, other, 8, printed)
+        views = [views[i] for i in rng.permutation(17)]
+    elif name == "aspect":
+        views = _pictured(rng, CAMERA, 17, replace(printed, aspect=1.05))
+    elif name == "copies":
+        one = _pictured(rng, CAMERA, 1, printed)[0]
+        views = [replace(one, name=f"copy{i}") for i in range(17)]
+    elif name == "curved":
+        views = _pictured(rng, CAMERA, 17, replace(printed, bow_m=(0.003, 0.0)))
+    else:
+        views = _pictured(rng, CAMERA, 17, printed)
+    for model in ("radial2", "brown5"):
+        _, found = _judged(views, CAMERA.image_size_px, model)
+        assert found.verdict in right, (found.verdict, found.reasons)
+        assert (found.verdict == "ok") == (name == "good")

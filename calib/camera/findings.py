@@ -1,10 +1,46 @@
-"""Limits of the verdict, in one place, each with its reason."""
+"""What a check has found about a calibration, and the limits that a finding is held against."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-__all__ = ["Limits"]
+__all__ = [
+    "INCONSISTENT",
+    "OK",
+    "POOR",
+    "REMARK",
+    "UNIDENTIFIABLE",
+    "VERDICTS",
+    "Finding",
+    "Limits",
+    "listed",
+]
+
+OK = "ok"
+POOR = "poor"
+INCONSISTENT = "inconsistent"
+UNIDENTIFIABLE = "unidentifiable"
+REMARK = "remark"
+
+VERDICTS = (OK, POOR, INCONSISTENT, UNIDENTIFIABLE)
+"""From the best to the worst; the worst finding decides."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A sentence, its weight (one of `VERDICTS` but `OK`, or `REMARK`) and what to do about it."""
+
+    kind: str
+    text: str
+    advice: str = ""
+
+
+def listed(names: Sequence[str], most: int = 6) -> str:
+    """Names for a sentence, the rest counted."""
+    if len(names) <= most:
+        return ", ".join(names)
+    return ", ".join(names[:most]) + f" and {len(names) - most} more"
 
 
 @dataclass(frozen=True)
@@ -22,10 +58,14 @@ class Limits:
     view_poor : share of the image that a typical view spans.
     projection_share : standard deviation of projection inside of what was seen, over the width.
     centre_poor, centre_remark : offset of the principal point from the image's centre, over its side.
+    lens_remark, lens_poor, lens_poor_px : share, and pixels, of the RMS that a richer lens model would
+        take away.
     rms_px : residuals above which something is wrong whatever it is, at up to 1000 pixels' width.
     view_bad, view_remark : RMS of a view over the others'.
     point_factor, point_floor_px, points_poor : a point off by this many medians and pixels is an
         outlier; share of outliers.
+    heavy_remark : share of the squared residuals that the worst percent of points may hold.
+    repeated_remark : error that repeats at the same points over what independent errors leave.
     repeat_share : share of unique views below which the copies rule the answer.
     decrement : standard deviations that the solver may stop short of a minimum.
     split_ratio, change_ratio : two cameras, in any order and one after the other: the statistic over
@@ -56,12 +96,17 @@ class Limits:
     projection_share: float = 0.002
     centre_poor: float = 0.15
     centre_remark: float = 0.10
+    lens_remark: float = 0.1
+    lens_poor: float = 0.33
+    lens_poor_px: float = 0.1
     rms_px: float = 1.0
     view_bad: float = 5.0
     view_remark: float = 3.0
     point_factor: float = 8.0
     point_floor_px: float = 0.5
     points_poor: float = 0.01
+    heavy_remark: float = 0.2
+    repeated_remark: float = 1.6
     repeat_share: float = 0.5
     decrement: float = 2.0
     split_ratio: float = 1.4
