@@ -18,14 +18,18 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from calib import __version__
 from calib.errors import BadInputError
 from calib.files import one_line, read_bytes, read_yaml_mapping, sha256, shown, write_atomically
+from calib.rig_imu import Imu
+from calib.rig_lowpass import LowPass
 
 __all__ = [
     "Camera",
     "CovarianceTable",
     "Distortion",
     "Geometry",
+    "Imu",
     "InverseLens",
     "Lens",
+    "LowPass",
     "Plane",
     "Provenance",
     "Rig",
@@ -208,6 +212,8 @@ class Rig(BaseModel):
     camera: Camera | None = None
     plane: Plane | None = None
     lens: Lens | None = None
+    imu: Imu | None = None
+    lowpass: LowPass | None = None
     provenance: Provenance = Provenance()
 
 

@@ -13,6 +13,7 @@ __all__ = [
     "parse_duration_s",
     "parse_frequency_hz",
     "parse_image_size",
+    "parse_jitter",
     "parse_length_m",
     "parse_region_px",
     "parse_square_m",
@@ -56,6 +57,14 @@ def parse_square_m(text: str, what: str = "--square") -> float:
     if not 1e-5 <= value < 10.0:
         raise UsageError(f"{what}: {text!r} is not between 0.01 mm and 10 m")
     return value
+
+
+def parse_jitter(text: str, what: str = "--jitter") -> tuple[float, str]:
+    """Metres and "m" from '0.1mm', or pixels and "px" from '0.3px'; positive."""
+    value = _quantity(text, {**_LENGTHS, "px": 1.0}, what, "0.1mm or 0.3px")
+    if value <= 0.0:
+        raise UsageError(f"{what}: {text!r} is not positive")
+    return value, "px" if text.strip().lower().endswith("px") else "m"
 
 
 def parse_frequency_hz(text: str, what: str) -> float:

@@ -20,6 +20,7 @@ import numpy.typing as npt
 from calib.arrays import BoolArray, FloatArray, GrayImage, IntArray
 from calib.camera.cornerfit import Frames, LocalFit, fit_corners, frames_of
 from calib.camera.gridmodel import Lens, Prediction, predict
+from calib.camera.lattice import extrapolated
 
 __all__ = ["Part", "Refined", "misshape", "part_around", "refine", "square_px"]
 
@@ -239,7 +240,9 @@ def _rescued(part: Part, fit: LocalFit) -> tuple[LocalFit, BoolArray, Prediction
     check = checked[0]
     # A clean fit may contradict the others: neither board nor lens need be smooth. A disturbed one may not.
     clean = fit.residual < _DISTURBED * np.median(fit.residual) + 0.02
-    good &= check.away < np.where(clean, check.far, check.bound)
+    beside = extrapolated(fit.points.reshape(*part.shape, 2))[1:-1, 1:-1].reshape(-1, 2)
+    nearest = np.fmin(check.away, np.linalg.norm(fit.points - beside, axis=1))
+    good &= np.where(clean, nearest < check.far, check.away < check.bound)
     prediction = predict(fit.points.reshape(*part.shape, 2), good.reshape(part.shape), part.lens)
     return None if prediction is None else (fit, good, prediction)
 

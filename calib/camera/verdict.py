@@ -19,14 +19,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from calib.arrays import FloatArray, IntArray
+from calib.arrays import FloatArray
 from calib.camera import reasons, reasons_fit
 from calib.camera.board_shape import target_shape
 from calib.camera.bundle import Calibration
 from calib.camera.covariance import Covariance, covariance, projection_sigma_px
 from calib.camera.coverage import Coverage, coverage, inside_hull, lens_shape, repeated_views
 from calib.camera.evidence import evidence, overdispersion
-from calib.camera.findings import OK, REMARK, UNIDENTIFIABLE, VERDICTS, Finding, Limits
+from calib.camera.findings import INCONSISTENT, OK, REMARK, UNIDENTIFIABLE, VERDICTS, Finding, Limits
 from calib.camera.misfit import misfit, screen
 from calib.camera.next_view import best_next_view
 from calib.camera.starts import conditioned, focal_interval, other_starts, resolved
@@ -49,7 +49,7 @@ class Judgement:
     reasons : sentences that explain a verdict other than ok, the worst first.
     remarks : sentences about what does not matter enough.
     advice : what to do, in order; last the picture to take next.
-    numbers : what the sentences are made from, by name.
+    numbers : what the sentences are made from, by name, as far as it is finite.
     """
 
     verdict: str
@@ -169,7 +169,7 @@ def _uncertainty(
     findings = []
     interval = None
     if "fx_px" in known.names:
-        some, _ = _sampled(fit)
+        some = _sampled(fit)
         own = covariance(some).sigma()["fx_px"]
         interval = focal_interval(some, own, inflation)
         findings += reasons_fit.of_starts(other_starts(some), some, own, inflation, limits)
@@ -200,7 +200,7 @@ def _focal_share(fit: Calibration, known: Covariance, inflation: float) -> float
 
 def _contradictions(fit: Calibration, limits: Limits, numbers: dict[str, float]) -> list[Finding]:
     """Two cameras, a refocused lens, a board that is not what it is said to be."""
-    some, _ = _sampled(fit)
+    some = _sampled(fit)
     # The lens first: a target would bend to make up for a lens that the model cannot follow.
     wide = widened(some)
     findings = reasons_fit.of_richer(some, wide, limits)
@@ -229,12 +229,11 @@ def _contradictions(fit: Calibration, limits: Limits, numbers: dict[str, float])
     return findings + late + mixed
 
 
-def _sampled(fit: Calibration) -> tuple[Calibration, IntArray]:
+def _sampled(fit: Calibration) -> Calibration:
     views = fit.observations.views
     if views <= _SAMPLE:
-        return fit, np.arange(views)
-    index: IntArray = np.unique(np.linspace(0, views - 1, _SAMPLE).astype(np.int64))
-    return resolved(fit, index), index
+        return fit
+    return resolved(fit, np.unique(np.linspace(0, views - 1, _SAMPLE).astype(np.int64)))
 
 
 def _inside(covered: Coverage) -> FloatArray:
@@ -254,20 +253,23 @@ def _concluded(findings: list[Finding], fit: Calibration | None, numbers: dict[s
     for one in [*failing, *(f for f in findings if f.kind == REMARK)]:
         if one.advice and one.advice not in advice:
             advice.append(one.advice)
-    if fit is not None:
+    # Where views contradict each other, more of them settle nothing.
+    if fit is not None and verdict != INCONSISTENT:
         advice.extend(_next_picture(fit, verdict))
     return Judgement(
         verdict,
         tuple(f.text for f in failing),
         tuple(f.text for f in findings if f.kind == REMARK),
         tuple(advice),
-        numbers,
+        {name: float(value) for name, value in numbers.items() if np.isfinite(value)},
     )
 
 
 def _next_picture(fit: Calibration, verdict: str) -> list[str]:
-    S = evidence(fit).S.sum(axis=0)
-    best = best_next_view(fit, S)
+    width = max(fit.camera.image_size_px)
+    if not 0.2 * width < min(fit.camera.fx_px, fit.camera.fy_px) < 50 * width:
+        return []
+    best = best_next_view(fit, evidence(fit).S.sum(axis=0))
     if best is None:
         return []
     lean = (

@@ -12,7 +12,9 @@ from calib.cli.distortion import distortion
 from calib.cli.exchange import export_camera, import_camera
 from calib.cli.extrinsics import extrinsics
 from calib.cli.firmware import firmware
+from calib.cli.imu import imu
 from calib.cli.intrinsics import intrinsics
+from calib.cli.lowpass import lowpass
 from calib.cli.simulate import simulate
 
 __all__ = ["app"]
@@ -45,6 +47,8 @@ def _options(
 app.command("intrinsics")(intrinsics)
 app.command("extrinsics")(extrinsics)
 app.command("distortion")(distortion)
+app.command("lowpass")(lowpass)
+app.add_typer(imu, name="imu")
 app.command("firmware")(firmware)
 app.command("board")(board)
 app.command("simulate")(simulate)

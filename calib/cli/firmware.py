@@ -38,7 +38,8 @@ def firmware(
         f"{section}/{name}": digest
         for section in ("camera", "plane")
         for name, digest in whole.provenance.inputs.get(section, {}).items()
-        if section == "camera" or plane is not None
+        # The plane's camera is the camera above; only files are inputs of the header.
+        if (section == "camera" or plane is not None) and name != "camera"
     }
     constants = firmware_constants(whole.camera, plane)
     text = header_text(constants, inputs)

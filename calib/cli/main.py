@@ -52,7 +52,7 @@ def _run(debug: bool) -> int:
         empty = next((word for word in sys.argv[1:] if not word or re.fullmatch(r"--[a-z-]+=", word)), None)
         if empty is not None:
             raise UsageError(f"an argument is empty: {empty!r}")
-        app()
+        app(prog_name="calib")
     except SystemExit as leaving:
         code = leaving.code if isinstance(leaving.code, int) else EXIT_DONE
         if code == _EXIT_INTERRUPTED:

@@ -72,7 +72,7 @@ class _Lags:
 
 def octaves(n: int, share: float = 0.25) -> IntArray:
     """Averaging factors 1, 2, 4, ... up to `share` of n samples."""
-    count = int(math.floor(math.log2(max(share * n, 1.0)))) + 1
+    count = math.floor(math.log2(max(share * n, 1.0))) + 1
     return np.asarray(2 ** np.arange(count), dtype=np.int64)
 
 

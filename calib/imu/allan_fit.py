@@ -182,20 +182,28 @@ def _term(fit: _Fit, k: int, variance: FloatArray, D: FloatArray, G: FloatArray,
     if fit.active[k] and square > 0.0:
         spread = math.sqrt(float(fit.covariance[k, k]))
         value = math.sqrt(square)
-        factor = math.exp(0.5 * _TWO_SIDED_95 * spread / square)
-        return Term(True, unit * value, unit * 0.5 * spread / value, unit * value / factor, unit * value * factor, nan)
-    estimate, spread = _unsupported(fit, k, variance, D, G)
-    return Term(False, nan, nan, nan, nan, unit * math.sqrt(max(estimate, 0.0) + _ONE_SIDED_95 * spread))
+        sigma, factor = 0.5 * spread / value, math.exp(0.5 * _TWO_SIDED_95 * spread / square)
+        value *= unit
+        return Term(True, value, unit * sigma, value / factor, value * factor, nan)
+    below = _unsupported(fit, k, variance, D, G, _ONE_SIDED_95)
+    return Term(False, nan, nan, nan, nan, unit * math.sqrt(below))
 
 
 def _unsupported(
-    fit: _Fit, k: int, variance: FloatArray, D: FloatArray, G: FloatArray
-) -> tuple[float, float]:
-    """Square of a term that was not taken up and its deviation, were it added."""
-    wider = fit.active.copy()
-    wider[k] = True
-    estimate, covariance = _least_squares(variance, D, _covariance(G, fit.theta), wider)
-    return float(estimate[k]), math.sqrt(float(covariance[k, k]))
+    fit: _Fit, k: int, variance: FloatArray, D: FloatArray, G: FloatArray, times_sigma: float
+) -> float:
+    """Upper bound of the square of a term that was not taken up.
+
+    B and K are hard to tell apart, so the bound is the larger one of those with the other and without.
+    """
+    C = _covariance(G, fit.theta)
+    found = []
+    for others in (fit.active, np.array([True, False, False])):
+        wider = others.copy()
+        wider[k] = True
+        estimate, covariance = _least_squares(variance, D, C, wider)
+        found.append(max(float(estimate[k]), 0.0) + times_sigma * math.sqrt(float(covariance[k, k])))
+    return max(found)
 
 
 def analyse(parts: Sequence[FloatArray], period_s: float) -> Allan:
@@ -231,13 +239,12 @@ def analyse(parts: Sequence[FloatArray], period_s: float) -> Allan:
     terms = [_term(fit, k, *used, units[k]) for k in range(len(KINDS))]
     walk = float(fit.theta[2])
     if not terms[2].supported:
-        estimate, spread = _unsupported(fit, 2, *used)
-        walk = max(estimate, 0.0) + spread
+        walk = _unsupported(fit, 2, *used, 1.0)
     everywhere = allan_variance(parts, m_all)
     freedom = degrees_of_freedom(m_all, lengths, fit.theta)
     low, high = bounds(everywhere, freedom)
     return Allan(
-        tau_s=period_s * m_all,
+        tau_s=period_s * m_all.astype(np.float64),
         deviation=np.sqrt(everywhere),
         low=low,
         high=high,

@@ -9,9 +9,9 @@ and as many zeros at z = -1. A pair of poles makes a section
 
     H(z) = g (1 + 2 z^-1 + z^-2) / (1 + a1 z^-1 + a2 z^-2),   g = (1 + a1 + a2) / 4,
 
-a single one g (1 + z^-1) / (1 + a1 z^-1) with g = (1 + a1) / 2. First a1 and a2 are rounded, on a grid on which
-g is a binary32, too; then g follows from them. So H(1) is 1 and not nearly 1, the zeros stay at -1, and
-a position at rest is reported where it is.
+a single one g (1 + z^-1) / (1 + a1 z^-1) with g = (1 + a1) / 2. First a1 and a2 are rounded, on a grid
+on which g is a binary32, too; then g follows from them. So H(1) is 1 and not nearly 1, the zeros stay
+at -1, and a position at rest is reported where it is.
 
 Families: Butterworth (flattest gain), Bessel (flattest delay, Thomson 1949), and critical: n equal real
 poles -1 / sqrt(2^(1/n) - 1), which never overshoot.
@@ -114,7 +114,7 @@ def analogue_poles(family: str, order: int) -> ComplexArray:
         math.factorial(2 * order - k) // (2 ** (order - k) * math.factorial(k) * math.factorial(order - k))
         for k in range(order + 1)
     ]
-    poles = np.roots(np.array(rising[::-1], dtype=np.float64))
+    poles = np.roots(np.array(rising[::-1], dtype=np.float64)).astype(np.complex128)
     return np.asarray(poles / _half_power_frequency(poles), dtype=np.complex128)
 
 

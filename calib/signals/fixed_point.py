@@ -60,7 +60,7 @@ def _integers(section: FloatArray) -> tuple[list[int], int]:
 
 
 def _come_to_rest(sections: list[tuple[list[int], int]], x: int, starts: IntMatrix, steps: int) -> IntMatrix:
-    """Distance (n,) from x at which the cascade ends, or the widest of a limit cycle, from each start (n,)."""
+    """Distance (n,) from x at which the cascade ends, or the widest of a cycle, from each start (n,)."""
     delay = [[starts.copy() for _ in range(4)] for _ in sections]
     last = np.zeros((32, len(starts)), dtype=np.int64)
     for k in range(steps):

@@ -4,7 +4,7 @@ All sections (k, 6) have a gain of 1 at zero frequency and their zeros at z = -1
 `calib.signals.design`. A numerator (1 + z^-1)^n then delays every frequency by n / 2 samples, and with
 D(z) = 1 + a1 z^-1 + a2 z^-2 the group delay of a section is
 
-    tau = n / 2 - Re[ (a1 z^-1 + 2 a2 z^-2) / D(z) ],   at zero frequency  n / 2 - (a1 + 2 a2) / (1 + a1 + a2).
+    tau = n / 2 - Re[ (a1 z^-1 + 2 a2 z^-2) / D(z) ],   n / 2 - (a1 + 2 a2) / (1 + a1 + a2) at zero frequency.
 
 Signals are filtered in the transposed direct form II,
 

@@ -1,9 +1,9 @@
 """Motion and jitter of a logged position, told apart by their spectrum.
 
-Motion of a heavy thing is slow, quantisation and tracking errors are spread over all frequencies. So the power
-density (Welch 1967) falls from the motion to a floor. Means over the segments hold motion however short it
-was; medians count a few outliers little. The motion ends at the last frequency f_m of the lower
-half of the band at which the mean is above three times the floor of the means, and the density of the jitter is
+Motion of a heavy thing is slow, quantisation and tracking errors are spread over all frequencies. So
+the power density (Welch 1967) falls from the motion to a floor. Means over the segments hold motion however
+short it was; medians count a few outliers little. The motion ends at the last frequency f_m of the lower
+half of the band at which the mean is above three times the floor of the means. The jitter has the density
 
     N(f) = F below f_m (motion hides it there),   N(f) = P(f) above,
 
@@ -16,9 +16,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
-from scipy.signal import savgol_filter, welch
+from scipy.signal import detrend, savgol_filter, welch
 
 from calib.arrays import FloatArray
 from calib.errors import BadInputError
@@ -71,11 +72,8 @@ def spectrum(x: FloatArray, rate_hz: float) -> Spectrum:
         raise BadInputError(f"has {len(x)} camera ticks without a long gap, expected at least {FEWEST}")
     # With at least four segments a median is one; half-overlapping ones of n / 2.5 make four.
     segment = int(min(max(32, round(_SEGMENT_S * rate_hz)), 2048, len(x) / 2.5))
-    mean, median = (
-        np.asarray(welch(x, rate_hz, nperseg=segment, detrend="linear", average=kind)[1][1:-1])
-        for kind in ("mean", "median")
-    )
-    f = np.arange(1, len(mean) + 1) * (rate_hz / segment)
+    mean, median = _density(x, rate_hz, segment, "mean"), _density(x, rate_hz, segment, "median")
+    f = np.arange(1.0, len(mean) + 1.0) * (rate_hz / segment)
     upper = f >= 0.25 * rate_hz
     floor, floor_of_means = float(np.median(median[upper])), float(np.median(mean[upper]))
     above = np.nonzero(_smoothed(mean[~upper]) > _FLOOR_TIMES * floor_of_means)[0]
@@ -86,12 +84,21 @@ def spectrum(x: FloatArray, rate_hz: float) -> Spectrum:
     return Spectrum(
         rate_hz,
         f,
-        np.where(moving, floor, median),
-        np.where(moving, np.maximum(mean - floor_of_means, 0.0), 0.0),
+        np.asarray(np.where(moving, floor, median), dtype=np.float64),
+        np.asarray(np.where(moving, np.maximum(mean - floor_of_means, 0.0), 0.0)),
         floor,
         float(f[end - 1]) if end else 0.0,
         bool(flat),
     )
+
+
+def _density(x: FloatArray, rate_hz: float, segment: int, average: Literal["mean", "median"]) -> FloatArray:
+    _, P = welch(x - x.mean(), rate_hz, nperseg=segment, detrend=_without_line, average=average)
+    return np.asarray(P[1:-1], dtype=np.float64)
+
+
+def _without_line(segments: FloatArray) -> FloatArray:
+    return np.asarray(detrend(segments, axis=-1, type="linear"), dtype=np.float64)
 
 
 def _smoothed(P: FloatArray) -> FloatArray:
@@ -142,8 +149,8 @@ def quantisation_hz(pixels: FloatArray, step_px: float, rate_hz: float) -> Float
     """Frequencies (3,) of the sawtooth that rounding adds to motion: quartiles of |speed| / step.
 
     A marker that moves at w px/s crosses w / step grid lines a second. The speed (n,) is that of a cubic
-    through half a second; what is slower than a line in two seconds is rest and not counted. NaN where all is.
-    Frequencies above half the rate are folded back.
+    through half a second; what is slower than a line in two seconds is rest and not
+    counted; NaN where all is. Frequencies above half the rate are folded back.
     """
     window = max(5, int(0.5 * rate_hz) | 1)
     if step_px <= 0.0 or len(pixels) < window:

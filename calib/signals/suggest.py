@@ -92,8 +92,16 @@ def _three_digits_below(value: float) -> float:
     return float(f"{math.floor(value / 10.0**power * (1 + 1e-12))}e{power}")
 
 
+def _amount(value: float, unit: str) -> str:
+    return f"{1e3 * value:.3g} mm" if unit == "m" else f"{value:.3g} {unit}"
+
+
 def suggest(
-    spectra: Sequence[Spectrum], wanted: float, orders: Sequence[int] = (), families: Sequence[str] = ()
+    spectra: Sequence[Spectrum],
+    wanted: float,
+    orders: Sequence[int] = (),
+    families: Sequence[str] = (),
+    unit: str = "m",
 ) -> Suggestion:
     """The filter of least delay for a jitter of at most `wanted`, in the spectra's unit.
 
@@ -101,6 +109,7 @@ def suggest(
     ----------
     spectra : of each coordinate, at the same rate; each has to keep to `wanted`.
     orders, families : to choose from; all where empty.
+    unit : of the jitter, for messages.
 
     Raises
     ------
@@ -108,12 +117,12 @@ def suggest(
         Where there is no jitter, not more than is wanted, or none of the filters leaves so little.
     """
     unfiltered = max(one.jitter for one in spectra)
+    has, most = _amount(unfiltered, unit), _amount(wanted, unit)
     if unfiltered == 0.0:
         raise BadInputError("has no jitter at all: its values never change, or only so slowly as motion does")
     if wanted >= unfiltered:
         raise BadInputError(
-            f"jitters by {unfiltered:.3g} unfiltered, which is not more than the {wanted:.3g} that is wanted; "
-            "no low-pass is needed"
+            f"jitters by {has} unfiltered, not more than the {most} that is wanted; no low-pass is needed"
         )
     found = [
         _candidate(spectra, wanted, order, family)
@@ -124,8 +133,7 @@ def suggest(
     candidates = sorted((one for one in found if one is not None), key=lambda one: one.delay_s)
     if not candidates:
         raise BadInputError(
-            f"jitters by {unfiltered:.3g} unfiltered and no low-pass of single precision leaves {wanted:.3g}; "
-            "ask for more"
+            f"jitters by {has} unfiltered and no low-pass here leaves only {most}; ask for more"
         )
     tied = [one for one in candidates if one.delay_s <= (1.0 + _TIE) * candidates[0].delay_s]
     least = min(one.motion_lost for one in tied)

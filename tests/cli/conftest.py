@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from synthetic import observe
+from synthetic import views_of
 
 COMMAND = (sys.executable, "-c", "from calib.cli.main import main; main()")
 
@@ -127,7 +127,7 @@ def rig(rig_text: str, tmp_path: Path) -> Path:
 def table_text() -> str:
     """A table of six synthetic views of a 9x6 board, 640x480 px."""
     rows = ["view,x_m,y_m,u_px,v_px"]
-    for view in observe(6, noise_px=0.05, seed=3):
+    for view in views_of(6, noise_px=0.05, seed=3):
         for (x, y), (u, v) in zip(view.target_m.tolist(), view.pixels.tolist(), strict=True):
             rows.append(f"{view.name},{x!r},{y!r},{u!r},{v!r}")
     return "\n".join(rows) + "\n"

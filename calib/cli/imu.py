@@ -1,0 +1,22 @@
+"""`calib imu`: the verbs that are about the IMU."""
+
+from __future__ import annotations
+
+import typer
+
+from calib.cli.imu_static import static
+
+__all__ = ["imu"]
+
+imu = typer.Typer(
+    help="Understand an IMU: its bias, its noise, its drift.", no_args_is_help=True, rich_markup_mode=None
+)
+
+
+@imu.callback()
+def _imu() -> None:
+    # With a callback the name of the verb stays even while there is one alone.
+    pass
+
+
+imu.command("static")(static)

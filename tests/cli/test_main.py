@@ -1,0 +1,309 @@
+"""How the command starts and ends: help, exit codes, streams, interruption, and mistakes of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+VERBS = ("intrinsics", "extrinsics", "distortion", "firmware", "board", "export", "import")
+HEAVY = ("numpy", "scipy", "cv2", "matplotlib", "numba", "filterpy", "pydantic", "yaml", "jinja2", "rich")
+
+
+def test_help_imports_nothing_heavy(environment) -> None:
+    script = (
+        "import sys; sys.argv = ['calib', '--help']\n"
+        "from calib.cli.main import main\n"
+        "try: main()\n"
+        f"except SystemExit: print([m for m in {HEAVY} if m in sys.modules], file=sys.stderr)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stderr == "[]\n"
+    assert all(verb in done.stdout for verb in VERBS)
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_help_of_each_verb_explains_every_argument(calib, verb: str) -> None:
+    ended = calib(verb, "--help")
+    assert ended.code == 0
+    assert ended.err == ""
+    lines = [*ended.out.splitlines(), ""]
+    assert max(map(len, lines)) <= 80
+    for i, line in enumerate(lines):
+        if line.startswith("  -"):
+            explained = line.rstrip() + " " + lines[i + 1].strip()
+            assert len(explained.split()) >= 4, line
+
+
+def test_units_and_defaults_are_in_the_help(calib) -> None:
+    text = " ".join(calib("intrinsics", "--help").out.split())
+    for words in ("20mm", "640x480", "[default: board.yaml", "[default: auto]", "[default: rig.yaml]"):
+        assert words in text
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ((), "Usage: calib"),
+        (("frobnicate",), "No such command 'frobnicate'"),
+        (("intrinsics",), "Missing argument"),
+        (("intrinsics", "a", "--frobnicate"), "No such option: --frobnicate"),
+        (("intrinsics", "-x"), "No such option: -x"),
+        (("intrinsics", "a", "--model", "fisheye"), "'fisheye' is not one of"),
+        (("intrinsics", "a", "--loss", "l1"), "'l1' is not one of"),
+        (("board", "--page", "A3"), "'A3' is not one of"),
+        (("export", "matlab"), "'matlab' is not one of"),
+        (("intrinsics", ""), "an argument is empty: ''"),
+        (("intrinsics", "a", "--rig="), "an argument is empty: '--rig='"),
+        (("intrinsics", "a", "--square", "20"), "--square: '20' has no unit, expected one of mm, cm, m, in"),
+        (("intrinsics", "a", "--square", "20px"), "--square: '20px' has the unit 'px'"),
+        (("intrinsics", "a", "--square=-2mm"), "--square: '-2mm' is not positive"),
+        (("intrinsics", "a", "--square", "20m"), "--square: '20m' is not between 0.01 mm and 10 m"),
+        (("intrinsics", "a", "--corners", "7"), "--corners: '7' is not two whole numbers"),
+        (("intrinsics", "a", "--corners", "2x2"), "--corners: '2x2' is not between 3x3 and 200x200"),
+        (("intrinsics", "a", "--image-size", "0x9"), "--image-size: '0x9' is not a picture's size"),
+        (("distortion", "--region", "1,2,3"), "--region: '1,2,3' is not four numbers"),
+        (("distortion", "--region", "5,5,1,nan"), "--region: '5,5,1,nan' is not a box"),
+    ],
+)
+def test_usage_ends_with_two(calib, words: tuple[str, ...], says: str) -> None:
+    ended = calib(*words)
+    assert ended.code == 2
+    assert says in ended.err
+    assert ended.out == ""
+
+
+def test_version(calib) -> None:
+    ended = calib("--version")
+    assert (ended.code, ended.err) == (0, "")
+    assert ended.out.startswith("calib 0.")
+
+
+def test_a_mistake_of_the_program_is_one_sentence(calib, monkeypatch, tmp_path) -> None:
+    def broken(*_: object) -> None:
+        raise RuntimeError("first line\nsecond\x1b line")
+
+    monkeypatch.setattr("calib.rig.read_rig", broken)
+    monkeypatch.delenv("CALIB_DEBUG", raising=False)
+    ended = calib("firmware", "--rig", "rig.yaml", cwd=tmp_path)
+    assert ended.code == 70
+    assert ended.sentence.startswith(
+        "internal error: RuntimeError: first line second\\x1b line (calib.cli.firmware"
+    )
+    assert "please report" in ended.sentence
+    monkeypatch.setenv("CALIB_DEBUG", "1")
+    ended = calib("firmware", "--rig", "rig.yaml", cwd=tmp_path)
+    assert ended.code == 70
+    assert "Traceback" in ended.err
+
+
+@pytest.mark.parametrize(
+    ("failure", "code", "says"),
+    [
+        (MemoryError(), 3, "out of memory"),
+        (KeyboardInterrupt(), 130, "interrupted; files that were there before"),
+        (OSError(5, "Input/output error", "/x/rig.yaml"), 3, "/x/rig.yaml: Input/output error"),
+    ],
+)
+def test_other_ends(calib, monkeypatch, failure: BaseException, code: int, says: str) -> None:
+    def fail(*_: object) -> None:
+        raise failure
+
+    monkeypatch.setattr("calib.rig.read_rig", fail)
+    ended = calib("firmware")
+    assert ended.code == code
+    assert says in ended.sentence
+
+
+def test_json_is_one_document_also_when_the_verdict_is_not_ok(
+    calib, pictures, project_root, tmp_path
+) -> None:
+    rig = ("--json", "--rig", tmp_path / "rig.yaml")
+    for words, code in (
+        (("intrinsics", pictures(1), "--model", "radial2"), 1),
+        (("extrinsics", project_root / "images" / "plane"), 1),
+        (("distortion",), 0),
+        (("firmware", "-o", tmp_path), 1),
+        (("export", "ros"), 0),
+    ):
+        ended = calib(*words, *rig)
+        assert ended.code == code, words
+        document = json.loads(ended.out)
+        assert (document["schema"], document["verb"]) == (1, words[0])
+    assert calib("board", "-o", tmp_path / "b.pdf", "--json").out.startswith('{\n "schema": 1')
+
+
+def test_json_says_nothing_on_stdout_when_it_fails(calib, tmp_path) -> None:
+    ended = calib("intrinsics", tmp_path, "--json")
+    assert (ended.code, ended.out) == (3, "")
+
+
+def test_narration_goes_to_stderr_without_colour(process, pictures, tmp_path) -> None:
+    ended = process(
+        "intrinsics", pictures(4), "--model", "radial2", "--rig", tmp_path / "rig.yaml", FORCE_COLOR="1"
+    )
+    assert "verdict:" in ended.out
+    assert "found" not in ended.out
+    assert "\x1b" not in ended.out + ended.err
+    assert [line.split()[0] for line in ended.err.splitlines()] == ["the", "found", "board", "camera"]
+
+
+def _sh(environment: dict[str, str], script: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    command = f"{sys.executable} -c 'from calib.cli.main import main; main()'"
+    return subprocess.run(
+        ["bash", "-c", script.replace("calib ", command + " ")],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+
+
+def test_a_reader_that_goes_away(environment, rig) -> None:
+    script = "calib export ros --rig rig.yaml | true; echo ${PIPESTATUS[0]}"
+    done = _sh(environment, script, rig.parent)
+    assert done.stdout == "141\n"
+    assert done.stderr == ""
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+def test_stdout_that_is_full(environment, rig) -> None:
+    done = _sh(environment, "calib export ros --rig rig.yaml > /dev/full", rig.parent)
+    assert done.returncode == 3
+    assert done.stderr == "calib: standard output: cannot be written: No space left on device\n"
+    done = _sh(environment, "calib board -o /dev/full", rig.parent)
+    assert done.returncode == 3
+    assert done.stderr == "calib: /dev/full: cannot be written: No space left on device\n"
+
+
+@pytest.mark.parametrize("closed", ["2>&-", ">&-", "<&- >&- 2>&-", "2>/dev/full"])
+def test_streams_that_are_closed_harm_nothing(environment, rig, closed: str) -> None:
+    before = rig.read_bytes()
+    done = _sh(environment, f"calib firmware --rig rig.yaml -o out {closed}", rig.parent)
+    assert done.returncode == 0
+    assert (rig.parent / "out" / "calib_constants.h").read_text().startswith("/*\n * calib_constants.h")
+    assert rig.read_bytes() == before
+
+
+def test_devices_are_written_through_and_stay(environment, rig) -> None:
+    done = _sh(environment, "calib export ros --rig rig.yaml -o /dev/stdout | head -1", rig.parent)
+    assert done.stdout == "image_width: 316\n"
+    assert _sh(environment, "calib board -o /dev/null", rig.parent).returncode == 0
+    assert Path("/dev/null").is_char_device()
+
+
+@pytest.mark.parametrize("after_s", [0.1, 0.4, 0.8, 1.2, 1.6])
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.slow
+def test_an_interruption_leaves_the_old_file_or_the_new_one(
+    environment, project_root, rig, how, after_s
+) -> None:
+    before = rig.read_bytes()
+    command = [sys.executable, "-c", "from calib.cli.main import main; main()", "intrinsics"]
+    started = subprocess.Popen(
+        [*command, str(project_root / "images"), "--rig", str(rig)],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    time.sleep(after_s)
+    started.send_signal(how)
+    _, err = started.communicate(timeout=60)
+    if started.returncode == 130:
+        assert err.splitlines()[-1].startswith("calib: interrupted")
+        assert "Traceback" not in err
+    else:
+        # Done before, or killed; or the interpreter itself was still starting on a busy machine.
+        assert started.returncode in (0, -how)
+    after = rig.read_text()
+    assert after.encode() == before or (after.startswith("camera:") and "\nprovenance:\n" in after)
+    assert [path.name for path in rig.parent.iterdir()] == ["rig.yaml"]
+
+
+def test_an_interruption_while_boards_are_searched(environment, tmp_path) -> None:
+    # The search sleeps in its threads; nothing may wait for them.
+    script = (
+        "import sys, time, numpy as np, calib.boards\n"
+        "from calib.pictures import Picture\n"
+        "calib.boards.read_picture = lambda p: Picture(p.name, '', np.zeros((9, 9), np.uint8), (9, 9))\n"
+        "def slow(*_):\n    print('searching', flush=True); time.sleep(30)\n"
+        "calib.boards.detect = slow\n"
+        "from calib.cli.main import main\n"
+        "sys.argv = ['calib', 'intrinsics', '.', '--corners', '7x5']\n"
+        "main()\n"
+    )
+    for name in ("a.png", "b.png", "c.png"):
+        (tmp_path / name).write_bytes(b"x")
+    began = time.monotonic()
+    started = subprocess.Popen(
+        [sys.executable, "-c", script],
+        cwd=tmp_path,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert started.stdout is not None
+    assert started.stdout.readline() == "searching\n"
+    started.send_signal(signal.SIGINT)
+    _, err = started.communicate(timeout=25)
+    assert started.returncode == 130
+    assert err == "calib: interrupted; files that were there before are unchanged or whole\n"
+    assert time.monotonic() - began < 25
+
+
+def test_the_same_inputs_give_the_same_bytes(environment, project_root, tmp_path) -> None:
+    images = project_root / "images"
+    runs = {"a": "", "b": "", "c": "OPENBLAS_NUM_THREADS=4 PYTHONHASHSEED=7 "}
+    if (
+        hasattr(os, "sched_getaffinity")
+        and subprocess.run(["which", "taskset"], capture_output=True, check=False).returncode == 0
+    ):
+        runs["b"] = f"taskset -c {min(os.sched_getaffinity(0))} "
+    for name, prefix in runs.items():
+        folder = tmp_path / name
+        folder.mkdir()
+        script = "".join(
+            f"{prefix}calib {words} --rig rig.yaml && "
+            for words in (
+                f"intrinsics {images}",
+                f"extrinsics {images / 'plane'}",
+                "distortion",
+                "firmware -o .",
+            )
+        )
+        done = _sh(environment, script + "true", folder)
+        assert done.returncode == 0, done.stderr
+    for file in ("rig.yaml", "calib_constants.h"):
+        first, *others = ((tmp_path / name / file).read_bytes() for name in runs)
+        assert all(other == first for other in others)
+        assert str(project_root).encode() not in first
+        assert str(tmp_path).encode() not in first
+
+
+def test_completion(environment) -> None:
+    words = {
+        "COMP_WORDS": "calib intrinsics --model r",
+        "COMP_CWORD": "3",
+        "_CALIB_COMPLETE": "complete_bash",
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", "from calib.cli.main import main; main()"],
+        env=environment | words,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout.split() == ["radial2", "radial3", "rational8"]
+    assert done.stderr == ""

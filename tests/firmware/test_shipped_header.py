@@ -1,0 +1,28 @@
+"""The header in `firmware_constants/` is what the shipped pictures give."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+
+def _calib(*words: str, cwd: Path) -> None:
+    call = [sys.executable, "-c", "from calib.cli.main import main; main()", *words]
+    done = subprocess.run(call, cwd=cwd, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_shipped_pictures_give_the_shipped_header(tmp_path: Path, project_root: Path) -> None:
+    rig = str(tmp_path / "rig.yaml")
+    _calib("intrinsics", "images", "--rig", rig, cwd=project_root)
+    _calib("extrinsics", "images/plane", "--rig", rig, cwd=project_root)
+    _calib("firmware", "-o", str(tmp_path / "made"), "--rig", rig, cwd=project_root)
+    shipped = project_root / "firmware_constants" / "calib_constants.h"
+    assert (tmp_path / "made" / shipped.name).read_bytes() == shipped.read_bytes()
+    text = shipped.read_text()
+    focal = re.search(r"CALIB_CAMERA_FX_PX (\S+)f", text)
+    assert focal is not None
+    # The truth is in tests/truth/pictures.json: 273.4; sigma is 0.043.
+    assert abs(float(focal.group(1)) - 273.4) < 0.2
