@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import cv2
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -40,9 +40,13 @@ Position = Annotated[list[Place], Field(min_length=2, max_length=2)]
 Pixel = Annotated[list[Number], Field(min_length=2, max_length=2)]
 Angle = Annotated[float, Field(ge=-6.2832, le=6.2832, allow_inf_nan=False, strict=True)]
 
+S = TypeVar("S")
+T = TypeVar("T")
+
 BOARD_FILE = "board.yaml"
 _SIZE_SAMPLE = 5
 """Pictures that are asked for the size of an unknown board."""
+_LOOK_UP_S = 0.2
 _KEPT_PIXELS = 250_000_000
 """Pixels that are kept in memory; further pictures are read twice."""
 
@@ -208,7 +212,7 @@ class _Search:
     def _pictures(self) -> list[Picture]:
         """All pictures; the pixels only of as many as memory surely has room for."""
         kept, pictures = 0, []
-        for picture in self.pool.map(read_picture, self.paths):
+        for picture in _in_order(self.pool, read_picture, self.paths):
             kept += picture.gray.size
             pictures.append(picture if kept <= _KEPT_PIXELS else picture.without_pixels())
         return pictures
@@ -225,7 +229,7 @@ class _Search:
         self, pictures: Sequence[Picture], which: Sequence[int], corners: tuple[int, int]
     ) -> dict[int, Detection | None]:
         found: dict[int, Detection | None] = {}
-        detections = self.pool.map(lambda i: detect(self._gray(pictures, i), *corners), which)
+        detections = _in_order(self.pool, lambda i: detect(self._gray(pictures, i), *corners), which)
         for i, detection in zip(which, detections, strict=True):
             found[i] = detection
             self.done += 1
@@ -240,10 +244,25 @@ class _Search:
         Seen upright and lying, a board counts the same.
         """
         new = [i for i in which if i not in self.sizes]
-        self.sizes |= zip(new, self.pool.map(lambda i: find_size(self._gray(pictures, i)), new), strict=True)
+        sizes = _in_order(self.pool, lambda i: find_size(self._gray(pictures, i)), new)
+        self.sizes |= zip(new, sizes, strict=True)
         counts = Counter((max(s), min(s)) for i in which if (s := self.sizes[i]) is not None)
         most = max(counts, key=lambda s: (counts[s], s[0] * s[1]), default=None)
         return None if most is None or counts[most] < share * len(which) else most
+
+
+def _in_order(pool: Executor, work: Callable[[S], T], items: Iterable[S]) -> Iterator[T]:
+    """Results of `work` in the order of the items.
+
+    The wait is a short one, again and again: Ctrl-C that comes just before a long one is answered only
+    at its end.
+    """
+    futures = [pool.submit(work, item) for item in items]
+    futures.reverse()
+    while futures:
+        while not wait([futures[-1]], timeout=_LOOK_UP_S).done:
+            pass
+        yield futures.pop().result()
 
 
 def _not_found(pictures: Sequence[Picture], wanted: tuple[int, int], other: tuple[int, int] | None) -> str:

@@ -92,7 +92,9 @@ def positions_from_log(
     pixels = np.stack([log.columns["u_px"][rows], log.columns["v_px"][rows]], axis=1)
     values, unit, names = pixels, "px", ("u", "v")
     if camera is not None and A_inverse is not None:
-        values, unit, names = apply_homography(A_inverse, undistort(camera, pixels)), "m", ("x", "y")
+        rays = undistort(camera, pixels)
+        ideal = np.column_stack([rays, np.ones(len(rays))]) @ camera.K[:2].T
+        values, unit, names = apply_homography(A_inverse, ideal), "m", ("x", "y")
         lost = np.nonzero(np.isnan(values).any(axis=1))[0]
         if len(lost):
             u, v = pixels[lost[0]]
@@ -220,7 +222,7 @@ def _judged(filter_: Filter, rounded_hz: float, seen: Positions | None) -> tuple
     unsure = [name for name, of in zip(seen.names, seen.spectra, strict=True) if not of.flat]
     if unsure:
         reasons.append(
-            f"The spectrum of {' and '.join(unsure)} falls up to half the rate: motion and jitter cannot "
+            f"The spectrum of {' and '.join(unsure)} does not fall to a floor: motion and jitter cannot "
             "be told apart; use a log at rest."
         )
     delay_s = dc_delay_s(filter_.sections, design.rate_hz)
@@ -229,6 +231,11 @@ def _judged(filter_: Filter, rounded_hz: float, seen: Positions | None) -> tuple
         remarks.append(
             f"{changed:.0%} of this log's motion does not come through unchanged; it reaches "
             f"{max(of.motion_hz for of in seen.spectra):.3g} Hz."
+        )
+    outliers = max(of.outliers for of in seen.spectra)
+    if outliers:
+        remarks.append(
+            f"{outliers} outliers are not counted as jitter; the filter passes them on, smeared out."
         )
     total = sum(len(piece.t_s) for piece in seen.ticks.pieces)
     if seen.ticks.held > 0.05 * total:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -100,7 +101,7 @@ def static(
     Writes the section imu of the rig's file. Exits 1 when the verdict is not ok.
     """
     from calib.files import check_folder, check_writable, shown, write_atomically
-    from calib.imu.static import analyse_static
+    from calib.imu.static import RestLog, analyse_static
     from calib.imu.static_verdict import judge
     from calib.imulogs import read_rest_log
     from calib.imusections import imu_section, kalibr_imu
@@ -112,11 +113,16 @@ def static(
     if figures is not None:
         check_folder(figures)
     before = read_rig(rig)
-    read, hashes = [], {}
+    read: list[RestLog] = []
+    hashes: dict[str, str] = {}
     for path in logs:
         log, said = read_rest_log(path, acc_unit, gyro_unit)
-        read.append(log)
-        hashes[shown(path.name)] = hash_of(path)
+        name = shown(path.name)
+        if name in hashes:
+            name = f"{name} ({len(read) + 1})"
+        # What is written to the rig's file does not depend on the folder.
+        read.append(replace(log, source=name))
+        hashes[name] = hash_of(path)
         for sentence in said:
             narrate(sentence)
     result = analyse_static(read)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from calib.arrays import FloatArray
 from calib.imu.allan_fit import model_variance
@@ -35,6 +36,10 @@ __all__ = ["allan_figure", "drift_figure", "signal_figure", "write_imu_figures"]
 _UNIT = {"g": "rad/s", "a": "m/s\N{SUPERSCRIPT TWO}"}
 _DENSITY = {"g": "rad/s/\N{SQUARE ROOT}Hz", "a": "m/s\N{SUPERSCRIPT TWO}/\N{SQUARE ROOT}Hz"}
 _WALK = {"g": "rad/s\N{SUPERSCRIPT TWO}/\N{SQUARE ROOT}Hz", "a": "m/s\N{SUPERSCRIPT THREE}/\N{SQUARE ROOT}Hz"}
+_RAISED = (
+    "\N{SUPERSCRIPT ZERO}\N{SUPERSCRIPT ONE}\N{SUPERSCRIPT TWO}\N{SUPERSCRIPT THREE}\N{SUPERSCRIPT FOUR}"
+    "\N{SUPERSCRIPT FIVE}\N{SUPERSCRIPT SIX}\N{SUPERSCRIPT SEVEN}\N{SUPERSCRIPT EIGHT}\N{SUPERSCRIPT NINE}"
+)
 _MOST_POINTS = 2500
 _TAU = "\N{GREEK SMALL LETTER TAU}"
 
@@ -48,6 +53,23 @@ def _panels(figure: Figure, result: Static) -> list[tuple[Axes, int]]:
         axes = figure.add_subplot(grid[kinds.index(axis[0]), "xyz".index(axis[1])])
         panels.append((axes, k))
     return panels
+
+
+def _power(value: float, _position: object = None) -> str:
+    """A power of ten in plain signs."""
+    exponent = round(float(np.log10(value)))
+    signs = str.maketrans("-0123456789", "\N{SUPERSCRIPT MINUS}" + _RAISED)
+    return f"10{str(exponent).translate(signs)}"
+
+
+def _logarithmic(axes: Axes) -> None:
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(LogLocator(10.0, numticks=7))
+        axis.set_minor_formatter(NullFormatter())
+        axis.set_major_formatter(FuncFormatter(_power))
+    axes.grid(True, which="major")
 
 
 def _rows(result: Static) -> int:
@@ -78,7 +100,7 @@ def allan_figure(result: Static, verdict: str = "ok") -> Figure:
         "\N{LESS-THAN SIGN} is a bound of 95 % for what they are too short for."
     )
     figure = sheet(2.75 * _rows(result) + 0.25, "Allan deviation at rest", note, verdict)
-    handles, labels = [], []
+    legend: dict[str, Artist] = {}
     for axes, k in _panels(figure, result):
         noise = result.noise[k]
         axes.set_title(noise.axis)
@@ -88,9 +110,7 @@ def allan_figure(result: Static, verdict: str = "ok") -> Figure:
             axes.set_yticks([])
             continue
         a = noise.allan
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        axes.grid(True, which="major")
+        _logarithmic(axes)
         axes.fill_between(a.tau_s, a.low, a.high, color=SHADE, linewidth=0.0)
         axes.plot(a.tau_s, a.low, color=GREY, linewidth=0.5)
         axes.plot(a.tau_s, a.high, color=GREY, linewidth=0.5)
@@ -105,19 +125,25 @@ def allan_figure(result: Static, verdict: str = "ok") -> Figure:
         axes.plot(
             a.tau_s, a.deviation, color=INK, linewidth=1.2, marker="o", markersize=2.2, label="measured"
         )
-        axes.set_ylim(low / 4.0, high * 1.6)
+        axes.set_ylim(low / 12.0, high * 1.6)
         axes.set_xlabel(f"{_TAU} (s)")
         if axes.get_subplotspec().is_first_col():  # type: ignore[union-attr]  # made from a grid above
             axes.set_ylabel(
                 f"{'rate' if noise.axis[0] == 'g' else 'specific force'} ({_UNIT[noise.axis[0]]})"
             )
-        axes.text(0.04, 0.04, _coefficients(noise), transform=axes.transAxes, fontsize=9, va="bottom")
-        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-            if label not in labels:
-                handles.append(handle)
-                labels.append(label)
-    if handles:
-        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+        axes.text(
+            0.04,
+            0.04,
+            _coefficients(noise),
+            transform=axes.transAxes,
+            fontsize=9,
+            va="bottom",
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.5, "alpha": 0.9},
+        )
+        legend |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    shown = [label for label in ("measured", "fitted", "N", "B", "K") if label in legend]
+    if shown:
+        figure.legend([legend[label] for label in shown], shown, loc="outside lower center", ncols=5)
     return figure
 
 
@@ -211,6 +237,8 @@ def write_imu_figures(folder: Path, result: Static, verdict: str = "ok") -> list
     with look():
         out = [save(allan_figure(result, verdict), folder / "imu_allan.png")]
         out.append(save(drift_figure(result, verdict), folder / "imu_drift.png"))
-        for i in range(len(result.logs)):
-            out.append(save(signal_figure(result, i, verdict), folder / f"imu_static_{i + 1}.png"))
+        out += [
+            save(signal_figure(result, i, verdict), folder / f"imu_static_{i + 1}.png")
+            for i in range(len(result.logs))
+        ]
     return out

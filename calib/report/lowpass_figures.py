@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
+from matplotlib.ticker import NullFormatter
 
 from calib.arrays import FloatArray
 from calib.lowpass import Positions
@@ -74,12 +75,12 @@ def _response(filter_: Filter, section: LowPass) -> Figure:
     _gain(gain, f, filter_, section)
     delay.plot(f, group_delay_s(filter_.sections, f, rate), color=BLUE, linewidth=2.0)
     delay.axvline(cut, color=VERMILLION, linewidth=1.4, linestyle="--")
-    delay.set_xscale("log")
+    _logarithmic(delay)
     delay.set_xlim(f[0], 0.5 * rate)
     delay.set_ylim(0.0, 1.15 * max(section.largest_delay_s, section.dc_delay_s))
     delay.set_xlabel("frequency (Hz)")
     delay.set_ylabel("delay (s)")
-    delay.set_title(f"Group delay: {number(section.dc_delay_s, 's')} at rest; red: cut-off")
+    delay.set_title(f"Group delay: {number(section.dc_delay_s, 's')} at 0 Hz; red: cut-off")
     delay.grid()
     answer = step_response(filter_.sections, rate)
     last = max(1.6 * section.step["settling_s"], 8.0 / rate)
@@ -96,6 +97,17 @@ def _response(filter_: Filter, section: LowPass) -> Figure:
     return figure
 
 
+def _plain_tick(value: float, _: float | None) -> str:
+    return f"{value:g}"
+
+
+def _logarithmic(axes: Axes) -> None:
+    """A frequency axis whose ticks are plain numbers."""
+    axes.set_xscale("log")
+    axes.xaxis.set_major_formatter(_plain_tick)
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
 def _gain(axes: Axes, f: FloatArray, filter_: Filter, section: LowPass) -> None:
     gain = decibels(frequency_response(filter_.sections, f, section.rate_hz))
     axes.plot(f, gain, color=BLUE, linewidth=2.0)
@@ -104,7 +116,7 @@ def _gain(axes: Axes, f: FloatArray, filter_: Filter, section: LowPass) -> None:
         grid = [value for axis in section.log.axes.values() for value in axis.quantisation_hz]
         if grid:
             axes.axvspan(min(grid), max(grid), color="#fdeccc", zorder=0)
-    axes.set_xscale("log")
+    _logarithmic(axes)
     axes.set_xlim(f[0], 0.5 * section.rate_hz)
     axes.set_ylim(_LOWEST_DB, 5.0)
     axes.set_xlabel("frequency (Hz)")
@@ -122,7 +134,7 @@ def _poles(axes: Axes, section: LowPass) -> None:
     reach = 1.35 * max(float(np.abs(z[:, 1]).max()), 1.0 - float(z[:, 0].min()), 0.02)
     reach = min(reach, 1.1)
     axes.scatter(z[:, 0], z[:, 1], marker="x", s=60, color=VERMILLION, linewidths=2.0, zorder=3)
-    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_aspect("equal", adjustable="box")
     axes.set_xlim(1.0 - 1.6 * reach, 1.0 + 0.6 * reach)
     axes.set_ylim(-reach, reach)
     axes.set_xlabel("real part")
@@ -162,8 +174,8 @@ def _on_log(filter_: Filter, section: LowPass, seen: Positions) -> Figure:
     for i, (name, of) in enumerate(zip(seen.names, seen.spectra, strict=True)):
         left, right = panels[i]
         t = piece.t_s[window]
-        left.plot(t, scale * piece.values[window, i], color=BLUE, linewidth=0.9, label="as logged")
-        left.plot(t, scale * filtered[window, i], color=ORANGE, linewidth=2.2, label="filtered")
+        left.plot(t, scale * piece.values[window, i], color=BLUE, linewidth=0.9)
+        left.plot(t, scale * filtered[window, i], color=ORANGE, linewidth=2.2)
         left.set_xlim(t[0], t[-1])
         _without_outliers(left, scale * piece.values[window, i])
         left.set_xlabel("time (s)")
@@ -194,8 +206,10 @@ def _spectrum(axes: Axes, of: Spectrum, filter_: Filter, scale: float, name: str
     axes.axhline(scale * np.sqrt(of.floor), color=GREEN, linewidth=1.4, linestyle="--")
     if of.motion_hz > 0.0:
         axes.axvline(of.motion_hz, color=INK, linewidth=1.2, linestyle=":")
-    axes.set_xscale("log")
+    _logarithmic(axes)
     axes.set_yscale("log")
+    axes.yaxis.set_major_formatter(_plain_tick)
+    axes.yaxis.set_minor_formatter(NullFormatter())
     top = float(whole.max())
     axes.set_ylim(max(1e-3 * float(np.median(whole[shown])), 1e-7 * top), 2.0 * top)
     axes.set_xlabel("frequency (Hz)")

@@ -1,15 +1,17 @@
 """Motion and jitter of a logged position, told apart by their spectrum.
 
 Motion of a heavy thing is slow, quantisation and tracking errors are spread over all frequencies. So
-the power density (Welch 1967) falls from the motion to a floor. Means over the segments hold motion however
-short it was; medians count a few outliers little. The motion ends at the last frequency f_m of the lower
-half of the band at which the mean is above three times the floor of the means. The jitter has the density
+the power density (Welch 1967) falls from the motion to a floor. Outliers are no jitter: samples beyond six
+standard deviations from the median of five (Hampel 1974) are replaced by it first. Of the segments'
+densities the mean holds motion however short it was, and the median P counts disturbances little.
+The motion ends at the last frequency f_m of the lower half of the band at which the mean is above three
+times its own floor. The jitter has the density
 
     N(f) = F below f_m (motion hides it there),   N(f) = P(f) above,
 
-with the medians P and their own median F over the upper half. A filter H leaves the jitter
-sigma^2 = sum of N |H|^2 df. Where motion reaches the upper half F is not the jitter's: the spectrum is then
-called not flat, and a log at rest is needed. An outlier is no jitter and is not in sigma.
+with F the median of P over the upper half. A filter H leaves the jitter sigma^2 = sum of N |H|^2 df.
+Where motion reaches an eighth of the rate, F may be its tail and not the jitter's: the spectrum is then
+called not flat, and a log at rest is needed.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from scipy.ndimage import median_filter
 from scipy.signal import detrend, savgol_filter, welch
 
 from calib.arrays import FloatArray
@@ -33,6 +36,8 @@ FEWEST = 64
 _SEGMENT_S = 8.0
 _FLOOR_TIMES = 3.0
 _FLAT = 4.0
+_HIGHEST_MOTION = 0.125
+_OUTLIER_SIGMAS = 6.0
 
 
 @dataclass(frozen=True)
@@ -47,6 +52,7 @@ class Spectrum:
     floor : density of the jitter below the motion.
     motion_hz : where the motion ends, 0 without motion.
     flat : whether the upper half of the band looks like jitter alone.
+    outliers : samples that were replaced.
     """
 
     rate_hz: float
@@ -56,6 +62,7 @@ class Spectrum:
     floor: float
     motion_hz: float
     flat: bool
+    outliers: int = 0
 
     @property
     def jitter(self) -> float:
@@ -70,16 +77,19 @@ def spectrum(x: FloatArray, rate_hz: float) -> Spectrum:
     """
     if len(x) < FEWEST:
         raise BadInputError(f"has {len(x)} camera ticks without a long gap, expected at least {FEWEST}")
+    x, outliers = _without_outliers(x)
     # With at least four segments a median is one; half-overlapping ones of n / 2.5 make four.
     segment = int(min(max(32, round(_SEGMENT_S * rate_hz)), 2048, len(x) / 2.5))
     mean, median = _density(x, rate_hz, segment, "mean"), _density(x, rate_hz, segment, "median")
     f = np.arange(1.0, len(mean) + 1.0) * (rate_hz / segment)
     upper = f >= 0.25 * rate_hz
     floor, floor_of_means = float(np.median(median[upper])), float(np.median(mean[upper]))
-    above = np.nonzero(_smoothed(mean[~upper]) > _FLOOR_TIMES * floor_of_means)[0]
+    nothing = (1e-13 * float(np.abs(x).max())) ** 2
+    above = np.nonzero(_smoothed(mean[~upper]) > max(_FLOOR_TIMES * floor_of_means, nothing))[0]
     end = int(above[-1]) + 1 if len(above) else 0
     thirds = [float(np.mean(part)) for part in np.array_split(mean[upper], 3)]
-    flat = end < int((~upper).sum()) and thirds[0] <= _FLAT * min(thirds[1:])
+    flat = f[end - 1] <= _HIGHEST_MOTION * rate_hz if end else True
+    flat = flat and thirds[0] <= max(_FLAT * min(thirds[1:]), nothing)
     moving = np.arange(len(f)) < end
     return Spectrum(
         rate_hz,
@@ -89,7 +99,20 @@ def spectrum(x: FloatArray, rate_hz: float) -> Spectrum:
         floor,
         float(f[end - 1]) if end else 0.0,
         bool(flat),
+        outliers,
     )
+
+
+def _without_outliers(x: FloatArray) -> tuple[FloatArray, int]:
+    """The signal with the median of five in place of outliers, and how many there were.
+
+    The spread is taken from the 95 % quantile: on a pixel grid more than half of the differences are zero.
+    """
+    middle = np.asarray(median_filter(x, 5, mode="nearest"), dtype=np.float64)
+    away = np.abs(x - middle)
+    sigma = float(np.quantile(away, 0.95)) / 1.96
+    out = away > _OUTLIER_SIGMAS * sigma if sigma > 0.0 else np.zeros(len(x), dtype=np.bool_)
+    return np.where(out, middle, x), int(out.sum())
 
 
 def _density(x: FloatArray, rate_hz: float, segment: int, average: Literal["mean", "median"]) -> FloatArray:
