@@ -11,7 +11,7 @@ from calib.arrays import BoolArray, FloatArray, GrayImage
 from calib.camera.boardcheck import continuing_sides, fault_of
 from calib.camera.ordering import canonical_turn, orderings
 from calib.camera.refine import Refined, refine, square_px
-from calib.camera.search import Stage, fallback_stages, lattice_stages
+from calib.camera.search import fallback_stages, lattice_stages
 from calib.camera.size import board_sizes
 from calib.errors import BadInputError
 
@@ -81,10 +81,10 @@ def _ordered(grid: Refined, columns: int, rows: int, detector: str) -> Detection
     )
 
 
-def _best_of(gray: GrayImage, stage: Stage) -> Refined | None:
-    """The grid of a stage that passes every test; of several the one with the largest squares."""
+def _best_of(gray: GrayImage, grids: Sequence[FloatArray]) -> Refined | None:
+    """The grid that passes every test; of several the one with the largest squares."""
     best: Refined | None = None
-    for points in stage.search():
+    for points in grids:
         grid = refine(gray, points)
         if grid is None or fault_of(gray, grid) is not None or any(continuing_sides(gray, grid)):
             continue
@@ -119,10 +119,16 @@ def detect(gray: GrayImage, columns: int, rows: int) -> Detection | None:
         )
     if not _checked(gray):
         return None
-    for stage in lattice_stages(gray, columns, rows) + fallback_stages(gray, columns, rows):
-        grid = _best_of(gray, stage)
-        if grid is not None:
-            return _ordered(grid, columns, rows, stage.name)
+    fragments = False
+    for stages in (lattice_stages, fallback_stages):
+        for stage in stages(gray, columns, rows):
+            found = stage.search()
+            fragments |= found.fragments
+            grid = _best_of(gray, found.grids)
+            if grid is not None:
+                return _ordered(grid, columns, rows, stage.name)
+        if not fragments:
+            break
     return None
 
 

@@ -3,12 +3,13 @@
 The first stages look for grids of saddle points in copies of the picture, from a small one, where
 large squares stay and noise goes, up to one of twice the size for squares of a few pixels. OpenCV's
 finders follow: the classic one, the sector-based one (SB) and SB with an exhaustive search, the last
-two also on an enlarged copy.
+two also on an enlarged copy. They take long where there is no board and are asked only when the first
+stages saw a part of one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -19,7 +20,16 @@ from calib.camera.gridmodel import predict
 from calib.camera.lattice import Lattice, find_lattices
 from calib.camera.saddles import find_saddles
 
-__all__ = ["Level", "Stage", "complete", "fallback_stages", "lattice_levels", "lattice_stages", "resized"]
+__all__ = [
+    "Found",
+    "Level",
+    "Stage",
+    "complete",
+    "fallback_stages",
+    "lattice_levels",
+    "lattice_stages",
+    "resized",
+]
 
 _COARSE_PIXELS = 120_000
 _LARGEST_PIXELS = 6_000_000
@@ -29,6 +39,8 @@ _OPENCV_PIXELS = 1_300_000
 _SEEN_SHARE = 0.8
 """Least share of a grid's corners that must be seen; the others are looked for where they should be."""
 _MIN_SIDE_PX = 16
+_FRAGMENT = 0.4
+"""Share of the corners, in a grid with holes, from which on OpenCV's finders are asked too."""
 
 
 @dataclass(frozen=True)
@@ -44,11 +56,19 @@ class Level:
 
 
 @dataclass(frozen=True)
+class Found:
+    """What a stage saw: grids (r, c, 2) of the picture to try, and whether a broken grid is there."""
+
+    grids: list[FloatArray]
+    fragments: bool = False
+
+
+@dataclass(frozen=True)
 class Stage:
-    """One way of looking: its name and a function that yields grids (r, c, 2) of the picture."""
+    """One way of looking."""
 
     name: str
-    search: Callable[[], Iterator[FloatArray]]
+    search: Callable[[], Found]
 
 
 def resized(gray: GrayImage, zoom: float) -> Level:
@@ -98,13 +118,16 @@ def lattice_stages(gray: GrayImage, columns: int, rows: int) -> list[Stage]:
     """Stages that join saddle points of copies of the picture."""
 
     def stage(zoom: float) -> Stage:
-        def search() -> Iterator[FloatArray]:
+        def search() -> Found:
             level = resized(gray, zoom)
+            grids, fragments = [], False
             for lattice in find_lattices(find_saddles(level.image), least=max(4, columns * rows // 4)):
-                if sorted(lattice.points.shape[:2]) == sorted((rows, columns)):
-                    points = complete(lattice)
-                    if points is not None:
-                        yield level.to_picture(points)
+                fits = sorted(lattice.points.shape[:2]) == sorted((rows, columns))
+                points = complete(lattice) if fits else None
+                if points is not None:
+                    grids.append(level.to_picture(points))
+                fragments |= not lattice.seen.all() and int(lattice.seen.sum()) >= _FRAGMENT * columns * rows
+            return Found(grids, fragments)
 
         return Stage(f"saddles x{zoom:g}", search)
 
@@ -143,16 +166,16 @@ def fallback_stages(gray: GrayImage, columns: int, rows: int) -> list[Stage]:
     def stage(
         name: str, finder: Callable[[GrayImage, tuple[int, int]], FloatArray | None], zoom: float
     ) -> Stage:
-        def search() -> Iterator[FloatArray]:
+        def search() -> Found:
             level = resized(gray, zoom)
             try:
                 corners = finder(level.image, (columns, rows))
             except cv2.error:
-                # Some sizes of picture are too small for a finder's own filters.
-                return
-            if corners is not None and corners.size == 2 * columns * rows:
-                grid = corners.reshape(rows, columns, 2)
-                yield level.to_picture(_not_mirrored(grid))
+                # Some pictures are too small for a finder's own filters.
+                return Found([])
+            if corners is None or corners.size != 2 * columns * rows:
+                return Found([])
+            return Found([level.to_picture(_not_mirrored(corners.reshape(rows, columns, 2)))])
 
         return Stage(f"{name} x{zoom:g}", search)
 

@@ -90,6 +90,9 @@ def rest_parts(
         w = _windows(part, size)
         excess = w.std(axis=1) / np.minimum(TIMES_SPREAD * quiet + 1e-12, most)
         change = np.abs(np.diff(w.mean(axis=1), axis=0)) / (TIMES_MEAN * jump)
+        # Coming to rest is no motion of the window that follows.
+        shaken = (excess > 1.0).any(axis=1)
+        change[shaken[:-1]] = 0.0
         excess[1:] = np.maximum(excess[1:], change)
         moving = (excess > 1.0).any(axis=1)
         for start, stop, moves in _runs(moving):

@@ -12,6 +12,7 @@ __all__ = ["Judgement", "judge"]
 _MOST_MISSING = 0.02
 _MOST_REPEATED = 0.02
 _MOST_SIGMA_OF_N = 0.10
+_LEAST_REST_S = 10.0
 _LEAST_CHANCE = 1e-4
 
 
@@ -96,6 +97,10 @@ def judge(result: Static) -> Judgement:
         remarks += said
     unsupported = [n.axis for n in result.noise if n.allan is not None and not n.allan.K.supported]
     longest = max(log.rest_s for log in result.logs)
+    if longest < _LEAST_REST_S:
+        reasons.append(
+            f"{longest:.3g} s at rest are too short to tell a bias from noise, expected {_LEAST_REST_S:g} s"
+        )
     advice = []
     if unsupported:
         remarks.append(

@@ -3,7 +3,8 @@
 For every family and order the jitter behind the filter rises with the cut-off, so the highest cut-off that
 keeps it is found by bisection; of these filters the one with the least delay at zero frequency is
 suggested. In white jitter a filter of first order and every one with a single pair of poles have
-the same product of delay and noise bandwidth, 1/4, so delays within half a tick count as equal: of those
+the same product of delay and noise bandwidth, 1/4, which sampling and a log's scatter part by some
+percent. So delays within 7 % count as equal: of those
 the one wins that changes the shape of the log's motion least (`calib.signals.spectrum.motion_lost`), and
 without motion the one of lowest order.
 """
@@ -21,6 +22,7 @@ from calib.signals.spectrum import Spectrum, jitter_after, motion_lost
 
 __all__ = ["Candidate", "Suggestion", "suggest"]
 
+_TIE = 0.07
 _LOWEST = 1e-4
 """Lowest cut-off that is tried, in parts of the rate."""
 _HIGHEST = 0.45
@@ -134,7 +136,7 @@ def suggest(
         raise BadInputError(
             f"jitters by {has} unfiltered and no low-pass here leaves only {most}; ask for more"
         )
-    tied = [one for one in candidates if one.delay_s <= candidates[0].delay_s + 0.5 / spectra[0].rate_hz]
+    tied = [one for one in candidates if one.delay_s <= (1.0 + _TIE) * candidates[0].delay_s]
     least = min(one.motion_lost for one in tied)
     same = [one for one in tied if one.motion_lost <= least + _SAME_SHAPE]
     best = min(same, key=lambda one: (one.filter.design.order, one.delay_s))

@@ -1,0 +1,199 @@
+"""Corners: every board of the real sets, the truth of rendered ones, one order at every angle."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from calib.arrays import FloatArray, GrayImage
+from calib.camera.board import Board
+from calib.camera.bundle import calibrate
+from calib.camera.corners import detect, find_size
+from calib.camera.model import Camera
+from calib.camera.views import View, pack
+from calib.errors import BadInputError
+from calib.pictures import list_pictures, read_picture
+from calib.twin.scene import Light, PrintedBoard, Sensor, corner_pixels, pose_facing, render
+
+LENS = np.array([-0.22, 0.12, 0, 0, 0, 0, 0, 0.0])
+VGA = Camera("radial2", (640, 480), 545.0, 545.0, 0.0, 323.3, 237.9, LENS)
+PIXY = Camera("radial2", (316, 208), 270.0, 270.0, 0.0, 161.3, 101.9, LENS)
+
+
+def _picture(
+    camera: Camera, board: Board, seed: int, roll_rad: float | None = None, **sensor: float
+) -> tuple[GrayImage, FloatArray]:
+    rng = np.random.default_rng(seed)
+    width, height = camera.image_size_px
+    printed = PrintedBoard(board)
+    pose = pose_facing(
+        camera,
+        printed,
+        (width * rng.uniform(0.45, 0.55), height * rng.uniform(0.45, 0.55)),
+        (board.columns + 2) * board.square_m * camera.fx_px / width * rng.uniform(1.25, 1.7),
+        tilt_rad=rng.uniform(0, 0.6),
+        azimuth_rad=rng.uniform(0, 2 * np.pi),
+        roll_rad=rng.uniform(-0.4, 0.4) if roll_rad is None else roll_rad,
+    )
+    chosen = {"blur_px": 0.7, "noise_grey": 2.0, "gamma": 1.3} | sensor
+    image = render(camera, printed, pose, sensor=Sensor(**chosen), background=0.4, seed=seed)
+    return image, corner_pixels(camera, printed, pose)
+
+
+@pytest.mark.parametrize(
+    ("folder", "size", "rms_px"), [("opencv_left", (9, 6), 0.170), ("gloworm_qvga", (8, 6), 0.068)]
+)
+def test_every_board_of_the_real_sets(
+    shared_data: Path, folder: str, size: tuple[int, int], rms_px: float
+) -> None:
+    pictures = [read_picture(path) for path in list_pictures([shared_data / folder])]
+    board = Board(*size, 0.025)
+    with ThreadPoolExecutor(2) as pool:
+        found = list(pool.map(lambda p: detect(p.gray, *size), pictures))
+    views = [
+        View(p.name, board.points_m(), d.pixels, d.refined)
+        for p, d in zip(pictures, found, strict=True)
+        if d is not None
+    ]
+    assert len(views) == len(pictures)
+    assert calibrate(pack(views), pictures[0].size_px, "radial2").rms_px <= rms_px
+
+
+def _opencv_classic(gray: GrayImage, size: tuple[int, int]) -> FloatArray | None:
+    found, corners = cv2.findChessboardCorners(gray, size)
+    ends = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
+    return cv2.cornerSubPix(gray, corners, (5, 5), (-1, -1), ends).reshape(-1, 2) if found else None
+
+
+def _opencv_sb(gray: GrayImage, size: tuple[int, int]) -> FloatArray | None:
+    found, corners = cv2.findChessboardCornersSB(gray, size, flags=cv2.CALIB_CB_ACCURACY)
+    return corners.reshape(-1, 2) if found else None
+
+
+@pytest.mark.parametrize(("camera", "most_px"), [(VGA, 0.02), (PIXY, 0.025)], ids=["640x480", "316x208"])
+def test_error_against_rendered_truth_is_below_opencvs(camera: Camera, most_px: float) -> None:
+    board = Board(9, 6, 0.025)
+    finders: dict[str, Callable[[GrayImage], FloatArray | None]] = {
+        "ours": lambda gray: detection.pixels if (detection := detect(gray, 9, 6)) else None,
+        "classic": lambda gray: _opencv_classic(gray, (9, 6)),
+        "sb": lambda gray: _opencv_sb(gray, (9, 6)),
+    }
+    errors: dict[str, list[float]] = {name: [] for name in finders}
+    for seed in range(8):
+        gray, truth = _picture(camera, board, seed)
+        for name, find in finders.items():
+            corners = find(gray)
+            assert corners is not None or name != "ours"
+            if corners is not None:
+                squared = min(float(np.mean((c - truth) ** 2)) for c in (corners, corners[::-1]))
+                errors[name].append(squared)
+    rmse = {name: float(np.sqrt(np.mean(values))) for name, values in errors.items() if values}
+    assert rmse["ours"] <= most_px
+    assert all(rmse["ours"] < value for name, value in rmse.items() if name != "ours"), rmse
+
+
+@pytest.mark.parametrize("size", [(7, 5), (9, 6), (4, 4), (5, 4)])
+def test_indices_keep_their_corners_at_every_angle(size: tuple[int, int]) -> None:
+    board = Board(*size, 0.02)
+    for step in range(12):
+        roll = np.deg2rad(30 * step + 7)
+        gray, truth = _picture(PIXY, board, 3, roll_rad=roll)
+        detection = detect(gray, *size)
+        assert detection is not None, np.rad2deg(roll)
+        grid = truth.reshape(size[1], size[0], 2)
+        turns = range(4) if size[0] == size[1] else (0, 2)
+        off = [float(np.abs(np.rot90(grid, t).reshape(-1, 2) - detection.pixels).max()) for t in turns]
+        assert min(off) < 0.5
+        found = detection.pixels.reshape(size[1], size[0], 2)
+        along, across = found[:, -1].mean(0) - found[:, 0].mean(0), found[-1].mean(0) - found[0].mean(0)
+        # Never mirrored: rows run clockwise from columns.
+        assert along[0] * across[1] - along[1] * across[0] > 0
+        if (size[0] + size[1]) % 2 == 0 and size[0] != size[1]:
+            assert along[0] > 0
+        if (size[0] + size[1]) % 2 == 1:
+            # The square outward of corner (0, 0) is dark.
+            u, v = 1.5 * found[0, 0] - 0.5 * found[1, 1]
+            bright = 1.5 * found[0, -1] - 0.5 * found[1, -2]
+            assert gray[round(v), round(u)] < gray[round(bright[1]), round(bright[0])]
+
+
+def test_a_quarter_turn_of_the_picture_turns_the_corners_with_it() -> None:
+    gray, _ = _picture(VGA, Board(9, 6, 0.025), 1)
+    plain = detect(gray, 9, 6)
+    turned = detect(np.ascontiguousarray(np.rot90(gray)), 9, 6)
+    assert plain is not None
+    assert turned is not None
+    # rot90 maps (u, v) to (v, width - 1 - u).
+    expected = np.stack([plain.pixels[:, 1], gray.shape[1] - 1 - plain.pixels[:, 0]], axis=1)
+    assert np.abs(expected - turned.pixels).max() < 0.02
+
+
+@pytest.mark.parametrize(
+    ("what", "sensor"),
+    [
+        ("blurred", {"blur_px": 1.6}),
+        ("noisy", {"noise_grey": 10.0}),
+        ("dark response", {"gamma": 2.2}),
+        ("shaken", {"motion_px": (2.0, 1.0)}),
+    ],
+)
+def test_hard_pictures_are_found_and_honest(what: str, sensor: dict[str, float]) -> None:
+    gray, truth = _picture(VGA, Board(9, 6, 0.025), 5, **sensor)
+    detection = detect(gray, 9, 6)
+    assert detection is not None, what
+    error = min(np.sqrt(np.mean((c - truth) ** 2)) for c in (detection.pixels, detection.pixels[::-1]))
+    assert error < 0.08
+    assert detection.refined.mean() > 0.9
+    # Sigma from the fits themselves covers the error.
+    assert error < 4 * np.median(detection.sigma_px) + 0.01
+
+
+def test_uneven_light_and_shadow() -> None:
+    printed = PrintedBoard(Board(9, 6, 0.025))
+    pose = pose_facing(VGA, printed, (320, 240), 0.42, tilt_rad=0.4, azimuth_rad=1.0)
+    light = Light(gradient=(0.35, -0.25), vignetting=0.4)
+    gray = render(VGA, printed, pose, light=light, sensor=Sensor(), background=0.3, seed=2)
+    detection = detect(gray, 9, 6)
+    assert detection is not None
+    assert np.sqrt(np.mean((detection.pixels - corner_pixels(VGA, printed, pose)) ** 2)) < 0.03
+
+
+def test_another_size_is_not_reported_as_the_one_asked_for() -> None:
+    gray, _ = _picture(VGA, Board(9, 6, 0.025), 2)
+    for columns, rows in ((8, 6), (9, 5), (8, 5), (7, 4), (10, 6), (6, 6)):
+        assert detect(gray, columns, rows) is None
+    assert find_size(gray) == (9, 6)
+    assert find_size([gray, _picture(VGA, Board(9, 6, 0.025), 4)[0]]) == (9, 6)
+
+
+def test_the_same_on_any_number_of_threads() -> None:
+    grays = [_picture(PIXY, Board(7, 5, 0.02), seed)[0] for seed in range(4)]
+    alone = [detect(gray, 7, 5) for gray in grays]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda gray: detect(gray, 7, 5), grays))
+    for a, b in zip(alone, together, strict=True):
+        assert a is not None
+        assert b is not None
+        np.testing.assert_array_equal(a.pixels, b.pixels)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 500), (7, 7), (30, 40)])
+def test_tiny_and_constant_pictures_hold_no_board(
+    shape: tuple[int, int], capfd: pytest.CaptureFixture[str]
+) -> None:
+    for level in (0, 128, 255):
+        assert detect(np.full(shape, level, dtype=np.uint8), 7, 5) is None
+        assert find_size(np.full(shape, level, dtype=np.uint8)) is None
+    assert capfd.readouterr() == ("", "")
+
+
+def test_what_is_no_grey_picture_is_refused() -> None:
+    with pytest.raises(BadInputError, match="uint8"):
+        detect(np.zeros((50, 50, 3), dtype=np.uint8), 7, 5)
+    with pytest.raises(BadInputError, match="3x3"):
+        detect(np.zeros((50, 50), dtype=np.uint8), 2, 5)
