@@ -10,7 +10,17 @@ import pytest
 
 from calib import files
 from calib.errors import BadInputError
-from calib.files import check_writable, read_text, read_yaml_mapping, shown, write_atomically
+from calib.files import (
+    check_folder,
+    check_readable,
+    check_writable,
+    one_line,
+    read_bytes,
+    read_text,
+    read_yaml_mapping,
+    shown,
+    write_atomically,
+)
 
 
 def test_a_file_is_replaced_whole(tmp_path: Path) -> None:
@@ -73,6 +83,12 @@ def test_unwritable_places_are_known_before_work(tmp_path: Path) -> None:
         ("1: 2\n", "not text"),
         ("a: 1\n\tb: 2\n", "line 2"),
         ("x: " + "[" * 3000, "not YAML"),
+        ("x: " + "{a: " * 90_000, "nested more than 40 deep"),
+        ("a: 1\nb: 2\na: 3\n", "line 3: the key a was given before"),
+        ("a: [{b: 1, c: 2, b: 3}]\n", "line 1: the key b was given before"),
+        ("a: \x07\n", "control characters are not allowed"),
+        ("a: " + "9" * 5000, "not YAML that can be read"),
+        ("a: 1\n---\nb: 2\n", "another document"),
     ],
 )
 def test_wrong_yaml_is_one_sentence(tmp_path: Path, text: str, says: str) -> None:
@@ -102,3 +118,61 @@ def test_text_that_is_not_utf8(tmp_path: Path) -> None:
 
 def test_names_are_shown_on_one_line() -> None:
     assert shown("a\nb\x1b[31m.png") == r"a\nb\x1b[31m.png"
+
+
+def test_the_same_key_in_two_places_is_no_repetition(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    path.write_text("a: {b: 1}\nc: [{b: 1}, {b: 2}]\nb: &b {x: 1}\nd: {<<: *b, y: 2}\ne: [b, b]\n")
+    assert read_yaml_mapping(path)["d"] == {"x": 1, "y": 2}
+
+
+def test_a_list_that_holds_itself_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    for text in ("a: &a [*a]\n", "a: &a {b: *a}\n"):
+        path.write_text(text)
+        with pytest.raises(BadInputError, match="expands"):
+            read_yaml_mapping(path)
+
+
+def test_what_is_no_regular_file_is_not_read(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "file").write_bytes(b"12345")
+    assert check_readable(tmp_path / "file") == 5
+    with pytest.raises(BadInputError, match="is a pipe or a device"):
+        read_bytes(tmp_path / "pipe")
+    with pytest.raises(BadInputError, match="is a folder"):
+        read_bytes(tmp_path)
+    with pytest.raises(BadInputError, match="No such file"):
+        read_bytes(tmp_path / "gone")
+    with pytest.raises(BadInputError, match="is larger than 4e-06 MB"):
+        read_bytes(tmp_path / "file", most=4)
+
+
+def test_read_only_files_and_loops_are_not_written(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    path.write_text("old")
+    path.chmod(0o444)
+    with pytest.raises(BadInputError, match="is read-only"):
+        write_atomically(path, "new")
+    assert path.read_text() == "old"
+    (tmp_path / "loop").symlink_to("loop")
+    with pytest.raises(BadInputError, match="leads back to itself"):
+        write_atomically(tmp_path / "loop", "new")
+
+
+def test_devices_are_written_through() -> None:
+    write_atomically(Path("/dev/null"), "x")
+    assert Path("/dev/null").is_char_device()
+
+
+def test_folders_are_known_before_work(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    check_folder(tmp_path / "a" / "b")
+    assert not (tmp_path / "a").exists()
+    with pytest.raises(BadInputError, match="file is a file"):
+        check_folder(tmp_path / "file" / "b")
+
+
+def test_one_line() -> None:
+    assert one_line("plain \N{GREEK SMALL LETTER MU}m") == "plain \N{GREEK SMALL LETTER MU}m"
+    assert one_line("a\r\nb\u202e\udcff") == r"a\r\nb\u202e\udcff"

@@ -100,3 +100,64 @@ def test_mixed_sizes_name_both(tmp_path: Path) -> None:
     (tmp_path / "b.png").write_bytes(_png(GRAY[:30]))
     with pytest.raises(BadInputError, match=r"b\.png: is 60x30 px, but a\.png is 60x40 px"):
         same_size([read_picture(tmp_path / n) for n in ("a.png", "b.png")])
+
+
+def test_the_order_does_not_depend_on_the_file_system(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = ["view1.png", "view01.png", "View1.png", "\u00b25.png", "10.png", "9.png"]
+    for name in names:
+        (tmp_path / name).write_bytes(b"x")
+    if len(list(tmp_path.iterdir())) < len(names):
+        pytest.skip("this file system does not tell upper from lower case")
+    listed = [p.name for p in list_pictures([tmp_path])]
+    inside = list(tmp_path.iterdir())
+    monkeypatch.setattr(Path, "iterdir", lambda self: reversed(inside))
+    assert [p.name for p in list_pictures([tmp_path])] == listed
+    assert listed[:2] == ["9.png", "10.png"]
+
+
+def test_only_hidden_pictures_are_none(tmp_path: Path) -> None:
+    (tmp_path / "._view1.png").write_bytes(b"x")
+    with pytest.raises(BadInputError, match="holds no pictures"):
+        list_pictures([tmp_path])
+
+
+def test_names_that_would_be_shown_alike(tmp_path: Path) -> None:
+    for name in ("a\nb.png", "a\\nb.png"):
+        (tmp_path / name).write_bytes(_png(GRAY))
+    with pytest.raises(BadInputError, match="two pictures have this name"):
+        list_pictures([tmp_path])
+    assert read_picture(tmp_path / "a\nb.png").name == "a\\nb.png"
+
+
+def test_a_motion_photo_with_a_film_behind_the_picture(tmp_path: Path) -> None:
+    # The film's bytes may look like markers of a picture.
+    (tmp_path / "a.jpg").write_bytes(_jpg(GRAY) + b"ftyp\xff\xda\x00" * 50)
+    assert read_picture(tmp_path / "a.jpg").size_px == (60, 40)
+
+
+def test_damage_that_only_the_decoder_sees(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (64, 64)).astype(np.uint8)
+    data = _jpg(noise)
+    (tmp_path / "a.jpg").write_bytes(data[: len(data) // 2] + b"\xff\xd9")
+    with pytest.raises(BadInputError, match=r"damaged JPEG \(premature end of data segment\)"):
+        read_picture(tmp_path / "a.jpg")
+    assert capfd.readouterr().err == ""
+
+
+def test_floats_with_infinities_and_without_contrast(tmp_path: Path) -> None:
+    values = GRAY.astype(np.float32) / 255
+    values[3, 3], values[4, 4] = np.inf, np.nan
+    (tmp_path / "a.tif").write_bytes(cv2.imencode(".tif", values)[1].tobytes())
+    gray = read_picture(tmp_path / "a.tif").gray
+    assert gray.dtype == np.uint8
+    assert np.median(gray) == pytest.approx(np.median(GRAY) * 255 / np.percentile(GRAY, 99.9), abs=2)
+    (tmp_path / "b.png").write_bytes(_png(np.zeros((9, 9), np.uint16)))
+    assert read_picture(tmp_path / "b.png").gray.max() == 0
+
+
+def test_a_picture_without_its_pixels_keeps_its_size(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(_png(GRAY))
+    picture = read_picture(tmp_path / "a.png").without_pixels()
+    assert (picture.size_px, picture.gray.size) == ((60, 40), 0)

@@ -34,12 +34,12 @@ def test_round_trip_and_same_bytes(tmp_path: Path) -> None:
 
 def test_sections_of_later_versions_survive(tmp_path: Path) -> None:
     path = tmp_path / "rig.yaml"
-    path.write_text("imu: {gyro_bias_radps: [0.1, 0.2, 0.3]}\nfuture: {a: 1}\n")
+    path.write_text("estimator: {gyro_bias_radps: [0.1, 0.2, 0.3]}\nfuture: {a: 1}\n")
     write_rig(path, read_rig(path).model_copy(update={"camera": CAMERA}), {})
     text = path.read_text()
     assert "gyro_bias_radps: [0.1, 0.2, 0.3]" in text
     assert "future: {a: 1}" in text
-    assert text.index("camera:") < text.index("imu:") < text.index("provenance:")
+    assert text.index("camera:") < text.index("estimator:") < text.index("provenance:")
 
 
 def test_no_file_is_an_empty_rig(tmp_path: Path) -> None:
@@ -50,13 +50,22 @@ def test_no_file_is_an_empty_rig(tmp_path: Path) -> None:
     ("change", "says"),
     [
         (("fx_px: 273.4", "fx_px: 273px"), r"camera\.fx_px is '273px', expected a number"),
-        (("fx_px: 273.4", "fx_px: -3.0"), r"camera\.fx_px is -3\.0, expected greater than 0"),
+        (
+            ("fx_px: 273.4", "fx_px: -3.0"),
+            r"camera\.fx_px is -3\.0, expected greater than or equal to 0\.001",
+        ),
         (("fx_px: 273.4", "fx_px: .nan"), r"camera\.fx_px is nan"),
         (("fx_px: 273.4", "fx_mm: 3.0"), r"camera\.fx_px is missing"),
         (("verdict: ok", "verdict: fine"), r"camera\.verdict is 'fine'"),
         (("[316, 208]", "[316]"), r"camera\.image_size_px"),
         (("cx_px: 160.7", "cx_px: 160.7\n  colour: red"), r"camera\.colour is not a key"),
-        (("camera:", "camera: 7\nother:"), r"camera is 7"),
+        (("camera:", "camera: 7\nother:"), r"camera is 7, expected keys with values"),
+        (("fx_px: 273.4", "fx_px: 273e0"), r"camera\.fx_px is '273e0', expected a number \(without quotes"),
+        (("[316, 208]", "[316, 208, 3]"), r"camera\.image_size_px is \[316, 208, 3\], expected 2 values"),
+        (("[316, 208]", "[316, 208.0]"), r"camera\.image_size_px\.1 is 208\.0, expected a whole number"),
+        (("cx_px: 160.7", "cx_px: 1.0e+300"), r"camera\.cx_px is 1e\+300, expected less than or equal to"),
+        (("k3: 0.0", "k3: 0.1"), r"camera\.distortion\.k3 is 0\.1, but radial2 has no k3"),
+        (("verdict: ok", "verdict: 1"), r"camera\.verdict is 1, expected text"),
     ],
 )
 def test_wrong_values_name_file_key_value_and_what_was_expected(
@@ -70,3 +79,15 @@ def test_wrong_values_name_file_key_value_and_what_was_expected(
         read_rig(path)
     assert "rig.yaml" in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_file_of_another_kind_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "compose.yaml"
+    path.write_text("services: {web: {image: nginx}}\n")
+    with pytest.raises(BadInputError, match=r"is not a rig\.yaml: it has 'services'"):
+        read_rig(path)
+
+
+def test_a_link_to_no_file_is_an_empty_rig(tmp_path: Path) -> None:
+    (tmp_path / "rig.yaml").symlink_to("gone.yaml")
+    assert read_rig(tmp_path / "rig.yaml") == Rig()

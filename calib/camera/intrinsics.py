@@ -29,6 +29,8 @@ __all__ = ["Choices", "Intrinsics", "calibrate_camera"]
 _REJECT_SIGMAS = 5.0
 _REJECT_SHARE = 0.3
 """A view that loses more of its points than this is left out whole."""
+_HOPELESS = 0.02
+"""RMS over the picture's larger side from which on the points belong to no camera at all."""
 
 
 @dataclass(frozen=True)
@@ -187,7 +189,16 @@ def calibrate_camera(
     solved = time.perf_counter()
     sigma = covariance(fit)
     covered = time.perf_counter()
-    judgement = judge(fit, sigma)
+    try:
+        judgement = judge(fit, sigma)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        # Points that no camera sees on a flat board leave the checks without a linear system to solve.
+        if fit.rms_px < _HOPELESS * max(image_size_px):
+            raise
+        raise BadInputError(
+            f"no camera fits these views: the best leaves an RMS of {fit.rms_px:.0f} px; expected views of one "
+            "flat target, each point with its own pixel"
+        ) from error
     judged = time.perf_counter()
     seconds = {"solve": solved - began, "covariance": covered - solved, "judge": judged - covered}
     return Intrinsics(fit, sigma, judgement, models, boards, board, tuple(rejected), seconds)

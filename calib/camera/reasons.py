@@ -207,30 +207,35 @@ def of_split(found: Split | None, in_order: bool, calibration: Calibration, limi
     """One camera, or two."""
     if found is None or found.ratio < (limits.change_ratio if in_order else limits.split_ratio):
         return []
-    shift = {name: found.difference[name] / max(found.sigma[name], 1e-300) for name in found.difference}
-    strongest = max(shift, key=lambda name: abs(shift[name]))
-    if abs(shift[strongest]) < limits.split_sigma:
-        return []
-    names = calibration.observations.names
-    camera = calibration.camera
+    shift = {name: abs(found.difference[name]) / max(found.sigma[name], 1e-300) for name in found.difference}
+    camera, names = calibration.camera, calibration.observations.names
     width = max(camera.image_size_px)
     scale = {"fx_px": camera.fx_px, "fy_px": camera.fy_px, "cx_px": width, "cy_px": width}
-    apart = max(abs(found.difference.get(name, 0.0)) / value for name, value in scale.items())
+    # Distortion alone tells no two cameras apart; it follows the part of the picture that was seen.
+    telling = [
+        name
+        for name, value in scale.items()
+        if shift.get(name, 0.0) > limits.split_sigma
+        and abs(found.difference[name]) > limits.split_least * value
+    ]
+    strongest = max(telling or shift, key=lambda name: shift[name])
+    if shift[strongest] < limits.split_sigma:
+        return []
     by = ", ".join(
         f"{name.removesuffix('_px')} by {found.difference[name]:+.1f} px"
         for name in ("fx_px", "cx_px", "cy_px")
         if name in shift
     )
     sure = (
-        f"({by}; {strongest.removesuffix('_px')} by {abs(shift[strongest]):.0f} standard deviations; the RMS "
+        f"({by}; {strongest.removesuffix('_px')} by {shift[strongest]:.0f} standard deviations; the RMS "
         f"falls from {found.rms_px:.3f} to {found.split_rms_px:.3f} px, {found.ratio:.1f} times what chance "
         "explains)"
     )
     second = np.flatnonzero(found.second)
-    if apart < limits.split_least:
+    if not telling:
         text = (
-            f"{listed([names[i] for i in second], 20)} would have a camera of their own {sure}, but it "
-            f"differs by less than {100 * limits.split_least:.1f} %, too little to matter."
+            f"{listed([names[i] for i in second], 20)} would have a camera of their own {sure}, but no focal "
+            f"length or centre that differs for certain by {100 * limits.split_least:.1f} %, which would matter."
         )
         return [Finding(REMARK, text)]
     if in_order:

@@ -2,9 +2,8 @@
 
 The first stages look for grids of saddle points in copies of the picture, from a small one, where
 large squares stay and noise goes, up to one of twice the size for squares of a few pixels. OpenCV's
-finders follow: the classic one, the sector-based one (SB) and SB with an exhaustive search, the last
-two also on an enlarged copy. They take long where there is no board and are asked only when the first
-stages saw a part of one.
+finders follow: the classic one, the sector-based one (SB) and SB with an exhaustive search, which
+take long where there is no board and are asked only when the first stages saw most of one.
 """
 
 from __future__ import annotations
@@ -39,8 +38,8 @@ _OPENCV_PIXELS = 1_300_000
 _SEEN_SHARE = 0.8
 """Least share of a grid's corners that must be seen; the others are looked for where they should be."""
 _MIN_SIDE_PX = 16
-_FRAGMENT = 0.4
-"""Share of the corners, in a grid with holes, from which on OpenCV's finders are asked too."""
+_FRAGMENT = 0.5
+"""Share of the board's corners, in a grid with holes, from which on OpenCV's finders are asked too."""
 
 
 @dataclass(frozen=True)
@@ -122,16 +121,22 @@ def lattice_stages(gray: GrayImage, columns: int, rows: int) -> list[Stage]:
             level = resized(gray, zoom)
             grids, fragments = [], False
             for lattice in find_lattices(find_saddles(level.image), least=max(4, columns * rows // 4)):
-                fits = sorted(lattice.points.shape[:2]) == sorted((rows, columns))
+                shape = lattice.points.shape[:2]
+                fits = sorted(shape) == sorted((rows, columns))
                 points = complete(lattice) if fits else None
                 if points is not None:
                     grids.append(level.to_picture(points))
-                fragments |= not lattice.seen.all() and int(lattice.seen.sum()) >= _FRAGMENT * columns * rows
+                within = all(a <= b for a, b in zip(sorted(shape), sorted((rows, columns)), strict=True))
+                share = int(lattice.seen.sum()) / (columns * rows)
+                fragments |= points is None and within and share >= _FRAGMENT
             return Found(grids, fragments)
 
         return Stage(f"saddles x{zoom:g}", search)
 
     return [stage(zoom) for zoom in lattice_levels(gray)]
+
+
+_Finder = Callable[[GrayImage, tuple[int, int]], FloatArray | None]
 
 
 def _classic(image: GrayImage, size: tuple[int, int]) -> FloatArray | None:
@@ -161,13 +166,10 @@ def fallback_stages(gray: GrayImage, columns: int, rows: int) -> list[Stage]:
         n += 1
     plain = 1.0 / n
     finders = (("classic", _classic), ("SB", _sector_based), ("SB exhaustive", _exhaustive))
-    zooms = [plain] + ([2.0] if gray.size < _ENLARGE_BELOW_PIXELS / 2 else [])
 
-    def stage(
-        name: str, finder: Callable[[GrayImage, tuple[int, int]], FloatArray | None], zoom: float
-    ) -> Stage:
+    def stage(name: str, finder: _Finder) -> Stage:
         def search() -> Found:
-            level = resized(gray, zoom)
+            level = resized(gray, plain)
             try:
                 corners = finder(level.image, (columns, rows))
             except cv2.error:
@@ -177,9 +179,9 @@ def fallback_stages(gray: GrayImage, columns: int, rows: int) -> list[Stage]:
                 return Found([])
             return Found([level.to_picture(_not_mirrored(corners.reshape(rows, columns, 2)))])
 
-        return Stage(f"{name} x{zoom:g}", search)
+        return Stage(f"{name} x{plain:g}", search)
 
-    return [stage(name, finder, zoom) for zoom in zooms for name, finder in finders]
+    return [stage(name, finder) for name, finder in finders]
 
 
 def _not_mirrored(grid: FloatArray) -> FloatArray:

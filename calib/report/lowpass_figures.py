@@ -139,7 +139,7 @@ def _poles(axes: Axes, section: LowPass) -> None:
     axes.set_ylim(-reach, reach)
     axes.set_xlabel("real part")
     axes.set_ylabel("imaginary part")
-    axes.set_title(f"Poles within {section.pole_radius:.4f} of 0; grey: limit of stability")
+    axes.set_title("Poles; grey: unit circle")
     axes.grid()
 
 

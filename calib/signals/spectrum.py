@@ -4,13 +4,13 @@ Motion of a heavy thing is slow, quantisation and tracking errors are spread ove
 the power density (Welch 1967) falls from the motion to a floor. Outliers are no jitter: samples beyond six
 standard deviations from the median of five (Hampel 1974) are replaced by it first. Of the segments'
 densities the mean holds motion however short it was, and the median P counts disturbances little.
-The motion ends at the last frequency f_m of the lower half of the band at which the mean is above three
+The motion ends at the last frequency f_m of the lower half of the band at which the mean is above six
 times its own floor. The jitter has the density
 
     N(f) = F below f_m (motion hides it there),   N(f) = P(f) above,
 
 with F the median of P over the upper half. A filter H leaves the jitter sigma^2 = sum of N |H|^2 df.
-Where motion reaches an eighth of the rate, F may be its tail and not the jitter's: the spectrum is then
+Where motion reaches a tenth of the rate, F may be its tail and not the jitter's: the spectrum is then
 called not flat, and a log at rest is needed.
 """
 
@@ -34,9 +34,11 @@ FEWEST = 64
 """Ticks below which nothing is said of a spectrum."""
 
 _SEGMENT_S = 8.0
-_FLOOR_TIMES = 3.0
+_FLOOR_TIMES = 6.0
+"""The pixel grid's sawtooth stands up to three times above the floor and is jitter."""
 _FLAT = 4.0
-_HIGHEST_MOTION = 0.125
+_HIGHEST_MOTION = 0.1
+"""Parts of the rate. A random walk, which has no floor, seems to end at 0.12."""
 _OUTLIER_SIGMAS = 6.0
 
 

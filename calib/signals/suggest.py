@@ -4,9 +4,8 @@ For every family and order the jitter behind the filter rises with the cut-off, 
 keeps it is found by bisection; of these filters the one with the least delay at zero frequency is
 suggested. In white jitter a filter of first order and every one with a single pair of poles have
 the same product of delay and noise bandwidth, 1/4, which sampling and a log's scatter part by some
-percent. So delays within 7 % count as equal: of those
-the one wins that changes the shape of the log's motion least (`calib.signals.spectrum.motion_lost`), and
-without motion the one of lowest order.
+percent. So delays within 7 % count as equal: of those the one wins that changes the shape of the log's
+motion least (`calib.signals.spectrum.motion_lost`), and without motion the one of lowest order.
 """
 
 from __future__ import annotations
@@ -27,6 +26,8 @@ _LOWEST = 1e-4
 """Lowest cut-off that is tried, in parts of the rate."""
 _HIGHEST = 0.45
 _SAME_SHAPE = 0.01
+_HALVINGS = 16
+"""Of the logarithm of the range: to 2 in ten thousand."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ def _candidate(spectra: Sequence[Spectrum], wanted: float, order: int, family: s
     if _worst(spectra, at(low)) > wanted:
         return None
     if _worst(spectra, at(high)) > wanted:
-        for _ in range(24):
+        for _ in range(_HALVINGS):
             middle = math.sqrt(low * high)
             if _worst(spectra, at(middle)) > wanted:
                 high = middle

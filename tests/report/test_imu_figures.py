@@ -29,7 +29,7 @@ def _log(
 
 
 def _several() -> Static:
-    return analyse_static([_log(f"static{k}.csv", seed=k) for k in range(3)])
+    return analyse_static([_log(f"static{k}.csv", seed=k) for k in range(2)])
 
 
 def _moved() -> Static:
@@ -46,7 +46,10 @@ def _one_axis() -> Static:
     return analyse_static([_log("gz.csv", ("gz",), n=200, onchip=False)])
 
 
-@pytest.mark.parametrize("result", [_several, _moved, _one_axis])
+_SLOW = [pytest.param(result, marks=pytest.mark.slow) for result in (_several, _moved)]
+
+
+@pytest.mark.parametrize("result", [*_SLOW, _one_axis])
 def test_every_word_can_be_read(result: object, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     assert callable(result)
     with kept(monkeypatch, imu_figures) as figures:
@@ -56,17 +59,12 @@ def test_every_word_can_be_read(result: object, monkeypatch: pytest.MonkeyPatch,
             assert any("poor" in text.get_text() for text in drawn_texts(figure))
 
 
+@pytest.mark.slow
 def test_files_repeat_and_hold_a_picture(tmp_path: Path) -> None:
-    result = _several()
+    result = analyse_static([_log("static.csv")])
     first = write_imu_figures(tmp_path / "a", result)
     names = [path.name for path in first]
-    assert names == [
-        "imu_allan.png",
-        "imu_drift.png",
-        "imu_static_1.png",
-        "imu_static_2.png",
-        "imu_static_3.png",
-    ]
+    assert names == ["imu_allan.png", "imu_drift.png", "imu_static_1.png"]
     for path, again in zip(first, write_imu_figures(tmp_path / "b", result), strict=True):
         assert path.read_bytes() == again.read_bytes()
         picture = cv2.imread(str(path))
@@ -82,6 +80,7 @@ def test_bounds_stand_for_what_is_not_shown(monkeypatch: pytest.MonkeyPatch, tmp
     with kept(monkeypatch, imu_figures) as figures:
         write_imu_figures(tmp_path, analyse_static([white]))
         words = "\n".join(text.get_text() for text in drawn_texts(figures["imu_allan.png"]))
-    assert "N 0.00010" in words or "N 9.9" in words or "N 0.0000" in words or "N 1.0" in words
+    # Readings of 1e-3 at 100 Hz have a density of 1e-4.
+    assert any(start in words for start in ("N 9.", "N 0.0001"))
     assert "B <" in words
     assert "K <" in words

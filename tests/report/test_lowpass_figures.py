@@ -28,6 +28,7 @@ def _positions(folder: Path, still: bool = False, n: int = 3000) -> Positions:
     return positions_from_log(folder / "log.csv", 60.0, None, None)
 
 
+@pytest.mark.slow
 def test_every_figure_is_written_and_the_bytes_repeat(tmp_path: Path) -> None:
     made, seen = design_lowpass(Design(1.0, 60.0, 2)), _positions(tmp_path)
     section = lowpass_section(made, WORKSPACE, seen)
@@ -42,6 +43,7 @@ def test_every_figure_is_written_and_the_bytes_repeat(tmp_path: Path) -> None:
     assert [path.name for path in alone] == ["lowpass_response.png"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("cutoff", "order", "family", "still"),
     [
@@ -81,7 +83,7 @@ def test_the_lines_are_the_filters(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert len(poles.collections[0].get_offsets()) == 2
     before, after = (line.get_data() for line in figures["lowpass_log.png"].axes[0].lines[:2])
     whole = filter_signal(made.sections, seen.ticks.longest.values[:, 0])
-    first = int(round(float(before[0][0]) * 60))
+    first = round(float(before[0][0]) * 60)
     np.testing.assert_allclose(after[1], whole[first : first + len(after[1])])
 
 

@@ -44,7 +44,7 @@ def test_at_rest_the_simplest_of_equals_and_in_motion_the_truest() -> None:
     rest, moving = suggest([REST], 0.1), suggest([MOVING], 0.1)
     assert rest.best.filter.design.order == 1
     assert moving.best.filter.design.order == 2
-    assert moving.best.delay_s == pytest.approx(rest.best.delay_s, rel=0.1)
+    assert moving.best.delay_s <= 1.07 * moving.candidates[0].delay_s
     single = next(one for one in moving.candidates if one.filter.design.order == 1)
     assert moving.best.motion_lost < 0.7 * single.motion_lost
 

@@ -1,0 +1,78 @@
+"""`calib firmware`: the header is written, marked where the calibration is poor, and always whole."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+
+import pytest
+
+
+def test_the_header(calib, rig) -> None:
+    ended = calib("firmware", "--rig", rig, "-o", rig.parent / "new" / "out")
+    path = rig.parent / "new" / "out" / "calib_constants.h"
+    assert (ended.code, ended.out) == (0, f"{path}: 21 constants\n")
+    text = path.read_text("ascii")
+    assert "#define CALIB_CAMERA_OK 1" in text
+    assert str(rig.parent) not in text
+    assert "input plane/board.yaml: " in text
+    if compiler := shutil.which("cc"):
+        subprocess.run([compiler, "-fsyntax-only", "-Wall", "-Werror", "-x", "c", str(path)], check=True)
+
+
+@pytest.mark.parametrize("which", ["camera", "plane", "both"])
+def test_a_poor_rig_is_written_and_marked(calib, rig, which: str) -> None:
+    text = rig.read_text()
+    head, tail = text[: text.index("\nplane:")], text[text.index("\nplane:") :]
+    if which != "plane":
+        head = head.replace("verdict: ok", "verdict: poor")
+        # The plane belongs to this camera all the same.
+        tail = tail[: tail.index("\nprovenance:")] + "\n"
+    if which != "camera":
+        tail = tail.replace("verdict: ok", "verdict: poor")
+    rig.write_text(head + tail)
+    ended = calib("firmware", "--rig", rig, "-o", rig.parent, "--json")
+    assert ended.code == 1
+    weak = ["camera", "plane"] if which == "both" else [which]
+    assert json.loads(ended.out)["gate"] == [f"{name} is poor" for name in weak]
+    text = (rig.parent / "calib_constants.h").read_text()
+    for name in ("camera", "plane"):
+        assert f"#define CALIB_{name.upper()}_OK {int(name not in weak)}" in text
+
+
+def test_a_camera_has_to_be_there_first(calib, tmp_path) -> None:
+    ended = calib("firmware", "--rig", tmp_path / "rig.yaml", "-o", tmp_path / "out")
+    assert ended.code == 3
+    assert "has no camera yet" in ended.sentence
+    assert not (tmp_path / "out").exists()
+
+
+def test_places_that_are_no_folder(calib, rig) -> None:
+    for place in (rig, rig / "out"):
+        ended = calib("firmware", "--rig", rig, "-o", place)
+        assert ended.code == 3
+        assert ended.sentence == f"{place}: cannot be made a folder: {rig} is a file"
+    (rig.parent / "out" / "calib_constants.h").mkdir(parents=True)
+    ended = calib("firmware", "--rig", rig, "-o", rig.parent / "out")
+    assert ended.code == 3
+    assert "calib_constants.h: is a folder, expected a file to write" in ended.sentence
+
+
+def test_a_rig_without_a_plane(calib, rig) -> None:
+    text = rig.read_text()
+    rig.write_text(text[: text.index("\nplane:")] + "\n")
+    ended = calib("firmware", "--rig", rig, "-o", rig.parent)
+    assert ended.code == 0
+    assert "12 constants, no plane yet (calib extrinsics)" in ended.out
+    assert "CALIB_PLANE" not in (rig.parent / "calib_constants.h").read_text()
+
+
+def test_a_number_that_no_float_holds(calib, rig) -> None:
+    text = rig.read_text()
+    text = text[: text.index("\nplane:")]
+    rig.write_text(text.replace("skew_px: 0.0", "skew_px: 1.0e-42") + "\n")
+    ended = calib("firmware", "--rig", rig, "-o", rig.parent / "out")
+    assert ended.code == 3
+    assert "CALIB_CAMERA_SKEW_PX is 1e-42, too small for a normal float" in ended.sentence
+    assert not (rig.parent / "out").exists()

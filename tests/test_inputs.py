@@ -1,0 +1,77 @@
+"""Views from tables: what is checked beyond the table's own form, and what is left as it was."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.errors import BadInputError, UsageError
+from calib.inputs import Told, read_views
+from synthetic import views_of
+
+SIZE = (640, 480)
+
+
+@pytest.fixture
+def table(tmp_path: Path):
+    def write(change=lambda x, y, u, v: (x, y, u, v)) -> Path:
+        rows = ["view,x_m,y_m,u_px,v_px"]
+        for view in views_of(3):
+            points = np.hstack([view.target_m, view.pixels]).tolist()
+            rows += [",".join([view.name, *map(repr, change(*point))]) for point in points]
+        path = tmp_path / "points.csv"
+        path.write_text("\n".join(rows))
+        return path
+
+    return write
+
+
+def test_a_table_is_taken_as_it_is(table) -> None:
+    found = read_views([table()], Told(image_size_px=SIZE))
+    assert found.image_size_px == SIZE
+    assert list(found.hashes) == ["points.csv"]
+    for view, truth in zip(found.views, views_of(3), strict=True):
+        np.testing.assert_array_equal(view.target_m, truth.target_m)
+        np.testing.assert_array_equal(view.pixels, truth.pixels)
+
+
+def test_a_distant_target_is_moved_to_its_origin(table) -> None:
+    path = table(lambda x, y, u, v: (x + 500.0, y - 300.0, u, v))
+    found = read_views([path], Told(image_size_px=SIZE))
+    moved = [view.target_m - truth.target_m for view, truth in zip(found.views, views_of(3), strict=True)]
+    # The same for all views, to what the table's digits hold of a millimetre at 500 m.
+    assert np.ptp(np.concatenate(moved), axis=0).max() < 1e-12
+    assert max(np.abs(view.target_m).max() for view in found.views) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda x, y, u, v: (x, y, u + 500, v), "points lie outside a picture of 640x480 px"),
+        (lambda x, y, u, v: (x, y, u, v - 480), "points lie outside a picture of 640x480 px"),
+        (lambda x, y, u, v: (x * 1e6, y, u, v), "its target lies 2e\\+05 m away, expected metres"),
+        (lambda x, y, u, v: (x * 1e-9, y * 1e-9, u, v), "its target measures 2e-10 m, expected metres"),
+    ],
+)
+def test_points_that_cannot_be(table, change, says: str) -> None:
+    with pytest.raises(BadInputError, match=says):
+        read_views([table(change)], Told(image_size_px=SIZE))
+
+
+def test_corners_at_the_very_border_are_inside(table) -> None:
+    path = table(lambda x, y, u, v: (x, y, min(max(u, -0.7), 639.7), v))
+    text = path.read_text().splitlines()
+    text[1] = ",".join([*text[1].split(",")[:3], "639.7", "-0.7"])
+    path.write_text("\n".join(text))
+    assert read_views([path], Told(image_size_px=SIZE)).views[0].pixels[0].tolist() == [639.7, -0.7]
+
+
+def test_what_does_not_go_together(table) -> None:
+    path = table()
+    for told in (Told(), Told(corners=(9, 6), image_size_px=SIZE), Told(square_m=0.02, image_size_px=SIZE)):
+        with pytest.raises(UsageError, match=r"points\.csv"):
+            read_views([path], told)
+    with pytest.raises(UsageError, match="given alone"):
+        read_views([path.parent, path], Told(image_size_px=SIZE))
