@@ -155,6 +155,8 @@ def projection_sigma_px(
     sigma = np.full(len(pixels), np.nan)
     if not np.all(np.isfinite(found.joint)):
         return np.where(seen, np.inf, np.nan)
+    if not seen.any():
+        return sigma
     J = joint_jacobian(calibration, points[seen])
     cov = J @ found.joint @ J.transpose(0, 2, 1)
     mean = 0.5 * (cov[:, 0, 0] + cov[:, 1, 1])

@@ -196,8 +196,8 @@ def calibrate_camera(
         if fit.rms_px < _HOPELESS * max(image_size_px):
             raise
         raise BadInputError(
-            f"no camera fits these views: the best leaves an RMS of {fit.rms_px:.0f} px; expected views of one "
-            "flat target, each point with its own pixel"
+            f"no camera fits these views: the best leaves an RMS of {fit.rms_px:.0f} px; expected views of "
+            "one flat target, each point with its own pixel"
         ) from error
     judged = time.perf_counter()
     seconds = {"solve": solved - began, "covariance": covered - solved, "judge": judged - covered}

@@ -99,14 +99,25 @@ def _finished(image: np.ndarray, rng: np.random.Generator) -> GrayImage:
     return np.clip(blurred + rng.normal(0, 2, blurred.shape), 0, 255).astype(np.uint8)
 
 
+@pytest.fixture
+def one_thread():
+    """OpenCV's finders on one thread, as `find_boards` runs them."""
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    yield
+    cv2.setNumThreads(threads)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__.strip("_"))
-def test_no_board_is_found_where_there_is_none(kind) -> None:
+def test_no_board_is_found_where_there_is_none(kind, one_thread) -> None:
     found = []
     for seed in range(20):
         rng = np.random.default_rng(seed)
         gray = _finished(kind(rng), rng)
-        found += [(seed, size) for size in ((7, 5), (9, 6)) if detect(gray, *size) is not None]
-        if kind not in (_cut_board,):
+        size = ((7, 5), (9, 6))[seed % 2]
+        found += [(seed, size)] if detect(gray, *size) is not None else []
+        # What is left of a cut board can be a whole board of fewer squares.
+        if kind is not _cut_board and seed % 4 == 0:
             found += [(seed, "any")] if find_size(gray) is not None else []
     assert found == []
