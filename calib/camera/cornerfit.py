@@ -229,7 +229,7 @@ def _model(q: _Float32, win: _Windows) -> tuple[_Float32, _Float32]:
     if np.any(full):
         J *= ~full[:, None, :]
         shown = np.clip(shown, 0.0, _WHITE)
-    return win.grey * win.weight - shown, J
+    return (win.grey * win.weight - shown).astype(np.float32, copy=False), J
 
 
 def _start(points: FloatArray, frames: Frames, win: _Windows) -> FloatArray:

@@ -76,7 +76,8 @@ def _links(saddles: Saddles) -> IntArray:
         return links
     angles, parity = _ports(saddles)
     k = min(_NEIGHBOURS + 1, N)
-    distance, other = cKDTree(saddles.points).query(saddles.points, k)
+    found = cKDTree(saddles.points).query(saddles.points, k)
+    distance, other = np.asarray(found[0], dtype=np.float64), np.asarray(found[1], dtype=np.int64)
     a = np.repeat(np.arange(N), k - 1)
     b, d = other[:, 1:].ravel(), distance[:, 1:].ravel()
     keep = (d > _LEAST_EDGE_PX) & (a != b)

@@ -44,7 +44,7 @@ def canonical_turn(points: FloatArray, colours: FloatArray, columns: int, rows: 
         return None
     i, j = np.indices((rows, columns))
     parity = 1.0 - 2.0 * ((i + j) % 2)
-    # Outward of corner (0, 0) is the colour of the square diagonally opposite, between growing column and row.
+    # Outward of corner (0, 0) is the colour of the square across it, between growing column and row.
     bright = {k: float(np.sum(np.sign(turned_colours(colours, k)) * parity)) > 0 for k in turns}
     if len(set(bright.values())) == 2:
         turns = [k for k in turns if not bright[k]]

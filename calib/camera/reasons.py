@@ -235,7 +235,8 @@ def of_split(found: Split | None, in_order: bool, calibration: Calibration, limi
     if not telling:
         text = (
             f"{listed([names[i] for i in second], 20)} would have a camera of their own {sure}, but no focal "
-            f"length or centre that differs for certain by {100 * limits.split_least:.1f} %, which would matter."
+            f"length or centre that differs for certain by {100 * limits.split_least:.1f} %, which would "
+            "matter."
         )
         return [Finding(REMARK, text)]
     if in_order:

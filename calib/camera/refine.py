@@ -243,8 +243,8 @@ def _rescued(part: Part, fit: LocalFit) -> tuple[LocalFit, BoolArray, Prediction
     beside = extrapolated(fit.points.reshape(*part.shape, 2))[1:-1, 1:-1].reshape(-1, 2)
     nearest = np.fmin(check.away, np.linalg.norm(fit.points - beside, axis=1))
     good &= np.where(clean, nearest < check.far, check.away < check.bound)
-    prediction = predict(fit.points.reshape(*part.shape, 2), good.reshape(part.shape), part.lens)
-    return None if prediction is None else (fit, good, prediction)
+    last = predict(fit.points.reshape(*part.shape, 2), good.reshape(part.shape), part.lens)
+    return None if last is None else (fit, good, last)
 
 
 def refine(gray: GrayImage, points: FloatArray) -> Refined | None:

@@ -123,11 +123,9 @@ def find_saddles(gray: GrayImage | _Float32) -> Saddles:
     ----------
     gray : (H, W) grey levels.
     """
-    smooth = np.asarray(
-        cv2.GaussianBlur(
-            np.asarray(gray, dtype=np.float32), (0, 0), _BLUR_PX, borderType=cv2.BORDER_REPLICATE
-        )
-    )
+    smooth = cv2.GaussianBlur(
+        np.asarray(gray, dtype=np.float32), (0, 0), _BLUR_PX, borderType=cv2.BORDER_REPLICATE
+    ).astype(np.float32, copy=False)
     points = _extrema(smooth)
     angle = np.arange(_RING_POINTS) * (2 * np.pi / _RING_POINTS)
     ring = sample(smooth, points[:, None] + _RING_PX * np.stack([np.cos(angle), np.sin(angle)], axis=1))
