@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -190,8 +191,11 @@ def test_an_unwritable_place_is_named(tmp_path: Path, write) -> None:
         write_log(tmp_path / "nowhere" / "log.csv", log)
 
 
-@pytest.mark.skipif(importlib.util.find_spec("pyarrow") is not None, reason="pyarrow is installed")
-def test_parquet_without_its_extra_says_what_to_install(tmp_path: Path, write) -> None:
+def test_parquet_without_its_extra_says_what_to_install(
+    tmp_path: Path, write, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
     with pytest.raises(BadInputError, match="install the extra logs"):
         write_log(tmp_path / "log.parquet", read_log(write(SMALL)))
     with pytest.raises(BadInputError, match="install the extra logs"):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +14,7 @@ from calib.camera.lattice import extrapolated, looks_like_corners
 from calib.camera.refine import Refined, misshape, part_around, square_px
 from calib.camera.saddles import sample
 
-__all__ = ["continuing_sides", "fault_of"]
+__all__ = ["Surroundings", "fault_of", "surroundings"]
 
 _UNREFINED_SHARE = 0.1
 _MISFIT = 0.08
@@ -24,8 +26,11 @@ _CONTINUES = 0.4
 """Least amplitude of a further corner over the median of the grid."""
 _WORST_RESIDUAL = 0.3
 _REACH_PX = 10
+_ITERATIONS = 8
 _UNEVEN_SHARE = 0.4
 """Largest share of squares that a shadow's edge may cross."""
+_LEAST_STEP = 0.38
+"""Least step between neighbouring squares over the step at the corners."""
 _FLAT = 0.6
 """Largest difference between the quarters of a square, over the step from dark to bright."""
 
@@ -59,7 +64,7 @@ def _squares_are_plain(smooth: _Float32, grid: Refined) -> bool:
         # Each square against the neighbours that share a side with it, which have the other colour.
         signed = np.where(bright, tone, -tone)
         across, down = signed[:, 1:] + signed[:, :-1], signed[1:] + signed[:-1]
-        if min(across.min(initial=np.inf), down.min(initial=np.inf)) < 0.3 * float(local.min()):
+        if min(across.min(initial=np.inf), down.min(initial=np.inf)) < _LEAST_STEP * float(local.min()):
             return False
     uneven = quarters.max(axis=0) - quarters.min(axis=0)
     return bool(np.mean(uneven > _FLAT * np.maximum(local, 0.25 * step)) < _UNEVEN_SHARE)
@@ -91,11 +96,26 @@ def _smoothed(gray: GrayImage, square: float) -> _Float32:
     return np.asarray(cv2.blur(gray.astype(np.float32), (3, 3)) if square > 12.0 else gray.astype(np.float32))
 
 
-def continuing_sides(gray: GrayImage, grid: Refined) -> tuple[bool, bool, bool, bool]:
-    """On which sides another row of corners follows: top, bottom, left, right of the grid's arrays.
+@dataclass(frozen=True)
+class Surroundings:
+    """What is beyond the four sides of a grid's arrays: top, bottom, left, right.
+
+    Attributes
+    ----------
+    continues : whether another row of corners follows.
+    seen : whether the picture shows where that row would be.
+    """
+
+    continues: tuple[bool, bool, bool, bool]
+    seen: tuple[bool, bool, bool, bool]
+
+
+def surroundings(gray: GrayImage, grid: Refined) -> Surroundings:
+    """Look for another row of corners on each side.
 
     A part of a larger board is not the board: which part it is cannot be told.
     """
+    nothing = (False, False, False, False)
     place = extrapolated(grid.points)
     place[1:-1, 1:-1] = grid.points
     for v, v1 in ((0, 1), (-1, -2)):
@@ -103,7 +123,7 @@ def continuing_sides(gray: GrayImage, grid: Refined) -> tuple[bool, bool, bool, 
             place[v, u] = place[v, u1] + place[v1, u] - place[v1, u1]
     part = part_around(gray, place)
     if part is None:
-        return False, False, False, False
+        return Surroundings(nothing, nothing)
     image, local = part.image, part.points
     frames = frames_of(local)
     rows, columns = local.shape[:2]
@@ -120,14 +140,15 @@ def continuing_sides(gray: GrayImage, grid: Refined) -> tuple[bool, bool, bool, 
     chosen = np.flatnonzero((inside & (parity * half_step > 0.5 * least) & (unlike < 1.0)).ravel())
     found: BoolArray = np.zeros(rows * columns, dtype=np.bool_)
     if len(chosen):
-        fit = fit_corners(image, local.reshape(-1, 2)[chosen], frames.take(chosen), reach_px=_REACH_PX)
+        fit = fit_corners(image, local.reshape(-1, 2)[chosen], frames.take(chosen), _ITERATIONS, _REACH_PX)
         square = np.minimum(np.linalg.norm(frames.along, axis=1), np.linalg.norm(frames.across, axis=1))
         near = np.linalg.norm(fit.points - local.reshape(-1, 2)[chosen], axis=1) < 0.3 * square[chosen]
         strong = parity.ravel()[chosen] * fit.amplitude > least
         found[chosen] = fit.converged & near & strong & (misshape(fit, part.noise) < _WORST_RESIDUAL)
-    hit, seen = found.reshape(rows, columns), inside
-    sides = []
-    for line in (np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1]):
-        count = int(seen[line].sum())
-        sides.append(count >= 2 and bool(hit[line].sum() >= max(2, 0.5 * count)))
-    return sides[0], sides[1], sides[2], sides[3]
+    hit = found.reshape(rows, columns)
+    lines = (np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1])
+    count = [int(inside[line].sum()) for line in lines]
+    hits = [int(hit[line].sum()) for line in lines]
+    top, bottom, left, right = (n >= 2 and h >= max(2, 0.5 * n) for h, n in zip(hits, count, strict=True))
+    above, below, before, after = (n >= 2 for n in count)
+    return Surroundings((top, bottom, left, right), (above, below, before, after))

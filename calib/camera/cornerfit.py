@@ -28,18 +28,19 @@ import numpy.typing as npt
 
 from calib.arrays import BoolArray, FloatArray, IntArray
 
-__all__ = ["Frames", "LocalFit", "fit_corners", "frames_of"]
+__all__ = ["WINDOW", "Frames", "LocalFit", "fit_corners", "frames_of"]
 
 WINDOW = 0.45
 """Half the window's width over the local square: the next corner must not come in."""
 REACH_PX = 16
 _LEAST_REACH_PX = 2.5
-_ITERATIONS = 25
+_ITERATIONS = 16
 _STEP_PX = 1e-3
 _STEP_SIGMA = 0.05
 _WHITE = np.float32(255.0)
 _NOISE, _LEAST_NOISE = 0.04, 1.0
 _LEAST_BEND_SIGMA = 1e-6
+_WARM_RESIDUAL = 0.3
 _START_WIDTH_PX = 1.2
 _WIDTH_PX = (0.3, 12.0)
 _PARAMETERS = 11
@@ -83,6 +84,8 @@ class LocalFit:
         column and growing row is bright, grey levels.
     residual : (N,) RMS of the fit over |amplitude|.
     width_px : (N,) sqrt(2) times the standard deviation of the blur.
+    window : (N,) half the width of the window over the local square.
+    parameters : (N, 11) as the fit holds them, to start another one.
     converged : (N,) whether the last step was small and the window held enough of the corner.
     """
 
@@ -91,6 +94,8 @@ class LocalFit:
     amplitude: FloatArray
     residual: FloatArray
     width_px: FloatArray
+    window: FloatArray
+    parameters: FloatArray
     converged: BoolArray
 
 
@@ -258,6 +263,7 @@ def fit_corners(
     iterations: int = _ITERATIONS,
     reach_px: int = REACH_PX,
     window: float = WINDOW,
+    warm: LocalFit | None = None,
 ) -> LocalFit:
     """Fit the blurred corner around each of N points.
 
@@ -268,10 +274,14 @@ def fit_corners(
     frames : steps and curvatures of the grid at the N points.
     reach_px : most pixels that a window reaches to each side of its corner.
     window : half the width of a window over the local square.
+    warm : an earlier fit of the same corners, whose other parameters are taken for a start.
     """
     N = len(points)
     win = _windows(image, points, frames, window, reach_px)
     q = _start(points, frames, win)
+    if warm is not None:
+        kept = warm.residual < _WARM_RESIDUAL
+        q[kept, 2:9] = warm.parameters[kept, 2:9]
     freedom = np.maximum(win.weight.sum(axis=1).astype(np.float64) - _PARAMETERS, 1.0)
     damping, converged = np.full(N, 1e-3), np.zeros(N, dtype=bool)
     # Weight of the curvatures' own observation, for residuals of the size that the fit will leave.
@@ -307,7 +317,7 @@ def fit_corners(
         active = active[~converged[active]]
         if len(active) == 0:
             break
-    return _result(q, win, normal, cost, freedom, converged)
+    return _result(q, win, window, normal, cost, freedom, converged)
 
 
 def _equations(
@@ -327,6 +337,7 @@ def _equations(
 def _result(
     q: FloatArray,
     win: _Windows,
+    window: float,
     normal: FloatArray,
     cost: FloatArray,
     freedom: FloatArray,
@@ -346,5 +357,7 @@ def _result(
         amplitude=amplitude,
         residual=residual,
         width_px=q[:, 4],
+        window=np.full(len(q), window),
+        parameters=q,
         converged=converged & finite & (freedom > _PARAMETERS),
     )

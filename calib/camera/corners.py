@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.arrays import BoolArray, FloatArray, GrayImage
-from calib.camera.boardcheck import continuing_sides, fault_of
+from calib.camera.boardcheck import fault_of, surroundings
 from calib.camera.ordering import canonical_turn, orderings
 from calib.camera.refine import Refined, refine, square_px
 from calib.camera.search import fallback_stages, lattice_stages
@@ -86,7 +86,7 @@ def _best_of(gray: GrayImage, grids: Sequence[FloatArray]) -> Refined | None:
     best: Refined | None = None
     for points in grids:
         grid = refine(gray, points)
-        if grid is None or fault_of(gray, grid) is not None or any(continuing_sides(gray, grid)):
+        if grid is None or fault_of(gray, grid) is not None or any(surroundings(gray, grid).continues):
             continue
         if best is None or square_px(grid.points) > square_px(best.points):
             best = grid

@@ -109,7 +109,7 @@ class Limits:
     repeated_remark: float = 1.6
     repeat_share: float = 0.5
     decrement: float = 2.0
-    split_ratio: float = 1.4
+    split_ratio: float = 1.5
     change_ratio: float = 1.3
     split_sigma: float = 4.0
     split_least: float = 0.007

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calib.arrays import BoolArray, FloatArray, GrayImage, IntArray
-from calib.camera.cornerfit import Frames, LocalFit, fit_corners, frames_of
+from calib.camera.cornerfit import WINDOW, Frames, LocalFit, fit_corners, frames_of
 from calib.camera.gridmodel import Lens, Prediction, predict
 from calib.camera.lattice import extrapolated
 
@@ -59,6 +59,7 @@ class Refined:
     amplitude : half the step from dark to bright, positive where the square between growing column
         and growing row is bright, grey levels.
     residual : RMS of the fit over |amplitude|, without the share of the noise.
+    narrow : whether a corner had to be fitted with a smaller window than usual.
     refined : False where a corner could not be measured and its predicted place is given.
     misfit_px : typical distance of a corner from where the others place it.
     """
@@ -67,6 +68,7 @@ class Refined:
     sigma_px: FloatArray
     amplitude: FloatArray
     residual: FloatArray
+    narrow: BoolArray
     refined: BoolArray
     misfit_px: float
 
@@ -274,8 +276,9 @@ def refine(gray: GrayImage, points: FloatArray) -> Refined | None:
     away = np.linalg.norm(first.points - rough.points.reshape(-1, 2), axis=1)
     stays = sound & (away < rough.limit_px.ravel())
     moved = np.where(stays[:, None], first.points, rough.points.reshape(-1, 2)).reshape(start.shape)
+    fit = first
     for _ in range(_PASSES):
-        fit = fit_corners(part.image, moved.reshape(-1, 2), frames_of(moved))
+        fit = fit_corners(part.image, moved.reshape(-1, 2), frames_of(moved), warm=fit)
         before, moved = (
             moved,
             np.where(_sound(part, fit)[:, None], fit.points, moved.reshape(-1, 2)).reshape(start.shape),
@@ -295,6 +298,7 @@ def refine(gray: GrayImage, points: FloatArray) -> Refined | None:
         sigma_px=part.k * np.where(good, fit.sigma_px, unknown).reshape(shape),
         amplitude=fit.amplitude.reshape(shape),
         residual=misshape(fit, part.noise).reshape(shape),
+        narrow=(fit.window < WINDOW).reshape(shape),
         refined=good.reshape(shape),
         misfit_px=part.k * prediction.spread_px,
     )

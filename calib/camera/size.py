@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 
 from calib.arrays import FloatArray, GrayImage
-from calib.camera.boardcheck import continuing_sides, fault_of
+from calib.camera.boardcheck import fault_of, surroundings
 from calib.camera.lattice import extrapolated, find_lattices
-from calib.camera.refine import Refined, refine
+from calib.camera.refine import Refined, refine, square_px
 from calib.camera.saddles import find_saddles
 from calib.camera.search import complete, lattice_levels, resized
 
@@ -19,21 +19,31 @@ __all__ = ["board_size", "board_sizes"]
 
 _LEAST_CORNERS = 9
 _ROUNDS = 12
+_NARROW = 0.65
+"""Largest share of corners that only a small window can fit, in a board that nobody asked for."""
+_MISFIT = 0.04
+"""Largest misfit, in squares, of a board that nobody asked for."""
 _LATTICES = 3
 _OPENCV_PIXELS = 1_300_000
 
 
 def _whole(gray: GrayImage, points: FloatArray) -> Refined | None:
-    """Refine a grid and add the rows that follow it, until there are none; None when it is no board."""
+    """Refine a grid and add the rows that follow it, until there are none; None when it is no board.
+
+    A pattern that leaves the picture on every side has no size.
+    """
     for _ in range(_ROUNDS):
         if min(points.shape[:2]) < 3:
             return None
         grid = refine(gray, points)
         if grid is None or fault_of(gray, grid) is not None:
             return None
-        top, bottom, left, right = continuing_sides(gray, grid)
-        if not (top or bottom or left or right):
-            return grid
+        around = surroundings(gray, grid)
+        top, bottom, left, right = around.continues
+        if not any(around.continues):
+            sure = grid.refined.all() and grid.narrow.mean() < _NARROW
+            sure &= grid.misfit_px < _MISFIT * square_px(grid.points)
+            return grid if sure and any(around.seen) else None
         wide = extrapolated(grid.points)
         wide[1:-1, 1:-1] = grid.points
         for v, v1 in ((0, 1), (-1, -2)):

@@ -41,7 +41,7 @@ FOCAL_STARTS = (0.4, 0.7, 1.1, 1.8, 4.0)
 _CHI2_95 = 3.84
 _MAX_ITERATIONS = 60
 _MAX_VIEWS = 60
-_NEARLY = 1.05
+_NEARLY = 1.02
 """Cost of five coefficients over that of the rational model below which they do."""
 
 

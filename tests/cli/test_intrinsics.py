@@ -239,6 +239,23 @@ def test_points_without_noise_come_to_an_end(calib, tmp_path) -> None:
     assert _camera(rig)["fx_px"] == pytest.approx(600.0, rel=1e-6)
 
 
+@pytest.mark.parametrize("model", ["pinhole", "radial2", "rational8"])
+def test_points_that_belong_to_no_camera(calib, table_text, tmp_path, model: str) -> None:
+    rng = np.random.default_rng(0)
+    rows = [line.split(",")[:3] for line in table_text.splitlines()[1:]][:108]
+    pixels = rng.uniform(0, 400, (len(rows), 2)).tolist()
+    file, rig = tmp_path / "points.csv", tmp_path / "rig.yaml"
+    lines = [",".join([*row, repr(u), repr(v)]) for row, (u, v) in zip(rows, pixels, strict=True)]
+    file.write_text("view,x_m,y_m,u_px,v_px\n" + "\n".join(lines))
+    ended = calib("intrinsics", file, *SIZE, "--model", model, "--rig", rig)
+    if ended.code == 3:
+        assert ended.sentence.startswith(("no camera fits these views", "no useful answer follows"))
+        assert not rig.exists()
+    else:
+        assert ended.code == 1
+        assert _camera(rig)["verdict"] != "ok"
+
+
 @pytest.mark.slow
 def test_a_table_of_many_rows_is_read_with_little_memory(tmp_path) -> None:
     import tracemalloc
