@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor, wait
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated
 
-import cv2
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from calib.arrays import GrayImage
@@ -21,6 +18,7 @@ from calib.errors import BadInputError
 from calib.files import read_yaml_mapping, shown
 from calib.pictures import Picture, read_picture, same_size
 from calib.rig import hash_of, validation_sentence
+from calib.workers import Workers
 
 __all__ = [
     "BOARD_FILE",
@@ -28,7 +26,6 @@ __all__ = [
     "BoardSearch",
     "board_of",
     "find_boards",
-    "processors",
     "read_board_file",
 ]
 
@@ -40,13 +37,9 @@ Position = Annotated[list[Place], Field(min_length=2, max_length=2)]
 Pixel = Annotated[list[Number], Field(min_length=2, max_length=2)]
 Angle = Annotated[float, Field(ge=-6.2832, le=6.2832, allow_inf_nan=False, strict=True)]
 
-S = TypeVar("S")
-T = TypeVar("T")
-
 BOARD_FILE = "board.yaml"
 _SIZE_SAMPLE = 5
 """Pictures that are asked for the size of an unknown board."""
-_LOOK_UP_S = 0.2
 _KEPT_PIXELS = 250_000_000
 """Pixels that are kept in memory; further pictures are read twice."""
 
@@ -143,39 +136,63 @@ def find_boards(
     BadInputError : a picture that cannot be read, pictures of several sizes, or no board in any; when
         another board is there the message says which.
     """
-    workers = max(1, min(len(paths), processors()))
-    # One picture for each thread; OpenCV's own threads would only get in each other's way.
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    pool = ThreadPoolExecutor(workers)
-    try:
-        return _Search(pool, paths, square_m, progress).run(corners, image_size_px)
-    finally:
-        # After an error or Ctrl-C nobody waits for the pictures still being searched.
-        pool.shutdown(wait=False, cancel_futures=True)
-        cv2.setNumThreads(threads)
+    pictures = _read(paths)
+    with Workers(_Album(paths, pictures), len(paths)) as workers:
+        return _Search(workers, pictures, square_m, progress).run(corners, image_size_px)
 
 
-def processors() -> int:
-    """How many processors this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+def _read(paths: Sequence[Path]) -> list[Picture]:
+    """All pictures; the pixels only of as many as memory surely has room for."""
+    kept, pictures = 0, []
+    with Workers(None, len(paths), large=True) as workers:
+        for picture in workers.in_order(_picture, paths):
+            kept += picture.gray.size
+            pictures.append(picture if kept <= _KEPT_PIXELS else picture.without_pixels())
+    return pictures
+
+
+def _picture(_: None, path: Path) -> Picture:
+    return read_picture(path)
+
+
+@dataclass(frozen=True)
+class _Album:
+    """Pictures that workers look into, and where to find those that are not in memory."""
+
+    paths: Sequence[Path]
+    pictures: Sequence[Picture]
+
+    def gray(self, i: int) -> GrayImage:
+        if self.pictures[i].gray.size:
+            return self.pictures[i].gray
+        again = read_picture(self.paths[i])
+        if again.sha256 != self.pictures[i].sha256:
+            raise BadInputError(f"{self.pictures[i].name}: has changed since the work began")
+        return again.gray
+
+
+def _detection(album: _Album, what: tuple[int, tuple[int, int]]) -> Detection | None:
+    i, corners = what
+    return detect(album.gray(i), *corners)
+
+
+def _size(album: _Album, i: int) -> tuple[int, int] | None:
+    return find_size(album.gray(i))
 
 
 @dataclass
 class _Search:
     """The work of `find_boards`."""
 
-    pool: Executor
-    paths: Sequence[Path]
+    workers: Workers[_Album]
+    pictures: Sequence[Picture]
     square_m: float
     progress: Callable[[int, int], None]
     done: int = 0
     sizes: dict[int, tuple[int, int] | None] = field(default_factory=dict)
 
     def run(self, corners: tuple[int, int] | None, expected_px: tuple[int, int] | None) -> BoardSearch:
-        pictures = self._pictures()
+        pictures = self.pictures
         size_px = same_size(pictures)
         if expected_px is not None and size_px != expected_px:
             raise BadInputError(
@@ -184,19 +201,19 @@ class _Search:
             )
         count = len(pictures)
         sample = list(range(0, count, max(1, count // _SIZE_SAMPLE)))
-        wanted = corners or self._common_size(pictures, sample) or self._common_size(pictures, range(count))
+        wanted = corners or self._common_size(sample) or self._common_size(range(count))
         if wanted is None:
             raise BadInputError(f"{_names(pictures)}: no checkerboard found in {_count(count)}")
         found: dict[int, Detection | None] = {}
         # A wrong size is known after a few pictures; looking for it in all of them would take long.
         for part, share in ((sample[:2], 1.0), (sample[2:], 0.5)):
-            found |= self._detect(pictures, part, wanted)
-            other = None if any(found.values()) else self._common_size(pictures, sample, share)
+            found |= self._detect(part, wanted)
+            other = None if any(found.values()) else self._common_size(sample, share)
             if other is not None and sorted(other) != sorted(wanted):
                 raise BadInputError(_not_found(pictures, wanted, other))
-        found |= self._detect(pictures, [i for i in range(count) if i not in found], wanted)
+        found |= self._detect([i for i in range(count) if i not in found], wanted)
         if not any(found.values()):
-            raise BadInputError(_not_found(pictures, wanted, self._common_size(pictures, sample)))
+            raise BadInputError(_not_found(pictures, wanted, self._common_size(sample)))
         board = Board(*wanted, self.square_m)
         target = board.points_m()
         seen = [(picture, detection) for i, picture in enumerate(pictures) if (detection := found[i])]
@@ -209,60 +226,26 @@ class _Search:
             hashes={picture.name: picture.sha256 for picture in pictures},
         )
 
-    def _pictures(self) -> list[Picture]:
-        """All pictures; the pixels only of as many as memory surely has room for."""
-        kept, pictures = 0, []
-        for picture in _in_order(self.pool, read_picture, self.paths):
-            kept += picture.gray.size
-            pictures.append(picture if kept <= _KEPT_PIXELS else picture.without_pixels())
-        return pictures
-
-    def _gray(self, pictures: Sequence[Picture], i: int) -> GrayImage:
-        if pictures[i].gray.size:
-            return pictures[i].gray
-        again = read_picture(self.paths[i])
-        if again.sha256 != pictures[i].sha256:
-            raise BadInputError(f"{pictures[i].name}: has changed since the work began")
-        return again.gray
-
-    def _detect(
-        self, pictures: Sequence[Picture], which: Sequence[int], corners: tuple[int, int]
-    ) -> dict[int, Detection | None]:
+    def _detect(self, which: Sequence[int], corners: tuple[int, int]) -> dict[int, Detection | None]:
         found: dict[int, Detection | None] = {}
-        detections = _in_order(self.pool, lambda i: detect(self._gray(pictures, i), *corners), which)
+        detections = self.workers.in_order(_detection, [(i, corners) for i in which])
         for i, detection in zip(which, detections, strict=True):
             found[i] = detection
             self.done += 1
-            self.progress(self.done, len(pictures))
+            self.progress(self.done, len(self.pictures))
         return found
 
-    def _common_size(
-        self, pictures: Sequence[Picture], which: Sequence[int], share: float = 0.0
-    ) -> tuple[int, int] | None:
+    def _common_size(self, which: Sequence[int], share: float = 0.0) -> tuple[int, int] | None:
         """The size of board that most of these pictures show, if a share of them does; the larger in a tie.
 
         Seen upright and lying, a board counts the same.
         """
         new = [i for i in which if i not in self.sizes]
-        sizes = _in_order(self.pool, lambda i: find_size(self._gray(pictures, i)), new)
+        sizes = self.workers.in_order(_size, new)
         self.sizes |= zip(new, sizes, strict=True)
         counts = Counter((max(s), min(s)) for i in which if (s := self.sizes[i]) is not None)
         most = max(counts, key=lambda s: (counts[s], s[0] * s[1]), default=None)
         return None if most is None or counts[most] < share * len(which) else most
-
-
-def _in_order(pool: Executor, work: Callable[[S], T], items: Iterable[S]) -> Iterator[T]:
-    """Results of `work` in the order of the items.
-
-    The wait is a short one, again and again: Ctrl-C that comes just before a long one is answered only
-    at its end.
-    """
-    futures = [pool.submit(work, item) for item in items]
-    futures.reverse()
-    while futures:
-        while not wait([futures[-1]], timeout=_LOOK_UP_S).done:
-            pass
-        yield futures.pop().result()
 
 
 def _not_found(pictures: Sequence[Picture], wanted: tuple[int, int], other: tuple[int, int] | None) -> str:

@@ -1,7 +1,7 @@
 /*
  * calib_constants.h - constants of one rig, written by calib 0.1.0. Do not edit.
  *
- * SHA-256 of the values: 613ad9424bfe9bd6b42b55850d3644115a66e5bcc77047c377244528b68a5e98
+ * SHA-256 of the values: 31777472957751c12e0ff992f6a72408378ddcf509593e4ad4c12d6041b90cec
  * input camera/board.yaml: f77bc61378d4ff28baac9883646ca1bf8dc43576acf495b4800377effe06e39b
  * input camera/view01.png: a8a5d43cd237c318df2372ece67ce52fa2a09171cff9447bb68af2394a832c30
  * input camera/view02.png: 74159ff201b50cc6f7316fa06817c34155aa126f4f03cb7415b51f5489fcb730
@@ -43,20 +43,20 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x613AD942UL
+#define CALIB_ID 0x31777472UL
 
 #define CALIB_IMAGE_WIDTH_PX 316
 #define CALIB_IMAGE_HEIGHT_PX 208
 #define CALIB_CAMERA_OK 1 /* 0: the calibration failed its gate */
 
 /* Camera (2.5) and lens (B.1). */
-#define CALIB_CAMERA_FX_PX 273.410095f /* focal length along u, px; sigma_mu of (2.5) */
-#define CALIB_CAMERA_FY_PX 272.604462f /* focal length along v, px; sigma_nu of (2.5) */
+#define CALIB_CAMERA_FX_PX 273.409546f /* focal length along u, px; sigma_mu of (2.5) */
+#define CALIB_CAMERA_FY_PX 272.603973f /* focal length along v, px; sigma_nu of (2.5) */
 #define CALIB_CAMERA_SKEW_PX 0.0f /* skew, px; gamma of (2.5) */
-#define CALIB_CAMERA_CX_PX 160.669815f /* principal point, px from the centre of the left column; mu_0 of (2.5) */
-#define CALIB_CAMERA_CY_PX 101.869499f /* principal point, px from the centre of the top row; nu_0 of (2.5) */
-#define CALIB_CAMERA_K1 -0.220021829f /* lens, dimensionless, OpenCV's order and signs */
-#define CALIB_CAMERA_K2 0.549367309f /* lens, dimensionless, OpenCV's order and signs */
+#define CALIB_CAMERA_CX_PX 160.670013f /* principal point, px from the centre of the left column; mu_0 of (2.5) */
+#define CALIB_CAMERA_CY_PX 101.869606f /* principal point, px from the centre of the top row; nu_0 of (2.5) */
+#define CALIB_CAMERA_K1 -0.220018402f /* lens, dimensionless, OpenCV's order and signs */
+#define CALIB_CAMERA_K2 0.549356937f /* lens, dimensionless, OpenCV's order and signs */
 
 /*
  * Inverse lens, normalised coordinates: yd = (v - cy) / fy, xd = (u - cx - skew yd) / fx, then
@@ -65,23 +65,23 @@
  */
 #define CALIB_LENS_INVERSE_ORDER 5
 #define CALIB_LENS_DECENTERING_STEPS 0
-#define CALIB_LENS_INVERSE_C1 0.217690438f /* coefficient of r2^1, dimensionless */
-#define CALIB_LENS_INVERSE_C2 -0.333743751f /* coefficient of r2^2, dimensionless */
-#define CALIB_LENS_INVERSE_C3 -1.56928301f /* coefficient of r2^3, dimensionless */
-#define CALIB_LENS_INVERSE_C4 3.43676472f /* coefficient of r2^4, dimensionless */
-#define CALIB_LENS_INVERSE_C5 -2.06404114f /* coefficient of r2^5, dimensionless */
+#define CALIB_LENS_INVERSE_C1 0.217687085f /* coefficient of r2^1, dimensionless */
+#define CALIB_LENS_INVERSE_C2 -0.333740503f /* coefficient of r2^2, dimensionless */
+#define CALIB_LENS_INVERSE_C3 -1.56922519f /* coefficient of r2^3, dimensionless */
+#define CALIB_LENS_INVERSE_C4 3.4366219f /* coefficient of r2^4, dimensionless */
+#define CALIB_LENS_INVERSE_C5 -2.06394172f /* coefficient of r2^5, dimensionless */
 
 /* Plane of the actuator. */
 #define CALIB_HAS_PLANE 1
 #define CALIB_PLANE_OK 1 /* 0: the plane failed its gate */
-#define CALIB_PLANE_INVERSE_11 0.00365898339f /* entry of A^-1, undistorted px to m; (2.11), the last row gives 1/s of (2.12) */
-#define CALIB_PLANE_INVERSE_12 -8.8427907e-05f /* entry of A^-1, undistorted px to m; (2.11), the last row gives 1/s of (2.12) */
-#define CALIB_PLANE_INVERSE_13 -0.599109948f /* entry of A^-1, undistorted px to m; (2.11), the last row gives 1/s of (2.12) */
-#define CALIB_PLANE_INVERSE_21 7.93003419e-05f /* entry of A^-1, undistorted px to m; (2.11), the last row gives 1/s of (2.12) */
-#define CALIB_PLANE_INVERSE_22 0.00362180942f /* entry of A^-1, undistorted px to m; (2.11), the last row gives 1/s of (2.12) */
-#define CALIB_PLANE_INVERSE_23 -0.160717577f /* entry of A^-1, undistorted px to m; (2.11), the last row gives 1/s of (2.12) */
-#define CALIB_PLANE_INVERSE_31 -0.000315893587f /* entry of A^-1, undistorted px to m; (2.11), the last row gives 1/s of (2.12) */
-#define CALIB_PLANE_INVERSE_32 -0.000872939941f /* entry of A^-1, undistorted px to m; (2.11), the last row gives 1/s of (2.12) */
-#define CALIB_PLANE_INVERSE_33 3.7639668f /* entry of A^-1, undistorted px to m; (2.11), the last row gives 1/s of (2.12) */
+#define CALIB_PLANE_INVERSE_11 0.00365899038f /* entry of A^-1, undistorted px to m; (2.11), the last row gives 1/s of (2.12) */
+#define CALIB_PLANE_INVERSE_12 -8.8428118e-05f /* entry of A^-1, undistorted px to m; (2.11), the last row gives 1/s of (2.12) */
+#define CALIB_PLANE_INVERSE_13 -0.59911108f /* entry of A^-1, undistorted px to m; (2.11), the last row gives 1/s of (2.12) */
+#define CALIB_PLANE_INVERSE_21 7.93001309e-05f /* entry of A^-1, undistorted px to m; (2.11), the last row gives 1/s of (2.12) */
+#define CALIB_PLANE_INVERSE_22 0.00362181547f /* entry of A^-1, undistorted px to m; (2.11), the last row gives 1/s of (2.12) */
+#define CALIB_PLANE_INVERSE_23 -0.160717785f /* entry of A^-1, undistorted px to m; (2.11), the last row gives 1/s of (2.12) */
+#define CALIB_PLANE_INVERSE_31 -0.000315899641f /* entry of A^-1, undistorted px to m; (2.11), the last row gives 1/s of (2.12) */
+#define CALIB_PLANE_INVERSE_32 -0.000872946228f /* entry of A^-1, undistorted px to m; (2.11), the last row gives 1/s of (2.12) */
+#define CALIB_PLANE_INVERSE_33 3.76397467f /* entry of A^-1, undistorted px to m; (2.11), the last row gives 1/s of (2.12) */
 
 #endif /* CALIB_CONSTANTS_H */

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib import boards
-from calib.boards import BoardFile, board_of, find_boards, processors, read_board_file
+from calib import boards, workers
+from calib.boards import BoardFile, board_of, find_boards, read_board_file
 from calib.errors import BadInputError
 
 
@@ -48,7 +48,7 @@ def test_a_picture_that_changes_meanwhile(
     def change(done: int, total: int) -> None:
         shutil.copy(shipped[5], copies[1])
 
-    monkeypatch.setattr(boards, "processors", lambda: 1)
+    monkeypatch.setattr(workers, "processors", lambda: 1)
     monkeypatch.setattr(boards, "same_size", lambda pictures: change(0, 0) or pictures[0].size_px)
     with pytest.raises(BadInputError, match=r"view02\.png: has changed since the work began"):
         find_boards(copies, (7, 5), 0.02)
@@ -65,6 +65,7 @@ def test_a_wrong_size_is_known_after_two_pictures(
         return detect(gray, columns, rows)
 
     monkeypatch.setattr(boards, "detect", counted)
+    monkeypatch.setattr(workers, "processors", lambda: 1)
     with pytest.raises(BadInputError, match=r"no board with 9x6 .* any of 17 pictures, but one with 7x5 was"):
         find_boards(shipped, (9, 6), 0.02)
     assert searched == [(9, 6)] * 2
@@ -73,10 +74,6 @@ def test_a_wrong_size_is_known_after_two_pictures(
 def test_a_size_that_is_expected(shipped: list[Path]) -> None:
     with pytest.raises(BadInputError, match=r"view01\.png: is 316x208 px, expected 640x480 px"):
         find_boards(shipped[:1], (7, 5), 0.02, image_size_px=(640, 480))
-
-
-def test_workers_are_the_processors_that_may_be_used() -> None:
-    assert processors() >= 1
 
 
 def test_no_file_tells_nothing(tmp_path: Path) -> None:

@@ -109,9 +109,16 @@ def _basis(board: FloatArray, degree: int, columns: int, rows: int) -> FloatArra
     return np.stack(terms, axis=1)
 
 
+def _median(values: FloatArray) -> float:
+    """Median of (n,) values; NumPy's own takes five times as long for so few."""
+    n = len(values)
+    low, high = np.partition(values, ((n - 1) // 2, n // 2))[[(n - 1) // 2, n // 2]]
+    return 0.5 * float(low + high)
+
+
 def _weights(error: FloatArray, used: BoolArray, least: float) -> FloatArray:
     """Geman and McClure's weights with the median of the errors for a scale."""
-    scale = max(3.0 * float(np.median(error[used])), least)
+    scale = max(3.0 * _median(error[used]), least)
     return used / (1.0 + (error / scale) ** 2) ** 2
 
 
@@ -161,7 +168,8 @@ class _Fit:
     shape: tuple[int, int]
 
     def _apart(self, straight: FloatArray) -> FloatArray:
-        return np.asarray(np.linalg.norm(self.pixels - self.lens.bent(straight, self.strength), axis=1))
+        u, v = (self.pixels - self.lens.bent(straight, self.strength)).T
+        return np.asarray(np.hypot(u, v))
 
     def homography(self) -> tuple[FloatArray, FloatArray]:
         """Robust weights (N,) and mapped corners (N, 2), straightened."""
@@ -189,7 +197,7 @@ class _Fit:
                 break
         without = target - (target - smooth) / (1.0 - leverage)[:, None]
         points = self.lens.bent(np.where(self.used[:, None], without, smooth), self.strength)
-        spread = float(np.median((apart / (1.0 - leverage))[self.used]))
+        spread = _median((apart / (1.0 - leverage))[self.used])
         # A prediction is as uncertain as the corners, and as its leverage makes it.
         limit = _LIMIT * max(spread, _LEAST_SPREAD_PX) * np.sqrt(1.0 + np.minimum(power, 8.0))
         return Prediction(points.reshape(*self.shape, 2), spread, limit.reshape(self.shape))

@@ -11,7 +11,10 @@ import numpy as np
 from calib.arrays import BoolArray
 from calib.camera.bundle import Calibration, calibrate
 from calib.camera.covariance import Covariance, covariance
+from calib.camera.coverage import lens_shape
+from calib.camera.misfit import screen
 from calib.camera.projection import free_intrinsics
+from calib.camera.reasons import of_screening
 from calib.camera.selection import (
     BOARDS,
     Candidate,
@@ -20,6 +23,7 @@ from calib.camera.selection import (
     candidates_by_model,
     simplest_good,
 )
+from calib.camera.starts import best_of_starts
 from calib.camera.verdict import Judgement, judge
 from calib.camera.views import Observations, View, pack
 from calib.errors import BadInputError
@@ -31,6 +35,8 @@ _REJECT_SHARE = 0.3
 """A view that loses more of its points than this is left out whole."""
 _HOPELESS = 0.02
 """RMS over the picture's larger side from which on the points belong to no camera at all."""
+_LOWER = 1.0 - 1e-6
+"""Cost of another start over that of the fit below which the fit is not the best one."""
 
 
 @dataclass(frozen=True)
@@ -112,8 +118,10 @@ def _chosen_model(
     )
     if not found:
         return "radial2", None, ()
-    best = simplest_good([candidate for candidate, _ in found])
-    return found[best][0].name, found[best][1], tuple(candidate for candidate, _ in found)
+    # A lens that folds the picture where points were seen is none, however well it fits.
+    sound = [one for one in found if lens_shape(one[1]).seen_slope > 0.0] or found
+    best, fit = sound[simplest_good([candidate for candidate, _ in sound])]
+    return best.name, fit, tuple(candidate for candidate, _ in found)
 
 
 def _outliers(fit: Calibration) -> tuple[BoolArray, list[str]]:
@@ -182,26 +190,36 @@ def calibrate_camera(
     if board != "rigid":
         fit, board, boards = _with_board(fit, choices)
     if fit.termination == "behind the camera":
-        raise BadInputError(
-            "no camera fits these views: a solution has points behind the camera; expected views of one flat "
-            "target, each point with its own pixel"
-        )
+        raise _no_camera(observations, "a solution has points behind the camera")
     solved = time.perf_counter()
     sigma = covariance(fit)
     covered = time.perf_counter()
-    try:
-        judgement = judge(fit, sigma)
-    except (np.linalg.LinAlgError, ValueError) as error:
-        # Points that no camera sees on a flat board leave the checks without a linear system to solve.
-        if fit.rms_px < _HOPELESS * max(image_size_px):
-            raise
-        raise BadInputError(
-            f"no camera fits these views: the best leaves an RMS of {fit.rms_px:.0f} px; expected views of "
-            "one flat target, each point with its own pixel"
-        ) from error
+    judgement = _judged(fit, sigma)
+    if judgement.numbers.get("lowest_start_cost_share", 1.0) < _LOWER:
+        better = best_of_starts(fit)
+        if better is not fit:
+            fit, sigma = better, covariance(better)
+            judgement = _judged(fit, sigma)
     judged = time.perf_counter()
     seconds = {"solve": solved - began, "covariance": covered - solved, "judge": judged - covered}
     return Intrinsics(fit, sigma, judgement, models, boards, board, tuple(rejected), seconds)
+
+
+def _judged(fit: Calibration, sigma: Covariance) -> Judgement:
+    try:
+        return judge(fit, sigma)
+    except (np.linalg.LinAlgError, ValueError, IndexError) as error:
+        # Points that no camera sees on a flat board leave the checks without a linear system to solve.
+        if fit.rms_px < _HOPELESS * max(fit.camera.image_size_px):
+            raise
+        raise _no_camera(fit.observations, f"the best leaves an RMS of {fit.rms_px:.0f} px") from error
+
+
+def _no_camera(observations: Observations, what: str) -> BadInputError:
+    """The error for views that no camera fits, with those named that are no views of a flat target."""
+    found = of_screening(screen(observations), observations.names)
+    why = found[0].text if found else "Expected views of one flat target, each point with its own pixel."
+    return BadInputError(f"no camera fits these views: {what}. {why}")
 
 
 def _with_board(rigid: Calibration, choices: Choices) -> tuple[Calibration, str, tuple[Candidate, ...]]:

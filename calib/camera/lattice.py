@@ -12,9 +12,9 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from calib.arrays import BoolArray, FloatArray, IntArray
 from calib.camera.saddles import Saddles, sample
@@ -22,6 +22,7 @@ from calib.camera.saddles import Saddles, sample
 __all__ = ["Lattice", "extrapolated", "find_lattices", "looks_like_corners"]
 
 _NEIGHBOURS = 30
+_KDTREE_SINGLE = 4
 _LEAST_EDGE_PX = 4.5
 _OFF_AXIS = float(np.cos(np.radians(25.0)))
 _ALONG_EDGE = (0.3, 0.5, 0.7)
@@ -60,6 +61,22 @@ class Lattice:
         return np.asarray(self.sign * (1.0 - 2.0 * ((i + j) % 2)))
 
 
+class _Nearest:
+    """Indices (n, k) of the points nearest to each of (n, 2) queries, the nearest first.
+
+    OpenCV's search tree: SciPy's would double the time that it takes to load this package.
+    """
+
+    def __init__(self, points: FloatArray) -> None:
+        # The tree does not keep the points alive.
+        self._points = points.astype(np.float32)
+        self._tree = cv2.flann.Index(self._points, {"algorithm": _KDTREE_SINGLE})
+
+    def __call__(self, queries: FloatArray, k: int) -> IntArray:
+        found, _ = self._tree.knnSearch(queries.astype(np.float32), k, params={"checks": -1})
+        return np.asarray(found, dtype=np.int64)
+
+
 def _ports(saddles: Saddles) -> tuple[FloatArray, IntArray]:
     """Angles (N, 4) of the ports, and which of the even and odd ports is rising (0 or 1), (N,)."""
     first = np.minimum(saddles.rising, saddles.falling)
@@ -76,10 +93,10 @@ def _links(saddles: Saddles) -> IntArray:
         return links
     angles, parity = _ports(saddles)
     k = min(_NEIGHBOURS + 1, N)
-    found = cKDTree(saddles.points).query(saddles.points, k)
-    distance, other = np.asarray(found[0], dtype=np.float64), np.asarray(found[1], dtype=np.int64)
+    other = _Nearest(saddles.points)(saddles.points, k)
     a = np.repeat(np.arange(N), k - 1)
-    b, d = other[:, 1:].ravel(), distance[:, 1:].ravel()
+    b = other[:, 1:].ravel()
+    d = np.linalg.norm(saddles.points[b] - saddles.points[a], axis=1)
     keep = (d > _LEAST_EDGE_PX) & (a != b)
     a, b, d = a[keep], b[keep], d[keep]
     direction = (saddles.points[b] - saddles.points[a]) / d[:, None]
@@ -238,7 +255,7 @@ def looks_like_corners(
     return half_step, unlike / np.maximum(2.0 * np.abs(half_step), 1e-9)
 
 
-def _grown(saddles: Saddles, lattice: Lattice, pool: FloatArray, tree: cKDTree) -> Lattice:
+def _grown(saddles: Saddles, lattice: Lattice, pool: FloatArray, nearest_to: _Nearest) -> Lattice:
     """Add the saddle points that lie where the grid goes on, until there are none left."""
     for _ in range(40):
         place = extrapolated(lattice.points)
@@ -251,8 +268,8 @@ def _grown(saddles: Saddles, lattice: Lattice, pool: FloatArray, tree: cKDTree) 
         if not todo.any():
             break
         square = np.minimum(np.linalg.norm(along, axis=-1), np.linalg.norm(across, axis=-1))
-        distance, nearest = tree.query(place[todo])
-        snapped = pool[nearest]
+        snapped = pool[nearest_to(place[todo], 1)[:, 0]]
+        distance = np.linalg.norm(snapped - place[todo], axis=1)
         half_step, unlike = looks_like_corners(saddles.smooth, snapped, along[todo], across[todo])
         wide = replace(lattice, points=points, sign=lattice.sign)
         agrees = wide.colours()[todo] * half_step > 0.35 * lattice.contrast
@@ -314,12 +331,12 @@ def find_lattices(saddles: Saddles, least: int = _LEAST_CORNERS) -> list[Lattice
     pool = np.concatenate([saddles.points, saddles.weak])
     if not grids:
         return []
-    tree = cKDTree(pool)
+    nearest_to = _Nearest(pool)
     found = []
     for grid in grids[:_GRIDS]:
         if len(grid) < least:
             break
-        lattice = _trimmed(_pruned(saddles, _grown(saddles, _lattice(saddles, grid), pool, tree)))
+        lattice = _trimmed(_pruned(saddles, _grown(saddles, _lattice(saddles, grid), pool, nearest_to)))
         if min(lattice.points.shape[:2]) >= 2:
             found.append(lattice)
     found.sort(key=lambda lattice: int(lattice.seen.sum()), reverse=True)

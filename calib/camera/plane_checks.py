@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import fdtrc
 
 from calib.arrays import FloatArray
 from calib.camera.homography import fit_homography
@@ -120,6 +119,9 @@ def compare_pictures(
         fits.append(PictureFit(view.name, M, float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))), moved))
     if tested < 2:
         return tuple(fits), Comparison(1.0, 0.0, "", 1.0)
+    # SciPy takes longer to load than most planes to check.
+    from scipy.special import fdtrc
+
     between = max(joint - separate, 0.0) / (6 * (tested - 1))
     ratio = between / max(separate / freedom, 1e-24)
     probability = float(fdtrc(6 * (tested - 1), freedom, ratio))

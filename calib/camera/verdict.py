@@ -72,6 +72,9 @@ def judge(
     observations = calibration.observations
     numbers: dict[str, float] = {"views": observations.views}
     findings = reasons.of_screening(screen(observations), observations.names)
+    if any(one.kind == INCONSISTENT for one in findings):
+        # What else is wrong follows from the views that are none.
+        return _concluded(findings, None, numbers)
     if not np.all(np.isfinite(calibration.block.intrinsics)) or not np.all(np.isfinite(calibration.normal)):
         findings += reasons_fit.of_solution(calibration, observations.views, limits)
         if not any(one.kind == UNIDENTIFIABLE for one in findings):
@@ -172,7 +175,10 @@ def _uncertainty(
         some = _sampled(fit)
         own = covariance(some).sigma()["fx_px"]
         interval = focal_interval(some, own, inflation)
-        findings += reasons_fit.of_starts(other_starts(some), some, own, inflation, limits)
+        ends = other_starts(some)
+        findings += reasons_fit.of_starts(ends, some, own, inflation, limits)
+        lowest = min((end.cost for end in ends), default=np.inf)
+        numbers["lowest_start_cost_share"] = lowest / max(some.squared_sum, 1e-300)
         numbers["fx_low_px"], numbers["fx_high_px"] = interval.low_px, interval.high_px
     findings += reasons_fit.of_focal(share, interval, limits)
     findings += reasons_fit.of_projection(projection, width, limits)

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from calib.camera import intrinsics
+from calib.camera.bundle import calibrate
 from calib.camera.intrinsics import Choices, calibrate_camera
 from calib.camera.views import View
 from calib.errors import BadInputError
@@ -70,3 +74,40 @@ def test_the_board_model_is_chosen_on_held_back_views() -> None:
     result = calibrate_camera(views_of(12, 2, 0.15), (640, 480), Choices(model="radial2", board="auto"))
     assert result.board == "rigid"
     assert [c.name for c in result.boards] == ["rigid", "warp", "released"]
+
+
+def test_a_start_that_ends_lower_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    views = views_of(12, 4, 0.1, tilt_rad=0.05)
+    best = calibrate_camera(views, (640, 480), Choices(model="radial2"))
+    calls = []
+
+    def worse(*arguments, **named):
+        # The first fit stops where a long lens would leave it.
+        fit = calibrate(*arguments, **named)
+        if calls:
+            return fit
+        calls.append(fit)
+        block = fit.block
+        long = replace(
+            block,
+            intrinsics=block.intrinsics * np.array([4.0, 4.0, *np.ones(len(block.intrinsics) - 2)]),
+            t_CT_m=block.t_CT_m * np.array([1.0, 1.0, 4.0]),
+        )
+        return calibrate(*arguments, **{**named, "start": long, "max_iterations": 1})
+
+    monkeypatch.setattr(intrinsics, "calibrate", worse)
+    found = calibrate_camera(views, (640, 480), Choices(model="radial2"))
+    assert calls
+    assert found.calibration.rms_px == pytest.approx(best.calibration.rms_px, rel=1e-6)
+    assert found.calibration.camera.fx_px == pytest.approx(best.calibration.camera.fx_px, rel=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_view_in_disorder_is_named(seed: int) -> None:
+    views = views_of(12, 1, 0.1)
+    order = np.random.default_rng(seed).permutation(len(views[4].pixels))
+    views[4] = replace(views[4], pixels=views[4].pixels[order])
+    found = calibrate_camera(views, (640, 480)).judgement
+    assert found.verdict == "inconsistent"
+    assert "view05 shows points that no camera sees on a flat board" in found.reasons[0]
+    assert found.advice[0] == "Leave out view05."
