@@ -55,7 +55,10 @@ class Covariance:
 
     def sigma(self) -> dict[str, float]:
         """Standard deviation of each estimated intrinsic by name."""
-        return dict(zip(self.names, np.sqrt(np.diag(self.intrinsics)).tolist(), strict=True))
+        variance = np.diag(self.intrinsics)
+        # Where rounding leaves no positive variance the data do not bound it.
+        bounded = np.sqrt(np.where(variance >= 0.0, variance, np.inf))
+        return dict(zip(self.names, bounded.tolist(), strict=True))
 
 
 def _skew(v: FloatArray) -> FloatArray:

@@ -155,6 +155,8 @@ def _without(observations: Observations, rejected: BoolArray) -> Observations:
     return left.select(np.flatnonzero(left.present.sum(axis=1) >= 4))
 
 
+# Views that belong to no camera overflow; what is not finite is looked for at each stage.
+@np.errstate(all="ignore")
 def calibrate_camera(
     views: Sequence[View], image_size_px: tuple[int, int], choices: Choices = Choices()
 ) -> Intrinsics:
@@ -226,6 +228,8 @@ def _with_board(rigid: Calibration, choices: Choices) -> tuple[Calibration, str,
     """The same camera with the board model that was asked for, or that views held back prefer."""
     if not rigid.observations.same_target:
         raise BadInputError(f"--board {choices.board} needs the same points of the target in every view")
+    if choices.board == "auto" and rigid.observations.views < 3:
+        return rigid, "rigid", ()
     if choices.board == "auto":
         found = candidates_by_board(rigid, choices.skew, BOARDS)
         best = simplest_good([candidate for candidate, _ in found])

@@ -173,6 +173,8 @@ def of_projection(sigma_px: float, width: int, limits: Limits) -> list[Finding]:
         f"Where points were seen the camera predicts pixels to {sigma_px:.2f} px only "
         f"(median standard deviation; {limit:.2f} is good)."
     )
+    if not np.isfinite(sigma_px):
+        text = "Where points were seen nothing bounds the error of the pixels that the camera predicts."
     return [Finding(POOR, text, "Take more pictures, with the board tilted and close.")]
 
 

@@ -126,7 +126,10 @@ def _on_held_back(
         if fit.termination in ("behind the camera", "singular"):
             continue
         residuals = refit_poses(fit, observations.select(held))
-        squared[held] = np.nanmean(np.sum(residuals**2, axis=2), axis=1)
+        of_point = np.sum(residuals**2, axis=2)
+        known = np.isfinite(of_point)
+        total = np.where(known, of_point, 0.0).sum(axis=1)
+        squared[held] = np.where(known.any(axis=1), total / np.maximum(known.sum(axis=1), 1), np.nan)
     return squared
 
 

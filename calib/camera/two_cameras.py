@@ -210,7 +210,8 @@ def _described(
     variance = calibration.sigma_px**2
     inverse = np.linalg.inv(S[0] + np.eye(len(scale)))
     left = max(problem.cost - fall, 0.0) / problem.freedom * max(phi2, 1.0)
-    sigma = scale * np.sqrt(np.diag(inverse[0] + inverse[1]) * left)
+    # Rounding makes a variance of next to nothing negative.
+    sigma = scale * np.sqrt(np.maximum(np.diag(inverse[0] + inverse[1]), 0.0) * left)
     difference = scale * (d[0, 1] - d[0, 0])
     names = calibration.free_names
     return Split(

@@ -168,7 +168,9 @@ def _uncertainty(
     inside = _inside(covered)
     projection = np.inf
     if len(inside):
-        projection = float(np.nanmedian(inflation * projection_sigma_px(fit, known, inside)))
+        spread = inflation * projection_sigma_px(fit, known, inside)
+        bounded = spread[~np.isnan(spread)]
+        projection = float(np.median(bounded)) if len(bounded) else np.inf
     findings = []
     interval = None
     if "fx_px" in known.names:
