@@ -21,6 +21,8 @@ from calib.errors import BadInputError
 
 __all__ = ["Comparison", "PictureFit", "compare_pictures", "judge", "refuse_unusable"]
 
+_MOSTLY_UNSEEN = 0.5
+"""Share of the workspace outside the picture above which the plane is of no use."""
 _RMS_LIMIT_PX = 1.0
 """A board that is found to 0.1 px and still misses by this much does not fit its description."""
 _RMS_FACTOR, _RMS_NOTICED_PX = 3.0, 0.3
@@ -159,6 +161,11 @@ def judge(
     out_of_sight = float(np.mean(~np.isfinite(sigma.plane_mm[:, 0])))
     if out_of_sight == 1.0:
         poor.append("no part of the workspace is in the picture")
+    elif out_of_sight > _MOSTLY_UNSEEN:
+        poor.append(
+            f"{100 * out_of_sight:.0f} % of the workspace is outside the picture; move the camera, or say in "
+            "the rig's file where the marker can be (geometry.workspace_m)"
+        )
     elif out_of_sight > 0.0:
         notes.append(
             f"{100 * out_of_sight:.0f} % of the workspace is outside the picture; sigma is given for the rest"

@@ -171,9 +171,12 @@ def test_corners_in_one_spot_do_not_fix_a_far_workspace() -> None:
 
 def test_a_workspace_out_of_the_picture() -> None:
     views = several(1)
-    partly = calibrate_plane(THESIS, COVARIANCE, views, workspace_m=(-0.05, 0.02, 0.5, 0.1))
+    partly = calibrate_plane(THESIS, COVARIANCE, views, workspace_m=(-0.05, 0.02, 0.2, 0.1))
     assert partly.verdict == "ok"
-    assert "outside the picture" in partly.notes[0]
+    assert "14 % of the workspace is outside the picture" in partly.notes[0]
+    mostly = calibrate_plane(THESIS, COVARIANCE, views, workspace_m=(-0.05, 0.02, 0.5, 0.1))
+    assert mostly.verdict == "poor"
+    assert "56 % of the workspace is outside the picture" in mostly.reasons[0]
     nowhere = calibrate_plane(THESIS, COVARIANCE, views, workspace_m=(1.0, 1.0, 1.2, 1.2))
     assert nowhere.verdict == "poor"
     assert "no part of the workspace" in nowhere.reasons[0]
