@@ -7,6 +7,7 @@ and on systems where forking is not safe at all, threads do the work.
 
 from __future__ import annotations
 
+import ctypes
 import multiprocessing
 import os
 import signal
@@ -30,6 +31,8 @@ _LOOK_UP_S = 0.2
 _FEWEST_TO_FORK = 4
 """Starting processes for fewer items takes longer than they save."""
 
+_PR_SET_PDEATHSIG = 1
+
 _held: Any = None
 
 
@@ -40,11 +43,15 @@ def processors() -> int:
     return os.cpu_count() or 1
 
 
-def _hold(shared: object) -> None:
+def _hold(shared: object, parent: int) -> None:
     global _held  # noqa: PLW0603  a worker process serves one pool and keeps what it shares here
     _held = shared
     # Ctrl-C reaches all processes of a terminal; the first one answers for all.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # A worker waits for work on a pipe that it holds open itself: it has to be told of its parent's end.
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL))
+    if os.getppid() != parent:
+        os._exit(1)
 
 
 def _on_held(work: Callable[[Any, S], T], item: S) -> T:
@@ -80,7 +87,7 @@ class Workers(Generic[Shared]):
         self._pool: Executor
         if self._forks:
             self._pool = ProcessPoolExecutor(
-                count, multiprocessing.get_context("fork"), initializer=_hold, initargs=(shared,)
+                count, multiprocessing.get_context("fork"), initializer=_hold, initargs=(shared, os.getpid())
             )
         else:
             self._pool = ThreadPoolExecutor(count)

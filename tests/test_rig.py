@@ -34,12 +34,12 @@ def test_round_trip_and_same_bytes(tmp_path: Path) -> None:
 
 def test_sections_of_later_versions_survive(tmp_path: Path) -> None:
     path = tmp_path / "rig.yaml"
-    path.write_text("estimator: {gyro_bias_radps: [0.1, 0.2, 0.3]}\nfuture: {a: 1}\n")
+    path.write_text("twin: {lever_m: [0.1, 0.2, 0.3]}\nfuture: {a: 1}\n")
     write_rig(path, read_rig(path).model_copy(update={"camera": CAMERA}), {})
     text = path.read_text()
-    assert "gyro_bias_radps: [0.1, 0.2, 0.3]" in text
+    assert "lever_m: [0.1, 0.2, 0.3]" in text
     assert "future: {a: 1}" in text
-    assert text.index("camera:") < text.index("estimator:") < text.index("provenance:")
+    assert text.index("camera:") < text.index("twin:") < text.index("provenance:")
 
 
 def test_no_file_is_an_empty_rig(tmp_path: Path) -> None:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import cv2
 import pytest
@@ -55,3 +58,28 @@ def test_processors_are_those_that_may_be_used(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.delattr(os, "sched_getaffinity", raising=False)
     monkeypatch.setattr(workers.os, "cpu_count", lambda: None)
     assert processors() == 1
+
+
+@pytest.mark.skipif(sys.platform != "linux" or processors() < 2, reason="no second process to fork")
+def test_no_worker_outlives_its_parent(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import os, signal, time\n"
+        "from calib.workers import Workers\n"
+        "def number(shared, i):\n"
+        "    time.sleep(0.01)\n"
+        "    return os.getpid()\n"
+        "with Workers(None, 8) as pool:\n"
+        "    print(*set(pool.in_order(number, range(8))), flush=True)\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, str(script)], capture_output=True, text=True, timeout=60, check=False
+    )
+    workers_seen = [int(word) for word in done.stdout.split()]
+    # subprocess.run returns when nobody holds the pipe any more.
+    assert done.returncode == -signal.SIGKILL
+    assert workers_seen
+    for process in workers_seen:
+        with pytest.raises(ProcessLookupError):
+            os.kill(process, 0)
