@@ -18,18 +18,24 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from calib import __version__
 from calib.errors import BadInputError
 from calib.files import one_line, read_bytes, read_yaml_mapping, sha256, shown, write_atomically
+from calib.rig_estimator import Estimator
+from calib.rig_filter import OrientationFilter
 from calib.rig_imu import Imu
+from calib.rig_imu_intrinsics import ImuIntrinsics
 from calib.rig_lowpass import LowPass
 
 __all__ = [
     "Camera",
     "CovarianceTable",
     "Distortion",
+    "Estimator",
     "Geometry",
     "Imu",
+    "ImuIntrinsics",
     "InverseLens",
     "Lens",
     "LowPass",
+    "OrientationFilter",
     "Plane",
     "Provenance",
     "Rig",
@@ -49,6 +55,7 @@ SECTIONS = (
     "plane",
     "lens",
     "imu",
+    "imu_intrinsics",
     "orientation_filter",
     "lowpass",
     "align",
@@ -213,7 +220,10 @@ class Rig(BaseModel):
     plane: Plane | None = None
     lens: Lens | None = None
     imu: Imu | None = None
+    imu_intrinsics: ImuIntrinsics | None = None
+    orientation_filter: OrientationFilter | None = None
     lowpass: LowPass | None = None
+    estimator: Estimator | None = None
     provenance: Provenance = Provenance()
 
 

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import typer
 
+from calib.cli.imu_drift import drift
+from calib.cli.imu_intrinsics import intrinsics
 from calib.cli.imu_static import static
+from calib.cli.imu_tune import tune
 
 __all__ = ["imu"]
 
@@ -20,3 +23,6 @@ def _imu() -> None:
 
 
 imu.command("static")(static)
+imu.command("intrinsics")(intrinsics)
+imu.command("drift")(drift)
+imu.command("tune")(tune)

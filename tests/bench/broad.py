@@ -1,0 +1,65 @@
+"""Filters on BROAD's recordings, as a script: `python tests/bench/broad.py [--no-slow]`.
+
+First the inclination's RMSE in motion of filters by others beside what was published, which shows that
+the evaluation is right; then the angle in the plane, in windows where the sensor's plane is near gravity.
+Recordings lie in the folder broad of CALIB_SHARED_DATA.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+
+from broad_trials import FILES, PUBLISHED_DEG, filter_rmse_deg, read_trial, rmse_deg, windows
+
+from calib.imu.orientation import inclination_error, rms_in_motion, up_in_sensor
+from calib.imu.peers import missing, run_peer
+from calib.imu.rate import planar_rate, up_vector
+
+
+def main() -> None:
+    """Print both tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--no-slow", action="store_true", help="leave out the peers that take seconds")
+    slow = not parser.parse_known_args()[0].no_slow
+    folder = Path(os.environ.get("CALIB_SHARED_DATA", ROOT.parent / "shared" / "data")) / "broad"
+    if not folder.is_dir():
+        print(f"no recordings at {folder}; set CALIB_SHARED_DATA")
+        return
+    for name, file in FILES.items():
+        one = read_trial(folder / file)
+        print(f"trial {name}, {len(one.gyro)} samples: inclination's RMSE in motion, deg")
+        ups = {}
+        for peer, published in PUBLISHED_DEG.items():
+            if missing(peer) or (peer in ("Mahony", "Madgwick") and not slow):
+                continue
+            q = run_peer(peer, one.gyro, one.force, one.period_s)
+            ups[peer] = up_in_sensor(q)
+            found = np.degrees(rms_in_motion(inclination_error(q, one.truth), one.moving))
+            print(f"  {peer:12} {found:.4f}  published {published[name]:.3f}")
+        up = up_vector(one.force, one.gyro, one.period_s)
+        apart = np.linalg.norm(up - up_in_sensor(one.truth), axis=1)
+        print(f"  up vector    {np.degrees(rms_in_motion(apart, one.moving)):.4f}")
+        for least in (0.25, 0.5, 0.75):
+            where = windows(one, up, least)
+            length = sum(w.stop - w.start for w in where) * one.period_s
+            tilt = np.degrees(np.arccos(np.sqrt(least)))
+            print(f"  plane within {tilt:.0f} deg, {len(where)} windows, {length:.1f} s: angle's RMSE, deg")
+            print(f"    MM 3/3, -gz             {filter_rmse_deg(one, -one.gyro[:, 2], where):.3f}")
+            tilted = planar_rate(one.gyro, up)
+            print(f"    MM 3/3, with up vector  {filter_rmse_deg(one, tilted, where):.3f}")
+            phi_acc = np.arctan2(one.force[:, 1], one.force[:, 0])
+            print(f"    accelerometer alone     {rmse_deg(one, phi_acc, where):.3f}")
+            for peer, u in ups.items():
+                print(f"    {peer:23} {rmse_deg(one, np.arctan2(u[:, 1], u[:, 0]), where):.3f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,88 @@
+"""BROAD's recordings for the test and the benchmark: reading, windows in plane, and the filter in them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.io import loadmat
+
+from calib.imu.mahony import Mahony, MahonyState
+from calib.imu.mahony_batch import accelerometer_angles, filter_log, wrapped
+from calib.imu.orientation import up_in_sensor
+from calib.imu.rate import in_plane
+
+__all__ = ["FILES", "PUBLISHED_DEG", "Trial", "filter_rmse_deg", "read_trial", "rmse_deg", "windows"]
+
+FILES = {
+    "02": "02_undisturbed_slow_rotation_B.mat",
+    "05": "05_undisturbed_slow_rotation_with_breaks_B.mat",
+}
+PUBLISHED_DEG = {
+    "VQF": {"02": 0.429, "05": 0.353},
+    "VQF offline": {"02": 0.312, "05": 0.271},
+    "imufusion": {"02": 0.666, "05": 0.553},
+    "Mahony": {"02": 0.459, "05": 0.528},
+    "Madgwick": {"02": 0.606, "05": 0.549},
+}
+"""Inclination's RMSE in motion of six-axis filters, by others."""
+
+_SHORTEST_S = 1.0
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A recording: rates [rad/s], forces [m/s^2], true quaternions with gaps, and whether it moves."""
+
+    gyro: np.ndarray
+    force: np.ndarray
+    truth: np.ndarray
+    moving: np.ndarray
+    period_s: float
+
+    @property
+    def true_phi(self) -> np.ndarray:
+        """Angle of the true up vector in the plane."""
+        up = up_in_sensor(self.truth)
+        return np.arctan2(up[:, 1], up[:, 0])
+
+
+def read_trial(path: Path) -> Trial:
+    """A recording of BROAD."""
+    m = loadmat(path, squeeze_me=True)
+    return Trial(
+        np.ascontiguousarray(m["imu_gyr"]),
+        np.ascontiguousarray(m["imu_acc"]),
+        m["opt_quat"],
+        m["movement"] == 1,
+        1.0 / float(m["sampling_rate"]),
+    )
+
+
+def windows(one: Trial, up: np.ndarray, least: float) -> list[slice]:
+    """Stretches of a second or more in motion, with known truth and in plane."""
+    inside = one.moving & np.isfinite(one.truth).all(axis=1) & in_plane(up, least)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], inside.astype(np.int64), [0]])))
+    return [
+        slice(a, b)
+        for a, b in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
+        if (b - a) * one.period_s >= _SHORTEST_S
+    ]
+
+
+def rmse_deg(one: Trial, phi: np.ndarray, where: list[slice]) -> float:
+    """Of an angle in the windows, all together."""
+    errors = [wrapped(phi[w] - one.true_phi[w]) for w in where]
+    return float(np.degrees(np.sqrt(np.mean(np.concatenate(errors) ** 2))))
+
+
+def filter_rmse_deg(one: Trial, rate: np.ndarray, where: list[slice]) -> float:
+    """Of MM 3/3 with this rate, begun in each window at the accelerometer's angle."""
+    phi_acc = accelerometer_angles(one.force[:, 0], one.force[:, 1])
+    t = one.period_s * np.arange(len(phi_acc), dtype=np.float64)
+    phi = np.full(len(phi_acc), np.nan)
+    for w in where:
+        start = MahonyState(float(phi_acc[w.start]))
+        phi[w] = filter_log(Mahony(), t[w], phi_acc[w], rate[w], start)[0]
+    return rmse_deg(one, phi, where)
