@@ -15,6 +15,7 @@ from calib.cli.firmware import firmware
 from calib.cli.imu import imu
 from calib.cli.intrinsics import intrinsics
 from calib.cli.lowpass import lowpass
+from calib.cli.replay import replay
 from calib.cli.simulate import simulate
 
 __all__ = ["app"]
@@ -49,6 +50,7 @@ app.command("extrinsics")(extrinsics)
 app.command("distortion")(distortion)
 app.command("lowpass")(lowpass)
 app.add_typer(imu, name="imu")
+app.command("replay")(replay)
 app.command("firmware")(firmware)
 app.command("board")(board)
 app.command("simulate")(simulate)

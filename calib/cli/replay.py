@@ -1,0 +1,125 @@
+"""`calib replay`: logs of camera and IMU in, lengths, angle and their covariance out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from calib.cli.common import FiguresOption, JsonOption, RigOption, document, narrate, progress_bar, say, table
+from calib.errors import EXIT_POOR, UsageError
+
+if TYPE_CHECKING:
+    from calib.replay import Replayed
+
+__all__ = ["replay"]
+
+
+def _cell(value: float | None, digits: int = 3) -> str:
+    return "-" if value is None else f"{value:.{digits}g}"
+
+
+def _tell(result: Replayed) -> None:
+    say(f"{result.source}: {result.rows} rows, {result.duration_s:.5g} s, {result.estimator}")
+    if result.rmse:
+        rows = []
+        for name, figures in (("this", result.rmse), *((n, f) for n, f in result.others.items())):
+            rows.append(
+                [name, *(_cell(figures.get(k)) for k in ("q1_mm", "q2_mm", "mean_q_mm", "phi_deg", "nees"))]
+            )
+        for line in table(["RMSE after 2 s", "q1, mm", "q2, mm", "mean, mm", "phi, deg", "NEES (2)"], rows):
+            say(line)
+    if result.sensors:
+        rows = [
+            [
+                f"{name} ({check['degrees']})",
+                _cell(check["nis"]),
+                f"{check['low']:.3g} .. {check['high']:.3g}",
+                f"{100 * check['inside']:.1f} %",
+                _cell(check["correlation"], 2),
+                str(check["gated"]),
+            ]
+            for name, check in result.sensors.items()
+        ]
+        head = ["sensor (degrees)", "NIS", "95 % band", "inside", "correlation", "gated"]
+        for line in table(head, rows):
+            say(line)
+    say(f"verdict: {result.verdict}")
+    for sentence in (*result.reasons, *result.remarks):
+        say(f"  - {sentence}")
+
+
+def replay(
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs of camera and IMU.")],
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", help="States to write; with several logs a folder, made if needed."),
+    ] = None,
+    estimator: Annotated[
+        Literal["fused", "baseline"],
+        typer.Option(help="The fused filter, or the low-pass pipeline that it replaces."),
+    ] = "fused",
+    smooth: Annotated[
+        bool, typer.Option("--smooth", help="Look at the whole log, forward and backward.")
+    ] = False,
+    tune: Annotated[
+        bool, typer.Option("--tune", help="Learn the noise from these logs; written to the rig's file.")
+    ] = False,
+    figures: FiguresOption = None,
+    rig: RigOption = Path("rig.yaml"),
+    as_json: JsonOption = False,
+) -> None:
+    """Estimate lengths, angle and pose from logs, with standard deviations and what they are worth.
+
+    Exits 1 when the innovations of a log contradict its covariance or a sensor is missing.
+    """
+    from calib.files import check_folder, check_writable, make_folder, shown
+    from calib.replay import replay_log
+    from calib.rig import hash_of, read_rig, section_json, write_rig
+
+    if estimator == "baseline" and (smooth or tune):
+        raise UsageError("--estimator baseline: cannot be smoothed or tuned")
+    several = len(logs) > 1
+    if output is not None:
+        (check_folder if several else check_writable)(output)
+    if tune:
+        check_writable(rig)
+    if figures is not None:
+        check_folder(figures)
+    known = read_rig(rig)
+    told: dict[str, Any] = {}
+    if tune:
+        from calib.tuning import tuned_section
+
+        with progress_bar("tuning") as progress:
+            section = tuned_section(logs, known, rig, progress)
+        known = write_rig(
+            rig,
+            known.model_copy(update={"estimator": section}),
+            {"estimator": {shown(path.name): hash_of(path) for path in logs}},
+        )
+        told["estimator"] = section_json(section)
+        narrate(f"estimator written to {shown(rig)}")
+    if output is not None and several:
+        make_folder(output)
+    results: list[Replayed] = []
+    for path in logs:
+        states = output / f"{path.stem}_states.csv" if output is not None and several else output
+        with progress_bar(f"replaying {path.name}") as progress:
+            result = replay_log(path, known, rig, estimator, smooth, states, progress, figures is not None)
+        results.append(result)
+        if states is not None:
+            narrate(f"states written to {shown(states)}")
+    if figures is not None:
+        from calib.report.replay_figures import write_replay_figures
+
+        write_replay_figures(figures, results)
+        narrate(f"figures in {shown(figures)}")
+    if as_json:
+        document("replay", {**told, "replay": {"logs": [result.as_json() for result in results]}})
+    else:
+        for result in results:
+            _tell(result)
+    if any(result.verdict != "ok" for result in results):
+        raise typer.Exit(EXIT_POOR)

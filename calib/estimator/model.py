@@ -1,0 +1,277 @@
+"""The kinematic process: how the head moves when nothing is known of what drives it.
+
+Angle and length each follow
+
+    dp = v dt + dw_p,   dv = (a - v / T_v) dt,   da = -a / T_a dt + dw_a
+
+with white noise w_p, w_a: an acceleration that forgets after T_a and a rate that dies after T_v
+(Singer 1970 with friction). One level of noise cannot serve rest and swing, so a bank of levels runs side
+by side as an interacting multiple model (Blom and Bar-Shalom 1988): before each event a level i starts
+from the mixture of all levels j with the weights of j having turned into i. The sensors' quantities
+are constant but for a slow random walk.
+
+A step of more than `LARGEST_STEP_S` is taken in parts, so that the series for the transition,
+I + A h + A^2 h^2 / 2 + A^3 h^3 / 6, and that for its noise hold.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numba import njit
+
+from calib.arrays import FloatArray
+from calib.estimator.sensors import SIZE
+
+__all__ = [
+    "LARGEST_STEP_S",
+    "LEVELS",
+    "Kinematic",
+    "Level",
+    "axis_noise",
+    "axis_transition",
+    "mix",
+    "predict",
+    "settle_weights",
+]
+
+LARGEST_STEP_S = 0.02
+
+
+@dataclass(frozen=True)
+class Level:
+    """Process noise of one level, for phi [rad] and for the length [m].
+
+    Attributes
+    ----------
+    name : for what it is made.
+    accel_phi_radps2, accel_length_mps2 : standard deviation of the acceleration.
+    memory_s : T_a of both. friction_s : T_v of the length; that of phi is infinite.
+    walk_phi, walk_length : density of w_p [rad/sqrt(s), m/sqrt(s)].
+    """
+
+    name: str
+    accel_phi_radps2: float
+    accel_length_mps2: float
+    memory_s: float
+    friction_s: float
+    walk_phi: float
+    walk_length: float
+
+    def numbers(self) -> list[float]:
+        """(1/T_a, 1/T_v, density of w_a, of w_p) of phi and then of the length."""
+        b, c = 1.0 / self.friction_s, 1.0 / self.memory_s
+        return [
+            c, 0.0, 2.0 * self.accel_phi_radps2**2 * c, self.walk_phi**2,
+            c, b, 2.0 * self.accel_length_mps2**2 * c, self.walk_length**2,
+        ]  # fmt: skip
+
+
+LEVELS = (
+    Level("rest", 1.0, 3e-4, 0.04, 0.08, 5e-6, 1.5e-5),
+    Level("drift", 1.0, 8e-3, 0.04, 7.5, 5e-6, 3e-6),
+    Level("move", 20.0, 0.05, 0.02, 1.0, 1.3e-4, 2.6e-5),
+    Level("swing", 120.0, 0.8, 0.05, 50.0, 7e-4, 6e-5),
+)
+"""From rest over the slow and quick motion of the pumps to a free swing.
+
+Found by a random search for the least errors on simulated rigs whose parameters vary. Rest and drift have
+the same angle, so that the gyroscope has no say in which of them it is: ten times as fast as the camera,
+it would outvote the pictures, which alone see a slow change of length.
+"""
+
+
+@dataclass(frozen=True)
+class Kinematic:
+    """Parameters of the process.
+
+    Attributes
+    ----------
+    levels : the bank.
+    switch_hz : rate at which one level turns into another.
+    sensor_walk : (13,) densities of the walk of `sensors.SENSOR`, unit per sqrt(s).
+    """
+
+    levels: tuple[Level, ...] = LEVELS
+    switch_hz: float = 0.1
+    sensor_walk: tuple[float, ...] = (
+        2e-5,
+        2e-4,
+        2e-4,
+        1e-6,
+        1e-6,
+        1e-7,
+        1e-7,
+        1e-7,
+        1e-8,
+        1e-8,
+        1e-6,
+        1e-6,
+        1e-6,
+    )
+    names: tuple[str, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "names", tuple(level.name for level in self.levels))
+
+    def arrays(self) -> tuple[FloatArray, FloatArray]:
+        """Levels (M, 8) and squared walks (13,) for the compiled functions."""
+        return np.array([level.numbers() for level in self.levels]), np.array(self.sensor_walk) ** 2
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def axis_transition(c: float, b: float, h: float) -> tuple[float, float, float, float, float]:
+    """Entries f01, f02, f11, f12, f22 of the transition of (p, v, a) over h [s]; c = 1/T_a, b = 1/T_v."""
+    h2, h3 = 0.5 * h * h, h * h * h / 6.0
+    return (
+        h - b * h2 + b * b * h3,
+        h2 - (b + c) * h3,
+        1.0 - b * h + b * b * h2 - b * b * b * h3,
+        h - (b + c) * h2 + (b * b + b * c + c * c) * h3,
+        1.0 - c * h + c * c * h2 - c * c * c * h3,
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def axis_noise(q: float, walk: float, h: float) -> tuple[float, float, float, float, float, float]:
+    """Entries pp, pv, pa, vv, va, aa of the noise over h [s] for the densities q of w_a, walk of w_p."""
+    h2 = h * h
+    h3 = h2 * h
+    return (
+        walk * h + q * h2 * h3 / 20.0,
+        q * h2 * h2 / 8.0,
+        q * h3 / 6.0,
+        q * h3 / 3.0,
+        q * h2 / 2.0,
+        q * h,
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _step(x: FloatArray, P: FloatArray, level: FloatArray, walk: FloatArray, h: float) -> None:
+    n = x.shape[0]
+    for axis in range(2):
+        k = 4 * axis
+        f01, f02, f11, f12, f22 = axis_transition(level[k], level[k + 1], h)
+        p, v, a = axis, axis + 2, axis + 4
+        x[p] += f01 * x[v] + f02 * x[a]
+        x[v] = f11 * x[v] + f12 * x[a]
+        x[a] = f22 * x[a]
+        for j in range(n):
+            P[p, j] += f01 * P[v, j] + f02 * P[a, j]
+            P[v, j] = f11 * P[v, j] + f12 * P[a, j]
+            P[a, j] = f22 * P[a, j]
+    for axis in range(2):
+        k = 4 * axis
+        f01, f02, f11, f12, f22 = axis_transition(level[k], level[k + 1], h)
+        p, v, a = axis, axis + 2, axis + 4
+        for i in range(6):
+            P[i, p] += f01 * P[i, v] + f02 * P[i, a]
+            P[i, v] = f11 * P[i, v] + f12 * P[i, a]
+            P[i, a] = f22 * P[i, a]
+        pp, pv, pa, vv, va, aa = axis_noise(level[k + 2], level[k + 3], h)
+        P[p, p] += pp
+        P[p, v] += pv
+        P[v, p] += pv
+        P[p, a] += pa
+        P[a, p] += pa
+        P[v, v] += vv
+        P[v, a] += va
+        P[a, v] += va
+        P[a, a] += aa
+    for i in range(6):
+        for j in range(i):
+            P[i, j] = P[j, i]
+        for j in range(6, n):
+            P[j, i] = P[i, j]
+    for i in range(6, n):
+        P[i, i] += walk[i - 6] * h
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def predict(x: FloatArray, P: FloatArray, level: FloatArray, walk: FloatArray, dt: float) -> None:
+    """Carry a state (19,) and its covariance (19, 19) on by dt >= 0 [s], in place.
+
+    Parameters
+    ----------
+    level : (8,) a row of `Kinematic.arrays`.
+    walk : (13,) squared densities of the sensors' walk.
+    """
+    if not dt > 0.0:
+        return
+    parts = max(math.ceil(dt / LARGEST_STEP_S - 1e-9), 1)
+    h = dt / parts
+    for _ in range(parts):
+        _step(x, P, level, walk, h)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def mix(x: FloatArray, P: FloatArray, weight: FloatArray, stay: float, turn: float) -> None:
+    """Let the levels start from their mixtures, in place.
+
+    Parameters
+    ----------
+    x, P : (M, n) and (M, n, n).
+    weight : (M,) of the levels; on return those predicted.
+    stay, turn : probabilities of staying and of turning into each one of the others.
+    """
+    levels, n = x.shape
+    if levels == 1:
+        return
+    before_x, before_P, before = x.copy(), P.copy(), weight.copy()
+    share, away = np.empty(levels), np.empty(n)
+    for j in range(levels):
+        total = 0.0
+        for i in range(levels):
+            share[i] = before[i] * (stay if i == j else turn)
+            total += share[i]
+        weight[j] = total
+        for i in range(levels):
+            share[i] /= total
+        if share[j] > 1.0 - 1e-6:
+            continue
+        for k in range(n):
+            x[j, k] = 0.0
+            for m in range(n):
+                P[j, k, m] = 0.0
+        for i in range(levels):
+            for k in range(n):
+                x[j, k] += share[i] * before_x[i, k]
+        for i in range(levels):
+            if share[i] < 1e-9:
+                continue
+            part = share[i]
+            for k in range(n):
+                away[k] = before_x[i, k] - x[j, k]
+            for k in range(n):
+                d = part * away[k]
+                for m in range(n):
+                    P[j, k, m] += part * before_P[i, k, m] + d * away[m]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def settle_weights(weight: FloatArray, log_likelihood: FloatArray) -> float:
+    """Weights (M,) after an event, in place; returns the log likelihood of the event.
+
+    No weight falls below 1e-6, so that a level can come back.
+    """
+    best = log_likelihood.max()
+    total = 0.0
+    for j in range(weight.shape[0]):
+        weight[j] *= math.exp(log_likelihood[j] - best)
+        total += weight[j]
+    if not total > 0.0:
+        weight[:] = 1.0 / weight.shape[0]
+        return float(best)
+    floored = 0.0
+    for j in range(weight.shape[0]):
+        weight[j] = max(weight[j] / total, 1e-6)
+        floored += weight[j]
+    for j in range(weight.shape[0]):
+        weight[j] /= floored
+    return float(best + math.log(total))
+
+
+assert SIZE == 19

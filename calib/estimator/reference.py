@@ -1,0 +1,170 @@
+"""The same recursion on filterpy, for one level of process noise: the proof of the compiled filter.
+
+Readings leave `kernel.CONSIDERED` alone in both. `extended` runs filterpy's ExtendedKalmanFilter over the
+events of a log: predict with F and Q of `model`, then each scalar reading in turn, a rounded pixel as its
+equivalent Gaussian reading. It agrees with the compiled filter to rounding. `unscented` is filterpy's
+UnscentedKalmanFilter with the same noise, whole readings at once and rounding as variance g^2 / 12: not the
+same estimator, but one without a Jacobian. `extended_smoothed` adds Rauch, Tung and Striebel with matrices
+inverted by numpy.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from calib.arrays import FloatArray
+from calib.estimator.filter import starting_state
+from calib.estimator.kernel import CAMERA, CONSIDERED, camera_terms, imu_terms
+from calib.estimator.model import predict
+from calib.estimator.rounding import update_terms
+from calib.estimator.sensors import SIZE
+from calib.estimator.setup import Rows, Setup
+from calib.estimator.smoother import Events, transition
+
+__all__ = ["extended", "extended_smoothed", "process_noise", "unscented"]
+
+
+def process_noise(level: FloatArray, walk: FloatArray, dt: float) -> FloatArray:
+    """Q (19, 19) of `model.predict` over dt [s]."""
+    Q, x = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
+    predict(x, Q, level, walk, dt)
+    return Q
+
+
+def _constants(setup: Setup) -> FloatArray:
+    return np.array([setup.gravity_mps2, setup.lever_across_m])
+
+
+def _scalar_readings(
+    setup: Setup, kind: int, z: FloatArray, x: FloatArray, P: FloatArray
+) -> list[tuple[float, float, FloatArray, float, bool]]:
+    """Each reading of an event: value, prediction, gradient, variance of its noise, whether rounded."""
+    noise, out = setup.noise, np.empty(SIZE)
+    H = np.empty((3, SIZE))
+    if kind == CAMERA:
+        camera_terms(setup.view, noise, x, P, H, out)
+        jitter = noise[0] ** 2
+        return [(z[k], out[k], H[k].copy(), jitter + out[2 + k], True) for k in range(2)]
+    imu_terms(_constants(setup), noise, x, P, H, out)
+    return [(z[k], out[k], H[k].copy(), out[3 + k], False) for k in (2, 0, 1) if not math.isnan(z[k])]
+
+
+def extended(setup: Setup, rows: Rows, events: Events, gated: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """States (n, 19) and covariances (n, 19, 19) after each event, by filterpy's EKF.
+
+    Parameters
+    ----------
+    gated : (n, 3) readings that stay out, as the compiled filter found them.
+    """
+    from filterpy.kalman import ExtendedKalmanFilter
+
+    levels, walk = setup.process.arrays()
+    start_x, start_P, _ = starting_state(setup, rows)
+    ekf: Any = ExtendedKalmanFilter(dim_x=SIZE, dim_z=1)
+    ekf.x, ekf.P = start_x[0].copy(), start_P[0].copy()
+    held = list(CONSIDERED)
+    n = len(events.t_s)
+    x, P, F = np.empty((n, SIZE)), np.empty((n, SIZE, SIZE)), np.empty((SIZE, SIZE))
+    for k in range(n):
+        dt = float(events.t_s[k] - events.t_s[k - 1]) if k else 0.0
+        transition(levels[0], dt, F)
+        ekf.F, ekf.Q = F.copy(), process_noise(levels[0], walk, dt)
+        ekf.predict()
+        kind = int(events.kinds[k])
+        if kind:
+            before = ekf.x.copy()
+            readings = _scalar_readings(setup, kind, events.readings[k], before, ekf.P)
+            for place, (z, predicted, H, variance, rounded) in enumerate(readings):
+                sensor = (
+                    0 if kind == CAMERA else 2 if place == 0 and not math.isnan(events.readings[k, 2]) else 1
+                )
+                if gated[k, sensor]:
+                    continue
+                expected = predicted + float(H @ (ekf.x - before))
+                if rounded:
+                    spread = float(H @ ekf.P @ H)
+                    y, S, _ = update_terms(z - expected, spread, variance, setup.noise[1])
+                    z, variance = expected + y, S - spread
+                kept_x, kept_P = ekf.x[held].copy(), ekf.P[np.ix_(held, held)].copy()
+                ekf.update(
+                    np.array([z]),
+                    lambda _, H=H: H[None, :],
+                    lambda _, h=expected: np.array([h]),
+                    R=np.array([[variance]]),
+                )
+                ekf.x[held], ekf.P[np.ix_(held, held)] = kept_x, kept_P
+        x[k], P[k] = ekf.x, ekf.P
+    return x, P
+
+
+def extended_smoothed(
+    setup: Setup, events: Events, x: FloatArray, P: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Rauch, Tung and Striebel over the states of `extended`."""
+    levels, walk = setup.process.arrays()
+    x, P = x.copy(), P.copy()
+    F = np.empty((SIZE, SIZE))
+    for k in range(len(x) - 2, -1, -1):
+        dt = float(events.t_s[k + 1] - events.t_s[k])
+        transition(levels[0], dt, F)
+        ahead = F @ P[k] @ F.T + process_noise(levels[0], walk, dt)
+        scale = 1.0 / np.sqrt(np.diag(ahead))
+        gain = (P[k] @ F.T * scale) @ np.linalg.inv(ahead * scale[:, None] * scale) * scale
+        x[k] += gain @ (x[k + 1] - F @ x[k])
+        P[k] += gain @ (P[k + 1] - ahead) @ gain.T
+    return x, P
+
+
+def unscented(setup: Setup, rows: Rows, events: Events, gated: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """States (n, 19) and covariances after each event, by filterpy's UKF (Julier's sigma points)."""
+    from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
+
+    levels, walk = setup.process.arrays()
+    start_x, start_P, _ = starting_state(setup, rows)
+    points = MerweScaledSigmaPoints(SIZE, alpha=0.5, beta=2.0, kappa=0.0)
+    F = np.eye(SIZE)
+
+    def carry(x: FloatArray, _: float) -> FloatArray:
+        return np.asarray(F @ x)
+
+    def nothing(x: FloatArray) -> FloatArray:
+        return x[:1]
+
+    ukf: Any = UnscentedKalmanFilter(SIZE, 1, 1.0, hx=nothing, fx=carry, points=points)
+    ukf.x, ukf.P = start_x[0].copy(), start_P[0].copy()
+    n = len(events.t_s)
+    x, P = np.empty((n, SIZE)), np.empty((n, SIZE, SIZE))
+    for k in range(n):
+        dt = float(events.t_s[k] - events.t_s[k - 1]) if k else 0.0
+        transition(levels[0], dt, F)
+        ukf.Q = process_noise(levels[0], walk, dt)
+        ukf.predict()
+        kind = int(events.kinds[k])
+        # filterpy keeps the points of the process; readings need those of the predicted covariance.
+        ukf.sigmas_f = points.sigma_points(ukf.x, ukf.P)
+        if kind and not gated[k, 0 if kind == CAMERA else 1]:
+            z = events.readings[k, : 2 if kind == CAMERA else 3]
+            base = _scalar_readings(setup, kind, events.readings[k], ukf.x, ukf.P)
+            order = [0, 1] if kind == CAMERA else [2, 0, 1]
+            R = np.zeros(len(order))
+            for place, reading in zip(order, base, strict=True):
+                R[place] = reading[3] + (setup.noise[1] ** 2 / 12.0 if kind == CAMERA else 0.0)
+
+            def read(state: FloatArray, kind: int = kind) -> FloatArray:
+                H, out, none = np.empty((3, SIZE)), np.empty(SIZE), np.zeros((SIZE, SIZE))
+                if kind == CAMERA:
+                    camera_terms(setup.view, setup.noise, state, none, H, out)
+                    return out[:2].copy()
+                imu_terms(_constants(setup), setup.noise, state, none, H, out)
+                return out[:3].copy()
+
+            held = list(CONSIDERED)
+            kept_x, kept_P = ukf.x[held].copy(), ukf.P[np.ix_(held, held)].copy()
+            ukf._dim_z = len(z)
+            ukf.update(z, R=np.diag(R), hx=read)
+            ukf.x[held], ukf.P[np.ix_(held, held)] = kept_x, kept_P
+        x[k], P[k] = ukf.x, ukf.P
+    return x, P

@@ -1,0 +1,328 @@
+"""What camera, accelerometer and gyroscope read on a moving head, with analytic gradients.
+
+The head's motion is given by phi, l and their first and second derivatives, see `HEAD`, the sensors
+by the quantities of `SENSOR`; a gradient has one entry for each of them in this order, 19 in all.
+
+Marker. Constant curvature puts the marker, d along the head's tangent (A.1), at
+
+    (X, Y) = l S(phi) (sin(phi / 2), cos(phi / 2)) + d (sin phi, cos phi)                 (3.6)
+
+in the plane. An error of the calibrated plane shows it at (X, Y) + (shift_x, shift_y) +
+stretch ((X, Y) - middle). That point is mapped by the plane's pose and the lens into distorted pixels.
+The picture was exposed `time_offset` seconds earlier than the time to which the head's motion belongs,
+so that phi - time_offset dphi + time_offset^2 ddphi / 2 stands for phi in it, and so for l.
+
+Accelerometer. With h = phi / 2, rho = l S and
+
+    r = rho'' - rho dphi^2 / 4,   x = rho ddphi / 2 + rho' dphi
+
+along and across the chord the head accelerates by A_t = r cos h + x sin h along its tangent and by
+A_n = -r sin h + x cos h across it. At the lever (c_n, c_t) across and along the tangent, with gravity g,
+
+    f_x = g cos phi - (A_t - ddphi c_n - dphi^2 c_t),   f_y = g sin phi + A_n + ddphi c_t - dphi^2 c_n
+
+is the specific force a - g in the IMU's axes, x towards the base. Mounted at the angle alpha it reads
+
+    a_x = (1 + scale_x) (cos alpha f_x - sin alpha f_y) + bias_x
+    a_y = (1 + scale_y) (sin alpha f_x + cos alpha f_y) + bias_y
+
+so that at rest and without errors atan2(a_y, a_x) = phi + alpha (2.1).
+
+Gyroscope. g_z = -(1 + scale) dphi + bias.
+
+All functions are compiled; S is that of `calib.actuator.arc`.
+"""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import numpy as np
+from numba import njit
+
+from calib.actuator.arc import chord_decay_w, chord_ratio_w
+from calib.arrays import FloatArray
+from calib.camera.model import Camera
+
+__all__ = [
+    "GRAVITY_MPS2",
+    "HEAD",
+    "SENSOR",
+    "SIZE",
+    "accelerometer",
+    "gyroscope",
+    "head_position",
+    "invert_marker",
+    "marker",
+    "marker_rows",
+    "sensor_values",
+    "view_coefficients",
+]
+
+HEAD = ("phi_rad", "length_m", "dphi_radps", "dlength_mps", "ddphi_radps2", "ddlength_mps2")
+"""Motion of the head: entries 0 to 5 of a state and of a gradient."""
+
+SENSOR = (
+    "gyro_bias_radps",
+    "accel_bias_x_mps2",
+    "accel_bias_y_mps2",
+    "mount_angle_rad",
+    "gyro_scale",
+    "imu_lever_m",
+    "marker_offset_m",
+    "time_offset_s",
+    "shift_x_m",
+    "shift_y_m",
+    "stretch",
+    "accel_scale_x",
+    "accel_scale_y",
+)
+"""What the sensors are: entries 6 to 18. The lever is that along the tangent."""
+
+SIZE = len(HEAD) + len(SENSOR)
+
+GRAVITY_MPS2 = 9.81
+
+
+def _slope_series(terms: int = 13) -> tuple[float, ...]:
+    """Coefficients of -2 dD/dw, highest power of w first."""
+    out = []
+    for n in range(2, terms + 2):
+        decay = (Fraction(1, math.factorial(2 * n + 1)) - Fraction(1, math.factorial(2 * n))) * Fraction(
+            (-1) ** n, 4**n
+        )
+        out.append(float(-2 * (n - 1) * decay))
+    return tuple(reversed(out))
+
+
+_E_SERIES = _slope_series()
+
+
+def view_coefficients(
+    camera: Camera, R_CW: FloatArray, t_CW_m: FloatArray, middle_m: tuple[float, float] = (0.0, 0.08)
+) -> FloatArray:
+    """Camera and plane as the (24,) numbers that `marker` takes.
+
+    Parameters
+    ----------
+    R_CW, t_CW_m : (3, 3) and (3,), world to camera.
+    middle_m : place in the plane about which `stretch` magnifies.
+    """
+    R = np.asarray(R_CW, dtype=np.float64)
+    lens = [camera.fx_px, camera.fy_px, camera.skew_px, camera.cx_px, camera.cy_px]
+    parts = [R[:, 0], R[:, 1], np.asarray(t_CW_m, dtype=np.float64), lens, camera.distortion, middle_m]
+    return np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
+
+
+def sensor_values(values: dict[str, float]) -> FloatArray:
+    """The (13,) vector of `SENSOR` with these values, zero where none is given."""
+    return np.array([values.get(name, 0.0) for name in SENSOR], dtype=np.float64)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def head_position(phi: float, length: float) -> tuple[float, float]:
+    """Head (x, y) [m] of angle and length (3.6)."""
+    rho = length * chord_ratio_w(phi * phi)
+    return rho * math.sin(0.5 * phi), rho * math.cos(0.5 * phi)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _pixel(view: FloatArray, X: float, Y: float) -> tuple[float, float, float, float, float, float]:
+    """Distorted pixel of a place in the plane and its derivatives: u, v, u_X, u_Y, v_X, v_Y.
+
+    NaN behind the camera.
+    """
+    p1 = view[0] * X + view[3] * Y + view[6]
+    p2 = view[1] * X + view[4] * Y + view[7]
+    p3 = view[2] * X + view[5] * Y + view[8]
+    if not p3 > 0.0:
+        return math.nan, math.nan, math.nan, math.nan, math.nan, math.nan
+    inverse = 1.0 / p3
+    x, y = p1 * inverse, p2 * inverse
+    x_X, x_Y = (view[0] - x * view[2]) * inverse, (view[3] - x * view[5]) * inverse
+    y_X, y_Y = (view[1] - y * view[2]) * inverse, (view[4] - y * view[5]) * inverse
+    fx, fy, skew, cx, cy = view[9], view[10], view[11], view[12], view[13]
+    k1, k2, t1, t2, k3, k4, k5, k6 = (
+        view[14], view[15], view[16], view[17], view[18], view[19], view[20], view[21],
+    )  # fmt: skip
+    r2 = x * x + y * y
+    over = 1.0 / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) * over
+    slope = (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3) - radial * (k4 + r2 * (2.0 * k5 + r2 * 3.0 * k6))) * over
+    xd = x * radial + 2.0 * t1 * x * y + t2 * (r2 + 2.0 * x * x)
+    yd = y * radial + t1 * (r2 + 2.0 * y * y) + 2.0 * t2 * x * y
+    xx = radial + 2.0 * x * x * slope + 2.0 * t1 * y + 6.0 * t2 * x
+    yy = radial + 2.0 * y * y * slope + 6.0 * t1 * y + 2.0 * t2 * x
+    xy = 2.0 * x * y * slope + 2.0 * t1 * x + 2.0 * t2 * y
+    xd_X, xd_Y = xx * x_X + xy * y_X, xx * x_Y + xy * y_Y
+    yd_X, yd_Y = xy * x_X + yy * y_X, xy * x_Y + yy * y_Y
+    return (
+        fx * xd + skew * yd + cx,
+        fy * yd + cy,
+        fx * xd_X + skew * yd_X,
+        fx * xd_Y + skew * yd_Y,
+        fy * yd_X,
+        fy * yd_Y,
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def marker(view: FloatArray, state: FloatArray, by_u: FloatArray, by_v: FloatArray) -> tuple[float, float]:
+    """Distorted pixel (u, v) of the marker; NaN behind the camera.
+
+    Parameters
+    ----------
+    view : (24,) of `view_coefficients`.
+    state : (19,) of `HEAD` and `SENSOR`.
+    by_u, by_v : (19,) gradients, written to.
+    """
+    late, d = state[13], state[12]
+    dphi, dl = state[2] - late * state[4], state[3] - late * state[5]
+    phi = state[0] - late * state[2] + 0.5 * late * late * state[4]
+    length = state[1] - late * state[3] + 0.5 * late * late * state[5]
+    w = phi * phi
+    S, D = chord_ratio_w(w), chord_decay_w(w)
+    S1 = -phi * D
+    sh, ch = math.sin(0.5 * phi), math.cos(0.5 * phi)
+    s, c = 2.0 * sh * ch, 1.0 - 2.0 * sh * sh
+    X = length * S * sh + d * s
+    Y = length * S * ch + d * c
+    X_phi = length * (S1 * sh + 0.5 * S * ch) + d * c
+    Y_phi = length * (S1 * ch - 0.5 * S * sh) - d * s
+    grow = 1.0 + state[16]
+    from_x, from_y = X - view[22], Y - view[23]
+    u, v, u_X, u_Y, v_X, v_Y = _pixel(
+        view, view[22] + grow * from_x + state[14], view[23] + grow * from_y + state[15]
+    )
+    for k in range(by_u.shape[0]):
+        by_u[k] = 0.0
+        by_v[k] = 0.0
+    u_phi, v_phi = grow * (u_X * X_phi + u_Y * Y_phi), grow * (v_X * X_phi + v_Y * Y_phi)
+    u_l, v_l = grow * S * (u_X * sh + u_Y * ch), grow * S * (v_X * sh + v_Y * ch)
+    by_u[0], by_v[0] = u_phi, v_phi
+    by_u[1], by_v[1] = u_l, v_l
+    by_u[2], by_v[2] = -late * u_phi, -late * v_phi
+    by_u[3], by_v[3] = -late * u_l, -late * v_l
+    half = 0.5 * late * late
+    by_u[4], by_v[4] = half * u_phi, half * v_phi
+    by_u[5], by_v[5] = half * u_l, half * v_l
+    by_u[12], by_v[12] = grow * (u_X * s + u_Y * c), grow * (v_X * s + v_Y * c)
+    by_u[13], by_v[13] = -(u_phi * dphi + u_l * dl), -(v_phi * dphi + v_l * dl)
+    by_u[14], by_v[14] = u_X, v_X
+    by_u[15], by_v[15] = u_Y, v_Y
+    by_u[16], by_v[16] = u_X * from_x + u_Y * from_y, v_X * from_x + v_Y * from_y
+    return u, v
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def accelerometer(
+    gravity: float, across: float, state: FloatArray, by_x: FloatArray, by_y: FloatArray
+) -> tuple[float, float]:
+    """Specific force (a_x, a_y) [m/s^2] that the mounted IMU reads.
+
+    Parameters
+    ----------
+    gravity, across : g [m/s^2] and the lever c_n across the tangent [m].
+    state : (19,) of `HEAD` and `SENSOR`.
+    by_x, by_y : (19,) gradients, written to.
+    """
+    phi, length, dphi, dl, ddphi, ddl = state[0], state[1], state[2], state[3], state[4], state[5]
+    alpha, lever = state[9], state[11]
+    w = phi * phi
+    S, D = chord_ratio_w(w), chord_decay_w(w)
+    E = _E_SERIES[0]
+    for coefficient in _E_SERIES[1:]:
+        E = E * w + coefficient
+    S1, S2 = -phi * D, 2.0 * D - 0.25 * S
+    S3 = -2.0 * phi * E - 0.25 * S1
+    sh, ch = math.sin(0.5 * phi), math.cos(0.5 * phi)
+    s, c = 2.0 * sh * ch, 1.0 - 2.0 * sh * sh
+    rho, drho = length * S, dl * S + length * S1 * dphi
+    spin2 = dphi * dphi
+    r = ddl * S + 2.0 * dl * S1 * dphi + length * (S2 * spin2 + S1 * ddphi) - 0.25 * rho * spin2
+    x = 0.5 * rho * ddphi + drho * dphi
+    r_phi = ddl * S1 + 2.0 * dl * S2 * dphi + length * ((S3 - 0.25 * S1) * spin2 + S2 * ddphi)
+    x_phi = 0.5 * length * S1 * ddphi + (dl * S1 + length * S2 * dphi) * dphi
+    r_l, x_l = (S2 - 0.25 * S) * spin2 + S1 * ddphi, 0.5 * S * ddphi + S1 * spin2
+    r_dphi, x_dphi = 2.0 * dl * S1 + (2.0 * length * S2 - 0.5 * rho) * dphi, drho + length * S1 * dphi
+    r_dl, x_dl = 2.0 * S1 * dphi, S * dphi
+    r_ddphi, x_ddphi = length * S1, 0.5 * rho
+    A_t, A_n = r * ch + x * sh, x * ch - r * sh
+    f_x = gravity * c - A_t + ddphi * across + spin2 * lever
+    f_y = gravity * s + A_n + ddphi * lever - spin2 * across
+    ca, sa = math.cos(alpha), math.sin(alpha)
+    grow_x, grow_y = 1.0 + state[17], 1.0 + state[18]
+    for k in range(by_x.shape[0]):
+        by_x[k] = 0.0
+        by_y[k] = 0.0
+    by_x[0] = -gravity * s - (r_phi * ch + x_phi * sh + 0.5 * A_n)
+    by_y[0] = gravity * c + (x_phi * ch - r_phi * sh - 0.5 * A_t)
+    by_x[1], by_y[1] = -(r_l * ch + x_l * sh), x_l * ch - r_l * sh
+    by_x[2] = -(r_dphi * ch + x_dphi * sh) + 2.0 * dphi * lever
+    by_y[2] = x_dphi * ch - r_dphi * sh - 2.0 * dphi * across
+    by_x[3], by_y[3] = -(r_dl * ch + x_dl * sh), x_dl * ch - r_dl * sh
+    by_x[4], by_y[4] = across - (r_ddphi * ch + x_ddphi * sh), lever + x_ddphi * ch - r_ddphi * sh
+    by_x[5], by_y[5] = -S * ch, -S * sh
+    by_x[11], by_y[11] = spin2, ddphi
+    for k in (0, 1, 2, 3, 4, 5, 11):
+        a, b = by_x[k], by_y[k]
+        by_x[k], by_y[k] = grow_x * (ca * a - sa * b), grow_y * (sa * a + ca * b)
+    out_x, out_y = ca * f_x - sa * f_y, sa * f_x + ca * f_y
+    by_x[9], by_y[9] = -grow_x * out_y, grow_y * out_x
+    by_x[7], by_y[8] = 1.0, 1.0
+    by_x[17], by_y[18] = out_x, out_y
+    return grow_x * out_x + state[7], grow_y * out_y + state[8]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def gyroscope(state: FloatArray, by_z: FloatArray) -> float:
+    """Rotation rate g_z [rad/s] of a state (19,); the gradient (19,) is written to."""
+    for k in range(by_z.shape[0]):
+        by_z[k] = 0.0
+    by_z[2], by_z[6], by_z[10] = -(1.0 + state[10]), 1.0, -state[2]
+    return float(-(1.0 + state[10]) * state[2] + state[6])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def marker_rows(view: FloatArray, states: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Pixels (n, 2) of the states (n, 19) and their gradients (n, 2, 19)."""
+    pixels, by = np.empty((len(states), 2)), np.empty((len(states), 2, states.shape[1]))
+    for i in range(len(states)):
+        pixels[i, 0], pixels[i, 1] = marker(view, states[i], by[i, 0], by[i, 1])
+    return pixels, by
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def invert_marker(
+    view: FloatArray, sensor: FloatArray, u: float, v: float, phi: float, length: float
+) -> tuple[float, float, bool]:
+    """Angle and length at which a resting marker is seen at (u, v), and whether they were found.
+
+    Newton's method from (phi, length) on two pixels; the length has to be positive and the angle below
+    3 rad.
+
+    Parameters
+    ----------
+    sensor : (13,) of `SENSOR`.
+    """
+    state, by_u, by_v = np.zeros(SIZE), np.empty(SIZE), np.empty(SIZE)
+    state[6:] = sensor
+    state[13] = 0.0
+    state[0], state[1] = phi, length
+    for _ in range(30):
+        at_u, at_v = marker(view, state, by_u, by_v)
+        eu, ev = u - at_u, v - at_v
+        det = by_u[0] * by_v[1] - by_u[1] * by_v[0]
+        if not abs(det) > 1e-12:
+            return phi, length, False
+        step_phi = (eu * by_v[1] - ev * by_u[1]) / det
+        step_l = (by_u[0] * ev - by_v[0] * eu) / det
+        limit = max(abs(step_phi) / 0.5, abs(step_l) / 0.02, 1.0)
+        state[0] += step_phi / limit
+        state[1] += step_l / limit
+        if not (abs(state[0]) < 3.0 and 1e-3 < state[1] < 10.0):
+            return phi, length, False
+        if limit == 1.0 and abs(step_phi) < 1e-10 and abs(step_l) < 1e-12:
+            return state[0], state[1], True
+    return phi, length, False

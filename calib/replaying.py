@@ -1,0 +1,358 @@
+"""From a log and a rig.yaml to the estimator's rows and its set-up.
+
+Logs are read block by block; nothing grows with their length.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel
+
+from calib.actuator.parameters import Plant
+from calib.arrays import BoolArray, FloatArray
+from calib.errors import BadInputError
+from calib.estimator.baseline import BaselineSetup, undistorting_nothing
+from calib.estimator.model import LEVELS, Kinematic, Level
+from calib.estimator.noise import grid_px
+from calib.estimator.sensors import SENSOR, sensor_values, view_coefficients
+from calib.estimator.setup import Rows, Setup, Start
+from calib.files import shown
+from calib.logs import Log, iter_log
+from calib.rig import Geometry, Rig
+from calib.rig_align import Align, AlignCovariance
+from calib.sections import camera_from_section, current_plane
+
+__all__ = [
+    "Periods",
+    "baseline_setup",
+    "blocks",
+    "periods",
+    "rows_of",
+    "setup_from_rig",
+    "truth_of",
+]
+
+_READINGS = ("u_px", "v_px", "ax_mps2", "ay_mps2", "gz_radps")
+_TRUTH = ("true_q1_m", "true_q2_m", "true_phi_rad")
+
+DEFAULTS: dict[str, tuple[float, float]] = {
+    "gyro_bias_radps": (0.0, 0.02),
+    "accel_bias_x_mps2": (0.0, 0.1),
+    "accel_bias_y_mps2": (0.0, 0.1),
+    "mount_angle_rad": (0.0, 0.05),
+    "gyro_scale": (0.0, 0.01),
+    "imu_lever_m": (0.006, 0.001),
+    "marker_offset_m": (0.015, 3e-4),
+    "time_offset_s": (0.025, 0.01),
+    "shift_x_m": (0.0, 2e-4),
+    "shift_y_m": (0.0, 2e-4),
+    "stretch": (0.0, 1e-3),
+    "accel_scale_x": (0.0, 0.003),
+    "accel_scale_y": (0.0, 0.003),
+}
+"""Value and standard deviation of what no section of the rig's file says."""
+
+_NOISE = {
+    "jitter_px": 0.3, "grid_px": 1.0, "accel_x_mps2": 0.0158, "accel_y_mps2": 0.0158, "gyro_radps": 0.0026,
+    "accel_share": 0.002, "camera_stamp_s": 5e-5, "imu_stamp_s": 5e-5, "camera_gate": 20.0,
+    "accel_gate": 30.0, "gyro_gate": 25.0,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Periods:
+    """What the beginning of a log says of its sensors.
+
+    Attributes
+    ----------
+    camera_s, imu_s : median distance of samples [s], NaN where there are too few.
+    grid_px : 1 for whole pixels, 0 for others.
+    ticks : whether rows with commands and without IMU are ticks of the camera's clock.
+    camera, imu : samples.
+    """
+
+    camera_s: float
+    imu_s: float
+    grid_px: float
+    ticks: bool
+    camera: int
+    imu: int
+
+
+def _column(log: Log, name: str) -> FloatArray:
+    return log.columns[name] if name in log.columns else np.full(len(log), np.nan)
+
+
+def _kinds(log: Log, readings: FloatArray, ticks: bool) -> tuple[BoolArray, BoolArray]:
+    """Rows (n,) with a picture or a tick of the camera, and rows with an IMU sample."""
+    finite = np.isfinite(readings)
+    imu: BoolArray = np.any(finite[:, 2:], axis=1)
+    camera: BoolArray = np.all(finite[:, :2], axis=1)
+    if ticks:
+        camera |= np.isfinite(_column(log, "pwm1")) & ~imu
+    return camera, imu
+
+
+def _readings(log: Log) -> FloatArray:
+    values = np.stack([_column(log, name) for name in _READINGS], axis=1)
+    return np.where(np.isfinite(values), values, np.nan)
+
+
+def _period(t_s: FloatArray) -> float:
+    steps = np.diff(t_s)
+    steps = steps[steps > 1e-5]
+    return float(np.median(steps)) if len(steps) >= 5 else math.nan
+
+
+def periods(log: Log) -> Periods:
+    """Rates and pixel grid from the first block of a log."""
+    readings = _readings(log)
+    seen, imu = _kinds(log, readings, False)
+    ticks = np.isfinite(_column(log, "pwm1")) & ~imu
+    # Commands stand in the rows of pictures when most of those rows have one.
+    use = bool(ticks.any()) and int((ticks & seen).sum()) >= 0.5 * int(ticks.sum()) > 0
+    camera = seen | ticks if use else seen
+    return Periods(
+        _period(log.t_s[camera]),
+        _period(log.t_s[imu]),
+        grid_px(readings),
+        use,
+        int(seen.sum()),
+        int(imu.sum()),
+    )
+
+
+def rows_of(log: Log, ticks: bool) -> Rows:
+    """A block's rows for the estimator."""
+    readings = _readings(log)
+    camera, imu = _kinds(log, readings, ticks)
+    kinds = camera.astype(np.int64) + 2 * imu.astype(np.int64)
+    return Rows(np.asarray(log.t_s, dtype=np.float64), readings, kinds)
+
+
+def truth_of(log: Log) -> FloatArray | None:
+    """True q1, q2 [m] and phi [rad] (n, 3), None for a log that does not know them."""
+    if any(name not in log.columns for name in _TRUTH):
+        return None
+    return np.stack([log.columns[name] for name in _TRUTH], axis=1)
+
+
+def blocks(path: Path) -> Iterator[Log]:
+    """Blocks with rows of a log. Raises `BadInputError` for one without rows, camera and IMU."""
+    rows, known = 0, False
+    for block in iter_log(path):
+        if not known and not any(name in block.columns for name in _READINGS):
+            raise BadInputError(
+                f"{shown(path)}: has neither camera nor IMU, expected columns as u_px, v_px or gz_radps"
+            )
+        known = True
+        if len(block):
+            rows += len(block)
+            yield block
+    if rows == 0:
+        raise BadInputError(f"{shown(path)}: has a header but no rows")
+
+
+def _section(rig: Rig, name: str) -> Mapping[str, Any]:
+    """A section as a mapping, whether it has a schema or not; empty without one."""
+    section = getattr(rig, name, None)
+    if section is None:
+        section = (rig.model_extra or {}).get(name)
+    if isinstance(section, BaseModel):
+        section = section.model_dump()
+    return section if isinstance(section, Mapping) else {}
+
+
+def _number(source: str, section: str, key: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise BadInputError(f"{source}: {section}.{key} is {value!r}, expected a number")
+    return float(value)
+
+
+def _from_align(rig: Rig) -> tuple[dict[str, tuple[float, float]], FloatArray | None, list[str]]:
+    """Values and deviations of the sensors, their covariance, and sentences for what is only assumed."""
+    values, said = dict(DEFAULTS), []
+    plane = rig.plane
+    if plane is not None and plane.sigma_marker_mm.get("calibration_max") is not None:
+        shift = 1e-3 * float(plane.sigma_marker_mm["calibration_max"] or 0.0) / math.sqrt(2.0)
+        values["shift_x_m"] = values["shift_y_m"] = (0.0, max(shift, 1e-6))
+    if rig.imu is not None and rig.imu.gyro_bias_radps[2] is not None:
+        listed = rig.imu.sigma.get("gyro_bias_radps")
+        sigma = listed[2] if listed is not None else None
+        values["gyro_bias_radps"] = (rig.imu.gyro_bias_radps[2], max(2e-4, sigma or 1e-3))
+    align = rig.align
+    if align is None:
+        said.append(
+            "no section align: time offset, mount angle and biases are taken from the log itself within "
+            "wide priors (calib align finds them)"
+        )
+        return values, None, said
+    found = _named_values(align)
+    sigmas = {name: values[name][1] for name in SENSOR}
+    for key, names in _ALIGNED.items():
+        deviations = align.sigma.get(key)
+        for k, name in enumerate(names):
+            one = deviations[k] if isinstance(deviations, list) and k < len(deviations) else deviations
+            if isinstance(one, float):
+                sigmas[name] = max(one, 1e-9)
+    values = {name: (found[name], sigmas[name]) for name in SENSOR}
+    covariance = None if align.covariance is None else _covariance(align.covariance, sigmas)
+    if align.verdict != "ok":
+        said.append(f"the alignment's own verdict is {align.verdict}")
+    return values, covariance, said
+
+
+_ALIGNED = {
+    "gyro_bias_radps": ("gyro_bias_radps",),
+    "accel_bias_mps2": ("accel_bias_x_mps2", "accel_bias_y_mps2"),
+    "mount_angle_rad": ("mount_angle_rad",),
+    "gyro_scale": ("gyro_scale",),
+    "imu_lever_m": ("imu_lever_m",),
+    "marker_offset_m": ("marker_offset_m",),
+    "time_offset_s": ("time_offset_s",),
+    "plane_shift_m": ("shift_x_m", "shift_y_m"),
+    "plane_stretch": ("stretch",),
+    "accel_scale": ("accel_scale_x", "accel_scale_y"),
+}
+"""Keys of the section `align` and the quantities of `sensors.SENSOR` that they hold."""
+
+_BETWEEN_LOGS = {"gyro_bias_radps": 1e-4, "accel_bias_x_mps2": 1e-3, "accel_bias_y_mps2": 1e-3}
+"""How far biases walk between the logs of the alignment and another one."""
+
+
+def _named_values(align: Align) -> dict[str, float]:
+    out: dict[str, float] = {}
+    for key, names in _ALIGNED.items():
+        value = getattr(align, key)
+        out |= dict(zip(names, value if isinstance(value, list) else [value], strict=True))
+    return out
+
+
+def _covariance(table: AlignCovariance, sigmas: Mapping[str, float]) -> FloatArray:
+    """Covariance (13, 13) of `sensors.SENSOR`; those that the table lacks stand alone."""
+    V = np.diag([sigmas[name] ** 2 for name in SENSOR])
+    known = [name for name in table.order if name in SENSOR]
+    at = [SENSOR.index(name) for name in known]
+    rows = [table.order.index(name) for name in known]
+    V[np.ix_(at, at)] = np.array(table.values)[np.ix_(rows, rows)]
+    for name, walk in _BETWEEN_LOGS.items():
+        V[SENSOR.index(name), SENSOR.index(name)] += walk**2
+    # A table that was rounded on its way through the file may have lost a digit of its smallest eigenvalue.
+    V = 0.5 * (V + V.T)
+    scale = np.sqrt(np.maximum(np.diag(V), 1e-18))
+    eigenvalues, Q = np.linalg.eigh(V / scale / scale[:, None])
+    normal = (Q * np.maximum(eigenvalues, 1e-9)) @ Q.T
+    return np.asarray(normal * scale * scale[:, None], dtype=np.float64)
+
+
+def _process(rig: Rig) -> Kinematic:
+    tuned = rig.estimator
+    if tuned is None or not tuned.levels:
+        return Kinematic(LEVELS)
+    levels = []
+    for level in tuned.levels:
+        walks = level.walk_phi_rad_per_sqrt_s, level.walk_length_m_per_sqrt_s
+        accelerations = level.accel_phi_radps2, level.accel_length_mps2
+        levels.append(Level(level.name, *accelerations, level.memory_s, level.friction_s, *walks))
+    return Kinematic(tuple(levels))
+
+
+def _noise(rig: Rig, found: Periods) -> FloatArray:
+    numbers = dict(_NOISE)
+    numbers["grid_px"] = found.grid_px
+    imu = rig.imu
+    if imu is not None:
+        root = math.sqrt(1.0 / found.imu_s) if found.imu_s > 0.0 else math.sqrt(imu.rate_hz)
+        for key, density in (
+            ("accel_x_mps2", imu.accel_noise_mps2_per_sqrt_Hz[0]),
+            ("accel_y_mps2", imu.accel_noise_mps2_per_sqrt_Hz[1]),
+            ("gyro_radps", imu.gyro_noise_radps_per_sqrt_Hz[2]),
+        ):
+            if density:
+                numbers[key] = density * root
+    if rig.align is not None:
+        numbers["jitter_px"] = rig.align.jitter_px or numbers["jitter_px"]
+        numbers["gyro_radps"] = rig.align.gyro_noise_radps or numbers["gyro_radps"]
+        for key, value in zip(("accel_x_mps2", "accel_y_mps2"), rig.align.accel_noise_mps2, strict=True):
+            numbers[key] = value or numbers[key]
+    if rig.estimator is not None:
+        numbers["jitter_px"] = rig.estimator.jitter_px
+        if rig.estimator.accel_noise_mps2 is not None:
+            numbers["accel_x_mps2"] = numbers["accel_y_mps2"] = rig.estimator.accel_noise_mps2
+        if rig.estimator.gyro_noise_radps is not None:
+            numbers["gyro_radps"] = rig.estimator.gyro_noise_radps
+    return np.array(list(numbers.values()))
+
+
+def _actuator(rig: Rig, source: str, key: str, default: float) -> float:
+    section = _section(rig, "actuator")
+    if key not in section:
+        return default
+    value = _number(source, "actuator", key, section[key])
+    if not value > 0.0:
+        raise BadInputError(f"{source}: actuator.{key} is {value:g}, expected a positive number")
+    return value
+
+
+def setup_from_rig(rig: Rig, path: Path, found: Periods) -> tuple[Setup, list[str]]:
+    """The estimator's set-up, and sentences about what is assumed.
+
+    Raises `BadInputError` without a camera or a plane where the log has pictures.
+    """
+    source = shown(path)
+    said: list[str] = []
+    workspace = (rig.geometry or Geometry()).workspace_m
+    view = np.zeros(24)
+    if found.camera:
+        plane = current_plane(rig, str(path))
+        if rig.camera is None:
+            raise BadInputError(f"{source}: has no camera, which pictures need; run calib intrinsics first")
+        if plane is None:
+            raise BadInputError(f"{source}: has no plane, which pictures need; run calib extrinsics first")
+        middle = (0.5 * (workspace[0] + workspace[2]), 0.5 * (workspace[1] + workspace[3]))
+        view = view_coefficients(
+            camera_from_section(rig.camera), np.array(plane.R_CW), np.array(plane.t_CW_m), middle
+        )
+    else:
+        said.append("no pictures: the length is known from the prior alone, the result is degraded")
+    if not found.imu:
+        said.append("no IMU: angle and length come from the camera alone, the result is degraded")
+    values, covariance, assumed = _from_align(rig)
+    said += assumed
+    nominal = Plant()
+    rest = _actuator(rig, source, "rest_length_m", nominal.rest_length_m)
+    head = np.array([0.0, rest + 0.004, 0.0, 0.0, 0.0, 0.0])
+    start = Start(
+        sensor_values({name: values[name][0] for name in SENSOR}),
+        sensor_values({name: values[name][1] for name in SENSOR}),
+        head,
+        sensor_covariance=covariance,
+    )
+    radius = _actuator(rig, source, "bellows_radius_m", nominal.bellows_radius_m)
+    setup = Setup(
+        view, _noise(rig, found), start, radius, process=_process(rig),
+        camera_period_s=found.camera_s, imu_period_s=found.imu_s,
+    )  # fmt: skip
+    return setup, said
+
+
+def baseline_setup(setup: Setup, rig: Rig, path: Path, found: Periods) -> BaselineSetup:
+    """The source's pipeline for the same rig, without what it does not know of."""
+    if rig.camera is None or not found.camera:
+        raise BadInputError(f"{shown(path)}: the baseline needs a camera, a plane, and pictures in the log")
+    x0, y0, x1, y1 = (rig.geometry or Geometry()).workspace_m
+    width, height = rig.camera.image_size_px
+    return BaselineSetup(
+        undistorting_nothing(setup.view, (x0, y0, x1, y1), (width, height)),
+        setup.bellows_radius_m,
+        float(setup.start.head[1]),
+        float(setup.start.sensor[6]),
+        1.0 / found.imu_s if found.imu_s > 0.0 else 100.0,
+        1.0 / found.camera_s if found.camera_s > 0.0 else 60.0,
+    )

@@ -1,0 +1,52 @@
+"""A whole log through filter and smoother; the states written are those of the smoother."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from calib.estimator.consistency import Tally
+from calib.estimator.filter import Filter
+from calib.estimator.setup import OUT, Rows, Setup
+from calib.estimator.smoother import smooth
+from calib.logs import Log
+from calib.replaying import Periods, rows_of, truth_of
+from calib.statesfile import STATES, states_writer
+
+__all__ = ["joined", "smooth_log"]
+
+
+def joined(parts: list[Rows]) -> Rows:
+    """Rows of a log in one piece."""
+    return Rows(
+        np.concatenate([part.t_s for part in parts]),
+        np.concatenate([part.readings for part in parts]),
+        np.concatenate([part.kinds for part in parts]),
+    )
+
+
+def smooth_log(
+    setup: Setup, found: Periods, stream: Iterable[Log], output: Path | None
+) -> tuple[Tally, Tally, list[np.ndarray]]:
+    """Sums of the smoother and of the filter, and for figures its rows with the truth, block by block.
+
+    Raises `BadInputError` where `output` cannot be written.
+    """
+    fused, parts, outs, truths = Filter(setup), [], [], []
+    for log in stream:
+        rows, truth = rows_of(log, found.ticks), truth_of(log)
+        parts.append(rows)
+        outs.append(fused.run(rows))
+        truths.append(np.full((len(log), 3), np.nan) if truth is None else truth)
+    whole, filtered, truth = joined(parts), np.concatenate(outs), np.concatenate(truths)
+    smoothed = smooth(setup, whole, filtered)
+    before, after = Tally(setup.bellows_radius_m), Tally(setup.bellows_radius_m)
+    before.add(filtered, truth)
+    after.add(smoothed, truth)
+    if output is not None:
+        with states_writer(output) as states:
+            states.add(smoothed[:, [OUT.index(name) for name in STATES]])
+    traced = np.concatenate([smoothed, np.full((len(whole), 3), np.nan), truth], axis=1)
+    return after, before, [traced]

@@ -1,0 +1,71 @@
+"""`calib replay --tune`: the section `estimator` of rig.yaml from logs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from calib.errors import BadInputError
+from calib.estimator.noise import tune
+from calib.files import shown
+from calib.replay import Progress, prepared
+from calib.replaying import rows_of
+from calib.rig import Rig
+from calib.rig_estimator import Estimator, EstimatorLevel
+from calib.smoothing import joined
+
+__all__ = ["tuned_section"]
+
+_MOST_ROWS = 20_000
+
+
+def tuned_section(
+    logs: Sequence[Path], rig: Rig, rig_path: Path, progress: Progress | None = None
+) -> Estimator:
+    """Noise by maximum likelihood on the first 20,000 rows of each log.
+
+    Raises `BadInputError` for logs that cannot be used, or without camera and IMU.
+    """
+    every, first = [], None
+    for path in logs:
+        setup, found, stream, _ = prepared(path, rig.model_copy(update={"estimator": None}), rig_path)
+        if not (found.camera and found.imu):
+            raise BadInputError(f"{shown(path)}: tuning needs camera and IMU, and the log lacks one")
+        parts, count = [], 0
+        for log in stream:
+            parts.append(rows_of(log, found.ticks))
+            count += len(log)
+            if count >= _MOST_ROWS:
+                break
+        every.append(joined(parts))
+        first = setup if first is None else first
+    if first is None:
+        raise BadInputError("LOG: none given, expected at least one")
+    found_noise = tune(first, every, progress)
+    sigma = {"jitter_px": found_noise.jitter_px.sigma}
+    sigma |= {name: factor.sigma for name, factor in found_noise.factors.items()}
+    reasons = []
+    if found_noise.jitter_px.sigma is None:
+        reasons.append("the logs do not bound the tracker's jitter")
+    else:
+        sigma["jitter_px"] = found_noise.jitter_px.sigma * found_noise.jitter_px.value
+    return Estimator(
+        jitter_px=found_noise.jitter_px.value,
+        sigma=sigma,
+        levels=[
+            EstimatorLevel(
+                name=level.name,
+                accel_phi_radps2=level.accel_phi_radps2,
+                accel_length_mps2=level.accel_length_mps2,
+                memory_s=level.memory_s,
+                friction_s=level.friction_s,
+                walk_phi_rad_per_sqrt_s=level.walk_phi,
+                walk_length_m_per_sqrt_s=level.walk_length,
+            )
+            for level in found_noise.setup.process.levels
+        ],
+        gain_per_row=(found_noise.after - found_noise.before) / max(found_noise.rows, 1),
+        logs=[shown(path.name) for path in logs],
+        verdict="poor" if reasons else "ok",
+        reasons=reasons,
+    )

@@ -1,0 +1,140 @@
+"""Simulated logs with a set-up of the estimator that errs from the truth within its own deviations."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from calib.arrays import FloatArray
+from calib.estimator.model import Kinematic
+from calib.estimator.sensors import sensor_values, view_coefficients
+from calib.estimator.setup import Rows, Setup, Start
+from calib.logs import Log
+from calib.replaying import periods, rows_of
+from calib.twin.camera_sensor import Tracker
+from calib.twin.rig import SimulatedRig
+from calib.twin.scenarios import make_scenario, run_scenario
+from calib.twin.simulate import log_of
+
+SCENARIOS = {
+    "static": ("static", 15.0),
+    "swing": ("swing", None),
+    "ellipse": ("ellipse", None),
+    "step": ("orientation", None),
+    "elongation": ("elongation", None),
+}
+
+SIGMA = {
+    "gyro_bias_radps": 5e-4,
+    "accel_bias_x_mps2": 0.02,
+    "accel_bias_y_mps2": 2e-3,
+    "mount_angle_rad": 3e-4,
+    "gyro_scale": 1e-3,
+    "imu_lever_m": 3e-4,
+    "marker_offset_m": 3e-5,
+    "time_offset_s": 5e-4,
+    "shift_x_m": 1e-5,
+    "shift_y_m": 1e-5,
+    "stretch": 1e-4,
+    "accel_scale_x": 3e-3,
+    "accel_scale_y": 3e-3,
+}
+"""What a good alignment leaves unknown."""
+
+NOISE = np.array([0.3, 1.0, 0.0158, 0.0158, 0.0026, 0.002, 5e-5, 5e-5, 20.0, 30.0, 25.0])
+
+
+def varied(seed: int) -> SimulatedRig:
+    """A rig whose plant, sensors and latency differ from the nominal one; seed 0 is nominal."""
+    rig = SimulatedRig()
+    if seed == 0:
+        return rig
+    rng = np.random.default_rng(1000 + seed)
+    imu = replace(
+        rig.imu,
+        mount_angle_rad=float(rng.uniform(-0.05, 0.05)),
+        gyro_bias_radps=tuple(rng.normal(0.0, 0.006, 3).tolist()),
+        accel_bias_mps2=tuple(rng.normal(0.0, 0.05, 3).tolist()),
+        gyro_scale=tuple(rng.normal(0.0, 0.005, 3).tolist()),
+        accel_scale=tuple(rng.normal(0.0, 0.003, 3).tolist()),
+    )
+    factor = rng.uniform(0.92, 1.08, 4)
+    plant = replace(
+        rig.plant,
+        stiffness_scale=rig.plant.stiffness_scale * factor[0],
+        damping_scale=rig.plant.damping_scale * factor[1],
+        bending_N_per_rad2=rig.plant.bending_N_per_rad2 * factor[2],
+        mass_kg=rig.plant.mass_kg * factor[3],
+    )
+    strength = 1.0 + rng.uniform(-0.03, 0.03, 2)
+    return replace(
+        rig,
+        imu=imu,
+        plant=plant,
+        pump_strength=(float(strength[0]), float(strength[1])),
+        tracker=replace(rig.tracker, latency_s=float(rng.uniform(0.01, 0.04))),
+    )
+
+
+@cache
+def simulated(name: str, seed: int = 0) -> tuple[SimulatedRig, Log]:
+    """A rig and its log of a scenario."""
+    rig = varied(seed)
+    kind, duration = SCENARIOS[name]
+    return rig, log_of(run_scenario(make_scenario(kind), rig, seed, "sensors", duration))
+
+
+def rows_from(log: Log) -> Rows:
+    """The log's rows as the estimator gets them."""
+    return rows_of(log, periods(log).ticks)
+
+
+def truth_of_sensors(rig: SimulatedRig) -> FloatArray:
+    """The sensors of a rig as a vector."""
+    imu, tracker = rig.imu, rig.tracker
+    return sensor_values(
+        {
+            "gyro_bias_radps": imu.gyro_bias_radps[2],
+            "accel_bias_x_mps2": imu.accel_bias_mps2[0],
+            "accel_bias_y_mps2": imu.accel_bias_mps2[1],
+            "mount_angle_rad": imu.mount_angle_rad,
+            "gyro_scale": imu.gyro_scale[2],
+            "imu_lever_m": imu.lever_m[1],
+            "marker_offset_m": tracker.marker_offset_m,
+            "time_offset_s": tracker.latency_s,
+            "accel_scale_x": imu.accel_scale[0],
+            "accel_scale_y": imu.accel_scale[1],
+        }
+    )
+
+
+def setup_for(
+    rig: SimulatedRig, seed: int = 0, process: Kinematic | None = None, tracker: Tracker | None = None
+) -> Setup:
+    """A set-up whose sensors err from the truth by a draw from their deviations."""
+    rng = np.random.default_rng(seed)
+    sigma = sensor_values(SIGMA)
+    error = sigma * rng.standard_normal(len(sigma))
+    value = truth_of_sensors(rig) + error
+    value[8:11] = 0.0
+    view = rig.view
+    # The calibrated plane shows places shifted by the error.
+    t = view.t_CW_m - view.R_CW[:, 0] * error[8] - view.R_CW[:, 1] * error[9]
+    noise = NOISE.copy()
+    noise[0] = (tracker or rig.tracker).jitter_px
+    return Setup(
+        view_coefficients(view.camera, view.R_CW, t),
+        noise,
+        Start(value, sigma),
+        rig.plant.bellows_radius_m,
+        process=process or Kinematic(),
+        camera_period_s=1.0 / 60.0,
+        imu_period_s=1.0 / rig.imu.rate_hz,
+    )
+
+
+def truth(log: Log) -> FloatArray:
+    """True q1, q2, phi (n, 3)."""
+    return np.stack([log.columns[name] for name in ("true_q1_m", "true_q2_m", "true_phi_rad")], axis=1)
