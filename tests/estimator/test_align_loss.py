@@ -26,8 +26,9 @@ def test_the_pull_is_the_slope_of_the_loss(grid: float, off: tuple[float, float]
         ahead[0, k] += step
         back[0, k] -= step
         slope = (_terms(ahead, 0.35, grid, 0.01)[0] - _terms(back, 0.35, grid, 0.01)[0]) / (2 * step)
-        assert pull[0, k] == pytest.approx(slope, rel=1e-4, abs=1e-6)
-    assert (good[0] < 0.01) == (abs(off[0]) > 5.0)
+        # Beyond six deviations the truncated normal's mean is an approximation; pulls are of the order 3.
+        assert pull[0, k] == pytest.approx(slope, rel=1e-4, abs=1e-5)
+    assert (good[0] < 0.01) == (abs(off[0]) > 2.0)
 
 
 def test_a_picture_that_is_not_finite_has_no_say() -> None:
@@ -50,8 +51,7 @@ def test_readings_have_a_loss_with_a_far_knee() -> None:
     noise = np.array([0.1, 0.2, 0.01])
     off = np.array([[0.05, np.nan, 0.2], [-0.1, 1.6, 0.0]])
     loss, pull, weight = imu_terms(off, noise)
-    z = np.array([0.5, 1.0, 8.0])
-    by_hand = 0.5 * z[0] ** 2 + 0.5 * z[1] ** 2 + 2 * HUBER * (z[2] - 0.5 * HUBER)
+    by_hand = 0.5 * 0.5**2 + 0.5 * 1.0**2 + HUBER * (8.0 - 0.5 * HUBER) + HUBER * (20.0 - 0.5 * HUBER)
     assert loss == pytest.approx(by_hand)
     assert weight[0, 1] == 0.0
     assert pull[0, 1] == 0.0

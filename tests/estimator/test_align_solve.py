@@ -33,7 +33,9 @@ SIGMA = np.array([0.1, 0.3, 0.3, 0.5, 0.02, 0.02, 0.003, 0.05, 5e-5, 5e-5, 1e-3,
 NOISE = Noise(0.3, 0.003, np.array([0.015, 0.015, 0.0025]))
 
 
-def _problem(noisy: bool, seed: int = 0, span_s: float = 0.05, duration_s: float = 4.0) -> tuple[Problem, FloatArray]:
+def _problem(
+    noisy: bool, seed: int = 0, span_s: float = 0.05, duration_s: float = 4.0
+) -> tuple[Problem, FloatArray]:
     """A motion that lies in the spline's space, its exact or noisy readings, and its coefficients."""
     rng = np.random.default_rng(seed)
     knots = Knots.over(-0.06, duration_s + 0.06, span_s)

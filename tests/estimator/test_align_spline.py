@@ -54,9 +54,7 @@ def test_gradients_by_coefficients_and_sensors_against_differences() -> None:
     numbers = view_coefficients(view.camera, view.R_CW, view.t_CW_m)
     knots = Knots.over(0.0, 0.4, 0.05)
     c = np.stack([rng.normal(0.0, 0.3, knots.count), rng.normal(0.075, 0.005, knots.count)], axis=1)
-    sensor = np.array(
-        [0.01, 0.05, -0.03, 0.1, 0.01, 0.006, 0.015, 0.03, 1e-4, -1e-4, 1e-3, 0.002, 0.003]
-    )
+    sensor = np.array([0.01, 0.05, -0.03, 0.1, 0.01, 0.006, 0.015, 0.03, 1e-4, -1e-4, 1e-3, 0.002, 0.003])
     t = rng.uniform(0.05, 0.35, 7)
 
     def predicted(values: np.ndarray) -> np.ndarray:

@@ -72,7 +72,9 @@ def test_what_is_not_told_apart_is_named(found: Alignment) -> None:
     i, j = SENSOR.index("mount_angle_rad"), SENSOR.index("accel_bias_y_mps2")
     rest[i, j] = rest[j, i] = -0.9999 * found.prior[i] * found.prior[j]
     judged = judge_align(replace(found, covariance=rest))
-    assert any("the mount angle and the accelerometer's bias along y are nearly one" in r for r in judged.remarks)
+    assert any(
+        "the mount angle and the accelerometer's bias along y are nearly one" in r for r in judged.remarks
+    )
     assert any("next to nothing of the gyroscope's bias" in remark for remark in judged.remarks)
     a, b = SENSOR.index("gyro_scale"), SENSOR.index("marker_offset_m")
     rest[a, b] = rest[b, a] = 0.99 * found.prior[a] * found.prior[b]
