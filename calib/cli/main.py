@@ -10,7 +10,6 @@ import io
 import os
 import re
 import sys
-import threading
 import traceback
 import warnings
 from typing import NoReturn
@@ -39,8 +38,8 @@ def main() -> NoReturn:
         if not sys.warnoptions and not debug:
             warnings.simplefilter("ignore")
         code = _flushed(_run(debug))
-    if threading.active_count() > 1 and code == _EXIT_INTERRUPTED:
-        # Pictures are still being searched; nothing waits for them any more.
+    if code == _EXIT_INTERRUPTED:
+        # Nothing waits for threads and processes that are still searching, or were just being started.
         os._exit(code)
     sys.exit(code)
 
