@@ -18,6 +18,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from calib import __version__
 from calib.errors import BadInputError
 from calib.files import one_line, read_bytes, read_yaml_mapping, sha256, shown, write_atomically
+from calib.rig_align import Align
+from calib.rig_controller import Controller
 from calib.rig_estimator import Estimator
 from calib.rig_filter import OrientationFilter
 from calib.rig_imu import Imu
@@ -25,6 +27,7 @@ from calib.rig_imu_intrinsics import ImuIntrinsics
 from calib.rig_lowpass import LowPass
 
 __all__ = [
+    "Align",
     "Camera",
     "CovarianceTable",
     "Distortion",
@@ -223,7 +226,9 @@ class Rig(BaseModel):
     imu_intrinsics: ImuIntrinsics | None = None
     orientation_filter: OrientationFilter | None = None
     lowpass: LowPass | None = None
+    align: Align | None = None
     estimator: Estimator | None = None
+    controller: Controller | None = None
     provenance: Provenance = Provenance()
 
 

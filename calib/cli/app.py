@@ -7,7 +7,9 @@ import sys
 import typer
 
 from calib import __version__
+from calib.cli.align import align
 from calib.cli.board import board
+from calib.cli.control import control
 from calib.cli.distortion import distortion
 from calib.cli.exchange import export_camera, import_camera
 from calib.cli.extrinsics import extrinsics
@@ -50,7 +52,9 @@ app.command("extrinsics")(extrinsics)
 app.command("distortion")(distortion)
 app.command("lowpass")(lowpass)
 app.add_typer(imu, name="imu")
+app.command("align")(align)
 app.command("replay")(replay)
+app.add_typer(control, name="control")
 app.command("firmware")(firmware)
 app.command("board")(board)
 app.command("simulate")(simulate)

@@ -30,10 +30,16 @@ _F_SERIES = tuple(float(c) for c in inverse_coefficients())
 
 @dataclass(frozen=True)
 class Seen:
-    """What a controller is given: the head's angle [rad] and the bellows' lengths [m]."""
+    """What a controller is given: the head's angle [rad] and the bellows' lengths [m].
+
+    With sensors also the readings since the last tick, for a controller with an observer of its own:
+    the marker [px], NaN where nothing was found, and (ax, ay, gz) of each IMU sample.
+    """
 
     phi_rad: float
     q_m: tuple[float, float]
+    marker_px: tuple[float, float] = (math.nan, math.nan)
+    imu: tuple[tuple[float, float, float], ...] = ()
 
 
 @dataclass(frozen=True)

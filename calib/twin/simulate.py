@@ -13,7 +13,7 @@ sample in between. Its true_* columns are the state at the row's own time stamp.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -167,15 +167,17 @@ class _Eyes:
     def look(self, k: int, past: Trajectory) -> Seen:
         sensors = self.sensors
         samples = slice(int(sensors.due[k - 1]) if k else 0, int(sensors.due[k]))
+        readings: list[tuple[float, float, float]] = []
         if samples.stop > samples.start:
             sensors.take_samples(past, samples)
             force, rate = sensors.accel[samples].tolist(), sensors.gyro[samples].tolist()
-            for (ax, ay, _), (_, _, gz) in zip(force, rate, strict=True):
+            readings = [(ax, ay, gz) for (ax, ay, _), (_, _, gz) in zip(force, rate, strict=True)]
+            for ax, ay, gz in readings:
                 self.state = add_imu(self.firmware, self.state, ax, ay, gz)
         sensors.take_frames(past, slice(k, k + 1))
         u, v = sensors.pixels[k].tolist()
         self.state, seen = add_frame(self.firmware, self.state, u, v)
-        return seen
+        return replace(seen, marker_px=(u, v), imu=tuple(readings))
 
 
 def _truth(row: FloatArray, bellows_radius_m: float) -> Seen:

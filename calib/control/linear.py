@@ -1,0 +1,211 @@
+"""The loops for small motion about a rest: plant, pumps, delay, hold and controller in discrete time.
+
+At a rest the plant is `dynamics.linearised` with the slope of the pump's static map as its input,
+
+    x = (q, dq, z, F),   dF/dt = (g'(u0) u - F) / tau,
+
+held over a tick (zero-order hold, exact by the matrix exponential) and delayed by whole ticks. The limit
+on the falling rate is no part of it: it does not act on small motion. Controllers are (D.6). What the
+firmware makes of its sensors may be in between: the length from the camera, one latency late and
+low-passed, the angle as it is (the gyroscope carries its fast part).
+
+Everything here is a `System`, x' = A x + B u, y = C x + D u with a period; `response` gives its
+frequency response.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from calib.actuator.dynamics import input_forces, linearised, mass_matrix
+from calib.arrays import FloatArray
+from calib.control.inverse_model import Model, force_of_pwm, holding_force, pwm_of_force
+from calib.control.pid import Pid
+from calib.errors import BadInputError
+
+__all__ = [
+    "System",
+    "bent_rest",
+    "closed_loop",
+    "delay",
+    "firmware_sensing",
+    "gain",
+    "pid_system",
+    "pump_slope",
+    "response",
+    "rig_system",
+    "series",
+    "side_by_side",
+    "spectral_radius",
+]
+
+ComplexArray = npt.NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class System:
+    """A discrete linear system with matrices A (n, n), B (n, m), C (p, n), D (p, m)."""
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    tick_s: float
+
+
+def gain(matrix: FloatArray, tick_s: float) -> System:
+    """A system without memory."""
+    D = np.atleast_2d(np.asarray(matrix, dtype=np.float64))
+    p, m = D.shape
+    return System(np.zeros((0, 0)), np.zeros((0, m)), np.zeros((p, 0)), D, tick_s)
+
+
+def series(first: System, second: System) -> System:
+    """`second` after `first`."""
+    n1, n2 = len(first.A), len(second.A)
+    A = np.zeros((n1 + n2, n1 + n2))
+    A[:n1, :n1], A[n1:, n1:] = first.A, second.A
+    A[n1:, :n1] = second.B @ first.C
+    return System(
+        A,
+        np.vstack([first.B, second.B @ first.D]),
+        np.hstack([second.D @ first.C, second.C]),
+        second.D @ first.D,
+        first.tick_s,
+    )
+
+
+def side_by_side(one: System, other: System) -> System:
+    """Both with inputs and outputs of their own."""
+
+    def corner(a: FloatArray, b: FloatArray) -> FloatArray:
+        out = np.zeros((a.shape[0] + b.shape[0], a.shape[1] + b.shape[1]))
+        out[: a.shape[0], : a.shape[1]] = a
+        out[a.shape[0] :, a.shape[1] :] = b
+        return out
+
+    return System(
+        corner(one.A, other.A), corner(one.B, other.B), corner(one.C, other.C), corner(one.D, other.D),
+        one.tick_s,
+    )  # fmt: skip
+
+
+def delay(ticks: int, tick_s: float) -> System:
+    """One channel, some ticks late."""
+    if ticks == 0:
+        return gain(np.eye(1), tick_s)
+    A = np.eye(ticks, k=-1)
+    B, C = np.zeros((ticks, 1)), np.zeros((1, ticks))
+    B[0, 0] = C[0, -1] = 1.0
+    return System(A, B, C, np.zeros((1, 1)), tick_s)
+
+
+def response(system: System, omega: FloatArray) -> ComplexArray:
+    """Frequency response (k, p, m) at angular frequencies (k,) [rad/s]."""
+    z = np.exp(1j * np.asarray(omega) * system.tick_s)
+    n = len(system.A)
+    if n == 0:
+        return np.broadcast_to(system.D.astype(np.complex128), (len(z), *system.D.shape)).copy()
+    inner = np.linalg.solve(
+        z[:, None, None] * np.eye(n) - system.A, np.broadcast_to(system.B, (len(z), *system.B.shape))
+    )
+    return np.asarray(system.C @ inner + system.D, dtype=np.complex128)
+
+
+def closed_loop(loop: System) -> System:
+    """From the reference to the output of a square loop with negative feedback."""
+    back = np.linalg.inv(np.eye(len(loop.D)) + loop.D)
+    return System(loop.A - loop.B @ back @ loop.C, loop.B @ back, back @ loop.C, back @ loop.D, loop.tick_s)
+
+
+def spectral_radius(system: System) -> float:
+    """Largest magnitude of the eigenvalues; below 1 the system is stable."""
+    return float(np.abs(np.linalg.eigvals(system.A)).max()) if len(system.A) else 0.0
+
+
+def pid_system(pid: Pid) -> System:
+    """(D.6) as a system: the sum of the past errors times h, and the last error, each where it is used."""
+    h, I, D = pid.tick_s, pid.Ki != 0.0, pid.Kd != 0.0  # noqa: E741  the field's letters
+    used = [i for i, wanted in enumerate((I, D)) if wanted]
+    A, B = np.diag([1.0, 0.0]), np.array([[h], [1.0]])
+    C = np.array([[pid.Ki, -pid.Kd / h]])
+    whole = np.array([[pid.Kp + 0.5 * h * pid.Ki + pid.Kd / h]])
+    return System(A[np.ix_(used, used)], B[used], C[:, used], whole, h)
+
+
+def pump_slope(model: Model, q_m: FloatArray) -> FloatArray:
+    """dg/du (2,) [N/PWM] of the static maps where they hold the lengths (2,); 0 outside their limits."""
+    force = holding_force(model.plant, q_m)
+    pwm = pwm_of_force(model, force)
+    step = 1.0
+    low, high = np.maximum(pwm - step, model.low_pwm), np.minimum(pwm + step, model.high_pwm)
+    slope = (force_of_pwm(model, high) - force_of_pwm(model, low)) / (high - low)
+    held = (force > 1e-9) & (force <= force_of_pwm(model, np.full(2, model.high_pwm)))
+    return np.asarray(np.where(held, slope, 0.0))
+
+
+def bent_rest(model: Model, phi_rad: float) -> FloatArray:
+    """Lengths (2,) [m] at rest at an angle [rad] with one pump alone.
+
+    Raises `BadInputError` for an angle at which no length satisfies this.
+    """
+    from scipy.optimize import brentq
+
+    plant = model.plant
+    half, idle = plant.bellows_radius_m * phi_rad, 1 if phi_rad >= 0.0 else 0
+
+    def rest(l: float) -> float:  # noqa: E741  the source's symbol
+        return float(holding_force(plant, np.array([l + half, l - half]))[idle])
+
+    low, high = max(abs(half) * 1.001, 0.2 * plant.rest_length_m), 3.0 * plant.rest_length_m
+    if not (low < high and rest(low) < 0.0 < rest(high)):
+        raise BadInputError(
+            f"angle: found {phi_rad:g} rad, at which no length is at rest with one pump, expected a "
+            "smaller one"
+        )
+    l = float(brentq(rest, low, high, xtol=1e-12))  # noqa: E741  the source's symbol
+    return np.array([l + half, l - half])
+
+
+def rig_system(model: Model, q_m: FloatArray, extra_delay_ticks: int = 0) -> System:
+    """From PWM (2,) to lengths (2,) [m] about the rest at the lengths (2,) [m].
+
+    Raises `BadInputError` for forces in the head's projection, for which no linear model is known here.
+    """
+    from scipy.linalg import expm
+
+    plant, h = model.plant, model.tick_s
+    if plant.force_projection != "virtual_work":
+        raise BadInputError("margins: force_projection is 'head', expected 'virtual_work'")
+    q = np.asarray(q_m, dtype=np.float64)
+    A, B = np.zeros((8, 8)), np.zeros((8, 2))
+    A[:6, :6] = linearised(plant, q)
+    A[2:4, 6:] = np.linalg.solve(mass_matrix(plant, q), input_forces(plant, np.tile(q, (2, 1)), np.eye(2)).T)
+    A[6:, 6:] = -np.eye(2) / model.pump.lag_s
+    B[6:] = np.diag(pump_slope(model, q)) / model.pump.lag_s
+    block = np.zeros((10, 10))
+    block[:8, :8], block[:8, 8:] = A, B
+    held = expm(h * block)
+    C = np.zeros((2, 8))
+    C[0, 0] = C[1, 1] = 1.0
+    late = delay(model.pump.delay_ticks + extra_delay_ticks, h)
+    return series(side_by_side(late, late), System(held[:8, :8], held[:8, 8:], C, np.zeros((2, 2)), h))
+
+
+def firmware_sensing(model: Model, cutoff_hz: float = 1.0, latency_s: float = 0.025) -> System:
+    """Lengths (2,) as the firmware sees them: their mean late and low-passed, their difference at once."""
+    from scipy.signal import butter
+
+    h = model.tick_s
+    b, a = butter(1, cutoff_hz, fs=1.0 / h)
+    low = System(
+        np.array([[-a[1]]]), np.array([[1.0]]), np.array([[b[1] - b[0] * a[1]]]), np.array([[b[0]]]), h
+    )
+    length = series(delay(math.ceil(latency_s / h - 1e-9), h), low)
+    apart = gain(np.array([[0.5, 0.5], [0.5, -0.5]]), h)
+    together = gain(np.array([[1.0, 1.0], [1.0, -1.0]]), h)
+    return series(series(apart, side_by_side(length, gain(np.eye(1), h))), together)

@@ -1,0 +1,210 @@
+"""`calib control` from the command line: what it says and writes, and how it ends."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calib.rig import read_rig
+
+Run = Callable[..., Any]
+
+
+def test_run_compares_controllers(calib: Run, tmp_path: Path) -> None:
+    words = ("control", "run", "jump", "--controller", "clamping", "--controller", "back")
+    ended = calib(*words, "--figures", "drawn", cwd=tmp_path)
+    assert ended.code == 0, ended.err
+    assert "jump: 10 s at 60 Hz, feedback from sensors" in ended.out
+    assert "after jump" in ended.out and "  clamping" in ended.out and "  back" in ended.out
+    assert "the pumps cannot follow it: at 0.00 s" in ended.out
+    assert {path.name for path in (tmp_path / "drawn").iterdir()} == {"control_run.png"}
+    assert not (tmp_path / "rig.yaml").exists()
+
+
+def test_run_as_one_json_document_and_the_same_again(calib: Run, tmp_path: Path) -> None:
+    words = ("control", "run", "elongation", "--duration", "2s", "--json", "--seed", "3")
+    first, again = calib(*words, cwd=tmp_path), calib(*words, cwd=tmp_path)
+    assert first.code == 0 and first.out == again.out
+    told = json.loads(first.out)
+    assert (told["schema"], told["verb"]) == (1, "control run")
+    runs = {one["controller"]: one for one in told["control"]["runs"]}
+    assert set(runs) == {"pd", "pd+ff", "pd+map", "torque"}
+    assert max(runs["torque"]["rms_mm"]) < min(runs["pd"]["rms_mm"])
+    assert runs["pd"]["rise_s"] is None and told["control"]["possible"] is True
+
+
+@pytest.mark.slow
+def test_tune_writes_the_section_that_run_then_uses(calib: Run, tmp_path: Path) -> None:
+    ended = calib("control", "tune", "--figures", "drawn", cwd=tmp_path)
+    assert ended.code == 0, ended.err
+    assert "orientation: Kp = 470 PWM/rad, Ki = 1000 PWM/rad/s" in ended.out
+    assert "orientation, PID 1000/1000/10" in ended.out and "unstable" in ended.out
+    assert "verdict: ok" in ended.out
+    text = (tmp_path / "rig.yaml").read_text()
+    section = read_rig(tmp_path / "rig.yaml").controller
+    assert section is not None
+    assert section.orientation.Kp_pwm_per_rad == 470.0
+    assert all(row.stable and (row.gain or 99.0) > 1.96 for row in section.margins)
+    assert (tmp_path / "drawn" / "control_margins.png").exists()
+    again = calib("control", "tune", "--json", cwd=tmp_path)
+    assert (tmp_path / "rig.yaml").read_text() == text
+    told = json.loads(again.out)
+    assert told["controller"]["orientation"]["Kp_pwm_per_rad"] == 470.0
+    assert set(told["source_margins"]) == {"PID 1000/1000/10", "PD 15000/150", "PD 10000/1000"}
+    ended = calib("control", "run", "step", "--controller", "tuned-pid", "--duration", "2s", cwd=tmp_path)
+    assert ended.code == 0 and "tuned-pid" in ended.out
+
+
+@pytest.mark.slow
+def test_provenance_names_what_the_gains_follow_from(calib: Run, tmp_path: Path) -> None:
+    rig = tmp_path / "rig.yaml"
+    rig.write_text("actuator: {mass_kg: 0.017}\npump: {lag_s: 0.6}\n")
+    assert calib("control", "tune", cwd=tmp_path).code == 0
+    first = read_rig(rig).provenance.inputs["controller"]
+    assert set(first) == {"actuator", "pump"}
+    rig.write_text(rig.read_text().replace("lag_s: 0.6", "lag_s: 0.65"))
+    assert calib("control", "tune", cwd=tmp_path).code == 0
+    second = read_rig(rig).provenance.inputs["controller"]
+    assert second["actuator"] == first["actuator"] and second["pump"] != first["pump"]
+
+
+def test_check_names_the_first_second_and_writes_a_slower_one(calib: Run, tmp_path: Path) -> None:
+    t = np.arange(0.0, 8.0, 1.0 / 60.0)
+    turn = 2.0 * np.pi * t / 8.0
+    rows = [
+        f"{a:.6f},{b:.9f},{c:.9f}"
+        for a, b, c in zip(t, -0.015 * np.sin(turn), 0.078 - 0.01 * np.cos(turn), strict=True)
+    ]
+    (tmp_path / "fast.csv").write_text("\n".join(["t_s,x_m,y_m", *rows]) + "\n")
+    ended = calib("control", "check", "fast.csv", "--slow", "slow.csv", "--figures", "f", cwd=tmp_path)
+    assert ended.code == 1
+    assert "verdict: the pumps cannot follow it from 4.5" in ended.out
+    assert "bellows 2 would have to deflate at" in ended.out
+    assert (tmp_path / "f" / "control_check.png").exists()
+    ended = calib("control", "check", "slow.csv", "--json", cwd=tmp_path)
+    assert ended.code == 0, ended.err
+    told = json.loads(ended.out)
+    assert told["control"]["possible"] is True and 9.0 < told["control"]["duration_s"] < 14.0
+
+
+def test_check_of_what_no_slowness_helps(calib: Run, tmp_path: Path) -> None:
+    rows = [f"{k / 10},{0.08 + 0.0002 * k:.6f},{0.08 + 0.0002 * k:.6f}" for k in range(71)]
+    (tmp_path / "long.csv").write_text("\n".join(["t_s,q1_m,q2_m", *rows]) + "\n")
+    ended = calib("control", "check", "long.csv", "--slow", "slow.csv", cwd=tmp_path)
+    assert ended.code == 1
+    assert "cannot be held by the pumps at any speed" in ended.out
+    assert not (tmp_path / "slow.csv").exists()
+
+
+def test_a_simulated_log_as_reference(calib: Run, tmp_path: Path) -> None:
+    words = ("simulate", "ellipse", "-o", "log.csv", "--duration", "4s")
+    assert calib(*words, cwd=tmp_path).code == 0
+    ended = calib("control", "run", "log.csv", "--controller", "torque", "--json", cwd=tmp_path)
+    assert ended.code == 0, ended.err
+    (one,) = json.loads(ended.out)["control"]["runs"]
+    assert max(one["rms_mm"]) < 0.4
+
+
+def test_the_plant_of_the_file_is_controlled(calib: Run, tmp_path: Path) -> None:
+    """A slower pump reaches the angle later."""
+
+    def rise() -> float:
+        ended = calib("control", "run", "step", "--controller", "pid", "--json", cwd=tmp_path)
+        return float(json.loads(ended.out)["control"]["runs"][0]["rise_s"])
+
+    nominal = rise()
+    (tmp_path / "rig.yaml").write_text("pump: {lag_s: 1.2}\n")
+    assert rise() > 1.3 * nominal
+
+
+@pytest.mark.parametrize(
+    ("verb", "text", "sentence"),
+    [
+        ("run", "t_s,q1_m,q2_m\n0,0.07,0.07\n1,nan,0.07\n2,0.07,0.07\n", "ref.csv, line 3: q1_m is nan"),
+        ("check", "t_s,q1_m,q2_m\n0,.07,.07\n2,.07,.07\n1,.07,.07\n", "ref.csv, line 4: t_s is 1 after 2"),
+        (
+            "check",
+            "t_s,q1_m,q2_m\n0,.07,.07\n1,.07,.07\n",
+            "ref.csv: has 2 rows over 1 s, expected at least 3",
+        ),
+        ("check", "t_s,q1_m,q2_m\n0,.07,.07\n1,.13,.13\n2,.1,.1\n", "outside the workspace"),
+        ("run", "t_s,q1_m,q2_m\n0,.07,.07\n1,-.1,.1\n2,.1,.1\n", "expected a positive length"),
+        ("run", "t_s,u_px\n0,1\n", "ref.csv: has no reference in it"),
+    ],
+)
+def test_references_that_cannot_be_used(
+    calib: Run, tmp_path: Path, verb: str, text: str, sentence: str
+) -> None:
+    (tmp_path / "ref.csv").write_text(text)
+    ended = calib("control", verb, "ref.csv", cwd=tmp_path)
+    assert ended.code == 3
+    assert sentence in ended.sentence
+
+
+@pytest.mark.parametrize("verb", [("run", "step"), ("check", "step"), ("tune",)])
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("actuator: {lambda1_per_s: -0.1047, lambda2_N_per_m: -14.98, lambda3: -1.854}\n", "make the plant"),
+        ("pump: {lag_s: 700}\n", "rig.yaml: pump.lag_s is 700, expected seconds between"),
+        ("controller: {pwm_low: 9.0}\n", "rig.yaml: controller.tick_s is missing"),
+    ],
+)
+def test_rigs_that_cannot_be_controlled(
+    calib: Run, tmp_path: Path, verb: tuple[str, ...], text: str, sentence: str
+) -> None:
+    (tmp_path / "rig.yaml").write_text(text)
+    ended = calib("control", *verb, cwd=tmp_path)
+    assert ended.code == 3
+    assert sentence in ended.sentence
+    assert (tmp_path / "rig.yaml").read_text() == text
+
+
+@pytest.mark.parametrize("limits", ["200,100", "0,300", "0,90", "0.5,200"])
+def test_limits_that_no_motor_has(calib: Run, tmp_path: Path, limits: str) -> None:
+    ended = calib("control", "check", "ellipse", "--pwm-limits", limits, cwd=tmp_path)
+    assert ended.code == 3
+    assert "PWM limits:" in ended.sentence
+
+
+def test_limits_change_what_is_reached(calib: Run, tmp_path: Path) -> None:
+    ended = calib("control", "check", "ellipse", "--pwm-limits", "0,200", cwd=tmp_path)
+    assert ended.code == 1
+    assert "its pump gives at most" in ended.out or "lag does not allow" in ended.out
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("run", "step", "--controller", "lqr"), "--controller: 'lqr' is not one of p, pid"),
+        (("run", "step", "--feedback", "guess"), "--feedback: 'guess' is not one of"),
+        (("run", "step", "--pwm-limits", "all"), "--pwm-limits: 'all' is not two numbers"),
+        (("run", "step", "--pwm-limits", "0,nan"), "--pwm-limits: '0,nan' is not two finite numbers"),
+        (("run", "step", "--duration", "5"), "--duration: '5' has no unit"),
+        (("tune", "--gain-margin", "1"), "gain margin: found 1"),
+        (("tune", "--phase-margin", "95deg"), "phase margin: found 95 deg"),
+    ],
+)
+def test_words_that_do_not_fit(calib: Run, tmp_path: Path, words: tuple[str, ...], sentence: str) -> None:
+    ended = calib("control", *words, cwd=tmp_path)
+    assert ended.code == 2
+    assert sentence in ended.sentence
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("run", "circle"), "circle: is no such file and none of the references elongation"),
+        (("run", "step", "--controller", "tuned-pid"), "no gains have been tuned"),
+        (("tune", "--gain-margin", "99"), "no gains reach a gain margin of 99"),
+    ],
+)
+def test_what_is_not_there(calib: Run, tmp_path: Path, words: tuple[str, ...], sentence: str) -> None:
+    ended = calib("control", *words, cwd=tmp_path)
+    assert ended.code == 3
+    assert sentence in ended.sentence
