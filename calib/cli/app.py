@@ -14,6 +14,7 @@ from calib.cli.distortion import distortion
 from calib.cli.exchange import export_camera, import_camera
 from calib.cli.extrinsics import extrinsics
 from calib.cli.firmware import firmware
+from calib.cli.identify import identify
 from calib.cli.imu import imu
 from calib.cli.intrinsics import intrinsics
 from calib.cli.lowpass import lowpass
@@ -54,6 +55,7 @@ app.command("lowpass")(lowpass)
 app.add_typer(imu, name="imu")
 app.command("align")(align)
 app.command("replay")(replay)
+app.add_typer(identify, name="identify")
 app.add_typer(control, name="control")
 app.command("firmware")(firmware)
 app.command("board")(board)

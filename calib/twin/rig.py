@@ -143,7 +143,7 @@ _THOUSANDTHS = {
     "N/rad^2": "mN/rad^2",
     "seconds": "milliseconds",
 }
-_REMARKS = ("sigma", "covariance", "verdict", "reasons", "remarks", "advice")
+_REMARKS = ("sigma", "covariance", "verdict", "reasons", "remarks", "advice", "identified")
 
 Section = TypeVar("Section")
 

@@ -1,0 +1,197 @@
+"""`calib identify` from the command line: what it writes and says, and how it ends."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from identifytrials import log_file, pump_records
+
+from calib.actuator.identify_pump_models import LAG
+from calib.twin.rig import SimulatedRig
+
+Run = Callable[..., Any]
+
+
+@pytest.fixture(scope="module")
+def swings(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("swings")
+    angles = ("0.5", "-0.4")
+    return [
+        log_file(folder / f"swing{k}.csv", SimulatedRig(), "swing", k, 5.0, phi_rad=phi)
+        for k, phi in enumerate(angles)
+    ]
+
+
+@pytest.fixture(scope="module")
+def tables(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder, paths = tmp_path_factory.mktemp("tables"), []
+    for record in pump_records(LAG, np.array([0.06, 25.0, 0.5, 1e6]), 3):
+        path = folder / f"{record.name}.csv"
+        rows = np.stack([record.t_s, record.pwm, record.value], axis=1).tolist()
+        path.write_text("Time,PWM,Pressure\n" + "".join(",".join(f"{c:.6g}" for c in r) + "\n" for r in rows))
+        paths.append(path)
+    return paths
+
+
+def _edit(path: Path, to: Path, change: Callable[[list[str], dict[str, int]], list[str] | None]) -> Path:
+    """A copy of a log with its rows changed or, where `change` says None, left out."""
+    lines = path.read_text().splitlines()
+    where = {name: k for k, name in enumerate(lines[0].split(","))}
+    rows = [change(line.split(","), where) for line in lines[1:]]
+    to.write_text("\n".join([lines[0], *(",".join(r) for r in rows if r is not None)]) + "\n")
+    return to
+
+
+def test_swings_fill_the_section(calib: Run, rig: Path, swings: list[Path], tmp_path: Path) -> None:
+    ended = calib("identify", *swings, "--rig", rig, "--figures", tmp_path / "figures")
+    assert ended.code in (0, 1)
+    for words in (
+        "stiffness_scale",
+        "lambda2 and lambda3 enter only as a product",
+        "held phi",
+        "zeta by peaks",
+    ):
+        assert words in ended.out
+    section = yaml.safe_load(rig.read_text())["actuator"]
+    for name, truth in (("stiffness_scale", 1.0), ("damping_scale_free_swing", 3.3), ("lambda1_per_s", 3.0)):
+        assert abs(section[name] - truth) < 4.0 * section["sigma"][name]
+    assert set(yaml.safe_load(rig.read_text())["provenance"]["inputs"]["actuator"]) == {
+        p.name for p in swings
+    }
+    assert (tmp_path / "figures" / "identify_motion.png").exists()
+    # The simulation takes the file as it is.
+    assert calib("simulate", "swing", "-o", tmp_path / "x.csv", "--rig", rig, "--duration", "1s").code == 0
+
+
+def test_one_document_and_the_same_bytes(
+    calib: Run, rig_text: str, swings: list[Path], tmp_path: Path
+) -> None:
+    texts, document = [], {}
+    for name in ("a.yaml", "b.yaml"):
+        path = tmp_path / name
+        path.write_text(rig_text)
+        ended = calib("identify", "logs", *swings, "--rig", path, "--json", "--no-hold-back")
+        document = json.loads(ended.out)
+        texts.append(path.read_bytes())
+    assert texts[0] == texts[1]
+    assert (document["schema"], document["verb"]) == (1, "identify")
+    assert set(document["identify"]["parameters"]) == set(document["identify"]["correlation"]["order"])
+    assert {p["name"] for p in document["identify"]["next"]} == {
+        "static",
+        "swing",
+        "step",
+        "ellipse",
+        "elongation",
+    }
+
+
+def test_logs_that_cannot_be_used_end_in_a_sentence(
+    calib: Run, rig: Path, swings: list[Path], tmp_path: Path
+) -> None:
+    log = swings[0]
+
+    def late(row: list[str], where: dict[str, int]) -> list[str]:
+        t = float(row[where["t_s"]])
+        row[where["t_s"]] = f"{t + (60.0 if t > 2.0 else 0.0):.6f}"
+        return row
+
+    def short(row: list[str], where: dict[str, int]) -> list[str] | None:
+        return row if float(row[where["t_s"]]) < 0.4 else None
+
+    def mute(row: list[str], where: dict[str, int]) -> list[str]:
+        row[where["pwm1"]] = row[where["pwm2"]] = ""
+        return row
+
+    def blind(row: list[str], where: dict[str, int]) -> list[str]:
+        if row[where["u_px"]]:
+            row[where["u_px"]] = "nan"
+        return row
+
+    for change, words in (
+        (late, "the clock jumps"),
+        (short, "expected at least 40"),
+        (mute, "has no commands"),
+        (blind, "has no marker"),
+    ):
+        ended = calib("identify", _edit(log, tmp_path / "log.csv", change), "--rig", rig)
+        assert ended.code == 3
+        assert words in ended.sentence
+    assert "actuator" not in yaml.safe_load(rig.read_text())
+
+
+def test_a_log_at_rest_names_what_it_cannot_tell(calib: Run, rig: Path, tmp_path: Path) -> None:
+    still = log_file(tmp_path / "static.csv", SimulatedRig(), "static", 0, 4.0)
+    ended = calib("identify", still, "--rig", rig)
+    assert ended.code == 3
+    for words in ("cannot tell any parameter", "stiffness_scale", "bending_N_per_rad2", "lambda1_per_s"):
+        assert words in ended.sentence
+
+
+def test_a_log_that_excites_little_is_unidentifiable(calib: Run, rig: Path, tmp_path: Path) -> None:
+    steps = log_file(tmp_path / "steps.csv", SimulatedRig(), "steps", 0, 8.0)
+    ended = calib("identify", steps, "--rig", rig)
+    assert ended.code == 1
+    assert "verdict: unidentifiable" in ended.out
+    assert "bending_N_per_rad2 is not identifiable from these logs" in ended.out
+    assert "next experiment" in ended.out
+
+
+def test_usage(calib: Run, rig: Path, swings: list[Path]) -> None:
+    assert calib("identify", *swings, "--states", swings[0], "--rig", rig).code == 2
+    assert calib("identify", "--help").code == 0
+
+
+def test_a_pump_and_both_its_models(calib: Run, tables: list[Path], tmp_path: Path) -> None:
+    rig = tmp_path / "rig.yaml"
+    ended = calib(
+        "identify", "pump", *tables[:2], "--held", tables[2], "--rig", rig, "--figures", tmp_path / "f"
+    )
+    assert ended.code in (0, 1)
+    for words in ("linear lag", "orifice flow", "RMS on files not fitted, kPa", "RMS on the tables kept out"):
+        assert words in ended.out
+    section = yaml.safe_load(rig.read_text())["pump"]
+    assert section["lag_s"] == pytest.approx(0.5, rel=0.03)
+    assert section["identified"]["better"] == "linear lag"
+    assert (tmp_path / "f" / "pump_runs.png").exists()
+    document = json.loads(calib("identify", "pump", *tables[:1], "--rig", rig, "--json").out)
+    assert document["verb"] == "identify pump"
+
+
+def test_pump_tables_that_cannot_be_used(calib: Run, tables: list[Path], tmp_path: Path) -> None:
+    path = tmp_path / "bad.csv"
+    text = tables[0].read_text()
+    for changed, words in (
+        (text.replace("Pressure", "Flow"), "has no pressure or force"),
+        (text.replace("PWM", "Duty"), "has no PWM"),
+        ("\n".join(text.splitlines()[:6]) + "\n", "has 5 rows"),
+        (text.replace("\n0.5,", "\n90.5,"), "time"),
+        (text.replace("\n0.5,", "\n0.5,nan,"), "cells"),
+    ):
+        path.write_text(changed)
+        ended = calib("identify", "pump", path, "--rig", tmp_path / "rig.yaml")
+        assert ended.code == 3
+        assert words in ended.sentence
+
+
+def test_springs_from_weights(calib: Run, tmp_path: Path) -> None:
+    eps = np.linspace(0.003, 0.026, 9)
+    mass_g = 2.0 * (47.7 + 1092.9 * eps) * eps / 9.81e-3
+    path, rig = tmp_path / "weights.csv", tmp_path / "rig.yaml"
+    path.write_text(
+        "mass_g,elongation_mm\n"
+        + "".join(f"{m:.4f},{1e3 * e:.4f}\n" for m, e in zip(mass_g, eps, strict=True))
+    )
+    ended = calib("identify", "stiffness", path, "--rig", rig, "--figures", tmp_path / "f")
+    assert ended.code == 0
+    assert "order 2 (used)" in ended.out
+    section = yaml.safe_load(rig.read_text())["actuator"]
+    assert section["k0_N_per_m"] == pytest.approx(47.7, rel=1e-3)
+    assert (tmp_path / "f" / "identify_stiffness.png").exists()
+    path.write_text("mass_g\n1\n")
+    assert calib("identify", "stiffness", path, "--rig", rig).code == 3
