@@ -10,6 +10,7 @@ import io
 import os
 import re
 import sys
+import threading
 import traceback
 import warnings
 from typing import NoReturn
@@ -38,10 +39,16 @@ def main() -> NoReturn:
         if not sys.warnoptions and not debug:
             warnings.simplefilter("ignore")
         code = _flushed(_run(debug))
-    if code == _EXIT_INTERRUPTED:
+    if code == _EXIT_INTERRUPTED and _still_working():
         # Nothing waits for threads and processes that are still searching, or were just being started.
         os._exit(code)
     sys.exit(code)
+
+
+def _still_working() -> bool:
+    import multiprocessing
+
+    return threading.active_count() > 1 or bool(multiprocessing.active_children())
 
 
 def _run(debug: bool) -> int:
