@@ -17,17 +17,14 @@ from calib.camera.intrinsics import Intrinsics
 from calib.camera.model import COEFFICIENTS, MODELS, Camera
 from calib.camera.plane import Plane
 from calib.camera.projection import INTRINSICS
-from calib.camera.undistortion import fit_inverse
 from calib.errors import BadInputError
 from calib.files import shown
-from calib.firmware.header import CameraConstants, camera_constants
 
 __all__ = [
     "camera_covariance",
     "camera_from_section",
     "camera_section",
     "current_plane",
-    "firmware_constants",
     "image_grid",
     "imported_camera_section",
     "lens_section",
@@ -35,10 +32,6 @@ __all__ = [
     "plane_section",
     "plane_view",
 ]
-
-_INVERSE_PX = 0.1
-_INVERSE_SHARE = 0.9
-"""A header is marked when its polynomial undoes the lens worse than this, or in less of the picture."""
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -291,32 +284,4 @@ def lens_section(report: DistortionReport) -> rig.Lens:
         ),
         verdict="negligible" if report.verdict == "negligible" else "matters",
         reasons=list(report.reasons),
-    )
-
-
-def firmware_constants(camera: rig.Camera, plane: rig.Plane | None) -> CameraConstants:
-    """The constants of the header, the inverse lens fitted to this camera.
-
-    A lens that the firmware could not undo makes the camera's verdict in the header poor.
-    """
-    seen = camera_from_section(camera)
-    inverse = fit_inverse(seen)
-    undone = inverse.max_error_px <= _INVERSE_PX and inverse.covered >= _INVERSE_SHARE
-    named = dict(zip(COEFFICIENTS, seen.distortion.tolist(), strict=True))
-    intrinsics = {
-        "fx_px": camera.fx_px,
-        "fy_px": camera.fy_px,
-        "skew_px": camera.skew_px,
-        "cx_px": camera.cx_px,
-        "cy_px": camera.cy_px,
-        **{name: named[name] for name in MODELS[camera.model]},
-    }
-    return camera_constants(
-        seen.image_size_px,
-        camera.model,
-        camera.verdict if undone or camera.verdict != "ok" else "poor",
-        intrinsics,
-        inverse,
-        None if plane is None else np.array(plane.A_inverse),
-        "" if plane is None else plane.verdict,
     )

@@ -11,7 +11,6 @@ from calib.errors import BadInputError
 from calib.sections import (
     camera_covariance,
     camera_from_section,
-    firmware_constants,
     image_grid,
     imported_camera_section,
     outdated,
@@ -52,10 +51,3 @@ def test_what_is_outdated() -> None:
     whole.provenance.inputs["plane"]["camera"] = "another"
     assert [sentence.split()[0] for sentence in outdated(whole)] == ["plane", "lens"]
     assert outdated(rig.Rig()) == []
-
-
-def test_a_lens_that_firmware_cannot_undo_is_marked() -> None:
-    section = imported_camera_section(CAMERA, "ros").model_copy(update={"verdict": "ok"})
-    assert firmware_constants(section, None).verdict == "ok"
-    bent = section.model_copy(update={"distortion": rig.Distortion(k1=-50.0)})
-    assert firmware_constants(bent, None).verdict == "poor"

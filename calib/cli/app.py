@@ -18,6 +18,7 @@ from calib.cli.identify import identify
 from calib.cli.imu import imu
 from calib.cli.intrinsics import intrinsics
 from calib.cli.lowpass import lowpass
+from calib.cli.record import record
 from calib.cli.replay import replay
 from calib.cli.simulate import simulate
 
@@ -58,6 +59,7 @@ app.command("replay")(replay)
 app.add_typer(identify, name="identify")
 app.add_typer(control, name="control")
 app.command("firmware")(firmware)
+app.command("record")(record)
 app.command("board")(board)
 app.command("simulate")(simulate)
 app.command("export")(export_camera)

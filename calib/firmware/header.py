@@ -1,183 +1,195 @@
-"""calib_constants.h: every constant of rig.yaml that firmware needs, as float literals of C.
+"""calib_constants.h: every constant of rig.yaml that firmware needs, and the files around it.
 
-The text is a template's; here are the numbers, their literals, and what keeps text from a rig.yaml
-from leaving a comment. The same rig gives the same bytes: no time and no path goes in.
+The text is a template's; here are the order of the groups, the provenance, and the guards' numbers. The
+same rig gives the same bytes: no time and no path goes in.
 """
 
 from __future__ import annotations
 
 import hashlib
-import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
+from typing import TYPE_CHECKING
 
 import jinja2
 import numpy as np
 
 from calib import __version__
-from calib.arrays import FloatArray
-from calib.camera.undistortion import InversePolynomial
-from calib.errors import BadInputError
+from calib.camera.model import COEFFICIENTS, MODELS
+from calib.camera.undistortion import fit_inverse
+from calib.firmware.constants_camera import CameraConstants, PlaneConstants, camera_groups, plane_constants
+from calib.firmware.constants_control import control_groups
+from calib.firmware.constants_motion import motion_groups, tick_rate_hz
+from calib.firmware.known import Known
+from calib.firmware.literals import (
+    Constant,
+    Group,
+    Macro,
+    Table,
+    Whole,
+    comment_text,
+    literals,
+)
 
-__all__ = [
-    "SCHEMA",
-    "CameraConstants",
-    "Constant",
-    "camera_constants",
-    "comment_text",
-    "float_literal",
-    "header_text",
-]
+if TYPE_CHECKING:
+    from calib.rig import Rig
 
-SCHEMA = 1
+__all__ = ["SCHEMA", "Header", "environment", "header_of", "header_text", "identity_of", "verbatim"]
+
+SCHEMA = 2
 """Raised when a constant changes its name, unit or meaning."""
 
-_SMALLEST_NORMAL = 1.1754943508222875e-38
-_LARGEST = 3.4028234663852886e38
+_INVERSE_PX = 0.1
+_INVERSE_SHARE = 0.9
+"""A header is marked when its polynomial undoes the lens worse than this, or in less of the picture."""
 
 
 @dataclass(frozen=True)
-class Constant:
-    """One macro: its name, value, and what a reader has to know (unit, range, source)."""
-
-    name: str
-    value: float
-    comment: str
-
-
-@dataclass(frozen=True)
-class CameraConstants:
-    """What the header says of the camera.
+class Header:
+    """What goes into calib_constants.h.
 
     Attributes
     ----------
-    image_size_px : width and height.
-    model, verdict : of the camera.
-    intrinsics : pinhole and distortion.
-    inverse_lens, inverse : coefficients of the polynomial that undistorts, and all about it.
-    plane : inverse homography of (2.11) and (2.12), row by row; empty without a plane.
+    camera : intrinsics, lens and plane.
+    groups : all constants in the order of the file.
+    inputs : SHA-256 of each input by name.
     """
 
-    image_size_px: tuple[int, int]
-    model: str
-    verdict: str
-    intrinsics: tuple[Constant, ...]
-    inverse_lens: tuple[Constant, ...]
-    inverse: InversePolynomial
-    plane: tuple[Constant, ...]
-    plane_verdict: str
+    camera: CameraConstants
+    groups: tuple[Group, ...]
+    inputs: Mapping[str, str]
+
+    @property
+    def literals(self) -> dict[str, str]:
+        """Every value as it stands in the file, by name."""
+        return literals(self.groups)
 
 
-def float_literal(value: float, key: str) -> str:
-    """A C literal that a compiler reads back as the binary32 nearest to `value`.
-
-    Nine significant digits are enough for any binary32. Raises `BadInputError` for NaN, infinity,
-    and magnitudes that binary32 holds only as subnormal or not at all; `key` names the value.
-    """
-    if not math.isfinite(value) or abs(value) > _LARGEST:
-        raise BadInputError(f"{key} is {value!r}, which no float constant of C can hold")
-    if value != 0.0 and abs(value) < _SMALLEST_NORMAL:
-        raise BadInputError(f"{key} is {value!r}, too small for a normal float; set it to zero")
-    text = f"{float(np.float32(value)):.9g}"
-    if not any(c in text for c in ".e"):
-        text += ".0"
-    elif "." not in text:
-        mantissa, exponent = text.split("e")
-        text = f"{mantissa}.0e{exponent}"
-    return text + "f"
-
-
-def comment_text(text: str) -> str:
-    """Text that cannot end a C comment or start a trigraph, whatever it was: one line of ASCII."""
-    plain = text.encode("unicode_escape").decode("ascii")
-    # A backslash would continue a line or, with trigraphs, mean something else.
-    return plain.replace("\\", "|").replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?")
-
-
-def camera_constants(
-    image_size_px: tuple[int, int],
-    model: str,
-    verdict: str,
-    intrinsics: dict[str, float],
-    inverse: InversePolynomial,
-    A_inverse: FloatArray | None,
-    plane_verdict: str,
-) -> CameraConstants:
-    """Names, values and comments of the camera's constants.
-
-    Parameters
-    ----------
-    intrinsics : by the names of rig.yaml (fx_px ... k1 ...).
-    inverse : polynomial that undoes the lens.
-    A_inverse : (3, 3) of (2.11), ideal pixels to metres.
-    """
-    what = {
-        "fx_px": "focal length along u, px; sigma_mu of (2.5)",
-        "fy_px": "focal length along v, px; sigma_nu of (2.5)",
-        "skew_px": "skew, px; gamma of (2.5)",
-        "cx_px": "principal point, px from the centre of the left column; mu_0 of (2.5)",
-        "cy_px": "principal point, px from the centre of the top row; nu_0 of (2.5)",
-    }
-    rows = [
-        Constant(
-            f"CALIB_CAMERA_{name.upper()}",
-            value,
-            what.get(name, "lens, dimensionless, OpenCV's order and signs"),
-        )
-        for name, value in intrinsics.items()
-    ]
-    radial = [
-        Constant(
-            f"CALIB_LENS_INVERSE_C{i}",
-            value,
-            f"coefficient of r2^{i}, dimensionless",
-        )
-        for i, value in enumerate(inverse.radial, start=1)
-    ]
-    plane = (
-        []
-        if A_inverse is None
-        else [
-            Constant(
-                f"CALIB_PLANE_INVERSE_{i + 1}{j + 1}",
-                float(A_inverse[i, j]),
-                "entry of A^-1, undistorted px to m; (2.11), the last row gives 1/s of (2.12)",
-            )
-            for i in range(3)
-            for j in range(3)
-        ]
-    )
-    return CameraConstants(
-        image_size_px, model, verdict, tuple(rows), tuple(radial), inverse, tuple(plane), plane_verdict
-    )
-
-
-def _environment() -> jinja2.Environment:
-    source = resources.files("calib.firmware").joinpath("templates/calib_constants.h.j2").read_text("utf-8")
-    return jinja2.Environment(
-        loader=jinja2.DictLoader({"calib_constants.h": source}),
+def environment() -> jinja2.Environment:
+    """Templates of C text; `comment` makes text safe inside a comment."""
+    made = jinja2.Environment(
+        loader=jinja2.FunctionLoader(verbatim),
         undefined=jinja2.StrictUndefined,
         autoescape=False,
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
+    made.filters["comment"] = comment_text
+    return made
 
 
-def header_text(camera: CameraConstants, inputs: dict[str, str]) -> str:
-    """The header; `inputs` holds the SHA-256 of each input by name."""
-    constants = [*camera.intrinsics, *camera.inverse_lens, *camera.plane]
-    literals = {c.name: float_literal(c.value, c.name) for c in constants}
-    canonical = "\n".join(f"{name} {literal}" for name, literal in literals.items())
-    digest = hashlib.sha256(f"{SCHEMA}\n{camera.image_size_px}\n{canonical}\n".encode()).hexdigest()
-    environment = _environment()
-    environment.filters["comment"] = comment_text
-    return environment.get_template("calib_constants.h").render(
-        schema=SCHEMA,
-        version=__version__,
-        digest=digest,
-        identity=digest[:8].upper(),
-        camera=camera,
-        literals=literals,
-        inputs=dict(sorted(inputs.items())),
+def verbatim(name: str) -> str:
+    """Text of a file in `templates`."""
+    return resources.files("calib.firmware").joinpath("templates", name).read_text("utf-8")
+
+
+def identity_of(header: Header) -> str:
+    """SHA-256 of schema and values; its first eight digits are CALIB_ID."""
+    canonical = "\n".join(f"{name} {literal}" for name, literal in header.literals.items())
+    return hashlib.sha256(f"{SCHEMA}\n{canonical}\n".encode()).hexdigest()
+
+
+def _camera_constants(whole: Rig, source: str) -> CameraConstants:
+    from calib.rig import Geometry
+    from calib.sections import camera_from_section, current_plane
+
+    section = whole.camera
+    assert section is not None
+    camera = camera_from_section(section)
+    inverse = fit_inverse(camera)
+    undone = inverse.max_error_px <= _INVERSE_PX and inverse.covered >= _INVERSE_SHARE
+    named = dict(zip(COEFFICIENTS, camera.distortion.tolist(), strict=True))
+    intrinsics = {
+        "fx_px": section.fx_px,
+        "fy_px": section.fy_px,
+        "skew_px": section.skew_px,
+        "cx_px": section.cx_px,
+        "cy_px": section.cy_px,
+        **{name: named[name] for name in MODELS[section.model]},
+    }
+    plane: PlaneConstants | None = None
+    known = current_plane(whole, source)
+    if known is not None:
+        x0, y0, x1, y1 = (whole.geometry or Geometry()).workspace_m
+        plane = plane_constants(
+            camera,
+            np.array(known.R_CW),
+            np.array(known.t_CW_m),
+            np.array(known.A_inverse),
+            (x0, y0, x1, y1),
+            known.verdict,
+        )
+    verdict = section.verdict if undone or section.verdict != "ok" else "poor"
+    return CameraConstants(camera.image_size_px, section.model, verdict, intrinsics, inverse, plane)
+
+
+def header_of(whole: Rig, source: str) -> Header:
+    """The header of a rig that has a camera.
+
+    A lens that the firmware could not undo makes the camera's verdict in the header poor.
+
+    Parameters
+    ----------
+    source : the file's name for messages.
+
+    Raises `BadInputError` for values that the firmware cannot run with, by their key.
+    """
+    camera = _camera_constants(whole, source)
+    known = Known(whole, source)
+    rate_hz = tick_rate_hz(known)
+    known.told()
+    groups = (*camera_groups(camera), *motion_groups(known), *control_groups(known, rate_hz))
+    inputs = {
+        f"{section}/{name}": digest
+        for section, named in whole.provenance.inputs.items()
+        for name, digest in named.items()
+        # Sections that name others as inputs; only files are inputs of the header.
+        if name not in ("camera", "plane") and (section != "plane" or camera.plane is not None)
+    }
+    return Header(camera, groups, inputs)
+
+
+def _lines(group: Group, literal: Mapping[str, str]) -> list[str]:
+    lines = []
+    for item in group.items:
+        note = comment_text(item.comment)
+        if isinstance(item, Constant | Whole):
+            lines.append(f"#define {item.name} {literal[item.name]} /* {note} */")
+        elif isinstance(item, Macro):
+            lines.append(f"#define {item.name} {item.body} /* {note} */")
+        elif isinstance(item, Table):
+            lines.append(f"/* {note} */")
+            entries = [literal[f"{item.name}[{i}]"] for i in range(len(item.values))]
+            lines.append(f"static const float {item.name}[{len(entries)}] CALIB_IN_FLASH = {{")
+            lines += [f"    {', '.join(entries[i : i + 6])}," for i in range(0, len(entries), 6)]
+            lines.append("};")
+    return lines
+
+
+def header_text(header: Header) -> str:
+    """calib_constants.h. Raises `BadInputError` for a value that a float cannot hold."""
+    literal = header.literals
+    digest = identity_of(header)
+    groups = [
+        {
+            "notes": [*group.notes, *([group.defaults] if group.defaults else [])],
+            "lines": _lines(group, literal),
+        }
+        for group in header.groups
+    ]
+    return (
+        environment()
+        .get_template("calib_constants.h.j2")
+        .render(
+            schema=SCHEMA,
+            version=__version__,
+            digest=digest,
+            identity=digest[:8].upper(),
+            camera=header.camera,
+            plane_verdict=header.camera.plane.verdict if header.camera.plane else "",
+            groups=groups,
+            inputs=dict(sorted(header.inputs.items())),
+        )
     )

@@ -1,4 +1,4 @@
-"""The header in `firmware_constants/` is what the shipped pictures give."""
+"""What is in `firmware_constants/` is what the shipped pictures give."""
 
 from __future__ import annotations
 
@@ -14,13 +14,17 @@ def _calib(*words: str, cwd: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_the_shipped_pictures_give_the_shipped_header(tmp_path: Path, project_root: Path) -> None:
+def test_the_shipped_pictures_give_the_shipped_firmware(tmp_path: Path, project_root: Path) -> None:
     rig = str(tmp_path / "rig.yaml")
     _calib("intrinsics", "images", "--rig", rig, cwd=project_root)
     _calib("extrinsics", "images/plane", "--rig", rig, cwd=project_root)
-    _calib("firmware", "-o", str(tmp_path / "made"), "--rig", rig, cwd=project_root)
-    shipped = project_root / "firmware_constants" / "calib_constants.h"
-    assert (tmp_path / "made" / shipped.name).read_bytes() == shipped.read_bytes()
+    made = tmp_path / "firmware_constants"
+    _calib("firmware", "-o", str(made), "--rig", rig, cwd=project_root)
+    folder = project_root / "firmware_constants"
+    assert sorted(p.name for p in made.iterdir()) == sorted(p.name for p in folder.iterdir())
+    for path in made.iterdir():
+        assert (folder / path.name).read_bytes() == path.read_bytes(), path.name
+    shipped = folder / "calib_constants.h"
     text = shipped.read_text()
     focal = re.search(r"CALIB_CAMERA_FX_PX (\S+)f", text)
     assert focal is not None

@@ -1,0 +1,143 @@
+"""The pipeline on the ATmega328P's instruction set: the same values, and what they cost."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from firmware_build import avr, compare, run, write
+from firmware_rigs import header, rig
+
+from calib.firmware.conformance import MODE_POSITION, Inputs, Reference
+from calib.firmware.literals import values
+from calib.firmware.vectors import TOLERANCE, binary32, directed
+from calib.rig import Rig
+
+LIMITS = np.array([TOLERANCE["phi_rad"], *[TOLERANCE["marker_m"]] * 2, *[TOLERANCE["q_m"]] * 4, *[0.01] * 2])
+
+TICK_CYCLES = 266_667
+STAGES = ("", "angle", "plane", "offset", "low-pass", "lengths", "control")
+
+
+@pytest.mark.parametrize("progmem", [False, True])
+@pytest.mark.parametrize("undistort", [0, 1])
+@pytest.mark.parametrize("kind", ["nominal", "full"])
+def test_the_same_values_as_in_float64(tmp_path: Path, kind: str, undistort: int, progmem: bool) -> None:
+    made = header(kind)
+    write(tmp_path, made)
+    command, sizes = avr(
+        tmp_path, f"-DCALIB_UNDISTORT={undistort}", *(["-DCALIB_PROGMEM"] if progmem else [])
+    )
+    ticks = directed(values(made.literals), 1500)
+    found = run(command, ticks)
+    worst, undecided = compare(made, ticks, found, bool(undistort))
+    print(f"{kind}, undistort {undistort}: differences {worst}, {sizes}, stack {found.stack}")
+    assert (worst <= LIMITS).all(), worst
+    assert undecided <= 0.01
+    assert sizes["flash"] <= 8192
+    assert sizes["ram"] + found.stack <= 300 + 60 * (kind == "full")
+
+
+@pytest.mark.parametrize("kind", ["nominal", "full"])
+def test_the_self_test_passes_on_the_board(tmp_path: Path, kind: str) -> None:
+    write(tmp_path, header(kind))
+    command, sizes = avr(tmp_path, "-DCALIB_SELFTEST", "-DCALIB_PROGMEM")
+    found = run(command, [_thesis_ticks([(0.08, 0.08)])[0]])
+    print(f"self-test: {sizes}, stack {found.stack}, {found.extra[0, 7] / 16e6:.3f} s")
+    assert found.flags[0] == 0
+    path = tmp_path / "calib_constants.h"
+    radius = f"CALIB_BELLOWS_RADIUS_M {header(kind).literals['CALIB_BELLOWS_RADIUS_M']}"
+    assert radius in path.read_text()
+    path.write_text(path.read_text().replace(radius, "CALIB_BELLOWS_RADIUS_M 0.0127f"))
+    assert (
+        run(
+            avr(tmp_path, "-DCALIB_SELFTEST", "-DCALIB_PROGMEM")[0], [_thesis_ticks([(0.08, 0.08)])[0]]
+        ).flags[0]
+        > 0
+    )
+
+
+def _thesis_ticks(reference: list[tuple[float, float]]) -> list[Inputs]:
+    """Motion through the workspace with both controllers' parts at work and nothing lost."""
+    made = []
+    for k, wanted in enumerate(reference):
+        phi = 1.2 * math.sin(0.013 * k)
+        made.append(
+            binary32(
+                Inputs(
+                    158.0 + 90.0 * math.sin(0.017 * k),
+                    104.0 + 70.0 * math.cos(0.011 * k),
+                    9.81 * math.cos(phi) + 0.4 * math.sin(0.5 * k),
+                    9.81 * math.sin(phi) + 0.4 * math.cos(0.7 * k),
+                    -1.2 * 0.013 * 60.0 * math.cos(0.013 * k),
+                    wanted,
+                    mode=MODE_POSITION,
+                )
+            )
+        )
+    return made
+
+
+def _told(name: str, cycles: np.ndarray) -> int:
+    most = int(cycles[2:, 7].max())
+    parts = ", ".join(f"{stage} {int(cycles[2:, i].max())}" for i, stage in enumerate(STAGES) if stage)
+    print(f"{name}: {int(cycles[2:, 7].mean())} cycles on average, {most} at most ({parts})")
+    print(f"  {100.0 * most / TICK_CYCLES:.1f} % of a 60 Hz tick at 16 MHz")
+    return most
+
+
+def test_the_budget_of_the_thesis_tick(tmp_path: Path) -> None:
+    """Angle filter, homography, low-pass, inverse kinematics, PD with feed-forward, in every tick."""
+    from calib.firmware.header import header_of
+
+    still = [(0.08, 0.085)] * 1200
+    moving = [(0.015 * math.sin(0.02 * k), 0.078 - 0.01 * math.cos(0.02 * k)) for k in range(1200)]
+    write(tmp_path, header())
+    command, sizes = avr(tmp_path, "-DCALIB_UNDISTORT=0")
+    assert _told("constant reference", run(command, _thesis_ticks(still)).extra) <= 15_000
+    command, sizes = avr(tmp_path, "-DCALIB_UNDISTORT=0", "-DCALIB_MOVING")
+    assert _told("moving reference", run(command, _thesis_ticks(moving)).extra) <= 19_000
+    assert sizes["flash"] <= 8192
+    integral = _with_integral(rig())
+    write(tmp_path, header_of(integral, "rig.yaml"))
+    command, sizes = avr(tmp_path, "-DCALIB_UNDISTORT=0")
+    cycles = run(command, _thesis_ticks(still)).extra
+    _told("constant reference, integral part as well", cycles)
+    assert int(cycles[2:, 7].mean()) <= 15_000
+    write(tmp_path, header())
+    command, sizes = avr(tmp_path, "-DCALIB_UNDISTORT=1", "-DCALIB_MOVING")
+    assert _told("moving reference and undistortion", run(command, _thesis_ticks(moving)).extra) <= 23_000
+
+
+def _with_integral(plain: Rig) -> Rig:
+    control = rig("full").controller
+    assert control is not None
+    return plain.model_copy(update={"controller": control})
+
+
+def test_a_moving_reference_is_that_of_the_set_points(tmp_path: Path) -> None:
+    """calib_reference_point against the exact inverse kinematics that the set-points use."""
+    from calib.control.setpoints import Ellipse
+
+    ellipse, times = Ellipse(), np.linspace(0.0, 20.0, 400)
+    wanted = ellipse.bellows_m(times, values(header().literals)["CALIB_BELLOWS_RADIUS_M"])
+    pose = ellipse.pose(times)
+    reference = Reference(values(header().literals))
+    found = np.array([reference.reference_point(x, y) for x, y, _ in pose.tolist()])
+    assert np.abs(found - wanted).max() < 1e-9
+    write(tmp_path, header())
+    command, _ = avr(tmp_path, "-DCALIB_UNDISTORT=1", "-DCALIB_MOVING")
+    ticks = _thesis_ticks([(float(x), float(y)) for x, y in pose[:, :2]])
+    moved = run(command, ticks)
+    again = run(
+        avr(tmp_path, "-DCALIB_UNDISTORT=1")[0], [_with(t, q) for t, q in zip(ticks, found, strict=True)]
+    )
+    assert np.abs(moved.numbers - again.numbers)[:, 7:].max() < 0.01
+
+
+def _with(tick: Inputs, q: np.ndarray) -> Inputs:
+    from dataclasses import replace
+
+    return binary32(replace(tick, reference=(float(q[0]), float(q[1]))))

@@ -1,0 +1,168 @@
+"""Compiling the firmware for this machine and for an ATmega328P, and running both on the same records."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import struct
+import subprocess
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.firmware.conformance import Inputs, Outputs, Reference
+from calib.firmware.header import Header, header_text, verbatim
+from calib.firmware.literals import values
+from calib.firmware.vectors import selftest_text
+
+__all__ = ["Process", "Ticks", "avr", "compare", "host", "need", "pack", "run", "warnings", "write"]
+
+NATIVE = Path(__file__).parent / "firmware" / "native"
+
+warnings = [
+    *("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wdouble-promotion", "-Wfloat-conversion"),
+    *("-Wundef", "-Wshadow", "-Werror"),
+]
+
+
+def need(tool: str) -> None:
+    """Skip without a tool; in CI, where all are installed, fail."""
+    there = Path("/usr/include/simavr/sim_avr.h").exists() if tool == "simavr" else shutil.which(tool)
+    if tool == "avr-gcc" and there:
+        there = Path("/usr/lib/avr/include/avr/io.h").exists()
+    if not there:
+        if os.environ.get("CI"):
+            pytest.fail(f"{tool} is not installed")
+        pytest.skip(f"{tool} is not installed")
+
+
+def write(folder: Path, header: Header) -> None:
+    """The header's files, as `calib firmware` writes them."""
+    (folder / "calib_constants.h").write_text(header_text(header))
+    (folder / "calib_pipeline.h").write_text(verbatim("calib_pipeline.h"))
+    (folder / "calib_selftest.h").write_text(selftest_text(header))
+
+
+def _compile(command: Sequence[str | Path]) -> None:
+    done = subprocess.run([str(word) for word in command], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def host(folder: Path, *flags: str, compiler: str = "gcc") -> list[str]:
+    """Compile program.c with the headers in a folder; the command that runs it."""
+    need(compiler)
+    made = folder / f"host-{compiler}"
+    strict = ["-std=c99", "-O2", "-ffp-contract=off", *warnings, *flags]
+    _compile([compiler, *strict, f"-I{folder}", "-o", made, NATIVE / "program.c", "-lm"])
+    return [str(made)]
+
+
+def avr(folder: Path, *flags: str) -> tuple[list[str], dict[str, int]]:
+    """The same for the ATmega328P, in the simulator; the command and the sizes in bytes."""
+    need("avr-gcc")
+    need("simavr")
+    need("gcc")
+    made, runner = folder / "program.elf", folder / "runner"
+    target = ["-std=c99", "-Os", "-mmcu=atmega328p", "-DF_CPU=16000000UL", "-DCALIB_MEASURE"]
+    _compile(["avr-gcc", *target, *warnings, *flags, f"-I{folder}", "-o", made, NATIVE / "program.c", "-lm"])
+    _compile(["gcc", "-O2", "-o", runner, NATIVE / "runner.c", "-lsimavr"])
+    listing = subprocess.run(["avr-nm", made], capture_output=True, text=True, check=True).stdout
+    places = {name: f"0x{place}" for place, name in re.findall(r"^(\w+) \w (in|out|_end)$", listing, re.M)}
+    sizes = subprocess.run(["avr-size", made], capture_output=True, text=True, check=True).stdout
+    text, data, bss = map(int, sizes.splitlines()[1].split()[:3])
+    command = [str(runner), str(made), places["in"], places["out"], places["_end"]]
+    return command, {"flash": text + data, "ram": data + bss}
+
+
+def pack(given: Inputs) -> bytes:
+    """The record that program.c takes."""
+    numbers = (given.u_px, given.v_px, given.ax_mps2, given.ay_mps2, given.gz_radps, *given.reference)
+    return struct.pack("<7f3B", *numbers, given.marker_seen, given.imu_read, given.mode)
+
+
+@dataclass(frozen=True)
+class Ticks:
+    """What a program gave.
+
+    Attributes
+    ----------
+    numbers : (n, 9) phi, marker, head, lengths, commands. flags : (n,). duty : (n, 2).
+    extra : (n, m) the counters of the host, or cycles by stage of the AVR.
+    stack : deepest stack of the AVR in bytes, 0 of a host.
+    """
+
+    numbers: np.ndarray
+    flags: np.ndarray
+    duty: np.ndarray
+    extra: np.ndarray
+    stack: int
+
+
+def _unpacked(data: bytes, on_avr: bool, stack: int = 0) -> Ticks:
+    more = np.dtype(("<u4", 8)) if on_avr else np.dtype(("<u2", 6))
+    kind = np.dtype([("numbers", "<f4", 9), ("flags", "<u2"), ("duty", "u1", 2), ("extra", more)])
+    rows = np.frombuffer(data, dtype=kind)
+    return Ticks(rows["numbers"].astype(float), rows["flags"].astype(int), rows["duty"], rows["extra"], stack)
+
+
+def run(command: Sequence[str], ticks: Sequence[Inputs]) -> Ticks:
+    """All ticks through a program, from its start."""
+    done = subprocess.run(command, input=b"".join(map(pack, ticks)), capture_output=True, check=True)
+    stack = re.search(rb"stack (\d+)", done.stderr)
+    found = _unpacked(done.stdout, len(command) > 1, int(stack.group(1)) if stack else 0)
+    assert len(found.flags) == len(ticks)
+    return found
+
+
+class Process:
+    """A program that gets one tick at a time."""
+
+    def __init__(self, command: Sequence[str]) -> None:
+        self.on_avr = len(command) > 1
+        arguments = list(command) if self.on_avr else [*command, "flush"]
+        self.process = subprocess.Popen(
+            arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+        )
+
+    def send(self, given: Inputs) -> None:
+        """Begin a tick."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(pack(given))
+        self.process.stdin.flush()
+
+    def receive(self) -> Ticks:
+        """Wait for its end."""
+        assert self.process.stdout is not None
+        return _unpacked(self.process.stdout.read(72 if self.on_avr else 52), self.on_avr)
+
+    def close(self) -> None:
+        """End the program."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.close()
+        self.process.wait(timeout=60)
+        self.process.stdout.close()
+
+
+def numbers(wanted: Outputs) -> list[float]:
+    """The nine numbers of the reference in the order of `Ticks.numbers`."""
+    return [wanted.phi_rad, *wanted.marker_m, *wanted.head_m, *wanted.q_m, *wanted.pwm]
+
+
+def compare(
+    header: Header, ticks: Sequence[Inputs], found: Ticks, undistort: bool | None = None
+) -> tuple[np.ndarray, float]:
+    """Largest differences (9,) from the reference, and of undecided outputs [PWM]; flags have to agree."""
+    reference = Reference(values(header.literals), undistort)
+    wanted, undecided = [], 0.0
+    for k, given in enumerate(ticks):
+        out = reference.step(given, int(found.flags[k]))
+        said = f"tick {k}: flags {found.flags[k]:#x}, wanted {out.flags:#x}, {given}"
+        assert out.flags == found.flags[k], said
+        undecided = max(undecided, out.undecided_pwm)
+        wanted.append(numbers(out))
+    return np.abs(found.numbers - np.array(wanted)).max(axis=0), undecided

@@ -1,0 +1,149 @@
+"""Rigs for the tests of the firmware: the nominal one, and one that has everything."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from calib.firmware.header import Header, header_of
+from calib.rig import Rig
+from calib.signals.design import Design, design_lowpass
+from calib.twin.pictures import CAMERA, PLANE
+
+__all__ = ["header", "rig"]
+
+
+def _camera(**more: Any) -> dict[str, Any]:
+    c = CAMERA
+    names = ("fx_px", "fy_px", "skew_px", "cx_px", "cy_px")
+    section: dict[str, Any] = {name: float(getattr(c, name)) for name in names}
+    lens = {"k1": float(c.distortion[0]), "k2": float(c.distortion[1])}
+    section |= {
+        "model": "radial2",
+        "image_size_px": list(c.image_size_px),
+        "distortion": lens,
+        "verdict": "ok",
+    }
+    return section | more
+
+
+def _plane(camera: dict[str, Any]) -> dict[str, Any]:
+    K = np.array(
+        [
+            [camera["fx_px"], camera["skew_px"], camera["cx_px"]],
+            [0.0, camera["fy_px"], camera["cy_px"]],
+            [0, 0, 1],
+        ]
+    )
+    R, t = np.array(PLANE.R_CW), np.array(PLANE.t_m)
+    A = K @ np.column_stack([R[:, 0], R[:, 1], t])
+    return {
+        "R_CW": R.tolist(),
+        "t_CW_m": t.tolist(),
+        "A_px_per_m": A.tolist(),
+        "A_inverse": np.linalg.inv(A).tolist(),
+        "rms_px": 0.0,
+        "rms_mm": 0.0,
+        "verdict": "ok",
+    }
+
+
+def _align() -> dict[str, Any]:
+    return {
+        "time_offset_s": 0.035,
+        "mount_angle_rad": 0.05,
+        "rest_angle_rad": 0.06,
+        "gyro_scale": 0.02,
+        "gyro_bias_radps": 0.013,
+        "accel_bias_mps2": [0.1, 0.1],
+        "accel_scale": [0.0, 0.0],
+        "imu_lever_m": 0.0,
+        "marker_offset_m": 0.0147,
+        "plane_shift_m": [0.0, 0.0],
+        "plane_stretch": 0.0,
+        "jitter_px": 0.1,
+        "outlier_share": 0.0,
+        "accel_noise_mps2": [0.1, 0.1],
+        "gyro_noise_radps": 0.01,
+        "verdict": "ok",
+    }
+
+
+def _controller() -> dict[str, Any]:
+    return {
+        "tick_s": 1.0 / 60.0,
+        "pwm_low": 5.0,
+        "pwm_high": 250.0,
+        "criterion": {"gain_margin": 2.0, "phase_margin_rad": 0.8, "sensitivity": 2.0},
+        "orientation": {
+            "Kp_pwm_per_rad": 800.0,
+            "Ki_pwm_per_rad_s": 900.0,
+            "Kd_pwm_s_per_rad": 12.0,
+            "back_calculation_s": 0.4,
+        },
+        "position": {"Kp_pwm_per_m": 12000.0, "Ki_pwm_per_m_s": 8000.0, "Kd_pwm_s_per_m": 300.0},
+        "feedforward": {
+            "rest_length_m": 0.065,
+            "bellows_radius_m": 0.0126,
+            "stiffness_N_per_m": [47.7, 1092.9, 0.0, 0.0],
+            "bending_N_per_rad2": 0.17,
+            "strength": [1.0, 0.98],
+            "force_pwm": [[0.0, 99.9], [0.3, 140.0], [1.0, 195.0], [2.04, 255.0]],
+        },
+        "lag_s": 0.7,
+        "delay_ticks": 2,
+        "verdict": "ok",
+    }
+
+
+def _lowpass() -> dict[str, Any]:
+    made = design_lowpass(Design(2.0, 60.0, 3))
+    rows = made.sections.tolist()
+    return {
+        "family": "butterworth",
+        "order": 3,
+        "cutoff_hz": 2.0,
+        "rate_hz": 60.0,
+        "sections": [{"b": row[:3], "a": row[3:]} for row in rows],
+        "rounded_cutoff_hz": 2.0,
+        "pole_radius": 0.9,
+        "dc_delay_s": 0.1,
+        "largest_delay_s": 0.1,
+        "noise_gain": 0.1,
+        "verdict": "ok",
+    }
+
+
+@cache
+def rig(kind: str = "nominal") -> Rig:
+    """A rig with camera and plane alone, or "full" with every section that firmware reads."""
+    camera = _camera()
+    sections: dict[str, Any] = {"camera": camera, "plane": _plane(camera)}
+    if kind == "full":
+        lens = {"k1": -0.2201, "k2": 0.5494, "p1": 0.002, "p2": -0.003, "k3": 0.0}
+        camera = _camera(model="brown5", distortion=lens, skew_px=0.8)
+        sections = {
+            "camera": camera,
+            "plane": _plane(camera),
+            "align": _align(),
+            "lowpass": _lowpass(),
+            "controller": _controller(),
+            "orientation_filter": {
+                "Kp_per_s": 2.2,
+                "Ki_per_s2": 1.4,
+                "rate_hz": 100.0,
+                "recommended": "tuned",
+                "recommended_by": "reference",
+                "verdict": "ok",
+            },
+            "actuator": {"bellows_radius_m": 0.0131, "rest_length_m": 0.066},
+        }
+    return Rig.model_validate(sections)
+
+
+@cache
+def header(kind: str = "nominal") -> Header:
+    """The header of that rig."""
+    return header_of(rig(kind), "rig.yaml")
