@@ -12,24 +12,30 @@ from typing import Any
 import numpy as np
 
 from calib.arrays import FloatArray
+from calib.driving import drive_from_rig, has_commands, pwm_of
 from calib.errors import BadInputError
 from calib.estimator.baseline import BASELINE, Baseline
 from calib.estimator.consistency import SENSORS, Tally
+from calib.estimator.driven_setup import Drive
 from calib.estimator.filter import Filter
 from calib.estimator.noise import jitter_px
-from calib.estimator.setup import FLAGS, OUT, Setup
+from calib.estimator.setup import FLAGS, OUT, Rows, Setup
 from calib.files import shown
 from calib.logs import Log
 from calib.replaying import baseline_setup, blocks, periods, rows_of, setup_from_rig, truth_of
 from calib.rig import Rig
 from calib.statesfile import STATES, StatesFile, states_writer
 
-__all__ = ["Replayed", "Trace", "prepared", "replay_log"]
+__all__ = ["MODELS", "Replayed", "Trace", "prepared", "replay_log"]
+
+MODELS = ("auto", "kinematic", "driven")
 
 _JITTER_ROWS = 6000
 _MOST_POINTS = 6000
 _NIS_FACTOR = 2.0
 _GATED_SHARE = 0.05
+_INSIDE_SHARE = 0.7
+_CORRELATED = 0.6
 
 Progress = Callable[[int, int], None]
 
@@ -50,7 +56,7 @@ class Trace:
             self.rows.append(values[at])
             self._next = self._count + int(at[-1]) + self.step
         self._count += len(values)
-        if sum(len(part) for part in self.rows) > 2 * _MOST_POINTS:
+        while sum(len(part) for part in self.rows) > 2 * _MOST_POINTS:
             # Rows that are kept lie `step` apart from the first on.
             whole = np.concatenate(self.rows)
             self._next = (len(whole) + len(whole) % 2) * self.step
@@ -71,6 +77,7 @@ class Replayed:
     source, rows, duration_s, estimator : of the log.
     rmse, others : errors against the truth by `Tally.rmse`, of this estimator and of another.
     sensors : consistency by sensor. flags : rows by flag. jitter_px : that was used.
+    driven_share : of the rows, in which the driven model spoke; None where there was none.
     trace : rows for figures: `setup.OUT`, then q1, q2, phi of the baseline, then the truth.
     """
 
@@ -87,12 +94,13 @@ class Replayed:
     reasons: list[str]
     remarks: list[str]
     trace: FloatArray
+    driven_share: float | None = None
 
     def as_json(self) -> dict[str, Any]:
         """For the document."""
         names = (
             "source", "rows", "duration_s", "estimator", "rmse", "sensors", "flags", "jitter_px", "verdict",
-            "reasons", "remarks",
+            "reasons", "remarks", "driven_share",
         )  # fmt: skip
         out = {name: getattr(self, name) for name in names}
         return out | {"compared": self.others}
@@ -123,8 +131,12 @@ def replay_log(
     output: Path | None = None,
     progress: Progress | None = None,
     traced: bool = False,
+    model: str = "auto",
 ) -> Replayed:
     """Run one log, block by block, and write its states; `smooth` needs the whole log in memory.
+
+    `model` is one of `MODELS`: driven by the commands or kinematic, "auto" both where the log has commands,
+    camera and IMU, each speaking where it is the better.
 
     Raises `BadInputError` for a log or a rig that cannot be used.
     """
@@ -134,14 +146,19 @@ def replay_log(
     tally, trace = Tally(setup.bellows_radius_m), Trace()
     baseline_tally = Tally(setup.bellows_radius_m)
     baseline = Baseline(baseline_setup(setup, rig, rig_path, found)) if found.camera and found.imu else None
-    fused = Filter(setup)
+    first = next(stream)
+    stream = chain([first], stream)
+    drive = _drive(model, first, found, rig, path, rig_path)
+    estimate = _estimate(setup, drive, model)
+    shares = Shares()
     size = path.stat().st_size
 
     def run(states: StatesFile | None) -> None:
         done = 0
         for log in _told(stream, said):
             rows, truth = rows_of(log, found.ticks), truth_of(log)
-            out = fused.run(rows)
+            out = estimate(rows, log)
+            shares.add(out)
             tally.add(out, truth)
             other = np.full((len(log), 3), np.nan)
             if baseline is not None:
@@ -162,17 +179,69 @@ def replay_log(
     if smooth:
         from calib.smoothing import smooth_log
 
-        after, before, traces = smooth_log(setup, found, _told(stream, said), output)
+        after, before, traces = smooth_log(setup, found, _told(stream, said), output, drive)
+        shares.add(traces[0])
         result = _result(path, "smoothed", setup, found, after, before, said, traces[0], True)
+        result = replace(result, driven_share=shares.value)
         return replace(result, others={"filter": _errors(before, True)} if before.scored else {})
     if output is None:
         run(None)
     else:
         with states_writer(output, STATES if estimator == "fused" else BASELINE) as states:
             run(states)
-    return _result(
+    result = _result(
         path, estimator, setup, found, tally, baseline_tally, said, trace.values, baseline is not None
     )
+    return replace(result, driven_share=shares.value)
+
+
+@dataclass
+class Shares:
+    """In how many rows the driven model has spoken."""
+
+    rows: int = 0
+    driven: int = 0
+
+    def add(self, out: FloatArray) -> None:
+        """Rows of `setup.OUT` that follow."""
+        weight = out[:, OUT.index("driven_weight")]
+        self.rows += int(np.isfinite(weight).sum())
+        self.driven += int(np.count_nonzero(weight >= 0.5))
+
+    @property
+    def value(self) -> float | None:
+        """Their share, None without a driven model."""
+        return self.driven / self.rows if self.rows else None
+
+
+def _drive(model: str, first: Log, found: Any, rig: Rig, path: Path, rig_path: Path) -> Drive | None:
+    if model == "kinematic":
+        return None
+    told = has_commands(first)
+    if told and found.camera and found.imu:
+        return drive_from_rig(rig, rig_path)
+    if model == "driven":
+        lacks = "commands (pwm1, pwm2)" if not told else "pictures" if not found.camera else "IMU samples"
+        raise BadInputError(
+            f"{shown(path)}: the driven model needs commands, camera and IMU, found no {lacks}"
+        )
+    return None
+
+
+def _estimate(setup: Setup, drive: Drive | None, model: str) -> Callable[[Rows, Log], FloatArray]:
+    """The estimator as a function of rows and the log that they come from."""
+    if drive is None:
+        fused = Filter(setup)
+        return lambda rows, log: fused.run(rows)
+    if model == "driven":
+        from calib.estimator.driven_filter import DrivenFilter
+
+        alone = DrivenFilter(setup, drive)
+        return lambda rows, log: alone.run(rows, pwm_of(log))
+    from calib.estimator.driven_handover import Handover
+
+    both = Handover(setup, drive)
+    return lambda rows, log: both.run(rows, pwm_of(log))
 
 
 def _told(stream: Iterator[Log], said: list[str]) -> Iterator[Log]:
@@ -239,6 +308,14 @@ def judged(
         share = check["gated"] / max(check["readings"] + check["gated"], 1)
         if share > _GATED_SHARE:
             reasons.append(f"{100.0 * share:.0f} % of the {name}'s readings were gated out")
+        if check["inside"] < _INSIDE_SHARE:
+            reasons.append(
+                f"only {100.0 * check['inside']:.0f} % of the {name}'s innovations lie in their 95 % band"
+            )
+        if abs(check["correlation"]) > _CORRELATED:
+            remarks.append(
+                f"the innovations of the {name} are not white: {check['correlation']:.2f} with the one before"
+            )
     for name, sentence in (
         ("camera_silent", "the camera is silent"),
         ("imu_silent", "the IMU is silent"),

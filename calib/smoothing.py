@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from calib.driving import pwm_of
 from calib.estimator.consistency import Tally
+from calib.estimator.driven_setup import Drive
 from calib.estimator.filter import Filter
 from calib.estimator.setup import OUT, Rows, Setup
 from calib.estimator.smoother import smooth
@@ -28,20 +30,39 @@ def joined(parts: list[Rows]) -> Rows:
 
 
 def smooth_log(
-    setup: Setup, found: Periods, stream: Iterable[Log], output: Path | None
+    setup: Setup, found: Periods, stream: Iterable[Log], output: Path | None, drive: Drive | None = None
 ) -> tuple[Tally, Tally, list[np.ndarray]]:
     """Sums of the smoother and of the filter, and for figures its rows with the truth, block by block.
+
+    With a `drive` both models are smoothed and weighed.
 
     Raises `BadInputError` where `output` cannot be written.
     """
     fused, parts, outs, truths = Filter(setup), [], [], []
+    both, pwm, driven, kinematic = None, [], [], []
+    if drive is not None:
+        from calib.estimator.driven_handover import Handover, blended, smooth_both
+
+        both = Handover(setup, drive)
     for log in stream:
         rows, truth = rows_of(log, found.ticks), truth_of(log)
         parts.append(rows)
-        outs.append(fused.run(rows))
+        if both is None:
+            outs.append(fused.run(rows))
+        else:
+            pwm.append(pwm_of(log))
+            one, other, weight = both.run_each(rows, pwm[-1])
+            outs.append(blended(one, other, weight))
+            driven.append(one)
+            kinematic.append(other)
         truths.append(np.full((len(log), 3), np.nan) if truth is None else truth)
     whole, filtered, truth = joined(parts), np.concatenate(outs), np.concatenate(truths)
-    smoothed = smooth(setup, whole, filtered)
+    if drive is None:
+        smoothed = smooth(setup, whole, filtered)
+    else:
+        smoothed = smooth_both(
+            setup, drive, whole, np.concatenate(pwm), np.concatenate(driven), np.concatenate(kinematic)
+        )
     before, after = Tally(setup.bellows_radius_m), Tally(setup.bellows_radius_m)
     before.add(filtered, truth)
     after.add(smoothed, truth)

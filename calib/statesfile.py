@@ -20,6 +20,7 @@ STATES = (
     "t_s", "q1_m", "q2_m", "dq1_mps", "dq2_mps", "phi_rad", "length_m", "x_m", "y_m", "gyro_bias_radps",
     "sigma_q1_m", "sigma_q2_m", "sigma_phi_rad", "nis_camera", "nis_accel", "nis_gyro",
     "gated_camera", "gated_accel", "gated_gyro", "flags", "rest_weight", "swing_weight",
+    "driven_weight",
 )  # fmt: skip
 """Columns of the states file."""
 

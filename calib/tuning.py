@@ -6,17 +6,48 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from calib.errors import BadInputError
+from calib.estimator.constant_gain import MOST_DELAY_TICKS, AxisGain, design, tick_noise
 from calib.estimator.noise import tune
+from calib.estimator.setup import Setup
 from calib.files import shown
 from calib.replay import Progress, prepared
 from calib.replaying import rows_of
 from calib.rig import Rig
-from calib.rig_estimator import Estimator, EstimatorLevel
+from calib.rig_estimator import Estimator, EstimatorAxisGain, EstimatorGain, EstimatorLevel
 from calib.smoothing import joined
 
-__all__ = ["tuned_section"]
+__all__ = ["gain_section", "tuned_section"]
 
 _MOST_ROWS = 20_000
+
+
+_PHI_LEVEL, _LENGTH_LEVEL = "swing", "drift"
+"""For the angle, which the gyroscope measures, and for the length, which only pictures show."""
+_TICK_HZ = 60.0
+
+
+def _axis(gain: AxisGain) -> EstimatorAxisGain:
+    return EstimatorAxisGain(
+        F=gain.F.tolist(), H=gain.H.tolist(), K=gain.K.tolist(), sigma=gain.sigma.tolist()
+    )
+
+
+def gain_section(setup: Setup, rate_hz: float) -> EstimatorGain | None:
+    """Constant gains at a rate of ticks; None without pictures, or where they are more than 8 ticks late."""
+    ticks = round(max(float(setup.start.sensor[7]), 0.0) * rate_hz)
+    levels = {level.name: level for level in setup.process.levels}
+    if ticks > MOST_DELAY_TICKS or not setup.view.any() or not {_PHI_LEVEL, _LENGTH_LEVEL} <= set(levels):
+        return None
+    noise = tick_noise(setup, levels[_PHI_LEVEL], rate_hz)
+    phi, length = design(levels[_PHI_LEVEL], levels[_LENGTH_LEVEL], noise, rate_hz, ticks)
+    return EstimatorGain(
+        rate_hz=rate_hz,
+        delay_ticks=ticks,
+        phi_level=_PHI_LEVEL,
+        length_level=_LENGTH_LEVEL,
+        phi=_axis(phi),
+        length=_axis(length),
+    )
 
 
 def tuned_section(
@@ -64,6 +95,7 @@ def tuned_section(
             )
             for level in found_noise.setup.process.levels
         ],
+        constant_gain=gain_section(found_noise.setup, rig.lowpass.rate_hz if rig.lowpass else _TICK_HZ),
         gain_per_row=(found_noise.after - found_noise.before) / max(found_noise.rows, 1),
         logs=[shown(path.name) for path in logs],
         verdict="poor" if reasons else "ok",

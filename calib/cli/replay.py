@@ -21,7 +21,10 @@ def _cell(value: float | None, digits: int = 3) -> str:
 
 
 def _tell(result: Replayed) -> None:
-    say(f"{result.source}: {result.rows} rows, {result.duration_s:.5g} s, {result.estimator}")
+    share = (
+        "" if result.driven_share is None else f", driven in {100.0 * result.driven_share:.0f} % of the rows"
+    )
+    say(f"{result.source}: {result.rows} rows, {result.duration_s:.5g} s, {result.estimator}{share}")
     if result.rmse:
         rows = []
         for name, figures in (("this", result.rmse), *((n, f) for n, f in result.others.items())):
@@ -60,6 +63,12 @@ def replay(
         Literal["fused", "baseline"],
         typer.Option(help="The fused filter, or the low-pass pipeline that it replaces."),
     ] = "fused",
+    model: Annotated[
+        Literal["auto", "kinematic", "driven"],
+        typer.Option(
+            help="Driven by the commands in the log, kinematic, or (auto) whichever explains the log better."
+        ),
+    ] = "auto",
     smooth: Annotated[
         bool, typer.Option("--smooth", help="Look at the whole log, forward and backward.")
     ] = False,
@@ -107,7 +116,9 @@ def replay(
     for path in logs:
         states = output / f"{path.stem}_states.csv" if output is not None and several else output
         with progress_bar(f"replaying {path.name}") as progress:
-            result = replay_log(path, known, rig, estimator, smooth, states, progress, figures is not None)
+            result = replay_log(
+                path, known, rig, estimator, smooth, states, progress, figures is not None, model
+            )
         results.append(result)
         if states is not None:
             narrate(f"states written to {shown(states)}")

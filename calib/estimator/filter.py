@@ -20,8 +20,8 @@ from numba import njit
 
 from calib.arrays import FloatArray, IntArray
 from calib.estimator.clock import CLOCK_SIZE, advance, new_clock, restart
-from calib.estimator.kernel import CAMERA, IMU, event
-from calib.estimator.model import axis_noise, axis_transition, predict
+from calib.estimator.kernel import CAMERA, IMU, TRACE, WORK, event
+from calib.estimator.model import axis_noise, axis_transition, mix, predict
 from calib.estimator.sensors import SIZE, head_position, invert_marker
 from calib.estimator.setup import OUT, Rows, Setup
 
@@ -68,15 +68,8 @@ def _hold(x: FloatArray, P: FloatArray, k: int, middle: float, sigma: float) -> 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _one(
-    x: FloatArray, P: FloatArray, weight: FloatArray, kind: int, z: FloatArray, dt: float, switch_hz: float,
-    levels: FloatArray, walk: FloatArray, view: FloatArray, constants: FloatArray, noise: FloatArray,
-    head: FloatArray, head_sigma: FloatArray, work: FloatArray, again: bool, report: FloatArray,
-    gated: FloatArray,
-) -> int:  # fmt: skip
-    """An event in a slot, and whether the state is still one: flags."""
-    event(x, P, weight, kind, z, dt, switch_hz, levels, walk, view, constants, noise, work,
-          again, report, gated)  # fmt: skip
+def _mend(x: FloatArray, P: FloatArray, head: FloatArray, head_sigma: FloatArray) -> int:
+    """Whether the state is still one, and what is done where it is not: flags."""
     flags = 0
     for m in range(x.shape[0]):
         if P[m, 0, 0] > 1.0:
@@ -90,10 +83,13 @@ def _one(
             good = good and abs(x[m, i]) < 1e6 and P[m, i, i] > 0.0
         if not good:
             # A level that has left the model starts again from the prior, all of it.
-            x[m, :6], P[m, :, :] = head, 0.0
             for i in range(x.shape[1]):
-                if not abs(x[m, i]) < 1e6:
+                if i < 6:
+                    x[m, i] = head[i]
+                elif not abs(x[m, i]) < 1e6:
                     x[m, i] = 0.0
+                for j in range(x.shape[1]):
+                    P[m, i, j] = 0.0
                 P[m, i, i] = head_sigma[i] ** 2 if i < 6 else 1e-2
             flags |= 1
     return flags
@@ -163,7 +159,8 @@ def run_filter(
 ) -> None:  # fmt: skip
     """Rows (n,), (n, 5), (n,) through the ring of the last events; writes `out` (n, len(OUT))."""
     size, count, n = ring_x.shape
-    work, report, spare = np.zeros((13, n)), np.empty(12), np.empty(12)
+    work, report, spare = np.zeros((count, WORK, n)), np.empty(12), np.empty(12)
+    untraced = np.empty((0, TRACE))
     spare_x, spare_P, spare_w = np.empty((count, n)), np.empty((count, n, n)), np.empty(count)
     z = np.empty(3)
     for row in range(len(t)):
@@ -196,7 +193,7 @@ def run_filter(
                 real[_CAMERA_SEEN] = stamp
             else:
                 when = advance(imu_clock, stamp)
-                z[:] = readings[row, 2:]
+                z[0], z[1], z[2] = readings[row, 2], readings[row, 3], readings[row, 4]
                 if math.isnan(z[2]) and (math.isnan(z[0]) or math.isnan(z[1])):
                     continue
                 real[_IMU_SEEN] = stamp
@@ -206,7 +203,8 @@ def run_filter(
                 whole[_COUNT] = 1
                 if kind == IMU and not math.isnan(z[0]) and math.hypot(z[0], z[1]) > 1.0:
                     tilt = math.atan2(z[1], z[0]) - ring_x[newest, 0, 9]
-                    ring_x[newest, :, 0] = min(max(math.atan2(math.sin(tilt), math.cos(tilt)), -1.5), 1.5)
+                    for m in range(count):
+                        ring_x[newest, m, 0] = min(max(math.atan2(math.sin(tilt), math.cos(tilt)), -1.5), 1.5)
             # Back to the last event before this one.
             back = 0
             while back < whole[_COUNT] - 1 and ring_t[(newest - back) % size] > when:
@@ -219,32 +217,34 @@ def run_filter(
             for i in range(back):
                 to, since = (newest + 1 - i) % size, (newest - i) % size
                 ring_t[to], ring_kind[to] = ring_t[since], ring_kind[since]
-                ring_z[to], ring_gated[to] = ring_z[since], ring_gated[since]
+                for k in range(3):
+                    ring_z[to, k], ring_gated[to, k] = ring_z[since, k], ring_gated[since, k]
             own = (newest + 1 - back) % size
             ring_t[own], ring_kind[own] = when, kind
-            ring_z[own] = z
+            for k in range(3):
+                ring_z[own, k] = z[k]
             begin_camera = kind == CAMERA and (whole[_CAMERA_STARTED] == 0 or whole[_PENDING] == 1)
             for i in range(back + 1):
                 now = (newest + 1 - back + i) % size
                 before = (now - 1) % size
-                ring_x[now], ring_P[now], ring_w[now] = ring_x[before], ring_P[before], ring_w[before]
                 if i == 0 and begin_camera:
-                    phi, length, found = invert_marker(
-                        view, ring_x[now, 0, 6:], z[0], z[1], ring_x[now, 0, 0], head[1]
-                    )
+                    sensor, angle = ring_x[before, 0, 6:], ring_x[before, 0, 0]
+                    phi, length, found = invert_marker(view, sensor, z[0], z[1], angle, head[1])
                     if not found:
-                        phi, length, found = invert_marker(view, ring_x[now, 0, 6:], z[0], z[1], 0.0, head[1])
+                        phi, length, found = invert_marker(view, sensor, z[0], z[1], 0.0, head[1])
                     if found and 0.2 * head[1] < length < 3.0 * head[1]:
                         if whole[_CAMERA_STARTED] == 1:
                             flags |= 1
-                        _reset_head(ring_x[now], ring_P[now], ring_w[now], head, head_sigma)
-                        ring_x[now, :, 0], ring_x[now, :, 1] = phi, length
+                        _reset_head(ring_x[before], ring_P[before], ring_w[before], head, head_sigma)
+                        for m in range(count):
+                            ring_x[before, m, 0], ring_x[before, m, 1] = phi, length
                         whole[_CAMERA_STARTED], whole[_PENDING] = 1, 0
-                flags |= _one(
-                    ring_x[now], ring_P[now], ring_w[now], ring_kind[now], ring_z[now],
-                    ring_t[now] - ring_t[before], switch_hz, levels, walk, view, constants, noise,
-                    head, head_sigma, work, i > 0, report if i == 0 else spare, ring_gated[now],
+                event(
+                    ring_x[before], ring_P[before], ring_w[before], ring_x[now], ring_P[now], ring_w[now],
+                    ring_kind[now], ring_z[now], ring_t[now] - ring_t[before], switch_hz, levels, walk, view,
+                    constants, noise, work, i > 0, report if i == 0 else spare, ring_gated[now], untraced,
                 )  # fmt: skip
+                flags |= _mend(ring_x[now], ring_P[now], head, head_sigma)
             whole[_NEWEST] = (newest + 1) % size
             whole[_COUNT] = min(whole[_COUNT] + 1, size)
             likelihood = out[row, 24]
@@ -270,7 +270,8 @@ def run_filter(
                     here = whole[_NEWEST]
                     phi, length = ring_x[here, 0, 0], ring_x[here, 0, 1]
                     _reset_head(ring_x[here], ring_P[here], ring_w[here], head, head_sigma)
-                    ring_x[here, :, 0], ring_x[here, :, 1] = phi, length
+                    for m in range(count):
+                        ring_x[here, m, 0], ring_x[here, m, 1] = phi, length
                     real[_GYRO_REJECTED_SINCE] = math.nan
                     flags |= 1
         if stamp - real[_CAMERA_SEEN] > _SILENT_S:
@@ -282,10 +283,9 @@ def run_filter(
         if whole[_COUNT] == 0:
             flags |= 64
         if abs(ahead) > 0.02:
-            spare_x[:], spare_P[:], spare_w[:] = ring_x[here], ring_P[here], ring_w[here]
-            if ahead > 0.0:
-                for m in range(count):
-                    predict(spare_x[m], spare_P[m], levels[m], walk, ahead)
+            mix(ring_x[here], ring_P[here], ring_w[here], spare_x, spare_P, spare_w, 0.0)
+            for m in range(count):
+                predict(spare_x[m], spare_P[m], levels[m], walk, ahead)
             _write(spare_x, spare_P, spare_w, 0.0, levels, radius, out[row])
         else:
             _write(ring_x[here], ring_P[here], ring_w[here], ahead, levels, radius, out[row])

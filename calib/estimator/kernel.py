@@ -24,12 +24,13 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba import njit
 
 from calib.arrays import FloatArray
 from calib.estimator.model import mix, predict, settle_weights
 from calib.estimator.rounding import update_terms
-from calib.estimator.sensors import accelerometer, gyroscope, marker
+from calib.estimator.sensors import SIZE, accelerometer, gyroscope, marker
 
 __all__ = [
     "CAMERA",
@@ -37,6 +38,8 @@ __all__ = [
     "IMU",
     "NOISE",
     "REPORT",
+    "TRACE",
+    "WORK",
     "camera_terms",
     "event",
     "imu_terms",
@@ -44,7 +47,9 @@ __all__ = [
 ]
 
 CONSIDERED = (11, 12, 14, 15, 16)
-"""Entries of the state that readings do not change; `scalar_update` has them written out."""
+"""Entries of the state that readings do not change."""
+
+_LEARNT = np.array([0.0 if k in CONSIDERED else 1.0 for k in range(SIZE)])
 
 CAMERA, IMU = 1, 2
 """Kinds of events; a picture has the readings (u, v), a sample (a_x, a_y, g_z), NaN where missing."""
@@ -80,6 +85,12 @@ REPORT = (
 )
 """What an event says of itself; e are innovations over their standard deviation. NaN: not sampled."""
 
+WORK = 8
+"""Scratch of each level: gradients 0 to 2, P H' 3 to 5, innovations and variances 6, chi-squares 7."""
+
+TRACE = 40
+"""What a reading leaves for the smoother: H (19), P H' / S (19), y / S, 1 / S; the last is 0 without one."""
+
 _TELLING = 9.0
 """A rate or acceleration below three deviations (squared) tells nothing of what it multiplies."""
 
@@ -100,34 +111,15 @@ def scalar_update(x: FloatArray, P: FloatArray, innovation: float, S: float, p: 
     move = innovation * root
     for i in range(n):
         gain = p[i]
-        if i == 11 or i == 12 or 14 <= i <= 16:
-            for j in range(11):
-                P[i, j] -= gain * p[j]
-            P[i, 13] -= gain * p[13]
-            P[i, 17] -= gain * p[17]
-            P[i, 18] -= gain * p[18]
+        if i < SIZE and _LEARNT[i] == 0.0:
+            for j in range(n):
+                if j >= SIZE or _LEARNT[j] != 0.0:
+                    P[i, j] -= gain * p[j]
             continue
         x[i] += gain * move
         # p_i p_j is the same product on both sides of the diagonal, so P stays symmetric.
         for j in range(n):
             P[i, j] -= gain * p[j]
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _project(P: FloatArray, H: FloatArray, p: FloatArray) -> float:
-    """p = P H' and H P H'."""
-    n = H.shape[0]
-    for j in range(n):
-        p[j] = 0.0
-    for k in range(n):
-        slope = H[k]
-        if slope != 0.0:
-            for j in range(n):
-                p[j] += slope * P[k, j]
-    total = 0.0
-    for k in range(n):
-        total += H[k] * p[k]
-    return total
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -166,23 +158,162 @@ def imu_terms(
     out[5] = noise[4] * noise[4] + (x[4] * noise[7]) ** 2
 
 
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _expect(
+    x: FloatArray, P: FloatArray, kind: int, z: FloatArray, view: FloatArray, constants: FloatArray,
+    noise: FloatArray, work: FloatArray,
+) -> None:  # fmt: skip
+    """Gradients H, P H', innovations 6[:3], variances of the noise 6[3:6] and of the prediction 6[6:10]."""
+    n, out, told = x.shape[0], work[7], work[6]
+    count = 2 if kind == CAMERA else 3
+    if kind == CAMERA:
+        camera_terms(view, noise, x, P, work, out)
+    else:
+        imu_terms(constants, noise, x, P, work, out)
+    for i in range(count):
+        told[i], told[3 + i] = z[i] - out[i], out[count + i]
+        H, p = work[i], work[3 + i]
+        for j in range(n):
+            p[j] = 0.0
+        for k in range(n):
+            slope = H[k]
+            if slope != 0.0:
+                for j in range(n):
+                    p[j] += slope * P[k, j]
+        total = 0.0
+        for k in range(n):
+            total += H[k] * p[k]
+        told[6 + i] = total
+    total = 0.0
+    for k in range(n):
+        total += work[1, k] * work[3, k]
+    told[9] = total
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def _pair(
-    P: FloatArray, H: FloatArray, work: FloatArray, m: int, e0: float, e1: float, r0: float, r1: float
-) -> float:
-    """Chi-square of two readings together in level m; it and both innovations go to `work`."""
-    p = work[0]
-    a = _project(P, H[0], p) + r0
-    b = 0.0
-    for k in range(H.shape[1]):
-        b += H[1, k] * p[k]
-    c = _project(P, H[1], p) + r1
-    work[8, m], work[10, m], work[11, m] = (
-        (c * e0 * e0 - 2.0 * b * e0 * e1 + a * e1 * e1) / (a * c - b * b),
-        e0 / math.sqrt(a),
-        e1 / math.sqrt(c),
-    )
-    return float(work[8, m])
+def _pair(told: FloatArray, more: float, kept: FloatArray) -> float:
+    """Chi-square of two readings together, `more` added to their variances; both go to `kept`."""
+    a, b, c = told[6] + told[3] + more, told[9], told[7] + told[4] + more
+    e0, e1 = told[0], told[1]
+    kept[0] = (c * e0 * e0 - 2.0 * b * e0 * e1 + a * e1 * e1) / (a * c - b * b)
+    kept[2], kept[3] = e0 / math.sqrt(a), e1 / math.sqrt(c)
+    return float(kept[0])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _judge(
+    kind: int, z: FloatArray, noise: FloatArray, work: FloatArray, report: FloatArray, gated: FloatArray
+) -> None:
+    """Which sensors of an event are gated, by the level that expects them best."""
+    best, best_gyro = math.inf, math.inf
+    if kind == CAMERA:
+        variance = noise[0] * noise[0] + noise[1] * noise[1] / 12.0
+        for m in range(work.shape[0]):
+            best = min(best, _pair(work[m, 6], variance + _MARGIN_PX2, work[m, 7]))
+            _pair(work[m, 6], variance, work[m, 7])
+        gated[0] = 0.0 if best < noise[8] else 1.0
+        report[8] = gated[0]
+        return
+    gated[1], gated[2] = 1.0, 1.0
+    for m in range(work.shape[0]):
+        told, kept = work[m, 6], work[m, 7]
+        S = told[8] + told[5]
+        kept[1], kept[4] = told[2] * told[2] / S, told[2] / math.sqrt(S)
+        best_gyro = min(best_gyro, kept[1])
+        best = min(best, _pair(told, 0.0, kept))
+    if not (math.isnan(z[0]) or math.isnan(z[1])):
+        gated[1] = 0.0 if best < noise[9] else 1.0
+        report[9] = gated[1]
+    if not math.isnan(z[2]):
+        gated[2] = 0.0 if best_gyro < noise[10] else 1.0
+        report[10] = gated[2]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _absorb(
+    x: FloatArray, P: FloatArray, kind: int, noise: FloatArray, work: FloatArray, gated: FloatArray,
+    trace: FloatArray,
+) -> float:  # fmt: skip
+    """Update by the readings of an event, one after the other; their log likelihood.
+
+    The readings act on P H' of those that follow at once and on P itself together at the end.
+    """
+    n, told = x.shape[0], work[6]
+    total, used = 0.0, 0
+    move0, move1, move2 = 0.0, 0.0, 0.0
+    for order in range(3):
+        # The gyroscope first: it is the most exact.
+        k = order if kind == CAMERA else (order + 2) % 3
+        p, H = work[3 + k], work[k]
+        sensor = 0 if kind == CAMERA else 2 if k == 2 else 1
+        if gated[sensor] != 0.0 or (kind == CAMERA and k == 2):
+            for j in range(n):
+                p[j] = 0.0
+            continue
+        spread = 0.0
+        for j in range(n):
+            spread += H[j] * p[j]
+        if kind == CAMERA:
+            y, S, log_z = update_terms(told[k], spread, noise[0] * noise[0] + told[3 + k], noise[1])
+            total += log_z
+        else:
+            y, S = told[k], spread + told[3 + k]
+            total -= 0.5 * (y * y / S + math.log(2.0 * math.pi * S))
+        if trace.shape[0]:
+            for j in range(n):
+                trace[used, j], trace[used, n + j] = H[j], p[j] / S
+            trace[used, 2 * n], trace[used, 2 * n + 1] = y / S, 1.0 / S
+            used += 1
+        root = 1.0 / math.sqrt(S)
+        for j in range(n):
+            p[j] *= root
+        move = y * root
+        for later in range(order + 1, 3):
+            other = later if kind == CAMERA else (later + 2) % 3
+            if kind == CAMERA and other == 2:
+                continue
+            next_H, next_p = work[other], work[3 + other]
+            every = 0.0
+            for j in range(n):
+                every += p[j] * next_H[j]
+            learnt = 0.0
+            for j in range(n):
+                learnt += _LEARNT[j] * p[j] * next_H[j]
+            told[other] -= learnt * move
+            # Between two that are only considered the covariance stays.
+            for j in range(n):
+                next_p[j] -= (learnt + _LEARNT[j] * (every - learnt)) * p[j]
+        if k == 0:
+            move0 = move
+        elif k == 1:
+            move1 = move
+        else:
+            move2 = move
+    if trace.shape[0]:
+        for k in range(used, 3):
+            trace[k, 2 * n + 1] = 0.0
+    p0, p1, p2 = work[3], work[4], work[5]
+    three = kind != CAMERA
+    for i in range(n):
+        if _LEARNT[i] == 0.0:
+            continue
+        g0, g1 = p0[i], p1[i]
+        x[i] += g0 * move0 + g1 * move1
+        # p_i p_j is the same product on both sides of the diagonal, so P stays symmetric.
+        if three:
+            g2 = p2[i]
+            x[i] += g2 * move2
+            for j in range(n):
+                P[i, j] -= g0 * p0[j] + g1 * p1[j] + g2 * p2[j]
+        else:
+            for j in range(n):
+                P[i, j] -= g0 * p0[j] + g1 * p1[j]
+    for i in range(6, n):
+        if _LEARNT[i] == 0.0:
+            for j in range(n):
+                if _LEARNT[j] != 0.0:
+                    P[i, j] = P[j, i]
+    return total
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -190,11 +321,12 @@ def _tell(kind: int, weight: FloatArray, work: FloatArray, report: FloatArray) -
     """Innovations in the report, those of each level weighted as after the event."""
     pair, gyro, e0, e1, e2 = 0.0, 0.0, 0.0, 0.0, 0.0
     for m in range(weight.shape[0]):
-        pair += weight[m] * work[8, m]
-        gyro += weight[m] * work[9, m]
-        e0 += weight[m] * work[10, m]
-        e1 += weight[m] * work[11, m]
-        e2 += weight[m] * work[12, m]
+        kept = work[m, 7]
+        pair += weight[m] * kept[0]
+        gyro += weight[m] * kept[1]
+        e0 += weight[m] * kept[2]
+        e1 += weight[m] * kept[3]
+        e2 += weight[m] * kept[4]
     if kind == CAMERA:
         report[0], report[3], report[4] = pair, e0, e1
         return
@@ -205,97 +337,10 @@ def _tell(kind: int, weight: FloatArray, work: FloatArray, report: FloatArray) -
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _judge_camera(
-    x: FloatArray, P: FloatArray, view: FloatArray, noise: FloatArray, z: FloatArray, H: FloatArray,
-    work: FloatArray, report: FloatArray, gated: FloatArray,
-) -> None:  # fmt: skip
-    """Innovations of a picture, and whether it is gated."""
-    out = work[2]
-    variance = noise[0] * noise[0] + noise[1] * noise[1] / 12.0
-    best = math.inf
-    for m in range(x.shape[0]):
-        camera_terms(view, noise, x[m], P[m], H, out)
-        e0, e1 = z[0] - out[0], z[1] - out[1]
-        r0, r1 = variance + out[2], variance + out[3]
-        best = min(best, _pair(P[m], H, work, m, e0, e1, r0 + _MARGIN_PX2, r1 + _MARGIN_PX2))
-        _pair(P[m], H, work, m, e0, e1, r0, r1)
-    gated[0] = 0.0 if best < noise[8] else 1.0
-    report[8] = gated[0]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _camera(
-    x: FloatArray, P: FloatArray, view: FloatArray, noise: FloatArray, z: FloatArray, H: FloatArray,
-    work: FloatArray, log_l: FloatArray,
-) -> None:  # fmt: skip
-    p, x0, out = work[0], work[1], work[2]
-    jitter, grid = noise[0] * noise[0], noise[1]
-    for m in range(x.shape[0]):
-        camera_terms(view, noise, x[m], P[m], H, out)
-        x0[:] = x[m]
-        for k in range(2):
-            spread = _project(P[m], H[k], p)
-            moved = 0.0
-            for i in range(x.shape[1]):
-                moved += H[k, i] * (x[m, i] - x0[i])
-            y, S, log_z = update_terms(z[k] - out[k] - moved, spread, jitter + out[2 + k], grid)
-            log_l[m] += log_z
-            scalar_update(x[m], P[m], y, S, p)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _judge_imu(
-    x: FloatArray, P: FloatArray, constants: FloatArray, noise: FloatArray, z: FloatArray, H: FloatArray,
-    work: FloatArray, report: FloatArray, gated: FloatArray,
-) -> None:  # fmt: skip
-    """Innovations of an IMU sample, and which of its two sensors is gated or missing."""
-    p, out = work[0], work[2]
-    has_accel = not (math.isnan(z[0]) or math.isnan(z[1]))
-    has_gyro = not math.isnan(z[2])
-    best_accel, best_gyro = math.inf, math.inf
-    for m in range(x.shape[0]):
-        imu_terms(constants, noise, x[m], P[m], H, out)
-        if has_gyro:
-            S = _project(P[m], H[2], p) + out[5]
-            e = z[2] - out[2]
-            work[9, m], work[12, m] = e * e / S, e / math.sqrt(S)
-            best_gyro = min(best_gyro, e * e / S)
-        if has_accel:
-            x_off, y_off = z[0] - out[0], z[1] - out[1]
-            best_accel = min(best_accel, _pair(P[m], H, work, m, x_off, y_off, out[3], out[4]))
-    gated[1], gated[2] = 1.0, 1.0
-    if has_accel:
-        gated[1] = 0.0 if best_accel < noise[9] else 1.0
-        report[9] = gated[1]
-    if has_gyro:
-        gated[2] = 0.0 if best_gyro < noise[10] else 1.0
-        report[10] = gated[2]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _imu(
-    x: FloatArray, P: FloatArray, constants: FloatArray, noise: FloatArray, z: FloatArray, H: FloatArray,
-    work: FloatArray, log_l: FloatArray, gated: FloatArray,
-) -> None:  # fmt: skip
-    p, x0, out = work[0], work[1], work[2]
-    for m in range(x.shape[0]):
-        imu_terms(constants, noise, x[m], P[m], H, out)
-        x0[:] = x[m]
-        for order in range(3):
-            # The gyroscope first: it is the most exact.
-            k = 2 if order == 0 else order - 1
-            if gated[2 if k == 2 else 1] != 0.0:
-                continue
-            S = _project(P[m], H[k], p) + out[3 + k]
-            y = z[k] - out[k]
-            for i in range(x.shape[1]):
-                y -= H[k, i] * (x[m, i] - x0[i])
-            log_l[m] -= 0.5 * (y * y / S + math.log(2.0 * math.pi * S))
-            scalar_update(x[m], P[m], y, S, p)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def event(
+    old_x: FloatArray,
+    old_P: FloatArray,
+    old_weight: FloatArray,
     x: FloatArray,
     P: FloatArray,
     weight: FloatArray,
@@ -312,39 +357,43 @@ def event(
     again: bool,
     report: FloatArray,
     gated: FloatArray,
+    trace: FloatArray,
 ) -> None:
-    """Carry the bank on to an event and update it, in place.
+    """Carry the bank on to an event and update it.
 
     Parameters
     ----------
-    x, P, weight : (M, 19), (M, 19, 19), (M,).
-    kind, z, dt : `CAMERA` or `IMU`, readings (3,), time since the last event [s].
+    old_x, old_P, old_weight : (M, 19), (M, 19, 19), (M,) after the event before.
+    x, P, weight : the same after this one; written to.
+    kind, z, dt : `CAMERA`, `IMU` or 0 for none, readings (3,), time since the event before [s].
     switch_hz, levels, walk : of `model.Kinematic`.
     view, constants, noise : camera (24,), gravity and lever across (2,), `NOISE` (11,).
-    work : (13, 19) scratch. report : (12,) of `REPORT`, written to.
+    work : (M, `WORK`, 19) scratch. report : (12,) of `REPORT`, written to.
     again : whether the event is done once more; then `gated` holds.
     gated : (3,) 1 where camera, accelerometer or gyroscope is not used.
+    trace : (3, `TRACE`) what each reading of the last level did, for the smoother; (0, `TRACE`) for nothing.
     """
     count = x.shape[0]
+    turn = (1.0 - math.exp(-count * switch_hz * dt)) / count if count > 1 and dt > 0.0 else 0.0
+    mix(old_x, old_P, old_weight, x, P, weight, turn)
     if not again:
         report[:] = math.nan
-    if count > 1 and dt > 0.0:
-        turn = (1.0 - math.exp(-count * switch_hz * dt)) / count
-        mix(x, P, weight, 1.0 - (count - 1) * turn, turn)
+    if kind == 0:
+        for m in range(count):
+            predict(x[m], P[m], levels[m], walk, dt)
+        if trace.shape[0]:
+            trace[:, TRACE - 1] = 0.0
+        report[11] = 0.0
+        return
     for m in range(count):
         predict(x[m], P[m], levels[m], walk, dt)
-    log_l = work[4, :count]
-    log_l[:] = 0.0
-    H = work[5:8]
-    if kind == CAMERA:
-        if not again:
-            _judge_camera(x, P, view, noise, z, H, work, report, gated)
-        if gated[0] == 0.0:
-            _camera(x, P, view, noise, z, H, work, log_l)
-    elif kind == IMU:
-        if not again:
-            _judge_imu(x, P, constants, noise, z, H, work, report, gated)
-        _imu(x, P, constants, noise, z, H, work, log_l, gated)
-    report[11] = settle_weights(weight, log_l) if count > 1 else log_l[0]
-    if not again and kind != 0:
+        _expect(x[m], P[m], kind, z, view, constants, noise, work[m])
+    if not again:
+        _judge(kind, z, noise, work, report, gated)
+    best = -math.inf
+    for m in range(count):
+        work[m, 6, 12] = _absorb(x[m], P[m], kind, noise, work[m], gated, trace)
+        best = max(best, work[m, 6, 12])
+    report[11] = settle_weights(weight, work[:, 6, 12]) if count > 1 else best
+    if not again:
         _tell(kind, weight, work, report)

@@ -38,6 +38,8 @@ __all__ = [
 ]
 
 LARGEST_STEP_S = 0.02
+_NEGLIGIBLE = 1e-6
+"""A share of a mixture that is left out."""
 
 
 @dataclass(frozen=True)
@@ -98,8 +100,8 @@ class Kinematic:
     switch_hz: float = 0.1
     sensor_walk: tuple[float, ...] = (
         2e-5,
-        2e-4,
-        2e-4,
+        3e-3,
+        1e-3,
         1e-6,
         1e-6,
         1e-7,
@@ -207,48 +209,52 @@ def predict(x: FloatArray, P: FloatArray, level: FloatArray, walk: FloatArray, d
         _step(x, P, level, walk, h)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def mix(x: FloatArray, P: FloatArray, weight: FloatArray, stay: float, turn: float) -> None:
-    """Let the levels start from their mixtures, in place.
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def mix(
+    old_x: FloatArray, old_P: FloatArray, old_weight: FloatArray, x: FloatArray, P: FloatArray,
+    weight: FloatArray, turn: float,
+) -> None:  # fmt: skip
+    """Let the levels start from their mixtures.
 
     Parameters
     ----------
-    x, P : (M, n) and (M, n, n).
-    weight : (M,) of the levels; on return those predicted.
-    stay, turn : probabilities of staying and of turning into each one of the others.
+    old_x, old_P, old_weight : (M, n), (M, n, n), (M,) of the levels.
+    x, P, weight : of the mixtures; written to.
+    turn : probability of turning into each one of the others.
     """
     levels, n = x.shape
-    if levels == 1:
-        return
-    before_x, before_P, before = x.copy(), P.copy(), weight.copy()
-    share, away = np.empty(levels), np.empty(n)
+    stay = 1.0 - (levels - 1) * turn
     for j in range(levels):
         total = 0.0
         for i in range(levels):
-            share[i] = before[i] * (stay if i == j else turn)
-            total += share[i]
+            total += old_weight[i] * (stay if i == j else turn)
         weight[j] = total
+        alone = -1
         for i in range(levels):
-            share[i] /= total
-        if share[j] > 1.0 - 1e-6:
+            if old_weight[i] * (stay if i == j else turn) > (1.0 - _NEGLIGIBLE) * total:
+                alone = i
+        if alone >= 0:
+            for k in range(n):
+                x[j, k] = old_x[alone, k]
+                for m in range(n):
+                    P[j, k, m] = old_P[alone, k, m]
             continue
         for k in range(n):
-            x[j, k] = 0.0
+            mean = 0.0
+            for i in range(levels):
+                mean += old_weight[i] * (stay if i == j else turn) * old_x[i, k]
+            x[j, k] = mean / total
             for m in range(n):
                 P[j, k, m] = 0.0
         for i in range(levels):
-            for k in range(n):
-                x[j, k] += share[i] * before_x[i, k]
-        for i in range(levels):
-            if share[i] < 1e-9:
+            part = old_weight[i] * (stay if i == j else turn) / total
+            if part < _NEGLIGIBLE:
                 continue
-            part = share[i]
+            root = math.sqrt(part)
             for k in range(n):
-                away[k] = before_x[i, k] - x[j, k]
-            for k in range(n):
-                d = part * away[k]
+                away = root * (old_x[i, k] - x[j, k])
                 for m in range(n):
-                    P[j, k, m] += part * before_P[i, k, m] + d * away[m]
+                    P[j, k, m] += part * old_P[i, k, m] + away * (root * (old_x[i, m] - x[j, m]))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

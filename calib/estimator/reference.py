@@ -103,18 +103,23 @@ def extended(setup: Setup, rows: Rows, events: Events, gated: FloatArray) -> tup
 def extended_smoothed(
     setup: Setup, events: Events, x: FloatArray, P: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Rauch, Tung and Striebel over the states of `extended`."""
+    """Rauch, Tung and Striebel over the states of `extended` where what is considered has no variance.
+
+    Inverts the predicted covariance of all that has one.
+    """
     levels, walk = setup.process.arrays()
     x, P = x.copy(), P.copy()
-    F = np.empty((SIZE, SIZE))
+    F, free = np.empty((SIZE, SIZE)), [i for i in range(SIZE) if i not in CONSIDERED]
+    block = np.ix_(free, free)
     for k in range(len(x) - 2, -1, -1):
         dt = float(events.t_s[k + 1] - events.t_s[k])
         transition(levels[0], dt, F)
-        ahead = F @ P[k] @ F.T + process_noise(levels[0], walk, dt)
+        before, f = P[k][block], F[block]
+        ahead = f @ before @ f.T + process_noise(levels[0], walk, dt)[block]
         scale = 1.0 / np.sqrt(np.diag(ahead))
-        gain = (P[k] @ F.T * scale) @ np.linalg.inv(ahead * scale[:, None] * scale) * scale
-        x[k] += gain @ (x[k + 1] - F @ x[k])
-        P[k] += gain @ (P[k + 1] - ahead) @ gain.T
+        gain = (before @ f.T * scale) @ np.linalg.inv(ahead * scale[:, None] * scale) * scale
+        x[k, free] += gain @ (x[k + 1] - F @ x[k])[free]
+        P[k][block] += gain @ (P[k + 1][block] - ahead) @ gain.T
     return x, P
 
 

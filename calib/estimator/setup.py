@@ -26,6 +26,7 @@ FLAGS = {
 OUT = (
     "t_s", "q1_m", "q2_m", "dq1_mps", "dq2_mps", "phi_rad", "length_m", "x_m", "y_m", "gyro_bias_radps",
     "sigma_q1_m", "sigma_q2_m", "sigma_phi_rad", *REPORT, "flags", "swing_weight", "rest_weight",
+    "driven_weight",
 )  # fmt: skip
 """Columns of the output."""
 """Bits of the column `flags`."""

@@ -3,13 +3,21 @@
 1. The bank runs over the events in the order of their times, pictures at their exposure, and leaves its
    weights; these are smoothed backwards (Kim 1994, eq. 2.20),
        w_k|N(i) = w_k|k(i) sum_j pi_ij w_k+1|N(j) / w_k+1|k(j).
-2. One filter with the process noise that these weights mix runs forward. Readings that the bank has
-   gated stay out.
-3. Rauch, Tung and Striebel (1965) backwards: with P' = F P F' + Q
-       C = P F' P'^-1,   x_N += C (x_N+1 - F x),   P_N += C (P_N+1 - P') C'.
+2. One filter with the process noise that these weights mix runs forward, given what is only considered
+   (`kernel.CONSIDERED`). Readings that the bank has gated stay out.
+3. Bryson and Frazier (1963) backwards: each scalar reading, with k = P H' / S and L = I - k H, turns
+       y into L' y + H' innovation / S,   Y into L' Y L + H' H / S,
+   each step from one event to the next turns them into F' y and F' Y F, and
+       x_N = x + P y,   P_N = P - P Y P.
+   Nothing is inverted, and what has no variance does no harm.
+4. The same again from starting states that are off by a deviation along each principal direction of what is
+   considered, all else following by regression: the squares of what this makes of the states are added.
 
-Rows of the output are events without a reading. P' is scaled by its diagonal before it is factorised: a
-state holds accelerations of the angle next to micrometres.
+A filter that does not learn some states leaves innovations that are not white, and a backward pass over those
+would learn from afterwards what the filter had refused to: a loose alignment then made the smoothed
+angle several times worse than the filtered one. Given what is considered, both passes are optimal.
+
+Rows of the output are events without a reading.
 
 The backward pass begins anew every `WINDOW` events, from events `OVERLAP` further on, so that memory does not
 grow with the log; what is constant over the log is then known from all before and the overlap.
@@ -26,14 +34,16 @@ from numba import njit
 from calib.arrays import FloatArray, IntArray
 from calib.estimator.clock import even_times, new_clock
 from calib.estimator.filter import starting_state, write_columns
-from calib.estimator.kernel import event
-from calib.estimator.model import LARGEST_STEP_S, axis_transition, predict
+from calib.estimator.kernel import CONSIDERED, TRACE, WORK, event
+from calib.estimator.model import LARGEST_STEP_S, axis_transition
 from calib.estimator.sensors import SIZE
 from calib.estimator.setup import OUT, Rows, Setup
 
-__all__ = ["OVERLAP", "WINDOW", "Events", "events_of", "forward_bank", "smooth", "transition"]
+__all__ = ["OVERLAP", "WINDOW", "Events", "backward", "events_of", "forward", "smooth", "transition"]
 
 WINDOW, OVERLAP = 12_000, 3_000
+_KEPT = 7
+"""States that the output needs: the head's motion and the gyroscope's bias."""
 
 
 @dataclass(frozen=True)
@@ -74,22 +84,51 @@ def events_of(setup: Setup, rows: Rows, outputs: bool = True) -> Events:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def forward_bank(
-    t: FloatArray, kinds: IntArray, readings: FloatArray, x: FloatArray, P: FloatArray, w: FloatArray,
-    switch_hz: float, levels: FloatArray, walk: FloatArray, view: FloatArray, constants: FloatArray,
-    noise: FloatArray, weights: FloatArray, gated: FloatArray,
+def forward(
+    t: FloatArray, before_s: float, kinds: IntArray, readings: FloatArray, x: FloatArray, P: FloatArray,
+    w: FloatArray, switch_hz: float, levels: FloatArray, walk: FloatArray, view: FloatArray,
+    constants: FloatArray, noise: FloatArray, again: bool, gated: FloatArray, weights: FloatArray,
+    trace: FloatArray, kept_x: FloatArray, kept_P: FloatArray,
 ) -> float:  # fmt: skip
-    """The bank over all events, in place; weights (n, M) and what was gated (n, 3); log likelihood."""
-    work, report = np.zeros((13, x.shape[1])), np.empty(12)
-    total = 0.0
+    """A bank over all events; its log likelihood.
+
+    Parameters
+    ----------
+    before_s : time of x, P, w, which become those after the last event.
+    levels : (1, M, 8), or (n, M, 8) with levels of their own for each event.
+    again : whether `gated` (n, 3) holds; else it is written to.
+    weights : (n, M) written to. trace : (n, 3, `TRACE`) or (0, 3, `TRACE`), of the last level.
+    kept_x, kept_P : (n, a) and (n, a, 19), the last level's first states after each event; or none (0, ...).
+    """
+    count, size = x.shape
+    work, report = np.zeros((count, WORK, size)), np.empty(12)
+    other_x, other_P, other_w = np.empty_like(x), np.empty_like(P), np.empty_like(w)
+    untraced = np.empty((0, TRACE))
+    rows, total = kept_x.shape[1], 0.0
     for k in range(len(t)):
-        dt = t[k] - t[k - 1] if k else 0.0
+        dt = t[k] - (t[k - 1] if k else before_s)
+        even = k % 2 == 0
+        to_x, to_P, to_w = (other_x, other_P, other_w) if even else (x, P, w)
         event(
-            x, P, w, kinds[k], readings[k], dt, switch_hz, levels, walk, view, constants, noise, work, False,
-            report, gated[k],
+            x if even else other_x, P if even else other_P, w if even else other_w, to_x, to_P, to_w,
+            kinds[k], readings[k], dt, switch_hz, levels[k if levels.shape[0] > 1 else 0], walk, view,
+            constants, noise, work, again, report, gated[k], trace[k] if trace.shape[0] else untraced,
         )  # fmt: skip
-        weights[k] = w
+        for m in range(count):
+            weights[k, m] = to_w[m]
+        if kept_x.shape[0]:
+            for i in range(rows):
+                kept_x[k, i] = to_x[count - 1, i]
+                for j in range(size):
+                    kept_P[k, i, j] = to_P[count - 1, i, j]
         total += report[11]
+    if len(t) % 2:
+        for m in range(count):
+            w[m] = other_w[m]
+            for i in range(size):
+                x[m, i] = other_x[m, i]
+                for j in range(size):
+                    P[m, i, j] = other_P[m, i, j]
     return total
 
 
@@ -137,58 +176,114 @@ def transition(level: FloatArray, dt: float, F: FloatArray) -> None:
                 F[a, j] = f22 * F[a, j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _forward(
-    t: FloatArray, before_s: float, kinds: IntArray, readings: FloatArray, level: FloatArray,
-    gated: FloatArray, x: FloatArray, P: FloatArray, walk: FloatArray, view: FloatArray,
-    constants: FloatArray, noise: FloatArray, kept_x: FloatArray, kept_P: FloatArray,
-) -> None:  # fmt: skip
-    """One filter with the mixed levels (n, 8) over events, keeping all states."""
-    work, report, one = np.zeros((13, x.shape[1])), np.empty(12), np.ones(1)
-    for k in range(len(t)):
-        dt = t[k] - (t[k - 1] if k else before_s)
-        event(
-            x, P, one, kinds[k], readings[k], dt, 0.0, level[k : k + 1], walk, view, constants, noise, work,
-            True, report, gated[k],
-        )  # fmt: skip
-        kept_x[k], kept_P[k] = x[0], P[0]
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _undo_step(y: FloatArray, level: FloatArray, h: float) -> None:
+    """F' y for a step of h, in place."""
+    for axis in range(2):
+        f01, f02, f11, f12, f22 = axis_transition(level[4 * axis], level[4 * axis + 1], h)
+        p, v, a = y[axis], y[axis + 2], y[axis + 4]
+        y[axis + 2] = f01 * p + f11 * v
+        y[axis + 4] = f02 * p + f12 * v + f22 * a
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _backward(
-    t: FloatArray, level: FloatArray, walk: FloatArray, kept_x: FloatArray, kept_P: FloatArray
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def backward(
+    t: FloatArray, level: FloatArray, trace: FloatArray, kept_x: FloatArray, kept_P: FloatArray
 ) -> None:
-    """Rauch, Tung and Striebel over the kept states, in place."""
-    n = kept_x.shape[1]
-    F, ahead_x, ahead_P, scale = np.empty((n, n)), np.empty(n), np.empty((n, n)), np.empty(n)
-    for k in range(len(t) - 2, -1, -1):
-        dt = t[k + 1] - t[k]
-        transition(level[k + 1], dt, F)
-        ahead_x[:], ahead_P[:] = kept_x[k], kept_P[k]
-        predict(ahead_x, ahead_P, level[k + 1], walk, dt)
-        for i in range(n):
-            scale[i] = 1.0 / math.sqrt(ahead_P[i, i])
-        normal = np.empty((n, n))
-        for i in range(n):
+    """Bryson and Frazier over what `forward` has kept of one level, in place.
+
+    Parameters
+    ----------
+    level : (n, 8). trace : (n, 3, `TRACE`). kept_x, kept_P : (n, a) and (n, a, 19); of kept_P the first a
+        columns become the smoothed covariance. What is considered stays as it was in kept_x and kept_P.
+    """
+    rows, n = kept_P.shape[1], kept_P.shape[2]
+    y, Y, Yk, part = np.zeros(n), np.zeros((n, n)), np.empty(n), np.empty((rows, n))
+    for k in range(len(t) - 1, -1, -1):
+        # What follows the event tells of the state after its readings.
+        for i in range(rows):
             for j in range(n):
-                normal[i, j] = ahead_P[i, j] * scale[i] * scale[j]
-            normal[i, i] += 1e-13
-        cross = F @ kept_P[k]
-        for i in range(n):
+                part[i, j] = 0.0
+            for m in range(n):
+                for j in range(n):
+                    part[i, j] += kept_P[k, i, m] * Y[m, j]
+        for i in range(rows):
+            if i == 11 or i == 12 or 14 <= i <= 16:
+                continue
             for j in range(n):
-                cross[i, j] *= scale[i]
-        gain = np.linalg.solve(normal, cross).T
-        move, change = np.empty(n), np.empty((n, n))
-        for i in range(n):
-            move[i] = (kept_x[k + 1, i] - ahead_x[i]) * scale[i]
-            for j in range(n):
-                change[i, j] = (kept_P[k + 1, i, j] - ahead_P[i, j]) * scale[i] * scale[j]
-        kept_x[k] += gain @ move
-        added = gain @ change @ gain.T
-        for i in range(n):
-            for j in range(n):
-                kept_P[k, i, j] += 0.5 * (added[i, j] + added[j, i])
-            kept_P[k, i, i] = max(kept_P[k, i, i], 1e-24)
+                kept_x[k, i] += kept_P[k, i, j] * y[j]
+        for i in range(rows):
+            for j in range(i + 1):
+                off = 0.0
+                for m in range(n):
+                    off += part[i, m] * kept_P[k, j, m]
+                Yk[j] = off
+            for j in range(i + 1):
+                part[i, j] = Yk[j]
+        for i in range(rows):
+            for j in range(i + 1):
+                kept_P[k, i, j] -= part[i, j]
+                kept_P[k, j, i] = kept_P[k, i, j]
+        for reading in range(2, -1, -1):
+            weight = trace[k, reading, 2 * n + 1]
+            if weight == 0.0:
+                continue
+            H, gain = trace[k, reading, :n], trace[k, reading, n : 2 * n]
+            known = 0.0
+            for i in range(n):
+                known += gain[i] * y[i]
+                Yk[i] = 0.0
+            for i in range(n):
+                for j in range(n):
+                    Yk[j] += gain[i] * Y[i, j]
+            for i in range(n):
+                weight += gain[i] * Yk[i]
+            change = trace[k, reading, 2 * n] - known
+            for i in range(n):
+                y[i] += H[i] * change
+                half = 0.5 * weight * H[i] - Yk[i]
+                for j in range(n):
+                    Y[i, j] += half * H[j] + H[i] * (0.5 * weight * H[j] - Yk[j])
+        if k == 0:
+            continue
+        dt = t[k] - t[k - 1]
+        if not dt > 0.0:
+            continue
+        parts = max(math.ceil(dt / LARGEST_STEP_S - 1e-9), 1)
+        for _ in range(parts):
+            _undo_step(y, level[k], dt / parts)
+            for i in range(n):
+                _undo_step(Y[i], level[k], dt / parts)
+            for i in range(6, n):
+                for j in range(6):
+                    Y[j, i] = Y[i, j]
+            for j in range(6):
+                for i in range(6):
+                    Yk[i] = Y[i, j]
+                _undo_step(Yk, level[k], dt / parts)
+                for i in range(6):
+                    Y[i, j] = Yk[i]
+
+
+def _given(x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Starting states (1 + k, 19), what is considered as it is and off by a deviation, and their covariance.
+
+    The rest follows by its regression on what is considered; k counts the principal directions of that.
+    """
+    held, free = list(CONSIDERED), [i for i in range(SIZE) if i not in CONSIDERED]
+    V = P[np.ix_(held, held)]
+    sigma = np.sqrt(np.maximum(np.diag(V), 1e-30))
+    eigenvalues, Q = np.linalg.eigh(V / sigma / sigma[:, None])
+    use = eigenvalues > 1e-6
+    directions = sigma[:, None] * Q[:, use] * np.sqrt(eigenvalues[use])
+    along = Q[:, use] / np.sqrt(eigenvalues[use]) / sigma[:, None]
+    follow = P[np.ix_(free, held)] @ along
+    states = np.tile(x, (1 + directions.shape[1], 1))
+    states[1:, held] += directions.T
+    states[1:, free] += follow.T
+    left = np.zeros((SIZE, SIZE))
+    left[np.ix_(free, free)] = P[np.ix_(free, free)] - follow @ follow.T
+    return states, left
 
 
 def smooth(setup: Setup, rows: Rows, outputs: FloatArray) -> FloatArray:
@@ -200,36 +295,55 @@ def smooth(setup: Setup, rows: Rows, outputs: FloatArray) -> FloatArray:
     """
     events = events_of(setup, rows)
     levels, walk = setup.process.arrays()
-    constants = np.array([setup.gravity_mps2, setup.lever_across_m])
     x, P, w = starting_state(setup, rows)
     n, count = len(events.t_s), len(levels)
+    out = outputs.copy()
+    if n == 0:
+        return out
     weights, gated = np.empty((n, count)), np.zeros((n, 3))
-    common = (walk, setup.view, constants, setup.noise)
-    bank_x, bank_P = x.copy(), P.copy()
-    forward_bank(
-        events.t_s, events.kinds, events.readings, bank_x, bank_P, w, setup.process.switch_hz, levels,
-        *common, weights, gated,
+    states, left = _given(x[0], P[0])
+    steady = walk.copy()
+    steady[[k - 6 for k in CONSIDERED]] = 0.0
+    known = (setup.view, np.array([setup.gravity_mps2, setup.lever_across_m]), setup.noise)
+    none = (np.empty((0, 3, TRACE)), np.empty((0, _KEPT)), np.empty((0, _KEPT, SIZE)))
+    forward(
+        events.t_s, float(events.t_s[0]), events.kinds, events.readings, x, P, w, setup.process.switch_hz,
+        levels[None], walk, *known, False, gated, weights, *none,
     )  # fmt: skip
     _smooth_weights(events.t_s, setup.process.switch_hz, weights)
     mixed = weights @ levels
-    out = outputs.copy()
-    one_x, one_P = x[:1].copy(), P[:1].copy()
-    begin, before = 0, float(events.t_s[0]) if n else 0.0
+    ones = [(state[None].copy(), left[None].copy(), np.ones(1)) for state in states]
+    begin, before = 0, float(events.t_s[0])
     while begin < n:
         end = min(begin + WINDOW, n)
         stop = min(end + OVERLAP, n)
-        part = slice(begin, stop)
-        kept_x, kept_P = np.empty((stop - begin, SIZE)), np.empty((stop - begin, SIZE, SIZE))
-        _forward(
-            events.t_s[part], before, events.kinds[part], events.readings[part], mixed[part], gated[part],
-            one_x, one_P, *common, kept_x, kept_P,
-        )  # fmt: skip
-        at_end = end - begin - 1
-        one_x[0], one_P[0] = kept_x[at_end], kept_P[at_end]
-        _backward(events.t_s[part], mixed[part], walk, kept_x, kept_P)
-        own = np.nonzero(events.kinds[begin:end] == 0)[0]
+        own, beyond = slice(begin, end), slice(end, stop)
+        shown = np.nonzero(events.kinds[own] == 0)[0]
+        kept_x, kept_P = np.empty((stop - begin, _KEPT)), np.empty((stop - begin, _KEPT, SIZE))
+        trace, spare = np.empty((stop - begin, 3, TRACE)), np.empty((stop - begin, 1))
+        mean, covariance = np.empty(0), np.empty(0)
+        for number, state in enumerate(ones):
+            since = before
+            for part in (own, beyond):
+                if part is beyond:
+                    # The next window begins with the state at `end`; what is beyond only looks back.
+                    state = (state[0].copy(), state[1].copy(), state[2].copy())
+                at = slice(part.start - begin, part.stop - begin)
+                if part.start < part.stop:
+                    forward(
+                        events.t_s[part], since, events.kinds[part], events.readings[part], *state, 0.0,
+                        mixed[part, None], steady, *known, True, gated[part], spare[at], trace[at],
+                        kept_x[at], kept_P[at],
+                    )  # fmt: skip
+                since = float(events.t_s[end - 1])
+            backward(events.t_s[begin:stop], mixed[begin:stop], trace, kept_x, kept_P)
+            if number == 0:
+                mean, covariance = kept_x[shown], kept_P[shown, :, :_KEPT]
+            else:
+                away = kept_x[shown] - mean
+                covariance = covariance + away[:, :, None] * away[:, None, :]
         write_columns(
-            kept_x[own], kept_P[own], mixed[begin:end][own], events.rows[begin:end][own],
+            mean, np.ascontiguousarray(covariance), mixed[own][shown], events.rows[own][shown],
             setup.bellows_radius_m, out,
         )  # fmt: skip
         before = float(events.t_s[end - 1])

@@ -19,25 +19,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import numpy as np
 from estimatorlogs import rows_from, setup_for, simulated
-from numba import njit
 
 from calib.estimator import reference, smoother
 from calib.estimator.filter import Filter, starting_state
-from calib.estimator.kernel import event
+from calib.estimator.kernel import TRACE
 from calib.estimator.model import Kinematic
 from calib.estimator.smoother import Events
-
-
-@njit
-def _recursion(t, kinds, readings, x, P, levels, walk, view, constants, noise):  # type: ignore[no-untyped-def]
-    """All events by `kernel.event`, without keeping or judging anything."""
-    work, report, one, gated = np.zeros((13, x.shape[1])), np.empty(12), np.ones(1), np.zeros(3)
-    for k in range(len(t)):
-        dt = t[k] - t[k - 1] if k else 0.0
-        event(
-            x, P, one, kinds[k], readings[k], dt, 0.0, levels, walk, view, constants, noise, work, True,
-            report, gated,
-        )  # fmt: skip
 
 
 def _seconds(call: Callable[[], object], repeats: int = 7) -> float:
@@ -57,23 +44,21 @@ def main() -> None:
     events = smoother.events_of(setup, rows, outputs=False)
     count = len(events.t_s)
     levels, walk = setup.process.arrays()
-    mixed, gated, constants = np.tile(levels[0], (count, 1)), np.zeros((count, 3)), np.array([9.81, 0.0])
+    gated, constants = np.zeros((count, 3)), np.array([9.81, 0.0])
     kept_x, kept_P = np.empty((count, 19)), np.empty((count, 19, 19))
+    nothing = (np.empty((0, 3, TRACE)), np.empty((0, 19)), np.empty((0, 19, 19)))
 
-    def ours() -> None:
-        x, P, _ = starting_state(setup, rows)
-        smoother._forward(
-            events.t_s, float(events.t_s[0]), events.kinds, events.readings, mixed, gated, x, P, walk,
-            setup.view, constants, setup.noise, kept_x, kept_P,
+    def recursion(*kept: np.ndarray) -> None:
+        x, P, w = starting_state(setup, rows)
+        smoother.forward(
+            events.t_s, float(events.t_s[0]), events.kinds, events.readings, x, P, w, 0.0, levels[None], walk,
+            setup.view, constants, setup.noise, True, gated, np.empty((count, 1)), *kept,
         )  # fmt: skip
 
     def alone() -> None:
-        x, P, _ = starting_state(setup, rows)
-        _recursion(
-            events.t_s, events.kinds, events.readings, x, P, levels, walk, setup.view, constants, setup.noise
-        )
+        recursion(*nothing)
 
-    ours()
+    recursion(np.empty((0, 3, TRACE)), kept_x, kept_P)
     alone()
     few = 600
     some = Events(events.t_s[:few], events.kinds[:few], events.readings[:few], events.rows[:few])

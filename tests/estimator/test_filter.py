@@ -12,9 +12,10 @@ from estimatorlogs import SCENARIOS, rows_from, setup_for, simulated, truth
 from calib.arrays import FloatArray
 from calib.estimator.consistency import Tally
 from calib.estimator.filter import Filter, starting_state
-from calib.estimator.kernel import CAMERA
+from calib.estimator.kernel import CAMERA, TRACE
+from calib.estimator.sensors import SIZE
 from calib.estimator.setup import FLAGS, OUT, Rows, Setup
-from calib.estimator.smoother import events_of, forward_bank
+from calib.estimator.smoother import events_of, forward
 
 TARGET_MM = {"static": 0.08, "swing": 0.22, "ellipse": 0.19, "step": 0.22, "elongation": 0.18}
 TARGET_DEG = {"swing": 0.06}
@@ -87,9 +88,10 @@ def test_late_pictures_end_in_the_state_of_the_right_order() -> None:
     x, P, w = starting_state(setup, rows)
     levels, walk = setup.process.arrays()
     weights, gated = np.empty((len(events.t_s), len(levels))), np.zeros((len(events.t_s), 3))
-    forward_bank(
-        events.t_s, events.kinds, events.readings, x, P, w, setup.process.switch_hz, levels, walk, setup.view,
-        np.array([9.81, 0.0]), setup.noise, weights, gated,
+    forward(
+        events.t_s, float(events.t_s[0]), events.kinds, events.readings, x, P, w, setup.process.switch_hz,
+        levels[None], walk, setup.view, np.array([9.81, 0.0]), setup.noise, False, gated, weights,
+        np.empty((0, 3, TRACE)), np.empty((0, SIZE)), np.empty((0, SIZE, SIZE)),
     )  # fmt: skip
     assert np.nansum(out[:, OUT.index("gated_camera")]) == gated[events.kinds == CAMERA, 0].sum()
     got_x, got_P, got_w = late.state

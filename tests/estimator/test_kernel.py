@@ -7,7 +7,7 @@ import pytest
 from estimatorlogs import rows_from, setup_for, simulated
 
 from calib.estimator.filter import Filter, starting_state
-from calib.estimator.kernel import CAMERA, CONSIDERED, IMU, REPORT, event, scalar_update
+from calib.estimator.kernel import CAMERA, CONSIDERED, IMU, REPORT, TRACE, WORK, event, scalar_update
 from calib.estimator.model import Kinematic
 from calib.estimator.sensors import SIZE
 from calib.estimator.setup import Rows
@@ -41,11 +41,15 @@ def _one_event(kind: int, z: list[float], levels: int = 4) -> tuple[dict[str, fl
     before = x.copy()
     level, walk = process.arrays()
     report, gated = np.empty(len(REPORT)), np.zeros(3)
+    after, after_P, after_w = np.empty_like(x), np.empty_like(P), np.empty_like(w)
     event(
-        x, P, w, kind, np.array(z), 0.0, 0.3, level, walk, setup.view, np.array([9.81, 0.0]), setup.noise,
-        np.zeros((13, SIZE)), False, report, gated,
+        x, P, w, after, after_P, after_w, kind, np.array(z), 0.0, 0.3, level, walk, setup.view,
+        np.array([9.81, 0.0]), setup.noise, np.zeros((levels, WORK, SIZE)), False, report, gated,
+        np.empty((0, TRACE)),
     )  # fmt: skip
-    return dict(zip(REPORT, report.tolist(), strict=True)), before, x
+    np.testing.assert_array_equal(x, before)
+    np.testing.assert_array_equal(after_P, np.swapaxes(after_P, 1, 2))
+    return dict(zip(REPORT, report.tolist(), strict=True)), before, after
 
 
 def test_an_outlier_changes_nothing() -> None:

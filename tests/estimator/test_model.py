@@ -76,15 +76,18 @@ def test_mixing_keeps_mean_and_covariance_of_the_whole_bank() -> None:
     x, P = rng.standard_normal((3, SIZE)), np.stack([covariance(k) for k in range(3)])
     w = np.array([0.6, 0.3, 0.1])
 
-    def moments() -> tuple[FloatArray, FloatArray]:
+    def moments(x: FloatArray, P: FloatArray, w: FloatArray) -> tuple[FloatArray, FloatArray]:
         mean = w @ x
         d = x - mean
         return mean, np.einsum("m,mij->ij", w, P) + np.einsum("m,mi,mj->ij", w, d, d)
 
-    before = moments()
-    mix(x, P, w, 0.9, 0.05)
-    after = moments()
-    np.testing.assert_allclose(w.sum(), 1.0)
+    before = moments(x, P, w)
+    mixed_x, mixed_P, mixed_w = np.empty_like(x), np.empty_like(P), np.empty_like(w)
+    mix(x, P, w, mixed_x, mixed_P, mixed_w, 0.05)
+    after = moments(mixed_x, mixed_P, mixed_w)
+    np.testing.assert_allclose(mixed_w, [0.56, 0.305, 0.135])
+    mix(x, P, w, mixed_x, mixed_P, mixed_w, 0.0)
+    np.testing.assert_array_equal(mixed_P, P)
     np.testing.assert_allclose(after[0], before[0], atol=1e-12)
     np.testing.assert_allclose(after[1], before[1], atol=1e-12)
 

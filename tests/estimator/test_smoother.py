@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from estimatorlogs import rows_from, setup_for, simulated, truth
+from estimatorlogs import SIGMA, rows_from, setup_for, simulated, truth, truth_of_sensors
 
 from calib.estimator import smoother
 from calib.estimator.consistency import Tally
 from calib.estimator.filter import Filter
 from calib.estimator.model import Kinematic, predict
-from calib.estimator.sensors import SIZE
+from calib.estimator.sensors import SIZE, sensor_values, view_coefficients
+from calib.estimator.setup import Start
 
 
 def test_transition_is_that_of_the_prediction() -> None:
@@ -41,6 +44,44 @@ def test_smoothing_halves_the_error_and_tells_it(name: str) -> None:
     filtered_mm, smoothed_mm, nees = np.mean(figures, axis=0)
     assert smoothed_mm < 0.65 * filtered_mm
     assert nees < 6.0
+
+
+LOOSE = {"gyro_scale": 3.4e-3, "marker_offset_m": 3.8e-4, "stretch": 1e-3, "accel_bias_x_mps2": 0.065}
+
+
+@pytest.mark.slow
+def test_a_loose_alignment_makes_the_smoother_no_worse_than_the_filter() -> None:
+    """All that scales the angle is known only together, as an alignment on a few logs leaves it."""
+    sigma = sensor_values({**SIGMA, **LOOSE, "accel_scale_x": 6.6e-3, "accel_scale_y": 3.2e-3})
+    together = sensor_values(
+        {"gyro_scale": 1.0, "marker_offset_m": 1.0, "accel_bias_x_mps2": -1.0, "imu_lever_m": 1.0}
+        | {"accel_scale_x": 1.0, "accel_scale_y": 1.0}
+    )
+    V = np.diag(sigma**2) + (1.0 - 1e-3) * np.outer(sigma * together, sigma * together)
+    V -= np.diag((1.0 - 1e-3) * (sigma * together) ** 2)
+    errors = []
+    for seed in (0, 1, 2, 3):
+        rig, log = simulated("step", seed)
+        setup, rows = setup_for(rig, seed), rows_from(log)
+        value = truth_of_sensors(rig) + np.linalg.cholesky(V) @ np.random.default_rng(seed).normal(size=13)
+        value[8:11] = 0.0
+        setup = replace(
+            setup,
+            start=Start(value, sigma, sensor_covariance=V),
+            view=view_coefficients(rig.view.camera, rig.view.R_CW, rig.view.t_CW_m),
+        )
+        filtered = Filter(setup).run(rows)
+        smoothed = smoother.smooth(setup, rows, filtered)
+        found = []
+        for out in (filtered, smoothed):
+            tally = Tally(setup.bellows_radius_m)
+            tally.add(out, truth(log))
+            found += [tally.rmse()["mean_q_mm"], tally.rmse()["phi_deg"], tally.rmse()["nees"]]
+        errors.append(found)
+    before_mm, before_deg, _, after_mm, after_deg, nees = np.mean(errors, axis=0)
+    assert after_mm <= before_mm
+    assert after_deg <= before_deg
+    assert nees < 4.0
 
 
 def test_windows_hardly_matter(monkeypatch: pytest.MonkeyPatch) -> None:

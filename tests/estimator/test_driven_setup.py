@@ -1,0 +1,46 @@
+"""What the driven filter starts from."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from drivenlogs import varied_drive
+from estimatorlogs import setup_for
+
+from calib.estimator.driven_model import DRIVEN, DYNAMIC, INVOLVED, PLANT
+from calib.estimator.driven_setup import Drive, commands
+
+
+def test_the_prior_holds_hoses_off_and_on() -> None:
+    x, P = Drive().start(setup_for(varied_drive(1)))
+    at = DRIVEN.index("log_damping")
+    off = math.log(3.3 / 16.0)
+    assert abs(x[at] - off) < 1.1 * math.sqrt(P[at, at])
+    assert abs(x[at]) < 1.1 * math.sqrt(P[at, at])
+    assert np.all(np.linalg.eigvalsh(P) > 0.0)
+    np.testing.assert_array_equal(
+        P[INVOLVED:, INVOLVED:], setup_for(varied_drive(1)).start.covariance()[6:, 6:]
+    )
+
+
+def test_pictures_are_put_at_their_exposure() -> None:
+    setup = setup_for(varied_drive(2))
+    assert setup.start.sensor[7] > 0.005
+    assert Drive().start(setup)[0][DRIVEN.index("time_offset_s")] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_vectors_have_their_lengths() -> None:
+    drive, setup = Drive(), setup_for(varied_drive(1))
+    assert drive.numbers().shape == (len(PLANT),)
+    assert drive.walk(setup).shape == (len(DRIVEN),)
+    assert len(drive.sigma) == INVOLVED - DYNAMIC
+
+
+def test_commands_become_static_forces_and_blank_ones_stay_blank() -> None:
+    pwm = np.array([[0.0, 255.0], [np.nan, np.nan], [50.0, 300.0]])
+    got = commands(Drive(strength=(1.0, 1.1)), pwm)
+    assert np.isnan(got[1]).all()
+    assert got[0, 0] == 0.0 and got[2, 0] == 0.0
+    assert got[0, 1] == got[2, 1] == pytest.approx(1.1 * 2.04, rel=0.03)

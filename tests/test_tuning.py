@@ -1,0 +1,48 @@
+"""`calib replay --tune`: the section that it makes of logs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from estimatorlogs import rows_from, setup_for, simulated
+
+from calib.errors import BadInputError
+from calib.estimator.constant_gain import run_gain, ticks_of
+from calib.logs import write_log
+from calib.rig import Rig
+from calib.tuning import gain_section, tuned_section
+
+
+def test_needs_logs_with_camera_and_imu(tmp_path: Path) -> None:
+    log = simulated("static")[1]
+    blind = replace(log, columns={k: v for k, v in log.columns.items() if k not in ("u_px", "v_px")})
+    write_log(tmp_path / "blind.csv", blind)
+    with pytest.raises(BadInputError, match=r"blind\.csv: tuning needs camera and IMU"):
+        tuned_section([tmp_path / "blind.csv"], Rig(), tmp_path / "rig.yaml")
+    with pytest.raises(BadInputError, match="none given"):
+        tuned_section([], Rig(), tmp_path / "rig.yaml")
+
+
+def test_constant_gains_are_those_of_the_set_up_and_stay_finite() -> None:
+    rig, log = simulated("ellipse", 1)
+    setup, rows = setup_for(rig, 1), rows_from(log)
+    section = gain_section(setup, 60.0)
+    assert section is not None
+    assert section.delay_ticks == round(60.0 * float(setup.start.sensor[7]))
+    ticks = ticks_of(setup, rows)
+    for axis, z in ((section.phi, ticks.phi), (section.length, ticks.length)):
+        F, H, K = np.array(axis.F), np.array(axis.H), np.array(axis.K)
+        assert np.abs(np.linalg.eigvals(F - K @ H @ F)).max() < 1.0
+        assert np.isfinite(run_gain(F, H, K, z, 0.0)).all()
+
+
+def test_no_constant_gains_without_a_camera_or_with_pictures_that_are_too_late() -> None:
+    rig, _ = simulated("ellipse", 1)
+    setup = setup_for(rig, 1)
+    assert gain_section(replace(setup, view=np.zeros(24)), 60.0) is None
+    sensor = setup.start.sensor.copy()
+    sensor[7] = 0.2
+    assert gain_section(replace(setup, start=replace(setup.start, sensor=sensor)), 60.0) is None
