@@ -10,7 +10,9 @@ from calib import __version__
 from calib.cli.align import align
 from calib.cli.board import board
 from calib.cli.control import control
+from calib.cli.diff import diff
 from calib.cli.distortion import distortion
+from calib.cli.doctor import doctor
 from calib.cli.exchange import export_camera, import_camera
 from calib.cli.extrinsics import extrinsics
 from calib.cli.firmware import firmware
@@ -20,6 +22,8 @@ from calib.cli.intrinsics import intrinsics
 from calib.cli.lowpass import lowpass
 from calib.cli.record import record
 from calib.cli.replay import replay
+from calib.cli.report import report
+from calib.cli.run import run
 from calib.cli.simulate import simulate
 
 __all__ = ["app"]
@@ -49,6 +53,7 @@ def _options(
     pass
 
 
+app.command("run")(run)
 app.command("intrinsics")(intrinsics)
 app.command("extrinsics")(extrinsics)
 app.command("distortion")(distortion)
@@ -64,3 +69,6 @@ app.command("board")(board)
 app.command("simulate")(simulate)
 app.command("export")(export_camera)
 app.command("import")(import_camera)
+app.command("report")(report)
+app.command("diff")(diff)
+app.command("doctor")(doctor)

@@ -133,12 +133,21 @@ def _comparison(candidates: Sequence[Any]) -> list[dict[str, Any]]:
 
 
 def _per_view(result: Intrinsics) -> list[dict[str, Any]]:
+    seen = result.calibration.observations
     return [
-        {"view": name, "points": int(points), "rms_px": rms}
-        for name, points, rms in zip(
-            result.calibration.observations.names,
-            result.calibration.observations.present.sum(axis=1),
+        {
+            "view": name,
+            "points": int(present.sum()),
+            "rms_px": rms,
+            "points_px": pixels[present].round(2).tolist(),
+            "residuals_px": residuals[present].round(4).tolist(),
+        }
+        for name, present, rms, pixels, residuals in zip(
+            seen.names,
+            seen.present,
             result.calibration.view_rms_px.tolist(),
+            seen.pixels,
+            result.calibration.residuals_px,
             strict=True,
         )
     ]

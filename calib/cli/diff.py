@@ -1,0 +1,105 @@
+"""`calib diff`: what changed between two calibrations, and whether it is more than their error bars."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from calib.cli.common import JsonOption, document, say, table
+
+if TYPE_CHECKING:
+    from calib.rigdiff import Change, RigDiff
+
+__all__ = ["diff"]
+
+
+def diff(
+    before: Annotated[Path, typer.Argument(help="rig.yaml of one calibration.")],
+    after: Annotated[Path, typer.Argument(help="rig.yaml of the other.")],
+    every: Annotated[
+        bool, typer.Option("--all", help="Show every constant that differs, not only the foremost.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare two calibrations, in standard deviations and in millimetres on the plane.
+
+    Exits 0 whatever has changed; the two are taken as independent of each other.
+    """
+    from calib.rigdiff import diff_rigs
+
+    found = diff_rigs(before, after)
+    if as_json:
+        document(
+            "diff",
+            {
+                "changes": [{**asdict(c), "significant": c.significant} for c in found.changes],
+                "plane": None
+                if found.plane is None
+                else {**asdict(found.plane), "significant": found.plane.significant},
+                "verdicts": [
+                    dict(zip(("section", "before", "after"), v, strict=True)) for v in found.verdicts
+                ],
+                "only_before": list(found.only_before),
+                "only_after": list(found.only_after),
+                "other_inputs": list(found.inputs),
+                "compared": found.compared,
+                "significant": found.significant,
+            },
+        )
+        return
+    _tell(found, every)
+
+
+_SHOWN = 20
+
+
+def _tell(found: RigDiff, every: bool) -> None:
+    both = [c for c in found.changes if c.before is not None and c.after is not None]
+    say(f"{found.compared} constants are in both, {len(both)} of them differ")
+    rows = [_row(change) for change in (both if every else both[:_SHOWN])]
+    if rows:
+        for line in table(["constant", "before", "after", "difference", "unit", "in sigma", ""], rows):
+            say(line)
+    if len(rows) < len(both):
+        say(f"  {len(both) - len(rows)} more (--all shows them)")
+    for words, names in (
+        ("only before", found.only_before),
+        ("only after", found.only_after),
+        ("learnt from other inputs", found.inputs),
+    ):
+        if names:
+            say(f"{words}: {', '.join(names)}")
+    for section, old, new in found.verdicts:
+        say(f"verdict of {section}: {old} before, {new} after")
+    plane = found.plane
+    if plane is None:
+        say("no plane in both: no difference in millimetres")
+    else:
+        bar = "" if not plane.sigma_mm else f", sigma {plane.sigma_mm:.4f} mm"
+        say(
+            f"a marker in the workspace is read {plane.mean_mm:.4f} mm elsewhere on average, "
+            f"{plane.largest_mm:.4f} mm at most{bar}: {_judged(plane.significant)}"
+        )
+    say(f"in all: {'significant' if found.significant else 'nothing beyond the error bars'}")
+
+
+def _row(change: Change) -> list[str]:
+    from calib.rigvalues import digits
+
+    assert change.before is not None and change.after is not None
+    return [
+        f"{change.section}.{change.name}",
+        digits(change.before, change.sigma),
+        digits(change.after, change.sigma),
+        f"{change.after - change.before:+.3g}",
+        change.unit,
+        "-" if change.sigmas is None else f"{change.sigmas:.1f}",
+        _judged(change.significant),
+    ]
+
+
+def _judged(significant: bool | None) -> str:
+    return "no error bars" if significant is None else "significant" if significant else "not significant"

@@ -1,0 +1,55 @@
+"""`calib doctor`: whether the installation is whole, and which optional tools are there."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from calib.cli.common import JsonOption, document, say, table
+from calib.errors import EXIT_POOR
+
+__all__ = ["doctor"]
+
+
+def doctor(
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Leave out the trial of the whole camera chain.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Check the installation: Python, libraries, compiled code, a small trial, and optional tools.
+
+    Exits 1 when something that calib needs is missing or does not work.
+    """
+    from calib.doctoring import examine
+
+    checks = examine(quick)
+    bad = [check for check in checks if check.needed and not check.good]
+    if as_json:
+        document(
+            "doctor",
+            {
+                "checks": [
+                    {
+                        "name": c.name,
+                        "needed": c.needed,
+                        "good": c.good,
+                        "found": c.found,
+                        "what_for": c.what_for,
+                    }
+                    for c in checks
+                ],
+                "gate": [c.name for c in bad] or "passed",
+            },
+        )
+    else:
+        rows = [
+            [c.name, "ok" if c.good else "MISSING" if c.needed else "not there", c.found, c.what_for]
+            for c in checks
+        ]
+        for line in table(["", "", "found", "for"], rows):
+            say(line)
+        say(f"verdict: {'poor, ' + ', '.join(c.name for c in bad) if bad else 'ok'}")
+    if bad:
+        raise typer.Exit(EXIT_POOR)

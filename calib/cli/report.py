@@ -1,0 +1,37 @@
+"""`calib report`: the page of a rig.yaml, from what lies beside it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calib.cli.common import JsonOption, document, narrate, say
+
+__all__ = ["report"]
+
+
+def report(
+    rig: Annotated[
+        Path, typer.Argument(help="rig.yaml of calib run, or of single verbs: then without figures.")
+    ] = Path("rig.yaml"),
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", help="Page to write. [default: report.html beside it]"),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Write the page of a calibration again: one HTML file that needs no network."""
+    from calib.files import check_writable, shown
+    from calib.report.page import write_page
+
+    target = rig.parent / "report.html" if output is None else output
+    check_writable(target)
+    write_page(rig, target)
+    size = target.stat().st_size
+    if as_json:
+        document("report", {"page": str(target), "bytes": size})
+    else:
+        say(f"{shown(target)}: {1e-6 * size:.1f} MB")
+        narrate("open it in a browser")

@@ -1,0 +1,142 @@
+"""`calib run`: a folder of pictures and logs in; rig.yaml, states, firmware and a page out."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from calib.cli.common import JsonOption, document, narrate, progress_bar, say, table
+from calib.errors import BadInputError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from calib.running.folder import Folder
+    from calib.running.pool import Pool
+    from calib.running.runner import Done
+
+__all__ = ["is_available", "run"]
+
+
+def run(
+    folder: Annotated[
+        Path | None,
+        typer.Argument(
+            help="Rig folder: images/, images/plane/, logs/, and rig.yaml for what you know of the rig. "
+            "Without one a simulated rig is calibrated."
+        ),
+    ] = None,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Folder for the results; a later run goes on from it.")
+    ] = Path("calibration"),
+    fresh: Annotated[bool, typer.Option("--fresh", help="Do all stages again, whatever is there.")] = False,
+    follow_links: Annotated[
+        bool, typer.Option("--follow-links", help="Take files that are links out of the folder as well.")
+    ] = False,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, max=64, help="Stages at a time. [default: one per processor]")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Calibrate a whole rig: every stage from pictures and logs to the firmware and a page to read.
+
+    Stages whose inputs have not changed are not run again; one that fails stops only what needs it. Exits
+    1 when the page does not say that the firmware can be flashed, 3 when a stage has failed.
+    """
+    from calib.report.page import write_page
+    from calib.report.page_pictures import keep_pictures
+    from calib.report.page_verdict import decide
+    from calib.running.folder import read_folder
+    from calib.running.outputs import exit_code, publish, summary
+    from calib.running.pool import Pool
+    from calib.running.runner import HIDDEN, Runner, opened
+    from calib.workers import processors
+
+    seen = None if folder is None else read_folder(folder, follow_links)
+    with opened(output, folder) as interrupted, Pool(jobs or processors()) as pool:
+        if interrupted is not None:
+            narrate("the last run here was interrupted; going on where it stopped")
+        if seen is None:
+            narrate("no folder given: a simulated rig is calibrated, not a real one")
+            seen = _simulated(output, pool)
+        for sentence in seen.left_out:
+            narrate(sentence)
+        with progress_bar("calibrating") as progress:
+            runner = Runner(seen, output, pool, is_available, narrate, progress, fresh=fresh)
+            ended = runner.run()
+        told = summary(runner, ended, folder is None)
+        files = publish(runner, ended, told)
+        keep_pictures(seen.pictures, output / HIDDEN / "pictures")
+        write_page(output / "rig.yaml")
+    code = exit_code(ended)
+    decision = decide(told, runner.sections().values)
+    if as_json:
+        document("run", {"run": told, "decision": decision.as_json(), "files": [*files, "report.html"]})
+    else:
+        _tell(ended, files, output)
+        say(f"can it be flashed? {decision.answer}: {decision.headline}")
+        for sentence in decision.weak:
+            say(f"  - {sentence}")
+    narrate(f"page written to {output / 'report.html'}")
+    if code:
+        raise typer.Exit(code)
+
+
+@cache
+def is_available(verb: tuple[str, ...]) -> bool:
+    """Whether this version has a verb."""
+    command = _all_verbs()
+    for word in verb:
+        command = getattr(command, "commands", {}).get(word)
+        if command is None:
+            return False
+    return not getattr(command, "commands", {})
+
+
+@cache
+def _all_verbs() -> Any:
+    """The whole command; its classes are those of typer's own copy of click, hence no type."""
+    from calib.cli.app import app
+
+    return typer.main.get_command(app)
+
+
+def _simulated(output: Path, pool: Pool) -> Folder:
+    """The folder of a simulated rig, made beside the results unless this program has made it before."""
+    from calib.files import make_folder
+    from calib.running.cache import key_of, load, remove, store
+    from calib.running.folder import read_folder
+    from calib.running.pool import Command
+    from calib.running.runner import HIDDEN
+
+    hidden = output / HIDDEN
+    place, key = hidden / "stages" / "simulate", key_of(("simulate", "rig"), {}, "")
+    if load(place, key) is None:
+        work = hidden / "work" / "simulate"
+        remove(work)
+        make_folder(work)
+        words = ("simulate", "rig", "-o", str((work / "rig").absolute()))
+        pool.start(Command("simulate", words, work / "document.txt", work / "messages.txt"))
+        code = next(code for _, code in pool.finished())
+        if code:
+            said = (work / "messages.txt").read_text(encoding="utf-8", errors="replace").strip()
+            raise BadInputError(f"the simulated rig could not be made: {said or f'exit code {code}'}")
+        for name in ("document.txt", "messages.txt"):
+            (work / name).unlink()
+        store(work, place, key, code, hidden / "work" / "old-simulate")
+    return read_folder(place / "rig")
+
+
+def _tell(ended: Sequence[Done], files: Sequence[str], output: Path) -> None:
+    from calib.files import one_line, shown
+
+    rows = []
+    for done in ended:
+        log = "" if done.job.log is None else f" of {one_line(done.job.log.path.stem)}"
+        rows.append([f"{done.job.stage.title}{log}", done.status, "as before" if done.reused else ""])
+    for line in table(["stage", "", ""], rows):
+        say(line)
+    say(f"{shown(output)}: report.html and {len(files)} more files")

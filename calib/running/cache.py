@@ -1,0 +1,148 @@
+"""Results of stages on the disk: which one belongs to which inputs, and whether it is whole.
+
+A result is a folder that appears under its name in one step, when all in it has been written:
+
+    result.json    key, exit code, SHA-256 of every other file
+    rig.yaml       the rig's file after the stage: what it saw, and what it has written
+    document.json  what the verb said with --json    messages.txt  what it said on stderr
+    figures/       and what it wrote with -o
+
+The key is the SHA-256 of all that the result follows from: the program, the command, the inputs' hashes
+and the sections of the rig's file that the stage saw.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from calib import __version__
+from calib.errors import BadInputError
+from calib.files import sha256, shown, write_atomically
+from calib.running.folder import digest_of
+
+__all__ = ["Result", "key_of", "load", "program_digest", "remove", "store"]
+
+_RESULT = "result.json"
+_MOST_BYTES = 50_000_000
+_SOURCES = (".py", ".j2", ".h", ".ino")
+
+
+@dataclass(frozen=True)
+class Result:
+    """A stage's result.
+
+    Attributes
+    ----------
+    code : exit code of the verb, 0 or 1 for a result that can be used.
+    files : SHA-256 by name relative to `folder`.
+    """
+
+    folder: Path
+    key: str
+    code: int
+    files: dict[str, str]
+
+    def document(self) -> dict[str, Any]:
+        """What the verb said with --json; empty where it said nothing that can be read."""
+        path = self.folder / "document.json"
+        with contextlib.suppress(OSError, ValueError):
+            if path.stat().st_size <= _MOST_BYTES:
+                found = json.loads(path.read_text(encoding="utf-8"))
+                return found if isinstance(found, dict) else {}
+        return {}
+
+    def messages(self) -> list[str]:
+        """What the verb said on stderr."""
+        with contextlib.suppress(OSError):
+            text = (self.folder / "messages.txt").read_text(encoding="utf-8", errors="replace")
+            return [line for line in text.splitlines() if line.strip()]
+        return []
+
+    def figures(self) -> list[Path]:
+        """The figures, in the order of their names."""
+        names = sorted(name for name in self.files if name.startswith("figures/"))
+        return [self.folder / name for name in names if name.endswith((".png", ".svg"))]
+
+
+@cache
+def program_digest() -> str:
+    """SHA-256 of this version and its source: another program's results are not reused."""
+    root = Path(__file__).resolve().parent.parent
+    sources = [path for path in sorted(root.rglob("*")) if path.suffix in _SOURCES and path.is_file()]
+    parts = [__version__, *(f"{path.relative_to(root).as_posix()} {digest_of(path)}" for path in sources)]
+    return sha256("\n".join(parts).encode())
+
+
+def key_of(command: tuple[str, ...], inputs: Mapping[str, str], sections: str) -> str:
+    """Key of a result: `inputs` holds SHA-256 by name, `command` names in place of paths, and
+    `sections` is what the stage sees of the rig's file."""
+    whole = {
+        "program": program_digest(),
+        "command": list(command),
+        "inputs": dict(sorted(inputs.items())),
+        "sections": sha256(sections.encode()),
+    }
+    return sha256(json.dumps(whole, sort_keys=True, ensure_ascii=True).encode())
+
+
+def load(folder: Path, key: str | None = None) -> Result | None:
+    """The result in a folder if it is whole, and of this key where one is given."""
+    try:
+        told = json.loads((folder / _RESULT).read_text(encoding="utf-8"))
+        result = Result(
+            folder,
+            str(told["key"]),
+            int(told["code"]),
+            {str(name): str(digest) for name, digest in told["files"].items()},
+        )
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+    if key is not None and result.key != key:
+        return None
+    for name, digest in result.files.items():
+        path = folder / name
+        if not path.is_file() or path.is_symlink() or digest_of(path) != digest:
+            return None
+    return result
+
+
+def store(work: Path, folder: Path, key: str, code: int, trash: Path) -> Result:
+    """Turn a folder of work into the result of that name; an older one gives way."""
+    files = {}
+    for path in sorted(work.rglob("*")):
+        if path.is_file() and not path.is_symlink():
+            files[path.relative_to(work).as_posix()] = digest_of(path)
+    told = {"schema": 1, "key": key, "code": code, "files": files}
+    write_atomically(work / _RESULT, json.dumps(told, indent=1, sort_keys=True) + "\n")
+    try:
+        if folder.exists():
+            folder.rename(trash)
+        work.rename(folder)
+        _settle(folder.parent)
+    except OSError as error:
+        raise BadInputError(f"{shown(folder)}: cannot be written: {error.strerror or error}") from error
+    remove(trash)
+    return Result(folder, key, code, files)
+
+
+def _settle(folder: Path) -> None:
+    """Let the disk know of what was renamed in a folder."""
+    with contextlib.suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def remove(folder: Path) -> None:
+    """Remove a folder of ours, as far as that is possible."""
+    shutil.rmtree(folder, ignore_errors=True)

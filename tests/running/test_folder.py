@@ -1,0 +1,93 @@
+"""What a rig folder holds, odd names and links included."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from running_trials import make_folder, run_small
+
+from calib.errors import BadInputError
+from calib.running.folder import read_folder, slug
+
+
+def test_kinds_of_logs_and_their_columns(tmp_path: Path) -> None:
+    root = make_folder(tmp_path / "rig")
+    (root / "logs" / "static1.csv").write_text("# a note\n\nt_s, gz_radps\n0,1\n")
+    (root / "logs" / "poses.csv").write_text("t_s,ax_mps2\n")
+    (root / "logs" / "notes.txt").write_text("none")
+    (root / "logs" / ".hidden.csv").write_text("t_s\n")
+    folder = read_folder(root)
+    assert {log.slug: log.kind for log in folder.logs} == {
+        "one": "motion", "two": "motion", "poses": "poses", "static1": "rest",
+    }  # fmt: skip
+    static = next(log for log in folder.logs if log.kind == "rest")
+    assert static.columns == ("t_s", "gz_radps")
+    assert static.has("gz_radps") and not static.has("ax_mps2")
+
+
+@pytest.mark.parametrize("make", ["nothing", "empty", "file"])
+def test_what_is_no_rig_folder(tmp_path: Path, make: str) -> None:
+    path = tmp_path / "rig"
+    if make == "empty":
+        path.mkdir()
+    elif make == "file":
+        path.write_text("")
+    with pytest.raises(BadInputError, match="rig"):
+        read_folder(path)
+
+
+def test_links_out_of_the_folder_are_left_out_and_named(tmp_path: Path) -> None:
+    root = make_folder(tmp_path / "rig")
+    secret = tmp_path / "secret.csv"
+    secret.write_text("t_s,u_px,v_px\n0,1,2\n")
+    (root / "logs" / "linked.csv").symlink_to(secret)
+    (root / "logs" / "within.csv").symlink_to(root / "logs" / "one.csv")
+    (root / "logs" / "dangling.csv").symlink_to(tmp_path / "nowhere")
+    (root / "images" / "c.png").symlink_to(secret)
+    folder = read_folder(root)
+    assert [log.slug for log in folder.logs] == ["one", "two", "within"]
+    assert [path.name for path in folder.pictures] == ["a.png", "b.png"]
+    assert len(folder.left_out) == 3
+    assert any("link out of the folder" in sentence for sentence in folder.left_out)
+    followed = read_folder(root, follow_links=True)
+    assert [log.slug for log in followed.logs] == ["linked", "one", "two", "within"]
+
+
+def test_a_linked_folder_of_logs_is_a_link_out_as_well(tmp_path: Path) -> None:
+    root = make_folder(tmp_path / "rig")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "x.csv").write_text("t_s\n")
+    for path in (root / "logs").iterdir():
+        path.unlink()
+    (root / "logs").rmdir()
+    (root / "logs").symlink_to(tmp_path / "other")
+    assert read_folder(root).logs == ()
+
+
+@pytest.mark.parametrize("name", ["a\nb", "a..", "-rf", "<script>", "a;b'\"", "é", "x" * 200, "a b"])
+def test_odd_names_stay_inside_and_run(tmp_path: Path, name: str) -> None:
+    root, out = make_folder(tmp_path / "rig"), tmp_path / "out"
+    (root / "logs" / f"{name}.csv").write_text("t_s,u_px,v_px\n0,1,2\n")
+    run_small(root, out)
+    states = sorted(path.name for path in (out / "states").iterdir())
+    assert len(states) == 3
+    assert all(path.parent.parent == tmp_path or path.is_relative_to(out) for path in out.rglob("*"))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "rig"]
+    assert all(part.isascii() and part.isprintable() for part in states)
+
+
+def test_names_that_differ_in_odd_signs_alone_stay_apart() -> None:
+    assert slug("a\nb") != slug("a\tb") != slug("a_b")
+    assert slug("a_b") == "a_b"
+    assert slug("A", ["a"]) != "A"
+
+
+@given(st.text(min_size=1))
+def test_a_slug_is_a_plain_file_name(name: str) -> None:
+    text = slug(name)
+    assert text and len(text) <= 100
+    assert Path(text).name == text and text not in (".", "..") and not text.startswith((".", "-"))
+    assert text == slug(name)

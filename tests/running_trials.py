@@ -1,0 +1,133 @@
+"""Small stages for tests of the runner: verbs that take no time, run in this process."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from calib.files import sha256, write_atomically
+from calib.rig import read_rig, write_rig
+from calib.running.folder import Folder, LogFile, read_folder
+from calib.running.outputs import publish, summary
+from calib.running.pool import Command
+from calib.running.runner import Done, Runner, opened
+from calib.running.stages import Planned, Stage
+
+__all__ = ["CALLS", "STAGES", "Inline", "make_folder", "run_small"]
+
+CALLS: list[str] = []
+"""Names of the commands that were run, in their order."""
+
+Act = Callable[[list[str], Path], int]
+
+
+def _option(words: tuple[str, ...], name: str) -> Path | None:
+    return Path(words[words.index(name) + 1]) if name in words else None
+
+
+class Inline:
+    """Runs a command at once; `acts` holds exit codes by the name of the command, 0 for the others."""
+
+    def __init__(
+        self, codes: dict[str, int] | None = None, during: Callable[[str], None] | None = None
+    ) -> None:
+        self.codes, self.during = codes or {}, during
+        self._ended: list[tuple[str, int]] = []
+
+    @property
+    def free(self) -> bool:
+        return not self._ended
+
+    def start(self, command: Command) -> None:
+        CALLS.append(command.name)
+        code = self.codes.get(command.name, 0)
+        if code in (0, 1):
+            self._work(command, code)
+        else:
+            command.stderr.write_text(f"calib: {command.name} cannot\n")
+        if self.during is not None:
+            self.during(command.name)
+        self._ended.append((command.name, code))
+
+    def _work(self, command: Command, code: int) -> None:
+        rig_path = _option(command.words, "--rig")
+        assert rig_path is not None
+        rig = read_rig(rig_path)
+        inputs = [Path(word) for word in command.words if word.endswith((".csv", ".png"))]
+        digest = sha256(
+            b"".join(path.read_bytes() for path in inputs if path.parent.name in ("logs", "images"))
+        )
+        if command.words[0] == "first":
+            section = {"value_m": int(digest[:6], 16) * 1e-6, "verdict": "poor" if code else "ok"}
+            section |= {"reasons": ["it is weak"] if code else []}
+            rig = rig.model_validate({**rig.model_dump(exclude_none=True), "first": section})
+            write_rig(rig_path, rig, {"first": {path.name: digest for path in inputs}})
+        elif command.words[0] == "second":
+            known = (rig.model_extra or {})["first"]["value_m"]
+            rig = rig.model_validate({**rig.model_dump(exclude_none=True), "second": {"twice_m": 2 * known}})
+            write_rig(rig_path, rig, {"second": {}})
+        output = _option(command.words, "-o")
+        if output is not None and output.suffix:
+            write_atomically(output, f"t_s\n{digest}\n")
+        elif output is not None:
+            output.mkdir()
+            write_atomically(output / "header.h", f"// {sorted((rig.model_extra or {}).items())}\n")
+        figures = _option(command.words, "--figures")
+        if figures is not None:
+            figures.mkdir(exist_ok=True)
+            write_atomically(figures / "some_figure.svg", "<svg xmlns='http://www.w3.org/2000/svg'/>")
+        command.stdout.write_text(json.dumps({"schema": 1, "verb": command.words[0], "seconds": {"a": 1.5}}))
+        command.stderr.write_text(f"written to {rig_path}\nsaid by {command.name}\n")
+
+    def finished(self) -> Iterator[tuple[str, int]]:
+        ended, self._ended = self._ended, []
+        yield from ended
+
+
+def _pictures(folder: Folder) -> Planned | str:
+    return Planned(tuple(map(str, folder.pictures)), folder.pictures) if folder.pictures else "no pictures"
+
+
+def _nothing(_: Folder) -> Planned | str:
+    return Planned((), ())
+
+
+def _log(log: LogFile) -> Planned | str:
+    return Planned((str(log.path),), (log.path,))
+
+
+STAGES = (
+    Stage("first", "First", ("first",), _pictures, writes=("first",), flashed=True),
+    Stage("second", "Second", ("second",), _nothing, writes=("second",), needs=("first",)),
+    Stage("lone", "Lone", ("lone",), _nothing),
+    Stage("each", "Each", ("each",), None, _log, needs=("first",), output="states.csv"),
+    Stage("absent", "Absent", ("absent",), _nothing, writes=("absent",)),
+    Stage("firmware", "Firmware", ("firmware",), _nothing, needs=("first",),
+          uses=("second", "absent"), output="firmware", figures=False),
+)  # fmt: skip
+
+
+def make_folder(root: Path) -> Path:
+    """A folder with two pictures and two logs, by their names alone."""
+    (root / "images").mkdir(parents=True)
+    (root / "logs").mkdir()
+    for name in ("a.png", "b.png"):
+        (root / "images" / name).write_bytes(name.encode())
+    for name in ("one.csv", "two.csv"):
+        (root / "logs" / name).write_text(f"t_s,u_px,v_px\n0,1,{len(name)}\n")
+    return root
+
+
+def run_small(
+    root: Path, out: Path, runs: Inline | None = None, follow_links: bool = False, fresh: bool = False
+) -> list[Done]:
+    """A whole run with the small stages."""
+    folder = read_folder(root, follow_links)
+    with opened(out, root):
+        runner = Runner(
+            folder, out, runs or Inline(), lambda verb: verb != ("absent",), stages=STAGES, fresh=fresh
+        )
+        ended = runner.run()
+        publish(runner, ended, summary(runner, ended, False))
+    return ended
