@@ -25,6 +25,7 @@ from calib.cli.replay import replay
 from calib.cli.report import report
 from calib.cli.run import run
 from calib.cli.simulate import simulate
+from calib.cli.validate import validate
 
 __all__ = ["app"]
 
@@ -63,6 +64,7 @@ app.command("align")(align)
 app.command("replay")(replay)
 app.add_typer(identify, name="identify")
 app.add_typer(control, name="control")
+app.command("validate")(validate)
 app.command("firmware")(firmware)
 app.command("record")(record)
 app.command("board")(board)

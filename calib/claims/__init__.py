@@ -1,0 +1,1 @@
+"""The book of claims: every figure of the source, computed again."""
