@@ -87,7 +87,7 @@ Matrix3 = Annotated[list[Row3], Field(min_length=3, max_length=3)]
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", defer_build=True)
 
 
 class Geometry(_Section):
@@ -216,7 +216,7 @@ class Provenance(_Section):
 class Rig(BaseModel):
     """The whole file. Sections of later versions are kept as they are."""
 
-    model_config = ConfigDict(extra="allow")
+    model_config = ConfigDict(extra="allow", defer_build=True)
 
     geometry: Geometry | None = None
     camera: Camera | None = None

@@ -22,7 +22,7 @@ MetresPair = Annotated[list[Metres], Field(min_length=2, max_length=2)]
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", defer_build=True)
 
 
 class AlignCovariance(_Section):

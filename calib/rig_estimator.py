@@ -14,7 +14,7 @@ NotNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False, strict=T
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", defer_build=True)
 
 
 class EstimatorLevel(_Section):

@@ -16,7 +16,7 @@ Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", defer_build=True)
 
 
 class FilterCandidate(_Section):

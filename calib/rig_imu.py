@@ -17,7 +17,7 @@ Sizes = Annotated[list[NotNegative | None], Field(min_length=3, max_length=3)]
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", defer_build=True)
 
 
 class ImuDrift(_Section):

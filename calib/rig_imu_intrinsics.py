@@ -21,7 +21,7 @@ AngleSigmas = dict[str, NotNegative | None]
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", defer_build=True)
 
 
 class IntrinsicsSigma(_Section):

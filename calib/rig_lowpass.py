@@ -16,7 +16,7 @@ Row3 = Annotated[list[Number], Field(min_length=3, max_length=3)]
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", defer_build=True)
 
 
 class LowPassSection(_Section):
