@@ -282,7 +282,7 @@ def linearised(plant: Plant, q_m: FloatArray) -> FloatArray:
     """
     q = np.asarray(q_m, dtype=np.float64)
     c = coefficients(plant)
-    phi, l = float(angle(q, c.r)), float(length(q))  # noqa: E741
+    phi, l = float(angle(q, c.r)), float(length(q))  # noqa: E741  the source's symbol
     eps = q - c.l0
     stiff = plant.stiffness_scale * np.array([plant.stiffness.tangent(e) for e in eps.tolist()])
     secant = np.array([plant.stiffness.secant(e) for e in eps.tolist()])

@@ -96,13 +96,12 @@ class Known:
         if value is None:
             self._missing.append(key)
             return default
-        good = isinstance(value, list | tuple) and least <= len(value) <= most
-        if not good or not all(
-            isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v)
-            for v in value  # type: ignore[attr-defined]  # a list, by the line above
+        listed = list(value) if isinstance(value, list | tuple) else []
+        if not least <= len(listed) <= most or not all(
+            isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in listed
         ):
             raise BadInputError(f"{self.source}: {key} is {value!r}, expected {least} to {most} numbers")
-        return tuple(float(v) for v in value)  # type: ignore[attr-defined]  # a list, checked above
+        return tuple(float(v) for v in listed)
 
     def told(self) -> str:
         """The keys that took defaults since the last call, in words; empty when there were none."""

@@ -202,7 +202,8 @@ def _reachable(axes: Axes, model: Model) -> None:
     phi_most, l_most = 1.1 * largest_angle(model), longest_m(model)
     phi = np.linspace(-phi_most, phi_most, 161)
     rest = plant.rest_length_m
-    l = np.linspace(rest - 0.1 * (l_most - rest), l_most + 0.05 * (l_most - rest), 121)  # noqa: E741
+    span = l_most - rest
+    l = np.linspace(rest - 0.1 * span, l_most + 0.05 * span, 121)  # noqa: E741  the source's symbol
     turned = plant.bellows_radius_m * phi[None, :]
     q = np.stack([l[:, None] + turned, l[:, None] - turned], axis=-1)
     F = holding_force(plant, q)

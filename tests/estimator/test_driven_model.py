@@ -53,7 +53,7 @@ def test_it_moves_as_the_simulation_does(pump: Pump) -> None:
     x = some_state(1)
     x[10:INVOLVED] = 0.0
     r = body.bellows_radius_m
-    l, phi, dl, dphi = x[1], x[0], x[3], x[2]  # noqa: E741
+    l, phi, dl, dphi = x[1], x[0], x[3], x[2]  # noqa: E741  the source's symbols
     lengths = [l + r * phi, l - r * phi, dl + r * dphi, dl - r * dphi]
     row = np.array([*lengths, 0.5 * (x[4] + x[5]), 0.5 * (x[4] - x[5]), *x[6:10]])
     static = np.array([[1.5, 0.2], [1.0, 0.0]])
