@@ -29,7 +29,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _read(folder: Path, name: str, **options: object) -> TrackSource:
     rig = rig_file(folder / "rig.yaml")
-    return read_track(folder / name, rig, folder / "rig.yaml", RADIUS, **options)  # type: ignore[arg-type]  # any
+    return read_track(folder / name, rig, folder / "rig.yaml", RADIUS, **options)
 
 
 def _changed(folder: Path, name: str, **columns: np.ndarray | None) -> Path:

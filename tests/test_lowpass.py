@@ -32,7 +32,7 @@ def _write(path: Path, n: int = 600, **changes: object) -> Path:
     noise = np.random.default_rng(1).normal(size=(2, n))
     columns = {"u_px": np.round(150 + 20 * np.sin(t) + noise[0]), "v_px": np.round(90 + noise[1])}
     log = Log(path.name, t, columns, np.arange(2, n + 2))
-    write_log(path, replace(log, **changes))  # type: ignore[arg-type]
+    write_log(path, replace(log, **changes))
     return path
 
 
@@ -118,7 +118,7 @@ def test_sections_that_contradict_themselves(change: dict[str, object]) -> None:
 )
 def test_logs_that_are_refused(tmp_path: Path, changes: dict[str, object], words: str) -> None:
     n = changes.pop("n", 600)
-    path = _write(tmp_path / "log.csv", n, **changes)  # type: ignore[arg-type]
+    path = _write(tmp_path / "log.csv", n, **changes)
     with pytest.raises(BadInputError, match=rf"log\.csv.*{words}"):
         positions_from_log(path, 60.0, None, None)
 

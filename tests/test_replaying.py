@@ -44,7 +44,7 @@ def log_of(t: list[float], **columns: list[float]) -> Log:
 
 
 def sensor(setup: object, name: str) -> tuple[float, float]:
-    start = setup.start  # type: ignore[attr-defined]
+    start = setup.start
     k = SENSOR.index(name)
     return float(start.sensor[k]), float(start.sensor_sigma[k])
 

@@ -105,4 +105,4 @@ def test_marks_a_set_that_leaves_the_model(gravity: tuple[float, float]) -> None
 def test_bad_input(change: dict[str, object], words: str) -> None:
     arguments = {"plants": [PUMPED], "pumps": [Pump()], "pwm": np.zeros((5, 2)), "start": state_row(PUMPED)}
     with pytest.raises(BadInputError, match=words):
-        simulate_batch(**{**arguments, **change})  # type: ignore[arg-type]
+        simulate_batch(**{**arguments, **change})

@@ -58,7 +58,7 @@ def lagrange() -> tuple[Callable[..., FloatArray], Callable[..., FloatArray], Ca
     swept = momentum.jacobian(q) * sympy.Matrix(v) - sympy.Matrix([sympy.diff(T, x) for x in q])
     pull = sympy.Matrix([sympy.diff(U, x) for x in q])
     arguments = (*q, *v, m, J, r, l0, k0, k1, kb, gx, gy)
-    return tuple(sympy.lambdify(arguments, e, "numpy", cse=True) for e in (M, swept, pull))  # type: ignore[return-value]
+    return tuple(sympy.lambdify(arguments, e, "numpy", cse=True) for e in (M, swept, pull))
 
 
 def symbols_of(plant: Plant, q: FloatArray, dq: FloatArray) -> tuple[float, ...]:

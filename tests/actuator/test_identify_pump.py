@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from identifytrials import FLOW_TRUTH, LAG_TRUTH, pump_records
+from outside import outside
 
 from calib.actuator.identify_pump import cross_validate, fit_pump, rms_ahead, rms_of
 from calib.actuator.identify_pump_models import LAG, MODELS, ORIFICE, PumpRecord
@@ -74,9 +75,7 @@ def test_nothing_to_see_is_refused() -> None:
 @pytest.mark.slow
 def test_a_real_pump(shared_data: Path) -> None:
     """Errors in kPa on files that were not fitted, and which model is the better one."""
-    folder = shared_data / "softbot"
-    if not folder.is_dir():
-        pytest.skip("no recordings of the pump")
+    folder = outside(shared_data / "softbot")
     runs = []
     for path in sorted(folder.glob("sweep_*.csv")):
         table = np.genfromtxt(path, delimiter=",", skip_header=1)

@@ -259,7 +259,7 @@ def test_leaving_the_model_is_told_not_returned() -> None:
 def test_bad_input(call: object, words: str | None) -> None:
     if words is None:
         # One step per tick is still stable for the nominal plant, though not accurate.
-        call()  # type: ignore[operator]
+        call()
         return
     with pytest.raises(BadInputError, match=words):
-        call()  # type: ignore[operator]
+        call()

@@ -108,7 +108,7 @@ def numeric(function: object, at: FloatArray, h: float = 1e-6) -> FloatArray:
     for i in range(len(at)):
         step = np.zeros(len(at))
         step[i] = h
-        columns.append((function(at + step) - function(at - step)) / (2 * h))  # type: ignore[operator]
+        columns.append((function(at + step) - function(at - step)) / (2 * h))
     return np.stack(columns, axis=-1)
 
 
@@ -187,4 +187,4 @@ def test_length_is_symmetric_in_the_sign_of_the_angle() -> None:
 )
 def test_bad_input(call: object, words: str) -> None:
     with pytest.raises(BadInputError, match=words):
-        call()  # type: ignore[operator]
+        call()

@@ -81,7 +81,7 @@ def test_linear_and_actuator_laws() -> None:
 )
 def test_refused_values(change: dict[str, object], words: str) -> None:
     with pytest.raises(BadInputError, match=words):
-        replace(Plant(), **change)  # type: ignore[arg-type]
+        replace(Plant(), **change)
 
 
 @pytest.mark.parametrize(

@@ -203,4 +203,4 @@ def test_rest_under_a_held_command_stays() -> None:
 )
 def test_bad_input(build: object, words: str) -> None:
     with pytest.raises(BadInputError, match=words):
-        build()  # type: ignore[operator]
+        build()

@@ -92,11 +92,11 @@ def main() -> None:
 
 
 def _vqf(module: object, gyr: np.ndarray, acc: np.ndarray) -> None:
-    module.VQF(DT_S).updateBatch(np.ascontiguousarray(gyr), np.ascontiguousarray(acc))  # type: ignore[attr-defined]
+    module.VQF(DT_S).updateBatch(np.ascontiguousarray(gyr), np.ascontiguousarray(acc))
 
 
 def _imufusion(module: object, gyr: np.ndarray, acc: np.ndarray) -> None:
-    filter_ = module.Ahrs()  # type: ignore[attr-defined]
+    filter_ = module.Ahrs()
     degrees, g = np.degrees(gyr), acc / 9.81
     for k in range(len(gyr)):
         filter_.update_no_magnetometer(degrees[k], g[k])

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import typer
 from imu_poses import AXES, G, PoseLog, Sensor, in_counts, pose_log, sphere_poses, tilts
+from outside import outside
 
 from calib.cli.imu_intrinsics import intrinsics
 from calib.errors import BadInputError, UsageError
@@ -163,9 +164,7 @@ def test_bad_input_is_one_sentence(tmp_path: Path, text: str, words: str) -> Non
 def test_the_recording_of_imu_tk_with_figures(
     shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = shared_data / "imu_tk"
-    if not folder.is_dir():
-        pytest.skip(f"no recording at {folder}")
+    folder = outside(shared_data / "imu_tk")
     intrinsics(
         accel=folder / "xsens_acc.mat.gz",
         gyro=folder / "xsens_gyro.mat.gz",

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import typer
 import yaml
+from outside import outside
 
 from calib.cli.imu_static import static
 from calib.errors import BadInputError
@@ -165,9 +166,7 @@ def test_figures_are_drawn(logs: list[Path], tmp_path: Path) -> None:
 
 
 def test_a_recording_of_a_real_sensor(shared_data: Path, tmp_path: Path) -> None:
-    path = shared_data / "imufusion" / "sensor_data.csv"
-    if not path.exists():
-        pytest.skip(f"no recording at {path}")
+    path = outside(shared_data / "imufusion" / "sensor_data.csv")
     table = np.genfromtxt(path, delimiter=",", skip_header=1)[:, :7]
     rest = table[table[:, 0] - table[0, 0] < 11.0]
     log = _write(tmp_path / "log.csv", rest[:, 1:], rest[:, 0])

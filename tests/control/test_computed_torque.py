@@ -89,7 +89,7 @@ def test_gains_act_on_the_error() -> None:
 )
 def test_parameters_that_cannot_be(words: dict[str, float], sentence: str) -> None:
     with pytest.raises(BadInputError, match=sentence):
-        ComputedTorque(**words)  # type: ignore[arg-type]
+        ComputedTorque(**words)
 
 
 def test_a_reference_needs_three_ticks() -> None:

@@ -45,7 +45,7 @@ def test_an_integrator_has_the_margins_of_the_book(k: float) -> None:
 @pytest.mark.parametrize("phi", [0.15, 0.4, 0.8])
 @pytest.mark.parametrize("gains", [(470.0, 1000.0, 0.0), (350.0, 300.0, 10.0), (600.0, 0.0, 0.0)])
 def test_the_gain_margin_by_brute_force(model: object, phi: float, gains: tuple[float, ...]) -> None:
-    loop = orientation_loop(model, Pid(*gains), tuple(bent_rest(model, phi)))  # type: ignore[arg-type]
+    loop = orientation_loop(model, Pid(*gains), tuple(bent_rest(model, phi)))
     (found,) = loop_margins(loop)
     assert found.stable
     assert found.gain == pytest.approx(gain_to_instability(loop), rel=1e-3)

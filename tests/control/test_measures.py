@@ -15,7 +15,7 @@ from calib.control.references import Reference, built_in
 R, H = NOMINAL.plant.bellows_radius_m, NOMINAL.tick_s
 
 
-def _tracking(reference: Reference, q: np.ndarray, pwm: np.ndarray | None = None):  # type: ignore[no-untyped-def]
+def _tracking(reference: Reference, q: np.ndarray, pwm: np.ndarray | None = None):
     return tracking(reference, q, np.zeros_like(q) if pwm is None else pwm, R, 0.0, 255.0)
 
 

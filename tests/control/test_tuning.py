@@ -77,7 +77,7 @@ def test_a_lower_demand_gives_stronger_gains(orientation: Tuned) -> None:
 
 def test_operating_points_are_within_reach() -> None:
     for q in (*operating_angles(NOMINAL), *operating_lengths(NOMINAL)):
-        assert bool(reachable(NOMINAL, q))  # type: ignore[arg-type]
+        assert bool(reachable(NOMINAL, q))
 
 
 def test_a_demand_beyond_the_delay_is_refused() -> None:

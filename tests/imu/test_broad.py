@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from broad_trials import FILES, PUBLISHED_DEG, Trial, filter_rmse_deg, read_trial, windows
+from outside import outside
 
 from calib.imu.mahony_batch import wrapped
 from calib.imu.orientation import inclination_error, rms_in_motion, up_in_sensor
@@ -26,10 +27,7 @@ def trials(shared_data: Path) -> dict[str, Trial]:
     """Both recordings."""
     out = {}
     for name, file in FILES.items():
-        path = shared_data / "broad" / file
-        if not path.exists():
-            pytest.skip(f"no recording at {path}")
-        out[name] = read_trial(path)
+        out[name] = read_trial(outside(shared_data / "broad" / file))
     return out
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from imu_poses import AXES, G, PoseLog, Sensor, in_counts, pose_log, sphere_poses, tilts
+from outside import outside
 
 from calib.errors import BadInputError
 from calib.imu.intrinsics import count_poses, find_intrinsics
@@ -103,9 +104,7 @@ def test_poses_are_counted_once() -> None:
 
 
 def test_the_xsens_recording_of_imu_tk(shared_data: Path) -> None:
-    folder = shared_data / "imu_tk"
-    if not folder.is_dir():
-        pytest.skip(f"no recording at {folder}")
+    folder = outside(shared_data / "imu_tk")
     tables = []
     for name in ("xsens_gyro.mat.gz", "xsens_acc.mat.gz"):
         with gzip.open(folder / name, "rt") as stream:

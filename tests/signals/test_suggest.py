@@ -76,7 +76,7 @@ def test_a_wish_just_below_what_there_is() -> None:
 )
 def test_wishes_that_cannot_be_met(of: object, wanted: float, words: str) -> None:
     with pytest.raises(BadInputError, match=words):
-        suggest([of], wanted, unit="px")  # type: ignore[list-item]
+        suggest([of], wanted, unit="px")
 
 
 def test_metres_are_told_as_millimetres() -> None:
