@@ -85,11 +85,7 @@ def read_align_log(path: Path, image_size_px: tuple[int, int]) -> tuple[AlignLog
     """
     log = read_log(path)
     check_time(log)
-    said = []
-    if log.not_finite:
-        said.append(f"{log.source}: {log.not_finite} cells say nan or inf and count as blank")
-    if log.truncated:
-        said.append(f"{log.source}: the last line is cut short and left out")
+    said = log.passed_over()
     pixels = np.stack([_column(log, "u_px"), _column(log, "v_px")], axis=1)
     seen = np.isfinite(pixels).all(axis=1)
     width, height = image_size_px

@@ -19,7 +19,7 @@ from calib.errors import BadInputError
 from calib.imu.rest import MOST_GYRO_RADPS
 from calib.imu.tracks import DriftLog
 from calib.imulogs import ACCEL_UNITS, GYRO_UNITS
-from calib.logs import Log, check_time, read_log
+from calib.logs import ROWS_MISSING, Log, check_time, read_log
 
 __all__ = ["drift_log", "read_drift_log"]
 
@@ -181,10 +181,6 @@ def read_drift_log(
 ) -> tuple[DriftLog, Sequence[str]]:
     """`drift_log` of a file, and sentences about what was passed over in it."""
     log = read_log(path)
-    said = []
-    if log.not_finite:
-        said.append(f"{log.source}: {log.not_finite} cells say nan or inf; their rows count as missing")
-    if log.truncated:
-        said.append(f"{log.source}: the last line is cut short and left out")
+    said = log.passed_over(ROWS_MISSING)
     found, more = drift_log(log, acc_unit, gyro_unit)
     return found, [*said, *more]

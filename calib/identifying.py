@@ -211,9 +211,7 @@ def read_track(
     no marker, or a rig without camera or plane where the pictures are needed.
     """
     log = read_log(path)
-    said = []
-    if log.not_finite:
-        said.append(f"{log.source}: {log.not_finite} cells say nan or inf and count as blank")
+    said = log.passed_over()
     _check_clock(log)
     begin, tick_s, pwm = _commands(log, no_pwm)
     delay_s = 0.0

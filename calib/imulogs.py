@@ -17,7 +17,7 @@ from calib.errors import BadInputError
 from calib.imu.rest import MOST_GYRO_RADPS, quiet_spread
 from calib.imu.sampling import Part
 from calib.imu.static import AXES, RestLog, is_gyro
-from calib.logs import Log, check_time, read_log
+from calib.logs import ROWS_MISSING, Log, check_time, read_log
 
 __all__ = ["ACCEL_UNITS", "GYRO_UNITS", "read_rest_log", "rest_log"]
 
@@ -121,9 +121,5 @@ def read_rest_log(
 ) -> tuple[RestLog, Sequence[str]]:
     """`rest_log` of a file, and sentences about what was passed over in it."""
     log = read_log(path)
-    said = []
-    if log.not_finite:
-        said.append(f"{log.source}: {log.not_finite} cells say nan or inf; their rows count as missing")
-    if log.truncated:
-        said.append(f"{log.source}: the last line is cut short and left out")
+    said = log.passed_over(ROWS_MISSING)
     return rest_log(log, acc_unit, gyro_unit), said

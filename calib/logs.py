@@ -1,4 +1,4 @@
-"""Logs: time stamps with the readings of camera, IMU and pumps, as CSV or Parquet.
+"""Logs: time stamps with the readings of camera, IMU and pumps, as CSV, Parquet or bags.
 
 A CSV log has a header and one row per sample: `t_s` and any of `COLUMNS`, in any order. A blank cell means
 that this sensor was not sampled in that row, so a 60 Hz camera and a 100 Hz IMU may interleave. Columns of
@@ -30,8 +30,10 @@ from calib.errors import BadInputError
 from calib.files import shown, write_atomically
 
 __all__ = [
+    "BLANK",
     "COLUMNS",
     "MEASURED",
+    "ROWS_MISSING",
     "TRUE",
     "Log",
     "check_time",
@@ -60,6 +62,10 @@ TRUE = ("true_q1_m", "true_q2_m", "true_phi_rad", "true_x_m", "true_y_m")
 """What only the simulated rig knows, at the row's `t_s`; (x, y) is the head. For scoring."""
 
 COLUMNS = (*MEASURED, *TRUE)
+
+BLANK = " and count as blank"
+ROWS_MISSING = "; their rows count as missing"
+"""What cells that are not finite count as, for `Log.passed_over`."""
 
 _BLOCK_BYTES = 1 << 20
 _LONGEST_LINE = 1 << 16
@@ -97,6 +103,15 @@ class Log:
         if not names or any(name not in self.columns for name in names):
             return np.zeros(0, dtype=np.int64)
         return np.nonzero(np.logical_and.reduce([~np.isnan(self.columns[name]) for name in names]))[0]
+
+    def passed_over(self, counts: str = BLANK) -> list[str]:
+        """Sentences on cells that are not finite, with what they count as, and on a last line cut short."""
+        said = []
+        if self.not_finite:
+            said.append(f"{self.source}: {self.not_finite} cells say nan or inf{counts}")
+        if self.truncated:
+            said.append(f"{self.source}: the last line is cut short and left out")
+        return said
 
 
 def check_time(log: Log) -> None:
@@ -295,8 +310,10 @@ def _parquet_column(layout: _Layout, column: Any, name: str) -> FloatArray:
         raise BadInputError(f"{layout.source}: {name} holds {column.type}, expected numbers") from error
 
 
-def iter_log(path: Path) -> Iterator[Log]:
+def iter_log(path: Path, topics: Path | None = None) -> Iterator[Log]:
     """Blocks of a log in turn, each a `Log` of some ten thousand rows at most; a block may have none.
+
+    CSV, Parquet, or a bag (see `calib.log_bags`), of which `topics` may say what is where.
 
     Raises
     ------
@@ -304,12 +321,18 @@ def iter_log(path: Path) -> Iterator[Log]:
         For a file that cannot be read, has no `t_s`, a row without time or with too few cells, or a cell
         that is no number: with the number of the line.
     """
+    from calib.log_bags import is_bag, iter_bag
+
+    if is_bag(path):
+        return iter_bag(path, topics)
+    if topics is not None:
+        raise BadInputError(f"{shown(path)}: has columns, expected a bag where topics are given")
     return _iter_parquet(path) if path.suffix.lower() == ".parquet" else _iter_csv(path)
 
 
-def read_log(path: Path) -> Log:
+def read_log(path: Path, topics: Path | None = None) -> Log:
     """A whole log. Raises `BadInputError` as `iter_log`, and for a log without rows."""
-    blocks = list(iter_log(path))
+    blocks = list(iter_log(path, topics))
     if not sum(len(block) for block in blocks):
         raise BadInputError(f"{shown(path)}: has a header but no rows")
     first = blocks[0]

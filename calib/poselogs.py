@@ -21,7 +21,7 @@ from calib.files import as_text, read_bytes, shown
 from calib.imu.intrinsics import PoseLog
 from calib.imu.static import AXES, is_gyro
 from calib.imulogs import ACCEL_UNITS, GYRO_UNITS
-from calib.logs import Log, check_time, read_log
+from calib.logs import ROWS_MISSING, Log, check_time, read_log
 
 __all__ = ["pose_log", "read_pose_files", "read_pose_log"]
 
@@ -157,11 +157,7 @@ def read_pose_log(
 ) -> tuple[PoseLog, Sequence[str]]:
     """`pose_log` of a file, and sentences about what was passed over in it."""
     log = read_log(path)
-    said = []
-    if log.not_finite:
-        said.append(f"{log.source}: {log.not_finite} cells say nan or inf; their rows count as missing")
-    if log.truncated:
-        said.append(f"{log.source}: the last line is cut short and left out")
+    said = log.passed_over(ROWS_MISSING)
     return pose_log(log, acc_unit, gyro_unit, planar), said
 
 

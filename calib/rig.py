@@ -13,12 +13,13 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from calib import __version__
 from calib.errors import BadInputError
 from calib.files import one_line, read_bytes, read_yaml_mapping, sha256, shown, write_atomically
 from calib.rig_align import Align
+from calib.rig_base import Count, CovarianceTable, Matrix3, NotNegative, Number, Row3, Section
 from calib.rig_controller import Controller
 from calib.rig_estimator import Estimator
 from calib.rig_filter import OrientationFilter
@@ -73,24 +74,15 @@ SECTIONS = (
 
 Verdict = Annotated[str, Field(pattern="^(ok|poor|unidentifiable|inconsistent)$")]
 Model = Annotated[str, Field(pattern="^(pinhole|radial2|radial3|brown5|rational8)$")]
-Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 Focal = Annotated[float, Field(ge=1e-3, le=1e7, allow_inf_nan=False, strict=True)]
 Pixels = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False, strict=True)]
 Coefficient = Annotated[float, Field(ge=-1e30, le=1e30, allow_inf_nan=False, strict=True)]
 Metres = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False, strict=True)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
-Count = Annotated[int, Field(ge=0, strict=True)]
 Side = Annotated[int, Field(ge=1, le=100_000, strict=True)]
 Sigma = dict[str, NotNegative | None]
-Row3 = Annotated[list[Number], Field(min_length=3, max_length=3)]
-Matrix3 = Annotated[list[Row3], Field(min_length=3, max_length=3)]
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", defer_build=True)
-
-
-class Geometry(_Section):
+class Geometry(Section):
     """What a person knows of the rig. Defaults: the nominal actuator."""
 
     workspace_m: Annotated[list[Metres], Field(min_length=4, max_length=4)] = [-0.06, 0.04, 0.06, 0.11]
@@ -104,7 +96,7 @@ class Geometry(_Section):
         return value
 
 
-class Distortion(_Section):
+class Distortion(Section):
     """Coefficients of `calib.camera.model`; absent ones are zero."""
 
     k1: Coefficient = 0.0
@@ -117,20 +109,7 @@ class Distortion(_Section):
     k6: Coefficient = 0.0
 
 
-class CovarianceTable(_Section):
-    """A covariance matrix with the names of its rows."""
-
-    order: list[str]
-    values: list[list[Number]]
-
-    @model_validator(mode="after")
-    def _square(self) -> CovarianceTable:
-        if len(self.values) != len(self.order) or any(len(row) != len(self.order) for row in self.values):
-            raise ValueError(f"expected {len(self.order)} rows and columns, as many as names in order")
-        return self
-
-
-class Camera(_Section):
+class Camera(Section):
     """Intrinsics, what they are worth, and why."""
 
     model: Model
@@ -158,7 +137,7 @@ class Camera(_Section):
     advice: list[str] = []
 
 
-class Plane(_Section):
+class Plane(Section):
     """The actuator's plane seen by the camera: A maps world metres to pixels (2.9 with K)."""
 
     R_CW: Matrix3
@@ -177,7 +156,7 @@ class Plane(_Section):
     reasons: list[str] = []
 
 
-class InverseLens(_Section):
+class InverseLens(Section):
     """The polynomial of `calib.camera.undistortion`."""
 
     radial: list[Number]
@@ -186,7 +165,7 @@ class InverseLens(_Section):
     covered: Annotated[float, Field(ge=0, le=1)]
 
 
-class Lens(_Section):
+class Lens(Section):
     """What lens distortion does over the picture and costs on the plane."""
 
     kind: str
@@ -206,7 +185,7 @@ class Lens(_Section):
     reasons: list[str] = []
 
 
-class Provenance(_Section):
+class Provenance(Section):
     """Version and the SHA-256 of each input by section and name."""
 
     version: str = __version__

@@ -10,28 +10,20 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from calib.errors import BadInputError
 from calib.files import shown
-from calib.rig import CovarianceTable, Rig, validation_sentence
+from calib.rig import Rig, validation_sentence
+from calib.rig_base import CovarianceTable, NotNegative, Number, Pair, Positive, Section
 
 __all__ = ["Actuator", "PumpIdentified", "PumpModel", "PumpSection", "StaticMapSection", "section_of"]
 
-Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
-Count = Annotated[int, Field(ge=0, strict=True)]
-Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
 Verdict = Literal["ok", "poor", "unidentifiable"]
-Section = TypeVar("Section", bound=BaseModel)
+Kind = TypeVar("Kind", bound=BaseModel)
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", defer_build=True)
-
-
-class _Judged(_Section):
+class _Judged(Section):
     """What every identified section has beside its values.
 
     Attributes
@@ -70,7 +62,7 @@ class Actuator(_Judged):
     force_projection: Literal["virtual_work", "head"] | None = None
 
 
-class PumpModel(_Section):
+class PumpModel(Section):
     """One model of the pump in a table: parameters with sigma, and errors on recordings not fitted."""
 
     parameters: dict[str, Number]
@@ -83,7 +75,7 @@ class PumpModel(_Section):
     ahead_by_file: dict[str, NotNegative | None] = {}
 
 
-class StaticMapSection(_Section):
+class StaticMapSection(Section):
     """A static map from settled values, see `calib.actuator.identify_static_map`."""
 
     end: Number
@@ -95,7 +87,7 @@ class StaticMapSection(_Section):
     outliers_pwm: list[Number] = []
 
 
-class PumpIdentified(_Section):
+class PumpIdentified(Section):
     """What `calib identify pump` finds, in the unit of its tables.
 
     Attributes
@@ -134,7 +126,7 @@ class PumpSection(_Judged):
         return self
 
 
-def section_of(rig: Rig, name: str, kind: type[Section], path: Path) -> Section:
+def section_of(rig: Rig, name: str, kind: type[Kind], path: Path) -> Kind:
     """A section of a rig by its schema, empty where the file has none.
 
     Raises `BadInputError` naming file and key.

@@ -5,46 +5,35 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from calib.rig_base import Count, CovarianceTable, NotNegative, Number, Pair, Section
 
 __all__ = ["Align", "AlignCovariance", "AlignLogCheck"]
 
-Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 Angle = Annotated[float, Field(ge=-7.0, le=7.0, allow_inf_nan=False, strict=True)]
 Seconds = Annotated[float, Field(ge=-10.0, le=10.0, allow_inf_nan=False, strict=True)]
 Metres = Annotated[float, Field(ge=-1.0, le=1.0, allow_inf_nan=False, strict=True)]
 Share = Annotated[float, Field(gt=-1.0, le=10.0, allow_inf_nan=False, strict=True)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
-Count = Annotated[int, Field(ge=0, strict=True)]
-Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
 SharePair = Annotated[list[Share], Field(min_length=2, max_length=2)]
 MetresPair = Annotated[list[Metres], Field(min_length=2, max_length=2)]
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", defer_build=True)
-
-
-class AlignCovariance(_Section):
+class AlignCovariance(CovarianceTable):
     """Covariance with the names of its rows, those of `calib.estimator.sensors.SENSOR`."""
 
-    order: list[str]
-    values: list[list[Number]]
-
     @model_validator(mode="after")
-    def _whole(self) -> AlignCovariance:
-        n, V = len(self.order), self.values
-        if len(V) != n or any(len(row) != n for row in V):
-            raise ValueError(f"expected {n} rows and columns, as many as names in order")
-        for i in range(n):
-            for j in range(n):
+    def _positive(self) -> AlignCovariance:
+        V = self.values
+        for i in range(len(V)):
+            for j in range(len(V)):
                 limit = math.sqrt(max(V[i][i], 0.0) * max(V[j][j], 0.0)) * (1.0 + 1e-6)
                 if abs(V[i][j] - V[j][i]) > 1e-6 * limit or abs(V[i][j]) > limit:
                     raise ValueError("expected a covariance matrix")
         return self
 
 
-class AlignLogCheck(_Section):
+class AlignLogCheck(Section):
     """A log's part: readings that were used, clocks, and residuals; see `calib.estimator.align.LogCheck`."""
 
     name: str
@@ -65,7 +54,7 @@ class AlignLogCheck(_Section):
     accel_rms_mps2: NotNegative | None = None
 
 
-class Align(_Section):
+class Align(Section):
     """Camera and IMU in line.
 
     Attributes

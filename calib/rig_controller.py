@@ -15,7 +15,9 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from calib.rig_base import Row3, Section
 
 __all__ = [
     "ComputedTorqueGains",
@@ -33,14 +35,9 @@ NotNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False, strict=T
 Pwm = Annotated[float, Field(ge=0, le=255, allow_inf_nan=False, strict=True)]
 Count = Annotated[int, Field(ge=1, le=1000, strict=True)]
 Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
-Row3 = Annotated[list[Number], Field(min_length=3, max_length=3)]
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", defer_build=True)
-
-
-class ControllerCriterion(_Section):
+class ControllerCriterion(Section):
     """Margins that the gains keep at every operating point."""
 
     gain_margin: Annotated[float, Field(gt=1, lt=100, allow_inf_nan=False, strict=True)]
@@ -48,7 +45,7 @@ class ControllerCriterion(_Section):
     sensitivity: Annotated[float, Field(gt=1, lt=100, allow_inf_nan=False, strict=True)]
 
 
-class OrientationGains(_Section):
+class OrientationGains(Section):
     """PID of the angle with back-calculation; `sign` is that of the error of bellows 1."""
 
     Kp_pwm_per_rad: NotNegative
@@ -59,7 +56,7 @@ class OrientationGains(_Section):
     sign: Literal[1, -1] = 1
 
 
-class PositionGains(_Section):
+class PositionGains(Section):
     """PD of the lengths beside the feed-forward."""
 
     Kp_pwm_per_m: NotNegative
@@ -67,7 +64,7 @@ class PositionGains(_Section):
     Kd_pwm_s_per_m: NotNegative
 
 
-class StaticMap(_Section):
+class StaticMap(Section):
     """Force that holds a bellows, and the PWM for it.
 
     F_i = c_spr (k0 + k1 eps + k2 eps^2 + k3 eps^3) eps +- k_bnd phi |phi|, eps = q_i - l0, + for bellows 1;
@@ -83,7 +80,7 @@ class StaticMap(_Section):
     force_pwm: Annotated[list[Pair], Field(min_length=2, max_length=64)]
 
 
-class ComputedTorqueGains(_Section):
+class ComputedTorqueGains(Section):
     """Horizon and gains of the law, and the observer's gain: rows q1, q2, dq1, dq2, z1, z2, d1, d2, bias."""
 
     horizon_ticks: Count
@@ -93,7 +90,7 @@ class ComputedTorqueGains(_Section):
     observer_gain: Annotated[list[Row3], Field(min_length=9, max_length=9)]
 
 
-class ControllerMargins(_Section):
+class ControllerMargins(Section):
     """Margins of a loop at a rest; null where nothing limits them."""
 
     loop: Literal["orientation", "position"]
@@ -106,7 +103,7 @@ class ControllerMargins(_Section):
     sensitivity: Positive
 
 
-class Controller(_Section):
+class Controller(Section):
     """Gains that were tuned on the model.
 
     Attributes

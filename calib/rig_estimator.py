@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from calib.rig_base import Section
 
 __all__ = ["Estimator", "EstimatorAxisGain", "EstimatorGain", "EstimatorLevel"]
 
@@ -13,11 +15,7 @@ Finite = Annotated[float, Field(ge=-1e12, le=1e12, allow_inf_nan=False, strict=T
 NotNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False, strict=True)]
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", defer_build=True)
-
-
-class EstimatorLevel(_Section):
+class EstimatorLevel(Section):
     """One level of process noise, see `calib.estimator.model.Level`."""
 
     name: str
@@ -29,7 +27,7 @@ class EstimatorLevel(_Section):
     walk_length_m_per_sqrt_s: NotNegative
 
 
-class EstimatorAxisGain(_Section):
+class EstimatorAxisGain(Section):
     """One axis, see `calib.estimator.constant_gain.AxisGain`: F (n, n), H (m, n), K (n, m), sigma (n,)."""
 
     F: list[list[Finite]]
@@ -46,7 +44,7 @@ class EstimatorAxisGain(_Section):
         return self
 
 
-class EstimatorGain(_Section):
+class EstimatorGain(Section):
     """The kinematic filter with constant gains, for a controller; angle and length apart.
 
     Attributes
@@ -63,7 +61,7 @@ class EstimatorGain(_Section):
     length: EstimatorAxisGain
 
 
-class Estimator(_Section):
+class Estimator(Section):
     """Noise of the sensors and of the process, by maximum likelihood of innovations.
 
     Attributes

@@ -4,22 +4,14 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from calib.rig_base import Count, NotNegative, Number, Pair, Positive, Section
 
 __all__ = ["FilterCandidate", "FilterLog", "OrientationFilter"]
 
-Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
-Count = Annotated[int, Field(ge=0, strict=True)]
-Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
 
-
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", defer_build=True)
-
-
-class FilterCandidate(_Section):
+class FilterCandidate(Section):
     """A pair of gains, what it does, and its held-out error.
 
     Attributes
@@ -52,7 +44,7 @@ class FilterCandidate(_Section):
     whole_rmse_deg: NotNegative | None = None
 
 
-class FilterLog(_Section):
+class FilterLog(Section):
     """How a log was sampled, what it was judged by, and what its own smoothed angle explains.
 
     Attributes
@@ -80,7 +72,7 @@ class FilterLog(_Section):
     bias_degps: Number | None = None
 
 
-class OrientationFilter(_Section):
+class OrientationFilter(Section):
     """Gains of the angle filter (2.3) and why they are these.
 
     Attributes

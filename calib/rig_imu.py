@@ -4,23 +4,14 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from calib.rig_base import Count, NotNegative, Number, PerAxis, Positive, Section, Sizes
 
 __all__ = ["Imu", "ImuDrift", "ImuLog"]
 
-Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
-Count = Annotated[int, Field(ge=0, strict=True)]
-PerAxis = Annotated[list[Number | None], Field(min_length=3, max_length=3)]
-Sizes = Annotated[list[NotNegative | None], Field(min_length=3, max_length=3)]
 
-
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", defer_build=True)
-
-
-class ImuDrift(_Section):
+class ImuDrift(Section):
     """Slopes of an angle, one for each log: mean and standard deviation from log to log."""
 
     mean_degps: Number
@@ -28,7 +19,7 @@ class ImuDrift(_Section):
     logs: Count
 
 
-class ImuLog(_Section):
+class ImuLog(Section):
     """How a log was sampled, and the drift of the angle in it (Fig. 2.4)."""
 
     name: str
@@ -49,7 +40,7 @@ class ImuLog(_Section):
     onchip_sigma_degps: NotNegative | None = None
 
 
-class Imu(_Section):
+class Imu(Section):
     """The sensor at rest; lists hold x, y, z, null for what was not logged or cannot be told.
 
     Attributes

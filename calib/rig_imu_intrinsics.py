@@ -4,27 +4,17 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from calib.rig_base import Count, Matrix3, NotNegative, Number, PerAxis, Positive, Section, Sizes
 
 __all__ = ["AccelIntrinsics", "GyroIntrinsics", "GyroSigma", "ImuIntrinsics", "IntrinsicsSigma"]
 
-Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
-Count = Annotated[int, Field(ge=0, strict=True)]
-PerAxis = Annotated[list[Number | None], Field(min_length=3, max_length=3)]
-Sizes = Annotated[list[NotNegative | None], Field(min_length=3, max_length=3)]
-Row3 = Annotated[list[Number], Field(min_length=3, max_length=3)]
-Matrix3 = Annotated[list[Row3], Field(min_length=3, max_length=3)]
 Angles = dict[str, Number | None]
 AngleSigmas = dict[str, NotNegative | None]
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", defer_build=True)
-
-
-class IntrinsicsSigma(_Section):
+class IntrinsicsSigma(Section):
     """Standard deviations of the values of the same names."""
 
     bias: Sizes
@@ -38,7 +28,7 @@ class GyroSigma(IntrinsicsSigma):
     sensitivity: Matrix3 | None = None
 
 
-class AccelIntrinsics(_Section):
+class AccelIntrinsics(Section):
     """a = T diag(1 / scale) (reading - bias), T = [[1, -yz, zy], [0, 1, -zx], [0, 0, 1]].
 
     Attributes
@@ -60,7 +50,7 @@ class AccelIntrinsics(_Section):
     disagreement_mps2: NotNegative | None = None
 
 
-class GyroIntrinsics(_Section):
+class GyroIntrinsics(Section):
     """w = T diag(1 / scale) (reading - bias - S a), T = [[1, -yz, zy], [xz, 1, -zx], [-xy, yx, 1]].
 
     Attributes
@@ -84,7 +74,7 @@ class GyroIntrinsics(_Section):
     turns: Count
 
 
-class ImuIntrinsics(_Section):
+class ImuIntrinsics(Section):
     """Bias, scale and misalignment of an IMU from rests in many poses.
 
     Attributes

@@ -4,29 +4,21 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from calib.rig_base import Count, NotNegative, Number, Positive, Row3, Section
 
 __all__ = ["LowPass", "LowPassAxis", "LowPassLog", "LowPassSection"]
 
-Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
-Count = Annotated[int, Field(ge=0, strict=True)]
-Row3 = Annotated[list[Number], Field(min_length=3, max_length=3)]
 
-
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", defer_build=True)
-
-
-class LowPassSection(_Section):
+class LowPassSection(Section):
     """b0 b1 b2 and 1 a1 a2 of a second-order section; values that binary32 holds exactly."""
 
     b: Row3
     a: Row3
 
 
-class LowPassAxis(_Section):
+class LowPassAxis(Section):
     """Jitter of one coordinate in the log's unit (standard deviation), and what becomes of its motion.
 
     Attributes
@@ -45,7 +37,7 @@ class LowPassAxis(_Section):
     quantisation_db: list[Number] = []
 
 
-class LowPassLog(_Section):
+class LowPassLog(Section):
     """What the filter does to a log."""
 
     name: str
@@ -58,7 +50,7 @@ class LowPassLog(_Section):
     axes: dict[str, LowPassAxis]
 
 
-class LowPass(_Section):
+class LowPass(Section):
     """The low-pass of the positions, its delay, and what rounding does to it.
 
     Attributes

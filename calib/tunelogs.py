@@ -22,7 +22,7 @@ from calib.imu.smoother import SHORTEST_S, smooth_log
 from calib.imu.static import is_gyro
 from calib.imu.tracks import DriftLog, on_grid
 from calib.imu.tuning import Piece
-from calib.logs import Log, read_log
+from calib.logs import ROWS_MISSING, Log, read_log
 from calib.phi_reference import angle_from_pixels, lag_of
 from calib.rig import Rig
 
@@ -214,11 +214,7 @@ def read_tune_log(path: Path, how: Reading) -> TuneLog:
     """
     log = read_log(path)
     read, more = drift_log(log, how.acc_unit, how.gyro_unit)
-    said = list(more)
-    if log.not_finite:
-        said.append(f"{log.source}: {log.not_finite} cells say nan or inf; their rows count as missing")
-    if log.truncated:
-        said.append(f"{log.source}: the last line is cut short and left out")
+    said = [*more, *log.passed_over(ROWS_MISSING)]
     lacking = [f"{k}{x}" for k in "ga" for x in "xyz" if f"{k}{x}" not in read.axes]
     if how.tilted and lacking:
         raise BadInputError(

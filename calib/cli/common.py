@@ -9,7 +9,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import typer
 
@@ -17,7 +17,9 @@ from calib.errors import CalibError, ReaderGoneError
 from calib.files import one_line
 
 __all__ = [
+    "AccUnitOption",
     "FiguresOption",
+    "GyroUnitOption",
     "JsonOption",
     "ProgressCall",
     "RigOption",
@@ -31,6 +33,12 @@ __all__ = [
 
 RigOption = Annotated[Path, typer.Option("--rig", help="The rig's file.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of words.")]
+AccUnitOption = Annotated[
+    Literal["m/s2", "g"], typer.Option("--acc-unit", help="Unit of ax, ay, az in the logs.")
+]
+GyroUnitOption = Annotated[
+    Literal["rad/s", "deg/s"], typer.Option("--gyro-unit", help="Unit of gx, gy, gz in the logs.")
+]
 FiguresOption = Annotated[
     Path | None, typer.Option("--figures", help="Folder to draw figures into, made if needed.")
 ]

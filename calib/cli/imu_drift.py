@@ -5,11 +5,21 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from calib.cli.common import FiguresOption, JsonOption, RigOption, document, narrate, say, table
+from calib.cli.common import (
+    AccUnitOption,
+    FiguresOption,
+    GyroUnitOption,
+    JsonOption,
+    RigOption,
+    document,
+    narrate,
+    say,
+    table,
+)
 
 if TYPE_CHECKING:
     from calib.imu.drift import LogDrift
@@ -73,12 +83,8 @@ def drift(
     peers: Annotated[
         bool, typer.Option("--peers/--no-peers", help="Run the filters of the extra peers as well.")
     ] = True,
-    acc_unit: Annotated[
-        Literal["m/s2", "g"], typer.Option("--acc-unit", help="Unit of ax, ay, az in the logs.")
-    ] = "m/s2",
-    gyro_unit: Annotated[
-        Literal["rad/s", "deg/s"], typer.Option("--gyro-unit", help="Unit of gx, gy, gz in the logs.")
-    ] = "rad/s",
+    acc_unit: AccUnitOption = "m/s2",
+    gyro_unit: GyroUnitOption = "rad/s",
     rig: RigOption = Path("rig.yaml"),
     as_json: JsonOption = False,
 ) -> None:

@@ -4,11 +4,21 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calib.cli.common import FiguresOption, JsonOption, RigOption, document, narrate, say, table
+from calib.cli.common import (
+    AccUnitOption,
+    FiguresOption,
+    GyroUnitOption,
+    JsonOption,
+    RigOption,
+    document,
+    narrate,
+    say,
+    table,
+)
 from calib.errors import EXIT_POOR
 
 if TYPE_CHECKING:
@@ -87,12 +97,8 @@ def static(
     imu_yaml: Annotated[
         Path | None, typer.Option("--imu-yaml", help="Kalibr's imu.yaml to write as well.")
     ] = None,
-    acc_unit: Annotated[
-        Literal["m/s2", "g"], typer.Option("--acc-unit", help="Unit of ax, ay, az in the logs.")
-    ] = "m/s2",
-    gyro_unit: Annotated[
-        Literal["rad/s", "deg/s"], typer.Option("--gyro-unit", help="Unit of gx, gy, gz in the logs.")
-    ] = "rad/s",
+    acc_unit: AccUnitOption = "m/s2",
+    gyro_unit: GyroUnitOption = "rad/s",
     rig: RigOption = Path("rig.yaml"),
     as_json: JsonOption = False,
 ) -> None:

@@ -8,7 +8,17 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from calib.cli.common import FiguresOption, JsonOption, RigOption, document, narrate, say, table
+from calib.cli.common import (
+    AccUnitOption,
+    FiguresOption,
+    GyroUnitOption,
+    JsonOption,
+    RigOption,
+    document,
+    narrate,
+    say,
+    table,
+)
 from calib.errors import EXIT_POOR, BadInputError
 
 if TYPE_CHECKING:
@@ -109,12 +119,8 @@ def tune(
         typer.Option(help="Rate of the angle: -gz, or of the up vector for a sensor that is not in plane."),
     ] = "plane",
     figures: FiguresOption = None,
-    acc_unit: Annotated[
-        Literal["m/s2", "g"], typer.Option("--acc-unit", help="Unit of ax, ay, az in the logs.")
-    ] = "m/s2",
-    gyro_unit: Annotated[
-        Literal["rad/s", "deg/s"], typer.Option("--gyro-unit", help="Unit of gx, gy, gz in the logs.")
-    ] = "rad/s",
+    acc_unit: AccUnitOption = "m/s2",
+    gyro_unit: GyroUnitOption = "rad/s",
     rig: RigOption = Path("rig.yaml"),
     as_json: JsonOption = False,
 ) -> None:
