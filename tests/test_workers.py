@@ -79,3 +79,64 @@ def test_no_worker_outlives_its_parent(tmp_path: Path) -> None:
     # That it ended at all is the point: it ends when no worker holds the pipe any more.
     assert done.returncode == -signal.SIGKILL
     assert done.stdout.split()
+
+
+def _odd(shared: object, i: int) -> object:
+    if i == 3:
+        raise _UnpicklableError(lambda: i)
+    return (lambda: i) if i == 5 else i
+
+
+class _UnpicklableError(Exception):
+    pass
+
+
+def _dies(shared: object, i: int) -> int:
+    if i == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return i
+
+
+forked = pytest.mark.skipif(
+    sys.platform != "linux" or processors() < 2,
+    reason="not part of the project and not here: a second processor",
+)
+
+
+@forked
+def test_what_cannot_be_sent_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(threading, "active_count", lambda: 1)
+    with Workers(None, 8) as pool:
+        with pytest.raises(RuntimeError, match="_UnpicklableError"):
+            list(pool.in_order(_odd, range(4)))
+        with pytest.raises((AttributeError, TypeError), match="pickle"):
+            list(pool.in_order(_odd, [0, 1, 5]))
+        # What was left of those rounds is in nobody's way.
+        assert list(pool.in_order(_odd, [0, 1, 2, 4])) == [0, 1, 2, 4]
+
+
+@forked
+def test_a_worker_that_the_system_ends_is_no_hang(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(threading, "active_count", lambda: 1)
+    with pytest.raises(MemoryError, match="-9"), Workers(None, 8) as pool:
+        list(pool.in_order(_dies, range(8)))
+
+
+@forked
+def test_an_error_in_the_middle_ends_the_process_in_silence(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import time\n"
+        "from calib.workers import Workers\n"
+        "def slow(shared, i):\n"
+        "    time.sleep(0.01)\n"
+        "try:\n"
+        "    with Workers(None, 8) as pool:\n"
+        "        for _ in pool.in_order(slow, range(8)):\n"
+        "            raise ValueError\n"
+        "except ValueError:\n"
+        "    pass\n"
+    )
+    for _ in range(10):
+        done = subprocess.run([sys.executable, str(script)], capture_output=True, timeout=60, check=True)
+        assert not done.stderr
