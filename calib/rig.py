@@ -8,38 +8,38 @@ bound is null.
 
 from __future__ import annotations
 
+import importlib
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from calib import __version__
 from calib.errors import BadInputError
-from calib.files import one_line, read_bytes, read_yaml_mapping, sha256, shown, write_atomically
-from calib.rig_align import Align
+from calib.files import file_sha256, one_line, read_yaml_mapping, sha256, shown, write_atomically
 from calib.rig_base import Count, CovarianceTable, Matrix3, NotNegative, Number, Row3, Section
-from calib.rig_controller import Controller
-from calib.rig_estimator import Estimator
-from calib.rig_filter import OrientationFilter
-from calib.rig_imu import Imu
-from calib.rig_imu_intrinsics import ImuIntrinsics
-from calib.rig_lowpass import LowPass
+
+if TYPE_CHECKING:
+    from calib.rig_align import Align
+    from calib.rig_controller import Controller
+    from calib.rig_estimator import Estimator
+    from calib.rig_filter import OrientationFilter
+    from calib.rig_imu import Imu
+    from calib.rig_imu_intrinsics import ImuIntrinsics
+    from calib.rig_lowpass import LowPass
+else:
+    # Their schemas take a tenth of a second to build and are loaded where a file has these sections.
+    Align = Controller = Estimator = OrientationFilter = Imu = ImuIntrinsics = LowPass = Any
 
 __all__ = [
-    "Align",
     "Camera",
     "CovarianceTable",
     "Distortion",
-    "Estimator",
     "Geometry",
-    "Imu",
-    "ImuIntrinsics",
     "InverseLens",
     "Lens",
-    "LowPass",
-    "OrientationFilter",
     "Plane",
     "Provenance",
     "Rig",
@@ -71,6 +71,17 @@ SECTIONS = (
     "provenance",
 )
 """Sections in the order of the file."""
+
+_LATER = {
+    "imu": ("calib.rig_imu", "Imu"),
+    "imu_intrinsics": ("calib.rig_imu_intrinsics", "ImuIntrinsics"),
+    "orientation_filter": ("calib.rig_filter", "OrientationFilter"),
+    "lowpass": ("calib.rig_lowpass", "LowPass"),
+    "align": ("calib.rig_align", "Align"),
+    "estimator": ("calib.rig_estimator", "Estimator"),
+    "controller": ("calib.rig_controller", "Controller"),
+}
+"""Sections with modules of their own, and what they are there."""
 
 Verdict = Annotated[str, Field(pattern="^(ok|poor|unidentifiable|inconsistent)$")]
 Model = Annotated[str, Field(pattern="^(pinhole|radial2|radial3|brown5|rational8)$")]
@@ -209,6 +220,13 @@ class Rig(BaseModel):
     estimator: Estimator | None = None
     controller: Controller | None = None
     provenance: Provenance = Provenance()
+
+    @field_validator(*_LATER, mode="plain")
+    @classmethod
+    def _loaded(cls, value: Any, info: ValidationInfo) -> BaseModel | None:
+        module, name = _LATER[str(info.field_name)]
+        kind: type[BaseModel] = getattr(importlib.import_module(module), name)
+        return None if value is None else kind.model_validate(value)
 
 
 _EXPECTED = {
@@ -365,5 +383,5 @@ def finite_or_none(value: float) -> float | None:
 
 
 def hash_of(path: Path) -> str:
-    """SHA-256 of a file."""
-    return sha256(read_bytes(path))
+    """SHA-256 of a file of any size."""
+    return file_sha256(path)

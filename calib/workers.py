@@ -28,6 +28,9 @@ from typing import Any, Generic, TypeVar, cast
 
 import cv2
 
+# np.median and np.unique load it: once here, before the processes fork, instead of once in each.
+import numpy.ma  # noqa: F401
+
 __all__ = ["Workers", "at_most", "processors"]
 
 Shared = TypeVar("Shared")
@@ -89,6 +92,7 @@ def _may_fork(items: int) -> bool:
         and processors() > 1
         and sys.platform == "linux"
         and threading.active_count() == 1
+        and not multiprocessing.current_process().daemon
     )
 
 

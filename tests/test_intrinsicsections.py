@@ -10,7 +10,8 @@ from imu_poses import G, PoseLog, Sensor, in_counts, pose_log, sphere_poses, til
 from calib.imu.intrinsics import find_intrinsics
 from calib.imu.intrinsics_verdict import judge_intrinsics
 from calib.intrinsicsections import intrinsics_section
-from calib.rig import ImuIntrinsics, Rig, rig_text
+from calib.rig import Rig, rig_text
+from calib.rig_imu_intrinsics import ImuIntrinsics
 
 SENSOR = Sensor()
 

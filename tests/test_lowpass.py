@@ -13,7 +13,8 @@ from calib.actuator.kinematics import marker_from_head
 from calib.errors import BadInputError
 from calib.logs import Log, write_log
 from calib.lowpass import lowpass_section, positions_from_log
-from calib.rig import LowPass, Rig, read_rig, write_rig
+from calib.rig import Rig, read_rig, write_rig
+from calib.rig_lowpass import LowPass
 from calib.signals.design import Design, design_lowpass
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario

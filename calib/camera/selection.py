@@ -18,6 +18,7 @@ from calib.camera.bundle import Calibration, calibrate, refit_poses
 from calib.camera.model import MODELS
 from calib.camera.projection import Block, free_intrinsics
 from calib.camera.views import Observations
+from calib.workers import Workers
 
 __all__ = [
     "BOARDS",
@@ -96,41 +97,59 @@ def _folds(views: int) -> list[IntArray]:
     return [np.arange(first, views, count, dtype=np.int64) for first in range(count)]
 
 
-def _on_held_back(
-    whole: Calibration,
-    observations: Observations,
-    image_size_px: tuple[int, int],
-    skew: bool,
-    fixed: tuple[str, ...],
-) -> FloatArray:
-    """Mean squared residual vector (N,) of each view by a camera that has not seen it."""
-    squared = np.full(observations.views, np.nan)
-    for held in _folds(observations.views):
-        kept = np.setdiff1d(np.arange(observations.views, dtype=np.int64), held)
-        start = Block(
-            whole.block.intrinsics, whole.block.R_CT[kept], whole.block.t_CT_m[kept], whole.block.deformation
-        )
-        fit = calibrate(
-            observations.select(kept),
-            image_size_px,
-            whole.camera.model,
-            skew=skew,
-            fixed=fixed,
-            basis=whole.basis,
-            loss=whole.loss,
-            start=start,
-            max_iterations=_MAX_ITERATIONS,
-            tolerance=_ENOUGH,
-        )
-        # A direction that a fold leaves flat makes "iterations" usual for rich models; its error counts.
-        if fit.termination in ("behind the camera", "singular"):
-            continue
-        residuals = refit_poses(fit, observations.select(held))
-        of_point = np.sum(residuals**2, axis=2)
-        known = np.isfinite(of_point)
-        total = np.where(known, of_point, 0.0).sum(axis=1)
-        squared[held] = np.where(known.any(axis=1), total / np.maximum(known.sum(axis=1), 1), np.nan)
+@dataclass(frozen=True)
+class _Judges:
+    """What every fold has in common; `fits` are those to all views, which a fold starts from."""
+
+    fits: Sequence[Calibration]
+    folds: Sequence[IntArray]
+    skew: bool
+    fixed: tuple[str, ...]
+
+
+def _on_held_back(fits: Sequence[Calibration], skew: bool, fixed: tuple[str, ...]) -> FloatArray:
+    """Mean squared residual vector (len(fits), N) of each view by a camera that has not seen it."""
+    if not fits:
+        return np.zeros((0, 0))
+    views = fits[0].observations.views
+    folds = _folds(views)
+    squared = np.full((len(fits), views), np.nan)
+    jobs = [(i, k) for i in range(len(fits)) for k in range(len(folds))]
+    with Workers(_Judges(fits, folds, skew, fixed), len(jobs)) as workers:
+        for (i, k), found in zip(jobs, workers.in_order(_on_fold, jobs), strict=True):
+            squared[i, folds[k]] = found
     return squared
+
+
+# As in the whole calibration, what is not finite is looked for; a thread does not inherit that.
+@np.errstate(all="ignore")
+def _on_fold(judges: _Judges, job: tuple[int, int]) -> FloatArray:
+    """The same for the views of one fold, NaN where the others do not make a camera."""
+    whole, held = judges.fits[job[0]], judges.folds[job[1]]
+    observations = whole.observations
+    kept = np.setdiff1d(np.arange(observations.views, dtype=np.int64), held)
+    fit = calibrate(
+        observations.select(kept),
+        whole.camera.image_size_px,
+        whole.camera.model,
+        skew=judges.skew,
+        fixed=judges.fixed,
+        basis=whole.basis,
+        loss=whole.loss,
+        start=Block(
+            whole.block.intrinsics, whole.block.R_CT[kept], whole.block.t_CT_m[kept], whole.block.deformation
+        ),
+        max_iterations=_MAX_ITERATIONS,
+        tolerance=_ENOUGH,
+    )
+    # A direction that a fold leaves flat makes "iterations" usual for rich models; its error counts.
+    if fit.termination in ("behind the camera", "singular"):
+        return np.full(len(held), np.nan)
+    residuals = refit_poses(fit, observations.select(held))
+    of_point = np.sum(residuals**2, axis=2)
+    known = np.isfinite(of_point)
+    total = np.where(known, of_point, 0.0).sum(axis=1)
+    return np.where(known.any(axis=1), total / np.maximum(known.sum(axis=1), 1), np.nan)
 
 
 def _candidate(name: str, fit: Calibration, per_view: FloatArray) -> Candidate:
@@ -152,7 +171,7 @@ def candidates_by_model(
 
     A model that the views are too few for is left out.
     """
-    found: list[tuple[Candidate, Calibration]] = []
+    fits: list[Calibration] = []
     start: Block | None = None
     for model in models:
         if 2 * observations.points < len(free_intrinsics(model, skew, fixed)) + 6 * observations.views + 1:
@@ -171,9 +190,9 @@ def candidates_by_model(
         if fit.termination in ("behind the camera", "singular"):
             continue
         start = fit.block
-        per_view = _on_held_back(fit, observations, image_size_px, skew, fixed)
-        found.append((_candidate(model, fit, per_view), fit))
-    return found
+        fits.append(fit)
+    held = _on_held_back(fits, skew, fixed)
+    return [(_candidate(fit.camera.model, fit, held[i]), fit) for i, fit in enumerate(fits)]
 
 
 def candidates_by_board(
@@ -184,7 +203,8 @@ def candidates_by_board(
     Only for targets whose points are the same in every view; otherwise the rigid board alone.
     """
     observations, size = rigid.observations, rigid.camera.image_size_px
-    found: list[tuple[Candidate, Calibration]] = []
+    names: list[str] = []
+    fits: list[Calibration] = []
     for kind in kinds:
         if kind != "rigid" and not observations.same_target:
             continue
@@ -208,8 +228,10 @@ def candidates_by_board(
             )
         if fit.termination in ("behind the camera", "singular"):
             continue
-        found.append((_candidate(kind, fit, _on_held_back(fit, observations, size, skew, ())), fit))
-    return found
+        names.append(kind)
+        fits.append(fit)
+    held = _on_held_back(fits, skew, ())
+    return [(_candidate(names[i], fit, held[i]), fit) for i, fit in enumerate(fits)]
 
 
 def simplest_good(candidates: Sequence[Candidate]) -> int:

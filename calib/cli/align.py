@@ -14,7 +14,7 @@ from calib.errors import EXIT_POOR, BadInputError
 
 if TYPE_CHECKING:
     from calib.estimator.align_start import AlignLog
-    from calib.rig import Align
+    from calib.rig_align import Align
 
 __all__ = ["align"]
 

@@ -12,7 +12,7 @@ from calib.cli.common import FiguresOption, JsonOption, RigOption, document, nar
 from calib.errors import EXIT_POOR, UsageError
 
 if TYPE_CHECKING:
-    from calib.rig import ImuIntrinsics
+    from calib.rig_imu_intrinsics import ImuIntrinsics
 
 __all__ = ["intrinsics"]
 

@@ -22,7 +22,7 @@ from calib.cli.common import (
 from calib.errors import EXIT_POOR
 
 if TYPE_CHECKING:
-    from calib.rig import Imu
+    from calib.rig_imu import Imu
 
 __all__ = ["static"]
 

@@ -22,7 +22,7 @@ from calib.cli.common import (
 from calib.errors import EXIT_POOR, BadInputError
 
 if TYPE_CHECKING:
-    from calib.rig import OrientationFilter
+    from calib.rig_filter import OrientationFilter
 
 __all__ = ["tune"]
 

@@ -23,6 +23,8 @@ __all__ = ["main"]
 # Small matrices gain nothing from BLAS threads, and sums then do not depend on their number.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")
+# No plugin of pydantic is wanted, and the search for them loads every installed package's metadata.
+os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 
 _EXIT_INTERRUPTED = 130
 
