@@ -189,7 +189,7 @@ class _Fit:
             weighted = basis * weights[:, None]
             inverse = np.linalg.inv(weighted.T @ basis + 1e-9 * np.eye(basis.shape[1]))
             smooth = plane + basis @ (inverse @ (weighted.T @ (target - plane)))
-            power = np.einsum("np,pq,nq->n", basis, inverse, basis)
+            power = np.sum((basis @ inverse) * basis, axis=1)
             leverage = np.clip(weights * power, 0.0, 0.95)
             apart = self._apart(smooth)
             before, weights = weights, _weights(apart / np.sqrt(1.0 - leverage), self.used, 1e-3)

@@ -16,7 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+sys.path[:0] = [str(Path(__file__).resolve().parents[2]), str(Path(__file__).resolve().parent)]
+
+from _rows import Row
 
 from calib.imu.mahony import Mahony, MahonySample, MahonyState, step
 from calib.imu.mahony_batch import filter_log
@@ -45,19 +47,15 @@ def looped(phi_acc: list[float], w: list[float], Kp: float = 3.0, Ki: float = 3.
     return out
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--samples", type=int, default=10_000_000)
-    parser.add_argument("--repeats", type=int, default=3)
-    told = parser.parse_args()
-    n = told.samples
+def measured(n: int, repeats: int) -> tuple[float, dict[str, float]]:
+    """Samples a second of ours and of the peers that are here."""
     rng = np.random.default_rng(0)
     t = DT_S * np.arange(n)
     w = np.tile(np.repeat(rng.normal(size=100), 100), -(-n // 10_000))[:n]
     phi = np.cumsum(w) * DT_S
     phi_acc = np.arctan2(np.sin(phi), np.cos(phi)) + 0.02 * rng.normal(size=n)
     filter_log(Mahony(), t[:10], phi_acc[:10], w[:10])
-    ours = rate(lambda: filter_log(Mahony(), t, phi_acc, w), n, told.repeats)
+    ours = rate(lambda: filter_log(Mahony(), t, phi_acc, w), n, repeats)
     few = min(n, 20_000)
     state, worst = MahonyState(float(phi_acc[0]), 0.0), 0.0
     angles = filter_log(Mahony(), t[:few], phi_acc[:few], w[:few])[0]
@@ -71,7 +69,7 @@ def main() -> None:
     others = {}
     few = min(n, 1_000_000)
     a, b = phi_acc[:few].tolist(), w[:few].tolist()
-    others["pure Python"] = rate(lambda: looped(a, b), few, told.repeats)
+    others["pure Python"] = rate(lambda: looped(a, b), few, repeats)
     acc = 9.81 * np.stack([np.cos(phi_acc), np.sin(phi_acc), np.zeros(n)], axis=1)
     gyr = np.stack([np.zeros(n), np.zeros(n), -w], axis=1)
     for name, samples, run in (
@@ -86,6 +84,24 @@ def main() -> None:
             continue
         part = slice(0, min(n, samples))
         others[name] = rate(lambda r=run, m=module, p=part: r(m, gyr[p], acc[p]), part.stop, 1)
+    return ours, others
+
+
+def rows() -> list[Row]:
+    """Ten million samples; the peers' time for as many."""
+    n = 10_000_000
+    ours, others = measured(n, 3)
+    return [
+        Row("angle filter, 10^7 samples", name, n / ours, n / other, 4.0) for name, other in others.items()
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--samples", type=int, default=10_000_000)
+    parser.add_argument("--repeats", type=int, default=3)
+    told = parser.parse_args()
+    ours, others = measured(told.samples, told.repeats)
     for name, other in others.items():
         print(f"{name}: {other / 1e6:.3f} million samples/s, {ours / other:.1f} times slower")
     print(f"fastest of the others: {ours / max(others.values()):.1f} times slower (wanted: 4)")

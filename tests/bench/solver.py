@@ -15,16 +15,16 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+sys.path[:0] = [str(Path(__file__).resolve().parents[1]), str(Path(__file__).resolve().parent)]
 
 import cv2
 import numpy as np
+from _rows import Row, interleaved, peak_mib, print_rows
 
 from calib.camera.bundle import calibrate
 from calib.camera.covariance import covariance
@@ -32,12 +32,6 @@ from calib.camera.views import View, pack
 from synthetic import BOARD, views_of
 
 FLAGS = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3
-
-
-def _seconds(call: Callable[[], object]) -> float:
-    began = time.perf_counter()
-    call()
-    return time.perf_counter() - began
 
 
 def _ours(views: list[View]) -> tuple[float, float]:
@@ -69,51 +63,63 @@ def _mrcal(python: str, views: list[View]) -> dict[str, float]:
         return json.loads(subprocess.run(call, capture_output=True, check=True, text=True).stdout)
 
 
-def main(extended: bool) -> None:
-    """Print the table and the exponent of our time in the number of views."""
+def rows(counts: Sequence[int] = (20, 100, 400), extended: bool = False) -> list[Row]:
+    """Each number of views beside each peer."""
     python = _python_with_mrcal()
     board = np.concatenate([BOARD.points_m(), np.zeros((54, 1))], axis=1).astype(np.float32)
-    print(
-        f"{'views':>6} {'ours, ms':>9} {'OpenCV, ms':>11} {'ratio':>6} {'mrcal, ms':>10} {'ratio':>6}", end=""
-    )
-    print(f" {'Extended, s':>12} {'ratio':>7}" if extended else "")
-    counts, times = (20, 100, 400, 1000), []
+    out = []
     for count in counts:
         views = views_of(count, 1, 0.2)
-        target = [board] * count
-        pixels = [v.pixels.astype(np.float32)[:, None] for v in views]
-
-        def plain(target: list = target, pixels: list = pixels) -> object:
-            return cv2.calibrateCamera(target, pixels, (640, 480), None, None, flags=FLAGS)
-
-        ours, theirs, mrcals = [], [], []
-        for _ in range(9 if count <= 100 else 5):
-            ours.append(_seconds(lambda views=views: _ours(views)))
-            theirs.append(_seconds(plain))
-            if python is not None and len(mrcals) < 3:
-                mrcals.append(_mrcal(python, views))
+        given = (
+            [board] * count,
+            [v.pixels.astype(np.float32)[:, None] for v in views],
+            (640, 480),
+            None,
+            None,
+        )
+        found = interleaved(
+            {
+                "ours": lambda views=views: _ours(views),
+                "OpenCV": lambda given=given: cv2.calibrateCamera(*given, flags=FLAGS),
+            },
+            9 if count <= 100 else 5,
+        )
         fx, rms = _ours(views)
-        found = plain()
-        assert abs(found[0] - rms) < 1e-3 * rms and abs(found[1][0, 0] - fx) < 0.05
-        times.append(median(ours))
-        opencv = median(theirs)
-        line = f"{count:6d} {1e3 * times[-1]:9.1f} {1e3 * opencv:11.1f} {opencv / times[-1]:6.1f}"
-        if mrcals:
-            seconds = median(one["seconds"] for one in mrcals)
-            assert abs(mrcals[0]["fx_px"] / fx - 1.0) < 0.01
-            line += f" {1e3 * seconds:10.1f} {seconds / times[-1]:6.1f}"
-        else:
-            line += f" {'not here':>10} {'':6}"
+        opencv = cv2.calibrateCamera(*given, flags=FLAGS)
+        assert abs(opencv[0] - rms) < 1e-3 * rms and abs(opencv[1][0, 0] - fx) < 0.05
+        job, ours = f"solve with sigma, {count} views", found["ours"]
+        mib = peak_mib(lambda views=views: _ours(views))
+        target = 6.0 if count >= 100 else None
+        out.append(Row(job, "OpenCV, no sigma", ours, found["OpenCV"], target, mib))
         if extended and count <= 400:
-            slow = _seconds(
-                lambda target=target, pixels=pixels: cv2.calibrateCameraExtended(
-                    target, pixels, (640, 480), None, None, flags=FLAGS
-                )
+            slow = interleaved(
+                {"OpenCV": lambda given=given: cv2.calibrateCameraExtended(*given, flags=FLAGS)}, 1
             )
-            line += f" {slow:12.2f} {slow / times[-1]:7.0f}"
-        print(line)
-    exponent = np.polyfit(np.log(counts[1:]), np.log(times[1:]), 1)[0]
-    print(f"our time grows as views^{exponent:.2f} from 100 views on")
+            out.append(
+                Row(job, "OpenCV Extended", ours, slow["OpenCV"], 200.0 if count == 400 else None, mib)
+            )
+        if python is None:
+            out.append(Row(job, "mrcal", ours, None, note="not installed"))
+            continue
+        mrcals = [_mrcal(python, views) for _ in range(3)]
+        assert abs(mrcals[0]["fx_px"] / fx - 1.0) < 0.01
+        out.append(Row(job, "mrcal, no sigma", ours, median(one["seconds"] for one in mrcals), None, mib))
+    return out
+
+
+def growth(found: Sequence[Row]) -> str:
+    """How our time grows with the views."""
+    ours = {int(row.job.split()[-2]): row.ours_s for row in found}
+    counts = [count for count in ours if count >= 100]
+    exponent = np.polyfit(np.log(counts), np.log([ours[count] for count in counts]), 1)[0]
+    return f"solver: time grows as views^{exponent:.2f} from 100 views on; one core, bound by memory"
+
+
+def main(extended: bool) -> None:
+    """Print the table and the exponent."""
+    found = rows((20, 100, 400, 1000), extended)
+    print_rows(found)
+    print(growth(found))
 
 
 if __name__ == "__main__":

@@ -1,0 +1,119 @@
+"""What the benchmarks share: rows of one table, interleaved repetitions, processes measured whole."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import time
+import tracemalloc
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from statistics import median
+
+__all__ = ["Process", "Row", "interleaved", "interleaved_processes", "peak_mib", "print_rows"]
+
+
+@dataclass(frozen=True)
+class Row:
+    """Ours beside one peer.
+
+    Attributes
+    ----------
+    ours_s, peer_s : medians of the same run; a peer that is not here has None.
+    target : least ratio of theirs over ours, if one is set.
+    ours_mib, peer_mib : peak memory, of whole processes, or of ours what it allocated.
+    note : boards found, digits agreed, or why there is no figure.
+    """
+
+    job: str
+    peer: str
+    ours_s: float
+    peer_s: float | None
+    target: float | None = None
+    ours_mib: float | None = None
+    peer_mib: float | None = None
+    note: str = ""
+
+    @property
+    def ratio(self) -> float | None:
+        return None if self.peer_s is None else self.peer_s / self.ours_s
+
+
+@dataclass(frozen=True)
+class Process:
+    """A finished process: wall seconds, peak memory of its largest process, exit code and output."""
+
+    seconds: float
+    mib: float
+    code: int
+    output: str
+
+
+def interleaved(calls: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, float]:
+    """Median seconds of each call, in turn: A B C A B C."""
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(repeats):
+        for name, call in calls.items():
+            began = time.perf_counter()
+            call()
+            times[name].append(time.perf_counter() - began)
+    return {name: median(found) for name, found in times.items()}
+
+
+def _run(command: Sequence[str]) -> Process:
+    began = time.perf_counter()
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as child:
+        assert child.stdout is not None
+        output = child.stdout.read()
+        _, status, used = os.wait4(child.pid, 0)
+        seconds = time.perf_counter() - began
+        child.returncode = os.waitstatus_to_exitcode(status)
+    return Process(seconds, used.ru_maxrss / 1024, child.returncode, output)
+
+
+def interleaved_processes(commands: Mapping[str, Sequence[str]], repeats: int) -> dict[str, Process]:
+    """Median seconds of whole processes in turn, the first round not counted, with the last one's output."""
+    found: dict[str, list[Process]] = {name: [] for name in commands}
+    for _ in range(1 + repeats):
+        for name, command in commands.items():
+            found[name].append(_run(command))
+    return {
+        name: Process(median(p.seconds for p in runs[1:]), runs[-1].mib, runs[-1].code, runs[-1].output)
+        for name, runs in found.items()
+    }
+
+
+def peak_mib(call: Callable[[], object]) -> float:
+    """What Python and NumPy allocate at most during a call."""
+    tracemalloc.start()
+    call()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return peak / 2**20
+
+
+def _seconds(value: float | None) -> str:
+    if value is None:
+        return "-"
+    for factor, unit in ((1.0, "s"), (1e3, "ms"), (1e6, "us")):
+        if value * factor >= 1.0:
+            return f"{value * factor:.3g} {unit}"
+    return f"{1e9 * value:.3g} ns"
+
+
+def _mib(value: float | None) -> str:
+    return "" if value is None else f"{value:.0f}"
+
+
+def print_rows(rows: Sequence[Row]) -> None:
+    """The table, with a mark where a target is missed."""
+    print(f"{'job':44}{'peer':22}{'ours':>9}{'peer':>9}{'ratio':>8}{'target':>8}{'MiB':>6}{'peer':>6}  note")
+    for row in rows:
+        ratio = "skipped" if row.ratio is None else f"{row.ratio:.3g}"
+        target = "" if row.target is None else f">= {row.target:g}"
+        missed = row.target is not None and row.ratio is not None and row.ratio < row.target
+        print(
+            f"{row.job:44}{row.peer:22}{_seconds(row.ours_s):>9}{_seconds(row.peer_s):>9}{ratio:>8}{target:>8}"
+            f"{_mib(row.ours_mib):>6}{_mib(row.peer_mib):>6}  {'MISSED ' if missed else ''}{row.note}",
+            flush=True,
+        )
