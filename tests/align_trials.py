@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calib.aligning import PRIOR as USUAL_PRIOR
 from calib.arrays import FloatArray
 from calib.estimator.align import Alignment, Settings, rest_angle
 from calib.estimator.align_start import AlignLog
@@ -27,21 +28,8 @@ MOTIONS = (
     ("orientation", {}),
 )
 
-PRIOR = {
-    "gyro_bias_radps": (0.0, 0.1),
-    "accel_bias_x_mps2": (0.0, 0.3),
-    "accel_bias_y_mps2": (0.0, 0.3),
-    "mount_angle_rad": (0.0, 0.5),
-    "gyro_scale": (0.0, 0.02),
-    "imu_lever_m": (0.006, 0.02),
-    "marker_offset_m": (0.015, 0.003),
-    "time_offset_s": (0.025, 0.05),
-    "shift_x_m": (0.0, 5e-5),
-    "shift_y_m": (0.0, 5e-5),
-    "stretch": (0.0, 1e-3),
-    "accel_scale_x": (0.0, 0.01),
-    "accel_scale_y": (0.0, 0.01),
-}
+PRIOR = {**USUAL_PRIOR, "shift_x_m": (0.0, 5e-5), "shift_y_m": (0.0, 5e-5)}
+"""The plane of these rigs is known better than a printed board's."""
 
 
 @dataclass(frozen=True)

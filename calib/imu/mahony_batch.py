@@ -23,7 +23,7 @@ from calib.arrays import FloatArray
 from calib.errors import BadInputError
 from calib.imu.mahony import Mahony, MahonyState
 
-__all__ = ["accelerometer_angles", "filter_log", "filter_many", "wrapped"]
+__all__ = ["accelerometer_angles", "advance", "filter_log", "filter_many", "wrapped"]
 
 _TURN = 2.0 * math.pi
 
@@ -39,6 +39,18 @@ def wrapped(angle_rad: FloatArray) -> FloatArray:
 
 
 # A product and a sum may be rounded once; nothing else is loosened.
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def advance(
+    phi: float, integral: float, phi_acc: float, w: float, dt: float, Kp: float, Ki: float
+) -> tuple[float, float]:
+    """Angle and integral after one sample (2.3), compiled."""
+    e = phi_acc - phi
+    if not -math.pi <= e <= math.pi:
+        e -= _TURN * np.rint(e / _TURN)
+    turned = dt * (integral + w)
+    return phi + (dt * (Kp + Ki * dt) * e + turned), integral + Ki * dt * e
+
+
 @njit(cache=True, nogil=True, fastmath={"contract"})
 def _run(
     t: FloatArray,
@@ -58,12 +70,7 @@ def _run(
         if dt < 0.0:
             return k
         before = t[k]
-        e = phi_acc[k] - phi
-        if not -math.pi <= e <= math.pi:
-            e -= _TURN * np.rint(e / _TURN)
-        turned = dt * (integral + w[k])
-        integral += Ki * dt * e
-        phi += dt * (Kp + Ki * dt) * e + turned
+        phi, integral = advance(phi, integral, phi_acc[k], w[k], dt, Kp, Ki)
         out_phi[k] = phi
         out_integral[k] = integral
     return -1

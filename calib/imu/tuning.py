@@ -32,7 +32,7 @@ from calib.imu.frontier import damped, gain_grid
 from calib.imu.gains import Noise, equivalent_noise, riccati
 from calib.imu.heldout import CONFIDENCE, Candidate, Row, compared, rms
 from calib.imu.mahony import Mahony, MahonyState
-from calib.imu.mahony_batch import filter_log, wrapped
+from calib.imu.mahony_batch import advance, filter_log, wrapped
 from calib.imu.mahony_kalman import Prior, filter_from_prior
 from calib.imu.smoother import BLOCK_S, SHORTEST_S, Smoothed, smooth_log
 
@@ -121,12 +121,7 @@ def _squares(
         for k in range(len(t)):
             dt = t[k] - before
             before = t[k]
-            e = phi_acc[k] - phi
-            if not -math.pi <= e <= math.pi:
-                e -= turn * np.rint(e / turn)
-            turned = dt * (integral + w[k])
-            integral += Ki * dt * e
-            phi += dt * (Kp + Ki * dt) * e + turned
+            phi, integral = advance(phi, integral, phi_acc[k], w[k], dt, Kp, Ki)
             d = phi - target[k]
             if d == d:
                 d -= turn * np.rint(d / turn)
