@@ -180,6 +180,11 @@ def save(figure: Figure, path: Path) -> Path:
     """Write a figure as PNG, atomically and without dates: the same figure gives the same bytes."""
     buffer = io.BytesIO()
     FigureCanvasAgg(figure)
+    panels = figure.get_layout_engine()
+    if panels is not None:
+        # Laid out here, the figure is not drawn once more for the layout's sake.
+        panels.execute(figure)
+        figure.set_layout_engine("none")
     figure.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})
     write_atomically(path, buffer.getvalue())
     return path
