@@ -16,10 +16,12 @@ import numpy as np
 
 from calib.actuator.identify_tracks import Track
 from calib.actuator.pump import TICK_S
+from calib.actuatorsections import nominal_of
 from calib.arrays import FloatArray
 from calib.errors import BadInputError
 from calib.estimator.sensors import SIZE, invert_marker, marker
 from calib.files import shown
+from calib.identifystart import start_in_motion
 from calib.logs import Log, check_time, read_log
 from calib.pumptables import find_column, number, read_columns
 from calib.replaying import periods, setup_from_rig
@@ -32,6 +34,8 @@ _SHORTEST_S = 1.0
 _FEWEST = 40
 _GAP_S = 0.5
 _BEFORE_RELEASE_S = 0.03
+_MOST_TICKS = 10_000_000
+_LATE_S = 0.01
 _TRUE_SIGMA = (1e-4, 1e-5)
 _LENGTH_SIGMA_M = 2e-4
 _GRAVITY_MPS2 = 9.81
@@ -41,13 +45,17 @@ Head = tuple[FloatArray, FloatArray, FloatArray]
 
 @dataclass(frozen=True)
 class TrackSource:
-    """A track, how its pose was found, what is known of its delay, and sentences about it."""
+    """A track, how its pose was found, what is known of its delay, and sentences about it.
+
+    `begin_s` is the time of the log at which the track begins.
+    """
 
     track: Track
     source: str
     delay_s: float
     said: tuple[str, ...]
     states: Path | None = None
+    begin_s: float = 0.0
 
 
 def states_beside(path: Path) -> Path | None:
@@ -172,6 +180,11 @@ def _commands(log: Log, no_pwm: bool) -> tuple[float, float, FloatArray]:
     tick_s = float(np.median(np.diff(t))) if len(t) > 2 else TICK_S
     # A nominal rate that the stamps only scatter about is exact.
     tick_s = TICK_S if abs(tick_s / TICK_S - 1.0) < 0.01 else tick_s
+    if not tick_s * _MOST_TICKS > end - float(t[0]):
+        raise BadInputError(
+            f"{log.source}: its commands are {tick_s:g} s apart in the median, over {end - float(t[0]):g} s; "
+            "expected ticks of some milliseconds"
+        )
     n = max(math.ceil((end - float(t[0])) / tick_s) + 1, 2)
     ticks = float(t[0]) + tick_s * np.arange(n, dtype=np.float64)
     latest = np.clip(np.searchsorted(t, ticks + 0.5 * tick_s, side="right") - 1, 0, len(t) - 1)
@@ -231,8 +244,6 @@ def read_track(
         if let_go is not None:
             begin, pwm = let_go, np.zeros((max(math.ceil((t[-1] - let_go) / tick_s) + 1, 2), 2))
             said.append(f"{log.source}: let go at {let_go:.2f} s; what is before is left out")
-    if hoses and pwm[0].any():
-        said.append(f"{log.source}: begins with the pumps on; it is taken to begin at rest all the same")
     inside = (t >= begin - 0.5 * tick_s) & (t <= begin + LONGEST_S)
     if t[-1] > begin + LONGEST_S:
         said.append(f"{log.source}: only the first {LONGEST_S:g} s are used")
@@ -244,8 +255,23 @@ def read_track(
             f"{log.source}: too short: {len(t)} poses over {span:.3g} s, expected at least {_FEWEST} and "
             f"{_SHORTEST_S:g} s"
         )
-    track = Track(shown(path.name), tick_s, pwm, hoses, np.maximum(t, 0.0), head, W)
-    return TrackSource(track, how, delay_s, tuple(said), states)
+    t = np.maximum(t, 0.0)
+    spread = np.linalg.inv(W[:20])
+    noise = float(np.median(np.linalg.norm(spread[:, 0], axis=1)))
+    # What a picture shows was so one delay earlier.
+    seen_s = t - delay_s
+    known = seen_s >= 0.0
+    moving = start_in_motion(seen_s[known], head[known], hoses, nominal_of(rig, rig_path).plant, noise)
+    if moving is not None:
+        said.append(
+            f"{log.source}: begins in motion ({moving.phi_rad:.3f} rad, {moving.dphi_radps:+.2f} rad/s); its "
+            "start is estimated too"
+        )
+        # The first pictures show the head before the first tick.
+        late = t >= delay_s + _LATE_S
+        t, head, W = t[late], head[late], W[late]
+    track = Track(shown(path.name), tick_s, pwm, hoses, t, head, W, moving)
+    return TrackSource(track, how, delay_s, tuple(said), states, begin)
 
 
 _LENGTHS = {"elongation_mm": 1e-3, "displacement_mm": 1e-3, "elongation_m": 1.0, "displacement_m": 1.0}

@@ -17,7 +17,7 @@ from calib.logs import Log
 from calib.replaying import Periods, rows_of, truth_of
 from calib.statesfile import STATES, states_writer
 
-__all__ = ["joined", "smooth_log"]
+__all__ = ["first_rows", "joined", "smooth_log"]
 
 
 def joined(parts: list[Rows]) -> Rows:
@@ -27,6 +27,19 @@ def joined(parts: list[Rows]) -> Rows:
         np.concatenate([part.readings for part in parts]),
         np.concatenate([part.kinds for part in parts]),
     )
+
+
+def first_rows(setup: Setup, found: Periods, stream: Iterable[Log], until_s: float) -> np.ndarray:
+    """Rows (n, len(OUT)) of the kinematic smoother up to a time of the log [s], which may be its end."""
+    parts = []
+    for log in stream:
+        rows = rows_of(log, found.ticks)
+        some = rows.t_s <= until_s
+        parts.append(Rows(rows.t_s[some], rows.readings[some], rows.kinds[some]))
+        if not some.all():
+            break
+    whole = joined(parts)
+    return np.asarray(smooth(setup, whole, Filter(setup).run(whole)))
 
 
 def smooth_log(

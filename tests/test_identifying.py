@@ -110,6 +110,10 @@ def test_logs_that_cannot_be_used(folder: Path) -> None:
         write_log(folder / "clock.csv", replace(log, t_s=t))
         with pytest.raises(BadInputError, match=words):
             _read(folder, "clock.csv")
+    for t in (np.full(len(log), 1.0), 1e-12 * np.arange(len(log)) + np.where(log.t_s > 2.0, 5.0, 0.0)):
+        write_log(folder / "clock.parquet", replace(log, t_s=t))
+        with pytest.raises(BadInputError, match=r"s apart in the median|the clock jumps from|too short"):
+            _read(folder, "clock.parquet")
     few = log.t_s < 0.5
     write_log(
         folder / "short.csv",

@@ -5,7 +5,8 @@ Unknowns are the parameters that are estimated, and what each log needs beside t
     offset_phi, offset_length      of the camera's plane, the same in all logs, small by their priors
     delay                          of the measured rows; for logs with commands one for all, since there
                                    it cannot be told from the pumps' dead time, else one for each log
-    phi, length                    at rest before each log's first tick
+    phi, length                    before each log's first tick; of a log that begins in motion also rates,
+                                   creep and forces there, bounded by wide priors about a first guess
 
 The whitened residual of a row is r = W (measured - simulated(t - delay) - offset). Derivatives by
 parameters and starts are central differences, which a batch of simulations gives at once; those by the
@@ -15,7 +16,7 @@ delays and offsets are exact.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
@@ -34,7 +35,13 @@ FAR = 1e3
 _OFFSET_SIGMA = (0.005, 0.0005)
 _DELAY_SIGMA_S = 0.03
 _STEP = 1e-4
-_START_STEP = (1e-4, 1e-5)
+_START_STEP = (1e-4, 1e-5, 1e-3, *(1e-4,) * 7)
+_START_SCALE = (0.01, 0.001, 0.1, 0.005, 0.02, 0.02, *(0.05,) * 4)
+_START_REACH = (0.3, 0.02, 30.0, 1.0, 2.0, 2.0, *(5.0,) * 4)
+"""Steps, scales and bounds by `identify_tracks.COMPONENTS`."""
+_FREE_SIGMA = (3.0, 0.1, 0.2, 0.2)
+_PUMPED_SIGMA = (0.5, 0.02, 0.2, 0.2, *(0.5,) * 4)
+"""Priors of the same, without those of angle and length: of free swings and of logs with pumps."""
 _PRIORS = ("offset_phi_rad", "offset_length_m")
 
 
@@ -44,7 +51,7 @@ class Layout:
 
     names: tuple[str, ...]
     delays: tuple[int, ...]
-    tracks: int
+    starts: tuple[int, ...]
 
     @property
     def offset(self) -> int:
@@ -60,7 +67,12 @@ class Layout:
 
     @property
     def size(self) -> int:
-        return self.start + 2 * self.tracks
+        return self.start + sum(self.starts)
+
+    def of_start(self, k: int) -> slice:
+        """The start of log k."""
+        at = self.start + sum(self.starts[:k])
+        return slice(at, at + self.starts[k])
 
     @property
     def nuisances(self) -> int:
@@ -96,7 +108,7 @@ class Problem:
             else:
                 numbers.append(used)
                 used += 1
-        return Layout(self.names, tuple(numbers), len(self.tracks))
+        return Layout(self.names, tuple(numbers), tuple(len(track.unknown) for track in self.tracks))
 
     def scales(self) -> FloatArray:
         """Typical changes of all unknowns."""
@@ -105,7 +117,8 @@ class Problem:
         out[: layout.offset] = [PARAMETERS[name].scale for name in self.names]
         out[layout.offset : layout.delay] = _OFFSET_SIGMA
         out[layout.delay : layout.start] = 0.01
-        out[layout.start :] = np.tile([0.01, 0.001], layout.tracks)
+        for k, count in enumerate(layout.starts):
+            out[layout.of_start(k)] = _START_SCALE[:count]
         return out
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
@@ -116,10 +129,9 @@ class Problem:
         high[: layout.offset] = [PARAMETERS[name].high for name in self.names]
         low[layout.delay : layout.start], high[layout.delay : layout.start] = -0.5, 0.5
         for k, track in enumerate(self.tracks):
-            at = layout.start + 2 * k
-            begin = track.start
-            low[at : at + 2] = begin.phi_rad - 0.3, begin.length_m - 0.02
-            high[at : at + 2] = begin.phi_rad + 0.3, begin.length_m + 0.02
+            at, count = layout.of_start(k), layout.starts[k]
+            begin, reach = np.array(astuple(track.start))[:count], np.array(_START_REACH)[:count]
+            low[at], high[at] = begin - reach, begin + reach
         return low, high
 
     def values(self, x: FloatArray) -> dict[str, float]:
@@ -134,26 +146,34 @@ def first_guess(problem: Problem, values: Mapping[str, float]) -> FloatArray:
     x[: layout.offset] = [values[name] for name in problem.names]
     x[layout.delay : layout.start] = problem.delay_s
     for k, track in enumerate(problem.tracks):
-        begin = track.start
-        x[layout.start + 2 * k : layout.start + 2 * k + 2] = begin.phi_rad, begin.length_m
+        x[layout.of_start(k)] = astuple(track.start)[: layout.starts[k]]
     return x
 
 
 def starts_of(problem: Problem, x: FloatArray) -> list[Start]:
     """Starts of all logs in a vector of unknowns."""
-    at = problem.layout.start
-    return [Start(float(x[at + 2 * k]), float(x[at + 2 * k + 1])) for k in range(len(problem.tracks))]
+    layout = problem.layout
+    return [Start(*x[layout.of_start(k)].tolist()) for k in range(len(problem.tracks))]
 
 
 def _whitened(track: Track, error: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("mij,...mj->...mi", track.whitening, error))
 
 
+def _start_sigma(track: Track) -> FloatArray:
+    return np.array(_PUMPED_SIGMA if track.hoses else _FREE_SIGMA)
+
+
 def _priors(problem: Problem, x: FloatArray) -> FloatArray:
     layout = problem.layout
     offsets = x[layout.offset : layout.delay] / np.array(_OFFSET_SIGMA)
     delays = (x[layout.delay : layout.start] - problem.delay_s) / problem.delay_sigma_s
-    return np.concatenate([offsets, delays])
+    parts = [offsets, delays]
+    for k, track in enumerate(problem.tracks):
+        if track.moving is not None:
+            guess = np.array(astuple(track.moving))[2 : layout.starts[k]]
+            parts.append((x[layout.of_start(k)][2:] - guess) / _start_sigma(track))
+    return np.concatenate(parts)
 
 
 def residuals(problem: Problem, xs: FloatArray) -> FloatArray:
@@ -194,18 +214,19 @@ def jacobian(problem: Problem, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         for name, a, b in zip(problem.names, up.tolist(), down.tolist(), strict=True):
             sets += [{**base, name: a}, {**base, name: b}]
             starts += [begin, begin]
-        for turn, stretch in ((_START_STEP[0], 0.0), (0.0, _START_STEP[1])):
+        count = layout.starts[k]
+        for name, step in zip(track.unknown, _START_STEP, strict=False):
             sets += [base, base]
-            starts += [Start(begin.phi_rad + s * turn, begin.length_m + s * stretch) for s in (1.0, -1.0)]
+            starts += [replace(begin, **{name: getattr(begin, name) + s * step}) for s in (1.0, -1.0)]
         delay = layout.delay + layout.delays[k]
         head, rate = heads_of(track, problem.nominal, sets, starts, float(x[delay]), problem.threads)
         W = track.whitening
         J = np.zeros((len(track.t_s), 2, layout.size))
-        width = np.concatenate([up - down, 2.0 * np.array(_START_STEP)])
+        width = np.concatenate([up - down, 2.0 * np.array(_START_STEP)[:count]])
         slope = (head[1::2] - head[2::2]) / width[:, None, None]
         slope = -np.einsum("mij,smj->mis", W, slope)
         J[:, :, :P] = slope[:, :, :P]
-        J[:, :, layout.start + 2 * k : layout.start + 2 * k + 2] = slope[:, :, P:]
+        J[:, :, layout.of_start(k)] = slope[:, :, P:]
         J[:, :, layout.offset : layout.delay] = -W
         J[:, :, delay] = _whitened(track, rate[0])
         error = _whitened(track, track.head - head[0] - x[layout.offset : layout.delay])
@@ -217,4 +238,10 @@ def jacobian(problem: Problem, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         prior[row, layout.offset + row] = 1.0 / sigma
     for row in range(layout.start - layout.delay):
         prior[2 + row, layout.delay + row] = 1.0 / problem.delay_sigma_s
-    return np.concatenate([*errors, _priors(problem, x)]), np.vstack([*blocks, prior])
+    priors = [prior]
+    for k, track in enumerate(problem.tracks):
+        if track.moving is not None:
+            rows = np.zeros((layout.starts[k] - 2, layout.size))
+            rows[:, layout.of_start(k)][:, 2:] = np.diag(1.0 / _start_sigma(track))
+            priors.append(rows)
+    return np.concatenate([*errors, _priors(problem, x)]), np.vstack([*blocks, *priors])

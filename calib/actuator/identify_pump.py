@@ -6,8 +6,14 @@ measured values, nothing else. What is left over is the models' error and not no
 standard deviations are therefore those of a sandwich, H^-1 (sum g g^T) H^-1, with the gradient g summed
 over whole recordings, or over stretches of a second where there are fewer than four recordings.
 
-A parameter that can be switched off (a limit, a leak, a hose) is taken only if the data ask for it: the
-robust cost must fall by more than `_WORTH`.
+A parameter that can be switched off (a limit, a leak, a hose) is taken only if the data ask for it, by two
+measures. One that they do not ask for lowers the robust cost all the same, by lambda chi^2_1 / 2, where
+lambda = g^2 / h with the variance g^2 of its gradient and its curvature h; lambda is 1 for white noise, and
+much more for what a model misses, which is the same all along a recording. It is measured: fitted without a
+recording, the parameters raise the cost of what is left out by lambda each, over all recordings together.
+So k parameters have to lower the cost by more than lambda chi^2_k(0.95) / 2. And they have to lower it by
+`_WORTH` for each extra: the start is read off noisy values, and taking up its error, an extra that the truth
+has not lowers the cost of a simulated pump by 2 %, not by chance.
 """
 
 from __future__ import annotations
@@ -19,6 +25,7 @@ from itertools import combinations, pairwise
 
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.stats import chi2
 
 from calib.actuator.identify_pump_models import LAG, MODELS, ORIFICE, PumpRecord, Shape, simulate_pump
 from calib.arrays import FloatArray
@@ -27,6 +34,8 @@ from calib.errors import BadInputError
 __all__ = ["Held", "PumpFit", "cross_validate", "fit_pump", "rms_ahead", "rms_of"]
 
 _WORTH = 0.03
+_CONFIDENCE = 0.95
+_AGAIN = 10
 _SCALE_SHARE = 0.01
 _AHEAD_S = 0.5
 _FEWEST_CLUSTERS = 4
@@ -102,8 +111,13 @@ class _Problem:
         return np.array([math.nan if p.off is None else p.off for p in MODELS[self.model]])
 
 
-def _solve(problem: _Problem, theta: FloatArray, free: list[int]) -> tuple[FloatArray, float, FloatArray]:
-    """Least squares over some parameters: values, robust cost per sample, and the weighted Jacobian."""
+def _solve(
+    problem: _Problem, theta: FloatArray, free: list[int], most: int = 40, without: slice | None = None
+) -> tuple[FloatArray, float, FloatArray]:
+    """Least squares over some parameters: values, robust cost per sample, and the weighted Jacobian.
+
+    `without` leaves some rows out.
+    """
     start, low, high = problem.nominal()
     scale = np.maximum(np.abs(start), 1e-3)[free]
 
@@ -113,7 +127,8 @@ def _solve(problem: _Problem, theta: FloatArray, free: list[int]) -> tuple[Float
         return out
 
     def rows(x: FloatArray) -> FloatArray:
-        return problem.residual(full(x)) / (_SCALE_SHARE * problem.span)
+        out = problem.residual(full(x)) / (_SCALE_SHARE * problem.span)
+        return out if without is None else np.delete(out, without)
 
     inside = np.clip(theta[free], low[free] + 1e-9 * scale, high[free] - 1e-9 * scale)
     found = least_squares(
@@ -123,7 +138,7 @@ def _solve(problem: _Problem, theta: FloatArray, free: list[int]) -> tuple[Float
         x_scale=scale,
         loss="soft_l1",
         diff_step=np.full(len(free), _STEP),
-        max_nfev=40,
+        max_nfev=most,
         xtol=1e-6,
         ftol=1e-7,
     )
@@ -145,8 +160,10 @@ def _clusters(problem: _Problem) -> list[slice]:
     return out
 
 
-def _covariance(problem: _Problem, theta: FloatArray, free: list[int]) -> FloatArray:
-    """Sandwich covariance of the free parameters under the robust loss."""
+def _slopes(
+    problem: _Problem, theta: FloatArray, free: list[int]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Scaled residuals, their derivatives by the free parameters, and the weights of the robust loss."""
     scale = _SCALE_SHARE * problem.span
     base = problem.residual(theta) / scale
     _, low, high = problem.nominal()
@@ -156,12 +173,33 @@ def _covariance(problem: _Problem, theta: FloatArray, free: list[int]) -> FloatA
         moved = theta.copy()
         moved[k] += h if moved[k] + h <= high[k] else -h
         J[:, column] = (problem.residual(moved) / scale - base) / (moved[k] - theta[k])
-    weight = 1.0 / np.sqrt(1.0 + base * base)
+    return base, J, np.asarray(1.0 / np.sqrt(1.0 + base * base))
+
+
+def _inverse(H: FloatArray) -> FloatArray:
+    size = np.sqrt(np.maximum(np.diag(H), 1e-300))
+    return np.asarray(np.linalg.pinv(H / np.outer(size, size), rcond=1e-12) / np.outer(size, size))
+
+
+def _by_chance(problem: _Problem, theta: FloatArray, free: list[int], extras: int) -> float:
+    """How much a number of parameters that are not needed lowers the cost per sample, at most in 95 %."""
+    base = problem.residual(theta) / (_SCALE_SHARE * problem.span)
+    rise = 0.0
+    for s in _clusters(problem):
+        moved, _, _ = _solve(problem, theta, free, _AGAIN, s)
+        left_out = problem.residual(moved)[s] / (_SCALE_SHARE * problem.span)
+        rise += float(np.sum(np.sqrt(1.0 + left_out**2) - np.sqrt(1.0 + base[s] ** 2)))
+    lam = max(rise, 0.0) / len(free) / len(base)
+    return 0.5 * lam * float(chi2.ppf(_CONFIDENCE, extras))
+
+
+def _covariance(problem: _Problem, theta: FloatArray, free: list[int]) -> FloatArray:
+    """Sandwich covariance of the free parameters under the robust loss."""
+    base, J, weight = _slopes(problem, theta, free)
     H = (J * weight[:, None]).T @ J
     G = [J[s].T @ (weight[s] * base[s]) for s in _clusters(problem)]
     middle = sum((np.outer(g, g) for g in G), np.zeros_like(H)) * (len(G) / max(len(G) - 1, 1))
-    size = np.sqrt(np.maximum(np.diag(H), 1e-300))
-    inverse = np.linalg.pinv(H / np.outer(size, size), rcond=1e-12) / np.outer(size, size)
+    inverse = _inverse(H)
     return np.asarray(inverse @ middle @ inverse)
 
 
@@ -247,7 +285,8 @@ def _search(
                 best, cost = theta, value
     free, first = list(always), best
     scores: dict[tuple[tuple[str, ...], ...], float] = {(): cost}
-    lowest = cost
+    chances: dict[tuple[tuple[str, ...], ...], float] = {(): 0.0}
+    lowest, chance = cost, 0.0
     for count in range(1, len(groups) + 1):
         for chosen in combinations(groups, count):
             members = [names.index(name) for group in chosen for name in group]
@@ -256,18 +295,24 @@ def _search(
             wider = sorted(always + members)
             theta, value, _ = _solve(problem, begin, wider)
             scores[chosen] = value
-            if value * (1.0 + _WORTH) ** count < lowest and not _vague(problem, theta, wider, off):
-                best, cost, free, lowest = theta, value, wider, value * (1.0 + _WORTH) ** count
+            worth = value * (1.0 + _WORTH) ** count
+            if worth >= lowest or _vague(problem, theta, wider, off):
+                continue
+            chances[chosen] = _by_chance(problem, theta, wider, len(members))
+            if value + chances[chosen] < cost + chance:
+                best, cost, free, lowest, chance = theta, value, wider, worth, chances[chosen]
     for group in groups:
         if names.index(group[0]) not in free:
-            more = [
-                v
+            more = {
+                c: v
                 for c, v in scores.items()
                 if group in c and all(_within(names, g, free) for g in c if g != group)
-            ]
-            gain = 100.0 * (1.0 - min(more) / cost)
-            why = f"it would lower the cost by {max(gain, 0.0):.2g} % only"
-            fixed |= dict.fromkeys(group, f"off: {why if gain < 100.0 * _WORTH else 'it is not bounded'}")
+            }
+            with_it = min(more, key=lambda c: more[c])
+            gain = max(1.0 - more[with_it] / cost, 0.0)
+            bound = max(chances.get(with_it, 0.0) / cost, _WORTH)
+            why = f"it would lower the cost by {100.0 * gain:.2g} %, where {100.0 * bound:.2g} % say nothing"
+            fixed |= dict.fromkeys(group, f"off: {why if gain <= bound else 'it is not bounded'}")
     return best, cost, free
 
 

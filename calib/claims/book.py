@@ -17,9 +17,9 @@ from calib.claims import (
     claims_pump,
     claims_setpoints,
 )
-from calib.claims.outcome import Claim, Finding, Outcome
+from calib.claims.outcome import BASES, Claim, Finding, Outcome
 
-__all__ = ["BOOK", "Examined", "count", "examine", "rows", "select"]
+__all__ = ["BOOK", "Examined", "by_basis", "count", "examine", "rows", "select"]
 
 BOOK: tuple[Claim, ...] = (
     *claims_imu.CLAIMS,
@@ -69,6 +69,12 @@ def count(examined: Iterable[Examined]) -> dict[Outcome, int]:
     return {outcome: found[outcome] for outcome in Outcome}
 
 
+def by_basis(examined: Iterable[Examined]) -> dict[str, dict[Outcome, int]]:
+    """How many claims of each basis came to each outcome."""
+    found = tuple(examined)
+    return {basis: count(one for one in found if one.claim.basis == basis) for basis in BASES}
+
+
 def rows(examined: Iterable[Examined]) -> list[dict[str, str | bool | Mapping[str, float]]]:
     """The table as plain values, for a JSON document or a page."""
     return [
@@ -78,6 +84,7 @@ def rows(examined: Iterable[Examined]) -> list[dict[str, str | bool | Mapping[st
             "claim": one.claim.says,
             "printed": one.claim.printed,
             "kind": one.claim.kind,
+            "basis": one.claim.basis,
             "ours": one.finding.ours,
             "simulated": one.finding.simulated,
             "outcome": one.finding.outcome.value,

@@ -23,7 +23,13 @@ _MEAN_OF_RAYLEIGH = np.sqrt(0.5 * np.pi)
 _FITS = 8
 
 
-@claim("cam.points", "2.2.2", "corners of a board of 6 x 8 squares in 17 views", "35 x 17 = 595")
+@claim(
+    "cam.points",
+    "2.2.2",
+    "corners of a board of 6 x 8 squares in 17 views",
+    "35 x 17 = 595",
+    basis="equations",
+)
 def points() -> Finding:
     inner = (6 - 1) * (8 - 1)
     return Finding(
@@ -54,6 +60,7 @@ def _views(noise_px: float, seed: int) -> list[View]:
     "mean distance between corners and their reprojection after a calibration without a lens model",
     "0.31 px",
     "data",
+    basis="twin",
 )
 def mean_error() -> Finding:
     fit = calibrate(pack(_views(0.0, 0)), CAMERA.image_size_px, "pinhole")
@@ -83,7 +90,7 @@ def _extrinsic() -> FloatArray:
     return np.column_stack([PLANE.R_CW[:, :2], PLANE.t_m])
 
 
-@claim("cam.homography", "2.9", "the map from the plane to the picture is A = [R1 R2 t]")
+@claim("cam.homography", "2.9", "the map from the plane to the picture is A = [R1 R2 t]", basis="equations")
 def homography() -> Finding:
     world = _workspace()
     in_camera = world @ PLANE.R_CW[:, :2].T + PLANE.t_m
@@ -99,7 +106,13 @@ def homography() -> Finding:
     )
 
 
-@claim("cam.scale", "2.12", "the scale of a pixel follows from the third row of the inverse of A", "exact")
+@claim(
+    "cam.scale",
+    "2.12",
+    "the scale of a pixel follows from the third row of the inverse of A",
+    "exact",
+    basis="equations",
+)
 def scale() -> Finding:
     A, world = CAMERA.K @ _extrinsic(), _workspace()
     pixels, depth = _pinhole_pixels(A, world)
@@ -114,7 +127,14 @@ def scale() -> Finding:
     )
 
 
-@claim("cam.distortion", "B", "radial coefficients of the lens", "k1 = -0.2201, k2 = 0.5494", "data")
+@claim(
+    "cam.distortion",
+    "B",
+    "radial coefficients of the lens",
+    "k1 = -0.2201, k2 = 0.5494",
+    "data",
+    basis="chosen",
+)
 def distortion() -> Finding:
     noise = float(_MEAN_ERROR_PX / _MEAN_OF_RAYLEIGH)
     found = np.array(
@@ -135,7 +155,7 @@ def distortion() -> Finding:
     )
 
 
-@claim("cam.mustache", "B", "coefficients of different sign make mustache distortion")
+@claim("cam.mustache", "B", "coefficients of different sign make mustache distortion", basis="printed")
 def mustache() -> Finding:
     k1, k2 = CAMERA.distortion[:2].tolist()
     turns_at = float(np.sqrt(-3.0 * k1 / (5.0 * k2)))
@@ -160,7 +180,12 @@ def _bow(k1: float) -> float:
     return float(xd[0] - xd[1])
 
 
-@claim("cam.naming", "B", "positive coefficients are barrel distortion, negative ones pincushion")
+@claim(
+    "cam.naming",
+    "B",
+    "positive coefficients are barrel distortion, negative ones pincushion",
+    basis="equations",
+)
 def naming() -> Finding:
     positive, negative = _bow(0.2), _bow(-0.2)
     return Finding(
@@ -172,7 +197,9 @@ def naming() -> Finding:
     )
 
 
-@claim("cam.negligible", "B", "the lens does not matter where the marker moves", "-", "plant")
+@claim(
+    "cam.negligible", "B", "the lens does not matter where the marker moves", "-", "plant", basis="printed"
+)
 def negligible() -> Finding:
     width, height = CAMERA.image_size_px
 
@@ -197,7 +224,12 @@ def negligible() -> Finding:
     )
 
 
-@claim("cam.no_closed_form", "B", "taking the distortion off needs a non-linear optimisation at every step")
+@claim(
+    "cam.no_closed_form",
+    "B",
+    "taking the distortion off needs a non-linear optimisation at every step",
+    basis="printed",
+)
 def no_closed_form() -> Finding:
     inverse = fit_inverse(CAMERA, 0.01)
     return Finding(
@@ -209,7 +241,13 @@ def no_closed_form() -> Finding:
     )
 
 
-@claim("cam.offset", "A.1", "the head follows from the marker by d = 0.015 m along the tangent", "exact")
+@claim(
+    "cam.offset",
+    "A.1",
+    "the head follows from the marker by d = 0.015 m along the tangent",
+    "exact",
+    basis="equations",
+)
 def offset() -> Finding:
     phi, length, d = np.linspace(-1.5, 1.5, 13), np.full(13, 0.08), 0.015
     H = transform(phi, length)

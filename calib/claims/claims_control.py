@@ -20,7 +20,7 @@ _FIVE_S = 5.0
 _PEAK_RAD, _PEAK_DEG = 0.7288, 41.76
 
 
-@claim("ctl.dt", "4.1", "time step of the controller", "1/60 s, about 0.0167 s")
+@claim("ctl.dt", "4.1", "time step of the controller", "1/60 s, about 0.0167 s", basis="printed")
 def dt() -> Finding:
     tick = Pid(1.0).tick_s
     return Finding(
@@ -28,7 +28,14 @@ def dt() -> Finding:
     )
 
 
-@claim("ctl.p", "Fig. 4.2", "with none of these gains P control reaches 0.7 rad", "500 - 5000", "plant")
+@claim(
+    "ctl.p",
+    "Fig. 4.2",
+    "with none of these gains P control reaches 0.7 rad",
+    "500 - 5000",
+    "plant",
+    basis="chosen",
+)
 def proportional() -> Finding:
     peaks = {
         gain: tried("orientation", _FIVE_S, controller="p", Kp=str(gain))[1]["peak_rad"] or math.nan
@@ -43,7 +50,9 @@ def proportional() -> Finding:
     )
 
 
-@claim("ctl.pid_discrete", "4.4, D.9", "difference equation of the PID controller", "exact")
+@claim(
+    "ctl.pid_discrete", "4.4, D.9", "difference equation of the PID controller", "exact", basis="equations"
+)
 def pid_discrete() -> Finding:
     pid, h = Pid(1000.0, 1000.0, 10.0), 1.0 / 60.0
     k = np.arange(300)
@@ -71,6 +80,7 @@ def pid_discrete() -> Finding:
     "highest angle with PID control, and the same in degrees",
     "0.7288 rad = 41.76 deg",
     "plant",
+    basis="chosen",
 )
 def pid_peak() -> Finding:
     peak = tried("orientation", _FIVE_S)[1]["peak_rad"] or math.nan
@@ -91,6 +101,7 @@ def pid_peak() -> Finding:
     "settled, first reached, and no longer saturated at these times",
     "2.3 s, 0.95 s, 0.73 s",
     "plant",
+    basis="chosen",
 )
 def pid_settle() -> Finding:
     run, figures = tried("orientation", _FIVE_S)
@@ -112,6 +123,7 @@ def pid_settle() -> Finding:
     "with clamping almost nothing is left of the overshoot after a jump, and the rise is slower",
     "-",
     "plant",
+    basis="chosen",
 )
 def windup() -> Finding:
     plain, clamped = (tried("orientation", controller=name)[1] for name in ("pid", "clamping"))
@@ -138,7 +150,12 @@ def _saturated(rig: SimulatedRig | None) -> float:
 
 
 @claim(
-    "ctl.sim_saturates", "4.1.1", "in simulation the PID's output is at 255 for all of the 5 s", "-", "plant"
+    "ctl.sim_saturates",
+    "4.1.1",
+    "in simulation the PID's output is at 255 for all of the 5 s",
+    "-",
+    "plant",
+    basis="twin",
 )
 def sim_saturates() -> Finding:
     ours = _saturated(None)

@@ -38,7 +38,12 @@ def _velocity(q: FloatArray, dq: FloatArray) -> FloatArray:
     return np.asarray((forward(q + _STEP * dq, _R) - forward(q - _STEP * dq, _R))[:2] / (2.0 * _STEP))
 
 
-@claim("dyn.identity", "3.23, C", "derivatives by the coordinates and of the rates by the rates agree")
+@claim(
+    "dyn.identity",
+    "3.23, C",
+    "derivatives by the coordinates and of the rates by the rates agree",
+    basis="equations",
+)
 def identity() -> Finding:
     worst = 0.0
     for bellows, rates in _STATES:
@@ -56,7 +61,13 @@ def identity() -> Finding:
     )
 
 
-@claim("dyn.rotational", "3.25", "rotational part of the inertia", "J / (4 r_B^2) (ddq_i - ddq_j)")
+@claim(
+    "dyn.rotational",
+    "3.25",
+    "rotational part of the inertia",
+    "J / (4 r_B^2) (ddq_i - ddq_j)",
+    basis="equations",
+)
 def rotational() -> Finding:
     J, worst = _PLANT.inertia_kgm2, 0.0
     for i in range(2):
@@ -83,7 +94,7 @@ def rotational() -> Finding:
     )
 
 
-@claim("dyn.mass", "3.34", "mass matrix", "symmetric, positive definite")
+@claim("dyn.mass", "3.34", "mass matrix", "symmetric, positive definite", basis="equations")
 def mass() -> Finding:
     q1, q2 = np.meshgrid(np.linspace(0.06, 0.095, 8), np.linspace(0.06, 0.095, 8))
     M = mass_matrix(_PLANT, np.stack([q1.ravel(), q2.ravel()], axis=1))
@@ -103,7 +114,7 @@ def _kinetic(q: FloatArray, dq: FloatArray) -> float:
     return float(moving + turning)
 
 
-@claim("dyn.coriolis", "3.35", "Coriolis matrix, against Euler and Lagrange")
+@claim("dyn.coriolis", "3.35", "Coriolis matrix, against Euler and Lagrange", basis="equations")
 def coriolis() -> Finding:
     ddq, worst = np.array([4.0, -6.0]), 0.0
     for bellows, rates in _STATES:
@@ -133,7 +144,7 @@ def coriolis() -> Finding:
     )
 
 
-@claim("dyn.spring_sign", "3.36, 3.38", "springs enter the left-hand side as k (l0 - q)")
+@claim("dyn.spring_sign", "3.36, 3.38", "springs enter the left-hand side as k (l0 - q)", basis="equations")
 def spring_sign() -> Finding:
     k = _PLANT.stiffness.secant(0.0)
     rates = np.sqrt(np.linalg.eigvals(np.linalg.solve(mass_matrix(_PLANT, np.full(2, 0.065)), k * np.eye(2))))
@@ -152,6 +163,7 @@ def spring_sign() -> Finding:
     "Table 3.1",
     "mass, inertia, rest length and radius of the bellows",
     "0.0166 kg, 1.27e-5 kg m2, 0.065 m, 0.0126 m",
+    basis="chosen",
 )
 def constants() -> Finding:
     gyration = math.sqrt(_PLANT.inertia_kgm2 / _PLANT.mass_kg)
@@ -167,7 +179,13 @@ def constants() -> Finding:
     )
 
 
-@claim("dyn.ke_share", "Fig. 3.8", "share of the rotation in the kinetic energy of a swing", "about 20 %")
+@claim(
+    "dyn.ke_share",
+    "Fig. 3.8",
+    "share of the rotation in the kinetic energy of a swing",
+    "about 20 %",
+    basis="printed",
+)
 def ke_share() -> Finding:
     def share(q: FloatArray, dq: FloatArray) -> float:
         moving, turning = kinetic_energy_J(_PLANT, q, dq)
@@ -188,7 +206,14 @@ def ke_share() -> Finding:
     )
 
 
-@claim("dyn.damping_ratio", "3.40", "damping ratio of a free swing by its decrement", "0.0513", "data")
+@claim(
+    "dyn.damping_ratio",
+    "3.40",
+    "damping ratio of a free swing by its decrement",
+    "0.0513",
+    "data",
+    basis="chosen",
+)
 def damping_ratio() -> Finding:
     zeta = tried("swing")[1]["damping_ratio"] or math.nan
     return Finding(
@@ -208,7 +233,12 @@ def lateral_damping(plant: Plant) -> float:
     return float(-slowest.real / abs(slowest))
 
 
-@claim("dyn.damping_lateral", "3.41", "the measured ratio, put into 3.41, gives the lateral decay back")
+@claim(
+    "dyn.damping_lateral",
+    "3.41",
+    "the measured ratio, put into 3.41, gives the lateral decay back",
+    basis="printed",
+)
 def damping_lateral() -> Finding:
     zeta = lateral_damping(first_model().free_plant)
     share = zeta / _PLANT.damping_ratio
@@ -230,7 +260,14 @@ def model_errors() -> FloatArray:
     return np.column_stack([q, truth.phi_rad - first.phi_rad])
 
 
-@claim("dyn.error_band", "3.3", "error of the first model's bellows in a free swing", "-1 .. 1 cm", "data")
+@claim(
+    "dyn.error_band",
+    "3.3",
+    "error of the first model's bellows in a free swing",
+    "-1 .. 1 cm",
+    "data",
+    basis="twin",
+)
 def error_band() -> Finding:
     q = 1e3 * model_errors()[:, :2]
     low, high = float(q.min()), float(q.max())
@@ -243,7 +280,14 @@ def error_band() -> Finding:
     )
 
 
-@claim("dyn.static_error", "3.3", "error that is left when the swing has died away", "0.5 mm", "data")
+@claim(
+    "dyn.static_error",
+    "3.3",
+    "error that is left when the swing has died away",
+    "0.5 mm",
+    "data",
+    basis="twin",
+)
 def static_error() -> Finding:
     run, _ = tried("swing", 20.0)
     rest = nominal().plant.rest_length_m

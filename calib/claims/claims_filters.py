@@ -22,6 +22,7 @@ _MOST_LOST = 0.05
     "a low-pass at 1 Hz smooths the positions, keeps the motion and delays it little",
     "delay not printed",
     "plant",
+    basis="twin",
 )
 def cutoff() -> Finding:
     filters = {order: design_lowpass(Design(1.0, 60.0, order)) for order in (1, 2)}

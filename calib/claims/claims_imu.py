@@ -28,6 +28,7 @@ _G = 9.81
     "at rest the angle of the chip's own fusion drifts, by this much on average over five logs",
     "0.145 deg/s",
     "data",
+    basis="chosen",
 )
 def onchip_drift() -> Finding:
     drifts = [tried("static", 60.0, seed=seed)[1]["onchip_drift_degps"] or 0.0 for seed in range(_LOGS)]
@@ -64,6 +65,7 @@ def _motion_error_rad(Kp: float, Ki: float) -> float:
     "gains of the filter, chosen by eye on one log",
     "Kp = 3, Ki = 3",
     "data",
+    basis="twin",
 )
 def mm_gains() -> Finding:
     own = _motion_error_rad(3.0, 3.0)
@@ -85,6 +87,7 @@ def mm_gains() -> Finding:
     "the filtered angle drifts less than the chip's, by this rate without an angle in its unit",
     "-9.07e-4 /s",
     "data",
+    basis="twin",
 )
 def mm_drift() -> Finding:
     slopes = []
@@ -108,6 +111,7 @@ def mm_drift() -> Finding:
     "2.1",
     "the gyroscope measures up to this rate with this resolution",
     "2000 deg/s, 0.0305 deg/s",
+    basis="printed",
 )
 def gyro_lsb() -> Finding:
     both, one = 2.0 * 2000.0 / 2**16, 2000.0 / 2**16
@@ -120,7 +124,13 @@ def gyro_lsb() -> Finding:
     )
 
 
-@claim("imu.acc_lsb", "2.1", "the accelerometer has this range and this resolution", "+-4 g, 0.01916 m/s2")
+@claim(
+    "imu.acc_lsb",
+    "2.1",
+    "the accelerometer has this range and this resolution",
+    "+-4 g, 0.01916 m/s2",
+    basis="printed",
+)
 def acc_lsb() -> Finding:
     step_mps2 = 2.0 * 4.0 * _G / 2**12
     return Finding(
@@ -153,7 +163,10 @@ def _largest_difference(dt_s: float) -> float:
 
 
 @claim(
-    "imu.backward_difference", "2.3", "the discrete filter is the continuous one (2.2) to first order in dt"
+    "imu.backward_difference",
+    "2.3",
+    "the discrete filter is the continuous one (2.2) to first order in dt",
+    basis="equations",
 )
 def backward_difference() -> Finding:
     coarse, fine = _largest_difference(0.01), _largest_difference(0.005)

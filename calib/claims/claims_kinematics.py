@@ -24,7 +24,9 @@ _HARDLY_VISIBLE = 1e-3
 """Share of the length that a line in a plot is wide."""
 
 
-@claim("kin.limits", "3.9", "limits of the head's coordinates at zero curvature", "0 and l")
+@claim(
+    "kin.limits", "3.9", "limits of the head's coordinates at zero curvature", "0 and l", basis="equations"
+)
 def limits() -> Finding:
     at = pose_from_configuration(np.array([[0.0, _LENGTH_M], [1e-9, _LENGTH_M], [-1e-9, _LENGTH_M]]))
     error = float(np.abs(at[:, :2] - [0.0, _LENGTH_M]).max())
@@ -41,6 +43,7 @@ def limits() -> Finding:
     "3.10, Figs. 3.2, 3.3",
     "from order 7 on the truncation is hardly visible, for a length of 0.065 m",
     "order 7",
+    basis="equations",
 )
 def series_H() -> Finding:
     bend = np.array([0.5 * np.pi])
@@ -55,7 +58,7 @@ def series_H() -> Finding:
     )
 
 
-@claim("kin.rotation", "3.6", "rotation block of the head's frame", "[[c, -s], [s, c]]")
+@claim("kin.rotation", "3.6", "rotation block of the head's frame", "[[c, -s], [s, c]]", basis="equations")
 def rotation() -> Finding:
     phi = 0.7
     kappa = phi / _LENGTH_M
@@ -79,7 +82,7 @@ def _bellows() -> FloatArray:
     return np.stack([q1.ravel(), q2.ravel()], axis=1)
 
 
-@claim("kin.inverse", "3.11, 3.12", "inverse kinematics", "exact")
+@claim("kin.inverse", "3.11, 3.12", "inverse kinematics", "exact", basis="equations")
 def inverse_kinematics() -> Finding:
     q = _bellows()
     error = float(np.abs(inverse(forward(q, _RADIUS_M), _RADIUS_M) - q).max())
@@ -91,7 +94,9 @@ def inverse_kinematics() -> Finding:
     )
 
 
-@claim("kin.series_f", "3.14", "coefficients of the series of f", "2, 1/12, 7/2880, 31/483840")
+@claim(
+    "kin.series_f", "3.14", "coefficients of the series of f", "2, 1/12, 7/2880, 31/483840", basis="equations"
+)
 def series_f() -> Finding:
     ours = inverse_coefficients(6)
     printed = (Fraction(2), Fraction(1, 12), Fraction(7, 2880), Fraction(31, 483840))
@@ -103,7 +108,13 @@ def series_f() -> Finding:
     )
 
 
-@claim("kin.series_f_error", "3.1", "error of the series up to the power 6 at pi / 2", "4.45e-5")
+@claim(
+    "kin.series_f_error",
+    "3.1",
+    "error of the series up to the power 6 at pi / 2",
+    "4.45e-5",
+    basis="equations",
+)
 def series_f_error() -> Finding:
     at, nearer = (float(abs(f_error(np.array([phi]))[0])) for phi in (0.5 * np.pi, 1.5))
     return Finding(
@@ -114,7 +125,14 @@ def series_f_error() -> Finding:
     )
 
 
-@claim("kin.fem", "Fig. 2.2", "the curvature is nearly constant along the actuator at 40 kPa", "-", "data")
+@claim(
+    "kin.fem",
+    "Fig. 2.2",
+    "the curvature is nearly constant along the actuator at 40 kPa",
+    "-",
+    "data",
+    basis="chosen",
+)
 def fem() -> Finding:
     s = np.linspace(0.005, _LENGTH_M, 60)
     points = pose_from_configuration(np.stack([np.full_like(s, 0.7 / _LENGTH_M), s], axis=1))[:, :2]

@@ -19,7 +19,7 @@ _PRINTED = (-0.1493, 3.376, -25.87, 54.13)
 """Coefficients of (2.13) as printed, in millimetres."""
 
 
-@claim("pump.threshold", "2.3", "no elongation below this voltage", "4.7 V (PWM 100)", "data")
+@claim("pump.threshold", "2.3", "no elongation below this voltage", "4.7 V (PWM 100)", "data", basis="chosen")
 def threshold() -> Finding:
     pump = nominal().pump
     pwm = np.arange(0.0, PWM_MAX + 1.0)
@@ -42,6 +42,7 @@ def threshold() -> Finding:
     "2.13",
     "steady elongation as a cubic of the voltage from 4.7 to 12 V",
     "-0.1493 u3 + 3.376 u2 - 25.87 u + 54.13",
+    basis="printed",
 )
 def poly() -> Finding:
     low, high = (float(np.polyval(_PRINTED, u)) for u in (_THRESHOLD_V, _SUPPLY_V))
@@ -55,7 +56,7 @@ def poly() -> Finding:
     )
 
 
-@claim("pump.range", "4.2", "lengths that the pumps reach", "65 - 91 mm", "plant")
+@claim("pump.range", "4.2", "lengths that the pumps reach", "65 - 91 mm", "plant", basis="chosen")
 def reach() -> Finding:
     inflated = tried("deflate")[1]["inflated_mm"] or math.nan
     rest = 1e3 * nominal().plant.rest_length_m
@@ -68,7 +69,13 @@ def reach() -> Finding:
     )
 
 
-@claim("pump.g", "3.49", "steady force as a polynomial of the PWM value, without a unit", "as printed")
+@claim(
+    "pump.g",
+    "3.49",
+    "steady force as a polynomial of the PWM value, without a unit",
+    "as printed",
+    basis="printed",
+)
 def force_polynomial() -> Finding:
     law = PolynomialForce()
     pwm = np.arange(0.0, PWM_MAX + 1.0)
@@ -86,7 +93,7 @@ def force_polynomial() -> Finding:
     )
 
 
-@claim("pump.tau", "3.5", "time constant of the pumps", "0.7 s", "plant")
+@claim("pump.tau", "3.5", "time constant of the pumps", "0.7 s", "plant", basis="chosen")
 def tau() -> Finding:
     run, _ = tried("deflate")
     mm = elongation_mm(run)[: round(5.0 / run.tick_s)]
@@ -101,7 +108,13 @@ def tau() -> Finding:
     )
 
 
-@claim("pump.fall", "3.5", "the force falls at this rate at most, from a deflation of 5 s", "-2 N/s")
+@claim(
+    "pump.fall",
+    "3.5",
+    "the force falls at this rate at most, from a deflation of 5 s",
+    "-2 N/s",
+    basis="twin",
+)
 def fall() -> Finding:
     quick = tried("deflate", rig=with_pump(PRINTED_RATE))[1]["deflation_s"]
     slow = tried("deflate")[1]["deflation_s"]
@@ -116,7 +129,14 @@ def fall() -> Finding:
     )
 
 
-@claim("pump.deflation", "Fig. 3.24", "deflation takes this long, about twice the inflation", "5 s", "plant")
+@claim(
+    "pump.deflation",
+    "Fig. 3.24",
+    "deflation takes this long, about twice the inflation",
+    "5 s",
+    "plant",
+    basis="chosen",
+)
 def deflation() -> Finding:
     run, figures = tried("deflate")
     mm, seconds = elongation_mm(run), figures["deflation_s"]
@@ -137,6 +157,7 @@ def deflation() -> Finding:
     "the simulated deflation overshoots at 10 s because of the creep",
     "-",
     "plant",
+    basis="twin",
 )
 def overshoot() -> Finding:
     least = {}
@@ -159,7 +180,7 @@ def overshoot() -> Finding:
     )
 
 
-@claim("pump.pwm6v", "3.5", "PWM value of 6 V", "127.5")
+@claim("pump.pwm6v", "3.5", "PWM value of 6 V", "127.5", basis="printed")
 def pwm6v() -> Finding:
     value = 6.0 / _SUPPLY_V * PWM_MAX
     return Finding(f"{value:g}", exactly(value == 127.5), "6 V of 12 V, 255 in full", {"pwm": value})

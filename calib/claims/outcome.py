@@ -9,9 +9,15 @@ it. Its kind says what that takes:
 
 What comes of it is one of three. Of a claim about the plant, `reproduced` means that the simulated rig
 shows it, within `TWIN_TOLERANCE` where it is a number; what it does not show is not thereby wrong, only
-not reproducible. The rig's nominal parameters were chosen so that its runs resemble the source's text, so
-a reproduced claim of this kind says that the text is consistent with one model, not that the model is
-true.
+not reproducible.
+
+How much that is worth depends on what our figure rests on, its basis:
+
+    equations   an identity, a series or a limit; no number of any rig
+    printed     arithmetic on numbers that the source prints
+    twin        a run or a sensor of the simulated rig, with other figures fixed beforehand
+    chosen      the same, but this very figure was put in or looked at when the rig's nominal parameters
+                were chosen: it shows that the text agrees with one model, and is no evidence for either
 """
 
 from __future__ import annotations
@@ -20,12 +26,25 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
-__all__ = ["KINDS", "TWIN_TOLERANCE", "Claim", "Finding", "Outcome", "claim", "exactly", "near", "on_twin"]
+__all__ = [
+    "BASES",
+    "KINDS",
+    "TWIN_TOLERANCE",
+    "Claim",
+    "Finding",
+    "Outcome",
+    "claim",
+    "exactly",
+    "near",
+    "on_twin",
+]
 
 TWIN_TOLERANCE = 0.10
 """Share by which a figure of the simulated rig may differ from the printed one to count as reproduced."""
 
 KINDS = ("math", "plant", "data")
+
+BASES = ("equations", "printed", "twin", "chosen")
 
 
 class Outcome(Enum):
@@ -62,7 +81,7 @@ class Claim:
     ----------
     id : name in the list of claims. where : section, equation or figure.
     says : what is claimed. printed : the figure as printed, "-" without one.
-    kind : of `KINDS`. check : computes it.
+    kind : of `KINDS`. basis : of `BASES`. check : computes it.
     """
 
     id: str
@@ -70,16 +89,17 @@ class Claim:
     says: str
     printed: str
     kind: str
+    basis: str
     check: Callable[[], Finding]
 
 
 def claim(
-    name: str, where: str, says: str, printed: str = "-", kind: str = "math"
+    name: str, where: str, says: str, printed: str = "-", kind: str = "math", *, basis: str
 ) -> Callable[[Callable[[], Finding]], Claim]:
     """Turn a function that computes a statement into the `Claim`."""
 
     def made(check: Callable[[], Finding]) -> Claim:
-        return Claim(name, where, says, printed, kind, check)
+        return Claim(name, where, says, printed, kind, basis, check)
 
     return made
 

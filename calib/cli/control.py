@@ -33,7 +33,10 @@ control = typer.Typer(
     name="control", help="Try controllers on the identified model before the hardware.", no_args_is_help=True
 )
 
-_REFERENCE = "elongation, step, jump, ellipse, or a CSV with t_s and q1_m, q2_m, or x_m, y_m, or phi_rad."
+_REFERENCE = (
+    "elongation, step, jump, ellipse, a CSV with t_s and q1_m, q2_m, or x_m, y_m, or phi_rad, "
+    "or a recorded log."
+)
 ReferenceArgument = Annotated[str, typer.Argument(help=_REFERENCE)]
 LimitsOption = Annotated[
     str | None, typer.Option("--pwm-limits", help="PWM values between which commands stay, as 0,255.")
@@ -107,9 +110,9 @@ def run(
     from calib.control.reach import follow
     from calib.control.references import check_workspace
     from calib.controlling import CONTROLLERS, controllers_for, run_controller
+    from calib.controlreference import wanted_reference
     from calib.controlsections import check_json, outcome_json
     from calib.files import check_folder
-    from calib.referencefile import reference_of
     from calib.twin.simulate import FEEDBACKS
 
     if feedback not in FEEDBACKS:
@@ -120,7 +123,7 @@ def run(
     if figures is not None:
         check_folder(figures)
     known, machine, model = _known(rig, limits)
-    wanted = reference_of(reference, model, _duration_s(duration))
+    wanted = wanted_reference(reference, model, _duration_s(duration), known, rig)
     check_workspace(model, wanted, _workspace(known))
     found = follow(model, wanted.path_m(model.plant.rest_length_m))
     names = controllers or list(controllers_for(wanted, known.controller))
@@ -190,19 +193,20 @@ def check(
 
     Exits 1 when they cannot.
     """
-    from calib.control.reach import follow, slowed
+    from calib.control.reach import brought_in, follow, slowed
     from calib.control.references import check_workspace, from_lengths
+    from calib.controlreference import wanted_reference
     from calib.controlsections import check_json, reach_json
     from calib.errors import BadInputError
     from calib.files import check_folder, check_writable
-    from calib.referencefile import reference_of, write_reference
+    from calib.referencefile import write_reference
 
     if slow is not None:
         check_writable(slow)
     if figures is not None:
         check_folder(figures)
     known, _, model = _known(rig, limits)
-    wanted = reference_of(reference, model, _duration_s(duration))
+    wanted = wanted_reference(reference, model, _duration_s(duration), known, rig)
     check_workspace(model, wanted, _workspace(known))
     found = follow(model, wanted.path_m(model.plant.rest_length_m))
     told: dict[str, Any] = {**check_json(wanted, found), "reachable": reach_json(model)}
@@ -212,6 +216,8 @@ def check(
             q_m, _ = slowed(model, wanted.path_m(model.plant.rest_length_m))
             slower = from_lengths(model, f"{wanted.name}, slowed", q_m)
             told["slowed_s"] = slower.duration_s
+            _, moved_m = brought_in(model, wanted.path_m(model.plant.rest_length_m))
+            told["moved_mm"] = 1e3 * moved_m
         except BadInputError as error:
             never = str(error)
             told["never"] = never
@@ -250,6 +256,8 @@ def _tell_check(told: dict[str, Any], never: str) -> None:
         say(f"  - {never}")
     else:
         say(f"  slowed down to {told['slowed_s']:.2f} s they can (--slow writes it)")
+        if told["moved_mm"] > 0.0:
+            say(f"  with lengths moved by up to {told['moved_mm']:.2f} mm onto what the pumps can hold")
 
 
 @control.command("tune")

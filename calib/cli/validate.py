@@ -34,12 +34,15 @@ def _left(head: list[str], rows: list[list[str]]) -> list[str]:
 
 def _tell_log(one: Comparison) -> None:
     hoses = "pumps connected" if one.hoses else "hoses off"
-    say(f"{one.name}: {len(one.t_s)} poses over {one.t_s[-1] - one.t_s[0]:.4g} s from {one.how}, {hoses}")
+    say(
+        f"{one.name}: {len(one.t_s)} poses over {one.t_s[-1] - one.t_s[0]:.4g} s from {one.how}, {hoses}, "
+        f"start by {'the estimator' if one.start == 'estimator' else one.start}"
+    )
     rows = []
     for quantity, (scale, unit) in _UNITS.items():
         for model, errors in one.errors.items():
             error = errors[quantity]
-            gained = one.improvement_percent(quantity) if model == "improved" else None
+            gained = None if model == "original" else one.improvement_percent(quantity, model)
             rows.append(
                 [
                     f"{quantity}, {unit}, {model}",
@@ -58,19 +61,21 @@ def _tell_log(one: Comparison) -> None:
 
 
 def _tell_claims(examined: tuple[Examined, ...]) -> None:
-    from calib.claims.book import BOOK, count
+    from calib.claims.book import BOOK, by_basis, count
+    from calib.claims.outcome import Outcome
 
     rows = [
         [
             one.claim.id,
             one.claim.where,
             one.claim.kind,
+            one.claim.basis,
             one.finding.outcome.value,
             one.finding.ours + (" (simulated)" if one.finding.simulated else ""),
         ]
         for one in examined
     ]
-    for line in _left(["claim", "where", "kind", "outcome", "our figure"], rows):
+    for line in _left(["claim", "where", "kind", "basis", "outcome", "our figure"], rows):
         say(line)
     for one in examined:
         printed = "" if one.claim.printed == "-" else f"; printed: {one.claim.printed}"
@@ -78,15 +83,24 @@ def _tell_claims(examined: tuple[Examined, ...]) -> None:
         say(f"  {one.finding.outcome.value}: {one.finding.how}")
     found = ", ".join(f"{number} {outcome.value}" for outcome, number in count(examined).items())
     say(f"{len(examined)} of {len(BOOK)} claims: {found}")
-    say(
-        "plant and data claims are shown on a simulated rig whose parameters were chosen to resemble the text"
-    )
+    words = {
+        "equations": "from the equations alone",
+        "printed": "from printed numbers",
+        "twin": "on the simulated rig, with other figures fixed beforehand",
+        "chosen": "on the simulated rig, this very figure among those it was chosen by",
+    }
+    for basis, outcomes in by_basis(examined).items():
+        say(
+            f"  {sum(outcomes.values()):2d} {words[basis]}: {outcomes[Outcome.REPRODUCED]} reproduced, "
+            f"{outcomes[Outcome.REFUTED]} refuted, {outcomes[Outcome.UNMEASURED]} open"
+        )
 
 
 def _log_json(one: Comparison) -> dict[str, Any]:
     return {
         "log": one.name,
         "pose_from": one.how,
+        "start_from": one.start,
         "pumps_connected": one.hoses,
         "poses": len(one.t_s),
         "duration_s": float(one.t_s[-1] - one.t_s[0]),
@@ -102,7 +116,11 @@ def _log_json(one: Comparison) -> dict[str, Any]:
             }
             for model, errors in one.errors.items()
         },
-        "smaller_by_percent": {quantity: one.improvement_percent(quantity) for quantity in _UNITS},
+        "smaller_by_percent": {
+            model: {quantity: one.improvement_percent(quantity, model) for quantity in _UNITS}
+            for model in one.errors
+            if model != "original"
+        },
     }
 
 
@@ -119,7 +137,7 @@ def _compared(
             narrate(sentence)
         out.append(one)
     if out and IMPROVED not in out[0].errors:
-        narrate(f"{rig} has no section actuator or pump: only the original model is compared")
+        narrate(f"{rig} has no section actuator or pump: the improved model has nominal parameters")
     return out
 
 
@@ -144,14 +162,16 @@ def validate(
 ) -> None:
     """Hold the models against logs, and compute every claim of the source again.
 
-    A log's commands are played to the nominal model and to that of the sections actuator and pump, from
-    the log's start; without LOG the book of claims is examined. Exits 0 whatever comes of it.
+    A log's commands are played to the original model of the source, to the improved one with nominal
+    parameters, and to that with the sections actuator and pump, from the estimator's state at its start;
+    without LOG the book of claims is examined, and --figures draws what corresponds to the source's figures
+    from simulated runs. Exits 0 whatever comes of it.
     """
     from calib.files import check_folder, shown
 
     paths = logs or []
-    if not paths and (states or truth or no_pwm or figures is not None):
-        raise UsageError("--states, --truth, --no-pwm and --figures: need a LOG")
+    if not paths and (states or truth or no_pwm):
+        raise UsageError("--states, --truth and --no-pwm: need a LOG")
     if states and len(states) != len(paths):
         raise UsageError(f"--states: {len(states)} files for {len(paths)} logs, expected one for each")
     if truth and states:
@@ -159,19 +179,28 @@ def validate(
     if figures is not None:
         check_folder(figures)
     compared = _compared(paths, states, truth, no_pwm, rig)
-    if figures is not None:
+    examined: tuple[Examined, ...] = ()
+    drawn: list[str] = []
+    if figures is not None and compared:
         from calib.report.validate_figures import write_validate_figures
 
-        write_validate_figures(figures, compared)
+        drawn += [path.name for path in write_validate_figures(figures, compared)]
         narrate(f"figures in {shown(figures)}")
-    examined: tuple[Examined, ...] = ()
+    if figures is not None and (claims or not paths):
+        from calib.claims.album import ALBUM
+        from calib.report.source_figures import write_source_figures
+
+        with progress_bar("drawing") as progress:
+            drawn += [path.name for path in write_source_figures(figures, ALBUM, progress)]
+        narrate(f"{len(ALBUM)} simulated figures in {shown(figures)}, index.html shows them all")
     if claims or not paths:
         from calib.claims.book import examine
 
         with progress_bar("examining") as progress:
             examined = examine(progress=progress)
     if as_json:
-        document("validate", {"validate": _whole_json(compared, examined)})
+        told = _whole_json(compared, examined)
+        document("validate", {"validate": {**told, "figures": drawn} if drawn else told})
         return
     for one in compared:
         _tell_log(one)
@@ -182,9 +211,13 @@ def validate(
 def _whole_json(compared: list[Comparison], examined: tuple[Examined, ...]) -> dict[str, Any]:
     told: dict[str, Any] = {"logs": [_log_json(one) for one in compared]}
     if examined:
-        from calib.claims.book import BOOK, count, rows
+        from calib.claims.book import BOOK, by_basis, count, rows
 
         told["claims"] = rows(examined)
         told["outcomes"] = {outcome.value: number for outcome, number in count(examined).items()}
+        told["by_basis"] = {
+            basis: {outcome.value: number for outcome, number in outcomes.items()}
+            for basis, outcomes in by_basis(examined).items()
+        }
         told["not_examined"] = len(BOOK) - len(examined)
     return told

@@ -34,9 +34,11 @@ from calib.control.pump_model import falling_rate
 from calib.errors import BadInputError
 
 __all__ = [
+    "CLOSE_M",
     "TOLERANCE_M",
     "Following",
     "approach_s",
+    "brought_in",
     "follow",
     "largest_angle",
     "longest_m",
@@ -47,6 +49,9 @@ __all__ = [
 TOLERANCE_M = 2.5e-4
 """Lengths that may be missing: half of what a pixel of the rig's camera shows."""
 
+CLOSE_M = 1e-3
+"""Lengths that are brought in before a reference counts as out of reach: a pixel of the rig's camera."""
+
 _SHARE = 0.9
 """Of the pumps' rates that a slowed reference uses at first."""
 _PIECE_M = 2e-4
@@ -54,6 +59,7 @@ _JUMP_M = 2e-3
 """In a tick; no pump moves a bellows a tenth as far."""
 _SPREAD_S = 0.15
 _TRIES = 40
+_NEWTON = 6
 _LONGEST_TICKS = 432_000
 
 
@@ -185,6 +191,28 @@ def follow(model: Model, q_m: FloatArray, tolerance_m: float = TOLERANCE_M) -> F
     )
 
 
+def brought_in(model: Model, q_m: FloatArray) -> tuple[FloatArray, float]:
+    """Lengths (n, 2) [m] with those just outside of the reachable set on its edge, and the longest way there.
+
+    The edge is found by Newton's method on the forces that hold them, cut to what the pumps can give. Lengths
+    that are farther than `CLOSE_M` from it stay as they are.
+    """
+    q = np.array(q_m, dtype=np.float64)
+    moved = 0.0
+    for k in np.flatnonzero(~reachable(model, q)):
+        wanted = np.clip(holding_force(model.plant, q[k]), 0.0, largest_force_N(model))
+        at = q[k].copy()
+        for _ in range(_NEWTON):
+            short = wanted - holding_force(model.plant, at)
+            at = at + np.linalg.solve(static_stiffness(model.plant, at), short)
+            if np.abs(at - q[k]).max() > 2.0 * CLOSE_M:
+                break
+        way = float(np.abs(at - q[k]).max())
+        if way <= CLOSE_M:
+            q[k], moved = at, max(moved, way)
+    return q, moved
+
+
 def _path(q: FloatArray, h: float) -> tuple[FloatArray, FloatArray]:
     """Points (m, 2) no farther apart than a piece, and the time (m - 1,) of each of them."""
     steps = np.maximum(np.ceil(np.abs(np.diff(q, axis=0)).max(axis=1) / _PIECE_M).astype(int), 1)
@@ -209,11 +237,13 @@ def _least_times(model: Model, points: FloatArray) -> FloatArray:
 def slowed(model: Model, q_m: FloatArray, tolerance_m: float = TOLERANCE_M) -> tuple[FloatArray, Following]:
     """Lengths (m, 2) [m] at the ticks along the same path, slow enough for the pumps, and the proof.
 
-    Jumps become the fastest way along the straight line between their ends. Raises `BadInputError` for a
-    path that leaves the reachable set, which no slowness brings back, and one that would take longer
-    than two hours.
+    Jumps become the fastest way along the straight line between their ends. Lengths that lie outside of the
+    reachable set by less than `CLOSE_M`, as those of a recorded run with its noise, are brought in first.
+    Raises `BadInputError` for a path that leaves the set by more, which no slowness brings back, and one that
+    would take longer than two hours.
     """
-    h, q = model.tick_s, np.asarray(q_m, dtype=np.float64)
+    h = model.tick_s
+    q, _ = brought_in(model, q_m)
     points, times = _path(q, h)
     outside = np.flatnonzero(~reachable(model, points))
     if len(outside):

@@ -4,6 +4,15 @@ The errors of an angle are correlated over seconds, so that samples are no indep
 circular block bootstrap (Politis and Romano, in Exploring the Limits of Bootstrap, 1992) draws runs of a
 tenth of the log, 2 to 60 s. All filters are drawn with the same runs: what they have in common cancels
 in their difference.
+
+With m runs, about ten, the spread of the draws is too small and not well known. Runs about their common mean
+lose a share 1 / m of the variance, and a variance from overlapping runs has 1.5 m degrees of freedom
+(Kuensch, Annals of Statistics 17, 1989). So deviations from the estimate are widened by
+
+    sqrt(m / (m - 1)) t(1.5 m) / z,   t and z the 97.5 % points of Student's and the normal distribution,
+
+and intervals of an error, which is a scale, are those of its logarithm, turned about the estimate: an error
+that was found too small was found with too small a spread.
 """
 
 from __future__ import annotations
@@ -13,6 +22,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import norm, t
 
 from calib.arrays import FloatArray, IntArray
 from calib.imu.mahony import Mahony
@@ -87,6 +97,12 @@ def _resampled(blocks: int, length: int) -> IntArray:
     return np.asarray(at.reshape(_RESAMPLES, -1)[:, :blocks])
 
 
+def _widening(runs: float) -> float:
+    """By how much deviations of the draws from the estimate are too small, for a number of runs."""
+    m = max(runs, 2.0)
+    return math.sqrt(m / (m - 1.0)) * float(t.ppf(0.975, 1.5 * m) / norm.ppf(0.975))
+
+
 def rms(errors: Sequence[FloatArray]) -> float:
     """Root mean square of errors in several pieces, NaN not counted."""
     whole = np.concatenate(errors)
@@ -109,14 +125,16 @@ def compared(rows: Sequence[Row], dt_s: float) -> tuple[tuple[Candidate, ...], f
     drawn = [
         np.sqrt(total[at].sum(axis=1) / np.maximum(count[at].sum(axis=1), 1.0)) for total, count in tables
     ]
-    base = rms(rows[0].errors_rad)
+    base, wide = rms(rows[0].errors_rad), _widening(len(tables[0][0]) / length)
     out = []
     for row, draws in zip(rows, drawn, strict=True):
         rmse = rms(row.errors_rad)
-        low, high = np.quantile(draws, [0.025, 0.975]).tolist()
-        less_low, less_high = np.quantile(draws - drawn[0], [0.025, 0.975]).tolist()
-        confidence = float((draws < drawn[0]).mean())
+        off = wide * (np.log(np.maximum(draws, 1e-300)) - math.log(max(rmse, 1e-300)))
+        high, low = (rmse * np.exp(-np.quantile(off, [0.025, 0.975]))).tolist()
         less = rmse - base
+        apart = less + wide * (draws - drawn[0] - less)
+        less_low, less_high = np.quantile(apart, [0.025, 0.975]).tolist()
+        confidence = float((apart < 0.0).mean())
         out.append(
             Candidate(
                 row.name, row.gains, rmse, low, high, less, less_low, less_high, confidence, row.whole_rad

@@ -9,13 +9,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from calib.report.style import BLUE, GREY, ORANGE, figure_folder, look, number, plain, save, sheet
-from calib.validating import IMPROVED, ORIGINAL, QUANTITIES, Comparison
+from calib.report.style import BLUE, GREEN, GREY, ORANGE, figure_folder, look, number, plain, save, sheet
+from calib.validating import IMPROVED, NOMINAL, ORIGINAL, QUANTITIES, Comparison
 
 __all__ = ["model_figure", "write_validate_figures"]
 
 _MOST_S = 20.0
-_COLOURS = {ORIGINAL: ORANGE, IMPROVED: BLUE}
+_COLOURS = {ORIGINAL: ORANGE, NOMINAL: GREEN, IMPROVED: BLUE}
 _SCALES = {
     "q1": (1e3, "length of bellows 1 (mm)"),
     "q2": (1e3, "length of bellows 2 (mm)"),
@@ -66,7 +66,7 @@ def model_figure(one: Comparison) -> Figure:
     panels[0, 1].set_title("Measured less simulated")
     for axes in panels[-1]:
         axes.set_xlabel("time (s)")
-    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return figure
 
 

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
-import numpy as np
-from identifytrials import track
+from dataclasses import replace
 
+import numpy as np
+import pytest
+from identifytrials import SIGMA, track
+
+from calib.actuator.identify_fit import fit_tracks
 from calib.actuator.identify_parameters import Nominal, values_of
-from calib.actuator.identify_problem import FAR, Problem, first_guess, jacobian, residuals
+from calib.actuator.identify_problem import FAR, Problem, first_guess, jacobian, residuals, starts_of
+from calib.actuator.identify_sigma import uncertainty
+from calib.actuator.identify_tracks import Start, Track
+from calib.identifystart import start_in_motion
 
 NAMES = (
     "stiffness_scale",
@@ -67,3 +74,61 @@ def test_a_candidate_that_leaves_the_model_is_far_and_not_nan() -> None:
     rows = residuals(problem, first_guess(problem, values)[None])
     assert np.all(np.isfinite(rows))
     assert np.any(rows == FAR) or np.abs(rows).max() > 50.0
+
+
+def _cut(one: Track, from_s: float, moving: Start) -> Track:
+    """The rest of a track from a tick on, begun in motion."""
+    tick = round(from_s / one.tick_s)
+    late = one.t_s >= tick * one.tick_s + 0.03
+    return replace(
+        one,
+        pwm=one.pwm[tick:],
+        t_s=one.t_s[late] - tick * one.tick_s,
+        head=one.head[late],
+        whitening=one.whitening[late],
+        moving=moving,
+    )
+
+
+def test_a_log_in_motion_has_its_start_among_the_unknowns() -> None:
+    moving = Start(0.1, 0.07, -0.5, 0.01, 0.02, -0.01, 0.5, 0.3, 0.4, 0.2)
+    tracks = [track("free", duration_s=1.5), _cut(track("prbs", duration_s=2.5), 1.0, moving)]
+    free = _cut(track("free", duration_s=2.5), 0.5, Start(0.1, 0.065, -2.0))
+    problem = Problem(Nominal(), [*tracks, free], NAMES, {}, threads=1)
+    layout = problem.layout
+    assert layout.starts == (2, 10, 6)
+    assert layout.of_start(1) == slice(layout.start + 2, layout.start + 12)
+    x = first_guess(problem, values_of(Nominal()))
+    assert starts_of(problem, x)[1] == moving
+    assert starts_of(problem, x)[2].dphi_radps == -2.0
+    x[layout.start :] += 1e-3 * problem.scales()[layout.start :]
+    base, J = jacobian(problem, x)
+    assert np.allclose(base, residuals(problem, x[None])[0], atol=1e-6)
+    steps = 1e-3 * problem.scales()
+    for k in range(layout.start, layout.size):
+        up, down = x.copy(), x.copy()
+        up[k] += steps[k]
+        down[k] -= steps[k]
+        slope = (residuals(problem, up[None]) - residuals(problem, down[None]))[0] / (2.0 * steps[k])
+        assert np.abs(J[:, k] - slope).max() < 0.02 * np.abs(slope).max(), k
+
+
+@pytest.mark.slow
+def test_a_log_that_is_cut_out_of_a_longer_one_gives_the_same_parameters() -> None:
+    values = {"stiffness_scale": 1.1, "lag_s": 0.6, "falling_N_per_s": 0.5, "strength2": 0.95}
+    whole = track("prbs", values, duration_s=14.0)
+    late = whole.t_s >= 4.03
+    at = whole.t_s[late] - 4.0
+    guess = start_in_motion(at - 0.025, whole.head[late], True, Nominal().plant, SIGMA[0])
+    assert guess is not None
+    cut = _cut(whole, 4.0, guess)
+    found = fit_tracks(Nominal(), [cut], delay_s=0.025, threads=1)
+    known = uncertainty(found)
+    for name, value in found.values.items():
+        truth = values.get(name, values_of(Nominal())[name])
+        assert abs(value - truth) < 3.5 * known.sigma[name], name
+    # Taken to begin at rest, the same rows give another rig.
+    rest = fit_tracks(Nominal(), [replace(cut, moving=None)], delay_s=0.025, threads=1)
+    sure = uncertainty(rest)
+    away = [abs(v - values.get(n, values_of(Nominal())[n])) / sure.sigma[n] for n, v in rest.values.items()]
+    assert max(away) > 6.0

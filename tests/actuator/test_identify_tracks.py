@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 from identifytrials import track
 
-from calib.actuator.identify_parameters import Nominal
-from calib.actuator.identify_tracks import Start, Track, heads_of
+from calib.actuator.batch import simulate_batch
+from calib.actuator.identify_parameters import Nominal, made
+from calib.actuator.identify_tracks import COMPONENTS, Start, Track, heads_of
+from calib.actuator.integrate import state_row
+from calib.actuator.pump import TICK_S
 from calib.errors import BadInputError
 
 
@@ -50,3 +53,32 @@ def test_arrays_that_do_not_match_are_refused() -> None:
     with pytest.raises(BadInputError, match="no rows"):
         Track("x", 0.1, one.pwm, False, one.t_s[:0], one.head[:0], one.whitening[:0])
     assert one.start.phi_rad == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_start_in_motion_continues_a_longer_run() -> None:
+    one = track("prbs", duration_s=4.0, noise=0.0)
+    nominal = Nominal()
+    plant, pump = made(nominal, {}, True, TICK_S)
+    tick = 110
+    states, _ = simulate_batch([plant], [pump], one.pwm, state_row(plant), 12, 1)
+    row = states[0, tick - 1]
+    r = plant.bellows_radius_m
+    begin = Start(
+        float(row[0] - row[1]) / (2.0 * r),
+        0.5 * float(row[0] + row[1]),
+        float(row[2] - row[3]) / (2.0 * r),
+        0.5 * float(row[2] + row[3]),
+        *row[4:6].tolist(),
+        *row[8:10].tolist(),
+        *row[6:8].tolist(),
+    )
+    assert np.allclose(begin.row(plant), row, atol=1e-12)
+    late = one.t_s >= (tick + 3) * TICK_S
+    rows = {"head": one.head[late], "whitening": one.whitening[late]}
+    rest = Start(0.0, plant.rest_length_m)
+    whole, _ = heads_of(replace(one, t_s=one.t_s[late], **rows), nominal, [{}], [rest], 0.0, 1)
+    cut = replace(one, pwm=one.pwm[tick:], t_s=one.t_s[late] - tick * TICK_S, moving=begin, **rows)
+    late_run, _ = heads_of(cut, nominal, [{}], [begin], 0.0, 1)
+    # The commands that were on their way are like the first one here.
+    assert np.abs(whole - late_run).max() < 1e-9
+    assert cut.unknown == COMPONENTS and one.unknown == ("phi_rad", "length_m")

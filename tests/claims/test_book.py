@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from outside import outside
 
-from calib.claims.book import BOOK, count, examine, rows, select
-from calib.claims.outcome import KINDS, Claim, Outcome
+from calib.claims.book import BOOK, by_basis, count, examine, rows, select
+from calib.claims.outcome import BASES, KINDS, Claim, Outcome
 
 REPRODUCED, REFUTED, UNMEASURED = Outcome.REPRODUCED, Outcome.REFUTED, Outcome.UNMEASURED
 
@@ -92,11 +92,15 @@ def test_outcome(claim: Claim) -> None:
     assert finding.ours and "nan" not in finding.ours and finding.how
     assert all(math.isfinite(value) for value in finding.numbers.values())
     assert not (finding.simulated and finding.outcome is REFUTED and claim.kind == "data")
+    assert finding.simulated == (claim.basis in ("twin", "chosen"))
+    # What was chosen to come out so neither proves nor refutes the text.
+    assert not (claim.basis == "chosen" and finding.outcome is REFUTED)
 
 
 def test_the_book_has_every_claim_once() -> None:
     assert [claim.id for claim in BOOK] == list(EXPECTED)
     assert {claim.kind for claim in BOOK} == set(KINDS)
+    assert {claim.basis for claim in BOOK} == set(BASES)
     assert all(claim.says and claim.where and claim.printed for claim in BOOK)
 
 
@@ -116,10 +120,14 @@ def test_examining_tells_how_far_it_is_and_gives_plain_values() -> None:
     found = examine(chosen, lambda done, total: told.append((done, total)))
     assert told == [(k, 8) for k in range(8)]
     assert count(found) == {REPRODUCED: 5, REFUTED: 2, UNMEASURED: 1}
+    by = by_basis(found)
+    assert tuple(by) == BASES
+    assert by["equations"] == {REPRODUCED: 4, REFUTED: 2, UNMEASURED: 0}
+    assert sum(sum(outcomes.values()) for outcomes in by.values()) == len(found)
     table = rows(found)
     assert json.loads(json.dumps(table)) == table
     assert table[-1]["id"] == "ctl.dt" and table[-1]["outcome"] == "reproduced"
-    assert set(table[0]) >= {"where", "claim", "printed", "ours", "how", "numbers", "simulated"}
+    assert set(table[0]) >= {"where", "claim", "printed", "ours", "how", "numbers", "simulated", "basis"}
 
 
 def test_select() -> None:

@@ -8,11 +8,12 @@ from calib.claims.outcome import TWIN_TOLERANCE, Finding, Outcome, claim, exactl
 
 
 def test_a_function_becomes_a_claim_that_computes_it() -> None:
-    @claim("a.b", "1.1", "two and two", "5")
+    @claim("a.b", "1.1", "two and two", "5", basis="equations")
     def two() -> Finding:
         return Finding(str(2 + 2), exactly(2 + 2 == 5), "added up", {"sum": 4.0})
 
-    assert (two.id, two.where, two.says, two.printed, two.kind) == ("a.b", "1.1", "two and two", "5", "math")
+    assert (two.id, two.where, two.says, two.printed) == ("a.b", "1.1", "two and two", "5")
+    assert (two.kind, two.basis) == ("math", "equations")
     found = two.check()
     assert found.outcome is Outcome.REFUTED
     assert found.numbers == {"sum": 4.0} and not found.simulated

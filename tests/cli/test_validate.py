@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from identifytrials import log_file, rig_file
 
+from calib.claims.album import ALBUM
 from calib.claims.book import BOOK
 from calib.twin.rig import SimulatedRig
 
@@ -50,14 +51,26 @@ def test_the_book_as_one_document_and_the_same_again(calib: Run, tmp_path: Path)
     assert claims["kin.rotation"]["outcome"] == "refuted" and claims["ctl.p"]["simulated"] is True
 
 
+@pytest.mark.slow
+def test_figures_of_the_source_and_their_index(calib: Run, tmp_path: Path) -> None:
+    ended = calib("validate", "--figures", "drawn", "--json", cwd=tmp_path)
+    assert ended.code == 0, ended.err
+    told = json.loads(ended.out)["validate"]["figures"]
+    assert len(told) == len(ALBUM) + 2 and {path.name for path in (tmp_path / "drawn").iterdir()} == set(told)
+    index = json.loads((tmp_path / "drawn" / "figures.json").read_text())["figures"]
+    assert [row["number"] for row in index] == [one.number for one in ALBUM]
+    assert "49 simulated figures" in ended.err
+
+
 def test_a_log_against_the_original_model_alone(calib: Run, tmp_path: Path, log: Path) -> None:
     rig = _rig(tmp_path)
     before = rig.read_bytes()
     ended = calib("validate", log, "--rig", rig)
     assert ended.code == 0, ended.err
     assert "swing.csv: " in ended.out and "from pictures, hoses off" in ended.out
-    assert "phi, rad, original" in ended.out and "improved" not in ended.out
-    assert "has no section actuator or pump: only the original model" in ended.err
+    assert "phi, rad, original" in ended.out and "phi, rad, nominal" in ended.out
+    assert "improved" not in ended.out and "start by the estimator" in ended.out
+    assert "has no section actuator or pump: the improved model has nominal parameters" in ended.err
     assert rig.read_bytes() == before
 
 
@@ -67,11 +80,12 @@ def test_both_models_in_one_table_and_figures(calib: Run, tmp_path: Path, log: P
     ended = calib("validate", log, "--rig", rig, "--figures", drawn, "--json")
     assert ended.code == 0, ended.err
     (told,) = json.loads(ended.out)["validate"]["logs"]
-    assert set(told["models"]) == {"original", "improved"}
+    assert list(told["models"]) == ["original", "nominal", "improved"]
     # The log is of the nominal rig, so the other parameters are worse.
     phi = {name: model["phi"] for name, model in told["models"].items()}
-    assert phi["original"]["rms_rad"] < 0.02 < phi["improved"]["rms_rad"]
-    assert told["smaller_by_percent"]["phi"] < -100.0
+    assert phi["nominal"]["rms_rad"] < 0.02 < phi["improved"]["rms_rad"]
+    assert phi["original"]["rms_rad"] > 3.0 * phi["nominal"]["rms_rad"]
+    assert told["smaller_by_percent"]["nominal"]["phi"] > 60.0
     ratio = phi["original"]["norm_rad"] / phi["original"]["rms_rad"]
     assert ratio == pytest.approx(told["poses"] ** 0.5)
     assert [path.name for path in drawn.iterdir()] == ["validate_model.png"]
@@ -81,7 +95,7 @@ def test_both_models_in_one_table_and_figures(calib: Run, tmp_path: Path, log: P
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (("--figures", "x"), "need a LOG"),
+        (("--truth",), "need a LOG"),
         (("LOG", "--states", "a.csv", "--states", "b.csv"), "2 files for 1 logs"),
         (("LOG", "--states", "a.csv", "--truth"), "--truth: takes the true columns"),
     ],

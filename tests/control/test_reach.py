@@ -15,6 +15,7 @@ from calib.control.inverse_model import Model, feed_forward_pwm, holding_force
 from calib.control.linear import bent_rest
 from calib.control.reach import (
     approach_s,
+    brought_in,
     follow,
     largest_angle,
     longest_m,
@@ -128,6 +129,26 @@ def test_a_jump_becomes_a_ramp_and_holds_stay() -> None:
 def test_no_slowness_brings_back_what_is_out_of_reach() -> None:
     with pytest.raises(BadInputError, match="cannot be held by the pumps at any speed"):
         slowed(NOMINAL, np.linspace(0.08, 0.1, 100)[:, None] * np.ones(2))
+
+
+def test_lengths_just_outside_are_brought_to_the_edge_and_others_stay() -> None:
+    rest = NOMINAL.plant.rest_length_m
+    q = np.array([[rest - 5e-4, rest - 3e-4], [0.07, 0.072], [0.08, 0.0655], [rest - 3e-3, rest]])
+    inside, moved = brought_in(NOMINAL, q)
+    assert reachable(NOMINAL, inside).tolist() == [True, True, True, False]
+    assert np.array_equal(inside[[1, 3]], q[[1, 3]])
+    assert inside[0] == pytest.approx([rest, rest], abs=1e-6)
+    assert moved == pytest.approx(np.abs(inside - q).max()) and moved <= 1e-3
+    # On the edge one pump is off.
+    assert holding_force(NOMINAL.plant, inside[2])[1] == pytest.approx(0.0, abs=1e-8)
+
+
+def test_a_recorded_run_with_its_noise_can_be_slowed() -> None:
+    q = _ellipse(12.0)
+    q = q + 2e-4 * np.sin(np.arange(len(q)) / 9.0)[:, None]
+    q[:60] = NOMINAL.plant.rest_length_m - 4e-4
+    slow, proof = slowed(NOMINAL, q)
+    assert proof.possible and len(slow) > len(q)
 
 
 def test_the_way_there() -> None:

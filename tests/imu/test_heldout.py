@@ -28,17 +28,18 @@ def test_equal_filters_win_as_rarely_as_they_should() -> None:
         rng = np.random.default_rng(seed)
         pair = [[_coloured(rng, 3000, 1.0)] for _ in range(2)]
         wins += compared(_rows(pair), 0.01)[0][1].wins
-    # 5 % nominally; ten blocks of a short log are a little too sure.
-    assert wins <= 14
+    # 5 % nominally; more than 10 of 100 come in one of a hundred such tests.
+    assert wins <= 10
 
 
 def test_interval_covers_the_error() -> None:
     inside = 0
-    for seed in range(60):
+    for seed in range(120):
         errors = [_coloured(np.random.default_rng(seed), 3000, 2.0, 0.9)]
         one = compared(_rows([errors]), 0.01)[0][0]
         inside += one.low_rad < 2.0 < one.high_rad
-    assert inside >= 48
+    # 95 % nominally; of ten runs of a coloured log it is about 92 %.
+    assert inside >= 106
 
 
 def test_half_the_error_wins_and_missing_samples_do_not_count() -> None:
