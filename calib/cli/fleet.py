@@ -1,0 +1,163 @@
+"""`calib fleet`: many rigs from a manifest; a table, a page, and each rig's own results out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from calib.cli.common import JsonOption, document, narrate, progress_bar, say, table
+from calib.errors import EXIT_POOR
+
+if TYPE_CHECKING:
+    from calib.fleet.running import Counts
+    from calib.fleet.summary import FleetSummary
+
+__all__ = ["RetriesOption", "SchedulerOption", "WorkersOption", "fleet"]
+
+SchedulerOption = Annotated[
+    str | None,
+    typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler to work on, as tcp://host:8786."),
+]
+WorkersOption = Annotated[
+    int | None,
+    typer.Option("--workers", min=1, max=512, help="Processes on this machine. [default: one per processor]"),
+]
+RetriesOption = Annotated[
+    int,
+    typer.Option("--retries", min=0, max=10, help="How often a rig is tried again after its process died."),
+]
+
+
+def fleet(
+    manifest: Annotated[
+        Path,
+        typer.Argument(help="CSV or YAML with name, path (or URL) and perhaps serial of each rig."),
+    ],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Folder for the results; a later run goes on from it.")
+    ],
+    scheduler: SchedulerOption = None,
+    workers: WorkersOption = None,
+    retries: RetriesOption = 2,
+    pages: Annotated[bool, typer.Option("--pages", help="Make the page of each rig as well.")] = False,
+    prior: Annotated[
+        Path | None,
+        typer.Option(
+            "--prior",
+            help="Results of an earlier fleet, from which each rig's camera may borrow: camera-prior.yaml "
+            "beside its own rig.yaml, which stays as it is.",
+        ),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Calibrate many rigs on many processes, and compare them with each other.
+
+    A rig that fails is a row and does not end the run; rigs whose results are there are not done again.
+    Exits 1 when a rig is not ok.
+    """
+    from calib.errors import UsageError
+    from calib.files import shown
+    from calib.fleet.cluster import connected
+    from calib.fleet.finishing import finish
+    from calib.fleet.manifest import read_manifest
+    from calib.fleet.prior import read_prior
+    from calib.fleet.running import run_fleet
+    from calib.fleet.store import opened_store
+    from calib.fleet.task import FleetOptions
+    from calib.report.fleet_page import PAGE, write_fleet_page
+    from calib.workers import processors
+
+    if scheduler is not None and workers is not None:
+        raise UsageError("--workers: an existing cluster has its own workers, give --scheduler alone")
+    known = read_manifest(manifest)
+    if known.ignored:
+        narrate(f"{shown(manifest)}: not used: {', '.join(known.ignored)}")
+    borrowed = None if prior is None else read_prior(prior)
+    for sentence in () if borrowed is None else borrowed.remarks:
+        narrate(sentence)
+    with opened_store(output, "calib fleet", ("fleet.parquet", PAGE)) as (store, interrupted):
+        if interrupted:
+            narrate("the last run here was interrupted; going on where it stopped")
+        with connected(scheduler, workers or processors(), store.scratch, retries) as cluster:
+            for sentence in cluster.remarks:
+                narrate(sentence)
+            with progress_bar("rigs") as progress:
+                counts = run_fleet(
+                    store, cluster, known, FleetOptions(pages=pages), retries, progress, narrate
+                )
+        summary, told = finish(store, known, borrowed)
+        write_fleet_page(output / PAGE, summary, told)
+    if as_json:
+        document("fleet", {"fleet": _as_json(summary, counts, told)})
+    else:
+        _tell(summary, counts, told, output)
+    narrate(f"page written to {output / PAGE}")
+    if any(verdict != "ok" for verdict in summary.verdicts):
+        raise typer.Exit(EXIT_POOR)
+
+
+def _as_json(summary: FleetSummary, counts: Counts, told: Any) -> dict[str, Any]:
+    return {
+        "rigs": summary.rigs,
+        "verdicts": summary.verdicts,
+        "as_before": counts.as_before,
+        "seconds": summary.seconds,
+        "stages": summary.stages,
+        "constants": [
+            {
+                "name": one.name,
+                "unit": one.unit,
+                "rigs": one.spread.count,
+                "median": one.spread.median,
+                "spread": one.spread.scale,
+                "between_rigs": one.spread.between,
+                "own_sigma": one.spread.own,
+                "outliers": one.standing_out,
+                "drift_per_serial": None if one.drift is None else one.drift.slope,
+                "drift_sigma": None if one.drift is None else one.drift.sigma,
+                "drifts": one.drifts,
+            }
+            for one in summary.constants
+        ],
+        "to_look_at": [
+            {"name": look.name, "serial": look.serial, "verdict": look.verdict, "z": look.z, "why": look.why}
+            for look in summary.looks
+        ],
+        "prior": None if told is None else told.as_json(),
+    }
+
+
+_MOST_TOLD = 20
+
+
+def _tell(summary: FleetSummary, counts: Counts, told: Any, output: Path) -> None:
+    from calib.files import shown
+
+    words = ", ".join(f"{count} {verdict}" for verdict, count in summary.verdicts.items())
+    say(f"{summary.rigs} rigs: {words}" + (f"; {counts.as_before} as before" if counts.as_before else ""))
+    rows = []
+    for one in summary.constants:
+        if one.standing_out or one.drifts:
+            drift = "" if one.drift is None else f"{one.drift.slope:.3g} ± {one.drift.sigma:.2g}"
+            rows.append(
+                [
+                    one.name,
+                    f"{one.spread.median:.6g}",
+                    f"{one.spread.scale:.2g}",
+                    str(one.standing_out),
+                    drift if one.drifts else "",
+                ]
+            )
+    if rows:
+        for line in table(["constant", "median", "spread", "outliers", "drift per number"], rows):
+            say(line)
+    for look in summary.looks[:_MOST_TOLD]:
+        say(f"look at {look.name}: {look.verdict}{', ' if look.why else ''}{look.why}")
+    if summary.to_look_at > _MOST_TOLD:
+        say(f"... and {summary.to_look_at - _MOST_TOLD} more, in the page")
+    if told is not None:
+        for sentence in told.sentences():
+            say(sentence)
+    say(f"{shown(output)}: fleet.parquet, fleet.html and a folder for each rig in rigs/")

@@ -1,0 +1,115 @@
+"""`calib sweep`: controllers, scenarios and filters over plants and gains; a table and a page out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from calib.cli.common import JsonOption, document, narrate, progress_bar, say, table
+from calib.cli.fleet import RetriesOption, SchedulerOption, WorkersOption
+from calib.errors import EXIT_POOR
+
+if TYPE_CHECKING:
+    from calib.fleet.sweeping import Point, SweepSummary
+
+__all__ = ["sweep"]
+
+
+def sweep(
+    spec: Annotated[Path, typer.Argument(help="YAML with base, grid, draws and measure.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Folder for the results; a later run goes on from it.")
+    ],
+    scheduler: SchedulerOption = None,
+    workers: WorkersOption = None,
+    retries: RetriesOption = 2,
+    as_json: JsonOption = False,
+) -> None:
+    """Run a controller, a scenario or a filter on the simulated rig over many plants and settings.
+
+    The first measure decides; the least of it is best, or what is near the value that was asked for. A case
+    that fails is a row. Exits 1 when one has failed.
+    """
+    from calib.errors import UsageError
+    from calib.files import shown
+    from calib.fleet.cluster import connected
+    from calib.fleet.store import opened_store
+    from calib.fleet.sweeping import run_sweep, summarise_sweep
+    from calib.fleet.sweepspec import read_sweep
+    from calib.report.sweep_page import PAGE, write_sweep_page
+    from calib.workers import processors
+
+    if scheduler is not None and workers is not None:
+        raise UsageError("--workers: an existing cluster has its own workers, give --scheduler alone")
+    known = read_sweep(spec)
+    with opened_store(output, "calib sweep", ("sweep.parquet", PAGE)) as (store, interrupted):
+        if interrupted:
+            narrate("the last run here was interrupted; going on where it stopped")
+        with connected(scheduler, workers or processors(), store.scratch, retries) as cluster:
+            for sentence in cluster.remarks:
+                narrate(sentence)
+            with progress_bar("cases") as progress:
+                before = run_sweep(store, cluster, known, retries, progress)
+        summary = summarise_sweep(store, known, before)
+        write_sweep_page(output / PAGE, known, summary)
+    if as_json:
+        document("sweep", {"sweep": _as_json(summary)})
+    else:
+        _tell(summary)
+        say(f"{shown(output)}: sweep.parquet and sweep.html")
+    narrate("simulated: a model of a rig, not the rig")
+    if summary.failed:
+        raise typer.Exit(EXIT_POOR)
+
+
+def _as_json(summary: SweepSummary) -> dict[str, Any]:
+    def told(point: Point) -> dict[str, Any]:
+        return {
+            "point": point.number,
+            "parameters": dict(point.values),
+            "median": point.median,
+            "worst": point.worst,
+            "draws": point.draws,
+            "measures": dict(point.measures),
+        }
+
+    return {
+        "cases": summary.cases,
+        "failed": summary.failed,
+        "as_before": summary.as_before,
+        "why": summary.why,
+        "measure": summary.measure,
+        "best": [told(point) for point in summary.best],
+        "worst": [told(point) for point in summary.worst],
+    }
+
+
+def _tell(summary: SweepSummary) -> None:
+    parts = [f"{summary.cases} cases"]
+    if summary.as_before:
+        parts.append(f"{summary.as_before} as before")
+    if summary.failed:
+        parts.append(f"{summary.failed} failed, the first: {summary.why}")
+    say("; ".join(parts))
+    for title, points in (("best", summary.best[:5]), ("worst", summary.worst[:5])):
+        if not points:
+            continue
+        names = [name for name, _ in points[0].values]
+        head = [title, *names, f"{summary.measure}, median", "worst draw"]
+        rows = [
+            [
+                f"#{point.number}",
+                *(_text(value) for _, value in point.values),
+                f"{point.median:.4g}",
+                f"{point.worst:.4g}",
+            ]
+            for point in points
+        ]
+        for line in table(head, rows):
+            say(line)
+
+
+def _text(value: Any) -> str:
+    return f"{value:.5g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,243 @@
+"""`calib fleet` as a person types it: what is refused, and what survives."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fleet_rigs import write_fleet, write_manifest
+
+from calib.fleet import cluster
+from calib.fleet.store import opened_store
+
+pytest.importorskip("distributed")
+
+COMMAND = (sys.executable, "-c", "from calib.cli.main import main; main()")
+
+
+def _manifest(tmp_path: Path, rows: str) -> Path:
+    path = tmp_path / "m.csv"
+    path.write_text("name,path\n" + rows)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        ("", "names no rigs"),
+        ("a,x\na,y\n", "the name 'a' is that of line 2"),
+        ("../a,x\n", "line 2: the name '../a' begins with a dot"),
+    ],
+)
+def test_a_manifest_that_is_none(calib: Callable[..., Any], tmp_path: Path, rows: str, said: str) -> None:
+    ended = calib("fleet", _manifest(tmp_path, rows), "-o", tmp_path / "out")
+    assert ended.code == 3 and said in ended.sentence
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_cannot_be(calib: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    manifest = _manifest(tmp_path, "a,x\n")
+
+    def ended(*words: object) -> tuple[int, str]:
+        found = calib("fleet", *words)
+        return found.code, found.sentence
+
+    code, said = ended(tmp_path / "none.csv", "-o", tmp_path / "out")
+    assert code == 3 and "none.csv: cannot be read" in said
+    code, said = ended(manifest, "-o", manifest / "out")
+    assert code == 3 and "is a file" in said
+    code, said = ended(manifest, "-o", tmp_path / "out", "--prior", tmp_path)
+    assert code == 3 and "has no fleet.parquet" in said
+    code, said = ended(manifest, "-o", tmp_path / "out", "--scheduler", "tcp://x:1", "--workers", "2")
+    assert code == 2 and "--workers" in said
+    with opened_store(tmp_path / "taken", "calib fleet", ()):
+        code, said = ended(manifest, "-o", tmp_path / "taken")
+    assert code == 3 and "another calib fleet" in said and "is at work there" in said
+    monkeypatch.setattr(cluster, "_CONNECT_S", 0.5)
+    with socket.socket() as silent:
+        silent.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        code, said = ended(manifest, "-o", tmp_path / "out", "--scheduler", address)
+    assert code == 3 and said == f"{address}: no scheduler answers there within 0.5 s"
+
+
+@pytest.fixture(scope="module")
+def rigs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Path]]:
+    """Six rigs and their manifest, with one folder that is not there and one without a picture in it."""
+    root = tmp_path_factory.mktemp("rigs")
+    folders = write_fleet(root, 6, cameras=2)
+    (root / "bad" / "images").mkdir(parents=True)
+    (root / "bad" / "images" / "a.png").write_bytes(b"no picture")
+    return write_manifest(root / "m.csv", [*folders, root / "bad", root / "gone"], "radial2"), folders
+
+
+def _results(out: Path) -> dict[str, bytes]:
+    return {path.parent.name: path.read_bytes() for path in sorted(out.glob("rigs/*/rig.yaml"))}
+
+
+def _done(out: Path) -> int:
+    return len(list((out / ".fleet" / "outcomes").glob("*.json")))
+
+
+def _workers(parent: int) -> list[int]:
+    found = subprocess.run(
+        ["ps", "-o", "pid=,args=", "--ppid", str(parent)], capture_output=True, text=True, check=False
+    )
+    return [int(line.split()[0]) for line in found.stdout.splitlines() if "spawn_main" in line]
+
+
+@contextmanager
+def _started(environment: dict[str, str], *words: object) -> Iterator[subprocess.Popen[str]]:
+    process = subprocess.Popen(
+        [*COMMAND, "fleet", *map(str, words)],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def _until(true: Callable[[], bool], process: subprocess.Popen[str]) -> None:
+    while not true():
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.02)
+
+
+def _gone(process: int) -> bool:
+    try:
+        os.kill(process, signal.SIG_DFL)
+    except ProcessLookupError:
+        return True
+    state = Path(f"/proc/{process}/stat")
+    return state.exists() and state.read_text().rpartition(")")[2].split()[0] == "Z"
+
+
+@pytest.mark.slow
+def test_killed_worker_killed_client_and_single_runs_end_in_the_same(
+    rigs: tuple[Path, list[Path]], environment: dict[str, str], tmp_path: Path
+) -> None:
+    manifest, folders = rigs
+    out, other = tmp_path / "out", tmp_path / "other"
+    # A worker is killed on the way: nothing is lost.
+    with _started(environment, manifest, "-o", out, "--workers", 2, "--json") as process:
+        _until(lambda: _done(out) >= 2, process)
+        os.kill(_workers(process.pid)[0], signal.SIGKILL)
+        said, told = process.communicate()
+    assert process.returncode == 1, told
+    found = json.loads(said)["fleet"]
+    assert found["rigs"] == 8 and found["verdicts"]["failed"] == 2 and "lost" not in found["verdicts"]
+    looks = {look["name"]: look["why"] for look in found["to_look_at"]}
+    assert "is not there, expected the rig's folder" in looks["gone"] and "a.png" in looks["bad"]
+    whole = _results(out)
+    assert set(whole) >= {folder.name for folder in folders}
+    assert (out / "fleet.parquet").stat().st_size > 1000
+    page = (out / "fleet.html").read_text()
+    assert "Fleet of 8 rigs" in page and "gone</td>" in page
+    # The same bytes as those of single runs, each in a process of its own.
+    for folder in folders[:2]:
+        rig = tmp_path / f"{folder.name}.yaml"
+        for words in (
+            ("intrinsics", str(folder / "images"), "--model", "radial2"),
+            ("distortion",),
+        ):
+            subprocess.run(
+                [*COMMAND, *words, "--rig", str(rig)], env=environment, capture_output=True, check=False
+            )
+        assert rig.read_bytes() == whole[folder.name]
+    # The client and its scheduler are killed: the workers follow, and the next run goes on.
+    with _started(environment, manifest, "-o", other, "--workers", 2) as process:
+        _until(lambda: _done(other) >= 2, process)
+        children = _workers(process.pid)
+        process.kill()
+        process.wait()
+    until = time.monotonic() + 30.0
+    while not all(map(_gone, children)) and time.monotonic() < until:
+        time.sleep(0.1)
+    assert all(map(_gone, children))
+    before = {path: path.stat().st_mtime_ns for path in other.glob("rigs/*/rig.yaml")}
+    with _started(environment, manifest, "-o", other, "--workers", 1, "--json") as process:
+        said, told = process.communicate()
+    assert process.returncode == 1 and "interrupted" in told
+    assert json.loads(said)["fleet"]["as_before"] >= 2
+    assert _results(other) == whole
+    assert all(path.stat().st_mtime_ns == when for path, when in before.items())
+    assert not (other / ".fleet" / "work").exists()
+    # One rig's pictures change, another result was edited: those two are done again.
+    copy = tmp_path / "rigs"
+    shutil.copytree(manifest.parent, copy)
+    manifest = write_manifest(copy / "m.csv", [copy / f.name for f in folders], "radial2")
+    (copy / folders[0].name / "images" / "view5.png").unlink()
+    (other / "rigs" / folders[1].name / "rig.yaml").write_text("edited")
+    with _started(environment, manifest, "-o", other, "--workers", 1, "--json") as process:
+        said, _ = process.communicate()
+    assert json.loads(said)["fleet"]["as_before"] == 4
+    again = _results(other)
+    assert again[folders[1].name] == whole[folders[1].name]
+    assert again[folders[0].name] != whole[folders[0].name]
+
+
+def _dask(environment: dict[str, str], *words: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "distributed.cli." + words[0], *words[1:]],
+        env={**environment, "OPENBLAS_NUM_THREADS": "1"},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+
+
+@pytest.mark.slow
+def test_an_existing_scheduler_that_is_killed(
+    rigs: tuple[Path, list[Path]], environment: dict[str, str], tmp_path: Path
+) -> None:
+    manifest, folders = rigs
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    address, out = f"tcp://127.0.0.1:{port}", tmp_path / "out"
+    scheduler_words = ("dask_scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard")
+    worker_words = ("dask_worker", address, "--nthreads", "1", "--local-directory", str(tmp_path / "w"))
+    running = [_dask(environment, *scheduler_words), _dask(environment, *worker_words)]
+    try:
+        with _started(environment, manifest, "-o", out, "--scheduler", address) as process:
+            _until(lambda: _done(out) >= 2, process)
+            running[0].kill()
+            _, told = process.communicate(timeout=120)
+        assert process.returncode == 3
+        last = told.strip().splitlines()[-1]
+        assert last.startswith(f"calib: the scheduler at {address} does not answer any more")
+        assert "Traceback" not in told
+        kept = _done(out)
+        running.append(_dask(environment, *scheduler_words))
+        running.append(_dask(environment, *worker_words))
+        with _started(environment, manifest, "-o", out, "--scheduler", address, "--json") as process:
+            said, told = process.communicate(timeout=300)
+        assert process.returncode == 1, told
+        found = json.loads(said)["fleet"]
+        assert found["as_before"] >= kept - 2 and found["rigs"] == 8
+        assert set(_results(out)) >= {folder.name for folder in folders}
+    finally:
+        for one in running:
+            one.terminate()
+        for one in running:
+            try:
+                one.wait(20)
+            except subprocess.TimeoutExpired:
+                one.kill()
+                one.wait()

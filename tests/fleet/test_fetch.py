@@ -1,0 +1,122 @@
+"""Folders from URLs: what is fetched, what is refused, and what is tried again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from calib.errors import BadInputError
+from calib.fleet import fetch
+from calib.fleet.fetch import local_folder
+
+fsspec = pytest.importorskip("fsspec")
+
+
+@pytest.fixture
+def memory() -> Iterator[Any]:
+    system = fsspec.filesystem("memory")
+    system.store.clear()
+    system.pseudo_dirs[:] = [""]
+    yield system
+    system.store.clear()
+
+
+@pytest.fixture(autouse=True)
+def _no_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fetch.time, "sleep", lambda _: None)
+
+
+def test_what_belongs_to_a_rig_is_fetched_and_no_more(memory: Any, tmp_path: Path) -> None:
+    for name in ("images/a.png", "images/board.yaml", "images/plane/p.jpg", "logs/x.csv", "rig.yaml"):
+        memory.pipe(f"/rig/{name}", name.encode())
+    for name in ("images/run.sh", "secret/key.csv", "images/deep/er/b.png"):
+        memory.pipe(f"/rig/{name}", b"no")
+    root = local_folder("memory://rig", tmp_path / "here", 1)
+    found = {path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file()}
+    assert found == {"images/a.png", "images/board.yaml", "images/plane/p.jpg", "logs/x.csv", "rig.yaml"}
+    assert (root / "logs/x.csv").read_bytes() == b"logs/x.csv"
+
+
+def test_a_path_is_itself(tmp_path: Path) -> None:
+    assert local_folder(str(tmp_path), tmp_path / "scratch", 1) == tmp_path
+    assert not (tmp_path / "scratch").exists()
+    with pytest.raises(BadInputError, match="is not there, expected the rig's folder"):
+        local_folder(str(tmp_path / "none"), tmp_path / "scratch", 1)
+
+
+def test_what_is_too_large_is_refused(memory: Any, tmp_path: Path) -> None:
+    memory.pipe("/rig/images/a.png", b"x" * 600)
+    memory.pipe("/rig/images/b.png", b"x" * 600)
+    with pytest.raises(BadInputError, match="larger than"):
+        local_folder("memory://rig", tmp_path / "here", 1, 1000)
+
+
+@pytest.mark.parametrize("name", ["a/../../evil.png", "a\\..\\..\\evil.png", "/etc/evil.png"])
+def test_names_that_lead_out_stay_in(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class System:
+        def ls(self, place: str, **_: Any) -> list[dict[str, str]]:
+            if place.endswith("images"):
+                return [{"name": name, "type": "file"}]
+            return []
+
+        def open(self, remote: str, mode: str) -> Any:
+            assert remote == name
+            return (tmp_path / "source").open(mode)
+
+    (tmp_path / "source").write_bytes(b"x")
+    monkeypatch.setattr(fsspec.core, "url_to_fs", lambda url: (System(), "/rig"))
+    root = local_folder("ftp://host/rig", tmp_path / "deep" / "er" / "here", 1)
+    assert list(tmp_path.rglob("evil.png")) == [root / "images" / "evil.png"]
+
+
+@pytest.mark.parametrize("name", ["-rf.png", ".hidden.png", "a\nb.png"])
+def test_names_that_are_no_names_are_refused(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class System:
+        def ls(self, *_: Any, **__: Any) -> list[dict[str, str]]:
+            return [{"name": f"/rig/{name}", "type": "file"}]
+
+    monkeypatch.setattr(fsspec.core, "url_to_fs", lambda url: (System(), "/rig"))
+    with pytest.raises(BadInputError, match="has a file with the name"):
+        local_folder("ftp://host/rig", tmp_path / "here", 1)
+
+
+class _Flaky:
+    def __init__(self, failures: int, error: Exception) -> None:
+        self.failures, self.error, self.calls = failures, error, 0
+
+    def ls(self, *_: Any, **__: Any) -> list[dict[str, str]]:
+        self.calls += 1
+        if self.calls <= self.failures:
+            raise self.error
+        return []
+
+
+@pytest.mark.parametrize(
+    ("failures", "error", "said", "calls"),
+    [
+        (99, ConnectionResetError("gone"), "could not be fetched in 3 attempts: gone", 3),
+        (99, PermissionError("locked"), "cannot be read: locked", 1),
+        (99, FileNotFoundError("none"), "cannot be read: none", 1),
+        (2, TimeoutError("slow"), "holds no pictures and no logs", 7),
+    ],
+)
+def test_what_may_pass_is_tried_again(
+    failures: int, error: Exception, said: str, calls: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    system = _Flaky(failures, error)
+    monkeypatch.setattr(fsspec.core, "url_to_fs", lambda url: (system, "/rig"))
+    with pytest.raises(BadInputError, match=said) as told:
+        local_folder("ftp://me:secret@host/rig?key=1", tmp_path / "here", 3)
+    # Two failed attempts and four folders with nothing in them; the first one is asked again each time.
+    assert system.calls == calls - (error.args == ("slow",))
+    assert "secret" not in str(told.value) and "key" not in str(told.value)
+
+
+def test_a_scheme_that_nobody_knows(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="is no URL that can be read"):
+        local_folder("nosuchscheme://x/y", tmp_path / "here", 1)

@@ -1,0 +1,121 @@
+"""A sweep in this process: all cases, what is kept, and the best and worst points."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.errors import BadInputError
+from calib.fleet import engine, sweeping
+from calib.fleet.cluster import Cluster
+from calib.fleet.rows import Table, column, texts
+from calib.fleet.store import Store, opened_store
+from calib.fleet.sweeping import run_sweep, summarise_sweep
+from calib.fleet.sweepspec import Base, Case, SweepSpec
+from calib.fleet.sweeptask import CaseResult
+from calib.fleet.task import program
+
+distributed = pytest.importorskip("distributed")
+pytest.importorskip("pyarrow")
+
+pytestmark = pytest.mark.filterwarnings("default")
+"""What Dask warns of is not ours."""
+
+SPEC = SweepSpec(
+    Base("scenario", "orientation", "", "", "truth", 1.0, "auto"),
+    (("scenario.Kp", (1.0, 2.0, 3.0)), ("scenario.controller", ("p", "pid"))),
+    (("actuator.mass_kg", ("uniform", 0.04, 0.06)),),
+    4,
+    0,
+    ("error",),
+)
+
+
+def bowl(base: Base, cases: tuple[Case, ...], seed: int, scratch: str) -> list[CaseResult]:
+    """An error that is least at Kp = 2 with pid; the third draw fails there."""
+    out = []
+    for case in cases:
+        values = dict(case.values)
+        kp, pid = float(values["scenario.Kp"]), values["scenario.controller"] == "pid"
+        error = (kp - 2.0) ** 2 + (0.0 if pid else 0.5) + 0.01 * case.draw
+        fails = case.draw == 3 and kp == 2.0 and pid
+        out.append(CaseResult(case.number, {} if fails else {"error": error, "other": kp}, "oh" * fails, 0.1))
+    return out
+
+
+@pytest.fixture(scope="module")
+def here() -> Iterator[Cluster]:
+    options = {
+        "n_workers": 1,
+        "threads_per_worker": 1,
+        "processes": False,
+        "dashboard_address": "127.0.0.1:0",
+    }
+    with distributed.LocalCluster(**options) as cluster, distributed.Client(cluster) as client:
+        engine._settled.set()
+        yield Cluster(client, "", program())
+
+
+@pytest.fixture(autouse=True)
+def _small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sweeping, "run_cases", bowl)
+    monkeypatch.setattr(sweeping, "BUNDLE", 5)
+
+
+def _opened(tmp_path: Path) -> Iterator[Store]:
+    with opened_store(tmp_path / "out", "calib sweep", ()) as (store, _):
+        yield store
+
+
+def test_best_worst_and_resumed(here: Cluster, tmp_path: Path) -> None:
+    for store in _opened(tmp_path):
+        assert run_sweep(store, here, SPEC, 1) == 0
+        found = summarise_sweep(store, SPEC, 0)
+        assert (found.cases, found.failed, found.why, found.measure) == (24, 1, "oh", "error")
+        best = found.best[0]
+        assert dict(best.values) == {"scenario.Kp": 2.0, "scenario.controller": "pid"}
+        assert (best.draws, best.median, best.worst) == (3, pytest.approx(0.01), pytest.approx(0.02))
+        assert dict(best.measures) == {"error": pytest.approx(0.01)}
+        assert found.best[0].loss < found.best[-1].loss and not found.worst
+        with Table(tmp_path / "out" / "sweep.parquet") as table:
+            assert table.rows == 24
+            np.testing.assert_equal(column(table, "case"), np.arange(24.0))
+            assert texts(table, "scenario.controller")[:8] == ["p"] * 4 + ["pid"] * 4
+            assert sum(bool(s) for s in texts(table, "sentence")) == 1
+            masses = column(table, "actuator.mass_kg").reshape(6, 4)
+            assert (masses == masses[0]).all()
+        # One bundle is lost, one is of another sweep: both are done again, and no others.
+        files = sorted((tmp_path / "out" / ".fleet" / "outcomes").glob("bundle*.json"))
+        assert len(files) == 5
+        files[0].unlink()
+        told = json.loads(files[2].read_text())
+        files[2].write_text(json.dumps({**told, "digest": "x"}))
+        assert run_sweep(store, here, SPEC, 1) == 14
+        assert summarise_sweep(store, SPEC, 14).best == found.best
+
+
+def test_nearest_to_a_value(here: Cluster, tmp_path: Path) -> None:
+    spec = replace(SPEC, near=1.0)
+    for store in _opened(tmp_path):
+        run_sweep(store, here, spec, 1)
+        best = summarise_sweep(store, spec, 0).best[0]
+        assert dict(best.values)["scenario.controller"] == "pid" and dict(best.values)["scenario.Kp"] != 2.0
+
+
+def test_draws_alone_and_a_measure_that_is_not_there(here: Cluster, tmp_path: Path) -> None:
+    spec = replace(SPEC, grid=(("scenario.Kp", (2.0,)), ("scenario.controller", ("p",))), count=12)
+    for store in _opened(tmp_path):
+        run_sweep(store, here, spec, 1)
+        found = summarise_sweep(store, spec, 0)
+        assert len(found.best) == 1 and found.best[0].draws == 12
+        assert [name for name, _ in found.clouds] == ["scenario.Kp", "actuator.mass_kg"]
+        assert len(found.clouds[1][1]) == 12
+        with pytest.raises(BadInputError, match="nonsense was not measured, expected some of error, other"):
+            summarise_sweep(store, replace(spec, measures=("nonsense",)), 0) if run_sweep(
+                store, here, replace(spec, measures=("nonsense",)), 1
+            ) == 0 else None
