@@ -49,6 +49,8 @@ _LIBRARIES = (
 
 _EXTRAS = (
     ("pyarrow", "pyarrow", "logs in Parquet: calib[logs]"),
+    ("mcap", "mcap", "logs and states in MCAP: calib[logs]"),
+    ("rosbags", "rosbags", "logs in ROS bags: calib[logs]"),
     ("pyserial", "serial", "calib record: calib[serial]"),
     ("ahrs", "ahrs", "filters of others in calib imu drift: calib[peers]"),
     ("imufusion", "imufusion", "filters of others in calib imu drift: calib[peers]"),

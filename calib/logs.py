@@ -9,7 +9,8 @@ that begin with # are passed over. A cell that says nan or inf counts as blank; 
 Nothing is said here about whether the numbers make sense; `check_time` is there for verbs that need
 time to run forward.
 
-Reading goes in blocks, so that a log longer than the memory can be streamed (`iter_log`).
+Reading goes in blocks, so that a log longer than the memory can be streamed (`iter_log`); `read_log`
+holds the whole and refuses more than 200 million cells.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ __all__ = [
     "Log",
     "check_time",
     "iter_log",
+    "iter_rows",
     "log_text",
     "read_log",
     "write_log",
@@ -70,6 +72,8 @@ ROWS_MISSING = "; their rows count as missing"
 _BLOCK_BYTES = 1 << 20
 _LONGEST_LINE = 1 << 16
 _MAX_COLUMNS = 1000
+_MOST_CELLS = 200_000_000
+"""Numbers that `read_log` takes, 1.6 GB; blocks have no such limit."""
 
 
 @dataclass(frozen=True)
@@ -250,27 +254,31 @@ def _header(stream: BinaryIO, source: str) -> tuple[_Layout, int]:
         raise BadInputError(f"{where}: is not comma-separated: {error}") from error
 
 
+def iter_rows(stream: BinaryIO, source: str) -> Iterator[Log]:
+    """Blocks of the rows of a CSV log that is open; raises as `iter_log`."""
+    layout, line = _header(stream, source)
+    rest = b""
+    while data := stream.read(_BLOCK_BYTES):
+        cut = data.rfind(b"\n") + 1
+        if cut == 0:
+            rest += data
+            if len(rest) > 2 * _BLOCK_BYTES:
+                raise BadInputError(f"{source}, line {line}: does not end, expected a text file")
+            continue
+        block, line = _block(layout, rest + data[:cut], line)
+        rest = data[cut:]
+        if len(block):
+            yield block
+    if rest.strip():
+        yield _last(layout, rest, line)
+
+
 def _iter_csv(path: Path) -> Iterator[Log]:
-    source = shown(path)
     try:
         with path.open("rb") as stream:
-            layout, line = _header(stream, source)
-            rest = b""
-            while data := stream.read(_BLOCK_BYTES):
-                cut = data.rfind(b"\n") + 1
-                if cut == 0:
-                    rest += data
-                    if len(rest) > 2 * _BLOCK_BYTES:
-                        raise BadInputError(f"{source}, line {line}: does not end, expected a text file")
-                    continue
-                block, line = _block(layout, rest + data[:cut], line)
-                rest = data[cut:]
-                if len(block):
-                    yield block
-            if rest.strip():
-                yield _last(layout, rest, line)
+            yield from iter_rows(stream, shown(path))
     except OSError as error:
-        raise BadInputError(f"{source}: cannot be read: {error.strerror or error}") from error
+        raise BadInputError(f"{shown(path)}: cannot be read: {error.strerror or error}") from error
 
 
 def _last(layout: _Layout, text: bytes, line: int) -> Log:
@@ -288,7 +296,7 @@ def _iter_parquet(path: Path) -> Iterator[Log]:
     except ImportError as error:
         raise BadInputError(f"{source}: reading Parquet needs pyarrow; install the extra logs") from error
     try:
-        file = parquet.ParquetFile(path)
+        file = parquet.ParquetFile(path, pre_buffer=False)
         layout = _layout(source, 1, file.schema_arrow.names)
         first = 1
         for batch in file.iter_batches(batch_size=65536, columns=list(layout.known)):
@@ -313,7 +321,8 @@ def _parquet_column(layout: _Layout, column: Any, name: str) -> FloatArray:
 def iter_log(path: Path, topics: Path | None = None) -> Iterator[Log]:
     """Blocks of a log in turn, each a `Log` of some ten thousand rows at most; a block may have none.
 
-    CSV, Parquet, or a bag (see `calib.log_bags`), of which `topics` may say what is where.
+    CSV, Parquet, a bag (see `calib.log_bags`), of which `topics` may say what is where, or what a board with
+    the sketch sent (`calib.log_serial`).
 
     Raises
     ------
@@ -322,17 +331,32 @@ def iter_log(path: Path, topics: Path | None = None) -> Iterator[Log]:
         that is no number: with the number of the line.
     """
     from calib.log_bags import is_bag, iter_bag
+    from calib.log_serial import STREAMS, iter_stream
 
     if is_bag(path):
         return iter_bag(path, topics)
     if topics is not None:
         raise BadInputError(f"{shown(path)}: has columns, expected a bag where topics are given")
-    return _iter_parquet(path) if path.suffix.lower() == ".parquet" else _iter_csv(path)
+    ending = path.suffix.lower()
+    if ending in STREAMS:
+        return iter_stream(path)
+    return _iter_parquet(path) if ending == ".parquet" else _iter_csv(path)
 
 
 def read_log(path: Path, topics: Path | None = None) -> Log:
-    """A whole log. Raises `BadInputError` as `iter_log`, and for a log without rows."""
-    blocks = list(iter_log(path, topics))
+    """A whole log, of at most 200 million cells that are read.
+
+    Raises `BadInputError` as `iter_log`, and for a log without rows or with more cells.
+    """
+    blocks, cells = list[Log](), 0
+    for block in iter_log(path, topics):
+        blocks.append(block)
+        cells += len(block) * (2 + len(block.columns))
+        if cells > _MOST_CELLS:
+            raise BadInputError(
+                f"{shown(path)}: has more than {_MOST_CELLS // 1_000_000} million cells, which is more than "
+                "is read at once; cut it into parts"
+            )
     if not sum(len(block) for block in blocks):
         raise BadInputError(f"{shown(path)}: has a header but no rows")
     first = blocks[0]
@@ -352,14 +376,12 @@ def log_text(log: Log) -> str:
 
     The columns come in the order of `COLUMNS`. The same log gives the same text.
     """
+    from calib.textcells import GENERAL, TIME, table_bytes
+
     names = [name for name in COLUMNS if name in log.columns]
-    out = io.StringIO()
-    out.write(",".join(["t_s", *names]) + "\n")
-    columns = [log.columns[name].tolist() for name in names]
-    for i, t in enumerate(log.t_s.tolist()):
-        cells = [f"{value:.9g}" if value == value else "" for value in (column[i] for column in columns)]
-        out.write(f"{t:.6f},{','.join(cells)}\n" if cells else f"{t:.6f}\n")
-    return out.getvalue()
+    values = np.column_stack([log.t_s, *(log.columns[name] for name in names)])
+    kinds = np.array([TIME] + [GENERAL] * len(names))
+    return ",".join(["t_s", *names]) + "\n" + table_bytes(values, kinds).decode()
 
 
 def _parquet_bytes(log: Log, path: Path) -> bytes:

@@ -22,11 +22,12 @@ from calib.estimator.noise import jitter_px
 from calib.estimator.setup import FLAGS, OUT, Rows, Setup
 from calib.files import shown
 from calib.logs import Log
+from calib.relay import ahead, behind
 from calib.replaying import baseline_setup, blocks, periods, rows_of, setup_from_rig, truth_of
 from calib.rig import Rig
 from calib.statesfile import STATES, StatesFile, states_writer
 
-__all__ = ["MODELS", "Replayed", "Trace", "prepared", "replay_log"]
+__all__ = ["MODELS", "Replayed", "Trace", "drive_for", "estimator_of", "prepared", "replay_log"]
 
 MODELS = ("auto", "kinematic", "driven")
 
@@ -36,6 +37,8 @@ _NIS_FACTOR = 2.0
 _GATED_SHARE = 0.05
 _INSIDE_SHARE = 0.7
 _CORRELATED = 0.6
+_SMOOTHED_ROWS = 1_000_000
+"""The smoother keeps 1.6 kB for each row with the kinematic model alone."""
 
 Progress = Callable[[int, int], None]
 
@@ -106,9 +109,11 @@ class Replayed:
         return out | {"compared": self.others}
 
 
-def prepared(path: Path, rig: Rig, rig_path: Path) -> tuple[Setup, Any, Iterator[Log], list[str]]:
+def prepared(
+    path: Path, rig: Rig, rig_path: Path, topics: Path | None = None
+) -> tuple[Setup, Any, Iterator[Log], list[str]]:
     """Set-up, periods, all blocks of the log, and sentences on what is assumed."""
-    stream = blocks(path)
+    stream = blocks(path, topics)
     first = next(stream)
     found = periods(first)
     setup, said = setup_from_rig(rig, rig_path, found)
@@ -132,6 +137,7 @@ def replay_log(
     progress: Progress | None = None,
     traced: bool = False,
     model: str = "auto",
+    topics: Path | None = None,
 ) -> Replayed:
     """Run one log, block by block, and write its states; `smooth` needs the whole log in memory.
 
@@ -140,7 +146,7 @@ def replay_log(
 
     Raises `BadInputError` for a log or a rig that cannot be used.
     """
-    setup, found, stream, said = prepared(path, rig, rig_path)
+    setup, found, stream, said = prepared(path, rig, rig_path, topics)
     if estimator == "baseline" and not (found.camera and found.imu):
         raise BadInputError(f"{shown(path)}: the baseline needs camera and IMU, and the log lacks one")
     tally, trace = Tally(setup.bellows_radius_m), Trace()
@@ -148,20 +154,22 @@ def replay_log(
     baseline = Baseline(baseline_setup(setup, rig, rig_path, found)) if found.camera and found.imu else None
     first = next(stream)
     stream = chain([first], stream)
-    drive = _drive(model, first, found, rig, path, rig_path)
-    estimate = _estimate(setup, drive, model)
+    drive = drive_for(model, first, found, rig, path, rig_path)
+    estimate = estimator_of(setup, drive, model)
     shares = Shares()
-    size = path.stat().st_size
+    parts = path.iterdir() if path.is_dir() else (path,)
+    size = sum(part.stat().st_size for part in parts)
 
     def run(states: StatesFile | None) -> None:
         done = 0
-        for log in _told(stream, said):
-            rows, truth = rows_of(log, found.ticks), truth_of(log)
-            out = estimate(rows, log)
+
+        def finish(item: tuple[Log, Rows, FloatArray]) -> None:
+            log, rows, out = item
+            truth = truth_of(log)
             shares.add(out)
             tally.add(out, truth)
-            other = np.full((len(log), 3), np.nan)
-            if baseline is not None:
+            other = np.full((len(log), 3), np.nan) if traced else None
+            if baseline is not None and (truth is not None or traced or estimator == "baseline"):
                 held = baseline.run(rows)
                 other = held[:, 1:4]
                 baseline_tally.add(_as_out(held), truth)
@@ -172,14 +180,19 @@ def replay_log(
             if traced:
                 known = np.full((len(log), 3), np.nan) if truth is None else truth
                 trace.add(np.concatenate([out, other, known], axis=1))
-            done += len(log)
-            if progress is not None:
-                progress(min(done * 80, size), size)
+
+        with behind(finish) as hand:
+            for log in ahead(_told(stream, said)):
+                rows = rows_of(log, found.ticks)
+                hand((log, rows, estimate(rows, log)))
+                done += len(log)
+                if progress is not None:
+                    progress(min(done * 80, size), size)
 
     if smooth:
         from calib.smoothing import smooth_log
 
-        after, before, traces = smooth_log(setup, found, _told(stream, said), output, drive)
+        after, before, traces = smooth_log(setup, found, _bounded(_told(stream, said)), output, drive)
         shares.add(traces[0])
         result = _result(path, "smoothed", setup, found, after, before, said, traces[0], True)
         result = replace(result, driven_share=shares.value)
@@ -214,7 +227,7 @@ class Shares:
         return self.driven / self.rows if self.rows else None
 
 
-def _drive(model: str, first: Log, found: Any, rig: Rig, path: Path, rig_path: Path) -> Drive | None:
+def drive_for(model: str, first: Log, found: Any, rig: Rig, path: Path, rig_path: Path) -> Drive | None:
     if model == "kinematic":
         return None
     told = has_commands(first)
@@ -228,7 +241,7 @@ def _drive(model: str, first: Log, found: Any, rig: Rig, path: Path, rig_path: P
     return None
 
 
-def _estimate(setup: Setup, drive: Drive | None, model: str) -> Callable[[Rows, Log], FloatArray]:
+def estimator_of(setup: Setup, drive: Drive | None, model: str) -> Callable[[Rows, Log], FloatArray]:
     """The estimator as a function of rows and the log that they come from."""
     if drive is None:
         fused = Filter(setup)
@@ -255,6 +268,19 @@ def _told(stream: Iterator[Log], said: list[str]) -> Iterator[Log]:
         said.append(f"{cells} cells say nan or inf and count as blank")
     if truncated:
         said.append("the last line is cut short and left out")
+
+
+def _bounded(stream: Iterator[Log]) -> Iterator[Log]:
+    """The blocks of a log that may be held in memory as a whole."""
+    rows = 0
+    for log in stream:
+        rows += len(log)
+        if rows > _SMOOTHED_ROWS:
+            raise BadInputError(
+                f"{log.source}: has more than {_SMOOTHED_ROWS} rows, which smoothing would hold in memory; "
+                "leave --smooth out or cut the log"
+            )
+        yield log
 
 
 _COLUMNS = [OUT.index(name) for name in STATES]

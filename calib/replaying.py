@@ -143,10 +143,13 @@ def truth_of(log: Log) -> FloatArray | None:
     return np.stack([log.columns[name] for name in _TRUTH], axis=1)
 
 
-def blocks(path: Path) -> Iterator[Log]:
-    """Blocks with rows of a log. Raises `BadInputError` for one without rows, camera and IMU."""
+def blocks(path: Path, topics: Path | None = None) -> Iterator[Log]:
+    """Blocks with rows of a log; `topics` as for `iter_log`.
+
+    Raises `BadInputError` for one without rows, camera and IMU.
+    """
     rows, known = 0, False
-    for block in iter_log(path):
+    for block in iter_log(path, topics):
         if not known and not any(name in block.columns for name in _READINGS):
             raise BadInputError(
                 f"{shown(path)}: has neither camera nor IMU, expected columns as u_px, v_px or gz_radps"

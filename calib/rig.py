@@ -383,5 +383,8 @@ def finite_or_none(value: float) -> float | None:
 
 
 def hash_of(path: Path) -> str:
-    """SHA-256 of a file of any size."""
+    """SHA-256 of a file of any size, or of the names and files in a bag's folder."""
+    if (path / "metadata.yaml").is_file():
+        files = sorted(item for item in path.iterdir() if item.is_file())
+        return sha256("".join(f"{item.name!a} {file_sha256(item)}\n" for item in files).encode())
     return file_sha256(path)

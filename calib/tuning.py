@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 from calib.errors import BadInputError
-from calib.estimator.constant_gain import MOST_DELAY_TICKS, AxisGain, design, tick_noise
+from calib.estimator.constant_gain import tick_noise
+from calib.estimator.gains import MOST_DELAY_TICKS, design
 from calib.estimator.noise import tune
 from calib.estimator.setup import Setup
 from calib.files import shown
 from calib.replay import Progress, prepared
 from calib.replaying import rows_of
 from calib.rig import Rig
-from calib.rig_estimator import Estimator, EstimatorAxisGain, EstimatorGain, EstimatorLevel
+from calib.rig_estimator import Estimator, EstimatorGain, EstimatorLevel
 from calib.smoothing import joined
 
 __all__ = ["gain_section", "tuned_section"]
@@ -21,37 +23,24 @@ __all__ = ["gain_section", "tuned_section"]
 _MOST_ROWS = 20_000
 
 
-_PHI_LEVEL, _LENGTH_LEVEL = "swing", "drift"
-"""For the angle, which the gyroscope measures, and for the length, which only pictures show."""
 _TICK_HZ = 60.0
-
-
-def _axis(gain: AxisGain) -> EstimatorAxisGain:
-    return EstimatorAxisGain(
-        F=gain.F.tolist(), H=gain.H.tolist(), K=gain.K.tolist(), sigma=gain.sigma.tolist()
-    )
 
 
 def gain_section(setup: Setup, rate_hz: float) -> EstimatorGain | None:
     """Constant gains at a rate of ticks; None without pictures, or where they are more than 8 ticks late."""
-    ticks = round(max(float(setup.start.sensor[7]), 0.0) * rate_hz)
-    levels = {level.name: level for level in setup.process.levels}
-    if ticks > MOST_DELAY_TICKS or not setup.view.any() or not {_PHI_LEVEL, _LENGTH_LEVEL} <= set(levels):
+    delay_s = max(float(setup.start.sensor[7]), 0.0)
+    if delay_s * rate_hz > MOST_DELAY_TICKS or not setup.view.any():
         return None
-    noise = tick_noise(setup, levels[_PHI_LEVEL], rate_hz)
-    phi, length = design(levels[_PHI_LEVEL], levels[_LENGTH_LEVEL], noise, rate_hz, ticks)
-    return EstimatorGain(
-        rate_hz=rate_hz,
-        delay_ticks=ticks,
-        phi_level=_PHI_LEVEL,
-        length_level=_LENGTH_LEVEL,
-        phi=_axis(phi),
-        length=_axis(length),
-    )
+    lever_m = 0.5 * float(setup.start.head[1]) + float(setup.start.sensor[6])
+    return EstimatorGain(**asdict(design(tick_noise(setup), rate_hz, delay_s, lever_m)))
 
 
 def tuned_section(
-    logs: Sequence[Path], rig: Rig, rig_path: Path, progress: Progress | None = None
+    logs: Sequence[Path],
+    rig: Rig,
+    rig_path: Path,
+    progress: Progress | None = None,
+    topics: Path | None = None,
 ) -> Estimator:
     """Noise by maximum likelihood on the first 20,000 rows of each log.
 
@@ -59,7 +48,7 @@ def tuned_section(
     """
     every, first = [], None
     for path in logs:
-        setup, found, stream, _ = prepared(path, rig.model_copy(update={"estimator": None}), rig_path)
+        setup, found, stream, _ = prepared(path, rig.model_copy(update={"estimator": None}), rig_path, topics)
         if not (found.camera and found.imu):
             raise BadInputError(f"{shown(path)}: tuning needs camera and IMU, and the log lacks one")
         parts, count = [], 0

@@ -172,6 +172,15 @@ def test_a_line_without_an_end_is_not_read_into_memory(write, monkeypatch: pytes
         read_log(write("t_s,ax_mps2\n0,1\n" + "7" * 5000))
 
 
+def test_a_log_beyond_the_memory_is_refused_while_it_is_read(write, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write("t_s,u_px\n" + "".join(f"{k},1\n" for k in range(4000)))
+    monkeypatch.setattr(logs, "_BLOCK_BYTES", 1000)
+    monkeypatch.setattr(logs, "_MOST_CELLS", 6000)
+    with pytest.raises(BadInputError, match="million cells, which is more than is read at once"):
+        read_log(path)
+    assert sum(len(block) for block in iter_log(path)) == 4000
+
+
 def test_files_that_are_not_there(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=r"none\.csv: cannot be read"):
         read_log(tmp_path / "none.csv")

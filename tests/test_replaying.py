@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from estimatorlogs import simulated
 
-from calib import rig as schema
 from calib.errors import BadInputError
 from calib.estimator.model import LEVELS
 from calib.estimator.sensors import SENSOR
 from calib.logs import Log, write_log
 from calib.replaying import DEFAULTS, Periods, blocks, periods, rows_of, setup_from_rig, truth_of
 from calib.rig import Rig
+from calib.rig_estimator import Estimator
 
 ALIGN = {
     "time_offset_s": 0.031,
@@ -157,4 +157,4 @@ def test_blocks_refuse_a_log_without_sensors(tmp_path: Path) -> None:
 
 
 def test_the_section_of_the_estimator_is_part_of_the_schema() -> None:
-    assert schema.Estimator.model_validate({"jitter_px": 0.3, "verdict": "ok"}).levels == []
+    assert Estimator.model_validate({"jitter_px": 0.3, "verdict": "ok"}).levels == []

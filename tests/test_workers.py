@@ -140,3 +140,14 @@ def test_an_error_in_the_middle_ends_the_process_in_silence(tmp_path: Path) -> N
     for _ in range(10):
         done = subprocess.run([sys.executable, str(script)], capture_output=True, timeout=60, check=True)
         assert not done.stderr
+
+
+def test_no_more_processors_than_allowed() -> None:
+    from calib.workers import at_most
+
+    before = processors()
+    with at_most(1):
+        assert processors() == 1
+        with at_most(64):
+            assert processors() == 1
+    assert processors() == before

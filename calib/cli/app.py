@@ -10,12 +10,14 @@ from calib import __version__
 from calib.cli.align import align
 from calib.cli.board import board
 from calib.cli.control import control
+from calib.cli.convert import convert
 from calib.cli.diff import diff
 from calib.cli.distortion import distortion
 from calib.cli.doctor import doctor
 from calib.cli.exchange import export_camera, import_camera
 from calib.cli.extrinsics import extrinsics
 from calib.cli.firmware import firmware
+from calib.cli.fleet import fleet
 from calib.cli.identify import identify
 from calib.cli.imu import imu
 from calib.cli.intrinsics import intrinsics
@@ -25,6 +27,7 @@ from calib.cli.replay import replay
 from calib.cli.report import report
 from calib.cli.run import run
 from calib.cli.simulate import simulate
+from calib.cli.sweep import sweep
 from calib.cli.validate import validate
 
 __all__ = ["app"]
@@ -66,7 +69,10 @@ app.add_typer(identify, name="identify")
 app.add_typer(control, name="control")
 app.command("validate")(validate)
 app.command("firmware")(firmware)
+app.command("fleet")(fleet)
+app.command("sweep")(sweep)
 app.command("record")(record)
+app.command("convert")(convert)
 app.command("board")(board)
 app.command("simulate")(simulate)
 app.command("export")(export_camera)

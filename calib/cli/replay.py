@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from calib.cli.common import FiguresOption, JsonOption, RigOption, document, narrate, progress_bar, say, table
-from calib.errors import EXIT_POOR, UsageError
+from calib.errors import EXIT_POOR, BadInputError, UsageError
 
 if TYPE_CHECKING:
     from calib.replay import Replayed
@@ -25,6 +25,9 @@ def _tell(result: Replayed) -> None:
         "" if result.driven_share is None else f", driven in {100.0 * result.driven_share:.0f} % of the rows"
     )
     say(f"{result.source}: {result.rows} rows, {result.duration_s:.5g} s, {result.estimator}{share}")
+    if result.driven_share is not None and result.driven_share < 0.99:
+        rest = 100.0 * (1.0 - result.driven_share)
+        say(f"  in {rest:.0f} % of the rows the kinematic model spoke: the dynamics did not explain them")
     if result.rmse:
         rows = []
         for name, figures in (("this", result.rmse), *((n, f) for n, f in result.others.items())):
@@ -57,7 +60,18 @@ def replay(
     logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs of camera and IMU.")],
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", help="States to write; with several logs a folder, made if needed."),
+        typer.Option(
+            "-o",
+            "--output",
+            help="States to write, .csv, .parquet or .mcap; with several logs a folder, made if needed.",
+        ),
+    ] = None,
+    states_format: Annotated[
+        Literal["csv", "parquet", "mcap"], typer.Option("--format", help="Of the states of several logs.")
+    ] = "csv",
+    topics: Annotated[
+        Path | None,
+        typer.Option(help="Which topic of a bag is which column; else NAME.topics.yaml beside the bag."),
     ] = None,
     estimator: Annotated[
         Literal["fused", "baseline"],
@@ -86,6 +100,7 @@ def replay(
     from calib.files import check_folder, check_writable, make_folder, shown
     from calib.replay import replay_log
     from calib.rig import hash_of, read_rig, section_json, write_rig
+    from calib.running.folder import inside, slug
 
     if estimator == "baseline" and (smooth or tune):
         raise UsageError("--estimator baseline: cannot be smoothed or tuned")
@@ -102,7 +117,7 @@ def replay(
         from calib.tuning import tuned_section
 
         with progress_bar("tuning") as progress:
-            section = tuned_section(logs, known, rig, progress)
+            section = tuned_section(logs, known, rig, progress, topics)
         known = write_rig(
             rig,
             known.model_copy(update={"estimator": section}),
@@ -113,11 +128,18 @@ def replay(
     if output is not None and several:
         make_folder(output)
     results: list[Replayed] = []
+    taken: list[str] = []
     for path in logs:
-        states = output / f"{path.stem}_states.csv" if output is not None and several else output
+        states = output
+        if output is not None and several:
+            # Names of logs may hold anything, and two logs in different folders may share one.
+            taken.append(slug(path.stem, taken))
+            states = output / f"{taken[-1]}_states.{states_format}"
+            if states.is_symlink() and not inside(states, output):
+                raise BadInputError(f"{shown(states)}: is a link out of {shown(output)}, nothing was written")
         with progress_bar(f"replaying {path.name}") as progress:
             result = replay_log(
-                path, known, rig, estimator, smooth, states, progress, figures is not None, model
+                path, known, rig, estimator, smooth, states, progress, figures is not None, model, topics
             )
         results.append(result)
         if states is not None:

@@ -83,6 +83,14 @@ def state_figure(result: Replayed) -> Figure:
         axes.set_ylabel(label)
         axes.grid(True)
         axes.yaxis.set_major_locator(MaxNLocator(5))
+    # NaN where there is no driven model.
+    handed_over = _named(trace, "driven_weight") < 0.5
+    if handed_over.any():
+        for axes in panels:
+            axes.fill_between(
+                t, 0.0, 1.0, where=handed_over, transform=axes.get_xaxis_transform(), color=ORANGE,
+                alpha=0.12, linewidth=0.0, label="kinematic model speaks",
+            )  # fmt: skip
     panels[-1].set_xlabel("time (s)")
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4)

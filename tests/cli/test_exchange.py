@@ -89,3 +89,34 @@ def test_places_that_cannot_be_written(calib, rig, tmp_path) -> None:
 def test_a_name_of_several_lines_stays_one_value(calib, rig) -> None:
     text = calib("export", "ros", "--rig", rig, "--name", "left: x\nimage_width: 5").out
     assert yaml.safe_load(text)["image_width"] == 316
+
+
+IMU = (
+    "accelerometer_noise_density: 2.0e-3\naccelerometer_random_walk: 3.0e-3\n"
+    "gyroscope_noise_density: 1.6968e-04\ngyroscope_random_walk: 1.9393e-05\n"
+    "rostopic: /imu0\nupdate_rate: 200.0\n"
+)
+
+
+def test_the_noise_of_an_imu_there_and_back(calib, rig, tmp_path) -> None:
+    file, again = tmp_path / "imu.yaml", tmp_path / "again.yaml"
+    assert calib("export", "kalibr-imu", "--rig", rig).code == 3
+    file.write_text(IMU)
+    ended = calib("import", "kalibr-imu", file, "--rig", rig)
+    assert ended.code == 0 and "verdict is poor until" in ended.out
+    section = yaml.safe_load(rig.read_text())["imu"]
+    assert section["gyro_walk_radps2_per_sqrt_Hz"] == [1.9393e-05] * 3 and section["rate_hz"] == 200.0
+    ended = calib("export", "kalibr-imu", "--rig", rig, "-o", again, "--name", "/imu0")
+    assert ended.code == 0 and "the IMU's verdict is poor" in ended.err
+    assert yaml.safe_load(again.read_text()) == yaml.safe_load(IMU)
+    assert calib("export", "kalibr-imu", "--rig", rig, "--name", "x: 1\ny").code == 2
+    assert json.loads(calib("import", "kalibr-imu", again, "--rig", rig, "--json").out)["imu"] == section
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_other_files_for_an_imu(calib, rig, tmp_path, what: str) -> None:
+    file, before = tmp_path / "imu.yaml", rig.read_bytes()
+    file.write_bytes(BAD[what])
+    ended = calib("import", "kalibr-imu", file, "--rig", rig)
+    assert ended.code == 3 and ended.err.count("\n") == 1 and str(file) in ended.err
+    assert rig.read_bytes() == before

@@ -219,3 +219,71 @@ def test_tuning_writes_the_estimator_section(
     assert section["gain_per_row"] > -1e-6
     assert json.loads(ended.out)["estimator"]["verdict"] == section["verdict"]
     assert calib("replay", path, "--rig", aligned).code in (0, 1)
+
+
+def test_states_as_parquet_and_mcap_and_a_bag_as_a_log(
+    calib: Run, aligned: Path, log_file: Callable[..., Path], tmp_path: Path
+) -> None:
+    """Whatever the formats, the same log gives the same states."""
+    from bags import write_bag
+    from pyarrow import parquet
+
+    from calib.logs import read_log
+
+    path = log_file("swing")
+    log = read_log(path)
+    (tmp_path / "bags").mkdir()
+    messages = []
+    for i, t in enumerate(log.t_s.tolist()):
+        stamp = 10**18 + round(t * 1e6) * 1000
+        for kind, names in (("imu", IMU), ("marker", ("u_px", "v_px")), ("pwm", ("pwm1", "pwm2"))):
+            values = tuple(float(log.columns[name][i]) for name in names)
+            if all(value == value for value in values):
+                messages.append((kind, stamp, values))
+    bag = write_bag(tmp_path / "bags", "ros1", messages)
+    outs = [tmp_path / f"states{ending}" for ending in (".csv", ".parquet", ".mcap")]
+    for out in outs:
+        assert calib("replay", bag, "--rig", aligned, "-o", out, "--model", "kinematic").code == 0
+    assert calib("replay", path, "--rig", aligned, "-o", tmp_path / "t.csv", "--model", "kinematic").code == 0
+    table, wanted = read_states(outs[0]), read_states(tmp_path / "t.csv")
+    stored = parquet.read_table(outs[1])
+    for name in ("t_s", "q1_m", "q2_m", "phi_rad", "sigma_phi_rad", "flags"):
+        held = stored[name].cast("float64").to_numpy()
+        assert np.allclose(table[name], held, rtol=5.1e-9, atol=5.1e-7)
+        assert np.allclose(table[name], wanted[name], rtol=1e-6, atol=1e-9), name
+    assert outs[2].read_bytes().startswith(b"\x89MCAP0\r\n")
+
+
+IMU = ("ax_mps2", "ay_mps2", "az_mps2", "gx_radps", "gy_radps", "gz_radps")
+
+
+def test_names_of_several_logs_stay_in_the_folder(
+    calib: Run, aligned: Path, log_file: Callable[..., Path], tmp_path: Path
+) -> None:
+    """Line breaks and equal names become names of their own; no link out of the folder is followed."""
+    path, out = log_file("swing"), tmp_path / "out"
+    logs = [tmp_path / "a" / "same.csv", tmp_path / "b" / "same.csv", tmp_path / "a" / "=x\n.csv"]
+    for log in logs:
+        log.parent.mkdir(exist_ok=True)
+        log.write_bytes(path.read_bytes())
+    assert calib("replay", *logs, "--rig", aligned, "-o", out, "--format", "parquet").code == 0
+    names = sorted(item.name for item in out.iterdir())
+    assert len(names) == 3 and all(name.endswith("_states.parquet") for name in names)
+    assert not any(mark in name for name in names for mark in "\n=/")
+    elsewhere = tmp_path / "elsewhere.parquet"
+    elsewhere.write_text("mine")
+    (out / "same_states.parquet").unlink()
+    (out / "same_states.parquet").symlink_to(elsewhere)
+    ended = calib("replay", *logs, "--rig", aligned, "-o", out, "--format", "parquet")
+    assert ended.code == 3 and "is a link out of" in ended.err and ended.err.count("\n") == 1
+    assert elsewhere.read_text() == "mine"
+
+
+def test_a_log_too_long_to_be_smoothed_is_refused(
+    calib: Run, aligned: Path, log_file: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("calib.replay._SMOOTHED_ROWS", 100)
+    path = log_file("swing")
+    ended = calib("replay", path, "--rig", aligned, "--smooth", "--model", "kinematic")
+    assert ended.code == 3 and "has more than 100 rows, which smoothing would hold in memory" in ended.err
+    assert calib("replay", path, "--rig", aligned, "--model", "kinematic").code == 0

@@ -43,6 +43,18 @@ def test_panels_hold_what_they_say() -> None:
     np.testing.assert_allclose(line.get_ydata(), expected)
 
 
+def test_the_kinematic_model_s_rows_are_shaded_where_it_took_over() -> None:
+    made = result()
+    trace = made.trace.copy()
+    trace[:, OUT.index("driven_weight")] = np.where(trace[:, 0] > 2.0, 0.1, 0.9)
+    with look():
+        labels = [
+            [str(shade.get_label()) for shade in state_figure(one).axes[2].collections]
+            for one in (made, replace(made, trace=trace))
+        ]
+    assert ["kinematic model speaks" in names for names in labels] == [False, True]
+
+
 def test_logs_of_one_name_and_without_truth_or_innovations(tmp_path: Path) -> None:
     made = result()
     trace = made.trace.copy()

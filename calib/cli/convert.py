@@ -1,0 +1,69 @@
+"""`calib convert`: a log of any format as CSV or Parquet."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calib.cli.common import JsonOption, document, narrate, progress_bar, say
+from calib.errors import BadInputError, UsageError
+
+__all__ = ["convert"]
+
+
+def convert(
+    log: Annotated[Path, typer.Argument(help="Log: .csv, .parquet, .mcap, .bag, .db3 or a ROS 2 folder.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Log to write, .csv or .parquet.")],
+    topics: Annotated[
+        Path | None,
+        typer.Option(help="Which topic of a bag is which column; else NAME.topics.yaml beside the bag."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Write a log as CSV or Parquet, block by block; bags by their topics.
+
+    Time is written to the microsecond and values to nine digits in CSV, as they are in Parquet.
+    """
+    import numpy as np
+
+    from calib.files import shown
+    from calib.logs import iter_log
+    from calib.statesfile import states_writer
+
+    if output.suffix.lower() not in (".csv", ".parquet"):
+        raise UsageError(f"{shown(output)}: expected a name that ends in .csv or .parquet")
+    stream = iter_log(log, topics)
+    block = next(stream, None)
+    if block is None:
+        raise BadInputError(f"{shown(log)}: has a header but no rows")
+    names = tuple(block.columns)
+    rows, blank, truncated = 0, 0, False
+    with states_writer(output, ("t_s", *names)) as writer, progress_bar(f"converting {log.name}") as progress:
+        while True:
+            writer.add(np.column_stack([block.t_s, *(block.columns[name] for name in names)]))
+            rows, blank, truncated = rows + len(block), blank + block.not_finite, block.truncated
+            progress(rows, 0)
+            following = next(stream, None)
+            if following is None:
+                break
+            block = following
+    told = {
+        "log": shown(output),
+        "rows": rows,
+        "columns": list(names),
+        "left_out": list(block.unknown),
+        "not_finite": blank,
+        "truncated": truncated,
+    }
+    if as_json:
+        document("convert", {"convert": told})
+        return
+    say(f"{rows} rows written to {shown(output)}: t_s, {', '.join(names)}")
+    if block.unknown:
+        narrate(f"left out: {', '.join(block.unknown)}")
+    if blank:
+        narrate(f"{blank} cells say nan or inf and are blank now")
+    if truncated:
+        narrate("the end is cut short and left out")
