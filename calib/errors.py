@@ -30,6 +30,16 @@ class CalibError(Exception):
 
     exit_code = EXIT_BAD_INPUT
 
+    def __init__(self, message: str = "") -> None:
+        # A cell or a key that is quoted may hold what moves a terminal's cursor.
+        super().__init__("".join(_visible(c) for c in message) if not message.isprintable() else message)
+
+
+def _visible(character: str) -> str:
+    if character.isprintable():
+        return character
+    return character.encode("unicode_escape").decode("ascii")
+
 
 class BadInputError(CalibError):
     """Something that was read is not what it has to be; the message names file, line or key."""

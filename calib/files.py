@@ -15,6 +15,7 @@ __all__ = [
     "check_folder",
     "check_readable",
     "check_writable",
+    "file_sha256",
     "make_folder",
     "one_line",
     "read_bytes",
@@ -27,8 +28,6 @@ __all__ = [
 
 _MAX_BYTES = 500_000_000
 _MAX_YAML_BYTES = 1_000_000
-_MAX_YAML_NODES = 200_000
-_MAX_YAML_DEPTH = 40
 
 
 def one_line(text: str) -> str:
@@ -91,81 +90,38 @@ def sha256(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
+def file_sha256(path: Path) -> str:
+    """SHA-256 of a file of any size in hexadecimal, or a `BadInputError` that says why not."""
+    import hashlib
+
+    check_readable(path)
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise BadInputError(f"{shown(path)}: cannot be read: {error.strerror or error}") from error
+
+
 def read_yaml_mapping(path: Path) -> dict[str, Any]:
     """A YAML file whose top level is a mapping; bounded in size and depth, aliases included.
 
     Raises `BadInputError`, also for a key that is given twice: YAML's readers would keep the last.
     """
-    import yaml
+    from calib.boundedyaml import YamlProblem, load
 
     text = read_text(path, _MAX_YAML_BYTES)
-    # The reader in C is ten times as fast.
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
-        problem = _yaml_problem(yaml.parse(text, Loader=loader))
-        if problem is not None:
-            raise BadInputError(f"{shown(path)}, {problem}")
-        document = yaml.load(text, Loader=loader)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f", line {mark.line + 1}" if mark is not None else ""
-        said = getattr(error, "problem", None) or getattr(error, "reason", None) or "not readable"
-        raise BadInputError(f"{shown(path)}{where}: is not YAML: {' '.join(str(said).split())}") from error
-    except (RecursionError, ValueError) as error:
-        raise BadInputError(f"{shown(path)}: is not YAML that can be read: {error}") from error
+        document = load(text)
+    except YamlProblem as problem:
+        where = "" if problem.line is None else f", line {problem.line}"
+        raise BadInputError(f"{shown(path)}{where}: {problem.said}") from problem
     if not isinstance(document, dict):
         found = "nothing" if document is None else f"a {type(document).__name__}"
         raise BadInputError(f"{shown(path)}: holds {found}, expected keys with values")
-    if _expands_beyond(document, _MAX_YAML_NODES):
-        raise BadInputError(f"{shown(path)}: expands to more than {_MAX_YAML_NODES} values")
     wrong = next((key for key in document if not isinstance(key, str)), None)
     if wrong is not None:
         raise BadInputError(f"{shown(path)}: the key {wrong!r} is not text")
     return document
-
-
-def _yaml_problem(events: Any) -> str | None:
-    """What forbids to load these parsing events, with its line, or None.
-
-    Depth has to be known before loading: the reader in C recurses without a limit.
-    """
-    open_keys: list[set[str] | None] = []
-    expects_key: list[bool] = []
-    for count, event in enumerate(events):
-        kind = type(event).__name__
-        where = f"line {event.start_mark.line + 1}"
-        if count > _MAX_YAML_NODES:
-            return f"{where}: has more than {_MAX_YAML_NODES} values before it"
-        if kind in ("MappingEndEvent", "SequenceEndEvent"):
-            open_keys.pop()
-            expects_key.pop()
-        if kind in ("ScalarEvent", "AliasEvent", "MappingStartEvent", "SequenceStartEvent") and open_keys:
-            keys = open_keys[-1]
-            if keys is not None:
-                if expects_key[-1] and kind == "ScalarEvent" and event.value != "<<":
-                    if event.value in keys:
-                        return f"{where}: the key {one_line(event.value)[:60]} was given before"
-                    keys.add(event.value)
-                expects_key[-1] = not expects_key[-1]
-        if kind in ("MappingStartEvent", "SequenceStartEvent"):
-            open_keys.append(set() if kind == "MappingStartEvent" else None)
-            expects_key.append(kind == "MappingStartEvent")
-            if len(open_keys) > _MAX_YAML_DEPTH:
-                return f"{where}: is not YAML that can be read: nested more than {_MAX_YAML_DEPTH} deep"
-    return None
-
-
-def _expands_beyond(document: Any, most: int) -> bool:
-    """Whether there are more than `most` values below, each alias counted where it stands."""
-    waiting = [document]
-    while waiting:
-        value = waiting.pop()
-        children = value.values() if isinstance(value, dict) else value
-        most -= len(children)
-        if most < 0:
-            return True
-        waiting += [child for child in children if isinstance(child, dict | list)]
-    return False
 
 
 def _target(path: Path) -> Path:
@@ -248,7 +204,8 @@ def write_atomically(path: Path, data: bytes | str) -> None:
         raise BadInputError(f"{shown(path)}: cannot be written: {error.strerror or error}") from error
     finally:
         if temporary is not None:
-            with contextlib.suppress(FileNotFoundError):
+            # After the renaming there is none; one that cannot be removed is no reason to fail.
+            with contextlib.suppress(OSError):
                 Path(temporary).unlink()
     with contextlib.suppress(OSError):
         folder = os.open(target.parent, os.O_RDONLY)

@@ -11,7 +11,7 @@ import numpy as np
 from calib.boards import board_of, find_boards
 from calib.camera.views import View
 from calib.errors import BadInputError, UsageError
-from calib.files import shown
+from calib.files import check_readable, shown
 from calib.pictures import list_pictures
 from calib.rig import hash_of
 from calib.tables import read_table, read_vnl
@@ -19,6 +19,8 @@ from calib.tables import read_table, read_vnl
 __all__ = ["Told", "ViewSet", "read_views"]
 
 _TABLES = (".csv", ".vnl")
+_MOST_BYTES = 500_000_000
+"""Largest table; all of its points are held in memory."""
 _OUTSIDE_PX = 1.0
 """How far a corner may be found beyond the border of the picture."""
 _LARGEST_M = 1e4
@@ -72,6 +74,8 @@ def read_views(
 
 
 def _from_table(path: Path, told: Told) -> ViewSet:
+    if check_readable(path) > _MOST_BYTES:
+        raise BadInputError(f"{shown(path)}: is larger than {_MOST_BYTES / 1e6:g} MB")
     digest = hash_of(path)
     if told.image_size_px is None:
         raise UsageError(

@@ -22,10 +22,9 @@ import numpy as np
 from calib.arrays import AnyArray, GrayImage
 from calib.errors import BadInputError
 from calib.files import read_bytes, sha256, shown
+from calib.pictureheaders import declared_pixels
 
 os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")
-# What a header declares is allocated before anything of it is decoded.
-os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", "200000000")
 import cv2
 
 __all__ = ["SUFFIXES", "Picture", "list_pictures", "read_picture", "same_size"]
@@ -122,22 +121,6 @@ def _incomplete(data: bytes) -> str | None:
     return None
 
 
-def _declared_pixels(data: bytes) -> int:
-    """Width times height as a PNG or JPEG header declares them, zero where unknown."""
-    if data.startswith(_PNG) and len(data) >= 24:
-        width, height = struct.unpack(">II", data[16:24])
-        return int(width) * int(height)
-    if data.startswith(_JPEG):
-        at = 2
-        while at + 9 < len(data) and data[at] == 0xFF:
-            marker, length = data[at + 1], struct.unpack(">H", data[at + 2 : at + 4])[0]
-            if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-                height, width = struct.unpack(">HH", data[at + 5 : at + 9])
-                return int(width) * int(height)
-            at += 2 + length
-    return 0
-
-
 def read_picture(path: Path) -> Picture:
     """Decode one file to 8-bit grey values.
 
@@ -150,7 +133,13 @@ def read_picture(path: Path) -> Picture:
     problem = _incomplete(data)
     if problem is not None:
         raise BadInputError(f"{shown(path)}: {problem}")
-    if _declared_pixels(data) > _MAX_PIXELS:
+    pixels = declared_pixels(data)
+    if pixels is None:
+        what = (
+            "a truncated or damaged JPEG" if data.startswith(_JPEG) else "not a picture that can be decoded"
+        )
+        raise BadInputError(f"{shown(path)}: is {what}")
+    if pixels > _MAX_PIXELS:
         raise BadInputError(f"{shown(path)}: has more than {_MAX_PIXELS // 1_000_000} million pixels")
     if data.startswith(_JPEG):
         decoded, complaints = _decoded_with_complaints(data)

@@ -151,7 +151,7 @@ def read_pump_table(
     good = np.isfinite(table).all(axis=1)
     if not good.all():
         bad = int((~good).sum())
-        if bad > max(_MOST_BAD * len(table), 1.0):
+        if bad > max(_MOST_BAD * len(table), 1.0) or bad == len(table):
             first = lines[int(np.nonzero(~good)[0][0])]
             raise BadInputError(
                 f"{shown(path)}: {bad} of {len(table)} rows have a blank or nan, the first in line {first}, "

@@ -226,7 +226,7 @@ def read_vnl(path: Path, columns: int, rows: int, square_m: float) -> list[View]
             )
         row = dict(zip(legend, words, strict=False))
         # mrgingham leaves the level out where it found no board.
-        if "x" not in row or "y" not in row or len(words) > len(legend):
+        if not {"filename", "x", "y"} <= row.keys() or len(words) > len(legend):
             raise BadInputError(
                 f"{shown(path)}: line {line}: has {len(words)} values, expected {len(legend)} as in the "
                 "legend"

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from calib.errors import BadInputError
 from calib.files import sha256, write_atomically
 from calib.rig import read_rig, write_rig
 from calib.running.folder import Folder, LogFile, read_folder
@@ -43,12 +45,22 @@ class Inline:
         CALLS.append(command.name)
         code = self.codes.get(command.name, 0)
         if code in (0, 1):
-            self._work(command, code)
+            code = self._guarded(command, code)
         else:
             command.stderr.write_text(f"calib: {command.name} cannot\n")
         if self.during is not None:
             self.during(command.name)
         self._ended.append((command.name, code))
+
+    def _guarded(self, command: Command, code: int) -> int:
+        """As the command line ends a verb that cannot write."""
+        try:
+            self._work(command, code)
+            return code
+        except (OSError, BadInputError) as error:
+            with contextlib.suppress(OSError):
+                command.stderr.write_text(f"calib: {error}\n")
+            return 3
 
     def _work(self, command: Command, code: int) -> None:
         rig_path = _option(command.words, "--rig")

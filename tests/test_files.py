@@ -14,6 +14,7 @@ from calib.files import (
     check_folder,
     check_readable,
     check_writable,
+    file_sha256,
     one_line,
     read_bytes,
     read_text,
@@ -122,8 +123,8 @@ def test_names_are_shown_on_one_line() -> None:
 
 def test_the_same_key_in_two_places_is_no_repetition(tmp_path: Path) -> None:
     path = tmp_path / "rig.yaml"
-    path.write_text("a: {b: 1}\nc: [{b: 1}, {b: 2}]\nb: &b {x: 1}\nd: {<<: *b, y: 2}\ne: [b, b]\n")
-    assert read_yaml_mapping(path)["d"] == {"x": 1, "y": 2}
+    path.write_text("a: {b: 1}\nc: [{b: 1}, {b: 2}]\nb: &b {x: 1}\nd: {b: *b, y: 2}\ne: [b, b]\n")
+    assert read_yaml_mapping(path)["d"] == {"b": {"x": 1}, "y": 2}
 
 
 def test_a_list_that_holds_itself_is_refused(tmp_path: Path) -> None:
@@ -176,3 +177,15 @@ def test_folders_are_known_before_work(tmp_path: Path) -> None:
 def test_one_line() -> None:
     assert one_line("plain \N{GREEK SMALL LETTER MU}m") == "plain \N{GREEK SMALL LETTER MU}m"
     assert one_line("a\r\nb\u202e\udcff") == r"a\r\nb\u202e\udcff"
+
+
+def test_the_hash_of_a_file_of_any_size(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_bytes(b"abc")
+    assert file_sha256(path) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    for other, says in ((tmp_path, "is a folder"), (tmp_path / "none", "cannot be read")):
+        with pytest.raises(BadInputError, match=says):
+            file_sha256(other)
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(BadInputError, match="is a pipe or a device"):
+        file_sha256(tmp_path / "pipe")

@@ -75,3 +75,13 @@ def test_what_does_not_go_together(table) -> None:
             read_views([path], told)
     with pytest.raises(UsageError, match="given alone"):
         read_views([path.parent, path], Told(image_size_px=SIZE))
+
+
+def test_a_table_beyond_the_memory_is_refused_by_its_size(tmp_path: Path) -> None:
+    path = tmp_path / "points.csv"
+    path.write_text("view,x_m,y_m,u_px,v_px\n")
+    with path.open("r+b") as stream:
+        # A file with holes takes no room on the disk.
+        stream.truncate(2_000_000_000)
+    with pytest.raises(BadInputError, match="is larger than 500 MB"):
+        read_views([path], Told(image_size_px=SIZE))

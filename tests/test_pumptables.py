@@ -104,6 +104,12 @@ def test_what_is_wrong_is_said_with_its_line(tmp_path: Path, kind: str, words: s
         read_pump_table(_write(tmp_path / "a.csv", "t_s,pwm,pressure_kPa", _broken(kind)))
 
 
+def test_a_table_of_one_blank_row(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("time_s,pwm,pressure_kPa\n,101,2.5\n")
+    with pytest.raises(BadInputError, match="1 of 1 rows have a blank or nan, the first in line 2"):
+        read_pump_table(tmp_path / "a.csv")
+
+
 def test_one_blank_is_left_out_and_said(tmp_path: Path) -> None:
     rows = _rows()
     rows[20, 2] = np.nan

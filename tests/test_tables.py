@@ -184,6 +184,7 @@ LEGEND = "# filename x y level\n"
         (LEGEND + corners("a", SIX[:5]) + "a 1\n", "line 7: has 2 values, expected 4"),
         (LEGEND + corners("a", SIX[:3]) + "a - - -\n" * 3, "line 2: a has 3 corners that were seen"),
         (LEGEND + "a - - -\n" * 2, "line 2: a has 2 corners, expected"),
+        ("# x y filename\n1 2\n", "line 2: has 2 values, expected 3"),
         (LEGEND.encode() + b"\0\0", "line 2 has a zero byte"),
     ],
 )

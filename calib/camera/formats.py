@@ -20,6 +20,8 @@ import numpy as np
 import yaml
 
 from calib.arrays import FloatArray
+from calib.boundedyaml import YamlProblem, load
+from calib.camera.filestorage import matrix, read_storage
 from calib.camera.model import COEFFICIENTS, MODELS, Camera
 from calib.errors import BadInputError
 
@@ -106,17 +108,9 @@ def from_opencv(text: str) -> Camera:
         For text that is no FileStorage, a missing or wrong key, a fisheye model, or coefficients of
         OpenCV's thin-prism and tilted models that are not zero.
     """
-    try:
-        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-        opened = storage.isOpened()
-    except (SystemError, cv2.error):
-        opened = False
-    if not opened:
-        raise BadInputError("not an OpenCV FileStorage (YAML, XML or JSON)")
-    root = storage.root()
-    if not root.isMap():
-        raise BadInputError("not an OpenCV FileStorage with named values")
-    if not root.getNode("fisheye_model").empty() and root.getNode("fisheye_model").real() != 0.0:
+    root = read_storage(text)
+    fisheye = root.get("fisheye_model", 0)
+    if not isinstance(fisheye, int | float) or fisheye != 0:
         raise BadInputError("fisheye_model is set, and a fisheye lens cannot be expressed")
     width, height = (_storage_whole(root, key) for key in ("image_width", "image_height"))
     K = _storage_matrix(root, "camera_matrix")
@@ -234,13 +228,10 @@ def _mapping(text: str) -> Mapping[str, Any]:
     if lines[0].startswith("%YAML:"):
         text = "\n" + (lines[1] if len(lines) > 1 else "")
     try:
-        document = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f" at line {mark.line + 1}" if mark is not None else ""
-        raise BadInputError(f"not valid YAML{where}") from error
-    except (ValueError, RecursionError) as error:
-        raise BadInputError("not valid YAML") from error
+        document = load(text)
+    except YamlProblem as problem:
+        where = "" if problem.line is None else f" at line {problem.line}"
+        raise BadInputError(f"not valid YAML{where}: {problem.said}") from problem
     if not isinstance(document, dict):
         raise BadInputError(f"expected a YAML mapping, found {type(document).__name__}")
     return document
@@ -295,23 +286,19 @@ def _ros_matrix(document: Mapping[str, Any], key: str, shape: tuple[int, int] | 
     return np.array(data, dtype=np.float64).reshape(rows, cols)
 
 
-def _storage_whole(root: Any, key: str) -> int:
-    node = root.getNode(key)
-    if node.empty():
+def _storage_whole(root: Mapping[str, Any], key: str) -> int:
+    value = root.get(key)
+    if value is None:
         raise BadInputError(f"{key} is missing")
-    if not node.isInt():
+    if not _is_whole(value):
         raise BadInputError(f"{key} is not a whole number")
-    return int(node.real())
+    return int(value)
 
 
-def _storage_matrix(root: Any, key: str) -> FloatArray:
-    node = root.getNode(key)
-    if node.empty():
+def _storage_matrix(root: Mapping[str, Any], key: str) -> FloatArray:
+    if root.get(key) is None:
         raise BadInputError(f"{key} is missing")
-    try:
-        values = node.mat()
-    except cv2.error:
-        values = None
-    if values is None or values.ndim != 2 or not np.all(np.isfinite(values)):
+    values = matrix(root[key])
+    if values is None:
         raise BadInputError(f"{key} is not a matrix of finite numbers")
-    return np.asarray(values, dtype=np.float64)
+    return values

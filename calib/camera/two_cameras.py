@@ -27,6 +27,7 @@ import numpy as np
 from calib.arrays import BoolArray, FloatArray
 from calib.camera.bundle import Calibration, calibrate
 from calib.camera.evidence import Evidence, evidence, scaled_inverse
+from calib.camera.projection import jacobian
 from calib.camera.starts import held
 
 __all__ = ["Split", "best_change", "best_split", "straightened", "widened"]
@@ -92,8 +93,11 @@ def widened(calibration: Calibration) -> Calibration:
 
 
 def straightened(calibration: Calibration, displacement_m: FloatArray) -> Calibration:
-    """The same views of a target whose points are moved by `displacement_m` (1 or N, M, 3)."""
-    return calibrate(
+    """The same views of a target whose points are moved by `displacement_m` (1 or N, M, 3).
+
+    A target that would then lie behind the camera tells nothing; the calibration is left as it is.
+    """
+    moved = calibrate(
         calibration.observations.displaced(displacement_m),
         calibration.camera.image_size_px,
         calibration.camera.model,
@@ -102,6 +106,8 @@ def straightened(calibration: Calibration, displacement_m: FloatArray) -> Calibr
         start=calibration.block,
         max_iterations=_MAX_ITERATIONS,
     )
+    in_front = jacobian(moved.block, moved.observations, moved.free, None) is not None
+    return moved if in_front else calibration
 
 
 @dataclass(frozen=True)

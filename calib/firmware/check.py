@@ -14,7 +14,8 @@ from pathlib import Path
 
 from calib.errors import BadInputError
 from calib.files import read_bytes, shown
-from calib.firmware.conformance import CLAMPED, Outputs, Reference
+from calib.firmware.conformance import BY_FUSED, BY_MEAN_RATE, CLAMPED, Outputs
+from calib.firmware.conformance_fused import reference_of
 from calib.firmware.header import Header, identity_of
 from calib.firmware.literals import values
 from calib.firmware.telemetry import BOARD_COLUMNS, Frame, frame_from_row
@@ -23,6 +24,8 @@ from calib.firmware.vectors import TOLERANCE
 __all__ = ["Check", "check_frames", "read_frames"]
 
 _CLAMP_BITS = CLAMPED[0] | CLAMPED[1]
+_UNDECIDED_M = 1e-6
+"""What rounding makes of the fused estimator's residuals after a long rest."""
 
 
 @dataclass(frozen=True)
@@ -57,19 +60,20 @@ def read_frames(path: Path) -> list[Frame]:
 
     Raises `BadInputError` for another file, by its line.
     """
-    text = read_bytes(path).decode("utf-8", "replace")
+    text = read_bytes(path).decode("utf-8-sig", "replace")
+    if "\0" in text:
+        raise BadInputError(f"{shown(path)}: has a zero byte, expected a log of calib record")
     reader = csv.DictReader(text.splitlines())
-    missing = [name for name in BOARD_COLUMNS if name not in (reader.fieldnames or ())]
-    if missing:
-        raise BadInputError(f"{shown(path)}: has no column {missing[0]}, expected a log of calib record")
     frames = []
-    for row in reader:
-        try:
-            frames.append(frame_from_row(row))
-        except (KeyError, TypeError, ValueError) as error:
-            raise BadInputError(
-                f"{shown(path)}: line {reader.line_num} is no tick of a board ({error})"
-            ) from error
+    try:
+        missing = [name for name in BOARD_COLUMNS if name not in (reader.fieldnames or ())]
+        if missing:
+            raise BadInputError(f"{shown(path)}: has no column {missing[0]}, expected a log of calib record")
+        frames += [frame_from_row(row) for row in reader]
+    except (KeyError, TypeError, ValueError, OverflowError, csv.Error) as error:
+        raise BadInputError(
+            f"{shown(path)}: line {reader.line_num} is no tick of a board ({error})"
+        ) from error
     if not frames:
         raise BadInputError(f"{shown(path)}: holds no tick of a board")
     return frames
@@ -93,7 +97,8 @@ def check_frames(header: Header, frames: list[Frame], source: str, undistort: bo
     Parameters
     ----------
     source : the log's name for messages.
-    undistort : CALIB_UNDISTORT that the board was built with; by default the header's.
+    undistort : CALIB_UNDISTORT that the board was built with; by default the header's. CALIB_FUSED and
+        CALIB_RATE_IS_MEAN are told by the board's flags.
 
     Raises `BadInputError` for a board with another header and for a log that does not begin at the start.
     """
@@ -109,7 +114,10 @@ def check_frames(header: Header, frames: list[Frame], source: str, undistort: bo
         raise BadInputError(
             f"{source}: begins with tick {first.sequence}, expected 0: record from the board's start"
         )
-    reference = Reference(values(header.literals), undistort)
+    by_fused, by_mean = bool(first.flags & BY_FUSED), bool(first.flags & BY_MEAN_RATE)
+    if by_fused and header.literals["CALIB_HAS_FUSED"] != "1":
+        raise BadInputError(f"{source}: the board runs the fused estimator, for which rig.yaml has no gains")
+    reference = reference_of(values(header.literals), undistort, by_fused, by_mean)
     worst = dict.fromkeys(TOLERANCE, 0.0)
     differ, bad, ticks, lost = 0, None, 0, None
     for tick, frame in enumerate(frames):
@@ -124,6 +132,8 @@ def check_frames(header: Header, frames: list[Frame], source: str, undistort: bo
             over.append("flags")
         if wanted.undecided_pwm > TOLERANCE["pwm"]:
             over.append("the decision to clamp")
+        if wanted.undecided_m > _UNDECIDED_M:
+            over.append("the decision on rest, motion or a marker to leave out")
         if over and bad is None:
             bad = (tick, over[0])
         worst = {name: max(worst[name], value) for name, value in found.items()}

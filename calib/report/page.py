@@ -12,7 +12,6 @@ inputs give the same bytes.
 from __future__ import annotations
 
 import base64
-import contextlib
 import hashlib
 import json
 import re
@@ -29,9 +28,11 @@ from calib.report.page_pictures import data_uri, kept_picture, size_of, small_fi
 from calib.report.page_stages import Table, caption, facts, tables
 from calib.report.page_verdict import decide
 from calib.rig import read_rig
+from calib.rig_actuator import Actuator, PumpSection, section_of
 from calib.rigvalues import constants, digits
 from calib.running.cache import Result, load
 from calib.running.runner import HIDDEN
+from calib.running.summaryfile import read_summary
 
 __all__ = ["MOST_BYTES", "page_text", "write_page"]
 
@@ -94,11 +95,13 @@ def page_text(rig: Path) -> str:
 
     if not rig.exists():
         raise BadInputError(f"{shown(rig)}: cannot be read: there is no such file")
-    read_rig(rig)
+    whole = read_rig(rig)
+    for name, kind in (("actuator", Actuator), ("pump", PumpSection)):
+        section_of(whole, name, kind, rig)
     sections = read_yaml_mapping(rig)
     provenance = sections.pop("provenance", None) or {}
     hidden = rig.parent / HIDDEN
-    told = _run_summary(hidden) or _summary_of(sections)
+    told = read_summary(hidden / "run.json") or _summary_of(sections)
     budget = _Budget(MOST_BYTES - _ROOM_BYTES)
     views = _views(hidden, _Budget(_VIEWS_BYTES))
     budget.left -= sum(len(view["image"]) for view in views)
@@ -148,14 +151,6 @@ def _as_script(value: Any) -> str:
     """JSON that no element of a page can end."""
     text = json.dumps(value, ensure_ascii=True, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-
-
-def _run_summary(hidden: Path) -> dict[str, Any] | None:
-    with contextlib.suppress(OSError, ValueError):
-        told = json.loads((hidden / "run.json").read_text(encoding="utf-8"))
-        if isinstance(told, dict) and isinstance(told.get("jobs"), list):
-            return told
-    return None
 
 
 def _summary_of(sections: Mapping[str, Any]) -> dict[str, Any]:

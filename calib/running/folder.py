@@ -15,12 +15,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calib.errors import BadInputError
-from calib.files import one_line, shown
+from calib.files import file_sha256, one_line, shown
 
-__all__ = ["Folder", "LogFile", "digest_of", "folder_digests", "inside", "read_folder", "slug"]
+__all__ = ["Folder", "LogFile", "digest_of", "folder_digests", "inside", "read_folder", "slug", "with_topics"]
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm")
-_LOGS = (".csv", ".parquet")
+_LOGS = (".csv", ".parquet", ".mcap", ".bag", ".db3")
 _HEAD_BYTES = 1 << 16
 _SAFE = frozenset("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789-_.")
 _LONGEST = 80
@@ -33,7 +33,7 @@ class LogFile:
     Attributes
     ----------
     slug : a name that is safe as a file's name, different for each log.
-    columns : of its header, None where it cannot be told without reading all (Parquet).
+    columns : that it has, None where it cannot be told.
     kind : "rest", "poses" or "motion", by the file's name.
     """
 
@@ -75,7 +75,7 @@ class Folder:
             *self.pictures,
             *self.plane,
             *(path for path in single if path is not None),
-            *(log.path for log in self.logs),
+            *with_topics(log.path for log in self.logs),
         )
 
     def name_of(self, path: Path) -> str:
@@ -125,7 +125,7 @@ def read_folder(root: Path, follow_links: bool = False) -> Folder:
     plane, plane_board = _pictures(root / "images" / "plane", taken)
     logs: list[LogFile] = []
     for path in _listed(root / "logs", _LOGS):
-        if taken(path):
+        if all(taken(part) for part in with_topics([path])):
             name = slug(path.stem, (log.slug for log in logs))
             logs.append(LogFile(path, name, _columns(path), _kind(path.name)))
     own = root / "rig.yaml"
@@ -164,10 +164,27 @@ def _kind(name: str) -> str:
     return "motion"
 
 
+def with_topics(logs: Iterable[Path]) -> tuple[Path, ...]:
+    """Logs, each followed by the file beside it that says which topic of a bag is which column."""
+    from calib.log_bags import is_bag
+    from calib.log_topics import find_topics
+
+    listed: list[Path] = []
+    for path in logs:
+        topics = find_topics(path) if is_bag(path) else None
+        listed += [path] if topics is None else [path, topics]
+    return tuple(dict.fromkeys(listed))
+
+
 def _columns(path: Path) -> tuple[str, ...] | None:
-    """Names in the header of a CSV; whether they make sense is for the verbs to say."""
+    """Names in the header of a CSV, columns of another log; whether they make sense the verbs say."""
     if path.suffix.lower() != ".csv":
-        return None
+        from calib.logs import iter_log
+
+        try:
+            return tuple(next(iter_log(path)).columns)
+        except (BadInputError, StopIteration):
+            return None
     try:
         with path.open("rb") as stream:
             head = stream.read(_HEAD_BYTES).decode("utf-8-sig", "replace")
@@ -182,11 +199,7 @@ def _columns(path: Path) -> tuple[str, ...] | None:
 
 def digest_of(path: Path) -> str:
     """SHA-256 of a file of any size. Raises `BadInputError` for one that cannot be read."""
-    try:
-        with path.open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
-    except OSError as error:
-        raise BadInputError(f"{shown(path)}: cannot be read: {error.strerror or error}") from error
+    return file_sha256(path)
 
 
 def folder_digests(folder: Folder) -> dict[Path, str]:

@@ -45,7 +45,7 @@ def _holder(path: Path) -> str:
 
 
 @contextmanager
-def held(path: Path, folder: Path) -> Iterator[int | None]:
+def held(path: Path, folder: Path, verb: str = "calib run") -> Iterator[int | None]:
     """Hold the lock; yields the number of a process whose run was interrupted here, None without one.
 
     Raises `BadInputError` while another process holds it, and where the file cannot be made.
@@ -57,7 +57,7 @@ def held(path: Path, folder: Path) -> Iterator[int | None]:
     try:
         if not _try_lock(descriptor):
             raise BadInputError(
-                f"{shown(folder)}: another calib run{_holder(path)} is at work there; wait for it, or give "
+                f"{shown(folder)}: another {verb}{_holder(path)} is at work there; wait for it, or give "
                 "another folder"
             )
         os.lseek(descriptor, 0, os.SEEK_SET)

@@ -95,18 +95,26 @@ def publish(runner: Runner, ended: Sequence[Done], told: dict[str, Any]) -> list
     _list(out, sorted({*before, *names}))
     for name in names:
         _copy(wanted[name], out / name, out / HIDDEN / "work")
-    for name in set(before) - set(names):
-        path = out / name
-        with contextlib.suppress(OSError):
-            if path.parent.resolve().is_relative_to(out.resolve()):
-                path.unlink()
+    left = [name for name in sorted(set(before) - set(names)) if not _removed(out, out / name)]
     for folder in {str(Path(name).parent) for name in before} - {str(Path(name).parent) for name in names}:
         with contextlib.suppress(OSError):
             (out / folder).rmdir()
-    _list(out, names)
+    # One that could not be removed is tried again by the next run.
+    _list(out, sorted({*names, *left}))
     _write(out / "rig.yaml", runner.sections().text(out / "rig.yaml"))
     _write(out / HIDDEN / "run.json", json.dumps(told, indent=1, ensure_ascii=True) + "\n")
     return ["rig.yaml", *names]
+
+
+def _removed(out: Path, path: Path) -> bool:
+    """Remove a file that an earlier run has left; whether nothing of ours is there any more."""
+    if not path.parent.resolve().is_relative_to(out.resolve()):
+        return True
+    try:
+        path.unlink(missing_ok=True)
+    except OSError:
+        return False
+    return True
 
 
 def _listed(out: Path) -> list[str]:

@@ -18,7 +18,7 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, Protocol
 
-__all__ = ["Command", "Pool", "Runs"]
+__all__ = ["Command", "Pool", "Runs", "run_here"]
 
 _PR_SET_PDEATHSIG = 1
 _LOOK_UP_S = 0.2
@@ -63,14 +63,15 @@ def _serve(channel: Connection, parent: int) -> None:
             command = channel.recv()
         except EOFError:
             return
-        code = _run(command)
+        code = run_here(command)
         try:
             channel.send(code)
         except OSError:
             return
 
 
-def _run(command: Command) -> int:
+def run_here(command: Command) -> int:
+    """Run a verb in this process and return its exit code; one at a time, for it takes over stdout."""
     from calib.cli.main import main
 
     before = sys.argv, sys.stdout, sys.stderr

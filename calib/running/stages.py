@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from calib.running.folder import Folder, LogFile
+from calib.running.folder import Folder, LogFile, with_topics
 
 __all__ = ["STAGES", "Job", "Planned", "Stage", "jobs_of"]
 
@@ -79,7 +79,7 @@ class Job:
 
 
 def _given(paths: tuple[Path, ...], *more: str) -> Planned:
-    return Planned((*(str(path) for path in paths), *more), paths)
+    return Planned((*(str(path) for path in paths), *more), with_topics(paths))
 
 
 def _logs(folder: Folder, kind: str, *columns: str) -> tuple[Path, ...]:
@@ -132,7 +132,7 @@ def _lowpass(folder: Folder) -> Planned | str:
     logs = _logs(folder, "motion", *_CAMERA)
     if not logs:
         return Planned((), ())
-    return Planned(("--log", str(logs[0])), logs[:1])
+    return Planned(("--log", str(logs[0])), with_topics(logs[:1]))
 
 
 def _both(folder: Folder) -> Planned | str:
@@ -162,7 +162,7 @@ def _nothing(_: Folder) -> Planned | str:
 def _replay(log: LogFile) -> Planned | str:
     if not (log.has(*_CAMERA) or log.has(*_IMU)):
         return "the log has neither a camera nor an IMU"
-    return Planned((str(log.path),), (log.path,))
+    return Planned((str(log.path),), with_topics([log.path]))
 
 
 _OPTICS = ("camera", "plane")

@@ -104,3 +104,14 @@ def test_the_same_seed_gives_the_same_answer() -> None:
     assert second is not None
     assert first.statistic == second.statistic
     assert first.chance == second.chance
+
+
+def test_a_target_moved_behind_the_camera_changes_nothing() -> None:
+    fit = _fit(take(np.random.default_rng(0), camera_of(), 6))
+    shape = target_shape(widened(fit))
+    assert shape is not None
+    away = np.zeros_like(shape.displacement_m)
+    away[..., 2] = -100.0
+    for far in (away, -away):
+        moved = straightened(fit, far)
+        assert best_change(moved) is not None

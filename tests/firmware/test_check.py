@@ -38,6 +38,21 @@ def test_a_good_board_passes(tmp_path: Path) -> None:
     assert max(result.worst.values()) < 1e-5
 
 
+def test_a_board_with_the_fused_estimator_is_known_by_its_flags(tmp_path: Path) -> None:
+    identity = int(identity_of(header("fused"))[:8], 16)
+    frames = []
+    for k, vector in enumerate(vectors(header("fused"), 120, fused=True)):
+        w = vector.wanted
+        frames.append(
+            Frame(identity, 60000, k, vector.given, w.phi_rad, w.marker_m, w.head_m, w.q_m, w.pwm, w.flags)
+        )
+    result = check_frames(header("fused"), read_frames(_log(tmp_path / "log.csv", frames)), "log.csv")
+    assert (result.ticks, result.reasons, result.flags_differ) == (120, [], 0)
+    without = [replace(frame, identity=int(identity_of(header())[:8], 16)) for frame in frames]
+    with pytest.raises(BadInputError, match=r"log\.csv: the board runs the fused estimator, for which"):
+        check_frames(header(), without, "log.csv")
+
+
 def test_a_wrong_value_is_named_with_its_tick() -> None:
     frames = _frames()
     frames[41] = replace(frames[41], q_m=(frames[41].q_m[0] + 1e-5, frames[41].q_m[1]))

@@ -82,6 +82,20 @@ def test_a_rig_without_a_run_gives_a_page_of_constants(rig: Path, tmp_path: Path
     assert 'class="figure"' not in text
 
 
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("actuator: {sigma: x}\npump: {sigma: {a: 1.0}}\n", "actuator.sigma is 'x'"),
+        ("actuator: {verdict: poor, reasons: 5}\n", "actuator.reasons is 5"),
+        ("pump: [1]\n", "pump is .* expected keys with values"),
+    ],
+)
+def test_sections_that_mean_nothing_are_refused_by_their_key(tmp_path: Path, text: str, says: str) -> None:
+    (tmp_path / "rig.yaml").write_text(text)
+    with pytest.raises(BadInputError, match=says):
+        page_text(tmp_path / "rig.yaml")
+
+
 def test_what_is_no_rig_file(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="no such file"):
         page_text(tmp_path / "rig.yaml")

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from running_trials import make_folder, run_small
 
 from calib.errors import BadInputError
-from calib.running.folder import read_folder, slug
+from calib.running.folder import read_folder, slug, with_topics
 
 
 def test_kinds_of_logs_and_their_columns(tmp_path: Path) -> None:
@@ -91,3 +91,25 @@ def test_a_slug_is_a_plain_file_name(name: str) -> None:
     assert text and len(text) <= 100
     assert Path(text).name == text and text not in (".", "..") and not text.startswith((".", "-"))
     assert text == slug(name)
+
+
+def test_bags_are_logs_with_the_file_that_explains_them(tmp_path: Path) -> None:
+    import numpy as np
+    from bags import readings, write_bag
+
+    root = make_folder(tmp_path / "rig")
+    bag = write_bag(root / "logs", "json", readings(np.random.default_rng(0), 0.2))
+    log = next(log for log in read_folder(root).logs if log.path == bag)
+    assert log.has("u_px", "gz_radps", "pwm1") and not log.has("true_q1_m")
+    topics = root / "logs" / "log.topics.yaml"
+    topics.write_text("topics:\n  /imu/data: {gz_radps: gz_radps}\n")
+    folder = read_folder(root)
+    log = next(log for log in folder.logs if log.path == bag)
+    assert log.columns == ("gz_radps",) and topics in folder.files()
+    assert with_topics([bag, bag]) == (bag, topics)
+    topics.rename(tmp_path / "elsewhere.yaml")
+    topics.symlink_to(tmp_path / "elsewhere.yaml")
+    assert all(log.path != bag for log in read_folder(root).logs)
+    topics.unlink()
+    bag.write_bytes(b"\x89MCAP0\r\nbroken")
+    assert next(log for log in read_folder(root).logs if log.path == bag).columns is None

@@ -1,0 +1,138 @@
+"""rig.yaml: read, written again, shown on the page, compared, put into the header and other formats."""
+
+from __future__ import annotations
+
+import math
+import random
+import sys
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+MODULES = ("calib.rig", "calib.files", "calib.rigdiff", "calib.rigvalues", "calib.report.page_verdict",
+           "calib.firmware.known", "calib.firmware.header", "calib.running.sections")  # fmt: skip
+
+WORDS = (
+    b"camera:", b"plane:", b"lens:", b"imu:", b"align:", b"lowpass:", b"orientation_filter:", b"controller:",
+    b"actuator:", b"pump:", b"estimator:", b"twin:", b"provenance:", b"geometry:", b"imu_intrinsics:",
+    b"inputs:", b"verdict:", b"poor", b"ok", b"unidentifiable", b"reasons:", b"sigma:", b"covariance:",
+    b"order:", b"values:", b"radial2", b"rational8", b"pinhole", b"k3:", b"k6:", b"- [0, 0]", b"1.0e-300",
+    b"1.0e+300", b"1.0e+7", b"0.0", b"1", b"100000",
+)  # fmt: skip
+
+
+ODD = (
+    None, 0, 1, -1, 1.5, 1e300, -1e300, 1e-300, math.nan, math.inf, 10**400, "x", "<script>alert(1)</script>",
+    [], {}, [1], ["a"], {"a": 1}, {1: 2}, True, "../../x", [[1]], [None], "ok", "poor",
+    {"a": {"b": [1, {"c": None}]}},
+)  # fmt: skip
+"""Values that stand where others belong."""
+
+
+def mutate(data: bytes, dice: random.Random) -> bytes:
+    """The same document with a value or two of another kind, scaled or gone; as it was if it is no YAML."""
+    try:
+        document = yaml.safe_load(data)
+        for _ in range(dice.choice((1, 1, 2))):
+            path = dice.choice(_paths(document)[1:])
+            parent = document
+            for key in path[:-1]:
+                parent = parent[key]
+            value, way = parent[path[-1]], dice.random()
+            if way < 0.15:
+                del parent[path[-1]]
+            elif way < 0.3 and isinstance(value, float):
+                parent[path[-1]] = value * dice.choice((-1.0, 1e3, 1e-3, 1e9, 0.0))
+            else:
+                parent[path[-1]] = dice.choice(ODD)
+        return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110).encode()
+    except (yaml.YAMLError, ValueError, IndexError, TypeError, AttributeError, RecursionError):
+        return data
+
+
+def _paths(value: Any, start: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    return [start, *(path for key, one in inner for path in _paths(one, (*start, key)))]
+
+
+def check(data: bytes, folder: Path) -> None:
+    """Whatever `read_rig` takes, all that read a rig can work with or refuse."""
+    from calib.errors import BadInputError
+    from calib.rig import read_rig, rig_text
+    from calib.running.sections import sections_of
+    from calib.sections import outdated
+
+    path, again = folder / "rig.yaml", folder / "again.yaml"
+    path.write_bytes(data)
+    rig = read_rig(path)
+    text = rig_text(rig)
+    again.write_text(text, encoding="utf-8")
+    if len(text) < 500_000:
+        assert rig_text(read_rig(again)) == text
+    outdated(rig)
+    for use in (_sections, _page, _difference, _constants, _formats):
+        try:
+            use(path)
+        except BadInputError as error:
+            refusal = str(error)
+            assert refusal and "\n" not in refusal and refusal.isprintable(), repr(refusal)
+    sections_of(path)
+
+
+def _sections(path: Path) -> None:
+    from calib.rig import read_rig
+    from calib.rig_actuator import Actuator, PumpSection, section_of
+    from calib.running.sections import sections_of
+
+    whole = read_rig(path)
+    sections_of(path).text(path)
+    section_of(whole, "actuator", Actuator, path)
+    section_of(whole, "pump", PumpSection, path)
+
+
+def _page(path: Path) -> None:
+    from calib.report.page import page_text
+
+    text = page_text(path)
+    assert "<script>alert" not in text
+
+
+def _difference(path: Path) -> None:
+    from calib.rigdiff import diff_rigs
+
+    known = Path(__file__).resolve().parent / "corpus" / "rig_yaml" / "seed_camera.yaml"
+    diff_rigs(path, known)
+    diff_rigs(known, path)
+
+
+def _constants(path: Path) -> None:
+    from calib.firmware.header import header_of, header_text
+    from calib.rig import read_rig
+
+    whole = read_rig(path)
+    if whole.camera is not None:
+        text = header_text(header_of(whole, "rig.yaml"))
+        assert text.isascii() or text.isprintable
+
+
+def _formats(path: Path) -> None:
+    from calib.camera.formats import from_opencv, from_ros, to_kalibr, to_opencv, to_ros
+    from calib.rig import read_rig
+    from calib.sections import camera_covariance, camera_from_section, current_plane
+
+    whole = read_rig(path)
+    if whole.camera is None:
+        return
+    camera = camera_from_section(whole.camera)
+    for there, back in ((to_ros, from_ros), (to_opencv, from_opencv)):
+        assert back(there(camera)).K.tolist() == camera.K.tolist()
+    current_plane(whole, "rig.yaml")
+    camera_covariance(whole.camera, "rig.yaml")
+    to_kalibr(camera)
+
+
+if __name__ == "__main__":
+    from harness import main
+
+    main(sys.modules[__name__])
