@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from calib.rig_base import Section
 
-__all__ = ["Estimator", "EstimatorAxisGain", "EstimatorGain", "EstimatorLevel"]
+__all__ = ["Estimator", "EstimatorGain", "EstimatorLevel"]
 
 Positive = Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False, strict=True)]
-Finite = Annotated[float, Field(ge=-1e12, le=1e12, allow_inf_nan=False, strict=True)]
 NotNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False, strict=True)]
+Gain = Annotated[float, Field(gt=0, lt=1, allow_inf_nan=False, strict=True)]
 
 
 class EstimatorLevel(Section):
@@ -27,38 +27,23 @@ class EstimatorLevel(Section):
     walk_length_m_per_sqrt_s: NotNegative
 
 
-class EstimatorAxisGain(Section):
-    """One axis, see `calib.estimator.constant_gain.AxisGain`: F (n, n), H (m, n), K (n, m), sigma (n,)."""
-
-    F: list[list[Finite]]
-    H: list[list[Finite]]
-    K: list[list[Finite]]
-    sigma: list[NotNegative]
-
-    @model_validator(mode="after")
-    def _fits(self) -> EstimatorAxisGain:
-        n, m = len(self.F), len(self.H)
-        whole = all(len(row) == n for row in (*self.F, *self.H)) and all(len(row) == m for row in self.K)
-        if not whole or len(self.K) != n or len(self.sigma) != n:
-            raise ValueError("expected F of n x n, H of m x n, K of n x m and n deviations")
-        return self
-
-
 class EstimatorGain(Section):
-    """The kinematic filter with constant gains, for a controller; angle and length apart.
-
-    Attributes
-    ----------
-    rate_hz, delay_ticks : ticks, and how many of them a picture is late.
-    phi_level, length_level : names of the levels of process noise that the gains are made for.
-    """
+    """The fused estimator with constant gains, for a controller; see `calib.estimator.gains.Gains`."""
 
     rate_hz: Positive
-    delay_ticks: Annotated[int, Field(ge=0, le=8, strict=True)]
-    phi_level: str
-    length_level: str
-    phi: EstimatorAxisGain
-    length: EstimatorAxisGain
+    delay_ticks: Annotated[float, Field(ge=0, le=8, allow_inf_nan=False, strict=True)]
+    lever_m: Positive
+    camera_phi: Gain
+    accel_phi: Gain
+    bias: Gain
+    moving_length: Gain
+    moving_rate: Gain
+    rest_length: Gain
+    rate_decay: Gain
+    slow: Gain
+    moving_m: Positive
+    still_m: Positive
+    gate_m: Positive
 
 
 class Estimator(Section):

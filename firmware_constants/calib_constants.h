@@ -1,7 +1,7 @@
 /*
  * calib_constants.h - constants of one rig, written by calib 0.1.0. Do not edit.
  *
- * SHA-256 of the values: ebfa79c1909748bf2daf4844a01b4010d0296a6932b0b51b65aacc4e4f4eaad8
+ * SHA-256 of the values: 3197c976c04f1ecffd8204ab2a28f544ae55984da981595c464ed90b81f6acf1
  * input camera/board.yaml: f77bc61378d4ff28baac9883646ca1bf8dc43576acf495b4800377effe06e39b
  * input camera/view01.png: a8a5d43cd237c318df2372ece67ce52fa2a09171cff9447bb68af2394a832c30
  * input camera/view02.png: 74159ff201b50cc6f7316fa06817c34155aa126f4f03cb7415b51f5489fcb730
@@ -53,7 +53,7 @@
 #define CALIB_TABLE_READ(address) (*(address))
 #endif
 
-#define CALIB_SCHEMA 2
+#define CALIB_SCHEMA 3
 #if defined(CALIB_EXPECT_SCHEMA)
 #if CALIB_EXPECT_SCHEMA != CALIB_SCHEMA
 #error "calib: this header has another schema than the code expects"
@@ -61,7 +61,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0xEBFA79C1UL
+#define CALIB_ID 0x3197C976UL
 
 /* Camera (2.5) and lens (B.1). */
 #define CALIB_IMAGE_WIDTH_PX 316 /* columns */
@@ -95,7 +95,7 @@
 #define CALIB_LENS_INVERSE_C5 -2.06394172f /* coefficient of r2^5, dimensionless */
 #define CALIB_LENS_INVERSE_P(r2) (1.0f + (r2) * (CALIB_LENS_INVERSE_C1 + (r2) * (CALIB_LENS_INVERSE_C2 + (r2) * (CALIB_LENS_INVERSE_C3 + (r2) * (CALIB_LENS_INVERSE_C4 + (r2) * (CALIB_LENS_INVERSE_C5)))))) /* P by Horner's scheme */
 
-/* Plane of the actuator. */
+/* Plane of the actuator, without the shift and stretch that align has found. */
 #define CALIB_HAS_PLANE 1 /* for #if */
 #define CALIB_PLANE_OK 1 /* 0: the plane failed its gate */
 #define CALIB_PLANE_INVERSE_11 0.00365899038f /* row 1, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
@@ -148,8 +148,8 @@
 #define CALIB_TIME_OFFSET_REST_S 0.0f /* what the whole ticks leave of that, s, unused */
 
 /*
- * IMU on the head, x from the head to the base at rest; phi = atan2(ay, ax) - mount (2.1),
- * dphi/dt = -gz.
+ * IMU on the head, x from the head to the base at rest; phi = atan2(RATIO ay, ax) - mount (2.1),
+ * dphi/dt = -gz. rig.yaml has no key for the signs of the axes, they are 1.
  * Defaults of the nominal actuator, not in rig.yaml: align.rest_angle_rad, imu.gyro_bias_radps.2.
  */
 #define CALIB_IMU_SIGN_AX 1 /* 1 or -1, by hand for an IMU that is not right-handed as mounted */
@@ -157,15 +157,16 @@
 #define CALIB_IMU_SIGN_GZ 1 /* 1 or -1 */
 #define CALIB_IMU_ACCEL_BIAS_X_MPS2 0.0f /* subtracted from ax, m/s^2 */
 #define CALIB_IMU_ACCEL_BIAS_Y_MPS2 0.0f /* subtracted from ay, m/s^2 */
+#define CALIB_IMU_ACCEL_RATIO 1.0f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
 #define CALIB_IMU_GYRO_BIAS_RADPS 0.0f /* gz at rest, rad/s; sign as read */
-#define CALIB_IMU_MOUNT_ANGLE_RAD 0.0f /* atan2(ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
+#define CALIB_IMU_MOUNT_ANGLE_RAD 0.0f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
 #define CALIB_IMU_ACCEL_LIMIT_MPS2 400.0f /* readings beyond are lost, m/s^2 */
 #define CALIB_IMU_RATE_LIMIT_RADPS 60.0f /* readings beyond are lost, rad/s */
 #define CALIB_IMU_ACCEL_WEAK_MPS2 1.0f /* |ax| and |ay| below say nothing of phi, m/s^2 */
 
 /*
  * Angle filter (2.3), dt folded in. The integral is kept as an angle per tick, J = I dt:
- * J += KI_DT2 e, phi += KP_DT e + J - (DT gz - GYRO_BIAS_DT).
+ * J += KI_DT2 e, phi += KP_DT e + J - DT gz; J begins at GYRO_BIAS_DT.
  * Defaults of the nominal actuator, not in rig.yaml: orientation_filter.Kp_per_s, orientation_filter.Ki_per_s2.
  */
 #define CALIB_MM_KP_DT 0.0500000007f /* Kp dt, dimensionless; Kp = 3 1/s */
@@ -206,6 +207,9 @@
 #define CALIB_INVERSE_F1_PER_RAD2 0.0833333358f /* coefficient of phi^2 (3.14), 1/rad^2 */
 #define CALIB_INVERSE_F2_PER_RAD4 0.00243055564f /* coefficient of phi^4 (3.14), 1/rad^4 */
 #define CALIB_INVERSE_F3_PER_RAD6 6.40707658e-05f /* coefficient of phi^6 (3.14), 1/rad^6 */
+
+/* Fused estimator: none. rig.yaml lacks align. */
+#define CALIB_HAS_FUSED 0 /* for #if; CALIB_FUSED 1 does not compile */
 
 /*
  * Pumps.

@@ -9,6 +9,10 @@
  * IMU -> angle (2.3); marker -> plane (2.11), (2.12) -> head (A.1) -> low-pass -> lengths (3.12), (3.14);
  * then the controller that inputs.mode asks for: angle (4.1), (4.4) or lengths with feed-forward (4.5), (4.6).
  *
+ * With CALIB_FUSED 1 one estimator with constant gains stands for angle filter and low-pass: the gyroscope
+ * carries the angle, pictures and accelerometer pull it, the length follows the pictures with one of two gains,
+ * and the age of a picture, in parts of a tick, is allowed for. It needs align in rig.yaml.
+ *
  * What goes wrong, and what happens then (flags say it for the tick, counters for good):
  *   no marker, NaN, outside the picture   the last marker is held            CALIB_MARKER_HELD
  *   behind or near the horizon            the last marker is held            and CALIB_HORIZON
@@ -20,9 +24,16 @@
  *   reference NaN or absurd               pumps off, controllers cleared     CALIB_BAD_REFERENCE
  *   command beyond the limits             saturated, anti-windup             CALIB_SATURATED_1, _2
  * A marker that comes back after CALIB_HOLD_TICKS starts the low-pass afresh. No output is ever NaN or infinite.
+ * With CALIB_FUSED 1 moreover
+ *   no marker                             angle by the IMU, the length's rate decays
+ *   marker far from the expected place    left out, after CALIB_FUSED_PATIENCE
+ *                                         of them in a row a new start       CALIB_MARKER_REJECTED
+ *   no IMU sample                         the angle by the pictures alone    CALIB_IMU_HELD
  *
- * Before including: CALIB_UNDISTORT 0 or 1 (default: 1 where the camera has a lens), CALIB_PROGMEM for
- * tables in flash, CALIB_STAGE(n) to measure stages 1 to 6, CALIB_SQRTF(x) for another square root.
+ * Before including: CALIB_UNDISTORT 0 or 1 (default: 1 where the camera has a lens), CALIB_FUSED 0 or 1 (default 0),
+ * CALIB_RATE_IS_MEAN 1 where gz_radps is the mean since the last tick instead of a reading at the tick (CALIB_FUSED
+ * alone; for a program that reads the gyroscope more often than it ticks), CALIB_PROGMEM for tables in flash,
+ * CALIB_STAGE(n) to measure stages 1 to 6, CALIB_SQRTF(x) for another square root.
  */
 #ifndef CALIB_PIPELINE_H
 #define CALIB_PIPELINE_H
@@ -32,7 +43,7 @@
 #include <string.h>
 
 #ifndef CALIB_EXPECT_SCHEMA
-#define CALIB_EXPECT_SCHEMA 2
+#define CALIB_EXPECT_SCHEMA 3
 #endif
 #include "calib_constants.h"
 
@@ -45,6 +56,17 @@
 #endif
 #if !CALIB_UNDISTORT && !CALIB_HAS_RAW_PLANE
 #error "calib: no plane without undistortion, the camera does not see the workspace"
+#endif
+
+#ifndef CALIB_FUSED
+#define CALIB_FUSED 0
+#endif
+#if CALIB_FUSED && !CALIB_HAS_FUSED
+#error "calib: rig.yaml lacks what CALIB_FUSED needs, calib_constants.h says what (calib align)"
+#endif
+
+#ifndef CALIB_RATE_IS_MEAN
+#define CALIB_RATE_IS_MEAN 0
 #endif
 
 #ifndef CALIB_STAGE
@@ -81,6 +103,10 @@ extern "C" {
 #define CALIB_CLAMPED_2 0x0100u
 #define CALIB_SATURATED_1 0x0200u
 #define CALIB_SATURATED_2 0x0400u
+#define CALIB_MARKER_REJECTED 0x0800u
+#define CALIB_LENGTH_MOVES 0x1000u /* of the fused estimator: the length does not rest */
+#define CALIB_BY_MEAN_RATE 0x4000u /* in every tick: CALIB_RATE_IS_MEAN was 1 */
+#define CALIB_BY_FUSED 0x8000u     /* in every tick: CALIB_FUSED was 1 */
 
 /* Counters of state.count; they stop at 65535. */
 #define CALIB_COUNT_MARKER 0    /* ticks without a marker */
@@ -89,7 +115,8 @@ extern "C" {
 #define CALIB_COUNT_STALE 3     /* ticks that a lost sensor stopped */
 #define CALIB_COUNT_REFERENCE 4 /* ticks that a bad reference stopped */
 #define CALIB_COUNT_SATURATED 5 /* ticks with a saturated command */
-#define CALIB_COUNTERS 6
+#define CALIB_COUNT_REJECTED 6  /* markers that the fused estimator left out */
+#define CALIB_COUNTERS 7
 
 #define CALIB_LOWPASS_STATES (2 * CALIB_LOWPASS_PAIRS + CALIB_LOWPASS_SINGLES)
 
@@ -104,22 +131,36 @@ typedef struct {
 typedef struct {
     float phi_rad;
     float marker_m[2];                    /* marker in the plane, held where none was seen */
-    float head_m[2];                      /* head after the low-pass */
+    float head_m[2];                      /* head after the low-pass; fused: when the picture was exposed */
     float q_m[2];                         /* lengths of the bellows */
     float pwm[2];                         /* commands, within the pumps' limits */
     uint16_t flags;
     uint8_t duty[2];                      /* the commands as whole numbers for a timer's register */
 } calib_outputs;
 
+/* A controller's memory: P and e_(k-1), reference and feed-forward of the tick before. */
 typedef struct {
-    float phi_rad, integral_rad;          /* angle and J of (2.3) */
+    float sum, error, fed_m, fed_pwm;
+} calib_channel;
+
+typedef struct {
+    float phi_rad;
     float marker_m[2];
+#if CALIB_FUSED
+    float bias_rad, half_rad;             /* what the gyroscope turns too little in a tick; T / 2 times its rate */
+    float length_m, rate_m, slow_m;       /* length, its change in a tick, mean residual */
+#if CALIB_FUSED_TICKS > 0
+    float past_rad[CALIB_FUSED_TICKS];    /* angles of the last ticks, the oldest first */
+#endif
+    uint8_t boost, moving, rejected;
+#else
+    float integral_rad;                   /* J of (2.3), from the gyroscope's known bias on */
     float lowpass[2][CALIB_LOWPASS_STATES];
-    float sum[2], error[2];               /* P and e_(k-1) of the controllers */
-    float fed_m[2], fed_pwm[2];           /* reference and feed-forward of the tick before */
 #if CALIB_TIME_OFFSET_TICKS > 0
     float past_rad[CALIB_TIME_OFFSET_TICKS];
 #endif
+#endif
+    calib_channel channel[2];
     uint16_t marker_age, imu_age;         /* ticks since the last good one, from CALIB_NEVER */
     uint16_t count[CALIB_COUNTERS];
     uint8_t mode;
@@ -155,6 +196,11 @@ static inline uint8_t calib_negative(float value) {
 /* |value| <= limit for a positive limit; false for NaN. */
 static inline uint8_t calib_within(float value, float limit) {
     return (uint8_t)((calib_bits(value) & 0x7FFFFFFFUL) <= calib_bits(limit));
+}
+
+/* value > limit for a limit that is not negative; true for a positive NaN. */
+static inline uint8_t calib_above(float value, float limit) {
+    return (uint8_t)(!calib_negative(value) && calib_bits(value) > calib_bits(limit));
 }
 
 /* A value within +-limit: itself, or the limit on its side. Not for NaN. */
@@ -194,6 +240,16 @@ static inline float calib_atan2(float y, float x) {
     return calib_negative(y) ? -t : t;
 }
 
+#if CALIB_FUSED
+/* sin(h) / h to 3e-9 and cos(h) to 4e-8 for |h| <= CALIB_PHI_LIMIT_RAD / 2; w is h squared. */
+static inline float calib_sinc_half(float w) {
+    return 1.0f + w * (-0.1666665f + w * (0.00833195f + w * -0.00019492f));
+}
+
+static inline float calib_cos_half(float w) {
+    return 1.0f + w * (-0.49999891f + w * (0.04165605f + w * -0.00135944f));
+}
+#else
 /*
  * d sin(phi) and d cos(phi) for |phi| <= CALIB_PHI_LIMIT_RAD, to 1e-6 d; w is phi squared. The compiler multiplies
  * the coefficients by d.
@@ -214,13 +270,17 @@ static inline float calib_half_f(float w) {
                 w * (0.5f * CALIB_INVERSE_F2_PER_RAD4 + w * (0.5f * CALIB_INVERSE_F3_PER_RAD6)));
 }
 
-/* Lengths of the bellows by (3.12) of the head (x, y) and the angle, |phi| <= CALIB_PHI_LIMIT_RAD. */
+/*
+ * Lengths of the bellows by (3.12) of the head (x, y) and the angle, |phi| <= CALIB_PHI_LIMIT_RAD; w is the square
+ * of the angle that belongs to the head.
+ */
 static inline void calib_bellows(float x, float y, float phi, float w, float *q) {
     float length = (float)CALIB_SQRTF(x * x + y * y) * calib_half_f(w);
     float turned = CALIB_BELLOWS_RADIUS_M * phi;
     q[0] = length + turned;
     q[1] = length - turned;
 }
+#endif
 
 /*
  * Lengths that bring the head to (x, y), exact to 4e-7: under constant curvature the angle is twice that of the
@@ -251,26 +311,43 @@ static inline uint16_t calib_imu_lost(calib_state *state) {
     return CALIB_IMU_HELD;
 }
 
-/* Angle filter (2.3). Returns flags. */
-static inline uint16_t calib_angle(calib_state *state, const calib_inputs *in) {
-    float ax = in->ax_mps2, ay = in->ay_mps2, gz = in->gz_radps, e = 0.0f, phi = state->phi_rad;
-    uint16_t flags = 0;
-    if (!in->imu_read || !calib_within(ax, CALIB_IMU_ACCEL_LIMIT_MPS2) ||
-        !calib_within(ay, CALIB_IMU_ACCEL_LIMIT_MPS2) || !calib_within(gz, CALIB_IMU_RATE_LIMIT_RADPS)) {
-        return calib_imu_lost(state);
-    }
+/* Whether the IMU's sample can be used. */
+static inline uint8_t calib_sampled(const calib_inputs *in) {
+    return (uint8_t)(in->imu_read && calib_within(in->ax_mps2, CALIB_IMU_ACCEL_LIMIT_MPS2) &&
+                     calib_within(in->ay_mps2, CALIB_IMU_ACCEL_LIMIT_MPS2) &&
+                     calib_within(in->gz_radps, CALIB_IMU_RATE_LIMIT_RADPS));
+}
+
 #if CALIB_IMU_SIGN_AX < 0
-    ax = -ax;
+#define CALIB_AX(in) (-(in)->ax_mps2)
+#else
+#define CALIB_AX(in) ((in)->ax_mps2)
 #endif
 #if CALIB_IMU_SIGN_AY < 0
-    ay = -ay;
+#define CALIB_AY(in) (-(in)->ay_mps2)
+#else
+#define CALIB_AY(in) ((in)->ay_mps2)
 #endif
 #if CALIB_IMU_SIGN_GZ < 0
-    gz = -gz;
+#define CALIB_GZ(in) (-(in)->gz_radps)
+#else
+#define CALIB_GZ(in) ((in)->gz_radps)
 #endif
-    /* Differences, because a compiler may leave out x - 0 but not x + 0. */
+
+#if !CALIB_FUSED
+/* Angle filter (2.3). Returns flags. */
+static inline uint16_t calib_angle(calib_state *state, const calib_inputs *in) {
+    float ax, ay, gz, e = 0.0f, phi = state->phi_rad;
+    uint16_t flags = 0;
+    if (!calib_sampled(in)) {
+        return calib_imu_lost(state);
+    }
+    ax = CALIB_AX(in);
+    ay = CALIB_AY(in);
+    gz = CALIB_GZ(in);
+    /* Differences, because a compiler may leave out x - 0 and x * 1, but not x + 0. */
     ax = ax - CALIB_IMU_ACCEL_BIAS_X_MPS2;
-    ay = ay - CALIB_IMU_ACCEL_BIAS_Y_MPS2;
+    ay = (ay - CALIB_IMU_ACCEL_BIAS_Y_MPS2) * CALIB_IMU_ACCEL_RATIO;
     if (calib_within(ax, CALIB_IMU_ACCEL_WEAK_MPS2) && calib_within(ay, CALIB_IMU_ACCEL_WEAK_MPS2)) {
         if (state->imu_age == CALIB_NEVER) {
             return (uint16_t)(CALIB_ACCEL_WEAK | calib_imu_lost(state));
@@ -287,7 +364,7 @@ static inline uint16_t calib_angle(calib_state *state, const calib_inputs *in) {
     } else {
         float J = calib_clip(state->integral_rad + CALIB_MM_KI_DT2 * e, CALIB_MM_INTEGRAL_LIMIT_RAD);
         state->integral_rad = J;
-        phi += CALIB_MM_KP_DT * e + (J - (CALIB_MM_DT_S * gz - CALIB_MM_GYRO_BIAS_DT_RAD));
+        phi += CALIB_MM_KP_DT * e + (J - CALIB_MM_DT_S * gz);
     }
     if (!calib_within(phi, CALIB_PHI_LIMIT_RAD)) {
         phi = calib_clip(phi, CALIB_PHI_LIMIT_RAD);
@@ -297,6 +374,7 @@ static inline uint16_t calib_angle(calib_state *state, const calib_inputs *in) {
     state->imu_age = 0;
     return flags;
 }
+#endif
 
 #if CALIB_UNDISTORT
 /* Undistorted normalised coordinates of a pixel. */
@@ -344,7 +422,7 @@ static inline uint16_t calib_marker(calib_state *state, const calib_inputs *in, 
         float x, y;
         calib_undistort(u, v, &x, &y);
         W = CALIB_PLANE_NORMALISED_31 * x + CALIB_PLANE_NORMALISED_32 * y + CALIB_PLANE_NORMALISED_33;
-        if (W > CALIB_PLANE_LEAST_PER_M) {
+        if (calib_above(W, CALIB_PLANE_LEAST_PER_M)) {
             float s = 1.0f / W;
             state->marker_m[0] =
                 s * (CALIB_PLANE_NORMALISED_11 * x + CALIB_PLANE_NORMALISED_12 * y + CALIB_PLANE_NORMALISED_13);
@@ -354,7 +432,7 @@ static inline uint16_t calib_marker(calib_state *state, const calib_inputs *in, 
         }
 #else
         W = CALIB_PLANE_RAW_31 * u + CALIB_PLANE_RAW_32 * v + CALIB_PLANE_RAW_33;
-        if (W > CALIB_PLANE_RAW_LEAST_PER_M) {
+        if (calib_above(W, CALIB_PLANE_RAW_LEAST_PER_M)) {
             float s = 1.0f / W;
             state->marker_m[0] = s * (CALIB_PLANE_RAW_11 * u + CALIB_PLANE_RAW_12 * v + CALIB_PLANE_RAW_13);
             state->marker_m[1] = s * (CALIB_PLANE_RAW_21 * u + CALIB_PLANE_RAW_22 * v + CALIB_PLANE_RAW_23);
@@ -376,6 +454,7 @@ static inline uint16_t calib_marker(calib_state *state, const calib_inputs *in, 
     return flags;
 }
 
+#if !CALIB_FUSED
 /* One tick of the low-pass of one coordinate; s is its memory. Exact at rest. */
 static inline float calib_lowpass(float *s, float x) {
 #if CALIB_LOWPASS_PAIRS > 0
@@ -437,6 +516,153 @@ static inline void calib_lowpass_settle(float *s, float x) {
     *s = x;
 #endif
 }
+#else
+/*
+ * The fused estimator. A picture tells where the head was when it was exposed, CALIB_FUSED_TICKS less
+ * CALIB_FUSED_PART ticks ago; with h half the angle of then, the marker's place across the chord tells that angle's
+ * error, its place along the chord the length, without root or arc tangent. Returns flags.
+ */
+static inline uint16_t calib_fuse(calib_state *state, const calib_inputs *in, calib_outputs *out) {
+    float phi = state->phi_rad, A = 0.0f, B = 0.0f, half, then, h, w, s, sh, ch, chord, c = 0.0f;
+    uint16_t flags = 0, age = state->marker_age;
+    uint8_t sampled = calib_sampled(in), afresh;
+#if CALIB_FUSED_TICKS > 0
+    uint8_t i;
+#endif
+    if (sampled) {
+        float ax = CALIB_AX(in), ay = CALIB_AY(in);
+        /* Gravity's share along and across the head, times the accelerometer's gain. */
+        A = CALIB_FUSED_ACCEL_11 * ax + (CALIB_FUSED_ACCEL_12 * ay - CALIB_FUSED_ACCEL_1);
+        B = CALIB_FUSED_ACCEL_21 * ax + (CALIB_FUSED_ACCEL_22 * ay - CALIB_FUSED_ACCEL_2);
+        half = CALIB_FUSED_HALF_BIAS_RAD - CALIB_FUSED_HALF_DT_S * CALIB_GZ(in);
+        if (calib_within(A, CALIB_FUSED_ACCEL_WEAK) && calib_within(B, CALIB_FUSED_ACCEL_WEAK)) {
+            flags = CALIB_ACCEL_WEAK;
+        }
+        if (state->imu_age <= CALIB_HOLD_TICKS || age <= CALIB_HOLD_TICKS) {
+#if CALIB_RATE_IS_MEAN
+            phi += half + half + state->bias_rad;
+#else
+            phi += half + (state->imu_age ? half : state->half_rad) + state->bias_rad;
+#endif
+        } else if (flags) {
+            sampled = 0;
+        } else {
+            /* Nothing is known of the angle: the accelerometer's. */
+            phi = calib_clip(calib_atan2(B, A), CALIB_PHI_LIMIT_RAD);
+#if CALIB_FUSED_TICKS > 0
+            for (i = 0; i < CALIB_FUSED_TICKS; i++) {
+                state->past_rad[i] = phi;
+            }
+#endif
+        }
+        state->half_rad = half;
+    }
+    if (sampled) {
+        state->imu_age = 0;
+    } else {
+        flags = (uint16_t)(flags | calib_imu_lost(state));
+    }
+    CALIB_STAGE(2);
+    flags = (uint16_t)(flags | calib_marker(state, in, &afresh));
+    CALIB_STAGE(3);
+#if CALIB_FUSED_TICKS > 1
+    then = state->past_rad[0] + CALIB_FUSED_PART * (state->past_rad[1] - state->past_rad[0]);
+#elif CALIB_FUSED_TICKS > 0
+    then = state->past_rad[0] + CALIB_FUSED_PART * (phi - state->past_rad[0]);
+#else
+    then = phi;
+#endif
+    h = 0.5f * then;
+    w = h * h;
+    s = calib_sinc_half(w);
+    sh = h * s;
+    ch = calib_cos_half(w);
+    if (sampled && !(flags & CALIB_ACCEL_WEAK)) {
+        /* B cos(then) - A sin(then), which is the angle's error of then, seen now. */
+        c = B - (sh + sh) * (B * sh + A * ch) - CALIB_FUSED_ACCEL_GAIN * (phi - then);
+        c = calib_clip(c, CALIB_FUSED_ACCEL_GAIN);
+    }
+    CALIB_STAGE(4);
+    state->length_m += state->rate_m;
+    chord = s * (state->length_m - CALIB_FUSED_DELAY_TICKS * state->rate_m);
+    if (flags & CALIB_MARKER_HELD) {
+        state->rate_m *= CALIB_FUSED_RATE_DECAY;
+    } else {
+        float X = state->marker_m[0], Y = state->marker_m[1], e, more = 0.0f;
+        float across = X * ch - (Y + CALIB_MARKER_OFFSET_M) * sh;
+        float along = X * sh + (Y - CALIB_MARKER_OFFSET_M) * ch;
+        if (afresh || state->rejected >= CALIB_FUSED_PATIENCE) {
+            chord = along;
+            state->length_m = along / s;
+            state->rate_m = 0.0f;
+            state->slow_m = 0.0f;
+            state->boost = CALIB_FUSED_BOOST_TICKS;
+            state->moving = CALIB_FUSED_MOVING_TICKS;
+            state->rejected = 0;
+        }
+        e = along - chord;
+        if (state->boost) {
+            state->boost--;
+            c = calib_clip(CALIB_FUSED_BOOST_PHI_PER_M * across, CALIB_FUSED_BOOST);
+            more = CALIB_FUSED_BOOST * e;
+        } else if (calib_within(across, CALIB_FUSED_GATE_M) && calib_within(e, CALIB_FUSED_GATE_M)) {
+            state->rejected = 0;
+            if (sampled) {
+                c += CALIB_FUSED_PHI_PER_M * across;
+            } else {
+                c = CALIB_FUSED_ALONE_PHI_PER_M * across;
+            }
+            state->slow_m += CALIB_FUSED_SLOW * (e - state->slow_m);
+            if (!calib_within(state->slow_m, CALIB_FUSED_MOVING_M) ||
+                !calib_within(state->rate_m, CALIB_FUSED_STILL_M)) {
+                state->moving = CALIB_FUSED_MOVING_TICKS;
+                flags = (uint16_t)(flags | CALIB_LENGTH_MOVES);
+            } else if (state->moving) {
+                state->moving--;
+            }
+            if (state->moving) {
+                more = CALIB_FUSED_MOVING_LENGTH * e;
+                state->rate_m += CALIB_FUSED_MOVING_RATE * e;
+            } else {
+                more = CALIB_FUSED_REST_LENGTH * e;
+                state->rate_m *= CALIB_FUSED_RATE_DECAY;
+            }
+        } else {
+            state->rejected++;
+            state->rate_m *= CALIB_FUSED_RATE_DECAY;
+            state->marker_age = calib_older(age);
+            calib_count(state, CALIB_COUNT_REJECTED);
+            flags = (uint16_t)(flags | CALIB_MARKER_REJECTED);
+        }
+        state->length_m += more;
+        chord += more;
+    }
+    if (sampled && !state->boost) {
+        state->bias_rad = calib_clip(state->bias_rad + CALIB_FUSED_BIAS * c, CALIB_MM_INTEGRAL_LIMIT_RAD);
+    }
+    phi += c;
+    if (!calib_within(phi, CALIB_PHI_LIMIT_RAD)) {
+        phi = calib_clip(phi, CALIB_PHI_LIMIT_RAD);
+        flags = (uint16_t)(flags | CALIB_ANGLE_LIMIT);
+    }
+#if CALIB_FUSED_TICKS > 0
+    for (i = 0; i + 1 < CALIB_FUSED_TICKS; i++) {
+        state->past_rad[i] = calib_clip(state->past_rad[i + 1] + c, CALIB_PHI_LIMIT_RAD);
+    }
+    state->past_rad[CALIB_FUSED_TICKS - 1] = phi;
+#endif
+    state->phi_rad = phi;
+    CALIB_STAGE(5);
+    out->phi_rad = phi;
+    phi *= CALIB_BELLOWS_RADIUS_M;
+    out->q_m[0] = state->length_m + phi;
+    out->q_m[1] = state->length_m - phi;
+    /* The head at the time of the picture (3.6). */
+    out->head_m[0] = chord * sh;
+    out->head_m[1] = chord * ch;
+    return flags;
+}
+#endif
 
 /* Feed-forward of one bellows (4.6), or from the table. */
 static inline float calib_feed_forward(float q_ref_m) {
@@ -464,29 +690,15 @@ static inline float calib_feed_forward(float q_ref_m) {
 
 /* A state that has seen nothing yet. */
 static inline void calib_start(calib_state *state) {
-    uint8_t i, k;
-    state->phi_rad = 0.0f;
-    state->integral_rad = 0.0f;
-    for (i = 0; i < 2; i++) {
-        state->marker_m[i] = 0.0f;
-        for (k = 0; k < CALIB_LOWPASS_STATES; k++) {
-            state->lowpass[i][k] = 0.0f;
-        }
-        state->sum[i] = 0.0f;
-        state->error[i] = 0.0f;
-        state->fed_m[i] = 0.0f;
-        state->fed_pwm[i] = calib_feed_forward(0.0f);
-    }
-#if CALIB_TIME_OFFSET_TICKS > 0
-    for (i = 0; i < CALIB_TIME_OFFSET_TICKS; i++) {
-        state->past_rad[i] = 0.0f;
-    }
+    /* All floats to zero; so is the feed-forward of no length. */
+    memset(state, 0, sizeof *state);
+#if CALIB_FUSED
+    state->length_m = CALIB_REST_LENGTH_M;
+#else
+    state->integral_rad = CALIB_MM_GYRO_BIAS_DT_RAD;
 #endif
     state->marker_age = CALIB_NEVER;
     state->imu_age = CALIB_NEVER;
-    for (i = 0; i < CALIB_COUNTERS; i++) {
-        state->count[i] = 0;
-    }
     state->mode = CALIB_MODE_OFF;
 }
 
@@ -530,11 +742,13 @@ static inline uint8_t calib_whole(float u) {
     return (uint8_t)(((uint16_t)u + 1u) >> 1);
 }
 
+/* Without clamping, which looks at the feedback alone, the integral's sum carries the feed-forward: one sum less. */
+#define CALIB_FED_IN_SUM (CALIB_POSITION_HAS_KI && !CALIB_POSITION_CLAMPING)
+
 static inline void calib_pumps_off(calib_state *state, calib_outputs *out) {
     uint8_t i;
+    memset(state->channel, 0, sizeof state->channel);
     for (i = 0; i < 2; i++) {
-        state->sum[i] = 0.0f;
-        state->error[i] = 0.0f;
         out->pwm[i] = CALIB_PUMP_LOW_PWM;
         out->duty[i] = calib_whole(CALIB_PUMP_LOW_PWM);
     }
@@ -564,17 +778,25 @@ static inline uint16_t calib_control(calib_state *state, const calib_inputs *in,
         return CALIB_BAD_REFERENCE;
     }
     for (i = 0; i < 2; i++) {
+        calib_channel *own = &state->channel[i];
         float e, u;
         if (position) {
-            e = in->reference[i] - out->q_m[i];
-            u = calib_pid(&state->sum[i], e, state->error[i], CALIB_POSITION_KPDI_PWM_PER_M,
+            float wanted = in->reference[i];
+            if (calib_bits(wanted) != calib_bits(own->fed_m)) {
+                float fed = calib_feed_forward(wanted);
+                if (CALIB_FED_IN_SUM) {
+                    own->sum += fed - own->fed_pwm;
+                }
+                own->fed_m = wanted;
+                own->fed_pwm = fed;
+            }
+            e = wanted - out->q_m[i];
+            u = calib_pid(&own->sum, e, own->error, CALIB_POSITION_KPDI_PWM_PER_M,
                           CALIB_POSITION_KD_PER_DT_PWM_PER_M, CALIB_POSITION_KI_HALF_DT_PWM_PER_M,
                           CALIB_POSITION_HAS_KI, CALIB_POSITION_CLAMPING, &clamped);
-            if (calib_bits(in->reference[i]) != calib_bits(state->fed_m[i])) {
-                state->fed_m[i] = in->reference[i];
-                state->fed_pwm[i] = calib_feed_forward(in->reference[i]);
+            if (!CALIB_FED_IN_SUM) {
+                u += own->fed_pwm;
             }
-            u += state->fed_pwm[i];
         } else {
             e = in->reference[0] - out->phi_rad;
             if (CALIB_ORIENTATION_SIGN < 0) {
@@ -583,24 +805,24 @@ static inline uint16_t calib_control(calib_state *state, const calib_inputs *in,
             if (i) {
                 e = -e;
             }
-            u = calib_pid(&state->sum[i], e, state->error[i], CALIB_ORIENTATION_KPDI_PWM_PER_RAD,
+            u = calib_pid(&own->sum, e, own->error, CALIB_ORIENTATION_KPDI_PWM_PER_RAD,
                           CALIB_ORIENTATION_KD_PER_DT_PWM_PER_RAD, CALIB_ORIENTATION_KI_HALF_DT_PWM_PER_RAD,
                           CALIB_ORIENTATION_HAS_KI, CALIB_ORIENTATION_CLAMPING, &clamped);
         }
-        state->error[i] = e;
+        own->error = e;
         if (clamped) {
             flags = (uint16_t)(flags | (CALIB_CLAMPED_1 << i));
         }
         if (!calib_in_limits(u)) {
-            float limited = calib_negative(u) || u < CALIB_PUMP_LOW_PWM ? CALIB_PUMP_LOW_PWM : CALIB_PUMP_HIGH_PWM;
+            float limited = calib_above(u, CALIB_PUMP_HIGH_PWM) ? CALIB_PUMP_HIGH_PWM : CALIB_PUMP_LOW_PWM;
 #if CALIB_ORIENTATION_HAS_BACK
             if (!position) {
-                state->sum[i] += CALIB_ORIENTATION_BACK * (limited - u);
+                own->sum += CALIB_ORIENTATION_BACK * (limited - u);
             }
 #endif
 #if CALIB_POSITION_HAS_BACK
             if (position) {
-                state->sum[i] += CALIB_POSITION_BACK * (limited - u);
+                own->sum += CALIB_POSITION_BACK * (limited - u);
             }
 #endif
             u = limited;
@@ -618,6 +840,14 @@ static inline uint16_t calib_control(calib_state *state, const calib_inputs *in,
 /* One tick. Nothing in inputs has to be finite. */
 static inline void calib_tick(calib_state *state, const calib_inputs *in, calib_outputs *out) {
     uint16_t flags;
+#if CALIB_FUSED
+
+    CALIB_STAGE(1);
+    flags = calib_fuse(state, in, out);
+    flags = (uint16_t)(flags | CALIB_BY_FUSED | (CALIB_RATE_IS_MEAN ? CALIB_BY_MEAN_RATE : 0u));
+    out->marker_m[0] = state->marker_m[0];
+    out->marker_m[1] = state->marker_m[1];
+#else
     uint8_t afresh, i;
     float phi, w;
 
@@ -632,15 +862,16 @@ static inline void calib_tick(calib_state *state, const calib_inputs *in, calib_
     out->marker_m[1] = state->marker_m[1];
 
     CALIB_STAGE(3);
-    w = phi * phi;
     if (state->marker_age != CALIB_NEVER) {
         float x, y;
 #if CALIB_TIME_OFFSET_TICKS > 0
-        /* The angle at the time of the picture. */
-        float then = state->past_rad[0], ww = then * then;
-        x = state->marker_m[0] - calib_sin(CALIB_MARKER_OFFSET_M, then, ww);
-        y = state->marker_m[1] - calib_cos(CALIB_MARKER_OFFSET_M, ww);
+        /* The angle at the time of the picture, for all that is of the picture. */
+        float then = state->past_rad[0];
+        w = then * then;
+        x = state->marker_m[0] - calib_sin(CALIB_MARKER_OFFSET_M, then, w);
+        y = state->marker_m[1] - calib_cos(CALIB_MARKER_OFFSET_M, w);
 #else
+        w = phi * phi;
         x = state->marker_m[0] - calib_sin(CALIB_MARKER_OFFSET_M, phi, w);
         y = state->marker_m[1] - calib_cos(CALIB_MARKER_OFFSET_M, w);
 #endif
@@ -667,6 +898,7 @@ static inline void calib_tick(calib_state *state, const calib_inputs *in, calib_
     state->past_rad[CALIB_TIME_OFFSET_TICKS - 1] = phi;
 #else
     (void)i;
+#endif
 #endif
 
     CALIB_STAGE(6);

@@ -7,7 +7,7 @@
  * The pumps stay off until CALIB_EXAMPLE_MODE is set to something else than CALIB_MODE_OFF.
  */
 #define CALIB_PROGMEM 1
-#define CALIB_EXPECT_SCHEMA 2
+#define CALIB_EXPECT_SCHEMA 3
 #define CALIB_EXPECT_PUMP_HIGH 255
 
 #include <Arduino.h>

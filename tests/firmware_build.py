@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import re
 import shutil
 import struct
@@ -14,11 +15,32 @@ import numpy as np
 import pytest
 
 from calib.firmware.conformance import Inputs, Outputs, Reference
+from calib.firmware.conformance_fused import FusedReference
 from calib.firmware.header import Header, header_text, verbatim
 from calib.firmware.literals import values
-from calib.firmware.vectors import selftest_text
+from calib.firmware.vectors import TOLERANCE, selftest_text
 
-__all__ = ["Process", "Ticks", "avr", "compare", "host", "need", "pack", "run", "warnings", "write"]
+__all__ = [
+    "HOSTILE",
+    "LIMITS",
+    "Process",
+    "Simulated",
+    "Ticks",
+    "avr",
+    "compare",
+    "host",
+    "need",
+    "pack",
+    "run",
+    "warnings",
+    "write",
+]
+
+LIMITS = np.array([TOLERANCE["phi_rad"], *[TOLERANCE["marker_m"]] * 2, *[TOLERANCE["q_m"]] * 4, *[0.01] * 2])
+"""What the nine numbers of a tick may differ by from float64."""
+
+HOSTILE = [0.0, -0.0, 1e-45, -1e-38, 1e-20, 0.5, 3.14159, 400.0, 401.0, 1e9, -1e20, 3.4e38, -3.4e38]
+HOSTILE += [float("nan"), float("inf"), -float("inf")]
 
 NATIVE = Path(__file__).parent / "firmware" / "native"
 
@@ -67,6 +89,7 @@ def avr(folder: Path, *flags: str) -> tuple[list[str], dict[str, int]]:
     target = ["-std=c99", "-Os", "-mmcu=atmega328p", "-DF_CPU=16000000UL", "-DCALIB_MEASURE"]
     _compile(["avr-gcc", *target, *warnings, *flags, f"-I{folder}", "-o", made, NATIVE / "program.c", "-lm"])
     _compile(["gcc", "-O2", "-o", runner, NATIVE / "runner.c", "-lsimavr"])
+    _compile(["gcc", "-O2", "-fPIC", "-shared", "-o", f"{runner}.so", NATIVE / "runner.c", "-lsimavr"])
     listing = subprocess.run(["avr-nm", made], capture_output=True, text=True, check=True).stdout
     places = {name: f"0x{place}" for place, name in re.findall(r"^(\w+) \w (in|out|_end)$", listing, re.M)}
     sizes = subprocess.run(["avr-size", made], capture_output=True, text=True, check=True).stdout
@@ -100,7 +123,7 @@ class Ticks:
 
 
 def _unpacked(data: bytes, on_avr: bool, stack: int = 0) -> Ticks:
-    more = np.dtype(("<u4", 8)) if on_avr else np.dtype(("<u2", 6))
+    more = np.dtype(("<u4", 8)) if on_avr else np.dtype(("<u2", 7))
     kind = np.dtype([("numbers", "<f4", 9), ("flags", "<u2"), ("duty", "u1", 2), ("extra", more)])
     rows = np.frombuffer(data, dtype=kind)
     return Ticks(rows["numbers"].astype(float), rows["flags"].astype(int), rows["duty"], rows["extra"], stack)
@@ -113,6 +136,27 @@ def run(command: Sequence[str], ticks: Sequence[Inputs]) -> Ticks:
     found = _unpacked(done.stdout, len(command) > 1, int(stack.group(1)) if stack else 0)
     assert len(found.flags) == len(ticks)
     return found
+
+
+class Simulated:
+    """The AVR's program in a simulator that lives in this process; one at a time in a folder.
+
+    Attributes
+    ----------
+    record : (31,) bytes of the next tick's inputs, as `pack` makes them. result : (72,) bytes.
+    """
+
+    def __init__(self, command: Sequence[str]) -> None:
+        library = ctypes.CDLL(f"{command[0]}.so")
+        addresses = [int(word, 0) & 0xFFFF for word in command[2:5]]
+        assert library.runner_open(command[1].encode(), *addresses) == 0
+        self.record, self.result = np.zeros(31, dtype=np.uint8), np.zeros(72, dtype=np.uint8)
+        self._tick = library.runner_tick
+        self._places = (ctypes.c_void_p(self.record.ctypes.data), ctypes.c_void_p(self.result.ctypes.data))
+
+    def tick(self) -> None:
+        """From `record` to `result`."""
+        assert self._tick(*self._places) == 0
 
 
 class Process:
@@ -134,7 +178,7 @@ class Process:
     def receive(self) -> Ticks:
         """Wait for its end."""
         assert self.process.stdout is not None
-        return _unpacked(self.process.stdout.read(72 if self.on_avr else 52), self.on_avr)
+        return _unpacked(self.process.stdout.read(72 if self.on_avr else 54), self.on_avr)
 
     def close(self) -> None:
         """End the program."""
@@ -151,15 +195,25 @@ def numbers(wanted: Outputs) -> list[float]:
 
 
 def compare(
-    header: Header, ticks: Sequence[Inputs], found: Ticks, undistort: bool | None = None
+    header: Header,
+    ticks: Sequence[Inputs],
+    found: Ticks,
+    undistort: bool | None = None,
+    fused: bool = False,
+    mean_rate: bool = False,
 ) -> tuple[np.ndarray, float]:
-    """Largest differences (9,) from the reference, and of undecided outputs [PWM]; flags have to agree."""
-    reference = Reference(values(header.literals), undistort)
+    """Largest differences (9,) from the reference, and of undecided outputs [PWM]; flags have to agree.
+
+    What the fused estimator may have decided otherwise lies within a micrometre of its limits.
+    """
+    constants = values(header.literals)
+    reference = FusedReference(constants, undistort, mean_rate) if fused else Reference(constants, undistort)
     wanted, undecided = [], 0.0
     for k, given in enumerate(ticks):
         out = reference.step(given, int(found.flags[k]))
         said = f"tick {k}: flags {found.flags[k]:#x}, wanted {out.flags:#x}, {given}"
         assert out.flags == found.flags[k], said
         undecided = max(undecided, out.undecided_pwm)
+        assert out.undecided_m <= 1e-6, (k, out.undecided_m)
         wanted.append(numbers(out))
     return np.abs(found.numbers - np.array(wanted)).max(axis=0), undecided

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from functools import cache
 from typing import Any
 
 import numpy as np
 
+from calib.estimator.gains import TickNoise, design
 from calib.firmware.header import Header, header_of
 from calib.rig import Rig
 from calib.signals.design import Design, design_lowpass
 from calib.twin.pictures import CAMERA, PLANE
+from calib.twin.rig import SimulatedRig
 
 __all__ = ["header", "rig"]
 
@@ -58,7 +61,7 @@ def _align() -> dict[str, Any]:
         "gyro_scale": 0.02,
         "gyro_bias_radps": 0.013,
         "accel_bias_mps2": [0.1, 0.1],
-        "accel_scale": [0.0, 0.0],
+        "accel_scale": [0.004, -0.003],
         "imu_lever_m": 0.0,
         "marker_offset_m": 0.0147,
         "plane_shift_m": [0.0, 0.0],
@@ -68,6 +71,21 @@ def _align() -> dict[str, Any]:
         "accel_noise_mps2": [0.1, 0.1],
         "gyro_noise_radps": 0.01,
         "verdict": "ok",
+    }
+
+
+def _twin() -> dict[str, Any]:
+    rig = SimulatedRig()
+    imu, angle = rig.imu, rig.imu.mount_angle_rad
+    return {
+        "time_offset_s": rig.tracker.latency_s,
+        "mount_angle_rad": angle,
+        "rest_angle_rad": angle,
+        "gyro_scale": imu.gyro_scale[2],
+        "gyro_bias_radps": imu.gyro_bias_radps[2],
+        "accel_bias_mps2": list(imu.accel_bias_mps2[:2]),
+        "accel_scale": list(imu.accel_scale[:2]),
+        "marker_offset_m": rig.tracker.marker_offset_m,
     }
 
 
@@ -98,6 +116,15 @@ def _controller() -> dict[str, Any]:
     }
 
 
+def _gain(delay_s: float) -> dict[str, Any]:
+    noise = TickNoise(camera_rad=8.6e-3, camera_m=4.3e-4, gyro_radps=2e-3, accel_rad=0.025)
+    return asdict(design(noise, 60.0, delay_s, 0.0475))
+
+
+def _estimator(delay_s: float) -> dict[str, Any]:
+    return {"jitter_px": 0.3, "constant_gain": _gain(delay_s), "verdict": "ok"}
+
+
 def _lowpass() -> dict[str, Any]:
     made = design_lowpass(Design(2.0, 60.0, 3))
     rows = made.sections.tolist()
@@ -118,9 +145,16 @@ def _lowpass() -> dict[str, Any]:
 
 @cache
 def rig(kind: str = "nominal") -> Rig:
-    """A rig with camera and plane alone, or "full" with every section that firmware reads."""
+    """A rig with camera and plane; "full" with every section.
+
+    "fused" has what that estimator needs, "twin" the same with the sensors of the nominal simulated rig.
+    """
     camera = _camera()
     sections: dict[str, Any] = {"camera": camera, "plane": _plane(camera)}
+    if kind == "fused":
+        sections |= {"align": {**_align(), "time_offset_s": 0.025}, "estimator": _estimator(0.025)}
+    if kind == "twin":
+        sections |= {"align": _align() | _twin(), "estimator": _estimator(0.025)}
     if kind == "full":
         lens = {"k1": -0.2201, "k2": 0.5494, "p1": 0.002, "p2": -0.003, "k3": 0.0}
         camera = _camera(model="brown5", distortion=lens, skew_px=0.8)
@@ -128,6 +162,7 @@ def rig(kind: str = "nominal") -> Rig:
             "camera": camera,
             "plane": _plane(camera),
             "align": _align(),
+            "estimator": _estimator(0.035),
             "lowpass": _lowpass(),
             "controller": _controller(),
             "orientation_filter": {

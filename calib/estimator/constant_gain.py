@@ -1,17 +1,31 @@
-"""The kinematic filter with constant gains, for a controller that has no time for a covariance.
+"""The fused estimator with constant gains as the firmware runs it, on one picture and one IMU sample a tick.
 
-Once a tick of T the camera gives angle and length (phi_c, l_c), exposed d ticks ago, the gyroscope the mean
-rate since the last tick and the accelerometer the angle atan2(a_y, a_x) less the mount. Angle and length are
-apart then, with one level of `model.Level` each and a line of the last values behind:
+A camera that sees whole pixels tells the angle to half a degree, the gyroscope its change to a thousandth of
+that, and the accelerometer's angle is wrong while the head accelerates. So the gyroscope carries the angle,
+and pictures and accelerometer pull it, slowly. A picture belongs to the time of its exposure, D ticks ago:
+the angle of then is remembered, the residual taken there and added now. With (X, Y) the marker, d its offset,
+phi_D the angle D ticks ago and h = phi_D / 2, constant curvature (3.6), (A.1) gives to first order
 
-    x_phi = (phi, dphi, ddphi, b, phi[k-1] ...),   z_phi = (phi_c, -g_z, phi_a)
-    x_l   = (l, dl, ddl, l[k-1] ...),              z_l   = (l_c)
-    x     <- F x,   x <- x + K (z - H x)
+    X cos h - Y sin h - d sin h = (rho / 2 + d cos h) (angle - phi_D)        across the chord
+    X sin h + Y cos h - d cos h = l S(phi_D) - d sin h (angle - phi_D)        along it
 
-with b the gyroscope's bias in the sense of the angle, so that -g_z = (phi - phi[k-1]) / T + b, which holds
-for any motion between the ticks. The line has max(d, 1) values. K is that of the stationary filter: P of the
-discrete algebraic Riccati equation, K = P H' (H P H' + R)^-1 (Anderson and Moore 1979, 4.4). A missing
-reading counts as expected.
+without root or arc tangent; the last term, 10 um for a tenth of a degree, is left out. A tick of T is then
+
+    phi += T (w + w') / 2 + b,              w = -(g_z - bias) / (1 + scale), w' that of the tick before
+    e_c = across / lever,                   lever = l0 / 2 + d
+    e_a = (a_y cos(phi_D + alpha) - a_x sin(phi_D + alpha)) / g - (phi - phi_D)
+    c = K_c e_c + K_a e_a,                  phi += c,  b += K_b c
+    l += v,  e_l = along - S (l - D v)
+    s += K_s (e_l - s),                     moving: |s| > s_0 or |v| > v_0, and for `MOVING_TICKS` after that
+    l += K_m e_l, v += K_v e_l moving,      else l += K_r e_l, v *= K_d
+
+The gains are those of `calib.estimator.gains`. One cannot serve a length at rest and in motion; the mean
+residual s tells which it is.
+
+A picture with |across| or |e_l| beyond `gate_m` is left out; after `PATIENCE` of them in a row the next one
+starts afresh. Then, and at the beginning, the length is that of the picture, and for `BOOST_TICKS` pictures
+angle and length go by `BOOST` of their residual. Without a picture v *= K_d, and without a sample of the IMU
+the angle stands but for `ALONE` of the pictures' residual.
 """
 
 from __future__ import annotations
@@ -22,196 +36,205 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from calib.arrays import FloatArray
-from calib.errors import BadInputError
-from calib.estimator.model import Level, axis_noise, axis_transition
-from calib.estimator.sensors import invert_marker, marker
+from calib.actuator.arc import chord_ratio_w
+from calib.arrays import BoolArray, FloatArray, IntArray
+from calib.camera.model import Camera, undistort
+from calib.estimator.gains import (
+    ALONE,
+    BOOST,
+    BOOST_TICKS,
+    MOVING_TICKS,
+    PATIENCE,
+    SHAKING_RADPS2,
+    Gains,
+    TickNoise,
+)
+from calib.estimator.sensors import marker
 from calib.estimator.setup import Rows, Setup
 
-__all__ = [
-    "MOST_DELAY_TICKS",
-    "AxisGain",
-    "TickNoise",
-    "Ticks",
-    "design",
-    "run_gain",
-    "tick_noise",
-    "ticks_of",
-]
+__all__ = ["GAINED", "Ticks", "run_gains", "tick_noise", "ticks_of"]
 
-MOST_DELAY_TICKS = 8
-
-
-@dataclass(frozen=True)
-class TickNoise:
-    """Standard deviations of a tick's readings.
-
-    Attributes
-    ----------
-    camera_rad, camera_m : of angle and length from a picture. gyro_radps : of the mean rate.
-    accel_rad : of the accelerometer's angle, the head's own acceleration included.
-    bias_walk_radps : density of the gyroscope's bias, per sqrt(s).
-    """
-
-    camera_rad: float
-    camera_m: float
-    gyro_radps: float
-    accel_rad: float
-    bias_walk_radps: float = 2e-5
-
-
-@dataclass(frozen=True)
-class AxisGain:
-    """One axis: F (n, n), H (m, n), K (n, m), and the stationary deviations (n,) that the model expects."""
-
-    F: FloatArray
-    H: FloatArray
-    K: FloatArray
-    sigma: FloatArray
+GAINED = ("phi_rad", "length_m", "bias_rad", "rate_m")
+"""Columns of what `run_gains` gives; bias and rate are per tick."""
 
 
 @dataclass(frozen=True)
 class Ticks:
-    """Readings at the ticks: t_s (n,), phi (n, 3) and length (n, 1), NaN where missing."""
+    """Readings at the ticks (n,), NaN where missing; marker (n, 2) in the plane, accelerometer (n, 2).
+
+    The IMU's are free of bias, scale and mount: a_x, a_y as at phi, and the rate w of phi.
+    """
 
     t_s: FloatArray
-    phi: FloatArray
-    length: FloatArray
+    marker_m: FloatArray
+    accel_mps2: FloatArray
+    rate_radps: FloatArray
 
 
-def tick_noise(setup: Setup, level: Level, rate_hz: float) -> TickNoise:
-    """Noise of a tick's readings from that of the sensors, at the head's rest.
-
-    The accelerometer is trusted as far as the level's accelerations let it show gravity.
-    """
+def tick_noise(setup: Setup) -> TickNoise:
+    """Noise of a tick's readings from that of the sensors, at the head's rest."""
     state, by = np.concatenate([setup.start.head, setup.start.sensor]), np.empty((2, 19))
     state[2:6] = 0.0
     marker(setup.view, state, by[0], by[1])
     inverse = np.linalg.inv(by[:, :2])
     pixel = setup.noise[0] ** 2 + setup.noise[1] ** 2 / 12.0
     camera = np.sqrt(pixel * np.sum(inverse**2, axis=1))
-    samples = max(1.0 / (setup.imu_period_s * rate_hz), 1.0) if setup.imu_period_s > 0.0 else 1.0
     reach = 0.5 * float(setup.start.head[1]) + float(setup.start.sensor[5])
-    shaken = level.accel_phi_radps2 * reach / setup.gravity_mps2
     return TickNoise(
         float(camera[0]),
         float(camera[1]),
-        float(setup.noise[4]) / math.sqrt(samples),
-        math.hypot(float(setup.noise[3]) / setup.gravity_mps2, shaken),
+        float(setup.noise[4]),
+        math.hypot(float(setup.noise[3]), SHAKING_RADPS2 * reach) / setup.gravity_mps2,
     )
 
 
-def _axis(numbers: list[float], h: float) -> tuple[FloatArray, FloatArray]:
-    """F and Q (3, 3) of (p, v, a)."""
-    f01, f02, f11, f12, f22 = axis_transition(numbers[0], numbers[1], h)
-    pp, pv, pa, vv, va, aa = axis_noise(numbers[2], numbers[3], h)
-    F = np.array([[1.0, f01, f02], [0.0, f11, f12], [0.0, 0.0, f22]])
-    return F, np.array([[pp, pv, pa], [pv, vv, va], [pa, va, aa]])
+def _camera_of(view: FloatArray) -> tuple[Camera, FloatArray]:
+    """The camera of `sensors.view_coefficients`, and the homography (3, 3) from its rays to the plane."""
+    fx, fy, skew, cx, cy = (float(value) for value in view[9:14])
+    camera = Camera("rational8", (1, 1), fx, fy, skew, cx, cy, np.asarray(view[14:22], dtype=np.float64))
+    return camera, np.asarray(np.linalg.inv(view[:9].reshape(3, 3).T), dtype=np.float64)
 
 
-def _stationary(F: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> AxisGain:
-    from scipy.linalg import solve_discrete_are
-
-    scale = np.sqrt(np.maximum(np.diag(Q), 1e-30))
-    scale[scale < 1e-12] = scale.max()
-    # The line of old values has no noise of its own; a trace of it keeps the pencil regular.
-    f, h = F / scale[:, None] * scale, H * scale
-    q = Q / scale[:, None] / scale + 1e-12 * np.eye(len(F))
-    P = solve_discrete_are(f.T, h.T, q, R)
-    K = np.asarray(np.linalg.solve(h @ P @ h.T + R, h @ P).T, dtype=np.float64)
-    sigma = np.sqrt(np.maximum(np.diag(P - K @ h @ P), 0.0)) * scale
-    return AxisGain(F, H, K * scale[:, None], np.asarray(sigma, dtype=np.float64))
-
-
-def design(
-    phi_level: Level, length_level: Level, noise: TickNoise, rate_hz: float, delay_ticks: int
-) -> tuple[AxisGain, AxisGain]:
-    """Gains for the angle with the first level's noise and for the length with the second's.
+def ticks_of(setup: Setup, rows: Rows, mean_rate: bool = False) -> Ticks:
+    """A tick at each picture or camera's tick of a log with the IMU's newest sample, as controllers see it.
 
     Parameters
     ----------
-    delay_ticks : how old a picture is when it arrives.
-
-    Raises `BadInputError` for a rate that is not positive or a delay of more than `MOST_DELAY_TICKS`.
+    mean_rate : the rate is the mean since the last tick instead, of all samples, carried on to the tick by
+        the last two.
     """
-    if not rate_hz > 0.0:
-        raise BadInputError(f"rate_hz is {rate_hz:g}, expected a positive rate of ticks")
-    if not 0 <= delay_ticks <= MOST_DELAY_TICKS:
-        raise BadInputError(f"delay_ticks is {delay_ticks}, expected 0 to {MOST_DELAY_TICKS}")
-    T, gains = 1.0 / rate_hz, []
-    line = max(delay_ticks, 1)
-    for axis, own, numbers in ((0, 4, phi_level.numbers()[:4]), (1, 3, length_level.numbers()[4:])):
-        n = own + line
-        F, Q = np.zeros((n, n)), np.zeros((n, n))
-        parts = max(math.ceil(T / 0.005), 1)
-        f, q = np.eye(3), np.zeros((3, 3))
-        step, added = _axis(numbers, T / parts)
-        for _ in range(parts):
-            f, q = step @ f, step @ q @ step.T + added
-        F[:3, :3], Q[:3, :3] = f, q
-        if axis == 0:
-            F[3, 3], Q[3, 3] = 1.0, noise.bias_walk_radps**2 * T
-        for k in range(line):
-            F[own + k, own + k - 1 if k else 0] = 1.0
-        H = np.zeros((3 if axis == 0 else 1, n))
-        H[0, n - 1 if delay_ticks else 0] = 1.0
-        if axis == 0:
-            H[1, 0], H[1, own], H[1, 3], H[2, 0] = 1.0 / T, -1.0 / T, 1.0, 1.0
-            R = np.diag([noise.camera_rad, noise.gyro_radps, noise.accel_rad]) ** 2
-        else:
-            R = np.array([[noise.camera_m**2]])
-        gains.append(_stationary(F, Q, H, R))
-    return gains[0], gains[1]
+    at = np.flatnonzero(rows.kinds & 1)
+    sensor, t = setup.start.sensor, rows.t_s[at]
+    camera, to_plane = _camera_of(setup.view)
+    places, pixels = np.full((len(at), 2), np.nan), rows.readings[at, :2]
+    seen = np.isfinite(pixels).all(axis=1)
+    if seen.any():
+        rays = undistort(camera, pixels[seen])
+        world = np.concatenate([rays, np.ones((len(rays), 1))], axis=1) @ to_plane.T
+        middle = setup.view[22:24]
+        shown = world[:, :2] / world[:, 2:] - sensor[8:10]
+        places[seen] = middle + (shown - middle) / (1.0 + sensor[10])
+    samples = np.flatnonzero(np.isfinite(rows.readings[:, 2:5]).all(axis=1))
+    accel, rate = np.full((len(at), 2), np.nan), np.full(len(at), np.nan)
+    if len(samples):
+        newest = np.searchsorted(samples, at, side="right") - 1
+        fresh = (newest >= 0) & (np.diff(newest, prepend=-1) > 0)
+        own = newest[fresh]
+        force = (rows.readings[samples, 2:4] - sensor[1:3]) / (1.0 + sensor[11:13])
+        ca, sa = math.cos(float(sensor[3])), math.sin(float(sensor[3]))
+        force = force @ np.array([[ca, -sa], [sa, ca]])
+        turning = -(rows.readings[samples, 4] - sensor[0]) / (1.0 + sensor[4])
+        accel[fresh], rate[fresh] = force[own], turning[own]
+        if mean_rate:
+            rate = _means(t, newest, fresh, rows.t_s[samples], turning, setup.imu_period_s)
+    return Ticks(t, places, accel, rate)
 
 
-def ticks_of(setup: Setup, rows: Rows) -> Ticks:
-    """A tick at each picture or camera's tick of a log, as a controller sees it."""
-    at = np.nonzero(rows.kinds & 1)[0]
-    phi, length = np.full((len(at), 3), np.nan), np.full((len(at), 1), np.nan)
-    sensor, last = setup.start.sensor, (0.0, float(setup.start.head[1]))
-    scale, mount = 1.0 + sensor[4], float(sensor[3])
-    before = 0
-    for k, row in enumerate(at.tolist()):
-        u, v = rows.readings[row, :2].tolist()
-        if math.isfinite(u) and math.isfinite(v):
-            found = invert_marker(setup.view, sensor, u, v, *last)
-            if found[2]:
-                last = found[:2]
-                phi[k, 0], length[k, 0] = last
-        since = rows.readings[before : row + 1]
-        rates, accel = since[np.isfinite(since[:, 4]), 4], since[np.isfinite(since[:, 2:4]).all(axis=1), 2:4]
-        if len(rates):
-            phi[k, 1] = -(float(rates.mean()) - sensor[0]) / scale
-        if len(accel):
-            a_x, a_y = (accel[-1] - sensor[1:3]) / (1.0 + sensor[11:13])
-            phi[k, 2] = math.atan2(a_y, a_x) - mount
-        before = row + 1
-    return Ticks(rows.t_s[at], phi, length)
+def _means(
+    t: FloatArray, newest: IntArray, fresh: BoolArray, at: FloatArray, rate: FloatArray, period: float
+) -> FloatArray:
+    """Mean rates between ticks (n,) from even samples (m,), integrated by the trapezoid."""
+    turned = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1])) * period])
+    slope = np.diff(rate, prepend=rate[0]) / period
+    k = np.maximum(newest, 0)
+    age = np.clip(t - at[k], 0.0, 1.2 * period)
+    angle = turned[k] + (rate[k] + 0.5 * slope[k] * age) * age
+    out = np.full(len(t), np.nan)
+    out[1:] = np.diff(angle) / np.maximum(np.diff(t), 1e-6)
+    out[~fresh] = np.nan
+    if len(t):
+        out[0] = rate[k[0]] if fresh[0] else np.nan
+    return out
+
+
+def run_gains(gains: Gains, setup: Setup, ticks: Ticks, mean_rate: bool = False) -> FloatArray:
+    """Estimates (n, len(GAINED)) after each tick.
+
+    Parameters
+    ----------
+    mean_rate : the ticks' rates are means, see `ticks_of`.
+    """
+    g = gains
+    numbers = np.array(
+        [
+            g.rate_hz, g.delay_ticks, g.lever_m, g.camera_phi, g.accel_phi, g.bias, g.moving_length,
+            g.moving_rate, g.rest_length, g.rate_decay, g.slow, g.moving_m, g.still_m, g.gate_m,
+            setup.start.sensor[6], setup.start.head[1], setup.gravity_mps2, float(mean_rate),
+        ]
+    )  # fmt: skip
+    out = np.empty((len(ticks.t_s), len(GAINED)))
+    _run(numbers, ticks.marker_m, ticks.accel_mps2, ticks.rate_radps, out)
+    return out
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def run_gain(F: FloatArray, H: FloatArray, K: FloatArray, z: FloatArray, start: float) -> FloatArray:
-    """States (k, n) after each tick's readings z (k, m) of an axis that starts at rest at `start`."""
-    n, m = K.shape
-    out, x = np.empty((z.shape[0], n)), np.zeros(n)
-    ahead, y = np.empty(n), np.empty(m)
-    for j in range(n):
-        # The value and its line; rates, acceleration and bias begin at zero.
-        x[j] = start if j == 0 or (j >= (4 if m == 3 else 3)) else 0.0
-    for k in range(z.shape[0]):
-        for i in range(n):
-            ahead[i] = 0.0
-            for j in range(n):
-                ahead[i] += F[i, j] * x[j]
-        for i in range(m):
-            y[i] = 0.0
-            if not math.isnan(z[k, i]):
-                y[i] = z[k, i]
-                for j in range(n):
-                    y[i] -= H[i, j] * ahead[j]
-        for i in range(n):
-            x[i] = ahead[i]
-            for j in range(m):
-                x[i] += K[i, j] * y[j]
-            out[k, i] = x[i]
-    return out
+def _run(n: FloatArray, places: FloatArray, accel: FloatArray, rate: FloatArray, out: FloatArray) -> None:
+    T, delay, lever, K_c, K_a, K_b = 1.0 / n[0], n[1], n[2], n[3], n[4], n[5]
+    K_m, K_v, K_r, K_d, K_s, s_0, v_0, gate = n[6], n[7], n[8], n[9], n[10], n[11], n[12], n[13]
+    d, gravity, mean_rate, hold = n[14], n[16], n[17] != 0.0, round(n[0])
+    line = math.ceil(delay)
+    past = np.zeros(line + 1)
+    phi = bias = v = slow = before = 0.0
+    length = n[15]
+    # Ticks since the last good sample and picture; both begin beyond what is held.
+    imu_age, marker_age, boost, moving, rejected = hold + 1, hold + 1, 0, 0, 0
+    for k in range(len(rate)):
+        here = not (math.isnan(rate[k]) or math.isnan(accel[k, 0]) or math.isnan(accel[k, 1]))
+        if here:
+            w = rate[k]
+            if imu_age > hold and marker_age > hold:
+                phi = math.atan2(accel[k, 1], accel[k, 0])
+                past[:] = phi
+            else:
+                phi += T * (w if mean_rate else 0.5 * (w + (before if imu_age == 0 else w))) + bias
+            before, imu_age = w, 0
+        else:
+            imu_age += 1
+        past[line] = phi
+        then = phi if line == 0 else past[0] + (line - delay) * (past[1] - past[0])
+        sh, ch = math.sin(0.5 * then), math.cos(0.5 * then)
+        c = 0.0
+        if here:
+            e = (accel[k, 1] * math.cos(then) - accel[k, 0] * math.sin(then)) / gravity - (phi - then)
+            c = K_a * min(max(e, -1.0), 1.0)
+        length += v
+        X, Y = places[k]
+        if math.isnan(X):
+            v *= K_d
+            marker_age += 1
+        else:
+            across, along = X * ch - Y * sh - d * sh, X * sh + Y * ch - d * ch
+            s = chord_ratio_w(then * then)
+            if marker_age > hold or rejected >= PATIENCE:
+                length, v, slow = along / s, 0.0, 0.0
+                boost, moving, rejected = BOOST_TICKS, MOVING_TICKS, 0
+            e = along - s * (length - delay * v)
+            if boost > 0:
+                boost -= 1
+                marker_age = 0
+                c = min(max(BOOST * across / lever, -BOOST), BOOST)
+                length += BOOST * e
+            elif abs(across) <= gate and abs(e) <= gate:
+                rejected = marker_age = 0
+                c = c + K_c * across / lever if here else ALONE * across / lever
+                slow += K_s * (e - slow)
+                if abs(slow) > s_0 or abs(v) > v_0:
+                    moving = MOVING_TICKS
+                elif moving > 0:
+                    moving -= 1
+                if moving > 0:
+                    length += K_m * e
+                    v += K_v * e
+                else:
+                    length += K_r * e
+                    v *= K_d
+            else:
+                rejected += 1
+                marker_age += 1
+                v *= K_d
+        if here and boost == 0:
+            bias += K_b * c
+        phi += c
+        for j in range(line):
+            past[j] = past[j + 1] + c
+        out[k, 0], out[k, 1], out[k, 2], out[k, 3] = phi, length, bias, v

@@ -13,12 +13,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+
+import numpy as np
 
 __all__ = [
     "ACCEL_WEAK",
     "ANGLE_LIMIT",
     "BAD_REFERENCE",
+    "BY_FUSED",
+    "BY_MEAN_RATE",
     "CLAMPED",
     "COUNTERS",
     "HORIZON",
@@ -27,11 +31,17 @@ __all__ = [
     "MODE_OFF",
     "MODE_ORIENTATION",
     "MODE_POSITION",
+    "MOVING",
+    "REJECTED",
     "SATURATED",
     "STALE",
     "Inputs",
     "Outputs",
+    "Pair",
     "Reference",
+    "binary32",
+    "clip",
+    "older",
 ]
 
 MODE_OFF, MODE_ORIENTATION, MODE_POSITION = 0, 1, 2
@@ -39,11 +49,14 @@ MODE_OFF, MODE_ORIENTATION, MODE_POSITION = 0, 1, 2
 MARKER_HELD, HORIZON, IMU_HELD, ACCEL_WEAK = 0x1, 0x2, 0x4, 0x8
 ANGLE_LIMIT, STALE, BAD_REFERENCE = 0x10, 0x20, 0x40
 CLAMPED, SATURATED = (0x80, 0x100), (0x200, 0x400)
+REJECTED, MOVING, BY_MEAN_RATE, BY_FUSED = 0x800, 0x1000, 0x4000, 0x8000
 
-COUNTERS = ("marker", "horizon", "imu", "stale", "reference", "saturated")
+COUNTERS = ("marker", "horizon", "imu", "stale", "reference", "saturated", "rejected")
 
 REFERENCE_LIMIT = 6.3
 _NEVER = 0xFFFF
+
+Pair = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -70,6 +83,24 @@ class Inputs:
     mode: int = MODE_OFF
 
 
+def binary32(given: Inputs) -> Inputs:
+    """Inputs as the firmware gets them."""
+
+    def near(value: float) -> float:
+        with np.errstate(over="ignore"):
+            return float(np.float32(value))
+
+    return replace(
+        given,
+        u_px=near(given.u_px),
+        v_px=near(given.v_px),
+        ax_mps2=near(given.ax_mps2),
+        ay_mps2=near(given.ay_mps2),
+        gz_radps=near(given.gz_radps),
+        reference=(near(given.reference[0]), near(given.reference[1])),
+    )
+
+
 @dataclass(frozen=True)
 class Outputs:
     """As `calib_outputs`, without the whole numbers for a timer.
@@ -77,6 +108,7 @@ class Outputs:
     Attributes
     ----------
     undecided_pwm : how far outputs were from the limits where the firmware decided otherwise on clamping.
+    undecided_m : the same of the fused estimator's gate and of its telling rest from motion.
     """
 
     phi_rad: float
@@ -86,6 +118,7 @@ class Outputs:
     pwm: tuple[float, float]
     flags: int
     undecided_pwm: float = 0.0
+    undecided_m: float = 0.0
 
 
 @dataclass
@@ -102,11 +135,13 @@ class _Memory:
     mode: int = MODE_OFF
 
 
-def _older(age: int) -> int:
+def older(age: int) -> int:
+    """An age after one more tick; what was never heard stays so."""
     return age if age >= _NEVER - 1 else age + 1
 
 
-def _clip(value: float, limit: float) -> float:
+def clip(value: float, limit: float) -> float:
+    """A value within +-limit."""
     return min(max(value, -limit), limit)
 
 
@@ -130,23 +165,29 @@ class Reference:
         self.memory = _Memory(
             lowpass=[[0.0] * (2 * pairs + singles) for _ in range(2)],
             past=[0.0] * int(self.c["TIME_OFFSET_TICKS"]),
+            integral=self.c["MM_GYRO_BIAS_DT_RAD"],
         )
         self.count = dict.fromkeys(COUNTERS, 0)
 
     def _counted(self, name: str) -> None:
         self.count[name] = min(self.count[name] + 1, 0xFFFF)
 
+    def _sampled(self, given: Inputs) -> bool:
+        """Whether the IMU's sample can be used; written so that NaN fails."""
+        c = self.c
+        limit, ax, ay = c["IMU_ACCEL_LIMIT_MPS2"], given.ax_mps2, given.ay_mps2
+        good = abs(ax) <= limit and abs(ay) <= limit and abs(given.gz_radps) <= c["IMU_RATE_LIMIT_RADPS"]
+        return given.imu_read and good
+
     def _angle(self, given: Inputs) -> int:
         c, m, flags = self.c, self.memory, 0
         ax, ay, gz = given.ax_mps2, given.ay_mps2, given.gz_radps
-        # Written so that NaN fails.
-        good = abs(ax) <= c["IMU_ACCEL_LIMIT_MPS2"] and abs(ay) <= c["IMU_ACCEL_LIMIT_MPS2"]
-        if not (given.imu_read and good and abs(gz) <= c["IMU_RATE_LIMIT_RADPS"]):
-            m.imu_age = _older(m.imu_age)
+        if not self._sampled(given):
+            m.imu_age = older(m.imu_age)
             self._counted("imu")
             return IMU_HELD
         ax = c["IMU_SIGN_AX"] * ax - c["IMU_ACCEL_BIAS_X_MPS2"]
-        ay = c["IMU_SIGN_AY"] * ay - c["IMU_ACCEL_BIAS_Y_MPS2"]
+        ay = c["IMU_ACCEL_RATIO"] * (c["IMU_SIGN_AY"] * ay - c["IMU_ACCEL_BIAS_Y_MPS2"])
         gz = c["IMU_SIGN_GZ"] * gz
         if max(abs(ax), abs(ay)) <= c["IMU_ACCEL_WEAK_MPS2"]:
             if m.imu_age == _NEVER:
@@ -158,10 +199,10 @@ class Reference:
         if m.imu_age == _NEVER:
             m.phi = e
         else:
-            m.integral = _clip(m.integral + c["MM_KI_DT2"] * e, c["MM_INTEGRAL_LIMIT_RAD"])
-            m.phi += c["MM_KP_DT"] * e + m.integral + c["MM_GYRO_BIAS_DT_RAD"] - c["MM_DT_S"] * gz
+            m.integral = clip(m.integral + c["MM_KI_DT2"] * e, c["MM_INTEGRAL_LIMIT_RAD"])
+            m.phi += c["MM_KP_DT"] * e + m.integral - c["MM_DT_S"] * gz
         if abs(m.phi) > c["PHI_LIMIT_RAD"]:
-            m.phi = _clip(m.phi, c["PHI_LIMIT_RAD"])
+            m.phi = clip(m.phi, c["PHI_LIMIT_RAD"])
             flags |= ANGLE_LIMIT
         m.imu_age = 0
         return flags
@@ -205,7 +246,7 @@ class Reference:
                 self._counted("horizon")
         if flags:
             self._counted("marker")
-            m.marker_age = _older(m.marker_age)
+            m.marker_age = older(m.marker_age)
             return flags, False
         afresh = m.marker_age > c["HOLD_TICKS"]
         m.marker_age = 0
@@ -227,10 +268,10 @@ class Reference:
             x = y
         return x
 
-    def bellows(self, x: float, y: float, phi: float) -> tuple[float, float]:
-        """Lengths of the bellows by (3.12) with the series (3.14)."""
+    def bellows(self, x: float, y: float, phi: float, then: float) -> tuple[float, float]:
+        """Lengths of the bellows by (3.12) with the series (3.14) of the angle that belongs to the head."""
         c = self.c
-        f = sum(c[f"INVERSE_F{n}_PER_RAD{2 * n}"] * phi ** (2 * n) for n in range(4))
+        f = sum(c[f"INVERSE_F{n}_PER_RAD{2 * n}"] * then ** (2 * n) for n in range(4))
         length, turned = 0.5 * math.hypot(x, y) * f, c["BELLOWS_RADIUS_M"] * phi
         return length + turned, length - turned
 
@@ -314,15 +355,10 @@ class Reference:
             self._counted("saturated")
         return (pwm[0], pwm[1]), flags, undecided
 
-    def step(self, given: Inputs, decided: int | None = None) -> Outputs:
-        """One tick.
-
-        Parameters
-        ----------
-        given : values that binary32 holds; NaN and infinity are allowed.
-        decided : flags of the firmware for this tick, whose decisions on clamping are then taken over.
-        """
+    def _estimate(self, given: Inputs, decided: int | None) -> tuple[int, Pair, Pair, float]:
+        """Flags, head, lengths, and how far a decision that went otherwise was from its limit [m]."""
         c, m = self.c, self.memory
+        del decided
         flags = self._angle(given)
         phi = m.phi
         seen, afresh = self._marker(given)
@@ -335,8 +371,20 @@ class Reference:
             d = c["MARKER_OFFSET_M"]
             x, y = m.marker[0] - d * math.sin(then), m.marker[1] - d * math.cos(then)
             head = (self._lowpass(0, x, afresh), self._lowpass(1, y, afresh))
-            q = self.bellows(*head, phi)
+            q = self.bellows(*head, phi, then)
         if m.past:
             m.past = [*m.past[1:], phi]
+        return flags, head, q, 0.0
+
+    def step(self, given: Inputs, decided: int | None = None) -> Outputs:
+        """One tick.
+
+        Parameters
+        ----------
+        given : values that binary32 holds; NaN and infinity are allowed.
+        decided : flags of the firmware for this tick, whose decisions on clamping are then taken over.
+        """
+        flags, head, q, undecided_m = self._estimate(given, decided)
+        m = self.memory
         pwm, driven, undecided = self._control(given, q, decided)
-        return Outputs(phi, m.marker, head, q, pwm, flags | driven, undecided)
+        return Outputs(m.phi, m.marker, head, q, pwm, flags | driven, undecided, undecided_m)

@@ -12,7 +12,7 @@ marker can be; at a tenth of its least value there the marker counts as lost beh
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from calib.camera.undistortion import InversePolynomial
 from calib.errors import BadInputError
 from calib.firmware.literals import Constant, Group, Macro, Whole
 
-__all__ = ["CameraConstants", "PlaneConstants", "camera_groups", "plane_constants"]
+__all__ = ["MIDDLE_M", "CameraConstants", "PlaneConstants", "camera_groups", "plane_constants", "put_right"]
 
 _WHAT = {
     "fx_px": "focal length along u, px; sigma_mu of (2.5)",
@@ -34,6 +34,9 @@ _WHAT = {
 }
 
 _HORIZON_SHARE = 0.1
+
+MIDDLE_M = (0.0, 0.08)
+"""Place about which an alignment's stretch magnifies, as in `calib.estimator.sensors`."""
 
 
 @dataclass(frozen=True)
@@ -130,6 +133,30 @@ def plane_constants(
     return PlaneConstants(ideal, ideal @ K, raw, (least, raw_least), error, verdict)
 
 
+def put_right(plane: PlaneConstants, shift_m: tuple[float, float], stretch: float) -> PlaneConstants:
+    """The plane without the error that an alignment has found: places it shows are shifted and stretched.
+
+    Parameters
+    ----------
+    shift_m, stretch : the calibrated plane shows P at P + shift + stretch (P - `MIDDLE_M`).
+    """
+    shrink, (x, y) = 1.0 / (1.0 + stretch), MIDDLE_M
+    right = np.array(
+        [
+            [shrink, 0.0, x - shrink * (x + shift_m[0])],
+            [0.0, shrink, y - shrink * (y + shift_m[1])],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+    raw = None if plane.from_raw is None else right @ plane.from_raw
+    return replace(
+        plane,
+        from_ideal=right @ plane.from_ideal,
+        from_normalised=right @ plane.from_normalised,
+        from_raw=raw,
+    )
+
+
 def _matrix(name: str, values: FloatArray, comment: str) -> tuple[Constant, ...]:
     return tuple(
         Constant(f"{name}_{i + 1}{j + 1}", float(values[i, j]), f"row {i + 1}, {comment}")
@@ -175,7 +202,7 @@ def _plane_groups(plane: PlaneConstants) -> list[Group]:
     ok = Whole("CALIB_PLANE_OK", int(plane.verdict == "ok"), "0: the plane failed its gate")
     groups = [
         Group(
-            ("Plane of the actuator.",),
+            ("Plane of the actuator, without the shift and stretch that align has found.",),
             (
                 Whole("CALIB_HAS_PLANE", 1, "for #if"),
                 ok,

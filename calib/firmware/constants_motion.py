@@ -4,7 +4,7 @@ The tick's period is folded into the gains of the angle filter (2.3), whose inte
 per tick J = I dt:
 
     J   += (Ki dt^2) e                       e = atan2(ay, ax) - mount - phi, wrapped to half a turn
-    phi += (Kp dt) e + J + bias dt - dt gz
+    phi += (Kp dt) e + J - dt gz,                J = bias dt at the start
 
 A section of the low-pass of order one, b0 (1 + z^-1) / (1 + a1 z^-1), runs in the trapezoidal form
 v = b0 (x - s), y = s + v, s' = y + v: one product, and y = x exactly at rest. A section of order two runs
@@ -79,10 +79,12 @@ def _tick_group(known: Known, rate_hz: float) -> Group:
 
 def _imu_groups(known: Known, rate_hz: float) -> tuple[Group, Group]:
     dt = 1.0 / rate_hz
-    bias = [0.0, 0.0]
+    bias, ratio = [0.0, 0.0], 1.0
     if known.node("align") is not None:
-        # What the accelerometer reads at rest has its biases in it.
-        mount = math.remainder(known.number("align.rest_angle_rad", 0.0), 2.0 * math.pi)
+        mount = math.remainder(known.number("align.mount_angle_rad", 0.0), 2.0 * math.pi)
+        bias = [known.number(f"align.accel_bias_mps2.{i}", 0.0, -5.0, 5.0) for i in range(2)]
+        x, y = (1.0 + known.number(f"align.accel_scale.{i}", 0.0, -0.5, 0.5) for i in range(2))
+        ratio = x / y
         gyro = known.number("align.gyro_bias_radps", 0.0, -1.0, 1.0)
         scale = 1.0 + known.number("align.gyro_scale", 0.0, -0.5, 0.5)
     else:
@@ -93,8 +95,8 @@ def _imu_groups(known: Known, rate_hz: float) -> tuple[Group, Group]:
     signs = [1, 1, 1]
     imu = Group(
         (
-            "IMU on the head, x from the head to the base at rest; phi = atan2(ay, ax) - mount (2.1),",
-            "dphi/dt = -gz.",
+            "IMU on the head, x from the head to the base at rest; phi = atan2(RATIO ay, ax) - mount (2.1),",
+            "dphi/dt = -gz. rig.yaml has no key for the signs of the axes, they are 1.",
         ),
         (
             Whole(
@@ -106,11 +108,14 @@ def _imu_groups(known: Known, rate_hz: float) -> tuple[Group, Group]:
             Whole("CALIB_IMU_SIGN_GZ", signs[2], "1 or -1"),
             Constant("CALIB_IMU_ACCEL_BIAS_X_MPS2", bias[0], "subtracted from ax, m/s^2"),
             Constant("CALIB_IMU_ACCEL_BIAS_Y_MPS2", bias[1], "subtracted from ay, m/s^2"),
+            Constant(
+                "CALIB_IMU_ACCEL_RATIO", ratio, "of ay less its bias: (1 + scale of x) / (1 + scale of y)"
+            ),
             Constant("CALIB_IMU_GYRO_BIAS_RADPS", gyro, "gz at rest, rad/s; sign as read"),
             Constant(
                 "CALIB_IMU_MOUNT_ANGLE_RAD",
                 mount,
-                "atan2(ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi",
+                "atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi",
             ),
             Constant("CALIB_IMU_ACCEL_LIMIT_MPS2", _ACCEL_LIMIT_MPS2, "readings beyond are lost, m/s^2"),
             Constant("CALIB_IMU_RATE_LIMIT_RADPS", _RATE_LIMIT_RADPS, "readings beyond are lost, rad/s"),
@@ -125,7 +130,7 @@ def _imu_groups(known: Known, rate_hz: float) -> tuple[Group, Group]:
     mahony = Group(
         (
             "Angle filter (2.3), dt folded in. The integral is kept as an angle per tick, J = I dt:",
-            "J += KI_DT2 e, phi += KP_DT e + J - (DT gz - GYRO_BIAS_DT).",
+            "J += KI_DT2 e, phi += KP_DT e + J - DT gz; J begins at GYRO_BIAS_DT.",
         ),
         (
             Constant("CALIB_MM_KP_DT", Kp * dt, f"Kp dt, dimensionless; Kp = {Kp:.9g} 1/s"),

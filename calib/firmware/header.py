@@ -18,8 +18,15 @@ import numpy as np
 from calib import __version__
 from calib.camera.model import COEFFICIENTS, MODELS
 from calib.camera.undistortion import fit_inverse
-from calib.firmware.constants_camera import CameraConstants, PlaneConstants, camera_groups, plane_constants
+from calib.firmware.constants_camera import (
+    CameraConstants,
+    PlaneConstants,
+    camera_groups,
+    plane_constants,
+    put_right,
+)
 from calib.firmware.constants_control import control_groups
+from calib.firmware.constants_fused import fused_group
 from calib.firmware.constants_motion import motion_groups, tick_rate_hz
 from calib.firmware.known import Known
 from calib.firmware.literals import (
@@ -37,7 +44,7 @@ if TYPE_CHECKING:
 
 __all__ = ["SCHEMA", "Header", "environment", "header_of", "header_text", "identity_of", "verbatim"]
 
-SCHEMA = 2
+SCHEMA = 3
 """Raised when a constant changes its name, unit or meaning."""
 
 _INVERSE_PX = 0.1
@@ -110,6 +117,7 @@ def _camera_constants(whole: Rig, source: str) -> CameraConstants:
         **{name: named[name] for name in MODELS[section.model]},
     }
     plane: PlaneConstants | None = None
+    align = whole.align
     known = current_plane(whole, source)
     if known is not None:
         x0, y0, x1, y1 = (whole.geometry or Geometry()).workspace_m
@@ -121,6 +129,9 @@ def _camera_constants(whole: Rig, source: str) -> CameraConstants:
             (x0, y0, x1, y1),
             known.verdict,
         )
+        if align is not None:
+            x, y = align.plane_shift_m
+            plane = put_right(plane, (x, y), align.plane_stretch)
     verdict = section.verdict if undone or section.verdict != "ok" else "poor"
     return CameraConstants(camera.image_size_px, section.model, verdict, intrinsics, inverse, plane)
 
@@ -140,7 +151,8 @@ def header_of(whole: Rig, source: str) -> Header:
     known = Known(whole, source)
     rate_hz = tick_rate_hz(known)
     known.told()
-    groups = (*camera_groups(camera), *motion_groups(known), *control_groups(known, rate_hz))
+    motion = (*motion_groups(known), fused_group(known, rate_hz, camera.plane))
+    groups = (*camera_groups(camera), *motion, *control_groups(known, rate_hz))
     inputs = {
         f"{section}/{name}": digest
         for section, named in whole.provenance.inputs.items()

@@ -17,6 +17,7 @@ from calib.errors import BadInputError
 __all__ = [
     "Constant",
     "Group",
+    "Item",
     "Macro",
     "Table",
     "Whole",

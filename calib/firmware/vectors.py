@@ -11,16 +11,27 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-import numpy as np
-
-from calib.firmware.conformance import MODE_OFF, MODE_ORIENTATION, MODE_POSITION, Inputs, Outputs, Reference
+from calib.firmware.conformance import (
+    MODE_OFF,
+    MODE_ORIENTATION,
+    MODE_POSITION,
+    Inputs,
+    Outputs,
+    Reference,
+    binary32,
+)
+from calib.firmware.conformance_fused import reference_of
 from calib.firmware.header import SCHEMA, Header, environment, identity_of
 from calib.firmware.literals import float_literal, values
+from calib.firmware.vectors_fused import directed_fused
 
 __all__ = ["TOLERANCE", "Vector", "binary32", "directed", "selftest_text", "vectors"]
 
 TOLERANCE = {"phi_rad": 2e-6, "marker_m": 2e-7, "q_m": 2e-6, "pwm": 0.01}
 """What a board may differ by from float64."""
+
+FUSED_TICKS = 72
+"""Golden vectors of the fused estimator: pictures until it runs, a swing, a new start, rest."""
 
 
 @dataclass(frozen=True)
@@ -29,24 +40,6 @@ class Vector:
 
     given: Inputs
     wanted: Outputs
-
-
-def binary32(given: Inputs) -> Inputs:
-    """Inputs as the firmware gets them."""
-
-    def near(value: float) -> float:
-        with np.errstate(over="ignore"):
-            return float(np.float32(value))
-
-    return replace(
-        given,
-        u_px=near(given.u_px),
-        v_px=near(given.v_px),
-        ax_mps2=near(given.ax_mps2),
-        ay_mps2=near(given.ay_mps2),
-        gz_radps=near(given.gz_radps),
-        reference=(near(given.reference[0]), near(given.reference[1])),
-    )
 
 
 def directed(constants: Mapping[str, float], ticks: int) -> list[Inputs]:
@@ -90,11 +83,12 @@ def directed(constants: Mapping[str, float], ticks: int) -> list[Inputs]:
     return made
 
 
-def vectors(header: Header, ticks: int = 48) -> list[Vector]:
-    """Golden vectors of a header that has a plane."""
+def vectors(header: Header, ticks: int = 48, fused: bool = False) -> list[Vector]:
+    """Golden vectors of a header that has a plane; `fused` for CALIB_FUSED 1."""
     constants = values(header.literals)
-    reference = Reference(constants)
-    return [Vector(given, reference.step(given)) for given in directed(constants, ticks)]
+    reference = reference_of(constants, fused=fused)
+    given = directed_fused(constants, ticks, period=ticks) if fused else directed(constants, ticks)
+    return [Vector(one, reference.step(one)) for one in given]
 
 
 def _lines(vector: Vector) -> list[str]:
@@ -114,6 +108,8 @@ def selftest_text(header: Header) -> str:
     """calib_selftest.h of a header that has a plane."""
     from calib import __version__
 
+    fused = header.literals["CALIB_HAS_FUSED"] == "1"
+
     return (
         environment()
         .get_template("calib_selftest.h.j2")
@@ -123,6 +119,9 @@ def selftest_text(header: Header) -> str:
             identity=identity_of(header)[:8].upper(),
             undistort=int(Reference(values(header.literals)).undistort),
             rows=[_lines(vector) for vector in vectors(header)],
+            fused_rows=[_lines(vector) for vector in vectors(header, FUSED_TICKS, fused=True)]
+            if fused
+            else [],
             tolerance=TOLERANCE,
         )
     )

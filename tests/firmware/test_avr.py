@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from firmware_build import avr, compare, run, write
+from firmware_build import LIMITS, avr, compare, run, write
 from firmware_rigs import header, rig
 
 from calib.firmware.conformance import MODE_POSITION, Inputs, Reference
 from calib.firmware.literals import values
-from calib.firmware.vectors import TOLERANCE, binary32, directed
+from calib.firmware.vectors import binary32, directed
+from calib.firmware.vectors_fused import coherent, directed_fused
 from calib.rig import Rig
-
-LIMITS = np.array([TOLERANCE["phi_rad"], *[TOLERANCE["marker_m"]] * 2, *[TOLERANCE["q_m"]] * 4, *[0.01] * 2])
 
 TICK_CYCLES = 266_667
 STAGES = ("", "angle", "plane", "offset", "low-pass", "lengths", "control")
@@ -40,10 +40,27 @@ def test_the_same_values_as_in_float64(tmp_path: Path, kind: str, undistort: int
     assert sizes["ram"] + found.stack <= 300 + 60 * (kind == "full")
 
 
-@pytest.mark.parametrize("kind", ["nominal", "full"])
+@pytest.mark.parametrize("undistort", [0, 1])
+@pytest.mark.parametrize("kind", ["fused", "full"])
+def test_the_fused_estimator_gives_the_same_values(tmp_path: Path, kind: str, undistort: int) -> None:
+    made = header(kind)
+    write(tmp_path, made)
+    command, sizes = avr(tmp_path, "-DCALIB_FUSED=1", f"-DCALIB_UNDISTORT={undistort}")
+    ticks = directed_fused(values(made.literals), 1500, bool(undistort))
+    found = run(command, ticks)
+    worst, undecided = compare(made, ticks, found, bool(undistort), fused=True)
+    print(f"{kind}, fused, undistort {undistort}: differences {worst}, {sizes}, stack {found.stack}")
+    assert (worst <= LIMITS).all(), worst
+    assert undecided <= 0.01
+    assert sizes["flash"] <= 8192
+    assert sizes["ram"] + found.stack <= 300
+
+
+@pytest.mark.parametrize("kind", ["nominal", "fused", "full"])
 def test_the_self_test_passes_on_the_board(tmp_path: Path, kind: str) -> None:
     write(tmp_path, header(kind))
-    command, sizes = avr(tmp_path, "-DCALIB_SELFTEST", "-DCALIB_PROGMEM")
+    switch = ["-DCALIB_FUSED=1"] if kind == "fused" else []
+    command, sizes = avr(tmp_path, "-DCALIB_SELFTEST", "-DCALIB_PROGMEM", *switch)
     found = run(command, [_thesis_ticks([(0.08, 0.08)])[0]])
     print(f"self-test: {sizes}, stack {found.stack}, {found.extra[0, 7] / 16e6:.3f} s")
     assert found.flags[0] == 0
@@ -51,12 +68,8 @@ def test_the_self_test_passes_on_the_board(tmp_path: Path, kind: str) -> None:
     radius = f"CALIB_BELLOWS_RADIUS_M {header(kind).literals['CALIB_BELLOWS_RADIUS_M']}"
     assert radius in path.read_text()
     path.write_text(path.read_text().replace(radius, "CALIB_BELLOWS_RADIUS_M 0.0127f"))
-    assert (
-        run(
-            avr(tmp_path, "-DCALIB_SELFTEST", "-DCALIB_PROGMEM")[0], [_thesis_ticks([(0.08, 0.08)])[0]]
-        ).flags[0]
-        > 0
-    )
+    command, _ = avr(tmp_path, "-DCALIB_SELFTEST", "-DCALIB_PROGMEM", *switch)
+    assert run(command, [_thesis_ticks([(0.08, 0.08)])[0]]).flags[0] > 0
 
 
 def _thesis_ticks(reference: list[tuple[float, float]]) -> list[Inputs]:
@@ -100,15 +113,38 @@ def test_the_budget_of_the_thesis_tick(tmp_path: Path) -> None:
     command, sizes = avr(tmp_path, "-DCALIB_UNDISTORT=0", "-DCALIB_MOVING")
     assert _told("moving reference", run(command, _thesis_ticks(moving)).extra) <= 19_000
     assert sizes["flash"] <= 8192
+    write(tmp_path, header("twin"))
+    command, _ = avr(tmp_path, "-DCALIB_UNDISTORT=0")
+    assert _told("aligned rig, constant reference", run(command, _thesis_ticks(still)).extra) <= 15_000
+    command, _ = avr(tmp_path, "-DCALIB_UNDISTORT=0", "-DCALIB_MOVING")
+    assert _told("aligned rig, moving reference", run(command, _thesis_ticks(moving)).extra) <= 19_000
     integral = _with_integral(rig())
     write(tmp_path, header_of(integral, "rig.yaml"))
     command, sizes = avr(tmp_path, "-DCALIB_UNDISTORT=0")
     cycles = run(command, _thesis_ticks(still)).extra
-    _told("constant reference, integral part as well", cycles)
-    assert int(cycles[2:, 7].mean()) <= 15_000
+    assert _told("constant reference, integral part as well", cycles) <= 15_000
     write(tmp_path, header())
     command, sizes = avr(tmp_path, "-DCALIB_UNDISTORT=1", "-DCALIB_MOVING")
     assert _told("moving reference and undistortion", run(command, _thesis_ticks(moving)).extra) <= 23_000
+
+
+def test_the_budget_of_the_fused_tick(tmp_path: Path) -> None:
+    """Undistortion, fused estimator, reference point and PD with feed-forward, in every tick."""
+    made = header("fused")
+    still, moving = (0.08, 0.085), [(0.015 * math.sin(0.02 * k), 0.078) for k in range(1200)]
+    ticks = coherent(values(made.literals), len(moving))
+    write(tmp_path, made)
+    for name, flags, wanted, most in (
+        ("fused, undistortion, constant reference", (), [still] * len(moving), 20_000),
+        ("fused, undistortion, moving reference", ("-DCALIB_MOVING",), moving, 23_000),
+    ):
+        command, sizes = avr(tmp_path, "-DCALIB_FUSED=1", "-DCALIB_UNDISTORT=1", *flags)
+        given = [replace(t, reference=w, mode=MODE_POSITION) for t, w in zip(ticks, wanted, strict=True)]
+        found = run(command, list(map(binary32, given)))
+        assert _told(name, found.extra) <= most
+        print(f"  {sizes}, stack {found.stack}")
+        assert sizes["flash"] <= 8192
+        assert sizes["ram"] + found.stack <= 300
 
 
 def _with_integral(plain: Rig) -> Rig:
@@ -138,6 +174,4 @@ def test_a_moving_reference_is_that_of_the_set_points(tmp_path: Path) -> None:
 
 
 def _with(tick: Inputs, q: np.ndarray) -> Inputs:
-    from dataclasses import replace
-
     return binary32(replace(tick, reference=(float(q[0]), float(q[1]))))

@@ -11,7 +11,7 @@ from firmware_rigs import header, rig
 
 from calib.camera.model import project, undistort
 from calib.errors import BadInputError
-from calib.firmware.constants_camera import camera_groups, plane_constants
+from calib.firmware.constants_camera import MIDDLE_M, camera_groups, plane_constants, put_right
 from calib.firmware.header import header_of, header_text
 from calib.firmware.literals import literals
 from calib.twin.pictures import CAMERA, PLANE
@@ -54,6 +54,33 @@ def test_both_ways_through_the_plane_find_the_world() -> None:
     assert made.from_raw is not None
     raw, _ = _mapped(made.from_raw, pixels)
     assert 1e-5 < np.abs(raw - world).max() < 1.2 * made.raw_error_m
+
+
+def test_an_alignments_shift_and_stretch_are_undone() -> None:
+    """Places that the calibrated plane shows as the estimator's model of it does come out right."""
+    from calib.estimator.sensors import view_coefficients
+
+    shift, stretch = (3e-4, -2e-4), 2e-3
+    middle = view_coefficients(CAMERA, np.eye(3), np.zeros(3))[22:24]
+    assert tuple(middle) == MIDDLE_M
+    world, _ = _points()
+    shown = world + np.array(shift) + stretch * (world - middle)
+    R, t = np.array(PLANE.R_CW), np.array(PLANE.t_m)
+    pixels = project(CAMERA, shown @ R[:, :2].T + t)
+    right = put_right(_made(), shift, stretch)
+    found, W = _mapped(right.from_normalised, undistort(CAMERA, pixels))
+    assert np.abs(found - world).max() < 1e-9
+    assert (W > 0.0).all()
+    align = rig("full").align
+    assert align is not None
+    moved = align.model_copy(update={"plane_shift_m": list(shift), "plane_stretch": stretch})
+    made = header_of(rig("full").model_copy(update={"align": moved}), "rig.yaml")
+    assert made.camera.plane is not None
+    plain = header("full").camera.plane
+    assert plain is not None
+    np.testing.assert_allclose(
+        made.camera.plane.from_normalised, put_right(plain, shift, stretch).from_normalised, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("scale", [-3.0, 0.01, 100.0])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from firmware_rigs import header, rig
@@ -36,9 +38,21 @@ def test_a_calibrated_rig_gives_its_own() -> None:
     # A rate w is read as (1 + scale) w.
     assert c["CALIB_MM_DT_S"] == pytest.approx(1.0 / 60.0 / 1.02)
     assert c["CALIB_MM_GYRO_BIAS_DT_RAD"] == pytest.approx(0.013 / 60.0 / 1.02)
-    assert c["CALIB_IMU_MOUNT_ANGLE_RAD"] == pytest.approx(0.06)
+    assert c["CALIB_IMU_MOUNT_ANGLE_RAD"] == pytest.approx(0.05)
     assert c["CALIB_MARKER_OFFSET_M"] == pytest.approx(0.0147)
     assert (c["CALIB_TIME_OFFSET_TICKS"], c["CALIB_BELLOWS_RADIUS_M"]) == pytest.approx((2, 0.0131))
+
+
+@pytest.mark.parametrize("phi", [-1.2, 0.0, 0.7])
+def test_the_accelerometers_angle_is_right_at_every_angle(phi: float) -> None:
+    """Biases and scales by themselves, not only what they make of the angle at rest."""
+    c = _of("full")
+    alpha = c["CALIB_IMU_MOUNT_ANGLE_RAD"]
+    ax = 1.004 * 9.81 * math.cos(phi + alpha) + 0.1
+    ay = 0.997 * 9.81 * math.sin(phi + alpha) + 0.1
+    x = ax - c["CALIB_IMU_ACCEL_BIAS_X_MPS2"]
+    y = (ay - c["CALIB_IMU_ACCEL_BIAS_Y_MPS2"]) * c["CALIB_IMU_ACCEL_RATIO"]
+    assert math.atan2(y, x) - alpha == pytest.approx(phi, abs=1e-6)
 
 
 def test_the_state_variable_form_is_the_section() -> None:

@@ -72,8 +72,11 @@ def test_every_float_has_a_comment_and_defaults_are_named() -> None:
     assert "actuator.bellows_radius_m" not in full
 
 
+@pytest.mark.parametrize("fused", [0, 1])
 @pytest.mark.parametrize(("compiler", "flags"), COMPILERS, ids=lambda v: v.replace(" ", ""))
-def test_every_constant_compiles_to_numpys_bits(tmp_path: Path, compiler: str, flags: str) -> None:
+def test_every_constant_compiles_to_numpys_bits(
+    tmp_path: Path, compiler: str, flags: str, fused: int
+) -> None:
     made = replace(header("full"), inputs=HOSTILE)
     write(tmp_path, made)
     floats = {n: v for n, v in made.literals.items() if v.endswith("f")}
@@ -85,7 +88,7 @@ def test_every_constant_compiles_to_numpys_bits(tmp_path: Path, compiler: str, f
         "extern float entry(int i);\n"
         "float entry(int i) { return CALIB_TABLE_READ(&calib_ff_table_pwm[i]); }\n"
     )
-    done = _compiled(tmp_path, compiler, flags, unit)
+    done = _compiled(tmp_path, compiler, f"{flags} -DCALIB_FUSED={fused}", unit)
     assert done.returncode == 0, done.stderr
     thing = (tmp_path / "unit.o").read_bytes()
     scalars = [np.float32(v[:-1]) for n, v in floats.items() if "[" not in n]
@@ -108,10 +111,21 @@ def test_what_does_not_fit_does_not_compile(tmp_path: Path, line: str, message: 
     done = _compiled(tmp_path, "gcc", "-std=c99", f'{line}\n#include "calib_constants.h"\n')
     assert done.returncode != 0
     assert message in done.stderr
-    fits = "#define CALIB_EXPECT_SCHEMA 2\n#define CALIB_EXPECT_TICK_RATE_MHZ 60000\n"
+    fits = "#define CALIB_EXPECT_SCHEMA 3\n#define CALIB_EXPECT_TICK_RATE_MHZ 60000\n"
     fits += "#define CALIB_EXPECT_PUMP_HIGH 255\n"
     done = _compiled(tmp_path, "gcc", "-std=c99", f'{fits}#include "calib_pipeline.h"\n')
     assert done.returncode == 0, done.stderr
+
+
+def test_a_rig_without_what_the_fused_estimator_needs_does_not_compile(tmp_path: Path) -> None:
+    bare = header_of(rig("fused").model_copy(update={"align": None}), "rig.yaml")
+    write(tmp_path, bare)
+    assert "Fused estimator: none. rig.yaml lacks align." in (tmp_path / "calib_constants.h").read_text()
+    for fused in (0, 1):
+        unit = '#include "calib_pipeline.h"\n'
+        done = _compiled(tmp_path, "gcc", f"-std=c99 -DCALIB_FUSED={fused}", unit)
+        assert (done.returncode == 0) == (fused == 0)
+    assert "rig.yaml lacks what CALIB_FUSED needs" in done.stderr
 
 
 def test_a_header_without_a_plane_has_no_pipeline(tmp_path: Path) -> None:
@@ -146,5 +160,7 @@ def test_cppcheck_finds_nothing(tmp_path: Path) -> None:
     (tmp_path / "unit.c").write_text(unit)
     call = ["cppcheck", "--std=c99", "--enable=warning,performance,portability", "--inline-suppr", "--force"]
     call += ["--error-exitcode=1", "--quiet", "-DCALIB_STAGE(n)=", "unit.c"]
-    done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    for fused in (0, 1):
+        own = [*call, f"-DCALIB_FUSED={fused}"]
+        done = subprocess.run(own, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr

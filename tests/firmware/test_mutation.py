@@ -9,15 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from firmware_build import NATIVE, need, numbers, run, write
-from firmware_rigs import header
+from firmware_build import LIMITS, NATIVE, need, numbers, run, write
+from firmware_rigs import header, rig
 
 from calib.firmware.conformance import MODE_ORIENTATION, MODE_POSITION, Inputs, Reference
+from calib.firmware.conformance_fused import FusedReference
 from calib.firmware.header import header_text
 from calib.firmware.literals import float_literal, values
-from calib.firmware.vectors import TOLERANCE, binary32, directed
-
-LIMITS = np.array([TOLERANCE["phi_rad"], *[TOLERANCE["marker_m"]] * 2, *[TOLERANCE["q_m"]] * 4, *[0.01] * 2])
+from calib.firmware.vectors import binary32, directed
+from calib.firmware.vectors_fused import coherent, directed_fused, pixel_of
 
 # Not reached by any marker inside the picture; test_pipeline.py has a plane whose horizon is.
 UNREACHED = {"CALIB_PLANE_LEAST_PER_M", "CALIB_PLANE_RAW_LEAST_PER_M"}
@@ -101,6 +101,8 @@ def _coherent(c: dict[str, float]) -> bool:
     ok.append(near(c["CALIB_PUMP_DEAD_ZONE_PWM"] * c["CALIB_PUMP_SUPPLY_V"], 255.0 * 4.7))
     whole = c["CALIB_TIME_OFFSET_TICKS"] / rate + c["CALIB_TIME_OFFSET_REST_S"]
     ok.append(abs(whole - (0.035 if c["CALIB_TIME_OFFSET_TICKS"] else 0.0)) < 1e-6)
+    # The limits are whole numbers; a thousandth of 5 PWM is below what a command may be off by.
+    ok.append(near(c["CALIB_PUMP_LOW_PWM"], round(c["CALIB_PUMP_LOW_PWM"])))
     # A thousandth of the series' last coefficient is 7e-8 m at the largest angle: checked against (3.14).
     ok.append(near(c["CALIB_INVERSE_F3_PER_RAD6"], 31.0 / 483840.0))
     # The camera of the two rigs.
@@ -113,6 +115,97 @@ def _build(folder: Path, text: str, undistort: int) -> list[str]:
     flags = ["-std=c99", "-O0", f"-DCALIB_UNDISTORT={undistort}", f"-I{folder}"]
     subprocess.run(["gcc", *flags, "-o", folder / "host", NATIVE / "program.c", "-lm"], check=True)
     return [str(folder / "host")]
+
+
+def _stimulus_fused(constants: dict[str, float]) -> list[Inputs]:
+    """Directed ticks, then rest, a long creep, and a tick on either side of each limit of the estimator."""
+    c, reference = {name.removeprefix("CALIB_"): v for name, v in constants.items()}, Reference(constants)
+    ticks = directed_fused(constants, 2400)
+    period = coherent(constants, 240)
+    # With the feedback alone at work.
+    for _ in range(4):
+        ticks += [replace(one, mode=MODE_POSITION, reference=(0.072, 0.072)) for one in period]
+    rest = replace(period[-1], mode=MODE_POSITION, reference=(0.069, 0.069))
+    # The rate that a stop leaves decays without pictures.
+    ticks += period[:60] + [replace(period[60], marker_seen=False)] * 30
+    # Without the IMU the pictures' share alone, after a start the greater one.
+    ticks += [replace(one, imu_read=False) for one in period[:120]] + period[:100]
+    ticks += [rest] * 200 + [replace(rest, u_px=rest.u_px + 40.0)] * 40
+    # Head on: the marker is along the chord, and the residual is what it is moved by.
+    still = replace(rest, gz_radps=c["MM_GYRO_BIAS_DT_RAD"] / c["MM_DT_S"])
+    Y = c["REST_LENGTH_M"] + c["MARKER_OFFSET_M"]
+
+    def along(by_m: float) -> Inputs:
+        u, v = pixel_of(reference, 0.0, Y + by_m)
+        return replace(still, u_px=u, v_px=v)
+
+    creep = 0.85 * c["FUSED_REST_LENGTH"] * c["FUSED_MOVING_M"]
+    ticks += [along(0.0)] * 400 + [along(creep * k) for k in range(700)]
+    # After a start nothing is left of former residuals.
+    lost = replace(still, marker_seen=False)
+    for limit in (c["FUSED_GATE_M"], c["FUSED_MOVING_M"] / c["FUSED_SLOW"]):
+        for factor in (0.9995, 1.0005):
+            ticks += [lost] * 70 + [along(0.0)] * 20 + [along(factor * limit)]
+    weak = c["FUSED_ACCEL_WEAK"]
+    for factor in (0.9995, 1.0005):
+        rows = np.array([[c[f"FUSED_ACCEL_{i}{j}"] for j in (1, 2)] for i in (1, 2)])
+        offset = np.array([c["FUSED_ACCEL_1"], c["FUSED_ACCEL_2"]])
+        ax, ay = np.linalg.solve(rows, offset + np.array([factor * weak, 0.0])).tolist()
+        ticks.append(replace(along(0.0), ax_mps2=ax, ay_mps2=ay))
+    return list(map(binary32, ticks))
+
+
+def _coherent_fused(c: dict[str, float]) -> bool:
+    """What is too small to be seen in a tick follows from the rig: the biases' share, 1e-5 rad for 0.1 %, and
+    the gain at rest, which leaves 4e-7 m of a residual unless it changes the length by its last digit.
+    """
+    section = rig("fused").estimator
+    assert section is not None
+    assert section.constant_gain is not None
+    bias, rest = np.array([0.1, 0.1]), section.constant_gain.rest_length
+    rows = np.array([[c[f"CALIB_FUSED_ACCEL_{i}{j}"] for j in (1, 2)] for i in (1, 2)])
+    told = np.array([c["CALIB_FUSED_ACCEL_1"], c["CALIB_FUSED_ACCEL_2"]])
+    near = abs(c["CALIB_FUSED_REST_LENGTH"] / rest - 1.0) < 1e-4
+    return near and bool(np.allclose(rows @ bias, told, rtol=1e-4))
+
+
+def _build_fused(folder: Path, text: str) -> list[str]:
+    (folder / "calib_constants.h").write_text(text)
+    flags = ["-std=c99", "-O0", "-DCALIB_FUSED=1", f"-I{folder}"]
+    subprocess.run(["gcc", *flags, "-o", folder / "host", NATIVE / "program.c", "-lm"], check=True)
+    return [str(folder / "host")]
+
+
+@pytest.mark.slow
+def test_a_constant_of_the_fused_estimator_that_is_off_is_seen(tmp_path: Path) -> None:
+    """By a thousandth, or by one where it counts ticks: off by five times what rounding gives."""
+    need("gcc")
+    made = header("fused")
+    constants, text = values(made.literals), header_text(made)
+    write(tmp_path, made)
+    ticks = _stimulus_fused(constants)
+    plain = run(_build_fused(tmp_path, text), ticks)
+    reference = FusedReference(constants)
+    wanted = [reference.step(t, int(f)) for t, f in zip(ticks, plain.flags, strict=True)]
+    table = np.array([numbers(out) for out in wanted])
+    rounding = np.abs(plain.numbers - table).max(axis=0)
+    assert (rounding <= LIMITS).all(), rounding
+    assert _coherent_fused(constants)
+    unseen = []
+    for name, literal in made.literals.items():
+        if not name.startswith("CALIB_FUSED_") or name in ("CALIB_FUSED_TICKS", "CALIB_HAS_FUSED"):
+            continue
+        whole = not literal.endswith("f")
+        changed = str(int(literal) + 1) if whole else float_literal(1.001 * constants[name], name)
+        if not _coherent_fused({**constants, name: values({name: changed})[name]}):
+            continue
+        mutated = text.replace(f"#define {name} {literal} ", f"#define {name} {changed} ")
+        assert mutated != text, name
+        found = run(_build_fused(tmp_path, mutated), ticks)
+        off = np.abs(found.numbers - table).max(axis=0)
+        if not ((off > 5.0 * rounding).any() or (found.flags != plain.flags).any()):
+            unseen.append((name, float((off / rounding).max())))
+    assert not unseen
 
 
 @pytest.mark.slow
@@ -142,7 +235,7 @@ def test_a_constant_that_is_off_by_a_thousandth_is_seen(tmp_path: Path, kind: st
         idle_here = ("PLANE_RAW",) if undistort else ("PLANE_NORMALISED", "LENS_INVERSE")
         if not literal.endswith("f") or constants[name] == 0.0 or name in UNREACHED:
             continue
-        if any(part in name for part in idle_here):
+        if any(part in name for part in (*idle_here, "CALIB_FUSED_")):
             continue
         changed = float_literal(1.001 * constants[name], name)
         if not _coherent({**constants, name: values({name: changed})[name]}):

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from firmware_build import compare, host, need, numbers, run, write
+from firmware_build import HOSTILE, LIMITS, compare, host, need, numbers, run, write
 from firmware_rigs import header, rig
 
 from calib.firmware.conformance import (
@@ -39,13 +39,8 @@ from calib.firmware.conformance import (
 )
 from calib.firmware.header import Header
 from calib.firmware.literals import values
-from calib.firmware.vectors import TOLERANCE, binary32, directed
+from calib.firmware.vectors import binary32, directed
 from calib.rig_lowpass import LowPassSection
-
-LIMITS = np.array([TOLERANCE["phi_rad"], *[TOLERANCE["marker_m"]] * 2, *[TOLERANCE["q_m"]] * 4, *[0.01] * 2])
-
-HOSTILE = [0.0, -0.0, 1e-45, -1e-38, 1e-20, 0.5, 3.14159, 400.0, 401.0, 1e9, -1e20, 3.4e38, -3.4e38]
-HOSTILE += [float("nan"), float("inf"), -float("inf")]
 
 
 @pytest.fixture(scope="module", params=["nominal", "full"])

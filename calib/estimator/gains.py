@@ -1,0 +1,150 @@
+"""Gains of the fused estimator of `calib.estimator.constant_gain`: what it runs with, and how they are found.
+
+K_c, K_a, K_b are those of the stationary filter of (phi, b), which the gyroscope's turn carries from tick to
+tick, K_m, K_v of (l, v), and K_r of l alone. With P of the discrete algebraic Riccati equation they are
+K = P H' (H P H' + R)^-1 (Anderson and Moore 1979, 4.4). A picture that is D ticks late shows l - D v. The
+densities of the process noise were found by a random search for the least errors on simulated rigs whose
+parameters vary.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.arrays import FloatArray
+from calib.errors import BadInputError
+
+__all__ = [
+    "ALONE",
+    "BOOST",
+    "BOOST_TICKS",
+    "MOST_DELAY_TICKS",
+    "MOVING_TICKS",
+    "PATIENCE",
+    "SHAKING_RADPS2",
+    "Gains",
+    "TickNoise",
+    "design",
+]
+
+MOST_DELAY_TICKS = 8
+MOVING_TICKS = 6
+PATIENCE = 6
+BOOST_TICKS, BOOST, ALONE = 8, 0.5, 0.25
+SHAKING_RADPS2 = 6.0
+"""Acceleration of the head that its accelerometer is trusted through."""
+
+_TURN_WALK = 1.1e-3
+_BIAS_WALK_RADPS = 2e-4
+_REST_WALK_M, _MOVING_WALK_M, _MOVING_ACCEL = 3e-5, 5e-4, 1.5e-3
+_RATE_MEMORY_S, _SLOW_S = 0.25, 0.16
+_MOVING_SIGMA, _STILL_MPS, _GATE_M = 3.8, 4.4e-4, 5e-3
+
+
+@dataclass(frozen=True)
+class TickNoise:
+    """Standard deviations of a tick's readings.
+
+    Attributes
+    ----------
+    camera_rad, camera_m : of angle and length from a picture. gyro_radps : of the rate.
+    accel_rad : of the accelerometer's angle, the head's own acceleration included.
+    """
+
+    camera_rad: float
+    camera_m: float
+    gyro_radps: float
+    accel_rad: float
+
+
+@dataclass(frozen=True)
+class Gains:
+    """What the estimator runs with; lengths are in metres, rates per tick.
+
+    Attributes
+    ----------
+    rate_hz, delay_ticks : T = 1 / rate_hz, D. lever_m : l0 / 2 + d.
+    camera_phi, accel_phi, bias : K_c, K_a, K_b.
+    moving_length, moving_rate, rest_length, rate_decay : K_m, K_v, K_r, K_d.
+    slow : K_s. moving_m, still_m : s_0, v_0. gate_m : of the residuals of a picture.
+    """
+
+    rate_hz: float
+    delay_ticks: float
+    lever_m: float
+    camera_phi: float
+    accel_phi: float
+    bias: float
+    moving_length: float
+    moving_rate: float
+    rest_length: float
+    rate_decay: float
+    slow: float
+    moving_m: float
+    still_m: float
+    gate_m: float
+
+
+def _stationary(F: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
+    """K (n, m) of the stationary filter."""
+    from scipy.linalg import solve_discrete_are
+
+    scale = np.sqrt(np.diag(Q))
+    f, h, q = F / scale[:, None] * scale, H * scale, Q / scale[:, None] / scale
+    unit = np.sqrt(np.diag(R))
+    h, r = h / unit[:, None], R / unit[:, None] / unit
+    P = solve_discrete_are(f.T, h.T, q, r)
+    K = np.linalg.solve(h @ P @ h.T + r, h @ P).T
+    return np.asarray(K * scale[:, None] / unit, dtype=np.float64)
+
+
+def design(noise: TickNoise, rate_hz: float, delay_s: float, lever_m: float) -> Gains:
+    """Gains for ticks of a rate and pictures that are late.
+
+    Raises `BadInputError` for a rate that is not positive, and pictures more than `MOST_DELAY_TICKS` late or
+    from the future.
+    """
+    if not rate_hz > 0.0:
+        raise BadInputError(f"rate_hz is {rate_hz:g}, expected a positive rate of ticks")
+    delay = delay_s * rate_hz
+    if not 0.0 <= delay <= MOST_DELAY_TICKS:
+        raise BadInputError(f"pictures are {delay:.3g} ticks late, expected 0 to {MOST_DELAY_TICKS}")
+    T = 1.0 / rate_hz
+    carried = np.array([[1.0, 1.0], [0.0, 1.0]])
+    turned = (noise.gyro_radps * T) ** 2 + _TURN_WALK**2 * T
+    phi = _stationary(
+        carried,
+        np.diag([turned, _BIAS_WALK_RADPS**2 * T**3]),
+        np.array([[1.0, 0.0], [1.0, 0.0]]),
+        np.diag([noise.camera_rad, noise.accel_rad]) ** 2,
+    )
+    camera = np.array([[noise.camera_m**2]])
+    # The rate's noise per tick, of a white acceleration.
+    force = _MOVING_ACCEL**2 * T**3
+    moving = _stationary(
+        carried,
+        np.diag([_MOVING_WALK_M**2 * T + force / 3.0, force]),
+        np.array([[1.0, -delay]]),
+        camera,
+    )
+    rest = _stationary(np.eye(1), np.array([[_REST_WALK_M**2 * T]]), np.eye(1), camera)
+    slow = 1.0 - math.exp(-T / _SLOW_S)
+    return Gains(
+        rate_hz=rate_hz,
+        delay_ticks=delay,
+        lever_m=lever_m,
+        camera_phi=float(phi[0, 0]),
+        accel_phi=float(phi[0, 1]),
+        bias=float(phi[1, 0] / phi[0, 0]),
+        moving_length=float(moving[0, 0]),
+        moving_rate=float(moving[1, 0]),
+        rest_length=float(rest[0, 0]),
+        rate_decay=math.exp(-T / _RATE_MEMORY_S),
+        slow=slow,
+        moving_m=_MOVING_SIGMA * noise.camera_m * math.sqrt(slow / (2.0 - slow)),
+        still_m=_STILL_MPS * T,
+        gate_m=max(_GATE_M, 8.0 * noise.camera_m),
+    )
