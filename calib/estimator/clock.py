@@ -17,6 +17,7 @@ import numpy as np
 from numba import njit
 
 from calib.arrays import FloatArray
+from calib.estimator.compiled import compiled
 
 __all__ = ["CLOCK_SIZE", "advance", "even_times", "new_clock", "restart"]
 
@@ -37,14 +38,14 @@ def new_clock(period_s: float) -> FloatArray:
     return clock
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def restart(clock: FloatArray) -> None:
     """Forget the time, but neither the nominal period nor the jitter."""
     clock[0] = 0.0
     clock[7] = 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def advance(clock: FloatArray, stamp: float) -> float:
     """Time of the sample that came with this stamp [s]."""
     nominal = clock[8]
@@ -96,7 +97,7 @@ def advance(clock: FloatArray, stamp: float) -> float:
     return float(clock[1])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def advance_again(clock: FloatArray, stamp: float) -> float:
     """Start from this stamp with the period as it was."""
     clock[0], clock[1], clock[7] = 1.0, stamp, 0.0

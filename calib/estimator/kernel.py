@@ -6,7 +6,9 @@ Each scalar reading z = h(x) + noise updates a state x with covariance P in turn
 
 with y = z - h(x0) - H (x - x0), linearised at the state x0 before the event's first reading. For one
 scalar and this gain Joseph's form is the same thing: its remainder p - K S is zero term by term. P is
-kept symmetric to the last bit. A rounded pixel enters as its equivalent Gaussian reading (`rounding`).
+kept symmetric to the last bit. Of H only what is not zero is kept; the readings of an event act on the P H'
+of those that follow by the Cholesky factor of their own covariance, and on P together at the end. A rounded
+pixel enters as its equivalent Gaussian reading (`rounding`).
 
 A reading is gated by the chi-square of its whole sensor in that level of the bank that expects it best;
 a gated one changes nothing. The noise of an accelerometer grows with the head's acceleration by a share,
@@ -25,34 +27,51 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from calib.arrays import FloatArray
-from calib.estimator.model import mix, predict, settle_weights
+from calib.estimator.bank import (
+    CORE,
+    POSITIVE,
+    RECORD,
+    STATE,
+    WIDTH,
+    copy_level,
+    mix,
+    predict,
+    settle_weights,
+)
+from calib.estimator.compiled import compiled
+from calib.estimator.expect import (
+    FELT_X,
+    FELT_Y,
+    H_U,
+    H_V,
+    H_X,
+    H_Y,
+    H_Z,
+    P0,
+    P1,
+    P2,
+    SEEN,
+    TURNED,
+    expect_camera,
+    expect_imu,
+)
 from calib.estimator.rounding import update_terms
-from calib.estimator.sensors import SIZE, accelerometer, gyroscope, marker
+from calib.estimator.sensors import SIZE
 
-__all__ = [
-    "CAMERA",
-    "CONSIDERED",
-    "IMU",
-    "NOISE",
-    "REPORT",
-    "TRACE",
-    "WORK",
-    "camera_terms",
-    "event",
-    "imu_terms",
-    "scalar_update",
-]
+__all__ = ["CAMERA", "CONSIDERED", "IMU", "MIXED_S", "NOISE", "REPORT", "TRACE", "event", "mixes"]
 
 CONSIDERED = (11, 12, 14, 15, 16)
 """Entries of the state that readings do not change."""
 
-_LEARNT = np.array([0.0 if k in CONSIDERED else 1.0 for k in range(SIZE)])
+_LEARNT = np.array([0.0 if k in CONSIDERED else 1.0 for k in range(WIDTH)])
 
 CAMERA, IMU = 1, 2
 """Kinds of events; a picture has the readings (u, v), a sample (a_x, a_y, g_z), NaN where missing."""
+
+MIXED_S = 0.015
+"""The levels are mixed at each picture, without pictures after so long: their turns take seconds."""
 
 NOISE = (
     "jitter_px",
@@ -85,248 +104,206 @@ REPORT = (
 )
 """What an event says of itself; e are innovations over their standard deviation. NaN: not sampled."""
 
-WORK = 8
-"""Scratch of each level: gradients 0 to 2, P H' 3 to 5, innovations and variances 6, chi-squares 7."""
-
 TRACE = 40
 """What a reading leaves for the smoother: H (19), P H' / S (19), y / S, 1 / S; the last is 0 without one."""
 
-_TELLING = 9.0
-"""A rate or acceleration below three deviations (squared) tells nothing of what it multiplies."""
+_Q0, _Q1, _Q2 = CORE + 3 * WIDTH, CORE + 4 * WIDTH, CORE + 5 * WIDTH
+"""Rows of a record: P H' / sqrt(S) of each reading, and the same with zeros for what is only considered."""
 
+_TURN = 2.0 * math.pi
 _MARGIN_PX2 = 0.25
 """Added to the variance for gating: half a pixel of motion that no level expects is no outlier."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def scalar_update(x: FloatArray, P: FloatArray, innovation: float, S: float, p: FloatArray) -> None:
-    """Update of (n,) and (n, n) in place by an innovation with variance S; p = P H' is used up.
-
-    What is only considered keeps its value and its covariance.
-    """
-    n = x.shape[0]
-    root = 1.0 / math.sqrt(S)
-    for j in range(n):
-        p[j] *= root
-    move = innovation * root
-    for i in range(n):
-        gain = p[i]
-        if i < SIZE and _LEARNT[i] == 0.0:
-            for j in range(n):
-                if j >= SIZE or _LEARNT[j] != 0.0:
-                    P[i, j] -= gain * p[j]
-            continue
-        x[i] += gain * move
-        # p_i p_j is the same product on both sides of the diagonal, so P stays symmetric.
-        for j in range(n):
-            P[i, j] -= gain * p[j]
+@compiled()
+def _pair(told: FloatArray, m: int, more: float) -> float:
+    """Chi-square of the first two readings together, `more` added to their variances."""
+    a, b, c = told[m, 6] + told[m, 3] + more, told[m, 9], told[m, 7] + told[m, 4] + more
+    e0, e1 = told[m, 0], told[m, 1]
+    told[m, 14], told[m, 15] = e0 / math.sqrt(a), e1 / math.sqrt(c)
+    told[m, 12] = (c * e0 * e0 - 2.0 * b * e0 * e1 + a * e1 * e1) / (a * c - b * b)
+    return float(told[m, 12])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def camera_terms(
-    view: FloatArray, noise: FloatArray, x: FloatArray, P: FloatArray, H: FloatArray, out: FloatArray
-) -> None:
-    """Predicted pixel and what the stamps' error adds to its variance: u, v, var_u, var_v.
-
-    H (2, n) gets the gradients.
-    """
-    out[0], out[1] = marker(view, x, H[0], H[1])
-    for k in range(2):
-        speed = H[k, 0] * x[2] + H[k, 1] * x[3]
-        out[2 + k] = (speed * noise[6]) ** 2
-        if speed * speed < _TELLING * (H[k, 0] ** 2 * P[2, 2] + H[k, 1] ** 2 * P[3, 3]):
-            H[k, 13] = 0.0
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def imu_terms(
-    constants: FloatArray, noise: FloatArray, x: FloatArray, P: FloatArray, H: FloatArray, out: FloatArray
-) -> None:
-    """Predicted a_x, a_y, g_z and the variances of their noise; H (3, n) gets the gradients."""
-    out[0], out[1] = accelerometer(constants[0], constants[1], x, H[0], H[1])
-    out[2] = gyroscope(x, H[2])
-    if x[2] * x[2] < _TELLING * P[2, 2]:
-        H[2, 10] = 0.0
-    tilt = x[0] + x[9]
-    moved_x = out[0] - x[7] - constants[0] * math.cos(tilt)
-    moved_y = out[1] - x[8] - constants[0] * math.sin(tilt)
-    scale = noise[5] * noise[5] * (moved_x * moved_x + moved_y * moved_y)
-    for k in range(2):
-        unknown = H[k, 1] * H[k, 1] * P[1, 1] + H[k, 11] * H[k, 11] * P[11, 11]
-        out[3 + k] = noise[2 + k] * noise[2 + k] + scale + unknown
-        H[k, 1], H[k, 11] = 0.0, 0.0
-    out[5] = noise[4] * noise[4] + (x[4] * noise[7]) ** 2
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _expect(
-    x: FloatArray, P: FloatArray, kind: int, z: FloatArray, view: FloatArray, constants: FloatArray,
-    noise: FloatArray, work: FloatArray,
-) -> None:  # fmt: skip
-    """Gradients H, P H', innovations 6[:3], variances of the noise 6[3:6] and of the prediction 6[6:10]."""
-    n, out, told = x.shape[0], work[7], work[6]
-    count = 2 if kind == CAMERA else 3
-    if kind == CAMERA:
-        camera_terms(view, noise, x, P, work, out)
-    else:
-        imu_terms(constants, noise, x, P, work, out)
-    for i in range(count):
-        told[i], told[3 + i] = z[i] - out[i], out[count + i]
-        H, p = work[i], work[3 + i]
-        for j in range(n):
-            p[j] = 0.0
-        for k in range(n):
-            slope = H[k]
-            if slope != 0.0:
-                for j in range(n):
-                    p[j] += slope * P[k, j]
-        total = 0.0
-        for k in range(n):
-            total += H[k] * p[k]
-        told[6 + i] = total
-    total = 0.0
-    for k in range(n):
-        total += work[1, k] * work[3, k]
-    told[9] = total
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _pair(told: FloatArray, more: float, kept: FloatArray) -> float:
-    """Chi-square of two readings together, `more` added to their variances; both go to `kept`."""
-    a, b, c = told[6] + told[3] + more, told[9], told[7] + told[4] + more
-    e0, e1 = told[0], told[1]
-    kept[0] = (c * e0 * e0 - 2.0 * b * e0 * e1 + a * e1 * e1) / (a * c - b * b)
-    kept[2], kept[3] = e0 / math.sqrt(a), e1 / math.sqrt(c)
-    return float(kept[0])
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def _judge(
-    kind: int, z: FloatArray, noise: FloatArray, work: FloatArray, report: FloatArray, gated: FloatArray
-) -> None:
+    kind: int, z: FloatArray, row: int, noise: FloatArray, told: FloatArray, report: FloatArray,
+    gated: FloatArray,
+) -> None:  # fmt: skip
     """Which sensors of an event are gated, by the level that expects them best."""
     best, best_gyro = math.inf, math.inf
     if kind == CAMERA:
         variance = noise[0] * noise[0] + noise[1] * noise[1] / 12.0
-        for m in range(work.shape[0]):
-            best = min(best, _pair(work[m, 6], variance + _MARGIN_PX2, work[m, 7]))
-            _pair(work[m, 6], variance, work[m, 7])
-        gated[0] = 0.0 if best < noise[8] else 1.0
-        report[8] = gated[0]
+        for m in range(told.shape[0]):
+            best = min(best, _pair(told, m, variance + _MARGIN_PX2))
+            _pair(told, m, variance)
+        gated[row, 0] = 0.0 if best < noise[8] else 1.0
+        report[8] = gated[row, 0]
         return
-    gated[1], gated[2] = 1.0, 1.0
-    for m in range(work.shape[0]):
-        told, kept = work[m, 6], work[m, 7]
-        S = told[8] + told[5]
-        kept[1], kept[4] = told[2] * told[2] / S, told[2] / math.sqrt(S)
-        best_gyro = min(best_gyro, kept[1])
-        best = min(best, _pair(told, 0.0, kept))
-    if not (math.isnan(z[0]) or math.isnan(z[1])):
-        gated[1] = 0.0 if best < noise[9] else 1.0
-        report[9] = gated[1]
-    if not math.isnan(z[2]):
-        gated[2] = 0.0 if best_gyro < noise[10] else 1.0
-        report[10] = gated[2]
+    gated[row, 1], gated[row, 2] = 1.0, 1.0
+    for m in range(told.shape[0]):
+        S = told[m, 8] + told[m, 5]
+        told[m, 16] = told[m, 2] / math.sqrt(S)
+        told[m, 13] = told[m, 16] * told[m, 16]
+        best_gyro = min(best_gyro, told[m, 13])
+        best = min(best, _pair(told, m, 0.0))
+    if not (math.isnan(z[row, 0]) or math.isnan(z[row, 1])):
+        gated[row, 1] = 0.0 if best < noise[9] else 1.0
+        report[9] = gated[row, 1]
+    if not math.isnan(z[row, 2]):
+        gated[row, 2] = 0.0 if best_gyro < noise[10] else 1.0
+        report[10] = gated[row, 2]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _absorb(
-    x: FloatArray, P: FloatArray, kind: int, noise: FloatArray, work: FloatArray, gated: FloatArray,
-    trace: FloatArray,
-) -> float:  # fmt: skip
-    """Update by the readings of an event, one after the other; their log likelihood.
+@compiled(contract=True)
+def _settle(bank: FloatArray, at: int, move0: float, move1: float, move2: float) -> None:
+    """Take the rows of three readings from covariance and state; p_i p_j is the same on both sides of P.
 
-    The readings act on P H' of those that follow at once and on P itself together at the end.
+    Between two quantities that are only considered the covariance stays, and so do their values.
     """
-    n, told = x.shape[0], work[6]
-    total, used = 0.0, 0
-    move0, move1, move2 = 0.0, 0.0, 0.0
-    for order in range(3):
-        # The gyroscope first: it is the most exact.
-        k = order if kind == CAMERA else (order + 2) % 3
-        p, H = work[3 + k], work[k]
-        sensor = 0 if kind == CAMERA else 2 if k == 2 else 1
-        if gated[sensor] != 0.0 or (kind == CAMERA and k == 2):
-            for j in range(n):
-                p[j] = 0.0
-            continue
-        spread = 0.0
-        for j in range(n):
-            spread += H[j] * p[j]
-        if kind == CAMERA:
-            y, S, log_z = update_terms(told[k], spread, noise[0] * noise[0] + told[3 + k], noise[1])
-            total += log_z
-        else:
-            y, S = told[k], spread + told[3 + k]
-            total -= 0.5 * (y * y / S + math.log(2.0 * math.pi * S))
-        if trace.shape[0]:
-            for j in range(n):
-                trace[used, j], trace[used, n + j] = H[j], p[j] / S
-            trace[used, 2 * n], trace[used, 2 * n + 1] = y / S, 1.0 / S
-            used += 1
-        root = 1.0 / math.sqrt(S)
-        for j in range(n):
-            p[j] *= root
-        move = y * root
-        for later in range(order + 1, 3):
-            other = later if kind == CAMERA else (later + 2) % 3
-            if kind == CAMERA and other == 2:
-                continue
-            next_H, next_p = work[other], work[3 + other]
-            every = 0.0
-            for j in range(n):
-                every += p[j] * next_H[j]
-            learnt = 0.0
-            for j in range(n):
-                learnt += _LEARNT[j] * p[j] * next_H[j]
-            told[other] -= learnt * move
-            # Between two that are only considered the covariance stays.
-            for j in range(n):
-                next_p[j] -= (learnt + _LEARNT[j] * (every - learnt)) * p[j]
-        if k == 0:
-            move0 = move
-        elif k == 1:
-            move1 = move
-        else:
-            move2 = move
+    o = at & POSITIVE
+    p = o + P0
+    a0, a1, a2 = bank[p], bank[p + WIDTH], bank[p + 2 * WIDTH]
+    b0, b1, b2 = bank[p + 1], bank[p + WIDTH + 1], bank[p + 2 * WIDTH + 1]
+    c0, c1, c2 = bank[p + 2], bank[p + WIDTH + 2], bank[p + 2 * WIDTH + 2]
+    d0, d1, d2 = bank[p + 3], bank[p + WIDTH + 3], bank[p + 2 * WIDTH + 3]
+    e0, e1, e2 = bank[p + 4], bank[p + WIDTH + 4], bank[p + 2 * WIDTH + 4]
+    f0, f1, f2 = bank[p + 5], bank[p + WIDTH + 5], bank[p + 2 * WIDTH + 5]
+    for j in range(WIDTH):
+        p0, p1, p2 = bank[o + P0 + j], bank[o + P1 + j], bank[o + P2 + j]
+        q0, q1, q2 = bank[o + _Q0 + j], bank[o + _Q1 + j], bank[o + _Q2 + j]
+        bank[o + j] -= a0 * p0 + a1 * p1 + a2 * p2
+        bank[o + WIDTH + j] -= b0 * p0 + b1 * p1 + b2 * p2
+        bank[o + 2 * WIDTH + j] -= c0 * p0 + c1 * p1 + c2 * p2
+        bank[o + 3 * WIDTH + j] -= d0 * p0 + d1 * p1 + d2 * p2
+        bank[o + 4 * WIDTH + j] -= e0 * p0 + e1 * p1 + e2 * p2
+        bank[o + 5 * WIDTH + j] -= f0 * p0 + f1 * p1 + f2 * p2
+        bank[o + STATE + j] += move0 * q0 + move1 * q1 + move2 * q2
+    a0, a1, a2 = bank[p + 6], bank[p + WIDTH + 6], bank[p + 2 * WIDTH + 6]
+    b0, b1, b2 = bank[p + 7], bank[p + WIDTH + 7], bank[p + 2 * WIDTH + 7]
+    c0, c1, c2 = bank[p + 8], bank[p + WIDTH + 8], bank[p + 2 * WIDTH + 8]
+    d0, d1, d2 = bank[p + 9], bank[p + WIDTH + 9], bank[p + 2 * WIDTH + 9]
+    e0, e1, e2 = bank[p + 10], bank[p + WIDTH + 10], bank[p + 2 * WIDTH + 10]
+    f0, f1, f2 = bank[p + 13], bank[p + WIDTH + 13], bank[p + 2 * WIDTH + 13]
+    g0, g1, g2 = bank[p + 17], bank[p + WIDTH + 17], bank[p + 2 * WIDTH + 17]
+    h0, h1, h2 = bank[p + 18], bank[p + WIDTH + 18], bank[p + 2 * WIDTH + 18]
+    for j in range(4, WIDTH):
+        p0, p1, p2 = bank[o + P0 + j], bank[o + P1 + j], bank[o + P2 + j]
+        bank[o + 6 * WIDTH + j] -= a0 * p0 + a1 * p1 + a2 * p2
+        bank[o + 7 * WIDTH + j] -= b0 * p0 + b1 * p1 + b2 * p2
+        bank[o + 8 * WIDTH + j] -= c0 * p0 + c1 * p1 + c2 * p2
+        bank[o + 9 * WIDTH + j] -= d0 * p0 + d1 * p1 + d2 * p2
+        bank[o + 10 * WIDTH + j] -= e0 * p0 + e1 * p1 + e2 * p2
+        bank[o + 13 * WIDTH + j] -= f0 * p0 + f1 * p1 + f2 * p2
+        bank[o + 17 * WIDTH + j] -= g0 * p0 + g1 * p1 + g2 * p2
+        bank[o + 18 * WIDTH + j] -= h0 * p0 + h1 * p1 + h2 * p2
+    a0, a1, a2 = bank[p + 11], bank[p + WIDTH + 11], bank[p + 2 * WIDTH + 11]
+    b0, b1, b2 = bank[p + 12], bank[p + WIDTH + 12], bank[p + 2 * WIDTH + 12]
+    c0, c1, c2 = bank[p + 14], bank[p + WIDTH + 14], bank[p + 2 * WIDTH + 14]
+    d0, d1, d2 = bank[p + 15], bank[p + WIDTH + 15], bank[p + 2 * WIDTH + 15]
+    e0, e1, e2 = bank[p + 16], bank[p + WIDTH + 16], bank[p + 2 * WIDTH + 16]
+    for j in range(4, WIDTH):
+        p0, p1, p2 = bank[o + _Q0 + j], bank[o + _Q1 + j], bank[o + _Q2 + j]
+        bank[o + 11 * WIDTH + j] -= a0 * p0 + a1 * p1 + a2 * p2
+        bank[o + 12 * WIDTH + j] -= b0 * p0 + b1 * p1 + b2 * p2
+        bank[o + 14 * WIDTH + j] -= c0 * p0 + c1 * p1 + c2 * p2
+        bank[o + 15 * WIDTH + j] -= d0 * p0 + d1 * p1 + d2 * p2
+        bank[o + 16 * WIDTH + j] -= e0 * p0 + e1 * p1 + e2 * p2
+
+
+@compiled(contract=True)
+def _leave(
+    trace: FloatArray, row: int, used: int, bank: FloatArray, p: int, told: FloatArray, m: int, H: int,
+    places: tuple[int, ...], move: float, scale: float,
+) -> None:  # fmt: skip
+    """Write what a reading does to the trace; `scale` is 1 / sqrt(S), which row and move have in them."""
+    for j in range(SIZE):
+        trace[row, used, j], trace[row, used, SIZE + j] = 0.0, bank[p + j] * scale
+    for k, place in enumerate(places):
+        trace[row, used, place] = told[m, H + k]
+    trace[row, used, 2 * SIZE], trace[row, used, 2 * SIZE + 1] = move * scale, scale * scale
+
+
+@compiled(contract=True)
+def _absorb_camera(
+    bank: FloatArray, at: int, noise: FloatArray, told: FloatArray, m: int, trace: FloatArray, row: int
+) -> None:
+    """Update by the readings of a picture, one after the other."""
+    o = at & POSITIVE
+    jitter = noise[0] * noise[0]
+    y, S, log_u = update_terms(told[m, 0], told[m, 6], jitter + told[m, 3], noise[1])
+    scale0 = 1.0 / math.sqrt(S)
+    move0 = y * scale0
+    learnt, considered = told[m, 10] * scale0, told[m, 11] * scale0
+    left = max(told[m, 7] - learnt * (learnt + 2.0 * considered), 0.0)
+    y, S, log_v = update_terms(told[m, 1] - learnt * move0, left, jitter + told[m, 4], noise[1])
+    scale1 = 1.0 / math.sqrt(S)
+    move1 = y * scale1
+    told[m, 17] = log_u + log_v
+    for j in range(WIDTH):
+        free = _LEARNT[j]
+        p0 = scale0 * bank[o + P0 + j]
+        p1 = scale1 * (bank[o + P1 + j] - (learnt + free * considered) * p0)
+        bank[o + P0 + j], bank[o + P1 + j], bank[o + P2 + j] = p0, p1, 0.0
+        bank[o + _Q0 + j], bank[o + _Q1 + j], bank[o + _Q2 + j] = free * p0, free * p1, 0.0
     if trace.shape[0]:
-        for k in range(used, 3):
-            trace[k, 2 * n + 1] = 0.0
-    p0, p1, p2 = work[3], work[4], work[5]
-    three = kind != CAMERA
-    for i in range(n):
-        if _LEARNT[i] == 0.0:
-            continue
-        g0, g1 = p0[i], p1[i]
-        x[i] += g0 * move0 + g1 * move1
-        # p_i p_j is the same product on both sides of the diagonal, so P stays symmetric.
-        if three:
-            g2 = p2[i]
-            x[i] += g2 * move2
-            for j in range(n):
-                P[i, j] -= g0 * p0[j] + g1 * p1[j] + g2 * p2[j]
-        else:
-            for j in range(n):
-                P[i, j] -= g0 * p0[j] + g1 * p1[j]
-    for i in range(6, n):
-        if _LEARNT[i] == 0.0:
-            for j in range(n):
-                if _LEARNT[j] != 0.0:
-                    P[i, j] = P[j, i]
-    return total
+        _leave(trace, row, 0, bank, o + P0, told, m, H_U, SEEN, move0, scale0)
+        _leave(trace, row, 1, bank, o + P1, told, m, H_V, SEEN, move1, scale1)
+        trace[row, 2, TRACE - 1] = 0.0
+    _settle(bank, at, move0, move1, 0.0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _tell(kind: int, weight: FloatArray, work: FloatArray, report: FloatArray) -> None:
+@compiled(contract=True)
+def _absorb_imu(
+    bank: FloatArray, at: int, told: FloatArray, m: int, gated: FloatArray, trace: FloatArray, row: int
+) -> None:
+    """Update by the readings of a sample, the gyroscope first: it is the most exact."""
+    o = at & POSITIVE
+    log_l, product = 0.0, 1.0
+    scale0, scale1, scale2, move0, move1, move2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    z_on_x, z_on_y, x_on_y = 0.0, 0.0, 0.0
+    if gated[row, 2] == 0.0:
+        S = told[m, 8] + told[m, 5]
+        scale2 = 1.0 / math.sqrt(S)
+        move2 = told[m, 2] * scale2
+        z_on_x, z_on_y = told[m, 10] * scale2, told[m, 11] * scale2
+        log_l, product = log_l + move2 * move2, product * S * _TURN
+    if gated[row, 1] == 0.0:
+        S = max(told[m, 6] - z_on_x * z_on_x, 0.0) + told[m, 3]
+        scale0 = 1.0 / math.sqrt(S)
+        move0 = (told[m, 0] - z_on_x * move2) * scale0
+        log_l, product = log_l + move0 * move0, product * S * _TURN
+        x_on_y = (told[m, 9] - z_on_x * z_on_y) * scale0
+        S = max(told[m, 7] - z_on_y * z_on_y - x_on_y * x_on_y, 0.0) + told[m, 4]
+        scale1 = 1.0 / math.sqrt(S)
+        move1 = (told[m, 1] - z_on_y * move2 - x_on_y * move0) * scale1
+        log_l, product = log_l + move1 * move1, product * S * _TURN
+    told[m, 17] = -0.5 * (log_l + math.log(product))
+    for j in range(WIDTH):
+        free = _LEARNT[j]
+        p2 = scale2 * bank[o + P2 + j]
+        p0 = scale0 * (bank[o + P0 + j] - z_on_x * p2)
+        p1 = scale1 * (bank[o + P1 + j] - z_on_y * p2 - x_on_y * p0)
+        bank[o + P0 + j], bank[o + P1 + j], bank[o + P2 + j] = p0, p1, p2
+        bank[o + _Q0 + j], bank[o + _Q1 + j], bank[o + _Q2 + j] = free * p0, free * p1, free * p2
+    if trace.shape[0]:
+        _leave(trace, row, 0, bank, o + P2, told, m, H_Z, TURNED, move2, scale2)
+        _leave(trace, row, 1, bank, o + P0, told, m, H_X, FELT_X, move0, scale0)
+        _leave(trace, row, 2, bank, o + P1, told, m, H_Y, FELT_Y, move1, scale1)
+    _settle(bank, at, move0, move1, move2)
+
+
+@compiled()
+def _tell(kind: int, weights: FloatArray, slot: int, told: FloatArray, report: FloatArray) -> None:
     """Innovations in the report, those of each level weighted as after the event."""
     pair, gyro, e0, e1, e2 = 0.0, 0.0, 0.0, 0.0, 0.0
-    for m in range(weight.shape[0]):
-        kept = work[m, 7]
-        pair += weight[m] * kept[0]
-        gyro += weight[m] * kept[1]
-        e0 += weight[m] * kept[2]
-        e1 += weight[m] * kept[3]
-        e2 += weight[m] * kept[4]
+    for m in range(told.shape[0]):
+        w = weights[slot, m]
+        pair += w * told[m, 12]
+        gyro += w * told[m, 13]
+        e0 += w * told[m, 14]
+        e1 += w * told[m, 15]
+        e2 += w * told[m, 16]
     if kind == CAMERA:
         report[0], report[3], report[4] = pair, e0, e1
         return
@@ -336,64 +313,76 @@ def _tell(kind: int, weight: FloatArray, work: FloatArray, report: FloatArray) -
         report[2], report[7] = gyro, e2
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
+def mixes(kind: int, since: float) -> bool:
+    """Whether the levels are mixed before an event of this kind, so long after they last were [s]."""
+    return bool(kind == CAMERA or (kind != 0 and since > MIXED_S))
+
+
+@compiled()
 def event(
-    old_x: FloatArray,
-    old_P: FloatArray,
-    old_weight: FloatArray,
-    x: FloatArray,
-    P: FloatArray,
-    weight: FloatArray,
-    kind: int,
-    z: FloatArray,
-    dt: float,
-    switch_hz: float,
-    levels: FloatArray,
-    walk: FloatArray,
-    view: FloatArray,
-    constants: FloatArray,
-    noise: FloatArray,
-    work: FloatArray,
-    again: bool,
-    report: FloatArray,
-    gated: FloatArray,
+    bank: FloatArray, weights: FloatArray, old: int, new: int, kind: int, z: FloatArray, row: int, dt: float,
+    switch_hz: float, levels: FloatArray, k: int, walk: FloatArray, view: FloatArray, constants: FloatArray,
+    noise: FloatArray, told: FloatArray, again: bool, report: FloatArray, gated: FloatArray,
     trace: FloatArray,
-) -> None:
+) -> None:  # fmt: skip
     """Carry the bank on to an event and update it.
 
     Parameters
     ----------
-    old_x, old_P, old_weight : (M, 19), (M, 19, 19), (M,) after the event before.
-    x, P, weight : the same after this one; written to.
-    kind, z, dt : `CAMERA`, `IMU` or 0 for none, readings (3,), time since the event before [s].
-    switch_hz, levels, walk : of `model.Kinematic`.
+    bank : memory of `bank`, of which slot `old` is read and `new` written; of one level they may be the same.
+    weights : (slots, M + 1) weights of the levels, and the time since they were last mixed [s].
+    kind, dt : `CAMERA`, `IMU` or 0 for none; time since the event before [s].
+    z, gated : (n, 3) each, of which `row` counts: readings, and 1 where camera, accelerometer or gyroscope is
+        not used.
+    switch_hz, levels, walk : of `model.Kinematic`, (n, M, 8) levels of which [k] counts.
     view, constants, noise : camera (24,), gravity and lever across (2,), `NOISE` (11,).
-    work : (M, `WORK`, 19) scratch. report : (12,) of `REPORT`, written to.
+    told : (M, `expect.TOLD`) scratch.
     again : whether the event is done once more; then `gated` holds.
-    gated : (3,) 1 where camera, accelerometer or gyroscope is not used.
-    trace : (3, `TRACE`) what each reading of the last level did, for the smoother; (0, `TRACE`) for nothing.
+    report : (12,) of `REPORT`, written to.
+    trace : (n, 3, `TRACE`) what each reading of the last level did, for the smoother; (0, 3, `TRACE`) for
+        nothing.
     """
-    count = x.shape[0]
-    turn = (1.0 - math.exp(-count * switch_hz * dt)) / count if count > 1 and dt > 0.0 else 0.0
-    mix(old_x, old_P, old_weight, x, P, weight, turn)
+    count = told.shape[0]
+    since = weights[old, count] + max(dt, 0.0)
+    if count > 1 and mixes(kind, since):
+        mix(bank, weights, old, new, (1.0 - math.exp(-count * switch_hz * since)) / count)
+        since = 0.0
+    elif old != new:
+        for m in range(count):
+            copy_level(bank, (old * count + m) * RECORD, (new * count + m) * RECORD)
+            weights[new, m] = weights[old, m]
+    weights[new, count] = since
     if not again:
         report[:] = math.nan
+    report[11] = 0.0
+    for m in range(count):
+        at = (new * count + m) * RECORD
+        predict(bank, at, levels, k, m, walk, dt)
+        if kind == CAMERA:
+            expect_camera(bank, at, z, row, view, noise, told, m)
+        elif kind == IMU:
+            expect_imu(bank, at, z, row, constants, noise, told, m)
     if kind == 0:
-        for m in range(count):
-            predict(x[m], P[m], levels[m], walk, dt)
         if trace.shape[0]:
-            trace[:, TRACE - 1] = 0.0
-        report[11] = 0.0
+            for i in range(3):
+                trace[row, i, TRACE - 1] = 0.0
         return
-    for m in range(count):
-        predict(x[m], P[m], levels[m], walk, dt)
-        _expect(x[m], P[m], kind, z, view, constants, noise, work[m])
     if not again:
-        _judge(kind, z, noise, work, report, gated)
-    best = -math.inf
-    for m in range(count):
-        work[m, 6, 12] = _absorb(x[m], P[m], kind, noise, work[m], gated, trace)
-        best = max(best, work[m, 6, 12])
-    report[11] = settle_weights(weight, work[:, 6, 12]) if count > 1 else best
+        _judge(kind, z, row, noise, told, report, gated)
+    if kind == CAMERA and gated[row, 0] != 0.0:
+        for m in range(count):
+            told[m, 17] = 0.0
+        if trace.shape[0]:
+            for i in range(3):
+                trace[row, i, TRACE - 1] = 0.0
+    else:
+        for m in range(count):
+            at = (new * count + m) * RECORD
+            if kind == CAMERA:
+                _absorb_camera(bank, at, noise, told, m, trace, row)
+            else:
+                _absorb_imu(bank, at, told, m, gated, trace, row)
+    report[11] = settle_weights(weights, new, told, 17) if count > 1 else told[0, 17]
     if not again:
-        _tell(kind, weight, work, report)
+        _tell(kind, weights, new, told, report)

@@ -16,14 +16,12 @@ I + A h + A^2 h^2 / 2 + A^3 h^3 / 6, and that for its noise hold.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba import njit
 
 from calib.arrays import FloatArray
-from calib.estimator.sensors import SIZE
+from calib.estimator.compiled import compiled
 
 __all__ = [
     "LARGEST_STEP_S",
@@ -32,14 +30,9 @@ __all__ = [
     "Level",
     "axis_noise",
     "axis_transition",
-    "mix",
-    "predict",
-    "settle_weights",
 ]
 
 LARGEST_STEP_S = 0.02
-_NEGLIGIBLE = 1e-6
-"""A share of a mixture that is left out."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +116,7 @@ class Kinematic:
         return np.array([level.numbers() for level in self.levels]), np.array(self.sensor_walk) ** 2
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def axis_transition(c: float, b: float, h: float) -> tuple[float, float, float, float, float]:
     """Entries f01, f02, f11, f12, f22 of the transition of (p, v, a) over h [s]; c = 1/T_a, b = 1/T_v."""
     h2, h3 = 0.5 * h * h, h * h * h / 6.0
@@ -136,7 +129,7 @@ def axis_transition(c: float, b: float, h: float) -> tuple[float, float, float, 
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def axis_noise(q: float, walk: float, h: float) -> tuple[float, float, float, float, float, float]:
     """Entries pp, pv, pa, vv, va, aa of the noise over h [s] for the densities q of w_a, walk of w_p."""
     h2 = h * h
@@ -149,135 +142,3 @@ def axis_noise(q: float, walk: float, h: float) -> tuple[float, float, float, fl
         q * h2 / 2.0,
         q * h,
     )
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _step(x: FloatArray, P: FloatArray, level: FloatArray, walk: FloatArray, h: float) -> None:
-    n = x.shape[0]
-    for axis in range(2):
-        k = 4 * axis
-        f01, f02, f11, f12, f22 = axis_transition(level[k], level[k + 1], h)
-        p, v, a = axis, axis + 2, axis + 4
-        x[p] += f01 * x[v] + f02 * x[a]
-        x[v] = f11 * x[v] + f12 * x[a]
-        x[a] = f22 * x[a]
-        for j in range(n):
-            P[p, j] += f01 * P[v, j] + f02 * P[a, j]
-            P[v, j] = f11 * P[v, j] + f12 * P[a, j]
-            P[a, j] = f22 * P[a, j]
-    for axis in range(2):
-        k = 4 * axis
-        f01, f02, f11, f12, f22 = axis_transition(level[k], level[k + 1], h)
-        p, v, a = axis, axis + 2, axis + 4
-        for i in range(6):
-            P[i, p] += f01 * P[i, v] + f02 * P[i, a]
-            P[i, v] = f11 * P[i, v] + f12 * P[i, a]
-            P[i, a] = f22 * P[i, a]
-        pp, pv, pa, vv, va, aa = axis_noise(level[k + 2], level[k + 3], h)
-        P[p, p] += pp
-        P[p, v] += pv
-        P[v, p] += pv
-        P[p, a] += pa
-        P[a, p] += pa
-        P[v, v] += vv
-        P[v, a] += va
-        P[a, v] += va
-        P[a, a] += aa
-    for i in range(6):
-        for j in range(i):
-            P[i, j] = P[j, i]
-        for j in range(6, n):
-            P[j, i] = P[i, j]
-    for i in range(6, n):
-        P[i, i] += walk[i - 6] * h
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def predict(x: FloatArray, P: FloatArray, level: FloatArray, walk: FloatArray, dt: float) -> None:
-    """Carry a state (19,) and its covariance (19, 19) on by dt >= 0 [s], in place.
-
-    Parameters
-    ----------
-    level : (8,) a row of `Kinematic.arrays`.
-    walk : (13,) squared densities of the sensors' walk.
-    """
-    if not dt > 0.0:
-        return
-    parts = max(math.ceil(dt / LARGEST_STEP_S - 1e-9), 1)
-    h = dt / parts
-    for _ in range(parts):
-        _step(x, P, level, walk, h)
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def mix(
-    old_x: FloatArray, old_P: FloatArray, old_weight: FloatArray, x: FloatArray, P: FloatArray,
-    weight: FloatArray, turn: float,
-) -> None:  # fmt: skip
-    """Let the levels start from their mixtures.
-
-    Parameters
-    ----------
-    old_x, old_P, old_weight : (M, n), (M, n, n), (M,) of the levels.
-    x, P, weight : of the mixtures; written to.
-    turn : probability of turning into each one of the others.
-    """
-    levels, n = x.shape
-    stay = 1.0 - (levels - 1) * turn
-    for j in range(levels):
-        total = 0.0
-        for i in range(levels):
-            total += old_weight[i] * (stay if i == j else turn)
-        weight[j] = total
-        alone = -1
-        for i in range(levels):
-            if old_weight[i] * (stay if i == j else turn) > (1.0 - _NEGLIGIBLE) * total:
-                alone = i
-        if alone >= 0:
-            for k in range(n):
-                x[j, k] = old_x[alone, k]
-                for m in range(n):
-                    P[j, k, m] = old_P[alone, k, m]
-            continue
-        for k in range(n):
-            mean = 0.0
-            for i in range(levels):
-                mean += old_weight[i] * (stay if i == j else turn) * old_x[i, k]
-            x[j, k] = mean / total
-            for m in range(n):
-                P[j, k, m] = 0.0
-        for i in range(levels):
-            part = old_weight[i] * (stay if i == j else turn) / total
-            if part < _NEGLIGIBLE:
-                continue
-            root = math.sqrt(part)
-            for k in range(n):
-                away = root * (old_x[i, k] - x[j, k])
-                for m in range(n):
-                    P[j, k, m] += part * old_P[i, k, m] + away * (root * (old_x[i, m] - x[j, m]))
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def settle_weights(weight: FloatArray, log_likelihood: FloatArray) -> float:
-    """Weights (M,) after an event, in place; returns the log likelihood of the event.
-
-    No weight falls below 1e-6, so that a level can come back.
-    """
-    best = log_likelihood.max()
-    total = 0.0
-    for j in range(weight.shape[0]):
-        weight[j] *= math.exp(log_likelihood[j] - best)
-        total += weight[j]
-    if not total > 0.0:
-        weight[:] = 1.0 / weight.shape[0]
-        return float(best)
-    floored = 0.0
-    for j in range(weight.shape[0]):
-        weight[j] = max(weight[j] / total, 1e-6)
-        floored += weight[j]
-    for j in range(weight.shape[0]):
-        weight[j] /= floored
-    return float(best + math.log(total))
-
-
-assert SIZE == 19

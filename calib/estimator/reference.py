@@ -14,24 +14,72 @@ import math
 from typing import Any
 
 import numpy as np
+from numba import njit
 
 from calib.arrays import FloatArray
+from calib.estimator.expect import TELLING
 from calib.estimator.filter import starting_state
-from calib.estimator.kernel import CAMERA, CONSIDERED, camera_terms, imu_terms
-from calib.estimator.model import predict
+from calib.estimator.kernel import CAMERA, CONSIDERED
+from calib.estimator.model import LARGEST_STEP_S, axis_noise
 from calib.estimator.rounding import update_terms
-from calib.estimator.sensors import SIZE
+from calib.estimator.sensors import SIZE, accelerometer, gyroscope, marker
 from calib.estimator.setup import Rows, Setup
 from calib.estimator.smoother import Events, transition
 
-__all__ = ["extended", "extended_smoothed", "process_noise", "unscented"]
+__all__ = ["camera_terms", "extended", "extended_smoothed", "imu_terms", "process_noise", "unscented"]
 
 
 def process_noise(level: FloatArray, walk: FloatArray, dt: float) -> FloatArray:
-    """Q (19, 19) of `model.predict` over dt [s]."""
-    Q, x = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
-    predict(x, Q, level, walk, dt)
+    """Q (19, 19) over dt [s], steps of more than `model.LARGEST_STEP_S` in parts."""
+    Q, F, part = np.zeros((SIZE, SIZE)), np.empty((SIZE, SIZE)), np.zeros((SIZE, SIZE))
+    if not dt > 0.0:
+        return Q
+    parts = max(math.ceil(dt / LARGEST_STEP_S - 1e-9), 1)
+    transition(level, dt / parts, F)
+    for axis in range(2):
+        pp, pv, pa, vv, va, aa = axis_noise(level[4 * axis + 2], level[4 * axis + 3], dt / parts)
+        rows = [axis, axis + 2, axis + 4]
+        part[np.ix_(rows, rows)] = [[pp, pv, pa], [pv, vv, va], [pa, va, aa]]
+    part[range(6, SIZE), range(6, SIZE)] = walk * dt / parts
+    for _ in range(parts):
+        Q = F @ Q @ F.T + part
     return Q
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def camera_terms(
+    view: FloatArray, noise: FloatArray, x: FloatArray, P: FloatArray, H: FloatArray, out: FloatArray
+) -> None:
+    """Predicted pixel and what the stamps' error adds to its variance: u, v, var_u, var_v.
+
+    H (2, n) gets the gradients.
+    """
+    out[0], out[1] = marker(view, x, H[0], H[1])
+    for k in range(2):
+        speed = H[k, 0] * x[2] + H[k, 1] * x[3]
+        out[2 + k] = (speed * noise[6]) ** 2
+        if speed * speed < TELLING * (H[k, 0] ** 2 * P[2, 2] + H[k, 1] ** 2 * P[3, 3]):
+            H[k, 13] = 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def imu_terms(
+    constants: FloatArray, noise: FloatArray, x: FloatArray, P: FloatArray, H: FloatArray, out: FloatArray
+) -> None:
+    """Predicted a_x, a_y, g_z and the variances of their noise; H (3, n) gets the gradients."""
+    out[0], out[1] = accelerometer(constants[0], constants[1], x, H[0], H[1])
+    out[2] = gyroscope(x, H[2])
+    if x[2] * x[2] < TELLING * P[2, 2]:
+        H[2, 10] = 0.0
+    tilt = x[0] + x[9]
+    moved_x = out[0] - x[7] - constants[0] * math.cos(tilt)
+    moved_y = out[1] - x[8] - constants[0] * math.sin(tilt)
+    scale = noise[5] * noise[5] * (moved_x * moved_x + moved_y * moved_y)
+    for k in range(2):
+        unknown = H[k, 1] * H[k, 1] * P[1, 1] + H[k, 11] * H[k, 11] * P[11, 11]
+        out[3 + k] = noise[2 + k] * noise[2 + k] + scale + unknown
+        H[k, 1], H[k, 11] = 0.0, 0.0
+    out[5] = noise[4] * noise[4] + (x[4] * noise[7]) ** 2
 
 
 def _constants(setup: Setup) -> FloatArray:

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
+from calib.estimator.compiled import compiled
 
 __all__ = ["truncated", "update_terms"]
 
@@ -25,7 +25,7 @@ _NORM = 1.0 / math.sqrt(2.0 * math.pi)
 _FAR = 6.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def truncated(a: float, b: float) -> tuple[float, float, float]:
     """Log of the probability of [a, b], mean and variance within it, of a standard normal number.
 
@@ -57,14 +57,15 @@ def truncated(a: float, b: float) -> tuple[float, float, float]:
             mean, variance = middle - middle * width * width / 12.0, width * width / 12.0
         else:
             na, nb = _NORM * math.exp(-0.5 * a * a), _NORM * math.exp(-0.5 * b * b)
-            mean = (na - nb) / z
-            variance = 1.0 + (a * na - b * nb) / z - mean * mean
+            scale = 1.0 / z
+            mean = (na - nb) * scale
+            variance = 1.0 + (a * na - b * nb) * scale - mean * mean
             variance = min(max(variance, 1e-3 * min(1.0, width * width / 12.0)), 1.0)
         log_z = math.log(z)
     return log_z, -mean if flip else mean, variance
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def update_terms(innovation: float, spread: float, jitter: float, grid: float) -> tuple[float, float, float]:
     """Equivalent Gaussian reading of a rounded one: innovation, its whole variance S, log likelihood.
 
@@ -78,9 +79,11 @@ def update_terms(innovation: float, spread: float, jitter: float, grid: float) -
     if not grid > 0.0:
         return innovation, S, -0.5 * (innovation * innovation / S + math.log(2.0 * math.pi * S))
     root = math.sqrt(S)
-    log_z, mean, variance = truncated((innovation - 0.5 * grid) / root, (innovation + 0.5 * grid) / root)
+    scale = 1.0 / root
+    log_z, mean, variance = truncated((innovation - 0.5 * grid) * scale, (innovation + 0.5 * grid) * scale)
     gain = 1.0 - variance
     if gain < 1e-9:
         # The interval holds nearly all of the distribution: nothing is learnt.
         return 0.0, S * 1e9, log_z
-    return root * mean / gain, S / gain, log_z
+    scale = 1.0 / gain
+    return root * mean * scale, S * scale, log_z

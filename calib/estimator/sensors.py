@@ -44,6 +44,7 @@ from numba import njit
 from calib.actuator.arc import chord_decay_w, chord_ratio_w
 from calib.arrays import FloatArray
 from calib.camera.model import Camera
+from calib.estimator.compiled import compiled
 
 __all__ = [
     "GRAVITY_MPS2",
@@ -51,11 +52,13 @@ __all__ = [
     "SENSOR",
     "SIZE",
     "accelerometer",
+    "accelerometer_terms",
     "gyroscope",
     "head_position",
     "invert_marker",
     "marker",
     "marker_rows",
+    "marker_terms",
     "sensor_values",
     "view_coefficients",
 ]
@@ -120,14 +123,14 @@ def sensor_values(values: dict[str, float]) -> FloatArray:
     return np.array([values.get(name, 0.0) for name in SENSOR], dtype=np.float64)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def head_position(phi: float, length: float) -> tuple[float, float]:
     """Head (x, y) [m] of angle and length (3.6)."""
     rho = length * chord_ratio_w(phi * phi)
     return rho * math.sin(0.5 * phi), rho * math.cos(0.5 * phi)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def _pixel(view: FloatArray, X: float, Y: float) -> tuple[float, float, float, float, float, float]:
     """Distorted pixel of a place in the plane and its derivatives: u, v, u_X, u_Y, v_X, v_Y.
 
@@ -167,7 +170,48 @@ def _pixel(view: FloatArray, X: float, Y: float) -> tuple[float, float, float, f
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
+def marker_terms(
+    view: FloatArray, phi: float, length: float, dphi: float, dl: float, ddphi: float, ddl: float,
+    d: float, late: float, shift_x: float, shift_y: float, stretch: float,
+) -> tuple[float, ...]:  # fmt: skip
+    """Distorted pixel (u, v) of the marker and pairs of its derivatives, NaN behind the camera.
+
+    Those by phi, l, d, `late`, X, Y and the stretch; of a head that is not late, phi and l of its motion.
+
+    Parameters
+    ----------
+    view : (24,) of `view_coefficients`.
+    phi .. ddl : motion of the head. d : the marker's offset. late : the time offset.
+    """
+    dphi, dl = dphi - late * ddphi, dl - late * ddl
+    phi, length = phi - late * (dphi + 0.5 * late * ddphi), length - late * (dl + 0.5 * late * ddl)
+    w = phi * phi
+    S, D = chord_ratio_w(w), chord_decay_w(w)
+    S1 = -phi * D
+    # sin(phi / 2) and cos(phi / 2), from the series that are there already.
+    sh, ch = 0.5 * phi * S, S - w * D
+    s, c = 2.0 * sh * ch, 1.0 - 2.0 * sh * sh
+    X = length * S * sh + d * s
+    Y = length * S * ch + d * c
+    X_phi = length * (S1 * sh + 0.5 * S * ch) + d * c
+    Y_phi = length * (S1 * ch - 0.5 * S * sh) - d * s
+    grow = 1.0 + stretch
+    from_x, from_y = X - view[22], Y - view[23]
+    u, v, u_X, u_Y, v_X, v_Y = _pixel(
+        view, view[22] + grow * from_x + shift_x, view[23] + grow * from_y + shift_y
+    )
+    u_phi, v_phi = grow * (u_X * X_phi + u_Y * Y_phi), grow * (v_X * X_phi + v_Y * Y_phi)
+    u_l, v_l = grow * S * (u_X * sh + u_Y * ch), grow * S * (v_X * sh + v_Y * ch)
+    u_d, v_d = grow * (u_X * s + u_Y * c), grow * (v_X * s + v_Y * c)
+    u_late, v_late = -(u_phi * dphi + u_l * dl), -(v_phi * dphi + v_l * dl)
+    u_grow, v_grow = u_X * from_x + u_Y * from_y, v_X * from_x + v_Y * from_y
+    return (
+        u, v, u_phi, v_phi, u_l, v_l, u_d, v_d, u_late, v_late, u_X, v_X, u_Y, v_Y, u_grow, v_grow,
+    )  # fmt: skip
+
+
+@compiled()
 def marker(view: FloatArray, state: FloatArray, by_u: FloatArray, by_v: FloatArray) -> tuple[float, float]:
     """Distorted pixel (u, v) of the marker; NaN behind the camera.
 
@@ -177,58 +221,42 @@ def marker(view: FloatArray, state: FloatArray, by_u: FloatArray, by_v: FloatArr
     state : (19,) of `HEAD` and `SENSOR`.
     by_u, by_v : (19,) gradients, written to.
     """
-    late, d = state[13], state[12]
-    dphi, dl = state[2] - late * state[4], state[3] - late * state[5]
-    phi = state[0] - late * state[2] + 0.5 * late * late * state[4]
-    length = state[1] - late * state[3] + 0.5 * late * late * state[5]
-    w = phi * phi
-    S, D = chord_ratio_w(w), chord_decay_w(w)
-    S1 = -phi * D
-    sh, ch = math.sin(0.5 * phi), math.cos(0.5 * phi)
-    s, c = 2.0 * sh * ch, 1.0 - 2.0 * sh * sh
-    X = length * S * sh + d * s
-    Y = length * S * ch + d * c
-    X_phi = length * (S1 * sh + 0.5 * S * ch) + d * c
-    Y_phi = length * (S1 * ch - 0.5 * S * sh) - d * s
-    grow = 1.0 + state[16]
-    from_x, from_y = X - view[22], Y - view[23]
-    u, v, u_X, u_Y, v_X, v_Y = _pixel(
-        view, view[22] + grow * from_x + state[14], view[23] + grow * from_y + state[15]
-    )
+    late = state[13]
+    found = marker_terms(
+        view, state[0], state[1], state[2], state[3], state[4], state[5], state[12], late, state[14],
+        state[15], state[16],
+    )  # fmt: skip
+    half = 0.5 * late * late
     for k in range(by_u.shape[0]):
         by_u[k] = 0.0
         by_v[k] = 0.0
-    u_phi, v_phi = grow * (u_X * X_phi + u_Y * Y_phi), grow * (v_X * X_phi + v_Y * Y_phi)
-    u_l, v_l = grow * S * (u_X * sh + u_Y * ch), grow * S * (v_X * sh + v_Y * ch)
-    by_u[0], by_v[0] = u_phi, v_phi
-    by_u[1], by_v[1] = u_l, v_l
-    by_u[2], by_v[2] = -late * u_phi, -late * v_phi
-    by_u[3], by_v[3] = -late * u_l, -late * v_l
-    half = 0.5 * late * late
-    by_u[4], by_v[4] = half * u_phi, half * v_phi
-    by_u[5], by_v[5] = half * u_l, half * v_l
-    by_u[12], by_v[12] = grow * (u_X * s + u_Y * c), grow * (v_X * s + v_Y * c)
-    by_u[13], by_v[13] = -(u_phi * dphi + u_l * dl), -(v_phi * dphi + v_l * dl)
-    by_u[14], by_v[14] = u_X, v_X
-    by_u[15], by_v[15] = u_Y, v_Y
-    by_u[16], by_v[16] = u_X * from_x + u_Y * from_y, v_X * from_x + v_Y * from_y
-    return u, v
+    by_u[0], by_v[0] = found[2], found[3]
+    by_u[1], by_v[1] = found[4], found[5]
+    for k in range(2):
+        by_u[2 + k], by_v[2 + k] = -late * by_u[k], -late * by_v[k]
+        by_u[4 + k], by_v[4 + k] = half * by_u[k], half * by_v[k]
+    by_u[12], by_v[12] = found[6], found[7]
+    by_u[13], by_v[13] = found[8], found[9]
+    by_u[14], by_v[14] = found[10], found[11]
+    by_u[15], by_v[15] = found[12], found[13]
+    by_u[16], by_v[16] = found[14], found[15]
+    return found[0], found[1]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def accelerometer(
-    gravity: float, across: float, state: FloatArray, by_x: FloatArray, by_y: FloatArray
-) -> tuple[float, float]:
-    """Specific force (a_x, a_y) [m/s^2] that the mounted IMU reads.
+@compiled()
+def accelerometer_terms(
+    gravity: float, across: float, phi: float, length: float, dphi: float, dl: float, ddphi: float,
+    ddl: float, alpha: float, lever: float,
+) -> tuple[float, ...]:  # fmt: skip
+    """Specific force of the mounted IMU without biases and scales, that at rest, and pairs of derivatives.
+
+    Those by phi, l, dphi, dl, ddphi, ddl and the lever; that by alpha is (-a_y, a_x).
 
     Parameters
     ----------
     gravity, across : g [m/s^2] and the lever c_n across the tangent [m].
-    state : (19,) of `HEAD` and `SENSOR`.
-    by_x, by_y : (19,) gradients, written to.
+    phi .. ddl : motion of the head. alpha, lever : mount angle and the lever along the tangent.
     """
-    phi, length, dphi, dl, ddphi, ddl = state[0], state[1], state[2], state[3], state[4], state[5]
-    alpha, lever = state[9], state[11]
     w = phi * phi
     S, D = chord_ratio_w(w), chord_decay_w(w)
     E = _E_SERIES[0]
@@ -236,7 +264,7 @@ def accelerometer(
         E = E * w + coefficient
     S1, S2 = -phi * D, 2.0 * D - 0.25 * S
     S3 = -2.0 * phi * E - 0.25 * S1
-    sh, ch = math.sin(0.5 * phi), math.cos(0.5 * phi)
+    sh, ch = 0.5 * phi * S, S - w * D
     s, c = 2.0 * sh * ch, 1.0 - 2.0 * sh * sh
     rho, drho = length * S, dl * S + length * S1 * dphi
     spin2 = dphi * dphi
@@ -251,31 +279,53 @@ def accelerometer(
     A_t, A_n = r * ch + x * sh, x * ch - r * sh
     f_x = gravity * c - A_t + ddphi * across + spin2 * lever
     f_y = gravity * s + A_n + ddphi * lever - spin2 * across
+    x0 = -gravity * s - (r_phi * ch + x_phi * sh + 0.5 * A_n)
+    y0 = gravity * c + (x_phi * ch - r_phi * sh - 0.5 * A_t)
+    x1, y1 = -(r_l * ch + x_l * sh), x_l * ch - r_l * sh
+    x2 = -(r_dphi * ch + x_dphi * sh) + 2.0 * dphi * lever
+    y2 = x_dphi * ch - r_dphi * sh - 2.0 * dphi * across
+    x3, y3 = -(r_dl * ch + x_dl * sh), x_dl * ch - r_dl * sh
+    x4, y4 = across - (r_ddphi * ch + x_ddphi * sh), lever + x_ddphi * ch - r_ddphi * sh
+    x5, y5 = -S * ch, -S * sh
     ca, sa = math.cos(alpha), math.sin(alpha)
+    return (
+        ca * f_x - sa * f_y, sa * f_x + ca * f_y, gravity * (ca * c - sa * s), gravity * (sa * c + ca * s),
+        ca * x0 - sa * y0, sa * x0 + ca * y0, ca * x1 - sa * y1, sa * x1 + ca * y1,
+        ca * x2 - sa * y2, sa * x2 + ca * y2, ca * x3 - sa * y3, sa * x3 + ca * y3,
+        ca * x4 - sa * y4, sa * x4 + ca * y4, ca * x5 - sa * y5, sa * x5 + ca * y5,
+        ca * spin2 - sa * ddphi, sa * spin2 + ca * ddphi,
+    )  # fmt: skip
+
+
+@compiled()
+def accelerometer(
+    gravity: float, across: float, state: FloatArray, by_x: FloatArray, by_y: FloatArray
+) -> tuple[float, float]:
+    """Specific force (a_x, a_y) [m/s^2] that the mounted IMU reads.
+
+    Parameters
+    ----------
+    gravity, across : g [m/s^2] and the lever c_n across the tangent [m].
+    state : (19,) of `HEAD` and `SENSOR`.
+    by_x, by_y : (19,) gradients, written to.
+    """
+    found = accelerometer_terms(
+        gravity, across, state[0], state[1], state[2], state[3], state[4], state[5], state[9], state[11]
+    )
     grow_x, grow_y = 1.0 + state[17], 1.0 + state[18]
     for k in range(by_x.shape[0]):
         by_x[k] = 0.0
         by_y[k] = 0.0
-    by_x[0] = -gravity * s - (r_phi * ch + x_phi * sh + 0.5 * A_n)
-    by_y[0] = gravity * c + (x_phi * ch - r_phi * sh - 0.5 * A_t)
-    by_x[1], by_y[1] = -(r_l * ch + x_l * sh), x_l * ch - r_l * sh
-    by_x[2] = -(r_dphi * ch + x_dphi * sh) + 2.0 * dphi * lever
-    by_y[2] = x_dphi * ch - r_dphi * sh - 2.0 * dphi * across
-    by_x[3], by_y[3] = -(r_dl * ch + x_dl * sh), x_dl * ch - r_dl * sh
-    by_x[4], by_y[4] = across - (r_ddphi * ch + x_ddphi * sh), lever + x_ddphi * ch - r_ddphi * sh
-    by_x[5], by_y[5] = -S * ch, -S * sh
-    by_x[11], by_y[11] = spin2, ddphi
-    for k in (0, 1, 2, 3, 4, 5, 11):
-        a, b = by_x[k], by_y[k]
-        by_x[k], by_y[k] = grow_x * (ca * a - sa * b), grow_y * (sa * a + ca * b)
-    out_x, out_y = ca * f_x - sa * f_y, sa * f_x + ca * f_y
-    by_x[9], by_y[9] = -grow_x * out_y, grow_y * out_x
+    for k in range(6):
+        by_x[k], by_y[k] = grow_x * found[4 + 2 * k], grow_y * found[5 + 2 * k]
+    by_x[11], by_y[11] = grow_x * found[16], grow_y * found[17]
+    by_x[9], by_y[9] = -grow_x * found[1], grow_y * found[0]
     by_x[7], by_y[8] = 1.0, 1.0
-    by_x[17], by_y[18] = out_x, out_y
-    return grow_x * out_x + state[7], grow_y * out_y + state[8]
+    by_x[17], by_y[18] = found[0], found[1]
+    return grow_x * found[0] + state[7], grow_y * found[1] + state[8]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def gyroscope(state: FloatArray, by_z: FloatArray) -> float:
     """Rotation rate g_z [rad/s] of a state (19,); the gradient (19,) is written to."""
     for k in range(by_z.shape[0]):
@@ -293,7 +343,7 @@ def marker_rows(view: FloatArray, states: FloatArray) -> tuple[FloatArray, Float
     return pixels, by
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def invert_marker(
     view: FloatArray, sensor: FloatArray, u: float, v: float, phi: float, length: float
 ) -> tuple[float, float, bool]:
@@ -306,23 +356,21 @@ def invert_marker(
     ----------
     sensor : (13,) of `SENSOR`.
     """
-    state, by_u, by_v = np.zeros(SIZE), np.empty(SIZE), np.empty(SIZE)
-    state[6:] = sensor
-    state[13] = 0.0
-    state[0], state[1] = phi, length
     for _ in range(30):
-        at_u, at_v = marker(view, state, by_u, by_v)
+        at_u, at_v, u_phi, v_phi, u_l, v_l, _, _, _, _, _, _, _, _, _, _ = marker_terms(
+            view, phi, length, 0.0, 0.0, 0.0, 0.0, sensor[6], 0.0, sensor[8], sensor[9], sensor[10]
+        )
         eu, ev = u - at_u, v - at_v
-        det = by_u[0] * by_v[1] - by_u[1] * by_v[0]
+        det = u_phi * v_l - u_l * v_phi
         if not abs(det) > 1e-12:
             return phi, length, False
-        step_phi = (eu * by_v[1] - ev * by_u[1]) / det
-        step_l = (by_u[0] * ev - by_v[0] * eu) / det
+        step_phi = (eu * v_l - ev * u_l) / det
+        step_l = (u_phi * ev - v_phi * eu) / det
         limit = max(abs(step_phi) / 0.5, abs(step_l) / 0.02, 1.0)
-        state[0] += step_phi / limit
-        state[1] += step_l / limit
-        if not (abs(state[0]) < 3.0 and 1e-3 < state[1] < 10.0):
+        phi += step_phi / limit
+        length += step_l / limit
+        if not (abs(phi) < 3.0 and 1e-3 < length < 10.0):
             return phi, length, False
         if limit == 1.0 and abs(step_phi) < 1e-10 and abs(step_l) < 1e-12:
-            return state[0], state[1], True
+            return phi, length, True
     return phi, length, False

@@ -10,8 +10,9 @@
    each step from one event to the next turns them into F' y and F' Y F, and
        x_N = x + P y,   P_N = P - P Y P.
    Nothing is inverted, and what has no variance does no harm.
-4. The same again from starting states that are off by a deviation along each principal direction of what is
-   considered, all else following by regression: the squares of what this makes of the states are added.
+4. The same again, without the covariance, from starting states that are off by a deviation along each
+   principal direction of what is considered, all else following by regression: the squares of what this makes
+   of the states are added.
 
 A filter that does not learn some states leaves innovations that are not white, and a backward pass over those
 would learn from afterwards what the filter had refused to: a loose alignment then made the smoothed
@@ -32,14 +33,27 @@ import numpy as np
 from numba import njit
 
 from calib.arrays import FloatArray, IntArray
+from calib.estimator.bank import RECORD, STATE, WIDTH, copy_level, new_bank, put
 from calib.estimator.clock import even_times, new_clock
-from calib.estimator.filter import starting_state, write_columns
-from calib.estimator.kernel import CONSIDERED, TRACE, WORK, event
+from calib.estimator.columns import write_columns
+from calib.estimator.expect import TOLD
+from calib.estimator.filter import starting_state
+from calib.estimator.kernel import CONSIDERED, TRACE, event, mixes
 from calib.estimator.model import LARGEST_STEP_S, axis_transition
 from calib.estimator.sensors import SIZE
 from calib.estimator.setup import OUT, Rows, Setup
 
-__all__ = ["OVERLAP", "WINDOW", "Events", "backward", "events_of", "forward", "smooth", "transition"]
+__all__ = [
+    "OVERLAP",
+    "WINDOW",
+    "Events",
+    "backward",
+    "banked",
+    "events_of",
+    "forward",
+    "smooth",
+    "transition",
+]
 
 WINDOW, OVERLAP = 12_000, 3_000
 _KEPT = 7
@@ -85,60 +99,60 @@ def events_of(setup: Setup, rows: Rows, outputs: bool = True) -> Events:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def forward(
-    t: FloatArray, before_s: float, kinds: IntArray, readings: FloatArray, x: FloatArray, P: FloatArray,
-    w: FloatArray, switch_hz: float, levels: FloatArray, walk: FloatArray, view: FloatArray,
-    constants: FloatArray, noise: FloatArray, again: bool, gated: FloatArray, weights: FloatArray,
+    t: FloatArray, before_s: float, kinds: IntArray, readings: FloatArray, bank: FloatArray,
+    weights: FloatArray, switch_hz: float, levels: FloatArray, walk: FloatArray, view: FloatArray,
+    constants: FloatArray, noise: FloatArray, again: bool, gated: FloatArray, kept_weights: FloatArray,
     trace: FloatArray, kept_x: FloatArray, kept_P: FloatArray,
 ) -> float:  # fmt: skip
     """A bank over all events; its log likelihood.
 
     Parameters
     ----------
-    before_s : time of x, P, w, which become those after the last event.
+    before_s : time of the first slot of `bank` and `weights`, which becomes that after the last event.
     levels : (1, M, 8), or (n, M, 8) with levels of their own for each event.
     again : whether `gated` (n, 3) holds; else it is written to.
-    weights : (n, M) written to. trace : (n, 3, `TRACE`) or (0, 3, `TRACE`), of the last level.
+    kept_weights : (n, M) written to. trace : (n, 3, `TRACE`) or (0, 3, `TRACE`), of the last level.
     kept_x, kept_P : (n, a) and (n, a, 19), the last level's first states after each event; or none (0, ...).
     """
-    count, size = x.shape
-    work, report = np.zeros((count, WORK, size)), np.empty(12)
-    other_x, other_P, other_w = np.empty_like(x), np.empty_like(P), np.empty_like(w)
-    untraced = np.empty((0, TRACE))
-    rows, total = kept_x.shape[1], 0.0
+    count = weights.shape[1] - 1
+    told, report = np.zeros((count, TOLD)), np.empty(12)
+    size, rows, total = kept_P.shape[2], kept_x.shape[1], 0.0
     for k in range(len(t)):
         dt = t[k] - (t[k - 1] if k else before_s)
-        even = k % 2 == 0
-        to_x, to_P, to_w = (other_x, other_P, other_w) if even else (x, P, w)
+        old = k % 2 if count > 1 else 0
+        new = 1 - old if count > 1 else 0
         event(
-            x if even else other_x, P if even else other_P, w if even else other_w, to_x, to_P, to_w,
-            kinds[k], readings[k], dt, switch_hz, levels[k if levels.shape[0] > 1 else 0], walk, view,
-            constants, noise, work, again, report, gated[k], trace[k] if trace.shape[0] else untraced,
+            bank, weights, old, new, kinds[k], readings, k, dt, switch_hz, levels,
+            k if levels.shape[0] > 1 else 0, walk, view, constants, noise, told, again, report, gated, trace,
         )  # fmt: skip
         for m in range(count):
-            weights[k, m] = to_w[m]
+            kept_weights[k, m] = weights[new, m]
         if kept_x.shape[0]:
+            o = (new * count + count - 1) * RECORD
             for i in range(rows):
-                kept_x[k, i] = to_x[count - 1, i]
+                kept_x[k, i] = bank[o + STATE + i]
                 for j in range(size):
-                    kept_P[k, i, j] = to_P[count - 1, i, j]
+                    kept_P[k, i, j] = bank[o + WIDTH * (j if i > 5 >= j else i) + (i if i > 5 >= j else j)]
         total += report[11]
-    if len(t) % 2:
+    if count > 1 and len(t) % 2:
         for m in range(count):
-            w[m] = other_w[m]
-            for i in range(size):
-                x[m, i] = other_x[m, i]
-                for j in range(size):
-                    P[m, i, j] = other_P[m, i, j]
+            copy_level(bank, (count + m) * RECORD, m * RECORD)
+            weights[0, m] = weights[1, m]
+        weights[0, count] = weights[1, count]
     return total
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _smooth_weights(t: FloatArray, switch_hz: float, weights: FloatArray) -> None:
+def _smooth_weights(t: FloatArray, kinds: IntArray, switch_hz: float, weights: FloatArray) -> None:
     """Kim's backward pass over the weights (n, M), in place."""
     n, count = weights.shape
-    ratio = np.empty(count)
+    ratio, turned_s, since = np.empty(count), np.zeros(n), 0.0
+    for k in range(1, n):
+        since += t[k] - t[k - 1]
+        if mixes(kinds[k], since):
+            turned_s[k], since = since, 0.0
     for k in range(n - 2, -1, -1):
-        turn = (1.0 - math.exp(-count * switch_hz * (t[k + 1] - t[k]))) / count
+        turn = (1.0 - math.exp(-count * switch_hz * turned_s[k + 1])) / count
         stay = 1.0 - (count - 1) * turn
         for j in range(count):
             ahead = 0.0
@@ -188,7 +202,7 @@ def _undo_step(y: FloatArray, level: FloatArray, h: float) -> None:
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def backward(
-    t: FloatArray, level: FloatArray, trace: FloatArray, kept_x: FloatArray, kept_P: FloatArray
+    t: FloatArray, level: FloatArray, trace: FloatArray, kept_x: FloatArray, kept_P: FloatArray, spread: bool
 ) -> None:
     """Bryson and Frazier over what `forward` has kept of one level, in place.
 
@@ -196,23 +210,24 @@ def backward(
     ----------
     level : (n, 8). trace : (n, 3, `TRACE`). kept_x, kept_P : (n, a) and (n, a, 19); of kept_P the first a
         columns become the smoothed covariance. What is considered stays as it was in kept_x and kept_P.
+    spread : whether the covariance is wanted; the states do without it.
     """
     rows, n = kept_P.shape[1], kept_P.shape[2]
     y, Y, Yk, part = np.zeros(n), np.zeros((n, n)), np.empty(n), np.empty((rows, n))
     for k in range(len(t) - 1, -1, -1):
         # What follows the event tells of the state after its readings.
         for i in range(rows):
+            if i == 11 or i == 12 or 14 <= i <= 16:
+                continue
+            for j in range(n):
+                kept_x[k, i] += kept_P[k, i, j] * y[j]
+        for i in range(rows if spread else 0):
             for j in range(n):
                 part[i, j] = 0.0
             for m in range(n):
                 for j in range(n):
                     part[i, j] += kept_P[k, i, m] * Y[m, j]
-        for i in range(rows):
-            if i == 11 or i == 12 or 14 <= i <= 16:
-                continue
-            for j in range(n):
-                kept_x[k, i] += kept_P[k, i, j] * y[j]
-        for i in range(rows):
+        for i in range(rows if spread else 0):
             for j in range(i + 1):
                 off = 0.0
                 for m in range(n):
@@ -220,7 +235,7 @@ def backward(
                 Yk[j] = off
             for j in range(i + 1):
                 part[i, j] = Yk[j]
-        for i in range(rows):
+        for i in range(rows if spread else 0):
             for j in range(i + 1):
                 kept_P[k, i, j] -= part[i, j]
                 kept_P[k, j, i] = kept_P[k, i, j]
@@ -233,14 +248,17 @@ def backward(
             for i in range(n):
                 known += gain[i] * y[i]
                 Yk[i] = 0.0
+            change = trace[k, reading, 2 * n] - known
+            for i in range(n):
+                y[i] += H[i] * change
+            if not spread:
+                continue
             for i in range(n):
                 for j in range(n):
                     Yk[j] += gain[i] * Y[i, j]
             for i in range(n):
                 weight += gain[i] * Yk[i]
-            change = trace[k, reading, 2 * n] - known
             for i in range(n):
-                y[i] += H[i] * change
                 half = 0.5 * weight * H[i] - Yk[i]
                 for j in range(n):
                     Y[i, j] += half * H[j] + H[i] * (0.5 * weight * H[j] - Yk[j])
@@ -252,6 +270,8 @@ def backward(
         parts = max(math.ceil(dt / LARGEST_STEP_S - 1e-9), 1)
         for _ in range(parts):
             _undo_step(y, level[k], dt / parts)
+            if not spread:
+                continue
             for i in range(n):
                 _undo_step(Y[i], level[k], dt / parts)
             for i in range(6, n):
@@ -286,6 +306,14 @@ def _given(x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
     return states, left
 
 
+def banked(x: FloatArray, P: FloatArray, w: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Memory of a bank that starts from states (M, 19), covariances and weights, and its weights."""
+    bank, weights = new_bank(2, len(w)), np.zeros((2, len(w) + 1))
+    put(bank, 0, x, P)
+    weights[0, : len(w)] = w
+    return bank, weights
+
+
 def smooth(setup: Setup, rows: Rows, outputs: FloatArray) -> FloatArray:
     """Smoothed estimates (n, len(OUT)) at the rows' stamps.
 
@@ -307,12 +335,12 @@ def smooth(setup: Setup, rows: Rows, outputs: FloatArray) -> FloatArray:
     known = (setup.view, np.array([setup.gravity_mps2, setup.lever_across_m]), setup.noise)
     none = (np.empty((0, 3, TRACE)), np.empty((0, _KEPT)), np.empty((0, _KEPT, SIZE)))
     forward(
-        events.t_s, float(events.t_s[0]), events.kinds, events.readings, x, P, w, setup.process.switch_hz,
-        levels[None], walk, *known, False, gated, weights, *none,
+        events.t_s, float(events.t_s[0]), events.kinds, events.readings, *banked(x, P, w),
+        setup.process.switch_hz, levels[None], walk, *known, False, gated, weights, *none,
     )  # fmt: skip
-    _smooth_weights(events.t_s, setup.process.switch_hz, weights)
+    _smooth_weights(events.t_s, events.kinds, setup.process.switch_hz, weights)
     mixed = weights @ levels
-    ones = [(state[None].copy(), left[None].copy(), np.ones(1)) for state in states]
+    ones = [banked(state[None], left[None], np.ones(1)) for state in states]
     begin, before = 0, float(events.t_s[0])
     while begin < n:
         end = min(begin + WINDOW, n)
@@ -327,7 +355,7 @@ def smooth(setup: Setup, rows: Rows, outputs: FloatArray) -> FloatArray:
             for part in (own, beyond):
                 if part is beyond:
                     # The next window begins with the state at `end`; what is beyond only looks back.
-                    state = (state[0].copy(), state[1].copy(), state[2].copy())
+                    state = (state[0].copy(), state[1].copy())
                 at = slice(part.start - begin, part.stop - begin)
                 if part.start < part.stop:
                     forward(
@@ -336,15 +364,14 @@ def smooth(setup: Setup, rows: Rows, outputs: FloatArray) -> FloatArray:
                         kept_x[at], kept_P[at],
                     )  # fmt: skip
                 since = float(events.t_s[end - 1])
-            backward(events.t_s[begin:stop], mixed[begin:stop], trace, kept_x, kept_P)
+            backward(events.t_s[begin:stop], mixed[begin:stop], trace, kept_x, kept_P, number == 0)
             if number == 0:
                 mean, covariance = kept_x[shown], kept_P[shown, :, :_KEPT]
             else:
                 away = kept_x[shown] - mean
                 covariance = covariance + away[:, :, None] * away[:, None, :]
         write_columns(
-            mean, np.ascontiguousarray(covariance), mixed[own][shown], events.rows[own][shown],
-            setup.bellows_radius_m, out,
+            mean, np.ascontiguousarray(covariance), events.rows[own][shown], setup.bellows_radius_m, out,
         )  # fmt: skip
         before = float(events.t_s[end - 1])
         begin = end

@@ -3,12 +3,15 @@
     python tests/bench/estimator.py
 
 One level of process noise with its 19 states: compiled and on filterpy, the same recursion to 1e-9. Then the
-whole filter as `calib replay` runs it: clocks, late pictures, gating and a bank of four levels.
+whole filter as `calib replay` runs it: clocks, late pictures, gating and a bank of four levels; its time and
+memory over logs of up to 64 times the rows, read in blocks. Times are those of the processor, the least of
+several, so that other work on the machine shows little.
 """
 
 from __future__ import annotations
 
 import os
+import resource
 import sys
 import time
 from collections.abc import Callable
@@ -24,16 +27,36 @@ from calib.estimator import reference, smoother
 from calib.estimator.filter import Filter, starting_state
 from calib.estimator.kernel import TRACE
 from calib.estimator.model import Kinematic
+from calib.estimator.setup import Rows
 from calib.estimator.smoother import Events
 
 
 def _seconds(call: Callable[[], object], repeats: int = 7) -> float:
     best = float("inf")
     for _ in range(repeats):
-        began = time.perf_counter()
+        began = time.process_time()
         call()
-        best = min(best, time.perf_counter() - began)
+        best = min(best, time.process_time() - began)
     return best
+
+
+def _growth(rows: Rows) -> None:
+    """Time per row, its exponent and the process's memory over longer and longer logs of four levels."""
+    length, sizes, times = float(rows.t_s[-1] - rows.t_s[0]) + 0.01, (1, 4, 16, 64), []
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for size in sizes:
+        whole = Filter(setup_for(simulated("ellipse", 1)[0], 1))
+        began = time.process_time()
+        for turn in range(size):
+            whole.run(Rows(rows.t_s + turn * length, rows.readings, rows.kinds))
+        times.append(time.process_time() - began)
+    grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+    exponent = np.polyfit(np.log(sizes), np.log(times), 1)[0]
+    each = ", ".join(f"{1e6 * t / n / len(rows):.2f}" for t, n in zip(times, sizes, strict=True))
+    print(
+        f"four levels over {len(rows)} to {sizes[-1] * len(rows)} rows: {each} us per row, "
+        f"time grows as rows^{exponent:.2f}, memory by {1024 * grown / sizes[-1] / len(rows):.1f} bytes a row"
+    )
 
 
 def main() -> None:
@@ -51,8 +74,8 @@ def main() -> None:
     def recursion(*kept: np.ndarray) -> None:
         x, P, w = starting_state(setup, rows)
         smoother.forward(
-            events.t_s, float(events.t_s[0]), events.kinds, events.readings, x, P, w, 0.0, levels[None], walk,
-            setup.view, constants, setup.noise, True, gated, np.empty((count, 1)), *kept,
+            events.t_s, float(events.t_s[0]), events.kinds, events.readings, *smoother.banked(x, P, w), 0.0,
+            levels[None], walk, setup.view, constants, setup.noise, True, gated, np.empty((count, 1)), *kept,
         )  # fmt: skip
 
     def alone() -> None:
@@ -80,6 +103,7 @@ def main() -> None:
             f"whole filter, {label}: {1e6 * seconds / len(rows):.2f} us per row, "
             f"{float(rows.t_s[-1]) / seconds:.0f} times real time"
         )
+    _growth(rows)
     outputs = Filter(setup_for(rig, 1)).run(rows)
     whole = setup_for(rig, 1)
     smoother.smooth(whole, rows, outputs)

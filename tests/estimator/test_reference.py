@@ -32,8 +32,9 @@ def compiled(
     for again in (False, True):
         x, P, w = starting_state(setup, rows)
         smoother.forward(
-            events.t_s, begin, events.kinds, events.readings, x, P, w, 0.0, levels[None], walk, setup.view,
-            constants, setup.noise, again, gated, np.empty((n, 1)), trace, kept_x, kept_P,
+            events.t_s, begin, events.kinds, events.readings, *smoother.banked(x, P, w), 0.0,
+            levels[None], walk, setup.view, constants, setup.noise, again, gated, np.empty((n, 1)), trace,
+            kept_x, kept_P,
         )  # fmt: skip
     return events, gated, kept_x, kept_P, trace
 
@@ -68,7 +69,7 @@ def test_compiled_smoother_equals_matrices() -> None:
     levels, _ = setup.process.arrays()
     expected_x, expected_P = reference.extended_smoothed(setup, events, x, P)
     deviation = np.sqrt(np.diagonal(P, axis1=1, axis2=2)) + 1e-12
-    smoother.backward(events.t_s, np.tile(levels[0], (len(x), 1)), trace, x, P)
+    smoother.backward(events.t_s, np.tile(levels[0], (len(x), 1)), trace, x, P, True)
     np.testing.assert_allclose(x / deviation, expected_x / deviation, rtol=0, atol=1e-5)
     np.testing.assert_allclose(P[:, :2, :2], expected_P[:, :2, :2], rtol=1e-4, atol=1e-14)
 

@@ -9,9 +9,10 @@ import pytest
 from estimatorlogs import SIGMA, rows_from, setup_for, simulated, truth, truth_of_sensors
 
 from calib.estimator import smoother
+from calib.estimator.bank import get, new_bank, predict, put
 from calib.estimator.consistency import Tally
 from calib.estimator.filter import Filter
-from calib.estimator.model import Kinematic, predict
+from calib.estimator.model import Kinematic
 from calib.estimator.sensors import SIZE, sensor_values, view_coefficients
 from calib.estimator.setup import Start
 
@@ -22,9 +23,10 @@ def test_transition_is_that_of_the_prediction() -> None:
     for dt in (0.0, 0.004, 0.07):
         smoother.transition(levels[1], dt, F)
         x = np.random.default_rng(1).standard_normal(SIZE)
-        moved = x.copy()
-        predict(moved, np.zeros((SIZE, SIZE)), levels[1], walk, dt)
-        np.testing.assert_allclose(F @ x, moved, rtol=1e-12, atol=1e-14)
+        bank = new_bank(1, 1)
+        put(bank, 0, x[None], np.zeros((1, SIZE, SIZE)))
+        predict(bank, 0, levels[None, 1:], 0, 0, walk, dt)
+        np.testing.assert_allclose(F @ x, get(bank, 0, 1)[0][0], rtol=1e-12, atol=1e-14)
 
 
 @pytest.mark.parametrize("name", ["swing", "ellipse", "elongation"])
