@@ -142,7 +142,6 @@ class Workers(Generic[Shared]):
 
     def _by_threads(self, work: Callable[[Shared, S], T], items: Iterable[S]) -> Iterator[T]:
         pool = ThreadPoolExecutor(self._count)
-        done = False
         try:
             futures = [pool.submit(work, self._shared, item) for item in items]
             futures.reverse()
@@ -151,10 +150,13 @@ class Workers(Generic[Shared]):
                 while not wait([futures[-1]], timeout=_LOOK_UP_S).done:
                     pass
                 yield futures.pop().result()
-            done = True
-        finally:
-            # After an error or Ctrl-C nobody waits for the work still under way.
-            pool.shutdown(wait=done, cancel_futures=True)
+        except KeyboardInterrupt:
+            # It may have come where the pool holds a lock, so that nothing more is asked of the pool.
+            raise
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+        pool.shutdown()
 
     def _by_processes(self, work: Callable[[Shared, S], T], items: list[S]) -> Iterator[T]:
         self._start()
