@@ -27,7 +27,7 @@ def _tell(result: Replayed) -> None:
     say(f"{result.source}: {result.rows} rows, {result.duration_s:.5g} s, {result.estimator}{share}")
     if result.driven_share is not None and result.driven_share < 0.99:
         rest = 100.0 * (1.0 - result.driven_share)
-        say(f"  in {rest:.0f} % of the rows the kinematic model spoke: the dynamics did not explain them")
+        say(f"  in {rest:.0f} % of the rows the kinematic model spoke, which explained them better")
     if result.rmse:
         rows = []
         for name, figures in (("this", result.rmse), *((n, f) for n, f in result.others.items())):

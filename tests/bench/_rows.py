@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import os
+import json
 import subprocess
+import sys
 import time
 import tracemalloc
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from statistics import median
 
 __all__ = ["Process", "Row", "interleaved", "interleaved_processes", "peak_mib", "print_rows"]
@@ -61,14 +63,8 @@ def interleaved(calls: Mapping[str, Callable[[], object]], repeats: int) -> dict
 
 
 def _run(command: Sequence[str]) -> Process:
-    began = time.perf_counter()
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as child:
-        assert child.stdout is not None
-        output = child.stdout.read()
-        _, status, used = os.wait4(child.pid, 0)
-        seconds = time.perf_counter() - began
-        child.returncode = os.waitstatus_to_exitcode(status)
-    return Process(seconds, used.ru_maxrss / 1024, child.returncode, output)
+    measured = [sys.executable, "-S", str(Path(__file__).with_name("_measured.py")), *command]
+    return Process(**json.loads(subprocess.run(measured, capture_output=True, check=True).stdout))
 
 
 def interleaved_processes(commands: Mapping[str, Sequence[str]], repeats: int) -> dict[str, Process]:
