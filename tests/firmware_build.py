@@ -8,13 +8,13 @@ import shutil
 import struct
 import subprocess
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from calib.firmware.conformance import Inputs, Outputs, Reference
+from calib.firmware.conformance import Inputs, Outputs, Reference, binary32
 from calib.firmware.conformance_fused import FusedReference
 from calib.firmware.header import Header, header_text, verbatim
 from calib.firmware.literals import values
@@ -29,9 +29,11 @@ __all__ = [
     "avr",
     "compare",
     "host",
+    "hostile",
     "need",
     "pack",
     "run",
+    "strew",
     "warnings",
     "write",
 ]
@@ -217,3 +219,29 @@ def compare(
         assert out.undecided_m <= 1e-6, (k, out.undecided_m)
         wanted.append(numbers(out))
     return np.abs(found.numbers - np.array(wanted)).max(axis=0), undecided
+
+
+def strew(ticks: list[Inputs], rng: np.random.Generator, losses: int) -> None:
+    """Put hostile values into some of the ticks, and let a sensor fall silent `losses` times."""
+    for k in rng.choice(len(ticks), 3000, replace=False).tolist():
+        field = rng.choice(["u_px", "v_px", "ax_mps2", "ay_mps2", "gz_radps"])
+        ticks[k] = binary32(replace(ticks[k], **{str(field): float(rng.choice(HOSTILE))}))
+    for k in rng.choice(len(ticks), 300, replace=False).tolist():
+        ticks[k] = binary32(
+            replace(ticks[k], reference=(float(rng.choice(HOSTILE)), float(rng.choice(HOSTILE))))
+        )
+    for k in rng.choice(len(ticks) - 100, losses, replace=False).tolist():
+        lost = {"marker_seen": False} if rng.random() < 0.5 else {"imu_read": False}
+        for j in range(k, k + int(rng.integers(5, 90))):
+            ticks[j] = replace(ticks[j], **lost)
+
+
+def hostile(rng: np.random.Generator, count: int) -> list[Inputs]:
+    """Ticks in which every value is hostile at once."""
+    draw = rng.choice(HOSTILE, (count, 7)).tolist()
+    modes = rng.integers(0, 5, len(draw)).tolist()
+    seen = rng.integers(0, 2, (len(draw), 2)).tolist()
+    return [
+        binary32(Inputs(*row[:5], (row[5], row[6]), bool(a), bool(b), mode))
+        for row, mode, (a, b) in zip(draw, modes, seen, strict=True)
+    ]

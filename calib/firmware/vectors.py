@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from calib.firmware.conformance import (
-    MODE_OFF,
     MODE_ORIENTATION,
     MODE_POSITION,
     Inputs,
@@ -23,7 +22,7 @@ from calib.firmware.conformance import (
 from calib.firmware.conformance_fused import reference_of
 from calib.firmware.header import SCHEMA, Header, environment, identity_of
 from calib.firmware.literals import float_literal, values
-from calib.firmware.vectors_fused import directed_fused
+from calib.firmware.vectors_fused import directed_fused, spoilt
 
 __all__ = ["TOLERANCE", "Vector", "binary32", "directed", "selftest_text", "vectors"]
 
@@ -71,15 +70,7 @@ def directed(constants: Mapping[str, float], ticks: int) -> list[Inputs]:
             reference=reference,
             mode=mode,
         )
-        if k % 29 == 17:
-            given = replace(given, marker_seen=False)
-        if k % 31 == 19:
-            given = replace(given, imu_read=False)
-        if k % 37 == 23:
-            given = replace(given, reference=(7.0, 7.0))
-        if k % 41 == 40:
-            given = replace(given, mode=MODE_OFF)
-        made.append(binary32(given))
+        made.append(binary32(spoilt(given, k)))
     return made
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from calib.errors import BadInputError
 from calib.firmware.conformance import MODE_OFF, MODE_ORIENTATION, MODE_POSITION, Inputs, Reference, binary32
 
-__all__ = ["PERIOD", "Motion", "coherent", "directed_fused", "pixel_of"]
+__all__ = ["PERIOD", "Motion", "coherent", "directed_fused", "pixel_of", "spoilt"]
 
 PERIOD = 240
 _SWING = 0.55
@@ -143,8 +143,8 @@ def directed_fused(
     return [binary32(_disturbed(one, k, period)) for k, one in enumerate(given)]
 
 
-def _disturbed(given: Inputs, k: int, period: int) -> Inputs:
-    at = k % period
+def spoilt(given: Inputs, k: int) -> Inputs:
+    """Tick `k` as it comes: without marker, IMU or command every now and then, the reference out of reach."""
     if k % 29 == 17:
         given = replace(given, marker_seen=False)
     if k % 31 == 19:
@@ -153,6 +153,12 @@ def _disturbed(given: Inputs, k: int, period: int) -> Inputs:
         given = replace(given, reference=(7.0, 7.0))
     if k % 41 == 40:
         given = replace(given, mode=MODE_OFF)
+    return given
+
+
+def _disturbed(given: Inputs, k: int, period: int) -> Inputs:
+    at = k % period
+    given = spoilt(given, k)
     if k % 43 == 33:
         given = replace(given, ax_mps2=0.1, ay_mps2=-0.1)
     if k % 23 == 14 or 3 * period // 10 <= at < 3 * period // 10 + 8:

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from firmware_build import HOSTILE, LIMITS, compare, host, need, numbers, run, write
+from firmware_build import LIMITS, compare, host, hostile, need, numbers, run, strew, write
 from firmware_rigs import header, rig
 
 from calib.firmware.conformance import (
@@ -89,17 +89,7 @@ def test_a_hundred_thousand_ticks(built: tuple[Header, list[str], Path]) -> None
     rng = np.random.default_rng(6)
     ticks = list(_logged(10_000, 3))
     ticks += directed(values(made.literals), 100_000 - len(ticks))
-    for k in rng.choice(len(ticks), 3000, replace=False).tolist():
-        field = rng.choice(["u_px", "v_px", "ax_mps2", "ay_mps2", "gz_radps"])
-        ticks[k] = binary32(replace(ticks[k], **{str(field): float(rng.choice(HOSTILE))}))
-    for k in rng.choice(len(ticks), 300, replace=False).tolist():
-        ticks[k] = binary32(
-            replace(ticks[k], reference=(float(rng.choice(HOSTILE)), float(rng.choice(HOSTILE))))
-        )
-    for k in rng.choice(len(ticks) - 100, 20, replace=False).tolist():
-        lost = {"marker_seen": False} if rng.random() < 0.5 else {"imu_read": False}
-        for j in range(k, k + int(rng.integers(5, 90))):
-            ticks[j] = replace(ticks[j], **lost)
+    strew(ticks, rng, losses=20)
     assert len(ticks) == 100_000
     found = run(command, ticks)
     assert np.isfinite(found.numbers).all()
@@ -113,13 +103,7 @@ def test_nothing_is_ever_nan(built: tuple[Header, list[str], Path]) -> None:
     """Every value of every input hostile at once."""
     made, command, _ = built
     rng = np.random.default_rng(7)
-    draw = rng.choice(HOSTILE, (20_000, 7)).tolist()
-    modes = rng.integers(0, 5, len(draw)).tolist()
-    seen = rng.integers(0, 2, (len(draw), 2)).tolist()
-    ticks = [
-        binary32(Inputs(*row[:5], (row[5], row[6]), bool(a), bool(b), mode))
-        for row, mode, (a, b) in zip(draw, modes, seen, strict=True)
-    ]
+    ticks = hostile(rng, 20_000)
     found = run(command, ticks)
     assert np.isfinite(found.numbers).all()
     low, high = values(made.literals)["CALIB_PUMP_LOW_PWM"], values(made.literals)["CALIB_PUMP_HIGH_PWM"]

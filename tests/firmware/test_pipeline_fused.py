@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from firmware_build import HOSTILE, LIMITS, compare, host, need, run, write
+from firmware_build import LIMITS, compare, host, hostile, need, run, strew, write
 from firmware_rigs import header, rig
 
 from calib.estimator.constant_gain import Ticks, run_gains
@@ -66,17 +66,7 @@ def test_a_hundred_thousand_ticks(built: tuple[Header, list[str], Path]) -> None
     rng = np.random.default_rng(8)
     period = directed_fused(values(made.literals), 10_000)
     ticks = [one for _ in range(10) for one in period]
-    for k in rng.choice(len(ticks), 3000, replace=False).tolist():
-        field = rng.choice(["u_px", "v_px", "ax_mps2", "ay_mps2", "gz_radps"])
-        ticks[k] = binary32(replace(ticks[k], **{str(field): float(rng.choice(HOSTILE))}))
-    for k in rng.choice(len(ticks), 300, replace=False).tolist():
-        ticks[k] = binary32(
-            replace(ticks[k], reference=(float(rng.choice(HOSTILE)), float(rng.choice(HOSTILE))))
-        )
-    for k in rng.choice(len(ticks) - 100, 30, replace=False).tolist():
-        lost = {"marker_seen": False} if rng.random() < 0.5 else {"imu_read": False}
-        for j in range(k, k + int(rng.integers(5, 90))):
-            ticks[j] = replace(ticks[j], **lost)
+    strew(ticks, rng, losses=30)
     found = run(command, ticks)
     assert np.isfinite(found.numbers).all()
     worst, undecided = compare(made, ticks, found, fused=True)
@@ -89,13 +79,7 @@ def test_nothing_is_ever_nan(built: tuple[Header, list[str], Path]) -> None:
     """Every value of every input hostile at once."""
     made, command, _ = built
     rng = np.random.default_rng(9)
-    draw = rng.choice(HOSTILE, (20_000, 7)).tolist()
-    modes = rng.integers(0, 5, len(draw)).tolist()
-    seen = rng.integers(0, 2, (len(draw), 2)).tolist()
-    ticks = [
-        binary32(Inputs(*row[:5], (row[5], row[6]), bool(a), bool(b), mode))
-        for row, mode, (a, b) in zip(draw, modes, seen, strict=True)
-    ]
+    ticks = hostile(rng, 20_000)
     # Pictures from anywhere, one after the other, as well.
     ticks += [
         binary32(replace(one, u_px=float(u), v_px=float(v), gz_radps=float(g), marker_seen=True))
