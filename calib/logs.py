@@ -29,6 +29,7 @@ import numpy as np
 from calib.arrays import FloatArray, IntArray
 from calib.errors import BadInputError
 from calib.files import shown, write_atomically
+from calib.units import plain_number
 
 __all__ = [
     "BLANK",
@@ -41,6 +42,7 @@ __all__ = [
     "iter_log",
     "iter_rows",
     "log_text",
+    "passed_over",
     "read_log",
     "write_log",
 ]
@@ -74,6 +76,12 @@ _LONGEST_LINE = 1 << 16
 _MAX_COLUMNS = 1000
 _MOST_CELLS = 200_000_000
 """Numbers that `read_log` takes, 1.6 GB; blocks have no such limit."""
+
+
+def passed_over(not_finite: int, truncated: bool, counts: str = BLANK) -> list[str]:
+    """Sentences on cells that are not finite, with what they count as, and on a last line cut short."""
+    said = [f"{not_finite} cells say nan or inf{counts}"] if not_finite else []
+    return [*said, "the last line is cut short and left out"] if truncated else said
 
 
 @dataclass(frozen=True)
@@ -110,12 +118,7 @@ class Log:
 
     def passed_over(self, counts: str = BLANK) -> list[str]:
         """Sentences on cells that are not finite, with what they count as, and on a last line cut short."""
-        said = []
-        if self.not_finite:
-            said.append(f"{self.source}: {self.not_finite} cells say nan or inf{counts}")
-        if self.truncated:
-            said.append(f"{self.source}: the last line is cut short and left out")
-        return said
+        return [f"{self.source}: {one}" for one in passed_over(self.not_finite, self.truncated, counts)]
 
 
 def check_time(log: Log) -> None:
@@ -168,10 +171,7 @@ def _number(layout: _Layout, text: str, slot: int, line: int) -> float:
     word = text.strip()
     if not word:
         return math.nan
-    try:
-        value = float(word) if "_" not in word else None
-    except ValueError:
-        value = None
+    value = plain_number(word)
     if value is None:
         raise BadInputError(
             f"{layout.source}, line {line}: {layout.known[slot]} is {shown(word[:40])!r}, expected a number"

@@ -25,6 +25,7 @@ from calib.actuator.identify_pump_models import PumpRecord
 from calib.arrays import FloatArray
 from calib.errors import BadInputError
 from calib.files import read_text, shown
+from calib.units import plain_number
 
 __all__ = ["STATIC_S", "PumpTable", "Settled", "read_columns", "read_pump_table"]
 
@@ -111,10 +112,7 @@ def number(cell: str, path: Path, line: int, name: str) -> float:
     word = cell.strip()
     if not word:
         return math.nan
-    try:
-        value = float(word) if "_" not in word else None
-    except ValueError:
-        value = None
+    value = plain_number(word)
     if value is None:
         raise BadInputError(f"{shown(path)}, line {line}: {name} is {shown(word[:40])!r}, expected a number")
     return value if math.isfinite(value) else math.nan

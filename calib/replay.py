@@ -21,7 +21,7 @@ from calib.estimator.filter import Filter
 from calib.estimator.noise import jitter_px
 from calib.estimator.setup import FLAGS, OUT, Rows, Setup
 from calib.files import shown
-from calib.logs import Log
+from calib.logs import Log, passed_over
 from calib.relay import ahead, behind
 from calib.replaying import baseline_setup, blocks, periods, rows_of, setup_from_rig, truth_of
 from calib.rig import Rig
@@ -264,10 +264,7 @@ def _told(stream: Iterator[Log], said: list[str]) -> Iterator[Log]:
         cells += log.not_finite
         truncated = log.truncated
         yield log
-    if cells:
-        said.append(f"{cells} cells say nan or inf and count as blank")
-    if truncated:
-        said.append("the last line is cut short and left out")
+    said.extend(passed_over(cells, truncated))
 
 
 def _bounded(stream: Iterator[Log]) -> Iterator[Log]:

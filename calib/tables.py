@@ -24,6 +24,7 @@ from calib.camera.board import Board
 from calib.camera.views import View
 from calib.errors import BadInputError
 from calib.files import shown
+from calib.units import plain_number
 
 __all__ = ["COLUMNS", "read_table", "read_vnl"]
 
@@ -97,12 +98,8 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
 def _number(text: str, path: Path, line: int, column: str) -> float:
     """A finite decimal number."""
     word = text.strip()
-    try:
-        # Python's own number syntax has underscores; a table has not.
-        value = float(word) if "_" not in word else math.nan
-    except ValueError:
-        value = math.nan
-    if math.isfinite(value):
+    value = plain_number(word)
+    if value is not None and math.isfinite(value):
         return value
     found = "empty" if not word else repr(word[:40])
     raise BadInputError(f"{shown(path)}: line {line}: {column} is {found}, expected a finite number")

@@ -1,4 +1,4 @@
-"""Quantities as people type them: a number with its unit, read into SI."""
+"""Numbers and quantities as people type them; those with a unit are read into SI."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ __all__ = [
     "parse_length_m",
     "parse_region_px",
     "parse_square_m",
+    "plain_number",
 ]
 
 _LENGTHS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
@@ -25,6 +26,17 @@ _ANGLES = {"deg": math.pi / 180.0, "rad": 1.0}
 _DURATIONS = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
 _QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-zA-Z]*)\s*")
 _PAIR = re.compile(r"\s*(\d{1,6})\s*[xX\u00d7,]\s*(\d{1,6})\s*")
+
+
+def plain_number(word: str) -> float | None:
+    """A cell's decimal number, nan and inf included; None for other words.
+
+    Python's own syntax of numbers has underscores, a table's has not.
+    """
+    try:
+        return float(word) if "_" not in word else None
+    except ValueError:
+        return None
 
 
 def _quantity(text: str, units: dict[str, float], what: str, example: str) -> float:

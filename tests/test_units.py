@@ -19,6 +19,7 @@ from calib.units import (
     parse_length_m,
     parse_region_px,
     parse_square_m,
+    plain_number,
 )
 
 
@@ -84,3 +85,13 @@ def test_squares_and_regions() -> None:
             parse_region_px(text)
     with pytest.raises(UsageError, match="--image-size"):
         parse_image_size("999999x9")
+
+
+@pytest.mark.parametrize(("word", "value"), [("1.5", 1.5), ("-2e-3", -2e-3), ("inf", math.inf), (".5", 0.5)])
+def test_plain_number_reads_decimals(word: str, value: float) -> None:
+    assert plain_number(word) == value
+
+
+@pytest.mark.parametrize("word", ["", "1_000", "1,5", "0x10", "one", "1 2"])
+def test_plain_number_takes_no_other_words(word: str) -> None:
+    assert plain_number(word) is None
