@@ -7,7 +7,7 @@ import signal
 import time
 from pathlib import Path
 
-__all__ = ["dies_in", "double", "faulty", "noted"]
+__all__ = ["dies_in", "double", "faulty", "hangs", "noted"]
 
 
 def double(number: int) -> int:
@@ -34,4 +34,11 @@ def noted(number: int, folder: str, seconds: float) -> int:
     """As `double` after some time; leaves a file that tells which process has begun."""
     Path(folder, f"{number}-{os.getpid()}").touch()
     time.sleep(seconds)
+    return 2 * number
+
+
+def hangs(number: int, endless: tuple[int, ...]) -> int:
+    """As `double`; some numbers never come to an end."""
+    while number in endless:
+        time.sleep(0.1)
     return 2 * number

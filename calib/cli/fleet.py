@@ -7,6 +7,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from calib.cli.clusters import (
+    OutOption,
+    RetriesOption,
+    SchedulerOption,
+    WorkersOption,
+    check_places,
+    opened_out,
+    processes,
+)
 from calib.cli.common import JsonOption, document, narrate, progress_bar, say, table
 from calib.errors import EXIT_POOR
 
@@ -14,20 +23,7 @@ if TYPE_CHECKING:
     from calib.fleet.running import Counts
     from calib.fleet.summary import FleetSummary
 
-__all__ = ["RetriesOption", "SchedulerOption", "WorkersOption", "fleet"]
-
-SchedulerOption = Annotated[
-    str | None,
-    typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler to work on, as tcp://host:8786."),
-]
-WorkersOption = Annotated[
-    int | None,
-    typer.Option("--workers", min=1, max=512, help="Processes on this machine. [default: one per processor]"),
-]
-RetriesOption = Annotated[
-    int,
-    typer.Option("--retries", min=0, max=10, help="How often a rig is tried again after its process died."),
-]
+__all__ = ["fleet"]
 
 
 def fleet(
@@ -35,12 +31,16 @@ def fleet(
         Path,
         typer.Argument(help="CSV or YAML with name, path (or URL) and perhaps serial of each rig."),
     ],
-    output: Annotated[
-        Path, typer.Option("-o", "--output", help="Folder for the results; a later run goes on from it.")
-    ],
+    output: OutOption,
     scheduler: SchedulerOption = None,
     workers: WorkersOption = None,
     retries: RetriesOption = 2,
+    timeout: Annotated[
+        str,
+        typer.Option(
+            "--timeout", metavar="TIME", help="The most time that a rig gets; one that needs more is a row."
+        ),
+    ] = "1h",
     pages: Annotated[bool, typer.Option("--pages", help="Make the page of each rig as well.")] = False,
     prior: Annotated[
         Path | None,
@@ -57,36 +57,31 @@ def fleet(
     A rig that fails is a row and does not end the run; rigs whose results are there are not done again.
     Exits 1 when a rig is not ok.
     """
-    from calib.errors import UsageError
     from calib.files import shown
-    from calib.fleet.cluster import connected
     from calib.fleet.finishing import finish
-    from calib.fleet.manifest import read_manifest
+    from calib.fleet.manifest import read_manifest, twice_told
     from calib.fleet.prior import read_prior
     from calib.fleet.running import run_fleet
-    from calib.fleet.store import opened_store
+    from calib.fleet.store import check_apart
     from calib.fleet.task import FleetOptions
     from calib.report.fleet_page import PAGE, write_fleet_page
-    from calib.workers import processors
+    from calib.units import parse_duration_s
 
-    if scheduler is not None and workers is not None:
-        raise UsageError("--workers: an existing cluster has its own workers, give --scheduler alone")
+    check_places(scheduler, workers)
+    limit_s = parse_duration_s(timeout, "--timeout")
     known = read_manifest(manifest)
     if known.ignored:
         narrate(f"{shown(manifest)}: not used: {', '.join(known.ignored)}")
+    for sentence in twice_told(known.rigs):
+        narrate(f"{shown(manifest)}: {sentence}")
+    check_apart(output, known.rigs)
     borrowed = None if prior is None else read_prior(prior)
     for sentence in () if borrowed is None else borrowed.remarks:
         narrate(sentence)
-    with opened_store(output, "calib fleet", ("fleet.parquet", PAGE)) as (store, interrupted):
-        if interrupted:
-            narrate("the last run here was interrupted; going on where it stopped")
-        with connected(scheduler, workers or processors(), store.scratch, retries) as cluster:
-            for sentence in cluster.remarks:
-                narrate(sentence)
-            with progress_bar("rigs") as progress:
-                counts = run_fleet(
-                    store, cluster, known, FleetOptions(pages=pages), retries, progress, narrate
-                )
+    with opened_out(output, "calib fleet", ("fleet.parquet", PAGE)) as store:
+        options = FleetOptions(pages=pages)
+        with processes(store, scheduler, workers, retries) as cluster, progress_bar("rigs") as progress:
+            counts = run_fleet(store, cluster, known, options, retries, progress, narrate, limit_s)
         summary, told = finish(store, known, borrowed)
         write_fleet_page(output / PAGE, summary, told)
     if as_json:

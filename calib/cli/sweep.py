@@ -7,8 +7,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from calib.cli.clusters import (
+    OutOption,
+    RetriesOption,
+    SchedulerOption,
+    WorkersOption,
+    check_places,
+    opened_out,
+    processes,
+)
 from calib.cli.common import JsonOption, document, narrate, progress_bar, say, table
-from calib.cli.fleet import RetriesOption, SchedulerOption, WorkersOption
 from calib.errors import EXIT_POOR
 
 if TYPE_CHECKING:
@@ -19,12 +27,16 @@ __all__ = ["sweep"]
 
 def sweep(
     spec: Annotated[Path, typer.Argument(help="YAML with base, grid, draws and measure.")],
-    output: Annotated[
-        Path, typer.Option("-o", "--output", help="Folder for the results; a later run goes on from it.")
-    ],
+    output: OutOption,
     scheduler: SchedulerOption = None,
     workers: WorkersOption = None,
     retries: RetriesOption = 2,
+    timeout: Annotated[
+        str,
+        typer.Option(
+            "--timeout", metavar="TIME", help="The most time that a case gets; one that needs more is a row."
+        ),
+    ] = "10min",
     as_json: JsonOption = False,
 ) -> None:
     """Run a controller, a scenario or a filter on the simulated rig over many plants and settings.
@@ -32,26 +44,18 @@ def sweep(
     The first measure decides; the least of it is best, or what is near the value that was asked for. A case
     that fails is a row. Exits 1 when one has failed.
     """
-    from calib.errors import UsageError
     from calib.files import shown
-    from calib.fleet.cluster import connected
-    from calib.fleet.store import opened_store
     from calib.fleet.sweeping import run_sweep, summarise_sweep
     from calib.fleet.sweepspec import read_sweep
     from calib.report.sweep_page import PAGE, write_sweep_page
-    from calib.workers import processors
+    from calib.units import parse_duration_s
 
-    if scheduler is not None and workers is not None:
-        raise UsageError("--workers: an existing cluster has its own workers, give --scheduler alone")
+    check_places(scheduler, workers)
+    limit_s = parse_duration_s(timeout, "--timeout")
     known = read_sweep(spec)
-    with opened_store(output, "calib sweep", ("sweep.parquet", PAGE)) as (store, interrupted):
-        if interrupted:
-            narrate("the last run here was interrupted; going on where it stopped")
-        with connected(scheduler, workers or processors(), store.scratch, retries) as cluster:
-            for sentence in cluster.remarks:
-                narrate(sentence)
-            with progress_bar("cases") as progress:
-                before = run_sweep(store, cluster, known, retries, progress)
+    with opened_out(output, "calib sweep", ("sweep.parquet", PAGE)) as store:
+        with processes(store, scheduler, workers, retries) as cluster, progress_bar("cases") as progress:
+            before = run_sweep(store, cluster, known, retries, progress, narrate, limit_s)
         summary = summarise_sweep(store, known, before)
         write_sweep_page(output / PAGE, known, summary)
     if as_json:

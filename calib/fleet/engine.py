@@ -13,19 +13,23 @@ of those that stay away.
 
 from __future__ import annotations
 
-import threading
 import time
 import uuid
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from calib.errors import BadInputError
+from calib.files import one_line
 from calib.fleet.cluster import Cluster
 from calib.fleet.extra import needed
+from calib.fleet.worker import Stranger, call
 
-__all__ = ["Broken", "Lost", "Task", "call", "run_tasks"]
+__all__ = ["LIMIT_S", "Broken", "Lost", "Task", "run_tasks"]
+
+LIMIT_S = 3600.0
+"""Time that a task has."""
 
 _AHEAD = 2
 """Tasks under way for each process: one that runs and one that waits, so that none idles."""
@@ -33,8 +37,6 @@ _LOOK_S = 0.01
 _COUNT_S = 3.0
 _NO_WORKERS_S = 60.0
 _AWAY_S = 20.0
-_SETTLE_S = 1.0
-_settled = threading.Event()
 _GATHER_S = 60.0
 _MOST_CANCELLED = 5
 
@@ -61,29 +63,27 @@ class Broken:
     words: str
 
 
-def call(function: Callable[..., Any], *arguments: Any) -> Any:
-    """`function(*arguments)` in a worker, not before the worker's nanny knows that it is there."""
-    if not _settled.is_set():
-        time.sleep(_SETTLE_S)
-        _settled.set()
-    return function(*arguments)
-
-
 def run_tasks(
     cluster: Cluster,
     function: Callable[..., Any],
     tasks: Iterable[Task],
     done: Callable[[Task, Any], None],
     retries: int = 2,
+    limit_s: float = LIMIT_S,
+    tell: Callable[[str], None] = lambda _: None,
 ) -> None:
     """Call `function(*task.arguments)` for each task and `done(task, result)` in the order in which they end.
 
     Parameters
     ----------
     function : of a module, and without effects that count: a task may be run more than once.
-    done : gets `Lost` or `Broken` in place of a result; what it keeps is what this takes of memory.
+    done : gets `Lost`, `Broken` or `Overdue` in place of a result; what it keeps is what this takes of
+        memory.
+    limit_s : time [s] that a task has from when it is begun.
+    tell : gets sentences about workers that are not used.
 
-    Raises `BadInputError` when the scheduler is gone, or has had no workers for a minute.
+    Raises `BadInputError` when the scheduler is gone, or has had no workers for a minute, or none that work
+    with this program.
     """
     suspects: list[Task] = []
 
@@ -93,80 +93,109 @@ def run_tasks(
         else:
             done(task, result)
 
-    _run(cluster, function, iter(tasks), first, None)
+    run = _Run(cluster, function, limit_s, tell)
+    run.all(iter(tasks), first, None)
     for task in suspects:
 
         def last(one: Task, result: Any) -> None:
             done(one, Lost(2 * (retries + 1)) if isinstance(result, Lost) else result)
 
-        _run(cluster, function, iter([task]), last, 1)
+        run.all(iter([task]), last, 1)
 
 
-def _run(
-    cluster: Cluster,
-    function: Callable[..., Any],
-    tasks: Iterator[Task],
-    done: Callable[[Task, Any], None],
-    most: int | None,
-) -> None:
-    client, label = cluster.client, uuid.uuid4().hex[:12]
-    completed = needed("distributed").as_completed(loop=client.loop)
-    under_way: dict[Any, tuple[Task, Any]] = {}
-    room, counted, seen = 1, -_COUNT_S, time.monotonic()
-    complete = seen
-    exhausted, again, cancelled = False, deque[Task](), Counter[str]()
-    try:
-        while True:
-            now = time.monotonic()
-            if now - counted > _COUNT_S:
-                counted = now
-                _check_connection(cluster)
-                processes = sum(cluster.processes().values())
-                seen = now if processes else seen
-                complete = now if processes >= cluster.wanted else complete
-                if now - complete > _AWAY_S:
-                    cluster.grow(cluster.wanted - processes)
-                    complete = now
-                if now - seen > _NO_WORKERS_S:
-                    raise BadInputError(f"{_name(cluster)} has had no workers for a minute; {_AGAIN}")
-                room = most or _AHEAD * max(1, processes)
-            while len(under_way) < room and (again or not exhausted):
-                task = again.popleft() if again else next(tasks, None)
-                if task is None:
-                    exhausted = True
-                    break
-                key = f"calib-{label}-{cancelled[task.name]}-{task.name}"
-                try:
-                    future = client.submit(call, function, *task.arguments, key=key, pure=False)
-                except Exception as error:  # a connection that is gone has many names
-                    raise _gone(cluster) from error
-                under_way[future.key] = task, future
-                completed.add(future)
+@dataclass
+class _Run:
+    """What is known of the workers while tasks are run."""
+
+    cluster: Cluster
+    function: Callable[..., Any]
+    limit_s: float
+    tell: Callable[[str], None]
+    strangers: set[str] = field(default_factory=set)
+
+    def all(self, tasks: Iterator[Task], done: Callable[[Task, Any], None], most: int | None) -> None:
+        """Run tasks with at most so many under way, by default a few for each process."""
+        cluster, label = self.cluster, uuid.uuid4().hex[:12]
+        completed = needed("distributed").as_completed(loop=cluster.client.loop)
+        under_way: dict[Any, tuple[Task, Any]] = {}
+        room, counted, seen = 1, -_COUNT_S, time.monotonic()
+        complete = seen
+        exhausted, again, tries, cancelled = False, deque[Task](), Counter[str](), Counter[str]()
+        try:
+            while True:
+                now = time.monotonic()
+                if now - counted > _COUNT_S:
+                    counted = now
+                    _check_connection(cluster)
+                    processes = sum(cluster.processes().values())
+                    seen = now if processes else seen
+                    complete = now if processes >= cluster.wanted else complete
+                    if now - complete > _AWAY_S:
+                        cluster.grow(cluster.wanted - processes)
+                        complete = now
+                    if now - seen > _NO_WORKERS_S:
+                        raise BadInputError(f"{_name(cluster)} has had no workers for a minute; {_AGAIN}")
+                    room = most or _AHEAD * max(1, processes)
+                while len(under_way) < room and (again or not exhausted):
+                    task = again.popleft() if again else next(tasks, None)
+                    if task is None:
+                        exhausted = True
+                        break
+                    future = self._submitted(task, f"calib-{label}-{tries[task.name]}-{task.name}")
+                    under_way[future.key] = task, future
+                    completed.add(future)
+                    del future
+                if not under_way:
+                    return
+                if not completed.has_ready():
+                    time.sleep(_LOOK_S)
+                    continue
+                future = next(completed)
+                result = _result(cluster, future)
+                if result is _NOT_YET:
+                    completed.add(future)
+                    continue
+                task, _ = under_way.pop(future.key)
+                future.release()
                 del future
-            if not under_way:
-                return
-            if not completed.has_ready():
-                time.sleep(_LOOK_S)
-                continue
-            future = next(completed)
-            result = _result(cluster, future)
-            if result is _NOT_YET:
-                completed.add(future)
-                continue
-            task, _ = under_way.pop(future.key)
-            future.release()
-            del future
-            if result is _CANCELLED:
-                cancelled[task.name] += 1
-                if cancelled[task.name] > _MOST_CANCELLED:
-                    raise _gone(cluster)
-                again.append(task)
-                continue
-            done(task, result)
-            del result
-    finally:
-        for _, future in under_way.values():
-            future.release()
+                if result is _CANCELLED or isinstance(result, Stranger):
+                    tries[task.name] += 1
+                    again.append(task)
+                    if isinstance(result, Stranger):
+                        self._refuse(result.worker)
+                        continue
+                    cancelled[task.name] += 1
+                    if cancelled[task.name] > _MOST_CANCELLED:
+                        raise _gone(cluster)
+                    continue
+                done(task, result)
+                del result
+        finally:
+            for _, future in under_way.values():
+                future.release()
+
+    def _submitted(self, task: Task, key: str) -> Any:
+        words: dict[str, Any] = {"key": key, "pure": False}
+        if self.strangers:
+            # Only a wish: a task that can go nowhere else would wait for ever.
+            words |= {"workers": sorted(self._known()), "allow_other_workers": True}
+        arguments = (self.cluster.program, self.limit_s, self.function, *task.arguments)
+        try:
+            return self.cluster.client.submit(call, *arguments, **words)
+        except Exception as error:  # a connection that is gone has many names
+            raise _gone(self.cluster) from error
+
+    def _known(self) -> set[str]:
+        return set(self.cluster.processes()) - self.strangers
+
+    def _refuse(self, worker: str) -> None:
+        if not self.cluster.address:
+            raise BadInputError(f"calib, or a library, was changed while it was at work; {_AGAIN}")
+        if worker not in self.strangers:
+            self.strangers.add(worker)
+            self.tell(f"worker {one_line(worker)}: has another calib, or other libraries, and is not used")
+        if not self._known():
+            raise BadInputError(f"{_name(self.cluster)} has only workers with another program; {_AGAIN}")
 
 
 _AGAIN = "what is done is kept, and the same command goes on from there"

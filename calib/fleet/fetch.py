@@ -7,6 +7,7 @@ tried again; a file that is not there is not.
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable
 from functools import partial
@@ -16,7 +17,7 @@ from typing import Any
 from calib.errors import BadInputError
 from calib.files import make_folder, one_line, shown
 from calib.fleet.extra import needed
-from calib.fleet.manifest import is_url
+from calib.fleet.manifest import is_url, without_secrets
 
 __all__ = ["MOST_BYTES", "local_folder"]
 
@@ -48,10 +49,12 @@ def _fetched(url: str, scratch: Path, attempts: int, most_bytes: int) -> Path:
     try:
         system, root = needed("fsspec.core").url_to_fs(url)
     except ImportError as error:
-        raise BadInputError(f"{_without_secrets(url)}: needs a package that is not here: {error}") from error
+        raise BadInputError(
+            f"{without_secrets(url)}: needs a package that is not here: {_words(error)}"
+        ) from error
     except (ValueError, OSError) as error:
-        raise BadInputError(f"{_without_secrets(url)}: is no URL that can be read: {error}") from error
-    told = _without_secrets(url)
+        raise BadInputError(f"{without_secrets(url)}: is no URL that can be read: {_words(error)}") from error
+    told = without_secrets(url)
     listed = _again(partial(_listed, system, str(root), told), attempts, told)
     if not listed:
         raise BadInputError(f"{told}: holds no pictures and no logs")
@@ -82,15 +85,13 @@ def _again(work: Callable[[], Any], attempts: int, told: str) -> Any:
     raise AssertionError
 
 
+_SECRETS = (re.compile(r"(?<=://)[^/@\s]+@"), re.compile(r"(?<=://)([^\s?'\"]*)\?[^\s'\"),]*"))
+"""User and password, and the query, of a URL in a text."""
+
+
 def _words(error: BaseException) -> str:
-    return one_line(" ".join(str(error).split()))[:200] or type(error).__name__
-
-
-def _without_secrets(url: str) -> str:
-    """A URL as it may be shown: without user, password and query."""
-    scheme, _, rest = url.partition("://")
-    host, slash, path = rest.partition("?")[0].partition("/")
-    return one_line(f"{scheme}://{host.rpartition('@')[2]}{slash}{path}")
+    text = _SECRETS[1].sub(r"\1", _SECRETS[0].sub("", " ".join(str(error).split())))
+    return one_line(text)[:200] or type(error).__name__
 
 
 def _listed(system: Any, root: str, told: str) -> dict[str, str]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,16 @@ from calib.errors import BadInputError, CalibError
 from calib.files import one_line, read_text, read_yaml_mapping, shown
 from calib.units import parse_corners, parse_square_m
 
-__all__ = ["OPTIONS", "Manifest", "RigSpec", "is_url", "read_manifest", "serial_number"]
+__all__ = [
+    "OPTIONS",
+    "Manifest",
+    "RigSpec",
+    "is_url",
+    "read_manifest",
+    "serial_number",
+    "twice_told",
+    "without_secrets",
+]
 
 OPTIONS = ("corners", "square", "model", "loss", "board")
 """What may differ from rig to rig."""
@@ -70,6 +79,15 @@ def is_url(source: str) -> bool:
     return _SCHEME.match(source) is not None
 
 
+def without_secrets(source: str) -> str:
+    """A source as it may be shown and kept: a URL without user, password and query, a path as it is."""
+    if not is_url(source):
+        return source
+    scheme, _, rest = source.partition("://")
+    host, slash, path = rest.partition("?")[0].partition("/")
+    return one_line(f"{scheme}://{host.rpartition('@')[2]}{slash}{path}")
+
+
 def serial_number(serial: str) -> float | None:
     """The number in a serial: all of it, or the digits at its end, as 17 of AX-0017. None without."""
     found = re.search(r"(\d{1,15})\D{0,2}$", serial)
@@ -97,6 +115,22 @@ def read_manifest(path: Path) -> Manifest:
     if not rigs:
         raise BadInputError(f"{shown(path)}: names no rigs, expected at least one row with name and path")
     return Manifest(tuple(rigs), ignored)
+
+
+def twice_told(rigs: Iterable[RigSpec]) -> tuple[str, ...]:
+    """Sentences on what several rigs have in common though it should be a rig's own."""
+    said = []
+    for what, key in (("folder", "source"), ("serial number", "serial")):
+        seen, again = set[str](), list[str]()
+        for rig in rigs:
+            value = getattr(rig, key)
+            if value and value in seen:
+                again.append(rig.name)
+            seen.add(value)
+        if again:
+            verb = "rig has" if len(again) == 1 else "rigs have"
+            said.append(f"{len(again)} {verb} the {what} of one before, the first is {again[0]}")
+    return tuple(said)
 
 
 def _from_csv(path: Path) -> tuple[Iterator[tuple[str, Mapping[str, Any]]], tuple[str, ...]]:

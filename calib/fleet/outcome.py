@@ -26,7 +26,7 @@ class Outcome:
     ----------
     name, serial, source : of the manifest.
     status : "ok", "poor", "failed" (bad input or a stage that failed), "broken" (a fault of the program),
-        "lost" (every process that tried it died), or `SAME`.
+        "lost" (its time ran out, or every process that tried it died), or `SAME`.
     code : exit code that a single run would have had.
     sentence : why, in one sentence; "" for "ok".
     key : of all that the result follows from, "" where that is not known.

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 from calib.errors import EXIT_INTERNAL
 from calib.fleet.cluster import Cluster
-from calib.fleet.engine import Broken, Lost, Task, run_tasks
-from calib.fleet.manifest import Manifest, RigSpec
+from calib.fleet.engine import LIMIT_S, Broken, Lost, Task, run_tasks
+from calib.fleet.manifest import Manifest, RigSpec, without_secrets
 from calib.fleet.outcome import SAME, Outcome
 from calib.fleet.store import Store
 from calib.fleet.task import Answer, FleetOptions, calibrate_rig
+from calib.fleet.worker import Overdue
 
 __all__ = ["Counts", "run_fleet"]
 
@@ -41,11 +42,14 @@ def run_fleet(
     retries: int,
     progress: Progress = lambda done, total: None,
     tell: Callable[[str], None] = lambda _: None,
+    limit_s: float = LIMIT_S,
 ) -> Counts:
-    """Run all rigs whose results are not there; raises `BadInputError` as `run_tasks` and `Store.keep`."""
+    """Run all rigs whose results are not there, each in `limit_s` seconds at most.
+
+    Raises `BadInputError` as `run_tasks` and `Store.keep`.
+    """
     counts, total = Counts(), len(manifest.rigs)
     scratch = "" if cluster.address else str(store.scratch)
-    options = replace(options, program=cluster.program)
 
     def tasks() -> Iterator[Task]:
         for spec in manifest.rigs:
@@ -63,7 +67,7 @@ def run_fleet(
         progress(counts.done, total)
 
     progress(0, total)
-    run_tasks(cluster, calibrate_rig, tasks(), done, retries)
+    run_tasks(cluster, calibrate_rig, tasks(), done, retries, limit_s, tell)
     return counts
 
 
@@ -75,8 +79,10 @@ def _answer(spec: RigSpec, result: Any) -> Answer:
         sentence = (
             f"each of the {result.tries} processes that tried it died: out of memory, or a fault in a library"
         )
+    elif isinstance(result, Overdue):
+        status, sentence = "lost", f"was not done after {result.limit_s:g} s, which is the --timeout of a rig"
     else:
         words = result.words if isinstance(result, Broken) else type(result).__name__
         status, sentence = "broken", f"internal error: {words}"
-    blank = Outcome(spec.name, spec.serial, spec.source, status, EXIT_INTERNAL, sentence)
+    blank = Outcome(spec.name, spec.serial, without_secrets(spec.source), status, EXIT_INTERNAL, sentence)
     return Answer(blank, {})

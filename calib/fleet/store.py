@@ -3,7 +3,7 @@
     rigs/NAME/               results of a rig, as a single run leaves them
     .fleet/outcomes/NAME.json    how it ended; written last, so that what it tells of is there
     .fleet/lock              one fleet at a time
-    .fleet/work/             scratch of a local cluster
+    .fleet/scratch/          of a local cluster, gone at the end
 
 All is written by one process, the one that was started by a person: workers need not see this folder.
 """
@@ -12,19 +12,21 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
 from calib.errors import BadInputError
 from calib.files import check_folder, check_writable, make_folder, sha256, shown, write_atomically
+from calib.fleet.manifest import RigSpec, is_url
 from calib.fleet.outcome import Outcome, from_json, to_json
 from calib.fleet.task import Answer
 from calib.running.folder import digest_of
 from calib.running.lock import held
 
-__all__ = ["HIDDEN", "Store", "opened_store"]
+__all__ = ["HIDDEN", "Store", "check_apart", "opened_store"]
 
 HIDDEN = ".fleet"
 _MOST_BYTES = 5_000_000
@@ -35,7 +37,7 @@ class Store:
 
     def __init__(self, out: Path) -> None:
         self.out = out
-        self.scratch = out / HIDDEN / "work"
+        self.scratch = out / HIDDEN / "scratch"
 
     def _file(self, name: str) -> Path:
         return self.out / HIDDEN / "outcomes" / f"{name}.json"
@@ -86,6 +88,22 @@ class Store:
         return self.out / "rigs" / name / file
 
 
+def check_apart(out: Path, rigs: Iterable[RigSpec]) -> None:
+    """Raise `BadInputError` where results would be written into a rig's folder, or over one."""
+    place = Path(os.path.realpath(out))
+    for rig in rigs:
+        if is_url(rig.source):
+            continue
+        source = Path(os.path.realpath(rig.source))
+        if place.is_relative_to(source):
+            raise BadInputError(f"{shown(out)}: lies in the folder of {rig.name}, expected another one")
+        if source.is_relative_to(place / "rigs") or source.is_relative_to(place / HIDDEN):
+            raise BadInputError(
+                f"{shown(rig.source)}: the folder of {rig.name} is where results are written, expected "
+                "another output folder"
+            )
+
+
 @contextmanager
 def opened_store(out: Path, verb: str, outputs: tuple[str, ...]) -> Iterator[tuple[Store, bool]]:
     """Make and lock an output folder; yields it, and whether the last run there was interrupted.
@@ -98,9 +116,13 @@ def opened_store(out: Path, verb: str, outputs: tuple[str, ...]) -> Iterator[tup
     """
     check_folder(out)
     hidden = out / HIDDEN
-    for path in (hidden, out / "rigs", hidden / "outcomes", hidden / "work"):
+    for path in (hidden, out / "rigs", hidden / "outcomes", hidden / "scratch"):
         if path.is_symlink():
             raise BadInputError(f"{shown(path)}: is a symbolic link, expected a place in the output folder")
+    if (out / "rigs").exists() and not hidden.exists():
+        raise BadInputError(
+            f"{shown(out / 'rigs')}: is there, and is not the work of {verb}; expected another output folder"
+        )
     make_folder(hidden / "outcomes")
     for name in outputs:
         check_writable(out / name)
@@ -115,7 +137,7 @@ def opened_store(out: Path, verb: str, outputs: tuple[str, ...]) -> Iterator[tup
                 with contextlib.suppress(OSError):
                     left.unlink()
         yield Store(out), interrupted is not None
-        shutil.rmtree(hidden / "work", ignore_errors=True)
+        shutil.rmtree(hidden / "scratch", ignore_errors=True)
 
 
 def _verb(path: Path) -> str:

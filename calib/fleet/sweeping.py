@@ -17,13 +17,14 @@ from calib.arrays import FloatArray
 from calib.errors import BadInputError
 from calib.files import one_line, sha256, write_atomically
 from calib.fleet.cluster import Cluster
-from calib.fleet.engine import Broken, Lost, Task, run_tasks
+from calib.fleet.engine import LIMIT_S, Broken, Lost, Task, run_tasks
 from calib.fleet.extra import needed
 from calib.fleet.rows import Table, column, texts, write_table
 from calib.fleet.store import HIDDEN, Store
 from calib.fleet.sweepspec import Case, SweepSpec, cases
 from calib.fleet.sweeptask import CaseResult, run_cases
 from calib.fleet.task import program
+from calib.fleet.worker import Overdue
 
 __all__ = ["Point", "SweepSummary", "run_sweep", "summarise_sweep"]
 
@@ -83,10 +84,11 @@ def _file(store: Store, bundle: int) -> Path:
     return store.out / HIDDEN / "outcomes" / f"bundle{bundle:07d}.json"
 
 
-def _kept(store: Store, bundle: int, digest: str) -> list[CaseResult] | None:
+def _kept(store: Store, bundle: int, digest: str, final: bool = False) -> list[CaseResult] | None:
+    """Results of a bundle; with `final` only where none of them came of the processes that did the work."""
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
         told = json.loads(_file(store, bundle).read_text(encoding="utf-8"))
-        if told["digest"] == digest:
+        if told["digest"] == digest and not (final and told["lost"]):
             return [CaseResult(**one) for one in told["results"]]
     return None
 
@@ -104,34 +106,76 @@ def run_sweep(
     spec: SweepSpec,
     retries: int,
     progress: Progress = lambda done, total: None,
+    tell: Callable[[str], None] = lambda _: None,
+    limit_s: float = LIMIT_S,
 ) -> int:
-    """Run all bundles of cases that are not there; returns how many cases were. Raises as `run_tasks`."""
+    """Run all bundles of cases that are not there, each case in `limit_s` seconds at most.
+
+    A bundle that is lost, or overdue, is done again case by case: one of them may be at fault, and the others
+    are not. Returns how many cases were there. Raises as `run_tasks`.
+    """
     digest, scratch = _digest(spec), "" if cluster.address else str(store.scratch)
     before = done_now = 0
+    apart: list[tuple[int, tuple[Case, ...]]] = []
+
+    def task(some: tuple[Case, ...]) -> Task:
+        return Task(f"{some[0].number}-{len(some)}", (spec.base, some, spec.seed, scratch))
 
     def tasks() -> Iterator[Task]:
         nonlocal before
         for number, bundle in _bundles(spec):
-            if _kept(store, number, digest) is not None:
+            if _kept(store, number, digest, final=True) is not None:
                 before += len(bundle)
                 continue
-            yield Task(f"{number}", (spec.base, bundle, spec.seed, scratch))
+            yield task(bundle)
 
-    def done(task: Task, result: Any) -> None:
+    def keep(number: int, results: list[CaseResult], lost: bool) -> None:
         nonlocal done_now
-        bundle = task.arguments[1]
-        if isinstance(result, Lost | Broken):
-            words = "each process that tried it died" if isinstance(result, Lost) else result.words
-            result = [CaseResult(case.number, {}, words, 0.0) for case in bundle]
-        told = {"digest": digest, "results": [asdict(one) for one in result]}
-        write_atomically(_file(store, int(task.name)), json.dumps(told) + "\n")
-        done_now += len(bundle)
+        told = {"digest": digest, "lost": lost, "results": [asdict(one) for one in results]}
+        write_atomically(_file(store, number), json.dumps(told) + "\n")
+        done_now += len(results)
         progress(before + done_now, spec.cases)
 
+    def done(task: Task, result: Any) -> None:
+        bundle, number = task.arguments[1], task.arguments[1][0].number // BUNDLE
+        if isinstance(result, Lost | Overdue) and len(bundle) > 1:
+            apart.append((number, bundle))
+        else:
+            keep(number, *_results(bundle, result))
+
+    def one_by_one(number: int, bundle: tuple[Case, ...]) -> None:
+        found: dict[int, CaseResult] = {}
+        lost = False
+
+        def one(task: Task, result: Any) -> None:
+            nonlocal lost
+            results, fault = _results(task.arguments[1], result)
+            found[results[0].number] = results[0]
+            lost = lost or fault
+
+        alone = (task((case,)) for case in bundle)
+        run_tasks(cluster, run_cases, alone, one, retries, limit_s, tell)
+        keep(number, [found[case.number] for case in bundle], lost)
+
     progress(0, spec.cases)
-    run_tasks(cluster, run_cases, tasks(), done, retries)
+    run_tasks(cluster, run_cases, tasks(), done, retries, BUNDLE * limit_s, tell)
+    for number, bundle in apart:
+        one_by_one(number, bundle)
     progress(spec.cases, spec.cases)
     return before
+
+
+def _results(some: tuple[Case, ...], result: Any) -> tuple[list[CaseResult], bool]:
+    """What came of some cases, and whether that was the processes' fault."""
+    if isinstance(result, Overdue):
+        words = f"was not done after {result.limit_s:g} s, which is the --timeout of a case"
+    elif isinstance(result, Lost):
+        words = "each process that tried it died"
+    elif isinstance(result, Broken):
+        words = result.words
+    else:
+        return result, False
+    return [CaseResult(case.number, {}, words, 0.0) for case in some], True
 
 
 def _rows(store: Store, spec: SweepSpec, measures: tuple[str, ...]) -> Iterator[dict[str, Any]]:

@@ -44,6 +44,7 @@ _BASE = (*_KINDS, "reference", "rig", "feedback", "duration", "model")
 _FILTERS = ("fused", "baseline")
 _MODELS = ("auto", "kinematic", "driven")
 _MOST_CASES = 1_000_000
+_LONGEST_S = 3600.0
 _KEY = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)+")
 
 Value = float | str | bool
@@ -147,17 +148,20 @@ def read_sweep(path: Path) -> SweepSpec:
     if unknown is not None:
         raise BadInputError(f"{where}: {one_line(unknown)} is not known here, expected {', '.join(_KEYS)}")
     base = _base(where, _mapping(where, "base", whole.get("base")), path)
-    grid = tuple(
-        (key, _values(f"{where}: grid.{one_line(key)}", value))
-        for key, value in _mapping(where, "grid", whole.get("grid") or {}).items()
-    )
+    grid, points = list[tuple[str, tuple[Value, ...]]](), 1
+    for key, value in _mapping(where, "grid", whole.get("grid") or {}).items():
+        grid.append((key, _values(f"{where}: grid.{one_line(key)}", value)))
+        points *= len(grid[-1][1])
+        _check_cases(where, points)
     drawn = dict(_mapping(where, "draws", whole.get("draws") or {}))
     count, seed = drawn.pop("count", 1), drawn.pop("seed", 0)
     for name, value, least in (("count", count, 1), ("seed", seed, 0)):
         if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise BadInputError(f"{where}: draws.{name} is {value!r}, expected a whole number from {least}")
+            raise BadInputError(
+                f"{where}: draws.{name} is {_short(value)}, expected a whole number from {least}"
+            )
     draws = tuple(
-        (key, _distribution(f"{where}: draws.{one_line(str(key))}", value)) for key, value in drawn.items()
+        (key, _distribution(f"{where}: draws.{one_line(key)}", value)) for key, value in drawn.items()
     )
     for key in (*(key for key, _ in grid), *(key for key, _ in draws)):
         _check_key(where, key, base)
@@ -170,30 +174,35 @@ def read_sweep(path: Path) -> SweepSpec:
     near = None if whole.get("near") is None else _finite(f"{where}: near", whole["near"])
     if near is not None and not measures:
         raise BadInputError(f"{where}: near says what the first measure should be, and measure names none")
-    spec = SweepSpec(base, grid, draws, count, seed, tuple(measures), near)
+    spec = SweepSpec(base, tuple(grid), draws, count, seed, tuple(measures), near)
     if not spec.names and count == 1:
         raise BadInputError(f"{where}: has neither grid nor draws, so there is nothing to sweep over")
-    if spec.cases > _MOST_CASES:
-        raise BadInputError(f"{where}: asks for {spec.cases} cases, expected no more than {_MOST_CASES}")
+    _check_cases(where, spec.cases)
     return spec
+
+
+def _check_cases(where: str, count: int) -> None:
+    if count > _MOST_CASES:
+        raise BadInputError(f"{where}: asks for {count} cases or more, expected no more than {_MOST_CASES}")
 
 
 def _mapping(where: str, key: str, value: Any) -> Mapping[str, Any]:
     if not isinstance(value, dict):
         found = "missing" if value is None else "no mapping"
         raise BadInputError(f"{where}: {key} is {found}, expected keys with values")
+    wrong = [name for name in value if not isinstance(name, str)]
+    if wrong:
+        raise BadInputError(f"{where}: {key} has the key {one_line(repr(wrong[0]))[:60]}, expected text")
     return value
 
 
 def _base(where: str, told: Mapping[str, Any], path: Path) -> Base:
     unknown = next((key for key in told if key not in _BASE), None)
     if unknown is not None:
-        raise BadInputError(
-            f"{where}: base.{one_line(str(unknown))} is not known, expected {', '.join(_BASE)}"
-        )
+        raise BadInputError(f"{where}: base.{one_line(unknown)} is not known, expected {', '.join(_BASE)}")
     wrong = next((key for key, value in told.items() if not isinstance(value, str)), None)
     if wrong is not None:
-        raise BadInputError(f"{where}: base.{wrong} is {told[wrong]!r}, expected text")
+        raise BadInputError(f"{where}: base.{wrong} is {_short(told[wrong])}, expected text")
     if "filter" in told:
         kind, name, other = "filter", told["filter"], told.get("scenario", "")
         _one_of(where, "base.filter", name, _FILTERS)
@@ -211,6 +220,8 @@ def _base(where: str, told: Mapping[str, Any], path: Path) -> Base:
         duration = parse_duration_s(told["duration"], "base.duration") if "duration" in told else None
     except CalibError as error:
         raise BadInputError(f"{where}: {error}") from error
+    if duration is not None and duration > _LONGEST_S:
+        raise BadInputError(f"{where}: base.duration is {_short(told['duration'])}, expected at most 1h")
     return Base(kind, name, other, _rig_text(where, told.get("rig"), path), feedback, duration, model)
 
 
@@ -241,7 +252,7 @@ def _rig_text(where: str, rig: str | None, path: Path) -> str:
 
 def _one_of(where: str, key: str, value: str, known: tuple[str, ...]) -> None:
     if value not in known:
-        raise BadInputError(f"{where}: {key} is {one_line(value)!r}, expected one of {', '.join(known)}")
+        raise BadInputError(f"{where}: {key} is {_short(value)}, expected one of {', '.join(known)}")
 
 
 def _check_key(where: str, key: str, base: Base) -> None:
@@ -255,18 +266,30 @@ def _check_key(where: str, key: str, base: Base) -> None:
 
 
 def _finite(where: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise BadInputError(f"{where} has {value!r} in it, expected a number")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(_float(value)):
+        raise BadInputError(f"{where} has {_short(value)} in it, expected a number")
     return float(value)
+
+
+def _float(value: float) -> float:
+    """The number; infinity for a whole one that no float can hold."""
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf
+
+
+def _short(value: Any) -> str:
+    return one_line(repr(value))[:60]
 
 
 def _values(where: str, told: Any) -> tuple[Value, ...]:
     if isinstance(told, dict):
         if set(told) - {"from", "to", "count", "log"} or not {"from", "to", "count"} <= set(told):
-            raise BadInputError(f"{where} has {', '.join(map(str, told))}, expected from, to, count, log")
+            raise BadInputError(f"{where} has {_short(list(told))}, expected from, to, count, log")
         a, b, count = _finite(where, told["from"]), _finite(where, told["to"]), told["count"]
         if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= 10_000:
-            raise BadInputError(f"{where}: count is {count!r}, expected a whole number from 1 to 10000")
+            raise BadInputError(f"{where}: count is {_short(count)}, expected a whole number from 1 to 10000")
         if told.get("log"):
             if not (a > 0.0 and b > 0.0):
                 raise BadInputError(f"{where} goes from {a:g} to {b:g}, expected positive numbers with log")
@@ -274,9 +297,10 @@ def _values(where: str, told: Any) -> tuple[Value, ...]:
         return tuple(np.linspace(a, b, count).tolist())
     if not isinstance(told, list) or not told:
         raise BadInputError(f"{where} is no list of values and no range, expected for instance [1.0, 2.0]")
-    wrong = next((v for v in told if not isinstance(v, str | bool | int | float)), None)
-    if wrong is not None or any(isinstance(v, float) and not math.isfinite(v) for v in told):
-        raise BadInputError(f"{where} has {wrong!r} in it, expected numbers or words")
+    for value in told:
+        word = isinstance(value, str | bool)
+        if not word and not (isinstance(value, int | float) and math.isfinite(_float(value))):
+            raise BadInputError(f"{where} has {_short(value)} in it, expected numbers or words")
     return tuple(float(v) if isinstance(v, int) and not isinstance(v, bool) else v for v in told)
 
 
@@ -288,7 +312,7 @@ def _distribution(where: str, told: Any) -> tuple[str, float, float]:
         )
     kind, numbers = next(iter(told.items()))
     if not isinstance(numbers, list) or len(numbers) != 2:
-        raise BadInputError(f"{where}.{kind} is {numbers!r}, expected two numbers")
+        raise BadInputError(f"{where}.{kind} is {_short(numbers)}, expected two numbers")
     a, b = (_finite(f"{where}.{kind}", value) for value in numbers)
     if kind == "normal" and b < 0.0:
         raise BadInputError(f"{where}.normal has the standard deviation {b:g}, expected none below zero")

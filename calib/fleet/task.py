@@ -10,7 +10,6 @@ import contextlib
 import json
 import platform
 import tempfile
-import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -20,7 +19,7 @@ from pathlib import Path
 from calib.errors import EXIT_INTERNAL, CalibError
 from calib.files import sha256
 from calib.fleet.fetch import MOST_BYTES, local_folder
-from calib.fleet.manifest import RigSpec
+from calib.fleet.manifest import RigSpec, without_secrets
 from calib.fleet.outcome import SAME, Outcome, verdict_of
 from calib.fleet.stages import kind_of, rig_folder, run_stages
 from calib.running.cache import key_of, program_digest
@@ -29,8 +28,6 @@ from calib.running.folder import folder_digests
 __all__ = ["Answer", "FleetOptions", "calibrate_rig", "peak_memory_MB", "program"]
 
 _MOST_KEPT_BYTES = 30_000_000
-_one_at_a_time = threading.Lock()
-"""A verb takes over stdout, and memory is measured for the whole process."""
 
 
 @dataclass(frozen=True)
@@ -41,13 +38,11 @@ class FleetOptions:
     ----------
     pages : whether each rig's page is made and brought back.
     attempts : to fetch a file. most_bytes : of a folder that is fetched.
-    program : see `program`; a process with another one does not work.
     """
 
     pages: bool = False
     attempts: int = 3
     most_bytes: int = MOST_BYTES
-    program: str = ""
 
 
 @dataclass(frozen=True)
@@ -70,15 +65,15 @@ def program() -> str:
 
 
 def calibrate_rig(spec: RigSpec, options: FleetOptions, known: str = "", scratch: str = "") -> Answer:
-    """Calibrate one rig; every failure is an outcome, none an exception.
+    """Calibrate one rig; every failure is an outcome, none an exception. One at a time in a process.
 
     Parameters
     ----------
     known : key of an earlier result; where it still is the key, the rig is not calibrated again.
     scratch : folder for what is fetched and made, removed afterwards; the system's own without.
     """
-    blank = Outcome(spec.name, spec.serial, spec.source, "failed", EXIT_INTERNAL)
-    with _one_at_a_time, _measured() as spent:
+    blank = Outcome(spec.name, spec.serial, without_secrets(spec.source), "failed", EXIT_INTERNAL)
+    with _measured() as spent:
         try:
             with tempfile.TemporaryDirectory(prefix="rig-", dir=scratch or None) as place:
                 answer = _calibrated(spec, options, known, Path(place), blank)

@@ -6,25 +6,23 @@ are escaped, and a policy in the page lets no script run but its own.
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
-from typing import Any
 
 from calib import __version__
 from calib.files import write_atomically
 from calib.fleet.borrowing import Borrowing
 from calib.fleet.summary import ConstantSummary, FleetSummary
 from calib.report.fleet_svg import drift_svg, histogram_svg
+from calib.report.rendering import render
 from calib.rigvalues import BLANK, SIGMA, digits
 
-__all__ = ["PAGE", "fleet_page_text", "render", "write_fleet_page"]
+__all__ = ["PAGE", "SCRIPT", "STYLE", "fleet_page_text", "write_fleet_page"]
 
 PAGE = "fleet.html"
+STYLE, SCRIPT = ("page.css", "fleet.css"), ("common.js",)
 _MOST_DRAWN = 60
 _KIND = {"ok": "ok", "poor": "poor", "failed": "failed", "broken": "failed", "lost": "failed"}
 _STAGE_KIND = {"ok": "ok", "poor": "poor", "failed": "failed", "blocked": "blocked"}
@@ -56,6 +54,9 @@ def fleet_page_text(summary: FleetSummary, borrowing: Borrowing | None = None) -
     answer, headline = _answer(summary)
     return render(
         "fleet.html.j2",
+        STYLE,
+        SCRIPT,
+        version=__version__,
         summary=summary,
         borrowing=borrowing,
         answer=answer,
@@ -70,29 +71,6 @@ def fleet_page_text(summary: FleetSummary, borrowing: Borrowing | None = None) -
         looks=[(look, _KIND.get(look.verdict, "skipped"), _z(look.z)) for look in summary.looks],
         limit=f"{summary.limit:.2f}" if math.isfinite(summary.limit) else "",
     )
-
-
-def render(template: str, **values: Any) -> str:
-    """A template of this package with style and script in it."""
-    import jinja2
-
-    script = _resource("fleet.js")
-    policy = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    text = environment.from_string(_resource(template)).render(
-        version=__version__,
-        style=_resource("page.css") + _resource("fleet.css"),
-        script=script,
-        script_hash=f"sha256-{policy}",
-        **values,
-    )
-    return text.encode("utf-8", "backslashreplace").decode("utf-8")
-
-
-def _resource(name: str) -> str:
-    return (resources.files("calib.report") / "templates" / name).read_text(encoding="utf-8")
 
 
 def _answer(summary: FleetSummary) -> tuple[str, str]:

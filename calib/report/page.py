@@ -11,13 +11,10 @@ inputs give the same bytes.
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +24,7 @@ from calib.files import read_yaml_mapping, shown, write_atomically
 from calib.report.page_pictures import data_uri, kept_picture, size_of, small_figure
 from calib.report.page_stages import Table, caption, facts, tables
 from calib.report.page_verdict import decide
+from calib.report.rendering import render
 from calib.rig import read_rig
 from calib.rig_actuator import Actuator, PumpSection, section_of
 from calib.rigvalues import constants, digits
@@ -38,6 +36,10 @@ __all__ = ["MOST_BYTES", "page_text", "write_page"]
 
 MOST_BYTES = 5_000_000
 """A page is never larger; figures that do not fit are named instead."""
+_AIM_BYTES = 4_350_000
+"""What a page should take: beyond this, of several logs only the first figure of each is shown."""
+_NARROW_PX = 640
+"""Width of those where even they are too many."""
 _VIEWS_BYTES = 1_000_000
 _ROOM_BYTES = 400_000
 """What is kept for words, tables and numbers."""
@@ -91,8 +93,6 @@ def write_page(rig: Path, output: Path | None = None) -> Path:
 
 def page_text(rig: Path) -> str:
     """The whole page. Raises `BadInputError` for a rig.yaml that is not there or cannot be read."""
-    import jinja2
-
     if not rig.exists():
         raise BadInputError(f"{shown(rig)}: cannot be read: there is no such file")
     whole = read_rig(rig)
@@ -106,12 +106,10 @@ def page_text(rig: Path) -> str:
     views = _views(hidden, _Budget(_VIEWS_BYTES))
     budget.left -= sum(len(view["image"]) for view in views)
     stages = _stages(told, sections, hidden, budget)
-    script = _resource("page.js")
-    policy = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    text = environment.from_string(_resource("page.html.j2")).render(
+    return render(
+        "page.html.j2",
+        ("page.css",),
+        ("common.js", "page.js"),
         decision=decide(told, sections),
         told=told,
         stages=stages,
@@ -135,16 +133,7 @@ def page_text(rig: Path) -> str:
             for name, digest in files.items()
         ],
         version=provenance.get("version", __version__),
-        style=_resource("page.css"),
-        script=script,
-        script_hash=f"sha256-{policy}",
     )
-    # A file's name may hold halves of characters, which no page can.
-    return text.encode("utf-8", "backslashreplace").decode("utf-8")
-
-
-def _resource(name: str) -> str:
-    return (resources.files("calib.report") / "templates" / name).read_text(encoding="utf-8")
 
 
 def _as_script(value: Any) -> str:
@@ -223,12 +212,16 @@ def _stage(
 ) -> dict[str, Any]:
     section = _merged([sections.get(n) for job in jobs for n in job["writes"]])
     logs = [str(log.get("name")) for log in section.get("logs") or () if isinstance(log, dict)]
+    ran = [job["status"] not in ("skipped", "missing", "blocked") for job in jobs]
+    results = [
+        load(hidden / "stages" / str(job["name"])) if one else None
+        for job, one in zip(jobs, ran, strict=True)
+    ]
+    shown, width_px = _chosen(results, hidden / "figures", budget)
     parts = []
-    for job in jobs:
-        ran = job["status"] not in ("skipped", "missing", "blocked")
-        result = load(hidden / "stages" / str(job["name"])) if ran else None
+    for job, result in zip(jobs, results, strict=True):
         document = {} if result is None else result.document()
-        figures, dropped = _figures(result, hidden, budget, logs)
+        figures, dropped = _figures(result, shown, logs)
         parts.append(
             {
                 "job": job,
@@ -242,6 +235,7 @@ def _stage(
         )
     status = _worst([job["status"] for job in jobs])
     document = parts[0]["document"] if len(parts) == 1 else {}
+    coarse = f"of {len(jobs)} logs the figures are {width_px} px wide here, to keep this page small"
     return {
         "name": name,
         "title": jobs[0]["title"],
@@ -249,7 +243,11 @@ def _stage(
         "kind": status,
         "facts": facts(name, section, document) if status in ("ok", "poor") else [],
         "reasons": list(section.get("reasons") or ()),
-        "remarks": [*(section.get("remarks") or ()), *(section.get("advice") or ())],
+        "remarks": [
+            *(section.get("remarks") or ()),
+            *(section.get("advice") or ()),
+            *([coarse] if width_px else ()),
+        ],
         "parts": parts,
         "tables": _replay_tables(parts) if len(parts) > 1 or name == "replay" else tables(document),
         "several": len(parts) > 1,
@@ -276,20 +274,45 @@ def _worst(statuses: list[str]) -> str:
     return min(statuses, key=order.index)
 
 
+def _chosen(
+    results: list[Result | None], folder: Path, budget: _Budget
+) -> tuple[dict[Path, tuple[str, int, int]], int]:
+    """Address, width and height of the figures that are shown, and to what width in px they were narrowed.
+
+    Of several logs the first figure of each comes before the second of any, as far as the page is no larger
+    than it should be; the first ones may be narrowed, else the width is 0.
+    """
+    ordered = [[] if result is None else sorted(result.figures(), key=_place) for result in results]
+    listed = sorted(
+        (k, job, path) for job, paths in enumerate(ordered) for k, path in enumerate(paths) if _counts(path)
+    )
+    room = budget.left - (MOST_BYTES - _AIM_BYTES if len(results) > 1 else 0)
+    first = [data_uri(small_figure(path, folder)) for k, _, path in listed if k == 0]
+    width_px = _NARROW_PX if len(results) > 1 and sum(map(len, first)) > room else 0
+    shown = {}
+    for k, _, path in listed:
+        image = small_figure(path, folder, width_px)
+        address = data_uri(image)
+        if (k == 0 or len(address) <= room) and budget.takes(address):
+            shown[path] = (address, *size_of(image))
+            room -= len(address)
+    return shown, width_px
+
+
+def _counts(path: Path) -> bool:
+    """Whether a figure is one of the first of its kind."""
+    counted = re.search(r"_(\d+)$", path.stem)
+    return counted is None or int(counted.group(1)) <= _MOST_COUNTED
+
+
 def _figures(
-    result: Result | None, hidden: Path, budget: _Budget, logs: list[str]
+    result: Result | None, shown: Mapping[Path, tuple[str, int, int]], logs: list[str]
 ) -> tuple[list[dict[str, Any]], list[str]]:
     figures, dropped = [], []
     for path in sorted([] if result is None else result.figures(), key=_place):
-        counted = re.search(r"_(\d+)$", path.stem)
-        if counted is not None and int(counted.group(1)) > _MOST_COUNTED:
-            dropped.append(caption(path.stem, logs))
-            continue
-        data = small_figure(path, hidden / "figures")
-        image = data_uri(data)
         words = caption(path.stem, logs)
-        if budget.takes(image):
-            width, height = size_of(data)
+        if path in shown:
+            image, width, height = shown[path]
             figures.append({"image": image, "caption": words, "width": width, "height": height})
         else:
             dropped.append(words)

@@ -22,6 +22,8 @@ _WIDEST_PX = 640
 _QUALITY = 72
 _COLOURS = 128
 _MOST_PICTURES = 120
+_KIND_AT, _PALETTE = 25, b"\x03"
+"""Where a PNG tells how its colours are stored, and what it tells where it has few."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,8 @@ def _key(name: str) -> str:
 def keep_pictures(paths: Sequence[Path], folder: Path) -> None:
     """Keep small copies of pictures, by name; pictures that cannot be read are passed over.
 
-    A copy is named by the picture's name and begins with a line of the picture's hash and size.
+    A copy is named by the picture's name and begins with a line of the picture's hash and size and of its
+    own hash.
     """
     make_folder(folder)
     wanted = {f"{_key(path.name)}.view": path for path in paths[:_MOST_PICTURES]}
@@ -72,12 +75,12 @@ def keep_pictures(paths: Sequence[Path], folder: Path) -> None:
             raw = read_bytes(path)
             digest = sha256(raw)
             place = folder / name
-            if place.is_file() and place.read_bytes()[:64] == digest.encode():
+            if kept_picture(path.name, folder) and place.read_bytes()[:64] == digest.encode():
                 continue
             made = _small_picture(path)
             if made is not None:
                 width, height, data = made
-                write_atomically(place, f"{digest} {width} {height}\n".encode() + data)
+                write_atomically(place, f"{digest} {width} {height} {sha256(data)}\n".encode() + data)
 
 
 def _small_picture(path: Path) -> tuple[int, int, bytes] | None:
@@ -98,24 +101,33 @@ def kept_picture(name: str, folder: Path) -> Embedded | None:
     """The small copy of a picture by its name, None where there is none."""
     with contextlib.suppress(OSError, ValueError):
         head, data = (folder / f"{_key(name)}.view").read_bytes().split(b"\n", 1)
-        _, width, height = head.split()
-        if data.startswith(b"\xff\xd8"):
+        _, width, height, own = head.split()
+        if data.startswith(b"\xff\xd8") and own == sha256(data).encode():
             return Embedded(name, int(width), int(height), data)
     return None
 
 
-def small_figure(path: Path, folder: Path) -> bytes:
-    """A figure with as few colours as it needs, from `folder` where it has been made before."""
+def small_figure(path: Path, folder: Path, width_px: int = 0) -> bytes:
+    """A figure with as few colours as it needs, from `folder` where it has been made before.
+
+    With `width_px` it is made narrower, if it is wider than that and takes less room then.
+    """
     raw = path.read_bytes()
     if not raw.startswith(b"\x89PNG"):
         return raw
-    place = folder / f"{sha256(raw)}.png"
+    narrower = 0 < width_px < size_of(raw)[0]
+    if not narrower and raw[_KIND_AT : _KIND_AT + 1] == _PALETTE:
+        return raw
+    place = folder / (f"{sha256(raw)}_{width_px}.png" if narrower else f"{sha256(raw)}.png")
     with contextlib.suppress(OSError):
         return place.read_bytes()
     from PIL import Image
 
     with Image.open(io.BytesIO(raw)) as whole:
-        few = whole.convert("RGB").quantize(_COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+        plain = whole.convert("RGB")
+        if narrower:
+            plain = plain.resize((width_px, max(1, round(plain.height * width_px / plain.width))))
+        few = plain.quantize(_COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
         buffer = io.BytesIO()
         few.save(buffer, format="png", compress_level=6)
     small = min(buffer.getvalue(), raw, key=len)

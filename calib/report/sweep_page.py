@@ -6,10 +6,12 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from calib import __version__
 from calib.files import write_atomically
 from calib.fleet.sweeping import Point, SweepSummary
 from calib.fleet.sweepspec import SweepSpec
-from calib.report.fleet_page import render
+from calib.report.fleet_page import SCRIPT, STYLE
+from calib.report.rendering import render
 
 __all__ = ["PAGE", "cloud_svg", "sweep_page_text", "write_sweep_page"]
 
@@ -33,6 +35,9 @@ def sweep_page_text(spec: SweepSpec, summary: SweepSummary) -> str:
     ]
     return render(
         "sweep.html.j2",
+        STYLE,
+        SCRIPT,
+        version=__version__,
         summary=summary,
         what=what,
         feedback=base.feedback,

@@ -6,18 +6,22 @@ bellows' lengths against DOP853 at 1e-12.
 - one core: 1 ms steps with both pumps, random commands at every tick, the kernel and the public call;
 - batch: 200 parameter sets of 10 s on two threads;
 - against a usual implementation: the same free swing by `solve_ivp` (RK45, 1e-3, 1e-6, the settings of
-  ode45) on M, C and N that sympy derived and lambdified.
+  ode45) on M, C and N that sympy derived and lambdified; over 20 s also by jsrm (`pip install jsrm`), where
+  it is installed: `--only swing` prints no more than that.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import sympy
@@ -25,7 +29,7 @@ from scipy.integrate import solve_ivp
 
 sys.path[:0] = [str(Path(__file__).resolve().parents[2]), str(Path(__file__).resolve().parent)]
 
-from _rows import Row
+from _rows import Row, interleaved, print_rows
 
 from calib.actuator.adaptive import simulate_adaptive, swing_adaptive
 from calib.actuator.batch import simulate_batch
@@ -145,25 +149,89 @@ def against_usual(repeats: int) -> tuple[float, float, float, float]:
     return duration / best(ode45, repeats), duration / best(ours, 20 * repeats), errors[0], errors[1]
 
 
-def rows() -> list[Row]:
-    """A swing of 4 s, the integrator's steps and accuracy as each has them."""
-    slow, fast, rough, fine = against_usual(10)
+def jsrm_swings(duration: float) -> tuple[dict[str, Callable[[], object]], dict[str, str]]:
+    """The same swing of a rod of one constant-strain segment (bending and axial strain) by jsrm, compiled.
+
+    Another model than ours: its mass is along the rod. Mass, length, radius, 4 Hz and damping ratio are ours.
+    jsrm gives the slope; what integrates it is JAX's own dopri5 at the settings of ode45, and RK4 in steps of
+    1 ms as ours. Its slope is not smooth where the rod is nearly straight: steps of 1 ms and of 0.5 ms end
+    some hundredths of a radian apart, and dopri5 takes 25 s at 1e-6. Returns the calls, and what is to be
+    said of each. Raises `ImportError` where jsrm is not installed.
+    """
+    jsrm, jax = importlib.import_module("jsrm"), importlib.import_module("jax")
+    jax.config.update("jax_enable_x64", True)
+    np_ = importlib.import_module("jax.numpy")
+    expressions = Path(jsrm.__file__).parent / "symbolic_expressions" / "planar_pcs_ns-1.dill"
+    factory = importlib.import_module("jsrm.systems.planar_pcs").factory
+    _, _, matrices, _ = factory(expressions, np_.array([True, False, True]))
+    plant = free_swing()
+    length, radius = plant.rest_length_m, plant.bellows_radius_m
+    values: dict[str, object] = {
+        "th0": 0.0, "l": [length], "r": [radius], "g": [0.0, 0.0], "E": [7.7e3], "G": [2.6e3],
+        "rho": [plant.mass_kg / (np.pi * radius**2 * length)], "D": np.diag([4.3e-8, 0.0, 4.8e-4]),
+    }  # fmt: skip
+    parameters = {name: np_.array(value) for name, value in values.items()}
+    slope = importlib.import_module("jsrm.integration").ode_factory(matrices, parameters, np_.zeros(2))
+    odeint = importlib.import_module("jax.experimental.ode").odeint
+    start, times, h = np_.array([0.5 / length, 0.0, 0.0, 0.0]), np_.linspace(0.0, duration, 2001), 1e-3
+
+    def step(x: Any, _: object) -> tuple[Any, Any]:
+        k1 = slope(0.0, x)
+        k2 = slope(0.0, x + 0.5 * h * k1)
+        k3 = slope(0.0, x + 0.5 * h * k2)
+        x = x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + slope(0.0, x + h * k3))
+        return x, x
+
+    fixed = jax.jit(lambda x: jax.lax.scan(step, x, None, length=round(duration / h))[1])
+    adaptive = jax.jit(lambda x: odeint(lambda y, t: slope(t, y), x, times, rtol=1e-3, atol=1e-6))
+    found: dict[str, Any] = {
+        "jsrm, RK4 1 ms": fixed,
+        "jsrm, dopri5 1e-3": adaptive,
+    }
+    notes, angles = dict[str, str](), dict[str, FloatArray]()
+    for name, solve in found.items():
+        began = time.perf_counter()
+        angle = np.asarray(solve(start).block_until_ready())[:, 0] * length
+        angles[name] = angle[9::10] if solve is fixed else angle[1:]
+        compiled = time.perf_counter() - began
+        apart = np.abs(angles[name] - angles["jsrm, RK4 1 ms"]).max()
+        notes[name] = f"one segment; compiled in {compiled:.0f} s; {apart:.0e} rad from RK4"
+    angle = angles["jsrm, RK4 1 ms"][:200]
+    crossings = np.flatnonzero(np.diff(np.sign(angle)))
+    assert 3.5 < 0.5 / (0.01 * np.diff(crossings).mean()) < 4.5 and np.abs(angle).max() < 0.6
+    return {name: partial(lambda s: s(start).block_until_ready(), f) for name, f in found.items()}, notes
+
+
+def rows(repeats: int = 5) -> list[Row]:
+    """A swing of 20 s, each with steps and accuracy of its own."""
+    plant, duration, job = free_swing(), 20.0, "simulation, 20 s of free swing"
+    start, times = state_row(plant, 0.5), np.linspace(0.0, duration, 2001)
+    slope = usual(plant)
+
+    def ode45() -> FloatArray:
+        found = solve_ivp(slope, (0, duration), start[:6], t_eval=times, rtol=1e-3, atol=1e-6)
+        return np.asarray(found.y[:2].T)
+
+    def ours() -> FloatArray:
+        return swing(plant, start, duration, 1e-3, every=10).q_m
+
+    exact = swing_adaptive(plant, start, times, rtol=1e-12, atol=1e-14).q_m
+    fine, rough = (float(np.abs(f() - exact).max()) for f in (ours, ode45))
+    calls: dict[str, Callable[[], object]] = {"ours": ours, "lambdified solve_ivp": ode45}
+    notes = {"lambdified solve_ivp": f"errors {fine:.0e} and {rough:.0e} m"}
+    with contextlib.suppress(ImportError):
+        rods, said = jsrm_swings(duration)
+        calls, notes = calls | rods, notes | said
+    for call in calls.values():
+        call()
+    seconds = interleaved(calls, repeats)
+    own = seconds.pop("ours")
     out = [
-        Row(
-            "simulation, 4 s of free swing",
-            "lambdified solve_ivp",
-            4.0 / fast,
-            4.0 / slow,
-            50.0,
-            note=f"errors {fine:.0e} and {rough:.0e} m",
-        )
+        Row(job, name, own, found, 150.0 if name.startswith("jsrm") else 50.0, note=notes[name])
+        for name, found in seconds.items()
     ]
-    try:
-        importlib.import_module("jsrm")
-    except ImportError:
-        out.append(
-            Row("simulation, 4 s of free swing", "jsrm", 4.0 / fast, None, 150.0, note="not installed")
-        )
+    if len(seconds) == 1:
+        out.append(Row(job, "jsrm", own, None, 150.0, note="not installed"))
     return out
 
 
@@ -172,7 +240,12 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--repeats", type=int, default=10)
-    repeats = parser.parse_args().repeats
+    parser.add_argument("--only", choices=["swing"])
+    told = parser.parse_args()
+    repeats = told.repeats
+    if told.only == "swing":
+        print_rows(rows(repeats))
+        return
     began = time.perf_counter()
     simulate(pumps_connected(), PUMP, np.zeros((1, 2)))
     print(f"first call, compiled or loaded: {time.perf_counter() - began:.2f} s")
@@ -187,6 +260,7 @@ def main() -> None:
     slow, fast, rough, fine = against_usual(repeats)
     print(f"free swing: lambdified solve_ivp RK45 {slow:.1f}, swing() {fast:.0f} times real time")
     print(f"    {fast / slow:.0f} times as fast (target 50), errors {rough:.1e} and {fine:.1e} m")
+    print_rows(rows(repeats))
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from fleet_processes import COMMAND, done, workers
 from fleet_rigs import write_fleet, write_manifest
 
 from calib.files import sha256
@@ -38,24 +39,11 @@ from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.simulate import log_of
 
-COMMAND = [sys.executable, "-c", "from calib.cli.main import main; main()"]
 PARTS = ("kill", "speed", "memory", "whole")
 
 
 def _load() -> str:
     return f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} processors"
-
-
-def _workers(parent: int) -> list[int]:
-    """Worker processes of a fleet: they were spawned, and they are not the tracker of resources."""
-    found = subprocess.run(
-        ["ps", "-o", "pid=,args=", "--ppid", str(parent)], capture_output=True, text=True, check=False
-    )
-    return [int(line.split()[0]) for line in found.stdout.splitlines() if "spawn_main" in line]
-
-
-def _done(out: Path) -> int:
-    return len(list((out / ".fleet" / "outcomes").glob("*.json")))
 
 
 def _single(folder: Path, place: Path) -> bytes:
@@ -83,17 +71,17 @@ def kill(folders: list[Path], manifest: Path, place: Path) -> None:
     victim = 0
     while process.poll() is None and not victim:
         time.sleep(0.05)
-        if _done(out) >= len(folders) // 2:
-            victim = _workers(process.pid)[0]
+        if done(out) >= len(folders) // 2:
+            victim = workers(process.pid)[0]
             os.kill(victim, signal.SIGKILL)
-            at = _done(out)
+            at = done(out)
     code = process.wait()
     seconds = time.monotonic() - began
     print(
         f"{len(folders)} rigs, 2 workers, one killed (SIGKILL) after {at}: exit code {code}, {seconds:.0f} s"
     )
     names = {path.parent.name for path in (out / "rigs").glob("*/rig.yaml")}
-    print(f"  results there: {len(names)} of {len(folders)}; outcomes: {_done(out)}")
+    print(f"  results there: {len(names)} of {len(folders)}; outcomes: {done(out)}")
     singles = place / "singles"
     singles.mkdir()
     same = sum(
@@ -125,17 +113,17 @@ def speed(folders: list[Path], manifest: Path, place: Path) -> None:
     """Seconds with one worker and with two, twice each and in turn."""
     seconds: dict[int, list[float]] = {1: [], 2: []}
     for turn in range(2):
-        for workers in (1, 2):
-            out = place / f"speed-{workers}-{turn}"
+        for count in (1, 2):
+            out = place / f"speed-{count}-{turn}"
             before, began = _load(), time.monotonic()
             subprocess.run(
-                [*COMMAND, "fleet", str(manifest), "-o", str(out), "--workers", str(workers)],
+                [*COMMAND, "fleet", str(manifest), "-o", str(out), "--workers", str(count)],
                 capture_output=True,
                 check=False,
             )
-            seconds[workers].append(time.monotonic() - began)
+            seconds[count].append(time.monotonic() - began)
             print(
-                f"{len(folders)} rigs, {workers} worker(s): {seconds[workers][-1]:7.1f} s ({before})",
+                f"{len(folders)} rigs, {count} worker(s): {seconds[count][-1]:7.1f} s ({before})",
                 flush=True,
             )
     one, two = min(seconds[1]), min(seconds[2])

@@ -9,21 +9,18 @@ import signal
 import socket
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from fleet_processes import COMMAND, all_gone, done, started, until, workers
 from fleet_rigs import write_fleet, write_manifest
 
 from calib.fleet import cluster
 from calib.fleet.store import opened_store
 
 pytest.importorskip("distributed")
-
-COMMAND = (sys.executable, "-c", "from calib.cli.main import main; main()")
 
 
 def _manifest(tmp_path: Path, rows: str) -> Path:
@@ -61,6 +58,10 @@ def test_what_cannot_be(calib: Callable[..., Any], tmp_path: Path, monkeypatch: 
     assert code == 3 and "has no fleet.parquet" in said
     code, said = ended(manifest, "-o", tmp_path / "out", "--scheduler", "tcp://x:1", "--workers", "2")
     assert code == 2 and "--workers" in said
+    code, said = ended(manifest, "-o", tmp_path / "out", "--timeout", "never")
+    assert code == 2 and "--timeout: 'never' is not a number with a unit" in said
+    code, said = ended(manifest, "-o", tmp_path / "x" / "out")
+    assert code == 3 and "lies in the folder of a" in said
     with opened_store(tmp_path / "taken", "calib fleet", ()):
         code, said = ended(manifest, "-o", tmp_path / "taken")
     assert code == 3 and "another calib fleet" in said and "is at work there" in said
@@ -86,48 +87,6 @@ def _results(out: Path) -> dict[str, bytes]:
     return {path.parent.name: path.read_bytes() for path in sorted(out.glob("rigs/*/rig.yaml"))}
 
 
-def _done(out: Path) -> int:
-    return len(list((out / ".fleet" / "outcomes").glob("*.json")))
-
-
-def _workers(parent: int) -> list[int]:
-    found = subprocess.run(
-        ["ps", "-o", "pid=,args=", "--ppid", str(parent)], capture_output=True, text=True, check=False
-    )
-    return [int(line.split()[0]) for line in found.stdout.splitlines() if "spawn_main" in line]
-
-
-@contextmanager
-def _started(environment: dict[str, str], *words: object) -> Iterator[subprocess.Popen[str]]:
-    process = subprocess.Popen(
-        [*COMMAND, "fleet", *map(str, words)],
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
-
-
-def _until(true: Callable[[], bool], process: subprocess.Popen[str]) -> None:
-    while not true():
-        assert process.poll() is None, process.communicate()
-        time.sleep(0.02)
-
-
-def _gone(process: int) -> bool:
-    try:
-        os.kill(process, signal.SIG_DFL)
-    except ProcessLookupError:
-        return True
-    state = Path(f"/proc/{process}/stat")
-    return state.exists() and state.read_text().rpartition(")")[2].split()[0] == "Z"
-
-
 @pytest.mark.slow
 def test_killed_worker_killed_client_and_single_runs_end_in_the_same(
     rigs: tuple[Path, list[Path]], environment: dict[str, str], tmp_path: Path
@@ -135,9 +94,9 @@ def test_killed_worker_killed_client_and_single_runs_end_in_the_same(
     manifest, folders = rigs
     out, other = tmp_path / "out", tmp_path / "other"
     # A worker is killed on the way: nothing is lost.
-    with _started(environment, manifest, "-o", out, "--workers", 2, "--json") as process:
-        _until(lambda: _done(out) >= 2, process)
-        os.kill(_workers(process.pid)[0], signal.SIGKILL)
+    with started(environment, "fleet", manifest, "-o", out, "--workers", 2, "--json") as process:
+        until(lambda: done(out) >= 2, process)
+        os.kill(workers(process.pid)[0], signal.SIGKILL)
         said, told = process.communicate()
     assert process.returncode == 1, told
     found = json.loads(said)["fleet"]
@@ -161,30 +120,27 @@ def test_killed_worker_killed_client_and_single_runs_end_in_the_same(
             )
         assert rig.read_bytes() == whole[folder.name]
     # The client and its scheduler are killed: the workers follow, and the next run goes on.
-    with _started(environment, manifest, "-o", other, "--workers", 2) as process:
-        _until(lambda: _done(other) >= 2, process)
-        children = _workers(process.pid)
+    with started(environment, "fleet", manifest, "-o", other, "--workers", 2) as process:
+        until(lambda: done(other) >= 2, process)
+        children = workers(process.pid)
         process.kill()
         process.wait()
-    until = time.monotonic() + 30.0
-    while not all(map(_gone, children)) and time.monotonic() < until:
-        time.sleep(0.1)
-    assert all(map(_gone, children))
+    assert all_gone(children)
     before = {path: path.stat().st_mtime_ns for path in other.glob("rigs/*/rig.yaml")}
-    with _started(environment, manifest, "-o", other, "--workers", 1, "--json") as process:
+    with started(environment, "fleet", manifest, "-o", other, "--workers", 1, "--json") as process:
         said, told = process.communicate()
     assert process.returncode == 1 and "interrupted" in told
     assert json.loads(said)["fleet"]["as_before"] >= 2
     assert _results(other) == whole
     assert all(path.stat().st_mtime_ns == when for path, when in before.items())
-    assert not (other / ".fleet" / "work").exists()
+    assert not (other / ".fleet" / "scratch").exists()
     # One rig's pictures change, another result was edited: those two are done again.
     copy = tmp_path / "rigs"
     shutil.copytree(manifest.parent, copy)
     manifest = write_manifest(copy / "m.csv", [copy / f.name for f in folders], "radial2")
     (copy / folders[0].name / "images" / "view5.png").unlink()
     (other / "rigs" / folders[1].name / "rig.yaml").write_text("edited")
-    with _started(environment, manifest, "-o", other, "--workers", 1, "--json") as process:
+    with started(environment, "fleet", manifest, "-o", other, "--workers", 1, "--json") as process:
         said, _ = process.communicate()
     assert json.loads(said)["fleet"]["as_before"] == 4
     again = _results(other)
@@ -215,18 +171,18 @@ def test_an_existing_scheduler_that_is_killed(
     worker_words = ("dask_worker", address, "--nthreads", "1", "--local-directory", str(tmp_path / "w"))
     running = [_dask(environment, *scheduler_words), _dask(environment, *worker_words)]
     try:
-        with _started(environment, manifest, "-o", out, "--scheduler", address) as process:
-            _until(lambda: _done(out) >= 2, process)
+        with started(environment, "fleet", manifest, "-o", out, "--scheduler", address) as process:
+            until(lambda: done(out) >= 2, process)
             running[0].kill()
             _, told = process.communicate(timeout=120)
         assert process.returncode == 3
         last = told.strip().splitlines()[-1]
         assert last.startswith(f"calib: the scheduler at {address} does not answer any more")
         assert "Traceback" not in told
-        kept = _done(out)
+        kept = done(out)
         running.append(_dask(environment, *scheduler_words))
         running.append(_dask(environment, *worker_words))
-        with _started(environment, manifest, "-o", out, "--scheduler", address, "--json") as process:
+        with started(environment, "fleet", manifest, "-o", out, "--scheduler", address, "--json") as process:
             said, told = process.communicate(timeout=300)
         assert process.returncode == 1, told
         found = json.loads(said)["fleet"]

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from fleet_clusters import in_threads
+from fleet_processes import COMMAND, all_gone, done, started, until, workers
+
+from calib.fleet.store import opened_store
+from calib.fleet.sweeping import run_sweep, summarise_sweep
+from calib.fleet.sweepspec import read_sweep
+from calib.report.sweep_page import write_sweep_page
 
 pytest.importorskip("distributed")
-
-COMMAND = (sys.executable, "-c", "from calib.cli.main import main; main()")
 
 
 def test_what_is_no_sweep(calib: Callable[..., Any], tmp_path: Path) -> None:
@@ -46,3 +52,52 @@ def test_controllers_over_plants(environment: dict[str, str], tmp_path: Path) ->
     again = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
     told = json.loads(again.stdout)["sweep"]
     assert told["as_before"] == 12 and told["best"] == found["best"]
+
+
+_MANY = (
+    "base: {scenario: orientation, feedback: truth, duration: 6s}\n"
+    "grid: {scenario.controller: [p, pid], actuator.mass_kg: {from: 0.04, to: 0.06, count: 8}}\n"
+    "draws: {count: 8, seed: 3, actuator.stiffness_scale: {uniform: [0.9, 1.1]}}\nmeasure: [peak_rad]\n"
+)
+
+
+def _table(out: Path) -> Any:
+    """All columns but the times."""
+    from pyarrow import parquet
+
+    return parquet.read_table(out / "sweep.parquet").drop_columns(["seconds"])
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")
+def test_killed_client_and_killed_worker_end_in_the_same(environment: dict[str, str], tmp_path: Path) -> None:
+    spec, out, here = tmp_path / "s.yaml", tmp_path / "out", tmp_path / "here"
+    spec.write_text(_MANY)
+    # The client and its scheduler are killed: the workers follow.
+    with started(environment, "sweep", spec, "-o", out, "--workers", 2) as process:
+        until(lambda: done(out) >= 2, process)
+        children = workers(process.pid)
+        process.kill()
+        process.wait()
+    assert all_gone(children)
+    assert not (out / "sweep.parquet").exists()
+    kept = {path: path.stat().st_mtime_ns for path in (out / ".fleet" / "outcomes").glob("*.json")}
+    assert 2 <= len(kept) < 16
+    # The next run goes on, and a worker is killed on the way: nothing is lost, nothing is done again.
+    with started(environment, "sweep", spec, "-o", out, "--workers", 2, "--json") as process:
+        until(lambda: done(out) > len(kept), process)
+        os.kill(workers(process.pid)[0], signal.SIGKILL)
+        said, told = process.communicate()
+    assert process.returncode == 0 and "interrupted" in told, told
+    found = json.loads(said)["sweep"]
+    assert (found["cases"], found["failed"], found["as_before"]) == (128, 0, 8 * len(kept))
+    assert all(path.stat().st_mtime_ns == when for path, when in kept.items())
+    assert not (out / ".fleet" / "scratch").exists()
+    # A sweep at one go in one process has the same results.
+    with in_threads(1) as cluster, opened_store(here, "calib sweep", ()) as (store, _):
+        store.scratch.mkdir()
+        known = read_sweep(spec)
+        assert run_sweep(store, cluster, known, 0) == 0
+        write_sweep_page(here / "sweep.html", known, summarise_sweep(store, known, 0))
+    assert _table(out).equals(_table(here)) and _table(out).num_rows == 128
+    assert (out / "sweep.html").read_bytes() == (here / "sweep.html").read_bytes()

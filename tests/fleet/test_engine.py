@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fleet_clusters import in_threads
 from fleet_tasks import dies_in, double, faulty, noted
 
 from calib.errors import BadInputError
@@ -28,15 +29,8 @@ pytestmark = pytest.mark.filterwarnings("default")
 @pytest.fixture(scope="module")
 def here() -> Iterator[Cluster]:
     """Two workers that are threads of this process."""
-    options = {
-        "n_workers": 2,
-        "threads_per_worker": 1,
-        "processes": False,
-        "dashboard_address": "127.0.0.1:0",
-    }
-    with distributed.LocalCluster(**options) as cluster, distributed.Client(cluster) as client:
-        engine._settled.set()
-        yield Cluster(client, "", "")
+    with in_threads(2) as cluster:
+        yield cluster
 
 
 def _tasks(count: int, *more: Any) -> Iterator[Task]:
@@ -126,9 +120,9 @@ def processes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
     place = tmp_path_factory.mktemp("cluster")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", os.pathsep.join(p for p in sys.path if p))
-        with connected(None, 2, place / "work", 1) as cluster:
+        with connected(None, 2, place / "scratch", 1) as cluster:
             yield cluster
-    assert not (place / "work").exists()
+    assert not (place / "scratch").exists()
 
 
 @pytest.mark.slow

@@ -120,3 +120,10 @@ def test_what_may_pass_is_tried_again(
 def test_a_scheme_that_nobody_knows(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="is no URL that can be read"):
         local_folder("nosuchscheme://x/y", tmp_path / "here", 1)
+
+
+def test_what_a_file_system_says_of_a_url_has_no_secret_in_it() -> None:
+    url = "https://user:word@host/a/b.png?key=1&x=2"
+    said = fetch._words(FileNotFoundError(f"('{url}', 404) and {url}"))
+    assert said == "('https://host/a/b.png', 404) and https://host/a/b.png"
+    assert fetch._words(OSError("is this a?b")) == "is this a?b"

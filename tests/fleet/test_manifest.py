@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calib.errors import BadInputError
-from calib.fleet.manifest import is_url, read_manifest, serial_number
+from calib.fleet.manifest import RigSpec, is_url, read_manifest, serial_number, twice_told, without_secrets
 
 
 def _csv(tmp_path: Path, text: str) -> Path:
@@ -116,3 +116,18 @@ def test_serial_numbers(serial: str, number: float | None) -> None:
         assert serial_number(serial) == 999999999999999.0
     else:
         assert serial_number(serial) == number
+
+
+def test_what_several_rigs_share_is_told() -> None:
+    rigs = [RigSpec("a", "/x", "1"), RigSpec("b", "/y", "1"), RigSpec("c", "/x", ""), RigSpec("d", "/x", "")]
+    assert twice_told(rigs[:1]) == ()
+    assert twice_told(rigs) == (
+        "2 rigs have the folder of one before, the first is c",
+        "1 rig has the serial number of one before, the first is b",
+    )
+
+
+def test_no_secret_is_kept() -> None:
+    assert without_secrets("https://user:word@host:1/a/b?key=1") == "https://host:1/a/b"
+    assert without_secrets("s3://bucket/a") == "s3://bucket/a"
+    assert without_secrets("/data/a?b@c") == "/data/a?b@c"

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from fleet_clusters import in_threads
 
-from calib.fleet import engine
+from calib.fleet import running, worker
 from calib.fleet.cluster import Cluster
 from calib.fleet.manifest import Manifest, RigSpec
+from calib.fleet.outcome import Outcome
 from calib.fleet.running import run_fleet
 from calib.fleet.store import opened_store
-from calib.fleet.task import FleetOptions, program
+from calib.fleet.task import Answer, FleetOptions, program
 
 distributed = pytest.importorskip("distributed")
 
@@ -22,15 +25,8 @@ pytestmark = pytest.mark.filterwarnings("default")
 
 @pytest.fixture(scope="module")
 def here() -> Iterator[Cluster]:
-    options = {
-        "n_workers": 1,
-        "threads_per_worker": 1,
-        "processes": False,
-        "dashboard_address": "127.0.0.1:0",
-    }
-    with distributed.LocalCluster(**options) as cluster, distributed.Client(cluster) as client:
-        engine._settled.set()
-        yield Cluster(client, "", program())
+    with in_threads(1, program()) as cluster:
+        yield cluster
 
 
 def test_failures_are_rows_and_what_is_there_is_left_alone(here: Cluster, tmp_path: Path) -> None:
@@ -54,3 +50,25 @@ def test_failures_are_rows_and_what_is_there_is_left_alone(here: Cluster, tmp_pa
         again = run_fleet(store, here, manifest, FleetOptions(), 1)
         assert again.as_before == 4 and again.by_status == {"failed": 2} and again.done == 6
         assert not list(store.scratch.iterdir())
+
+
+def slow_calibrate(spec: RigSpec, options: FleetOptions, known: str, scratch: str) -> Answer:
+    """As `calibrate_rig` for a rig without anything in it; one never ends."""
+    if spec.name == "endless":
+        threading.Event().wait(5.0)
+    return Answer(Outcome(spec.name, spec.serial, spec.source, "ok", 0), {})
+
+
+def test_a_rig_that_hangs_is_a_row(here: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(running, "calibrate_rig", slow_calibrate)
+    monkeypatch.setattr(worker, "_end_process", lambda seconds: None)
+    monkeypatch.setattr(worker, "_LEAVE_S", 0.01)
+    manifest = Manifest(tuple(RigSpec(name, "/x") for name in ("a", "endless", "b")), ())
+    with opened_store(tmp_path / "out", "calib fleet", ()) as (store, _):
+        store.scratch.mkdir()
+        counts = run_fleet(store, here, manifest, FleetOptions(), 1, limit_s=0.5)
+        found = store.outcome("endless")
+    worker._leaving.clear()
+    assert counts.by_status == {"ok": 2, "lost": 1}
+    assert found is not None and found.key == ""
+    assert found.sentence == "was not done after 0.5 s, which is the --timeout of a rig"

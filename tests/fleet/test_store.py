@@ -8,8 +8,9 @@ import pytest
 
 from calib.errors import BadInputError
 from calib.files import sha256
+from calib.fleet.manifest import RigSpec
 from calib.fleet.outcome import Outcome
-from calib.fleet.store import HIDDEN, Store, opened_store
+from calib.fleet.store import HIDDEN, Store, check_apart, opened_store
 from calib.fleet.task import Answer
 
 
@@ -30,7 +31,7 @@ def test_kept_known_and_damaged(tmp_path: Path) -> None:
         assert store.known("a") == ""
         store.result("a", "firmware/x.h").unlink()
         assert store.known("a") == ""
-    assert not (tmp_path / "out" / HIDDEN / "work").exists()
+    assert not (tmp_path / "out" / HIDDEN / "scratch").exists()
 
 
 def test_a_failure_is_kept_and_done_again(tmp_path: Path) -> None:
@@ -102,3 +103,33 @@ def test_an_interrupted_one_is_told_of(tmp_path: Path) -> None:
     (tmp_path / HIDDEN / "lock").write_text("4242\n")
     with opened_store(tmp_path, "calib fleet", ()) as (_, interrupted):
         assert interrupted
+
+
+def test_results_that_would_be_written_over_a_rig(tmp_path: Path) -> None:
+    rig = tmp_path / "rig1"
+    (rig / "images").mkdir(parents=True)
+    specs = [RigSpec("far", "s3://bucket/a"), RigSpec("gone", str(tmp_path / "none")), RigSpec("r", str(rig))]
+    check_apart(tmp_path / "out", specs)
+    check_apart(tmp_path, specs)
+    for inside in (rig, rig / "images", rig / "out"):
+        with pytest.raises(BadInputError, match="lies in the folder of r, expected another one"):
+            check_apart(inside, specs)
+    (tmp_path / "link").symlink_to(rig)
+    with pytest.raises(BadInputError, match="lies in the folder of r"):
+        check_apart(tmp_path / "link" / "out", specs)
+    under = [RigSpec("r", str(tmp_path / "rigs" / "a"))]
+    with pytest.raises(BadInputError, match="is where results are written"):
+        check_apart(tmp_path, under)
+    check_apart(tmp_path / "rig", specs)
+
+
+def test_rigs_that_no_fleet_has_made_are_not_touched(tmp_path: Path) -> None:
+    (tmp_path / "rigs" / "a").mkdir(parents=True)
+    (tmp_path / "rigs" / "a" / "rig.yaml").write_text("mine")
+    with (
+        pytest.raises(BadInputError, match="is there, and is not the work of calib fleet"),
+        opened_store(tmp_path, "calib fleet", ()),
+    ):
+        pass
+    assert (tmp_path / "rigs" / "a" / "rig.yaml").read_text() == "mine"
+    assert not (tmp_path / HIDDEN).exists()

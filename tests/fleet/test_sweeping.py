@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from fleet_clusters import in_threads
 
 from calib.errors import BadInputError
-from calib.fleet import engine, sweeping
+from calib.fleet import sweeping, worker
 from calib.fleet.cluster import Cluster
+from calib.fleet.engine import Lost
 from calib.fleet.rows import Table, column, texts
 from calib.fleet.store import Store, opened_store
 from calib.fleet.sweeping import run_sweep, summarise_sweep
@@ -50,15 +53,8 @@ def bowl(base: Base, cases: tuple[Case, ...], seed: int, scratch: str) -> list[C
 
 @pytest.fixture(scope="module")
 def here() -> Iterator[Cluster]:
-    options = {
-        "n_workers": 1,
-        "threads_per_worker": 1,
-        "processes": False,
-        "dashboard_address": "127.0.0.1:0",
-    }
-    with distributed.LocalCluster(**options) as cluster, distributed.Client(cluster) as client:
-        engine._settled.set()
-        yield Cluster(client, "", program())
+    with in_threads(1, program()) as cluster:
+        yield cluster
 
 
 @pytest.fixture(autouse=True)
@@ -119,3 +115,43 @@ def test_draws_alone_and_a_measure_that_is_not_there(here: Cluster, tmp_path: Pa
             summarise_sweep(store, replace(spec, measures=("nonsense",)), 0) if run_sweep(
                 store, here, replace(spec, measures=("nonsense",)), 1
             ) == 0 else None
+
+
+def deadly(base: Base, cases: tuple[Case, ...], seed: int, scratch: str) -> list[CaseResult] | Lost:
+    """As `bowl`; one case is as good as the death of its process, and takes all beside it with it."""
+    if any(case.number == 7 for case in cases):
+        return Lost(1)
+    return bowl(base, cases, seed, scratch)
+
+
+def test_one_case_takes_no_others_with_it(
+    here: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sweeping, "run_cases", deadly)
+    for store in _opened(tmp_path):
+        run_sweep(store, here, SPEC, 1)
+        found = summarise_sweep(store, SPEC, 0)
+        assert (found.cases, found.failed, found.why) == (24, 2, "each process that tried it died")
+        # It may live another time: its bundle is done again, and no others.
+        monkeypatch.setattr(sweeping, "run_cases", bowl)
+        assert run_sweep(store, here, SPEC, 1) == 19
+        assert summarise_sweep(store, SPEC, 19).failed == 1
+
+
+def endless(base: Base, cases: tuple[Case, ...], seed: int, scratch: str) -> list[CaseResult]:
+    """As `bowl`; one case never ends."""
+    if any(case.number == 7 for case in cases):
+        threading.Event().wait(5.0)
+    return bowl(base, cases, seed, scratch)
+
+
+def test_a_case_that_hangs_is_a_row(here: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sweeping, "run_cases", endless)
+    monkeypatch.setattr(worker, "_end_process", lambda seconds: None)
+    monkeypatch.setattr(worker, "_LEAVE_S", 0.01)
+    for store in _opened(tmp_path):
+        run_sweep(store, here, SPEC, 1, limit_s=0.2)
+        found = summarise_sweep(store, SPEC, 0)
+    worker._leaving.clear()
+    assert (found.cases, found.failed) == (24, 2)
+    assert found.why == "was not done after 0.2 s, which is the --timeout of a case"

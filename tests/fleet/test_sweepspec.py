@@ -65,6 +65,13 @@ def test_log_range(tmp_path: Path) -> None:
         (_BASE + "grid: {pump.lag_s: []}\n", "no list of values and no range"),
         (_BASE + "grid: {pump.lag_s: [.nan]}\n", "has .* in it, expected numbers"),
         (_BASE + "grid: {pump.lag_s: [[1]]}\n", "in it, expected numbers"),
+        (_BASE + "grid: {pump.lag_s: [null]}\n", "has None in it"),
+        (_BASE + f"grid: {{pump.lag_s: [{'9' * 390}]}}\n", "has 9{60} in it, expected numbers"),
+        (_BASE + "grid: {true: [1]}\n", "grid has the key True, expected text"),
+        (_BASE + "draws: {count: 2, 3.5: {uniform: [0, 1]}}\n", "draws has the key 3.5"),
+        (_BASE + f"draws: {{count: 2, pump.lag_s: {{uniform: [0, {'9' * 390}]}}}}\n", "expected a number"),
+        ("base: {~: 1, scenario: swing, duration: {}}\n", "base has the key None"),
+        ("base: {scenario: swing, duration: 2h}\n", "base.duration is '2h', expected at most 1h"),
         (_BASE + "grid: {pump.lag_s: {from: 1, to: 2, count: 0}}\n", "count is 0"),
         (_BASE + "grid: {pump.lag_s: {from: 0, to: 2, count: 3, log: true}}\n", "expected positive"),
         (_BASE + "draws: {count: 0}\n", "draws.count is 0"),
@@ -73,6 +80,12 @@ def test_log_range(tmp_path: Path) -> None:
         (_BASE + "draws: {count: 2, pump.lag_s: {normal: [1, -1]}}\n", "none below zero"),
         (_BASE + "grid: {pump.lag_s: [1]}\ndraws: {pump.lag_s: {normal: [1, 1]}}\n", "in grid and in draws"),
         (_BASE + "grid: {pump.lag_s: [1, 2]}\ndraws: {count: 900000}\n", "asks for 1800000 cases"),
+        (
+            _BASE
+            + "grid:\n"
+            + "".join(f"  pump.a{k}: {{from: 0, to: 1, count: 10000}}\n" for k in range(99)),
+            "asks for 100000000 cases or more",
+        ),
         (_BASE + "grid: {pump.lag_s: [1]}\nmeasure: 3\n", "measure is no list"),
         (_BASE + "grid: {pump.lag_s: [1]}\nnear: 2\n", "measure names none"),
     ],

@@ -56,3 +56,9 @@ def test_a_fault_of_the_program_is_an_outcome(tmp_path: Path, monkeypatch: pytes
 def test_memory_and_program() -> None:
     assert peak_memory_MB() > 10.0
     assert len(program()) == 64 and program() == program()
+
+
+def test_the_outcome_has_no_secret_in_it() -> None:
+    found = calibrate_rig(RigSpec("a", "nothing://user:word@host/a?key=1"), FleetOptions()).outcome
+    assert found.source == "nothing://host/a" and found.status == "failed"
+    assert "word" not in found.sentence and "key" not in found.sentence

@@ -7,12 +7,15 @@ from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 
+import numpy as np
 import pytest
 from chromium import Browser, browser_or_skip
 from pages import EVIL, finished_run
+from PIL import Image
 
 from calib.errors import BadInputError
-from calib.report.page import MOST_BYTES, page_text, write_page
+from calib.report.page import _AIM_BYTES, MOST_BYTES, _Budget, _chosen, page_text, write_page
+from calib.running.cache import Result
 
 
 @pytest.fixture(scope="module")
@@ -200,3 +203,38 @@ def test_dark_light_print_and_keyboard(rig: Path, browser: Browser) -> None:
     assert nameless == []
     assert EVIL not in browser.run("document.title")
     assert browser.errors == []
+
+
+def _drawn(root: Path, logs: int) -> list[Result | None]:
+    """Results of as many logs, each with figures of about 40 kB."""
+    made: list[Result | None] = []
+    for log in range(logs):
+        folder = root / f"replay-{log}"
+        (folder / "figures").mkdir(parents=True)
+        files = {}
+        for k, part in enumerate(("errors", "innovations", "states")):
+            noise = np.random.default_rng(3 * log + k).integers(0, 255, (200, 900), dtype=np.uint8)
+            image = Image.fromarray(np.where(np.arange(900) % 5 == 0, noise, 255).astype(np.uint8))
+            name = f"figures/replay_{log}_{part}.png"
+            image.quantize(128).save(folder / name)
+            files[name] = ""
+        made.append(Result(folder, "", 0, files))
+    return made
+
+
+@pytest.mark.parametrize(("logs", "narrow"), [(4, False), (40, False), (130, True)])
+def test_of_many_logs_the_states_come_first_and_the_page_stays_small(
+    tmp_path: Path, logs: int, narrow: bool
+) -> None:
+    results = _drawn(tmp_path, logs)
+    budget = _Budget(MOST_BYTES - 400_000)
+    shown, width_px = _chosen(results, tmp_path / "figures", budget)
+    stems = [path.stem for path in shown]
+    assert budget.left >= 0
+    assert sum(stem.endswith("states") for stem in stems) == logs
+    assert bool(width_px) == narrow
+    if logs == 4:
+        assert len(shown) == 12
+    else:
+        assert len(shown) < 3 * logs
+        assert narrow or budget.left >= MOST_BYTES - _AIM_BYTES

@@ -18,7 +18,7 @@
     const cell = row.cells[column];
     if (cell.dataset.value !== undefined) return cell.dataset.value === "" ? null : Number(cell.dataset.value);
     const text = cell.textContent.trim();
-    return text === "" ? null : text;
+    return text === "" || text === "–" ? null : text;
   };
   const compare = (a, b) => typeof a === "number" && typeof b === "number"
     ? a - b : String(a).localeCompare(String(b), "en", { numeric: true });
@@ -36,7 +36,7 @@
     }));
   }
 
-  // Cards and rows with all the words that were typed.
+  // What can be filtered is shown where it has all the words that were typed.
   const filter = get("filter");
   if (filter) {
     const parts = [...document.querySelectorAll(".filtered")];
