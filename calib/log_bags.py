@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import importlib
 import json
-import struct
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from itertools import pairwise
@@ -19,15 +18,22 @@ from calib.errors import BadInputError, CalibError
 from calib.files import check_readable, one_line, shown
 from calib.log_messages import Source, rows_from_messages
 from calib.log_topics import Topic, topic_map
+from calib.log_unpacking import (
+    MOST_BYTES,
+    BoundedFile,
+    BoundedPath,
+    bound_chunks,
+    check_folder_of_bag,
+    check_mcap,
+    check_types,
+    unpacked,
+)
 from calib.logs import Log
 
 __all__ = ["BAGS", "is_bag", "iter_bag"]
 
 BAGS = (".bag", ".db3", ".mcap")
 """Endings of bags; a ROS 2 bag may also be a folder."""
-
-_MOST_BYTES = 1 << 28
-"""Of one record or chunk, packed or not."""
 
 _MOST_TOPICS = 10000
 
@@ -82,8 +88,8 @@ def _kind(name: str) -> str:
 class _RosBag:
     """A bag that `rosbags` has opened."""
 
-    def __init__(self, reader: Any) -> None:
-        self._reader = reader
+    def __init__(self, reader: Any, packing: str) -> None:
+        self._reader, self._packing = reader, packing
         self.truncated = False
         kinds = {connection.topic: _kind(connection.msgtype) for connection in reader.connections}
         self.topics = tuple(Topic(name, kinds[name]) for name in sorted(kinds))
@@ -92,6 +98,7 @@ class _RosBag:
         wanted = set(names)
         connections = [item for item in self._reader.connections if item.topic in wanted]
         for connection, received, data in self._reader.messages(connections=connections):
+            data = unpacked(self._packing, data) if self._packing else data
             yield connection.topic, received, self._reader.deserialize(data, connection.msgtype)
 
 
@@ -105,8 +112,16 @@ def _rosbag(path: Path) -> Iterator[Source]:
     typesys = _module(path, "rosbags.typesys", "rosbags")
     # Bags older than ROS 2 Iron do not say how their messages are made up.
     known = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-    with reader.AnyReader([path], default_typestore=known) as opened:
-        yield _RosBag(opened)
+    packing = check_folder_of_bag(path) if path.is_dir() else ""
+    with reader.AnyReader([BoundedPath(path)], default_typestore=known) as opened:
+        check_types(opened.typestore.fielddefs)
+        for one in opened.readers:
+            if hasattr(one, "chunks"):
+                bound_chunks(one)
+            elif packing:
+                # Its own way to unpack messages has no bound.
+                one.storage.metadata = one.storage.metadata._replace(compression_mode=None)
+        yield _RosBag(opened, packing)
 
 
 class _Mcap:
@@ -118,10 +133,10 @@ class _Mcap:
         reader = _module(path, "mcap.reader", "mcap")
         self._errors = _module(path, "mcap.exceptions", "mcap")
         self._make = {
-            True: lambda: reader.SeekingReader(stream, record_size_limit=_MOST_BYTES),
-            False: lambda: reader.NonSeekingReader(stream, record_size_limit=_MOST_BYTES),
+            True: lambda: reader.SeekingReader(stream, record_size_limit=MOST_BYTES),
+            False: lambda: reader.NonSeekingReader(stream, record_size_limit=MOST_BYTES),
         }
-        self._check_chunks()
+        check_mcap(path, stream)
         summary = self._summary()
         self._indexed = summary is not None
         # Sorting costs a third of the time, and most writers close a chunk before they begin the next.
@@ -138,23 +153,6 @@ class _Mcap:
         if len(channels) > _MOST_TOPICS:
             raise BadInputError(f"{shown(path)}: has {len(channels)} topics, expected at most {_MOST_TOPICS}")
         self.topics = tuple(_mcap_topic(name, *channels[name]) for name in sorted(channels))
-
-    def _check_chunks(self) -> None:
-        """Refuse a chunk that unpacks to more than there is room for, whatever it says of itself."""
-        records = _module(self._path, "mcap.stream_reader", "mcap").StreamReader(
-            self._stream, emit_chunks=True, record_size_limit=_MOST_BYTES
-        )
-        try:
-            for record in records.records:
-                if type(record).__name__ == "Chunk" and (size := _unpacked_size(record)) > _MOST_BYTES:
-                    raise BadInputError(
-                        f"{shown(self._path)}: a chunk unpacks to {size / 1e6:.0f} MB or more, expected "
-                        f"at most {_MOST_BYTES / 1e6:.0f}"
-                    )
-        except (self._errors.EndOfFile, struct.error):
-            # How much of a file that ends early can be used is seen when it is read.
-            pass
-        self._stream.seek(0)
 
     def _summary(self) -> Any:
         """The index at the end; None for a file that was not closed."""
@@ -179,17 +177,6 @@ class _Mcap:
             if decode is None:
                 decode = decoders[channel.id] = _decoder(self._path, schema, channel)
             yield channel.topic, message.log_time, decode(message.data)
-
-
-def _unpacked_size(chunk: Any) -> int:
-    """Bytes that a chunk unpacks to, at least, where that is beyond what is allowed."""
-    size = int(chunk.uncompressed_size)
-    if chunk.compression == "zstd":
-        return max(size, int(importlib.import_module("zstandard").frame_content_size(chunk.data)))
-    if chunk.compression == "lz4" and 255 * len(chunk.data) > _MOST_BYTES:
-        unpacker = importlib.import_module("lz4.frame").LZ4FrameDecompressor()
-        return max(size, len(unpacker.decompress(chunk.data, _MOST_BYTES + 1)))
-    return size
 
 
 def _mcap_topic(name: str, schema: Any, channel: Any) -> Topic:
@@ -224,6 +211,7 @@ def _decoder(path: Path, schema: Any, channel: Any) -> Callable[[bytes], Any]:
             store.register(typesys.get_types_from_idl(part))
     else:
         store.register(typesys.get_types_from_msg(text, name))
+    check_types(store.fielddefs)
     read = store.deserialize_ros1 if channel.message_encoding == "ros1" else store.deserialize_cdr
     return lambda data: read(data, name)
 
@@ -231,5 +219,5 @@ def _decoder(path: Path, schema: Any, channel: Any) -> Callable[[bytes], Any]:
 @contextmanager
 def _mcap(path: Path) -> Iterator[Source]:
     _module(path, "mcap.reader", "mcap")
-    with path.open("rb") as stream:
+    with BoundedFile(path) as stream:
         yield _Mcap(path, stream)

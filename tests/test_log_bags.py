@@ -220,7 +220,7 @@ def test_a_chunk_that_unpacks_to_too_much_is_refused(
     (tmp_path / "topics.yaml").write_text("topics:\n  /imu: {gz_radps: gz_radps}\n")
     if index:
         assert len(read_log(path)) == 2000
-    monkeypatch.setattr("calib.log_bags._MOST_BYTES", 100_000)
+    monkeypatch.setattr("calib.log_unpacking.MOST_BYTES", 100_000)
     said = _refused(path)
     assert "a chunk unpacks to" in said or "exceeds" in said
 

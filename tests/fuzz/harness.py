@@ -42,7 +42,10 @@ __all__ = ["CORPUS", "LONGEST_SENTENCE", "TARGETS", "corpus", "main", "only_insi
 
 HERE = Path(__file__).resolve().parent
 CORPUS = HERE / "corpus"
-TARGETS = ("rig_yaml", "board_yaml", "log_csv", "table_csv", "vnl", "filestorage", "serial_frames")
+TARGETS = (
+    "rig_yaml", "board_yaml", "log_csv", "table_csv", "vnl", "filestorage", "serial_frames", "bag_ros1",
+    "bag_ros2", "bag_mcap", "manifest", "sweep_yaml",
+)  # fmt: skip
 LONGEST_SENTENCE = 2000
 _CALIB = Path(calib.__file__).resolve().parent
 _MEMORY_BYTES = 1 << 30
@@ -50,6 +53,14 @@ _SLOWEST_S = 10
 """Of processor time for one input; a machine that stands still for a while is no finding."""
 
 Check = Callable[[bytes, Path], None]
+
+
+class Forbidden(AssertionError):
+    """Something was written, removed or started where nothing may be."""
+
+
+class TooSlow(Exception):
+    """One input has taken more than its time."""
 
 
 def corpus(target: str) -> list[Path]:
@@ -65,6 +76,9 @@ def run(check: Check, data: bytes, folder: Path) -> str:
         try:
             check(data, folder)
         except BadInputError as error:
+            # A reader that refuses whatever its library raises must not hide these.
+            if isinstance(error.__cause__, MemoryError | TooSlow | Forbidden):
+                raise error.__cause__ from None
             sentence = str(error)
             assert sentence and "\n" not in sentence and len(sentence) < LONGEST_SENTENCE, repr(sentence)
             assert sentence.isprintable(), repr(sentence)
@@ -85,21 +99,23 @@ def _hook(event: str, arguments: tuple[Any, ...]) -> None:
         return
     if opens or event in ("os.mkdir", "os.remove", "os.rmdir", "os.truncate", "os.chmod", "os.chown"):
         paths = [arguments[0]]
+        if event in ("os.remove", "os.rmdir") and arguments[1] >= 0:
+            paths = [Path(f"/proc/self/fd/{arguments[1]}", os.fsdecode(arguments[0]))]
     elif event in ("os.rename", "os.link", "os.symlink"):
         paths = [arguments[0], arguments[1]]
     elif event in ("subprocess.Popen", "os.system", "os.exec", "socket.connect"):
-        raise AssertionError(f"reached {event}")
+        raise Forbidden(f"reached {event}")
     for path in paths:
         if isinstance(path, str | bytes | os.PathLike):
             real = Path(os.path.realpath(os.fsdecode(path)))
             ours = real.is_relative_to(_INSIDE[0]) or real == Path(os.devnull) or "__pycache__" in real.parts
             if not ours:
-                raise AssertionError(f"wrote outside: {event} {real}")
+                raise Forbidden(f"wrote outside: {event} {real}")
 
 
 @contextlib.contextmanager
 def only_inside(folder: Path) -> Iterator[None]:
-    """An `AssertionError` where anything is written, removed or started outside of a folder."""
+    """`Forbidden` where anything is written, removed or started outside of a folder."""
     if not _HOOKED:
         sys.addaudithook(_hook)
         _HOOKED.append(True)
@@ -209,7 +225,7 @@ def _fuzz(name: str, target: ModuleType, seconds: int, work: Path, folder: Path)
 
 
 def _too_slow(*_: object) -> None:
-    raise TimeoutError(f"more than {_SLOWEST_S} s of processor time")
+    raise TooSlow(f"more than {_SLOWEST_S} s of processor time")
 
 
 def _guarded(check: Check, data: bytes, folder: Path, findings: dict[str, int], work: Path) -> None:
@@ -317,6 +333,7 @@ def _replay_finding(check: Check, path: Path) -> int:
 def main(target: ModuleType) -> None:
     """The command line of a target."""
     name = Path(str(target.__file__)).stem
+    sys.path.insert(0, str(HERE.parent))
     words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     words.add_argument("input", nargs="?", type=Path)
     words.add_argument("--seconds", type=int, default=60)

@@ -1,0 +1,47 @@
+"""MCAP files with messages of ROS or in JSON, and the file beside them that says what is where."""
+
+from __future__ import annotations
+
+import random
+import sys
+from pathlib import Path
+
+MODULES = ("calib.log_bags", "calib.log_unpacking", "calib.log_messages", "calib.log_topics")
+
+MOST_BYTES = 12_000
+
+RULE = b"\n== topics ==\n"
+"""Between the bag and topics.yaml, where there is one."""
+
+WORDS = (
+    b"\x89MCAP0\r\n", b"json", b"jsonschema", b"ros2msg", b"ros2idl", b"ros1msg", b"cdr", b"ros1", b"zstd",
+    b"lz4", b"{\"properties\": {\"gz_radps\": {}}}", b"gz_radps", b"\"timestamp\"", b"{\"sec\": 1}", b"NaN",
+    b"null", b"1e400", b"[" * 2000, b"float64 x\n", b"float64[] data\n", RULE, b"time: received", b"topics:",
+    b"/imu/data: imu", b"u_px: 'data[0]'", b"data[999999]", b"{field: x, factor: 2}", b"a.b.c",
+)  # fmt: skip
+
+
+def check(data: bytes, folder: Path) -> None:
+    """Rows with a time, or a refusal."""
+    from fuzz.bagbytes import check_bag
+
+    body, rule, topics = data.partition(RULE)
+    path, beside = folder / "log.mcap", folder / "topics.yaml"
+    path.write_bytes(body)
+    beside.unlink(missing_ok=True)
+    if rule:
+        beside.write_bytes(topics)
+    check_bag(path)
+
+
+def mutate(data: bytes, dice: random.Random) -> bytes:
+    """Numbers and parts of the bag or of the file beside it."""
+    from fuzz.bagbytes import damage, mutate_parts
+
+    return mutate_parts(data, RULE, dice) if RULE in data else damage(data, dice)
+
+
+if __name__ == "__main__":
+    from harness import main
+
+    main(sys.modules[__name__])
