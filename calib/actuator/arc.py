@@ -56,9 +56,8 @@ def inlined(function: Callable[Parameters, Returned]) -> Callable[Parameters, Re
     """Leave a scalar function as it is for Python and let compiled callers inline it.
 
     Without the inlining each call copies the coefficients, which costs a third of the speed.
-    `contract` allows fused multiply-add and nothing else, so NaN is still seen.
     """
-    register_jitable(forceinline=True, error_model="numpy", fastmath={"contract"})(function)
+    register_jitable(forceinline=True, error_model="numpy")(function)
     return function
 
 

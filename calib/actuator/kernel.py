@@ -56,9 +56,9 @@ Function = TypeVar("Function", bound=Callable[..., object])
 def _compiled(function: Function) -> Function:
     """Compile at the first call; keep the result on disk where some folder can be written."""
     try:
-        kept = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})(function)
+        kept = njit(cache=True, nogil=True, error_model="numpy")(function)
     except RuntimeError:
-        kept = njit(nogil=True, error_model="numpy", fastmath={"contract"})(function)
+        kept = njit(nogil=True, error_model="numpy")(function)
     return cast(Function, kept)
 
 

@@ -9,6 +9,7 @@ import typer
 from calib import __version__
 from calib.cli.align import align
 from calib.cli.board import board
+from calib.cli.compiling import telling
 from calib.cli.control import control
 from calib.cli.convert import convert
 from calib.cli.diff import diff
@@ -57,24 +58,24 @@ def _options(
     pass
 
 
-app.command("run")(run)
+app.command("run")(telling(run))
 app.command("intrinsics")(intrinsics)
 app.command("extrinsics")(extrinsics)
 app.command("distortion")(distortion)
 app.command("lowpass")(lowpass)
 app.add_typer(imu, name="imu")
-app.command("align")(align)
-app.command("replay")(replay)
+app.command("align")(telling(align))
+app.command("replay")(telling(replay))
 app.add_typer(identify, name="identify")
 app.add_typer(control, name="control")
-app.command("validate")(validate)
+app.command("validate")(telling(validate))
 app.command("firmware")(firmware)
-app.command("fleet")(fleet)
-app.command("sweep")(sweep)
+app.command("fleet")(telling(fleet))
+app.command("sweep")(telling(sweep))
 app.command("record")(record)
 app.command("convert")(convert)
 app.command("board")(board)
-app.command("simulate")(simulate)
+app.command("simulate")(telling(simulate))
 app.command("export")(export_camera)
 app.command("import")(import_camera)
 app.command("report")(report)

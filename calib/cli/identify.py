@@ -9,6 +9,7 @@ import typer
 from typer.core import TyperGroup
 
 from calib.cli.common import FiguresOption, JsonOption, RigOption, document, narrate, progress_bar, say, table
+from calib.cli.compiling import telling
 from calib.errors import EXIT_POOR, UsageError
 
 if TYPE_CHECKING:
@@ -307,6 +308,6 @@ def stiffness(
         say(line)
 
 
-identify.command("logs")(logs)
-identify.command("pump")(pump)
+identify.command("logs")(telling(logs))
+identify.command("pump")(telling(pump))
 identify.command("stiffness")(stiffness)

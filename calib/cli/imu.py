@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import typer
 
+from calib.cli.compiling import telling
 from calib.cli.imu_drift import drift
 from calib.cli.imu_intrinsics import intrinsics
 from calib.cli.imu_static import static
@@ -25,4 +26,4 @@ def _imu() -> None:
 imu.command("static")(static)
 imu.command("intrinsics")(intrinsics)
 imu.command("drift")(drift)
-imu.command("tune")(tune)
+imu.command("tune")(telling(tune))

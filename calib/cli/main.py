@@ -15,6 +15,7 @@ import traceback
 import warnings
 from typing import NoReturn
 
+from calib.compiledfolder import choose_folder
 from calib.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERNAL, EXIT_READER_GONE, CalibError, UsageError
 from calib.files import one_line
 
@@ -25,6 +26,7 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")
 # No plugin of pydantic is wanted, and the search for them loads every installed package's metadata.
 os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
+choose_folder()
 
 _EXIT_INTERRUPTED = 130
 

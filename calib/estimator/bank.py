@@ -22,6 +22,7 @@ from calib.estimator.sensors import SIZE
 
 __all__ = [
     "CORE",
+    "DIAGONAL",
     "POSITIVE",
     "RECORD",
     "STATE",
@@ -37,6 +38,9 @@ __all__ = [
 ]
 
 WIDTH = 20
+R1, R2, R3, R4, R5, R6, R7, R8, R9, R10, R11, R12, R13, R14, R15, R16, R17, R18 = range(20, 380, 20)
+"""Where the rows after the first begin; every product that is written out costs time when compiling."""
+DIAGONAL = WIDTH + 1
 CORE = WIDTH * (SIZE + 1)
 """Covariance and state: what a level is between events."""
 RECORD = WIDTH * (SIZE + 7)
@@ -78,7 +82,7 @@ def copy_level(bank: FloatArray, since: int, to: int) -> None:
         bank[to + k] = bank[since + k]
 
 
-@compiled(contract=True)
+@compiled(inlined=True)
 def _step(bank: FloatArray, at: int, level: FloatArray, k: int, m: int, walk: FloatArray, h: float) -> None:
     o = at & POSITIVE
     a01, a02, a11, a12, a22 = axis_transition(level[k, m, 0], level[k, m, 1], h)
@@ -90,14 +94,14 @@ def _step(bank: FloatArray, at: int, level: FloatArray, k: int, m: int, walk: Fl
     bank[o + STATE + 1] = p + (b01 * v + b02 * a)
     bank[o + STATE + 3], bank[o + STATE + 5] = b11 * v + b12 * a, b22 * a
     for j in range(WIDTH):
-        v, a = bank[o + 2 * WIDTH + j], bank[o + 4 * WIDTH + j]
+        v, a = bank[o + R2 + j], bank[o + R4 + j]
         bank[o + j] += a01 * v + a02 * a
-        bank[o + 2 * WIDTH + j] = a11 * v + a12 * a
-        bank[o + 4 * WIDTH + j] = a22 * a
-        v, a = bank[o + 3 * WIDTH + j], bank[o + 5 * WIDTH + j]
-        bank[o + WIDTH + j] += b01 * v + b02 * a
-        bank[o + 3 * WIDTH + j] = b11 * v + b12 * a
-        bank[o + 5 * WIDTH + j] = b22 * a
+        bank[o + R2 + j] = a11 * v + a12 * a
+        bank[o + R4 + j] = a22 * a
+        v, a = bank[o + R3 + j], bank[o + R5 + j]
+        bank[o + R1 + j] += b01 * v + b02 * a
+        bank[o + R3 + j] = b11 * v + b12 * a
+        bank[o + R5 + j] = b22 * a
     for i in range(6):
         r = o + WIDTH * i
         v, a = bank[r + 2], bank[r + 4]
@@ -110,18 +114,18 @@ def _step(bank: FloatArray, at: int, level: FloatArray, k: int, m: int, walk: Fl
         bank[r + 5] = b22 * a
     for axis in range(2):
         pp, pv, pa, vv, va, aa = axis_noise(level[k, m, 4 * axis + 2], level[k, m, 4 * axis + 3], h)
-        r = o + axis * (WIDTH + 1)
+        r = o + axis * DIAGONAL
         bank[r] += pp
-        bank[r + 2 * WIDTH] += pv
-        bank[r + 4 * WIDTH] += pa
-        bank[r + 2 * WIDTH + 2] += vv
-        bank[r + 4 * WIDTH + 2] += va
-        bank[r + 4 * WIDTH + 4] += aa
+        bank[r + R2] += pv
+        bank[r + R4] += pa
+        bank[r + R2 + 2] += vv
+        bank[r + R4 + 2] += va
+        bank[r + R4 + 4] += aa
     for i in range(5):
         for j in range(i + 1, 6):
             bank[o + WIDTH * i + j] = bank[o + WIDTH * j + i]
     for i in range(6, SIZE):
-        bank[o + (WIDTH + 1) * i] += walk[i - 6] * h
+        bank[o + DIAGONAL * i] += walk[i - 6] * h
 
 
 @compiled()
@@ -132,7 +136,7 @@ def mirror(bank: FloatArray, at: int, i: int) -> None:
         bank[o + WIDTH * i + j] = bank[o + WIDTH * j + i]
 
 
-@compiled()
+@compiled(inlined=True)
 def predict(
     bank: FloatArray, at: int, levels: FloatArray, k: int, m: int, walk: FloatArray, dt: float
 ) -> None:
@@ -150,7 +154,7 @@ def predict(
         _step(bank, at, levels, k, m, walk, dt / parts)
 
 
-@compiled(contract=True)
+@compiled()
 def _spread(bank: FloatArray, to: int, since: int, part: float) -> None:
     """Add part (x - x') (x - x')' to the covariance at `to`, x the state there, x' that at `since`."""
     o, other = to & POSITIVE, since & POSITIVE
@@ -158,19 +162,19 @@ def _spread(bank: FloatArray, to: int, since: int, part: float) -> None:
     for j in range(WIDTH):
         bank[o + CORE + j] = root * (bank[other + STATE + j] - bank[o + STATE + j])
     for i in range(6):
-        r = o + 3 * WIDTH * i
+        r = o + R3 * i
         g0, g1, g2 = bank[o + CORE + 3 * i], bank[o + CORE + 3 * i + 1], bank[o + CORE + 3 * i + 2]
         for j in range(WIDTH):
             d = bank[o + CORE + j]
             bank[r + j] += g0 * d
-            bank[r + WIDTH + j] += g1 * d
-            bank[r + 2 * WIDTH + j] += g2 * d
+            bank[r + R1 + j] += g1 * d
+            bank[r + R2 + j] += g2 * d
     g0 = bank[o + CORE + 18]
     for j in range(WIDTH):
-        bank[o + 18 * WIDTH + j] += g0 * bank[o + CORE + j]
+        bank[o + R18 + j] += g0 * bank[o + CORE + j]
 
 
-@compiled(contract=True)
+@compiled()
 def mix(bank: FloatArray, weights: FloatArray, old: int, new: int, turn: float) -> None:
     """Let the levels start from their mixtures.
 
@@ -246,4 +250,4 @@ def settle_weights(weights: FloatArray, slot: int, log_likelihood: FloatArray, p
     return best + math.log(total)
 
 
-assert SIZE == 19
+assert SIZE == 19 and R18 == 18 * WIDTH

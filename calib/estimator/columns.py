@@ -5,12 +5,31 @@ from __future__ import annotations
 import math
 
 from calib.arrays import FloatArray, IntArray
-from calib.estimator.bank import RECORD, STATE, WIDTH
+from calib.estimator.bank import R1, R2, R3, R4, R5, RECORD, STATE
+from calib.estimator.clock import restart
 from calib.estimator.compiled import compiled
 from calib.estimator.model import axis_noise, axis_transition
 from calib.estimator.sensors import head_position
 
-__all__ = ["write_bank", "write_columns"]
+__all__ = ["begin_row", "write_bank", "write_columns"]
+
+_JUMP_S = (-0.1, 2.0)
+
+
+@compiled()
+def begin_row(
+    stamp: float, last: float, camera_clock: FloatArray, imu_clock: FloatArray, out: FloatArray, row: int
+) -> bool:
+    """Blank a row but for its stamp; whether time jumps there from the last one, where clocks start again."""
+    for k in range(out.shape[1]):
+        out[row, k] = math.nan
+    out[row, 0] = stamp
+    step = stamp - last
+    jumps = step < _JUMP_S[0] or step > _JUMP_S[1]
+    if jumps:
+        restart(camera_clock)
+        restart(imu_clock)
+    return bool(jumps)
 
 
 @compiled()
@@ -49,8 +68,8 @@ def write_bank(
         if m == 0:
             phi_0, length_0 = phi_m, length_m
         phi_m, length_m = phi_m - phi_0, length_m - length_0
-        p, v, a = at, at + 2 * WIDTH, at + 4 * WIDTH
-        q, u, b = at + WIDTH, at + 3 * WIDTH, at + 5 * WIDTH
+        p, v, a = at, at + R2, at + R4
+        q, u, b = at + R1, at + R3, at + R5
         var_p = (
             bank[p] + a01 * a01 * bank[v + 2] + a02 * a02 * bank[a + 4]
             + 2.0 * (a01 * bank[p + 2] + a02 * bank[p + 4] + a01 * a02 * bank[v + 4])

@@ -14,16 +14,18 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from calib.arrays import FloatArray, IntArray
-from calib.estimator.clock import advance, new_clock, restart
+from calib.estimator.clock import advance, new_clock
+from calib.estimator.columns import begin_row
+from calib.estimator.compiled import compiled
 from calib.estimator.driven_kernel import (
     CAMERA,
     HOSES,
     IMU,
     SETTLING_S,
     WORK,
+    copy_state,
     driven_event,
     predict_driven,
 )
@@ -34,7 +36,6 @@ from calib.estimator.setup import OUT, Rows, Setup
 
 __all__ = ["DrivenFilter", "begin_again", "run_driven", "sound", "write_row"]
 
-_JUMP_S = (-0.1, 2.0)
 _LOCKED_OUT = 5.5
 """So many pictures rejected, IMU readings twice so many, and the filter starts again."""
 _BEFORE_S = 0.03
@@ -43,7 +44,7 @@ _NEWEST, _COUNT, _STARTED, _PENDING, _SWITCH, _HOSES = range(6)
 _SWITCHES = 128
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def write_row(x: FloatArray, P: FloatArray, dt: float, radius: float, out: FloatArray) -> None:
     """Mean and deviations a very short time dt after the state into columns 1 to 12."""
     phi, length = x[0] + dt * x[2], x[1] + dt * x[3]
@@ -61,7 +62,7 @@ def write_row(x: FloatArray, P: FloatArray, dt: float, radius: float, out: Float
     out[12] = math.sqrt(max(pp, 1e-18))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def begin_again(
     x: FloatArray, P: FloatArray, x0: FloatArray, P0: FloatArray, view: FloatArray, u: float, v: float
 ) -> bool:
@@ -69,12 +70,12 @@ def begin_again(
     phi, length, found = invert_marker(view, x0[INVOLVED:], u, v, 0.0, x0[1])
     if not (found and 0.2 * x0[1] < length < 3.0 * x0[1]):
         return False
-    x[:], P[:] = x0, P0
+    copy_state(x, P, x0, P0)
     x[0], x[1] = phi, length
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def sound(x: FloatArray, P: FloatArray) -> bool:
     """Whether a state is one."""
     good = abs(x[0]) < 3.0 and 1e-3 < x[1] < 1.0
@@ -84,37 +85,32 @@ def sound(x: FloatArray, P: FloatArray) -> bool:
     return bool(good)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def run_driven(
     t: FloatArray, readings: FloatArray, kinds: IntArray, forces: FloatArray, driven: FloatArray,
     ring_x: FloatArray, ring_P: FloatArray, ring_t: FloatArray, ring_z: FloatArray, ring_kind: IntArray,
     ring_gated: FloatArray, switch_t: FloatArray, switch_g: FloatArray, whole: IntArray, real: FloatArray,
     camera_clock: FloatArray, imu_clock: FloatArray, x0: FloatArray, P0: FloatArray, plant: FloatArray,
     walk: FloatArray, view: FloatArray, constants: FloatArray, noise: FloatArray, radius: float,
-    delay: float, action: float, hoses_sigma: float, out: FloatArray,
+    delay: float, action: float, hoses_sigma: float, z: FloatArray, report: FloatArray, spare: FloatArray,
+    spare_x: FloatArray, spare_P: FloatArray, F: FloatArray, work: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
     """Rows (n,), (n, 5), (n,), (n, 2), (n,) through the ring of the last events; writes `out`.
 
-    `driven` says whether a row's command drives the pumps, `action` how long after it it acts [s].
+    `driven` says whether a row's command drives the pumps, `action` how long after it it acts [s]. What is
+    from `z` (4,) on is scratch.
     """
-    size, n = ring_x.shape
-    work, report, spare = np.zeros(WORK), np.empty(12), np.empty(12)
-    F, spare_x, spare_P = np.zeros((DYNAMIC, INVOLVED)), np.empty(n), np.empty((n, n))
-    z = np.empty(4)
+    size = ring_x.shape[0]
     for row in range(len(t)):
         stamp = t[row]
         flags = 0
-        for k in range(out.shape[1]):
-            out[row, k] = math.nan
-        out[row, 0] = stamp
-        step = stamp - real[_LAST]
-        if step < _JUMP_S[0] or step > _JUMP_S[1]:
-            restart(camera_clock)
-            restart(imu_clock)
+        if begin_row(stamp, real[_LAST], camera_clock, imu_clock, out, row):
             newest = whole[_NEWEST]
             whole[_COUNT], whole[_STARTED], whole[_PENDING] = 0, 0, 0
-            switch_t[:] = -math.inf
-            switch_g[:] = switch_g[whole[_SWITCH]]
+            for k in range(len(switch_t)):
+                switch_t[k] = -math.inf
+                switch_g[k, 0] = switch_g[whole[_SWITCH], 0]
+                switch_g[k, 1] = switch_g[whole[_SWITCH], 1]
             real[_REJECTED], real[_REJECTED_IMU], real[_FIRST] = 0.0, 0.0, stamp
             flags |= 32
         elif math.isnan(real[_LAST]):
@@ -126,7 +122,7 @@ def run_driven(
         if not math.isnan(forces[row, 0]):
             to = (whole[_SWITCH] + 1) % len(switch_t)
             switch_t[to] = max(tick + action, switch_t[whole[_SWITCH]])
-            switch_g[to] = forces[row]
+            switch_g[to, 0], switch_g[to, 1] = forces[row, 0], forces[row, 1]
             whole[_SWITCH] = to
         for turn in range(3):
             if turn == 0:
@@ -147,7 +143,7 @@ def run_driven(
                 if not kinds[row] & 2:
                     continue
                 kind, when = IMU, advance(imu_clock, stamp)
-                z[:3], z[3] = readings[row, 2:], imu_clock[3]
+                z[0], z[1], z[2], z[3] = readings[row, 2], readings[row, 3], readings[row, 4], imu_clock[3]
                 if math.isnan(z[2]) and (math.isnan(z[0]) or math.isnan(z[1])):
                     continue
             newest = whole[_NEWEST]
@@ -165,17 +161,22 @@ def run_driven(
             for i in range(back):
                 to, since = (newest + 1 - i) % size, (newest - i) % size
                 ring_t[to], ring_kind[to] = ring_t[since], ring_kind[since]
-                ring_z[to], ring_gated[to] = ring_z[since], ring_gated[since]
+                for k in range(4):
+                    ring_z[to, k] = ring_z[since, k]
+                for k in range(3):
+                    ring_gated[to, k] = ring_gated[since, k]
             own = (newest + 1 - back) % size
-            ring_t[own], ring_kind[own], ring_z[own] = when, kind, z
+            ring_t[own], ring_kind[own] = when, kind
+            for k in range(4):
+                ring_z[own, k] = z[k]
             # Who holds the head until the log begins is not in the model.
             begin = (kind == CAMERA and (whole[_STARTED] == 0 or whole[_PENDING] == 1)
                      and when > real[_FIRST] + _BEFORE_S)  # fmt: skip
             for i in range(back + 1):
                 now = (newest + 1 - back + i) % size
                 before = (now - 1) % size
-                ring_x[now], ring_P[now] = ring_x[before], ring_P[before]
                 x, P = ring_x[now], ring_P[now]
+                copy_state(x, P, ring_x[before], ring_P[before])
                 if whole[_STARTED] == 1:
                     predict_driven(
                         x, P, ring_t[before], ring_t[now], plant, walk, switch_t, switch_g, whole[_SWITCH],
@@ -191,15 +192,17 @@ def run_driven(
                 if ring_kind[now] == IMU and ring_t[now] < real[_BEGUN] + SETTLING_S:
                     ring_z[now, 0], ring_z[now, 1], ring_gated[now, 1] = math.nan, math.nan, 1.0
                 if whole[_STARTED] == 0 and ring_kind[now] != HOSES:
-                    report[:] = math.nan
-                    ring_gated[now] = 1.0
+                    for k in range(12):
+                        report[k] = math.nan
+                    for k in range(3):
+                        ring_gated[now, k] = 1.0
                     continue
                 driven_event(
                     x, P, ring_kind[now], ring_z[now], plant, view, constants, noise, work, i > 0,
                     report if i == 0 else spare, ring_gated[now],
                 )  # fmt: skip
                 if not sound(x, P):
-                    x[:], P[:] = x0, P0
+                    copy_state(x, P, x0, P0)
                     whole[_PENDING] = 1
                     flags |= 1
             whole[_NEWEST] = (newest + 1) % size
@@ -225,13 +228,13 @@ def run_driven(
         if whole[_STARTED] == 0:
             flags |= 64
         if ahead > 1e-3 and whole[_STARTED] == 1:
-            spare_x[:], spare_P[:] = ring_x[here], ring_P[here]
+            copy_state(spare_x, spare_P, ring_x[here], ring_P[here])
             predict_driven(
                 spare_x, spare_P, ring_t[here], stamp, plant, walk, switch_t, switch_g, whole[_SWITCH], F,
                 work,
             )  # fmt: skip
             if not sound(spare_x, spare_P):
-                spare_x[:], spare_P[:] = x0, P0
+                copy_state(spare_x, spare_P, x0, P0)
             write_row(spare_x, spare_P, 0.0, radius, out[row])
         else:
             write_row(ring_x[here], ring_P[here], min(max(ahead, -0.02), 1e-3), radius, out[row])
@@ -256,7 +259,11 @@ class DrivenFilter:
         self._imu_clock = new_clock(setup.imu_period_s)
         self._start = drive.start(setup)
         self._x[0], self._P[0] = self._start
-        self._numbers, self._walk = drive.numbers(), drive.walk(setup)
+        self._numbers, self._walk, self._noise = drive.numbers(), drive.walk(setup), drive.noise(setup)
+        self._scratch = (
+            np.empty(4), np.empty(12), np.empty(12), np.empty(n), np.empty((n, n)),
+            np.zeros((DYNAMIC, INVOLVED)), np.zeros(WORK),
+        )  # fmt: skip
 
     def run(self, rows: Rows, pwm: FloatArray) -> FloatArray:
         """Estimates (n, len(OUT)) of rows with commands (n, 2); call again with the rows that follow."""
@@ -267,8 +274,8 @@ class DrivenFilter:
             rows.t_s, rows.readings, rows.kinds, commands(drive, pwm), driven, self._x, self._P, self._t,
             self._z, self._kind, self._gated, self._switch_t, self._switch_g, self._whole, self._real,
             self._camera_clock, self._imu_clock, *self._start, self._numbers, self._walk, setup.view,
-            np.array([setup.gravity_mps2, setup.lever_across_m]), setup.noise, setup.bellows_radius_m,
-            self._delay, drive.pump.delay_ticks * drive.pump.tick_s, drive.sigma[1], out,
+            np.array([setup.gravity_mps2, setup.lever_across_m]), self._noise, setup.bellows_radius_m,
+            self._delay, drive.pump.delay_ticks * drive.pump.tick_s, drive.sigma[1], *self._scratch, out,
         )  # fmt: skip
         return out
 

@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
 from calib.arrays import FloatArray
+from calib.estimator.compiled import compiled
 from calib.estimator.driven_model import DRIVEN, DYNAMIC, INVOLVED, accelerations, carry, jacobian
 from calib.estimator.rounding import update_terms
 from calib.estimator.sensors import SIZE, accelerometer, gyroscope, marker
@@ -24,6 +23,7 @@ __all__ = [
     "LONGEST_S",
     "SETTLING_S",
     "WORK",
+    "copy_state",
     "cut",
     "driven_event",
     "measure",
@@ -51,7 +51,16 @@ _SHIFT = INVOLVED - 6
 """The sensors' quantities stand this much further on than in `sensors`."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@compiled()
+def copy_state(to_x: FloatArray, to_P: FloatArray, x: FloatArray, P: FloatArray) -> None:
+    """Copy a state and its covariance."""
+    for i in range(x.shape[0]):
+        to_x[i] = x[i]
+        for j in range(x.shape[0]):
+            to_P[i, j] = P[i, j]
+
+
+@compiled()
 def _update(x: FloatArray, P: FloatArray, innovation: float, S: float, p: FloatArray) -> None:
     """Update in place by an innovation with variance S; p = P H' is used up."""
     n = x.shape[0]
@@ -74,7 +83,7 @@ def _update(x: FloatArray, P: FloatArray, innovation: float, S: float, p: FloatA
             P[i, j] -= gain * p[j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@compiled()
 def _project(P: FloatArray, H: FloatArray, p: FloatArray) -> float:
     """p = P H' and H P H'."""
     n = H.shape[0]
@@ -91,7 +100,7 @@ def _project(P: FloatArray, H: FloatArray, p: FloatArray) -> float:
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def cut(
     begin: float, end: float, switch_t: FloatArray, switch_g: FloatArray, last: int, segments: FloatArray
 ) -> int:
@@ -122,7 +131,7 @@ def cut(
         back -= 1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def predict_driven(
     x: FloatArray, P: FloatArray, begin: float, end: float, plant: FloatArray, walk: FloatArray,
     switch_t: FloatArray, switch_g: FloatArray, last: int, F: FloatArray, work: FloatArray,
@@ -141,7 +150,7 @@ def predict_driven(
             x[i] = moved[i]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def _spread_out(h: FloatArray, H: FloatArray) -> None:
     """A gradient (19,) by head and sensors as one by the driven state; accelerations are left out."""
     for k in range(4, INVOLVED):
@@ -152,7 +161,7 @@ def _spread_out(h: FloatArray, H: FloatArray) -> None:
         H[k + _SHIFT] = h[k]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def measure(
     kind: int, x: FloatArray, P: FloatArray, plant: FloatArray, view: FloatArray, constants: FloatArray,
     noise: FloatArray, stamp: float, H: FloatArray, out: FloatArray, work: FloatArray,
@@ -199,7 +208,7 @@ def measure(
     out[5] = noise[4] * noise[4] + state[4] * state[4] * stamp
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def _chi_square(
     P: FloatArray, H: FloatArray, p: FloatArray, first: int, e: FloatArray, r: FloatArray, more: float
 ) -> tuple[float, float, float]:
@@ -214,7 +223,7 @@ def _chi_square(
     return total, math.sqrt(a), math.sqrt(c)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def driven_event(
     x: FloatArray, P: FloatArray, kind: int, z: FloatArray, plant: FloatArray, view: FloatArray,
     constants: FloatArray, noise: FloatArray, work: FloatArray, again: bool, report: FloatArray,
@@ -231,12 +240,14 @@ def driven_event(
     again : whether the event is done once more; then `gated` (3,) holds.
     """
     if not again:
-        report[:] = math.nan
+        for k in range(report.shape[0]):
+            report[k] = math.nan
     log_l = 0.0
     stamp = max(noise[6 if kind == CAMERA else 7] ** 2, z[3])
     H, p, out, e = work[2:5], work[0], work[5], work[10]
     if kind == HOSES:
-        p[:] = P[:, 13]
+        for k in range(x.shape[0]):
+            p[k] = P[k, 13]
         _update(x, P, -x[13], P[13, 13] + z[0] * z[0], p)
     elif kind == CAMERA:
         measure(kind, x, P, plant, view, constants, noise, stamp, H, out, work)
@@ -250,7 +261,8 @@ def driven_event(
             report[8] = gated[0]
         if gated[0] == 0.0:
             x0 = work[1]
-            x0[:] = x
+            for k in range(x.shape[0]):
+                x0[k] = x[k]
             for k in range(2):
                 spread = _project(P, H[k], p)
                 moved = 0.0
@@ -277,7 +289,8 @@ def driven_event(
                 gated[2] = 0.0 if report[2] < noise[10] else 1.0
                 report[10] = gated[2]
         x0 = work[1]
-        x0[:] = x
+        for k in range(x.shape[0]):
+            x0[k] = x[k]
         for order in range(3):
             k = 2 if order == 0 else order - 1
             if gated[2 if k == 2 else 1] != 0.0:

@@ -18,11 +18,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from calib.actuator.dynamics import Coefficients, rates
 from calib.actuator.pump import PumpCoefficients, advance
 from calib.arrays import FloatArray
+from calib.estimator.compiled import compiled
 from calib.estimator.sensors import SENSOR
 
 __all__ = [
@@ -68,12 +68,12 @@ _NUDGE = np.array([1e-6, 1e-7, 1e-5, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1
                    1e-5, 1e-5, 1e-5, 1e-5, 1e-5, 1e-5, 1e-5, 1e-7, 1e-5, 1e-5, 1e-5])  # fmt: skip
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def _factor(deviation: float) -> float:
     return max(1.0 + deviation, 0.1)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def _coefficients(plant: FloatArray, x: FloatArray) -> Coefficients:
     scale = _factor(x[12])
     return Coefficients(
@@ -85,7 +85,7 @@ def _coefficients(plant: FloatArray, x: FloatArray) -> Coefficients:
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@compiled()
 def flow(plant: FloatArray, x: FloatArray, segments: FloatArray, count: int, out: FloatArray) -> None:
     """State of the moving part (12,) after the segments.
 
@@ -134,50 +134,51 @@ def flow(plant: FloatArray, x: FloatArray, segments: FloatArray, count: int, out
     out[6], out[7], out[8], out[9], out[10], out[11] = x1, x2, f1, f2, d1, d2
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def jacobian(
     plant: FloatArray, x: FloatArray, segments: FloatArray, count: int, out: FloatArray, F: FloatArray
 ) -> None:
-    """`flow` into out (12,), and its derivative F (12, 23)."""
+    """`flow` into out[:12], and its derivative F (12, 23).
+
+    Twelve more entries of out are scratch; x is nudged on the way and then as before.
+    """
     flow(plant, x, segments, count, out)
-    near, moved = np.empty(INVOLVED), np.empty(DYNAMIC)
-    near[:] = x[:INVOLVED]
+    moved = out[DYNAMIC:]
     for k in range(INVOLVED):
-        step = _NUDGE[k]
-        near[k] = x[k] + step
-        flow(plant, near, segments, count, moved)
-        near[k] = x[k]
+        step, own = _NUDGE[k], x[k]
+        x[k] = own + step
+        flow(plant, x, segments, count, moved)
+        x[k] = own
         for i in range(DYNAMIC):
             F[i, k] = (moved[i] - out[i]) / step
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def _accelerate(plant: FloatArray, x: FloatArray) -> tuple[float, float]:
     c = _coefficients(plant, x)
     ddl, ddphi, _, _ = rates(c, x[1], x[0], x[3], x[2], x[4], x[5], x[8] + x[10], x[9] + x[11])
     return ddphi, ddl
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def accelerations(
     plant: FloatArray, x: FloatArray, by_phi: FloatArray, by_length: FloatArray
 ) -> tuple[float, float]:
-    """ddphi [rad/s^2], ddl [m/s^2] of a state and their gradients (23,), written to."""
+    """ddphi [rad/s^2], ddl [m/s^2] of a state and their gradients (23,), written to; x stays."""
     ddphi, ddl = _accelerate(plant, x)
-    near = np.empty(INVOLVED)
-    near[:] = x[:INVOLVED]
     for k in range(INVOLVED):
         by_phi[k], by_length[k] = 0.0, 0.0
         if k == 6 or k == 7 or 15 <= k <= 18 or k >= 21:
             continue
-        near[k] = x[k] + _NUDGE[k]
-        a, b = _accelerate(plant, near)
-        near[k] = x[k]
+        own = x[k]
+        x[k] = own + _NUDGE[k]
+        a, b = _accelerate(plant, x)
+        x[k] = own
         by_phi[k], by_length[k] = (a - ddphi) / _NUDGE[k], (b - ddl) / _NUDGE[k]
     return ddphi, ddl
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@compiled()
 def carry(P: FloatArray, F: FloatArray, noise: FloatArray, dt: float, FP: FloatArray) -> None:
     """P = [F 0; 0 1] P [F 0; 0 1]' + noise dt, in place.
 

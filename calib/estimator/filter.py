@@ -19,8 +19,8 @@ import numpy as np
 
 from calib.arrays import FloatArray, IntArray
 from calib.estimator.bank import RECORD, STATE, WIDTH, copy_level, get, new_bank, predict, put
-from calib.estimator.clock import CLOCK_SIZE, advance, new_clock, restart
-from calib.estimator.columns import write_bank
+from calib.estimator.clock import CLOCK_SIZE, advance, new_clock
+from calib.estimator.columns import begin_row, write_bank
 from calib.estimator.compiled import compiled
 from calib.estimator.expect import TOLD
 from calib.estimator.kernel import CAMERA, IMU, REPORT, TRACE, event
@@ -30,12 +30,12 @@ from calib.estimator.setup import OUT, Rows, Setup
 __all__ = ["Filter", "run_filter", "starting_state"]
 
 _SILENT_S = 0.5
-_JUMP_S = (-0.1, 2.0)
 _LOCKED_OUT_S = 0.5
 _KNOWN_M = 0.05
 """A length with a larger deviation than this is as good as unknown."""
 _LAST, _CAMERA_SEEN, _IMU_SEEN, _REJECTED_SINCE, _GYRO_REJECTED_SINCE = range(5)
 _NEWEST, _COUNT, _CAMERA_STARTED, _PENDING = range(4)
+_PHI, _LENGTH = 0, 1
 
 
 @compiled()
@@ -91,10 +91,10 @@ def _mend(bank: FloatArray, slot: int, count: int, head: FloatArray, head_sigma:
         at = (slot * count + m) * RECORD
         x = at + STATE
         if bank[at] > 1.0:
-            _hold(bank, at, 0, head[0], 0.7)
+            _hold(bank, at, int(_PHI), head[0], 0.7)
             flags |= 8
         if bank[at + WIDTH + 1] > 2.25 * head_sigma[1] * head_sigma[1]:
-            _hold(bank, at, 1, head[1], head_sigma[1])
+            _hold(bank, at, int(_LENGTH), head[1], head_sigma[1])
             flags |= 8
         bad = 0 if abs(bank[x]) < 3.0 and 1e-3 < bank[x + 1] < 1.0 else 1
         for i in range(SIZE):
@@ -132,13 +132,7 @@ def run_filter(
     for row in range(len(t)):
         stamp = t[row]
         flags = 0
-        for k in range(out.shape[1]):
-            out[row, k] = math.nan
-        out[row, 0] = stamp
-        step = stamp - real[_LAST]
-        if step < _JUMP_S[0] or step > _JUMP_S[1]:
-            restart(camera_clock)
-            restart(imu_clock)
+        if begin_row(stamp, real[_LAST], camera_clock, imu_clock, out, row):
             newest = whole[_NEWEST]
             _reset_head(bank, weights, newest, head, head_sigma)
             whole[_COUNT], whole[_CAMERA_STARTED], whole[_PENDING] = 0, 0, 0

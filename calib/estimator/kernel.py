@@ -28,10 +28,28 @@ import math
 
 import numpy as np
 
-from calib.arrays import FloatArray
+from calib.arrays import FloatArray, IntArray
 from calib.estimator.bank import (
     CORE,
     POSITIVE,
+    R1,
+    R2,
+    R3,
+    R4,
+    R5,
+    R6,
+    R7,
+    R8,
+    R9,
+    R10,
+    R11,
+    R12,
+    R13,
+    R14,
+    R15,
+    R16,
+    R17,
+    R18,
     RECORD,
     STATE,
     WIDTH,
@@ -110,6 +128,7 @@ TRACE = 40
 _Q0, _Q1, _Q2 = CORE + 3 * WIDTH, CORE + 4 * WIDTH, CORE + 5 * WIDTH
 """Rows of a record: P H' / sqrt(S) of each reading, and the same with zeros for what is only considered."""
 
+_FIRST, _SECOND, _THIRD = range(3)
 _TURN = 2.0 * math.pi
 _MARGIN_PX2 = 0.25
 """Added to the variance for gating: half a pixel of motion that no level expects is no outlier."""
@@ -155,7 +174,13 @@ def _judge(
         report[10] = gated[row, 2]
 
 
-@compiled(contract=True)
+@compiled()
+def _gains(bank: FloatArray, p: int) -> tuple[float, float, float]:
+    """What the three readings make of one quantity."""
+    return bank[p], bank[p + R1], bank[p + R2]
+
+
+@compiled(inlined=True)
 def _settle(bank: FloatArray, at: int, move0: float, move1: float, move2: float) -> None:
     """Take the rows of three readings from covariance and state; p_i p_j is the same on both sides of P.
 
@@ -163,68 +188,68 @@ def _settle(bank: FloatArray, at: int, move0: float, move1: float, move2: float)
     """
     o = at & POSITIVE
     p = o + P0
-    a0, a1, a2 = bank[p], bank[p + WIDTH], bank[p + 2 * WIDTH]
-    b0, b1, b2 = bank[p + 1], bank[p + WIDTH + 1], bank[p + 2 * WIDTH + 1]
-    c0, c1, c2 = bank[p + 2], bank[p + WIDTH + 2], bank[p + 2 * WIDTH + 2]
-    d0, d1, d2 = bank[p + 3], bank[p + WIDTH + 3], bank[p + 2 * WIDTH + 3]
-    e0, e1, e2 = bank[p + 4], bank[p + WIDTH + 4], bank[p + 2 * WIDTH + 4]
-    f0, f1, f2 = bank[p + 5], bank[p + WIDTH + 5], bank[p + 2 * WIDTH + 5]
+    a0, a1, a2 = _gains(bank, p)
+    b0, b1, b2 = _gains(bank, p + 1)
+    c0, c1, c2 = _gains(bank, p + 2)
+    d0, d1, d2 = _gains(bank, p + 3)
+    e0, e1, e2 = _gains(bank, p + 4)
+    f0, f1, f2 = _gains(bank, p + 5)
     for j in range(WIDTH):
         p0, p1, p2 = bank[o + P0 + j], bank[o + P1 + j], bank[o + P2 + j]
         q0, q1, q2 = bank[o + _Q0 + j], bank[o + _Q1 + j], bank[o + _Q2 + j]
         bank[o + j] -= a0 * p0 + a1 * p1 + a2 * p2
-        bank[o + WIDTH + j] -= b0 * p0 + b1 * p1 + b2 * p2
-        bank[o + 2 * WIDTH + j] -= c0 * p0 + c1 * p1 + c2 * p2
-        bank[o + 3 * WIDTH + j] -= d0 * p0 + d1 * p1 + d2 * p2
-        bank[o + 4 * WIDTH + j] -= e0 * p0 + e1 * p1 + e2 * p2
-        bank[o + 5 * WIDTH + j] -= f0 * p0 + f1 * p1 + f2 * p2
+        bank[o + R1 + j] -= b0 * p0 + b1 * p1 + b2 * p2
+        bank[o + R2 + j] -= c0 * p0 + c1 * p1 + c2 * p2
+        bank[o + R3 + j] -= d0 * p0 + d1 * p1 + d2 * p2
+        bank[o + R4 + j] -= e0 * p0 + e1 * p1 + e2 * p2
+        bank[o + R5 + j] -= f0 * p0 + f1 * p1 + f2 * p2
         bank[o + STATE + j] += move0 * q0 + move1 * q1 + move2 * q2
-    a0, a1, a2 = bank[p + 6], bank[p + WIDTH + 6], bank[p + 2 * WIDTH + 6]
-    b0, b1, b2 = bank[p + 7], bank[p + WIDTH + 7], bank[p + 2 * WIDTH + 7]
-    c0, c1, c2 = bank[p + 8], bank[p + WIDTH + 8], bank[p + 2 * WIDTH + 8]
-    d0, d1, d2 = bank[p + 9], bank[p + WIDTH + 9], bank[p + 2 * WIDTH + 9]
-    e0, e1, e2 = bank[p + 10], bank[p + WIDTH + 10], bank[p + 2 * WIDTH + 10]
-    f0, f1, f2 = bank[p + 13], bank[p + WIDTH + 13], bank[p + 2 * WIDTH + 13]
-    g0, g1, g2 = bank[p + 17], bank[p + WIDTH + 17], bank[p + 2 * WIDTH + 17]
-    h0, h1, h2 = bank[p + 18], bank[p + WIDTH + 18], bank[p + 2 * WIDTH + 18]
+    a0, a1, a2 = _gains(bank, p + 6)
+    b0, b1, b2 = _gains(bank, p + 7)
+    c0, c1, c2 = _gains(bank, p + 8)
+    d0, d1, d2 = _gains(bank, p + 9)
+    e0, e1, e2 = _gains(bank, p + 10)
+    f0, f1, f2 = _gains(bank, p + 13)
+    g0, g1, g2 = _gains(bank, p + 17)
+    h0, h1, h2 = _gains(bank, p + 18)
     for j in range(4, WIDTH):
         p0, p1, p2 = bank[o + P0 + j], bank[o + P1 + j], bank[o + P2 + j]
-        bank[o + 6 * WIDTH + j] -= a0 * p0 + a1 * p1 + a2 * p2
-        bank[o + 7 * WIDTH + j] -= b0 * p0 + b1 * p1 + b2 * p2
-        bank[o + 8 * WIDTH + j] -= c0 * p0 + c1 * p1 + c2 * p2
-        bank[o + 9 * WIDTH + j] -= d0 * p0 + d1 * p1 + d2 * p2
-        bank[o + 10 * WIDTH + j] -= e0 * p0 + e1 * p1 + e2 * p2
-        bank[o + 13 * WIDTH + j] -= f0 * p0 + f1 * p1 + f2 * p2
-        bank[o + 17 * WIDTH + j] -= g0 * p0 + g1 * p1 + g2 * p2
-        bank[o + 18 * WIDTH + j] -= h0 * p0 + h1 * p1 + h2 * p2
-    a0, a1, a2 = bank[p + 11], bank[p + WIDTH + 11], bank[p + 2 * WIDTH + 11]
-    b0, b1, b2 = bank[p + 12], bank[p + WIDTH + 12], bank[p + 2 * WIDTH + 12]
-    c0, c1, c2 = bank[p + 14], bank[p + WIDTH + 14], bank[p + 2 * WIDTH + 14]
-    d0, d1, d2 = bank[p + 15], bank[p + WIDTH + 15], bank[p + 2 * WIDTH + 15]
-    e0, e1, e2 = bank[p + 16], bank[p + WIDTH + 16], bank[p + 2 * WIDTH + 16]
+        bank[o + R6 + j] -= a0 * p0 + a1 * p1 + a2 * p2
+        bank[o + R7 + j] -= b0 * p0 + b1 * p1 + b2 * p2
+        bank[o + R8 + j] -= c0 * p0 + c1 * p1 + c2 * p2
+        bank[o + R9 + j] -= d0 * p0 + d1 * p1 + d2 * p2
+        bank[o + R10 + j] -= e0 * p0 + e1 * p1 + e2 * p2
+        bank[o + R13 + j] -= f0 * p0 + f1 * p1 + f2 * p2
+        bank[o + R17 + j] -= g0 * p0 + g1 * p1 + g2 * p2
+        bank[o + R18 + j] -= h0 * p0 + h1 * p1 + h2 * p2
+    a0, a1, a2 = _gains(bank, p + 11)
+    b0, b1, b2 = _gains(bank, p + 12)
+    c0, c1, c2 = _gains(bank, p + 14)
+    d0, d1, d2 = _gains(bank, p + 15)
+    e0, e1, e2 = _gains(bank, p + 16)
     for j in range(4, WIDTH):
         p0, p1, p2 = bank[o + _Q0 + j], bank[o + _Q1 + j], bank[o + _Q2 + j]
-        bank[o + 11 * WIDTH + j] -= a0 * p0 + a1 * p1 + a2 * p2
-        bank[o + 12 * WIDTH + j] -= b0 * p0 + b1 * p1 + b2 * p2
-        bank[o + 14 * WIDTH + j] -= c0 * p0 + c1 * p1 + c2 * p2
-        bank[o + 15 * WIDTH + j] -= d0 * p0 + d1 * p1 + d2 * p2
-        bank[o + 16 * WIDTH + j] -= e0 * p0 + e1 * p1 + e2 * p2
+        bank[o + R11 + j] -= a0 * p0 + a1 * p1 + a2 * p2
+        bank[o + R12 + j] -= b0 * p0 + b1 * p1 + b2 * p2
+        bank[o + R14 + j] -= c0 * p0 + c1 * p1 + c2 * p2
+        bank[o + R15 + j] -= d0 * p0 + d1 * p1 + d2 * p2
+        bank[o + R16 + j] -= e0 * p0 + e1 * p1 + e2 * p2
 
 
-@compiled(contract=True)
+@compiled()
 def _leave(
     trace: FloatArray, row: int, used: int, bank: FloatArray, p: int, told: FloatArray, m: int, H: int,
-    places: tuple[int, ...], move: float, scale: float,
+    places: IntArray, move: float, scale: float,
 ) -> None:  # fmt: skip
     """Write what a reading does to the trace; `scale` is 1 / sqrt(S), which row and move have in them."""
     for j in range(SIZE):
         trace[row, used, j], trace[row, used, SIZE + j] = 0.0, bank[p + j] * scale
-    for k, place in enumerate(places):
-        trace[row, used, place] = told[m, H + k]
+    for k in range(len(places)):
+        trace[row, used, places[k]] = told[m, H + k]
     trace[row, used, 2 * SIZE], trace[row, used, 2 * SIZE + 1] = move * scale, scale * scale
 
 
-@compiled(contract=True)
+@compiled(inlined=True)
 def _absorb_camera(
     bank: FloatArray, at: int, noise: FloatArray, told: FloatArray, m: int, trace: FloatArray, row: int
 ) -> None:
@@ -247,13 +272,13 @@ def _absorb_camera(
         bank[o + P0 + j], bank[o + P1 + j], bank[o + P2 + j] = p0, p1, 0.0
         bank[o + _Q0 + j], bank[o + _Q1 + j], bank[o + _Q2 + j] = free * p0, free * p1, 0.0
     if trace.shape[0]:
-        _leave(trace, row, 0, bank, o + P0, told, m, H_U, SEEN, move0, scale0)
-        _leave(trace, row, 1, bank, o + P1, told, m, H_V, SEEN, move1, scale1)
+        _leave(trace, row, int(_FIRST), bank, o + P0, told, m, int(H_U), SEEN, move0, scale0)
+        _leave(trace, row, int(_SECOND), bank, o + P1, told, m, int(H_V), SEEN, move1, scale1)
         trace[row, 2, TRACE - 1] = 0.0
     _settle(bank, at, move0, move1, 0.0)
 
 
-@compiled(contract=True)
+@compiled(inlined=True)
 def _absorb_imu(
     bank: FloatArray, at: int, told: FloatArray, m: int, gated: FloatArray, trace: FloatArray, row: int
 ) -> None:
@@ -287,9 +312,9 @@ def _absorb_imu(
         bank[o + P0 + j], bank[o + P1 + j], bank[o + P2 + j] = p0, p1, p2
         bank[o + _Q0 + j], bank[o + _Q1 + j], bank[o + _Q2 + j] = free * p0, free * p1, free * p2
     if trace.shape[0]:
-        _leave(trace, row, 0, bank, o + P2, told, m, H_Z, TURNED, move2, scale2)
-        _leave(trace, row, 1, bank, o + P0, told, m, H_X, FELT_X, move0, scale0)
-        _leave(trace, row, 2, bank, o + P1, told, m, H_Y, FELT_Y, move1, scale1)
+        _leave(trace, row, int(_FIRST), bank, o + P2, told, m, int(H_Z), TURNED, move2, scale2)
+        _leave(trace, row, int(_SECOND), bank, o + P0, told, m, int(H_X), FELT_X, move0, scale0)
+        _leave(trace, row, int(_THIRD), bank, o + P1, told, m, int(H_Y), FELT_Y, move1, scale1)
     _settle(bank, at, move0, move1, move2)
 
 
@@ -319,7 +344,7 @@ def mixes(kind: int, since: float) -> bool:
     return bool(kind == CAMERA or (kind != 0 and since > MIXED_S))
 
 
-@compiled()
+@compiled(inlined=True)
 def event(
     bank: FloatArray, weights: FloatArray, old: int, new: int, kind: int, z: FloatArray, row: int, dt: float,
     switch_hz: float, levels: FloatArray, k: int, walk: FloatArray, view: FloatArray, constants: FloatArray,

@@ -116,7 +116,7 @@ class Kinematic:
         return np.array([level.numbers() for level in self.levels]), np.array(self.sensor_walk) ** 2
 
 
-@compiled()
+@compiled(inlined=True)
 def axis_transition(c: float, b: float, h: float) -> tuple[float, float, float, float, float]:
     """Entries f01, f02, f11, f12, f22 of the transition of (p, v, a) over h [s]; c = 1/T_a, b = 1/T_v."""
     h2, h3 = 0.5 * h * h, h * h * h / 6.0
@@ -129,7 +129,7 @@ def axis_transition(c: float, b: float, h: float) -> tuple[float, float, float, 
     )
 
 
-@compiled()
+@compiled(inlined=True)
 def axis_noise(q: float, walk: float, h: float) -> tuple[float, float, float, float, float, float]:
     """Entries pp, pv, pa, vv, va, aa of the noise over h [s] for the densities q of w_a, walk of w_p."""
     h2 = h * h

@@ -190,7 +190,7 @@ def transition(level: FloatArray, dt: float, F: FloatArray) -> None:
                 F[a, j] = f22 * F[a, j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, nogil=True, error_model="numpy")
 def _undo_step(y: FloatArray, level: FloatArray, h: float) -> None:
     """F' y for a step of h, in place."""
     for axis in range(2):
@@ -200,7 +200,7 @@ def _undo_step(y: FloatArray, level: FloatArray, h: float) -> None:
         y[axis + 4] = f02 * p + f12 * v + f22 * a
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, nogil=True, error_model="numpy")
 def backward(
     t: FloatArray, level: FloatArray, trace: FloatArray, kept_x: FloatArray, kept_P: FloatArray, spread: bool
 ) -> None:

@@ -39,7 +39,7 @@ def wrapped(angle_rad: FloatArray) -> FloatArray:
 
 
 # A product and a sum may be rounded once; nothing else is loosened.
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, nogil=True)
 def advance(
     phi: float, integral: float, phi_acc: float, w: float, dt: float, Kp: float, Ki: float
 ) -> tuple[float, float]:
@@ -51,7 +51,7 @@ def advance(
     return phi + (dt * (Kp + Ki * dt) * e + turned), integral + Ki * dt * e
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, nogil=True)
 def _run(
     t: FloatArray,
     phi_acc: FloatArray,
@@ -76,7 +76,7 @@ def _run(
     return -1
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, nogil=True)
 def _run_many(
     t: FloatArray,
     phi_acc: FloatArray,

@@ -103,7 +103,7 @@ class Tuning:
     block_s: float
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, nogil=True)
 def _squares(
     t: FloatArray,
     phi_acc: FloatArray,

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from calib.estimator.bank import new_bank, put
-from calib.estimator.columns import write_bank, write_columns
+from calib.estimator.clock import new_clock
+from calib.estimator.columns import begin_row, write_bank, write_columns
 from calib.estimator.model import Kinematic
 from calib.estimator.sensors import SIZE
 from calib.estimator.setup import OUT
@@ -30,3 +31,15 @@ def test_a_bank_gives_the_moments_of_its_mixture() -> None:
     write_columns(mean[None], V[None], np.array([1]), r, again)
     np.testing.assert_allclose(again[1, 1:13], out[0, 1:13])
     assert not again[0].any()
+
+
+def test_a_row_begins_blank_and_a_jump_of_time_starts_the_clocks_again() -> None:
+    out = np.ones((2, 5))
+    for step, jumps in ((0.01, False), (-0.05, False), (1.9, False), (-0.2, True), (3600.0, True)):
+        camera, imu = new_clock(0.016), new_clock(0.01)
+        camera[0] = imu[0] = 1.0
+        assert begin_row(7.0 + step, 7.0, camera, imu, out, 1) is jumps
+        assert out[1, 0] == 7.0 + step
+        assert np.isnan(out[1, 1:]).all()
+        assert camera[0] == imu[0] == (0.0 if jumps else 1.0)
+    assert not begin_row(7.0, np.nan, new_clock(0.016), new_clock(0.01), out, 0)

@@ -73,9 +73,9 @@ def test_it_moves_as_the_simulation_does(pump: Pump) -> None:
 def test_the_jacobian_agrees_with_central_differences(pump: Pump, seed: int) -> None:
     plant, x = Drive(pump=pump).numbers(), some_state(seed)
     segments = np.array([[0.004, 1.5, 0.2], [0.003, 1.2, 0.1]])
-    out, F = np.empty(DYNAMIC), np.empty((DYNAMIC, INVOLVED))
+    out, F = np.empty(2 * DYNAMIC), np.empty((DYNAMIC, INVOLVED))
     jacobian(plant, x, segments, 2, out, F)
-    np.testing.assert_array_equal(out, stepped(plant, x, segments))
+    np.testing.assert_array_equal(out[:DYNAMIC], stepped(plant, x, segments))
     central = np.empty_like(F)
     for k in range(INVOLVED):
         h = 1e-4 if k != 1 and k != 19 else 1e-6
