@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from calib.arrays import FloatArray
 from calib.errors import BadInputError
-from calib.estimator.align import Alignment, LogCheck, Settings
+from calib.estimator.align import Alignment, LogCheck, Settings, rest_angle
 from calib.estimator.align_start import AlignLog
 from calib.estimator.align_verdict import AlignJudgement
 from calib.estimator.noise import grid_px
@@ -22,7 +23,7 @@ from calib.rig import Geometry, Rig, finite_or_none
 from calib.rig_align import Align, AlignCovariance, AlignLogCheck
 from calib.sections import camera_from_section, current_plane
 
-__all__ = ["PRIOR", "align_section", "read_align_log", "settings_from_rig"]
+__all__ = ["PRIOR", "align_section", "read_align_log", "settings_from_rig", "with_drawn_marker"]
 
 PRIOR: dict[str, tuple[float, float]] = {
     "gyro_bias_radps": (0.0, 0.1),
@@ -41,12 +42,16 @@ PRIOR: dict[str, tuple[float, float]] = {
 }
 """Value and deviation of what is known before: data sheets, a ruler, and a printed board's scale."""
 
-_LEAST_SHIFT_M = 2e-5
+_LEAST_SHIFT_M = 1e-5
 _LEAST_BIAS_MPS2 = 0.02
 _LEAST_SCALE = 5e-4
 _FASTEST_RADPS = 45.0
 _ABOUT_G = (4.0, 25.0)
 _IN_G = (0.85, 1.15)
+_DOUBT = {True: 0.02, False: 0.1}
+"""Probability that the marker is not where its drawing says: with one written down, and without."""
+_ELSEWHERE_M = 3e-3
+_MARKER = SENSOR.index("marker_offset_m")
 
 
 def _column(log: Log, name: str) -> FloatArray:
@@ -171,6 +176,53 @@ def settings_from_rig(
         grid_px(pixels),
         **walks,
     )
+
+
+def with_drawn_marker(found: Alignment, geometry: Geometry) -> tuple[Alignment, list[str]]:
+    """An alignment with what the rig's drawing says of the marker's offset d, and a sentence on that.
+
+    Along the straight actuator d and the length are one number. Logs part them only by the angle between
+    chord and tangent, to some tenths of a millimetre, since the scales of gyroscope and accelerometer take
+    the same share of it. So the drawing counts as one more reading of d, of two kinds: right to its
+    deviation, or, with the probability `_DOUBT`, off by about `_ELSEWHERE_M`. Each kind is weighed by how
+    well the logs bear it, and mean and covariance are those of the mixture: the further apart drawing and
+    logs are, the larger is sigma, until the logs alone are left.
+    """
+    written = "marker_offset_m" in geometry.model_fields_set
+    drawn, sigma = geometry.marker_offset_m, geometry.marker_offset_sigma_m
+    value, by = float(found.sensor[_MARKER]), found.covariance[_MARKER]
+    doubt, away = _DOUBT[written], drawn - value
+    sums = by[_MARKER] + np.array([sigma, math.hypot(sigma, _ELSEWHERE_M)]) ** 2
+    likely = np.array([1.0 - doubt, doubt]) * np.exp(-0.5 * away * away / sums) / np.sqrt(sums)
+    weight = likely / likely.sum()
+    # Both kinds move all quantities along their covariance with d, by these amounts of d per variance.
+    pulls = away / sums
+    pull = float(weight @ pulls)
+    spread = float(weight @ (1.0 / sums) - weight @ (pulls - pull) ** 2)
+    sensor = found.sensor + by * pull
+    covariance = found.covariance - spread * np.outer(by, by)
+    angle, gradient = rest_angle(sensor)
+    mixed = replace(
+        found,
+        sensor=sensor,
+        covariance=covariance,
+        rest_angle_rad=angle,
+        rest_angle_sigma=math.sqrt(float(gradient @ covariance @ gradient)),
+    )
+    both = (
+        f"the marker's offset d: {_mm(drawn, sigma)} as drawn (geometry.marker_offset_m), "
+        f"{_mm(value, math.sqrt(float(by[_MARKER])))} by the logs alone, "
+        f"{_mm(float(sensor[_MARKER]), math.sqrt(float(covariance[_MARKER, _MARKER])))} together"
+    )
+    if weight[0] < 0.5:
+        return mixed, [f"{both}; drawing and logs contradict each other, and the logs are believed"]
+    if not written:
+        both += "; lengths err as much as it does, so measure it and write it down: nobody has for this rig"
+    return mixed, [both]
+
+
+def _mm(value_m: float, sigma_m: float) -> str:
+    return f"{1e3 * value_m:.2f} +- {1e3 * sigma_m:.2f} mm"
 
 
 def _log_check(log: LogCheck) -> AlignLogCheck:

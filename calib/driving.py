@@ -139,6 +139,14 @@ def drive_from_rig(rig: Rig, path: Path) -> Drive:
         if found is not None:
             sigma[name] = found
     strength = pump.strength or list(nominal.strength)
+    tuned = rig.estimator.driven if rig.estimator is not None else None
+    if tuned is not None:
+        nominal = replace(
+            nominal,
+            walk_disturbance=tuned.walk_disturbance_N_per_sqrt_s,
+            walk_rates=(tuned.walk_turning_radps_per_sqrt_s, tuned.walk_growing_mps_per_sqrt_s),
+            walk_forces=tuned.walk_forces_N_per_sqrt_s,
+        )
     return replace(
         nominal,
         plant=plant,

@@ -23,9 +23,18 @@ from calib.estimator.setup import FLAGS, OUT, Rows, Setup
 from calib.files import shown
 from calib.logs import Log, passed_over
 from calib.relay import ahead, behind
-from calib.replaying import baseline_setup, blocks, periods, rows_of, setup_from_rig, truth_of
+from calib.replaying import (
+    baseline_setup,
+    blocks,
+    noise_at_rest,
+    periods,
+    rows_of,
+    setup_from_rig,
+    truth_of,
+)
 from calib.rig import Rig
 from calib.statesfile import STATES, StatesFile, states_writer
+from calib.warming import driven_elsewhere, warm
 
 __all__ = ["MODELS", "Replayed", "Trace", "drive_for", "estimator_of", "prepared", "replay_log"]
 
@@ -146,7 +155,9 @@ def replay_log(
 
     Raises `BadInputError` for a log or a rig that cannot be used.
     """
-    setup, found, stream, said = prepared(path, rig, rig_path, topics)
+    with driven_elsewhere(estimator == "fused" and model != "kinematic", smooth):
+        setup, found, stream, said = prepared(path, rig, rig_path, topics)
+        warm(setup, smooth)
     if estimator == "baseline" and not (found.camera and found.imu):
         raise BadInputError(f"{shown(path)}: the baseline needs camera and IMU, and the log lacks one")
     tally, trace = Tally(setup.bellows_radius_m), Trace()
@@ -232,7 +243,7 @@ def drive_for(model: str, first: Log, found: Any, rig: Rig, path: Path, rig_path
         return None
     told = has_commands(first)
     if told and found.camera and found.imu:
-        return drive_from_rig(rig, rig_path)
+        return replace(drive_from_rig(rig, rig_path), imu_noise=noise_at_rest(rig, found))
     if model == "driven":
         lacks = "commands (pwm1, pwm2)" if not told else "pictures" if not found.camera else "IMU samples"
         raise BadInputError(

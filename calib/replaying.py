@@ -32,6 +32,7 @@ __all__ = [
     "Periods",
     "baseline_setup",
     "blocks",
+    "noise_at_rest",
     "periods",
     "rows_of",
     "setup_from_rig",
@@ -266,19 +267,27 @@ def _process(rig: Rig) -> Kinematic:
     return Kinematic(tuple(levels))
 
 
-def _noise(rig: Rig, found: Periods) -> FloatArray:
-    numbers = dict(_NOISE)
-    numbers["grid_px"] = found.grid_px
+_SHAKEN = 1.6
+"""So many times the noise at rest in the alignment's logs, and a moving rig shakes its IMU."""
+
+
+def _at_rest(rig: Rig, found: Periods) -> dict[str, float]:
+    """Noise of an IMU sample by `calib imu static`."""
     imu = rig.imu
-    if imu is not None:
-        root = math.sqrt(1.0 / found.imu_s) if found.imu_s > 0.0 else math.sqrt(imu.rate_hz)
-        for key, density in (
-            ("accel_x_mps2", imu.accel_noise_mps2_per_sqrt_Hz[0]),
-            ("accel_y_mps2", imu.accel_noise_mps2_per_sqrt_Hz[1]),
-            ("gyro_radps", imu.gyro_noise_radps_per_sqrt_Hz[2]),
-        ):
-            if density:
-                numbers[key] = density * root
+    if imu is None:
+        return {}
+    root = math.sqrt(1.0 / found.imu_s) if found.imu_s > 0.0 else math.sqrt(imu.rate_hz)
+    densities = (
+        ("accel_x_mps2", imu.accel_noise_mps2_per_sqrt_Hz[0]),
+        ("accel_y_mps2", imu.accel_noise_mps2_per_sqrt_Hz[1]),
+        ("gyro_radps", imu.gyro_noise_radps_per_sqrt_Hz[2]),
+    )
+    return {key: density * root for key, density in densities if density}
+
+
+def _noise(rig: Rig, found: Periods) -> FloatArray:
+    numbers = dict(_NOISE) | _at_rest(rig, found)
+    numbers["grid_px"] = found.grid_px
     if rig.align is not None:
         numbers["jitter_px"] = rig.align.jitter_px or numbers["jitter_px"]
         numbers["gyro_radps"] = rig.align.gyro_noise_radps or numbers["gyro_radps"]
@@ -291,6 +300,23 @@ def _noise(rig: Rig, found: Periods) -> FloatArray:
         if rig.estimator.gyro_noise_radps is not None:
             numbers["gyro_radps"] = rig.estimator.gyro_noise_radps
     return np.array(list(numbers.values()))
+
+
+def noise_at_rest(rig: Rig, found: Periods) -> tuple[float, float, float] | None:
+    """Noise of a_x, a_y, g_z for a filter that knows the head's accelerations; None without a log at rest.
+
+    The noise that an alignment finds holds what its splines cannot follow as well, which suits a model that
+    knows no better. Where it is much greater than that at rest, the moving rig shakes, and it holds.
+    """
+    tuned, rest = rig.estimator, _at_rest(rig, found)
+    if not rest or (tuned is not None and (tuned.accel_noise_mps2 or tuned.gyro_noise_radps)):
+        return None
+    moving = dict(zip(_NOISE, _noise(rig, found).tolist(), strict=True))
+    x, y, z = (
+        rest[key] if key in rest and moving[key] <= _SHAKEN * rest[key] else moving[key]
+        for key in ("accel_x_mps2", "accel_y_mps2", "gyro_radps")
+    )
+    return x, y, z
 
 
 def _actuator(rig: Rig, source: str, key: str, default: float) -> float:

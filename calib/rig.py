@@ -99,6 +99,10 @@ class Geometry(Section):
     workspace_m: Annotated[list[Metres], Field(min_length=4, max_length=4)] = [-0.06, 0.04, 0.06, 0.11]
     """Where the marker can be, world metres: least x, least y, greatest x, greatest y."""
 
+    marker_offset_m: Metres = 0.015
+    marker_offset_sigma_m: Annotated[Metres, Field(gt=0.0)] = 5e-5
+    """Marker beyond the head along its tangent (A.1), and how well a drawing or a caliper tells it."""
+
     @field_validator("workspace_m")
     @classmethod
     def _ordered(cls, value: list[float]) -> list[float]:

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from calib.rig_base import Section
 
-__all__ = ["Estimator", "EstimatorGain", "EstimatorLevel"]
+__all__ = ["Estimator", "EstimatorDriven", "EstimatorGain", "EstimatorLevel"]
 
 Positive = Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False, strict=True)]
 NotNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False, strict=True)]
@@ -46,6 +46,15 @@ class EstimatorGain(Section):
     gate_m: Positive
 
 
+class EstimatorDriven(Section):
+    """Process noise of the driven model; densities of the walks of `calib.estimator.driven_setup.Drive`."""
+
+    walk_disturbance_N_per_sqrt_s: Positive
+    walk_turning_radps_per_sqrt_s: Positive
+    walk_growing_mps_per_sqrt_s: Positive
+    walk_forces_N_per_sqrt_s: Positive
+
+
 class Estimator(Section):
     """Noise of the sensors and of the process, by maximum likelihood of innovations.
 
@@ -53,7 +62,8 @@ class Estimator(Section):
     ----------
     jitter_px : of the tracker, before rounding. accel_noise_mps2, gyro_noise_radps : of one sample.
     sigma : standard deviations by key, of the logarithm for the levels' factors.
-    levels : the bank; none for the built-in one. constant_gain : for a controller.
+    levels : the bank; none for the built-in one. driven : none where the logs had no commands.
+    constant_gain : for a controller.
     gain_per_row : log likelihood that the tuning has won, per row of the logs.
     """
 
@@ -62,6 +72,7 @@ class Estimator(Section):
     gyro_noise_radps: Positive | None = None
     sigma: dict[str, NotNegative | None] = {}
     levels: list[EstimatorLevel] = []
+    driven: EstimatorDriven | None = None
     constant_gain: EstimatorGain | None = None
     gain_per_row: float | None = None
     logs: list[str] = []

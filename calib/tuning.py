@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
+import numpy as np
+
+from calib.arrays import FloatArray
+from calib.driving import drive_from_rig, pwm_of
 from calib.errors import BadInputError
 from calib.estimator.constant_gain import tick_noise
+from calib.estimator.driven_setup import Drive
 from calib.estimator.gains import MOST_DELAY_TICKS, design
 from calib.estimator.noise import tune
-from calib.estimator.setup import Setup
+from calib.estimator.setup import Rows, Setup
 from calib.files import shown
 from calib.replay import Progress, prepared
-from calib.replaying import rows_of
+from calib.replaying import noise_at_rest, rows_of
 from calib.rig import Rig
-from calib.rig_estimator import Estimator, EstimatorGain, EstimatorLevel
+from calib.rig_estimator import Estimator, EstimatorDriven, EstimatorGain, EstimatorLevel
 from calib.smoothing import joined
 
 __all__ = ["gain_section", "tuned_section"]
 
 _MOST_ROWS = 20_000
-
+_MOST_DRIVEN_ROWS = 6_000
 
 _TICK_HZ = 60.0
 
@@ -35,6 +40,31 @@ def gain_section(setup: Setup, rate_hz: float) -> EstimatorGain | None:
     return EstimatorGain(**asdict(design(tick_noise(setup), rate_hz, delay_s, lever_m)))
 
 
+def _driven_section(
+    setup: Setup, drive: Drive, logs: Sequence[tuple[Rows, FloatArray]], progress: Progress | None
+) -> tuple[EstimatorDriven | None, dict[str, float | None]]:
+    """Walks of the driven model from the first 6,000 rows of the logs with commands, and their deviations."""
+    from calib.estimator.driven_noise import tune_driven
+
+    known = [(rows, pwm) for rows, pwm in logs if np.isfinite(pwm).all(axis=1).any()]
+    if not known:
+        return None, {}
+    short = [
+        (Rows(rows.t_s[:n], rows.readings[:n], rows.kinds[:n]), pwm[:n])
+        for rows, pwm in known
+        for n in [min(len(rows), _MOST_DRIVEN_ROWS)]
+    ]
+    found = tune_driven(setup, drive, short, progress)
+    turning, growing = found.drive.walk_rates
+    section = EstimatorDriven(
+        walk_disturbance_N_per_sqrt_s=found.drive.walk_disturbance,
+        walk_turning_radps_per_sqrt_s=turning,
+        walk_growing_mps_per_sqrt_s=growing,
+        walk_forces_N_per_sqrt_s=found.drive.walk_forces,
+    )
+    return section, {f"driven_{name}": factor.sigma for name, factor in found.factors.items()}
+
+
 def tuned_section(
     logs: Sequence[Path],
     rig: Rig,
@@ -42,28 +72,35 @@ def tuned_section(
     progress: Progress | None = None,
     topics: Path | None = None,
 ) -> Estimator:
-    """Noise by maximum likelihood on the first 20,000 rows of each log.
+    """Noise by maximum likelihood on the first 20,000 rows of each log, of both models where commands are.
 
     Raises `BadInputError` for logs that cannot be used, or without camera and IMU.
     """
-    every, first = [], None
+    every, told, first, at_rest = [], [], None, None
+    bare = rig.model_copy(update={"estimator": None})
+    drive = drive_from_rig(bare, rig_path)
     for path in logs:
-        setup, found, stream, _ = prepared(path, rig.model_copy(update={"estimator": None}), rig_path, topics)
+        setup, found, stream, _ = prepared(path, bare, rig_path, topics)
         if not (found.camera and found.imu):
             raise BadInputError(f"{shown(path)}: tuning needs camera and IMU, and the log lacks one")
-        parts, count = [], 0
+        parts, commands, count = [], [], 0
         for log in stream:
             parts.append(rows_of(log, found.ticks))
+            commands.append(pwm_of(log))
             count += len(log)
             if count >= _MOST_ROWS:
                 break
         every.append(joined(parts))
-        first = setup if first is None else first
+        told.append((every[-1], np.concatenate(commands)))
+        if first is None:
+            first, at_rest = setup, noise_at_rest(bare, found)
     if first is None:
         raise BadInputError("LOG: none given, expected at least one")
     found_noise = tune(first, every, progress)
     sigma = {"jitter_px": found_noise.jitter_px.sigma}
     sigma |= {name: factor.sigma for name, factor in found_noise.factors.items()}
+    driven, more = _driven_section(found_noise.setup, replace(drive, imu_noise=at_rest), told, progress)
+    sigma |= more
     reasons = []
     if found_noise.jitter_px.sigma is None:
         reasons.append("the logs do not bound the tracker's jitter")
@@ -84,6 +121,7 @@ def tuned_section(
             )
             for level in found_noise.setup.process.levels
         ],
+        driven=driven,
         constant_gain=gain_section(found_noise.setup, rig.lowpass.rate_hz if rig.lowpass else _TICK_HZ),
         gain_per_row=(found_noise.after - found_noise.before) / max(found_noise.rows, 1),
         logs=[shown(path.name) for path in logs],

@@ -41,7 +41,7 @@ SIGMA = {
     "accel_scale_x": 3e-3,
     "accel_scale_y": 3e-3,
 }
-"""What a good alignment leaves unknown."""
+"""What a good alignment leaves unknown; of the marker, a drawing."""
 
 NOISE = np.array([0.3, 1.0, 0.0158, 0.0158, 0.0026, 0.002, 5e-5, 5e-5, 20.0, 30.0, 25.0])
 

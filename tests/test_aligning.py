@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from align_trials import align_log, known, twin_log
+from scipy.stats import norm
 
-from calib.aligning import PRIOR, align_section, read_align_log, settings_from_rig
+from calib.aligning import PRIOR, align_section, read_align_log, settings_from_rig, with_drawn_marker
+from calib.arrays import FloatArray
 from calib.errors import BadInputError
-from calib.estimator.align import align
+from calib.estimator.align import Alignment, align
 from calib.estimator.align_verdict import judge_align
 from calib.estimator.sensors import SENSOR
 from calib.logs import Log, write_log
 from calib.replaying import Periods, setup_from_rig
-from calib.rig import Camera, Distortion, Plane, Rig, read_rig, write_rig
+from calib.rig import Camera, Distortion, Geometry, Plane, Rig, read_rig, write_rig
 from calib.twin.rig import SimulatedRig
 
 RIG = SimulatedRig()
@@ -145,3 +147,74 @@ def test_the_section_is_what_the_estimator_reads(log: Log, tmp_path: Path) -> No
         assert setup.start.sensor_sigma[k] == pytest.approx(found.sigma[k])
     truth = known(RIG).truth
     assert abs(section.time_offset_s - truth[SENSOR.index("time_offset_s")]) < 1e-3
+
+
+def _mixture(found: Alignment, drawn: float, sigma: float, doubt: float) -> tuple[FloatArray, FloatArray]:
+    """Mean and covariance after a reading of d of two kinds, by information matrices and their sum."""
+    at = SENSOR.index("marker_offset_m")
+    scale = found.sigma
+    own, start = np.linalg.inv(found.covariance / np.outer(scale, scale)), found.sensor / scale
+    means, covariances, weights = [], [], []
+    for share, room in ((1.0 - doubt, sigma), (doubt, np.hypot(sigma, 3e-3))):
+        information = own.copy()
+        information[at, at] += (scale[at] / room) ** 2
+        right = own @ start
+        right[at] += drawn / room**2 * scale[at]
+        covariances.append(np.linalg.inv(information))
+        means.append(covariances[-1] @ right)
+        weights.append(share * norm.pdf(drawn, found.sensor[at], np.hypot(scale[at], room)))
+    share = np.array(weights) / np.sum(weights)
+    mean = share @ np.array(means)
+    covariance = sum(
+        w * (C + np.outer(m - mean, m - mean)) for w, m, C in zip(share, means, covariances, strict=True)
+    )
+    return mean * scale, covariance * np.outer(scale, scale)
+
+
+@pytest.mark.parametrize("apart", [-8.0, -1.5, 0.2, 2.0, 3.0, 8.0])
+def test_the_drawing_is_one_more_reading_of_the_marker(log: Log, apart: float) -> None:
+    found = align([align_log(log)], settings_from_rig(_rig_file(), Path("rig.yaml"), []))
+    at = SENSOR.index("marker_offset_m")
+    drawn = float(found.sensor[at] + apart * found.sigma[at])
+    told, said = with_drawn_marker(found, Geometry(marker_offset_m=drawn, marker_offset_sigma_m=1e-4))
+    mean, covariance = _mixture(found, drawn, 1e-4, 0.02)
+    assert np.all(np.abs(told.sensor - mean) < 1e-5 * found.sigma)
+    np.testing.assert_allclose(told.covariance, covariance, atol=1e-6 * found.sigma.max() ** 2, rtol=1e-4)
+    np.testing.assert_array_equal(told.covariance, told.covariance.T)
+    assert np.linalg.eigvalsh(told.covariance / np.outer(found.sigma, found.sigma)).min() > 0.0
+    assert ("contradict" in said[0]) == (abs(apart) > 5.0)
+    if abs(apart) < 1.0:
+        assert told.sigma[at] < 2e-4 < found.sigma[at]
+        # What was one number with the marker is known with it.
+        assert told.sigma[SENSOR.index("imu_lever_m")] < 0.7 * found.sigma[SENSOR.index("imu_lever_m")]
+        assert told.rest_angle_sigma <= found.rest_angle_sigma
+        assert "as drawn" in said[0] and "measure it" not in said[0]
+
+
+def test_a_drawing_that_nobody_wrote_down_is_doubted_more(log: Log) -> None:
+    found = align([align_log(log)], settings_from_rig(_rig_file(), Path("rig.yaml"), []))
+    nominal, said = with_drawn_marker(found, Geometry())
+    written, _ = with_drawn_marker(found, Geometry(marker_offset_m=0.015))
+    at = SENSOR.index("marker_offset_m")
+    assert written.sigma[at] < nominal.sigma[at] < found.sigma[at]
+    assert "measure it and write it down" in said[0]
+
+
+def test_sigma_grows_where_the_marker_is_not_where_it_was_drawn() -> None:
+    """Markers half a millimetre off, and nobody knows: sigma follows the error, a firm prior's does not."""
+    rng = np.random.default_rng(4)
+    at, own, drawn = SENSOR.index("marker_offset_m"), 2.5e-4, Geometry()
+    covariance = np.diag(np.full(len(SENSOR), 1e-6))
+    covariance[at, at] = own * own
+    blank = Alignment(**{field.name: None for field in fields(Alignment)})
+    mixed, firm = [], []
+    room = drawn.marker_offset_sigma_m**2
+    for _ in range(2000):
+        true = drawn.marker_offset_m + rng.normal(0.0, 5e-4)
+        sensor = np.zeros(len(SENSOR))
+        sensor[at] = true + rng.normal(0.0, own)
+        told, _ = with_drawn_marker(replace(blank, sensor=sensor, covariance=covariance), drawn)
+        mixed.append((told.sensor[at] - true) ** 2 / told.covariance[at, at])
+        mean = (sensor[at] * room + drawn.marker_offset_m * own**2) / (own**2 + room)
+        firm.append((mean - true) ** 2 * (1.0 / room + 1.0 / own**2))
+    assert np.mean(mixed) < 0.2 * np.mean(firm)

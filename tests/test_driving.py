@@ -63,6 +63,16 @@ def test_what_the_file_says_is_taken_with_its_deviations() -> None:
     assert sigma["bending"] == nominal["bending"]
 
 
+def test_tuned_walks_are_taken() -> None:
+    driven = {
+        "walk_disturbance_N_per_sqrt_s": 1e-3, "walk_turning_radps_per_sqrt_s": 4e-3,
+        "walk_growing_mps_per_sqrt_s": 2e-4, "walk_forces_N_per_sqrt_s": 5e-5,
+    }  # fmt: skip
+    rig = Rig.model_validate({"estimator": {"jitter_px": 0.3, "verdict": "ok", "driven": driven}})
+    drive = drive_from_rig(rig, HERE)
+    assert (drive.walk_disturbance, drive.walk_rates, drive.walk_forces) == (1e-3, (4e-3, 2e-4), 5e-5)
+
+
 def test_a_rate_limit_is_the_default() -> None:
     drive = drive_from_rig(Rig.model_validate({"pump": {"falling_N_per_s": 0.5}}), HERE)
     assert drive.pump.deflation == RateLimit(0.5)

@@ -13,7 +13,16 @@ from calib.errors import BadInputError
 from calib.estimator.model import LEVELS
 from calib.estimator.sensors import SENSOR
 from calib.logs import Log, write_log
-from calib.replaying import DEFAULTS, Periods, blocks, periods, rows_of, setup_from_rig, truth_of
+from calib.replaying import (
+    DEFAULTS,
+    Periods,
+    blocks,
+    noise_at_rest,
+    periods,
+    rows_of,
+    setup_from_rig,
+    truth_of,
+)
 from calib.rig import Rig
 from calib.rig_estimator import Estimator
 
@@ -111,6 +120,27 @@ def test_values_come_from_the_sections() -> None:
     assert setup.bellows_radius_m == 0.014 and setup.start.head[1] == pytest.approx(0.074)
     assert setup.noise[0] == 0.5 and setup.noise[2] == setup.noise[3] == 0.03
     assert not any("align" in sentence for sentence in said)
+
+
+def test_noise_is_that_at_rest_unless_the_moving_rig_shakes() -> None:
+    size = {
+        "rate_hz": 100.0, "gyro_noise_radps_per_sqrt_Hz": [None, None, 2e-4],
+        "accel_noise_mps2_per_sqrt_Hz": [1.8e-3, 1e-3, None],
+    }  # fmt: skip
+    others = (
+        "gyro_bias_radps", "gyro_instability_radps", "gyro_walk_radps2_per_sqrt_Hz", "accel_mean_mps2",
+        "accel_instability_mps2", "accel_walk_mps3_per_sqrt_Hz", "gyro_step_radps", "accel_step_mps2",
+    )  # fmt: skip
+    imu = {**{name: [None, None, None] for name in others}, **size, "verdict": "ok"}
+    made = Rig.model_validate({"align": ALIGN, "imu": imu})
+    # 0.02 in the alignment: a little more than 0.018 at rest, twice as much as 0.01.
+    np.testing.assert_allclose(noise_at_rest(made, BLIND), [0.018, 0.02, 0.002])
+    np.testing.assert_allclose(
+        setup_from_rig(made, Path("rig.yaml"), BLIND)[0].noise[2:5], [0.02, 0.02, 0.003]
+    )
+    tuned = {"jitter_px": 0.5, "verdict": "ok", "accel_noise_mps2": 0.03}
+    assert noise_at_rest(Rig.model_validate({"imu": imu, "estimator": tuned}), BLIND) is None
+    assert noise_at_rest(Rig.model_validate({"align": ALIGN}), BLIND) is None
 
 
 @pytest.mark.parametrize(

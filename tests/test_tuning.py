@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from estimatorlogs import rows_from, setup_for, simulated
+from identifytrials import rig_file
 
 from calib.errors import BadInputError
 from calib.estimator.constant_gain import run_gains, ticks_of
@@ -43,3 +44,23 @@ def test_no_constant_gains_without_a_camera_or_with_pictures_that_are_too_late()
     sensor = setup.start.sensor.copy()
     sensor[7] = 0.2
     assert gain_section(replace(setup, start=replace(setup.start, sensor=sensor)), 60.0) is None
+
+
+def test_a_log_with_commands_tunes_the_driven_model_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("calib.tuning._MOST_ROWS", 400)
+    _, log = simulated("ellipse", 1)
+    first = np.arange(len(log)) < 400
+    short = replace(log, t_s=log.t_s[first], columns={k: v[first] for k, v in log.columns.items()},
+                    lines=log.lines[first])  # fmt: skip
+    write_log(tmp_path / "told.csv", short)
+    quiet = {k: v for k, v in short.columns.items() if not k.startswith("pwm")}
+    write_log(tmp_path / "quiet.csv", replace(short, columns=quiet))
+    path = tmp_path / "rig.yaml"
+    rig = rig_file(path)
+    found = tuned_section([tmp_path / "told.csv"], rig, path)
+    assert found.driven is not None
+    assert found.driven.walk_disturbance_N_per_sqrt_s > 0.0
+    assert {"driven_disturbance", "driven_rates", "driven_forces"} <= set(found.sigma)
+    assert tuned_section([tmp_path / "quiet.csv"], rig, path).driven is None

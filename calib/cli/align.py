@@ -99,11 +99,11 @@ def align(
     A free swing shows the time offset, slow motion to large angles all the rest. Writes the section align
     of the rig's file. Exits 1 when the verdict is not ok.
     """
-    from calib.aligning import align_section, read_align_log, settings_from_rig
+    from calib.aligning import align_section, read_align_log, settings_from_rig, with_drawn_marker
     from calib.estimator.align import align as find
     from calib.estimator.align_verdict import judge_align
     from calib.files import check_folder, check_writable, shown
-    from calib.rig import hash_of, read_rig, section_json, write_rig
+    from calib.rig import Geometry, hash_of, read_rig, section_json, write_rig
     from calib.units import parse_length_m
 
     marker_offset_m = None if marker_offset is None else parse_length_m(marker_offset, "--marker-offset")
@@ -135,7 +135,11 @@ def align(
     found = find(read, settings_from_rig(before, rig, read, marker_offset_m))
     for sentence in found.said:
         narrate(sentence)
-    section = align_section(found, judge_align(found))
+    remarks: list[str] = []
+    judgement = judge_align(found)
+    if marker_offset_m is None:
+        found, remarks = with_drawn_marker(found, before.geometry or Geometry())
+    section = align_section(found, replace(judgement, remarks=[*judgement.remarks, *remarks]))
     write_rig(rig, before.model_copy(update={"align": section}), {"align": hashes})
     narrate(f"align written to {shown(rig)}")
     if figures is not None:

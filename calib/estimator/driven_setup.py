@@ -32,6 +32,8 @@ class Drive:
     walk_rates : densities of the walk of dphi and dl [rad/s, m/s per sqrt(s)].
     walk_forces : density of the walk of lag, force and creep [N/sqrt(s)].
     walk_parameters : of all parameters, as a share of their deviation per sqrt(s).
+    imu_noise : deviations of a_x, a_y [m/s^2] and g_z [rad/s] for this filter, which knows the head's
+        accelerations; None for those of the set-up.
     """
 
     plant: Plant = field(default_factory=pumps_connected)
@@ -43,14 +45,22 @@ class Drive:
     sigma_disturbance_N: float = 0.01
     sigma_creep_N: float = 0.03
     sigma_turning_radps: float = 6.0
-    walk_disturbance: float = 5e-4
+    walk_disturbance: float = 2.5e-4
     walk_rates: tuple[float, float] = (2e-3, 1e-4)
     walk_forces: float = 1e-4
     walk_parameters: float = 2e-3
+    imu_noise: tuple[float, float, float] | None = None
 
     def numbers(self) -> FloatArray:
         """The (22,) vector of `driven_model.PLANT`."""
         return np.array([*coefficients(self.plant), *pump_coefficients(self.pump)], dtype=np.float64)
+
+    def noise(self, setup: Setup) -> FloatArray:
+        """The (11,) of `kernel.NOISE` for the driven filter."""
+        noise = setup.noise.copy()
+        if self.imu_noise is not None:
+            noise[2:5] = self.imu_noise
+        return noise
 
     def walk(self, setup: Setup) -> FloatArray:
         """Squared densities (36,) of the walk of the state."""

@@ -199,7 +199,7 @@ def smooth_driven(setup: Setup, drive: Drive, rows: Rows, pwm: FloatArray, outpu
     x0, P0 = x.copy(), P.copy()
     constants = np.array([setup.gravity_mps2, setup.lever_across_m])
     whole, rejected = np.zeros(3, dtype=np.int64), np.zeros(3)
-    plant, walk = drive.numbers(), drive.walk(setup)
+    plant, walk, noise = drive.numbers(), drive.walk(setup), drive.noise(setup)
     out = outputs.copy()
     out[:, 1:13] = np.nan
     n, size = len(t), len(DRIVEN)
@@ -214,7 +214,7 @@ def smooth_driven(setup: Setup, drive: Drive, rows: Rows, pwm: FloatArray, outpu
         chained, alive = np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
         _forward(
             t[part], before, first, kinds[part], readings[part], x, P, whole, rejected, switch_t, switch_g,
-            x0, P0, plant, walk, setup.view, constants, setup.noise, kept_x, kept_P, ahead, F, chained,
+            x0, P0, plant, walk, setup.view, constants, noise, kept_x, kept_P, ahead, F, chained,
             alive, end - begin - 1, drive.sigma[1],
         )  # fmt: skip
         _backward(t[part], walk, F, ahead, chained, kept_x, kept_P)

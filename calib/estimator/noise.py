@@ -20,11 +20,12 @@ from calib.estimator.filter import Filter
 from calib.estimator.model import Kinematic, Level
 from calib.estimator.setup import OUT, Rows, Setup
 
-__all__ = ["Estimate", "Tuning", "grid_px", "jitter_px", "log_likelihood", "tune"]
+__all__ = ["GATED", "Estimate", "Tuning", "best", "grid_px", "jitter_px", "log_likelihood", "tune"]
 
 _JITTERS_PX = np.array([0.05, 0.1, 0.15, 0.22, 0.3, 0.42, 0.6, 0.85, 1.2, 2.0])
 _FACTORS = np.array([0.5, 1.0, 2.0])
-_GATED = 12.0
+GATED = 12.0
+"""What a gated sensor costs."""
 _DEFAULT_JITTER_PX = 0.4
 
 
@@ -68,11 +69,11 @@ def log_likelihood(setup: Setup, logs: Sequence[Rows]) -> float:
     for rows in logs:
         out = Filter(setup).run(rows)
         total += float(np.nansum(out[:, OUT.index("log_likelihood")]))
-        total -= _GATED * float(np.nansum(out[:, gates]))
+        total -= GATED * float(np.nansum(out[:, gates]))
     return total
 
 
-def _best(values: FloatArray, likelihood: Callable[[float], float]) -> tuple[Estimate, float]:
+def best(values: FloatArray, likelihood: Callable[[float], float]) -> tuple[Estimate, float]:
     """The maximum over a rising grid of positive numbers, refined in the logarithm."""
     found = np.array([likelihood(float(value)) for value in values])
     k = int(np.argmax(found))
@@ -103,7 +104,7 @@ def jitter_px(setup: Setup, logs: Sequence[Rows]) -> Estimate:
     """
     if not any(np.isfinite(rows.readings[:, 0]).any() for rows in logs):
         return Estimate(_DEFAULT_JITTER_PX, None)
-    return _best(_JITTERS_PX, lambda value: log_likelihood(_with_jitter(setup, value), logs))[0]
+    return best(_JITTERS_PX, lambda value: log_likelihood(_with_jitter(setup, value), logs))[0]
 
 
 def _scaled(process: Kinematic, index: int, axis: str, factor: float) -> Kinematic:
@@ -138,7 +139,7 @@ def tune(setup: Setup, logs: Sequence[Rows], progress: Callable[[int, int], None
             def likelihood(factor: float, index: int = index, axis: str = axis, now: Setup = setup) -> float:
                 return log_likelihood(replace(now, process=_scaled(now.process, index, axis, factor)), logs)
 
-            found, reached = _best(_FACTORS, likelihood)
+            found, reached = best(_FACTORS, likelihood)
             factors[f"{level.name}_{axis}"] = found
             if reached > after:
                 after = reached

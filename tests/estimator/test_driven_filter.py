@@ -17,7 +17,7 @@ from calib.estimator.driven_filter import DrivenFilter
 from calib.estimator.driven_setup import Drive
 from calib.estimator.setup import OUT, Rows
 
-TARGET_MM = {"static": 0.06, "swing": 0.11, "ellipse": 0.07, "step": 0.07, "elongation": 0.07}
+TARGET_MM = {"static": 0.04, "swing": 0.11, "ellipse": 0.05, "step": 0.06, "elongation": 0.07}
 """Means over the seeds below; an alignment as in `estimatorlogs.SIGMA` alone leaves 0.03 mm."""
 
 
@@ -29,7 +29,7 @@ def part(rows: Rows, which: slice | FloatArray) -> Rows:
 @pytest.mark.parametrize("name", TARGET_MM)
 def test_it_reaches_its_accuracy_on_rigs_that_differ(name: str) -> None:
     figures = []
-    for seed in (21, 22, 23, 24):
+    for seed in range(21, 29):
         rig, log = driven_log(name, seed)
         setup = setup_for(rig, seed)
         tally = Tally(setup.bellows_radius_m)
@@ -39,7 +39,7 @@ def test_it_reaches_its_accuracy_on_rigs_that_differ(name: str) -> None:
     mm, degrees, nees = np.mean(figures, axis=0)
     assert mm < TARGET_MM[name]
     assert degrees < 0.06
-    assert nees < 6.0
+    assert 0.8 < nees < 3.0
 
 
 def test_parameters_move_towards_the_truth() -> None:

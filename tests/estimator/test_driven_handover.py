@@ -51,6 +51,28 @@ def test_smoothing_of_both_is_finite_and_better_than_the_filter() -> None:
     assert after.rmse()["mean_q_mm"] < before.rmse()["mean_q_mm"]
 
 
+SMOOTHED_MM = {"static": 0.035, "swing": 0.05, "ellipse": 0.04, "step": 0.04, "elongation": 0.05}
+"""Means over the seeds below, of which a marker known to 0.03 mm is the larger part."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SMOOTHED_MM)
+def test_smoothing_reaches_its_accuracy_on_rigs_that_differ(name: str) -> None:
+    figures = []
+    for seed in range(21, 29):
+        rig, log = driven_log(name, seed)
+        setup, rows, pwm = setup_for(rig, seed), rows_from(log), commands_of(log)
+        driven, kinematic, _ = Handover(setup, Drive()).run_each(rows, pwm)
+        tally = Tally(setup.bellows_radius_m)
+        tally.add(smooth_both(setup, Drive(), rows, pwm, driven, kinematic), truth(log))
+        found = tally.rmse()
+        figures.append((found["mean_q_mm"], found["phi_deg"], found["nees"]))
+    mm, degrees, nees = np.mean(figures, axis=0)
+    assert mm < SMOOTHED_MM[name]
+    assert degrees < 0.03
+    assert 0.8 < nees < 3.2
+
+
 def innovations(count: int, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     out = np.full((count, len(OUT)), np.nan)

@@ -44,3 +44,11 @@ def test_commands_become_static_forces_and_blank_ones_stay_blank() -> None:
     assert np.isnan(got[1]).all()
     assert got[0, 0] == 0.0 and got[2, 0] == 0.0
     assert got[0, 1] == got[2, 1] == pytest.approx(1.1 * 2.04, rel=0.03)
+
+
+def test_noise_at_rest_is_that_of_the_driven_filter_alone() -> None:
+    setup = setup_for(varied_drive(1), 1)
+    np.testing.assert_array_equal(Drive().noise(setup), setup.noise)
+    own = Drive(imu_noise=(0.01, 0.02, 0.003)).noise(setup)
+    np.testing.assert_array_equal(own[2:5], [0.01, 0.02, 0.003])
+    np.testing.assert_array_equal(np.delete(own, [2, 3, 4]), np.delete(setup.noise, [2, 3, 4]))
