@@ -16,6 +16,7 @@ import os
 import signal
 import sys
 import threading
+import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterable, Iterator
@@ -23,6 +24,7 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from multiprocessing import connection
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Generic, TypeVar, cast
 
@@ -38,6 +40,7 @@ S = TypeVar("S")
 T = TypeVar("T")
 
 _LOOK_UP_S = 0.2
+_LAST_BREATH_S = 2.0
 _FEWEST_TO_FORK = 4
 """Starting processes for fewer items takes longer than they save."""
 
@@ -47,6 +50,8 @@ _IN_HAND = 2
 _PR_SET_PDEATHSIG = 1
 
 _most: list[int] = []
+_leaving: set[int] = set()
+"""Threads of ours, by the system's numbers, that may still be there."""
 
 
 def processors() -> int:
@@ -93,7 +98,26 @@ def _may_fork(items: int) -> bool:
         and sys.platform == "linux"
         and threading.active_count() == 1
         and not multiprocessing.current_process().daemon
+        and _have_left()
     )
+
+
+def _sign() -> None:
+    _leaving.add(threading.get_native_id())
+
+
+def _have_left() -> bool:
+    """Wait until threads that Python has done with are gone for the system as well.
+
+    On its way out a thread gives back what libraries keep for it, under their locks: OpenCV's would stay
+    locked for ever in a process that is forked at that moment.
+    """
+    until = time.monotonic() + _LAST_BREATH_S
+    while _leaving and time.monotonic() < until:
+        _leaving.difference_update([n for n in _leaving if not Path(f"/proc/self/task/{n}").exists()])
+        if _leaving:
+            time.sleep(1e-4)
+    return not _leaving
 
 
 class Workers(Generic[Shared]):
@@ -141,7 +165,7 @@ class Workers(Generic[Shared]):
         return self._by_processes(work, list(items)) if self._forks else self._by_threads(work, items)
 
     def _by_threads(self, work: Callable[[Shared, S], T], items: Iterable[S]) -> Iterator[T]:
-        pool = ThreadPoolExecutor(self._count)
+        pool = ThreadPoolExecutor(self._count, initializer=_sign)
         try:
             futures = [pool.submit(work, self._shared, item) for item in items]
             futures.reverse()

@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 
 from calib import workers
@@ -151,3 +152,20 @@ def test_no_more_processors_than_allowed() -> None:
         with at_most(64):
             assert processors() == 1
     assert processors() == before
+
+
+def _uses_opencv(_: None, i: int) -> int:
+    cv2.GaussianBlur(np.zeros((40, 40), dtype=np.uint8), (3, 3), 1.0)
+    return threading.get_native_id() + 0 * i
+
+
+@forked
+def test_no_thread_is_on_its_way_out_when_processes_are_forked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A lock that such a thread holds would stay locked in the forked process for ever."""
+    monkeypatch.setattr(threading, "active_count", lambda: 1)
+    for _ in range(40):
+        with Workers(None, 8, large=True) as pool:
+            threads = set(pool.in_order(_uses_opencv, range(8)))
+        with Workers(None, 8) as pool:
+            assert not threads & {int(path.name) for path in Path("/proc/self/task").iterdir()}
+            assert pool._forks

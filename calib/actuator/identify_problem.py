@@ -20,8 +20,10 @@ from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
-from calib.actuator.identify_parameters import PARAMETERS, Nominal
+from calib.actuator.identify_parameters import PARAMETERS, Nominal, made
 from calib.actuator.identify_tracks import Start, Track, heads_of
+from calib.actuator.parameters import Plant
+from calib.actuator.pump import Pump
 from calib.arrays import FloatArray
 
 __all__ = ["CAMERA_DELAY_S", "FAR", "Layout", "Problem", "first_guess", "jacobian", "residuals", "starts_of"]
@@ -207,19 +209,25 @@ def jacobian(problem: Problem, x: FloatArray) -> tuple[FloatArray, FloatArray]:
     steps = _STEP * np.maximum(np.abs(x[:P]), scales[:P])
     up, down = np.minimum(x[:P] + steps, high[:P]), np.maximum(x[:P] - steps, low[:P])
     base = problem.values(x)
+    moved = [base]
+    for name, a, b in zip(problem.names, up.tolist(), down.tolist(), strict=True):
+        moved += [{**base, name: a}, {**base, name: b}]
+    # Making a plant checks it, which takes as long as a short log: once for all logs of a kind.
+    alike: dict[tuple[bool, float], list[tuple[Plant, Pump]]] = {}
     blocks, errors = [], []
     for k, track in enumerate(problem.tracks):
         begin = starts_of(problem, x)[k]
-        sets, starts = [base], [begin]
-        for name, a, b in zip(problem.names, up.tolist(), down.tolist(), strict=True):
-            sets += [{**base, name: a}, {**base, name: b}]
-            starts += [begin, begin]
+        sets, starts = list(moved), [begin] * len(moved)
+        kind = track.hoses, track.tick_s
+        if kind not in alike:
+            alike[kind] = [made(problem.nominal, values, *kind) for values in moved]
         count = layout.starts[k]
         for name, step in zip(track.unknown, _START_STEP, strict=False):
             sets += [base, base]
             starts += [replace(begin, **{name: getattr(begin, name) + s * step}) for s in (1.0, -1.0)]
         delay = layout.delay + layout.delays[k]
-        head, rate = heads_of(track, problem.nominal, sets, starts, float(x[delay]), problem.threads)
+        pairs = [*alike[kind], *[alike[kind][0]] * (len(sets) - len(moved))]
+        head, rate = heads_of(track, problem.nominal, sets, starts, float(x[delay]), problem.threads, pairs)
         W = track.whitening
         J = np.zeros((len(track.t_s), 2, layout.size))
         width = np.concatenate([up - down, 2.0 * np.array(_START_STEP)[:count]])

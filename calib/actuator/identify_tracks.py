@@ -19,6 +19,7 @@ from calib.actuator.batch import simulate_batch
 from calib.actuator.identify_parameters import Nominal, made
 from calib.actuator.integrate import state_row
 from calib.actuator.parameters import Plant
+from calib.actuator.pump import Pump
 from calib.arrays import FloatArray
 from calib.errors import BadInputError
 
@@ -113,16 +114,19 @@ def heads_of(
     starts: Sequence[Start],
     delay_s: float,
     threads: int = 2,
+    pairs: Sequence[tuple[Plant, Pump]] | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Angle and length at the track's rows, and their rates, for sets of parameters: (sets, m, 2) each.
 
     Parameters
     ----------
     delay_s : the rows show the head as it was this much earlier.
+    pairs : plants and pumps of the sets, where they have been made before.
 
     A set whose motion leaves the model is NaN.
     """
-    pairs = [made(nominal, values, track.hoses, track.tick_s) for values in sets]
+    if pairs is None:
+        pairs = [made(nominal, values, track.hoses, track.tick_s) for values in sets]
     r, pwm = nominal.plant.bellows_radius_m, track.pwm
     if track.moving is not None:
         # The batch knows no commands before the first; those on their way are put in by hand.

@@ -37,6 +37,7 @@ The force does not depend on the bellows' length, so the pumps can be advanced b
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -91,9 +92,17 @@ class ElongationForce:
     def force_N(self, pwm: FloatArray) -> FloatArray:
         """Steady force [N] of PWM values 0 .. 255, any shape."""
         u = self.supply_V * pwm / PWM_MAX
-        eps = 1e-3 * np.polyval(self.elongation_mm, u)
+        eps = 1e-3 * _polynomial(self.elongation_mm, u)
         eps = np.where(u < self.dead_zone_V, 0.0, np.maximum(eps, 0.0))
-        return np.asarray(np.polyval(self.stiffness.coefficients[::-1], eps) * eps)
+        return np.asarray(_polynomial(self.stiffness.coefficients[::-1], eps) * eps)
+
+
+def _polynomial(coefficients: Sequence[float], x: FloatArray) -> FloatArray:
+    """As `np.polyval`, to the last bit, in half the time for the few values of a tick."""
+    y = np.asarray(coefficients[0], dtype=np.float64)
+    for c in coefficients[1:]:
+        y = y * x + c
+    return y
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,8 @@ from calib.estimator.align import Alignment, Trace
 from calib.estimator.sensors import SENSOR
 from calib.report.style import (
     BLUE,
+    CLOUD,
+    FOR_EACH_DPI,
     GREY,
     INK,
     ORANGE,
@@ -33,7 +35,7 @@ from calib.report.style import (
 __all__ = ["correlation_figure", "residual_figure", "write_align_figures"]
 
 _MPS2 = "m/s\N{SUPERSCRIPT TWO}"
-_MOST_POINTS = 6000
+_MOST_POINTS = 3000
 
 
 def _traces(found: Alignment, log: int) -> list[Trace]:
@@ -50,7 +52,7 @@ def _cloud(axes: Axes, t: FloatArray, values: FloatArray, limit: float, colour: 
     step = max(1, len(t) // _MOST_POINTS)
     known = np.isfinite(values)
     t, values = t[known][::step], np.clip(values[known][::step], -0.98 * limit, 0.98 * limit)
-    axes.plot(t, values, color=colour, linestyle="none", marker=".", markersize=2.0, label=label)
+    axes.plot(t, values, color=colour, label=label, **CLOUD)
 
 
 def residual_figure(found: Alignment, log: int, verdict: str = "ok") -> Figure:
@@ -61,7 +63,7 @@ def residual_figure(found: Alignment, log: int, verdict: str = "ok") -> Figure:
         "beforehand, without mount angle and biases. Blue: with those found. Red crosses: pictures taken for "
         "something else. Points at the edge lie beyond it."
     )
-    figure = sheet(7.4, plain(f"Residuals: {source}", 90), note, verdict)
+    figure = sheet(7.4, plain(f"Residuals: {source}", 90), note, verdict, FOR_EACH_DPI)
     panels = figure.subplots(4, 1, sharex=True)
     traces = _traces(found, log)
     if not traces:

@@ -17,6 +17,7 @@ from calib.arrays import FloatArray
 from calib.identification import simulated_heads
 from calib.report.style import (
     BLUE,
+    CLOUD,
     GREEN,
     GREY,
     INK,
@@ -59,7 +60,7 @@ def motion_figure(found: Identified) -> Figure:
         for column, (scale, unit) in enumerate(((1.0, "angle (rad)"), (1e3, "length (mm)"))):
             axes = panels[row, column]
             seen, told = scale * track.head[some, column], scale * head[some, column]
-            axes.plot(track.t_s[some], seen, ".", color=GREY, markersize=2.0, label="measured")
+            axes.plot(track.t_s[some], seen, color=GREY, label="measured", **CLOUD)
             axes.plot(track.t_s[some], told, color=BLUE, linewidth=1.0, label="simulated")
             spread = max(float(np.ptp(told)), 1e-3 * scale)
             # A picture with another thing in place of the marker is far away; the curve is what counts.
@@ -70,7 +71,9 @@ def motion_figure(found: Identified) -> Figure:
                 axes.set_title(plain(track.name, 40))
     for axes in panels[-1]:
         axes.set_xlabel("time (s)")
-    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    figure.legend(
+        *panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2, markerscale=2.0
+    )
     return figure
 
 

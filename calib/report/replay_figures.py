@@ -14,6 +14,8 @@ from calib.arrays import FloatArray
 from calib.estimator.setup import OUT
 from calib.report.style import (
     BLUE,
+    CLOUD,
+    FOR_EACH_DPI,
     GREY,
     INK,
     ORANGE,
@@ -35,6 +37,8 @@ __all__ = ["error_figure", "innovation_figure", "state_figure", "write_replay_fi
 
 _BASELINE = len(OUT)
 _TRUTH = len(OUT) + 3
+_MOST_POINTS = 3000
+"""Of each sensor's innovations in the figure; more of them only make it black."""
 _QUANTITIES = (
     ("bellows 1 (mm)", "q1_m", "sigma_q1_m", 0, 1e3),
     ("bellows 2 (mm)", "q2_m", "sigma_q2_m", 1, 1e3),
@@ -62,7 +66,7 @@ def state_figure(result: Replayed) -> Figure:
         f"Blue: estimate with its 2{SIGMA} band. Orange: the source's pipeline with its 1 Hz low-pass. "
         "Black: truth, where the log knows it. Red marks: pictures that were gated out."
     )
-    figure = sheet(6.6, plain(f"States: {result.source}", 90), note, result.verdict)
+    figure = sheet(6.6, plain(f"States: {result.source}", 90), note, result.verdict, FOR_EACH_DPI)
     panels = figure.subplots(3, 1, sharex=True)
     t = _named(trace, "t_s")
     for axes, (label, name, sigma, k, factor) in zip(panels, _QUANTITIES, strict=True):
@@ -104,7 +108,7 @@ def innovation_figure(result: Replayed) -> Figure:
         f"An honest covariance keeps 95 % within the grey band of 2{SIGMA}, without a pattern. "
         "Red: gated out and not used; marks at the edge lie beyond it."
     )
-    figure = sheet(6.6, plain(f"Innovations: {result.source}", 90), note, result.verdict)
+    figure = sheet(6.6, plain(f"Innovations: {result.source}", 90), note, result.verdict, FOR_EACH_DPI)
     panels = figure.subplots(3, 1, sharex=True)
     t = _named(trace, "t_s")
     for axes, (label, columns, gate) in zip(
@@ -126,7 +130,9 @@ def innovation_figure(result: Replayed) -> Figure:
             continue
         for name, colour in zip(columns, (BLUE, GREY), strict=False):
             value = np.clip(_named(trace, name), -5.8, 5.8)
-            axes.plot(t[~gated], value[~gated], color=colour, linestyle="none", marker=".", markersize=2.0)
+            some = np.nonzero(~gated & np.isfinite(value))[0]
+            some = some[:: max(1, len(some) // _MOST_POINTS)]
+            axes.plot(t[some], value[some], color=colour, **CLOUD)
             axes.plot(t[gated], value[gated], color=VERMILLION, linestyle="none", marker="x", markersize=4.0)
     panels[-1].set_xlabel("time (s)")
     return figure
@@ -136,7 +142,7 @@ def error_figure(result: Replayed) -> Figure:
     """Errors against the truth with the 2-sigma band, the baseline's beside them."""
     trace = result.trace
     note = f"Grey: 2{SIGMA} of the estimate. Blue: its error. Orange: the error of the source's pipeline."
-    figure = sheet(6.6, plain(f"Errors: {result.source}", 90), note, result.verdict)
+    figure = sheet(6.6, plain(f"Errors: {result.source}", 90), note, result.verdict, FOR_EACH_DPI)
     panels = figure.subplots(3, 1, sharex=True)
     t = _named(trace, "t_s")
     for axes, (label, name, sigma, k, factor) in zip(panels, _QUANTITIES, strict=True):

@@ -14,11 +14,12 @@ import textwrap
 import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib import font_manager
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -26,14 +27,18 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.ft2font import FT2Font
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.textpath import text_to_path
+from numpy.typing import NDArray
+from PIL import Image
 
 from calib.errors import BadInputError
 from calib.files import shown, write_atomically
+from calib.report.layout import PanelLayout
 
 __all__ = [
     "BLUE",
+    "CLOUD",
+    "FOR_EACH_DPI",
     "GREEN",
     "GREY",
     "INK",
@@ -68,6 +73,17 @@ RISING = LinearSegmentedColormap.from_list(
 SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 WIDTH_IN = 9.2
 _DPI = 130
+FOR_EACH_DPI = 90
+"""Figures of which there are many are coarser, so that a page has room for them."""
+CLOUD: dict[str, Any] = {
+    "linestyle": "none", "marker": "s", "markersize": 1.6, "markeredgewidth": 0.0, "antialiased": False
+}  # fmt: skip
+"""Look of some thousand dots: squares of whole pixels, whose edges take no room in a file."""
+_COARSE_SHARE = 0.95
+_NEARLY_WHITE = 252
+_COLOURS = 128
+_STEPS = (32, 64, 96, 128, 160, 192, 224, 248)
+"""Where the steps of a channel begin, for figures for each log."""
 _LINE_IN = 0.19
 _TAG_IN = 2.15
 """Width that is kept free for the verdict."""
@@ -113,26 +129,23 @@ def look() -> Iterator[None]:
         yield
 
 
-def sheet(height_in: float, title: str, note: str = "", verdict: str = "ok") -> Figure:
+def sheet(height_in: float, title: str, note: str = "", verdict: str = "ok", dpi: int = _DPI) -> Figure:
     """A white figure with a bold title and a line of plain words under it, panels laid out below.
 
     Parameters
     ----------
     height_in : height of the panels together, without title and note.
     verdict : anything but "ok" is shown in the corner, so that the figure cannot be taken for a good one.
+    dpi : `FOR_EACH_DPI` for a figure of which there is one for each log.
     """
-    wide_in = WIDTH_IN - 0.3
-    titles = _lines(
-        title,
-        FontProperties(family="DejaVu Sans", size=13, weight="bold"),
-        wide_in - (verdict != "ok") * _TAG_IN,
-    )
-    notes = _lines(note, FontProperties(family="DejaVu Sans", size=10), wide_in)
+    # Letters take whole pixels, so that lines grow longer where those are large.
+    wide_in = (WIDTH_IN - 0.3) * (1.0 if dpi == _DPI else _COARSE_SHARE)
+    titles = _lines(title, 13, True, wide_in - (verdict != "ok") * _TAG_IN)
+    notes = _lines(note, 10, False, wide_in)
     head_in = 0.26 + 0.235 * len(titles) + _LINE_IN * len(notes)
     whole_in = height_in + head_in
     below = (0.008, 0.008, 0.984, 1.0 - head_in / whole_in - 0.008)
-    panels = ConstrainedLayoutEngine(rect=below, wspace=0.03, hspace=0.03)
-    figure = Figure(figsize=(WIDTH_IN, whole_in), dpi=_DPI, layout=panels)
+    figure = Figure(figsize=(WIDTH_IN, whole_in), dpi=dpi, layout=PanelLayout(below, 0.03))
     left, top = 0.13 / WIDTH_IN, whole_in - 0.12
     figure.text(
         left, top / whole_in, "\n".join(titles), fontsize=13, fontweight="bold", va="top", linespacing=1.3
@@ -161,33 +174,80 @@ def sheet(height_in: float, title: str, note: str = "", verdict: str = "ok") -> 
     return figure
 
 
-def _lines(words: str, font: FontProperties, width_in: float) -> list[str]:
+def _lines(words: str, size: float, bold: bool, width_in: float) -> list[str]:
     """The words broken into lines that fit into a width, as the font is drawn."""
     lines: list[str] = []
     for word in words.split():
         longer = f"{lines[-1]} {word}" if lines else word
-        if (
-            lines
-            and text_to_path.get_text_width_height_descent(longer, font, ismath=False)[0] > 72.0 * width_in
-        ):
+        if lines and _width_pt(longer, size, bold) > 72.0 * width_in:
             lines.append(word)
         else:
             lines[-1:] = [longer]
     return lines
 
 
+@lru_cache(2000)
+def _width_pt(words: str, size: float, bold: bool) -> float:
+    font = FontProperties(family="DejaVu Sans", size=size, weight="bold" if bold else "normal")
+    return float(text_to_path.get_text_width_height_descent(words, font, ismath=False)[0])
+
+
 def save(figure: Figure, path: Path) -> Path:
-    """Write a figure as PNG, atomically and without dates: the same figure gives the same bytes."""
-    buffer = io.BytesIO()
-    FigureCanvasAgg(figure)
-    panels = figure.get_layout_engine()
-    if panels is not None:
-        # Laid out here, the figure is not drawn once more for the layout's sake.
-        panels.execute(figure)
-        figure.set_layout_engine("none")
-    figure.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})
-    write_atomically(path, buffer.getvalue())
+    """Write a figure as PNG, atomically and without dates: the same figure gives the same bytes.
+
+    Of as few colours as are told apart, which makes it a quarter as large; of the figures for each log
+    those are fewer still.
+    """
+    canvas: Any = FigureCanvasAgg(figure)
+    canvas.draw()
+    rows, columns = canvas.get_width_height()[::-1]
+    pixels = np.frombuffer(canvas.buffer_rgba(), dtype=np.uint8).reshape(rows, columns, 4)[:, :, :3]
+    few = _few_hues(pixels) if figure.dpi == FOR_EACH_DPI else _few_colours(Image.fromarray(pixels.copy()))
+    write_atomically(path, _png(few))
     return path
+
+
+def _few_colours(picture: Image.Image) -> Image.Image:
+    """A picture with a palette."""
+    few = picture.quantize(_COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    few.putpalette(_white_paper(np.array(few.getpalette(), dtype=np.uint8).reshape(-1, 3)))
+    return few
+
+
+def _white_paper(colours: NDArray[np.uint8]) -> bytes:
+    """A palette (n, 3) in which what is nearly white is white."""
+    return (
+        np.where(colours.min(axis=1, keepdims=True) >= _NEARLY_WHITE, 255, colours).astype(np.uint8).tobytes()
+    )
+
+
+def _few_hues(pixels: NDArray[np.uint8]) -> Image.Image:
+    """Lines and letters (rows, columns, 3) with few steps from each hue to the paper.
+
+    Colours of one cell of a coarse grid become their mean; the few hues of a figure lie in cells of their
+    own, and so does white.
+    """
+    step = np.searchsorted(_STEPS, np.arange(256), side="right").astype(np.uint16)
+    levels = len(_STEPS) + 1
+    red, green, blue = (step[pixels[:, :, k]] for k in range(3))
+    cell = (red * levels + green) * levels + blue
+    count = np.bincount(cell.ravel(), minlength=levels**3)
+    used = np.nonzero(count)[0]
+    sums = [np.bincount(cell.ravel(), pixels[:, :, k].ravel(), levels**3)[used] for k in range(3)]
+    colours = np.stack(sums, axis=-1) / count[used][:, None]
+    most = np.argsort(-count[used], kind="stable")[:256]
+    nearest = np.argmin(np.sum((colours[:, None] - colours[None, most]) ** 2, axis=-1), axis=1)
+    place = np.zeros(levels**3, dtype=np.uint8)
+    place[used] = nearest
+    few = Image.frombytes("P", (pixels.shape[1], pixels.shape[0]), place[cell].tobytes())
+    few.putpalette(_white_paper(np.rint(colours[most]).astype(np.uint8)))
+    return few
+
+
+def _png(picture: Image.Image) -> bytes:
+    buffer = io.BytesIO()
+    picture.save(buffer, format="png", compress_level=6)
+    return buffer.getvalue()
 
 
 def figure_folder(folder: Path) -> Path:

@@ -9,7 +9,20 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from calib.report.style import BLUE, GREEN, GREY, ORANGE, figure_folder, look, number, plain, save, sheet
+from calib.report.style import (
+    BLUE,
+    CLOUD,
+    FOR_EACH_DPI,
+    GREEN,
+    GREY,
+    ORANGE,
+    figure_folder,
+    look,
+    number,
+    plain,
+    save,
+    sheet,
+)
 from calib.validating import IMPROVED, NOMINAL, ORIGINAL, QUANTITIES, Comparison
 
 __all__ = ["model_figure", "write_validate_figures"]
@@ -44,7 +57,7 @@ def _note(one: Comparison) -> str:
 
 def model_figure(one: Comparison) -> Figure:
     """Bellows and angle of one log, measured and simulated, and beside them the errors."""
-    figure = sheet(6.6, f"Model against log: {plain(one.name, 50)}", _note(one))
+    figure = sheet(6.6, f"Model against log: {plain(one.name, 50)}", _note(one), dpi=FOR_EACH_DPI)
     panels = figure.subplots(3, 2, squeeze=False, sharex=True, gridspec_kw={"width_ratios": [1.5, 1.0]})
     some = one.t_s <= _MOST_S
     t = one.t_s[some]
@@ -52,7 +65,7 @@ def model_figure(one: Comparison) -> Figure:
         scale, unit = _SCALES[name]
         seen = scale * one.measured[some, row]
         left, right = panels[row]
-        left.plot(t, seen, ".", color=GREY, markersize=2.0, label="measured")
+        left.plot(t, seen, color=GREY, label="measured", **CLOUD)
         for model in _known(one):
             told = scale * one.simulated[model][some, row]
             left.plot(t, told, color=_COLOURS[model], linewidth=1.1, label=model)
@@ -66,7 +79,9 @@ def model_figure(one: Comparison) -> Figure:
     panels[0, 1].set_title("Measured less simulated")
     for axes in panels[-1]:
         axes.set_xlabel("time (s)")
-    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    figure.legend(
+        *panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, markerscale=2.0
+    )
     return figure
 
 

@@ -2,7 +2,7 @@
 
 A result is a folder that appears under its name in one step, when all in it has been written:
 
-    result.json    key, exit code, SHA-256 of every other file
+    result.json    key, exit code, SHA-256 of every other file, and of all this
     rig.yaml       the rig's file after the stage: what it saw, and what it has written
     document.json  what the verb said with --json    messages.txt  what it said on stderr
     figures/       and what it wrote with -o
@@ -53,8 +53,8 @@ class Result:
     def document(self) -> dict[str, Any]:
         """What the verb said with --json; empty where it said nothing that can be read."""
         path = self.folder / "document.json"
-        with contextlib.suppress(OSError, ValueError):
-            if path.stat().st_size <= _MOST_BYTES:
+        with contextlib.suppress(OSError, ValueError, RecursionError):
+            if path.name in self.files and path.stat().st_size <= _MOST_BYTES:
                 found = json.loads(path.read_text(encoding="utf-8"))
                 return found if isinstance(found, dict) else {}
         return {}
@@ -62,8 +62,9 @@ class Result:
     def messages(self) -> list[str]:
         """What the verb said on stderr."""
         with contextlib.suppress(OSError):
-            text = (self.folder / "messages.txt").read_text(encoding="utf-8", errors="replace")
-            return [line for line in text.splitlines() if line.strip()]
+            if "messages.txt" in self.files:
+                text = (self.folder / "messages.txt").read_text(encoding="utf-8", errors="replace")
+                return [line for line in text.splitlines() if line.strip()]
         return []
 
     def figures(self) -> list[Path]:
@@ -93,17 +94,23 @@ def key_of(command: tuple[str, ...], inputs: Mapping[str, str], sections: str) -
     return sha256(json.dumps(whole, sort_keys=True, ensure_ascii=True).encode())
 
 
+def _digest(told: Mapping[str, Any]) -> str:
+    return sha256(json.dumps(told, sort_keys=True).encode())
+
+
 def load(folder: Path, key: str | None = None) -> Result | None:
     """The result in a folder if it is whole, and of this key where one is given."""
     try:
         told = json.loads((folder / _RESULT).read_text(encoding="utf-8"))
+        if told.pop("sha256", None) != _digest(told):
+            return None
         result = Result(
             folder,
             str(told["key"]),
             int(told["code"]),
             {str(name): str(digest) for name, digest in told["files"].items()},
         )
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None
     if key is not None and result.key != key:
         return None
@@ -120,7 +127,8 @@ def store(work: Path, folder: Path, key: str, code: int, trash: Path) -> Result:
     for path in sorted(work.rglob("*")):
         if path.is_file() and not path.is_symlink():
             files[path.relative_to(work).as_posix()] = digest_of(path)
-    told = {"schema": 1, "key": key, "code": code, "files": files}
+    told: dict[str, Any] = {"schema": 1, "key": key, "code": code, "files": files}
+    told["sha256"] = _digest(told)
     write_atomically(work / _RESULT, json.dumps(told, indent=1, sort_keys=True) + "\n")
     try:
         if folder.exists():

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import importlib
 import multiprocessing
 import os
 import signal
@@ -24,6 +25,18 @@ _PR_SET_PDEATHSIG = 1
 _LOOK_UP_S = 0.2
 _LOST = 70
 """Exit code for a verb whose process has died."""
+_LIBRARIES = (
+    "calib.cli.main",
+    "calib.cli.app",
+    "calib.rig",
+    "scipy.optimize",
+    "scipy.signal",
+    "numba",
+    "calib.report.style",
+)
+"""What most verbs need and takes long to load; the first of them sets up the others."""
+
+_Process = tuple[multiprocessing.process.BaseProcess, Connection]
 
 
 @dataclass(frozen=True)
@@ -50,14 +63,21 @@ class Runs(Protocol):
         """Wait until at least one command has ended."""
 
 
-def _serve(channel: Connection, parent: int) -> None:
-    """Life of a process: commands in, exit codes out, until the other end closes."""
+def _serve(channel: Connection, parent: int, ahead: bool) -> None:
+    """Life of a process: commands in, exit codes out, until the other end closes.
+
+    One that is started `ahead` of its first command loads meanwhile what most of them need.
+    """
     # Ctrl-C reaches all processes of a terminal; the first one answers for all.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL))
         if os.getppid() != parent:
             os._exit(1)
+    for name in _LIBRARIES if ahead else ():
+        # The verb that needs it says so.
+        with contextlib.suppress(ImportError):
+            importlib.import_module(name)
     while True:
         try:
             command = channel.recv()
@@ -95,8 +115,8 @@ class Pool:
     def __init__(self, count: int) -> None:
         self._context = multiprocessing.get_context("spawn")
         self._count = max(1, count)
-        self._idle: list[tuple[multiprocessing.process.BaseProcess, Connection]] = []
-        self._busy: dict[str, tuple[multiprocessing.process.BaseProcess, Connection]] = {}
+        self._idle: list[_Process] = []
+        self._busy: dict[str, _Process] = {}
 
     def __enter__(self) -> Pool:
         return self
@@ -114,17 +134,21 @@ class Pool:
         return len(self._busy) < self._count
 
     def start(self, command: Command) -> None:
-        """Hand a command to an idle process, or to a new one."""
-        if self._idle:
-            process, channel = self._idle.pop()
-        else:
-            channel, theirs = self._context.Pipe()
-            process = self._context.Process(target=_serve, args=(theirs, os.getpid()))
-            process.start()
-            theirs.close()
+        """Hand a command to an idle process, or to a new one; with the first, another is made ready."""
+        first = not (self._idle or self._busy)
+        process, channel = self._idle.pop() if self._idle else self._made(ahead=False)
         self._busy[command.name] = process, channel
         with contextlib.suppress(OSError):
             channel.send(command)
+        if first and self._count > 1:
+            self._idle.append(self._made(ahead=True))
+
+    def _made(self, ahead: bool) -> _Process:
+        channel, theirs = self._context.Pipe()
+        process = self._context.Process(target=_serve, args=(theirs, os.getpid(), ahead))
+        process.start()
+        theirs.close()
+        return process, channel
 
     def finished(self) -> Iterator[tuple[str, int]]:
         """Names and exit codes of commands that have ended; waits for at least one."""

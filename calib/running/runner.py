@@ -23,7 +23,7 @@ from calib.running.folder import Folder, folder_digests
 from calib.running.lock import held
 from calib.running.pool import Command, Runs
 from calib.running.sections import Sections, sections_of
-from calib.running.stages import STAGES, Job, Stage, jobs_of
+from calib.running.stages import STAGES, Job, Stage, jobs_of, urgency
 
 __all__ = ["HIDDEN", "Done", "Runner", "opened"]
 
@@ -136,7 +136,9 @@ class Runner:
             asked = [job for job in jobs if job.planned is not None and self.available(job.stage.verb)]
             learnt = {name for job in asked for name in job.stage.writes}
             self._base = told.without(learnt)
-        waiting, running = jobs, dict[str, tuple[Job, str, Path]]()
+        urgent = urgency(self.stages)
+        waiting = sorted(jobs, key=lambda job: -urgent[job.stage.name])
+        running: dict[str, tuple[Job, str, Path]] = {}
         while waiting or running:
             waiting = [job for job in waiting if not self._settled(job)]
             for job in list(waiting):

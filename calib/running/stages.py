@@ -13,7 +13,7 @@ from pathlib import Path
 
 from calib.running.folder import Folder, LogFile, with_topics
 
-__all__ = ["STAGES", "Job", "Planned", "Stage", "jobs_of"]
+__all__ = ["STAGES", "Job", "Planned", "Stage", "jobs_of", "urgency"]
 
 _IMU = ("ax_mps2", "ay_mps2", "gz_radps")
 _CAMERA = ("u_px", "v_px")
@@ -45,6 +45,7 @@ class Stage:
         it reads where they are.
     output : name of what it writes with -o, "" for nothing. figures : whether it draws.
     flashed : whether its result goes into the firmware.
+    seconds : about how long it takes, by which the runner begins what holds up most.
     """
 
     name: str
@@ -58,6 +59,7 @@ class Stage:
     output: str = ""
     figures: bool = True
     flashed: bool = False
+    seconds: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -170,33 +172,47 @@ _SENSORS = (*_OPTICS, "lens", "imu", "imu_intrinsics", "orientation_filter", "lo
 _MACHINE = ("actuator", "pump")
 
 STAGES: tuple[Stage, ...] = (
-    Stage("intrinsics", "Camera", ("intrinsics",), _intrinsics, writes=("camera",), flashed=True),
+    Stage("intrinsics", "Camera", ("intrinsics",), _intrinsics, writes=("camera",), flashed=True,
+          seconds=5.0),
     Stage("extrinsics", "Plane of motion", ("extrinsics",), _extrinsics, writes=("plane",), needs=("camera",),
-          flashed=True),
+          flashed=True, seconds=3.0),
     Stage("distortion", "Lens", ("distortion",), _nothing, writes=("lens",), needs=("camera",),
           uses=("plane",)),
-    Stage("imu-static", "IMU at rest", ("imu", "static"), _static, writes=("imu",), flashed=True),
+    Stage("imu-static", "IMU at rest", ("imu", "static"), _static, writes=("imu",), flashed=True,
+          seconds=4.0),
     Stage("imu-intrinsics", "IMU in poses", ("imu", "intrinsics"), _poses, writes=("imu_intrinsics",),
           uses=("imu",)),
     Stage("imu-tune", "Angle filter", ("imu", "tune"), _moving, writes=("orientation_filter",),
-          uses=(*_OPTICS, "imu", "imu_intrinsics"), flashed=True),
+          uses=(*_OPTICS, "imu", "imu_intrinsics"), flashed=True, seconds=4.0),
     Stage("imu-drift", "Drift of the angle", ("imu", "drift"), _drift,
-          uses=("imu", "imu_intrinsics", "orientation_filter")),
-    Stage("lowpass", "Low-pass", ("lowpass",), _lowpass, writes=("lowpass",), uses=_OPTICS, flashed=True),
+          uses=("imu", "imu_intrinsics", "orientation_filter"), seconds=2.0),
+    Stage("lowpass", "Low-pass", ("lowpass",), _lowpass, writes=("lowpass",), uses=_OPTICS, flashed=True,
+          seconds=3.0),
     Stage("align", "Camera and IMU together", ("align",), _both, writes=("align",), needs=_OPTICS,
-          uses=("imu", "imu_intrinsics"), flashed=True),
-    Stage("replay", "States", ("replay",), None, _replay, needs=_OPTICS, uses=_SENSORS, output="states.csv"),
+          uses=("imu", "imu_intrinsics"), flashed=True, seconds=9.0),
+    Stage("replay", "States", ("replay",), None, _replay, needs=_OPTICS, uses=_SENSORS, output="states.csv",
+          seconds=2.0),
     Stage("identify", "Model of the actuator", ("identify", "logs"), _identify, writes=_MACHINE,
-          needs=_OPTICS, uses=_SENSORS),
+          needs=_OPTICS, uses=_SENSORS, seconds=9.0),
     Stage("control", "Controllers", ("control", "tune"), _nothing, writes=("controller",),
-          uses=(*_OPTICS, *_MACHINE), flashed=True),
+          uses=(*_OPTICS, *_MACHINE), flashed=True, seconds=3.0),
     Stage("validate", "Model against log", ("validate",), _driven, needs=_OPTICS,
-          uses=(*_SENSORS, *_MACHINE, "controller")),
+          uses=(*_SENSORS, *_MACHINE, "controller"), seconds=8.0),
     Stage("claims", "Book of claims", ("validate",), _claims, figures=False),
     Stage("firmware", "Firmware", ("firmware",), _nothing, needs=("camera",),
           uses=(*_SENSORS, *_MACHINE, "controller"), output="firmware", figures=False),
 )  # fmt: skip
 """All stages, each after those whose sections it reads."""
+
+
+def urgency(stages: tuple[Stage, ...] = STAGES) -> dict[str, float]:
+    """Seconds from the start of each stage to the end of all that waits for it, by name."""
+    out: dict[str, float] = {}
+    for stage in reversed(stages):
+        waits = [out[other.name] for other in stages if other.name in out
+                 and {*other.needs, *other.uses} & set(stage.writes)]  # fmt: skip
+        out[stage.name] = stage.seconds + max(waits, default=0.0)
+    return out
 
 
 def jobs_of(folder: Folder, stages: tuple[Stage, ...] = STAGES) -> Iterator[Job]:

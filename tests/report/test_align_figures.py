@@ -47,5 +47,6 @@ def test_files_repeat_and_hold_a_picture(tmp_path: Path) -> None:
         assert path.read_bytes() == again.read_bytes()
         picture = cv2.imread(str(path))
         assert picture is not None
-        assert picture.shape[1] > 1000
+        # One for each log is coarser, so that a page has room for all.
+        assert picture.shape[1] > (800 if "residuals" in path.name else 1000)
         assert picture.std() > 10.0

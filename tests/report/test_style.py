@@ -10,9 +10,27 @@ import pytest
 from figure_checks import complaints, drawn_texts
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
 from calib.errors import BadInputError
-from calib.report.style import figure_folder, look, number, plain, round_down, save, sheet, view_colours
+from calib.report.style import (
+    BLUE,
+    FOR_EACH_DPI,
+    GREEN,
+    GREY,
+    INK,
+    ORANGE,
+    SHADE,
+    VERMILLION,
+    figure_folder,
+    look,
+    number,
+    plain,
+    round_down,
+    save,
+    sheet,
+    view_colours,
+)
 
 
 @given(st.text(st.characters(codec=None), max_size=60), st.integers(8, 40))
@@ -112,3 +130,19 @@ def test_a_folder_without_permission_is_a_sentence(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(Path, "mkdir", refuse)
     with pytest.raises(BadInputError, match="no folder for figures can be made here: Permission denied"):
         figure_folder(tmp_path / "figures")
+
+
+def test_a_figure_for_each_log_keeps_its_hues_apart(tmp_path: Path) -> None:
+    hues = (INK, GREY, SHADE, BLUE, VERMILLION, GREEN, ORANGE)
+    with look():
+        figure = sheet(3.0, "Hues", dpi=FOR_EACH_DPI)
+        axes = figure.subplots()
+        for k, hue in enumerate(hues):
+            axes.plot([0.0, 1.0], [k, k], color=hue, linewidth=9.0)
+        path = save(figure, tmp_path / "a.png")
+    with Image.open(path) as drawn:
+        assert drawn.mode == "P"
+        seen = {colour for count, colour in drawn.convert("RGB").getcolors(1 << 16) if count > 1000}
+    for hue in (*hues, "#ffffff"):
+        wanted = np.array([int(hue[k : k + 2], 16) for k in (1, 3, 5)])
+        assert min(np.abs(np.array(colour) - wanted).max() for colour in seen) <= 4, hue

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+
 from calib.running.cache import key_of, load, store
 
 
@@ -48,6 +50,20 @@ def test_what_was_touched_is_not_used(tmp_path: Path) -> None:
     ):
         (folder / "result.json").write_text(text)
         assert load(folder) is None
+
+
+@pytest.mark.parametrize("changed", ["document.json", "messages.txt", "result.json"])
+def test_forged_numbers_are_not_told(tmp_path: Path, changed: str) -> None:
+    folder = _stored(tmp_path)
+    path = folder / changed
+    forged = {
+        "document.json": path.read_text().replace("x", "y"),
+        "messages.txt": "all is well\n",
+        "result.json": path.read_text().replace('"code": 1', '"code": 0'),
+    }[changed]
+    assert forged != path.read_text()
+    path.write_text(forged)
+    assert load(folder) is None and load(folder, "k") is None
 
 
 def test_key_depends_on_each_part() -> None:

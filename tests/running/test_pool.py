@@ -32,3 +32,16 @@ def test_verbs_one_after_another_and_one_that_dies(tmp_path: Path) -> None:
         assert list(pool.finished()) == [("long", 70)]
         pool.start(_command(tmp_path, "again", "--version"))
         assert list(pool.finished()) == [("again", 0)]
+
+
+@pytest.mark.slow
+def test_another_process_is_made_ready_with_the_first(tmp_path: Path) -> None:
+    with Pool(2) as pool:
+        pool.start(_command(tmp_path, "one", "--version"))
+        ((ready, _),) = pool._idle
+        pool.start(_command(tmp_path, "two", "--version"))
+        assert [process for process, _ in pool._busy.values()][1] is ready
+        ended: dict[str, int] = {}
+        while len(ended) < 2:
+            ended |= dict(pool.finished())
+        assert ended == {"one": 0, "two": 0}

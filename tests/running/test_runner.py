@@ -42,6 +42,8 @@ def test_order_outputs_and_what_is_not_available(tmp_path: Path) -> None:
         "absent": "missing", "firmware": "ok",
     }  # fmt: skip
     assert CALLS.index("first") < CALLS.index("second") < CALLS.index("firmware")
+    # What nobody waits for comes last, whatever its place in the table.
+    assert CALLS.index("second") < CALLS.index("lone")
     out = tmp_path / "out"
     assert sorted(p.name for p in out.iterdir()) == [HIDDEN, "firmware", "rig.yaml", "states"]
     assert sorted(p.name for p in (out / "states").iterdir()) == ["one.csv", "two.csv"]
@@ -150,9 +152,12 @@ def test_a_damaged_result_is_made_again(tmp_path: Path) -> None:
     before = _bytes(out)
     (out / HIDDEN / "stages" / "each-one" / "states.csv").write_text("torn")
     (out / HIDDEN / "stages" / "second" / "result.json").write_text("{")
+    (out / HIDDEN / "stages" / "lone" / "document.json").write_text(
+        '{"schema": 1, "lone": {"verdict": "ok"}}'
+    )
     CALLS.clear()
     run_small(root, out)
-    assert sorted(CALLS) == ["each-one", "second"]
+    assert sorted(CALLS) == ["each-one", "lone", "second"]
     assert _bytes(out) == before
 
 

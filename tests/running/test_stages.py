@@ -13,7 +13,7 @@ from calib.cli.app import app
 from calib.cli.run import is_available
 from calib.rig import SECTIONS
 from calib.running.folder import read_folder
-from calib.running.stages import STAGES, Stage, jobs_of
+from calib.running.stages import STAGES, Stage, jobs_of, urgency
 
 
 def test_every_stage_comes_after_what_it_reads() -> None:
@@ -73,3 +73,12 @@ def test_plane_with_a_link_out_is_not_handed_to_the_verb(tmp_path: Path) -> None
     jobs = {job.name: job for job in jobs_of(read_folder(root))}
     assert jobs["extrinsics"].planned is None
     assert "link out of the folder" in jobs["extrinsics"].reason
+
+
+def test_what_others_wait_for_is_more_urgent_than_they_are() -> None:
+    first = urgency()
+    for stage in STAGES:
+        for other in STAGES:
+            if set(stage.writes) & {*other.needs, *other.uses}:
+                assert first[stage.name] >= first[other.name] + stage.seconds
+    assert min(first["identify"], first["control"]) > first["replay"] > first["firmware"]
