@@ -21,8 +21,9 @@ from calib.rig_actuator import Actuator, PumpSection, section_of
 
 __all__ = ["drive_from_rig", "has_commands", "pwm_of"]
 
-_LEAST_SHARE = 0.01
-"""Identified values are not taken to be nearer the truth than this."""
+_LEAST_SHARE, _APART = 0.01, 0.003
+"""Identified values are not taken to be nearer the truth than the first, nor what they tell together than
+the second: an identification keeps mass and rest length as they are, and its model is not the actuator."""
 
 
 def has_commands(log: Log) -> bool:
@@ -119,6 +120,34 @@ def _deviation(section: Actuator | PumpSection, key: str, at: int, relative: boo
     return max(float(sigma) / abs(float(value)), _LEAST_SHARE) if value else None
 
 
+def _covariance(actuator: Actuator, pump: PumpSection, sigma: dict[str, float]) -> FloatArray | None:
+    """Covariance (11, 11) of the parameters: their deviations with the correlations of the identification.
+
+    What was estimated apart since then, so that the deviation in the file is another one, is independent.
+    """
+    table, out = actuator.covariance, np.diag(np.array(list(sigma.values())) ** 2)
+    if table is None:
+        return None
+    rows, names = [], []
+    for name, (section, key) in _SIGMA.items():
+        row = name if key == "strength" else key
+        known = actuator if section == "actuator" else pump
+        told = _deviation(known, key, int(name == "strength2"), relative=False)
+        if not told or row not in table.order:
+            continue
+        at = table.order.index(row)
+        if math.isclose(told * told, table.values[at][at], rel_tol=2e-3):
+            rows.append(at)
+            names.append(name)
+    spread = np.sqrt([table.values[k][k] for k in rows])
+    places = [PARAMETER.index(name) for name in names]
+    correlation = np.array(table.values)[np.ix_(rows, rows)] / np.outer(spread, spread)
+    deviation = np.array([sigma[name] for name in names])
+    out[np.ix_(places, places)] = correlation * np.outer(deviation, deviation)
+    out[places, places] += _APART**2
+    return np.asarray(out)
+
+
 def drive_from_rig(rig: Rig, path: Path) -> Drive:
     """Plant and pumps with their deviations; what the file lacks is nominal.
 
@@ -137,7 +166,20 @@ def drive_from_rig(rig: Rig, path: Path) -> Drive:
         known = actuator if section == "actuator" else pump
         found = _deviation(known, key, int(name == "strength2"), name != "rest_length_m")
         if found is not None:
-            sigma[name] = found
+            # What was hardly identified differs from other rigs as they do from each other.
+            sigma[name] = found if actuator.covariance is None else min(found, sigma[name])
+    if actuator.covariance is not None and "mass_kg" not in actuator.sigma:
+        # Forces, springs and mass have one scale, which the identification takes from the mass.
+        sigma["mass"] = _LEAST_SHARE
+    covariance = _covariance(actuator, pump, sigma)
+    if covariance is not None:
+        least = float(np.linalg.eigvalsh(covariance / np.outer(*[np.sqrt(np.diag(covariance))] * 2))[0])
+        if not least > 0.0:
+            raise BadInputError(
+                f"{shown(path)}: actuator.covariance has correlations whose least eigenvalue is {least:.1g}, "
+                "expected a positive one"
+            )
+        sigma = dict(zip(PARAMETER, np.sqrt(np.diag(covariance)).tolist(), strict=True))
     strength = pump.strength or list(nominal.strength)
     tuned = rig.estimator.driven if rig.estimator is not None else None
     if tuned is not None:
@@ -154,4 +196,5 @@ def drive_from_rig(rig: Rig, path: Path) -> Drive:
         strength=(strength[0], strength[1]),
         free_damping_scale=_or(actuator.damping_scale_free_swing, nominal.free_damping_scale),
         sigma=tuple(sigma.values()),
+        covariance=covariance,
     )

@@ -53,6 +53,12 @@ def until(true: Callable[[], bool], process: subprocess.Popen[str]) -> None:
         time.sleep(0.02)
 
 
+def first_worker(process: subprocess.Popen[str]) -> int:
+    """A worker of a run, as soon as there is one: asked for later, a quick run may have ended."""
+    until(lambda: bool(workers(process.pid)), process)
+    return workers(process.pid)[0]
+
+
 def all_gone(processes: list[int], seconds: float = 30.0) -> bool:
     """Whether these processes end within some time."""
     ends = time.monotonic() + seconds

@@ -14,7 +14,10 @@ from calib.arrays import FloatArray
 from calib.estimator.driven_model import DRIVEN, DYNAMIC, INVOLVED, PARAMETER
 from calib.estimator.setup import Setup
 
-__all__ = ["Drive", "commands"]
+__all__ = ["SIGMA", "Drive", "commands"]
+
+SIGMA = (0.08, 0.1, 0.1, 0.06, 0.06, 0.06, 0.08, 5e-4, 0.08, 0.1, 0.1)
+"""Deviations of `driven_model.PARAMETER` from nominal: by what two rigs that were made alike differ."""
 
 
 @dataclass(frozen=True)
@@ -26,12 +29,14 @@ class Drive:
     plant, pump, strength : nominal, with the hoses on; factors on the pumps' static forces.
     free_damping_scale : c_dmp with the hoses off. Until the first command nobody knows which it is.
     sigma : (11,) deviations of `driven_model.PARAMETER`.
+    covariance : (11, 11) of the same where they are not independent; its diagonal is `sigma` squared.
     sigma_force_N, sigma_disturbance_N, sigma_creep_N : of the state before the first reading.
     sigma_turning_radps : of dphi; a free swing is fast.
     walk_disturbance : density of the disturbances' walk [N/sqrt(s)].
     walk_rates : densities of the walk of dphi and dl [rad/s, m/s per sqrt(s)].
     walk_forces : density of the walk of lag, force and creep [N/sqrt(s)].
-    walk_parameters : of all parameters, as a share of their deviation per sqrt(s).
+    walk_parameters : of all parameters, as a share of `SIGMA` per sqrt(s). Known ones walk as well: they
+        stand for a model that is not the actuator, and a smoother spreads what they learn over the log.
     imu_noise : deviations of a_x, a_y [m/s^2] and g_z [rad/s] for this filter, which knows the head's
         accelerations; None for those of the set-up.
     """
@@ -40,7 +45,7 @@ class Drive:
     pump: Pump = field(default_factory=Pump)
     strength: tuple[float, float] = (1.0, 1.0)
     free_damping_scale: float = DAMPING_SCALE_FREE
-    sigma: tuple[float, ...] = (0.08, 0.1, 0.1, 0.06, 0.06, 0.06, 0.08, 5e-4, 0.08, 0.1, 0.1)
+    sigma: tuple[float, ...] = SIGMA
     sigma_force_N: float = 0.03
     sigma_disturbance_N: float = 0.01
     sigma_creep_N: float = 0.03
@@ -48,8 +53,9 @@ class Drive:
     walk_disturbance: float = 2.5e-4
     walk_rates: tuple[float, float] = (2e-3, 1e-4)
     walk_forces: float = 1e-4
-    walk_parameters: float = 2e-3
+    walk_parameters: float = 5e-3
     imu_noise: tuple[float, float, float] | None = None
+    covariance: FloatArray | None = None
 
     def numbers(self) -> FloatArray:
         """The (22,) vector of `driven_model.PLANT`."""
@@ -68,7 +74,7 @@ class Drive:
         moving[2:4] = self.walk_rates
         moving[4:10] = self.walk_forces
         moving[10:12] = self.walk_disturbance
-        parameters = self.walk_parameters * np.array(self.sigma)
+        parameters = self.walk_parameters * np.array(SIGMA)
         return np.concatenate([moving, parameters, setup.process.sensor_walk]) ** 2
 
     def start(self, setup: Setup) -> tuple[FloatArray, FloatArray]:
@@ -90,6 +96,9 @@ class Drive:
         # Pictures are put at their exposure, so that what is left of the offset is zero.
         x[INVOLVED + 7] -= max(float(begin.sensor[7]), 0.0)
         P = np.diag(sigma**2)
+        if self.covariance is not None:
+            P[DYNAMIC:INVOLVED, DYNAMIC:INVOLVED] = self.covariance
+            P[at, at] = sigma[at] ** 2
         P[INVOLVED:, INVOLVED:] = begin.covariance()[6:, 6:]
         return x, P
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fleet_processes import COMMAND, all_gone, done, started, until, workers
+from fleet_processes import COMMAND, all_gone, done, first_worker, started, until, workers
 from fleet_rigs import write_fleet, write_manifest
 
 from calib.fleet import cluster
@@ -95,8 +95,9 @@ def test_killed_worker_killed_client_and_single_runs_end_in_the_same(
     out, other = tmp_path / "out", tmp_path / "other"
     # A worker is killed on the way: nothing is lost.
     with started(environment, "fleet", manifest, "-o", out, "--workers", 2, "--json") as process:
+        victim = first_worker(process)
         until(lambda: done(out) >= 2, process)
-        os.kill(workers(process.pid)[0], signal.SIGKILL)
+        os.kill(victim, signal.SIGKILL)
         said, told = process.communicate()
     assert process.returncode == 1, told
     found = json.loads(said)["fleet"]

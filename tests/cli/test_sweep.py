@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 from fleet_clusters import in_threads
-from fleet_processes import COMMAND, all_gone, done, started, until, workers
+from fleet_processes import COMMAND, all_gone, done, first_worker, started, until, workers
 
 from calib.fleet.store import opened_store
 from calib.fleet.sweeping import run_sweep, summarise_sweep
@@ -85,8 +85,9 @@ def test_killed_client_and_killed_worker_end_in_the_same(environment: dict[str, 
     assert 2 <= len(kept) < 16
     # The next run goes on, and a worker is killed on the way: nothing is lost, nothing is done again.
     with started(environment, "sweep", spec, "-o", out, "--workers", 2, "--json") as process:
+        victim = first_worker(process)
         until(lambda: done(out) > len(kept), process)
-        os.kill(workers(process.pid)[0], signal.SIGKILL)
+        os.kill(victim, signal.SIGKILL)
         said, told = process.communicate()
     assert process.returncode == 0 and "interrupted" in told, told
     found = json.loads(said)["sweep"]

@@ -25,6 +25,22 @@ def test_the_prior_holds_hoses_off_and_on() -> None:
     )
 
 
+def test_what_was_identified_together_starts_together() -> None:
+    sigma = np.array(Drive().sigma)
+    told = 0.01 * np.outer(sigma, sigma) + 0.01 * np.diag(sigma**2)
+    deviation = np.sqrt(np.diag(told))
+    drive = Drive(sigma=tuple(deviation.tolist()), covariance=told)
+    _, P = drive.start(setup_for(varied_drive(1)))
+    at = DRIVEN.index("log_damping")
+    others = [k for k in range(DYNAMIC, INVOLVED) if k != at]
+    np.testing.assert_array_equal(
+        P[np.ix_(others, others)], told[np.ix_(*[np.subtract(others, DYNAMIC)] * 2)]
+    )
+    # Of the damping nobody knows yet whether the hoses are on.
+    assert P[at, at] > 100.0 * told[1, 1]
+    assert np.all(np.linalg.eigvalsh(P) > 0.0)
+
+
 def test_pictures_are_put_at_their_exposure() -> None:
     setup = setup_for(varied_drive(2))
     assert setup.start.sensor[7] > 0.005
