@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from calib.errors import BadInputError, CalibError
 from calib.files import one_line, read_yaml_mapping, shown
@@ -42,6 +43,7 @@ _KEYS = ("base", "grid", "draws", "measure", "near")
 _KINDS = ("controller", "scenario", "filter")
 _BASE = (*_KINDS, "reference", "rig", "feedback", "duration", "model")
 _FILTERS = ("fused", "baseline")
+_GAINS = {"orientation": "tuned-pid", "position": "tuned-pd", "computed_torque": "torque"}
 _MODELS = ("auto", "kinematic", "driven")
 _MOST_CASES = 1_000_000
 _LONGEST_S = 3600.0
@@ -263,6 +265,21 @@ def _check_key(where: str, key: str, base: Base) -> None:
         )
     if key.startswith("scenario.") and base.kind == "controller":
         raise BadInputError(f"{where}: {key} needs a scenario, and base has a controller with a reference")
+    if key.startswith("controller."):
+        _check_gain(where, key, base)
+
+
+def _check_gain(where: str, key: str, base: Base) -> None:
+    """Refuse keys of the section `controller` that nothing would read."""
+    if base.kind != "controller":
+        raise BadInputError(f"{where}: {key} needs a controller, and base has a {base.kind}")
+    whose = _GAINS.get(key.split(".")[1], base.name)
+    if whose != base.name:
+        raise BadInputError(f"{where}: {key} belongs to the controller {whose}, and base has {base.name}")
+    if "controller" not in (yaml.safe_load(base.rig) or {}):
+        raise BadInputError(
+            f"{where}: {key} is in the section controller, which base.rig lacks; calib control tune writes it"
+        )
 
 
 def _finite(where: str, value: Any) -> float:

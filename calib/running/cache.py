@@ -32,7 +32,7 @@ __all__ = ["Result", "key_of", "load", "program_digest", "remove", "store"]
 
 _RESULT = "result.json"
 _MOST_BYTES = 50_000_000
-_SOURCES = (".py", ".j2", ".h", ".ino")
+_SOURCES = (".py", ".j2", ".h", ".ino", ".js", ".css")
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,12 @@ def test_help_imports_nothing_heavy(environment) -> None:
     assert all(verb in done.stdout for verb in VERBS)
 
 
+def test_the_module_is_the_command(environment) -> None:
+    command = [sys.executable, "-m", "calib", "--version"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("calib ")
+
+
 @pytest.mark.parametrize("verb", VERBS)
 def test_help_of_each_verb_explains_every_argument(calib, verb: str) -> None:
     ended = calib(verb, "--help")

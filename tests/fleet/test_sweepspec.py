@@ -62,6 +62,12 @@ def test_log_range(tmp_path: Path) -> None:
         (_BASE + "grid: {lag: [1]}\n", "lag is no parameter"),
         (_BASE + "grid: {__class__.x: [1]}\n", "is no parameter"),
         (_BASE + "grid: {scenario.Kp: [1]}\n", "needs a scenario"),
+        (
+            _BASE + "grid: {controller.orientation.Kp_pwm_per_rad: [1]}\n",
+            "belongs to the controller tuned-pid",
+        ),
+        (_BASE + "grid: {controller.pwm_high: [200]}\n", "section controller, which base.rig lacks"),
+        ("base: {scenario: swing}\ngrid: {controller.pwm_high: [200]}\n", "needs a controller"),
         (_BASE + "grid: {pump.lag_s: []}\n", "no list of values and no range"),
         (_BASE + "grid: {pump.lag_s: [.nan]}\n", "has .* in it, expected numbers"),
         (_BASE + "grid: {pump.lag_s: [[1]]}\n", "in it, expected numbers"),
