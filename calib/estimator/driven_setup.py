@@ -53,7 +53,7 @@ class Drive:
     walk_disturbance: float = 2.5e-4
     walk_rates: tuple[float, float] = (2e-3, 1e-4)
     walk_forces: float = 1e-4
-    walk_parameters: float = 5e-3
+    walk_parameters: float = 3.5e-3
     imu_noise: tuple[float, float, float] | None = None
     covariance: FloatArray | None = None
 
