@@ -141,7 +141,8 @@ def _covariance(actuator: Actuator, pump: PumpSection, sigma: dict[str, float]) 
             names.append(name)
     spread = np.sqrt([table.values[k][k] for k in rows])
     places = [PARAMETER.index(name) for name in names]
-    correlation = np.array(table.values)[np.ix_(rows, rows)] / np.outer(spread, spread)
+    together = np.array(table.values)[np.ix_(rows, rows)]
+    correlation = 0.5 * (together + together.T) / np.outer(spread, spread)
     deviation = np.array([sigma[name] for name in names])
     out[np.ix_(places, places)] = correlation * np.outer(deviation, deviation)
     out[places, places] += _APART**2
@@ -173,13 +174,14 @@ def drive_from_rig(rig: Rig, path: Path) -> Drive:
         sigma["mass"] = _LEAST_SHARE
     covariance = _covariance(actuator, pump, sigma)
     if covariance is not None:
-        least = float(np.linalg.eigvalsh(covariance / np.outer(*[np.sqrt(np.diag(covariance))] * 2))[0])
-        if not least > 0.0:
+        deviation = np.sqrt(np.diag(covariance))
+        correlation = covariance / np.outer(deviation, deviation)
+        if not (np.abs(correlation).max() < 1.01 and np.linalg.eigvalsh(correlation)[0] > 0.0):
             raise BadInputError(
-                f"{shown(path)}: actuator.covariance has correlations whose least eigenvalue is {least:.1g}, "
-                "expected a positive one"
+                f"{shown(path)}: actuator.covariance has correlations that no quantities have, expected a "
+                "positive definite matrix"
             )
-        sigma = dict(zip(PARAMETER, np.sqrt(np.diag(covariance)).tolist(), strict=True))
+        sigma = dict(zip(PARAMETER, deviation.tolist(), strict=True))
     strength = pump.strength or list(nominal.strength)
     tuned = rig.estimator.driven if rig.estimator is not None else None
     if tuned is not None:

@@ -105,9 +105,12 @@ def test_what_was_identified_together_stays_together() -> None:
 
 
 def test_correlations_that_cannot_be_are_refused() -> None:
-    rig = _identified((0.022, 0.36, 0.014, 0.02, 0.0194, 0.1), 1.4)
-    with pytest.raises(BadInputError, match=r"rig\.yaml: actuator\.covariance has .* expected a positive"):
-        drive_from_rig(rig, HERE)
+    for correlation in (1.4, -0.9, 1e6):
+        rig = _identified((0.022, 0.36, 0.014, 0.02, 0.0194, 0.1), correlation)
+        with pytest.raises(
+            BadInputError, match=r"rig\.yaml: actuator\.covariance has .* expected a positive"
+        ):
+            drive_from_rig(rig, HERE)
 
 
 def test_what_was_estimated_apart_since_is_independent() -> None:
