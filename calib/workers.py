@@ -31,7 +31,7 @@ from typing import Any, Generic, TypeVar, cast
 import cv2
 
 # np.median and np.unique load it: once here, before the processes fork, instead of once in each.
-import numpy.ma  # noqa: F401
+import numpy.ma  # noqa: F401  for its loading
 
 __all__ = ["Workers", "at_most", "processors"]
 

@@ -126,9 +126,7 @@ def _drive(record: PumpRecord, shape: Shape, dead_time_s: float, step_s: float, 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _lag(
-    g: FloatArray, step_s: float, p: float, z: float, theta: FloatArray, out: FloatArray
-) -> None:  # pragma: no cover  compiled
+def _lag(g: FloatArray, step_s: float, p: float, z: float, theta: FloatArray, out: FloatArray) -> None:
     share, most = -math.expm1(-step_s / theta[2]), theta[3] * step_s
     p += z
     out[0] = p
@@ -138,7 +136,7 @@ def _lag(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _flow(theta: FloatArray, g: float, p: float, z: float, opened: float) -> float:  # pragma: no cover
+def _flow(theta: FloatArray, g: float, p: float, z: float, opened: float) -> float:
     a, b = theta[2], theta[3]
     drop = g - p
     w = 2.0 * drop / (a + math.sqrt(a * a + 4.0 * b * drop)) if drop > 0.0 else 0.0
@@ -146,9 +144,7 @@ def _flow(theta: FloatArray, g: float, p: float, z: float, opened: float) -> flo
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _orifice(
-    g: FloatArray, step_s: float, p: float, z: float, theta: FloatArray, out: FloatArray
-) -> None:  # pragma: no cover  compiled
+def _orifice(g: FloatArray, step_s: float, p: float, z: float, theta: FloatArray, out: FloatArray) -> None:
     z += p
     out[0] = p
     opened = 0.0

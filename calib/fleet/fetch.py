@@ -29,6 +29,7 @@ _SUFFIXES = (
 )  # fmt: skip
 _FOLDERS = ("", "images", "images/plane", "logs")
 _FINAL = (FileNotFoundError, NotADirectoryError, IsADirectoryError, PermissionError, NotImplementedError)
+"""Another attempt would end in the same; the last is fsspec's for what a kind of URL cannot do."""
 
 
 def local_folder(source: str, scratch: Path, attempts: int, most_bytes: int = MOST_BYTES) -> Path:

@@ -32,6 +32,7 @@ __all__ = ["error_figure", "residual_figure"]
 _MOST_NAMED = 26
 """Views whose names fit beside their bars."""
 _ROUNDING_PX = 1e-9
+"""No corner is measured to this; residuals below it are those of arithmetic."""
 _MOST_ARROWS = 720
 _LEAST_IN_CELL = 6
 """Points from which a cell's mean residual is worth an arrow."""
@@ -175,13 +176,14 @@ def residual_figure(fit: Calibration, verdict: str = "ok") -> Figure:
     left, right = figure.subplots(1, 2)
     for axes in (left, right):
         picture_frame(axes, camera.image_size_px)
+    nothing = ""
     if len(at) == 0:
+        nothing = f"no residuals: the fit ended as {fit.termination!r}"
+    elif float(np.abs(vectors).max()) < _ROUNDING_PX:
+        nothing = "the residuals are rounding errors"
+    if nothing:
         for axes in (left, right):
-            empty(axes, f"no residuals: the fit ended as {fit.termination!r}")
-        return figure
-    if float(np.abs(vectors).max()) < _ROUNDING_PX:
-        for axes in (left, right):
-            empty(axes, "the residuals are rounding errors")
+            empty(axes, nothing)
         return figure
     times = arrows(left, at[some], vectors[some], 0.08 * max(camera.image_size_px))
     which = "Each point" if len(some) == len(at) else f"{len(some)} of {len(at)} points"

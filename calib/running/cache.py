@@ -32,7 +32,6 @@ __all__ = ["Result", "key_of", "load", "program_digest", "remove", "store"]
 
 _RESULT = "result.json"
 _MOST_BYTES = 50_000_000
-_SOURCES = (".py", ".j2", ".h", ".ino", ".js", ".css")
 
 
 @dataclass(frozen=True)
@@ -75,9 +74,10 @@ class Result:
 
 @cache
 def program_digest() -> str:
-    """SHA-256 of this version and its source: another program's results are not reused."""
+    """SHA-256 of this version and its files but compiled ones: results of another program are not reused."""
     root = Path(__file__).resolve().parent.parent
-    sources = [path for path in sorted(root.rglob("*")) if path.suffix in _SOURCES and path.is_file()]
+    files = (path for path in sorted(root.rglob("*")) if path.is_file())
+    sources = [path for path in files if path.parent.name != "__pycache__"]
     parts = [__version__, *(f"{path.relative_to(root).as_posix()} {digest_of(path)}" for path in sources)]
     return sha256("\n".join(parts).encode())
 
