@@ -34,7 +34,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import numpy as np
 from drivenlogs import varied_drive
+from estimatorlogs import truth_of_sensors
 
+from calib.estimator.align import rest_angle
 from calib.logs import log_text
 from calib.replay import Replayed, replay_log
 from calib.rig import read_rig
@@ -158,6 +160,15 @@ def _nis(found: list[Replayed]) -> str:
     return "  ".join(cells)
 
 
+def misaligned(folder: Path, rig: SimulatedRig) -> tuple[float, float]:
+    """How far the alignment is off: the delay [ms], and the angle that a straight head reads [deg]."""
+    found = read_rig(folder / "rig.yaml").align
+    assert found is not None
+    late = found.time_offset_s - rig.tracker.latency_s
+    turned = found.rest_angle_rad - rest_angle(truth_of_sensors(rig))[0]
+    return 1e3 * abs(late), float(np.degrees(abs(turned)))
+
+
 def table(results: dict[str, dict[str, list[Replayed]]], count: int) -> None:
     """Errors by way and log, then NIS."""
     print(f"\n{f'{count} rigs':21s}" + "".join(f"{name:>28s}" for name in REPLAYED))
@@ -182,6 +193,7 @@ def main() -> None:
     parser.add_argument("--off", type=float, default=0.0)
     given = parser.parse_args()
     results: dict[str, dict[str, list[Replayed]]] = {way: {name: [] for name in REPLAYED} for way in WAYS}
+    off: list[tuple[float, float]] = []
     with tempfile.TemporaryDirectory() as place:
         root = given.keep or Path(place)
         for done, seed in enumerate(range(given.first, given.first + given.count), start=1):
@@ -191,6 +203,7 @@ def main() -> None:
                 make(folder, seed, given.off)
             if not (folder / "identified.yaml").exists():
                 said = calibrate(folder, given.undrawn)
+            off.append(misaligned(folder, drawn(seed, given.off)))
             for way, (file, how) in WAYS.items():
                 path = folder / file
                 rig = read_rig(path)
@@ -205,6 +218,8 @@ def main() -> None:
             )
             if done % 4 == 0 or done == given.count:
                 table(results, done)
+                late, turned = np.max(off, axis=0)
+                print(f"alignment: delay off by at most {late:.2f} ms, angle at rest by {turned:.3f} degrees")
 
 
 if __name__ == "__main__":
