@@ -14,7 +14,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 from calib.fleet.extra import needed
@@ -96,5 +95,5 @@ def _end_process(seconds: float) -> None:
 
 
 @cache
-def _nowhere() -> Any:
-    return Path(os.devnull).open("w")
+def _nowhere() -> int:
+    return os.open(os.devnull, os.O_WRONLY)
