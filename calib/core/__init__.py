@@ -1,0 +1,1 @@
+"""What every part shares: verdicts, units, errors, geometry, and the shape of a result."""
