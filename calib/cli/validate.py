@@ -1,4 +1,4 @@
-"""`calib validate`: the models against logs, and the book of claims."""
+"""`calib validate`: the models against logs."""
 
 from __future__ import annotations
 
@@ -7,29 +7,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from calib.cli.common import FiguresOption, JsonOption, RigOption, document, narrate, progress_bar, say, table
+from calib.cli.common import FiguresOption, JsonOption, RigOption, document, narrate, say, table
 from calib.errors import UsageError
 
 if TYPE_CHECKING:
-    from calib.claims.book import Examined
     from calib.validating import Comparison
-
-__all__ = ["validate"]
 
 _UNITS = {"q1": (1e3, "mm"), "q2": (1e3, "mm"), "phi": (1.0, "rad")}
 
 
 def _cell(value: float | None, form: str = ".3g") -> str:
     return "-" if value is None or value != value else f"{value:{form}}"
-
-
-def _left(head: list[str], rows: list[list[str]]) -> list[str]:
-    """Lines of a table of words, every column to the left."""
-    widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]
-    return [
-        "  " + "  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip()
-        for row in [head, *rows]
-    ]
 
 
 def _tell_log(one: Comparison) -> None:
@@ -58,42 +46,6 @@ def _tell_log(one: Comparison) -> None:
         say("  - a simulated motion leaves the model before the log ends, its errors are not known")
     if one.replaced:
         say(f"  - {one.replaced} rows stood away from their neighbours and were replaced by them")
-
-
-def _tell_claims(examined: tuple[Examined, ...]) -> None:
-    from calib.claims.book import BOOK, by_basis, count
-    from calib.claims.outcome import Outcome
-
-    rows = [
-        [
-            one.claim.id,
-            one.claim.where,
-            one.claim.kind,
-            one.claim.basis,
-            one.finding.outcome.value,
-            one.finding.ours + (" (simulated)" if one.finding.simulated else ""),
-        ]
-        for one in examined
-    ]
-    for line in _left(["claim", "where", "kind", "basis", "outcome", "our figure"], rows):
-        say(line)
-    for one in examined:
-        printed = "" if one.claim.printed == "-" else f"; printed: {one.claim.printed}"
-        say(f"{one.claim.id}: {one.claim.says}{printed}")
-        say(f"  {one.finding.outcome.value}: {one.finding.how}")
-    found = ", ".join(f"{number} {outcome.value}" for outcome, number in count(examined).items())
-    say(f"{len(examined)} of {len(BOOK)} claims: {found}")
-    words = {
-        "equations": "from the equations alone",
-        "printed": "from printed numbers",
-        "twin": "on the simulated rig, with other figures fixed beforehand",
-        "chosen": "on the simulated rig, this very figure among those it was chosen by",
-    }
-    for basis, outcomes in by_basis(examined).items():
-        say(
-            f"  {sum(outcomes.values()):2d} {words[basis]}: {outcomes[Outcome.REPRODUCED]} reproduced, "
-            f"{outcomes[Outcome.REFUTED]} refuted, {outcomes[Outcome.UNMEASURED]} open"
-        )
 
 
 def _log_json(one: Comparison) -> dict[str, Any]:
@@ -136,18 +88,13 @@ def _compared(
         for sentence in said:
             narrate(sentence)
         out.append(one)
-    if out and IMPROVED not in out[0].errors:
+    if IMPROVED not in out[0].errors:
         narrate(f"{rig} has no section actuator or pump: the improved model has nominal parameters")
     return out
 
 
 def validate(
-    logs: Annotated[
-        list[Path] | None, typer.Argument(metavar="[LOG...]", help="Logs to hold the models against.")
-    ] = None,
-    claims: Annotated[
-        bool, typer.Option("--claims", help="Examine the book of claims too, as is done without LOG.")
-    ] = False,
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs to hold the models against.")],
     states: Annotated[
         list[Path] | None,
         typer.Option(help="States of calib replay to use instead of the pictures, for the logs in turn."),
@@ -160,64 +107,29 @@ def validate(
     rig: RigOption = Path("rig.yaml"),
     as_json: JsonOption = False,
 ) -> None:
-    """Hold the models against logs, and compute every claim of the source again.
+    """Hold the models against logs.
 
     A log's commands are played to the original model of the source, to the improved one with nominal
-    parameters, and to that with the sections actuator and pump, from the estimator's state at its start;
-    without LOG the book of claims is examined, and --figures draws what corresponds to the source's figures
-    from simulated runs. Exits 0 whatever comes of it.
+    parameters, and to that with the sections actuator and pump, from the estimator's state at its start.
+    Exits 0 whatever comes of it.
     """
     from calib.files import check_folder, shown
 
-    paths = logs or []
-    if not paths and (states or truth or no_pwm):
-        raise UsageError("--states, --truth and --no-pwm: need a LOG")
-    if states and len(states) != len(paths):
-        raise UsageError(f"--states: {len(states)} files for {len(paths)} logs, expected one for each")
+    if states and len(states) != len(logs):
+        raise UsageError(f"--states: {len(states)} files for {len(logs)} logs, expected one for each")
     if truth and states:
         raise UsageError("--truth: takes the true columns, --states does not apply")
     if figures is not None:
         check_folder(figures)
-    compared = _compared(paths, states, truth, no_pwm, rig)
-    examined: tuple[Examined, ...] = ()
-    drawn: list[str] = []
-    if figures is not None and compared:
+    compared = _compared(logs, states, truth, no_pwm, rig)
+    result: dict[str, Any] = {"logs": [_log_json(one) for one in compared]}
+    if figures is not None:
         from calib.report.validate_figures import write_validate_figures
 
-        drawn += [path.name for path in write_validate_figures(figures, compared)]
+        result["figures"] = [path.name for path in write_validate_figures(figures, compared)]
         narrate(f"figures in {shown(figures)}")
-    if figures is not None and (claims or not paths):
-        from calib.claims.album import ALBUM
-        from calib.report.source_figures import write_source_figures
-
-        with progress_bar("drawing") as progress:
-            drawn += [path.name for path in write_source_figures(figures, ALBUM, progress)]
-        narrate(f"{len(ALBUM)} simulated figures in {shown(figures)}, index.html shows them all")
-    if claims or not paths:
-        from calib.claims.book import examine
-
-        with progress_bar("examining") as progress:
-            examined = examine(progress=progress)
     if as_json:
-        told = _whole_json(compared, examined)
-        document("validate", {"validate": {**told, "figures": drawn} if drawn else told})
+        document("validate", {"validate": result})
         return
     for one in compared:
         _tell_log(one)
-    if examined:
-        _tell_claims(examined)
-
-
-def _whole_json(compared: list[Comparison], examined: tuple[Examined, ...]) -> dict[str, Any]:
-    told: dict[str, Any] = {"logs": [_log_json(one) for one in compared]}
-    if examined:
-        from calib.claims.book import BOOK, by_basis, count, rows
-
-        told["claims"] = rows(examined)
-        told["outcomes"] = {outcome.value: number for outcome, number in count(examined).items()}
-        told["by_basis"] = {
-            basis: {outcome.value: number for outcome, number in outcomes.items()}
-            for basis, outcomes in by_basis(examined).items()
-        }
-        told["not_examined"] = len(BOOK) - len(examined)
-    return told

@@ -153,10 +153,6 @@ def _driven(folder: Folder) -> Planned | str:
     return _given(logs) if logs else "no logs with camera and PWM in logs/"
 
 
-def _claims(_: Folder) -> Planned | str:
-    return Planned(("--claims",), ())
-
-
 def _nothing(_: Folder) -> Planned | str:
     return Planned((), ())
 
@@ -198,7 +194,6 @@ STAGES: tuple[Stage, ...] = (
           uses=(*_OPTICS, *_MACHINE), flashed=True, seconds=3.0),
     Stage("validate", "Model against log", ("validate",), _driven, needs=_OPTICS,
           uses=(*_SENSORS, *_MACHINE, "controller"), seconds=8.0),
-    Stage("claims", "Book of claims", ("validate",), _claims, figures=False),
     Stage("firmware", "Firmware", ("firmware",), _nothing, needs=("camera",),
           uses=(*_SENSORS, *_MACHINE, "controller"), output="firmware", figures=False),
 )  # fmt: skip

@@ -10,8 +10,6 @@ from typing import Any
 import pytest
 from identifytrials import log_file, rig_file
 
-from calib.claims.album import ALBUM
-from calib.claims.book import BOOK
 from calib.twin.rig import SimulatedRig
 
 Run = Callable[..., Any]
@@ -26,40 +24,6 @@ def _rig(folder: Path, **sections: Any) -> Path:
     path = folder / "rig.yaml"
     rig_file(path, **sections)
     return path
-
-
-@pytest.mark.slow
-def test_without_a_log_the_book_is_examined(calib: Run, tmp_path: Path) -> None:
-    ended = calib("validate", cwd=tmp_path)
-    assert ended.code == 0, ended.err
-    lines = ended.out.splitlines()
-    assert [line.split()[0] for line in lines[1 : 1 + len(BOOK)]] == [claim.id for claim in BOOK]
-    assert f"{len(BOOK)} of {len(BOOK)} claims: " in ended.out
-    assert "printed: 4.45e-5" in ended.out and "refuted: " in ended.out
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.slow
-def test_the_book_as_one_document_and_the_same_again(calib: Run, tmp_path: Path) -> None:
-    first, again = (calib("validate", "--claims", "--json", cwd=tmp_path) for _ in range(2))
-    assert first.code == 0 and first.out == again.out
-    told = json.loads(first.out)
-    assert (told["schema"], told["verb"], told["validate"]["logs"]) == (1, "validate", [])
-    claims = {one["id"]: one for one in told["validate"]["claims"]}
-    assert len(claims) == len(BOOK) and told["validate"]["not_examined"] == 0
-    assert sum(told["validate"]["outcomes"].values()) == len(BOOK)
-    assert claims["kin.rotation"]["outcome"] == "refuted" and claims["ctl.p"]["simulated"] is True
-
-
-@pytest.mark.slow
-def test_figures_of_the_source_and_their_index(calib: Run, tmp_path: Path) -> None:
-    ended = calib("validate", "--figures", "drawn", "--json", cwd=tmp_path)
-    assert ended.code == 0, ended.err
-    told = json.loads(ended.out)["validate"]["figures"]
-    assert len(told) == len(ALBUM) + 2 and {path.name for path in (tmp_path / "drawn").iterdir()} == set(told)
-    index = json.loads((tmp_path / "drawn" / "figures.json").read_text())["figures"]
-    assert [row["number"] for row in index] == [one.number for one in ALBUM]
-    assert "49 simulated figures" in ended.err
 
 
 def test_a_log_against_the_original_model_alone(calib: Run, tmp_path: Path, log: Path) -> None:
@@ -89,13 +53,11 @@ def test_both_models_in_one_table_and_figures(calib: Run, tmp_path: Path, log: P
     ratio = phi["original"]["norm_rad"] / phi["original"]["rms_rad"]
     assert ratio == pytest.approx(told["poses"] ** 0.5)
     assert [path.name for path in drawn.iterdir()] == ["validate_model.png"]
-    assert "claims" not in json.loads(ended.out)["validate"]
 
 
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (("--truth",), "need a LOG"),
         (("LOG", "--states", "a.csv", "--states", "b.csv"), "2 files for 1 logs"),
         (("LOG", "--states", "a.csv", "--truth"), "--truth: takes the true columns"),
     ],

@@ -1,1 +1,0 @@
-"""The book of claims: every figure of the source, computed again."""
