@@ -10,9 +10,8 @@ import pytest
 from align_trials import align_log, known, twin_log
 from scipy.stats import norm
 
-from calib.aligning import PRIOR, align_section, read_align_log, settings_from_rig, with_drawn_marker
+from calib.aligning import align_section, read_align_log, settings_from_rig, with_drawn_marker
 from calib.arrays import FloatArray
-from calib.errors import BadInputError
 from calib.estimator.align import Alignment, align
 from calib.estimator.align_verdict import judge_align
 from calib.estimator.sensors import SENSOR
@@ -68,17 +67,6 @@ def _changed(log: Log, **columns: object) -> Log:
     return replace(log, columns=kept)
 
 
-def test_rows_of_both_sensors_are_taken_apart(log: Log, tmp_path: Path) -> None:
-    write_log(tmp_path / "log.csv", log)
-    read, said = read_align_log(tmp_path / "log.csv", SIZE)
-    assert read is not None
-    assert said == []
-    expected = align_log(log)
-    assert np.allclose(read.pixels, expected.pixels)
-    assert np.allclose(read.readings, expected.readings)
-    assert np.allclose(read.imu_s, expected.imu_s, atol=1e-6)
-
-
 def test_a_marker_outside_of_the_picture_counts_as_blank(log: Log, tmp_path: Path) -> None:
     u = log.columns["u_px"].copy()
     rows = np.flatnonzero(np.isfinite(u))
@@ -88,45 +76,6 @@ def test_a_marker_outside_of_the_picture_counts_as_blank(log: Log, tmp_path: Pat
     assert read is not None
     assert len(read.pixels) == len(rows) - 7
     assert "7 pictures put the marker outside the image" in said[0]
-
-
-def test_a_log_without_a_sensor_is_passed_over(log: Log, tmp_path: Path) -> None:
-    write_log(tmp_path / "a.csv", _changed(log, u_px=None, v_px=None))
-    write_log(tmp_path / "b.csv", _changed(log, gz_radps=None))
-    write_log(tmp_path / "c.csv", _changed(log, ax_mps2=None, ay_mps2=None))
-    for name, words in (("a", "has no picture of the marker"), ("b", "has no gyroscope")):
-        read, said = read_align_log(tmp_path / f"{name}.csv", SIZE)
-        assert read is None
-        assert words in said[-1]
-    read, said = read_align_log(tmp_path / "c.csv", SIZE)
-    assert read is not None
-    assert "has no accelerometer" in said[-1]
-
-
-def test_units_that_are_others_are_refused(log: Log, tmp_path: Path) -> None:
-    g = {name: log.columns[name] / 9.81 for name in ("ax_mps2", "ay_mps2")}
-    write_log(tmp_path / "g.csv", _changed(log, **g))
-    with pytest.raises(BadInputError, match="in g, expected m/s"):
-        read_align_log(tmp_path / "g.csv", SIZE)
-    write_log(tmp_path / "deg.csv", _changed(log, gz_radps=57.3 * log.columns["gz_radps"]))
-    with pytest.raises(BadInputError, match="in deg/s, expected rad/s"):
-        read_align_log(tmp_path / "deg.csv", SIZE)
-    counts = {name: 1000.0 * log.columns[name] for name in ("ax_mps2", "ay_mps2")}
-    write_log(tmp_path / "counts.csv", _changed(log, **counts))
-    with pytest.raises(BadInputError, match=r"expected about 9\.81"):
-        read_align_log(tmp_path / "counts.csv", SIZE)
-
-
-def test_priors_come_from_the_file() -> None:
-    settings = settings_from_rig(_rig_file(), Path("rig.yaml"), [])
-    assert settings.sigma[SENSOR.index("shift_x_m")] == pytest.approx(0.06e-3 / np.sqrt(2.0))
-    assert settings.mean[SENSOR.index("marker_offset_m")] == PRIOR["marker_offset_m"][0]
-    given = settings_from_rig(_rig_file(), Path("rig.yaml"), [], 0.012)
-    assert given.mean[SENSOR.index("marker_offset_m")] == 0.012
-    with pytest.raises(BadInputError, match="run calib intrinsics first"):
-        settings_from_rig(Rig(), Path("rig.yaml"), [])
-    with pytest.raises(BadInputError, match="run calib extrinsics first"):
-        settings_from_rig(_rig_file().model_copy(update={"plane": None}), Path("rig.yaml"), [])
 
 
 def test_the_section_is_what_the_estimator_reads(log: Log, tmp_path: Path) -> None:

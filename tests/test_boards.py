@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calib import boards, workers
-from calib.boards import BoardFile, board_of, find_boards, read_board_file
+from calib.boards import board_of, find_boards
 from calib.errors import BadInputError
 
 
@@ -69,16 +69,6 @@ def test_a_wrong_size_is_known_after_two_pictures(
     with pytest.raises(BadInputError, match=r"no board with 9x6 .* any of 17 pictures, but one with 7x5 was"):
         find_boards(shipped, (9, 6), 0.02)
     assert searched == [(9, 6)] * 2
-
-
-def test_a_size_that_is_expected(shipped: list[Path]) -> None:
-    with pytest.raises(BadInputError, match=r"view01\.png: is 316x208 px, expected 640x480 px"):
-        find_boards(shipped[:1], (7, 5), 0.02, image_size_px=(640, 480))
-
-
-def test_no_file_tells_nothing(tmp_path: Path) -> None:
-    assert read_board_file(tmp_path) == BoardFile()
-    assert board_of([tmp_path]) == (BoardFile(), {})
 
 
 def test_the_board_of_several_folders(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calib.boundedyaml import MAX_NODES, YamlProblem, expands_beyond, load
+from calib.boundedyaml import MAX_NODES, YamlProblem, load
 
 DOUBLING = "".join(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n" for i in range(1, 40))
 
@@ -49,13 +49,6 @@ def test_what_grows_is_refused_with_its_line(name: str) -> None:
     assert str(refused.value).isprintable()
 
 
-def test_ordinary_yaml_is_what_the_safe_loader_makes_of_it() -> None:
-    text = (
-        "a: &a [1, 2.5, text, 2020-01-01, true, null]\nb: *a\nc: {'<<': 1, d: \"<<\"}\ne: !!str 5\nf: 0x1F\n"
-    )
-    assert load(text) == yaml.safe_load(text)
-
-
 LEAVES = st.none() | st.booleans() | st.integers(-(10**30), 10**30) | st.floats(allow_nan=False) | st.text()
 VALUES = st.recursive(
     LEAVES, lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner), max_leaves=30
@@ -77,10 +70,3 @@ def test_any_text_is_loaded_or_refused_in_one_line(text: str) -> None:
     except YamlProblem as problem:
         assert "\n" not in str(problem)
         assert str(problem).endswith(problem.said)
-
-
-def test_aliases_count_where_they_stand() -> None:
-    inner = [0] * 10
-    assert expands_beyond({"a": inner, "b": inner}, 21)
-    assert not expands_beyond({"a": inner, "b": inner}, 22)
-    assert not expands_beyond("text", 0)

@@ -7,18 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.control.antiwindup import BackCalculation
-from calib.control.pid import Pid
 from calib.control.references import BUILT_IN, Reference, built_in, from_lengths
 from calib.controlling import (
     CONTROLLERS,
     Outcome,
     control_model,
-    controllers_for,
     run_controller,
-    tune_back_calculation,
 )
-from calib.errors import BadInputError
 from calib.twin.closed_loop import EllipseTrack, Elongation, Orientation
 from calib.twin.rig import SimulatedRig
 
@@ -115,36 +110,6 @@ def test_the_same_seed_the_same_run() -> None:
     reference = built_in(MODEL, "ellipse", 1.0)
     one, two, other = (_run("torque", reference, seed=s).run.pwm for s in (4, 4, 5))
     assert np.array_equal(one, two) and not np.array_equal(one, other)
-
-
-def test_which_controllers_suit_what() -> None:
-    assert "pid" in controllers_for(built_in(MODEL, "step"), None)
-    assert "pd+map" in controllers_for(built_in(MODEL, "ellipse"), None)
-    assert not any(n.startswith("tuned") for n in controllers_for(built_in(MODEL, "ellipse"), None))
-
-
-def test_what_is_refused() -> None:
-    reference = built_in(MODEL, "step", 1.0)
-    with pytest.raises(BadInputError, match="controller: found 'lqr'"):
-        _run("lqr", reference)
-    with pytest.raises(BadInputError, match="no gains have been tuned, run calib control tune first"):
-        _run("tuned-pid", reference)
-    with pytest.raises(BadInputError, match="PWM limits: found 255 to 0"):
-        control_model(RIG, None, (255.0, 0.0))
-
-
-def test_tuning_the_back_calculation() -> None:
-    seen: list[tuple[int, int]] = []
-    pid = Pid(470.0, 1000.0)
-    back_s, share, told = tune_back_calculation(
-        RIG, MODEL, pid, lambda done, total: seen.append((done, total))
-    )
-    assert BackCalculation(pid.Kp, pid.Ki, 0.0, back_s).tracking_s == back_s and 0.0 <= share <= 1.0
-    assert set(told) == {"pid", "clamping", "back_calculation"}
-    best, clamped = told["back_calculation"], told["clamping"]
-    assert best["overshoot_after_jump_rad"] <= clamped["overshoot_after_jump_rad"] / 3.0
-    assert best["rise_s"] <= clamped["rise_s"] + MODEL.tick_s + 1e-9
-    assert seen[0] == (0, 12)
 
 
 def test_a_controller_may_read_the_sensors_themselves() -> None:

@@ -15,11 +15,9 @@ from calib.files import (
     check_readable,
     check_writable,
     file_sha256,
-    one_line,
     read_bytes,
     read_text,
     read_yaml_mapping,
-    shown,
     write_atomically,
 )
 
@@ -101,38 +99,11 @@ def test_wrong_yaml_is_one_sentence(tmp_path: Path, text: str, says: str) -> Non
     assert "board.yaml" in str(caught.value)
 
 
-def test_yaml_that_multiplies_itself_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "bomb.yaml"
-    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
-    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 10)]
-    path.write_text("\n".join(lines))
-    with pytest.raises(BadInputError, match="expands"):
-        read_yaml_mapping(path)
-
-
 def test_text_that_is_not_utf8(tmp_path: Path) -> None:
     path = tmp_path / "points.csv"
     path.write_bytes(b"view,\xff\xfe")
     with pytest.raises(BadInputError, match="UTF-8"):
         read_text(path)
-
-
-def test_names_are_shown_on_one_line() -> None:
-    assert shown("a\nb\x1b[31m.png") == r"a\nb\x1b[31m.png"
-
-
-def test_the_same_key_in_two_places_is_no_repetition(tmp_path: Path) -> None:
-    path = tmp_path / "rig.yaml"
-    path.write_text("a: {b: 1}\nc: [{b: 1}, {b: 2}]\nb: &b {x: 1}\nd: {b: *b, y: 2}\ne: [b, b]\n")
-    assert read_yaml_mapping(path)["d"] == {"b": {"x": 1}, "y": 2}
-
-
-def test_a_list_that_holds_itself_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "rig.yaml"
-    for text in ("a: &a [*a]\n", "a: &a {b: *a}\n"):
-        path.write_text(text)
-        with pytest.raises(BadInputError, match="expands"):
-            read_yaml_mapping(path)
 
 
 def test_what_is_no_regular_file_is_not_read(tmp_path: Path) -> None:
@@ -172,11 +143,6 @@ def test_folders_are_known_before_work(tmp_path: Path) -> None:
     assert not (tmp_path / "a").exists()
     with pytest.raises(BadInputError, match="file is a file"):
         check_folder(tmp_path / "file" / "b")
-
-
-def test_one_line() -> None:
-    assert one_line("plain \N{GREEK SMALL LETTER MU}m") == "plain \N{GREEK SMALL LETTER MU}m"
-    assert one_line("a\r\nb\u202e\udcff") == r"a\r\nb\u202e\udcff"
 
 
 def test_the_hash_of_a_file_of_any_size(tmp_path: Path) -> None:

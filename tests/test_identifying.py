@@ -10,9 +10,8 @@ import pytest
 from identifytrials import log_file, rig_file
 
 from calib.errors import BadInputError
-from calib.identifying import TrackSource, read_displacements, read_track
+from calib.identifying import TrackSource, read_track
 from calib.logs import Log, read_log, write_log
-from calib.rig import Rig
 from calib.twin.rig import SimulatedRig
 
 RADIUS = 0.0126
@@ -95,62 +94,3 @@ def test_states_stand_in_for_pictures(folder: Path) -> None:
     states.unlink()
     with pytest.raises(BadInputError, match="has no marker"):
         _read(folder, path.name)
-
-
-def test_logs_that_cannot_be_used(folder: Path) -> None:
-    without = _changed(folder, "swing.csv", pwm1=None, pwm2=None)
-    with pytest.raises(BadInputError, match="has no commands, expected pwm1 and pwm2"):
-        _read(folder, without.name)
-    assert not _read(folder, without.name, no_pwm=True).track.hoses
-    log = read_log(folder / "prbs.csv")
-    for t, words in (
-        (np.where(log.t_s > 2.0, log.t_s + 30.0, log.t_s), "the clock jumps from"),
-        (np.where(log.t_s > 2.0, log.t_s - 1.0, log.t_s), "t_s goes back"),
-    ):
-        write_log(folder / "clock.csv", replace(log, t_s=t))
-        with pytest.raises(BadInputError, match=words):
-            _read(folder, "clock.csv")
-    for t in (np.full(len(log), 1.0), 1e-12 * np.arange(len(log)) + np.where(log.t_s > 2.0, 5.0, 0.0)):
-        write_log(folder / "clock.parquet", replace(log, t_s=t))
-        with pytest.raises(BadInputError, match=r"s apart in the median|the clock jumps from|too short"):
-            _read(folder, "clock.parquet")
-    few = log.t_s < 0.5
-    write_log(
-        folder / "short.csv",
-        replace(log, t_s=log.t_s[few], columns={k: v[few] for k, v in log.columns.items()}),
-    )
-    with pytest.raises(BadInputError, match=r"too short|expected at least 40"):
-        _read(folder, "short.csv")
-    big = _changed(folder, "prbs.csv", pwm1=3.0 * log.columns["pwm1"])
-    with pytest.raises(BadInputError, match="expected 0 to 255"):
-        _read(folder, big.name)
-    with pytest.raises(BadInputError, match="run calib intrinsics first"):
-        read_track(folder / "prbs.csv", Rig(), folder / "rig.yaml", RADIUS)
-
-
-def test_words_that_say_nan_count_as_blank(folder: Path) -> None:
-    text = (folder / "prbs.csv").read_text().splitlines()
-    column = text[0].split(",").index("u_px")
-    for k in range(1, 200):
-        cells = text[k].split(",")
-        if cells[column]:
-            cells[column] = "nan"
-        text[k] = ",".join(cells)
-    (folder / "nan.csv").write_text("\n".join(text) + "\n")
-    source = _read(folder, "nan.csv")
-    assert "say nan or inf" in source.said[0]
-    assert len(source.track.t_s) < len(_read(folder, "prbs.csv").track.t_s) - 20
-
-
-def test_tables_of_weights(tmp_path: Path) -> None:
-    path = tmp_path / "weights.csv"
-    path.write_text("mass_g,elongation_mm\n0,0\n100,9.1\n200,15.2\n")
-    eps, force = read_displacements(path)
-    assert np.allclose(eps, [0.0, 0.0091, 0.0152])
-    assert np.allclose(force, [0.0, 0.981, 1.962])
-    path.write_text("mass_g,elongation_mm\n100,\n")
-    with pytest.raises(BadInputError, match="line 2: has a blank"):
-        read_displacements(path)
-    path.write_text("volt,elongation_mm\n1,2\n")
-    with pytest.raises(BadInputError, match="has no force"):
-        read_displacements(path)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from identifytrials import SIGMA, track
@@ -67,8 +65,3 @@ def test_pumps_that_are_on_already_are_seen_by_the_pose() -> None:
     assert abs(begun.phi_rad) < 0.01 and begun.length_m > PLANT.rest_length_m + 0.01
     assert begun.force1_N == pytest.approx(begun.force2_N, abs=0.1) and begun.force1_N > 0.5
     assert begun.lag1_N == begun.force1_N and begun.creep1_N == 0.0
-
-
-def test_too_few_rows_tell_nothing() -> None:
-    t = np.arange(5) / 60.0
-    assert start_in_motion(t, np.full((5, 2), math.pi), False, PLANT, 0.01) is None

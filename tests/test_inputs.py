@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.errors import BadInputError, UsageError
+from calib.errors import BadInputError
 from calib.inputs import Told, read_views
 from synthetic import views_of
 
@@ -26,15 +26,6 @@ def table(tmp_path: Path):
         return path
 
     return write
-
-
-def test_a_table_is_taken_as_it_is(table) -> None:
-    found = read_views([table()], Told(image_size_px=SIZE))
-    assert found.image_size_px == SIZE
-    assert list(found.hashes) == ["points.csv"]
-    for view, truth in zip(found.views, views_of(3), strict=True):
-        np.testing.assert_array_equal(view.target_m, truth.target_m)
-        np.testing.assert_array_equal(view.pixels, truth.pixels)
 
 
 def test_a_distant_target_is_moved_to_its_origin(table) -> None:
@@ -58,23 +49,6 @@ def test_a_distant_target_is_moved_to_its_origin(table) -> None:
 def test_points_that_cannot_be(table, change, says: str) -> None:
     with pytest.raises(BadInputError, match=says):
         read_views([table(change)], Told(image_size_px=SIZE))
-
-
-def test_corners_at_the_very_border_are_inside(table) -> None:
-    path = table(lambda x, y, u, v: (x, y, min(max(u, -0.7), 639.7), v))
-    text = path.read_text().splitlines()
-    text[1] = ",".join([*text[1].split(",")[:3], "639.7", "-0.7"])
-    path.write_text("\n".join(text))
-    assert read_views([path], Told(image_size_px=SIZE)).views[0].pixels[0].tolist() == [639.7, -0.7]
-
-
-def test_what_does_not_go_together(table) -> None:
-    path = table()
-    for told in (Told(), Told(corners=(9, 6), image_size_px=SIZE), Told(square_m=0.02, image_size_px=SIZE)):
-        with pytest.raises(UsageError, match=r"points\.csv"):
-            read_views([path], told)
-    with pytest.raises(UsageError, match="given alone"):
-        read_views([path.parent, path], Told(image_size_px=SIZE))
 
 
 def test_a_table_beyond_the_memory_is_refused_by_its_size(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import yaml
-from imu_poses import G, PoseLog, Sensor, in_counts, pose_log, sphere_poses, tilts
+from imu_poses import G, PoseLog, Sensor, in_counts, pose_log, sphere_poses
 
 from calib.imu.intrinsics import find_intrinsics
 from calib.imu.intrinsics_verdict import judge_intrinsics
@@ -50,33 +50,6 @@ class _Silent:
 
     def normal(self, size: tuple[int, int]) -> np.ndarray:
         return np.zeros(size)
-
-
-def test_a_plane_leaves_the_rest_null() -> None:
-    section = _section(pose_log(tilts(np.radians(np.arange(0, 720, 45))), SENSOR))
-    assert section.planar
-    assert section.accel.bias[2] is None
-    assert section.accel.scale[2] is None
-    assert set(section.accel.misalignment_rad) == {"yz"}
-    assert section.accel.matrix is not None
-    assert section.accel.matrix[2] == [0.0, 0.0, 0.0]
-    assert section.gyro is not None
-    assert section.gyro.scale[:2] == [None, None]
-    assert section.gyro.bias[:2] == [None, None]
-    assert section.gyro.scale[2] is not None
-    assert section.gyro.misalignment_rad == {}
-
-
-def test_what_is_not_told_is_null() -> None:
-    few = _section(pose_log(sphere_poses(3), SENSOR))
-    assert few.verdict == "unidentifiable"
-    assert few.accel.scale == [None, None, None]
-    assert few.accel.matrix is None
-    assert few.gyro is None
-    cap = [pose for pose in sphere_poses(90) if pose.inv().apply([0, 0, 1])[2] > 0.8]
-    told = _section(pose_log(cap, SENSOR))
-    assert told.accel.sigma.scale == [None, None, None]
-    assert told.accel.rms_mps2 is None
 
 
 def test_sensitivity_is_written_with_its_sigma() -> None:

@@ -46,18 +46,6 @@ def test_there_and_back(values: tuple[float, ...], rate_hz: float) -> None:
     assert kalibr_imu(again, "/imu") == text
 
 
-def test_one_sensor_alone() -> None:
-    document = {key: value for key, value in yaml.safe_load(TEXT).items() if not key.startswith("acc")}
-    imu = from_kalibr_imu(document)
-    assert imu.accel_noise_mps2_per_sqrt_Hz == [None] * 3
-    _same(from_kalibr_imu(yaml.safe_load(kalibr_imu(imu))), imu)
-    del document["gyroscope_random_walk"]
-    with pytest.raises(BadInputError, match="gyroscope_random_walk is missing"):
-        from_kalibr_imu(document)
-    with pytest.raises(BadInputError, match="accelerometer_noise_density is missing"):
-        from_kalibr_imu({"update_rate": 1.0})
-
-
 @pytest.mark.parametrize("nested", [False, True])
 def test_a_file_as_kalibr_writes_it(nested: bool) -> None:
     document = yaml.safe_load(TEXT)

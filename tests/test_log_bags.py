@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from calib.errors import BadInputError
-from calib.log_bags import is_bag
-from calib.logs import iter_log, read_log
+from calib.logs import read_log
 
 COLUMNS = {
     "imu": ("ax_mps2", "ay_mps2", "az_mps2", "gx_radps", "gy_radps", "gz_radps"),
@@ -71,16 +69,6 @@ def test_no_reading_is_lost_or_changed(
         assert np.allclose(log.t_s[rows], [(m[1] - start) / 1e9 for m in wanted], rtol=0, atol=1e-9)
         for k, name in enumerate(columns):
             assert log.columns[name][rows].tolist() == [m[2][k] for m in wanted]
-
-
-def test_blocks_give_the_same_as_the_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write_bag(tmp_path, "json", readings(np.random.default_rng(1), 8.0))
-    whole = read_log(path)
-    monkeypatch.setattr("calib.log_messages._ROWS", 37)
-    blocks = list(iter_log(path))
-    assert len(blocks) > 5
-    assert np.concatenate([block.t_s for block in blocks]).tolist() == whole.t_s.tolist()
-    assert np.concatenate([block.lines for block in blocks]).tolist() == list(range(1, len(whole) + 1))
 
 
 def test_what_arrives_late_is_put_where_it_belongs(tmp_path: Path) -> None:
@@ -172,13 +160,6 @@ def test_damaged_bytes_are_refused_or_read_never_raised(form: str, tmp_path: Pat
     assert refused > 3
 
 
-def test_a_folder_that_is_no_bag(tmp_path: Path) -> None:
-    assert not is_bag(tmp_path)
-    folder = tmp_path / "some.db3"
-    folder.mkdir()
-    assert "is a folder without metadata.yaml" in _refused(folder)
-
-
 def test_a_bag_that_is_not_there_and_one_that_is_a_pipe(tmp_path: Path) -> None:
     import os
 
@@ -186,18 +167,6 @@ def test_a_bag_that_is_not_there_and_one_that_is_a_pipe(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe.bag"
     os.mkfifo(pipe)
     assert "is a pipe" in _refused(pipe)
-
-
-@pytest.mark.parametrize(("form", "package"), [("json", "mcap"), ("ros1", "rosbags"), ("mcap", "rosbags")])
-def test_a_missing_package_is_named(
-    form: str, package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = write_bag(tmp_path, form, readings(np.random.default_rng(0), 0.2))
-    for name in ("mcap.reader", "rosbags.highlevel", "rosbags.typesys"):
-        if name.startswith(package):
-            monkeypatch.setitem(sys.modules, name, None)
-    said = _refused(path)
-    assert f"needs the package {package}; install the extra logs" in said
 
 
 @pytest.mark.parametrize("packing", ["ZSTD", "LZ4", "NONE"])
@@ -223,28 +192,6 @@ def test_a_chunk_that_unpacks_to_too_much_is_refused(
     monkeypatch.setattr("calib.log_unpacking.MOST_BYTES", 100_000)
     said = _refused(path)
     assert "a chunk unpacks to" in said or "exceeds" in said
-
-
-def test_an_encoding_that_is_not_known(tmp_path: Path) -> None:
-    from mcap.writer import Writer
-
-    path = tmp_path / "log.mcap"
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        schema = writer.register_schema("some.Imu", "protobuf", b"")
-        channel = writer.register_channel("/imu", "protobuf", schema)
-        writer.add_message(channel, 1, b"123", 1)
-        writer.finish()
-    assert "has no topic that is known by itself, found /imu (some.Imu)" in _refused(path)
-    (tmp_path / "topics.yaml").write_text("topics:\n  /imu: {gz_radps: rate}\n")
-    assert "/imu is encoded as 'protobuf', expected json, cdr or ros1" in _refused(path)
-
-
-def test_topics_of_a_table_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "log.csv"
-    path.write_text("t_s,gz_radps\n0,1\n")
-    assert "has columns, expected a bag" in _refused(path, tmp_path / "topics.yaml")
 
 
 def test_the_hash_of_a_folder_is_that_of_its_files(tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calib.errors import BadInputError
 from calib.log_messages import WINDOW_S, rows_from_messages
 from calib.log_topics import Field, Topic, TopicMap
 
@@ -37,20 +36,6 @@ def rows(
     blocks = list(rows_from_messages("log", Messages(items), topics))
     columns = [np.concatenate([block.columns[name] for block in blocks]) for name in topics.columns]
     return np.column_stack([np.concatenate([block.t_s for block in blocks]), *columns]), blocks
-
-
-def test_one_time_and_different_columns_are_one_row() -> None:
-    found, blocks = rows(
-        [("/a", 5, {"u": 1, "v": 2}), ("/c", 5, {}), ("/b", 5, {"g": 3}), ("/b", 7, {"g": 4})]
-    )
-    assert np.array_equal(found, [[5e-9, 1, 2, 3], [7e-9, np.nan, np.nan, 4]], equal_nan=True)
-    assert blocks[0].unknown == ("/c",)
-
-
-def test_one_time_and_the_same_column_stay_two_rows() -> None:
-    found, _ = rows([("/b", 5, {"g": 3}), ("/a", 5, {"u": 1, "v": 2}), ("/b", 5, {"g": 4})])
-    assert found[:, 0].tolist() == [5e-9] * 3
-    assert sorted(found[:, 3][~np.isnan(found[:, 3])]) == [3, 4]
 
 
 def test_the_epoch_is_the_first_row_and_a_simulated_time_is_kept() -> None:
@@ -80,18 +65,6 @@ def test_the_stamp_of_a_message_or_its_reception(body: dict[str, Any], seconds: 
     assert found[0, 0] == seconds
     received = TopicMap(MAP.source, MAP.topics, stamped=False)
     assert rows([("/b", 4_000_000_000, {"g": 1.0, **body})], received)[0][0, 0] == 4.0
-
-
-def test_no_message_gives_one_block_without_rows() -> None:
-    found, blocks = rows([])
-    assert found.shape == (0, 4) and len(blocks) == 1
-
-
-def test_a_field_that_is_missing_later_is_named() -> None:
-    with pytest.raises(
-        BadInputError, match="log: /b: g \\(for gz_radps\\) is not in the message, which has h"
-    ):
-        rows([("/b", 1, {"g": 1}), ("/b", 2, {"h": 1})])
 
 
 @settings(max_examples=80, deadline=None)

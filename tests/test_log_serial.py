@@ -53,11 +53,3 @@ def test_no_frame_at_all(data: bytes, tmp_path: Path) -> None:
     path.write_bytes(data)
     with pytest.raises(BadInputError, match=r"log\.bin: holds no frame of the example sketch, only \d+"):
         read_log(path)
-
-
-def test_a_file_that_is_too_large(tmp_path: Path) -> None:
-    path = tmp_path / "log.bin"
-    with path.open("wb") as stream:
-        stream.truncate(1 << 29)
-    with pytest.raises(BadInputError, match="is larger than 268"):
-        read_log(path)

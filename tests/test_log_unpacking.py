@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import bz2
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import lz4.frame
 import numpy as np
 import pytest
-from bags import KINDS, NAMES, START_NS, _ros, readings, write_bag
+from bags import KINDS, NAMES, START_NS, _ros
 
 from calib import log_unpacking
 from calib.errors import BadInputError
-from calib.log_unpacking import BoundedFile, BoundedPath, check_types, unpacked
+from calib.log_unpacking import BoundedFile, BoundedPath, unpacked
 from calib.logs import read_log
 
 MOST = 100_000
@@ -88,33 +86,6 @@ def test_ros_2_bags_that_are_packed(mode: str, tmp_path: Path, monkeypatch: pyte
         read_log(_ros2(tmp_path / "big", mode, 2 * MOST))
 
 
-def test_a_folder_whose_metadata_are_none(tmp_path: Path) -> None:
-    path = write_bag(tmp_path, "sqlite", readings(np.random.default_rng(0), 0.1))
-    metadata = path / "metadata.yaml"
-    text = metadata.read_text()
-    for damaged, said in (
-        ("a: &a [x, x]\nb: [*a, *a]\n", "has a metadata.yaml without rosbag2_bagfile_information"),
-        (text.replace("log.db3", "../other.db3"), "other.db3: is not there, expected a file of the bag"),
-        ("a" * 2_000_000, "is larger than 1 MB"),
-    ):
-        metadata.write_text(damaged)
-        with pytest.raises(BadInputError, match=said):
-            read_log(path)
-
-
-def _kinds(text: str) -> Any:
-    from rosbags.typesys import get_types_from_msg
-
-    return get_types_from_msg(text + "\n" + "=" * 80 + "\nMSG: a/Empty\n", "a/msg/B")
-
-
-def test_elements_that_hold_nothing() -> None:
-    check_types(_kinds("a/Empty x\nfloat64[] y\nstring[5] z"))
-    for text in ("a/Empty[] x", "a/Empty[1000000000] x", "float64 y\na/Empty[2] x"):
-        with pytest.raises(ValueError, match="many elements that hold nothing"):
-            check_types(_kinds(text))
-
-
 def test_no_room_is_made_for_what_a_file_does_not_hold(tmp_path: Path) -> None:
     path = tmp_path / "a"
     path.write_bytes(b"x" * 3_000_000)
@@ -128,9 +99,3 @@ def test_no_room_is_made_for_what_a_file_does_not_hold(tmp_path: Path) -> None:
     with BoundedPath(path).open("rb") as again:
         assert isinstance(again, BoundedFile)
     assert BoundedPath(path).read_text() == path.read_text()
-
-
-def test_chunks_larger_than_the_bound_are_not_read() -> None:
-    reader = SimpleNamespace(chunks={0: SimpleNamespace(datasize=1 << 40, decompressor=bz2.decompress)})
-    with pytest.raises(ValueError, match="a chunk has 1099512 MB"):
-        log_unpacking.bound_chunks(reader)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import math
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from hypothesis import strategies as st
 
 import calib.logs as logs
 from calib.errors import BadInputError
-from calib.logs import COLUMNS, MEASURED, TRUE, Log, check_time, iter_log, log_text, read_log, write_log
+from calib.logs import Log, iter_log, log_text, read_log, write_log
 
 SMALL = (
     "t_s,u_px,v_px,ax_mps2,gz_radps,pwm1\n"
@@ -45,21 +44,6 @@ def test_rows_of_two_rates_interleave(write) -> None:
     assert log.sampled().tolist() == []
     assert list(log.columns) == ["u_px", "v_px", "ax_mps2", "gz_radps", "pwm1"]
     assert (log.unknown, log.not_finite, log.truncated, len(log)) == ((), 0, False, 4)
-
-
-def test_strangers_are_kept_out_of_the_way(write) -> None:
-    text = '# a comment\n\n"note", gz_radps ,t_s,temperature\n"a, b",1,0.5,warm\n# more\n\nx,2, 0.6 ,\n'
-    log = read_log(write("\ufeff" + text))
-    assert log.unknown == ("note", "temperature")
-    assert list(log.columns) == ["gz_radps"]
-    assert log.columns["gz_radps"].tolist() == [1.0, 2.0]
-    assert log.t_s.tolist() == [0.5, 0.6]
-    assert log.lines.tolist() == [4, 7]
-
-
-def test_windows_line_ends_and_a_missing_last_one(write) -> None:
-    unix, windows = read_log(write(SMALL)), read_log(write(SMALL.replace("\n", "\r\n").removesuffix("\r\n")))
-    assert log_text(unix) == log_text(windows)
 
 
 def test_nan_and_infinite_cells_count_as_blank(write) -> None:
@@ -119,23 +103,6 @@ def test_what_is_written_is_read(
     assert log_text(back) == path.read_text()
 
 
-def test_the_columns_are_those_of_the_format() -> None:
-    assert MEASURED[:10] == (
-        "u_px",
-        "v_px",
-        "ax_mps2",
-        "ay_mps2",
-        "az_mps2",
-        "gx_radps",
-        "gy_radps",
-        "gz_radps",
-        "pwm1",
-        "pwm2",
-    )
-    assert TRUE == ("true_q1_m", "true_q2_m", "true_phi_rad", "true_x_m", "true_y_m")
-    assert set(COLUMNS) == {*MEASURED, *TRUE}
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -179,36 +146,6 @@ def test_a_log_beyond_the_memory_is_refused_while_it_is_read(write, monkeypatch:
     with pytest.raises(BadInputError, match="million cells, which is more than is read at once"):
         read_log(path)
     assert sum(len(block) for block in iter_log(path)) == 4000
-
-
-def test_files_that_are_not_there(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match=r"none\.csv: cannot be read"):
-        read_log(tmp_path / "none.csv")
-    with pytest.raises(BadInputError, match="cannot be read"):
-        read_log(tmp_path)
-
-
-def test_time_running_backwards_is_named_by_its_line(write) -> None:
-    check_time(read_log(write("t_s,ax_mps2\n0,1\n1,1\n1,2\n")))
-    with pytest.raises(BadInputError, match=r"line 4: t_s goes back from 2.000000 to 1.500000"):
-        check_time(read_log(write("t_s,ax_mps2\n0,1\n2,1\n1.5,2\n")))
-
-
-def test_an_unwritable_place_is_named(tmp_path: Path, write) -> None:
-    log = read_log(write(SMALL))
-    with pytest.raises(BadInputError, match="there is no folder"):
-        write_log(tmp_path / "nowhere" / "log.csv", log)
-
-
-def test_parquet_without_its_extra_says_what_to_install(
-    tmp_path: Path, write, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
-    with pytest.raises(BadInputError, match="install the extra logs"):
-        write_log(tmp_path / "log.parquet", read_log(write(SMALL)))
-    with pytest.raises(BadInputError, match="install the extra logs"):
-        read_log(write(b"PAR1", "log.parquet"))
 
 
 @pytest.mark.skipif(

@@ -9,13 +9,11 @@ import pytest
 from identifytrials import FLOW_TRUTH, LAG_TRUTH, pump_records
 
 from calib.actuator.identify_pump_models import LAG, ORIFICE, PumpRecord, Shape
-from calib.actuatorsections import with_sections
 from calib.errors import BadInputError
 from calib.identification import PumpFound, identify_pump
 from calib.pumpsections import judge_pump, pump_section, unexplained
 from calib.pumptables import PumpTable, Settled
-from calib.rig import Rig, read_rig, write_rig
-from calib.twin.rig import rig_from_file
+from calib.rig import Rig
 
 PATH = Path("rig.yaml")
 U = np.arange(100.0, 256.0, 5.0)
@@ -43,14 +41,6 @@ def test_a_pump_that_is_a_lag_is_found_to_be_one(found: PumpFound) -> None:
     static = section.identified.static["static"]
     assert static.dead_pwm == pytest.approx(90.0, abs=4.0)
     assert set(section.identified.models) == {LAG, ORIFICE}
-
-
-def test_the_simulation_reads_the_section(found: PumpFound, tmp_path: Path) -> None:
-    path = tmp_path / "rig.yaml"
-    write_rig(path, with_sections(Rig(), {"pump": pump_section(found, Rig(), path)}), {})
-    twin = rig_from_file(read_rig(path), str(path))
-    assert twin.pump.lag_s == pytest.approx(0.5, rel=0.02)
-    assert twin.pump.delay_ticks == 4
 
 
 def test_what_the_pwm_does_not_explain_makes_it_poor(found: PumpFound) -> None:

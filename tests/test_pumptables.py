@@ -39,16 +39,6 @@ def test_columns_are_recognised(tmp_path: Path, head: str, unit: str) -> None:
     assert np.allclose(table.record.value, _rows()[:, 2], atol=1e-4)
 
 
-def test_columns_can_be_named(tmp_path: Path) -> None:
-    path = _write(tmp_path / "a.csv", "when,duty,bar", _rows())
-    table = read_pump_table(path, "when", "duty", "bar", "kPa")
-    assert table.record is not None
-    with pytest.raises(BadInputError, match="has no time"):
-        read_pump_table(path)
-    with pytest.raises(BadInputError, match="has no column volt"):
-        read_pump_table(path, "when", "volt", "bar")
-
-
 def test_settled_values_are_taken_apart_by_mode(tmp_path: Path) -> None:
     path = tmp_path / "static.csv"
     rows = [
@@ -102,32 +92,3 @@ def _broken(kind: str) -> np.ndarray:
 def test_what_is_wrong_is_said_with_its_line(tmp_path: Path, kind: str, words: str) -> None:
     with pytest.raises(BadInputError, match=words):
         read_pump_table(_write(tmp_path / "a.csv", "t_s,pwm,pressure_kPa", _broken(kind)))
-
-
-def test_a_table_of_one_blank_row(tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_text("time_s,pwm,pressure_kPa\n,101,2.5\n")
-    with pytest.raises(BadInputError, match="1 of 1 rows have a blank or nan, the first in line 2"):
-        read_pump_table(tmp_path / "a.csv")
-
-
-def test_one_blank_is_left_out_and_said(tmp_path: Path) -> None:
-    rows = _rows()
-    rows[20, 2] = np.nan
-    table = read_pump_table(_write(tmp_path / "a.csv", "t_s,pwm,pressure_kPa", rows))
-    assert table.record is not None
-    assert len(table.record.t_s) == 99
-    assert "1 rows with a blank or nan are left out" in table.said[0]
-
-
-def test_files_that_are_no_tables(tmp_path: Path) -> None:
-    for text, words in (
-        ("", "is empty"),
-        ("t_s,pwm,pressure_kPa\n", "no rows"),
-        ("t_s,pwm\n1\n", "line 2: has 1 cells"),
-    ):
-        (tmp_path / "a.csv").write_text(text)
-        with pytest.raises(BadInputError, match=words):
-            read_pump_table(tmp_path / "a.csv")
-    (tmp_path / "a.csv").write_text("t_s,pwm,pressure_kPa\n0,x,1\n")
-    with pytest.raises(BadInputError, match="line 2: pwm is 'x'"):
-        read_pump_table(tmp_path / "a.csv")

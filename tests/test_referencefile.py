@@ -10,10 +10,9 @@ import pytest
 from control_models import NOMINAL
 
 from calib.actuator.kinematics import forward
-from calib.control.references import built_in
 from calib.control.setpoints import Ellipse
 from calib.errors import BadInputError
-from calib.referencefile import read_reference, reference_of, write_reference
+from calib.referencefile import read_reference
 
 R, H = NOMINAL.plant.bellows_radius_m, NOMINAL.tick_s
 Make = Callable[[str], Path]
@@ -32,15 +31,6 @@ def make(tmp_path: Path) -> Make:
 def _table(header: str, *columns: np.ndarray) -> str:
     rows = (",".join(f"{value:.9g}" for value in row) for row in zip(*columns, strict=True))
     return "\n".join([header, *rows]) + "\n"
-
-
-def test_what_is_written_is_read_again(tmp_path: Path) -> None:
-    for name in ("ellipse", "elongation"):
-        made = built_in(NOMINAL, name)
-        write_reference(tmp_path / "r.csv", made)
-        again = read_reference(tmp_path / "r.csv", NOMINAL)
-        assert again.q_m == pytest.approx(made.q_m, abs=2e-8)
-        assert again.kind == "lengths"
 
 
 def test_lengths_heads_and_angles_are_the_same_motion(make: Make) -> None:
@@ -62,16 +52,6 @@ def test_a_recorded_log_is_a_reference(make: Make) -> None:
     q = 0.07 + 0.003 * np.sin(t)
     made = read_reference(make(_table("t_s,u_px,true_q1_m,true_q2_m", t, t, q, q)), NOMINAL)
     assert made.q_m[:, 0] == pytest.approx(0.07 + 0.003 * np.sin(made.t_s), abs=1e-6)
-
-
-def test_by_name_or_by_file(make: Make) -> None:
-    assert reference_of("step", NOMINAL, 1.0).duration_s == pytest.approx(1.0)
-    path = make("t_s,phi_rad\n0,0.1\n1,0.2\n2,0.1\n")
-    assert reference_of(str(path), NOMINAL).kind == "angle"
-    with pytest.raises(BadInputError, match="a file has its own duration"):
-        reference_of(str(path), NOMINAL, 1.0)
-    with pytest.raises(BadInputError, match="nowhere: is no such file and none of the references elongation"):
-        reference_of("nowhere", NOMINAL)
 
 
 @pytest.mark.parametrize(

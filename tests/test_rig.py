@@ -42,10 +42,6 @@ def test_sections_of_later_versions_survive(tmp_path: Path) -> None:
     assert text.index("camera:") < text.index("twin:") < text.index("provenance:")
 
 
-def test_no_file_is_an_empty_rig(tmp_path: Path) -> None:
-    assert read_rig(tmp_path / "rig.yaml").camera is None
-
-
 @pytest.mark.parametrize(
     ("change", "says"),
     [

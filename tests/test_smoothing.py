@@ -7,30 +7,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from estimatorlogs import rows_from, setup_for, simulated
+from estimatorlogs import setup_for, simulated
 
 from calib.estimator.setup import OUT
 from calib.logs import Log
 from calib.replaying import periods
-from calib.smoothing import joined, smooth_log
+from calib.smoothing import smooth_log
 from calib.statesfile import STATES
 
 
 def cut(log: Log, pieces: int) -> Iterator[Log]:
     for part in np.array_split(np.arange(len(log)), pieces):
         yield replace(log, t_s=log.t_s[part], columns={k: v[part] for k, v in log.columns.items()})
-
-
-def test_joined_rows_are_those_that_were_cut() -> None:
-    rows = rows_from(simulated("swing", 1)[1])
-    parts = [
-        replace(rows, t_s=rows.t_s[at], readings=rows.readings[at], kinds=rows.kinds[at])
-        for at in np.array_split(np.arange(len(rows)), 5)
-    ]
-    whole = joined(parts)
-    np.testing.assert_array_equal(whole.t_s, rows.t_s)
-    np.testing.assert_array_equal(whole.readings, rows.readings)
-    np.testing.assert_array_equal(whole.kinds, rows.kinds)
 
 
 def test_blocks_make_no_difference_and_the_states_are_the_smoother_s(tmp_path: Path) -> None:

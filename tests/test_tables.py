@@ -25,21 +25,6 @@ def write(tmp_path: Path):
     return _write
 
 
-def test_a_table_is_read_in_order(write) -> None:
-    rows = [
-        f"{view},{x},{y},{100 * x + 1},{100 * y + 2}"
-        for x in range(3)
-        for y in range(2)
-        for view in ("b", "a")
-    ]
-    views = read_table(write(HEADER + "\n".join(rows)))
-    assert [view.name for view in views] == ["b", "a"]
-    expected = np.array([(x, y) for x in range(3) for y in range(2)], dtype=float)
-    for view in views:
-        assert np.array_equal(view.target_m, expected)
-        assert np.array_equal(view.pixels, 100 * expected + [1, 2])
-
-
 def test_columns_in_any_order_with_strangers_comments_and_blanks(write) -> None:
     text = (
         "\ufeff# made by hand\n\nv_px, u_px ,note,view, x_m,y_m\n"
@@ -101,14 +86,6 @@ def test_a_bad_table_is_answered_with_file_and_line(write, content: str | bytes,
     assert "\n" not in str(caught.value)
 
 
-def test_files_that_cannot_be_opened(tmp_path: Path) -> None:
-    for path in (tmp_path / "missing.csv", tmp_path):
-        with pytest.raises(BadInputError, match="cannot be read"):
-            read_table(path)
-        with pytest.raises(BadInputError, match="cannot be read"):
-            read_vnl(path, 3, 2, 0.02)
-
-
 BOARD = Board(3, 2, 0.02)
 SIX = np.array([[10.0, 10], [20, 11], [30, 12], [9, 20], [19, 21], [29, 22]])
 
@@ -130,14 +107,6 @@ def test_a_corner_file_is_read_row_by_row(write) -> None:
     assert np.array_equal(views[0].target_m, BOARD.points_m())
     assert np.array_equal(views[0].pixels, SIX)
     assert np.array_equal(views[1].pixels, SIX + 5)
-
-
-def test_legends_without_a_level_or_with_more(write) -> None:
-    plain = read_vnl(write("# filename x y\n" + corners("a", SIX, ""), "p.vnl"), 3, 2, 1.0)
-    more = "# x y filename level extra\n" + "".join(f"{u} {v} a 0 -\n" for u, v in SIX)
-    other = read_vnl(write(more, "m.vnl"), 3, 2, 1.0)
-    assert np.array_equal(plain[0].pixels, SIX)
-    assert np.array_equal(other[0].pixels, SIX)
 
 
 def test_corners_that_were_not_seen_are_left_out(write) -> None:

@@ -10,22 +10,10 @@ import pytest
 from estimatorlogs import rows_from, setup_for, simulated
 from identifytrials import rig_file
 
-from calib.errors import BadInputError
 from calib.estimator.constant_gain import run_gains, ticks_of
 from calib.estimator.gains import Gains
 from calib.logs import write_log
-from calib.rig import Rig
 from calib.tuning import gain_section, tuned_section
-
-
-def test_needs_logs_with_camera_and_imu(tmp_path: Path) -> None:
-    log = simulated("static")[1]
-    blind = replace(log, columns={k: v for k, v in log.columns.items() if k not in ("u_px", "v_px")})
-    write_log(tmp_path / "blind.csv", blind)
-    with pytest.raises(BadInputError, match=r"blind\.csv: tuning needs camera and IMU"):
-        tuned_section([tmp_path / "blind.csv"], Rig(), tmp_path / "rig.yaml")
-    with pytest.raises(BadInputError, match="none given"):
-        tuned_section([], Rig(), tmp_path / "rig.yaml")
 
 
 def test_constant_gains_are_those_of_the_set_up_and_stay_finite() -> None:
@@ -35,15 +23,6 @@ def test_constant_gains_are_those_of_the_set_up_and_stay_finite() -> None:
     assert section is not None
     assert section.delay_ticks == pytest.approx(60.0 * float(setup.start.sensor[7]))
     assert np.isfinite(run_gains(Gains(**section.model_dump()), setup, ticks_of(setup, rows))).all()
-
-
-def test_no_constant_gains_without_a_camera_or_with_pictures_that_are_too_late() -> None:
-    rig, _ = simulated("ellipse", 1)
-    setup = setup_for(rig, 1)
-    assert gain_section(replace(setup, view=np.zeros(24)), 60.0) is None
-    sensor = setup.start.sensor.copy()
-    sensor[7] = 0.2
-    assert gain_section(replace(setup, start=replace(setup.start, sensor=sensor)), 60.0) is None
 
 
 def test_a_log_with_commands_tunes_the_driven_model_too(

@@ -10,15 +10,9 @@ from hypothesis import strategies as st
 
 from calib.errors import UsageError
 from calib.units import (
-    parse_angle_rad,
     parse_corners,
     parse_duration_s,
-    parse_frequency_hz,
-    parse_image_size,
-    parse_jitter,
     parse_length_m,
-    parse_region_px,
-    parse_square_m,
     plain_number,
 )
 
@@ -45,16 +39,6 @@ def test_durations(text: str, seconds: float) -> None:
         parse_duration_s(f"-{text}", "--duration")
 
 
-def test_other_quantities() -> None:
-    assert parse_frequency_hz("1.5kHz", "--rate") == 1500.0
-    assert parse_angle_rad("180deg", "--angle") == pytest.approx(math.pi)
-    assert parse_image_size("640x480") == (640, 480)
-    with pytest.raises(UsageError):
-        parse_frequency_hz("0Hz", "--rate")
-    with pytest.raises(UsageError):
-        parse_image_size("0x480")
-
-
 @given(st.integers(3, 200), st.integers(3, 200), st.sampled_from(["x", "X", ",", " x "]))
 def test_corners(columns: int, rows: int, by: str) -> None:
     assert parse_corners(f"{columns}{by}{rows}") == (columns, rows)
@@ -64,27 +48,6 @@ def test_corners(columns: int, rows: int, by: str) -> None:
 def test_wrong_corners(text: str) -> None:
     with pytest.raises(UsageError, match="--corners"):
         parse_corners(text)
-
-
-def test_jitter_in_millimetres_or_pixels() -> None:
-    assert parse_jitter("0.1mm") == (pytest.approx(1e-4), "m")
-    assert parse_jitter("0.3 px") == (0.3, "px")
-    for text, words in (("0.3", "has no unit"), ("0px", "is not positive"), ("1Hz", "has the unit 'Hz'")):
-        with pytest.raises(UsageError, match=words):
-            parse_jitter(text)
-
-
-def test_squares_and_regions() -> None:
-    assert parse_square_m("20mm") == 0.02
-    assert parse_region_px("1,2.5, 3,4") == (1.0, 2.5, 3.0, 4.0)
-    for text in ("20m", "1e-30mm"):
-        with pytest.raises(UsageError, match=r"--square: .* is not between 0\.01 mm and 10 m"):
-            parse_square_m(text)
-    for text in ("1,2,3", "a,b,c,d", "5,0,1,9", "0,0,inf,9", "nan,0,1,1", "1e400,0,5,5"):
-        with pytest.raises(UsageError, match="--region"):
-            parse_region_px(text)
-    with pytest.raises(UsageError, match="--image-size"):
-        parse_image_size("999999x9")
 
 
 @pytest.mark.parametrize(("word", "value"), [("1.5", 1.5), ("-2e-3", -2e-3), ("inf", math.inf), (".5", 0.5)])

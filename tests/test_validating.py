@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,35 +10,17 @@ import pytest
 from identifytrials import log_file, rig_file, track, varied
 
 from calib.actuator.identify_parameters import Nominal
-from calib.errors import BadInputError
 from calib.identifying import TrackSource
 from calib.logs import read_log, write_log
-from calib.rig import Rig, read_rig
 from calib.twin.rig import SimulatedRig
 from calib.validating import (
     IMPROVED,
     NOMINAL,
     ORIGINAL,
     compare,
-    errors_of,
     estimated_start,
-    models_of,
     validate_log,
 )
-
-
-def test_norms_by_hand() -> None:
-    measured = np.array([[1.0, 2.0, 0.0], [3.0, 2.0, 1.0], [5.0, 2.0, 2.0], [7.0, 2.0, 3.0]])
-    errors = errors_of(measured, measured + np.array([3.0, 0.0, -0.5]))
-    assert errors["q1"].norm == pytest.approx(6.0) and errors["q1"].rms == pytest.approx(3.0)
-    # About their mean of 4 the values have a norm of sqrt(20).
-    assert errors["q1"].fit_percent == pytest.approx(100.0 * (1.0 - 6.0 / math.sqrt(20.0)))
-    assert errors["q2"].norm == 0.0 and math.isnan(errors["q2"].fit_percent)
-    assert errors["phi"].rms == pytest.approx(0.5)
-    twice = errors_of(np.tile(measured, (2, 1)), np.tile(measured, (2, 1)) + 1.0)
-    once = errors_of(measured, measured + 1.0)
-    assert twice["q1"].norm == pytest.approx(math.sqrt(2.0) * once["q1"].norm)
-    assert twice["q1"].rms == pytest.approx(once["q1"].rms)
 
 
 def test_the_true_model_leaves_the_noise_and_another_one_more() -> None:
@@ -70,27 +51,6 @@ def test_one_wrong_picture_does_not_decide() -> None:
     assert wrong.improvement_percent("q1") is None
 
 
-def test_a_motion_that_leaves_the_model_is_not_known() -> None:
-    nominal = Nominal()
-    soft = replace(nominal, plant=replace(nominal.plant, stiffness_scale=0.05, bending_N_per_rad2=0.0))
-    torn = replace(soft, strength=(10.0, 0.05))
-    found = compare(TrackSource(track("prbs"), "truth", 0.025, ()), {ORIGINAL: torn}, 0.0126)
-    assert math.isnan(found.errors[ORIGINAL]["q1"].norm)
-
-
-def test_the_improved_model_is_that_of_the_sections(tmp_path: Path) -> None:
-    assert list(models_of(Rig(), tmp_path / "rig.yaml")) == [ORIGINAL, NOMINAL]
-    path = tmp_path / "rig.yaml"
-    path.write_text("actuator: {stiffness_scale: 1.3}\npump: {lag_s: 0.5, strength: [1.1, 0.9]}\n")
-    models = models_of(read_rig(path), path)
-    assert models[NOMINAL] == Nominal()
-    first = models[ORIGINAL].plant
-    assert (first.bending_N_per_rad2, first.creep_rates[1], first.damping_scale) == (0.0, 0.0, 1.0)
-    assert models[ORIGINAL].free_damping_scale == 1.0
-    assert models[IMPROVED].plant.stiffness_scale == 1.3
-    assert (models[IMPROVED].pump.lag_s, models[IMPROVED].strength) == (0.5, (1.1, 0.9))
-
-
 def test_a_log_with_its_true_parameters(tmp_path: Path) -> None:
     rig, truth = varied(2)
     keys = ("stiffness_scale", "damping_scale_pumps_connected", "bending_N_per_rad2", "lambda1_per_s")
@@ -109,19 +69,6 @@ def test_a_log_with_its_true_parameters(tmp_path: Path) -> None:
     # The marker's place comes in whole pixels of a third of a millimetre and more.
     assert 1e-4 < seen.errors[IMPROVED]["q1"].rms < 1e-3
     assert seen.errors[IMPROVED]["q1"].fit_percent > seen.errors[ORIGINAL]["q1"].fit_percent
-
-
-def test_a_log_without_commands_is_refused(tmp_path: Path) -> None:
-    log = log_file(tmp_path / "log.csv", SimulatedRig(), "swing", 0, 2.0)
-    lines = [line.split(",") for line in log.read_text().splitlines()]
-    keep = [k for k, name in enumerate(lines[0]) if not name.startswith("pwm")]
-    log.write_text("\n".join(",".join(line[k] for k in keep) for line in lines) + "\n")
-    path = tmp_path / "rig.yaml"
-    known = rig_file(path)
-    with pytest.raises(BadInputError, match="has no commands, expected pwm1 and pwm2"):
-        validate_log(log, known, path)
-    found, _ = validate_log(log, known, path, no_pwm=True)
-    assert not found.hoses and found.errors[NOMINAL]["phi"].fit_percent > 80.0
 
 
 def test_the_start_is_the_estimators_and_no_models(tmp_path: Path) -> None:

@@ -54,12 +54,3 @@ def test_numbers_do_not_have_to_be_small_or_in_order() -> None:
     far = _line(1e9 + 1000.0 * t[mixed], x[mixed], sigma[mixed])
     assert 1000.0 * far.slope == pytest.approx(near.slope, rel=1e-6)
     assert 1000.0 * far.sigma == pytest.approx(near.sigma, rel=1e-6)
-
-
-def test_where_there_is_no_line() -> None:
-    t, x, sigma = np.arange(20.0), np.sin(np.arange(20.0)), np.full(20, 0.1)
-    some = spread_of(x, sigma)
-    assert drift_of(t[:5], x[:5], sigma[:5], some) is None
-    assert drift_of(np.full(20, 3.0), x, sigma, some) is None
-    assert drift_of(t, np.full(20, 2.0), sigma, spread_of(np.full(20, 2.0), sigma)) is None
-    assert drift_of(np.full(20, np.nan), x, sigma, some) is None

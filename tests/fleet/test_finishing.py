@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.errors import BadInputError
 from calib.files import sha256
 from calib.fleet.borrowing import BORROWED
 from calib.fleet.finishing import finish
@@ -122,15 +121,3 @@ def test_new_rigs_borrow_and_say_so(tmp_path: Path) -> None:
     with _fleet(tmp_path / "new", {"new0": _rig(rng, "x", fx_px=300.0)}) as (store, manifest):
         finish(store, manifest, prior)
         assert not store.result("new0", BORROWED).exists()
-
-
-def test_what_is_no_prior(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match=r"has no fleet\.parquet"):
-        read_prior(tmp_path)
-    (tmp_path / "fleet.parquet").write_bytes(b"no table")
-    with pytest.raises(BadInputError, match="is no table of a fleet"):
-        read_prior(tmp_path)
-    with _fleet(tmp_path / "few", _many(0, 7)) as (store, manifest):
-        finish(store, manifest)
-    with pytest.raises(BadInputError, match=r"7 rigs with radial2 are too few for 3 constants.*no prior"):
-        read_prior(tmp_path / "few")

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calib.errors import BadInputError
-from calib.fleet.manifest import RigSpec, is_url, read_manifest, serial_number, twice_told, without_secrets
+from calib.fleet.manifest import is_url, read_manifest, without_secrets
 
 
 def _csv(tmp_path: Path, text: str) -> Path:
@@ -104,27 +104,6 @@ def test_a_name_that_is_taken_is_a_safe_folder(name: str) -> None:
     if _problem_of_name(name) == "":
         path = Path("root") / name
         assert path.parent == Path("root") and path.name == name and name.isprintable()
-
-
-@pytest.mark.parametrize(
-    ("serial", "number"),
-    [("17", 17.0), ("AX-0017", 17.0), ("2024/003b", 3.0), ("", None), ("none", None), ("9" * 20, None)],
-)
-def test_serial_numbers(serial: str, number: float | None) -> None:
-    if serial == "9" * 20:
-        # So long a number is taken from its end; it is no number of a rig anyway.
-        assert serial_number(serial) == 999999999999999.0
-    else:
-        assert serial_number(serial) == number
-
-
-def test_what_several_rigs_share_is_told() -> None:
-    rigs = [RigSpec("a", "/x", "1"), RigSpec("b", "/y", "1"), RigSpec("c", "/x", ""), RigSpec("d", "/x", "")]
-    assert twice_told(rigs[:1]) == ()
-    assert twice_told(rigs) == (
-        "2 rigs have the folder of one before, the first is c",
-        "1 rig has the serial number of one before, the first is b",
-    )
 
 
 def test_no_secret_is_kept() -> None:

@@ -83,9 +83,3 @@ def test_a_fleet_whose_rigs_are_alike_has_no_spread_of_its_own() -> None:
     assert np.trace(found.between) < 1.0
     after = posterior(found, MU + np.array([1.0, 0.0, 0.0]), np.eye(3))
     assert np.trace(after.covariance) < 0.5 * 3.0
-
-
-def test_too_few_rigs_are_no_prior() -> None:
-    rng = np.random.default_rng(4)
-    _, x, V = _rigs(rng, 7)
-    assert group_of(ORDER, x, V) is None

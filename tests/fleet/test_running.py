@@ -17,7 +17,7 @@ from calib.fleet.running import run_fleet
 from calib.fleet.store import opened_store
 from calib.fleet.task import Answer, FleetOptions, program
 
-distributed = pytest.importorskip("distributed")
+pytest.importorskip("distributed")
 
 pytestmark = pytest.mark.filterwarnings("default")
 """What Dask warns of is not ours."""

@@ -9,16 +9,6 @@ from hypothesis import strategies as st
 
 from calib.fleet.spread import limit_of, robust_z, spread_of
 
-NAN = np.nan
-
-
-def test_spread_of_known_values() -> None:
-    x = np.array([1.0, 2.0, 3.0, 4.0, 100.0, NAN])
-    found = spread_of(x, np.full(6, NAN))
-    assert (found.count, found.median, found.low, found.high) == (5, 3.0, 1.0, 100.0)
-    assert found.scale == pytest.approx(1.482602218505602)
-    assert found.between == found.scale and np.isnan(found.own)
-
 
 def test_own_sigma_takes_its_part_of_the_spread_and_of_z() -> None:
     x = np.array([-1.0, 0.0, 1.0])
@@ -40,21 +30,6 @@ def test_z_does_not_depend_on_units(values: list[float], factor: float, shift: f
     z = robust_z(x, sigma, spread_of(x, sigma))
     y, bars = factor * x + shift, factor * sigma
     np.testing.assert_allclose(robust_z(y, bars, spread_of(y, bars)), z, rtol=1e-5, atol=1e-5)
-
-
-def test_more_than_half_alike() -> None:
-    x = np.array([5.0] * 9 + [6.0])
-    none = np.full(10, NAN)
-    found = spread_of(x, none)
-    assert found.scale == pytest.approx(1.2533141373155001 * 0.1)
-    assert robust_z(x, none, found)[-1] == pytest.approx(1.0 / found.scale)
-    same = spread_of(np.full(10, 0.1), none)
-    assert same.scale == 0.0 and not robust_z(np.full(10, 0.1), none, same).any()
-
-
-def test_nothing_known() -> None:
-    found = spread_of(np.full(4, NAN), np.full(4, NAN))
-    assert found.count == 0 and np.isnan(robust_z(np.full(4, NAN), np.full(4, NAN), found)).all()
 
 
 def test_chance_alone_is_beyond_the_limit_in_about_one_fleet_of_twenty() -> None:

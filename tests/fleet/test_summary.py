@@ -69,24 +69,6 @@ def test_its_size_does_not_grow_with_the_fleet(tmp_path: Path) -> None:
         assert all(len(one.points) <= 240 and len(one.counts) == 36 for one in found.constants)
 
 
-def test_a_few_rigs_are_not_judged(tmp_path: Path) -> None:
-    known = _fleet(6)
-    path = tmp_path / "few.parquet"
-    write_outcomes(path, list(known), known.get)
-    found, worst, _ = summarise(path)
-    assert np.isnan(worst).all() and np.isnan(found.limit)
-    assert all(one.standing_out == 0 and one.drift is None for one in found.constants)
-    assert [look.name for look in found.looks] == ["rig3", "rig5"]
-
-
-def test_nothing_but_failures(tmp_path: Path) -> None:
-    known = {f"r{k}": Outcome(f"r{k}", "", "", "failed", 3, "gone") for k in range(12)}
-    path = tmp_path / "none.parquet"
-    write_outcomes(path, list(known), known.get)
-    found, _, _ = summarise(path)
-    assert found.constants == () and found.to_look_at == 12
-
-
 def test_what_is_judged() -> None:
     names = (
         "name",

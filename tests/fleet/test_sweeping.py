@@ -5,14 +5,12 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from fleet_clusters import in_threads
 
-from calib.errors import BadInputError
 from calib.fleet import sweeping, worker
 from calib.fleet.cluster import Cluster
 from calib.fleet.engine import Lost
@@ -23,7 +21,7 @@ from calib.fleet.sweepspec import Base, Case, SweepSpec
 from calib.fleet.sweeptask import CaseResult
 from calib.fleet.task import program
 
-distributed = pytest.importorskip("distributed")
+pytest.importorskip("distributed")
 pytest.importorskip("pyarrow")
 
 pytestmark = pytest.mark.filterwarnings("default")
@@ -93,28 +91,6 @@ def test_best_worst_and_resumed(here: Cluster, tmp_path: Path) -> None:
         files[2].write_text(json.dumps({**told, "digest": "x"}))
         assert run_sweep(store, here, SPEC, 1) == 14
         assert summarise_sweep(store, SPEC, 14).best == found.best
-
-
-def test_nearest_to_a_value(here: Cluster, tmp_path: Path) -> None:
-    spec = replace(SPEC, near=1.0)
-    for store in _opened(tmp_path):
-        run_sweep(store, here, spec, 1)
-        best = summarise_sweep(store, spec, 0).best[0]
-        assert dict(best.values)["scenario.controller"] == "pid" and dict(best.values)["scenario.Kp"] != 2.0
-
-
-def test_draws_alone_and_a_measure_that_is_not_there(here: Cluster, tmp_path: Path) -> None:
-    spec = replace(SPEC, grid=(("scenario.Kp", (2.0,)), ("scenario.controller", ("p",))), count=12)
-    for store in _opened(tmp_path):
-        run_sweep(store, here, spec, 1)
-        found = summarise_sweep(store, spec, 0)
-        assert len(found.best) == 1 and found.best[0].draws == 12
-        assert [name for name, _ in found.clouds] == ["scenario.Kp", "actuator.mass_kg"]
-        assert len(found.clouds[1][1]) == 12
-        with pytest.raises(BadInputError, match="nonsense was not measured, expected some of error, other"):
-            summarise_sweep(store, replace(spec, measures=("nonsense",)), 0) if run_sweep(
-                store, here, replace(spec, measures=("nonsense",)), 1
-            ) == 0 else None
 
 
 def deadly(base: Base, cases: tuple[Case, ...], seed: int, scratch: str) -> list[CaseResult] | Lost:

@@ -40,11 +40,6 @@ def test_grid_times_draws(tmp_path: Path) -> None:
     assert all(1.0 <= dict(case.values)["pump.falling_N_per_s"] <= 10.0 for case in made)
 
 
-def test_log_range(tmp_path: Path) -> None:
-    spec = _read(tmp_path, _BASE + "grid: {pump.lag_s: {from: 0.01, to: 1, count: 3, log: true}}\n")
-    np.testing.assert_allclose(spec.grid[0][1], [0.01, 0.1, 1.0])
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [

@@ -153,11 +153,3 @@ def test_the_file_is_the_same_every_time_and_its_table_of_objects_is_right() -> 
     length = re.search(rb"/Length (\d+) >>\nstream\n", pdf)
     assert length is not None
     assert pdf[length.end() + int(length.group(1)) :].startswith(b"\nendstream")
-
-
-def test_the_sheet_says_what_it_is() -> None:
-    pdf = board_pdf(7, 5, 0.0225, "Letter")
-    assert b"(calib board: 7 x 5 inner corners, square 22.5 mm, Letter)" in pdf
-    assert b"/PrintScaling /None" in pdf
-    assert b"Half a turn" in pdf
-    assert b"Half a turn" not in board_pdf(9, 6, 0.02)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from figure_checks import complaints, drawn_texts, kept
@@ -14,15 +13,11 @@ from calib.camera.bundle import calibrate
 from calib.camera.covariance import covariance
 from calib.camera.intrinsics import Intrinsics
 from calib.camera.model import Camera
-from calib.camera.selection import Candidate
 from calib.camera.verdict import Judgement
 from calib.camera.views import View, pack
-from calib.errors import BadInputError
 from calib.report import camera_figures
 from calib.report.camera_figures import write_camera_figures
 from synthetic import CAMERA, views_of
-
-SIX = ["errors", "residuals", "coverage", "poses", "sigma", "distortion"]
 
 
 def result_of(
@@ -36,42 +31,6 @@ def result_of(
     fit = calibrate(pack(views), size, model, fixed=fixed)
     judgement = Judgement(verdict, (), (), (), {})
     return Intrinsics(fit, covariance(fit), judgement, (), (), "rigid", (), {})
-
-
-@pytest.fixture(scope="module")
-def usual() -> Intrinsics:
-    return result_of(views_of(9, noise_px=0.1))
-
-
-def _candidates(count: int, views: int) -> tuple[Candidate, ...]:
-    names = ("pinhole", "radial2", "radial3", "brown5", "rational8")[:count]
-    rms = (1.9, 0.2101, 0.2098, 0.2097, 0.2090)
-    held = (2.1, 0.2122, 0.2125, 0.2139, np.nan)
-    return tuple(Candidate(names[i], 4 + i, rms[i], held[i], np.full(views, rms[i])) for i in range(count))
-
-
-def test_every_figure_is_written(usual: Intrinsics, tmp_path: Path) -> None:
-    result = replace(usual, models=_candidates(5, 9), boards=_candidates(2, 9))
-    written = write_camera_figures(tmp_path / "new" / "folder", result)
-    assert [p.name for p in written] == [f"camera_{name}.png" for name in [*SIX, "models", "boards"]]
-    assert sorted(p.name for p in written[0].parent.iterdir()) == sorted(p.name for p in written)
-    for path in written:
-        picture = cv2.imread(str(path))
-        assert picture is not None
-        assert picture.shape[1] == 1196
-        assert 300 < picture.shape[0] < 1300
-        assert np.all(picture[:3] == 255), "white paper"
-        assert picture.std() > 15, "something is drawn"
-
-
-@pytest.mark.slow
-def test_the_bytes_repeat(usual: Intrinsics, tmp_path: Path) -> None:
-    result = replace(usual, models=_candidates(5, 9))
-    first = write_camera_figures(tmp_path / "a", result)
-    for a, b in zip(first, write_camera_figures(tmp_path / "b", result), strict=True):
-        assert a.read_bytes() == b.read_bytes()
-        assert b"tIME" not in a.read_bytes()
-        assert b"Software" not in a.read_bytes()
 
 
 def _tilted(tilt_rad: float, count: int) -> Intrinsics:
@@ -203,30 +162,3 @@ def test_what_is_not_bounded_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert "not bounded" in _words(result, "sigma", tmp_path, monkeypatch)
     assert "not estimated" in _words(result, "coverage", tmp_path, monkeypatch)
     assert "verdict: unidentifiable" in _words(result, "poses", tmp_path, monkeypatch)
-
-
-def test_names_are_shown_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    words = _words(_no_distortion_and_odd_names(), "errors", tmp_path, monkeypatch)
-    for name in ("a$b$c.png", "$\\frac{.png", "\\u5199\\u771f.png", "line\\nbreak\\t.png", "_^{}%.png"):
-        assert name in words
-
-
-def test_numbers_in_the_figures_are_those_of_the_fit(
-    usual: Intrinsics, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    fit = usual.calibration
-    words = _words(usual, "errors", tmp_path, monkeypatch)
-    assert f"RMS {fit.rms_px:.3f} px" in words
-    assert f"{np.nanmax(fit.view_rms_px):.3f} px in" in words
-    distance = np.linalg.norm(fit.residuals_px, axis=2)
-    inside = round(100 * float(np.mean(distance <= 2 * fit.sigma_px)))
-    assert f"2\N{GREEK SMALL LETTER SIGMA}: {inside} %" in words
-
-
-def test_a_folder_that_cannot_be_made_is_named(usual: Intrinsics, tmp_path: Path) -> None:
-    file = tmp_path / "taken"
-    file.write_text("a file")
-    with pytest.raises(BadInputError, match="taken: is a file, expected a folder"):
-        write_camera_figures(file, usual)
-    with pytest.raises(BadInputError, match="no folder for figures can be made here"):
-        write_camera_figures(file / "below", usual)

@@ -72,17 +72,6 @@ def test_a_page_does_not_grow_with_the_fleet(tmp_path: Path) -> None:
     assert many < 1.1 * few < 400_000
 
 
-def test_a_fleet_in_order_says_so(tmp_path: Path) -> None:
-    rng = np.random.default_rng(1)
-    known = {
-        f"r{k}": Outcome(f"r{k}", "", "", "ok", 0, values={"camera.fx_px": (rng.standard_normal(), 1.0)})
-        for k in range(20)
-    }
-    write_outcomes(tmp_path / "x.parquet", list(known), known.get)
-    text = fleet_page_text(summarise(tmp_path / "x.parquet")[0])
-    assert "all 20 rigs are ok, and none stands out" in text and "None: all are ok" in text
-
-
 def test_in_a_browser(tmp_path: Path) -> None:
     browser = browser_or_skip(tmp_path / "profile")
     try:

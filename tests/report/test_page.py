@@ -99,11 +99,6 @@ def test_sections_that_mean_nothing_are_refused_by_their_key(tmp_path: Path, tex
         page_text(tmp_path / "rig.yaml")
 
 
-def test_what_is_no_rig_file(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="no such file"):
-        page_text(tmp_path / "rig.yaml")
-
-
 def test_too_many_figures_are_named_instead(rig: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("calib.report.page.MOST_BYTES", 460_000)
     text = page_text(rig)

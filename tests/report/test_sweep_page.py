@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import re
-from xml.etree import ElementTree
 
 from calib.fleet.sweeping import Point, SweepSummary
 from calib.fleet.sweepspec import Base, SweepSpec
-from calib.report.sweep_page import cloud_svg, sweep_page_text
+from calib.report.sweep_page import sweep_page_text
 
 _SPEC = SweepSpec(
     Base("controller", "pid", "jump", "", "truth", None, "auto"),
@@ -34,8 +33,3 @@ def test_what_is_told() -> None:
     assert "controller pid on jump" in text and "1 of them failed: &lt;b&gt;too heavy" in text
     assert text.index("0.125") < text.index("8.5") and "Simulated." in text and ">7<" in text
     assert not re.search(r"https?://|src=", text)
-
-
-def test_a_cloud_with_one_value_only() -> None:
-    root = ElementTree.fromstring(cloud_svg("a<b", "m", ((1.0, 2.0), (1.0, 2.0))))
-    assert len([e for e in root if e.get("class") == "dot"]) == 2

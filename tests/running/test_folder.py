@@ -5,12 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from running_trials import make_folder, run_small
 
 from calib.errors import BadInputError
-from calib.running.folder import read_folder, slug, with_topics
+from calib.running.folder import read_folder, with_topics
 
 
 def test_kinds_of_logs_and_their_columns(tmp_path: Path) -> None:
@@ -77,20 +75,6 @@ def test_odd_names_stay_inside_and_run(tmp_path: Path, name: str) -> None:
     assert all(path.parent.parent == tmp_path or path.is_relative_to(out) for path in out.rglob("*"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "rig"]
     assert all(part.isascii() and part.isprintable() for part in states)
-
-
-def test_names_that_differ_in_odd_signs_alone_stay_apart() -> None:
-    assert slug("a\nb") != slug("a\tb") != slug("a_b")
-    assert slug("a_b") == "a_b"
-    assert slug("A", ["a"]) != "A"
-
-
-@given(st.text(min_size=1))
-def test_a_slug_is_a_plain_file_name(name: str) -> None:
-    text = slug(name)
-    assert text and len(text) <= 100
-    assert Path(text).name == text and text not in (".", "..") and not text.startswith((".", "-"))
-    assert text == slug(name)
 
 
 def test_bags_are_logs_with_the_file_that_explains_them(tmp_path: Path) -> None:

@@ -35,24 +35,6 @@ def _bytes(out: Path) -> dict[str, bytes]:
     }
 
 
-def test_order_outputs_and_what_is_not_available(tmp_path: Path) -> None:
-    ended = run_small(make_folder(tmp_path / "rig"), tmp_path / "out")
-    assert _status(ended) == {
-        "first": "ok", "second": "ok", "lone": "ok", "each-one": "ok", "each-two": "ok",
-        "absent": "missing", "firmware": "ok",
-    }  # fmt: skip
-    assert CALLS.index("first") < CALLS.index("second") < CALLS.index("firmware")
-    # What nobody waits for comes last, whatever its place in the table.
-    assert CALLS.index("second") < CALLS.index("lone")
-    out = tmp_path / "out"
-    assert sorted(p.name for p in out.iterdir()) == [HIDDEN, "firmware", "rig.yaml", "states"]
-    assert sorted(p.name for p in (out / "states").iterdir()) == ["one.csv", "two.csv"]
-    rig = yaml.safe_load((out / "rig.yaml").read_text())
-    assert rig["second"]["twice_m"] == 2 * rig["first"]["value_m"]
-    assert set(rig["provenance"]["inputs"]["first"]) == {"a.png", "b.png"}
-    assert exit_code(ended) == 0
-
-
 def test_second_run_reuses_all_and_gives_the_same_bytes(tmp_path: Path) -> None:
     root, out = make_folder(tmp_path / "rig"), tmp_path / "out"
     run_small(root, out)
@@ -62,12 +44,6 @@ def test_second_run_reuses_all_and_gives_the_same_bytes(tmp_path: Path) -> None:
     assert CALLS == []
     assert all(done.reused for done in ended if done.status == "ok")
     assert _bytes(out) == before
-
-
-def test_same_folder_elsewhere_gives_the_same_bytes(tmp_path: Path) -> None:
-    run_small(make_folder(tmp_path / "rig"), tmp_path / "out")
-    run_small(make_folder(tmp_path / "deeper" / "another"), tmp_path / "other" / "place")
-    assert _bytes(tmp_path / "out") == _bytes(tmp_path / "other" / "place")
 
 
 def test_one_changed_log_runs_one_stage(tmp_path: Path) -> None:

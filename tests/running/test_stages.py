@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-import pytest
-import typer
 from running_trials import make_folder
 
-from calib.cli.app import app
-from calib.cli.run import is_available
 from calib.rig import SECTIONS
 from calib.running.folder import read_folder
-from calib.running.stages import STAGES, Stage, jobs_of, urgency
+from calib.running.stages import STAGES, jobs_of
 
 
 def test_every_stage_comes_after_what_it_reads() -> None:
@@ -26,31 +21,6 @@ def test_every_stage_comes_after_what_it_reads() -> None:
             # A section that a later stage writes would make the two wait for each other.
             assert name in written or not later, (stage.name, name)
         written |= dict.fromkeys(stage.writes, stage.name)
-
-
-def test_names_are_unique_and_safe() -> None:
-    names = [stage.name for stage in STAGES]
-    assert len(set(names)) == len(names)
-    assert all(name.replace("-", "").isalnum() for name in names)
-
-
-@pytest.mark.parametrize("stage", STAGES, ids=lambda stage: stage.name)
-def test_verb_has_the_options_that_the_runner_gives(stage: Stage) -> None:
-    assert is_available(stage.verb)
-    command: Any = typer.main.get_command(app)
-    for word in stage.verb:
-        command = command.commands[word]
-    options = {name for parameter in command.params for name in parameter.opts}
-    assert {"--rig", "--json"} <= options
-    assert not stage.figures or "--figures" in options
-    assert not stage.output or "-o" in options
-
-
-def test_what_there_is_no_verb_for() -> None:
-    assert is_available(("imu", "static"))
-    assert not is_available(("imu",))
-    assert not is_available(("imu", "nonsense"))
-    assert not is_available(("nonsense",))
 
 
 def test_a_folder_with_little_says_what_is_lacking(tmp_path: Path) -> None:
@@ -73,12 +43,3 @@ def test_plane_with_a_link_out_is_not_handed_to_the_verb(tmp_path: Path) -> None
     jobs = {job.name: job for job in jobs_of(read_folder(root))}
     assert jobs["extrinsics"].planned is None
     assert "link out of the folder" in jobs["extrinsics"].reason
-
-
-def test_what_others_wait_for_is_more_urgent_than_they_are() -> None:
-    first = urgency()
-    for stage in STAGES:
-        for other in STAGES:
-            if set(stage.writes) & {*other.needs, *other.uses}:
-                assert first[stage.name] >= first[other.name] + stage.seconds
-    assert min(first["identify"], first["control"]) > first["replay"] > first["firmware"]
