@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from calib.actuator.identify_pump import PumpFit
-from calib.actuator.identify_pump_models import LAG, MODELS, PWM_MAX, Parameter
-from calib.actuator.pump import TICK_S
+from calib.actuator.identify_pump_models import LAG, MODELS, Parameter
+from calib.actuator.pump import PWM_MAX, TICK_S
 from calib.identification import PumpFound
 from calib.rig import Rig, finite_or_none
 from calib.rig_actuator import PumpIdentified, PumpModel, PumpSection, StaticMapSection, section_of

@@ -29,6 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from calib.actuator.pump import PWM_MAX
 from calib.arrays import FloatArray
 from calib.errors import BadInputError
 
@@ -36,7 +37,6 @@ __all__ = ["LAG", "MODELS", "ORIFICE", "STEP_S", "Parameter", "PumpRecord", "Sha
 
 LAG, ORIFICE = "linear lag", "orifice flow"
 STEP_S = 2e-3
-PWM_MAX = 255.0
 _START_S = 0.2
 _FREE = 1e6
 _PRIOR = 0.15

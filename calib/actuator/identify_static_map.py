@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from calib.actuator.identify_pump_models import PWM_MAX, Shape
+from calib.actuator.identify_pump_models import Shape
+from calib.actuator.pump import PWM_MAX
 from calib.arrays import FloatArray
 from calib.errors import BadInputError
 

@@ -19,10 +19,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from calib.actuator.dynamics import input_forces, linearised, mass_matrix
-from calib.arrays import FloatArray
+from calib.arrays import ComplexArray, FloatArray
 from calib.control.inverse_model import Model, force_of_pwm, holding_force, pwm_of_force
 from calib.control.pid import Pid
 from calib.errors import BadInputError
@@ -42,8 +41,6 @@ __all__ = [
     "side_by_side",
     "spectral_radius",
 ]
-
-ComplexArray = npt.NDArray[np.complex128]
 
 
 @dataclass(frozen=True)

@@ -21,14 +21,11 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
-from calib.arrays import FloatArray
+from calib.arrays import ComplexArray, FloatArray
 from calib.control.linear import System, closed_loop, response, spectral_radius
 
 __all__ = ["Margins", "break_at", "frequencies", "gain_to_instability", "loop_margins", "margins_of_response"]
-
-ComplexArray = npt.NDArray[np.complex128]
 
 
 @dataclass(frozen=True)

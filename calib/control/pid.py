@@ -27,12 +27,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from calib.actuator.pump import PWM_MAX
 from calib.errors import BadInputError
 
-__all__ = ["PWM_MAX", "PWM_MIN", "TICK_S", "Pid", "PidState", "saturate", "step"]
+__all__ = ["PWM_MIN", "TICK_S", "Pid", "PidState", "saturate", "step"]
 
-PWM_MIN, PWM_MAX = 0.0, 255.0
-"""Limits of what the microcontroller can put out, 0 V to 12 V."""
+PWM_MIN = 0.0
+"""Limits of what the microcontroller can put out, 0 V to 12 V, with `PWM_MAX`."""
 
 TICK_S = 1.0 / 60.0
 """Period of the controller (4.1)."""

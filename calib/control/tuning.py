@@ -22,9 +22,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from calib.arrays import FloatArray
+from calib.arrays import ComplexArray, FloatArray
 from calib.control.inverse_model import Model
 from calib.control.linear import (
     System,
@@ -56,8 +55,6 @@ __all__ = [
     "tune_orientation",
     "tune_position",
 ]
-
-ComplexArray = npt.NDArray[np.complex128]
 
 _INTEGRAL_S = np.geomspace(0.15, 4.0, 10)
 _DERIVATIVE_S = np.array([0.0, 0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.2])

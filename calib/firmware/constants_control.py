@@ -16,9 +16,9 @@ from __future__ import annotations
 import numpy as np
 
 from calib.actuator.parameters import LONGEST_ELONGATION_M, Plant
-from calib.actuator.pump import ElongationForce
+from calib.actuator.pump import PWM_MAX, ElongationForce
 from calib.control.feedforward import FeedForward
-from calib.control.pid import PWM_MAX, PWM_MIN, Pid
+from calib.control.pid import PWM_MIN, Pid
 from calib.errors import BadInputError
 from calib.firmware.known import Known
 from calib.firmware.literals import Constant, Group, Table, Whole

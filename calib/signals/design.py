@@ -23,9 +23,8 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
-from calib.arrays import FloatArray
+from calib.arrays import ComplexArray, FloatArray
 from calib.errors import BadInputError
 
 __all__ = [
@@ -43,8 +42,6 @@ LARGEST_ORDER = 8
 
 _FINEST, _COARSEST = 30, 22
 """Grids 2^-k that a1 and a2 are rounded to; on the coarsest g is a binary32 for every stable section."""
-
-ComplexArray = npt.NDArray[np.complex128]
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,10 @@ from functools import lru_cache
 
 import numpy as np
 
+from calib.actuator.pump import PWM_MAX
 from calib.arrays import FloatArray
 from calib.control.loop import LoopState, OrientationControl, step_orientation
-from calib.control.pid import PWM_MAX, PWM_MIN, Pid
+from calib.control.pid import PWM_MIN, Pid
 from calib.control.setpoints import AngleSteps
 from calib.twin.measures import StepResponse, step_response
 from calib.twin.scenarios import make_scenario, run_scenario
