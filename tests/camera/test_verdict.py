@@ -1,4 +1,4 @@
-"""Good sets are blessed, bad ones are not, and the sentences say why."""
+"""What is said of a calibration: good sets are blessed, bad ones are not, and what is wrong is named."""
 
 from __future__ import annotations
 
@@ -11,16 +11,27 @@ import numpy as np
 import pytest
 from sets import BAD, Recipe, camera_of, good_set, take
 
+from calib.camera import intrinsics
 from calib.camera.board import Board
+from calib.camera.board_shape import target_shape
 from calib.camera.bundle import Calibration, calibrate
 from calib.camera.corners import detect
 from calib.camera.covariance import covariance
+from calib.camera.coverage import coverage, lens_shape, repeated_views
+from calib.camera.evidence import evidence, gain, overdispersion
+from calib.camera.intrinsics import Choices, calibrate_camera
+from calib.camera.levenberg import minimise
+from calib.camera.misfit import Misfit, misfit, screen
 from calib.camera.model import MODELS, Camera
+from calib.camera.next_view import Candidate, best_next_view
 from calib.camera.pose import fit_pose
+from calib.camera.two_cameras import best_change, best_split, straightened, widened
 from calib.camera.verdict import Judgement, judge
 from calib.camera.views import View, pack
+from calib.errors import BadInputError
 from calib.twin.pictures import BOARD, CAMERA
 from calib.twin.scene import Pose, PrintedBoard, render
+from synthetic import views_of
 
 
 def _judged(views: list[View], size_px: tuple[int, int], model: str) -> tuple[Calibration, Judgement]:
@@ -57,25 +68,12 @@ def test_two_cameras_are_told_apart_view_by_view() -> None:
     assert len(group) == 13
 
 
-def test_a_refocused_lens_is_dated() -> None:
-    views, camera = BAD["refocused by 3 % late"][0](np.random.default_rng(3))
-    _, found = _judged(views, camera.image_size_px, "radial2")
-    assert found.reasons[0].startswith("From w00 on the camera differs")
-
-
 def test_the_shape_of_the_board_is_measured() -> None:
     rng = np.random.default_rng(4)
     _, found = _judged(take(rng, camera_of(), 17, recipe=Recipe(aspect=1.05)), (640, 480), "radial2")
     assert "1.05" in found.reasons[0]
     _, found = _judged(take(rng, camera_of(), 17, recipe=Recipe(bow_m=0.003)), (640, 480), "radial2")
     assert "bent by about 3." in found.reasons[0] or "bent by about 2.9" in found.reasons[0]
-
-
-def test_pixels_that_are_not_square_are_no_fault() -> None:
-    camera = replace(camera_of(), fy_px=camera_of().fx_px * 1.08)
-    _, found = _judged(take(np.random.default_rng(2), camera, 17), (640, 480), "radial2")
-    assert found.verdict == "ok"
-    assert any("the pixels, not the squares" in sentence for sentence in found.remarks)
 
 
 def test_a_lens_model_that_is_too_poor_is_said_and_not_taken_for_a_bent_board() -> None:
@@ -100,91 +98,12 @@ def test_a_few_copies_count_once_and_are_named() -> None:
     assert fit.converged
 
 
-def test_mirrored_views_are_named_but_harmless_when_all_are() -> None:
-    rng = np.random.default_rng(6)
-    views = take(rng, camera_of(), 12)
-    upward = [replace(v, target_m=v.target_m * [1.0, -1.0]) for v in views]
-    assert _judged(upward, (640, 480), "radial2")[1].verdict == "ok"
-    mixed = [upward[i] if i in (2, 5) else v for i, v in enumerate(views)]
-    _, found = _judged(mixed, (640, 480), "radial2")
-    assert found.verdict == "inconsistent"
-    assert found.reasons[0].startswith("v02, v05 show the board mirrored")
-
-
 @pytest.mark.parametrize("loss", ["huber", "cauchy"])
 def test_a_robust_loss_saves_a_set_with_outliers(loss: str) -> None:
     views, camera = BAD["outliers"][0](np.random.default_rng(7))
     fit = calibrate(pack(views), camera.image_size_px, "radial2", loss=loss)
     found = judge(fit, covariance(fit))
     assert found.verdict == "ok", found.reasons
-
-
-def test_a_board_that_is_allowed_to_bend_is_no_longer_a_fault() -> None:
-    camera = camera_of()
-    target = Board(9, 6, 0.025).points_m()
-    views = take(np.random.default_rng(8), camera, 17, target, Recipe(bow_m=0.004))
-    x, y = (target / np.ptp(target[:, 0]) * 2 - 1).T
-    basis = np.zeros((2, 3, len(target)))
-    basis[0, 2], basis[1, 2] = 1 - x**2, 1 - y**2
-    fit = calibrate(pack(views), camera.image_size_px, "radial2", basis=basis)
-    assert judge(fit, covariance(fit)).verdict == "ok"
-    assert judge(calibrate(pack(views), camera.image_size_px, "radial2")).verdict == "inconsistent"
-
-
-def test_every_view_may_show_other_points() -> None:
-    rng = np.random.default_rng(9)
-    camera = camera_of()
-
-    def ragged(bow_m: float) -> list[View]:
-        shots = [
-            take(
-                rng, camera, 1, rng.uniform(0, 1, (int(rng.integers(60, 256)), 2)) * 0.2, Recipe(bow_m=bow_m)
-            )
-            for _ in range(15)
-        ]
-        return [replace(shot[0], name=f"v{i:02d}") for i, shot in enumerate(shots)]
-
-    assert _judged(ragged(0.0), (640, 480), "radial2")[1].verdict == "ok"
-    assert _judged(ragged(0.006), (640, 480), "radial2")[1].verdict == "inconsistent"
-
-
-def test_fixed_intrinsics_and_skew_are_judged() -> None:
-    views = take(np.random.default_rng(10), camera_of(off_centre_px=(0.0, 0.0)), 14)
-    observations = pack(views)
-    assert judge(calibrate(observations, (640, 480), "radial2", skew=True)).verdict == "ok"
-    assert judge(calibrate(observations, (640, 480), "radial2", fixed=("fx_px", "fy_px"))).verdict != "ok"
-    centred = calibrate(observations, (640, 480), "radial2")
-    held = calibrate(
-        observations, (640, 480), "radial2", fixed=("cx_px", "cy_px"), start=replace(centred.block)
-    )
-    assert judge(held).verdict == "ok"
-
-
-def test_many_views_are_judged_by_a_sample() -> None:
-    rng = np.random.default_rng(11)
-    camera = camera_of()
-    views = take(rng, camera, 130)
-    assert _judged(views, (640, 480), "radial2")[1].verdict == "ok"
-    zoomed = replace(camera, fx_px=1.03 * camera.fx_px, fy_px=1.03 * camera.fy_px)
-    mixed = [*views[:70], *take(rng, zoomed, 70, prefix="w")]
-    _, found = _judged(mixed, (640, 480), "radial2")
-    assert found.verdict == "inconsistent"
-
-
-def test_the_same_views_get_the_same_words() -> None:
-    views, camera = good_set(3, "brown5")
-    first = _judged(views, camera.image_size_px, "brown5")[1]
-    assert _judged(views, camera.image_size_px, "brown5")[1] == first
-
-
-def test_no_camera_at_all_is_said() -> None:
-    views = take(np.random.default_rng(12), camera_of(), 12)
-    fit = calibrate(pack(views), (640, 480), "radial2")
-    nothing = replace(fit, normal=np.full_like(fit.normal, np.nan), termination="behind the camera")
-    found = judge(nothing)
-    assert found.verdict == "unidentifiable"
-    assert found.advice is not None
-    assert "in front" in found.reasons[0]
 
 
 @pytest.mark.slow
@@ -313,3 +232,390 @@ def test_pictures_of_each_failure(name: str, right: tuple[str, ...]) -> None:
         _, found = _judged(views, CAMERA.image_size_px, model)
         assert found.verdict in right, (found.verdict, found.reasons)
         assert (found.verdict == "ok") == (name == "good")
+
+
+def test_good_views_are_ok() -> None:
+    result = calibrate_camera(views_of(17, 2, 0.15), (640, 480))
+    assert result.judgement.verdict == "ok", result.judgement.reasons
+    assert result.calibration.camera.model == "radial2"
+    assert [c.name for c in result.models] == ["pinhole", "radial2", "radial3", "brown5", "rational8"]
+    assert set(result.seconds) == {"solve", "covariance", "judge"}
+    off = abs(result.calibration.camera.fx_px - 530.0)
+    assert off < 4 * result.covariance.sigma()["fx_px"]
+
+
+def test_outliers_are_rejected_and_named() -> None:
+    views = views_of(15, 3, 0.1)
+    views[4].pixels[10] += [6.0, -5.0]
+    views[7].pixels[:30] += np.random.default_rng(0).uniform(-40, 40, (30, 2))
+    result = calibrate_camera(views, (640, 480), Choices(model="radial2", reject=True))
+    assert any("view05: point 10" in sentence for sentence in result.rejected)
+    assert any("view08: left out whole" in sentence for sentence in result.rejected)
+    assert len(result.rejected) <= 4
+    assert "view08" not in result.calibration.observations.names
+    assert result.calibration.sigma_px == pytest.approx(0.1, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("count", "choices", "says"),
+    [
+        (0, Choices(), "no views"),
+        (2, Choices(model="radial2", skew=True), "needs at least 3 views, found 2"),
+        (1, Choices(model="radial2", board="released"), "more unknowns"),
+    ],
+)
+def test_what_cannot_be_answered_is_refused(count: int, choices: Choices, says: str) -> None:
+    with pytest.raises(BadInputError, match=says):
+        calibrate_camera(views_of(count, 2, 0.1), (640, 480), choices)
+
+
+def test_degenerate_views_are_refused() -> None:
+    good = views_of(3, 2, 0.1)
+    line = View("line", good[0].target_m[:9], good[0].pixels[:9])
+    with pytest.raises(BadInputError, match=r"line: all its points lie on one line"):
+        calibrate_camera([*good, line], (640, 480))
+    few = View("few", good[0].target_m[:3], good[0].pixels[:3])
+    with pytest.raises(BadInputError, match="few: has 3 points"):
+        calibrate_camera([*good, few], (640, 480))
+    corners = [View(v.name, v.target_m[[0, 8, 45, 53]], v.pixels[[0, 8, 45, 53]]) for v in good[:2]]
+    with pytest.raises(BadInputError, match="cannot fix"):
+        calibrate_camera(corners, (640, 480), Choices(model="brown5"))
+
+
+def test_a_start_that_ends_lower_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    views = views_of(12, 4, 0.1, tilt_rad=0.05)
+    best = calibrate_camera(views, (640, 480), Choices(model="radial2"))
+    calls = []
+
+    def worse(*arguments, **named):
+        # The first fit stops where a long lens would leave it.
+        fit = calibrate(*arguments, **named)
+        if calls:
+            return fit
+        calls.append(fit)
+        block = fit.block
+        long = replace(
+            block,
+            intrinsics=block.intrinsics * np.array([4.0, 4.0, *np.ones(len(block.intrinsics) - 2)]),
+            t_CT_m=block.t_CT_m * np.array([1.0, 1.0, 4.0]),
+        )
+        return calibrate(*arguments, **{**named, "start": long, "max_iterations": 1})
+
+    monkeypatch.setattr(intrinsics, "calibrate", worse)
+    found = calibrate_camera(views, (640, 480), Choices(model="radial2"))
+    assert calls
+    assert found.calibration.rms_px == pytest.approx(best.calibration.rms_px, rel=1e-6)
+    assert found.calibration.camera.fx_px == pytest.approx(best.calibration.camera.fx_px, rel=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_view_in_disorder_is_named(seed: int) -> None:
+    views = views_of(12, 1, 0.1)
+    order = np.random.default_rng(seed).permutation(len(views[4].pixels))
+    views[4] = replace(views[4], pixels=views[4].pixels[order])
+    found = calibrate_camera(views, (640, 480)).judgement
+    assert found.verdict == "inconsistent"
+    assert "view05 shows points that no camera sees on a flat board" in found.reasons[0]
+    assert found.advice[0] == "Leave out view05."
+
+
+USUAL = Recipe()
+
+
+def _fit(recipe: Recipe = USUAL, count: int = 12, seed: int = 0) -> Calibration:
+    return calibrate(
+        pack(take(np.random.default_rng(seed), camera_of(), count, recipe=recipe)), (640, 480), "radial2"
+    )
+
+
+def test_tilts_are_those_that_were_made() -> None:
+    found = coverage(_fit(Recipe(tilt_deg=(19.0, 21.0))))
+    np.testing.assert_allclose(found.tilts_deg, 20.0, atol=1.5)
+    assert 30 < found.spread_deg < 43
+    assert found.weaker_spread_deg > 5
+    parallel = coverage(_fit(Recipe(tilt_deg=(20.0, 20.5), azimuth_deg=30.0, roll_deg=0.5)))
+    assert parallel.spread_deg < 3
+    one_axis = coverage(_fit(Recipe(tilt_deg=(0.0, 40.0), azimuth_deg=0.0, roll_deg=0.0)))
+    assert one_axis.spread_deg > 20
+    assert one_axis.weaker_spread_deg < 3
+
+
+def test_shares_of_the_image() -> None:
+    full = coverage(_fit(count=40))
+    assert full.area_share > 0.7
+    assert full.cells_share > 0.8
+    assert not full.empty.any()
+    assert 0.7 < full.radius_share <= 1.0
+    small = coverage(_fit(Recipe(fill=(0.15, 0.2), spread=0.05)))
+    assert small.area_share < 0.1
+    assert small.empty.sum() >= 6
+    assert not small.empty[1, 1]
+
+
+def test_copies_are_found_through_noise() -> None:
+    rng = np.random.default_rng(2)
+    views = take(rng, camera_of(), 8)
+    again = [
+        replace(views[i], pixels=views[i].pixels + 0.05 * rng.standard_normal((35, 2))) for i in (1, 1, 6)
+    ]
+    fit = calibrate(pack([*views, *again]), (640, 480), "radial2")
+    np.testing.assert_array_equal(repeated_views(fit, 0.5), [0, 1, 2, 3, 4, 5, 6, 7, 1, 1, 6])
+    np.testing.assert_array_equal(repeated_views(fit, 1e-6), np.arange(11))
+
+
+def test_mirrored_views_are_seen_from_behind() -> None:
+    views = take(np.random.default_rng(3), camera_of(), 8)
+    turned = [replace(v, target_m=v.target_m * [-1.0, 1.0]) if i == 2 else v for i, v in enumerate(views)]
+    found = coverage(calibrate(pack(turned), (640, 480), "radial2"))
+    np.testing.assert_array_equal(np.flatnonzero(found.mirrored), [2])
+    assert found.spread_deg < 90
+
+
+def test_a_lens_that_folds() -> None:
+    fit = _fit()
+    fine = lens_shape(fit)
+    assert fine.image_shown == 1.0
+    assert 0.5 < fine.image_slope <= fine.seen_slope < 1.0
+    folding = replace(fit, camera=replace(fit.camera, distortion=np.array([-0.9, 0, 0, 0, 0, 0, 0, 0.0])))
+    found = lens_shape(folding)
+    assert found.image_shown < 1.0
+    assert found.image_slope <= 0.0
+
+
+def _views(count: int = 12, seed: int = 0) -> list[View]:
+    return take(np.random.default_rng(seed), camera_of(), count)
+
+
+def _misfit(views: list[View]) -> Misfit:
+    return misfit(calibrate(pack(views), (640, 480), "radial2"), 5.0, 8.0, 0.5)
+
+
+def test_what_is_no_view_of_a_plane_is_named() -> None:
+    views = _views(8)
+    rng = np.random.default_rng(1)
+    grid = views[3].pixels.reshape(5, 7, 2)
+    views[1] = replace(views[1], pixels=rng.permutation(views[1].pixels))
+    views[3] = replace(views[3], pixels=grid[[1, 0, 2, 4, 3]].reshape(-1, 2))
+    views[4] = View("line", views[4].target_m[:7], views[4].pixels[:7])
+    views[5] = View("few", views[5].target_m[:3], views[5].pixels[:3])
+    views[6] = replace(views[6], pixels=views[6].pixels[:, :1] * [1.0, 0.3] + 5.0)
+    found = screen(pack(views))
+    np.testing.assert_array_equal(np.flatnonzero(found.not_a_plane), [1, 3])
+    np.testing.assert_array_equal(np.flatnonzero(found.on_a_line), [4, 6])
+    np.testing.assert_array_equal(np.flatnonzero(found.few), [5])
+    np.testing.assert_array_equal(np.flatnonzero(found.unusable), [1, 3, 4, 5, 6])
+
+
+def test_noise_alone_is_no_misfit() -> None:
+    found = _misfit(_views())
+    assert not found.bad_views.any()
+    assert not found.bad_points.any()
+    assert found.rms_px == pytest.approx(found.typical_px, rel=0.1)
+    assert found.heavy_share == pytest.approx(0.055, abs=0.03)
+    assert found.repeated == pytest.approx(1.0, abs=0.35)
+
+
+def test_a_bad_view_and_bad_points_are_found() -> None:
+    views = _views()
+    rng = np.random.default_rng(2)
+    views[2] = replace(views[2], pixels=views[2].pixels + rng.normal(0, 2.0, (35, 2)))
+    views[7].pixels[4] += [3.0, -2.0]
+    found = _misfit(views)
+    np.testing.assert_array_equal(np.flatnonzero(found.bad_views), [2])
+    np.testing.assert_array_equal(np.argwhere(found.bad_points), [[7, 4]])
+    assert found.heavy_share > 0.1
+
+
+def test_errors_printed_on_the_board_repeat() -> None:
+    rng = np.random.default_rng(3)
+    views = _views(20)
+    printed = views[0].target_m + rng.normal(0, 1e-4, (35, 2))
+    wrong = [replace(v, target_m=printed) for v in views]
+    assert _misfit(wrong).repeated > 2.0
+    # Points that differ from view to view have nothing that could repeat.
+    ragged = [View(v.name, v.target_m[i % 3 :], v.pixels[i % 3 :]) for i, v in enumerate(views)]
+    assert _misfit(ragged).repeated == 1.0
+
+
+NOTHING = np.zeros(0, dtype=np.int64)
+
+
+def _fit_evidence(
+    count: int = 12, seed: int = 0, model: str = "radial2", noise_px: float = 0.1
+) -> Calibration:
+    views = take(np.random.default_rng(seed), camera_of(), count, recipe=Recipe(noise_px=noise_px))
+    return calibrate(pack(views), (640, 480), model)
+
+
+@pytest.mark.parametrize("model", ["pinhole", "radial2", "brown5"])
+def test_cost_of_a_view_under_another_camera(model: str) -> None:
+    # Curvature without second derivatives is the cost's where residuals and shifts are small.
+    fit = _fit_evidence(model=model, noise_px=0.001)
+    found = evidence(fit)
+    rng = np.random.default_rng(1)
+    shift = rng.standard_normal(len(fit.free)) * 0.02 / np.sqrt(np.diagonal(found.S.sum(axis=0)))
+    moved = fit.block.intrinsics.copy()
+    moved[fit.free] += shift
+    there = minimise(replace(fit.block, intrinsics=moved), fit.observations, NOTHING)
+    assert there.at is not None
+    costs = (there.at.residuals**2).sum(axis=(1, 2))
+    expected = found.cost + 2 * found.b @ shift + np.einsum("g,ngh,h->n", shift, found.S, shift)
+    rise = costs - found.cost
+    np.testing.assert_allclose(expected - found.cost, rise, atol=2e-3 * np.abs(rise).max())
+
+
+def test_gain_of_a_group_is_what_fitting_it_alone_gains() -> None:
+    fit = _fit_evidence(16)
+    found = evidence(fit)
+    group = np.arange(8)
+    alone = calibrate(fit.observations.select(group), (640, 480), "radial2")
+    fall = found.cost[group].sum() - alone.squared_sum
+    assert float(gain(found.S[group].sum(axis=0), found.b[group].sum(axis=0))) == pytest.approx(
+        fall, rel=0.02
+    )
+
+
+def test_deformation_has_the_slope_of_the_cost() -> None:
+    fit = _fit_evidence(8)
+    points = fit.observations.target_m.shape[1]
+    basis = np.random.default_rng(2).standard_normal((1, 2, 3, points))
+    found = evidence(fit, basis, ("one", "two"))
+    assert found.names[-2:] == ("one", "two")
+    step = 1e-7
+    for k in range(2):
+        costs = []
+        for sign in (1.0, -1.0):
+            seen = fit.observations.displaced(sign * step * basis[0, k].T)
+            there = minimise(fit.block, seen, NOTHING)
+            assert there.at is not None
+            costs.append((there.at.residuals**2).sum(axis=(1, 2)))
+        slope = (costs[0] - costs[1]) / (2 * step)
+        np.testing.assert_allclose(2 * found.b[:, found.intrinsics + k], slope, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(found.camera_only().S, evidence(fit).S, rtol=1e-9, atol=1e-6)
+
+
+def test_overdispersion_sees_errors_shared_by_a_view() -> None:
+    rng = np.random.default_rng(3)
+    views = take(rng, camera_of(), 40)
+    # A smooth error of each view, as motion blur or a rolling shutter leave it.
+    bent = [
+        replace(
+            v, pixels=v.pixels + 0.3 * ((v.pixels - v.pixels.mean(axis=0)) / 50) ** 2 * rng.normal(0, 1, 2)
+        )
+        for v in views
+    ]
+    fit = calibrate(pack(bent), (640, 480), "radial2")
+    assert overdispersion(evidence(fit)) > 1.5
+
+
+def _fit_two_cameras(views: list[View], model: str = "radial2") -> Calibration:
+    return calibrate(pack(views), (640, 480), model)
+
+
+def _prepared(fit: Calibration) -> Calibration:
+    wide = widened(fit)
+    shape = target_shape(wide)
+    return wide if shape is None else straightened(wide, shape.displacement_m)
+
+
+@pytest.mark.parametrize("shuffled", [False, True])
+def test_two_cameras_are_separated(shuffled: bool) -> None:
+    rng = np.random.default_rng(0)
+    camera = camera_of()
+    other = replace(camera, fx_px=camera.fx_px * 1.03, fy_px=camera.fy_px * 1.03)
+    views = take(rng, camera, 10) + take(rng, other, 8, prefix="w")
+    order = rng.permutation(18) if shuffled else np.arange(18)
+    truth = order >= 10
+    wide = _prepared(_fit_two_cameras([views[i] for i in order]))
+    split = best_split(wide)
+    assert split is not None
+    assert split.ratio > 2
+    assert (split.second == truth).mean() >= 17 / 18
+    assert split.difference["fx_px"] == pytest.approx(0.03 * camera.fx_px, abs=4 * split.sigma["fx_px"])
+    assert split.split_rms_px < split.rms_px
+    change = best_change(wide)
+    assert change is not None
+    if shuffled:
+        assert change.ratio < split.ratio
+    else:
+        assert change.ratio > 2
+        np.testing.assert_array_equal(change.second, truth)
+
+
+def test_one_camera_stays_below_what_chance_reaches() -> None:
+    splits, changes = [], []
+    for seed in range(12):
+        views, camera = good_set(seed + 40, ("radial2", "brown5")[seed % 2])
+        fit = calibrate(pack(views), camera.image_size_px, camera.model)
+        wide = _prepared(fit)
+        split, change = best_split(wide), best_change(wide)
+        assert split is not None
+        assert change is not None
+        splits.append(split.ratio)
+        changes.append(change.ratio)
+    assert max(splits) < 1.4
+    assert max(changes) < 1.3
+    assert np.median(splits) < 1.0
+
+
+def test_a_bent_board_is_not_a_second_camera() -> None:
+    views = take(np.random.default_rng(1), camera_of(), 25, recipe=Recipe(bow_m=0.001))
+    fit = _fit_two_cameras(views)
+    straightened = best_split(_prepared(fit))
+    assert straightened is not None
+    assert straightened.ratio < 1.4
+
+
+def test_a_lens_that_the_model_cannot_follow_is_not_a_second_camera() -> None:
+    camera = camera_of(lens=(-0.29, 0.107, 0.0015, -0.0003))
+    fit = _fit_two_cameras(take(np.random.default_rng(2), camera, 20))
+    wide = _prepared(fit)
+    assert wide.camera.model == "brown5"
+    split = best_split(wide)
+    assert split is not None
+    assert split.ratio < 1.4
+
+
+def _fit_next_view(recipe: Recipe, count: int = 10, seed: int = 0) -> Calibration:
+    return calibrate(
+        pack(take(np.random.default_rng(seed), camera_of(), count, recipe=recipe)), (640, 480), "radial2"
+    )
+
+
+def _advice(fit: Calibration) -> Candidate:
+    found = best_next_view(fit, evidence(fit).S.sum(axis=0))
+    assert found is not None
+    assert 0.0 < found.remaining < 1.0
+    return found
+
+
+def test_parallel_views_want_a_tilted_one() -> None:
+    found = _advice(_fit_next_view(Recipe(tilt_deg=(0.0, 4.0))))
+    assert found.tilt_deg >= 30.0
+    assert found.away in ("left", "right", "top", "bottom")
+
+
+def test_views_on_the_left_want_one_on_the_right() -> None:
+    rng = np.random.default_rng(1)
+    views = [
+        v for v in take(rng, camera_of(), 60, recipe=Recipe(fill=(0.3, 0.45))) if v.pixels[:, 0].max() < 380
+    ]
+    fit = calibrate(pack(views), (640, 480), "radial2")
+    assert len(views) > 5
+    assert "right" in _advice(fit).where
+
+
+def test_advice_beats_more_of_the_same() -> None:
+    rng = np.random.default_rng(2)
+    camera = camera_of()
+    views = take(rng, camera, 8, recipe=Recipe(tilt_deg=(0.0, 6.0)))
+
+    def sigma(more: Recipe) -> float:
+        found = calibrate(
+            pack([*views, *take(np.random.default_rng(3), camera, 1, recipe=more)]), (640, 480), "radial2"
+        )
+        return covariance(found, 0.01).sigma()["fx_px"]
+
+    advised = _advice(calibrate(pack(views), (640, 480), "radial2"))
+    tilted = Recipe(tilt_deg=(advised.tilt_deg, advised.tilt_deg), fill=(0.55, 0.6))
+    assert sigma(tilted) < 0.5 * sigma(Recipe(tilt_deg=(0.0, 6.0)))

@@ -1,0 +1,494 @@
+"""From views to a camera: truth recovered, agreement with OpenCV, gradients, covariance, choice of models."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sets import Recipe, camera_of, take
+
+from calib.camera.board_shape import DEFORMATIONS, TargetShape, target_shape
+from calib.camera.bundle import Calibration, calibrate
+from calib.camera.covariance import covariance, joint_jacobian, projection_sigma_px, residual_inflation
+from calib.camera.levenberg import linearise, rotation_exp
+from calib.camera.model import COEFFICIENTS, MODELS, Camera, undistort
+from calib.camera.projection import INTRINSICS, Block, free_intrinsics, jacobian, vector_from_camera
+from calib.camera.selection import board_basis, candidates_by_board, candidates_by_model, simplest_good
+from calib.camera.starts import best_of_starts, conditioned, focal_interval
+from calib.camera.views import Observations, View, pack
+from calib.camera.zhang import closed_form_intrinsics, homographies, initial_guess
+from synthetic import BOARD, CAMERA, views_of
+
+LENS = {"k1": -0.25, "k2": 0.1, "k3": 0.02, "p1": 1e-3, "p2": -5e-4, "k4": 0.05, "k5": 0.02, "k6": -0.01}
+
+
+def _camera(model: str, skew: float) -> Camera:
+    lens = np.array([LENS[name] if name in MODELS[model] else 0.0 for name in COEFFICIENTS])
+    return Camera(model, (640, 480), 530.0, 532.0, skew, 325.0, 236.0, lens)
+
+
+@pytest.mark.parametrize("model", ["pinhole", "radial2", "radial3", "brown5"])
+@pytest.mark.parametrize("skew", [0.0, 2.5])
+def test_exact_views_give_back_the_camera(model: str, skew: float) -> None:
+    camera = _camera(model, skew)
+    fit = calibrate(pack(views_of(12, seed=3, camera=camera)), (640, 480), model, skew=skew != 0.0)
+    assert fit.converged
+    assert fit.rms_px < 1e-7
+    assert fit.camera.fx_px == pytest.approx(530.0, abs=1e-4)
+    assert fit.camera.skew_px == pytest.approx(skew, abs=1e-4)
+    assert fit.camera.cy_px == pytest.approx(236.0, abs=1e-3)
+    np.testing.assert_allclose(fit.camera.distortion, camera.distortion, atol=1e-5)
+
+
+@pytest.mark.parametrize("skew", [0.0, 2.5])
+def test_rational_lens_is_recovered_within_its_sigma(skew: float) -> None:
+    # Its numerator and denominator all but cancel: exact views leave a valley too flat for rounding.
+    camera = _camera("rational8", skew)
+    views = views_of(12, seed=3, camera=camera, noise_px=0.05)
+    fit = calibrate(pack(views), (640, 480), "rational8", skew=skew != 0.0)
+    assert fit.converged
+    sigma = covariance(fit).sigma()
+    for name, value in (("fx_px", 530.0), ("cx_px", 325.0), ("cy_px", 236.0)):
+        assert abs(getattr(fit.camera, name) - value) < 4 * sigma[name]
+    if skew:
+        assert abs(fit.camera.skew_px - skew) < 4 * sigma["skew_px"]
+
+
+@pytest.mark.parametrize(
+    ("model", "flags"),
+    [
+        ("radial2", cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3),
+        ("radial3", cv2.CALIB_ZERO_TANGENT_DIST),
+        ("brown5", 0),
+    ],
+)
+def test_agrees_with_opencv(model: str, flags: int) -> None:
+    views = [replace(v, pixels=v.pixels.astype(np.float32).astype(float)) for v in views_of(15, 5, 0.3)]
+    fit = calibrate(pack(views), (640, 480), model)
+    board = np.concatenate([BOARD.points_m(), np.zeros((54, 1))], axis=1).astype(np.float32)
+    exact = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 500, 1e-15)
+    rms, K, lens, *_ = cv2.calibrateCamera(
+        [board] * 15,
+        [v.pixels.astype(np.float32)[:, None] for v in views],
+        (640, 480),
+        None,
+        None,
+        flags=flags,
+        criteria=exact,
+    )
+    # OpenCV holds the board in single precision, a part in 10^7.
+    assert fit.rms_px == pytest.approx(rms, rel=1e-6)
+    assert fit.rms_px <= rms * (1 + 1e-7)
+    np.testing.assert_allclose(fit.camera.K, K, rtol=1e-5, atol=1e-3)
+    np.testing.assert_allclose(fit.camera.distortion[:5], np.ravel(lens)[:5], rtol=1e-3, atol=1e-5)
+
+
+def test_the_end_is_a_minimum() -> None:
+    fit = calibrate(pack(views_of(10, 7, 0.3)), (640, 480), "brown5", skew=True)
+    assert fit.converged
+    at = linearise(fit.block, fit.observations, fit.free, None)
+    assert at is not None
+    G = len(fit.free)
+    gradient = np.concatenate([at.gradient[:, :G].sum(axis=0), at.gradient[:, G:].ravel()])
+    diagonal = np.concatenate(
+        [at.normal[:, range(G), range(G)].sum(axis=0), at.normal[:, range(G, G + 6), range(G, G + 6)].ravel()]
+    )
+    # Cosine of the angle between the residuals and each column of the Jacobian.
+    assert np.abs(gradient / np.sqrt(diagonal * at.cost)).max() < 1e-7
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        shift = 1e-4 * rng.standard_normal(G) / np.sqrt(diagonal[:G])
+        intrinsics = fit.block.intrinsics.copy()
+        intrinsics[fit.free] += shift
+        near = linearise(
+            Block(intrinsics, fit.block.R_CT, fit.block.t_CT_m, fit.block.deformation),
+            fit.observations,
+            fit.free,
+            None,
+        )
+        assert near is not None
+        assert near.cost >= at.cost
+
+
+def test_one_view_with_a_fixed_centre() -> None:
+    camera = Camera("pinhole", (640, 480), 530.0, 530.0, 0.0, 319.5, 239.5)
+    fit = calibrate(pack(views_of(1, 4, camera=camera)), (640, 480), "pinhole", fixed=("cx_px", "cy_px"))
+    assert fit.camera.fx_px == pytest.approx(530.0, abs=1e-3)
+    assert fit.camera.fy_px == pytest.approx(530.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("loss", ["huber", "cauchy"])
+def test_robust_loss_bears_outliers(loss: str) -> None:
+    views = views_of(12, 9, 0.1)
+    rng = np.random.default_rng(1)
+    for view in views:
+        view.pixels[rng.integers(0, 54, 2)] += rng.uniform(5, 15, (2, 2))
+    plain = calibrate(pack(views), (640, 480), "radial2")
+    robust = calibrate(pack(views), (640, 480), "radial2", loss=loss)
+    assert robust.converged
+    off = abs(robust.camera.fx_px - 530.0)
+    assert off < 0.5
+    assert off < 0.5 * abs(plain.camera.fx_px - 530.0)
+    assert robust.sigma_px == pytest.approx(0.1, rel=0.35)
+
+
+def test_bowed_board_is_found_by_the_warp() -> None:
+    from calib.camera.selection import board_basis
+
+    views = views_of(15, 11)
+    observations = pack(views)
+    basis = board_basis(observations.target_m[0], "warp")
+    assert basis is not None
+    truth = np.array([2e-3, -1e-3])
+    bowed = observations.displaced(np.tensordot(truth, basis, axes=1).T)
+    fit = calibrate(observations, (640, 480), "radial2")
+    start = Block(fit.block.intrinsics, fit.block.R_CT, fit.block.t_CT_m, truth)
+    from calib.camera.projection import jacobian
+
+    J = jacobian(start, observations, fit.free, basis)
+    assert J is not None
+    pixels = observations.pixels + J[:, -1].reshape(-1, 2, 54).transpose(0, 2, 1)
+    found = calibrate(replace(observations, pixels=pixels), (640, 480), "radial2", basis=basis)
+    assert found.converged
+    np.testing.assert_allclose(found.block.deformation, truth, atol=1e-8)
+    assert bowed.target_m[0, :, 2].max() > 0
+
+
+def test_identical_views_are_named_singular_or_stalled_not_solved() -> None:
+    view = views_of(1, 3, 0.1)[0]
+    fit = calibrate(pack([View(str(i), view.target_m, view.pixels) for i in range(5)]), (640, 480), "brown5")
+    sigma = covariance(fit).sigma()["fx_px"]
+    assert not fit.converged or sigma > 5.0
+
+
+@pytest.mark.parametrize(("unknowns", "views"), [("skew", 3), ("no skew", 2), ("centre", 1)])
+def test_the_fewest_views_suffice(unknowns: str, views: int) -> None:
+    skew = 3.0 if unknowns == "skew" else 0.0
+    centre = (319.5, 239.5) if unknowns == "centre" else (325.0, 236.0)
+    camera = Camera("pinhole", (640, 480), 530.0, 545.0, skew, *centre)
+    H = homographies(pack(views_of(views, 4, camera=camera)))
+    K = closed_form_intrinsics(H, (640, 480), unknowns)
+    assert K is not None
+    np.testing.assert_allclose(K, camera.K, rtol=1e-6, atol=1e-4)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 1e-9, 1e-3])
+def test_parallel_views_still_give_a_start(tilt: float) -> None:
+    guess = initial_guess(pack(views_of(5, 2, 0.1, tilt_rad=tilt)), (640, 480), skew=True)
+    assert np.isfinite(guess.K).all()
+    assert guess.K[0, 0] > 0
+    assert np.isfinite(guess.t_CT_m).all()
+
+
+def _block(seed: int, deformation: int = 0) -> Block:
+    rng = np.random.default_rng(seed)
+    lens = rng.uniform(-0.1, 0.1, 8)
+    intrinsics = np.array([500.0, 510.0, 320.0, 240.0, 3.0, *lens])
+    R = rotation_exp(rng.uniform(-0.6, 0.6, (3, 3)))
+    t = np.array([[-0.1, -0.06, 0.5], [0.0, 0.0, 0.4], [-0.12, -0.1, 0.7]])
+    return Block(intrinsics, R, t, 1e-3 * rng.standard_normal(deformation))
+
+
+def _observations() -> Observations:
+    points = BOARD.points_m()
+    views = [View(str(i), points[: 54 - 5 * i], np.full((54 - 5 * i, 2), 100.0 * i)) for i in range(3)]
+    shared = [View(v.name, points, np.resize(v.pixels, (54, 2))) for v in views]
+    return pack(shared)
+
+
+def _shifted(
+    block: Block, free: np.ndarray, row: int, view: int, step: float, basis: np.ndarray | None
+) -> Block:
+    G = len(free) + (0 if basis is None else len(basis))
+    intrinsics, R, t = block.intrinsics.copy(), block.R_CT.copy(), block.t_CT_m.copy()
+    deformation = block.deformation.copy()
+    if row < len(free):
+        intrinsics[free[row]] += step
+    elif row < G:
+        deformation[row - len(free)] += step
+    elif row < G + 3:
+        delta = np.zeros((1, 3))
+        delta[0, row - G] = step
+        R[view] = rotation_exp(delta)[0] @ R[view]
+    else:
+        t[view, row - G - 3] += step
+    return Block(intrinsics, R, t, deformation)
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("kind", ["rigid", "warp"])
+@given(seed=st.integers(0, 1000))
+@settings(max_examples=5, deadline=None)
+def test_gradients_agree_with_finite_differences(model: str, kind: str, seed: int) -> None:
+    observations = _observations()
+    basis = board_basis(observations.target_m[0], kind)
+    free = free_intrinsics(model, skew=True)
+    block = _block(seed, 0 if basis is None else len(basis))
+    J = jacobian(block, observations, free, basis)
+    assert J is not None
+    for row in range(J.shape[1] - 1):
+        name = INTRINSICS[free[row]] if row < len(free) else "other"
+        step = 1e-3 if name.endswith("_px") else 1e-6
+        for view in (0, 2):
+            ahead = jacobian(_shifted(block, free, row, view, step, basis), observations, free, basis)
+            behind = jacobian(_shifted(block, free, row, view, -step, basis), observations, free, basis)
+            assert ahead is not None and behind is not None
+            numeric = (ahead[view, -1] - behind[view, -1]) / (2 * step)
+            scale = np.abs(J[view, row]).max() + 1.0
+            np.testing.assert_allclose(J[view, row] / scale, numeric / scale, atol=2e-7)
+
+
+def test_points_behind_the_camera_are_refused() -> None:
+    block = _block(0)
+    behind = Block(block.intrinsics, block.R_CT, -block.t_CT_m, block.deformation)
+    assert jacobian(behind, _observations(), free_intrinsics("radial2", False), None) is None
+
+
+def _dense_covariance(normal: np.ndarray, G: int, variance: float) -> np.ndarray:
+    views = len(normal)
+    H = np.zeros((G + 6 * views, G + 6 * views))
+    for i, block in enumerate(normal):
+        at = slice(G + 6 * i, G + 6 * i + 6)
+        H[:G, :G] += block[:G, :G]
+        H[:G, at] = block[:G, G:]
+        H[at, :G] = block[G:, :G]
+        H[at, at] = block[G:, G:]
+    return variance * np.linalg.inv(H)
+
+
+def test_blocks_equal_the_dense_inverse() -> None:
+    fit = calibrate(pack(views_of(6, 2, 0.2)), (640, 480), "radial2")
+    found = covariance(fit)
+    dense = _dense_covariance(fit.normal, 6, fit.sigma_px**2)
+    np.testing.assert_allclose(found.intrinsics, dense[:6, :6], rtol=1e-7)
+    for i in range(6):
+        at = slice(6 + 6 * i, 12 + 6 * i)
+        np.testing.assert_allclose(found.poses[i], dense[at, at], rtol=1e-6, atol=1e-18)
+
+
+def test_singular_problem_has_no_finite_sigma() -> None:
+    view = views_of(1, 3)[0]
+    fit = calibrate(pack([view]), (640, 480), "brown5")
+    assert (
+        not fit.converged
+        or not np.isfinite(covariance(fit, 0.01).intrinsics).all()
+        or (covariance(fit, 0.01).sigma()["fx_px"] > 20.0)
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["radial2", "brown5"])
+def test_monte_carlo(model: str) -> None:
+    runs, noise = 500, 0.2
+    clean = pack(views_of(20, 3))
+    truth = vector_from_camera(CAMERA)
+    rng = np.random.default_rng(0)
+    pixels = np.array([[5.0, 5.0], [320.0, 240.0], [600.0, 100.0]])
+    reference = calibrate(clean, (640, 480), model)
+    P = len(reference.free)
+    estimates, sigmas, joints, shifts, projected = [], [], [], [], []
+    start = reference.block
+    ideal = undistort(CAMERA, pixels)
+    for _ in range(runs):
+        noisy = replace(clean, pixels=clean.pixels + noise * rng.standard_normal(clean.pixels.shape))
+        fit = calibrate(noisy, (640, 480), model, start=start)
+        assert fit.converged
+        found = covariance(fit)
+        estimates.append(fit.block.intrinsics[fit.free])
+        sigmas.append(np.sqrt(np.diag(found.intrinsics)))
+        projected.append(projection_sigma_px(fit, found, pixels))
+        # The change of projection at fixed places of the scene, poses aligned as the module defines.
+        V = reference.normal[:, P:, P:]
+        turn = fit.block.R_CT @ reference.block.R_CT.transpose(0, 2, 1)
+        dz = np.concatenate(
+            [
+                np.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], axis=1),
+                fit.block.t_CT_m - reference.block.t_CT_m,
+            ],
+            axis=1,
+        )
+        G = np.zeros((20, 6, 6))
+        G[:, range(6), range(6)] = 1.0
+        t = reference.block.t_CT_m
+        for row, col, value in ((3, 1, t[:, 2]), (3, 2, -t[:, 1]), (4, 0, -t[:, 2]), (4, 2, t[:, 0])):
+            G[:, row, col] = value
+        G[:, 5, 0], G[:, 5, 1] = t[:, 1], -t[:, 0]
+        weighted = G.transpose(0, 2, 1) @ V
+        g = np.linalg.solve((weighted @ G).sum(axis=0), np.einsum("nab,nb->a", weighted, dz))
+        rays = np.concatenate([ideal, np.ones((3, 1))], axis=1)
+        points = found.distance_m * rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        change = np.concatenate([estimates[-1] - truth[fit.free], g])
+        joints.append(change)
+        shifts.append(joint_jacobian(reference, points) @ change)
+    ratio = np.std(estimates, axis=0) / np.mean(sigmas, axis=0)
+    # 500 runs know a standard deviation to 3.2 %.
+    np.testing.assert_allclose(ratio, 1.0, atol=0.10)
+    inside = np.abs(np.array(estimates) - truth[reference.free]) < 1.96 * np.array(sigmas)
+    assert 0.93 <= inside.mean() <= 0.97
+    cov = np.einsum("rni,rnj->nij", shifts, shifts) / runs
+    worst = np.sqrt(np.linalg.eigvalsh(cov)[:, -1])
+    np.testing.assert_allclose(worst / np.mean(projected, axis=0), 1.0, atol=0.10)
+
+
+def test_inflation_is_one_for_white_residuals_and_more_for_a_common_error() -> None:
+    white = calibrate(pack(views_of(20, 4, 0.2)), (640, 480), "radial2")
+    assert residual_inflation(white) < 1.25
+    views = views_of(20, 4, 0.2)
+    # A lens that the model does not have.
+    for view in views:
+        x, y = (view.pixels - [320, 240]).T / 320
+        view.pixels[:, 0] += 1.5 * np.sin(4 * x) * np.sin(3 * y)
+    structured = calibrate(pack(views), (640, 480), "radial2")
+    assert residual_inflation(structured) > 1.5
+
+
+LENSES = {
+    "pinhole": {},
+    "radial2": {"k1": -0.25, "k2": 0.1},
+    "brown5": {"k1": -0.25, "k2": 0.1, "p1": 0.004, "p2": -0.003, "k3": 0.0},
+}
+
+
+@pytest.mark.parametrize("truth", LENSES)
+def test_the_true_lens_is_chosen(truth: str) -> None:
+    lens = np.array([LENSES[truth].get(name, 0.0) for name in COEFFICIENTS])
+    camera = Camera(truth, (640, 480), 530.0, 532.0, 0.0, 325.0, 236.0, lens)
+    found = candidates_by_model(pack(views_of(18, 3, 0.2, camera=camera)), (640, 480))
+    names = [candidate.name for candidate, _ in found]
+    assert names == ["pinhole", "radial2", "radial3", "brown5", "rational8"]
+    fitted = [candidate.fitted_rms_px for candidate, _ in found]
+    assert all(b <= a * (1 + 1e-4) for a, b in pairwise(fitted[:4]))
+    assert names[simplest_good([candidate for candidate, _ in found])] == truth
+
+
+@pytest.mark.parametrize("truth", ["rigid", "warp", "released"])
+def test_the_true_board_is_chosen(truth: str) -> None:
+    views = views_of(16, 5)
+    observations = pack(views)
+    rng = np.random.default_rng(0)
+    basis = board_basis(observations.target_m[0], truth)
+    if basis is not None:
+        weights = np.array([1.5e-3, -1e-3]) if truth == "warp" else 4e-4 * rng.standard_normal(len(basis))
+        shape = np.tensordot(weights, basis, axes=1).T
+        # Views of the deformed board: fit poses exactly, then project the displaced points.
+        fit = calibrate(observations, (640, 480), "radial2")
+        from calib.camera.projection import jacobian
+
+        J = jacobian(fit.block, observations.displaced(shape), fit.free, None)
+        assert J is not None
+        observations = replace(
+            observations, pixels=observations.pixels + J[:, -1].reshape(-1, 2, 54).transpose(0, 2, 1)
+        )
+    observations = replace(
+        observations, pixels=observations.pixels + 0.1 * rng.standard_normal(observations.pixels.shape)
+    )
+    found = candidates_by_board(calibrate(observations, (640, 480), "radial2"), skew=False)
+    names = [candidate.name for candidate, _ in found]
+    assert names == ["rigid", "warp", "released"]
+    assert names[simplest_good([candidate for candidate, _ in found])] == truth
+
+
+USUAL = Recipe()
+
+
+def _fit(recipe: Recipe = USUAL, count: int = 14, seed: int = 0, model: str = "radial2") -> Calibration:
+    views = take(np.random.default_rng(seed), camera_of(), count, recipe=recipe)
+    return calibrate(pack(views), (640, 480), model)
+
+
+@pytest.mark.parametrize("views", [12, 80])
+def test_a_better_minimum_is_adopted(views: int) -> None:
+    fit = _fit(count=views)
+    # Stopped early, far away.
+    intrinsics = fit.block.intrinsics.copy()
+    intrinsics[:2] *= 4.0
+    lost = calibrate(
+        fit.observations,
+        (640, 480),
+        "radial2",
+        start=replace(fit.block, intrinsics=intrinsics, t_CT_m=fit.block.t_CT_m * [1, 1, 4]),
+        max_iterations=2,
+    )
+    assert lost.squared_sum > 2 * fit.squared_sum
+    assert best_of_starts(lost).squared_sum == pytest.approx(fit.squared_sum, rel=1e-6)
+
+
+def test_interval_of_a_good_set_is_its_sigma() -> None:
+    fit = _fit()
+    sigma = covariance(fit).sigma()["fx_px"]
+    found = focal_interval(fit, sigma, 1.0)
+    assert found.bounded
+    assert not found.lower_cost
+    assert fit.camera.fx_px - found.low_px == pytest.approx(1.96 * sigma, rel=0.05)
+    assert found.high_px - fit.camera.fx_px == pytest.approx(1.96 * sigma, rel=0.05)
+    assert found.half_width_share == pytest.approx(1.96 * sigma / fit.camera.fx_px, rel=0.05)
+    wider = focal_interval(fit, sigma, 2.0)
+    assert wider.half_width_share == pytest.approx(2 * found.half_width_share, rel=0.05)
+
+
+def test_parallel_views_leave_the_interval_open() -> None:
+    fit = _fit(Recipe(tilt_deg=(0.0, 0.5), noise_px=0.2))
+    found = focal_interval(fit, covariance(fit).sigma()["fx_px"], 1.0)
+    assert found.lower_cost or not found.bounded
+    assert found.lower_cost or np.isinf(found.half_width_share)
+
+
+def test_the_rational_denominator_is_put_aside() -> None:
+    fit = _fit(model="rational8")
+    sturdy = conditioned(fit)
+    assert sturdy.camera.model == "brown5"
+    assert sturdy.squared_sum < 1.05 * fit.squared_sum
+    assert np.isfinite(covariance(sturdy).sigma()["fx_px"])
+    plain = _fit()
+    assert conditioned(plain) is plain
+
+
+def test_a_denominator_that_is_needed_is_held() -> None:
+    lens = (0.4, -0.05, 0.0, 0.0, 0.0, 0.9, 0.15, 0.0)
+    camera = camera_of((1280, 960), 100.0, lens, "rational8")
+    views = take(np.random.default_rng(1), camera, 25, recipe=Recipe(noise_px=0.01))
+    fit = calibrate(pack(views), (1280, 960), "rational8")
+    simple = calibrate(pack(views), (1280, 960), "brown5")
+    assert simple.squared_sum > 1.05 * fit.squared_sum
+    sturdy = conditioned(fit)
+    assert sturdy.camera == fit.camera
+    assert sturdy.free_names == simple.free_names
+    assert sturdy.normal.shape[1] == fit.normal.shape[1] - 3
+
+
+def _shape(recipe: Recipe, seed: int = 0, count: int = 17) -> TargetShape:
+    views = take(np.random.default_rng(seed), camera_of(), count, recipe=recipe)
+    found = target_shape(calibrate(pack(views), (640, 480), "radial2"))
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("aspect", [0.95, 0.99, 1.0, 1.02])
+def test_aspect_is_measured(aspect: float) -> None:
+    found = _shape(Recipe(aspect=aspect))
+    assert found.aspect == pytest.approx(aspect - 1, abs=max(4 * found.aspect_sigma, 0.05 * abs(aspect - 1)))
+    assert found.aspect_sigma < 0.005
+
+
+@pytest.mark.parametrize("bow_m", [-0.003, -0.0005, 0.001, 0.003])
+def test_bow_is_measured(bow_m: float) -> None:
+    found = _shape(Recipe(bow_m=bow_m))
+    along_x = found.values[DEFORMATIONS.index("bow_x")]
+    assert along_x == pytest.approx(bow_m, abs=4 * found.sigma[2] + 0.05 * abs(bow_m))
+    assert found.bow_m == pytest.approx(abs(bow_m), rel=0.15)
+    assert found.bow_significance > 4
+    assert found.size_m == pytest.approx(0.12)
+    assert found.rms_drop > 0.05
+
+
+def test_a_flat_board_of_square_squares_is_left_alone() -> None:
+    for seed in range(5):
+        found = _shape(Recipe(), seed)
+        assert found.bow_significance < 3.5
+        assert abs(found.aspect) < 4 * found.aspect_sigma
+        assert found.rms_drop < 0.02
