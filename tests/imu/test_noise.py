@@ -1,0 +1,499 @@
+"""Noise at rest: Allan variance, N, B and K, biases with intervals that hold, and the sampling of logs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import allantools
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calib.errors import BadInputError
+from calib.imu.allan import allan_variance, bounds, covariance_forms, degrees_of_freedom, design, spaced
+from calib.imu.allan_fit import analyse
+from calib.imu.rest import rest_parts
+from calib.imu.sampling import Part, regular_parts
+from calib.imu.static import AXES, RestLog, Static, analyse_static
+from calib.imu.static_verdict import judge
+from calib.imusections import imu_section, kalibr_imu
+from calib.kalibr_imu import from_kalibr_imu
+from calib.rig_imu import Imu as Imu_of_kalibr_imu
+from calib.twin.imu_sensor import Imu, draw_imu_noise, measure
+from calib.twin.sensors import HeadMotion
+
+IMU = Imu(gyro_scale=(0.0, 0.0, 0.0), accel_scale=(0.0, 0.0, 0.0), mount_angle_rad=0.0)
+
+
+def _at_rest(n: int) -> HeadMotion:
+    zero = np.zeros(n)
+    return HeadMotion(zero, zero, zero, np.zeros((n, 2)), np.zeros((n, 2)))
+
+
+def rest_log(imu: Imu, duration_s: float, seed: int, source: str = "log.csv") -> tuple[RestLog, np.ndarray]:
+    """Readings of the simulated sensor, and what its biases are at the end, without the white noise."""
+    noise = draw_imu_noise(imu, duration_s, seed)
+    force, rate = measure(imu, noise, slice(None), _at_rest(len(noise.taken_s)))
+    silent = draw_imu_noise(replace(imu, gyro_noise=0.0, accel_noise=0.0), duration_s, seed)
+    end = np.concatenate([silent.gyro[-1], silent.accel[-1] + [9.81, 0.0, 0.0]])
+    values = np.concatenate([rate, force], axis=1)
+    return RestLog(source, AXES, noise.stamp_s, values, np.zeros(0), np.zeros(0)), end
+
+
+def test_the_simulated_sensor_is_recovered() -> None:
+    log, _ = rest_log(IMU, 300.0, 1)
+    found = analyse_static([log])
+    assert found.rate_hz == pytest.approx(100.0, rel=1e-4)
+    assert judge(found).verdict == "ok"
+    for k, noise in enumerate(found.noise):
+        gyro = k < 3
+        density = IMU.gyro_noise if gyro else IMU.accel_noise
+        step = IMU.gyro_step_radps if gyro else IMU.accel_step_mps2
+        # Rounding adds the variance step^2 / 12 to every sample.
+        true = np.sqrt(density**2 + step**2 / 12.0 / IMU.rate_hz)
+        assert noise.allan is not None
+        assert abs(noise.allan.N.value - true) < 4.0 * noise.allan.N.sigma
+        assert noise.allan.N.sigma < 0.01 * true
+        assert found.logs[0].sampling.step[k] == pytest.approx(step, rel=1e-6)
+    bias = found.noise[2]
+    assert bias.low < IMU.gyro_bias_radps[2] < bias.high
+    drift = found.logs[0].gyro
+    assert drift is not None
+    assert drift.slope_radps == pytest.approx(-bias.bias)
+    assert drift.sigma_radps == pytest.approx(IMU.gyro_noise / np.sqrt(300.0), rel=0.1)
+
+
+@pytest.mark.slow
+def test_the_interval_holds_the_bias_that_is_met_after_the_log() -> None:
+    held, naive, total = 0, 0, 0
+    for seed in range(30):
+        log, end = rest_log(replace(IMU, gyro_walk=3e-5, accel_walk=2e-4), 120.0, seed)
+        for k, noise in enumerate(analyse_static([log]).noise):
+            held += noise.low <= end[k] <= noise.high
+            naive += abs(noise.bias - end[k]) <= 1.96 * noise.sigma_mean
+            total += 1
+    assert held >= 0.9 * total
+    # White noise alone would promise far too much.
+    assert naive <= 0.6 * total
+
+
+@pytest.mark.slow
+def test_densities_lie_in_their_intervals() -> None:
+    imu = replace(IMU, gyro_walk=3e-4, accel_walk=2e-3, gyro_step_radps=0.0, accel_step_mps2=0.0)
+    held_N, held_K, total = 0, 0, 0
+    for seed in range(15):
+        for k, noise in enumerate(analyse_static([rest_log(imu, 600.0, seed)[0]]).noise):
+            assert noise.allan is not None
+            density, walk = (imu.gyro_noise, imu.gyro_walk) if k < 3 else (imu.accel_noise, imu.accel_walk)
+            held_N += noise.allan.N.low <= density <= noise.allan.N.high
+            held_K += noise.allan.K.supported and noise.allan.K.low <= walk <= noise.allan.K.high
+            total += 1
+    assert held_N >= 0.88 * total
+    assert held_K >= 0.85 * total
+
+
+def test_several_logs_give_mean_and_spread() -> None:
+    logs, biases = [], (0.004, 0.006, 0.011)
+    for seed, bias in enumerate(biases):
+        logs.append(rest_log(replace(IMU, gyro_bias_radps=(0.0, 0.0, bias)), 60.0, seed, f"{seed}.csv")[0])
+    found = analyse_static(logs)
+    gz = found.noise[2]
+    assert gz.bias == pytest.approx(np.mean(biases), abs=2e-4)
+    assert gz.spread == pytest.approx(np.std(biases, ddof=1), rel=0.1)
+    # Student's 97.5 % point with two degrees of freedom is 4.30.
+    assert gz.high - gz.bias == pytest.approx(4.3027 * gz.spread / np.sqrt(3.0), rel=1e-3)
+    slopes = [log.gyro.slope_radps for log in found.logs if log.gyro is not None]
+    assert np.allclose(slopes, -np.array(biases), atol=3e-4)
+    one = analyse_static(logs[:1]).noise[2]
+    assert np.isnan(one.spread)
+    assert one.allan is not None
+    assert gz.allan is not None
+    assert gz.allan.N.sigma < 0.7 * one.allan.N.sigma
+
+
+def test_the_drift_on_the_chip() -> None:
+    log, _ = rest_log(IMU, 60.0, 3)
+    rng = np.random.default_rng(3)
+    wander = np.cumsum(1e-4 * rng.normal(size=len(log.t_s)))
+    angle = np.angle(np.exp(1j * (3.0 + 0.01 * log.t_s + wander)))
+    drift = analyse_static([replace(log, onchip_t_s=log.t_s, onchip_phi_rad=angle)]).logs[0].onchip
+    assert drift is not None
+    expected = np.polyfit(log.t_s, np.unwrap(angle), 1)[0]
+    assert drift.slope_radps == pytest.approx(expected, rel=1e-9)
+    # A walk of q per sample ends q sqrt(rate T) away, which over T is a slope of q sqrt(rate / T).
+    assert drift.sigma_radps == pytest.approx(1e-4 * np.sqrt(100.0 / 60.0), rel=0.7)
+
+
+def test_motion_is_left_out_and_makes_it_poor() -> None:
+    log, _ = rest_log(IMU, 60.0, 4)
+    moved = log.values.copy()
+    moved[2000:2300, 2] += 0.3 * np.sin(0.05 * np.arange(300))
+    found = analyse_static([replace(log, values=moved)])
+    judged = judge(found)
+    assert judged.verdict == "poor"
+    assert "log.csv: moves from 20.0 to 23.0 s, seen most in gz" in judged.reasons[0]
+    assert found.logs[0].gyro is None
+    assert found.noise[2].bias == pytest.approx(IMU.gyro_bias_radps[2], abs=3e-4)
+
+
+def test_a_stuck_axis_is_named() -> None:
+    log, _ = rest_log(IMU, 60.0, 5)
+    values = log.values.copy()
+    values[:, 1] = -0.0031
+    found = analyse_static([replace(log, values=values)])
+    assert found.noise[1].allan is None
+    judged = judge(found)
+    assert judged.verdict == "poor"
+    assert any("gy never changes: it is stuck at -0.0031" in reason for reason in judged.reasons)
+
+
+def test_logs_that_do_not_go_together() -> None:
+    one, _ = rest_log(IMU, 10.0, 7)
+    other, _ = rest_log(replace(IMU, rate_hz=50.0), 10.0, 7, "other.csv")
+    with pytest.raises(
+        BadInputError, match=r"other\.csv: is sampled at 50 Hz, expected 100 Hz as in log\.csv"
+    ):
+        analyse_static([one, other])
+    with pytest.raises(BadInputError, match=r"other\.csv: has the axes gx, gy, expected gx, gy, gz"):
+        analyse_static([one, replace(other, axes=("gx", "gy"), values=other.values[:, :2])])
+    with pytest.raises(BadInputError, match="expected at least one"):
+        analyse_static([])
+    short = replace(one, t_s=one.t_s[:50], values=one.values[:50])
+    with pytest.raises(BadInputError, match=r"log\.csv: has 50 IMU samples without a long gap"):
+        analyse_static([short])
+    shaken = replace(one, values=one.values + 0.5 * np.sin(np.arange(len(one.t_s)))[:, None])
+    with pytest.raises(BadInputError, match=r"log\.csv: is never at rest"):
+        analyse_static([shaken])
+
+
+def _nbs14() -> np.ndarray:
+    n, out = 1234567890, []
+    for _ in range(1000):
+        out.append(n / 2147483647)
+        n = 16807 * n % 2147483647
+    return np.array(out)
+
+
+def test_the_published_set() -> None:
+    found = np.sqrt(allan_variance([_nbs14()], np.array([1, 10, 100])))
+    assert found == pytest.approx([0.2922319, 0.09159953, 0.03241343], rel=2e-7)
+
+
+@pytest.mark.parametrize("walk", [0.0, 0.3])
+def test_the_same_as_allantools(walk: float) -> None:
+    rng = np.random.default_rng(1)
+    y = 5.0 + rng.normal(size=5000) + walk * np.cumsum(rng.normal(size=5000))
+    m = spaced(len(y))
+    _, theirs, _, _ = allantools.oadev(y, rate=100.0, data_type="freq", taus=m / 100.0)
+    assert np.allclose(np.sqrt(allan_variance([y], m)), theirs, rtol=1e-10)
+
+
+def test_a_log_in_parts_gives_the_mean_over_its_second_differences() -> None:
+    rng = np.random.default_rng(2)
+    long, short, m = rng.normal(size=400), rng.normal(size=60), np.array([1, 8, 40])
+    both = allan_variance([long, short, np.zeros(1)], m)
+    one, other = allan_variance([long], m), allan_variance([short], m)
+    assert np.isnan(other[2])
+    M1, M2 = 401 - 2 * m, np.maximum(61 - 2 * m, 0)
+    assert np.allclose(both, (one * M1 + np.nan_to_num(other) * M2) / (M1 + M2))
+    with pytest.raises(BadInputError, match="found 0, expected 1 or more"):
+        allan_variance([long], np.array([0]))
+
+
+@pytest.mark.parametrize(("kind", "alpha"), [(0, 0), (1, -1), (2, -2)])
+def test_degrees_of_freedom_are_those_of_greenhall_and_riley(kind: int, alpha: int) -> None:
+    theta = np.zeros(3)
+    theta[kind] = 0.7
+    for n in (1000, 50_000):
+        # Their sums leave out what discrete samples add below sixteen.
+        m = np.array([16, 50, 100, n // 4])
+        theirs = [
+            allantools.edf_greenhall(alpha, 2, int(k), n + 1, overlapping=True, modified=False) for k in m
+        ]
+        assert np.allclose(degrees_of_freedom(m, [n], theta), theirs, rtol=0.05)
+
+
+@pytest.mark.parametrize(("white", "walk"), [(1.0, 0.0), (0.0, 1.0), (1.0, 0.1)])
+def test_the_covariance_of_variances_is_met(white: float, walk: float) -> None:
+    rng, n, m = np.random.default_rng(3), 300, np.array([2, 8, 9, 32])
+    found = []
+    for _ in range(4000):
+        y = white * rng.normal(size=n)
+        if walk:
+            # The mean of a walk over a sample, not its value at the end.
+            fine = np.cumsum(rng.normal(size=10 * n)) / np.sqrt(10.0)
+            y = y + walk * fine.reshape(n, 10).mean(axis=1)
+        found.append(allan_variance([y], m))
+    theta = np.array([white**2, 0.0, walk**2])
+    expected = np.einsum("ijpq,p,q->ij", covariance_forms(m, [n]), theta, theta)
+    size = np.sqrt(np.diag(expected))
+    assert np.allclose(np.mean(found, axis=0), design(m) @ theta, rtol=0.03)
+    assert np.allclose(
+        np.cov(np.array(found).T) / np.outer(size, size), expected / np.outer(size, size), atol=0.1
+    )
+
+
+def test_bounds_hold_two_thirds_of_the_time() -> None:
+    rng, n, m = np.random.default_rng(4), 400, np.array([1, 10, 50])
+    freedom = degrees_of_freedom(m, [n], np.array([1.0, 0.0, 0.0]))
+    inside = np.zeros(3)
+    for _ in range(1500):
+        low, high = bounds(allan_variance([rng.normal(size=n)], m), freedom)
+        inside += (low < 1.0 / np.sqrt(m)) & (1.0 / np.sqrt(m) < high)
+    assert np.allclose(inside / 1500, 0.683, atol=0.05)
+
+
+RATE_HZ = 100.0
+
+
+def _readings(n: int, N: float, K: float, seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    walk = np.cumsum(K / np.sqrt(RATE_HZ) * rng.normal(size=n))
+    return 0.01 + N * np.sqrt(RATE_HZ) * rng.normal(size=n) + walk
+
+
+def test_white_noise_is_recovered_and_nothing_is_made_up() -> None:
+    N, z, inside, made_up = 1e-3, [], 0, 0
+    for seed in range(60):
+        found = analyse([_readings(6000, N, 0.0, seed)], 1.0 / RATE_HZ)
+        z.append((found.N.value - N) / found.N.sigma)
+        inside += found.N.low <= N <= found.N.high
+        made_up += found.K.supported + found.B.supported
+    assert abs(np.mean(z)) < 0.5
+    assert 0.75 < np.std(z) < 1.3
+    assert inside >= 52
+    assert made_up <= 3
+
+
+@pytest.mark.slow
+def test_a_random_walk_is_recovered_from_a_long_log() -> None:
+    N, K, inside, values = 1e-3, 1e-3, 0, []
+    for seed in range(40):
+        found = analyse([_readings(60_000, N, K, seed)], 1.0 / RATE_HZ)
+        assert found.K.supported
+        inside += found.K.low <= K <= found.K.high
+        values.append(found.K.value / K)
+    assert inside >= 35
+    assert np.median(values) == pytest.approx(1.0, abs=0.1)
+
+
+def test_what_a_short_log_cannot_show_gets_a_bound() -> None:
+    N, K, held = 1e-3, 1e-4, 0
+    for seed in range(40):
+        found = analyse([_readings(6000, N, K, seed)], 1.0 / RATE_HZ)
+        held += found.K.supported or found.K.below > K
+        assert found.K.supported or np.isnan(found.K.value)
+        assert found.walk_within > 0.0
+    assert held >= 36
+
+
+def test_flicker_noise_is_taken_for_bias_instability() -> None:
+    # White noise of variance 1 at the period tau0 has the two-sided density tau0. Filtered by
+    # (1 - 1/z)^(-1/2) it has 1 / (2 pi f) at low frequencies, which is B^2 / (2 pi f) with B = 1.
+    B, n, rng = 2e-3, 60_000, np.random.default_rng(5)
+    k = np.arange(1, n)
+    kernel = np.concatenate([[1.0], np.cumprod((k - 0.5) / k)])
+    size = 1 << 17
+    white = rng.normal(size=n)
+    flicker = np.fft.irfft(np.fft.rfft(kernel, size) * np.fft.rfft(white, size), size)[:n]
+    found = analyse([B * flicker + 1e-3 * np.sqrt(RATE_HZ) * rng.normal(size=n)], 1.0 / RATE_HZ)
+    assert found.B.supported
+    assert found.B.value == pytest.approx(B, rel=0.2)
+
+
+GYRO = np.array([True, False])
+NONE = np.array([np.nan, np.nan])
+NOISE = np.array([2.4e-3, 0.015])
+
+
+def _part(values: np.ndarray, start_s: float = 5.0) -> tuple[Part, ...]:
+    places = np.arange(len(values))
+    return (Part(start_s, values, places, places),)
+
+
+def _still(seed: int, n: int = 6000) -> np.ndarray:
+    return NOISE * np.random.default_rng(seed).normal(size=(n, 2)) + [0.006, 9.81]
+
+
+def test_rest_is_rest() -> None:
+    for seed in range(40):
+        parts, motions = rest_parts(_part(_still(seed)), 0.01, GYRO, NONE)
+        assert motions == ()
+        assert len(parts[0].values) == 6000
+
+
+def test_a_walking_bias_and_a_coarse_step_are_rest() -> None:
+    rng = np.random.default_rng(1)
+    walk = np.cumsum(1e-4 * rng.normal(size=(60_000, 2)), axis=0)
+    assert rest_parts(_part(_still(2, 60_000) + walk), 0.01, GYRO, NONE)[1] == ()
+    coarse = 0.02 * np.rint(_still(3) / 0.02)
+    assert rest_parts(_part(coarse), 0.01, GYRO, np.array([0.02, 0.02]))[1] == ()
+
+
+@pytest.mark.parametrize(("axis", "size"), [(0, 0.03), (1, 0.2)])
+def test_a_knock_is_found_and_cut_out(axis: int, size: float) -> None:
+    values = _still(4)
+    values[2030:2090, axis] += size * np.sin(np.arange(60))
+    parts, motions = rest_parts(_part(values), 0.01, GYRO, NONE)
+    (motion,) = motions
+    assert motion.axis == axis
+    assert motion.from_s <= 5.0 + 20.3
+    assert motion.to_s >= 5.0 + 20.9
+    assert motion.to_s - motion.from_s <= 2.1
+    assert [len(part.values) for part in parts] == [
+        2000,
+        6000 - 2000 - round((motion.to_s - motion.from_s) * 100),
+    ]
+    assert parts[1].places[0] == 0
+    assert np.array_equal(parts[1].values, values[parts[1].rows])
+
+
+def _log(n: int = 6000, jitter_s: float = 4e-4, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    t = np.maximum.accumulate(0.01 * np.arange(n) + jitter_s * rng.normal(size=n))
+    return t, rng.normal(size=(n, 2)) + np.array([0.0, 9.81])
+
+
+def test_rate_and_jitter() -> None:
+    t, values = _log()
+    sampling, parts = regular_parts(t, values, GYRO)
+    assert sampling.rate_hz == pytest.approx(100.0, rel=1e-5)
+    assert sampling.jitter_s == pytest.approx(4e-4, rel=0.1)
+    assert (sampling.gaps, sampling.repeated_rows, sampling.repeated_stamps) == ((), 0, 0)
+    assert len(parts) == 1
+    assert np.array_equal(parts[0].values, values)
+    assert np.isnan(sampling.step).all()
+
+
+def test_stamps_that_repeat_are_samples_of_their_own() -> None:
+    t, values = _log()
+    late = np.random.default_rng(1).choice(np.arange(1, 5999), 12, replace=False)
+    for i in sorted(late.tolist()):
+        t[i] = t[i - 1]
+    sampling, parts = regular_parts(t, values, GYRO)
+    assert (sampling.repeated_stamps, sampling.repeated_rows, sampling.missing) == (12, 0, 0)
+    assert np.array_equal(parts[0].values, values)
+
+
+def test_rows_written_twice_are_dropped() -> None:
+    t, values = _log()
+    rows = np.sort(np.concatenate([np.arange(6000), np.arange(100, 5900, 480)]))
+    sampling, parts = regular_parts(t[rows], values[rows], GYRO)
+    assert sampling.repeated_rows == 13
+    assert sampling.gaps == ()
+    assert np.array_equal(parts[0].values, values)
+
+
+def test_a_short_gap_is_filled_and_the_time_axis_kept() -> None:
+    t, values = _log(jitter_s=1e-4)
+    keep = np.ones(6000, dtype=bool)
+    keep[3000:3002] = False
+    sampling, parts = regular_parts(t[keep], values[keep], GYRO)
+    (gap,) = sampling.gaps
+    assert (gap.missing, gap.split) == (2, False)
+    assert gap.at_s == pytest.approx(29.99, abs=1e-3)
+    assert gap.duration_s == pytest.approx(0.03, abs=1e-3)
+    assert len(parts[0].values) == 6000
+    filled = values[2999] + np.outer([1 / 3, 2 / 3], values[3002] - values[2999])
+    assert np.allclose(parts[0].values[3000:3002], filled)
+    assert np.array_equal(parts[0].values[3002:], values[3002:])
+
+
+def test_a_long_gap_splits() -> None:
+    t, values = _log()
+    t[4000:] += 3600.0
+    sampling, parts = regular_parts(t, values, GYRO)
+    assert [gap.split for gap in sampling.gaps] == [True]
+    assert [len(part.values) for part in parts] == [4000, 2000]
+    assert sampling.duration_s == pytest.approx(60.0, rel=1e-3)
+    assert sampling.jitter_s == pytest.approx(4e-4, rel=0.15)
+    assert np.array_equal(parts[1].values, values[4000:])
+    assert parts[1].rows[0] == 4000
+
+
+def _result(axes: tuple[str, ...] = AXES, walk: float = 0.0, n: int = 12_000) -> Static:
+    rng = np.random.default_rng(0)
+    values = 1e-3 * rng.normal(size=(n, len(axes))) + walk * np.cumsum(
+        rng.normal(size=(n, len(axes))), axis=0
+    )
+    return analyse_static([RestLog("a.csv", axes, 0.01 * np.arange(n), values, np.zeros(0), np.zeros(0))])
+
+
+def test_kalibr_gets_the_worst_axis_in_continuous_time() -> None:
+    # 1e-3 at 100 Hz is a density of 1e-4.
+    result = _result(walk=1e-4)
+    section = imu_section(result, judge(result))
+    text = kalibr_imu(section)
+    document = yaml.safe_load(text)
+    assert set(document) == {
+        "accelerometer_noise_density",
+        "accelerometer_random_walk",
+        "gyroscope_noise_density",
+        "gyroscope_random_walk",
+        "rostopic",
+        "update_rate",
+    }
+    assert document["gyroscope_noise_density"] == pytest.approx(1e-4, rel=0.1)
+    assert document["gyroscope_random_walk"] == pytest.approx(1e-4 * np.sqrt(100.0), rel=0.4)
+    assert "upper bound" not in text
+    assert document["update_rate"] == pytest.approx(100.0)
+
+
+KEYS = {
+    "accelerometer_noise_density": "accel_noise_mps2_per_sqrt_Hz",
+    "accelerometer_random_walk": "accel_walk_mps3_per_sqrt_Hz",
+    "gyroscope_noise_density": "gyro_noise_radps_per_sqrt_Hz",
+    "gyroscope_random_walk": "gyro_walk_radps2_per_sqrt_Hz",
+}
+# The four numbers of the EuRoC sequences' ADIS16448, as that data set's sensor.yaml gives them.
+EUROC = (2.0e-3, 3.0e-3, 1.6968e-04, 1.9393e-05)
+TEXT = (
+    "accelerometer_noise_density: 2.0e-3\naccelerometer_random_walk: 3e-3\n"
+    "gyroscope_noise_density: 1.6968e-04\ngyroscope_random_walk: 1.9393e-05\n"
+    "rostopic: /imu0\nupdate_rate: 200\n"
+)
+sizes = st.floats(1e-12, 1e3, allow_nan=False)
+
+
+def _same(one: Imu_of_kalibr_imu, other: Imu_of_kalibr_imu) -> None:
+    """Equal to the seven digits that are written."""
+    assert one.rate_hz == pytest.approx(other.rate_hz, rel=6e-7, abs=6e-7)
+    for name in KEYS.values():
+        mine, theirs = getattr(one, name), getattr(other, name)
+        assert mine == (theirs if None in theirs else pytest.approx(theirs, rel=6e-7))
+
+
+@given(st.tuples(sizes, sizes, sizes, sizes), st.floats(1e-3, 1e5))
+def test_there_and_back(values: tuple[float, ...], rate_hz: float) -> None:
+    imu = from_kalibr_imu({**dict(zip(KEYS, values, strict=True)), "update_rate": rate_hz})
+    text = kalibr_imu(imu, "/imu")
+    again = from_kalibr_imu(yaml.safe_load(text))
+    _same(again, imu)
+    assert kalibr_imu(again, "/imu") == text
+
+
+@pytest.mark.parametrize("nested", [False, True])
+def test_a_file_as_kalibr_writes_it(nested: bool) -> None:
+    document = yaml.safe_load(TEXT)
+    imu = from_kalibr_imu({"imu0": document} if nested else document)
+    assert isinstance(imu, Imu_of_kalibr_imu) and imu.rate_hz == 200.0 and imu.verdict == "poor"
+    for name, value in zip(KEYS.values(), EUROC, strict=True):
+        assert getattr(imu, name) == [value] * 3
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"update_rate": None}, "update_rate is None, expected a number"),
+        ({"gyroscope_random_walk": "fast\n"}, r"gyroscope_random_walk is 'fast\n', expected a number"),
+        ({"accelerometer_noise_density": float("nan")}, "accelerometer_noise_density is nan, expected"),
+    ],
+)
+def test_what_is_wrong_is_named(change: dict[str, object], words: str) -> None:
+    with pytest.raises(BadInputError) as caught:
+        from_kalibr_imu({**yaml.safe_load(TEXT), **change})
+    assert words in str(caught.value)
+    with pytest.raises(BadInputError, match="update_rate is missing"):
+        from_kalibr_imu(dict.fromkeys(KEYS, 1.0))
