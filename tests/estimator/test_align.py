@@ -1,18 +1,43 @@
-"""Alignments of simulated rigs: errors against sigma, what cannot be told apart, and bad logs."""
+"""Alignment: errors against sigma on simulated rigs; its spline, solver and losses; input from files."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from align_trials import MOTIONS, Trial, align_log, draw, known, prior_settings, scores, twin_log
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import norm
 
+from calib.aligning import align_section, read_align_log, settings_from_rig, with_drawn_marker
+from calib.arrays import FloatArray
 from calib.errors import BadInputError
 from calib.estimator.align import Alignment, align, rest_angle
-from calib.estimator.sensors import SENSOR
-from calib.twin.rig import SimulatedRig
+from calib.estimator.align_clock import even_times_of
+from calib.estimator.align_loss import best_jitter_px, pixel_terms
+from calib.estimator.align_problem import Noise, Problem, Stretch, pictures_off, readings_off
+from calib.estimator.align_solve import response, solve
+from calib.estimator.align_spline import (
+    BAND,
+    Knots,
+    basis_rows,
+    camera_rows,
+    gathered,
+    imu_rows,
+    normal_sums,
+    states_of,
+)
+from calib.estimator.align_start import AlignLog, correlation, pieces_of, start
+from calib.estimator.align_verdict import judge_align
+from calib.estimator.sensors import SENSOR, SIZE, sensor_values, view_coefficients
+from calib.logs import Log, write_log
+from calib.replaying import Periods, setup_from_rig
+from calib.rig import Camera, Distortion, Geometry, Plane, Rig, read_rig, write_rig
+from calib.twin.rig import SimulatedRig, nominal_view
 
 OFFSET, MOUNT, BIAS = (
     SENSOR.index(name) for name in ("time_offset_s", "mount_angle_rad", "accel_bias_y_mps2")
@@ -79,13 +104,6 @@ def test_the_angle_at_rest_and_its_gradient() -> None:
         assert abs(angle) < 0.5
 
 
-def test_a_moment_is_not_enough() -> None:
-    trial = known(SimulatedRig())
-    log = align_log(twin_log(trial.rig, "swing", {}, 3, 0.5))
-    with pytest.raises(BadInputError, match="has no stretch of 1 s"):
-        align([log], prior_settings(trial.view))
-
-
 @pytest.mark.slow
 def test_sigma_tells_the_errors_of_rigs_that_differ() -> None:
     """Latency 10 - 40 ms, mount, lever, scales, biases, noise and plane drawn anew for each rig."""
@@ -104,3 +122,445 @@ def test_sigma_tells_the_errors_of_rigs_that_differ() -> None:
     assert ((np.abs(np.array(z)) < 1.96).sum(axis=0) >= 13).all()
     assert np.abs(offset).max() < 1e-3
     assert np.sqrt(np.mean(np.square(mount))) < math.radians(0.1)
+
+
+def _stamped(taken: FloatArray, jitter: float, repeated: float, seed: int) -> FloatArray:
+    rng = np.random.default_rng(seed)
+    t = np.maximum.accumulate(taken + jitter * rng.standard_normal(len(taken)))
+    for i in np.flatnonzero(rng.random(len(t)) < repeated):
+        t[i] = t[max(i - 1, 0)]
+    return t
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_jitter_and_repeated_stamps_leave_microseconds(seed: int) -> None:
+    taken = 3.0 + 0.0100003 * np.arange(4000)
+    found = even_times_of(_stamped(taken, 4e-4, 0.002, seed))
+    # The line through 4000 stamps has the deviation 2 * 0.4 ms / sqrt(4000) at its ends; four of that.
+    assert np.abs(found.t_s - taken).max() < 4 * 2 * 4e-4 / np.sqrt(4000)
+    # Its slope has the deviation 0.4 ms sqrt(12 / 4000^3), and four of that are allowed.
+    assert found.period_s == pytest.approx(0.0100003, abs=4 * 4e-4 * np.sqrt(12 / 4000**3))
+    assert found.jitter_s == pytest.approx(4e-4, rel=0.1)
+    assert found.missing == 0
+    assert found.repeated > 0
+
+
+def test_a_clock_that_wanders_is_followed() -> None:
+    taken = 0.01 * np.arange(12000)
+    wander = 3e-3 * np.sin(2.0 * np.pi * taken / 90.0)
+    found = even_times_of(_stamped(taken + wander, 4e-4, 0.0, 3))
+    # The blocks' medians follow it; without them the line would leave millimetres of seconds.
+    middle = slice(500, -500)
+    assert np.abs(found.t_s - taken - wander)[middle].max() < 4e-4
+
+
+AREA = 1256.0
+
+
+def _terms(off: np.ndarray, jitter: float, grid: float, share: float) -> tuple[float, np.ndarray, np.ndarray]:
+    pull, weight, good = np.empty(off.shape), np.empty(off.shape), np.empty(len(off))
+    loss = pixel_terms(off, jitter, grid, share, AREA, pull, weight, good)
+    return loss, pull, good
+
+
+@pytest.mark.parametrize("grid", [0.0, 1.0])
+@pytest.mark.parametrize("off", [(0.1, -0.4), (1.3, 0.2), (2.6, -1.9), (9.0, 4.0)])
+def test_the_pull_is_the_slope_of_the_loss(grid: float, off: tuple[float, float]) -> None:
+    at, step = np.array([off]), 1e-6
+    _, pull, good = _terms(at, 0.35, grid, 0.01)
+    for k in range(2):
+        ahead, back = at.copy(), at.copy()
+        ahead[0, k] += step
+        back[0, k] -= step
+        slope = (_terms(ahead, 0.35, grid, 0.01)[0] - _terms(back, 0.35, grid, 0.01)[0]) / (2 * step)
+        # Beyond six deviations the truncated normal's mean is an approximation; pulls are of the order 3.
+        assert pull[0, k] == pytest.approx(slope, rel=1e-4, abs=1e-5)
+    assert (good[0] < 0.01) == (abs(off[0]) > 2.0)
+
+
+@pytest.mark.parametrize("jitter", [0.2, 0.35, 0.7])
+def test_jitter_is_found_below_a_pixel(jitter: float) -> None:
+    rng = np.random.default_rng(3)
+    place = rng.uniform(0.0, 100.0, (20000, 2))
+    seen = np.rint(place + jitter * rng.standard_normal(place.shape))
+    seen[:60] += rng.uniform(5.0, 14.0, (60, 2))
+    assert best_jitter_px(seen - place, 1.0, 0.003, AREA) == pytest.approx(jitter, rel=0.03)
+
+
+VIEW = nominal_view()
+NUMBERS = view_coefficients(VIEW.camera, VIEW.R_CW, VIEW.t_CW_m)
+TRUTH = sensor_values(
+    {
+        "gyro_bias_radps": 0.01,
+        "accel_bias_x_mps2": 0.05,
+        "accel_bias_y_mps2": -0.04,
+        "mount_angle_rad": 0.03,
+        "gyro_scale": 0.006,
+        "imu_lever_m": 0.006,
+        "marker_offset_m": 0.0155,
+        "time_offset_s": 0.031,
+    }
+)
+MEAN = sensor_values({"marker_offset_m": 0.015, "time_offset_s": 0.025})
+SIGMA = np.array([0.1, 0.3, 0.3, 0.5, 0.02, 0.02, 0.003, 0.05, 5e-5, 5e-5, 1e-3, 0.01, 0.01])
+NOISE = Noise(0.3, 0.003, np.array([0.015, 0.015, 0.0025]))
+
+
+def _problem(
+    noisy: bool, seed: int = 0, span_s: float = 0.05, duration_s: float = 4.0
+) -> tuple[Problem, FloatArray]:
+    """A motion that lies in the spline's space, its exact or noisy readings, and its coefficients."""
+    rng = np.random.default_rng(seed)
+    knots = Knots.over(-0.06, duration_s + 0.06, span_s)
+    at = knots.start_s + span_s * (np.arange(knots.count) - 2.0)
+    phi = 0.5 * np.sin(2.0 * np.pi * 1.3 * at) + 0.2 * np.sin(0.9 * at)
+    c = np.stack([phi, 0.078 + 0.008 * np.sin(1.7 * at)], axis=1)
+    camera_s = np.arange(4, int(60 * duration_s)) / 60.0
+    imu_s = np.arange(int(100 * duration_s)) / 100.0
+    pixels = camera_rows(NUMBERS, knots, c, TRUTH, camera_s).predicted
+    readings = imu_rows(9.81, 0.0, knots, c, TRUTH, imu_s).predicted
+    if noisy:
+        pixels = pixels + 0.3 * rng.standard_normal(pixels.shape)
+        readings = readings + NOISE.imu * rng.standard_normal(readings.shape)
+    begin = c + np.array([0.02, 0.001]) * rng.standard_normal(c.shape)
+    loose = np.full((knots.count - 5, 2), 1e3)
+    stretch = Stretch(0, camera_s, pixels, imu_s, readings, knots, begin, loose)
+    return Problem(NUMBERS, 9.81, 0.0, 0.0, 1256.0, (stretch,), MEAN, SIGMA), c
+
+
+def test_exact_readings_give_the_truth_back() -> None:
+    problem, c = _problem(noisy=False)
+    loose = replace(problem, sigma=1e3 * SIGMA)
+    fit = solve(loose, MEAN, NOISE)
+    stretch = loose.stretches[0]
+    assert np.abs(pictures_off(loose, stretch, fit.coefficients[0], fit.sensor)).max() < 1e-3
+    assert np.abs(readings_off(loose, stretch, fit.coefficients[0], fit.sensor)).max() < 1e-3
+    # What the motion shows well is exact; scale, d and stretch together have a direction of their own.
+    assert fit.sensor[7] == pytest.approx(TRUTH[7], abs=2e-6)
+    assert fit.sensor[0] == pytest.approx(TRUTH[0], abs=2e-6)
+    assert c.shape == fit.coefficients[0].shape
+
+
+@pytest.mark.slow
+def test_covariance_is_that_of_repeated_fits() -> None:
+    found, sigmas, noises = [], [], []
+    for seed in range(40):
+        problem, _ = _problem(noisy=True, seed=seed)
+        # The truth is drawn about the prior's mean, as the covariance takes it.
+        shift = np.random.default_rng(1000 + seed).standard_normal(13)
+        mean = TRUTH + SIGMA * np.where(np.arange(13) >= 8, shift, 0.0)
+        fit = solve(replace(problem, mean=mean), mean, NOISE)
+        assert fit.converged
+        found.append(fit.sensor - TRUTH)
+        sigmas.append(np.sqrt(np.diag(fit.covariance)))
+        noises.append([fit.noise.jitter_px, *fit.noise.imu])
+    z = np.array(found) / np.array(sigmas)
+    rms = np.sqrt((z**2).mean(axis=0))
+    # 40 draws leave 11 %; four of that.
+    assert (rms < 1.45).all(), rms
+    assert (rms > 0.55).all(), rms
+    assert np.mean(noises, axis=0) == pytest.approx([0.3, 0.015, 0.015, 0.0025], rel=0.03)
+
+
+def test_the_covariance_is_the_inverse_of_the_whole_matrix() -> None:
+    problem, _ = _problem(noisy=True, span_s=0.1, duration_s=1.5)
+    fit = solve(problem, MEAN, NOISE)
+    stretch, c = problem.stretches[0], fit.coefficients[0]
+    at = np.concatenate([c.ravel(), fit.sensor])
+
+    def off(values: FloatArray) -> FloatArray:
+        moved, sensor = values[: c.size].reshape(c.shape), values[c.size :]
+        seen = pictures_off(problem, stretch, moved, sensor) / fit.noise.jitter_px
+        felt = readings_off(problem, stretch, moved, sensor) / fit.noise.imu
+        anchor = (moved - stretch.start) / np.array([3.0, 0.1])
+        return np.concatenate([seen.ravel(), felt.ravel(), anchor.ravel(), (sensor - MEAN) / SIGMA])
+
+    steps = np.concatenate([np.full(c.size, 1e-6), 1e-4 * SIGMA])
+    columns = []
+    for k, step in enumerate(steps):
+        ahead, back = at.copy(), at.copy()
+        ahead[k] += step
+        back[k] -= step
+        columns.append((off(ahead) - off(back)) / (2.0 * step))
+    J = np.stack(columns, axis=1)
+    dense = np.linalg.inv(J.T @ J)[c.size :, c.size :]
+    assert np.sqrt(np.diag(fit.covariance)) == pytest.approx(np.sqrt(np.diag(dense)), rel=0.03)
+
+
+def test_the_response_is_that_of_changed_readings() -> None:
+    problem, _ = _problem(noisy=True)
+    fit = solve(problem, MEAN, NOISE)
+    stretch = problem.stretches[0]
+    change = np.zeros_like(stretch.readings)
+    change[:, 2] = 1e-4
+    predicted = response(problem, fit, [np.zeros_like(stretch.pixels)], [change])
+    moved = replace(stretch, readings=stretch.readings - change, start=fit.coefficients[0])
+    again = solve(replace(problem, stretches=(moved,)), fit.sensor, fit.noise)
+    assert predicted[0] == pytest.approx(-1e-4, rel=0.02)
+    assert again.sensor[0] - fit.sensor[0] == pytest.approx(predicted[0], rel=0.05)
+
+
+KNOTS = Knots.over(1.0, 3.0, 0.05)
+
+
+# The first example compiles.
+@settings(deadline=None)
+@given(st.lists(st.floats(0.5, 3.5), min_size=1, max_size=20))
+def test_bases_sum_to_one_and_their_derivatives_to_zero(times: list[float]) -> None:
+    t = np.array(times)
+    _, basis = basis_rows(KNOTS, t)
+    scale = 1.0 + np.abs(basis).max(axis=2)
+    assert np.abs(basis[:, 0].sum(axis=1) - 1.0).max() < 1e-10 * scale[:, 0].max()
+    assert np.abs(basis[:, 1].sum(axis=1)).max() < 1e-10 * scale[:, 1].max()
+    assert np.abs(basis[:, 2].sum(axis=1)).max() < 1e-10 * scale[:, 2].max()
+
+
+def test_a_swing_of_four_hertz_is_met_with_its_acceleration() -> None:
+    knots = Knots.over(0.0, 1.0, 0.02)
+    omega = 2.0 * np.pi * 4.0
+    t = np.linspace(0.0, 1.0, 501)
+    span, basis = basis_rows(knots, t)
+    A = np.zeros((len(t), knots.count))
+    for n in range(len(t)):
+        A[n, span[n] : span[n] + 6] = basis[n, 0]
+    c = np.linalg.lstsq(A, 0.5 * np.sin(omega * t), rcond=None)[0]
+    states = states_of(span, basis, np.stack([c, c], axis=1), np.zeros(13))
+    bend = -0.5 * omega**2 * np.sin(omega * t)
+    inside = slice(50, -50)
+    assert np.abs(states[inside, 4] - bend[inside]).max() < 1e-3 * 0.5 * omega**2
+    assert np.array_equal(states[:, 4], states[:, 5])
+
+
+def test_gradients_by_coefficients_and_sensors_against_differences() -> None:
+    rng = np.random.default_rng(0)
+    view = nominal_view()
+    numbers = view_coefficients(view.camera, view.R_CW, view.t_CW_m)
+    knots = Knots.over(0.0, 0.4, 0.05)
+    c = np.stack([rng.normal(0.0, 0.3, knots.count), rng.normal(0.075, 0.005, knots.count)], axis=1)
+    sensor = np.array([0.01, 0.05, -0.03, 0.1, 0.01, 0.006, 0.015, 0.03, 1e-4, -1e-4, 1e-3, 0.002, 0.003])
+    t = rng.uniform(0.05, 0.35, 7)
+
+    def predicted(values: np.ndarray) -> np.ndarray:
+        coefficients, s = values[: c.size].reshape(c.shape), values[c.size :]
+        seen = camera_rows(numbers, knots, coefficients, s, t).predicted
+        felt = imu_rows(9.81, 0.001, knots, coefficients, s, t).predicted
+        return np.concatenate([seen.ravel(), felt.ravel()])
+
+    at = np.concatenate([c.ravel(), sensor])
+    weights = rng.standard_normal(len(predicted(at)))
+    to_c, to_s = np.zeros(c.size), np.zeros(13)
+    rows = camera_rows(numbers, knots, c, sensor, t)
+    gathered(rows.span, rows.basis, rows.by, weights[:14].reshape(7, 2), to_c, to_s)
+    rows = imu_rows(9.81, 0.001, knots, c, sensor, t)
+    gathered(rows.span, rows.basis, rows.by, weights[14:].reshape(7, 3), to_c, to_s)
+    found = np.concatenate([to_c, to_s])
+    for k in range(len(at)):
+        step = 1e-6 if k < c.size else 1e-6 * max(abs(at[k]), 1e-2)
+        ahead, back = at.copy(), at.copy()
+        ahead[k] += step
+        back[k] -= step
+        slope = weights @ (predicted(ahead) - predicted(back)) / (2.0 * step)
+        assert abs(slope - found[k]) < 1e-5 * (1.0 + abs(slope)), k
+
+
+def test_sums_are_those_of_the_dense_matrices() -> None:
+    rng = np.random.default_rng(1)
+    knots = Knots.over(0.0, 0.5, 0.05)
+    t = rng.uniform(0.0, 0.5, 40)
+    span, basis = basis_rows(knots, t)
+    by, weight = rng.standard_normal((40, 2, SIZE)), rng.uniform(0.0, 2.0, (40, 2))
+    n = 2 * knots.count
+    A, B, C = np.zeros((BAND, n)), np.zeros((n, 13)), np.zeros((13, 13))
+    normal_sums(span, basis, by, weight, A, B, C)
+    J = np.zeros((80, n + 13))
+    for i in range(40):
+        for channel in range(2):
+            row = J[2 * i + channel]
+            for d in range(3):
+                row[2 * span[i] : 2 * span[i] + 12 : 2] += by[i, channel, 2 * d] * basis[i, d]
+                row[2 * span[i] + 1 : 2 * span[i] + 12 : 2] += by[i, channel, 2 * d + 1] * basis[i, d]
+            row[n:] = by[i, channel, 6:]
+    N = J.T @ (weight.reshape(-1, 1) * J)
+    scale = np.abs(N).max()
+    for k in range(BAND):
+        assert np.abs(A[k, : n - k] - np.diagonal(N[:n, :n], -k)).max() < 1e-12 * scale
+    assert np.abs(B - N[:n, n:]).max() < 1e-12 * scale
+    assert np.abs(C - N[n:, n:]).max() < 1e-12 * scale
+    assert np.abs(np.tril(N[:n, :n], -BAND)).max() == 0.0
+
+
+RIG = SimulatedRig()
+MEAN_ALIGN_START = prior_settings(NUMBERS).mean
+
+
+@pytest.fixture(scope="module")
+def swing() -> AlignLog:
+    return align_log(twin_log(RIG, "swing", {"phi_rad": "0.5"}, 1))
+
+
+def test_a_swing_shows_offset_and_mount(swing: AlignLog) -> None:
+    pieces, said = pieces_of([swing], NUMBERS, MEAN_ALIGN_START)
+    first = start(pieces, [swing], 0.0)
+    assert said == []
+    assert first.moves
+    assert first.time_offset_s == pytest.approx(0.025, abs=0.0051)
+    assert first.factor == pytest.approx(1.0, abs=0.05)
+    assert first.mount_angle_rad == pytest.approx(0.0158, abs=0.01)
+    shown = correlation(pieces)
+    assert shown.offset_s[np.argmax(shown.value)] == pytest.approx(0.025, abs=0.0051)
+
+
+@pytest.mark.parametrize(("factor", "words"), [(57.2958, "in deg/s"), (-1.0, "the other way round")])
+def test_a_gyroscope_in_other_units_is_refused(swing: AlignLog, factor: float, words: str) -> None:
+    wrong = replace(swing, readings=swing.readings * np.array([1.0, 1.0, factor]))
+    pieces, _ = pieces_of([wrong], NUMBERS, MEAN_ALIGN_START)
+    with pytest.raises(BadInputError, match=words):
+        start(pieces, [wrong], 0.025)
+
+
+SIZE_ALIGNING = RIG.view.camera.image_size_px
+
+
+@pytest.fixture(scope="module")
+def log() -> Log:
+    return twin_log(RIG, "swing", {"phi_rad": "0.5"}, 1)
+
+
+def _rig_file() -> Rig:
+    view = RIG.view
+    R, t, K = view.R_CW, view.t_CW_m, view.camera.K
+    A = K @ np.column_stack([R[:, 0], R[:, 1], t])
+    k1, k2 = view.camera.distortion[:2].tolist()
+    camera = Camera(
+        model="radial2",
+        image_size_px=list(SIZE_ALIGNING),
+        fx_px=view.camera.fx_px,
+        fy_px=view.camera.fy_px,
+        cx_px=view.camera.cx_px,
+        cy_px=view.camera.cy_px,
+        distortion=Distortion(k1=k1, k2=k2),
+        verdict="ok",
+    )
+    plane = Plane(
+        R_CW=R.tolist(),
+        t_CW_m=t.tolist(),
+        A_px_per_m=A.tolist(),
+        A_inverse=np.linalg.inv(A).tolist(),
+        rms_px=0.0,
+        rms_mm=0.0,
+        sigma_marker_mm={"calibration_max": 0.06},
+        verdict="ok",
+    )
+    return Rig(camera=camera, plane=plane)
+
+
+def _changed(log: Log, **columns: object) -> Log:
+    kept = dict(log.columns)
+    for name, value in columns.items():
+        if value is None:
+            kept.pop(name)
+        else:
+            kept[name] = np.asarray(value)
+    return replace(log, columns=kept)
+
+
+def test_a_marker_outside_of_the_picture_counts_as_blank(log: Log, tmp_path: Path) -> None:
+    u = log.columns["u_px"].copy()
+    rows = np.flatnonzero(np.isfinite(u))
+    u[rows[:7]] = -40.0
+    write_log(tmp_path / "log.csv", _changed(log, u_px=u))
+    read, said = read_align_log(tmp_path / "log.csv", SIZE_ALIGNING)
+    assert read is not None
+    assert len(read.pixels) == len(rows) - 7
+    assert "7 pictures put the marker outside the image" in said[0]
+
+
+def test_the_section_is_what_the_estimator_reads(log: Log, tmp_path: Path) -> None:
+    whole = _rig_file()
+    logs = [align_log(log)]
+    found = align(logs, settings_from_rig(whole, Path("rig.yaml"), logs))
+    section = align_section(found, judge_align(found))
+    path = tmp_path / "rig.yaml"
+    write_rig(path, whole.model_copy(update={"align": section}), {})
+    back = read_rig(path)
+    assert back.align == section
+    assert section.covariance is not None
+    assert section.covariance.order == list(SENSOR)
+    setup, _ = setup_from_rig(back, path, Periods(1 / 60, 0.01, 1.0, False, 100, 100))
+    for name in ("time_offset_s", "mount_angle_rad", "gyro_scale", "gyro_bias_radps", "marker_offset_m"):
+        k = SENSOR.index(name)
+        assert setup.start.sensor[k] == found.sensor[k]
+        assert setup.start.sensor_sigma[k] == pytest.approx(found.sigma[k])
+    truth = known(RIG).truth
+    assert abs(section.time_offset_s - truth[SENSOR.index("time_offset_s")]) < 1e-3
+
+
+def _mixture(found: Alignment, drawn: float, sigma: float, doubt: float) -> tuple[FloatArray, FloatArray]:
+    """Mean and covariance after a reading of d of two kinds, by information matrices and their sum."""
+    at = SENSOR.index("marker_offset_m")
+    scale = found.sigma
+    own, start = np.linalg.inv(found.covariance / np.outer(scale, scale)), found.sensor / scale
+    means, covariances, weights = [], [], []
+    for share, room in ((1.0 - doubt, sigma), (doubt, np.hypot(sigma, 3e-3))):
+        information = own.copy()
+        information[at, at] += (scale[at] / room) ** 2
+        right = own @ start
+        right[at] += drawn / room**2 * scale[at]
+        covariances.append(np.linalg.inv(information))
+        means.append(covariances[-1] @ right)
+        weights.append(share * norm.pdf(drawn, found.sensor[at], np.hypot(scale[at], room)))
+    share = np.array(weights) / np.sum(weights)
+    mean = share @ np.array(means)
+    covariance = sum(
+        w * (C + np.outer(m - mean, m - mean)) for w, m, C in zip(share, means, covariances, strict=True)
+    )
+    return mean * scale, covariance * np.outer(scale, scale)
+
+
+@pytest.mark.parametrize("apart", [-8.0, -1.5, 0.2, 2.0, 3.0, 8.0])
+def test_the_drawing_is_one_more_reading_of_the_marker(log: Log, apart: float) -> None:
+    found = align([align_log(log)], settings_from_rig(_rig_file(), Path("rig.yaml"), []))
+    at = SENSOR.index("marker_offset_m")
+    drawn = float(found.sensor[at] + apart * found.sigma[at])
+    told, said = with_drawn_marker(found, Geometry(marker_offset_m=drawn, marker_offset_sigma_m=1e-4))
+    mean, covariance = _mixture(found, drawn, 1e-4, 0.02)
+    assert np.all(np.abs(told.sensor - mean) < 1e-5 * found.sigma)
+    np.testing.assert_allclose(told.covariance, covariance, atol=1e-6 * found.sigma.max() ** 2, rtol=1e-4)
+    np.testing.assert_array_equal(told.covariance, told.covariance.T)
+    assert np.linalg.eigvalsh(told.covariance / np.outer(found.sigma, found.sigma)).min() > 0.0
+    assert ("contradict" in said[0]) == (abs(apart) > 5.0)
+    if abs(apart) < 1.0:
+        assert told.sigma[at] < 2e-4 < found.sigma[at]
+        # What was one number with the marker is known with it.
+        assert told.sigma[SENSOR.index("imu_lever_m")] < 0.7 * found.sigma[SENSOR.index("imu_lever_m")]
+        assert told.rest_angle_sigma <= found.rest_angle_sigma
+        assert "as drawn" in said[0] and "measure it" not in said[0]
+
+
+def test_a_drawing_that_nobody_wrote_down_is_doubted_more(log: Log) -> None:
+    found = align([align_log(log)], settings_from_rig(_rig_file(), Path("rig.yaml"), []))
+    nominal, said = with_drawn_marker(found, Geometry())
+    written, _ = with_drawn_marker(found, Geometry(marker_offset_m=0.015))
+    at = SENSOR.index("marker_offset_m")
+    assert written.sigma[at] < nominal.sigma[at] < found.sigma[at]
+    assert "measure it and write it down" in said[0]
+
+
+def test_sigma_grows_where_the_marker_is_not_where_it_was_drawn() -> None:
+    """Markers half a millimetre off, and nobody knows: sigma follows the error, a firm prior's does not."""
+    rng = np.random.default_rng(4)
+    at, own, drawn = SENSOR.index("marker_offset_m"), 2.5e-4, Geometry()
+    covariance = np.diag(np.full(len(SENSOR), 1e-6))
+    covariance[at, at] = own * own
+    blank = Alignment(**{field.name: None for field in fields(Alignment)})
+    mixed, firm = [], []
+    room = drawn.marker_offset_sigma_m**2
+    for _ in range(2000):
+        true = drawn.marker_offset_m + rng.normal(0.0, 5e-4)
+        sensor = np.zeros(len(SENSOR))
+        sensor[at] = true + rng.normal(0.0, own)
+        told, _ = with_drawn_marker(replace(blank, sensor=sensor, covariance=covariance), drawn)
+        mixed.append((told.sensor[at] - true) ** 2 / told.covariance[at, at])
+        mean = (sensor[at] * room + drawn.marker_offset_m * own**2) / (own**2 + room)
+        firm.append((mean - true) ** 2 * (1.0 / room + 1.0 / own**2))
+    assert np.mean(mixed) < 0.2 * np.mean(firm)

@@ -1,22 +1,51 @@
-"""The fused filter: accuracy and honesty on simulated rigs, and everything that can be wrong with a log."""
+"""The fused filter: filterpy's numbers, accuracy and honesty on varied rigs, and what can be wrong with a log."""
 
 from __future__ import annotations
 
+import importlib
+import math
+import pkgutil
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
 from estimatorlogs import SCENARIOS, rows_from, setup_for, simulated, truth
+from numba.core.dispatcher import Dispatcher
+from scipy.stats import truncnorm
 
+import calib.actuator
+import calib.estimator
+from calib.actuator.kinematics import forward as forward_of_sensors
 from calib.arrays import FloatArray
-from calib.estimator.bank import get
-from calib.estimator.consistency import Tally
+from calib.estimator import reference, sensors, smoother
+from calib.estimator.bank import get, new_bank, put
+from calib.estimator.baseline import Baseline, BaselineSetup
+from calib.estimator.clock import even_times, new_clock
+from calib.estimator.consistency import Tally, chi_square_band, nees
+from calib.estimator.expect import TOLD
 from calib.estimator.filter import Filter, starting_state
-from calib.estimator.kernel import CAMERA, TRACE
-from calib.estimator.sensors import SIZE
+from calib.estimator.kernel import CAMERA, CONSIDERED, IMU, REPORT, TRACE, event
+from calib.estimator.model import Kinematic
+from calib.estimator.noise import jitter_px, log_likelihood, tune
+from calib.estimator.reference import camera_terms, imu_terms
+from calib.estimator.rounding import truncated, update_terms
+from calib.estimator.sensors import SENSOR, SIZE
 from calib.estimator.setup import FLAGS, OUT, Rows, Setup
-from calib.estimator.smoother import banked, events_of, forward
+from calib.estimator.smoother import Events, banked, events_of, forward
+from calib.logs import Log
+from calib.replay import Trace, judged
+from calib.replaying import Periods, noise_at_rest, periods, rows_of, setup_from_rig, truth_of
+from calib.rig import Rig
+from calib.twin.camera_sensor import Tracker, marker_pixels
+from calib.twin.feedback import Firmware, FirmwareState, add_frame, add_imu
+from calib.twin.imu_sensor import Imu, ImuNoise, measure
+from calib.twin.rig import SimulatedRig, nominal_view, workspace_homography
+from calib.twin.scenarios import make_scenario, run_scenario
+from calib.twin.sensors import HeadMotion
+from calib.twin.simulate import log_of
 
 TARGET_MM = {"static": 0.08, "swing": 0.22, "ellipse": 0.19, "step": 0.22, "elongation": 0.18}
 TARGET_DEG = {"swing": 0.06}
@@ -136,14 +165,6 @@ def test_imu_alone_works_is_bounded_and_says_so() -> None:
     assert np.sqrt(np.mean(error**2)) < 1.0
 
 
-def test_no_sensor_at_all_is_the_prior() -> None:
-    setup, rows, _ = nominal()
-    rows.readings[:] = np.nan
-    out = Filter(setup).run(rows)
-    sane(out)
-    assert flag(out, "not_started").all()
-
-
 def test_outliers_are_gated() -> None:
     setup, rows, true = nominal("static")
     rng = np.random.default_rng(5)
@@ -199,12 +220,6 @@ def test_jumps_of_the_time_start_the_filter_again(jump: float) -> None:
     assert 1e3 * np.abs(out[-300:, 1] - true[-300:, 0]).mean() < 0.4
 
 
-def test_time_running_backwards_all_the_way_is_survived() -> None:
-    setup, rows, _ = nominal()
-    out = Filter(setup).run(replace(rows, t_s=rows.t_s[::-1].copy()))
-    sane(out)
-
-
 def test_small_disorder_and_repeated_rows_do_little() -> None:
     setup, rows, true = nominal()
     order = np.argsort(rows.t_s + np.random.default_rng(1).uniform(0.0, 0.012, len(rows)), kind="stable")
@@ -219,40 +234,550 @@ def test_small_disorder_and_repeated_rows_do_little() -> None:
     assert 1e3 * np.sqrt(np.mean((out[late, 1] - true[twice][late, 0]) ** 2)) < 0.35
 
 
-def test_a_marker_outside_of_the_picture_is_gated() -> None:
-    setup, rows, _ = nominal("static")
-    seen = np.nonzero(np.isfinite(rows.readings[:, 0]))[0][60::40]
-    rows.readings[seen, :2] = [-4000.0, 1e7]
-    out = Filter(setup).run(rows)
-    sane(out)
-    assert (out[seen, OUT.index("gated_camera")] == 1.0).all()
+def compiled(
+    setup: Setup, rows: Rows, seconds: float
+) -> tuple[Events, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Events of the first seconds, what was gated, states and covariances after each event, and the trace."""
+    events = smoother.events_of(setup, rows, outputs=False)
+    keep = events.t_s < rows.t_s[0] + seconds
+    events = Events(events.t_s[keep], events.kinds[keep], events.readings[keep], events.rows[keep])
+    levels, walk = setup.process.arrays()
+    n, constants, begin = len(events.t_s), np.array([9.81, 0.0]), float(events.t_s[0])
+    gated, trace, kept_x, kept_P = (
+        np.zeros((n, 3)), np.empty((n, 3, TRACE)), np.empty((n, 19)), np.empty((n, 19, 19)),
+    )  # fmt: skip
+    for again in (False, True):
+        x, P, w = starting_state(setup, rows)
+        smoother.forward(
+            events.t_s, begin, events.kinds, events.readings, *smoother.banked(x, P, w), 0.0,
+            levels[None], walk, setup.view, constants, setup.noise, again, gated, np.empty((n, 1)), trace,
+            kept_x, kept_P,
+        )  # fmt: skip
+    return events, gated, kept_x, kept_P, trace
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 5])
-def test_a_log_shorter_than_the_latency_gives_the_prior_and_what_it_has(count: int) -> None:
-    setup, rows, _ = nominal()
-    out = Filter(setup).run(part(rows, slice(0, count)))
-    assert len(out) == count
-    sane(out)
+def prepared(name: str, level: int = 2) -> tuple[Setup, Rows]:
+    rig, log = simulated(name, 1)
+    return setup_for(rig, 1, Kinematic((Kinematic().levels[level],))), rows_from(log)
 
 
-def test_readings_far_beyond_any_sensor_do_no_harm() -> None:
-    setup, rows, _ = nominal("static")
-    rows.readings[500:520, 2:] = 1e12
-    rows.readings[900:905, 4] = -1e300
-    rows.readings[1200:1203, :2] = 1e300
-    sane(Filter(setup).run(rows))
+@pytest.mark.parametrize("name", sorted(SCENARIOS))
+def test_compiled_filter_equals_filterpy(name: str) -> None:
+    setup, rows = prepared(name, 3 if name == "swing" else 2)
+    events, gated, x, P, _ = compiled(setup, rows, 4.0)
+    got_x, got_P = reference.extended(setup, rows, events, gated)
+    deviation = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+    np.testing.assert_allclose(x / deviation, got_x / deviation, rtol=0, atol=1e-9)
+    scale = deviation[:, :, None] * deviation[:, None, :]
+    np.testing.assert_allclose(P / scale, got_P / scale, rtol=0, atol=1e-9)
 
 
-def test_one_row_may_hold_both_sensors() -> None:
-    setup, rows, true = nominal()
-    ticks = np.nonzero(rows.kinds == 1)[0]
-    samples = np.nonzero(rows.kinds == 2)[0]
-    nearest = samples[np.clip(np.searchsorted(rows.t_s[samples], rows.t_s[ticks]), 0, len(samples) - 1)]
-    readings = rows.readings[ticks].copy()
-    readings[:, 2:] = rows.readings[nearest, 2:]
-    both = Rows(rows.t_s[ticks], readings, np.full(len(ticks), 3))
-    out = Filter(replace(setup, imu_period_s=1.0 / 60.0)).run(both)
-    sane(out)
-    late = out[:, 0] > 2.0
-    assert 1e3 * np.sqrt(np.mean((out[late, 1] - true[ticks][late, 0]) ** 2)) < 0.6
+def test_compiled_smoother_equals_matrices() -> None:
+    setup, rows = prepared("ellipse")
+    sigma, walks = setup.start.sensor_sigma.copy(), list(setup.process.sensor_walk)
+    for k in CONSIDERED:
+        sigma[k - 6], walks[k - 6] = 0.0, 0.0
+    setup = replace(
+        setup,
+        start=replace(setup.start, sensor_sigma=sigma),
+        process=replace(setup.process, sensor_walk=tuple(walks)),
+    )
+    events, _, x, P, trace = compiled(setup, rows, 2.0)
+    levels, _ = setup.process.arrays()
+    expected_x, expected_P = reference.extended_smoothed(setup, events, x, P)
+    deviation = np.sqrt(np.diagonal(P, axis1=1, axis2=2)) + 1e-12
+    smoother.backward(events.t_s, np.tile(levels[0], (len(x), 1)), trace, x, P, True)
+    np.testing.assert_allclose(x / deviation, expected_x / deviation, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(P[:, :2, :2], expected_P[:, :2, :2], rtol=1e-4, atol=1e-14)
+
+
+def test_unscented_filter_agrees_within_its_deviation() -> None:
+    setup, rows = prepared("ellipse")
+    events, gated, x, P, _ = compiled(setup, rows, 3.0)
+    got_x, _ = reference.unscented(setup, rows, events, gated)
+    late = events.t_s > rows.t_s[0] + 1.0
+    deviation = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+    away = (x - got_x)[late, :2] / deviation[late, :2]
+    assert np.sqrt(np.mean(away**2)) < 0.5
+
+
+def _one_event(
+    kind: int, z: list[float], levels: int = 4, setup: Setup | None = None
+) -> tuple[dict[str, float], tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
+    rig, log = simulated("static")
+    process = Kinematic(Kinematic().levels[:levels])
+    setup = setup or setup_for(rig, 0, process)
+    x, P, w = starting_state(setup, rows_from(log))
+    bank, weights = new_bank(2, levels), np.zeros((2, levels + 1))
+    put(bank, 0, x, P)
+    weights[0, :levels] = w
+    level, walk = process.arrays()
+    report = np.empty(len(REPORT))
+    event(
+        bank, weights, 0, 1, kind, np.array([z]), 0, 0.0, 0.3, level[None], 0, walk, setup.view,
+        np.array([9.81, 0.0]), setup.noise, np.zeros((levels, TOLD)), False, report, np.zeros((1, 3)),
+        np.empty((0, 3, TRACE)),
+    )  # fmt: skip
+    np.testing.assert_array_equal(get(bank, 0, levels)[0], x)
+    after = get(bank, 1, levels)
+    np.testing.assert_array_equal(after[1], np.swapaxes(after[1], 1, 2))
+    return dict(zip(REPORT, report.tolist(), strict=True)), (x, P), after
+
+
+@pytest.mark.parametrize("kind", [CAMERA, IMU])
+def test_an_event_is_joseph_s_form_reading_by_reading_but_for_what_is_considered(kind: int) -> None:
+    rig, log = simulated("static")
+    process = Kinematic(Kinematic().levels[:1])
+    setup = setup_for(rig, 0, process)
+    noise = setup.noise.copy()
+    noise[1] = 0.0
+    setup = replace(setup, noise=noise)
+    rows = rows_from(log)
+    row = np.nonzero(rows.kinds == kind)[0][3]
+    z = [*rows.readings[row, :2], np.nan] if kind == CAMERA else rows.readings[row, 2:].tolist()
+    _, (x, P), (got_x, got_P) = _one_event(kind, z, 1, setup)
+    H, out, held = np.zeros((3, SIZE)), np.empty(SIZE), list(CONSIDERED)
+    before, x, P = x[0], x[0].copy(), P[0].copy()
+    if kind == CAMERA:
+        camera_terms(setup.view, noise, before, P, H, out)
+        order, R = [0, 1], out[2:4] + noise[0] ** 2
+    else:
+        imu_terms(np.array([9.81, 0.0]), noise, before, P, H, out)
+        order, R = [2, 0, 1], out[3:6].copy()
+    for k in order:
+        S = H[k] @ P @ H[k] + R[k]
+        K = P @ H[k] / S
+        y = z[k] - out[k] - H[k] @ (x - before)
+        left = np.eye(SIZE) - np.outer(K, H[k])
+        updated, moved = left @ P @ left.T + R[k] * np.outer(K, K), x + y * K
+        updated[np.ix_(held, held)], moved[held] = P[np.ix_(held, held)], x[held]
+        x, P = moved, updated
+    sigma = np.sqrt(np.diag(P))
+    np.testing.assert_allclose(got_x[0] / sigma, x / sigma, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        got_P[0] / sigma / sigma[:, None], P / sigma / sigma[:, None], rtol=0, atol=1e-9
+    )
+    assert np.linalg.eigvalsh(got_P[0] / sigma / sigma[:, None])[0] > 0.0
+
+
+@pytest.mark.slow
+def test_covariance_stays_positive_definite_for_ten_million_steps() -> None:
+    rig, log = simulated("swing")
+    setup = setup_for(rig, 0, Kinematic(Kinematic().levels[:1]))
+    rows, filtered = rows_from(log), Filter(setup)
+    length = float(rows.t_s[-1]) + 0.01
+    filtered.run(rows)
+    many = 50
+    once = len(rows)
+    t = np.concatenate([rows.t_s + length * k for k in range(1, many + 1)])
+    readings, kinds = np.tile(rows.readings, (many, 1)), np.tile(rows.kinds, many)
+    done, turn = once, 1
+    while done < 1e7:
+        filtered.run(Rows(t + (turn - 1) * many * length, readings, kinds))
+        done += many * once
+        turn += 1
+    _, P, _ = filtered.state
+    np.testing.assert_array_equal(P[0], P[0].T)
+    scale = 1.0 / np.sqrt(np.diag(P[0]))
+    assert np.linalg.eigvalsh(P[0] * scale[:, None] * scale)[0] > 1e-12
+
+
+@pytest.mark.parametrize("a", [-9.0, -1.3, 0.0, 3.0, 6.1])
+@pytest.mark.parametrize("width", [0.01, 0.3, 1.0, 4.0])
+def test_moments_agree_with_scipy(a: float, width: float) -> None:
+    log_z, mean, variance = truncated(a, a + width)
+    expected = truncnorm(a, a + width)
+    tail = min(abs(a), abs(a + width)) > 6.0 and a * (a + width) > 0.0
+    assert mean == pytest.approx(float(expected.mean()), rel=2e-2 if tail else 1e-6, abs=1e-6)
+    assert variance == pytest.approx(float(expected.var()), rel=0.15 if tail else 1e-3)
+    z = expected.pdf(a + 0.5 * width)
+    middle = a + 0.5 * width
+    density = -0.5 * middle * middle - 0.5 * math.log(2.0 * math.pi)
+    assert log_z == pytest.approx(density - math.log(float(z)), rel=1e-2, abs=1e-5)
+
+
+def _average(jitter: float, rounded: bool, trials: int, count: int) -> float:
+    """Mean squared error over variance of a constant that is estimated from whole numbers."""
+    rng = np.random.default_rng(2)
+    total = 0.0
+    for _ in range(trials):
+        place = rng.uniform(-0.5, 0.5)
+        m, P = 0.0, 1.0
+        for z in np.rint(place + jitter * rng.standard_normal(count)):
+            if rounded:
+                y, S, _ = update_terms(z - m, P, jitter**2, 1.0)
+            else:
+                y, S = z - m, P + jitter**2 + 1.0 / 12.0
+            m, P = m + P / S * y, P - P * P / S
+        total += (m - place) ** 2 / P
+    return total / trials
+
+
+def test_intervals_are_honest_where_gaussian_noise_of_the_same_variance_is_not() -> None:
+    assert _average(0.15, True, 200, 400) < 3.0
+    assert _average(0.15, False, 200, 400) > 10.0
+    assert 0.6 < _average(0.4, True, 200, 200) < 1.5
+
+
+PERIOD = 0.01
+
+
+def jittered(count: int = 3000, jitter: float = 4e-4, seed: int = 0) -> tuple[FloatArray, FloatArray]:
+    true = 5.0 + 1.0002 * PERIOD * np.arange(count)
+    return true, true + jitter * np.random.default_rng(seed).standard_normal(count)
+
+
+def rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def test_jitter_is_removed() -> None:
+    true, stamps = jittered()
+    error = even_times(new_clock(PERIOD), stamps) - true
+    assert rms(error[500:]) < 0.15 * 4e-4
+
+
+def test_missing_samples_are_counted() -> None:
+    true, stamps = jittered()
+    keep = np.random.default_rng(1).uniform(size=len(true)) > 0.1
+    keep[1000:1040] = False
+    error = even_times(new_clock(PERIOD), stamps[keep]) - true[keep]
+    assert rms(error[500:]) < 0.2 * 4e-4
+    assert np.abs(error[500:]).max() < 4e-4
+
+
+def test_jumps_start_the_clock_again() -> None:
+    true, stamps = jittered()
+    for jump in (3600.0, -3.0, 0.005):
+        moved, shifted = true.copy(), stamps.copy()
+        moved[1500:] += jump
+        shifted[1500:] += jump
+        error = even_times(new_clock(PERIOD), shifted) - moved
+        assert np.isfinite(error).all()
+        assert rms(error[2200:]) < 0.3 * 4e-4
+
+
+@pytest.mark.parametrize("jitter", [0.2, 0.5])
+def test_jitter_is_recovered_from_whole_pixels(jitter: float) -> None:
+    nominal = SimulatedRig()
+    rig = replace(nominal, tracker=replace(nominal.tracker, jitter_px=jitter))
+    log = log_of(run_scenario(make_scenario("ellipse"), rig, 3, "sensors", 12.0))
+    found = jitter_px(setup_for(nominal), [rows_from(log)])
+    assert found.sigma is not None and found.sigma < 0.15
+    assert abs(np.log(found.value / jitter)) < max(4.0 * found.sigma, 0.12)
+
+
+def test_tuning_mends_a_level_that_is_far_too_loud() -> None:
+    rig, log = simulated("swing", 1)
+    levels = Kinematic().levels
+    loud = replace(levels[3], accel_phi_radps2=levels[3].accel_phi_radps2 * 8.0)
+    setup = setup_for(rig, 1, Kinematic((levels[0], loud)))
+    rows = rows_from(log)
+    short = Rows(rows.t_s[:500], rows.readings[:500], rows.kinds[:500])
+    steps: list[int] = []
+    found = tune(setup, [short], lambda done, total: steps.append(done))
+    assert found.after > found.before
+    assert found.after == pytest.approx(log_likelihood(found.setup, [short]))
+    assert found.factors["swing_phi"].value < 0.7
+    assert found.rows == 500 and len(steps) == 4
+
+
+R = 0.0125
+
+
+def made(count: int, seed: int = 0, inflation: float = 1.0) -> tuple[FloatArray, FloatArray]:
+    """Output rows with errors of a known covariance of length and angle, and the truth."""
+    rng = np.random.default_rng(seed)
+    C = np.array([[1e-8, 3e-8], [3e-8, 4e-6]])
+    error = rng.multivariate_normal([0.0, 0.0], C, count)
+    out = np.full((count, len(OUT)), np.nan)
+    out[:, 0] = 0.01 * np.arange(count)
+    length, phi = 0.07 + error[:, 0], 0.2 + error[:, 1]
+    out[:, 1], out[:, 2], out[:, 5] = length + R * phi, length - R * phi, phi
+    for k, sign in ((10, 1.0), (11, -1.0)):
+        out[:, k] = np.sqrt(C[0, 0] + R**2 * C[1, 1] + 2.0 * sign * R * C[0, 1]) * inflation
+    out[:, 12] = np.sqrt(C[1, 1]) * inflation
+    for column in ("nis_camera", "nis_accel"):
+        out[:, OUT.index(column)] = rng.chisquare(2, count)
+    e = rng.standard_normal((count, 5))
+    out[:, OUT.index("e_u") : OUT.index("e_u") + 5] = e
+    out[:, OUT.index("nis_gyro")] = e[:, 4] ** 2
+    out[:, OUT.index("gated_camera") : OUT.index("gated_camera") + 3] = 0.0
+    out[:, OUT.index("log_likelihood")] = 1.0
+    out[:, OUT.index("flags")] = 0.0
+    truth = np.tile([0.07 + R * 0.2, 0.07 - R * 0.2, 0.2], (count, 1))
+    return out, truth
+
+
+def test_nees_of_an_honest_covariance_is_two() -> None:
+    out, truth = made(20_000)
+    values = nees(out, truth[:, :2], truth[:, 2], R)
+    low, high = chi_square_band(2, len(values))
+    assert low < values.mean() < high
+    out, truth = made(20_000, inflation=0.5)
+    assert nees(out, truth[:, :2], truth[:, 2], R).mean() == pytest.approx(8.0, rel=0.05)
+
+
+def test_coloured_innovations_are_seen() -> None:
+    out, _ = made(3000)
+    column = OUT.index("e_u")
+    out[1:, column] = 0.8 * out[:-1, column] + 0.6 * out[1:, column]
+    tally = Tally(R)
+    tally.add(out)
+    check = tally.check("camera")
+    assert check is not None and check.correlation > 5.0 * check.bound
+    assert tally.rmse() == {}
+
+
+SPREAD = np.array(
+    [
+        0.7,
+        0.01,
+        10.0,
+        0.5,
+        300.0,
+        10.0,
+        0.01,
+        0.1,
+        0.1,
+        0.1,
+        0.02,
+        0.005,
+        0.003,
+        0.02,
+        1e-3,
+        1e-3,
+        0.02,
+        0.01,
+        0.01,
+    ]
+)
+MIDDLE_SENSORS = np.zeros(19)
+MIDDLE_SENSORS[1], MIDDLE_SENSORS[11], MIDDLE_SENSORS[12] = 0.07, 0.006, 0.015
+
+
+def view() -> FloatArray:
+    seen = nominal_view()
+    return sensors.view_coefficients(seen.camera, seen.R_CW, seen.t_CW_m)
+
+
+def states(count: int) -> FloatArray:
+    """Random motions, straight and nearly straight ones among them."""
+    out = MIDDLE_SENSORS + SPREAD * np.random.default_rng(4).uniform(-1.0, 1.0, (count, 19))
+    out[0] = MIDDLE_SENSORS
+    out[1:8, 0] = 10.0 ** -np.arange(1.0, 15.0, 2.0)
+    return np.asarray(out)
+
+
+def readings(state: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """All five readings (5,) and their gradients (5, 19)."""
+    by = np.empty((5, 19))
+    u, v = sensors.marker(view(), state, by[0], by[1])
+    ax, ay = sensors.accelerometer(9.81, 0.002, state, by[2], by[3])
+    return np.array([u, v, ax, ay, sensors.gyroscope(state, by[4])]), by
+
+
+def test_gradients_agree_with_differences() -> None:
+    for state in states(60):
+        _, by = readings(state)
+        for k in range(19):
+            h = 1e-4 * SPREAD[k]
+            step = h * (np.arange(19) == k)
+            low2, low, high, high2 = (readings(state + a * step)[0] for a in (-2.0, -1.0, 1.0, 2.0))
+            difference = (low2 - high2 + 8.0 * (high - low)) / (12.0 * h)
+            np.testing.assert_allclose(by[:, k], difference, rtol=1e-6, atol=1e-6 * np.abs(by).max())
+
+
+def test_marker_agrees_with_the_simulated_camera() -> None:
+    rows = states(40)
+    rows[:, 13:] = 0.0
+    rows[:, 12] = 0.015
+    r = 0.0126
+    q = np.stack([rows[:, 1] + r * rows[:, 0], rows[:, 1] - r * rows[:, 0]], axis=1)
+    pixels, _ = sensors.marker_rows(view(), rows)
+    np.testing.assert_allclose(pixels, marker_pixels(nominal_view(), Tracker(), q, r), rtol=0, atol=1e-9)
+    for row, pose in zip(rows, forward_of_sensors(q, r), strict=True):
+        np.testing.assert_allclose(sensors.head_position(row[0], row[1]), pose[:2], atol=1e-15)
+
+
+def test_accelerometer_and_gyroscope_agree_with_the_simulated_imu() -> None:
+    rows = states(40)
+    rows[:, 9] = 0.05
+    rows[:, 17], rows[:, 18] = 0.004, -0.003
+    rows[:, 10] = -0.01
+    rows[:, 11] = 0.006
+    rows[:, 6:9] = 0.01, 0.05, -0.04
+    imu = replace(
+        Imu(), mount_angle_rad=0.05, lever_m=(0.002, 0.006), gyro_scale=(0.0, 0.0, -0.01),
+        accel_scale=(0.004, -0.003, 0.0), gyro_step_radps=0.0, accel_step_mps2=0.0,
+        accel_range_mps2=1e6, gyro_range_radps=1e6,
+    )  # fmt: skip
+    n = len(rows)
+    noise = ImuNoise(
+        np.zeros(n), np.zeros(n), np.tile([0.0, 0.0, 0.01], (n, 1)), np.tile([0.05, -0.04, 0.0], (n, 1)),
+        np.zeros(n),
+    )  # fmt: skip
+    motion = _head_motion(rows)
+    force, rate = measure(imu, noise, slice(0, n), motion)
+    mine = np.array([readings(row)[0] for row in rows])
+    np.testing.assert_allclose(mine[:, 2:4], force[:, :2], rtol=1e-6, atol=1e-5)
+    np.testing.assert_allclose(mine[:, 4], rate[:, 2], atol=1e-12)
+
+
+def _head_motion(rows: FloatArray) -> HeadMotion:
+    """Motion of the head by differences of its position along a parabola in phi and l."""
+    h = 1e-4
+
+    def place(t: float) -> FloatArray:
+        phi = rows[:, 0] + t * rows[:, 2] + 0.5 * t * t * rows[:, 4]
+        length = rows[:, 1] + t * rows[:, 3] + 0.5 * t * t * rows[:, 5]
+        return np.asarray(
+            forward_of_sensors(np.stack([length + 0.01 * phi, length - 0.01 * phi], axis=1), 0.01)[:, :2]
+        )
+
+    five = [place(k * h) for k in (-2, -1, 0, 1, 2)]
+    a = (-five[0] + 16.0 * five[1] - 30.0 * five[2] + 16.0 * five[3] - five[4]) / (12.0 * h * h)
+    return HeadMotion(rows[:, 0], rows[:, 2], rows[:, 4], five[2], a)
+
+
+@pytest.mark.parametrize("package", [calib.estimator, calib.actuator])
+def test_no_function_may_round_as_its_compilation_happens_to_be(package: ModuleType) -> None:
+    """States are the same bytes whether functions were compiled here, elsewhere or in another order."""
+    found = []
+    for info in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
+        module = importlib.import_module(info.name)
+        found += [one for one in vars(module).values() if isinstance(one, Dispatcher)]
+    assert len(found) > 5
+    assert not [one.__name__ for one in found if one.targetoptions.get("fastmath")]
+
+
+def test_it_is_the_firmware_of_the_simulated_rig() -> None:
+    rig, log = simulated("ellipse", 1)
+    to_plane = np.linalg.inv(workspace_homography(rig.view))
+    rows = rows_from(log)
+    made = Baseline(BaselineSetup(to_plane, rig.plant.bellows_radius_m, rig.plant.rest_length_m)).run(rows)
+    firmware = Firmware(to_plane, rig.plant.bellows_radius_m, rig.plant.rest_length_m, 0.015, 100.0)
+    state = FirmwareState()
+    for i in range(600):
+        u, v, ax, ay, gz = rows.readings[i].tolist()
+        if rows.kinds[i] == 2:
+            state = add_imu(firmware, state, ax, ay, gz)
+            continue
+        state, seen = add_frame(firmware, state, u, v)
+        assert np.allclose(made[i, 1:4], [*seen.q_m, seen.phi_rad], rtol=0, atol=1e-12)
+
+
+GOOD = {"degrees": 2, "readings": 900, "gated": 2, "nis": 2.1, "inside": 0.95, "correlation": 0.02}
+
+
+@pytest.mark.parametrize(("rows", "step"), [(100, 1), (12_000, 1), (30_000, 4), (200_000, 32)])
+def test_a_trace_keeps_every_k_th_row_whatever_the_blocks(rows: int, step: int) -> None:
+    values = np.arange(float(rows))[:, None]
+    for size in (rows, 997, 4096):
+        trace = Trace()
+        for begin in range(0, rows, size):
+            trace.add(values[begin : begin + size])
+        kept = trace.values[:, 0]
+        assert len(kept) <= 12_000 + 4096
+        steps = np.unique(np.diff(kept))
+        assert len(steps) == 1
+        if size == 997:
+            assert steps[0] == step
+    assert Trace().values.shape == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"nis": 9.0}, "the innovations of the camera are 4.5 times what the covariance expects"),
+        ({"nis": 0.2}, "the innovations of the camera are 0.1 times"),
+        ({"inside": 0.5}, "only 50 % of the camera's innovations lie in their 95 % band"),
+        ({"gated": 300}, "25 % of the camera's readings were gated out"),
+    ],
+)
+def test_innovations_that_contradict_their_covariance_are_poor(change: dict[str, float], words: str) -> None:
+    reasons, _ = judged({"camera": {**GOOD, **change}}, {}, 1000)
+    assert len(reasons) == 1 and words in reasons[0]
+
+
+@pytest.mark.parametrize("correlation", [0.8, -0.8])
+def test_innovations_that_are_not_white_are_remarked_on(correlation: float) -> None:
+    reasons, remarks = judged({"accel": {**GOOD, "correlation": correlation}}, {}, 1000)
+    assert reasons == []
+    assert remarks == [f"the innovations of the accel are not white: {correlation:.2f} with the one before"]
+
+
+ALIGN = {
+    "time_offset_s": 0.031,
+    "mount_angle_rad": 0.01,
+    "rest_angle_rad": 0.01,
+    "gyro_scale": 0.002,
+    "gyro_bias_radps": 0.001,
+    "accel_bias_mps2": [0.1, -0.2],
+    "accel_scale": [0.001, 0.002],
+    "imu_lever_m": 0.007,
+    "marker_offset_m": 0.016,
+    "plane_shift_m": [1e-5, 2e-5],
+    "plane_stretch": 1e-4,
+    "jitter_px": 0.4,
+    "outlier_share": 0.0,
+    "accel_noise_mps2": [0.02, 0.02],
+    "gyro_noise_radps": 0.003,
+    "verdict": "ok",
+}
+BLIND = Periods(math.nan, 0.01, 0.0, False, 0, 100)
+
+
+def log_of_replaying(t: list[float], **columns: list[float]) -> Log:
+    made = {name: np.array(values) for name, values in columns.items()}
+    return Log("made", np.array(t), made, np.arange(len(t)))
+
+
+def test_commands_in_rows_of_their_own_are_no_clock_of_the_camera() -> None:
+    nan = math.nan
+    log = log_of_replaying(
+        [0.0, 0.01, 0.02, 0.03],
+        u_px=[1.5, nan, nan, nan],
+        v_px=[2.0, nan, nan, nan],
+        pwm1=[nan, 5.0, 5.0, 5.0],
+        gz_radps=[nan, nan, nan, 0.1],
+    )
+    found = periods(log)
+    assert not found.ticks and found.grid_px == 0.0 and math.isnan(found.camera_s)
+    assert rows_of(log, found.ticks).kinds.tolist() == [1, 0, 0, 2]
+    assert truth_of(log) is None
+
+
+def test_noise_is_that_at_rest_unless_the_moving_rig_shakes() -> None:
+    size = {
+        "rate_hz": 100.0, "gyro_noise_radps_per_sqrt_Hz": [None, None, 2e-4],
+        "accel_noise_mps2_per_sqrt_Hz": [1.8e-3, 1e-3, None],
+    }  # fmt: skip
+    others = (
+        "gyro_bias_radps", "gyro_instability_radps", "gyro_walk_radps2_per_sqrt_Hz", "accel_mean_mps2",
+        "accel_instability_mps2", "accel_walk_mps3_per_sqrt_Hz", "gyro_step_radps", "accel_step_mps2",
+    )  # fmt: skip
+    imu = {**{name: [None, None, None] for name in others}, **size, "verdict": "ok"}
+    made = Rig.model_validate({"align": ALIGN, "imu": imu})
+    # 0.02 in the alignment: a little more than 0.018 at rest, twice as much as 0.01.
+    np.testing.assert_allclose(noise_at_rest(made, BLIND), [0.018, 0.02, 0.002])
+    np.testing.assert_allclose(
+        setup_from_rig(made, Path("rig.yaml"), BLIND)[0].noise[2:5], [0.02, 0.02, 0.003]
+    )
+    tuned = {"jitter_px": 0.5, "verdict": "ok", "accel_noise_mps2": 0.03}
+    assert noise_at_rest(Rig.model_validate({"imu": imu, "estimator": tuned}), BLIND) is None
+    assert noise_at_rest(Rig.model_validate({"align": ALIGN}), BLIND) is None
+
+
+def test_the_covariance_of_the_alignment_is_carried() -> None:
+    order = ["mount_angle_rad", "accel_bias_y_mps2"]
+    values = [[1e-4, -9.8e-4], [-9.8e-4, 9.7e-3]]
+    made = Rig.model_validate({"align": {**ALIGN, "covariance": {"order": order, "values": values}}})
+    setup, _ = setup_from_rig(made, Path("rig.yaml"), BLIND)
+    P = setup.start.covariance()
+    at = [6 + SENSOR.index(name) for name in order]
+    np.testing.assert_allclose(P[np.ix_(at, at)], values, rtol=1e-3)
+    assert np.linalg.eigvalsh(P[6:, 6:])[0] > 0.0
+    # Together they are known far better than either.
+    both = np.array([9.81, 1.0])
+    assert both @ P[np.ix_(at, at)] @ both < 1e-3 < 9.81**2 * P[at[0], at[0]]

@@ -2,31 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from estimatorlogs import SIGMA, rows_from, setup_for, simulated, truth, truth_of_sensors
 
 from calib.estimator import smoother
-from calib.estimator.bank import get, new_bank, predict, put
 from calib.estimator.consistency import Tally
 from calib.estimator.filter import Filter
-from calib.estimator.model import Kinematic
-from calib.estimator.sensors import SIZE, sensor_values, view_coefficients
-from calib.estimator.setup import Start
-
-
-def test_transition_is_that_of_the_prediction() -> None:
-    levels, walk = Kinematic().arrays()
-    F = np.empty((SIZE, SIZE))
-    for dt in (0.0, 0.004, 0.07):
-        smoother.transition(levels[1], dt, F)
-        x = np.random.default_rng(1).standard_normal(SIZE)
-        bank = new_bank(1, 1)
-        put(bank, 0, x[None], np.zeros((1, SIZE, SIZE)))
-        predict(bank, 0, levels[None, 1:], 0, 0, walk, dt)
-        np.testing.assert_allclose(F @ x, get(bank, 0, 1)[0][0], rtol=1e-12, atol=1e-14)
+from calib.estimator.sensors import sensor_values, view_coefficients
+from calib.estimator.setup import OUT, Start
+from calib.logs import Log
+from calib.replaying import periods
+from calib.smoothing import smooth_log
+from calib.statesfile import STATES
 
 
 @pytest.mark.parametrize("name", ["swing", "ellipse", "elongation"])
@@ -98,12 +90,20 @@ def test_windows_hardly_matter(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_allclose(np.median(cut[:, 10]), np.median(whole[:, 10]), rtol=0.2)
 
 
-def test_events_come_in_order_and_pictures_at_their_exposure() -> None:
-    rig, log = simulated("swing")
-    setup, rows = setup_for(rig), rows_from(log)
-    events = smoother.events_of(setup, rows)
-    assert (np.diff(events.t_s) >= 0.0).all()
-    pictures = events.kinds == 1
-    delay = rows.t_s[events.rows[pictures]] - events.t_s[pictures]
-    np.testing.assert_allclose(delay, setup.start.sensor[7], atol=1.5e-3)
-    assert (events.kinds == 0).sum() == len(rows)
+def cut(log: Log, pieces: int) -> Iterator[Log]:
+    for part in np.array_split(np.arange(len(log)), pieces):
+        yield replace(log, t_s=log.t_s[part], columns={k: v[part] for k, v in log.columns.items()})
+
+
+def test_blocks_make_no_difference_and_the_states_are_the_smoother_s(tmp_path: Path) -> None:
+    rig, log = simulated("ellipse", 1)
+    setup, found = setup_for(rig, 1), periods(log)
+    after, before, traced = smooth_log(setup, found, cut(log, 4), tmp_path / "states.csv")
+    again, _, _ = smooth_log(setup, found, [log], None)
+    assert after.rmse() == again.rmse()
+    assert after.rmse()["mean_q_mm"] < 0.7 * before.rmse()["mean_q_mm"]
+    lines = (tmp_path / "states.csv").read_text().splitlines()
+    assert lines[0].split(",") == list(STATES)
+    assert len(lines) == 1 + len(log)
+    q1 = [float(line.split(",")[1]) for line in lines[1:]]
+    np.testing.assert_allclose(q1, traced[0][:, OUT.index("q1_m")], rtol=1e-8)
