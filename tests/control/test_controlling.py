@@ -1,19 +1,17 @@
-"""Controllers on the simulated rig: the figures that were promised, with simulated sensors."""
+"""Controllers on the simulated rig: the figures that were promised, and how they are measured."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from control_models import NOMINAL
 
+from calib.control.measures import tracking
 from calib.control.references import BUILT_IN, Reference, built_in, from_lengths
-from calib.controlling import (
-    CONTROLLERS,
-    Outcome,
-    control_model,
-    run_controller,
-)
+from calib.controlling import CONTROLLERS, Outcome, control_model, run_controller
 from calib.twin.closed_loop import EllipseTrack, Elongation, Orientation
 from calib.twin.rig import SimulatedRig
 
@@ -131,3 +129,41 @@ def test_a_controller_may_read_the_sensors_themselves() -> None:
     assert np.array_equal(np.array(rows)[:, :2], run.accel_mps2[: len(rows), :2])
     assert 98 <= len(rows) <= 100
     assert np.array_equal(np.array([seen.marker_px for seen in read]), run.pixels, equal_nan=True)
+
+
+R, H = NOMINAL.plant.bellows_radius_m, NOMINAL.tick_s
+
+
+def _tracking(reference: Reference, q: np.ndarray, pwm: np.ndarray | None = None):
+    return tracking(reference, q, np.zeros_like(q) if pwm is None else pwm, R, 0.0, 255.0)
+
+
+def test_a_constant_error_is_its_own_rms() -> None:
+    reference = built_in(NOMINAL, "ellipse")
+    q = reference.q_m + np.array([1e-3, -1e-3])
+    q[:120] += 0.005
+    found = _tracking(reference, q)
+    assert found.rms_mm == pytest.approx((1.0, 1.0))
+    assert found.largest_mm == pytest.approx(1.0)
+    assert found.angle_rms_rad == pytest.approx(1e-3 / R)
+    assert found.rms_from_start_mm[0] == pytest.approx(math.sqrt(0.9 + 0.1 * 36.0))
+    assert found.rise_s is None and found.jump_overshoot_rad is None
+    # An error in the angle alone moves the head sideways by about half of l times the angle.
+    assert found.head_rms_mm == pytest.approx(1e3 * 0.5 * 0.08 * 1e-3 / R, rel=0.1)
+
+
+def test_the_figures_of_a_step_and_a_jump() -> None:
+    reference = built_in(NOMINAL, "jump")
+    t = reference.t_s
+    phi = np.where(t < 5.0, np.minimum(0.7 * t, 0.75), np.maximum(0.75 - 0.3 * (t - 5.0), 0.25))
+    phi[(t >= 2.0) & (t < 5.0)] = 0.701
+    phi[t >= 8.0] = 0.301
+    q = 0.08 + R * np.stack([phi, -phi], axis=1)
+    found = _tracking(reference, q)
+    assert found.rise_s == pytest.approx(0.95, abs=1.01 * H)
+    assert found.reach_s == pytest.approx(1.0, abs=1.01 * H)
+    assert found.overshoot_rad == pytest.approx(0.05, abs=1e-9)
+    assert found.settling_s == pytest.approx(2.0, abs=H)
+    assert found.jump_overshoot_rad == pytest.approx(0.05, abs=1e-9)
+    assert found.jump_settling_s == pytest.approx(3.0, abs=H)
+    assert math.isnan(found.rms_mm[0]) and math.isnan(found.head_rms_mm)

@@ -1,0 +1,401 @@
+"""Controllers: PID, limits and anti-windup, feed-forward, the model read backwards, the observer."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from control_models import MODELS, NOMINAL, ORIFICE, UNLIKE
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.signal import dlsim, dlti, lfilter
+
+from calib.actuator.dynamics import acceleration
+from calib.actuator.integrate import SUBSTEPS, rig_at_rest, simulate
+from calib.actuator.parameters import pumps_connected
+from calib.actuator.pump import Pump, pump_at_rest, static_force_N, step_pump
+from calib.control.antiwindup import BackCalculation, BackState, step_back
+from calib.control.computed_torque import ComputedTorque, wanted_motion
+from calib.control.computed_torque import step as step_of_computed_torque
+from calib.control.feedforward import FeedForward, feed_forward
+from calib.control.inverse_model import (
+    Model,
+    creep_along,
+    feed_forward_pwm,
+    force_of_pwm,
+    holding_force,
+    largest_force_N,
+    moving_force,
+    pwm_of_force,
+    static_stiffness,
+)
+from calib.control.loop import LoopState, OrientationControl, PositionControl, step_orientation, step_position
+from calib.control.observer import (
+    Observer,
+    ObserverState,
+    correct,
+    design_observer,
+    marker_jacobian,
+    marker_of,
+    predict,
+    start_observer,
+)
+from calib.control.pid import Pid, PidState, step
+from calib.control.pid import step as step_pid
+from calib.control.pump_model import PumpEstimate, ahead, pumps_at_rest, push, pwm_for_force
+from calib.control.setpoints import Ellipse
+
+
+def _outputs(pid: Pid, errors: list[float], state: PidState | None = None) -> np.ndarray:
+    state = PidState() if state is None else state
+    out = []
+    for error in errors:
+        state, u = step(pid, state, error)
+        out.append(u)
+    return np.array(out)
+
+
+def test_it_is_the_transfer_function_of_the_appendix() -> None:
+    Kp, Ki, Kd, h = 1000.0, 1000.0, 10.0, 1.0 / 60.0
+    e = np.random.default_rng(1).normal(size=200)
+    # (D.6): Kp + Ki h / 2 (z + 1) / (z - 1) + Kd / h (z - 1) / z, over the common denominator z (z - 1).
+    numerator = (
+        Kp * np.array([1.0, -1.0, 0.0])
+        + 0.5 * Ki * h * np.array([1.0, 1.0, 0.0])
+        + Kd / h * np.array([1.0, -2.0, 1.0])
+    )
+    _, by_z = dlsim(dlti(numerator, [1.0, -1.0, 0.0], dt=h), e)
+    ours = _outputs(Pid(Kp, Ki, Kd), e.tolist())
+    assert np.allclose(ours, by_z[:, 0], rtol=1e-10, atol=1e-8)
+    # (D.9) as a filter.
+    b = [Kp + 0.5 * Ki * h + Kd / h, -Kp + 0.5 * Ki * h - 2.0 * Kd / h, Kd / h]
+    assert np.allclose(ours, lfilter(b, [1.0, -1.0], e), rtol=1e-10, atol=1e-8)
+
+
+@given(st.floats(-500.0, 500.0), st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))
+def test_clamping_drops_the_integral_where_the_output_is_out_of_range(
+    u: float, e0: float, e1: float, e2: float
+) -> None:
+    pid, state = Pid(1000.0, 1000.0, 10.0, clamping=True), PidState(u, e1, e2)
+    with_integral = step(replace(pid, clamping=False), state, e0)[1]
+    without = step(replace(pid, clamping=False, Ki=0.0), state, e0)[1]
+    after, got = step(pid, state, e0)
+    assert got == (with_integral if 0.0 <= with_integral <= 255.0 else without)
+    # What is remembered is the output itself, however far beyond the limits.
+    assert after == PidState(got, e0, e1)
+
+
+def test_the_output_winds_up_without_clamping_and_not_with_it() -> None:
+    errors = [0.5] * 600
+    assert _outputs(Pid(1000.0, 1000.0, 0.0), errors)[-1] > 5000.0
+    assert _outputs(Pid(1000.0, 1000.0, 0.0, clamping=True), errors)[-1] == pytest.approx(500.0, abs=1e-9)
+
+
+errors = st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=60)
+
+
+@given(errors=errors, Kp=st.floats(0, 2000), Ki=st.floats(0, 2000), Kd=st.floats(0, 50))
+def test_without_limits_it_is_the_incremental_form(
+    errors: list[float], Kp: float, Ki: float, Kd: float
+) -> None:
+    back, pid = BackCalculation(Kp, Ki, Kd), Pid(Kp, Ki, Kd)
+    a, b = BackState(), PidState()
+    for error in errors:
+        a, u = step_back(back, a, error, -math.inf, math.inf)
+        b, v = step_pid(pid, b, error)
+        assert u == pytest.approx(v, abs=1e-6 * (1.0 + abs(v)))
+
+
+@given(errors=errors, tracking_s=st.floats(0.02, 5.0))
+def test_commands_stay_within_their_limits(errors: list[float], tracking_s: float) -> None:
+    back, state = BackCalculation(1000.0, 1000.0, 10.0, tracking_s), BackState()
+    for error in errors:
+        state, u = step_back(back, state, error, 10.0, 200.0)
+        assert 10.0 <= u <= 200.0
+
+
+def test_a_constant_error_beyond_the_limit_settles_the_integral() -> None:
+    """At rest Ki e = (v - u) / Tt: the integral stops a known way beyond the limit, it does not wind up."""
+    back, state = BackCalculation(100.0, 50.0, 0.0, 0.5), BackState()
+    for _ in range(3000):
+        state, u = step_back(back, state, 3.0, 0.0, 255.0)
+    v = 100.0 * 3.0 + state.integral + 0.5 / 60.0 * 50.0 * 3.0
+    assert u == 255.0
+    assert v - 255.0 == pytest.approx(0.5 * 50.0 * 3.0, rel=1e-9)
+
+
+def test_the_formula_extends_bellows_1_when_the_angle_is_too_small() -> None:
+    _, command = step_orientation(OrientationControl(Pid(500.0)), LoopState(), 0.7, 0.6)
+    assert command.feedback == pytest.approx((50.0, -50.0))
+    assert command.pwm == (50.0, 0.0)
+    _, crossed = step_orientation(OrientationControl(Pid(500.0), sign=-1), LoopState(), 0.7, 0.6)
+    assert crossed.feedback == pytest.approx((-50.0, 50.0))
+
+
+def test_the_feed_forward_is_added_but_not_fed_back() -> None:
+    rng = np.random.default_rng(0)
+    reference, measured = 0.067 + 0.02 * rng.random((200, 2)), 0.065 + 0.02 * rng.random((200, 2))
+    pid = Pid(300.0, 50.0, 1.0)
+    control, bare = PositionControl(pid), PositionControl(pid, None)
+    with_line, without = LoopState(), LoopState()
+    for q_ref, q in zip(reference.tolist(), measured.tolist(), strict=True):
+        with_line, command = step_position(control, with_line, tuple(q_ref), tuple(q))
+        without, plain = step_position(bare, without, tuple(q_ref), tuple(q))
+        assert command.feedback == plain.feedback
+        for u, value, pwm in zip(command.feedback, q_ref, command.pwm, strict=True):
+            total = u + feed_forward(FeedForward(), value)
+            assert abs(pwm - min(max(total, 0.0), 255.0)) <= 0.5
+    assert with_line == without
+
+
+LINE = FeedForward()
+
+
+def test_values_of_the_text() -> None:
+    assert feed_forward(LINE, math.nextafter(0.067, 0.0)) == 0.0
+    assert feed_forward(LINE, 0.067) == 110.0
+    assert feed_forward(LINE, 0.091) == pytest.approx(241.95, abs=0.01)
+    assert pytest.approx(0.09337, abs=1e-5) == LINE.saturates_at_m
+    assert feed_forward(LINE, LINE.saturates_at_m + 1e-6) == 255.0
+    assert feed_forward(LINE, 1.0) == 255.0
+
+
+def test_alone_it_errs_by_up_to_3_5_mm() -> None:
+    # A straight line through the S of the steady elongation (2.13): too low below 80 mm, too high above.
+    pump = Pump()
+    wanted = np.linspace(0.068, 0.091, 60)
+    pwm = np.array([feed_forward(LINE, q) for q in wanted.tolist()])
+    grid = np.linspace(0.0, 0.0266, 2000)
+    force = (47.7 + 1092.9 * grid) * grid
+    reached = np.interp(static_force_N(pump, pwm), force, grid) + 0.065
+    error_mm = 1e3 * (reached - wanted)
+    assert error_mm.min() == pytest.approx(-3.46, abs=0.01)
+    assert 0.0 < error_mm.max() < 1.5
+
+
+lengths = st.tuples(st.floats(0.055, 0.095), st.floats(0.055, 0.095))
+rates = st.tuples(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2))
+
+
+@pytest.mark.parametrize("model", MODELS)
+@given(share=st.tuples(st.floats(0.0, 1.0), st.floats(0.0, 1.0)))
+def test_a_force_comes_back_from_its_pwm(model: Model, share: tuple[float, float]) -> None:
+    force = np.array(share) * largest_force_N(model)
+    pwm = pwm_of_force(model, force)
+    assert np.all((pwm >= 0.0) & (pwm <= 255.0))
+    # The table is a quarter of a PWM value fine; the printed polynomial jumps at its dead zone.
+    back = force_of_pwm(model, pwm)
+    floor = static_force_N(model.pump, np.array([100.0]))[0] * 1.1
+    assert np.all((np.abs(back - force) < 1e-3) | (force < floor))
+
+
+@given(q=lengths, dq=rates, ddq=rates, z=rates)
+@pytest.mark.parametrize("projection", ["virtual_work", "head"])
+def test_moving_forces_are_the_inverse_of_accelerations(
+    projection: str, q: tuple[float, float], dq: tuple[float, float], ddq: tuple[float, float], z: tuple
+) -> None:
+    plant = replace(pumps_connected(), force_projection=projection, gravity_mps2=(0.0, 9.81))
+    rows = [np.array(value) for value in (q, dq, 10.0 * np.array(ddq), z)]
+    force = moving_force(plant, rows[0], rows[1], rows[2], rows[3])
+    assert acceleration(plant, rows[0], rows[1], rows[3], force) == pytest.approx(rows[2], abs=1e-9)
+
+
+@given(q=lengths)
+def test_the_stiffness_is_the_derivative_of_the_holding_force(q: tuple[float, float]) -> None:
+    plant, at, eps = replace(pumps_connected(), gravity_mps2=(1.0, 9.81)), np.array(q), 1e-7
+    # The spring has a corner at the rest length.
+    if np.min(np.abs(at - plant.rest_length_m)) < 1e-5:
+        return
+    columns = [
+        (holding_force(plant, at + eps * e) - holding_force(plant, at - eps * e)) / (2 * eps)
+        for e in np.eye(2)
+    ]
+    assert static_stiffness(plant, at) == pytest.approx(np.stack(columns, axis=1), rel=1e-5, abs=1e-4)
+
+
+@pytest.mark.parametrize("q", [(0.07, 0.07), (0.085, 0.085), (0.085, 0.072), (0.071, 0.082)])
+def test_the_feed_forward_holds_what_it_is_for(q: tuple[float, float]) -> None:
+    """Commanded for long, the map ends at the wanted lengths, also bent, where the line of (4.6) does not."""
+    pwm = feed_forward_pwm(NOMINAL, np.array(q))
+    motion = simulate(NOMINAL.plant, NOMINAL.pump, np.tile(pwm, (900, 1)))
+    assert motion.q_m[-1] == pytest.approx(np.array(q), abs=2e-6)
+
+
+def test_creep_agrees_with_the_simulation() -> None:
+    pwm = np.full((300, 2), 200.0)
+    fine = simulate(NOMINAL.plant, NOMINAL.pump, pwm, rig_at_rest(NOMINAL.plant, Pump()), every=1)
+    z = creep_along(NOMINAL.plant, NOMINAL.tick_s / SUBSTEPS, fine.dq_mps)
+    assert np.abs(z - fine.z_N).max() < 2e-4 * np.abs(fine.z_N).max()
+
+
+commands = st.lists(st.tuples(st.floats(0, 255), st.floats(0, 255)), min_size=1, max_size=40)
+
+
+@pytest.mark.parametrize("model", [NOMINAL, ORIFICE])
+@given(pwm=commands)
+def test_it_follows_the_pumps_of_the_plant(model: Model, pwm: list[tuple[float, float]]) -> None:
+    mine, plant = pumps_at_rest(model), pump_at_rest(model.pump)
+    for pair in pwm:
+        mine, plant = push(model, mine, pair), step_pump(model.pump, plant, pair)
+        assert mine.force_N == pytest.approx(plant.force_N, abs=1e-12)
+        assert mine.waiting_pwm == plant.waiting_pwm
+
+
+@given(pwm=commands)
+def test_looking_ahead_is_what_happens(pwm: list[tuple[float, float]]) -> None:
+    state = pumps_at_rest(UNLIKE)
+    for pair in pwm:
+        state = push(UNLIKE, state, pair)
+    seen = ahead(UNLIKE, state)
+    assert len(seen) == 1 + UNLIKE.pump.delay_ticks
+    for expected in seen[1:]:
+        state = push(UNLIKE, state, (255.0, 0.0))
+        assert state.force_N == expected.force_N
+
+
+@given(
+    start=st.tuples(st.floats(0.3, 1.5), st.floats(0.3, 1.5)),
+    up=st.floats(-0.02, 0.08),
+    ticks=st.integers(1, 12),
+)
+def test_a_force_within_reach_is_reached(start: tuple[float, float], up: float, ticks: int) -> None:
+    model = NOMINAL
+    state = PumpEstimate(start, start, ())
+    T = ticks * model.tick_s
+    rise = (largest_force_N(model) - np.array(start)) * (1.0 - math.exp(-T / model.pump.lag_s))
+    wanted = np.array(start) + np.clip(up, -0.4 * T, 0.9 * rise.min())
+    pwm = pwm_for_force(model, state, wanted, ticks)
+    still = Model(model.plant, model.pump.__class__(delay_ticks=0))
+    for _ in range(ticks):
+        state = push(still, state, (float(pwm[0]), float(pwm[1])))
+    # What the table of the static map is worth.
+    assert state.force_N == pytest.approx(wanted, abs=1e-3)
+
+
+R = NOMINAL.plant.bellows_radius_m
+
+
+@given(q1=st.floats(0.05, 0.1), q2=st.floats(0.05, 0.1))
+def test_its_jacobian_by_differences(q1: float, q2: float) -> None:
+    eps, J = 1e-6, marker_jacobian(q1, q2, R, 0.015)
+    by1 = np.subtract(marker_of(q1 + eps, q2, R, 0.015), marker_of(q1 - eps, q2, R, 0.015)) / (2 * eps)
+    by2 = np.subtract(marker_of(q1, q2 + eps, R, 0.015), marker_of(q1, q2 - eps, R, 0.015)) / (2 * eps)
+    assert np.stack([by1, by2], axis=1) == pytest.approx(J, abs=1e-6)
+
+
+def _commands(ticks: int) -> np.ndarray:
+    rng = np.random.default_rng(5)
+    return np.repeat(rng.uniform(100.0, 250.0, size=(ticks // 20, 2)).round(), 20, axis=0)
+
+
+@pytest.mark.parametrize("model", [NOMINAL, ORIFICE])
+def test_without_readings_it_is_the_simulation(model: Model) -> None:
+    pwm = _commands(300)
+    truth = simulate(model.plant, model.pump, pwm, rig_at_rest(model.plant, model.pump))
+    observer = design_observer(model)
+    state = start_observer(observer)
+    for k, row in enumerate(pwm.tolist()):
+        # Forces go in straight lines between ticks here, along curves there.
+        assert state.y[:2] == pytest.approx(truth.q_m[k], abs=3e-5)
+        state = predict(observer, state, (row[0], row[1]))
+
+
+def _follow(
+    observer: Observer, pwm: np.ndarray, truth: np.ndarray, noise_m: float, bias: float, push: float = 0.0
+) -> list[ObserverState]:
+    """Estimates along a simulated motion, the marker two ticks late."""
+    rng = np.random.default_rng(11)
+    state, out = start_observer(observer), []
+    for k, row in enumerate(pwm.tolist()):
+        q, dq = truth[max(k - 2, 0), :2], truth[k, 2:4]
+        marker = np.array(marker_of(q[0], q[1], R, observer.marker_offset_m)) + noise_m * rng.normal(size=2)
+        if k % 50 == 49:
+            marker += push
+        rate = (dq[0] - dq[1]) / (2 * R) + bias + 0.003 * rng.normal()
+        state = correct(observer, state, (float(marker[0]), float(marker[1])), rate)
+        out.append(state)
+        state = predict(observer, state, (row[0], row[1]))
+    return out
+
+
+def test_it_finds_the_bias_and_is_better_than_its_readings() -> None:
+    pwm = _commands(900)
+    truth = simulate(NOMINAL.plant, NOMINAL.pump, pwm).states
+    observer = design_observer(NOMINAL, latency_s=2.0 / 60.0)
+    found = _follow(observer, pwm, truth, 2.5e-4, 0.03)
+    error = np.array([s.y[:2] for s in found])[300:] - truth[300:900, :2]
+    # The marker alone gives lengths to 2.5e-4 / sqrt(2) straight, and more than that bent.
+    assert float(np.sqrt(np.mean(error**2))) < 2e-4
+    assert np.mean([s.bias_radps for s in found[800:]]) == pytest.approx(0.03, abs=3e-3)
+
+
+def test_an_unknown_force_is_found() -> None:
+    """A plant with a pump 10 % weaker: d makes up for the missing force."""
+    weak = Model(NOMINAL.plant, NOMINAL.pump, (0.9, 1.0))
+    pwm = np.full((600, 2), 210.0)
+    static = NOMINAL.pump.static.force_N(np.array([210.0]))[0]
+    from calib.actuator.dynamics import coefficients
+    from calib.actuator.kernel import STATE, run
+    from calib.actuator.pump import pump_coefficients
+
+    out = np.empty((600, len(STATE)))
+    row = rig_at_rest(weak.plant, weak.pump).row
+    forces = np.tile([0.9 * static, static], (600, 1))
+    forces[:2] = 0.0
+    assert run(coefficients(weak.plant), pump_coefficients(weak.pump), row, forces, 1 / 60, 17, 17, out) < 0
+    truth = np.vstack([row, out])
+    found = _follow(design_observer(NOMINAL, latency_s=2.0 / 60.0), pwm, truth, 1e-5, 0.0)
+    assert found[-1].d_N == pytest.approx([-0.1 * static, 0.0], abs=0.01)
+
+
+def test_outliers_are_not_believed_and_a_lost_estimate_comes_back() -> None:
+    pwm = _commands(600)
+    truth = simulate(NOMINAL.plant, NOMINAL.pump, pwm).states
+    observer = design_observer(NOMINAL, latency_s=2.0 / 60.0)
+    clean = np.array([s.y[:2] for s in _follow(observer, pwm, truth, 1e-4, 0.0)])
+    dirty = np.array([s.y[:2] for s in _follow(observer, pwm, truth, 1e-4, 0.0, push=0.02)])
+    assert np.abs(clean - dirty).max() < 2e-4
+    state = start_observer(observer)
+    away = marker_of(0.08, 0.08, R, 0.015)
+    for _ in range(10):
+        state = correct(observer, state, away, math.nan)
+        assert state.y[0] == pytest.approx(0.065)
+    assert correct(observer, state, away, math.nan).y[0] > 0.066
+
+
+def _ellipse(model: Model, ticks: int) -> np.ndarray:
+    return Ellipse().bellows_m(model.tick_s * np.arange(ticks), model.plant.bellows_radius_m)
+
+
+def _commands_computed_torque(model: Model, q: np.ndarray, control: ComputedTorque) -> np.ndarray:
+    """Commands when the model is the truth: the observer needs no readings."""
+    observer, wanted = design_observer(model), wanted_motion(model, q)
+    state, out = start_observer(observer), []
+    for k in range(len(q)):
+        command = step_of_computed_torque(control, observer, state, wanted, k)
+        out.append(command.pwm)
+        state = predict(observer, state, command.pwm)
+    return np.array(out)
+
+
+@pytest.mark.parametrize(("model", "horizon"), [(NOMINAL, 1), (NOMINAL, 12), (ORIFICE, 6)])
+def test_with_a_perfect_model_the_ellipse_is_drawn(model: Model, horizon: int) -> None:
+    """Whole PWM values and all: 0.03 mm, where PD with feed-forward is 0.8 mm off on the same plant."""
+    q = _ellipse(model, 700)
+    pwm = _commands_computed_torque(model, q, ComputedTorque(horizon))
+    assert np.all((pwm >= 0) & (pwm <= 255) & (pwm == np.round(pwm)))
+    truth = simulate(model.plant, model.pump, pwm)
+    error = 1e3 * (q - truth.q_m[:700])[120:]
+    assert float(np.sqrt(np.mean(error**2))) < 0.05
+    assert float(np.abs(error).max()) < 0.2
+
+
+def test_the_wanted_forces_are_those_of_the_simulation() -> None:
+    """Along a simulated motion the wanted forces are the ones that drove it."""
+    pwm = 170.0 + 60.0 * np.sin(np.arange(900) / 60.0)[:, None] * np.array([1.0, -0.7])
+    truth = simulate(NOMINAL.plant, NOMINAL.pump, pwm)
+    wanted = wanted_motion(NOMINAL, truth.q_m)
+    inner = slice(60, -60)
+    assert wanted.force_N[inner] == pytest.approx(truth.force_N[inner], abs=8e-3)
