@@ -1,4 +1,4 @@
-"""The fused filter: filterpy's numbers, accuracy, honesty on varied rigs, and what can be wrong with a log."""
+"""The fused filter: filterpy's numbers, accuracy and honesty on varied rigs, what can be wrong with a log."""
 
 from __future__ import annotations
 
