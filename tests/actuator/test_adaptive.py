@@ -8,11 +8,10 @@ from scipy.integrate import solve_ivp
 
 from calib.actuator import dynamics as dyn
 from calib.actuator.adaptive import Method, simulate_adaptive, swing_adaptive
-from calib.actuator.integrate import rig_at_rest, state_row
-from calib.actuator.parameters import Creep, Plant, Stiffness, pumps_connected
+from calib.actuator.integrate import state_row
+from calib.actuator.parameters import Plant, pumps_connected
 from calib.actuator.pump import Pump, RateLimit, delayed, static_force_N
 from calib.arrays import FloatArray
-from calib.errors import BadInputError
 
 
 @pytest.mark.parametrize("method", ["RK45", "Radau", "LSODA"])
@@ -51,22 +50,3 @@ def test_pumps_as_differential_equations() -> None:
             lag = lag + h * (g - lag) / pump.lag_s
             force = np.maximum(lag, force - 0.4 * h)
         assert motion.force_N[k + 1] == pytest.approx(force, abs=2e-5)
-
-
-def test_start_is_the_first_row() -> None:
-    plant, pump = pumps_connected(), Pump()
-    begin = rig_at_rest(plant, pump, 0.3, 0.07)
-    motion = simulate_adaptive(plant, pump, np.zeros((3, 2)), begin)
-    assert np.array_equal(motion.states[0], begin.row)
-    assert motion.t_s == pytest.approx(pump.tick_s * np.arange(4))
-
-
-@pytest.mark.filterwarnings("ignore::calib.actuator.parameters.UnstablePlantWarning")
-def test_leaving_the_model_is_told() -> None:
-    """A creep that wins over k0 explodes; a force that the springs cannot hold goes on."""
-    wild = Plant(creep=Creep(0.0, 200.0, 1.0), allow_unstable=True)
-    with pytest.raises(BadInputError, match=r"simulation: at 0\.\d+ s a bellows has no length left"):
-        swing_adaptive(wild, state_row(wild, 0.5), np.array([0.0, 50.0]))
-    soft = Plant(stiffness=Stiffness((5.0,)), bending_N_per_rad2=0.0)
-    with pytest.raises(BadInputError, match="expected smaller forces"):
-        simulate_adaptive(soft, Pump(), np.tile([255.0, 0.0], (200, 1)))

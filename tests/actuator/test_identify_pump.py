@@ -1,4 +1,4 @@
-"""Fitting the pump: truth recovered, extras only where they are needed, files not fitted, real recordings."""
+"""The pump's identification: truth recovered, extras only where needed, tables as people write them."""
 
 from __future__ import annotations
 
@@ -10,17 +10,14 @@ import pytest
 from identifytrials import FLOW_TRUTH, LAG_TRUTH, pump_records
 from outside import outside
 
-from calib.actuator.identify_pump import (
-    _by_chance,
-    _Problem,
-    _solve,
-    cross_validate,
-    fit_pump,
-    rms_ahead,
-    rms_of,
-)
-from calib.actuator.identify_pump_models import LAG, MODELS, ORIFICE, PumpRecord, Shape
+from calib.actuator.identify_pump import _by_chance, _Problem, _solve, cross_validate, fit_pump
+from calib.actuator.identify_pump_models import LAG, MODELS, ORIFICE, PumpRecord, Shape, simulate_pump
+from calib.actuator.pump import Orifice
 from calib.errors import BadInputError
+from calib.identification import PumpFound, identify_pump
+from calib.pumpsections import judge_pump, pump_section, unexplained
+from calib.pumptables import PumpTable, Settled, read_pump_table
+from calib.rig import Rig
 
 
 @pytest.mark.parametrize(
@@ -60,26 +57,6 @@ def test_the_right_model_wins_on_recordings_not_fitted() -> None:
     assert cross_validate(fit_pump(runs[:1], LAG), runs[:1]) == []
 
 
-def test_outlying_runs_do_not_pull() -> None:
-    runs = pump_records(LAG, LAG_TRUTH, 6)
-    off = PumpRecord(
-        "off", runs[0].t_s, runs[0].pwm, np.where(runs[0].t_s > 1.5, runs[0].value + 5.0, runs[0].value)
-    )
-    fit = fit_pump([*runs, off], LAG)
-    assert fit.values["level"] == pytest.approx(25.0, abs=0.4)
-    assert rms_of(fit, off) > 3.0
-    assert rms_ahead(fit, runs[0]) < 0.2
-
-
-def test_nothing_to_see_is_refused() -> None:
-    t = 0.02 * np.arange(50)
-    flat = PumpRecord("flat", t, np.full(50, 255.0), np.full(50, 3.0))
-    with pytest.raises(BadInputError, match="flat: neither PWM nor the measured value ever changes"):
-        fit_pump([flat], LAG)
-    with pytest.raises(BadInputError, match="no recording"):
-        fit_pump([], LAG)
-
-
 @pytest.mark.slow
 def test_a_real_pump(shared_data: Path) -> None:
     """Errors in kPa on files that were not fitted, and which model is the better one."""
@@ -116,3 +93,176 @@ def test_what_chance_brings_is_bounded_by_recordings_left_out() -> None:
         _, plain, _ = _solve(problem, np.array([*rich[:3], 20.0]), [0, 1, 2])
         beyond += plain - cost > _by_chance(problem, rich, [0, 1, 2, 3], 1)
     assert beyond <= 4
+
+
+T = 0.02 * np.arange(200)
+FREE = 1e6
+
+
+def _record(pwm: np.ndarray, value: np.ndarray | None = None) -> PumpRecord:
+    return PumpRecord("run", T, pwm, np.zeros(len(T)) if value is None else value)
+
+
+def _step(at_s: float = 0.1, level: float = 255.0) -> np.ndarray:
+    return np.where(at_s - 1e-9 <= T, level, 0.0)
+
+
+def test_the_lag_is_the_exponential_that_it_should_be() -> None:
+    theta = np.array([0.05, 30.0, 0.6, FREE])
+    told = simulate_pump(LAG, theta, _record(_step()), start_s=-1.0)
+    expected = 30.0 * -np.expm1(-np.maximum(T - 0.15, 0.0) / 0.6)
+    assert np.allclose(told, expected, atol=2e-3)
+
+
+def test_dead_time_shifts_and_is_smooth() -> None:
+    for model, theta in (
+        (LAG, [0.05, 30.0, 0.6, FREE]),
+        (ORIFICE, [0.05, 30.0, 0.2, 5e-3, FREE, 20.0, 0.05]),
+    ):
+        base = np.array(theta)
+        near = [
+            simulate_pump(model, np.concatenate([[d], base[1:]]), _record(_step()))
+            for d in (0.05, 0.0501, 0.0502)
+        ]
+        first, second = near[1] - near[0], near[2] - near[1]
+        assert np.abs(first - second).max() < 0.1 * np.abs(first).max() + 1e-9
+        assert np.abs(first).max() < 0.02
+
+
+def test_the_flow_in_follows_the_law_of_the_orifice() -> None:
+    """Without hose and leak the fall of g - p is the emptying of `Orifice` with the same coefficients."""
+    a, b, level = 0.3, 0.01, 30.0
+    told = simulate_pump(ORIFICE, np.array([0.0, level, a, b, FREE, 0.0, 1.0]), _record(_step(0.0)))
+    law, drop, h = Orifice(a, b), level, 1e-4
+    expected = []
+    for k in range(len(T)):
+        expected.append(level - drop)
+        for _ in range(round(0.02 / h)):
+            w = 2.0 * drop / (law.laminar_s + np.sqrt(law.laminar_s**2 + 4.0 * law.turbulent_s2_per_N * drop))
+            drop -= h * w
+        assert k >= 0
+    assert np.allclose(told, expected, atol=0.02)
+
+
+PATH = Path("rig.yaml")
+U = np.arange(100.0, 256.0, 5.0)
+
+
+def _table(record: PumpRecord, unit: str = "kPa") -> PumpTable:
+    return PumpTable(unit, record, (), ())
+
+
+@pytest.fixture(scope="module")
+def found() -> PumpFound:
+    settled = Settled("static", U, 25.0 * Shape(90.0, 40.0).of(U) + 0.05 * np.sin(7.0 * U))
+    tables = [_table(r) for r in pump_records(LAG, LAG_TRUTH, 3)]
+    return identify_pump([*tables, PumpTable("kPa", None, (settled,), ())])
+
+
+def test_a_pump_that_is_a_lag_is_found_to_be_one(found: PumpFound) -> None:
+    section = pump_section(found, Rig(), PATH)
+    assert section.lag_s == pytest.approx(0.5, rel=0.02)
+    assert section.delay_ticks == 4.0
+    assert section.identified is not None
+    assert section.identified.better == LAG
+    # The recordings' own map is a line through zero, and the data say so.
+    assert found.fits[LAG].shape == Shape()
+    static = section.identified.static["static"]
+    assert static.dead_pwm == pytest.approx(90.0, abs=4.0)
+    assert set(section.identified.models) == {LAG, ORIFICE}
+
+
+def test_what_the_pwm_does_not_explain_makes_it_poor(found: PumpFound) -> None:
+    t = 0.02 * np.arange(250)
+    pwm = np.where(t > 0.03, 255.0, 0.0)
+    y = 25.0 * -np.expm1(-np.maximum(t - 0.1, 0.0) / 0.5)
+    runs = [PumpRecord(f"run{k}", t, pwm, y + 0.02 * np.sin(40.0 * t + k)) for k in range(3)]
+    runs.append(PumpRecord("odd", t, pwm, y + 6.0 * np.clip(t - 2.0, 0.0, 1.0)))
+    odd = identify_pump([_table(r) for r in runs])
+    said = unexplained(odd)
+    assert "settle apart: 3 at 25.0 kPa" in said[0]
+    assert "odd leaves the model" in said[1]
+    assert "while the PWM stood still" in said[1]
+    assert judge_pump(odd)[0] == "poor"
+    assert odd.main_group is not None
+    assert odd.held_rms(LAG, odd.main_group.names) < odd.held_rms(LAG)
+
+
+def _write(path: Path, head: str, rows: np.ndarray) -> Path:
+    lines = [",".join("" if c != c else f"{c:.6g}" for c in row) for row in rows.tolist()]
+    path.write_text("\n".join([head, *lines]) + "\n")
+    return path
+
+
+def _rows(n: int = 100) -> np.ndarray:
+    t = 0.02 * np.arange(n)
+    return np.stack([t, np.where(t > 0.1, 255.0, 0.0), 30.0 * -np.expm1(-t)], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("head", "unit"),
+    [
+        ("Time,PWM,Pressure", "kPa"),
+        ("t_s,pwm,pressure_kPa", "kPa"),
+        ("Timestamp_s,PWM_Main,Feedback_kPa", "kPa"),
+        ("t_s,pwm1,force_N", "N"),
+    ],
+)
+def test_columns_are_recognised(tmp_path: Path, head: str, unit: str) -> None:
+    table = read_pump_table(_write(tmp_path / "a.csv", head, _rows()))
+    assert table.unit == unit
+    assert table.record is not None
+    assert np.allclose(table.record.value, _rows()[:, 2], atol=1e-4)
+
+
+def test_settled_values_are_taken_apart_by_mode(tmp_path: Path) -> None:
+    path = tmp_path / "static.csv"
+    rows = [
+        f"{mode},{100 + 10 * k},{sign * k},{3 * k}"
+        for mode, sign in (("in", 1), ("out", -1))
+        for k in range(8)
+    ]
+    rows = [f"{r.rsplit(',', 1)[0]},{3 * i}" for i, r in enumerate(rows)]
+    path.write_text("mode,pwm_input,pressure_kpa,timestamp\n" + "\n".join(rows) + "\n")
+    table = read_pump_table(path)
+    assert table.record is None
+    assert [s.name for s in table.settled] == ["static.csv, in", "static.csv, out"]
+    assert table.settled[1].value[-1] == -7.0
+
+
+def test_real_tables(shared_data: Path) -> None:
+    folder = outside(shared_data / "softbot")
+    for path in sorted(folder.glob("sweep_*.csv")):
+        record = read_pump_table(path).record
+        assert record is not None
+        assert record.pwm.max() == 255.0
+    parts = read_pump_table(next(folder.glob("calibration_raw*.csv"))).settled
+    assert [len(s.pwm) for s in parts] == [30, 30]
+
+
+def _broken(kind: str) -> np.ndarray:
+    rows = _rows()
+    if kind == "back":
+        rows[50:, 0] -= 0.5
+    elif kind == "jump":
+        rows[50:, 0] += 100.0
+    elif kind == "range":
+        rows[10, 1] = 400.0
+    elif kind == "nan":
+        rows[10:30, 2] = np.nan
+    elif kind == "short":
+        rows = rows[:8]
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("back", "line 52: time goes back"),
+        ("range", "line 12: PWM is 400, expected 0 to 255"),
+        ("short", "has 8 rows over 0.14 s"),
+    ],
+)
+def test_what_is_wrong_is_said_with_its_line(tmp_path: Path, kind: str, words: str) -> None:
+    with pytest.raises(BadInputError, match=words):
+        read_pump_table(_write(tmp_path / "a.csv", "t_s,pwm,pressure_kPa", _broken(kind)))

@@ -1,17 +1,25 @@
-"""Spaces of one section: inverses, derivatives, frames and signs."""
+"""Kinematics of one section: the arc's functions against multiple precision, inverses, derivatives, signs."""
 
 from __future__ import annotations
 
-from math import copysign
+from math import copysign, factorial
 
+import mpmath
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from calib.actuator import kinematics as kin
+from calib.actuator.arc import (
+    chord_curvature,
+    chord_decay,
+    chord_decay_w,
+    chord_ratio,
+    chord_ratio_w,
+    chord_slope,
+)
 from calib.arrays import FloatArray
-from calib.errors import BadInputError
 
 R_B = 0.0126
 BELLOWS = st.floats(0.04, 0.1)
@@ -40,34 +48,6 @@ def test_configuration_survives_task_space_at_any_curvature(phi: float, length: 
     assert back[0] == pytest.approx(k[0], rel=4e-14, abs=0.0)
     assert back[1] == pytest.approx(k[1], rel=2e-14)
     assert copysign(1.0, back[0]) == copysign(1.0, k[0])
-
-
-@given(TINY, LENGTHS)
-def test_head_of_a_nearly_straight_arc(phi: float, length: float) -> None:
-    """x = l phi / 2 and y = l to first order; x keeps its relative precision."""
-    x, y, angle = kin.pose_from_configuration(np.array([phi / length, length]))
-    assert angle == pytest.approx(phi, rel=1e-15, abs=0.0)
-    if abs(phi) < 1e-8:
-        assert x == pytest.approx(0.5 * length * phi, rel=1e-14, abs=0.0)
-        assert y == pytest.approx(length, rel=1e-15)
-
-
-@given(BELLOWS, BELLOWS)
-def test_configuration_and_bellows(q1: float, q2: float) -> None:
-    q = np.array([q1, q2])
-    k = kin.configuration(q, R_B)
-    assert k[0] == pytest.approx((q1 - q2) / ((q1 + q2) * R_B), rel=1e-12, abs=1e-15)
-    assert kin.bellows_from_configuration(k, R_B) == pytest.approx(q, rel=1e-14)
-    assert kin.pose_from_configuration(k) == pytest.approx(kin.forward(q, R_B), abs=1e-15)
-
-
-def test_smooth_through_zero() -> None:
-    """No switch: the second difference of the head's path is that of a smooth curve, not of noise."""
-    h = 1e-4
-    phi = h * np.arange(-50, 51)
-    pose = kin.pose_from_configuration(np.stack([phi / 0.065, np.full_like(phi, 0.065)], axis=1))
-    bends = np.diff(pose[:, 1], 2) / h**2
-    assert bends == pytest.approx(np.full(99, -0.065 / 3), rel=1e-4)
 
 
 def test_signs_and_frames() -> None:
@@ -126,13 +106,6 @@ def test_jacobians_against_differences(q: FloatArray) -> None:
     )
 
 
-@given(BELLOWS, BELLOWS)
-def test_inverse_jacobian_undoes_the_forward_one(q1: float, q2: float) -> None:
-    q = np.array([q1, q2])
-    product = kin.inverse_jacobian(kin.forward(q, R_B), R_B) @ kin.forward_jacobian(q, R_B)
-    assert product == pytest.approx(np.eye(2), abs=1e-12)
-
-
 @pytest.mark.parametrize("q", [*random_bellows(2, 5), np.array([0.07, 0.07])])
 def test_jacobian_rate_and_the_identity_323(q: FloatArray) -> None:
     """dJ/dt by the chain rule, and d(dx/dt)/dq = d/dt(dx/dq), which (3.35) rests on."""
@@ -153,38 +126,41 @@ def test_marker_and_head(x: float, y: float, phi: float) -> None:
     assert kin.head_from_marker(marker, np.array(phi)) == pytest.approx(head, abs=1e-16)
 
 
-def test_marker_lies_on_the_heads_tangent() -> None:
-    q = np.array([0.08, 0.07])
-    x, y, phi = kin.forward(q, R_B)
-    H = kin.transform(phi, kin.length(q))
-    placed = (H @ np.array([0.0, kin.MARKER_OFFSET_M, 1.0]))[:2]
-    assert kin.marker_from_head(np.array([x, y]), phi) == pytest.approx(placed, abs=1e-16)
+ANGLES_ARC = [0.0, 1e-300, 1e-12, 1e-8, 1e-4, 0.01, 0.1, 0.7, 1.5, np.pi / 2, 2.0, np.pi, 4.0, 5.5, 6.2]
 
 
-def test_arrays_of_any_shape() -> None:
-    q = random_bellows(3, 24).reshape(2, 3, 4, 2)
-    pose = kin.forward(q, R_B)
-    assert pose.shape == (2, 3, 4, 3)
-    assert kin.forward_jacobian(q, R_B).shape == (2, 3, 4, 3, 2)
-    assert kin.inverse_jacobian(pose, R_B).shape == (2, 3, 4, 2, 3)
-    assert kin.transform(pose[..., 2], kin.length(q)).shape == (2, 3, 4, 3, 3)
-    assert pose[1, 2, 3] == pytest.approx(kin.forward(q[1, 2, 3], R_B))
+def exact(phi: float) -> tuple[float, float, float, float]:
+    """S, S', S'', D with 60 digits, from the definition and its derivatives."""
+    with mpmath.workdps(60):
+
+        def S(x: mpmath.mpf) -> mpmath.mpf:
+            return mpmath.sinc(x / 2)
+
+        x = mpmath.mpf(phi)
+        first, second = mpmath.diff(S, x), mpmath.diff(S, x, 2)
+        decay = (S(x) - mpmath.cos(x / 2)) / x**2 if abs(phi) > 1e-10 else mpmath.mpf(1) / 12
+        return float(S(x)), float(first), float(second), float(decay)
 
 
-def test_length_is_symmetric_in_the_sign_of_the_angle() -> None:
-    pose = np.array([0.02, 0.06, 0.6])
-    mirrored = pose * np.array([-1.0, 1.0, -1.0])
-    assert kin.inverse(pose, R_B) == pytest.approx(kin.inverse(mirrored, R_B)[::-1])
+@pytest.mark.parametrize("phi", ANGLES_ARC)
+def test_series_reach_machine_precision(phi: float) -> None:
+    S, _, _, D = exact(phi)
+    first_left_out = (phi / 2) ** 26 / factorial(27)
+    assert chord_ratio_w(phi * phi) == pytest.approx(S, abs=4e-16 + first_left_out)
+    assert chord_decay_w(phi * phi) == pytest.approx(D, abs=1e-16)
+    assert float(chord_ratio(np.array(phi))) == pytest.approx(S, abs=4e-16)
 
 
-@pytest.mark.parametrize(
-    ("call", "words"),
-    [
-        (lambda: kin.inverse(np.array([0.0, 0.06, 6.3]), R_B), "less than a full circle"),
-        (lambda: kin.forward(np.array([0.06, 0.06, 0.06]), R_B), r"expected \(..., 2\)"),
-        (lambda: kin.configuration_from_pose(np.array([0.0, 0.06])), r"expected \(..., 3\)"),
-    ],
-)
-def test_bad_input(call: object, words: str) -> None:
-    with pytest.raises(BadInputError, match=words):
-        call()
+@pytest.mark.parametrize("phi", [0.01, 0.7, -1.5, 3.0, 6.0])
+def test_derivatives_match_multiple_precision(phi: float) -> None:
+    _, S1, S2, _ = exact(phi)
+    assert float(chord_slope(np.array(phi))) == pytest.approx(S1, rel=1e-13, abs=1e-15)
+    assert float(chord_curvature(np.array(phi))) == pytest.approx(S2, rel=1e-12, abs=1e-15)
+
+
+def test_limits_at_zero_curvature() -> None:
+    assert float(chord_ratio(np.array(0.0))) == 1.0
+    assert float(chord_decay(np.array(0.0))) == pytest.approx(1 / 12, rel=1e-15)
+    assert float(chord_curvature(np.array(0.0))) == pytest.approx(-1 / 12, rel=1e-15)
+    # S' = -phi / 12 keeps its relative precision where a difference quotient would have none.
+    assert float(chord_slope(np.array(1e-300))) == pytest.approx(-1e-300 / 12, rel=1e-15)

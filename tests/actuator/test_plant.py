@@ -1,8 +1,9 @@
-"""Pumps: static laws, lag, limits, delay, and both deflation models."""
+"""Plant and pumps: parameters and laws, refused values, lag, limits, delay, and both deflation models."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from calib.actuator.parameters import Stiffness
+from calib.actuator.dynamics import linearised
+from calib.actuator.parameters import (
+    PRINTED_CREEP,
+    Creep,
+    Plant,
+    StandardLinearSolid,
+    Stiffness,
+    UnstablePlantWarning,
+    free_swing,
+    growth_rate_per_s,
+    pumps_connected,
+)
 from calib.actuator.pump import (
     ElongationForce,
     Orifice,
@@ -19,7 +31,6 @@ from calib.actuator.pump import (
     PumpState,
     RateLimit,
     advance,
-    delayed,
     pump_at_rest,
     pump_coefficients,
     static_force_N,
@@ -27,6 +38,88 @@ from calib.actuator.pump import (
 )
 from calib.arrays import FloatArray
 from calib.errors import BadInputError
+
+
+def test_nominal_values() -> None:
+    plant = free_swing()
+    assert (plant.mass_kg, plant.inertia_kgm2) == (0.0166, 1.27e-5)
+    assert (plant.bellows_radius_m, plant.rest_length_m) == (0.0126, 0.065)
+    assert plant.stiffness.coefficients == (47.7, 1092.9)
+    assert (plant.damping_ratio, plant.damping_scale) == (0.0513, 3.3)
+    assert pumps_connected().damping_scale == 16.0
+    assert plant.bending_N_per_rad2 == 0.1695
+    assert plant.creep_rates == (3.0, 10.0, -1.0)
+    assert plant.gravity_mps2 == (0.0, 0.0)
+    assert plant.force_projection == "virtual_work"
+
+
+@pytest.mark.parametrize("law", [Stiffness(), Stiffness((60.0,)), Stiffness((40.0, 500.0, -2e4, 3e5))])
+def test_stiffness_law_is_consistent(law: Stiffness) -> None:
+    """Secant, tangent and energy belong to one force."""
+    for eps in (-0.01, 1e-4, 0.01, 0.0266, 0.039):
+        h = 1e-6
+        force = [law.secant(e) * e for e in (eps - h, eps, eps + h)]
+        assert law.tangent(eps) == pytest.approx((force[2] - force[0]) / (2 * h), rel=1e-5)
+        slope = (law.energy(eps + h) - law.energy(eps - h)) / (2 * h)
+        assert slope == pytest.approx(force[1], rel=1e-6)
+    assert law.secant(-0.02) == law.coefficients[0]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"mass_kg": 0.0}, "mass: found 0"),
+        ({"inertia_kgm2": -1e-6}, "inertia"),
+        ({"stiffness_scale": 0.0}, "scale of the stiffness"),
+        ({"bending_N_per_rad2": -0.1}, "bending stiffness"),
+        ({"gravity_mps2": (0.0, 9810.0)}, "gravity: found 9810"),
+    ],
+)
+def test_refused_values(change: dict[str, object], words: str) -> None:
+    with pytest.raises(BadInputError, match=words):
+        replace(Plant(), **change)
+
+
+@pytest.mark.parametrize(
+    ("coefficients", "words"),
+    [
+        ((), "found 0 coefficients"),
+        ((math.inf,), "finite"),
+    ],
+)
+def test_refused_stiffness(coefficients: tuple[float, ...], words: str) -> None:
+    with pytest.raises(BadInputError, match=words):
+        Stiffness(coefficients)
+
+
+def test_printed_creep_is_refused_with_its_growth_rate() -> None:
+    """lambda2 lambda3 = 27.8 N/m takes so much of k0 that z grows at 0.1047 / (1 - 27.8 / 47.7)."""
+    with pytest.raises(BadInputError, match=r"leaves rest at 0\.25 1/s \(e-fold in 4 s\)"):
+        Plant(creep=Creep(*PRINTED_CREEP))
+    slow = 0.1047 / (1 - 14.98 * 1.854 / 47.7)
+    with pytest.warns(UnstablePlantWarning, match="unstable"):
+        kept = Plant(creep=Creep(*PRINTED_CREEP), allow_unstable=True)
+    assert growth_rate_per_s(kept) == pytest.approx(slow, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    "creep", [Creep(*PRINTED_CREEP), Creep(), Creep(1.0, 20.0, 1.0), Creep(2.0, 60.0, 1.0), None]
+)
+@pytest.mark.filterwarnings("ignore::calib.actuator.parameters.UnstablePlantWarning")
+def test_growth_rate_against_the_linearised_plant(creep: Creep | None) -> None:
+    plant = Plant(creep=creep, allow_unstable=True)
+    roots = np.linalg.eigvals(linearised(plant, np.array([0.065, 0.065])))
+    expected = max(float(roots.real.max()), 0.0)
+    assert growth_rate_per_s(plant) == pytest.approx(expected, rel=1e-9, abs=1e-7)
+
+
+@given(st.floats(0.0, 1e3), st.floats(1e-2, 1e2))
+def test_standard_linear_solid_is_passive_and_stable(branch: float, relaxation: float) -> None:
+    solid = StandardLinearSolid(branch, relaxation)
+    assert solid.passive
+    assert Creep(*solid.rates).passive
+    assert growth_rate_per_s(Plant(creep=solid)) == 0.0
+
 
 FULL_N = float(static_force_N(Pump(), np.array(255.0)))
 DEFLATIONS = [RateLimit(), Orifice()]
@@ -48,12 +141,6 @@ def test_static_force_holds_the_measured_elongation(volt: float, elongation_mm: 
     force = float(static_force_N(Pump(), np.array(volt * 255 / 12)))
     eps = 1e-3 * elongation_mm
     assert force == pytest.approx(Stiffness().secant(eps) * eps, rel=2e-3)
-
-
-def test_dead_zone_and_saturation() -> None:
-    pwm = np.array([-50.0, 0.0, 50.0, 99.8, 255.0, 400.0])
-    assert static_force_N(Pump(), pwm) == pytest.approx([0, 0, 0, 0, FULL_N, FULL_N])
-    assert np.all(static_force_N(Pump(), np.linspace(0, 255, 2000)) >= 0.0)
 
 
 def test_printed_coefficient_of_213_gives_negative_lengths() -> None:
@@ -90,22 +177,6 @@ def test_transport_delay_in_ticks(deflation: RateLimit | Orifice, delay: int) ->
     force = ticks(pump, [255.0] * 10)
     assert np.all(force[:delay] == 0.0)
     assert np.all(force[delay:] > 0.0)
-
-
-def test_delayed_rows() -> None:
-    pump = Pump()
-    rows = np.arange(10.0).reshape(5, 2)
-    assert np.array_equal(delayed(pump, rows), [[0, 0], [0, 0], [0, 1], [2, 3], [4, 5]])
-    assert np.array_equal(delayed(pump, rows[:1], np.array([[7.0, 8.0], [9.0, 9.0]])), [[7, 8]])
-
-
-def test_falling_rate_limit() -> None:
-    pump = Pump(delay_ticks=0)
-    force = ticks(pump, [0.0] * 330, PumpState((FULL_N, 0.0), (FULL_N, 0.0), ()))
-    t = pump.tick_s * np.arange(1, 331)
-    expected = np.maximum(FULL_N - 0.4 * t, FULL_N * np.exp(-t / 0.7))
-    assert force == pytest.approx(expected, abs=1e-12)
-    assert np.argmax(force < 0.05 * FULL_N) * pump.tick_s == pytest.approx(0.95 * FULL_N / 0.4, abs=0.02)
 
 
 def test_printed_rate_limit_is_too_fast() -> None:
@@ -170,37 +241,3 @@ def test_orifice_falls_like_its_pressure_law() -> None:
     assert law.laminar_s * w + law.turbulent_s2_per_N * w**2 == pytest.approx(force[1:-1], rel=2e-4, abs=1e-7)
     late = np.log(force[540] / force[599]) / (59 * pump.tick_s)
     assert 1 / late == pytest.approx(law.laminar_s, rel=2e-3)
-
-
-def test_orifice_and_rate_limit_settle_alike() -> None:
-    for pwm in (0.0, 140.0, 200.0, 255.0):
-        ends = [ticks(Pump(deflation=d), [255.0] * 200 + [pwm] * 1500)[-1] for d in DEFLATIONS]
-        assert ends[0] == pytest.approx(float(static_force_N(Pump(), np.array(pwm))), abs=1e-9)
-        assert ends[1] == pytest.approx(ends[0], abs=1e-5)
-
-
-def test_rest_under_a_held_command_stays() -> None:
-    for deflation in DEFLATIONS:
-        pump = Pump(deflation=deflation)
-        state = pump_at_rest(pump, (200.0, 130.0))
-        moved = step_pump(pump, state, (200.0, 130.0))
-        assert moved.force_N == pytest.approx(state.force_N, abs=1e-15)
-        assert moved.waiting_pwm == state.waiting_pwm
-
-
-@pytest.mark.parametrize(
-    ("build", "words"),
-    [
-        (lambda: Pump(lag_s=0.0), "lag of the pump: found 0 s"),
-        (lambda: Pump(tick_s=-0.1), "tick: found -0.1 s"),
-        (lambda: Pump(delay_ticks=-1), "found -1 ticks"),
-        (lambda: RateLimit(-2.0), "falling rate: found -2 N/s, expected a positive rate"),
-        (lambda: Orifice(laminar_s=0.0), "orifice: found a = 0 s"),
-        (lambda: Orifice(turbulent_s2_per_N=-1.0), "orifice"),
-        (lambda: static_force_N(Pump(), np.array([1.0, math.nan])), "pwm: found a value that is not finite"),
-        (lambda: delayed(Pump(), np.zeros((4, 3))), r"expected \(n, 2\)"),
-    ],
-)
-def test_bad_input(build: object, words: str) -> None:
-    with pytest.raises(BadInputError, match=words):
-        build()
