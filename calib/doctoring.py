@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["Check", "examine"]
+from calib.errors import pip_install
 
 _LEAST_PYTHON = (3, 11)
 _PATIENCE_S = 20.0
@@ -44,17 +44,18 @@ _LIBRARIES = (
     ("pydantic", "pydantic", (2, 8)),
     ("pyyaml", "yaml", (6, 0)),
     ("jinja2", "jinja2", (3, 1)),
+    ("markdown-it-py", "markdown_it", (3, 0)),
 )
 """Distribution, module and least version of what every installation has."""
 
 _EXTRAS = (
-    ("pyarrow", "pyarrow", "logs in Parquet: calib[logs]"),
-    ("mcap", "mcap", "logs and states in MCAP: calib[logs]"),
-    ("rosbags", "rosbags", "logs in ROS bags: calib[logs]"),
-    ("pyserial", "serial", "calib record: calib[serial]"),
-    ("ahrs", "ahrs", "filters of others in calib imu drift: calib[peers]"),
-    ("imufusion", "imufusion", "filters of others in calib imu drift: calib[peers]"),
-    ("vqf", "vqf", "filters of others in calib imu drift: calib[peers]"),
+    ("pyarrow", "pyarrow", f"logs in Parquet: {pip_install('logs')}"),
+    ("mcap", "mcap", f"logs and states in MCAP: {pip_install('logs')}"),
+    ("rosbags", "rosbags", f"logs in ROS bags: {pip_install('logs')}"),
+    ("pyserial", "serial", f"calib record: {pip_install('serial')}"),
+    ("ahrs", "ahrs", f"filters of others in calib imu drift: {pip_install('peers')}"),
+    ("imufusion", "imufusion", f"filters of others in calib imu drift: {pip_install('peers')}"),
+    ("vqf", "vqf", f"filters of others in calib imu drift: {pip_install('peers')}"),
 )
 
 _TOOLS = (

@@ -2,19 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = [
-    "EXIT_BAD_INPUT",
-    "EXIT_DONE",
-    "EXIT_INTERNAL",
-    "EXIT_POOR",
-    "EXIT_READER_GONE",
-    "EXIT_USAGE",
-    "BadInputError",
-    "CalibError",
-    "ReaderGoneError",
-    "UsageError",
-]
-
 EXIT_DONE = 0
 EXIT_POOR = 1
 """Done and written, but the result fails its quality gate."""
@@ -23,6 +10,14 @@ EXIT_BAD_INPUT = 3
 EXIT_INTERNAL = 70
 """A mistake of the program's own; nothing that a user can put right."""
 EXIT_READER_GONE = 141
+
+DISTRIBUTION = "calib-rig"
+"""Name on the package index, where `calib` belongs to another project."""
+
+
+def pip_install(extra: str) -> str:
+    """The command that installs an extra of this project, for the end of a sentence."""
+    return f"pip install '{DISTRIBUTION}[{extra}]'"
 
 
 class CalibError(Exception):

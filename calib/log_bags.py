@@ -14,7 +14,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from calib.errors import BadInputError, CalibError
+from calib.errors import BadInputError, CalibError, pip_install
 from calib.files import check_readable, one_line, shown
 from calib.log_messages import Source, rows_from_messages
 from calib.log_topics import Topic, topic_map
@@ -29,8 +29,6 @@ from calib.log_unpacking import (
     unpacked,
 )
 from calib.logs import Log
-
-__all__ = ["BAGS", "is_bag", "iter_bag"]
 
 BAGS = (".bag", ".db3", ".mcap")
 """Endings of bags; a ROS 2 bag may also be a folder."""
@@ -76,7 +74,7 @@ def _module(path: Path, name: str, package: str) -> Any:
     except ImportError as error:
         what = f"reading {path.suffix.lstrip('.') or 'bags'}"
         raise BadInputError(
-            f"{shown(path)}: {what} needs the package {package}; install the extra logs"
+            f"{shown(path)}: {what} needs the package {package}: {pip_install('logs')}"
         ) from error
 
 

@@ -27,25 +27,9 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from calib.arrays import FloatArray, IntArray
-from calib.errors import BadInputError
+from calib.errors import BadInputError, pip_install
 from calib.files import shown, write_atomically
 from calib.units import plain_number
-
-__all__ = [
-    "BLANK",
-    "COLUMNS",
-    "MEASURED",
-    "ROWS_MISSING",
-    "TRUE",
-    "Log",
-    "check_time",
-    "iter_log",
-    "iter_rows",
-    "log_text",
-    "passed_over",
-    "read_log",
-    "write_log",
-]
 
 MEASURED = (
     "u_px",
@@ -294,7 +278,7 @@ def _iter_parquet(path: Path) -> Iterator[Log]:
     try:
         parquet: Any = importlib.import_module("pyarrow.parquet")
     except ImportError as error:
-        raise BadInputError(f"{source}: reading Parquet needs pyarrow; install the extra logs") from error
+        raise BadInputError(f"{source}: reading Parquet needs pyarrow: {pip_install('logs')}") from error
     try:
         file = parquet.ParquetFile(path, pre_buffer=False)
         layout = _layout(source, 1, file.schema_arrow.names)
@@ -389,9 +373,7 @@ def _parquet_bytes(log: Log, path: Path) -> bytes:
         arrow: Any = importlib.import_module("pyarrow")
         parquet: Any = importlib.import_module("pyarrow.parquet")
     except ImportError as error:
-        raise BadInputError(
-            f"{shown(path)}: writing Parquet needs pyarrow; install the extra logs"
-        ) from error
+        raise BadInputError(f"{shown(path)}: writing Parquet needs pyarrow: {pip_install('logs')}") from error
     table = {"t_s": log.t_s, **{name: log.columns[name] for name in COLUMNS if name in log.columns}}
     sink = io.BytesIO()
     parquet.write_table(arrow.table({k: arrow.array(v, from_pandas=True) for k, v in table.items()}), sink)

@@ -14,10 +14,8 @@ from pathlib import Path
 from typing import IO, Any
 
 from calib.arrays import FloatArray
-from calib.errors import BadInputError
+from calib.errors import BadInputError, pip_install
 from calib.files import shown
-
-__all__ = ["HEAD", "STATES_TOPIC", "McapStates"]
 
 STATES_TOPIC, HEAD = "/states", "/head"
 
@@ -59,7 +57,7 @@ class McapStates:
         try:
             writer: Any = importlib.import_module("mcap.writer")
         except ImportError as error:
-            raise BadInputError(f"{shown(path)}: writing MCAP needs mcap; install the extra logs") from error
+            raise BadInputError(f"{shown(path)}: writing MCAP needs mcap: {pip_install('logs')}") from error
         self._path, self._names = path, names
         self._pose_at = tuple(names.index(name) for name in ("x_m", "y_m", "phi_rad"))
         self._writer = writer.Writer(stream)

@@ -14,10 +14,8 @@ from typing import IO, Any, Protocol
 import numpy as np
 
 from calib.arrays import FloatArray
-from calib.errors import BadInputError
+from calib.errors import BadInputError, pip_install
 from calib.files import check_writable, shown
-
-__all__ = ["ENDINGS", "STATES", "CsvStates", "ParquetStates", "StatesFile", "is_whole", "states_writer"]
 
 STATES = (
     "t_s", "q1_m", "q2_m", "dq1_mps", "dq2_mps", "phi_rad", "length_m", "x_m", "y_m", "gyro_bias_radps",
@@ -84,7 +82,7 @@ class ParquetStates:
             parquet: Any = importlib.import_module("pyarrow.parquet")
         except ImportError as error:
             raise BadInputError(
-                f"{shown(path)}: writing Parquet needs pyarrow; install the extra logs"
+                f"{shown(path)}: writing Parquet needs pyarrow: {pip_install('logs')}"
             ) from error
         kinds = {True: self._arrow.int64(), False: self._arrow.float64()}
         self._schema = self._arrow.schema([(name, kinds[is_whole(name)]) for name in names])

@@ -14,6 +14,7 @@ from calib.cli.control import control
 from calib.cli.convert import convert
 from calib.cli.diff import diff
 from calib.cli.distortion import distortion
+from calib.cli.docs import docs
 from calib.cli.doctor import doctor
 from calib.cli.exchange import export_camera, import_camera
 from calib.cli.extrinsics import extrinsics
@@ -81,3 +82,4 @@ app.command("import")(import_camera)
 app.command("report")(report)
 app.command("diff")(diff)
 app.command("doctor")(doctor)
+app.command("docs")(docs)

@@ -9,9 +9,7 @@ from typing import Annotated
 import typer
 
 from calib.cli.common import JsonOption, document, narrate, say
-from calib.errors import BadInputError, UsageError
-
-__all__ = ["record"]
+from calib.errors import BadInputError, UsageError, pip_install
 
 _SILENT_S = 10.0
 
@@ -32,7 +30,7 @@ def record(
     try:
         import serial
     except ModuleNotFoundError as error:
-        raise UsageError("calib record needs pyserial; install calib[serial]") from error
+        raise UsageError(f"calib record needs pyserial: {pip_install('serial')}") from error
     duration_s = None if duration is None else parse_duration_s(duration, "--duration")
     check_writable(output)
     try:

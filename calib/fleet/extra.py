@@ -5,9 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-from calib.errors import BadInputError
-
-__all__ = ["needed"]
+from calib.errors import BadInputError, pip_install
 
 
 def needed(name: str) -> Any:
@@ -16,5 +14,5 @@ def needed(name: str) -> Any:
         return importlib.import_module(name)
     except ImportError as error:
         raise BadInputError(
-            f"{name} cannot be loaded, which fleets and sweeps need; install the extra fleet ({error})"
+            f"{name} cannot be loaded, which fleets and sweeps need ({error}): {pip_install('fleet')}"
         ) from error

@@ -17,9 +17,7 @@ from typing import Any
 import numpy as np
 
 from calib.arrays import FloatArray
-from calib.errors import BadInputError
-
-__all__ = ["MOST_SAMPLES", "PEERS", "missing", "run_peer"]
+from calib.errors import BadInputError, pip_install
 
 _G = 9.80665
 
@@ -97,7 +95,7 @@ def run_peer(name: str, gyro_radps: FloatArray, force_mps2: FloatArray, period_s
     BadInputError for an unknown name, a package that is not installed, and readings of another shape.
     """
     if package := missing(name):
-        raise BadInputError(f"{name}: needs the package {package}; install the extra peers")
+        raise BadInputError(f"{name}: needs the package {package}: {pip_install('peers')}")
     for what, values in (("rates", gyro_radps), ("specific forces", force_mps2)):
         if values.ndim != 2 or values.shape[1] != 3 or len(values) != len(gyro_radps) or len(values) == 0:
             raise BadInputError(f"{name}: found {what} {values.shape}, expected (n, 3)")

@@ -14,14 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.arrays import FloatArray
+from calib.errors import pip_install
 from calib.imu.mahony import Mahony, MahonyState
 from calib.imu.mahony_batch import accelerometer_angles, filter_log
 from calib.imu.orientation import up_in_sensor
 from calib.imu.peers import MOST_SAMPLES, PEERS, missing, run_peer
 from calib.imu.rate import planar_rate, up_vector
 from calib.imu.sampling import Part
-
-__all__ = ["DriftLog", "Track", "Tuned", "mean_angle", "on_grid", "tracks_of"]
 
 _START_S = 0.5
 _THREE = ("gx", "gy", "gz", "ax", "ay", "az")
@@ -189,7 +188,7 @@ def tracks_of(
     found.append(Track("MM 3/3 with up vector", runner.mahony(Mahony(), tilted=True)))
     for name in (name for name in PEERS if name != "VQF offline") if peers else ():
         if package := missing(name):
-            skipped.append(f"{name}: the package {package} is not installed; it comes with the extra peers")
+            skipped.append(f"{name}: the package {package} is not installed: {pip_install('peers')}")
         elif runner.samples > MOST_SAMPLES.get(name, runner.samples):
             skipped.append(
                 f"{name}: its loop is too slow for {runner.samples} samples, at most "

@@ -1,0 +1,332 @@
+"""README and manual: examples run, commands and links exist, and `calib docs` shows the pages offline."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from chromium import browser_or_skip
+from reference_pages import pages as generated_pages
+from reference_pages import verbs
+from typer.main import get_command
+
+from calib.cli.app import app
+from calib.cli.docs import MANUAL, docs, manual, page_of, slug, write_manual
+from calib.errors import DISTRIBUTION, UsageError, pip_install
+
+ROOT = Path(__file__).resolve().parents[2]
+README = ROOT / "README.md"
+NOT_RUN = {"tour.md"}
+"""Pages whose Python is not run here; each says so."""
+
+FENCE = re.compile(r"^(?P<indent> *)```(?P<kind>\w*)\n(?P<text>.*?)^ *```$", re.S | re.M)
+NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+SHELL = 'calib() { "$PYTHON" -m calib "$@"; }; '
+
+
+def documents() -> list[Path]:
+    return [README, *sorted(MANUAL.rglob("*.md"))]
+
+
+def blocks(text: str, kind: str) -> Iterator[tuple[int, str]]:
+    """Fenced blocks of a kind, with the number of the line before their first."""
+    for match in FENCE.finditer(text):
+        if match["kind"] == kind:
+            yield text.count("\n", 0, match.start("text")), match["text"]
+
+
+def without_blocks(text: str) -> str:
+    return FENCE.sub("", text)
+
+
+def python_pages() -> list[Path]:
+    return [
+        path
+        for path in documents()
+        if path.name not in NOT_RUN and any(blocks(path.read_text(encoding="utf-8"), "python"))
+    ]
+
+
+@pytest.mark.parametrize("path", python_pages(), ids=lambda path: path.stem)
+def test_python_blocks_run_and_leave_nothing(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = sorted(item.name for item in ROOT.iterdir())
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    names: dict[str, object] = {"__name__": path.stem}
+    for line, block in blocks(path.read_text(encoding="utf-8"), "python"):
+        # Later blocks use what earlier ones made; a traceback names the page's own line.
+        exec(compile("\n" * line + block, path.name, "exec"), names)
+        assert capsys.readouterr().out.strip(), f"{path.name}, line {line}: prints nothing"
+    assert sorted(item.name for item in ROOT.iterdir()) == before
+
+
+@pytest.mark.parametrize("name", sorted(NOT_RUN))
+def test_pages_that_are_not_run_say_so(name: str) -> None:
+    text = (MANUAL / name).read_text(encoding="utf-8")
+    assert "not yet run by the tests" in text
+    for _, block in blocks(text, "python"):
+        compile(block, name, "exec")
+
+
+def test_the_tutorial_prints_what_it_shows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each console block, run in order. Numbers may differ by 2 % or by one in their last digit."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(ROOT / "images", "images")
+    text = (MANUAL / "tutorial.md").read_text(encoding="utf-8")
+    for _, block in blocks(text, "python"):
+        names: dict[str, Path] = {}
+        exec(compile(block, "tutorial.md", "exec"), names)
+        names["zoomed"].rename(tmp_path / "zoomed")
+    environment = {**os.environ, "PYTHON": sys.executable, "PYTHONPATH": str(ROOT)}
+    compared = 0
+    for line, block in blocks(text, "console"):
+        lines = block.splitlines()
+        commands = [row.removeprefix("$ ") for row in lines if row.startswith("$ ")]
+        expected = [row for row in lines if not row.startswith("$ ")]
+        printed = ""
+        for command in commands:
+            done = subprocess.run(
+                ["bash", "-c", SHELL + command], env=environment, capture_output=True, text=True, check=False
+            )
+            assert done.returncode in (0, 1), f"line {line}: {command}: {done.stderr}"
+            printed += done.stdout
+        compare(expected, printed.splitlines(), f"tutorial.md, line {line}")
+        compared += len(expected)
+    assert compared > 50
+
+
+def compare(expected: list[str], printed: list[str], where: str) -> None:
+    """Hold printed lines against a page; `...` stands for the rest of a line, or for any lines."""
+    at = 0
+    for row in expected:
+        if row.strip() == "...":
+            at = -1
+            continue
+        if at < 0:
+            at = next((i for i, line in enumerate(printed) if alike(row, line)), len(printed))
+        assert at < len(printed), f"{where}: {row!r} is not printed"
+        assert alike(row, printed[at]), f"{where}: {row!r} is shown, {printed[at]!r} printed"
+        printed, at = printed[at + 1 :], 0
+    assert at < 0 or not printed, f"{where}: {printed} is printed as well"
+
+
+def alike(shown: str, printed: str) -> bool:
+    if shown.endswith("..."):
+        # What stands before the dots is long enough to tell lines apart.
+        return alike(shown[:-3], printed[: len(shown) - 3])
+    if NUMBER.sub("#", shown) != NUMBER.sub("#", printed):
+        return False
+    for one, other in zip(NUMBER.findall(shown), NUMBER.findall(printed), strict=True):
+        last_digit = 10.0 ** -len(one.partition(".")[2])
+        if abs(float(one) - float(other)) > max(0.02 * abs(float(one)), 1.01 * last_digit):
+            return False
+    return True
+
+
+def test_the_comparison_notices_what_differs() -> None:
+    compare(["a 1.00 b", "...", "c ..."], ["a 1.01 b", "x", "y", "c and more"], "")
+    for expected in (["a 1.00 b"], ["a 1.10 b", "..."], ["a 1.00 b", "...", "z"], ["b", "..."]):
+        with pytest.raises(AssertionError):
+            compare(expected, ["a 1.01 b", "x", "y", "c and more"], "")
+
+
+def test_hints_name_this_project_and_its_extras() -> None:
+    """What a message says to install leads to this project, not to another one's package."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert project["name"] == DISTRIBUTION and pip_install("logs") == f"pip install '{DISTRIBUTION}[logs]'"
+    sources = {path: path.read_text(encoding="utf-8") for path in (ROOT / "calib").rglob("*.py")}
+    extras = {name for text in sources.values() for name in re.findall(r"pip_install\([\"'](\w+)", text)}
+    assert len(extras) >= 4 and extras <= set(project["optional-dependencies"])
+    assert not [path for path, text in sources.items() if re.search(r"calib\[\w+\]|install the extra", text)]
+
+
+def test_readme_is_one_screen_and_holds_the_set_up() -> None:
+    text = README.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 150
+    set_up = re.findall(r"^    (python3 -m venv .*)$", text, re.M)
+    assert len(set_up) == 2
+    assert [".venv/bin/calib intrinsics images/" in set_up[0], "pytest" in set_up[1]] == [True, True]
+
+
+@pytest.mark.parametrize("path", sorted(generated_pages()))
+def test_generated_pages_are_up_to_date(path: str) -> None:
+    assert (MANUAL / path).read_text(encoding="utf-8") == generated_pages()[path], (
+        "refresh it: python tests/reference_pages.py"
+    )
+
+
+def test_every_verb_is_explained_and_shown() -> None:
+    text = (MANUAL / "reference" / "output.md").read_text(encoding="utf-8")
+    shown = re.findall(r"^\$ (calib .*)$", text, re.M)
+    words = [verb for verb, _ in verbs()]
+    assert len(words) > 25
+    assert not [verb for verb in words if not any(f"{line} ".startswith(f"{verb} ") for line in shown)]
+    explained = "".join(
+        path.read_text(encoding="utf-8") for path in documents() if path.parent.name != "reference"
+    )
+    assert not [verb for verb in words if not names_verb(verb, explained)]
+
+
+def names_verb(verb: str, text: str) -> bool:
+    """Whether a page outside the reference names a verb; the README's table leaves `calib` out."""
+    short = verb.removeprefix("calib ")
+    return verb in text or f"`{short}`" in text or (short == "identify logs" and "calib identify LOG" in text)
+
+
+def quoted_commands() -> Iterator[tuple[str, str]]:
+    """Page and words of every command line in a code block or between backticks."""
+    for path in documents():
+        text = path.read_text(encoding="utf-8")
+        lines = re.findall(
+            r"^ *(?:\$ )?(calib [^#\n]*)", "\n".join(m["text"] for m in FENCE.finditer(text)), re.M
+        )
+        plain = without_blocks(text)
+        lines += re.findall(r"^ {4,}(calib [^#\n]*)", plain, re.M)
+        lines += re.findall(r"`(?:\.venv/bin/)?(calib [a-z][^`]*)`", plain)
+        for line in lines:
+            yield path.name, line.split(" && ")[0].strip()
+
+
+def test_quoted_commands_have_existing_verbs_and_options() -> None:
+    wrong, count, whole = [], 0, get_command(app)
+    for page, line in quoted_commands():
+        words = shlex.split(line.replace("...", ""))[1:]
+        command = whole
+        while words and words[0] in getattr(command, "commands", {}):
+            command = command.commands[words.pop(0)]
+        if words and words[0] and getattr(command, "commands", None) and command.name == "identify":
+            command = command.commands["logs"]
+        if command.name == "calib":
+            wrong.append(f"{page}: {line}")
+            continue
+        known = {name for one in command.params for name in (*one.opts, *one.secondary_opts)}
+        known |= {"--help"}
+        options = [word.split("=")[0] for word in words if re.match(r"--?[a-z]", word)]
+        wrong += [f"{page}: {line}: {option}" for option in options if option not in known]
+        count += 1
+    assert not wrong
+    assert count > 60
+
+
+def test_links_lead_somewhere() -> None:
+    broken = []
+    for path in documents():
+        text = path.read_text(encoding="utf-8")
+        for target in re.findall(r"\]\(([^)\s]+)\)", without_blocks(text)):
+            if "://" in target:
+                continue
+            file, _, anchor = target.partition("#")
+            there = (path.parent / file).resolve() if file else path
+            if not there.exists():
+                broken.append(f"{path.name}: {target}")
+            elif anchor:
+                heads = re.findall(r"^#+ (.*)$", without_blocks(there.read_text(encoding="utf-8")), re.M)
+                if anchor not in map(slug, heads):
+                    broken.append(f"{path.name}: {target}")
+    assert not broken
+
+
+def test_the_index_links_every_page_and_topics_are_unique() -> None:
+    names = [page.name for page in manual()]
+    assert sorted(names) == sorted(
+        str(path.relative_to(MANUAL).with_suffix("").as_posix()) for path in MANUAL.rglob("*.md")
+    )
+    topics = [page.topic for page in manual()]
+    assert len(set(topics)) == len(topics)
+    assert all(page.text.startswith(f"# {page.title}\n") for page in manual())
+
+
+def test_pages_show_offline_and_fit_small_windows(tmp_path: Path) -> None:
+    folder = write_manual(manual(), tmp_path / "manual")
+    browser = browser_or_skip(tmp_path / "profile")
+    try:
+        for page in manual():
+            browser.open(folder / f"{page.name}.html", 1200)
+            assert browser.run("document.querySelector('h1').textContent") == page.title
+            assert browser.run("document.querySelector('[aria-current]').textContent") == page.title
+            for width in (1200, 360):
+                browser.size(width)
+                assert browser.run("document.documentElement.scrollWidth") <= width, (
+                    f"{page.name} at {width} px"
+                )
+        browser.open(folder / "howto" / "ros.html", 1200)
+        hrefs = browser.run("[...document.querySelectorAll('a')].map(a => a.href)")
+        files = [
+            Path(href.removeprefix("file://").partition("#")[0]) for href in hrefs if href.startswith("file:")
+        ]
+        assert files and all(file.exists() for file in files)
+        assert not browser.errors
+    finally:
+        browser.close()
+
+
+def test_markup_in_pages_is_shown_and_not_obeyed(tmp_path: Path) -> None:
+    (page,) = [one for one in manual() if one.topic == "limits"]
+    evil = type(page)("limits", "<b>", "# <b>\n\n<script>alert(1)</script>\n")
+    text = (write_manual([evil], tmp_path) / "limits.html").read_text(encoding="utf-8")
+    assert "<script>" not in text and "<b>" not in text
+
+
+def test_docs_opens_a_browser_or_prints_the_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", lambda address: opened.append(address) or True)
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    docs(topic="ros")
+    printed = capsys.readouterr()
+    path = Path(printed.out.strip())
+    assert path.is_relative_to(tmp_path) and path.name == "ros.html" and path.is_file()
+    assert not opened and "open this file" in printed.err
+    monkeypatch.setenv("DISPLAY", ":0")
+    docs(topic="ros")
+    assert opened == [path.as_uri()] and "open this file" not in capsys.readouterr().err
+
+
+def test_docs_without_a_folder_to_write_uses_temporary_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    monkeypatch.setattr("webbrowser.open", lambda address: True)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    docs()
+    assert Path(capsys.readouterr().out.strip()).is_file()
+
+
+def test_docs_prints_lists_and_refuses(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    docs(topic="limits", print_page=True)
+    assert capsys.readouterr().out == (MANUAL / "limits.md").read_text(encoding="utf-8")
+    docs(list_topics=True)
+    assert len(capsys.readouterr().out.splitlines()) == len(manual())
+    docs(topic="theory", output=tmp_path, as_json=True)
+    told = json.loads(capsys.readouterr().out)["docs"]
+    assert told["page"] == str(tmp_path / "theory.html") and told["topics"]["theory"] == "Theory"
+    with pytest.raises(UsageError, match="did you mean tutorial"):
+        page_of("tutorail", manual())
+    with pytest.raises(UsageError, match="--list"):
+        docs(topic="zzz")
+
+
+def test_help_of_docs_names_no_browser_it_would_load() -> None:
+    """The verb loads neither browser nor Markdown before it needs them."""
+    code = "import sys, calib.cli.app; print([m for m in ('webbrowser', 'markdown_it') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
