@@ -6,16 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.aligning import PRIOR as USUAL_PRIOR
-from calib.arrays import FloatArray
-from calib.estimator.align import Alignment, Settings, rest_angle
-from calib.estimator.align_start import AlignLog
-from calib.estimator.sensors import SENSOR, sensor_values, view_coefficients
-from calib.logs import Log
-from calib.twin.camera_sensor import Tracker
-from calib.twin.imu_sensor import Imu
+from calib.core.arrays import FloatArray
+from calib.io.logs import Log
+from calib.stages.align.read import PRIOR as USUAL_PRIOR
+from calib.stages.align.solve import AlignLog, Alignment, Settings, rest_angle
+from calib.stages.estimator.sensors import SENSOR, sensor_values, view_coefficients
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
+from calib.twin.sensors import Imu, Tracker
 from calib.twin.simulate import log_of
 
 __all__ = ["MOTIONS", "PRIOR", "Trial", "align_log", "draw", "known", "prior_settings", "scores", "twin_log"]

@@ -8,10 +8,8 @@ from pathlib import Path
 import numpy as np
 from scipy.io import loadmat
 
-from calib.imu.mahony import Mahony, MahonyState
-from calib.imu.mahony_batch import accelerometer_angles, filter_log, wrapped
-from calib.imu.orientation import up_in_sensor
-from calib.imu.rate import in_plane
+from calib.stages.imu.mahony import Mahony, MahonyState, accelerometer_angles, filter_log, wrapped
+from calib.stages.imu.tracks import in_plane, up_in_sensor
 
 __all__ = ["FILES", "PUBLISHED_DEG", "Trial", "filter_rmse_deg", "read_trial", "rmse_deg", "windows"]
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from calib.actuator.parameters import pumps_connected
-from calib.actuator.pump import Orifice, PolynomialForce, Pump
-from calib.control.inverse_model import Model
+from calib.stages.actuator.parameters import pumps_connected
+from calib.stages.actuator.pump import Orifice, PolynomialForce, Pump
+from calib.stages.control.laws import Model
 
 NOMINAL = Model(pumps_connected(), Pump())
 ORIFICE = Model(pumps_connected(), Pump(deflation=Orifice()))

@@ -8,10 +8,10 @@ from functools import cache
 import numpy as np
 from estimatorlogs import SCENARIOS, varied
 
-from calib.actuator.parameters import Creep
-from calib.actuator.pump import Orifice, RateLimit
-from calib.arrays import FloatArray
-from calib.logs import Log
+from calib.core.arrays import FloatArray
+from calib.io.logs import Log
+from calib.stages.actuator.parameters import Creep
+from calib.stages.actuator.pump import Orifice, RateLimit
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.simulate import log_of

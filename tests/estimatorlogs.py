@@ -7,15 +7,14 @@ from functools import cache
 
 import numpy as np
 
-from calib.arrays import FloatArray
-from calib.estimator.model import Kinematic
-from calib.estimator.sensors import sensor_values, view_coefficients
-from calib.estimator.setup import Rows, Setup, Start
-from calib.logs import Log
-from calib.replaying import periods, rows_of
-from calib.twin.camera_sensor import Tracker
+from calib.core.arrays import FloatArray
+from calib.io.logs import Log
+from calib.stages.estimator.kinematic import Kinematic, Rows, Setup, Start
+from calib.stages.estimator.read import periods, rows_of
+from calib.stages.estimator.sensors import sensor_values, view_coefficients
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
+from calib.twin.sensors import Tracker
 from calib.twin.simulate import log_of
 
 SCENARIOS = {

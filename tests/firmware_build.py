@@ -14,11 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.firmware.conformance import Inputs, Outputs, Reference, binary32
-from calib.firmware.conformance_fused import FusedReference
-from calib.firmware.header import Header, header_text, verbatim
-from calib.firmware.literals import values
-from calib.firmware.vectors import TOLERANCE, selftest_text
+from calib.stages.firmware.conformance import FusedReference, Inputs, Outputs, Reference, binary32
+from calib.stages.firmware.header import Header, header_text, verbatim
+from calib.stages.firmware.literals import values
+from calib.stages.firmware.vectors import TOLERANCE, selftest_text
 
 __all__ = [
     "HOSTILE",

@@ -1,7 +1,7 @@
 """The simulated rig one tick at a time in compiled code, for loops that a processor closes.
 
-Plant and pumps are `calib.actuator.kernel.run`; the sensors' arithmetic is the twin's written for one sample,
-with the twin's noise. `tests/firmware/test_plant.py` holds both against `calib.twin.simulate`.
+Plant and pumps are `calib.stages.actuator.simulate.run`; the sensors' arithmetic is the twin's written for
+one sample, with the twin's noise. `tests/firmware/test_plant.py` holds both against `calib.twin.simulate`.
 """
 
 from __future__ import annotations
@@ -12,13 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from calib.actuator.integrate import rig_at_rest
-from calib.actuator.kernel import derivative
-from calib.actuator.kernel import run as run_kernel
-from calib.actuator.pump import ElongationForce
-from calib.arrays import FloatArray
-from calib.twin.kernel import head_rows, states_between
+from calib.core.arrays import FloatArray
+from calib.stages.actuator.pump import ElongationForce
+from calib.stages.actuator.simulate import derivative, rig_at_rest
+from calib.stages.actuator.simulate import run as run_kernel
 from calib.twin.rig import SimulatedRig
+from calib.twin.sensors import head_rows, states_between
 from calib.twin.simulate import _NODES_PER_TICK, _SUBSTEPS, _Plant, _Sensors
 
 __all__ = ["Loop"]

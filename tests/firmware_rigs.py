@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from calib.estimator.gains import TickNoise, design
-from calib.firmware.header import Header, header_of
-from calib.rig import Rig
-from calib.signals.design import Design, design_lowpass
+from calib.core.rig import Rig
+from calib.stages.estimator.constant_gain import TickNoise, design
+from calib.stages.firmware.header import Header, header_of
+from calib.stages.lowpass.filters import Design, design_lowpass
 from calib.twin.pictures import CAMERA, PLANE
 from calib.twin.rig import SimulatedRig
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from calib.fleet import worker
-from calib.fleet.cluster import Cluster
+from calib.runner import engine as worker
+from calib.runner.engine import Cluster
 
 __all__ = ["in_threads"]
 

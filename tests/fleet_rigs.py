@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.arrays import GrayImage
-from calib.camera.model import Camera
+from calib.core.arrays import GrayImage
+from calib.stages.camera.model import Camera
 from calib.twin.pictures import BOARD, CAMERA, VIEWS, png_bytes
 from calib.twin.scene import Light, PrintedBoard, Sensor, pose_facing, render
 

@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from calib.actuator.identify_parameters import Nominal, made, values_of
-from calib.actuator.identify_pump_models import PumpRecord, simulate_pump
-from calib.actuator.identify_tracks import Track
-from calib.actuator.integrate import rig_at_rest, simulate
-from calib.actuator.parameters import Creep
-from calib.actuator.pump import TICK_S, RateLimit
-from calib.logs import write_log
-from calib.rig import Camera, Distortion, Plane, Rig, write_rig
+from calib.core.rig import Camera, Distortion, Plane, Rig, write_rig
+from calib.io.logs import write_log
+from calib.stages.actuator.identify import Nominal, Track, made, values_of
+from calib.stages.actuator.identify_pump import PumpRecord, simulate_pump
+from calib.stages.actuator.parameters import Creep
+from calib.stages.actuator.pump import TICK_S, RateLimit
+from calib.stages.actuator.simulate import rig_at_rest, simulate
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.simulate import log_of

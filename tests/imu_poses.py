@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.imu.intrinsics import PoseLog
+from calib.stages.imu.intrinsics import PoseLog
 
 AXES = ("gx", "gy", "gz", "ax", "ay", "az")
 G = 9.81

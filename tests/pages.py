@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from calib.report.page_pictures import keep_pictures
-from calib.running.cache import store
+from calib.runner.cache import store
+from calib.show.page import keep_pictures
 
 __all__ = ["EVIL", "finished_run"]
 

@@ -7,14 +7,12 @@ import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from calib.errors import BadInputError
-from calib.files import sha256, write_atomically
-from calib.rig import read_rig, write_rig
-from calib.running.folder import Folder, LogFile, read_folder
-from calib.running.outputs import publish, summary
-from calib.running.pool import Command
-from calib.running.runner import Done, Runner, opened
-from calib.running.stages import Planned, Stage
+from calib.core.errors import BadInputError
+from calib.core.files import sha256, write_atomically
+from calib.core.rig import read_rig, write_rig
+from calib.runner.folder import Folder, LogFile, read_folder
+from calib.runner.graph import Command, Done, Planned, Runner, Stage, opened
+from calib.runner.outputs import publish, summary
 
 __all__ = ["CALLS", "STAGES", "Inline", "make_folder", "run_small"]
 

@@ -8,12 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from calib.arrays import FloatArray
-from calib.camera.board import Board
-from calib.camera.coverage import image_outline
-from calib.camera.model import Camera, project, undistort
-from calib.camera.views import View
-from calib.twin.sheet import rotation
+from calib.core.arrays import FloatArray
+from calib.stages.camera.checks import image_outline
+from calib.stages.camera.model import Board, Camera, View, project, undistort
+from calib.twin.scene import rotation
 
 __all__ = ["BAD", "SIZES", "Recipe", "camera_of", "good_set", "take"]
 

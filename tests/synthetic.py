@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.arrays import FloatArray
-from calib.camera.board import Board
-from calib.camera.levenberg import rotation_exp
-from calib.camera.model import Camera, project
-from calib.camera.views import View
+from calib.core.arrays import FloatArray
+from calib.stages.camera.bundle import rotation_exp
+from calib.stages.camera.model import Board, Camera, View, project
 
 CAMERA = Camera(
     "radial2", (640, 480), 530.0, 532.0, 0.0, 325.0, 236.0, np.array([-0.25, 0.1, 0, 0, 0, 0, 0, 0.0])

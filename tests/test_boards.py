@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib import boards, workers
-from calib.boards import board_of, find_boards
-from calib.errors import BadInputError
+from calib.core import workers
+from calib.core.errors import BadInputError
+from calib.stages.camera import read as boards
+from calib.stages.camera.read import board_of, find_boards
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calib.boundedyaml import MAX_NODES, YamlProblem, load
+from calib.core.bounded_yaml import MAX_NODES, YamlProblem, load
 
 DOUBLING = "".join(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n" for i in range(1, 40))
 

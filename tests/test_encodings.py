@@ -9,17 +9,15 @@ import numpy as np
 import pytest
 import yaml
 
-from calib.boards import read_board_file
-from calib.cli.exchange import import_camera
-from calib.errors import BadInputError
-from calib.firmware.check import read_frames
-from calib.firmware.recording import record
-from calib.firmware.telemetry import encoded, frame_from_row
-from calib.logs import log_text, read_log
-from calib.pumptables import read_pump_table
-from calib.referencefile import _series
-from calib.rig import read_rig
-from calib.tables import read_table, read_vnl
+from calib.cli.camera import import_camera
+from calib.core.errors import BadInputError
+from calib.core.rig import read_rig
+from calib.io.logs import log_text, read_log
+from calib.io.serial import encoded, frame_from_row, record
+from calib.stages.actuator.read import read_pump_table
+from calib.stages.camera.read import read_board_file, read_table, read_vnl
+from calib.stages.control.read import _series
+from calib.stages.firmware.check import read_frames
 
 RIG = "geometry: {workspace_m: [0.0, 0.0, 0.1, 0.1]}\ntwin: {note: text}\n"
 BOARD = "corners: [7, 5]\nsquare_m: 0.02\n"

@@ -7,7 +7,7 @@ import pickle
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calib.errors import BadInputError, CalibError, ReaderGoneError, UsageError
+from calib.core.errors import BadInputError, CalibError, ReaderGoneError, UsageError
 
 
 def test_exit_codes() -> None:

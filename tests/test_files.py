@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from calib import files
-from calib.errors import BadInputError
-from calib.files import (
+from calib.core import files
+from calib.core.errors import BadInputError
+from calib.core.files import (
     check_folder,
     check_readable,
     check_writable,

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.errors import BadInputError
-from calib.inputs import Told, read_views
+from calib.core.errors import BadInputError
+from calib.stages.camera.read import Told, read_views
 from synthetic import views_of
 
 SIZE = (640, 480)

@@ -10,8 +10,8 @@ from bags import KINDS_OF_FORMAT, NAMES, START_NS, Message, readings, write_bag
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from calib.errors import BadInputError
-from calib.logs import read_log
+from calib.core.errors import BadInputError
+from calib.io.logs import read_log
 
 COLUMNS = {
     "imu": ("ax_mps2", "ay_mps2", "az_mps2", "gx_radps", "gy_radps", "gz_radps"),
@@ -189,13 +189,13 @@ def test_a_chunk_that_unpacks_to_too_much_is_refused(
     (tmp_path / "topics.yaml").write_text("topics:\n  /imu: {gz_radps: gz_radps}\n")
     if index:
         assert len(read_log(path)) == 2000
-    monkeypatch.setattr("calib.log_unpacking.MOST_BYTES", 100_000)
+    monkeypatch.setattr("calib.io.unpacking.MOST_BYTES", 100_000)
     said = _refused(path)
     assert "a chunk unpacks to" in said or "exceeds" in said
 
 
 def test_the_hash_of_a_folder_is_that_of_its_files(tmp_path: Path) -> None:
-    from calib.rig import hash_of
+    from calib.core.rig import hash_of
 
     path = write_bag(tmp_path, "sqlite", readings(np.random.default_rng(0), 0.2))
     before = hash_of(path)

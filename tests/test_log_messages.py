@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calib.log_messages import WINDOW_S, rows_from_messages
-from calib.log_topics import Field, Topic, TopicMap
+from calib.io.bags import WINDOW_S, Field, Topic, TopicMap, rows_from_messages
 
 MAP = TopicMap("x.yaml", {"/a": (Field("u_px", "u"), Field("v_px", "v")), "/b": (Field("gz_radps", "g"),)})
 
@@ -80,7 +79,7 @@ def test_blocks_of_any_size_give_the_same_rows(items: list[tuple[str, int]], siz
         (name, (10 * (k // 2) + at) * step, {"u": k, "v": -k, "g": k}) for k, (name, at) in enumerate(items)
     ]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("calib.log_messages._ROWS", size)
+        patch.setattr("calib.io.bags._ROWS", size)
         cut, blocks = rows(messages)
     whole, _ = rows(messages)
     assert np.array_equal(np.sort(cut[:, 0]), cut[:, 0])

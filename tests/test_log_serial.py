@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.errors import BadInputError
-from calib.firmware.conformance import Inputs
-from calib.firmware.telemetry import Frame, csv_header, csv_row, encoded
-from calib.logs import read_log
+from calib.core.errors import BadInputError
+from calib.io.logs import read_log
+from calib.io.serial import Frame, csv_header, csv_row, encoded
+from calib.stages.firmware.conformance import Inputs
 
 FRAME = Frame(
     7, 60_000, 0, Inputs(160.0, 104.0, 9.75, 0.25, -0.5, (0.065, 0.066), True, True, 0), 0.125, (0.0, 0.08),

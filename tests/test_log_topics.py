@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calib.errors import BadInputError
-from calib.log_topics import Field, Topic, reader_of, topic_map
+from calib.core.errors import BadInputError
+from calib.io.bags import Field, Topic, reader_of, topic_map
 
 TOPICS = (
     Topic("/imu", "sensor_msgs/Imu"),

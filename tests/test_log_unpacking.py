@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from bags import KINDS, NAMES, START_NS, _ros
 
-from calib import log_unpacking
-from calib.errors import BadInputError
-from calib.log_unpacking import BoundedFile, BoundedPath, unpacked
-from calib.logs import read_log
+from calib.core.errors import BadInputError
+from calib.io import unpacking as log_unpacking
+from calib.io.logs import read_log
+from calib.io.unpacking import BoundedFile, BoundedPath, unpacked
 
 MOST = 100_000
 

@@ -9,7 +9,7 @@ import numpy as np
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from calib.logcells import POWERS, scan
+from calib.io.cells import POWERS, scan
 
 
 def _scan(text: str, columns: int) -> tuple[np.ndarray, np.ndarray, list[list[int]]]:

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import calib.logs as logs
-from calib.errors import BadInputError
-from calib.logs import Log, iter_log, log_text, read_log, write_log
+import calib.io.logs as logs
+from calib.core.errors import BadInputError
+from calib.io.logs import Log, iter_log, log_text, read_log, write_log
 
 SMALL = (
     "t_s,u_px,v_px,ax_mps2,gz_radps,pwm1\n"

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.actuator.kinematics import marker_from_head
-from calib.errors import BadInputError
-from calib.logs import Log, write_log
-from calib.lowpass import lowpass_section, positions_from_log
-from calib.signals.design import Design, design_lowpass
+from calib.core.errors import BadInputError
+from calib.io.logs import Log, write_log
+from calib.stages.actuator.kinematics import marker_from_head
+from calib.stages.lowpass.filters import Design, design_lowpass
+from calib.stages.lowpass.stage import lowpass_section, positions_from_log
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.simulate import log_of

@@ -11,9 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calib.errors import BadInputError
-from calib.pictureheaders import declared_pixels
-from calib.pictures import read_picture
+from calib.core.errors import BadInputError
+from calib.io.pictures import declared_pixels, read_picture
 
 FORMATS = (".png", ".jpg", ".tif", ".bmp", ".webp", ".pgm", ".ppm")
 

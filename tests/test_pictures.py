@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from calib.errors import BadInputError
-from calib.pictures import list_pictures, read_picture
+from calib.core.errors import BadInputError
+from calib.io.pictures import list_pictures, read_picture
 
 GRAY = (np.add.outer(np.arange(40), np.arange(60)) * 2).astype(np.uint8)
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from calib.errors import BadInputError
-from calib.rig import Camera, Rig, identity, read_rig, rig_text, write_rig
+from calib.core.errors import BadInputError
+from calib.core.rig import Camera, Rig, identity, read_rig, rig_text, write_rig
 
 CAMERA = Camera(
     model="radial2",

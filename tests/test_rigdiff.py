@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
-from calib.rigdiff import diff_rigs
+from calib.show.diff import diff_rigs
 
 K = np.array([[273.4, 0.0, 160.7], [0.0, 272.6, 101.9], [0.0, 0.0, 1.0]])
 T_M = np.array([0.004, -0.061, 0.272])

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.errors import BadInputError
-from calib.statesfile import ENDINGS, STATES, states_writer
+from calib.core.errors import BadInputError
+from calib.io.states import ENDINGS, STATES, states_writer
 
 
 def test_an_interrupted_file_leaves_the_old_one(tmp_path: Path) -> None:

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.camera.board import Board
-from calib.errors import BadInputError
-from calib.tables import read_table, read_vnl
+from calib.core.errors import BadInputError
+from calib.stages.camera.model import Board
+from calib.stages.camera.read import read_table, read_vnl
 
 HEADER = "view,x_m,y_m,u_px,v_px\n"
 FOUR = "a,0,0,10,10\na,0.02,0,20,10\na,0,0.02,10,20\na,0.02,0.02,20.5,21\n"

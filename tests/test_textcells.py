@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from calib.textcells import GENERAL, TIME, WHOLE, table_bytes
+from calib.io.cells import GENERAL, TIME, WHOLE, table_bytes
 
 FORMATS = {TIME: ".6f", GENERAL: ".9g", WHOLE: ".0f"}
 

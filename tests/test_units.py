@@ -8,13 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calib.errors import UsageError
-from calib.units import (
-    parse_corners,
-    parse_duration_s,
-    parse_length_m,
-    plain_number,
-)
+from calib.core.errors import UsageError
+from calib.core.units import parse_corners, parse_duration_s, parse_length_m, plain_number
 
 
 @pytest.mark.parametrize(

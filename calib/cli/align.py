@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from calib.cli.common import FiguresOption, JsonOption, RigOption, document, narrate, say, table
-from calib.errors import EXIT_POOR, BadInputError
+from calib.core.errors import EXIT_POOR, BadInputError
 
 if TYPE_CHECKING:
-    from calib.estimator.align_start import AlignLog
-    from calib.rig_align import Align
+    from calib.stages.align.section import Align
+    from calib.stages.align.solve import AlignLog
 
 __all__ = ["align"]
 
@@ -99,12 +99,12 @@ def align(
     A free swing shows the time offset, slow motion to large angles all the rest. Writes the section align
     of the rig's file. Exits 1 when the verdict is not ok.
     """
-    from calib.aligning import align_section, read_align_log, settings_from_rig, with_drawn_marker
-    from calib.estimator.align import align as find
-    from calib.estimator.align_verdict import judge_align
-    from calib.files import check_folder, check_writable, shown
-    from calib.rig import Geometry, hash_of, read_rig, section_json, write_rig
-    from calib.units import parse_length_m
+    from calib.core.files import check_folder, check_writable, shown
+    from calib.core.rig import Geometry, hash_of, read_rig, section_json, write_rig
+    from calib.core.units import parse_length_m
+    from calib.stages.align.read import align_section, read_align_log, settings_from_rig, with_drawn_marker
+    from calib.stages.align.solve import align as find
+    from calib.stages.align.solve import judge_align
 
     marker_offset_m = None if marker_offset is None else parse_length_m(marker_offset, "--marker-offset")
     check_writable(rig)
@@ -143,7 +143,7 @@ def align(
     write_rig(rig, before.model_copy(update={"align": section}), {"align": hashes})
     narrate(f"align written to {shown(rig)}")
     if figures is not None:
-        from calib.report.align_figures import write_align_figures
+        from calib.stages.align.plots import write_align_figures
 
         write_align_figures(figures, found, section.verdict)
         narrate(f"figures in {shown(figures)}")

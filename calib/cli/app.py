@@ -8,21 +8,17 @@ import typer
 
 from calib import __version__
 from calib.cli.align import align
-from calib.cli.board import board
-from calib.cli.compiling import telling
+from calib.cli.camera import board, distortion, export_camera, extrinsics, import_camera, intrinsics
+from calib.cli.common import telling
 from calib.cli.control import control
 from calib.cli.convert import convert
 from calib.cli.diff import diff
-from calib.cli.distortion import distortion
 from calib.cli.docs import docs
 from calib.cli.doctor import doctor
-from calib.cli.exchange import export_camera, import_camera
-from calib.cli.extrinsics import extrinsics
 from calib.cli.firmware import firmware
 from calib.cli.fleet import fleet
 from calib.cli.identify import identify
 from calib.cli.imu import imu
-from calib.cli.intrinsics import intrinsics
 from calib.cli.lowpass import lowpass
 from calib.cli.record import record
 from calib.cli.replay import replay
@@ -31,8 +27,6 @@ from calib.cli.run import run
 from calib.cli.simulate import simulate
 from calib.cli.sweep import sweep
 from calib.cli.validate import validate
-
-__all__ = ["app"]
 
 app = typer.Typer(
     name="calib",

@@ -10,21 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from calib.cli.common import narrate
-from calib.errors import UsageError
+from calib.core.errors import UsageError
 
 if TYPE_CHECKING:
-    from calib.fleet.cluster import Cluster
-    from calib.fleet.store import Store
-
-__all__ = [
-    "OutOption",
-    "RetriesOption",
-    "SchedulerOption",
-    "WorkersOption",
-    "check_places",
-    "opened_out",
-    "processes",
-]
+    from calib.runner.engine import Cluster
+    from calib.runner.fleet import Store
 
 OutOption = Annotated[
     Path, typer.Option("-o", "--output", help="Folder for the results; a later run goes on from it.")
@@ -52,7 +42,7 @@ def check_places(scheduler: str | None, workers: int | None) -> None:
 @contextmanager
 def opened_out(output: Path, verb: str, outputs: tuple[str, ...]) -> Iterator[Store]:
     """The output folder, see `opened_store`; says so where the last run there was interrupted."""
-    from calib.fleet.store import opened_store
+    from calib.runner.fleet import opened_store
 
     with opened_store(output, verb, outputs) as (store, interrupted):
         if interrupted:
@@ -63,8 +53,8 @@ def opened_out(output: Path, verb: str, outputs: tuple[str, ...]) -> Iterator[St
 @contextmanager
 def processes(store: Store, scheduler: str | None, workers: int | None, retries: int) -> Iterator[Cluster]:
     """The processes to work in, see `connected`; says what is to be said of them."""
-    from calib.fleet.cluster import connected
-    from calib.workers import processors
+    from calib.core.workers import processors
+    from calib.runner.engine import connected
 
     with connected(scheduler, workers or processors(), store.scratch, retries) as cluster:
         for sentence in cluster.remarks:

@@ -3,33 +3,46 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal, ParamSpec, Protocol, TypeVar
 
 import typer
 
-from calib.errors import CalibError, ReaderGoneError
-from calib.files import one_line
+from calib.core.errors import CalibError, ReaderGoneError
+from calib.core.files import one_line
 
-__all__ = [
-    "AccUnitOption",
-    "FiguresOption",
-    "GyroUnitOption",
-    "JsonOption",
-    "ProgressCall",
-    "RigOption",
-    "document",
-    "emit",
-    "narrate",
-    "progress_bar",
-    "say",
-    "table",
-]
+# ----------------------------------------------------------------------
+# Telling a person who waits that functions are being compiled.
+
+Parameters = ParamSpec("Parameters")
+Returned = TypeVar("Returned")
+
+SENTENCE = "compiling what this needs, once for this installation: up to a minute"
+
+
+def telling(verb: Callable[Parameters, Returned]) -> Callable[Parameters, Returned]:
+    """A verb that says so once, on a terminal, when it has something compiled at its first use."""
+
+    @functools.wraps(verb)
+    def told(*args: Parameters.args, **options: Parameters.kwargs) -> Returned:
+        if not sys.stderr.isatty():
+            return verb(*args, **options)
+        from calib.core.compilation import on_compiling
+
+        with on_compiling(lambda: narrate(SENTENCE)):
+            return verb(*args, **options)
+
+    return told
+
+
+# ----------------------------------------------------------------------
+# What all verbs share: options, narration, progress and the JSON document.
 
 RigOption = Annotated[Path, typer.Option("--rig", help="The rig's file.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of words.")]

@@ -8,23 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from calib.cli.common import (
-    FiguresOption,
-    JsonOption,
-    RigOption,
-    document,
-    narrate,
-    progress_bar,
-    say,
-    table,
-)
-from calib.errors import EXIT_POOR, UsageError
+from calib.cli.common import FiguresOption, JsonOption, RigOption, document, narrate, progress_bar, say, table
+from calib.core.errors import EXIT_POOR, UsageError
 
 if TYPE_CHECKING:
-    from calib.control.inverse_model import Model
-    from calib.controlling import Outcome
-    from calib.rig import Rig
-    from calib.rig_controller import Controller, ControllerMargins
+    from calib.core.rig import Rig
+    from calib.stages.control.laws import Model
+    from calib.stages.control.section import Controller, ControllerMargins
+    from calib.stages.control.stage import Outcome
     from calib.twin.rig import SimulatedRig
 
 __all__ = ["control"]
@@ -57,9 +48,9 @@ def _limits(text: str | None) -> tuple[float, float] | None:
 
 
 def _known(path: Path, limits: str | None) -> tuple[Rig, SimulatedRig, Model]:
-    from calib.controlling import control_model
-    from calib.rig import read_rig
-    from calib.sections import camera_from_section
+    from calib.core.rig import read_rig
+    from calib.stages.camera.results import camera_from_section
+    from calib.stages.control.stage import control_model
     from calib.twin.rig import rig_from_file
 
     typed = _limits(limits)
@@ -70,14 +61,14 @@ def _known(path: Path, limits: str | None) -> tuple[Rig, SimulatedRig, Model]:
 
 
 def _workspace(rig: Rig) -> tuple[float, float, float, float]:
-    from calib.rig import Geometry
+    from calib.core.rig import Geometry
 
     x0, y0, x1, y1 = (rig.geometry or Geometry()).workspace_m
     return x0, y0, x1, y1
 
 
 def _duration_s(text: str | None) -> float | None:
-    from calib.units import parse_duration_s
+    from calib.core.units import parse_duration_s
 
     return None if text is None else parse_duration_s(text, "--duration")
 
@@ -107,12 +98,12 @@ def run(
 
     The plant is that of the sections actuator and pump, the nominal one without.
     """
-    from calib.control.reach import follow
-    from calib.control.references import check_workspace
-    from calib.controlling import CONTROLLERS, controllers_for, run_controller
-    from calib.controlreference import wanted_reference
-    from calib.controlsections import check_json, outcome_json
-    from calib.files import check_folder
+    from calib.core.files import check_folder
+    from calib.stages.control.read import wanted_reference
+    from calib.stages.control.references import check_workspace
+    from calib.stages.control.results import check_json, outcome_json
+    from calib.stages.control.stage import CONTROLLERS, controllers_for, run_controller
+    from calib.stages.control.tuning import follow
     from calib.twin.simulate import FEEDBACKS
 
     if feedback not in FEEDBACKS:
@@ -133,7 +124,7 @@ def run(
             progress(done, len(names))
             outcomes.append(run_controller(name, machine, model, wanted, known.controller, seed, feedback))
     if figures is not None:
-        from calib.report.control_figures import write_run_figures
+        from calib.stages.control.plots import write_run_figures
 
         write_run_figures(figures, model, wanted, outcomes)
         narrate(f"figures in {figures}")
@@ -193,13 +184,12 @@ def check(
 
     Exits 1 when they cannot.
     """
-    from calib.control.reach import brought_in, follow, slowed
-    from calib.control.references import check_workspace, from_lengths
-    from calib.controlreference import wanted_reference
-    from calib.controlsections import check_json, reach_json
-    from calib.errors import BadInputError
-    from calib.files import check_folder, check_writable
-    from calib.referencefile import write_reference
+    from calib.core.errors import BadInputError
+    from calib.core.files import check_folder, check_writable
+    from calib.stages.control.read import wanted_reference, write_reference
+    from calib.stages.control.references import check_workspace, from_lengths
+    from calib.stages.control.results import check_json, reach_json
+    from calib.stages.control.tuning import brought_in, follow, slowed
 
     if slow is not None:
         check_writable(slow)
@@ -225,7 +215,7 @@ def check(
         write_reference(slow, slower or wanted)
         narrate(f"reference written to {slow}")
     if figures is not None:
-        from calib.report.control_figures import write_check_figures
+        from calib.stages.control.plots import write_check_figures
 
         write_check_figures(figures, model, wanted, found, slower)
         narrate(f"figures in {figures}")
@@ -274,15 +264,14 @@ def tune(
 
     Exits 1 when the anti-windup does not do what it is for.
     """
-    from calib.control.computed_torque import ComputedTorque
-    from calib.control.observer import design_observer
-    from calib.control.tuning import Criterion, tune_orientation, tune_position
-    from calib.controlling import tune_back_calculation
-    from calib.controlsections import controller_section, source_margins
-    from calib.errors import BadInputError
-    from calib.files import check_folder, check_writable
-    from calib.rig import section_json, write_rig
-    from calib.units import parse_angle_rad
+    from calib.core.errors import BadInputError
+    from calib.core.files import check_folder, check_writable
+    from calib.core.rig import section_json, write_rig
+    from calib.core.units import parse_angle_rad
+    from calib.stages.control.laws import ComputedTorque, design_observer
+    from calib.stages.control.results import controller_section, source_margins
+    from calib.stages.control.stage import tune_back_calculation
+    from calib.stages.control.tuning import Criterion, tune_orientation, tune_position
 
     try:
         criterion = Criterion(gain_margin, parse_angle_rad(phase_margin, "--phase-margin"), sensitivity)
@@ -305,7 +294,7 @@ def tune(
     source = source_margins(model, orientation, position)
     write_rig(rig, known.model_copy(update={"controller": section}), {"controller": _hashes(known)})
     if figures is not None:
-        from calib.report.control_figures import write_tune_figures
+        from calib.stages.control.plots import write_tune_figures
 
         write_tune_figures(figures, model, section, orientation, position)
         narrate(f"figures in {figures}")
@@ -323,8 +312,8 @@ def _hashes(known: Rig) -> dict[str, str]:
     """SHA-256 of the sections that the gains follow from, where the file has them."""
     import yaml
 
-    from calib.files import sha256
-    from calib.rig import section_json
+    from calib.core.files import sha256
+    from calib.core.rig import section_json
 
     extra, out = known.model_extra or {}, {}
     for name in ("actuator", "pump"):

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from calib.cli.common import JsonOption, document, narrate, progress_bar, say
-from calib.errors import BadInputError, UsageError
+from calib.core.errors import BadInputError, UsageError
 
 __all__ = ["convert"]
 
@@ -28,9 +28,9 @@ def convert(
     """
     import numpy as np
 
-    from calib.files import shown
-    from calib.logs import iter_log
-    from calib.statesfile import states_writer
+    from calib.core.files import shown
+    from calib.io.logs import iter_log
+    from calib.io.states import states_writer
 
     if output.suffix.lower() not in (".csv", ".parquet"):
         raise UsageError(f"{shown(output)}: expected a name that ends in .csv or .parquet")

@@ -11,7 +11,7 @@ import typer
 from calib.cli.common import JsonOption, document, say, table
 
 if TYPE_CHECKING:
-    from calib.rigdiff import Change, RigDiff
+    from calib.show.diff import Change, RigDiff
 
 __all__ = ["diff"]
 
@@ -28,7 +28,7 @@ def diff(
 
     Exits 0 whatever has changed; the two are taken as independent of each other.
     """
-    from calib.rigdiff import diff_rigs
+    from calib.show.diff import diff_rigs
 
     found = diff_rigs(before, after)
     if as_json:
@@ -87,7 +87,7 @@ def _tell(found: RigDiff, every: bool) -> None:
 
 
 def _row(change: Change) -> list[str]:
-    from calib.rigvalues import digits
+    from calib.show.values import digits
 
     assert change.before is not None and change.after is not None
     return [

@@ -13,7 +13,7 @@ import typer
 
 from calib import __version__
 from calib.cli.common import JsonOption, document, emit, narrate, say
-from calib.errors import BadInputError, UsageError
+from calib.core.errors import BadInputError, UsageError
 
 if TYPE_CHECKING:
     from markdown_it import MarkdownIt
@@ -107,7 +107,7 @@ def write_manual(pages: list[Page], folder: Path) -> Path:
     import jinja2
     from markupsafe import Markup
 
-    from calib.files import make_folder, write_atomically
+    from calib.core.files import make_folder, write_atomically
 
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
     template = environment.from_string((MANUAL / "page.html.j2").read_text(encoding="utf-8"))
@@ -159,7 +159,7 @@ def _cache() -> Path:
     """The user's cache, since the pages outlive the command; a temporary folder if it cannot be written."""
     import tempfile
 
-    from calib.files import make_folder
+    from calib.core.files import make_folder
 
     system = {"win32": os.environ.get("LOCALAPPDATA"), "darwin": "~/Library/Caches"}
     base = system.get(sys.platform) or os.environ.get("XDG_CACHE_HOME") or "~/.cache"

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from calib.cli.common import JsonOption, document, say, table
-from calib.errors import EXIT_POOR
+from calib.core.errors import EXIT_POOR
 
 __all__ = ["doctor"]
 
@@ -22,7 +22,7 @@ def doctor(
 
     Exits 1 when something that calib needs is missing or does not work.
     """
-    from calib.doctoring import examine
+    from calib.runner.doctor import examine
 
     checks = examine(quick)
     bad = [check for check in checks if check.needed and not check.good]

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from calib.cli.common import JsonOption, RigOption, document, narrate, say
-from calib.errors import EXIT_POOR, BadInputError
+from calib.core.errors import EXIT_POOR, BadInputError
 
 if TYPE_CHECKING:
-    from calib.firmware.header import Header
+    from calib.stages.firmware.header import Header
 
 __all__ = ["firmware"]
 
@@ -32,12 +32,12 @@ def firmware(
     Exits 1 when the verdict of camera or plane is not ok (all is written and says so), or when a board
     computes something else.
     """
-    from calib.files import shown
-    from calib.firmware.header import header_of
-    from calib.rig import read_rig
+    from calib.core.files import shown
+    from calib.core.rig import read_rig
+    from calib.stages.firmware.header import header_of
 
     if check is None:
-        from calib.files import check_folder
+        from calib.core.files import check_folder
 
         check_folder(output)
     whole = read_rig(rig)
@@ -68,9 +68,9 @@ def firmware(
 
 def _write(header: Header, output: Path) -> tuple[list[str], int]:
     """Write the folder; returns the files' names and how many constants the header has."""
-    from calib.files import make_folder, write_atomically
-    from calib.firmware.header import header_text, verbatim
-    from calib.firmware.vectors import selftest_text
+    from calib.core.files import make_folder, write_atomically
+    from calib.stages.firmware.header import header_text, verbatim
+    from calib.stages.firmware.vectors import selftest_text
 
     texts = {"calib_constants.h": header_text(header)}
     if header.camera.plane is not None:
@@ -85,9 +85,9 @@ def _write(header: Header, output: Path) -> tuple[list[str], int]:
 
 
 def _check(header: Header, log: Path, rig: Path, as_json: bool) -> None:
-    from calib.files import shown
-    from calib.firmware.check import check_frames, read_frames
-    from calib.firmware.vectors import TOLERANCE
+    from calib.core.files import shown
+    from calib.stages.firmware.check import check_frames, read_frames
+    from calib.stages.firmware.vectors import TOLERANCE
 
     if header.camera.plane is None:
         raise BadInputError(

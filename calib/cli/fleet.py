@@ -17,11 +17,10 @@ from calib.cli.clusters import (
     processes,
 )
 from calib.cli.common import JsonOption, document, narrate, progress_bar, say, table
-from calib.errors import EXIT_POOR
+from calib.core.errors import EXIT_POOR
 
 if TYPE_CHECKING:
-    from calib.fleet.running import Counts
-    from calib.fleet.summary import FleetSummary
+    from calib.runner.fleet import Counts, FleetSummary
 
 __all__ = ["fleet"]
 
@@ -57,15 +56,12 @@ def fleet(
     A rig that fails is a row and does not end the run; rigs whose results are there are not done again.
     Exits 1 when a rig is not ok.
     """
-    from calib.files import shown
-    from calib.fleet.finishing import finish
-    from calib.fleet.manifest import read_manifest, twice_told
-    from calib.fleet.prior import read_prior
-    from calib.fleet.running import run_fleet
-    from calib.fleet.store import check_apart
-    from calib.fleet.task import FleetOptions
-    from calib.report.fleet_page import PAGE, write_fleet_page
-    from calib.units import parse_duration_s
+    from calib.core.files import shown
+    from calib.core.units import parse_duration_s
+    from calib.runner.finishing import finish
+    from calib.runner.fleet import check_apart, read_prior, run_fleet
+    from calib.runner.task import FleetOptions, read_manifest, twice_told
+    from calib.show.fleet import PAGE, write_fleet_page
 
     check_places(scheduler, workers)
     limit_s = parse_duration_s(timeout, "--timeout")
@@ -128,7 +124,7 @@ _MOST_TOLD = 20
 
 
 def _tell(summary: FleetSummary, counts: Counts, told: Any, output: Path) -> None:
-    from calib.files import shown
+    from calib.core.files import shown
 
     words = ", ".join(f"{count} {verdict}" for verdict, count in summary.verdicts.items())
     say(f"{summary.rigs} rigs: {words}" + (f"; {counts.as_before} as before" if counts.as_before else ""))

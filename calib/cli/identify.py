@@ -8,14 +8,98 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from typer.core import TyperGroup
 
-from calib.cli.common import FiguresOption, JsonOption, RigOption, document, narrate, progress_bar, say, table
-from calib.cli.compiling import telling
-from calib.errors import EXIT_POOR, UsageError
+from calib.cli.common import (
+    FiguresOption,
+    JsonOption,
+    RigOption,
+    document,
+    narrate,
+    progress_bar,
+    say,
+    table,
+    telling,
+)
+from calib.core.errors import EXIT_POOR, UsageError
 
 if TYPE_CHECKING:
-    from calib.actuatorsections import Identified
+    from calib.stages.actuator.results import Identified
+    from calib.stages.actuator.section import PumpSection
+    from calib.stages.actuator.stage import PumpFound
 
-__all__ = ["identify"]
+# ----------------------------------------------------------------------
+# What `calib identify pump` says on stdout.
+
+
+def _cell(value: float | None, digits: int = 3) -> str:
+    return "-" if value is None or value != value else f"{value:.{digits}g}"
+
+
+def tell_pump(found: PumpFound, section: PumpSection) -> None:
+    """Parameters, errors on files that were not fitted, static maps, and what is not explained."""
+    from calib.stages.actuator.stage import parameter_rows
+
+    unit = found.unit
+    for model, fit in found.fits.items():
+        rows = [
+            [name, _cell(value, 4) if sigma is not None else "off", _cell(sigma, 2), of or "-"]
+            for name, value, sigma, of, _ in parameter_rows(fit, unit)
+        ]
+        for line in table([model, "value", "sigma", "unit"], rows):
+            say(line)
+    if found.fits:
+        models = list(found.fits)
+        held = {model: {h.name: h for h in found.held[model]} for model in models}
+        rows = []
+        for record in found.records:
+            cells = [held[m].get(record.name) for m in models]
+            free = [_cell(None if h is None else h.rms) for h in cells]
+            rows.append([record.name, *free, *(_cell(None if h is None else h.ahead) for h in cells)])
+        main = found.main_group
+        if main is not None:
+            ends = [_cell(found.held_rms(m, main.names)) for m in models]
+            rows.append([f"all that settle near {main.value:.1f} {unit}", *ends, *["" for _ in models]])
+        rows.append(["all", *(_cell(found.held_rms(m)) for m in models), *["" for _ in models]])
+        head = [f"RMS on files not fitted, {unit}", *models, *(f"{m}, 0.5 s ahead" for m in models)]
+        for line in table(head, rows):
+            say(line)
+        say(
+            "simulated from a file's PWM and its first 0.2 s, which give the start; the extras of a model "
+            "are chosen once, on all files"
+        )
+        kept = {model: {h.name: h for h in found.asked[model]} for model in models}
+        if kept[models[0]]:
+            rows = [
+                [
+                    name,
+                    *(_cell(kept[m][name].rms) for m in models),
+                    *(_cell(kept[m][name].ahead) for m in models),
+                ]
+                for name in kept[models[0]]
+            ]
+            for line in table([f"RMS on the tables kept out, {unit}", *head[1:]], rows):
+                say(line)
+    if found.maps:
+        rows = [
+            [
+                m.name,
+                f"{m.end:.4g} +- {_cell(m.sigma['end'], 2)}",
+                f"{m.shape.dead_pwm:.1f} +- {_cell(m.sigma['dead_pwm'], 2)}",
+                f"{m.shape.scale_pwm:.1f} +- {_cell(m.sigma['scale_pwm'], 2)}",
+                f"{m.saturates_pwm:.0f}",
+                _cell(m.scatter),
+            ]
+            for m in found.maps
+        ]
+        head = ["static map", f"at PWM 255, {unit}", "dead zone, PWM", "scale, PWM", "95 % at PWM", "scatter"]
+        for line in table(head, rows):
+            say(line)
+    say(f"verdict: {section.verdict}")
+    for sentence in (*section.reasons, *section.remarks):
+        say(f"  - {sentence}")
+
+
+# ----------------------------------------------------------------------
+# `calib identify`: parameters of the actuator and its pumps from logs and tables, with error bars.
 
 
 class _LogsByDefault(TyperGroup):
@@ -43,7 +127,7 @@ def _identify() -> None:
 
 
 def _tell(found: Identified) -> None:
-    from calib.actuator.identify_parameters import PARAMETERS
+    from calib.stages.actuator.identify import PARAMETERS
 
     solution, known = found.solution, found.uncertainty
     rows = [
@@ -132,17 +216,17 @@ def logs(
 
     Writes the sections actuator and, where a log has commands, pump. Exits 1 when the verdict is not ok.
     """
-    from calib.actuatorsections import (
+    from calib.core.files import check_folder, check_writable, shown
+    from calib.core.rig import hash_of, read_rig, write_rig
+    from calib.stages.actuator.read import read_track
+    from calib.stages.actuator.results import (
         identified_json,
         nominal_of,
         plain_section,
         sections_from,
         with_sections,
     )
-    from calib.files import check_folder, check_writable, shown
-    from calib.identification import identify_logs
-    from calib.identifying import read_track
-    from calib.rig import hash_of, read_rig, write_rig
+    from calib.stages.actuator.stage import identify_logs
 
     if states and len(states) != len(paths):
         raise UsageError(f"--states: {len(states)} files for {len(paths)} logs, expected one for each")
@@ -170,7 +254,7 @@ def logs(
     write_rig(rig, with_sections(before, sections), dict.fromkeys(sections, hashes))
     narrate(f"{' and '.join(sections)} written to {shown(rig)}")
     if figures is not None:
-        from calib.report.identify_figures import write_identify_figures
+        from calib.stages.actuator.plots import write_identify_figures
 
         write_identify_figures(figures, found)
         narrate(f"figures in {shown(figures)}")
@@ -202,13 +286,11 @@ def pump(
 
     Writes the section pump. Exits 1 when something is left that the PWM does not explain.
     """
-    from calib.actuatorsections import plain_section, with_sections
-    from calib.cli.identify_tell import tell_pump
-    from calib.files import check_folder, check_writable, shown
-    from calib.identification import identify_pump
-    from calib.pumpsections import pump_section
-    from calib.pumptables import read_pump_table
-    from calib.rig import hash_of, read_rig, write_rig
+    from calib.core.files import check_folder, check_writable, shown
+    from calib.core.rig import hash_of, read_rig, write_rig
+    from calib.stages.actuator.read import read_pump_table
+    from calib.stages.actuator.results import plain_section, with_sections
+    from calib.stages.actuator.stage import identify_pump, pump_section
 
     check_writable(rig)
     if figures is not None:
@@ -223,7 +305,7 @@ def pump(
     write_rig(rig, with_sections(before, {"pump": section}), {"pump": hashes})
     narrate(f"pump written to {shown(rig)}")
     if figures is not None:
-        from calib.report.identify_pump_figures import write_pump_figures
+        from calib.stages.actuator.plots import write_pump_figures
 
         write_pump_figures(figures, found, section.verdict or "ok")
         narrate(f"figures in {shown(figures)}")
@@ -254,11 +336,11 @@ def stiffness(
 
     Writes k0 .. k3 of one bellows to the section actuator.
     """
-    from calib.actuator.identify_stiffness import fit_stiffness
-    from calib.actuatorsections import plain_section, stiffness_section, with_sections
-    from calib.files import check_folder, check_writable, shown
-    from calib.identifying import read_displacements
-    from calib.rig import hash_of, read_rig, write_rig
+    from calib.core.files import check_folder, check_writable, shown
+    from calib.core.rig import hash_of, read_rig, write_rig
+    from calib.stages.actuator.identify import fit_stiffness
+    from calib.stages.actuator.read import read_displacements
+    from calib.stages.actuator.results import plain_section, stiffness_section, with_sections
 
     check_writable(rig)
     if figures is not None:
@@ -274,7 +356,7 @@ def stiffness(
     )
     narrate(f"actuator written to {shown(rig)}")
     if figures is not None:
-        from calib.report.identify_figures import write_stiffness_figure
+        from calib.stages.actuator.plots import write_stiffness_figure
 
         write_stiffness_figure(figures, eps, force, fits, best)
         narrate(f"figures in {shown(figures)}")

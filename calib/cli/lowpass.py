@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from calib.cli.common import FiguresOption, JsonOption, RigOption, document, narrate, say, table
-from calib.errors import EXIT_POOR, BadInputError, UsageError
+from calib.core.errors import EXIT_POOR, BadInputError, UsageError
 
 if TYPE_CHECKING:
-    from calib.rig_lowpass import LowPass
-    from calib.signals.suggest import Suggestion
+    from calib.stages.lowpass.filters import Suggestion
+    from calib.stages.lowpass.section import LowPass
 
 __all__ = ["lowpass"]
 
@@ -55,14 +55,13 @@ def lowpass(
     Uses the sections camera and plane of the rig's file for millimetres; without them jitter is in
     pixels. Exits 1 when the verdict is not ok.
     """
-    from calib.files import check_folder, check_writable
-    from calib.lowpass import lowpass_section, positions_from_log
-    from calib.rig import Geometry, hash_of, identity, read_rig, section_json, write_rig
-    from calib.sections import camera_from_section, current_plane
-    from calib.signals.design import Design, design_lowpass
-    from calib.signals.spectrum import jitter_after
-    from calib.signals.suggest import suggest as choose
-    from calib.units import parse_frequency_hz, parse_jitter
+    from calib.core.files import check_folder, check_writable
+    from calib.core.rig import Geometry, hash_of, identity, read_rig, section_json, write_rig
+    from calib.core.units import parse_frequency_hz, parse_jitter
+    from calib.stages.camera.results import camera_from_section, current_plane
+    from calib.stages.lowpass.filters import Design, design_lowpass, jitter_after
+    from calib.stages.lowpass.filters import suggest as choose
+    from calib.stages.lowpass.stage import lowpass_section, positions_from_log
 
     if jitter is not None and suggest is None:
         raise UsageError("--jitter: is for --suggest, which chooses the filter")
@@ -112,7 +111,7 @@ def lowpass(
     section = lowpass_section(made, workspace_m, seen, wanted)
     write_rig(rig, before.model_copy(update={"lowpass": section}), {"lowpass": hashes})
     if figures is not None:
-        from calib.report.lowpass_figures import write_lowpass_figures
+        from calib.stages.lowpass.plots import write_lowpass_figures
 
         write_lowpass_figures(figures, made, section, seen)
         narrate(f"figures in {figures}")

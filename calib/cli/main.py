@@ -15,11 +15,16 @@ import traceback
 import warnings
 from typing import NoReturn
 
-from calib.compiledfolder import choose_folder
-from calib.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERNAL, EXIT_READER_GONE, CalibError, UsageError
-from calib.files import one_line
-
-__all__ = ["main"]
+from calib.core.compiled import choose_folder
+from calib.core.errors import (
+    EXIT_BAD_INPUT,
+    EXIT_DONE,
+    EXIT_INTERNAL,
+    EXIT_READER_GONE,
+    CalibError,
+    UsageError,
+)
+from calib.core.files import one_line
 
 # Small matrices gain nothing from BLAS threads, and sums then do not depend on their number.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"

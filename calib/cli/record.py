@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from calib.cli.common import JsonOption, document, narrate, say
-from calib.errors import BadInputError, UsageError, pip_install
+from calib.core.errors import BadInputError, UsageError, pip_install
 
 _SILENT_S = 10.0
 
@@ -23,9 +23,9 @@ def record(
     as_json: JsonOption = False,
 ) -> None:
     """Record a board's ticks: camera, IMU and commands as a log, and what the board made of them."""
-    from calib.files import check_writable, shown, write_atomically
-    from calib.firmware.recording import record as run
-    from calib.units import parse_duration_s
+    from calib.core.files import check_writable, shown, write_atomically
+    from calib.core.units import parse_duration_s
+    from calib.io.serial import record as run
 
     try:
         import serial

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from calib.cli.common import FiguresOption, JsonOption, RigOption, document, narrate, progress_bar, say, table
-from calib.errors import EXIT_POOR, BadInputError, UsageError
+from calib.core.errors import EXIT_POOR, BadInputError, UsageError
 
 if TYPE_CHECKING:
-    from calib.replay import Replayed
+    from calib.stages.estimator.replay import Replayed
 
 __all__ = ["replay"]
 
@@ -97,10 +97,10 @@ def replay(
 
     Exits 1 when the innovations of a log contradict its covariance or a sensor is missing.
     """
-    from calib.files import check_folder, check_writable, make_folder, shown
-    from calib.replay import replay_log
-    from calib.rig import hash_of, read_rig, section_json, write_rig
-    from calib.running.folder import inside, slug
+    from calib.core.files import check_folder, check_writable, make_folder, shown
+    from calib.core.rig import hash_of, read_rig, section_json, write_rig
+    from calib.runner.folder import inside, slug
+    from calib.stages.estimator.replay import replay_log
 
     if estimator == "baseline" and (smooth or tune):
         raise UsageError("--estimator baseline: cannot be smoothed or tuned")
@@ -114,7 +114,7 @@ def replay(
     known = read_rig(rig)
     told: dict[str, Any] = {}
     if tune:
-        from calib.tuning import tuned_section
+        from calib.stages.estimator.tuning import tuned_section
 
         with progress_bar("tuning") as progress:
             section = tuned_section(logs, known, rig, progress, topics)
@@ -145,7 +145,7 @@ def replay(
         if states is not None:
             narrate(f"states written to {shown(states)}")
     if figures is not None:
-        from calib.report.replay_figures import write_replay_figures
+        from calib.stages.estimator.plots import write_replay_figures
 
         write_replay_figures(figures, results)
         narrate(f"figures in {shown(figures)}")

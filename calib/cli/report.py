@@ -23,8 +23,8 @@ def report(
     as_json: JsonOption = False,
 ) -> None:
     """Write the page of a calibration again: one HTML file that needs no network."""
-    from calib.files import check_writable, shown
-    from calib.report.page import write_page
+    from calib.core.files import check_writable, shown
+    from calib.show.page import write_page
 
     target = rig.parent / "report.html" if output is None else output
     check_writable(target)

@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from calib.cli.common import JsonOption, document, narrate, progress_bar, say, table
-from calib.errors import BadInputError
+from calib.core.errors import BadInputError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from calib.running.folder import Folder
-    from calib.running.pool import Pool
-    from calib.running.runner import Done
+    from calib.runner.folder import Folder
+    from calib.runner.graph import Done, Pool
 
 __all__ = ["is_available", "run"]
 
@@ -46,14 +45,11 @@ def run(
     Stages whose inputs have not changed are not run again; one that fails stops only what needs it. Exits
     1 when the page does not say that the firmware can be flashed, 3 when a stage has failed.
     """
-    from calib.report.page import write_page
-    from calib.report.page_pictures import keep_pictures
-    from calib.report.page_verdict import decide
-    from calib.running.folder import read_folder
-    from calib.running.outputs import exit_code, publish, summary
-    from calib.running.pool import Pool
-    from calib.running.runner import HIDDEN, Runner, opened
-    from calib.workers import processors
+    from calib.core.workers import processors
+    from calib.runner.folder import read_folder
+    from calib.runner.graph import HIDDEN, Pool, Runner, opened
+    from calib.runner.outputs import exit_code, publish, summary
+    from calib.show.page import decide, keep_pictures, write_page
 
     seen = None if folder is None else read_folder(folder, follow_links)
     with opened(output, folder) as interrupted, Pool(jobs or processors()) as pool:
@@ -106,11 +102,10 @@ def _all_verbs() -> Any:
 
 def _simulated(output: Path, pool: Pool) -> Folder:
     """The folder of a simulated rig, made beside the results unless this program has made it before."""
-    from calib.files import make_folder
-    from calib.running.cache import key_of, load, remove, store
-    from calib.running.folder import read_folder
-    from calib.running.pool import Command
-    from calib.running.runner import HIDDEN
+    from calib.core.files import make_folder
+    from calib.runner.cache import key_of, load, remove, store
+    from calib.runner.folder import read_folder
+    from calib.runner.graph import HIDDEN, Command
 
     hidden = output / HIDDEN
     place, key = hidden / "stages" / "simulate", key_of(("simulate", "rig"), {}, "")
@@ -131,7 +126,7 @@ def _simulated(output: Path, pool: Pool) -> Folder:
 
 
 def _tell(ended: Sequence[Done], files: Sequence[str], output: Path) -> None:
-    from calib.files import one_line, shown
+    from calib.core.files import one_line, shown
 
     rows = []
     for done in ended:

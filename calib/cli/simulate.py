@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from calib.cli.common import JsonOption, document, narrate, progress_bar, say
-from calib.errors import UsageError
+from calib.core.errors import UsageError
 
 __all__ = ["simulate"]
 
@@ -49,14 +49,14 @@ def simulate(
     as_json: JsonOption = False,
 ) -> None:
     """Simulate an experiment and write its log, with the truth in columns of its own."""
-    from calib.errors import BadInputError
-    from calib.files import check_writable, shown
-    from calib.logs import write_log
+    from calib.core.errors import BadInputError
+    from calib.core.files import check_writable, shown
+    from calib.core.units import parse_duration_s
+    from calib.io.logs import write_log
+    from calib.twin.folder import write_rig_folder
     from calib.twin.rig import SimulatedRig, rig_from_file
-    from calib.twin.rig_folder import write_rig_folder
     from calib.twin.scenarios import make_scenario, run_scenario
     from calib.twin.simulate import FEEDBACKS, log_of
-    from calib.units import parse_duration_s
 
     if feedback not in FEEDBACKS:
         raise UsageError(f"--feedback: {feedback!r} is not one of {', '.join(FEEDBACKS)}")
@@ -66,8 +66,8 @@ def simulate(
         raise BadInputError(f"{shown(rig)}: cannot be read: there is no such file")
     machine = SimulatedRig()
     if rig is not None:
-        from calib.rig import read_rig
-        from calib.sections import camera_from_section
+        from calib.core.rig import read_rig
+        from calib.stages.camera.results import camera_from_section
 
         known = read_rig(rig)
         camera = None if known.camera is None else camera_from_section(known.camera)

@@ -17,10 +17,10 @@ from calib.cli.clusters import (
     processes,
 )
 from calib.cli.common import JsonOption, document, narrate, progress_bar, say, table
-from calib.errors import EXIT_POOR
+from calib.core.errors import EXIT_POOR
 
 if TYPE_CHECKING:
-    from calib.fleet.sweeping import Point, SweepSummary
+    from calib.runner.sweep import Point, SweepSummary
 
 __all__ = ["sweep"]
 
@@ -44,20 +44,19 @@ def sweep(
     The first measure decides; the least of it is best, or what is near the value that was asked for. A case
     that fails is a row. Exits 1 when one has failed.
     """
-    from calib.files import shown
-    from calib.fleet.sweeping import run_sweep, summarise_sweep
-    from calib.fleet.sweepspec import read_sweep
-    from calib.report.sweep_page import PAGE, write_sweep_page
-    from calib.units import parse_duration_s
+    from calib.core.files import shown
+    from calib.core.units import parse_duration_s
+    from calib.runner.sweep import read_sweep, run_sweep, summarise_sweep
+    from calib.show.fleet import SWEEP_PAGE, write_sweep_page
 
     check_places(scheduler, workers)
     limit_s = parse_duration_s(timeout, "--timeout")
     known = read_sweep(spec)
-    with opened_out(output, "calib sweep", ("sweep.parquet", PAGE)) as store:
+    with opened_out(output, "calib sweep", ("sweep.parquet", SWEEP_PAGE)) as store:
         with processes(store, scheduler, workers, retries) as cluster, progress_bar("cases") as progress:
             before = run_sweep(store, cluster, known, retries, progress, narrate, limit_s)
         summary = summarise_sweep(store, known, before)
-        write_sweep_page(output / PAGE, known, summary)
+        write_sweep_page(output / SWEEP_PAGE, known, summary)
     if as_json:
         document("sweep", {"sweep": _as_json(summary)})
     else:

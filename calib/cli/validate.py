@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from calib.cli.common import FiguresOption, JsonOption, RigOption, document, narrate, say, table
-from calib.errors import UsageError
+from calib.core.errors import UsageError
 
 if TYPE_CHECKING:
-    from calib.validating import Comparison
+    from calib.stages.actuator.validate import Comparison
 
 _UNITS = {"q1": (1e3, "mm"), "q2": (1e3, "mm"), "phi": (1.0, "rad")}
 
@@ -79,8 +79,8 @@ def _log_json(one: Comparison) -> dict[str, Any]:
 def _compared(
     logs: list[Path], states: list[Path] | None, truth: bool, no_pwm: bool, rig: Path
 ) -> list[Comparison]:
-    from calib.rig import read_rig
-    from calib.validating import IMPROVED, validate_log
+    from calib.core.rig import read_rig
+    from calib.stages.actuator.validate import IMPROVED, validate_log
 
     known, out = read_rig(rig), []
     for k, path in enumerate(logs):
@@ -113,7 +113,7 @@ def validate(
     parameters, and to that with the sections actuator and pump, from the estimator's state at its start.
     Exits 0 whatever comes of it.
     """
-    from calib.files import check_folder, shown
+    from calib.core.files import check_folder, shown
 
     if states and len(states) != len(logs):
         raise UsageError(f"--states: {len(states)} files for {len(logs)} logs, expected one for each")
@@ -124,7 +124,7 @@ def validate(
     compared = _compared(logs, states, truth, no_pwm, rig)
     result: dict[str, Any] = {"logs": [_log_json(one) for one in compared]}
     if figures is not None:
-        from calib.report.validate_figures import write_validate_figures
+        from calib.stages.actuator.plots import write_validate_figures
 
         result["figures"] = [path.name for path in write_validate_figures(figures, compared)]
         narrate(f"figures in {shown(figures)}")

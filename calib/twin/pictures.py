@@ -20,35 +20,10 @@ from typing import Any
 
 import numpy as np
 
-from calib.arrays import FloatArray, GrayImage
-from calib.camera.board import Board
-from calib.camera.model import Camera
-from calib.errors import CalibError, UsageError
-from calib.twin.scene import (
-    Light,
-    Pose,
-    PrintedBoard,
-    Sensor,
-    corner_pixels,
-    pose_facing,
-    render,
-    rotation,
-)
-
-__all__ = [
-    "BOARD",
-    "CAMERA",
-    "PLANE",
-    "VIEWS",
-    "Plane",
-    "Shot",
-    "main",
-    "plane_shot",
-    "png_bytes",
-    "shots",
-    "truth",
-    "write_pictures",
-]
+from calib.core.arrays import FloatArray, GrayImage
+from calib.core.errors import CalibError, UsageError
+from calib.stages.camera.model import Board, Camera
+from calib.twin.scene import Light, Pose, PrintedBoard, Sensor, corner_pixels, pose_facing, render, rotation
 
 CAMERA = Camera(
     model="radial2",

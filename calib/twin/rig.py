@@ -28,7 +28,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from calib.actuator.parameters import (
+from calib.core.arrays import FloatArray
+from calib.core.errors import BadInputError
+from calib.core.files import shown
+from calib.stages.actuator.parameters import (
     DAMPING_SCALE_FREE,
     DAMPING_SCALE_PUMPS,
     Creep,
@@ -36,19 +39,13 @@ from calib.actuator.parameters import (
     Stiffness,
     pumps_connected,
 )
-from calib.actuator.pump import ElongationForce, Orifice, Pump, RateLimit
-from calib.arrays import FloatArray
-from calib.camera.model import Camera, project
-from calib.errors import BadInputError
-from calib.files import shown
-from calib.twin.camera_sensor import Tracker, View
-from calib.twin.imu_sensor import Imu
+from calib.stages.actuator.pump import ElongationForce, Orifice, Pump, RateLimit
+from calib.stages.camera.model import Camera, project
 from calib.twin.pictures import CAMERA, PLANE
+from calib.twin.sensors import Imu, Tracker, View
 
 if TYPE_CHECKING:
-    from calib.rig import Rig
-
-__all__ = ["SimulatedRig", "nominal_view", "rig_from_file", "workspace_homography"]
+    from calib.core.rig import Rig
 
 
 def nominal_view() -> View:
@@ -94,7 +91,7 @@ def workspace_homography(view: View) -> FloatArray:
 
     Raises `BadInputError` where the camera does not see the workspace.
     """
-    from calib.camera.homography import fit_homography
+    from calib.core.geometry import fit_homography
 
     x, y = np.meshgrid(np.linspace(-0.06, 0.06, 9), np.linspace(0.05, 0.11, 7))
     world = np.stack([x.ravel(), y.ravel()], axis=1)

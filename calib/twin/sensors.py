@@ -1,28 +1,210 @@
-"""What sensors on the simulated head could sense: its true motion at any time, and when it is logged.
-
-The plant is simulated on a regular grid of nodes. Between them the bellows' lengths follow the cubic
-that takes lengths and rates over from both nodes, and their rates its derivative (1.1e-8 m and 1.0e-5 m/s
-from the truth in a swing with nodes 1/300 s apart). Creep and forces change slowly and are
-interpolated linearly. Accelerations come from the equations of motion in the interpolated state.
-
-`calib.twin.camera_sensor` and `calib.twin.imu_sensor` make measurements of it. Every random number of a
-log is drawn before the simulation from streams of its own, so that closing the loop over the sensors
-or not does not change the noise.
-"""
+"""The simulated sensors: what they sense of the head's true motion, and what they make of it."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
-from calib.actuator.dynamics import Coefficients
-from calib.actuator.kernel import derivative
-from calib.arrays import FloatArray
-from calib.twin.background import gaussian_noise, uniform
-from calib.twin.kernel import head_rows, states_between
+from calib.core.arrays import BoolArray, FloatArray
+from calib.core.errors import BadInputError
+from calib.stages.actuator.dynamics import Coefficients
+from calib.stages.actuator.kinematics import (
+    MARKER_OFFSET_M,
+    chord_decay_w,
+    chord_ratio_w,
+    forward,
+    marker_from_head,
+)
+from calib.stages.actuator.simulate import derivative
+from calib.stages.camera.model import Camera, project
 
-__all__ = ["HeadMotion", "Trajectory", "head_motion", "normal", "stamps", "stream"]
+# ----------------------------------------------------------------------
+# A cluttered desk behind the board, and random numbers that are the same on every machine.
+#
+# Only elementwise arithmetic in double precision and NumPy's raw bit streams are used: NumPy promises
+# to keep those, while the distributions on top of them may change between versions, and sums in an
+# order of the processor's choosing may change between machines.
+
+_BYTES_PER_NORMAL = 16
+_OBJECTS = 16
+
+
+def uniform(bits: np.random.PCG64, count: int) -> FloatArray:
+    """`count` uniform numbers in [0, 1), shape (count,), from the raw stream of `bits`."""
+    raw = np.asarray(bits.random_raw(count), dtype=np.uint64)
+    return (raw >> np.uint64(11)).astype(np.float64) * 2.0**-53
+
+
+def gaussian_noise(bits: np.random.PCG64, shape: tuple[int, int]) -> FloatArray:
+    """Normal noise of mean 0 and deviation 1: standardised sums of 16 random bytes, an exact integer sum.
+
+    The tails end at 6.9 and the excess kurtosis is -0.075, which no picture of 256 levels can show.
+    """
+    words = np.asarray(bits.random_raw(shape[0] * shape[1] * _BYTES_PER_NORMAL // 8), dtype="<u8")
+    total = words.view(np.uint8).reshape(*shape, _BYTES_PER_NORMAL).sum(axis=-1, dtype=np.int64)
+    deviation = math.sqrt(_BYTES_PER_NORMAL * (256**2 - 1) / 12)
+    noise: FloatArray = (total - _BYTES_PER_NORMAL * 127.5) / deviation
+    return noise
+
+
+def _value_noise(bits: np.random.PCG64, width: int, height: int, cell_px: float) -> FloatArray:
+    """Smooth random surface in [-1, 1], shape (height, width), with bumps of about `cell_px`."""
+    columns, rows = int(width / cell_px) + 2, int(height / cell_px) + 2
+    knots = 2.0 * uniform(bits, columns * rows).reshape(rows, columns) - 1.0
+
+    def along(count: int) -> tuple[np.ndarray[tuple[int], np.dtype[np.intp]], FloatArray]:
+        position = np.arange(count) / cell_px
+        cell = np.floor(position).astype(np.intp)
+        t = position - cell
+        return cell, t * t * (3.0 - 2.0 * t)
+
+    (i, s), (j, t) = along(width), along(height)
+    upper = knots[:, i] + s * (knots[:, i + 1] - knots[:, i])
+    return upper[j] + t[:, None] * (upper[j + 1] - upper[j])
+
+
+def _distance_rectangle(x: FloatArray, y: FloatArray, half_x: float, half_y: float) -> FloatArray:
+    """Signed distance to a rectangle's outline, negative inside (an octagonal norm at the corners)."""
+    return np.maximum(np.abs(x) - half_x, np.abs(y) - half_y)
+
+
+def _distance_disc(x: FloatArray, y: FloatArray, radius: float) -> FloatArray:
+    """Signed distance to a circle, negative inside."""
+    return np.sqrt(x * x + y * y) - radius
+
+
+def clutter(size_px: tuple[int, int], seed: int) -> FloatArray:
+    """Reflectance of a desk strewn with papers, discs, frames and cables, without any checkerboard.
+
+    Parameters
+    ----------
+    size_px : (width, height).
+
+    Returns
+    -------
+    (height, width) in [0.03, 0.95].
+    """
+    width, height = size_px
+    bits = np.random.PCG64(seed)
+    scale = float(max(width, height))
+    v, u = np.mgrid[0:height, 0:width].astype(np.float64)
+    tone = float(uniform(bits, 1)[0])
+    picture = 0.26 + 0.24 * tone + np.zeros((height, width))
+    for cell, strength in ((0.31, 0.07), (0.083, 0.03), (0.019, 0.015)):
+        picture += strength * _value_noise(bits, width, height, max(2.0, cell * scale))
+    grain = _value_noise(bits, width, height, max(2.0, 0.012 * scale))
+    for _ in range(_OBJECTS):
+        draw = [float(value) for value in uniform(bits, 10)]
+        angle = math.pi * draw[2]
+        c, s = math.cos(angle), math.sin(angle)
+        du, dv = u - width * (1.2 * draw[0] - 0.1), v - height * (1.2 * draw[1] - 0.1)
+        x, y = c * du + s * dv, c * dv - s * du
+        size = scale * (0.03 + 0.12 * draw[3])
+        kind = int(5 * draw[4])
+        if kind == 0:  # a disc, such as a mug from above, with a rim
+            distance = _distance_disc(x, y, 0.6 * size)
+            if draw[9] > 0.5:
+                distance = np.abs(distance) - 0.12 * size
+        elif kind == 1:  # a cable: a long, slightly bent line
+            bend = (draw[5] - 0.5) / scale
+            distance = np.abs(y - bend * x * x) - scale * (0.003 + 0.005 * draw[9])
+        elif kind == 2:  # the outline of a frame
+            distance = np.abs(_distance_rectangle(x, y, size, size * (0.4 + draw[5]))) - 0.08 * size
+        elif kind == 3:  # a pen
+            distance = _distance_rectangle(x, y, 1.6 * size, scale * (0.006 + 0.008 * draw[5]))
+        else:  # a book or a sheet of paper
+            distance = _distance_rectangle(x, y, size, size * (0.5 + draw[5]))
+        softness = 1.0 + 0.006 * scale * draw[6]
+        coverage = np.clip(0.5 - distance / softness, 0.0, 1.0)
+        shade = 0.06 + 0.66 * draw[7] + 0.08 * (draw[8] - 0.5) * (du + dv) / size + 0.03 * grain
+        shadow = 0.3 * np.clip(0.6 - distance / (0.03 * scale), 0.0, 1.0)
+        picture = (1.0 - coverage) * picture * (1.0 - shadow) + coverage * shade
+    return np.clip(picture, 0.03, 0.95)
+
+
+# ----------------------------------------------------------------------
+# Compiled arithmetic of the simulated head: states between nodes, and the head's motion in them.
+#
+# Sensors in a closed loop look at one or two states per tick, where calls cost more than numbers.
+#
+# With rho = l S(phi), h = phi / 2 and S of `calib.stages.actuator.kinematics` the head is at rho (sin h,
+# cos h), and its
+# acceleration along and across that direction is
+#
+#     a_r = rho'' - rho dphi^2 / 4,   a_t = rho ddphi / 2 + rho' dphi,
+#     rho' = dl S + l S' dphi,   rho'' = ddl S + 2 dl S' dphi + l (S'' dphi^2 + S' ddphi),
+#     S' = -phi D,   S'' = 2 D - S / 4.
+
+MOTION = ("phi_rad", "dphi_radps", "ddphi_radps2", "x_m", "y_m", "ax_mps2", "ay_mps2")
+"""Columns of `head_rows`, in the world frame."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def states_between(node_s: float, nodes: FloatArray, t_s: FloatArray) -> FloatArray:
+    """States (m, 10) at the times (m,) from nodes (n, 10); see `sensors.Trajectory`."""
+    last = len(nodes) - 1
+    out = np.empty((len(t_s), nodes.shape[1]))
+    for row in range(len(t_s)):
+        place = min(max(t_s[row] / node_s, 0.0), float(last))
+        near = np.rint(place)
+        # A time meant to be a node's own must find it in spite of rounding.
+        if abs(place - near) < 1e-7:
+            place = near
+        i = int(place)
+        s = place - i
+        if i >= last or s == 0.0:
+            out[row] = nodes[min(i, last)]
+            continue
+        a, b = nodes[i], nodes[i + 1]
+        for k in range(4, nodes.shape[1]):
+            out[row, k] = a[k] + s * (b[k] - a[k])
+        for k in range(2):
+            v0, v1, rise = node_s * a[k + 2], node_s * b[k + 2], b[k] - a[k]
+            # The cubic q0 + s v0 + s^2 (3 rise - 2 v0 - v1) + s^3 (v0 + v1 - 2 rise).
+            second, third = 3.0 * rise - 2.0 * v0 - v1, v0 + v1 - 2.0 * rise
+            out[row, k] = a[k] + s * (v0 + s * (second + s * third))
+            out[row, k + 2] = (v0 + s * (2.0 * second + 3.0 * s * third)) / node_s
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def head_rows(r: float, states: FloatArray, ddq: FloatArray) -> FloatArray:
+    """Motion (m, 7) of the head, see `MOTION`, from states (m, 10) and accelerations (m, 2) [m/s^2]."""
+    out = np.empty((len(states), 7))
+    for row in range(len(states)):
+        q1, q2, dq1, dq2 = states[row, 0], states[row, 1], states[row, 2], states[row, 3]
+        phi, length = (q1 - q2) / (2.0 * r), 0.5 * (q1 + q2)
+        dphi, dl = (dq1 - dq2) / (2.0 * r), 0.5 * (dq1 + dq2)
+        ddphi, ddl = (ddq[row, 0] - ddq[row, 1]) / (2.0 * r), 0.5 * (ddq[row, 0] + ddq[row, 1])
+        S, D = chord_ratio_w(phi * phi), chord_decay_w(phi * phi)
+        S1, S2 = -phi * D, 2.0 * D - 0.25 * S
+        rho = length * S
+        drho = dl * S + length * S1 * dphi
+        ddrho = ddl * S + 2.0 * dl * S1 * dphi + length * (S2 * dphi * dphi + S1 * ddphi)
+        along = ddrho - 0.25 * rho * dphi * dphi
+        across = 0.5 * rho * ddphi + drho * dphi
+        sine, cosine = math.sin(0.5 * phi), math.cos(0.5 * phi)
+        out[row, 0], out[row, 1], out[row, 2] = phi, dphi, ddphi
+        out[row, 3], out[row, 4] = rho * sine, rho * cosine
+        out[row, 5] = along * sine + across * cosine
+        out[row, 6] = along * cosine - across * sine
+    return out
+
+
+# ----------------------------------------------------------------------
+# What sensors on the simulated head could sense: its true motion at any time, and when it is logged.
+#
+# The plant is simulated on a regular grid of nodes. Between them the bellows' lengths follow the cubic
+# that takes lengths and rates over from both nodes, and their rates its derivative (1.1e-8 m and 1.0e-5 m/s
+# from the truth in a swing with nodes 1/300 s apart). Creep and forces change slowly and are
+# interpolated linearly. Accelerations come from the equations of motion in the interpolated state.
+#
+# `calib.twin.sensors` and `calib.twin.sensors` make measurements of it. Every random number of a
+# log is drawn before the simulation from streams of its own, so that closing the loop over the sensors
+# or not does not change the noise.
 
 
 def stream(seed: int, *purpose: int) -> np.random.PCG64:
@@ -101,3 +283,352 @@ def stamps(
         twice[0] = False
     source = np.maximum.accumulate(np.where(twice, 0, np.arange(len(t_s))))
     return np.asarray(noisy[source])
+
+
+# ----------------------------------------------------------------------
+# The simulated tracker: a Pixy2 that reports the marker on the head as a whole pixel, 60 times a second.
+#
+# The marker sits at the distance d along the head's tangent (A.1), is mapped by the plane's pose and
+# the lens into distorted pixels, and is found there with jitter, rounded to the pixel grid. Some frames
+# show something else instead (outliers), in some nothing is found (dropouts, blackouts), and what is
+# reported at a tick was exposed `latency_s` earlier.
+
+_PURPOSE = 1
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera and the pose R_CW (3, 3), t_CW_m (3,) of the world in its frame."""
+
+    camera: Camera
+    R_CW: FloatArray
+    t_CW_m: FloatArray
+
+
+@dataclass(frozen=True)
+class Tracker:
+    """Errors of the tracker.
+
+    Attributes
+    ----------
+    marker_offset_m : d of (A.1).
+    latency_s : time from the exposure to the tick that reads the result.
+    jitter_px : standard deviation of the found position along each axis, before rounding.
+    grid_px : the position is a multiple of this; zero leaves it as it is.
+    outliers : probability that a frame shows another thing, `outlier_px` (least, most) away.
+    dropouts : probability that nothing is found in a frame.
+    blackouts_s : pairs (start, duration) without any frame.
+    stamp_jitter_s : standard deviation of the time stamps.
+
+    Raises `BadInputError` for values that no tracker has.
+    """
+
+    marker_offset_m: float = MARKER_OFFSET_M
+    latency_s: float = 0.025
+    jitter_px: float = 0.3
+    grid_px: float = 1.0
+    outliers: float = 0.003
+    outlier_px: tuple[float, float] = (5.0, 20.0)
+    dropouts: float = 0.004
+    blackouts_s: tuple[tuple[float, float], ...] = ()
+    stamp_jitter_s: float = 2e-4
+
+    def __post_init__(self) -> None:
+        for name, most in (("marker_offset_m", 0.5), ("latency_s", 1.0), ("stamp_jitter_s", 0.1)):
+            value = getattr(self, name)
+            if not 0.0 <= value <= most:
+                raise BadInputError(f"tracker {name}: found {value:g}, expected 0 to {most:g}")
+        for name in ("jitter_px", "grid_px"):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise BadInputError(f"tracker {name}: found {getattr(self, name):g}, expected zero or more")
+        for name in ("outliers", "dropouts"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise BadInputError(f"tracker {name}: found {getattr(self, name):g}, expected a probability")
+        if len(self.outlier_px) != 2 or not 0.0 <= self.outlier_px[0] <= self.outlier_px[1] < math.inf:
+            raise BadInputError(f"tracker outlier_px: found {self.outlier_px}, expected (least, most)")
+        for pair in self.blackouts_s:
+            if len(pair) != 2 or not all(0.0 <= value < math.inf for value in pair):
+                raise BadInputError(f"tracker blackouts_s: found {pair}, expected (start, duration)")
+
+
+@dataclass(frozen=True)
+class TrackerNoise:
+    """Everything random about the n frames of a log.
+
+    Attributes
+    ----------
+    exposed_s : (n,) times of exposure.
+    stamp_s : (n,) time stamps of the ticks that read them.
+    offset_px : (n, 2) jitter and outliers.
+    missing : (n,) frames in which nothing is found.
+    """
+
+    exposed_s: FloatArray
+    stamp_s: FloatArray
+    offset_px: FloatArray
+    missing: BoolArray
+
+
+def draw_tracker_noise(tracker: Tracker, tick_times_s: FloatArray, seed: int) -> TrackerNoise:
+    """Noise of the frames that are read at the times (n,) [s]."""
+    n = len(tick_times_s)
+    bits = stream(seed, _PURPOSE)
+    stamp = stamps(tick_times_s, tracker.stamp_jitter_s, 0.0, bits)
+    offset = tracker.jitter_px * normal(bits, n, 2)
+    chance, share, turn, lost = (uniform(bits, n) for _ in range(4))
+    least, most = tracker.outlier_px
+    radius = np.where(chance < tracker.outliers, least + (most - least) * share, 0.0)
+    offset += radius[:, None] * np.stack([np.cos(2.0 * np.pi * turn), np.sin(2.0 * np.pi * turn)], axis=-1)
+    missing = lost < tracker.dropouts
+    for start, duration in tracker.blackouts_s:
+        missing |= (tick_times_s >= start) & (tick_times_s < start + duration)
+    return TrackerNoise(tick_times_s - tracker.latency_s, stamp, offset, missing)
+
+
+def marker_pixels(view: View, tracker: Tracker, q_m: FloatArray, bellows_radius_m: float) -> FloatArray:
+    """Where the marker is seen (m, 2) [px] for bellows (m, 2) [m]; NaN behind the camera."""
+    pose = forward(q_m, bellows_radius_m)
+    marker = marker_from_head(pose[:, :2], pose[:, 2], tracker.marker_offset_m)
+    R = view.R_CW
+    points = marker[:, :1] * R[:, 0] + marker[:, 1:] * R[:, 1] + view.t_CW_m
+    front = points[:, 2] > 0.0
+    points = np.where(front[:, None], points, 1.0)
+    return np.where(front[:, None], project(view.camera, points), np.nan)
+
+
+def track(
+    view: View,
+    tracker: Tracker,
+    noise: TrackerNoise,
+    frames: slice,
+    q_m: FloatArray,
+    bellows_radius_m: float,
+) -> FloatArray:
+    """Reported pixels (m, 2) of the frames of `noise`, NaN where there are none.
+
+    Parameters
+    ----------
+    q_m : (m, 2) lengths of the bellows at the frames' exposures.
+    """
+    pixels = marker_pixels(view, tracker, q_m, bellows_radius_m) + noise.offset_px[frames]
+    if tracker.grid_px > 0.0:
+        pixels = tracker.grid_px * np.floor(pixels / tracker.grid_px + 0.5)
+    width, height = view.camera.image_size_px
+    outside = (pixels < -0.5) | (pixels > np.array([width - 0.5, height - 0.5])) | np.isnan(pixels)
+    gone = noise.missing[frames] | outside.any(axis=-1)
+    return np.where(gone[:, None], np.nan, pixels)
+
+
+# ----------------------------------------------------------------------
+# The simulated BNO055 on the head (2.1): rotation rate, specific force, and its own drifting angle.
+#
+# Axes. Unmounted, the sensor's x axis points from the head to the base, y is the head's +x and z points
+# away from the camera, in the world frame
+#
+#     x_S = -(sin phi, cos phi, 0),   y_S = (cos phi, -sin phi, 0),   z_S = (0, 0, 1),
+#
+# so that at rest atan2(ay, ax) = phi and at all times gz = -dphi/dt. Mounted with the angle alpha the
+# sensor is turned about z so that it reads phi + alpha at rest.
+#
+# The accelerometer feels the specific force f = a - g at its own place c in the head's frame,
+#
+#     a = a_head + ddphi R' c - dphi^2 R c,   R = [[cos, sin], [-sin, cos]],  R' = dR / dphi,
+#
+# with g = (0, 9.81) m/s^2 in the world. Then per axis
+#
+#     m = clip(round(((1 + scale error) true + bias + walk + white noise) / step) step).
+#
+# White noise is given by its density, as in Kalibr's imu.yaml: the deviation of a sample is the density
+# times sqrt(rate). The bias walks by a normal step of density / sqrt(rate) per sample.
+#
+# Scale errors, biases and walks are those of a common part, the densities of noise are the data sheet's
+# (0.014 deg/s/sqrt(Hz), 150 ug/sqrt(Hz)).
+
+_SENSOR_PURPOSE = 2
+_DEG = math.pi / 180.0
+_G = 9.81
+
+Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Imu:
+    """Place and errors of the sensor.
+
+    Attributes
+    ----------
+    rate_hz : samples per second.
+    mount_angle_rad : what it reads at rest at phi = 0.
+    lever_m : its place c in the head's frame, across and along the tangent [m].
+    gravity_mps2 : g in the world frame.
+    gyro_scale, accel_scale : scale errors per axis.
+    gyro_bias_radps, accel_bias_mps2 : biases at the start.
+    gyro_noise, accel_noise : densities of the white noise [rad/s/sqrt(Hz), m/s^2/sqrt(Hz)].
+    gyro_walk, accel_walk : densities of the biases' walk [rad/s^2/sqrt(Hz), m/s^3/sqrt(Hz)].
+    gyro_step_radps, accel_step_mps2 : quantisation; zero for none.
+    gyro_range_radps, accel_range_mps2 : largest reading.
+    stamp_jitter_s, duplicated_stamps : deviation of the time stamps, share that repeat the last one.
+    onchip : whether the fusion on the chip is logged too.
+    onchip_drift_radps, onchip_spread : mean of its drift over many logs, and the deviation of a log's
+        drift from it as a share of it (Fig. 2.4).
+
+    Raises `BadInputError` for values that no sensor has.
+    """
+
+    rate_hz: float = 100.0
+    mount_angle_rad: float = 0.02
+    lever_m: tuple[float, float] = (0.0, 0.006)
+    gravity_mps2: tuple[float, float] = (0.0, _G)
+    gyro_scale: Triple = (0.004, -0.003, 0.006)
+    accel_scale: Triple = (0.003, -0.002, 0.004)
+    gyro_bias_radps: Triple = (0.004, -0.003, 0.006)
+    accel_bias_mps2: Triple = (0.05, -0.04, 0.07)
+    gyro_noise: float = 0.014 * _DEG
+    accel_noise: float = 150e-6 * _G
+    gyro_walk: float = 1e-5
+    accel_walk: float = 1e-4
+    gyro_step_radps: float = 0.0305 * _DEG
+    accel_step_mps2: float = 0.01916
+    gyro_range_radps: float = 2000.0 * _DEG
+    accel_range_mps2: float = 4.0 * _G
+    stamp_jitter_s: float = 4e-4
+    duplicated_stamps: float = 0.002
+    onchip: bool = False
+    onchip_drift_radps: float = 0.145 * _DEG
+    onchip_spread: float = 0.4
+
+    def __post_init__(self) -> None:
+        if not 1.0 <= self.rate_hz <= 1e5:
+            raise BadInputError(f"imu rate_hz: found {self.rate_hz:g}, expected 1 to 100000 Hz")
+        for name in (
+            "gyro_noise",
+            "accel_noise",
+            "gyro_walk",
+            "accel_walk",
+            "gyro_step_radps",
+            "accel_step_mps2",
+            "stamp_jitter_s",
+            "onchip_spread",
+        ):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise BadInputError(f"imu {name}: found {getattr(self, name):g}, expected zero or more")
+        for name in ("gyro_range_radps", "accel_range_mps2"):
+            if not getattr(self, name) > 0.0:
+                raise BadInputError(f"imu {name}: found {getattr(self, name):g}, expected a positive number")
+        if not 0.0 <= self.duplicated_stamps < 1.0:
+            raise BadInputError(
+                f"imu duplicated_stamps: found {self.duplicated_stamps:g}, expected a share below 1"
+            )
+        for name, most in (("mount_angle_rad", math.pi), ("onchip_drift_radps", 1.0)):
+            if not abs(getattr(self, name)) <= most:
+                raise BadInputError(
+                    f"imu {name}: found {getattr(self, name):g}, expected {-most:.3g} to {most:.3g}"
+                )
+        for name, size, most in (
+            ("lever_m", 2, 0.5),
+            ("gravity_mps2", 2, 100.0),
+            ("gyro_scale", 3, 0.5),
+            ("accel_scale", 3, 0.5),
+            ("gyro_bias_radps", 3, 10.0),
+            ("accel_bias_mps2", 3, 50.0),
+        ):
+            values = getattr(self, name)
+            if len(values) != size or not all(abs(value) <= most for value in values):
+                raise BadInputError(
+                    f"imu {name}: found {tuple(values)}, expected {size} numbers of at most {most:g}"
+                )
+
+
+@dataclass(frozen=True)
+class ImuNoise:
+    """Everything random about the n samples of a log.
+
+    Attributes
+    ----------
+    taken_s, stamp_s : (n,) times of the samples and their time stamps.
+    gyro, accel : (n, 3) biases with their walk, and white noise [rad/s, m/s^2].
+    onchip_rad : (n,) error of the on-chip angle.
+    """
+
+    taken_s: FloatArray
+    stamp_s: FloatArray
+    gyro: FloatArray
+    accel: FloatArray
+    onchip_rad: FloatArray
+
+
+def _axis_errors(
+    imu: Imu, n: int, bias: Triple, noise: float, walk: float, bits: np.random.PCG64
+) -> FloatArray:
+    white = noise * math.sqrt(imu.rate_hz) * normal(bits, n, 3)
+    steps = walk / math.sqrt(imu.rate_hz) * normal(bits, n, 3)
+    return np.asarray(np.array(bias) + np.cumsum(steps, axis=0) + white)
+
+
+def draw_imu_noise(imu: Imu, duration_s: float, seed: int) -> ImuNoise:
+    """Noise of all samples from 0 up to, not including, the duration [s]."""
+    n = max(math.ceil(duration_s * imu.rate_hz - 1e-9), 0)
+    taken = np.arange(n) / imu.rate_hz
+    stamp = stamps(taken, imu.stamp_jitter_s, imu.duplicated_stamps, stream(seed, _SENSOR_PURPOSE, 0))
+    gyro = _axis_errors(
+        imu, n, imu.gyro_bias_radps, imu.gyro_noise, imu.gyro_walk, stream(seed, _SENSOR_PURPOSE, 1)
+    )
+    accel = _axis_errors(
+        imu, n, imu.accel_bias_mps2, imu.accel_noise, imu.accel_walk, stream(seed, _SENSOR_PURPOSE, 2)
+    )
+    # The drift of a log is inconsistent in Fig. 2.4 from log to log, and a little within one.
+    bits = stream(seed, _SENSOR_PURPOSE, 3)
+    drift = imu.onchip_drift_radps * (1.0 + imu.onchip_spread * float(normal(bits, 1)[0, 0]))
+    wander = 0.1 * abs(imu.onchip_drift_radps) / math.sqrt(imu.rate_hz) * np.cumsum(normal(bits, n)[:, 0])
+    return ImuNoise(taken, stamp, gyro, accel, drift * taken + wander)
+
+
+def _read(true: FloatArray, scale: Triple, error: FloatArray, step: float, limit: float) -> FloatArray:
+    value = (1.0 + np.array(scale)) * true + error
+    if step <= 0.0:
+        return np.clip(value, -limit, limit)
+    most = math.floor(limit / step + 1e-9)
+    return step * np.clip(np.floor(value / step + 0.5), -most, most)
+
+
+def _specific_force(imu: Imu, motion: HeadMotion) -> FloatArray:
+    """f = a - g at the sensor's place, world frame (m, 2)."""
+    s, c = np.sin(motion.phi_rad), np.cos(motion.phi_rad)
+    across, along = imu.lever_m
+    arm_x, arm_y = c * across + s * along, c * along - s * across
+    turned_x, turned_y = arm_y, -arm_x
+    spin2 = motion.dphi_radps * motion.dphi_radps
+    a_x = motion.acceleration_mps2[:, 0] + motion.ddphi_radps2 * turned_x - spin2 * arm_x
+    a_y = motion.acceleration_mps2[:, 1] + motion.ddphi_radps2 * turned_y - spin2 * arm_y
+    return np.stack([a_x - imu.gravity_mps2[0], a_y - imu.gravity_mps2[1]], axis=-1)
+
+
+def measure(imu: Imu, noise: ImuNoise, samples: slice, motion: HeadMotion) -> tuple[FloatArray, FloatArray]:
+    """Readings of the samples of `noise` while the head moves as `motion` (m).
+
+    Returns
+    -------
+    specific force (m, 3) [m/s^2] and rotation rate (m, 3) [rad/s] in the sensor's axes.
+    """
+    s, c = np.sin(motion.phi_rad), np.cos(motion.phi_rad)
+    f = _specific_force(imu, motion)
+    x = -(s * f[:, 0] + c * f[:, 1])
+    y = c * f[:, 0] - s * f[:, 1]
+    ca, sa = math.cos(imu.mount_angle_rad), math.sin(imu.mount_angle_rad)
+    zero = np.zeros_like(x)
+    force = np.stack([ca * x - sa * y, sa * x + ca * y, zero], axis=-1)
+    rate = np.stack([zero, zero, -motion.dphi_radps], axis=-1)
+    return (
+        _read(force, imu.accel_scale, noise.accel[samples], imu.accel_step_mps2, imu.accel_range_mps2),
+        _read(rate, imu.gyro_scale, noise.gyro[samples], imu.gyro_step_radps, imu.gyro_range_radps),
+    )
+
+
+def onchip_angle_rad(imu: Imu, noise: ImuNoise, samples: slice, motion: HeadMotion) -> FloatArray:
+    """Angle (m,) [rad] of the fusion on the chip: right but for the mount angle and its drift.
+
+    The chip reports it in steps of 1/16 deg.
+    """
+    step = _DEG / 16.0
+    angle = motion.phi_rad + imu.mount_angle_rad + noise.onchip_rad[samples]
+    return np.asarray(step * np.floor(angle / step + 0.5))

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from calib.actuator import dynamics as dyn
-from calib.actuator.adaptive import Method, simulate_adaptive, swing_adaptive
-from calib.actuator.integrate import state_row
-from calib.actuator.parameters import Plant, pumps_connected
-from calib.actuator.pump import Pump, RateLimit, delayed, static_force_N
-from calib.arrays import FloatArray
+from calib.core.arrays import FloatArray
+from calib.stages.actuator import dynamics as dyn
+from calib.stages.actuator.adaptive import Method, simulate_adaptive, swing_adaptive
+from calib.stages.actuator.parameters import Plant, pumps_connected
+from calib.stages.actuator.pump import Pump, RateLimit, delayed, static_force_N
+from calib.stages.actuator.simulate import state_row
 
 
 @pytest.mark.parametrize("method", ["RK45", "Radau", "LSODA"])

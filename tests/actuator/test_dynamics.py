@@ -16,18 +16,34 @@ import sympy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calib.actuator import dynamics as dyn
-from calib.actuator import kernel
-from calib.actuator import kinematics as kin
-from calib.actuator.adaptive import simulate_adaptive, swing_adaptive
-from calib.actuator.batch import simulate_batch
-from calib.actuator.dynamics import coefficients, rates
-from calib.actuator.integrate import Motion, largest_step_s, rig_at_rest, simulate, state_row, swing, tick
-from calib.actuator.kernel import LANES, STATE, derivative
-from calib.actuator.parameters import Plant, StandardLinearSolid, Stiffness, free_swing, pumps_connected
-from calib.actuator.pump import Orifice, Pump, RateLimit, advance, pump_coefficients
-from calib.arrays import FloatArray
-from calib.errors import BadInputError
+from calib.core.arrays import FloatArray
+from calib.core.errors import BadInputError
+from calib.stages.actuator import dynamics as dyn
+from calib.stages.actuator import kinematics as kin
+from calib.stages.actuator import simulate as kernel
+from calib.stages.actuator.adaptive import simulate_adaptive, swing_adaptive
+from calib.stages.actuator.dynamics import coefficients, rates
+from calib.stages.actuator.parameters import (
+    Plant,
+    StandardLinearSolid,
+    Stiffness,
+    free_swing,
+    pumps_connected,
+)
+from calib.stages.actuator.pump import Orifice, Pump, RateLimit, advance_pump, pump_coefficients
+from calib.stages.actuator.simulate import (
+    LANES,
+    STATE,
+    Motion,
+    derivative,
+    largest_step_s,
+    rig_at_rest,
+    simulate,
+    simulate_batch,
+    state_row,
+    swing,
+    tick,
+)
 
 BELLOWS = st.floats(0.045, 0.095)
 GRAVITY = Plant(gravity_mps2=(1.3, 9.81))
@@ -392,7 +408,7 @@ def python_run(plant: Plant, pump: Pump, start: FloatArray, g: FloatArray, subst
 
     for row in g:
         for _ in range(substeps):
-            both = [advance(p, lag[i], force[i], row[i], decay, h) for i in range(2)]
+            both = [advance_pump(p, lag[i], force[i], row[i], decay, h) for i in range(2)]
             middle, end = np.array([b[1] for b in both]), np.array([b[2] for b in both])
             k1 = slope(y, force)
             k2 = slope(y + 0.5 * h * k1, middle)
@@ -442,8 +458,8 @@ def test_runs_where_no_folder_can_be_written() -> None:
     code = (
         "import numba.core.caching as caching\n"
         "caching.CacheImpl._locator_classes = []\n"
-        "from calib.actuator.integrate import state_row, swing\n"
-        "from calib.actuator.parameters import Plant\n"
+        "from calib.stages.actuator.simulate import state_row, swing\n"
+        "from calib.stages.actuator.parameters import Plant\n"
         "print(swing(Plant(), state_row(Plant(), 0.1), 0.01).q_m[-1].sum())"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -9,26 +9,40 @@ import numpy as np
 import pytest
 from identifytrials import SIGMA, log_file, rig_file, track, varied
 
-from calib.actuator.batch import simulate_batch
-from calib.actuator.identify_decrement import decrement
-from calib.actuator.identify_fit import Solution, fit_tracks, solve
-from calib.actuator.identify_next import EXPERIMENTS, prospects
-from calib.actuator.identify_parameters import Nominal, candidates, made, values_of
-from calib.actuator.identify_problem import Problem, first_guess, jacobian, residuals, starts_of
-from calib.actuator.identify_pump_models import Shape
-from calib.actuator.identify_sigma import colour_of, held_back, uncertainty
-from calib.actuator.identify_static_map import fit_static_map
-from calib.actuator.identify_stiffness import fit_stiffness
-from calib.actuator.identify_tracks import COMPONENTS, Start, Track, heads_of
-from calib.actuator.integrate import state_row
-from calib.actuator.parameters import Plant
-from calib.actuator.pump import TICK_S, Orifice, Pump
-from calib.errors import BadInputError
-from calib.identifying import TrackSource, read_track
-from calib.identifystart import start_in_motion, swing_at_beginning
-from calib.logs import Log, read_log, write_log
+from calib.core.errors import BadInputError
+from calib.io.logs import Log, read_log, write_log
+from calib.stages.actuator.identify import (
+    COMPONENTS,
+    EXPERIMENTS,
+    Nominal,
+    Problem,
+    Solution,
+    Start,
+    Track,
+    candidates,
+    colour_of,
+    decrement,
+    first_guess,
+    fit_stiffness,
+    fit_tracks,
+    heads_of,
+    held_back,
+    jacobian,
+    made,
+    prospects,
+    residuals,
+    solve,
+    starts_of,
+    uncertainty,
+    values_of,
+)
+from calib.stages.actuator.identify_pump import Shape, fit_static_map
+from calib.stages.actuator.parameters import Plant
+from calib.stages.actuator.pump import TICK_S, Orifice, Pump
+from calib.stages.actuator.read import TrackSource, read_track, start_in_motion, swing_at_beginning
+from calib.stages.actuator.simulate import simulate_batch, state_row
+from calib.stages.actuator.validate import IMPROVED, NOMINAL, ORIGINAL, compare, estimated_start, validate_log
 from calib.twin.rig import SimulatedRig
-from calib.validating import IMPROVED, NOMINAL, ORIGINAL, compare, estimated_start, validate_log
 
 TRUTH = {
     "stiffness_scale": 1.15,

@@ -10,14 +10,24 @@ import pytest
 from identifytrials import FLOW_TRUTH, LAG_TRUTH, pump_records
 from outside import outside
 
-from calib.actuator.identify_pump import _by_chance, _Problem, _solve, cross_validate, fit_pump
-from calib.actuator.identify_pump_models import LAG, MODELS, ORIFICE, PumpRecord, Shape, simulate_pump
-from calib.actuator.pump import Orifice
-from calib.errors import BadInputError
-from calib.identification import PumpFound, identify_pump
-from calib.pumpsections import judge_pump, pump_section, unexplained
-from calib.pumptables import PumpTable, Settled, read_pump_table
-from calib.rig import Rig
+from calib.core.errors import BadInputError
+from calib.core.rig import Rig
+from calib.stages.actuator.identify_pump import (
+    LAG,
+    MODELS,
+    ORIFICE,
+    PumpRecord,
+    Shape,
+    _by_chance,
+    _Problem,
+    _solve,
+    cross_validate,
+    fit_pump,
+    simulate_pump,
+)
+from calib.stages.actuator.pump import Orifice
+from calib.stages.actuator.read import PumpTable, Settled, read_pump_table
+from calib.stages.actuator.stage import PumpFound, identify_pump, judge_pump, pump_section, unexplained
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calib.actuator import kinematics as kin
-from calib.actuator.arc import (
+from calib.core.arrays import FloatArray
+from calib.stages.actuator import kinematics as kin
+from calib.stages.actuator.kinematics import (
     chord_curvature,
     chord_decay,
     chord_decay_w,
@@ -19,7 +20,6 @@ from calib.actuator.arc import (
     chord_ratio_w,
     chord_slope,
 )
-from calib.arrays import FloatArray
 
 R_B = 0.0126
 BELLOWS = st.floats(0.04, 0.1)

@@ -11,8 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from calib.actuator.dynamics import linearised
-from calib.actuator.parameters import (
+from calib.core.arrays import FloatArray
+from calib.core.errors import BadInputError
+from calib.stages.actuator.dynamics import linearised
+from calib.stages.actuator.parameters import (
     PRINTED_CREEP,
     Creep,
     Plant,
@@ -23,21 +25,19 @@ from calib.actuator.parameters import (
     growth_rate_per_s,
     pumps_connected,
 )
-from calib.actuator.pump import (
+from calib.stages.actuator.pump import (
     ElongationForce,
     Orifice,
     PolynomialForce,
     Pump,
     PumpState,
     RateLimit,
-    advance,
+    advance_pump,
     pump_at_rest,
     pump_coefficients,
     static_force_N,
     step_pump,
 )
-from calib.arrays import FloatArray
-from calib.errors import BadInputError
 
 
 def test_nominal_values() -> None:
@@ -105,7 +105,7 @@ def test_printed_creep_is_refused_with_its_growth_rate() -> None:
 @pytest.mark.parametrize(
     "creep", [Creep(*PRINTED_CREEP), Creep(), Creep(1.0, 20.0, 1.0), Creep(2.0, 60.0, 1.0), None]
 )
-@pytest.mark.filterwarnings("ignore::calib.actuator.parameters.UnstablePlantWarning")
+@pytest.mark.filterwarnings("ignore::calib.stages.actuator.parameters.UnstablePlantWarning")
 def test_growth_rate_against_the_linearised_plant(creep: Creep | None) -> None:
     plant = Plant(creep=creep, allow_unstable=True)
     roots = np.linalg.eigvals(linearised(plant, np.array([0.065, 0.065])))
@@ -200,12 +200,12 @@ def test_closed_form_of_the_rate_limit_is_exact(
     x, f = lag, lag + above
     for dt in pieces:
         before = f
-        x, middle, f = advance(p, x, f, g, math.exp(-0.5 * dt / 0.7), dt)
+        x, middle, f = advance_pump(p, x, f, g, math.exp(-0.5 * dt / 0.7), dt)
         assert f >= before - 0.4 * dt - 1e-12
         assert f >= x - 1e-15
         assert middle >= before - 0.2 * dt - 1e-12
     total = sum(pieces)
-    _, _, whole = advance(p, lag, lag + above, g, math.exp(-0.5 * total / 0.7), total)
+    _, _, whole = advance_pump(p, lag, lag + above, g, math.exp(-0.5 * total / 0.7), total)
     assert f == pytest.approx(whole, abs=1e-12)
 
 
@@ -225,7 +225,7 @@ def test_orifice_against_an_adaptive_integrator() -> None:
         r = float(solve_ivp(slope, (0, dt), [r], rtol=1e-11, atol=1e-13).y[0, -1])
         reference.append(r)
         before = f
-        _, middle, f = advance(p, 0.0, f, g, 1.0, dt)
+        _, middle, f = advance_pump(p, 0.0, f, g, 1.0, dt)
         force.append(f)
         assert min(before, f) - 1e-12 <= middle <= max(before, f) + 1e-12
     # The corner where the valve closes or opens costs the one step per tick its order.

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.actuator import kinematics as kin
-from calib.actuator import sections
-from calib.arrays import FloatArray
-from calib.errors import BadInputError
+from calib.core.arrays import FloatArray
+from calib.core.errors import BadInputError
+from calib.stages.actuator import chain as sections
+from calib.stages.actuator import kinematics as kin
 
 R_B = 0.0126
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import sympy
 
-from calib.actuator import kinematics as kin
-from calib.actuator import series
-from calib.errors import BadInputError
+from calib.core.errors import BadInputError
+from calib.stages.actuator import kinematics as kin
+from calib.stages.actuator import kinematics as series
 
 R_B = 0.0126
 

@@ -17,8 +17,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from calib.imu.allan import allan_variance, octaves
-from calib.imu.allan_fit import analyse
+from calib.stages.imu.allan import allan_variance, analyse, octaves
 
 RATE_HZ = 100.0
 HOURS = 10.0

@@ -19,9 +19,15 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 from broad_trials import FILES, PUBLISHED_DEG, filter_rmse_deg, read_trial, rmse_deg, windows
 
-from calib.imu.orientation import inclination_error, rms_in_motion, up_in_sensor
-from calib.imu.peers import missing, run_peer
-from calib.imu.rate import planar_rate, up_vector
+from calib.stages.imu.tracks import (
+    inclination_error,
+    missing,
+    planar_rate,
+    rms_in_motion,
+    run_peer,
+    up_in_sensor,
+    up_vector,
+)
 
 
 def main() -> None:

@@ -22,10 +22,9 @@ import numpy as np
 from drivenlogs import driven_log
 from estimatorlogs import SCENARIOS, rows_from, setup_for, truth
 
-from calib.estimator.baseline import Baseline, BaselineSetup, undistorting_nothing
-from calib.estimator.constant_gain import run_gains, tick_noise, ticks_of
-from calib.estimator.filter import Filter
-from calib.estimator.gains import design
+from calib.stages.estimator.baseline import Baseline, BaselineSetup, undistorting_nothing
+from calib.stages.estimator.constant_gain import design, run_gains, tick_noise, ticks_of
+from calib.stages.estimator.kinematic import Filter
 
 NAMES = ("source", "full filter", "newest", "mean")
 

@@ -21,14 +21,12 @@ sys.path.insert(0, str(ROOT / "tests"))
 import cv2
 import numpy as np
 
-from calib.arrays import FloatArray, GrayImage
-from calib.boards import read_board_file
-from calib.camera.board import Board
-from calib.camera.bundle import calibrate
-from calib.camera.corners import detect
-from calib.camera.model import Camera
-from calib.camera.views import View, pack
-from calib.pictures import list_pictures, read_picture
+from calib.core.arrays import FloatArray, GrayImage
+from calib.io.pictures import list_pictures, read_picture
+from calib.stages.camera.bundle import calibrate
+from calib.stages.camera.corners import detect
+from calib.stages.camera.model import Board, Camera, View, pack
+from calib.stages.camera.read import read_board_file
 from calib.twin.scene import PrintedBoard, Sensor, corner_pixels, pose_facing, render
 
 Finder = Callable[[GrayImage, int, int], FloatArray | None]

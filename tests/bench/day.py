@@ -27,15 +27,15 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import numpy as np
 import yaml
 
-from calib.arrays import FloatArray
-from calib.estimator.consistency import Tally
-from calib.estimator.setup import OUT
-from calib.logs import COLUMNS, TRUE, Log, iter_log
-from calib.replay import drive_for, estimator_of, prepared
-from calib.replaying import rows_of, truth_of
-from calib.rig import read_rig
-from calib.statesfile import STATES, states_writer
-from calib.textcells import GENERAL, TIME, table_bytes
+from calib.core.arrays import FloatArray
+from calib.core.rig import read_rig
+from calib.io.cells import GENERAL, TIME, table_bytes
+from calib.io.logs import COLUMNS, TRUE, Log, iter_log
+from calib.io.states import STATES, states_writer
+from calib.stages.estimator.consistency import Tally
+from calib.stages.estimator.kinematic import OUT
+from calib.stages.estimator.read import rows_of, truth_of
+from calib.stages.estimator.replay import drive_for, estimator_of, prepared
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.simulate import log_of

@@ -23,15 +23,12 @@ import numpy as np
 from drivenlogs import commands_of, driven_log
 from estimatorlogs import SCENARIOS, rows_from, setup_for, truth
 
-from calib.actuator.parameters import pumps_connected
-from calib.arrays import FloatArray
-from calib.estimator.consistency import Tally
-from calib.estimator.driven_filter import DrivenFilter
-from calib.estimator.driven_handover import Handover, blended, smooth_both
-from calib.estimator.driven_setup import Drive
-from calib.estimator.driven_smoother import smooth_driven
-from calib.estimator.setup import Setup
-from calib.logs import Log
+from calib.core.arrays import FloatArray
+from calib.io.logs import Log
+from calib.stages.actuator.parameters import pumps_connected
+from calib.stages.estimator.consistency import Tally
+from calib.stages.estimator.driven import Drive, DrivenFilter, Handover, blended, smooth_both, smooth_driven
+from calib.stages.estimator.kinematic import Setup
 
 FULL = Drive()
 

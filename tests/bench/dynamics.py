@@ -31,14 +31,12 @@ sys.path[:0] = [str(Path(__file__).resolve().parents[2]), str(Path(__file__).res
 
 from _rows import Row, interleaved, print_rows
 
-from calib.actuator.adaptive import simulate_adaptive, swing_adaptive
-from calib.actuator.batch import simulate_batch
-from calib.actuator.dynamics import coefficients
-from calib.actuator.integrate import rig_at_rest, simulate, state_row, swing
-from calib.actuator.kernel import run
-from calib.actuator.parameters import Plant, Stiffness, free_swing, pumps_connected
-from calib.actuator.pump import Orifice, Pump, delayed, pump_coefficients, static_force_N
-from calib.arrays import FloatArray
+from calib.core.arrays import FloatArray
+from calib.stages.actuator.adaptive import simulate_adaptive, swing_adaptive
+from calib.stages.actuator.dynamics import coefficients
+from calib.stages.actuator.parameters import Plant, Stiffness, free_swing, pumps_connected
+from calib.stages.actuator.pump import Orifice, Pump, delayed, pump_coefficients, static_force_N
+from calib.stages.actuator.simulate import rig_at_rest, run, simulate, simulate_batch, state_row, swing
 
 STEPS_PER_TICK = 17
 PUMP = Pump(tick_s=STEPS_PER_TICK * 1e-3)

@@ -24,12 +24,9 @@ import numpy as np
 from _rows import Row
 from estimatorlogs import rows_from, setup_for, simulated
 
-from calib.estimator import reference, smoother
-from calib.estimator.filter import Filter, starting_state
-from calib.estimator.kernel import TRACE
-from calib.estimator.model import Kinematic
-from calib.estimator.setup import Rows
-from calib.estimator.smoother import Events
+from calib.stages.estimator import reference, smoother
+from calib.stages.estimator.kinematic import TRACE, Filter, Kinematic, Rows, starting_state
+from calib.stages.estimator.smoother import Events
 
 
 def _seconds(call: Callable[[], object], repeats: int = 7) -> float:

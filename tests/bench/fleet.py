@@ -26,15 +26,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from fleet_processes import COMMAND, done, workers
 from fleet_rigs import write_fleet, write_manifest
 
-from calib.files import sha256
-from calib.fleet.cluster import connected
-from calib.fleet.engine import Task, run_tasks
-from calib.fleet.manifest import RigSpec
-from calib.fleet.outcome import Outcome
-from calib.fleet.store import opened_store
-from calib.fleet.task import Answer, FleetOptions, calibrate_rig
-from calib.logs import log_text
-from calib.running.pool import Command, run_here
+from calib.core.files import sha256
+from calib.io.logs import log_text
+from calib.runner.engine import Task, connected, run_tasks
+from calib.runner.fleet import opened_store
+from calib.runner.graph import Command, run_here
+from calib.runner.task import Answer, FleetOptions, Outcome, RigSpec, calibrate_rig
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.simulate import log_of

@@ -20,8 +20,7 @@ sys.path[:0] = [str(Path(__file__).resolve().parents[2]), str(Path(__file__).res
 
 from _rows import Row
 
-from calib.imu.mahony import Mahony, MahonySample, MahonyState, step
-from calib.imu.mahony_batch import filter_log
+from calib.stages.imu.mahony import Mahony, MahonySample, MahonyState, filter_log, step
 
 DT_S = 0.01
 

@@ -21,10 +21,9 @@ import cv2
 import numpy as np
 from _rows import Row, print_rows
 
-from calib.camera.bundle import calibrate
-from calib.camera.covariance import covariance
-from calib.camera.views import View, pack
-from calib.workers import Workers
+from calib.core.workers import Workers
+from calib.stages.camera.bundle import calibrate, covariance
+from calib.stages.camera.model import View, pack
 from synthetic import BOARD, views_of
 
 FLAGS = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3

@@ -23,12 +23,11 @@ import numpy as np
 from drivenlogs import commands_of, driven_log
 from estimatorlogs import SCENARIOS, SIGMA, rows_from, setup_for, truth, truth_of_sensors
 
-from calib.arrays import FloatArray
-from calib.estimator.consistency import Tally
-from calib.estimator.driven_handover import Handover, blended, smooth_both
-from calib.estimator.driven_setup import Drive
-from calib.estimator.sensors import SENSOR, view_coefficients
-from calib.estimator.setup import Setup
+from calib.core.arrays import FloatArray
+from calib.stages.estimator.consistency import Tally
+from calib.stages.estimator.driven import Drive, Handover, blended, smooth_both
+from calib.stages.estimator.kinematic import Setup
+from calib.stages.estimator.sensors import SENSOR, view_coefficients
 from calib.twin.rig import SimulatedRig
 
 SENSORS = {

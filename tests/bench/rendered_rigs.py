@@ -36,16 +36,16 @@ import numpy as np
 from drivenlogs import varied_drive
 from estimatorlogs import truth_of_sensors
 
-from calib.estimator.align import rest_angle
-from calib.logs import log_text
-from calib.replay import Replayed, replay_log
-from calib.rig import read_rig
-from calib.twin.camera_sensor import View
+from calib.core.rig import read_rig
+from calib.io.logs import log_text
+from calib.stages.align.solve import rest_angle
+from calib.stages.estimator.replay import Replayed, replay_log
+from calib.twin.folder import write_rig_folder
 from calib.twin.pictures import CAMERA, PLANE
 from calib.twin.rig import SimulatedRig
-from calib.twin.rig_folder import write_rig_folder
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.scene import rotation
+from calib.twin.sensors import View
 from calib.twin.simulate import log_of
 
 RESTS = ("static1", "static2")

@@ -18,12 +18,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import numpy as np
 from sets import BAD, camera_of, good_set, take
 
-from calib.camera.bundle import calibrate
-from calib.camera.covariance import covariance
-from calib.camera.findings import VERDICTS
-from calib.camera.model import MODELS
-from calib.camera.verdict import judge
-from calib.camera.views import View, pack
+from calib.stages.camera.bundle import calibrate, covariance
+from calib.stages.camera.model import MODELS, View, pack
+from calib.stages.camera.verdict import VERDICTS, judge
 
 
 def _verdict(views: list[View], size_px: tuple[int, int], model: str) -> tuple[str, float]:

@@ -24,8 +24,7 @@ sys.path[:0] = [str(ROOT), str(HERE)]
 
 from _rows import Process, Row, interleaved_processes, print_rows
 
-from calib.camera.board import Board
-from calib.camera.model import Camera
+from calib.stages.camera.model import Board, Camera
 from calib.twin.scene import PrintedBoard, Sensor, pose_facing, render
 
 CALIB = "from calib.cli.main import main; main()"

@@ -16,9 +16,9 @@ import tempfile
 import time
 from pathlib import Path
 
-from calib.logs import log_text, read_log
+from calib.io.logs import log_text, read_log
+from calib.twin.folder import write_rig_folder
 from calib.twin.rig import SimulatedRig
-from calib.twin.rig_folder import write_rig_folder
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.simulate import log_of
 

@@ -22,15 +22,13 @@ import numpy as np
 from drivenlogs import commands_of, varied_drive
 from estimatorlogs import SCENARIOS, rows_from, setup_for, truth
 
-from calib.actuator.pump import Orifice
-from calib.arrays import FloatArray
-from calib.estimator.consistency import Tally
-from calib.estimator.driven_handover import Handover, blended, smooth_both
-from calib.estimator.driven_setup import Drive
-from calib.logs import Log
-from calib.twin.experiment import at_rest
+from calib.core.arrays import FloatArray
+from calib.io.logs import Log
+from calib.stages.actuator.pump import Orifice
+from calib.stages.estimator.consistency import Tally
+from calib.stages.estimator.driven import Drive, Handover, blended, smooth_both
 from calib.twin.rig import SimulatedRig
-from calib.twin.scenarios import make_scenario, run_scenario
+from calib.twin.scenarios import at_rest, make_scenario, run_scenario
 from calib.twin.simulate import log_of, simulate
 
 LIMIT = {"ellipse": 1.2 * 0.15, "step": 1.2 * 0.20, "elongation": 1.2 * 0.14}

@@ -12,16 +12,47 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sets import Recipe, camera_of, take
 
-from calib.camera.board_shape import DEFORMATIONS, TargetShape, target_shape
-from calib.camera.bundle import Calibration, calibrate
-from calib.camera.covariance import covariance, joint_jacobian, projection_sigma_px, residual_inflation
-from calib.camera.levenberg import linearise, rotation_exp
-from calib.camera.model import COEFFICIENTS, MODELS, Camera, undistort
-from calib.camera.projection import INTRINSICS, Block, free_intrinsics, jacobian, vector_from_camera
-from calib.camera.selection import board_basis, candidates_by_board, candidates_by_model, simplest_good
-from calib.camera.starts import best_of_starts, conditioned, focal_interval
-from calib.camera.views import Observations, View, pack
-from calib.camera.zhang import closed_form_intrinsics, homographies, initial_guess
+from calib.stages.camera.bundle import (
+    Calibration,
+    calibrate,
+    closed_form_intrinsics,
+    covariance,
+    homographies,
+    initial_guess,
+    joint_jacobian,
+    linearise,
+    projection_sigma_px,
+    residual_inflation,
+    rotation_exp,
+)
+from calib.stages.camera.checks import (
+    DEFORMATIONS,
+    TargetShape,
+    best_of_starts,
+    conditioned,
+    focal_interval,
+    target_shape,
+)
+from calib.stages.camera.intrinsics import (
+    board_basis,
+    candidates_by_board,
+    candidates_by_model,
+    simplest_good,
+)
+from calib.stages.camera.model import (
+    COEFFICIENTS,
+    INTRINSICS,
+    MODELS,
+    Block,
+    Camera,
+    Observations,
+    View,
+    free_intrinsics,
+    jacobian,
+    pack,
+    undistort,
+    vector_from_camera,
+)
 from synthetic import BOARD, CAMERA, views_of
 
 LENS = {"k1": -0.25, "k2": 0.1, "k3": 0.02, "p1": 1e-3, "p2": -5e-4, "k4": 0.05, "k5": 0.02, "k6": -0.01}
@@ -138,7 +169,7 @@ def test_robust_loss_bears_outliers(loss: str) -> None:
 
 
 def test_bowed_board_is_found_by_the_warp() -> None:
-    from calib.camera.selection import board_basis
+    from calib.stages.camera.intrinsics import board_basis
 
     views = views_of(15, 11)
     observations = pack(views)
@@ -148,7 +179,7 @@ def test_bowed_board_is_found_by_the_warp() -> None:
     bowed = observations.displaced(np.tensordot(truth, basis, axes=1).T)
     fit = calibrate(observations, (640, 480), "radial2")
     start = Block(fit.block.intrinsics, fit.block.R_CT, fit.block.t_CT_m, truth)
-    from calib.camera.projection import jacobian
+    from calib.stages.camera.model import jacobian
 
     J = jacobian(start, observations, fit.free, basis)
     assert J is not None
@@ -377,7 +408,7 @@ def test_the_true_board_is_chosen(truth: str) -> None:
         shape = np.tensordot(weights, basis, axes=1).T
         # Views of the deformed board: fit poses exactly, then project the displaced points.
         fit = calibrate(observations, (640, 480), "radial2")
-        from calib.camera.projection import jacobian
+        from calib.stages.camera.model import jacobian
 
         J = jacobian(fit.block, observations.displaced(shape), fit.free, None)
         assert J is not None

@@ -10,13 +10,11 @@ import cv2
 import numpy as np
 import pytest
 
-from calib.arrays import FloatArray, GrayImage
-from calib.camera.board import Board
-from calib.camera.bundle import calibrate
-from calib.camera.corners import detect, find_size
-from calib.camera.model import Camera
-from calib.camera.views import View, pack
-from calib.pictures import list_pictures, read_picture
+from calib.core.arrays import FloatArray, GrayImage
+from calib.io.pictures import list_pictures, read_picture
+from calib.stages.camera.bundle import calibrate
+from calib.stages.camera.corners import detect, find_size
+from calib.stages.camera.model import Board, Camera, View, pack
 from calib.twin.scene import Light, PrintedBoard, Sensor, corner_pixels, pose_facing, render
 
 LENS = np.array([-0.22, 0.12, 0, 0, 0, 0, 0, 0.0])

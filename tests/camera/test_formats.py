@@ -10,10 +10,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calib.camera.filestorage import matrix, read_storage
-from calib.camera.formats import from_kalibr, from_opencv, from_ros, to_kalibr, to_opencv, to_ros
-from calib.camera.model import COEFFICIENTS, MODELS, Camera
-from calib.errors import BadInputError
+from calib.core.errors import BadInputError
+from calib.stages.camera.formats import (
+    from_kalibr,
+    from_opencv,
+    from_ros,
+    matrix,
+    read_storage,
+    to_kalibr,
+    to_opencv,
+    to_ros,
+)
+from calib.stages.camera.model import COEFFICIENTS, MODELS, Camera
 
 SIZE = (316, 208)
 VALUES = {

@@ -8,23 +8,27 @@ import cv2
 import numpy as np
 import pytest
 
-from calib.camera.distortion import (
+from calib.stages.camera.lens import (
     PlaneView,
     analyse_distortion,
     displacement_field,
-    distortion_kind,
-    projection_sigma_px,
-)
-from calib.camera.model import Camera, distort, project, undistort
-from calib.camera.pose import rotation
-from calib.camera.projection import camera_from_vector, vector_from_camera
-from calib.camera.undistortion import (
     distorted_normalised,
+    distortion_kind,
     fit_inverse,
     fold_radius,
     pixel_grid,
+    projection_sigma_px,
     undistort_by_polynomial,
 )
+from calib.stages.camera.model import (
+    Camera,
+    camera_from_vector,
+    distort,
+    project,
+    undistort,
+    vector_from_camera,
+)
+from calib.stages.camera.pose import rotation
 
 FOCAL = 158.0 / np.tan(np.radians(30.0))
 THESIS = Camera(

@@ -10,17 +10,28 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calib.camera.board import Board
-from calib.camera.homography import apply_homography, fit_homography, map_jacobian
-from calib.camera.model import Camera, project
-from calib.camera.placement import settle_orientation, world_points_m
-from calib.camera.plane import Plane, calibrate_plane, to_pixels, to_world, to_world_without_undistortion
-from calib.camera.plane_checks import compare_pictures
-from calib.camera.plane_sigma import position_sigma, workspace_grid
-from calib.camera.pose import fit_pose, plane_map, pose_derivatives, projection_with_derivatives, rotation
-from calib.camera.projection import camera_from_vector, vector_from_camera
-from calib.camera.views import View
-from calib.errors import BadInputError
+from calib.core.errors import BadInputError
+from calib.core.geometry import apply_homography, fit_homography, map_jacobian
+from calib.stages.camera.model import Board, Camera, View, camera_from_vector, project, vector_from_camera
+from calib.stages.camera.plane import (
+    Plane,
+    calibrate_plane,
+    compare_pictures,
+    position_sigma,
+    settle_orientation,
+    to_pixels,
+    to_world,
+    to_world_without_undistortion,
+    workspace_grid,
+    world_points_m,
+)
+from calib.stages.camera.pose import (
+    fit_pose,
+    plane_map,
+    pose_derivatives,
+    projection_with_derivatives,
+    rotation,
+)
 
 THESIS = Camera(
     "radial2", (316, 208), 273.66, 273.66, 0.0, 157.5, 103.5, np.array([-0.2201, 0.5494, 0, 0, 0, 0, 0, 0])

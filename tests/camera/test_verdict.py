@@ -11,24 +11,32 @@ import numpy as np
 import pytest
 from sets import BAD, Recipe, camera_of, good_set, take
 
-from calib.camera import intrinsics
-from calib.camera.board import Board
-from calib.camera.board_shape import target_shape
-from calib.camera.bundle import Calibration, calibrate
-from calib.camera.corners import detect
-from calib.camera.covariance import covariance
-from calib.camera.coverage import coverage, lens_shape, repeated_views
-from calib.camera.evidence import evidence, gain, overdispersion
-from calib.camera.intrinsics import Choices, calibrate_camera
-from calib.camera.levenberg import minimise
-from calib.camera.misfit import Misfit, misfit, screen
-from calib.camera.model import MODELS, Camera
-from calib.camera.next_view import Candidate, best_next_view
-from calib.camera.pose import fit_pose
-from calib.camera.two_cameras import best_change, best_split, straightened, widened
-from calib.camera.verdict import Judgement, judge
-from calib.camera.views import View, pack
-from calib.errors import BadInputError
+from calib.core.errors import BadInputError
+from calib.stages.camera import intrinsics
+from calib.stages.camera.bundle import Calibration, calibrate, covariance, minimise
+from calib.stages.camera.checks import (
+    Candidate,
+    Misfit,
+    best_change,
+    best_next_view,
+    best_split,
+    coverage,
+    evidence,
+    gain,
+    lens_shape,
+    misfit,
+    overdispersion,
+    repeated_views,
+    screen,
+    straightened,
+    target_shape,
+    widened,
+)
+from calib.stages.camera.corners import detect
+from calib.stages.camera.intrinsics import Choices, calibrate_camera
+from calib.stages.camera.model import MODELS, Board, Camera, View, pack
+from calib.stages.camera.pose import fit_pose
+from calib.stages.camera.verdict import Judgement, judge
 from calib.twin.pictures import BOARD, CAMERA
 from calib.twin.scene import Pose, PrintedBoard, render
 from synthetic import views_of

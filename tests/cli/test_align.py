@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from align_trials import twin_log
 
-from calib.arrays import FloatArray
-from calib.logs import Log, write_log
-from calib.rig import read_rig
+from calib.core.arrays import FloatArray
+from calib.core.rig import read_rig
+from calib.io.logs import Log, write_log
 from calib.twin.rig import SimulatedRig
 
 from .conftest import Run

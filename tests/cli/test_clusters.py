@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from calib.cli.clusters import check_places, opened_out
-from calib.errors import UsageError
+from calib.core.errors import UsageError
 
 
 def test_an_existing_cluster_or_processes_of_ones_own() -> None:

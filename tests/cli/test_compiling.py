@@ -8,7 +8,7 @@ import sys
 import pytest
 from numba import njit
 
-from calib.cli.compiling import SENTENCE, telling
+from calib.cli.common import SENTENCE, telling
 
 
 def _verb(count: int, twice: bool = False) -> int:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.rig import read_rig
+from calib.core.rig import read_rig
 
 Run = Callable[..., Any]
 

@@ -13,7 +13,7 @@ from bags import readings, write_bag
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from calib.logs import MEASURED, Log, read_log, write_log
+from calib.io.logs import MEASURED, Log, read_log, write_log
 
 Run = Callable[..., Any]
 

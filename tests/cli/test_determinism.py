@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from calib.logs import log_text
-from calib.running.runner import HIDDEN
+from calib.io.logs import log_text
+from calib.runner.graph import HIDDEN
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.simulate import log_of

@@ -8,7 +8,7 @@ import pytest
 import typer
 
 from calib.cli.doctor import doctor
-from calib.doctoring import Check
+from calib.runner.doctor import Check
 
 
 def test_whole_installation(capsys: pytest.CaptureFixture[str]) -> None:
@@ -21,7 +21,7 @@ def test_missing_library_ends_with_one(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     checks = [Check("numpy", True, False, "-", "sums"), Check("avr-gcc", False, False, "-", "")]
-    monkeypatch.setattr("calib.doctoring.examine", lambda quick: checks)
+    monkeypatch.setattr("calib.runner.doctor.examine", lambda quick: checks)
     with pytest.raises(typer.Exit) as left:
         doctor(as_json=True)
     assert left.value.exit_code == 1

@@ -17,8 +17,8 @@ import pytest
 from fleet_processes import COMMAND, all_gone, done, first_worker, started, until, workers
 from fleet_rigs import write_fleet, write_manifest
 
-from calib.fleet import cluster
-from calib.fleet.store import opened_store
+from calib.runner import engine as cluster
+from calib.runner.fleet import opened_store
 
 pytest.importorskip("distributed")
 

@@ -12,7 +12,7 @@ import pytest
 import yaml
 from identifytrials import log_file, pump_records
 
-from calib.actuator.identify_pump_models import LAG
+from calib.stages.actuator.identify_pump import LAG
 from calib.twin.rig import SimulatedRig
 
 Run = Callable[..., Any]

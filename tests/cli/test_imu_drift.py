@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.imu.peers import missing
-from calib.logs import log_text
-from calib.rig import hash_of
+from calib.core.rig import hash_of
+from calib.io.logs import log_text
+from calib.stages.imu.tracks import missing
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.simulate import log_of

@@ -14,9 +14,9 @@ import typer
 from imu_poses import AXES, G, PoseLog, Sensor, in_counts, pose_log, sphere_poses, tilts
 from outside import outside
 
-from calib.cli.imu_intrinsics import intrinsics
-from calib.errors import BadInputError, UsageError
-from calib.rig import read_rig
+from calib.cli.imu import intrinsics
+from calib.core.errors import BadInputError, UsageError
+from calib.core.rig import read_rig
 
 HEAD = "t_s," + ",".join(f"{axis}_{'radps' if axis[0] == 'g' else 'mps2'}" for axis in AXES) + "\n"
 

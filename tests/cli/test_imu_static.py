@@ -14,10 +14,10 @@ import typer
 import yaml
 from outside import outside
 
-from calib.cli.imu_static import static
-from calib.errors import BadInputError
-from calib.logs import log_text, read_log
-from calib.rig import read_rig
+from calib.cli.imu import static
+from calib.core.errors import BadInputError
+from calib.core.rig import read_rig
+from calib.io.logs import log_text, read_log
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.simulate import log_of

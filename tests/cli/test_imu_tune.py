@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from armlogs import Arm, swung, write
 
-from calib.rig import read_rig
+from calib.core.rig import read_rig
 
 Run = Callable[..., object]
 

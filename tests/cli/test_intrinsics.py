@@ -223,7 +223,7 @@ def test_a_corner_file(calib, table_text, points, tmp_path) -> None:
 
 
 def test_points_without_noise_come_to_an_end(calib, tmp_path) -> None:
-    from calib.camera.model import Camera
+    from calib.stages.camera.model import Camera
     from synthetic import views_of
 
     camera = Camera("pinhole", (640, 480), 600.0, 600.0, 0.0, 320.0, 240.0, np.zeros(8))
@@ -260,7 +260,7 @@ def test_points_that_belong_to_no_camera(calib, table_text, tmp_path, model: str
 def test_a_table_of_many_rows_is_read_with_little_memory(tmp_path) -> None:
     import tracemalloc
 
-    from calib.tables import read_table
+    from calib.stages.camera.read import read_table
 
     rng = np.random.default_rng(0)
     file = tmp_path / "points.csv"

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.logs import Log, write_log
-from calib.rig import hash_of, identity, read_rig
+from calib.core.rig import hash_of, identity, read_rig
+from calib.io.logs import Log, write_log
 
 Run = Callable[..., Any]
 

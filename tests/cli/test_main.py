@@ -97,7 +97,7 @@ def test_a_mistake_of_the_program_is_one_sentence(calib, monkeypatch, tmp_path) 
     def broken(*_: object) -> None:
         raise RuntimeError("first line\nsecond\x1b line")
 
-    monkeypatch.setattr("calib.rig.read_rig", broken)
+    monkeypatch.setattr("calib.core.rig.read_rig", broken)
     monkeypatch.delenv("CALIB_DEBUG", raising=False)
     ended = calib("firmware", "--rig", "rig.yaml", cwd=tmp_path)
     assert ended.code == 70
@@ -123,7 +123,7 @@ def test_other_ends(calib, monkeypatch, failure: BaseException, code: int, says:
     def fail(*_: object) -> None:
         raise failure
 
-    monkeypatch.setattr("calib.rig.read_rig", fail)
+    monkeypatch.setattr("calib.core.rig.read_rig", fail)
     # Threads that other tests have left behind are not this command's.
     monkeypatch.setattr("calib.cli.main._still_working", lambda: False)
     ended = calib("firmware")
@@ -242,11 +242,12 @@ def test_an_interruption_leaves_the_old_file_or_the_new_one(
 def test_an_interruption_while_boards_are_searched(environment, tmp_path) -> None:
     # The search sleeps in its threads; nothing may wait for them.
     script = (
-        "import sys, time, numpy as np, calib.boards\n"
-        "from calib.pictures import Picture\n"
-        "calib.boards.read_picture = lambda p: Picture(p.name, '', np.zeros((9, 9), np.uint8), (9, 9))\n"
+        "import sys, time, numpy as np, calib.stages.camera.read\n"
+        "from calib.io.pictures import Picture\n"
+        "import calib.stages.camera.read as read\n"
+        "read.read_picture = lambda p: Picture(p.name, '', np.zeros((9, 9), np.uint8), (9, 9))\n"
         "def slow(*_):\n    sys.stdout.write('searching\\n'); sys.stdout.flush(); time.sleep(30)\n"
-        "calib.boards.detect = slow\n"
+        "calib.stages.camera.read.detect = slow\n"
         "from calib.cli.main import main\n"
         "sys.argv = ['calib', 'intrinsics', '.', '--corners', '7x5']\n"
         "main()\n"

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import pytest
 
-from calib.firmware.header import Header, header_of, identity_of
-from calib.firmware.telemetry import Frame, encoded
-from calib.firmware.vectors import vectors
-from calib.logs import read_log
-from calib.rig import read_rig
+from calib.core.rig import read_rig
+from calib.io.logs import read_log
+from calib.io.serial import Frame, encoded
+from calib.stages.firmware.header import Header, header_of, identity_of
+from calib.stages.firmware.vectors import vectors
 
 serial = pytest.importorskip("serial")
 

@@ -13,8 +13,8 @@ import pytest
 import yaml
 from estimatorlogs import simulated
 
-from calib.logs import Log, write_log
-from calib.statesfile import STATES
+from calib.io.logs import Log, write_log
+from calib.io.states import STATES
 
 Run = Callable[..., Any]
 
@@ -228,7 +228,7 @@ def test_states_as_parquet_and_mcap_and_a_bag_as_a_log(
     from bags import write_bag
     from pyarrow import parquet
 
-    from calib.logs import read_log
+    from calib.io.logs import read_log
 
     path = log_file("swing")
     log = read_log(path)
@@ -282,7 +282,7 @@ def test_names_of_several_logs_stay_in_the_folder(
 def test_a_log_too_long_to_be_smoothed_is_refused(
     calib: Run, aligned: Path, log_file: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("calib.replay._SMOOTHED_ROWS", 100)
+    monkeypatch.setattr("calib.stages.estimator.replay._SMOOTHED_ROWS", 100)
     path = log_file("swing")
     ended = calib("replay", path, "--rig", aligned, "--smooth", "--model", "kinematic")
     assert ended.code == 3 and "has more than 100 rows, which smoothing would hold in memory" in ended.err

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from estimatorlogs import simulated
 
-from calib.logs import write_log
+from calib.io.logs import write_log
 
 Run = Callable[..., Any]
 

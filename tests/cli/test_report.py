@@ -9,7 +9,7 @@ import pytest
 from pages import finished_run
 
 from calib.cli.report import report
-from calib.errors import BadInputError
+from calib.core.errors import BadInputError
 
 
 def test_page_beside_the_rig_and_elsewhere(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,9 +15,9 @@ import pytest
 import yaml
 
 from calib.cli.run import run
-from calib.errors import BadInputError
-from calib.logs import log_text
-from calib.running.runner import HIDDEN
+from calib.core.errors import BadInputError
+from calib.io.logs import log_text
+from calib.runner.graph import HIDDEN
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.simulate import log_of

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from calib.cli.simulate import simulate
-from calib.errors import BadInputError, UsageError
-from calib.logs import read_log
+from calib.core.errors import BadInputError, UsageError
+from calib.io.logs import read_log
 
 SHORT = "0.5s"
 

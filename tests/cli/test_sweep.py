@@ -14,10 +14,9 @@ import pytest
 from fleet_clusters import in_threads
 from fleet_processes import COMMAND, all_gone, done, first_worker, started, until, workers
 
-from calib.fleet.store import opened_store
-from calib.fleet.sweeping import run_sweep, summarise_sweep
-from calib.fleet.sweepspec import read_sweep
-from calib.report.sweep_page import write_sweep_page
+from calib.runner.fleet import opened_store
+from calib.runner.sweep import read_sweep, run_sweep, summarise_sweep
+from calib.show.fleet import write_sweep_page
 
 pytest.importorskip("distributed")
 

@@ -12,40 +12,52 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import dlsim, dlti, lfilter
 
-from calib.actuator.dynamics import acceleration
-from calib.actuator.integrate import SUBSTEPS, rig_at_rest, simulate
-from calib.actuator.parameters import pumps_connected
-from calib.actuator.pump import Pump, pump_at_rest, static_force_N, step_pump
-from calib.control.antiwindup import BackCalculation, BackState, step_back
-from calib.control.computed_torque import ComputedTorque, wanted_motion
-from calib.control.computed_torque import step as step_of_computed_torque
-from calib.control.feedforward import FeedForward, feed_forward
-from calib.control.inverse_model import (
+from calib.stages.actuator.dynamics import acceleration
+from calib.stages.actuator.parameters import pumps_connected
+from calib.stages.actuator.pump import Pump, pump_at_rest, static_force_N, step_pump
+from calib.stages.actuator.simulate import SUBSTEPS, rig_at_rest, simulate
+from calib.stages.control.laws import (
+    BackCalculation,
+    BackState,
+    ComputedTorque,
+    FeedForward,
+    LoopState,
     Model,
+    Observer,
+    ObserverState,
+    OrientationControl,
+    Pid,
+    PidState,
+    PositionControl,
+    PumpEstimate,
+    ahead,
+    correct,
     creep_along,
+    design_observer,
+    feed_forward,
     feed_forward_pwm,
     force_of_pwm,
     holding_force,
     largest_force_N,
-    moving_force,
-    pwm_of_force,
-    static_stiffness,
-)
-from calib.control.loop import LoopState, OrientationControl, PositionControl, step_orientation, step_position
-from calib.control.observer import (
-    Observer,
-    ObserverState,
-    correct,
-    design_observer,
     marker_jacobian,
     marker_of,
+    moving_force,
     predict,
+    pumps_at_rest,
+    push,
+    pwm_for_force,
+    pwm_of_force,
     start_observer,
+    static_stiffness,
+    step,
+    step_back,
+    step_orientation,
+    step_position,
+    wanted_motion,
 )
-from calib.control.pid import Pid, PidState, step
-from calib.control.pid import step as step_pid
-from calib.control.pump_model import PumpEstimate, ahead, pumps_at_rest, push, pwm_for_force
-from calib.control.setpoints import Ellipse
+from calib.stages.control.laws import computed_torque_step as step_of_computed_torque
+from calib.stages.control.laws import step as step_pid
+from calib.stages.control.references import Ellipse
 
 
 def _outputs(pid: Pid, errors: list[float], state: PidState | None = None) -> np.ndarray:
@@ -336,9 +348,9 @@ def test_an_unknown_force_is_found() -> None:
     weak = Model(NOMINAL.plant, NOMINAL.pump, (0.9, 1.0))
     pwm = np.full((600, 2), 210.0)
     static = NOMINAL.pump.static.force_N(np.array([210.0]))[0]
-    from calib.actuator.dynamics import coefficients
-    from calib.actuator.kernel import STATE, run
-    from calib.actuator.pump import pump_coefficients
+    from calib.stages.actuator.dynamics import coefficients
+    from calib.stages.actuator.pump import pump_coefficients
+    from calib.stages.actuator.simulate import STATE, run
 
     out = np.empty((600, len(STATE)))
     row = rig_at_rest(weak.plant, weak.pump).row

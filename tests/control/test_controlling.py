@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from control_models import NOMINAL
 
-from calib.control.measures import tracking
-from calib.control.references import BUILT_IN, Reference, built_in, from_lengths
-from calib.controlling import CONTROLLERS, Outcome, control_model, run_controller
-from calib.twin.closed_loop import EllipseTrack, Elongation, Orientation
+from calib.stages.control.references import BUILT_IN, Reference, built_in, from_lengths
+from calib.stages.control.stage import CONTROLLERS, Outcome, control_model, run_controller
+from calib.stages.control.tuning import tracking
 from calib.twin.rig import SimulatedRig
+from calib.twin.scenarios import EllipseTrack, Elongation, Orientation
 
 RIG = SimulatedRig()
 MODEL = control_model(RIG)
@@ -112,10 +112,9 @@ def test_the_same_seed_the_same_run() -> None:
 
 def test_a_controller_may_read_the_sensors_themselves() -> None:
     """The samples of each tick once, in order, and the marker as the tracker reports it."""
-    from calib.control.loop import LoopState
-    from calib.twin.experiment import at_rest
-    from calib.twin.feedback import Seen
-    from calib.twin.simulate import simulate
+    from calib.stages.control.laws import LoopState
+    from calib.twin.scenarios import at_rest
+    from calib.twin.simulate import Seen, simulate
 
     read: list[Seen] = []
 

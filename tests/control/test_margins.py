@@ -12,23 +12,25 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import signal
 
-from calib.actuator.integrate import RigState, simulate
-from calib.control.inverse_model import Model, feed_forward_pwm, holding_force
-from calib.control.linear import (
+from calib.core.errors import BadInputError
+from calib.stages.actuator.simulate import RigState, simulate
+from calib.stages.control.laws import Model, Pid, PidState, feed_forward_pwm, holding_force
+from calib.stages.control.laws import step as step_pid
+from calib.stages.control.linear import (
     System,
     bent_rest,
+    break_at,
     closed_loop,
     delay,
+    gain_to_instability,
+    loop_margins,
     pid_system,
     response,
     rig_system,
     series,
     spectral_radius,
 )
-from calib.control.margins import break_at, gain_to_instability, loop_margins
-from calib.control.pid import Pid, PidState
-from calib.control.pid import step as step_pid
-from calib.control.tuning import (
+from calib.stages.control.tuning import (
     Criterion,
     Tuned,
     holds,
@@ -38,7 +40,6 @@ from calib.control.tuning import (
     tune_orientation,
     tune_position,
 )
-from calib.errors import BadInputError
 
 H = NOMINAL.tick_s
 

@@ -12,14 +12,20 @@ from control_models import MODELS, NOMINAL, ORIFICE
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calib.actuator.integrate import simulate
-from calib.actuator.kinematics import angle, forward
-from calib.control.inverse_model import Model, feed_forward_pwm
-from calib.control.reach import follow, largest_angle, longest_m, reachable, slowed
-from calib.control.references import BUILT_IN, built_in, check_workspace, resampled
-from calib.control.setpoints import Ellipse, PolynomialElongation
-from calib.errors import BadInputError
-from calib.referencefile import read_reference
+from calib.core.errors import BadInputError
+from calib.stages.actuator.kinematics import angle, forward
+from calib.stages.actuator.simulate import simulate
+from calib.stages.control.laws import Model, feed_forward_pwm
+from calib.stages.control.read import read_reference
+from calib.stages.control.references import (
+    BUILT_IN,
+    Ellipse,
+    PolynomialElongation,
+    built_in,
+    check_workspace,
+    resampled,
+)
+from calib.stages.control.tuning import follow, largest_angle, longest_m, reachable, slowed
 
 H = NOMINAL.tick_s
 BOX = (-0.06, 0.04, 0.06, 0.11)

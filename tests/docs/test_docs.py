@@ -22,7 +22,7 @@ from typer.main import get_command
 
 from calib.cli.app import app
 from calib.cli.docs import MANUAL, docs, manual, page_of, slug, write_manual
-from calib.errors import DISTRIBUTION, UsageError, pip_install
+from calib.core.errors import DISTRIBUTION, UsageError, pip_install
 
 ROOT = Path(__file__).resolve().parents[2]
 README = ROOT / "README.md"

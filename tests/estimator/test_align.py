@@ -13,15 +13,32 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import norm
 
-from calib.aligning import align_section, read_align_log, settings_from_rig, with_drawn_marker
-from calib.arrays import FloatArray
-from calib.errors import BadInputError
-from calib.estimator.align import Alignment, align, rest_angle
-from calib.estimator.align_clock import even_times_of
-from calib.estimator.align_loss import best_jitter_px, pixel_terms
-from calib.estimator.align_problem import Noise, Problem, Stretch, pictures_off, readings_off
-from calib.estimator.align_solve import response, solve
-from calib.estimator.align_spline import (
+from calib.core.arrays import FloatArray
+from calib.core.errors import BadInputError
+from calib.core.rig import Camera, Distortion, Geometry, Plane, Rig, read_rig, write_rig
+from calib.io.logs import Log, write_log
+from calib.stages.align.read import align_section, read_align_log, settings_from_rig, with_drawn_marker
+from calib.stages.align.solve import (
+    AlignLog,
+    Alignment,
+    Noise,
+    Problem,
+    Stretch,
+    align,
+    best_jitter_px,
+    correlation,
+    even_times_of,
+    judge_align,
+    pictures_off,
+    pieces_of,
+    pixel_terms,
+    readings_off,
+    response,
+    rest_angle,
+    solve,
+    start,
+)
+from calib.stages.align.spline import (
     BAND,
     Knots,
     basis_rows,
@@ -31,12 +48,8 @@ from calib.estimator.align_spline import (
     normal_sums,
     states_of,
 )
-from calib.estimator.align_start import AlignLog, correlation, pieces_of, start
-from calib.estimator.align_verdict import judge_align
-from calib.estimator.sensors import SENSOR, SIZE, sensor_values, view_coefficients
-from calib.logs import Log, write_log
-from calib.replaying import Periods, setup_from_rig
-from calib.rig import Camera, Distortion, Geometry, Plane, Rig, read_rig, write_rig
+from calib.stages.estimator.read import Periods, setup_from_rig
+from calib.stages.estimator.sensors import SENSOR, SIZE, sensor_values, view_coefficients
 from calib.twin.rig import SimulatedRig, nominal_view
 
 OFFSET, MOUNT, BIAS = (

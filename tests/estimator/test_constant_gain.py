@@ -8,11 +8,19 @@ import numpy as np
 import pytest
 from estimatorlogs import rows_from, setup_for, simulated, truth
 
-from calib.estimator.baseline import Baseline, BaselineSetup, undistorting_nothing
-from calib.estimator.constant_gain import Ticks, run_gains, tick_noise, ticks_of
-from calib.estimator.gains import MOST_DELAY_TICKS, Gains, TickNoise, design
-from calib.estimator.sensors import head_position
-from calib.estimator.setup import Setup
+from calib.stages.estimator.baseline import Baseline, BaselineSetup, undistorting_nothing
+from calib.stages.estimator.constant_gain import (
+    MOST_DELAY_TICKS,
+    Gains,
+    TickNoise,
+    Ticks,
+    design,
+    run_gains,
+    tick_noise,
+    ticks_of,
+)
+from calib.stages.estimator.kinematic import Setup
+from calib.stages.estimator.sensors import head_position
 
 NOISE = TickNoise(8.6e-3, 4.3e-4, 2e-3, 0.025)
 T = 1.0 / 60.0

@@ -12,35 +12,42 @@ from drivenlogs import commands_of, driven_log, varied_drive
 from estimatorlogs import rows_from, setup_for, simulated, truth
 from identifytrials import rig_file
 
-from calib.actuator.dynamics import coefficients
-from calib.actuator.kernel import derivative, run
-from calib.actuator.parameters import pumps_connected
-from calib.actuator.pump import Orifice, Pump, RateLimit, pump_coefficients
-from calib.arrays import FloatArray
-from calib.driving import drive_from_rig
-from calib.estimator import driven_smoother
-from calib.estimator.consistency import Tally
-from calib.estimator.constant_gain import run_gains, ticks_of
-from calib.estimator.driven_filter import DrivenFilter
-from calib.estimator.driven_handover import Handover, blended, new_handover, smooth_both, weigh
-from calib.estimator.driven_kernel import CAMERA, IMU, WORK, driven_event, measure
-from calib.estimator.driven_model import (
+from calib.core.arrays import FloatArray
+from calib.core.rig import Rig
+from calib.io.logs import write_log
+from calib.stages.actuator.dynamics import coefficients
+from calib.stages.actuator.parameters import pumps_connected
+from calib.stages.actuator.pump import Orifice, Pump, RateLimit, pump_coefficients
+from calib.stages.actuator.simulate import derivative, run
+from calib.stages.estimator import driven as driven_smoother
+from calib.stages.estimator.consistency import Tally
+from calib.stages.estimator.constant_gain import Gains, run_gains, ticks_of
+from calib.stages.estimator.driven import (
+    CAMERA,
     DRIVEN,
     DYNAMIC,
+    IMU,
     INVOLVED,
     PARAMETER,
+    WORK,
+    Drive,
+    DrivenFilter,
+    Handover,
     accelerations,
+    blended,
     carry,
+    driven_event,
     flow,
     jacobian,
+    measure,
+    new_handover,
+    smooth_both,
+    weigh,
 )
-from calib.estimator.driven_noise import WALKS, driven_likelihood, scaled, tune_driven
-from calib.estimator.driven_setup import Drive
-from calib.estimator.gains import Gains
-from calib.estimator.setup import OUT, Rows, Setup
-from calib.logs import write_log
-from calib.rig import Rig
-from calib.tuning import gain_section, tuned_section
+from calib.stages.estimator.kinematic import OUT, Rows, Setup
+from calib.stages.estimator.noise import WALKS, driven_likelihood, scaled, tune_driven
+from calib.stages.estimator.read import drive_from_rig
+from calib.stages.estimator.tuning import gain_section, tuned_section
 
 TARGET_MM = {"static": 0.04, "swing": 0.11, "ellipse": 0.05, "step": 0.06, "elongation": 0.07}
 """Means over the seeds below; an alignment as in `estimatorlogs.SIGMA` alone leaves 0.03 mm."""
@@ -546,7 +553,7 @@ def test_constant_gains_are_those_of_the_set_up_and_stay_finite() -> None:
 def test_a_log_with_commands_tunes_the_driven_model_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("calib.tuning._MOST_ROWS", 400)
+    monkeypatch.setattr("calib.stages.estimator.tuning._MOST_ROWS", 400)
     _, log = simulated("ellipse", 1)
     first = np.arange(len(log)) < 400
     short = replace(log, t_s=log.t_s[first], columns={k: v[first] for k, v in log.columns.items()},

@@ -16,36 +16,46 @@ from estimatorlogs import SCENARIOS, rows_from, setup_for, simulated, truth
 from numba.core.dispatcher import Dispatcher
 from scipy.stats import truncnorm
 
-import calib.actuator
-import calib.estimator
-from calib.actuator.kinematics import forward as forward_of_sensors
-from calib.arrays import FloatArray
-from calib.estimator import reference, sensors, smoother
-from calib.estimator.bank import get, new_bank, put
-from calib.estimator.baseline import Baseline, BaselineSetup
-from calib.estimator.clock import even_times, new_clock
-from calib.estimator.consistency import Tally, chi_square_band, nees
-from calib.estimator.expect import TOLD
-from calib.estimator.filter import Filter, starting_state
-from calib.estimator.kernel import CAMERA, CONSIDERED, IMU, REPORT, TRACE, event
-from calib.estimator.model import Kinematic
-from calib.estimator.noise import jitter_px, log_likelihood, tune
-from calib.estimator.reference import camera_terms, imu_terms
-from calib.estimator.rounding import truncated, update_terms
-from calib.estimator.sensors import SENSOR, SIZE
-from calib.estimator.setup import FLAGS, OUT, Rows, Setup
-from calib.estimator.smoother import Events, banked, events_of, forward
-from calib.logs import Log
-from calib.replay import Trace, judged
-from calib.replaying import Periods, noise_at_rest, periods, rows_of, setup_from_rig, truth_of
-from calib.rig import Rig
-from calib.twin.camera_sensor import Tracker, marker_pixels
-from calib.twin.feedback import Firmware, FirmwareState, add_frame, add_imu
-from calib.twin.imu_sensor import Imu, ImuNoise, measure
+import calib.stages.actuator
+import calib.stages.estimator
+from calib.core.arrays import FloatArray
+from calib.core.rig import Rig
+from calib.io.logs import Log
+from calib.stages.actuator.kinematics import forward as forward_of_sensors
+from calib.stages.estimator import reference, sensors, smoother
+from calib.stages.estimator.baseline import Baseline, BaselineSetup
+from calib.stages.estimator.consistency import Tally, chi_square_band, nees
+from calib.stages.estimator.kinematic import (
+    CAMERA,
+    CONSIDERED,
+    FLAGS,
+    IMU,
+    OUT,
+    REPORT,
+    TOLD,
+    TRACE,
+    Filter,
+    Kinematic,
+    Rows,
+    Setup,
+    even_times,
+    event,
+    get,
+    new_bank,
+    new_clock,
+    put,
+    starting_state,
+)
+from calib.stages.estimator.noise import jitter_px, log_likelihood, tune
+from calib.stages.estimator.read import Periods, noise_at_rest, periods, rows_of, setup_from_rig, truth_of
+from calib.stages.estimator.reference import camera_terms, imu_terms
+from calib.stages.estimator.replay import Trace, judged
+from calib.stages.estimator.sensors import SENSOR, SIZE, truncated, update_terms
+from calib.stages.estimator.smoother import Events, banked, events_of, forward
 from calib.twin.rig import SimulatedRig, nominal_view, workspace_homography
 from calib.twin.scenarios import make_scenario, run_scenario
-from calib.twin.sensors import HeadMotion
-from calib.twin.simulate import log_of
+from calib.twin.sensors import HeadMotion, Imu, ImuNoise, Tracker, marker_pixels, measure
+from calib.twin.simulate import Firmware, FirmwareState, add_frame, add_imu, log_of
 
 TARGET_MM = {"static": 0.08, "swing": 0.22, "ellipse": 0.19, "step": 0.22, "elongation": 0.18}
 TARGET_DEG = {"swing": 0.06}
@@ -640,7 +650,7 @@ def _head_motion(rows: FloatArray) -> HeadMotion:
     return HeadMotion(rows[:, 0], rows[:, 2], rows[:, 4], five[2], a)
 
 
-@pytest.mark.parametrize("package", [calib.estimator, calib.actuator])
+@pytest.mark.parametrize("package", [calib.stages.estimator, calib.stages.actuator])
 def test_no_function_may_round_as_its_compilation_happens_to_be(package: ModuleType) -> None:
     """States are the same bytes whether functions were compiled here, elsewhere or in another order."""
     found = []

@@ -10,15 +10,14 @@ import numpy as np
 import pytest
 from estimatorlogs import SIGMA, rows_from, setup_for, simulated, truth, truth_of_sensors
 
-from calib.estimator import smoother
-from calib.estimator.consistency import Tally
-from calib.estimator.filter import Filter
-from calib.estimator.sensors import sensor_values, view_coefficients
-from calib.estimator.setup import OUT, Start
-from calib.logs import Log
-from calib.replaying import periods
-from calib.smoothing import smooth_log
-from calib.statesfile import STATES
+from calib.io.logs import Log
+from calib.io.states import STATES
+from calib.stages.estimator import smoother
+from calib.stages.estimator.consistency import Tally
+from calib.stages.estimator.kinematic import OUT, Filter, Start
+from calib.stages.estimator.read import periods
+from calib.stages.estimator.replay import smooth_log
+from calib.stages.estimator.sensors import sensor_values, view_coefficients
 
 
 @pytest.mark.parametrize("name", ["swing", "ellipse", "elongation"])

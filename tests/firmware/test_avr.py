@@ -11,11 +11,10 @@ import pytest
 from firmware_build import LIMITS, avr, compare, run, write
 from firmware_rigs import header, rig
 
-from calib.firmware.conformance import MODE_POSITION, Inputs, Reference
-from calib.firmware.literals import values
-from calib.firmware.vectors import binary32, directed
-from calib.firmware.vectors_fused import coherent, directed_fused
-from calib.rig import Rig
+from calib.core.rig import Rig
+from calib.stages.firmware.conformance import MODE_POSITION, Inputs, Reference
+from calib.stages.firmware.literals import values
+from calib.stages.firmware.vectors import binary32, coherent, directed, directed_fused
 
 TICK_CYCLES = 266_667
 STAGES = ("", "angle", "plane", "offset", "low-pass", "lengths", "control")
@@ -103,7 +102,7 @@ def _told(name: str, cycles: np.ndarray) -> int:
 
 def test_the_budget_of_the_thesis_tick(tmp_path: Path) -> None:
     """Angle filter, homography, low-pass, inverse kinematics, PD with feed-forward, in every tick."""
-    from calib.firmware.header import header_of
+    from calib.stages.firmware.header import header_of
 
     still = [(0.08, 0.085)] * 1200
     moving = [(0.015 * math.sin(0.02 * k), 0.078 - 0.01 * math.cos(0.02 * k)) for k in range(1200)]
@@ -155,7 +154,7 @@ def _with_integral(plain: Rig) -> Rig:
 
 def test_a_moving_reference_is_that_of_the_set_points(tmp_path: Path) -> None:
     """calib_reference_point against the exact inverse kinematics that the set-points use."""
-    from calib.control.setpoints import Ellipse
+    from calib.stages.control.references import Ellipse
 
     ellipse, times = Ellipse(), np.linspace(0.0, 20.0, 400)
     wanted = ellipse.bellows_m(times, values(header().literals)["CALIB_BELLOWS_RADIUS_M"])

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 from firmware_rigs import header
 
-from calib.errors import BadInputError
-from calib.firmware.check import check_frames, read_frames
-from calib.firmware.header import identity_of
-from calib.firmware.telemetry import Frame, csv_header, csv_row
-from calib.firmware.vectors import vectors
+from calib.core.errors import BadInputError
+from calib.io.serial import Frame, csv_header, csv_row
+from calib.stages.firmware.check import check_frames, read_frames
+from calib.stages.firmware.header import identity_of
+from calib.stages.firmware.vectors import vectors
 
 
 def _frames(ticks: int = 120) -> list[Frame]:

@@ -8,19 +8,24 @@ import numpy as np
 import pytest
 from firmware_rigs import header
 
-from calib.actuator.kinematics import head_from_marker
-from calib.actuator.series import inverse_series
-from calib.camera.model import Camera, undistort
-from calib.control.feedforward import FeedForward
-from calib.control.loop import LoopState, OrientationControl, PositionControl, step_orientation, step_position
-from calib.control.pid import Pid
-from calib.firmware.conformance import MODE_ORIENTATION, MODE_POSITION, Inputs, Reference
-from calib.firmware.literals import values
-from calib.firmware.vectors import binary32
-from calib.imu.mahony import Mahony, MahonySample, MahonyState
-from calib.imu.mahony import step as step_angle
-from calib.signals.lowpass import LowPass, settled
-from calib.signals.lowpass import step as step_lowpass
+from calib.stages.actuator.kinematics import head_from_marker, inverse_series
+from calib.stages.camera.model import Camera, undistort
+from calib.stages.control.laws import (
+    FeedForward,
+    LoopState,
+    OrientationControl,
+    Pid,
+    PositionControl,
+    step_orientation,
+    step_position,
+)
+from calib.stages.firmware.conformance import MODE_ORIENTATION, MODE_POSITION, Inputs, Reference
+from calib.stages.firmware.literals import values
+from calib.stages.firmware.vectors import binary32
+from calib.stages.imu.mahony import Mahony, MahonySample, MahonyState
+from calib.stages.imu.mahony import step as step_angle
+from calib.stages.lowpass.filters import LowPass, settled
+from calib.stages.lowpass.filters import step as step_lowpass
 from calib.twin.pictures import CAMERA, PLANE
 
 TICKS = 600

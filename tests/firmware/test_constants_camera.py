@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from firmware_rigs import header, rig
 
-from calib.camera.model import project, undistort
-from calib.errors import BadInputError
-from calib.firmware.constants_camera import MIDDLE_M, camera_groups, plane_constants, put_right
-from calib.firmware.header import header_of, header_text
-from calib.firmware.literals import literals
+from calib.core.errors import BadInputError
+from calib.stages.camera.model import project, undistort
+from calib.stages.firmware.constants import MIDDLE_M, camera_groups, plane_constants, put_right
+from calib.stages.firmware.header import header_of, header_text
+from calib.stages.firmware.literals import literals
 from calib.twin.pictures import CAMERA, PLANE
 
 WORKSPACE = (-0.06, 0.04, 0.06, 0.11)
@@ -58,7 +58,7 @@ def test_both_ways_through_the_plane_find_the_world() -> None:
 
 def test_an_alignments_shift_and_stretch_are_undone() -> None:
     """Places that the calibrated plane shows as the estimator's model of it does come out right."""
-    from calib.estimator.sensors import view_coefficients
+    from calib.stages.estimator.sensors import view_coefficients
 
     shift, stretch = (3e-4, -2e-4), 2e-3
     middle = view_coefficients(CAMERA, np.eye(3), np.zeros(3))[22:24]

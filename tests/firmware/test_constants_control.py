@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from firmware_rigs import rig
 
-from calib.actuator.parameters import Stiffness
-from calib.actuator.pump import ElongationForce
-from calib.control.pid import Pid, PidState, step
-from calib.errors import BadInputError
-from calib.firmware.constants_control import control_groups
-from calib.firmware.known import Known
-from calib.firmware.literals import literals, values
+from calib.core.errors import BadInputError
+from calib.stages.actuator.parameters import Stiffness
+from calib.stages.actuator.pump import ElongationForce
+from calib.stages.control.laws import Pid, PidState, step
+from calib.stages.firmware.constants import Known, control_groups
+from calib.stages.firmware.literals import literals, values
 
 
 def _of(kind: str) -> dict[str, float]:
@@ -36,7 +35,7 @@ def _summed(c: dict[str, float], errors: np.ndarray, clamping: bool) -> np.ndarr
 
 @pytest.mark.parametrize("clamping", [False, True])
 def test_the_summed_form_is_the_incremental_one(clamping: bool) -> None:
-    """Random errors that cross both limits, against `calib.control.pid`."""
+    """Random errors that cross both limits, against `calib.stages.control.laws`."""
     errors = 0.15 * np.cumsum(np.random.default_rng(1).normal(0.0, 0.3, 400))
     pid, state, wanted = Pid(1000.0, 1000.0, 10.0, clamping=clamping), PidState(), []
     for e in errors.tolist():

@@ -9,15 +9,13 @@ import pytest
 from estimatorlogs import NOISE
 from firmware_rigs import header, rig
 
-from calib.errors import BadInputError
-from calib.estimator.constant_gain import tick_noise
-from calib.estimator.gains import design
-from calib.estimator.sensors import sensor_values, view_coefficients
-from calib.estimator.setup import Setup, Start
-from calib.firmware.constants_fused import fused_group
-from calib.firmware.known import Known
-from calib.firmware.literals import Group, literals, values
-from calib.rig import Rig
+from calib.core.errors import BadInputError
+from calib.core.rig import Rig
+from calib.stages.estimator.constant_gain import design, tick_noise
+from calib.stages.estimator.kinematic import Setup, Start
+from calib.stages.estimator.sensors import sensor_values, view_coefficients
+from calib.stages.firmware.constants import Known, fused_group
+from calib.stages.firmware.literals import Group, literals, values
 from calib.twin.pictures import CAMERA, PLANE
 
 
@@ -69,7 +67,7 @@ def test_the_age_of_a_picture_in_parts_of_a_tick(late_ticks: float, remembered: 
 
 
 def test_without_tuned_gains_they_are_for_the_noise_of_the_alignment() -> None:
-    """As `calib.estimator.constant_gain` finds it from the set-up, to second order in the angle."""
+    """As `calib.stages.estimator.constant_gain` finds it from the set-up, to second order in the angle."""
     whole = _with("align", jitter_px=0.3, imu_lever_m=0.006)
     whole = whole.model_copy(update={"estimator": None})
     group, c = _group(whole), _values(whole)

@@ -9,12 +9,11 @@ import pytest
 from firmware_rigs import header, rig
 from scipy.signal import butter
 
-from calib.errors import BadInputError
-from calib.firmware.constants_motion import motion_groups
-from calib.firmware.header import header_of
-from calib.firmware.known import Known
-from calib.firmware.literals import literals, values
-from calib.rig import Rig
+from calib.core.errors import BadInputError
+from calib.core.rig import Rig
+from calib.stages.firmware.constants import Known, motion_groups
+from calib.stages.firmware.header import header_of
+from calib.stages.firmware.literals import literals, values
 
 
 def _of(kind: str) -> dict[str, float]:

@@ -12,8 +12,8 @@ import pytest
 from firmware_build import need, warnings, write
 from firmware_rigs import header, rig
 
-from calib.errors import BadInputError
-from calib.firmware.header import header_of, header_text, identity_of
+from calib.core.errors import BadInputError
+from calib.stages.firmware.header import header_of, header_text, identity_of
 
 HOSTILE = {"*/ int x; /*": "1", "??/\n#error": "2", 'quote".png': "3", "ünï\u202e.png": "4", "\\": "5"}
 

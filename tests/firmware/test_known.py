@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from firmware_rigs import rig
 
-from calib.errors import BadInputError
-from calib.firmware.known import Known
-from calib.rig import Rig
+from calib.core.errors import BadInputError
+from calib.core.rig import Rig
+from calib.stages.firmware.constants import Known
 
 
 def test_models_mappings_and_lists_are_asked_alike() -> None:

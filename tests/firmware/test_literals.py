@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calib.errors import BadInputError
-from calib.firmware.literals import (
+from calib.core.errors import BadInputError
+from calib.stages.firmware.literals import (
     Constant,
     Group,
     Table,

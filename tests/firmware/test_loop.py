@@ -19,10 +19,9 @@ from firmware_build import Process, Simulated, avr, host, write
 from firmware_plant import Loop
 from firmware_rigs import header
 
-from calib.control.setpoints import Ellipse
-from calib.firmware.conformance import MODE_ORIENTATION, MODE_POSITION, Inputs, binary32
-from calib.firmware.conformance_fused import reference_of
-from calib.firmware.literals import values
+from calib.stages.control.references import Ellipse
+from calib.stages.firmware.conformance import MODE_ORIENTATION, MODE_POSITION, Inputs, binary32, reference_of
+from calib.stages.firmware.literals import values
 from calib.twin.rig import SimulatedRig
 
 

@@ -12,12 +12,16 @@ import pytest
 from firmware_build import LIMITS, NATIVE, need, numbers, run, write
 from firmware_rigs import header, rig
 
-from calib.firmware.conformance import MODE_ORIENTATION, MODE_POSITION, Inputs, Reference
-from calib.firmware.conformance_fused import FusedReference
-from calib.firmware.header import header_text
-from calib.firmware.literals import float_literal, values
-from calib.firmware.vectors import binary32, directed
-from calib.firmware.vectors_fused import coherent, directed_fused, pixel_of
+from calib.stages.firmware.conformance import (
+    MODE_ORIENTATION,
+    MODE_POSITION,
+    FusedReference,
+    Inputs,
+    Reference,
+)
+from calib.stages.firmware.header import header_text
+from calib.stages.firmware.literals import float_literal, values
+from calib.stages.firmware.vectors import binary32, coherent, directed, directed_fused, pixel_of
 
 # Not reached by any marker inside the picture; test_pipeline.py has a plane whose horizon is.
 UNREACHED = {"CALIB_PLANE_LEAST_PER_M", "CALIB_PLANE_RAW_LEAST_PER_M"}

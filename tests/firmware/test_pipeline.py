@@ -25,7 +25,7 @@ import pytest
 from firmware_build import LIMITS, compare, host, hostile, need, numbers, run, strew, write
 from firmware_rigs import header, rig
 
-from calib.firmware.conformance import (
+from calib.stages.firmware.conformance import (
     BAD_REFERENCE,
     HORIZON,
     IMU_HELD,
@@ -37,10 +37,10 @@ from calib.firmware.conformance import (
     Inputs,
     Reference,
 )
-from calib.firmware.header import Header
-from calib.firmware.literals import values
-from calib.firmware.vectors import binary32, directed
-from calib.rig_lowpass import LowPassSection
+from calib.stages.firmware.header import Header
+from calib.stages.firmware.literals import values
+from calib.stages.firmware.vectors import binary32, directed
+from calib.stages.lowpass.section import LowPassSection
 
 
 @pytest.fixture(scope="module", params=["nominal", "full"])
@@ -214,8 +214,8 @@ def test_signs_of_the_imus_axes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("order", [2, 5, 8])
 def test_low_passes_of_every_order(tmp_path: Path, order: int) -> None:
-    from calib.firmware.header import header_of
-    from calib.signals.design import Design, design_lowpass
+    from calib.stages.firmware.header import header_of
+    from calib.stages.lowpass.filters import Design, design_lowpass
 
     section = rig("full").lowpass
     assert section is not None

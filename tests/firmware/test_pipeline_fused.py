@@ -26,15 +26,21 @@ import pytest
 from firmware_build import LIMITS, compare, host, hostile, need, run, strew, write
 from firmware_rigs import header, rig
 
-from calib.estimator.constant_gain import Ticks, run_gains
-from calib.estimator.gains import Gains
-from calib.estimator.setup import Setup, Start
-from calib.firmware.conformance import IMU_HELD, MARKER_HELD, MODE_OFF, MODE_POSITION, REJECTED, STALE, Inputs
-from calib.firmware.conformance_fused import FusedReference
-from calib.firmware.header import Header
-from calib.firmware.literals import values
-from calib.firmware.vectors import binary32
-from calib.firmware.vectors_fused import PERIOD, coherent, directed_fused
+from calib.stages.estimator.constant_gain import Gains, Ticks, run_gains
+from calib.stages.estimator.kinematic import Setup, Start
+from calib.stages.firmware.conformance import (
+    IMU_HELD,
+    MARKER_HELD,
+    MODE_OFF,
+    MODE_POSITION,
+    REJECTED,
+    STALE,
+    FusedReference,
+    Inputs,
+)
+from calib.stages.firmware.header import Header
+from calib.stages.firmware.literals import values
+from calib.stages.firmware.vectors import PERIOD, binary32, coherent, directed_fused
 
 
 @pytest.fixture(scope="module", params=["fused", "full"])
@@ -156,7 +162,8 @@ def _angle(made: Header, given: Inputs) -> float:
 
 @pytest.mark.parametrize("mean_rate", [False, True])
 def test_the_reference_is_the_projects_estimator(mean_rate: bool) -> None:
-    """Fed with calibrated readings, `calib.estimator.constant_gain` gives the same angle and length."""
+    """Fed with calibrated readings, `calib.stages.estimator.constant_gain` gives the same angle and
+    length."""
     made, whole = header("fused"), rig("fused")
     constants = values(made.literals)
     section = whole.estimator

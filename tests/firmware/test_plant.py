@@ -7,7 +7,7 @@ import math
 import numpy as np
 from firmware_plant import Loop
 
-from calib.actuator.integrate import rig_at_rest
+from calib.stages.actuator.simulate import rig_at_rest
 from calib.twin.rig import SimulatedRig
 from calib.twin.simulate import simulate
 

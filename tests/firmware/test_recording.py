@@ -6,9 +6,8 @@ from dataclasses import replace
 
 from firmware_rigs import header
 
-from calib.firmware.recording import Recording, record
-from calib.firmware.telemetry import Frame, encoded
-from calib.firmware.vectors import vectors
+from calib.io.serial import Frame, Recording, encoded, record
+from calib.stages.firmware.vectors import vectors
 
 
 def _frames(count: int, first: int = 0) -> list[Frame]:

@@ -9,9 +9,9 @@ import pytest
 from firmware_build import NATIVE, need, write
 from firmware_rigs import header
 
-from calib.firmware.check import check_frames
-from calib.firmware.header import verbatim
-from calib.firmware.telemetry import Decoder
+from calib.io.serial import Decoder
+from calib.stages.firmware.check import check_frames
+from calib.stages.firmware.header import verbatim
 
 
 def _sketch(folder: Path) -> Path:

@@ -10,9 +10,9 @@ import math
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calib.firmware.conformance import Inputs
-from calib.firmware.telemetry import Decoder, Frame, checksum, csv_header, csv_row, encoded, frame_from_row
-from calib.firmware.vectors import binary32
+from calib.io.serial import Decoder, Frame, checksum, csv_header, csv_row, encoded, frame_from_row
+from calib.stages.firmware.conformance import Inputs
+from calib.stages.firmware.vectors import binary32
 
 floats = st.floats(width=32, allow_nan=False)
 

@@ -7,7 +7,7 @@ import re
 import pytest
 from firmware_rigs import header
 
-from calib.firmware.conformance import (
+from calib.stages.firmware.conformance import (
     ANGLE_LIMIT,
     BAD_REFERENCE,
     CLAMPED,
@@ -15,8 +15,8 @@ from calib.firmware.conformance import (
     MARKER_HELD,
     SATURATED,
 )
-from calib.firmware.header import identity_of
-from calib.firmware.vectors import selftest_text, vectors
+from calib.stages.firmware.header import identity_of
+from calib.stages.firmware.vectors import selftest_text, vectors
 
 
 @pytest.mark.parametrize("kind", ["nominal", "full"])

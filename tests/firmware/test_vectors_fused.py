@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from firmware_rigs import header
 
-from calib.errors import BadInputError
-from calib.firmware.conformance import (
+from calib.core.errors import BadInputError
+from calib.stages.firmware.conformance import (
     ACCEL_WEAK,
     BAD_REFERENCE,
     IMU_HELD,
@@ -17,12 +17,19 @@ from calib.firmware.conformance import (
     MOVING,
     REJECTED,
     SATURATED,
+    FusedReference,
     Reference,
 )
-from calib.firmware.conformance_fused import FusedReference
-from calib.firmware.literals import values
-from calib.firmware.vectors import FUSED_TICKS, selftest_text, vectors
-from calib.firmware.vectors_fused import PERIOD, Motion, coherent, pixel_of
+from calib.stages.firmware.literals import values
+from calib.stages.firmware.vectors import (
+    FUSED_TICKS,
+    PERIOD,
+    Motion,
+    coherent,
+    pixel_of,
+    selftest_text,
+    vectors,
+)
 
 
 @pytest.mark.parametrize("kind", ["fused", "full"])

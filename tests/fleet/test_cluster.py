@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from calib.errors import BadInputError
-from calib.fleet import cluster
-from calib.fleet.cluster import check_survey, connected, survey
+from calib.core.errors import BadInputError
+from calib.runner import engine as cluster
+from calib.runner.engine import check_survey, connected, survey
 
 pytest.importorskip("distributed")
 

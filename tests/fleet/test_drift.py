@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.arrays import FloatArray
-from calib.fleet.drift import Drift, drift_limit, drift_of
-from calib.fleet.spread import spread_of
+from calib.core.arrays import FloatArray
+from calib.runner.fleet import Drift, drift_limit, drift_of, spread_of
 
 
 def _line(t: FloatArray, x: FloatArray, sigma: FloatArray) -> Drift:

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from calib.errors import BadInputError
-from calib.fleet import fetch
-from calib.fleet.fetch import local_folder
+from calib.core.errors import BadInputError
+from calib.runner import task as fetch
+from calib.runner.task import local_folder
 
 fsspec = pytest.importorskip("fsspec")
 

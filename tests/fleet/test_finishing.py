@@ -9,16 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.files import sha256
-from calib.fleet.borrowing import BORROWED
-from calib.fleet.finishing import finish
-from calib.fleet.manifest import Manifest, RigSpec
-from calib.fleet.outcome import Outcome
-from calib.fleet.prior import read_prior
-from calib.fleet.rows import Table, column, texts
-from calib.fleet.store import Store, opened_store
-from calib.fleet.task import Answer
-from calib.rig import Camera, CovarianceTable, Distortion, Provenance, Rig, read_rig, rig_text
+from calib.core.files import sha256
+from calib.core.rig import Camera, CovarianceTable, Distortion, Provenance, Rig, read_rig, rig_text
+from calib.runner.finishing import finish
+from calib.runner.fleet import BORROWED, Store, Table, column, opened_store, read_prior, texts
+from calib.runner.task import Answer, Manifest, Outcome, RigSpec
 
 pytest.importorskip("pyarrow")
 
@@ -49,7 +44,7 @@ def _rig(rng: np.random.Generator, name: str, fx_px: float | None = None, verdic
 
 @contextmanager
 def _fleet(out: Path, rigs: dict[str, Rig]) -> Iterator[tuple[Store, Manifest]]:
-    from calib.fleet.task import _values
+    from calib.runner.task import _values
 
     with opened_store(out, "calib fleet", ()) as (store, _):
         for name, rig in rigs.items():

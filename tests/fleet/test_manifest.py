@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calib.errors import BadInputError
-from calib.fleet.manifest import is_url, read_manifest, without_secrets
+from calib.core.errors import BadInputError
+from calib.runner.task import is_url, read_manifest, without_secrets
 
 
 def _csv(tmp_path: Path, text: str) -> Path:
@@ -99,7 +99,7 @@ def test_what_is_no_yaml_manifest(tmp_path: Path, text: str, said: str) -> None:
 
 @given(st.text(max_size=12))
 def test_a_name_that_is_taken_is_a_safe_folder(name: str) -> None:
-    from calib.fleet.manifest import _problem_of_name
+    from calib.runner.task import _problem_of_name
 
     if _problem_of_name(name) == "":
         path = Path("root") / name

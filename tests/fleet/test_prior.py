@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.arrays import FloatArray
-from calib.fleet.prior import Group, group_of, posterior
+from calib.core.arrays import FloatArray
+from calib.runner.fleet import Group, group_of, posterior
 
 ORDER = ("a", "b", "c")
 MU = np.array([273.0, 160.0, -0.22])

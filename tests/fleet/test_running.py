@@ -9,13 +9,11 @@ from pathlib import Path
 import pytest
 from fleet_clusters import in_threads
 
-from calib.fleet import running, worker
-from calib.fleet.cluster import Cluster
-from calib.fleet.manifest import Manifest, RigSpec
-from calib.fleet.outcome import Outcome
-from calib.fleet.running import run_fleet
-from calib.fleet.store import opened_store
-from calib.fleet.task import Answer, FleetOptions, program
+from calib.runner import engine as worker
+from calib.runner import fleet as running
+from calib.runner.engine import Cluster
+from calib.runner.fleet import opened_store, run_fleet
+from calib.runner.task import Answer, FleetOptions, Manifest, Outcome, RigSpec, program
 
 pytest.importorskip("distributed")
 

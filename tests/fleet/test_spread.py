@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calib.fleet.spread import limit_of, robust_z, spread_of
+from calib.runner.fleet import limit_of, robust_z, spread_of
 
 
 def test_own_sigma_takes_its_part_of_the_spread_and_of_z() -> None:

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from calib.errors import BadInputError
-from calib.fleet.stages import kind_of, rig_folder, run_stages
-from calib.running.pool import Command, run_here
+from calib.core.errors import BadInputError
+from calib.runner.graph import Command, run_here
+from calib.runner.task import kind_of, rig_folder, run_stages
 
 
 def _verbs(tmp_path: Path, *commands: tuple[str, ...]) -> bytes:

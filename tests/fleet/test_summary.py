@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.fleet.outcome import Outcome
-from calib.fleet.rows import write_outcomes
-from calib.fleet.summary import FleetSummary, judged_names, summarise
+from calib.runner.fleet import FleetSummary, judged_names, summarise, write_outcomes
+from calib.runner.task import Outcome
 
 pytest.importorskip("pyarrow")
 

@@ -11,15 +11,12 @@ import numpy as np
 import pytest
 from fleet_clusters import in_threads
 
-from calib.fleet import sweeping, worker
-from calib.fleet.cluster import Cluster
-from calib.fleet.engine import Lost
-from calib.fleet.rows import Table, column, texts
-from calib.fleet.store import Store, opened_store
-from calib.fleet.sweeping import run_sweep, summarise_sweep
-from calib.fleet.sweepspec import Base, Case, SweepSpec
-from calib.fleet.sweeptask import CaseResult
-from calib.fleet.task import program
+from calib.runner import engine as worker
+from calib.runner import sweep as sweeping
+from calib.runner.engine import Cluster, Lost
+from calib.runner.fleet import Store, Table, column, opened_store, texts
+from calib.runner.sweep import Base, Case, CaseResult, SweepSpec, run_sweep, summarise_sweep
+from calib.runner.task import program
 
 pytest.importorskip("distributed")
 pytest.importorskip("pyarrow")

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.errors import BadInputError
-from calib.fleet.sweepspec import SweepSpec, cases, read_sweep
+from calib.core.errors import BadInputError
+from calib.runner.sweep import SweepSpec, cases, read_sweep
 
 _BASE = "base: {controller: pid, reference: jump}\n"
 

@@ -6,7 +6,7 @@ import random
 import sys
 from pathlib import Path
 
-MODULES = ("calib.log_bags", "calib.log_unpacking", "calib.log_messages", "calib.log_topics")
+MODULES = ("calib.io.bags", "calib.io.unpacking", "calib.io.bags", "calib.io.bags")
 
 MOST_BYTES = 12_000
 

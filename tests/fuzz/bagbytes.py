@@ -49,7 +49,7 @@ def check_bag(path: Path) -> None:
     """The rows of a bag are the same in blocks and as a whole, and all of them have a time."""
     import numpy as np
 
-    from calib.logs import iter_log, log_text, read_log
+    from calib.io.logs import iter_log, log_text, read_log
 
     log = read_log(path)
     assert np.isfinite(log.t_s).all() and len(log) > 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-MODULES = ("calib.boards", "calib.boundedyaml")
+MODULES = ("calib.stages.camera.read", "calib.core.bounded_yaml")
 
 WORDS = (
     b"corners:", b"square_m:", b"first_corner_m:", b"angle_rad:", b"first_corner_px:", b"[7, 5]", b"[7.0, 5]",
@@ -15,7 +15,7 @@ WORDS = (
 
 def check(data: bytes, folder: Path) -> None:
     """A board of sane numbers, or a refusal; the same board in two folders is one board."""
-    from calib.boards import board_of, read_board_file
+    from calib.stages.camera.read import board_of, read_board_file
 
     (folder / "other").mkdir(exist_ok=True)
     for place in (folder, folder / "other"):

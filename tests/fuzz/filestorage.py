@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-MODULES = ("calib.camera.filestorage", "calib.camera.formats", "calib.boundedyaml")
+MODULES = ("calib.stages.camera.formats", "calib.stages.camera.formats", "calib.core.bounded_yaml")
 
 WORDS = (
     b"%YAML:1.0\n---\n", b"!!opencv-matrix", b"camera_matrix:", b"distortion_coefficients:", b"image_width:",
@@ -26,9 +26,9 @@ def check(data: bytes, folder: Path) -> None:
     """A camera that can be written and read again, or a refusal."""
     import numpy as np
 
-    from calib.camera.formats import from_kalibr, from_opencv, from_ros, to_opencv
-    from calib.errors import BadInputError
-    from calib.files import as_text
+    from calib.core.errors import BadInputError
+    from calib.core.files import as_text
+    from calib.stages.camera.formats import from_kalibr, from_opencv, from_ros, to_opencv
 
     if len(data) > 200_000:
         return

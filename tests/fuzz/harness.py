@@ -36,7 +36,7 @@ from types import CodeType, FrameType, ModuleType
 from typing import Any
 
 import calib
-from calib.errors import BadInputError
+from calib.core.errors import BadInputError
 
 __all__ = ["CORPUS", "LONGEST_SENTENCE", "TARGETS", "corpus", "main", "only_inside", "run"]
 

@@ -7,8 +7,13 @@ import math
 import sys
 from pathlib import Path
 
-MODULES = ("calib.logs", "calib.pumptables", "calib.referencefile", "calib.firmware.check",
-           "calib.running.folder")  # fmt: skip
+MODULES = (
+    "calib.io.logs",
+    "calib.stages.actuator.read",
+    "calib.stages.control.read",
+    "calib.stages.firmware.check",
+    "calib.runner.folder",
+)
 
 WORDS = (
     b"t_s", b"u_px", b"v_px", b"ax_mps2", b"ay_mps2", b"gz_radps", b"pwm1", b"pwm2", b"true_phi_rad",
@@ -22,11 +27,11 @@ WORDS = (
 
 def check(data: bytes, folder: Path) -> None:
     """What is read is what Python's `float` makes of each cell, in blocks of any length."""
-    from calib.errors import BadInputError
-    from calib.firmware.check import read_frames
-    from calib.pumptables import read_pump_table
-    from calib.referencefile import _series
-    from calib.running.folder import read_folder
+    from calib.core.errors import BadInputError
+    from calib.runner.folder import read_folder
+    from calib.stages.actuator.read import read_pump_table
+    from calib.stages.control.read import _series
+    from calib.stages.firmware.check import read_frames
 
     (folder / "logs").mkdir(exist_ok=True)
     path = folder / "logs" / "log.csv"
@@ -44,9 +49,9 @@ def check(data: bytes, folder: Path) -> None:
 def _log(data: bytes, path: Path) -> None:
     import numpy as np
 
-    from calib import logs
-    from calib.errors import BadInputError
-    from calib.logs import log_text, read_log
+    from calib.core.errors import BadInputError
+    from calib.io import logs
+    from calib.io.logs import log_text, read_log
 
     try:
         log = read_log(path)

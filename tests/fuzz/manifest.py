@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-MODULES = ("calib.fleet.manifest",)
+MODULES = ("calib.runner.task",)
 
 WORDS = (
     b"name,path,serial", b"name", b"path", b"serial", b"corners", b"square", b"model", b"loss", b"board",
@@ -18,9 +18,9 @@ WORDS = (
 
 def check(data: bytes, folder: Path) -> None:
     """Rigs with names that are folders of their own in an output folder, or a refusal."""
-    from calib.errors import BadInputError
-    from calib.fleet.manifest import OPTIONS, is_url, read_manifest, serial_number
-    from calib.fleet.store import Store
+    from calib.core.errors import BadInputError
+    from calib.runner.fleet import Store
+    from calib.runner.task import OPTIONS, is_url, read_manifest, serial_number
 
     store, refusals = Store(folder / "out"), list[BadInputError]()
     for ending in ("csv", "yaml"):

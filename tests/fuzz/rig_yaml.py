@@ -10,8 +10,16 @@ from typing import Any
 
 import yaml
 
-MODULES = ("calib.rig", "calib.files", "calib.rigdiff", "calib.rigvalues", "calib.report.page_verdict",
-           "calib.firmware.known", "calib.firmware.header", "calib.running.sections")  # fmt: skip
+MODULES = (
+    "calib.core.rig",
+    "calib.core.files",
+    "calib.show.diff",
+    "calib.show.values",
+    "calib.show.page",
+    "calib.stages.firmware.constants",
+    "calib.stages.firmware.header",
+    "calib.runner.graph",
+)
 
 WORDS = (
     b"camera:", b"plane:", b"lens:", b"imu:", b"align:", b"lowpass:", b"orientation_filter:", b"controller:",
@@ -58,10 +66,10 @@ def _paths(value: Any, start: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 
 def check(data: bytes, folder: Path) -> None:
     """Whatever `read_rig` takes, all that read a rig can work with or refuse."""
-    from calib.errors import BadInputError
-    from calib.rig import read_rig, rig_text
-    from calib.running.sections import sections_of
-    from calib.sections import outdated
+    from calib.core.errors import BadInputError
+    from calib.core.rig import read_rig, rig_text
+    from calib.runner.graph import sections_of
+    from calib.stages.camera.results import outdated
 
     path, again = folder / "rig.yaml", folder / "again.yaml"
     path.write_bytes(data)
@@ -81,9 +89,9 @@ def check(data: bytes, folder: Path) -> None:
 
 
 def _sections(path: Path) -> None:
-    from calib.rig import read_rig
-    from calib.rig_actuator import Actuator, PumpSection, section_of
-    from calib.running.sections import sections_of
+    from calib.core.rig import read_rig
+    from calib.runner.graph import sections_of
+    from calib.stages.actuator.section import Actuator, PumpSection, section_of
 
     whole = read_rig(path)
     sections_of(path).text(path)
@@ -92,14 +100,14 @@ def _sections(path: Path) -> None:
 
 
 def _page(path: Path) -> None:
-    from calib.report.page import page_text
+    from calib.show.page import page_text
 
     text = page_text(path)
     assert "<script>alert" not in text
 
 
 def _difference(path: Path) -> None:
-    from calib.rigdiff import diff_rigs
+    from calib.show.diff import diff_rigs
 
     known = Path(__file__).resolve().parent / "corpus" / "rig_yaml" / "seed_camera.yaml"
     diff_rigs(path, known)
@@ -107,8 +115,8 @@ def _difference(path: Path) -> None:
 
 
 def _constants(path: Path) -> None:
-    from calib.firmware.header import header_of, header_text
-    from calib.rig import read_rig
+    from calib.core.rig import read_rig
+    from calib.stages.firmware.header import header_of, header_text
 
     whole = read_rig(path)
     if whole.camera is not None:
@@ -117,9 +125,9 @@ def _constants(path: Path) -> None:
 
 
 def _formats(path: Path) -> None:
-    from calib.camera.formats import from_opencv, from_ros, to_kalibr, to_opencv, to_ros
-    from calib.rig import read_rig
-    from calib.sections import camera_covariance, camera_from_section, current_plane
+    from calib.core.rig import read_rig
+    from calib.stages.camera.formats import from_opencv, from_ros, to_kalibr, to_opencv, to_ros
+    from calib.stages.camera.results import camera_covariance, camera_from_section, current_plane
 
     whole = read_rig(path)
     if whole.camera is None:

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from unittest import mock
 
-MODULES = ("calib.firmware.telemetry", "calib.firmware.recording")
+MODULES = ("calib.io.serial", "calib.io.serial")
 
 MOST_BYTES = 1000
 
@@ -24,7 +24,7 @@ WORDS = (
 
 def check(data: bytes, folder: Path) -> None:
     """Every byte is in a frame, skipped or waiting; how the reads fall changes nothing; the log is read."""
-    from calib.firmware import telemetry
+    from calib.io import serial as telemetry
 
     # The same numbers as `checksum`, a hundred times as fast.
     with mock.patch.object(telemetry, "checksum", lambda body: binascii.crc_hqx(body, 0xFFFF)):
@@ -32,11 +32,10 @@ def check(data: bytes, folder: Path) -> None:
 
 
 def _check(data: bytes, folder: Path) -> None:
-    from calib.errors import BadInputError
-    from calib.firmware.check import read_frames
-    from calib.firmware.recording import record
-    from calib.firmware.telemetry import Decoder, encoded
-    from calib.logs import read_log
+    from calib.core.errors import BadInputError
+    from calib.io.logs import read_log
+    from calib.io.serial import Decoder, encoded, record
+    from calib.stages.firmware.check import read_frames
 
     whole = Decoder()
     frames = list(whole.feed(data))

@@ -6,7 +6,7 @@ import sys
 from itertools import islice
 from pathlib import Path
 
-MODULES = ("calib.fleet.sweepspec", "calib.fleet.sweeptask")
+MODULES = ("calib.runner.sweep", "calib.runner.sweep")
 
 WORDS = (
     b"base:", b"grid:", b"draws:", b"measure:", b"near:", b"controller:", b"scenario:", b"filter: fused",
@@ -24,8 +24,7 @@ _LONGEST_S = 0.5
 
 def check(data: bytes, folder: Path) -> None:
     """Cases with parameters of their own, of which the first ends with measures or with a reason."""
-    from calib.fleet.sweepspec import cases, read_sweep
-    from calib.fleet.sweeptask import run_cases
+    from calib.runner.sweep import cases, read_sweep, run_cases
 
     path = folder / "sweep.yaml"
     path.write_bytes(data)

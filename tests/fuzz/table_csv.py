@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-MODULES = ("calib.tables", "calib.inputs")
+MODULES = ("calib.stages.camera.read", "calib.stages.camera.read")
 
 WORDS = (
     b"view", b"x_m", b"y_m", b"u_px", b"v_px", b"view,x_m,y_m,u_px,v_px", b",", b"\"a,b\"", b"#", b"1e5",
@@ -17,8 +17,7 @@ def check(data: bytes, folder: Path) -> None:
     """Views of finite numbers with four points at least, each once, inside the picture."""
     import numpy as np
 
-    from calib.inputs import Told, read_views
-    from calib.tables import read_table
+    from calib.stages.camera.read import Told, read_table, read_views
 
     path = folder / "points.csv"
     path.write_bytes(data)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-MODULES = ("calib.tables", "calib.inputs")
+MODULES = ("calib.stages.camera.read", "calib.stages.camera.read")
 
 WORDS = (
     b"# filename x y level", b"# filename x y weight", b"# x y filename", b"filename", b"level",
@@ -18,8 +18,7 @@ def check(data: bytes, folder: Path) -> None:
     """Views of at most the board's corners, all finite."""
     import numpy as np
 
-    from calib.inputs import Told, read_views
-    from calib.tables import read_vnl
+    from calib.stages.camera.read import Told, read_views, read_vnl
 
     path = folder / "corners.vnl"
     path.write_bytes(data)

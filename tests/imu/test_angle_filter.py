@@ -17,26 +17,50 @@ from scipy.io import loadmat
 from scipy.signal import freqz, lfilter
 from scipy.spatial.transform import Rotation
 
-from calib.actuator.kinematics import marker_from_head, pose_from_configuration
-from calib.camera.model import Camera, project
-from calib.imu.gains import DATA_SHEET, Noise, gain_facts, predicted_sigma, riccati
-from calib.imu.heldout import Row, compared, rms
-from calib.imu.mahony import Mahony, MahonySample, MahonyState, accelerometer_angle, step
-from calib.imu.mahony_batch import accelerometer_angles, filter_log, filter_many, wrapped
-from calib.imu.mahony_kalman import Prior, filter_from_prior
-from calib.imu.orientation import (
+from calib.stages.actuator.kinematics import marker_from_head, pose_from_configuration
+from calib.stages.camera.model import Camera, project
+from calib.stages.imu.mahony import (
+    Mahony,
+    MahonySample,
+    MahonyState,
+    accelerometer_angle,
+    accelerometer_angles,
+    filter_log,
+    filter_many,
+    step,
+    wrapped,
+)
+from calib.stages.imu.read import angle_from_marker, angle_from_pixels, lag_of
+from calib.stages.imu.tracks import (
+    PEERS,
     conjugate,
     heading_error,
+    in_plane,
     inclination_error,
+    missing,
+    planar_rate,
     product,
     rms_in_motion,
+    run_peer,
     total_error,
     up_in_sensor,
+    up_vector,
 )
-from calib.imu.peers import PEERS, missing, run_peer
-from calib.imu.rate import in_plane, planar_rate, up_vector
-from calib.imu.tuning import THREE, Piece, tune
-from calib.phi_reference import angle_from_marker, angle_from_pixels, lag_of
+from calib.stages.imu.tuning import (
+    DATA_SHEET,
+    THREE,
+    Noise,
+    Piece,
+    Prior,
+    Row,
+    compared,
+    filter_from_prior,
+    gain_facts,
+    predicted_sigma,
+    riccati,
+    rms,
+    tune,
+)
 
 DT = 0.01
 

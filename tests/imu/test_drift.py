@@ -12,13 +12,11 @@ import pytest
 from armlogs import swung
 from scipy.signal import lfilter
 
-from calib.imu.drift import LogDrift, Measures, analyse_drift
-from calib.imu.mahony import Mahony, MahonySample, MahonyState, step
-from calib.imu.mahony_batch import filter_log
-from calib.imu.measures import allan_at, lag_s, slope_of
-from calib.imu.sampling import Part
-from calib.imu.smoother import smooth_log
-from calib.imu.tracks import DriftLog, Tuned, on_grid, tracks_of
+from calib.stages.imu.drift import LogDrift, Measures, allan_at, analyse_drift, lag_s, slope_of
+from calib.stages.imu.mahony import Mahony, MahonySample, MahonyState, filter_log, step
+from calib.stages.imu.sampling import Part
+from calib.stages.imu.tracks import DriftLog, Tuned, on_grid, tracks_of
+from calib.stages.imu.tuning import smooth_log
 
 AXES = ("gx", "gy", "gz", "ax", "ay", "az")
 PERIOD = 0.01

@@ -16,25 +16,29 @@ from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 from scipy.special import stdtrit
 
-import calib.imu.intrinsics
-from calib.imu.accelerometer import (
+import calib.stages.imu.intrinsics
+from calib.core.rig import Rig, rig_text
+from calib.stages.imu.intrinsics import (
     ANGLES,
+    GYRO_ANGLES,
     Accelerometer,
+    IntrinsicsJudgement,
+    Turns,
     _residual_and_jacobian,
     corrected,
+    find_intrinsics,
     fit_accelerometer,
+    judge_intrinsics,
     misalignment,
+    misfit,
+    misfit_covariance,
+    protocol,
+    tangents,
+    turn_directions,
 )
-from calib.imu.gyroscope import GYRO_ANGLES
-from calib.imu.intrinsics import find_intrinsics
-from calib.imu.intrinsics_verdict import IntrinsicsJudgement, judge_intrinsics, protocol
-from calib.imu.rests import Rest, find_rests, quiet_level, spread
-from calib.imu.sampling import Part
-from calib.imu.turn_kernel import turn_directions
-from calib.imu.turns import Turns, misfit, misfit_covariance, tangents
-from calib.intrinsicsections import intrinsics_section
-from calib.rig import Rig, rig_text
-from calib.rig_imu_intrinsics import ImuIntrinsics
+from calib.stages.imu.results import intrinsics_section
+from calib.stages.imu.sampling import Part, Rest, find_rests, quiet_level, spread
+from calib.stages.imu.section import ImuIntrinsics
 
 SENSOR = Sensor()
 
@@ -284,7 +288,7 @@ def test_turns_about_one_axis_leave_the_others_unknown() -> None:
 def test_reported_deviations_are_those_of_many_repetitions_in_gyroscope(
     monkeypatch: pytest.MonkeyPatch, planar: bool
 ) -> None:
-    monkeypatch.setattr(calib.imu.intrinsics, "MULTIPLES", (4.0,))
+    monkeypatch.setattr(calib.stages.imu.intrinsics, "MULTIPLES", (4.0,))
     flat = replace(SENSOR, accel_angles=np.array([0.011, 0.0, 0.0]), gyro_angles=np.zeros(6))
     sensor = flat if planar else SENSOR
     poses = tilts(np.radians(np.arange(0, 720, 45))) if planar else sphere_poses(24)

@@ -11,18 +11,21 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calib.errors import BadInputError
-from calib.imu.allan import allan_variance, bounds, covariance_forms, degrees_of_freedom, design, spaced
-from calib.imu.allan_fit import analyse
-from calib.imu.rest import rest_parts
-from calib.imu.sampling import Part, regular_parts
-from calib.imu.static import AXES, RestLog, Static, analyse_static
-from calib.imu.static_verdict import judge
-from calib.imusections import imu_section, kalibr_imu
-from calib.kalibr_imu import from_kalibr_imu
-from calib.rig_imu import Imu as Imu_of_kalibr_imu
-from calib.twin.imu_sensor import Imu, draw_imu_noise, measure
-from calib.twin.sensors import HeadMotion
+from calib.core.errors import BadInputError
+from calib.stages.imu.allan import (
+    allan_variance,
+    analyse,
+    bounds,
+    covariance_forms,
+    degrees_of_freedom,
+    design,
+    spaced,
+)
+from calib.stages.imu.results import from_kalibr_imu, imu_section, kalibr_imu
+from calib.stages.imu.sampling import Part, regular_parts, rest_parts
+from calib.stages.imu.section import Imu as Imu_of_kalibr_imu
+from calib.stages.imu.static import AXES, RestLog, Static, analyse_static, judge
+from calib.twin.sensors import HeadMotion, Imu, draw_imu_noise, measure
 
 IMU = Imu(gyro_scale=(0.0, 0.0, 0.0), accel_scale=(0.0, 0.0, 0.0), mount_angle_rad=0.0)
 

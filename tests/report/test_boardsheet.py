@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
-from calib.errors import BadInputError
-from calib.report.boardsheet import PAGES_MM, board_pdf
+from calib.core.errors import BadInputError
+from calib.show.boardsheet import PAGES_MM, board_pdf
 
 DPI = 200
 PX_PER_MM = DPI / 25.4

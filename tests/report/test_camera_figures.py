@@ -9,14 +9,12 @@ import numpy as np
 import pytest
 from figure_checks import complaints, drawn_texts, kept
 
-from calib.camera.bundle import calibrate
-from calib.camera.covariance import covariance
-from calib.camera.intrinsics import Intrinsics
-from calib.camera.model import Camera
-from calib.camera.verdict import Judgement
-from calib.camera.views import View, pack
-from calib.report import camera_figures
-from calib.report.camera_figures import write_camera_figures
+from calib.stages.camera import plots as camera_figures
+from calib.stages.camera.bundle import calibrate, covariance
+from calib.stages.camera.intrinsics import Intrinsics
+from calib.stages.camera.model import Camera, View, pack
+from calib.stages.camera.plots import write_camera_figures
+from calib.stages.camera.verdict import Judgement
 from synthetic import CAMERA, views_of
 
 

@@ -9,12 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.quiver import Quiver
 
-from calib.report.fields import (
-    arrows,
-    contour_levels,
-    picture_frame,
-)
-from calib.report.style import look, sheet
+from calib.show.style import look, sheet
+from calib.stages.camera.plots import arrows, contour_levels, picture_frame
 
 finite = st.floats(1e-12, 1e12)
 

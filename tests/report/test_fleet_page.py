@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 from chromium import browser_or_skip
 
-from calib.fleet.borrowing import Borrowing
-from calib.fleet.outcome import Outcome
-from calib.fleet.rows import write_outcomes
-from calib.fleet.summary import FleetSummary, summarise
-from calib.report.fleet_page import PAGE, fleet_page_text, write_fleet_page
+from calib.runner.fleet import Borrowing, FleetSummary, summarise, write_outcomes
+from calib.runner.task import Outcome
+from calib.show.fleet import PAGE, fleet_page_text, write_fleet_page
 
 pytest.importorskip("pyarrow")
 

@@ -9,13 +9,11 @@ import numpy as np
 import pytest
 from figure_checks import complaints, drawn_texts, kept
 
-from calib.camera.bundle import calibrate
-from calib.camera.covariance import covariance
-from calib.camera.distortion import PlaneView, analyse_distortion
-from calib.camera.model import Camera
-from calib.camera.views import pack
-from calib.report import lens_figures
-from calib.report.lens_figures import _inverse_error, _radial, _radial_sigma, write_lens_figures
+from calib.stages.camera import plots as lens_figures
+from calib.stages.camera.bundle import calibrate, covariance
+from calib.stages.camera.lens import PlaneView, analyse_distortion
+from calib.stages.camera.model import Camera, pack
+from calib.stages.camera.plots import _inverse_error, _radial, _radial_sigma, write_lens_figures
 from synthetic import CAMERA, views_of
 
 BROWN = Camera(

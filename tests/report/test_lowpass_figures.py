@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from figure_checks import complaints, drawn_texts, kept
 
-from calib.logs import Log, write_log
-from calib.lowpass import Positions, lowpass_section, positions_from_log
-from calib.report import lowpass_figures
-from calib.report.lowpass_figures import write_lowpass_figures
-from calib.signals.design import Design, design_lowpass
+from calib.io.logs import Log, write_log
+from calib.stages.lowpass import plots as lowpass_figures
+from calib.stages.lowpass.filters import Design, design_lowpass
+from calib.stages.lowpass.plots import write_lowpass_figures
+from calib.stages.lowpass.stage import Positions, lowpass_section, positions_from_log
 
 WORKSPACE = (-0.06, 0.04, 0.06, 0.11)
 

@@ -13,9 +13,9 @@ from chromium import Browser, browser_or_skip
 from pages import EVIL, finished_run
 from PIL import Image
 
-from calib.errors import BadInputError
-from calib.report.page import _AIM_BYTES, MOST_BYTES, _Budget, _chosen, page_text, write_page
-from calib.running.cache import Result
+from calib.core.errors import BadInputError
+from calib.runner.cache import Result
+from calib.show.page import _AIM_BYTES, MOST_BYTES, _Budget, _chosen, page_text, write_page
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +100,7 @@ def test_sections_that_mean_nothing_are_refused_by_their_key(tmp_path: Path, tex
 
 
 def test_too_many_figures_are_named_instead(rig: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("calib.report.page.MOST_BYTES", 460_000)
+    monkeypatch.setattr("calib.show.page.MOST_BYTES", 460_000)
     text = page_text(rig)
     assert len(text.encode()) < 460_000
     assert "Left out to keep this page small" in text

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from calib.report.page_pictures import data_uri, keep_pictures, kept_picture, size_of, small_figure
+from calib.show.page import data_uri, keep_pictures, kept_picture, size_of, small_figure
 
 
 def _png(path: Path, width: int, height: int, seed: int = 0) -> Path:

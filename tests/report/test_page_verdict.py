@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from calib.report.page_verdict import decide
+from calib.show.page import decide
 
 
 def _job(stage: str, status: str = "ok", **more: Any) -> dict[str, Any]:

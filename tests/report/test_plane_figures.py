@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 from figure_checks import complaints, drawn_texts, kept
 
-from calib.arrays import FloatArray
-from calib.camera.levenberg import rotation_exp
-from calib.camera.model import Camera, project
-from calib.camera.plane import Plane, calibrate_plane
-from calib.camera.views import View
-from calib.report import plane_figures
-from calib.report.plane_figures import write_plane_figures
+from calib.core.arrays import FloatArray
+from calib.stages.camera import plots as plane_figures
+from calib.stages.camera.bundle import rotation_exp
+from calib.stages.camera.model import Camera, View, project
+from calib.stages.camera.plane import Plane, calibrate_plane
+from calib.stages.camera.plots import write_plane_figures
 from synthetic import CAMERA
 
 WORKSPACE = (-0.06, 0.04, 0.06, 0.11)

@@ -9,7 +9,7 @@ from hashlib import sha256
 import jinja2
 import pytest
 
-from calib.report.rendering import _resource, render
+from calib.show.page import _resource, render
 
 
 def test_the_policy_is_that_of_the_script() -> None:

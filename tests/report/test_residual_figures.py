@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 from figure_checks import drawn_texts
 
-from calib.camera.bundle import Calibration, calibrate
-from calib.camera.views import pack
-from calib.report.residual_figures import _cell_means, residual_figure
-from calib.report.style import look
+from calib.show.style import look
+from calib.stages.camera.bundle import Calibration, calibrate
+from calib.stages.camera.model import pack
+from calib.stages.camera.plots import _cell_means, residual_figure
 from synthetic import views_of
 
 FIT = calibrate(pack(views_of(12, noise_px=0.1)), (640, 480), "radial2")

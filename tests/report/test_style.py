@@ -8,13 +8,7 @@ from figure_checks import complaints
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calib.report.style import (
-    look,
-    number,
-    plain,
-    round_down,
-    sheet,
-)
+from calib.show.style import look, number, plain, round_down, sheet
 
 
 @given(st.text(st.characters(codec=None), max_size=60), st.integers(8, 40))

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import re
 
-from calib.fleet.sweeping import Point, SweepSummary
-from calib.fleet.sweepspec import Base, SweepSpec
-from calib.report.sweep_page import sweep_page_text
+from calib.runner.sweep import Base, Point, SweepSpec, SweepSummary
+from calib.show.fleet import sweep_page_text
 
 _SPEC = SweepSpec(
     Base("controller", "pid", "jump", "", "truth", None, "auto"),

@@ -20,13 +20,12 @@ import pytest
 import yaml
 from running_trials import make_folder, run_small
 
-from calib.errors import BadInputError
-from calib.files import write_atomically
-from calib.report.page import write_page
-from calib.report.page_pictures import keep_pictures
-from calib.running.folder import read_folder
-from calib.running.lock import held
-from calib.running.runner import HIDDEN
+from calib.core.errors import BadInputError
+from calib.core.files import write_atomically
+from calib.runner.cache import held
+from calib.runner.folder import read_folder
+from calib.runner.graph import HIDDEN
+from calib.show.page import keep_pictures, write_page
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="forking is POSIX's")
 

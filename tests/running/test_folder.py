@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from running_trials import make_folder, run_small
 
-from calib.errors import BadInputError
-from calib.running.folder import read_folder, with_topics
+from calib.core.errors import BadInputError
+from calib.runner.folder import read_folder, with_topics
 
 
 def test_kinds_of_logs_and_their_columns(tmp_path: Path) -> None:

@@ -11,9 +11,9 @@ import pytest
 import yaml
 from running_trials import CALLS, Inline, make_folder, run_small
 
-from calib.errors import BadInputError
-from calib.running.outputs import exit_code
-from calib.running.runner import HIDDEN, Done, opened
+from calib.core.errors import BadInputError
+from calib.runner.graph import HIDDEN, Done, opened
+from calib.runner.outputs import exit_code
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="killing is POSIX's")
 

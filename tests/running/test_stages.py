@@ -6,9 +6,9 @@ from pathlib import Path
 
 from running_trials import make_folder
 
-from calib.rig import SECTIONS
-from calib.running.folder import read_folder
-from calib.running.stages import STAGES, jobs_of
+from calib.core.rig import SECTIONS
+from calib.runner.folder import read_folder
+from calib.runner.graph import STAGES, jobs_of
 
 
 def test_every_stage_comes_after_what_it_reads() -> None:

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 from pages import finished_run
 
-from calib.report.page import page_text
-from calib.running.summaryfile import read_summary
+from calib.runner.outputs import read_summary
+from calib.show.page import page_text
 
 WRONG: tuple[Any, ...] = (None, 0, 1.5, True, "", "<script>alert(1)</script>", [], {}, [1], ["a"], {"a": 1})
 

@@ -12,9 +12,16 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 from scipy.signal import bessel, butter, sosfreqz
 
-from calib.errors import BadInputError
-from calib.signals.design import FAMILIES, Design, analogue_poles, design_lowpass, digital_poles
-from calib.signals.lowpass import LowPass, coefficients
+from calib.core.errors import BadInputError
+from calib.stages.lowpass.filters import (
+    FAMILIES,
+    Design,
+    LowPass,
+    analogue_poles,
+    coefficients,
+    design_lowpass,
+    digital_poles,
+)
 
 FREQUENCIES = np.array([0.0, 0.1, 0.7, 1.0, 3.0, 11.0, 29.0])
 

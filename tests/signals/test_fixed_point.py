@@ -7,8 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from calib.signals.design import FAMILIES, Design, design_lowpass
-from calib.signals.fixed_point import dead_band_binary32, fixed_point
+from calib.stages.lowpass.filters import FAMILIES, Design, dead_band_binary32, design_lowpass, fixed_point
 
 
 @pytest.mark.parametrize("family", FAMILIES)

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import butter, group_delay, lfilter
 
-from calib.errors import BadInputError
-from calib.signals.lowpass import LowPass, LowPassState, coefficients, settled, step
+from calib.core.errors import BadInputError
+from calib.stages.lowpass.filters import LowPass, LowPassState, coefficients, settled, step
 
 
 @given(st.floats(0.01, 29.0))

@@ -6,17 +6,21 @@ import numpy as np
 import pytest
 from scipy.signal import group_delay, sos2tf, sosfilt, sosfilt_zi, sosfreqz
 
-from calib.signals.design import FAMILIES, Design, design_lowpass
-from calib.signals.lowpass import LowPass, settled, step
-from calib.signals.response import (
+from calib.stages.lowpass.filters import (
+    FAMILIES,
+    Design,
+    LowPass,
     cutoff_hz,
     dc_delay_s,
     decibels,
+    design_lowpass,
     filter_signal,
     frequency_response,
     group_delay_s,
     noise_gain,
+    settled,
     settled_state,
+    step,
     step_response,
 )
 

@@ -7,14 +7,23 @@ import math
 import numpy as np
 import pytest
 
-from calib.errors import BadInputError
-from calib.signals.design import Design, design_lowpass
-from calib.signals.response import dc_delay_s, filter_signal, noise_gain
-from calib.signals.spectrum import grid_step, jitter_after, motion_lost, quantisation_hz, spectrum
-from calib.signals.ticks import on_ticks
-from calib.twin.camera_sensor import marker_pixels
+from calib.core.errors import BadInputError
+from calib.stages.lowpass.filters import (
+    Design,
+    dc_delay_s,
+    design_lowpass,
+    filter_signal,
+    grid_step,
+    jitter_after,
+    motion_lost,
+    noise_gain,
+    on_ticks,
+    quantisation_hz,
+    spectrum,
+)
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
+from calib.twin.sensors import marker_pixels
 from calib.twin.simulate import log_of
 
 FIRST = design_lowpass(Design()).sections

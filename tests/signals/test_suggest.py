@@ -7,11 +7,17 @@ import math
 import numpy as np
 import pytest
 
-from calib.errors import BadInputError
-from calib.signals.design import FAMILIES, Design, design_lowpass
-from calib.signals.response import dc_delay_s, filter_signal
-from calib.signals.spectrum import jitter_after, spectrum
-from calib.signals.suggest import suggest
+from calib.core.errors import BadInputError
+from calib.stages.lowpass.filters import (
+    FAMILIES,
+    Design,
+    dc_delay_s,
+    design_lowpass,
+    filter_signal,
+    jitter_after,
+    spectrum,
+    suggest,
+)
 
 T = np.arange(6000) / 60.0
 NOISE = 0.5 * np.random.default_rng(2).normal(size=6000)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.errors import BadInputError
-from calib.signals.ticks import on_ticks, sampling_rate_hz
+from calib.core.errors import BadInputError
+from calib.stages.lowpass.filters import on_ticks, sampling_rate_hz
 
 T = np.arange(600) / 60.0
 X = np.stack([np.arange(600.0), -np.arange(600.0)], axis=1)

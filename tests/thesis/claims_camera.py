@@ -6,12 +6,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from calib.actuator.kinematics import head_from_marker, marker_from_head, transform
-from calib.arrays import FloatArray
-from calib.camera.bundle import calibrate
-from calib.camera.model import distort, undistort
-from calib.camera.undistortion import fit_inverse, pixel_grid
-from calib.camera.views import View, pack
+from calib.core.arrays import FloatArray
+from calib.stages.actuator.kinematics import head_from_marker, marker_from_head, transform
+from calib.stages.camera.bundle import calibrate
+from calib.stages.camera.lens import fit_inverse, pixel_grid
+from calib.stages.camera.model import View, distort, pack, undistort
 from calib.twin.pictures import BOARD, CAMERA, PLANE, shots
 from calib.twin.scene import PrintedBoard, corner_pixels
 from thesis.outcome import Finding, Outcome, claim, exactly

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.actuator.pump import PWM_MAX, PolynomialForce, Pump, RateLimit
-from calib.control.pid import Pid, PidState, step
+from calib.stages.actuator.pump import PWM_MAX, PolynomialForce, Pump, RateLimit
+from calib.stages.control.laws import Pid, PidState, step
 from calib.twin.rig import SimulatedRig
 from thesis.outcome import Finding, claim, exactly, near, on_twin
 from thesis.runs import PRINTED_K_BND, PRINTED_RATE, nominal, printed_plant, tried

@@ -7,15 +7,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from calib.actuator.dynamics import (
-    coriolis_matrix,
-    kinetic_energy_J,
-    linearised,
-    mass_matrix,
-)
-from calib.actuator.kinematics import forward, forward_jacobian
-from calib.actuator.parameters import Plant
-from calib.arrays import FloatArray
+from calib.core.arrays import FloatArray
+from calib.stages.actuator.dynamics import coriolis_matrix, kinetic_energy_J, linearised, mass_matrix
+from calib.stages.actuator.kinematics import forward, forward_jacobian
+from calib.stages.actuator.parameters import Plant
 from thesis.outcome import Finding, Outcome, claim, exactly
 from thesis.runs import first_model, nominal, tried
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.actuator.kinematics import forward
-from calib.signals.design import Design, design_lowpass
-from calib.signals.response import dc_delay_s, filter_signal, frequency_response
+from calib.stages.actuator.kinematics import forward
+from calib.stages.lowpass.filters import Design, dc_delay_s, design_lowpass, filter_signal, frequency_response
 from thesis.outcome import Finding, claim, on_twin
 from thesis.runs import tried
 

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from calib.actuator.parameters import PRINTED_CREEP, growth_rate_per_s
-from calib.actuator.pump import PWM_MAX, PolynomialForce
+from calib.stages.actuator.parameters import PRINTED_CREEP, growth_rate_per_s
+from calib.stages.actuator.pump import PWM_MAX, PolynomialForce
 from thesis.claims_dynamics import lateral_damping, model_errors
 from thesis.outcome import Finding, claim, exactly
 from thesis.runs import (

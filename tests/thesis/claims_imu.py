@@ -8,9 +8,8 @@ from functools import lru_cache
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from calib.arrays import FloatArray
-from calib.imu.mahony import Mahony, MahonySample, MahonyState, step
-from calib.imu.mahony_batch import accelerometer_angles, filter_log
+from calib.core.arrays import FloatArray
+from calib.stages.imu.mahony import Mahony, MahonySample, MahonyState, accelerometer_angles, filter_log, step
 from calib.twin.simulate import Run
 from thesis.outcome import Finding, Outcome, claim, exactly
 from thesis.runs import tried

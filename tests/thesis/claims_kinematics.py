@@ -6,15 +6,18 @@ from fractions import Fraction
 
 import numpy as np
 
-from calib.actuator.kinematics import forward, inverse, pose_from_configuration, transform
-from calib.actuator.series import (
+from calib.core.arrays import FloatArray
+from calib.stages.actuator.kinematics import (
     H13_ORDER,
     H13_error_m,
     H23_error_m,
     f_error,
+    forward,
+    inverse,
     inverse_coefficients,
+    pose_from_configuration,
+    transform,
 )
-from calib.arrays import FloatArray
 from thesis.outcome import Finding, Outcome, claim, exactly
 
 __all__ = ["CLAIMS"]

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.actuator.pump import PWM_MAX, ElongationForce, PolynomialForce, static_force_N
-from calib.twin.experiment import elongation_mm
+from calib.stages.actuator.pump import PWM_MAX, ElongationForce, PolynomialForce, static_force_N
+from calib.twin.scenarios import elongation_mm
 from thesis.outcome import Finding, Outcome, claim, exactly, near, on_twin
 from thesis.runs import PRINTED_RATE, nominal, printed_plant, tried, with_plant, with_pump
 

@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
-from calib.actuator.kinematics import forward, inverse
-from calib.actuator.pump import ElongationForce
-from calib.control.feedforward import FeedForward, feed_forward
-from calib.control.setpoints import Ellipse, PolynomialElongation
+from calib.stages.actuator.kinematics import forward, inverse
+from calib.stages.actuator.pump import ElongationForce
+from calib.stages.control.laws import FeedForward, feed_forward
+from calib.stages.control.references import Ellipse, PolynomialElongation
 from thesis.outcome import Finding, claim, exactly, near, on_twin
 from thesis.runs import PRINTED_C_DMP, nominal, tried, with_plant
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from calib.arrays import FloatArray
+from calib.core.arrays import FloatArray
 
 __all__ = ["KINDS", "Band", "Box", "Curve", "Diagram", "Drawn", "Plot", "Wire", "drawn"]
 

@@ -11,13 +11,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from calib.actuator.pump import PWM_MAX
-from calib.arrays import FloatArray
-from calib.control.loop import LoopState, OrientationControl, step_orientation
-from calib.control.pid import PWM_MIN, Pid
-from calib.control.setpoints import AngleSteps
-from calib.twin.measures import StepResponse, step_response
-from calib.twin.scenarios import make_scenario, run_scenario
+from calib.core.arrays import FloatArray
+from calib.stages.actuator.pump import PWM_MAX
+from calib.stages.control.laws import PWM_MIN, LoopState, OrientationControl, Pid, step_orientation
+from calib.stages.control.references import AngleSteps
+from calib.twin.scenarios import StepResponse, make_scenario, run_scenario, step_response
 from calib.twin.simulate import Run
 from thesis.drawn import Band, Curve, Plot, drawn
 from thesis.runs import nominal

@@ -10,15 +10,12 @@ from functools import lru_cache
 
 import numpy as np
 
-from calib.actuator.kinematics import forward
-from calib.arrays import FloatArray
-from calib.control.feedforward import FeedForward
-from calib.control.loop import LoopState, PositionControl, step_position
-from calib.control.pid import Pid
-from calib.control.setpoints import Ellipse
-from calib.twin.experiment import at_rest
-from calib.twin.feedback import Seen
-from calib.twin.simulate import Run, simulate
+from calib.core.arrays import FloatArray
+from calib.stages.actuator.kinematics import forward
+from calib.stages.control.laws import FeedForward, LoopState, Pid, PositionControl, step_position
+from calib.stages.control.references import Ellipse
+from calib.twin.scenarios import at_rest
+from calib.twin.simulate import Run, Seen, simulate
 from thesis.drawn import Band, Curve, Plot, drawn
 from thesis.drawn_lengths import unlike_rig
 from thesis.runs import nominal

@@ -10,10 +10,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from calib.actuator.pump import ElongationForce
-from calib.arrays import FloatArray
-from calib.control.feedforward import FeedForward, feed_forward
-from calib.control.setpoints import PolynomialElongation
+from calib.core.arrays import FloatArray
+from calib.stages.actuator.pump import ElongationForce
+from calib.stages.control.laws import FeedForward, feed_forward
+from calib.stages.control.references import PolynomialElongation
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.simulate import Run

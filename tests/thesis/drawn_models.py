@@ -6,10 +6,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from calib.actuator.dynamics import kinetic_energy_J
-from calib.actuator.identify_stiffness import StiffnessFit, fit_stiffness
-from calib.actuator.series import H13_error_m, f_error, f_series
-from calib.arrays import FloatArray
+from calib.core.arrays import FloatArray
+from calib.stages.actuator.dynamics import kinetic_energy_J
+from calib.stages.actuator.identify import StiffnessFit, fit_stiffness
+from calib.stages.actuator.kinematics import H13_error_m, f_error, f_series
 from thesis.drawn import Curve, Plot, drawn
 from thesis.runs import nominal, tried
 

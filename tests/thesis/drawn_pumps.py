@@ -8,11 +8,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from calib.actuator.kernel import STATE
-from calib.actuator.pump import Orifice
-from calib.arrays import FloatArray
-from calib.twin.experiment import at_rest, elongation_mm, tick_times
-from calib.twin.measures import fall_time_s
+from calib.core.arrays import FloatArray
+from calib.stages.actuator.pump import Orifice
+from calib.stages.actuator.simulate import STATE
+from calib.twin.scenarios import at_rest, elongation_mm, fall_time_s, tick_times
 from calib.twin.simulate import Run, simulate
 from thesis.drawn import Band, Curve, Plot, drawn
 from thesis.drawn_sensors import seen_elongation_mm

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.actuator.pump import PWM_MAX
-from calib.control.feedforward import FeedForward, feed_forward
-from calib.control.pid import Pid
+from calib.stages.actuator.pump import PWM_MAX
+from calib.stages.control.laws import FeedForward, Pid, feed_forward
 from thesis.drawn import Box, Diagram, Wire, drawn
 from thesis.drawn_angle import WANTED_RAD, angle_run, unsaturated
 from thesis.drawn_ellipse import ellipse_run, seen_lengths, wanted_ellipse

@@ -8,14 +8,12 @@ from functools import lru_cache
 import numpy as np
 from scipy.ndimage import median_filter
 
-from calib.actuator.pump import ElongationForce
-from calib.arrays import FloatArray
-from calib.imu.mahony import Mahony
-from calib.imu.mahony_batch import accelerometer_angles, filter_log
-from calib.signals.design import Design, design_lowpass
-from calib.signals.response import dc_delay_s, filter_signal
-from calib.twin.experiment import elongation_mm
+from calib.core.arrays import FloatArray
+from calib.stages.actuator.pump import ElongationForce
+from calib.stages.imu.mahony import Mahony, accelerometer_angles, filter_log
+from calib.stages.lowpass.filters import Design, dc_delay_s, design_lowpass, filter_signal
 from calib.twin.rig import workspace_homography
+from calib.twin.scenarios import elongation_mm
 from calib.twin.simulate import Run
 from thesis.drawn import Curve, Plot, drawn
 from thesis.runs import tried

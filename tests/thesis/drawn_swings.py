@@ -12,12 +12,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from calib.actuator.identify_decrement import Decrement, decrement
-from calib.actuator.identify_fit import Solution, fit_tracks
-from calib.actuator.identify_parameters import Nominal, made
-from calib.actuator.identify_tracks import Track
-from calib.actuator.parameters import Creep
-from calib.arrays import FloatArray
+from calib.core.arrays import FloatArray
+from calib.stages.actuator.identify import Decrement, Nominal, Solution, Track, decrement, fit_tracks, made
+from calib.stages.actuator.parameters import Creep
 from calib.twin.rig import SimulatedRig
 from calib.twin.sensors import normal, stream
 from calib.twin.simulate import Run

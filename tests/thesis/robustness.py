@@ -11,9 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.actuator.parameters import Creep, Stiffness
-from calib.actuator.pump import ElongationForce, RateLimit
-from calib.errors import BadInputError
+from calib.core.errors import BadInputError
+from calib.stages.actuator.parameters import Creep, Stiffness
+from calib.stages.actuator.pump import ElongationForce, RateLimit
 from calib.twin.rig import SimulatedRig
 from thesis import claims_dynamics, runs
 from thesis.book import BOOK

@@ -7,11 +7,10 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
-from calib.actuator.parameters import PRINTED_CREEP, Creep, Plant, UnstablePlantWarning
-from calib.actuator.pump import Pump, RateLimit
-from calib.twin.experiment import Figures
+from calib.stages.actuator.parameters import PRINTED_CREEP, Creep, Plant, UnstablePlantWarning
+from calib.stages.actuator.pump import Pump, RateLimit
 from calib.twin.rig import SimulatedRig
-from calib.twin.scenarios import make_scenario, run_scenario
+from calib.twin.scenarios import Figures, make_scenario, run_scenario
 from calib.twin.simulate import Run
 
 __all__ = [

@@ -16,8 +16,8 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyBboxPatch
 
-from calib.files import write_atomically
-from calib.report.style import (
+from calib.core.files import write_atomically
+from calib.show.style import (
     BLUE,
     GREEN,
     GREY,

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from calib.files import write_atomically
+from calib.core.files import write_atomically
 
 __all__ = ["Entry", "write_index"]
 

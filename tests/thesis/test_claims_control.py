@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from calib.control.pid import PidState
+from calib.stages.control.laws import PidState
 from thesis import claims_control
 from thesis.outcome import Outcome
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from calib.actuator.dynamics import mass_matrix
-from calib.actuator.parameters import Plant
+from calib.stages.actuator.dynamics import mass_matrix
+from calib.stages.actuator.parameters import Plant
 from thesis import claims_dynamics
 from thesis.claims_dynamics import lateral_damping, model_errors
 from thesis.outcome import Outcome

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from calib.actuator.parameters import Plant
+from calib.stages.actuator.parameters import Plant
 from thesis import claims_fit
 from thesis.outcome import Outcome
 

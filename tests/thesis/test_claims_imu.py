@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from calib.imu.mahony import MahonyState
+from calib.stages.imu.mahony import MahonyState
 from thesis import claims_imu
 
 

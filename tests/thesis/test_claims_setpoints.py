@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from calib.control.feedforward import FeedForward
+from calib.stages.control.laws import FeedForward
 from thesis import claims_setpoints
 from thesis.outcome import Outcome
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.control.pid import Pid
+from calib.stages.control.laws import Pid
 from thesis.drawn import Drawn, Plot
 from thesis.drawn_angle import (
     GAINS,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.actuator.pump import ElongationForce
+from calib.stages.actuator.pump import ElongationForce
 from thesis.drawn import Drawn, Plot
 from thesis.drawn_pumps import (
     bent_runs,

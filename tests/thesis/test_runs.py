@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.actuator.parameters import PRINTED_CREEP, growth_rate_per_s
-from calib.actuator.pump import RateLimit
+from calib.stages.actuator.parameters import PRINTED_CREEP, growth_rate_per_s
+from calib.stages.actuator.pump import RateLimit
 from calib.twin.rig import SimulatedRig
 from thesis.runs import PRINTED_K_BND, first_model, nominal, printed_plant, tried, with_plant, with_pump
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from figure_checks import complaints, drawn_texts
 
-from calib.errors import BadInputError
-from calib.report.style import look
+from calib.core.errors import BadInputError
+from calib.show.style import look
 from thesis.album import ALBUM
 from thesis.drawn import Drawn, Plot
 from thesis.source_figures import source_figure, write_source_figures

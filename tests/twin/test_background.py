@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from calib.twin.background import clutter, gaussian_noise, uniform
+from calib.twin.sensors import clutter, gaussian_noise, uniform
 
 
 def test_noise_is_standard_normal() -> None:

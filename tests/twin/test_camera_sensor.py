@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from calib.actuator.kinematics import forward
-from calib.errors import BadInputError
-from calib.twin.camera_sensor import Tracker, draw_tracker_noise, marker_pixels, track
+from calib.core.errors import BadInputError
+from calib.stages.actuator.kinematics import forward
 from calib.twin.rig import nominal_view
+from calib.twin.sensors import Tracker, draw_tracker_noise, marker_pixels, track
 
 VIEW, RADIUS_M = nominal_view(), 0.0126
 CLEAN = Tracker(latency_s=0.0, jitter_px=0.0, grid_px=0.0, outliers=0.0, dropouts=0.0, stamp_jitter_s=0.0)

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.signal import butter, lfilter, lfilter_zi
 
-from calib.actuator.series import inverse_series
-from calib.camera.homography import apply_homography
-from calib.control.setpoints import Ellipse
-from calib.twin.camera_sensor import Tracker, marker_pixels
-from calib.twin.feedback import Firmware, FirmwareState, add_frame, add_imu
+from calib.core.geometry import apply_homography
+from calib.stages.actuator.kinematics import inverse_series
+from calib.stages.control.references import Ellipse
 from calib.twin.rig import nominal_view, workspace_homography
+from calib.twin.sensors import Tracker, marker_pixels
+from calib.twin.simulate import Firmware, FirmwareState, add_frame, add_imu
 
 RADIUS_M, D_M = 0.0126, 0.015
 H = workspace_homography(nominal_view())

@@ -9,12 +9,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib.actuator.dynamics import coefficients
-from calib.actuator.integrate import state_row, swing
-from calib.actuator.parameters import free_swing
-from calib.errors import BadInputError
-from calib.twin.imu_sensor import Imu, ImuNoise, draw_imu_noise, measure, onchip_angle_rad
-from calib.twin.sensors import HeadMotion, head_motion
+from calib.core.errors import BadInputError
+from calib.stages.actuator.dynamics import coefficients
+from calib.stages.actuator.parameters import free_swing
+from calib.stages.actuator.simulate import state_row, swing
+from calib.twin.sensors import (
+    HeadMotion,
+    Imu,
+    ImuNoise,
+    draw_imu_noise,
+    head_motion,
+    measure,
+    onchip_angle_rad,
+)
 
 ZERO = (0.0, 0.0, 0.0)
 CLEAN = Imu(

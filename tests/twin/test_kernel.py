@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calib.actuator.integrate import state_row, swing
-from calib.actuator.kinematics import forward, forward_jacobian, forward_jacobian_rate
-from calib.actuator.parameters import free_swing
-from calib.twin.kernel import MOTION, head_rows, states_between
+from calib.stages.actuator.kinematics import forward, forward_jacobian, forward_jacobian_rate
+from calib.stages.actuator.parameters import free_swing
+from calib.stages.actuator.simulate import state_row, swing
+from calib.twin.sensors import MOTION, head_rows, states_between
 
 RADIUS_M = 0.0126
 NODE_S = 1.0 / 300.0

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from calib.errors import BadInputError
-from calib.twin.measures import fall_time_s, step_response, swing_decay
+from calib.core.errors import BadInputError
+from calib.twin.scenarios import fall_time_s, step_response, swing_decay
 
 T = 1e-3 * np.arange(5001)
 

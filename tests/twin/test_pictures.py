@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calib.camera.model import distort, project, undistort
-from calib.twin.background import clutter, gaussian_noise
+from calib.stages.camera.model import distort, project, undistort
 from calib.twin.pictures import (
     BOARD,
     CAMERA,
@@ -24,6 +23,7 @@ from calib.twin.pictures import (
     write_pictures,
 )
 from calib.twin.scene import PrintedBoard, corner_pixels, expose
+from calib.twin.sensors import clutter, gaussian_noise
 
 PRINTED = PrintedBoard(BOARD)
 

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.actuator.pump import Orifice, RateLimit, static_force_N
-from calib.camera.homography import apply_homography
-from calib.camera.model import Camera, project
-from calib.errors import BadInputError
-from calib.rig import read_rig
-from calib.sections import camera_from_section
-from calib.twin.camera_sensor import View
+from calib.core.errors import BadInputError
+from calib.core.geometry import apply_homography
+from calib.core.rig import read_rig
+from calib.stages.actuator.pump import Orifice, RateLimit, static_force_N
+from calib.stages.camera.model import Camera, project
+from calib.stages.camera.results import camera_from_section
 from calib.twin.rig import SimulatedRig, nominal_view, rig_from_file, workspace_homography
+from calib.twin.sensors import View
 
 
 @pytest.fixture

@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.boards import read_board_file
-from calib.camera.model import Camera, project
-from calib.errors import BadInputError
-from calib.logs import check_time, read_log
-from calib.pictures import list_pictures
-from calib.twin.camera_sensor import View
+from calib.core.errors import BadInputError
+from calib.io.logs import check_time, read_log
+from calib.io.pictures import list_pictures
+from calib.stages.camera.model import Camera, project
+from calib.stages.camera.read import read_board_file
+from calib.twin.folder import LOGS, write_rig_folder
 from calib.twin.rig import SimulatedRig, nominal_view
-from calib.twin.rig_folder import LOGS, write_rig_folder
+from calib.twin.sensors import View
 
 RIG = SimulatedRig()
 
@@ -61,7 +61,7 @@ def test_the_folder_holds_pictures_plane_and_logs(tmp_path: Path, project_root: 
 
 @pytest.mark.slow
 def test_another_cameras_pictures_show_the_board_where_it_says(tmp_path: Path) -> None:
-    from calib.boards import find_boards
+    from calib.stages.camera.read import find_boards
 
     nominal = nominal_view()
     camera = Camera(

@@ -10,16 +10,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.actuator.integrate import rig_at_rest
-from calib.control.loop import LoopState
-from calib.control.pid import Pid, PidState, saturate, step
-from calib.errors import BadInputError, UsageError
-from calib.logs import log_text
-from calib.twin.experiment import Figures
-from calib.twin.feedback import Seen
+from calib.core.errors import BadInputError, UsageError
+from calib.io.logs import log_text
+from calib.stages.actuator.simulate import rig_at_rest
+from calib.stages.control.laws import LoopState, Pid, PidState, saturate, step
 from calib.twin.rig import SimulatedRig
-from calib.twin.scenarios import SCENARIOS, make_scenario, run_scenario
-from calib.twin.simulate import Run, log_of, simulate
+from calib.twin.scenarios import SCENARIOS, Figures, make_scenario, run_scenario
+from calib.twin.simulate import Run, Seen, log_of, simulate
 
 RIG = SimulatedRig()
 WITHIN = 0.05

@@ -11,9 +11,8 @@ from scipy.ndimage import map_coordinates, spline_filter
 from scipy.optimize import least_squares
 from scipy.special import erf
 
-from calib.camera.board import Board
-from calib.camera.model import Camera
-from calib.errors import BadInputError
+from calib.core.errors import BadInputError
+from calib.stages.camera.model import Board, Camera
 from calib.twin.scene import (
     Light,
     Pose,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.actuator.dynamics import coefficients
-from calib.actuator.integrate import state_row, swing
-from calib.actuator.parameters import free_swing
+from calib.stages.actuator.dynamics import coefficients
+from calib.stages.actuator.parameters import free_swing
+from calib.stages.actuator.simulate import state_row, swing
 from calib.twin.sensors import Trajectory, head_motion, normal, stamps, stream
 
 

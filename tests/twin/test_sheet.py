@@ -7,10 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from calib.camera.board import Board
-from calib.camera.model import Camera, project, undistort
-from calib.errors import BadInputError
-from calib.twin.sheet import (
+from calib.core.errors import BadInputError
+from calib.stages.camera.model import Board, Camera, project, undistort
+from calib.twin.scene import (
     Pose,
     PrintedBoard,
     board_coordinates,

@@ -8,18 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.actuator import integrate
-from calib.actuator.integrate import rig_at_rest
-from calib.actuator.kinematics import forward
-from calib.actuator.parameters import Plant, Stiffness
-from calib.control.loop import LoopState
-from calib.errors import BadInputError
-from calib.logs import COLUMNS, log_text
-from calib.twin.camera_sensor import Tracker, marker_pixels
-from calib.twin.feedback import Seen
-from calib.twin.imu_sensor import Imu
+from calib.core.errors import BadInputError
+from calib.io.logs import COLUMNS, log_text
+from calib.stages.actuator import simulate as integrate
+from calib.stages.actuator.kinematics import forward
+from calib.stages.actuator.parameters import Plant, Stiffness
+from calib.stages.actuator.simulate import rig_at_rest
+from calib.stages.control.laws import LoopState
 from calib.twin.rig import SimulatedRig
-from calib.twin.simulate import LONGEST_S, Law, Run, log_of, simulate
+from calib.twin.sensors import Imu, Tracker, marker_pixels
+from calib.twin.simulate import LONGEST_S, Law, Run, Seen, log_of, simulate
 
 RIG = SimulatedRig()
 PERFECT = replace(

@@ -1,0 +1,216 @@
+"""Reading and replacing files: whole, atomic, and with errors of one sentence."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import stat
+from pathlib import Path
+from typing import Any
+
+from calib.core.errors import BadInputError
+
+_MAX_BYTES = 500_000_000
+_MAX_YAML_BYTES = 1_000_000
+
+
+def one_line(text: str) -> str:
+    """Text as a terminal may get it: line breaks and other control characters escaped."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+def shown(path: Path | str) -> str:
+    """A path as an error message shows it, see `one_line`."""
+    return one_line(str(path))
+
+
+def check_readable(path: Path) -> int:
+    """Size in bytes of a regular file. Raises `BadInputError` for all else: a pipe may never end."""
+    try:
+        status = path.stat()
+    except OSError as error:
+        raise BadInputError(f"{shown(path)}: cannot be read: {error.strerror or error}") from error
+    if stat.S_ISDIR(status.st_mode):
+        raise BadInputError(f"{shown(path)}: is a folder, expected a file")
+    if not stat.S_ISREG(status.st_mode):
+        raise BadInputError(f"{shown(path)}: is a pipe or a device, expected a file")
+    return status.st_size
+
+
+def read_bytes(path: Path, most: int = _MAX_BYTES) -> bytes:
+    """Contents of a file of at most `most` bytes, or a `BadInputError` that says why not."""
+    size = check_readable(path)
+    data = b""
+    if size <= most:
+        try:
+            with path.open("rb") as stream:
+                data = stream.read(most + 1)
+        except OSError as error:
+            raise BadInputError(f"{shown(path)}: cannot be read: {error.strerror or error}") from error
+    if max(size, len(data)) > most:
+        raise BadInputError(f"{shown(path)}: is larger than {most / 1e6:g} MB")
+    return data
+
+
+def read_text(path: Path, most: int = _MAX_BYTES) -> str:
+    """Text of a UTF-8 file of at most `most` bytes, without a byte-order mark."""
+    return as_text(path, read_bytes(path, most))
+
+
+def as_text(path: Path, data: bytes) -> str:
+    """What a UTF-8 file holds as text, without a byte-order mark."""
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise BadInputError(f"{shown(path)}: is not UTF-8 text (byte {error.start})") from error
+
+
+def sha256(data: bytes) -> str:
+    """SHA-256 in hexadecimal."""
+    import hashlib
+
+    return hashlib.sha256(data).hexdigest()
+
+
+def file_sha256(path: Path) -> str:
+    """SHA-256 of a file of any size in hexadecimal, or a `BadInputError` that says why not."""
+    import hashlib
+
+    check_readable(path)
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise BadInputError(f"{shown(path)}: cannot be read: {error.strerror or error}") from error
+
+
+def read_yaml_mapping(path: Path) -> dict[str, Any]:
+    """A YAML file whose top level is a mapping; bounded in size and depth, aliases included.
+
+    Raises `BadInputError`, also for a key that is given twice: YAML's readers would keep the last.
+    """
+    from calib.core.bounded_yaml import YamlProblem, load
+
+    text = read_text(path, _MAX_YAML_BYTES)
+    try:
+        document = load(text)
+    except YamlProblem as problem:
+        where = "" if problem.line is None else f", line {problem.line}"
+        raise BadInputError(f"{shown(path)}{where}: {problem.said}") from problem
+    if not isinstance(document, dict):
+        found = "nothing" if document is None else f"a {type(document).__name__}"
+        raise BadInputError(f"{shown(path)}: holds {found}, expected keys with values")
+    wrong = next((key for key in document if not isinstance(key, str)), None)
+    if wrong is not None:
+        raise BadInputError(f"{shown(path)}: the key {wrong!r} is not text")
+    return document
+
+
+def _target(path: Path) -> Path:
+    """The file that a path stands for, symbolic links followed."""
+    if not path.is_symlink() or _is_device(path):
+        return path
+    target = Path(os.path.realpath(path))
+    if target.is_symlink():
+        raise BadInputError(f"{shown(path)}: is a symbolic link that leads back to itself")
+    return target
+
+
+def check_writable(path: Path) -> None:
+    """Fail before long work when `path` cannot be written afterwards."""
+    target = _target(path)
+    parent = target.parent
+    if target.is_dir():
+        raise BadInputError(f"{shown(path)}: is a folder, expected a file to write")
+    if not parent.is_dir():
+        raise BadInputError(f"{shown(path)}: cannot be written: there is no folder {shown(parent)}")
+    if target.exists() and not (target.stat().st_mode & 0o222 and os.access(target, os.W_OK)):
+        raise BadInputError(f"{shown(path)}: cannot be written: it is read-only")
+    if _is_device(target):
+        return
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise BadInputError(f"{shown(path)}: cannot be written: no permission in {shown(parent.resolve())}")
+
+
+def check_folder(path: Path) -> None:
+    """Fail before long work when `make_folder` or writing into this folder cannot succeed afterwards."""
+    there = path
+    while not there.exists() and there != there.parent:
+        there = there.parent
+    if not there.is_dir():
+        raise BadInputError(f"{shown(path)}: cannot be made a folder: {shown(there)} is a file")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise BadInputError(f"{shown(path)}: cannot be written: no permission in {shown(there.resolve())}")
+
+
+def _is_device(path: Path) -> bool:
+    """Whether this is there and can only be written through, as /dev/null or a pipe."""
+    return path.exists() and not path.is_file() and not path.is_dir()
+
+
+def make_folder(path: Path) -> None:
+    """Create a folder to write into, or a `BadInputError` that says why not."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadInputError(f"{shown(path)}: cannot be made a folder: {error.strerror or error}") from error
+
+
+def write_atomically(path: Path, data: bytes | str) -> None:
+    """Replace a file so that at every moment either the old or the new contents are there whole.
+
+    A temporary file beside it is written, flushed to the disk and renamed; devices and pipes are
+    written through. Raises `BadInputError` when the disk is full or the place cannot be written; the
+    old file then survives.
+    """
+    import tempfile
+
+    raw = data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data
+    check_writable(path)
+    target = _target(path)
+    temporary: str | None = None
+    try:
+        if _is_device(target):
+            target.write_bytes(raw)
+            return
+        descriptor, temporary = tempfile.mkstemp(
+            prefix=f".{target.name[:40]}.", suffix=".tmp", dir=target.parent
+        )
+        with os.fdopen(descriptor, "wb") as stream:
+            stream.write(raw)
+            stream.flush()
+            os.fsync(stream.fileno())
+        _take_over(target, Path(temporary))
+        Path(temporary).replace(target)
+    except OSError as error:
+        raise BadInputError(f"{shown(path)}: cannot be written: {error.strerror or error}") from error
+    finally:
+        if temporary is not None:
+            # After the renaming there is none; one that cannot be removed is no reason to fail.
+            with contextlib.suppress(OSError):
+                Path(temporary).unlink()
+    with contextlib.suppress(OSError):
+        folder = os.open(target.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+
+def _take_over(old: Path, new: Path) -> None:
+    """Give a file the mode and, where allowed, the owner of the one that it replaces."""
+    if not old.exists():
+        new.chmod(0o666 & ~_umask())
+        return
+    status = old.stat()
+    with contextlib.suppress(OSError):
+        os.chown(new, status.st_uid, status.st_gid)
+    new.chmod(status.st_mode & 0o777)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

@@ -1,0 +1,201 @@
+"""The homography from a plane to pixels, fitted without knowing the camera.
+
+    s (u, v, 1) = H (X, Y, 1)
+
+Start: the direct linear transform on normalised points (Hartley 1997). Then Levenberg-Marquardt on the
+distances in pixels; with w = h3 . X the derivatives are du/dh1 = X / w, du/dh3 = -u X / w, and alike
+for v. Of the nine entries eight are free, and a step along h itself changes nothing, so it is left
+out. H is scaled to a depth s of 1 at the points' centroid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.core.arrays import FloatArray, IntArray
+from calib.core.errors import BadInputError
+
+_MAX_ITERATIONS = 50
+_STEP_PX = 1e-10
+"""Where the Gauss-Newton step moves no point by more than this, the minimum is reached."""
+_ROUNDING = 1e-12
+"""Rounding in the sum of squares must not stop a step that the gradient asks for."""
+
+
+@dataclass(frozen=True)
+class Homography:
+    """A fitted homography.
+
+    Attributes
+    ----------
+    H : (3, 3), metres to pixels, depth 1 at the centroid of the points.
+    covariance : (9, 9) of H row by row, of rank 8.
+    rms_px : root of the mean squared distance between measured and mapped points.
+    sigma_px : standard deviation of one pixel coordinate, from the residuals.
+    """
+
+    H: FloatArray
+    covariance: FloatArray
+    rms_px: float
+    sigma_px: float
+
+
+def apply_homography(H: FloatArray, points: FloatArray) -> FloatArray:
+    """Map (..., 2) points by H; points at or beyond the horizon become NaN."""
+    mapped = points @ H[:, :2].T + H[:, 2]
+    depth = np.where(mapped[..., 2:] > 0.0, mapped[..., 2:], np.nan)
+    return np.asarray(mapped[..., :2] / depth)
+
+
+def map_jacobian(H: FloatArray, points: FloatArray) -> FloatArray:
+    """Derivative of the mapped points by the points, (..., 2, 2)."""
+    mapped = points @ H[:, :2].T + H[:, 2]
+    depth = mapped[..., 2]
+    image = mapped[..., :2] / depth[..., None]
+    return np.asarray((H[:2, :2] - image[..., :, None] * H[2, :2]) / depth[..., None, None])
+
+
+def grouped_variance(residuals: FloatArray, groups: IntArray, parameters: int) -> float:
+    """Variance of one coordinate where several residuals may belong to the same point.
+
+    Pictures of a scene that stands still repeat each other's errors, and N copies are not N times the
+    information. Residuals of the same point are averaged first: with n_g residuals of mean r_g,
+    sigma^2 = sum n_g |r_g|^2 / (2 G - parameters), which is the usual estimate when errors are
+    independent and N times as large when they repeat.
+
+    Parameters
+    ----------
+    residuals : (M, 2) pixels.
+    groups : (M,) index of the point, 0 .. G - 1.
+    """
+    count = np.bincount(groups)
+    mean_u = np.bincount(groups, residuals[:, 0]) / count
+    mean_v = np.bincount(groups, residuals[:, 1]) / count
+    freedom = 2 * len(count) - parameters
+    if freedom <= 0:
+        return float("nan")
+    return float(np.sum(count * (mean_u**2 + mean_v**2)) / freedom)
+
+
+def _normalising(points: FloatArray) -> FloatArray:
+    """Similarity that brings points to zero mean and a mean square radius of 2."""
+    centre = points.mean(axis=0)
+    spread = np.sqrt(np.mean(np.sum((points - centre) ** 2, axis=1)) / 2.0)
+    k = 1.0 / spread if spread > 0 else 1.0
+    return np.array([[k, 0.0, -k * centre[0]], [0.0, k, -k * centre[1]], [0.0, 0.0, 1.0]])
+
+
+def _direct_linear(points: FloatArray, pixels: FloatArray) -> FloatArray:
+    """The linear estimate on normalised points, Frobenius norm 1, depths positive."""
+    M = len(points)
+    X = np.column_stack([points, np.ones(M)])
+    system = np.zeros((2 * M, 9))
+    system[:M, :3], system[:M, 6:] = X, -pixels[:, :1] * X
+    system[M:, 3:6], system[M:, 6:] = X, -pixels[:, 1:] * X
+    _, singular, V = np.linalg.svd(system, full_matrices=M < 5)
+    if singular[7] < 1e-9 * singular[0]:
+        raise BadInputError("the points do not fix a homography: too many of them lie on one line")
+    H = V[8].reshape(3, 3)
+    return np.asarray(H if np.sum(X @ H[2]) > 0 else -H)
+
+
+def _residuals(h: FloatArray, X: FloatArray, pixels: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+    """Residuals (2 M,) and Jacobian (2 M, 9), or None where a point has no positive depth."""
+    M = len(X)
+    mapped = X @ h.reshape(3, 3).T
+    depth = mapped[:, 2:]
+    if depth.min() <= 0.0:
+        return None
+    image = mapped[:, :2] / depth
+    J = np.zeros((2 * M, 9))
+    J[:M, :3] = J[M:, 3:6] = X / depth
+    J[:M, 6:] = -image[:, :1] * X / depth
+    J[M:, 6:] = -image[:, 1:] * X / depth
+    return (image - pixels).T.ravel(), J
+
+
+def fit_homography(points: FloatArray, pixels: FloatArray, groups: IntArray | None = None) -> Homography:
+    """Homography from points of a plane to pixels that minimises the distances in pixels.
+
+    Parameters
+    ----------
+    points : (M, 2) metres, M >= 4, not all but one on a line.
+    pixels : (M, 2).
+    groups : (M,) which residuals belong to the same point; each its own by default.
+
+    Raises
+    ------
+    BadInputError
+        When there are fewer than four points or they do not fix a homography.
+
+    Notes
+    -----
+    With four points the covariance and `sigma_px` are NaN: nothing is left to estimate them from.
+    """
+    if len(points) < 4:
+        raise BadInputError(f"a plane needs at least 4 points, got {len(points)}")
+    from_points, from_pixels = _normalising(points), _normalising(pixels)
+    X = np.column_stack([points, np.ones(len(points))]) @ from_points.T
+    scaled = pixels @ from_pixels[:2, :2].T + from_pixels[:2, 2]
+    px = from_pixels[0, 0]
+    h = _direct_linear(X[:, :2], scaled).ravel()
+    now = _residuals(h, X, scaled)
+    if now is None:
+        raise BadInputError(
+            "the points do not fix a homography: some would lie beyond the horizon of the others"
+        )
+    damping = 1e-3
+    for _ in range(_MAX_ITERATIONS):
+        r, J = now
+        normal, gradient = J.T @ J, J.T @ r
+        # h h^T fills the one direction in which nothing changes.
+        filled = normal + np.trace(normal) * np.outer(h, h)
+        if np.abs(J @ np.linalg.solve(filled, gradient)).max() < _STEP_PX * px:
+            break
+        accepted = None
+        while accepted is None and damping < 1e9:
+            step = -np.linalg.solve(filled + damping * np.diag(np.diag(normal)), gradient)
+            h_trial = (h + step) / np.linalg.norm(h + step)
+            trial = _residuals(h_trial, X, scaled)
+            if trial is not None and trial[0] @ trial[0] <= (r @ r) * (1 + _ROUNDING):
+                accepted = trial
+            else:
+                damping *= 8.0
+        if accepted is None:
+            break
+        h, now, damping = h_trial, accepted, max(0.1 * damping, 1e-12)
+    return _scaled_to_centroid(h, now, X, from_points, from_pixels, groups)
+
+
+def _scaled_to_centroid(
+    h: FloatArray,
+    now: tuple[FloatArray, FloatArray],
+    X: FloatArray,
+    from_points: FloatArray,
+    from_pixels: FloatArray,
+    groups: IntArray | None,
+) -> Homography:
+    """Undo the normalisation of points and pixels, scale, and propagate the covariance."""
+    r, J = now
+    residuals = r.reshape(2, -1).T / from_pixels[0, 0]
+    own = np.arange(len(X)) if groups is None else groups
+    variance = grouped_variance(residuals, own, 8)
+    # The direction h that fills the null space is removed again by the scaling below.
+    normal = J.T @ J
+    inverse = np.linalg.inv(normal + np.trace(normal) * np.outer(h, h))
+    covariance = inverse * variance * from_pixels[0, 0] ** 2
+    # vec(T H S) = (T kron S^T) vec(H) row by row; then the scale, h / (g . h) with g . h the depth.
+    linear = np.kron(np.linalg.inv(from_pixels), from_points.T)
+    h = linear @ h
+    g = np.zeros(9)
+    g[6:] = np.linalg.solve(from_points, np.array([0.0, 0.0, 1.0]))
+    depth = g @ h
+    scaling = (np.eye(9) - np.outer(h, g) / depth) / depth @ linear
+    return Homography(
+        H=(h / depth).reshape(3, 3),
+        covariance=scaling @ covariance @ scaling.T,
+        rms_px=float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))),
+        sigma_px=float(np.sqrt(variance)),
+    )

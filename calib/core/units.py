@@ -1,0 +1,121 @@
+"""Numbers and quantities as people type them; those with a unit are read into SI."""
+
+from __future__ import annotations
+
+import math
+import re
+
+from calib.core.errors import UsageError
+
+_LENGTHS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
+_FREQUENCIES = {"hz": 1.0, "khz": 1e3}
+_ANGLES = {"deg": math.pi / 180.0, "rad": 1.0}
+_DURATIONS = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
+_QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-zA-Z]*)\s*")
+_PAIR = re.compile(r"\s*(\d{1,6})\s*[xX\u00d7,]\s*(\d{1,6})\s*")
+
+
+def plain_number(word: str) -> float | None:
+    """A cell's decimal number, nan and inf included; None for other words.
+
+    Python's own syntax of numbers has underscores, a table's has not.
+    """
+    try:
+        return float(word) if "_" not in word else None
+    except ValueError:
+        return None
+
+
+def _quantity(text: str, units: dict[str, float], what: str, example: str) -> float:
+    found = _QUANTITY.fullmatch(text)
+    if found is None:
+        raise UsageError(f"{what}: {text!r} is not a number with a unit, expected for instance {example}")
+    number, unit = found.groups()
+    if unit.lower() not in units:
+        has = f"the unit {unit!r}" if unit else "no unit"
+        raise UsageError(
+            f"{what}: {text!r} has {has}, expected one of {', '.join(units)}, for instance {example}"
+        )
+    value = float(number) * units[unit.lower()]
+    if not math.isfinite(value):
+        raise UsageError(f"{what}: {text!r} is too large")
+    return value
+
+
+def parse_length_m(text: str, what: str) -> float:
+    """Metres from '20mm', '2 cm', '0.02m' or '1in'; positive."""
+    value = _quantity(text, _LENGTHS, what, "20mm")
+    if value <= 0.0:
+        raise UsageError(f"{what}: {text!r} is not positive")
+    return value
+
+
+def parse_square_m(text: str, what: str = "--square") -> float:
+    """Metres of a square's side from '20mm'; from 0.01 mm to 10 m, as in board.yaml."""
+    value = parse_length_m(text, what)
+    if not 1e-5 <= value < 10.0:
+        raise UsageError(f"{what}: {text!r} is not between 0.01 mm and 10 m")
+    return value
+
+
+def parse_jitter(text: str, what: str = "--jitter") -> tuple[float, str]:
+    """Metres and "m" from '0.1mm', or pixels and "px" from '0.3px'; positive."""
+    value = _quantity(text, {**_LENGTHS, "px": 1.0}, what, "0.1mm or 0.3px")
+    if value <= 0.0:
+        raise UsageError(f"{what}: {text!r} is not positive")
+    return value, "px" if text.strip().lower().endswith("px") else "m"
+
+
+def parse_frequency_hz(text: str, what: str) -> float:
+    """Hertz from '60Hz' or '1.5 kHz'; positive."""
+    value = _quantity(text, _FREQUENCIES, what, "60Hz")
+    if value <= 0.0:
+        raise UsageError(f"{what}: {text!r} is not positive")
+    return value
+
+
+def parse_duration_s(text: str, what: str) -> float:
+    """Seconds from '10s', '500 ms', '2min' or '1h'; positive."""
+    value = _quantity(text, _DURATIONS, what, "10s")
+    if value <= 0.0:
+        raise UsageError(f"{what}: {text!r} is not positive")
+    return value
+
+
+def parse_angle_rad(text: str, what: str) -> float:
+    """Radians from '30deg' or '0.5rad'."""
+    return _quantity(text, _ANGLES, what, "30deg")
+
+
+def _pair(text: str, what: str, example: str) -> tuple[int, int]:
+    found = _PAIR.fullmatch(text)
+    if found is None:
+        raise UsageError(f"{what}: {text!r} is not two whole numbers, expected for instance {example}")
+    return int(found.group(1)), int(found.group(2))
+
+
+def parse_corners(text: str, what: str = "--corners") -> tuple[int, int]:
+    """Inner corners, columns and rows, from '9x6'; at least 3 x 3, at most 200 x 200."""
+    columns, rows = _pair(text, what, "9x6")
+    if not (min(columns, rows) >= 3 and max(columns, rows) <= 200):
+        raise UsageError(f"{what}: {text!r} is not between 3x3 and 200x200 inner corners")
+    return columns, rows
+
+
+def parse_image_size(text: str, what: str = "--image-size") -> tuple[int, int]:
+    """Width and height in pixels from '640x480'."""
+    width, height = _pair(text, what, "640x480")
+    if min(width, height) < 1 or max(width, height) > 100_000:
+        raise UsageError(f"{what}: {text!r} is not a picture's size, expected sides of 1 to 100000 px")
+    return width, height
+
+
+def parse_region_px(text: str, what: str = "--region") -> tuple[float, float, float, float]:
+    """A box in pixels from 'u0,v0,u1,v1', left before right and upper before lower."""
+    try:
+        u0, v0, u1, v1 = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise UsageError(f"{what}: {text!r} is not four numbers, expected u0,v0,u1,v1 in pixels") from error
+    if not (-math.inf < u0 < u1 < math.inf and -math.inf < v0 < v1 < math.inf):
+        raise UsageError(f"{what}: {text!r} is not a box, expected u0 < u1 and v0 < v1")
+    return u0, v0, u1, v1

@@ -1,0 +1,1 @@
+"""Logs and their formats, pictures, bags and states: the only part that touches the contents of files."""

@@ -1,0 +1,644 @@
+"""Logs in bags: ROS 1 `.bag`, ROS 2 folders and `.db3`, MCAP (ROS messages or JSON)."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import math
+import operator
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from calib.core.arrays import FloatArray, IntArray
+from calib.core.errors import BadInputError, CalibError, pip_install
+from calib.core.files import check_readable, one_line, read_yaml_mapping, shown
+from calib.io.logs import COLUMNS, Log
+from calib.io.unpacking import (
+    MOST_BYTES,
+    BoundedFile,
+    BoundedPath,
+    bound_chunks,
+    check_folder_of_bag,
+    check_mcap,
+    check_types,
+    unpacked,
+)
+
+# ----------------------------------------------------------------------
+# Which field of which topic of a bag is which column of a log.
+#
+# A bag holds messages by topic; `calib.io.logs` knows columns. What goes where stands in a YAML file,
+# `NAME.topics.yaml` beside the bag, or `topics.yaml` in its folder:
+#
+#     time: stamp                # header.stamp where a message has one (default), or received
+#     topics:
+#       /imu/data: imu           # accelerations and rates of sensor_msgs/Imu
+#       /camera/marker:          # any message: column and path of the field
+#         u_px: point.x
+#         v_px: point.y
+#       /command:
+#         pwm1: data[0]
+#         gz_radps: {field: rates.z, factor: 0.017453292519943295}
+#
+# Without the file the only topic of sensor_msgs/Imu is the IMU, `/marker` (a point) the marker and `/pwm`
+# (an array) the commands; fields of JSON messages that bear a column's name are that column.
+
+IMU = {
+    "ax_mps2": "linear_acceleration.x",
+    "ay_mps2": "linear_acceleration.y",
+    "az_mps2": "linear_acceleration.z",
+    "gx_radps": "angular_velocity.x",
+    "gy_radps": "angular_velocity.y",
+    "gz_radps": "angular_velocity.z",
+}
+"""Fields of sensor_msgs/Imu."""
+
+_POINTS = {
+    "geometry_msgs/PointStamped": "point.",
+    "geometry_msgs/Point": "",
+    "geometry_msgs/Vector3Stamped": "vector.",
+    "geometry_msgs/Vector3": "",
+}
+_ARRAY = re.compile(r"std_msgs/(Float|U?Int)(8|16|32|64)MultiArray")
+_STEP = re.compile(r"([A-Za-z_]\w*)((?:\[\d{1,6}\])*)")
+_PRESETS = ("imu", "marker", "pwm")
+_SHOWN = 8
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of a bag: its name, its type as package/Name, and the fields of its JSON schema."""
+
+    name: str
+    kind: str
+    fields: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Field:
+    """Where a column comes from: path of the field, and what it is multiplied by."""
+
+    column: str
+    path: str
+    factor: float = 1.0
+
+
+@dataclass(frozen=True)
+class TopicMap:
+    """Fields by topic; `stamped` whether the time is the message's own, `source` for messages."""
+
+    source: str
+    topics: Mapping[str, tuple[Field, ...]]
+    stamped: bool = True
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Columns that come out, in the order of `calib.io.logs.COLUMNS`."""
+        named = {field.column for fields in self.topics.values() for field in fields}
+        return tuple(name for name in COLUMNS if name in named)
+
+
+def find_topics(path: Path) -> Path | None:
+    """The file of topics that lies beside a bag, or in it if it is a folder; None without."""
+    places = [path.with_name(f"{path.stem}.topics.yaml"), path.with_name("topics.yaml")]
+    if path.is_dir():
+        places = [path / "topics.yaml", path.with_name(f"{path.name}.topics.yaml"), places[1]]
+    return next((place for place in places if place.is_file()), None)
+
+
+def topic_map(bag: Path, topics: Sequence[Topic], given: Path | None = None) -> TopicMap:
+    """What is read of a bag: as `given` says, as the file beside it says, or the defaults.
+
+    Raises `BadInputError` naming the key for what is wrong, the topics of the bag for one it lacks.
+    """
+    place = find_topics(bag) if given is None else given
+    return _defaults(bag, topics) if place is None else _from_file(place, bag, topics)
+
+
+def _listed(topics: Sequence[Topic]) -> str:
+    if not topics:
+        return "none"
+    named = [f"{one_line(topic.name)[:80]} ({one_line(topic.kind)[:60]})" for topic in topics[:_SHOWN]]
+    return ", ".join(named) + (f" and {len(topics) - _SHOWN} others" if len(topics) > _SHOWN else "")
+
+
+def _preset(kind: str, topic: Topic) -> dict[str, str] | None:
+    """Columns and paths of what is expected of a topic, None where its type has none."""
+    if kind == "imu":
+        return dict(IMU) if topic.kind == "sensor_msgs/Imu" else None
+    if kind == "marker" and topic.kind in _POINTS:
+        return {"u_px": _POINTS[topic.kind] + "x", "v_px": _POINTS[topic.kind] + "y"}
+    if kind == "pwm" and _ARRAY.fullmatch(topic.kind):
+        return {"pwm1": "data[0]", "pwm2": "data[1]"}
+    return None
+
+
+_EXPECTED = {
+    "imu": "sensor_msgs/Imu",
+    "marker": "geometry_msgs/PointStamped, Point, Vector3Stamped or Vector3",
+    "pwm": "std_msgs/Float32MultiArray or another array of numbers",
+}
+
+
+def _fields(columns: Mapping[str, str]) -> tuple[Field, ...]:
+    return tuple(Field(column, path) for column, path in columns.items())
+
+
+def _defaults(bag: Path, topics: Sequence[Topic]) -> TopicMap:
+    source = shown(bag)
+    found: dict[str, tuple[Field, ...]] = {}
+    imus = [topic for topic in topics if topic.kind == "sensor_msgs/Imu"]
+    hint = f"say which in {shown(bag.stem)}.topics.yaml beside it"
+    if len(imus) > 1:
+        raise BadInputError(f"{source}: has {len(imus)} topics of sensor_msgs/Imu: {_listed(imus)}; {hint}")
+    for topic in topics:
+        named = topic.name.strip("/")
+        kind = "imu" if topic in imus else named if named in ("marker", "pwm") else ""
+        columns = _preset(kind, topic) if kind else None
+        if columns is None:
+            columns = {name: name for name in topic.fields if name in COLUMNS}
+        if columns:
+            found[topic.name] = _fields(columns)
+    if not found:
+        raise BadInputError(
+            f"{source}: has no topic that is known by itself, found {_listed(topics)}; {hint}"
+        )
+    return _checked(TopicMap(source, found))
+
+
+def _from_file(place: Path, bag: Path, topics: Sequence[Topic]) -> TopicMap:
+    source, document = shown(place), read_yaml_mapping(place)
+    for key in document:
+        if key not in ("time", "topics"):
+            raise BadInputError(f"{source}: {one_line(key)[:60]} is not known, expected time or topics")
+    time = document.get("time", "stamp")
+    if time not in ("stamp", "received"):
+        raise BadInputError(f"{source}: time is {_short(time)}, expected stamp or received")
+    listed = document.get("topics")
+    if not isinstance(listed, dict) or not listed:
+        raise BadInputError(f"{source}: topics is {_short(listed)}, expected topics with their columns")
+    there = {topic.name: topic for topic in topics}
+    found = {}
+    for name, wanted in listed.items():
+        if name not in there:
+            raise BadInputError(
+                f"{source}: the topic {_short(name)} is not in {shown(bag)}, which has {_listed(topics)}"
+            )
+        found[name] = _wanted(f"{source}: topics.{one_line(name)[:80]}", wanted, there[name])
+    return _checked(TopicMap(source, found, time == "stamp"))
+
+
+def _wanted(where: str, wanted: Any, topic: Topic) -> tuple[Field, ...]:
+    """The fields that one entry of the file asks for."""
+    if isinstance(wanted, str):
+        if wanted not in _PRESETS:
+            raise BadInputError(f"{where} is {_short(wanted)}, expected {', '.join(_PRESETS)} or columns")
+        columns = _preset(wanted, topic)
+        if columns is None:
+            raise BadInputError(
+                f"{where} is of type {one_line(topic.kind)[:60]}, expected {_EXPECTED[wanted]}"
+            )
+        return _fields(columns)
+    if not isinstance(wanted, dict) or not wanted:
+        raise BadInputError(f"{where} is {_short(wanted)}, expected {', '.join(_PRESETS)} or columns")
+    fields = []
+    for column, path in wanted.items():
+        if column not in COLUMNS:
+            raise BadInputError(
+                f"{where}: {_short(column)} is no column, expected one of {', '.join(COLUMNS)}"
+            )
+        entry: dict[str, Any] = (
+            path if isinstance(path, dict) and set(path) <= {"field", "factor"} else {"field": path}
+        )
+        path, factor = entry.get("field"), entry.get("factor", 1.0)
+        if not isinstance(path, str) or not all(_STEP.fullmatch(step) for step in path.split(".")):
+            raise BadInputError(
+                f"{where}.{column} is {_short(path)}, expected a field such as point.x or data[0]"
+            )
+        if isinstance(factor, bool) or not isinstance(factor, int | float) or not math.isfinite(factor):
+            raise BadInputError(f"{where}.{column}: the factor is {_short(factor)}, expected a number")
+        fields.append(Field(column, path, float(factor)))
+    return tuple(fields)
+
+
+def _short(value: Any) -> str:
+    return one_line(repr(value))[:60]
+
+
+def _checked(found: TopicMap) -> TopicMap:
+    """The map, if no column comes from two topics."""
+    origin: dict[str, str] = {}
+    for topic, fields in found.topics.items():
+        for field in fields:
+            if field.column in origin:
+                names = f"{one_line(origin[field.column])[:80]} and {one_line(topic)[:80]}"
+                raise BadInputError(f"{found.source}: {field.column} comes from two topics, {names}")
+            origin[field.column] = topic
+    return found
+
+
+def reader_of(source: str, topic: str, field: Field) -> Callable[[Any], float]:
+    """A function from a message to a column's value; NaN for a null.
+
+    The function raises `BadInputError` where the message has no such field or it is no number.
+    """
+    steps: list[str | int] = [
+        name if name else int(index) for name, index in re.findall(r"([A-Za-z_]\w*)|\[(\d+)\]", field.path)
+    ]
+    where = f"{source}: {one_line(topic)[:80]}: {field.path} (for {field.column})"
+    factor = field.factor
+
+    def found(message: Any) -> Any:
+        value = message
+        for step in steps:
+            try:
+                value = (
+                    value[step] if isinstance(step, int) or isinstance(value, dict) else getattr(value, step)
+                )
+            except (AttributeError, KeyError, IndexError, TypeError):
+                raise BadInputError(
+                    f"{where} is not in the message, which has {_named(value, step)}"
+                ) from None
+        return value
+
+    named = [step for step in steps if isinstance(step, str)]
+    quick = operator.attrgetter(field.path) if len(named) == len(steps) else found
+
+    def read(message: Any) -> float:
+        try:
+            value = found(message) if isinstance(message, dict) else quick(message)
+        except AttributeError:
+            value = found(message)
+        if isinstance(value, float):
+            return value * factor
+        if value is None:
+            return math.nan
+        try:
+            if isinstance(value, str | bytes | bytearray):
+                raise TypeError
+            return float(value) * factor
+        except (TypeError, ValueError, OverflowError):
+            raise BadInputError(f"{where} is {_short(value)}, expected a number") from None
+
+    return read
+
+
+def _named(value: Any, step: str | int) -> str:
+    """What stands where a field was looked for in vain."""
+    if isinstance(step, int):
+        try:
+            return f"{len(value)} elements there"
+        except TypeError:
+            return f"{_short(value)} there"
+    names = list(value) if isinstance(value, dict) else list(getattr(value, "__dataclass_fields__", ()))
+    names = [one_line(str(name))[:40] for name in names if not str(name).startswith("__")]
+    return ", ".join(names[:_SHOWN]) if names else f"{_short(value)} there"
+
+
+# ----------------------------------------------------------------------
+# From the messages of a bag to the rows of a log, in the order of their time.
+#
+# Topics are recorded as they arrive, so stamps of two topics interleave out of order by some
+# milliseconds; messages are held for `WINDOW_S` and sorted. Those with one stamp and different columns
+# make one row. Stamps that count from the epoch are told from the first row on, so that a double holds
+# them to the nanosecond; others, as of a simulation, stay as they are.
+
+WINDOW_S = 2.0
+"""How long a message is waited for that arrives after one with a later stamp."""
+
+_ROWS = 16384
+_EPOCH_NS = 10**17
+"""Three years: no log of a rig's own clock is longer."""
+
+
+class Source(Protocol):
+    """Messages of an opened bag.
+
+    Attributes
+    ----------
+    topics : what it holds. truncated : whether it was found to end early, known after the last message.
+    """
+
+    @property
+    def topics(self) -> tuple[Topic, ...]: ...
+
+    @property
+    def truncated(self) -> bool: ...
+
+    def messages(self, names: Iterable[str]) -> Iterator[tuple[str, int, Any]]:
+        """Topic, time of reception [ns] and decoded message, in the order of the file."""
+        ...
+
+
+def _stamp(message: Any) -> int | None:
+    """A message's own time [ns], None without: header.stamp, or what JSON messages call timestamp."""
+    if isinstance(message, dict):
+        header = message.get("header")
+        stamp = header.get("stamp") if isinstance(header, dict) else message.get("timestamp")
+        if not isinstance(stamp, dict):
+            return None
+        sec, nsec = stamp.get("sec"), stamp.get("nsec", stamp.get("nanosec", 0))
+    else:
+        stamp = getattr(getattr(message, "header", None), "stamp", None)
+        sec, nsec = getattr(stamp, "sec", None), getattr(stamp, "nanosec", 0)
+    if not isinstance(sec, int) or not isinstance(nsec, int):
+        return None
+    whole = sec * 1_000_000_000 + nsec
+    return whole if 0 < whole < 2**63 else None
+
+
+@dataclass
+class _Sorter:
+    """Rows that wait for earlier ones."""
+
+    stamps: IntArray
+    values: FloatArray
+
+    def take(self, stamps: IntArray, values: FloatArray, last: bool) -> tuple[IntArray, FloatArray]:
+        """Add rows; those that nothing can precede any more, all at the end."""
+        stamps, values = np.concatenate([self.stamps, stamps]), np.concatenate([self.values, values])
+        order = np.argsort(stamps, kind="stable")
+        stamps, values = stamps[order], values[order]
+        ready = len(stamps)
+        if not last and ready:
+            ready = int(np.searchsorted(stamps, stamps[-1] - int(WINDOW_S * 1e9)))
+        self.stamps, self.values = stamps[ready:], values[ready:]
+        return stamps[:ready], values[:ready]
+
+
+def _merged(stamps: IntArray, values: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Rows of one stamp as one, where no column has two values; rows are sorted."""
+    if len(stamps) < 2 or not np.any(stamps[1:] == stamps[:-1]):
+        return stamps, values
+    begin = np.nonzero(np.concatenate([[True], stamps[1:] != stamps[:-1]]))[0]
+    there = ~np.isnan(values)
+    counts = np.add.reduceat(there.astype(np.int64), begin, axis=0)
+    sums = np.add.reduceat(np.where(there, values, 0.0), begin, axis=0)
+    alone = np.all(counts <= 1, axis=1)
+    group = np.cumsum(np.concatenate([[True], stamps[1:] != stamps[:-1]])) - 1
+    keep = ~alone[group]
+    keep[begin] = True
+    out = values.copy()
+    out[begin[alone]] = np.where(counts > 0, sums, np.nan)[alone]
+    return stamps[keep], out[keep]
+
+
+def _chunks(source: str, stream: Source, topics: TopicMap) -> Iterator[tuple[IntArray, FloatArray]]:
+    """Stamps and values in the order of the file, some thousand messages at a time."""
+    slots = {name: k for k, name in enumerate(topics.columns)}
+    readers: dict[str, list[tuple[int, Callable[[Any], float]]]] = {
+        name: [(slots[field.column], reader_of(source, name, field)) for field in fields]
+        for name, fields in topics.topics.items()
+    }
+    stamps, values = np.empty(_ROWS, dtype=np.int64), np.full((_ROWS, len(slots)), np.nan)
+    filled = 0
+    for name, received, message in stream.messages(list(readers)):
+        stamp = _stamp(message) if topics.stamped else None
+        stamps[filled] = received if stamp is None else stamp
+        row = values[filled]
+        for slot, read in readers[name]:
+            row[slot] = read(message)
+        filled += 1
+        if filled == _ROWS:
+            yield stamps, values
+            stamps, values, filled = np.empty_like(stamps), np.full_like(values, np.nan), 0
+    if filled:
+        yield stamps[:filled], values[:filled]
+
+
+def rows_from_messages(source: str, stream: Source, topics: TopicMap) -> Iterator[Log]:
+    """Blocks of a log; a block may have no rows, and there is at least one.
+
+    Raises `BadInputError` for a message without an expected field.
+    """
+    unknown = tuple(topic.name for topic in stream.topics if topic.name not in topics.topics)
+    columns = topics.columns
+    sorter = _Sorter(np.empty(0, dtype=np.int64), np.empty((0, len(columns))))
+    start, first = None, 1
+
+    def made(stamps: IntArray, values: FloatArray) -> Log:
+        nonlocal start, first
+        infinite = int(np.count_nonzero(np.isinf(values)))
+        stamps, values = _merged(stamps, np.where(np.isinf(values), np.nan, values))
+        if start is None and len(stamps):
+            start = int(stamps[0]) if stamps[0] >= _EPOCH_NS else 0
+        t_s = (stamps - (start or 0)) / 1e9
+        lines = np.arange(first, first + len(stamps), dtype=np.int64)
+        first += len(stamps)
+        named = {name: np.ascontiguousarray(values[:, k]) for k, name in enumerate(columns)}
+        return Log(source, t_s, named, lines, unknown, infinite)
+
+    try:
+        waiting = (sorter.stamps, sorter.values)
+        for following in _chunks(source, stream, topics):
+            block = made(*sorter.take(*waiting, False))
+            if len(block):
+                yield block
+            waiting = following
+        yield replace(made(*sorter.take(*waiting, True)), truncated=stream.truncated)
+    except OverflowError as error:
+        raise BadInputError(f"{source}: has a time that is none: {error}") from error
+
+
+# ----------------------------------------------------------------------
+# Logs in bags: ROS 1 `.bag`, ROS 2 folders and `.db3`, MCAP (ROS messages or JSON).
+#
+# The readers are those of the packages `rosbags` and `mcap` (extra logs). Both hand out one message at a
+# time, so nothing grows with the length of a bag but its index.
+
+BAGS = (".bag", ".db3", ".mcap")
+"""Endings of bags; a ROS 2 bag may also be a folder."""
+
+_MOST_TOPICS = 10000
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path is read as a bag: by its ending, or as a folder with a bag's metadata."""
+    return path.suffix.lower() in BAGS or (path / "metadata.yaml").is_file()
+
+
+def iter_bag(path: Path, topics: Path | None = None) -> Iterator[Log]:
+    """Blocks of the log in a bag; `topics` is a file that says what is where, see `calib.io.bags`.
+
+    Raises
+    ------
+    BadInputError
+        Without the extra logs, for a bag that cannot be read, a topic it lacks, a field that its messages
+        lack, and a value that is no number.
+    """
+    source = shown(path)
+    if path.is_file() or not path.is_dir():
+        check_readable(path)
+    opened = _mcap if path.is_file() and path.suffix.lower() == ".mcap" else _rosbag
+    try:
+        with opened(path) as stream:
+            found = topic_map(path, stream.topics, topics)
+            yield from rows_from_messages(source, stream, found)
+    except CalibError:
+        raise
+    except OSError as error:
+        raise BadInputError(f"{source}: cannot be read: {error.strerror or error}") from error
+    except Exception as error:
+        # Damaged bytes make the packages raise nearly anything, and which is not part of their interface.
+        said = one_line(str(error) or type(error).__name__)[:160]
+        raise BadInputError(f"{source}: is not a bag that can be read: {said}") from error
+
+
+def _module(path: Path, name: str, package: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        what = f"reading {path.suffix.lstrip('.') or 'bags'}"
+        raise BadInputError(
+            f"{shown(path)}: {what} needs the package {package}: {pip_install('logs')}"
+        ) from error
+
+
+def _kind(name: str) -> str:
+    """A message type as package/Name, as ROS 1 writes it."""
+    return name.replace("/msg/", "/")
+
+
+class _RosBag:
+    """A bag that `rosbags` has opened."""
+
+    def __init__(self, reader: Any, packing: str) -> None:
+        self._reader, self._packing = reader, packing
+        self.truncated = False
+        kinds = {connection.topic: _kind(connection.msgtype) for connection in reader.connections}
+        self.topics = tuple(Topic(name, kinds[name]) for name in sorted(kinds))
+
+    def messages(self, names: Iterable[str]) -> Iterator[tuple[str, int, Any]]:
+        wanted = set(names)
+        connections = [item for item in self._reader.connections if item.topic in wanted]
+        for connection, received, data in self._reader.messages(connections=connections):
+            data = unpacked(self._packing, data) if self._packing else data
+            yield connection.topic, received, self._reader.deserialize(data, connection.msgtype)
+
+
+@contextmanager
+def _rosbag(path: Path) -> Iterator[Source]:
+    if path.is_dir() and not (path / "metadata.yaml").is_file():
+        raise BadInputError(
+            f"{shown(path)}: is a folder without metadata.yaml, expected a log or a ROS 2 bag"
+        )
+    reader = _module(path, "rosbags.highlevel", "rosbags")
+    typesys = _module(path, "rosbags.typesys", "rosbags")
+    # Bags older than ROS 2 Iron do not say how their messages are made up.
+    known = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    packing = check_folder_of_bag(path) if path.is_dir() else ""
+    with reader.AnyReader([BoundedPath(path)], default_typestore=known) as opened:
+        check_types(opened.typestore.fielddefs)
+        for one in opened.readers:
+            if hasattr(one, "chunks"):
+                bound_chunks(one)
+            elif packing:
+                # Its own way to unpack messages has no bound.
+                one.storage.metadata = one.storage.metadata._replace(compression_mode=None)
+        yield _RosBag(opened, packing)
+
+
+class _Mcap:
+    """An MCAP file: with its index in the order of time, without in the order of the file."""
+
+    def __init__(self, path: Path, stream: Any) -> None:
+        self._path, self._stream = path, stream
+        self.truncated = False
+        reader = _module(path, "mcap.reader", "mcap")
+        self._errors = _module(path, "mcap.exceptions", "mcap")
+        self._make = {
+            True: lambda: reader.SeekingReader(stream, record_size_limit=MOST_BYTES),
+            False: lambda: reader.NonSeekingReader(stream, record_size_limit=MOST_BYTES),
+        }
+        check_mcap(path, stream)
+        summary = self._summary()
+        self._indexed = summary is not None
+        # Sorting costs a third of the time, and most writers close a chunk before they begin the next.
+        chunks = [] if summary is None else summary.chunk_indexes
+        spans = sorted((c.chunk_start_offset, c.message_start_time, c.message_end_time) for c in chunks)
+        self._jumbled = any(after[1] < before[2] for before, after in pairwise(spans))
+        channels: dict[str, tuple[Any, Any]] = {}
+        if summary is not None:
+            for channel in summary.channels.values():
+                channels[channel.topic] = (summary.schemas.get(channel.schema_id), channel)
+        else:
+            for schema, channel, _ in self._all(None):
+                channels.setdefault(channel.topic, (schema, channel))
+        if len(channels) > _MOST_TOPICS:
+            raise BadInputError(f"{shown(path)}: has {len(channels)} topics, expected at most {_MOST_TOPICS}")
+        self.topics = tuple(_mcap_topic(name, *channels[name]) for name in sorted(channels))
+
+    def _summary(self) -> Any:
+        """The index at the end; None for a file that was not closed."""
+        try:
+            summary = self._make[True]().get_summary()
+        except (self._errors.McapError, ValueError, EOFError):
+            return None
+        return summary if summary is not None and summary.channels else None
+
+    def _all(self, names: list[str] | None) -> Iterator[tuple[Any, Any, Any]]:
+        self._stream.seek(0)
+        reader = self._make[self._indexed]()
+        try:
+            yield from reader.iter_messages(topics=names, log_time_order=self._jumbled)
+        except self._errors.EndOfFile:
+            self.truncated = True
+
+    def messages(self, names: Iterable[str]) -> Iterator[tuple[str, int, Any]]:
+        decoders: dict[int, Callable[[bytes], Any]] = {}
+        for schema, channel, message in self._all(list(names)):
+            decode = decoders.get(channel.id)
+            if decode is None:
+                decode = decoders[channel.id] = _decoder(self._path, schema, channel)
+            yield channel.topic, message.log_time, decode(message.data)
+
+
+def _mcap_topic(name: str, schema: Any, channel: Any) -> Topic:
+    fields: tuple[str, ...] = ()
+    if channel.message_encoding == "json" and schema is not None and schema.encoding == "jsonschema":
+        described = json.loads(schema.data)
+        listed = described.get("properties") if isinstance(described, dict) else None
+        fields = tuple(listed) if isinstance(listed, dict) else ()
+    return Topic(name, _kind(schema.name) if schema is not None and schema.name else "no type", fields)
+
+
+def _decoder(path: Path, schema: Any, channel: Any) -> Callable[[bytes], Any]:
+    """From bytes to a message; types are taken from the file's own schema."""
+    where = f"{shown(path)}: {one_line(channel.topic)[:80]}"
+    if channel.message_encoding == "json":
+        return json.loads
+    encodings = {"cdr": ("ros2msg", "ros2idl"), "ros1": ("ros1msg",)}
+    if channel.message_encoding not in encodings or schema is None:
+        found = one_line(f"{channel.message_encoding}")[:40]
+        raise BadInputError(f"{where} is encoded as {found!r}, expected json, cdr or ros1")
+    if schema.encoding not in encodings[channel.message_encoding]:
+        found = one_line(f"{schema.encoding}")[:40]
+        raise BadInputError(f"{where} has a schema in {found!r}, expected ros2msg, ros2idl or ros1msg")
+    typesys = _module(path, "rosbags.typesys", "rosbags")
+    store = typesys.get_typestore(typesys.Stores.EMPTY)
+    text = schema.data.decode("utf-8")
+    name = schema.name if "/msg/" in schema.name else schema.name.replace("/", "/msg/", 1)
+    if schema.encoding == "ros2idl":
+        rule = "=" * 80 + "\n"
+        parts = [part.split("\n", 1)[1] for part in text.split(rule) if part] if rule in text else [text]
+        for part in parts:
+            store.register(typesys.get_types_from_idl(part))
+    else:
+        store.register(typesys.get_types_from_msg(text, name))
+    check_types(store.fielddefs)
+    read = store.deserialize_ros1 if channel.message_encoding == "ros1" else store.deserialize_cdr
+    return lambda data: read(data, name)
+
+
+@contextmanager
+def _mcap(path: Path) -> Iterator[Source]:
+    _module(path, "mcap.reader", "mcap")
+    with BoundedFile(path) as stream:
+        yield _Mcap(path, stream)

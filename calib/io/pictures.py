@@ -1,0 +1,303 @@
+"""Picture files: which there are, what size they declare, whether they are whole, and their grey values."""
+
+from __future__ import annotations
+
+import os
+import re
+import struct
+import tempfile
+import threading
+import zlib
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from calib.core.arrays import AnyArray, GrayImage
+from calib.core.errors import BadInputError
+from calib.core.files import read_bytes, sha256, shown
+
+# ----------------------------------------------------------------------
+# How many pixels the header of a picture declares: known before anything is decoded or allocated.
+#
+# A few kilobytes can decode to gigabytes, and OpenCV takes the memory for all of a picture before it looks
+# at the data. OpenCV's own limit is read when its library loads, which nobody here controls.
+#
+# Formats: PNG (W3C), JPEG (T.81, B.2.2), TIFF 6.0 and BigTIFF, BMP, WebP (RFC 9649), Netpbm.
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+_NETPBM = re.compile(rb"P[1-6](?:\s+|#[^\n]*\n)+(\d{1,9})(?:\s+|#[^\n]*\n)+(\d{1,9})\s")
+_TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
+_TIFF_KINDS = {1: "B", 3: "H", 4: "I", 16: "Q"}
+_MOST_TAGS = 1000
+_MARKER = re.compile(rb"\xff[^\xff]", re.DOTALL)
+_MOST_SEGMENTS = 10_000
+_SOF = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_ALONE = frozenset((0x01, *range(0xD0, 0xDA)))
+
+
+def declared_pixels(data: bytes) -> int | None:
+    """Width times height by a picture's header; None where there is no header of a known kind."""
+    try:
+        if data.startswith(_PNG):
+            width, height = struct.unpack_from(">II", data, 16)
+        elif data.startswith(b"\xff\xd8"):
+            width, height = _jpeg(data)
+        elif data[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+            width, height = _tiff(data)
+        elif data.startswith(b"BM"):
+            width, height = _bmp(data)
+        elif data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+            width, height = _webp(data)
+        else:
+            found = _NETPBM.match(data)
+            width, height = (0, 0) if found is None else (int(found[1]), int(found[2]))
+    except (struct.error, OverflowError, KeyError):
+        return None
+    return int(width) * int(height) or None
+
+
+def _jpeg(data: bytes) -> tuple[int, int]:
+    """Size in the start of frame, after the segments before it."""
+    at = 2
+    for _ in range(_MOST_SEGMENTS):
+        # Some cameras leave bytes between segments, and any number of 0xFF may precede a marker.
+        found = _MARKER.search(data, at)
+        if found is None:
+            break
+        at, marker = found.end(), data[found.end() - 1]
+        if marker in _SOF:
+            height, width = struct.unpack_from(">HH", data, at + 3)
+            return width, height
+        at += 0 if marker in _ALONE else struct.unpack_from(">H", data, at)[0]
+    return 0, 0
+
+
+def _tiff(data: bytes) -> tuple[int, int]:
+    """Size of the first picture of a file."""
+    order = "<" if data.startswith(b"II") else ">"
+    big = data[2:4] in (b"+\0", b"\0+")
+    start = struct.unpack_from(f"{order}Q" if big else f"{order}I", data, 8 if big else 4)[0]
+    count = struct.unpack_from(f"{order}Q" if big else f"{order}H", data, start)[0]
+    at, size = start + (8 if big else 2), 20 if big else 12
+    found: dict[int, int] = {}
+    for k in range(min(count, _MOST_TAGS)):
+        tag, kind = struct.unpack_from(f"{order}HH", data, at + k * size)
+        if tag in (_TIFF_WIDTH, _TIFF_HEIGHT):
+            value_at = at + k * size + (12 if big else 8)
+            # A tag given twice counts with its larger value.
+            value = struct.unpack_from(order + _TIFF_KINDS[kind], data, value_at)[0]
+            found[tag] = max(value, found.get(tag, 0))
+    return found[_TIFF_WIDTH], found[_TIFF_HEIGHT]
+
+
+def _bmp(data: bytes) -> tuple[int, int]:
+    if struct.unpack_from("<I", data, 14)[0] == 12:
+        return struct.unpack_from("<HH", data, 18)
+    width, height = struct.unpack_from("<ii", data, 18)
+    # A negative height says that the rows begin at the top.
+    return abs(width), abs(height)
+
+
+def _webp(data: bytes) -> tuple[int, int]:
+    kind = data[12:16]
+    if kind == b"VP8X":
+        return 1 + int.from_bytes(data[24:27], "little"), 1 + int.from_bytes(data[27:30], "little")
+    if kind == b"VP8L":
+        bits = struct.unpack_from("<I", data, 21)[0]
+        return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
+    width, height = struct.unpack_from("<HH", data, 26)
+    return width & 0x3FFF, height & 0x3FFF
+
+
+# ----------------------------------------------------------------------
+# Picture files: which there are, whether they are whole, and their pixels as grey values.
+#
+# A picture's EXIF orientation is not applied: calibration is in the sensor's own pixels, and a camera
+# that was held upright for one view has not changed its lens.
+
+os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")
+
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm")
+_MAX_PIXELS = 200_000_000
+_PICTURES_PNG = b"\x89PNG\r\n\x1a\n"
+_JPEG = b"\xff\xd8"
+_JPEG_DAMAGE = ("premature end", "bad huffman", "bad arithmetic", "found marker", "inconsistent progression")
+"""Complaints of libjpeg after which parts of the picture are made up. Extraneous bytes are not among
+them: many cameras pad their pictures."""
+_STDERR = threading.Lock()
+"""Held while file descriptor 2, which belongs to the whole process, leads elsewhere."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A decoded picture.
+
+    Attributes
+    ----------
+    name : of the file, control characters escaped.
+    sha256 : of the file.
+    gray : (height, width) grey values.
+    size_px : width and height.
+    """
+
+    name: str
+    sha256: str
+    gray: GrayImage
+    size_px: tuple[int, int]
+
+    def without_pixels(self) -> Picture:
+        """The same without its grey values, which take the memory."""
+        return replace(self, gray=np.empty((0, 0), dtype=np.uint8))
+
+
+def _natural(path: Path) -> tuple[object, ...]:
+    """Sorting key under which view2 comes before view10."""
+    parts = re.split(r"(\d+)", path.name.lower())
+    key = ((0, int(p), "") if i % 2 else (1, 0, p) for i, p in enumerate(parts))
+    # The name itself decides between view1 and view01: folders are listed in no certain order.
+    return (*key, (2, 0, path.name))
+
+
+def list_pictures(sources: Sequence[Path]) -> list[Path]:
+    """Picture files of folders (without their sub-folders) and of single files, in natural order.
+
+    Raises `BadInputError` when a source does not exist, or no pictures are there.
+    """
+    found: list[Path] = []
+    for source in sources:
+        if source.is_dir():
+            try:
+                inside = [p for p in source.iterdir() if _is_picture_file(p)]
+            except OSError as error:
+                raise BadInputError(f"{shown(source)}: cannot be listed: {error.strerror}") from error
+            if not inside:
+                kinds = ", ".join(suffix[1:] for suffix in SUFFIXES)
+                raise BadInputError(f"{shown(source)}: holds no pictures, expected files of {kinds}")
+            found += sorted(inside, key=_natural)
+        elif source.exists():
+            found.append(source)
+        else:
+            raise BadInputError(f"{shown(source)}: does not exist")
+    twice = next((name for name, n in Counter(shown(path.name) for path in found).items() if n > 1), None)
+    if twice is not None:
+        raise BadInputError(f"{twice}: two pictures have this name; views are told apart by their names")
+    return found
+
+
+def _is_picture_file(path: Path) -> bool:
+    """Whether a folder's entry is to be read; a link that leads nowhere is, so that it is complained of."""
+    if path.suffix.lower() not in SUFFIXES or path.name.startswith("."):
+        return False
+    return path.is_file() or (path.is_symlink() and not path.exists())
+
+
+def _incomplete(data: bytes) -> str | None:
+    """What is wrong with the file as a container, or None."""
+    if data.startswith(_PICTURES_PNG):
+        at = len(_PICTURES_PNG)
+        while at + 12 <= len(data):
+            length, kind = struct.unpack(">I4s", data[at : at + 8])
+            end = at + 12 + length
+            if end > len(data):
+                break
+            if zlib.crc32(data[at + 4 : end - 4]) != struct.unpack(">I", data[end - 4 : end])[0]:
+                return f"is a damaged PNG (checksum of its {kind.decode('latin-1')} part)"
+            if kind == b"IEND":
+                return None
+            at = end
+        return "is a truncated PNG"
+    return None
+
+
+def read_picture(path: Path) -> Picture:
+    """Decode one file to 8-bit grey values.
+
+    Colour is averaged as OpenCV does, an alpha channel is dropped, and deeper pictures are scaled so
+    that their brightest 0.1 % are white. Raises `BadInputError` for what is not a whole picture.
+    """
+    data = read_bytes(path)
+    if not data:
+        raise BadInputError(f"{shown(path)}: is empty, expected a picture")
+    problem = _incomplete(data)
+    if problem is not None:
+        raise BadInputError(f"{shown(path)}: {problem}")
+    pixels = declared_pixels(data)
+    if pixels is None:
+        what = (
+            "a truncated or damaged JPEG" if data.startswith(_JPEG) else "not a picture that can be decoded"
+        )
+        raise BadInputError(f"{shown(path)}: is {what}")
+    if pixels > _MAX_PIXELS:
+        raise BadInputError(f"{shown(path)}: has more than {_MAX_PIXELS // 1_000_000} million pixels")
+    if data.startswith(_JPEG):
+        decoded, complaints = _decoded_with_complaints(data)
+        damage = next((line for line in complaints.splitlines() if _tells_of_damage(line)), None)
+        if decoded is None or damage is not None:
+            why = "" if damage is None else f" ({damage.removeprefix('Corrupt JPEG data: ')[:80]})"
+            raise BadInputError(f"{shown(path)}: is a truncated or damaged JPEG{why}")
+    else:
+        decoded = _decoded(data)
+    if decoded is None or decoded.size == 0:
+        raise BadInputError(f"{shown(path)}: is not a picture that can be decoded")
+    height, width = decoded.shape[:2]
+    return Picture(shown(path.name), sha256(data), _eight_bits(decoded), (width, height))
+
+
+def _decoded(data: bytes) -> AnyArray | None:
+    flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        return cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
+    except cv2.error:
+        return None
+
+
+def _decoded_with_complaints(data: bytes) -> tuple[AnyArray | None, str]:
+    """A decoded picture and what the decoder wrote to stderr, the only place where it tells of damage."""
+    with _STDERR, tempfile.TemporaryFile() as heard:
+        before = os.dup(2)
+        try:
+            os.dup2(heard.fileno(), 2)
+            decoded = _decoded(data)
+        finally:
+            os.dup2(before, 2)
+            os.close(before)
+        heard.seek(0)
+        return decoded, heard.read(10_000).decode("utf-8", "replace")
+
+
+def _tells_of_damage(complaint: str) -> bool:
+    return any(word in complaint.lower() for word in _JPEG_DAMAGE)
+
+
+def _eight_bits(decoded: AnyArray) -> GrayImage:
+    if decoded.dtype == np.uint8:
+        return np.ascontiguousarray(decoded, dtype=np.uint8)
+    values = decoded.astype(np.float32)
+    finite = np.isfinite(values)
+    if not finite.all():
+        values = np.where(finite, values, np.float32(0.0))
+    low = min(float(values.min()), 0.0)
+    white = float(np.percentile(values, 99.9))
+    if not 1e-12 < white - low < 1e30:
+        return np.zeros(values.shape, dtype=np.uint8)
+    values -= np.float32(low)
+    values *= np.float32(255.0 / (white - low))
+    return np.clip(np.rint(values, out=values), 0, 255, out=values).astype(np.uint8)
+
+
+def same_size(pictures: Sequence[Picture]) -> tuple[int, int]:
+    """The size that all pictures have; `BadInputError` names two that differ."""
+    first = pictures[0]
+    for other in pictures[1:]:
+        if other.size_px != first.size_px:
+            a, b = first.size_px, other.size_px
+            raise BadInputError(
+                f"{shown(other.name)}: is {b[0]}x{b[1]} px, but {shown(first.name)} is {a[0]}x{a[1]} px; "
+                "pictures of one camera have one size"
+            )
+    return first.size_px

@@ -1,0 +1,295 @@
+"""The bytes of a board with the example sketch: frames checked and decoded, recorded, read as a log."""
+
+from __future__ import annotations
+
+import io
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from calib.core.errors import BadInputError
+from calib.core.files import check_readable, shown
+from calib.io.logs import Log, iter_rows
+from calib.stages.firmware.conformance import Inputs
+
+# ----------------------------------------------------------------------
+# Frames that the sketch sends: found in a stream of bytes, checked, and written as a log.
+#
+#     A5 5A | length | payload | CRC-16        (0x1021 from 0xFFFF over length and payload), little-endian
+#
+# The payload holds the id of the header, the tick rate, a sequence number, what went into the tick and what
+# came out. After garbage the search goes on one byte behind the false start, so no whole frame is lost to
+# bytes that look like the beginning of one. The log has the columns that `calib.io.logs` knows and, beside
+# them, the board's own: everything that is needed to compute the tick again.
+
+_SYNC = b"\xa5\x5a"
+_PAYLOAD = struct.Struct("<IIHBB7f9fH")
+
+BOARD_COLUMNS = (
+    "sequence", "rate_mhz", "calib_id", "marker_seen", "imu_read", "mode",
+    "board_u_px", "board_v_px", "reference_1", "reference_2",
+    "board_phi_rad", "board_marker_x_m", "board_marker_y_m", "board_head_x_m", "board_head_y_m",
+    "board_q1_m", "board_q2_m", "board_flags",
+)  # fmt: skip
+"""Columns of the log that are the board's own."""
+
+_LOG_COLUMNS = ("t_s", "u_px", "v_px", "ax_mps2", "ay_mps2", "gz_radps", "pwm1", "pwm2")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One tick of a board.
+
+    Attributes
+    ----------
+    identity : CALIB_ID of its header. rate_mhz : ticks in 1000 s. sequence : counts up to 65535.
+    given : inputs.
+    phi_rad, marker_m, head_m, q_m, pwm, flags : outputs.
+    """
+
+    identity: int
+    rate_mhz: int
+    sequence: int
+    given: Inputs
+    phi_rad: float
+    marker_m: tuple[float, float]
+    head_m: tuple[float, float]
+    q_m: tuple[float, float]
+    pwm: tuple[float, float]
+    flags: int
+
+    @property
+    def outputs(self) -> tuple[float, ...]:
+        """phi, marker, head, lengths, commands: nine numbers."""
+        return (self.phi_rad, *self.marker_m, *self.head_m, *self.q_m, *self.pwm)
+
+
+def checksum(data: bytes) -> int:
+    """CRC-16 with the polynomial 0x1021 from 0xFFFF."""
+    crc = 0xFFFF
+    for byte in data:
+        crc ^= byte << 8
+        for _ in range(8):
+            crc = ((crc << 1) ^ 0x1021 if crc & 0x8000 else crc << 1) & 0xFFFF
+    return crc
+
+
+def _frame(
+    identity: int,
+    rate_mhz: int,
+    sequence: int,
+    sensors: int,
+    mode: int,
+    numbers: tuple[float, ...],
+    flags: int,
+) -> Frame:
+    u, v, ax, ay, gz, r1, r2 = numbers[:7]
+    given = Inputs(u, v, ax, ay, gz, (r1, r2), bool(sensors & 1), bool(sensors & 2), mode)
+    phi, X, Y, x, y, q1, q2, p1, p2 = numbers[7:]
+    return Frame(identity, rate_mhz, sequence, given, phi, (X, Y), (x, y), (q1, q2), (p1, p2), flags)
+
+
+def encoded(frame: Frame) -> bytes:
+    """The frame as a board sends it."""
+    given = frame.given
+    sensors = int(given.marker_seen) + 2 * int(given.imu_read)
+    into = (given.u_px, given.v_px, given.ax_mps2, given.ay_mps2, given.gz_radps, *given.reference)
+    payload = _PAYLOAD.pack(
+        frame.identity,
+        frame.rate_mhz,
+        frame.sequence,
+        sensors,
+        given.mode,
+        *into,
+        *frame.outputs,
+        frame.flags,
+    )
+    body = bytes([len(payload)]) + payload
+    return _SYNC + body + struct.pack("<H", checksum(body))
+
+
+class Decoder:
+    """Frames out of a stream that may begin anywhere and hold anything.
+
+    Attributes
+    ----------
+    skipped : bytes that belonged to no frame so far. damaged : frames whose checksum was wrong.
+    """
+
+    def __init__(self) -> None:
+        self._waiting = bytearray()
+        self.skipped = 0
+        self.damaged = 0
+
+    def feed(self, data: bytes) -> Iterator[Frame]:
+        """Take more of the stream; the frames that are complete now."""
+        waiting = self._waiting
+        waiting += data
+        while True:
+            start = waiting.find(_SYNC)
+            if start < 0:
+                # The last byte may be the first of a mark.
+                drop = len(waiting) - (1 if waiting[-1:] == _SYNC[:1] else 0)
+                self.skipped += drop
+                del waiting[:drop]
+                return
+            self.skipped += start
+            del waiting[:start]
+            if len(waiting) < 3:
+                return
+            length = waiting[2]
+            if length != _PAYLOAD.size:
+                self.skipped += 1
+                del waiting[:1]
+                continue
+            end = 3 + length + 2
+            if len(waiting) < end:
+                return
+            body = bytes(waiting[2 : end - 2])
+            if checksum(body) != int.from_bytes(waiting[end - 2 : end], "little"):
+                self.damaged += 1
+                self.skipped += 1
+                del waiting[:1]
+                continue
+            identity, rate, sequence, sensors, mode, *rest = _PAYLOAD.unpack(body[1:])
+            del waiting[:end]
+            yield _frame(identity, rate, sequence, sensors, mode, tuple(rest[:-1]), rest[-1])
+
+
+def csv_header() -> str:
+    """First line of a log of frames."""
+    return ",".join((*_LOG_COLUMNS, *BOARD_COLUMNS)) + "\n"
+
+
+def csv_row(frame: Frame, tick: int) -> str:
+    """A line of the log.
+
+    Parameters
+    ----------
+    tick : number since the first frame, from the sequence numbers.
+    """
+    g = frame.given
+
+    def text(value: float) -> str:
+        return f"{value:.9g}"
+
+    marker = [text(g.u_px), text(g.v_px)] if g.marker_seen else ["", ""]
+    imu = [text(v) for v in (g.ax_mps2, g.ay_mps2, g.gz_radps)]
+    time = f"{1e3 * tick / frame.rate_mhz:.9g}" if frame.rate_mhz else "0"
+    whole = [frame.sequence, frame.rate_mhz, frame.identity, int(g.marker_seen), int(g.imu_read), g.mode]
+    board = [g.u_px, g.v_px, *g.reference, *frame.outputs[:7]]
+    cells = [time, *marker, *(imu if g.imu_read else ["", "", ""]), *map(text, frame.pwm), *map(str, whole)]
+    return ",".join([*cells, *map(text, board), str(frame.flags)]) + "\n"
+
+
+def frame_from_row(row: dict[str, str]) -> Frame:
+    """The frame of a line of the log, by column; `KeyError` or `ValueError` for another line."""
+    number = {name: float(row[name]) for name in (*BOARD_COLUMNS, "pwm1", "pwm2")}
+    imu = [float(row[name]) if row[name] else 0.0 for name in ("ax_mps2", "ay_mps2", "gz_radps")]
+    sensors = int(number["marker_seen"]) + 2 * int(number["imu_read"])
+    into = (number["board_u_px"], number["board_v_px"], *imu, number["reference_1"], number["reference_2"])
+    out = tuple(number[name] for name in BOARD_COLUMNS[10:17])
+    return _frame(
+        int(number["calib_id"]),
+        int(number["rate_mhz"]),
+        int(number["sequence"]),
+        sensors,
+        int(number["mode"]),
+        (*into, *out, number["pwm1"], number["pwm2"]),
+        int(number["board_flags"]),
+    )
+
+
+# ----------------------------------------------------------------------
+# Recording a board: from reads of a port to the text of a log.
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What came in.
+
+    Attributes
+    ----------
+    text : the log. ticks : its rows. lost : sequence numbers that never came. restarts : of the board.
+    skipped : bytes outside frames. damaged : frames with a wrong checksum.
+    """
+
+    text: str
+    ticks: int
+    lost: int
+    restarts: int
+    skipped: int
+    damaged: int
+
+
+def record(read: Callable[[], bytes], more: Callable[[int], bool]) -> Recording:
+    """Read until told to stop; a board that restarts begins the log anew.
+
+    Parameters
+    ----------
+    read : the next bytes of the port, b"" when none came within its timeout.
+    more : whether to go on, given the ticks so far.
+    """
+    decoder, lines = Decoder(), [csv_header()]
+    last: Frame | None = None
+    tick = lost = restarts = 0
+    try:
+        while more(len(lines) - 1):
+            for frame in decoder.feed(read()):
+                if last is not None and frame.sequence == 0 and last.sequence != 0xFFFF:
+                    # What an earlier start sent belongs to another run.
+                    lines, last, tick, lost = [csv_header()], None, 0, 0
+                    restarts += 1
+                if last is not None:
+                    step = (frame.sequence - last.sequence) & 0xFFFF
+                    lost += max(step - 1, 0)
+                    tick += step
+                lines.append(csv_row(frame, tick))
+                last = frame
+    except KeyboardInterrupt:
+        # Stopping by hand is the usual end; what came so far is the log.
+        pass
+    return Recording("".join(lines), len(lines) - 1, lost, restarts, decoder.skipped, decoder.damaged)
+
+
+# ----------------------------------------------------------------------
+# The bytes that a board with the example sketch sent, kept in a file, as a log.
+#
+# What `calib record` does with a port: frames are found and checked, a board that restarts begins the log
+# anew, and lost frames leave a gap in the time.
+
+STREAMS = (".bin", ".serial")
+"""Endings of such files."""
+
+_CHUNK = 1 << 16
+_MOST_BYTES = 1 << 28
+
+
+def iter_stream(path: Path) -> Iterator[Log]:
+    """Blocks of the log. Raises `BadInputError` for a file without a frame, or one that is too large."""
+
+    size = check_readable(path)
+    if size > _MOST_BYTES:
+        raise BadInputError(f"{shown(path)}: is larger than {_MOST_BYTES / 1e6:g} MB")
+    ended = False
+
+    def read() -> bytes:
+        nonlocal ended
+        data = stream.read(_CHUNK)
+        ended = not data
+        return data
+
+    try:
+        with path.open("rb") as stream:
+            result = record(read, lambda ticks: not ended)
+    except OSError as error:
+        raise BadInputError(f"{shown(path)}: cannot be read: {error.strerror or error}") from error
+    if not ended:
+        # For a port Ctrl-C is the end of the log; of a file it would be half.
+        raise KeyboardInterrupt
+    if not result.ticks:
+        raise BadInputError(
+            f"{shown(path)}: holds no frame of the example sketch, only {result.skipped} other bytes"
+        )
+    yield from iter_rows(io.BytesIO(result.text.encode()), shown(path))

@@ -1,0 +1,204 @@
+"""What a rig folder holds: pictures, pictures of the plane, logs at rest, of poses and in motion.
+
+A symbolic link that leads out of the folder is left out and named: a folder that somebody else made
+must not bring files of this machine into a page that is passed on.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import os
+import stat
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from calib.core.errors import BadInputError
+from calib.core.files import file_sha256, one_line, shown
+
+_PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm")
+_LOGS = (".csv", ".parquet", ".mcap", ".bag", ".db3")
+_HEAD_BYTES = 1 << 16
+_SAFE = frozenset("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789-_.")
+_LONGEST = 80
+
+
+@dataclass(frozen=True)
+class LogFile:
+    """A log of the folder.
+
+    Attributes
+    ----------
+    slug : a name that is safe as a file's name, different for each log.
+    columns : that it has, None where it cannot be told.
+    kind : "rest", "poses" or "motion", by the file's name.
+    """
+
+    path: Path
+    slug: str
+    columns: tuple[str, ...] | None
+    kind: str
+
+    def has(self, *names: str) -> bool:
+        """Whether the log may have all these columns."""
+        return self.columns is None or all(name in self.columns for name in names)
+
+
+@dataclass(frozen=True)
+class Folder:
+    """A rig folder.
+
+    Attributes
+    ----------
+    pictures, plane : picture files; board, plane_board : their board.yaml, None without.
+    logs : in the order of their names.
+    rig : the folder's own rig.yaml, None without.
+    left_out : sentences on files that were not taken.
+    """
+
+    root: Path
+    pictures: tuple[Path, ...]
+    board: Path | None
+    plane: tuple[Path, ...]
+    plane_board: Path | None
+    logs: tuple[LogFile, ...]
+    rig: Path | None
+    left_out: tuple[str, ...]
+
+    def files(self) -> tuple[Path, ...]:
+        """Every file that is read."""
+        single = (self.board, self.plane_board, self.rig)
+        return (
+            *self.pictures,
+            *self.plane,
+            *(path for path in single if path is not None),
+            *with_topics(log.path for log in self.logs),
+        )
+
+    def name_of(self, path: Path) -> str:
+        """Name relative to the folder, the same wherever the folder lies."""
+        return path.relative_to(self.root).as_posix()
+
+
+def inside(path: Path, root: Path) -> bool:
+    """Whether a path, links followed, lies in a folder."""
+    return Path(os.path.realpath(path)).is_relative_to(Path(os.path.realpath(root)))
+
+
+def slug(name: str, taken: Iterable[str] = ()) -> str:
+    """A file's stem as a safe name: no separators, control characters or leading dots and dashes.
+
+    Where something had to be changed, or the name is taken, six digits of the name's hash tell it apart.
+    """
+    raw = name.encode("utf-8", "surrogateescape")
+    text = "".join(c if c in _SAFE else "_" for c in name).lstrip(".-")[:_LONGEST]
+    if text != name or not text or text.lower() in {other.lower() for other in taken}:
+        text = f"{text or 'log'}_{hashlib.sha256(raw).hexdigest()[:6]}"
+    return text
+
+
+def read_folder(root: Path, follow_links: bool = False) -> Folder:
+    """What a rig folder holds. Raises `BadInputError` where there is no such folder, or nothing in it."""
+    if not root.is_dir():
+        what = "is a file" if root.exists() else "is not there"
+        raise BadInputError(f"{shown(root)}: {what}, expected a folder with images/ and logs/")
+    root = root.absolute()
+    left_out: list[str] = []
+
+    def taken(path: Path) -> bool:
+        try:
+            regular = stat.S_ISREG(path.stat().st_mode)
+        except OSError:
+            left_out.append(f"{_named(path, root)}: leads nowhere and was left out")
+            return False
+        if not regular:
+            return False
+        if not follow_links and not inside(path, root):
+            left_out.append(f"{_named(path, root)}: is a link out of the folder and was left out")
+            return False
+        return True
+
+    pictures, board = _pictures(root / "images", taken)
+    plane, plane_board = _pictures(root / "images" / "plane", taken)
+    logs: list[LogFile] = []
+    for path in _listed(root / "logs", _LOGS):
+        if all(taken(part) for part in with_topics([path])):
+            name = slug(path.stem, (log.slug for log in logs))
+            logs.append(LogFile(path, name, _columns(path), _kind(path.name)))
+    own = root / "rig.yaml"
+    rig = own if own.is_file() and taken(own) else None
+    if not (pictures or plane or logs):
+        raise BadInputError(
+            f"{shown(root)}: holds no pictures in images/ and no logs in logs/; see calib run --help"
+        )
+    return Folder(root, pictures, board, plane, plane_board, tuple(logs), rig, tuple(left_out))
+
+
+def _named(path: Path, root: Path) -> str:
+    return one_line(path.relative_to(root).as_posix())
+
+
+def _pictures(folder: Path, taken: Callable[[Path], bool]) -> tuple[tuple[Path, ...], Path | None]:
+    pictures = tuple(path for path in _listed(folder, _PICTURES) if taken(path))
+    board = folder / "board.yaml"
+    return pictures, board if board.exists() and taken(board) else None
+
+
+def _listed(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    if not folder.is_dir():
+        return []
+    try:
+        found = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith(".")]
+    except OSError as error:
+        raise BadInputError(f"{shown(folder)}: cannot be listed: {error.strerror or error}") from error
+    return sorted(found, key=lambda path: path.name)
+
+
+def _kind(name: str) -> str:
+    for start, kind in (("static", "rest"), ("poses", "poses")):
+        if name.lower().startswith(start):
+            return kind
+    return "motion"
+
+
+def with_topics(logs: Iterable[Path]) -> tuple[Path, ...]:
+    """Logs, each followed by the file beside it that says which topic of a bag is which column."""
+    from calib.io.bags import find_topics, is_bag
+
+    listed: list[Path] = []
+    for path in logs:
+        topics = find_topics(path) if is_bag(path) else None
+        listed += [path] if topics is None else [path, topics]
+    return tuple(dict.fromkeys(listed))
+
+
+def _columns(path: Path) -> tuple[str, ...] | None:
+    """Names in the header of a CSV, columns of another log; whether they make sense the verbs say."""
+    if path.suffix.lower() != ".csv":
+        from calib.io.logs import iter_log
+
+        try:
+            return tuple(next(iter_log(path)).columns)
+        except (BadInputError, StopIteration):
+            return None
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(_HEAD_BYTES).decode("utf-8-sig", "replace")
+    except OSError:
+        return None
+    lines = [line for line in head.splitlines() if line.strip() and not line.startswith("#")]
+    try:
+        return tuple(name.strip() for name in next(csv.reader(lines[:1]), []))
+    except csv.Error:
+        return None
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 of a file of any size. Raises `BadInputError` for one that cannot be read."""
+    return file_sha256(path)
+
+
+def folder_digests(folder: Folder) -> dict[Path, str]:
+    """SHA-256 of every file that is read."""
+    return {path: digest_of(path) for path in folder.files()}

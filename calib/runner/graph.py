@@ -1,0 +1,739 @@
+"""A run: every stage as soon as what it reads is known, old results where nothing has changed."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import importlib
+import json
+import multiprocessing
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import Any, Protocol
+
+from pydantic import ValidationError
+
+from calib.core.errors import EXIT_DONE, EXIT_POOR, BadInputError
+from calib.core.files import check_folder, make_folder, one_line, read_yaml_mapping, shown, write_atomically
+from calib.core.rig import Rig, read_rig, rig_text, validation_sentence
+from calib.runner.cache import Result, held, key_of, load, remove, store
+from calib.runner.folder import Folder, LogFile, folder_digests, with_topics
+
+# ----------------------------------------------------------------------
+# Sections of the rig's file, handed from stage to stage.
+#
+# A stage gets a file of its own with the sections that its row names, and gives back those that it writes.
+# What a run knows in the end is put together from these parts in the order of the file, whatever the order
+# in which the stages came to an end.
+
+
+@dataclass
+class Sections:
+    """Sections by name as plain values, and the hashes of what each was learnt from."""
+
+    values: dict[str, Any] = field(default_factory=dict)
+    inputs: dict[str, dict[str, str]] = field(default_factory=dict)
+
+    def only(self, names: Iterable[str]) -> Sections:
+        """Those of these names."""
+        wanted = set(names)
+        return Sections(
+            {name: value for name, value in self.values.items() if name in wanted},
+            {name: value for name, value in self.inputs.items() if name in wanted},
+        )
+
+    def without(self, names: Iterable[str]) -> Sections:
+        """All but those of these names."""
+        return self.only(set(self.values) - set(names))
+
+    def joined(self, other: Sections) -> Sections:
+        """Both; the other's where both have one."""
+        return Sections({**self.values, **other.values}, {**self.inputs, **other.inputs})
+
+    def canonical(self) -> str:
+        """All of it as one line, the same for the same sections; quicker to make than the file's text."""
+        return json.dumps([self.values, self.inputs], sort_keys=True, ensure_ascii=True, default=str)
+
+    def text(self, source: Path) -> str:
+        """Text of a rig's file with these sections; `source` is named should they not be valid."""
+        inputs = {name: dict(sorted(self.inputs[name].items())) for name in sorted(self.inputs)}
+        try:
+            return rig_text(Rig.model_validate({**self.values, "provenance": {"inputs": inputs}}))
+        except ValidationError as error:
+            raise BadInputError(validation_sentence(source, error)) from error
+
+
+def sections_of(path: Path) -> Sections:
+    """Sections of a rig's file. Raises `BadInputError` as `read_rig` does."""
+    read_rig(path)
+    document = read_yaml_mapping(path)
+    provenance = document.pop("provenance", None) or {}
+    return Sections(document, dict(provenance.get("inputs") or {}))
+
+
+# ----------------------------------------------------------------------
+# The stages of a run: each is a command as a person would type it, and what it depends on.
+#
+# A later verb joins by one row in `STAGES`. A stage sees only the sections of the rig's file that its row
+# names (and what the person wrote into the folder's own rig.yaml), so that what it does cannot depend on
+# anything else, and the sections that it writes are those that its row names.
+
+_IMU = ("ax_mps2", "ay_mps2", "gz_radps")
+_CAMERA = ("u_px", "v_px")
+_PUMP = ("pwm1", "pwm2")
+
+
+@dataclass(frozen=True)
+class Planned:
+    """Arguments of a stage's verb, without those that all stages have, and the files that it reads."""
+
+    arguments: tuple[str, ...]
+    inputs: tuple[Path, ...]
+
+
+Plan = Callable[[Folder], Planned | str]
+"""What a stage does with a folder, or why it has nothing to do."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A row of the table.
+
+    Attributes
+    ----------
+    name : the stage's folder and anchor. title : its heading.
+    verb : words of the command.
+    plan : arguments and inputs for a folder; `plan_log` instead for a stage that runs once for each log.
+    writes : sections of the rig's file. needs : sections without which it cannot run. uses : sections that
+        it reads where they are.
+    output : name of what it writes with -o, "" for nothing. figures : whether it draws.
+    flashed : whether its result goes into the firmware.
+    seconds : about how long it takes, by which the runner begins what holds up most.
+    """
+
+    name: str
+    title: str
+    verb: tuple[str, ...]
+    plan: Plan | None = None
+    plan_log: Callable[[LogFile], Planned | str] | None = None
+    writes: tuple[str, ...] = ()
+    needs: tuple[str, ...] = ()
+    uses: tuple[str, ...] = ()
+    output: str = ""
+    figures: bool = True
+    flashed: bool = False
+    seconds: float = 1.0
+
+
+@dataclass(frozen=True)
+class Job:
+    """A stage with its part of the folder: what to run, or why not.
+
+    Attributes
+    ----------
+    name : unique, and safe as a path: that of the stage, or stage and log.
+    log : of a stage that runs for each log.
+    planned : None where `reason` says why there is nothing to do.
+    """
+
+    name: str
+    stage: Stage
+    log: LogFile | None
+    planned: Planned | None
+    reason: str = ""
+
+
+def _given(paths: tuple[Path, ...], *more: str) -> Planned:
+    return Planned((*(str(path) for path in paths), *more), with_topics(paths))
+
+
+def _logs(folder: Folder, kind: str, *columns: str) -> tuple[Path, ...]:
+    return tuple(log.path for log in folder.logs if log.kind == kind and log.has(*columns))
+
+
+def _linked(folder: Folder, start: str) -> str:
+    return next((sentence for sentence in folder.left_out if sentence.startswith(start)), "")
+
+
+def _intrinsics(folder: Folder) -> Planned | str:
+    if not folder.pictures:
+        return "no pictures in images/"
+    linked = _linked(folder, "images/board.yaml")
+    board = () if folder.board is None else (folder.board,)
+    return linked or Planned(tuple(map(str, folder.pictures)), (*folder.pictures, *board))
+
+
+def _extrinsics(folder: Folder) -> Planned | str:
+    if not folder.plane:
+        return "no pictures in images/plane/"
+    if linked := _linked(folder, "images/plane/"):
+        return linked
+    board = () if folder.plane_board is None else (folder.plane_board,)
+    return Planned((str(folder.root / "images" / "plane"),), (*folder.plane, *board))
+
+
+def _static(folder: Folder) -> Planned | str:
+    logs = _logs(folder, "rest", *_IMU)
+    return _given(logs) if logs else "no logs of an IMU at rest, logs/static*.csv"
+
+
+def _poses(folder: Folder) -> Planned | str:
+    logs = _logs(folder, "poses", *_IMU)
+    return _given(logs[:1]) if logs else "no log of rests in different poses, logs/poses*.csv"
+
+
+def _moving(folder: Folder) -> Planned | str:
+    logs = _logs(folder, "motion", *_IMU)
+    return _given(logs) if logs else "no logs of an IMU in motion in logs/"
+
+
+def _drift(folder: Folder) -> Planned | str:
+    logs = (*_logs(folder, "rest", *_IMU), *_logs(folder, "motion", *_IMU)[:1])
+    # What is installed beside calib must not change the page.
+    return _given(logs, "--no-peers") if logs else "no logs of an IMU in logs/"
+
+
+def _lowpass(folder: Folder) -> Planned | str:
+    logs = _logs(folder, "motion", *_CAMERA)
+    if not logs:
+        return Planned((), ())
+    return Planned(("--log", str(logs[0])), with_topics(logs[:1]))
+
+
+def _both(folder: Folder) -> Planned | str:
+    logs = _logs(folder, "motion", *_IMU, *_CAMERA)
+    return _given(logs) if logs else "no logs of camera and IMU in motion in logs/"
+
+
+def _identify(folder: Folder) -> Planned | str:
+    logs = _logs(folder, "motion", *_CAMERA, *_PUMP)
+    # A fit without each log in turn takes as many times as long, and is left to the verb.
+    return _given(logs, "--no-hold-back") if logs else "no logs with camera and PWM in logs/"
+
+
+def _driven(folder: Folder) -> Planned | str:
+    logs = _logs(folder, "motion", *_CAMERA, *_PUMP)
+    return _given(logs) if logs else "no logs with camera and PWM in logs/"
+
+
+def _nothing(_: Folder) -> Planned | str:
+    return Planned((), ())
+
+
+def _replay(log: LogFile) -> Planned | str:
+    if not (log.has(*_CAMERA) or log.has(*_IMU)):
+        return "the log has neither a camera nor an IMU"
+    return Planned((str(log.path),), with_topics([log.path]))
+
+
+_OPTICS = ("camera", "plane")
+_SENSORS = (*_OPTICS, "lens", "imu", "imu_intrinsics", "orientation_filter", "lowpass", "align", "estimator")
+_MACHINE = ("actuator", "pump")
+
+STAGES: tuple[Stage, ...] = (
+    Stage("intrinsics", "Camera", ("intrinsics",), _intrinsics, writes=("camera",), flashed=True,
+          seconds=5.0),
+    Stage("extrinsics", "Plane of motion", ("extrinsics",), _extrinsics, writes=("plane",), needs=("camera",),
+          flashed=True, seconds=3.0),
+    Stage("distortion", "Lens", ("distortion",), _nothing, writes=("lens",), needs=("camera",),
+          uses=("plane",)),
+    Stage("imu-static", "IMU at rest", ("imu", "static"), _static, writes=("imu",), flashed=True,
+          seconds=4.0),
+    Stage("imu-intrinsics", "IMU in poses", ("imu", "intrinsics"), _poses, writes=("imu_intrinsics",),
+          uses=("imu",)),
+    Stage("imu-tune", "Angle filter", ("imu", "tune"), _moving, writes=("orientation_filter",),
+          uses=(*_OPTICS, "imu", "imu_intrinsics"), flashed=True, seconds=4.0),
+    Stage("imu-drift", "Drift of the angle", ("imu", "drift"), _drift,
+          uses=("imu", "imu_intrinsics", "orientation_filter"), seconds=2.0),
+    Stage("lowpass", "Low-pass", ("lowpass",), _lowpass, writes=("lowpass",), uses=_OPTICS, flashed=True,
+          seconds=3.0),
+    Stage("align", "Camera and IMU together", ("align",), _both, writes=("align",), needs=_OPTICS,
+          uses=("imu", "imu_intrinsics"), flashed=True, seconds=9.0),
+    Stage("identify", "Model of the actuator", ("identify", "logs"), _identify, writes=_MACHINE,
+          needs=_OPTICS, uses=_SENSORS, seconds=9.0),
+    Stage("replay", "States", ("replay",), None, _replay, needs=_OPTICS, uses=(*_SENSORS, *_MACHINE),
+          output="states.csv", seconds=2.0),
+    Stage("control", "Controllers", ("control", "tune"), _nothing, writes=("controller",),
+          uses=(*_OPTICS, *_MACHINE), flashed=True, seconds=3.0),
+    Stage("validate", "Model against log", ("validate",), _driven, needs=_OPTICS,
+          uses=(*_SENSORS, *_MACHINE, "controller"), seconds=8.0),
+    Stage("firmware", "Firmware", ("firmware",), _nothing, needs=("camera",),
+          uses=(*_SENSORS, *_MACHINE, "controller"), output="firmware", figures=False),
+)  # fmt: skip
+"""All stages, each after those whose sections it reads."""
+
+
+def urgency(stages: tuple[Stage, ...] = STAGES) -> dict[str, float]:
+    """Seconds from the start of each stage to the end of all that waits for it, by name."""
+    out: dict[str, float] = {}
+    for stage in reversed(stages):
+        waits = [out[other.name] for other in stages if other.name in out
+                 and {*other.needs, *other.uses} & set(stage.writes)]  # fmt: skip
+        out[stage.name] = stage.seconds + max(waits, default=0.0)
+    return out
+
+
+def jobs_of(folder: Folder, stages: tuple[Stage, ...] = STAGES) -> Iterator[Job]:
+    """The work that a folder asks for, in the table's order."""
+    for stage in stages:
+        if stage.plan_log is not None:
+            if not folder.logs:
+                yield Job(stage.name, stage, None, None, "no logs in logs/")
+            for log in folder.logs:
+                yield _job(f"{stage.name}-{log.slug}", stage, log, stage.plan_log(log))
+        elif stage.plan is not None:
+            yield _job(stage.name, stage, None, stage.plan(folder))
+
+
+def _job(name: str, stage: Stage, log: LogFile | None, planned: Planned | str) -> Job:
+    if isinstance(planned, str):
+        return Job(name, stage, log, None, planned)
+    return Job(name, stage, log, planned)
+
+
+# ----------------------------------------------------------------------
+# Processes in which verbs run, one at a time in each, as if they had been typed.
+#
+# A process is kept for many verbs: starting Python and its libraries takes longer than most verbs do. A
+# verb that brings its process down (out of memory, a fault in a library) fails alone.
+
+_PR_SET_PDEATHSIG = 1
+_LOOK_UP_S = 0.2
+_LOST = 70
+"""Exit code for a verb whose process has died."""
+_LIBRARIES = (
+    "calib.cli.main",
+    "calib.cli.app",
+    "calib.core.rig",
+    "scipy.optimize",
+    "scipy.signal",
+    "numba",
+    "calib.show.style",
+)
+"""What most verbs need and takes long to load; the first of them sets up the others."""
+
+_Process = tuple[multiprocessing.process.BaseProcess, Connection]
+
+
+@dataclass(frozen=True)
+class Command:
+    """A verb to run: its words, and files for what it says on stdout and stderr."""
+
+    name: str
+    words: tuple[str, ...]
+    stdout: Path
+    stderr: Path
+
+
+class Runs(Protocol):
+    """What runs commands: `start` while `free`, then the names and exit codes of `finished` ones."""
+
+    @property
+    def free(self) -> bool:
+        """Whether another command can start."""
+
+    def start(self, command: Command) -> None:
+        """Start a command."""
+
+    def finished(self) -> Iterator[tuple[str, int]]:
+        """Wait until at least one command has ended."""
+
+
+def _serve(channel: Connection, parent: int, ahead: bool) -> None:
+    """Life of a process: commands in, exit codes out, until the other end closes.
+
+    One that is started `ahead` of its first command loads meanwhile what most of them need.
+    """
+    # Ctrl-C reaches all processes of a terminal; the first one answers for all.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL))
+        if os.getppid() != parent:
+            os._exit(1)
+    for name in _LIBRARIES if ahead else ():
+        # The verb that needs it says so.
+        with contextlib.suppress(ImportError):
+            importlib.import_module(name)
+    while True:
+        try:
+            command = channel.recv()
+        except EOFError:
+            return
+        code = run_here(command)
+        try:
+            channel.send(code)
+        except OSError:
+            return
+
+
+def run_here(command: Command) -> int:
+    """Run a verb in this process and return its exit code; one at a time, for it takes over stdout."""
+    from calib.cli.main import main
+
+    before = sys.argv, sys.stdout, sys.stderr
+    how: Any = {"mode": "w", "encoding": "utf-8", "errors": "backslashreplace"}
+    try:
+        with command.stdout.open(**how) as out, command.stderr.open(**how) as told:
+            sys.argv, sys.stdout, sys.stderr = ["calib", *command.words], out, told
+            try:
+                main()
+            except SystemExit as leaving:
+                return leaving.code if isinstance(leaving.code, int) else 0
+    except OSError:
+        return _LOST
+    finally:
+        sys.argv, sys.stdout, sys.stderr = before
+
+
+class Pool:
+    """A few processes that run verbs; use with `with`."""
+
+    def __init__(self, count: int) -> None:
+        self._context = multiprocessing.get_context("spawn")
+        self._count = max(1, count)
+        self._idle: list[_Process] = []
+        self._busy: dict[str, _Process] = {}
+
+    def __enter__(self) -> Pool:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for process, channel in (*self._idle, *self._busy.values()):
+            channel.close()
+            process.kill()
+        for process, _channel in (*self._idle, *self._busy.values()):
+            process.join()
+
+    @property
+    def free(self) -> bool:
+        """Whether another command can start."""
+        return len(self._busy) < self._count
+
+    def start(self, command: Command) -> None:
+        """Hand a command to an idle process, or to a new one; with the first, another is made ready."""
+        first = not (self._idle or self._busy)
+        process, channel = self._idle.pop() if self._idle else self._made(ahead=False)
+        self._busy[command.name] = process, channel
+        with contextlib.suppress(OSError):
+            channel.send(command)
+        if first and self._count > 1:
+            self._idle.append(self._made(ahead=True))
+
+    def _made(self, ahead: bool) -> _Process:
+        channel, theirs = self._context.Pipe()
+        process = self._context.Process(target=_serve, args=(theirs, os.getpid(), ahead))
+        process.start()
+        theirs.close()
+        return process, channel
+
+    def finished(self) -> Iterator[tuple[str, int]]:
+        """Names and exit codes of commands that have ended; waits for at least one."""
+        ready: list[object] = []
+        while not ready and self._busy:
+            # The wait is a short one, again and again, so that Ctrl-C is answered.
+            ready = list(wait([channel for _, channel in self._busy.values()], timeout=_LOOK_UP_S))
+        for name, (process, channel) in list(self._busy.items()):
+            if channel not in ready:
+                continue
+            del self._busy[name]
+            try:
+                code = int(channel.recv())
+                self._idle.append((process, channel))
+            except (EOFError, OSError):
+                process.kill()
+                process.join()
+                channel.close()
+                code = _LOST
+            yield name, code
+
+
+# ----------------------------------------------------------------------
+# The run itself: every stage as soon as what it reads is known, old results where nothing has changed.
+#
+# Each stage works in a folder of its own under `.calib/work` and its result appears under `.calib/stages`
+# in one step, so that a run can be killed between any two writes: what is whole is used by the next run,
+# all else is made again, and the end is the same.
+
+HIDDEN = ".calib"
+_USABLE = (EXIT_DONE, EXIT_POOR)
+
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Done:
+    """How a job ended.
+
+    Attributes
+    ----------
+    status : "ok", "poor", "failed"; "blocked" by one that failed; "skipped" where the folder has nothing
+        for it; "missing" where this version has no such verb.
+    reason : one sentence for all but "ok".
+    result : None where nothing was run.
+    """
+
+    job: Job
+    status: str
+    reason: str = ""
+    result: Result | None = None
+    reused: bool = False
+
+
+@contextmanager
+def opened(out: Path, folder: Path | None) -> Iterator[int | None]:
+    """Make and lock the output folder; yields the process whose run was interrupted there, or None.
+
+    Raises `BadInputError` when another run is at work there, when it is the folder that is read, and for
+    links that would lead a write out of it.
+    """
+    if folder is not None and os.path.realpath(out) in (
+        os.path.realpath(folder), os.path.realpath(folder / "images"),
+        os.path.realpath(folder / "images" / "plane"), os.path.realpath(folder / "logs"),
+    ):  # fmt: skip
+        raise BadInputError(f"{shown(out)}: is the folder that is read, expected another one for the results")
+    check_folder(out)
+    hidden = out / HIDDEN
+    ours = [hidden / name for name in ("work", "stages", "pictures", "figures")]
+    public = [out / name for name in ("states", "firmware", "rig.yaml", "report.html")]
+    for path in (hidden, *ours, *public):
+        if path.is_symlink():
+            raise BadInputError(f"{shown(path)}: is a symbolic link, expected a place in the output folder")
+    make_folder(hidden)
+    with held(hidden / "lock", out) as interrupted:
+        remove(hidden / "work")
+        _sweep(out)
+        make_folder(hidden / "work")
+        make_folder(hidden / "stages")
+        yield interrupted
+
+
+def _sweep(out: Path) -> None:
+    """Remove what an interrupted write has left beside the file that it was about."""
+    hidden = out / HIDDEN
+    left = [path for name in ("rig.yaml", "report.html") for path in out.glob(f".{name}.*.tmp")]
+    for folder in (hidden, hidden / "pictures", hidden / "figures"):
+        left += folder.glob(".*.tmp")
+    for path in left:
+        with contextlib.suppress(OSError):
+            path.unlink()
+
+
+def _stamp(path: Path) -> tuple[int, int, int]:
+    try:
+        status = path.stat()
+    except OSError:
+        return (-1, 0, 0)
+    return status.st_size, status.st_mtime_ns, status.st_ino
+
+
+@dataclass
+class Runner:
+    """A run of a folder into an opened output folder.
+
+    Parameters
+    ----------
+    runs : what runs commands.
+    available : whether this version has a verb.
+    tell : gets a line for each stage that has ended; `progress` how many there are.
+    fresh : whether old results are left aside.
+    """
+
+    folder: Folder
+    out: Path
+    runs: Runs
+    available: Callable[[tuple[str, ...]], bool]
+    tell: Tell = lambda _: None
+    progress: Callable[[int, int], None] = lambda _done, _total: None
+    stages: tuple[Stage, ...] = STAGES
+    fresh: bool = False
+    done: dict[str, Done] = field(default_factory=dict)
+    _base: Sections = field(default_factory=Sections)
+    _sections: dict[str, Sections] = field(default_factory=dict)
+    _digests: dict[Path, str] = field(default_factory=dict)
+    _before: dict[Path, tuple[int, int, int]] = field(default_factory=dict)
+    _began: dict[str, float] = field(default_factory=dict)
+
+    def run(self) -> list[Done]:
+        """Run all jobs; returns how they ended, in the table's order."""
+        jobs = list(jobs_of(self.folder, self.stages))
+        self._before = {path: _stamp(path) for path in self.folder.files()}
+        self._digests = folder_digests(self.folder)
+        if self.folder.rig is not None:
+            told = sections_of(self.folder.rig)
+            asked = [job for job in jobs if job.planned is not None and self.available(job.stage.verb)]
+            learnt = {name for job in asked for name in job.stage.writes}
+            self._base = told.without(learnt)
+        urgent = urgency(self.stages)
+        waiting = sorted(jobs, key=lambda job: -urgent[job.stage.name])
+        running: dict[str, tuple[Job, str, Path]] = {}
+        while waiting or running:
+            waiting = [job for job in waiting if not self._settled(job)]
+            for job in list(waiting):
+                if not self.runs.free:
+                    break
+                if self._ready(job, waiting, running):
+                    waiting.remove(job)
+                    started = self._start(job)
+                    if started is not None:
+                        running[job.name] = started
+            if running and (not self.runs.free or not self._any_ready(waiting, running)):
+                for name, code in self.runs.finished():
+                    job, key, work = running.pop(name)
+                    self._end(job, key, work, code)
+            self.progress(len(self.done), len(jobs))
+        return [self.done[job.name] for job in jobs]
+
+    def sections(self) -> Sections:
+        """All that is known at the end: what the person told and what the stages have learnt."""
+        whole = self._base
+        for stage in self.stages:
+            for name, part in self._sections.items():
+                if self.done[name].job.stage is stage:
+                    whole = whole.joined(part)
+        return whole
+
+    def _any_ready(self, waiting: list[Job], running: dict[str, tuple[Job, str, Path]]) -> bool:
+        return any(self._ready(job, waiting, running) for job in waiting)
+
+    def _settled(self, job: Job) -> bool:
+        """Whether a job has ended without being run; it is then among `done`."""
+        stage = job.stage
+        if not self.available(stage.verb):
+            self._finish(Done(job, "missing", f"this version has no calib {' '.join(stage.verb)}"))
+            return True
+        if job.planned is None:
+            self._finish(Done(job, "skipped", job.reason))
+            return True
+        return False
+
+    def _ready(self, job: Job, waiting: list[Job], running: dict[str, tuple[Job, str, Path]]) -> bool:
+        read = {*job.stage.needs, *job.stage.uses}
+        others = [*(other for other in waiting if other is not job), *(one for one, _, _ in running.values())]
+        return not any(read & set(other.stage.writes) for other in others)
+
+    def _known(self, job: Job) -> Sections:
+        """The sections that a job may see."""
+        whole = self.sections()
+        return whole.only({*self._base.values, *job.stage.needs, *job.stage.uses}).without(job.stage.writes)
+
+    def _start(self, job: Job) -> tuple[Job, str, Path] | None:
+        """Start a job, or end it at once: blocked, or with the result that is there."""
+        assert job.planned is not None
+        known = self._known(job)
+        lacking = next((name for name in job.stage.needs if name not in known.values), None)
+        if lacking is not None:
+            self._finish(self._blocked(job, lacking))
+            return None
+        inputs = {self.folder.name_of(path): self._digests[path] for path in job.planned.inputs}
+        names = {str(path): self.folder.name_of(path) for path in job.planned.inputs}
+        root = str(self.folder.root) + os.sep
+        words = tuple(names.get(word, word.removeprefix(root)) for word in job.planned.arguments)
+        key = key_of((*job.stage.verb, *words), inputs, known.canonical())
+        kept = None if self.fresh else load(self.out / HIDDEN / "stages" / job.name, key)
+        if kept is not None and kept.code in _USABLE:
+            self._finish(self._judged(job, kept, reused=True))
+            return None
+        work = self.out / HIDDEN / "work" / job.name
+        remove(work)
+        make_folder(work)
+        write_atomically(work / "rig.yaml", known.text(self.folder.rig or self.out / "rig.yaml"))
+        arguments = [*job.stage.verb, "--json", "--rig", str(work / "rig.yaml")]
+        if job.stage.figures:
+            arguments += ["--figures", str(work / "figures")]
+        if job.stage.output:
+            arguments += ["-o", str(work / job.stage.output)]
+        # Names that begin with a dash are no options: all paths here begin with a slash.
+        arguments += job.planned.arguments
+        self._began[job.name] = time.monotonic()
+        self.runs.start(Command(job.name, tuple(arguments), work / "document.json", work / "messages.txt"))
+        return job, key, work
+
+    def _blocked(self, job: Job, section: str) -> Done:
+        for done in self.done.values():
+            if section in done.job.stage.writes:
+                if done.status in ("failed", "blocked"):
+                    return Done(job, "blocked", f"needs {section}, and {done.job.stage.title} has failed")
+                return Done(job, "skipped", f"needs {section}: {done.reason}")
+        return Done(job, "skipped", f"needs {section}, which the folder's rig.yaml has not")
+
+    def _end(self, job: Job, key: str, work: Path, code: int) -> None:
+        assert job.planned is not None
+        changed = next((path for path in job.planned.inputs if _stamp(path) != self._before[path]), None)
+        if changed is not None:
+            name = one_line(self.folder.name_of(changed))
+            self._finish(Done(job, "failed", f"{name} changed while it was read; run it again"))
+            return
+        self._tidy(work)
+        hidden = self.out / HIDDEN
+        result = store(work, hidden / "stages" / job.name, key, code, hidden / "work" / f"old-{job.name}")
+        self._finish(self._judged(job, result, reused=False))
+
+    def _tidy(self, work: Path) -> None:
+        """Leave nothing in a result that differs from run to run: durations, places."""
+        document, messages = work / "document.json", work / "messages.txt"
+        with contextlib.suppress(OSError, ValueError):
+            told = json.loads(document.read_text(encoding="utf-8"))
+            if isinstance(told, dict):
+                told.pop("seconds", None)
+                write_atomically(document, json.dumps(told, indent=1) + "\n")
+        with contextlib.suppress(OSError):
+            text = messages.read_text(encoding="utf-8", errors="replace")
+            root, place = str(self.folder.root) + os.sep, str(work)
+            kept = [line.replace(root, "") for line in text.splitlines() if place not in line]
+            if not any(line.startswith("calib: ") for line in kept):
+                # What the verb ended with is told even where it names our place.
+                kept += [
+                    line.replace(place + os.sep, "").replace(root, "")
+                    for line in text.splitlines() if line.startswith("calib: ")
+                ]  # fmt: skip
+            write_atomically(messages, "".join(f"{line}\n" for line in kept))
+
+    def _judged(self, job: Job, result: Result, reused: bool) -> Done:
+        if result.code not in _USABLE:
+            said = result.messages()
+            words = said[-1].removeprefix("calib: ") if said else f"ended with exit code {result.code}"
+            return Done(job, "failed", words, result)
+        part = Sections()
+        if job.stage.writes:
+            try:
+                part = sections_of(result.folder / "rig.yaml").only(job.stage.writes)
+            except BadInputError as error:
+                return Done(job, "failed", str(error), result)
+            if not part.values:
+                return Done(job, "failed", f"has written no {' and no '.join(job.stage.writes)}", result)
+        self._sections[job.name] = part
+        if result.code == EXIT_DONE:
+            return Done(job, "ok", "", result, reused)
+        return Done(job, "poor", _reason(job, part, result), result, reused)
+
+    def _finish(self, done: Done) -> None:
+        self.done[done.job.name] = done
+        words = {"missing": "not available", "blocked": "not run"}.get(done.status, done.status)
+        of = "" if done.job.log is None else f" of {one_line(done.job.log.path.stem)}"
+        began = self._began.pop(done.job.name, None)
+        how = "" if began is None else f", {time.monotonic() - began:.1f} s"
+        how = ", as before" if done.reused else how
+        why = f" ({done.reason})" if done.reason else ""
+        self.tell(f"{done.job.stage.title}{of}: {words}{how}{why}")
+
+
+def _reason(job: Job, part: Sections, result: Result) -> str:
+    """The first reason that a stage gives for a poor result."""
+    for name in job.stage.writes:
+        reasons = part.values.get(name, {}).get("reasons")
+        if reasons:
+            return str(reasons[0])
+    for value in result.document().values():
+        logs = value.get("logs") if isinstance(value, dict) else None
+        for log in logs if isinstance(logs, list) else []:
+            if isinstance(log, dict) and log.get("reasons"):
+                return str(log["reasons"][0])
+    said = result.messages()
+    return said[-1] if said else "fails its quality gate"

@@ -1,0 +1,203 @@
+"""What a run leaves in its folder: rig.yaml, states/, firmware/, and a summary for the page."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from calib.core.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_POOR, BadInputError
+from calib.core.files import make_folder, one_line, read_text, shown, write_atomically
+from calib.runner.folder import Folder, digest_of
+from calib.runner.graph import HIDDEN, Done, Job, Runner
+
+# ----------------------------------------------------------------------
+# What a run leaves in its folder: rig.yaml, states/, firmware/, and a summary for the page.
+#
+# Each file is replaced in one step, only where it differs. Files that an earlier run has left and this one
+# does not (of a log that is gone) are removed; files of other origin are not touched.
+
+_LIST = "outputs.json"
+
+
+def exit_code(ended: Sequence[Done]) -> int:
+    """3 when a stage has failed, 1 when one is poor or there is no firmware, else 0."""
+    if any(done.status in ("failed", "blocked") for done in ended):
+        return EXIT_BAD_INPUT
+    flashed = any(done.job.stage.name == "firmware" and done.status == "ok" for done in ended)
+    return EXIT_DONE if flashed and all(done.status != "poor" for done in ended) else EXIT_POOR
+
+
+def summary(runner: Runner, ended: Sequence[Done], simulated: bool) -> dict[str, Any]:
+    """What the page tells of a run: nothing of time or place, so that the same inputs give the same."""
+    jobs = []
+    for done in ended:
+        job = done.job
+        planned = job.planned
+        jobs.append(
+            {
+                "name": job.name,
+                "stage": job.stage.name,
+                "title": job.stage.title,
+                "verb": " ".join(job.stage.verb),
+                "log": None if job.log is None else one_line(job.log.path.name),
+                "inputs": [] if planned is None else [_named(runner.folder, path) for path in planned.inputs],
+                "command": _command(runner.folder, job),
+                "writes": list(job.stage.writes),
+                "flashed": job.stage.flashed,
+                "status": done.status,
+                "reason": done.reason,
+            }
+        )
+    return {
+        "schema": 1,
+        "simulated": simulated,
+        "pictures": len(runner.folder.pictures),
+        "logs": [one_line(log.path.name) for log in runner.folder.logs],
+        "left_out": list(runner.folder.left_out),
+        "jobs": jobs,
+    }
+
+
+def _command(folder: Folder, job: Job) -> list[str]:
+    """Words of the command as a person would type them in the folder."""
+    root = f"{folder.root}{os.sep}"
+    words = () if job.planned is None else job.planned.arguments
+    return ["calib", *job.stage.verb, *(one_line(word.removeprefix(root)) for word in words)]
+
+
+def _named(folder: Folder, path: Path) -> str:
+    return one_line(folder.name_of(path))
+
+
+def publish(runner: Runner, ended: Sequence[Done], told: dict[str, Any]) -> list[str]:
+    """Write all but the page; returns the names of the files relative to the output folder."""
+    out = runner.out
+    wanted: dict[str, Path] = {}
+    for done in ended:
+        if done.result is None or done.status not in ("ok", "poor"):
+            continue
+        output = done.job.stage.output
+        if done.job.log is not None and output in done.result.files:
+            wanted[f"states/{done.job.log.slug}{Path(output).suffix}"] = done.result.folder / output
+        elif output:
+            for name in done.result.files:
+                if name.startswith(f"{output}/"):
+                    wanted[name] = done.result.folder / name
+    names = sorted(wanted)
+    before = _listed(out)
+    # Named first and written then: a file of ours is never forgotten.
+    _list(out, sorted({*before, *names}))
+    for name in names:
+        _copy(wanted[name], out / name, out / HIDDEN / "work")
+    left = [name for name in sorted(set(before) - set(names)) if not _removed(out, out / name)]
+    for folder in {str(Path(name).parent) for name in before} - {str(Path(name).parent) for name in names}:
+        with contextlib.suppress(OSError):
+            (out / folder).rmdir()
+    # One that could not be removed is tried again by the next run.
+    _list(out, sorted({*names, *left}))
+    _write(out / "rig.yaml", runner.sections().text(out / "rig.yaml"))
+    _write(out / HIDDEN / "run.json", json.dumps(told, indent=1, ensure_ascii=True) + "\n")
+    return ["rig.yaml", *names]
+
+
+def _removed(out: Path, path: Path) -> bool:
+    """Remove a file that an earlier run has left; whether nothing of ours is there any more."""
+    if not path.parent.resolve().is_relative_to(out.resolve()):
+        return True
+    try:
+        path.unlink(missing_ok=True)
+    except OSError:
+        return False
+    return True
+
+
+def _listed(out: Path) -> list[str]:
+    """Names that an earlier run has left, as far as they are such as a run leaves."""
+    with contextlib.suppress(OSError, ValueError, TypeError):
+        found = json.loads((out / HIDDEN / _LIST).read_text(encoding="utf-8"))
+        return [name for name in found if _is_ours(name)]
+    return []
+
+
+def _is_ours(name: object) -> bool:
+    parts = Path(name).parts if isinstance(name, str) else ()
+    return len(parts) == 2 and parts[0] in ("states", "firmware") and parts[1] not in ("..", ".")
+
+
+def _list(out: Path, names: list[str]) -> None:
+    _write(out / HIDDEN / _LIST, json.dumps(names, indent=1) + "\n")
+
+
+def _write(path: Path, text: str) -> None:
+    raw = text.encode("utf-8", "backslashreplace")
+    with contextlib.suppress(OSError):
+        if not path.is_symlink() and path.is_file() and path.read_bytes() == raw:
+            return
+    write_atomically(path, raw)
+
+
+def _copy(source: Path, target: Path, work: Path) -> None:
+    """Copy a file of any size into place in one step."""
+    make_folder(target.parent)
+    if target.is_symlink() or (target.exists() and not target.is_file()):
+        raise BadInputError(f"{shown(target)}: is no file of a run, and was not replaced")
+    if target.is_file() and digest_of(target) == digest_of(source):
+        return
+    between = work / f"copy-{target.name}"
+    try:
+        shutil.copyfile(source, between)
+        with between.open("rb+") as stream:
+            stream.flush()
+            os.fsync(stream.fileno())
+        between.replace(target)
+    except OSError as error:
+        raise BadInputError(f"{shown(target)}: cannot be written: {error.strerror or error}") from error
+
+
+# ----------------------------------------------------------------------
+# run.json: what a run tells the page, read from a folder that may come from anywhere.
+
+_MOST_BYTES = 10_000_000
+Count = Annotated[int, Field(ge=0, strict=True)]
+Text = Annotated[str, Field(strict=True)]
+Flag = Annotated[bool, Field(strict=True)]
+
+
+class _Job(BaseModel):
+    model_config = ConfigDict(extra="ignore")
+
+    name: Text
+    stage: Text
+    title: Text
+    verb: Text
+    log: Text | None
+    inputs: list[Text]
+    command: list[Text]
+    writes: list[Text]
+    flashed: Flag
+    status: Literal["ok", "poor", "failed", "blocked", "skipped", "missing"]
+    reason: Text
+
+
+class _Summary(BaseModel):
+    model_config = ConfigDict(extra="ignore")
+
+    simulated: Flag
+    pictures: Count
+    logs: list[Text]
+    left_out: list[Text]
+    jobs: list[_Job]
+
+
+def read_summary(path: Path) -> dict[str, Any] | None:
+    """The summary that `outputs.publish` has written; None where there is none, or something else."""
+    with contextlib.suppress(BadInputError, ValueError, RecursionError, ValidationError):
+        return _Summary.model_validate(json.loads(read_text(path, _MOST_BYTES))).model_dump()
+    return None

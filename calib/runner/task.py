@@ -1,0 +1,761 @@
+"""One rig of a fleet: its row of the manifest, its files fetched, its run, its outcome."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import importlib
+import io
+import json
+import math
+import platform
+import re
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import cache, partial
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from calib.core.errors import (
+    EXIT_BAD_INPUT,
+    EXIT_DONE,
+    EXIT_INTERNAL,
+    EXIT_POOR,
+    BadInputError,
+    CalibError,
+    pip_install,
+)
+from calib.core.files import make_folder, one_line, read_text, read_yaml_mapping, sha256, shown
+from calib.core.units import parse_corners, parse_square_m
+from calib.runner.cache import key_of, program_digest
+from calib.runner.folder import Folder, folder_digests, read_folder
+from calib.runner.graph import STAGES, Command, Done, Planned, Runner, Stage, opened, run_here
+from calib.runner.outputs import exit_code, publish, summary
+
+# ----------------------------------------------------------------------
+# The packages of the extra `fleet`, loaded when they are first needed.
+
+
+def needed(name: str) -> Any:
+    """A module by its name. Raises `BadInputError` where it is not installed."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise BadInputError(
+            f"{name} cannot be loaded, which fleets and sweeps need ({error}): {pip_install('fleet')}"
+        ) from error
+
+
+# ----------------------------------------------------------------------
+# The manifest of a fleet: one row per rig, as CSV or YAML.
+#
+#     name     what its results are called                path    its folder, or the URL of one
+#     serial   optional: its place in the order of making
+#     corners, square, model, loss, board                 optional: as the options of `calib intrinsics`
+#
+# A CSV has these as its header. A YAML file has a list `rigs` of such mappings, and perhaps `options` that
+# hold for all. Relative paths start at the manifest's folder.
+
+OPTIONS = ("corners", "square", "model", "loss", "board")
+"""What may differ from rig to rig."""
+
+_CHOICES = {
+    "model": ("auto", "pinhole", "radial2", "radial3", "brown5", "rational8"),
+    "loss": ("none", "huber", "cauchy"),
+    "board": ("rigid", "warp", "released", "auto"),
+}
+_COLUMNS = ("name", "path", "serial", *OPTIONS)
+_SIGNS = frozenset(" -_.+#=@()")
+_LONGEST = 80
+_MOST_BYTES = 200_000_000
+_SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
+
+
+@dataclass(frozen=True)
+class RigSpec:
+    """A rig of the manifest.
+
+    Attributes
+    ----------
+    name : safe as the name of a folder.
+    source : absolute path of its folder, or a URL.
+    serial : as written, "" without.
+    options : of its camera, by name.
+    """
+
+    name: str
+    source: str
+    serial: str = ""
+    options: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """All rigs in their order, and the columns that mean nothing here."""
+
+    rigs: tuple[RigSpec, ...]
+    ignored: tuple[str, ...]
+
+
+def is_url(source: str) -> bool:
+    """Whether a source is a URL and not a path."""
+    return _SCHEME.match(source) is not None
+
+
+def without_secrets(source: str) -> str:
+    """A source as it may be shown and kept: a URL without user, password and query, a path as it is."""
+    if not is_url(source):
+        return source
+    scheme, _, rest = source.partition("://")
+    host, slash, path = rest.partition("?")[0].partition("/")
+    return one_line(f"{scheme}://{host.rpartition('@')[2]}{slash}{path}")
+
+
+def serial_number(serial: str) -> float | None:
+    """The number in a serial: all of it, or the digits at its end, as 17 of AX-0017. None without."""
+    found = re.search(r"(\d{1,15})\D{0,2}$", serial)
+    return float(found.group(1)) if found else None
+
+
+def read_manifest(path: Path) -> Manifest:
+    """The rigs of a manifest.
+
+    Raises `BadInputError`, with line or entry, for a manifest without rigs, names that are no names, the
+    same name twice, and options that `calib intrinsics` would refuse.
+    """
+    if path.suffix.lower() in (".yaml", ".yml"):
+        rows, ignored = _from_yaml(path)
+    else:
+        rows, ignored = _from_csv(path)
+    root, rigs, seen = path.absolute().parent, list[RigSpec](), dict[str, str]()
+    for where, row in rows:
+        rig = _rig(f"{shown(path)}, {where}", row, root)
+        # Folders that differ in capitals only are one folder on some systems.
+        before = seen.setdefault(rig.name.casefold(), where)
+        if before != where:
+            raise BadInputError(f"{shown(path)}, {where}: the name {rig.name!r} is that of {before}")
+        rigs.append(rig)
+    if not rigs:
+        raise BadInputError(f"{shown(path)}: names no rigs, expected at least one row with name and path")
+    return Manifest(tuple(rigs), ignored)
+
+
+def twice_told(rigs: Iterable[RigSpec]) -> tuple[str, ...]:
+    """Sentences on what several rigs have in common though it should be a rig's own."""
+    said = []
+    for what, key in (("folder", "source"), ("serial number", "serial")):
+        seen, again = set[str](), list[str]()
+        for rig in rigs:
+            value = getattr(rig, key)
+            if value and value in seen:
+                again.append(rig.name)
+            seen.add(value)
+        if again:
+            verb = "rig has" if len(again) == 1 else "rigs have"
+            said.append(f"{len(again)} {verb} the {what} of one before, the first is {again[0]}")
+    return tuple(said)
+
+
+def _from_csv(path: Path) -> tuple[Iterator[tuple[str, Mapping[str, Any]]], tuple[str, ...]]:
+    text = read_text(path, _MOST_BYTES)
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    try:
+        head = [name.strip() for name in next(reader, [])]
+    except csv.Error as error:
+        raise BadInputError(f"{shown(path)}, line 1: is not CSV: {error}") from error
+    if not any(head):
+        raise BadInputError(f"{shown(path)}: is empty, expected a header with name and path")
+    for name in ("name", "path"):
+        if name not in head:
+            found = one_line(", ".join(head))[:80]
+            raise BadInputError(f"{shown(path)}, line 1: has no column {name}, found {found}")
+    twice = next((name for name in head if name and head.count(name) > 1), None)
+    if twice is not None:
+        raise BadInputError(f"{shown(path)}, line 1: has the column {one_line(twice)!r} twice")
+
+    def rows() -> Iterator[tuple[str, Mapping[str, Any]]]:
+        try:
+            for cells in reader:
+                if not any(cell.strip() for cell in cells):
+                    continue
+                where = f"line {reader.line_num}"
+                if len(cells) != len(head):
+                    raise BadInputError(
+                        f"{shown(path)}, {where}: has {len(cells)} cells, the header {len(head)}"
+                    )
+                yield where, dict(zip(head, cells, strict=True))
+        except csv.Error as error:
+            raise BadInputError(f"{shown(path)}, line {reader.line_num}: is not CSV: {error}") from error
+
+    return rows(), tuple(one_line(name) for name in head if name and name not in _COLUMNS)
+
+
+def _from_yaml(path: Path) -> tuple[Iterator[tuple[str, Mapping[str, Any]]], tuple[str, ...]]:
+    whole = read_yaml_mapping(path)
+    unknown = next((key for key in whole if key not in ("rigs", "options")), None)
+    if unknown is not None:
+        raise BadInputError(
+            f"{shown(path)}: {one_line(unknown)} is not a key that is known here, expected rigs and options"
+        )
+    listed, common = whole.get("rigs"), whole.get("options") or {}
+    if not isinstance(listed, list):
+        raise BadInputError(f"{shown(path)}: has no list rigs, expected one entry for each rig")
+    if not isinstance(common, dict):
+        raise BadInputError(f"{shown(path)}: options is no mapping, expected for instance model: radial2")
+    strange = next((key for key in common if key not in OPTIONS), None)
+    if strange is not None:
+        raise BadInputError(
+            f"{shown(path)}: options.{one_line(str(strange))} is not one of {', '.join(OPTIONS)}"
+        )
+    ignored: dict[str, None] = {}
+
+    def rows() -> Iterator[tuple[str, Mapping[str, Any]]]:
+        for number, entry in enumerate(listed, start=1):
+            where = f"rig {number}"
+            if not isinstance(entry, dict):
+                raise BadInputError(f"{shown(path)}, {where}: is no mapping, expected name and path")
+            yield where, {**common, **entry}
+
+    for entry in listed:
+        if isinstance(entry, dict):
+            ignored |= dict.fromkeys(one_line(str(key)) for key in entry if key not in _COLUMNS)
+    return rows(), tuple(ignored)
+
+
+def _text(where: str, row: Mapping[str, Any], key: str) -> str:
+    value = row.get(key)
+    if value is None:
+        return ""
+    if isinstance(value, bool) or not isinstance(value, str | int | float):
+        raise BadInputError(f"{where}: {key} is {one_line(repr(value))[:60]}, expected text")
+    return str(value).strip(" \t")
+
+
+def _rig(where: str, row: Mapping[str, Any], root: Path) -> RigSpec:
+    name = _text(where, row, "name")
+    problem = _problem_of_name(name)
+    if problem:
+        raise BadInputError(f"{where}: the name {one_line(repr(name))[:60]} {problem}")
+    source = _text(where, row, "path")
+    if not source:
+        raise BadInputError(f"{where}: {name} has no path, expected the rig's folder")
+    if not source.isprintable():
+        raise BadInputError(f"{where}: the path of {name} has control characters in it")
+    if "::" in source and "://" in source:
+        raise BadInputError(f"{where}: the URL of {name} chains several with '::', expected a plain one")
+    if not is_url(source):
+        source = str(root / source)
+    serial = _text(where, row, "serial")
+    if len(serial) > _LONGEST or not serial.isprintable():
+        raise BadInputError(f"{where}: the serial of {name} is no short text")
+    options = []
+    for key in OPTIONS:
+        value = _text(where, row, key)
+        if value:
+            _check_option(f"{where}: {key} of {name}", key, value)
+            options.append((key, value))
+    return RigSpec(name, source, serial, tuple(options))
+
+
+def _problem_of_name(name: str) -> str:
+    if not name:
+        return "is empty, expected a name for the rig's results"
+    if len(name.encode()) > _LONGEST:
+        return f"is longer than {_LONGEST} bytes"
+    if name[0] in ".- " or name[-1] in ". ":
+        return "begins with a dot or a dash, or ends with a dot"
+    wrong = next((c for c in name if not (c.isalnum() or c in _SIGNS)), None)
+    if wrong is not None:
+        signs = "".join(sorted(_SIGNS)).strip()
+        return f"has {one_line(wrong)!r} in it, expected letters, digits and {signs}"
+    return ""
+
+
+def _check_option(where: str, key: str, value: str) -> None:
+    try:
+        if key == "corners":
+            parse_corners(value)
+        elif key == "square":
+            parse_square_m(value)
+    except CalibError as error:
+        raise BadInputError(f"{where}: {error}") from error
+    if key in _CHOICES and value not in _CHOICES[key]:
+        raise BadInputError(f"{where} is {one_line(value)!r}, expected one of {', '.join(_CHOICES[key])}")
+
+
+# ----------------------------------------------------------------------
+# What became of one rig: a small record that is kept in a file of its own.
+
+SAME = "same"
+"""Status of a rig whose earlier result still holds; nothing else of its outcome means anything."""
+
+_MOST_TEXT = 2000
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A rig's row.
+
+    Attributes
+    ----------
+    name, serial, source : of the manifest.
+    status : "ok", "poor", "failed" (bad input or a stage that failed), "broken" (a fault of the program),
+        "lost" (its time ran out, or every process that tried it died), or `SAME`.
+    code : exit code that a single run would have had.
+    sentence : why, in one sentence; "" for "ok".
+    key : of all that the result follows from, "" where that is not known.
+    kind : "run" for all stages, "camera" for those of a camera.
+    reasons : of stages that are not ok. stages : outcome of each stage by its name.
+    values : constants with their standard deviations, by "section.name".
+    seconds, peak_MB : spent on it, and the process's largest memory meanwhile.
+    files : SHA-256 of its results by name.
+    """
+
+    name: str
+    serial: str
+    source: str
+    status: str
+    code: int
+    sentence: str = ""
+    key: str = ""
+    kind: str = ""
+    reasons: tuple[str, ...] = ()
+    stages: dict[str, str] = field(default_factory=dict)
+    values: dict[str, tuple[float, float | None]] = field(default_factory=dict)
+    seconds: float = 0.0
+    peak_MB: float | None = None
+    files: dict[str, str] = field(default_factory=dict)
+
+
+def verdict_of(code: int) -> str:
+    """Status of a rig that came to an end by itself."""
+    names = {EXIT_DONE: "ok", EXIT_POOR: "poor", EXIT_BAD_INPUT: "failed", EXIT_INTERNAL: "broken"}
+    return names.get(code, "failed")
+
+
+def to_json(outcome: Outcome) -> str:
+    """Text of an outcome's file."""
+    told = asdict(outcome)
+    told["sentence"] = one_line(outcome.sentence)[:_MOST_TEXT]
+    told["reasons"] = [one_line(reason)[:_MOST_TEXT] for reason in outcome.reasons]
+    told["values"] = {
+        name: [value, sigma if sigma is not None and math.isfinite(sigma) else None]
+        for name, (value, sigma) in outcome.values.items()
+        if math.isfinite(value)
+    }
+    return json.dumps({"schema": 1, **told}, indent=1, sort_keys=True, allow_nan=False) + "\n"
+
+
+def from_json(text: str) -> Outcome | None:
+    """The outcome in a file's text, None for what is not one."""
+    try:
+        told: dict[str, Any] = json.loads(text)
+        if told.pop("schema") != 1:
+            return None
+        told["reasons"] = tuple(str(reason) for reason in told["reasons"])
+        told["values"] = {
+            str(name): (float(value), None if sigma is None else float(sigma))
+            for name, (value, sigma) in told["values"].items()
+        }
+        told["files"] = {str(name): str(digest) for name, digest in told["files"].items()}
+        return Outcome(**told)
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return None
+
+
+# ----------------------------------------------------------------------
+# A rig folder as this process can read it: where it lies, or fetched from a URL into a folder of scratch.
+#
+# What a server calls its files is not trusted: a name that leads out of the folder is refused, only files
+# that a rig folder can hold are fetched, and their number and size are limited. A fault on the way is
+# tried again; a file that is not there is not.
+
+MOST_BYTES = 4_000_000_000
+_MOST_FILES = 20_000
+_PIECE = 1 << 20
+_SUFFIXES = (
+    ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".csv", ".parquet", ".yaml",
+)  # fmt: skip
+_FOLDERS = ("", "images", "images/plane", "logs")
+_FINAL = (FileNotFoundError, NotADirectoryError, IsADirectoryError, PermissionError, NotImplementedError)
+"""Another attempt would end in the same; the last is fsspec's for what a kind of URL cannot do."""
+
+
+def local_folder(source: str, scratch: Path, attempts: int, most_bytes: int = MOST_BYTES) -> Path:
+    """The rig's folder: the path itself, or `scratch` with what was fetched.
+
+    Raises `BadInputError` for a folder that is not there or cannot be had.
+    """
+    if not is_url(source):
+        root = Path(source)
+        if not root.is_dir():
+            what = "is a file" if root.exists() else "is not there"
+            raise BadInputError(f"{shown(root)}: {what}, expected the rig's folder")
+        return root
+    return _fetched(source, scratch, attempts, most_bytes)
+
+
+def _fetched(url: str, scratch: Path, attempts: int, most_bytes: int) -> Path:
+    try:
+        system, root = needed("fsspec.core").url_to_fs(url)
+    except ImportError as error:
+        raise BadInputError(
+            f"{without_secrets(url)}: needs a package that is not here: {_words(error)}"
+        ) from error
+    except (ValueError, OSError) as error:
+        raise BadInputError(f"{without_secrets(url)}: is no URL that can be read: {_words(error)}") from error
+    told = without_secrets(url)
+    listed = _again(partial(_listed, system, str(root), told), attempts, told)
+    if not listed:
+        raise BadInputError(f"{told}: holds no pictures and no logs")
+    total = 0
+    for name, remote in listed.items():
+        left = most_bytes - total
+        target = scratch / name
+        make_folder(target.parent)
+        total += _again(partial(_copied, system, remote, target, left, told), attempts, told)
+    return scratch
+
+
+def _again(work: Callable[[], Any], attempts: int, told: str) -> Any:
+    """What `work` returns; a fault that may pass is given time to."""
+    for attempt in range(max(1, attempts)):
+        try:
+            return work()
+        except BadInputError:
+            raise
+        except _FINAL as error:
+            raise BadInputError(f"{told}: cannot be read: {_words(error)}") from error
+        except Exception as error:  # each file system has errors of its own
+            if attempt + 1 >= max(1, attempts):
+                raise BadInputError(
+                    f"{told}: could not be fetched in {attempt + 1} attempts: {_words(error)}"
+                ) from error
+            time.sleep(min(0.2 * 4.0**attempt, 10.0))
+    raise AssertionError
+
+
+_SECRETS = (re.compile(r"(?<=://)[^/@\s]+@"), re.compile(r"(?<=://)([^\s?'\"]*)\?[^\s'\"),]*"))
+"""User and password, and the query, of a URL in a text."""
+
+
+def _words(error: BaseException) -> str:
+    text = _SECRETS[1].sub(r"\1", _SECRETS[0].sub("", " ".join(str(error).split())))
+    return one_line(text)[:200] or type(error).__name__
+
+
+def _listed(system: Any, root: str, told: str) -> dict[str, str]:
+    """Files to fetch by their names relative to the folder."""
+    out: dict[str, str] = {}
+    base = root.rstrip("/")
+    for folder in _FOLDERS:
+        place = f"{base}/{folder}".rstrip("/")
+        try:
+            entries = system.ls(place, detail=True)
+        except (FileNotFoundError, NotADirectoryError):
+            if not folder:
+                raise
+            continue
+        for entry in entries:
+            remote = str(entry["name"])
+            # Of a listing only the last part of a name counts; a server's idea of a path does not.
+            name = PurePosixPath(remote.rstrip("/").replace("\\", "/")).name
+            if entry.get("type") == "directory" or not name.lower().endswith(_SUFFIXES):
+                continue
+            if name in ("", ".", "..") or name.startswith((".", "-")) or not name.isprintable():
+                raise BadInputError(f"{told}: has a file with the name {one_line(remote)[:80]}")
+            out[f"{folder}/{name}" if folder else name] = remote
+            if len(out) > _MOST_FILES:
+                raise BadInputError(f"{told}: has more than {_MOST_FILES} files")
+    return dict(sorted(out.items()))
+
+
+def _copied(system: Any, remote: str, target: Path, most: int, told: str) -> int:
+    """Copy one file and return its size; what a listing says of sizes is not relied on."""
+    size = 0
+    with system.open(remote, "rb") as source, target.open("wb") as sink:
+        while piece := source.read(_PIECE):
+            size += len(piece)
+            if size > most:
+                raise BadInputError(f"{told}: is larger than {1e-9 * MOST_BYTES:g} GB, or than was allowed")
+            sink.write(piece)
+    return size
+
+
+# ----------------------------------------------------------------------
+# One rig in this process: the stages of `calib run`, or those of a camera, one verb after the other.
+#
+# The verbs are those that a person types, with the same words, so that the results are the same bytes.
+# Figures are drawn only for a page; they change no number.
+
+CAMERA_STAGES = ("intrinsics", "extrinsics", "distortion")
+_PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm")
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a rig's stages ended, and the results by name relative to `out`."""
+
+    code: int
+    stages: dict[str, str]
+    reasons: tuple[str, ...]
+    out: Path
+    files: tuple[str, ...]
+
+
+class _Here:
+    """Runs each command at once, in this process."""
+
+    def __init__(self) -> None:
+        self._ended: list[tuple[str, int]] = []
+
+    @property
+    def free(self) -> bool:
+        """Whether another command can start."""
+        return not self._ended
+
+    def start(self, command: Command) -> None:
+        """Run a command to its end."""
+        self._ended.append((command.name, run_here(command)))
+
+    def finished(self) -> Iterator[tuple[str, int]]:
+        """The command that was run."""
+        ended, self._ended = self._ended, []
+        yield from ended
+
+
+def rig_folder(root: Path) -> Folder:
+    """What a rig's folder holds; pictures may lie in it directly where there is neither images/ nor logs/.
+
+    Raises `BadInputError` for a folder with nothing to work on.
+    """
+    if (root / "images").is_dir() or (root / "logs").is_dir():
+        return read_folder(root)
+    root = root.absolute()
+    try:
+        found = sorted(path for path in root.iterdir() if path.suffix.lower() in _PICTURES and path.is_file())
+    except OSError as error:
+        raise BadInputError(f"{shown(root)}: cannot be listed: {error.strerror or error}") from error
+    pictures = tuple(path for path in found if not path.is_symlink() and not path.name.startswith("."))
+    if not pictures:
+        raise BadInputError(f"{shown(root)}: holds no images/, no logs/ and no pictures")
+    board, rig = root / "board.yaml", root / "rig.yaml"
+    return Folder(
+        root, pictures, board if board.is_file() else None, (), None, (), rig if rig.is_file() else None, ()
+    )
+
+
+def kind_of(folder: Folder) -> str:
+    """ "camera" for a folder that holds only pictures, "run" for one with logs."""
+    return "run" if folder.logs else "camera"
+
+
+def _given(stage: Stage, folder: Folder, words: tuple[str, ...]) -> Stage:
+    """A stage with more words in its command."""
+    planned = "" if stage.plan is None else stage.plan(folder)
+    if not words or not isinstance(planned, Planned):
+        return stage
+    told = Planned((*planned.arguments, *words), planned.inputs)
+    return replace(stage, plan=lambda _: told)
+
+
+def _stages(
+    folder: Folder, kind: str, options: Sequence[tuple[str, str]], figures: bool
+) -> tuple[Stage, ...]:
+    words = tuple(word for key, value in options for word in (f"--{key}", value))
+    wanted = [stage for stage in STAGES if kind == "run" or stage.name in CAMERA_STAGES]
+    out = []
+    for stage in wanted:
+        if stage.name == "intrinsics":
+            stage = _given(stage, folder, words)
+        out.append(stage if figures else replace(stage, figures=False))
+    return tuple(out)
+
+
+def run_stages(
+    folder: Folder, kind: str, options: Sequence[tuple[str, str]], out: Path, page: bool = False
+) -> Ended:
+    """Run a folder's stages into a new output folder. Raises `BadInputError` as `calib run` does."""
+    from calib.cli.run import is_available
+
+    with opened(out, folder.root):
+        runner = Runner(
+            folder, out, _Here(), is_available, stages=_stages(folder, kind, options, page), fresh=True
+        )
+        ended = runner.run()
+        told = summary(runner, ended, False)
+        files = publish(runner, ended, told)
+        if page:
+            from calib.runner.graph import HIDDEN
+            from calib.show.page import keep_pictures, write_page
+
+            keep_pictures(folder.pictures, out / HIDDEN / "pictures")
+            write_page(out / "rig.yaml")
+            files = [*files, "report.html"]
+    code = exit_code(ended) if kind == "run" else _camera_code(ended)
+    reasons = tuple(f"{done.job.stage.title}: {done.reason}" for done in ended if done.status in _TELLING)
+    return Ended(code, {done.job.name: done.status for done in ended}, reasons, out, tuple(files))
+
+
+_TELLING = ("poor", "failed", "blocked")
+
+
+def _camera_code(ended: Sequence[Done]) -> int:
+    """As `calib run` would end, firmware apart: 3 when a stage has failed, 1 when one is poor."""
+    statuses = {done.status for done in ended}
+    if statuses & {"failed", "blocked"}:
+        return EXIT_BAD_INPUT
+    return EXIT_POOR if "poor" in statuses or "ok" not in statuses else EXIT_DONE
+
+
+# ----------------------------------------------------------------------
+# The work on one rig, as it goes to a process: a function of the rig and the options alone.
+#
+# Nothing is kept between rigs and nothing is written but scratch, so that a rig that is tried again,
+# elsewhere or later, gives the same bytes.
+
+_MOST_KEPT_BYTES = 30_000_000
+
+
+@dataclass(frozen=True)
+class FleetOptions:
+    """What holds for all rigs.
+
+    Attributes
+    ----------
+    pages : whether each rig's page is made and brought back.
+    attempts : to fetch a file. most_bytes : of a folder that is fetched.
+    """
+
+    pages: bool = False
+    attempts: int = 3
+    most_bytes: int = MOST_BYTES
+
+
+@dataclass(frozen=True)
+class Answer:
+    """An outcome with the results that belong to it."""
+
+    outcome: Outcome
+    files: dict[str, bytes]
+
+
+@cache
+def program() -> str:
+    """What results follow from beside their inputs: this program and the libraries under it."""
+    import cv2
+    import numpy
+    import scipy
+
+    versions = (platform.python_version(), numpy.__version__, scipy.__version__, cv2.__version__)
+    return sha256(json.dumps([program_digest(), *versions]).encode())
+
+
+def calibrate_rig(spec: RigSpec, options: FleetOptions, known: str = "", scratch: str = "") -> Answer:
+    """Calibrate one rig; every failure is an outcome, none an exception. One at a time in a process.
+
+    Parameters
+    ----------
+    known : key of an earlier result; where it still is the key, the rig is not calibrated again.
+    scratch : folder for what is fetched and made, removed afterwards; the system's own without.
+    """
+    blank = Outcome(spec.name, spec.serial, without_secrets(spec.source), "failed", EXIT_INTERNAL)
+    with _measured() as spent:
+        try:
+            with tempfile.TemporaryDirectory(prefix="rig-", dir=scratch or None) as place:
+                answer = _calibrated(spec, options, known, Path(place), blank)
+        except CalibError as error:
+            answer = _failed(blank, error.exit_code, str(error))
+        except Exception as error:
+            words = " ".join(str(error).split())[:200]
+            answer = _failed(blank, EXIT_INTERNAL, f"internal error: {type(error).__name__}: {words}")
+    seconds, peak = spent
+    return Answer(replace(answer.outcome, seconds=round(seconds, 3), peak_MB=peak), answer.files)
+
+
+def _failed(blank: Outcome, code: int, sentence: str) -> Answer:
+    return Answer(replace(blank, status=verdict_of(code), code=code, sentence=sentence), {})
+
+
+def _calibrated(spec: RigSpec, options: FleetOptions, known: str, place: Path, blank: Outcome) -> Answer:
+    root = local_folder(spec.source, place / "fetched", options.attempts, options.most_bytes)
+    folder = rig_folder(root)
+    kind = kind_of(folder)
+    inputs = {folder.name_of(path): digest for path, digest in folder_digests(folder).items()}
+    chosen = [word for pair in spec.options for word in pair]
+    command = ("fleet", kind, str(options.pages), program(), *chosen)
+    key = key_of(command, inputs, "")
+    if known == key:
+        return Answer(replace(blank, status=SAME, code=0, key=key), {})
+    import cv2
+
+    from calib.core.workers import at_most
+
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        with at_most(1):
+            ended = run_stages(folder, kind, spec.options, place / "out", options.pages)
+    finally:
+        cv2.setNumThreads(threads)
+    files = _kept(ended.out, ended.files, options.pages)
+    outcome = replace(
+        blank,
+        status=verdict_of(ended.code),
+        code=ended.code,
+        sentence=ended.reasons[0] if ended.reasons else "",
+        key=key,
+        kind=kind,
+        reasons=ended.reasons,
+        stages=ended.stages,
+        values=_values(ended.out / "rig.yaml"),
+        files={name: sha256(data) for name, data in files.items()},
+    )
+    return Answer(outcome, files)
+
+
+def _kept(out: Path, names: tuple[str, ...], pages: bool) -> dict[str, bytes]:
+    """Results that come back: constants, firmware and, where asked for, the page; states stay away."""
+    files, total = {}, 0
+    for name in sorted(names):
+        if name == "rig.yaml" or name.startswith("firmware/") or (pages and name == "report.html"):
+            data = (out / name).read_bytes()
+            total += len(data)
+            if total <= _MOST_KEPT_BYTES:
+                files[name] = data
+    return files
+
+
+def _values(rig: Path) -> dict[str, tuple[float, float | None]]:
+    from calib.runner.graph import sections_of
+    from calib.show.values import constants
+
+    return {f"{one.section}.{one.name}": (one.value, one.sigma) for one in constants(sections_of(rig).values)}
+
+
+@contextlib.contextmanager
+def _measured() -> Iterator[list[float]]:
+    """Seconds and largest memory in megabytes of what is done inside, in a list that is filled at the end."""
+    with contextlib.suppress(OSError):
+        # 5 makes the kernel forget the largest memory so far (proc(5), clear_refs).
+        Path("/proc/self/clear_refs").write_text("5")
+    began, spent = time.perf_counter(), list[float]()
+    try:
+        yield spent
+    finally:
+        spent += [time.perf_counter() - began, peak_memory_MB()]
+
+
+def peak_memory_MB() -> float:
+    """Largest resident memory of this process in megabytes, since it was last forgotten."""
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return round(1.024e-3 * int(line.split()[1]), 1)
+    with contextlib.suppress(ImportError):
+        import resource
+
+        return round(1.024e-3 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, 1)
+    return float("nan")

@@ -1,0 +1,209 @@
+"""Two calibrations side by side: which constants differ, by how many standard deviations, and by how much
+in millimetres on the plane.
+
+A difference is judged against the standard deviations of both, taken as independent. Two calibrations from
+the same pictures share their errors, so that there the real significance is larger than what is said.
+
+On the plane the whole chain is compared: points of the workspace are put into the picture by one
+calibration and read by the other. Its standard deviation is that of both calibrations, without that of
+whole pixels, which is no property of a calibration.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.core.arrays import FloatArray
+from calib.core.errors import BadInputError
+from calib.core.files import shown
+from calib.core.rig import Geometry, Rig, read_rig, section_json
+from calib.show.values import Constant, constants
+from calib.stages.camera.model import project, undistort
+from calib.stages.camera.results import camera_from_section
+
+SIGNIFICANT = 3.0
+"""Standard deviations from which on a difference is called significant."""
+_SAME = 1e-12
+_NOT_LEARNT = ("views", "points", "rms_px", "mean_error_px", "rms_mm", "pictures")
+_EVIDENCE = ("log.", "sigma_", "projection_sigma_", "drift.", "anti_windup.")
+"""Keys, and beginnings of keys, that describe a calibration and are no constants."""
+_GRID = (13, 9)
+
+
+@dataclass(frozen=True)
+class Change:
+    """A constant in two calibrations; a side that lacks it is None.
+
+    Attributes
+    ----------
+    sigmas : difference over the standard deviation of the difference, None where that is not known.
+    """
+
+    section: str
+    name: str
+    unit: str
+    before: float | None
+    after: float | None
+    sigma: float | None
+    sigmas: float | None
+
+    @property
+    def significant(self) -> bool | None:
+        """Whether the difference is significant, None where no standard deviation says so."""
+        return None if self.sigmas is None else self.sigmas >= SIGNIFICANT
+
+
+@dataclass(frozen=True)
+class PlaneChange:
+    """Differences of position over the workspace: mean, largest, and their standard deviation, mm."""
+
+    mean_mm: float
+    largest_mm: float
+    at_m: tuple[float, float]
+    sigma_mm: float | None
+
+    @property
+    def significant(self) -> bool | None:
+        """Whether the largest difference is significant, None where no standard deviation says so."""
+        return None if not self.sigma_mm else self.largest_mm >= SIGNIFICANT * self.sigma_mm
+
+
+@dataclass(frozen=True)
+class RigDiff:
+    """All that differs between two calibrations.
+
+    Attributes
+    ----------
+    changes : constants that differ, by significance; those of one side only come last.
+    plane : None where a side has no camera or plane.
+    verdicts : section, verdict before, verdict after, where they differ.
+    only_before, only_after : sections of one side.
+    inputs : sections learnt from other inputs.
+    compared : how many constants both have.
+    """
+
+    changes: tuple[Change, ...]
+    plane: PlaneChange | None
+    verdicts: tuple[tuple[str, str, str], ...]
+    only_before: tuple[str, ...]
+    only_after: tuple[str, ...]
+    inputs: tuple[str, ...]
+    compared: int
+
+    @property
+    def significant(self) -> bool:
+        """Whether anything has changed by more than its standard deviation explains."""
+        return any(change.significant for change in self.changes) or bool(
+            self.plane is not None and self.plane.significant
+        )
+
+
+def diff_rigs(before: Path, after: Path) -> RigDiff:
+    """Compare two rig.yaml. Raises `BadInputError` for files that cannot be read."""
+    old, new = _read(before), _read(after)
+    a, b = _sections(old), _sections(new)
+    left, right = _by_name(a), _by_name(b)
+    changes = [_change(left.get(key), right.get(key)) for key in dict.fromkeys([*left, *right])]
+    differ = [change for change in changes if change is not None]
+    differ.sort(key=lambda c: (c.before is None or c.after is None, -(c.sigmas or 0.0)))
+    verdicts = [
+        (name, str(a[name].get("verdict", "-")), str(b[name].get("verdict", "-")))
+        for name in a
+        if name in b and a[name].get("verdict") != b[name].get("verdict")
+    ]
+    learnt_a, learnt_b = old.provenance.inputs, new.provenance.inputs
+    return RigDiff(
+        tuple(differ),
+        _on_plane(old, new),
+        tuple(verdicts),
+        tuple(name for name in a if name not in b),
+        tuple(name for name in b if name not in a),
+        tuple(name for name in learnt_a if name in learnt_b and learnt_a[name] != learnt_b[name]),
+        len(left.keys() & right.keys()),
+    )
+
+
+def _read(path: Path) -> Rig:
+    if not path.exists():
+        raise BadInputError(f"{shown(path)}: cannot be read: there is no such file")
+    return read_rig(path)
+
+
+def _sections(rig: Rig) -> dict[str, dict[str, Any]]:
+    named = {
+        name: section_json(getattr(rig, name))
+        for name in type(rig).model_fields
+        if name != "provenance" and getattr(rig, name) is not None
+    }
+    extra = {name: value for name, value in (rig.model_extra or {}).items() if isinstance(value, dict)}
+    return {**named, **extra}
+
+
+def _by_name(sections: Mapping[str, Any]) -> dict[tuple[str, str], Constant]:
+    return {
+        (c.section, c.name): c
+        for c in constants(sections)
+        if c.name not in _NOT_LEARNT and c.section != "geometry" and not c.name.startswith(_EVIDENCE)
+    }
+
+
+def _change(before: Constant | None, after: Constant | None) -> Change | None:
+    one = before or after
+    assert one is not None
+    if before is None or after is None:
+        return Change(
+            one.section, one.name, one.unit, before.value if before else None, after.value if after else None,
+            None, None,
+        )  # fmt: skip
+    difference = abs(after.value - before.value)
+    if difference <= _SAME * max(abs(before.value), abs(after.value)):
+        return None
+    known = before.sigma is not None and after.sigma is not None
+    sigma = math.hypot(before.sigma or 0.0, after.sigma or 0.0) if known else None
+    sigmas = difference / sigma if sigma else None
+    return Change(one.section, one.name, one.unit, before.value, after.value, sigma, sigmas)
+
+
+def _on_plane(old: Rig, new: Rig) -> PlaneChange | None:
+    if old.camera is None or new.camera is None or old.plane is None or new.plane is None:
+        return None
+    x0, y0, x1, y1 = (new.geometry or old.geometry or Geometry()).workspace_m
+    columns, rows = _GRID
+    x, y = np.meshgrid(np.linspace(x0, x1, columns), np.linspace(y0, y1, rows))
+    world = np.column_stack([x.ravel(), y.ravel()])
+    apart = 1e3 * np.linalg.norm(_read_back(new, _seen(old, world)) - world, axis=1)
+    if not np.isfinite(apart).any():
+        return None
+    worst = int(np.nanargmax(apart))
+    bars = [rig.plane.sigma_marker_mm.get("calibration_max") for rig in (old, new) if rig.plane is not None]
+    known = [bar for bar in bars if bar is not None]
+    sigma = math.hypot(*known) if len(known) == 2 else None
+    return PlaneChange(
+        float(np.nanmean(apart)),
+        float(apart[worst]),
+        (float(world[worst, 0]), float(world[worst, 1])),
+        sigma,
+    )
+
+
+def _seen(rig: Rig, world_m: FloatArray) -> FloatArray:
+    """Distorted pixels (n, 2) of points (n, 2) of the plane."""
+    assert rig.camera is not None and rig.plane is not None
+    points_W = np.column_stack([world_m, np.zeros(len(world_m))])
+    points_C = points_W @ np.array(rig.plane.R_CW).T + np.array(rig.plane.t_CW_m)
+    return project(camera_from_section(rig.camera), points_C)
+
+
+def _read_back(rig: Rig, pixels: FloatArray) -> FloatArray:
+    """Points (n, 2) of the plane at distorted pixels (n, 2)."""
+    assert rig.camera is not None and rig.plane is not None
+    camera = camera_from_section(rig.camera)
+    rays = np.column_stack([undistort(camera, pixels), np.ones(len(pixels))])
+    p = rays @ camera.K.T @ np.array(rig.plane.A_inverse).T
+    return np.asarray(p[:, :2] / p[:, 2:])

@@ -1,0 +1,943 @@
+"""The page of a calibration: one HTML file that needs no network."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import hashlib
+import io
+import json
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from calib import __version__
+from calib.core.errors import BadInputError
+from calib.core.files import make_folder, read_bytes, read_yaml_mapping, sha256, shown, write_atomically
+from calib.core.rig import read_rig
+from calib.runner.cache import Result, load
+from calib.runner.graph import HIDDEN
+from calib.runner.outputs import read_summary
+from calib.show.values import BLANK, SIGMA, constants, digits, short, unit_of
+from calib.stages.actuator.section import Actuator, PumpSection, section_of
+
+# ----------------------------------------------------------------------
+# Pages from their templates: each is one file, with its style and its script in it.
+
+
+def render(template: str, style: tuple[str, ...], script: tuple[str, ...], **values: Any) -> str:
+    """A template of this package with what else goes into a page.
+
+    Parameters
+    ----------
+    style, script : names of files that are put one behind the other. The page's policy lets no script run
+        but this one.
+    values : what the template asks for beside them; all of it is escaped.
+    """
+    import jinja2
+
+    words = "".join(_resource(name) for name in script)
+    digest = base64.b64encode(hashlib.sha256(words.encode()).digest()).decode()
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    text = environment.from_string(_resource(template)).render(
+        style="".join(_resource(name) for name in style),
+        script=words,
+        script_hash=f"sha256-{digest}",
+        **values,
+    )
+    # A file's name may hold halves of characters, which no page can.
+    return text.encode("utf-8", "backslashreplace").decode("utf-8")
+
+
+def _resource(name: str) -> str:
+    return (resources.files("calib.show") / "templates" / name).read_text(encoding="utf-8")
+
+
+# ----------------------------------------------------------------------
+# Pictures and figures small enough for one page: views as JPEG, figures with few colours.
+#
+# What was made once is kept beside the run by the hash of its source, so that a page is rebuilt quickly
+# and without the pictures themselves.
+
+_WIDEST_PX = 640
+_QUALITY = 72
+_COLOURS = 128
+_MOST_PICTURES = 120
+_KIND_AT, _PALETTE = 25, b"\x03"
+"""Where a PNG tells how its colours are stored, and what it tells where it has few."""
+
+
+@dataclass(frozen=True)
+class Embedded:
+    """A picture in the page: its own size in px, and the data of a smaller copy."""
+
+    name: str
+    width_px: int
+    height_px: int
+    data: bytes
+
+
+def data_uri(data: bytes) -> str:
+    """A picture as an address that needs no network."""
+    if data.startswith(b"\xff\xd8"):
+        kind = "jpeg"
+    elif data.startswith(b"\x89PNG"):
+        kind = "png"
+    else:
+        kind = "svg+xml"
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
+
+
+def size_of(png: bytes) -> tuple[int, int]:
+    """Width and height of a PNG, a usual shape for anything else."""
+    if png.startswith(b"\x89PNG") and len(png) >= 24:
+        return int.from_bytes(png[16:20], "big"), int.from_bytes(png[20:24], "big")
+    return 1196, 800
+
+
+def _key(name: str) -> str:
+    return sha256(name.encode("utf-8", "surrogateescape"))[:24]
+
+
+def keep_pictures(paths: Sequence[Path], folder: Path) -> None:
+    """Keep small copies of pictures, by name; pictures that cannot be read are passed over.
+
+    A copy is named by the picture's name and begins with a line of the picture's hash and size and of its
+    own hash.
+    """
+    make_folder(folder)
+    wanted = {f"{_key(path.name)}.view": path for path in paths[:_MOST_PICTURES]}
+    for path in folder.iterdir():
+        if path.name not in wanted:
+            with contextlib.suppress(OSError):
+                path.unlink()
+    for name, path in wanted.items():
+        with contextlib.suppress(BadInputError):
+            raw = read_bytes(path)
+            digest = sha256(raw)
+            place = folder / name
+            if kept_picture(path.name, folder) and place.read_bytes()[:64] == digest.encode():
+                continue
+            made = _small_picture(path)
+            if made is not None:
+                width, height, data = made
+                write_atomically(place, f"{digest} {width} {height} {sha256(data)}\n".encode() + data)
+
+
+def _small_picture(path: Path) -> tuple[int, int, bytes] | None:
+    import cv2
+
+    from calib.io.pictures import read_picture
+
+    gray = read_picture(path).gray
+    height, width = gray.shape
+    if width > _WIDEST_PX:
+        size = (_WIDEST_PX, max(1, round(height * _WIDEST_PX / width)))
+        gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA).astype(gray.dtype)
+    done, data = cv2.imencode(".jpg", gray, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    return (width, height, data.tobytes()) if done else None
+
+
+def kept_picture(name: str, folder: Path) -> Embedded | None:
+    """The small copy of a picture by its name, None where there is none."""
+    with contextlib.suppress(OSError, ValueError):
+        head, data = (folder / f"{_key(name)}.view").read_bytes().split(b"\n", 1)
+        _, width, height, own = head.split()
+        if data.startswith(b"\xff\xd8") and own == sha256(data).encode():
+            return Embedded(name, int(width), int(height), data)
+    return None
+
+
+def small_figure(path: Path, folder: Path, width_px: int = 0) -> bytes:
+    """A figure with as few colours as it needs, from `folder` where it has been made before.
+
+    With `width_px` it is made narrower, if it is wider than that and takes less room then.
+    """
+    raw = path.read_bytes()
+    if not raw.startswith(b"\x89PNG"):
+        return raw
+    narrower = 0 < width_px < size_of(raw)[0]
+    if not narrower and raw[_KIND_AT : _KIND_AT + 1] == _PALETTE:
+        return raw
+    place = folder / (f"{sha256(raw)}_{width_px}.png" if narrower else f"{sha256(raw)}.png")
+    with contextlib.suppress(OSError):
+        return place.read_bytes()
+    from PIL import Image
+
+    with Image.open(io.BytesIO(raw)) as whole:
+        plain = whole.convert("RGB")
+        if narrower:
+            plain = plain.resize((width_px, max(1, round(plain.height * width_px / plain.width))))
+        few = plain.quantize(_COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+        buffer = io.BytesIO()
+        few.save(buffer, format="png", compress_level=6)
+    small = min(buffer.getvalue(), raw, key=len)
+    with contextlib.suppress(BadInputError):
+        make_folder(folder)
+        write_atomically(place, small)
+    return small
+
+
+# ----------------------------------------------------------------------
+# Whether a calibration can be flashed, what is weak about it, and what to record next.
+#
+# The answer is one of
+#
+#     yes         every stage whose result the firmware uses is ok, and nothing else speaks against it
+#     with care   those are, but something beside them is poor or has failed
+#     not yet     a result that the firmware uses is poor or lacking
+#     no          such a stage has failed, or its numbers mean nothing, or there is no firmware
+
+_MEANINGLESS = ("unidentifiable", "inconsistent")
+_RECORD = {
+    "intrinsics": "15 to 25 pictures of a checkerboard into images/, with images/board.yaml",
+    "extrinsics": "a picture of the board lying in the plane of motion into images/plane/",
+    "imu-static": "the rig at rest for a minute or more, logs/static1.csv; hours show how the bias drifts",
+    "imu-tune": "the rig in motion, with the IMU at its full rate, as logs/NAME.csv",
+    "align": "camera and IMU in one log: a free swing, then slow motion to large angles",
+    "replay": "logs of camera and IMU as logs/NAME.csv",
+}
+"""What a stage wants that had nothing to work with."""
+_SHOWN = 4
+
+
+@dataclass(frozen=True)
+class Decision:
+    """The answer with its reasons; all of them sentences or names as they were found, not yet escaped."""
+
+    answer: str
+    headline: str
+    weak: tuple[str, ...]
+    record: tuple[str, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """For the document."""
+        return {
+            "answer": self.answer,
+            "headline": self.headline,
+            "weak": list(self.weak),
+            "record_next": list(self.record),
+        }
+
+
+def decide(told: Mapping[str, Any], sections: Mapping[str, Any]) -> Decision:
+    """The decision on a run: `told` is its summary, `sections` those of its rig.yaml."""
+    jobs: Sequence[Mapping[str, Any]] = told.get("jobs", ())
+    answer, headline = _answer(jobs, sections)
+    if told.get("simulated"):
+        headline = f"{headline}; the rig is a simulated one, so these numbers are for no real machine"
+    return Decision(answer, headline, tuple(_weak(jobs, sections)), tuple(_record(jobs, sections)))
+
+
+def _verdict(job: Mapping[str, Any], sections: Mapping[str, Any]) -> str:
+    for name in job.get("writes", ()):
+        section = sections.get(name)
+        if isinstance(section, dict) and section.get("verdict"):
+            return str(section["verdict"])
+    return ""
+
+
+def _answer(jobs: Sequence[Mapping[str, Any]], sections: Mapping[str, Any]) -> tuple[str, str]:
+    used = [job for job in jobs if job["flashed"]]
+    broken = [job for job in used if job["status"] in ("failed", "blocked")]
+    if broken:
+        return "no", f"{_titles(broken)} failed"
+    senseless = [job for job in used if _verdict(job, sections) in _MEANINGLESS]
+    if senseless:
+        return "no", f"the data do not support {_titles(senseless)}"
+    made = [job for job in jobs if job["stage"] == "firmware"]
+    if not made or made[0]["status"] not in ("ok", "poor"):
+        why = made[0]["reason"] if made else "it was not asked for"
+        return "no", f"there is no firmware: {why}"
+    poor = [job for job in used if job["status"] == "poor"]
+    if poor:
+        return "not yet", f"{_titles(poor)} too weak"
+    optics = {name for name in ("camera", "plane") if name not in sections}
+    lacking = [job for job in used if optics & set(job["writes"])]
+    if lacking:
+        return "not yet", f"{_titles(lacking)} not known"
+    if made[0]["status"] == "poor":
+        return "not yet", str(made[0]["reason"])
+    others = [job for job in jobs if job["status"] in ("poor", "failed", "blocked")]
+    if others:
+        return "with care", f"what the firmware uses is sound, but look at {_titles(others, plain=True)}"
+    return "yes", "every stage that had data passed its own quality gate"
+
+
+def _titles(jobs: Sequence[Mapping[str, Any]], plain: bool = False) -> str:
+    names = list(dict.fromkeys(f"“{job['title']}”" for job in jobs))
+    text = names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+    if plain:
+        return text
+    return f"{text} {'is' if len(names) == 1 else 'are'}" if jobs[0]["status"] == "poor" else text
+
+
+def _weak(jobs: Sequence[Mapping[str, Any]], sections: Mapping[str, Any]) -> list[str]:
+    grouped: dict[tuple[str, str], list[str]] = {}
+    for job in jobs:
+        if job["status"] not in ("poor", "failed", "blocked"):
+            continue
+        reasons = [str(job["reason"])]
+        for name in job["writes"]:
+            section = sections.get(name)
+            if job["status"] == "poor" and isinstance(section, dict) and section.get("reasons"):
+                reasons = [str(reason) for reason in section["reasons"]]
+        for reason in reasons:
+            grouped.setdefault((str(job["title"]), reason), []).append(str(job["log"] or ""))
+    out = []
+    for (title, reason), logs in grouped.items():
+        names = [log for log in logs if log]
+        more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+        where = f" ({', '.join(names[:_SHOWN])}{more})" if names else ""
+        out.append(f"{title}{where}: {reason}")
+    return out
+
+
+def _record(jobs: Sequence[Mapping[str, Any]], sections: Mapping[str, Any]) -> list[str]:
+    out = []
+    for job in jobs:
+        wanted = _RECORD.get(str(job["stage"]))
+        if job["status"] == "skipped" and wanted and job["log"] is None:
+            out.append(f"{job['title']}: {wanted}")
+    for job in jobs:
+        for name in job["writes"]:
+            section = sections.get(name)
+            if isinstance(section, dict):
+                out += [f"{job['title']}: {advice}" for advice in section.get("advice") or ()]
+    return list(dict.fromkeys(out))
+
+
+# ----------------------------------------------------------------------
+# What the page says of each stage: a few figures at its head, and tables of what the verb told.
+#
+# A stage without words of its own gets tables of whatever lists its document has, so that the page of a
+# later verb is not empty.
+
+Values = Mapping[str, Any]
+Fact = tuple[str, str]
+
+_CAPTIONS = {
+    "camera_errors": "Reprojection errors of each view",
+    "camera_residuals": "Residuals over the picture",
+    "camera_coverage": "Where in the picture the board was seen",
+    "camera_poses": "Poses of the board",
+    "camera_sigma": "Standard deviation of a projected point over the picture",
+    "camera_distortion": "Distortion of the lens over the picture",
+    "camera_models": "Lens models compared on views held back",
+    "camera_boards": "Shapes of the board compared on views held back",
+    "plane_picture": "The board lying in the plane, with the world's axes",
+    "plane_sigma": "Standard deviation in millimetres over the workspace",
+    "plane_difference": "What a homography without the lens gets wrong",
+    "lens_displacement": "What the lens displaces, in px and mm",
+    "lens_inverse": "Error of the polynomial that undoes the lens",
+    "imu_allan": "Allan deviation of every axis",
+    "imu_drift": "Drift of the angle at rest",
+    "imu_poses": "Rests in different poses",
+    "imu_residuals": "Residuals of gravity over the poses",
+    "tune_gains": "Frontier of the angle filter's gains",
+    "tune_errors": "Errors of the angle on parts held back",
+    "drift_angles": "Angle over time, by every filter",
+    "drift_slopes": "Slopes of the angle with their intervals",
+    "lowpass_response": "Response of the low-pass",
+    "lowpass_log": "The low-pass on a log",
+    "align_correlation": "Gyroscope against camera over the time offset",
+    "control_margins": "Margins of the tuned loops",
+}
+_PARTS = {
+    "states": f"States with their 2{SIGMA} bands",
+    "errors": f"Errors against the truth, with 2{SIGMA}",
+    "innovations": "Consistency: innovations of each sensor",
+    "residuals": "Residuals",
+    "static": "Signals at rest",
+    "motion": "Angle in motion",
+}
+_ROWS = 200
+_DEEP = 4
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A cell: what is shown, and the number by which it is sorted (None for text)."""
+
+    text: str
+    number: float | None = None
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table with a title; every row has as many cells as there are heads."""
+
+    title: str
+    heads: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+
+
+def caption(stem: str, logs: Sequence[str] = ()) -> str:
+    """Words for a figure by its file's name; they serve readers who do not see it.
+
+    A number at the end of the name counts the stage's `logs`.
+    """
+    if stem in _CAPTIONS:
+        return _CAPTIONS[stem]
+    words = stem.split("_")
+    if words[-1].isdigit() and 1 <= int(words[-1]) <= len(logs):
+        words[-1] = logs[int(words[-1]) - 1]
+    for k in range(len(words) - 1, 0, -1):
+        if words[k] in _PARTS:
+            rest = " ".join(words[1:k] + words[k + 1 :])
+            return f"{_PARTS[words[k]]}{f': {rest}' if rest else ''}"
+    return stem.replace("_", " ")
+
+
+def facts(stage: str, section: Values, document: Values) -> list[Fact]:
+    """The few figures at the head of a stage, each with its unit."""
+    made = _FACTS.get(stage)
+    return [] if made is None else [(label, text) for label, text in made(section, document) if text]
+
+
+def _value(values: Values, key: str, unit: str | None = None, factor: float = 1.0) -> str:
+    value = values.get(key)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        return ""
+    return f"{short(factor * value)} {unit_of(key) if unit is None else unit}".strip()
+
+
+def _with_sigma(values: Values, key: str, unit: str, factor: float = 1.0) -> str:
+    value, sigma = values.get(key), (values.get("sigma") or {}).get(key)
+    if not isinstance(value, int | float):
+        return ""
+    if not isinstance(sigma, int | float):
+        return f"{digits(factor * value)} {unit}".strip()
+    return f"{digits(factor * value, factor * sigma)} ± {factor * sigma:.2g} {unit}".strip()
+
+
+def _camera(section: Values, _: Values) -> list[Fact]:
+    sigma = section.get("projection_sigma_px") or {}
+    return [
+        ("focal length", _with_sigma(section, "fx_px", "px")),
+        ("RMS", _value(section, "rms_px")),
+        ("views", _value(section, "views", "")),
+        ("points", _value(section, "points", "")),
+        (f"projection {SIGMA}, worst", _value(sigma, "max", "px") or "not bounded"),
+        ("lens model", str(section.get("model", ""))),
+    ]
+
+
+def _plane(section: Values, _: Values) -> list[Fact]:
+    sigma = section.get("sigma_marker_mm") or {}
+    return [
+        ("RMS on the plane", _value(section, "rms_mm")),
+        (f"calibration {SIGMA}, worst", _value(sigma, "calibration_max", "mm")),
+        (f"whole-pixel {SIGMA}", _value(sigma, "quantisation_max", "mm")),
+        ("without the lens, up to", _value(section.get("without_intrinsics") or {}, "difference_max_mm")),
+    ]
+
+
+def _lens(section: Values, _: Values) -> list[Fact]:
+    return [
+        ("kind", str(section.get("kind", ""))),
+        ("displacement, worst", _value(section, "max_px")),
+        ("neglecting it, up to", _value(section, "plane_max_mm")),
+        ("inverse's error", _value(section.get("inverse") or {}, "max_error_px")),
+    ]
+
+
+def _imu(section: Values, _: Values) -> list[Fact]:
+    bias = section.get("gyro_bias_radps") or [None] * 3
+    noise = section.get("gyro_noise_radps_per_sqrt_Hz") or [None] * 3
+    drift = (section.get("drift") or {}).get("gyro") or {}
+    return [
+        ("rate", _value(section, "rate_hz")),
+        ("gyro bias z", _value({"v": bias[2]}, "v", "rad/s")),
+        ("gyro noise z", _value({"v": noise[2]}, "v", "rad/s/√Hz")),
+        ("drift of the angle", _value(drift, "mean_degps")),
+    ]
+
+
+def _tune(section: Values, _: Values) -> list[Fact]:
+    candidates = section.get("candidates") or {}
+    chosen = candidates.get(str(section.get("recommended"))) or {}
+    return [
+        ("recommended", str(section.get("recommended", ""))),
+        ("Kp", _value(section, "Kp_per_s")),
+        ("Ki", _value(section, "Ki_per_s2")),
+        ("held-out error", _value(chosen, "rmse_deg")),
+        ("of 3/3", _value(candidates.get("3/3") or {}, "rmse_deg")),
+    ]
+
+
+def _lowpass(section: Values, _: Values) -> list[Fact]:
+    return [
+        ("filter", f"{section.get('family', '')}, order {section.get('order', '')}"),
+        ("cut-off", _value(section, "cutoff_hz")),
+        ("delay at rest", _value(section, "dc_delay_s", "ms", 1e3)),
+        ("rate", _value(section, "rate_hz")),
+    ]
+
+
+def _align(section: Values, _: Values) -> list[Fact]:
+    degree = math.degrees(1.0)
+    return [
+        ("time offset", _with_sigma(section, "time_offset_s", "ms", 1e3)),
+        ("rest angle", _with_sigma(section, "rest_angle_rad", "°", degree)),
+        ("gyro bias", _with_sigma(section, "gyro_bias_radps", "°/s", degree)),
+        ("tracker's jitter", _value(section, "jitter_px")),
+    ]
+
+
+def _identify(section: Values, _: Values) -> list[Fact]:
+    return [
+        ("stiffness, of the nominal", _with_sigma(section, "stiffness_scale", "")),
+        ("bending", _with_sigma(section, "bending_N_per_rad2", "N/rad²")),
+        ("pumps' lag", _with_sigma(section, "lag_s", "s")),
+        ("deflation", _with_sigma(section, "falling_N_per_s", "N/s")),
+    ]
+
+
+def _control(section: Values, _: Values) -> list[Fact]:
+    turn, move = section.get("orientation") or {}, section.get("position") or {}
+    return [
+        ("angle, Kp", _value(turn, "Kp_pwm_per_rad")),
+        ("angle, Ki", _value(turn, "Ki_pwm_per_rad_s")),
+        ("lengths, Kp", _value(move, "Kp_pwm_per_m")),
+        ("tick", _value(section, "tick_s", "ms", 1e3)),
+    ]
+
+
+def _firmware(_: Values, document: Values) -> list[Fact]:
+    return [
+        ("constants", _value(document, "constants", "")),
+        ("files", ", ".join(str(name) for name in document.get("files") or ())),
+    ]
+
+
+_FACTS: dict[str, Callable[[Values, Values], list[Fact]]] = {
+    "intrinsics": _camera,
+    "extrinsics": _plane,
+    "distortion": _lens,
+    "imu-static": _imu,
+    "imu-tune": _tune,
+    "lowpass": _lowpass,
+    "align": _align,
+    "identify": _identify,
+    "control": _control,
+    "firmware": _firmware,
+}
+
+
+def tables(document: Values) -> list[Table]:
+    """A table for each list or mapping of records in a verb's document, in its order."""
+    out: list[Table] = []
+    _search(document, (), out)
+    return out
+
+
+def _search(value: Any, path: tuple[str, ...], out: list[Table]) -> None:
+    if len(path) > _DEEP:
+        return
+    if isinstance(value, dict):
+        if len(path) > 1 and len(value) > 1 and all(isinstance(part, dict) for part in value.values()):
+            out += _table(path, [{"": name, **part} for name, part in value.items()])
+            return
+        for name, part in value.items():
+            if name not in ("sigma", "covariance", "schema", "verb", "per_view"):
+                _search(part, (*path, str(name)), out)
+    elif isinstance(value, list) and value and all(isinstance(part, dict) for part in value):
+        out += (
+            _table((*path[:-1], "models"), _compared(value)) if "models" in value[0] else _table(path, value)
+        )
+
+
+def _compared(logs: Sequence[Values]) -> list[Values]:
+    """A record for each log and model of `calib validate`, the errors of each quantity beside each other."""
+    out: list[Values] = []
+    for log in logs:
+        models = log.get("models")
+        for model, quantities in (models if isinstance(models, dict) else {}).items():
+            row: dict[str, Any] = {"log": log.get("log"), "model": model}
+            for name, errors in (quantities if isinstance(quantities, dict) else {}).items():
+                for key, value in (errors if isinstance(errors, dict) else {}).items():
+                    row[f"{name} {key}"] = value
+            out.append(row)
+    return out
+
+
+def _table(path: tuple[str, ...], records: Sequence[Values]) -> list[Table]:
+    heads = [name for name in dict.fromkeys(k for r in records for k in r) if _tells(name, records)]
+    if not heads:
+        return []
+    title = " ".join(path[-2:]).replace("_", " ")
+    rows = tuple(tuple(_cell(record.get(name)) for name in heads) for record in records[:_ROWS])
+    return [Table(title, tuple(_head(name) for name in heads), rows)]
+
+
+def _tells(name: str, records: Sequence[Values]) -> bool:
+    """Whether a column holds single values, and not only blanks."""
+    values = [record.get(name) for record in records]
+    if any(isinstance(value, dict) or (isinstance(value, list) and len(value) > 3) for value in values):
+        return False
+    return any(value not in (None, [], "") for value in values)
+
+
+def _head(name: str) -> str:
+    unit = unit_of(name)
+    if not unit:
+        return name.replace("_", " ") or "name"
+    end = next(n for n in range(1, len(name)) if unit_of(name[n - 1 :]) == unit and unit_of(name[n:]) != unit)
+    return f"{name[: end - 1].replace('_', ' ')}, {unit}"
+
+
+def _cell(value: Any) -> Cell:
+    if value is None or value == []:
+        return Cell(BLANK)
+    if isinstance(value, bool):
+        return Cell("yes" if value else "no")
+    if isinstance(value, int | float):
+        return Cell(short(value), float(value))
+    if isinstance(value, list):
+        return Cell("  ".join(_cell(part).text for part in value))
+    return Cell(str(value))
+
+
+# ----------------------------------------------------------------------
+# The page of a calibration: one HTML file that needs no network, from rig.yaml and what lies beside it.
+#
+#     rig.yaml            the constants
+#     .calib/run.json     how each stage ended          .calib/stages/   what the stages said and drew
+#     .calib/pictures/    small copies of the views
+#
+# A rig.yaml without the rest gives a page of verdicts and constants. Everything that was read is escaped,
+# and a policy in the page lets no script run but its own. Nothing of time or place goes in: the same
+# inputs give the same bytes.
+
+MOST_BYTES = 5_000_000
+"""A page is never larger; figures that do not fit are named instead."""
+_AIM_BYTES = 4_350_000
+"""What a page should take: beyond this, of several logs only the first figure of each is shown."""
+_NARROW_PX = 640
+"""Width of those where even they are too many."""
+_VIEWS_BYTES = 1_000_000
+_ROOM_BYTES = 400_000
+"""What is kept for words, tables and numbers."""
+_MOST_COUNTED = 6
+"""Figures of one kind for each log that a stage shows, so that there is room for the states of all logs."""
+_STATUS = {
+    "ok": "ok",
+    "poor": "poor",
+    "failed": "failed",
+    "blocked": "not run",
+    "skipped": "no data",
+    "missing": "not available",
+}
+_STAGE_OF = {
+    "camera": ("intrinsics", "Camera"),
+    "plane": ("extrinsics", "Plane of motion"),
+    "lens": ("distortion", "Lens"),
+    "imu": ("imu-static", "IMU at rest"),
+    "imu_intrinsics": ("imu-intrinsics", "IMU in poses"),
+    "orientation_filter": ("imu-tune", "Angle filter"),
+    "lowpass": ("lowpass", "Low-pass"),
+    "align": ("align", "Camera and IMU together"),
+    "actuator": ("identify", "Model of the actuator"),
+    "pump": ("identify", "Model of the actuator"),
+    "estimator": ("estimator", "Noise of the estimator"),
+    "controller": ("control", "Controllers"),
+}
+_FLASHED = ("camera", "plane", "imu", "orientation_filter", "lowpass", "align", "controller")
+
+
+@dataclass
+class _Budget:
+    """Bytes that may still go into the page."""
+
+    left: int
+
+    def takes(self, text: str) -> bool:
+        if len(text) > self.left:
+            return False
+        self.left -= len(text)
+        return True
+
+
+def write_page(rig: Path, output: Path | None = None) -> Path:
+    """Write the page of a rig.yaml, `report.html` beside it by default. Raises `BadInputError`."""
+    target = rig.parent / "report.html" if output is None else output
+    text = page_text(rig)
+    write_atomically(target, text)
+    return target
+
+
+def page_text(rig: Path) -> str:
+    """The whole page. Raises `BadInputError` for a rig.yaml that is not there or cannot be read."""
+    if not rig.exists():
+        raise BadInputError(f"{shown(rig)}: cannot be read: there is no such file")
+    whole = read_rig(rig)
+    for name, kind in (("actuator", Actuator), ("pump", PumpSection)):
+        section_of(whole, name, kind, rig)
+    sections = read_yaml_mapping(rig)
+    provenance = sections.pop("provenance", None) or {}
+    hidden = rig.parent / HIDDEN
+    told = read_summary(hidden / "run.json") or _summary_of(sections)
+    budget = _Budget(MOST_BYTES - _ROOM_BYTES)
+    views = _views(hidden, _Budget(_VIEWS_BYTES))
+    budget.left -= sum(len(view["image"]) for view in views)
+    stages = _stages(told, sections, hidden, budget)
+    return render(
+        "page.html.j2",
+        ("page.css",),
+        ("common.js", "page.js"),
+        decision=decide(told, sections),
+        told=told,
+        stages=stages,
+        views=views,
+        views_json=_as_script(views),
+        constants=[
+            {
+                "section": c.section,
+                "name": c.name,
+                "value": c.value,
+                "text": digits(c.value, c.sigma),
+                "unit": c.unit,
+                "sigma": c.sigma,
+                "share": c.share,
+            }
+            for c in constants(sections)
+        ],
+        inputs=[
+            (section, name, digest)
+            for section, files in (provenance.get("inputs") or {}).items()
+            for name, digest in files.items()
+        ],
+        version=provenance.get("version", __version__),
+    )
+
+
+def _as_script(value: Any) -> str:
+    """JSON that no element of a page can end."""
+    text = json.dumps(value, ensure_ascii=True, separators=(",", ":"))
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def _summary_of(sections: Mapping[str, Any]) -> dict[str, Any]:
+    """A summary for a rig.yaml that no run has made: each section is a stage."""
+    jobs = []
+    for name, values in sections.items():
+        if name in _STAGE_OF and isinstance(values, dict):
+            stage, title = _STAGE_OF[name]
+            poor = values.get("verdict", "ok") in ("poor", "unidentifiable", "inconsistent")
+            reasons = values.get("reasons") or [f"its verdict is {values.get('verdict')}"]
+            job: dict[str, Any] = {
+                "name": stage,
+                "stage": stage,
+                "title": title,
+                "verb": "",
+                "log": None,
+                "inputs": [],
+            }
+            state = {"status": "poor" if poor else "ok", "reason": str(reasons[0]) if poor else ""}
+            jobs.append({**job, "writes": [name], "flashed": name in _FLASHED, **state})
+    return {"simulated": False, "pictures": 0, "logs": [], "left_out": [], "jobs": jobs, "alone": True}
+
+
+def _views(hidden: Path, budget: _Budget) -> list[dict[str, Any]]:
+    """Each view with its picture and its residuals, the worst first where not all fit."""
+    result = load(hidden / "stages" / "intrinsics")
+    seen = [] if result is None else result.document().get("per_view") or []
+    out = []
+    for view in sorted(seen, key=lambda one: -(one.get("rms_px") or 0.0)):
+        picture = kept_picture(str(view.get("view")), hidden / "pictures")
+        image = "" if picture is None else data_uri(picture.data)
+        if picture is None or not view.get("points_px") or not budget.takes(image):
+            continue
+        out.append(
+            {
+                "name": picture.name,
+                "width": picture.width_px,
+                "height": picture.height_px,
+                "image": image,
+                "rms_px": view.get("rms_px"),
+                "points": view.get("points_px"),
+                "residuals": view.get("residuals_px"),
+            }
+        )
+    order = {str(view.get("view")): k for k, view in enumerate(seen)}
+    return sorted(out, key=lambda one: order[one["name"]])
+
+
+def _stages(
+    told: Mapping[str, Any], sections: Mapping[str, Any], hidden: Path, budget: _Budget
+) -> list[dict[str, Any]]:
+    """A part of the page for each stage, with all its jobs; figures first of stages that run once."""
+    grouped: dict[str, list[dict[str, Any]]] = {}
+    for job in told["jobs"]:
+        grouped.setdefault(job["stage"], []).append(job)
+    made: dict[str, dict[str, Any]] = {}
+    for several in (False, True):
+        for name, jobs in grouped.items():
+            if (len(jobs) > 1) == several:
+                made[name] = _stage(name, jobs, sections, hidden, budget)
+    return [made[name] for name in grouped]
+
+
+def _stage(
+    name: str,
+    jobs: list[dict[str, Any]],
+    sections: Mapping[str, Any],
+    hidden: Path,
+    budget: _Budget,
+) -> dict[str, Any]:
+    section = _merged([sections.get(n) for job in jobs for n in job["writes"]])
+    logs = [str(log.get("name")) for log in section.get("logs") or () if isinstance(log, dict)]
+    ran = [job["status"] not in ("skipped", "missing", "blocked") for job in jobs]
+    results = [
+        load(hidden / "stages" / str(job["name"])) if one else None
+        for job, one in zip(jobs, ran, strict=True)
+    ]
+    shown, width_px = _chosen(results, hidden / "figures", budget)
+    parts = []
+    for job, result in zip(jobs, results, strict=True):
+        document = {} if result is None else result.document()
+        figures, dropped = _figures(result, shown, logs)
+        parts.append(
+            {
+                "job": job,
+                "status": _STATUS.get(job["status"], job["status"]),
+                "document": document,
+                "figures": figures,
+                "dropped": dropped,
+                "messages": [] if result is None else result.messages(),
+                "command": _command(job),
+            }
+        )
+    status = _worst([job["status"] for job in jobs])
+    document = parts[0]["document"] if len(parts) == 1 else {}
+    coarse = f"of {len(jobs)} logs the figures are {width_px} px wide here, to keep this page small"
+    return {
+        "name": name,
+        "title": jobs[0]["title"],
+        "status": _STATUS.get(status, status),
+        "kind": status,
+        "facts": facts(name, section, document) if status in ("ok", "poor") else [],
+        "reasons": list(section.get("reasons") or ()),
+        "remarks": [
+            *(section.get("remarks") or ()),
+            *(section.get("advice") or ()),
+            *([coarse] if width_px else ()),
+        ],
+        "parts": parts,
+        "tables": _replay_tables(parts) if len(parts) > 1 or name == "replay" else tables(document),
+        "several": len(parts) > 1,
+        "flashed": bool(jobs[0]["flashed"]),
+    }
+
+
+def _merged(sections: list[Any]) -> dict[str, Any]:
+    """The sections of a stage as one; reasons and the like of all of them."""
+    whole: dict[str, Any] = {}
+    for section in sections:
+        for key, value in (section if isinstance(section, dict) else {}).items():
+            if isinstance(value, list) and key in ("reasons", "remarks", "advice"):
+                whole[key] = [*whole.get(key, ()), *value]
+            elif isinstance(value, dict) and key == "sigma":
+                whole[key] = {**whole.get(key, {}), **value}
+            else:
+                whole.setdefault(key, value)
+    return whole
+
+
+def _worst(statuses: list[str]) -> str:
+    order = ("failed", "blocked", "poor", "ok", "skipped", "missing")
+    return min(statuses, key=order.index)
+
+
+def _chosen(
+    results: list[Result | None], folder: Path, budget: _Budget
+) -> tuple[dict[Path, tuple[str, int, int]], int]:
+    """Address, width and height of the figures that are shown, and to what width in px they were narrowed.
+
+    Of several logs the first figure of each comes before the second of any, as far as the page is no larger
+    than it should be; the first ones may be narrowed, else the width is 0.
+    """
+    ordered = [[] if result is None else sorted(result.figures(), key=_place) for result in results]
+    listed = sorted(
+        (k, job, path) for job, paths in enumerate(ordered) for k, path in enumerate(paths) if _counts(path)
+    )
+    room = budget.left - (MOST_BYTES - _AIM_BYTES if len(results) > 1 else 0)
+    first = [data_uri(small_figure(path, folder)) for k, _, path in listed if k == 0]
+    width_px = _NARROW_PX if len(results) > 1 and sum(map(len, first)) > room else 0
+    shown = {}
+    for k, _, path in listed:
+        image = small_figure(path, folder, width_px)
+        address = data_uri(image)
+        if (k == 0 or len(address) <= room) and budget.takes(address):
+            shown[path] = (address, *size_of(image))
+            room -= len(address)
+    return shown, width_px
+
+
+def _counts(path: Path) -> bool:
+    """Whether a figure is one of the first of its kind."""
+    counted = re.search(r"_(\d+)$", path.stem)
+    return counted is None or int(counted.group(1)) <= _MOST_COUNTED
+
+
+def _figures(
+    result: Result | None, shown: Mapping[Path, tuple[str, int, int]], logs: list[str]
+) -> tuple[list[dict[str, Any]], list[str]]:
+    figures, dropped = [], []
+    for path in sorted([] if result is None else result.figures(), key=_place):
+        words = caption(path.stem, logs)
+        if path in shown:
+            image, width, height = shown[path]
+            figures.append({"image": image, "caption": words, "width": width, "height": height})
+        else:
+            dropped.append(words)
+    return figures, dropped
+
+
+def _place(path: Path) -> tuple[object, ...]:
+    """States come first, then by name with numbers in their order."""
+    parts = re.split(r"(\d+)", path.stem)
+    return (
+        not path.stem.endswith("_states"),
+        [(int(part), "") if k % 2 else (0, part) for k, part in enumerate(parts)],
+    )
+
+
+def _command(job: Mapping[str, Any]) -> str:
+    """The command; of many files the first two stand for all."""
+    words, inputs = [str(word) for word in job.get("command") or ()], {str(name) for name in job["inputs"]}
+    files = [word for word in words if word in inputs]
+    if len(files) > 3:
+        first = words.index(files[2])
+        rest = [word for word in words[first:] if word not in inputs]
+        words = [*words[:first], f"\N{HORIZONTAL ELLIPSIS} ({len(files)} files)", *rest]
+    return " ".join(words)
+
+
+def _replay_tables(parts: list[dict[str, Any]]) -> list[Table]:
+    """One table over all logs of a stage that runs for each."""
+    records = []
+    for part in parts:
+        logs = (part["document"].get("replay") or {}).get("logs") or []
+        for log in logs:
+            other = (log.get("compared") or {}).get("baseline") or {}
+            error = log.get("rmse") or {}
+            row = {
+                "log": part["job"]["log"],
+                "verdict": log.get("verdict"),
+                "duration_s": log.get("duration_s"),
+            }
+            row |= {"mean q error_mm": error.get("mean_q_mm"), "baseline_mm": other.get("mean_q_mm")}
+            row |= {"phi error_deg": error.get("phi_deg"), "baseline phi_deg": other.get("phi_deg")}
+            row |= {"NEES (2)": error.get("nees")}
+            for sensor, check in (log.get("sensors") or {}).items():
+                row[f"NIS {sensor} ({check.get('degrees')})"] = check.get("nis")
+            records.append(row)
+    return tables({"": {"logs": records}}) if records else []

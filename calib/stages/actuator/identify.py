@@ -1,0 +1,1509 @@
+"""Parameters of the actuator from logs: fit, error bars, verdict, and the next experiment."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import astuple, dataclass, field, fields, replace
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from calib.core.arrays import FloatArray, IntArray
+from calib.core.errors import BadInputError
+from calib.stages.actuator.parameters import DAMPING_SCALE_FREE, DAMPING_SCALE_PUMPS, Creep, Plant
+from calib.stages.actuator.pump import ElongationForce, Orifice, Pump, RateLimit
+from calib.stages.actuator.simulate import simulate_batch, state_row
+
+# ----------------------------------------------------------------------
+# The parameters that an identification can estimate, and how a vector of them becomes a rig.
+#
+# Names and units are those of the rig's file. All are positive: the creep's lambda1 and lambda2 by their
+# bounds, so that with lambda3 < 0 every candidate is passive (3.45). lambda2 and lambda3 enter the motion
+# only by their product; lambda3 is among the parameters so that this is found and said, and is then fixed.
+#
+# The static force of the pumps is either scaled for each bellows (`strength1`, `strength2`), or its map is
+# estimated: the steady elongations at 6, 8, 10 and 12 V, which are the cubic of (2.13), with the strength
+# of
+# the second pump against the first.
+
+KNOTS_V = (6.0, 8.0, 10.0, 12.0)
+"""Voltages at which the static map is estimated (Fig. 2.11)."""
+
+
+@dataclass(frozen=True)
+class Spec:
+    """One parameter: unit, bounds, the size of a typical change, and what it acts on.
+
+    `acts` is "all", "free" (swings with the hoses off) or "pumps"; `symbol` is the source's.
+    """
+
+    unit: str
+    low: float
+    high: float
+    scale: float
+    acts: str
+    symbol: str
+
+
+PARAMETERS: dict[str, Spec] = {
+    "stiffness_scale": Spec("", 0.05, 20.0, 0.2, "all", "c_spr"),
+    "damping_scale_free_swing": Spec("", 0.01, 200.0, 1.0, "free", "c_dmp"),
+    "damping_scale_pumps_connected": Spec("", 0.01, 500.0, 5.0, "pumps", "c_dmp"),
+    "bending_N_per_rad2": Spec("N/rad^2", 0.0, 10.0, 0.05, "all", "k_bnd"),
+    "lambda1_per_s": Spec("1/s", 0.02, 60.0, 1.0, "all", "lambda1"),
+    "lambda2_N_per_m": Spec("N/m", 0.01, 500.0, 3.0, "all", "lambda2"),
+    "lambda3": Spec("", -50.0, -0.01, 0.3, "all", "lambda3"),
+    "lag_s": Spec("s", 0.01, 10.0, 0.2, "pumps", "tau"),
+    "strength1": Spec("", 0.05, 10.0, 0.2, "pumps", "strength1"),
+    "strength2": Spec("", 0.05, 10.0, 0.2, "pumps", "strength2"),
+    "falling_N_per_s": Spec("N/s", 0.01, 50.0, 0.1, "pumps", "R"),
+    "laminar_s": Spec("s", 0.01, 50.0, 0.3, "pumps", "a"),
+    "turbulent_s2_per_N": Spec("s^2/N", 0.0, 200.0, 0.3, "pumps", "b"),
+    "elongation_6V_mm": Spec("mm", 0.0, 60.0, 2.0, "pumps", "eps(6 V)"),
+    "elongation_8V_mm": Spec("mm", 0.0, 60.0, 2.0, "pumps", "eps(8 V)"),
+    "elongation_10V_mm": Spec("mm", 0.0, 60.0, 2.0, "pumps", "eps(10 V)"),
+    "elongation_12V_mm": Spec("mm", 0.0, 60.0, 2.0, "pumps", "eps(12 V)"),
+}
+"""All parameters in the order of tables."""
+
+_ELONGATIONS = tuple(f"elongation_{volt:g}V_mm" for volt in KNOTS_V)
+
+
+@dataclass(frozen=True)
+class StrengthForce(ElongationForce):
+    """The static force with a factor for each of two pumps."""
+
+    strength: tuple[float, float] = (1.0, 1.0)
+
+    def force_N(self, pwm: FloatArray) -> FloatArray:
+        """Steady forces (..., 2) [N] of PWM values (..., 2)."""
+        return np.asarray(super().force_N(pwm) * np.array(self.strength))
+
+
+@dataclass(frozen=True)
+class Nominal:
+    """The rig as it is known before: what is not estimated, and where searches start.
+
+    `plant` has the damping of connected pumps; `free_damping_scale` is c_dmp with the hoses off.
+    """
+
+    plant: Plant = field(default_factory=lambda: replace(Plant(), damping_scale=DAMPING_SCALE_PUMPS))
+    free_damping_scale: float = DAMPING_SCALE_FREE
+    pump: Pump = field(default_factory=Pump)
+    strength: tuple[float, float] = (1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.pump.static, ElongationForce):
+            raise BadInputError("pump: found a polynomial of the force, expected elongation_mm")
+        if not self.plant.creep_rates[2] < 0.0 < self.plant.creep_rates[0]:
+            raise BadInputError(
+                "actuator: found creep that is not passive to start from, expected lambda1 > 0 > lambda3"
+            )
+
+
+def elongation_polynomial(elongation_mm: Sequence[float]) -> tuple[float, float, float, float]:
+    """Coefficients of u^3 .. 1 through the steady elongations [mm] at `KNOTS_V`."""
+    a, b, c, d = np.polyfit(KNOTS_V, np.asarray(elongation_mm, dtype=np.float64), 3).tolist()
+    return a, b, c, d
+
+
+def values_of(nominal: Nominal) -> dict[str, float]:
+    """All parameters of a rig by name."""
+    plant, pump = nominal.plant, nominal.pump
+    l1, l2, l3 = plant.creep_rates
+    law = pump.deflation
+    orifice = law if isinstance(law, Orifice) else Orifice()
+    falling = law.falling_N_per_s if isinstance(law, RateLimit) else 0.4
+    assert isinstance(pump.static, ElongationForce)
+    knots = np.polyval(pump.static.elongation_mm, KNOTS_V).tolist()
+    return {
+        "stiffness_scale": plant.stiffness_scale,
+        "damping_scale_free_swing": nominal.free_damping_scale,
+        "damping_scale_pumps_connected": plant.damping_scale,
+        "bending_N_per_rad2": plant.bending_N_per_rad2,
+        "lambda1_per_s": l1,
+        "lambda2_N_per_m": l2,
+        "lambda3": l3,
+        "lag_s": pump.lag_s,
+        "strength1": nominal.strength[0],
+        "strength2": nominal.strength[1],
+        "falling_N_per_s": falling,
+        "laminar_s": orifice.laminar_s,
+        "turbulent_s2_per_N": orifice.turbulent_s2_per_N,
+        **dict(zip(_ELONGATIONS, knots, strict=True)),
+    }
+
+
+def candidates(nominal: Nominal, free: bool, pumps: bool, static_map: bool) -> tuple[str, ...]:
+    """Parameters that logs of these kinds can tell at all, lambda3 with them.
+
+    Parameters
+    ----------
+    free, pumps : whether there are swings with the hoses off, and logs with commands.
+    static_map : estimate the elongations at `KNOTS_V` instead of the strength of the first pump.
+    """
+    wanted = {"all"} | ({"free"} if free else set()) | ({"pumps"} if pumps else set())
+    names = [name for name, spec in PARAMETERS.items() if spec.acts in wanted]
+    orifice = isinstance(nominal.pump.deflation, Orifice)
+    left_out = {"falling_N_per_s"} if orifice else {"laminar_s", "turbulent_s2_per_N"}
+    left_out |= {"strength1"} if static_map else set(_ELONGATIONS)
+    return tuple(name for name in names if name not in left_out)
+
+
+def made(nominal: Nominal, values: Mapping[str, float], hoses: bool, tick_s: float) -> tuple[Plant, Pump]:
+    """Plant and pump with some parameters changed.
+
+    Parameters
+    ----------
+    values : by name of `PARAMETERS`; the others keep their nominal value.
+    hoses : whether the pumps are connected, which decides on the damping.
+    """
+    v = {**values_of(nominal), **values}
+    plant = nominal.plant
+    plant = replace(
+        plant,
+        stiffness_scale=v["stiffness_scale"],
+        damping_scale=v["damping_scale_pumps_connected" if hoses else "damping_scale_free_swing"],
+        bending_N_per_rad2=v["bending_N_per_rad2"],
+        creep=Creep(v["lambda1_per_s"], v["lambda2_N_per_m"], v["lambda3"]),
+    )
+    static = nominal.pump.static
+    assert isinstance(static, ElongationForce)
+    law = nominal.pump.deflation
+    curve = static.elongation_mm
+    if any(name in values for name in _ELONGATIONS):
+        curve = elongation_polynomial([v[name] for name in _ELONGATIONS])
+    deflation = (
+        RateLimit(v["falling_N_per_s"])
+        if isinstance(law, RateLimit)
+        else Orifice(v["laminar_s"], v["turbulent_s2_per_N"])
+    )
+    force = StrengthForce(
+        curve, static.stiffness, static.supply_V, static.dead_zone_V, (v["strength1"], v["strength2"])
+    )
+    return plant, replace(nominal.pump, static=force, deflation=deflation, lag_s=v["lag_s"], tick_s=tick_s)
+
+
+# ----------------------------------------------------------------------
+# A log as an identification sees it, and what simulated rigs would have shown in its place.
+#
+# A `Track` holds the commands by ticks and what was measured of the head: angle and length with the square
+# root of the inverse of their covariance, so that whitened residuals of a perfect model have deviation one.
+#
+# The rig is at rest before the first tick, bent and stretched as the start says, or in motion there, with
+# rates, creep and forces that are unknown too. Commands before it are zero, or of a start in motion the
+# first
+# one. Between ticks the states follow the cubic through values and rates at both ends (4e-5 rad at 4 Hz).
+
+SUBSTEPS = 12
+"""Steps per tick of 1/60 s: 1.4 ms, of fourth order."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """State before the first tick: angle and length, and what is zero at rest with the pumps off.
+
+    Attributes
+    ----------
+    phi_rad, length_m, dphi_radps, dlength_mps : of the head.
+    creep1_N, creep2_N : z of (3.45). force1_N, force2_N : of the pumps. lag1_N, lag2_N : of their lags, which
+        are below the forces while air leaves at its limit.
+    """
+
+    phi_rad: float
+    length_m: float
+    dphi_radps: float = 0.0
+    dlength_mps: float = 0.0
+    creep1_N: float = 0.0
+    creep2_N: float = 0.0
+    force1_N: float = 0.0
+    force2_N: float = 0.0
+    lag1_N: float = 0.0
+    lag2_N: float = 0.0
+
+    def row(self, plant: Plant) -> FloatArray:
+        """The row (10,) of `kernel.STATE`."""
+        row = state_row(plant, self.phi_rad, self.length_m, (self.force1_N, self.force2_N))
+        turning = plant.bellows_radius_m * self.dphi_radps
+        row[2:4] = self.dlength_mps + turning, self.dlength_mps - turning
+        row[4:8] = self.creep1_N, self.creep2_N, self.lag1_N, self.lag2_N
+        return row
+
+
+COMPONENTS = tuple(field.name for field in fields(Start))
+"""Names of a start's values, those of rest first, those that only pumps have last."""
+
+
+@dataclass(frozen=True)
+class Track:
+    """One log.
+
+    Attributes
+    ----------
+    name : for messages. tick_s : period of the commands.
+    pwm : (n, 2) commands, row k at the time k tick_s. hoses : whether the pumps are connected.
+    t_s : (m,) times of the measured rows. head : (m, 2) angle [rad] and length [m].
+    whitening : (m, 2, 2) turns errors of `head` into numbers of deviation one.
+    moving : a guess of the start where the log begins in motion, None where it begins at rest.
+    """
+
+    name: str
+    tick_s: float
+    pwm: FloatArray
+    hoses: bool
+    t_s: FloatArray
+    head: FloatArray
+    whitening: FloatArray
+    moving: Start | None = None
+
+    def __post_init__(self) -> None:
+        m = len(self.t_s)
+        if self.head.shape != (m, 2) or self.whitening.shape != (m, 2, 2) or self.pwm.shape[1:] != (2,):
+            raise BadInputError(f"{self.name}: found arrays that do not match")
+        if m == 0 or len(self.pwm) < 2:
+            raise BadInputError(f"{self.name}: found no rows to identify from")
+
+    @property
+    def start(self) -> Start:
+        """Median of the first five rows, which outliers do not move; of a log in motion its guess."""
+        if self.moving is not None:
+            return self.moving
+        phi, length = np.median(self.head[:5], axis=0).tolist()
+        return Start(phi, length)
+
+    @property
+    def unknown(self) -> tuple[str, ...]:
+        """Values of the start that are not known: of `COMPONENTS` the first 2, 6 or 10."""
+        return COMPONENTS[: 2 if self.moving is None else 10 if self.hoses else 6]
+
+
+def heads_of(
+    track: Track,
+    nominal: Nominal,
+    sets: Sequence[Mapping[str, float]],
+    starts: Sequence[Start],
+    delay_s: float,
+    threads: int = 2,
+    pairs: Sequence[tuple[Plant, Pump]] | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """Angle and length at the track's rows, and their rates, for sets of parameters: (sets, m, 2) each.
+
+    Parameters
+    ----------
+    delay_s : the rows show the head as it was this much earlier.
+    pairs : plants and pumps of the sets, where they have been made before.
+
+    A set whose motion leaves the model is NaN.
+    """
+    if pairs is None:
+        pairs = [made(nominal, values, track.hoses, track.tick_s) for values in sets]
+    r, pwm = nominal.plant.bellows_radius_m, track.pwm
+    if track.moving is not None:
+        # The batch knows no commands before the first; those on their way are put in by hand.
+        late = np.maximum(np.arange(len(pwm)) - nominal.pump.delay_ticks, 0)
+        pwm, pairs = pwm[late], [(plant, replace(pump, delay_ticks=0)) for plant, pump in pairs]
+    rows = np.stack([start.row(plant) for (plant, _), start in zip(pairs, starts, strict=True)])
+    last = float(track.t_s[-1] - delay_s)
+    ticks = min(max(int(np.ceil(last / track.tick_s)) + 1, 2), len(track.pwm))
+    substeps = max(round(SUBSTEPS * 60.0 * track.tick_s), 4)
+    states, _ = simulate_batch(
+        [p for p, _ in pairs], [u for _, u in pairs], pwm[:ticks], rows, substeps, threads
+    )
+    states = np.concatenate([rows[:, None, :], states], axis=1)
+    half = 0.5 / r
+    y = np.stack([(states[..., 0] - states[..., 1]) * half, 0.5 * (states[..., 0] + states[..., 1])], axis=-1)
+    dy = np.stack(
+        [(states[..., 2] - states[..., 3]) * half, 0.5 * (states[..., 2] + states[..., 3])], axis=-1
+    )
+    at = np.clip((track.t_s - delay_s) / track.tick_s, 0.0, float(ticks))
+    k = np.minimum(at.astype(np.int64), ticks - 1)
+    x = (at - k)[None, :, None]
+    h = track.tick_s
+    y0, y1, d0, d1 = y[:, k], y[:, k + 1], h * dy[:, k], h * dy[:, k + 1]
+    rise = y1 - y0
+    curve, bend = 3.0 * rise - 2.0 * d0 - d1, d0 + d1 - 2.0 * rise
+    value = y0 + x * (d0 + x * (curve + x * bend))
+    rate = (d0 + x * (2.0 * curve + 3.0 * x * bend)) / h
+    return np.asarray(value), np.asarray(rate)
+
+
+# ----------------------------------------------------------------------
+# Residuals of simulated against estimated motion and their derivatives, for several logs at once.
+#
+# Unknowns are the parameters that are estimated, and what each log needs beside them:
+#
+#     offset_phi, offset_length      of the camera's plane, the same in all logs, small by their priors
+#     delay                          of the measured rows; for logs with commands one for all, since there
+#                                    it cannot be told from the pumps' dead time, else one for each log
+#     phi, length                    before each log's first tick; of a log that begins in motion also
+# rates,
+#                                    creep and forces there, bounded by wide priors about a first guess
+#
+# The whitened residual of a row is r = W (measured - simulated(t - delay) - offset). Derivatives by
+# parameters and starts are central differences, which a batch of simulations gives at once; those by the
+# delays and offsets are exact.
+
+CAMERA_DELAY_S = 0.025
+"""Usual time from the exposure to the tick that reads the result."""
+
+FAR = 1e3
+"""Residual of a row that a candidate cannot reach at all."""
+
+_OFFSET_SIGMA = (0.005, 0.0005)
+_DELAY_SIGMA_S = 0.03
+_STEP = 1e-4
+_START_STEP = (1e-4, 1e-5, 1e-3, *(1e-4,) * 7)
+_START_SCALE = (0.01, 0.001, 0.1, 0.005, 0.02, 0.02, *(0.05,) * 4)
+_START_REACH = (0.3, 0.02, 30.0, 1.0, 2.0, 2.0, *(5.0,) * 4)
+"""Steps, scales and bounds by `identify_tracks.COMPONENTS`."""
+_FREE_SIGMA = (3.0, 0.1, 0.2, 0.2)
+_PUMPED_SIGMA = (0.5, 0.02, 0.2, 0.2, *(0.5,) * 4)
+"""Priors of the same, without those of angle and length: of free swings and of logs with pumps."""
+_PRIORS = ("offset_phi_rad", "offset_length_m")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the unknowns are: parameters, offsets, delays, starts."""
+
+    names: tuple[str, ...]
+    delays: tuple[int, ...]
+    starts: tuple[int, ...]
+
+    @property
+    def offset(self) -> int:
+        return len(self.names)
+
+    @property
+    def delay(self) -> int:
+        return self.offset + 2
+
+    @property
+    def start(self) -> int:
+        return self.delay + max(self.delays) + 1
+
+    @property
+    def size(self) -> int:
+        return self.start + sum(self.starts)
+
+    def of_start(self, k: int) -> slice:
+        """The start of log k."""
+        at = self.start + sum(self.starts[:k])
+        return slice(at, at + self.starts[k])
+
+    @property
+    def nuisances(self) -> int:
+        return self.size - len(self.names)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Logs and what is estimated from them.
+
+    Attributes
+    ----------
+    names : parameters that are estimated. held : values of others that differ from the nominal ones.
+    delay_s, delay_sigma_s : what is known of the rows' delay.
+    """
+
+    nominal: Nominal
+    tracks: Sequence[Track]
+    names: tuple[str, ...]
+    held: Mapping[str, float]
+    delay_s: float = CAMERA_DELAY_S
+    delay_sigma_s: float = _DELAY_SIGMA_S
+    threads: int = 2
+
+    @property
+    def layout(self) -> Layout:
+        numbers, used, shared = [], 0, -1
+        for track in self.tracks:
+            if track.hoses:
+                if shared < 0:
+                    shared, used = used, used + 1
+                numbers.append(shared)
+            else:
+                numbers.append(used)
+                used += 1
+        return Layout(self.names, tuple(numbers), tuple(len(track.unknown) for track in self.tracks))
+
+    def scales(self) -> FloatArray:
+        """Typical changes of all unknowns."""
+        layout = self.layout
+        out = np.empty(layout.size)
+        out[: layout.offset] = [PARAMETERS[name].scale for name in self.names]
+        out[layout.offset : layout.delay] = _OFFSET_SIGMA
+        out[layout.delay : layout.start] = 0.01
+        for k, count in enumerate(layout.starts):
+            out[layout.of_start(k)] = _START_SCALE[:count]
+        return out
+
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Least and greatest values of all unknowns."""
+        layout = self.layout
+        low, high = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)
+        low[: layout.offset] = [PARAMETERS[name].low for name in self.names]
+        high[: layout.offset] = [PARAMETERS[name].high for name in self.names]
+        low[layout.delay : layout.start], high[layout.delay : layout.start] = -0.5, 0.5
+        for k, track in enumerate(self.tracks):
+            at, count = layout.of_start(k), layout.starts[k]
+            begin, reach = np.array(astuple(track.start))[:count], np.array(_START_REACH)[:count]
+            low[at], high[at] = begin - reach, begin + reach
+        return low, high
+
+    def values(self, x: FloatArray) -> dict[str, float]:
+        """Parameters by name of a vector of unknowns."""
+        return {**self.held, **dict(zip(self.names, x[: len(self.names)].tolist(), strict=True))}
+
+
+def first_guess(problem: Problem, values: Mapping[str, float]) -> FloatArray:
+    """Unknowns with these parameters, offsets zero, usual delays, and starts as they were measured."""
+    layout = problem.layout
+    x = np.zeros(layout.size)
+    x[: layout.offset] = [values[name] for name in problem.names]
+    x[layout.delay : layout.start] = problem.delay_s
+    for k, track in enumerate(problem.tracks):
+        x[layout.of_start(k)] = astuple(track.start)[: layout.starts[k]]
+    return x
+
+
+def starts_of(problem: Problem, x: FloatArray) -> list[Start]:
+    """Starts of all logs in a vector of unknowns."""
+    layout = problem.layout
+    return [Start(*x[layout.of_start(k)].tolist()) for k in range(len(problem.tracks))]
+
+
+def _whitened(track: Track, error: FloatArray) -> FloatArray:
+    return np.asarray(np.einsum("mij,...mj->...mi", track.whitening, error))
+
+
+def _start_sigma(track: Track) -> FloatArray:
+    return np.array(_PUMPED_SIGMA if track.hoses else _FREE_SIGMA)
+
+
+def _priors(problem: Problem, x: FloatArray) -> FloatArray:
+    layout = problem.layout
+    offsets = x[layout.offset : layout.delay] / np.array(_OFFSET_SIGMA)
+    delays = (x[layout.delay : layout.start] - problem.delay_s) / problem.delay_sigma_s
+    parts = [offsets, delays]
+    for k, track in enumerate(problem.tracks):
+        if track.moving is not None:
+            guess = np.array(astuple(track.moving))[2 : layout.starts[k]]
+            parts.append((x[layout.of_start(k)][2:] - guess) / _start_sigma(track))
+    return np.concatenate(parts)
+
+
+def residuals(problem: Problem, xs: FloatArray) -> FloatArray:
+    """Whitened residuals (sets, rows) of vectors of unknowns (sets, size), the priors' at the end.
+
+    The rows are those of the logs in turn, angle and length of a picture side by side (before whitening).
+    """
+    layout = problem.layout
+    parts = []
+    values = [problem.values(x) for x in xs]
+    for k, track in enumerate(problem.tracks):
+        starts = [starts_of(problem, x)[k] for x in xs]
+        delay = layout.delay + layout.delays[k]
+        # Candidates of one batch may differ in their delay; rates shift them to their own.
+        middle = float(np.mean(xs[:, delay]))
+        head, rate = heads_of(track, problem.nominal, values, starts, middle, problem.threads)
+        if np.ptp(xs[:, delay]) > 0.0:
+            head = head - rate * (xs[:, delay] - middle)[:, None, None]
+        error = track.head - head - xs[:, None, layout.offset : layout.delay]
+        rows = _whitened(track, error).reshape(len(xs), -1)
+        parts.append(np.where(np.isfinite(rows), rows, FAR))
+    parts.append(np.stack([_priors(problem, x) for x in xs]))
+    return np.concatenate(parts, axis=1)
+
+
+def jacobian(problem: Problem, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Residuals (rows,) and their derivatives (rows, size) at a vector of unknowns."""
+    layout, scales = problem.layout, problem.scales()
+    low, high = problem.bounds()
+    P = len(problem.names)
+    steps = _STEP * np.maximum(np.abs(x[:P]), scales[:P])
+    up, down = np.minimum(x[:P] + steps, high[:P]), np.maximum(x[:P] - steps, low[:P])
+    base = problem.values(x)
+    moved = [base]
+    for name, a, b in zip(problem.names, up.tolist(), down.tolist(), strict=True):
+        moved += [{**base, name: a}, {**base, name: b}]
+    # Making a plant checks it, which takes as long as a short log: once for all logs of a kind.
+    alike: dict[tuple[bool, float], list[tuple[Plant, Pump]]] = {}
+    blocks, errors = [], []
+    for k, track in enumerate(problem.tracks):
+        begin = starts_of(problem, x)[k]
+        sets, starts = list(moved), [begin] * len(moved)
+        kind = track.hoses, track.tick_s
+        if kind not in alike:
+            alike[kind] = [made(problem.nominal, values, *kind) for values in moved]
+        count = layout.starts[k]
+        for name, step in zip(track.unknown, _START_STEP, strict=False):
+            sets += [base, base]
+            starts += [replace(begin, **{name: getattr(begin, name) + s * step}) for s in (1.0, -1.0)]
+        delay = layout.delay + layout.delays[k]
+        pairs = [*alike[kind], *[alike[kind][0]] * (len(sets) - len(moved))]
+        head, rate = heads_of(track, problem.nominal, sets, starts, float(x[delay]), problem.threads, pairs)
+        W = track.whitening
+        J = np.zeros((len(track.t_s), 2, layout.size))
+        width = np.concatenate([up - down, 2.0 * np.array(_START_STEP)[:count]])
+        slope = (head[1::2] - head[2::2]) / width[:, None, None]
+        slope = -np.einsum("mij,smj->mis", W, slope)
+        J[:, :, :P] = slope[:, :, :P]
+        J[:, :, layout.of_start(k)] = slope[:, :, P:]
+        J[:, :, layout.offset : layout.delay] = -W
+        J[:, :, delay] = _whitened(track, rate[0])
+        error = _whitened(track, track.head - head[0] - x[layout.offset : layout.delay])
+        good = np.isfinite(error).all() and np.isfinite(J).all()
+        blocks.append(J.reshape(-1, layout.size) if good else np.zeros((2 * len(track.t_s), layout.size)))
+        errors.append(np.where(np.isfinite(error), error, FAR).reshape(-1))
+    prior = np.zeros((2 + layout.start - layout.delay, layout.size))
+    for row, sigma in enumerate(_OFFSET_SIGMA):
+        prior[row, layout.offset + row] = 1.0 / sigma
+    for row in range(layout.start - layout.delay):
+        prior[2 + row, layout.delay + row] = 1.0 / problem.delay_sigma_s
+    priors = [prior]
+    for k, track in enumerate(problem.tracks):
+        if track.moving is not None:
+            rows = np.zeros((layout.starts[k] - 2, layout.size))
+            rows[:, layout.of_start(k)][:, 2:] = np.diag(1.0 / _start_sigma(track))
+            priors.append(rows)
+    return np.concatenate([*errors, _priors(problem, x)]), np.vstack([*blocks, *priors])
+
+
+# ----------------------------------------------------------------------
+# Non-linear least squares over several logs, from several starts, with what cannot be told left out.
+#
+# A batch of candidates spread about the nominal rig costs little more than one, so the search begins with
+# `CANDIDATES` of them; the best are refined by a trust region within bounds under a soft-L1 loss, which
+# keeps frames with another thing in place of the marker from pulling.
+#
+# Which parameters are estimated is decided by the information the logs hold about them, everything else
+# that is unknown eliminated (S, the Schur complement). In relative changes of the parameters:
+#
+# - two whose effects are the same up to a factor enter only as a product or ratio; the second is fixed;
+# - one whose relative standard deviation would be above `VAGUE` is fixed at its nominal value.
+#
+# Both are looked at where the search starts and again at the solution.
+
+CANDIDATES = 32
+VAGUE = 0.5
+_SAME = 0.99995
+_SOFT = 2.0
+_REFINED = 3
+_ROUNDS = 4
+_MOVES = 4.0
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A minimum.
+
+    Attributes
+    ----------
+    problem : with the names that were estimated in the end. x : all unknowns.
+    residual, J : whitened residuals and their derivatives there. cost : robust cost.
+    fixed : sentences by parameter for what was left out.
+    agreeing, starts : how many of the refined starts came to the same minimum.
+    """
+
+    problem: Problem
+    x: FloatArray
+    residual: FloatArray
+    J: FloatArray
+    cost: float
+    fixed: dict[str, str]
+    agreeing: int
+    starts: int
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Estimated parameters by name."""
+        return {name: float(v) for name, v in zip(self.problem.names, self.x, strict=False)}
+
+
+def _robust(r: FloatArray) -> FloatArray:
+    """Soft-L1 cost of rows (..., n)."""
+    return np.asarray(_SOFT**2 * np.sum(np.sqrt(1.0 + (r / _SOFT) ** 2) - 1.0, axis=-1))
+
+
+def weights(residual: FloatArray) -> FloatArray:
+    """Weight of each residual under the loss."""
+    return np.asarray(1.0 / np.sqrt(1.0 + (residual / _SOFT) ** 2))
+
+
+def solve(
+    problem: Problem, x: FloatArray, most: int = 30
+) -> tuple[FloatArray, float, FloatArray, FloatArray]:
+    """A minimum near x: unknowns, robust cost, residuals and derivatives there."""
+    low, high = problem.bounds()
+    scales = problem.scales()
+    begin = np.clip(x, low + 1e-9 * scales, high - 1e-9 * scales)
+    seen: dict[bytes, tuple[FloatArray, FloatArray]] = {}
+
+    def both(at: FloatArray) -> tuple[FloatArray, FloatArray]:
+        key = at.tobytes()
+        if key not in seen:
+            seen.clear()
+            seen[key] = jacobian(problem, at)
+        return seen[key]
+
+    def rows(at: FloatArray) -> FloatArray:
+        return both(at)[0]
+
+    def slopes(at: FloatArray) -> FloatArray:
+        return both(at)[1]
+
+    found = least_squares(
+        rows,
+        begin,
+        jac=slopes,
+        bounds=(low, high),
+        x_scale=scales,
+        loss="soft_l1",
+        f_scale=_SOFT,
+        max_nfev=most,
+        xtol=1e-8,
+        ftol=1e-8,
+        gtol=1e-10,
+    )
+    residual, J = both(np.asarray(found.x, dtype=np.float64))
+    return np.asarray(found.x), float(_robust(residual)), residual, J
+
+
+def informative(problem: Problem, residual: FloatArray, J: FloatArray, x: FloatArray) -> FloatArray:
+    """Information (P, P) about relative changes of the parameters, the other unknowns eliminated."""
+    P = len(problem.names)
+    # Relative changes of magnitudes, so that a product of a positive and a negative one is seen as such.
+    size = np.copysign(np.maximum(np.abs(x[:P]), 0.1 * problem.scales()[:P]), x[:P])
+    w = weights(residual) if float(np.max(np.abs(residual), initial=0.0)) < FAR else np.ones(len(residual))
+    A = J * np.sqrt(w)[:, None]
+    A[:, :P] *= size
+    H = A.T @ A
+    nuisance = H[P:, P:]
+    scale = np.sqrt(np.maximum(np.diag(nuisance), 1e-300))
+    inverse = np.linalg.pinv(nuisance / np.outer(scale, scale), rcond=1e-12) / np.outer(scale, scale)
+    return np.asarray(H[:P, :P] - H[:P, P:] @ inverse @ H[P:, :P])
+
+
+def _words(name: str) -> str:
+    symbol = PARAMETERS[name].symbol
+    return symbol if name.startswith(symbol) else f"{name} ({symbol})"
+
+
+def _left_out(problem: Problem, S: FloatArray, held: Mapping[str, float]) -> tuple[str, str] | None:
+    """A parameter that the logs cannot tell, and the sentence about it."""
+    names = problem.names
+    size = np.sqrt(np.maximum(np.diag(S), 0.0))
+    for k, name in enumerate(names):
+        if size[k] < 1e-6 * max(float(size.max(initial=0.0)), 1e-300) or size[k] < 1.0 / VAGUE / 10.0:
+            return name, f"the logs do not depend on it; kept at {held[name]:.4g}"
+    cosine = S / np.outer(size, size)
+    for i in range(len(names)):
+        for j in range(i + 1, len(names)):
+            if abs(cosine[i, j]) > _SAME:
+                how = "a product" if cosine[i, j] > 0.0 else "a ratio"
+                if not 0.99 < size[i] / size[j] < 1.01:
+                    how = "one combination"
+                sentence = f"{_words(names[i])} and {_words(names[j])} enter only as {how}"
+                return names[j], f"{sentence}; kept at {held[names[j]]:.4g}"
+    sigma = np.sqrt(np.maximum(np.diag(np.linalg.pinv(cosine, rcond=1e-10)), 0.0)) / size
+    worst = int(np.argmax(sigma))
+    if sigma[worst] > VAGUE:
+        return names[worst], (
+            f"the logs tell it to {100.0 * sigma[worst]:.0f} % only; kept at {held[names[worst]]:.4g}"
+        )
+    return None
+
+
+def _pruned(
+    problem: Problem, x: FloatArray, residual: FloatArray, J: FloatArray, fixed: dict[str, str]
+) -> tuple[Problem, FloatArray, FloatArray]:
+    """The problem without what cannot be told, its unknowns and derivatives."""
+    known = {**values_of(problem.nominal), **problem.held}
+    while problem.names:
+        found = _left_out(problem, informative(problem, residual, J, x), known)
+        if found is None:
+            break
+        name, sentence = found
+        k = problem.names.index(name)
+        fixed[name] = sentence
+        problem = replace(problem, names=tuple(n for n in problem.names if n != name))
+        x, J = np.delete(x, k), np.delete(J, k, axis=1)
+    return problem, x, J
+
+
+def _blind(fixed: Mapping[str, str]) -> BadInputError:
+    names = ", ".join(name for name in fixed if name != "lambda3")
+    return BadInputError(
+        f"identify: these logs cannot tell any parameter ({names}); expected logs in which the rig moves"
+    )
+
+
+def _moves(track: Track) -> bool:
+    """Whether some second of a log shows more than the noise does; single far readings do not count."""
+    z = np.einsum("mij,mj->mi", track.whitening, track.head - np.median(track.head, axis=0))
+    power = np.minimum(np.mean(z * z, axis=1), 25.0)
+    rows = max(round(1.0 / max(float(np.median(np.diff(track.t_s))), 1e-3)), 5)
+    mean = np.convolve(power, np.full(rows, 1.0 / rows), mode="valid")
+    return bool(len(mean) and float(mean.max()) > _MOVES)
+
+
+def _spread(problem: Problem, values: Mapping[str, float], seed: int) -> FloatArray:
+    """Candidates (`CANDIDATES`, size) about the nominal rig, itself the first."""
+    rng = np.random.default_rng(seed)
+    x = first_guess(problem, values)
+    out = np.tile(x, (CANDIDATES, 1))
+    P = len(problem.names)
+    out[1:, :P] *= np.exp(rng.uniform(-0.7, 0.7, (CANDIDATES - 1, P)))
+    low, high = problem.bounds()
+    out[:, :P] = np.clip(out[:, :P], low[:P] * 1.001, high[:P] * 0.999)
+    return out
+
+
+def fit_tracks(
+    nominal: Nominal,
+    tracks: Sequence[Track],
+    static_map: bool = False,
+    delay_s: float | None = None,
+    delay_sigma_s: float | None = None,
+    threads: int = 2,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Solution:
+    """Estimate all parameters that these logs can tell.
+
+    Parameters
+    ----------
+    static_map : see `identify_parameters.candidates`.
+    delay_s, delay_sigma_s : what is known of the delay of the measured rows.
+
+    Raises
+    ------
+    BadInputError without logs; when no parameter can be told, with the reason for each.
+    """
+    if not tracks:
+        raise BadInputError("identify: found no log, expected at least one")
+    names = candidates(nominal, any(not t.hoses for t in tracks), any(t.hoses for t in tracks), static_map)
+    if not any(_moves(track) for track in tracks):
+        raise _blind(dict.fromkeys(names, "the rig does not move"))
+    known = values_of(nominal)
+    problem = Problem(nominal, tracks, names, {}, threads=threads)
+    if delay_s is not None:
+        problem = replace(problem, delay_s=delay_s)
+    if delay_sigma_s is not None:
+        problem = replace(problem, delay_sigma_s=max(delay_sigma_s, 1e-5))
+    fixed: dict[str, str] = {}
+    x = first_guess(problem, known)
+    residual, J = jacobian(problem, x)
+    # Where the search starts nothing fits yet: all rows count alike there.
+    problem, x, J = _pruned(problem, x, np.zeros_like(residual), J, fixed)
+    if not problem.names:
+        raise _blind(fixed)
+    best, agreeing, refined = _search(problem, known, seed, progress)
+    for _ in range(_ROUNDS):
+        x, cost, residual, J = best
+        smaller, x, J = _pruned(problem, x, residual, J, fixed)
+        if smaller.names == problem.names:
+            break
+        problem = smaller
+        if not problem.names:
+            break
+        best = solve(problem, x)
+    if not problem.names:
+        raise _blind(fixed)
+    x, cost, residual, J = best
+    return Solution(problem, x, residual, J, cost, fixed, agreeing, refined)
+
+
+def _search(
+    problem: Problem, known: Mapping[str, float], seed: int, progress: Progress | None
+) -> tuple[tuple[FloatArray, float, FloatArray, FloatArray], int, int]:
+    """The best of several refined starts, how many agree with it, and of how many."""
+    spread = _spread(problem, known, seed)
+    costs = _robust(residuals(problem, spread))
+    order = np.argsort(costs, kind="stable")[:_REFINED].tolist()
+    if 0 not in order:
+        order.append(0)
+    found = []
+    for done, k in enumerate(order):
+        if progress is not None:
+            progress(done, len(order) + 1)
+        found.append(solve(problem, spread[k], 25))
+    best = min(found, key=lambda one: one[1])
+    final = solve(problem, best[0], 40)
+    limit = final[1] * 1.01 + 3.0
+    return final, sum(one[1] <= limit for one in found), len(order) if math.isfinite(final[1]) else 0
+
+
+# ----------------------------------------------------------------------
+# What a fit is worth: standard deviations, correlation, whiteness of residuals, and a log held back.
+#
+# With weighted derivatives J and information H = J^T J of all unknowns, priors included, white residuals of
+# variance s^2 would give the covariance s^2 H^-1. Those of a camera with coarse pixels, and of a model that
+# is not quite right, are coloured. Then the sandwich
+#
+#     H^-1 (sum_k w_k sum_i g_i g_(i+k)^T) H^-1,   g_i the gradient of row i, w_k = 1 - |k| / (L + 1)
+#
+# (Newey and West) holds, with the lags L of a third of a second. It scatters itself, so of it and the white
+# one the larger variance is taken for each parameter; their ratio says how far colour has inflated it.
+
+_SPAN_S = 0.35
+_LAGS = 20
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Standard deviations and correlation of the estimated parameters.
+
+    Attributes
+    ----------
+    sigma : by name. inflation : by name, how much colour has raised it. covariance, correlation : (P, P).
+    scale : robust standard deviation of the whitened residuals, 1 for a perfect model and noise.
+    """
+
+    sigma: dict[str, float]
+    inflation: dict[str, float]
+    covariance: FloatArray
+    correlation: FloatArray
+    scale: float
+
+
+@dataclass(frozen=True)
+class Colour:
+    """Whiteness of one log's residuals.
+
+    Attributes
+    ----------
+    first : correlation with the next row, of angle and length. outside : share of `_LAGS` lags that are
+    beyond the 95 % band of white noise, which is about 0.05 then. share_far : rows with a weight below 1/3.
+    """
+
+    name: str
+    first: tuple[float, float]
+    outside: float
+    share_far: float
+
+    @property
+    def white(self) -> bool:
+        """Whether hardly more lags than chance allows are outside."""
+        return self.outside <= 0.15
+
+
+@dataclass(frozen=True)
+class HeldLog:
+    """RMS of angle [rad] and length [m] on a log, fitted and held back."""
+
+    name: str
+    fitted_phi_rad: float
+    fitted_length_m: float
+    held_phi_rad: float
+    held_length_m: float
+
+
+def _spans(tracks: Sequence[Track]) -> list[slice]:
+    out, at = [], 0
+    for track in tracks:
+        out.append(slice(at, at + 2 * len(track.t_s)))
+        at += 2 * len(track.t_s)
+    return out
+
+
+def _inverse(H: FloatArray) -> FloatArray:
+    size = np.sqrt(np.maximum(np.diag(H), 1e-300))
+    return np.asarray(np.linalg.pinv(H / np.outer(size, size), rcond=1e-13) / np.outer(size, size))
+
+
+def uncertainty(solution: Solution) -> Uncertainty:
+    """Covariance of the parameters, the larger of the white one and the sandwich."""
+    problem, r, J = solution.problem, solution.residual, solution.J
+    P = len(problem.names)
+    w = weights(r)
+    spans = _spans(problem.tracks)
+    rows = spans[-1].stop
+    scale = max(1.4826 * float(np.median(np.abs(r[:rows]))), 1e-9)
+    # The prior is known, the scale of the residuals is not.
+    size = np.concatenate([np.full(rows, 1.0 / scale**2), np.ones(len(r) - rows)])
+    H = (J * (w * size)[:, None]).T @ J
+    inverse = _inverse(H)
+    middle = (J[rows:]).T @ J[rows:]
+    for track, span in zip(problem.tracks, spans, strict=True):
+        g = (J[span] * (w * size * r)[span, None]).reshape(-1, 2, J.shape[1]).sum(axis=1)
+        period = float(np.median(np.diff(track.t_s))) if len(track.t_s) > 1 else track.tick_s
+        lags = min(max(round(_SPAN_S / max(period, 1e-4)), 1), len(g) // 4)
+        middle = middle + g.T @ g
+        for k in range(1, lags + 1):
+            cross = g[:-k].T @ g[k:]
+            middle = middle + (1.0 - k / (lags + 1.0)) * (cross + cross.T)
+    # With far rows weighted down, the mean of w r^2 stands for the scale of the others.
+    sandwich = (inverse @ middle @ inverse)[:P, :P]
+    spread = float(np.mean((w * r**2)[:rows])) / scale**2
+    white = inverse[:P, :P] * max(spread, 1.0)
+    ratio = np.sqrt(np.maximum(np.diag(sandwich) / np.maximum(np.diag(white), 1e-300), 1.0))
+    covariance = white * np.outer(ratio, ratio)
+    sigma = np.sqrt(np.diag(covariance))
+    return Uncertainty(
+        dict(zip(problem.names, sigma.tolist(), strict=True)),
+        dict(zip(problem.names, ratio.tolist(), strict=True)),
+        covariance,
+        covariance / np.outer(sigma, sigma),
+        scale,
+    )
+
+
+def colour_of(solution: Solution) -> tuple[Colour, ...]:
+    """Whiteness of each log's whitened residuals, rows that are far off cut at three deviations."""
+    out = []
+    w = weights(solution.residual)
+    for track, span in zip(solution.problem.tracks, _spans(solution.problem.tracks), strict=True):
+        r = solution.residual[span].reshape(-1, 2)
+        far = float(np.mean((w[span].reshape(-1, 2) < 1.0 / 3.0).any(axis=1)))
+        size = np.maximum(1.4826 * np.median(np.abs(r), axis=0), 1e-9)
+        z = np.clip(r / size, -3.0, 3.0)
+        z = z - z.mean(axis=0)
+        power = np.maximum(np.sum(z * z, axis=0), 1e-12)
+        lags = min(_LAGS, max(len(z) - 2, 1))
+        c = np.stack([np.sum(z[k:] * z[:-k], axis=0) / power for k in range(1, lags + 1)])
+        out.append(
+            Colour(
+                track.name,
+                (float(c[0, 0]), float(c[0, 1])),
+                float(np.mean(np.abs(c) > 1.96 / math.sqrt(len(z)))),
+                far,
+            )
+        )
+    return tuple(out)
+
+
+def rms_by_track(problem: Problem, residual: FloatArray) -> list[tuple[float, float]]:
+    """RMS of angle [rad] and length [m] of each log, rows beyond six deviations left out."""
+    out = []
+    for track, span in zip(problem.tracks, _spans(problem.tracks), strict=True):
+        r = residual[span].reshape(-1, 2)
+        size = np.maximum(1.4826 * np.median(np.abs(r)), 1e-9)
+        near = (np.abs(r) < 6.0 * size).all(axis=1)
+        error = np.linalg.solve(track.whitening[near], r[near][:, :, None])[:, :, 0]
+        phi, length = np.sqrt(np.mean(error**2, axis=0)).tolist()
+        out.append((phi, length))
+    return out
+
+
+def held_back(solution: Solution) -> list[HeldLog]:
+    """Each log predicted by a fit to all others; empty for a single one.
+
+    Of the log that is held back only its start, delay and the camera's offset are estimated. A log that
+    alone tells a parameter keeps the others from telling it; that one stays as it was found.
+    """
+    problem = solution.problem
+    if len(problem.tracks) < 2:
+        return []
+    inside = rms_by_track(problem, solution.residual)
+    found = {**problem.held, **solution.values}
+    out = []
+    for k, track in enumerate(problem.tracks):
+        others = [t for i, t in enumerate(problem.tracks) if i != k]
+        kinds = {t.hoses for t in others}
+        names = tuple(name for name in problem.names if _told_by(name, kinds))
+        less = replace(problem, tracks=others, names=names, held=found)
+        x, _, _, _ = solve(less, first_guess(less, found), 15)
+        alone = replace(problem, tracks=[track], names=(), held={**found, **less.values(x)})
+        _, _, residual, _ = solve(alone, first_guess(alone, found), 15)
+        (phi, length) = rms_by_track(alone, residual)[0]
+        out.append(HeldLog(track.name, *inside[k], phi, length))
+    return out
+
+
+def _told_by(name: str, kinds: set[bool]) -> bool:
+
+    acts = PARAMETERS[name].acts
+    return acts == "all" or (acts == "pumps") in kinds
+
+
+# ----------------------------------------------------------------------
+# Damping by the logarithmic decrement (3.39), (3.40), from peaks that outliers do not make.
+#
+# Single readings that stand away from the cubic through their six neighbours are replaced by it. The
+# extremes
+# of what is left are found once the motion has come back by a fifth of its amplitude, so that noise makes
+# none, and each is the vertex of a parabola through the rows about it. The amplitude is that from peak to
+# peak, which does not see an offset that creeps; on the raw curve (3.39) yields about 0.004.
+#
+#     delta = ln(x_i / x_(i+1)) over a period,   zeta = delta / sqrt(4 pi^2 + delta^2)
+#
+# delta is the median of the slopes between all pairs of amplitudes (Theil and Sen), with the standard
+# deviation that the scatter about that line gives.
+
+_HALF_WINDOW = 3
+_FAR = 4.0
+_FEWEST = 4
+_FLOOR = 10.0
+_LARGEST_SHARE = 0.1
+
+
+@dataclass(frozen=True)
+class Decrement:
+    """A decaying swing.
+
+    Attributes
+    ----------
+    zeta, sigma : damping ratio and its standard deviation. frequency_hz : of the swing.
+    peak_at_s, peak : (n,) extremes that were used. outliers : readings that were replaced.
+    """
+
+    zeta: float
+    sigma: float
+    frequency_hz: float
+    peak_at_s: FloatArray
+    peak: FloatArray
+    outliers: int
+
+
+def without_outliers(values: FloatArray) -> tuple[FloatArray, int]:
+    """Values (n,) with single ones that stand away from their neighbours replaced, and how many."""
+    n = len(values)
+    at = np.clip(np.arange(n)[:, None] + np.arange(-_HALF_WINDOW, _HALF_WINDOW + 1), 0, n - 1)
+    # A cubic through the other rows of the window follows a swing, which a median does not.
+    x = np.arange(-_HALF_WINDOW, _HALF_WINDOW + 1, dtype=np.float64)
+    others = np.delete(np.arange(2 * _HALF_WINDOW + 1), _HALF_WINDOW)
+    V = np.vander(x[others], 4)
+    mid = np.linalg.pinv(V)[-1]
+    guess = values[at][:, others] @ mid
+    error = values - guess
+    scale = 1.4826 * float(np.median(np.abs(error)))
+    # A cubic misses a tenth of a fast swing's window.
+    local = np.ptp(values[at][:, others], axis=1)
+    far = np.abs(error) > np.maximum(np.maximum(_FAR * scale, 0.25 * local), 1e-12)
+    # Of neighbours that all look wrong only the worst is.
+    worst = np.abs(error) >= np.abs(error)[at].max(axis=1) - 1e-15
+    bad = far & worst
+    out = values.copy()
+    out[bad] = guess[bad]
+    return out, int(bad.sum())
+
+
+def _turns(y: FloatArray, share: float) -> IntArray:
+    """Rows of the extremes, each confirmed by a return of `share` times the swing before it."""
+    found: list[int] = []
+    top = low = 0
+    direction = 0
+    swing = float(np.ptp(y[: max(len(y) // 8, 8)]))
+    for i in range(1, len(y)):
+        if y[i] > y[top]:
+            top = i
+        if y[i] < y[low]:
+            low = i
+        back = share * swing
+        if direction >= 0 and y[top] - y[i] > back:
+            found.append(top)
+            swing = abs(float(y[top] - y[found[-2]])) if len(found) > 1 else swing
+            direction, low = -1, i
+            top = i
+        elif direction <= 0 and y[i] - y[low] > back:
+            found.append(low)
+            swing = abs(float(y[low] - y[found[-2]])) if len(found) > 1 else swing
+            direction, top = 1, i
+            low = i
+    return np.array(found, dtype=np.int64)
+
+
+def _vertex(t: FloatArray, y: FloatArray, i: int, reach: int) -> tuple[float, float]:
+    a, b = max(i - reach, 0), min(i + reach + 1, len(y))
+    if b - a < 3:
+        return float(t[i]), float(y[i])
+    c = np.polyfit(t[a:b] - t[i], y[a:b], 2)
+    if c[0] == 0.0:
+        return float(t[i]), float(y[i])
+    at = float(np.clip(-0.5 * c[1] / c[0], t[a] - t[i], t[b - 1] - t[i]))
+    return float(t[i]) + at, float(np.polyval(c, at))
+
+
+def _regular(t: FloatArray, y: FloatArray, at: FloatArray, peak: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Extremes where their neighbours say that they are.
+
+    A vertex that is sought among noisy readings is too high, the more so the smaller the swing. The times of
+    the extremes go smoothly, so that of each follows from all, and a parabola about it gives its height.
+    """
+    k = np.arange(len(at), dtype=np.float64)
+    big = np.concatenate([[True], np.abs(np.diff(peak)) > 0.1 * np.abs(np.diff(peak)).max()])
+    count = len(big) if bool(big.all()) else max(int(np.argmin(big)), _FEWEST)
+    smooth = np.polyval(np.polyfit(k[:count], at[:count], 2 if count > 5 else 1), k[:count])
+    half = float(np.median(np.diff(smooth)))
+    if float(np.abs(smooth - at[:count]).max()) > 0.3 * half:
+        return at, peak
+    heights = peak[:count].copy()
+    for i, centre in enumerate(smooth.tolist()):
+        near = np.abs(t - centre) <= 0.32 * half
+        if int(near.sum()) >= 4:
+            heights[i] = np.polyval(np.polyfit(t[near] - centre, y[near], 2), 0.0)
+    return np.asarray(smooth, dtype=np.float64), heights
+
+
+def decrement(t_s: FloatArray, phi_rad: FloatArray, noise_rad: float = 0.0) -> Decrement:
+    """Damping of a free swing from its angle (n,) at times (n,).
+
+    Parameters
+    ----------
+    noise_rad : standard deviation of a reading; swings below ten times that are left out,
+        since noise makes small extremes larger.
+
+    Raises `BadInputError` when fewer than four extremes stand out.
+    """
+    y, outliers = without_outliers(np.asarray(phi_rad, dtype=np.float64))
+    turns = _turns(y, 0.3)
+    if len(turns) < _FEWEST:
+        raise BadInputError(f"swing: found {len(turns)} extremes, expected at least {_FEWEST}")
+    rows = float(np.median(np.diff(turns)))
+    reach = max(round(0.25 * rows), 1)
+    ends = [_vertex(t_s, y, int(i), reach) for i in turns]
+    at, peak = _regular(t_s, y, np.array([e[0] for e in ends]), np.array([e[1] for e in ends]))
+    height = np.abs(np.diff(peak))
+    floor = max(_FLOOR * noise_rad, _LARGEST_SHARE * float(height.max()))
+    small = np.nonzero(height < floor)[0]
+    used = int(small[0]) if len(small) else len(height)
+    if used < _FEWEST - 1:
+        raise BadInputError(f"swing: found {used + 1} extremes above the noise, expected at least {_FEWEST}")
+    k = np.arange(used, dtype=np.float64)
+    log = np.log(height[:used])
+    i, j = np.triu_indices(used, 1)
+    slope = float(np.median((log[j] - log[i]) / (k[j] - k[i])))
+    scatter = 1.4826 * float(np.median(np.abs(log - slope * k - np.median(log - slope * k))))
+    lever = k - k.mean()
+    total = max(float(np.sum(lever**2)), 1e-12)
+    # The scatter of few peaks may be small by chance; it cannot be less than what the noise makes.
+    by_noise = math.sqrt(float(np.sum((lever * noise_rad / height[:used]) ** 2))) / total
+    spread = 1.2 * max(scatter / math.sqrt(total), by_noise)
+    delta, delta_sigma = -2.0 * slope, 2.0 * spread
+    half = float(np.median(np.diff(at[: used + 1])))
+    norm = math.hypot(delta, 2.0 * math.pi)
+    return Decrement(
+        delta / norm,
+        delta_sigma * (2.0 * math.pi) ** 2 / norm**3,
+        0.5 / half,
+        at[: used + 1],
+        peak[: used + 1],
+        outliers,
+    )
+
+
+# ----------------------------------------------------------------------
+# Stiffness from hanging weights or steady elongations: linear and polynomial, zero at zero (Fig. 3.10).
+#
+#     F = (k0 + k1 eps + k2 eps^2 + ...) eps
+#
+# by least squares on the force, with the standard deviation and correlation of the coefficients. The order
+# is the one whose force at points left out is best; a higher one has to beat a lower by a twentieth.
+
+_ORDERS = (1, 2, 3)
+_BETTER = 0.95
+
+
+@dataclass(frozen=True)
+class StiffnessFit:
+    """A law of one order.
+
+    Attributes
+    ----------
+    coefficients, sigma : (order,) k0 [N/m], k1 [N/m^2], ...
+    correlation : (order, order). rms_N : over the points. left_out_rms_N : over points left out in turn.
+    """
+
+    coefficients: FloatArray
+    sigma: FloatArray
+    correlation: FloatArray
+    rms_N: float
+    left_out_rms_N: float
+
+    @property
+    def order(self) -> int:
+        """Number of coefficients."""
+        return len(self.coefficients)
+
+    def force_N(self, elongation_m: FloatArray) -> FloatArray:
+        """Force [N] at elongations (n,) [m]."""
+        return np.asarray(np.polyval(self.coefficients[::-1], elongation_m) * elongation_m)
+
+
+def _one(eps: FloatArray, force: FloatArray, order: int) -> StiffnessFit:
+    A = np.stack([eps ** (k + 1) for k in range(order)], axis=1)
+    size = np.sqrt(np.sum(A * A, axis=0))
+    B = A / size
+    inverse = np.linalg.inv(B.T @ B)
+    k = inverse @ (B.T @ force)
+    residual = force - B @ k
+    leverage = np.sum((B @ inverse) * B, axis=1)
+    left = residual / np.maximum(1.0 - leverage, 1e-6)
+    variance = float(residual @ residual) / max(len(eps) - order, 1)
+    spread = np.sqrt(variance * np.diag(inverse))
+    root = np.sqrt(np.diag(inverse))
+    return StiffnessFit(
+        k / size,
+        spread / size,
+        inverse / np.outer(root, root),
+        float(np.sqrt(np.mean(residual**2))),
+        float(np.sqrt(np.mean(left**2))),
+    )
+
+
+def fit_stiffness(name: str, elongation_m: FloatArray, force_N: FloatArray) -> tuple[list[StiffnessFit], int]:
+    """Laws of all orders that the points allow, and the index of the one to use.
+
+    Parameters
+    ----------
+    elongation_m, force_N : (n,) from the rest length on; points at zero say nothing.
+
+    Raises `BadInputError` for fewer than three points, or forces that do not pull with the elongation.
+    """
+    eps, force = np.asarray(elongation_m, dtype=np.float64), np.asarray(force_N, dtype=np.float64)
+    some = np.abs(eps) > 1e-9
+    eps, force = eps[some], force[some]
+    levels = len(np.unique(np.round(eps, 9)))
+    if levels < 3:
+        raise BadInputError(f"{name}: has {levels} elongations apart from zero, expected at least 3")
+    if not float(eps @ force) > 0.0:
+        raise BadInputError(f"{name}: force and elongation have opposite signs, expected the same")
+    fits = [_one(eps, force, order) for order in _ORDERS if order < levels]
+    best = 0
+    for k in range(1, len(fits)):
+        if fits[k].left_out_rms_N < _BETTER * fits[best].left_out_rms_N:
+            best = k
+    return fits, best
+
+
+# ----------------------------------------------------------------------
+# Which experiment to do next: the one that would shrink the worst standard deviation most.
+#
+# Experiments add their information: S_after = S_now + S_experiment, each with its own start, delay and
+# offsets
+# eliminated. That of an experiment that was not done yet is that of a simulated one on the identified rig,
+# with a picture at each tick and the noise of the logs at hand.
+
+_DURATION_S = 8.0
+_TYPICAL = (0.004, 0.0004)
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """An open-loop experiment: start, whether the hoses are on, and the commands over time."""
+
+    name: str
+    what: str
+    start: Start
+    hoses: bool
+    pwm: FloatArray
+
+
+@dataclass(frozen=True)
+class Prospect:
+    """Relative standard deviations after one more experiment, and the worst of them."""
+
+    name: str
+    what: str
+    relative: dict[str, float]
+    worst: str
+    worst_relative: float
+
+
+def EXPERIMENTS(
+    rest_length_m: float, tick_s: float, duration_s: float = _DURATION_S
+) -> tuple[Experiment, ...]:
+    """Static, swing, step, ellipse and elongation, open-loop stand-ins of the source's experiments."""
+    n = round(duration_s / tick_s)
+    t = tick_s * np.arange(n, dtype=np.float64)
+    off, straight = np.zeros((n, 2)), Start(0.0, rest_length_m)
+    step = np.where((t >= 0.5) & (t < 0.6 * duration_s), 225.0, 0.0)
+    turn = 2.0 * np.pi * t / (0.5 * duration_s)
+    ellipse = np.stack([180.0 + 60.0 * np.sin(turn), 180.0 + 60.0 * np.cos(turn)], axis=1)
+    stairs = np.array([130.0, 175.0, 215.0, 250.0, 0.0])[np.minimum((5.0 * t / duration_s).astype(int), 4)]
+    return (
+        Experiment("static", "rest, pumps off", straight, True, off),
+        Experiment("swing", "released from 0.5 rad, hoses off", Start(0.5, rest_length_m), False, off),
+        Experiment("step", "one pump on, then off", straight, True, np.stack([step, 0.0 * step], axis=1)),
+        Experiment("ellipse", "both pumps swept a quarter of a turn apart", straight, True, ellipse),
+        Experiment(
+            "elongation", "both pumps up in steps, then off", straight, True, np.stack([stairs] * 2, 1)
+        ),
+    )
+
+
+def _information(
+    problem: Problem, names: tuple[str, ...], values: Mapping[str, float], one: Experiment, noise: FloatArray
+) -> FloatArray | None:
+    """Information (P, P) about relative changes from one experiment; None where it leaves the model.
+
+    What the experiment brings in that is not asked for, as the pumps' strength, is eliminated.
+    """
+    tick_s = problem.nominal.pump.tick_s
+    n = len(one.pwm)
+    t = tick_s * np.arange(1, n, dtype=np.float64)
+    W = np.broadcast_to(np.diag(1.0 / noise), (n - 1, 2, 2)).copy()
+    track = Track(one.name, tick_s, one.pwm, one.hoses, t, np.zeros((n - 1, 2)), W)
+    try:
+        head, _ = heads_of(track, problem.nominal, [values], [one.start], 0.0, problem.threads)
+    except BadInputError:
+        return None
+    if not np.isfinite(head).all():
+        return None
+    track = replace(track, head=head[0])
+    mine = candidates(problem.nominal, not one.hoses, one.hoses, False)
+    more = tuple(name for name in mine if name not in names and name != "lambda3")
+    if any(name.startswith("elongation") for name in names):
+        more = tuple(name for name in more if name != "strength1")
+    alone = replace(problem, tracks=[track], names=names + more, held=values, delay_s=0.0)
+    x = first_guess(alone, values)
+    x[alone.layout.start :] = one.start.phi_rad, one.start.length_m
+    residual, J = jacobian(alone, x)
+    S = informative(alone, np.zeros_like(residual), J, x)
+    P = len(names)
+    if not more:
+        return S
+    return np.asarray(
+        S[:P, :P] - S[:P, P:] @ np.linalg.pinv(S[P:, P:], rcond=1e-10, hermitian=True) @ S[P:, :P]
+    )
+
+
+def prospects(solution: Solution, known: Uncertainty) -> tuple[Prospect, ...]:
+    """All experiments, the most useful first.
+
+    Judged are the parameters that were estimated and those that could not be told for want of excitation,
+    lambda3 apart, which no experiment tells from lambda2.
+    """
+    problem = solution.problem
+    values = {**values_of(problem.nominal), **problem.held, **solution.values}
+    vague = [n for n in solution.fixed if n != "lambda3" and n in PARAMETERS]
+    order = list(PARAMETERS)
+    names = tuple(sorted([*problem.names, *vague], key=order.index))
+    now = np.zeros((len(names), len(names)))
+    at = [names.index(name) for name in problem.names]
+    size = np.array([max(abs(values[n]), 0.1 * PARAMETERS[n].scale) for n in problem.names])
+    now[np.ix_(at, at)] = np.linalg.pinv(known.covariance / np.outer(size, size), hermitian=True)
+    W = np.concatenate([track.whitening for track in problem.tracks])
+    inverse = np.linalg.inv(W)
+    noise = known.scale * np.sqrt(np.median(np.sum(inverse**2, axis=2), axis=0))
+    noise = np.where(np.isfinite(noise) & (noise > 0.0), noise, np.array(_TYPICAL))
+    out = []
+    rest = problem.nominal.plant.rest_length_m
+    for one in EXPERIMENTS(rest, problem.nominal.pump.tick_s):
+        gained = _information(problem, names, values, one, noise)
+        if gained is None:
+            continue
+        relative = _relative(now + gained, names)
+        worst = max(relative, key=lambda n: relative[n])
+        out.append(Prospect(one.name, one.what, relative, worst, relative[worst]))
+    return tuple(sorted(out, key=lambda p: (p.worst_relative, sum(p.relative.values()))))
+
+
+def _relative(S: FloatArray, names: Sequence[str]) -> dict[str, float]:
+    """Relative standard deviations of an information matrix; those that nothing bounds count as 10."""
+    prior = 1e-2 * np.eye(len(S))
+    sigma = np.sqrt(np.diag(np.linalg.inv(S + prior)))
+    return {
+        name: min(float(s), 10.0) if math.isfinite(s) else 10.0 for name, s in zip(names, sigma, strict=True)
+    }
+
+
+# ----------------------------------------------------------------------
+# What an identification is worth in words: verdict, reasons, remarks and advice.
+#
+# - unidentifiable: the logs cannot tell a parameter that they should.
+# - poor: the model does not explain the logs (residuals far above the noise, a held-back log predicted much
+#   worse than fitted), a parameter lies at a bound, or an important one is vague.
+
+_MOST_SCALE = 2.5
+_MOST_INFLATION = 4.0
+_MOST_HELD = 1.5
+_MOST_RELATIVE = 0.25
+_STRONG = 0.95
+_FAR_ROWS = 0.05
+_BY_NATURE = ("lambda3",)
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Verdict "ok", "poor" or "unidentifiable", with sentences."""
+
+    verdict: str
+    reasons: tuple[str, ...]
+    remarks: tuple[str, ...]
+    advice: tuple[str, ...]
+
+
+def _bounds(solution: Solution) -> list[str]:
+    out = []
+    for name, value in solution.values.items():
+        spec = PARAMETERS[name]
+        near = 1e-3 * spec.scale
+        if value - spec.low < near or spec.high - value < near:
+            out.append(f"{name} lies at its bound {value:.4g} {spec.unit}".rstrip())
+    return out
+
+
+def _of_fit(solution: Solution, known: Uncertainty, colours: Sequence[Colour]) -> tuple[list[str], list[str]]:
+    reasons, remarks = _bounds(solution), []
+    if known.scale > _MOST_SCALE:
+        reasons.append(
+            f"the residuals are {known.scale:.1f} times what the sensor's noise explains; the model misses "
+            "something, or the camera's jitter is larger than the rig's file says"
+        )
+    worst = max(known.inflation, key=lambda n: known.inflation[n])
+    if known.inflation[worst] > _MOST_INFLATION:
+        reasons.append(
+            f"the residuals are so coloured that the deviation of {worst} had to be raised "
+            f"{known.inflation[worst]:.1f} times"
+        )
+    for colour in colours:
+        if not colour.white:
+            remarks.append(
+                f"{colour.name}: residuals are not white ({100.0 * colour.outside:.0f} % of the lags outside "
+                f"the 95 % band, {max(colour.first, key=abs):+.2f} from row to row); deviations are raised"
+            )
+        if colour.share_far > _FAR_ROWS:
+            reasons.append(f"{colour.name}: {100.0 * colour.share_far:.0f} % of the poses are far off")
+    names = solution.problem.names
+    close = [
+        f"{names[i]} and {names[j]} {float(known.correlation[i, j]):+.2f}"
+        for i in range(len(names))
+        for j in range(i + 1, len(names))
+        if abs(float(known.correlation[i, j])) > _STRONG
+    ]
+    if close:
+        remarks.append(f"hardly told apart, by their correlation: {', '.join(close)}")
+    if solution.starts > 1 and solution.agreeing == 1:
+        remarks.append(f"one of {solution.starts} starts alone came to this minimum; there may be others")
+    return reasons, remarks
+
+
+def judge(
+    solution: Solution,
+    known: Uncertainty,
+    colours: Sequence[Colour],
+    held: Sequence[HeldLog],
+    next_ones: Sequence[Prospect],
+) -> Judgement:
+    """Judge an identification from what was computed of it."""
+    blind = {name: why for name, why in solution.fixed.items() if "enter only" not in why}
+    reasons = [f"{name} is not identifiable from these logs: {why}" for name, why in blind.items()]
+    remarks = [f"{why}" for why in solution.fixed.values() if "enter only" in why]
+    for name, value in solution.values.items():
+        relative = known.sigma[name] / max(abs(value), 1e-12)
+        if relative > _MOST_RELATIVE:
+            reasons.append(f"{name} is known to {100.0 * relative:.0f} % only")
+    more, said = _of_fit(solution, known, colours)
+    for log in held:
+        if log.held_phi_rad > _MOST_HELD * log.fitted_phi_rad + 1e-4:
+            more.append(
+                f"{log.name}: held back, its angle is predicted to {1e3 * log.held_phi_rad:.3g} mrad, "
+                f"fitted to {1e3 * log.fitted_phi_rad:.3g} mrad"
+            )
+    if not held:
+        said.append("one log alone: nothing is left to check the parameters on")
+    advice = []
+    if next_ones:
+        best = next_ones[0]
+        advice.append(
+            f"next experiment: {best.name} ({best.what}); it would leave {best.worst} as the least known, "
+            f"to {100.0 * best.worst_relative:.2g} %"
+        )
+    verdict = "unidentifiable" if blind else "poor" if reasons or more else "ok"
+    return Judgement(verdict, tuple(reasons + more), tuple(remarks + said), tuple(advice))

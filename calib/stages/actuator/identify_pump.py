@@ -1,0 +1,786 @@
+"""Models of a pump with its chamber, fitted to recordings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import combinations, pairwise
+
+import numpy as np
+from numba import njit
+from scipy.optimize import least_squares
+from scipy.stats import chi2
+
+from calib.core.arrays import FloatArray
+from calib.core.errors import BadInputError
+from calib.stages.actuator.pump import PWM_MAX
+
+# ----------------------------------------------------------------------
+# Two models of a pump with its chamber, from PWM to the pressure (or force) that a sensor sees.
+#
+# u(t) is the PWM value, T_d the dead time, s(u) the shape of the static map with s(255) = 1 and P its
+# level, so that g(t) = P s(u(t - T_d)) is what the pump would settle at.
+#
+# `LAG`, the linear first-order lag of (3.5), with a limit R on the rising rate where data need one:
+#
+#     dp/dt = min((g - p) / tau, R)
+#
+# `ORIFICE`. Valves let the air in only, through a passage whose laminar and turbulent drops of pressure add
+# up, and it leaks out through another. The sensor sits in a hose of small volume beside the chamber:
+#
+#     g - p = a w + b w^2            w = 2 (g - p) / (a + sqrt(a^2 + 4 b (g - p))), 0 for g < p
+#     dp/dt = w - p / T_leak - c (p - z),   dz/dt = (p - z) / T_z
+#
+# with p the pressure in the hose, z that in the chamber, and w in units of pressure per second. It is the
+# law of `calib.stages.actuator.pump.Orifice` on the way in. While the pump has never run, hose and chamber
+# are
+# taken for shut off from each other, as a valve leaves them.
+#
+# Commands are held between their time stamps. A step of the simulation gets their mean over the step, so
+# that results are smooth in T_d. The steps are at most `STEP_S` and shorter for stiffer parameters.
+
+LAG, ORIFICE = "linear lag", "orifice flow"
+STEP_S = 2e-3
+_START_S = 0.2
+_FREE = 1e6
+_PRIOR = 0.15
+"""What the first measured value counts for a start, in samples."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number of a model: unit, where a search starts, its bounds, and the value that switches it off.
+
+    A unit of "y" is that of the measured values, and `start` and bounds are then multiples of their range.
+    """
+
+    name: str
+    unit: str
+    start: float
+    low: float
+    high: float
+    off: float | None = None
+
+
+_COMMON = (Parameter("dead_time_s", "s", 0.05, 0.0, 0.5), Parameter("level", "y", 1.0, 0.05, 20.0))
+MODELS: dict[str, tuple[Parameter, ...]] = {
+    LAG: (
+        *_COMMON,
+        Parameter("lag_s", "s", 0.6, 0.005, 30.0),
+        Parameter("rising_limit_per_s", "y", 0.5, 0.05, 200.0, _FREE),
+    ),
+    ORIFICE: (
+        *_COMMON,
+        Parameter("laminar_s", "s", 0.2, 0.0, 30.0, 0.0),
+        Parameter("turbulent_s2", "1/y", 0.2, 1e-5, 100.0),
+        Parameter("leak_s", "s", 10.0, 0.02, 1000.0, _FREE),
+        Parameter("hose_per_s", "1/s", 50.0, 0.0, 100.0, 0.0),
+        Parameter("chamber_s", "s", 0.05, 0.01, 3.0, 1.0),
+    ),
+}
+"""Parameters of each model in the order of the vectors that `simulate_pump` takes."""
+
+
+@dataclass(frozen=True)
+class PumpRecord:
+    """One recording: time [s], PWM 0 .. 255, and the measured pressure or force, each (n,)."""
+
+    name: str
+    t_s: FloatArray
+    pwm: FloatArray
+    value: FloatArray
+
+    def __post_init__(self) -> None:
+        if not len(self.t_s) == len(self.pwm) == len(self.value) or len(self.t_s) < 10:
+            raise BadInputError(f"{self.name}: found {len(self.t_s)} rows, expected at least 10")
+        if not np.all(np.diff(self.t_s) > 0.0):
+            raise BadInputError(f"{self.name}: found time that stands still or runs backward")
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Static map over its level: 0 below `dead_pwm`, then 1 - exp(-(u - dead) / scale) over that at 255.
+
+    An infinite `scale_pwm` is a straight line from the dead zone to 255.
+    """
+
+    dead_pwm: float = 0.0
+    scale_pwm: float = math.inf
+
+    def of(self, pwm: FloatArray) -> FloatArray:
+        """s(u) of PWM values (n,)."""
+        over = np.clip(np.asarray(pwm, dtype=np.float64), 0.0, PWM_MAX) - self.dead_pwm
+        over, most = np.maximum(over, 0.0), PWM_MAX - self.dead_pwm
+        if not math.isfinite(self.scale_pwm):
+            return np.asarray(over / most)
+        return np.asarray(np.expm1(-over / self.scale_pwm) / math.expm1(-most / self.scale_pwm))
+
+
+_STRAIGHT = Shape()
+
+
+def _drive(record: PumpRecord, shape: Shape, dead_time_s: float, step_s: float, steps: int) -> FloatArray:
+    """Mean of s(u(t - T_d)) over each step (steps,)."""
+    t, s = record.t_s - record.t_s[0], shape.of(record.pwm)
+    area = np.concatenate([[0.0], np.cumsum(s[:-1] * np.diff(t))])
+    edges = step_s * np.arange(steps + 1, dtype=np.float64) - dead_time_s
+    # Before the first row its command is taken to have been held.
+    whole = np.interp(edges, t, area) + np.where(edges < 0.0, s[0] * edges, 0.0)
+    return np.asarray(np.diff(whole) / step_s)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _lag(g: FloatArray, step_s: float, p: float, z: float, theta: FloatArray, out: FloatArray) -> None:
+    share, most = -math.expm1(-step_s / theta[2]), theta[3] * step_s
+    p += z
+    out[0] = p
+    for k in range(len(g)):
+        p += min((theta[1] * g[k] - p) * share, most)
+        out[k + 1] = p
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _flow(theta: FloatArray, g: float, p: float, z: float, opened: float) -> float:
+    a, b = theta[2], theta[3]
+    drop = g - p
+    w = 2.0 * drop / (a + math.sqrt(a * a + 4.0 * b * drop)) if drop > 0.0 else 0.0
+    return float(w - p / theta[4] - opened * theta[5] * (p - z))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _orifice(g: FloatArray, step_s: float, p: float, z: float, theta: FloatArray, out: FloatArray) -> None:
+    z += p
+    out[0] = p
+    opened = 0.0
+    for k in range(len(g)):
+        # Opens within a step or a few, and not at once, so that the result is smooth in the dead time.
+        opened = min(1.0, opened + 4.0 * g[k])
+        drive = theta[1] * g[k]
+        p_half = p + 0.5 * step_s * _flow(theta, drive, p, z, opened)
+        z_half = z + 0.5 * step_s * opened * (p - z) / theta[6]
+        p += step_s * _flow(theta, drive, p_half, z_half, opened)
+        z += step_s * opened * (p_half - z_half) / theta[6]
+        out[k + 1] = p
+
+
+def _step_s(model: str, theta: FloatArray, span: float) -> float:
+    """A step that the midpoint rule is stable and fair with."""
+    if model == LAG:
+        return STEP_S
+    a, b = float(theta[2]), float(theta[3])
+    # The steepest slope of w over p that matters is where the drop is a hundredth of the range.
+    slope = 1.0 / max(math.sqrt(a * a + 0.04 * b * span), 1e-3)
+    return min(STEP_S, 0.8 / (slope + float(theta[5]) + 1.0 / float(theta[6])))
+
+
+def simulate_pump(
+    model: str,
+    theta: FloatArray,
+    record: PumpRecord,
+    shape: Shape = _STRAIGHT,
+    start_s: float = _START_S,
+) -> FloatArray:
+    """Pressure (n,) at the record's times, simulated from its PWM and its beginning alone.
+
+    The start is the first measured value plus what explains the first `start_s` best: of the state itself
+    for the lag, of the chamber for the orifice. Nothing measured later is used.
+
+    Parameters
+    ----------
+    theta : values in the order of `MODELS[model]`.
+    """
+    t = record.t_s - record.t_s[0]
+    span = max(float(np.ptp(record.value)), 1e-9)
+    step = _step_s(model, theta, span)
+    steps = max(math.ceil(float(t[-1]) / step), 1)
+    g = _drive(record, shape, float(theta[0]), step, steps)
+    run = _lag if model == LAG else _orifice
+    grid = step * np.arange(steps + 1, dtype=np.float64)
+    first = float(record.value[0])
+    out = np.empty(steps + 1)
+
+    def at(offset: float) -> FloatArray:
+        run(g, step, first, offset, theta, out)
+        return np.asarray(np.interp(t, grid, out))
+
+    head = t <= start_s
+    base = at(0.0)
+    if int(head.sum()) < 3:
+        return base
+    # The beginning is all but linear in the offset.
+    nudge = 0.02 * span
+    by = (at(nudge)[head] - base[head]) / nudge
+    error = (record.value - base)[head]
+    return at(float(by @ error) / (float(by @ by) + _PRIOR))
+
+
+# ----------------------------------------------------------------------
+# Fitting a pump's models to recordings, what the fit is worth, and what it does not explain.
+#
+# Robust non-linear least squares (soft L1) on simulated minus measured pressure, all recordings at once,
+# from several starts. A simulation runs free: it sees the PWM and the first fifth of a second of the
+# measured values, nothing else. What is left over is the models' error and not noise, so it is coloured;
+# standard deviations are therefore those of a sandwich, H^-1 (sum g g^T) H^-1, with the gradient g summed
+# over whole recordings, or over stretches of a second where there are fewer than four recordings.
+#
+# A parameter that can be switched off (a limit, a leak, a hose) is taken only if the data ask for it, by
+# two
+# measures. One that they do not ask for lowers the robust cost all the same, by lambda chi^2_1 / 2, where
+# lambda = g^2 / h with the variance g^2 of its gradient and its curvature h; lambda is 1 for white noise,
+# and
+# much more for what a model misses, which is the same all along a recording. It is measured: fitted
+# without a
+# recording, the parameters raise the cost of what is left out by lambda each, over all recordings together.
+# So k parameters have to lower the cost by more than lambda chi^2_k(0.95) / 2. And they have to lower it by
+# `_WORTH` for each extra: the start is read off noisy values, and taking up its error, an extra that the
+# truth
+# has not lowers the cost of a simulated pump by 2 %, not by chance.
+
+_WORTH = 0.03
+_CONFIDENCE = 0.95
+_AGAIN = 10
+_SCALE_SHARE = 0.01
+_AHEAD_S = 0.5
+_FEWEST_CLUSTERS = 4
+_STEP = 1e-4
+_PUMP_FREE = 1e6
+
+
+@dataclass(frozen=True)
+class PumpFit:
+    """A fitted model.
+
+    Attributes
+    ----------
+    model : of `MODELS`. theta : all its parameters, in order.
+    fitted : names of those that were estimated; sigma : their standard deviations.
+    correlation : (n, n) of the fitted ones.
+    fixed : sentences by name for those that were not.
+    rms : over all samples that were fitted. shape : of the static map.
+    """
+
+    model: str
+    theta: FloatArray
+    fitted: tuple[str, ...]
+    sigma: dict[str, float]
+    correlation: FloatArray
+    rms: float
+    cost: float
+    shape: Shape
+    fixed: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def values(self) -> dict[str, float]:
+        """All parameters by name."""
+        return dict(zip([p.name for p in MODELS[self.model]], self.theta.tolist(), strict=True))
+
+
+@dataclass(frozen=True)
+class Held:
+    """Errors on a recording that was not fitted: free run, and `_AHEAD_S` ahead of measured values."""
+
+    name: str
+    rms: float
+    ahead: float
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Recordings and the scales of a fit."""
+
+    model: str
+    records: Sequence[PumpRecord]
+    shape: Shape
+    span: float
+
+    @property
+    def unit(self) -> dict[str, float]:
+        return {"y": self.span, "1/y": 1.0 / self.span}
+
+    def nominal(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Starts and bounds, in SI and in the unit of the values."""
+        rows = [
+            [x * self.unit.get(p.unit, 1.0) for x in (p.start, p.low, p.high)] for p in MODELS[self.model]
+        ]
+        start, low, high = np.array(rows).T
+        return start, low, high
+
+    def residual(self, theta: FloatArray) -> FloatArray:
+        return np.concatenate(
+            [simulate_pump(self.model, theta, r, self.shape) - r.value for r in self.records]
+        )
+
+    def off(self) -> FloatArray:
+        return np.array([math.nan if p.off is None else p.off for p in MODELS[self.model]])
+
+
+def _solve(
+    problem: _Problem, theta: FloatArray, free: list[int], most: int = 40, without: slice | None = None
+) -> tuple[FloatArray, float, FloatArray]:
+    """Least squares over some parameters: values, robust cost per sample, and the weighted Jacobian.
+
+    `without` leaves some rows out.
+    """
+    start, low, high = problem.nominal()
+    scale = np.maximum(np.abs(start), 1e-3)[free]
+
+    def full(x: FloatArray) -> FloatArray:
+        out = theta.copy()
+        out[free] = x
+        return out
+
+    def rows(x: FloatArray) -> FloatArray:
+        out = problem.residual(full(x)) / (_SCALE_SHARE * problem.span)
+        return out if without is None else np.delete(out, without)
+
+    inside = np.clip(theta[free], low[free] + 1e-9 * scale, high[free] - 1e-9 * scale)
+    found = least_squares(
+        rows,
+        inside,
+        bounds=(low[free], high[free]),
+        x_scale=scale,
+        loss="soft_l1",
+        diff_step=np.full(len(free), _STEP),
+        max_nfev=most,
+        xtol=1e-6,
+        ftol=1e-7,
+    )
+    return full(found.x), float(found.cost) / len(found.fun), np.asarray(found.jac, dtype=np.float64)
+
+
+def _clusters(problem: _Problem) -> list[slice]:
+    """Stretches whose residuals are taken to be independent of each other."""
+    out, at = [], 0
+    for record in problem.records:
+        n = len(record.t_s)
+        if len(problem.records) >= _FEWEST_CLUSTERS:
+            out.append(slice(at, at + n))
+        else:
+            pieces = max(int(record.t_s[-1] - record.t_s[0]), 1)
+            edges = np.linspace(at, at + n, pieces + 1).astype(int).tolist()
+            out += [slice(a, b) for a, b in pairwise(edges)]
+        at += n
+    return out
+
+
+def _slopes(
+    problem: _Problem, theta: FloatArray, free: list[int]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Scaled residuals, their derivatives by the free parameters, and the weights of the robust loss."""
+    scale = _SCALE_SHARE * problem.span
+    base = problem.residual(theta) / scale
+    _, low, high = problem.nominal()
+    J = np.empty((len(base), len(free)))
+    for column, k in enumerate(free):
+        h = _STEP * max(abs(theta[k]), 1e-2 * (high[k] - low[k]) if theta[k] == 0.0 else 0.0)
+        moved = theta.copy()
+        moved[k] += h if moved[k] + h <= high[k] else -h
+        J[:, column] = (problem.residual(moved) / scale - base) / (moved[k] - theta[k])
+    return base, J, np.asarray(1.0 / np.sqrt(1.0 + base * base))
+
+
+def _inverse(H: FloatArray) -> FloatArray:
+    size = np.sqrt(np.maximum(np.diag(H), 1e-300))
+    return np.asarray(np.linalg.pinv(H / np.outer(size, size), rcond=1e-12) / np.outer(size, size))
+
+
+def _by_chance(problem: _Problem, theta: FloatArray, free: list[int], extras: int) -> float:
+    """How much a number of parameters that are not needed lowers the cost per sample, at most in 95 %."""
+    base = problem.residual(theta) / (_SCALE_SHARE * problem.span)
+    rise = 0.0
+    for s in _clusters(problem):
+        moved, _, _ = _solve(problem, theta, free, _AGAIN, s)
+        left_out = problem.residual(moved)[s] / (_SCALE_SHARE * problem.span)
+        rise += float(np.sum(np.sqrt(1.0 + left_out**2) - np.sqrt(1.0 + base[s] ** 2)))
+    lam = max(rise, 0.0) / len(free) / len(base)
+    return 0.5 * lam * float(chi2.ppf(_CONFIDENCE, extras))
+
+
+def _covariance(problem: _Problem, theta: FloatArray, free: list[int]) -> FloatArray:
+    """Sandwich covariance of the free parameters under the robust loss."""
+    base, J, weight = _slopes(problem, theta, free)
+    H = (J * weight[:, None]).T @ J
+    G = [J[s].T @ (weight[s] * base[s]) for s in _clusters(problem)]
+    middle = sum((np.outer(g, g) for g in G), np.zeros_like(H)) * (len(G) / max(len(G) - 1, 1))
+    inverse = _inverse(H)
+    return np.asarray(inverse @ middle @ inverse)
+
+
+def _check(records: Sequence[PumpRecord]) -> float:
+    if not records:
+        raise BadInputError("pump: found no recording with values over time, expected at least one")
+    span = float(max(np.ptp(r.value) for r in records))
+    quiet = [r.name for r in records if not np.ptp(r.pwm) and np.ptp(r.value) < 0.02 * max(span, 1e-12)]
+    if len(quiet) == len(records) or span <= 0.0:
+        names = ", ".join(r.name for r in records)
+        raise BadInputError(f"{names}: neither PWM nor the measured value ever changes, expected steps")
+    return span
+
+
+def fit_pump(
+    records: Sequence[PumpRecord], model: str, shape: Shape | None = None, start: FloatArray | None = None
+) -> PumpFit:
+    """Estimate a model of the pump.
+
+    Parameters
+    ----------
+    model : `LAG` or `ORIFICE`.
+    shape : of the static map; a straight line through zero by default.
+    start : parameters to search from instead of several starts; those at their off value stay there.
+
+    Raises
+    ------
+    BadInputError without recordings, or when nothing changes in any of them.
+    """
+    span = _check(records)
+    problem = _Problem(model, records, shape or Shape(), span)
+    names = [p.name for p in MODELS[model]]
+    nominal, _, _ = problem.nominal()
+    off = problem.off()
+    fixed: dict[str, str] = {}
+    if start is not None:
+        free = [k for k in range(len(names)) if start[k] != off[k] and not _tied(model, names[k], start)]
+        theta, cost, _ = _solve(problem, start, free)
+    else:
+        theta, cost, free = _search(problem, nominal, off, fixed)
+    covariance = _covariance(problem, theta, free)
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    safe = np.where(sigma > 0.0, sigma, 1.0)
+    residual = problem.residual(theta)
+    return PumpFit(
+        model,
+        theta,
+        tuple(names[k] for k in free),
+        {names[k]: float(s) for k, s in zip(free, sigma, strict=True)},
+        covariance / np.outer(safe, safe),
+        float(np.sqrt(np.mean(residual**2))),
+        cost,
+        problem.shape,
+        fixed,
+    )
+
+
+def _tied(model: str, name: str, theta: FloatArray) -> bool:
+    """Whether a parameter does nothing because another is switched off."""
+    return model == ORIFICE and name == "chamber_s" and float(theta[5]) == 0.0
+
+
+def _search(
+    problem: _Problem, nominal: FloatArray, off: FloatArray, fixed: dict[str, str]
+) -> tuple[FloatArray, float, list[int]]:
+    """The plain model from several starts, then the set of extras that earns its place."""
+    names = [p.name for p in MODELS[problem.model]]
+    if problem.model == LAG:
+        groups: list[tuple[str, ...]] = [("rising_limit_per_s",)]
+        always = [0, 1, 2]
+    else:
+        groups = [("laminar_s",), ("leak_s",), ("hose_per_s", "chamber_s")]
+        always = [0, 1, 3]
+    plain = np.where(np.isnan(off), nominal, off)
+    best, cost = plain, math.inf
+    for factor in (0.3, 1.0, 3.0):
+        for dead_time_s in (0.03, 0.1):
+            begin = plain.copy()
+            begin[always[-1]] *= factor
+            begin[0] = dead_time_s
+            theta, value, _ = _solve(problem, begin, always)
+            if value < cost:
+                best, cost = theta, value
+    free, first = list(always), best
+    scores: dict[tuple[tuple[str, ...], ...], float] = {(): cost}
+    chances: dict[tuple[tuple[str, ...], ...], float] = {(): 0.0}
+    lowest, chance = cost, 0.0
+    for count in range(1, len(groups) + 1):
+        for chosen in combinations(groups, count):
+            members = [names.index(name) for group in chosen for name in group]
+            begin = first.copy()
+            begin[members] = nominal[members]
+            wider = sorted(always + members)
+            theta, value, _ = _solve(problem, begin, wider)
+            scores[chosen] = value
+            worth = value * (1.0 + _WORTH) ** count
+            if worth >= lowest or _vague(problem, theta, wider, off):
+                continue
+            chances[chosen] = _by_chance(problem, theta, wider, len(members))
+            if value + chances[chosen] < cost + chance:
+                best, cost, free, lowest, chance = theta, value, wider, worth, chances[chosen]
+    for group in groups:
+        if names.index(group[0]) not in free:
+            more = {
+                c: v
+                for c, v in scores.items()
+                if group in c and all(_within(names, g, free) for g in c if g != group)
+            }
+            with_it = min(more, key=lambda c: more[c])
+            gain = max(1.0 - more[with_it] / cost, 0.0)
+            bound = max(chances.get(with_it, 0.0) / cost, _WORTH)
+            why = f"it would lower the cost by {100.0 * gain:.2g} %, where {100.0 * bound:.2g} % say nothing"
+            fixed |= dict.fromkeys(group, f"off: {why if gain <= bound else 'it is not bounded'}")
+    return best, cost, free
+
+
+def _within(names: list[str], group: tuple[str, ...], free: list[int]) -> bool:
+    return names.index(group[0]) in free
+
+
+def _vague(problem: _Problem, theta: FloatArray, free: list[int], off: FloatArray) -> bool:
+    """Whether a parameter that infinity switches off cannot be told from infinity."""
+    sigma = np.sqrt(np.maximum(np.diag(_covariance(problem, theta, free)), 0.0))
+    return any(
+        off[k] == _PUMP_FREE and not s <= 0.7 * abs(theta[k])
+        for k, s in zip(free, sigma.tolist(), strict=True)
+    )
+
+
+def rms_of(fit: PumpFit, record: PumpRecord) -> float:
+    """RMS of the free run on a recording."""
+    error = simulate_pump(fit.model, fit.theta, record, fit.shape) - record.value
+    return float(np.sqrt(np.mean(error**2)))
+
+
+def rms_ahead(fit: PumpFit, record: PumpRecord, ahead_s: float = _AHEAD_S) -> float:
+    """RMS of predictions a time ahead of a measured value, begun anew ten times in it."""
+    t = record.t_s
+    begin, errors = float(t[0]), []
+    while begin + ahead_s < float(t[-1]):
+        # A tenth of a second before the beginning gives the start, as with a whole recording.
+        rows = np.nonzero((t >= begin - 0.1) & (t <= begin + ahead_s))[0]
+        if len(rows) >= 10:
+            part = PumpRecord(record.name, t[rows], record.pwm[rows], record.value[rows])
+            known = float(begin - t[rows[0]]) if begin > float(t[0]) else 0.04
+            told = simulate_pump(fit.model, fit.theta, part, fit.shape, known)
+            late = t[rows] >= begin + 0.9 * ahead_s
+            errors.append((told - part.value)[late])
+        begin += 0.1 * ahead_s
+    return float(np.sqrt(np.mean(np.concatenate(errors) ** 2))) if errors else math.nan
+
+
+def cross_validate(fit: PumpFit, records: Sequence[PumpRecord]) -> list[Held]:
+    """Each recording predicted by a fit to all others; empty for a single one."""
+    out = []
+    for k, held in enumerate(records):
+        others = [r for i, r in enumerate(records) if i != k]
+        if not others:
+            return []
+        again = fit_pump(others, fit.model, fit.shape, fit.theta)
+        out.append(Held(held.name, rms_of(again, held), rms_ahead(again, held)))
+    return out
+
+
+# ----------------------------------------------------------------------
+# What a pump's model cannot explain: runs that settle apart at the same PWM, and where runs leave it.
+
+_SETTLED_S = 1.0
+_APART = 0.05
+_LONG_S = 0.3
+_STEADY_PWM = 3.0
+_JUMP_S = 0.1
+
+
+@dataclass(frozen=True)
+class Group:
+    """Runs that settle at the same value under nearly the same PWM.
+
+    Attributes
+    ----------
+    value, spread : mean and standard deviation of the settled values.
+    pwm : least and greatest PWM while settled. names : of the runs.
+    """
+
+    value: float
+    spread: float
+    pwm: tuple[float, float]
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Departure:
+    """Where a run leaves the model: time from its start [s], error there after, and whether PWM had moved."""
+
+    name: str
+    at_s: float
+    error: float
+    pwm_moved: bool
+
+
+def settled_groups(records: Sequence[PumpRecord]) -> tuple[Group, ...]:
+    """Groups of runs by the value of their last second, for runs near full PWM then.
+
+    Two groups are apart by more than a twentieth of the largest value.
+    """
+    ends = []
+    for record in records:
+        late = record.t_s >= record.t_s[-1] - _SETTLED_S
+        pwm = record.pwm[late]
+        if float(np.median(pwm)) >= 0.85 * 255.0 and float(np.ptp(record.value)) > 0.0:
+            value = float(np.median(record.value[late]))
+            ends.append((value, record.name, float(np.quantile(pwm, 0.05)), float(pwm.max())))
+    ends.sort()
+    groups: list[list[tuple[float, str, float, float]]] = []
+    for end in ends:
+        if groups and end[0] - groups[-1][-1][0] <= _APART * max(abs(e[0]) for e in ends):
+            groups[-1].append(end)
+        else:
+            groups.append([end])
+    return tuple(
+        Group(
+            float(np.mean([e[0] for e in group])),
+            float(np.std([e[0] for e in group])),
+            (min(e[2] for e in group), max(e[3] for e in group)),
+            tuple(e[1] for e in group),
+        )
+        for group in groups
+    )
+
+
+def departures(fit: PumpFit, records: Sequence[PumpRecord]) -> tuple[Departure, ...]:
+    """Runs whose error grows beyond a twentieth of their range and stays there, and when it began."""
+    out = []
+    for record in records:
+        error = record.value - simulate_pump(fit.model, fit.theta, record, fit.shape)
+        limit = _APART * float(np.ptp(record.value))
+        large = np.abs(error) > limit
+        # The last stretch of large errors, up to the end of the run.
+        small = np.nonzero(~large)[0]
+        first = int(small[-1]) + 1 if len(small) else 0
+        if first >= len(error) or record.t_s[-1] - record.t_s[first] < _LONG_S:
+            continue
+        # Back to where the error was last within a quarter of that.
+        near = np.nonzero(np.abs(error[: first + 1]) < 0.25 * limit)[0]
+        begin = int(near[-1]) if len(near) else first
+        before = (record.t_s <= record.t_s[begin]) & (record.t_s > record.t_s[begin] - _LONG_S)
+        moved = float(np.ptp(record.pwm[before])) > _STEADY_PWM
+        out.append(
+            Departure(
+                record.name,
+                float(record.t_s[begin] - record.t_s[0]),
+                float(np.median(error[first:])),
+                moved,
+            )
+        )
+    return tuple(out)
+
+
+def jumps(records: Sequence[PumpRecord]) -> tuple[tuple[str, float, float], ...]:
+    """Runs that begin with a jump: name, its size, and the value before it.
+
+    A jump is a rise within a tenth of a second that is more than twice as fast as that of the
+    tenth after it, and more than a twentieth of the range.
+    """
+    out = []
+    for record in records:
+        t, y = record.t_s - record.t_s[0], record.value
+        found = []
+        for k in np.nonzero(t < 0.3)[0].tolist():
+            after = np.searchsorted(t, t[k] + 0.4 * _JUMP_S)
+            later = np.searchsorted(t, t[k] + 1.4 * _JUMP_S)
+            if later >= len(t):
+                break
+            rise, next_rise = float(y[after] - y[k]), float(y[later] - y[after])
+            slope = next_rise / max(float(t[later] - t[after]), 1e-9) * float(t[after] - t[k])
+            if rise > 2.0 * max(slope, 0.0) and rise > _APART * float(np.ptp(y)):
+                found.append((rise - slope, float(y[k])))
+        if found:
+            out.append((record.name, *max(found)))
+    return tuple(out)
+
+
+# ----------------------------------------------------------------------
+# The static map of a pump from settled values: dead zone, saturation, and what scatters about them.
+#
+#     y(u) = Y (1 - exp(-(u - u0) / S)) / (1 - exp(-(255 - u0) / S)) for u > u0, else 0
+#
+# with the value Y at PWM 255, the dead zone u0 and the scale S of the saturation; the map has reached 95 %
+# of its end at u0 + 3 S at most. Least squares with soft L1 loss on the magnitudes; standard deviations
+# from
+# the scatter of the settled values about the map, those that lie far off counted as outliers and named.
+
+_FEWEST = 5
+_FAR = 4.0
+
+
+@dataclass(frozen=True)
+class StaticMap:
+    """A fitted static map.
+
+    Attributes
+    ----------
+    name : of the table or the part of it. end : Y with its sign. shape : dead zone and scale.
+    sigma : of end, dead_pwm, scale_pwm. saturates_pwm : where 95 % of the end are reached.
+    scatter : robust standard deviation of the settled values about the map.
+    pwm, value : (n,) what was fitted. outliers : (m,) PWM values that lie more than four scatters off.
+    """
+
+    name: str
+    end: float
+    shape: Shape
+    sigma: dict[str, float]
+    saturates_pwm: float
+    scatter: float
+    pwm: FloatArray
+    value: FloatArray
+    outliers: tuple[float, ...]
+
+    def of(self, pwm: FloatArray) -> FloatArray:
+        """Settled value of PWM values (n,)."""
+        return np.asarray(self.end * self.shape.of(pwm))
+
+
+def fit_static_map(name: str, pwm: FloatArray, value: FloatArray) -> StaticMap:
+    """Fit the map to settled values (n,) at PWM values (n,), all of one sign.
+
+    Raises `BadInputError` for fewer than five levels of PWM or values that are all alike.
+    """
+    u, y = np.asarray(pwm, dtype=np.float64), np.asarray(value, dtype=np.float64)
+    if len(np.unique(u)) < _FEWEST:
+        raise BadInputError(f"{name}: has {len(np.unique(u))} levels of PWM, expected at least {_FEWEST}")
+    sign = -1.0 if float(np.median(y)) < 0.0 else 1.0
+    size = sign * y
+    top = float(np.quantile(size, 0.9))
+    if not top > 0.0:
+        raise BadInputError(f"{name}: the settled values are all zero, expected the pump's effect")
+
+    def residual(x: FloatArray) -> FloatArray:
+        return np.asarray((x[0] * Shape(float(x[1]), float(x[2])).of(u) - size) / (0.02 * top))
+
+    low, high = np.array([0.1 * top, 0.0, 3.0]), np.array([5.0 * top, float(u.max()) - 5.0, 400.0])
+    best = None
+    for dead in (0.3 * float(u.min()), 0.9 * float(u.min())):
+        for scale in (15.0, 60.0, 200.0):
+            found = least_squares(
+                residual,
+                np.clip([top, dead, scale], low * 1.01 + 1e-9, high * 0.99),
+                bounds=(low, high),
+                x_scale=[top, 50.0, 50.0],
+                loss="soft_l1",
+            )
+            if best is None or found.cost < best.cost:
+                best = found
+    assert best is not None
+    end, dead, scale = (float(v) for v in best.x)
+    error = residual(best.x)
+    scatter = max(1.4826 * float(np.median(np.abs(error))), 1e-6)
+    far = np.abs(error) > _FAR * scatter
+    J = np.asarray(best.jac)[~far]
+    inside = [k for k in range(3) if low[k] * 1.001 < best.x[k] < high[k] * 0.999]
+    sigma = {"end": math.inf, "dead_pwm": math.inf, "scale_pwm": math.inf}
+    weight = error[~far]
+    noise = float(np.sqrt(np.sum(weight**2) / max(len(weight) - len(inside), 1)))
+    H = J[:, inside].T @ J[:, inside]
+    if len(J) > len(inside) and np.linalg.cond(H) < 1e14:
+        spread = noise * np.sqrt(np.diag(np.linalg.inv(H)))
+        for k, s in zip(inside, spread.tolist(), strict=True):
+            sigma[("end", "dead_pwm", "scale_pwm")[k]] = s
+    reach = -scale * math.log1p(0.95 * math.expm1(-(PWM_MAX - dead) / scale))
+    return StaticMap(
+        name,
+        sign * end,
+        Shape(dead, scale),
+        sigma,
+        dead + reach,
+        scatter * 0.02 * top,
+        u,
+        y,
+        tuple(sorted(u[far].tolist())),
+    )

@@ -1,0 +1,408 @@
+"""Kinematics of one section of constant curvature, exact and as the firmware's truncated series."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from fractions import Fraction
+from math import factorial
+from typing import ParamSpec, TypeVar
+
+import numpy as np
+from numba.extending import register_jitable
+
+from calib.core.arrays import FloatArray
+from calib.core.errors import BadInputError
+
+# ----------------------------------------------------------------------
+# The circular arc: four functions of its angle on which kinematics and dynamics rest.
+#
+# An arc of length l that turns by phi has the chord l S(phi) in the direction phi / 2, with
+#
+#     S(phi) = sin(phi / 2) / (phi / 2),   S'(phi) = -phi D(phi),   S''(phi) = 2 D(phi) - S(phi) / 4,
+#     D(phi) = (S(phi) - cos(phi / 2)) / phi^2.
+#
+# The second derivative follows from the differential equation of the spherical Bessel function j0.
+# S and D are entire and even, so both are power series in w = phi^2 without any singularity: there is
+# nothing to switch at zero curvature, and (3.9) holds by itself. D has no closed form that does not
+# cancel at zero; `chord_ratio_w` and `chord_decay_w` sum the series, to the last bit for |phi| <= 4 and
+# within 1e-15 up to 2 pi, where the arc closes on itself and the model ends.
+#
+# With them H13 = l S sin(phi / 2) and H23 = l S cos(phi / 2) in (3.6), f = 2 / S in (3.13).
+#
+# The functions whose names end in `_w` are plain Python for arrays and for numbers, and the compiled
+# kernel inlines the same functions (`inlined`).
+
+FULL_CIRCLE_RAD = 2.0 * np.pi
+"""At this angle the chord vanishes and the mass matrix loses its rank: the end of the model."""
+
+LARGEST_ANGLE_RAD = 6.0
+"""Where simulations stop: the chord is a twentieth of the arc, and soon no step is small enough."""
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result", float, FloatArray)
+Returned = TypeVar("Returned")
+
+
+def inlined(function: Callable[Parameters, Returned]) -> Callable[Parameters, Returned]:
+    """Leave a scalar function as it is for Python and let compiled callers inline it.
+
+    Without the inlining each call copies the coefficients, which costs a third of the speed.
+    """
+    register_jitable(forceinline=True, error_model="numpy")(function)
+    return function
+
+
+_TERMS = 13
+"""The first term left out, pi^(2n) / (2n + 1)! at phi = 2 pi, is 8e-16 for n = 13; at pi it is 1e-23."""
+
+_RATIO = tuple(float(Fraction((-1) ** n, factorial(2 * n + 1) * 4**n)) for n in range(_TERMS))
+_DECAY = tuple(
+    float((Fraction(1, factorial(2 * n + 1)) - Fraction(1, factorial(2 * n))) * Fraction((-1) ** n, 4**n))
+    for n in range(1, _TERMS + 1)
+)
+
+
+@inlined
+def _series(c: tuple[float, ...], w: Result) -> Result:
+    """Sum of c[n] w^n by Estrin's scheme: its additions wait for each other in five places, not in twelve."""
+    w2 = w * w
+    w4 = w2 * w2
+    low = (c[0] + c[1] * w) + (c[2] + c[3] * w) * w2
+    middle = (c[4] + c[5] * w) + (c[6] + c[7] * w) * w2
+    high = (c[8] + c[9] * w) + (c[10] + c[11] * w) * w2 + c[12] * w4
+    return (low + middle * w4) + high * (w4 * w4)
+
+
+@inlined
+def chord_ratio_w(w: Result) -> Result:
+    """S as a function of w = phi^2."""
+    return _series(_RATIO, w)
+
+
+@inlined
+def chord_decay_w(w: Result) -> Result:
+    """D = -2 dS/dw as a function of w = phi^2."""
+    return _series(_DECAY, w)
+
+
+def chord_ratio(phi: FloatArray) -> FloatArray:
+    """S, chord over arc length, of the angle phi [rad], any shape; exact for every angle."""
+    return np.sinc(np.asarray(phi, dtype=np.float64) / FULL_CIRCLE_RAD)
+
+
+def chord_decay(phi: FloatArray) -> FloatArray:
+    """D = -S' / phi of the angle phi [rad], any shape, for |phi| <= 2 pi."""
+    angle = np.asarray(phi, dtype=np.float64)
+    return chord_decay_w(angle * angle)
+
+
+def chord_slope(phi: FloatArray) -> FloatArray:
+    """S' of the angle phi [rad], any shape, for |phi| <= 2 pi."""
+    return -np.asarray(phi, dtype=np.float64) * chord_decay(phi)
+
+
+def chord_curvature(phi: FloatArray) -> FloatArray:
+    """S'' of the angle phi [rad], any shape, for |phi| <= 2 pi."""
+    return 2.0 * chord_decay(phi) - 0.25 * chord_ratio(phi)
+
+
+# ----------------------------------------------------------------------
+# Actuator, configuration and task space of one section, both ways, with their derivatives.
+#
+#     q = (q1, q2)        lengths of the bellows [m]                                  (3.1)
+#     k = (kappa, l)      curvature [1/m] and length of the backbone [m]              (3.2)
+#     x = (x, y, phi)     head in the world frame [m, m, rad]                         (3.4)
+#
+#     phi = kappa l = (q1 - q2) / (2 r_B),   l = (q1 + q2) / 2                        (3.3)
+#     (x, y) = l S(phi) (sin(phi / 2), cos(phi / 2))                                  (3.6), (3.10)
+#     l = |(x, y)| / S(phi)                                                           (3.11), (3.12)
+#
+# with S of `calib.stages.actuator.kinematics`. World: x to the right, y along the straight actuator
+# towards the
+# head, phi > 0 bends the head towards +x and bellows 1, at -r_B in the head's frame, is then longer.
+#
+# The rotation in (3.6) is printed the other way round: the arc's tangent at the head is
+# (sin phi, cos phi), as (A.1) has it, so the block is [[cos, sin], [-sin, cos]].
+#
+# All functions take arrays with any leading dimensions.
+
+MARKER_OFFSET_M = 0.015
+"""Distance d from the head to the marker along the head's tangent (A.1)."""
+
+
+def _parts(values: FloatArray, size: int, what: str) -> tuple[FloatArray, ...]:
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim == 0 or array.shape[-1] != size:
+        raise BadInputError(f"{what}: found shape {array.shape}, expected (..., {size})")
+    return tuple(array[..., i] for i in range(size))
+
+
+def angle(q_m: FloatArray, bellows_radius_m: float) -> FloatArray:
+    """Bending angle phi [rad] of the bellows' lengths (..., 2) (3.3)."""
+    q1, q2 = _parts(q_m, 2, "bellows")
+    return (q1 - q2) / (2.0 * bellows_radius_m)
+
+
+def length(q_m: FloatArray) -> FloatArray:
+    """Length l [m] of the backbone (3.3)."""
+    q1, q2 = _parts(q_m, 2, "bellows")
+    return 0.5 * (q1 + q2)
+
+
+def configuration(q_m: FloatArray, bellows_radius_m: float) -> FloatArray:
+    """Curvature and length (..., 2) [1/m, m] of the bellows' lengths (..., 2) (3.3)."""
+    ell = length(q_m)
+    return np.stack([angle(q_m, bellows_radius_m) / ell, ell], axis=-1)
+
+
+def bellows_from_configuration(k: FloatArray, bellows_radius_m: float) -> FloatArray:
+    """Lengths of the bellows (..., 2) [m] of curvature and length (..., 2), the inverse of (3.3)."""
+    kappa, ell = _parts(k, 2, "configuration")
+    half = bellows_radius_m * kappa * ell
+    return np.stack([ell + half, ell - half], axis=-1)
+
+
+def pose_from_configuration(k: FloatArray) -> FloatArray:
+    """Head (..., 3) [m, m, rad] of curvature and length (..., 2) (3.6), exact at zero curvature."""
+    kappa, ell = _parts(k, 2, "configuration")
+    phi = kappa * ell
+    chord = ell * chord_ratio(phi)
+    return np.stack([chord * np.sin(0.5 * phi), chord * np.cos(0.5 * phi), phi], axis=-1)
+
+
+def configuration_from_pose(pose: FloatArray) -> FloatArray:
+    """Curvature and length (..., 2) [1/m, m] of the head (..., 3) (3.11).
+
+    Raises `BadInputError` for |phi| >= 2 pi, where no chord is left to measure.
+    """
+    x, y, phi = _parts(pose, 3, "pose")
+    if np.any(np.abs(phi) >= FULL_CIRCLE_RAD):
+        raise BadInputError(
+            f"pose: found an angle of {np.nanmax(np.abs(phi)):.6g} rad, expected less than a full circle"
+        )
+    ell = np.hypot(x, y) / chord_ratio(phi)
+    return np.stack([phi / ell, ell], axis=-1)
+
+
+def forward(q_m: FloatArray, bellows_radius_m: float) -> FloatArray:
+    """Head (..., 3) [m, m, rad] of the bellows' lengths (..., 2) (3.3), (3.6)."""
+    phi = angle(q_m, bellows_radius_m)
+    chord = length(q_m) * chord_ratio(phi)
+    return np.stack([chord * np.sin(0.5 * phi), chord * np.cos(0.5 * phi), phi], axis=-1)
+
+
+def inverse(pose: FloatArray, bellows_radius_m: float) -> FloatArray:
+    """Lengths of the bellows (..., 2) [m] of the head (..., 3) (3.12).
+
+    Only the distance of (x, y) from the base counts, as in the source. Raises `BadInputError` for
+    |phi| >= 2 pi.
+    """
+    ell = configuration_from_pose(pose)[..., 1]
+    half = bellows_radius_m * np.asarray(pose, dtype=np.float64)[..., 2]
+    return np.stack([ell + half, ell - half], axis=-1)
+
+
+def transform(phi: FloatArray, length_m: FloatArray) -> FloatArray:
+    """Homogeneous transform H_bh (..., 3, 3) from the head's to the base frame (3.5), (3.6).
+
+    Parameters
+    ----------
+    phi : (...) bending angle [rad].
+    length_m : (...) length of the backbone [m].
+    """
+    phi, ell = np.broadcast_arrays(np.asarray(phi, dtype=np.float64), np.asarray(length_m, dtype=np.float64))
+    chord = ell * chord_ratio(phi)
+    H = np.zeros((*phi.shape, 3, 3))
+    H[..., 0, 0] = H[..., 1, 1] = np.cos(phi)
+    H[..., 0, 1] = np.sin(phi)
+    H[..., 1, 0] = -H[..., 0, 1]
+    H[..., 0, 2] = chord * np.sin(0.5 * phi)
+    H[..., 1, 2] = chord * np.cos(0.5 * phi)
+    H[..., 2, 2] = 1.0
+    return H
+
+
+def configuration_jacobian(q_m: FloatArray, bellows_radius_m: float) -> FloatArray:
+    """d(kappa, l) / d(q1, q2), shape (..., 2, 2), of (3.3)."""
+    q1, q2 = _parts(q_m, 2, "bellows")
+    scale = 2.0 / (bellows_radius_m * (q1 + q2) ** 2)
+    half = np.full_like(q1, 0.5)
+    return np.stack([np.stack([scale * q2, -scale * q1], axis=-1), np.stack([half, half], axis=-1)], axis=-2)
+
+
+def _arc_derivatives(phi: FloatArray) -> tuple[FloatArray, ...]:
+    """a = S sin(phi / 2) and b = S cos(phi / 2) with their first and second derivatives."""
+    S, S1, S2 = chord_ratio(phi), chord_slope(phi), chord_curvature(phi)
+    s, c = np.sin(0.5 * phi), np.cos(0.5 * phi)
+    return (
+        S * s,
+        S1 * s + 0.5 * S * c,
+        S2 * s + S1 * c - 0.25 * S * s,
+        S * c,
+        S1 * c - 0.5 * S * s,
+        S2 * c - S1 * s - 0.25 * S * c,
+    )
+
+
+def _to_bellows(by_length: FloatArray, by_phi: FloatArray, bellows_radius_m: float) -> FloatArray:
+    """Columns d/dq1, d/dq2 from d/dl, d/dphi: ell = (q1 + q2) / 2, phi = (q1 - q2) / (2 r_B)."""
+    half_l, half_phi = 0.5 * by_length, by_phi / (2.0 * bellows_radius_m)
+    return np.stack([half_l + half_phi, half_l - half_phi], axis=-1)
+
+
+def forward_jacobian(q_m: FloatArray, bellows_radius_m: float) -> FloatArray:
+    """J = d(x, y, phi) / d(q1, q2), shape (..., 3, 2), of `forward`, for |phi| <= 2 pi."""
+    phi, ell = angle(q_m, bellows_radius_m), length(q_m)
+    a, a1, _, b, b1, _ = _arc_derivatives(phi)
+    zero, one = np.zeros_like(phi), np.ones_like(phi)
+    return _to_bellows(
+        np.stack([a, b, zero], axis=-1), np.stack([ell * a1, ell * b1, one], axis=-1), bellows_radius_m
+    )
+
+
+def forward_jacobian_rate(q_m: FloatArray, dq_mps: FloatArray, bellows_radius_m: float) -> FloatArray:
+    """dJ/dt, shape (..., 3, 2), along (q, dq): the head accelerates with J ddq + dJ/dt dq."""
+    phi, ell = angle(q_m, bellows_radius_m), length(q_m)
+    dphi, dl = angle(dq_mps, bellows_radius_m), length(dq_mps)
+    _, a1, a2, _, b1, b2 = _arc_derivatives(phi)
+    zero = np.zeros_like(phi * dphi)
+    return _to_bellows(
+        np.stack([a1 * dphi, b1 * dphi, zero], axis=-1),
+        np.stack([dl * a1 + ell * a2 * dphi, dl * b1 + ell * b2 * dphi, zero], axis=-1),
+        bellows_radius_m,
+    )
+
+
+def inverse_jacobian(pose: FloatArray, bellows_radius_m: float) -> FloatArray:
+    """d(q1, q2) / d(x, y, phi), shape (..., 2, 3), of `inverse`, away from the base, |phi| < 2 pi."""
+    x, y, phi = _parts(pose, 3, "pose")
+    S = chord_ratio(phi)
+    chord = np.hypot(x, y)
+    by_x, by_y = x / (chord * S), y / (chord * S)
+    by_phi = -chord * chord_slope(phi) / (S * S)
+    return np.stack(
+        [
+            np.stack([by_x, by_y, by_phi + bellows_radius_m], axis=-1),
+            np.stack([by_x, by_y, by_phi - bellows_radius_m], axis=-1),
+        ],
+        axis=-2,
+    )
+
+
+def _along_tangent(phi: FloatArray, distance_m: float) -> FloatArray:
+    phi = np.asarray(phi, dtype=np.float64)
+    return distance_m * np.stack([np.sin(phi), np.cos(phi)], axis=-1)
+
+
+def head_from_marker(marker_m: FloatArray, phi: FloatArray, offset_m: float = MARKER_OFFSET_M) -> FloatArray:
+    """Head (..., 2) [m] of the marker (..., 2) [m] and the angle phi (...) [rad] (A.1)."""
+    return np.asarray(marker_m, dtype=np.float64) - _along_tangent(phi, offset_m)
+
+
+def marker_from_head(head_m: FloatArray, phi: FloatArray, offset_m: float = MARKER_OFFSET_M) -> FloatArray:
+    """Marker (..., 2) [m] of the head (..., 2) [m] and the angle phi (...) [rad], (A.1) reversed."""
+    return np.asarray(head_m, dtype=np.float64) + _along_tangent(phi, offset_m)
+
+
+# ----------------------------------------------------------------------
+# The truncated series of the firmware: (3.10) forward, (3.14) inverse, and what they cost.
+#
+#     H13 = l sum_n (-1)^n phi^(2n + 1) / (2n + 2)!,   H23 = l sum_n (-1)^n phi^(2n) / (2n + 1)!    (3.10)
+#     f(phi) = phi / sin(phi / 2) = 2 + phi^2 / 12 + 7 phi^4 / 2880 + 31 phi^6 / 483840 + ...        (3.14)
+#
+# with phi = kappa l. `order` is the highest power of phi that is kept: the source uses H13 up to 7
+# and f up to 6. Its text gives 4.45e-5 as the error of f at pi / 2; that is the error at 1.5 rad, the
+# one at pi / 2 is 6.49e-5.
+#
+# `calib.stages.actuator.kinematics` has the exact functions; these here are for comparing and for constants
+# of a microcontroller.
+
+H13_ORDER = 7
+H23_ORDER = 6
+INVERSE_ORDER = 6
+"""Orders that the source truncates at."""
+
+
+def _terms(order: int, first: int) -> int:
+    """Number of terms up to and with phi^order of a series that starts at phi^first."""
+    if order < first:
+        raise BadInputError(f"order of the series: found {order}, expected {first} or more")
+    return (order - first) // 2 + 1
+
+
+def _polynomial(w: FloatArray, coefficients: list[float]) -> FloatArray:
+    total = np.full_like(w, coefficients[-1])
+    for coefficient in reversed(coefficients[:-1]):
+        total = total * w + coefficient
+    return total
+
+
+def _arrays(phi: FloatArray, length_m: FloatArray | float) -> tuple[FloatArray, FloatArray]:
+    return np.asarray(phi, dtype=np.float64), np.asarray(length_m, dtype=np.float64)
+
+
+def H13_series_m(phi: FloatArray, length_m: FloatArray | float, order: int = H13_ORDER) -> FloatArray:
+    """x of the head [m] by (3.10a) up to phi^order, of phi (...) [rad] and the length [m]."""
+    angle, ell = _arrays(phi, length_m)
+    coefficients = [(-1.0) ** n / factorial(2 * n + 2) for n in range(_terms(order, 1))]
+    return ell * angle * _polynomial(angle * angle, coefficients)
+
+
+def H23_series_m(phi: FloatArray, length_m: FloatArray | float, order: int = H23_ORDER) -> FloatArray:
+    """y of the head [m] by (3.10b) up to phi^order, of phi (...) [rad] and the length [m]."""
+    angle, ell = _arrays(phi, length_m)
+    coefficients = [(-1.0) ** n / factorial(2 * n + 1) for n in range(_terms(order, 0))]
+    return ell * _polynomial(angle * angle, coefficients)
+
+
+def inverse_coefficients(order: int = INVERSE_ORDER) -> tuple[Fraction, ...]:
+    """Coefficients of phi^0, phi^2, ... phi^order of f (3.14): 2, 1/12, 7/2880, 31/483840, ...
+
+    u / sin u has the coefficients c_n with sum_k (-1)^k c_(n-k) / (2k + 1)! = 0, and f is twice
+    that at u = phi / 2.
+    """
+    c = [Fraction(1)]
+    for n in range(1, _terms(order, 0)):
+        c.append(-sum(((-1) ** k * c[n - k] / factorial(2 * k + 1) for k in range(1, n + 1)), Fraction(0)))
+    return tuple(2 * value / 4**n for n, value in enumerate(c))
+
+
+def f_series(phi: FloatArray, order: int = INVERSE_ORDER) -> FloatArray:
+    """The series of (3.14) up to phi^order, of phi (...) [rad]."""
+    angle = np.asarray(phi, dtype=np.float64)
+    return _polynomial(angle * angle, [float(c) for c in inverse_coefficients(order)])
+
+
+def H13_error_m(phi: FloatArray, length_m: FloatArray | float, order: int = H13_ORDER) -> FloatArray:
+    """Exact minus truncated x of the head [m] (Figs. 3.2, 3.3)."""
+    angle, ell = _arrays(phi, length_m)
+    return ell * chord_ratio(angle) * np.sin(0.5 * angle) - H13_series_m(angle, ell, order)
+
+
+def H23_error_m(phi: FloatArray, length_m: FloatArray | float, order: int = H23_ORDER) -> FloatArray:
+    """Exact minus truncated y of the head [m]."""
+    angle, ell = _arrays(phi, length_m)
+    return ell * chord_ratio(angle) * np.cos(0.5 * angle) - H23_series_m(angle, ell, order)
+
+
+def f_error(phi: FloatArray, order: int = INVERSE_ORDER) -> FloatArray:
+    """Exact minus truncated f (Figs. 3.4, 3.5), |phi| < 2 pi."""
+    return 2.0 / chord_ratio(phi) - f_series(phi, order)
+
+
+def forward_series(q_m: FloatArray, bellows_radius_m: float) -> FloatArray:
+    """Head (..., 3) [m, m, rad] of the bellows (..., 2) as the source's simulation has it."""
+    q = np.asarray(q_m, dtype=np.float64)
+    phi = (q[..., 0] - q[..., 1]) / (2.0 * bellows_radius_m)
+    ell = 0.5 * (q[..., 0] + q[..., 1])
+    return np.stack([H13_series_m(phi, ell), H23_series_m(phi, ell), phi], axis=-1)
+
+
+def inverse_series(pose: FloatArray, bellows_radius_m: float, order: int = INVERSE_ORDER) -> FloatArray:
+    """Bellows (..., 2) [m] of the head (..., 3) by (3.12) with the series for f, as the firmware does.
+
+    q1 = r_B phi + |(x, y)| f(phi) / 2 and q2 = -r_B phi + |(x, y)| f(phi) / 2.
+    """
+    x, y, phi = np.moveaxis(np.asarray(pose, dtype=np.float64), -1, 0)
+    ell = 0.5 * np.hypot(x, y) * f_series(phi, order)
+    return np.stack([ell + bellows_radius_m * phi, ell - bellows_radius_m * phi], axis=-1)

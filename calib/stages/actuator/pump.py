@@ -1,0 +1,279 @@
+"""The two pumps: from a PWM value to the force of the air in the bellows.
+
+Order of (2.13), (3.49) and Fig. 3.22, corrected:
+
+    transport delay in ticks -> saturation to 0 .. 255 -> static force g(u), zero in the dead zone
+    -> first-order lag of 0.7 s -> limit on the falling rate.
+
+Static force. `ElongationForce` turns (2.13) into a force with the spring law: F = k(eps) eps, so
+that the steady elongation is the measured one. The printed 3.376 in (2.13) gives negative lengths;
+3.756 gives 26.56 mm at 12 V, as the text says. `PolynomialForce` is (3.49), which is in
+millinewton, and zero below PWM 100, where it has a bump of 244 mN. Just above the dead zone (2.13)
+dips 0.02 mm below zero; air does not pull, so it is cut at zero.
+
+Deflation. The air leaves through a small orifice only, since the pumps have valves.
+
+- `RateLimit`: the lag's output followed by a limit on the falling rate, 0.4 N/s. The printed -2 N/s
+  deflates in 2.6 s, the text says 5 s. For a command g that is constant from the time 0
+
+      x(t) = g + (x0 - g) exp(-t / tau),   F(t) = max(x(t), F0 - R t)
+
+  is exact and not a discretisation: x is monotone and gets slower all the time, so once F has met x
+  it never parts from it again.
+- `Orifice`: the flow out is driven by the gauge pressure, hence by F. A laminar and a turbulent part
+  of the pressure drop add up, F = a w + b w^2, with w the rate in N/s that the outflow takes away:
+
+      w(F) = 2 F / (a + sqrt(a^2 + 4 b F)),   dF/dt = max((g - F) / tau, -w(F)).
+
+  The pump delivers dF/dt + w, which follows from the lag of 0.7 s while it is positive; when it
+  would be negative the valve is closed and the orifice alone empties the bellows. Falling is then
+  nearly exponential with the time constant a. The steady states and the rise are those of
+  `RateLimit`; a = 1.045 s and b = 1.07 s^2/N, which share the pressure at 12 V evenly, give the same
+  5.04 s. They are not identified from data.
+
+The force does not depend on the bellows' length, so the pumps can be advanced before the mechanics.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from calib.core.arrays import FloatArray
+from calib.core.errors import BadInputError
+from calib.stages.actuator.kinematics import inlined
+from calib.stages.actuator.parameters import Stiffness
+
+PWM_MAX = 255.0
+TICK_S = 1.0 / 60.0
+
+RATE_LIMIT, ORIFICE = 0, 1
+
+
+@dataclass(frozen=True)
+class ElongationForce:
+    """Static force by way of the steady elongation (2.13).
+
+    Attributes
+    ----------
+    elongation_mm : coefficients of u^3, u^2, u, 1, u in volt, in millimetres.
+    stiffness : spring law that turns the elongation into the force of one bellows.
+    supply_V : voltage at PWM 255.
+    dead_zone_V : no force below.
+    """
+
+    elongation_mm: tuple[float, float, float, float] = (-0.1493, 3.756, -25.87, 54.13)
+    stiffness: Stiffness = field(default_factory=Stiffness)
+    supply_V: float = 12.0
+    dead_zone_V: float = 4.7
+
+    def force_N(self, pwm: FloatArray) -> FloatArray:
+        """Steady force [N] of PWM values 0 .. 255, any shape."""
+        u = self.supply_V * pwm / PWM_MAX
+        eps = 1e-3 * _polynomial(self.elongation_mm, u)
+        eps = np.where(u < self.dead_zone_V, 0.0, np.maximum(eps, 0.0))
+        return np.asarray(_polynomial(self.stiffness.coefficients[::-1], eps) * eps)
+
+
+def _polynomial(coefficients: Sequence[float], x: FloatArray) -> FloatArray:
+    """As `np.polyval`, to the last bit, in half the time for the few values of a tick."""
+    y = np.asarray(coefficients[0], dtype=np.float64)
+    for c in coefficients[1:]:
+        y = y * x + c
+    return y
+
+
+@dataclass(frozen=True)
+class PolynomialForce:
+    """Static force as a polynomial of the PWM value (3.49).
+
+    Attributes
+    ----------
+    force_mN : coefficients of u^4, u^3, u^2, u, u the PWM value, in millinewton.
+    dead_zone_pwm : no force below.
+    """
+
+    force_mN: tuple[float, float, float, float] = (-5.686e-6, 2.937e-3, -0.4189, 18.21)
+    dead_zone_pwm: float = 100.0
+
+    def force_N(self, pwm: FloatArray) -> FloatArray:
+        """Steady force [N] of PWM values 0 .. 255, any shape."""
+        force = 1e-3 * np.polyval((*self.force_mN, 0.0), pwm)
+        return np.where(pwm < self.dead_zone_pwm, 0.0, np.maximum(force, 0.0))
+
+
+@dataclass(frozen=True)
+class RateLimit:
+    """Deflation at a constant rate at most, `falling_N_per_s` (3.5); infinity switches it off."""
+
+    falling_N_per_s: float = 0.4
+
+    def __post_init__(self) -> None:
+        if not self.falling_N_per_s > 0.0:
+            raise BadInputError(f"falling rate: found {self.falling_N_per_s:g} N/s, expected a positive rate")
+
+
+@dataclass(frozen=True)
+class Orifice:
+    """Deflation through the orifice, F = a w + b w^2 with w = -dF/dt.
+
+    Attributes
+    ----------
+    laminar_s : a, the time constant at small forces.
+    turbulent_s2_per_N : b; zero leaves an exponential.
+    """
+
+    laminar_s: float = 1.045
+    turbulent_s2_per_N: float = 1.07
+
+    def __post_init__(self) -> None:
+        a, b = self.laminar_s, self.turbulent_s2_per_N
+        if not (0.0 < a < math.inf and 0.0 <= b < math.inf):
+            raise BadInputError(f"orifice: found a = {a:g} s, b = {b:g} s^2/N, expected a > 0 and b >= 0")
+
+
+@dataclass(frozen=True)
+class Pump:
+    """One pump with its hose and orifice; both pumps are alike.
+
+    Attributes
+    ----------
+    static : `ElongationForce` or `PolynomialForce`.
+    deflation : `RateLimit` or `Orifice`.
+    lag_s : time constant of the rise.
+    delay_ticks : ticks from a command to its effect.
+    tick_s : period of the commands.
+
+    Raises `BadInputError` for a time that is not positive or a negative delay.
+    """
+
+    static: ElongationForce | PolynomialForce = ElongationForce()
+    deflation: RateLimit | Orifice = RateLimit()
+    lag_s: float = 0.7
+    delay_ticks: int = 2
+    tick_s: float = TICK_S
+
+    def __post_init__(self) -> None:
+        for name, value in (("lag of the pump", self.lag_s), ("tick", self.tick_s)):
+            if not 0.0 < value < math.inf:
+                raise BadInputError(f"{name}: found {value:g} s, expected a positive time")
+        if self.delay_ticks < 0:
+            raise BadInputError(f"delay of the pump: found {self.delay_ticks} ticks, expected zero or more")
+
+
+class PumpCoefficients(NamedTuple):
+    """What `advance` needs, derived from a `Pump`."""
+
+    kind: int
+    lag_s: float
+    falling: float
+    laminar: float
+    turbulent: float
+
+
+def pump_coefficients(pump: Pump) -> PumpCoefficients:
+    """Coefficients of the compiled kernel."""
+    law = pump.deflation
+    if isinstance(law, RateLimit):
+        return PumpCoefficients(RATE_LIMIT, pump.lag_s, float(law.falling_N_per_s), 1.0, 0.0)
+    return PumpCoefficients(ORIFICE, pump.lag_s, 0.0, law.laminar_s, law.turbulent_s2_per_N)
+
+
+def static_force_N(pump: Pump, pwm: FloatArray) -> FloatArray:
+    """Force [N] that PWM values, any shape, settle at: saturation, dead zone, static law.
+
+    Raises `BadInputError` for values that are not finite.
+    """
+    values = np.asarray(pwm, dtype=np.float64)
+    if not np.all(np.isfinite(values)):
+        raise BadInputError("pwm: found a value that is not finite, expected numbers")
+    return pump.static.force_N(np.clip(values, 0.0, PWM_MAX))
+
+
+def delayed(pump: Pump, pwm: FloatArray, before: FloatArray | None = None) -> FloatArray:
+    """PWM rows (n, 2) as they reach the motors: `delay_ticks` rows later.
+
+    `before` (delay_ticks, 2) holds the commands of the ticks before the first row, zeros by default.
+    """
+    rows = np.asarray(pwm, dtype=np.float64)
+    lead = np.zeros((pump.delay_ticks, 2)) if before is None else np.asarray(before, dtype=np.float64)
+    if rows.ndim != 2 or rows.shape[1] != 2 or lead.shape != (pump.delay_ticks, 2):
+        raise BadInputError(
+            f"pwm: found shape {rows.shape} and {lead.shape} before it, "
+            f"expected (n, 2) and ({pump.delay_ticks}, 2)"
+        )
+    return np.concatenate([lead, rows])[: len(rows)]
+
+
+@inlined
+def _rise_or_leak(p: PumpCoefficients, force: float, g: float) -> float:
+    outflow = 2.0 * force / (p.laminar + math.sqrt(p.laminar * p.laminar + 4.0 * p.turbulent * force))
+    return max((g - force) / p.lag_s, -outflow)
+
+
+@inlined
+def _orifice(p: PumpCoefficients, force: float, g: float, dt: float) -> tuple[float, float]:
+    """Force after dt / 2 and dt: a Runge-Kutta step and the cubic between its ends."""
+    start = max(force, 0.0)
+    k1 = _rise_or_leak(p, start, g)
+    k2 = _rise_or_leak(p, max(start + 0.5 * dt * k1, 0.0), g)
+    k3 = _rise_or_leak(p, max(start + 0.5 * dt * k2, 0.0), g)
+    k4 = _rise_or_leak(p, max(start + dt * k3, 0.0), g)
+    middle = start + dt / 24.0 * (5.0 * k1 + 4.0 * (k2 + k3) - k4)
+    return middle, start + dt / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)
+
+
+@inlined
+def advance_pump(
+    p: PumpCoefficients, lag: float, force: float, g: float, decay: float, dt: float
+) -> tuple[float, float, float]:
+    """Lag output after dt [s], and force after dt / 2 and dt [N], of a constant static force g [N].
+
+    `decay` is exp(-dt / (2 lag_s)), which a caller with a fixed step computes once.
+    """
+    lag_middle = g + (lag - g) * decay
+    lag_end = g + (lag_middle - g) * decay
+    if p.kind == RATE_LIMIT:
+        middle = max(lag_middle, force - p.falling * (0.5 * dt))
+        return lag_end, middle, max(lag_end, middle - p.falling * (0.5 * dt))
+    middle, end = _orifice(p, force, g, dt)
+    return lag_end, middle, end
+
+
+@dataclass(frozen=True)
+class PumpState:
+    """Both pumps at a tick.
+
+    Attributes
+    ----------
+    lag_N, force_N : (2,) output of the lag and force on the bellows [N].
+    waiting_pwm : commands on their way, oldest first, `delay_ticks` pairs.
+    """
+
+    lag_N: tuple[float, float]
+    force_N: tuple[float, float]
+    waiting_pwm: tuple[tuple[float, float], ...]
+
+
+def pump_at_rest(pump: Pump, pwm: tuple[float, float] = (0.0, 0.0)) -> PumpState:
+    """State after a command has been held for long."""
+    g1, g2 = static_force_N(pump, np.array(pwm)).tolist()
+    return PumpState((g1, g2), (g1, g2), (pwm,) * pump.delay_ticks)
+
+
+def step_pump(pump: Pump, state: PumpState, pwm: tuple[float, float]) -> PumpState:
+    """State one tick after a new command, which takes effect `delay_ticks` later (Fig. 3.22).
+
+    One step per tick: exact for `RateLimit`, within 2e-5 N where the valve of an `Orifice` closes.
+    """
+    queue = (*state.waiting_pwm, pwm)
+    g1, g2 = static_force_N(pump, np.array(queue[0])).tolist()
+    p, dt = pump_coefficients(pump), pump.tick_s
+    decay = math.exp(-0.5 * dt / pump.lag_s)
+    lag1, _, force1 = advance_pump(p, state.lag_N[0], state.force_N[0], g1, decay, dt)
+    lag2, _, force2 = advance_pump(p, state.lag_N[1], state.force_N[1], g2, decay, dt)
+    return PumpState((lag1, lag2), (force1, force2), queue[1:])

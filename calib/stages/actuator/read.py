@@ -1,0 +1,591 @@
+"""From logs, tables and a rig to what an identification takes."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from calib.core.arrays import FloatArray
+from calib.core.errors import BadInputError
+from calib.core.files import read_text, shown
+from calib.core.rig import Rig
+from calib.core.units import plain_number
+from calib.io.logs import Log, check_time, read_log
+from calib.stages.actuator.identify import Start, Track, without_outliers
+from calib.stages.actuator.identify_pump import PumpRecord
+from calib.stages.actuator.parameters import Plant
+from calib.stages.actuator.pump import TICK_S
+from calib.stages.actuator.results import nominal_of
+from calib.stages.control.laws import holding_force
+from calib.stages.estimator.read import periods, setup_from_rig
+from calib.stages.estimator.sensors import SIZE, invert_marker, marker
+
+# ----------------------------------------------------------------------
+# Tables of a pump's recordings: time, PWM, and pressure or force, in columns of whatever name.
+#
+# A CSV with a header. The columns are those that are asked for, else the first whose name is known:
+#
+#     time        t_s, time, time_s, timestamp, timestamp_s, t
+#     PWM         pwm, pwm1, pwm_input, pwm_main
+#     value       pressure_kpa, feedback_kpa, pressure, force_n, force
+#
+# upper or lower case. Values are kPa unless the name says newton. Rows more than `STATIC_S` apart, each
+# with a PWM of its own, are settled values; a column `mode` then tells parts that do not belong together,
+# as inflation and suction. Other rows are a recording over time.
+
+STATIC_S = 0.9
+_TIME = ("t_s", "time", "time_s", "timestamp", "timestamp_s", "t")
+_PWM = ("pwm", "pwm1", "pwm_input", "pwm_main")
+_VALUE = ("pressure_kpa", "feedback_kpa", "pressure", "force_n", "force")
+_MOST_BAD = 0.05
+_FEWEST = 20
+_SHORTEST_S = 0.5
+_JUMP = 20.0
+
+
+@dataclass(frozen=True)
+class Settled:
+    """Settled values (n,) at PWM values (n,), of one mode."""
+
+    name: str
+    pwm: FloatArray
+    value: FloatArray
+
+
+@dataclass(frozen=True)
+class PumpTable:
+    """What a table holds: a recording over time, or settled values by mode; and sentences about it."""
+
+    unit: str
+    record: PumpRecord | None
+    settled: tuple[Settled, ...]
+    said: tuple[str, ...]
+
+
+def read_columns(path: Path) -> tuple[list[str], list[list[str]], list[int]]:
+    """Header, rows of cells, and the number of each row's line in a CSV.
+
+    Raises `BadInputError` for a file without header or rows and for a row of another length.
+    """
+    header: list[str] = []
+    rows: list[list[str]] = []
+    lines: list[int] = []
+    reader = csv.reader(io.StringIO(read_text(path)))
+    try:
+        for cells in reader:
+            if not cells or not any(cell.strip() for cell in cells) or cells[0].lstrip().startswith("#"):
+                continue
+            if not header:
+                header = [cell.strip() for cell in cells]
+                continue
+            if len(cells) != len(header):
+                raise BadInputError(
+                    f"{shown(path)}, line {reader.line_num}: has {len(cells)} cells, expected {len(header)}"
+                )
+            rows.append(cells)
+            lines.append(reader.line_num)
+    except csv.Error as error:
+        raise BadInputError(
+            f"{shown(path)}, line {reader.line_num}: is not comma-separated: {error}"
+        ) from error
+    if not header:
+        raise BadInputError(f"{shown(path)}: is empty, expected a header and rows")
+    if not rows:
+        raise BadInputError(f"{shown(path)}: has a header but no rows")
+    return header, rows, lines
+
+
+def find_column(path: Path, header: list[str], wanted: str | None, known: tuple[str, ...], what: str) -> int:
+    """Index of a column, the one asked for or the first known name."""
+    low = [name.lower() for name in header]
+    if wanted is not None:
+        if wanted.lower() not in low:
+            raise BadInputError(f"{shown(path)}: has no column {wanted}, found {', '.join(header)[:120]}")
+        return low.index(wanted.lower())
+    for name in known:
+        if name in low:
+            return low.index(name)
+    raise BadInputError(
+        f"{shown(path)}: has no {what}, found columns {', '.join(header)[:120]}; "
+        f"expected for instance {known[0]}"
+    )
+
+
+def number(cell: str, path: Path, line: int, name: str) -> float:
+    """A cell as a number, NaN where it is blank or says nan. Raises `BadInputError` for other words."""
+    word = cell.strip()
+    if not word:
+        return math.nan
+    value = plain_number(word)
+    if value is None:
+        raise BadInputError(f"{shown(path)}, line {line}: {name} is {shown(word[:40])!r}, expected a number")
+    return value if math.isfinite(value) else math.nan
+
+
+def read_pump_table(
+    path: Path,
+    time: str | None = None,
+    pwm: str | None = None,
+    value: str | None = None,
+    unit: str | None = None,
+) -> PumpTable:
+    """A table of a pump.
+
+    Parameters
+    ----------
+    time, pwm, value : names of the columns, recognised by default. unit : "kPa" or "N".
+
+    Raises
+    ------
+    BadInputError for missing columns, text for a number, PWM outside 0 .. 255, time that runs back or
+    jumps, and tables that are too short.
+    """
+    header, rows, lines = read_columns(path)
+    what = "pressure or force"
+    at = [
+        find_column(path, header, wanted, known, name)
+        for wanted, known, name in ((time, _TIME, "time"), (pwm, _PWM, "PWM"), (value, _VALUE, what))
+    ]
+    table = np.array(
+        [[number(row[k], path, line, header[k]) for k in at] for row, line in zip(rows, lines, strict=True)]
+    )
+    said = []
+    good = np.isfinite(table).all(axis=1)
+    if not good.all():
+        bad = int((~good).sum())
+        if bad > max(_MOST_BAD * len(table), 1.0) or bad == len(table):
+            first = lines[int(np.nonzero(~good)[0][0])]
+            raise BadInputError(
+                f"{shown(path)}: {bad} of {len(table)} rows have a blank or nan, the first in line {first}, "
+                f"expected numbers"
+            )
+        said.append(f"{shown(path)}: {bad} rows with a blank or nan are left out")
+    table, kept = table[good], [k for k in range(len(rows)) if good[k]]
+    t, u, y = table.T
+    name = shown(path.name)
+    if unit is None:
+        unit = "N" if header[at[2]].lower().startswith("force") else "kPa"
+        if header[at[2]].lower() == "pressure":
+            said.append(f"takes the column {header[at[2]]} for kPa")
+    outside = np.nonzero((u < 0.0) | (u > 255.0))[0]
+    if len(outside):
+        line = lines[kept[int(outside[0])]]
+        raise BadInputError(f"{shown(path)}, line {line}: PWM is {u[outside[0]]:g}, expected 0 to 255")
+    back = np.nonzero(np.diff(t) < 0.0)[0]
+    if len(back):
+        line = lines[kept[int(back[0]) + 1]]
+        raise BadInputError(
+            f"{shown(path)}, line {line}: time goes back from {t[back[0]]:g} to {t[back[0] + 1]:g} s"
+        )
+    if len(t) > 1 and float(np.median(np.diff(t))) >= STATIC_S:
+        return PumpTable(unit, None, _settled(name, header, [rows[k] for k in kept], u, y), tuple(said))
+    return PumpTable(unit, _record(path, name, t, u, y, [lines[k] for k in kept]), (), tuple(said))
+
+
+def _settled(
+    name: str, header: list[str], rows: list[list[str]], u: FloatArray, y: FloatArray
+) -> tuple[Settled, ...]:
+    low = [column.lower() for column in header]
+    if "mode" not in low:
+        return (Settled(name, u, y),)
+    modes = [row[low.index("mode")].strip() for row in rows]
+    out = []
+    for mode in dict.fromkeys(modes):
+        mine = np.array([m == mode for m in modes])
+        out.append(Settled(f"{name}, {shown(mode)}", u[mine], y[mine]))
+    return tuple(out)
+
+
+def _record(
+    path: Path, name: str, t: FloatArray, u: FloatArray, y: FloatArray, lines: list[int]
+) -> PumpRecord:
+    new = np.concatenate([[True], np.diff(t) > 0.0])
+    t, u, y = t[new], u[new], y[new]
+    kept = [line for line, keep in zip(lines, new.tolist(), strict=True) if keep]
+    if len(t) < _FEWEST or t[-1] - t[0] < _SHORTEST_S:
+        span = float(t[-1] - t[0]) if len(t) else 0.0
+        raise BadInputError(
+            f"{shown(path)}: has {len(t)} rows over {span:.3g} s, expected at least {_FEWEST} rows and "
+            f"{_SHORTEST_S:g} s"
+        )
+    steps = np.diff(t)
+    far = np.nonzero(steps > max(_JUMP * float(np.median(steps)), 0.5))[0]
+    if len(far):
+        k = int(far[0])
+        raise BadInputError(
+            f"{shown(path)}, line {kept[k + 1]}: time jumps from {t[k]:g} to {t[k + 1]:g} s; "
+            "cut the table there"
+        )
+    return PumpRecord(name, t, u, y)
+
+
+# ----------------------------------------------------------------------
+# Whether a log begins in motion, and a first guess of the state there.
+#
+# Hoses off. Angle and rate at the beginning are those of a damped swing fitted to the first second,
+#
+#     phi(t) = m + exp(-zeta w t) (a cos w t + b sin w t),
+#
+# linear in m, a, b for each w and zeta of a grid, which is finer about the best of a coarse one. A swing
+# that
+# is let go has hardly any rate at its beginning; one that is cut out of a longer log has.
+#
+# Pumps connected. A log whose head is away from the straight rest at its beginning is taken to be in
+# motion,
+# slowly: rates by straight lines, forces as they would hold the head.
+
+_FIRST_S = 1.0
+_SLOW_S = 0.25
+_HERTZ = np.geomspace(1.0, 10.0, 70)
+_NEAR = np.linspace(0.96, 1.04, 17)
+_ZETA = (0.02, 0.035, 0.05, 0.07, 0.1, 0.15)
+_IDENTIFYSTART_FEWEST = 12
+_SHARE = 0.3
+_SURE = 6.0
+_LEAST_RADPS = 0.2
+_AWAY_RAD = 0.06
+_AWAY_M = 0.004
+
+
+def _swing(t: FloatArray, phi: FloatArray, w: float, zeta: float) -> tuple[float, float, float, float, float]:
+    """Sum of squares, and what `swing_at_beginning` returns, of one w [rad/s] and zeta."""
+    decay = np.exp(-zeta * w * t)
+    A = np.stack([np.ones_like(t), decay * np.cos(w * t), decay * np.sin(w * t)], axis=1)
+    # A second of readings tells the three apart, so the normal equations do.
+    inverse = np.linalg.solve(A.T @ A, A.T)
+    m, a, b = (inverse @ phi).tolist()
+    residual = phi - A @ np.array([m, a, b])
+    noise = float(np.linalg.norm(residual)) / math.sqrt(max(len(t) - 5, 1))
+    by = w * (inverse[2] - zeta * inverse[1])
+    return (
+        float(residual @ residual),
+        m + a,
+        w * (b - zeta * a),
+        noise * float(np.linalg.norm(by)),
+        w * math.hypot(a, b),
+    )
+
+
+def swing_at_beginning(t_s: FloatArray, phi_rad: FloatArray) -> tuple[float, float, float, float]:
+    """Angle [rad], rate [rad/s], the rate's standard deviation and w times the amplitude, at t = 0.
+
+    The times (n,) begin at 0 or shortly after; a second of them is used, single wrong readings replaced.
+    """
+    some = t_s <= _FIRST_S
+    t, phi = t_s[some], without_outliers(phi_rad[some])[0]
+    tried = [(_swing(t, phi, w, zeta), w) for w in (2.0 * math.pi * _HERTZ).tolist() for zeta in _ZETA]
+    middle = min(tried)[1]
+    near = [middle * share for share in _NEAR.tolist()]
+    best = min(_swing(t, phi, w, zeta) for w in near for zeta in _ZETA)
+    return best[1:]
+
+
+def start_in_motion(
+    t_s: FloatArray, head: FloatArray, hoses: bool, plant: Plant, rest_noise_rad: float
+) -> Start | None:
+    """A guess of the start of a log that begins in motion; None for one that begins at rest.
+
+    Parameters
+    ----------
+    t_s, head : (n,) times from the beginning [s] and (n, 2) angle [rad] and length [m].
+    rest_noise_rad : standard deviation of a reading of the angle.
+    """
+    if len(t_s) < _IDENTIFYSTART_FEWEST:
+        return None
+    phi, length = np.median(head[:5], axis=0).tolist()
+    if hoses:
+        away = max(_AWAY_RAD, _SURE * rest_noise_rad)
+        if abs(phi) < away and abs(length - plant.rest_length_m) < _AWAY_M:
+            return None
+        some = t_s <= max(_SLOW_S, float(t_s[4]))
+        rates = np.polyfit(t_s[some], head[some], 1)[0].tolist()
+        turned = plant.bellows_radius_m * phi
+        F = np.maximum(holding_force(plant, np.array([length + turned, length - turned])), 0.0).tolist()
+        return Start(phi, length, rates[0], rates[1], 0.0, 0.0, *F, *F)
+    at_0, rate, sigma, fastest = swing_at_beginning(t_s, head[:, 0])
+    if abs(rate) < max(_SHARE * fastest, _SURE * sigma, _LEAST_RADPS):
+        return None
+    return Start(at_0, length, rate)
+
+
+# ----------------------------------------------------------------------
+# From a log and a rig.yaml to what an identification takes: commands by ticks, and the head's pose.
+#
+# The pose comes from the log's own pictures, marker by marker
+# (`calib.stages.estimator.sensors.invert_marker`), from
+# a states file of `calib replay`, or, for tests of the method, from the simulated rig's true columns. The
+# errors of pictures are independent of each other, those of filtered states are not and tell less than they
+# seem to.
+
+LONGEST_S = 120.0
+_IDENTIFYING_SHORTEST_S = 1.0
+_IDENTIFYING_FEWEST = 40
+_GAP_S = 0.5
+_BEFORE_RELEASE_S = 0.03
+_MOST_TICKS = 10_000_000
+_LATE_S = 0.01
+_TRUE_SIGMA = (1e-4, 1e-5)
+_LENGTH_SIGMA_M = 2e-4
+_GRAVITY_MPS2 = 9.81
+
+Head = tuple[FloatArray, FloatArray, FloatArray]
+
+
+@dataclass(frozen=True)
+class TrackSource:
+    """A track, how its pose was found, what is known of its delay, and sentences about it.
+
+    `begin_s` is the time of the log at which the track begins.
+    """
+
+    track: Track
+    source: str
+    delay_s: float
+    said: tuple[str, ...]
+    states: Path | None = None
+    begin_s: float = 0.0
+
+
+def states_beside(path: Path) -> Path | None:
+    """The states file that `calib replay` writes for a log, where it lies beside it."""
+    for name in (f"{path.stem}_states.csv", f"{path.stem}.states.csv"):
+        if path.with_name(name).is_file():
+            return path.with_name(name)
+    return None
+
+
+def _whitening(by: FloatArray, sigma: FloatArray) -> FloatArray:
+    return np.asarray(by / sigma[..., None])
+
+
+def _from_pictures(log: Log, rig: Rig, rig_path: Path) -> tuple[Head, float]:
+    rows = log.sampled("u_px", "v_px")
+    if not len(rows):
+        raise BadInputError(
+            f"{log.source}: has no marker, expected u_px and v_px, or the states of calib replay beside it"
+        )
+    found = periods(log)
+    setup, _ = setup_from_rig(rig, rig_path, found)
+    sensor = setup.start.sensor.copy()
+    delay_s = float(sensor[7])
+    state, by_u, by_v = np.zeros(SIZE), np.empty(SIZE), np.empty(SIZE)
+    state[6:] = sensor
+    state[13] = 0.0
+    rest = float(setup.start.head[1])
+    sigma = math.sqrt(float(setup.noise[0]) ** 2 + float(setup.noise[1]) ** 2 / 12.0)
+    guess = (0.0, rest)
+    t, heads, whitening = [], [], []
+    pixels = np.stack([log.columns["u_px"][rows], log.columns["v_px"][rows]], axis=1)
+    for at, (u, v) in zip(log.t_s[rows].tolist(), pixels.tolist(), strict=True):
+        for phi, length in (guess, (0.0, rest)):
+            phi, length, good = invert_marker(setup.view, sensor, u, v, phi, length)
+            if good:
+                break
+        if not good:
+            continue
+        guess = phi, length
+        state[0], state[1] = phi, length
+        marker(setup.view, state, by_u, by_v)
+        t.append(at)
+        heads.append(guess)
+        whitening.append([by_u[:2] / sigma, by_v[:2] / sigma])
+    if len(t) < _IDENTIFYING_FEWEST:
+        raise BadInputError(
+            f"{log.source}: {len(t)} of {len(rows)} pictures show the marker where it can be, "
+            f"expected at least {_FEWEST}"
+        )
+    return (np.array(t), np.array(heads), np.array(whitening)), delay_s
+
+
+def _from_states(path: Path) -> Head:
+    header, rows, lines = read_columns(path)
+    names = ("t_s", "phi_rad", "length_m", "sigma_phi_rad")
+    at = [find_column(path, header, name, (name,), name) for name in names]
+    table = np.array(
+        [[number(row[k], path, line, header[k]) for k in at] for row, line in zip(rows, lines, strict=True)]
+    )
+    low = [name.lower() for name in header]
+    spread = np.full(len(table), _LENGTH_SIGMA_M)
+    if "sigma_q1_m" in low and "sigma_q2_m" in low:
+        both = [
+            [number(row[low.index(n)], path, line, n) for n in ("sigma_q1_m", "sigma_q2_m")]
+            for row, line in zip(rows, lines, strict=True)
+        ]
+        spread = np.sqrt(np.mean(np.array(both) ** 2, axis=1))
+    good = np.isfinite(table).all(axis=1) & np.isfinite(spread) & (spread > 0.0) & (table[:, 3] > 0.0)
+    # States come at every row of camera and IMU; more than one per tick says the same again.
+    table, spread = table[good], spread[good]
+    tick = np.floor((table[:, 0] - table[0, 0]) / TICK_S) if len(table) else np.zeros(0)
+    first = np.concatenate([[True], np.diff(tick) > 0.0]) if len(table) else np.zeros(0, dtype=bool)
+    table, spread = table[first], spread[first]
+    W = np.zeros((len(table), 2, 2))
+    W[:, 0, 0], W[:, 1, 1] = 1.0 / table[:, 3], 1.0 / spread
+    return table[:, 0], table[:, 1:3], W
+
+
+def _from_truth(log: Log, bellows_radius_m: float) -> Head:
+    rows = log.sampled("true_q1_m", "true_q2_m")
+    if not len(rows):
+        raise BadInputError(f"{log.source}: has no true_q1_m and true_q2_m, which --truth needs")
+    q1, q2 = log.columns["true_q1_m"][rows], log.columns["true_q2_m"][rows]
+    head = np.stack([(q1 - q2) / (2.0 * bellows_radius_m), 0.5 * (q1 + q2)], axis=1)
+    W = np.broadcast_to(np.diag(1.0 / np.array(_TRUE_SIGMA)), (len(rows), 2, 2)).copy()
+    return log.t_s[rows], head, W
+
+
+def _check_clock(log: Log) -> None:
+    check_time(log)
+    steps = np.diff(log.t_s)
+    far = np.nonzero(steps > _GAP_S)[0]
+    if len(far):
+        k = int(far[0])
+        raise BadInputError(
+            f"{log.source}, line {log.lines[k + 1]}: the clock jumps from {log.t_s[k]:.3f} to "
+            f"{log.t_s[k + 1]:.3f} s; cut the log there"
+        )
+
+
+def _commands(log: Log, no_pwm: bool) -> tuple[float, float, FloatArray]:
+    """Time of the first tick, tick and commands (n, 2) held to an even grid."""
+    rows = log.sampled("pwm1", "pwm2")
+    end = float(log.t_s[-1])
+    if not len(rows):
+        if not no_pwm:
+            raise BadInputError(
+                f"{log.source}: has no commands, expected pwm1 and pwm2; for a swing with the hoses off give "
+                "--no-pwm"
+            )
+        begin = float(log.t_s[0])
+        return begin, TICK_S, np.zeros((max(math.ceil((end - begin) / TICK_S) + 1, 2), 2))
+    t = log.t_s[rows]
+    pwm = np.stack([log.columns["pwm1"][rows], log.columns["pwm2"][rows]], axis=1)
+    wrong = np.nonzero(((pwm < 0.0) | (pwm > 255.0)).any(axis=1))[0]
+    if len(wrong):
+        k = int(wrong[0])
+        raise BadInputError(
+            f"{log.source}, line {log.lines[rows[k]]}: pwm is {pwm[k].tolist()}, expected 0 to 255"
+        )
+    tick_s = float(np.median(np.diff(t))) if len(t) > 2 else TICK_S
+    # A nominal rate that the stamps only scatter about is exact.
+    tick_s = TICK_S if abs(tick_s / TICK_S - 1.0) < 0.01 else tick_s
+    if not tick_s * _MOST_TICKS > end - float(t[0]):
+        raise BadInputError(
+            f"{log.source}: its commands are {tick_s:g} s apart in the median, over {end - float(t[0]):g} s; "
+            "expected ticks of some milliseconds"
+        )
+    n = max(math.ceil((end - float(t[0])) / tick_s) + 1, 2)
+    ticks = float(t[0]) + tick_s * np.arange(n, dtype=np.float64)
+    latest = np.clip(np.searchsorted(t, ticks + 0.5 * tick_s, side="right") - 1, 0, len(t) - 1)
+    return float(t[0]), tick_s, pwm[latest]
+
+
+def _release(t: FloatArray, phi: FloatArray) -> float | None:
+    """Time shortly before a swing that is held for a while is let go; None where it begins at once."""
+    noise = float(np.median(np.abs(np.diff(phi[:20])))) + 1e-6
+    away = np.abs(phi - np.median(phi[:5])) > max(6.0 * noise, 0.02)
+    moving = np.nonzero(away[:-1] & away[1:])[0]
+    if len(moving) and t[moving[0]] - t[0] > 0.25:
+        return float(t[moving[0]]) - _BEFORE_RELEASE_S
+    return None
+
+
+def read_track(
+    path: Path,
+    rig: Rig,
+    rig_path: Path,
+    bellows_radius_m: float,
+    states: Path | None = None,
+    truth: bool = False,
+    no_pwm: bool = False,
+) -> TrackSource:
+    """A log as a track.
+
+    Parameters
+    ----------
+    states : states file to take the pose from; without pictures one beside the log is looked for.
+    truth : take the true columns.
+    no_pwm : logs without commands are swings with the hoses off.
+
+    Raises
+    ------
+    BadInputError for a log that is too short, jumps in time, has no commands or commands out of range,
+    no marker, or a rig without camera or plane where the pictures are needed.
+    """
+    log = read_log(path)
+    said = log.passed_over()
+    _check_clock(log)
+    begin, tick_s, pwm = _commands(log, no_pwm)
+    delay_s = 0.0
+    if states is None and not truth and not len(log.sampled("u_px", "v_px")):
+        states = states_beside(path)
+    if truth:
+        (t, head, W), how = _from_truth(log, bellows_radius_m), "truth"
+    elif states is not None:
+        (t, head, W), how = _from_states(states), "states"
+        said.append(f"{log.source}: takes the pose from {shown(states)}")
+    else:
+        (t, head, W), delay_s = _from_pictures(log, rig, rig_path)
+        how = "pictures"
+    hoses = bool(pwm.any())
+    if not hoses and len(t) > 20:
+        let_go = _release(t, head[:, 0])
+        if let_go is not None:
+            begin, pwm = let_go, np.zeros((max(math.ceil((t[-1] - let_go) / tick_s) + 1, 2), 2))
+            said.append(f"{log.source}: let go at {let_go:.2f} s; what is before is left out")
+    inside = (t >= begin - 0.5 * tick_s) & (t <= begin + LONGEST_S)
+    if t[-1] > begin + LONGEST_S:
+        said.append(f"{log.source}: only the first {LONGEST_S:g} s are used")
+    t, head, W = t[inside] - begin, head[inside], W[inside]
+    pwm = pwm[: math.ceil(LONGEST_S / tick_s) + 1]
+    if len(t) < _IDENTIFYING_FEWEST or t[-1] - t[0] < _IDENTIFYING_SHORTEST_S:
+        span = float(t[-1] - t[0]) if len(t) else 0.0
+        raise BadInputError(
+            f"{log.source}: too short: {len(t)} poses over {span:.3g} s, expected at least {_FEWEST} and "
+            f"{_SHORTEST_S:g} s"
+        )
+    t = np.maximum(t, 0.0)
+    spread = np.linalg.inv(W[:20])
+    noise = float(np.median(np.linalg.norm(spread[:, 0], axis=1)))
+    # What a picture shows was so one delay earlier.
+    seen_s = t - delay_s
+    known = seen_s >= 0.0
+    moving = start_in_motion(seen_s[known], head[known], hoses, nominal_of(rig, rig_path).plant, noise)
+    if moving is not None:
+        said.append(
+            f"{log.source}: begins in motion ({moving.phi_rad:.3f} rad, {moving.dphi_radps:+.2f} rad/s); its "
+            "start is estimated too"
+        )
+        # The first pictures show the head before the first tick.
+        late = t >= delay_s + _LATE_S
+        t, head, W = t[late], head[late], W[late]
+    track = Track(shown(path.name), tick_s, pwm, hoses, t, head, W, moving)
+    return TrackSource(track, how, delay_s, tuple(said), states, begin)
+
+
+_LENGTHS = {"elongation_mm": 1e-3, "displacement_mm": 1e-3, "elongation_m": 1.0, "displacement_m": 1.0}
+_LOADS = {"force_n": 1.0, "force_mn": 1e-3, "mass_kg": _GRAVITY_MPS2, "mass_g": 1e-3 * _GRAVITY_MPS2}
+
+
+def read_displacements(path: Path) -> tuple[FloatArray, FloatArray]:
+    """Elongations [m] and forces [N], each (n,), of a table of hanging weights or steady elongations.
+
+    Columns are any of elongation or displacement in mm or m, and force_N, force_mN, mass_g or mass_kg.
+    """
+    header, rows, lines = read_columns(path)
+    x = find_column(path, header, None, tuple(_LENGTHS), "elongation")
+    y = find_column(path, header, None, tuple(_LOADS), "force")
+    table = np.array(
+        [
+            [number(row[k], path, line, header[k]) for k in (x, y)]
+            for row, line in zip(rows, lines, strict=True)
+        ]
+    )
+    bad = np.nonzero(~np.isfinite(table).all(axis=1))[0]
+    if len(bad):
+        raise BadInputError(f"{shown(path)}, line {lines[int(bad[0])]}: has a blank or nan, expected numbers")
+    return table[:, 0] * _LENGTHS[header[x].lower()], table[:, 1] * _LOADS[header[y].lower()]

@@ -1,0 +1,630 @@
+"""Simulating actuator and pumps with fixed steps in time with the controller's ticks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TypeVar, cast
+
+import numpy as np
+from numba import njit
+
+from calib.core.arrays import FloatArray, IntArray
+from calib.core.errors import BadInputError
+from calib.stages.actuator.dynamics import Coefficients, coefficients, linearised, rates
+from calib.stages.actuator.kinematics import LARGEST_ANGLE_RAD, inlined
+from calib.stages.actuator.parameters import Plant
+from calib.stages.actuator.pump import (
+    Pump,
+    PumpCoefficients,
+    advance_pump,
+    delayed,
+    pump_at_rest,
+    pump_coefficients,
+    static_force_N,
+)
+
+# ----------------------------------------------------------------------
+# The compiled hot path: Runge-Kutta steps of the plant with its pumps, tick by tick.
+#
+# The mathematics is that of `dynamics.rates` and `pump.advance`, inlined. Forces are known ahead of the
+# mechanics, at the start, middle and end of each step, so the step is of fourth order.
+#
+# A state is the row
+#
+#     q1, q2 [m], dq1, dq2 [m/s], z1, z2 [N], lag1, lag2, force1, force2 [N].
+#
+# `run` follows one parameter set, `run_lanes` `LANES` sets side by side, which the compiler turns into
+# vector instructions: the same numbers at a quarter of the time for each.
+#
+# The functions are cached on disk beside this file. The cache notices a change of this file only, not
+# of the functions that it inlines: touch it after editing `dynamics`, `pump` or `arc`.
+
+STATE = (
+    "q1_m",
+    "q2_m",
+    "dq1_mps",
+    "dq2_mps",
+    "z1_N",
+    "z2_N",
+    "lag1_N",
+    "lag2_N",
+    "force1_N",
+    "force2_N",
+)
+
+LANES = 16
+"""Sets side by side; with fewer the compiler leaves the loop scalar, with more nothing is gained."""
+
+LANE_COEFFICIENTS = 18
+"""Rows of the coefficients of `run_lanes`: 13 of the plant, decay, and 4 of the pump."""
+
+
+Function = TypeVar("Function", bound=Callable[..., object])
+
+
+def _compiled(function: Function) -> Function:
+    """Compile at the first call; keep the result on disk where some folder can be written."""
+    try:
+        kept = njit(cache=True, nogil=True, error_model="numpy")(function)
+    except RuntimeError:
+        kept = njit(nogil=True, error_model="numpy")(function)
+    return cast(Function, kept)
+
+
+@inlined
+def _step(
+    c: Coefficients,
+    y: tuple[float, float, float, float, float, float],
+    h: float,
+    start: tuple[float, float],
+    middle: tuple[float, float],
+    end: tuple[float, float],
+) -> tuple[float, float, float, float, float, float]:
+    """One classical Runge-Kutta step of (l, phi, dl, dphi, z1 + z2, z1 - z2)."""
+    x, p, u, v, s, d = y
+    g = 0.5 * h
+    a1, b1, s1, d1 = rates(c, x, p, u, v, s, d, start[0], start[1])
+    u2, v2 = u + g * a1, v + g * b1
+    a2, b2, s2, d2 = rates(c, x + g * u, p + g * v, u2, v2, s + g * s1, d + g * d1, middle[0], middle[1])
+    u3, v3 = u + g * a2, v + g * b2
+    a3, b3, s3, d3 = rates(c, x + g * u2, p + g * v2, u3, v3, s + g * s2, d + g * d2, middle[0], middle[1])
+    u4, v4 = u + h * a3, v + h * b3
+    a4, b4, s4, d4 = rates(c, x + h * u3, p + h * v3, u4, v4, s + h * s3, d + h * d3, end[0], end[1])
+    w = h / 6.0
+    return (
+        x + w * (u + 2.0 * (u2 + u3) + u4),
+        p + w * (v + 2.0 * (v2 + v3) + v4),
+        u + w * (a1 + 2.0 * (a2 + a3) + a4),
+        v + w * (b1 + 2.0 * (b2 + b3) + b4),
+        s + w * (s1 + 2.0 * (s2 + s3) + s4),
+        d + w * (d1 + 2.0 * (d2 + d3) + d4),
+    )
+
+
+@_compiled
+def run(
+    c: Coefficients,
+    pump: PumpCoefficients,
+    start: FloatArray,
+    static_N: FloatArray,
+    tick_s: float,
+    substeps: int,
+    every: int,
+    out: FloatArray,
+) -> int:
+    """Simulate the ticks of `static_N` (n, 2), the static forces in effect [N]; returns a step number.
+
+    Writes the state after every `every`-th step into `out` (n * substeps // every, 10). The result is
+    the number of the step in which the state left the model (a length that is not positive, an
+    angle beyond `LARGEST_ANGLE_RAD`, or no number at all), or -1.
+    """
+    h = tick_s / substeps
+    decay = math.exp(-0.5 * h / pump.lag_s)
+    r = c.r
+    y = (
+        0.5 * (start[0] + start[1]),
+        0.5 * (start[0] - start[1]) / r,
+        0.5 * (start[2] + start[3]),
+        0.5 * (start[2] - start[3]) / r,
+        start[4] + start[5],
+        start[4] - start[5],
+    )
+    x1, x2, f1, f2 = start[6], start[7], start[8], start[9]
+    row, due, count = 0, every, 0
+    for tick in range(len(static_N)):
+        g1, g2 = static_N[tick, 0], static_N[tick, 1]
+        for _ in range(substeps):
+            x1, middle1, end1 = advance_pump(pump, x1, f1, g1, decay, h)
+            x2, middle2, end2 = advance_pump(pump, x2, f2, g2, decay, h)
+            y = _step(c, y, h, (f1, f2), (middle1, middle2), (end1, end2))
+            f1, f2 = end1, end2
+            # Written so that NaN fails as well.
+            if not (abs(y[1]) < LARGEST_ANGLE_RAD and y[0] > r * abs(y[1])):
+                return count
+            count += 1
+            due -= 1
+            if due == 0:
+                due = every
+                turned, spun = r * y[1], r * y[3]
+                out[row, 0], out[row, 1] = y[0] + turned, y[0] - turned
+                out[row, 2], out[row, 3] = y[2] + spun, y[2] - spun
+                out[row, 4], out[row, 5] = 0.5 * (y[4] + y[5]), 0.5 * (y[4] - y[5])
+                out[row, 6], out[row, 7], out[row, 8], out[row, 9] = x1, x2, f1, f2
+                row += 1
+    return -1
+
+
+@_compiled
+def derivative(c: Coefficients, y: FloatArray, F1: float, F2: float) -> FloatArray:
+    """Rate (6,) of the mechanical state (q1, q2, dq1, dq2, z1, z2) under the forces F1, F2 [N]."""
+    r = c.r
+    a, b, s, d = rates(
+        c,
+        0.5 * (y[0] + y[1]),
+        0.5 * (y[0] - y[1]) / r,
+        0.5 * (y[2] + y[3]),
+        0.5 * (y[2] - y[3]) / r,
+        y[4] + y[5],
+        y[4] - y[5],
+        F1,
+        F2,
+    )
+    out = np.empty(6)
+    out[0], out[1] = y[2], y[3]
+    out[2], out[3] = a + r * b, a - r * b
+    out[4], out[5] = 0.5 * (s + d), 0.5 * (s - d)
+    return out
+
+
+@_compiled
+def run_lanes(
+    kind: int,
+    table: FloatArray,
+    lanes: FloatArray,
+    static_N: FloatArray,
+    step_s: float,
+    substeps: int,
+    out: FloatArray,
+) -> None:
+    """As `run` for `LANES` sets with virtual work, without gravity, and pumps of one kind.
+
+    Lane i of row k of a flat array is at k LANES + i: offsets that are known when compiling are what
+    lets the loop over the lanes become vector instructions.
+
+    Parameters
+    ----------
+    table : (LANE_COEFFICIENTS * LANES,) the first 13 of `Coefficients`, the pumps' decay in half a step
+        and the last 4 of `PumpCoefficients`.
+    lanes : (12 * LANES,) l, phi, dl, dphi, z1 + z2, z1 - z2, lags, forces, then 1 for a lane that is in
+        the model and its number of good steps; written to.
+    static_N : (n, 2 * LANES) static forces in effect, those of bellows 1 first.
+    out : (n, 10 * LANES) the first ten rows of `lanes` after each tick.
+    """
+    for tick in range(len(static_N)):
+        for _ in range(substeps):
+            for i in range(LANES):
+                c = Coefficients(
+                    table[i],
+                    table[LANES + i],
+                    table[2 * LANES + i],
+                    table[3 * LANES + i],
+                    table[4 * LANES + i],
+                    table[5 * LANES + i],
+                    table[6 * LANES + i],
+                    table[7 * LANES + i],
+                    table[8 * LANES + i],
+                    table[9 * LANES + i],
+                    table[10 * LANES + i],
+                    table[11 * LANES + i],
+                    table[12 * LANES + i],
+                    0.0,
+                    0.0,
+                    0,
+                    0,
+                )
+                decay = table[13 * LANES + i]
+                pump = PumpCoefficients(
+                    kind,
+                    table[14 * LANES + i],
+                    table[15 * LANES + i],
+                    table[16 * LANES + i],
+                    table[17 * LANES + i],
+                )
+                g1, g2 = static_N[tick, i], static_N[tick, LANES + i]
+                f1, f2 = lanes[8 * LANES + i], lanes[9 * LANES + i]
+                x1, middle1, end1 = advance_pump(pump, lanes[6 * LANES + i], f1, g1, decay, step_s)
+                x2, middle2, end2 = advance_pump(pump, lanes[7 * LANES + i], f2, g2, decay, step_s)
+                y = (
+                    lanes[i],
+                    lanes[LANES + i],
+                    lanes[2 * LANES + i],
+                    lanes[3 * LANES + i],
+                    lanes[4 * LANES + i],
+                    lanes[5 * LANES + i],
+                )
+                y = _step(c, y, step_s, (f1, f2), (middle1, middle2), (end1, end2))
+                lanes[i], lanes[LANES + i] = y[0], y[1]
+                lanes[2 * LANES + i], lanes[3 * LANES + i] = y[2], y[3]
+                lanes[4 * LANES + i], lanes[5 * LANES + i] = y[4], y[5]
+                lanes[6 * LANES + i], lanes[7 * LANES + i] = x1, x2
+                lanes[8 * LANES + i], lanes[9 * LANES + i] = end1, end2
+                inside = abs(y[1]) < LARGEST_ANGLE_RAD and y[0] > c.r * abs(y[1])
+                kept = lanes[10 * LANES + i] if inside else 0.0
+                lanes[10 * LANES + i] = kept
+                lanes[11 * LANES + i] += kept
+        for k in range(10 * LANES):
+            out[tick, k] = lanes[k]
+
+
+# ----------------------------------------------------------------------
+# Simulating the actuator with fixed steps in time with the controller's ticks.
+#
+# Classical Runge-Kutta with `substeps` steps per tick, compiled (`kernel`). A command that is
+# given at a tick acts `delay_ticks` later and is constant within a tick, so no step ever spans a jump.
+# The default of 17 steps per tick at 60 Hz is 0.98 ms; the bellows' lengths then agree with an
+# adaptive method at 1e-12 to well within a micrometre.
+#
+# A step that is too large for the stiffness is refused beforehand, by the roots of the plant linearised
+# about the straight rest and the longest elongation and Runge-Kutta's region of stability; a motion
+# that leaves the model is refused when it does, never returned as NaN.
+
+SUBSTEPS = 17
+"""Steps per tick: 0.98 ms at 60 Hz."""
+
+_STRETCHED_M = 0.0266
+"""Elongation at 12 V, where the stiffness is greatest in use."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """States over time.
+
+    Attributes
+    ----------
+    t_s : (n,) times [s].
+    states : (n, 10) rows as named in `kernel.STATE`.
+    """
+
+    t_s: FloatArray
+    states: FloatArray
+
+    @property
+    def q_m(self) -> FloatArray:
+        """Lengths of the bellows (n, 2) [m]."""
+        return self.states[:, 0:2]
+
+    @property
+    def dq_mps(self) -> FloatArray:
+        """Their rates (n, 2) [m/s]."""
+        return self.states[:, 2:4]
+
+    @property
+    def z_N(self) -> FloatArray:
+        """Creep forces (n, 2) [N]."""
+        return self.states[:, 4:6]
+
+    @property
+    def force_N(self) -> FloatArray:
+        """Forces of the pumps (n, 2) [N]."""
+        return self.states[:, 8:10]
+
+
+@dataclass(frozen=True)
+class RigState:
+    """Plant and pumps at a tick: a row of `kernel.STATE` and the commands on their way, oldest first."""
+
+    row: FloatArray
+    waiting_pwm: tuple[tuple[float, float], ...]
+
+
+def state_row(
+    plant: Plant,
+    phi_rad: float = 0.0,
+    length_m: float | None = None,
+    force_N: tuple[float, float] = (0.0, 0.0),
+) -> FloatArray:
+    """A row (10,) of `kernel.STATE` at rest at an angle and a length (the rest length by default).
+
+    Raises `BadInputError` where a bellows would have no length.
+    """
+    l = plant.rest_length_m if length_m is None else length_m  # noqa: E741  the source's symbol
+    turned = plant.bellows_radius_m * phi_rad
+    row = np.array([l + turned, l - turned, 0.0, 0.0, 0.0, 0.0, *force_N, *force_N])
+    check_start(row)
+    return row
+
+
+def rig_at_rest(plant: Plant, pump: Pump, phi_rad: float = 0.0, length_m: float | None = None) -> RigState:
+    """The rig before the first command: pumps off, plant at rest at an angle and a length."""
+    off = pump_at_rest(pump)
+    return RigState(state_row(plant, phi_rad, length_m, off.force_N), off.waiting_pwm)
+
+
+def check_start(row: FloatArray) -> None:
+    """Raise `BadInputError` unless a row (10,) of `kernel.STATE` is finite with positive lengths."""
+    if row.shape != (len(STATE),) or not np.all(np.isfinite(row)):
+        raise BadInputError(f"start: found shape {row.shape}, expected {len(STATE)} finite numbers")
+    if not min(row[0], row[1]) > 0.0:
+        raise BadInputError(
+            f"start: found bellows of {row[0]:.6g} m and {row[1]:.6g} m, expected positive lengths"
+        )
+
+
+def _stable_step_s(A: FloatArray) -> float:
+    """Largest step that keeps Runge-Kutta from blowing up modes that decay or swing by themselves."""
+
+    def grows(h: float) -> bool:
+        w = h * modes
+        gain = np.abs(1.0 + w * (1.0 + w / 2.0 * (1.0 + w / 3.0 * (1.0 + w / 4.0))))
+        return bool(np.any(gain > 1.0 + 1e-9))
+
+    roots = np.linalg.eigvals(A)
+    modes = roots[(np.abs(roots) > 0.0) & (roots.real <= 1e-9 * np.abs(roots).max())]
+    if len(modes) == 0:
+        return math.inf
+    # Rounding may leave an undamped root on the right of the axis; it belongs on it.
+    modes = np.minimum(modes.real, 0.0) + 1j * modes.imag
+    high = 3.0 / float(np.abs(modes).max())
+    low = 0.1 * high
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if grows(middle) else (middle, high)
+    return low
+
+
+@lru_cache(maxsize=256)
+def _largest_step_straight_s(plant: Plant) -> float:
+    lengths = (plant.rest_length_m, plant.rest_length_m + _STRETCHED_M)
+    return min(_stable_step_s(linearised(plant, np.full(2, q))) for q in lengths)
+
+
+def largest_step_s(plant: Plant, q_m: FloatArray | None = None) -> float:
+    """Largest stable step [s] at rest, at the longest elongation and, if given, at the lengths (2,).
+
+    Steps that are accurate are a tenth of it and less.
+    """
+    step = _largest_step_straight_s(plant)
+    if q_m is None:
+        return step
+    return min(step, _stable_step_s(linearised(plant, q_m)))
+
+
+def _check_step(plant: Plant, step_s: float) -> None:
+    if not 0.0 < step_s < math.inf:
+        raise BadInputError(f"step: found {step_s:g} s, expected a positive time")
+    largest = _largest_step_straight_s(plant)
+    if step_s > largest:
+        raise BadInputError(
+            f"step: {step_s:.4g} s is too large for this stiffness and damping, "
+            f"expected at most {largest:.4g} s"
+        )
+
+
+def _run(
+    plant: Plant, pump: Pump, row: FloatArray, static_N: FloatArray, tick_s: float, substeps: int, every: int
+) -> FloatArray:
+    out = np.empty((len(static_N) * substeps // every, len(STATE)))
+    stopped = run(coefficients(plant), pump_coefficients(pump), row, static_N, tick_s, substeps, every, out)
+    if stopped >= 0:
+        h = tick_s / substeps
+        raise BadInputError(
+            f"simulation: at {(stopped + 1) * h:.4g} s a bellows has no length left or the actuator curls up "
+            f"beyond {LARGEST_ANGLE_RAD:g} rad; expected smaller forces, or steps below {h:.4g} s"
+        )
+    return out
+
+
+def _check_counts(substeps: int, every: int, ticks: int) -> None:
+    if substeps < 1 or every < 1:
+        raise BadInputError(f"steps: found {substeps} per tick, every {every}, expected 1 or more")
+    if ticks < 1:
+        raise BadInputError("pwm: found no rows, expected at least one tick")
+
+
+def simulate(
+    plant: Plant,
+    pump: Pump,
+    pwm: FloatArray,
+    start: RigState | None = None,
+    substeps: int = SUBSTEPS,
+    every: int | None = None,
+) -> Motion:
+    """Open loop with fixed steps.
+
+    Parameters
+    ----------
+    pwm : (n, 2) commands, row k given at the time k tick_s.
+    start : at rest and straight by default.
+    substeps : steps per tick.
+    every : steps between two rows of the result, a whole tick by default.
+
+    Returns
+    -------
+    `Motion` whose first row is the start.
+
+    Raises
+    ------
+    BadInputError for a step too large for the stiffness and a motion that leaves the model.
+    """
+    begin = rig_at_rest(plant, pump) if start is None else start
+    check_start(begin.row)
+    rows = delayed(pump, pwm, np.array(begin.waiting_pwm, dtype=np.float64).reshape(-1, 2))
+    stride = substeps if every is None else every
+    _check_counts(substeps, stride, len(rows))
+    h = pump.tick_s / substeps
+    _check_step(plant, h)
+    states = _run(plant, pump, begin.row, static_force_N(pump, rows), pump.tick_s, substeps, stride)
+    t = h * stride * np.arange(len(states) + 1, dtype=np.float64)
+    return Motion(t, np.vstack([begin.row, states]))
+
+
+def tick(
+    plant: Plant, pump: Pump, state: RigState, pwm: tuple[float, float], substeps: int = SUBSTEPS
+) -> tuple[RigState, FloatArray]:
+    """One tick of a closed loop: the state after it and the rows (substeps, 10) of all its steps."""
+    queue = (*state.waiting_pwm, pwm)
+    _check_counts(substeps, 1, 1)
+    _check_step(plant, pump.tick_s / substeps)
+    force = static_force_N(pump, np.array(queue[:1]))
+    rows = _run(plant, pump, state.row, force, pump.tick_s, substeps, 1)
+    return RigState(rows[-1], queue[1:]), rows
+
+
+def swing(plant: Plant, start: FloatArray, duration_s: float, step_s: float = 1e-3, every: int = 1) -> Motion:
+    """Motion under the constant forces in the row `start` (10,), with fixed steps; zero for a free swing.
+
+    The duration is rounded to whole steps. Raises `BadInputError` as `simulate`.
+    """
+    check_start(start)
+    _check_step(plant, step_s)
+    steps = round(duration_s / step_s)
+    _check_counts(1, every, steps // max(every, 1))
+    static = np.tile(start[8:10], (steps, 1))
+    held = np.concatenate([start[:6], start[8:10], start[8:10]])
+    states = _run(plant, Pump(), held, static, step_s, 1, every)
+    return Motion(step_s * every * np.arange(len(states) + 1, dtype=np.float64), np.vstack([held, states]))
+
+
+# ----------------------------------------------------------------------
+# Many parameter sets under the same commands, as an identification needs them.
+#
+# Sets are taken `LANES` at a time through `kernel.run_lanes`, and the blocks are shared among threads,
+# since the kernel releases the interpreter. Plants with gravity or with the head's projection need the
+# sine of the angle, which has no vector instruction, and go one by one through `kernel.run`. Either
+# way a set gives the numbers that `integrate.simulate` gives.
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What all threads share: the sets, and the arrays that they fill."""
+
+    plants: Sequence[Plant]
+    pumps: Sequence[Pump]
+    static_N: dict[Pump, FloatArray]
+    start: FloatArray
+    substeps: int
+    states: FloatArray
+    stopped: IntArray
+
+
+def _one(task: _Task, index: int) -> None:
+    plant, pump = task.plants[index], task.pumps[index]
+    c, p = coefficients(plant), pump_coefficients(pump)
+    rows, steps = task.states[index], task.substeps
+    stopped = run(c, p, task.start[index], task.static_N[pump], pump.tick_s, steps, steps, rows)
+    task.stopped[index] = stopped
+    if stopped >= 0:
+        rows[:] = np.nan
+
+
+def _block(task: _Task, indices: Sequence[int]) -> None:
+    """Up to `LANES` sets side by side; lanes that are left over repeat the last set."""
+    padded = [*indices, *[indices[-1]] * (LANES - len(indices))]
+    pumps = [task.pumps[i] for i in padded]
+    h = pumps[0].tick_s / task.substeps
+    table = np.empty((LANE_COEFFICIENTS, LANES))
+    for lane, (i, pump) in enumerate(zip(padded, pumps, strict=True)):
+        decay = math.exp(-0.5 * h / pump.lag_s)
+        table[:, lane] = (*coefficients(task.plants[i])[:13], decay, *pump_coefficients(pump)[1:])
+    radius = table[2]
+    begin = task.start[padded].T
+    lanes = np.empty((12, LANES))
+    for row, (first, divisor) in enumerate(((0, 2.0), (2, 2.0), (4, 1.0))):
+        lanes[2 * row] = (begin[first] + begin[first + 1]) / divisor
+        lanes[2 * row + 1] = (begin[first] - begin[first + 1]) / (divisor if row == 2 else 2.0 * radius)
+    lanes[6:10], lanes[10], lanes[11] = begin[6:], 1.0, 0.0
+    static = np.stack([task.static_N[pump] for pump in pumps], axis=-1)
+    ticks = len(static)
+    out = np.empty((ticks, 10 * LANES))
+    kind = pump_coefficients(pumps[0]).kind
+    flat = lanes.reshape(-1)
+    run_lanes(kind, table.reshape(-1), flat, static.reshape(ticks, -1), h, task.substeps, out)
+    alive, good = flat[10 * LANES : 11 * LANES], flat[11 * LANES :]
+    rows = out.reshape(ticks, 10, LANES)
+    for lane, i in enumerate(indices):
+        if alive[lane] == 0.0:
+            task.stopped[i] = round(good[lane])
+            task.states[i] = np.nan
+            continue
+        to, r = task.states[i], radius[lane]
+        for column, row, scale in ((0, 0, r), (2, 2, r), (4, 4, 1.0)):
+            mean, half = rows[:, row, lane], scale * rows[:, row + 1, lane]
+            to[:, column], to[:, column + 1] = mean + half, mean - half
+        to[:, 4:6] *= 0.5
+        to[:, 6:] = rows[:, 6:, lane]
+
+
+def _blocks(plants: Sequence[Plant], pumps: Sequence[Pump]) -> tuple[list[list[int]], list[int]]:
+    """Sets that may run side by side, and those that go alone."""
+    alike: dict[int, list[int]] = {}
+    alone = []
+    for i, (plant, pump) in enumerate(zip(plants, pumps, strict=True)):
+        c = coefficients(plant)
+        if c.head or c.gravity:
+            alone.append(i)
+        else:
+            alike.setdefault(pump_coefficients(pump).kind, []).append(i)
+    blocks = [group[k : k + LANES] for group in alike.values() for k in range(0, len(group), LANES)]
+    return blocks, alone
+
+
+def simulate_batch(
+    plants: Sequence[Plant],
+    pumps: Sequence[Pump],
+    pwm: FloatArray,
+    start: FloatArray,
+    substeps: int = SUBSTEPS,
+    threads: int = 2,
+) -> tuple[FloatArray, IntArray]:
+    """The same commands for many parameter sets at once.
+
+    Parameters
+    ----------
+    plants, pumps : one pair per set; the pumps' ticks are alike.
+    pwm : (n, 2) commands; those before are zero.
+    start : (10,) or (sets, 10) rows of `kernel.STATE`.
+    threads : workers that share the sets.
+
+    Returns
+    -------
+    states (sets, n, 10), one row at the end of each tick, and (sets,) the step in which a set left
+    the model, -1 where it did not; the states of such a set are NaN. The step is not checked
+    beforehand: an unstable one leaves the model.
+
+    Raises
+    ------
+    BadInputError for lists that do not match, ticks that differ and counts below one.
+    """
+    if len(plants) != len(pumps) or not plants:
+        raise BadInputError(f"batch: found {len(plants)} plants and {len(pumps)} pumps, expected as many")
+    if len({pump.tick_s for pump in pumps}) > 1:
+        raise BadInputError("batch: found pumps with different ticks, expected the same for all")
+    if substeps < 1 or threads < 1 or len(pwm) < 1:
+        raise BadInputError(
+            f"batch: found {substeps} steps per tick, {threads} threads, {len(pwm)} rows, expected 1 or more"
+        )
+    rows = np.asarray(start, dtype=np.float64)
+    if rows.shape not in ((len(STATE),), (len(plants), len(STATE))):
+        raise BadInputError(
+            f"batch: found starts of shape {rows.shape}, expected {len(STATE)} numbers per set"
+        )
+    task = _Task(
+        plants,
+        pumps,
+        {pump: static_force_N(pump, delayed(pump, pwm)) for pump in set(pumps)},
+        np.ascontiguousarray(np.broadcast_to(rows, (len(plants), len(STATE)))),
+        substeps,
+        np.empty((len(plants), len(pwm), len(STATE))),
+        np.full(len(plants), -1, dtype=np.int64),
+    )
+    blocks, alone = _blocks(plants, pumps)
+    with ThreadPoolExecutor(max_workers=threads) as pool:
+        side_by_side = [pool.submit(_block, task, block) for block in blocks]
+        single = [pool.submit(_one, task, index) for index in alone]
+        for job in (*side_by_side, *single):
+            job.result()
+    return task.states, task.stopped

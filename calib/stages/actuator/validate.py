@@ -1,0 +1,219 @@
+"""Model against log: what a model shows from a log's commands and start alone, beside what was measured.
+
+The commands are played to the plant and the pumps from the head's state at the start, which is that of the
+kinematic estimator, smoothed over the first seconds: it knows camera and IMU and none of the models.
+Without both sensors it is the median of the first readings. A log that begins at rest has no rates; one that
+begins in motion has the estimator's, and pumps that just hold the head. Nothing is fitted on the way.
+Errors are measured less simulated, of q1, q2 and phi, and of each
+
+    norm   the un-normalised L2 norm over the rows, as in Table 3.3; it grows with their number
+    RMS    the norm over the square root of the number of rows
+    fit    100 (1 - norm / norm of the measured values about their mean) in percent
+
+Three models are compared: the original one of 3.3, without bending and creep and with the damping of (3.41);
+the improved one of 3.4 with nominal parameters; and, where the rig's file has a section `actuator` or `pump`,
+the improved one with those. Rows that stand away from their neighbours are replaced by them
+first, as single wrong pictures would decide over an L2 norm.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from calib.core.arrays import FloatArray
+from calib.core.rig import Rig
+from calib.stages.actuator.identify import Nominal, Start, Track, heads_of, without_outliers
+from calib.stages.actuator.parameters import Creep, Plant
+from calib.stages.actuator.read import TrackSource, read_track
+from calib.stages.actuator.results import nominal_of
+from calib.stages.control.laws import holding_force
+
+ORIGINAL, NOMINAL, IMPROVED = "original", "nominal", "improved"
+_SECONDS = 2.0
+"""Of a log that the estimator looks at for the start."""
+
+QUANTITIES = ("q1", "q2", "phi")
+"""What errors are told of: two lengths in metres and an angle in radians."""
+
+
+@dataclass(frozen=True)
+class Error:
+    """Error of one quantity [m or rad]; NaN where the model's motion ends before the log does."""
+
+    norm: float
+    rms: float
+    fit_percent: float
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One log and what the models show in its place.
+
+    Attributes
+    ----------
+    name, how : the log, and where its pose comes from: "pictures", "states" or "truth".
+    start : where the models' start comes from: "estimator" or the same as `how`.
+    hoses : whether the pumps are connected. replaced : rows that stood away from their neighbours.
+    t_s : (n,) times. measured : (n, 3) q1, q2 [m] and phi [rad].
+    simulated : the same of each model. errors : of each model by quantity.
+    """
+
+    name: str
+    how: str
+    start: str
+    hoses: bool
+    replaced: int
+    t_s: FloatArray
+    measured: FloatArray
+    simulated: Mapping[str, FloatArray]
+    errors: Mapping[str, Mapping[str, Error]]
+
+    def improvement_percent(self, quantity: str, model: str = IMPROVED) -> float | None:
+        """By how much a model's norm is smaller than the original's; None without one of them."""
+        if model not in self.errors or ORIGINAL not in self.errors:
+            return None
+        before = self.errors[ORIGINAL][quantity].norm
+        after = self.errors[model][quantity].norm
+        return 100.0 * (1.0 - after / before) if before > 0.0 else math.nan
+
+
+def errors_of(measured: FloatArray, simulated: FloatArray) -> dict[str, Error]:
+    """Errors of the columns (n, 3) by quantity."""
+    norms = np.linalg.norm(measured - simulated, axis=0)
+    spread = np.linalg.norm(measured - measured.mean(axis=0), axis=0)
+    share = np.divide(norms, spread, out=np.full(norms.shape, np.nan), where=spread > 0.0)
+    values = zip(norms.tolist(), (norms / math.sqrt(len(measured))).tolist(), share.tolist(), strict=True)
+    return {
+        name: Error(norm, rms, 100.0 * (1.0 - part))
+        for name, (norm, rms, part) in zip(QUANTITIES, values, strict=True)
+    }
+
+
+def _columns(head: FloatArray, bellows_radius_m: float) -> FloatArray:
+    """q1, q2 and phi (n, 3) of angle and length (n, 2)."""
+    turned = bellows_radius_m * head[:, 0]
+    return np.column_stack([head[:, 1] + turned, head[:, 1] - turned, head[:, 0]])
+
+
+def _cleaned(track: Track) -> tuple[Track, int]:
+    """The track with single wrong rows replaced by what is around them, and how many."""
+    head, wrong = track.head.copy(), np.zeros(len(track.head), dtype=np.bool_)
+    for column in range(2):
+        head[:, column], _ = without_outliers(track.head[:, column])
+        wrong |= head[:, column] != track.head[:, column]
+    return replace(track, head=head), int(wrong.sum())
+
+
+def estimated_start(path: Path, rig: Rig, rig_path: Path, begin_s: float) -> Start | None:
+    """Angle, length and their rates at a time of a log [s] by the estimator; None where it lacks a sensor.
+
+    Raises `BadInputError` as `calib.stages.estimator.replay.prepared`.
+    """
+    from calib.stages.estimator.replay import first_rows, prepared
+
+    setup, found, stream, _ = prepared(path, rig, rig_path)
+    if not (found.camera and found.imu):
+        return None
+    rows = first_rows(setup, found, stream, begin_s + _SECONDS)
+    t, q, dq = rows[:, 0], rows[:, 1:3], rows[:, 3:5]
+    known = np.isfinite(rows[:, :5]).all(axis=1)
+    if not known.any():
+        return None
+    k = int(np.argmin(np.where(known, np.abs(t - begin_s), np.inf)))
+    half = 0.5 / setup.bellows_radius_m
+    # From the row's own time to the beginning.
+    q1, q2 = (q[k] + (begin_s - t[k]) * dq[k]).tolist()
+    dq1, dq2 = dq[k].tolist()
+    return Start(half * (q1 - q2), 0.5 * (q1 + q2), half * (dq1 - dq2), 0.5 * (dq1 + dq2))
+
+
+def _begun(track: Track, start: Start, nominal: Nominal) -> Track:
+    """The track begun as a start says: with its rates and forces where it is in motion, else at rest."""
+    if track.moving is None:
+        return track
+    if not track.hoses:
+        return replace(track, moving=start)
+    turned = nominal.plant.bellows_radius_m * start.phi_rad
+    q = np.array([start.length_m + turned, start.length_m - turned])
+    F1, F2 = np.maximum(holding_force(nominal.plant, q), 0.0).tolist()
+    return replace(track, moving=replace(start, force1_N=F1, force2_N=F2, lag1_N=F1, lag2_N=F2))
+
+
+def compare(
+    source: TrackSource, models: Mapping[str, Nominal], bellows_radius_m: float, start: Start | None = None
+) -> Comparison:
+    """A log against models by name, each simulated from the log's start.
+
+    Parameters
+    ----------
+    bellows_radius_m : that measured angles and lengths become bellows with.
+    start : the estimator's, the track's own without.
+    """
+    track, replaced = _cleaned(source.track)
+    begin = track.start if start is None else start
+    if track.moving is None:
+        begin = Start(begin.phi_rad, begin.length_m)
+    measured = _columns(track.head, bellows_radius_m)
+    simulated = {}
+    for name, nominal in models.items():
+        begun = _begun(track, begin, nominal)
+        at = begin if begun.moving is None else begun.moving
+        head, _ = heads_of(begun, nominal, [{}], [at], source.delay_s, threads=1)
+        simulated[name] = _columns(head[0], nominal.plant.bellows_radius_m)
+    errors = {name: errors_of(measured, curves) for name, curves in simulated.items()}
+    return Comparison(
+        track.name,
+        source.source,
+        source.source if start is None else "estimator",
+        track.hoses,
+        replaced,
+        track.t_s,
+        measured,
+        simulated,
+        errors,
+    )
+
+
+def models_of(rig: Rig, rig_path: Path) -> dict[str, Nominal]:
+    """The original model, the nominal one, and the improved one where the file has actuator or pump.
+
+    Mass, lengths and springs of the original model are the nominal ones.
+    """
+    first = replace(Plant(), damping_scale=1.0, bending_N_per_rad2=0.0, creep=Creep(1.0, 0.0, -1.0))
+    models = {ORIGINAL: Nominal(plant=first, free_damping_scale=1.0), NOMINAL: Nominal()}
+    extra = rig.model_extra or {}
+    if any(getattr(rig, name, None) is not None or name in extra for name in ("actuator", "pump")):
+        models[IMPROVED] = nominal_of(rig, rig_path)
+    return models
+
+
+def validate_log(
+    path: Path,
+    rig: Rig,
+    rig_path: Path,
+    states: Path | None = None,
+    truth: bool = False,
+    no_pwm: bool = False,
+) -> tuple[Comparison, Sequence[str]]:
+    """A log against the original and the improved model, and sentences about how it was read.
+
+    Parameters
+    ----------
+    states, truth, no_pwm : as in `calib.stages.actuator.read.read_track`.
+
+    Raises
+    ------
+    BadInputError as `read_track`, and for sections that no rig has.
+    """
+    models = models_of(rig, rig_path)
+    radius = models.get(IMPROVED, models[NOMINAL]).plant.bellows_radius_m
+    source = read_track(path, rig, rig_path, radius, states, truth, no_pwm)
+    start = None
+    if source.source == "pictures":
+        start = estimated_start(path, rig, rig_path, source.begin_s)
+    return compare(source, models, radius, start), source.said

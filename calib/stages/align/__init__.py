@@ -1,0 +1,1 @@
+"""Camera and IMU together: time offset, mount angle, scales and biases."""

@@ -1,0 +1,1378 @@
+"""Time offset, mount angle, scales and biases of camera and IMU, by least squares over a spline of motion."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+from numba import njit
+from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
+
+from calib.core.arrays import BoolArray, FloatArray, IntArray
+from calib.core.errors import BadInputError
+from calib.stages.align.spline import (
+    BAND,
+    Knots,
+    Rows,
+    basis_rows,
+    camera_rows,
+    gathered,
+    imu_rows,
+    normal_sums,
+)
+from calib.stages.estimator.sensors import GRAVITY_MPS2, SENSOR, SIZE, invert_marker, truncated
+
+# ----------------------------------------------------------------------
+# How well readings fit: whole pixels with outliers, and readings of the IMU.
+#
+# A rounded pixel r says that the tracker's place z ~ N(m, jitter^2) lay in [r - g / 2, r + g / 2] (see
+# `calib.stages.estimator.sensors`). With Z_u, Z_v the probabilities of both intervals a picture has the
+# likelihood
+#
+#     p = (1 - e) Z_u Z_v + e / a
+#
+# where e is the share of pictures that show something else and a the area over which that lies. By
+# its score and Fisher's information a pixel pulls the fit with w E / jitter and weighs w (1 - V) /
+# jitter^2,
+# E and V mean and variance of the truncated normal distribution in units of the jitter, and
+# w = (1 - e) Z_u Z_v / p.
+#
+# Readings of the IMU have Huber's loss with a far knee.
+
+HUBER = 4.0
+"""Knee of the loss of an IMU's reading, in deviations."""
+
+_JITTERS_PX = np.exp(np.linspace(math.log(0.03), math.log(3.0), 47))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def pixel_terms(
+    off: FloatArray, jitter: float, grid: float, share: float, area: float, pull: FloatArray,
+    weight: FloatArray, good: FloatArray,
+) -> float:  # fmt: skip
+    """Loss of pictures off by (n, 2) [px]; pull (n, 2), weight (n, 2) and w (n,) are written to.
+
+    A picture that is not finite has no pull and no weight. Without a grid the density at the reading stands
+    for Z over one pixel.
+    """
+    loss = 0.0
+    back = share / area
+    for n in range(len(off)):
+        log_z = 0.0
+        known = True
+        for k in range(2):
+            d = off[n, k]
+            pull[n, k], weight[n, k] = 0.0, 0.0
+            if not abs(d) < 1e6:
+                known = False
+            elif grid > 0.0:
+                z, mean, variance = truncated((d - 0.5 * grid) / jitter, (d + 0.5 * grid) / jitter)
+                log_z += z
+                pull[n, k] = mean / jitter
+                weight[n, k] = max(1.0 - variance, 1e-3) / (jitter * jitter)
+            else:
+                log_z += -0.5 * (d / jitter) ** 2 - math.log(jitter * math.sqrt(2.0 * math.pi))
+                pull[n, k] = d / (jitter * jitter)
+                weight[n, k] = 1.0 / (jitter * jitter)
+        if not known:
+            good[n] = 0.0
+            pull[n, 0], pull[n, 1], weight[n, 0], weight[n, 1] = 0.0, 0.0, 0.0, 0.0
+            loss -= math.log(back)
+            continue
+        inside = (1.0 - share) * math.exp(log_z)
+        good[n] = inside / (inside + back)
+        loss -= math.log(inside + back)
+        for k in range(2):
+            pull[n, k] *= good[n]
+            weight[n, k] *= good[n]
+    return loss
+
+
+def best_jitter_px(off: FloatArray, grid: float, share: float, area: float) -> float:
+    """Jitter that makes pictures off by (n, 2) [px] most likely."""
+    pull, weight, good = np.empty(off.shape), np.empty(off.shape), np.empty(len(off))
+    losses = np.array([pixel_terms(off, s, grid, share, area, pull, weight, good) for s in _JITTERS_PX])
+    k = int(np.argmin(losses))
+    if not 0 < k < len(losses) - 1:
+        return float(_JITTERS_PX[k])
+    a, b, c = losses[k - 1 : k + 2]
+    step = math.log(_JITTERS_PX[1] / _JITTERS_PX[0])
+    return float(_JITTERS_PX[k] * math.exp(0.5 * step * (a - c) / (a - 2.0 * b + c)))
+
+
+def imu_terms(off: FloatArray, noise: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+    """Loss of readings off by (n, 3), with pull and weight (n, 3); zero where a reading is missing.
+
+    Parameters
+    ----------
+    noise : (3,) standard deviations.
+    """
+    known = np.isfinite(off)
+    z = np.where(known, off, 0.0) / noise
+    size = np.abs(z)
+    inside = size <= HUBER
+    loss = float(np.sum(np.where(inside, 0.5 * z * z, HUBER * (size - 0.5 * HUBER))))
+    w = np.where(known, np.where(inside, 1.0, HUBER / np.maximum(size, HUBER)), 0.0)
+    return loss, w * z / noise, w / (noise * noise)
+
+
+# ----------------------------------------------------------------------
+# The normal equations of an alignment: readings, noise, losses, and an arrow of banded blocks.
+#
+# Unknown are the coefficients c of each stretch's spline and the 13 quantities s of `SENSOR`, which all
+# stretches share. Gauss-Newton's normal equations are
+#
+#     [A_1           B_1] [dc_1]   [g_1]
+#     [     ...         ] [    ] = [   ]
+#     [B_1' ...   C     ] [ds  ]   [g_s]
+#
+# so that with X_i = A_i^-1 B_i, S = C - sum B_i' X_i it is S ds = g_s - sum X_i' g_i, and S^-1 is the
+# covariance of s with the motion eliminated. Priors: s as given, and accelerations of the head at each knot
+# span about zero with a deviation that leaves them free (`loose`), for times without readings.
+
+_ANCHOR = np.array([3.0, 0.1])
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Readings without a long gap, at even times.
+
+    Attributes
+    ----------
+    log : number of the log that they are from.
+    camera_s, pixels : (n,) stamps and (n, 2) pictures.
+    imu_s, readings : (m,) times and (m, 3) a_x, a_y, g_z, NaN where one is missing.
+    knots, start : of the spline, and its coefficients (count, 2) to begin with.
+    loose : (spans, 2) deviation of the accelerations of phi and l.
+    """
+
+    log: int
+    camera_s: FloatArray
+    pixels: FloatArray
+    imu_s: FloatArray
+    readings: FloatArray
+    knots: Knots
+    start: FloatArray
+    loose: FloatArray
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise of the sensors: tracker's jitter [px], share of outliers, and (3,) of a_x, a_y, g_z."""
+
+    jitter_px: float
+    share: float
+    imu: FloatArray
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Everything that goes into the fit.
+
+    Attributes
+    ----------
+    view : (24,) of `sensors.view_coefficients`. gravity_mps2, across_m : g and c_n.
+    grid_px : step of the pixels, 0 for none. area_px2 : over which outliers lie.
+    mean, sigma : (13,) prior of `SENSOR`.
+    """
+
+    view: FloatArray
+    gravity_mps2: float
+    across_m: float
+    grid_px: float
+    area_px2: float
+    stretches: tuple[Stretch, ...]
+    mean: FloatArray
+    sigma: FloatArray
+
+
+@dataclass(frozen=True)
+class Arrow:
+    """Factors of the normal equations."""
+
+    factors: list[FloatArray]
+    X: list[FloatArray]
+    S: tuple[FloatArray, bool]
+
+    def solve(self, to_c: list[FloatArray], to_s: FloatArray) -> tuple[list[FloatArray], FloatArray]:
+        """Steps of all coefficients and of s for a right-hand side."""
+        inner = [cho_solve_banded((f, True), g) for f, g in zip(self.factors, to_c, strict=True)]
+        right = to_s.copy()
+        for X, g in zip(self.X, to_c, strict=True):
+            right -= X.T @ g
+        ds = np.asarray(cho_solve(self.S, right))
+        return [u - X @ ds for u, X in zip(inner, self.X, strict=True)], ds
+
+    def size(self, ds: FloatArray) -> float:
+        """The largest of a step (13,) in deviations."""
+        return float(np.max(np.abs(ds) / np.sqrt(np.diag(cho_solve(self.S, np.eye(len(ds)))))))
+
+
+def pictures_off(problem: Problem, stretch: Stretch, c: FloatArray, sensor: FloatArray) -> FloatArray:
+    """Pixels (n, 2) seen minus predicted."""
+    rows = camera_rows(problem.view, stretch.knots, c, sensor, stretch.camera_s)
+    return np.asarray(stretch.pixels - rows.predicted)
+
+
+def readings_off(problem: Problem, stretch: Stretch, c: FloatArray, sensor: FloatArray) -> FloatArray:
+    """Readings (m, 3) of the IMU minus predicted, NaN where one is missing."""
+    rows = imu_rows(problem.gravity_mps2, problem.across_m, stretch.knots, c, sensor, stretch.imu_s)
+    return np.asarray(stretch.readings - rows.predicted)
+
+
+def _loose_rows(stretch: Stretch) -> Rows:
+    """Accelerations of phi and l in the middle of each span."""
+    knots = stretch.knots
+    middles = knots.middles
+    span, basis = basis_rows(knots, middles)
+    by = np.zeros((len(middles), 2, SIZE))
+    by[:, 0, 4], by[:, 1, 5] = 1.0, 1.0
+    return Rows(span, basis, np.zeros((len(middles), 2)), by)
+
+
+class Work:
+    """The problem at a point: loss, and the normal equations."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self.loose = [_loose_rows(stretch) for stretch in problem.stretches]
+
+    def prior(self, i: int, c: FloatArray) -> tuple[float, FloatArray]:
+        """Loss of a stretch's accelerations and anchor, and its pull on the accelerations (n, 2)."""
+        stretch, rows = self.problem.stretches[i], self.loose[i]
+        at = rows.span[:, None] + np.arange(6)
+        bends = np.einsum("nj,nja->na", rows.basis[:, 2], c[at])
+        z, away = bends / stretch.loose, (c - stretch.start) / _ANCHOR
+        return 0.5 * float((z * z).sum() + (away * away).sum()), -z / stretch.loose
+
+    def loss(self, cs: list[FloatArray], s: FloatArray, noise: Noise) -> float:
+        """Minus the logarithm of the posterior."""
+        p = self.problem
+        total = 0.5 * float((((s - p.mean) / p.sigma) ** 2).sum())
+        for i, (stretch, c) in enumerate(zip(p.stretches, cs, strict=True)):
+            off = pictures_off(p, stretch, c, s)
+            room = np.empty_like(off), np.empty_like(off), np.empty(len(off))
+            total += pixel_terms(off, noise.jitter_px, p.grid_px, noise.share, p.area_px2, *room)
+            total += imu_terms(readings_off(p, stretch, c, s), noise.imu)[0]
+            total += self.prior(i, c)[0]
+        return total
+
+    def normal(
+        self, cs: list[FloatArray], s: FloatArray, noise: Noise
+    ) -> tuple[Arrow, list[FloatArray], FloatArray, list[FloatArray]]:
+        """Factors, right-hand sides, and the probability of each picture to show the marker."""
+        p = self.problem
+        C = np.diag(1.0 / p.sigma**2)
+        to_s = (p.mean - s) / p.sigma**2
+        factors: list[FloatArray] = []
+        Xs: list[FloatArray] = []
+        Bs: list[FloatArray] = []
+        to_cs: list[FloatArray] = []
+        goods: list[FloatArray] = []
+        for i, (stretch, c) in enumerate(zip(p.stretches, cs, strict=True)):
+            n = 2 * stretch.knots.count
+            A, B, to_c = np.zeros((BAND, n)), np.zeros((n, len(SENSOR))), np.zeros(n)
+            rows = camera_rows(p.view, stretch.knots, c, s, stretch.camera_s)
+            off = stretch.pixels - rows.predicted
+            pull, weight, good = np.empty_like(off), np.empty_like(off), np.empty(len(off))
+            pixel_terms(off, noise.jitter_px, p.grid_px, noise.share, p.area_px2, pull, weight, good)
+            by = np.where(good[:, None, None] > 0.0, rows.by, 0.0)
+            normal_sums(rows.span, rows.basis, by, weight, A, B, C)
+            gathered(rows.span, rows.basis, by, pull, to_c, to_s)
+            rows = imu_rows(p.gravity_mps2, p.across_m, stretch.knots, c, s, stretch.imu_s)
+            _, pull, weight = imu_terms(stretch.readings - rows.predicted, noise.imu)
+            normal_sums(rows.span, rows.basis, rows.by, weight, A, B, C)
+            gathered(rows.span, rows.basis, rows.by, pull, to_c, to_s)
+            rows = self.loose[i]
+            normal_sums(rows.span, rows.basis, rows.by, 1.0 / stretch.loose**2, A, B, C)
+            gathered(rows.span, rows.basis, rows.by, self.prior(i, c)[1], to_c, to_s)
+            A[0] += np.tile(1.0 / _ANCHOR**2, stretch.knots.count)
+            to_c += ((stretch.start - c) / _ANCHOR**2).ravel()
+            factor = np.asarray(cholesky_banded(A, lower=True, check_finite=False))
+            X = np.asarray(cho_solve_banded((factor, True), B, check_finite=False))
+            for found, value in zip((factors, Xs, Bs, to_cs, goods), (factor, X, B, to_c, good), strict=True):
+                found.append(value)
+        S = C - sum((B.T @ X for B, X in zip(Bs, Xs, strict=True)), np.zeros_like(C))
+        return Arrow(factors, Xs, cho_factor(0.5 * (S + S.T))), to_cs, to_s, goods
+
+
+# ----------------------------------------------------------------------
+# Even times for the samples of a whole log: a line through all time stamps of a sensor.
+#
+# A sensor that samples at a steady rate takes its k-th sample at o + k T. Its stamps have jitter, and a
+# sample that waited in a buffer bears the stamp of the one before it. Which k a stamp belongs to follows by
+# counting: k - i, the samples missing before the i-th row, can only grow, and is the running median of
+# round((t_i - o) / T) - i. Chunk by chunk is counted on from the line through those just before it, so
+# that a
+# clock that wanders does not lose count; stamps that are far off are left out of the fit. Where the clock
+# wanders about the line through all, the medians of blocks of the deviations are followed.
+#
+# `calib.stages.estimator.kinematic` does the same from the past alone.
+
+_FIRST, _CHUNK, _RECENT = 32, 256, 512
+_FAR = 5.0
+_BLOCK = 300
+_LEAST_SAMPLES = 8
+_UNEVEN = 0.25
+_WINDOW = 11
+_LAG = 8
+
+
+@dataclass(frozen=True)
+class EvenTimes:
+    """Times of samples and how their stamps lay about them.
+
+    Attributes
+    ----------
+    t_s : (n,) times; the stamps where the sampling is not steady.
+    period_s : NaN where it is not steady.
+    jitter_s : robust standard deviation of the stamps.
+    repeated : stamps that are that of the sample before. missing : samples that are not there.
+    """
+
+    t_s: FloatArray
+    period_s: float
+    jitter_s: float
+    repeated: int
+    missing: int
+
+
+def _running_median(values: FloatArray) -> FloatArray:
+    if len(values) < _WINDOW:
+        return values
+    half = _WINDOW // 2
+    padded = np.concatenate([values[:half][::-1], values, values[-half:][::-1]])
+    return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, _WINDOW), axis=1))
+
+
+def _counted(t: FloatArray, origin: float, period: float) -> FloatArray:
+    """Number k (n,) of each sample on the line, strictly rising."""
+    i = np.arange(len(t), dtype=np.float64)
+    behind = np.rint((t - origin) / period) - i
+    return np.asarray(np.rint(np.maximum.accumulate(_running_median(behind))) + i)
+
+
+def _line(k: FloatArray, t: FloatArray) -> tuple[float, float, float]:
+    """Origin, period and robust deviation of stamps (n,) over numbers (n,)."""
+    use = np.ones(len(t), dtype=np.bool_)
+    origin, period, spread = float(t[0]), 1.0, 0.0
+    for _ in range(4):
+        middle = float(k[use].mean())
+        slope, at = np.polyfit(k[use] - middle, t[use], 1)
+        origin, period = float(at - slope * middle), float(slope)
+        off = t - origin - period * k
+        spread = max(1.4826 * float(np.median(np.abs(off[use]))), 1e-7)
+        again = np.abs(off) <= _FAR * spread
+        if again.sum() < _LEAST_SAMPLES // 2 or np.array_equal(again, use):
+            break
+        use = again
+    return origin, period, spread
+
+
+def _all_counted(t: FloatArray, period: float) -> tuple[FloatArray, bool]:
+    """Numbers k (n,) of all samples, and whether they are steady.
+
+    Each chunk is counted on from the line through those before it.
+    """
+    k = np.zeros(len(t))
+    origin, nominal, done = float(t[0]), period, 0
+    while done < len(t):
+        end = min(done + min(max(done, _FIRST), _CHUNK), len(t))
+        since = max(done - _WINDOW, 0)
+        counted = _counted(t[since:end], origin, period)
+        # Numbers that are known stay; those after them go on rising.
+        k[done:end] = counted[done - since :]
+        if done:
+            behind = k[done - 1] + 1.0 - k[done]
+            k[done:end] += max(behind, 0.0)
+        recent = slice(max(end - _RECENT, 0), end)
+        origin, period, spread = _line(k[recent], t[recent])
+        if not 0.5 * nominal < period < 2.0 * nominal or spread > _UNEVEN * period:
+            return k, False
+        done = end
+    return k, True
+
+
+def even_times_of(stamps: FloatArray) -> EvenTimes:
+    """Even times of samples with these stamps (n,) [s], which do not go back."""
+    t = np.asarray(stamps, dtype=np.float64)
+    repeated = int((np.diff(t) == 0.0).sum())
+    steps = np.diff(t)
+    steps = steps[steps > 1e-6]
+    as_they_are = EvenTimes(t, math.nan, 0.0, repeated, 0)
+    if len(t) < _LEAST_SAMPLES or len(steps) < _LEAST_SAMPLES // 2:
+        return as_they_are
+    rough = float(np.median(steps))
+    # Over several samples jitter counts for less; where one of them is missing the time is far longer.
+    apart = (t[_LAG:] - t[:-_LAG]) / _LAG if len(t) > 2 * _LAG else steps
+    apart = apart[np.abs(apart / rough - 1.0) < 0.5 / _LAG]
+    k, steady = _all_counted(t, float(np.median(apart)) if len(apart) else rough)
+    if not steady:
+        return as_they_are
+    origin, period, spread = _line(k, t)
+    even = origin + period * k
+    even += _wander(even, t - even, spread)
+    jitter = 1.4826 * float(np.median(np.abs(t - even)))
+    return EvenTimes(even, period, jitter, repeated, int(k[-1] - k[0]) + 1 - len(t))
+
+
+def _wander(even: FloatArray, off: FloatArray, spread: float) -> FloatArray:
+    """What the clock is off the line (n,), zero where that is within the jitter."""
+    blocks = len(off) // _BLOCK
+    if blocks < 3:
+        return np.zeros(len(off))
+    pieces: list[IntArray] = list(np.array_split(np.arange(len(off)), blocks))
+    at = np.array([even[piece].mean() for piece in pieces])
+    medians = np.array([np.median(off[piece]) for piece in pieces])
+    if float(np.abs(medians).max()) <= 6.0 * 1.25 * spread / math.sqrt(_BLOCK) + 2e-6:
+        return np.zeros(len(off))
+    return np.asarray(np.interp(even, at, medians))
+
+
+# ----------------------------------------------------------------------
+# Where the alignment starts: stretches without gaps, the camera's own angle, and a first time offset.
+#
+# Two pixels give angle and length of a resting head (`invert_marker`), the gyroscope integrated gives the
+# angle but for a line in time. For offsets on a grid the camera's angle is fitted by
+#
+#     phi_camera(t) = a theta(t - offset) + b + c t,   theta' = -g_z
+#
+# over all stretches with one a; the offset with the least squares is the first guess. The factor a tells
+# a gyroscope in degrees per second (1 / 57) and one that turns the other way round (negative).
+
+SPLIT_S = 1.0
+SHORTEST_S = 1.0
+"""Gaps at which a log is split, and stretches that are too short to be used."""
+
+_OFFSETS_S = np.arange(-0.1, 0.3001, 0.0025)
+_LEAST_PICTURES = 20
+_START_LEAST_SAMPLES = 40
+_PHI_SIGMA = 0.012
+_WORTH = 60.0
+_TIMES_IN_DEGREES = (0.5 / 57.3, 2.0 / 57.3)
+_MARGIN_S = 0.06
+_LOCAL_S = 1.0
+_MEANS = 5
+_REST_FACTOR = 2.0
+_MOST_NOISE = (0.01, 0.06)
+_FREE = (10.0, 3.0)
+_TIMES_FELT = 20.0
+_RESTING = (1e-3, 3e-4)
+_LEAST_CREEP_M = 1e-4
+_UNFELT_MPS2 = 0.1
+
+
+@dataclass(frozen=True)
+class AlignLog:
+    """Readings of a log.
+
+    Attributes
+    ----------
+    camera_s, pixels : stamps (n,) and pictures (n, 2) [px].
+    imu_s, readings : stamps (m,) and a_x, a_y [m/s^2], g_z [rad/s] (m, 3), NaN where one is missing.
+    """
+
+    source: str
+    camera_s: FloatArray
+    pixels: FloatArray
+    imu_s: FloatArray
+    readings: FloatArray
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A stretch with even times, and the camera's own angle and length in it.
+
+    Attributes
+    ----------
+    phi, length : (n,), NaN where two pixels have no solution. fine : (n,) pictures that go with their
+        neighbours.
+    theta : (m,) integrated rate.
+    """
+
+    log: int
+    camera: EvenTimes
+    imu: EvenTimes
+    pixels: FloatArray
+    readings: FloatArray
+    phi: FloatArray
+    length: FloatArray
+    fine: BoolArray
+    theta: FloatArray
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """Correlation of the camera's rate of angle with the gyroscope's over the time offset (k,) [s]."""
+
+    offset_s: FloatArray
+    value: FloatArray
+
+
+@dataclass(frozen=True)
+class Started:
+    """First guess: stretches with splines, offset, mount angle, and the factor a.
+
+    `moves` says whether the offset could be told from the pictures at all.
+    """
+
+    stretches: tuple[Stretch, ...]
+    time_offset_s: float
+    mount_angle_rad: float
+    factor: float
+    moves: bool
+
+
+def _cuts(log: AlignLog) -> list[float]:
+    """Times at which a log is split."""
+    both = np.sort(np.concatenate([log.camera_s, log.imu_s]))
+    gaps = np.flatnonzero(np.diff(both) > SPLIT_S)
+    return [-math.inf, *(0.5 * (both[i] + both[i + 1]) for i in gaps.tolist()), math.inf]
+
+
+def _own_angle(view: FloatArray, sensor: FloatArray, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
+    phi, length = np.full(len(pixels), np.nan), np.full(len(pixels), np.nan)
+    at = (0.0, 0.07)
+    for n, (u, v) in enumerate(pixels.tolist()):
+        for guess in (at, (0.0, 0.07)):
+            angle, arc, found = invert_marker(view, sensor, u, v, *guess)
+            if found:
+                phi[n], length[n] = angle, arc
+                at = (angle, arc)
+                break
+    return phi, length
+
+
+def _like_neighbours(phi: FloatArray) -> BoolArray:
+    """Pictures whose angle is near the median of five."""
+    if len(phi) < 5:
+        return np.isfinite(phi)
+    filled = np.where(np.isfinite(phi), phi, np.nanmedian(phi) if np.isfinite(phi).any() else 0.0)
+    padded = np.concatenate([filled[2:0:-1], filled, filled[-2:-4:-1]])
+    off = filled - np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1)
+    limit = max(6.0 * 1.4826 * float(np.median(np.abs(off))), 0.04)
+    return np.asarray(np.isfinite(phi) & (np.abs(off) <= limit))
+
+
+def _integrated(t: FloatArray, gz: FloatArray) -> FloatArray:
+    known = np.isfinite(gz)
+    if known.sum() < 2:
+        return np.zeros(len(t))
+    rate = -np.interp(t, t[known], gz[known])
+    steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(t)
+    return np.asarray(np.concatenate([[0.0], np.cumsum(steps)]))
+
+
+def pieces_of(
+    logs: Sequence[AlignLog], view: FloatArray, sensor: FloatArray
+) -> tuple[list[Piece], list[str]]:
+    """Stretches that can be used, and sentences about what was left out.
+
+    Parameters
+    ----------
+    sensor : (13,) prior of `SENSOR`.
+    """
+    pieces, said = [], []
+    for number, log in enumerate(logs):
+        cuts, kept = _cuts(log), 0
+        if len(cuts) > 2:
+            said.append(f"{log.source}: split at {len(cuts) - 2} gap(s) of more than {SPLIT_S:g} s")
+        for begin, end in pairwise(cuts):
+            seen = (log.camera_s > begin) & (log.camera_s < end)
+            felt = (log.imu_s > begin) & (log.imu_s < end)
+            if seen.sum() < _LEAST_PICTURES or felt.sum() < _START_LEAST_SAMPLES:
+                continue
+            camera, imu = even_times_of(log.camera_s[seen]), even_times_of(log.imu_s[felt])
+            if min(camera.t_s[-1], imu.t_s[-1]) - max(camera.t_s[0], imu.t_s[0]) < SHORTEST_S:
+                continue
+            pixels, readings = log.pixels[seen], log.readings[felt]
+            phi, length = _own_angle(view, sensor, pixels)
+            theta = _integrated(imu.t_s, readings[:, 2])
+            fine = _like_neighbours(phi)
+            pieces.append(Piece(number, camera, imu, pixels, readings, phi, length, fine, theta))
+            kept += 1
+        if kept == 0:
+            said.append(f"{log.source}: has no stretch of {SHORTEST_S:g} s with pictures and IMU samples")
+    return pieces, said
+
+
+def _use(piece: Piece, offset_s: float) -> BoolArray:
+    """Pictures that go with their neighbours and were exposed while the IMU ran."""
+    exposed = piece.camera.t_s - offset_s
+    inside = (exposed >= piece.imu.t_s[0]) & (exposed <= piece.imu.t_s[-1])
+    return np.asarray(inside & piece.fine)
+
+
+def _factor_at(pieces: Sequence[Piece], offset_s: float) -> tuple[float, float, float]:
+    """Factor a at this offset, sum of squares with it, and without the gyroscope."""
+    cross, own, total = 0.0, 0.0, 0.0
+    for piece in pieces:
+        use = _use(piece, offset_s)
+        if use.sum() < _LEAST_PICTURES:
+            continue
+        t = piece.camera.t_s[use]
+        theta = np.interp(t - offset_s, piece.imu.t_s, piece.theta)
+        line = np.stack([np.ones(len(t)), t - t.mean()], axis=1)
+        norms = (line * line).sum(axis=0)
+        theta = theta - line @ (line.T @ theta / norms)
+        phi = piece.phi[use] - line @ (line.T @ piece.phi[use] / norms)
+        cross, own, total = cross + float(theta @ phi), own + float(theta @ theta), total + float(phi @ phi)
+    factor = cross / own if own > 0.0 else 0.0
+    return factor, total - factor * cross, total
+
+
+def correlation(pieces: Sequence[Piece]) -> Correlation:
+    """Correlation of the camera's rate, over four frames, with the gyroscope's over the same time."""
+    values = []
+    for offset in _OFFSETS_S:
+        cross, one, two = 0.0, 0.0, 0.0
+        for piece in pieces:
+            use = np.flatnonzero(_use(piece, float(offset)))
+            if len(use) < _LEAST_PICTURES:
+                continue
+            t = piece.camera.t_s[use]
+            theta = np.interp(t - offset, piece.imu.t_s, piece.theta)
+            a, b = piece.phi[use][4:] - piece.phi[use][:-4], theta[4:] - theta[:-4]
+            dt = t[4:] - t[:-4]
+            near = dt < 1.5 * float(np.median(dt))
+            a, b = a[near] / dt[near], b[near] / dt[near]
+            a, b = a - a.mean(), b - b.mean()
+            cross, one, two = cross + float(a @ b), one + float(a @ a), two + float(b @ b)
+        values.append(cross / math.sqrt(one * two) if one * two > 0.0 else math.nan)
+    return Correlation(_OFFSETS_S.copy(), np.array(values))
+
+
+def _check_gyro(pieces: Sequence[Piece], logs: Sequence[AlignLog], factor: float, share: float) -> None:
+    if share < 0.5:
+        return
+    if _TIMES_IN_DEGREES[0] < abs(factor) < _TIMES_IN_DEGREES[1]:
+        raise BadInputError(
+            f"{logs[pieces[0].log].source}: gz_radps turns {1.0 / abs(factor):.3g} times as fast as the "
+            "camera sees, so it is in deg/s, expected rad/s"
+        )
+    if factor < -0.3:
+        raise BadInputError(
+            f"{logs[pieces[0].log].source}: gz_radps turns the other way round than the camera sees, "
+            "expected minus the rate of phi (a right-handed IMU, its x axis from the head to the base)"
+        )
+
+
+def _spline(
+    knots: Knots, values: list[tuple[FloatArray, FloatArray, int, float]], loose: float
+) -> FloatArray:
+    """Coefficients (count,) by least squares: lists of (times, values, derivative, deviation)."""
+    n = 2 * knots.count
+    A, B, C = np.zeros((BAND, n)), np.zeros((n, SIZE - 6)), np.zeros((SIZE - 6, SIZE - 6))
+    to_c, to_s = np.zeros(n), np.zeros(SIZE - 6)
+    middles = knots.middles
+    for at, value, derivative, sigma in [*values, (middles, np.zeros(len(middles)), 2, loose)]:
+        span, basis = basis_rows(knots, at)
+        by = np.zeros((len(at), 1, SIZE))
+        by[:, 0, 2 * derivative] = 1.0
+        weight = np.full((len(at), 1), 1.0 / sigma**2)
+        normal_sums(span, basis, by, weight, A, B, C)
+        gathered(span, basis, by, weight * value[:, None], to_c, to_s)
+    A[0, 1::2] = 1.0
+    A[0, ::2] += 1e-3
+    factor = cholesky_banded(A, lower=True)
+    return np.asarray(cho_solve_banded((factor, True), to_c))[::2]
+
+
+def _local_size(t: FloatArray, values: FloatArray, at: FloatArray) -> FloatArray:
+    """Standard deviation (k,) of values (n,) within `_LOCAL_S` of the times (k,), those outside held."""
+    first, last = np.searchsorted(t, at - _LOCAL_S), np.searchsorted(t, at + _LOCAL_S)
+    first = np.minimum(first, len(t) - 2)
+    last = np.maximum(last, first + 2)
+    one, two = (np.concatenate([[0.0], np.cumsum(values**power)]) for power in (1, 2))
+    mean = (one[last] - one[first]) / (last - first)
+    return np.asarray(np.sqrt(np.maximum((two[last] - two[first]) / (last - first) - mean**2, 0.0)))
+
+
+def _averaged(t: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Means of `_MEANS` neighbours, and the middle times; what is missing is on a straight line."""
+    known = np.isfinite(values)
+    filled = np.interp(t, t[known], values[known])
+    kernel = np.full(_MEANS, 1.0 / _MEANS)
+    return np.convolve(t, kernel, "valid"), np.convolve(filled, kernel, "valid")
+
+
+def _sample_noise(values: FloatArray) -> float:
+    """Robust deviation of one sample from fourth differences, which slow motion does not reach."""
+    return 1.4826 * float(np.median(np.abs(np.diff(values, 4)))) / math.sqrt(70.0)
+
+
+def _at_rest(t: FloatArray, values: FloatArray, at: FloatArray, most: float) -> BoolArray:
+    """Whether averaged readings (n,) near these times (k,) spread no more than their noise does."""
+    known = np.isfinite(values)
+    if known.sum() < 4 * _MEANS:
+        return np.zeros(len(at), dtype=np.bool_)
+    noise = min(_sample_noise(values[known]), most)
+    middle, means = _averaged(t, values)
+    return _local_size(middle, means - means.mean(), at) < _REST_FACTOR * noise / math.sqrt(_MEANS)
+
+
+def _length_stays(piece: Piece, at: FloatArray) -> BoolArray:
+    """Whether the camera's own length is the same a second before and after these times (k,)."""
+    t, length = piece.camera.t_s[piece.fine], piece.length[piece.fine]
+    if len(t) < _LEAST_PICTURES:
+        return np.zeros(len(at), dtype=np.bool_)
+    noise = float(np.percentile(np.abs(np.diff(length, 4)), 90.0)) / 1.645 / math.sqrt(70.0)
+    sums = np.concatenate([[0.0], np.cumsum(length - length[0])])
+    first, middle, last = (np.searchsorted(t, at + shift) for shift in (-_LOCAL_S, 0.0, _LOCAL_S))
+    before, after = np.maximum(middle - first, 1), np.maximum(last - middle, 1)
+    moved = (sums[last] - sums[middle]) / after - (sums[middle] - sums[first]) / before
+    limit = _LEAST_CREEP_M + 3.0 * noise * np.sqrt(1.0 / before + 1.0 / after)
+    return np.asarray((np.abs(moved) < limit) & (middle - first > 10) & (last - middle > 10))
+
+
+def _loose(knots: Knots, piece: Piece) -> FloatArray:
+    """Deviation (spans, 2) of the accelerations of phi and l about zero.
+
+    In motion it is many times what is felt: a prior that is felt would favour small motion and with it
+    wrong scales. Where nothing moves it is tiny, or the fit would take the noise for motion, and the
+    sensors' agreement on it for knowledge. Where no accelerometer bounds the length it is small, too.
+    """
+    at = knots.middles
+    t, ax, gz = piece.imu.t_s, piece.readings[:, 0], piece.readings[:, 2]
+    # Stamps that are taken as they are may be equal.
+    steps = np.maximum(np.diff(t), 1e-4)
+    bend = np.diff(np.diff(piece.theta) / steps) / steps[1:]
+    out = np.empty((len(at), 2))
+    out[:, 0] = _FREE[0] + _TIMES_FELT * float(np.sqrt(np.mean(bend**2)))
+    out[:, 1] = _UNFELT_MPS2
+    if np.isfinite(ax).any():
+        out[:, 1] = _FREE[1] + _TIMES_FELT * float(np.nanstd(ax))
+    still = _at_rest(t, gz, at, _MOST_NOISE[0])
+    out[still, 0] = _RESTING[0]
+    out[still & _at_rest(t, ax, at, _MOST_NOISE[1]) & _length_stays(piece, at), 1] = _RESTING[1]
+    return out
+
+
+def _stretch(piece: Piece, offset_s: float) -> Stretch | None:
+    exposed = piece.camera.t_s - offset_s
+    first, last = piece.imu.t_s[0], piece.imu.t_s[-1]
+    # The first pictures may show the head before the IMU ran; what it did then nobody knows.
+    inside = (exposed >= first) & (exposed <= last)
+    use = inside & piece.fine
+    if inside.sum() < _LEAST_PICTURES or use.sum() < _LEAST_PICTURES // 2:
+        return None
+    period = piece.imu.period_s if piece.imu.period_s > 0.0 else float(np.median(np.diff(piece.imu.t_s)))
+    span = float(np.clip(2.0 * period, 0.005, 0.04))
+    knots = Knots.over(first - _MARGIN_S, last + _MARGIN_S, span)
+    t = exposed[use]
+    known = np.isfinite(piece.readings[:, 2])
+    rates = (piece.imu.t_s[known], -piece.readings[known, 2], 1, 0.02)
+    phi = _spline(knots, [(t, piece.phi[use], 0, _PHI_SIGMA), rates], 300.0)
+    length = _spline(knots, [(t, piece.length[use], 0, 1.5e-3)], 0.5)
+    return Stretch(
+        piece.log, piece.camera.t_s[inside], piece.pixels[inside], piece.imu.t_s, piece.readings, knots,
+        np.stack([phi, length], axis=1), _loose(knots, piece),
+    )  # fmt: skip
+
+
+def _mount(stretches: Sequence[Stretch]) -> float:
+    """What atan2(a_y, a_x) reads beyond phi, in the median."""
+    offs = []
+    for stretch in stretches:
+        span, basis = basis_rows(stretch.knots, stretch.imu_s)
+        phi = np.einsum("nj,nj->n", basis[:, 0], stretch.start[span[:, None] + np.arange(6), 0])
+        off = np.arctan2(stretch.readings[:, 1], stretch.readings[:, 0]) - phi
+        offs.append(off[np.isfinite(off)])
+    whole = np.concatenate(offs)
+    if len(whole) == 0:
+        return 0.0
+    middle = float(np.angle(np.exp(1j * whole).sum()))
+    return middle + float(np.median((whole - middle + math.pi) % (2.0 * math.pi) - math.pi))
+
+
+def start(pieces: Sequence[Piece], logs: Sequence[AlignLog], usual_offset_s: float) -> Started:
+    """First guess of all that the fit needs.
+
+    Raises `BadInputError` for a gyroscope in other units or with another sign.
+    """
+    found = [_factor_at(pieces, float(offset)) for offset in _OFFSETS_S]
+    squares = np.array([entry[1] for entry in found])
+    usual = int(np.argmin(np.abs(_OFFSETS_S - usual_offset_s)))
+    best = int(np.argmin(squares))
+    moves = bool((squares.max() - squares[best]) / _PHI_SIGMA**2 > _WORTH)
+    at = best if moves else usual
+    factor, left, total = found[at]
+    _check_gyro(pieces, logs, factor, 1.0 - left / total if total > 0.0 else 0.0)
+    offset = float(_OFFSETS_S[at])
+    made = [_stretch(piece, offset) for piece in pieces]
+    stretches = tuple(stretch for stretch in made if stretch is not None)
+    mount = _mount(stretches) if stretches else 0.0
+    return Started(stretches, offset, mount, factor, moves)
+
+
+# ----------------------------------------------------------------------
+# Batch least squares for what the sensors are, over splines for how the head moved.
+#
+# The normal equations are those of `align_problem`. Camera, accelerometer and gyroscope read the same
+# motion
+# with errors of known size, so that the fit, which makes the motion and the sensors' quantities most likely
+# together, is a total least squares: right on the average while the motion is left free (Van Huffel and
+# Vandewalle 1991).
+#
+# The noise is found on the way: the tracker's jitter and its share of outliers by maximum likelihood, the
+# IMU's from the residuals, sum w r^2 / (n - d), where d = tr(W J P J') are the degrees of freedom that
+# the fit took from the sensor; the trace comes from random signs (Hutchinson 1990).
+
+_MOST_STEPS = 40
+_HALVINGS = 8
+_SMALL_STEP = 0.01
+_SMALL_CHANGE = 0.01
+_PROBES = 4
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What the fit has come to.
+
+    Attributes
+    ----------
+    sensor, covariance : (13,) and (13, 13) of `SENSOR`.
+    coefficients : of each stretch's spline. noise : that was found.
+    good : for each stretch (n,), probability that a picture shows the marker.
+    loss, steps, converged : of Gauss-Newton.
+    """
+
+    sensor: FloatArray
+    covariance: FloatArray
+    coefficients: list[FloatArray]
+    noise: Noise
+    good: list[FloatArray]
+    loss: float
+    steps: int
+    converged: bool
+    arrow: Arrow
+
+
+def _imu_noise(work: Work, arrow: Arrow, cs: list[FloatArray], s: FloatArray, noise: Noise) -> FloatArray:
+    """Deviations (3,) of the IMU's readings by their residuals and degrees of freedom."""
+    p, rng = work.problem, np.random.default_rng(0)
+    squares, count, taken = np.zeros(3), np.zeros(3), np.zeros(3)
+    all_rows = []
+    for stretch, c in zip(p.stretches, cs, strict=True):
+        rows = imu_rows(p.gravity_mps2, p.across_m, stretch.knots, c, s, stretch.imu_s)
+        off = stretch.readings - rows.predicted
+        _, pull, weight = imu_terms(off, noise.imu)
+        squares += np.nansum(np.where(np.isfinite(off), pull * off, 0.0), axis=0)
+        count += (weight > 0.0).sum(axis=0)
+        all_rows.append((rows, np.sqrt(weight)))
+    for channel in range(3):
+        for _ in range(_PROBES):
+            to_cs, to_s = [], np.zeros(len(SENSOR))
+            for (rows, root), c in zip(all_rows, cs, strict=True):
+                signs = np.zeros_like(root)
+                signs[:, channel] = root[:, channel] * rng.choice(np.array([-1.0, 1.0]), len(root))
+                to_c = np.zeros(c.size)
+                gathered(rows.span, rows.basis, rows.by, signs, to_c, to_s)
+                to_cs.append(to_c)
+            dcs, ds = arrow.solve(to_cs, to_s)
+            taken[channel] += sum(float(a @ b) for a, b in zip(dcs, to_cs, strict=True)) + float(ds @ to_s)
+    left = np.maximum(count - taken / _PROBES, 1.0)
+    found = noise.imu * np.sqrt(squares / left)
+    # Without readings of an axis its deviation plays no part.
+    return np.where(count > 20, np.maximum(found, 1e-6), noise.imu)
+
+
+def _renewed(
+    work: Work, arrow: Arrow, cs: list[FloatArray], s: FloatArray, noise: Noise, goods: list[FloatArray]
+) -> Noise:
+    p = work.problem
+    offs = [pictures_off(p, stretch, c, s) for stretch, c in zip(p.stretches, cs, strict=True)]
+    good = np.concatenate(goods)
+    share = float(np.clip(1.0 - good.mean() if len(good) else 0.0, 1e-3, 0.5))
+    jitter = best_jitter_px(np.concatenate(offs), p.grid_px, share, p.area_px2)
+    return Noise(jitter, share, _imu_noise(work, arrow, cs, s, noise))
+
+
+def solve(problem: Problem, sensor: FloatArray, noise: Noise) -> Fit:
+    """Fit from these quantities (13,) and this noise on.
+
+    The noise is renewed after each step that is small or of which it was the third with the same noise.
+    """
+    work = Work(problem)
+    cs, s = [stretch.start.copy() for stretch in problem.stretches], sensor.copy()
+    same, converged, steps = 0, False, 0
+    loss = work.loss(cs, s, noise)
+    arrow, to_cs, to_s, goods = work.normal(cs, s, noise)
+    while steps < _MOST_STEPS and not converged:
+        steps += 1
+        dcs, ds = arrow.solve(to_cs, to_s)
+        size = arrow.size(ds)
+        share = 1.0
+        for _ in range(_HALVINGS):
+            moved = [c + share * dc.reshape(c.shape) for c, dc in zip(cs, dcs, strict=True)]
+            trial = work.loss(moved, s + share * ds, noise)
+            if trial <= loss + 1e-9 * abs(loss):
+                cs, s, loss = moved, s + share * ds, trial
+                break
+            share *= 0.5
+        else:
+            size = 0.0
+        same += 1
+        small = size < _SMALL_STEP
+        arrow, to_cs, to_s, goods = work.normal(cs, s, noise)
+        if small or same >= 3:
+            found = _renewed(work, arrow, cs, s, noise, goods)
+            change = np.abs(np.log(found.imu / noise.imu)).max()
+            change = max(float(change), abs(np.log(found.jitter_px / noise.jitter_px)))
+            noise, same = found, 0
+            arrow, to_cs, to_s, goods = work.normal(cs, s, noise)
+            converged = small and change < _SMALL_CHANGE
+            loss = work.loss(cs, s, noise)
+    covariance = np.asarray(cho_solve(arrow.S, np.eye(len(s))))
+    covariance = 0.5 * (covariance + covariance.T)
+    return Fit(s, covariance, cs, noise, goods, loss, steps, converged, arrow)
+
+
+def response(
+    problem: Problem, fit: Fit, pictures: list[FloatArray], readings: list[FloatArray]
+) -> FloatArray:
+    """Change (13,) of the sensors' quantities when predictions change by so much.
+
+    Parameters
+    ----------
+    pictures, readings : for each stretch (n, 2) [px] and (m, 3), the change of what is predicted.
+    """
+    to_cs, to_s = [], np.zeros(len(SENSOR))
+    for i, (stretch, c) in enumerate(zip(problem.stretches, fit.coefficients, strict=True)):
+        to_c = np.zeros(c.size)
+        rows = camera_rows(problem.view, stretch.knots, c, fit.sensor, stretch.camera_s)
+        off = stretch.pixels - rows.predicted
+        pull, weight, good = np.empty_like(off), np.empty_like(off), np.empty(len(off))
+        n = fit.noise
+        pixel_terms(off, n.jitter_px, problem.grid_px, n.share, problem.area_px2, pull, weight, good)
+        by = np.where(good[:, None, None] > 0.0, rows.by, 0.0)
+        gathered(rows.span, rows.basis, by, -weight * pictures[i], to_c, to_s)
+        rows = imu_rows(problem.gravity_mps2, problem.across_m, stretch.knots, c, fit.sensor, stretch.imu_s)
+        _, _, weight = imu_terms(stretch.readings - rows.predicted, n.imu)
+        gathered(rows.span, rows.basis, rows.by, -weight * readings[i], to_c, to_s)
+        to_cs.append(to_c)
+    return fit.arrow.solve(to_cs, to_s)[1]
+
+
+# ----------------------------------------------------------------------
+# Camera and IMU of a moving rig brought into line: time offset, mount angle, scales, biases, marker.
+#
+# Under constant curvature two pixels tell the angle and the length, so that what camera and IMU say of the
+# same motion can be compared: `align_start` finds where to begin, `align_solve` fits the sensors'
+# quantities and a spline of the motion to all readings at once (continuous-time batch estimation: Furgale,
+# Barfoot and Sibley 2012). Priors come from outside; where the posterior is no narrower, the logs say
+# nothing.
+#
+# The covariance is that of the fit plus that of biases that have walked by K sqrt(T / 3) in the mean of a
+# log.
+# At rest the mount angle and the bias along y are one number,
+#
+#     atan2((1 + s_y) g sin(alpha) + b_y, (1 + s_x) g cos(alpha) + b_x),
+#
+# what the accelerometer reads at phi = 0; it comes with its own deviation.
+
+_OUTLIER_AREA_PX2 = 1256.0
+_FIRST_NOISE = Noise(1.0, 0.05, np.array([0.2, 0.2, 0.01]))
+_GYRO, _AX, _AY, _MOUNT, _OFFSET = (
+    SENSOR.index(name)
+    for name in (
+        "gyro_bias_radps", "accel_bias_x_mps2", "accel_bias_y_mps2", "mount_angle_rad", "time_offset_s",
+    )
+)  # fmt: skip
+_SX, _SY = SENSOR.index("accel_scale_x"), SENSOR.index("accel_scale_y")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is known beforehand.
+
+    Attributes
+    ----------
+    view : (24,) of `sensors.view_coefficients`.
+    mean, sigma : (13,) prior of `SENSOR`. The mount angle's mean is replaced by a first guess.
+    grid_px : step of the pixels. gyro_walk, accel_walk : densities K of the biases' walk.
+    """
+
+    view: FloatArray
+    mean: FloatArray
+    sigma: FloatArray
+    grid_px: float = 1.0
+    gravity_mps2: float = GRAVITY_MPS2
+    across_m: float = 0.0
+    gyro_walk: float = 1e-5
+    accel_walk: float = 1e-4
+
+
+@dataclass(frozen=True)
+class LogCheck:
+    """A log's part in the fit.
+
+    Attributes
+    ----------
+    pictures, outliers : used, and those that more likely show something else.
+    samples, duration_s, stretches : of the IMU.
+    camera_rate_hz, imu_rate_hz, camera_jitter_s, imu_jitter_s, repeated, missing : of the clocks.
+    turned_rad : standard deviation of phi over the log.
+    camera_rms_px, gyro_rms_radps, accel_rms_mps2 : residuals.
+    """
+
+    source: str
+    pictures: int
+    outliers: int
+    samples: int
+    duration_s: float
+    stretches: int
+    camera_rate_hz: float
+    imu_rate_hz: float
+    camera_jitter_s: float
+    imu_jitter_s: float
+    repeated: int
+    missing: int
+    turned_rad: float
+    camera_rms_px: float
+    gyro_rms_radps: float
+    accel_rms_mps2: float
+
+
+@dataclass(frozen=True)
+class Trace:
+    """Residuals of a stretch for figures, with the first guess of the sensors and with the fit.
+
+    Attributes
+    ----------
+    log : number. camera_s, imu_s : times. good : (n,). camera_before, camera_after : (n, 2) [px].
+    imu_before, imu_after : (m, 3).
+    """
+
+    log: int
+    camera_s: FloatArray
+    good: FloatArray
+    camera_before: FloatArray
+    camera_after: FloatArray
+    imu_s: FloatArray
+    imu_before: FloatArray
+    imu_after: FloatArray
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """What was found.
+
+    Attributes
+    ----------
+    sensor, covariance : (13,) and (13, 13) of `SENSOR`; mean, prior : (13,) prior and its deviations.
+    rest_angle_rad, rest_angle_sigma : what the accelerometer reads at phi = 0 at rest.
+    noise, converged, steps : of the fit. moves : the first guess could see the offset. factor : of the
+        gyroscope against the camera.
+    """
+
+    sensor: FloatArray
+    covariance: FloatArray
+    mean: FloatArray
+    prior: FloatArray
+    rest_angle_rad: float
+    rest_angle_sigma: float
+    noise: Noise
+    converged: bool
+    steps: int
+    moves: bool
+    factor: float
+    logs: tuple[LogCheck, ...]
+    traces: tuple[Trace, ...]
+    correlation: Correlation
+    said: tuple[str, ...]
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard deviations (13,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def rest_angle(sensor: FloatArray, gravity_mps2: float = GRAVITY_MPS2) -> tuple[float, FloatArray]:
+    """Angle that the accelerometer reads at phi = 0 at rest, and its gradient (13,)."""
+    alpha = sensor[_MOUNT]
+    ca, sa = math.cos(alpha), math.sin(alpha)
+    x = (1.0 + sensor[_SX]) * gravity_mps2 * ca + sensor[_AX]
+    y = (1.0 + sensor[_SY]) * gravity_mps2 * sa + sensor[_AY]
+    square = x * x + y * y
+    by_x, by_y = -y / square, x / square
+    gradient = np.zeros(len(SENSOR))
+    gradient[_AX], gradient[_AY] = by_x, by_y
+    gradient[_SX], gradient[_SY] = by_x * gravity_mps2 * ca, by_y * gravity_mps2 * sa
+    gradient[_MOUNT] = gravity_mps2 * (by_y * (1.0 + sensor[_SY]) * ca - by_x * (1.0 + sensor[_SX]) * sa)
+    return math.atan2(y, x), gradient
+
+
+def _walked(settings: Settings, problem: Problem, fit: Fit) -> FloatArray:
+    """Covariance (13, 13) from biases that differ from stretch to stretch."""
+    total = np.zeros((len(SENSOR), len(SENSOR)))
+    nothing = [np.zeros_like(stretch.pixels) for stretch in problem.stretches]
+    for i, stretch in enumerate(problem.stretches):
+        duration = float(stretch.imu_s[-1] - stretch.imu_s[0])
+        for channel, walk in enumerate((settings.accel_walk, settings.accel_walk, settings.gyro_walk)):
+            change = [np.zeros_like(other.readings) for other in problem.stretches]
+            change[i][:, channel] = walk * math.sqrt(duration / 3.0)
+            moved = response(problem, fit, nothing, change)
+            total += np.outer(moved, moved)
+    return total
+
+
+def _rms(values: FloatArray) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(known**2))) if len(known) else math.nan
+
+
+def _traces(problem: Problem, first: FloatArray, fit: Fit) -> tuple[Trace, ...]:
+    out = []
+    for stretch, c, good in zip(problem.stretches, fit.coefficients, fit.good, strict=True):
+        out.append(
+            Trace(
+                stretch.log, stretch.camera_s, good,
+                pictures_off(problem, stretch, c, first), pictures_off(problem, stretch, c, fit.sensor),
+                stretch.imu_s,
+                readings_off(problem, stretch, c, first), readings_off(problem, stretch, c, fit.sensor),
+            )
+        )  # fmt: skip
+    return tuple(out)
+
+
+def _check(
+    number: int, log: AlignLog, pieces: Sequence[Piece], stretches: Sequence[Stretch], fit: Fit,
+    traces: Sequence[Trace],
+) -> LogCheck:  # fmt: skip
+    own = [i for i, stretch in enumerate(stretches) if stretch.log == number]
+    mine = [piece for piece in pieces if piece.log == number]
+    good = np.concatenate([fit.good[i] for i in own]) if own else np.zeros(0)
+    imu = np.concatenate([traces[i].imu_after for i in own]) if own else np.zeros((0, 3))
+    pictures = [traces[i].camera_after[fit.good[i] > 0.5] for i in own]
+    # The coefficients at the ends lie outside of the readings.
+    phi = [fit.coefficients[i][8:-8, 0] for i in own]
+
+    def middle(values: list[float], invert: bool = False) -> float:
+        value = float(np.median(values)) if values else math.nan
+        return 1.0 / value if invert else value
+
+    return LogCheck(
+        source=log.source,
+        pictures=len(good),
+        outliers=int((good < 0.5).sum()),
+        samples=len(imu),
+        duration_s=sum(float(stretches[i].imu_s[-1] - stretches[i].imu_s[0]) for i in own),
+        stretches=len(own),
+        camera_rate_hz=middle([piece.camera.period_s for piece in mine], True),
+        imu_rate_hz=middle([piece.imu.period_s for piece in mine], True),
+        camera_jitter_s=middle([piece.camera.jitter_s for piece in mine]),
+        imu_jitter_s=middle([piece.imu.jitter_s for piece in mine]),
+        repeated=sum(piece.camera.repeated + piece.imu.repeated for piece in mine),
+        missing=sum(piece.camera.missing + piece.imu.missing for piece in mine),
+        turned_rad=float(np.std(np.concatenate(phi))) if phi else 0.0,
+        camera_rms_px=_rms(np.concatenate(pictures)) if pictures else math.nan,
+        gyro_rms_radps=_rms(imu[:, 2]),
+        accel_rms_mps2=_rms(imu[:, :2]),
+    )
+
+
+def align(logs: Sequence[AlignLog], settings: Settings) -> Alignment:
+    """Find what the sensors are from logs, all at once.
+
+    Raises `BadInputError` where no log has a stretch to work on, and for a gyroscope in other units.
+    """
+    pieces, said = pieces_of(logs, settings.view, settings.mean)
+    if not pieces:
+        raise BadInputError(said[0] if said else "no log has pictures and IMU samples")
+    first = start(pieces, logs, float(settings.mean[_OFFSET]))
+    if not first.stretches:
+        raise BadInputError(
+            f"{logs[pieces[0].log].source}: hardly any picture shows a place where the marker can be, "
+            "expected pictures of the marker on the head"
+        )
+    mean = settings.mean.copy()
+    mean[_MOUNT] = first.mount_angle_rad
+    problem = Problem(
+        settings.view, settings.gravity_mps2, settings.across_m, settings.grid_px, _OUTLIER_AREA_PX2,
+        first.stretches, mean, settings.sigma,
+    )  # fmt: skip
+    sensor = mean.copy()
+    sensor[_OFFSET] = first.time_offset_s
+    fit = solve(problem, sensor, _FIRST_NOISE)
+    covariance = fit.covariance + _walked(settings, problem, fit)
+    angle, gradient = rest_angle(fit.sensor, settings.gravity_mps2)
+    # Before: the sensors as they were assumed to be.
+    before = mean.copy()
+    before[_MOUNT] = 0.0
+    traces = _traces(problem, before, fit)
+    checks = tuple(
+        _check(number, log, pieces, first.stretches, fit, traces) for number, log in enumerate(logs)
+    )
+    return Alignment(
+        fit.sensor, covariance, mean, settings.sigma, angle,
+        math.sqrt(float(gradient @ covariance @ gradient)), fit.noise, fit.converged, fit.steps, first.moves,
+        first.factor, checks, traces, correlation(pieces), tuple(said),
+    )  # fmt: skip
+
+
+# ----------------------------------------------------------------------
+# Whether an alignment can be used, and what its logs could not tell apart.
+#
+# What has to be known is the time offset and the angle read at rest. Of the others a combination is
+# often known much better than each alone: with the correlation r of two quantities, a part sqrt(1 - r^2) of
+# their deviations is left once the other is known.
+
+NAMES = {
+    "gyro_bias_radps": "the gyroscope's bias",
+    "accel_bias_x_mps2": "the accelerometer's bias along x",
+    "accel_bias_y_mps2": "the accelerometer's bias along y",
+    "mount_angle_rad": "the mount angle",
+    "gyro_scale": "the gyroscope's scale",
+    "imu_lever_m": "the IMU's place along the head",
+    "marker_offset_m": "the marker's offset d",
+    "time_offset_s": "the time offset",
+    "shift_x_m": "the plane's shift along x",
+    "shift_y_m": "the plane's shift along y",
+    "stretch": "the plane's stretch",
+    "accel_scale_x": "the accelerometer's scale along x",
+    "accel_scale_y": "the accelerometer's scale along y",
+}
+
+_OFFSET_S = (1e-3, 1e-2)
+_REST_RAD = math.radians(0.1)
+_OUTLIERS = (0.2, 0.5)
+_SHORT_S = 3.0
+_JITTER_PX = 1.5
+_FACTOR, _NO_FACTOR = 0.2, 0.5
+_BEYOND_PRIOR = 4.0
+_NOTHING_LEARNT = 0.8
+_INSEPARABLE = 0.98
+_TURNED_RAD = 0.02
+_SWING = "a log of a free swing, let go at 20 degrees, shows the time offset within a millisecond"
+_TILT = "slow motion to large angles both ways tells the mount angle from the accelerometer's bias"
+
+
+@dataclass
+class AlignJudgement:
+    """Verdict ok, poor or unidentifiable, with sentences."""
+
+    verdict: Literal["ok", "poor", "unidentifiable"] = "ok"
+    reasons: list[str] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+    advice: list[str] = field(default_factory=list)
+
+    def lower(self, to: Literal["poor", "unidentifiable"], reason: str) -> None:
+        """A reason why the verdict is not better."""
+        if self.verdict != "unidentifiable":
+            self.verdict = to
+        self.reasons.append(reason)
+
+
+def _data(found: Alignment, out: AlignJudgement) -> None:
+    pictures = sum(log.pictures for log in found.logs)
+    outliers = sum(log.outliers for log in found.logs)
+    share = outliers / max(pictures, 1)
+    if share > _OUTLIERS[0]:
+        out.lower(
+            "unidentifiable" if share > _OUTLIERS[1] else "poor",
+            f"{100.0 * share:.0f} % of {pictures} pictures show something else than the marker",
+        )
+    duration = sum(log.duration_s for log in found.logs)
+    if duration < _SHORT_S:
+        out.lower(
+            "poor", f"the logs are too short: {duration:.2g} s together, expected {_SHORT_S:g} s or more"
+        )
+    if not found.converged:
+        out.lower("poor", f"the fit has not converged after {found.steps} steps")
+    if found.noise.jitter_px > _JITTER_PX:
+        out.lower(
+            "poor",
+            f"pictures miss the fit by {found.noise.jitter_px:.2g} px; camera, plane or constant curvature "
+            "do not hold",
+        )
+    turned = max((log.turned_rad for log in found.logs), default=0.0)
+    if turned > _TURNED_RAD and abs(found.factor - 1.0) > _FACTOR:
+        out.lower(
+            "unidentifiable" if abs(found.factor - 1.0) > _NO_FACTOR else "poor",
+            f"the camera sees {found.factor:.2g} times the turn that the gyroscope feels",
+        )
+
+
+def _known(found: Alignment, out: AlignJudgement) -> None:
+    sigma = found.sigma
+    offset = float(sigma[SENSOR.index("time_offset_s")])
+    if offset > _OFFSET_S[0]:
+        turned = max((log.turned_rad for log in found.logs), default=0.0)
+        why = ""
+        if turned < _TURNED_RAD:
+            why = f": the logs hardly move (phi by {math.degrees(turned):.2g} degrees)"
+        words = "is not observable, its deviation is" if offset > _OFFSET_S[1] else "has a deviation of"
+        out.lower(
+            "unidentifiable" if offset > _OFFSET_S[1] else "poor",
+            f"the time offset {words} {1e3 * offset:.2g} ms, expected 1 ms{why}",
+        )
+        out.advice.append(_SWING)
+    if found.rest_angle_sigma > _REST_RAD:
+        out.lower(
+            "poor",
+            f"the angle read at rest is known to {math.degrees(found.rest_angle_sigma):.2g} degrees, "
+            "expected 0.1 degrees",
+        )
+    for k, name in enumerate(SENSOR):
+        away = abs(found.sensor[k] - found.mean[k]) / found.prior[k]
+        if away > _BEYOND_PRIOR:
+            out.lower("poor", f"{NAMES[name]} came out as {found.sensor[k]:.3g}, which is not to be expected")
+
+
+def _groups(tied: BoolArray) -> list[list[int]]:
+    """Groups of two or more quantities that are tied to each other, directly or by others."""
+    left, groups = set(range(len(tied))), []
+    while left:
+        group, new = set(), {min(left)}
+        while new:
+            group |= new
+            new = {k for i in new for k in np.flatnonzero(tied[i]).tolist()} - group
+        left -= group
+        if len(group) > 1:
+            groups.append(sorted(group))
+    return groups
+
+
+def _separable(found: Alignment, out: AlignJudgement) -> None:
+    sigma = found.sigma
+    R = found.covariance / sigma / sigma[:, None]
+    mount, bias = SENSOR.index("mount_angle_rad"), SENSOR.index("accel_bias_y_mps2")
+    unlearnt = [k for k in range(len(SENSOR)) if sigma[k] > _NOTHING_LEARNT * found.prior[k]]
+    if sigma[mount] > 2.0 * found.rest_angle_sigma or R[mount, bias] < -_INSEPARABLE:
+        out.remarks.append(
+            "the mount angle and the accelerometer's bias along y are nearly one number "
+            f"(correlation {R[mount, bias]:.3f}): together, as the angle read at rest at phi = 0, they are "
+            f"{math.degrees(found.rest_angle_rad):.3f} +- {math.degrees(found.rest_angle_sigma):.3f} deg, "
+            f"the mount angle alone {math.degrees(found.sensor[mount]):.2f} +- "
+            f"{math.degrees(sigma[mount]):.2f} deg"
+        )
+        if sigma[mount] > _REST_RAD:
+            out.advice.append(_TILT)
+    for group in _groups(np.abs(R) > _INSEPARABLE):
+        if set(group) != {mount, bias}:
+            words = [NAMES[SENSOR[k]] for k in group]
+            out.remarks.append(
+                f"hardly told apart from each other: {', '.join(words[:-1])} and {words[-1]}; what they do "
+                "together is known much better than each, see the covariance"
+            )
+    if unlearnt:
+        out.remarks.append(
+            "the logs say next to nothing of " + ", ".join(NAMES[SENSOR[k]] for k in unlearnt)
+            + ": as assumed beforehand"
+        )  # fmt: skip
+
+
+def judge_align(found: Alignment) -> AlignJudgement:
+    """Verdict on an alignment."""
+    out = AlignJudgement()
+    _data(found, out)
+    _known(found, out)
+    _separable(found, out)
+    if not np.isfinite(found.covariance).all():
+        out.lower("unidentifiable", "the covariance is not finite")
+    return out

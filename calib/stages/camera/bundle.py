@@ -1,0 +1,834 @@
+"""A camera fitted to all views of a target: start (Zhang), Levenberg-Marquardt, fit, covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.core.arrays import FloatArray, IntArray
+from calib.stages.camera.model import (
+    INTRINSICS,
+    Block,
+    Camera,
+    Observations,
+    camera_from_vector,
+    free_intrinsics,
+    jacobian,
+    undistort,
+    vector_from_camera,
+)
+
+# ----------------------------------------------------------------------
+# Levenberg-Marquardt over the poses of all views and what they share, with the poses eliminated.
+#
+# Minimised is the sum of squared pixel residuals over intrinsics s (shared by all views, with the
+# target's deformation if it has one) and one pose z_i for each view. The normal matrix has the shape
+#
+#     [ U    W_1 ... W_N ]        U = sum_i U_i   (G x G)
+#     [ W_1' V_1         ]        V_i             (6 x 6)
+#     [ ...       ...    ]
+#     [ W_N'         V_N ]
+#
+# so the poses are eliminated, (U - sum_i W_i V_i^-1 W_i') ds = -(g_s - sum_i W_i V_i^-1 g_i), and the
+# cost of an iteration is linear in the number of views.
+#
+# The search ends when the Newton decrement sqrt(g' H^-1 g) is below 10^-5 of the residuals' standard
+# deviation: the step that is left is then a hundred-thousandth of a standard deviation in every
+# direction of the parameter space, flat or steep. A limit on iterations is a failure, and named so.
+#
+# A robust loss is minimised by the same iteration with the weights rho'(r^2) of its points.
+
+LOSSES = ("none", "huber", "cauchy")
+
+TOLERANCE = 1e-5
+"""Newton decrement that ends the search, in standard deviations."""
+MAX_ITERATIONS = 300
+ENOUGH = 1e-2
+"""Tolerance where only the residuals count: they are then right to a part in 10^4."""
+_LEVEL_STEPS = 4
+"""Steps that may leave the cost as it is."""
+_FINEST_PX = 1e-4
+"""Residuals of made-up data can be zero; rounding is then the only noise, well below this."""
+_ROUNDING = 1.0 + 1e-12
+"""A cost that differs by less is the same cost."""
+_CHUNK = 80_000
+"""Jacobian entries of a chunk of views, halved: about 1.3 MB."""
+_TUNING = {"huber": 1.345, "cauchy": 2.385}
+"""95 % efficiency on Gaussian residuals."""
+
+
+def rotation_exp(delta: FloatArray) -> FloatArray:
+    """Rotation matrices (N, 3, 3) of rotation vectors (N, 3) (Rodrigues), smooth at zero."""
+    angle = np.linalg.norm(delta, axis=1)
+    a = np.sinc(angle / np.pi)
+    b = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    S = np.zeros((len(delta), 3, 3))
+    S[:, 0, 1], S[:, 0, 2], S[:, 1, 2] = -delta[:, 2], delta[:, 1], -delta[:, 0]
+    S -= S.transpose(0, 2, 1)
+    return np.asarray(np.eye(3) + a[:, None, None] * S + b[:, None, None] * (S @ S))
+
+
+@dataclass(frozen=True)
+class Minimum:
+    """Where `minimise` stopped: the block, the problem linearised there, and why it stopped."""
+
+    block: Block
+    at: Linearised | None
+    reason: str
+    evaluations: int
+    decrement: float
+
+
+def _moved(block: Block, free: IntArray, shared: FloatArray, poses: FloatArray) -> Block:
+    intrinsics = block.intrinsics.copy()
+    intrinsics[free] += shared[: len(free)]
+    return Block(
+        intrinsics,
+        rotation_exp(poses[:, :3]) @ block.R_CT,
+        block.t_CT_m + poses[:, 3:],
+        block.deformation + shared[len(free) :],
+    )
+
+
+def loss_weights(residuals: FloatArray, loss: str, scale_px: float) -> FloatArray:
+    """Weights rho'(s) of points (N, M) from residuals (N, 2, M)."""
+    if loss == "none":
+        return np.ones((len(residuals), residuals.shape[2]))
+    distance = np.hypot(residuals[:, 0], residuals[:, 1]) / (_TUNING[loss] * scale_px)
+    if loss == "huber":
+        return 1.0 / np.maximum(distance, 1.0)
+    return 1.0 / (1.0 + distance**2)
+
+
+def _loss_sum(residuals: FloatArray, loss: str, scale_px: float) -> float:
+    if loss == "none":
+        return float(np.vdot(residuals, residuals))
+    squared = residuals[:, 0] ** 2 + residuals[:, 1] ** 2
+    c2 = (_TUNING[loss] * scale_px) ** 2
+    if loss == "huber":
+        return float(np.where(squared <= c2, squared, 2 * np.sqrt(c2 * squared) - c2).sum())
+    return float((c2 * np.log1p(squared / c2)).sum())
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """The problem about a block.
+
+    Attributes
+    ----------
+    normal : (N, G + 6, G + 6) weighted J J' of each view.
+    gradient : (N, G + 6) weighted J r of each view.
+    residuals : (N, 2, M) without weights, zero where there is no point.
+    cost : value of the loss.
+    """
+
+    normal: FloatArray
+    gradient: FloatArray
+    residuals: FloatArray
+    cost: float
+
+
+def linearise(
+    block: Block,
+    observations: Observations,
+    free: IntArray,
+    basis: FloatArray | None,
+    loss: str = "none",
+    scale_px: float = 1.0,
+) -> Linearised | None:
+    """Normal equations of all views at `block`, or None where a point is behind the camera.
+
+    Views are taken a chunk at a time, so that a chunk's Jacobian stays in the processor's cache.
+    """
+    G = len(free) + (0 if basis is None else len(basis))
+    views, points = observations.views, observations.pixels.shape[1]
+    products = np.empty((views, G + 7, G + 7))
+    residuals = np.empty((views, 2, points))
+    chunk = max(1, _CHUNK // ((G + 7) * points))
+    for first in range(0, views, chunk):
+        part = slice(first, first + chunk)
+        J = jacobian(block.part(part), observations.part(part), free, basis)
+        if J is None:
+            return None
+        residuals[part] = J[:, -1].reshape(-1, 2, points)
+        if loss != "none":
+            J *= np.sqrt(np.tile(loss_weights(residuals[part], loss, scale_px), 2))[:, None]
+        np.matmul(J, J.transpose(0, 2, 1), out=products[part])
+    return Linearised(
+        products[:, :-1, :-1], products[:, :-1, -1], residuals, _loss_sum(residuals, loss, scale_px)
+    )
+
+
+def _solve_step(at: Linearised, G: int, damping: float) -> tuple[FloatArray, FloatArray] | None:
+    """Step (G,), (N, 6) of the damped normal equations, or None where they are singular."""
+    V, W, U = at.normal[:, G:, G:], at.normal[:, :G, G:], at.normal[:, :G, :G].sum(axis=0)
+    if damping:
+        V = V * (1.0 + damping * np.eye(6))
+        U = U * (1.0 + damping * np.eye(G))
+    right = np.concatenate([W.transpose(0, 2, 1), at.gradient[:, G:, None]], axis=2)
+    try:
+        eliminated = np.linalg.solve(V, right)
+        if G == 0:
+            return np.zeros(0), -eliminated[..., 0]
+        reduced = W.transpose(1, 0, 2).reshape(G, -1) @ eliminated.reshape(-1, G + 1)
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(U), 1e-300))
+        S = (U - reduced[:, :G]) * scale * scale[:, None]
+        step = -scale * np.linalg.solve(S, scale * (at.gradient[:, :G].sum(axis=0) - reduced[:, G]))
+    except np.linalg.LinAlgError:
+        return None
+    poses = -eliminated[..., G] - eliminated[..., :G] @ step
+    if not (np.all(np.isfinite(step)) and np.all(np.isfinite(poses))):
+        return None
+    return step, poses
+
+
+def minimise(
+    block: Block,
+    observations: Observations,
+    free: IntArray,
+    basis: FloatArray | None = None,
+    loss: str = "none",
+    scale_px: float = 1.0,
+    max_iterations: int = MAX_ITERATIONS,
+    tolerance: float = TOLERANCE,
+) -> Minimum:
+    """Levenberg-Marquardt from `block`; the problem linearised where it stopped comes with the answer.
+
+    `tolerance` is the relative Newton decrement to reach, in standard deviations.
+    """
+    G = len(free) + (0 if basis is None else len(basis))
+    freedom = max(2 * observations.points - G - 6 * observations.views, 1)
+    at = linearise(block, observations, free, basis, loss, scale_px)
+    if at is None:
+        return Minimum(block, None, "behind the camera", 1, np.inf)
+    damping, evaluations, decrement, level = 1e-6, 1, np.inf, 0
+    while True:
+        step = _solve_step(at, G, damping)
+        if step is not None:
+            decrement = _decrement(at, G, step, freedom)
+            if decrement < tolerance and damping > 0.0:
+                # Damping shortens steps along flat valleys, so the test is made without it.
+                step, damping = _solve_step(at, G, 0.0), 0.0
+                if step is None:
+                    # Damped again the same would follow, without an end.
+                    return Minimum(block, at, "singular", evaluations, decrement)
+                decrement = _decrement(at, G, step, freedom)
+            if decrement < tolerance:
+                return Minimum(block, at, "converged", evaluations, decrement)
+        if evaluations >= max_iterations:
+            return Minimum(block, at, "iterations", evaluations, decrement)
+        accepted = None
+        if step is not None:
+            trial = _moved(block, free, *step)
+            accepted = linearise(trial, observations, free, basis, loss, scale_px)
+            evaluations += 1
+        if accepted is not None and np.isfinite(accepted.cost) and accepted.cost <= at.cost * _ROUNDING:
+            level += accepted.cost >= at.cost * (2.0 - _ROUNDING)
+            block, at = trial, accepted
+            damping = damping * 0.01 if damping > 1e-13 else 0.0
+        else:
+            # So near, a full step only fails to lower the cost where rounding is reached.
+            level += damping == 0.0 and decrement < 1e-3
+            damping = max(10.0 * damping, 1e-13)
+        if damping > 1e10 or level > _LEVEL_STEPS:
+            # No step lowers the cost: rounding is reached, or there is no minimum to be found.
+            reason = "converged" if decrement < 1e-3 else "singular" if step is None else "stalled"
+            return Minimum(block, at, reason, evaluations, decrement)
+
+
+def _decrement(at: Linearised, G: int, step: tuple[FloatArray, FloatArray], freedom: int) -> float:
+    """Newton decrement over the residuals' standard deviation.
+
+    The sign is dropped: with a nearly singular normal matrix rounding can turn it.
+    """
+    slope = at.gradient[:, :G].sum(axis=0) @ step[0] + np.vdot(at.gradient[:, G:], step[1])
+    return float(np.sqrt(abs(slope) / max(at.cost / freedom, _FINEST_PX**2)))
+
+
+# ----------------------------------------------------------------------
+# Closed-form initial guess of a camera from views of a plane (Zhang 2000).
+#
+# A view's homography H = [h1 h2 h3] maps the target's plane to pixels and equals s K [r1 r2 t] (2.9
+# with the K that its printed form lacks). r1 and r2 are orthonormal, so that with B = K^-T K^-1
+#
+#     h1^T B h2 = 0,   h1^T B h1 = h2^T B h2
+#
+# are two equations linear in B for each view. Five unknown ratios of B (skew included) need three
+# views, four (no skew) need two, and two (principal point held at the image's centre) need one.
+
+
+@dataclass(frozen=True)
+class InitialGuess:
+    """K (3, 3) and the pose of each view: rotations R_CT (N, 3, 3) and translations t_CT_m (N, 3)."""
+
+    K: FloatArray
+    R_CT: FloatArray
+    t_CT_m: FloatArray
+
+
+def _similarity(points: FloatArray, present: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Centre (n, 2) and scale (n,) that bring each set of points to zero mean and unit spread."""
+    count = present.sum(axis=1)
+    centre = (points * present[..., None]).sum(axis=1) / count[:, None]
+    spread = (((points - centre[:, None]) ** 2).sum(axis=2) * present).sum(axis=1) / count
+    return centre, 1.0 / np.sqrt(np.maximum(spread, 1e-300))
+
+
+def homographies(observations: Observations) -> FloatArray:
+    """Homography from the target's plane (metres) to pixels for each view, shape (N, 3, 3).
+
+    Hartley's normalisation makes h33 of the normalised homography the depth of the target's
+    centroid, never zero for a target that was seen, so the eight other entries follow from normal
+    equations.
+    """
+    present = observations.present.astype(np.float64)
+    views = observations.views
+    target = np.broadcast_to(observations.target_m[..., :2], observations.pixels.shape)
+    centre_t, scale_t = _similarity(target, present)
+    centre_p, scale_p = _similarity(observations.pixels, present)
+    x, y = np.moveaxis((target - centre_t[:, None]) * scale_t[:, None, None], 2, 0)
+    u, v = np.moveaxis((observations.pixels - centre_p[:, None]) * scale_p[:, None, None], 2, 0)
+    one = np.ones_like(x)
+    design = np.zeros((views, 9, 2, x.shape[1]))
+    for row, value in enumerate((x, y, one)):
+        design[:, row, 0] = value
+        design[:, row + 3, 1] = value
+    design[:, 6, 0], design[:, 6, 1] = -u * x, -v * x
+    design[:, 7, 0], design[:, 7, 1] = -u * y, -v * y
+    design[:, 8, 0], design[:, 8, 1] = u, v
+    if not observations.complete:
+        design *= present[:, None, None]
+    rows = design.reshape(views, 9, -1)
+    normal = rows @ rows.transpose(0, 2, 1)
+    ridge = 1e-15 * np.trace(normal[:, :8, :8], axis1=1, axis2=2)
+    left = normal[:, :8, :8] + ridge[:, None, None] * np.eye(8)
+    h = np.ones((views, 9))
+    h[:, :8] = np.linalg.solve(left, normal[:, :8, 8:])[..., 0]
+    H = h.reshape(views, 3, 3)
+    to_pixels = np.zeros((views, 3, 3))
+    to_pixels[:, 0, 0] = to_pixels[:, 1, 1] = 1.0 / scale_p
+    to_pixels[:, :2, 2] = centre_p
+    to_pixels[:, 2, 2] = 1.0
+    from_target = np.zeros((views, 3, 3))
+    from_target[:, 0, 0] = from_target[:, 1, 1] = scale_t
+    from_target[:, :2, 2] = -centre_t * scale_t[:, None]
+    from_target[:, 2, 2] = 1.0
+    return to_pixels @ H @ from_target
+
+
+def _constraint(H: FloatArray, i: int, j: int) -> FloatArray:
+    """Row v_ij of Zhang's system, (N, 6): h_i^T B h_j = v_ij . (B11, B12, B22, B13, B23, B33)."""
+    a, b = H[:, :, i], H[:, :, j]
+    return np.stack(
+        [
+            a[:, 0] * b[:, 0],
+            a[:, 0] * b[:, 1] + a[:, 1] * b[:, 0],
+            a[:, 1] * b[:, 1],
+            a[:, 2] * b[:, 0] + a[:, 0] * b[:, 2],
+            a[:, 2] * b[:, 1] + a[:, 1] * b[:, 2],
+            a[:, 2] * b[:, 2],
+        ],
+        axis=1,
+    )
+
+
+def closed_form_intrinsics(H: FloatArray, image_size_px: tuple[int, int], unknowns: str) -> FloatArray | None:
+    """K from homographies, or None where noise or geometry leave no real solution.
+
+    Parameters
+    ----------
+    H : (N, 3, 3).
+    unknowns : "skew" (all of B), "no skew", or "centre" (principal point at the image's centre).
+    """
+    width, height = image_size_px
+    size = 0.5 * (width + height)
+    # Pixels about the image's centre and of order one condition the system.
+    normalise = np.array(
+        [[1 / size, 0, -0.5 * (width - 1) / size], [0, 1 / size, -0.5 * (height - 1) / size], [0, 0, 1]]
+    )
+    Hn = normalise @ H
+    Hn = Hn / np.linalg.norm(Hn, axis=(1, 2), keepdims=True)
+    system = np.concatenate([_constraint(Hn, 0, 1), _constraint(Hn, 0, 0) - _constraint(Hn, 1, 1)])
+    kept = {"skew": [0, 1, 2, 3, 4, 5], "no skew": [0, 2, 3, 4, 5], "centre": [0, 2, 5]}[unknowns]
+    if len(system) < len(kept) - 1:
+        return None
+    b = np.zeros(6)
+    b[kept] = np.linalg.eigh(system[:, kept].T @ system[:, kept])[1][:, 0]
+    B = np.array([[b[0], b[1], b[3]], [b[1], b[2], b[4]], [b[3], b[4], b[5]]]) * np.sign(b[0] or 1.0)
+    if np.linalg.eigvalsh(B)[0] <= 0.0:
+        return None
+    # B = K^-T K^-1 = L L^T with L lower triangular, hence K = L^-T up to scale.
+    K = np.linalg.inv(np.linalg.cholesky(B)).T
+    K = np.linalg.inv(normalise) @ (K / K[2, 2])
+    return np.asarray(K / K[2, 2])
+
+
+def poses_from_homographies(K: FloatArray, H: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rotations (N, 3, 3) and translations (N, 3) of the target in the camera's frame.
+
+    The two measured axes are made orthonormal symmetrically, so that neither is preferred.
+    """
+    M = np.linalg.solve(K, H)
+    # The target is in front of the camera.
+    M = M * np.where(M[:, 2, 2] < 0, -1.0, 1.0)[:, None, None]
+    a, b, t = M[:, :, 0], M[:, :, 1], M[:, :, 2]
+    scale = np.sqrt(np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1))
+    a = a / np.linalg.norm(a, axis=1, keepdims=True)
+    b = b / np.linalg.norm(b, axis=1, keepdims=True)
+    half = (a + b) / np.linalg.norm(a + b, axis=1, keepdims=True)
+    r3 = np.cross(a, b)
+    r3 = r3 / np.linalg.norm(r3, axis=1, keepdims=True)
+    across = np.cross(r3, half)
+    r1 = (half - across) / np.sqrt(2.0)
+    r2 = (half + across) / np.sqrt(2.0)
+    return np.stack([r1, r2, r3], axis=2), t / scale[:, None]
+
+
+def poses_with_camera(camera: Camera, observations: Observations) -> tuple[FloatArray, FloatArray]:
+    """Poses of the views seen by a known camera, linear; NaN where the lens cannot show such pixels."""
+    ideal = undistort(camera, observations.pixels)
+    usable = np.isfinite(ideal).all(axis=2) & observations.present
+    enough = usable.sum(axis=1) >= 4
+    seen = Observations(
+        observations.names, observations.target_m, np.nan_to_num(ideal), usable | ~enough[:, None]
+    )
+    R_CT, t_CT_m = poses_from_homographies(np.eye(3), homographies(seen))
+    R_CT[~enough], t_CT_m[~enough] = np.nan, np.nan
+    return R_CT, t_CT_m
+
+
+def _mismatch(K: FloatArray, H: FloatArray) -> float:
+    """How far K^-1 H is from two orthonormal columns, mean over views of a dimensionless error."""
+    M = np.linalg.solve(K, H)
+    a, b = M[:, :, 0], M[:, :, 1]
+    aa, bb, ab = (a * a).sum(1), (b * b).sum(1), (a * b).sum(1)
+    return float(np.mean(((aa - bb) ** 2 + 4 * ab**2) / (aa + bb) ** 2))
+
+
+def initial_guess(observations: Observations, image_size_px: tuple[int, int], skew: bool) -> InitialGuess:
+    """Intrinsics without distortion and the poses of all views, as a start for the bundle adjustment.
+
+    Zhang's closed form with as many unknowns as the views allow; where that has no plausible answer
+    the principal point is held at the centre, and where that fails too the focal length of a scan
+    that makes the target's axes most nearly orthonormal is taken.
+    """
+    H = homographies(observations)
+    width, height = image_size_px
+    longest = float(max(width, height))
+    centre = np.array([0.5 * (width - 1), 0.5 * (height - 1)])
+    attempts = (["skew"] if skew and observations.views >= 3 else []) + (
+        ["no skew"] if observations.views >= 2 else []
+    )
+    K = None
+    for unknowns in [*attempts, "centre"]:
+        K = closed_form_intrinsics(H, image_size_px, unknowns)
+        if K is not None and _plausible(K, longest, centre):
+            break
+        K = None
+    if K is None:
+        focal = longest * np.geomspace(0.3, 10.0, 60)
+        candidates = [np.array([[f, 0, centre[0]], [0, f, centre[1]], [0, 0, 1.0]]) for f in focal]
+        K = min(candidates, key=lambda candidate: _mismatch(candidate, H))
+    if not skew:
+        K[0, 1] = 0.0
+    R_CT, t_CT_m = poses_from_homographies(K, H)
+    return InitialGuess(K, R_CT, t_CT_m)
+
+
+def _plausible(K: FloatArray, longest: float, centre: FloatArray) -> bool:
+    """Focal lengths between a fifth and fifty times the image, principal point near the image."""
+    focal = np.array([K[0, 0], K[1, 1]])
+    near = np.abs(K[:2, 2] - centre) < longest
+    return bool(
+        np.all(np.isfinite(K))
+        and np.all(focal > 0.2 * longest)
+        and np.all(focal < 50 * longest)
+        and near.all()
+    )
+
+
+# ----------------------------------------------------------------------
+# A camera fitted to all views of a target (2.10, B.2): the fit, its residuals, and refitted poses.
+
+_WELL_CONDITIONED = 1e6
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A camera fitted to views.
+
+    Attributes
+    ----------
+    camera : the intrinsics found.
+    free : indices into `projection.INTRINSICS` of what was estimated.
+    block : intrinsics, poses and deformation as the solver holds them.
+    basis : (K, 3, M) of the target's deformation, or None.
+    residuals_px : (N, M, 2) projected minus measured; NaN where there is no point.
+    weights : (N, M) of the robust loss, one without.
+    normal : (N, G + 6, G + 6) weighted normal matrix of each view at the solution.
+    termination : "converged", "stalled", "iterations", "singular" or "behind the camera".
+    evaluations : evaluations of the Jacobian.
+    decrement : sqrt(g' H^-1 g) at the end, over the standard deviation of the residuals.
+    """
+
+    camera: Camera
+    free: IntArray
+    block: Block
+    basis: FloatArray | None
+    observations: Observations
+    residuals_px: FloatArray
+    weights: FloatArray
+    normal: FloatArray
+    termination: str
+    evaluations: int
+    decrement: float
+    loss: str = "none"
+
+    @property
+    def converged(self) -> bool:
+        """Whether the gradient test was met."""
+        return self.termination == "converged"
+
+    @property
+    def free_names(self) -> tuple[str, ...]:
+        """Names of the estimated intrinsics."""
+        return tuple(INTRINSICS[i] for i in self.free)
+
+    @property
+    def squared_sum(self) -> float:
+        """Sum of squared residuals, pixels squared, without weights; NaN where no camera was found."""
+        if not np.isfinite(self.residuals_px).any():
+            return float("nan")
+        return float(np.nansum(self.residuals_px**2))
+
+    @property
+    def rms_px(self) -> float:
+        """sqrt(mean |residual vector|^2) over points, as OpenCV reports it."""
+        return float(np.sqrt(self.squared_sum / self.observations.points))
+
+    @property
+    def view_rms_px(self) -> FloatArray:
+        """RMS of each view, (N,)."""
+        return np.asarray(np.sqrt(np.nanmean(np.sum(self.residuals_px**2, axis=2), axis=1)))
+
+    @property
+    def mean_error_px(self) -> float:
+        """Mean distance between measured and projected points, as the source document reports it."""
+        return float(np.nanmean(np.hypot(self.residuals_px[..., 0], self.residuals_px[..., 1])))
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Measured coordinates less estimated parameters."""
+        parameters = len(self.free) + len(self.block.deformation) + 6 * self.observations.views
+        return 2 * self.observations.points - parameters
+
+    @property
+    def sigma_px(self) -> float:
+        """Standard deviation of one measured coordinate, estimated from the residuals.
+
+        With a robust loss: Huber's estimate, from the weighted residuals and the share of points
+        that the loss leaves at full weight.
+        """
+        freedom = max(self.degrees_of_freedom, 1)
+        if self.loss == "none":
+            return float(np.sqrt(self.squared_sum / freedom))
+        squared = np.nansum(self.residuals_px**2, axis=2)
+        used = self.observations.present
+        psi = np.sum((self.weights**2 * squared)[used])
+        share = np.mean(self.weights[used])
+        return float(np.sqrt(psi / freedom) / share)
+
+
+def starting_block(
+    observations: Observations, image_size_px: tuple[int, int], skew: bool, free: IntArray | None = None
+) -> Block:
+    """Zhang's closed form as a start, with k1 and k2 by linear least squares where they are free."""
+    guess = initial_guess(observations, image_size_px, skew)
+    intrinsics = np.zeros(len(INTRINSICS))
+    intrinsics[:5] = guess.K[0, 0], guess.K[1, 1], guess.K[0, 2], guess.K[1, 2], guess.K[0, 1]
+    start = Block(intrinsics, guess.R_CT, guess.t_CT_m, np.zeros(0))
+    lens = np.array([INTRINSICS.index("k1"), INTRINSICS.index("k2")])
+    if free is None or not np.isin(lens, free).all():
+        return start
+    at = linearise(start, observations, lens, None)
+    if at is None:
+        return start
+    normal, gradient = at.normal[:, :2, :2].sum(axis=0), at.gradient[:, :2].sum(axis=0)
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    if np.linalg.cond(normal / scale / scale[:, None]) < _WELL_CONDITIONED:
+        intrinsics[lens] = -np.linalg.solve(normal, gradient)
+    return start
+
+
+def calibrate(
+    observations: Observations,
+    image_size_px: tuple[int, int],
+    model: str,
+    *,
+    skew: bool = False,
+    fixed: tuple[str, ...] = (),
+    basis: FloatArray | None = None,
+    loss: str = "none",
+    start: Block | None = None,
+    max_iterations: int = MAX_ITERATIONS,
+    tolerance: float = TOLERANCE,
+) -> Calibration:
+    """Fit a camera to views of a target.
+
+    Parameters
+    ----------
+    model : a key of `model.MODELS`.
+    skew : whether the skew is estimated; otherwise it is zero.
+    fixed : names of intrinsics held at the start's values.
+    basis : (K, 3, M) deformation of the target, which then has to be the same in all views.
+    loss : one of `levenberg.LOSSES`; its scale is the median of the plain fit's residuals.
+    start : where to start; Zhang's closed form by default.
+    tolerance : see `minimise`.
+    """
+    free = free_intrinsics(model, skew, fixed)
+    if start is None:
+        start = starting_block(observations, image_size_px, skew, free)
+    if basis is not None and len(start.deformation) != len(basis):
+        start = Block(start.intrinsics, start.R_CT, start.t_CT_m, np.zeros(len(basis)))
+    if basis is None and len(start.deformation):
+        start = Block(start.intrinsics, start.R_CT, start.t_CT_m, np.zeros(0))
+    found = minimise(start, observations, free, basis, max_iterations=max_iterations, tolerance=tolerance)
+    evaluations, scale_px = found.evaluations, 1.0
+    if loss != "none":
+        for _ in range(3):
+            if found.at is None:
+                break
+            distance = np.hypot(found.at.residuals[:, 0], found.at.residuals[:, 1])
+            # The median of a Rayleigh distribution is 1.1774 sigma.
+            scale_px = max(float(np.median(distance[observations.present])) / 1.1774, 1e-9)
+            found = minimise(
+                found.block, observations, free, basis, loss, scale_px, max_iterations, tolerance
+            )
+            evaluations += found.evaluations
+    camera = camera_from_vector(model, image_size_px, found.block.intrinsics)
+    G, M = len(free) + len(found.block.deformation), observations.pixels.shape[1]
+    if found.at is None:
+        normal = np.full((observations.views, G + 6, G + 6), np.nan)
+        residuals = np.full((observations.views, 2, M), np.nan)
+    else:
+        normal, residuals = found.at.normal, found.at.residuals
+    return Calibration(
+        camera=camera,
+        free=free,
+        block=found.block,
+        basis=basis,
+        observations=observations,
+        residuals_px=np.where(observations.present[..., None], residuals.transpose(0, 2, 1), np.nan),
+        weights=loss_weights(residuals, loss, scale_px),
+        normal=normal,
+        termination=found.reason,
+        evaluations=evaluations,
+        decrement=found.decrement,
+        loss=loss,
+    )
+
+
+def refit_poses(calibration: Calibration, observations: Observations) -> FloatArray:
+    """Residuals (N, M, 2) of other views of the same target with this camera and only poses fitted.
+
+    NaN throughout a view that cannot be fitted.
+    """
+    residuals = np.full(observations.pixels.shape, np.nan)
+    R_CT, t_CT_m = poses_with_camera(calibration.camera, observations)
+    usable = np.flatnonzero(np.isfinite(R_CT).all(axis=(1, 2)) & np.isfinite(t_CT_m).all(axis=1))
+    if len(usable) == 0:
+        return residuals
+    seen = observations.select(usable)
+    if calibration.basis is not None:
+        shape = np.tensordot(calibration.block.deformation, calibration.basis, axes=1)
+        seen = seen.displaced(shape.T)
+    start = Block(vector_from_camera(calibration.camera), R_CT[usable], t_CT_m[usable], np.zeros(0))
+    found = minimise(start, seen, np.zeros(0, dtype=np.int64), tolerance=ENOUGH)
+    if found.at is not None:
+        residuals[usable] = np.where(seen.present[..., None], found.at.residuals.transpose(0, 2, 1), np.nan)
+    return residuals
+
+
+# ----------------------------------------------------------------------
+# Standard deviations of a calibration: intrinsics, poses, and projection over the image.
+#
+# With the normal matrix H of `calib.stages.camera.bundle` and the residuals' variance sigma^2, the
+# covariance of
+# all parameters is sigma^2 H^-1. Its block of the intrinsics is the inverse of the Schur complement S,
+# and for view i
+#
+#     cov(z_i) = V_i^-1 + E_i S^-1 E_i',   cov(s, z_i) = -S^-1 E_i',   E_i = V_i^-1 W_i'.
+#
+# Projection uncertainty asks how far a point that is fixed in the scene would move in the picture if
+# the pictures were taken again (mrcal's question). New pictures change the intrinsics and, with them,
+# all poses; a common rigid motion g = (omega, tau) of the poses, taken in the camera's frame, is
+# invisible and only says where the camera thinks it stands. It is taken as the motion that best
+# explains the change of the poses, weighted by what each view knows,
+#
+#     g = (sum_i G_i' V_i G_i)^-1 sum_i G_i' V_i dz_i,   G_i = [[1, 0], [-[t_i]x, 1]],
+#
+# and the point p of the camera's frame then moves by omega x p + tau before it is projected.
+
+
+@dataclass(frozen=True)
+class Covariance:
+    """Covariance of a calibration's parameters.
+
+    Attributes
+    ----------
+    names : the estimated intrinsics, in order.
+    intrinsics : (P, P); infinite where the data leave a direction free.
+    deformation : (K,) standard deviations of the target's deformation, metres.
+    poses : (N, 6, 6) rotation vector (rad, left of R_CT) and translation (m) of each view.
+    joint : (P + 6, P + 6) of the intrinsics and the common motion g (rad, m).
+    distance_m : median distance of the targets' centres, where projection uncertainty is quoted.
+    """
+
+    names: tuple[str, ...]
+    intrinsics: FloatArray
+    deformation: FloatArray
+    poses: FloatArray
+    joint: FloatArray
+    distance_m: float
+
+    def sigma(self) -> dict[str, float]:
+        """Standard deviation of each estimated intrinsic by name."""
+        variance = np.diag(self.intrinsics)
+        # Where rounding leaves no positive variance the data do not bound it.
+        bounded = np.sqrt(np.where(variance >= 0.0, variance, np.inf))
+        return dict(zip(self.names, bounded.tolist(), strict=True))
+
+
+def _skew(v: FloatArray) -> FloatArray:
+    """Matrices (N, 3, 3) with [v]x w = v x w."""
+    S = np.zeros((len(v), 3, 3))
+    S[:, 0, 1], S[:, 0, 2], S[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
+    return S - S.transpose(0, 2, 1)
+
+
+def covariance(calibration: Calibration, variance_px2: float | None = None) -> Covariance:
+    """Covariance of everything that was estimated.
+
+    Parameters
+    ----------
+    variance_px2 : variance of one measured coordinate; from the residuals by default.
+    """
+    variance = calibration.sigma_px**2 if variance_px2 is None else variance_px2
+    H = calibration.normal
+    P = len(calibration.free)
+    G = P + len(calibration.block.deformation)
+    V, W, U = H[:, G:, G:], H[:, :G, G:], H[:, :G, :G].sum(axis=0)
+    views = len(H)
+    t = calibration.block.t_CT_m
+    distance = float(np.median(np.linalg.norm(t, axis=1)))
+    try:
+        V_inverse = np.linalg.inv(V)
+        E = V_inverse @ W.transpose(0, 2, 1)
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(U), 1e-300))
+        S = (U - np.einsum("ngk,nkh->gh", W, E)) * scale * scale[:, None]
+        if np.linalg.eigvalsh(S)[0] <= 1e-15:
+            raise np.linalg.LinAlgError
+        S_inverse = np.linalg.inv(S) * scale * scale[:, None]
+    except np.linalg.LinAlgError:
+        return Covariance(
+            calibration.free_names,
+            np.diag(np.full(P, np.inf)),
+            np.full(G - P, np.inf),
+            np.full((views, 6, 6), np.inf),
+            np.diag(np.full(P + 6, np.inf)),
+            distance,
+        )
+    poses = V_inverse + E @ S_inverse @ E.transpose(0, 2, 1)
+    motion = np.zeros((views, 6, 6))
+    motion[:, :3, :3] = motion[:, 3:, 3:] = np.eye(3)
+    motion[:, 3:, :3] = -_skew(t)
+    weighted = motion.transpose(0, 2, 1) @ V
+    total = (weighted @ motion).sum(axis=0)
+    # g = sum_i F_i dz_i with F_i = total^-1 G_i' V_i; dz_i = -E_i ds + its own noise.
+    F = np.linalg.solve(total, weighted)
+    of_shared = -np.einsum("nab,nbg->ag", F, E)
+    own = np.einsum("nab,nbc,ndc->ad", F, V_inverse, F)
+    joint = np.zeros((P + 6, P + 6))
+    joint[:P, :P] = S_inverse[:P, :P]
+    joint[P:, :P] = (of_shared @ S_inverse)[:, :P]
+    joint[:P, P:] = joint[P:, :P].T
+    joint[P:, P:] = of_shared @ S_inverse @ of_shared.T + own
+    return Covariance(
+        calibration.free_names,
+        variance * S_inverse[:P, :P],
+        np.sqrt(variance * np.diag(S_inverse)[P:]),
+        variance * poses,
+        variance * joint,
+        distance,
+    )
+
+
+def joint_jacobian(calibration: Calibration, points_C: FloatArray) -> FloatArray:
+    """Derivative (n, 2, P + 6) of the pixels of points (n, 3) by the intrinsics and the common motion g."""
+    n = len(points_C)
+    one = Observations(
+        names=("",), target_m=points_C[None], pixels=np.zeros((1, n, 2)), present=np.ones((1, n), np.bool_)
+    )
+    here = Block(calibration.block.intrinsics, np.eye(3)[None], np.zeros((1, 3)), np.zeros(0))
+    J = jacobian(here, one, calibration.free, None)
+    if J is None:
+        return np.full((n, 2, len(calibration.free) + 6), np.nan)
+    return J[0, :-1].reshape(-1, 2, n).transpose(2, 1, 0)
+
+
+def projection_sigma_px(
+    calibration: Calibration, found: Covariance, pixels: FloatArray, distance_m: float | None = None
+) -> FloatArray:
+    """Standard deviation of projection at these pixels (n, 2), in pixels, shape (n,).
+
+    The root of the larger eigenvalue of the 2 x 2 covariance: the worst direction. NaN where the
+    lens cannot show the pixel.
+
+    Parameters
+    ----------
+    distance_m : distance of the point that is looked at; the targets' median by default.
+    """
+    ideal = undistort(calibration.camera, pixels)
+    rays = np.concatenate([ideal, np.ones((len(ideal), 1))], axis=1)
+    distance = found.distance_m if distance_m is None else distance_m
+    points = distance * rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    seen = np.isfinite(points).all(axis=1)
+    sigma = np.full(len(pixels), np.nan)
+    if not np.all(np.isfinite(found.joint)):
+        return np.where(seen, np.inf, np.nan)
+    if not seen.any():
+        return sigma
+    J = joint_jacobian(calibration, points[seen])
+    cov = J @ found.joint @ J.transpose(0, 2, 1)
+    mean = 0.5 * (cov[:, 0, 0] + cov[:, 1, 1])
+    sigma[seen] = np.sqrt(mean + np.hypot(0.5 * (cov[:, 0, 0] - cov[:, 1, 1]), cov[:, 0, 1]))
+    return sigma
+
+
+def residual_inflation(calibration: Calibration) -> float:
+    """Factor on all standard deviations for residuals that are not white within a view.
+
+    The sandwich estimate: the spread of the views' own scores about what white residuals would
+    give, over the intrinsics. One, never less, where residuals are white.
+    """
+    P = len(calibration.free)
+    G = P + len(calibration.block.deformation)
+    H = calibration.normal
+    block, obs = calibration.block, calibration.observations
+    J = jacobian(block, obs, calibration.free, calibration.basis)
+    if J is None or P == 0 or obs.views < 2:
+        return 1.0
+    V_inverse = np.linalg.inv(H[:, G:, G:])
+    E = V_inverse @ H[:, :G, G:].transpose(0, 2, 1)
+    root = np.sqrt(np.tile(calibration.weights, 2))
+    gradient = np.einsum("nqm,nm->nq", J[:, :-1] * root[:, None], J[:, -1] * root)
+    score = gradient[:, :G] - np.einsum("ngk,nk->ng", E.transpose(0, 2, 1), gradient[:, G:])
+    S = H[:, :G, :G].sum(axis=0) - np.einsum("ngk,nkh->gh", H[:, :G, G:], E)
+    meat = score.T @ score * obs.views / max(obs.views - G / 2.0, 1.0)
+    expected = calibration.sigma_px**2 * S
+    try:
+        ratio = np.trace(np.linalg.solve(expected, meat)) / G
+    except np.linalg.LinAlgError:
+        return 1.0
+    return float(np.sqrt(max(ratio, 1.0)))

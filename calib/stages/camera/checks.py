@@ -1,0 +1,1262 @@
+"""What the views of a calibration say about it: coverage, misfit, evidence, other minima, two cameras."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.core.arrays import BoolArray, FloatArray, IntArray
+from calib.stages.camera.bundle import (
+    Calibration,
+    calibrate,
+    homographies,
+    minimise,
+    poses_from_homographies,
+    poses_with_camera,
+)
+from calib.stages.camera.model import (
+    INTRINSICS,
+    Block,
+    Camera,
+    Observations,
+    camera_from_vector,
+    distort,
+    free_intrinsics,
+    jacobian,
+    project,
+    undistort,
+)
+
+# ----------------------------------------------------------------------
+# How varied the views of a calibration are: tilts, distances, image covered, pictures taken twice.
+#
+# Two views whose boards are parallel say the same about the camera (Zhang 2000, section 4.3), so what
+# counts is not how far a board leans from the picture's plane but how far the boards' normals differ
+# among themselves; a board that never leans in any view is the worst case of that.
+
+_DIRECTIONS = 72
+_MAX_PAIRED = 2000
+"""Views above which repeats are sought among the first ones only."""
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Diversity of the views.
+
+    Attributes
+    ----------
+    mirrored : (N,) views that show the target's back: its points are listed mirrored.
+    tilts_deg : (N,) angle between the board's normal and the optical axis.
+    spread_deg : largest angle between the normals of two views.
+    weaker_spread_deg : standard deviation of the normals along their weaker direction.
+    distances_m : (N,) from the camera to the board's middle.
+    area_share : area of the hull of all points over the image's area.
+    view_share : median over views of the hull of one view over the image's area.
+    cells_share : share of the cells of a 6 x 5 grid over the image that hold a point.
+    empty : which of 3 x 3 parts of the image (rows from the top) hold no point.
+    radius_share : largest distance of a point from the principal point over that of the image's
+        farthest corner.
+    outside_share : share of points more than one pixel outside the image.
+    hull_px : (H, 2) hull of all points.
+    """
+
+    mirrored: BoolArray
+    tilts_deg: FloatArray
+    spread_deg: float
+    weaker_spread_deg: float
+    distances_m: FloatArray
+    area_share: float
+    view_share: float
+    cells_share: float
+    empty: BoolArray
+    radius_share: float
+    outside_share: float
+    hull_px: FloatArray
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Shape of the distortion over the image.
+
+    Attributes
+    ----------
+    seen_slope : least derivative of distorted by undistorted radius over the radii that were seen,
+        relative to the centre.
+    image_slope : the same out to the image's corners; zero or less where the lens folds over.
+    image_shown : share of points along the image's border that the model can show at all.
+    """
+
+    seen_slope: float
+    image_slope: float
+    image_shown: float
+
+
+def hull(points: FloatArray) -> FloatArray:
+    """Extreme points (H, 2) of a set (n, 2) in 72 directions, in order around it: its hull to a percent."""
+    angle = np.linspace(0.0, 2 * np.pi, _DIRECTIONS, endpoint=False)
+    extreme = np.argmax(np.stack([np.cos(angle), np.sin(angle)], axis=1) @ points.T, axis=1)
+    kept = np.flatnonzero(np.diff(extreme, prepend=extreme[-1]) != 0)
+    return np.asarray(points[extreme[kept]] if len(kept) else points[extreme[:1]])
+
+
+def _area(corners: FloatArray) -> float:
+    x, y = corners[:, 0], corners[:, 1]
+    return float(0.5 * abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)))
+
+
+def inside_hull(points: FloatArray, corners: FloatArray) -> BoolArray:
+    """Which points (n, 2) lie inside a convex polygon (H, 2)."""
+    side = np.roll(corners, -1, axis=0) - corners
+    offset = points[:, None] - corners
+    turn = side[:, 0] * offset[..., 1] - side[:, 1] * offset[..., 0]
+    return np.asarray(np.all(turn >= -1e-9, axis=1) | np.all(turn <= 1e-9, axis=1))
+
+
+def target_box(calibration: Calibration) -> FloatArray:
+    """Corners (4, 3) of the box around all points of the target, on its plane."""
+    observations = calibration.observations
+    target = np.broadcast_to(observations.target_m, (*observations.pixels.shape[:2], 3))
+    used = target[observations.present]
+    (x0, y0), (x1, y1) = used[:, :2].min(axis=0), used[:, :2].max(axis=0)
+    return np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
+
+
+def coverage(calibration: Calibration) -> Coverage:
+    """Diversity of the views of a calibration and the part of the image that they cover."""
+    observations, camera, block = calibration.observations, calibration.camera, calibration.block
+    width, height = camera.image_size_px
+    pixels = observations.pixels[observations.present]
+    outline = hull(pixels)
+    areas = [_area(hull(p[on])) for p, on in zip(observations.pixels, observations.present, strict=True)]
+    cells = _cells(pixels, camera, 6, 5)
+    normals = block.R_CT[:, :, 2]
+    # A mirrored list of points turns the board's back to the camera; its plane leans the same way.
+    normals = normals * np.where(normals[:, 2:] < 0.0, -1.0, 1.0)
+    middle = block.R_CT @ target_box(calibration).mean(axis=0) + block.t_CT_m
+    centre = np.array([camera.cx_px, camera.cy_px])
+    corner = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], dtype=np.float64)
+    outside = (pixels < -1.0) | (pixels > np.array([width, height], dtype=np.float64))
+    return Coverage(
+        mirrored=block.R_CT[:, 2, 2] < 0.0,
+        tilts_deg=np.degrees(np.arccos(np.clip(normals[:, 2], 0.0, 1.0))),
+        spread_deg=_widest_angle_deg(normals),
+        weaker_spread_deg=_weaker_spread_deg(normals),
+        distances_m=np.linalg.norm(middle, axis=1),
+        area_share=_area(outline) / (width * height),
+        view_share=float(np.median(areas)) / (width * height),
+        cells_share=float(np.mean(cells)),
+        empty=~_cells(pixels, camera, 3, 3),
+        radius_share=float(
+            np.linalg.norm(pixels - centre, axis=1).max() / np.linalg.norm(corner - centre, axis=1).max()
+        ),
+        outside_share=float(outside.any(axis=1).mean()),
+        hull_px=outline,
+    )
+
+
+def _cells(pixels: FloatArray, camera: Camera, columns: int, rows: int) -> BoolArray:
+    width, height = camera.image_size_px
+    column = np.clip((pixels[:, 0] + 0.5) / width * columns, 0, columns - 1).astype(np.int64)
+    row = np.clip((pixels[:, 1] + 0.5) / height * rows, 0, rows - 1).astype(np.int64)
+    hit = np.zeros((rows, columns), dtype=np.bool_)
+    hit[row, column] = True
+    return hit
+
+
+def _widest_angle_deg(normals: FloatArray) -> float:
+    """Largest angle between two normals, exact for few views and to a degree for many."""
+    some = normals[:: max(1, len(normals) // _MAX_PAIRED)]
+    return float(np.degrees(np.arccos(np.clip((some @ some.T).min(), -1.0, 1.0))))
+
+
+def _weaker_spread_deg(normals: FloatArray) -> float:
+    if len(normals) < 2:
+        return 0.0
+    singular = np.linalg.svd(normals - normals.mean(axis=0), compute_uv=False)
+    # The third is the curvature of the sphere, the second the weaker direction on it.
+    return float(np.degrees(singular[1] / np.sqrt(len(normals) - 1)))
+
+
+def repeated_views(calibration: Calibration, limit_px: float) -> IntArray:
+    """For each view the first view that shows the board in the same place, or its own index, (N,).
+
+    The same place: the corners of the target's box are seen within `limit_px`, root mean square.
+    Found from the poses, so that views of different points of a target can be compared.
+    """
+    block, camera = calibration.block, calibration.camera
+    first = np.arange(len(block.R_CT))
+    count = min(len(first), _MAX_PAIRED)
+    seen = target_box(calibration) @ block.R_CT[:count].transpose(0, 2, 1) + block.t_CT_m[:count, None]
+    # Without distortion, which may fold over outside of the image; the pixels are off by little.
+    flat = (seen[..., :2] / np.maximum(seen[..., 2:], 1e-9)).reshape(count, 8)
+    flat = flat * np.sqrt(abs(camera.fx_px * camera.fy_px))
+    square = (flat**2).sum(axis=1)
+    apart = np.maximum(square[:, None] + square - 2 * flat @ flat.T, 0.0) / 4
+    near = (apart < limit_px**2 + 1e-12 * square.max()) & (np.arange(count) < np.arange(count)[:, None])
+    for i in np.flatnonzero(near.any(axis=1)):
+        first[i] = first[int(np.argmax(near[i]))]
+    return first
+
+
+def image_outline(camera: Camera, per_side: int = 9) -> FloatArray:
+    """Pixels (4 * (per_side - 1), 2) along the image's border."""
+    width, height = camera.image_size_px
+    u, v = np.linspace(0, width - 1, per_side), np.linspace(0, height - 1, per_side)
+    top = np.stack([u[:-1], np.zeros(per_side - 1)], axis=1)
+    right = np.stack([np.full(per_side - 1, width - 1.0), v[:-1]], axis=1)
+    return np.concatenate([top, right, [width - 1, height - 1] - top, [width - 1, height - 1] - right])
+
+
+def lens_shape(calibration: Calibration) -> Lens:
+    """Whether the distortion is monotonic over the radii that were seen and over the image."""
+    camera, block, observations = calibration.camera, calibration.block, calibration.observations
+    points = observations.target_m @ block.R_CT.transpose(0, 2, 1) + block.t_CT_m[:, None]
+    radii = np.hypot(points[..., 0], points[..., 1]) / np.maximum(points[..., 2], 1e-9)
+    seen = float(radii[observations.present].max())
+    border = undistort(camera, image_outline(camera))
+    shown = np.isfinite(border).all(axis=1)
+    reach = float(np.hypot(*border[shown].T).max()) if shown.any() else seen
+    image_slope = _least_slope(camera, max(reach, seen))
+    return Lens(
+        seen_slope=_least_slope(camera, seen),
+        image_slope=image_slope if shown.all() else min(image_slope, 0.0),
+        image_shown=float(shown.mean()),
+    )
+
+
+def _least_slope(camera: Camera, radius: float) -> float:
+    """Least slope of the radial curve up to an undistorted radius."""
+    r = np.linspace(0.0, radius, 201)
+    radial = camera.distortion.copy()
+    radial[2:4] = 0.0
+    distorted, _ = distort(r, np.zeros_like(r), radial)
+    return float(np.min(np.diff(distorted) / np.diff(r)))
+
+
+# ----------------------------------------------------------------------
+# Views and points that do not fit: told from the correspondences alone, and from the residuals.
+#
+# A plane seen through a lens follows a homography up to distortion, a smooth bulge of at most a tenth of
+# the board's extent in the picture. Points in another order, from another board or on one line do not, and
+# one such view can keep a whole calibration from finding a camera. After the fit the residuals tell views
+# and points that are far worse than the others, and errors that repeat from view to view.
+
+_FLAT = 2e-3
+"""Smaller over larger extent of a set of points below which they lie on a line."""
+_OFF_PLANE = 0.2
+"""Departure from a homography over the extent in the picture; 100 degrees of barrel make 0.1."""
+
+
+@dataclass(frozen=True)
+class Screening:
+    """What is wrong with each view, all (N,).
+
+    Attributes
+    ----------
+    few : fewer than four points.
+    on_a_line : the target's points, or their pixels, lie on one line.
+    not_a_plane : no homography explains the pixels.
+    departure : root mean square departure from a homography over the extent in the picture; NaN in
+        the other two cases.
+    """
+
+    few: BoolArray
+    on_a_line: BoolArray
+    not_a_plane: BoolArray
+    departure: FloatArray
+
+    @property
+    def unusable(self) -> BoolArray:
+        """Views with any of these, (N,)."""
+        return self.few | self.on_a_line | self.not_a_plane
+
+
+def _flatness(points: FloatArray, present: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Smaller over larger, and larger, standard deviation of sets of points (N, M, 2), each (N,)."""
+    count = np.maximum(present.sum(axis=1), 1)
+    weight = present[..., None] / count[:, None, None]
+    off = (points - (points * weight).sum(axis=1, keepdims=True)) * present[..., None]
+    scatter = np.einsum("nmi,nmj->nij", off, off) / count[:, None, None]
+    values = np.sqrt(np.maximum(np.linalg.eigvalsh(scatter), 0.0))
+    return values[:, 0] / np.maximum(values[:, 1], 1e-300), values[:, 1]
+
+
+def screen(observations: Observations) -> Screening:
+    """Look for views that cannot be views of the plane."""
+    present, pixels = observations.present, observations.pixels
+    target = np.broadcast_to(observations.target_m, (*present.shape, 3))
+    few = present.sum(axis=1) < 4
+    extent = _flatness(pixels, present)[1]
+    line = (_flatness(target[..., :2], present)[0] < _FLAT) | (_flatness(pixels, present)[0] < _FLAT)
+    departure = np.full(observations.views, np.nan)
+    usable = np.flatnonzero(~few & ~line)
+    if len(usable):
+        chosen = observations.select(usable)
+        H = homographies(chosen)
+        plane = np.broadcast_to(chosen.target_m[..., :2], chosen.pixels.shape)
+        mapped = np.einsum("nij,nmj->nmi", H[..., :2], plane) + H[:, None, :, 2]
+        depth = np.where(np.abs(mapped[..., 2:]) > 1e-12, mapped[..., 2:], 1e-12)
+        off = np.where(chosen.present, ((mapped[..., :2] / depth - chosen.pixels) ** 2).sum(axis=2), 0.0)
+        rms = np.sqrt(off.sum(axis=1) / chosen.present.sum(axis=1))
+        departure[usable] = rms / np.maximum(extent[usable], 1e-300)
+    return Screening(few, line & ~few, np.nan_to_num(departure) > _OFF_PLANE, departure)
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """What the residuals show.
+
+    Attributes
+    ----------
+    rms_px : over all points.
+    view_rms_px : (N,).
+    typical_px : median of `view_rms_px`.
+    bad_views : (N,) views whose RMS is far above the others'.
+    bad_points : (N, M) points outside of bad views whose residual is far above the others'.
+    points : how many points there are outside of bad views.
+    heavy_share : share of squared residuals that the worst percent of points holds; 0.05 when normal.
+    repeated : root mean square over the target's points of the mean residual over views, in the
+        target's frame, over what it would be if the views' errors were independent.
+    """
+
+    rms_px: float
+    view_rms_px: FloatArray
+    typical_px: float
+    bad_views: BoolArray
+    bad_points: BoolArray
+    points: int
+    heavy_share: float
+    repeated: float
+
+
+def misfit(calibration: Calibration, view_factor: float, point_factor: float, floor_px: float) -> Misfit:
+    """Judge the residuals of a calibration.
+
+    Parameters
+    ----------
+    view_factor : a view is bad above this many times the median RMS of the views ...
+    point_factor : a point above this many times its view's and the median view's RMS ...
+    floor_px : ... and above this many pixels.
+    """
+    residuals, present = calibration.residuals_px, calibration.observations.present
+    squared = np.where(present, (residuals**2).sum(axis=2), 0.0)
+    squared = np.where(present, squared, 0.0)
+    per_view = np.sqrt(squared.sum(axis=1) / np.maximum(present.sum(axis=1), 1))
+    # A bad view drags the camera and raises its neighbours' residuals, so the lower half is the measure.
+    typical = float(np.median(per_view))
+    quiet = float(np.median(np.sort(per_view)[: (len(per_view) + 1) // 2]))
+    bad_views = per_view > max(view_factor * quiet, floor_px)
+    fine = present & ~bad_views[:, None]
+    distance = np.sqrt(squared)
+    median = _median_distance(distance, fine)
+    bad_points = fine & (distance > np.maximum(point_factor * median[:, None], floor_px))
+    ordered = np.sort(squared[fine])
+    worst = max(1, len(ordered) // 100)
+    return Misfit(
+        rms_px=calibration.rms_px,
+        view_rms_px=per_view,
+        typical_px=typical,
+        bad_views=bad_views,
+        bad_points=bad_points,
+        points=int(fine.sum()),
+        heavy_share=float(ordered[-worst:].sum() / max(ordered.sum(), 1e-300)) if len(ordered) else 0.0,
+        repeated=_repeated(calibration),
+    )
+
+
+def _median_distance(distance: FloatArray, fine: BoolArray) -> FloatArray:
+    """Median residual of each view, and not below that of all, (N,)."""
+    hidden = np.where(fine, distance, np.nan)
+    everything = float(np.median(distance[fine])) if fine.any() else 0.0
+    own = np.full(len(distance), everything)
+    some = fine.any(axis=1)
+    own[some] = np.nanmedian(hidden[some], axis=1)
+    return np.asarray(np.maximum(own, everything))
+
+
+def _repeated(calibration: Calibration) -> float:
+    """Mean residual of each target point over views, in the target's axes; one when independent."""
+    observations = calibration.observations
+    if not observations.same_target or observations.views < 4:
+        return 1.0
+    block = calibration.block
+    # Directions of the target's axes in the picture, turned back, lengths left out.
+    axes = block.R_CT[:, :2, :2]
+    U, _, Vt = np.linalg.svd(axes)
+    turned = np.einsum("nmi,nij->nmj", np.nan_to_num(calibration.residuals_px), U @ Vt)
+    count = np.maximum(observations.present.sum(axis=0), 1)
+    mean = turned.sum(axis=0) / count[:, None]
+    spread = float((turned**2).sum() / max(2 * observations.points, 1))
+    if spread <= 0.0:
+        return 1.0
+    return float(np.sqrt((mean**2 * count[:, None]).mean() / spread))
+
+
+# ----------------------------------------------------------------------
+# What each view says about the intrinsics, its own pose eliminated.
+#
+# To second order about the solution, the cost of view i when the shared parameters move by d and the
+# view's pose follows is
+#
+#     c_i(d) = c_i + 2 b_i' d + d' S_i d,   S_i = U_i - W_i V_i^-1 W_i',   b_i = g_i - W_i V_i^-1 g_zi
+#
+# with the blocks of `calib.stages.camera.bundle`. Views are independent given d, so that any question about
+# groups of views (one camera or two, early or late, with or without a view) is answered by sums of
+# S_i and b_i: the cost of a group falls by b' S^-1 b, b and S summed over the group.
+#
+# Deformations of the target enter as further shared parameters that rest at zero.
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Quadratic cost of every view about a calibration.
+
+    Attributes
+    ----------
+    names : G names of the shared parameters: free intrinsics, then deformations.
+    intrinsics : how many of them are intrinsics.
+    S : (N, G, G) information of each view, pixels squared per unit squared.
+    b : (N, G) half the gradient of each view's cost.
+    cost : (N,) sums of squared residuals, pixels squared.
+    measured : (N,) measured coordinates of each view.
+    sigma_px : standard deviation of one coordinate.
+    """
+
+    names: tuple[str, ...]
+    intrinsics: int
+    S: FloatArray
+    b: FloatArray
+    cost: FloatArray
+    measured: IntArray
+    sigma_px: float
+
+    def camera_only(self) -> Evidence:
+        """The same about the intrinsics alone, the target rigid."""
+        P = self.intrinsics
+        return Evidence(
+            self.names[:P], P, self.S[:, :P, :P], self.b[:, :P], self.cost, self.measured, self.sigma_px
+        )
+
+
+def evidence(
+    calibration: Calibration, basis: FloatArray | None = None, names: tuple[str, ...] = ()
+) -> Evidence:
+    """Information of each view about the free intrinsics and, with `basis`, the target's deformation.
+
+    Parameters
+    ----------
+    basis : (1 or N, K, 3, M) displacements of the target's points in metres, view by view.
+    names : K names of the deformations.
+    """
+    block, observations = calibration.block, calibration.observations
+    if calibration.basis is not None:
+        shape = np.tensordot(block.deformation, calibration.basis, axes=1)
+        observations = observations.displaced(shape.T)
+    J = jacobian(block, observations, calibration.free, None)
+    if J is None:
+        raise ValueError("the calibration has points behind the camera")
+    views, P = observations.views, len(calibration.free)
+    shared, poses, residuals = J[:, :P], J[:, P : P + 6], J[:, -1]
+    if basis is not None:
+        # du/dX = a R with a = du/dt, the last three rows of the pose.
+        a = poses[:, 3:].reshape(views, 3, 2, -1)
+        in_target = np.einsum("ncsm,ncd->ndsm", a, block.R_CT)
+        spread = np.broadcast_to(basis, (views, *basis.shape[1:]))
+        rows = np.einsum("ndsm,nkdm->nksm", in_target, spread)
+        shared = np.concatenate([shared, rows.reshape(views, basis.shape[1], -1)], axis=1)
+    V = poses @ poses.transpose(0, 2, 1)
+    W = shared @ poses.transpose(0, 2, 1)
+    right = np.concatenate([W.transpose(0, 2, 1), (poses @ residuals[..., None])], axis=2)
+    solved = np.linalg.solve(V, right)
+    G = shared.shape[1]
+    S = shared @ shared.transpose(0, 2, 1) - W @ solved[..., :G]
+    b = (shared @ residuals[..., None] - W @ solved[..., G:])[..., 0]
+    return Evidence(
+        names=tuple(INTRINSICS[i] for i in calibration.free) + names,
+        intrinsics=P,
+        S=0.5 * (S + S.transpose(0, 2, 1)),
+        b=b,
+        cost=(residuals**2).sum(axis=1),
+        measured=2 * observations.present.sum(axis=1),
+        sigma_px=calibration.sigma_px,
+    )
+
+
+def scaled_inverse(S: FloatArray, floor: float = 1e-13) -> FloatArray:
+    """Pseudo-inverse of symmetric matrices (..., G, G) after scaling their diagonals to one.
+
+    Directions that hold less than `floor` of the scaled information are left out.
+    """
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(S, axis1=-2, axis2=-1), 1e-300))
+    values, vectors = np.linalg.eigh(S * scale[..., :, None] * scale[..., None, :])
+    kept = values > floor * np.maximum(values[..., -1:], 1e-300)
+    inverse = np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)
+    middle = (vectors * inverse[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    return np.asarray(middle * scale[..., :, None] * scale[..., None, :])
+
+
+def gain(S: FloatArray, b: FloatArray) -> FloatArray:
+    """Fall of the cost b' S^-1 b when groups (..., G, G), (..., G) may choose their own parameters."""
+    return np.asarray(np.einsum("...g,...gh,...h->...", b, scaled_inverse(S), b))
+
+
+def overdispersion(found: Evidence) -> float:
+    """Factor on standard deviations for views that disagree more than white residuals would.
+
+    The sandwich estimate: the views' own scores against what they should scatter by. Never below one.
+    """
+    views, G = found.b.shape
+    if views < 2 or G == 0:
+        return 1.0
+    S = found.S.sum(axis=0)
+    scatter = found.b.T @ found.b * views / max(views - G / 2.0, 1.0)
+    ratio = np.trace(scaled_inverse(S) @ scatter) / (G * found.sigma_px**2)
+    return float(np.sqrt(max(ratio, 1.0)))
+
+
+# ----------------------------------------------------------------------
+# Is the target what it is said to be: flat, its squares square?
+#
+# A wrong target leaves residuals that repeat from view to view in the target's own frame. Five
+# deformations that a printed sheet really shows are tried at once, as shared parameters that rest at
+# zero: the height of the squares over their width, shear, a bow along each axis and a twist. One
+# Gauss-Newton step from the solution, poses and intrinsics following, gives each with its standard
+# deviation; the problem is close to linear in deformations that are small beside the distance.
+
+DEFORMATIONS = ("aspect", "shear", "bow_x", "bow_y", "twist")
+
+
+@dataclass(frozen=True)
+class TargetShape:
+    """Deformation of the target that explains the residuals best.
+
+    Attributes
+    ----------
+    aspect, aspect_sigma : height of what is said to be a square over its width, less one.
+    bow_m : largest departure from flatness between the target's middle and its border.
+    bow_significance : square root of the Wald statistic of the three bows, over its degrees of freedom.
+    size_m : longer side of the target.
+    rms_drop : share by which the RMS would fall with all five deformations.
+    focal_shift : share by which fx would move.
+    focal_per_bow : share by which fx moves for a bow of half a percent of the target's size.
+    values, sigma : (5,) in the order of `DEFORMATIONS`; slopes, and metres for bows and twist.
+    displacement_m : (1 or N, M, 3) of the target's points, all five together.
+    """
+
+    aspect: float
+    aspect_sigma: float
+    bow_m: float
+    bow_significance: float
+    size_m: float
+    rms_drop: float
+    focal_shift: float
+    focal_per_bow: float
+    values: FloatArray
+    sigma: FloatArray
+    displacement_m: FloatArray
+
+
+def _basis(calibration: Calibration) -> tuple[FloatArray, float]:
+    """Displacements (1 or N, 5, 3, M) of the points, and half the target's longer side."""
+    target = calibration.observations.target_m
+    present = np.broadcast_to(calibration.observations.present, calibration.observations.pixels.shape[:2])
+    used = np.broadcast_to(target, (*present.shape, 3))[present]
+    low, high = used[:, :2].min(axis=0), used[:, :2].max(axis=0)
+    half = 0.5 * float((high - low).max())
+    x, y = np.moveaxis(target[..., :2] - 0.5 * (low + high), 2, 0)
+    basis = np.zeros((target.shape[0], 5, 3, target.shape[1]))
+    basis[:, 0, 1] = y
+    basis[:, 1, 0] = y
+    basis[:, 2, 2] = 1.0 - (x / half) ** 2
+    basis[:, 3, 2] = 1.0 - (y / half) ** 2
+    basis[:, 4, 2] = x * y / half**2
+    return basis, half
+
+
+def target_shape(calibration: Calibration) -> TargetShape | None:
+    """Deformation of the target; None where the data are too few to say."""
+    if calibration.degrees_of_freedom <= 2 * len(DEFORMATIONS) or len(calibration.free) == 0:
+        return None
+    basis, half = _basis(calibration)
+    found = evidence(calibration, basis, DEFORMATIONS)
+    P = found.intrinsics
+    S, b = found.S.sum(axis=0), found.b.sum(axis=0)
+    inverse = scaled_inverse(S, 1e-12)
+    step = -inverse @ b
+    left = max(calibration.squared_sum - float(gain(S, b)), 0.0)
+    freedom = max(calibration.degrees_of_freedom - len(DEFORMATIONS), 1)
+    inflation = overdispersion(found)
+    # Noise after the deformations are taken out, lest they hide in their own residuals.
+    cov = inverse * (left / freedom) * inflation**2
+    sigma = np.sqrt(np.maximum(np.diag(cov), 0.0))
+    bows = step[P + 2 :]
+    wald = float(bows @ np.linalg.pinv(cov[P + 2 :, P + 2 :], hermitian=True) @ bows)
+    fx_at = found.names.index("fx_px") if "fx_px" in found.names else -1
+    fx = calibration.camera.fx_px
+    coupling = -scaled_inverse(S[:P, :P]) @ S[:P, P:] if fx_at >= 0 else np.zeros((1, 5))
+    row = coupling[fx_at] if fx_at >= 0 else coupling[0]
+    return TargetShape(
+        aspect=float(step[P]),
+        aspect_sigma=float(sigma[P]),
+        bow_m=_departure(bows, basis[:, 2:, 2]),
+        bow_significance=float(np.sqrt(wald / 3)),
+        size_m=2 * half,
+        rms_drop=1.0 - float(np.sqrt(left / max(calibration.squared_sum, 1e-300))),
+        focal_shift=float(step[fx_at] / fx) if fx_at >= 0 else 0.0,
+        focal_per_bow=float(np.abs(row[2:4]).max() * 0.01 * half / fx),
+        values=step[P:],
+        sigma=sigma[P:],
+        displacement_m=np.tensordot(step[P:], basis, axes=(0, 1)).transpose(0, 2, 1),
+    )
+
+
+def _departure(bows: FloatArray, shapes: FloatArray) -> float:
+    """Range of the bent surface over the points, metres."""
+    z = np.tensordot(bows, shapes, axes=(0, 1))
+    return float(z.max() - z.min())
+
+
+# ----------------------------------------------------------------------
+# Whether the minimum that was found is the minimum: other starts, and the profile over focal length.
+#
+# The local covariance of a calibration is a statement about the bottom of one valley. Two things it
+# cannot see: another valley as deep, and a valley that is flat and curved, along which the focal length
+# runs away. Both are looked for by minimising again.
+#
+# The profile is the cost as a function of fx with everything else minimised. The interval of fx in
+# which it rises by less than 3.84 sigma^2 holds the truth with 95 % probability (Wilks) however
+# lopsided it is.
+#
+# The rational model comes here `conditioned`: its denominator trades with the numerator at next to no
+# cost, and the searches would never end.
+
+FOCAL_STARTS = (0.4, 0.7, 1.1, 1.8, 4.0)
+"""Focal lengths of the starts, over the longer side of the image."""
+
+_CHI2_95 = 3.84
+_MAX_ITERATIONS = 60
+_MAX_VIEWS = 60
+_NEARLY = 1.02
+"""Cost of five coefficients over that of the rational model below which they do."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where one start ended.
+
+    Attributes
+    ----------
+    focal_px : focal length that it began with.
+    block : where it ended.
+    cost : sum of squared residuals there, pixels squared.
+    termination : as `Calibration.termination`.
+    """
+
+    focal_px: float
+    block: Block
+    cost: float
+    termination: str
+
+
+def resolved(calibration: Calibration, index: IntArray) -> Calibration:
+    """The calibration from some of its views only, same model and loss, started where it is."""
+    camera, block = calibration.camera, calibration.block
+    start = Block(block.intrinsics, block.R_CT[index], block.t_CT_m[index], block.deformation)
+    return calibrate(
+        calibration.observations.select(index),
+        camera.image_size_px,
+        camera.model,
+        skew=INTRINSICS.index("skew_px") in calibration.free,
+        fixed=held(calibration),
+        basis=calibration.basis,
+        loss=calibration.loss,
+        start=start,
+    )
+
+
+def held(calibration: Calibration) -> tuple[str, ...]:
+    """Names of intrinsics that the model has and the calibration does not estimate."""
+    every = free_intrinsics(calibration.camera.model, True)
+    return tuple(INTRINSICS[i] for i in every if i not in calibration.free)
+
+
+def conditioned(calibration: Calibration) -> Calibration:
+    """The same views without the freedom of the rational model's denominator; other models as they are.
+
+    The denominator trades with the numerator at next to no cost, so that what it leaves undetermined
+    says nothing about the camera. Where five coefficients do nearly as well they take its place, else
+    the denominator is held at its values.
+    """
+    loose = [INTRINSICS.index(name) for name in ("k4", "k5", "k6")]
+    kept = np.flatnonzero(~np.isin(calibration.free, loose))
+    if len(kept) == len(calibration.free):
+        return calibration
+    if all(name in calibration.free_names for name in ("k1", "k2", "p1", "p2", "k3")):
+        block, camera = calibration.block, calibration.camera
+        intrinsics = block.intrinsics.copy()
+        intrinsics[INTRINSICS.index("k1") :] = 0.0
+        simpler = calibrate(
+            calibration.observations,
+            camera.image_size_px,
+            "brown5",
+            skew="skew_px" in calibration.free_names,
+            fixed=tuple(name for name in held(calibration) if name != "skew_px"),
+            start=replace(block, intrinsics=intrinsics),
+            max_iterations=_MAX_ITERATIONS,
+        )
+        if simpler.converged and simpler.squared_sum < _NEARLY * calibration.squared_sum:
+            return simpler
+    rows = np.concatenate([kept, np.arange(len(calibration.free), calibration.normal.shape[1])])
+    normal = calibration.normal[:, rows][:, :, rows]
+    return replace(calibration, free=calibration.free[kept], normal=normal)
+
+
+def other_starts(calibration: Calibration, seed: int = 0) -> list[Start]:
+    """Minima reached from focal lengths of 0.4 to 4 image widths and principal points about the centre."""
+    rng = np.random.default_rng(seed)
+    observations, camera = calibration.observations, calibration.camera
+    width, height = camera.image_size_px
+    H = homographies(observations)
+    free = calibration.free
+    ends = []
+    for share in FOCAL_STARTS:
+        focal = share * max(width, height)
+        jitter = rng.uniform(-0.08, 0.08, 2) * (width, height)
+        guess = calibration.block.intrinsics.copy()
+        guess[calibration.free] = 0.0
+        for name, value in zip(
+            ("fx_px", "fy_px", "cx_px", "cy_px"),
+            (focal, focal, 0.5 * (width - 1) + jitter[0], 0.5 * (height - 1) + jitter[1]),
+            strict=True,
+        ):
+            index = INTRINSICS.index(name)
+            if index in free:
+                guess[index] = value
+        K = np.array([[guess[0], guess[4], guess[2]], [0.0, guess[1], guess[3]], [0.0, 0.0, 1.0]])
+        R_CT, t_CT_m = poses_from_homographies(K, H)
+        if not (np.all(np.isfinite(R_CT)) and np.all(np.isfinite(t_CT_m))):
+            continue
+        start = Block(guess, R_CT, t_CT_m, np.zeros(0))
+        found = minimise(start, observations, free, max_iterations=_MAX_ITERATIONS)
+        if found.at is not None:
+            ends.append(Start(focal, found.block, found.at.cost, found.reason))
+    return ends
+
+
+def best_of_starts(calibration: Calibration) -> Calibration:
+    """The calibration, or the one that another start leads to if its cost is lower by more than chance.
+
+    More than chance: by more than 3.84 times the residuals' variance. Above 60 views the starts are
+    tried on an even sample of them. A robust loss or a deformed target is returned as it is.
+    """
+    if calibration.basis is not None or calibration.loss != "none":
+        return calibration
+    some, views = calibration, calibration.observations.views
+    chance = _CHI2_95 * calibration.sigma_px**2
+    if views > _MAX_VIEWS:
+        index = np.unique(np.linspace(0, views - 1, _MAX_VIEWS).astype(np.int64))
+        some = _part(calibration, index)
+        # On a sample the fit to all views is not the best, by about its number of parameters.
+        chance *= len(calibration.free)
+    ends = other_starts(some)
+    if not ends:
+        return calibration
+    best = min(ends, key=lambda end: end.cost)
+    if best.cost > _cost(some) - chance:
+        return calibration
+    camera, start = calibration.camera, best.block
+    if some is not calibration:
+        found = camera_from_vector(camera.model, camera.image_size_px, start.intrinsics)
+        R_CT, t_CT_m = poses_with_camera(found, calibration.observations)
+        if not (np.all(np.isfinite(R_CT)) and np.all(np.isfinite(t_CT_m))):
+            return calibration
+        start = Block(start.intrinsics, R_CT, t_CT_m, np.zeros(0))
+    better = calibrate(
+        calibration.observations,
+        camera.image_size_px,
+        camera.model,
+        skew=INTRINSICS.index("skew_px") in calibration.free,
+        fixed=held(calibration),
+        start=start,
+    )
+    return better if _cost(better) < _cost(calibration) - _CHI2_95 * better.sigma_px**2 else calibration
+
+
+def _part(calibration: Calibration, index: IntArray) -> Calibration:
+    """Some views of a calibration as they are, not fitted anew."""
+    block = calibration.block
+    return replace(
+        calibration,
+        observations=calibration.observations.select(index),
+        block=replace(block, R_CT=block.R_CT[index], t_CT_m=block.t_CT_m[index]),
+        residuals_px=calibration.residuals_px[index],
+        weights=calibration.weights[index],
+        normal=calibration.normal[index],
+    )
+
+
+def _cost(calibration: Calibration) -> float:
+    """Sum of squared residuals, infinite where the fit has none."""
+    return calibration.squared_sum if np.all(np.isfinite(calibration.normal)) else float("inf")
+
+
+@dataclass(frozen=True)
+class FocalInterval:
+    """Interval of fx that the data allow.
+
+    Attributes
+    ----------
+    low_px, high_px : ends; 0 and infinity where the cost does not rise enough.
+    fx_px : where the minimum lies.
+    lower_cost : a cost below the minimum was met on the way.
+    """
+
+    low_px: float
+    high_px: float
+    fx_px: float
+    lower_cost: bool
+
+    @property
+    def bounded(self) -> bool:
+        """Whether both ends were found."""
+        return self.low_px > 0.0 and bool(np.isfinite(self.high_px))
+
+    @property
+    def half_width_share(self) -> float:
+        """Half the width over fx; infinite where the interval is unbounded."""
+        if not self.bounded:
+            return float("inf")
+        return 0.5 * (self.high_px - self.low_px) / self.fx_px
+
+
+def focal_interval(calibration: Calibration, sigma_fx_px: float, inflation: float) -> FocalInterval:
+    """95 % interval of fx from the profile of the cost.
+
+    Parameters
+    ----------
+    sigma_fx_px : standard deviation of fx from the covariance, without inflation; sets the first step.
+    inflation : factor on standard deviations for residuals that are not white.
+    """
+    fx = calibration.camera.fx_px
+    own = calibration.squared_sum
+    target = _CHI2_95 * (inflation * calibration.sigma_px) ** 2
+    free = calibration.free
+    free = free[free != INTRINSICS.index("fx_px")]
+    first = min(1.96 * sigma_fx_px * inflation, 0.15 * fx) if np.isfinite(sigma_fx_px) else 0.1 * fx
+    first = max(first, 1e-9 * fx)
+    lower = False
+    ends = []
+    for sign in (-1.0, 1.0):
+        at, block, rise, here = 0.0, calibration.block, 0.0, first
+        end = np.inf
+        for _ in range(8):
+            trial = fx + sign * here
+            if not 0.15 * fx < trial < 7.0 * fx:
+                break
+            moved = _with_fx(block, trial, INTRINSICS.index("fy_px") in free)
+            found = minimise(moved, calibration.observations, free, max_iterations=30)
+            if found.at is None or not np.isfinite(found.at.cost):
+                break
+            now = found.at.cost - own
+            if now < -0.1 * target:
+                lower = True
+                break
+            if now >= target:
+                # The rise is close to a parabola between two points of its root.
+                root_at, root_now = np.sqrt(max(rise, 0.0)), np.sqrt(now)
+                end = at + (here - at) * (np.sqrt(target) - root_at) / max(root_now - root_at, 1e-300)
+                break
+            at, block, rise = here, found.block, now
+            # Where the parabola would reach the target, at least a tenth and at most three times on.
+            here *= float(np.clip(1.05 * np.sqrt(target / max(now, 1e-3 * target)), 1.1, 3.0))
+        ends.append(fx + sign * end)
+    return FocalInterval(max(ends[0], 0.0), ends[1], fx, lower)
+
+
+def _with_fx(block: Block, fx_px: float, with_fy: bool) -> Block:
+    """Another fx, with distances and fy following it, which keeps the pictures nearly the same."""
+    ratio = fx_px / block.intrinsics[0]
+    intrinsics: FloatArray = block.intrinsics.copy()
+    intrinsics[: 2 if with_fy else 1] *= ratio
+    # The boards' distances are proportional to the focal length.
+    t = block.t_CT_m * np.array([1.0, 1.0, ratio])
+    return replace(block, intrinsics=intrinsics, t_CT_m=t)
+
+
+# ----------------------------------------------------------------------
+# One camera or two: do some views come from another camera, or from the same lens refocused?
+#
+# A set mixed from two cameras can fit one at a low RMS, because every view's pose bends to the
+# camera's will. Splitting the views always lowers the cost, also where there is one camera, so the fall
+# has to be compared with what it would be by chance. With the quadratic evidence of each view
+# (`calib.stages.camera.checks`) a split costs next to nothing:
+#
+# 1. views are reassigned between two cameras until stable, from several starts (k-means with each
+#    view's own metric); and, for a lens that was moved on the way, all splits in order are tried;
+# 2. the statistic is T2 = fall of the cost / (phi^2 sigma^2), with sigma^2 from the residuals after the
+#    split and phi^2 the overdispersion of the views *within* the two groups, so that residuals that are
+#    not white do not pass for a second camera;
+# 3. the same search on made-up scores of one camera, drawn from each view's own information, tells what
+#    T2 chance reaches.
+#
+# The lens model is first widened to five coefficients, where that helps, and the target takes the shape
+# that fits best: a lens that the model cannot follow, or a bent board, makes views disagree by where and
+# how the board lies in them, which is not a second camera.
+
+_REPLICATES = 16
+_QUANTILE = 3.5
+"""Standard deviations above the replicates' mean that chance is said to reach."""
+_STARTS = 10
+_ROUNDS = 15
+_TWO_CAMERAS_MAX_ITERATIONS = 40
+_WORTH = 3.0
+"""Fall of the cost, in variances, that a coefficient has to bring."""
+_LEAST = 3
+"""Views that a group needs."""
+_PRIOR = {"fx_px": 0.3, "fy_px": 0.3, "cx_px": 0.15, "cy_px": 0.15, "skew_px": 0.05}
+"""How far two cameras may differ, over the focal length; coefficients of distortion by one."""
+
+
+@dataclass(frozen=True)
+class Split:
+    """The best division of the views into two groups.
+
+    Attributes
+    ----------
+    second : (N,) True for the views of the smaller or later group.
+    statistic : T2, see the module.
+    chance : what T2 reaches with one camera: mean and 3.5 standard deviations of replicates.
+    rms_px, split_rms_px : before and after.
+    difference : intrinsics of the second group less those of the first, by name.
+    sigma : its standard deviation with the overdispersion within the groups, by name.
+    """
+
+    second: BoolArray
+    statistic: float
+    chance: float
+    rms_px: float
+    split_rms_px: float
+    difference: dict[str, float]
+    sigma: dict[str, float]
+
+    @property
+    def ratio(self) -> float:
+        """T2 over what chance reaches."""
+        return self.statistic / max(self.chance, 1e-9)
+
+
+def widened(calibration: Calibration) -> Calibration:
+    """The same views with k1, k2, p1, p2 and k3 free, where the model is poorer and that helps."""
+    camera, fixed = calibration.camera, held(calibration)
+    if camera.model in ("brown5", "rational8") or fixed not in ((), ("skew_px",)):
+        return calibration
+    rich = calibrate(
+        calibration.observations,
+        camera.image_size_px,
+        "brown5",
+        skew="skew_px" in calibration.free_names,
+        start=calibration.block,
+        max_iterations=_TWO_CAMERAS_MAX_ITERATIONS,
+    )
+    # Coefficients that explain nothing only blur the difference of two cameras.
+    worth = _WORTH * (len(rich.free) - len(calibration.free)) * calibration.sigma_px**2
+    return rich if rich.squared_sum < calibration.squared_sum - worth else calibration
+
+
+def straightened(calibration: Calibration, displacement_m: FloatArray) -> Calibration:
+    """The same views of a target whose points are moved by `displacement_m` (1 or N, M, 3).
+
+    A target that would then lie behind the camera tells nothing; the calibration is left as it is.
+    """
+    moved = calibrate(
+        calibration.observations.displaced(displacement_m),
+        calibration.camera.image_size_px,
+        calibration.camera.model,
+        skew="skew_px" in calibration.free_names,
+        fixed=held(calibration),
+        start=calibration.block,
+        max_iterations=_TWO_CAMERAS_MAX_ITERATIONS,
+    )
+    in_front = jacobian(moved.block, moved.observations, moved.free, None) is not None
+    return moved if in_front else calibration
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Scores and information of the views in units of the prior, sigma one."""
+
+    S: FloatArray
+    b: FloatArray
+    cost: float
+    freedom: int
+
+
+def _groups(problem: _Problem, second: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Sums S (T, 2, G, G) and b (T, 2, G) and best shifts d (T, 2, G) of divisions (T, N)."""
+    N, G = problem.b.shape
+    member = np.stack([~second, second], axis=1).astype(np.float64)
+    flat = member.reshape(-1, N)
+    S = (flat @ problem.S.reshape(N, -1)).reshape(-1, 2, G, G)
+    b = (flat @ problem.b).reshape(-1, 2, G)
+    d = -np.linalg.solve(S + np.eye(G), b[..., None])[..., 0]
+    return S, b, np.asarray(d, dtype=np.float64)
+
+
+def _reassigned(problem: _Problem, second: BoolArray) -> BoolArray:
+    """Divisions (T, N) after moving every view to the camera that suits it until nothing moves."""
+    N = len(problem.b)
+    for _ in range(_ROUNDS):
+        _, _, d = _groups(problem, second)
+        # Cost under the second less that under the first; (d2 - d1)' S (d1 + d2) = d2' S d2 - d1' S d1.
+        apart, both = d[:, 1] - d[:, 0], d[:, 1] + d[:, 0]
+        pushed = np.tensordot(both, problem.S, axes=(1, 1))
+        better = 2 * apart @ problem.b.T + np.einsum("tng,tg->tn", pushed, apart)
+        rank = np.argsort(np.argsort(better, axis=1), axis=1)
+        new = ((better < 0) | (rank < _LEAST)) & (rank < N - _LEAST)
+        if np.array_equal(new, second):
+            break
+        second = new
+    return second
+
+
+def _statistic(problem: _Problem, second: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """T2, fall of the cost and phi^2 of divisions (T, N), each (T,)."""
+    N, G = problem.b.shape
+    S, b, d = _groups(problem, second)
+    fall = -(b * d).sum(axis=(1, 2))
+    variance = np.maximum(problem.cost - fall, 1e-12 * problem.cost) / problem.freedom
+    inverse = np.linalg.inv(S + np.eye(G))
+    own = np.where(second[..., None], d[:, 1, None], d[:, 0, None])
+    score = problem.b + np.einsum("ngh,tnh->tng", problem.S, own)
+    metric = np.where(second[..., None, None], inverse[:, 1, None], inverse[:, 0, None])
+    scatter = np.einsum("tng,tngh,tnh->t", score, metric, score, optimize=True)
+    phi2 = scatter / (2 * G * variance) * N / max(N - G, 1)
+    return fall / (variance * np.maximum(phi2, 1.0)), fall, phi2
+
+
+def _problem(found: Evidence, calibration: Calibration) -> tuple[_Problem, FloatArray]:
+    focal, longest = calibration.camera.fx_px, max(calibration.camera.image_size_px)
+    width = {"cx_px": longest, "cy_px": longest}
+    scale = np.array(
+        [_PRIOR.get(name, 1.0) * width.get(name, focal if name in _PRIOR else 1.0) for name in found.names]
+    )
+    S = found.S * scale[:, None] * scale / found.sigma_px**2
+    b = found.b * scale / found.sigma_px**2
+    freedom = max(calibration.degrees_of_freedom - len(scale), 1)
+    return _Problem(S, b, float(found.cost.sum()) / found.sigma_px**2, freedom), scale
+
+
+def _beginnings(problem: _Problem, rng: np.random.Generator) -> BoolArray:
+    """Divisions to begin with: in order, along the views' main disagreement, and at random, (T, N)."""
+    N, G = problem.b.shape
+    order = np.arange(N)
+    starts = [order >= cut for cut in np.unique(np.linspace(_LEAST, N - _LEAST, 3).astype(np.int64))]
+    own = np.linalg.solve(problem.S + np.eye(G), problem.b[..., None])[..., 0]
+    weights = problem.S.sum(axis=0)
+    _, vectors = np.linalg.eigh(weights)
+    for k in range(1, 4):
+        along = own @ vectors[:, -min(k, G)]
+        starts.append(along > np.median(along))
+    starts.extend(rng.permutation(N) < N // 2 for _ in range(_STARTS - len(starts)))
+    return np.array(starts)
+
+
+def _replicates(problem: _Problem, rng: np.random.Generator) -> list[_Problem]:
+    """Scores as one camera would give them, centred on its solution."""
+    values, vectors = np.linalg.eigh(problem.S)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    inverse = scaled_inverse(problem.S.sum(axis=0))
+    made = []
+    for _ in range(_REPLICATES):
+        b = np.einsum("ngh,nh->ng", root, rng.standard_normal(problem.b.shape))
+        b = b - problem.S @ (inverse @ b.sum(axis=0))
+        made.append(_Problem(problem.S, b, float(problem.freedom), problem.freedom))
+    return made
+
+
+def _reach(statistics: list[float]) -> float:
+    return float(np.mean(statistics) + _QUANTILE * np.std(statistics, ddof=1))
+
+
+def _described(
+    problem: _Problem, scale: FloatArray, calibration: Calibration, second: BoolArray, chance: float
+) -> Split:
+    statistic, fall, phi2 = (float(value[0]) for value in _statistic(problem, second[None]))
+    S, _, d = _groups(problem, second[None])
+    points = calibration.observations.points
+    variance = calibration.sigma_px**2
+    inverse = np.linalg.inv(S[0] + np.eye(len(scale)))
+    left = max(problem.cost - fall, 0.0) / problem.freedom * max(phi2, 1.0)
+    # Rounding makes a variance of next to nothing negative.
+    sigma = scale * np.sqrt(np.maximum(np.diag(inverse[0] + inverse[1]), 0.0) * left)
+    difference = scale * (d[0, 1] - d[0, 0])
+    names = calibration.free_names
+    return Split(
+        second,
+        statistic,
+        chance,
+        calibration.rms_px,
+        float(np.sqrt(max(problem.cost - fall, 0.0) * variance / points)),
+        dict(zip(names, difference.tolist(), strict=True)),
+        dict(zip(names, sigma.tolist(), strict=True)),
+    )
+
+
+def best_split(calibration: Calibration, seed: int = 0) -> Split | None:
+    """The two groups of views that differ most, or None below six views.
+
+    Parameters
+    ----------
+    calibration : best `widened` and `straightened`, without robust loss.
+    seed : of the random starts and the replicates.
+    """
+    if calibration.observations.views < 2 * _LEAST:
+        return None
+    rng = np.random.default_rng(seed)
+    problem, scale = _problem(evidence(calibration), calibration)
+    second = _reassigned(problem, _beginnings(problem, rng))
+    statistics = _statistic(problem, second)[0]
+    best = second[int(np.argmax(statistics))]
+    reached = []
+    for made in _replicates(problem, rng):
+        ends = _reassigned(made, _beginnings(made, rng)[:6])
+        reached.append(float(_statistic(made, ends)[0].max()))
+    chance = _reach(reached)
+    if best.sum() > len(best) / 2:
+        best = ~best
+    return _described(problem, scale, calibration, best, chance)
+
+
+def best_change(calibration: Calibration, seed: int = 1) -> Split | None:
+    """The view from which on the camera differs most from before, or None below six views."""
+    N = calibration.observations.views
+    if N < 2 * _LEAST:
+        return None
+    rng = np.random.default_rng(seed)
+    problem, scale = _problem(evidence(calibration), calibration)
+    cuts = np.unique(np.linspace(_LEAST, N - _LEAST, 60).astype(np.int64))
+    second = np.arange(N) >= cuts[:, None]
+    statistics = _statistic(problem, second)[0]
+    chance = _reach([float(_statistic(made, second)[0].max()) for made in _replicates(problem, rng)])
+    return _described(problem, scale, calibration, second[int(np.argmax(statistics))], chance)
+
+
+# ----------------------------------------------------------------------
+# Which picture to take next: the one that takes most of the uncertainty away.
+#
+# A candidate view adds its information S_c (its pose eliminated, `calib.stages.camera.checks`) to the sum
+# S of
+# the views taken. What is left is measured by tr(R (S + S_c)^-1), where R is the mean information
+# of reference views that fill the whole picture: the expected squared error, in pixels, of explaining a
+# new view anywhere in the picture with this camera (optimal design, criterion V).
+
+_EDGES = {0: "right", 90: "bottom", 180: "left", 270: "top"}
+_PLACES = (0.22, 0.5, 0.78)
+_GRID = 6
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A picture to take.
+
+    Attributes
+    ----------
+    where : part of the picture, in words with a preposition.
+    tilt_deg : angle between the board and the picture's plane.
+    away : edge of the board (as the picture shows it) that leans away, or "" without tilt.
+    span_share : diagonal of the board over the diagonal of the picture.
+    remaining : root of the expected squared error after it over that before.
+    """
+
+    where: str
+    tilt_deg: float
+    away: str
+    span_share: float
+    remaining: float
+
+
+def _words(column: int, row: int) -> str:
+    across, down = ("left", "", "right")[column], ("top", "", "bottom")[row]
+    if not across and not down:
+        return "in the middle of the picture"
+    if across and down:
+        return f"in the {down} {across} corner of the picture"
+    return f"at the {across or down} edge of the picture"
+
+
+def _rotation(tilt: float, azimuth: float) -> FloatArray:
+    """Tilt that takes the side in the direction `azimuth` (0 right, pi/2 down) away from the camera."""
+    axis = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
+    S = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.asarray(np.eye(3) + np.sin(tilt) * S + (1 - np.cos(tilt)) * S @ S)
+
+
+def best_next_view(calibration: Calibration, information: FloatArray) -> Candidate | None:
+    """The most useful among about a hundred poses of the board that fit into the picture.
+
+    Parameters
+    ----------
+    information : (G, G) sum of the views' information about the free intrinsics, pixels squared.
+    """
+    camera = calibration.camera
+    width, height = camera.image_size_px
+    box = target_box(calibration)
+    extent = box.max(axis=0) - box.min(axis=0)
+    across, along = np.meshgrid(np.linspace(-0.5, 0.5, _GRID), np.linspace(-0.5, 0.5, _GRID))
+    target = np.stack([across.ravel() * extent[0], along.ravel() * extent[1], np.zeros(_GRID**2)], axis=1)
+    diagonal = float(np.hypot(extent[0], extent[1]))
+    rotations, translations, kinds = [], [], []
+    for row, v in enumerate(_PLACES):
+        for column, u in enumerate(_PLACES):
+            ray = undistort(camera, np.array([u * (width - 1), v * (height - 1)]))
+            if not np.all(np.isfinite(ray)):
+                continue
+            for span in (0.35, 0.6):
+                distance = camera.fx_px * diagonal / (span * np.hypot(width, height))
+                for azimuth in (None, 0, 90, 180, 270):
+                    tilt = 0.0 if azimuth is None else 35.0
+                    rotations.append(_rotation(np.radians(tilt), np.radians(azimuth or 0)))
+                    translations.append(distance * np.array([ray[0], ray[1], 1.0]))
+                    kinds.append((column, row, tilt, "" if azimuth is None else _EDGES[azimuth], span))
+    if not kinds or not np.all(np.isfinite(information)):
+        return None
+    R, t = np.array(rotations), np.array(translations)
+    points = target @ R.transpose(0, 2, 1) + t[:, None]
+    ahead = points[..., 2].min(axis=1) > 0.05 * diagonal
+    pixels = project(camera, np.where(ahead[:, None, None], points, [0.0, 0.0, 1.0]))
+    inside = ((pixels > 0) & (pixels < [width - 1, height - 1])).all(axis=(1, 2))
+    # A view half outside of the picture is no advice, except where no other fits.
+    kept = np.flatnonzero(ahead & inside & np.isfinite(pixels).all(axis=(1, 2)))
+    if len(kept) == 0:
+        return None
+    S = _information(calibration, target, R[kept], t[kept])
+    if S is None:
+        return None
+    reference = S.mean(axis=0)
+    # A direction that nothing has measured yet is held by a hundredth of one view.
+    base = information + 0.01 * reference
+    before = float(np.trace(reference @ scaled_inverse(base)))
+    after = np.array([np.trace(reference @ scaled_inverse(base + added)) for added in S])
+    best = int(np.argmin(after))
+    column, row, tilt, away, span = kinds[kept[best]]
+    return Candidate(
+        _words(column, row), tilt, away, span, float(np.sqrt(max(after[best], 0.0) / max(before, 1e-300)))
+    )
+
+
+def _information(
+    calibration: Calibration, target: FloatArray, R: FloatArray, t: FloatArray
+) -> FloatArray | None:
+    """Information (n, G, G) of made-up views of the target about the intrinsics."""
+    n, M, P = len(R), len(target), len(calibration.free)
+    made = Observations(("",) * n, target[None], np.zeros((n, M, 2)), np.ones((n, M), dtype=np.bool_))
+    block = Block(calibration.block.intrinsics, R, t, np.zeros(0))
+    J = jacobian(block, made, calibration.free, None)
+    if J is None:
+        return None
+    # As many points as the target has in a view, spread as they are.
+    share = calibration.observations.points / calibration.observations.views / M
+    normal = share * (J[:, :-1] @ J[:, :-1].transpose(0, 2, 1))
+    V, W = normal[:, P:, P:], normal[:, :P, P:]
+    return np.asarray(normal[:, :P, :P] - W @ np.linalg.solve(V, W.transpose(0, 2, 1)))

@@ -1,0 +1,627 @@
+"""Corners of a checkerboard in a picture: searched, checked and in one order for every picture."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from calib.core.arrays import BoolArray, FloatArray, GrayImage
+from calib.core.errors import BadInputError
+from calib.stages.camera.lattice import (
+    Lattice,
+    extrapolated,
+    find_lattices,
+    find_saddles,
+    looks_like_corners,
+    sample,
+)
+from calib.stages.camera.refine import (
+    Refined,
+    fit_corners,
+    frames_of,
+    misshape,
+    part_around,
+    predict,
+    refine,
+    square_px,
+)
+
+# ----------------------------------------------------------------------
+# The order of a checkerboard's corners: one rule for every picture.
+#
+# Quarter turns of a grid keep its hand, so a grid that is not mirrored stays so. Of the turns that give
+# the board's columns and rows, the rule takes those with the dark square outward of corner (0, 0), where
+# the colours differ between turns, and of these the one whose columns axis points most to the right.
+
+_TIE = 1e-9
+
+
+def turned_colours(colours: FloatArray, turns: int) -> FloatArray:
+    """Colours of a grid after quarter turns of its order.
+
+    Parameters
+    ----------
+    colours : (rows, columns), positive where the square between growing column and growing row of a
+        corner is bright. A quarter turn swaps the two squares that this can mean.
+    """
+    return np.asarray((-1.0) ** turns * np.rot90(colours, turns))
+
+
+def canonical_turn(points: FloatArray, colours: FloatArray, columns: int, rows: int) -> int | None:
+    """Quarter turns (for `numpy.rot90`) that bring a grid into the order of the rule.
+
+    Parameters
+    ----------
+    points : (r, c, 2) corners, not mirrored; r x c is rows x columns or columns x rows.
+    colours : (r, c) as in `turned_colours`.
+
+    Returns
+    -------
+    None when the grid has another size.
+    """
+    turns = [k for k in range(4) if np.rot90(colours, k).shape == (rows, columns)]
+    if not turns:
+        return None
+    i, j = np.indices((rows, columns))
+    parity = 1.0 - 2.0 * ((i + j) % 2)
+    # Outward of corner (0, 0) is the colour of the square across it, between growing column and row.
+    bright = {k: float(np.sum(np.sign(turned_colours(colours, k)) * parity)) > 0 for k in turns}
+    if len(set(bright.values())) == 2:
+        turns = [k for k in turns if not bright[k]]
+
+    def rightward(turn: int) -> tuple[float, float]:
+        grid = np.rot90(points, turn)
+        du, dv = np.mean(grid[:, -1] - grid[:, 0], axis=0)
+        cosine = float(du / max(np.hypot(du, dv), _TIE))
+        # Of two that point straight up and down the one that points down.
+        return round(cosine / _TIE) * _TIE, float(dv)
+
+    return max(turns, key=rightward)
+
+
+def orderings(pixels: FloatArray, columns: int, rows: int) -> tuple[FloatArray, ...]:
+    """The same corners in every order that a board of this shape allows, the given one first.
+
+    Parameters
+    ----------
+    pixels : (columns * rows, 2), row by row.
+
+    Returns
+    -------
+    The order after no and half a turn, or for square boards after 0, 1, 2, 3 quarter turns; each
+    (columns * rows, 2) and none mirrored.
+    """
+    grid = pixels.reshape(rows, columns, 2)
+    turns = range(4) if columns == rows else (0, 2)
+    return tuple(np.ascontiguousarray(np.rot90(grid, turn)).reshape(-1, 2) for turn in turns)
+
+
+# ----------------------------------------------------------------------
+# Is a refined grid a whole checkerboard? What a texture, or a part of a larger board, gets wrong.
+
+_UNREFINED_SHARE = 0.1
+_MISFIT = 0.08
+"""Largest typical distance of a corner from where the others place it, in squares."""
+_MEDIAN_RESIDUAL = 0.25
+_LEAST_AMPLITUDE = 2.5
+"""Grey levels."""
+_CONTINUES = 0.4
+"""Least amplitude of a further corner over the median of the grid."""
+_WORST_RESIDUAL = 0.3
+_REACH_PX = 10
+_ITERATIONS = 8
+_UNEVEN_SHARE = 0.4
+"""Largest share of squares that a shadow's edge may cross."""
+_LEAST_STEP = 0.38
+"""Least step between neighbouring squares over the step at the corners."""
+_FLAT = 0.6
+"""Largest difference between the quarters of a square, over the step from dark to bright."""
+
+_Float32 = npt.NDArray[np.float32]
+
+
+def _turns_alike(points: FloatArray) -> bool:
+    """Whether every square is convex and turns the same way."""
+    a, b = points[:-1, :-1], points[:-1, 1:]
+    c, d = points[1:, 1:], points[1:, :-1]
+    sides = [b - a, c - b, d - c, a - d]
+    for one, two in zip(sides, sides[1:] + sides[:1], strict=True):
+        if np.any(one[..., 0] * two[..., 1] - one[..., 1] * two[..., 0] <= 0):
+            return False
+    return True
+
+
+def _squares_are_plain(smooth: _Float32, grid: Refined) -> bool:
+    """Whether the squares between the corners alternate and are of one tone each."""
+    p = grid.points
+    corners = np.stack([p[:-1, :-1], p[:-1, 1:], p[1:, :-1], p[1:, 1:]])
+    middle = corners.mean(axis=0)
+    quarters = sample(smooth, 0.5 * (corners + middle))
+    tone = quarters.mean(axis=0)
+    i, j = np.indices(tone.shape)
+    bright = grid.sign * (1 - 2 * ((i + j) % 2)) > 0
+    step = 2.0 * float(np.median(np.abs(grid.amplitude)))
+    amplitude = np.abs(grid.amplitude)
+    local = 0.5 * (amplitude[:-1, :-1] + amplitude[1:, :-1] + amplitude[:-1, 1:] + amplitude[1:, 1:])
+    if bright.any() and (~bright).any():
+        # Each square against the neighbours that share a side with it, which have the other colour.
+        signed = np.where(bright, tone, -tone)
+        across, down = signed[:, 1:] + signed[:, :-1], signed[1:] + signed[:-1]
+        if min(across.min(initial=np.inf), down.min(initial=np.inf)) < _LEAST_STEP * float(local.min()):
+            return False
+    uneven = quarters.max(axis=0) - quarters.min(axis=0)
+    return bool(np.mean(uneven > _FLAT * np.maximum(local, 0.25 * step)) < _UNEVEN_SHARE)
+
+
+def fault_of(gray: GrayImage, grid: Refined) -> str | None:
+    """What speaks against a grid being a checkerboard, in a few words; None when nothing does."""
+    height, width = gray.shape
+    square = square_px(grid.points)
+    shape = grid.refined.shape
+    if np.any(grid.points < -0.5) or np.any(grid.points > np.array([width, height]) - 0.5):
+        return "corners outside the picture"
+    if np.sum(~grid.refined) > _UNREFINED_SHARE * grid.refined.size:
+        return "corners that are none"
+    if np.median(np.abs(grid.amplitude)) < _LEAST_AMPLITUDE:
+        return "too little contrast"
+    if np.median(grid.residual) > _MEDIAN_RESIDUAL:
+        return "corners of another shape"
+    if not grid.misfit_px < _MISFIT * square:
+        return "corners off the grid"
+    if not _turns_alike(grid.points):
+        return "a folded grid"
+    if min(shape) >= 2 and not _squares_are_plain(_smoothed(gray, square), grid):
+        return "squares that are not plain"
+    return None
+
+
+def _smoothed(gray: GrayImage, square: float) -> _Float32:
+    return np.asarray(cv2.blur(gray.astype(np.float32), (3, 3)) if square > 12.0 else gray.astype(np.float32))
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What is beyond the four sides of a grid's arrays: top, bottom, left, right.
+
+    Attributes
+    ----------
+    continues : whether another row of corners follows.
+    seen : whether the picture shows where that row would be.
+    """
+
+    continues: tuple[bool, bool, bool, bool]
+    seen: tuple[bool, bool, bool, bool]
+
+
+def surroundings(gray: GrayImage, grid: Refined) -> Surroundings:
+    """Look for another row of corners on each side.
+
+    A part of a larger board is not the board: which part it is cannot be told.
+    """
+    nothing = (False, False, False, False)
+    place = extrapolated(grid.points)
+    place[1:-1, 1:-1] = grid.points
+    for v, v1 in ((0, 1), (-1, -2)):
+        for u, u1 in ((0, 1), (-1, -2)):
+            place[v, u] = place[v, u1] + place[v1, u] - place[v1, u1]
+    part = part_around(gray, place)
+    if part is None:
+        return Surroundings(nothing, nothing)
+    image, local = part.image, part.points
+    frames = frames_of(local)
+    rows, columns = local.shape[:2]
+    outside = np.ones((rows, columns), dtype=np.bool_)
+    outside[1:-1, 1:-1] = False
+    outside[:: rows - 1, :: columns - 1] = False
+    low, high = np.array([1.0, 1.0]), np.array(image.shape[::-1]) - 2.0
+    inside = outside & np.all((local > low) & (local < high), axis=-1)
+    i, j = np.indices((rows, columns))
+    parity = (1.0 - 2.0 * ((i + j) % 2)) * grid.sign
+    least = _CONTINUES * float(np.median(np.abs(grid.amplitude)))
+    along, across = frames.along.reshape(local.shape), frames.across.reshape(local.shape)
+    half_step, unlike = looks_like_corners(image, local, along, across)
+    chosen = np.flatnonzero((inside & (parity * half_step > 0.5 * least) & (unlike < 1.0)).ravel())
+    found: BoolArray = np.zeros(rows * columns, dtype=np.bool_)
+    if len(chosen):
+        fit = fit_corners(image, local.reshape(-1, 2)[chosen], frames.take(chosen), _ITERATIONS, _REACH_PX)
+        square = np.minimum(np.linalg.norm(frames.along, axis=1), np.linalg.norm(frames.across, axis=1))
+        near = np.linalg.norm(fit.points - local.reshape(-1, 2)[chosen], axis=1) < 0.3 * square[chosen]
+        strong = parity.ravel()[chosen] * fit.amplitude > least
+        found[chosen] = fit.converged & near & strong & (misshape(fit, part.noise) < _WORST_RESIDUAL)
+    hit = found.reshape(rows, columns)
+    lines = (np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1])
+    count = [int(inside[line].sum()) for line in lines]
+    hits = [int(hit[line].sum()) for line in lines]
+    top, bottom, left, right = (n >= 2 and h >= max(2, 0.5 * n) for h, n in zip(hits, count, strict=True))
+    above, below, before, after = (n >= 2 for n in count)
+    return Surroundings((top, bottom, left, right), (above, below, before, after))
+
+
+# ----------------------------------------------------------------------
+# Candidates for a checkerboard, stage by stage, the cheap and sure stages first.
+#
+# The first stages look for grids of saddle points in copies of the picture, from a small one, where
+# large squares stay and noise goes, up to one of twice the size for squares of a few pixels. OpenCV's
+# finders follow: the classic one, the sector-based one (SB) and SB with an exhaustive search, which
+# take long where there is no board and are asked only when the first stages saw most of one.
+
+_COARSE_PIXELS = 120_000
+_LARGEST_PIXELS = 6_000_000
+_ENLARGE_BELOW_PIXELS = 700_000
+_ENLARGE_TWICE_BELOW_PIXELS = 90_000
+_OPENCV_PIXELS = 1_300_000
+_SEEN_SHARE = 0.8
+"""Least share of a grid's corners that must be seen; the others are looked for where they should be."""
+_MIN_SIDE_PX = 16
+_FRAGMENT = 0.5
+"""Share of the board's corners, in a grid with holes, from which on OpenCV's finders are asked too."""
+
+
+@dataclass(frozen=True)
+class Level:
+    """A copy of the picture, `zoom` times its size; u = (x + 1/2) / zoom - 1/2."""
+
+    image: GrayImage
+    zoom: float
+
+    def to_picture(self, points: FloatArray) -> FloatArray:
+        """Pixels of the picture from pixels of the copy."""
+        return np.asarray((points + 0.5) / self.zoom - 0.5)
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a stage saw: grids (r, c, 2) of the picture to try, and whether a broken grid is there."""
+
+    grids: list[FloatArray]
+    fragments: bool = False
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One way of looking."""
+
+    name: str
+    search: Callable[[], Found]
+
+
+def resized(gray: GrayImage, zoom: float) -> Level:
+    """A copy of the picture; `zoom` is 1 / n or n for a whole n."""
+    if zoom == 1.0:
+        return Level(gray, 1.0)
+    if zoom > 1.0:
+        copy = cv2.resize(gray, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC)
+        return Level(np.asarray(copy, dtype=np.uint8), zoom)
+    n = round(1.0 / zoom)
+    height, width = gray.shape[0] // n, gray.shape[1] // n
+    copy = cv2.resize(gray[: height * n, : width * n], (width, height), interpolation=cv2.INTER_AREA)
+    return Level(np.asarray(copy, dtype=np.uint8), zoom)
+
+
+def lattice_levels(gray: GrayImage) -> list[float]:
+    """Zooms at which to look for grids of saddle points, in order."""
+    zooms: list[float] = []
+    n = 1
+    while gray.size / n**2 > _COARSE_PIXELS:
+        n *= 2
+    while n >= 1:
+        if gray.size / n**2 <= _LARGEST_PIXELS:
+            zooms.append(1.0 / n)
+        n //= 2
+    if gray.size < _ENLARGE_BELOW_PIXELS:
+        zooms.append(2.0)
+    if gray.size < _ENLARGE_TWICE_BELOW_PIXELS:
+        zooms.append(4.0)
+    return zooms
+
+
+def complete(lattice: Lattice) -> FloatArray | None:
+    """Points of a lattice with the few unseen corners where the others place them, or None."""
+    seen = lattice.seen
+    if seen.all():
+        return lattice.points
+    if seen.mean() < _SEEN_SHARE:
+        return None
+    prediction = predict(lattice.points, seen)
+    if prediction is None:
+        return None
+    return np.where(seen[..., None], lattice.points, prediction.points)
+
+
+def lattice_stages(gray: GrayImage, columns: int, rows: int) -> list[Stage]:
+    """Stages that join saddle points of copies of the picture."""
+
+    def stage(zoom: float) -> Stage:
+        def search() -> Found:
+            level = resized(gray, zoom)
+            grids, fragments = [], False
+            for lattice in find_lattices(find_saddles(level.image), least=max(4, columns * rows // 4)):
+                shape = lattice.points.shape[:2]
+                fits = sorted(shape) == sorted((rows, columns))
+                points = complete(lattice) if fits else None
+                if points is not None:
+                    grids.append(level.to_picture(points))
+                within = all(a <= b for a, b in zip(sorted(shape), sorted((rows, columns)), strict=True))
+                share = int(lattice.seen.sum()) / (columns * rows)
+                fragments |= points is None and within and share >= _FRAGMENT
+            return Found(grids, fragments)
+
+        return Stage(f"saddles x{zoom:g}", search)
+
+    return [stage(zoom) for zoom in lattice_levels(gray)]
+
+
+_Finder = Callable[[GrayImage, tuple[int, int]], FloatArray | None]
+
+
+def _classic(image: GrayImage, size: tuple[int, int]) -> FloatArray | None:
+    found, corners = cv2.findChessboardCorners(
+        image, size, flags=cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+    )
+    return np.asarray(corners, dtype=np.float64) if found else None
+
+
+def _sector_based(image: GrayImage, size: tuple[int, int], flags: int = 0) -> FloatArray | None:
+    found, corners = cv2.findChessboardCornersSB(image, size, flags=flags)
+    return np.asarray(corners, dtype=np.float64) if found else None
+
+
+def _exhaustive(image: GrayImage, size: tuple[int, int]) -> FloatArray | None:
+    return _sector_based(
+        image, size, cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
+    )
+
+
+def fallback_stages(gray: GrayImage, columns: int, rows: int) -> list[Stage]:
+    """OpenCV's finders, on the picture or a copy of a size that they can do quickly."""
+    if min(gray.shape) < _MIN_SIDE_PX or min(columns, rows) < 3:
+        return []
+    n = 1
+    while gray.size / n**2 > _OPENCV_PIXELS:
+        n += 1
+    plain = 1.0 / n
+    finders = (("classic", _classic), ("SB", _sector_based), ("SB exhaustive", _exhaustive))
+
+    def stage(name: str, finder: _Finder) -> Stage:
+        def search() -> Found:
+            level = resized(gray, plain)
+            try:
+                corners = finder(level.image, (columns, rows))
+            except cv2.error:
+                # Some pictures are too small for a finder's own filters.
+                return Found([])
+            if corners is None or corners.size != 2 * columns * rows:
+                return Found([])
+            return Found([level.to_picture(_not_mirrored(corners.reshape(rows, columns, 2)))])
+
+        return Stage(f"{name} x{plain:g}", search)
+
+    return [stage(name, finder) for name, finder in finders]
+
+
+def _not_mirrored(grid: FloatArray) -> FloatArray:
+    along, across = grid[:, -1] - grid[:, 0], grid[-1] - grid[0]
+    a, b = along.mean(axis=0), across.mean(axis=0)
+    return grid if a[0] * b[1] - a[1] * b[0] > 0 else np.asarray(grid[:, ::-1])
+
+
+# ----------------------------------------------------------------------
+# How many corners a board of unknown size has.
+
+_LEAST_CORNERS = 9
+_ROUNDS = 12
+_NARROW = 0.65
+"""Largest share of corners that only a small window can fit, in a board that nobody asked for."""
+_SIZE_MISFIT = 0.04
+"""Largest misfit, in squares, of a board that nobody asked for."""
+_LATTICES = 3
+_SIZE_OPENCV_PIXELS = 1_300_000
+
+
+def _whole(gray: GrayImage, points: FloatArray) -> Refined | None:
+    """Refine a grid and add the rows that follow it, until there are none; None when it is no board.
+
+    A pattern that leaves the picture on every side has no size.
+    """
+    for _ in range(_ROUNDS):
+        if min(points.shape[:2]) < 3:
+            return None
+        grid = refine(gray, points)
+        if grid is None or fault_of(gray, grid) is not None:
+            return None
+        around = surroundings(gray, grid)
+        top, bottom, left, right = around.continues
+        if not any(around.continues):
+            sure = grid.refined.all() and grid.narrow.mean() < _NARROW
+            sure &= grid.misfit_px < _SIZE_MISFIT * square_px(grid.points)
+            return grid if sure and any(around.seen) else None
+        wide = extrapolated(grid.points)
+        wide[1:-1, 1:-1] = grid.points
+        for v, v1 in ((0, 1), (-1, -2)):
+            for u, u1 in ((0, 1), (-1, -2)):
+                wide[v, u] = wide[v, u1] + wide[v1, u] - wide[v1, u1]
+        rows, columns = wide.shape[:2]
+        points = wide[
+            0 if top else 1 : rows - (0 if bottom else 1), 0 if left else 1 : columns - (0 if right else 1)
+        ]
+    return None
+
+
+def board_size(gray: GrayImage) -> tuple[int, int] | None:
+    """Size (columns, rows), columns >= rows, of the largest board of one picture."""
+    for zoom in lattice_levels(gray):
+        level = resized(gray, zoom)
+        best: tuple[float, tuple[int, int]] | None = None
+        for lattice in find_lattices(find_saddles(level.image), least=6)[:_LATTICES]:
+            points = complete(lattice)
+            grid = None if points is None else _whole(gray, level.to_picture(points))
+            if grid is None or grid.refined.size < _LEAST_CORNERS:
+                continue
+            span = np.ptp(grid.points.reshape(-1, 2), axis=0)
+            area = float(span[0] * span[1])
+            if best is None or area > best[0]:
+                sides = sorted(grid.refined.shape, reverse=True)
+                best = (area, (int(sides[0]), int(sides[1])))
+        if best is not None:
+            return best[1]
+    return _size_by_opencv(gray)
+
+
+def _size_by_opencv(gray: GrayImage) -> tuple[int, int] | None:
+    n = 1
+    while gray.size / n**2 > _SIZE_OPENCV_PIXELS:
+        n += 1
+    level = resized(gray, 1.0 / n)
+    flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
+    try:
+        found, corners, meta = cv2.findChessboardCornersSBWithMeta(level.image, (3, 3), flags)
+    except cv2.error:
+        return None
+    if not found or corners is None or meta is None:
+        return None
+    rows, columns = meta.shape[:2]
+    if corners.size != 2 * rows * columns:
+        return None
+    grid = _whole(gray, level.to_picture(np.asarray(corners, dtype=np.float64).reshape(rows, columns, 2)))
+    if grid is None:
+        return None
+    sides = sorted(grid.refined.shape, reverse=True)
+    return int(sides[0]), int(sides[1])
+
+
+def board_sizes(pictures: Sequence[GrayImage]) -> tuple[int, int] | None:
+    """The size that most pictures show, the larger one in a tie; None when no picture shows a board."""
+    counts = Counter(size for size in map(board_size, pictures) if size is not None)
+    return max(counts, key=lambda size: (counts[size], size[0] * size[1], size), default=None)
+
+
+# ----------------------------------------------------------------------
+# Corners of a checkerboard in a picture: found, refined and in one order for every picture.
+
+_LEAST_RANGE = 6
+"""Grey levels between the darkest and the brightest pixel of a picture that may show a board."""
+
+
+@dataclass(frozen=True)
+class Detection:
+    """A checkerboard found in a picture.
+
+    Corner (column i, row j) has index j * columns + i. The grid is not mirrored: the rows axis is
+    clockwise from the columns axis as seen. Where the colours tell turns of the board apart, the
+    square outward of corner (0, 0) is dark; else the columns axis points right in the picture to
+    within 90 degrees (45 on square boards).
+
+    Attributes
+    ----------
+    pixels : (rows * columns, 2), (0, 0) at the centre of the top-left pixel, u right, v down.
+    columns, rows : inner corners.
+    detector : name of the stage that found the board.
+    sigma_px : (rows * columns,) standard deviation of one coordinate of a corner, from its own fit.
+    refined : (rows * columns,) False where the corner itself could not be measured: `pixels` then has
+        its place between the others and must not be taken for a measurement.
+    square_px : median side of the squares.
+    contrast : median half step from dark to bright, grey levels.
+    misfit_px : typical distance of a corner from where the others, by a smooth fit, place it.
+    """
+
+    pixels: FloatArray
+    columns: int
+    rows: int
+    detector: str
+    sigma_px: FloatArray
+    refined: BoolArray
+    square_px: float
+    contrast: float
+    misfit_px: float
+
+
+def _checked(gray: GrayImage) -> bool:
+    """Whether there is anything to look at. Raises `BadInputError` on what is no grey picture."""
+    if gray.ndim != 2 or gray.dtype != np.uint8:
+        raise BadInputError(
+            f"a picture for the corner search has shape {gray.shape} and type {gray.dtype}; expected two "
+            "dimensions of uint8"
+        )
+    return min(gray.shape) >= 8 and int(gray.max()) - int(gray.min()) >= _LEAST_RANGE
+
+
+def _ordered(grid: Refined, columns: int, rows: int, detector: str) -> Detection | None:
+    turn = canonical_turn(grid.points, grid.amplitude, columns, rows)
+    if turn is None:
+        return None
+    return Detection(
+        pixels=np.ascontiguousarray(np.rot90(grid.points, turn)).reshape(-1, 2),
+        columns=columns,
+        rows=rows,
+        detector=detector,
+        sigma_px=np.rot90(grid.sigma_px, turn).ravel(),
+        refined=np.rot90(grid.refined, turn).ravel(),
+        square_px=square_px(grid.points),
+        contrast=float(np.median(np.abs(grid.amplitude))),
+        misfit_px=grid.misfit_px,
+    )
+
+
+def _best_of(gray: GrayImage, grids: Sequence[FloatArray]) -> Refined | None:
+    """The grid that passes every test; of several the one with the largest squares."""
+    best: Refined | None = None
+    for points in grids:
+        grid = refine(gray, points)
+        if grid is None or fault_of(gray, grid) is not None or any(surroundings(gray, grid).continues):
+            continue
+        if best is None or square_px(grid.points) > square_px(best.points):
+            best = grid
+    return best
+
+
+def detect(gray: GrayImage, columns: int, rows: int) -> Detection | None:
+    """Find a board of `columns` x `rows` inner corners, at any angle, to a small fraction of a pixel.
+
+    The first stage whose grid is whole and passes the tests ends the search. Refinement starts each
+    corner anew from where the others place it, so it matters little which stage that is.
+
+    Parameters
+    ----------
+    gray : (H, W) of uint8.
+    columns, rows : inner corners, each at least 3.
+
+    Returns
+    -------
+    None where no such board is seen whole, or only as a part of a larger one.
+
+    Raises
+    ------
+    BadInputError
+        On a board of fewer than 3 x 3 corners or a picture that is not (H, W) of uint8.
+    """
+    if min(columns, rows) < 3:
+        raise BadInputError(
+            f"a board of {columns}x{rows} inner corners cannot be found; expected at least 3x3"
+        )
+    if not _checked(gray):
+        return None
+    fragments = False
+    for stages in (lattice_stages, fallback_stages):
+        for stage in stages(gray, columns, rows):
+            found = stage.search()
+            fragments |= found.fragments
+            grid = _best_of(gray, found.grids)
+            if grid is not None:
+                return _ordered(grid, columns, rows, stage.name)
+        if not fragments:
+            break
+    return None
+
+
+def find_size(gray: GrayImage | Sequence[GrayImage]) -> tuple[int, int] | None:
+    """Inner corners (columns, rows), columns >= rows, of the board in one or more pictures.
+
+    Of several pictures the size that most of them show; of sizes shown equally often the larger.
+    """
+    pictures = [gray] if isinstance(gray, np.ndarray) else list(gray)
+    return board_sizes([picture for picture in pictures if _checked(picture)])

@@ -1,0 +1,491 @@
+"""A camera in the files of other tools: ROS camera_info, OpenCV FileStorage, Kalibr camchain."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from functools import cache
+from typing import Any
+from xml.etree import ElementTree
+
+import cv2
+import numpy as np
+import yaml
+
+from calib.core.arrays import FloatArray
+from calib.core.bounded_yaml import MAX_NODES, YamlProblem, expands_beyond, load
+from calib.core.errors import BadInputError
+from calib.stages.camera.model import COEFFICIENTS, MODELS, Camera
+
+# ----------------------------------------------------------------------
+# OpenCV's FileStorage, read without OpenCV: YAML, XML and JSON, as plain values and matrices.
+#
+# OpenCV's own reader (5.0) trusts its input: texts of some hundred bytes make it write beyond its memory,
+# and a matrix takes the memory that its rows and columns ask for. Only what a camera needs is read here:
+# mappings, numbers, texts, and matrices of one channel.
+#
+# Format: OpenCV 5 documentation, "File Input and Output using XML / YAML / JSON files", and files that
+# OpenCV's writer makes.
+
+MATRIX = "opencv-matrix"
+"""Type of a matrix: a YAML tag, or the value of `_TYPE`."""
+
+_TYPE = "type_id"
+_MOST_NUMBERS = 10_000
+_DEEPEST = 20
+_HEADER_BYTES = 24
+_BASE64 = "$base64$"
+_TYPES = {"d": "<f8", "f": "<f4", "i": "<i4", "u": "u1", "c": "i1", "w": "<u2", "s": "<i2"}
+_REFUSED = "not an OpenCV FileStorage (YAML, XML or JSON)"
+
+
+def read_storage(text: str) -> Mapping[str, Any]:
+    """Named values of a FileStorage; a matrix is a mapping whose `type_id` is `MATRIX`, see `matrix`.
+
+    Raises `BadInputError` for text that is no FileStorage, or has no names.
+    """
+    start = text.lstrip()
+    try:
+        if start.startswith("<"):
+            found = _xml(start)
+        elif start.startswith("{"):
+            found = json.loads(_unescaped(re.sub(r"(?m)^\s*//.*$", "", start)))
+        else:
+            found = _yaml(text)
+    except (ElementTree.ParseError, YamlProblem, ValueError, RecursionError) as error:
+        raise BadInputError(_REFUSED) from error
+    if not isinstance(found, dict) or expands_beyond(found, MAX_NODES):
+        raise BadInputError(_REFUSED)
+    return found
+
+
+def matrix(node: object) -> FloatArray | None:
+    """A matrix (rows, cols) of finite numbers, None for all else."""
+    if not isinstance(node, Mapping) or node.get(_TYPE) != MATRIX:
+        return None
+    rows, cols, kind = _count(node.get("rows")), _count(node.get("cols")), _TYPES.get(str(node.get("dt")))
+    if kind is None or not 0 < rows * cols <= _MOST_NUMBERS:
+        return None
+    values = _values(node.get("data"), kind)
+    if values is None or values.size != rows * cols or not np.isfinite(values).all():
+        return None
+    return values.reshape(rows, cols)
+
+
+def _count(value: object) -> int:
+    """A positive whole number, zero for all else."""
+    return value if isinstance(value, int) and not isinstance(value, bool) and value > 0 else 0
+
+
+def _values(data: object, kind: str) -> FloatArray | None:
+    """Numbers of a matrix, of a list or of base64, None for all else."""
+    if isinstance(data, bytes):
+        return _binary(data, kind)
+    if isinstance(data, str) and data.startswith(_BASE64):
+        try:
+            return _binary(base64.b64decode(data.removeprefix(_BASE64), validate=True), kind)
+        except (binascii.Error, ValueError):
+            return None
+    if isinstance(data, int | float):
+        # The one number of an element of XML.
+        data = [data]
+    if isinstance(data, str) or not isinstance(data, Sequence) or len(data) > _MOST_NUMBERS:
+        return None
+    numbers = [_number(value) for value in data]
+    if kind in ("<f8", "<f4"):
+        with np.errstate(over="ignore"):
+            return np.array(numbers, dtype=kind).astype(np.float64)
+    return (
+        np.array(numbers) if all(value == int(value) for value in numbers if math.isfinite(value)) else None
+    )
+
+
+def _number(value: object) -> float:
+    """A number, NaN for what is none. YAML 1.1 takes some exponents for text."""
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        return math.nan
+    try:
+        return float(value)
+    except (ValueError, OverflowError):
+        return math.nan
+
+
+def _binary(raw: bytes, kind: str) -> FloatArray | None:
+    """Numbers after the header that names their type, such as "1d" or "d"."""
+    header, body = raw[:_HEADER_BYTES].decode("latin-1").split(), raw[_HEADER_BYTES:]
+    letter = next(letter for letter, name in _TYPES.items() if name == kind)
+    if header not in ([letter], [f"1{letter}"]) or len(body) % np.dtype(kind).itemsize:
+        return None
+    return np.frombuffer(body, dtype=kind).astype(np.float64)
+
+
+def _yaml(text: str) -> object:
+    # OpenCV's directive with its colon is no YAML.
+    text = re.sub(r"\A%YAML:[0-9.]+[^\n]*", "", text)
+    return load(_unescaped(text), (MATRIX, "binary"), _loader())
+
+
+def _unescaped(text: str) -> str:
+    """The same with apostrophes plain, which OpenCV escapes and neither YAML nor JSON knows escaped."""
+    return re.sub(r"(?<!\\)((?:\\\\)*)\\'", r"\1'", text)
+
+
+@cache
+def _loader() -> Any:
+    """A safe loader that knows OpenCV's matrices."""
+    import yaml
+
+    base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    made: Any = type("StorageLoader", (base,), {})
+
+    def construct(loader: Any, node: Any) -> dict[Any, Any]:
+        return {**loader.construct_mapping(node, deep=True), _TYPE: MATRIX}
+
+    made.add_constructor(f"tag:yaml.org,2002:{MATRIX}", construct)
+    return made
+
+
+class _Tree:
+    """Elements as nested values, with a bound on their depth."""
+
+    def __init__(self) -> None:
+        self.root: object = None
+        self._open: list[tuple[str, dict[str, str], dict[str, object], list[str]]] = []
+
+    def start(self, tag: str, attributes: dict[str, str]) -> None:
+        if len(self._open) >= _DEEPEST:
+            raise ValueError("too deep")
+        self._open.append((tag, attributes, {}, []))
+
+    def data(self, text: str) -> None:
+        if self._open:
+            self._open[-1][3].append(text)
+
+    def end(self, _: str) -> None:
+        tag, attributes, inner, texts = self._open.pop()
+        value: object = _leaf("".join(texts), attributes)
+        if inner:
+            value = {**inner, **({_TYPE: attributes[_TYPE]} if _TYPE in attributes else {})}
+        if not self._open:
+            self.root = (tag, value)
+        elif tag in self._open[-1][2]:
+            raise ValueError("given twice")
+        else:
+            self._open[-1][2][tag] = value
+
+    def close(self) -> object:
+        return self.root
+
+
+def _leaf(text: str, attributes: dict[str, str]) -> object:
+    """Text of an element: a number, a list of numbers, base64 or text."""
+    if attributes.get(_TYPE) == "binary":
+        return base64.b64decode("".join(text.split()), validate=True)
+    words = text.split()
+    if len(words) == 1 and re.fullmatch(r"[-+]?[0-9]{1,18}", words[0]):
+        return int(words[0])
+    if words and all(math.isfinite(_number(word)) for word in words[:2]):
+        return [_number(word) for word in words] if len(words) > 1 else _number(words[0])
+    return text.strip()
+
+
+def _xml(text: str) -> object:
+    if "<!" in re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL):
+        # Entities are the other way in which a small text becomes a large one.
+        raise ValueError("has declarations")
+    parser = ElementTree.XMLParser(target=_Tree())
+    parser.feed(text)
+    tag, value = parser.close() or ("", None)
+    return value if tag == "opencv_storage" else None
+
+
+# ----------------------------------------------------------------------
+# A camera in the files of other tools: ROS camera_info, OpenCV FileStorage, Kalibr camchain.
+#
+# Numbers are written with enough digits to come back bit for bit. What a format cannot hold is refused
+# and named, never dropped: Kalibr's radtan has no k3 and no skew. ROS's files and OpenCV's have a place
+# for the skew in K, which OpenCV's own functions then ignore. None of them holds the name of our model;
+# on reading it is the simplest one that has all coefficients that are not zero.
+#
+# All three count pixels from the centre of the top-left one and order the coefficients
+# k1, k2, p1, p2, k3, k4, k5, k6, as this project does.
+
+_BROWN = len(MODELS["brown5"])
+_BEYOND_RATIONAL = ("s1", "s2", "s3", "s4", "tau_x", "tau_y")
+"""OpenCV's thin prism and tilted sensor, which no model here has."""
+_SKEW_LIMIT = 1e-12
+
+
+def to_ros(camera: Camera, name: str = "camera") -> str:
+    """ROS camera_info YAML (sensor_msgs/CameraInfo): plumb_bob, or rational_polynomial for rational8.
+
+    The rectification is the identity and the projection matrix K, as for a single camera.
+    """
+    rational = bool(np.any(camera.distortion[_BROWN:]))
+    coefficients = camera.distortion if rational else camera.distortion[:_BROWN]
+    P = np.column_stack([camera.K, np.zeros(3)])
+    document = {
+        "image_width": int(camera.image_size_px[0]),
+        "image_height": int(camera.image_size_px[1]),
+        "camera_name": name,
+        "camera_matrix": _matrix(camera.K),
+        "distortion_model": "rational_polynomial" if rational else "plumb_bob",
+        "distortion_coefficients": _matrix(coefficients[None]),
+        "rectification_matrix": _matrix(np.eye(3)),
+        "projection_matrix": _matrix(P),
+    }
+    return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=1000, allow_unicode=True)
+
+
+def from_ros(text: str) -> Camera:
+    """Camera from a ROS camera_info YAML.
+
+    The rectification and projection matrices say how pictures are to be rectified, not what the camera
+    is, and are not read.
+
+    Raises
+    ------
+    BadInputError
+        Naming the key that is missing or wrong, or the distortion model that cannot be expressed.
+    """
+    document = _mapping(text)
+    size = (_whole(document, "image_width"), _whole(document, "image_height"))
+    model = document.get("distortion_model")
+    lengths = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8,)}
+    if not isinstance(model, str) or model not in lengths:
+        raise BadInputError(
+            f"distortion_model is {_short(model)}, expected plumb_bob or rational_polynomial; no other can "
+            "be "
+            "expressed"
+        )
+    coefficients = _ros_matrix(document, "distortion_coefficients", None)
+    if coefficients.size not in lengths[model]:
+        raise BadInputError(
+            f"distortion_coefficients.data has {coefficients.size} numbers, expected {lengths[model][-1]} "
+            f"for {model}"
+        )
+    return _camera(
+        size, _ros_matrix(document, "camera_matrix", (3, 3)), coefficients.ravel(), "camera_matrix"
+    )
+
+
+def to_opencv(camera: Camera) -> str:
+    """OpenCV FileStorage YAML with the keys of OpenCV's calibration sample."""
+    storage = cv2.FileStorage(
+        "camera.yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML
+    )
+    storage.write("image_width", int(camera.image_size_px[0]))
+    storage.write("image_height", int(camera.image_size_px[1]))
+    storage.write("camera_matrix", camera.K)
+    used = len(COEFFICIENTS) if np.any(camera.distortion[_BROWN:]) else _BROWN
+    storage.write("distortion_coefficients", camera.distortion[:used, None])
+    return str(storage.releaseAndGetString())
+
+
+def from_opencv(text: str) -> Camera:
+    """Camera from an OpenCV FileStorage, YAML, XML or JSON, written by OpenCV's calibration samples.
+
+    Raises
+    ------
+    BadInputError
+        For text that is no FileStorage, a missing or wrong key, a fisheye model, or coefficients of
+        OpenCV's thin-prism and tilted models that are not zero.
+    """
+    root = read_storage(text)
+    fisheye = root.get("fisheye_model", 0)
+    if not isinstance(fisheye, int | float) or fisheye != 0:
+        raise BadInputError("fisheye_model is set, and a fisheye lens cannot be expressed")
+    width, height = (_storage_whole(root, key) for key in ("image_width", "image_height"))
+    K = _storage_matrix(root, "camera_matrix")
+    coefficients = _storage_matrix(root, "distortion_coefficients").ravel()
+    if K.shape != (3, 3):
+        raise BadInputError(f"camera_matrix is {K.shape[0]}x{K.shape[1]}, expected 3x3")
+    if coefficients.size not in (4, 5, 8, 12, 14):
+        raise BadInputError(
+            f"distortion_coefficients has {coefficients.size} numbers, expected 4, 5, 8, 12 or 14"
+        )
+    for name, value in zip(_BEYOND_RATIONAL, coefficients[len(COEFFICIENTS) :], strict=False):
+        if value != 0.0:
+            raise BadInputError(
+                f"distortion_coefficients holds {name} = {value:g}, which cannot be expressed"
+            )
+    return _camera((width, height), K, coefficients[: len(COEFFICIENTS)], "camera_matrix")
+
+
+def to_kalibr(camera: Camera, name: str = "cam0") -> str:
+    """Kalibr camchain YAML with one pinhole-radtan camera.
+
+    Raises
+    ------
+    BadInputError
+        Naming the parameter that Kalibr's model lacks: skew, k3, k4, k5 or k6.
+    """
+    if camera.skew_px != 0.0:
+        raise BadInputError(
+            f"skew_px is {camera.skew_px:g} and a Kalibr camchain cannot express it; calibrate without skew"
+        )
+    for index, value in enumerate(camera.distortion.tolist()):
+        if index >= 4 and value != 0.0:
+            raise BadInputError(
+                f"{COEFFICIENTS[index]} is {value:g} and Kalibr's radtan (k1, k2, p1, p2) cannot express it; "
+                "calibrate with --model radial2"
+            )
+    numbers = [float(camera.fx_px), float(camera.fy_px), float(camera.cx_px), float(camera.cy_px)]
+    document = {
+        "cam0": {
+            "cam_overlaps": [],
+            "camera_model": "pinhole",
+            "distortion_coeffs": [float(value) for value in camera.distortion[:4]],
+            "distortion_model": "radtan",
+            "intrinsics": numbers,
+            "resolution": [int(size) for size in camera.image_size_px],
+            "rostopic": f"/{name}/image_raw",
+        }
+    }
+    return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=1000, allow_unicode=True)
+
+
+def from_kalibr(text: str, entry: str = "cam0") -> Camera:
+    """Camera `entry` of a Kalibr camchain YAML, pinhole with radtan or no distortion.
+
+    Raises
+    ------
+    BadInputError
+        Naming the key that is missing or wrong, or the model that cannot be expressed.
+    """
+    document = _mapping(text)
+    if not isinstance(document.get(entry), dict):
+        known = ", ".join(str(key)[:40] for key in list(document)[:5]) or "nothing"
+        raise BadInputError(f"{entry} is missing from the camchain, which has {known}")
+    camera = document[entry]
+    if camera.get("camera_model") != "pinhole":
+        raise BadInputError(
+            f"{entry}.camera_model is {_short(camera.get('camera_model'))}, expected pinhole; no other can "
+            "be "
+            "expressed"
+        )
+    model = camera.get("distortion_model")
+    if model not in ("radtan", "none"):
+        raise BadInputError(
+            f"{entry}.distortion_model is {_short(model)}, expected radtan or none; no other can be expressed"
+        )
+    fx, fy, cx, cy = _numbers(camera.get("intrinsics"), f"{entry}.intrinsics", 4)
+    coefficients: list[float] = []
+    if model == "radtan":
+        coefficients = _numbers(camera.get("distortion_coeffs"), f"{entry}.distortion_coeffs", 4)
+    size = camera.get("resolution")
+    if not (isinstance(size, list) and len(size) == 2 and all(_is_whole(value) for value in size)):
+        raise BadInputError(
+            f"{entry}.resolution is {_short(size)}, expected two whole numbers [width, height]"
+        )
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    return _camera((size[0], size[1]), K, np.array(coefficients), f"{entry}.intrinsics")
+
+
+def _camera(size: tuple[int, int], K: FloatArray, coefficients: FloatArray, key: str) -> Camera:
+    """The camera, after a look at K and at what it is made of."""
+    if min(size) < 1:
+        raise BadInputError(f"the image size is {size[0]}x{size[1]}, expected positive numbers")
+    lower = [K[1, 0], K[2, 0], K[2, 1]]
+    if np.abs(lower).max() > _SKEW_LIMIT or K[2, 2] != 1.0 or min(K[0, 0], K[1, 1]) <= 0.0:
+        raise BadInputError(f"{key} is not an intrinsic matrix: [fx skew cx; 0 fy cy; 0 0 1] with fx, fy > 0")
+    distortion = np.zeros(len(COEFFICIENTS))
+    distortion[: len(coefficients)] = coefficients
+    fx, skew, cx, fy, cy = (float(value) for value in (K[0, 0], K[0, 1], K[0, 2], K[1, 1], K[1, 2]))
+    return Camera(_simplest_model(distortion), size, fx, fy, skew, cx, cy, distortion)
+
+
+def _simplest_model(distortion: FloatArray) -> str:
+    used = {name for name, value in zip(COEFFICIENTS, distortion, strict=True) if value != 0.0}
+    return next(model for model, names in MODELS.items() if used <= set(names))
+
+
+def _matrix(values: FloatArray) -> dict[str, Any]:
+    rows, cols = values.shape
+    return {"rows": rows, "cols": cols, "data": [float(value) for value in values.ravel()]}
+
+
+def _mapping(text: str) -> Mapping[str, Any]:
+    # Some writers put OpenCV's directive, which is no YAML, on the first line.
+    lines = text.split("\n", 1)
+    if lines[0].startswith("%YAML:"):
+        text = "\n" + (lines[1] if len(lines) > 1 else "")
+    try:
+        document = load(text)
+    except YamlProblem as problem:
+        where = "" if problem.line is None else f" at line {problem.line}"
+        raise BadInputError(f"not valid YAML{where}: {problem.said}") from problem
+    if not isinstance(document, dict):
+        raise BadInputError(f"expected a YAML mapping, found {type(document).__name__}")
+    return document
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _is_whole(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def _whole(document: Mapping[str, Any], key: str) -> int:
+    value = document.get(key)
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise BadInputError(
+            f"{key} is missing" if value is None else f"{key} is {_short(value)}, expected a whole number"
+        )
+    return value
+
+
+def _numbers(values: object, key: str, count: int | None) -> list[float]:
+    """A list of finite numbers. YAML 1.1 reads 1e-05 as text, and yaml-cpp writes it like that."""
+    if not isinstance(values, Sequence) or isinstance(values, str):
+        raise BadInputError(
+            f"{key} is missing" if values is None else f"{key} is {_short(values)}, expected a list"
+        )
+    if count is not None and len(values) != count:
+        raise BadInputError(f"{key} has {len(values)} numbers, expected {count}")
+    numbers = []
+    for value in values:
+        try:
+            number = float(value) if not isinstance(value, bool) else math.nan
+        except (TypeError, ValueError, OverflowError):
+            number = math.nan
+        if not math.isfinite(number):
+            raise BadInputError(f"{key} contains {_short(value)}, expected finite numbers")
+        numbers.append(number)
+    return numbers
+
+
+def _ros_matrix(document: Mapping[str, Any], key: str, shape: tuple[int, int] | None) -> FloatArray:
+    node = document.get(key)
+    if not isinstance(node, dict):
+        raise BadInputError(f"{key} is missing" if node is None else f"{key} has no rows, cols and data")
+    rows, cols = _whole(node, "rows"), _whole(node, "cols")
+    data = _numbers(node.get("data"), f"{key}.data", rows * cols)
+    if shape is not None and (rows, cols) != shape:
+        raise BadInputError(f"{key} is {rows}x{cols}, expected {shape[0]}x{shape[1]}")
+    return np.array(data, dtype=np.float64).reshape(rows, cols)
+
+
+def _storage_whole(root: Mapping[str, Any], key: str) -> int:
+    value = root.get(key)
+    if value is None:
+        raise BadInputError(f"{key} is missing")
+    if not _is_whole(value):
+        raise BadInputError(f"{key} is not a whole number")
+    return int(value)
+
+
+def _storage_matrix(root: Mapping[str, Any], key: str) -> FloatArray:
+    if root.get(key) is None:
+        raise BadInputError(f"{key} is missing")
+    values = matrix(root[key])
+    if values is None:
+        raise BadInputError(f"{key} is not a matrix of finite numbers")
+    return values

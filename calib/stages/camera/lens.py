@@ -1,0 +1,506 @@
+"""What lens distortion does to the picture and costs on the plane, and a cheap inverse of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from calib.core.arrays import AnyArray, BoolArray, FloatArray
+from calib.core.errors import BadInputError
+from calib.core.geometry import apply_homography, fit_homography
+from calib.stages.camera.model import Camera, distort, project, undistort
+from calib.stages.camera.plane import visible, workspace_grid
+from calib.stages.camera.pose import projection_with_derivatives
+
+# ----------------------------------------------------------------------
+# Undistortion that a microcontroller can afford: a polynomial fitted to the inverse of the lens model.
+#
+# (B.1) has no inverse in closed form, but over the radii of one picture a short polynomial replaces it.
+# In normalised distorted coordinates w = (xd, yd), with rho = |w|^2, the radial part is undone by
+#
+#     x = w P(|w|^2),   P(rho) = 1 + c1 rho + c2 rho^2 + ...
+#
+# Decentering (p1, p2) is added by the model after the radial part, so it is taken off first, where the
+# point was found so far; the second line is repeated a few times, once or twice for a usual lens:
+#
+#     x <- w P(|w|^2)
+#     x <- v P(|v|^2),   v = w - T(x),   T(x) = (2 p1 x y + p2 (r2 + 2 x^2), p1 (r2 + 2 y^2) + 2 p2 x y)
+#
+# The coefficients minimise the largest error over the picture (Lawson's reweighted least squares), and
+# the shortest polynomial that is good enough is taken.
+
+_MOST_COEFFICIENTS, _MOST_STEPS = 10, 6
+_REWEIGHTINGS = 40
+_MOST_PIXELS = 200_000
+"""Larger pictures are checked on a grid of about this many pixels, their borders included."""
+
+
+@dataclass(frozen=True)
+class InversePolynomial:
+    """An inverse of the lens model, see the module.
+
+    Attributes
+    ----------
+    radial : c1, c2, ...
+    p1, p2 : decentering coefficients of the camera.
+    decentering_steps : how often the decentering is taken off.
+    max_error_px : largest distance between this and the exact inverse over the picture, in undistorted
+        pixels, computed in single precision as a microcontroller does.
+    covered : share of the picture that the lens model can show at all; the error is over this share.
+    tolerance_px : what was asked for.
+    """
+
+    radial: tuple[float, ...]
+    p1: float
+    p2: float
+    decentering_steps: int
+    max_error_px: float
+    covered: float
+    tolerance_px: float
+
+    @property
+    def good_enough(self) -> bool:
+        """Whether it reaches the tolerance everywhere in the picture."""
+        return self.covered == 1.0 and self.max_error_px <= self.tolerance_px
+
+
+def pixel_grid(
+    image_size_px: tuple[int, int],
+    region_px: tuple[float, float, float, float] | None = None,
+    most: int = _MOST_PIXELS,
+) -> FloatArray:
+    """Centres of the pixels of a picture, or of a box (u0, v0, u1, v1) with its borders, (rows, columns, 2).
+
+    Every pixel where there are no more than `most`, else evenly spaced ones that include the borders.
+    """
+    width, height = image_size_px
+    u0, v0, u1, v1 = region_px or (0.0, 0.0, width - 1.0, height - 1.0)
+    columns, rows = round(u1 - u0) + 1, round(v1 - v0) + 1
+    shrink = min(1.0, (most / (columns * rows)) ** 0.5)
+    u = np.linspace(u0, u1, max(2, round(columns * shrink)) if columns > 1 else 1)
+    v = np.linspace(v0, v1, max(2, round(rows * shrink)) if rows > 1 else 1)
+    return np.stack(np.meshgrid(u, v), axis=-1)
+
+
+def distorted_normalised(camera: Camera, pixels: AnyArray) -> AnyArray:
+    """Normalised distorted coordinates (..., 2) of pixels (..., 2), in the precision of the input."""
+    kind = pixels.dtype.type
+    y = (pixels[..., 1] - kind(camera.cy_px)) / kind(camera.fy_px)
+    x = (pixels[..., 0] - kind(camera.cx_px) - kind(camera.skew_px) * y) / kind(camera.fx_px)
+    return np.stack([x, y], axis=-1)
+
+
+def fold_radius(camera: Camera) -> tuple[float, float]:
+    """Where the radial curve r L(r) stops rising: undistorted radius r and distorted radius r L(r).
+
+    Normalised; infinite where it rises for ever or up to a pole of L. With L = N / D in rho = r^2 the
+    slope vanishes where N D + 2 rho (N' D - N D') = 0. Beyond it two points share a pixel.
+    """
+    k1, k2, _, _, k3, k4, k5, k6 = camera.distortion
+    N, D = np.polynomial.Polynomial([1, k1, k2, k3]), np.polynomial.Polynomial([1, k4, k5, k6])
+    rho = np.polynomial.Polynomial([0, 1])
+
+    def first_root(polynomial: Any) -> float:
+        roots = polynomial.trim().roots()
+        real = roots[(np.abs(roots.imag) < 1e-9 * np.maximum(1.0, np.abs(roots))) & (roots.real > 0)].real
+        return float(real.min()) if len(real) else np.inf
+
+    fold = first_root(N * D + 2 * rho * (N.deriv() * D - N * D.deriv()))
+    if not np.isfinite(fold) or first_root(D) < fold:
+        return np.inf, np.inf
+    radius = float(np.sqrt(fold))
+    return radius, radius * float(N(fold) / D(fold))
+
+
+def undistort_by_polynomial(inverse: InversePolynomial, distorted: AnyArray) -> AnyArray:
+    """Normalised undistorted coordinates (..., 2) of distorted ones, in the precision of the input."""
+    kind = distorted.dtype.type
+    p1, p2, two = kind(inverse.p1), kind(inverse.p2), kind(2)
+    xd, yd = distorted[..., 0], distorted[..., 1]
+    x, y = _times_radial(inverse.radial, xd, yd)
+    for _ in range(inverse.decentering_steps):
+        r2, xy = x * x + y * y, two * x * y
+        u = xd - (p1 * xy + p2 * (r2 + two * x * x))
+        v = yd - (p1 * (r2 + two * y * y) + p2 * xy)
+        x, y = _times_radial(inverse.radial, u, v)
+    return np.stack([x, y], axis=-1)
+
+
+def _times_radial(radial: tuple[float, ...], x: AnyArray, y: AnyArray) -> tuple[AnyArray, AnyArray]:
+    rho = x * x + y * y
+    P = np.zeros_like(rho)
+    for coefficient in (*reversed(radial), 1.0):
+        P = P * rho + rho.dtype.type(coefficient)
+    return x * P, y * P
+
+
+def exact_inverse(camera: Camera, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Normalised undistorted coordinates (M, 2) by Newton's method, and which pixels have them (M,).
+
+    Pixels that only a part of the curve beyond its fold could show count as having none.
+    """
+    ideal = undistort(camera, pixels)
+    with np.errstate(invalid="ignore"):
+        inside = np.linalg.norm(ideal, axis=1) < fold_radius(camera)[0]
+    return ideal, np.asarray(np.isfinite(ideal).all(axis=1) & inside)
+
+
+def fit_inverse(camera: Camera, tolerance_px: float = 0.01) -> InversePolynomial:
+    """The shortest inverse polynomial within `tolerance_px` of the exact inverse, else the best found.
+
+    Look at `good_enough`: where the lens model folds over inside the picture, or bends more than ten
+    coefficients can follow, the tolerance is not reached and `max_error_px` says by how much.
+    """
+    width, height = camera.image_size_px
+    pixels = pixel_grid(camera.image_size_px, (-0.5, -0.5, width - 0.5, height - 0.5)).reshape(-1, 2)
+    ideal, seen = exact_inverse(camera, pixels)
+    p1, p2 = float(camera.distortion[2]), float(camera.distortion[3])
+    covered = float(np.mean(seen))
+    best = InversePolynomial((), p1, p2, 0, np.inf, covered, tolerance_px)
+    if not seen.any():
+        return best
+    ideal = ideal[seen]
+    distorted = distorted_normalised(camera, pixels[seen].astype(np.float32))
+
+    def checked(radial: tuple[float, ...], steps: int) -> InversePolynomial:
+        trial = replace(best, radial=radial, decentering_steps=steps)
+        error = (undistort_by_polynomial(trial, distorted) - ideal) @ camera.K[:2, :2].T
+        return replace(trial, max_error_px=float(np.sqrt(np.max(np.sum(error**2, axis=1)))))
+
+    most = _MOST_STEPS if p1 or p2 else 0
+    largest = float(np.sqrt(np.max(np.sum(ideal**2, axis=1))))
+    with np.errstate(over="ignore", invalid="ignore"):
+        for count in range(_MOST_COEFFICIENTS + 1):
+            trial = checked(_minimax(camera, largest, count), most)
+            if trial.max_error_px < best.max_error_px:
+                best = trial
+            if best.max_error_px <= tolerance_px:
+                break
+        # Fewer steps where they do, and never more than help.
+        goal = max(tolerance_px, 1.02 * best.max_error_px)
+        for steps in range(most):
+            trial = checked(best.radial, steps)
+            if trial.max_error_px <= goal:
+                return trial
+    return best
+
+
+def _minimax(camera: Camera, largest: float, count: int) -> tuple[float, ...]:
+    """The c1, c2, ... with nearly the least largest error over undistorted radii up to `largest`."""
+    r = np.linspace(0.0, largest, 40 * (count + 5))[1:]
+    radial = camera.distortion.copy()
+    radial[2:4] = 0.0
+    w = distort(r, np.zeros_like(r), radial)[0]
+    if count == 0 or not radial.any():
+        return ()
+    rho = w * w
+    top = float(rho.max())
+    powers = (rho[:, None] / top) ** np.arange(1, count + 1) * w[:, None]
+    unit = 1.0 / np.sqrt(np.sum(powers**2, axis=0))
+    weight = np.full(len(r), 1.0 / len(r))
+    best, least = np.zeros(count), np.inf
+    for _ in range(_REWEIGHTINGS):
+        root = np.sqrt(weight)
+        solution = unit * np.linalg.lstsq(powers * unit * root[:, None], (r - w) * root, rcond=None)[0]
+        error = np.abs(powers @ solution - (r - w))
+        if error.max() < least:
+            best, least = solution, float(error.max())
+        if least < 1e-12:
+            break
+        weight = weight * error
+        weight = weight / weight.sum()
+    return tuple(float(c) for c in best / top ** np.arange(1.0, count + 1))
+
+
+# ----------------------------------------------------------------------
+# What lens distortion does to the picture, and what neglecting it costs.
+#
+# The displacement at the pixel mu of the undistorted picture is mu_distorted - mu with (B.1): where the
+# lens puts what an ideal lens would put at mu. Its length is the map of Fig. B.2.
+#
+# The kinds are named as photographers do. The printed text has them the wrong way round: k1 > 0
+# magnifies more towards the border and is pincushion, k1 < 0 is barrel.
+
+_TURN_PX = 0.01
+"""A turn of the radial curve smaller than this is not seen as a change of direction."""
+
+Region = tuple[float, float, float, float]
+"""A box (u0, v0, u1, v1) in pixels, borders included."""
+
+
+@dataclass(frozen=True)
+class PlaneView:
+    """The actuator's plane as far as distortion is concerned.
+
+    Attributes
+    ----------
+    R_CW, t_CW_m : (3, 3) and (3,), world to camera.
+    workspace_m : box (x0, y0, x1, y1) where the marker can be.
+    sigma_mm : standard deviation of a position that the calibration alone leaves open, at worst over
+        the workspace; None where it is not known.
+    """
+
+    R_CW: FloatArray
+    t_CW_m: FloatArray
+    workspace_m: tuple[float, float, float, float]
+    sigma_mm: float | None = None
+
+
+@dataclass(frozen=True)
+class PlaneCost:
+    """Errors of positions over the workspace when the lens is taken for ideal.
+
+    Attributes
+    ----------
+    max_mm, mean_mm : with the plane calibrated with the lens and read without it.
+    refitted_max_mm, refitted_mean_mm : with a homography fitted to the distorted pixels of the
+        workspace, the best that any map without a lens can do there.
+    """
+
+    max_mm: float
+    mean_mm: float
+    refitted_max_mm: float
+    refitted_mean_mm: float
+
+
+@dataclass(frozen=True)
+class DistortionReport:
+    """What distortion does and costs.
+
+    Attributes
+    ----------
+    kind : see `distortion_kind`.
+    max_px, mean_px : length of the displacement over the whole picture.
+    region_px : box that `region_*` are taken over.
+    region_max_px, region_mean_px : the same over the region of interest.
+    monotonic : whether the radial curve rises throughout the picture.
+    fold_px, corner_px : distance from the principal point at which the radial curve stops rising
+        (infinite if never), and of the corner farthest from it; distorted, of the mean focal length.
+    region_sigma_px : standard deviation of projection over the region at its least, from the
+        covariance of the intrinsics; None where that is not known.
+    plane : cost on the plane, None where no plane is known or none of it is seen.
+    inverse : polynomial that undoes the distortion.
+    verdict, reasons : "negligible" or "matters", and why.
+    """
+
+    kind: str
+    max_px: float
+    mean_px: float
+    region_px: Region
+    region_max_px: float
+    region_mean_px: float
+    monotonic: bool
+    fold_px: float
+    corner_px: float
+    region_sigma_px: float | None
+    plane: PlaneCost | None
+    inverse: InversePolynomial
+    verdict: str
+    reasons: tuple[str, ...]
+
+
+def displacement_field(camera: Camera, pixels: FloatArray) -> FloatArray:
+    """Displacement mu_distorted - mu (..., 2) in pixels at pixels (..., 2) of the undistorted picture "
+    "(B.1)."""
+    y = (pixels[..., 1] - camera.cy_px) / camera.fy_px
+    x = (pixels[..., 0] - camera.cx_px - camera.skew_px * y) / camera.fx_px
+    xd, yd = distort(x, y, camera.distortion)
+    return np.asarray(np.stack([xd - x, yd - y], axis=-1) @ camera.K[:2, :2].T)
+
+
+def central_region(image_size_px: tuple[int, int]) -> Region:
+    """The source document's region of interest, the central 160x120 of 316x208 pixels, to scale."""
+    box = []
+    for size, part in zip(image_size_px, (160 / 316, 120 / 208), strict=True):
+        count = max(1, round(size * part))
+        first = (size - count) // 2
+        box.append((float(first), float(first + count - 1)))
+    (u0, u1), (v0, v1) = box
+    return u0, v0, u1, v1
+
+
+def distortion_kind(camera: Camera) -> str:
+    """Name of the distortion: none, barrel, pincushion, mustache, or decentering.
+
+    With k1 and k2 alone the signs decide, as in the source document (errata B.1): both positive is
+    pincushion, both negative barrel, different signs mustache, whether or not the curve turns within
+    this picture. With more coefficients the radial curve decides over the radii of this picture:
+    magnification that rises outwards is pincushion, that falls is barrel, and that turns by more than
+    a hundredth of a pixel is mustache. Decentering alone has no radial curve.
+    """
+    k1, k2, p1, p2, *more = camera.distortion
+    if not np.any(camera.distortion):
+        return "none"
+    if not (k1 or k2 or any(more)):
+        return "decentering"
+    if not (p1 or p2 or any(more)):
+        if k1 * k2 < 0:
+            return "mustache"
+        return "pincushion" if k1 + k2 > 0 else "barrel"
+    r = np.linspace(0.0, min(_corner_radius(camera), fold_radius(camera)[0]), 500)[1:]
+    radial = camera.distortion.copy()
+    radial[2:4] = 0.0
+    steps = np.diff(distort(r, np.zeros_like(r), radial)[0] / r)
+    rise, fall = float(steps[steps > 0].sum()), float(-steps[steps < 0].sum())
+    seen_px = r[-1] * _focal(camera)
+    if max(rise, fall) * seen_px < 1e-9:
+        # The numerator and the denominator of the rational model cancel.
+        return "decentering" if p1 or p2 else "none"
+    if min(rise, fall) * seen_px > _TURN_PX:
+        return "mustache"
+    return "pincushion" if rise > fall else "barrel"
+
+
+def _focal(camera: Camera) -> float:
+    return float(np.sqrt(camera.fx_px * camera.fy_px))
+
+
+def _corner_radius(camera: Camera) -> float:
+    """Largest normalised radius of the picture's corners."""
+    width, height = camera.image_size_px
+    v = np.array([0.0, 0.0, height - 1.0, height - 1.0])
+    u = np.array([0.0, width - 1.0, 0.0, width - 1.0])
+    y = (v - camera.cy_px) / camera.fy_px
+    x = (u - camera.cx_px - camera.skew_px * y) / camera.fx_px
+    return float(np.hypot(x, y).max())
+
+
+def projection_sigma_px(camera: Camera, covariance: FloatArray, pixels: FloatArray) -> FloatArray:
+    """Standard deviation (N,) of where a far point is projected, root mean square of the two axes.
+
+    An error of the intrinsics that a small rotation of the camera would make good is no error: every
+    use of a camera first finds how it stands. The rotation that fits best over the picture is taken
+    off before the covariance is propagated (mrcal's implied transformation, rotation only).
+
+    Parameters
+    ----------
+    covariance : (13, 13) in the order of `projection.INTRINSICS`.
+    pixels : (N, 2) of the undistorted picture.
+    """
+
+    def derivatives(at: FloatArray) -> tuple[FloatArray, FloatArray]:
+        y = (at[:, 1] - camera.cy_px) / camera.fy_px
+        x = (at[:, 0] - camera.cx_px - camera.skew_px * y) / camera.fx_px
+        rays = np.stack([x, y, np.ones_like(x)], axis=1)
+        _, by_point, by_camera = projection_with_derivatives(camera, rays)
+        return np.cross(rays[:, None, :], by_point), by_camera
+
+    by_turn, by_camera = derivatives(pixel_grid(camera.image_size_px, most=400).reshape(-1, 2))
+    turn = np.linalg.lstsq(by_turn.reshape(-1, 3), by_camera.reshape(-1, 13), rcond=None)[0]
+    by_turn, by_camera = derivatives(pixels)
+    left = by_camera - by_turn @ turn
+    variance = np.einsum("nik,kl,nil->n", left, covariance, left)
+    return np.asarray(np.sqrt(np.maximum(0.5 * variance, 0.0)))
+
+
+def analyse_distortion(
+    camera: Camera,
+    camera_covariance: FloatArray | None = None,
+    *,
+    plane: PlaneView | None = None,
+    region_px: Region | None = None,
+    tolerance_px: float = 0.01,
+) -> DistortionReport:
+    """Displacement, kind, cost and inverse of a camera's distortion.
+
+    Distortion is called negligible only where neglecting it costs less than the calibration's own
+    standard deviation: on the plane in mm if the plane and its sigma are known, else at every pixel of
+    the region. Where no sigma is known it matters.
+
+    Parameters
+    ----------
+    camera_covariance : (13, 13) in the order of `projection.INTRINSICS`, or None.
+    region_px : region of interest; by default the box around the plane's workspace in the picture,
+        without a plane `central_region`.
+    tolerance_px : of the inverse polynomial.
+
+    Raises
+    ------
+    BadInputError
+        When `region_px` is empty or not inside the picture.
+    """
+    width, height = camera.image_size_px
+    cost, around = (None, None) if plane is None else _on_plane(camera, plane)
+    region = region_px or around or central_region(camera.image_size_px)
+    if not (0 <= region[0] <= region[2] <= width - 1 and 0 <= region[1] <= region[3] <= height - 1):
+        raise BadInputError(
+            f"the region {list(region)} is not a box [u0, v0, u1, v1] inside the picture of {width}x{height} "
+            "px"
+        )
+    whole = np.linalg.norm(displacement_field(camera, pixel_grid(camera.image_size_px)), axis=-1)
+    at = pixel_grid(camera.image_size_px, region).reshape(-1, 2)
+    inside = np.linalg.norm(displacement_field(camera, at), axis=1)
+    sigma = None
+    if camera_covariance is not None and np.all(np.isfinite(camera_covariance)):
+        sigma = projection_sigma_px(camera, camera_covariance, at)
+    _, fold = fold_radius(camera)
+    corner = _corner_radius(camera)
+    verdict, reasons = _judge(inside, sigma, plane, cost)
+    return DistortionReport(
+        kind=distortion_kind(camera),
+        max_px=float(whole.max()),
+        mean_px=float(whole.mean()),
+        region_px=region,
+        region_max_px=float(inside.max()),
+        region_mean_px=float(inside.mean()),
+        monotonic=corner < fold,
+        fold_px=fold * _focal(camera),
+        corner_px=corner * _focal(camera),
+        region_sigma_px=None if sigma is None else float(sigma.min()),
+        plane=cost,
+        inverse=fit_inverse(camera, tolerance_px),
+        verdict=verdict,
+        reasons=reasons,
+    )
+
+
+def _on_plane(camera: Camera, plane: PlaneView) -> tuple[PlaneCost | None, Region | None]:
+    """Cost over the workspace, and the box around it in the picture."""
+    points = workspace_grid(plane.workspace_m, 21)
+    points = points[visible(camera, plane.R_CW, plane.t_CW_m, points)]
+    if len(points) < 4 or np.linalg.matrix_rank(points - points.mean(axis=0)) < 2:
+        return None, None
+    H = np.column_stack([plane.R_CW[:, :2], plane.t_CW_m])
+    pixels = project(camera, np.column_stack([points, np.ones(len(points))]) @ H.T)
+    unaware = apply_homography(np.asarray(np.linalg.inv(camera.K @ H), dtype=np.float64), pixels)
+    error_mm = 1e3 * np.linalg.norm(unaware - points, axis=1)
+    fitted = fit_homography(points, pixels).H
+    refitted = apply_homography(np.asarray(np.linalg.inv(fitted), dtype=np.float64), pixels)
+    refitted_mm = 1e3 * np.linalg.norm(refitted - points, axis=1)
+    size = np.array(camera.image_size_px) - 1.0
+    u0, v0 = np.maximum(pixels.min(axis=0), 0.0)
+    u1, v1 = np.minimum(pixels.max(axis=0), size)
+    cost = PlaneCost(
+        float(error_mm.max()), float(error_mm.mean()), float(refitted_mm.max()), float(refitted_mm.mean())
+    )
+    return cost, (float(u0), float(v0), float(u1), float(v1))
+
+
+def _judge(
+    inside: FloatArray, sigma: FloatArray | None, plane: PlaneView | None, cost: PlaneCost | None
+) -> tuple[str, tuple[str, ...]]:
+    if inside.max() == 0.0:
+        return "negligible", (
+            "the camera's model has no distortion; whether the lens has none shows in the residuals",
+        )
+    if cost is not None and plane is not None and plane.sigma_mm is not None:
+        small = cost.max_mm < plane.sigma_mm
+        reason = (
+            f"neglecting the lens costs up to {cost.max_mm:.3f} mm on the plane, "
+            f"{'less' if small else 'not less'} than the calibration's own sigma of {plane.sigma_mm:.3f} mm"
+        )
+    elif sigma is not None:
+        small = bool(np.all(inside < sigma))
+        worst = int(np.argmax(inside / np.maximum(sigma, 1e-12)))
+        reason = (
+            f"the displacement is {inside[worst]:.3f} px in the region where the calibration's own sigma is "
+            f"{sigma[worst]:.3f} px"
+        )
+    else:
+        return "matters", (
+            f"the displacement reaches {inside.max():.2f} px in the region and no sigma is known to hold it "
+            "against",
+        )
+    return ("negligible" if small else "matters"), (reason,)

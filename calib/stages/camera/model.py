@@ -1,0 +1,472 @@
+"""The camera model, views of a target, and residuals with their Jacobian."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from calib.core.arrays import BoolArray, FloatArray, IntArray
+
+# ----------------------------------------------------------------------
+# The checkerboard: inner corners on a plane, in metres.
+#
+# Corner (column i, row j) has index `j * columns + i` and lies at `(i, j) * square_m`. Seen from the
+# printed side the columns axis, turned by a quarter clockwise, gives the rows axis, so that with the
+# image's axes (u right, v down) the grid is never mirrored and the board's z axis points away from the
+# camera.
+
+
+@dataclass(frozen=True)
+class Board:
+    """A checkerboard with `columns` x `rows` inner corners and squares of `square_m` metres."""
+
+    columns: int
+    rows: int
+    square_m: float
+
+    @property
+    def corners(self) -> int:
+        """Number of inner corners."""
+        return self.columns * self.rows
+
+    @property
+    def half_turn_looks_the_same(self) -> bool:
+        """Whether the colours repeat after half a turn: no picture tells the first corner from the last.
+
+        The square at (i, j) of columns + 1 by rows + 1 squares has the colour (i + j) mod 2; half a
+        turn moves it to a square of colour (columns + rows - i - j) mod 2.
+        """
+        return (self.columns + self.rows) % 2 == 0
+
+    def points_m(self) -> FloatArray:
+        """Inner corners on the board's plane, shape (columns * rows, 2), metres, row by row."""
+        rows, columns = np.mgrid[0 : self.rows, 0 : self.columns]
+        return np.stack([columns.ravel(), rows.ravel()], axis=1) * float(self.square_m)
+
+
+# ----------------------------------------------------------------------
+# Correspondences between points of a plane and pixels: one view, and many views packed for vector code.
+
+
+@dataclass(frozen=True)
+class View:
+    """One picture of a planar target.
+
+    Attributes
+    ----------
+    name : name of the picture, for reports.
+    target_m : (M, 2) points on the target's plane, metres.
+    pixels : (M, 2) where the picture shows them, distorted pixels, (0, 0) at the centre of the
+        top-left pixel, u right, v down.
+    measured : (M,) False for points that the picture does not show well enough to count; all True
+        when None. They keep their place, so that views of one board stay comparable.
+    """
+
+    name: str
+    target_m: FloatArray
+    pixels: FloatArray
+    measured: BoolArray | None = None
+
+
+@dataclass(frozen=True)
+class Observations:
+    """All views as arrays, padded to the largest number of points M.
+
+    Attributes
+    ----------
+    names : N names.
+    target_m : (1, M, 3) when every view shows the same points, else (N, M, 3); z is zero on a flat
+        target.
+    pixels : (N, M, 2).
+    present : (N, M), False for padding and for points that were not measured or were rejected.
+    """
+
+    names: tuple[str, ...]
+    target_m: FloatArray
+    pixels: FloatArray
+    present: BoolArray
+
+    @property
+    def views(self) -> int:
+        """Number of views N."""
+        return len(self.names)
+
+    @property
+    def points(self) -> int:
+        """Number of points over all views, padding left out."""
+        return int(self.present.sum())
+
+    @property
+    def complete(self) -> bool:
+        """Whether every view shows every point."""
+        return bool(self.present.all())
+
+    @property
+    def same_target(self) -> bool:
+        """Whether the target's points are the same in every view."""
+        return bool(self.target_m.shape[0] == 1)
+
+    def select(self, index: IntArray | Sequence[int]) -> Observations:
+        """The views at these indices, in this order."""
+        chosen = np.asarray(index, dtype=np.int64)
+        return Observations(
+            names=tuple(self.names[i] for i in chosen),
+            target_m=self.target_m if self.same_target else self.target_m[chosen],
+            pixels=self.pixels[chosen],
+            present=self.present[chosen],
+        )
+
+    def part(self, views: slice) -> Observations:
+        """A run of views, without copying."""
+        target = self.target_m if self.same_target else self.target_m[views]
+        return Observations(self.names[views], target, self.pixels[views], self.present[views])
+
+    def displaced(self, displacement_m: FloatArray) -> Observations:
+        """The same pixels of a target whose points are moved by `displacement_m` (M, 3)."""
+        return Observations(self.names, self.target_m + displacement_m, self.pixels, self.present)
+
+    def without(self, rejected: BoolArray) -> Observations:
+        """The same views with the points where `rejected` (N, M) is True left out."""
+        return Observations(self.names, self.target_m, self.pixels, self.present & ~rejected)
+
+
+def pack(views: Sequence[View]) -> Observations:
+    """Views as one set of padded arrays; the target is shared when all views have the same one."""
+    counts = [len(view.pixels) for view in views]
+    size = max(counts)
+    first = views[0].target_m
+    shared = all(v.target_m is first or np.array_equal(v.target_m, first) for v in views)
+    pixels = np.zeros((len(views), size, 2))
+    present = np.zeros((len(views), size), dtype=np.bool_)
+    target = np.zeros((1 if shared else len(views), size, 3))
+    for i, view in enumerate(views):
+        pixels[i, : counts[i]] = view.pixels
+        present[i, : counts[i]] = True if view.measured is None else view.measured
+        if not shared or i == 0:
+            target[0 if shared else i, : counts[i], :2] = view.target_m
+    return Observations(tuple(v.name for v in views), target, pixels, present)
+
+
+# ----------------------------------------------------------------------
+# The camera model: pinhole with skew and Brown's or the rational distortion.
+#
+# A point (X, Y, Z) of the camera's frame is seen at
+#
+#     x = X / Z,  y = Y / Z,  r2 = x^2 + y^2
+#     L  = (1 + k1 r2 + k2 r2^2 + k3 r2^3) / (1 + k4 r2 + k5 r2^2 + k6 r2^3)
+#     xd = x L + 2 p1 x y + p2 (r2 + 2 x^2)
+#     yd = y L + p1 (r2 + 2 y^2) + 2 p2 x y
+#     u  = fx xd + skew yd + cx,  v = fy yd + cy
+#
+# which is (2.4), (2.5) and (B.1) of the source document for k1, k2 alone, and OpenCV's model with a
+# skew added (Zhang 2000). The printed (2.7), gamma = f_w tan(psi), mixes units: skew is in pixels.
+
+COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+"""Order of the distortion coefficients everywhere, OpenCV's."""
+
+MODELS: dict[str, tuple[str, ...]] = {
+    "pinhole": (),
+    "radial2": ("k1", "k2"),
+    "radial3": ("k1", "k2", "k3"),
+    "brown5": ("k1", "k2", "p1", "p2", "k3"),
+    "rational8": COEFFICIENTS,
+}
+"""Coefficients that each model frees, from the simplest to the richest."""
+
+
+def _no_distortion() -> FloatArray:
+    return np.zeros(len(COEFFICIENTS))
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics of one camera.
+
+    Attributes
+    ----------
+    model : a key of `MODELS`.
+    image_size_px : (width, height).
+    fx_px, fy_px, skew_px, cx_px, cy_px : entries of K (2.5), pixels.
+    distortion : (8,) coefficients in the order of `COEFFICIENTS`, dimensionless.
+    """
+
+    model: str
+    image_size_px: tuple[int, int]
+    fx_px: float
+    fy_px: float
+    skew_px: float
+    cx_px: float
+    cy_px: float
+    distortion: FloatArray = field(default_factory=_no_distortion)
+
+    @property
+    def K(self) -> FloatArray:
+        """Intrinsic matrix (2.5), shape (3, 3), pixels."""
+        return np.array(
+            [[self.fx_px, self.skew_px, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]]
+        )
+
+
+def distort(x: FloatArray, y: FloatArray, distortion: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Distorted from undistorted normalised coordinates, any shape."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = distortion
+    r2 = x * x + y * y
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    xy = x * y
+    xd = x * radial + 2 * p1 * xy + p2 * (r2 + 2 * x * x)
+    yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * xy
+    return xd, yd
+
+
+def _distort_jacobian(
+    x: FloatArray, y: FloatArray, distortion: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Derivatives of (xd, yd) with respect to (x, y): xx, xy, yx, yy."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = distortion
+    r2 = x * x + y * y
+    numerator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    radial = numerator / denominator
+    slope = (k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / denominator
+    cross = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
+    xx = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
+    yy = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+    return xx, cross, cross, yy
+
+
+def project(camera: Camera, points_C: FloatArray) -> FloatArray:
+    """Pixels of points in the camera's frame.
+
+    Parameters
+    ----------
+    points_C : (..., 3) with positive Z.
+
+    Returns
+    -------
+    (..., 2) distorted pixels.
+    """
+    x = points_C[..., 0] / points_C[..., 2]
+    y = points_C[..., 1] / points_C[..., 2]
+    xd, yd = distort(x, y, camera.distortion)
+    u = camera.fx_px * xd + camera.skew_px * yd + camera.cx_px
+    v = camera.fy_px * yd + camera.cy_px
+    return np.stack([u, v], axis=-1)
+
+
+def undistort(camera: Camera, pixels: FloatArray, iterations: int = 30) -> FloatArray:
+    """Normalised undistorted coordinates (x, y) of distorted pixels, by Newton's method.
+
+    Where the distortion folds over and no answer exists the result is NaN.
+
+    Parameters
+    ----------
+    pixels : (..., 2) distorted pixels.
+
+    Returns
+    -------
+    (..., 2) normalised coordinates.
+    """
+    yd = (pixels[..., 1] - camera.cy_px) / camera.fy_px
+    xd = (pixels[..., 0] - camera.cx_px - camera.skew_px * yd) / camera.fx_px
+    x, y = xd.copy(), yd.copy()
+    with np.errstate(all="ignore"):
+        for _ in range(iterations):
+            xd_now, yd_now = distort(x, y, camera.distortion)
+            ex, ey = xd - xd_now, yd - yd_now
+            xx, xy, yx, yy = _distort_jacobian(x, y, camera.distortion)
+            det = xx * yy - xy * yx
+            # A step longer than the radius would leap over the fold of a barrel distortion.
+            step_x, step_y = (yy * ex - xy * ey) / det, (xx * ey - yx * ex) / det
+            limit = 0.5 * np.hypot(xd, yd) + 0.1
+            scale = np.minimum(1.0, limit / np.maximum(np.hypot(step_x, step_y), 1e-300))
+            x = x + scale * step_x
+            y = y + scale * step_y
+            if not np.any(np.hypot(step_x, step_y) > 1e-14):
+                break
+        xd_now, yd_now = distort(x, y, camera.distortion)
+        solved = np.hypot(xd - xd_now, yd - yd_now) < 1e-10
+        xx, xy, yx, yy = _distort_jacobian(x, y, camera.distortion)
+        # Both eigenvalues positive: beyond the fold the picture of the point's antipode has none.
+        solved &= (xx * yy - xy * yx > 0.0) & (xx + yy > 0.0)
+    return np.where(solved[..., None], np.stack([x, y], axis=-1), np.nan)
+
+
+# ----------------------------------------------------------------------
+# Residuals of all views and their Jacobian, for the bundle adjustment.
+#
+# For the point X of the target, p = R X + t in the camera's frame, x = p1 / p3, y = p2 / p3, distorted
+# and projected as in `calib.stages.camera.model`. With a = du/dp (3,) the derivatives are, for a rotation
+# exp(delta) R on the left,
+#
+#     du/d(delta) = (R X) x a,   du/dt = a,   du/dw_k = a . R B_k
+#
+# where the target is X + sum_k w_k B_k when it is allowed to deform. All arrays are kept with the
+# point last, so that each line of code runs over all views and points at once.
+
+INTRINSICS = ("fx_px", "fy_px", "cx_px", "cy_px", "skew_px", *COEFFICIENTS)
+"""Order of the vector of intrinsics."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """What the residuals depend on.
+
+    Attributes
+    ----------
+    intrinsics : (13,) in the order of `INTRINSICS`.
+    R_CT, t_CT_m : (N, 3, 3) and (N, 3), pose of the target in the camera's frame.
+    deformation : (K,) weights of the target's deformation, metres.
+    """
+
+    intrinsics: FloatArray
+    R_CT: FloatArray
+    t_CT_m: FloatArray
+    deformation: FloatArray
+
+    def part(self, views: slice) -> Block:
+        """The same with the poses of some views only."""
+        return Block(self.intrinsics, self.R_CT[views], self.t_CT_m[views], self.deformation)
+
+
+def free_intrinsics(model: str, skew: bool, fixed: tuple[str, ...] = ()) -> IntArray:
+    """Indices into `INTRINSICS` that the model estimates."""
+    names = ("fx_px", "fy_px", "cx_px", "cy_px") + (("skew_px",) if skew else ()) + MODELS[model]
+    return np.array([INTRINSICS.index(name) for name in names if name not in fixed], dtype=np.int64)
+
+
+def camera_from_vector(model: str, image_size_px: tuple[int, int], intrinsics: FloatArray) -> Camera:
+    """A camera from the vector of intrinsics."""
+    fx, fy, cx, cy, skew = (float(value) for value in intrinsics[:5])
+    return Camera(model, image_size_px, fx, fy, skew, cx, cy, intrinsics[5:].copy())
+
+
+def vector_from_camera(camera: Camera) -> FloatArray:
+    """The vector of intrinsics (13,) of a camera."""
+    five = [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.skew_px]
+    return np.concatenate([five, camera.distortion])
+
+
+def jacobian(
+    block: Block, observations: Observations, free: IntArray, basis: FloatArray | None
+) -> FloatArray | None:
+    """Jacobian and residuals stacked, (N, G + 7, 2 M), or None where a point is behind the camera.
+
+    Rows: free intrinsics and deformation (G together), rotation (3), translation (3), and last the
+    residual, projected minus measured. Columns: all u, then all v. Points that are not present are
+    zero throughout.
+
+    Parameters
+    ----------
+    free : indices into `INTRINSICS`.
+    basis : (K, 3, M) displacements of the target's points, or None for a rigid target.
+    """
+    points = observations.pixels.shape[1]
+    target = observations.target_m.transpose(0, 2, 1)
+    if basis is not None:
+        target = target + np.tensordot(block.deformation, basis, axes=1)
+    # (n, 3, M) and (N, 3, 3): R X without the translation.
+    rotated = block.R_CT @ target
+    p1, p2, p3 = np.moveaxis(rotated + block.t_CT_m[:, :, None], 1, 0)
+    if not observations.complete:
+        p3 = np.where(observations.present, p3, 1.0)
+    if p3.min() <= 0.0:
+        return None
+    fx, fy, cx, cy, skew = block.intrinsics[:5]
+    k1, k2, t1, t2, k3, k4, k5, k6 = block.intrinsics[5:]
+    inverse = 1.0 / p3
+    x, y = p1 * inverse, p2 * inverse
+    xx, yy, xy = x * x, y * y, x * y
+    r2 = xx + yy
+    numerator = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = k1 + r2 * (2.0 * k2 + r2 * (3.0 * k3))
+    over: FloatArray | float = 1.0
+    radial = numerator
+    if k4 or k5 or k6:
+        over = 1.0 / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        radial = numerator * over
+        slope = (slope - radial * (k4 + r2 * (2.0 * k5 + r2 * (3.0 * k6)))) * over
+    xd = x * radial
+    yd = y * radial
+    if t1 or t2:
+        xd = xd + 2.0 * t1 * xy + t2 * (r2 + 2.0 * xx)
+        yd = yd + t1 * (r2 + 2.0 * yy) + 2.0 * t2 * xy
+    # Derivatives of the distorted by the undistorted normalised coordinates; symmetric.
+    xd_x = radial + 2.0 * xx * slope + (2.0 * t1 * y + 6.0 * t2 * x if t1 or t2 else 0.0)
+    yd_y = radial + 2.0 * yy * slope + (6.0 * t1 * y + 2.0 * t2 * x if t1 or t2 else 0.0)
+    cross = 2.0 * xy * slope + (2.0 * t1 * x + 2.0 * t2 * y if t1 or t2 else 0.0)
+
+    shared = len(free) + (0 if basis is None else len(basis))
+    out = np.empty((observations.views, shared + 7, 2, points))
+    for row, index in enumerate(free):
+        u, v = out[:, row, 0], out[:, row, 1]
+        name = INTRINSICS[index]
+        if name in ("fx_px", "cx_px", "skew_px"):
+            u[:] = {"fx_px": xd, "cx_px": 1.0, "skew_px": yd}[name]
+            v[:] = 0.0
+        elif name in ("fy_px", "cy_px"):
+            u[:] = 0.0
+            v[:] = yd if name == "fy_px" else 1.0
+        else:
+            dx, dy = _by_coefficient(name, x, y, xx, yy, xy, r2, over, radial)
+            np.multiply(fx, dx, out=u)
+            if skew:
+                u += skew * dy
+            np.multiply(fy, dy, out=v)
+    pose = out[:, shared : shared + 6]
+    q1, q2, q3 = rotated[:, 0], rotated[:, 1], rotated[:, 2]
+    u_scale, v_scale = fx * inverse, fy * inverse
+    for side in (0, 1):
+        turn1, turn2, turn3, a1, a2, a3 = (pose[:, row, side] for row in range(6))
+        if side == 0:
+            np.multiply(xd_x, u_scale, out=a1)
+            np.multiply(cross, u_scale, out=a2)
+            if skew:
+                a1 += skew * inverse * cross
+                a2 += skew * inverse * yd_y
+        else:
+            np.multiply(cross, v_scale, out=a1)
+            np.multiply(yd_y, v_scale, out=a2)
+        np.multiply(x, a1, out=a3)
+        a3 += y * a2
+        np.negative(a3, out=a3)
+        np.multiply(q2, a3, out=turn1)
+        turn1 -= q3 * a2
+        np.multiply(q3, a1, out=turn2)
+        turn2 -= q1 * a3
+        np.multiply(q1, a2, out=turn3)
+        turn3 -= q2 * a1
+        if basis is not None:
+            in_target = np.einsum("ncm,ncd->ndm", pose[:, 3:, side], block.R_CT)
+            out[:, len(free) : shared, side] = np.einsum("ndm,kdm->nkm", in_target, basis)
+    residual_u, residual_v = out[:, shared + 6, 0], out[:, shared + 6, 1]
+    residual_u[:] = fx * xd + skew * yd + cx - observations.pixels[..., 0]
+    residual_v[:] = fy * yd + cy - observations.pixels[..., 1]
+    if not observations.complete:
+        out *= observations.present[:, None, None, :]
+    return out.reshape(observations.views, shared + 7, 2 * points)
+
+
+def _by_coefficient(
+    name: str,
+    x: FloatArray,
+    y: FloatArray,
+    xx: FloatArray,
+    yy: FloatArray,
+    xy: FloatArray,
+    r2: FloatArray,
+    over: FloatArray | float,
+    radial: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Derivatives of (xd, yd) by one distortion coefficient."""
+    if name == "p1":
+        return 2.0 * xy, r2 + 2.0 * yy
+    if name == "p2":
+        return r2 + 2.0 * xx, 2.0 * xy
+    power = {"k1": 1, "k2": 2, "k3": 3, "k4": 1, "k5": 2, "k6": 3}[name]
+    factor = r2 if power == 1 else r2 * r2 if power == 2 else r2 * r2 * r2
+    factor = factor * over
+    if name in ("k4", "k5", "k6"):
+        factor = -factor * radial
+    return x * factor, y * factor

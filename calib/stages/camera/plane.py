@@ -1,0 +1,778 @@
+"""The actuator's plane: from pixels to millimetres and back, and how far to trust it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.core.arrays import BoolArray, FloatArray, IntArray
+from calib.core.errors import BadInputError
+from calib.core.geometry import Homography, apply_homography, fit_homography, map_jacobian
+from calib.stages.camera.model import Board, Camera, View, project, undistort
+from calib.stages.camera.pose import Pose, fit_pose, plane_map, pose_derivatives
+
+# ----------------------------------------------------------------------
+# Standard deviation of a marker's position on the plane, from all that is uncertain.
+#
+# A marker at X is seen at the pixel m = g(c, e, X), with intrinsics c and pose e = (w, t). The position
+# read from m solves that for X, so that errors in c, e and m move it by
+#
+#     dX = G_X^-1 (dm - G_c dc - G_e de)
+#
+# The pose was itself estimated with these intrinsics, de = E dc + de_noise with E = de/dc of
+# `calib.stages.camera.pose`. Much of an error in c is absorbed that way, and leaving E out would overstate
+# it:
+#
+#     from the intrinsics    G_X^-1 (G_c + G_e E) dc
+#     from the plane's fit   G_X^-1 G_e de_noise
+#     from whole pixels      G_X^-1 dm,  dm uniform over a pixel, variance 1/12 px^2
+#
+# The three are independent as long as the plane's pictures were not among those of the intrinsics.
+
+QUANTISATION_VARIANCE_PX2 = 1.0 / 12.0
+"""Variance of an error that is uniform over one pixel."""
+
+
+@dataclass(frozen=True)
+class PositionSigma:
+    """Standard deviations of a marker's position, one row per place and the columns x and y.
+
+    Attributes
+    ----------
+    points_m : (N, 2) places on the plane; rows of places that the picture does not show are NaN in
+        all other arrays.
+    intrinsics_mm : (N, 2), or None where the covariance of the intrinsics is not known.
+    plane_mm, quantisation_mm : (N, 2).
+    """
+
+    points_m: FloatArray
+    intrinsics_mm: FloatArray | None
+    plane_mm: FloatArray
+    quantisation_mm: FloatArray
+
+    @property
+    def calibration_mm(self) -> FloatArray:
+        """Intrinsics and plane together, (N, 2): what the calibration alone leaves open."""
+        if self.intrinsics_mm is None:
+            return self.plane_mm
+        return np.asarray(np.hypot(self.intrinsics_mm, self.plane_mm))
+
+    @property
+    def total_mm(self) -> FloatArray:
+        """Everything together, (N, 2)."""
+        return np.asarray(np.hypot(self.calibration_mm, self.quantisation_mm))
+
+
+def workspace_grid(workspace_m: tuple[float, float, float, float], side: int = 9) -> FloatArray:
+    """A grid of side x side places over the box (x0, y0, x1, y1), shape (side^2, 2), metres."""
+    x0, y0, x1, y1 = workspace_m
+    x, y = np.meshgrid(np.linspace(x0, x1, side), np.linspace(y0, y1, side))
+    return np.stack([x.ravel(), y.ravel()], axis=1)
+
+
+def visible(camera: Camera, R_CW: FloatArray, t_CW_m: FloatArray, points_m: FloatArray) -> BoolArray:
+    """Which places (N, 2) of the plane the picture shows, (N,): in front, inside, and not folded over."""
+    shown = np.asarray(points_m @ R_CW[2, :2] + t_CW_m[2] > 0.0)
+    if not shown.any():
+        return shown
+    pixels = pose_derivatives(camera, R_CW, t_CW_m, points_m[shown])[0]
+    width, height = camera.image_size_px
+    inside = np.all((pixels >= -0.5) & (pixels <= np.array([width, height]) - 0.5), axis=1)
+    back = np.full(pixels.shape, np.nan)
+    back[inside] = plane_map(camera, R_CW, t_CW_m, pixels[inside])
+    size = np.linalg.norm(t_CW_m)
+    result = shown.copy()
+    returned = np.linalg.norm(back - points_m[shown], axis=1)
+    result[shown] = returned < 1e-6 * size
+    return result
+
+
+def position_sigma(
+    camera: Camera, camera_covariance: FloatArray | None, pose: Pose, points_m: FloatArray
+) -> PositionSigma:
+    """Standard deviations in mm of positions read from the picture.
+
+    Parameters
+    ----------
+    camera_covariance : (13, 13) in the order of `projection.INTRINSICS`, zero rows for what was not
+        estimated; None where it is not known.
+    points_m : (N, 2) places on the plane.
+    """
+    seen = visible(camera, pose.R_CW, pose.t_CW_m, points_m)
+    _, by_world, by_pose, by_camera = pose_derivatives(camera, pose.R_CW, pose.t_CW_m, points_m[seen])
+    to_world = 1e3 * np.linalg.inv(by_world)
+
+    def deviation(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
+        rows = to_world @ jacobian
+        result = np.full(points_m.shape, np.nan)
+        variance = np.einsum("nik,kl,nil->ni", rows, covariance, rows)
+        # Rounding may leave a covariance negative by its last digit.
+        result[seen] = np.sqrt(np.maximum(variance, 0.0))
+        return result
+
+    intrinsics = None
+    if camera_covariance is not None and not np.all(np.isfinite(camera_covariance)):
+        intrinsics = np.where(seen[:, None], np.inf, np.nan) * np.ones(2)
+    elif camera_covariance is not None:
+        intrinsics = deviation(by_camera + by_pose @ pose.by_intrinsics, camera_covariance)
+    pixel = np.broadcast_to(np.eye(2), by_world.shape)
+    return PositionSigma(
+        points_m,
+        intrinsics,
+        deviation(by_pose, pose.covariance),
+        deviation(pixel, QUANTISATION_VARIANCE_PX2 * np.eye(2)),
+    )
+
+
+# ----------------------------------------------------------------------
+# Whether pictures of a plane support the plane fitted to them.
+#
+# What cannot be computed is refused with an error; what can be computed but not trusted is computed and
+# marked. Each check has one constant and one sentence.
+
+_MOSTLY_UNSEEN = 0.5
+"""Share of the workspace outside the picture above which the plane is of no use."""
+_RMS_LIMIT_PX = 1.0
+"""A board that is found to 0.1 px and still misses by this much does not fit its description."""
+_RMS_FACTOR, _RMS_NOTICED_PX = 3.0, 0.3
+"""Against the camera's own RMS: this many times as large, and large enough to matter."""
+_HOMOGRAPHY_FACTOR, _HOMOGRAPHY_POINTS = 2.0, 10
+"""A homography that is free to bend to the pixels must not fit this much better than the pose."""
+_ELEVATION_LOST_DEG, _ELEVATION_POOR_DEG = 3.0, 15.0
+"""Angle between the line of sight and the plane: an error across it grows with its inverse sine."""
+_SPREAD_LOST_PX = 1.5
+"""Root mean square width of the points in the picture, across their longest direction."""
+_MOVED_PX, _MOVED_PROBABILITY = 0.25, 1e-4
+"""Pictures contradict each other when they differ visibly and not by chance."""
+_SCATTER_PROBABILITY = 0.01
+"""Below this the scatter between pictures, rather than within them, sets the uncertainty."""
+_SIGMA_SHARE = 0.02
+"""The plane's own sigma as a share of the workspace's diagonal."""
+_FEW_FREEDOMS = 10
+
+
+@dataclass(frozen=True)
+class PictureFit:
+    """How one picture fits the common pose.
+
+    Attributes
+    ----------
+    name : of the picture.
+    points : corners in it.
+    rms_px : reprojection error under the common pose.
+    moved_px : RMS distance between its corners under its own pose and under the common one; NaN when
+        it has too few points for a pose of its own.
+    """
+
+    name: str
+    points: int
+    rms_px: float
+    moved_px: float
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One pose for all pictures against one for each.
+
+    Attributes
+    ----------
+    probability : of a difference as large as this by chance (F test); 1 with a single picture.
+    moved_px, moved_name : the largest `PictureFit.moved_px`, and whose it is.
+    inflation : factor on the pose's covariance where pictures scatter more than their noise explains.
+    """
+
+    probability: float
+    moved_px: float
+    moved_name: str
+    inflation: float
+
+
+def refuse_unusable(views: Sequence[View]) -> None:
+    """Raise BadInputError for points from which no plane can be computed."""
+    if not views:
+        raise BadInputError("no picture of the plane was given")
+    for view in views:
+        if view.target_m.shape != view.pixels.shape or view.pixels.ndim != 2 or view.pixels.shape[1] != 2:
+            raise BadInputError(
+                f"{view.name}: world points {view.target_m.shape} and pixels {view.pixels.shape} must both "
+                "be (M, 2)"
+            )
+        if not (np.all(np.isfinite(view.target_m)) and np.all(np.isfinite(view.pixels))):
+            raise BadInputError(f"{view.name}: a corner's position is not a finite number")
+    world = np.unique(np.round(np.concatenate([view.target_m for view in views]), 9), axis=0)
+    if len(world) < 4:
+        raise BadInputError(f"a plane needs at least 4 different corners, got {len(world)}")
+    spread = np.linalg.svd(world - world.mean(axis=0), compute_uv=False)
+    if spread[1] < 1e-6 * spread[0]:
+        raise BadInputError(
+            "all corners of the plane lie on one line; a plane needs corners on both sides of it"
+        )
+
+
+def compare_pictures(
+    camera: Camera, views: Sequence[View], pose: Pose
+) -> tuple[tuple[PictureFit, ...], Comparison]:
+    """Fit every picture by itself and test whether the camera stood still."""
+    fits: list[PictureFit] = []
+    joint = separate = 0.0
+    tested = freedom = at = 0
+    for view in views:
+        M = len(view.pixels)
+        residuals = pose.residuals_px[at : at + M]
+        at += M
+        moved = np.nan
+        own = _own_pose(camera, view) if len(views) > 1 else None
+        if own is not None:
+            joint += float(np.sum(residuals**2))
+            separate += own.cost_px2
+            tested, freedom = tested + 1, freedom + 2 * M - 6
+            moved = float(np.sqrt(np.mean(np.sum((own.residuals_px - residuals) ** 2, axis=1))))
+        fits.append(PictureFit(view.name, M, float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))), moved))
+    if tested < 2:
+        return tuple(fits), Comparison(1.0, 0.0, "", 1.0)
+    # SciPy takes longer to load than most planes to check.
+    from scipy.special import fdtrc
+
+    between = max(joint - separate, 0.0) / (6 * (tested - 1))
+    ratio = between / max(separate / freedom, 1e-24)
+    probability = float(fdtrc(6 * (tested - 1), freedom, ratio))
+    worst = max((fit for fit in fits if np.isfinite(fit.moved_px)), key=lambda fit: fit.moved_px)
+    inflation = ratio if probability < _SCATTER_PROBABILITY else 1.0
+    return tuple(fits), Comparison(probability, worst.moved_px, worst.name, max(inflation, 1.0))
+
+
+def _own_pose(camera: Camera, view: View) -> Pose | None:
+    try:
+        refuse_unusable([view])
+        return fit_pose(camera, view.target_m, view.pixels)
+    except BadInputError:
+        return None
+
+
+def judge(
+    camera: Camera,
+    views: Sequence[View],
+    pose: Pose,
+    comparison: Comparison,
+    sigma: PositionSigma,
+    workspace_m: tuple[float, float, float, float],
+    camera_rms_px: float | None,
+) -> tuple[str, tuple[str, ...], tuple[str, ...]]:
+    """Verdict, its reasons, and notes that do not lower it."""
+    world_m = np.concatenate([view.target_m for view in views])
+    pixels = np.concatenate([view.pixels for view in views])
+    moved = _moved(comparison)
+    lost, flat = _shape(pose, world_m, pixels)
+    poor = flat + _fit(camera, pose, world_m, pixels, camera_rms_px)
+    poor += _horizon(camera, pose)
+    poor += _precision(camera, pose, sigma, workspace_m)
+    notes: list[str] = []
+    out_of_sight = float(np.mean(~np.isfinite(sigma.plane_mm[:, 0])))
+    if out_of_sight == 1.0:
+        poor.append("no part of the workspace is in the picture")
+    elif out_of_sight > _MOSTLY_UNSEEN:
+        poor.append(
+            f"{100 * out_of_sight:.0f} % of the workspace is outside the picture; move the camera, or say in "
+            "the rig's file where the marker can be (geometry.workspace_m)"
+        )
+    elif out_of_sight > 0.0:
+        notes.append(
+            f"{100 * out_of_sight:.0f} % of the workspace is outside the picture; sigma is given for the rest"
+        )
+    if sigma.intrinsics_mm is None:
+        notes.append("the uncertainty of the intrinsics is not known and not part of the sigma")
+    freedom = 2 * len(np.unique(np.round(world_m, 9), axis=0)) - 6
+    if freedom < _FEW_FREEDOMS:
+        notes.append(f"the sigma rests on {freedom} degrees of freedom only and is rough")
+    verdict = "inconsistent" if moved else "unidentifiable" if lost else "poor" if poor else "ok"
+    return verdict, tuple(moved + lost + poor), tuple(notes)
+
+
+def _moved(comparison: Comparison) -> list[str]:
+    if comparison.probability > _MOVED_PROBABILITY or comparison.moved_px < _MOVED_PX:
+        return []
+    return [
+        f"the pictures contradict each other: {comparison.moved_name} is {comparison.moved_px:.2f} px away "
+        "from the "
+        "common pose; the camera or the board moved in between"
+    ]
+
+
+def _shape(pose: Pose, world_m: FloatArray, pixels: FloatArray) -> tuple[list[str], list[str]]:
+    """Reasons why the plane's direction cannot be known, and why it is known badly."""
+    at = pose.R_CW[:, :2] @ world_m.mean(axis=0) + pose.t_CW_m
+    elevation = float(np.degrees(np.arcsin(min(1.0, pose.R_CW[:, 2] @ at / np.linalg.norm(at)))))
+    width = float(np.linalg.svd(pixels - pixels.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(pixels)))
+    if elevation < _ELEVATION_LOST_DEG or width < _SPREAD_LOST_PX:
+        return [
+            f"the plane is seen edge-on or from too far: the line of sight meets it at {elevation:.1f} "
+            "degrees and its "
+            f"corners spread over {width:.1f} px only"
+        ], []
+    if elevation < _ELEVATION_POOR_DEG:
+        return [], [
+            f"the plane is seen nearly edge-on, at {elevation:.1f} degrees; {_ELEVATION_POOR_DEG:.0f} or "
+            "more are needed"
+        ]
+    return [], []
+
+
+def _fit(
+    camera: Camera, pose: Pose, world_m: FloatArray, pixels: FloatArray, camera_rms_px: float | None
+) -> list[str]:
+    """Reasons that lie in the residuals."""
+    reasons = []
+    rms = float(np.sqrt(np.mean(np.sum(pose.residuals_px**2, axis=1))))
+    if pose.termination == "iteration limit":
+        reasons.append("the fit of the pose did not converge")
+    if rms > _RMS_LIMIT_PX:
+        reasons.append(
+            f"the corners miss their places by {rms:.2f} px RMS (limit {_RMS_LIMIT_PX:g}): wrong square, "
+            "wrong order of "
+            "corners, or another camera's intrinsics"
+        )
+    elif camera_rms_px is not None and rms > max(_RMS_FACTOR * camera_rms_px, _RMS_NOTICED_PX):
+        reasons.append(
+            f"the RMS of {rms:.2f} px is more than {_RMS_FACTOR:g} times the camera's own "
+            f"{camera_rms_px:.2f} px"
+        )
+    ideal = undistort(camera, pixels)
+    usable = np.isfinite(ideal).all(axis=1)
+    if not usable.all():
+        reasons.append(f"{int((~usable).sum())} corners lie where the camera's lens model folds over")
+    elif len(pixels) >= _HOMOGRAPHY_POINTS and rms > _RMS_NOTICED_PX:
+        free = fit_homography(world_m, ideal)
+        seen = project(camera, np.column_stack([world_m, np.ones(len(world_m))]) @ free.H.T)
+        free_rms = float(np.sqrt(np.mean(np.sum((seen - pixels) ** 2, axis=1))))
+        if rms > _HOMOGRAPHY_FACTOR * free_rms:
+            reasons.append(
+                f"a free homography fits to {free_rms:.2f} px where the pose fits to {rms:.2f} px: the "
+                "intrinsics or the "
+                "proportions of the board are not the real ones"
+            )
+    return reasons
+
+
+def _horizon(camera: Camera, pose: Pose) -> list[str]:
+    """The denominator of (2.12) must not cross zero within the picture."""
+    width, height = camera.image_size_px
+    u, v = np.meshgrid(np.linspace(0, width - 1, 41), np.linspace(0, height - 1, 31))
+    ideal = undistort(camera, np.stack([u.ravel(), v.ravel()], axis=1))
+    ideal = ideal[np.isfinite(ideal).all(axis=1)]
+    last = np.linalg.inv(np.column_stack([pose.R_CW[:, :2], pose.t_CW_m]))[2]
+    beyond = float(np.mean(ideal @ last[:2] + last[2] <= 0.0)) if len(ideal) else 0.0
+    if beyond == 0.0:
+        return []
+    return [
+        f"the plane's horizon crosses the picture: {100 * beyond:.0f} % of the pixels show nothing of the "
+        "plane"
+    ]
+
+
+def _precision(
+    camera: Camera, pose: Pose, sigma: PositionSigma, workspace_m: tuple[float, float, float, float]
+) -> list[str]:
+    """Reasons that lie in how well the pose is known over the workspace."""
+    seen = visible(camera, pose.R_CW, pose.t_CW_m, sigma.points_m)
+    if not seen.any():
+        return []
+    if np.any(np.isinf(sigma.calibration_mm[seen])):
+        return ["the intrinsics themselves are not known: their covariance is infinite"]
+    if not np.all(np.isfinite(sigma.calibration_mm[seen])):
+        return []
+    reasons = []
+    diagonal_mm = 1e3 * float(np.hypot(workspace_m[2] - workspace_m[0], workspace_m[3] - workspace_m[1]))
+    worst_mm = float(np.hypot(*sigma.plane_mm[seen].T).max())
+    if worst_mm > _SIGMA_SHARE * diagonal_mm:
+        reasons.append(
+            f"the corners do not fix the plane over the workspace: sigma reaches {worst_mm:.1f} mm of "
+            f"{diagonal_mm:.0f} mm"
+        )
+    if pose.other is not None:
+        cost, R, t = pose.other
+        points = sigma.points_m[seen]
+        pixels = project(camera, points @ pose.R_CW[:, :2].T + pose.t_CW_m)
+        apart = 1e3 * np.linalg.norm(plane_map(camera, R, t, pixels) - points, axis=1)
+        likely = cost - pose.cost_px2 < 9.0 * pose.sigma_px**2
+        calibration_mm = float(np.hypot(*sigma.calibration_mm[seen].T).max())
+        if likely and np.nanmax(apart) > 3.0 * calibration_mm:
+            reasons.append(
+                "the plane tilted the other way fits as well and puts the marker up to "
+                f"{np.nanmax(apart):.1f} mm elsewhere; "
+                "look at it more obliquely or from nearer"
+            )
+    return reasons
+
+
+# ----------------------------------------------------------------------
+# The actuator's plane: from pixels to millimetres and back, and how far to trust it.
+#
+# With the camera K and the pose R, t of the world in the camera's frame the plane Z = 0 is seen by
+#
+#     s (u, v, 1) = A (X, Y, 1),   A = K [R1 R2 t]                                        (2.9)
+#     (X, Y, 1) = s A^-1 (u, v, 1),   1 / s = A^-1_31 u + A^-1_32 v + A^-1_33             (2.11, 2.12)
+#
+# where (u, v) are pixels freed of lens distortion. The printed (2.9) lacks the K; with it (2.11) and
+# (2.12) are exact. A keeps its metric scale, so s is the depth in metres.
+#
+# A plane comes with a verdict: "ok"; "poor" where something is wrong enough to look into;
+# "unidentifiable" where the pictures do not hold the answer; "inconsistent" where they contradict each
+# other because the camera or the board moved.
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A calibrated plane.
+
+    Attributes
+    ----------
+    R_CW, t_CW_m : (3, 3) and (3,), world to camera.
+    A : (3, 3), homography (2.9) from metres to ideal pixels; s is the depth in metres.
+    covariance : (6, 6) of (rotation vector on the left, t) from the noise of the corners, rad and m.
+    rms_px, mean_error_px : reprojection error over all corners.
+    rms_mm, mean_error_mm : distance on the plane between where corners are and where they are read.
+    sigma_px : standard deviation of one pixel coordinate, from the residuals.
+    points : corners used, over all pictures.
+    pictures : fit of each picture.
+    corners_m, corners_px, residuals_px : (M, 2) of all pictures in turn: places on the plane, where the
+        pictures show them, and projected minus measured.
+    workspace_m : box (x0, y0, x1, y1) over which the uncertainty is reported.
+    sigma : standard deviations of a marker's position over the workspace.
+    direct : homography from metres to distorted pixels, fitted without intrinsics.
+    direct_difference_mm : (N,) distance between the two maps at `sigma.points_m`.
+    verdict, reasons : "ok", "poor", "unidentifiable" or "inconsistent", and why it is not ok.
+    notes : remarks that do not lower the verdict.
+    """
+
+    R_CW: FloatArray
+    t_CW_m: FloatArray
+    A: FloatArray
+    covariance: FloatArray
+    rms_px: float
+    mean_error_px: float
+    rms_mm: float
+    mean_error_mm: float
+    sigma_px: float
+    points: int
+    pictures: tuple[PictureFit, ...]
+    corners_m: FloatArray
+    corners_px: FloatArray
+    residuals_px: FloatArray
+    workspace_m: tuple[float, float, float, float]
+    sigma: PositionSigma
+    direct: Homography
+    direct_difference_mm: FloatArray
+    verdict: str
+    reasons: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def A_inverse(self) -> FloatArray:
+        """A^-1 of (2.11), (3, 3), ideal pixels to metres."""
+        return np.asarray(np.linalg.inv(self.A), dtype=np.float64)
+
+
+def plane_scale(plane: Plane, ideal_pixels: FloatArray) -> FloatArray:
+    """The scale s of (2.12), depth in metres, for undistorted pixels (..., 2); NaN beyond the horizon."""
+    last = plane.A_inverse[2]
+    denominator = ideal_pixels @ last[:2] + last[2]
+    return np.asarray(1.0 / np.where(denominator > 0.0, denominator, np.nan))
+
+
+def to_world_without_undistortion(plane: Plane, pixels: FloatArray) -> FloatArray:
+    """World positions (..., 2) in metres by (2.11) and (2.12) alone, as if the lens were ideal."""
+    inverse = plane.A_inverse
+    mapped = pixels @ inverse[:2, :2].T + inverse[:2, 2]
+    return np.asarray(plane_scale(plane, pixels)[..., None] * mapped)
+
+
+def to_world(plane: Plane, camera: Camera, pixels: FloatArray) -> FloatArray:
+    """World positions (..., 2) in metres of distorted pixels (..., 2): undistort, then (2.11), (2.12).
+
+    NaN beyond the plane's horizon and where the lens model shows no such pixel.
+    """
+    x, y = np.moveaxis(undistort(camera, pixels), -1, 0)
+    u = camera.fx_px * x + camera.skew_px * y + camera.cx_px
+    v = camera.fy_px * y + camera.cy_px
+    return to_world_without_undistortion(plane, np.stack([u, v], axis=-1))
+
+
+def to_pixels(plane: Plane, camera: Camera, world_m: FloatArray) -> FloatArray:
+    """Distorted pixels (..., 2) of world positions (..., 2), NaN behind the camera."""
+    points_C = world_m @ plane.R_CW[:, :2].T + plane.t_CW_m
+    front = points_C[..., 2] > 0.0
+    points_C = np.where(front[..., None], points_C, 1.0)
+    return np.where(front[..., None], project(camera, points_C), np.nan)
+
+
+def calibrate_plane(
+    camera: Camera,
+    camera_covariance: FloatArray | None,
+    views: Sequence[View],
+    *,
+    workspace_m: tuple[float, float, float, float] | None = None,
+    camera_rms_px: float | None = None,
+) -> Plane:
+    """Fit one pose of the world's plane to all pictures of it, taken by a camera that stands still.
+
+    Parameters
+    ----------
+    camera_covariance : (13, 13) in the order of `projection.INTRINSICS`, zero rows for what was not
+        estimated; None where it is not known.
+    views : pictures with `target_m` in the world's plane, see `placement.world_points_m`.
+    workspace_m : box (x0, y0, x1, y1) over which the uncertainty is reported; by default the box
+        around the corners, which the source document takes for the marker's range.
+    camera_rms_px : RMS of the camera's own calibration, to compare this one with.
+
+    Raises
+    ------
+    BadInputError
+        With fewer than four different points, points on a line, numbers that are not finite, or a
+        mirrored plane.
+    """
+    refuse_unusable(views)
+    world_m = np.concatenate([view.target_m for view in views])
+    pixels = np.concatenate([view.pixels for view in views])
+    groups = _same_points(world_m)
+    pose = fit_pose(camera, world_m, pixels, groups)
+    pictures, comparison = compare_pictures(camera, views, pose)
+    pose = replace(pose, covariance=pose.covariance * comparison.inflation)
+
+    box = workspace_m
+    if box is None:
+        low, high = world_m.min(axis=0), world_m.max(axis=0)
+        box = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+    sigma = position_sigma(camera, camera_covariance, pose, workspace_grid(box))
+    direct = fit_homography(world_m, pixels, groups)
+    verdict, reasons, notes = judge(camera, views, pose, comparison, sigma, box, camera_rms_px)
+
+    error_px = np.linalg.norm(pose.residuals_px, axis=1)
+    read_m = plane_map(camera, pose.R_CW, pose.t_CW_m, pixels)
+    error_mm = 1e3 * np.linalg.norm(read_m - world_m, axis=1)
+    error_mm = error_mm[np.isfinite(error_mm)]
+    return Plane(
+        R_CW=pose.R_CW,
+        t_CW_m=pose.t_CW_m,
+        A=camera.K @ np.column_stack([pose.R_CW[:, :2], pose.t_CW_m]),
+        covariance=pose.covariance,
+        rms_px=float(np.sqrt(np.mean(error_px**2))),
+        mean_error_px=float(np.mean(error_px)),
+        rms_mm=float(np.sqrt(np.mean(error_mm**2))),
+        mean_error_mm=float(np.mean(error_mm)),
+        sigma_px=pose.sigma_px,
+        points=len(world_m),
+        pictures=pictures,
+        corners_m=world_m,
+        corners_px=pixels,
+        residuals_px=pose.residuals_px,
+        workspace_m=box,
+        sigma=sigma,
+        direct=direct,
+        direct_difference_mm=_difference_mm(camera, pose, direct, sigma.points_m),
+        verdict=verdict,
+        reasons=reasons,
+        notes=notes,
+    )
+
+
+def _same_points(world_m: FloatArray) -> IntArray:
+    """Index of the different world points (to a nanometre) that each row belongs to."""
+    keys = np.round(world_m * 1e9).astype(np.int64)
+    return np.unique(keys, axis=0, return_inverse=True)[1].ravel()
+
+
+def _difference_mm(camera: Camera, pose: Pose, direct: Homography, points_m: FloatArray) -> FloatArray:
+    """How far apart the two maps put the marker that is at each of the places, (N,); NaN out of sight."""
+    difference = np.full(len(points_m), np.nan)
+    seen = visible(camera, pose.R_CW, pose.t_CW_m, points_m)
+    pixels = project(camera, points_m[seen] @ pose.R_CW[:, :2].T + pose.t_CW_m)
+    other = apply_homography(np.asarray(np.linalg.inv(direct.H), dtype=np.float64), pixels)
+    difference[seen] = 1e3 * np.linalg.norm(other - points_m[seen], axis=1)
+    return difference
+
+
+# ----------------------------------------------------------------------
+# Where the board lies in the actuator's plane, and which of its corners is the first.
+#
+# The world's x axis points right and its y axis down as the camera sees them, so that the corner at
+# (x, y) on the board lies at
+#
+#     X_W = first_corner + [[c, -s], [s, c]] (x, y),   c = cos(angle), s = sin(angle)
+#
+# A checkerboard looks the same after half a turn (a square one after a quarter), or the detector does
+# not care. No picture can settle that, so a rule does: the turn is taken that makes the world's x axis
+# point to the right in the picture, unless the user says where the first corner is seen.
+
+_UNDECIDED_DEG = 0.5
+"""Two turns are told apart only when the axis is at least this far from the border between them."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Corners of one picture in the board's own order.
+
+    Attributes
+    ----------
+    pixels : (columns * rows, 2), row by row from the corner (0, 0).
+    quarter_turns : by how many quarter turns, clockwise as seen, the detected order was turned.
+    x_axis_deg : direction of the world's x axis in the picture at the board's centre; 0 is right,
+        90 is down.
+    how : one sentence that says how the orientation was settled.
+    """
+
+    pixels: FloatArray
+    quarter_turns: int
+    x_axis_deg: float
+    how: str
+
+    def reordered(self, values: BoolArray, board: Board) -> BoolArray:
+        """Values (columns * rows,) of the detected corners in the order of `pixels`."""
+        return np.rot90(values.reshape(board.rows, board.columns), self.quarter_turns).ravel()
+
+
+def world_points_m(board: Board, first_corner_m: Sequence[float], angle_rad: float) -> FloatArray:
+    """Inner corners in the world's plane, shape (columns * rows, 2), metres, row by row.
+
+    Parameters
+    ----------
+    first_corner_m : world position of corner (0, 0).
+    angle_rad : direction of the board's columns axis, from x towards y.
+    """
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    turned = board.points_m() @ np.array([[c, s], [-s, c]])
+    return np.asarray(turned + np.asarray(first_corner_m, dtype=np.float64))
+
+
+def _turned(pixels: FloatArray, board: Board) -> list[tuple[int, FloatArray]]:
+    """The detected grid after 0, 1, 2, 3 quarter turns (1 and 3 on square boards only)."""
+    grid = pixels.reshape(board.rows, board.columns, 2)
+    turns = range(4) if board.columns == board.rows else (0, 2)
+    return [(turn, np.rot90(grid, turn).reshape(-1, 2)) for turn in turns]
+
+
+def _world_x_direction(pixels: FloatArray, board: Board, angle_rad: float) -> float:
+    """Direction (rad) of the world's x axis in the picture at the board's centre."""
+    points = board.points_m()
+    H = fit_homography(points, pixels).H
+    along_board = np.array([np.cos(angle_rad), -np.sin(angle_rad)])
+    du, dv = map_jacobian(H, points.mean(axis=0)) @ along_board
+    return float(np.arctan2(dv, du))
+
+
+def _local_square_px(pixels: FloatArray, board: Board) -> float:
+    """Mean length in pixels of the two sides that meet in the first corner."""
+    grid = pixels.reshape(board.rows, board.columns, 2)
+    return float(0.5 * (np.linalg.norm(grid[0, 1] - grid[0, 0]) + np.linalg.norm(grid[1, 0] - grid[0, 0])))
+
+
+def _wrapped_deg(angle_rad: float) -> float:
+    return float(np.degrees((angle_rad + np.pi) % (2 * np.pi) - np.pi))
+
+
+def settle_orientation(
+    pixels: FloatArray,
+    board: Board,
+    angle_rad: float,
+    first_corner_px: Sequence[float] | None = None,
+    name: str = "the picture",
+) -> Placement:
+    """Give the detected corners the board's own order, by a stated rule.
+
+    Without `first_corner_px` the half turn (or, on a square board, the quarter turn) is chosen that
+    turns the *world's* x axis most to the right in the picture, whatever `angle_rad` is and whether
+    or not the colours could tell the corners apart. With it the corner (0, 0) is the one seen there,
+    which must be within half a square of it.
+
+    Parameters
+    ----------
+    pixels : (columns * rows, 2) detected corners, row by row, of any turn but not mirrored.
+    angle_rad : direction of the board's columns axis in the world.
+    first_corner_px : (u, v) of the corner (0, 0), distorted pixels.
+    name : how messages call the picture.
+
+    Raises
+    ------
+    BadInputError
+        On a mirrored or incomplete grid, where the rule cannot decide, and where no corner that can
+        be the first is near `first_corner_px`.
+    """
+    if pixels.shape != (board.corners, 2) or not np.all(np.isfinite(pixels)):
+        raise BadInputError(
+            f"{name}: expected {board.columns}x{board.rows} finite corners, got an array of shape "
+            f"{pixels.shape}"
+        )
+    if min(board.columns, board.rows) < 2:
+        raise BadInputError(
+            f"{name}: a board of {board.columns}x{board.rows} inner corners shows no direction; 2x2 is the "
+            "least"
+        )
+    points = board.points_m()
+    if np.linalg.det(np.linalg.lstsq(points - points.mean(0), pixels - pixels.mean(0), rcond=None)[0]) <= 0:
+        raise BadInputError(
+            f"{name}: the grid of corners is mirrored; the rows axis must turn clockwise from the columns "
+            "axis"
+        )
+    candidates = _turned(pixels, board)
+    if first_corner_px is not None:
+        return _settle_by_pixel(candidates, board, angle_rad, first_corner_px, name)
+
+    directions = [_world_x_direction(turned, board, angle_rad) for _, turned in candidates]
+    off = np.abs([_wrapped_deg(direction) for direction in directions])
+    order = np.argsort(off)
+    best = int(order[0])
+    turn, chosen = candidates[best]
+    degrees = _wrapped_deg(directions[best])
+    if off[order[1]] - off[best] < 2 * _UNDECIDED_DEG:
+        raise BadInputError(
+            f"{name}: the world's x axis would point {degrees:.1f} or "
+            f"{_wrapped_deg(directions[int(order[1])]):.1f} degrees "
+            "from the picture's right, so the first corner cannot be told; give first_corner_px: [u, v] in "
+            "board.yaml"
+        )
+    limit = 90 if len(candidates) == 2 else 45
+    looks = "looks the same after a quarter turn" if limit == 45 else "can be read from either end"
+    how = (
+        f"The board {looks}; corner (0, 0) was taken at pixel ({chosen[0, 0]:.1f}, {chosen[0, 1]:.1f}), so "
+        "that the world's "
+        f"x axis points {_words(degrees)} in the picture (rule: right to within {limit} degrees)."
+    )
+    return Placement(chosen, turn, degrees, how)
+
+
+def _words(degrees: float) -> str:
+    if abs(degrees) < 0.05:
+        return "right"
+    return f"right and {abs(degrees):.1f} degrees {'down' if degrees > 0 else 'up'}"
+
+
+def _settle_by_pixel(
+    candidates: list[tuple[int, FloatArray]],
+    board: Board,
+    angle_rad: float,
+    first_corner_px: Sequence[float],
+    name: str,
+) -> Placement:
+    wanted = np.asarray(first_corner_px, dtype=np.float64)
+    if wanted.shape != (2,) or not np.all(np.isfinite(wanted)):
+        raise BadInputError(f"{name}: first_corner_px must be two numbers [u, v], got {first_corner_px!r}")
+    distances = [float(np.linalg.norm(turned[0] - wanted)) for _, turned in candidates]
+    best = int(np.argmin(distances))
+    turn, chosen = candidates[best]
+    limit = 0.5 * _local_square_px(chosen, board)
+    if distances[best] > limit:
+        seen = ", ".join(f"({turned[0, 0]:.1f}, {turned[0, 1]:.1f})" for _, turned in candidates)
+        raise BadInputError(
+            f"{name}: first_corner_px is [{wanted[0]:g}, {wanted[1]:g}], but the corners that can be the "
+            "first are seen at "
+            f"{seen}; expected one within half a square ({limit:.1f} px)"
+        )
+    degrees = _wrapped_deg(_world_x_direction(chosen, board, angle_rad))
+    how = (
+        f"Corner (0, 0) was taken at pixel ({chosen[0, 0]:.1f}, {chosen[0, 1]:.1f}), {distances[best]:.1f} "
+        "px from "
+        f"first_corner_px; the world's x axis points {degrees:.1f} degrees from the picture's right "
+        "(positive is down)."
+    )
+    return Placement(chosen, turn, degrees, how)

@@ -1,0 +1,689 @@
+"""What a camera is calibrated from: pictures of a board, or correspondences that others have found."""
+
+from __future__ import annotations
+
+import csv
+import math
+from array import array
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from calib.core.arrays import FloatArray, GrayImage
+from calib.core.errors import BadInputError, UsageError
+from calib.core.files import check_readable, read_yaml_mapping, shown
+from calib.core.rig import hash_of, validation_sentence
+from calib.core.units import plain_number
+from calib.core.workers import Workers
+from calib.io.pictures import Picture, list_pictures, read_picture, same_size
+from calib.stages.camera.corners import Detection, detect, find_size
+from calib.stages.camera.model import Board, View
+
+# ----------------------------------------------------------------------
+# board.yaml, and the search for its board in a set of pictures.
+
+Count = Annotated[int, Field(ge=3, le=200, strict=True)]
+Metres = Annotated[float, Field(ge=1e-5, lt=10, allow_inf_nan=False, strict=True)]
+Place = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False, strict=True)]
+Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
+Position = Annotated[list[Place], Field(min_length=2, max_length=2)]
+Pixel = Annotated[list[Number], Field(min_length=2, max_length=2)]
+Angle = Annotated[float, Field(ge=-6.2832, le=6.2832, allow_inf_nan=False, strict=True)]
+
+BOARD_FILE = "board.yaml"
+_SIZE_SAMPLE = 5
+"""Pictures that are asked for the size of an unknown board."""
+_KEPT_PIXELS = 250_000_000
+"""Pixels that are kept in memory; further pictures are read twice."""
+
+
+class BoardFile(BaseModel):
+    """board.yaml: the board, and for a plane where it lies.
+
+    `corners` counts inner corners, columns x rows. `first_corner_m` is the world position of corner
+    (0, 0), `angle_rad` the direction of the columns axis, `first_corner_px` where a picture shows
+    corner (0, 0), for boards that look the same after half a turn.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    corners: Annotated[list[Count], Field(min_length=2, max_length=2)] | None = None
+    square_m: Metres | None = None
+    first_corner_m: Position | None = None
+    angle_rad: Angle | None = None
+    first_corner_px: Pixel | None = None
+
+
+def read_board_file(folder: Path) -> BoardFile:
+    """board.yaml of a folder, all unset where there is none. Raises `BadInputError`."""
+    path = folder / BOARD_FILE
+    if not path.exists() and not path.is_symlink():
+        return BoardFile()
+    try:
+        return BoardFile.model_validate(read_yaml_mapping(path))
+    except ValidationError as error:
+        raise BadInputError(validation_sentence(path, error)) from error
+
+
+def board_of(sources: Sequence[Path]) -> tuple[BoardFile, dict[str, str]]:
+    """What board.yaml tells of the board in these folders or single pictures, and its SHA-256.
+
+    Raises `BadInputError` where two folders tell different boards.
+    """
+    told, hashes, where = BoardFile(), dict[str, str](), Path()
+    for folder in dict.fromkeys(source if source.is_dir() else source.parent for source in sources):
+        file = read_board_file(folder)
+        if file == BoardFile():
+            continue
+        if hashes and (file.corners, file.square_m) != (told.corners, told.square_m):
+            raise BadInputError(
+                f"{shown(folder / BOARD_FILE)}: tells another board than {shown(where / BOARD_FILE)}; "
+                "pictures of different boards cannot be calibrated together"
+            )
+        if not hashes:
+            told, where = file, folder
+            hashes[BOARD_FILE] = hash_of(folder / BOARD_FILE)
+    return told, hashes
+
+
+@dataclass(frozen=True)
+class BoardSearch:
+    """What a set of pictures shows.
+
+    Attributes
+    ----------
+    board : the board that was looked for, or found.
+    image_size_px : width and height of all pictures.
+    views : one for each picture with the board; the names are the files'.
+    detections : as `views`.
+    without : names of pictures where the board was not found.
+    hashes : SHA-256 of every picture by name.
+    """
+
+    board: Board
+    image_size_px: tuple[int, int]
+    views: tuple[View, ...]
+    detections: tuple[Detection, ...]
+    without: tuple[str, ...]
+    hashes: dict[str, str]
+
+
+def find_boards(
+    paths: Sequence[Path],
+    corners: tuple[int, int] | None,
+    square_m: float,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    image_size_px: tuple[int, int] | None = None,
+) -> BoardSearch:
+    """Decode pictures and find the board in each, several at a time.
+
+    Parameters
+    ----------
+    corners : inner corners, columns and rows; found in the pictures when None.
+    square_m : length of a square.
+    progress : called with pictures done and pictures in all.
+    image_size_px : the size that the pictures have to have, if that is known.
+
+    Raises
+    ------
+    BadInputError : a picture that cannot be read, pictures of several sizes, or no board in any; when
+        another board is there the message says which.
+    """
+    pictures = _read(paths)
+    with Workers(_Album(paths, pictures), len(paths)) as workers:
+        return _Search(workers, pictures, square_m, progress).run(corners, image_size_px)
+
+
+def _read(paths: Sequence[Path]) -> list[Picture]:
+    """All pictures; the pixels only of as many as memory surely has room for."""
+    kept, pictures = 0, []
+    with Workers(None, len(paths), large=True) as workers:
+        for picture in workers.in_order(_picture, paths):
+            kept += picture.gray.size
+            pictures.append(picture if kept <= _KEPT_PIXELS else picture.without_pixels())
+    return pictures
+
+
+def _picture(_: None, path: Path) -> Picture:
+    return read_picture(path)
+
+
+@dataclass(frozen=True)
+class _Album:
+    """Pictures that workers look into, and where to find those that are not in memory."""
+
+    paths: Sequence[Path]
+    pictures: Sequence[Picture]
+
+    def gray(self, i: int) -> GrayImage:
+        if self.pictures[i].gray.size:
+            return self.pictures[i].gray
+        again = read_picture(self.paths[i])
+        if again.sha256 != self.pictures[i].sha256:
+            raise BadInputError(f"{self.pictures[i].name}: has changed since the work began")
+        return again.gray
+
+
+def _detection(album: _Album, what: tuple[int, tuple[int, int]]) -> Detection | None:
+    i, corners = what
+    return detect(album.gray(i), *corners)
+
+
+def _size(album: _Album, i: int) -> tuple[int, int] | None:
+    return find_size(album.gray(i))
+
+
+@dataclass
+class _Search:
+    """The work of `find_boards`."""
+
+    workers: Workers[_Album]
+    pictures: Sequence[Picture]
+    square_m: float
+    progress: Callable[[int, int], None]
+    done: int = 0
+    sizes: dict[int, tuple[int, int] | None] = field(default_factory=dict)
+
+    def run(self, corners: tuple[int, int] | None, expected_px: tuple[int, int] | None) -> BoardSearch:
+        pictures = self.pictures
+        size_px = same_size(pictures)
+        if expected_px is not None and size_px != expected_px:
+            raise BadInputError(
+                f"{_names(pictures)}: {_is_or_are(pictures)} {size_px[0]}x{size_px[1]} px, "
+                f"expected {expected_px[0]}x{expected_px[1]} px"
+            )
+        count = len(pictures)
+        sample = list(range(0, count, max(1, count // _SIZE_SAMPLE)))
+        wanted = corners or self._common_size(sample) or self._common_size(range(count))
+        if wanted is None:
+            raise BadInputError(f"{_names(pictures)}: no checkerboard found in {_count(count)}")
+        found: dict[int, Detection | None] = {}
+        # A wrong size is known after a few pictures; looking for it in all of them would take long.
+        for part, share in ((sample[:2], 1.0), (sample[2:], 0.5)):
+            found |= self._detect(part, wanted)
+            other = None if any(found.values()) else self._common_size(sample, share)
+            if other is not None and sorted(other) != sorted(wanted):
+                raise BadInputError(_not_found(pictures, wanted, other))
+        found |= self._detect([i for i in range(count) if i not in found], wanted)
+        if not any(found.values()):
+            raise BadInputError(_not_found(pictures, wanted, self._common_size(sample)))
+        board = Board(*wanted, self.square_m)
+        target = board.points_m()
+        seen = [(picture, detection) for i, picture in enumerate(pictures) if (detection := found[i])]
+        return BoardSearch(
+            board=board,
+            image_size_px=size_px,
+            views=tuple(View(p.name, target, d.pixels, d.refined) for p, d in seen),
+            detections=tuple(detection for _, detection in seen),
+            without=tuple(picture.name for i, picture in enumerate(pictures) if found[i] is None),
+            hashes={picture.name: picture.sha256 for picture in pictures},
+        )
+
+    def _detect(self, which: Sequence[int], corners: tuple[int, int]) -> dict[int, Detection | None]:
+        found: dict[int, Detection | None] = {}
+        detections = self.workers.in_order(_detection, [(i, corners) for i in which])
+        for i, detection in zip(which, detections, strict=True):
+            found[i] = detection
+            self.done += 1
+            self.progress(self.done, len(self.pictures))
+        return found
+
+    def _common_size(self, which: Sequence[int], share: float = 0.0) -> tuple[int, int] | None:
+        """The size of board that most of these pictures show, if a share of them does; the larger in a tie.
+
+        Seen upright and lying, a board counts the same.
+        """
+        new = [i for i in which if i not in self.sizes]
+        sizes = self.workers.in_order(_size, new)
+        self.sizes |= zip(new, sizes, strict=True)
+        counts = Counter((max(s), min(s)) for i in which if (s := self.sizes[i]) is not None)
+        most = max(counts, key=lambda s: (counts[s], s[0] * s[1]), default=None)
+        return None if most is None or counts[most] < share * len(which) else most
+
+
+def _not_found(pictures: Sequence[Picture], wanted: tuple[int, int], other: tuple[int, int] | None) -> str:
+    instead = "and no other either" if other is None else f"but one with {other[0]}x{other[1]} was"
+    return (
+        f"{_names(pictures)}: no board with {wanted[0]}x{wanted[1]} inner corners found in "
+        f"{_count(len(pictures))}, {instead}"
+    )
+
+
+def _is_or_are(pictures: Sequence[Picture]) -> str:
+    return "is" if len(pictures) == 1 else "are"
+
+
+def _count(pictures: int) -> str:
+    return "the picture" if pictures == 1 else f"any of {pictures} pictures"
+
+
+def _names(pictures: Sequence[Picture]) -> str:
+    first, last = pictures[0].name, pictures[-1].name
+    return first if len(pictures) == 1 else f"{first} ... {last}"
+
+
+# ----------------------------------------------------------------------
+# Correspondences that others have found: CSV tables and the corner files of mrgingham and mrcal.
+#
+# A table has a header and one row per point: `view,x_m,y_m,u_px,v_px`, in any order of columns, with
+# further columns kept out of the way. Any planar target will do.
+#
+# A corner file (.vnl, a vnlog) has a legend `# filename x y level` and one line per corner, row by row of
+# the board; a picture without a board has a single line of `-`, and single corners that were not seen
+# have `-` too.
+
+COLUMNS = ("view", "x_m", "y_m", "u_px", "v_px")
+"""Columns that a correspondence table must have."""
+
+_FEWEST = 4
+_LONGEST_LINE = 65536
+
+
+@dataclass
+class _Points:
+    """What was read of one view so far: four numbers a row, and the lines; compact, for long tables."""
+
+    values: array[float] = field(default_factory=lambda: array("d"))
+    lines: array[int] = field(default_factory=lambda: array("q"))
+
+    def view(self, name: str, path: Path) -> View:
+        """The view, or a `BadInputError` for too few points or one that is given twice."""
+        where = f"view {shown(name)}"
+        if len(self.lines) < _FEWEST:
+            raise BadInputError(
+                f"{shown(path)}: {where} (from line {self.lines[0]}) has {len(self.lines)} points, "
+                f"expected at least {_FEWEST}"
+            )
+        rows = np.frombuffer(self.values, dtype=np.float64).reshape(-1, 4)
+        _, first, index = np.unique(rows[:, :2], axis=0, return_index=True, return_inverse=True)
+        again = np.flatnonzero(first[index.ravel()] != np.arange(len(rows)))
+        if len(again):
+            second = int(again[0])
+            x, y = rows[second, :2]
+            raise BadInputError(
+                f"{shown(path)}: line {self.lines[second]}: the point x_m = {x:g}, y_m = {y:g} of {where} "
+                f"was given in line {self.lines[int(first[index.ravel()[second]])]}"
+            )
+        return View(name, rows[:, :2].copy(), rows[:, 2:].copy())
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Numbered lines of a text file, without their ends; never more than one line in memory.
+
+    Raises
+    ------
+    BadInputError
+        For files that cannot be opened, are not UTF-8 text, or have lines of absurd length.
+    """
+    try:
+        with path.open("rb") as file:
+            number = 0
+            while raw := file.readline(_LONGEST_LINE):
+                number += 1
+                if b"\0" in raw:
+                    raise BadInputError(
+                        f"{shown(path)}: line {number} has a zero byte; expected a text file, not binary data"
+                    )
+                if len(raw) == _LONGEST_LINE and not raw.endswith(b"\n"):
+                    raise BadInputError(
+                        f"{shown(path)}: line {number} has more than {_LONGEST_LINE} characters"
+                    )
+                try:
+                    text = raw.decode("utf-8-sig" if number == 1 else "utf-8")
+                except UnicodeDecodeError as error:
+                    raise BadInputError(
+                        f"{shown(path)}: line {number} is not UTF-8 text (byte 0x{raw[error.start]:02x})"
+                    ) from error
+                yield number, text.rstrip("\r\n")
+    except OSError as error:
+        raise BadInputError(f"{shown(path)}: cannot be read: {error.strerror or error}") from error
+
+
+def _number(text: str, path: Path, line: int, column: str) -> float:
+    """A finite decimal number."""
+    word = text.strip()
+    value = plain_number(word)
+    if value is not None and math.isfinite(value):
+        return value
+    found = "empty" if not word else repr(word[:40])
+    raise BadInputError(f"{shown(path)}: line {line}: {column} is {found}, expected a finite number")
+
+
+def _numbers(text: str, cells: list[str], path: Path, line: int) -> list[float]:
+    """The numbers of a row; a good row, as nearly all are, is seen at a glance."""
+    try:
+        values = [float(cell) for cell in cells]
+        if "_" not in text and math.isfinite(sum(values)):
+            return values
+    except ValueError:
+        pass
+    return [_number(cell, path, line, column) for cell, column in zip(cells, COLUMNS[1:], strict=True)]
+
+
+def _cells(text: str, path: Path, line: int) -> list[str]:
+    if '"' not in text:
+        return text.split(",")
+    try:
+        return next(csv.reader([text], strict=True, skipinitialspace=True), [])
+    except csv.Error as error:
+        raise BadInputError(
+            f"{shown(path)}: line {line}: not a line of comma-separated values ({error})"
+        ) from error
+
+
+def _header(cells: list[str], path: Path, line: int) -> list[int]:
+    """Where each of `COLUMNS` is."""
+    names = [cell.strip() for cell in cells]
+    missing = [name for name in COLUMNS if name not in names]
+    if missing:
+        found = ",".join(names)[:80]
+        raise BadInputError(
+            f"{shown(path)}: line {line}: the header lacks {', '.join(missing)}; "
+            f"expected {','.join(COLUMNS)} separated by commas, found {found!r}"
+        )
+    for name in COLUMNS:
+        if names.count(name) > 1:
+            raise BadInputError(f"{shown(path)}: line {line}: the header has {name} more than once")
+    return [names.index(name) for name in COLUMNS]
+
+
+def read_table(path: Path) -> list[View]:
+    """Views of a correspondence table, in the order in which they first appear.
+
+    Rows of different views may be mixed. Blank lines and lines that begin with `#` are passed over.
+
+    Raises
+    ------
+    BadInputError
+        Naming the file and the line: no header, missing columns, text or NaN for a number, a row of
+        another length, a point of the target given twice in a view, a view with fewer than four
+        points, or a file that is empty or not text.
+    """
+    views: dict[str, _Points] = {}
+    where: list[int] = []
+    width = 0
+    for line, text in _lines(path):
+        if not text or text.isspace() or text.lstrip().startswith("#"):
+            continue
+        cells = _cells(text, path, line)
+        if not where:
+            where, width = _header(cells, path, line), len(cells)
+            continue
+        if len(cells) != width:
+            raise BadInputError(
+                f"{shown(path)}: line {line}: has {len(cells)} values, expected {width} as in the header"
+            )
+        name = cells[where[0]].strip()
+        if not name:
+            raise BadInputError(f"{shown(path)}: line {line}: view is empty, expected a name")
+        points = views.get(name)
+        if points is None:
+            points = views[name] = _Points()
+        points.values.extend(_numbers(text, [cells[i] for i in where[1:]], path, line))
+        points.lines.append(line)
+    if not where:
+        raise BadInputError(
+            f"{shown(path)}: is empty; expected a header {','.join(COLUMNS)} and one row per point"
+        )
+    if not views:
+        raise BadInputError(f"{shown(path)}: has a header but no points")
+    return [points.view(name, path) for name, points in views.items()]
+
+
+def read_vnl(path: Path, columns: int, rows: int, square_m: float) -> list[View]:
+    """Views of a corner file of mrgingham or mrcal; pictures without a board are left out.
+
+    Corners that a picture lacks (`-`, or mrcal's negative level) are left out of its view; all others
+    count alike, whatever their level. A grid that is mirrored against this project's convention (the
+    rows axis a quarter turn clockwise from the columns axis as seen) is read with its rows reversed,
+    which names the corners differently and changes nothing else.
+
+    Parameters
+    ----------
+    columns, rows : inner corners of the board; corners follow each other along the columns first.
+    square_m : side of a square in metres.
+
+    Raises
+    ------
+    BadInputError
+        Naming the file and the line: no legend, text for a number, a picture whose number of corners
+        is not columns * rows or fewer than four, no picture with a board, or a file that is not text.
+    """
+    board = Board(columns, rows, square_m)
+    legend: list[str] = []
+    pictures: dict[str, list[tuple[int, float, float]]] = {}
+    for line, text in _lines(path):
+        stripped = text.strip()
+        if stripped.startswith("#"):
+            if not legend and not stripped.startswith(("##", "#!")):
+                legend = _legend(stripped[1:].split(), path, line)
+            continue
+        words = stripped.split("#", 1)[0].split()
+        if not words:
+            continue
+        if not legend:
+            raise BadInputError(
+                f"{shown(path)}: line {line}: no legend before the data, expected '# filename x y level'"
+            )
+        row = dict(zip(legend, words, strict=False))
+        # mrgingham leaves the level out where it found no board.
+        if not {"filename", "x", "y"} <= row.keys() or len(words) > len(legend):
+            raise BadInputError(
+                f"{shown(path)}: line {line}: has {len(words)} values, expected {len(legend)} as in the "
+                "legend"
+            )
+        pictures.setdefault(row["filename"], []).append((line, *_corner(row, path, line)))
+    if not legend:
+        raise BadInputError(
+            f"{shown(path)}: is empty; expected a legend '# filename x y level' and one line per corner"
+        )
+    views = [view for name, found in pictures.items() if (view := _view(name, found, board, path))]
+    if not views:
+        raise BadInputError(f"{shown(path)}: no picture in it has a board")
+    return views
+
+
+def _legend(names: list[str], path: Path, line: int) -> list[str]:
+    for name in ("filename", "x", "y"):
+        if names.count(name) != 1:
+            raise BadInputError(
+                f"{shown(path)}: line {line}: the legend is {' '.join(names)[:80]!r}, expected '# filename x "
+                "y "
+                "level'"
+            )
+    return names
+
+
+def _corner(row: dict[str, str], path: Path, line: int) -> tuple[float, float]:
+    """Pixel of a corner, NaN where it was not seen."""
+    level = row.get("level", row.get("weight", "0"))
+    if row["x"] == "-" or row["y"] == "-" or level == "-":
+        return math.nan, math.nan
+    u, v = _number(row["x"], path, line, "x"), _number(row["y"], path, line, "y")
+    if _number(level, path, line, "level") < 0:
+        return math.nan, math.nan
+    return u, v
+
+
+def _view(name: str, found: list[tuple[int, float, float]], board: Board, path: Path) -> View | None:
+    pixels = np.array([(u, v) for _, u, v in found])
+    seen = np.isfinite(pixels[:, 0])
+    if not seen.any() and len(found) in (1, board.corners):
+        return None
+    if len(found) != board.corners:
+        raise BadInputError(
+            f"{shown(path)}: line {found[0][0]}: {shown(name)} has {len(found)} corners, expected "
+            f"{board.columns}x{board.rows} = "
+            f"{board.corners}"
+        )
+    if seen.sum() < _FEWEST:
+        raise BadInputError(
+            f"{shown(path)}: line {found[0][0]}: {shown(name)} has {int(seen.sum())} corners that were seen, "
+            f"expected at least {_FEWEST}"
+        )
+    target = board.points_m()
+    if _mirrored(target[seen], pixels[seen]):
+        pixels = pixels.reshape(board.rows, board.columns, 2)[:, ::-1].reshape(-1, 2)
+        seen = np.isfinite(pixels[:, 0])
+    return View(name, target[seen], pixels[seen])
+
+
+def _mirrored(target_m: FloatArray, pixels: FloatArray) -> bool:
+    """Whether going from the columns axis to the rows axis turns anticlockwise in the picture."""
+    centred = target_m - target_m.mean(axis=0)
+    affine = np.linalg.lstsq(centred, pixels - pixels.mean(axis=0), rcond=None)[0]
+    return bool(np.linalg.det(affine) < 0.0)
+
+
+# ----------------------------------------------------------------------
+# What a camera is calibrated from: pictures of a board, or correspondences that others have found.
+
+_TABLES = (".csv", ".vnl")
+_MOST_BYTES = 500_000_000
+"""Largest table; all of its points are held in memory."""
+_OUTSIDE_PX = 1.0
+"""How far a corner may be found beyond the border of the picture."""
+_LARGEST_M = 1e4
+_SMALLEST_M = 1e-6
+_NO_SQUARE = "the square's length is not given; intrinsics do not depend on it, lengths are in squares"
+
+
+@dataclass(frozen=True)
+class Told:
+    """What the command line says of the board and the pictures; None where it says nothing."""
+
+    corners: tuple[int, int] | None = None
+    square_m: float | None = None
+    image_size_px: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True)
+class ViewSet:
+    """Views to calibrate from.
+
+    Attributes
+    ----------
+    views : one for each picture with a board.
+    image_size_px : width and height.
+    hashes : SHA-256 of each input by its name.
+    without : names of pictures without a board.
+    remarks : sentences for the person who watches.
+    """
+
+    views: tuple[View, ...]
+    image_size_px: tuple[int, int]
+    hashes: dict[str, str]
+    without: tuple[str, ...]
+    remarks: tuple[str, ...]
+
+
+def read_views(
+    sources: Sequence[Path], told: Told, progress: Callable[[int, int], None] = lambda done, total: None
+) -> ViewSet:
+    """Views from folders of pictures and single pictures, or from one table.
+
+    Raises `BadInputError` for what cannot be read, and `UsageError` for options that do not go with
+    these sources.
+    """
+    tables = [source for source in sources if source.suffix.lower() in _TABLES and not source.is_dir()]
+    if not tables:
+        return _from_pictures(sources, told, progress)
+    if len(sources) > 1:
+        raise UsageError(f"{shown(tables[0])}: a table is given alone, without pictures or other tables")
+    return _from_table(tables[0], told)
+
+
+def _from_table(path: Path, told: Told) -> ViewSet:
+    if check_readable(path) > _MOST_BYTES:
+        raise BadInputError(f"{shown(path)}: is larger than {_MOST_BYTES / 1e6:g} MB")
+    digest = hash_of(path)
+    if told.image_size_px is None:
+        raise UsageError(
+            f"{shown(path)}: a table does not tell the size of the pictures; give --image-size, as 640x480"
+        )
+    remarks: tuple[str, ...] = ()
+    if path.suffix.lower() == ".csv":
+        if told.corners is not None or told.square_m is not None:
+            raise UsageError(
+                f"{shown(path)}: a table holds its target in metres; --corners and --square do not go with it"
+            )
+        views = read_table(path)
+    else:
+        if told.corners is None:
+            raise UsageError(
+                f"{shown(path)}: a .vnl file does not tell the board; give --corners and --square"
+            )
+        if told.square_m is None:
+            remarks = (_NO_SQUARE,)
+        views = read_vnl(path, *told.corners, 1.0 if told.square_m is None else told.square_m)
+    for view in views:
+        _check_inside(path, view, told.image_size_px)
+        _check_extent(path, view)
+    return ViewSet(_near_origin(views), told.image_size_px, {shown(path.name): digest}, (), remarks)
+
+
+def _check_inside(path: Path, view: View, image_size_px: tuple[int, int]) -> None:
+    upper = np.array(image_size_px) - 1 + _OUTSIDE_PX
+    outside = np.flatnonzero(((view.pixels < -_OUTSIDE_PX) | (view.pixels > upper)).any(axis=1))
+    if len(outside):
+        u, v = view.pixels[outside[0]]
+        raise BadInputError(
+            f"{shown(path)}: view {shown(view.name)}: {len(outside)} of {len(view.pixels)} points lie "
+            f"outside a picture of {image_size_px[0]}x{image_size_px[1]} px, as ({u:g}, {v:g}); "
+            "expected --image-size to be that of the pictures"
+        )
+
+
+def _check_extent(path: Path, view: View) -> None:
+    largest = float(np.abs(view.target_m).max())
+    extent = float(np.ptp(view.target_m, axis=0).max())
+    if largest > _LARGEST_M or extent < _SMALLEST_M:
+        what = f"lies {largest:.3g} m away" if largest > _LARGEST_M else f"measures {extent:.3g} m"
+        raise BadInputError(
+            f"{shown(path)}: view {shown(view.name)}: its target {what}, expected metres, "
+            f"from {_SMALLEST_M:g} to {_LARGEST_M:g}"
+        )
+
+
+def _near_origin(views: Sequence[View]) -> tuple[View, ...]:
+    """The same views; a target that lies far from its own origin is moved there, which changes no camera.
+
+    Rotating about a distant origin would cost the digits that tell the points apart.
+    """
+    every = np.concatenate([view.target_m for view in views])
+    middle = 0.5 * (every.min(axis=0) + every.max(axis=0))
+    if np.abs(middle).max() < 10.0 * np.ptp(every, axis=0).max():
+        return tuple(views)
+    return tuple(replace(view, target_m=view.target_m - middle) for view in views)
+
+
+def _from_pictures(sources: Sequence[Path], told: Told, progress: Callable[[int, int], None]) -> ViewSet:
+    paths = list_pictures(sources)
+    file, hashes = board_of(sources)
+    corners = told.corners or (None if file.corners is None else (file.corners[0], file.corners[1]))
+    square_m = file.square_m if told.square_m is None else told.square_m
+    remarks = []
+    if square_m is None:
+        remarks.append(_NO_SQUARE)
+    for option, here, there in (
+        ("--corners", told.corners, file.corners),
+        ("--square", told.square_m, file.square_m),
+    ):
+        if here is not None and there is not None and _text(here) != _text(there):
+            remarks.append(f"{option}: {_text(here)} is used, not {_text(there)} of board.yaml")
+    found = find_boards(paths, corners, 1.0 if square_m is None else square_m, progress, told.image_size_px)
+    if corners is None:
+        remarks.append(f"found a board with {found.board.columns}x{found.board.rows} inner corners")
+    remarks.append(f"board found in {len(found.views)} of {len(paths)} pictures")
+    return ViewSet(
+        found.views, found.image_size_px, {**found.hashes, **hashes}, found.without, tuple(remarks)
+    )
+
+
+def _text(value: Sequence[int] | float) -> str:
+    return f"{value:g} m" if isinstance(value, float | int) else "x".join(str(part) for part in value)

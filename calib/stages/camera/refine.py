@@ -1,0 +1,886 @@
+"""Sub-pixel refinement of a grid of corners."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from calib.core.arrays import BoolArray, FloatArray, GrayImage, IntArray
+from calib.stages.camera.lattice import extrapolated
+
+# ----------------------------------------------------------------------
+# The blurred corner itself, fitted to the grey levels around it, many corners at once.
+#
+# Around a corner at (u0, v0) the edges along the rows and along the columns of the board have the
+# directions alpha and beta and the curvatures kappa and lambda, which distortion gives them. With
+# (x, y) the offset from the corner, c = cos, s = sin,
+#
+#     t1 =  c(alpha) x + s(alpha) y      d1 = -s(alpha) x + c(alpha) y - kappa t1^2 / 2
+#     t2 =  c(beta)  x + s(beta)  y      d2 =  s(beta)  x - c(beta)  y + lambda t2^2 / 2
+#
+# d1 and d2 are the distances from the two edges, growing with row and column, t1 and t2 the way along
+# them. Blur and the pixel's aperture make an error function of each step:
+#
+#     I = (1 + g_x x + g_y y) (b + a erf(d1 / w) erf(d2 / w))
+#
+# Light that is not even scales dark and bright alike, hence one gradient g. The eleven parameters u0, v0,
+# alpha, beta, w, b, a, g_x, g_y, kappa, lambda of each corner are found by Levenberg-Marquardt. The
+# curvatures are measured much better by the row and column of corners than by a single window: that
+# value and its standard deviation enter as one more observation. The window is a parallelogram along
+# the board, so that the model holds in all of it.
+
+WINDOW = 0.45
+"""Half the window's width over the local square: the next corner must not come in."""
+REACH_PX = 12
+_LEAST_REACH_PX = 2.5
+_ITERATIONS = 16
+_STEP_PX = 1e-3
+_STEP_SIGMA = 0.05
+_WHITE = np.float32(255.0)
+_NOISE, _LEAST_NOISE = 0.04, 1.0
+_LEAST_BEND_SIGMA = 1e-6
+_WARM_RESIDUAL = 0.3
+_START_WIDTH_PX = 1.2
+_WIDTH_PX = (0.3, 12.0)
+_PARAMETERS = 11
+_BENDS = slice(9, 11)
+_UNKNOWN_BEND = 3e-3
+_PART_PIXELS, _LEAST_PART = 24_000, 8
+"""Corners are fitted in parts of about so many pixels, whose arrays stay in the processor's cache."""
+_EDGE_SLOPE = 2.0 / np.sqrt(np.pi)
+
+_Float32 = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Frames:
+    """What the grid says of the surroundings of each of N corners.
+
+    Attributes
+    ----------
+    along, across : (N, 2) steps to the next column and row, pixels.
+    bends : (N, 2) curvatures of the edges along the row and along the column, 1 / px.
+    bend_sigmas : (N, 2) standard deviations of `bends`.
+    """
+
+    along: FloatArray
+    across: FloatArray
+    bends: FloatArray
+    bend_sigmas: FloatArray
+
+    def take(self, chosen: IntArray) -> Frames:
+        """The frames of some corners."""
+        return Frames(self.along[chosen], self.across[chosen], self.bends[chosen], self.bend_sigmas[chosen])
+
+
+@dataclass(frozen=True)
+class LocalFit:
+    """Fitted corners.
+
+    Attributes
+    ----------
+    points : (N, 2) pixels.
+    sigma_px : (N,) standard deviation of one coordinate, from the fit's residuals.
+    amplitude : (N,) half the step from dark to bright, positive where the square between growing
+        column and growing row is bright, grey levels.
+    residual : (N,) RMS of the fit over |amplitude|.
+    width_px : (N,) sqrt(2) times the standard deviation of the blur.
+    window : (N,) half the width of the window over the local square.
+    parameters : (N, 11) as the fit holds them, to start another one.
+    converged : (N,) whether the last step was small and the window held enough of the corner.
+    """
+
+    points: FloatArray
+    sigma_px: FloatArray
+    amplitude: FloatArray
+    residual: FloatArray
+    width_px: FloatArray
+    window: FloatArray
+    parameters: FloatArray
+    converged: BoolArray
+
+    def take(self, chosen: IntArray) -> LocalFit:
+        """The fits of some corners."""
+        return LocalFit(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
+
+
+def _joined(fits: Sequence[LocalFit]) -> LocalFit:
+    return LocalFit(
+        *(np.concatenate([getattr(fit, name) for fit in fits]) for name in LocalFit.__dataclass_fields__)
+    )
+
+
+@dataclass(frozen=True)
+class _Windows:
+    """Pixels around N corners, (N, M) each, with weights 0 or 1; x and y from `centre` (N, 2)."""
+
+    centre: FloatArray
+    x: _Float32
+    y: _Float32
+    grey: _Float32
+    weight: _Float32
+
+    def take(self, chosen: IntArray) -> _Windows:
+        return _Windows(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
+
+
+def _curvatures(curves: FloatArray, degree: int) -> FloatArray:
+    """Curvature (m, n) of m curves of n points, (m, n, 2), each a polynomial over its own chord.
+
+    Perspective keeps lines straight, so the polynomial has to follow the lens only.
+    """
+    chord = curves[:, -1] - curves[:, 0]
+    length = np.maximum(np.linalg.norm(chord, axis=1), 1e-9)[:, None]
+    c, s = (chord / length).T[:, :, None]
+    offset = curves - curves.mean(axis=1, keepdims=True)
+    t = (c * offset[..., 0] + s * offset[..., 1]) * (2.0 / length)
+    height = c * offset[..., 1] - s * offset[..., 0]
+    powers = t[..., None] ** np.arange(degree + 1)
+    normal = powers.transpose(0, 2, 1) @ powers + 1e-9 * np.eye(degree + 1)
+    k = np.linalg.solve(normal, powers.transpose(0, 2, 1) @ height[..., None])[..., 0]
+    m = np.arange(degree + 1)
+    slope = np.einsum("mnd,md->mn", powers[..., :-1], (k * m)[:, 1:]) * (2.0 / length)
+    bend = np.einsum("mnd,md->mn", powers[..., :-2], (k * m * (m - 1))[:, 2:]) * (2.0 / length) ** 2
+    return np.asarray(bend / (1.0 + slope**2) ** 1.5)
+
+
+def _bends(curves: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Curvatures and their standard deviations, (m, n): half of what one degree more or less would change."""
+    n = curves.shape[1]
+    if n < 3:
+        return np.zeros(curves.shape[:2]), np.full(curves.shape[:2], _UNKNOWN_BEND)
+    degree = 2 if n < 5 else 3 if n < 7 else 4
+    bend = _curvatures(curves, degree)
+    lower = _curvatures(curves, degree - 1) if degree > 2 else np.zeros_like(bend)
+    change = 0.5 * np.abs(bend - lower)
+    # Alike along the curve, but for the ends, where the polynomials differ most.
+    sigma = np.maximum(change, np.sqrt(np.mean(change**2, axis=1, keepdims=True)))
+    return bend, sigma
+
+
+def frames_of(points: FloatArray) -> Frames:
+    """Steps and curvatures of a grid of corners, (rows, columns, 2) pixels, at least 2 x 2."""
+    along, across = np.gradient(points, axis=1), np.gradient(points, axis=0)
+    by_row, by_column = _bends(points), _bends(points.transpose(1, 0, 2))
+    bends, sigmas = (
+        np.stack([row.ravel(), column.T.ravel()], axis=1)
+        for row, column in zip(by_row, by_column, strict=True)
+    )
+    return Frames(along.reshape(-1, 2), across.reshape(-1, 2), bends, sigmas)
+
+
+def _windows(image: _Float32, points: FloatArray, frames: Frames, window: float, most_px: int) -> _Windows:
+    height, width = image.shape
+    centre = np.rint(points)
+    extent = window * (np.abs(frames.along) + np.abs(frames.across))
+    reach = int(np.clip(np.ceil(extent.max(initial=3.0)), np.ceil(_LEAST_REACH_PX), most_px))
+    offset = np.arange(-reach, reach + 1)
+    dx, dy = (o.ravel() for o in np.meshgrid(offset, offset))
+    x = dx - (points - centre)[:, :1]
+    y = dy - (points - centre)[:, 1:]
+    (ax, ay), (bx, by) = frames.along.T[:, :, None], frames.across.T[:, :, None]
+    area = np.maximum(np.abs(ax * by - ay * bx), 1e-9)
+    inside = (np.abs(by * x - bx * y) <= window * area) & (np.abs(ax * y - ay * x) <= window * area)
+    # The smallest squares leave too few pixels; there the next edge is let in.
+    inside |= (np.abs(x) <= _LEAST_REACH_PX) & (np.abs(y) <= _LEAST_REACH_PX)
+    u, v = centre[:, :1] + dx, centre[:, 1:] + dy
+    inside &= (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    # Pack the pixels that count to the left.
+    most = max(int(inside.sum(axis=1).max(initial=1)), 1)
+    packed = np.argsort(~inside, axis=1, kind="stable")[:, :most]
+    weight = np.take_along_axis(inside, packed, axis=1)
+    u = np.clip(np.take_along_axis(u, packed, axis=1), 0, width - 1).astype(np.intp)
+    v = np.clip(np.take_along_axis(v, packed, axis=1), 0, height - 1).astype(np.intp)
+    return _Windows(
+        centre,
+        dx[packed].astype(np.float32),
+        dy[packed].astype(np.float32),
+        image[v, u],
+        weight.astype(np.float32),
+    )
+
+
+def _edge(d: _Float32, w: _Float32) -> tuple[_Float32, _Float32, _Float32]:
+    """erf(d / w) and its derivatives by d and by w (Abramowitz and Stegun 7.1.26, error below 2e-7)."""
+    z = d / w
+    bell = np.exp(-z * z)
+    t = 1.0 / (1.0 + np.float32(0.3275911) * np.abs(z))
+    series = np.float32(1.061405429) * t
+    for c in (-1.453152027, 1.421413741, -0.284496736, 0.254829592):
+        series = (series + np.float32(c)) * t
+    slope = np.float32(_EDGE_SLOPE) * bell / w
+    return np.copysign(1.0 - series * bell, z), slope, -slope * z
+
+
+def _model(q: _Float32, win: _Windows, room: _Float32) -> tuple[_Float32, _Float32]:
+    """Residuals (N, M) and the Jacobian of the model (N, 11, M), in `room`, both zero outside the window."""
+    u0, v0, alpha, beta, w, b, a, gx, gy, kappa, lam = (q[:, k, None] for k in range(_PARAMETERS))
+    x, y = win.x - u0, win.y - v0
+    c1, s1, c2, s2 = np.cos(alpha), np.sin(alpha), np.cos(beta), np.sin(beta)
+    t1, t2 = c1 * x + s1 * y, c2 * x + s2 * y
+    n1, n2 = c1 * y - s1 * x, s2 * x - c2 * y
+    k1t, k2t = kappa * t1, lam * t2
+    E1, G1, W1 = _edge(n1 - 0.5 * k1t * t1, w)
+    E2, G2, W2 = _edge(n2 + 0.5 * k2t * t2, w)
+    light = (1.0 + gx * x + gy * y) * win.weight
+    P = E1 * E2
+    tone = b + a * P
+    J = room[: len(q)]
+    by_d1, by_d2 = a * light * G1 * E2, a * light * E1 * G2
+    toned = win.weight * tone
+    J[:, 0] = by_d1 * (s1 + k1t * c1) - by_d2 * (s2 + k2t * c2) - gx * toned
+    J[:, 1] = by_d1 * (k1t * s1 - c1) + by_d2 * (c2 - k2t * s2) - gy * toned
+    J[:, 2] = by_d1 * (-t1 - k1t * n1)
+    J[:, 3] = by_d2 * (t2 - k2t * n2)
+    J[:, 4] = a * light * (W1 * E2 + E1 * W2)
+    J[:, 5] = light
+    J[:, 6] = light * P
+    J[:, 7] = x * toned
+    J[:, 8] = y * toned
+    J[:, 9] = by_d1 * (-0.5 * t1 * t1)
+    J[:, 10] = by_d2 * (0.5 * t2 * t2)
+    shown = light * tone
+    # A sensor that is full shows white, whatever the light: nothing there to learn from.
+    full = (shown >= _WHITE) | (shown < 0.0)
+    if np.any(full):
+        J *= ~full[:, None, :]
+        shown = np.clip(shown, 0.0, _WHITE)
+    return (win.grey * win.weight - shown).astype(np.float32, copy=False), J
+
+
+def _start(points: FloatArray, frames: Frames, win: _Windows, room: _Float32) -> FloatArray:
+    """Parameters (N, 11) with position and directions of the grid, and the grey levels that fit them."""
+    q = np.zeros((len(points), _PARAMETERS))
+    q[:, :2] = points - win.centre
+    q[:, 2] = np.arctan2(frames.along[:, 1], frames.along[:, 0])
+    q[:, 3] = np.arctan2(frames.across[:, 1], frames.across[:, 0])
+    q[:, 4] = _START_WIDTH_PX
+    q[:, _BENDS] = frames.bends
+    _, J = _model(q.astype(np.float32), win, room)
+    ones, P = J[:, 5].astype(np.float64), J[:, 6].astype(np.float64)
+    grey = win.grey * win.weight
+    n, sum_p, sum_pp = ones.sum(axis=1), P.sum(axis=1), (P * P).sum(axis=1)
+    sum_g, sum_gp = grey.sum(axis=1), (grey * P).sum(axis=1)
+    det = np.maximum(n * sum_pp - sum_p**2, 1e-9)
+    q[:, 6] = (n * sum_gp - sum_p * sum_g) / det
+    q[:, 5] = (sum_pp * sum_g - sum_p * sum_gp) / det
+    return q
+
+
+def fit_corners(
+    image: _Float32,
+    points: FloatArray,
+    frames: Frames,
+    iterations: int = _ITERATIONS,
+    reach_px: int = REACH_PX,
+    window: float = WINDOW,
+    warm: LocalFit | None = None,
+) -> LocalFit:
+    """Fit the blurred corner around each of N points.
+
+    Parameters
+    ----------
+    image : (H, W) grey levels.
+    points : (N, 2) where to start, pixels.
+    frames : steps and curvatures of the grid at the N points.
+    reach_px : most pixels that a window reaches to each side of its corner.
+    window : half the width of a window over the local square.
+    warm : an earlier fit of the same corners, whose other parameters are taken for a start.
+    """
+    extent = (2.0 * window) ** 2 * np.abs(
+        frames.along[:, 0] * frames.across[:, 1] - frames.along[:, 1] * frames.across[:, 0]
+    )
+    count = max(_LEAST_PART, int(_PART_PIXELS / min(extent.max(initial=1.0), (2 * reach_px + 1) ** 2)))
+    fits = []
+    for first in range(0, max(len(points), 1), count):
+        part = np.arange(first, min(first + count, len(points)))
+        before = None if warm is None else warm.take(part)
+        fits.append(_fit_part(image, points[part], frames.take(part), iterations, reach_px, window, before))
+    return fits[0] if len(fits) == 1 else _joined(fits)
+
+
+def _fit_part(
+    image: _Float32,
+    points: FloatArray,
+    frames: Frames,
+    iterations: int,
+    reach_px: int,
+    window: float,
+    warm: LocalFit | None,
+) -> LocalFit:
+    N = len(points)
+    win = _windows(image, points, frames, window, reach_px)
+    room = np.empty((N, _PARAMETERS, win.x.shape[1]), dtype=np.float32)
+    q = _start(points, frames, win, room)
+    if warm is not None:
+        kept = warm.residual < _WARM_RESIDUAL
+        q[kept, 2:9] = warm.parameters[kept, 2:9]
+    freedom = np.maximum(win.weight.sum(axis=1).astype(np.float64) - _PARAMETERS, 1.0)
+    damping, converged = np.full(N, 1e-3), np.zeros(N, dtype=bool)
+    # Weight of the curvatures' own observation, for residuals of the size that the fit will leave.
+    noise = np.maximum(_NOISE * np.abs(q[:, 6]), _LEAST_NOISE)
+    prior = (noise[:, None] / np.maximum(frames.bend_sigmas, _LEAST_BEND_SIGMA)) ** 2
+    r, J = _model(q.astype(np.float32), win, room)
+    normal, gradient, cost = _equations(q, r, J, prior, frames.bends)
+    active = np.arange(N)
+    diagonal = np.arange(_PARAMETERS)
+    for _ in range(iterations):
+        N_a, g_a = normal[active], gradient[active]
+        A = N_a.copy()
+        A[:, diagonal, diagonal] *= 1.0 + damping[active, None]
+        A[:, diagonal, diagonal] += 1e-6
+        step = np.linalg.solve(A, g_a[:, :, None])[:, :, 0]
+        length = np.hypot(step[:, 0], step[:, 1])
+        step /= np.maximum(1.0, np.maximum(length, 4.0 * np.abs(step[:, 2:4]).max(axis=1)))[:, None]
+        foreseen = np.einsum("ni,ni->n", step, 2.0 * g_a - np.einsum("nij,nj->ni", N_a, step))
+        trial = q[active] + step
+        trial[:, 4] = np.clip(trial[:, 4], *_WIDTH_PX)
+        r, J = _model(trial.astype(np.float32), win.take(active) if len(active) < N else win, room)
+        equations = _equations(trial, r, J, prior[active], frames.bends[active])
+        gain = (cost[active] - equations[2]) / np.maximum(foreseen, 1e-9)
+        better = equations[2] <= cost[active] * (1 + 1e-6)
+        # A step is small when it is so in pixels, or against the fit's own uncertainty.
+        settled = (length < _STEP_PX) | (foreseen * freedom[active] < _STEP_SIGMA**2 * cost[active])
+        won = active[better]
+        q[won] = trial[better]
+        normal[won], gradient[won], cost[won] = (part[better] for part in equations)
+        factor = np.where(gain > 0.75, 0.1, np.where(gain > 0.25, 1.0, 6.0))
+        damping[active] = np.clip(damping[active] * factor, 1e-7, 1e8)
+        converged[active] = better & settled & (damping[active] < 1e3)
+        active = active[~converged[active]]
+        if len(active) == 0:
+            break
+    return _result(q, win, window, normal, cost, freedom, converged)
+
+
+def _equations(
+    q: FloatArray, r: _Float32, J: _Float32, prior: FloatArray, bends: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Normal matrix (N, 11, 11), right side (N, 11) and cost (N,), with the observed curvatures."""
+    normal = (J @ J.transpose(0, 2, 1)).astype(np.float64)
+    gradient = (J @ r[:, :, None])[:, :, 0].astype(np.float64)
+    cost = np.einsum("nm,nm->n", r, r, dtype=np.float64)
+    off = bends - q[:, _BENDS]
+    both = np.arange(_PARAMETERS)[_BENDS]
+    normal[:, both, both] += prior
+    gradient[:, _BENDS] += prior * off
+    return normal, gradient, cost + np.sum(prior * off**2, axis=1)
+
+
+def _result(
+    q: FloatArray,
+    win: _Windows,
+    window: float,
+    normal: FloatArray,
+    cost: FloatArray,
+    freedom: FloatArray,
+    converged: BoolArray,
+) -> LocalFit:
+    scale = np.sqrt(np.maximum(np.einsum("nii->ni", normal), 1e-12))
+    scaled = normal / (scale[:, :, None] * scale[:, None, :]) + 1e-7 * np.eye(_PARAMETERS)
+    inverse = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
+    variance = cost / freedom
+    sigma = np.sqrt(np.maximum(0.5 * (inverse[:, 0, 0] + inverse[:, 1, 1]) * variance, 0.0))
+    amplitude = q[:, 6]
+    residual = np.sqrt(variance) / np.maximum(np.abs(amplitude), 1e-9)
+    finite = np.all(np.isfinite(q), axis=1) & np.isfinite(sigma)
+    return LocalFit(
+        points=q[:, :2] + win.centre,
+        sigma_px=sigma,
+        amplitude=amplitude,
+        residual=residual,
+        width_px=q[:, 4],
+        window=np.full(len(q), window),
+        parameters=q,
+        converged=converged & finite & (freedom > _PARAMETERS),
+    )
+
+
+# ----------------------------------------------------------------------
+# Where the other corners say that a corner is: a homography seen through a smooth lens.
+#
+# A pixel at the distance r from the picture's centre, in half diagonals, is moved to r / (1 + lambda r^2)
+# (Fitzgibbon 2001), which straightens most of what a wide lens bends. There the corners are a homography
+# of the board plus what a polynomial of low degree over the board says, fitted robustly (Geman and
+# McClure's weights). Each corner is compared with what the fit without it would say: e_i / (1 - h_i),
+# where h_i is the corner's leverage. lambda and the degree are those whose predictions are best.
+
+_DEGREES = (1, 2, 3, 5)
+_FREEDOM = 1.6
+"""Corners for each coefficient that a degree must have."""
+_ROUNDS = 4
+_LAMBDAS = np.array([-0.9, -0.7, -0.5, -0.35, -0.22, -0.12, -0.05, 0.0, 0.05, 0.12])
+_LIMIT = 6.0
+_LEAST_SPREAD_PX = 0.02
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Centre (2,) and half diagonal of the picture, pixels."""
+
+    centre: FloatArray
+    radius_px: float
+
+    def straightened(self, points: FloatArray, strength: FloatArray | float) -> FloatArray:
+        """Points (..., 2) without the distortion of strength lambda."""
+        d = (points - self.centre) / self.radius_px
+        r2 = np.sum(d * d, axis=-1, keepdims=True)
+        return np.asarray(d / np.maximum(1.0 + strength * r2, 0.05))
+
+    def bent(self, straight: FloatArray, strength: float) -> FloatArray:
+        """The inverse of `straightened`."""
+        r2 = np.sum(straight * straight, axis=-1, keepdims=True)
+        root = np.sqrt(np.maximum(1.0 - 4.0 * strength * r2, 0.0))
+        return np.asarray(straight * (2.0 / (1.0 + root)) * self.radius_px + self.centre)
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Corners as their neighbours place them.
+
+    Attributes
+    ----------
+    points : (rows, columns, 2) pixels, each from all corners but itself.
+    spread_px : typical distance of a corner from its prediction, robust.
+    limit_px : (rows, columns) distance beyond which a corner disagrees with the others.
+    """
+
+    points: FloatArray
+    spread_px: float
+    limit_px: FloatArray
+
+
+def _homographies(board: FloatArray, targets: FloatArray, weights: FloatArray) -> FloatArray:
+    """Weighted direct linear transforms of board (N, 2) in [-1, 1] to L targets (L, N, 2), mapped."""
+    total = weights.sum()
+    centre = (weights[:, None] * targets).sum(axis=1, keepdims=True) / total
+    square = np.sum((targets - centre) ** 2, axis=2)
+    scale = np.sqrt((weights * square).sum(axis=1) / total)[:, None, None] + 1e-12
+    x = (targets - centre) / scale
+    X = np.column_stack([board, np.ones(len(board))])
+    rows = np.zeros((len(targets), 2, len(X), 9))
+    root = np.sqrt(weights)[:, None]
+    rows[:, 0, :, :3], rows[:, 1, :, 3:6] = root * X, root * X
+    rows[:, 0, :, 6:], rows[:, 1, :, 6:] = -root * x[..., :1] * X, -root * x[..., 1:] * X
+    system = rows.reshape(len(targets), -1, 9)
+    H = np.linalg.eigh(system.transpose(0, 2, 1) @ system)[1][:, :, 0].reshape(-1, 3, 3)
+    mapped = X @ H.transpose(0, 2, 1)
+    depth = np.where(np.abs(mapped[..., 2:]) < 1e-9, 1e-9, mapped[..., 2:])
+    return np.asarray(mapped[..., :2] / depth * scale + centre)
+
+
+def _strength(board: FloatArray, pixels: FloatArray, used: BoolArray, lens: Lens) -> float:
+    """The lambda under which the corners are nearest to a homography, robustly."""
+    straight = lens.straightened(pixels[None], _LAMBDAS[:, None, None])
+    mapped = _homographies(board, straight, used.astype(np.float64))
+    # What a straightened distance is worth in pixels differs from lambda to lambda.
+    back = np.stack([lens.bent(m, s) for m, s in zip(mapped, _LAMBDAS, strict=True)])
+    error = np.mean(np.linalg.norm(back - pixels, axis=2)[:, used], axis=1)
+    k = int(np.argmin(error))
+    none = int(np.argmin(np.abs(_LAMBDAS)))
+    if error[k] > 0.9 * error[none]:
+        return 0.0
+    if not 0 < k < len(_LAMBDAS) - 1:
+        return float(_LAMBDAS[k])
+    a, b, _ = np.polyfit(_LAMBDAS[k - 1 : k + 2], error[k - 1 : k + 2], 2)
+    return float(np.clip(-b / (2.0 * a), _LAMBDAS[k - 1], _LAMBDAS[k + 1])) if a > 0 else float(_LAMBDAS[k])
+
+
+def _basis(board: FloatArray, degree: int, columns: int, rows: int) -> FloatArray:
+    x, y = board.T
+    terms = [
+        x**p * y**q
+        for p in range(degree + 1)
+        for q in range(degree + 1 - p)
+        if p < max(columns - 1, 2) and q < max(rows - 1, 2)
+    ]
+    return np.stack(terms, axis=1)
+
+
+def _median(values: FloatArray) -> float:
+    """Median of (n,) values; NumPy's own takes five times as long for so few."""
+    n = len(values)
+    low, high = np.partition(values, ((n - 1) // 2, n // 2))[[(n - 1) // 2, n // 2]]
+    return 0.5 * float(low + high)
+
+
+def _weights(error: FloatArray, used: BoolArray, least: float) -> FloatArray:
+    """Geman and McClure's weights with the median of the errors for a scale."""
+    scale = max(3.0 * _median(error[used]), least)
+    return used / (1.0 + (error / scale) ** 2) ** 2
+
+
+def predict(points: FloatArray, known: BoolArray, lens: Lens | None = None) -> Prediction | None:
+    """Predict every corner of a grid from the others.
+
+    Parameters
+    ----------
+    points : (rows, columns, 2) pixels.
+    known : (rows, columns) which points to go by; at least six, or None is returned.
+    lens : where the picture's centre is; without it lambda is 0.
+    """
+    rows, columns = known.shape
+    j, i = np.mgrid[0:rows, 0:columns]
+    grid = np.stack([2.0 * i / max(columns - 1, 1) - 1.0, 2.0 * j / max(rows - 1, 1) - 1.0], axis=2)
+    board, used = grid.reshape(-1, 2), known.ravel()
+    if int(used.sum()) < 6:
+        return None
+    pixels = np.where(used[:, None], points.reshape(-1, 2), 0.0)
+    strength = 0.0
+    if lens is None:
+        lens = Lens(np.mean(pixels[used], axis=0), float(np.ptp(pixels[used])) + 1.0)
+    else:
+        strength = _strength(board, pixels, used, lens)
+    fit = _Fit(board, pixels, used, lens, strength, (rows, columns))
+    weights, plane = fit.homography()
+    best: Prediction | None = None
+    for degree in _DEGREES:
+        basis = _basis(board, degree, columns, rows)
+        if degree > 1 and used.sum() < _FREEDOM * basis.shape[1]:
+            break
+        candidate = fit.with_basis(basis, weights, plane)
+        if best is None or candidate.spread_px < best.spread_px:
+            best = candidate
+    return best
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Corners to fit: board (N, 2), pixels (N, 2), which are used (N,), and the lens of strength lambda."""
+
+    board: FloatArray
+    pixels: FloatArray
+    used: BoolArray
+    lens: Lens
+    strength: float
+    shape: tuple[int, int]
+
+    def _apart(self, straight: FloatArray) -> FloatArray:
+        u, v = (self.pixels - self.lens.bent(straight, self.strength)).T
+        return np.asarray(np.hypot(u, v))
+
+    def homography(self) -> tuple[FloatArray, FloatArray]:
+        """Robust weights (N,) and mapped corners (N, 2), straightened."""
+        target = self.lens.straightened(self.pixels, self.strength)[None]
+        weights = self.used.astype(np.float64)
+        plane = _homographies(self.board, target, weights)[0]
+        for _ in range(_ROUNDS - 1):
+            # Distortion that is left is no reason to distrust a corner; only large errors count here.
+            weights = _weights(self._apart(plane), self.used, 1.0)
+            plane = _homographies(self.board, target, weights)[0]
+        return weights, plane
+
+    def with_basis(self, basis: FloatArray, weights: FloatArray, plane: FloatArray) -> Prediction:
+        """Fit the displacement from the homography by `basis` (N, P), robustly."""
+        target = self.lens.straightened(self.pixels, self.strength)
+        for _ in range(_ROUNDS):
+            weighted = basis * weights[:, None]
+            inverse = np.linalg.inv(weighted.T @ basis + 1e-9 * np.eye(basis.shape[1]))
+            smooth = plane + basis @ (inverse @ (weighted.T @ (target - plane)))
+            power = np.sum((basis @ inverse) * basis, axis=1)
+            leverage = np.clip(weights * power, 0.0, 0.95)
+            apart = self._apart(smooth)
+            before, weights = weights, _weights(apart / np.sqrt(1.0 - leverage), self.used, 1e-3)
+            if np.max(np.abs(weights - before)) < 0.05:
+                break
+        without = target - (target - smooth) / (1.0 - leverage)[:, None]
+        points = self.lens.bent(np.where(self.used[:, None], without, smooth), self.strength)
+        spread = _median((apart / (1.0 - leverage))[self.used])
+        # A prediction is as uncertain as the corners, and as its leverage makes it.
+        limit = _LIMIT * max(spread, _LEAST_SPREAD_PX) * np.sqrt(1.0 + np.minimum(power, 8.0))
+        return Prediction(points.reshape(*self.shape, 2), spread, limit.reshape(self.shape))
+
+
+# ----------------------------------------------------------------------
+# Sub-pixel refinement of a grid of corners.
+#
+# Each corner is fitted on its own (`cornerfit`). Then the corners check each other (`gridmodel`): one that
+# did not converge, has the wrong colours or disagrees with the others is fitted again from where the
+# others place it. A corner that still fails is not a measurement: it is reported at its predicted place,
+# with a large sigma and `refined` false, and never at the place where the search began.
+#
+# Where squares are large the picture is averaged over blocks of k x k pixels first: the window then
+# covers the same share of the square, and averaging loses nothing that the blur has not lost.
+
+_SQUARE_PX = 40.0
+"""Squares of twice this size and more are averaged down to it."""
+_FIRST_ITERATIONS = 4
+_FIRST_REACH_PX = 8
+_LARGEST_RESIDUAL = 0.4
+"""RMS of a fit over the amplitude; clutter is above it."""
+_LEAST_SHARE = 0.1
+"""Least amplitude of a corner over the picture's median."""
+_FAR = 0.2
+"""Share of a square that no corner may be away from its prediction."""
+_UNKNOWN_SIGMA = 0.25
+"""Sigma of a corner that was not refined, in squares."""
+_RESCUE_WINDOWS = (0.45, 0.28, 0.2)
+_SIGMAS = 6.0
+_PASSES = 3
+_CLOSE_WINDOW = 0.28
+_DISTURBED = 1.5
+_STEADY_PX = 0.1
+"""Corners that moved farther are fitted again, with the curvatures of where they are now."""
+_LEAST_PICTURE_PX = 8
+
+_RefineFloat32 = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Refined:
+    """A refined grid; arrays are (rows, columns) and `points` has two pixel coordinates more.
+
+    Attributes
+    ----------
+    points : pixels.
+    sigma_px : standard deviation of one coordinate of a corner, from the residuals of its fit.
+    amplitude : half the step from dark to bright, positive where the square between growing column
+        and growing row is bright, grey levels.
+    residual : RMS of the fit over |amplitude|, without the share of the noise.
+    narrow : whether a corner had to be fitted with a smaller window than usual.
+    refined : False where a corner could not be measured and its predicted place is given.
+    misfit_px : typical distance of a corner from where the others place it.
+    """
+
+    points: FloatArray
+    sigma_px: FloatArray
+    amplitude: FloatArray
+    residual: FloatArray
+    narrow: BoolArray
+    refined: BoolArray
+    misfit_px: float
+
+    @property
+    def sign(self) -> int:
+        """+1 where the square between growing column and row of corner (0, 0) is bright, else -1."""
+        i, j = np.indices(self.amplitude.shape)
+        return 1 if np.sum(np.sign(self.amplitude) * (1 - 2 * ((i + j) % 2))) >= 0 else -1
+
+
+def square_px(points: FloatArray) -> float:
+    """Median length of the sides of the squares."""
+    along = np.linalg.norm(np.diff(points, axis=1), axis=-1)
+    across = np.linalg.norm(np.diff(points, axis=0), axis=-1)
+    return float(np.median(np.concatenate([along.ravel(), across.ravel()])))
+
+
+@dataclass(frozen=True)
+class Part:
+    """The part of a picture around a grid, averaged over k x k pixels.
+
+    Attributes
+    ----------
+    image : grey levels.
+    points : the grid in it, (rows, columns, 2) of its pixels.
+    k, origin : a pixel (x, y) of the part is at k (x, y) + (k - 1) / 2 + origin in the picture.
+    lens : the centre and half diagonal of the picture, in pixels of the part.
+    noise : standard deviation of the noise, grey levels.
+    """
+
+    image: _RefineFloat32
+    points: FloatArray
+    k: int
+    origin: FloatArray
+    lens: Lens
+    noise: float
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the grid."""
+        return self.points.shape[0], self.points.shape[1]
+
+    def to_picture(self, points: FloatArray) -> FloatArray:
+        """Pixels of the picture from pixels of the part."""
+        return np.asarray(points * self.k + 0.5 * (self.k - 1) + self.origin)
+
+
+def _noise(image: _RefineFloat32) -> float:
+    """Standard deviation of the noise, from the median of a mask that is blind to edges (Immerkaer 1996)."""
+    mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
+    return float(np.median(np.abs(cv2.filter2D(image, cv2.CV_32F, mask)[1:-1, 1:-1])) / (6.0 * 0.6745))
+
+
+def part_around(gray: GrayImage, points: FloatArray) -> Part | None:
+    """The part of a picture that holds a grid (rows, columns, 2); None when that is next to nothing."""
+    k = max(1, int(square_px(points) // _SQUARE_PX))
+    height, width = gray.shape
+    square = float(np.max(np.abs(np.gradient(points, axis=0)) + np.abs(np.gradient(points, axis=1))))
+    low = np.floor((points.reshape(-1, 2).min(axis=0) - square) / k).astype(int) * k
+    high = np.ceil(points.reshape(-1, 2).max(axis=0) + square).astype(int)
+    u0, v0 = max(int(low[0]), 0), max(int(low[1]), 0)
+    columns, rows = (min(int(high[0]), width) - u0) // k, (min(int(high[1]), height) - v0) // k
+    if min(columns, rows) < _LEAST_PICTURE_PX:
+        return None
+    image = gray[v0 : v0 + rows * k, u0 : u0 + columns * k].astype(np.float32)
+    if k > 1:
+        image = np.asarray(cv2.resize(image, (columns, rows), interpolation=cv2.INTER_AREA))
+    origin = np.array([u0, v0], dtype=np.float64)
+    shift = origin + 0.5 * (k - 1)
+    lens = Lens(
+        (0.5 * np.array([width - 1, height - 1]) - shift) / k, 0.5 * float(np.hypot(width, height)) / k
+    )
+    return Part(image, (points - shift) / k, k, origin, lens, _noise(image))
+
+
+def _colours(fit: LocalFit, shape: tuple[int, int]) -> FloatArray:
+    """Amplitude (N,), positive where a corner has the colours that most corners give it."""
+    j, i = np.indices(shape)
+    signed = fit.amplitude * (1.0 - 2.0 * ((i + j) % 2)).ravel()
+    return signed * (1.0 if np.sum(np.sign(signed)) >= 0 else -1.0)
+
+
+def misshape(fit: LocalFit, noise: float) -> FloatArray:
+    """What of the residuals (N,) of fits noise does not explain, over the amplitude."""
+    share = noise / np.maximum(np.abs(fit.amplitude), 1e-9)
+    return np.sqrt(np.maximum(fit.residual**2 - share**2, 0.0))
+
+
+def _sound(part: Part, fit: LocalFit) -> BoolArray:
+    """Which fits (N,) are of a corner with the right colours, converged or not yet."""
+    amplitude = _colours(fit, part.shape)
+    enough = amplitude > np.maximum(_LEAST_SHARE * np.median(np.abs(amplitude)), part.noise)
+    shaped = misshape(fit, part.noise) < _LARGEST_RESIDUAL
+    return np.asarray(enough & shaped & np.isfinite(fit.points[:, 0]))
+
+
+def _trusted(part: Part, fit: LocalFit) -> BoolArray:
+    """Which fits (N,) are measurements."""
+    return np.asarray(fit.converged & _sound(part, fit))
+
+
+def _merged(fit: LocalFit, again: LocalFit, where: IntArray, use: BoolArray) -> LocalFit:
+    """`fit` with the corners `where` (indices) replaced by those of `again` that are to be used."""
+    values = {}
+    for name in LocalFit.__dataclass_fields__:
+        merged = getattr(fit, name).copy()
+        merged[where[use]] = getattr(again, name)[use]
+        values[name] = merged
+    return LocalFit(**values)
+
+
+def _closer_looked(part: Part, fit: LocalFit, frames: Frames) -> LocalFit:
+    """Fit with a smaller window the corners that something near them disturbs: a margin, a shadow, a hand."""
+    typical = float(np.median(fit.residual))
+    doubtful = np.flatnonzero((fit.residual > _DISTURBED * typical + 0.02) | ~fit.converged)
+    if len(doubtful) == 0:
+        return fit
+    again = fit_corners(part.image, fit.points[doubtful], frames.take(doubtful), window=_CLOSE_WINDOW)
+    use = again.converged & (again.residual < np.where(fit.converged, 0.7 * fit.residual, np.inf)[doubtful])
+    return _merged(fit, again, doubtful, use)
+
+
+@dataclass(frozen=True)
+class _Check:
+    """What the other corners say of each of N fits.
+
+    Its place, the distance to it, the distance that is doubtful and the distance that is out of the
+    question.
+    """
+
+    placed: FloatArray
+    away: FloatArray
+    bound: FloatArray
+    far: FloatArray
+    frames: Frames
+
+
+def _checked(part: Part, fit: LocalFit, good: BoolArray) -> tuple[_Check, Prediction] | None:
+    prediction = predict(fit.points.reshape(*part.shape, 2), good.reshape(part.shape), part.lens)
+    if prediction is None:
+        return None
+    placed = prediction.points.reshape(-1, 2)
+    frames = frames_of(np.where(good[:, None], fit.points, placed).reshape(*part.shape, 2))
+    square = np.minimum(np.linalg.norm(frames.along, axis=1), np.linalg.norm(frames.across, axis=1))
+    away = np.linalg.norm(fit.points - placed, axis=1)
+    far = _FAR * square
+    bound = np.minimum(np.maximum(prediction.limit_px.ravel(), _SIGMAS * fit.sigma_px), far)
+    return _Check(placed, away, bound, far, frames), prediction
+
+
+def _rescued(part: Part, fit: LocalFit) -> tuple[LocalFit, BoolArray, Prediction] | None:
+    """Fit again, from where the others place them, the corners that failed or disagree with the others."""
+    good = _trusted(part, fit)
+    for window in _RESCUE_WINDOWS:
+        checked = _checked(part, fit, good)
+        if checked is None:
+            return None
+        check, prediction = checked
+        doubtful = np.flatnonzero(~good | ~(check.away < check.bound))
+        if len(doubtful) == 0:
+            return fit, good, prediction
+        again = fit_corners(part.image, check.placed[doubtful], check.frames.take(doubtful), window=window)
+        trial = _merged(fit, again, doubtful, np.ones(len(doubtful), dtype=np.bool_))
+        near = np.linalg.norm(again.points - check.placed[doubtful], axis=1)
+        use = _trusted(part, trial)[doubtful] & (~good[doubtful] | (near < 0.7 * check.away[doubtful]))
+        fit = _merged(fit, again, doubtful, use)
+        good[doubtful[use]] = True
+    checked = _checked(part, fit, good)
+    if checked is None:
+        return None
+    check = checked[0]
+    # A clean fit may contradict the others: neither board nor lens need be smooth. A disturbed one may not.
+    clean = fit.residual < _DISTURBED * np.median(fit.residual) + 0.02
+    beside = extrapolated(fit.points.reshape(*part.shape, 2))[1:-1, 1:-1].reshape(-1, 2)
+    nearest = np.fmin(check.away, np.linalg.norm(fit.points - beside, axis=1))
+    good &= np.where(clean, nearest < check.far, check.away < check.bound)
+    last = predict(fit.points.reshape(*part.shape, 2), good.reshape(part.shape), part.lens)
+    return None if last is None else (fit, good, last)
+
+
+def refine(gray: GrayImage, points: FloatArray) -> Refined | None:
+    """Refine a grid of corners to a small fraction of a pixel.
+
+    Parameters
+    ----------
+    gray : (H, W) grey levels.
+    points : (rows, columns, 2) pixels, off by less than a third of a square, at least 3 x 3.
+
+    Returns
+    -------
+    None where fewer than six corners could be fitted.
+    """
+    part = part_around(gray, points)
+    if part is None:
+        return None
+    shape, start = part.shape, part.points
+    first = fit_corners(
+        part.image, start.reshape(-1, 2), frames_of(start), _FIRST_ITERATIONS, _FIRST_REACH_PX
+    )
+    # A misplaced corner would spoil the curvatures of its row and column.
+    sound = _sound(part, first)
+    rough = predict(first.points.reshape(start.shape), sound.reshape(shape), part.lens)
+    if rough is None:
+        return None
+    away = np.linalg.norm(first.points - rough.points.reshape(-1, 2), axis=1)
+    stays = sound & (away < rough.limit_px.ravel())
+    moved = np.where(stays[:, None], first.points, rough.points.reshape(-1, 2)).reshape(start.shape)
+    fit = first
+    for _ in range(_PASSES):
+        fit = fit_corners(part.image, moved.reshape(-1, 2), frames_of(moved), warm=fit)
+        before, moved = (
+            moved,
+            np.where(_sound(part, fit)[:, None], fit.points, moved.reshape(-1, 2)).reshape(start.shape),
+        )
+        if np.max(np.abs(moved - before)) < _STEADY_PX:
+            break
+    fit = _closer_looked(part, fit, frames_of(moved))
+    rescued = _rescued(part, fit)
+    if rescued is None:
+        return None
+    fit, good, prediction = rescued
+    placed = prediction.points.reshape(-1, 2)
+    unknown = _UNKNOWN_SIGMA * square_px(prediction.points)
+    found = np.where(good[:, None], fit.points, placed).reshape(*shape, 2)
+    return Refined(
+        points=part.to_picture(found),
+        sigma_px=part.k * np.where(good, fit.sigma_px, unknown).reshape(shape),
+        amplitude=fit.amplitude.reshape(shape),
+        residual=misshape(fit, part.noise).reshape(shape),
+        narrow=(fit.window < WINDOW).reshape(shape),
+        refined=good.reshape(shape),
+        misfit_px=part.k * prediction.spread_px,
+    )

@@ -1,0 +1,917 @@
+"""Whether a calibration can be trusted: one of four verdicts, with reasons and advice."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from calib.core.arrays import FloatArray, IntArray
+from calib.stages.camera.bundle import Calibration, Covariance, covariance, projection_sigma_px
+from calib.stages.camera.checks import (
+    Coverage,
+    FocalInterval,
+    Lens,
+    Misfit,
+    Screening,
+    Split,
+    Start,
+    TargetShape,
+    best_change,
+    best_next_view,
+    best_split,
+    conditioned,
+    coverage,
+    evidence,
+    focal_interval,
+    inside_hull,
+    lens_shape,
+    misfit,
+    other_starts,
+    overdispersion,
+    repeated_views,
+    resolved,
+    screen,
+    straightened,
+    target_shape,
+    widened,
+)
+
+# ----------------------------------------------------------------------
+# What a check has found about a calibration, and the limits that a finding is held against.
+
+OK = "ok"
+POOR = "poor"
+INCONSISTENT = "inconsistent"
+UNIDENTIFIABLE = "unidentifiable"
+REMARK = "remark"
+
+VERDICTS = (OK, POOR, INCONSISTENT, UNIDENTIFIABLE)
+"""From the best to the worst; the worst finding decides."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A sentence, its weight (one of `VERDICTS` but `OK`, or `REMARK`) and what to do about it."""
+
+    kind: str
+    text: str
+    advice: str = ""
+
+
+def listed(names: Sequence[str], most: int = 6) -> str:
+    """Names for a sentence, the rest counted."""
+    if len(names) <= most:
+        return ", ".join(names)
+    return ", ".join(names[:most]) + f" and {len(names) - most} more"
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Where a calibration stops being good.
+
+    Attributes
+    ----------
+    views : unique views below which nothing is left over to check the answer with.
+    focal_remark, focal_poor, focal_free : relative standard deviation of a focal length. Distances
+        told by the camera are off by the same share.
+    spread_poor_deg, spread_free_deg : largest angle between two boards. Focal length comes from
+        perspective alone, which goes with the tilt.
+    area_poor : share of the image that the points span.
+    view_poor : share of the image that a typical view spans.
+    projection_share : standard deviation of projection inside of what was seen, over the width.
+    centre_poor, centre_remark : offset of the principal point from the image's centre, over its side.
+    lens_remark, lens_poor, lens_poor_px : share, and pixels, of the RMS that a richer lens model would
+        take away.
+    rms_px : residuals above which something is wrong whatever it is, at up to 1000 pixels' width.
+    view_bad, view_remark : RMS of a view over the others'.
+    point_factor, point_floor_px, points_poor : a point off by this many medians and pixels is an
+        outlier; share of outliers.
+    heavy_remark : share of the squared residuals that the worst percent of points may hold.
+    repeated_remark : error that repeats at the same points over what independent errors leave.
+    repeat_share : share of unique views below which the copies rule the answer.
+    decrement : standard deviations that the solver may stop short of a minimum.
+    split_ratio, change_ratio : two cameras, in any order and one after the other: the statistic over
+        what chance reaches. One camera reaches 1.2 in a hundred sets, two that differ by three
+        percent 2 to 50.
+    split_sigma, split_least : largest difference of an intrinsic over its standard deviation, and
+        the difference of focal length or principal point, as a share of the focal length or
+        width, that matters.
+    aspect_bad, aspect_remark, aspect_sigma : squares that are not square, as a share, and over its
+        standard deviation. Printers stretch by up to half a percent.
+    pixel_aspect : fx over fy where the board cannot tell whether it is to blame.
+    bow_bad, bow_remark, bow_sigma : departure from flatness over the board's size, and over its
+        standard deviation.
+    bow_focal, bow_focal_remark : share by which a bend that is there may move the focal length.
+    fragile : share by which a bend of half a percent of the size may do so.
+    rival_cost, rival_focal : another minimum with a cost up to this much higher and a focal length
+        this share away is a rival.
+    """
+
+    views: int = 4
+    focal_remark: float = 0.015
+    focal_poor: float = 0.03
+    focal_free: float = 0.10
+    spread_poor_deg: float = 12.0
+    spread_free_deg: float = 5.0
+    area_poor: float = 0.20
+    view_poor: float = 0.01
+    projection_share: float = 0.002
+    centre_poor: float = 0.15
+    centre_remark: float = 0.10
+    lens_remark: float = 0.1
+    lens_poor: float = 0.33
+    lens_poor_px: float = 0.1
+    rms_px: float = 1.0
+    view_bad: float = 5.0
+    view_remark: float = 3.0
+    point_factor: float = 8.0
+    point_floor_px: float = 0.5
+    points_poor: float = 0.01
+    heavy_remark: float = 0.2
+    repeated_remark: float = 1.6
+    repeat_share: float = 0.5
+    decrement: float = 2.0
+    split_ratio: float = 1.5
+    change_ratio: float = 1.3
+    split_sigma: float = 4.0
+    split_least: float = 0.007
+    aspect_bad: float = 0.007
+    aspect_remark: float = 0.003
+    aspect_sigma: float = 4.0
+    pixel_aspect: float = 0.02
+    bow_bad: float = 0.010
+    bow_remark: float = 0.005
+    bow_sigma: float = 4.0
+    bow_focal: float = 0.015
+    bow_focal_remark: float = 0.005
+    fragile: float = 0.03
+    rival_cost: float = 1.10
+    rival_focal: float = 0.10
+
+
+# ----------------------------------------------------------------------
+# From numbers to sentences: is the camera determined by the views?
+#
+# Every function takes what one module measured and returns findings, each one sentence with the number
+# and the limit it is held against. `calib.stages.camera.verdict` does the same for the views themselves.
+
+MORE_TILT = "Tilt the board by 30 degrees or more, about its long and its short side in turn."
+_MORE_VIEWS = "Take at least ten pictures with the board tilted in different directions."
+_IN_CORNERS = "Take pictures with the board in the picture's corners, or use a simpler model."
+
+_CHI2_95 = 3.84
+
+
+def of_solution(calibration: Calibration, unique: int, limits: Limits) -> list[Finding]:
+    """Enough views and points, and a solver that arrived."""
+    out = []
+    views, points = calibration.observations.views, calibration.observations.points
+    short = calibration.decrement
+    if calibration.termination == "behind the camera":
+        text = "No camera was found that has all points of the board in front of it."
+        out.append(Finding(UNIDENTIFIABLE, text))
+    elif calibration.termination == "singular":
+        text = (
+            "The normal equations are singular: the views leave a direction of the parameters entirely free."
+        )
+        out.append(Finding(UNIDENTIFIABLE, text, MORE_TILT))
+    elif not calibration.converged and not short < 0.1:
+        text = (
+            f"The solver stopped ({calibration.termination}) after {calibration.evaluations} evaluations, "
+            f"{short:.2g} standard deviations short of a minimum (up to {limits.decrement:g} does not "
+            "matter): the views leave a direction nearly free."
+        )
+        out.append(Finding(REMARK if short < limits.decrement else UNIDENTIFIABLE, text))
+    if calibration.degrees_of_freedom <= 0:
+        text = (
+            f"{points} points in {views} views give no more equations than there are unknowns, "
+            "so nothing checks the answer."
+        )
+        out.append(Finding(UNIDENTIFIABLE, text, _MORE_VIEWS))
+    if unique < 2:
+        text = "There is only one view of the board, which hardly tells focal length and distance apart."
+        out.append(Finding(UNIDENTIFIABLE, text, _MORE_VIEWS))
+    elif unique < limits.views:
+        text = (
+            f"{unique} different views are too few to check one against the others; "
+            f"{limits.views} are the least."
+        )
+        out.append(Finding(POOR, text, _MORE_VIEWS))
+    return out
+
+
+def of_lens(found: Lens, calibration: Calibration, reach: float) -> list[Finding]:
+    """The radial curve has to rise over the image, and the focal length has to be a lens's."""
+    camera = calibration.camera
+    width = max(camera.image_size_px)
+    out = []
+    if found.seen_slope <= 0.0:
+        text = (
+            "The distortion curve folds over among the points that were seen, so that two directions share "
+            "a pixel: distortion has taken the place of something else."
+        )
+        rational = camera.model == "rational8"
+        kind = POOR if rational else UNIDENTIFIABLE
+        out.append(Finding(kind, text, "Use a simpler lens model." if rational else MORE_TILT))
+    elif found.image_shown < 1.0 or found.image_slope <= 0.0:
+        lost = 100 * (1 - found.image_shown)
+        text = (
+            f"The distortion curve folds over inside of the picture: {lost:.0f} % of its border cannot be "
+            f"undistorted (up to 10 is good; points were seen {100 * reach:.0f} % of the way to the corners)."
+        )
+        out.append(Finding(POOR if lost > 10.0 else REMARK, text, _IN_CORNERS))
+    focal = min(camera.fx_px, camera.fy_px)
+    if not 0.25 * width < focal < 30 * width:
+        text = (
+            f"The focal length of {focal:.1f} px is {focal / width:.2f} times the picture's width; "
+            "lenses that this model suits have 0.25 to 30."
+        )
+        free = not 0.15 * width < focal < 100 * width
+        out.append(Finding(UNIDENTIFIABLE if free else POOR, text, MORE_TILT))
+    return out
+
+
+def of_focal(sigma_share: float, interval: FocalInterval | None, limits: Limits) -> list[Finding]:
+    """Standard deviation of the focal length, inflated, and its interval from the profile."""
+    out = []
+    if not sigma_share < limits.focal_remark:
+        known = f"{100 * sigma_share:.1f} %" if sigma_share < 2 else "no better than a factor of two"
+        text = (
+            f"The focal length is known to {known} (one standard deviation, residuals that are not white "
+            f"considered; up to {100 * limits.focal_poor:.0f} is good, {100 * limits.focal_free:.0f} means "
+            "that it is free)."
+        )
+        kind = REMARK if sigma_share < limits.focal_poor else POOR
+        out.append(Finding(kind if sigma_share < limits.focal_free else UNIDENTIFIABLE, text, MORE_TILT))
+    if interval is None:
+        return out
+    if interval.lower_cost:
+        text = "Moving the focal length lowers the cost: the solver had not found the minimum."
+        out.append(Finding(UNIDENTIFIABLE, text, MORE_TILT))
+    elif not interval.bounded:
+        text = (
+            f"The views fit a focal length of {_range(interval)} about as well as the "
+            f"{interval.fx_px:.0f} px found: its 95 % interval has no end."
+        )
+        out.append(Finding(UNIDENTIFIABLE, text, MORE_TILT))
+    elif interval.half_width_share > 2 * limits.focal_poor:
+        text = (
+            f"Focal lengths from {interval.low_px:.1f} to {interval.high_px:.1f} px fit the views about "
+            f"equally well (95 % interval; {200 * limits.focal_poor:.0f} % to either side is good)."
+        )
+        free = interval.half_width_share > 2 * limits.focal_free
+        out.append(Finding(UNIDENTIFIABLE if free else POOR, text, MORE_TILT))
+    return out
+
+
+def _range(interval: FocalInterval) -> str:
+    if interval.low_px > 0.0:
+        return f"any value above {interval.low_px:.0f} px"
+    return f"any value below {interval.high_px:.0f} px" if np.isfinite(interval.high_px) else "any value"
+
+
+def of_denominator(sigma_share: float, limits: Limits) -> list[Finding]:
+    """What the rational model's denominator costs the focal length when it is free as well."""
+    if sigma_share < limits.focal_poor:
+        return []
+    known = f"{100 * sigma_share:.1f} %" if sigma_share < 2 else "no better than a factor of two"
+    text = (
+        f"The coefficients k4, k5 and k6 are not determined; with them free the focal length is known to "
+        f"{known} (up to {100 * limits.focal_free:.0f} does not matter, as distortion makes up for it)."
+    )
+    return [Finding(REMARK if sigma_share < limits.focal_free else POOR, text, "Use a simpler lens model.")]
+
+
+def of_richer(fit: Calibration, wide: Calibration, limits: Limits) -> list[Finding]:
+    """Errors that the lens model leaves and five coefficients take away."""
+    drop = 1.0 - wide.rms_px / max(fit.rms_px, 1e-300)
+    if drop < limits.lens_remark:
+        return []
+    text = (
+        f"The lens model {fit.camera.model} leaves errors that five coefficients take away: "
+        f"the RMS falls from {fit.rms_px:.3f} to {wide.rms_px:.3f} px."
+    )
+    serious = drop > limits.lens_poor and fit.rms_px - wide.rms_px > limits.lens_poor_px
+    return [Finding(POOR if serious else REMARK, text, "Use a richer lens model.")]
+
+
+def of_projection(sigma_px: float, width: int, limits: Limits) -> list[Finding]:
+    """Standard deviation of projection, inflated, where points were seen."""
+    limit = limits.projection_share * width
+    if sigma_px <= limit:
+        return []
+    text = (
+        f"Where points were seen the camera predicts pixels to {sigma_px:.2f} px only "
+        f"(median standard deviation; {limit:.2f} is good)."
+    )
+    if not np.isfinite(sigma_px):
+        text = "Where points were seen nothing bounds the error of the pixels that the camera predicts."
+    return [Finding(POOR, text, "Take more pictures, with the board tilted and close.")]
+
+
+def of_starts(
+    ends: list[Start], calibration: Calibration, sigma_fx_px: float, inflation: float, limits: Limits
+) -> list[Finding]:
+    """All starts have to reach one minimum, or clearly worse ones.
+
+    Worse by more than chance is not clear enough where the model itself is in error, so that a minimum
+    far away with a cost a tenth higher counts as a rival, too.
+    """
+    own, chance = calibration.squared_sum, _CHI2_95 * (inflation * calibration.sigma_px) ** 2
+    fx = calibration.camera.fx_px
+    for end in sorted(ends, key=lambda one: one.cost):
+        other = float(end.block.intrinsics[0])
+        rms = float(np.sqrt(end.cost / calibration.observations.points))
+        apart = abs(other / fx - 1.0)
+        if end.cost < own - chance and apart > 1e-3:
+            text = (
+                f"A start at a focal length of {end.focal_px:.0f} px ends at fx = {other:.1f} px with RMS "
+                f"{rms:.3f} px, below the {calibration.rms_px:.3f} px of fx = {fx:.1f} px: "
+                "the answer is not the best one."
+            )
+            return [Finding(UNIDENTIFIABLE, text, MORE_TILT)]
+        equal = end.cost < own + chance and apart > max(0.02, 5 * inflation * sigma_fx_px / fx)
+        rival = end.cost < limits.rival_cost * own and apart > limits.rival_focal
+        if (equal or rival) and end.termination == "converged":
+            text = (
+                f"Two cameras fit the views about equally well: fx = {fx:.1f} px with RMS "
+                f"{calibration.rms_px:.3f} px and fx = {other:.1f} px with RMS {rms:.3f} px."
+            )
+            return [Finding(UNIDENTIFIABLE, text, MORE_TILT)]
+    return []
+
+
+# ----------------------------------------------------------------------
+# From numbers to sentences: are the views good, and do they agree with each other and the board?
+#
+# Every function takes what one module measured and returns findings, each one sentence with the number
+# and the limit it is held against. `calib.stages.camera.verdict` does the same for the fit.
+
+_CORNERS = "Take pictures with the board in the picture's corners."
+_CLOSER = "Bring the board closer, so that it fills a third of the picture or more, and into its corners."
+
+
+def of_screening(found: Screening, names: tuple[str, ...]) -> list[Finding]:
+    """Views that cannot be views of the board at all."""
+    out = []
+    for which, what in (
+        (found.few, "fewer than four points"),
+        (found.on_a_line, "only points on one line"),
+        (
+            found.not_a_plane,
+            "points that no camera sees on a flat board: listed in another order, or from another board",
+        ),
+    ):
+        some = [names[i] for i in np.flatnonzero(which)]
+        if len(some) == len(names):
+            out.append(Finding(UNIDENTIFIABLE, f"All views show {what}."))
+        elif some:
+            text = f"{listed(some)} {'shows' if len(some) == 1 else 'show'} {what}."
+            out.append(Finding(INCONSISTENT, text, f"Leave out {listed(some)}."))
+    return out
+
+
+def of_copies(first: IntArray, names: tuple[str, ...], ratio: float, limits: Limits) -> list[Finding]:
+    """Views that show the board where another view does.
+
+    Parameters
+    ----------
+    first : (N,) the view that each one repeats, or itself.
+    ratio : standard deviation without the copies over that with them.
+    """
+    copies = np.flatnonzero(first != np.arange(len(first)))
+    if len(copies) == 0:
+        return []
+    who = listed([f"{names[i]} (as {names[first[i]]})" for i in copies], 4)
+    one = len(copies) == 1
+    verbs = ("shows", "counts") if one else ("show", "count")
+    text = f"{who} {verbs[0]} the board where another view does and {verbs[1]} once"
+    if ratio > 1.05:
+        text += f"; with the copies the standard deviations come out {ratio:.1f} times too small"
+    many = len(first) - len(copies) <= limits.repeat_share * len(first)
+    return [Finding(POOR if many else REMARK, text + ".", "Remove the copies." if many else "")]
+
+
+def of_coverage(found: Coverage, calibration: Calibration, limits: Limits) -> list[Finding]:
+    """Tilts, size in the picture, the part of the picture that was covered, and its centre."""
+    out = []
+    if found.spread_deg < limits.spread_poor_deg and len(found.tilts_deg) > 1:
+        to = "the picture" if float(found.tilts_deg.max()) < limits.spread_poor_deg else "each other"
+        text = (
+            f"All views show the board nearly parallel to {to}: no two differ in tilt by more than "
+            f"{found.spread_deg:.1f} degrees (at least {limits.spread_poor_deg:.0f} are needed), and focal "
+            "length shows only in boards that are tilted differently."
+        )
+        kind = UNIDENTIFIABLE if found.spread_deg < limits.spread_free_deg else POOR
+        out.append(Finding(kind, text, MORE_TILT))
+    if found.area_share < limits.area_poor:
+        text = (
+            f"All points together span {100 * found.area_share:.0f} % of the picture "
+            f"(at least {100 * limits.area_poor:.0f} are needed); the lens elsewhere is a guess."
+        )
+        out.append(Finding(POOR, text, _CLOSER))
+    elif found.radius_share < 0.75:
+        text = (
+            f"Points reach {100 * found.radius_share:.0f} % of the way to the picture's corners; "
+            "beyond, the distortion is extrapolated."
+        )
+        out.append(Finding(REMARK, text, _CORNERS))
+    if found.view_share < limits.view_poor:
+        text = (
+            f"The board fills only {100 * found.view_share:.1f} % of a typical picture "
+            f"(at least {100 * limits.view_poor:.0f} are needed)."
+        )
+        out.append(Finding(POOR, text, _CLOSER))
+    return out + _of_order(found, calibration) + _of_frame(found, calibration, limits)
+
+
+def _of_order(found: Coverage, calibration: Calibration) -> list[Finding]:
+    """Views whose points are listed mirrored."""
+    if found.mirrored.all() or not found.mirrored.any():
+        return []
+    fewer = found.mirrored if found.mirrored.mean() <= 0.5 else ~found.mirrored
+    names = [calibration.observations.names[i] for i in np.flatnonzero(fewer)]
+    text = (
+        f"{listed(names)} {'shows' if len(names) == 1 else 'show'} the board mirrored with respect to the "
+        "other views: the points are listed in another order."
+    )
+    return [Finding(INCONSISTENT, text, "Give the points of all views in the same order.")]
+
+
+def _of_frame(found: Coverage, calibration: Calibration, limits: Limits) -> list[Finding]:
+    """The picture's size and the principal point in it."""
+    out = []
+    camera = calibration.camera
+    width, height = camera.image_size_px
+    if found.outside_share > 0.0:
+        text = (
+            f"{100 * found.outside_share:.1f} % of the points lie outside of the picture of {width}x{height} "
+            "pixels: its size is wrong, or u and v are swapped."
+        )
+        kind = INCONSISTENT if found.outside_share > 0.01 else POOR
+        out.append(Finding(kind, text, "Check the image size and the order of u and v."))
+    off = max(
+        abs(camera.cx_px - 0.5 * (width - 1)) / width,
+        abs(camera.cy_px - 0.5 * (height - 1)) / height,
+    )
+    if off > limits.centre_remark:
+        swapped = bool(found.mirrored.all()) and width != height
+        why = "u and v may be swapped" if swapped else "the picture is cropped, or its size is wrong"
+        text = (
+            f"The principal point ({camera.cx_px:.0f}, {camera.cy_px:.0f}) is {100 * off:.0f} % of the "
+            f"picture's side away from its centre (up to {100 * limits.centre_poor:.0f} is usual): {why}."
+        )
+        out.append(Finding(POOR if off > limits.centre_poor or swapped else REMARK, text))
+    return out
+
+
+def of_misfit(found: Misfit, calibration: Calibration, limits: Limits) -> list[Finding]:
+    """Residuals too large, bad views, bad points."""
+    names = calibration.observations.names
+    out = []
+    worse = np.flatnonzero(found.bad_views)
+    if len(worse):
+        worse = worse[np.argsort(-found.view_rms_px[worse])]
+        rest = found.view_rms_px[~found.bad_views]
+        good = float(np.median(rest)) if len(rest) else found.typical_px
+        detail = listed([f"{names[i]} ({found.view_rms_px[i]:.2f} px)" for i in worse], 4)
+        text = (
+            f"{detail} {'does' if len(worse) == 1 else 'do'} not fit the other views, whose RMS is "
+            f"{good:.2f} px: misplaced corners, another board, or motion during the exposure."
+        )
+        advice = f"Leave out {listed([names[i] for i in worse], 4)}, or look at the corners there."
+        out.append(Finding(INCONSISTENT, text, advice))
+    else:
+        odd = np.flatnonzero(found.view_rms_px > max(limits.view_remark * found.typical_px, 0.1))
+        if len(odd):
+            detail = listed([f"{names[i]} ({found.view_rms_px[i]:.2f} px)" for i in odd], 4)
+            text = (
+                f"{detail}: RMS more than {limits.view_remark:.0f} times that of a typical view "
+                f"({found.typical_px:.2f} px)."
+            )
+            out.append(Finding(REMARK, text))
+    limit = limits.rms_px * max(1.0, max(calibration.camera.image_size_px) / 1000)
+    if found.typical_px > limit:
+        text = (
+            f"The RMS error of a typical view is {found.typical_px:.2f} px (at most {limit:.1f} is good): "
+            "the corners, the board's description or the lens model is wrong."
+        )
+        advice = "Look at the corners, check the number of squares and try a richer lens model."
+        out.append(Finding(INCONSISTENT if found.typical_px > 3 * limit else POOR, text, advice))
+    count = int(found.bad_points.sum())
+    if count:
+        share = count / max(found.points, 1)
+        where = listed([names[i] for i in np.flatnonzero(found.bad_points.any(axis=1))])
+        text = (
+            f"{count} point{'s lie' if count > 1 else ' lies'} more than {limits.point_factor:.0f} times the "
+            f"median error off, in {where} ({100 * share:.1f} % of all; at most "
+            f"{100 * limits.points_poor:.0f} is good)."
+        )
+        many = share > limits.points_poor
+        advice = "Use a robust loss, or look at these corners." if many else ""
+        out.append(Finding(POOR if many else REMARK, text, advice))
+    return out + _of_pattern(found, limits)
+
+
+def _of_pattern(found: Misfit, limits: Limits) -> list[Finding]:
+    """Residuals that are not what independent normal noise leaves."""
+    out = []
+    if found.repeated > limits.repeated_remark:
+        text = (
+            f"Errors repeat at the same corners of the board from view to view, {found.repeated:.1f} times "
+            "what independent errors would leave: the printed board is not exactly as described."
+        )
+        out.append(Finding(REMARK, text))
+    if found.heavy_share > limits.heavy_remark:
+        text = (
+            f"The worst percent of the points holds {100 * found.heavy_share:.0f} % of the squared error "
+            "(five is normal)."
+        )
+        out.append(Finding(REMARK, text, "Use a robust loss, or look at these corners."))
+    return out
+
+
+def of_split(found: Split | None, in_order: bool, calibration: Calibration, limits: Limits) -> list[Finding]:
+    """One camera, or two."""
+    if found is None or found.ratio < (limits.change_ratio if in_order else limits.split_ratio):
+        return []
+    shift = {name: abs(found.difference[name]) / max(found.sigma[name], 1e-300) for name in found.difference}
+    camera, names = calibration.camera, calibration.observations.names
+    width = max(camera.image_size_px)
+    scale = {"fx_px": camera.fx_px, "fy_px": camera.fy_px, "cx_px": width, "cy_px": width}
+    # Distortion alone tells no two cameras apart; it follows the part of the picture that was seen.
+    telling = [
+        name
+        for name, value in scale.items()
+        if shift.get(name, 0.0) > limits.split_sigma
+        and abs(found.difference[name]) > limits.split_least * value
+    ]
+    strongest = max(telling or shift, key=lambda name: shift[name])
+    if shift[strongest] < limits.split_sigma:
+        return []
+    by = ", ".join(
+        f"{name.removesuffix('_px')} by {found.difference[name]:+.1f} px"
+        for name in ("fx_px", "cx_px", "cy_px")
+        if name in shift
+    )
+    sure = (
+        f"({by}; {strongest.removesuffix('_px')} by {shift[strongest]:.0f} standard deviations; the RMS "
+        f"falls from {found.rms_px:.3f} to {found.split_rms_px:.3f} px, {found.ratio:.1f} times what chance "
+        "explains)"
+    )
+    second = np.flatnonzero(found.second)
+    if not telling:
+        text = (
+            f"{listed([names[i] for i in second], 20)} would have a camera of their own {sure}, but no focal "
+            f"length or centre that differs for certain by {100 * limits.split_least:.1f} %, which would "
+            "matter."
+        )
+        return [Finding(REMARK, text)]
+    if in_order:
+        text = (
+            f"From {names[int(second[0])]} on the camera differs from the one before {sure}: the lens was "
+            "refocused or zoomed, or the camera changed."
+        )
+    else:
+        text = (
+            f"The views come from two cameras: {listed([names[i] for i in second], 20)} from one, "
+            f"the other views from another {sure}."
+        )
+    advice = "Calibrate the two groups separately, with focus and zoom locked."
+    return [Finding(INCONSISTENT, text, advice)]
+
+
+def of_target(found: TargetShape | None, calibration: Calibration, limits: Limits) -> list[Finding]:
+    """Squares that are square, on a board that is flat."""
+    if found is None:
+        return []
+    out = []
+    off = abs(found.aspect)
+    squares = (
+        f"the board's squares are {1 + found.aspect:.3f} times as high as wide "
+        f"(standard deviation {found.aspect_sigma:.3f})"
+    )
+    pixel = abs(calibration.camera.fx_px / calibration.camera.fy_px - 1.0)
+    if off > limits.aspect_remark and off > limits.aspect_sigma * found.aspect_sigma:
+        text = f"{squares[0].upper()}{squares[1:]}, not square as said."
+        advice = "Measure the printed squares along both sides; print without scaling."
+        out.append(Finding(INCONSISTENT if off > limits.aspect_bad else REMARK, text, advice))
+    elif pixel > limits.pixel_aspect:
+        # The board is cleared only where its aspect is known well and is one.
+        cleared = found.aspect_sigma < 0.2 * pixel and off < 2.5 * found.aspect_sigma
+        text = f"fx and fy differ by {100 * pixel:.1f} %" + (
+            "; boards turned in their plane agree that the pixels, not the squares, are not square."
+            if cleared
+            else f": the pixels or the squares are not square ({squares}), and these views cannot tell which."
+        )
+        advice = "" if cleared else "Take pictures with the board turned by 90 degrees in its plane."
+        out.append(Finding(REMARK if cleared else POOR, text, advice))
+    return out + _of_flatness(found, limits)
+
+
+def _of_flatness(found: TargetShape, limits: Limits) -> list[Finding]:
+    """A bend that is there, or views that could not bear one."""
+    bend, moved = found.bow_m / found.size_m, abs(found.focal_shift)
+    certain = found.bow_significance > limits.bow_sigma
+    if certain and (bend > limits.bow_remark or moved > limits.bow_focal_remark):
+        text = (
+            f"The board is not flat: it is bent by about {1e3 * found.bow_m:.1f} mm over "
+            f"{1e3 * found.size_m:.0f} mm ({found.bow_significance:.0f} standard deviations; up to "
+            f"{100 * limits.bow_bad:.0f} % is good), which moves the focal length by {100 * moved:.1f} %."
+        )
+        kind = INCONSISTENT if bend > limits.bow_bad else POOR if moved > limits.bow_focal else REMARK
+        return [
+            Finding(kind, text, "Glue the board to a flat plate, or let its shape be fitted (--board warp).")
+        ]
+    if found.focal_per_bow > limits.fragile:
+        text = (
+            "The focal length hangs on the board's flatness: a bend of half a percent of its size "
+            f"({5 * found.size_m:.1f} mm) would move it by {100 * found.focal_per_bow:.1f} %."
+        )
+        return [Finding(REMARK, text, MORE_TILT)]
+    return []
+
+
+# ----------------------------------------------------------------------
+# Whether a calibration can be trusted: one of four verdicts, with reasons and advice.
+#
+# A low RMS says that the model can be bent to the data, not that the data fix the model. `judge` asks
+# what the data would have to say if the answer were wrong, and refuses where they cannot object:
+#
+# ok              the views determine the camera and agree with it
+# poor            a camera, but known too badly, or over too little of the picture
+# inconsistent    the views contradict each other or the board's description
+# unidentifiable  the views do not determine a camera; its numbers mean nothing
+#
+# The worst finding decides. Remarks never do. All checks run on the unique views, without robust loss
+# (points it rejects are left out) and with the target rigid in the shape that was found for it.
+# Above 100 views the searches (other starts, profile, two cameras) run on an even sample of 100.
+
+_SAMPLE = 100
+_LEFT_OUT_WEIGHT = 0.5
+"""Points that a robust loss weighs less are left out of the checks."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Verdict on a calibration.
+
+    Attributes
+    ----------
+    verdict : "ok", "poor", "inconsistent" or "unidentifiable".
+    reasons : sentences that explain a verdict other than ok, the worst first.
+    remarks : sentences about what does not matter enough.
+    advice : what to do, in order; last the picture to take next.
+    numbers : what the sentences are made from, by name, as far as it is finite.
+    """
+
+    verdict: str
+    reasons: tuple[str, ...]
+    remarks: tuple[str, ...]
+    advice: tuple[str, ...]
+    numbers: dict[str, float] = field(default_factory=dict)
+
+
+def judge(
+    calibration: Calibration, found: Covariance | None = None, limits: Limits | None = None
+) -> Judgement:
+    """Judge a calibration by its views alone.
+
+    Parameters
+    ----------
+    found : its covariance, for the ratio of standard deviations that copies of views make; optional.
+    """
+    limits = Limits() if limits is None else limits
+    observations = calibration.observations
+    numbers: dict[str, float] = {"views": observations.views}
+    findings = of_screening(screen(observations), observations.names)
+    if any(one.kind == INCONSISTENT for one in findings):
+        # What else is wrong follows from the views that are none.
+        return _concluded(findings, None, numbers)
+    if not np.all(np.isfinite(calibration.block.intrinsics)) or not np.all(np.isfinite(calibration.normal)):
+        findings += of_solution(calibration, observations.views, limits)
+        if not any(one.kind == UNIDENTIFIABLE for one in findings):
+            findings.append(Finding(UNIDENTIFIABLE, "The solver found no camera that fits the views."))
+        return _concluded(findings, None, numbers)
+    fit, copies = _without_copies(_plain(calibration), found, limits, numbers)
+    findings += copies + of_solution(calibration, fit.observations.views, limits)
+    covered = coverage(fit)
+    findings += of_coverage(covered, fit, limits)
+    if fit.degrees_of_freedom <= 0 or fit.observations.views < 2 or not np.all(np.isfinite(fit.normal)):
+        return _concluded(findings, None, numbers)
+    left = misfit(fit, limits.view_bad, limits.point_factor, limits.point_floor_px)
+    findings += of_misfit(left, fit, limits)
+    sturdy = conditioned(fit)
+    if sturdy is not fit:
+        share = _focal_share(fit, covariance(fit), 1.0)
+        findings += of_denominator(share, limits)
+    # A target that was deformed to fit costs certainty, which the rigid target in its shape hides.
+    least = 0.0
+    if calibration.basis is not None:
+        least = _focal_share(calibration, covariance(calibration) if found is None else found, 1.0)
+    findings += _uncertainty(sturdy, covered, least, limits, numbers)
+    findings += _contradictions(sturdy, limits, numbers)
+    lens = lens_shape(fit)
+    findings += of_lens(lens, fit, covered.radius_share)
+    numbers.update(
+        rms_px=fit.rms_px,
+        worst_view_rms_px=float(left.view_rms_px.max()),
+        repeated_error=left.repeated,
+        lens_least_slope=lens.image_slope,
+    )
+    return _concluded(findings, sturdy, numbers)
+
+
+def _plain(calibration: Calibration) -> Calibration:
+    """The same fit by least squares: a robust loss turned into points left out, the target rigid."""
+    observations = calibration.observations
+    if calibration.basis is None and calibration.loss == "none":
+        return calibration
+    if calibration.loss != "none":
+        observations = observations.without(calibration.weights < _LEFT_OUT_WEIGHT)
+        kept = np.flatnonzero(observations.present.sum(axis=1) >= 4)
+        observations = observations.select(kept)
+    else:
+        kept = np.arange(observations.views)
+    if calibration.basis is not None:
+        observations = observations.displaced(
+            np.tensordot(calibration.block.deformation, calibration.basis, axes=1).T
+        )
+    block = calibration.block
+    start = replace(block, R_CT=block.R_CT[kept], t_CT_m=block.t_CT_m[kept], deformation=np.zeros(0))
+    bare = replace(
+        calibration,
+        observations=observations,
+        block=start,
+        basis=None,
+        loss="none",
+    )
+    return resolved(bare, np.arange(len(kept)))
+
+
+def _without_copies(
+    fit: Calibration, found: Covariance | None, limits: Limits, numbers: dict[str, float]
+) -> tuple[Calibration, list[Finding]]:
+    """One view of each place, refitted."""
+    width = fit.camera.image_size_px[0]
+    first = repeated_views(fit, float(np.clip(2 * fit.sigma_px, 0.3, 0.004 * width)))
+    unique = np.flatnonzero(first == np.arange(len(first)))
+    numbers["unique_views"] = len(unique)
+    if len(unique) == len(first):
+        return fit, []
+    single = resolved(fit, unique)
+    ratio = np.nan
+    if found is not None and "fx_px" in found.names and single.degrees_of_freedom > 0:
+        ratio = covariance(single).sigma()["fx_px"] / found.sigma()["fx_px"]
+    return single, of_copies(first, fit.observations.names, ratio, limits)
+
+
+def _uncertainty(
+    fit: Calibration,
+    covered: Coverage,
+    least_share: float,
+    limits: Limits,
+    numbers: dict[str, float],
+) -> list[Finding]:
+    """Standard deviations, profile, starts."""
+    known = covariance(fit)
+    inflation = overdispersion(evidence(fit))
+    share = max(_focal_share(fit, known, inflation), inflation * least_share)
+    width = max(fit.camera.image_size_px)
+    inside = _inside(covered)
+    projection = np.inf
+    if len(inside):
+        spread = inflation * projection_sigma_px(fit, known, inside)
+        bounded = spread[~np.isnan(spread)]
+        projection = float(np.median(bounded)) if len(bounded) else np.inf
+    findings = []
+    interval = None
+    if "fx_px" in known.names:
+        some = _sampled(fit)
+        own = covariance(some).sigma()["fx_px"]
+        interval = focal_interval(some, own, inflation)
+        ends = other_starts(some)
+        findings += of_starts(ends, some, own, inflation, limits)
+        lowest = min((end.cost for end in ends), default=np.inf)
+        numbers["lowest_start_cost_share"] = lowest / max(some.squared_sum, 1e-300)
+        numbers["fx_low_px"], numbers["fx_high_px"] = interval.low_px, interval.high_px
+    findings += of_focal(share, interval, limits)
+    findings += of_projection(projection, width, limits)
+    numbers.update(
+        sigma_inflation=inflation,
+        focal_sigma_share=share,
+        projection_sigma_px=projection,
+        tilt_spread_deg=covered.spread_deg,
+        weaker_tilt_spread_deg=covered.weaker_spread_deg,
+        tilt_median_deg=float(np.median(covered.tilts_deg)),
+        distance_ratio=float(covered.distances_m.max() / max(covered.distances_m.min(), 1e-12)),
+        area_share=covered.area_share,
+        cells_share=covered.cells_share,
+        radius_share=covered.radius_share,
+    )
+    return findings
+
+
+def _focal_share(fit: Calibration, known: Covariance, inflation: float) -> float:
+    """Larger relative standard deviation of the focal lengths, inflated; zero where they are held."""
+    sigma = known.sigma()
+    shares = [sigma[name] / getattr(fit.camera, name) for name in ("fx_px", "fy_px") if name in sigma]
+    return inflation * float(max(shares, default=0.0))
+
+
+def _contradictions(fit: Calibration, limits: Limits, numbers: dict[str, float]) -> list[Finding]:
+    """Two cameras, a refocused lens, a board that is not what it is said to be."""
+    some = _sampled(fit)
+    # The lens first: a target would bend to make up for a lens that the model cannot follow.
+    wide = widened(some)
+    findings = of_richer(some, wide, limits)
+    shape = target_shape(wide)
+    findings += of_target(shape, wide, limits)
+    if shape is not None:
+        numbers.update(
+            board_aspect=1 + shape.aspect,
+            board_aspect_sigma=shape.aspect_sigma,
+            board_bow_m=shape.bow_m,
+            focal_share_per_half_percent_bow=shape.focal_per_bow,
+        )
+        wide = straightened(wide, shape.displacement_m)
+    change, split = best_change(wide), best_split(wide)
+    if change is not None:
+        numbers["change_ratio"] = change.ratio
+    if split is not None:
+        numbers["split_ratio"] = split.ratio
+    late = of_split(change, True, wide, limits)
+    mixed = of_split(split, False, wide, limits)
+    # A split in order is found by both; what matters is told, and then what chance explains less.
+    if late and mixed and change is not None and split is not None:
+        if late[0].kind != mixed[0].kind:
+            return findings + [one for one in late + mixed if one.kind != REMARK]
+        return findings + (mixed if split.ratio > change.ratio else late)
+    return findings + late + mixed
+
+
+def _sampled(fit: Calibration) -> Calibration:
+    views = fit.observations.views
+    if views <= _SAMPLE:
+        return fit
+    return resolved(fit, np.unique(np.linspace(0, views - 1, _SAMPLE).astype(np.int64)))
+
+
+def _inside(covered: Coverage) -> FloatArray:
+    """Grid of pixels inside of the hull of what was seen."""
+    low, high = covered.hull_px.min(axis=0), covered.hull_px.max(axis=0)
+    u, v = np.meshgrid(np.linspace(low[0], high[0], 14), np.linspace(low[1], high[1], 12))
+    grid = np.stack([u.ravel(), v.ravel()], axis=1)
+    return grid[inside_hull(grid, covered.hull_px)]
+
+
+def _concluded(findings: list[Finding], fit: Calibration | None, numbers: dict[str, float]) -> Judgement:
+    """The worst finding decides; reasons in order of weight."""
+    weights = [VERDICTS.index(one.kind) for one in findings if one.kind != REMARK]
+    verdict = VERDICTS[max(weights, default=0)]
+    failing = sorted((f for f in findings if f.kind != REMARK), key=lambda f: -VERDICTS.index(f.kind))
+    advice: list[str] = []
+    for one in [*failing, *(f for f in findings if f.kind == REMARK)]:
+        if one.advice and one.advice not in advice:
+            advice.append(one.advice)
+    # Where views contradict each other, more of them settle nothing.
+    if fit is not None and verdict != INCONSISTENT:
+        advice.extend(_next_picture(fit, verdict))
+    return Judgement(
+        verdict,
+        tuple(f.text for f in failing),
+        tuple(f.text for f in findings if f.kind == REMARK),
+        tuple(advice),
+        {name: float(value) for name, value in numbers.items() if np.isfinite(value)},
+    )
+
+
+def _next_picture(fit: Calibration, verdict: str) -> list[str]:
+    width = max(fit.camera.image_size_px)
+    if not 0.2 * width < min(fit.camera.fx_px, fit.camera.fy_px) < 50 * width:
+        return []
+    best = best_next_view(fit, evidence(fit).S.sum(axis=0))
+    if best is None:
+        return []
+    lean = (
+        f"tilted by {best.tilt_deg:.0f} degrees with its {best.away} edge away from the camera"
+        if best.away
+        else "parallel to the picture"
+    )
+    size = (
+        "close, so that it spans about 60 % of the picture"
+        if best.span_share > 0.5
+        else "at about a third of the picture's size"
+    )
+    gain = 100 * (1 - best.remaining)
+    word = (
+        "The picture that would help most"
+        if verdict != OK
+        else "If you take another picture, the most useful"
+    )
+    return [
+        f"{word}: the board {best.where}, {lean}, {size}; "
+        f"it would lower the uncertainty by about {gain:.0f} %."
+    ]

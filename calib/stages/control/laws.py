@@ -1,0 +1,1095 @@
+"""Control laws: PID, feed-forward, anti-windup, observer, computed torque, and one step of them all."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import lru_cache
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from calib.core.arrays import FloatArray
+from calib.core.errors import BadInputError
+from calib.stages.actuator.dynamics import (
+    Coefficients,
+    coefficients,
+    coriolis_matrix,
+    force_map,
+    linearised,
+    mass_matrix,
+    resisting_forces,
+)
+from calib.stages.actuator.kinematics import MARKER_OFFSET_M, chord_decay_w, chord_ratio_w
+from calib.stages.actuator.parameters import Plant
+from calib.stages.actuator.pump import PWM_MAX, Orifice, Pump, advance_pump, pump_coefficients, static_force_N
+from calib.stages.actuator.simulate import derivative, largest_step_s
+
+# ----------------------------------------------------------------------
+# The discrete PID controller in its incremental form, with integrator clamping (4.4, D.1 - D.9).
+#
+# The backward difference for the derivative and the trapezoidal rule for the integral give
+#
+#     u_k = u_(k-1) + (Kp + Ki h / 2 + Kd / h) e_k + (-Kp + Ki h / 2 - 2 Kd / h) e_(k-1) + Kd / h e_(k-2)
+#
+# with the tick h. Its transfer function is (D.6) exactly, so that with a history of zeros it is the
+# sum of a proportional, an integral and a derivative term without any memory but the integral:
+#
+#     u_k = Kp e_k + Ki h (e_0 + ... + e_(k-1) + e_k / 2) + Kd (e_k - e_(k-1)) / h,  e_(-1) = 0.
+#
+# Three points that the source leaves open, and that decide whether the loop works:
+#
+# - History. It starts from zeros. Filling it with e_0 leaves out the first step of the proportional
+#   term, and with Ki = 0 the output is then wrong by -Kp e_0 for ever.
+# - Memory. u_(k-1) is the output of this recursion before saturation. With the saturated value stored,
+#   the recursion forgets what lay beyond the limits: 0.7 rad is then never reached within 5 s. Nor may
+#   a feed-forward term be in it, since it would be added again at every tick.
+# - Clamping. When u_k lies outside the limits it is computed again with Ki = 0 and the same history
+#   (4.1.1), and that value is both the output and the next u_(k-1).
+#
+# A controller here has one channel; `calib.stages.control.laws` runs one for each bellows.
+
+PWM_MIN = 0.0
+"""Limits of what the microcontroller can put out, 0 V to 12 V, with `PWM_MAX`."""
+
+TICK_S = 1.0 / 60.0
+"""Period of the controller (4.1)."""
+
+
+@dataclass(frozen=True)
+class Pid:
+    """Gains of one channel.
+
+    Attributes
+    ----------
+    Kp, Ki, Kd : gains [PWM per unit of the error, per second of it, per unit per second].
+    clamping : compute outputs beyond the limits again with Ki = 0.
+    low, high : limits that clamping goes by [PWM].
+    tick_s : period.
+
+    Raises `BadInputError` for gains that are not finite, a period that is not positive, or limits in
+    the wrong order.
+    """
+
+    Kp: float
+    Ki: float = 0.0
+    Kd: float = 0.0
+    clamping: bool = False
+    low: float = PWM_MIN
+    high: float = PWM_MAX
+    tick_s: float = TICK_S
+
+    def __post_init__(self) -> None:
+        for name, gain in (("Kp", self.Kp), ("Ki", self.Ki), ("Kd", self.Kd)):
+            if not math.isfinite(gain):
+                raise BadInputError(f"{name}: found {gain}, expected a finite gain")
+        if not 0.0 < self.tick_s < math.inf:
+            raise BadInputError(f"tick of the controller: found {self.tick_s:g} s, expected a positive time")
+        if not self.low < self.high:
+            raise BadInputError(
+                f"limits of the controller: found {self.low:g} to {self.high:g}, expected low < high"
+            )
+
+
+@dataclass(frozen=True)
+class PidState:
+    """What one tick hands to the next; zeros at the start.
+
+    Attributes
+    ----------
+    u : output of the tick before, not saturated [PWM].
+    e1, e2 : errors of the tick before and the one before that.
+    """
+
+    u: float = 0.0
+    e1: float = 0.0
+    e2: float = 0.0
+
+
+def _increment(Kp: float, Ki: float, Kd: float, h: float, error: float, state: PidState) -> float:
+    """u_k - u_(k-1) of (4.4)."""
+    integral, derivative = 0.5 * Ki * h, Kd / h
+    return (
+        (Kp + integral + derivative) * error
+        + (integral - Kp - 2.0 * derivative) * state.e1
+        + derivative * state.e2
+    )
+
+
+def step(pid: Pid, state: PidState, error: float) -> tuple[PidState, float]:
+    """One tick of (4.4), and of (4.8) for Ki = 0.
+
+    Parameters
+    ----------
+    error : e_k, set-point minus measured value.
+
+    Returns
+    -------
+    The next state, and u_k before saturation [PWM].
+    """
+    u = state.u + _increment(pid.Kp, pid.Ki, pid.Kd, pid.tick_s, error, state)
+    if pid.clamping and not pid.low <= u <= pid.high:
+        u = state.u + _increment(pid.Kp, 0.0, pid.Kd, pid.tick_s, error, state)
+    return PidState(u, error, state.e1), u
+
+
+def saturate(u: float, whole: bool = True, low: float = PWM_MIN, high: float = PWM_MAX) -> float:
+    """What reaches the motor [PWM]: limited, and a whole number as the PWM register holds one."""
+    limited = min(max(u, low), high)
+    return math.floor(limited + 0.5) if whole else limited
+
+
+# ----------------------------------------------------------------------
+# The identified model read backwards: forces that hold or move the bellows, and the PWM that gives them.
+#
+# Without motion the equations of `calib.stages.actuator.dynamics` leave the forces of the pumps as
+#
+#     P F = N(q, 0),                                                                      (3.43), (3.37)
+#
+# springs with bending and gravity, for any two lengths. The source's feed-forward (4.6) is a line through
+# the steady elongation with both motors alike, which holds for stretching without bending only. In
+# motion
+#
+#     P F = M(q) ddq + C(q, dq) dq + N(q, dq) - lambda3 z.                                 (3.33), (3.46)
+#
+# The static force of a pump is turned around on a table of whole and quarter PWM values. It is zero in
+# the dead zone, so that every force above zero needs a PWM above it, and a falling piece of the printed
+# polynomials, where there is one, is passed over to the next value that gives more.
+
+_STEP_PWM = 0.25
+
+
+@dataclass(frozen=True)
+class Model:
+    """The identified rig as controllers know it.
+
+    Attributes
+    ----------
+    plant, pump : as identified.
+    strength : factors on the static forces of the two pumps.
+    low_pwm, high_pwm : limits of the command [PWM].
+
+    Raises `BadInputError` for limits that the motors do not have or with which no pump gives any force.
+    """
+
+    plant: Plant
+    pump: Pump
+    strength: tuple[float, float] = (1.0, 1.0)
+    low_pwm: float = PWM_MIN
+    high_pwm: float = PWM_MAX
+
+    def __post_init__(self) -> None:
+        whole = float(self.low_pwm).is_integer() and float(self.high_pwm).is_integer()
+        if not PWM_MIN <= self.low_pwm < self.high_pwm <= PWM_MAX or not whole:
+            raise BadInputError(
+                f"PWM limits: found {self.low_pwm:g} to {self.high_pwm:g}, expected "
+                f"whole numbers, {PWM_MIN:g} <= low < high <= {PWM_MAX:g}"
+            )
+        for i, strength in enumerate(self.strength):
+            if not strength > 0.0:
+                raise BadInputError(
+                    f"strength of pump {i + 1}: found {strength:g}, expected a positive factor"
+                )
+        if float(np.max(static_force_N(self.pump, np.array([self.high_pwm])))) <= 0.0:
+            raise BadInputError(
+                f"PWM limits: at {self.high_pwm:g} the pumps give no force yet, expected a limit above "
+                "their dead zone"
+            )
+
+    @property
+    def tick_s(self) -> float:
+        """Period of the commands."""
+        return self.pump.tick_s
+
+
+@lru_cache(maxsize=32)
+def _table(pump: Pump, low: float, high: float) -> tuple[FloatArray, FloatArray]:
+    """Rising forces [N] and the PWM values that give them, the first at zero force."""
+    pwm = np.unique(np.append(np.arange(low, high, _STEP_PWM), high))
+    force = np.maximum.accumulate(static_force_N(pump, pwm))
+    rising = np.concatenate([np.diff(force) > 0.0, [False]])
+    # The last value of the dead zone, then every value that gives more than all before it.
+    keep = np.concatenate([[False], np.diff(force) > 0.0]) | (rising & (force == force[0]))
+    if not keep.any():
+        keep[-1] = True
+    return force[keep], pwm[keep]
+
+
+def force_of_pwm(model: Model, pwm: FloatArray) -> FloatArray:
+    """Force (..., 2) [N] that PWM values (..., 2) settle at, within the limits of the command."""
+    limited = np.clip(np.asarray(pwm, dtype=np.float64), model.low_pwm, model.high_pwm)
+    return np.asarray(static_force_N(model.pump, limited) * np.array(model.strength))
+
+
+def largest_force_N(model: Model) -> FloatArray:
+    """Greatest steady force (2,) [N] of the pumps."""
+    force, _ = _table(model.pump, model.low_pwm, model.high_pwm)
+    return np.asarray(force[-1] * np.array(model.strength))
+
+
+def pwm_of_force(model: Model, force_N: FloatArray) -> FloatArray:
+    """PWM values (..., 2) whose steady forces are the nearest to these (..., 2) [N].
+
+    `low_pwm` for no force at all; for one that the pumps do not reach, the value that gives most.
+    """
+    force, pwm = _table(model.pump, model.low_pwm, model.high_pwm)
+    wanted = np.asarray(force_N, dtype=np.float64) / np.array(model.strength)
+    found = np.interp(wanted, force, pwm)
+    return np.asarray(np.where(wanted <= force[0], model.low_pwm, found))
+
+
+def _forces(plant: Plant, q: FloatArray, generalised: FloatArray) -> FloatArray:
+    if plant.force_projection == "virtual_work":
+        return generalised
+    return np.asarray(np.linalg.solve(force_map(plant, q), generalised[..., None])[..., 0])
+
+
+def holding_force(plant: Plant, q_m: FloatArray) -> FloatArray:
+    """Forces (..., 2) [N] that hold the bellows at the lengths (..., 2) [m] after all creep."""
+    q = np.asarray(q_m, dtype=np.float64)
+    return _forces(plant, q, resisting_forces(plant, q, np.zeros_like(q)))
+
+
+def moving_force(
+    plant: Plant, q_m: FloatArray, dq_mps: FloatArray, ddq_mps2: FloatArray, z_N: FloatArray
+) -> FloatArray:
+    """Forces (..., 2) [N] that move the bellows so, with creep forces z (..., 2) [N]; all (..., 2)."""
+    q, dq = np.asarray(q_m, dtype=np.float64), np.asarray(dq_mps, dtype=np.float64)
+    inertia = np.einsum("...rc,...c->...r", mass_matrix(plant, q), np.asarray(ddq_mps2))
+    swept = np.einsum("...rc,...c->...r", coriolis_matrix(plant, q, dq), dq)
+    crept = plant.creep_rates[2] * np.asarray(z_N)
+    return _forces(plant, q, np.asarray(inertia + swept + resisting_forces(plant, q, dq) - crept))
+
+
+def creep_along(plant: Plant, tick_s: float, dq_mps: FloatArray) -> FloatArray:
+    """Creep forces z (n, 2) [N] along rates (n, 2) [m/s] at evenly spaced times, from zero (3.45).
+
+    Exact for rates that are straight lines between the times.
+    """
+    l1, l2, _ = plant.creep_rates
+    dq = np.asarray(dq_mps, dtype=np.float64)
+    z = np.zeros_like(dq)
+    if l2 == 0.0:
+        return z
+    w = l1 * tick_s
+    decay = np.exp(-w)
+    if w > 1e-6:
+        whole = (1.0 - decay) / l1
+        late = (1.0 - whole / tick_s) / l1
+    else:
+        whole, late = tick_s, 0.5 * tick_s
+    for k in range(1, len(dq)):
+        z[k] = decay * z[k - 1] + l2 * ((whole - late) * dq[k - 1] + late * dq[k])
+    return z
+
+
+def static_stiffness(plant: Plant, q_m: FloatArray) -> FloatArray:
+    """dF/dq (2, 2) [N/m] of `holding_force` at the lengths (2,), forces by virtual work."""
+    A = linearised(plant, q_m)
+    return np.asarray(-mass_matrix(plant, q_m) @ A[2:4, :2])
+
+
+def feed_forward_pwm(model: Model, q_ref_m: FloatArray) -> FloatArray:
+    """PWM (..., 2) that holds the lengths (..., 2) [m], in both bellows and with bending."""
+    return pwm_of_force(model, holding_force(model.plant, q_ref_m))
+
+
+# ----------------------------------------------------------------------
+# The pumps as a controller follows them: no sensor sees the air, but what was commanded is known.
+#
+# The state is that of `calib.stages.actuator.pump`: output of the lag, force on the bellows, and commands
+# on their
+# way. It follows from the commands alone, rounding and saturation included.
+#
+# Reading the lag backwards. A static force g held for the time T takes the lag from x to g + (x - g) a,
+# a = exp(-T / tau), so that
+#
+#     g = (x* - a x) / (1 - a)
+#
+# takes it to x*. T is a horizon of some ticks and not one: over one tick the inverse multiplies noise by
+# 1 / (1 - a) = 42, over six by 7.5. A force cannot fall faster than the orifice lets the air out. A lag
+# that is sent below the force then has to come back before the force rises again; so x* is never less
+# than what the force can have come down to.
+
+Pair = tuple[float, float]
+
+_IDLE_N = 0.02
+"""Less is noise: 0.4 mm of a nominal bellows."""
+
+
+@dataclass(frozen=True)
+class PumpEstimate:
+    """Both pumps at a tick.
+
+    Attributes
+    ----------
+    lag_N, force_N : output of the lags and forces on the bellows.
+    waiting_pwm : commands on their way, oldest first.
+    """
+
+    lag_N: Pair = (0.0, 0.0)
+    force_N: Pair = (0.0, 0.0)
+    waiting_pwm: tuple[Pair, ...] = ()
+
+
+def pumps_at_rest(model: Model) -> PumpEstimate:
+    """Pumps off for long."""
+    return PumpEstimate(waiting_pwm=((0.0, 0.0),) * model.pump.delay_ticks)
+
+
+def _arriving(model: Model, pwm: Pair) -> Pair:
+    g1, g2 = force_of_pwm(model, np.array(pwm)).tolist() if any(pwm) else (0.0, 0.0)
+    return g1, g2
+
+
+def _after(model: Model, state: PumpEstimate, pwm: Pair) -> tuple[Pair, Pair]:
+    p, dt = pump_coefficients(model.pump), model.tick_s
+    decay = math.exp(-0.5 * dt / model.pump.lag_s)
+    g = _arriving(model, pwm)
+    x1, _, F1 = advance_pump(p, state.lag_N[0], state.force_N[0], g[0], decay, dt)
+    x2, _, F2 = advance_pump(p, state.lag_N[1], state.force_N[1], g[1], decay, dt)
+    return (x1, x2), (F1, F2)
+
+
+def push(model: Model, state: PumpEstimate, pwm: Pair) -> PumpEstimate:
+    """State one tick after a new command, which takes effect `delay_ticks` later."""
+    queue = (*state.waiting_pwm, pwm)
+    lag, force = _after(model, state, queue[0])
+    return PumpEstimate(lag, force, queue[1:])
+
+
+def ahead(model: Model, state: PumpEstimate) -> list[PumpEstimate]:
+    """States at the ticks at which the commands on their way have acted one by one, the present first."""
+    states = [state]
+    for i, pwm in enumerate(state.waiting_pwm):
+        lag, force = _after(model, states[-1], pwm)
+        states.append(PumpEstimate(lag, force, state.waiting_pwm[i + 1 :]))
+    return states
+
+
+def falling_rate(model: Model, force_N: FloatArray) -> FloatArray:
+    """Fastest fall [N/s] at the forces (...) [N]: that of the rate limit or of the orifice."""
+    law, F = model.pump.deflation, np.maximum(np.asarray(force_N, dtype=np.float64), 0.0)
+    if isinstance(law, Orifice):
+        a, b = law.laminar_s, law.turbulent_s2_per_N
+        # With the valve open the pump can slow this down, never speed it up.
+        return np.asarray(2.0 * F / (a + np.sqrt(a * a + 4.0 * b * F)))
+    return np.minimum(np.full_like(F, law.falling_N_per_s), F / model.pump.lag_s + law.falling_N_per_s)
+
+
+def least_pwm(model: Model, state: PumpEstimate, share: float) -> Pair:
+    """Commands (2,) below which the lag would run ahead of a force that cannot fall any faster.
+
+    A lag at rest at F - share R tau falls with the share R of the rate there, R that of `falling_rate`.
+
+    Parameters
+    ----------
+    state : of the pumps when the command arrives, the last of `ahead`.
+    share : 0 holds the force, 1 lets it fall as fast as it can.
+    """
+    F = np.array(state.force_N)
+    floor = np.maximum(F - share * model.pump.lag_s * falling_rate(model, F), 0.0)
+    low = pwm_of_force(model, floor).tolist()
+    return low[0], low[1]
+
+
+def pwm_for_force(model: Model, state: PumpEstimate, wanted_N: FloatArray, horizon_ticks: int) -> FloatArray:
+    """Commands (2,) [PWM], not rounded, that take the forces to `wanted_N` (2,) in some ticks.
+
+    Parameters
+    ----------
+    state : of the pumps when the command arrives.
+
+    While a force is wanted a command stays above the dead zone even where it gives none for a moment: the
+    same force, without switching the motor off and on. A pump of which nothing is wanted is off.
+
+    Raises `BadInputError` for a horizon of less than a tick.
+    """
+    if horizon_ticks < 1:
+        raise BadInputError(f"horizon: found {horizon_ticks} ticks, expected at least 1")
+    T = horizon_ticks * model.tick_s
+    F = np.array(state.force_N)
+    # With an orifice the lag acts on the force itself.
+    x = F if isinstance(model.pump.deflation, Orifice) else np.array(state.lag_N)
+    target = np.maximum(np.asarray(wanted_N), F - T * falling_rate(model, F))
+    a = math.exp(-T / model.pump.lag_s)
+    pwm = pwm_of_force(model, (target - a * x) / (1.0 - a))
+    edge = pwm_of_force(model, np.full(2, 1e-9))
+    idle = (np.asarray(wanted_N) < _IDLE_N) & (F < _IDLE_N)
+    return np.where(idle, model.low_pwm, np.maximum(pwm, edge))
+
+
+# ----------------------------------------------------------------------
+# PID with back-calculation, against the limits of the command and against what the pumps can do.
+#
+#     v_k = Kp e_k + I_k + Ki h e_k / 2 + Kd (e_k - e_(k-1)) / h,    u_k = limit(v_k)
+#     I_(k+1) = I_k + h (Ki e_k + (u_k - v_k) / Tt)
+#
+# Within the limits this is (4.4) exactly, the recursion of `calib.stages.control.laws`. Beyond them the
+# integral
+# follows the limited command with the time constant Tt instead of standing still, as it does in the
+# source's clamping (4.1.1).
+#
+# The limits are not 0 and 255 alone. A bellows deflates slowly while the pump's lag runs ahead of it: a
+# command of 0 empties the lag within 2 s, the force needs 5 s, and before the force can be held again the
+# lag has to come all the way back. That is what makes the angle overshoot after a jump down, clamping or
+# not. Here the command is never below the one that empties the bellows with a share of the rate that the
+# orifice allows (`pump_model.least_pwm`), and the integral follows that limit like the other.
+
+
+@dataclass(frozen=True)
+class BackCalculation:
+    """Gains of one channel.
+
+    Attributes
+    ----------
+    Kp, Ki, Kd : as in `pid.Pid`.
+    tracking_s : Tt.
+    tick_s : period.
+
+    Raises `BadInputError` for gains that are not finite and times that are not positive or, for Tt,
+    shorter than a tick: the integral would overshoot the limit.
+    """
+
+    Kp: float
+    Ki: float = 0.0
+    Kd: float = 0.0
+    tracking_s: float = 4.0
+    tick_s: float = TICK_S
+
+    def __post_init__(self) -> None:
+        for name, gain in (("Kp", self.Kp), ("Ki", self.Ki), ("Kd", self.Kd)):
+            if not math.isfinite(gain):
+                raise BadInputError(f"{name}: found {gain}, expected a finite gain")
+        if not 0.0 < self.tick_s < math.inf:
+            raise BadInputError(f"tick of the controller: found {self.tick_s:g} s, expected a positive time")
+        if not self.tick_s <= self.tracking_s < math.inf:
+            raise BadInputError(
+                f"back-calculation time: found {self.tracking_s:g} s, expected at least a tick "
+                f"({self.tick_s:.3g} s)"
+            )
+
+
+@dataclass(frozen=True)
+class BackState:
+    """What one tick hands to the next: the integral [PWM] and the error of the tick before."""
+
+    integral: float = 0.0
+    e1: float = 0.0
+
+
+def step_back(
+    control: BackCalculation, state: BackState, error: float, low: float, high: float
+) -> tuple[BackState, float]:
+    """One tick. Returns the next state and the command within its limits [PWM]."""
+    h = control.tick_s
+    v = control.Kp * error + state.integral + 0.5 * h * control.Ki * error
+    v += control.Kd * (error - state.e1) / h
+    u = min(max(v, low), high)
+    integral = state.integral + h * (control.Ki * error + (u - v) / control.tracking_s)
+    return BackState(integral, error), u
+
+
+@dataclass(frozen=True)
+class BackOrientation:
+    """Control of the head's angle with back-calculation.
+
+    Attributes
+    ----------
+    control : of both bellows.
+    model : the identified rig; its pumps and limits.
+    falling_share : share of the falling rate that a command may ask for; 1 for all of it, infinity for
+        fixed limits only.
+    sign : of the error of bellows 1, as in `loop.OrientationControl`.
+    whole_pwm : send whole numbers to the motors.
+
+    Raises `BadInputError` for another sign and a share that is negative.
+    """
+
+    control: BackCalculation
+    model: Model
+    falling_share: float = 0.4
+    sign: int = 1
+    whole_pwm: bool = True
+
+    def __post_init__(self) -> None:
+        if self.sign not in (1, -1):
+            raise BadInputError(f"sign of the orientation error: found {self.sign}, expected 1 or -1")
+        if not self.falling_share >= 0.0:
+            raise BadInputError(
+                f"share of the falling rate: found {self.falling_share:g}, expected 0 or more"
+            )
+
+
+@dataclass(frozen=True)
+class BackOrientationState:
+    """Memory of both channels, and the pumps as they follow from the commands."""
+
+    pumps: PumpEstimate
+    first: BackState = field(default_factory=BackState)
+    second: BackState = field(default_factory=BackState)
+
+
+def start_back_orientation(control: BackOrientation) -> BackOrientationState:
+    """Zeros, pumps off."""
+    return BackOrientationState(pumps_at_rest(control.model))
+
+
+def step_back_orientation(
+    control: BackOrientation, state: BackOrientationState, phi_ref_rad: float, phi_rad: float
+) -> tuple[BackOrientationState, tuple[float, float]]:
+    """One tick: the next state and the PWM values.
+
+    Raises `BadInputError` for a measurement that is not a number.
+    """
+    if not (math.isfinite(phi_ref_rad) and math.isfinite(phi_rad)):
+        raise BadInputError(
+            f"angle of the orientation controller: found {phi_ref_rad}, {phi_rad}, expected finite numbers"
+        )
+    model, error = control.model, control.sign * (phi_ref_rad - phi_rad)
+    low = (model.low_pwm, model.low_pwm)
+    if math.isfinite(control.falling_share):
+        low = least_pwm(model, ahead(model, state.pumps)[-1], control.falling_share)
+    first, u1 = step_back(control.control, state.first, error, low[0], model.high_pwm)
+    second, u2 = step_back(control.control, state.second, -error, low[1], model.high_pwm)
+    pwm = (
+        saturate(u1, control.whole_pwm, model.low_pwm, model.high_pwm),
+        saturate(u2, control.whole_pwm, model.low_pwm, model.high_pwm),
+    )
+    return BackOrientationState(push(model, state.pumps, pwm), first, second), pwm
+
+
+# ----------------------------------------------------------------------
+# Feed-forward from the steady elongation of the bellows (4.6, Fig. 4.11).
+#
+#     u_ff = 0                                        for q_ref <  0.067 m
+#     u_ff = min(255, 5498.1 (q_ref - 0.067) + 110)   for q_ref >= 0.067 m
+#
+# The straight line is a fit to the steady elongation with both motors at the same voltage, so it
+# holds for stretching without bending. It jumps from 0 to 110 at 0.067 m, where the dead zone of the
+# pumps ends, reaches 242 at 91 mm and saturates at 93.4 mm.
+#
+# Its value is added to the output of the feedback controller before saturation and is no part of that
+# controller's memory (see `calib.stages.control.laws`).
+
+
+@dataclass(frozen=True)
+class FeedForward:
+    """The line of (4.6).
+
+    Attributes
+    ----------
+    from_m : shortest length of a bellows that needs any pressure [m].
+    offset_pwm : value there [PWM].
+    slope_pwm_per_m : increase with the length [PWM/m].
+    limit_pwm : largest value [PWM].
+
+    Raises `BadInputError` for values that are not finite or a length that is not positive.
+    """
+
+    from_m: float = 0.067
+    offset_pwm: float = 110.0
+    slope_pwm_per_m: float = 5498.1
+    limit_pwm: float = 255.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not math.isfinite(value):
+                raise BadInputError(f"feed-forward {name}: found {value}, expected a finite number")
+        if self.from_m <= 0.0:
+            raise BadInputError(f"feed-forward from_m: found {self.from_m:g} m, expected a positive length")
+
+    @property
+    def saturates_at_m(self) -> float:
+        """Length of a bellows from which the limit holds [m]."""
+        return self.from_m + (self.limit_pwm - self.offset_pwm) / self.slope_pwm_per_m
+
+
+def feed_forward(parameters: FeedForward, q_ref_m: float) -> float:
+    """u_ff [PWM] of the wanted length of one bellows [m] (4.6)."""
+    if q_ref_m < parameters.from_m:
+        return 0.0
+    return min(
+        parameters.limit_pwm,
+        parameters.slope_pwm_per_m * (q_ref_m - parameters.from_m) + parameters.offset_pwm,
+    )
+
+
+# ----------------------------------------------------------------------
+# Lengths, rates, creep and disturbing forces from PWM, marker and gyroscope, on the identified model.
+#
+#     x = (q, dq, z, d, b):  the plant of `calib.stages.actuator.dynamics` driven by the pumps' forces plus
+# d,
+#                            dd/dt = noise,  db/dt = noise
+#     marker  m = p(q) + offset (sin phi, cos phi), exposed one latency before the tick         (A.1)
+#     gyro   -gz = dphi + b
+#
+# The prediction is the nonlinear model, the correction a constant gain L: that of the stationary Kalman
+# filter of the model linearised at one point, sampled at the ticks. The marker's innovation is taken
+# against the prediction at the time of the exposure and turned into lengths by the Jacobian there. A
+# marker farther away than the gate is not believed.
+#
+# d takes up what the model does not explain, at rest all of it, which is what makes a controller that
+# subtracts it free of static error.
+
+STATES = 9
+
+
+@dataclass(frozen=True)
+class ObserverNoise:
+    """What the gain is designed for.
+
+    Attributes
+    ----------
+    marker_m : standard deviation of the marker along each axis [m].
+    gyro_radps : of the mean of a tick's samples [rad/s].
+    force_N_per_sqrt_s : walk of d. bias_radps_per_sqrt_s : walk of b.
+    accel_mps2_per_sqrt_Hz : density of what pushes the head unseen.
+
+    Raises `BadInputError` for values that are not positive.
+    """
+
+    marker_m: float = 2.5e-4
+    gyro_radps: float = 0.003
+    force_N_per_sqrt_s: float = 0.03
+    bias_radps_per_sqrt_s: float = 3e-3
+    accel_mps2_per_sqrt_Hz: float = 0.05
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0.0 < value < math.inf:
+                raise BadInputError(f"observer {name}: found {value:g}, expected a positive number")
+
+
+@dataclass(frozen=True)
+class Observer:
+    """An observer with its gain.
+
+    Attributes
+    ----------
+    model : the identified rig.
+    gain : (9, 3) L, columns q1, q2 [m] and the gyroscope [rad/s].
+    latency_s : from the exposure to the tick that reads the marker.
+    marker_offset_m, gate_m : offset of (A.1), and the largest innovation that is believed.
+    """
+
+    model: Model
+    gain: FloatArray
+    latency_s: float = 0.025
+    marker_offset_m: float = MARKER_OFFSET_M
+    gate_m: float = 4e-3
+
+
+class ObserverState(NamedTuple):
+    """Estimate at a tick.
+
+    Attributes
+    ----------
+    y : (6,) q, dq, z. d_N : (2,). bias_radps : b.
+    pumps : state of the pumps.
+    past_q : lengths at this tick and those before, the newest first.
+    refused : markers in a row that were not believed.
+    """
+
+    y: FloatArray
+    d_N: FloatArray
+    bias_radps: float
+    pumps: PumpEstimate
+    past_q: tuple[FloatArray, ...]
+    refused: int = 0
+
+
+def marker_of(q1: float, q2: float, r: float, offset_m: float) -> tuple[float, float]:
+    """The marker (x, y) [m] of the lengths [m] (3.6), (A.1)."""
+    phi, l = (q1 - q2) / (2.0 * r), 0.5 * (q1 + q2)  # noqa: E741  the source's symbol
+    chord = l * chord_ratio_w(phi * phi)
+    return (
+        chord * math.sin(0.5 * phi) + offset_m * math.sin(phi),
+        chord * math.cos(0.5 * phi) + offset_m * math.cos(phi),
+    )
+
+
+def marker_jacobian(q1: float, q2: float, r: float, offset_m: float) -> FloatArray:
+    """d(x, y) / d(q1, q2), shape (2, 2), of `marker_of`."""
+    phi, l = (q1 - q2) / (2.0 * r), 0.5 * (q1 + q2)  # noqa: E741  the source's symbol
+    S, S1 = chord_ratio_w(phi * phi), -phi * chord_decay_w(phi * phi)
+    s, c = math.sin(0.5 * phi), math.cos(0.5 * phi)
+    x_l, y_l = S * s, S * c
+    x_phi = l * (S1 * s + 0.5 * S * c) + offset_m * math.cos(phi)
+    y_phi = l * (S1 * c - 0.5 * S * s) - offset_m * math.sin(phi)
+    a, b = 0.5 / r * x_phi, 0.5 / r * y_phi
+    return np.array([[0.5 * x_l + a, 0.5 * x_l - a], [0.5 * y_l + b, 0.5 * y_l - b]])
+
+
+def design_observer(
+    model: Model,
+    noise: ObserverNoise | None = None,
+    at_q_m: tuple[float, float] | None = None,
+    latency_s: float = 0.025,
+    marker_offset_m: float = MARKER_OFFSET_M,
+) -> Observer:
+    """The observer whose gain is the stationary Kalman filter's at the lengths `at_q_m` [m].
+
+    By default at 12 mm of elongation, in the middle of the workspace. Raises `BadInputError` where no
+    stationary filter exists.
+    """
+    from scipy.linalg import LinAlgError, expm, solve_discrete_are
+
+    noise = noise or ObserverNoise()
+    plant, h = model.plant, model.tick_s
+    q = np.full(2, plant.rest_length_m + 0.012) if at_q_m is None else np.array(at_q_m)
+    A = np.zeros((STATES, STATES))
+    A[:6, :6] = linearised(plant, q)
+    inverse = np.linalg.inv(mass_matrix(plant, q))
+    A[2:4, 6:8] = inverse
+    pushed = np.zeros(STATES)
+    pushed[2:4] = noise.accel_mps2_per_sqrt_Hz**2
+    pushed[6:8] = noise.force_N_per_sqrt_s**2
+    pushed[8] = noise.bias_radps_per_sqrt_s**2
+    # Van Loan's block gives transition and noise of a tick together.
+    block = expm(h * np.block([[-A, np.diag(pushed)], [np.zeros_like(A), A.T]]))
+    Phi = block[STATES:, STATES:].T
+    Q = Phi @ block[:STATES, STATES:]
+    r = plant.bellows_radius_m
+    H = np.zeros((3, STATES))
+    H[0, 0] = H[1, 1] = 1.0
+    H[2, 2], H[2, 3], H[2, 8] = 0.5 / r, -0.5 / r, 1.0
+    to_q = np.linalg.inv(marker_jacobian(float(q[0]), float(q[1]), r, marker_offset_m))
+    R = np.zeros((3, 3))
+    R[:2, :2] = noise.marker_m**2 * to_q @ to_q.T
+    R[2, 2] = noise.gyro_radps**2
+    try:
+        P = solve_discrete_are(Phi.T, H.T, 0.5 * (Q + Q.T), R)
+    except (LinAlgError, ValueError) as error:
+        raise BadInputError(f"observer: has no stationary gain for this plant ({error})") from error
+    L = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+    return Observer(model, np.asarray(L), latency_s, marker_offset_m)
+
+
+def start_observer(observer: Observer) -> ObserverState:
+    """Straight at rest with the pumps off."""
+    rest = observer.model.plant.rest_length_m
+    y = np.array([rest, rest, 0.0, 0.0, 0.0, 0.0])
+    kept = 2 + math.ceil(observer.latency_s / observer.model.tick_s)
+    return ObserverState(y, np.zeros(2), 0.0, pumps_at_rest(observer.model), (y[:2],) * kept)
+
+
+def _substeps(model: Model) -> int:
+    return max(4, math.ceil(1.5 * model.tick_s / largest_step_s(model.plant)))
+
+
+def _advance(
+    c: Coefficients, y: FloatArray, start: FloatArray, end: FloatArray, tick_s: float, steps: int
+) -> FloatArray:
+    """Plant after a tick in which the forces go in a straight line from `start` to `end`."""
+    h = tick_s / steps
+    for i in range(steps):
+        a, b = start + (end - start) * (i / steps), start + (end - start) * ((i + 1) / steps)
+        m = 0.5 * (a + b)
+        k1 = derivative(c, y, a[0], a[1])
+        k2 = derivative(c, y + 0.5 * h * k1, m[0], m[1])
+        k3 = derivative(c, y + 0.5 * h * k2, m[0], m[1])
+        k4 = derivative(c, y + h * k3, b[0], b[1])
+        y = y + h / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)
+    return y
+
+
+def predict(observer: Observer, state: ObserverState, pwm: tuple[float, float]) -> ObserverState:
+    """State at the next tick after a command, without new readings."""
+    model = observer.model
+    pumps = push(model, state.pumps, pwm)
+    start, end = np.array(state.pumps.force_N) + state.d_N, np.array(pumps.force_N) + state.d_N
+    y = _advance(coefficients(model.plant), state.y, start, end, model.tick_s, _substeps(model))
+    return state._replace(y=y, pumps=pumps, past_q=(y[:2], *state.past_q[:-1]))
+
+
+def look_ahead(observer: Observer, state: ObserverState) -> tuple[FloatArray, PumpEstimate]:
+    """Plant (6,) and pumps at the tick at which the next command arrives."""
+    model = observer.model
+    c, steps, y = coefficients(model.plant), _substeps(model), state.y
+    pumps = ahead(model, state.pumps)
+    for a, b in pairwise(pumps):
+        forces = np.array(a.force_N) + state.d_N, np.array(b.force_N) + state.d_N
+        y = _advance(c, y, *forces, model.tick_s, steps)
+    return y, pumps[-1]
+
+
+def _exposed(observer: Observer, state: ObserverState) -> FloatArray:
+    late = observer.latency_s / observer.model.tick_s
+    i = min(int(late), len(state.past_q) - 2)
+    part = late - i
+    return np.asarray((1.0 - part) * state.past_q[i] + part * state.past_q[i + 1])
+
+
+def correct(
+    observer: Observer,
+    state: ObserverState,
+    marker_m: tuple[float, float],
+    minus_gz_radps: float,
+) -> ObserverState:
+    """State with a tick's readings.
+
+    Parameters
+    ----------
+    marker_m : in the plane [m], NaN where nothing was found.
+    minus_gz_radps : mean of the tick's samples, NaN without.
+    """
+    plant, innovation = observer.model.plant, np.zeros(3)
+    r, offset, refused = plant.bellows_radius_m, observer.marker_offset_m, state.refused
+    if not math.isnan(marker_m[0] + marker_m[1]):
+        q1, q2 = _exposed(observer, state).tolist()
+        x_m, y_m = marker_of(q1, q2, r, offset)
+        away = np.array([marker_m[0] - x_m, marker_m[1] - y_m])
+        # Ten in a row are no outliers: the estimate itself is off.
+        if float(np.hypot(*away)) <= observer.gate_m or refused >= 10:
+            innovation[:2] = np.linalg.solve(marker_jacobian(q1, q2, r, offset), away)
+            refused = 0
+        else:
+            refused += 1
+    if not math.isnan(minus_gz_radps):
+        dphi = 0.5 * float(state.y[2] - state.y[3]) / r
+        innovation[2] = minus_gz_radps - dphi - state.bias_radps
+    step = observer.gain @ innovation
+    y = state.y + step[:6]
+    moved = tuple(q + step[:2] for q in state.past_q)
+    return ObserverState(
+        y, state.d_N + step[6:8], state.bias_radps + float(step[8]), state.pumps, moved, refused
+    )
+
+
+# ----------------------------------------------------------------------
+# Computed torque with the observer's state, and the pumps' lag inverted where it can be.
+#
+# The wanted forces at the time t + T, T the pumps' delay and a horizon, are those of the model in the
+# wanted motion, corrected by what the observer says of the real one:
+#
+#     P F* = M (ddq_ref + Kd (dq_ref - dq^) + Kp (q_ref - q^)) + C dq_ref + N(q_ref, dq_ref)
+#            - lambda3 z^ - d^
+#
+# with the estimates at the time at which the command arrives. Springs and bending are taken at the
+# reference and not at the estimate: the bellows are fast (4 Hz and more) and the pumps slow, so that
+# cancelling the springs through the pumps would be feedback of the wrong sign. The static error goes to
+# zero by d^, which takes the place of an integrator and needs no anti-windup: it is driven by the
+# measurements' disagreement with the model under the *limited* commands.
+#
+# `calib.stages.control.laws` then turns F* into a command. Where F* asks for more than the pumps can do
+# the nearest that they can is commanded; `limited` tells.
+
+
+@dataclass(frozen=True)
+class ComputedTorque:
+    """Parameters of the law.
+
+    Attributes
+    ----------
+    horizon_ticks : time in which the pumps are asked to reach the wanted force.
+    Kp_per_s2, Kd_per_s : gains on the lengths' errors.
+    whole_pwm : send whole numbers to the motors.
+
+    Raises `BadInputError` for a horizon of less than a tick and for gains that are negative.
+    """
+
+    horizon_ticks: int = 6
+    Kp_per_s2: float = 0.0
+    Kd_per_s: float = 0.0
+    whole_pwm: bool = True
+
+    def __post_init__(self) -> None:
+        if self.horizon_ticks < 1:
+            raise BadInputError(f"horizon: found {self.horizon_ticks} ticks, expected at least 1")
+        for name in ("Kp_per_s2", "Kd_per_s"):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise BadInputError(f"{name}: found {getattr(self, name):g}, expected zero or more")
+
+
+@dataclass(frozen=True)
+class WantedMotion:
+    """A reference at the ticks with the forces that the model needs for it.
+
+    Attributes
+    ----------
+    q_m, dq_mps, z_N, force_N : (n, 2); the last row stands for all later ticks.
+    """
+
+    q_m: FloatArray
+    dq_mps: FloatArray
+    z_N: FloatArray
+    force_N: FloatArray
+
+    def at(self, k: int) -> int:
+        """Row of the tick k."""
+        return min(k, len(self.q_m) - 1)
+
+
+@dataclass(frozen=True)
+class TorqueCommand:
+    """Result of a tick: what the motors get, and whether the pumps can do what was wanted of them."""
+
+    pwm: tuple[float, float]
+    wanted_N: tuple[float, float]
+    limited: tuple[bool, bool]
+
+
+def wanted_motion(model: Model, q_m: FloatArray) -> WantedMotion:
+    """The motion along lengths (n, 2) [m] at the ticks; derivatives by central differences."""
+    h = model.tick_s
+    q = np.asarray(q_m, dtype=np.float64)
+    if len(q) < 3:
+        raise BadInputError(f"reference: found {len(q)} ticks, expected at least 3")
+    dq = np.gradient(q, h, axis=0)
+    ddq = np.zeros_like(q)
+    ddq[1:-1] = (q[2:] - 2.0 * q[1:-1] + q[:-2]) / h**2
+    z = creep_along(model.plant, h, dq)
+    return WantedMotion(q, dq, z, moving_force(model.plant, q, dq, ddq, z))
+
+
+def computed_torque_step(
+    control: ComputedTorque, observer: Observer, state: ObserverState, wanted: WantedMotion, k: int
+) -> TorqueCommand:
+    """The command of the tick k, from the estimate with the readings of that tick."""
+    model = observer.model
+    y, pumps = look_ahead(observer, state)
+    arrives = wanted.at(k + model.pump.delay_ticks)
+    then = wanted.at(k + model.pump.delay_ticks + control.horizon_ticks)
+    crept = model.plant.creep_rates[2] * (y[4:6] - wanted.z_N[arrives])
+    # A command that is held for T makes the force lead a ramp of slope s by s (T - tau (1 - a)).
+    T, lag = control.horizon_ticks * model.tick_s, model.pump.lag_s
+    lead = lag * -math.expm1(-T / lag) / T
+    ramp = wanted.force_N[then] - wanted.force_N[arrives]
+    force = wanted.force_N[arrives] + lead * ramp - crept - state.d_N
+    if control.Kp_per_s2 or control.Kd_per_s:
+        v = control.Kp_per_s2 * (wanted.q_m[arrives] - y[:2])
+        v = v + control.Kd_per_s * (wanted.dq_mps[arrives] - y[2:4])
+        force = force + mass_matrix(model.plant, y[:2]) @ v
+    pwm = pwm_for_force(model, pumps, force, control.horizon_ticks)
+    F = np.array(pumps.force_N)
+    lowest = np.maximum(F - T * falling_rate(model, F), 0.0)
+    limited = (
+        (pwm >= pwm_of_force(model, largest_force_N(model)))
+        | (force < lowest - 1e-3)
+        | (force > largest_force_N(model))
+    )
+    u1, u2 = (saturate(u, control.whole_pwm, model.low_pwm, model.high_pwm) for u in pwm.tolist())
+    return TorqueCommand((u1, u2), (float(force[0]), float(force[1])), (bool(limited[0]), bool(limited[1])))
+
+
+# ----------------------------------------------------------------------
+# One tick of the two control schemes: orientation (Fig. 4.1, 4.6) and position (Fig. 4.10).
+#
+# Each scheme turns a reference and a measurement into one error per bellows, runs one PID controller
+# for each, adds the feed-forward where there is one, and saturates:
+#
+#     orientation   e = (s, -s)(phi_ref - phi)            (4.1), s = +1 or -1
+#     position      e = q_ref - q,  u + u_ff(q_ref)       (4.5), (4.6), (4.8)
+#
+# The text under (4.1) says that bellows 2 has to extend when phi < phi_ref; the formula drives bellows
+# 1, which agrees with phi = (q1 - q2) / (2 r_B) of (3.3). `sign` is +1 for the formula, -1 for a rig
+# whose hoses are crossed.
+#
+# The loop has no memory but that of the controllers: the feed-forward and the saturated values are not
+# fed back.
+
+
+@dataclass(frozen=True)
+class OrientationControl:
+    """Control of the head's angle alone.
+
+    Attributes
+    ----------
+    pid : the controller of both bellows.
+    sign : of the error of bellows 1 (4.1).
+    whole_pwm : send whole numbers to the motors, as the microcontroller does.
+    """
+
+    pid: Pid
+    sign: int = 1
+    whole_pwm: bool = True
+
+    def __post_init__(self) -> None:
+        if self.sign not in (1, -1):
+            raise BadInputError(f"sign of the orientation error: found {self.sign}, expected 1 or -1")
+
+
+@dataclass(frozen=True)
+class PositionControl:
+    """Control of both bellows' lengths.
+
+    Attributes
+    ----------
+    pid : the controller of both bellows.
+    feedforward : None for feedback alone.
+    whole_pwm : send whole numbers to the motors, as the microcontroller does.
+    """
+
+    pid: Pid
+    feedforward: FeedForward | None = field(default_factory=FeedForward)
+    whole_pwm: bool = True
+
+
+@dataclass(frozen=True)
+class LoopState:
+    """Memory of the two controllers, zeros at the start."""
+
+    first: PidState = field(default_factory=PidState)
+    second: PidState = field(default_factory=PidState)
+
+
+@dataclass(frozen=True)
+class Command:
+    """Result of a tick for bellows 1 and 2.
+
+    Attributes
+    ----------
+    pwm : what the motors get.
+    feedback : output of the feedback controllers before saturation.
+    """
+
+    pwm: tuple[float, float]
+    feedback: tuple[float, float]
+
+
+def _finite(what: str, *values: float) -> None:
+    if not all(map(math.isfinite, values)):
+        raise BadInputError(f"{what}: found {', '.join(map(str, values))}, expected finite numbers")
+
+
+def step_orientation(
+    control: OrientationControl, state: LoopState, phi_ref_rad: float, phi_rad: float
+) -> tuple[LoopState, Command]:
+    """One tick of orientation control.
+
+    Parameters
+    ----------
+    phi_ref_rad, phi_rad : wanted and measured angle of the head [rad].
+
+    Raises `BadInputError` for a measurement that is not a number: a controller must not remember it.
+    """
+    _finite("angle of the orientation controller", phi_ref_rad, phi_rad)
+    error = control.sign * (phi_ref_rad - phi_rad)
+    first, u1 = step(control.pid, state.first, error)
+    second, u2 = step(control.pid, state.second, -error)
+    pwm = (saturate(u1, control.whole_pwm), saturate(u2, control.whole_pwm))
+    return LoopState(first, second), Command(pwm, (u1, u2))
+
+
+def step_position(
+    control: PositionControl, state: LoopState, q_ref_m: tuple[float, float], q_m: tuple[float, float]
+) -> tuple[LoopState, Command]:
+    """One tick of position control.
+
+    Parameters
+    ----------
+    q_ref_m, q_m : wanted and measured lengths of the bellows [m].
+
+    Raises `BadInputError` for a measurement that is not a number.
+    """
+    _finite("lengths of the position controller", *q_ref_m, *q_m)
+    first, u1 = step(control.pid, state.first, q_ref_m[0] - q_m[0])
+    second, u2 = step(control.pid, state.second, q_ref_m[1] - q_m[1])
+    extra1, extra2 = 0.0, 0.0
+    if control.feedforward is not None:
+        extra1 = feed_forward(control.feedforward, q_ref_m[0])
+        extra2 = feed_forward(control.feedforward, q_ref_m[1])
+    pwm = (saturate(u1 + extra1, control.whole_pwm), saturate(u2 + extra2, control.whole_pwm))
+    return LoopState(first, second), Command(pwm, (u1, u2))

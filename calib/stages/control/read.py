@@ -1,0 +1,202 @@
+"""References from files and from recorded logs."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from pathlib import Path
+
+import numpy as np
+
+from calib.core.arrays import FloatArray
+from calib.core.errors import BadInputError
+from calib.core.files import read_text, shown, write_atomically
+from calib.core.rig import Rig
+from calib.stages.actuator.kinematics import inverse
+from calib.stages.control.laws import Model
+from calib.stages.control.references import (
+    BUILT_IN,
+    LONGEST_S,
+    Reference,
+    built_in,
+    from_angles,
+    from_lengths,
+    resampled,
+)
+
+# ----------------------------------------------------------------------
+# References from files: a table of lengths, angles or head positions, or a recorded log.
+#
+# A CSV with `t_s` and one of
+#
+#     q1_m, q2_m               lengths, as `calib replay --states` writes them
+#     true_q1_m, true_q2_m     those of a simulated log
+#     x_m, y_m                 the head in the plane
+#     phi_rad                  the angle alone
+#
+# The first of these that the header has is taken. Other columns are passed over. Every row needs finite
+# values and a time not before that of the row before; of rows with the same time the last one counts.
+
+_KINDS = (("q1_m", "q2_m"), ("true_q1_m", "true_q2_m"), ("x_m", "y_m"), ("phi_rad",))
+_FEWEST = 3
+
+
+def _cell(where: str, name: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        found = "an empty cell" if not text.strip() else f"{text.strip()[:40]!r}"
+        raise BadInputError(f"{where}: {name} is {found}, expected a number") from None
+    if not math.isfinite(value):
+        raise BadInputError(f"{where}: {name} is {value}, expected a finite number")
+    return value
+
+
+def _series(path: Path) -> tuple[tuple[str, ...], FloatArray, FloatArray]:
+    """Names of the columns taken, times (n,) and values (n, len(names))."""
+    source = shown(path)
+    rows = csv.reader(io.StringIO(read_text(path)))
+    try:
+        header = [name.strip() for name in next(rows, [])]
+        if "t_s" not in header:
+            raise BadInputError(f"{source}: has no column t_s, expected a reference with times")
+        names = next((kind for kind in _KINDS if all(name in header for name in kind)), None)
+        if names is None:
+            raise BadInputError(
+                f"{source}: has no reference in it, expected q1_m and q2_m, x_m and y_m, or phi_rad; of a "
+                "recorded log calib replay writes them"
+            )
+        columns = [header.index("t_s"), *(header.index(name) for name in names)]
+        times: list[float] = []
+        values: list[list[float]] = []
+        for row in rows:
+            if not row or row[0].startswith("#"):
+                continue
+            where = f"{source}, line {rows.line_num}"
+            if len(row) <= max(columns):
+                raise BadInputError(f"{where}: has {len(row)} cells, expected {len(header)}")
+            t, *cells = (_cell(where, header[i], row[i]) for i in columns)
+            if times and t < times[-1]:
+                raise BadInputError(f"{where}: t_s is {t:g} after {times[-1]:g}, expected rising times")
+            if times and t == times[-1]:
+                # Loggers stamp samples that waited in a buffer alike; the last one is the newest.
+                values[-1] = cells
+                continue
+            times.append(t)
+            values.append(cells)
+    except csv.Error as error:
+        raise BadInputError(f"{source}, line {rows.line_num}: {error}") from error
+    return names, np.array(times), np.array(values)
+
+
+def read_reference(path: Path, model: Model) -> Reference:
+    """The reference in a file, at the model's ticks.
+
+    Raises `BadInputError` with file and line for what is none, values that are not finite and times that
+    run backwards, and for one that is too short or too long.
+    """
+    source = shown(path)
+    names, t, values = _series(path)
+    h = model.tick_s
+    span = float(t[-1] - t[0]) if len(t) else 0.0
+    if len(t) < _FEWEST or span < _FEWEST * h:
+        raise BadInputError(
+            f"{source}: has {len(t)} rows over {span:.3g} s, expected at least {_FEWEST} rows and "
+            f"{_FEWEST * h:.3g} s"
+        )
+    if span > LONGEST_S:
+        raise BadInputError(f"{source}: lasts {span:g} s, expected at most {LONGEST_S:g} s")
+    ticks = resampled(t, values, h)
+    if names == ("phi_rad",):
+        try:
+            return from_angles(model, source, ticks[:, 0])
+        except BadInputError as error:
+            raise BadInputError(f"{source}: {error}") from error
+    if names == ("x_m", "y_m"):
+        turned = 2.0 * np.arctan2(ticks[:, 0], ticks[:, 1])
+        return from_lengths(
+            model, source, inverse(np.column_stack([ticks, turned]), model.plant.bellows_radius_m)
+        )
+    return from_lengths(model, source, ticks)
+
+
+def reference_of(text: str, model: Model, duration_s: float | None = None) -> Reference:
+    """A built-in reference by its name, or the one in a file.
+
+    Raises `BadInputError`, also where a file is given a duration.
+    """
+    if text in BUILT_IN:
+        return built_in(model, text, duration_s)
+    path = Path(text)
+    if not path.exists():
+        raise BadInputError(
+            f"{shown(text)}: is no such file and none of the references {', '.join(BUILT_IN)}"
+        )
+    if duration_s is not None:
+        raise BadInputError(
+            f"{shown(text)}: a file has its own duration, --duration is for {', '.join(BUILT_IN)}"
+        )
+    return read_reference(path, model)
+
+
+def reference_text(reference: Reference) -> str:
+    """CSV with time and lengths."""
+    rows = ["t_s,q1_m,q2_m,phi_rad"]
+    for t, (q1, q2), phi in zip(
+        reference.t_s.tolist(), reference.q_m.tolist(), reference.phi_rad.tolist(), strict=True
+    ):
+        rows.append(f"{t:.6f},{q1:.9f},{q2:.9f},{phi:.9f}")
+    return "\n".join(rows) + "\n"
+
+
+def write_reference(path: Path, reference: Reference) -> None:
+    """Write a reference atomically. Raises `BadInputError` where the place cannot be written."""
+    write_atomically(path, reference_text(reference))
+
+
+# ----------------------------------------------------------------------
+# What a recorded log shows, as a reference: lengths by the estimator, smoothed over the whole log.
+#
+# The estimator is the kinematic one: the commands in the log are those of another controller.
+
+_OWN = ("q1_m", "true_q1_m", "x_m", "phi_rad")
+_CONTROLREFERENCE_FEWEST = 3
+
+
+def is_recorded(path: Path) -> bool:
+    """Whether a file is a log of pictures without a reference of its own in it."""
+    try:
+        with path.open(encoding="utf-8-sig", errors="replace") as stream:
+            header = next(csv.reader(io.StringIO(stream.readline())), [])
+    except OSError:
+        return False
+    names = {name.strip() for name in header}
+    return {"t_s", "u_px", "v_px"} <= names and not names & set(_OWN)
+
+
+def recorded_reference(path: Path, rig: Rig, rig_path: Path, model: Model) -> Reference:
+    """The lengths that a log of camera and IMU shows, at the model's ticks.
+
+    Raises `BadInputError` as `calib.stages.estimator.replay.prepared`, and where the estimator knows too
+    little.
+    """
+    from calib.stages.estimator.replay import first_rows, prepared
+
+    setup, found, stream, _ = prepared(path, rig, rig_path)
+    rows = first_rows(setup, found, stream, math.inf)
+    rows = rows[np.isfinite(rows[:, :3]).all(axis=1)]
+    rows = rows[np.concatenate([[True], np.diff(rows[:, 0]) > 0.0])] if len(rows) else rows
+    if len(rows) < _CONTROLREFERENCE_FEWEST:
+        raise BadInputError(f"{shown(path)}: shows no lengths to follow, expected camera and IMU in motion")
+    return from_lengths(model, shown(path), resampled(rows[:, 0], rows[:, 1:3], model.tick_s))
+
+
+def wanted_reference(
+    text: str, model: Model, duration_s: float | None, rig: Rig, rig_path: Path
+) -> Reference:
+    """A reference by name, from a table, or from a recorded log. Raises `BadInputError`."""
+    path = Path(text)
+    if duration_s is None and path.is_file() and is_recorded(path):
+        return recorded_reference(path, rig, rig_path, model)
+    return reference_of(text, model, duration_s)

@@ -1,0 +1,643 @@
+"""Gains chosen on the model: what is in reach, what is measured, and the search."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.core.arrays import BoolArray, ComplexArray, FloatArray
+from calib.core.errors import BadInputError
+from calib.stages.actuator.kinematics import angle, forward
+from calib.stages.control.laws import (
+    Model,
+    Pid,
+    falling_rate,
+    holding_force,
+    largest_force_N,
+    static_stiffness,
+    wanted_motion,
+)
+from calib.stages.control.linear import (
+    Margins,
+    System,
+    bent_rest,
+    break_at,
+    closed_loop,
+    firmware_sensing,
+    frequencies,
+    gain,
+    loop_margins,
+    margins_of_response,
+    pid_system,
+    response,
+    rig_system,
+    series,
+    side_by_side,
+    spectral_radius,
+)
+from calib.stages.control.references import Reference
+
+# ----------------------------------------------------------------------
+# What the pumps can follow: reachable lengths, rates of inflation and deflation, and references.
+#
+# At rest the forces that hold q have to lie between zero and the pumps' greatest (`holding_force`); the
+# lengths for which they do are the reachable set. In motion the forces are those of `moving_force`, and
+# from tick to tick they can rise no faster than the lag with the pump at its limit, and fall no faster
+# than the air leaves,
+#
+#     F_(k+1) <= G + (F_k - G) exp(-h / tau),    F_(k+1) >= F_k - h R(F_k)     (or the lag's own fall).
+#
+# `follow` takes the nearest forces that obey both and turns what is missing into lengths by the static
+# stiffness. A reference is followed while less than a tolerance is missing. It starts on the reference:
+# the way there from rest is not part of it, its time is told.
+#
+# Slowing down. Along the path q(s) the force is that of the rest there, and each piece ds needs
+#
+#     dt >= tau dF / (G - F)  rising,    dt >= -dF / R(F)  falling.
+#
+# `slowed` stretches the pieces that need it, rounds the corners that this leaves by a running mean, and
+# tries
+# again a little slower until `follow` agrees.
+
+TOLERANCE_M = 2.5e-4
+"""Lengths that may be missing: half of what a pixel of the rig's camera shows."""
+
+CLOSE_M = 1e-3
+"""Lengths that are brought in before a reference counts as out of reach: a pixel of the rig's camera."""
+
+_SHARE = 0.9
+"""Of the pumps' rates that a slowed reference uses at first."""
+_PIECE_M = 2e-4
+_JUMP_M = 2e-3
+"""In a tick; no pump moves a bellows a tenth as far."""
+_SPREAD_S = 0.15
+_TRIES = 40
+_NEWTON = 6
+_LONGEST_TICKS = 432_000
+
+
+def reachable(model: Model, q_m: FloatArray) -> BoolArray:
+    """Whether the pumps can hold the lengths (..., 2) [m], shape (...)."""
+    F, q = holding_force(model.plant, q_m), np.asarray(q_m)
+    slack = 1e-9
+    held = (-slack <= F) & (largest_force_N(model) + slack >= F) & (q > 0.0)
+    return np.asarray(held.all(axis=-1))
+
+
+def longest_m(model: Model) -> float:
+    """Greatest length [m] at which both bellows can be held alike."""
+    from scipy.optimize import brentq
+
+    plant, most = model.plant, float(largest_force_N(model).min())
+    low, high = plant.rest_length_m, 4.0 * plant.rest_length_m
+
+    def over(q: float) -> float:
+        return float(holding_force(plant, np.array([q, q]))[0]) - most
+
+    return float(brentq(over, low, high)) if over(high) > 0.0 else high
+
+
+def largest_angle(model: Model) -> float:
+    """Greatest angle [rad] that one pump alone can hold."""
+    low, high, most = 0.0, 1.5 * math.pi, float(largest_force_N(model)[0])
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        try:
+            held = float(holding_force(model.plant, bent_rest(model, middle))[0]) <= most
+        except BadInputError:
+            held = False
+        low, high = (middle, high) if held else (low, middle)
+    return low
+
+
+def approach_s(model: Model, q_m: FloatArray) -> float:
+    """Time [s] with the pumps at their limit until the forces that hold the lengths (2,) are there."""
+    F = np.maximum(holding_force(model.plant, q_m), 0.0)
+    share = F / largest_force_N(model)
+    if np.any(share >= 1.0):
+        return math.inf
+    return float(np.max(-model.pump.lag_s * np.log1p(-share))) + model.pump.delay_ticks * model.tick_s
+
+
+@dataclass(frozen=True)
+class Following:
+    """How far the pumps can follow a reference.
+
+    Attributes
+    ----------
+    possible : whether less than the tolerance is missing all the time.
+    at_s : first time at which more is, None if never.
+    reason : one sentence for that time, empty if never.
+    missing_m : (n, 2) lengths that are missing at the ticks.
+    wanted_N, given_N : (n, 2) forces that the reference needs and the nearest that the pumps can give.
+    fastest_rise_N_per_s, fastest_fall_N_per_s : of the wanted forces, of either bellows.
+    approach_s : time to get to its start from rest.
+    """
+
+    possible: bool
+    at_s: float | None
+    reason: str
+    missing_m: FloatArray
+    wanted_N: FloatArray
+    given_N: FloatArray
+    fastest_rise_N_per_s: float
+    fastest_fall_N_per_s: float
+    approach_s: float
+
+
+def _nearest(model: Model, wanted: FloatArray) -> FloatArray:
+    h, most = model.tick_s, largest_force_N(model)
+    a = math.exp(-h / model.pump.lag_s)
+    given = np.empty_like(wanted)
+    given[0] = np.clip(wanted[0], 0.0, most)
+    for k in range(1, len(wanted)):
+        F = given[k - 1]
+        fall = np.maximum(F * a, F - h * falling_rate(model, F))
+        given[k] = np.clip(wanted[k], np.minimum(fall, most), most + (F - most) * a)
+    return given
+
+
+def _reason(model: Model, q: FloatArray, wanted: FloatArray, k: int, missing: FloatArray) -> str:
+    i = int(np.argmax(np.abs(missing[k])))
+    jumps = np.abs(np.diff(q[max(k - 1, 0) : k + 3], axis=0))
+    if float(jumps.max()) > _JUMP_M:
+        j = int(np.argmax(jumps.max(axis=0)))
+        return f"the reference of bellows {j + 1} jumps by {1e3 * jumps[:, j].max():.3g} mm within a tick"
+    F, most = float(wanted[k, i]), float(largest_force_N(model)[i])
+    name = f"bellows {i + 1}"
+    if most < F:
+        return f"{name} needs {F:.3g} N to be that long, its pump gives at most {most:.3g} N"
+    if F < 0.0:
+        return f"{name} would have to be pulled together with {-F:.3g} N, pumps only push"
+    early = max(k - 6, 0)
+    rate = float(wanted[k, i] - wanted[early, i]) / ((k - early) * model.tick_s) if k else 0.0
+    if missing[k, i] > 0.0:
+        return f"{name} would have to inflate at {rate:.3g} N/s, which its pump's lag does not allow"
+    least = float(falling_rate(model, np.array(F)))
+    return f"{name} would have to deflate at {-rate:.3g} N/s, its air leaves at {least:.3g} N/s"
+
+
+def follow(model: Model, q_m: FloatArray, tolerance_m: float = TOLERANCE_M) -> Following:
+    """How far the pumps can follow lengths (n, 2) [m] at the ticks.
+
+    Raises `BadInputError` for fewer than three ticks.
+    """
+    wanted = wanted_motion(model, q_m).force_N
+    given, h = _nearest(model, wanted), model.tick_s
+    short = wanted - given
+    missing = np.zeros_like(short)
+    for k in np.flatnonzero(np.any(short != 0.0, axis=1)):
+        missing[k] = np.linalg.solve(static_stiffness(model.plant, q_m[k]), short[k])
+    bad = np.flatnonzero(np.max(np.abs(missing), axis=1) > tolerance_m)
+    rates = np.diff(wanted, axis=0) / h
+    at = int(bad[0]) if len(bad) else None
+    return Following(
+        at is None,
+        None if at is None else at * h,
+        "" if at is None else _reason(model, np.asarray(q_m), wanted, at, missing),
+        missing,
+        wanted,
+        given,
+        max(float(rates.max()), 0.0),
+        max(float(-rates.min()), 0.0),
+        approach_s(model, np.asarray(q_m)[0]),
+    )
+
+
+def brought_in(model: Model, q_m: FloatArray) -> tuple[FloatArray, float]:
+    """Lengths (n, 2) [m] with those just outside of the reachable set on its edge, and the longest way there.
+
+    The edge is found by Newton's method on the forces that hold them, cut to what the pumps can give. Lengths
+    that are farther than `CLOSE_M` from it stay as they are.
+    """
+    q = np.array(q_m, dtype=np.float64)
+    moved = 0.0
+    for k in np.flatnonzero(~reachable(model, q)):
+        wanted = np.clip(holding_force(model.plant, q[k]), 0.0, largest_force_N(model))
+        at = q[k].copy()
+        for _ in range(_NEWTON):
+            short = wanted - holding_force(model.plant, at)
+            at = at + np.linalg.solve(static_stiffness(model.plant, at), short)
+            if np.abs(at - q[k]).max() > 2.0 * CLOSE_M:
+                break
+        way = float(np.abs(at - q[k]).max())
+        if way <= CLOSE_M:
+            q[k], moved = at, max(moved, way)
+    return q, moved
+
+
+def _path(q: FloatArray, h: float) -> tuple[FloatArray, FloatArray]:
+    """Points (m, 2) no farther apart than a piece, and the time (m - 1,) of each of them."""
+    steps = np.maximum(np.ceil(np.abs(np.diff(q, axis=0)).max(axis=1) / _PIECE_M).astype(int), 1)
+    points, times = [q[:1]], []
+    for a, b, n in zip(q[:-1], q[1:], steps, strict=True):
+        s = np.arange(1, n + 1)[:, None] / n
+        points.append(a + s * (b - a))
+        times.append(np.full(n, h / n))
+    return np.concatenate(points), np.concatenate(times)
+
+
+def _least_times(model: Model, points: FloatArray) -> FloatArray:
+    """Least time (m - 1,) [s] of each piece between the points (m, 2) for forces at rest."""
+    F = np.maximum(holding_force(model.plant, points), 0.0)
+    most = largest_force_N(model)
+    dF, middle = np.diff(F, axis=0), 0.5 * (F[1:] + F[:-1])
+    up = model.pump.lag_s * dF / np.maximum(most - middle, 1e-3 * most)
+    down = -dF / np.maximum(falling_rate(model, middle), 1e-9)
+    return np.asarray(np.max(np.maximum(up, down), axis=1))
+
+
+def slowed(model: Model, q_m: FloatArray, tolerance_m: float = TOLERANCE_M) -> tuple[FloatArray, Following]:
+    """Lengths (m, 2) [m] at the ticks along the same path, slow enough for the pumps, and the proof.
+
+    Jumps become the fastest way along the straight line between their ends. Lengths that lie outside of the
+    reachable set by less than `CLOSE_M`, as those of a recorded run with its noise, are brought in first.
+    Raises `BadInputError` for a path that leaves the set by more, which no slowness brings back, and one that
+    would take longer than two hours.
+    """
+    h = model.tick_s
+    q, _ = brought_in(model, q_m)
+    points, times = _path(q, h)
+    outside = np.flatnonzero(~reachable(model, points))
+    if len(outside):
+        q1, q2 = (1e3 * points[outside[0]]).tolist()
+        raise BadInputError(
+            f"reference: lengths of {q1:.2f} and {q2:.2f} mm cannot be held by the pumps at any speed, "
+            "expected a path inside the reachable set"
+        )
+    least = _least_times(model, points)
+    for attempt in range(_TRIES):
+        need = np.maximum(times, least / _SHARE * 1.06**attempt)
+        t = np.concatenate([[0.0], np.cumsum(need)])
+        count = math.ceil(t[-1] / h) + 1
+        if count > _LONGEST_TICKS:
+            break
+        ticks = h * np.arange(max(count, 3))
+        slow = np.stack([np.interp(ticks, t, points[:, i]) for i in range(2)], axis=1)
+        slow = _rounded(slow, h, 1.0 + attempt * 0.5)
+        proof = follow(model, slow, tolerance_m)
+        if proof.possible:
+            return slow, proof
+    raise BadInputError("reference: no speed was found at which the pumps follow it")
+
+
+def _rounded(q: FloatArray, h: float, wide: float) -> FloatArray:
+    """Lengths (n, 2) without corners in time: a running mean that keeps both ends."""
+    half = max(round(0.5 * wide * _SPREAD_S / h), 1)
+    padded = np.concatenate([np.tile(q[:1], (2 * half, 1)), q, np.tile(q[-1:], (2 * half, 1))])
+    window = np.ones(2 * half + 1) / (2 * half + 1)
+    return np.stack([np.convolve(padded[:, i], window, mode="valid") for i in range(2)], axis=1)
+
+
+# ----------------------------------------------------------------------
+# Figures of a controlled motion: errors, overshoot, settling, saturation.
+#
+# All take evenly sampled truth, (n, ...), at the ticks.
+
+_BAND = 0.02
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """How well a reference was followed.
+
+    Attributes
+    ----------
+    rms_mm : (q1, q2). head_rms_mm : of the head's place. angle_rms_rad, largest_mm, largest_rad.
+    rms_from_start_mm : (q1, q2) with the way from rest to the reference.
+    rise_s, reach_s : time to 95 % of the first step and to all of it; None where there is none or never.
+    overshoot_rad : beyond the step's end in its direction. settling_s : into 2 % of the step for good.
+    jump_overshoot_rad, jump_settling_s : the same after the jump, 2 % of it.
+    saturation : share of the ticks in which a command is at a limit, per pump.
+    changes_pwm : mean change of a command from tick to tick.
+    """
+
+    rms_mm: tuple[float, float]
+    head_rms_mm: float
+    angle_rms_rad: float
+    largest_mm: float
+    largest_rad: float
+    rms_from_start_mm: tuple[float, float]
+    rise_s: float | None
+    reach_s: float | None
+    overshoot_rad: float | None
+    settling_s: float | None
+    jump_overshoot_rad: float | None
+    jump_settling_s: float | None
+    saturation: tuple[float, float]
+    changes_pwm: float
+
+
+def saturation_share(pwm: FloatArray, low: float, high: float) -> tuple[float, float]:
+    """Share of the ticks in which each of two commands (n, 2) is at a limit."""
+    at = ((pwm <= low) | (pwm >= high)).mean(axis=0)
+    return float(at[0]), float(at[1])
+
+
+def settling_s(tick_s: float, error: FloatArray, band: float) -> float | None:
+    """Time after which errors (n,) stay within a band for good; None when the last one is outside."""
+    outside = np.flatnonzero(np.abs(error) > band)
+    last = int(outside[-1]) + 1 if len(outside) else 0
+    return last * tick_s if last < len(error) else None
+
+
+def _first(tick_s: float, hit: BoolArray) -> float | None:
+    found = np.flatnonzero(hit)
+    return float(found[0]) * tick_s if len(found) else None
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _pair(error: FloatArray) -> tuple[float, float]:
+    return _rms(error[:, 0]), _rms(error[:, 1])
+
+
+def tracking(
+    reference: Reference, q_m: FloatArray, pwm: FloatArray, bellows_radius_m: float, low: float, high: float
+) -> Tracking:
+    """Figures of true lengths (n, 2) [m] and commands (n, 2) against a reference of n ticks.
+
+    Of a reference given as an angle the lengths are free, and their errors are NaN.
+    """
+    h, t = reference.tick_s, reference.t_s
+    phi = angle(q_m, bellows_radius_m)
+    judged = t >= reference.judged_from_s - 1e-9
+    if not judged.any():
+        judged[:] = True
+    error = 1e3 * (reference.q_m - q_m)
+    turned = reference.phi_rad - phi
+    free = reference.kind == "angle"
+    head = forward(q_m, bellows_radius_m)[:, :2] - forward(reference.q_m, bellows_radius_m)[:, :2]
+    nothing = (float("nan"), float("nan"))
+    rise = reach = over = settle = jump_over = jump_settle = None
+    if free and len(np.unique(reference.phi_rad)) <= 2 and reference.phi_rad[0] != 0.0:
+        jump = len(phi) if reference.jump_s is None else round(reference.jump_s / h)
+        wanted, way = float(reference.phi_rad[0]), float(np.sign(reference.phi_rad[0]))
+        first = phi[:jump]
+        rise = _first(h, way * first >= 0.95 * abs(wanted))
+        reach = _first(h, way * first >= abs(wanted))
+        over = max(float(np.max(way * (first - wanted))), 0.0)
+        settle = settling_s(h, first - wanted, _BAND * abs(wanted))
+        if jump < len(phi):
+            then, end = phi[jump:], float(reference.phi_rad[-1])
+            way = float(np.sign(end - wanted))
+            jump_over = max(float(np.max(way * (then - end))), 0.0)
+            jump_settle = settling_s(h, then - end, _BAND * abs(end - wanted))
+    return Tracking(
+        nothing if free else _pair(error[judged]),
+        float("nan") if free else _rms(1e3 * np.linalg.norm(head[judged], axis=1)),
+        _rms(turned[judged]),
+        float("nan") if free else float(np.abs(error[judged]).max()),
+        float(np.abs(turned[judged]).max()),
+        nothing if free else _pair(error),
+        rise,
+        reach,
+        over,
+        settle,
+        jump_over,
+        jump_settle,
+        saturation_share(pwm, low, high),
+        float(np.abs(np.diff(pwm, axis=0)).mean()) if len(pwm) > 1 else 0.0,
+    )
+
+
+# ----------------------------------------------------------------------
+# Gains from the model: the strongest controller whose margins hold at every operating point.
+#
+# Orientation, PID on one pump (4.1), (4.4). Of all gains with
+#
+#     gain margin >= GM,  phase margin >= PM,  Ms <= M
+#
+# at every operating point, the one with the largest Ki: after a step of an unknown force the integral of
+# the error is proportional to 1 / Ki, so this is the fastest recovery (Astrom and Hagglund's criterion).
+#
+# Position, PD on both bellows beside a feed-forward (4.5), (4.8): the largest Kp under the same margins,
+# since what the feed-forward leaves is divided by 1 + Kp times the slope. The camera's latency and the
+# firmware's low-pass are in the loop.
+#
+# The ratios Ki / Kp and Kd / Kp come from a grid; for each the largest gain is found by bisection on the
+# frequency responses, which are computed once, and the winner is checked by eigenvalues.
+
+_INTEGRAL_S = np.geomspace(0.15, 4.0, 10)
+_DERIVATIVE_S = np.array([0.0, 0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.2])
+_BISECTIONS = 16
+
+
+@dataclass(frozen=True)
+class Criterion:
+    """Margins that every operating point has to have.
+
+    Attributes
+    ----------
+    gain, phase_rad, sensitivity : least gain margin, least phase margin, greatest Ms.
+
+    Raises `BadInputError` for margins that no loop can have or that are none.
+    """
+
+    gain: float = 2.0
+    phase_rad: float = math.pi / 3.0
+    sensitivity: float = 2.0
+
+    def __post_init__(self) -> None:
+        if not 1.0 < self.gain < 100.0:
+            raise BadInputError(f"gain margin: found {self.gain:g}, expected a factor above 1")
+        if not 0.0 < self.phase_rad < 0.5 * math.pi:
+            raise BadInputError(
+                f"phase margin: found {math.degrees(self.phase_rad):g} deg, expected 0 to 90 deg"
+            )
+        if not 1.0 < self.sensitivity < 100.0:
+            raise BadInputError(f"sensitivity: found {self.sensitivity:g}, expected more than 1")
+
+
+@dataclass(frozen=True)
+class Point:
+    """Margins at an operating point, the least of its channels."""
+
+    q_m: tuple[float, float]
+    margins: Margins
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """Gains and their margins at every operating point."""
+
+    pid: Pid
+    points: tuple[Point, ...]
+
+
+def operating_angles(model: Model) -> tuple[tuple[float, float], ...]:
+    """Rests (q1, q2) [m] at 15, 40, 65 and 90 % of the greatest angle, one pump alone."""
+    most = largest_angle(model)
+    rests = (bent_rest(model, share * most) for share in (0.15, 0.4, 0.65, 0.9))
+    return tuple((float(q[0]), float(q[1])) for q in rests)
+
+
+def operating_lengths(model: Model) -> tuple[tuple[float, float], ...]:
+    """Rests (q1, q2) [m] at 10 to 95 % of the greatest elongation, and two that are bent."""
+    rest = model.plant.rest_length_m
+    span = longest_m(model) - rest
+    found = [(rest + s * span, rest + s * span) for s in (0.1, 0.35, 0.65, 0.95)]
+    found += [(rest + a * span, rest + b * span) for a, b in ((0.75, 0.25), (0.9, 0.5))]
+    return tuple(q for q in found if bool(reachable(model, np.array(q))))
+
+
+def orientation_loop(model: Model, pid: Pid, q_m: tuple[float, float]) -> System:
+    """Loop of (4.1) about a rest: error of the angle, both controllers, rig, angle."""
+    h = model.tick_s
+    return series(pid_system(pid), _angle_rig(model, q_m, h))
+
+
+def _angle_rig(model: Model, q_m: tuple[float, float], h: float) -> System:
+    half = 0.5 / model.plant.bellows_radius_m
+    rig = rig_system(model, np.array(q_m))
+    return series(gain(np.array([[1.0], [-1.0]]), h), series(rig, gain(np.array([[half, -half]]), h)))
+
+
+def _position_rig(model: Model, q_m: tuple[float, float], sensing: bool) -> System:
+    rig = rig_system(model, np.array(q_m))
+    return series(rig, firmware_sensing(model)) if sensing else rig
+
+
+def position_loop(model: Model, pid: Pid, q_m: tuple[float, float], sensing: bool = True) -> System:
+    """Loop of (4.5) about a rest: errors of the lengths, both controllers, rig, lengths as seen."""
+    both = side_by_side(pid_system(pid), pid_system(pid))
+    return series(both, _position_rig(model, q_m, sensing))
+
+
+def holds(criterion: Criterion, margins: Margins) -> bool:
+    """Whether margins satisfy the criterion; stability is part of it."""
+    return (
+        margins.stable
+        and margins.gain >= criterion.gain
+        and margins.gain_down <= 1.0 / criterion.gain
+        and margins.phase_rad >= criterion.phase_rad
+        and margins.sensitivity <= criterion.sensitivity
+    )
+
+
+def _worst(margins: Sequence[Margins]) -> Margins:
+    return Margins(
+        all(m.stable for m in margins),
+        min(m.gain for m in margins),
+        max(m.gain_down for m in margins),
+        min(m.phase_rad for m in margins),
+        min(m.delay_s for m in margins),
+        max(m.crossover_hz for m in margins),
+        max(m.sensitivity for m in margins),
+    )
+
+
+def points_of(
+    loop: Callable[[tuple[float, float]], System], at: Sequence[tuple[float, float]]
+) -> tuple[Point, ...]:
+    """Margins of a loop at operating points, the least of its channels at each."""
+    return tuple(Point(q, _worst(loop_margins(loop(q)))) for q in at)
+
+
+def _strongest(
+    criterion: Criterion, shape: ComplexArray, rigs: Sequence[ComplexArray], omega: FloatArray, most: float
+) -> float:
+    """Largest factor on a controller's response (k,) that keeps the margins at rigs (k, n, n); 0 if none."""
+
+    def good(factor: float) -> bool:
+        for rig in rigs:
+            L = factor * shape[:, None, None] * rig
+            for i in range(L.shape[1]):
+                if not holds(criterion, margins_of_response(omega, break_at(L, i), True)):
+                    return False
+        return True
+
+    low, high = 1e-3 * most, most
+    if not good(low):
+        return 0.0
+    for _ in range(_BISECTIONS):
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if good(middle) else (low, middle)
+    return low
+
+
+def _tuning_rounded(value: float) -> float:
+    """Down to two significant digits: nobody types more, and the margins hold."""
+    if value == 0.0:
+        return 0.0
+    unit = 10.0 ** (math.floor(math.log10(abs(value))) - 1)
+    return float(f"{math.floor(value / unit + 1e-9) * unit:.12g}")
+
+
+def _searched(
+    model: Model,
+    criterion: Criterion,
+    rigs: Sequence[System],
+    integrals_s: Sequence[float],
+    most: float,
+    merit: Callable[[Pid], float],
+    loop: Callable[[Pid, int], System],
+) -> Pid:
+    omega = frequencies(model.tick_s, 400)
+    seen = [response(rig, omega) for rig in rigs]
+    best: list[Pid] = []
+    for Ti in integrals_s:
+        for Td in _DERIVATIVE_S.tolist():
+            unit = Pid(1.0, 0.0 if math.isinf(Ti) else 1.0 / Ti, Td, tick_s=model.tick_s)
+            Kp = _strongest(criterion, response(pid_system(unit), omega)[:, 0, 0], seen, omega, most)
+            if Kp > 0.0:
+                Kp = _tuning_rounded(Kp)
+                gains = (_tuning_rounded(Kp * unit.Ki), _tuning_rounded(Kp * Td))
+                best.append(Pid(Kp, *gains, tick_s=model.tick_s))
+    best.sort(key=merit, reverse=True)
+    for pid in best:
+        if all(spectral_radius(closed_loop(loop(pid, i))) < 1.0 for i in range(len(rigs))):
+            worst = [_worst(loop_margins(loop(pid, i))) for i in range(len(rigs))]
+            if all(holds(_slack(criterion), one) for one in worst):
+                return pid
+    raise BadInputError(
+        f"controller: no gains reach a gain margin of {criterion.gain:g} and a phase margin of "
+        f"{math.degrees(criterion.phase_rad):.3g} deg at every operating point, expected a lower demand"
+    )
+
+
+def _slack(criterion: Criterion) -> Criterion:
+    """The criterion less what rounding the gains to two digits may cost."""
+    return Criterion(
+        1.0 + 0.98 * (criterion.gain - 1.0), 0.98 * criterion.phase_rad, 1.02 * criterion.sensitivity
+    )
+
+
+def tune_orientation(
+    model: Model, criterion: Criterion, at: Sequence[tuple[float, float]] | None = None
+) -> Tuned:
+    """PID of the angle with the largest Ki [PWM/rad/s].
+
+    Raises `BadInputError` where no gains hold the margins.
+    """
+    points = operating_angles(model) if at is None else tuple(at)
+    rigs = [_angle_rig(model, q, model.tick_s) for q in points]
+    pid = _searched(
+        model, criterion, rigs, _INTEGRAL_S.tolist(), 2e4, lambda p: p.Ki,
+        lambda p, i: series(pid_system(p), rigs[i]),
+    )  # fmt: skip
+    return Tuned(pid, points_of(lambda q: orientation_loop(model, pid, q), points))
+
+
+def tune_position(
+    model: Model,
+    criterion: Criterion,
+    at: Sequence[tuple[float, float]] | None = None,
+    sensing: bool = True,
+) -> Tuned:
+    """PD of the lengths with the largest Kp [PWM/m], `sensing` with the firmware's filters in the loop.
+
+    Raises `BadInputError` where no gains hold the margins.
+    """
+    points = operating_lengths(model) if at is None else tuple(at)
+    rigs = [_position_rig(model, q, sensing) for q in points]
+    pid = _searched(
+        model, criterion, rigs, [math.inf], 4e5, lambda p: p.Kp,
+        lambda p, i: series(side_by_side(pid_system(p), pid_system(p)), rigs[i]),
+    )  # fmt: skip
+    return Tuned(pid, points_of(lambda q: position_loop(model, pid, q, sensing), points))

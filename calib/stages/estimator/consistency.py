@@ -1,0 +1,178 @@
+"""Whether a covariance can be believed: NEES against truth, NIS per sensor, whiteness of innovations.
+
+With an honest covariance e' P^-1 e of n numbers is chi-square with n degrees of freedom, so that its mean
+over N independent draws lies in the band of chi2(n N) / N (Bar-Shalom, Li and Kirubarajan 2001, 5.4). Rows
+of one log are not independent draws; the bands here are those of white innovations, and for NEES
+those of logs. The angle and both lengths are two numbers, phi = (q1 - q2) / (2 r_B), so their NEES is 2.
+
+`Tally` gathers sums, so that a log of any length can be judged in constant memory.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from calib.core.arrays import FloatArray
+from calib.stages.estimator.kinematic import OUT
+
+SENSORS = {"camera": 2, "accel": 2, "gyro": 1}
+"""Readings of each sensor at a time."""
+
+_NIS = {"camera": "nis_camera", "accel": "nis_accel", "gyro": "nis_gyro"}
+_INNOVATIONS = {"camera": ("e_u", "e_v"), "accel": ("e_ax", "e_ay"), "gyro": ("e_gz",)}
+_SETTLED_S = 2.0
+
+
+def chi_square_band(degrees: int, draws: int, level: float = 0.95) -> tuple[float, float]:
+    """Band in which the mean of `draws` chi-square numbers of `degrees` lies with probability `level`."""
+    from scipy.special import chdtri
+
+    total, tail = degrees * max(draws, 1), 0.5 * (1.0 - level)
+    return float(chdtri(total, 1.0 - tail)) / max(draws, 1), float(chdtri(total, tail)) / max(draws, 1)
+
+
+def correlation_band(count: int) -> float:
+    """95 % bound of the correlation of a white sequence with itself one step later."""
+    return 1.96 / math.sqrt(max(count, 1))
+
+
+def nees(out: FloatArray, q_m: FloatArray, phi_rad: FloatArray, bellows_radius_m: float) -> FloatArray:
+    """NEES (n,) of (q1, q2, phi), two degrees of freedom, of rows of `setup.OUT` against the truth.
+
+    Parameters
+    ----------
+    q_m, phi_rad : (n, 2) and (n,) truth.
+    """
+    r = bellows_radius_m
+    s1, s2, sp = out[:, OUT.index("sigma_q1_m")], out[:, OUT.index("sigma_q2_m")], out[:, 12]
+    var_l = np.maximum(0.5 * (s1**2 + s2**2) - (r * sp) ** 2, 1e-18)
+    cross = (s1**2 - s2**2) / (4.0 * r)
+    e_l = 0.5 * (out[:, 1] + out[:, 2] - q_m[:, 0] - q_m[:, 1])
+    e_p = out[:, 5] - phi_rad
+    determinant = np.maximum(var_l * sp**2 - cross**2, 1e-12 * var_l * sp**2)
+    return np.asarray((sp**2 * e_l**2 - 2.0 * cross * e_l * e_p + var_l * e_p**2) / determinant)
+
+
+@dataclass(frozen=True)
+class SensorCheck:
+    """Verdict on one sensor's innovations.
+
+    Attributes
+    ----------
+    count, gated : readings used and gated.
+    nis, low, high : mean, and the 95 % band of white innovations.
+    inside : share of readings within the 95 % band of a single one.
+    correlation, bound : with the reading before, the largest of its axes, and its 95 % bound.
+    """
+
+    count: int
+    gated: int
+    nis: float
+    low: float
+    high: float
+    inside: float
+    correlation: float
+    bound: float
+
+
+@dataclass
+class Tally:
+    """Sums over the rows of a log, block after block; rows of the first two seconds do not count."""
+
+    bellows_radius_m: float
+    rows: int = 0
+    start_s: float = math.nan
+    end_s: float = math.nan
+    settled_rows: int = 0
+    scored: int = 0
+    log_likelihood: float = 0.0
+    sensors: dict[str, FloatArray] = field(
+        default_factory=lambda: {name: np.zeros(8) for name in (*SENSORS, "last")}
+    )
+    flags: dict[int, int] = field(default_factory=dict)
+    squares: FloatArray = field(default_factory=lambda: np.zeros(8))
+
+    def add(self, out: FloatArray, truth: FloatArray | None = None) -> None:
+        """Rows of `setup.OUT`, and (n, 3) true q1, q2, phi, NaN where not known."""
+        if len(out) == 0:
+            return
+        if self.rows == 0:
+            self.start_s = float(out[0, 0])
+        self.end_s = float(out[-1, 0])
+        self.rows += len(out)
+        flags = out[:, OUT.index("flags")].astype(np.int64)
+        for bit in (1, 2, 4, 8, 16, 32, 64):
+            self.flags[bit] = self.flags.get(bit, 0) + int(np.count_nonzero(flags & bit))
+        self.log_likelihood += float(np.nansum(out[:, OUT.index("log_likelihood")]))
+        late = out[:, 0] >= self.start_s + _SETTLED_S
+        self.settled_rows += int(late.sum())
+        for name in SENSORS:
+            self._add_sensor(name, out[late])
+        if truth is not None:
+            self._add_truth(out[late], truth[late])
+
+    def _add_sensor(self, name: str, out: FloatArray) -> None:
+        gated = out[:, OUT.index(f"gated_{name}")]
+        used = gated == 0.0
+        sums, last = self.sensors[name], self.sensors["last"]
+        sums[1] += int(np.count_nonzero(gated == 1.0))
+        nis = out[used, OUT.index(_NIS[name])]
+        if len(nis) == 0:
+            return
+        low, high = chi_square_band(SENSORS[name], 1)
+        sums[0] += len(nis)
+        sums[2] += float(nis.sum())
+        sums[3] += int(np.count_nonzero((nis >= low) & (nis <= high)))
+        for k, column in enumerate(_INNOVATIONS[name]):
+            place = list(SENSORS).index(name) * 2 + k
+            e = np.concatenate([[last[place]], out[used, OUT.index(column)]])
+            sums[4 + 2 * k] += float((e[1:] * e[:-1]).sum())
+            sums[5 + 2 * k] += float((e[1:] ** 2).sum())
+            last[place] = e[-1]
+
+    def _add_truth(self, out: FloatArray, truth: FloatArray) -> None:
+        known = np.isfinite(truth).all(axis=1)
+        out, truth = out[known], truth[known]
+        if len(out) == 0:
+            return
+        self.scored += len(out)
+        self.squares[0] += float(((out[:, 1] - truth[:, 0]) ** 2).sum())
+        self.squares[1] += float(((out[:, 2] - truth[:, 1]) ** 2).sum())
+        self.squares[2] += float(((out[:, 5] - truth[:, 2]) ** 2).sum())
+        self.squares[3] += float(nees(out, truth[:, :2], truth[:, 2], self.bellows_radius_m).sum())
+        for k in range(3):
+            self.squares[4 + k] += float((out[:, 10 + k] ** 2).sum())
+
+    def rmse(self) -> dict[str, float]:
+        """Errors against the truth, empty without one: q1, q2, their mean [mm], phi [deg], NEES."""
+        if self.scored == 0:
+            return {}
+        mean = self.squares / self.scored
+        q1, q2 = 1e3 * math.sqrt(mean[0]), 1e3 * math.sqrt(mean[1])
+        return {
+            "q1_mm": q1,
+            "q2_mm": q2,
+            "mean_q_mm": 0.5 * (q1 + q2),
+            "phi_deg": math.degrees(math.sqrt(mean[2])),
+            "nees": float(mean[3]),
+            "sigma_q1_mm": 1e3 * math.sqrt(mean[4]),
+            "sigma_q2_mm": 1e3 * math.sqrt(mean[5]),
+            "sigma_phi_deg": math.degrees(math.sqrt(mean[6])),
+        }
+
+    def check(self, name: str) -> SensorCheck | None:
+        """What a sensor's innovations say, None where it was never used after the first two seconds."""
+        sums = self.sensors[name]
+        count = int(sums[0])
+        if count == 0:
+            return None
+        low, high = chi_square_band(SENSORS[name], count)
+        axes = range(SENSORS[name])
+        correlations = [sums[4 + 2 * k] / sums[5 + 2 * k] if sums[5 + 2 * k] > 0.0 else 0.0 for k in axes]
+        return SensorCheck(
+            count, int(sums[1]), float(sums[2] / count), low, high, float(sums[3] / count),
+            float(max(correlations, key=abs)), correlation_band(count),
+        )  # fmt: skip

@@ -1,0 +1,1243 @@
+"""The driven filter: the actuator's dynamics as process model, filter, smoother, hand-over."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numba import njit
+
+from calib.core.arrays import BoolArray, FloatArray, IntArray
+from calib.stages.actuator.dynamics import Coefficients, coefficients, rates
+from calib.stages.actuator.parameters import DAMPING_SCALE_FREE, Plant, pumps_connected
+from calib.stages.actuator.pump import Pump, PumpCoefficients, advance_pump, pump_coefficients, static_force_N
+from calib.stages.estimator.kinematic import (
+    OUT,
+    Filter,
+    Rows,
+    Setup,
+    advance,
+    begin_row,
+    even_times,
+    new_clock,
+)
+from calib.stages.estimator.sensors import (
+    SENSOR,
+    SIZE,
+    accelerometer,
+    compiled,
+    gyroscope,
+    head_position,
+    invert_marker,
+    marker,
+    update_terms,
+)
+from calib.stages.estimator.smoother import events_of, smooth
+
+# ----------------------------------------------------------------------
+# The driven process: the actuator's dynamics with the commands of its pumps as input.
+#
+# A state is the row `DRIVEN` of 36 numbers. The first twelve move: angle, length and their rates, creep as
+# z1 + z2 and z1 - z2, and for each bellows the output of the pump's lag, its force, and a slow disturbance
+# that
+# is added to it. Then come what is not known exactly of plant and pumps (`PARAMETER`), as relative
+# deviations from the nominal value (of the damping its logarithm, of the rest length metres), and the
+# sensors of `sensors.SENSOR`.
+#
+# The motion is that of `calib.stages.actuator.dynamics.rates` and
+# `calib.stages.actuator.pump.advance_pump`, in Runge-Kutta steps
+# of at most `STEP_S`. A command acts as the static force that it settles at, constant between the times at
+# which commands take effect; a step of the filter is cut there (`Segments`). The Jacobian is by forward
+# differences of the same steps, over the 23 columns that the motion depends on; those of the sensors are
+# those of the identity.
+
+MOVING = (
+    "phi_rad", "length_m", "dphi_radps", "dlength_mps", "z_sum_N", "z_difference_N",
+    "lag1_N", "lag2_N", "force1_N", "force2_N", "disturbance1_N", "disturbance2_N",
+)  # fmt: skip
+
+PARAMETER = (
+    "stiffness", "log_damping", "bending", "strength1", "strength2", "lag", "deflation", "rest_length_m",
+    "mass", "creep_stiffness", "creep_rate",
+)  # fmt: skip
+"""What is uncertain of plant and pumps: entries 12 to 22 of a state."""
+
+DRIVEN = (*MOVING, *PARAMETER, *SENSOR)
+
+DYNAMIC = len(MOVING)
+INVOLVED = DYNAMIC + len(PARAMETER)
+"""Entries that move, and entries that the motion depends on."""
+
+PLANT = (
+    "m", "J", "r", "l0", "k0", "k1", "k2", "k3", "damping", "bending", "lambda1", "lambda2", "lambda3",
+    "gx", "gy", "head", "gravity", "kind", "lag_s", "falling", "laminar", "turbulent",
+)  # fmt: skip
+"""Nominal values, those of `Coefficients` and then of `PumpCoefficients`, as the vector `plant`."""
+
+STEP_S = 0.0035
+"""Longest Runge-Kutta step; the stiffest mode, 200 1/s, is then within 1e-4 of its own course."""
+
+_NUDGE = np.array([1e-6, 1e-7, 1e-5, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6,
+                   1e-5, 1e-5, 1e-5, 1e-5, 1e-5, 1e-5, 1e-5, 1e-7, 1e-5, 1e-5, 1e-5])  # fmt: skip
+
+
+@compiled()
+def _factor(deviation: float) -> float:
+    return max(1.0 + deviation, 0.1)
+
+
+@compiled()
+def _coefficients(plant: FloatArray, x: FloatArray) -> Coefficients:
+    scale = _factor(x[12])
+    return Coefficients(
+        plant[0] * _factor(x[20]), plant[1], plant[2], plant[3] + x[19],
+        plant[4] * scale, plant[5] * scale, plant[6] * scale, plant[7] * scale,
+        plant[8] * math.exp(min(x[13], 3.0)) / math.sqrt(scale), plant[9] * _factor(x[14]),
+        plant[10] * _factor(x[22]), plant[11] * _factor(x[21]), plant[12],
+        plant[13], plant[14], int(plant[15]), int(plant[16]),
+    )  # fmt: skip
+
+
+@compiled()
+def flow(plant: FloatArray, x: FloatArray, segments: FloatArray, count: int, out: FloatArray) -> None:
+    """State of the moving part (12,) after the segments.
+
+    Parameters
+    ----------
+    plant : (22,) of `PLANT`.
+    x : (23,) or more, of `DRIVEN`.
+    segments : (count, 3) or more rows: duration [s] and the nominal static forces of both pumps [N].
+    """
+    c = _coefficients(plant, x)
+    lag_s, deflation = plant[18] * _factor(x[17]), _factor(x[18])
+    # An orifice that passes more empties sooner.
+    pump = PumpCoefficients(
+        int(plant[17]), lag_s, plant[19] * deflation, plant[20] / deflation, plant[21] / deflation
+    )
+    y0, y1, y2, y3, y4, y5 = x[1], x[0], x[3], x[2], x[4], x[5]
+    x1, x2, f1, f2, d1, d2 = x[6], x[7], x[8], x[9], x[10], x[11]
+    strength1, strength2 = _factor(x[15]), _factor(x[16])
+    for k in range(count):
+        parts = max(math.ceil(segments[k, 0] / STEP_S - 1e-9), 1)
+        h = segments[k, 0] / parts
+        decay = math.exp(-0.5 * h / lag_s)
+        g1, g2 = strength1 * segments[k, 1], strength2 * segments[k, 2]
+        for _ in range(parts):
+            x1, middle1, end1 = advance_pump(pump, x1, f1, g1, decay, h)
+            x2, middle2, end2 = advance_pump(pump, x2, f2, g2, decay, h)
+            a0, a1, a2, a3, a4, a5 = y0, y1, y2, y3, y4, y5
+            s0 = s1 = s2 = s3 = s4 = s5 = 0.0
+            F1, F2 = f1 + d1, f2 + d2
+            # The four stages in a loop: compiling `rates` once takes a quarter of the time.
+            for stage in range(4):
+                if stage == 1:
+                    F1, F2 = middle1 + d1, middle2 + d2
+                elif stage == 3:
+                    F1, F2 = end1 + d1, end2 + d2
+                r2, r3, r4, r5 = rates(c, a0, a1, a2, a3, a4, a5, F1, F2)
+                w = h / 6.0 if stage == 0 or stage == 3 else h / 3.0
+                s0, s1, s2, s3 = s0 + w * a2, s1 + w * a3, s2 + w * r2, s3 + w * r3
+                s4, s5 = s4 + w * r4, s5 + w * r5
+                g = h if stage == 2 else 0.5 * h
+                a0, a1, a2, a3 = y0 + g * a2, y1 + g * a3, y2 + g * r2, y3 + g * r3
+                a4, a5 = y4 + g * r4, y5 + g * r5
+            y0, y1, y2, y3, y4, y5 = y0 + s0, y1 + s1, y2 + s2, y3 + s3, y4 + s4, y5 + s5
+            f1, f2 = end1, end2
+    out[0], out[1], out[2], out[3], out[4], out[5] = y1, y0, y3, y2, y4, y5
+    out[6], out[7], out[8], out[9], out[10], out[11] = x1, x2, f1, f2, d1, d2
+
+
+@compiled()
+def jacobian(
+    plant: FloatArray, x: FloatArray, segments: FloatArray, count: int, out: FloatArray, F: FloatArray
+) -> None:
+    """`flow` into out[:12], and its derivative F (12, 23).
+
+    Twelve more entries of out are scratch; x is nudged on the way and then as before.
+    """
+    flow(plant, x, segments, count, out)
+    moved = out[DYNAMIC:]
+    for k in range(INVOLVED):
+        step, own = _NUDGE[k], x[k]
+        x[k] = own + step
+        flow(plant, x, segments, count, moved)
+        x[k] = own
+        for i in range(DYNAMIC):
+            F[i, k] = (moved[i] - out[i]) / step
+
+
+@compiled()
+def _accelerate(plant: FloatArray, x: FloatArray) -> tuple[float, float]:
+    c = _coefficients(plant, x)
+    ddl, ddphi, _, _ = rates(c, x[1], x[0], x[3], x[2], x[4], x[5], x[8] + x[10], x[9] + x[11])
+    return ddphi, ddl
+
+
+@compiled()
+def accelerations(
+    plant: FloatArray, x: FloatArray, by_phi: FloatArray, by_length: FloatArray
+) -> tuple[float, float]:
+    """ddphi [rad/s^2], ddl [m/s^2] of a state and their gradients (23,), written to; x stays."""
+    ddphi, ddl = _accelerate(plant, x)
+    for k in range(INVOLVED):
+        by_phi[k], by_length[k] = 0.0, 0.0
+        if k == 6 or k == 7 or 15 <= k <= 18 or k >= 21:
+            continue
+        own = x[k]
+        x[k] = own + _NUDGE[k]
+        a, b = _accelerate(plant, x)
+        x[k] = own
+        by_phi[k], by_length[k] = (a - ddphi) / _NUDGE[k], (b - ddl) / _NUDGE[k]
+    return ddphi, ddl
+
+
+@compiled()
+def carry(P: FloatArray, F: FloatArray, noise: FloatArray, dt: float, FP: FloatArray) -> None:
+    """P = [F 0; 0 1] P [F 0; 0 1]' + noise dt, in place.
+
+    Parameters
+    ----------
+    P : (36, 36). F : (12, 23). noise : (36,) squared densities. FP : (12, 36) scratch.
+    """
+    n = P.shape[0]
+    for i in range(DYNAMIC):
+        for j in range(n):
+            FP[i, j] = 0.0
+        for k in range(INVOLVED):
+            slope = F[i, k]
+            if slope != 0.0:
+                for j in range(n):
+                    FP[i, j] += slope * P[k, j]
+    for i in range(DYNAMIC):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(INVOLVED):
+                total += FP[i, k] * F[j, k]
+            P[i, j] = total
+            P[j, i] = total
+        for j in range(DYNAMIC, n):
+            P[i, j] = FP[i, j]
+            P[j, i] = FP[i, j]
+    for i in range(n):
+        P[i, i] += noise[i] * dt
+
+
+# ----------------------------------------------------------------------
+# What the driven filter knows beforehand: plant, pumps, and how far from the truth they may be.
+
+SIGMA = (0.08, 0.1, 0.1, 0.06, 0.06, 0.06, 0.08, 5e-4, 0.08, 0.1, 0.1)
+"""Deviations of `driven_model.PARAMETER` from nominal: by what two rigs that were made alike differ."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Plant and pumps of the driven filter.
+
+    Attributes
+    ----------
+    plant, pump, strength : nominal, with the hoses on; factors on the pumps' static forces.
+    free_damping_scale : c_dmp with the hoses off. Until the first command nobody knows which it is.
+    sigma : (11,) deviations of `driven_model.PARAMETER`.
+    covariance : (11, 11) of the same where they are not independent; its diagonal is `sigma` squared.
+    sigma_force_N, sigma_disturbance_N, sigma_creep_N : of the state before the first reading.
+    sigma_turning_radps : of dphi; a free swing is fast.
+    walk_disturbance : density of the disturbances' walk [N/sqrt(s)].
+    walk_rates : densities of the walk of dphi and dl [rad/s, m/s per sqrt(s)].
+    walk_forces : density of the walk of lag, force and creep [N/sqrt(s)].
+    walk_parameters : of all parameters, as a share of `SIGMA` per sqrt(s). Known ones walk as well: they
+        stand for a model that is not the actuator, and a smoother spreads what they learn over the log.
+    imu_noise : deviations of a_x, a_y [m/s^2] and g_z [rad/s] for this filter, which knows the head's
+        accelerations; None for those of the set-up.
+    """
+
+    plant: Plant = field(default_factory=pumps_connected)
+    pump: Pump = field(default_factory=Pump)
+    strength: tuple[float, float] = (1.0, 1.0)
+    free_damping_scale: float = DAMPING_SCALE_FREE
+    sigma: tuple[float, ...] = SIGMA
+    sigma_force_N: float = 0.03
+    sigma_disturbance_N: float = 0.01
+    sigma_creep_N: float = 0.03
+    sigma_turning_radps: float = 6.0
+    walk_disturbance: float = 2.5e-4
+    walk_rates: tuple[float, float] = (2e-3, 1e-4)
+    walk_forces: float = 1e-4
+    walk_parameters: float = 3.5e-3
+    imu_noise: tuple[float, float, float] | None = None
+    covariance: FloatArray | None = None
+
+    def numbers(self) -> FloatArray:
+        """The (22,) vector of `driven_model.PLANT`."""
+        return np.array([*coefficients(self.plant), *pump_coefficients(self.pump)], dtype=np.float64)
+
+    def noise(self, setup: Setup) -> FloatArray:
+        """The (11,) of `kernel.NOISE` for the driven filter."""
+        noise = setup.noise.copy()
+        if self.imu_noise is not None:
+            noise[2:5] = self.imu_noise
+        return noise
+
+    def walk(self, setup: Setup) -> FloatArray:
+        """Squared densities (36,) of the walk of the state."""
+        moving = np.zeros(DYNAMIC)
+        moving[2:4] = self.walk_rates
+        moving[4:10] = self.walk_forces
+        moving[10:12] = self.walk_disturbance
+        parameters = self.walk_parameters * np.array(SIGMA)
+        return np.concatenate([moving, parameters, setup.process.sensor_walk]) ** 2
+
+    def start(self, setup: Setup) -> tuple[FloatArray, FloatArray]:
+        """State (36,) and covariance (36, 36) before the first reading."""
+        begin = setup.start
+        x, sigma = np.zeros(len(DRIVEN)), np.zeros(len(DRIVEN))
+        x[:4], sigma[:4] = begin.head[:4], begin.head_sigma[:4]
+        sigma[2] = self.sigma_turning_radps
+        sigma[4:6], sigma[6:10] = self.sigma_creep_N, self.sigma_force_N
+        sigma[10:12] = self.sigma_disturbance_N
+        sigma[DYNAMIC:INVOLVED] = self.sigma
+        # With the hoses off or on, whichever it is.
+        apart = (
+            math.log(self.free_damping_scale / self.plant.damping_scale) if self.free_damping_scale else -1.0
+        )
+        at = DYNAMIC + PARAMETER.index("log_damping")
+        x[at], sigma[at] = 0.5 * apart, math.hypot(0.5 * apart, self.sigma[1])
+        x[INVOLVED:] = begin.sensor
+        # Pictures are put at their exposure, so that what is left of the offset is zero.
+        x[INVOLVED + 7] -= max(float(begin.sensor[7]), 0.0)
+        P = np.diag(sigma**2)
+        if self.covariance is not None:
+            P[DYNAMIC:INVOLVED, DYNAMIC:INVOLVED] = self.covariance
+            P[at, at] = sigma[at] ** 2
+        P[INVOLVED:, INVOLVED:] = begin.covariance()[6:, 6:]
+        return x, P
+
+
+def commands(drive: Drive, pwm: FloatArray) -> FloatArray:
+    """Static forces (n, 2) [N] that commands (n, 2) settle at with nominal pumps; NaN without a command."""
+    known = np.isfinite(pwm).all(axis=1)
+    out = np.full(pwm.shape, np.nan)
+    out[known] = static_force_N(drive.pump, pwm[known]) * np.array(drive.strength)
+    return out
+
+
+# ----------------------------------------------------------------------
+# One event of the driven filter: a picture, an IMU sample, or the certainty that the hoses are on.
+#
+# The process is `driven_model`, the readings are those of `kernel`: pixels rounded as `rounding` has it,
+# linearised once per event, taken one after the other, gated by the chi-square of their sensor. The head's
+# accelerations, which the accelerometer feels, are what the dynamics say of the state, so their gradients
+# reach forces and parameters. What `kernel.CONSIDERED` names of the geometry is considered and not learnt.
+
+CAMERA, IMU, HOSES = 1, 2, 4
+
+LONGEST_S = 0.02
+"""Longer steps are taken in parts."""
+
+SIZE_D = len(DRIVEN)
+WORK = (24, SIZE_D)
+"""Shape of the scratch: p, x0, three gradients, terms, segments, accelerations, and F P."""
+
+_TELLING = 9.0
+_MARGIN_PX2 = 0.25
+_SWING_RADPS = 25.0
+_KNOWN_MPS = 3e-3
+"""The accelerometer is left out until the length's rate is known so well."""
+SETTLING_S = 0.3
+"""For so long after a start it is left out too: it is not linear in what is not known yet."""
+_MOST_SEGMENTS = 12
+_SHIFT = INVOLVED - 6
+"""The sensors' quantities stand this much further on than in `sensors`."""
+
+
+@compiled()
+def copy_state(to_x: FloatArray, to_P: FloatArray, x: FloatArray, P: FloatArray) -> None:
+    """Copy a state and its covariance."""
+    for i in range(x.shape[0]):
+        to_x[i] = x[i]
+        for j in range(x.shape[0]):
+            to_P[i, j] = P[i, j]
+
+
+@compiled()
+def _update(x: FloatArray, P: FloatArray, innovation: float, S: float, p: FloatArray) -> None:
+    """Update in place by an innovation with variance S; p = P H' is used up."""
+    n = x.shape[0]
+    root = 1.0 / math.sqrt(S)
+    for j in range(n):
+        p[j] *= root
+    move = innovation * root
+    for i in range(n):
+        gain = p[i]
+        # Lever, marker offset, shift and stretch of the plane.
+        if i == 28 or i == 29 or 31 <= i <= 33:
+            for j in range(28):
+                P[i, j] -= gain * p[j]
+            P[i, 30] -= gain * p[30]
+            P[i, 34] -= gain * p[34]
+            P[i, 35] -= gain * p[35]
+            continue
+        x[i] += gain * move
+        for j in range(n):
+            P[i, j] -= gain * p[j]
+
+
+@compiled()
+def _project(P: FloatArray, H: FloatArray, p: FloatArray) -> float:
+    """p = P H' and H P H'."""
+    n = H.shape[0]
+    for j in range(n):
+        p[j] = 0.0
+    for k in range(n):
+        slope = H[k]
+        if slope != 0.0:
+            for j in range(n):
+                p[j] += slope * P[k, j]
+    total = 0.0
+    for k in range(n):
+        total += H[k] * p[k]
+    return total
+
+
+@compiled()
+def cut(
+    begin: float, end: float, switch_t: FloatArray, switch_g: FloatArray, last: int, segments: FloatArray
+) -> int:
+    """Segments of constant command between two times; returns their number.
+
+    Parameters
+    ----------
+    switch_t, switch_g : ring of the times at which commands take effect and of their static forces.
+    last : place of the newest. Before the oldest one the oldest holds.
+    """
+    size = switch_t.shape[0]
+    back = 0
+    while back < size - 1 and switch_t[(last - back) % size] > begin:
+        back += 1
+    count, now = 0, begin
+    while True:
+        at = (last - back) % size
+        stop = end
+        if back > 0 and count < _MOST_SEGMENTS - 1:
+            stop = min(end, max(switch_t[(last - back + 1) % size], now))
+        if stop > now or stop == end:
+            segments[count, 0] = stop - now
+            segments[count, 1], segments[count, 2] = switch_g[at, 0], switch_g[at, 1]
+            count += 1
+            now = stop
+        if stop == end or back == 0:
+            return count
+        back -= 1
+
+
+@compiled()
+def predict_driven(
+    x: FloatArray, P: FloatArray, begin: float, end: float, plant: FloatArray, walk: FloatArray,
+    switch_t: FloatArray, switch_g: FloatArray, last: int, F: FloatArray, work: FloatArray,
+) -> None:  # fmt: skip
+    """Carry a state on from one time to another, in place; F (12, 23) is that of the last part."""
+    if not end > begin:
+        return
+    parts = max(math.ceil((end - begin) / LONGEST_S - 1e-9), 1)
+    h = (end - begin) / parts
+    segments, moved = work[8:12].reshape(-1)[: 3 * _MOST_SEGMENTS].reshape(_MOST_SEGMENTS, 3), work[6]
+    for k in range(parts):
+        count = cut(begin + k * h, begin + (k + 1) * h, switch_t, switch_g, last, segments)
+        jacobian(plant, x, segments, count, moved, F)
+        carry(P, F, walk, h, work[12:])
+        for i in range(DYNAMIC):
+            x[i] = moved[i]
+
+
+@compiled()
+def _spread_out(h: FloatArray, H: FloatArray) -> None:
+    """A gradient (19,) by head and sensors as one by the driven state; accelerations are left out."""
+    for k in range(4, INVOLVED):
+        H[k] = 0.0
+    for k in range(4):
+        H[k] = h[k]
+    for k in range(6, SIZE):
+        H[k + _SHIFT] = h[k]
+
+
+@compiled()
+def measure(
+    kind: int, x: FloatArray, P: FloatArray, plant: FloatArray, view: FloatArray, constants: FloatArray,
+    noise: FloatArray, stamp: float, H: FloatArray, out: FloatArray, work: FloatArray,
+) -> None:  # fmt: skip
+    """Predicted readings out[0:3] and variances of their noise out[3:6]; H (3, 36) gets the gradients.
+
+    `stamp` is the variance [s^2] of the event's time: what moves fast is not read where it was.
+    """
+    state = work[0, :SIZE]
+    state[0], state[1], state[2], state[3], state[4], state[5] = x[0], x[1], x[2], x[3], 0.0, 0.0
+    for k in range(6, SIZE):
+        state[k] = x[k + _SHIFT]
+    h0, h1 = work[1, :SIZE], work[7, :SIZE]
+    if kind == CAMERA:
+        out[0], out[1] = marker(view, state, h0, h1)
+        _spread_out(h0, H[0])
+        _spread_out(h1, H[1])
+        for k in range(2):
+            speed = H[k, 0] * x[2] + H[k, 1] * x[3]
+            out[3 + k] = noise[0] * noise[0] + speed * speed * stamp
+            if speed * speed < _TELLING * (H[k, 0] ** 2 * P[2, 2] + H[k, 1] ** 2 * P[3, 3]):
+                H[k, 30] = 0.0
+        return
+    by_phi, by_length = work[8], work[9]
+    state[4], state[5] = accelerations(plant, x, by_phi, by_length)
+    out[0], out[1] = accelerometer(constants[0], constants[1], state, h0, h1)
+    tilt = x[0] + x[26]
+    moved_x = out[0] - x[24] - constants[0] * math.cos(tilt)
+    moved_y = out[1] - x[25] - constants[0] * math.sin(tilt)
+    moved = moved_x * moved_x + moved_y * moved_y
+    # Of a swing at _SWING_RADPS the acceleration changes by so much in a second.
+    turning = constants[0] * constants[0] * x[2] * x[2] + _SWING_RADPS * _SWING_RADPS * moved
+    scale = noise[5] * noise[5] * moved + stamp * turning
+    for k in range(2):
+        h = h0 if k == 0 else h1
+        _spread_out(h, H[k])
+        for i in range(INVOLVED):
+            H[k, i] += h[4] * by_phi[i] + h[5] * by_length[i]
+        out[3 + k] = noise[2 + k] * noise[2 + k] + scale
+    out[2] = gyroscope(state, h0)
+    _spread_out(h0, H[2])
+    if x[2] * x[2] < _TELLING * P[2, 2]:
+        H[2, 27] = 0.0
+    out[5] = noise[4] * noise[4] + state[4] * state[4] * stamp
+
+
+@compiled()
+def _chi_square(
+    P: FloatArray, H: FloatArray, p: FloatArray, first: int, e: FloatArray, r: FloatArray, more: float
+) -> tuple[float, float, float]:
+    """Chi-square of two readings together, and the deviations of both."""
+    a = _project(P, H[first], p) + r[first] + more
+    b = 0.0
+    for k in range(H.shape[1]):
+        b += H[first + 1, k] * p[k]
+    c = _project(P, H[first + 1], p) + r[first + 1] + more
+    e0, e1 = e[first], e[first + 1]
+    total = (c * e0 * e0 - 2.0 * b * e0 * e1 + a * e1 * e1) / (a * c - b * b)
+    return total, math.sqrt(a), math.sqrt(c)
+
+
+@compiled()
+def driven_event(
+    x: FloatArray, P: FloatArray, kind: int, z: FloatArray, plant: FloatArray, view: FloatArray,
+    constants: FloatArray, noise: FloatArray, work: FloatArray, again: bool, report: FloatArray,
+    gated: FloatArray,
+) -> None:  # fmt: skip
+    """Update a predicted state by an event, in place.
+
+    Parameters
+    ----------
+    kind, z : `CAMERA`, `IMU` or `HOSES` and (4,) its readings, NaN where missing, and the variance of its
+        time [s^2]; of `HOSES` the deviation that the damping then has.
+    plant : (22,). view, constants, noise : as in `kernel.event`.
+    work : scratch of the shape `WORK`. report : (12,) of `kernel.REPORT`, written to.
+    again : whether the event is done once more; then `gated` (3,) holds.
+    """
+    if not again:
+        for k in range(report.shape[0]):
+            report[k] = math.nan
+    log_l = 0.0
+    stamp = max(noise[6 if kind == CAMERA else 7] ** 2, z[3])
+    H, p, out, e = work[2:5], work[0], work[5], work[10]
+    if kind == HOSES:
+        for k in range(x.shape[0]):
+            p[k] = P[k, 13]
+        _update(x, P, -x[13], P[13, 13] + z[0] * z[0], p)
+    elif kind == CAMERA:
+        measure(kind, x, P, plant, view, constants, noise, stamp, H, out, work)
+        e[0], e[1] = z[0] - out[0], z[1] - out[1]
+        grid = noise[1] * noise[1] / 12.0
+        if not again:
+            gate, _, _ = _chi_square(P, H, p, 0, e, out[3:6], grid + _MARGIN_PX2)
+            report[0], s0, s1 = _chi_square(P, H, p, 0, e, out[3:6], grid)
+            report[3], report[4] = e[0] / s0, e[1] / s1
+            gated[0] = 0.0 if gate < noise[8] else 1.0
+            report[8] = gated[0]
+        if gated[0] == 0.0:
+            x0 = work[1]
+            for k in range(x.shape[0]):
+                x0[k] = x[k]
+            for k in range(2):
+                spread = _project(P, H[k], p)
+                moved = 0.0
+                for i in range(x.shape[0]):
+                    moved += H[k, i] * (x[i] - x0[i])
+                y, S, log_z = update_terms(e[k] - moved, spread, out[3 + k], noise[1])
+                log_l += log_z
+                _update(x, P, y, S, p)
+    elif kind == IMU:
+        measure(kind, x, P, plant, view, constants, noise, stamp, H, out, work)
+        for k in range(3):
+            e[k] = z[k] - out[k]
+        if not again:
+            gated[1], gated[2] = 1.0, 1.0
+            known = P[3, 3] < _KNOWN_MPS * _KNOWN_MPS
+            if known and not (math.isnan(z[0]) or math.isnan(z[1])):
+                report[1], s0, s1 = _chi_square(P, H, p, 0, e, out[3:6], 0.0)
+                report[5], report[6] = e[0] / s0, e[1] / s1
+                gated[1] = 0.0 if report[1] < noise[9] else 1.0
+                report[9] = gated[1]
+            if not math.isnan(z[2]):
+                S = _project(P, H[2], p) + out[5]
+                report[2], report[7] = e[2] * e[2] / S, e[2] / math.sqrt(S)
+                gated[2] = 0.0 if report[2] < noise[10] else 1.0
+                report[10] = gated[2]
+        x0 = work[1]
+        for k in range(x.shape[0]):
+            x0[k] = x[k]
+        for order in range(3):
+            k = 2 if order == 0 else order - 1
+            if gated[2 if k == 2 else 1] != 0.0:
+                continue
+            S = _project(P, H[k], p) + out[3 + k]
+            y = e[k]
+            for i in range(x.shape[0]):
+                y -= H[k, i] * (x[i] - x0[i])
+            log_l -= 0.5 * (y * y / S + math.log(2.0 * math.pi * S))
+            _update(x, P, y, S, p)
+    report[11] = log_l
+
+
+assert SIZE_D == 36
+
+
+# ----------------------------------------------------------------------
+# The driven filter, row by row: the dynamics with the commands as input, readings as they arrive.
+#
+# As in `filter` a picture belongs to its exposure, before IMU samples that have been used already; the last
+# events are kept with the state before the reading of each, the picture is put among them and those after
+# it
+# are done again. A command acts `delay_s` after the tick that gave it, so it is known in time.
+#
+# The first command that is not zero says that the hoses are on (`HOSES`); until then the damping may be
+# that of either. When most readings are rejected for a tenth of a second, time jumps, or the state leaves
+# the
+# model, the filter starts again from the next picture: somebody may have held the head, or let it go.
+
+_LOCKED_OUT = 5.5
+"""So many pictures rejected, IMU readings twice so many, and the filter starts again."""
+_BEFORE_S = 0.03
+_LAST, _REJECTED, _FIRST, _REJECTED_IMU, _BEGUN = range(5)
+_NEWEST, _COUNT, _STARTED, _PENDING, _SWITCH, _HOSES = range(6)
+_SWITCHES = 128
+
+
+@compiled()
+def write_row(x: FloatArray, P: FloatArray, dt: float, radius: float, out: FloatArray) -> None:
+    """Mean and deviations a very short time dt after the state into columns 1 to 12."""
+    phi, length = x[0] + dt * x[2], x[1] + dt * x[3]
+    pp = P[0, 0] + dt * (2.0 * P[0, 2] + dt * P[2, 2])
+    ll = P[1, 1] + dt * (2.0 * P[1, 3] + dt * P[3, 3])
+    pl = P[0, 1] + dt * (P[0, 3] + P[1, 2] + dt * P[2, 3])
+    r = radius
+    out[1], out[2] = length + r * phi, length - r * phi
+    out[3], out[4] = x[3] + r * x[2], x[3] - r * x[2]
+    out[5], out[6] = phi, length
+    out[7], out[8] = head_position(phi, length)
+    out[9] = x[INVOLVED]
+    out[10] = math.sqrt(max(ll + r * r * pp + 2.0 * r * pl, 1e-18))
+    out[11] = math.sqrt(max(ll + r * r * pp - 2.0 * r * pl, 1e-18))
+    out[12] = math.sqrt(max(pp, 1e-18))
+
+
+@compiled()
+def begin_again(
+    x: FloatArray, P: FloatArray, x0: FloatArray, P0: FloatArray, view: FloatArray, u: float, v: float
+) -> bool:
+    """Start a state (36,) from its prior and a picture; what has been learnt may be wrong and goes."""
+    phi, length, found = invert_marker(view, x0[INVOLVED:], u, v, 0.0, x0[1])
+    if not (found and 0.2 * x0[1] < length < 3.0 * x0[1]):
+        return False
+    copy_state(x, P, x0, P0)
+    x[0], x[1] = phi, length
+    return True
+
+
+@compiled()
+def sound(x: FloatArray, P: FloatArray) -> bool:
+    """Whether a state is one."""
+    good = abs(x[0]) < 3.0 and 1e-3 < x[1] < 1.0
+    for i in range(x.shape[0]):
+        good = good and abs(x[i]) < 1e4 and 0.0 < P[i, i] < 1e6
+        good = good and abs(P[0, i]) + abs(P[1, i]) + abs(P[2, i]) + abs(P[3, i]) < 1e6
+    return bool(good)
+
+
+@compiled()
+def run_driven(
+    t: FloatArray, readings: FloatArray, kinds: IntArray, forces: FloatArray, driven: FloatArray,
+    ring_x: FloatArray, ring_P: FloatArray, ring_t: FloatArray, ring_z: FloatArray, ring_kind: IntArray,
+    ring_gated: FloatArray, switch_t: FloatArray, switch_g: FloatArray, whole: IntArray, real: FloatArray,
+    camera_clock: FloatArray, imu_clock: FloatArray, x0: FloatArray, P0: FloatArray, plant: FloatArray,
+    walk: FloatArray, view: FloatArray, constants: FloatArray, noise: FloatArray, radius: float,
+    delay: float, action: float, hoses_sigma: float, z: FloatArray, report: FloatArray, spare: FloatArray,
+    spare_x: FloatArray, spare_P: FloatArray, F: FloatArray, work: FloatArray, out: FloatArray,
+) -> None:  # fmt: skip
+    """Rows (n,), (n, 5), (n,), (n, 2), (n,) through the ring of the last events; writes `out`.
+
+    `driven` says whether a row's command drives the pumps, `action` how long after it it acts [s]. What is
+    from `z` (4,) on is scratch.
+    """
+    size = ring_x.shape[0]
+    for row in range(len(t)):
+        stamp = t[row]
+        flags = 0
+        if begin_row(stamp, real[_LAST], camera_clock, imu_clock, out, row):
+            newest = whole[_NEWEST]
+            whole[_COUNT], whole[_STARTED], whole[_PENDING] = 0, 0, 0
+            for k in range(len(switch_t)):
+                switch_t[k] = -math.inf
+                switch_g[k, 0] = switch_g[whole[_SWITCH], 0]
+                switch_g[k, 1] = switch_g[whole[_SWITCH], 1]
+            real[_REJECTED], real[_REJECTED_IMU], real[_FIRST] = 0.0, 0.0, stamp
+            flags |= 32
+        elif math.isnan(real[_LAST]):
+            real[_REJECTED], real[_REJECTED_IMU], real[_FIRST] = 0.0, 0.0, stamp
+        real[_LAST] = stamp
+        tick = stamp
+        if kinds[row] & 1:
+            tick = advance(camera_clock, stamp)
+        if not math.isnan(forces[row, 0]):
+            to = (whole[_SWITCH] + 1) % len(switch_t)
+            switch_t[to] = max(tick + action, switch_t[whole[_SWITCH]])
+            switch_g[to, 0], switch_g[to, 1] = forces[row, 0], forces[row, 1]
+            whole[_SWITCH] = to
+        for turn in range(3):
+            if turn == 0:
+                # Its own event, so that it is done again with those around it.
+                if whole[_HOSES] == 1 or not driven[row] > 0.0:
+                    continue
+                whole[_HOSES] = 1
+                kind, when = HOSES, tick
+                z[0], z[1], z[2], z[3] = hoses_sigma, math.nan, math.nan, 0.0
+            elif turn == 1:
+                if not kinds[row] & 1:
+                    continue
+                kind, when = CAMERA, tick - delay
+                z[0], z[1], z[2], z[3] = readings[row, 0], readings[row, 1], math.nan, camera_clock[3]
+                if math.isnan(z[0]) or math.isnan(z[1]):
+                    continue
+            else:
+                if not kinds[row] & 2:
+                    continue
+                kind, when = IMU, advance(imu_clock, stamp)
+                z[0], z[1], z[2], z[3] = readings[row, 2], readings[row, 3], readings[row, 4], imu_clock[3]
+                if math.isnan(z[2]) and (math.isnan(z[0]) or math.isnan(z[1])):
+                    continue
+            newest = whole[_NEWEST]
+            if whole[_COUNT] == 0:
+                ring_t[newest], ring_kind[newest] = when, 0
+                whole[_COUNT] = 1
+            back = 0
+            while back < whole[_COUNT] - 1 and ring_t[(newest - back) % size] > when:
+                back += 1
+            if ring_t[(newest - back) % size] > when:
+                if whole[_COUNT] == size:
+                    flags |= 16
+                    continue
+                when = ring_t[(newest - back) % size]
+            for i in range(back):
+                to, since = (newest + 1 - i) % size, (newest - i) % size
+                ring_t[to], ring_kind[to] = ring_t[since], ring_kind[since]
+                for k in range(4):
+                    ring_z[to, k] = ring_z[since, k]
+                for k in range(3):
+                    ring_gated[to, k] = ring_gated[since, k]
+            own = (newest + 1 - back) % size
+            ring_t[own], ring_kind[own] = when, kind
+            for k in range(4):
+                ring_z[own, k] = z[k]
+            # Who holds the head until the log begins is not in the model.
+            begin = (kind == CAMERA and (whole[_STARTED] == 0 or whole[_PENDING] == 1)
+                     and when > real[_FIRST] + _BEFORE_S)  # fmt: skip
+            for i in range(back + 1):
+                now = (newest + 1 - back + i) % size
+                before = (now - 1) % size
+                x, P = ring_x[now], ring_P[now]
+                copy_state(x, P, ring_x[before], ring_P[before])
+                if whole[_STARTED] == 1:
+                    predict_driven(
+                        x, P, ring_t[before], ring_t[now], plant, walk, switch_t, switch_g, whole[_SWITCH],
+                        F, work,
+                    )  # fmt: skip
+                if i == 0 and begin and begin_again(x, P, x0, P0, view, z[0], z[1]):
+                    if whole[_STARTED] == 1:
+                        flags |= 1
+                    whole[_STARTED], whole[_PENDING] = 1, 0
+                    real[_BEGUN] = ring_t[now]
+                    if whole[_HOSES] == 1:
+                        x[13], P[13, 13] = 0.0, hoses_sigma * hoses_sigma
+                if ring_kind[now] == IMU and ring_t[now] < real[_BEGUN] + SETTLING_S:
+                    ring_z[now, 0], ring_z[now, 1], ring_gated[now, 1] = math.nan, math.nan, 1.0
+                if whole[_STARTED] == 0 and ring_kind[now] != HOSES:
+                    for k in range(12):
+                        report[k] = math.nan
+                    for k in range(3):
+                        ring_gated[now, k] = 1.0
+                    continue
+                driven_event(
+                    x, P, ring_kind[now], ring_z[now], plant, view, constants, noise, work, i > 0,
+                    report if i == 0 else spare, ring_gated[now],
+                )  # fmt: skip
+                if not sound(x, P):
+                    copy_state(x, P, x0, P0)
+                    whole[_PENDING] = 1
+                    flags |= 1
+            whole[_NEWEST] = (newest + 1) % size
+            whole[_COUNT] = min(whole[_COUNT] + 1, size)
+            if kind == HOSES:
+                continue
+            likelihood = out[row, 24]
+            for k in range(12):
+                if not math.isnan(report[k]):
+                    out[row, 13 + k] = report[k]
+            if not math.isnan(likelihood):
+                out[row, 24] += likelihood
+            for k in range(3):
+                at = _REJECTED if k == 0 else _REJECTED_IMU
+                if report[8 + k] == 1.0:
+                    real[at] += 1.0
+                elif report[8 + k] == 0.0:
+                    real[at] *= 0.7
+            if real[_REJECTED] > _LOCKED_OUT or real[_REJECTED_IMU] > 2.0 * _LOCKED_OUT:
+                whole[_PENDING], real[_REJECTED], real[_REJECTED_IMU] = 1, 0.0, 0.0
+        here = whole[_NEWEST]
+        ahead = stamp - ring_t[here] if whole[_COUNT] > 0 else 0.0
+        if whole[_STARTED] == 0:
+            flags |= 64
+        if ahead > 1e-3 and whole[_STARTED] == 1:
+            copy_state(spare_x, spare_P, ring_x[here], ring_P[here])
+            predict_driven(
+                spare_x, spare_P, ring_t[here], stamp, plant, walk, switch_t, switch_g, whole[_SWITCH], F,
+                work,
+            )  # fmt: skip
+            if not sound(spare_x, spare_P):
+                copy_state(spare_x, spare_P, x0, P0)
+            write_row(spare_x, spare_P, 0.0, radius, out[row])
+        else:
+            write_row(ring_x[here], ring_P[here], min(max(ahead, -0.02), 1e-3), radius, out[row])
+        out[row, 25] = flags
+
+
+class DrivenFilter:
+    """A driven filter at work: rows and commands in, estimates out, with memory of the last events only."""
+
+    def __init__(self, setup: Setup, drive: Drive) -> None:
+        self.setup, self.drive = setup, drive
+        self._delay = max(float(setup.start.sensor[7]), 0.0)
+        period = setup.imu_period_s if setup.imu_period_s > 0.0 else 0.002
+        size = min(max(16, math.ceil(2.0 * (self._delay + 0.02) / period) + 8), 512)
+        n = len(DRIVEN)
+        self._x, self._P = np.zeros((size, n)), np.zeros((size, n, n))
+        self._t, self._z, self._gated = np.zeros(size), np.zeros((size, 4)), np.zeros((size, 3))
+        self._kind, self._whole = np.zeros(size, dtype=np.int64), np.zeros(6, dtype=np.int64)
+        self._real = np.full(5, np.nan)
+        self._switch_t, self._switch_g = np.full(_SWITCHES, -np.inf), np.zeros((_SWITCHES, 2))
+        self._camera_clock = new_clock(setup.camera_period_s)
+        self._imu_clock = new_clock(setup.imu_period_s)
+        self._start = drive.start(setup)
+        self._x[0], self._P[0] = self._start
+        self._numbers, self._walk, self._noise = drive.numbers(), drive.walk(setup), drive.noise(setup)
+        self._scratch = (
+            np.empty(4), np.empty(12), np.empty(12), np.empty(n), np.empty((n, n)),
+            np.zeros((DYNAMIC, INVOLVED)), np.zeros(WORK),
+        )  # fmt: skip
+
+    def run(self, rows: Rows, pwm: FloatArray) -> FloatArray:
+        """Estimates (n, len(OUT)) of rows with commands (n, 2); call again with the rows that follow."""
+        setup, drive = self.setup, self.drive
+        out = np.empty((len(rows), len(OUT)))
+        driven = np.asarray(np.nan_to_num(pwm).max(axis=1, initial=0.0), dtype=np.float64)
+        run_driven(
+            rows.t_s, rows.readings, rows.kinds, commands(drive, pwm), driven, self._x, self._P, self._t,
+            self._z, self._kind, self._gated, self._switch_t, self._switch_g, self._whole, self._real,
+            self._camera_clock, self._imu_clock, *self._start, self._numbers, self._walk, setup.view,
+            np.array([setup.gravity_mps2, setup.lever_across_m]), self._noise, setup.bellows_radius_m,
+            self._delay, drive.pump.delay_ticks * drive.pump.tick_s, drive.sigma[1], *self._scratch, out,
+        )  # fmt: skip
+        return out
+
+    @property
+    def state(self) -> tuple[FloatArray, FloatArray]:
+        """State (36,) and covariance (36, 36) after the last event."""
+        here = int(self._whole[0])
+        return self._x[here].copy(), self._P[here].copy()
+
+
+assert SIZE == 19
+
+
+# ----------------------------------------------------------------------
+# The driven smoother: forward with the commands, backward by Rauch, Tung and Striebel (1965).
+#
+# Events stand in the order of their times as in `smoother`, pictures at their exposure. With the
+# transition F
+# of `driven_model.jacobian`, its noise Q, P' = F P F' + Q and C = P F' P'^-1
+#
+#     x_N += C (x_N+1 - x'),   P_N += C (P_N+1 - P') C'.
+#
+# Only twelve of the states move, the others are carried over as they are. Where the forward filter starts
+# again the chain is cut: what comes later says nothing of what was before. The backward pass begins anew
+# every
+# `WINDOW` events, from events `OVERLAP` further on.
+
+WINDOW, OVERLAP = 6000, 3000
+_SMOOTHER_BEFORE_S, _SMOOTHER_LOCKED_OUT = 0.03, 5.5
+_SMOOTHER_STARTED, _SMOOTHER_PENDING, _SMOOTHER_HOSES = range(3)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _forward(
+    t: FloatArray, before_s: float, first_s: float, kinds: IntArray, readings: FloatArray, x: FloatArray,
+    P: FloatArray, whole: IntArray, rejected: FloatArray, switch_t: FloatArray, switch_g: FloatArray,
+    x0: FloatArray, P0: FloatArray, plant: FloatArray, walk: FloatArray, view: FloatArray,
+    constants: FloatArray, noise: FloatArray, kept_x: FloatArray, kept_P: FloatArray, ahead: FloatArray,
+    F: FloatArray, chained: BoolArray, alive: BoolArray, keep: int, hoses_sigma: float,
+) -> None:  # fmt: skip
+    """The filter over events, keeping all states; those of the event `keep` and its counters are left."""
+    work, report, gated = np.zeros(WORK), np.empty(12), np.zeros(3)
+    own_x, own_P, counters, marks = x.copy(), P.copy(), rejected.copy(), whole.copy()
+    last = 0
+    for k in range(len(t)):
+        begin = t[k - 1] if k else before_s
+        while last < len(switch_t) - 1 and switch_t[last + 1] <= t[k]:
+            last += 1
+        F[k] = 0.0
+        chained[k] = False
+        if whole[_SMOOTHER_STARTED] == 1:
+            for i in range(DYNAMIC):
+                F[k, i, i] = 1.0
+            predict_driven(x, P, begin, t[k], plant, walk, switch_t, switch_g, last, F[k], work)
+            chained[k] = True
+        ahead[k] = x[:DYNAMIC]
+        kind, z = kinds[k], readings[k]
+        if kind == HOSES:
+            whole[_SMOOTHER_HOSES] = 1
+        waits = (whole[_SMOOTHER_STARTED] == 0 or whole[_SMOOTHER_PENDING] == 1) and t[
+            k
+        ] > first_s + _SMOOTHER_BEFORE_S
+        if waits and kind == CAMERA and begin_again(x, P, x0, P0, view, z[0], z[1]):
+            whole[_SMOOTHER_STARTED], whole[_SMOOTHER_PENDING] = 1, 0
+            chained[k] = False
+            rejected[2] = t[k]
+            if whole[_SMOOTHER_HOSES] == 1:
+                x[13], P[13, 13] = 0.0, hoses_sigma * hoses_sigma
+        if kind == IMU and t[k] < rejected[2] + SETTLING_S:
+            z[0], z[1] = math.nan, math.nan
+        if whole[_SMOOTHER_STARTED] == 1 and kind != 0:
+            driven_event(x, P, kind, z, plant, view, constants, noise, work, False, report, gated)
+            for i in range(3):
+                if report[8 + i] == 1.0:
+                    rejected[min(i, 1)] += 1.0
+                elif report[8 + i] == 0.0:
+                    rejected[min(i, 1)] *= 0.7
+            if not sound(x, P):
+                x[:], P[:] = x0, P0
+                chained[k] = False
+                whole[_SMOOTHER_PENDING] = 1
+            elif rejected[0] > _SMOOTHER_LOCKED_OUT or rejected[1] > 2.0 * _SMOOTHER_LOCKED_OUT:
+                whole[_SMOOTHER_PENDING] = 1
+                rejected[:2] = 0.0
+        kept_x[k], kept_P[k] = x, P
+        alive[k] = whole[_SMOOTHER_STARTED] == 1
+        if k == keep:
+            own_x[:], own_P[:], counters[:], marks[:] = x, P, rejected, whole
+    x[:], P[:], rejected[:], whole[:] = own_x, own_P, counters, marks
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _backward(
+    t: FloatArray, walk: FloatArray, F: FloatArray, ahead: FloatArray, chained: BoolArray, kept_x: FloatArray,
+    kept_P: FloatArray,
+) -> None:  # fmt: skip
+    """Over the kept states, in place."""
+    n = kept_x.shape[1]
+    normal, cross, FP = np.empty((n, n)), np.empty((n, n)), np.empty((DYNAMIC, n))
+    P, scale, move, change = np.empty((n, n)), np.empty(n), np.empty(n), np.empty((n, n))
+    for k in range(len(t) - 2, -1, -1):
+        if not chained[k + 1] or not t[k + 1] > t[k]:
+            if chained[k + 1]:
+                kept_x[k], kept_P[k] = kept_x[k + 1], kept_P[k + 1]
+            continue
+        G = F[k + 1]
+        P[:] = kept_P[k]
+        carry(P, G, walk, t[k + 1] - t[k], FP)
+        # FP is F P of the moving part; below it P itself.
+        for i in range(n):
+            scale[i] = 1.0 / math.sqrt(P[i, i])
+        for i in range(n):
+            for j in range(n):
+                normal[i, j] = P[i, j] * scale[i] * scale[j]
+                cross[i, j] = (FP[i, j] if i < DYNAMIC else kept_P[k, i, j]) * scale[i]
+            normal[i, i] += 1e-12
+        gain = np.linalg.solve(normal, cross).T
+        for i in range(n):
+            before = ahead[k + 1, i] if i < DYNAMIC else kept_x[k, i]
+            move[i] = (kept_x[k + 1, i] - before) * scale[i]
+            for j in range(n):
+                change[i, j] = (kept_P[k + 1, i, j] - P[i, j]) * scale[i] * scale[j]
+        kept_x[k] += gain @ move
+        added = gain @ change @ gain.T
+        for i in range(n):
+            for j in range(n):
+                kept_P[k, i, j] += 0.5 * (added[i, j] + added[j, i])
+            kept_P[k, i, i] = max(kept_P[k, i, i], 1e-24)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _write(
+    kept_x: FloatArray, kept_P: FloatArray, kinds: IntArray, rows: IntArray, alive: BoolArray, radius: float,
+    out: FloatArray,
+) -> None:  # fmt: skip
+    for k in range(len(kinds)):
+        if kinds[k] == 0 and rows[k] >= 0 and alive[k]:
+            write_row(kept_x[k], kept_P[k], 0.0, radius, out[rows[k]])
+
+
+def _timeline(
+    setup: Setup, drive: Drive, rows: Rows, pwm: FloatArray
+) -> tuple[FloatArray, IntArray, FloatArray, IntArray, FloatArray, FloatArray]:
+    """Times, kinds, readings (n, 4) and rows of all events, and when commands act with their forces."""
+    events = events_of(setup, rows)
+    forces = commands(drive, pwm)
+    ticks = rows.t_s.copy()
+    camera = np.nonzero(rows.kinds & 1)[0]
+    ticks[camera] = even_times(new_clock(setup.camera_period_s), rows.t_s[camera])
+    given = np.isfinite(forces[:, 0])
+    action = drive.pump.delay_ticks * drive.pump.tick_s
+    switch_t = np.concatenate([[-np.inf], np.maximum.accumulate(ticks[given] + action)])
+    switch_g = np.concatenate([np.zeros((1, 2)), forces[given]])
+    t, kinds, at = events.t_s, events.kinds, events.rows
+    readings = np.full((len(t), 4), 0.0)
+    readings[:, :3] = events.readings
+    extra_t, extra_kind = [np.zeros(0)], [np.zeros(0, dtype=np.int64)]
+    driven = np.nonzero(np.nan_to_num(pwm).max(axis=1, initial=0.0) > 0.0)[0]
+    if len(driven):
+        extra_t.append(ticks[driven[:1]])
+        extra_kind.append(np.array([HOSES]))
+    for k in np.nonzero(np.diff(t) > 0.95 * LONGEST_S)[0]:
+        # No step is taken in parts, so that each has one transition. Longer silences are a cut.
+        gap = t[k + 1] - t[k]
+        if gap < 2.0:
+            fill = np.linspace(t[k], t[k + 1], math.ceil(gap / (0.95 * LONGEST_S)) + 1)[1:-1]
+            extra_t.append(fill)
+            extra_kind.append(np.zeros(len(fill), dtype=np.int64))
+    more_t, more_kind = np.concatenate(extra_t), np.concatenate(extra_kind)
+    more = np.zeros((len(more_t), 4))
+    more[:, 0] = drive.sigma[1]
+    order = np.argsort(np.concatenate([t, more_t]), kind="stable")
+    readings = np.concatenate([readings, more])[order]
+    kinds = np.concatenate([kinds, more_kind])[order]
+    at = np.concatenate([at, np.full(len(more_t), -1)])[order]
+    return np.concatenate([t, more_t])[order], kinds, readings, at, switch_t, switch_g
+
+
+def smooth_driven(setup: Setup, drive: Drive, rows: Rows, pwm: FloatArray, outputs: FloatArray) -> FloatArray:
+    """Smoothed estimates (n, len(OUT)) at the rows' stamps; NaN where the filter had not started.
+
+    Parameters
+    ----------
+    pwm : (n, 2) commands, NaN in rows without.
+    outputs : (n, len(OUT)) of the driven filter; what it says of innovations and flags is kept.
+    """
+    t, kinds, readings, at, switch_t, switch_g = _timeline(setup, drive, rows, pwm)
+    x, P = drive.start(setup)
+    x0, P0 = x.copy(), P.copy()
+    constants = np.array([setup.gravity_mps2, setup.lever_across_m])
+    whole, rejected = np.zeros(3, dtype=np.int64), np.zeros(3)
+    plant, walk, noise = drive.numbers(), drive.walk(setup), drive.noise(setup)
+    out = outputs.copy()
+    out[:, 1:13] = np.nan
+    n, size = len(t), len(DRIVEN)
+    begin, before = 0, float(t[0]) if n else 0.0
+    first = float(rows.t_s[0]) - max(float(setup.start.sensor[7]), 0.0) if n else 0.0
+    while begin < n:
+        end = min(begin + WINDOW, n)
+        stop = min(end + OVERLAP, n)
+        part, count = slice(begin, stop), stop - begin
+        kept_x, kept_P = np.empty((count, size)), np.empty((count, size, size))
+        ahead, F = np.empty((count, DYNAMIC)), np.empty((count, DYNAMIC, INVOLVED))
+        chained, alive = np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
+        _forward(
+            t[part], before, first, kinds[part], readings[part], x, P, whole, rejected, switch_t, switch_g,
+            x0, P0, plant, walk, setup.view, constants, noise, kept_x, kept_P, ahead, F, chained,
+            alive, end - begin - 1, drive.sigma[1],
+        )  # fmt: skip
+        _backward(t[part], walk, F, ahead, chained, kept_x, kept_P)
+        own = slice(0, end - begin)
+        _write(
+            kept_x[own], kept_P[own], kinds[begin:end], at[begin:end], alive[own], setup.bellows_radius_m, out
+        )
+        before = float(t[end - 1])
+        begin = end
+    return out
+
+
+# ----------------------------------------------------------------------
+# Which of two models speaks: the driven one while it explains the pictures, else the kinematic one.
+#
+# Both filters predict every picture. With s the sum over pictures of the log likelihood of the driven
+# filter
+# minus that of the kinematic one, each term cut to +-`CUT` and forgotten over `MEMORY_S`, the driven one's
+# weight is
+#
+#     w = 1 / (1 + exp(-(s - OFFSET) / SOFT)).
+#
+# Pictures are compared since they alone see the length. Likelihoods only compare two predictions, though,
+# and a wrong model of the plant may still predict better than one that knows nothing. So the driven filter
+# must agree with itself as well: over what is in memory the mean of each sensor's innovations, which a
+# wrong
+# force moves first, and their mean square are chi-square, and what they exceed that by is taken from s. A
+# restart or a reading that only the driven filter rejects counts against it too.
+#
+# Means are mixed by the weight, and what they differ by is added to the covariance.
+
+HANDOVER_STATE = 14
+"""Entries: time, s, and for each sensor a count, the sum of NIS and the sums of its innovations."""
+
+CUT, MEMORY_S = 6.0, 1.0
+OFFSET, SOFT = -4.0, 1.5
+AGAIN, BEGIN = -40.0, -12.0
+"""s after a restart, and at the first start of a filter that has to find its state; a smoother has not."""
+PULLED, PULL = 10.0, 0.5
+EXCEEDED, EXCESS = 0.25, 20.0
+_E, _NIS, _GATED, _LL, _FLAGS = (
+    OUT.index(name) for name in ("e_u", "nis_camera", "gated_camera", "log_likelihood", "flags")
+)
+
+
+def new_handover() -> FloatArray:
+    """Memory of `weigh` before the first row."""
+    memory = np.zeros(HANDOVER_STATE)
+    memory[0] = np.nan
+    return memory
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _distrust(memory: FloatArray) -> float:
+    """What the driven filter's innovations in memory cost it."""
+    cost = 0.0
+    for sensor in range(3):
+        at = 2 + 4 * sensor
+        count = memory[at]
+        if count < 6.0:
+            continue
+        # Of white innovations (sum)^2 / count is chi-square with one degree for each axis.
+        pull = (memory[at + 2] ** 2 + memory[at + 3] ** 2) / count
+        cost += PULL * max(pull - PULLED, 0.0)
+        degrees = 1.0 if sensor == 2 else 2.0
+        excess = memory[at + 1] / (degrees * count) - 1.0
+        cost += EXCESS * max(excess - 4.0 / math.sqrt(degrees * count) - EXCEEDED, 0.0)
+    return cost
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def weigh(
+    driven: FloatArray, kinematic: FloatArray, memory: FloatArray, begin: float, weight: FloatArray
+) -> None:
+    """Weight (n,) of the driven model after each row of both outputs (n, len(OUT)).
+
+    `begin` is s where the driven filter has not started.
+    """
+    for row in range(len(driven)):
+        t = driven[row, 0]
+        step = t - memory[0] if t > memory[0] else 0.0
+        memory[0] = t
+        keep = math.exp(-step / MEMORY_S)
+        for k in range(1, HANDOVER_STATE):
+            memory[k] *= keep
+        gated, other = driven[row, _GATED], kinematic[row, _GATED]
+        if gated == 0.0 and other == 0.0:
+            difference = driven[row, _LL] - kinematic[row, _LL]
+            memory[1] += min(max(difference, -CUT), CUT)
+        elif gated == 1.0 and other == 0.0:
+            memory[1] -= CUT
+        for sensor in range(3):
+            at, e = 2 + 4 * sensor, _E + 2 * sensor
+            if driven[row, _GATED + sensor] == 0.0:
+                memory[at] += 1.0
+                memory[at + 1] += driven[row, _NIS + sensor]
+                memory[at + 2] += driven[row, e]
+                if sensor < 2:
+                    memory[at + 3] += driven[row, e + 1]
+            elif driven[row, _GATED + sensor] == 1.0 and kinematic[row, _GATED + sensor] == 0.0:
+                memory[1] -= 0.5 * CUT
+        flags = int(driven[row, _FLAGS])
+        if flags & 97:
+            # Restarted, time jumped, or not started.
+            memory[1:] = 0.0
+            memory[1] = AGAIN if flags & 33 else begin
+        s = memory[1] - _distrust(memory)
+        weight[row] = 1.0 / (1.0 + math.exp(min(max(-(s - OFFSET) / SOFT, -40.0), 40.0)))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _positions(out: FloatArray) -> None:
+    for k in range(len(out)):
+        out[k, 7], out[k, 8] = head_position(out[k, 5], out[k, 6])
+
+
+def blended(driven: FloatArray, kinematic: FloatArray, weight: FloatArray) -> FloatArray:
+    """Both outputs (n, len(OUT)) mixed by the weight (n,) of the driven one, which is written beside them.
+
+    Innovations and gates are those of the filter that has the greater weight, flags of the kinematic one.
+    """
+    w = np.where(np.isfinite(driven[:, 5]), weight, 0.0)
+    driven = np.where((w > 0.0)[:, None], driven, kinematic)
+    out = np.where((w >= 0.5)[:, None], driven, kinematic)
+    columns = [1, 2, 3, 4, 5, 6, 9]
+    out[:, columns] = w[:, None] * driven[:, columns] + (1.0 - w)[:, None] * kinematic[:, columns]
+    _positions(out)
+    for sigma, value in ((10, 1), (11, 2), (12, 5)):
+        apart = driven[:, value] - kinematic[:, value]
+        variance = w * driven[:, sigma] ** 2 + (1.0 - w) * kinematic[:, sigma] ** 2
+        out[:, sigma] = np.sqrt(variance + w * (1.0 - w) * apart**2)
+    for name in ("flags", "swing_weight", "rest_weight"):
+        out[:, OUT.index(name)] = kinematic[:, OUT.index(name)]
+    out[:, OUT.index("driven_weight")] = w
+    return out
+
+
+class Handover:
+    """Both filters at work and the weighing of them; rows and commands in, estimates out."""
+
+    def __init__(self, setup: Setup, drive: Drive) -> None:
+        self._kinematic, self._driven = Filter(setup), DrivenFilter(setup, drive)
+        self._memory = new_handover()
+
+    def run_each(self, rows: Rows, pwm: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Estimates of the driven and of the kinematic filter (n, len(OUT)), and the driven one's weight."""
+        driven, kinematic = self._driven.run(rows, pwm), self._kinematic.run(rows)
+        weight = np.empty(len(rows))
+        weigh(driven, kinematic, self._memory, BEGIN, weight)
+        return driven, kinematic, weight
+
+    def run(self, rows: Rows, pwm: FloatArray) -> FloatArray:
+        """Estimates (n, len(OUT)) of rows with commands (n, 2); call again with the rows that follow."""
+        return blended(*self.run_each(rows, pwm))
+
+
+def smooth_both(
+    setup: Setup, drive: Drive, rows: Rows, pwm: FloatArray, driven: FloatArray, kinematic: FloatArray
+) -> FloatArray:
+    """Smoothed estimates (n, len(OUT)) of both models, weighed by what both sides of a row say.
+
+    Parameters
+    ----------
+    driven, kinematic : (n, len(OUT)) of the filters on the same rows.
+    """
+    weight, after = np.empty(len(rows)), np.empty(len(rows))
+    weigh(driven, kinematic, new_handover(), 0.0, weight)
+    back = driven[::-1].copy()
+    back[:, 0] = -back[:, 0]
+    weigh(back, kinematic[::-1].copy(), new_handover(), 0.0, after)
+    return blended(
+        smooth_driven(setup, drive, rows, pwm, driven),
+        smooth(setup, rows, kinematic),
+        np.minimum(weight, after[::-1]),
+    )

@@ -1,0 +1,235 @@
+"""Noise of sensors and process, tuned on logs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.core.arrays import FloatArray
+from calib.stages.estimator.driven import Drive, DrivenFilter
+from calib.stages.estimator.kinematic import OUT, Filter, Kinematic, Level, Rows, Setup
+
+# ----------------------------------------------------------------------
+# Noise that a log itself tells: the tracker's jitter, and levels of process noise.
+#
+# The likelihood of a log is the product of what its filter expected of each reading. It is maximised
+# over the logarithm of one number at a time: a grid, then the parabola through the best three
+# values, whose curvature gives the standard deviation. Pooled over logs of rest and motion it would drive
+# the process noise to what the most frequent regime needs, so each level of the bank is tuned by logs in
+# which
+# it speaks, weighted by nothing else: the bank's own likelihood does that.
+
+_JITTERS_PX = np.array([0.05, 0.1, 0.15, 0.22, 0.3, 0.42, 0.6, 0.85, 1.2, 2.0])
+_FACTORS = np.array([0.5, 1.0, 2.0])
+GATED = 12.0
+"""What a gated sensor costs."""
+_DEFAULT_JITTER_PX = 0.4
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number and the standard deviation of its logarithm, None where the log does not bound it."""
+
+    value: float
+    sigma: float | None
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """What tuning has found.
+
+    Attributes
+    ----------
+    setup : with the tuned noise. jitter_px : of the tracker.
+    factors : by level and axis, against the bank before.
+    before, after : log likelihood of all logs. rows : of all logs.
+    """
+
+    setup: Setup
+    jitter_px: Estimate
+    factors: dict[str, Estimate]
+    before: float
+    after: float
+    rows: int
+
+
+def grid_px(readings: FloatArray) -> float:
+    """Step of the pixels in readings (n, 5): 1 where all are whole, else 0."""
+    seen = readings[:, :2][np.isfinite(readings[:, :2]).all(axis=1)]
+    return 1.0 if len(seen) and bool(np.all(seen == np.rint(seen))) else 0.0
+
+
+def log_likelihood(setup: Setup, logs: Sequence[Rows]) -> float:
+    """Of all logs; a gated sensor counts as a reading at the edge, so that gating wins nothing."""
+    total = 0.0
+    gates = [OUT.index(f"gated_{name}") for name in ("camera", "accel", "gyro")]
+    for rows in logs:
+        out = Filter(setup).run(rows)
+        total += float(np.nansum(out[:, OUT.index("log_likelihood")]))
+        total -= GATED * float(np.nansum(out[:, gates]))
+    return total
+
+
+def best(values: FloatArray, likelihood: Callable[[float], float]) -> tuple[Estimate, float]:
+    """The maximum over a rising grid of positive numbers, refined in the logarithm."""
+    found = np.array([likelihood(float(value)) for value in values])
+    k = int(np.argmax(found))
+    if not 0 < k < len(values) - 1:
+        return Estimate(float(values[k]), None), float(found[k])
+    x, y = np.log(values[k - 1 : k + 2]), found[k - 1 : k + 2]
+    a, b, _ = np.polyfit(x - x[1], y - y[1], 2)
+    if not a < 0.0:
+        return Estimate(float(values[k]), None), float(found[k])
+    top = float(np.clip(-0.5 * b / a, x[0] - x[1], x[2] - x[1]))
+    value = math.exp(x[1] + top)
+    at_top = likelihood(value)
+    if at_top < found[k]:
+        return Estimate(float(values[k]), math.sqrt(-0.5 / a)), float(found[k])
+    return Estimate(value, math.sqrt(-0.5 / a)), at_top
+
+
+def _with_jitter(setup: Setup, jitter: float) -> Setup:
+    noise = setup.noise.copy()
+    noise[0] = jitter
+    return replace(setup, noise=noise)
+
+
+def jitter_px(setup: Setup, logs: Sequence[Rows]) -> Estimate:
+    """Standard deviation of the tracker's jitter before rounding [px], by maximum likelihood.
+
+    Without pictures it is a guess of 0.4 px without deviation.
+    """
+    if not any(np.isfinite(rows.readings[:, 0]).any() for rows in logs):
+        return Estimate(_DEFAULT_JITTER_PX, None)
+    return best(_JITTERS_PX, lambda value: log_likelihood(_with_jitter(setup, value), logs))[0]
+
+
+def _scaled(process: Kinematic, index: int, axis: str, factor: float) -> Kinematic:
+    level = process.levels[index]
+    if axis == "phi":
+        made = replace(level, accel_phi_radps2=level.accel_phi_radps2 * factor)
+    else:
+        made = replace(level, accel_length_mps2=level.accel_length_mps2 * factor)
+    levels: list[Level] = list(process.levels)
+    levels[index] = made
+    return replace(process, levels=tuple(levels))
+
+
+def tune(setup: Setup, logs: Sequence[Rows], progress: Callable[[int, int], None] | None = None) -> Tuning:
+    """Jitter and the levels' accelerations by maximum likelihood, one after the other.
+
+    A factor of a level is at most two either way: logs without its motion say little about it.
+    """
+    before = log_likelihood(setup, logs)
+    steps = 1 + 2 * len(setup.process.levels)
+    jitter = jitter_px(setup, logs)
+    setup = _with_jitter(setup, jitter.value)
+    factors: dict[str, Estimate] = {}
+    after = log_likelihood(setup, logs)
+    done = 1
+    for index, level in enumerate(setup.process.levels):
+        for axis in ("phi", "length"):
+            if progress is not None:
+                progress(done, steps)
+            done += 1
+
+            def likelihood(factor: float, index: int = index, axis: str = axis, now: Setup = setup) -> float:
+                return log_likelihood(replace(now, process=_scaled(now.process, index, axis, factor)), logs)
+
+            found, reached = best(_FACTORS, likelihood)
+            factors[f"{level.name}_{axis}"] = found
+            if reached > after:
+                after = reached
+                setup = replace(setup, process=_scaled(setup.process, index, axis, found.value))
+    return Tuning(setup, jitter, factors, before, after, sum(len(rows) for rows in logs))
+
+
+# ----------------------------------------------------------------------
+# Process noise of the driven filter from logs, by maximum likelihood of its innovations.
+#
+# What the model of plant and pumps lacks is in three random walks: of the disturbance forces, of the
+# rates, and
+# of lag, forces and creep. Each is scaled by the factor at which a log is most likely, one after the other.
+# A log in which little happens needs no noise and would, pooled with others, drive it to nothing; so logs
+# are
+# asked one by one, and the one that needs most has its way. No factor is less than a half: that nothing
+# disturbs a plant, a log cannot show.
+
+WALKS = ("disturbance", "rates", "forces")
+_DRIVEN_NOISE_FACTORS = np.array([0.5, 1.0, 2.0, 4.0, 8.0, 16.0])
+_CONVINCING = 2.0
+"""So much the log likelihood must rise, the gain of one number that means something."""
+
+Log = tuple[Rows, FloatArray]
+"""Rows and their commands (n, 2)."""
+
+
+@dataclass(frozen=True)
+class DriveTuning:
+    """What tuning has found.
+
+    Attributes
+    ----------
+    drive : with the tuned walks. factors : by walk, against those before.
+    before, after : log likelihood of all logs. rows : of all logs.
+    """
+
+    drive: Drive
+    factors: dict[str, Estimate]
+    before: float
+    after: float
+    rows: int
+
+
+def scaled(drive: Drive, walk: str, factor: float) -> Drive:
+    """A drive with one of `WALKS` scaled."""
+    if walk == "disturbance":
+        return replace(drive, walk_disturbance=factor * drive.walk_disturbance)
+    if walk == "rates":
+        phi, length = drive.walk_rates
+        return replace(drive, walk_rates=(factor * phi, factor * length))
+    return replace(drive, walk_forces=factor * drive.walk_forces)
+
+
+def driven_likelihood(setup: Setup, drive: Drive, logs: Sequence[Log]) -> float:
+    """Of all logs; a gated sensor counts as a reading at the edge, as in `noise.log_likelihood`."""
+    total = 0.0
+    gates = [OUT.index(f"gated_{name}") for name in ("camera", "accel", "gyro")]
+    for rows, pwm in logs:
+        out = DrivenFilter(setup, drive).run(rows, pwm)
+        total += float(np.nansum(out[:, OUT.index("log_likelihood")]))
+        total -= GATED * float(np.nansum(out[:, gates]))
+    return total
+
+
+def tune_driven(
+    setup: Setup, drive: Drive, logs: Sequence[Log], progress: Callable[[int, int], None] | None = None
+) -> DriveTuning:
+    """The walks that the log with the greatest need of each asks for."""
+    before = driven_likelihood(setup, drive, logs)
+    factors: dict[str, Estimate] = {}
+    steps, done = len(WALKS) * len(logs), 0
+    for walk in WALKS:
+        chosen = Estimate(1.0, None)
+        asked: list[Estimate] = []
+        for log in logs:
+            if progress is not None:
+                progress(done, steps)
+            done += 1
+
+            def likelihood(factor: float, walk: str = walk, log: Log = log, now: Drive = drive) -> float:
+                return driven_likelihood(setup, scaled(now, walk, factor), [log])
+
+            found, reached = best(_DRIVEN_NOISE_FACTORS, likelihood)
+            if reached - likelihood(1.0) < _CONVINCING:
+                found = Estimate(1.0, found.sigma)
+            asked.append(found)
+        if asked:
+            chosen = max(asked, key=lambda one: one.value)
+        factors[walk] = chosen
+        drive = scaled(drive, walk, chosen.value)
+    after = driven_likelihood(setup, drive, logs)
+    return DriveTuning(drive, factors, before, after, sum(len(rows) for rows, _ in logs))

@@ -1,0 +1,564 @@
+"""From a log and a rig to the estimator's rows and its set-up."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel
+
+from calib.core.arrays import BoolArray, FloatArray
+from calib.core.errors import BadInputError
+from calib.core.files import shown
+from calib.core.rig import Geometry, Rig
+from calib.io.logs import Log, iter_log
+from calib.stages.actuator.parameters import Creep, Plant, Stiffness, pumps_connected
+from calib.stages.actuator.pump import ElongationForce, Orifice, Pump, RateLimit
+from calib.stages.actuator.section import Actuator, PumpSection, section_of
+from calib.stages.align.section import Align, AlignCovariance
+from calib.stages.camera.results import camera_from_section, current_plane
+from calib.stages.estimator.baseline import BaselineSetup, undistorting_nothing
+from calib.stages.estimator.driven import PARAMETER, Drive
+from calib.stages.estimator.kinematic import LEVELS, Kinematic, Level, Rows, Setup, Start
+from calib.stages.estimator.noise import grid_px
+from calib.stages.estimator.sensors import SENSOR, sensor_values, view_coefficients
+
+# ----------------------------------------------------------------------
+# From a log and a rig.yaml to the estimator's rows and its set-up.
+#
+# Logs are read block by block; nothing grows with their length.
+
+_READINGS = ("u_px", "v_px", "ax_mps2", "ay_mps2", "gz_radps")
+_TRUTH = ("true_q1_m", "true_q2_m", "true_phi_rad")
+
+DEFAULTS: dict[str, tuple[float, float]] = {
+    "gyro_bias_radps": (0.0, 0.02),
+    "accel_bias_x_mps2": (0.0, 0.1),
+    "accel_bias_y_mps2": (0.0, 0.1),
+    "mount_angle_rad": (0.0, 0.05),
+    "gyro_scale": (0.0, 0.01),
+    "imu_lever_m": (0.006, 0.001),
+    "marker_offset_m": (0.015, 3e-4),
+    "time_offset_s": (0.025, 0.01),
+    "shift_x_m": (0.0, 2e-4),
+    "shift_y_m": (0.0, 2e-4),
+    "stretch": (0.0, 1e-3),
+    "accel_scale_x": (0.0, 0.003),
+    "accel_scale_y": (0.0, 0.003),
+}
+"""Value and standard deviation of what no section of the rig's file says."""
+
+_NOISE = {
+    "jitter_px": 0.3, "grid_px": 1.0, "accel_x_mps2": 0.0158, "accel_y_mps2": 0.0158, "gyro_radps": 0.0026,
+    "accel_share": 0.002, "camera_stamp_s": 5e-5, "imu_stamp_s": 5e-5, "camera_gate": 20.0,
+    "accel_gate": 30.0, "gyro_gate": 25.0,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Periods:
+    """What the beginning of a log says of its sensors.
+
+    Attributes
+    ----------
+    camera_s, imu_s : median distance of samples [s], NaN where there are too few.
+    grid_px : 1 for whole pixels, 0 for others.
+    ticks : whether rows with commands and without IMU are ticks of the camera's clock.
+    camera, imu : samples.
+    """
+
+    camera_s: float
+    imu_s: float
+    grid_px: float
+    ticks: bool
+    camera: int
+    imu: int
+
+
+def _column(log: Log, name: str) -> FloatArray:
+    return log.columns[name] if name in log.columns else np.full(len(log), np.nan)
+
+
+def _kinds(log: Log, readings: FloatArray, ticks: bool) -> tuple[BoolArray, BoolArray]:
+    """Rows (n,) with a picture or a tick of the camera, and rows with an IMU sample."""
+    finite = np.isfinite(readings)
+    imu: BoolArray = np.any(finite[:, 2:], axis=1)
+    camera: BoolArray = np.all(finite[:, :2], axis=1)
+    if ticks:
+        camera |= np.isfinite(_column(log, "pwm1")) & ~imu
+    return camera, imu
+
+
+def _readings(log: Log) -> FloatArray:
+    values = np.stack([_column(log, name) for name in _READINGS], axis=1)
+    return np.where(np.isfinite(values), values, np.nan)
+
+
+def _period(t_s: FloatArray) -> float:
+    steps = np.diff(t_s)
+    steps = steps[steps > 1e-5]
+    return float(np.median(steps)) if len(steps) >= 5 else math.nan
+
+
+def periods(log: Log) -> Periods:
+    """Rates and pixel grid from the first block of a log."""
+    readings = _readings(log)
+    seen, imu = _kinds(log, readings, False)
+    ticks = np.isfinite(_column(log, "pwm1")) & ~imu
+    # Commands stand in the rows of pictures when most of those rows have one.
+    use = bool(ticks.any()) and int((ticks & seen).sum()) >= 0.5 * int(ticks.sum()) > 0
+    camera = seen | ticks if use else seen
+    return Periods(
+        _period(log.t_s[camera]),
+        _period(log.t_s[imu]),
+        grid_px(readings),
+        use,
+        int(seen.sum()),
+        int(imu.sum()),
+    )
+
+
+def rows_of(log: Log, ticks: bool) -> Rows:
+    """A block's rows for the estimator."""
+    readings = _readings(log)
+    camera, imu = _kinds(log, readings, ticks)
+    kinds = camera.astype(np.int64) + 2 * imu.astype(np.int64)
+    return Rows(np.asarray(log.t_s, dtype=np.float64), readings, kinds)
+
+
+def truth_of(log: Log) -> FloatArray | None:
+    """True q1, q2 [m] and phi [rad] (n, 3), None for a log that does not know them."""
+    if any(name not in log.columns for name in _TRUTH):
+        return None
+    return np.stack([log.columns[name] for name in _TRUTH], axis=1)
+
+
+def blocks(path: Path, topics: Path | None = None) -> Iterator[Log]:
+    """Blocks with rows of a log; `topics` as for `iter_log`.
+
+    Raises `BadInputError` for one without rows, camera and IMU.
+    """
+    rows, known = 0, False
+    for block in iter_log(path, topics):
+        if not known and not any(name in block.columns for name in _READINGS):
+            raise BadInputError(
+                f"{shown(path)}: has neither camera nor IMU, expected columns as u_px, v_px or gz_radps"
+            )
+        known = True
+        if len(block):
+            rows += len(block)
+            yield block
+    if rows == 0:
+        raise BadInputError(f"{shown(path)}: has a header but no rows")
+
+
+def _section(rig: Rig, name: str) -> Mapping[str, Any]:
+    """A section as a mapping, whether it has a schema or not; empty without one."""
+    section = getattr(rig, name, None)
+    if section is None:
+        section = (rig.model_extra or {}).get(name)
+    if isinstance(section, BaseModel):
+        section = section.model_dump()
+    return section if isinstance(section, Mapping) else {}
+
+
+def _number(source: str, section: str, key: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise BadInputError(f"{source}: {section}.{key} is {value!r}, expected a number")
+    return float(value)
+
+
+def _from_align(rig: Rig) -> tuple[dict[str, tuple[float, float]], FloatArray | None, list[str]]:
+    """Values and deviations of the sensors, their covariance, and sentences for what is only assumed."""
+    values, said = dict(DEFAULTS), []
+    plane = rig.plane
+    if plane is not None and plane.sigma_marker_mm.get("calibration_max") is not None:
+        shift = 1e-3 * float(plane.sigma_marker_mm["calibration_max"] or 0.0) / math.sqrt(2.0)
+        values["shift_x_m"] = values["shift_y_m"] = (0.0, max(shift, 1e-6))
+    if rig.imu is not None and rig.imu.gyro_bias_radps[2] is not None:
+        listed = rig.imu.sigma.get("gyro_bias_radps")
+        sigma = listed[2] if listed is not None else None
+        values["gyro_bias_radps"] = (rig.imu.gyro_bias_radps[2], max(2e-4, sigma or 1e-3))
+    align = rig.align
+    if align is None:
+        said.append(
+            "no section align: time offset, mount angle and biases are taken from the log itself within "
+            "wide priors (calib align finds them)"
+        )
+        return values, None, said
+    found = _named_values(align)
+    sigmas = {name: values[name][1] for name in SENSOR}
+    for key, names in _ALIGNED.items():
+        deviations = align.sigma.get(key)
+        for k, name in enumerate(names):
+            one = deviations[k] if isinstance(deviations, list) and k < len(deviations) else deviations
+            if isinstance(one, float):
+                sigmas[name] = max(one, 1e-9)
+    values = {name: (found[name], sigmas[name]) for name in SENSOR}
+    covariance = None if align.covariance is None else _covariance(align.covariance, sigmas)
+    if align.verdict != "ok":
+        said.append(f"the alignment's own verdict is {align.verdict}")
+    return values, covariance, said
+
+
+_ALIGNED = {
+    "gyro_bias_radps": ("gyro_bias_radps",),
+    "accel_bias_mps2": ("accel_bias_x_mps2", "accel_bias_y_mps2"),
+    "mount_angle_rad": ("mount_angle_rad",),
+    "gyro_scale": ("gyro_scale",),
+    "imu_lever_m": ("imu_lever_m",),
+    "marker_offset_m": ("marker_offset_m",),
+    "time_offset_s": ("time_offset_s",),
+    "plane_shift_m": ("shift_x_m", "shift_y_m"),
+    "plane_stretch": ("stretch",),
+    "accel_scale": ("accel_scale_x", "accel_scale_y"),
+}
+"""Keys of the section `align` and the quantities of `sensors.SENSOR` that they hold."""
+
+_BETWEEN_LOGS = {"gyro_bias_radps": 1e-4, "accel_bias_x_mps2": 1e-3, "accel_bias_y_mps2": 1e-3}
+"""How far biases walk between the logs of the alignment and another one."""
+
+
+def _named_values(align: Align) -> dict[str, float]:
+    out: dict[str, float] = {}
+    for key, names in _ALIGNED.items():
+        value = getattr(align, key)
+        out |= dict(zip(names, value if isinstance(value, list) else [value], strict=True))
+    return out
+
+
+def _covariance(table: AlignCovariance, sigmas: Mapping[str, float]) -> FloatArray:
+    """Covariance (13, 13) of `sensors.SENSOR`; those that the table lacks stand alone."""
+    V = np.diag([sigmas[name] ** 2 for name in SENSOR])
+    known = [name for name in table.order if name in SENSOR]
+    at = [SENSOR.index(name) for name in known]
+    rows = [table.order.index(name) for name in known]
+    V[np.ix_(at, at)] = np.array(table.values)[np.ix_(rows, rows)]
+    for name, walk in _BETWEEN_LOGS.items():
+        V[SENSOR.index(name), SENSOR.index(name)] += walk**2
+    # A table that was rounded on its way through the file may have lost a digit of its smallest eigenvalue.
+    V = 0.5 * (V + V.T)
+    scale = np.sqrt(np.maximum(np.diag(V), 1e-18))
+    eigenvalues, Q = np.linalg.eigh(V / scale / scale[:, None])
+    normal = (Q * np.maximum(eigenvalues, 1e-9)) @ Q.T
+    return np.asarray(normal * scale * scale[:, None], dtype=np.float64)
+
+
+def _process(rig: Rig) -> Kinematic:
+    tuned = rig.estimator
+    if tuned is None or not tuned.levels:
+        return Kinematic(LEVELS)
+    levels = []
+    for level in tuned.levels:
+        walks = level.walk_phi_rad_per_sqrt_s, level.walk_length_m_per_sqrt_s
+        accelerations = level.accel_phi_radps2, level.accel_length_mps2
+        levels.append(Level(level.name, *accelerations, level.memory_s, level.friction_s, *walks))
+    return Kinematic(tuple(levels))
+
+
+_SHAKEN = 1.6
+"""So many times the noise at rest in the alignment's logs, and a moving rig shakes its IMU."""
+
+
+def _at_rest(rig: Rig, found: Periods) -> dict[str, float]:
+    """Noise of an IMU sample by `calib imu static`."""
+    imu = rig.imu
+    if imu is None:
+        return {}
+    root = math.sqrt(1.0 / found.imu_s) if found.imu_s > 0.0 else math.sqrt(imu.rate_hz)
+    densities = (
+        ("accel_x_mps2", imu.accel_noise_mps2_per_sqrt_Hz[0]),
+        ("accel_y_mps2", imu.accel_noise_mps2_per_sqrt_Hz[1]),
+        ("gyro_radps", imu.gyro_noise_radps_per_sqrt_Hz[2]),
+    )
+    return {key: density * root for key, density in densities if density}
+
+
+def _noise(rig: Rig, found: Periods) -> FloatArray:
+    numbers = dict(_NOISE) | _at_rest(rig, found)
+    numbers["grid_px"] = found.grid_px
+    if rig.align is not None:
+        numbers["jitter_px"] = rig.align.jitter_px or numbers["jitter_px"]
+        numbers["gyro_radps"] = rig.align.gyro_noise_radps or numbers["gyro_radps"]
+        for key, value in zip(("accel_x_mps2", "accel_y_mps2"), rig.align.accel_noise_mps2, strict=True):
+            numbers[key] = value or numbers[key]
+    if rig.estimator is not None:
+        numbers["jitter_px"] = rig.estimator.jitter_px
+        if rig.estimator.accel_noise_mps2 is not None:
+            numbers["accel_x_mps2"] = numbers["accel_y_mps2"] = rig.estimator.accel_noise_mps2
+        if rig.estimator.gyro_noise_radps is not None:
+            numbers["gyro_radps"] = rig.estimator.gyro_noise_radps
+    return np.array(list(numbers.values()))
+
+
+def noise_at_rest(rig: Rig, found: Periods) -> tuple[float, float, float] | None:
+    """Noise of a_x, a_y, g_z for a filter that knows the head's accelerations; None without a log at rest.
+
+    The noise that an alignment finds holds what its splines cannot follow as well, which suits a model that
+    knows no better. Where it is much greater than that at rest, the moving rig shakes, and it holds.
+    """
+    tuned, rest = rig.estimator, _at_rest(rig, found)
+    if not rest or (tuned is not None and (tuned.accel_noise_mps2 or tuned.gyro_noise_radps)):
+        return None
+    moving = dict(zip(_NOISE, _noise(rig, found).tolist(), strict=True))
+    x, y, z = (
+        rest[key] if key in rest and moving[key] <= _SHAKEN * rest[key] else moving[key]
+        for key in ("accel_x_mps2", "accel_y_mps2", "gyro_radps")
+    )
+    return x, y, z
+
+
+def _actuator(rig: Rig, source: str, key: str, default: float) -> float:
+    section = _section(rig, "actuator")
+    if key not in section:
+        return default
+    value = _number(source, "actuator", key, section[key])
+    if not value > 0.0:
+        raise BadInputError(f"{source}: actuator.{key} is {value:g}, expected a positive number")
+    return value
+
+
+def setup_from_rig(rig: Rig, path: Path, found: Periods) -> tuple[Setup, list[str]]:
+    """The estimator's set-up, and sentences about what is assumed.
+
+    Raises `BadInputError` without a camera or a plane where the log has pictures.
+    """
+    source = shown(path)
+    said: list[str] = []
+    workspace = (rig.geometry or Geometry()).workspace_m
+    view = np.zeros(24)
+    if found.camera:
+        plane = current_plane(rig, str(path))
+        if rig.camera is None:
+            raise BadInputError(f"{source}: has no camera, which pictures need; run calib intrinsics first")
+        if plane is None:
+            raise BadInputError(f"{source}: has no plane, which pictures need; run calib extrinsics first")
+        middle = (0.5 * (workspace[0] + workspace[2]), 0.5 * (workspace[1] + workspace[3]))
+        view = view_coefficients(
+            camera_from_section(rig.camera), np.array(plane.R_CW), np.array(plane.t_CW_m), middle
+        )
+    else:
+        said.append("no pictures: the length is known from the prior alone, the result is degraded")
+    if not found.imu:
+        said.append("no IMU: angle and length come from the camera alone, the result is degraded")
+    values, covariance, assumed = _from_align(rig)
+    said += assumed
+    nominal = Plant()
+    rest = _actuator(rig, source, "rest_length_m", nominal.rest_length_m)
+    head = np.array([0.0, rest + 0.004, 0.0, 0.0, 0.0, 0.0])
+    start = Start(
+        sensor_values({name: values[name][0] for name in SENSOR}),
+        sensor_values({name: values[name][1] for name in SENSOR}),
+        head,
+        sensor_covariance=covariance,
+    )
+    radius = _actuator(rig, source, "bellows_radius_m", nominal.bellows_radius_m)
+    setup = Setup(
+        view, _noise(rig, found), start, radius, process=_process(rig),
+        camera_period_s=found.camera_s, imu_period_s=found.imu_s,
+    )  # fmt: skip
+    return setup, said
+
+
+def baseline_setup(setup: Setup, rig: Rig, path: Path, found: Periods) -> BaselineSetup:
+    """The source's pipeline for the same rig, without what it does not know of."""
+    if rig.camera is None or not found.camera:
+        raise BadInputError(f"{shown(path)}: the baseline needs a camera, a plane, and pictures in the log")
+    x0, y0, x1, y1 = (rig.geometry or Geometry()).workspace_m
+    width, height = rig.camera.image_size_px
+    return BaselineSetup(
+        undistorting_nothing(setup.view, (x0, y0, x1, y1), (width, height)),
+        setup.bellows_radius_m,
+        float(setup.start.head[1]),
+        float(setup.start.sensor[6]),
+        1.0 / found.imu_s if found.imu_s > 0.0 else 100.0,
+        1.0 / found.camera_s if found.camera_s > 0.0 else 60.0,
+    )
+
+
+# ----------------------------------------------------------------------
+# The driven model of a rig: plant and pumps from the sections `actuator` and `pump` of rig.yaml.
+
+_LEAST_SHARE, _APART = 0.01, 0.003
+"""Identified values are not taken to be nearer the truth than the first, nor what they tell together than
+the second: an identification keeps mass and rest length as they are, and its model is not the actuator."""
+
+
+def has_commands(log: Log) -> bool:
+    """Whether a block says what the pumps were told."""
+    return any(np.isfinite(pair).all() for pair in pwm_of(log))
+
+
+def pwm_of(log: Log) -> FloatArray:
+    """Commands (n, 2) of a block, NaN in rows without."""
+    missing = np.full(len(log), np.nan)
+    return np.stack([log.columns.get(name, missing) for name in ("pwm1", "pwm2")], axis=1)
+
+
+def _or(value: float | None, default: float) -> float:
+    return default if value is None else value
+
+
+def _plant(section: Actuator) -> Plant:
+    nominal = pumps_connected()
+    names = ("k0_N_per_m", "k1_N_per_m2", "k2_N_per_m3", "k3_N_per_m4")
+    law = tuple(_or(getattr(section, n), k) for n, k in zip(names, nominal.stiffness.padded, strict=True))
+    creep, gravity = Creep(), section.gravity_mps2 or nominal.gravity_mps2
+    return Plant(
+        mass_kg=_or(section.mass_kg, nominal.mass_kg),
+        inertia_kgm2=_or(section.inertia_kgm2, nominal.inertia_kgm2),
+        bellows_radius_m=_or(section.bellows_radius_m, nominal.bellows_radius_m),
+        rest_length_m=_or(section.rest_length_m, nominal.rest_length_m),
+        stiffness=Stiffness(law),
+        stiffness_scale=_or(section.stiffness_scale, nominal.stiffness_scale),
+        damping_ratio=_or(section.damping_ratio, nominal.damping_ratio),
+        damping_scale=_or(section.damping_scale_pumps_connected, nominal.damping_scale),
+        bending_N_per_rad2=_or(section.bending_N_per_rad2, nominal.bending_N_per_rad2),
+        creep=Creep(
+            _or(section.lambda1_per_s, creep.lambda1_per_s),
+            _or(section.lambda2_N_per_m, creep.lambda2_N_per_m),
+            _or(section.lambda3, creep.lambda3),
+        ),
+        gravity_mps2=(gravity[0], gravity[1]),
+        force_projection=section.force_projection or nominal.force_projection,
+    )
+
+
+def _pump(section: PumpSection, plant: Plant) -> Pump:
+    nominal, static = Pump(), ElongationForce()
+    static = replace(
+        static,
+        supply_V=_or(section.supply_V, static.supply_V),
+        dead_zone_V=_or(section.dead_zone_V, static.dead_zone_V),
+    )
+    if section.elongation_mm is not None:
+        # Measured on this rig, so its forces follow from this rig's springs.
+        a, b, c, d = section.elongation_mm
+        static = replace(static, elongation_mm=(a, b, c, d), stiffness=plant.stiffness)
+    limit, orifice = RateLimit(), Orifice()
+    deflation: RateLimit | Orifice = RateLimit(_or(section.falling_N_per_s, limit.falling_N_per_s))
+    if section.deflation == "orifice":
+        deflation = Orifice(
+            _or(section.laminar_s, orifice.laminar_s),
+            _or(section.turbulent_s2_per_N, orifice.turbulent_s2_per_N),
+        )
+    return Pump(
+        static,
+        deflation,
+        _or(section.lag_s, nominal.lag_s),
+        int(_or(section.delay_ticks, nominal.delay_ticks)),
+        _or(section.tick_s, nominal.tick_s),
+    )
+
+
+_SIGMA = {
+    "stiffness": ("actuator", "stiffness_scale"),
+    "log_damping": ("actuator", "damping_scale_pumps_connected"),
+    "bending": ("actuator", "bending_N_per_rad2"),
+    "strength1": ("pump", "strength"),
+    "strength2": ("pump", "strength"),
+    "lag": ("pump", "lag_s"),
+    "deflation": ("pump", "falling_N_per_s"),
+    "rest_length_m": ("actuator", "rest_length_m"),
+    "mass": ("actuator", "mass_kg"),
+    "creep_stiffness": ("actuator", "lambda2_N_per_m"),
+    "creep_rate": ("actuator", "lambda1_per_s"),
+}
+"""Whose standard deviation, as a share of the value, a parameter has."""
+
+
+def _deviation(section: Actuator | PumpSection, key: str, at: int, relative: bool) -> float | None:
+    sigma, value = section.sigma.get(key), getattr(section, key)
+    if isinstance(sigma, list):
+        sigma, value = sigma[at], value[at] if isinstance(value, list) else value
+    if sigma is None or value is None or not math.isfinite(sigma):
+        return None
+    if not relative:
+        return float(sigma)
+    return max(float(sigma) / abs(float(value)), _LEAST_SHARE) if value else None
+
+
+def _driving_covariance(actuator: Actuator, pump: PumpSection, sigma: dict[str, float]) -> FloatArray | None:
+    """Covariance (11, 11) of the parameters: their deviations with the correlations of the identification.
+
+    What was estimated apart since then, so that the deviation in the file is another one, is independent.
+    """
+    table, out = actuator.covariance, np.diag(np.array(list(sigma.values())) ** 2)
+    if table is None:
+        return None
+    rows, names = [], []
+    for name, (section, key) in _SIGMA.items():
+        row = name if key == "strength" else key
+        known = actuator if section == "actuator" else pump
+        told = _deviation(known, key, int(name == "strength2"), relative=False)
+        if not told or row not in table.order:
+            continue
+        at = table.order.index(row)
+        if math.isclose(told * told, table.values[at][at], rel_tol=2e-3):
+            rows.append(at)
+            names.append(name)
+    spread = np.sqrt([table.values[k][k] for k in rows])
+    places = [PARAMETER.index(name) for name in names]
+    together = np.array(table.values)[np.ix_(rows, rows)]
+    correlation = 0.5 * (together + together.T) / np.outer(spread, spread)
+    deviation = np.array([sigma[name] for name in names])
+    out[np.ix_(places, places)] = correlation * np.outer(deviation, deviation)
+    out[places, places] += _APART**2
+    return np.asarray(out)
+
+
+def drive_from_rig(rig: Rig, path: Path) -> Drive:
+    """Plant and pumps with their deviations; what the file lacks is nominal.
+
+    Raises `BadInputError` naming file and key for values that no plant has.
+    """
+    actuator = section_of(rig, "actuator", Actuator, path)
+    pump = section_of(rig, "pump", PumpSection, path)
+    try:
+        plant = _plant(actuator)
+        made = _pump(pump, plant)
+    except BadInputError as error:
+        raise BadInputError(f"{shown(path)}: actuator and pump: {error}") from error
+    nominal = Drive()
+    sigma = dict(zip(PARAMETER, nominal.sigma, strict=True))
+    for name, (section, key) in _SIGMA.items():
+        known = actuator if section == "actuator" else pump
+        found = _deviation(known, key, int(name == "strength2"), name != "rest_length_m")
+        if found is not None:
+            # What was hardly identified differs from other rigs as they do from each other.
+            sigma[name] = found if actuator.covariance is None else min(found, sigma[name])
+    if actuator.covariance is not None and "mass_kg" not in actuator.sigma:
+        # Forces, springs and mass have one scale, which the identification takes from the mass.
+        sigma["mass"] = _LEAST_SHARE
+    covariance = _driving_covariance(actuator, pump, sigma)
+    if covariance is not None:
+        deviation = np.sqrt(np.diag(covariance))
+        correlation = covariance / np.outer(deviation, deviation)
+        if not (np.abs(correlation).max() < 1.01 and np.linalg.eigvalsh(correlation)[0] > 0.0):
+            raise BadInputError(
+                f"{shown(path)}: actuator.covariance has correlations that no quantities have, expected a "
+                "positive definite matrix"
+            )
+        sigma = dict(zip(PARAMETER, deviation.tolist(), strict=True))
+    strength = pump.strength or list(nominal.strength)
+    tuned = rig.estimator.driven if rig.estimator is not None else None
+    if tuned is not None:
+        nominal = replace(
+            nominal,
+            walk_disturbance=tuned.walk_disturbance_N_per_sqrt_s,
+            walk_rates=(tuned.walk_turning_radps_per_sqrt_s, tuned.walk_growing_mps_per_sqrt_s),
+            walk_forces=tuned.walk_forces_N_per_sqrt_s,
+        )
+    return replace(
+        nominal,
+        plant=plant,
+        pump=made,
+        strength=(strength[0], strength[1]),
+        free_damping_scale=_or(actuator.damping_scale_free_swing, nominal.free_damping_scale),
+        sigma=tuple(sigma.values()),
+        covariance=covariance,
+    )

@@ -1,0 +1,225 @@
+"""The same recursion on filterpy, for one level of process noise: the proof of the compiled filter.
+
+Readings leave `kernel.CONSIDERED` alone in both. `extended` runs filterpy's ExtendedKalmanFilter over the
+events of a log: predict with F and Q of `model`, then each scalar reading in turn, a rounded pixel as its
+equivalent Gaussian reading. It agrees with the compiled filter to rounding. `unscented` is filterpy's
+UnscentedKalmanFilter with the same noise, whole readings at once and rounding as variance g^2 / 12: not the
+same estimator, but one without a Jacobian. `extended_smoothed` adds Rauch, Tung and Striebel with matrices
+inverted by numpy.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from calib.core.arrays import FloatArray
+from calib.stages.estimator.kinematic import (
+    CAMERA,
+    CONSIDERED,
+    LARGEST_STEP_S,
+    TELLING,
+    Rows,
+    Setup,
+    axis_noise,
+    starting_state,
+)
+from calib.stages.estimator.sensors import SIZE, accelerometer, gyroscope, marker, update_terms
+from calib.stages.estimator.smoother import Events, transition
+
+
+def process_noise(level: FloatArray, walk: FloatArray, dt: float) -> FloatArray:
+    """Q (19, 19) over dt [s], steps of more than `model.LARGEST_STEP_S` in parts."""
+    Q, F, part = np.zeros((SIZE, SIZE)), np.empty((SIZE, SIZE)), np.zeros((SIZE, SIZE))
+    if not dt > 0.0:
+        return Q
+    parts = max(math.ceil(dt / LARGEST_STEP_S - 1e-9), 1)
+    transition(level, dt / parts, F)
+    for axis in range(2):
+        pp, pv, pa, vv, va, aa = axis_noise(level[4 * axis + 2], level[4 * axis + 3], dt / parts)
+        rows = [axis, axis + 2, axis + 4]
+        part[np.ix_(rows, rows)] = [[pp, pv, pa], [pv, vv, va], [pa, va, aa]]
+    part[range(6, SIZE), range(6, SIZE)] = walk * dt / parts
+    for _ in range(parts):
+        Q = F @ Q @ F.T + part
+    return Q
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def camera_terms(
+    view: FloatArray, noise: FloatArray, x: FloatArray, P: FloatArray, H: FloatArray, out: FloatArray
+) -> None:
+    """Predicted pixel and what the stamps' error adds to its variance: u, v, var_u, var_v.
+
+    H (2, n) gets the gradients.
+    """
+    out[0], out[1] = marker(view, x, H[0], H[1])
+    for k in range(2):
+        speed = H[k, 0] * x[2] + H[k, 1] * x[3]
+        out[2 + k] = (speed * noise[6]) ** 2
+        if speed * speed < TELLING * (H[k, 0] ** 2 * P[2, 2] + H[k, 1] ** 2 * P[3, 3]):
+            H[k, 13] = 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def imu_terms(
+    constants: FloatArray, noise: FloatArray, x: FloatArray, P: FloatArray, H: FloatArray, out: FloatArray
+) -> None:
+    """Predicted a_x, a_y, g_z and the variances of their noise; H (3, n) gets the gradients."""
+    out[0], out[1] = accelerometer(constants[0], constants[1], x, H[0], H[1])
+    out[2] = gyroscope(x, H[2])
+    if x[2] * x[2] < TELLING * P[2, 2]:
+        H[2, 10] = 0.0
+    tilt = x[0] + x[9]
+    moved_x = out[0] - x[7] - constants[0] * math.cos(tilt)
+    moved_y = out[1] - x[8] - constants[0] * math.sin(tilt)
+    scale = noise[5] * noise[5] * (moved_x * moved_x + moved_y * moved_y)
+    for k in range(2):
+        unknown = H[k, 1] * H[k, 1] * P[1, 1] + H[k, 11] * H[k, 11] * P[11, 11]
+        out[3 + k] = noise[2 + k] * noise[2 + k] + scale + unknown
+        H[k, 1], H[k, 11] = 0.0, 0.0
+    out[5] = noise[4] * noise[4] + (x[4] * noise[7]) ** 2
+
+
+def _constants(setup: Setup) -> FloatArray:
+    return np.array([setup.gravity_mps2, setup.lever_across_m])
+
+
+def _scalar_readings(
+    setup: Setup, kind: int, z: FloatArray, x: FloatArray, P: FloatArray
+) -> list[tuple[float, float, FloatArray, float, bool]]:
+    """Each reading of an event: value, prediction, gradient, variance of its noise, whether rounded."""
+    noise, out = setup.noise, np.empty(SIZE)
+    H = np.empty((3, SIZE))
+    if kind == CAMERA:
+        camera_terms(setup.view, noise, x, P, H, out)
+        jitter = noise[0] ** 2
+        return [(z[k], out[k], H[k].copy(), jitter + out[2 + k], True) for k in range(2)]
+    imu_terms(_constants(setup), noise, x, P, H, out)
+    return [(z[k], out[k], H[k].copy(), out[3 + k], False) for k in (2, 0, 1) if not math.isnan(z[k])]
+
+
+def extended(setup: Setup, rows: Rows, events: Events, gated: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """States (n, 19) and covariances (n, 19, 19) after each event, by filterpy's EKF.
+
+    Parameters
+    ----------
+    gated : (n, 3) readings that stay out, as the compiled filter found them.
+    """
+    from filterpy.kalman import ExtendedKalmanFilter
+
+    levels, walk = setup.process.arrays()
+    start_x, start_P, _ = starting_state(setup, rows)
+    ekf: Any = ExtendedKalmanFilter(dim_x=SIZE, dim_z=1)
+    ekf.x, ekf.P = start_x[0].copy(), start_P[0].copy()
+    held = list(CONSIDERED)
+    n = len(events.t_s)
+    x, P, F = np.empty((n, SIZE)), np.empty((n, SIZE, SIZE)), np.empty((SIZE, SIZE))
+    for k in range(n):
+        dt = float(events.t_s[k] - events.t_s[k - 1]) if k else 0.0
+        transition(levels[0], dt, F)
+        ekf.F, ekf.Q = F.copy(), process_noise(levels[0], walk, dt)
+        ekf.predict()
+        kind = int(events.kinds[k])
+        if kind:
+            before = ekf.x.copy()
+            readings = _scalar_readings(setup, kind, events.readings[k], before, ekf.P)
+            for place, (z, predicted, H, variance, rounded) in enumerate(readings):
+                sensor = (
+                    0 if kind == CAMERA else 2 if place == 0 and not math.isnan(events.readings[k, 2]) else 1
+                )
+                if gated[k, sensor]:
+                    continue
+                expected = predicted + float(H @ (ekf.x - before))
+                if rounded:
+                    spread = float(H @ ekf.P @ H)
+                    y, S, _ = update_terms(z - expected, spread, variance, setup.noise[1])
+                    z, variance = expected + y, S - spread
+                kept_x, kept_P = ekf.x[held].copy(), ekf.P[np.ix_(held, held)].copy()
+                ekf.update(
+                    np.array([z]),
+                    lambda _, H=H: H[None, :],
+                    lambda _, h=expected: np.array([h]),
+                    R=np.array([[variance]]),
+                )
+                ekf.x[held], ekf.P[np.ix_(held, held)] = kept_x, kept_P
+        x[k], P[k] = ekf.x, ekf.P
+    return x, P
+
+
+def extended_smoothed(
+    setup: Setup, events: Events, x: FloatArray, P: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Rauch, Tung and Striebel over the states of `extended` where what is considered has no variance.
+
+    Inverts the predicted covariance of all that has one.
+    """
+    levels, walk = setup.process.arrays()
+    x, P = x.copy(), P.copy()
+    F, free = np.empty((SIZE, SIZE)), [i for i in range(SIZE) if i not in CONSIDERED]
+    block = np.ix_(free, free)
+    for k in range(len(x) - 2, -1, -1):
+        dt = float(events.t_s[k + 1] - events.t_s[k])
+        transition(levels[0], dt, F)
+        before, f = P[k][block], F[block]
+        ahead = f @ before @ f.T + process_noise(levels[0], walk, dt)[block]
+        scale = 1.0 / np.sqrt(np.diag(ahead))
+        gain = (before @ f.T * scale) @ np.linalg.inv(ahead * scale[:, None] * scale) * scale
+        x[k, free] += gain @ (x[k + 1] - F @ x[k])[free]
+        P[k][block] += gain @ (P[k + 1][block] - ahead) @ gain.T
+    return x, P
+
+
+def unscented(setup: Setup, rows: Rows, events: Events, gated: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """States (n, 19) and covariances after each event, by filterpy's UKF (Julier's sigma points)."""
+    from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
+
+    levels, walk = setup.process.arrays()
+    start_x, start_P, _ = starting_state(setup, rows)
+    points = MerweScaledSigmaPoints(SIZE, alpha=0.5, beta=2.0, kappa=0.0)
+    F = np.eye(SIZE)
+
+    def carry(x: FloatArray, _: float) -> FloatArray:
+        return np.asarray(F @ x)
+
+    def nothing(x: FloatArray) -> FloatArray:
+        return x[:1]
+
+    ukf: Any = UnscentedKalmanFilter(SIZE, 1, 1.0, hx=nothing, fx=carry, points=points)
+    ukf.x, ukf.P = start_x[0].copy(), start_P[0].copy()
+    n = len(events.t_s)
+    x, P = np.empty((n, SIZE)), np.empty((n, SIZE, SIZE))
+    for k in range(n):
+        dt = float(events.t_s[k] - events.t_s[k - 1]) if k else 0.0
+        transition(levels[0], dt, F)
+        ukf.Q = process_noise(levels[0], walk, dt)
+        ukf.predict()
+        kind = int(events.kinds[k])
+        # filterpy keeps the points of the process; readings need those of the predicted covariance.
+        ukf.sigmas_f = points.sigma_points(ukf.x, ukf.P)
+        if kind and not gated[k, 0 if kind == CAMERA else 1]:
+            z = events.readings[k, : 2 if kind == CAMERA else 3]
+            base = _scalar_readings(setup, kind, events.readings[k], ukf.x, ukf.P)
+            order = [0, 1] if kind == CAMERA else [2, 0, 1]
+            R = np.zeros(len(order))
+            for place, reading in zip(order, base, strict=True):
+                R[place] = reading[3] + (setup.noise[1] ** 2 / 12.0 if kind == CAMERA else 0.0)
+
+            def read(state: FloatArray, kind: int = kind) -> FloatArray:
+                H, out, none = np.empty((3, SIZE)), np.empty(SIZE), np.zeros((SIZE, SIZE))
+                if kind == CAMERA:
+                    camera_terms(setup.view, setup.noise, state, none, H, out)
+                    return out[:2].copy()
+                imu_terms(_constants(setup), setup.noise, state, none, H, out)
+                return out[:3].copy()
+
+            held = list(CONSIDERED)
+            kept_x, kept_P = ukf.x[held].copy(), ukf.P[np.ix_(held, held)].copy()
+            ukf._dim_z = len(z)
+            ukf.update(z, R=np.diag(R), hx=read)
+            ukf.x[held], ukf.P[np.ix_(held, held)] = kept_x, kept_P
+        x[k], P[k] = ukf.x, ukf.P
+    return x, P

@@ -1,0 +1,125 @@
+"""`calib replay --tune`: the section `estimator` of rig.yaml from logs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+
+from calib.core.arrays import FloatArray
+from calib.core.errors import BadInputError
+from calib.core.files import shown
+from calib.core.rig import Rig
+from calib.stages.estimator.constant_gain import MOST_DELAY_TICKS, design, tick_noise
+from calib.stages.estimator.driven import Drive
+from calib.stages.estimator.kinematic import Rows, Setup
+from calib.stages.estimator.noise import tune
+from calib.stages.estimator.read import drive_from_rig, noise_at_rest, pwm_of, rows_of
+from calib.stages.estimator.replay import Progress, joined, prepared
+from calib.stages.estimator.section import Estimator, EstimatorDriven, EstimatorGain, EstimatorLevel
+
+_MOST_ROWS = 20_000
+_MOST_DRIVEN_ROWS = 6_000
+
+_TICK_HZ = 60.0
+
+
+def gain_section(setup: Setup, rate_hz: float) -> EstimatorGain | None:
+    """Constant gains at a rate of ticks; None without pictures, or where they are more than 8 ticks late."""
+    delay_s = max(float(setup.start.sensor[7]), 0.0)
+    if delay_s * rate_hz > MOST_DELAY_TICKS or not setup.view.any():
+        return None
+    lever_m = 0.5 * float(setup.start.head[1]) + float(setup.start.sensor[6])
+    return EstimatorGain(**asdict(design(tick_noise(setup), rate_hz, delay_s, lever_m)))
+
+
+def _driven_section(
+    setup: Setup, drive: Drive, logs: Sequence[tuple[Rows, FloatArray]], progress: Progress | None
+) -> tuple[EstimatorDriven | None, dict[str, float | None]]:
+    """Walks of the driven model from the first 6,000 rows of the logs with commands, and their deviations."""
+    from calib.stages.estimator.noise import tune_driven
+
+    known = [(rows, pwm) for rows, pwm in logs if np.isfinite(pwm).all(axis=1).any()]
+    if not known:
+        return None, {}
+    short = [
+        (Rows(rows.t_s[:n], rows.readings[:n], rows.kinds[:n]), pwm[:n])
+        for rows, pwm in known
+        for n in [min(len(rows), _MOST_DRIVEN_ROWS)]
+    ]
+    found = tune_driven(setup, drive, short, progress)
+    turning, growing = found.drive.walk_rates
+    section = EstimatorDriven(
+        walk_disturbance_N_per_sqrt_s=found.drive.walk_disturbance,
+        walk_turning_radps_per_sqrt_s=turning,
+        walk_growing_mps_per_sqrt_s=growing,
+        walk_forces_N_per_sqrt_s=found.drive.walk_forces,
+    )
+    return section, {f"driven_{name}": factor.sigma for name, factor in found.factors.items()}
+
+
+def tuned_section(
+    logs: Sequence[Path],
+    rig: Rig,
+    rig_path: Path,
+    progress: Progress | None = None,
+    topics: Path | None = None,
+) -> Estimator:
+    """Noise by maximum likelihood on the first 20,000 rows of each log, of both models where commands are.
+
+    Raises `BadInputError` for logs that cannot be used, or without camera and IMU.
+    """
+    every, told, first, at_rest = [], [], None, None
+    bare = rig.model_copy(update={"estimator": None})
+    drive = drive_from_rig(bare, rig_path)
+    for path in logs:
+        setup, found, stream, _ = prepared(path, bare, rig_path, topics)
+        if not (found.camera and found.imu):
+            raise BadInputError(f"{shown(path)}: tuning needs camera and IMU, and the log lacks one")
+        parts, commands, count = [], [], 0
+        for log in stream:
+            parts.append(rows_of(log, found.ticks))
+            commands.append(pwm_of(log))
+            count += len(log)
+            if count >= _MOST_ROWS:
+                break
+        every.append(joined(parts))
+        told.append((every[-1], np.concatenate(commands)))
+        if first is None:
+            first, at_rest = setup, noise_at_rest(bare, found)
+    if first is None:
+        raise BadInputError("LOG: none given, expected at least one")
+    found_noise = tune(first, every, progress)
+    sigma = {"jitter_px": found_noise.jitter_px.sigma}
+    sigma |= {name: factor.sigma for name, factor in found_noise.factors.items()}
+    driven, more = _driven_section(found_noise.setup, replace(drive, imu_noise=at_rest), told, progress)
+    sigma |= more
+    reasons = []
+    if found_noise.jitter_px.sigma is None:
+        reasons.append("the logs do not bound the tracker's jitter")
+    else:
+        sigma["jitter_px"] = found_noise.jitter_px.sigma * found_noise.jitter_px.value
+    return Estimator(
+        jitter_px=found_noise.jitter_px.value,
+        sigma=sigma,
+        levels=[
+            EstimatorLevel(
+                name=level.name,
+                accel_phi_radps2=level.accel_phi_radps2,
+                accel_length_mps2=level.accel_length_mps2,
+                memory_s=level.memory_s,
+                friction_s=level.friction_s,
+                walk_phi_rad_per_sqrt_s=level.walk_phi,
+                walk_length_m_per_sqrt_s=level.walk_length,
+            )
+            for level in found_noise.setup.process.levels
+        ],
+        driven=driven,
+        constant_gain=gain_section(found_noise.setup, rig.lowpass.rate_hz if rig.lowpass else _TICK_HZ),
+        gain_per_row=(found_noise.after - found_noise.before) / max(found_noise.rows, 1),
+        logs=[shown(path.name) for path in logs],
+        verdict="poor" if reasons else "ok",
+        reasons=reasons,
+    )

@@ -1,0 +1,138 @@
+"""What a board printed against float64: the log of `calib record` computed again, tick by tick.
+
+The reference starts from nothing, as the board does, so a log has to begin with sequence number 0
+(opening the port restarts the usual boards). Where frames are missing the board went on from what is not
+known here; the comparison ends there. Tolerances are those of the self-test.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+from calib.core.errors import BadInputError
+from calib.core.files import read_bytes, shown
+from calib.io.serial import BOARD_COLUMNS, Frame, frame_from_row
+from calib.stages.firmware.conformance import BY_FUSED, BY_MEAN_RATE, CLAMPED, Outputs, reference_of
+from calib.stages.firmware.header import Header, identity_of
+from calib.stages.firmware.literals import values
+from calib.stages.firmware.vectors import TOLERANCE
+
+_CLAMP_BITS = CLAMPED[0] | CLAMPED[1]
+_UNDECIDED_M = 1e-6
+"""What rounding makes of the fused estimator's residuals after a long rest."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """How far a board was from the reference.
+
+    Attributes
+    ----------
+    ticks : that were compared. missing_after : ticks before the first lost frame, None without one.
+    worst : largest difference by quantity of `vectors.TOLERANCE`.
+    flags_differ : ticks whose flags were others.
+    first_bad : the first tick beyond a tolerance, with the quantity; None where there is none.
+    """
+
+    ticks: int
+    missing_after: int | None
+    worst: dict[str, float]
+    flags_differ: int
+    first_bad: tuple[int, str] | None
+
+    @property
+    def reasons(self) -> list[str]:
+        """Why the board failed; empty when it passed."""
+        if self.first_bad is None:
+            return []
+        tick, what = self.first_bad
+        return [f"tick {tick} is the first that differs, in {what}"]
+
+
+def read_frames(path: Path) -> list[Frame]:
+    """Frames of a log as `calib record` writes it.
+
+    Raises `BadInputError` for another file, by its line.
+    """
+    text = read_bytes(path).decode("utf-8-sig", "replace")
+    if "\0" in text:
+        raise BadInputError(f"{shown(path)}: has a zero byte, expected a log of calib record")
+    reader = csv.DictReader(text.splitlines())
+    frames = []
+    try:
+        missing = [name for name in BOARD_COLUMNS if name not in (reader.fieldnames or ())]
+        if missing:
+            raise BadInputError(f"{shown(path)}: has no column {missing[0]}, expected a log of calib record")
+        frames += [frame_from_row(row) for row in reader]
+    except (KeyError, TypeError, ValueError, OverflowError, csv.Error) as error:
+        raise BadInputError(
+            f"{shown(path)}: line {reader.line_num} is no tick of a board ({error})"
+        ) from error
+    if not frames:
+        raise BadInputError(f"{shown(path)}: holds no tick of a board")
+    return frames
+
+
+def _differences(frame: Frame, wanted: Outputs) -> dict[str, float]:
+    pairs = {
+        "phi_rad": [(frame.phi_rad, wanted.phi_rad)],
+        "marker_m": zip(frame.marker_m, wanted.marker_m, strict=True),
+        "q_m": zip(frame.head_m + frame.q_m, wanted.head_m + wanted.q_m, strict=True),
+        "pwm": zip(frame.pwm, wanted.pwm, strict=True),
+    }
+    # NaN of a board is no small difference.
+    found = {name: max(abs(a - b) for a, b in pair) for name, pair in pairs.items()}
+    return {name: value if math.isfinite(value) else math.inf for name, value in found.items()}
+
+
+def check_frames(header: Header, frames: list[Frame], source: str, undistort: bool | None = None) -> Check:
+    """Compare the ticks of a board with the reference.
+
+    Parameters
+    ----------
+    source : the log's name for messages.
+    undistort : CALIB_UNDISTORT that the board was built with; by default the header's. CALIB_FUSED and
+        CALIB_RATE_IS_MEAN are told by the board's flags.
+
+    Raises `BadInputError` for a board with another header and for a log that does not begin at the start.
+    """
+    digest = identity_of(header)
+    identity = int(digest[:8], 16)
+    first = frames[0]
+    if first.identity != identity:
+        raise BadInputError(
+            f"{source}: the board runs the constants {first.identity:08X}, rig.yaml gives {identity:08X}; "
+            "write and flash the header again"
+        )
+    if first.sequence != 0:
+        raise BadInputError(
+            f"{source}: begins with tick {first.sequence}, expected 0: record from the board's start"
+        )
+    by_fused, by_mean = bool(first.flags & BY_FUSED), bool(first.flags & BY_MEAN_RATE)
+    if by_fused and header.literals["CALIB_HAS_FUSED"] != "1":
+        raise BadInputError(f"{source}: the board runs the fused estimator, for which rig.yaml has no gains")
+    reference = reference_of(values(header.literals), undistort, by_fused, by_mean)
+    worst = dict.fromkeys(TOLERANCE, 0.0)
+    differ, bad, ticks, lost = 0, None, 0, None
+    for tick, frame in enumerate(frames):
+        if frame.sequence != tick & 0xFFFF:
+            lost = tick
+            break
+        wanted = reference.step(frame.given, frame.flags)
+        found = _differences(frame, wanted)
+        over = [name for name, value in found.items() if value > TOLERANCE[name]]
+        if (frame.flags ^ wanted.flags) & ~_CLAMP_BITS:
+            differ += 1
+            over.append("flags")
+        if wanted.undecided_pwm > TOLERANCE["pwm"]:
+            over.append("the decision to clamp")
+        if wanted.undecided_m > _UNDECIDED_M:
+            over.append("the decision on rest, motion or a marker to leave out")
+        if over and bad is None:
+            bad = (tick, over[0])
+        worst = {name: max(worst[name], value) for name, value in found.items()}
+        ticks += 1
+    return Check(ticks, lost, worst, differ, bad)

@@ -1,0 +1,279 @@
+"""Test vectors that a board checks itself with."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.core.errors import BadInputError
+from calib.stages.firmware.conformance import (
+    MODE_OFF,
+    MODE_ORIENTATION,
+    MODE_POSITION,
+    Inputs,
+    Outputs,
+    Reference,
+    binary32,
+    reference_of,
+)
+from calib.stages.firmware.header import SCHEMA, Header, environment, identity_of
+from calib.stages.firmware.literals import float_literal, values
+
+# ----------------------------------------------------------------------
+# Golden vectors: a short run that drives every constant, with what the reference makes of it.
+#
+# The angle goes to +-1.3 rad, where the series and the angle filter have all their terms; the marker
+# crosses the picture; the wanted lengths sweep the feed-forward from its dead zone to its limit, and both
+# controllers meet both limits. A lost marker, a lost IMU and a refused reference are among the ticks.
+
+TOLERANCE = {"phi_rad": 2e-6, "marker_m": 2e-7, "q_m": 2e-6, "pwm": 0.01}
+"""What a board may differ by from float64."""
+
+FUSED_TICKS = 72
+"""Golden vectors of the fused estimator: pictures until it runs, a swing, a new start, rest."""
+
+
+@dataclass(frozen=True)
+class Vector:
+    """One tick: what goes in and what has to come out."""
+
+    given: Inputs
+    wanted: Outputs
+
+
+def directed(constants: Mapping[str, float], ticks: int) -> list[Inputs]:
+    """Ticks that reach every part of the pipeline.
+
+    Parameters
+    ----------
+    constants : of a header, by name.
+    """
+    width, height = constants["CALIB_CAMERA_GREATEST_U_PX"], constants["CALIB_CAMERA_GREATEST_V_PX"]
+    mount, rest = constants["CALIB_IMU_MOUNT_ANGLE_RAD"], constants["CALIB_REST_LENGTH_M"]
+    bias = constants["CALIB_IMU_GYRO_BIAS_RADPS"]
+    made = []
+    for k in range(ticks):
+        share = k / max(ticks - 1, 1)
+        turn = 2.0 * math.pi * share
+        phi = 1.3 * math.sin(3.0 * turn + 1.2)
+        mode = (MODE_POSITION, MODE_ORIENTATION)[(4 * k // ticks) % 2]
+        sweep = rest * (0.98 + 0.45 * abs(math.sin(2.0 * turn)))
+        reference = (
+            (sweep, 2.43 * rest - sweep) if mode == MODE_POSITION else (0.4 * math.cos(5.0 * turn), 0.0)
+        )
+        given = Inputs(
+            u_px=0.5 * width * (1.0 + 0.8 * math.cos(2.0 * turn)),
+            v_px=0.5 * height * (1.0 + 0.8 * math.sin(3.0 * turn)),
+            ax_mps2=9.81 * math.cos(phi + mount) + 0.8 * math.sin(11.0 * turn),
+            ay_mps2=9.81 * math.sin(phi + mount) + 0.8 * math.cos(13.0 * turn),
+            gz_radps=bias + 2.5 * math.sin(7.0 * turn),
+            reference=reference,
+            mode=mode,
+        )
+        made.append(binary32(spoilt(given, k)))
+    return made
+
+
+def vectors(header: Header, ticks: int = 48, fused: bool = False) -> list[Vector]:
+    """Golden vectors of a header that has a plane; `fused` for CALIB_FUSED 1."""
+    constants = values(header.literals)
+    reference = reference_of(constants, fused=fused)
+    given = directed_fused(constants, ticks, period=ticks) if fused else directed(constants, ticks)
+    return [Vector(one, reference.step(one)) for one in given]
+
+
+def _lines(vector: Vector) -> list[str]:
+    given, wanted = vector.given, vector.wanted
+    sensors = int(given.marker_seen) + 2 * int(given.imu_read)
+    into = [given.u_px, given.v_px, given.ax_mps2, given.ay_mps2, given.gz_radps, *given.reference]
+    out = [wanted.phi_rad, *wanted.marker_m, *wanted.head_m, *wanted.q_m, *wanted.pwm]
+
+    def row(numbers: list[float]) -> str:
+        # Zero where a value is too small for a normal float.
+        return ", ".join(float_literal(v if abs(v) > 1e-30 else 0.0, "calib_selftest_rows") for v in numbers)
+
+    return [row([*into, float(sensors), float(given.mode)]), row(out), row([float(wanted.flags)])]
+
+
+def selftest_text(header: Header) -> str:
+    """calib_selftest.h of a header that has a plane."""
+    from calib import __version__
+
+    fused = header.literals["CALIB_HAS_FUSED"] == "1"
+
+    return (
+        environment()
+        .get_template("calib_selftest.h.j2")
+        .render(
+            version=__version__,
+            schema=SCHEMA,
+            identity=identity_of(header)[:8].upper(),
+            undistort=int(Reference(values(header.literals)).undistort),
+            rows=[_lines(vector) for vector in vectors(header)],
+            fused_rows=[_lines(vector) for vector in vectors(header, FUSED_TICKS, fused=True)]
+            if fused
+            else [],
+            tolerance=TOLERANCE,
+        )
+    )
+
+
+# ----------------------------------------------------------------------
+# A run that drives the fused estimator: readings of one motion, so that the pictures fit the angle.
+#
+# Every `PERIOD` ticks the head swings through +-1.2 rad while its length changes, creeps by less than what
+# the
+# estimator counts as a motion, and rests. The marker is where the head was CALIB_FUSED_DELAY_TICKS earlier.
+# Pictures of something else, one by one and enough of them in a row for a new start, lost markers, lost
+# samples
+# of the IMU, free fall and refused references are among the ticks.
+
+PERIOD = 240
+_SWING = 0.55
+"""Share of a period in which the head swings; for half of the rest it creeps, then it stands still."""
+
+_STEP = 1e-4
+
+
+def pixel_of(
+    reference: Reference, X: float, Y: float, near: tuple[float, float] | None = None
+) -> tuple[float, float]:
+    """The pixel that the header's own constants take to the place (X, Y) [m] in the plane, to 1e-6 px.
+
+    Parameters
+    ----------
+    near : where to begin, the middle of the picture by default.
+
+    Raises `BadInputError` for a place that they give no pixel.
+    """
+    c = reference.c
+
+    def place(u: float, v: float) -> np.ndarray:
+        stem, (x, y) = ("PLANE_RAW", (u, v))
+        if reference.undistort:
+            stem, (x, y) = "PLANE_NORMALISED", reference.undistorted(u, v)
+        a, b, w = (c[f"{stem}_{i}1"] * x + c[f"{stem}_{i}2"] * y + c[f"{stem}_{i}3"] for i in (1, 2, 3))
+        return np.array([a / w - X, b / w - Y])
+
+    u, v = near or (0.5 * c["CAMERA_GREATEST_U_PX"], 0.5 * c["CAMERA_GREATEST_V_PX"])
+    for _ in range(40):
+        here = place(u, v)
+        slope = np.stack([place(u + _STEP, v) - here, place(u, v + _STEP) - here], axis=1) / _STEP
+        step = np.linalg.solve(slope, here)
+        # No farther than the picture's fifth, the lens' polynomial ends beyond its edge.
+        step /= max(1.0, float(np.abs(step).max()) / (0.2 * c["CAMERA_GREATEST_U_PX"]))
+        u, v = u - float(step[0]), v - float(step[1])
+        if float(np.abs(step).max()) < 1e-6:
+            return u, v
+    raise BadInputError(f"plane: no pixel shows the place ({X:.3g}, {Y:.3g}) m")
+
+
+class Motion:
+    """Angle [rad] and length [m] at a time in ticks.
+
+    Parameters
+    ----------
+    rest_m : rest length. period : ticks. creep_m : per tick, while the head creeps.
+    """
+
+    def __init__(self, rest_m: float, period: int, creep_m: float) -> None:
+        self.rest, self.period, self.creep = rest_m, period, creep_m
+
+    def at(self, k: float) -> tuple[float, float]:
+        """Angle and length."""
+        share = k / self.period - math.floor(k / self.period)
+        swung = min(share / _SWING, 1.0)
+        phi = 1.2 * math.sin(4.0 * math.pi * swung) * math.sin(math.pi * swung)
+        length = self.rest * (1.15 - 0.15 * math.cos(2.0 * math.pi * swung))
+        crept = min(max(share - _SWING, 0.0), 0.5 * (1.0 - _SWING)) * self.period
+        # Down again in the next swing.
+        back = 1.0 - swung if share < _SWING else 0.0
+        return phi, length + self.creep * (crept + back * 0.5 * (1.0 - _SWING) * self.period)
+
+    def rate(self, k: float) -> float:
+        """Change of the angle in a tick."""
+        return (self.at(k + 1e-3)[0] - self.at(k - 1e-3)[0]) / 2e-3
+
+
+def _readings(c: Mapping[str, float], phi: float, rate: float) -> tuple[float, float, float]:
+    """What the IMU reads at rest at an angle, turning by a rate per tick, by the header's constants."""
+    rows = np.array([[c[f"FUSED_ACCEL_{i}{j}"] for j in (1, 2)] for i in (1, 2)])
+    offset = np.array([c["FUSED_ACCEL_1"], c["FUSED_ACCEL_2"]])
+    gravity = c["FUSED_ACCEL_GAIN"] * np.array([math.cos(phi), math.sin(phi)])
+    ax, ay = np.linalg.solve(rows, gravity + offset).tolist()
+    gz = (c["FUSED_HALF_BIAS_RAD"] - 0.5 * rate) / c["FUSED_HALF_DT_S"]
+    return c["IMU_SIGN_AX"] * ax, c["IMU_SIGN_AY"] * ay, c["IMU_SIGN_GZ"] * gz
+
+
+def coherent(
+    constants: Mapping[str, float], ticks: int, undistort: bool | None = None, period: int = PERIOD
+) -> list[Inputs]:
+    """Readings of one motion, in either mode of control.
+
+    Parameters
+    ----------
+    constants : of a header that has the estimator, by name. undistort : CALIB_UNDISTORT.
+    """
+    reference = Reference(constants, undistort)
+    c = reference.c
+    creep = 0.5 * c["FUSED_REST_LENGTH"] * c["FUSED_MOVING_M"]
+    motion, d, made = Motion(c["REST_LENGTH_M"], period, creep), c["MARKER_OFFSET_M"], []
+    last: tuple[float, float] | None = None
+    for k in range(ticks):
+        phi, length = motion.at(k - c["FUSED_DELAY_TICKS"])
+        chord = length * (math.sin(0.5 * phi) / (0.5 * phi) if phi else 1.0)
+        X = chord * math.sin(0.5 * phi) + d * math.sin(phi)
+        Y = chord * math.cos(0.5 * phi) + d * math.cos(phi)
+        u, v = last = pixel_of(reference, X, Y, last)
+        angle, rate = motion.at(k)[0], motion.rate(k)
+        ax, ay, gz = _readings(c, angle, rate)
+        shaken = 0.8 if k % period < _SWING * period else 0.02
+        mode = (MODE_POSITION, MODE_ORIENTATION)[(3 * k // period) % 2]
+        wanted = motion.at(k)[1] * (1.0 + 0.05 * math.sin(0.11 * k))
+        noisy = 0.3 * (k % period < _SWING * period)
+        given = Inputs(
+            u_px=u + noisy * math.sin(1.7 * k),
+            v_px=v + noisy * math.cos(2.3 * k),
+            ax_mps2=ax + shaken * math.sin(0.9 * k),
+            ay_mps2=ay + shaken * math.cos(1.1 * k),
+            gz_radps=gz + 0.01,
+            reference=(wanted, wanted) if mode == MODE_POSITION else (angle + 0.1 * math.cos(0.07 * k), 0.0),
+            mode=mode,
+        )
+        made.append(binary32(given))
+    return made
+
+
+def directed_fused(
+    constants: Mapping[str, float], ticks: int, undistort: bool | None = None, period: int = PERIOD
+) -> list[Inputs]:
+    """`coherent` readings with all that can go wrong: every part of estimator and controllers is reached."""
+    given = coherent(constants, ticks, undistort, period)
+    return [binary32(_disturbed(one, k, period)) for k, one in enumerate(given)]
+
+
+def spoilt(given: Inputs, k: int) -> Inputs:
+    """Tick `k` as it comes: without marker, IMU or command every now and then, the reference out of reach."""
+    if k % 29 == 17:
+        given = replace(given, marker_seen=False)
+    if k % 31 == 19:
+        given = replace(given, imu_read=False)
+    if k % 37 == 23:
+        given = replace(given, reference=(7.0, 7.0))
+    if k % 41 == 40:
+        given = replace(given, mode=MODE_OFF)
+    return given
+
+
+def _disturbed(given: Inputs, k: int, period: int) -> Inputs:
+    at = k % period
+    given = spoilt(given, k)
+    if k % 43 == 33:
+        given = replace(given, ax_mps2=0.1, ay_mps2=-0.1)
+    if k % 23 == 14 or 3 * period // 10 <= at < 3 * period // 10 + 8:
+        # Something else in the picture.
+        given = replace(given, u_px=given.u_px + (25.0 if given.u_px < 150.0 else -25.0))
+    return given

@@ -1,0 +1,446 @@
+"""How the angles of one log drift apart."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.ndimage import uniform_filter1d
+from scipy.special import stdtrit
+
+from calib.core.arrays import BoolArray, FloatArray
+from calib.core.errors import BadInputError
+from calib.stages.imu.allan import allan_variance
+from calib.stages.imu.mahony import wrapped
+from calib.stages.imu.sampling import Sampling, regular_parts, rest_parts
+from calib.stages.imu.static import is_gyro
+from calib.stages.imu.tracks import DriftLog, Track, Tuned, mean_angle, on_grid, tracks_of
+
+# ----------------------------------------------------------------------
+# What is said of the error of an angle: its slope with an interval, its lag, its Allan deviation.
+#
+# **Slope.** An ordinary straight line with one slope and an offset for each stretch. The error of an angle
+# is no white noise: an integrated rate walks at random, a filter forgets slowly. So the stretches are cut
+# into about 128 blocks, and the blocks' means r about the line are taken for white noise on a process of
+# order one, whose limit is the random walk,
+#
+#     cov(r_i, r_j) = s^2 ((1 - a) [i = j] + a (1 - rho^2) rho^|i-j|),
+#
+# the second term being the covariance of the means of a walk for rho = 1 (min(i, j) would be that of single
+# samples, whose steps are larger by the root of 3 / 2).
+#
+# Every pair of a grid of (rho, a) is given its restricted likelihood (Patterson and Thompson, Biometrika
+# 58, 1971), which does not take what the line has fitted for evidence of calm, with the s^2 that suits it
+# best, and its variance of the slope, w' cov w for the weights w of the line. Where the log does not decide
+# between pairs, the most doubtful counts: the largest deviation among those whose log-likelihood is within
+# `_SUPPORT` of the highest. The interval is Student's for the number of blocks.
+#
+# A slope that itself wanders, as that of a gyroscope's bias does, has no interval from one log: the spread
+# over several logs shows it.
+#
+# **Lag.** Both angles are freed from what is slower than some seconds, the estimate is moved against the
+# truth by whole samples, and a parabola through the highest correlation and its neighbours gives the
+# fraction. Drift and offsets so play no part.
+
+_BLOCKS = 128
+_FEWEST_BLOCKS = 8
+_RHO = (0.0, 0.3, 0.6, 0.8, 0.9, 0.95, 0.98, 0.99, 1.0)
+_SHARE = (0.02, 0.1, 0.3, 0.6, 0.9, 1.0)
+_SUPPORT = 1.0
+_SLOW_S = 4.0
+_FARTHEST_S = 0.5
+_LEAST_CORRELATION = 0.5
+
+
+@dataclass(frozen=True)
+class Slope:
+    """Slope [rad/s], its standard deviation and its 95 % interval; NaN where it cannot be told.
+
+    `rho` is the coefficient from block to block that the deviation rests on, `block_s` their length.
+    """
+
+    value: float
+    sigma: float
+    low: float
+    high: float
+    rho: float
+    block_s: float
+
+
+def _line(stretches: Sequence[FloatArray]) -> float:
+    """Slope per sample with one offset for each stretch."""
+    top, below = 0.0, 0.0
+    for y in stretches:
+        k = np.arange(len(y), dtype=np.float64)
+        k -= k.mean()
+        top += float(k @ y)
+        below += float(k @ k)
+    return top / below if below > 0.0 else math.nan
+
+
+@lru_cache(maxsize=512)
+def _covariance(count: int, size: int, rho: float, share: float) -> FloatArray:
+    """Covariance of the means of `count` blocks of `size` samples for s^2 = 1."""
+    k = np.arange(count)
+    if rho >= 1.0:
+        # A walk of variance 1 / size per sample, averaged within each block.
+        slow = np.minimum.outer(k, k) + (size + 1.0) / (2.0 * size)
+        slow[k, k] = k + (size + 1.0) * (2.0 * size + 1.0) / (6.0 * size * size)
+    else:
+        slow = (1.0 - rho * rho) * rho ** np.abs(np.subtract.outer(k, k)).astype(np.float64)
+    return np.asarray((1.0 - share) * np.eye(count) + share * slow)
+
+
+def _judged(means: Sequence[FloatArray], size: int, rho: float, share: float) -> tuple[float, float]:
+    """Restricted log-likelihood, and variance of the slope per block."""
+    J, below = (
+        sum(len(mean) for mean in means),
+        sum(len(mean) * (len(mean) ** 2 - 1) / 12.0 for mean in means),
+    )
+    logs, weight = 0.0, 0.0
+    tt, ty, yy = 0.0, 0.0, 0.0
+    for mean in means:
+        k = np.arange(len(mean), dtype=np.float64)
+        k -= k.mean()
+        G = _covariance(len(mean), size, rho, share)
+        L = np.linalg.cholesky(G)
+        one, t, y = solve_triangular(L, np.stack([np.ones_like(k), k, mean], axis=1), lower=True).T
+        logs += 2.0 * float(np.log(np.diag(L)).sum()) + math.log(float(one @ one))
+        # Each stretch's own offset goes out first.
+        t, y = t - one * (one @ t) / (one @ one), y - one * (one @ y) / (one @ one)
+        tt, ty, yy = tt + float(t @ t), ty + float(t @ y), yy + float(y @ y)
+        weight += float(k @ G @ k) / below**2
+    free = J - len(means) - 1
+    scale = max(yy - ty * ty / tt, 0.0) / free
+    if scale <= 0.0:
+        return math.inf, 0.0
+    return -0.5 * (logs + math.log(tt) + free * math.log(scale)), scale * weight
+
+
+def slope_of(stretches: Sequence[FloatArray], period_s: float) -> Slope:
+    """Common slope of the stretches (n_i,) [rad] at one period, each with an offset of its own.
+
+    NaN without two samples in a stretch; without an interval where they give too few blocks.
+    """
+    nan = math.nan
+    long = [y for y in stretches if len(y) >= 2]
+    if not long:
+        return Slope(nan, nan, nan, nan, nan, nan)
+    value = _line(long) / period_s
+    size = max(sum(len(y) for y in long) // _BLOCKS, 1)
+    means = [y[: len(y) // size * size].reshape(-1, size).mean(axis=1) for y in long if len(y) >= 2 * size]
+    free = sum(len(mean) for mean in means) - len(means) - 1
+    if free < _FEWEST_BLOCKS:
+        return Slope(value, nan, nan, nan, nan, nan)
+    means = [mean - mean.mean() for mean in means]
+    pairs = [(rho, share) for rho in _RHO for share in (_SHARE if rho > 0.0 else _SHARE[:1])]
+    judged = [(*_judged(means, size, rho, share), rho) for rho, share in pairs]
+    most = max(likely for likely, _, _ in judged)
+    variance, rho = max((v, rho) for likely, v, rho in judged if likely >= most - _SUPPORT)
+    block_s = size * period_s
+    sigma = math.sqrt(variance) / block_s
+    half = float(stdtrit(free, 0.975)) * sigma
+    return Slope(value, sigma, value - half, value + half, rho, block_s)
+
+
+def allan_at(stretches: Sequence[FloatArray], period_s: float, tau_s: float) -> float:
+    """Overlapping Allan deviation of the angles [rad] averaged over tau; NaN where all are too short."""
+    m = np.array([max(round(tau_s / period_s), 1)], dtype=np.int64)
+    if not any(len(y) >= 2 * int(m[0]) for y in stretches):
+        return math.nan
+    return math.sqrt(float(allan_variance(list(stretches), m)[0]))
+
+
+def _quick(y: FloatArray, period_s: float) -> FloatArray:
+    """What is faster than some seconds."""
+    size = min(max(round(_SLOW_S / period_s), 3), len(y))
+    return np.asarray(y - uniform_filter1d(y, size, mode="nearest"))
+
+
+def lag_s(
+    estimate: Sequence[FloatArray],
+    truth: Sequence[FloatArray],
+    period_s: float,
+    farthest_s: float = _FARTHEST_S,
+) -> float:
+    """How much later [s] the estimate comes than the truth; negative where it is ahead.
+
+    Parameters
+    ----------
+    estimate, truth : pairs of stretches (n_i,) at one period.
+    farthest_s : lags that are tried, on both sides.
+
+    Returns
+    -------
+    NaN where the two hardly resemble each other, or are most alike at the end of what was tried.
+    """
+    M = max(round(farthest_s / period_s), 2)
+    lags = np.arange(-M, M + 1)
+    both, own, theirs = np.zeros(len(lags)), np.zeros(len(lags)), 0.0
+    for e, t in zip(estimate, truth, strict=True):
+        n = len(t)
+        if n < 4 * M:
+            continue
+        quick_e, quick_t = _quick(e, period_s), _quick(t, period_s)[M : n - M]
+        theirs += float(quick_t @ quick_t)
+        for i, lag in enumerate(lags.tolist()):
+            moved = quick_e[M + lag : n - M + lag]
+            both[i] += float(moved @ quick_t)
+            own[i] += float(moved @ moved)
+    if not (theirs > 0.0 and own.min() > 0.0):
+        return math.nan
+    c = both / np.sqrt(own * theirs)
+    i = int(np.argmax(c))
+    if i in (0, len(c) - 1) or c[i] < _LEAST_CORRELATION:
+        return math.nan
+    bend = c[i - 1] - 2.0 * c[i] + c[i + 1]
+    fraction = 0.5 * (c[i - 1] - c[i + 1]) / bend if bend < 0.0 else 0.0
+    return float((lags[i] + fraction) * period_s)
+
+
+# ----------------------------------------------------------------------
+# How the angle drifts by each way of getting it, on the same log.
+#
+# The methods are those of `calib.stages.imu.tracks`, over each part of a log that has no long gap. What is
+# judged is the error of their angle against
+#
+# - the true angle, where the log has one: everywhere, without the first seconds of a part for slope,
+#   offset and Allan deviation, and while it moves for RMSE and lag;
+# - otherwise a constant, in each stretch at rest, again without the stretch's first seconds, in which
+#   filters settle. A log that never rests then shows nothing.
+#
+# An angle has no absolute zero here, as the sensor is mounted at an unknown one: the offset is the mean
+# error against the truth, or against the accelerometer's mean angle in the same stretch, and the RMSE is
+# taken about the mean error while it moves.
+#
+# A slope alone does not rank filters. The MM filter takes a constant bias of the gyroscope into its
+# integral and rejects it entirely: what slope is left is the accelerometer's, whatever the gains. A slope
+# near zero thus says nothing about noise, lag and error in motion.
+
+NOT_A_RANKING = (
+    "a slope alone does not rank filters: the MM filter rejects a constant gyro bias entirely, so that the "
+    "slope it has left is the accelerometer's, whatever its gains; look at noise, lag and RMSE in motion too"
+)
+
+_SETTLE_S = 5.0
+_SETTLE_SHARE = 0.25
+_SHORTEST_S = 2.0
+
+
+@dataclass(frozen=True)
+class Measures:
+    """What is said of one method on one log [rad, s]; NaN where the log does not show it."""
+
+    name: str
+    offset_rad: float
+    slope: Slope
+    allan_1s_rad: float
+    allan_100s_rad: float
+    rmse_rad: float
+    lag_s: float
+
+
+@dataclass(frozen=True)
+class LogDrift:
+    """One log.
+
+    Attributes
+    ----------
+    against : "truth", "rest" or "nothing".
+    judged_s : length of what slope, offset and Allan deviation rest on.
+    moving_s : length of what it moves.
+    upright : median share of gravity that is in the sensor's plane, squared; NaN without az. Where it is
+        small the plane is nearly level, and the angle hardly defined.
+    start_s : time of each part's first sample.
+    moving : where (n_i,) each part moves.
+    truth_rad : the true angle in each part, NaN outside of its samples; None without.
+    tracks, measures : by method, in the same order.
+    skipped : sentences about methods that were left out.
+    """
+
+    source: str
+    sampling: Sampling
+    against: str
+    judged_s: float
+    moving_s: float
+    upright: float
+    start_s: tuple[float, ...]
+    moving: tuple[BoolArray, ...]
+    truth_rad: tuple[FloatArray, ...] | None
+    tracks: tuple[Track, ...]
+    measures: tuple[Measures, ...]
+    skipped: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Slopes [rad/s] of one method over several logs: mean, standard deviation from log to log, number."""
+
+    name: str
+    mean_radps: float
+    spread_radps: float
+    logs: int
+
+
+def _runs(flags: BoolArray) -> list[tuple[int, int]]:
+    """First and behind the last of each run of set flags."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int64), [0]])))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+def _settled(start: int, stop: int, period_s: float) -> slice:
+    skip = min(round(_SETTLE_S / period_s), int(_SETTLE_SHARE * (stop - start)))
+    return slice(start + skip, stop)
+
+
+def _no_turns(error: FloatArray) -> FloatArray:
+    """An error without jumps by a turn, its middle within half a turn."""
+    smooth = np.unwrap(error)
+    return np.asarray(smooth - 2.0 * math.pi * np.rint(np.median(smooth) / (2.0 * math.pi)))
+
+
+def _upright(log: DriftLog) -> float:
+    if "az" not in log.axes:
+        return math.nan
+    ax, ay, az = (log.values[:, log.axes.index(axis)] for axis in ("ax", "ay", "az"))
+    return float(np.median((ax**2 + ay**2) / np.maximum(ax**2 + ay**2 + az**2, 1e-12)))
+
+
+def _measure(
+    track: Track,
+    truth: Sequence[FloatArray] | None,
+    phi_acc: Sequence[FloatArray],
+    stretches: Sequence[tuple[int, slice]],
+    moving: Sequence[BoolArray],
+    period_s: float,
+) -> Measures:
+    errors, offsets = [], []
+    for k, where in stretches:
+        angle = track.phi_rad[k][where]
+        error = angle - truth[k][where] if truth is not None else angle
+        known = np.isfinite(error)
+        if known.sum() < 2:
+            continue
+        # Short gaps of the truth or of the chip's angle do not cut a stretch in two.
+        at = np.arange(len(error))
+        error = _no_turns(np.interp(at, at[known], _no_turns(error[known])))
+        errors.append(error)
+        zero = 0.0 if truth is not None else mean_angle(phi_acc[k][where])
+        offsets.append(float(error.mean()) - zero)
+    offset = math.nan
+    if offsets:
+        lengths = [len(error) for error in errors]
+        offset = float(np.average(wrapped(np.array(offsets)), weights=lengths))
+    rmse, lag = math.nan, math.nan
+    if truth is not None:
+        off = [(e - t)[np.isfinite(e - t) & m] for e, t, m in zip(track.phi_rad, truth, moving, strict=True)]
+        off = [_no_turns(error) for error in off if len(error)]
+        if off:
+            # Parts may be whole turns apart.
+            middle = float(np.median(off[0]))
+            flat = np.concatenate(
+                [
+                    error - 2.0 * math.pi * np.rint((np.median(error) - middle) / (2.0 * math.pi))
+                    for error in off
+                ]
+            )
+            rmse = float(flat.std())
+            pieces = [
+                (e[a:b], t[a:b])
+                for e, t in zip(track.phi_rad, truth, strict=True)
+                for a, b in _runs(np.isfinite(e) & np.isfinite(t))
+            ]
+            lag = lag_s([e for e, _ in pieces], [t for _, t in pieces], period_s)
+    return Measures(
+        track.name,
+        offset,
+        slope_of(errors, period_s),
+        allan_at(errors, period_s, 1.0),
+        allan_at(errors, period_s, 100.0),
+        rmse,
+        lag,
+    )
+
+
+def analyse_drift(
+    log: DriftLog,
+    tuned: Tuned | None = None,
+    peers: bool = True,
+    told: Callable[[str], None] = lambda sentence: None,
+) -> LogDrift:
+    """All methods on one log, and what is said of each.
+
+    Parameters
+    ----------
+    tuned : what the row "MM tuned" is made with, left out without.
+    peers : run the filters of others that are installed.
+    told : is called with a sentence before what may take long.
+
+    Raises
+    ------
+    BadInputError for a log without gz, ax and ay or with too few samples.
+    """
+    for axis in ("gz", "ax", "ay"):
+        if axis not in log.axes:
+            raise BadInputError(f"{log.source}: has no readings of {axis}, expected gz, ax and ay")
+    gyro = is_gyro(log.axes)
+    sampling, every = regular_parts(log.t_s, log.values, gyro, log.source)
+    period_s = sampling.period_s
+    parts = tuple(part for part in every if len(part.values) * period_s >= _SHORTEST_S)
+    if not parts:
+        longest = max(len(part.values) for part in every) * period_s
+        raise BadInputError(
+            f"{log.source}: is {longest:.3g} s long without a long gap, expected at least {_SHORTEST_S:g} s"
+        )
+    _, motions = rest_parts(parts, period_s, gyro, sampling.step)
+    moving = []
+    for part in parts:
+        at = part.start_s + period_s * (np.arange(len(part.values)) + 0.5)
+        flags = np.zeros(len(at), dtype=np.bool_)
+        for motion in motions:
+            flags[np.searchsorted(at, motion.from_s) : np.searchsorted(at, motion.to_s)] = True
+        moving.append(flags)
+    truth = None
+    if len(log.true_t_s) >= 2:
+        truth = on_grid(log.true_t_s, log.true_phi_rad, parts, period_s)
+        stretches = [(k, _settled(0, len(part.values), period_s)) for k, part in enumerate(parts)]
+    else:
+        stretches = [
+            (k, _settled(a, b, period_s))
+            for k, flags in enumerate(moving)
+            for a, b in _runs(~flags)
+            if (b - a) * period_s >= _SHORTEST_S
+        ]
+    tracks, skipped = tracks_of(log, parts, period_s, tuned, peers, told)
+    phi_acc = next(track.phi_rad for track in tracks if track.name == "accelerometer alone")
+    measures = [_measure(track, truth, phi_acc, stretches, moving, period_s) for track in tracks]
+    return LogDrift(
+        log.source,
+        sampling,
+        "truth" if truth is not None else "rest" if stretches else "nothing",
+        period_s * sum(where.stop - where.start for _, where in stretches),
+        period_s * sum(int(flags.sum()) for flags in moving),
+        _upright(log),
+        tuple(part.start_s for part in parts),
+        tuple(moving),
+        truth,
+        tuple(tracks),
+        tuple(measures),
+        tuple(skipped),
+    )
+
+
+def spread_of(logs: Sequence[LogDrift]) -> tuple[Spread, ...]:
+    """Mean and spread of the slopes of each method over the logs that show one (Fig. 2.4)."""
+    names = list(dict.fromkeys(measures.name for log in logs for measures in log.measures))
+    out = []
+    for name in names:
+        slopes = [m.slope.value for log in logs for m in log.measures if m.name == name]
+        known = np.array([slope for slope in slopes if math.isfinite(slope)])
+        spread = float(known.std(ddof=1)) if len(known) > 1 else math.nan
+        out.append(Spread(name, float(known.mean()) if len(known) else math.nan, spread, len(known)))
+    return tuple(out)

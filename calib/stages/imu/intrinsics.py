@@ -1,0 +1,1364 @@
+"""Bias, scale and misalignment of an IMU from rests in many poses and the turns between them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numba import njit
+from scipy.optimize import least_squares
+from scipy.special import fdtrc
+
+from calib.core.arrays import FloatArray, IntArray
+from calib.core.errors import BadInputError
+from calib.stages.imu.sampling import (
+    MULTIPLES,
+    Part,
+    Quiet,
+    Rest,
+    Sampling,
+    Spread,
+    find_rests,
+    quiet_level,
+    regular_parts,
+    spread,
+)
+from calib.stages.imu.static import is_gyro
+
+# ----------------------------------------------------------------------
+# Compiled integration of rates of rotation over many turns.
+
+
+@njit(cache=True, nogil=True)
+def _rate(q: FloatArray, w: FloatArray, out: FloatArray) -> None:
+    """dq/dt = q * (0, w) / 2."""
+    out[0] = 0.5 * (-q[1] * w[0] - q[2] * w[1] - q[3] * w[2])
+    out[1] = 0.5 * (q[0] * w[0] + q[2] * w[2] - q[3] * w[1])
+    out[2] = 0.5 * (q[0] * w[1] + q[3] * w[0] - q[1] * w[2])
+    out[3] = 0.5 * (q[0] * w[2] + q[1] * w[1] - q[2] * w[0])
+
+
+@njit(cache=True, nogil=True)
+def turn_directions(
+    rates: FloatArray,
+    M: FloatArray,
+    starts: IntArray,
+    stops: IntArray,
+    before: FloatArray,
+    period_s: float,
+    out: FloatArray,
+) -> None:
+    """Directions that are fixed in the world, as the sensor sees them after each turn.
+
+    Parameters
+    ----------
+    rates : (n, 3); the rate of rotation is M rate, linear between readings.
+    starts, stops : (k,) first and last reading of each turn.
+    before : (k, 3) vectors before the turns.
+    out : (k, 3) vectors after them.
+    """
+    w0, wm, w1 = np.zeros(3), np.zeros(3), np.zeros(3)
+    q, trial = np.zeros(4), np.zeros(4)
+    k1, k2, k3, k4 = np.zeros(4), np.zeros(4), np.zeros(4), np.zeros(4)
+    h = period_s
+    for turn in range(len(starts)):
+        q[0], q[1], q[2], q[3] = 1.0, 0.0, 0.0, 0.0
+        for i in range(3):
+            w1[i] = 0.0
+            for j in range(3):
+                w1[i] += M[i, j] * rates[starts[turn], j]
+        for row in range(starts[turn], stops[turn]):
+            for i in range(3):
+                w0[i] = w1[i]
+                w1[i] = 0.0
+                for j in range(3):
+                    w1[i] += M[i, j] * rates[row + 1, j]
+                wm[i] = 0.5 * (w0[i] + w1[i])
+            _rate(q, w0, k1)
+            for i in range(4):
+                trial[i] = q[i] + 0.5 * h * k1[i]
+            _rate(trial, wm, k2)
+            for i in range(4):
+                trial[i] = q[i] + 0.5 * h * k2[i]
+            _rate(trial, wm, k3)
+            for i in range(4):
+                trial[i] = q[i] + h * k3[i]
+            _rate(trial, w1, k4)
+            norm = 0.0
+            for i in range(4):
+                q[i] += h / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i])
+                norm += q[i] * q[i]
+            norm = norm**0.5
+            for i in range(4):
+                q[i] /= norm
+        # v_after = R(q)^T v_before, q turning vectors of the sensor after into those before.
+        s, x, y, z = q[0], q[1], q[2], q[3]
+        a, b, c = before[turn, 0], before[turn, 1], before[turn, 2]
+        out[turn, 0] = (1 - 2 * (y * y + z * z)) * a + 2 * (x * y + s * z) * b + 2 * (x * z - s * y) * c
+        out[turn, 1] = 2 * (x * y - s * z) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z + s * x) * c
+        out[turn, 2] = 2 * (x * z + s * y) * a + 2 * (y * z - s * x) * b + (1 - 2 * (x * x + y * y)) * c
+
+
+# ----------------------------------------------------------------------
+# An accelerometer's bias, scale and misalignment from rests in many poses.
+#
+# At rest the specific force has the length g, whatever the pose. Readings x (counts or m/s^2) become
+#
+#     a = T diag(1/s) (x - b),   T = [[1, -yz, zy], [0, 1, -zx], [0, 0, 1]],
+#
+# with the bias b, the scale s (counts per m/s^2, or about 1) and three small angles [rad] (Tedaldi, Pretto
+# and Menegatti, ICRA 2014, eqs. 1 - 6; names as in imu_tk). T is upper triangular because a rotation of all
+# axes together changes no length: the frame's z axis is the sensor's, its y axis lies in the plane of the
+# sensor's y and z. In a plane of two axes yz alone is left.
+#
+# The cost is the sum of w (|a| - g)^2 over the means of the rests. With the long-run variance of the
+# readings C, a mean of n has
+#
+#     1 / w = u^T A C A^T u / n + tau^2,   A = T diag(1/s),  u = a / |a|,
+#
+# where tau is what the rests disagree by beyond their noise (a bias that moves, a table that gives way),
+# chosen so that the weighted residuals have the size that their degrees of freedom ask for. So neither a
+# long
+# rest counts for more than it is worth, nor a short one for less. Standard deviations follow from the
+# normal
+# equations times the measured scale of the residuals.
+#
+# What can be told is judged by the singular values of dr/dp, in units of g, by which the root of the number
+# of rests is divided. Poses all over the sphere make the smallest 0.26, on the circle 0.35. Misalignments
+# that the poses do not tell, as when each axis just points up and down, are left at zero.
+
+ANGLES = {2: ("yz",), 3: ("yz", "zy", "zx")}
+"""Names of the misalignments by the number of axes, in the order of the parameters."""
+
+LEAST_SPAN = 0.02
+"""Smallest singular value below which parameters are not told apart."""
+
+_PLACES = {"yz": (0, 1, -1.0), "zy": (0, 2, 1.0), "zx": (1, 2, -1.0)}
+_ROUNDS = 6
+
+
+@dataclass(frozen=True)
+class Accelerometer:
+    """A fitted accelerometer of d axes.
+
+    Attributes
+    ----------
+    bias, scale : (d,) in the unit of the readings, and per m/s^2.
+    angles : (k,) misalignments as `ANGLES[d]`, rad; zero where `skewed` is False.
+    sigma : (2 d + k,) standard deviations of bias, scale and angles, infinite where not told.
+    covariance : (2 d + k, 2 d + k) of them, zero where not told.
+    directions : (n, d) unit vectors of the rests' specific forces.
+    direction_sigma : (n,) standard deviation of a direction [rad], residuals included.
+    residual_mps2 : (n,) |a| - g of the rests.
+    deviation_mps2 : (n,) what their deviation is, tau included.
+    tau_mps2 : disagreement beyond noise.
+    rms_mps2 : of the residuals, each rest alike.
+    dof : rests less parameters.
+    span : smallest singular value of all parameters that were fitted; 0 without a solution.
+    weakest : (2 d + k,) the direction in the space of parameters that belongs to it.
+    skewed : whether the misalignments were fitted.
+    """
+
+    bias: FloatArray
+    scale: FloatArray
+    angles: FloatArray
+    sigma: FloatArray
+    covariance: FloatArray
+    directions: FloatArray
+    direction_sigma: FloatArray
+    residual_mps2: FloatArray
+    deviation_mps2: FloatArray
+    tau_mps2: float
+    rms_mps2: float
+    dof: int
+    span: float
+    weakest: FloatArray
+    skewed: bool
+
+    @property
+    def parameters(self) -> FloatArray:
+        """Bias, scale and angles (2 d + k,)."""
+        return np.concatenate([self.bias, self.scale, self.angles])
+
+    @property
+    def matrix(self) -> FloatArray:
+        """A (d, d) of a = A (x - b)."""
+        return misalignment(self.angles, len(self.bias)) / self.scale
+
+
+def misalignment(angles: FloatArray, d: int) -> FloatArray:
+    """T (d, d) of the misalignments as `ANGLES[d]`."""
+    T = np.eye(d)
+    for name, angle in zip(ANGLES[d], angles, strict=True):
+        i, j, sign = _PLACES[name]
+        T[i, j] = sign * angle
+    return T
+
+
+def corrected(parameters: FloatArray, readings: FloatArray) -> FloatArray:
+    """Specific forces (n, d) of readings (n, d) [m/s^2], by parameters as `Accelerometer.parameters`."""
+    return _corrected(parameters, readings)[0]
+
+
+def _corrected(p: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """a (n, d) and its parts: T (d, d) and the scaled y (n, d)."""
+    d = x.shape[1]
+    T = misalignment(p[2 * d :], d)
+    y = (x - p[:d]) / p[d : 2 * d]
+    return y @ T.T, T, y
+
+
+def _residual_and_jacobian(p: FloatArray, x: FloatArray, g: float) -> tuple[FloatArray, FloatArray]:
+    """|a| - g (n,) and its derivative (n, 2 d + k)."""
+    d = x.shape[1]
+    a, T, y = _corrected(p, x)
+    length = np.maximum(np.linalg.norm(a, axis=1), 1e-12 * g)
+    u = a / length[:, None]
+    along = u @ T
+    J = np.empty((len(x), len(p)))
+    J[:, :d] = -along / p[d : 2 * d]
+    J[:, d : 2 * d] = -along * y / p[d : 2 * d]
+    for k, name in enumerate(ANGLES[d]):
+        i, j, sign = _PLACES[name]
+        J[:, 2 * d + k] = sign * u[:, i] * y[:, j]
+    return length - g, J
+
+
+def _units(p: FloatArray, d: int, g: float) -> FloatArray:
+    """A change of each parameter that alters a reading by about g, so that J * units / g has no unit."""
+    out = np.ones(len(p))
+    out[:d] = g * np.abs(p[d : 2 * d])
+    out[d : 2 * d] = np.abs(p[d : 2 * d])
+    return out
+
+
+def _start(x: FloatArray, g: float) -> FloatArray:
+    """Bias and scale of the axis-aligned ellipsoid through the means; a sphere where that is none."""
+    d = x.shape[1]
+    middle, size = x.mean(axis=0), max(float(np.ptp(x, axis=0).max()), 1e-12)
+    z = (x - middle) / size
+    k = ANGLES[d]
+    p = np.zeros(2 * d + len(k))
+    if len(x) >= 2 * d:
+        q = np.linalg.lstsq(np.hstack([z**2, z]), np.ones(len(x)), rcond=1e-9)[0]
+        if np.all(q[:d] > 0.0):
+            centre = -0.5 * q[d:] / q[:d]
+            radius = np.sqrt((1.0 + (q[:d] * centre**2).sum()) / q[:d])
+            if radius.max() < 3.0 * radius.min():
+                p[:d], p[d : 2 * d] = middle + size * centre, size * radius / g
+                return p
+    q = np.linalg.lstsq(np.hstack([2.0 * z, np.ones((len(x), 1))]), (z**2).sum(axis=1), rcond=1e-6)[0]
+    p[:d] = middle + size * q[:d]
+    p[d : 2 * d] = size * math.sqrt(max(float(q[d] + q[:d] @ q[:d]), 1e-6)) / g
+    return p
+
+
+def _starts(x: FloatArray, g: float, si: bool) -> list[FloatArray]:
+    d = x.shape[1]
+    starts = [_start(x, g)]
+    if si:
+        p = np.zeros_like(starts[0])
+        p[d : 2 * d] = 1.0
+        starts.insert(0, p)
+    return starts
+
+
+def _deviations(p: FloatArray, x: FloatArray, variance: FloatArray) -> FloatArray:
+    """Standard deviation (n,) of |a| from the noise of the readings' means, whose variance is (n, d)."""
+    d = x.shape[1]
+    a, T, _ = _corrected(p, x)
+    u = a / np.maximum(np.linalg.norm(a, axis=1), 1e-300)[:, None]
+    return np.asarray(np.sqrt((((u @ T) / p[d : 2 * d]) ** 2 * variance).sum(axis=1)))
+
+
+def _tau(r: FloatArray, deviation: FloatArray, dof: int) -> float:
+    """tau by which sum r^2 / (deviation^2 + tau^2) becomes dof; 0 where it is less without it."""
+
+    def excess(tau2: float) -> float:
+        return float((r**2 / (deviation**2 + tau2)).sum()) - dof
+
+    if dof <= 0 or excess(0.0) <= 0.0:
+        return 0.0
+    low, high = 0.0, float((r**2).sum()) / dof
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if excess(middle) > 0.0 else (low, middle)
+    return math.sqrt(0.5 * (low + high))
+
+
+def _solve(p: FloatArray, free: IntArray, x: FloatArray, g: float, deviation: FloatArray) -> FloatArray:
+    """Least squares over the free parameters."""
+    d = x.shape[1]
+    units = _units(p, d, g)[free]
+
+    def full(q: FloatArray) -> FloatArray:
+        out = p.copy()
+        out[free] = p[free] + q * units
+        # A scale of the other sign is the same sensor turned over.
+        out[d : 2 * d] = np.maximum(out[d : 2 * d], 0.02 * p[d : 2 * d])
+        return out
+
+    def weighted(q: FloatArray) -> FloatArray:
+        return np.asarray(_residual_and_jacobian(full(q), x, g)[0] / deviation)
+
+    def slope(q: FloatArray) -> FloatArray:
+        J = _residual_and_jacobian(full(q), x, g)[1]
+        return np.asarray(J[:, free] * units / deviation[:, None])
+
+    start = np.zeros(len(free))
+    found = least_squares(weighted, start, jac=slope, method="lm", xtol=1e-10, ftol=1e-10, max_nfev=200)
+    return full(found.x)
+
+
+def _span(p: FloatArray, free: IntArray, x: FloatArray, g: float) -> tuple[float, FloatArray]:
+    """Smallest singular value, and its direction (2 d + k,) in units of g."""
+    J = _residual_and_jacobian(p, x, g)[1][:, free] * _units(p, x.shape[1], g)[free] / g
+    _, values, Vt = np.linalg.svd(J / math.sqrt(len(x)))
+    weakest = np.zeros(len(p))
+    weakest[free] = Vt[-1]
+    return (float(values[-1]) if len(values) == len(free) else 0.0), weakest
+
+
+def _fit(
+    starts: list[FloatArray], free: IntArray, x: FloatArray, g: float, variance: FloatArray
+) -> tuple[FloatArray, FloatArray, float]:
+    """Parameters, deviations of the rests with tau in them, and tau."""
+    best: FloatArray | None = None
+    cost = math.inf
+    for start in starts:
+        flat = np.full(len(x), 1e-3 * g)
+        p = _solve(start, free, x, g, flat)
+        now = float((_residual_and_jacobian(p, x, g)[0] ** 2).sum())
+        if best is None or now < 0.999 * cost:
+            best, cost = p, now
+    assert best is not None
+    p, tau, deviation = best, -1.0, np.ones(len(x))
+    for _ in range(_ROUNDS):
+        white = np.maximum(_deviations(p, x, variance), 1e-9 * g)
+        r = _residual_and_jacobian(p, x, g)[0]
+        before, tau = tau, _tau(r, white, len(x) - len(free))
+        deviation = np.sqrt(white**2 + tau**2)
+        p = _solve(p, free, x, g, deviation)
+        if abs(tau - before) <= 1e-4 * float(deviation.mean()):
+            break
+    return p, deviation, tau
+
+
+def fit_accelerometer(rests: Sequence[Rest], gravity_mps2: float, si: bool) -> Accelerometer:
+    """Bias, scale and misalignment from rests.
+
+    Parameters
+    ----------
+    rests : at least 2 d, their means of d = 2 or 3 axes.
+    gravity_mps2 : g, in the plane for two axes.
+    si : readings are in m/s^2 already, so that bias 0 and scale 1 are a start.
+    """
+    x = np.stack([rest.mean for rest in rests])
+    n, d = x.shape
+    count = np.array([rest.samples for rest in rests], dtype=np.float64)
+    # The noise is the sensor's: one rest tells little of it, all together much.
+    scatter = np.median(np.stack([rest.scatter for rest in rests]), axis=0)
+    variance = scatter / count[:, None]
+    g = gravity_mps2
+    starts = _starts(x, g, si)
+    everything = np.arange(len(starts[0]), dtype=np.int64)
+    plain = everything[: 2 * d]
+    p, deviation, tau = _fit(starts, plain, x, g, variance)
+    free, skewed = plain, False
+    if n > len(everything) and _span(p, everything, x, g)[0] >= LEAST_SPAN:
+        free, skewed = everything, True
+        p, deviation, tau = _fit([p], free, x, g, variance)
+    span, weakest = _span(p, free, x, g)
+    if si and span < LEAST_SPAN:
+        # Such a fit may have gone anywhere; directions by readings as they are will do.
+        p = starts[0]
+        least, weakest = _span(p, free, x, g)
+        span = min(span, least)
+    r, J = _residual_and_jacobian(p, x, g)
+    dof = n - len(free)
+    scale2 = float(((r / deviation) ** 2).sum()) / dof if dof > 0 else 1.0
+    sigma, covariance = np.full(len(p), math.inf), np.zeros((len(p), len(p)))
+    if span > 1e-6:
+        units = _units(p, d, g)[free]
+        W = J[:, free] * units / deviation[:, None]
+        covariance[np.ix_(free, free)] = np.outer(units, units) * np.linalg.inv(W.T @ W) * scale2
+        sigma[free] = np.sqrt(np.diag(covariance)[free])
+    a = _corrected(p, x)[0]
+    u = a / np.maximum(np.linalg.norm(a, axis=1), 1e-300)[:, None]
+    across = np.sqrt((variance / p[d : 2 * d] ** 2).mean(axis=1) + tau**2) / g
+    return Accelerometer(
+        bias=p[:d],
+        scale=p[d : 2 * d],
+        angles=p[2 * d :],
+        sigma=sigma,
+        covariance=covariance,
+        directions=u,
+        direction_sigma=across,
+        residual_mps2=r,
+        deviation_mps2=deviation * math.sqrt(scale2),
+        tau_mps2=tau,
+        rms_mps2=float(np.sqrt((r**2).mean())),
+        dof=dof,
+        span=span,
+        weakest=weakest,
+        skewed=skewed,
+    )
+
+
+# ----------------------------------------------------------------------
+# Turns from one rest to the next: what the rates of rotation predict there, and how far it can be off.
+#
+# The rate is integrated from the end of a rest to the start of the next; the direction of gravity before,
+# carried along, is compared with that after by its components across the latter (Tedaldi, Pretto and
+# Menegatti, ICRA 2014, eqs. 13 - 18).
+#
+# A rest ends one turn and begins the next, so both share the error of its direction. All turns share the
+# errors of the gyroscope's bias and of the accelerometer's parameters. White noise of the rate and what the
+# bias moves by belong to each turn alone.
+
+
+@dataclass(frozen=True)
+class Turns:
+    """Readings on the way from each rest to the next.
+
+    Attributes
+    ----------
+    gyro : (n, 3) readings, (0, 0, z) in a plane.
+    accel : (n, d) readings.
+    first, last : (k,) last reading of the rest before and first of the rest after.
+    before, after : (k,) numbers of these rests, both rising.
+    rests : all of them.
+    gyro_mean, gyro_scatter : (m, 3) mean over each rest, and long-run variance of a reading.
+    initial : number of the rest that the bias is taken from.
+    """
+
+    gyro: FloatArray
+    accel: FloatArray
+    first: IntArray
+    last: IntArray
+    before: IntArray
+    after: IntArray
+    rests: Sequence[Rest]
+    gyro_mean: FloatArray
+    gyro_scatter: FloatArray
+    initial: int
+    period_s: float
+
+    @property
+    def duration_s(self) -> FloatArray:
+        """(k,) lengths in seconds."""
+        return np.asarray((self.last - self.first) * self.period_s)
+
+
+def rest_forces(turns: Turns, parameters: FloatArray) -> FloatArray:
+    """Specific forces (m, d) at rest [m/s^2], by parameters of the accelerometer."""
+    return corrected(parameters, np.stack([rest.mean for rest in turns.rests]))
+
+
+def _directions(turns: Turns, parameters: FloatArray) -> FloatArray:
+    """Unit vectors (m, 3) at rest; z is zero in a plane."""
+    f = rest_forces(turns, parameters)
+    out = np.zeros((len(f), 3))
+    out[:, : f.shape[1]] = f / np.linalg.norm(f, axis=1)[:, None]
+    return out
+
+
+def carried(turns: Turns, rates: FloatArray, M: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Vectors (k, 3) fixed in the world, given before each turn and returned as they are seen after it.
+
+    `rates` (n, 3) are readings without their bias, M (3, 3) makes them rad/s.
+    """
+    out = np.empty((len(turns.first), 3))
+    turn_directions(
+        rates,
+        np.ascontiguousarray(M),
+        turns.first,
+        turns.last,
+        np.ascontiguousarray(vectors),
+        turns.period_s,
+        out,
+    )
+    return out
+
+
+def tangents(turns: Turns, accel: Accelerometer) -> FloatArray:
+    """Unit vectors (k, 2, 3) across the direction after each turn; in a plane one (k, 1, 3)."""
+    u = _directions(turns, accel.parameters)[turns.after]
+    planar = len(accel.bias) == 2
+    z = np.tile([0.0, 0.0, 1.0], (len(u), 1)) if planar else np.eye(3)[np.argmin(np.abs(u), axis=1)]
+    first = np.cross(z, u)
+    first /= np.linalg.norm(first, axis=1)[:, None]
+    if planar:
+        return np.asarray(first[:, None])
+    return np.stack([first, np.cross(u, first)], axis=1)
+
+
+def misfit(
+    turns: Turns, parameters: FloatArray, rates: FloatArray, M: FloatArray, across: FloatArray
+) -> FloatArray:
+    """Direction predicted less direction found, along the vectors `across` (k, c, 3): (k c,) [rad]."""
+    u = _directions(turns, parameters)
+    off = carried(turns, rates, M, u[turns.before]) - u[turns.after]
+    return np.asarray(np.einsum("kci,ki->kc", across, off).ravel())
+
+
+def misfit_covariance(
+    turns: Turns,
+    accel: Accelerometer,
+    rates: FloatArray,
+    M: FloatArray,
+    across: FloatArray,
+    bias_sigma: FloatArray,
+    wander: FloatArray,
+) -> FloatArray:
+    """Covariance (k c, k c) of `misfit`.
+
+    Parameters
+    ----------
+    bias_sigma : (3,) of the bias that all turns share, in the readings' unit.
+    wander : (3,) standard deviation of the bias about that from turn to turn.
+    """
+    k, c = across.shape[:2]
+    s2 = accel.direction_sigma**2
+    gain = (M**2).sum(axis=0)
+    white = float((np.median(turns.gyro_scatter, axis=0) * gain).sum()) * turns.period_s
+    moved = float((wander**2 * gain).sum())
+    # In a plane all noise is that of z; else each component across has the mean of three axes.
+    axes = 1 if c == 1 else 3
+    T = turns.duration_s
+    own = s2[turns.before] + s2[turns.after] + (white * T + moved * T**2) / axes
+    C = np.zeros((k, c, k, c))
+    C[np.arange(k), :, np.arange(k), :] = own[:, None, None] * np.eye(c)
+    # Turns that follow each other: what the rest between them was off by, seen before and after.
+    last = np.flatnonzero(turns.after[:-1] == turns.before[1:])
+    vectors = np.zeros((c, k, 3))
+    vectors[:, last + 1] = across[last].transpose(1, 0, 2)
+    seen = np.stack([carried(turns, rates, M, one) for one in vectors], axis=1)
+    cross = -s2[turns.before, None, None] * np.einsum("kai,kbi->kab", across, seen)
+    C[last + 1, :, last, :] = cross[last + 1]
+    C[last, :, last + 1, :] = cross[last + 1].transpose(0, 2, 1)
+    C2 = C.reshape(k * c, k * c)
+    base = misfit(turns, accel.parameters, rates, M, across)
+    shared = [
+        misfit(turns, accel.parameters, rates - sigma * np.eye(3)[j], M, across) - base
+        for j, sigma in enumerate(bias_sigma.tolist())
+        if sigma > 0.0 and gain[j] > 0.0
+    ]
+    values, vectors = np.linalg.eigh(accel.covariance)
+    shared += [
+        misfit(turns, accel.parameters + math.sqrt(value) * vector, rates, M, across) - base
+        for value, vector in zip(values.tolist(), vectors.T, strict=True)
+        if value > 0.0
+    ]
+    E = np.array(shared).reshape(-1, k * c)
+    return np.asarray(C2 + E.T @ E + 1e-16 * np.eye(k * c))
+
+
+# ----------------------------------------------------------------------
+# A gyroscope's scale and misalignment from the turns between rests.
+#
+# Rates of rotation are
+#
+#     w = M (x - b - S a),   M = T diag(1/s),
+#     T = [[1, -yz, zy], [xz, 1, -zx], [-xy, yx, 1]],
+#
+# with readings x, bias b, scale s (counts per rad/s, or about 1) and six small angles [rad] to the axes of
+# the accelerometer's frame (Tedaldi, Pretto and Menegatti, ICRA 2014, eqs. 7 - 11; names as in imu_tk).
+# Integrated from rest to rest they carry gravity's direction along (`calib.stages.imu.intrinsics`). A turn
+# about gravity
+# itself shows nothing; many others together show all. In a plane the scale of z alone is left.
+#
+# The bias is that of the rest at the start, as in the paper. Where the readings at rest follow the pose
+# beyond doubt (F test), b and the sensitivity S to the specific force a are fitted to all rests instead: an
+# Xsens MTi has 0.2 deg/s per g, which is most of what its turns disagree by otherwise.
+#
+# The turns are weighted by their covariance, and the measured scale of the residuals goes into the standard
+# deviations.
+
+GYRO_ANGLES = {
+    "yz": (0, 1, -1.0),
+    "zy": (0, 2, 1.0),
+    "xz": (1, 0, 1.0),
+    "zx": (1, 2, -1.0),
+    "xy": (2, 0, -1.0),
+    "yx": (2, 1, 1.0),
+}
+"""Row, column and sign of each misalignment in T."""
+
+_FASTEST_RADPS, _SLOWEST_RADPS = 50.0, 0.2
+_FINE, _COARSE = 1.05, 1.3
+_FOLLOWS_POSE = 1e-4
+_LEAST_FALL = 0.7
+_ASTRAY_RAD = 0.2
+_LEAST_SPAN = 1e-3
+
+
+@dataclass(frozen=True)
+class Bias:
+    """What a gyroscope reads at rest.
+
+    Attributes
+    ----------
+    bias, sigma : (3,) at no specific force where S is fitted, else in the rest at the start; the deviation
+        from what is met in other rests.
+    sensitivity, sensitivity_sigma : (3, d) S per m/s^2, None where the bias does not follow the pose.
+    wander : (3,) standard deviation from rest to rest beyond noise.
+    """
+
+    bias: FloatArray
+    sigma: FloatArray
+    sensitivity: FloatArray | None
+    sensitivity_sigma: FloatArray | None
+    wander: FloatArray
+
+
+@dataclass(frozen=True)
+class Gyroscope:
+    """A fitted gyroscope.
+
+    Attributes
+    ----------
+    bias : what it reads at rest.
+    initial_bias : (3,) mean reading of the rest at the start.
+    scale, scale_sigma : (3,) per rad/s; NaN for axes that were not fitted.
+    angles, angle_sigma : (6,) rad as `GYRO_ANGLES`; NaN where not fitted.
+    residual_rad : (k, c) direction predicted less direction found after each turn, c = 1 in a plane.
+    rms_rad : of their lengths.
+    turns_s : (k,) lengths of the turns.
+    travel_rad : (3,) root mean square of the angle turned about each axis.
+    span : smallest singular value of the residuals' derivative by relative parameters over sqrt(k).
+    """
+
+    bias: Bias
+    initial_bias: FloatArray
+    scale: FloatArray
+    scale_sigma: FloatArray
+    angles: FloatArray
+    angle_sigma: FloatArray
+    residual_rad: FloatArray
+    rms_rad: float
+    turns_s: FloatArray
+    travel_rad: FloatArray
+    span: float
+
+    @property
+    def matrix(self) -> FloatArray:
+        """M (3, 3), zero where not fitted."""
+        return _matrix(np.concatenate([np.nan_to_num(self.scale, nan=math.inf), np.nan_to_num(self.angles)]))
+
+
+def _matrix(p: FloatArray) -> FloatArray:
+    T = np.eye(3)
+    for (i, j, sign), angle in zip(GYRO_ANGLES.values(), p[3:], strict=True):
+        T[i, j] = sign * angle
+    return np.asarray(T / p[:3])
+
+
+def fit_bias(turns: Turns, accel: Accelerometer) -> Bias:
+    """What the gyroscope reads at rest, by pose where that shows."""
+    x, d = turns.gyro_mean, len(accel.bias)
+    n = len(x)
+    length = np.array([rest.samples for rest in turns.rests], dtype=np.float64)
+    white = np.median(turns.gyro_scatter, axis=0) / length[:, None]
+    active = np.flatnonzero(white.any(axis=0))
+    f = rest_forces(turns, accel.parameters)
+    H = np.hstack([np.ones((n, 1)), f])
+    dof = n - d - 1
+    about = ((x - x.mean(axis=0)) ** 2).sum(axis=0)
+    if len(active) and dof >= 4 and np.linalg.svd(H, compute_uv=False)[-1] > 0.1 * math.sqrt(n):
+        c: FloatArray = np.asarray(np.linalg.lstsq(H, x, rcond=None)[0], dtype=np.float64)
+        left = ((x - H @ c) ** 2).sum(axis=0)
+        F = (about - left)[active] / d / np.maximum(left[active] / dof, 1e-300)
+        fall = math.sqrt(float(left[active].sum()) / max(float(about[active].sum()), 1e-300))
+        if float(fdtrc(d, dof, F).min()) < _FOLLOWS_POSE and fall < _LEAST_FALL:
+            inverse = np.diag(np.linalg.inv(H.T @ H))
+            sigma: FloatArray = np.sqrt(np.outer(inverse, left / dof)).astype(np.float64)
+            wander = np.asarray(np.sqrt(np.maximum(left / dof - white.mean(axis=0), 0.0)))
+            return Bias(c[0], sigma[0], c[1:].T, sigma[1:].T, wander)
+    excess = about / (n - 1) - white.mean(axis=0) if n > 1 else np.zeros(3)
+    # Noise alone exceeds its expectation by chance, too.
+    clear = excess > 3.0 * math.sqrt(2.0 / max(n - 1, 1)) * white.mean(axis=0)
+    wander = np.asarray(np.sqrt(np.where(clear, excess, 0.0)))
+    return Bias(x[turns.initial], np.sqrt(white[turns.initial] + wander**2), None, None, wander)
+
+
+def _rates(turns: Turns, accel: Accelerometer, bias: Bias) -> FloatArray:
+    """Readings (n, 3) without their bias."""
+    out = turns.gyro - bias.bias
+    if bias.sensitivity is not None:
+        out -= corrected(accel.parameters, turns.accel) @ bias.sensitivity.T
+    return np.ascontiguousarray(out)
+
+
+def _signed_permutations() -> list[FloatArray]:
+    out = []
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            P = np.zeros((3, 3))
+            P[np.arange(3), order] = signs
+            out.append(P)
+    return out
+
+
+def _scales(rates: FloatArray, si: bool, step: float) -> list[float]:
+    """Scales to try: 1, or all by which the fastest turn is one that a hand or a rig makes."""
+    if si:
+        return [1.0]
+    fastest = float(np.quantile(np.abs(rates).max(axis=1), 0.9999))
+    low, high = fastest / _FASTEST_RADPS, fastest / _SLOWEST_RADPS
+    return [] if low <= 0.0 else np.geomspace(low, high, math.ceil(math.log(high / low, step))).tolist()
+
+
+def _rms(turns: Turns, accel: Accelerometer, rates: FloatArray, M: FloatArray, across: FloatArray) -> float:
+    return float(np.sqrt((misfit(turns, accel.parameters, rates, M, across) ** 2).sum() / len(across)))
+
+
+def foreign_axes(turns: Turns, accel: Accelerometer, found: Gyroscope, si: bool) -> FloatArray | None:
+    """Which axes of the gyroscope run along which of the accelerometer, where that is not one to one.
+
+    Looked for only where the turns disagree widely. Returns the signed permutation P (3, 3) by which
+    w = P x / s explains them, or None where none does.
+    """
+    if len(accel.bias) == 2 or found.rms_rad < _ASTRAY_RAD:
+        return None
+    rates, across = _rates(turns, accel, found.bias), tangents(turns, accel)
+    best, least = None, 0.5 * found.rms_rad
+    for P in _signed_permutations():
+        for scale in _scales(rates, si, _COARSE if not si else _FINE):
+            now = _rms(turns, accel, rates, P / scale, across)
+            if now < least:
+                best, least = P, now
+    return best if best is None or not np.array_equal(best, np.eye(3)) else None
+
+
+def fit_gyroscope(turns: Turns, accel: Accelerometer, si: bool) -> Gyroscope:
+    """Scale and misalignment from at least one turn.
+
+    Parameters
+    ----------
+    turns : readings between rests, (0, 0, z) in a plane.
+    accel : the accelerometer as it was fitted to the same rests.
+    si : readings are in rad/s already, so that the scale is about 1.
+    """
+    planar = len(accel.bias) == 2
+    bias = fit_bias(turns, accel)
+    rates, across = _rates(turns, accel, bias), tangents(turns, accel)
+    k, c = across.shape[:2]
+    free = np.array([2]) if planar else np.arange(9)
+    start = np.zeros(9)
+    grid = _scales(rates, si, _FINE) or [1.0]
+    start[:3] = min(grid, key=lambda scale: _rms(turns, accel, rates, np.eye(3) / scale, across))
+    units = np.where(np.arange(9) < 3, start[0], 1.0)
+
+    def full(q: FloatArray) -> FloatArray:
+        p = start.copy()
+        p[free] += q * units[free]
+        p[:3] = np.where(np.abs(p[:3]) < 0.05 * start[0], 0.05 * start[0], p[:3])
+        return p
+
+    def off(q: FloatArray) -> FloatArray:
+        return misfit(turns, accel.parameters, rates, _matrix(full(q)), across)
+
+    method: Literal["lm", "trf"] = "lm" if k * c >= len(free) else "trf"
+    q = least_squares(off, np.zeros(len(free)), method=method).x
+    C = misfit_covariance(turns, accel, rates, _matrix(full(q)), across, bias.sigma, bias.wander)
+    L = np.linalg.cholesky(C)
+
+    def whitened(q: FloatArray) -> FloatArray:
+        return np.asarray(np.linalg.solve(L, off(q)))
+
+    solution = least_squares(whitened, q, method=method)
+    W: FloatArray = np.asarray(solution.jac)
+    p, dof = full(solution.x), k * c - len(free)
+    J = L @ W
+    span = float(np.linalg.svd(J / math.sqrt(k), compute_uv=False)[-1]) if k * c >= len(free) else 0.0
+    sigma = np.full(9, math.nan)
+    sigma[free] = math.inf
+    if span > _LEAST_SPAN:
+        scale2 = 2.0 * float(solution.cost) / dof if dof > 0 else 1.0
+        inverse = np.linalg.inv(W.T @ W)
+        sigma[free] = units[free] * np.sqrt(np.diag(inverse) * scale2)
+    values = np.full(9, math.nan)
+    values[free] = p[free]
+    residual = off(solution.x).reshape(k, c)
+    angle = np.stack(
+        [
+            (rates[a : b + 1] @ _matrix(p).T).sum(axis=0) * turns.period_s
+            for a, b in zip(turns.first, turns.last, strict=True)
+        ]
+    )
+    return Gyroscope(
+        bias=bias,
+        initial_bias=turns.gyro_mean[turns.initial],
+        scale=values[:3],
+        scale_sigma=sigma[:3],
+        angles=values[3:],
+        angle_sigma=sigma[3:],
+        residual_rad=residual,
+        rms_rad=float(np.sqrt((residual**2).sum() / k)),
+        turns_s=turns.duration_s,
+        travel_rad=np.sqrt((angle**2).mean(axis=0)),
+        span=span,
+    )
+
+
+# ----------------------------------------------------------------------
+# An IMU's intrinsics from one log: rests in many poses with turns between them.
+#
+# The rests are found with one threshold after another, the accelerometer is fitted to each set of them, and
+# the one with the least residual wins (Tedaldi, Pretto and Menegatti, ICRA 2014, algorithm 1). Thresholds
+# that lose poses are left out of the contest. With its rests the gyroscope is fitted.
+#
+# A rig that moves in a plane has two axes of the accelerometer in it and turns about z: the same code with
+# bias and scale of x and y, the angle between them, and the scale of gz. That is taken where the log has
+# these columns alone, or where all rests of a log in m/s^2 lie in the plane of x and y.
+
+_POSE_RAD = math.radians(5.0)
+_IN_PLANE = math.sin(math.radians(15.0))
+_PLANE_SPREAD = math.cos(math.radians(30.0))
+_LONGEST_FILLED_S = 0.1
+_KEPT = 0.9
+
+
+@dataclass(frozen=True)
+class PoseLog:
+    """Readings of a log with rests in many poses.
+
+    Attributes
+    ----------
+    source : name for messages.
+    axes : those of `calib.stages.imu.static.AXES` that it has.
+    t_s : (n,) time stamps that do not go back.
+    values : (n, axes) finite readings.
+    accel_unit, gyro_unit : "m/s2" or "counts", "rad/s" or "counts".
+    """
+
+    source: str
+    axes: tuple[str, ...]
+    t_s: FloatArray
+    values: FloatArray
+    accel_unit: str = "m/s2"
+    gyro_unit: str = "rad/s"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One threshold: how many rests and poses it gives, and their residual with lost freedom counted."""
+
+    multiple: float
+    rests: int
+    poses: int
+    rms_mps2: float
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """What a log tells of an IMU.
+
+    Attributes
+    ----------
+    planar, asked : whether two axes were calibrated, and whether that was asked for.
+    lean_rad : about how far the plane leans by az, NaN where that is not known.
+    quiet : spread at rest, and the rest at the start.
+    multiple : of the threshold that won among `trials`.
+    rests, poses : stretches at rest, and how many poses more than 5 degrees apart they show.
+    accel : None for fewer rests than bias and scale need.
+    gyro : None without turns, the axes of a gyroscope, or poses that tell the accelerometer.
+    foreign : (3, 3) signed permutation where the gyroscope's axes are not the accelerometer's.
+    turns_lost : turns not used, as readings are missing in them.
+    has_gyro : whether the log has the gyroscope's axes that are needed.
+    """
+
+    log: PoseLog
+    gravity_mps2: float
+    planar: bool
+    asked: bool
+    lean_rad: float
+    sampling: Sampling
+    quiet: Quiet
+    multiple: float
+    trials: tuple[Trial, ...]
+    rests: tuple[Rest, ...]
+    poses: int
+    accel: Accelerometer | None
+    gyro: Gyroscope | None
+    foreign: FloatArray | None
+    turns_lost: int
+    has_gyro: bool
+
+
+def count_poses(directions: FloatArray) -> int:
+    """How many of the unit vectors (n, d) are more than 5 degrees from each one counted before."""
+    kept: list[FloatArray] = []
+    for u in directions:
+        if all(float(u @ v) < math.cos(_POSE_RAD) for v in kept):
+            kept.append(u)
+    return len(kept)
+
+
+def _in_plane(rests: Sequence[Rest], columns: list[int]) -> bool:
+    """Whether the rests lie in the plane of x and y, and turn in it."""
+    if len(columns) != 3 or len(rests) < 3:
+        return False
+    means = np.stack([rest.mean for rest in rests])
+    u = means / np.maximum(np.linalg.norm(means, axis=1), 1e-300)[:, None]
+    apart = float((u @ u.T).min())
+    return bool(np.abs(u[:, 2]).max() < _IN_PLANE and apart < _PLANE_SPREAD)
+
+
+def _columns(log: PoseLog, planar: bool) -> list[int]:
+    names = ("ax", "ay") if planar or "az" not in log.axes else ("ax", "ay", "az")
+    missing = [name for name in names if name not in log.axes]
+    if missing:
+        raise BadInputError(
+            f"{log.source}: has no {' and no '.join(missing)}, expected an accelerometer of at least x and y"
+        )
+    return [log.axes.index(name) for name in names]
+
+
+def _contest(
+    parts: tuple[Part, ...], columns: list[int], s: Spread, quiet: Quiet, gravity_mps2: float, si: bool
+) -> tuple[tuple[Trial, ...], Trial, tuple[Rest, ...], Accelerometer | None]:
+    """All thresholds, the one that wins, its rests and its fit."""
+    tried: list[tuple[Trial, tuple[Rest, ...], Accelerometer | None]] = []
+    for multiple in MULTIPLES:
+        rests = find_rests(parts, columns, s, multiple * quiet.zeta)
+        accel = None
+        if len(rests) >= 2 * len(columns):
+            accel = fit_accelerometer(rests, gravity_mps2, si)
+        poses, rms = 0, math.inf
+        if accel is not None:
+            poses = count_poses(accel.directions)
+            if accel.dof > 0:
+                rms = accel.rms_mps2 * math.sqrt(len(rests) / accel.dof)
+        elif rests and si:
+            means = np.stack([rest.mean for rest in rests])
+            poses = count_poses(means / np.maximum(np.linalg.norm(means, axis=1), 1e-300)[:, None])
+        else:
+            poses = min(len(rests), 1)
+        tried.append((Trial(multiple, len(rests), poses, rms), rests, accel))
+    most = max(trial.poses for trial, _, _ in tried)
+    able = [one for one in tried if one[0].poses >= _KEPT * most]
+    trial, rests, accel = min(able, key=lambda one: (one[0].rms_mps2, one[0].multiple))
+    return tuple(one[0] for one in tried), trial, rests, accel
+
+
+def _scatter(values: FloatArray) -> FloatArray:
+    """Variance (3,) of a reading by differences, which a slow drift does not enter."""
+    return np.asarray((np.diff(values, axis=0) ** 2).mean(axis=0) / 2.0)
+
+
+def _turns(
+    log: PoseLog,
+    parts: tuple[Part, ...],
+    rests: tuple[Rest, ...],
+    columns: list[int],
+    quiet: Quiet,
+    period_s: float,
+) -> tuple[Turns, int]:
+    """Turns between rests, and how many could not be used."""
+    names = ("gx", "gy", "gz") if len(columns) == 3 else ("", "", "gz")
+    gyros, offsets = [], np.concatenate([[0], np.cumsum([len(part.values) for part in parts])])
+    for part in parts:
+        gyro = np.zeros((len(part.values), 3))
+        for k, name in enumerate(names):
+            if name:
+                gyro[:, k] = part.values[:, log.axes.index(name)]
+        gyros.append(gyro)
+    first, last, before, after, lost = [], [], [], [], 0
+    longest = max(2, round(_LONGEST_FILLED_S / period_s))
+    for i in range(len(rests) - 1):
+        a, b = rests[i], rests[i + 1]
+        if a.part != b.part:
+            lost += 1
+            continue
+        places = parts[a.part].places
+        inside = places[(places >= a.stop - 1) & (places <= b.start)]
+        if len(inside) < 2 or int(np.diff(inside).max()) > longest:
+            lost += 1
+            continue
+        first.append(int(offsets[a.part]) + a.stop - 1)
+        last.append(int(offsets[a.part]) + b.start)
+        before.append(i)
+        after.append(i + 1)
+    held = [gyros[rest.part][rest.start : rest.stop] for rest in rests]
+    initial = 0 if quiet.initial_s > 0.0 else int(np.argmax([rest.duration_s for rest in rests]))
+    turns = Turns(
+        gyro=np.ascontiguousarray(np.concatenate(gyros)),
+        accel=np.concatenate([part.values[:, columns] for part in parts]),
+        first=np.array(first, dtype=np.int64),
+        last=np.array(last, dtype=np.int64),
+        before=np.array(before, dtype=np.int64),
+        after=np.array(after, dtype=np.int64),
+        rests=rests,
+        gyro_mean=np.stack([values.mean(axis=0) for values in held]),
+        gyro_scatter=np.stack([_scatter(values) for values in held]),
+        initial=initial,
+        period_s=period_s,
+    )
+    return turns, lost
+
+
+def find_intrinsics(log: PoseLog, gravity_mps2: float = 9.80665, planar: bool = False) -> Intrinsics:
+    """Calibrate an accelerometer, and a gyroscope where the log has one.
+
+    Parameters
+    ----------
+    log : begins at rest, for the gyroscope's bias; then rests of a second or more in many poses.
+    gravity_mps2 : g where the log was taken.
+    planar : calibrate x, y and gz alone.
+
+    Raises
+    ------
+    BadInputError for a log without the accelerometer's axes, shorter than a second, or never at rest.
+    """
+    columns = _columns(log, planar)
+    gyro_axes = is_gyro(log.axes)
+    sampling, parts = regular_parts(log.t_s, log.values, gyro_axes, log.source)
+    si = log.accel_unit != "counts"
+    s = spread(parts, columns, sampling.period_s)
+    quiet = quiet_level(s, sampling.step[columns])
+    asked, lean = planar, math.nan
+    if si and not planar and len(columns) == 3:
+        planar = _in_plane(find_rests(parts, columns, s, 6.0 * quiet.zeta), columns)
+    if planar or len(columns) == 2:
+        planar = True
+        columns = _columns(log, True)
+        s = spread(parts, columns, sampling.period_s)
+        quiet = quiet_level(s, sampling.step[columns])
+    trials, won, rests, accel = _contest(parts, columns, s, quiet, gravity_mps2, si)
+    if not rests:
+        raise BadInputError(
+            f"{log.source}: is never at rest for a second, expected rests in many poses and turns between"
+        )
+    if planar and si and "az" in log.axes:
+        k = log.axes.index("az")
+        z = np.concatenate([parts[rest.part].values[rest.start : rest.stop, k] for rest in rests])
+        lean = math.asin(min(1.0, abs(float(z.mean())) / gravity_mps2))
+    needed = ("gz",) if planar else ("gx", "gy", "gz")
+    has_gyro = all(name in log.axes for name in needed)
+    gyro, foreign, lost = None, None, 0
+    # Directions of an accelerometer that is not told would be blamed on the gyroscope.
+    if has_gyro and accel is not None and accel.span >= LEAST_SPAN:
+        turns, lost = _turns(log, parts, rests, columns, quiet, sampling.period_s)
+        if len(turns.first):
+            gyro_si = log.gyro_unit != "counts"
+            gyro = fit_gyroscope(turns, accel, gyro_si)
+            foreign = foreign_axes(turns, accel, gyro, gyro_si)
+    return Intrinsics(
+        log=log,
+        gravity_mps2=gravity_mps2,
+        planar=planar,
+        asked=asked,
+        lean_rad=lean,
+        sampling=sampling,
+        quiet=quiet,
+        multiple=won.multiple,
+        trials=trials,
+        rests=rests,
+        poses=won.poses,
+        accel=accel,
+        gyro=gyro,
+        foreign=foreign,
+        turns_lost=lost,
+        has_gyro=has_gyro,
+    )
+
+
+# ----------------------------------------------------------------------
+# What an IMU's intrinsics are worth: a verdict, reasons in plain words, and poses that would help.
+#
+# - unidentifiable: the poses or turns do not tell the parameters at all;
+# - inconsistent: they are told, but contradict each other or what an IMU is (another unit, another g,
+#   axes of the gyroscope that are not the accelerometer's);
+# - poor: known less well than `LIMITS`, or poses missing on one side;
+# - ok otherwise.
+#
+# A scale and a bias of an axis are told apart by rests with the axis up and with it down. A side lacks
+# where
+# no rest has the axis within 60 degrees of it.
+
+LIMITS = {"scale": 0.005, "bias_g": 0.005, "angle_rad": math.radians(0.5), "gyro": 0.01}
+"""Largest standard deviations: relative scale, bias in g, misalignment, and those of the gyroscope."""
+
+_USELESS = 20.0
+_NEAR = 0.5
+_LARGEST_RMS_G = 0.01
+_OFF_SCALE = 0.15
+_OFF_ANGLE_RAD = math.radians(15.0)
+_ROUGH_TURNS_RAD, _WRONG_TURNS_RAD = 0.03, 0.2
+_TIMES_OTHERS = 6.0
+_LEAST_TRAVEL_RAD = 0.3
+_MOST_MISSING = 0.02
+
+
+@dataclass(frozen=True)
+class IntrinsicsJudgement:
+    """Verdict "ok", "poor", "unidentifiable" or "inconsistent", with sentences."""
+
+    verdict: str
+    reasons: tuple[str, ...]
+    remarks: tuple[str, ...]
+    advice: tuple[str, ...]
+
+
+class _Notes:
+    """Sentences as they are found, and the worst verdict among them."""
+
+    _ORDER = ("ok", "poor", "unidentifiable", "inconsistent")
+
+    def __init__(self) -> None:
+        self.verdict = "ok"
+        self.reasons: list[str] = []
+        self.remarks: list[str] = []
+        self.advice: list[str] = []
+
+    def because(self, verdict: str, sentence: str, advice: str = "") -> None:
+        self.verdict = max(self.verdict, verdict, key=self._ORDER.index)
+        self.reasons.append(sentence)
+        if advice and advice not in self.advice:
+            self.advice.append(advice)
+
+
+def protocol(planar: bool) -> str:
+    """How to record a log for this verb, in a sentence."""
+    if planar:
+        return (
+            "stand the plane upright, wait 10 s, then tilt about z by 45 degrees at a time through the whole "
+            "circle and back, each tilt held still for 3 s"
+        )
+    return (
+        "let it lie for 30 s, then put it down in 24 poses or more, each axis up and down and both ways at "
+        "45 degrees between two axes, each held still for 3 s, turning about another axis every time"
+    )
+
+
+def _sides(accel: Accelerometer, notes: _Notes) -> None:
+    u = accel.directions
+    for k, axis in enumerate("xyz"[: u.shape[1]]):
+        for sign, word in ((1.0, "up"), (-1.0, "down")):
+            best = float((sign * u[:, k]).max())
+            if best < _NEAR:
+                nearest = math.degrees(math.acos(max(-1.0, best)))
+                notes.because(
+                    "poor",
+                    f"no rest with the {axis} axis {word}: the nearest is {nearest:.0f} degrees from it",
+                    f"add rests with the {axis} axis {word}",
+                )
+
+
+def _name(accel: Accelerometer, place: int) -> str:
+    d = len(accel.bias)
+    if place < d:
+        return f"bias of {'xyz'[place]}"
+    if place < 2 * d:
+        return f"scale of {'xyz'[place - d]}"
+    return f"misalignment {ANGLES[d][place - 2 * d]}"
+
+
+def _of_accelerometer(result: Intrinsics, accel: Accelerometer, notes: _Notes) -> None:
+    d, g = len(accel.bias), result.gravity_mps2
+    if result.log.accel_unit == "m/s2" or accel.span >= LEAST_SPAN:
+        _sides(accel, notes)
+    if accel.span < LEAST_SPAN:
+        mixed = np.flatnonzero(np.abs(accel.weakest) > 0.3).tolist()
+        words = [_name(accel, place) for place in mixed]
+        names = " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+        notes.because("unidentifiable", f"the poses do not tell {names} apart", protocol(result.planar))
+        return
+    size = np.concatenate([g * accel.scale, accel.scale, np.ones(len(accel.angles))])
+    limit = np.repeat([LIMITS["bias_g"], LIMITS["scale"], LIMITS["angle_rad"]], [d, d, len(accel.angles)])
+    relative = accel.sigma / size / limit
+    for place in range(len(relative) if accel.skewed else 2 * d):
+        if relative[place] > 1.0:
+            value = accel.sigma[place] / size[place]
+            shown = (
+                f"{value:.2g} g" if place < d else f"{value:.2g} rad" if place >= 2 * d else f"{value:.2%}"
+            )
+            notes.because(
+                "unidentifiable" if relative[place] > _USELESS else "poor",
+                f"accelerometer, {_name(accel, place)}: known to {shown} only",
+                protocol(result.planar),
+            )
+    if not accel.skewed:
+        notes.remarks.append("the poses do not tell the accelerometer's misalignment; it is taken to be zero")
+        notes.advice.append("rests with two axes both at 45 degrees would show the misalignment")
+    if accel.dof <= 0:
+        notes.because(
+            "poor",
+            f"{len(result.rests)} rests for as many parameters: nothing is left to check them by, and sigma "
+            "is that of the noise alone",
+            protocol(result.planar),
+        )
+    elif accel.rms_mps2 > _LARGEST_RMS_G * g:
+        notes.because(
+            "inconsistent",
+            f"the rests disagree by {accel.rms_mps2:.3g} m/s^2, more than a bias, a scale and angles explain",
+            "hold each pose still, far from what vibrates",
+        )
+    r = np.abs(accel.residual_mps2)
+    others = 1.4826 * float(np.median(r))
+    worst = int(np.argmax(r))
+    if accel.dof >= 6 and r[worst] > max(_TIMES_OTHERS * others, 1e-3 * g):
+        rest = result.rests[worst]
+        notes.because(
+            "poor",
+            f"the rest from {rest.from_s:.1f} to {rest.to_s:.1f} s is off by {r[worst]:.2g} m/s^2, "
+            f"{r[worst] / max(others, 1e-12):.0f} times what the others are",
+            "look at that rest: something pushed the sensor, or it crept",
+        )
+    if result.log.accel_unit == "m/s2":
+        off = float(np.abs(accel.scale - 1.0).max())
+        if off > _OFF_SCALE:
+            notes.because(
+                "inconsistent",
+                f"a scale comes out as {accel.scale[int(np.argmax(np.abs(accel.scale - 1.0)))]:.3g}, so the "
+                "readings are not in the unit that was named, or gravity is another",
+                "check --acc-unit and --gravity",
+            )
+    if accel.skewed and float(np.abs(accel.angles).max(initial=0.0)) > _OFF_ANGLE_RAD:
+        notes.because(
+            "inconsistent",
+            f"two axes come out {math.degrees(float(np.abs(accel.angles).max())):.0f} degrees from a right "
+            "angle",
+        )
+
+
+def _swapped(P: FloatArray) -> str:
+    """Which column measures which axis, for P with w = P x."""
+    words = []
+    for column in range(3):
+        row = int(np.argmax(np.abs(P[:, column])))
+        words.append(f"g{'xyz'[column]} measures {'-' if P[row, column] < 0 else ''}{'xyz'[row]}")
+    return ", ".join(words)
+
+
+def _of_gyroscope(result: Intrinsics, gyro: Gyroscope, notes: _Notes) -> None:
+    if result.foreign is not None:
+        mirror = "; that mirrors it" if np.linalg.det(result.foreign) < 0.0 else ""
+        notes.because(
+            "inconsistent",
+            f"the gyroscope's axes are not the accelerometer's: {_swapped(result.foreign)}{mirror}",
+            "put the gyroscope's columns into the accelerometer's order and signs",
+        )
+        return
+    if gyro.rms_rad > _WRONG_TURNS_RAD:
+        notes.because(
+            "inconsistent",
+            f"the turns miss gravity's direction by {math.degrees(gyro.rms_rad):.0f} degrees: the rates are "
+            "not in the unit that was named, or gyroscope and accelerometer do not belong together",
+            "check --gyro-unit and the signs of the gyroscope",
+        )
+        return
+    if gyro.rms_rad > _ROUGH_TURNS_RAD:
+        notes.because(
+            "poor",
+            f"the turns miss gravity's direction by {math.degrees(gyro.rms_rad):.2g} degrees",
+            "turn more slowly, in a second or two, and log at 100 Hz or more",
+        )
+    used = np.isfinite(gyro.scale)
+    off = gyro.scale[used][int(np.argmax(np.abs(gyro.scale[used] - 1.0)))]
+    if result.log.gyro_unit == "rad/s" and abs(off - 1.0) > _OFF_SCALE:
+        notes.because(
+            "inconsistent",
+            f"a scale of the gyroscope comes out as {off:.3g}, so its readings are not in the unit that was "
+            "named",
+            "check --gyro-unit",
+        )
+    for k in np.flatnonzero(used).tolist():
+        travel = float(gyro.travel_rad[k])
+        if travel < _LEAST_TRAVEL_RAD:
+            notes.because(
+                "poor",
+                f"hardly a turn about the {'xyz'[k]} axis: {math.degrees(travel):.0f} degrees",
+                f"turn by 90 degrees or more about the {'xyz'[k]} axis between rests",
+            )
+    names = [f"scale of g{axis}" for axis in "xyz"] + [f"misalignment {name}" for name in GYRO_ANGLES]
+    sigma = np.concatenate([gyro.scale_sigma / np.abs(gyro.scale), gyro.angle_sigma])
+    unknown = [name for name, one in zip(names, sigma.tolist(), strict=True) if one == math.inf]
+    if unknown:
+        notes.because(
+            "unidentifiable",
+            f"{len(gyro.turns_s)} turn(s) do not tell the gyroscope's {len(unknown)} parameters",
+            protocol(result.planar),
+        )
+    for name, one in zip(names, sigma.tolist(), strict=True):
+        if LIMITS["gyro"] < one < math.inf:
+            shown = f"{one:.2%}" if name.startswith("scale") else f"{one:.2g} rad"
+            notes.because(
+                "unidentifiable" if one > _USELESS * LIMITS["gyro"] else "poor",
+                f"gyroscope, {name}: known to {shown} only",
+                protocol(result.planar),
+            )
+    if gyro.bias.sensitivity is not None:
+        notes.remarks.append(
+            "the gyroscope's bias follows the pose; its sensitivity to the specific force is fitted as well"
+        )
+
+
+def _of_log(result: Intrinsics, notes: _Notes) -> None:
+    s = result.sampling
+    for gap in s.gaps:
+        if gap.split:
+            notes.remarks.append(f"split at a gap of {gap.duration_s:.4g} s after {gap.at_s:.2f} s")
+    short = [gap for gap in s.gaps if not gap.split]
+    if short:
+        longest = max(short, key=lambda gap: gap.duration_s)
+        sentence = (
+            f"{s.missing} samples missing in {len(short)} gap(s), the longest {1e3 * longest.duration_s:.3g} "
+            f"ms after {longest.at_s:.2f} s; filled by straight lines"
+        )
+        if s.missing > _MOST_MISSING * s.samples:
+            notes.because("poor", sentence)
+        else:
+            notes.remarks.append(sentence)
+    if s.repeated_rows:
+        share = s.repeated_rows / (s.samples + s.repeated_rows)
+        notes.remarks.append(f"{s.repeated_rows} rows ({share:.2%}) repeat the one before; dropped")
+    if result.turns_lost:
+        notes.remarks.append(f"{result.turns_lost} turn(s) not used: readings are missing in them")
+    for axis, count in zip(result.log.axes, s.at_limit.tolist(), strict=True):
+        if count and result.log.accel_unit == "m/s2" and result.log.gyro_unit == "rad/s":
+            notes.because("poor", f"{axis} is at the end of its range in {count} samples")
+    if result.quiet.initial_s == 0.0 and result.has_gyro:
+        notes.because(
+            "poor",
+            "the log does not begin at rest; the gyroscope's bias is that of its longest rest",
+            "let the sensor lie still for 30 s at the start",
+        )
+
+
+def judge_intrinsics(result: Intrinsics) -> IntrinsicsJudgement:
+    """Verdict of a calibration of an IMU."""
+    notes = _Notes()
+    _of_log(result, notes)
+    if result.planar and not result.asked:
+        notes.remarks.append("all poses lie in the plane of x and y: ax, ay and gz alone are calibrated")
+    if result.planar:
+        lean = "" if math.isnan(result.lean_rad) else (
+            f"; by az it leans by {math.degrees(result.lean_rad):.1f} degrees at most, which would make the "
+            f"scales {1.0 - math.cos(result.lean_rad):.2g} too small"
+        )  # fmt: skip
+        notes.remarks.append("the plane is taken to stand upright" + lean)
+    if result.accel is None:
+        needed = 4 if result.planar else 6
+        notes.because(
+            "unidentifiable",
+            f"{len(result.rests)} rest(s) in {result.poses} pose(s) are fewer than the {needed} that bias "
+            "and scale need",
+            protocol(result.planar),
+        )
+    else:
+        _of_accelerometer(result, result.accel, notes)
+    if result.gyro is not None:
+        _of_gyroscope(result, result.gyro, notes)
+    elif not result.has_gyro:
+        needed_axes = "gz" if result.planar else "gx, gy and gz"
+        notes.remarks.append(f"without {needed_axes} the gyroscope is not calibrated")
+    elif result.accel is not None and result.accel.span >= LEAST_SPAN:
+        notes.because("unidentifiable", "no turn between two rests is there to calibrate the gyroscope by")
+    return IntrinsicsJudgement(notes.verdict, tuple(notes.reasons), tuple(notes.remarks), tuple(notes.advice))

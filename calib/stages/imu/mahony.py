@@ -1,0 +1,224 @@
+"""The Mahony-Madgwick filter of the angle (2.3), one log or many gains at once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from calib.core.arrays import FloatArray
+from calib.core.errors import BadInputError
+
+# ----------------------------------------------------------------------
+# The Mahony-Madgwick filter of the angle in the plane (2.1 - 2.3).
+#
+#     phi_acc = atan2(ay, ax)                                                (2.1)
+#     e_k   = phi_acc_k - phi_(k-1)                                          (2.3a)
+#     I_k   = I_(k-1) + Ki e_k dt                                            (2.3b)
+#     phi_k = phi_(k-1) + (Kp e_k + I_k + w_k) dt                            (2.3c)
+#
+# with the sensor's x axis from the head to the base at rest. For any right-handed sensor
+# d atan2(ay, ax) / dt = -gz, so the rate w is -gz. The error is wrapped to half a turn, the angle
+# itself is not. A constant gyro bias ends up in the integral and leaves no error.
+
+
+@dataclass(frozen=True)
+class Mahony:
+    """Gains Kp [1/s] and Ki [1/s^2]; the source has 3 and 3.
+
+    Raises `BadInputError` for gains that are negative or not finite.
+    """
+
+    Kp: float = 3.0
+    Ki: float = 3.0
+
+    def __post_init__(self) -> None:
+        for name, gain in (("Kp", self.Kp), ("Ki", self.Ki)):
+            if not 0.0 <= gain < math.inf:
+                raise BadInputError(f"{name} of the angle filter: found {gain:g}, expected zero or more")
+
+
+@dataclass(frozen=True)
+class MahonyState:
+    """Angle [rad] and integral I [rad/s], which goes to minus the bias of the rate."""
+
+    phi_rad: float = 0.0
+    integral_radps: float = 0.0
+
+
+@dataclass(frozen=True)
+class MahonySample:
+    """Specific force in the plane [m/s^2], rate about z [rad/s], and time since the last sample [s]."""
+
+    ax_mps2: float
+    ay_mps2: float
+    gz_radps: float
+    dt_s: float
+
+
+def accelerometer_angle(ax_mps2: float, ay_mps2: float) -> float:
+    """phi_acc [rad] of (2.1), in (-pi, pi]; right only while the sensor does not accelerate."""
+    return math.atan2(ay_mps2, ax_mps2)
+
+
+def step(parameters: Mahony, state: MahonyState, sample: MahonySample) -> MahonyState:
+    """State after one sample (2.3)."""
+    phi_acc = accelerometer_angle(sample.ax_mps2, sample.ay_mps2)
+    e = math.remainder(phi_acc - state.phi_rad, 2.0 * math.pi)
+    integral = state.integral_radps + parameters.Ki * e * sample.dt_s
+    phi = state.phi_rad + (parameters.Kp * e + integral - sample.gz_radps) * sample.dt_s
+    return MahonyState(phi, integral)
+
+
+# ----------------------------------------------------------------------
+# The angle filter of `calib.stages.imu.mahony` over whole logs, compiled.
+#
+# A sample's step is the time since the sample before it, so that stamps need not be even, may repeat
+# (a step of zero leaves the state as it is) and may leave gaps. The filter is linear apart from the
+# wrapping of e, and a new sample depends on the last state by one subtraction and one multiplication
+# only, which is what the loop is written for:
+#
+#     phi_k = phi_(k-1) + dt (Kp + Ki dt) e_k + dt (I_(k-1) + w_k),   I_k = I_(k-1) + Ki dt e_k.
+#
+# This is (2.3) with (2.3b) put into (2.3c). A step longer than 2 / Kp does not settle: logs are split at
+# long gaps before they come here.
+
+_TURN = 2.0 * math.pi
+
+
+def accelerometer_angles(ax_mps2: FloatArray, ay_mps2: FloatArray) -> FloatArray:
+    """phi_acc (n,) [rad] of (2.1) in [-pi, pi]; right only while the sensor does not accelerate."""
+    return np.arctan2(ay_mps2, ax_mps2)
+
+
+def wrapped(angle_rad: FloatArray) -> FloatArray:
+    """Angles (n,) taken to [-pi, pi] by whole turns."""
+    return angle_rad - _TURN * np.rint(angle_rad / _TURN)
+
+
+# A product and a sum may be rounded once; nothing else is loosened.
+@njit(cache=True, nogil=True)
+def advance(
+    phi: float, integral: float, phi_acc: float, w: float, dt: float, Kp: float, Ki: float
+) -> tuple[float, float]:
+    """Angle and integral after one sample (2.3), compiled."""
+    e = phi_acc - phi
+    if not -math.pi <= e <= math.pi:
+        e -= _TURN * np.rint(e / _TURN)
+    turned = dt * (integral + w)
+    return phi + (dt * (Kp + Ki * dt) * e + turned), integral + Ki * dt * e
+
+
+@njit(cache=True, nogil=True)
+def _run(
+    t: FloatArray,
+    phi_acc: FloatArray,
+    w: FloatArray,
+    Kp: float,
+    Ki: float,
+    phi: float,
+    integral: float,
+    out_phi: FloatArray,
+    out_integral: FloatArray,
+) -> int:
+    """Fills the outputs; returns the first sample whose time goes back, or -1."""
+    before = t[0]
+    for k in range(len(t)):
+        dt = t[k] - before
+        if dt < 0.0:
+            return k
+        before = t[k]
+        phi, integral = advance(phi, integral, phi_acc[k], w[k], dt, Kp, Ki)
+        out_phi[k] = phi
+        out_integral[k] = integral
+    return -1
+
+
+@njit(cache=True, nogil=True)
+def _run_many(
+    t: FloatArray,
+    phi_acc: FloatArray,
+    w: FloatArray,
+    gains: FloatArray,
+    phi_0: float,
+    integral_0: float,
+    out_phi: FloatArray,
+) -> None:
+    unused = np.empty(len(t))
+    for j in range(len(gains)):
+        _run(t, phi_acc, w, gains[j, 0], gains[j, 1], phi_0, integral_0, out_phi[j], unused)
+
+
+def _checked(
+    t_s: FloatArray, phi_acc_rad: FloatArray, rate_radps: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    t, phi_acc, w = (np.ascontiguousarray(x, dtype=np.float64) for x in (t_s, phi_acc_rad, rate_radps))
+    if t.ndim != 1 or t.shape != phi_acc.shape or t.shape != w.shape or len(t) == 0:
+        raise BadInputError(
+            f"angle filter: found times {t.shape}, angles {phi_acc.shape} and rates {w.shape}, "
+            "expected as many of each and at least one"
+        )
+    return t, phi_acc, w
+
+
+def filter_log(
+    parameters: Mahony,
+    t_s: FloatArray,
+    phi_acc_rad: FloatArray,
+    rate_radps: FloatArray,
+    start: MahonyState | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """Angle and integral after each sample of a log: `step`, from sample to sample.
+
+    Parameters
+    ----------
+    t_s : (n,) time stamps that do not go back.
+    phi_acc_rad : (n,) accelerometer's angles (2.1), wrapped or not.
+    rate_radps : (n,) rate of phi, which is -gz of a sensor in the plane.
+    start : state at the first sample, whose own step is zero; without it the first accelerometer's
+        angle and no integral.
+
+    Returns
+    -------
+    phi_rad (n,), not wrapped, and integral_radps (n,).
+
+    Raises
+    ------
+    BadInputError for lengths that differ, time that goes back and values that are not finite.
+    """
+    t, phi_acc, w = _checked(t_s, phi_acc_rad, rate_radps)
+    state = MahonyState(float(phi_acc[0]), 0.0) if start is None else start
+    phi, integral = np.empty(len(t)), np.empty(len(t))
+    back = _run(
+        t, phi_acc, w, parameters.Kp, parameters.Ki, state.phi_rad, state.integral_radps, phi, integral
+    )
+    if back >= 0:
+        raise BadInputError(
+            f"angle filter: time goes back from {t[back - 1]:.6f} to {t[back]:.6f} s at sample {back}, "
+            "expected time to run forward"
+        )
+    # What is not finite stays in the state.
+    if not math.isfinite(phi[-1]):
+        raise BadInputError(
+            "angle filter: the result is not finite, expected finite readings and shorter gaps"
+        )
+    return phi, integral
+
+
+def filter_many(
+    parameters: Sequence[Mahony],
+    t_s: FloatArray,
+    phi_acc_rad: FloatArray,
+    rate_radps: FloatArray,
+    start: MahonyState | None = None,
+) -> FloatArray:
+    """Angles (gains, n) of `filter_log` for each pair of gains; a pair that is unstable may overflow."""
+    t, phi_acc, w = _checked(t_s, phi_acc_rad, rate_radps)
+    state = MahonyState(float(phi_acc[0]), 0.0) if start is None else start
+    gains = np.array([(p.Kp, p.Ki) for p in parameters], dtype=np.float64).reshape(-1, 2)
+    phi = np.empty((len(gains), len(t)))
+    _run_many(t, phi_acc, w, gains, state.phi_rad, state.integral_radps, phi)
+    return phi

@@ -1,0 +1,480 @@
+"""How an IMU was sampled, and where it was at rest."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from calib.core.arrays import BoolArray, FloatArray, IntArray
+from calib.core.errors import BadInputError
+
+# ----------------------------------------------------------------------
+# How a log was sampled: rate, jitter, gaps, repeated rows and stamps, steps, readings at their limit.
+#
+# Samples are taken evenly, but their time stamps are not: they jitter, and a sample that waited in a
+# buffer bears the stamp of the one before it. So readings are put on an even grid by counting. A group of
+# c samples with one stamp takes c places, and where the next stamp comes later than these fill, the
+# difference in whole periods is missing. A row that repeats both stamp and readings is one sample written
+# twice, and is dropped.
+#
+# Up to `SPLIT_S` a gap is filled with readings on the straight line between its ends, which keeps the
+# time axis right; at longer ones the log is split.
+
+SPLIT_S = 1.0
+_G = 9.80665
+_GYRO_RANGES = tuple(math.radians(r) for r in (125.0, 250.0, 500.0, 1000.0, 2000.0, 4000.0))
+_ACCEL_RANGES = tuple(g * _G for g in (2.0, 4.0, 8.0, 16.0, 32.0))
+_AT_LIMIT_IN_A_ROW = 3
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Samples that are missing: when, for how long [s], how many, and whether the log is split there."""
+
+    at_s: float
+    duration_s: float
+    missing: int
+    split: bool
+
+
+@dataclass(frozen=True)
+class Part:
+    """Readings on an even grid.
+
+    Attributes
+    ----------
+    start_s : time of the first.
+    values : (n, axes), filled ones included.
+    rows : (k,) rows of the log that are in it, and `places` (k,) where they are in `values`.
+    """
+
+    start_s: float
+    values: FloatArray
+    rows: IntArray
+    places: IntArray
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """What is known of the sampling.
+
+    Attributes
+    ----------
+    samples : that were used.
+    period_s, rate_hz : of the even grid.
+    jitter_s : robust standard deviation of the time stamps about the grid.
+    repeated_rows, repeated_stamps : rows dropped, and stamps that occur again with other readings.
+    gaps : in order of time.
+    step : (axes,) quantisation step in the axis's unit, NaN where none is seen.
+    at_limit : (axes,) readings at the end of a usual range, several in a row.
+    """
+
+    samples: int
+    duration_s: float
+    period_s: float
+    rate_hz: float
+    jitter_s: float
+    repeated_rows: int
+    repeated_stamps: int
+    gaps: tuple[Gap, ...]
+    step: FloatArray
+    at_limit: IntArray
+
+    @property
+    def missing(self) -> int:
+        """Samples missing in gaps that were filled."""
+        return sum(gap.missing for gap in self.gaps if not gap.split)
+
+
+def _period_s(t: FloatArray, source: str) -> float:
+    """The period that most samples keep."""
+    dt = np.diff(t)
+    forward = dt[dt > 0.0]
+    if len(forward) == 0:
+        raise BadInputError(f"{source}: all {len(t)} IMU samples have the time {t[0]:g} s")
+    rough = float(np.median(forward))
+    # The median of jittering steps is off by far more than the mean of many; gaps are kept out of it.
+    near = dt[dt < 1.5 * rough]
+    if len(near) < 0.5 * len(dt):
+        return rough
+    smooth = _places(t, rough)[0]
+    inside = np.diff(smooth) == 1
+    lengths = np.diff(np.flatnonzero(np.concatenate([[True], ~inside, [True]])))
+    ends = np.cumsum(lengths)
+    longest = int(np.argmax(lengths))
+    first, last = int(ends[longest] - lengths[longest]), int(ends[longest]) - 1
+    if last - first < 20:
+        return rough
+    k = np.arange(last - first + 1, dtype=np.float64)
+    return float(np.polyfit(k, t[first : last + 1] - t[first], 1)[0])
+
+
+def _places(t: FloatArray, period_s: float) -> tuple[IntArray, IntArray]:
+    """Place (n,) of each sample on the grid, and how many are missing before it (n,)."""
+    new = np.concatenate([[True], np.diff(t) > 0.0])
+    first = np.flatnonzero(new)
+    count = np.diff(np.concatenate([first, [len(t)]]))
+    missing = np.zeros(len(t), dtype=np.int64)
+    whole = np.rint(np.diff(t[first]) / period_s).astype(np.int64)
+    missing[first[1:]] = np.maximum(whole - count[:-1], 0)
+    # Late stamps look like a gap that the next, shorter steps take back.
+    taken_back = np.maximum(count[:-1] - whole, 0)
+    for i in np.flatnonzero(missing).tolist():
+        if missing[i] <= 5:
+            group = int(np.searchsorted(first, i))
+            missing[i] -= min(missing[i], int(taken_back[group : group + 2 * int(missing[i]) + 1].sum()))
+    return np.cumsum(1 + missing) - 1, missing
+
+
+def _step(values: FloatArray) -> float:
+    """Quantisation step: the least distance of readings, where all are whole multiples of it apart."""
+    levels = np.unique(values)
+    if not 3 <= len(levels) <= 0.25 * len(values) + 3:
+        return math.nan
+    apart = np.diff(levels)
+    digits = 1e-7 * float(np.abs(levels).max())
+    least = float(apart[apart > digits].min(initial=math.inf))
+    whole = apart[apart > digits] / least
+    if not math.isfinite(least) or float(np.abs(whole - np.rint(whole)).max()) > 0.05:
+        return math.nan
+    return float((levels[-1] - levels[0]) / np.rint(whole).sum())
+
+
+def _at_limit(values: FloatArray, gyro: bool) -> int:
+    """Readings at the end of a usual range, in runs of at least `_AT_LIMIT_IN_A_ROW`."""
+    count = 0
+    for extreme in (float(values.max()), float(values.min())):
+        ends = _GYRO_RANGES if gyro else _ACCEL_RANGES
+        if not any(0.999 * end <= abs(extreme) <= 1.0005 * end for end in ends):
+            continue
+        at = np.concatenate([[False], values == extreme, [False]]).astype(np.int64)
+        starts, stops = np.flatnonzero(np.diff(at) == 1), np.flatnonzero(np.diff(at) == -1)
+        runs = stops - starts
+        count += int(runs[runs >= _AT_LIMIT_IN_A_ROW].sum())
+    return count
+
+
+def regular_parts(
+    t_s: FloatArray, values: FloatArray, gyro: BoolArray, source: str = "log"
+) -> tuple[Sampling, tuple[Part, ...]]:
+    """Readings on an even grid, in parts without long gaps, and how they were sampled.
+
+    Parameters
+    ----------
+    t_s : (n,) time stamps that do not go back.
+    values : (n, axes) finite readings.
+    gyro : (axes,) which axes are rates of rotation; the others are specific forces.
+
+    Raises
+    ------
+    BadInputError for fewer than two samples, and for stamps that are all the same.
+    """
+    if len(t_s) < 2:
+        raise BadInputError(f"{source}: has {len(t_s)} IMU sample(s), expected a log at rest")
+    again = (np.diff(t_s) == 0.0) & np.all(np.diff(values, axis=0) == 0.0, axis=1)
+    rows = np.flatnonzero(np.concatenate([[True], ~again]))
+    t, kept = t_s[rows], values[rows]
+    period = _period_s(t, source)
+    places, missing = _places(t, period)
+    gaps, parts, jitter = [], [], []
+    cuts = [0]
+    for i in np.flatnonzero(missing).tolist():
+        split = bool(missing[i] * period > SPLIT_S)
+        gaps.append(Gap(float(t[i - 1]), float(t[i] - t[i - 1]), int(missing[i]), split))
+        if split:
+            cuts.append(i)
+    for start, stop in zip(cuts, [*cuts[1:], len(t)], strict=True):
+        local = places[start:stop] - places[start]
+        grid = np.arange(int(local[-1]) + 1)
+        filled = kept[start:stop]
+        if len(grid) != stop - start:
+            filled = np.stack([np.interp(grid, local, column) for column in filled.T], axis=1)
+        parts.append(Part(float(t[start]), np.ascontiguousarray(filled), rows[start:stop], local))
+        jitter.append(t[start:stop] - period * local)
+    about = np.concatenate([late - np.median(late) for late in jitter])
+    sampling = Sampling(
+        samples=len(t),
+        duration_s=period * sum(len(part.values) for part in parts),
+        period_s=period,
+        rate_hz=1.0 / period,
+        jitter_s=float(1.4826 * np.median(np.abs(about))),
+        repeated_rows=int(again.sum()),
+        repeated_stamps=int((np.diff(t) == 0.0).sum()),
+        gaps=tuple(gaps),
+        step=np.array([_step(column) for column in kept.T]),
+        at_limit=np.array(
+            [_at_limit(column, bool(g)) for column, g in zip(kept.T, gyro, strict=True)], dtype=np.int64
+        ),
+    )
+    return sampling, tuple(parts)
+
+
+# ----------------------------------------------------------------------
+# Motion in a log that claims to be at rest.
+#
+# The log is cut into windows of about a second. A window moves where on any axis
+#
+# - its standard deviation is more than `TIMES_SPREAD` times that of the quiet windows, or above what no
+#   sensor has at rest (`MOST_GYRO_RADPS`, `MOST_ACCEL_MPS2`);
+# - its mean differs from the one before by more than `TIMES_MEAN` times the quiet windows' differences.
+#
+# Quiet is the lower quartile of all windows, so that up to three quarters of a log may be in motion. A
+# random walk of the bias raises all differences alike and is not taken for motion.
+
+MOST_GYRO_RADPS = 0.02
+MOST_ACCEL_MPS2 = 0.4
+TIMES_SPREAD = 3.0
+TIMES_MEAN = 8.0
+_WINDOW_S = 1.0
+_FEWEST = 20
+_QUARTILE_OF_NORMAL = 0.3186393639643752
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A stretch of time in which the log moves, and the axis that shows it most, by its number."""
+
+    from_s: float
+    to_s: float
+    axis: int
+
+
+def _window(period_s: float) -> int:
+    return max(_FEWEST, round(_WINDOW_S / period_s))
+
+
+def _windows(part: Part, size: int) -> FloatArray:
+    """Readings (w, size, axes) of whole windows; the rest of the part belongs to the last."""
+    count = len(part.values) // size
+    return part.values[: count * size].reshape(count, size, -1)
+
+
+def quiet_spread(parts: tuple[Part, ...], period_s: float) -> FloatArray:
+    """Standard deviation (axes,) within the quiet windows; zeros where there is no whole window."""
+    size = _window(period_s)
+    spreads = [_windows(part, size).std(axis=1) for part in parts if len(part.values) >= size]
+    if not spreads:
+        return np.zeros(parts[0].values.shape[1])
+    return np.asarray(np.quantile(np.concatenate(spreads), 0.25, axis=0))
+
+
+def rest_parts(
+    parts: tuple[Part, ...], period_s: float, gyro: BoolArray, step: FloatArray
+) -> tuple[tuple[Part, ...], tuple[Motion, ...]]:
+    """The parts without their moving windows, and where these are.
+
+    Parameters
+    ----------
+    parts : of one log.
+    gyro : (axes,) which axes are rates of rotation.
+    step : (axes,) quantisation steps, NaN for none.
+    """
+    size = _window(period_s)
+    coarse = np.nan_to_num(step)
+    most = np.where(gyro, MOST_GYRO_RADPS, MOST_ACCEL_MPS2)
+    quiet = np.maximum(quiet_spread(parts, period_s), 0.3 * coarse)
+    means = [_windows(part, size).mean(axis=1) for part in parts if len(part.values) >= 2 * size]
+    steps = [np.abs(np.diff(mean, axis=0)) for mean in means]
+    jump = np.zeros(len(gyro))
+    if steps:
+        jump = np.quantile(np.concatenate(steps), 0.25, axis=0) / _QUARTILE_OF_NORMAL
+    # Few windows may agree by chance; white noise alone gives this much.
+    jump = np.maximum(jump, np.sqrt(2.0 / size) * quiet) + 1e-12
+    still: list[Part] = []
+    motions: list[Motion] = []
+    for part in parts:
+        if len(part.values) < size:
+            still.append(part)
+            continue
+        w = _windows(part, size)
+        excess = w.std(axis=1) / np.minimum(TIMES_SPREAD * quiet + 1e-12, most)
+        change = np.abs(np.diff(w.mean(axis=1), axis=0)) / (TIMES_MEAN * jump)
+        # Coming to rest is no motion of the window that follows.
+        shaken = (excess > 1.0).any(axis=1)
+        change[shaken[:-1]] = 0.0
+        excess[1:] = np.maximum(excess[1:], change)
+        moving = (excess > 1.0).any(axis=1)
+        for start, stop, moves in _runs(moving):
+            begin, end = start * size, stop * size if stop < len(w) else len(part.values)
+            if moves:
+                axis = int(np.argmax(excess[start:stop].max(axis=0)))
+                motions.append(Motion(part.start_s + begin * period_s, part.start_s + end * period_s, axis))
+            else:
+                inside = (part.places >= begin) & (part.places < end)
+                still.append(
+                    Part(
+                        part.start_s + begin * period_s,
+                        part.values[begin:end],
+                        part.rows[inside],
+                        part.places[inside] - begin,
+                    )
+                )
+    return tuple(still), tuple(motions)
+
+
+def _runs(flags: BoolArray) -> list[tuple[int, int, bool]]:
+    """First, behind the last, and value of each run of equal flags."""
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(flags)) + 1, [len(flags)]]).tolist()
+    return [(a, b, bool(flags[a])) for a, b in pairwise(edges)]
+
+
+# ----------------------------------------------------------------------
+# Stretches in which a sensor is held still, found by the spread of its specific forces.
+#
+# A reading is at rest where the spread in a window about it,
+#
+#     zeta = sqrt(var_x^2 + var_y^2 + var_z^2),
+#
+# is below a multiple of what it is while the sensor lies still at the start of the log (Tedaldi, Pretto and
+# Menegatti, ICRA 2014, eq. 12). Which multiple is right depends on the sensor and on the table; whoever
+# fits
+# a model to the rests tries those of `MULTIPLES` and keeps the one with the least residual.
+#
+# Where the log does not begin at rest, its quietest windows are the measure instead.
+
+MULTIPLES = (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 15.0, 20.0, 30.0)
+WINDOW_S = 1.0
+_LEAST_REST_S = 1.0
+_RESTS_FEWEST = 21
+_LEAST_INITIAL_S = 3.0
+_QUIET_QUANTILE = 0.03
+_TIMES_QUIET = 12.0
+_BATCH_S = 0.25
+
+
+@dataclass(frozen=True)
+class Spread:
+    """zeta about each reading of each part, and the window's length in samples."""
+
+    zeta: tuple[FloatArray, ...]
+    window: int
+    period_s: float
+
+
+@dataclass(frozen=True)
+class Quiet:
+    """What zeta is at rest, and how long the rest at the start of the log is; 0 s where there is none."""
+
+    zeta: float
+    initial_s: float
+
+
+@dataclass(frozen=True)
+class Rest:
+    """A stretch at rest.
+
+    Attributes
+    ----------
+    part, start, stop : number of the part, first sample, and the one behind the last.
+    from_s, to_s : the same as time stamps.
+    mean : (d,) of the readings.
+    scatter : (d,) long-run variance of a reading: that of a mean of n readings is scatter / n.
+    """
+
+    part: int
+    start: int
+    stop: int
+    from_s: float
+    to_s: float
+    mean: FloatArray
+    scatter: FloatArray
+
+    @property
+    def samples(self) -> int:
+        """Number of readings."""
+        return self.stop - self.start
+
+    @property
+    def duration_s(self) -> float:
+        """Length in seconds."""
+        return self.to_s - self.from_s
+
+
+def _moving_variance(values: FloatArray, size: int) -> FloatArray:
+    """Variance (n - size + 1, d) in each window."""
+    centred = values - values.mean(axis=0)
+    zero = np.zeros((1, values.shape[1]))
+    first = np.concatenate([zero, np.cumsum(centred, axis=0)])
+    second = np.concatenate([zero, np.cumsum(centred**2, axis=0)])
+    mean = (first[size:] - first[:-size]) / size
+    return np.asarray(np.maximum((second[size:] - second[:-size]) / size - mean**2, 0.0))
+
+
+def spread(parts: tuple[Part, ...], columns: list[int], period_s: float) -> Spread:
+    """zeta of the given columns; infinite in parts that are shorter than a window.
+
+    Parameters
+    ----------
+    parts : readings on an even grid.
+    columns : those of the accelerometer.
+    """
+    size = max(_RESTS_FEWEST, round(WINDOW_S / period_s) | 1)
+    out = []
+    for part in parts:
+        zeta = np.full(len(part.values), math.inf)
+        if len(part.values) >= size:
+            inner = np.sqrt((_moving_variance(part.values[:, columns], size) ** 2).sum(axis=1))
+            half = size // 2
+            zeta[half : half + len(inner)] = inner
+            zeta[:half], zeta[half + len(inner) :] = inner[0], inner[-1]
+        out.append(zeta)
+    return Spread(tuple(out), size, period_s)
+
+
+def quiet_level(s: Spread, step: FloatArray) -> Quiet:
+    """What zeta is at rest, from the start of the log where that is still.
+
+    Parameters
+    ----------
+    step : (d,) quantisation steps, NaN for none; no reading is known better than its step.
+    """
+    zeta = np.concatenate([one[np.isfinite(one)] for one in s.zeta])
+    floor = float(np.linalg.norm(np.nan_to_num(step) ** 2 / 12.0))
+    if len(zeta) == 0:
+        return Quiet(floor, 0.0)
+    quietest = max(float(np.quantile(zeta, _QUIET_QUANTILE)), floor)
+    moves = np.flatnonzero(s.zeta[0] > _TIMES_QUIET * quietest)
+    initial = int(moves[0]) if len(moves) else len(s.zeta[0])
+    if initial * s.period_s >= _LEAST_INITIAL_S:
+        return Quiet(max(float(np.median(s.zeta[0][:initial])), floor), initial * s.period_s)
+    return Quiet(1.3 * quietest, 0.0)
+
+
+def _scatter(values: FloatArray, period_s: float) -> FloatArray:
+    """Long-run variance (d,): that of means over a batch times its length, which counts correlation."""
+    size = max(1, round(_BATCH_S / period_s))
+    count = len(values) // size
+    if count < 3:
+        return np.asarray(values.var(axis=0, ddof=1))
+    means = values[: count * size].reshape(count, size, -1).mean(axis=1)
+    # Differences of neighbours, as a drift over the rest is no noise of its mean.
+    return np.asarray(size * (np.diff(means, axis=0) ** 2).mean(axis=0) / 2.0)
+
+
+def find_rests(parts: tuple[Part, ...], columns: list[int], s: Spread, threshold: float) -> tuple[Rest, ...]:
+    """Stretches of at least a second in which zeta stays below the threshold, in order of time."""
+    least = max(_RESTS_FEWEST, round(_LEAST_REST_S / s.period_s))
+    rests = []
+    for number, (part, zeta) in enumerate(zip(parts, s.zeta, strict=True)):
+        still = np.concatenate([[False], zeta <= threshold, [False]]).astype(np.int64)
+        starts, stops = np.flatnonzero(np.diff(still) == 1), np.flatnonzero(np.diff(still) == -1)
+        for start, stop in zip(starts.tolist(), stops.tolist(), strict=True):
+            if stop - start < least:
+                continue
+            values = part.values[start:stop][:, columns]
+            at = part.start_s + s.period_s * np.array([start, stop])
+            rests.append(
+                Rest(
+                    number,
+                    start,
+                    stop,
+                    float(at[0]),
+                    float(at[1]),
+                    values.mean(axis=0),
+                    _scatter(values, s.period_s),
+                )
+            )
+    return tuple(rests)

@@ -1,0 +1,1209 @@
+"""Gains of the angle filter: judged on data held back, compared with a Kalman filter and a smoother."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
+from scipy.stats import norm, t
+
+from calib.core.arrays import BoolArray, FloatArray, IntArray
+from calib.core.errors import BadInputError
+from calib.stages.imu.mahony import Mahony, MahonyState, advance, filter_log, wrapped
+
+# ----------------------------------------------------------------------
+# The angle filter as a linear system, and gains from noise.
+#
+# Without wrapping one step of (2.3) with the input v = phi_acc and a rate that errs by b is
+#
+#     (phi, I)' = A (phi, I) + B v + (dt, 0) b,
+#     A = [[1 - dt (Kp + Ki dt), dt], [-Ki dt, 1]],   B = (dt (Kp + Ki dt), Ki dt).
+#
+# In continuous time its poles are the roots of s^2 + Kp s + Ki.
+#
+# It is the Kalman filter, settled, of the angle and the gyroscope's bias: with white noise N^2 on the rate,
+# K^2 on the bias' derivative and a density r of the accelerometer's angle the Riccati equation gives
+#
+#     Ki = K / sqrt(r),   Kp = sqrt(N^2 / r + 2 Ki)          for dt -> 0,
+#
+# so any pair with Kp^2 >= 2 Ki, damped by 1 / sqrt(2) or more, is a Kalman filter of some noise. For a
+# finite step the discrete equation is solved and its gains (L1, L2) of the prediction mapped by
+# Ki dt = -L2, dt (Kp + Ki dt) = L1.
+
+_BAND = 0.02
+_LONGEST_STEPS = 400_000
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Densities in continuous time.
+
+    Attributes
+    ----------
+    gyro : N of the rate [rad/s/sqrt(Hz)].
+    walk : K of the bias [rad/s^2/sqrt(Hz)].
+    accel : of the accelerometer's angle at low frequencies, motion included [rad/sqrt(Hz)].
+
+    Raises `BadInputError` for densities that are not finite or not positive; the walk may be zero.
+    """
+
+    gyro: float
+    walk: float
+    accel: float
+
+    def __post_init__(self) -> None:
+        for name, value, least in (("gyro", self.gyro, 0.0), ("accel", self.accel, 0.0)):
+            if not least < value < math.inf:
+                raise BadInputError(f"density {name}: found {value:g}, expected more than zero")
+        if not 0.0 <= self.walk < math.inf:
+            raise BadInputError(f"density walk: found {self.walk:g}, expected zero or more")
+
+
+DATA_SHEET = Noise(math.radians(0.01), 1e-4, 0.01)
+"""Gyroscope N and bias walk K of consumer sensors; the accelerometer's is only a stand-in at rest."""
+
+
+@dataclass(frozen=True)
+class GainFacts:
+    """What a pair of gains does at a step dt.
+
+    Attributes
+    ----------
+    poles : the two, discrete; stable inside of the unit circle.
+    damping : Kp / (2 sqrt(Ki)), infinite without Ki.
+    bandwidth_hz : where the accelerometer's part has fallen by 3 dB.
+    noise_gain : variance of the angle over that of white noise on phi_acc.
+    bias_gain_s : angle left by a constant bias of the rate [rad per rad/s].
+    bias_peak_s : largest angle on the way after the bias appears.
+    settling_s : time after which an error of the start stays below 2 % of it.
+    bias_settling_s : the same of the bias' estimate.
+    lag_s : time after which a step that the accelerometer alone sees is followed half way.
+    """
+
+    poles: tuple[complex, complex]
+    damping: float
+    bandwidth_hz: float
+    noise_gain: float
+    bias_gain_s: float
+    bias_peak_s: float
+    settling_s: float
+    bias_settling_s: float
+    lag_s: float
+
+    @property
+    def stable(self) -> bool:
+        """Whether all errors die out; a pole on the unit circle is the integral that is not used."""
+        return max(abs(p) for p in self.poles) < 1.0
+
+
+def _system(gains: Mahony, dt: float) -> tuple[FloatArray, FloatArray]:
+    whole = dt * (gains.Kp + gains.Ki * dt)
+    A = np.array([[1.0 - whole, dt], [-gains.Ki * dt, 1.0]])
+    return A, np.array([whole, gains.Ki * dt])
+
+
+def _bandwidth_hz(A: FloatArray, B: FloatArray, dt: float) -> float:
+    f = np.geomspace(1e-5, 0.5, 4000) / dt
+    z = np.exp(2j * math.pi * f * dt)
+    # (z - A)^-1 B for its first row, times z: phi_k hears of v_k at once.
+    determinant = (z - A[0, 0]) * (z - A[1, 1]) - A[0, 1] * A[1, 0]
+    gain = np.abs(z * ((z - A[1, 1]) * B[0] + A[0, 1] * B[1]) / determinant)
+    below = np.flatnonzero(gain < math.sqrt(0.5))
+    beyond = below[below > int(np.argmax(gain))]
+    return float(f[beyond[0]]) if len(beyond) else 0.5 / dt
+
+
+def _settled(values: FloatArray, dt: float) -> float:
+    outside = np.flatnonzero(np.abs(values) > _BAND * float(np.abs(values).max()))
+    return math.inf if outside[-1] == len(values) - 1 else float(outside[-1] + 1) * dt
+
+
+def _powers(A: FloatArray, x: FloatArray, steps: int) -> FloatArray:
+    """A^k x (steps, 2) by doubling."""
+    out = x[:, None]
+    power = A
+    while out.shape[1] < steps:
+        out = np.concatenate([out, power @ out], axis=1)
+        power = power @ power
+    return out[:, :steps].T
+
+
+def gain_facts(gains: Mahony, dt_s: float) -> GainFacts:
+    """Poles, bandwidth, noise, rejection of a bias and settling of a pair of gains.
+
+    Raises `BadInputError` for a step that is not positive and for gains that are unstable with it.
+    """
+    if not 0.0 < dt_s < math.inf:
+        raise BadInputError(f"step: found {dt_s:g} s, expected more than zero")
+    A, B = _system(gains, dt_s)
+    poles = np.linalg.eigvals(A)
+    size = float(np.abs(poles[np.abs(poles - 1.0) > 1e-12]).max(initial=0.0))
+    if size >= 1.0 or gains.Kp == 0.0:
+        raise BadInputError(
+            f"gains Kp {gains.Kp:g}, Ki {gains.Ki:g} at steps of {dt_s:g} s: are not stable, expected "
+            f"0 < Kp < {2.0 / dt_s:g}"
+        )
+    only = gains.Ki == 0.0
+    damping = math.inf if only else gains.Kp / (2.0 * math.sqrt(gains.Ki))
+    steps = min(math.ceil(math.log(1e-3) / math.log(size)) + 2, _LONGEST_STEPS)
+    start = _powers(A, np.array([1.0, 0.0]), steps)[:, 0]
+    toward = _powers(A, np.array([0.0, 1.0]), steps)
+    # Of a bias that appears at once the angle is the sum of what each step adds.
+    biased = dt_s * np.cumsum(start)
+    if only:
+        noise = float(B[0] ** 2 / (1.0 - A[0, 0] ** 2))
+        left = dt_s / (1.0 - A[0, 0])
+    else:
+        noise = float(solve_discrete_lyapunov(A, np.outer(B, B))[0, 0])
+        left = 0.0
+    follow = np.cumsum(_powers(A, B, steps)[:, 0])
+    half = np.flatnonzero(follow >= 0.5)
+    return GainFacts(
+        poles=(complex(poles[0]), complex(poles[1])),
+        damping=damping,
+        bandwidth_hz=_bandwidth_hz(A, B, dt_s),
+        noise_gain=noise,
+        bias_gain_s=left,
+        bias_peak_s=float(np.abs(biased).max()),
+        settling_s=_settled(start, dt_s),
+        bias_settling_s=math.inf if only else _settled(toward[:, 1], dt_s),
+        lag_s=float(half[0]) * dt_s if len(half) else math.inf,
+    )
+
+
+def predicted_sigma(gains: Mahony, noise: Noise, dt_s: float) -> float:
+    """Standard deviation of the settled angle [rad] under these densities; infinite where none settles."""
+    A, B = _system(gains, dt_s)
+    if float(np.abs(np.linalg.eigvals(A)).max()) >= 1.0:
+        return math.inf
+    # With the bias' walk in I: the error of I is I + b.
+    Q = np.diag([noise.gyro**2 * dt_s, noise.walk**2 * dt_s]) + noise.accel**2 / dt_s * np.outer(B, B)
+    return math.sqrt(float(solve_discrete_lyapunov(A, Q)[0, 0]))
+
+
+def riccati(noise: Noise, dt_s: float) -> Mahony:
+    """Gains of the settled Kalman filter of angle and bias for these densities.
+
+    Source: Higgins, IEEE Trans. Aerospace and Electronic Systems 11(3), 1975, for the equivalence.
+    """
+    if noise.walk == 0.0:
+        # The bias is known in the end; what is left is the angle alone.
+        q, R = noise.gyro**2 * dt_s, noise.accel**2 / dt_s
+        variance = 0.5 * (q + math.sqrt(q * q + 4.0 * q * R))
+        return Mahony(variance / (variance + R) / dt_s, 0.0)
+    F = np.array([[1.0, -dt_s], [0.0, 1.0]])
+    K2 = noise.walk**2
+    Q = np.array(
+        [
+            [noise.gyro**2 * dt_s + K2 * dt_s**3 / 3.0, -0.5 * K2 * dt_s**2],
+            [-0.5 * K2 * dt_s**2, K2 * dt_s],
+        ]
+    )
+    R = noise.accel**2 / dt_s
+    # Angles in units of the accelerometer's noise, for the solver's sake.
+    scale = 1.0 / R
+    P = solve_discrete_are(F.T, np.array([[1.0], [0.0]]), Q * scale, np.array([[1.0]]))
+    L = F @ P[:, 0] / (P[0, 0] + 1.0)
+    Ki = -float(L[1]) / dt_s
+    return Mahony(float(L[0]) / dt_s - Ki * dt_s, Ki)
+
+
+def equivalent_noise(gains: Mahony, accel: float) -> Noise:
+    """Densities whose Kalman filter settles to these gains, for dt -> 0 and a given accelerometer.
+
+    Below a damping of 1 / sqrt(2) there are none; the gyroscope's is then taken as nearly none.
+    """
+    square = max(gains.Kp**2 - 2.0 * gains.Ki, 1e-4 * gains.Kp**2)
+    return Noise(accel * math.sqrt(square), accel * gains.Ki, accel)
+
+
+# ----------------------------------------------------------------------
+# The angle filter with gains that start large: a Kalman filter of angle and gyro bias from a prior.
+#
+# The constant gains of (2.3) take many seconds to learn the bias. A Kalman filter that starts from what is
+# known of it, a standard deviation, learns it as fast as the accelerometer's noise allows, and settles to
+# the gains of `calib.stages.imu.tuning.riccati`. With P of (phi, I) and I = -b one sample is
+#
+#     s = P11 + r / dt,   Kp_k + Ki_k dt = (P11 + dt P12) / (s dt),   Ki_k = P12 / (s dt),
+#     P <- F (P - P1 P1' / s) F' + diag(N^2, K^2) dt,   F = [[1, dt], [0, 1]],
+#
+# after which the step is (2.3) with Kp_k and Ki_k.
+
+_TURN = 2.0 * math.pi
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known before the first sample: standard deviations of the angle [rad] and bias [rad/s]."""
+
+    angle_rad: float = 0.1
+    bias_radps: float = 0.05
+
+
+@dataclass(frozen=True)
+class Started:
+    """Angle and integral after each sample (n,), the gains that were used, and the last deviations.
+
+    `sigma_phi_rad` and `sigma_bias_radps` (n,) are those that the filter itself believes in.
+    """
+
+    phi_rad: FloatArray
+    integral_radps: FloatArray
+    Kp_per_s: FloatArray
+    Ki_per_s2: FloatArray
+    sigma_phi_rad: FloatArray
+    sigma_bias_radps: FloatArray
+
+
+@njit(cache=True, nogil=True)
+def _run(
+    t: FloatArray,
+    phi_acc: FloatArray,
+    w: FloatArray,
+    q: float,
+    q_b: float,
+    r: float,
+    phi: float,
+    integral: float,
+    P11: float,
+    P22: float,
+    out: FloatArray,
+) -> None:
+    P12 = 0.0
+    before = t[0]
+    Kp = Ki = 0.0
+    for k in range(len(t)):
+        dt = t[k] - before
+        before = t[k]
+        if dt > 0.0:
+            s = P11 + r / dt
+            whole = (P11 + dt * P12) / (s * dt)
+            Ki = P12 / (s * dt)
+            Kp = whole - Ki * dt
+            a11, a12, a22 = P11 - P11 * P11 / s, P12 - P11 * P12 / s, P22 - P12 * P12 / s
+            P11 = a11 + 2.0 * dt * a12 + dt * dt * a22 + q * dt
+            P12 = a12 + dt * a22
+            P22 = a22 + q_b * dt
+            e = phi_acc[k] - phi
+            e -= _TURN * np.rint(e / _TURN)
+            integral += Ki * e * dt
+            phi += (Kp * e + integral + w[k]) * dt
+        out[0, k] = phi
+        out[1, k] = integral
+        out[2, k] = Kp
+        out[3, k] = Ki
+        out[4, k] = math.sqrt(P11)
+        out[5, k] = math.sqrt(P22)
+
+
+def filter_from_prior(
+    noise: Noise,
+    prior: Prior,
+    t_s: FloatArray,
+    phi_acc_rad: FloatArray,
+    rate_radps: FloatArray,
+    start: MahonyState | None = None,
+) -> Started:
+    """The filter over a log, from the first accelerometer's angle or a given state.
+
+    Parameters
+    ----------
+    t_s, phi_acc_rad, rate_radps : (n,) as of `calib.stages.imu.mahony.filter_log`.
+
+    Raises
+    ------
+    BadInputError for lengths that differ, time that goes back, and values that are not finite.
+    """
+    t, phi_acc, w = (np.ascontiguousarray(x, dtype=np.float64) for x in (t_s, phi_acc_rad, rate_radps))
+    if t.ndim != 1 or t.shape != phi_acc.shape or t.shape != w.shape or len(t) == 0:
+        raise BadInputError(
+            f"angle filter: found times {t.shape}, angles {phi_acc.shape} and rates {w.shape}, "
+            "expected as many of each and at least one"
+        )
+    if not (np.isfinite(phi_acc).all() and np.isfinite(w).all() and (np.diff(t) >= 0.0).all()):
+        raise BadInputError("angle filter: expected finite readings and time that runs forward")
+    state = MahonyState(float(phi_acc[0]), 0.0) if start is None else start
+    out = np.empty((6, len(t)))
+    _run(
+        t,
+        phi_acc,
+        w,
+        noise.gyro**2,
+        noise.walk**2,
+        noise.accel**2,
+        state.phi_rad,
+        state.integral_radps,
+        prior.angle_rad**2,
+        prior.bias_radps**2,
+        out,
+    )
+    return Started(*out)
+
+
+# ----------------------------------------------------------------------
+# Held-out errors of filters, compared by a block bootstrap.
+#
+# The errors of an angle are correlated over seconds, so that samples are no independent witnesses. A
+# circular block bootstrap (Politis and Romano, in Exploring the Limits of Bootstrap, 1992) draws runs of a
+# tenth of the log, 2 to 60 s. All filters are drawn with the same runs: what they have in common cancels
+# in their difference.
+#
+# With m runs, about ten, the spread of the draws is too small and not well known. Runs about their common
+# mean
+# lose a share 1 / m of the variance, and a variance from overlapping runs has 1.5 m degrees of freedom
+# (Kuensch, Annals of Statistics 17, 1989). So deviations from the estimate are widened by
+#
+#     sqrt(m / (m - 1)) t(1.5 m) / z,   t and z the 97.5 % points of Student's and the normal distribution,
+#
+# and intervals of an error, which is a scale, are those of its logarithm, turned about the estimate: an
+# error
+# that was found too small was found with too small a spread.
+
+CONFIDENCE = 0.95
+_RESAMPLES = 2000
+_FINEST_S = 0.5
+_MOST_BLOCKS = 600
+_SEED = 20
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A filter and its held-out errors.
+
+    Attributes
+    ----------
+    name : "3/3", "tuned", "riccati", or one of these "from a prior".
+    gains : those that would be used, of the settled filter.
+    rmse_rad, low_rad, high_rad : held-out error and its 95 % interval.
+    less_rad, less_low_rad, less_high_rad : error less that of 3/3, and its 95 % interval.
+    confidence : share of the resamples in which it is less, NaN where nothing was judged.
+    whole_rad : error of `gains` on the whole logs, which for "tuned" they were tuned on.
+    """
+
+    name: str
+    gains: Mahony
+    rmse_rad: float
+    low_rad: float
+    high_rad: float
+    less_rad: float
+    less_low_rad: float
+    less_high_rad: float
+    confidence: float
+    whole_rad: float
+
+    @property
+    def wins(self) -> bool:
+        """Whether its error is less than that of 3/3 with 95 %."""
+        return self.confidence >= CONFIDENCE
+
+
+@dataclass(frozen=True)
+class Row:
+    """A filter's errors (n_i,) in each piece, NaN where it is not judged, and its error on the whole."""
+
+    name: str
+    gains: Mahony
+    errors_rad: Sequence[FloatArray]
+    whole_rad: float
+
+
+def _block_sums(errors: Sequence[FloatArray], size: int) -> tuple[FloatArray, FloatArray]:
+    """Sums of squares and counts in consecutive blocks of `size` samples."""
+    totals, counts = [], []
+    for e in errors:
+        known = np.isfinite(e)
+        starts = np.arange(0, len(e), size)
+        totals.append(np.add.reduceat(np.where(known, e, 0.0) ** 2, starts))
+        counts.append(np.add.reduceat(known.astype(np.float64), starts))
+    return np.concatenate(totals), np.concatenate(counts)
+
+
+def _resampled(blocks: int, length: int) -> IntArray:
+    """Numbers of the blocks (resamples, blocks) in runs of `length`, round the end."""
+    rng = np.random.default_rng(_SEED)
+    runs = -(-blocks // length)
+    first = rng.integers(0, blocks, size=(_RESAMPLES, runs))
+    at = (first[:, :, None] + np.arange(length)) % blocks
+    return np.asarray(at.reshape(_RESAMPLES, -1)[:, :blocks])
+
+
+def _widening(runs: float) -> float:
+    """By how much deviations of the draws from the estimate are too small, for a number of runs."""
+    m = max(runs, 2.0)
+    return math.sqrt(m / (m - 1.0)) * float(t.ppf(0.975, 1.5 * m) / norm.ppf(0.975))
+
+
+def rms(errors: Sequence[FloatArray]) -> float:
+    """Root mean square of errors in several pieces, NaN not counted."""
+    whole = np.concatenate(errors)
+    return math.sqrt(float(np.nanmean(whole**2)))
+
+
+def compared(rows: Sequence[Row], dt_s: float) -> tuple[tuple[Candidate, ...], float]:
+    """Candidates of held-out errors, and the length of the bootstrap's blocks [s]; 3/3 comes first.
+
+    Parameters
+    ----------
+    rows : all with errors of the same samples.
+    """
+    judged_s = dt_s * sum(int(np.isfinite(errors).sum()) for errors in rows[0].errors_rad)
+    size = max(round(max(_FINEST_S, judged_s / _MOST_BLOCKS) / dt_s), 1)
+    block_s = min(max(judged_s / 10.0, 2.0), 60.0)
+    tables = [_block_sums(row.errors_rad, size) for row in rows]
+    length = min(max(round(block_s / (size * dt_s)), 1), len(tables[0][0]))
+    at = _resampled(len(tables[0][0]), length)
+    drawn = [
+        np.sqrt(total[at].sum(axis=1) / np.maximum(count[at].sum(axis=1), 1.0)) for total, count in tables
+    ]
+    base, wide = rms(rows[0].errors_rad), _widening(len(tables[0][0]) / length)
+    out = []
+    for row, draws in zip(rows, drawn, strict=True):
+        rmse = rms(row.errors_rad)
+        off = wide * (np.log(np.maximum(draws, 1e-300)) - math.log(max(rmse, 1e-300)))
+        high, low = (rmse * np.exp(-np.quantile(off, [0.025, 0.975]))).tolist()
+        less = rmse - base
+        apart = less + wide * (draws - drawn[0] - less)
+        less_low, less_high = np.quantile(apart, [0.025, 0.975]).tolist()
+        confidence = float((apart < 0.0).mean())
+        out.append(
+            Candidate(
+                row.name, row.gains, rmse, low, high, less, less_low, less_high, confidence, row.whole_rad
+            )
+        )
+    return tuple(out), block_s
+
+
+# ----------------------------------------------------------------------
+# The angle of a whole log, from both of its ends: what a filter is judged by where nothing else is known.
+#
+# The rate integrated, theta, follows every motion but drifts; the accelerometer's angle does not drift but
+# feels every acceleration. Their difference d = phi_acc - theta is explained by
+#
+#     delta' = -(b + s w) + n,   b' = n_b,   c' = -c / tau + n_c,   d = delta + (X1 rx + X2 ry) + c + v
+#
+# with the bias b and the scale error s of the gyroscope, a lever (rx, ry) from the centre of rotation to
+# the sensor, whose accelerations follow from the rate,
+#
+#     X1 = (alpha cos phi + w^2 sin phi) / g,   X2 = (alpha sin phi - w^2 cos phi) / g,   alpha = dgz/dt,
+#
+# white noises n, n_b of the gyroscope, and of the accelerometer white noise v and accelerations c that last
+# for a time tau. A Kalman filter forwards and the
+# smoother of Rauch, Tung and Striebel backwards give phi = theta + delta. How much of c and v there is
+# depends on the motion, and a rate that is not quite that of the angle adds to n: densities, tau and the
+# size of c are those that make the log most likely, from means over half a second. What the accelerometer
+# feels stays bounded and what the gyroscope gathers does not, by which the two are told apart.
+
+_G = 9.80665
+BLOCK_S = 0.05
+_COARSE_S = 0.5
+SHORTEST_S = 4.0
+_LIKELY_BLOCKS = 2400
+_LASTING_S = (0.3, 1.0, 3.0)
+_LASTING_RAD = (2e-4, 6e-4, 2e-3, 6e-3, 2e-2, 6e-2)
+_NONE_RAD = 1e-6
+"""Size of c where there is none, which keeps the covariance regular."""
+_STATES = 6
+_BIAS_SIGMA_RADPS = 0.05
+_SCALE_SIGMA = 0.02
+_LEVER_SIGMA_M = 0.3
+"""What data sheets leave open, and levers that a hand-sized rig can have; a log of seconds narrows them."""
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """A log's own angle and what explains it.
+
+    Attributes
+    ----------
+    phi_rad : (n,) angle, not wrapped.
+    sigma_rad : its standard deviation, root of the mean square over the log.
+    gyro_noise : density of the rate's error [rad/s/sqrt(Hz)], at least that of the sensor.
+    accel_noise : density of the accelerometer's angle at low frequencies, motion included [rad/sqrt(Hz)].
+    bias_radps, scale : of the rate, at the end of the log.
+    lever_m : (2,) from the centre of rotation to the sensor, in its axes.
+    """
+
+    phi_rad: FloatArray
+    sigma_rad: float
+    gyro_noise: float
+    accel_noise: float
+    bias_radps: float
+    scale: float
+    lever_m: FloatArray
+
+
+@njit(cache=True, nogil=True)
+def _forward(
+    z: FloatArray,
+    X: FloatArray,
+    dt: FloatArray,
+    turn: FloatArray,
+    q: float,
+    q_b: float,
+    r: float,
+    tau: float,
+    c: float,
+    x: FloatArray,
+    P: FloatArray,
+    xs: FloatArray,
+    Ps: FloatArray,
+) -> float:
+    """Kalman filter over blocks; fills the states (n, 6) and covariances (n, 6, 6) where there is room.
+
+    Returns the logarithm of the likelihood, without its constant.
+    """
+    m = 6
+    keep = len(xs) > 0
+    x, P = x.copy(), P.copy()
+    h, Ph = np.zeros(m), np.zeros(m)
+    log_likelihood = 0.0
+    for k in range(len(z)):
+        if k > 0:
+            # P <- F P F' with F the identity but for its first row (1, dt, turn, 0, 0, 0) and its last.
+            a, b = dt[k], turn[k]
+            x[0] += a * x[1] + b * x[2]
+            for j in range(m):
+                P[0, j] += a * P[1, j] + b * P[2, j]
+            for i in range(m):
+                P[i, 0] += a * P[i, 1] + b * P[i, 2]
+            P[0, 0] += q * dt[k]
+            P[1, 1] += q_b * dt[k]
+            kept = math.exp(-dt[k] / tau)
+            x[5] *= kept
+            for j in range(m):
+                P[5, j] *= kept
+            for i in range(m):
+                P[i, 5] *= kept
+            P[5, 5] += c * c * (1.0 - kept * kept)
+        h[3], h[4] = X[k, 0], X[k, 1]
+        s, e = r / dt[k], z[k]
+        for i in range(m):
+            Ph[i] = P[i, 0] + P[i, 3] * h[3] + P[i, 4] * h[4] + P[i, 5]
+        s += Ph[0] + h[3] * Ph[3] + h[4] * Ph[4] + Ph[5]
+        e -= x[0] + h[3] * x[3] + h[4] * x[4] + x[5]
+        for i in range(m):
+            x[i] += Ph[i] / s * e
+            for j in range(i + 1):
+                P[i, j] -= Ph[i] * Ph[j] / s
+                P[j, i] = P[i, j]
+        log_likelihood -= 0.5 * (e * e / s + math.log(s))
+        if keep:
+            xs[k] = x
+            Ps[k] = P
+    return log_likelihood
+
+
+@njit(cache=True, nogil=True)
+def _backward(
+    dt: FloatArray,
+    turn: FloatArray,
+    q: float,
+    q_b: float,
+    tau: float,
+    c: float,
+    xs: FloatArray,
+    Ps: FloatArray,
+) -> float:
+    """Smooths the states in place; returns the mean variance of the first."""
+    m = 6
+    P_next, x_next = Ps[-1].copy(), xs[-1].copy()
+    total = P_next[0, 0]
+    F = np.eye(m)
+    for k in range(len(xs) - 2, -1, -1):
+        kept = math.exp(-dt[k + 1] / tau)
+        F[0, 1], F[0, 2], F[5, 5] = dt[k + 1], turn[k + 1], kept
+        ahead = F @ Ps[k]
+        P_minus = ahead @ F.T
+        P_minus[0, 0] += q * dt[k + 1]
+        P_minus[1, 1] += q_b * dt[k + 1]
+        P_minus[5, 5] += c * c * (1.0 - kept * kept)
+        G = np.linalg.solve(P_minus, ahead).T
+        x_next = xs[k] + G @ (x_next - F @ xs[k])
+        P_next = Ps[k] + G @ (P_next - P_minus) @ G.T
+        xs[k] = x_next
+        total += P_next[0, 0]
+    mean: float = total / len(xs)
+    return mean
+
+
+@dataclass(frozen=True)
+class _Blocks:
+    """Means over blocks: time, difference d, levers (n, 2), step and turn since the block before."""
+
+    t_s: FloatArray
+    d: FloatArray
+    X: FloatArray
+    dt: FloatArray
+    turn: FloatArray
+
+
+def _means(values: FloatArray, starts: FloatArray, counts: FloatArray) -> FloatArray:
+    return np.asarray(np.add.reduceat(values, starts.astype(np.int64))) / counts
+
+
+def _blocks(
+    t: FloatArray, theta: FloatArray, w: FloatArray, phi_acc: FloatArray, d: FloatArray, size_s: float
+) -> _Blocks:
+    number = np.floor((t - t[0]) / size_s)
+    starts = np.flatnonzero(np.diff(number, prepend=-1.0) > 0.0).astype(np.float64)
+    counts = np.diff(np.append(starts, len(t)))
+    tb, th, db = (_means(values, starts, counts) for values in (t, theta, d))
+    c, s, rate = (_means(values, starts, counts) for values in (np.cos(phi_acc), np.sin(phi_acc), w))
+    dt = np.diff(tb, prepend=tb[0] - size_s)
+    alpha = -np.gradient(rate, tb) if len(tb) > 2 else np.zeros(len(tb))
+    X = np.stack([alpha * c + rate**2 * s, alpha * s - rate**2 * c], axis=1) / _G
+    return _Blocks(tb, db, X, dt, np.diff(th, prepend=th[0]))
+
+
+@njit(cache=True, nogil=True)
+def _likelihoods(
+    z: FloatArray,
+    X: FloatArray,
+    dt: FloatArray,
+    turn: FloatArray,
+    q_b: float,
+    P: FloatArray,
+    tried: FloatArray,
+) -> FloatArray:
+    """Logarithms of the likelihood of rows (n, 4) of q, r, tau, c."""
+    out = np.empty(len(tried))
+    for i in range(len(tried)):
+        q, r, tau, c = tried[i]
+        P[5, 5] = c * c
+        out[i] = _forward(
+            z, X, dt, turn, q, q_b, r, tau, c, np.zeros(6), P, np.zeros((0, 6)), np.zeros((0, 6, 6))
+        )
+    return out
+
+
+def _likely(blocks: _Blocks, q_least: float, q_b: float, r_least: float, P: FloatArray) -> FloatArray:
+    """q, r, tau and c of highest likelihood: over wide steps, then over narrow ones about the best."""
+    few = slice(0, _LIKELY_BLOCKS)
+    data = (blocks.d[few], blocks.X[few], blocks.dt[few], blocks.turn[few], q_b, P.copy())
+    q, r = q_least * 4.0 ** np.arange(11), r_least * 4.0 ** np.arange(12)
+    lasting = [(1.0, _NONE_RAD), *((tau, c) for tau in _LASTING_S for c in _LASTING_RAD)]
+    rows = np.array([(a, b, tau, c) for a in q.tolist() for b in r.tolist() for tau, c in lasting])
+    best = rows[int(np.argmax(_likelihoods(*data, rows)))]
+    for step in (2.0, math.sqrt(2.0)):
+        about = (1.0 / step, 1.0, step)
+        rows = np.array([best * (a, b, e, f) for a in about for b in about for e in about for f in about])
+        rows = np.maximum(rows, [q_least, r_least, 0.1, _NONE_RAD])
+        best = rows[int(np.argmax(_likelihoods(*data, rows)))]
+    return np.asarray(best)
+
+
+def smooth_log(
+    t_s: FloatArray, phi_acc_rad: FloatArray, rate_radps: FloatArray, gyro_noise: float, gyro_walk: float
+) -> Smoothed:
+    """The smoothed angle of a log without long gaps.
+
+    Parameters
+    ----------
+    t_s, phi_acc_rad, rate_radps : (n,) as of `calib.stages.imu.mahony.filter_log`.
+    gyro_noise, gyro_walk : densities N [rad/s/sqrt(Hz)] and K [rad/s^2/sqrt(Hz)] of the sensor.
+
+    Raises `BadInputError` for a log of less than five seconds.
+
+    Source: Rauch, Tung and Striebel, AIAA Journal 3(8), 1965, (3.30).
+    """
+    t = np.asarray(t_s, dtype=np.float64)
+    if len(t) < 20 or t[-1] - t[0] < SHORTEST_S:
+        raise BadInputError(
+            f"smoothing: found {t[-1] - t[0]:.3g} s of samples, expected at least {SHORTEST_S:g} s"
+        )
+    step = np.diff(t, prepend=t[0])
+    theta = np.cumsum(rate_radps * step)
+    d = np.unwrap(wrapped(phi_acc_rad - theta))
+    offset = float(np.median(d[:20]))
+    d = d - offset
+    # White noise of the readings themselves, below which the accelerometer's cannot be.
+    period = (t[-1] - t[0]) / (len(t) - 1)
+    r_least = max(0.5 * float(np.median(np.diff(d) ** 2)) / 0.4549 * period, 1e-12)
+    q_b = gyro_walk**2
+    P = np.diag([1.0, _BIAS_SIGMA_RADPS**2, _SCALE_SIGMA**2, _LEVER_SIGMA_M**2, _LEVER_SIGMA_M**2, 0.0])
+    coarse = _blocks(t, theta, rate_radps, phi_acc_rad, d, _COARSE_S)
+    q, r, tau, c = _likely(coarse, gyro_noise**2, q_b, r_least, P).tolist()
+    P[5, 5] = c * c
+    fine = _blocks(t, theta, rate_radps, phi_acc_rad, d, BLOCK_S)
+    xs, Ps = np.empty((len(fine.d), _STATES)), np.empty((len(fine.d), _STATES, _STATES))
+    _forward(fine.d, fine.X, fine.dt, fine.turn, q, q_b, r, tau, c, np.zeros(_STATES), P, xs, Ps)
+    last = xs[-1].copy()
+    variance = _backward(fine.dt, fine.turn, q, q_b, tau, c, xs, Ps)
+    phi = theta + offset + np.interp(t, fine.t_s, xs[:, 0])
+    # What lasts for tau counts at low frequencies with its size times the time that it lasts.
+    slow = math.sqrt(r + 2.0 * c * c * tau)
+    return Smoothed(phi, math.sqrt(variance), math.sqrt(q), slow, -float(last[1]), -float(last[2]), last[3:5])
+
+
+# ----------------------------------------------------------------------
+# What pairs of gains cost: noise against lag, drift and settling, over the whole plane of gains.
+#
+# Every pair is named by Kp and its damping zeta, Ki = Kp^2 / (4 zeta^2). In continuous time the shapes of
+# all answers depend on zeta alone and their times on 1 / Kp:
+#
+#     bias of the rate -> angle      s / (s^2 + Kp s + Ki), a step of it peaks at
+#                                    exp(-zeta acos(zeta) / sqrt(1 - zeta^2)) / sqrt(Ki),
+#                                    with acosh and zeta^2 - 1 for zeta > 1
+#     accelerometer's angle -> angle (Kp s + Ki) / (s^2 + Kp s + Ki)
+#
+# Noise is that of the discrete filter, from its Lyapunov equation.
+
+_HIGHEST_KP = 20.0
+_LOWEST_KP = 0.02
+_LOWEST_DAMPING, _HIGHEST_DAMPING = 0.15, 10.0
+
+
+@dataclass(frozen=True)
+class Frontier:
+    """Facts of pairs of gains, each (n,).
+
+    Attributes
+    ----------
+    Kp, Ki, damping : the pairs.
+    noise_gain : variance of the angle over that of white noise on the accelerometer's angle.
+    lag_s : time to follow half of a step that the accelerometer alone sees.
+    bias_peak_s : largest angle after a bias appears, over the bias [rad per rad/s].
+    settling_s : time in which the slower pole takes an error to 2 %.
+    sigma_rad : predicted deviation under the log's densities.
+    best : pairs that no other beats in noise and settling at once.
+    """
+
+    Kp: FloatArray
+    Ki: FloatArray
+    damping: FloatArray
+    noise_gain: FloatArray
+    lag_s: FloatArray
+    bias_peak_s: FloatArray
+    settling_s: FloatArray
+    sigma_rad: FloatArray
+    best: BoolArray
+
+
+def damped(Kp: float, damping: float) -> Mahony:
+    """The pair of this Kp and damping ratio."""
+    return Mahony(Kp, Kp * Kp / (4.0 * damping * damping))
+
+
+def gain_grid(dt_s: float, kp: int = 25, dampings: int = 17) -> tuple[FloatArray, FloatArray]:
+    """Values of Kp (kp,) and of the damping (dampings,), evenly spaced in their logarithms.
+
+    From what a minute of data can tell to what the step allows. Raises `BadInputError` for steps of more
+    than a second or none.
+    """
+    if not 0.0 < dt_s <= 1.0:
+        raise BadInputError(f"step: found {dt_s:g} s, expected 0 to 1 s")
+    highest = min(_HIGHEST_KP, 0.5 / dt_s)
+    return (
+        np.geomspace(min(_LOWEST_KP, 0.1 * highest), highest, kp),
+        np.geomspace(_LOWEST_DAMPING, _HIGHEST_DAMPING, dampings),
+    )
+
+
+def _variance(A: FloatArray, Q: FloatArray) -> FloatArray:
+    """First element (n,) of P = A P A' + Q for pairs (n, 2, 2)."""
+    a, b, c, d = A[:, 0, 0], A[:, 0, 1], A[:, 1, 0], A[:, 1, 1]
+    one = np.ones_like(a)
+    # Unknowns P11, P12, P22.
+    M = np.stack(
+        [
+            np.stack([one - a * a, -2.0 * a * b, -b * b], axis=-1),
+            np.stack([-a * c, one - a * d - b * c, -b * d], axis=-1),
+            np.stack([-c * c, -2.0 * c * d, one - d * d], axis=-1),
+        ],
+        axis=-2,
+    )
+    right = np.stack([Q[:, 0, 0], Q[:, 0, 1], Q[:, 1, 1]], axis=-1)
+    return np.asarray(np.linalg.solve(M, right[..., None])[:, 0, 0])
+
+
+def _half_time(damping: float) -> float:
+    """Time times Kp after which a step is followed half way."""
+    Ki = 1.0 / (4.0 * damping * damping)
+    roots = np.roots([1.0, 1.0, Ki]).astype(np.complex128)
+    if abs(roots[0] - roots[1]) < 1e-6:
+        roots[0] *= 1.0 + 1e-5
+    # The error is 1 at first and falls with slope 1.
+    tau = np.linspace(0.0, 1.5, 3001)
+    s1, s2 = roots
+    error = ((-1.0 - s2) * np.exp(s1 * tau) - (-1.0 - s1) * np.exp(s2 * tau)) / (s1 - s2)
+    return float(np.interp(0.5, 1.0 - error.real, tau))
+
+
+def _bias_peak(damping: FloatArray) -> FloatArray:
+    """Peak times sqrt(Ki), of a step of the bias."""
+    z = np.where(np.abs(damping - 1.0) < 1e-6, 1.0 + 1e-6, damping)
+    root = np.sqrt(np.abs(1.0 - z * z))
+    angle = np.where(z < 1.0, np.arccos(np.minimum(z, 1.0)), np.arccosh(np.maximum(z, 1.0)))
+    return np.asarray(np.exp(-z * angle / root))
+
+
+def frontier(noise: Noise, dt_s: float, kp: int = 25, dampings: int = 17) -> Frontier:
+    """The facts of a grid of gains for a log's densities and step."""
+    K, Z = gain_grid(dt_s, kp, dampings)
+    Kp, damping = (x.ravel() for x in np.meshgrid(K, Z, indexing="ij"))
+    Ki = Kp**2 / (4.0 * damping**2)
+    whole = dt_s * (Kp + Ki * dt_s)
+    A = np.empty((len(Kp), 2, 2))
+    A[:, 0, 0], A[:, 0, 1], A[:, 1, 0], A[:, 1, 1] = 1.0 - whole, dt_s, -Ki * dt_s, 1.0
+    B = np.stack([whole, Ki * dt_s], axis=-1)
+    BB = B[:, :, None] * B[:, None, :]
+    own = np.diag([noise.gyro**2 * dt_s, noise.walk**2 * dt_s])
+    slowest = np.abs(np.linalg.eigvals(A)).max(axis=1)
+    settling = dt_s * math.log(0.02) / np.log(slowest)
+    noise_gain = _variance(A, BB)
+    order = np.lexsort((settling, noise_gain))
+    best = np.zeros(len(Kp), dtype=np.bool_)
+    least = np.minimum.accumulate(settling[order])
+    best[order] = np.concatenate([[True], least[1:] < least[:-1]])
+    return Frontier(
+        Kp=Kp,
+        Ki=Ki,
+        damping=damping,
+        noise_gain=noise_gain,
+        lag_s=np.repeat([[_half_time(z) for z in Z.tolist()]], len(K), axis=0).ravel() / Kp,
+        bias_peak_s=_bias_peak(damping) / np.sqrt(Ki),
+        settling_s=settling,
+        sigma_rad=np.sqrt(_variance(A, own + noise.accel**2 / dt_s * BB)),
+        best=best,
+    )
+
+
+# ----------------------------------------------------------------------
+# Gains of the angle filter from logs, tuned on one part and judged on the other.
+#
+# The judge is a reference angle where the logs have one, and the log's own smoothed angle where they do not
+# (`calib.stages.imu.tuning`). For Gaussian errors the latter is no makeshift: the expected square of a
+# filter's
+# error, given the log, is the square of its distance from the smoothed angle plus the smoother's variance,
+# which no gains change. It holds as far as the smoother's model does, so a log that contradicts the model
+# has no judge of its own.
+#
+# A filter runs over each log from its first sample with an empty integral, as firmware does. For the
+# judgement each half counts as a log of its own, so that both have a bias to learn; it starts at the angle
+# that it is judged by, as logs start at rest and halves do not. The best gains of the first half are judged
+# on the second and those of the second on the first: together these errors are the held-out ones of
+# "tuned". Whether they are less than those of 3/3 is asked of a block bootstrap
+# (`calib.stages.imu.tuning`). Only
+# a pair that wins with 95 % is recommended; the pair itself is then that of the whole logs.
+#
+# Of pairs within 3 % of the least error the best damped is taken: a short log does not tell them apart,
+# and a pair that rings has fitted the log's start.
+
+THREE = Mahony(3.0, 3.0)
+_ALIKE = 1.03
+_LEAST_JUDGED_S = 8.0
+_WORSE = 100.0
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A log without long gaps.
+
+    Attributes
+    ----------
+    t_s, phi_acc_rad, rate_radps : (n,) as of `calib.stages.imu.mahony.filter_log`.
+    reference_rad : (n,) the true angle but for a constant, NaN where it is not known; None without one.
+    in_plane : False where the rate is known not to be the angle's; the log then cannot judge itself.
+    """
+
+    source: str
+    t_s: FloatArray
+    phi_acc_rad: FloatArray
+    rate_radps: FloatArray
+    reference_rad: FloatArray | None = None
+    in_plane: bool = True
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Root mean square error (kp, dampings) on the whole logs over the grid of gains."""
+
+    Kp: FloatArray
+    damping: FloatArray
+    rmse_rad: FloatArray
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """What tuning found.
+
+    Attributes
+    ----------
+    judge : "reference", "smoothed", or "none" where nothing could be judged.
+    candidates : with 3/3 first; without errors (NaN) where nothing could be judged.
+    recommended : one of them that has constant gains.
+    reasons : why.
+    halves : best gains of the first and of the second halves.
+    surface : None where nothing could be judged.
+    smoothed : of each piece, None where it is too short.
+    noise : densities of the sensor with the accelerometer's in motion.
+    offset_rad : what was added to each piece's reference.
+    judged_s : length of what was judged, `block_s` that of the bootstrap's blocks.
+    """
+
+    judge: str
+    candidates: tuple[Candidate, ...]
+    recommended: Candidate
+    reasons: tuple[str, ...]
+    halves: tuple[Mahony, Mahony] | None
+    surface: Surface | None
+    smoothed: tuple[Smoothed | None, ...]
+    noise: Noise
+    offset_rad: tuple[float, ...]
+    judged_s: float
+    block_s: float
+
+
+@njit(cache=True, nogil=True)
+def _squares(
+    t: FloatArray,
+    phi_acc: FloatArray,
+    w: FloatArray,
+    target: FloatArray,
+    start: float,
+    gains: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Adds the sums of squared errors to out (gains,); NaN targets do not count."""
+    turn = 2.0 * math.pi
+    for j in range(len(gains)):
+        Kp, Ki = gains[j, 0], gains[j, 1]
+        phi, integral, before, total = start, 0.0, t[0], 0.0
+        for k in range(len(t)):
+            dt = t[k] - before
+            before = t[k]
+            phi, integral = advance(phi, integral, phi_acc[k], w[k], dt, Kp, Ki)
+            d = phi - target[k]
+            if d == d:
+                d -= turn * np.rint(d / turn)
+                total += d * d
+        out[j] += total
+
+
+@dataclass(frozen=True)
+class _Judged:
+    """Readings with the angle that they are judged by, NaN where they are not, and the filter's start."""
+
+    t_s: FloatArray
+    phi_acc_rad: FloatArray
+    rate_radps: FloatArray
+    target: FloatArray
+    start: MahonyState
+
+    def halves(self) -> tuple[_Judged, _Judged]:
+        """Two logs, each with half of what is judged."""
+        known = np.flatnonzero(np.isfinite(self.target))
+        m = int(known[len(known) // 2])
+        return self._part(slice(0, m)), self._part(slice(m, None))
+
+    def _part(self, rows: slice) -> _Judged:
+        target = self.target[rows]
+        first = float(target[0]) if math.isfinite(target[0]) else float(self.phi_acc_rad[rows][0])
+        return _Judged(
+            self.t_s[rows], self.phi_acc_rad[rows], self.rate_radps[rows], target, MahonyState(first)
+        )
+
+
+def _sums(judged: Sequence[_Judged], gains: Sequence[Mahony]) -> FloatArray:
+    pairs = np.array([(g.Kp, g.Ki) for g in gains])
+    out = np.zeros(len(gains))
+    for one in judged:
+        _squares(one.t_s, one.phi_acc_rad, one.rate_radps, one.target, one.start.phi_rad, pairs, out)
+    return np.where(np.isfinite(out), out, np.inf)
+
+
+def _pick(gains: Sequence[Mahony], errors: FloatArray) -> Mahony:
+    """The best damped of the pairs whose error is nearly the least, up to critical damping."""
+    near = np.flatnonzero(errors <= _ALIKE**2 * errors.min()).tolist()
+    rank = {k: min(round(gains[k].Kp / (2.0 * math.sqrt(gains[k].Ki)), 3), 1.0) for k in near}
+    most = max(rank.values())
+    return gains[min((k for k in near if rank[k] == most), key=lambda k: float(errors[k]))]
+
+
+def _search(judged: Sequence[_Judged], dt_s: float) -> tuple[Mahony, Surface]:
+    """Best gains of these logs, and the errors over the grid."""
+    K, Z = gain_grid(dt_s)
+    tried = [damped(k, z) for k in K.tolist() for z in Z.tolist()]
+    sums = _sums(judged, tried)
+    count = sum(int(np.isfinite(one.target).sum()) for one in judged)
+    surface = Surface(K, Z, np.sqrt(sums / count).reshape(len(K), len(Z)))
+    step_k, step_z = float(K[1] / K[0]), float(Z[1] / Z[0])
+    for _ in range(3):
+        step_k, step_z = math.sqrt(step_k), math.sqrt(step_z)
+        at = tried[int(np.argmin(sums))]
+        zeta = at.Kp / (2.0 * math.sqrt(at.Ki))
+        more = [
+            damped(
+                float(np.clip(at.Kp * step_k**i, K[0], K[-1])),
+                float(np.clip(zeta * step_z**j, Z[0], Z[-1])),
+            )
+            for i in (-1, 0, 1)
+            for j in (-1, 0, 1)
+            if (i, j) != (0, 0)
+        ]
+        tried += more
+        sums = np.concatenate([sums, _sums(judged, more)])
+    return _pick(tried, sums), surface
+
+
+def _errors(judged: _Judged, gains: Mahony) -> FloatArray:
+    one = judged
+    return wrapped(filter_log(gains, one.t_s, one.phi_acc_rad, one.rate_radps, one.start)[0] - one.target)
+
+
+def _errors_from_prior(judged: _Judged, noise: Noise, prior: Prior) -> FloatArray:
+    run = filter_from_prior(noise, prior, judged.t_s, judged.phi_acc_rad, judged.rate_radps, judged.start)
+    return wrapped(run.phi_rad - judged.target)
+
+
+def _smoothed(piece: Piece, sensor: Noise) -> Smoothed | None:
+    if piece.t_s[-1] - piece.t_s[0] < SHORTEST_S:
+        return None
+    return smooth_log(piece.t_s, piece.phi_acc_rad, piece.rate_radps, sensor.gyro, sensor.walk)
+
+
+def _astray(own: Smoothed, sensor: Noise) -> bool:
+    """Whether the smoothed angle is the accelerometer's alone, or the rate worse than any gyroscope's."""
+    return own.gyro_noise * BLOCK_S > own.accel_noise or own.gyro_noise > _WORSE * sensor.gyro
+
+
+def _offset(piece: Piece, smoothed: Smoothed | None) -> float:
+    """What brings the reference to the accelerometer's zero: how the sensor is mounted."""
+    assert piece.reference_rad is not None
+    own = piece.phi_acc_rad if smoothed is None else smoothed.phi_rad
+    apart = own - piece.reference_rad
+    known = apart[np.isfinite(apart)]
+    middle = math.atan2(float(np.sin(known).mean()), float(np.cos(known).mean()))
+    return middle + float(wrapped(known - middle).mean())
+
+
+def tune(pieces: Sequence[Piece], sensor: Noise, prior: Prior | None = None) -> Tuning:
+    """Gains for these logs, and whether they are worth more than 3/3.
+
+    Parameters
+    ----------
+    pieces : logs of the same rate; where one has a reference, only those that have one are judged.
+    sensor : densities of the sensor; the accelerometer's is that of a log too short to tell its own.
+    prior : of the start in "from a prior".
+
+    Raises `BadInputError` for no logs at all.
+    """
+    if not pieces:
+        raise BadInputError("logs: found none, expected at least one")
+    smoothed = tuple(_smoothed(piece, sensor) for piece in pieces)
+    spans = [len(piece.t_s) for piece in pieces]
+    known = [(n, s.accel_noise) for n, s in zip(spans, smoothed, strict=True) if s is not None]
+    accel = sensor.accel
+    if known:
+        accel = math.sqrt(sum(n * a * a for n, a in known) / sum(n for n, _ in known))
+    noise = Noise(sensor.gyro, sensor.walk, accel)
+    dt_s = float(np.median([(p.t_s[-1] - p.t_s[0]) / max(len(p.t_s) - 1, 1) for p in pieces]))
+    judge = "reference" if any(p.reference_rad is not None for p in pieces) else "smoothed"
+    judged, offsets, reasons = [], [], []
+    for piece, own in zip(pieces, smoothed, strict=True):
+        offset = 0.0
+        target: FloatArray | None = None if own is None else own.phi_rad
+        if judge == "reference":
+            target = None
+            if piece.reference_rad is not None and int(np.isfinite(piece.reference_rad).sum()) >= 20:
+                offset = _offset(piece, own)
+                target = piece.reference_rad + offset
+        elif own is not None and not piece.in_plane:
+            reasons.append(f"{piece.source}: the sensor tilts out of the plane, so that -gz is not its rate.")
+            target = None
+        elif own is not None and _astray(own, sensor):
+            reasons.append(
+                f"{piece.source}: the rate errs by {math.degrees(own.gyro_noise):.2g} deg/s/sqrt(Hz), so "
+                "that it is not the rate of the angle, and the log cannot judge itself."
+            )
+            target = None
+        offsets.append(offset)
+        if target is not None:
+            arrays = (piece.t_s, piece.phi_acc_rad, piece.rate_radps, target)
+            t, phi_acc, w, known_angle = (np.ascontiguousarray(x, dtype=np.float64) for x in arrays)
+            judged.append(_Judged(t, phi_acc, w, known_angle, MahonyState(float(phi_acc[0]))))
+    judged_s = sum(float(np.isfinite(one.target).sum()) for one in judged) * dt_s
+    if judged_s < _LEAST_JUDGED_S:
+        reasons.append(
+            f"There are {judged_s:.3g} s to judge gains by, expected at least {_LEAST_JUDGED_S:g} s: "
+            "3/3 is kept."
+        )
+        nan = math.nan
+        unknown = tuple(
+            Candidate(name, gains, nan, nan, nan, nan, nan, nan, nan, nan)
+            for name, gains in (("3/3", THREE), ("riccati", riccati(noise, dt_s)))
+        )
+        return Tuning(
+            judge="none",
+            candidates=unknown,
+            recommended=unknown[0],
+            reasons=tuple(reasons),
+            halves=None,
+            surface=None,
+            smoothed=smoothed,
+            noise=noise,
+            offset_rad=tuple(offsets),
+            judged_s=judged_s,
+            block_s=nan,
+        )
+    tuned, surface = _search(judged, dt_s)
+    firsts, seconds = zip(*(one.halves() for one in judged), strict=True)
+    of_first, of_second = _search(firsts, dt_s)[0], _search(seconds, dt_s)[0]
+    settled = riccati(noise, dt_s)
+    start = prior or Prior()
+    parts = [*firsts, *seconds]
+
+    def plain(name: str, gains: Mahony) -> Row:
+        whole = rms([_errors(one, gains) for one in judged])
+        return Row(name, gains, [_errors(one, gains) for one in parts], whole)
+
+    def started(name: str, gains: Mahony, density: Noise) -> Row:
+        whole = rms([_errors_from_prior(one, density, start) for one in judged])
+        return Row(name, gains, [_errors_from_prior(one, density, start) for one in parts], whole)
+
+    crossed = [_errors(one, of_second) for one in firsts] + [_errors(one, of_first) for one in seconds]
+    candidates, block_s = compared(
+        [
+            plain("3/3", THREE),
+            Row("tuned", tuned, crossed, rms([_errors(one, tuned) for one in judged])),
+            plain("riccati", settled),
+            started("3/3 from a prior", THREE, equivalent_noise(THREE, accel)),
+            started("riccati from a prior", settled, noise),
+        ],
+        dt_s,
+    )
+    recommended, why = _recommended(candidates, judge)
+    return Tuning(
+        judge,
+        candidates,
+        recommended,
+        (*reasons, *why),
+        (of_first, of_second),
+        surface,
+        smoothed,
+        noise,
+        tuple(offsets),
+        judged_s,
+        block_s,
+    )
+
+
+def _recommended(candidates: Sequence[Candidate], judge: str) -> tuple[Candidate, tuple[str, ...]]:
+    """The first of tuned and riccati that wins, else 3/3, and why."""
+    by = "the reference" if judge == "reference" else "the log's own smoothed angle"
+    base = candidates[0]
+    said: list[str] = []
+    for one in candidates[1:3]:
+        held = " on parts that it was not tuned on" if one.name == "tuned" else ""
+        errors = (
+            f"By {by} {one.name} leaves {math.degrees(one.rmse_rad):.3f} deg{held}, 3/3 "
+            f"{math.degrees(base.rmse_rad):.3f} deg; it is better with {100.0 * one.confidence:.3g} %"
+        )
+        if one.wins:
+            return one, (*said, f"{errors}, and recommended.")
+        said.append(f"{errors}, expected {100.0 * CONFIDENCE:g} %.")
+    return base, (*said, "3/3 is kept.")

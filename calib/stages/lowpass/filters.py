@@ -1,0 +1,915 @@
+"""Filters of sampled signals: design, response, rounding, choice, and the signals they are chosen for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import solve_discrete_lyapunov
+from scipy.ndimage import median_filter
+from scipy.optimize import brentq
+from scipy.signal import detrend, savgol_filter, sosfilt, welch
+
+from calib.core.arrays import BoolArray, ComplexArray, FloatArray
+from calib.core.errors import BadInputError
+
+# ----------------------------------------------------------------------
+# The first-order low-pass of the camera's positions (2.2.2): 1 Hz at 60 Hz.
+#
+# The analogue filter 1 / (1 + s / w) becomes, by the bilinear transform with its cut-off kept
+# (K = tan(pi f / rate)),
+#
+#     y_k = b0 (x_k + x_(k-1)) - a1 y_(k-1),   b0 = K / (1 + K),   a1 = (K - 1) / (K + 1).
+#
+# b0 = 0.04979798 and a1 = -0.90040404 for 1 Hz at 60 Hz. The source does not print the order; with
+# this one slow motion arrives 1 / (2 pi f) = 0.159 s late.
+
+
+@dataclass(frozen=True)
+class LowPass:
+    """Cut-off and sampling rate [Hz].
+
+    Raises `BadInputError` for a cut-off outside (0, rate / 2).
+    """
+
+    cutoff_hz: float = 1.0
+    rate_hz: float = 60.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.cutoff_hz < 0.5 * self.rate_hz < math.inf:
+            raise BadInputError(
+                f"low-pass: found a cut-off of {self.cutoff_hz:g} Hz at {self.rate_hz:g} Hz, "
+                "expected one between zero and half the rate"
+            )
+
+
+@dataclass(frozen=True)
+class LowPassState:
+    """Input and output of the sample before."""
+
+    x1: float
+    y1: float
+
+
+@lru_cache(maxsize=64)
+def coefficients(parameters: LowPass) -> tuple[float, float]:
+    """b0 and a1."""
+    K = math.tan(math.pi * parameters.cutoff_hz / parameters.rate_hz)
+    return K / (1.0 + K), (K - 1.0) / (K + 1.0)
+
+
+def settled(value: float) -> LowPassState:
+    """State after `value` has been the input for ever, so that a log starts without a transient."""
+    return LowPassState(value, value)
+
+
+def step(parameters: LowPass, state: LowPassState, sample: float) -> LowPassState:
+    """State after one sample; its `y1` is the output."""
+    b0, a1 = coefficients(parameters)
+    return LowPassState(sample, b0 * (sample + state.x1) - a1 * state.y1)
+
+
+# ----------------------------------------------------------------------
+# Samples with time stamps as the firmware sees them: one value per tick.
+#
+# The firmware counts ticks and does not look at clocks: a tick uses the newest sample, and where the camera
+# found nothing the last one is held. So samples are put on a uniform grid: a sample belongs to the tick
+# that is
+# nearest to its time stamp (jitter below half a tick changes nothing), of several in one tick the
+# last counts, and a tick without a sample holds the one before. After a gap longer than `LONGEST_HOLD_S`
+# a new piece begins, filtered from rest, because what was held so long is no position any more.
+
+LONGEST_HOLD_S = 1.0
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Ticks without a long gap.
+
+    Attributes
+    ----------
+    t_s : (n,) times of the ticks [s], `1 / rate` apart.
+    values : (n, d) one sample each.
+    held : (n,) ticks that repeat the sample before.
+    """
+
+    t_s: FloatArray
+    values: FloatArray
+    held: BoolArray
+
+
+@dataclass(frozen=True)
+class Ticks:
+    """A signal on ticks.
+
+    Attributes
+    ----------
+    rate_hz : ticks per second.
+    pieces : in order of time, each with at least one tick.
+    dropped : samples that shared a tick with a later one.
+    """
+
+    rate_hz: float
+    pieces: tuple[Piece, ...]
+    dropped: int
+
+    @property
+    def held(self) -> int:
+        """Ticks that repeat the sample before."""
+        return sum(int(piece.held.sum()) for piece in self.pieces)
+
+    @property
+    def longest(self) -> Piece:
+        """The longest piece, of equal ones the first."""
+        return max(self.pieces, key=lambda piece: len(piece.t_s))
+
+
+def sampling_rate_hz(t_s: FloatArray) -> float:
+    """Samples per second from the median of the steps of time (n,) [s]; equal stamps are passed over.
+
+    Raises `BadInputError` where there are not two different times.
+    """
+    steps = np.diff(t_s)
+    steps = steps[steps > 0.0]
+    if len(steps) == 0:
+        raise BadInputError("has no two samples at different times, expected a series")
+    return float(1.0 / np.median(steps))
+
+
+def on_ticks(t_s: FloatArray, values: FloatArray, rate_hz: float) -> Ticks:
+    """The samples (n, d), taken at times (n,) that do not run backwards, one per tick.
+
+    Raises `BadInputError` for no samples.
+    """
+    if len(t_s) == 0:
+        raise BadInputError("has no samples")
+    breaks = np.nonzero(np.diff(t_s) > max(LONGEST_HOLD_S, 2.0 / rate_hz))[0] + 1
+    pieces, dropped = [], 0
+    for first, last in zip([0, *breaks.tolist()], [*breaks.tolist(), len(t_s)], strict=True):
+        k = np.floor(_phase(t_s[first:last], rate_hz) + 0.5).astype(np.int64)
+        k -= k[0]
+        newest = np.nonzero(np.append(np.diff(k) > 0, True))[0]
+        ticks = np.arange(k[-1] + 1)
+        source = np.searchsorted(k[newest], ticks, side="right") - 1
+        taken = newest[source]
+        pieces.append(
+            Piece(t_s[first] + ticks / rate_hz, values[first:last][taken], np.asarray(k[taken] != ticks))
+        )
+        dropped += len(k) - len(newest)
+    return Ticks(rate_hz, tuple(pieces), dropped)
+
+
+def _phase(t_s: FloatArray, rate_hz: float) -> FloatArray:
+    """Times in ticks, shifted so that most stamps lie near whole numbers.
+
+    A clock that is a little off the rate drifts through the grid; then a tick is held or a sample
+    dropped now and then, as in the firmware.
+    """
+    phase = (t_s - t_s[0]) * rate_hz
+    early = phase[: max(1, min(len(phase), 64))]
+    turn = np.angle(np.mean(np.exp(2j * np.pi * early))) / (2.0 * np.pi)
+    return np.asarray(phase - turn)
+
+
+# ----------------------------------------------------------------------
+# Low-pass filters in second-order sections, with coefficients that binary32 holds exactly.
+#
+# The analogue prototype has its poles p_i normalised so that |H| = 1 / sqrt(2) at 1 rad/s. The bilinear
+# transform with the cut-off kept, s = (1 / K) (z - 1) / (z + 1) and K = tan(pi f / rate), gives
+#
+#     z_i = (1 + K p_i) / (1 - K p_i)
+#
+# and as many zeros at z = -1. A pair of poles makes a section
+#
+#     H(z) = g (1 + 2 z^-1 + z^-2) / (1 + a1 z^-1 + a2 z^-2),   g = (1 + a1 + a2) / 4,
+#
+# a single one g (1 + z^-1) / (1 + a1 z^-1) with g = (1 + a1) / 2. First a1 and a2 are rounded, on a grid
+# on which g is a binary32, too; then g follows from them. So H(1) is 1 and not nearly 1, the zeros stay
+# at -1, and a position at rest is reported where it is.
+#
+# Families: Butterworth (flattest gain), Bessel (flattest delay, Thomson 1949), and critical: n equal real
+# poles -1 / sqrt(2^(1/n) - 1), which never overshoot.
+
+FAMILIES = ("butterworth", "bessel", "critical")
+LARGEST_ORDER = 8
+
+_FINEST, _COARSEST = 30, 22
+"""Grids 2^-k that a1 and a2 are rounded to; on the coarsest g is a binary32 for every stable section."""
+
+
+@dataclass(frozen=True)
+class Design:
+    """What a person chooses: -3 dB cut-off and sampling rate [Hz], order, family.
+
+    Raises `BadInputError` for a cut-off outside (0, rate / 2), an order outside 1 .. 8, and an unknown
+    family.
+    """
+
+    cutoff_hz: float = 1.0
+    rate_hz: float = 60.0
+    order: int = 1
+    family: str = "butterworth"
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.cutoff_hz < 0.5 * self.rate_hz < math.inf:
+            raise BadInputError(
+                f"low-pass: the cut-off is {self.cutoff_hz:g} Hz at {self.rate_hz:g} samples/s, expected "
+                f"one between zero and half the rate, {0.5 * self.rate_hz:g} Hz"
+            )
+        if not 1 <= self.order <= LARGEST_ORDER:
+            raise BadInputError(f"low-pass: the order is {self.order}, expected 1 to {LARGEST_ORDER}")
+        if self.family not in FAMILIES:
+            raise BadInputError(
+                f"low-pass: the family is {self.family!r}, expected one of {', '.join(FAMILIES)}"
+            )
+
+
+@dataclass(frozen=True)
+class Filter:
+    """A designed filter.
+
+    Attributes
+    ----------
+    design : what was asked for.
+    exact : (k, 6) sections b0, b1, b2, 1, a1, a2 in double precision.
+    sections : (k, 6) the same with values that binary32 holds exactly; each has a gain of exactly 1 at
+        zero frequency. Slow poles come first; of an odd order the first section has b2 = a2 = 0.
+    """
+
+    design: Design
+    exact: FloatArray = field(repr=False)
+    sections: FloatArray = field(repr=False)
+
+    @property
+    def stable(self) -> bool:
+        """Whether the rounded sections are: |a2| < 1 and |a1| < 1 + a2 (Jury), exactly."""
+        a1, a2 = self.sections[:, 4], self.sections[:, 5]
+        return bool(np.all(np.abs(a2) < 1.0) and np.all(np.abs(a1) < 1.0 + a2))
+
+    @property
+    def pole_radius(self) -> float:
+        """Largest modulus of the rounded sections' poles."""
+        return float(np.abs(digital_poles(self.sections)).max())
+
+
+def analogue_poles(family: str, order: int) -> ComplexArray:
+    """Poles (order,) of the prototype with |H| = 1 / sqrt(2) at 1 rad/s."""
+    if family == "butterworth":
+        angle = np.pi * (2.0 * np.arange(order) + order + 1.0) / (2.0 * order)
+        return np.asarray(np.exp(1j * angle))
+    if family == "critical":
+        return np.full(order, -1.0 / math.sqrt(math.expm1(math.log(2.0) / order)), dtype=np.complex128)
+    # Reverse Bessel polynomial: theta_n(s) = sum of (2n - k)! / (2^(n-k) k! (n-k)!) s^k.
+    rising = [
+        math.factorial(2 * order - k) // (2 ** (order - k) * math.factorial(k) * math.factorial(order - k))
+        for k in range(order + 1)
+    ]
+    poles = np.roots(np.array(rising[::-1], dtype=np.float64)).astype(np.complex128)
+    return np.asarray(poles / _half_power_frequency(poles), dtype=np.complex128)
+
+
+def _half_power_frequency(poles: ComplexArray) -> float:
+    """Frequency [rad/s] at which an all-pole filter of unit gain has half its power, by bisection."""
+
+    def power(w: float) -> float:
+        return float(np.prod(np.abs(poles) ** 2 / np.abs(1j * w - poles) ** 2))
+
+    low, high = 0.0, 2.0 * float(np.abs(poles).max())
+    for _ in range(200):
+        middle = 0.5 * (low + high)
+        if not low < middle < high:
+            break
+        low, high = (middle, high) if power(middle) > 0.5 else (low, middle)
+    return 0.5 * (low + high)
+
+
+def digital_poles(sections: FloatArray) -> ComplexArray:
+    """Poles of sections (k, 6) in the z plane, two of each, one of a section with a2 = 0."""
+    found: list[ComplexArray] = []
+    for section in sections:
+        last = 6 if section[5] != 0.0 else 5
+        found.append(np.asarray(np.roots(section[3:last]), dtype=np.complex128))
+    return np.concatenate(found)
+
+
+def _denominators(design: Design) -> list[tuple[float, float | None]]:
+    """a1 and a2 of each section, a2 None for a single pole; slow poles first."""
+    K = math.tan(math.pi * design.cutoff_hz / design.rate_hz)
+    poles = analogue_poles(design.family, design.order)
+    upper = poles[poles.imag > 1e-9]
+    real = poles[np.abs(poles.imag) <= 1e-9].real
+    pairs = [
+        (float(-2.0 * (1.0 - w) / (1.0 - q + w)), float((1.0 + q + w) / (1.0 - q + w)))
+        for q, w in ((2.0 * K * p.real, K * K * abs(p) ** 2) for p in upper[np.argsort(-upper.real)])
+    ]
+    single = [(1.0 + K * float(p)) / (1.0 - K * float(p)) for p in real]
+    pairs += [
+        (-(single[i] + single[i + 1]), single[i] * single[i + 1])
+        for i in range(len(single) % 2, len(single), 2)
+    ]
+    first: list[tuple[float, float | None]] = [(-single[0], None)] if len(single) % 2 else []
+    return first + pairs
+
+
+def _section(a1: float, a2: float | None) -> list[float]:
+    if a2 is None:
+        g = 0.5 * (1.0 + a1)
+        return [g, g, 0.0, 1.0, a1, 0.0]
+    g = 0.25 * (1.0 + a1 + a2)
+    return [g, 2.0 * g, g, 1.0, a1, a2]
+
+
+def _rounded_section(a1: float, a2: float | None) -> list[float]:
+    """The section whose every coefficient is a binary32; sums of multiples of 2^-30 are exact here."""
+    section: list[float] = []
+    for places in range(_FINEST, _COARSEST - 1, -1):
+        section = _section(_on_grid(a1, places), None if a2 is None else _on_grid(a2, places))
+        if float(np.float32(section[0])) == section[0]:
+            break
+    return section
+
+
+def _on_grid(value: float, places: int) -> float:
+    return float(np.float32(math.ldexp(round(math.ldexp(value, places)), -places)))
+
+
+def design_lowpass(design: Design) -> Filter:
+    """The filter, exact and rounded.
+
+    Raises `BadInputError` where no rounded filter is stable: the cut-off is too low for the rate.
+    """
+    denominators = _denominators(design)
+    out = Filter(
+        design,
+        np.array([_section(a1, a2) for a1, a2 in denominators]),
+        np.array([_rounded_section(a1, a2) for a1, a2 in denominators]),
+    )
+    if not out.stable:
+        raise BadInputError(
+            f"low-pass: with coefficients of single precision a cut-off of {design.cutoff_hz:g} Hz at "
+            f"{design.rate_hz:g} samples/s and order {design.order} is not stable, expected a higher "
+            "cut-off, a lower rate or a lower order"
+        )
+    return out
+
+
+# ----------------------------------------------------------------------
+# What a low-pass does to a signal: gain, delay, step response, noise, and filtering itself.
+#
+# All sections (k, 6) have a gain of 1 at zero frequency and their zeros at z = -1, as those of
+# `calib.stages.lowpass.filters`. A numerator (1 + z^-1)^n then delays every frequency by n / 2 samples,
+# and with
+# D(z) = 1 + a1 z^-1 + a2 z^-2 the group delay of a section is
+#
+#     tau = n / 2 - Re[ (a1 z^-1 + 2 a2 z^-2) / D(z) ],   n / 2 - (a1 + 2 a2) / (1 + a1 + a2) at zero
+# frequency.
+#
+# Signals are filtered in the transposed direct form II,
+#
+#     y = b0 x + s1,   s1' = b1 x - a1 y + s2,   s2' = b2 x - a2 y,
+#
+# started from s1 = (1 - b0) x_0, s2 = (b2 - a2) x_0 as if x_0 had been there for ever: no transient.
+
+_FLOOR_DB = -400.0
+
+
+@dataclass(frozen=True)
+class StepResponse:
+    """Answer to a step from 0 to 1 at t = 0.
+
+    Attributes
+    ----------
+    t_s, values : (n,) samples; the first is the one with the step.
+    rise_s : time from 10 % to 90 %, between samples by interpolation.
+    settling_s : after this the answer stays within 2 %.
+    overshoot : largest value beyond 1.
+    """
+
+    t_s: FloatArray
+    values: FloatArray
+    rise_s: float
+    settling_s: float
+    overshoot: float
+
+
+def _z(f_hz: FloatArray, rate_hz: float) -> npt.NDArray[np.complex128]:
+    return np.asarray(np.exp(-2j * np.pi * np.asarray(f_hz) / rate_hz))
+
+
+def frequency_response(sections: FloatArray, f_hz: FloatArray, rate_hz: float) -> npt.NDArray[np.complex128]:
+    """H (n,) at frequencies (n,) [Hz] of sections (k, 6)."""
+    z = _z(f_hz, rate_hz)
+    H = np.ones(z.shape, dtype=np.complex128)
+    for b0, b1, b2, _, a1, a2 in sections:
+        H *= (b0 + z * (b1 + z * b2)) / (1.0 + z * (a1 + z * a2))
+    return H
+
+
+def decibels(H: npt.NDArray[np.complex128] | FloatArray) -> FloatArray:
+    """20 log10 |H|, at least -400."""
+    return np.asarray(20.0 * np.log10(np.maximum(np.abs(H), 10.0 ** (_FLOOR_DB / 20.0))))
+
+
+def group_delay_s(sections: FloatArray, f_hz: FloatArray, rate_hz: float) -> FloatArray:
+    """Group delay (n,) [s] at frequencies (n,) [Hz]."""
+    z = _z(f_hz, rate_hz)
+    samples = np.zeros(z.shape)
+    for _, _, b2, _, a1, a2 in sections:
+        samples += (1.0 if b2 != 0.0 else 0.5) - np.real(z * (a1 + 2.0 * z * a2) / (1.0 + z * (a1 + z * a2)))
+    return np.asarray(samples / rate_hz)
+
+
+def dc_delay_s(sections: FloatArray, rate_hz: float) -> float:
+    """Delay [s] of slow motion: the group delay at zero frequency."""
+    return float(group_delay_s(sections, np.zeros(1), rate_hz)[0])
+
+
+def cutoff_hz(sections: FloatArray, rate_hz: float) -> float:
+    """Frequency [Hz] at which the power is halved."""
+
+    def above_half(f: float) -> float:
+        return float(np.abs(frequency_response(sections, np.array([f]), rate_hz)[0])) ** 2 - 0.5
+
+    return float(brentq(above_half, 0.0, 0.5 * rate_hz, xtol=1e-15 * rate_hz, rtol=1e-12))
+
+
+def settled_state(sections: FloatArray, first: FloatArray) -> FloatArray:
+    """State (k, 2, ...) after `first` (...) has been the input for ever."""
+    state = np.stack([1.0 - sections[:, 0], sections[:, 2] - sections[:, 5]], axis=1)
+    return np.asarray(state.reshape(*state.shape, *([1] * np.ndim(first))) * first)
+
+
+def filter_signal(sections: FloatArray, x: FloatArray) -> FloatArray:
+    """Filtered signal (n, ...) along the first axis, started without a transient; `x` has no NaN."""
+    if len(x) == 0:
+        return np.array(x, dtype=np.float64)
+    y, _ = sosfilt(sections, x, axis=0, zi=settled_state(sections, np.asarray(x[0])))
+    return np.asarray(y, dtype=np.float64)
+
+
+def step_response(sections: FloatArray, rate_hz: float) -> StepResponse:
+    """Answer to a step, as long as it takes to settle to a thousandth."""
+    delay = dc_delay_s(sections, rate_hz) * rate_hz
+    count = int(min(max(8.0 * delay, 16.0) + 1, 4_000_000))
+    while True:
+        y = np.asarray(sosfilt(sections, np.ones(count)), dtype=np.float64)
+        outside = np.nonzero(np.abs(y - 1.0) > 1e-3)[0]
+        if len(outside) == 0 or outside[-1] < 0.9 * count or count > 2_000_000:
+            break
+        count *= 2
+    t = np.arange(count) / rate_hz
+    late = np.nonzero(np.abs(y - 1.0) > 0.02)[0]
+    return StepResponse(
+        t,
+        y,
+        _crossing_s(t, y, 0.9, rate_hz) - _crossing_s(t, y, 0.1, rate_hz),
+        0.0 if len(late) == 0 else float((late[-1] + 1) / rate_hz),
+        max(0.0, float(y.max()) - 1.0),
+    )
+
+
+def _crossing_s(t_s: FloatArray, y: FloatArray, level: float, rate_hz: float) -> float:
+    """First time [s] at which y reaches a level; before the first sample it was 0."""
+    i = int(np.argmax(y >= level))
+    before = 0.0 if i == 0 else float(y[i - 1])
+    return float(t_s[i]) - (float(y[i]) - level) / (float(y[i]) - before) / rate_hz
+
+
+def noise_gain(sections: FloatArray) -> float:
+    """Variance of the output over that of a white input: sum of the squared impulse response.
+
+    The stationary covariance P = A P A' + B B' of the cascade's state gives C P C' + D^2.
+    """
+    A, B, C, D = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.ones((1, 1))
+    for b0, b1, b2, _, a1, a2 in sections:
+        second = b2 != 0.0
+        n = 2 if second else 1
+        As = np.array([[-a1, 1.0], [-a2, 0.0]])[:n, :n]
+        Bs = np.array([[b1 - a1 * b0], [b2 - a2 * b0]])[:n]
+        Cs = np.array([[1.0, 0.0]])[:, :n]
+        A = np.block([[A, np.zeros((len(A), n))], [Bs @ C, As]])
+        B = np.vstack([B, Bs @ D])
+        C = np.hstack([b0 * C, Cs])
+        D = b0 * D
+    P = solve_discrete_lyapunov(A, B @ B.T)
+    return float((C @ P @ C.T + D @ D.T)[0, 0])
+
+
+# ----------------------------------------------------------------------
+# Motion and jitter of a logged position, told apart by their spectrum.
+#
+# Motion of a heavy thing is slow, quantisation and tracking errors are spread over all frequencies. So
+# the power density (Welch 1967) falls from the motion to a floor. Outliers are no jitter: samples beyond
+# six
+# standard deviations from the median of five (Hampel 1974) are replaced by it first. Of the segments'
+# densities the mean holds motion however short it was, and the median P counts disturbances little.
+# The motion ends at the last frequency f_m of the lower half of the band at which the mean is above six
+# times its own floor. The jitter has the density
+#
+#     N(f) = F below f_m (motion hides it there),   N(f) = P(f) above,
+#
+# with F the median of P over the upper half. A filter H leaves the jitter sigma^2 = sum of N |H|^2 df.
+# Where motion reaches a tenth of the rate, F may be its tail and not the jitter's: the spectrum is then
+# called not flat, and a log at rest is needed.
+
+FEWEST = 64
+"""Ticks below which nothing is said of a spectrum."""
+
+_SEGMENT_S = 8.0
+_FLOOR_TIMES = 6.0
+"""The pixel grid's sawtooth stands up to three times above the floor and is jitter."""
+_FLAT = 4.0
+_HIGHEST_MOTION = 0.1
+"""Parts of the rate. A random walk, which has no floor, seems to end at 0.12."""
+_OUTLIER_SIGMAS = 6.0
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Power density of one coordinate, one-sided, in squared units of the signal per Hz.
+
+    Attributes
+    ----------
+    rate_hz : samples per second.
+    f_hz : (n,) frequencies [Hz], without zero.
+    jitter_density, motion_density : (n,) of each; the sum over all is about the signal's.
+    floor : density of the jitter below the motion.
+    motion_hz : where the motion ends, 0 without motion.
+    flat : whether the upper half of the band looks like jitter alone.
+    outliers : samples that were replaced.
+    """
+
+    rate_hz: float
+    f_hz: FloatArray
+    jitter_density: FloatArray
+    motion_density: FloatArray
+    floor: float
+    motion_hz: float
+    flat: bool
+    outliers: int = 0
+
+    @property
+    def jitter(self) -> float:
+        """Standard deviation of the jitter, unfiltered."""
+        return math.sqrt(_jitter_power(self, np.ones(len(self.f_hz)), 1.0))
+
+
+def spectrum(x: FloatArray, rate_hz: float) -> Spectrum:
+    """Spectrum of a coordinate (n,) on ticks.
+
+    Raises `BadInputError` for fewer than 64 ticks.
+    """
+    if len(x) < FEWEST:
+        raise BadInputError(f"has {len(x)} camera ticks without a long gap, expected at least {FEWEST}")
+    x, outliers = _without_outliers(x)
+    # With at least four segments a median is one; half-overlapping ones of n / 2.5 make four.
+    segment = int(min(max(32, round(_SEGMENT_S * rate_hz)), 2048, len(x) / 2.5))
+    mean, median = _density(x, rate_hz, segment, "mean"), _density(x, rate_hz, segment, "median")
+    f = np.arange(1.0, len(mean) + 1.0) * (rate_hz / segment)
+    upper = f >= 0.25 * rate_hz
+    floor, floor_of_means = float(np.median(median[upper])), float(np.median(mean[upper]))
+    nothing = (1e-13 * float(np.abs(x).max())) ** 2
+    above = np.nonzero(_smoothed(mean[~upper]) > max(_FLOOR_TIMES * floor_of_means, nothing))[0]
+    end = int(above[-1]) + 1 if len(above) else 0
+    thirds = [float(np.mean(part)) for part in np.array_split(mean[upper], 3)]
+    flat = f[end - 1] <= _HIGHEST_MOTION * rate_hz if end else True
+    flat = flat and thirds[0] <= max(_FLAT * min(thirds[1:]), nothing)
+    moving = np.arange(len(f)) < end
+    return Spectrum(
+        rate_hz,
+        f,
+        np.asarray(np.where(moving, floor, median), dtype=np.float64),
+        np.asarray(np.where(moving, np.maximum(mean - floor_of_means, 0.0), 0.0)),
+        floor,
+        float(f[end - 1]) if end else 0.0,
+        bool(flat),
+        outliers,
+    )
+
+
+def _without_outliers(x: FloatArray) -> tuple[FloatArray, int]:
+    """The signal with the median of five in place of outliers, and how many there were.
+
+    The spread is taken from the 95 % quantile: on a pixel grid more than half of the differences are zero.
+    """
+    middle = np.asarray(median_filter(x, 5, mode="nearest"), dtype=np.float64)
+    away = np.abs(x - middle)
+    sigma = float(np.quantile(away, 0.95)) / 1.96
+    out = away > _OUTLIER_SIGMAS * sigma if sigma > 0.0 else np.zeros(len(x), dtype=np.bool_)
+    return np.where(out, middle, x), int(out.sum())
+
+
+def _density(x: FloatArray, rate_hz: float, segment: int, average: Literal["mean", "median"]) -> FloatArray:
+    _, P = welch(x - x.mean(), rate_hz, nperseg=segment, detrend=_without_line, average=average)
+    return np.asarray(P[1:-1], dtype=np.float64)
+
+
+def _without_line(segments: FloatArray) -> FloatArray:
+    return np.asarray(detrend(segments, axis=-1, type="linear"), dtype=np.float64)
+
+
+def _smoothed(P: FloatArray) -> FloatArray:
+    """Running geometric mean of three, so that one low value does not end the motion."""
+    tiny = np.finfo(np.float64).tiny
+    padded = np.log(np.maximum(np.pad(P, 1, mode="edge"), tiny))
+    return np.asarray(np.exp(np.convolve(padded, np.full(3, 1 / 3), mode="valid")))
+
+
+def jitter_after(of: Spectrum, sections: FloatArray) -> float:
+    """Standard deviation of the jitter behind a filter; the floor's part exactly, the rest by the sum."""
+    H2 = np.abs(frequency_response(sections, of.f_hz, of.rate_hz)) ** 2
+    return math.sqrt(_jitter_power(of, H2, noise_gain(sections)))
+
+
+def _jitter_power(of: Spectrum, H2: FloatArray, gain: float) -> float:
+    """Variance of the jitter; the floor's part exactly, so that filters narrower than a bin are right."""
+    df = float(of.f_hz[1] - of.f_hz[0])
+    excess = float(np.sum((of.jitter_density - of.floor) * H2)) * df
+    return max(of.floor * 0.5 * of.rate_hz * gain + excess, 0.0)
+
+
+def motion_lost(of: Spectrum, sections: FloatArray, delay_s: float) -> float:
+    """Share of the motion's amplitude (RMS) that is not passed unchanged with this delay.
+
+    sqrt( sum of M |H - exp(-i w delay)|^2 / sum of M ); 0 without motion.
+    """
+    M = of.motion_density
+    if not np.any(M > 0.0):
+        return 0.0
+    H = frequency_response(sections, of.f_hz, of.rate_hz)
+    error = np.abs(H - np.exp(-2j * np.pi * of.f_hz * delay_s)) ** 2
+    return math.sqrt(float(np.sum(M * error) / np.sum(M)))
+
+
+def grid_step(pixels: FloatArray) -> float:
+    """Step [px] that all values (n,) are multiples of, to 1e-6 px; 0 where there is none above 0.01 px."""
+    values = np.unique(np.round(pixels, 6))
+    steps = np.diff(values)
+    if len(steps) == 0:
+        return 0.0
+    step = float(steps.min())
+    whole = np.abs(values / step - np.round(values / step))
+    return step if step > 0.01 and float(whole.max()) < 1e-3 else 0.0
+
+
+def quantisation_hz(pixels: FloatArray, step_px: float, rate_hz: float) -> FloatArray:
+    """Frequencies (3,) of the sawtooth that rounding adds to motion: quartiles of |speed| / step.
+
+    A marker that moves at w px/s crosses w / step grid lines a second. The speed (n,) is that of a cubic
+    through half a second; what is slower than a line in two seconds is rest and not
+    counted; NaN where all is. Frequencies above half the rate are folded back.
+    """
+    window = max(5, int(0.5 * rate_hz) | 1)
+    if step_px <= 0.0 or len(pixels) < window:
+        return np.full(3, np.nan)
+    speed = np.abs(savgol_filter(pixels, window, 3, deriv=1, delta=1.0 / rate_hz))
+    lines = speed[speed > 0.5 * step_px] / step_px
+    if len(lines) == 0:
+        return np.full(3, np.nan)
+    f = np.percentile(lines, [25.0, 50.0, 75.0])
+    return np.asarray(np.abs((f + 0.5 * rate_hz) % rate_hz - 0.5 * rate_hz))
+
+
+# ----------------------------------------------------------------------
+# What sixteen-bit integers would do to a low-pass: its dead band and its cut-off.
+#
+# A section in the direct form I with Q15 samples and coefficients of q fractional bits (15 for a single
+# pole, 14 for a pair because |a1| reaches 2) computes
+#
+#     y_k = floor( (B0 x_k + B1 x_(k-1) + B2 x_(k-2) - A1 y_(k-1) - A2 y_(k-2)) / 2^q + 1/2 ).
+#
+# Every value y with |S (x - y)| < 1/2, S = 1 + a1 + a2, is a fixed point for the constant input x: the
+# output
+# sticks up to 1 / (2 S) steps away from it (Jackson 1970). The lower the cut-off against the rate, the
+# smaller S and the wider this dead band; S itself is known to 2^-q only, which moves the cut-off.
+# The same is measured in binary32 by letting the filter come to rest in that arithmetic.
+
+IntMatrix = npt.NDArray[np.int64]
+
+_STARTS = 16
+_LONGEST = 20_000
+
+
+@dataclass(frozen=True)
+class FixedPoint:
+    """A filter in sixteen-bit integers.
+
+    Attributes
+    ----------
+    usable : whether the rounded filter is stable and passes anything at all.
+    cutoff_hz : its cut-off, NaN where it is not usable.
+    dead_band : bound on how far from a constant input the output may stick, in steps of the samples.
+    stuck : how far it did stick when it was run, in steps.
+    """
+
+    usable: bool
+    cutoff_hz: float
+    dead_band: float
+    stuck: float
+
+
+def _integers(section: FloatArray) -> tuple[list[int], int]:
+    """B0, B1, B2, A1, A2 with B0 + B1 + B2 = 2^q + A1 + A2, and q."""
+    pair = section[5] != 0.0
+    q = 14 if pair else 15
+    A1, A2 = (round(math.ldexp(float(a), q)) for a in section[4:])
+    total = (1 << q) + A1 + A2
+    side = round(total / 4) if pair else total // 2
+    return [side, total - 2 * side if pair else total - side, side if pair else 0, A1, A2], q
+
+
+def _come_to_rest(sections: list[tuple[list[int], int]], x: int, starts: IntMatrix, steps: int) -> IntMatrix:
+    """Distance (n,) from x at which the cascade ends, or the widest of a cycle, from each start (n,)."""
+    delay = [[starts.copy() for _ in range(4)] for _ in sections]
+    last = np.zeros((32, len(starts)), dtype=np.int64)
+    for k in range(steps):
+        value = np.full(len(starts), x, dtype=np.int64)
+        for ((B0, B1, B2, A1, A2), q), d in zip(sections, delay, strict=True):
+            total = B0 * value + B1 * d[0] + B2 * d[1] - A1 * d[2] - A2 * d[3]
+            out = np.clip((total + (1 << (q - 1))) >> q, -(1 << 15), (1 << 15) - 1)
+            d[1], d[0], d[3], d[2] = d[0], value, d[2], out
+            value = out
+        last[k % len(last)] = value
+        if k % len(last) == len(last) - 1 and np.all(last == last[0]):
+            break
+    return np.asarray(np.abs(last - x).max(axis=0))
+
+
+def fixed_point(filter_: Filter) -> FixedPoint:
+    """The filter in Q15: whether it can be, its cut-off, and its dead band."""
+    integers = [_integers(section) for section in filter_.exact]
+    values = np.array(
+        [[*(math.ldexp(b, -q) for b in c[:3]), 1.0, *(math.ldexp(a, -q) for a in c[3:])] for c, q in integers]
+    )
+    S = 1.0 + values[:, 4] + values[:, 5]
+    usable = bool(np.all(S > 0.0)) and float(np.abs(digital_poles(values)).max()) < 1.0
+    if not usable:
+        return FixedPoint(False, math.nan, math.inf, math.nan)
+    bound = float(np.sum(0.5 / S))
+    reach = min(4.0 * bound, 12_000.0)
+    starts = np.round(np.linspace(-reach, reach, _STARTS)).astype(np.int64)
+    stuck = _come_to_rest(integers, 11_003, 11_003 + starts, _steps(filter_))
+    return FixedPoint(True, cutoff_hz(values, filter_.design.rate_hz), bound, float(stuck.max()))
+
+
+def _steps(filter_: Filter) -> int:
+    slowest = float(np.abs(digital_poles(filter_.exact)).max())
+    return int(min(25.0 / max(1.0 - slowest, 1e-6) + 200, _LONGEST))
+
+
+def dead_band_binary32(filter_: Filter) -> float:
+    """Largest distance from 1 at which the filter comes to rest in binary32, from starts around 1.
+
+    Relative: at a position of 0.1 m the distance is a tenth of it in metres.
+    """
+    sections = filter_.sections.astype(np.float32)
+    starts = np.linspace(0.0, 2.0, _STARTS)
+    s1, s2 = np.moveaxis(settled_state(filter_.sections, starts).astype(np.float32), 1, 0)
+    y = np.zeros(_STARTS, dtype=np.float32)
+    for _ in range(_steps(filter_)):
+        value = np.ones(_STARTS, dtype=np.float32)
+        for i, (b0, b1, b2, _, a1, a2) in enumerate(sections):
+            y = b0 * value + s1[i]
+            s1[i] = b1 * value - a1 * y + s2[i]
+            s2[i] = b2 * value - a2 * y
+            value = y
+    return float(np.abs(y.astype(np.float64) - 1.0).max())
+
+
+# ----------------------------------------------------------------------
+# The low-pass of least delay that leaves no more than a wanted jitter.
+#
+# For every family and order the jitter behind the filter rises with the cut-off, so the highest cut-off
+# that
+# keeps it is found by bisection; of these filters the one with the least delay at zero frequency is
+# suggested. In white jitter a filter of first order and every one with a single pair of poles have
+# the same product of delay and noise bandwidth, 1/4, which sampling and a log's scatter part by some
+# percent. So delays within 7 % count as equal: of those the one wins that changes the shape of the log's
+# motion least (`calib.stages.lowpass.filters.motion_lost`), and without motion the one of lowest order.
+
+_TIE = 0.07
+_LOWEST = 1e-4
+"""Lowest cut-off that is tried, in parts of the rate."""
+_HIGHEST = 0.45
+_SAME_SHAPE = 0.01
+_HALVINGS = 16
+"""Of the logarithm of the range: to 2 in ten thousand."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A filter that leaves the wanted jitter.
+
+    Attributes
+    ----------
+    filter : with a cut-off of three digits.
+    delay_s : at zero frequency.
+    jitter : standard deviation left, of the worse coordinate.
+    motion_lost : share of the motion that does not arrive unchanged after this delay, of the worse one.
+    """
+
+    filter: Filter
+    delay_s: float
+    jitter: float
+    motion_lost: float
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """The filter to take, and the best of each family and order, least delay first."""
+
+    best: Candidate
+    candidates: tuple[Candidate, ...]
+
+
+def _worst(spectra: Sequence[Spectrum], filter_: Filter) -> float:
+    return max(jitter_after(one, filter_.exact) for one in spectra)
+
+
+def _candidate(spectra: Sequence[Spectrum], wanted: float, order: int, family: str) -> Candidate | None:
+    rate = spectra[0].rate_hz
+
+    def at(cutoff_hz: float) -> Filter:
+        return design_lowpass(Design(cutoff_hz, rate, order, family))
+
+    low, high = _LOWEST * rate, _HIGHEST * rate
+    try:
+        at(low)
+    except BadInputError:
+        # Single precision has no such slow filter of this order; the slowest it has lies above.
+        low = 3e-3 * rate
+    if _worst(spectra, at(low)) > wanted:
+        return None
+    if _worst(spectra, at(high)) > wanted:
+        for _ in range(_HALVINGS):
+            middle = math.sqrt(low * high)
+            if _worst(spectra, at(middle)) > wanted:
+                high = middle
+            else:
+                low = middle
+    else:
+        low = high
+    filter_ = at(_three_digits_below(low))
+    delay_s = dc_delay_s(filter_.sections, rate)
+    lost = max(motion_lost(one, filter_.sections, delay_s) for one in spectra)
+    return Candidate(filter_, delay_s, _worst(spectra, filter_), lost)
+
+
+def _three_digits_below(value: float) -> float:
+    power = math.floor(math.log10(value)) - 2
+    return float(f"{math.floor(value / 10.0**power * (1 + 1e-12))}e{power}")
+
+
+def _amount(value: float, unit: str) -> str:
+    return f"{1e3 * value:.3g} mm" if unit == "m" else f"{value:.3g} {unit}"
+
+
+def suggest(
+    spectra: Sequence[Spectrum],
+    wanted: float,
+    orders: Sequence[int] = (),
+    families: Sequence[str] = (),
+    unit: str = "m",
+) -> Suggestion:
+    """The filter of least delay for a jitter of at most `wanted`, in the spectra's unit.
+
+    Parameters
+    ----------
+    spectra : of each coordinate, at the same rate; each has to keep to `wanted`.
+    orders, families : to choose from; all where empty.
+    unit : of the jitter, for messages.
+
+    Raises
+    ------
+    BadInputError
+        Where there is no jitter, not more than is wanted, or none of the filters leaves so little.
+    """
+    unfiltered = max(one.jitter for one in spectra)
+    has, most = _amount(unfiltered, unit), _amount(wanted, unit)
+    if unfiltered == 0.0:
+        raise BadInputError("has no jitter at all: its values never change, or only so slowly as motion does")
+    if wanted >= unfiltered:
+        raise BadInputError(
+            f"jitters by {has} unfiltered, not more than the {most} that is wanted; no low-pass is needed"
+        )
+    found = [
+        _candidate(spectra, wanted, order, family)
+        for order in (orders or range(1, LARGEST_ORDER + 1))
+        # The families differ from the second order on.
+        for family in (families or (FAMILIES if order > 1 or orders else FAMILIES[:1]))
+    ]
+    candidates = sorted((one for one in found if one is not None), key=lambda one: one.delay_s)
+    if not candidates:
+        raise BadInputError(
+            f"jitters by {has} unfiltered and no low-pass here leaves only {most}; ask for more"
+        )
+    tied = [one for one in candidates if one.delay_s <= (1.0 + _TIE) * candidates[0].delay_s]
+    least = min(one.motion_lost for one in tied)
+    same = [one for one in tied if one.motion_lost <= least + _SAME_SHAPE]
+    best = min(same, key=lambda one: (one.filter.design.order, one.delay_s))
+    return Suggestion(best, tuple(candidates))
