@@ -3,21 +3,33 @@
     python tests/reference_pages.py
 
 writes them anew. `verbs.md` follows from the signatures and docstrings of the command line's functions, not
-from the text of --help, which depends on typer's version and the terminal's width.
+from the text of --help, which depends on typer's version and the terminal's width. `rig-yaml.md` follows from
+the schema's classes: keys, types, ranges and defaults from their JSON schema, units from the keys' endings,
+meanings from the docstrings.
 """
 
 from __future__ import annotations
 
+import ast
+import fnmatch
+import importlib
 import inspect
+import itertools
+import math
+import re
+import textwrap
 import types
 import typing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import typer
+from pydantic import BaseModel
 
 from calib.cli.app import app
+from calib.core.rig import _LATER, SECTIONS, Rig
+from calib.stages.actuator.section import Actuator, PumpSection
 
 MANUAL = Path(__file__).resolve().parent.parent / "calib" / "docs"
 
@@ -45,7 +57,7 @@ _KINDS = {str: "text", int: "integer", float: "number", Path: "path", bool: "fla
 
 def pages() -> dict[str, str]:
     """Path below the manual and text of each generated page."""
-    return {"reference/verbs.md": verbs_page()}
+    return {"reference/verbs.md": verbs_page(), "reference/rig-yaml.md": rig_page()}
 
 
 def verbs() -> Iterator[tuple[str, Callable[..., Any]]]:
@@ -142,6 +154,188 @@ def _default(value: Any) -> str:
 
 def _cell(text: str) -> str:
     return " ".join(text.replace("|", "\\|").split())
+
+
+_RIG_HEAD = """# Keys of rig.yaml
+
+`python tests/reference_pages.py` generates this page from the schema. [Files](files.md) says which verb
+writes which section.
+
+A key ends with its unit. `[]` stands for the entries of a list, `NAME` for a name. A key without a default is
+required in its section. Values must be finite. These keys have the same meaning in every section:
+
+| key | meaning |
+|---|---|
+| `sigma` | standard deviations by key; null where the data do not bound one |
+| `covariance` | `order`: names of the rows; `values`: the matrix |
+| `verdict` | one of the words that the section's text lists |
+| `reasons`, `remarks`, `advice` | why the verdict is so; what does not change it; what to record next |
+"""
+
+_COMMON = ("sigma", "covariance", "verdict", "reasons", "remarks", "advice")
+
+_UNITS = {
+    **{one: one for one in ("px", "mm", "m", "rad", "deg", "s", "kg", "N", "V", "kPa", "ticks")},
+    **{f"{one}{power}": f"{one}^{power}" for one in ("m", "s", "rad") for power in (2, 3, 4)},
+    **{f"{one}ps{power}": f"{one}/s^{power}" for one in ("m", "rad") for power in (2, 3)},
+    **{f"{one}ps": f"{one}/s" for one in ("m", "rad", "deg")},
+    "kgm2": "kg m^2",
+    "hz": "Hz",
+    "Hz": "Hz",
+    "db": "dB",
+    "pwm": "PWM",
+}
+"""Units by the last words of keys."""
+
+
+def rig_page() -> str:
+    """The page of rig.yaml: a table of keys for each section."""
+    parts = [_RIG_HEAD.rstrip()]
+    for name, section in sections().items():
+        schema = section.model_json_schema()
+        parts += ["", f"## {name}", "", _plain(inspect.getdoc(section) or "").split(" Attributes ---", 1)[0]]
+        words = schema["properties"].get("verdict")
+        if words is not None:
+            parts[-1] += f" Verdict: {_type(words, schema)}."
+        parts += ["", "| key | unit | type and range | default | meaning |", "|---|---|---|---|---|"]
+        for key, entry, meaning in _keys("", schema, schema, section):
+            default = "" if "default" not in entry else _written(entry["default"])
+            cells = (f"`{key}`", unit(key), _type(entry, schema), default, meaning)
+            parts.append(f"| {' | '.join(map(_cell, cells))} |")
+    return "\n".join(parts) + "\n"
+
+
+def sections() -> dict[str, type[BaseModel]]:
+    """The class of each section of rig.yaml, in the order of the file; `twin` has none."""
+    out: dict[str, type[BaseModel]] = {"actuator": Actuator, "pump": PumpSection}
+    for name, (module, kind) in _LATER.items():
+        out[name] = getattr(importlib.import_module(module), kind)
+    for name, field in Rig.model_fields.items():
+        kinds = [
+            one for one in (field.annotation, *typing.get_args(field.annotation)) if inspect.isclass(one)
+        ]
+        model = next((one for one in kinds if issubclass(one, BaseModel)), None)
+        if model is not None:
+            out[name] = model
+    return {name: out[name] for name in SECTIONS if name in out}
+
+
+def _keys(
+    before: str, part: Mapping[str, Any], whole: Mapping[str, Any], kind: type[BaseModel]
+) -> Iterator[tuple[str, Mapping[str, Any], str]]:
+    """Dotted key, schema and meaning of every value; the parts of a section follow its own keys."""
+    described = meanings(kind)
+    for name, entry in part["properties"].items():
+        if name in _COMMON and not before:
+            continue
+        inner, suffix = _inner(entry, whole)
+        if inner is None:
+            yield before + name, entry, described.get(name, "")
+        else:
+            yield from _keys(f"{before}{name}{suffix}.", inner, whole, _class_of(kind, inner["title"]))
+
+
+def _inner(entry: Mapping[str, Any], whole: Mapping[str, Any]) -> tuple[Mapping[str, Any] | None, str]:
+    """The part that a key holds, alone, in a list or by name, and what stands for that in the dotted key."""
+    for one in (entry, *entry.get("anyOf", ()), *entry.get("allOf", ())):
+        if "$ref" in one:
+            return whole["$defs"][one["$ref"].rsplit("/", 1)[-1]], ""
+        if "$ref" in one.get("items", {}):
+            return whole["$defs"][one["items"]["$ref"].rsplit("/", 1)[-1]], "[]"
+        if isinstance(one.get("additionalProperties"), dict) and "$ref" in one["additionalProperties"]:
+            return whole["$defs"][one["additionalProperties"]["$ref"].rsplit("/", 1)[-1]], ".NAME"
+    return None, ""
+
+
+def _class_of(kind: type[BaseModel], title: str) -> type[BaseModel]:
+    """The class of a part, which stands in the module of its section or in one that this imports."""
+    for one in kind.__mro__:
+        found = getattr(inspect.getmodule(one), title, None)
+        if found is not None:
+            return typing.cast("type[BaseModel]", found)
+    raise LookupError(title)
+
+
+def meanings(kind: type[BaseModel]) -> dict[str, str]:
+    """What the docstring's list of attributes, and the text behind single fields, say of each key."""
+    out: dict[str, str] = {}
+    for one in reversed(kind.__mro__[: kind.__mro__.index(BaseModel)]):
+        listed = (inspect.getdoc(one) or "").partition("Attributes\n----------\n")[2]
+        entries = re.split(r"(?:^|(?<=[.,] )|\n)((?:[\w*]+, )*[\w*]+) : ", listed)
+        for names, text in zip(entries[1::2], entries[2::2], strict=True):
+            for name in names.split(", "):
+                out.update(dict.fromkeys(fnmatch.filter(one.model_fields, name), _plain(text).rstrip(",")))
+        named: list[ast.AnnAssign] = []
+        (tree,) = ast.parse(textwrap.dedent(inspect.getsource(one))).body
+        assert isinstance(tree, ast.ClassDef)
+        for line in tree.body:
+            if isinstance(line, ast.AnnAssign):
+                # A text belongs to the fields before it, up to an empty line.
+                named = [*named, line] if named and named[-1].end_lineno == line.lineno - 1 else [line]
+            elif isinstance(line, ast.Expr) and isinstance(line.value, ast.Constant):
+                out.update({ast.unparse(one.target): _plain(str(line.value.value)) for one in named})
+                named = []
+    return out
+
+
+def _plain(text: str) -> str:
+    """Text on one line, without its references to modules."""
+    return re.sub(r"[,;]? (?:see|of) `calib\.[\w.]+`", "", " ".join(text.split()))
+
+
+def unit(key: str) -> str:
+    """The unit that a key ends with: its last words that are units, as rad/s/sqrt(Hz)."""
+    words = re.split(r"_", key.rsplit(".", 1)[-1])
+    first = len(words)
+    while first > 0 and (words[first - 1] in _UNITS or words[first - 1] in ("per", "sqrt")):
+        first -= 1
+    # A key may be a unit's letter itself, as `k` or `s` alone.
+    parts: list[list[str]] = [[]]
+    for before, word in itertools.pairwise(["", *words[max(first, 1) :]]):
+        if word == "per":
+            parts.append([])
+        elif word != "sqrt":
+            parts[-1].append(f"sqrt({_UNITS[word]})" if before == "sqrt" else _UNITS[word])
+    above, *below = (" ".join(part) for part in parts)
+    return "/".join([above or "1", *(f"({one})" if " " in one else one for one in below)]) if below else above
+
+
+def _type(entry: Mapping[str, Any], whole: Mapping[str, Any]) -> str:
+    """A type in words with its range."""
+    if "anyOf" in entry:
+        return " or ".join(_type(one, whole) for one in entry["anyOf"])
+    if "const" in entry or "enum" in entry:
+        return ", ".join(f"`{one}`" for one in entry.get("enum", [entry.get("const")]))
+    if "pattern" in entry:
+        return ", ".join(f"`{one}`" for one in re.findall(r"\w+", entry["pattern"]))
+    kind = entry.get("type", "")
+    if kind == "array":
+        low, high = entry.get("minItems"), entry.get("maxItems")
+        count = "" if low is None else f" of {low}" if low == high else f" of {low} to {high}"
+        return f"list{count}: {_type(entry.get('items', {}), whole)}"
+    if kind == "object":
+        inner = entry.get("additionalProperties")
+        return f"by name: {_type(inner, whole)}" if isinstance(inner, dict) else "keys with values"
+    return {"string": "text", "boolean": "true or false", "integer": "whole number"}.get(kind, kind) + _range(
+        entry
+    )
+
+
+def _range(entry: Mapping[str, Any]) -> str:
+    limits = dict(entry)
+    if limits.get("exclusiveMinimum", -math.inf) >= limits.get("minimum", math.inf):
+        # A type's own limit, narrowed by the key's.
+        del limits["minimum"]
+    if "minimum" in limits and "maximum" in limits:
+        return f", {limits['minimum']:g} to {limits['maximum']:g}"
+    return "".join(f", {sign} {limits[key]:g}" for key, sign in _LIMITS.items() if key in limits)
+
+
+_LIMITS = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<"}
+
+
+def _written(value: Any) -> str:
+    return "null" if value is None else f"`{value}`"
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 MANUAL = Path(__file__).resolve().parent.parent / "docs"
 INDEX = "index"
+GROUPS = {"howto": "How to", "reference": "Reference"}
+"""Folders of the manual and their titles beside the pages."""
 
 
 @dataclass(frozen=True)
@@ -116,14 +118,18 @@ def write_manual(pages: list[Page], folder: Path) -> Path:
     for page in pages:
         path = folder / f"{page.name}.html"
         depth = "../" * (len(PurePosixPath(page.name).parts) - 1)
-        entries = [
-            {"link": f"{depth}{one.name}.html", "title": one.title, "current": one is page} for one in pages
-        ]
+        groups: list[dict[str, Any]] = []
+        for one in pages:
+            group = GROUPS.get(one.name.rpartition("/")[0], "About" if groups[1:] else "")
+            if not groups or groups[-1]["name"] != group:
+                groups.append({"name": group, "entries": []})
+            link = f"{depth}{one.name}.html"
+            groups[-1]["entries"].append({"link": link, "title": one.title, "current": one is page})
         # The Markdown is the package's own, and HTML inside it is escaped.
         body = Markup(markdown.render(page.text))
         make_folder(path.parent)
         write_atomically(
-            path, template.render(title=page.title, version=__version__, entries=entries, body=body)
+            path, template.render(title=page.title, version=__version__, groups=groups, body=body)
         )
     return folder
 
