@@ -1,4 +1,4 @@
-"""What is not part of the project and may be missing: recordings, and the list of claims."""
+"""What is not part of the project and may be missing: recordings."""
 
 from __future__ import annotations
 

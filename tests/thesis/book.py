@@ -1,95 +1,211 @@
-"""The book: all claims in the order of the source, and the table of what came of them."""
+"""The book: every claim of the source with what came of computing it again, and the words of its figures.
+
+thesis.yaml states the claims and what has to hold for each within which tolerance; the functions of
+`sensing`, `mechanics` and `control` compute values; the outcome follows from both by `outcome_of`.
+"""
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
 
-from thesis import (
-    claims_camera,
-    claims_control,
-    claims_dynamics,
-    claims_filters,
-    claims_fit,
-    claims_imu,
-    claims_kinematics,
-    claims_pump,
-    claims_setpoints,
-)
-from thesis.outcome import BASES, Claim, Finding, Outcome
+import numpy as np
+import yaml
 
-__all__ = ["BOOK", "Examined", "by_basis", "count", "examine", "rows", "select"]
+from thesis import control, mechanics, sensing
+from thesis.plot import Plot
+from thesis.runs import Values
 
-BOOK: tuple[Claim, ...] = (
-    *claims_imu.CLAIMS,
-    *claims_camera.CLAIMS,
-    *claims_filters.CLAIMS,
-    *claims_pump.STATIC,
-    *claims_kinematics.CLAIMS,
-    *claims_dynamics.CLAIMS,
-    *claims_fit.CLAIMS,
-    *claims_pump.DYNAMIC,
-    *claims_control.CLAIMS,
-    *claims_setpoints.CLAIMS,
-)
-"""Every claim once."""
+KINDS = ("math", "plant", "data")
+BASES = {
+    "equations": "from the equations alone",
+    "printed": "from printed numbers",
+    "twin": "on the simulated rig, with other figures fixed beforehand",
+    "chosen": "with a value that was chosen by this very figure",
+}
+_CONDITION = re.compile(r"(?:([<>]) )?(\S+?)(?: \+- (\S+?)( %)?)?")
+
+
+class Outcome(Enum):
+    """What came of computing a claim again."""
+
+    REPRODUCED = "reproduced"
+    REFUTED = "refuted"
+    CONSTRUCTED = "consistent by construction"
+    UNMEASURED = "not reproducible without its measurements"
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One statement of the source; thesis.yaml says what the fields are."""
+
+    id: str
+    where: str
+    statement: str
+    kind: str
+    basis: str
+    ours: str
+    how: str
+    printed: str = "-"
+    expect: Mapping[str, str | float] = field(default_factory=dict)
+    tolerance: str = ""
 
 
 @dataclass(frozen=True)
 class Examined:
-    """A claim and what came of it."""
+    """A claim, the values of its computation and what came of it; `ours` and `how` are the words for it."""
 
     claim: Claim
-    finding: Finding
+    values: Values
+    outcome: Outcome
+    ours: str
+    how: str
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """The words of a figure; thesis.yaml says what the fields are."""
+
+    number: str
+    file: str
+    title: str
+    source: str
+    note: str
+    boxes: Sequence[Any] = ()
+    sums: Sequence[Any] = ()
+    wires: Sequence[Any] = ()
+
+    @property
+    def path(self) -> str:
+        """Name of its file, such as figure_3_12_bellows_after_release.svg."""
+        return f"figure_{self.number.replace('.', '_')}_{self.file}.svg"
+
+    def make(self) -> tuple[Plot | None, Values]:
+        """Its curves, None for a scheme, and the values in its words."""
+        plot, values = _computed(f"figure_{self.number.replace('.', '_')}")
+        return plot, values
+
+
+def _computed(name: str) -> Any:
+    (function,) = (getattr(one, name) for one in (sensing, mechanics, control) if hasattr(one, name))
+    return function()
+
+
+def holds(condition: str | float, value: float) -> bool:
+    """Whether a value meets a condition: `5`, `5 +- 0.1`, `5 +- 10 %`, `< 5` or `> 5`; `1/60` is a number."""
+    match = _CONDITION.fullmatch(str(condition))
+    if match is None:
+        raise ValueError(f"condition {condition!r}: expected such as '5 +- 10 %' or '< 5'")
+    sign, number, off, percent = match.groups()
+    bound = float(Fraction(number))
+    if sign:
+        return value < bound if sign == "<" else value > bound
+    return abs(value - bound) <= float(off or 0.0) * (0.01 * abs(bound) if percent else 1.0)
+
+
+def outcome_of(claim: Claim, values: Values) -> Outcome:
+    """What came of a claim.
+
+    What was chosen to come out neither proves nor refutes a text. Nor does a simulated rig refute what was
+    seen on another one; it can only not show it.
+    """
+    if not claim.expect:
+        return Outcome.UNMEASURED
+    if all(holds(condition, float(values[name])) for name, condition in claim.expect.items()):
+        return Outcome.CONSTRUCTED if claim.basis == "chosen" else Outcome.REPRODUCED
+    of_text = claim.basis in ("equations", "printed") or (claim.basis == "twin" and claim.kind == "math")
+    return Outcome.REFUTED if of_text else Outcome.UNMEASURED
+
+
+def examine(claim: Claim) -> Examined:
+    """Compute a claim."""
+    values: Values = _computed(claim.id.replace(".", "_"))
+    simulated = claim.basis == "twin" or (claim.basis == "chosen" and claim.kind != "math")
+    ours = claim.ours.format(**values) + (" (simulated)" if simulated else "")
+    return Examined(claim, values, outcome_of(claim, values), ours, claim.how.format(**values))
+
+
+def _read() -> tuple[tuple[Claim, ...], tuple[Drawing, ...]]:
+    text = yaml.safe_load(Path(__file__).with_name("thesis.yaml").read_text(encoding="utf-8"))
+    return tuple(Claim(**one) for one in text["claims"]), tuple(Drawing(**one) for one in text["figures"])
+
+
+BOOK, ALBUM = _read()
+"""Every claim and every figure once, in the order of the source."""
 
 
 def select(words: Sequence[str]) -> tuple[Claim, ...]:
     """Claims whose name begins with one of the words, all without words."""
-    if not words:
-        return BOOK
-    return tuple(one for one in BOOK if one.id.startswith(tuple(words)))
+    return tuple(one for one in BOOK if not words or one.id.startswith(tuple(words)))
 
 
-def examine(
-    claims: Iterable[Claim] = BOOK, progress: Callable[[int, int], None] | None = None
-) -> tuple[Examined, ...]:
-    """Compute claims, one after the other; nothing is remembered from an earlier run of the program."""
-    chosen, out = tuple(claims), []
-    for done, one in enumerate(chosen):
-        if progress is not None:
-            progress(done, len(chosen))
-        out.append(Examined(one, one.check()))
-    return tuple(out)
+def counted(examined: Iterable[Examined]) -> str:
+    """How many claims came to each outcome, in words."""
+    numbers = Counter(one.outcome for one in examined)
+    return ", ".join(f"{numbers[outcome]} {outcome.value}" for outcome in Outcome if numbers[outcome])
 
 
-def count(examined: Iterable[Examined]) -> dict[Outcome, int]:
-    """How many claims came to each outcome, those without any too."""
-    found = Counter(one.finding.outcome for one in examined)
-    return {outcome: found[outcome] for outcome in Outcome}
+def row(one: Examined) -> dict[str, Any]:
+    """A claim as plain values, for a JSON document."""
+    claim = one.claim
+    return {
+        "id": claim.id,
+        "where": claim.where,
+        "claim": claim.statement,
+        "printed": claim.printed,
+        "kind": claim.kind,
+        "basis": claim.basis,
+        "expected": dict(claim.expect),
+        "tolerance": claim.tolerance,
+        "values": one.values,
+        "ours": one.ours,
+        "outcome": one.outcome.value,
+        "how": one.how,
+    }
 
 
-def by_basis(examined: Iterable[Examined]) -> dict[str, dict[Outcome, int]]:
-    """How many claims of each basis came to each outcome."""
-    found = tuple(examined)
-    return {basis: count(one for one in found if one.claim.basis == basis) for basis in BASES}
-
-
-def rows(examined: Iterable[Examined]) -> list[dict[str, str | bool | Mapping[str, float]]]:
-    """The table as plain values, for a JSON document or a page."""
-    return [
-        {
-            "id": one.claim.id,
-            "where": one.claim.where,
-            "claim": one.claim.says,
-            "printed": one.claim.printed,
-            "kind": one.claim.kind,
-            "basis": one.claim.basis,
-            "ours": one.finding.ours,
-            "simulated": one.finding.simulated,
-            "outcome": one.finding.outcome.value,
-            "how": one.finding.how,
-            "numbers": dict(one.finding.numbers),
-        }
-        for one in examined
+def words(examined: Sequence[Examined]) -> list[str]:
+    """The table of claims, the computation of each, and the sums, line by line."""
+    cells = [("claim", "where", "kind", "basis", "outcome", "our figure")]
+    cells += [
+        (e.claim.id, e.claim.where, e.claim.kind, e.claim.basis, e.outcome.value, e.ours) for e in examined
     ]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    lines = [
+        "  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in cells
+    ]
+    for one in examined:
+        printed = "" if one.claim.printed == "-" else f"; printed: {one.claim.printed}"
+        lines.append(f"{one.claim.id}: {one.claim.statement}{printed}")
+        if one.claim.expect:
+            expected = ", ".join(f"{name} {condition}" for name, condition in one.claim.expect.items())
+            lines.append(f"  expected: {expected}; tolerance: {one.claim.tolerance}")
+        lines.append(f"  {one.outcome.value}: {one.how}")
+    lines.append(f"{len(examined)} of {len(BOOK)} claims: {counted(examined)}")
+    for basis, meaning in BASES.items():
+        some = [one for one in examined if one.claim.basis == basis]
+        if some:
+            lines.append(f"  {len(some):2d} {meaning}: {counted(some)}")
+    return lines
+
+
+def golden_figure(plot: Plot | None, values: Values) -> dict[str, Any]:
+    """What a test holds of a figure: its values, and of each curve the size and means of x, y and |y|."""
+    curves = [] if plot is None else plot.curves
+    means = [[float(np.nanmean(v)) for v in (curve.x, curve.y, np.abs(curve.y))] for curve in curves]
+    return {"values": values, "curves": [[len(c.x), *mean] for c, mean in zip(curves, means, strict=True)]}
+
+
+def golden() -> dict[str, Any]:
+    """What tests hold of the whole book."""
+    return {
+        "claims": {e.claim.id: {"outcome": e.outcome.value, "values": e.values} for e in map(examine, BOOK)},
+        "figures": {one.number: golden_figure(*one.make()) for one in ALBUM},
+    }
