@@ -86,13 +86,6 @@ def test_what_decoders_say_on_stderr_does_not_come_through(process, pictures, gr
     assert len(ended.err.splitlines()) == 1
 
 
-def test_padding_that_cameras_leave_in_a_jpeg_is_no_damage(calib, pictures, gray, tmp_path) -> None:
-    folder = pictures(0)
-    data = _encoded(".jpg", gray)
-    (folder / "a.jpg").write_bytes(data[:-2] + bytes(3) + data[-2:] + b"trailer")
-    assert calib("intrinsics", folder, *RADIAL2, "--rig", tmp_path / "rig.yaml").code == 1
-
-
 @pytest.mark.parametrize("kind", ["deep", "alpha", "colour", "cmyk", "exif"])
 def test_other_kinds_of_picture_show_the_same_board(calib, pictures, gray, tmp_path, kind: str) -> None:
     Image = pytest.importorskip("PIL.Image")
@@ -164,13 +157,6 @@ def test_folders_without_pictures(calib, pictures, tmp_path) -> None:
         assert f"{folder}: holds no pictures, expected files of png" in ended.sentence
 
 
-def test_sub_folders_are_not_read_and_a_folder_may_be_named_as_a_table(calib, pictures, tmp_path) -> None:
-    folder = pictures(3, name="views.csv")
-    shutil.copytree(pictures(4, name="other"), folder / "inside")
-    ended = calib("intrinsics", folder, *RADIAL2, "--rig", tmp_path / "rig.yaml")
-    assert "board found in 3 of 3 pictures" in ended.err
-
-
 def test_sources_that_are_not_there_or_no_files(calib, pictures, tmp_path) -> None:
     folder, rig = pictures(1), tmp_path / "rig.yaml"
     os.mkfifo(tmp_path / "pipe.png")
@@ -229,23 +215,12 @@ def test_odd_file_names(calib, process, pictures, project_root, gray, tmp_path) 
 
 BOARDS = {
     "corners: [7]": "corners is [7], expected 2 values",
-    "corners: [7, 5, 3]": "corners is [7, 5, 3], expected 2 values",
-    "corners: [7.0, 5.0]": "corners.0 is 7.0, expected a whole number",
     "corners: [7, '5']": "corners.1 is '5', expected a whole number (without quotes",
-    "corners: 7x5": "corners is '7x5', expected a list",
     "corners: [-7, 5]": "corners.0 is -7, expected greater than or equal to 3",
-    "corners: [true, 5]": "corners.0 is True, expected a whole number",
-    "square_m: 20mm": "square_m is '20mm', expected a number",
     "square_m: 2e-2": "square_m is '2e-2', expected a number (without quotes, and in YAML an exponent needs",
-    "square_m: -0.02": "square_m is -0.02, expected greater than or equal to",
     "square_m: 0": "square_m is 0, expected greater than",
-    "square_m: .nan": "square_m is nan, expected a finite number",
-    "square_m: 1.0e-300": "square_m is 1e-300, expected greater than",
     "corner: [7, 5]": "corner is not a key that is known here",
-    "corners: [7, 5]\ncorners: [9, 6]": "board.yaml, line 2: the key corners was given before",
     "corners: [7": "board.yaml, line 2: is not YAML",
-    "- 7": "holds a list, expected keys with values",
-    "": "holds nothing, expected keys with values",
     "\x01": "is not YAML",
 }
 
@@ -287,18 +262,12 @@ def test_folders_with_different_boards(calib, pictures, tmp_path) -> None:
 
 RIGS = {
     b"services:\n  web: {image: nginx}\n": "is not a rig.yaml: it has 'services', expected sections",
-    b"corners: [7, 5]\n": "is not a rig.yaml",
     b"": "holds nothing",
-    b"a: 1\n" * 1_000_000: "is larger than 1 MB",
     bytes(range(256)): "is not UTF-8 text",
-    b"camera: \x00\n": "is not YAML: control characters are not allowed",
     b"a: &a [*a]\n": "expands to more than",
     b"camera: " + b"[" * 900 + b"]" * 900: "nested more than 40 deep",
-    b"camera: " + b"{a: " * 100_000: "nested more than 40 deep",
     b"camera: {fx_px: " + b"9" * 5000 + b"}": "is not YAML that can be read",
-    b"camera: [1]\n": "camera is [1], expected keys with values",
     b"camera: {model: !!python/name:os.system }\n": "is not YAML: could not determine",
-    b"provenance: 3\n": "provenance is 3, expected keys with values",
     b"geometry: {workspace_m: [1, 2, 0, 0]}\n": "geometry.workspace_m is [1, 2, 0, 0], expected [least x",
 }
 
@@ -317,19 +286,14 @@ def test_a_wrong_rig_file_is_left_alone(calib, pictures, tmp_path, number: int) 
 
 CONTRADICTIONS = (
     ("fx_px: 2", "fx_px: 0.0 #", "camera.fx_px is 0.0, expected greater than"),
-    ("fx_px: 2", "fx_px: 1.0e-300 #", "camera.fx_px is 1e-300, expected greater than"),
     ("[316, 208]", "[316.0, 208]", "camera.image_size_px.0 is 316.0, expected a whole number"),
-    ("[316, 208]", "['316', 208]", "camera.image_size_px.0 is '316', expected a whole number"),
     ("rms_px: 0", "rms_px: .inf #", "camera.rms_px is inf, expected a finite number"),
-    ("k4: 0.0", "k4: 0.5", "camera.distortion.k4 is 0.5, but radial2 has no k4"),
     ("  fx_px: 2", "  fx_px: 2\n  fx_px: 2", "the key fx_px was given before"),
-    ("verdict: ok", "verdict: 2020-01-01", "camera.verdict is datetime.date(2020, 1, 1), expected text"),
     (
         "  A_inverse:\n  - [0.",
         "  A_inverse:\n  - [1.",
         "plane.A_inverse is not the inverse of plane.A_px_per_m",
     ),
-    ("  R_CW:\n  - [0.", "  R_CW:\n  - [1.", "plane.R_CW is not a rotation"),
     ("fx_px: 27", "fx_px: 28", "plane was calibrated with another camera"),
 )
 
@@ -371,14 +335,6 @@ def test_places_where_no_rig_can_be_written(calib, pictures, rig, tmp_path) -> N
         assert says in ended.sentence
         assert "board found" not in ended.err
     assert read_only.stat().st_mode & 0o777 == 0o444
-
-
-def test_a_link_to_a_file_that_is_not_there_yet(calib, pictures, tmp_path) -> None:
-    link = tmp_path / "rig.yaml"
-    link.symlink_to("real.yaml")
-    assert calib("intrinsics", pictures(4), *RADIAL2, "--rig", link).code in (0, 1)
-    assert link.is_symlink()
-    assert "camera:" in (tmp_path / "real.yaml").read_text()
 
 
 def test_a_full_disk_leaves_the_old_file(calib, pictures, rig, monkeypatch) -> None:

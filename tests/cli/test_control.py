@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from calib.core.rig import read_rig
 
-Run = Callable[..., Any]
+from .conftest import Run
 
 
 def test_run_compares_controllers(calib: Run, tmp_path: Path) -> None:
@@ -60,19 +58,6 @@ def test_tune_writes_the_section_that_run_then_uses(calib: Run, tmp_path: Path) 
     assert ended.code == 0 and "tuned-pid" in ended.out
 
 
-@pytest.mark.slow
-def test_provenance_names_what_the_gains_follow_from(calib: Run, tmp_path: Path) -> None:
-    rig = tmp_path / "rig.yaml"
-    rig.write_text("actuator: {mass_kg: 0.017}\npump: {lag_s: 0.6}\n")
-    assert calib("control", "tune", cwd=tmp_path).code == 0
-    first = read_rig(rig).provenance.inputs["controller"]
-    assert set(first) == {"actuator", "pump"}
-    rig.write_text(rig.read_text().replace("lag_s: 0.6", "lag_s: 0.65"))
-    assert calib("control", "tune", cwd=tmp_path).code == 0
-    second = read_rig(rig).provenance.inputs["controller"]
-    assert second["actuator"] == first["actuator"] and second["pump"] != first["pump"]
-
-
 def test_check_names_the_first_second_and_writes_a_slower_one(calib: Run, tmp_path: Path) -> None:
     t = np.arange(0.0, 8.0, 1.0 / 60.0)
     turn = 2.0 * np.pi * t / 8.0
@@ -90,15 +75,6 @@ def test_check_names_the_first_second_and_writes_a_slower_one(calib: Run, tmp_pa
     assert ended.code == 0, ended.err
     told = json.loads(ended.out)
     assert told["control"]["possible"] is True and 9.0 < told["control"]["duration_s"] < 14.0
-
-
-def test_check_of_what_no_slowness_helps(calib: Run, tmp_path: Path) -> None:
-    rows = [f"{k / 10},{0.08 + 0.0002 * k:.6f},{0.08 + 0.0002 * k:.6f}" for k in range(71)]
-    (tmp_path / "long.csv").write_text("\n".join(["t_s,q1_m,q2_m", *rows]) + "\n")
-    ended = calib("control", "check", "long.csv", "--slow", "slow.csv", cwd=tmp_path)
-    assert ended.code == 1
-    assert "cannot be held by the pumps at any speed" in ended.out
-    assert not (tmp_path / "slow.csv").exists()
 
 
 def test_a_simulated_log_as_reference(calib: Run, tmp_path: Path) -> None:
@@ -126,14 +102,11 @@ def test_the_plant_of_the_file_is_controlled(calib: Run, tmp_path: Path) -> None
     ("verb", "text", "sentence"),
     [
         ("run", "t_s,q1_m,q2_m\n0,0.07,0.07\n1,nan,0.07\n2,0.07,0.07\n", "ref.csv, line 3: q1_m is nan"),
-        ("check", "t_s,q1_m,q2_m\n0,.07,.07\n2,.07,.07\n1,.07,.07\n", "ref.csv, line 4: t_s is 1 after 2"),
         (
             "check",
             "t_s,q1_m,q2_m\n0,.07,.07\n1,.07,.07\n",
             "ref.csv: has 2 rows over 1 s, expected at least 3",
         ),
-        ("check", "t_s,q1_m,q2_m\n0,.07,.07\n1,.13,.13\n2,.1,.1\n", "outside the workspace"),
-        ("run", "t_s,q1_m,q2_m\n0,.07,.07\n1,-.1,.1\n2,.1,.1\n", "expected a positive length"),
         ("run", "t_s,u_px\n0,1\n", "ref.csv: has no reference in it"),
     ],
 )
@@ -165,28 +138,24 @@ def test_rigs_that_cannot_be_controlled(
     assert (tmp_path / "rig.yaml").read_text() == text
 
 
-@pytest.mark.parametrize("limits", ["200,100", "0,300", "0,90", "0.5,200"])
+@pytest.mark.parametrize(
+    "limits",
+    [
+        "200,100",
+        "0.5,200",
+    ],
+)
 def test_limits_that_no_motor_has(calib: Run, tmp_path: Path, limits: str) -> None:
     ended = calib("control", "check", "ellipse", "--pwm-limits", limits, cwd=tmp_path)
     assert ended.code == 3
     assert "PWM limits:" in ended.sentence
 
 
-def test_limits_change_what_is_reached(calib: Run, tmp_path: Path) -> None:
-    ended = calib("control", "check", "ellipse", "--pwm-limits", "0,200", cwd=tmp_path)
-    assert ended.code == 1
-    assert "its pump gives at most" in ended.out or "lag does not allow" in ended.out
-
-
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
         (("run", "step", "--controller", "lqr"), "--controller: 'lqr' is not one of p, pid"),
-        (("run", "step", "--feedback", "guess"), "--feedback: 'guess' is not one of"),
-        (("run", "step", "--pwm-limits", "all"), "--pwm-limits: 'all' is not two numbers"),
         (("run", "step", "--pwm-limits", "0,nan"), "--pwm-limits: '0,nan' is not two finite numbers"),
-        (("run", "step", "--duration", "5"), "--duration: '5' has no unit"),
-        (("tune", "--gain-margin", "1"), "gain margin: found 1"),
         (("tune", "--phase-margin", "95deg"), "phase margin: found 95 deg"),
     ],
 )

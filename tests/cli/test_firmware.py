@@ -44,13 +44,6 @@ def test_a_poor_rig_is_written_and_marked(calib, rig, which: str) -> None:
         assert f"#define CALIB_{name.upper()}_OK {int(name not in weak)}" in text
 
 
-def test_a_camera_has_to_be_there_first(calib, tmp_path) -> None:
-    ended = calib("firmware", "--rig", tmp_path / "rig.yaml", "-o", tmp_path / "out")
-    assert ended.code == 3
-    assert "has no camera yet" in ended.sentence
-    assert not (tmp_path / "out").exists()
-
-
 def test_places_that_are_no_folder(calib, rig) -> None:
     for place in (rig, rig / "out"):
         ended = calib("firmware", "--rig", rig, "-o", place)

@@ -1,4 +1,4 @@
-"""How the command starts and ends: help, exit codes, streams, interruption, and mistakes of its own."""
+"""How the command starts and ends: help, exit codes, streams, interruption; doctor, report and diff."""
 
 from __future__ import annotations
 
@@ -11,6 +11,14 @@ import time
 from pathlib import Path
 
 import pytest
+import typer
+from pages import finished_run
+
+from calib.cli.diff import diff
+from calib.cli.doctor import doctor
+from calib.cli.report import report
+from calib.core.errors import BadInputError
+from calib.runner.doctor import Check
 
 VERBS = ("intrinsics", "extrinsics", "distortion", "firmware", "board", "export", "import")
 HEAVY = ("numpy", "scipy", "cv2", "matplotlib", "numba", "filterpy", "pydantic", "yaml", "jinja2", "rich")
@@ -49,34 +57,17 @@ def test_help_of_each_verb_explains_every_argument(calib, verb: str) -> None:
             assert len(explained.split()) >= 4, line
 
 
-def test_units_and_defaults_are_in_the_help(calib) -> None:
-    text = " ".join(calib("intrinsics", "--help").out.split())
-    for words in ("20mm", "640x480", "[default: board.yaml", "[default: auto]", "[default: rig.yaml]"):
-        assert words in text
-
-
 @pytest.mark.parametrize(
     ("words", "says"),
     [
         ((), "Usage: calib"),
-        (("frobnicate",), "No such command 'frobnicate'"),
         (("intrinsics",), "Missing argument"),
-        (("intrinsics", "a", "--frobnicate"), "No such option: --frobnicate"),
-        (("intrinsics", "-x"), "No such option: -x"),
         (("intrinsics", "a", "--model", "fisheye"), "'fisheye' is not one of"),
-        (("intrinsics", "a", "--loss", "l1"), "'l1' is not one of"),
         (("board", "--page", "A3"), "'A3' is not one of"),
-        (("export", "matlab"), "'matlab' is not one of"),
-        (("intrinsics", ""), "an argument is empty: ''"),
         (("intrinsics", "a", "--rig="), "an argument is empty: '--rig='"),
-        (("intrinsics", "a", "--square", "20"), "--square: '20' has no unit, expected one of mm, cm, m, in"),
         (("intrinsics", "a", "--square", "20px"), "--square: '20px' has the unit 'px'"),
-        (("intrinsics", "a", "--square=-2mm"), "--square: '-2mm' is not positive"),
         (("intrinsics", "a", "--square", "20m"), "--square: '20m' is not between 0.01 mm and 10 m"),
-        (("intrinsics", "a", "--corners", "7"), "--corners: '7' is not two whole numbers"),
-        (("intrinsics", "a", "--corners", "2x2"), "--corners: '2x2' is not between 3x3 and 200x200"),
         (("intrinsics", "a", "--image-size", "0x9"), "--image-size: '0x9' is not a picture's size"),
-        (("distortion", "--region", "1,2,3"), "--region: '1,2,3' is not four numbers"),
         (("distortion", "--region", "5,5,1,nan"), "--region: '5,5,1,nan' is not a box"),
     ],
 )
@@ -85,12 +76,6 @@ def test_usage_ends_with_two(calib, words: tuple[str, ...], says: str) -> None:
     assert ended.code == 2
     assert says in ended.err
     assert ended.out == ""
-
-
-def test_version(calib) -> None:
-    ended = calib("--version")
-    assert (ended.code, ended.err) == (0, "")
-    assert ended.out.startswith("calib 0.")
 
 
 def test_a_mistake_of_the_program_is_one_sentence(calib, monkeypatch, tmp_path) -> None:
@@ -147,11 +132,6 @@ def test_json_is_one_document_also_when_the_verdict_is_not_ok(
         document = json.loads(ended.out)
         assert (document["schema"], document["verb"]) == (1, words[0])
     assert calib("board", "-o", tmp_path / "b.pdf", "--json").out.startswith('{\n "schema": 1')
-
-
-def test_json_says_nothing_on_stdout_when_it_fails(calib, tmp_path) -> None:
-    ended = calib("intrinsics", tmp_path, "--json")
-    assert (ended.code, ended.out) == (3, "")
 
 
 def test_narration_goes_to_stderr_without_colour(process, pictures, tmp_path) -> None:
@@ -317,3 +297,72 @@ def test_completion(environment) -> None:
     )
     assert done.stdout.split() == ["radial2", "radial3", "rational8"]
     assert done.stderr == ""
+
+
+def test_whole_installation(capsys: pytest.CaptureFixture[str]) -> None:
+    doctor(quick=True)
+    said = capsys.readouterr().out
+    assert "numpy" in said and said.endswith("verdict: ok\n")
+
+
+def test_missing_library_ends_with_one(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    checks = [Check("numpy", True, False, "-", "sums"), Check("avr-gcc", False, False, "-", "")]
+    monkeypatch.setattr("calib.runner.doctor.examine", lambda quick: checks)
+    with pytest.raises(typer.Exit) as left:
+        doctor(as_json=True)
+    assert left.value.exit_code == 1
+    told = json.loads(capsys.readouterr().out)
+    assert told["gate"] == ["numpy"]
+
+
+def test_page_beside_the_rig_and_elsewhere(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = finished_run(tmp_path)
+    report(rig)
+    page = rig.with_name("report.html")
+    assert page.read_text().startswith("<!doctype html>")
+    assert "report.html: " in capsys.readouterr().out
+    report(rig, tmp_path / "other.html", as_json=True)
+    told = json.loads(capsys.readouterr().out)
+    assert told["verb"] == "report" and told["bytes"] == page.stat().st_size
+    assert (tmp_path / "other.html").read_bytes() == page.read_bytes()
+
+
+def test_what_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="no such file"):
+        report(tmp_path / "rig.yaml")
+    with pytest.raises(BadInputError, match="no folder"):
+        report(tmp_path / "rig.yaml", tmp_path / "none" / "page.html")
+
+
+RIG = """camera: {{model: pinhole, image_size_px: [316, 208], fx_px: {fx}, fy_px: 272.6, cx_px: 160.7,
+  cy_px: 101.9, sigma: {{fx_px: 0.03}}, verdict: ok}}
+"""
+
+
+def test_table_and_document(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    a, b = tmp_path / "a.yaml", tmp_path / "b.yaml"
+    a.write_text(RIG.format(fx=273.4))
+    b.write_text(RIG.format(fx=273.5))
+    diff(a, b)
+    said = capsys.readouterr().out
+    assert "camera.fx_px" in said and "not significant" in said and "2.4" in said
+    assert "nothing beyond the error bars" in said
+    diff(a, b, as_json=True)
+    told = json.loads(capsys.readouterr().out)
+    assert told["significant"] is False and told["plane"] is None
+    assert told["changes"][0]["sigmas"] == pytest.approx(0.1 / (0.03 * 2**0.5))
+
+
+def test_long_lists_are_cut_short_unless_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    a, b = tmp_path / "a.yaml", tmp_path / "b.yaml"
+    for path, value in ((a, 1.0), (b, 2.0)):
+        keys = ", ".join(f"k{i}_m: {value + i}" for i in range(40))
+        path.write_text(f"actuator: {{{keys}}}\n{RIG.format(fx=273.4)}")
+    diff(a, b)
+    assert "20 more (--all shows them)" in capsys.readouterr().out
+    diff(a, b, every=True)
+    assert "k39_m" in capsys.readouterr().out

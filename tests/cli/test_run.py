@@ -1,4 +1,4 @@
-"""`calib run` as a person types it: real verbs in real processes."""
+"""`calib run` as a person types it, and the same bytes whatever threads, processes and hash seeds."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -125,3 +126,58 @@ def test_output_in_the_inputs_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="folder that is read"):
         run(tmp_path, tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["logs"]
+
+
+WAYS: dict[str, tuple[int, int, str, str]] = {
+    "one": (1, 1, "1", "0"),
+    "two": (2, 2, "2", "12345"),
+}
+"""Processors, stages at a time, threads asked of every library, hash seed."""
+LOGS = (("static1", "static", 12.0, 0), ("swing", "swing", 8.0, 1))
+
+
+@pytest.fixture(scope="module")
+def folder_determinism(tmp_path_factory: pytest.TempPathFactory, project_root: Path) -> Path:
+    root = tmp_path_factory.mktemp("rig")
+    shutil.copytree(project_root / "images", root / "images")
+    (root / "logs").mkdir()
+    for name, scenario, seconds, seed in LOGS:
+        made = run_scenario(make_scenario(scenario), SimulatedRig(), seed, "truth", seconds)
+        (root / "logs" / f"{name}.csv").write_text(log_text(log_of(made)))
+    return root
+
+
+def _on(processors: int) -> Callable[[], None]:
+    free = sorted(os.sched_getaffinity(0))[:processors]
+    return lambda: os.sched_setaffinity(0, free)
+
+
+def _run(folder_determinism: Path, out: Path, way: str) -> dict[str, bytes]:
+    """All that a run leaves, results of stages included."""
+    processors, jobs, threads, seed = WAYS[way]
+    names = ("OPENBLAS", "OMP", "MKL", "NUMBA", "VECLIB_MAXIMUM", "NUMEXPR")
+    environment = {**os.environ, **{f"{name}_NUM_THREADS": threads for name in names}, "PYTHONHASHSEED": seed}
+    words = ["run", str(folder_determinism), "-o", str(out), "--jobs", str(jobs)]
+    ended = subprocess.run(
+        [sys.executable, "-c", "from calib.cli.main import main; main()", *words],
+        env=environment, capture_output=True, text=True, check=False, preexec_fn=_on(processors),
+    )  # fmt: skip
+    assert ended.returncode in (0, 1), ended.stderr
+    return {
+        path.relative_to(out).as_posix(): path.read_bytes()
+        for path in sorted(out.rglob("*"))
+        if path.is_file() and path != out / HIDDEN / "lock"
+    }
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="processors are given to a process on Linux only")
+def test_any_number_of_threads_gives_the_same_bytes(folder_determinism: Path, tmp_path: Path) -> None:
+    wanted = _run(folder_determinism, tmp_path / "one", "one")
+    assert {"rig.yaml", "report.html", "firmware/calib_constants.h", "states/swing.csv"} <= set(wanted)
+    # The same folder under another name, with other times.
+    again = tmp_path / "a copy"
+    shutil.copytree(folder_determinism, again, copy_function=shutil.copyfile)
+    found = _run(again, tmp_path / "two", "two")
+    assert set(found) == set(wanted)
+    assert [name for name in wanted if found[name] != wanted[name]] == []

@@ -1,8 +1,11 @@
-"""`calib identify` from the command line: what it writes and says, and how it ends."""
+"""`calib identify, validate, simulate` from the command line: what they write, say and refuse."""
 
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,12 +13,15 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from identifytrials import log_file, pump_records
+from identifytrials import log_file, pump_records, rig_file
 
+from calib.cli.simulate import simulate
+from calib.core.errors import BadInputError, UsageError
+from calib.io.logs import read_log
 from calib.stages.actuator.identify_pump import LAG
 from calib.twin.rig import SimulatedRig
 
-Run = Callable[..., Any]
+from .conftest import Run
 
 
 @pytest.fixture(scope="module")
@@ -195,3 +201,165 @@ def test_springs_from_weights(calib: Run, tmp_path: Path) -> None:
     assert (tmp_path / "f" / "identify_stiffness.png").exists()
     path.write_text("mass_g\n1\n")
     assert calib("identify", "stiffness", path, "--rig", rig).code == 3
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return log_file(tmp_path_factory.mktemp("log") / "swing.csv", SimulatedRig(), "swing", 0, 3.0)
+
+
+def _rig(folder: Path, **sections: Any) -> Path:
+    path = folder / "rig.yaml"
+    rig_file(path, **sections)
+    return path
+
+
+def test_a_log_against_the_original_model_alone(calib: Run, tmp_path: Path, log: Path) -> None:
+    rig = _rig(tmp_path)
+    before = rig.read_bytes()
+    ended = calib("validate", log, "--rig", rig)
+    assert ended.code == 0, ended.err
+    assert "swing.csv: " in ended.out and "from pictures, hoses off" in ended.out
+    assert "phi, rad, original" in ended.out and "phi, rad, nominal" in ended.out
+    assert "improved" not in ended.out and "start by the estimator" in ended.out
+    assert "has no section actuator or pump: the improved model has nominal parameters" in ended.err
+    assert rig.read_bytes() == before
+
+
+def test_both_models_in_one_table_and_figures(calib: Run, tmp_path: Path, log: Path) -> None:
+    rig = _rig(tmp_path, actuator={"stiffness_scale": 0.8, "damping_scale_free_swing": 5.0})
+    drawn = tmp_path / "drawn"
+    ended = calib("validate", log, "--rig", rig, "--figures", drawn, "--json")
+    assert ended.code == 0, ended.err
+    (told,) = json.loads(ended.out)["validate"]["logs"]
+    assert list(told["models"]) == ["original", "nominal", "improved"]
+    # The log is of the nominal rig, so the other parameters are worse.
+    phi = {name: model["phi"] for name, model in told["models"].items()}
+    assert phi["nominal"]["rms_rad"] < 0.02 < phi["improved"]["rms_rad"]
+    assert phi["original"]["rms_rad"] > 3.0 * phi["nominal"]["rms_rad"]
+    assert told["smaller_by_percent"]["nominal"]["phi"] > 60.0
+    ratio = phi["original"]["norm_rad"] / phi["original"]["rms_rad"]
+    assert ratio == pytest.approx(told["poses"] ** 0.5)
+    assert [path.name for path in drawn.iterdir()] == ["validate_model.png"]
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("LOG", "--states", "a.csv", "--states", "b.csv"), "2 files for 1 logs"),
+        (("LOG", "--states", "a.csv", "--truth"), "--truth: takes the true columns"),
+    ],
+)
+def test_options_that_do_not_go_together(
+    calib: Run, tmp_path: Path, log: Path, words: tuple[str, ...], sentence: str
+) -> None:
+    given = [log if word == "LOG" else word for word in words]
+    ended = calib("validate", *given, cwd=tmp_path)
+    assert ended.code == 2 and sentence in ended.sentence
+    assert not list(tmp_path.iterdir())
+
+
+def test_bad_input_is_one_sentence(calib: Run, tmp_path: Path, log: Path) -> None:
+    ended = calib("validate", log, cwd=tmp_path)
+    assert ended.code == 3 and "camera" in ended.sentence
+    rig = _rig(tmp_path, actuator={"stiffness_scale": -1.0})
+    ended = calib("validate", log, "--rig", rig)
+    assert ended.code == 3 and "actuator.stiffness_scale" in ended.sentence
+    short = tmp_path / "short.csv"
+    short.write_text("\n".join(log.read_text().splitlines()[:40]) + "\n")
+    ended = calib("validate", short, "--rig", _rig(tmp_path))
+    assert ended.code == 3 and "short.csv" in ended.sentence
+
+
+SHORT = "0.5s"
+
+
+def _calib(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])}
+    command = [sys.executable, "-c", "from calib.cli.main import main; main()", "simulate", *words]
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+
+
+def test_a_log_and_its_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    simulate("swing", tmp_path / "log.csv", duration="2s")
+    shown = capsys.readouterr()
+    log = read_log(tmp_path / "log.csv")
+    assert len(log) == 120 + 200
+    assert f"swing: 2 s, 320 rows written to {tmp_path / 'log.csv'}" in shown.out
+    assert "damping_ratio 0.055" in shown.out
+    assert "simulated" in shown.err
+
+
+def test_one_json_document(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    simulate(
+        "orientation", tmp_path / "log.csv", 3, "truth", SHORT, ["controller=p", "Kp = 500"], as_json=True
+    )
+    document = json.loads(capsys.readouterr().out)
+    assert (document["schema"], document["verb"]) == (1, "simulate")
+    told = document["simulate"]
+    assert (told["scenario"], told["seed"], told["feedback"]) == ("orientation", 3, "truth")
+    assert (told["rows"], told["duration_s"]) == (80, 0.5)
+    assert told["figures"]["reach_s"] is None
+    assert told["figures"]["peak_rad"] > 0.0
+
+
+def test_the_same_seed_writes_the_same_bytes(tmp_path: Path) -> None:
+    for name, seed in (("a", 7), ("b", 7), ("c", 8)):
+        simulate("orientation", tmp_path / name, seed, duration=SHORT)
+    a, b, c = ((tmp_path / name).read_bytes() for name in "abc")
+    assert a == b != c
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"scenario": "wobble"}, "SCENARIO: 'wobble' is not one of"),
+        ({"duration": "-1s"}, "--duration: '-1s' is not positive"),
+        ({"scenario": "rig", "duration": "1s"}, "--set and --duration do not apply"),
+    ],
+)
+def test_words_that_do_not_fit(tmp_path: Path, arguments: dict[str, object], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        simulate(**{"scenario": "swing", "output": tmp_path / "log.csv", **arguments})
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"settings": ["length_m=-0.065"]}, "expected positive lengths"),
+        ({"duration": "3h"}, "duration: found 10800 s"),
+        ({"rig": Path("none.yaml")}, r"none\.yaml: cannot be read: there is no such file"),
+        ({"output": Path("nowhere/log.csv")}, "there is no folder"),
+    ],
+)
+def test_input_that_cannot_be_used(tmp_path: Path, arguments: dict[str, object], words: str) -> None:
+    with pytest.raises(BadInputError, match=words):
+        simulate(**{"scenario": "swing", "output": tmp_path / "log.csv", **arguments})
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_exit_codes_and_one_sentence_each(tmp_path: Path) -> None:
+    (tmp_path / "mm.yaml").write_text("actuator: {rest_length_m: 65}\n")
+    (tmp_path / "creep.yaml").write_text(
+        "actuator: {lambda1_per_s: -0.1047, lambda2_N_per_m: -14.98, lambda3: -1.854}\n"
+    )
+    (tmp_path / "stiff.yaml").write_text(
+        "actuator: {k0_N_per_m: 100000, k1_N_per_m2: 10000000, mass_kg: 0.0001}\n"
+    )
+    for words, code, sentence in (
+        (("swing", "-o", "log.csv", "--duration", SHORT), 0, "swing: 0.5 s"),
+        (("swing",), 2, "output"),
+        (("wobble", "-o", "x.csv"), 2, "SCENARIO: 'wobble' is not one of"),
+        (("swing", "-o", "x.csv", "--rig", "mm.yaml"), 3, "is it in millimetres?"),
+        (("swing", "-o", "x.csv", "--rig", "creep.yaml"), 3, "make the plant unstable"),
+        (("swing", "-o", "x.csv", "--rig", "stiff.yaml"), 3, "is too large for its stiffness and damping"),
+    ):
+        ended = _calib(tmp_path, *words)
+        assert ended.returncode == code, (words, ended.stderr)
+        assert sentence in ended.stdout + ended.stderr
+        assert "Traceback" not in ended.stderr
+        if code == 3:
+            assert ended.stderr.count("\n") == 1
+    assert not (tmp_path / "x.csv").exists()

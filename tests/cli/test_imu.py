@@ -1,0 +1,590 @@
+"""`calib imu static, intrinsics, drift, tune` from the command line: what they write, say and refuse."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+import yaml
+from armlogs import Arm, swung, write
+from imu_poses import AXES, G, PoseLog, Sensor, in_counts, pose_log, sphere_poses, tilts
+from outside import outside
+
+from calib.cli.imu import intrinsics, static
+from calib.core.errors import BadInputError
+from calib.core.rig import hash_of, read_rig
+from calib.io.logs import log_text, read_log
+from calib.stages.imu.tracks import missing
+from calib.twin.rig import SimulatedRig
+from calib.twin.scenarios import make_scenario, run_scenario
+from calib.twin.simulate import log_of
+
+from .conftest import Run
+
+HEAD = "t_s,gx_radps,gy_radps,gz_radps,ax_mps2,ay_mps2,az_mps2\n"
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Three logs of the simulated rig at rest."""
+    folder = tmp_path_factory.mktemp("logs")
+    plan, paths = make_scenario("static"), []
+    for seed in range(3):
+        path = folder / f"static{seed}.csv"
+        path.write_text(log_text(log_of(run_scenario(plan, SimulatedRig(), seed, "truth", 20.0))))
+        paths.append(path)
+    return paths
+
+
+def _write(path: Path, values: np.ndarray, t_s: np.ndarray | None = None) -> Path:
+    t = 0.01 * np.arange(len(values)) if t_s is None else t_s
+    rows = np.column_stack([t, values]).tolist()
+    path.write_text(HEAD + "".join(",".join(f"{cell:.9g}" for cell in row) + "\n" for row in rows))
+    return path
+
+
+def _at_rest(n: int = 3000) -> np.ndarray:
+    noise = np.array([2e-3] * 3 + [0.02] * 3)
+    return noise * np.random.default_rng(0).normal(size=(n, 6)) + [0.004, -0.003, 0.006, 9.8, 0.2, 0.1]
+
+
+def test_section_table_and_kalibr(
+    logs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig, exported = tmp_path / "rig.yaml", tmp_path / "imu.yaml"
+    rig.write_text("geometry: {workspace_m: [-0.06, 0.04, 0.06, 0.11]}\n")
+    static(logs, imu_yaml=exported, rig=rig)
+    shown = capsys.readouterr()
+    assert "verdict: ok" in shown.out
+    assert "drift of the angle, deg/s" in shown.out
+    after = read_rig(rig)
+    assert after.geometry is not None
+    section = after.imu
+    assert section is not None
+    assert section.gyro_bias_radps[2] == pytest.approx(0.006, abs=5e-4)
+    assert [log.name for log in section.logs] == ["static0.csv", "static1.csv", "static2.csv"]
+    slopes = []
+    for path in logs:
+        log = read_log(path)
+        rows = log.sampled("onchip_phi_rad")
+        slopes.append(np.degrees(np.polyfit(log.t_s[rows], log.columns["onchip_phi_rad"][rows], 1)[0]))
+    assert section.drift["onchip"].mean_degps == pytest.approx(np.mean(slopes), rel=1e-6)
+    assert section.drift["onchip"].spread_degps == pytest.approx(np.std(slopes, ddof=1), rel=1e-6)
+    assert set(after.provenance.inputs["imu"]) == {path.name for path in logs}
+    assert yaml.safe_load(exported.read_text())["update_rate"] == pytest.approx(100.0, rel=1e-4)
+
+
+def test_one_json_document_and_the_same_bytes(
+    logs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("a.yaml", "b.yaml"):
+        static(logs[:1], rig=tmp_path / name, as_json=True)
+    out = capsys.readouterr().out
+    document = json.loads(out[: out.index("\n}\n") + 2])
+    assert (document["schema"], document["verb"]) == (1, "imu static")
+    assert document["imu"]["verdict"] == "ok"
+    assert len(document["imu"]["sigma"]["gyro_bias_radps"]) == 3
+    assert (tmp_path / "a.yaml").read_bytes() == (tmp_path / "b.yaml").read_bytes()
+
+
+def test_motion_is_poor_but_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    values = _at_rest()
+    values[1000:1200, 2] += 0.5 * np.sin(0.1 * np.arange(200))
+    with pytest.raises(typer.Exit) as ending:
+        static([_write(tmp_path / "log.csv", values)], rig=tmp_path / "rig.yaml")
+    assert ending.value.exit_code == 1
+    assert "log.csv: moves from 10.0 to 12.0 s, seen most in gz" in capsys.readouterr().out
+    section = read_rig(tmp_path / "rig.yaml").imu
+    assert section is not None
+    assert section.verdict == "poor"
+    assert section.logs[0].moves_s == [[pytest.approx(10.0, abs=0.05), pytest.approx(12.0, abs=0.05)]]
+
+
+def test_gaps_and_repeated_rows_are_handled_and_reported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    t = 0.01 * np.arange(3000)
+    t[2000:] += 3600.0
+    rows = np.sort(np.concatenate([np.delete(np.arange(3000), [1000, 1001]), np.arange(100, 700, 100)]))
+    static([_write(tmp_path / "log.csv", _at_rest()[rows], t[rows])], rig=tmp_path / "rig.yaml")
+    out = capsys.readouterr().out
+    assert "2 samples missing in 1 gap(s), the longest 30 ms after 9.99 s" in out
+    assert "split at a gap of 3600 s after 19.99 s" in out
+    assert "6 rows (0.20%) repeat the one before; dropped" in out
+
+
+def test_units_are_refused_and_then_converted(tmp_path: Path) -> None:
+    scale = np.array([180.0 / np.pi] * 3 + [1.0 / 9.80665] * 3)
+    path = _write(tmp_path / "log.csv", _at_rest() * scale)
+    with pytest.raises(BadInputError, match="give --acc-unit g"):
+        static([path], rig=tmp_path / "rig.yaml")
+    with pytest.raises(BadInputError, match="give --gyro-unit deg/s"):
+        static([path], acc_unit="g", rig=tmp_path / "rig.yaml")
+    assert not (tmp_path / "rig.yaml").exists()
+    static([path], acc_unit="g", gyro_unit="deg/s", rig=tmp_path / "rig.yaml")
+    section = read_rig(tmp_path / "rig.yaml").imu
+    assert section is not None
+    assert section.gyro_bias_radps[2] == pytest.approx(0.006, abs=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("t_s,u_px\n0,1\n1,2\n", "log.csv: has no IMU"),
+        (HEAD + "0,0,0,0,0,0,9.8\n", "log.csv: has 1 IMU sample"),
+        (HEAD + "".join(f"{i},0,0,0,0,0,0\n" for i in range(200)), "log.csv: all IMU readings are zero"),
+        (HEAD + "".join(f"{i},nan,nan,nan,nan,nan,nan\n" for i in range(200)), "hold no number"),
+        (HEAD + "1,0,0,0,9,1,1\n0,0.1,0,0,9,1,1\n", "log.csv, line 3: t_s goes back"),
+    ],
+)
+def test_bad_input_is_one_sentence(tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "log.csv").write_text(text)
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])}
+    command = [sys.executable, "-c", "from calib.cli.main import main; main()", "imu", "static", "log.csv"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 3
+    assert done.stdout == ""
+    assert words in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert not (tmp_path / "rig.yaml").exists()
+
+
+@pytest.mark.slow
+def test_figures_are_drawn(logs: list[Path], tmp_path: Path) -> None:
+    static(logs[:1], figures=tmp_path / "figures", rig=tmp_path / "rig.yaml")
+    found = sorted(path.name for path in (tmp_path / "figures").iterdir())
+    assert found == ["imu_allan.png", "imu_drift.png", "imu_static_1.png"]
+
+
+def test_a_recording_of_a_real_sensor(shared_data: Path, tmp_path: Path) -> None:
+    path = outside(shared_data / "imufusion" / "sensor_data.csv")
+    table = np.genfromtxt(path, delimiter=",", skip_header=1)[:, :7]
+    rest = table[table[:, 0] - table[0, 0] < 11.0]
+    log = _write(tmp_path / "log.csv", rest[:, 1:], rest[:, 0])
+    static([log], acc_unit="g", gyro_unit="deg/s", rig=tmp_path / "rig.yaml")
+    section = read_rig(tmp_path / "rig.yaml").imu
+    assert section is not None
+    # A sensor of this kind has about 0.01 deg/s/sqrt(Hz).
+    densities = np.degrees([value for value in section.gyro_noise_radps_per_sqrt_Hz if value is not None])
+    assert np.all((densities > 0.003) & (densities < 0.04))
+    assert section.rate_hz == pytest.approx(100.0, rel=1e-3)
+
+
+HEAD_IMU_INTRINSICS = (
+    "t_s," + ",".join(f"{axis}_{'radps' if axis[0] == 'g' else 'mps2'}" for axis in AXES) + "\n"
+)
+
+
+def _write_imu_intrinsics(path: Path, log: PoseLog) -> Path:
+    rows = np.column_stack([log.t_s, log.values]).tolist()
+    path.write_text(
+        HEAD_IMU_INTRINSICS + "".join(",".join(f"{cell:.9g}" for cell in row) + "\n" for row in rows)
+    )
+    return path
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return _write_imu_intrinsics(
+        tmp_path_factory.mktemp("poses") / "poses.csv", pose_log(sphere_poses(24), Sensor())
+    )
+
+
+def test_section_and_table(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = tmp_path / "rig.yaml"
+    rig.write_text("geometry: {workspace_m: [-0.06, 0.04, 0.06, 0.11]}\n")
+    intrinsics(log, gravity=G, rig=rig)
+    out = capsys.readouterr().out
+    for words in (
+        "accel bias, m/s^2",
+        "gyro scale, ratio",
+        "accel zx",
+        "in 24 poses more than 5 degrees apart",
+        "23 turns miss",
+        "verdict: ok",
+    ):
+        assert words in out
+    after = read_rig(rig)
+    assert after.geometry is not None
+    section = after.imu_intrinsics
+    assert section is not None
+    assert section.accel.scale == pytest.approx([1.012, 0.991, 1.006], abs=3e-4)
+    assert section.gyro is not None
+    assert section.gyro.scale == pytest.approx([1.01, 0.985, 0.993], abs=1e-3)
+    assert set(after.provenance.inputs["imu_intrinsics"]) == {"poses.csv"}
+
+
+def test_one_json_document_and_the_same_bytes_in_imu_intrinsics(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("a.yaml", "b.yaml"):
+        intrinsics(log, gravity=G, rig=tmp_path / name, as_json=True)
+    out = capsys.readouterr().out
+    document = json.loads(out[: out.index("\n}\n") + 2])
+    assert (document["schema"], document["verb"]) == (1, "imu intrinsics")
+    assert document["imu_intrinsics"]["verdict"] == "ok"
+    assert len(document["imu_intrinsics"]["accel"]["sigma"]["scale"]) == 3
+    assert (tmp_path / "a.yaml").read_bytes() == (tmp_path / "b.yaml").read_bytes()
+
+
+def test_a_plane_with_its_short_protocol(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    good = _write_imu_intrinsics(
+        tmp_path / "good.csv", pose_log(tilts(np.radians(np.arange(0, 720, 45))), Sensor())
+    )
+    intrinsics(good, gravity=G, planar=True, rig=tmp_path / "rig.yaml")
+    section = read_rig(tmp_path / "rig.yaml").imu_intrinsics
+    assert section is not None
+    assert section.planar
+    assert section.accel.scale[:2] == pytest.approx([1.012, 0.991], abs=5e-4)
+    arc = _write_imu_intrinsics(
+        tmp_path / "arc.csv", pose_log(tilts(np.radians([-30, 0, 30, -20, 20])), Sensor())
+    )
+    with pytest.raises(typer.Exit):
+        intrinsics(arc, gravity=G, planar=True, rig=tmp_path / "rig.yaml")
+    assert "tilt about z by 45 degrees at a time" in capsys.readouterr().out
+
+
+def test_units_are_refused_and_then_converted_in_imu_intrinsics(tmp_path: Path) -> None:
+    log = pose_log(sphere_poses(24), Sensor())
+    scale = np.array([180.0 / np.pi] * 3 + [1.0 / 9.80665] * 3)
+    path = _write_imu_intrinsics(tmp_path / "log.csv", PoseLog("log", AXES, log.t_s, log.values * scale))
+    rig = tmp_path / "rig.yaml"
+    with pytest.raises(BadInputError, match="give --acc-unit g"):
+        intrinsics(path, rig=rig)
+    with pytest.raises(BadInputError, match="give --gyro-unit deg/s"):
+        intrinsics(path, acc_unit="g", rig=rig)
+    assert not rig.exists()
+    intrinsics(path, gravity=G, acc_unit="g", gyro_unit="deg/s", rig=rig)
+    section = read_rig(rig).imu_intrinsics
+    assert section is not None
+    assert section.accel.scale == pytest.approx([1.012, 0.991, 1.006], abs=3e-4)
+
+
+def test_counts_gaps_and_repeated_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = pose_log(sphere_poses(30), in_counts(Sensor()), counts=True)
+    t = log.t_s.copy()
+    t[6350:] += 3600.0
+    rows = np.sort(np.concatenate([np.delete(np.arange(len(t)), [900, 901]), np.arange(100, 700, 20)]))
+    path = _write_imu_intrinsics(tmp_path / "log.csv", PoseLog("log", AXES, t[rows], log.values[rows]))
+    intrinsics(path, gravity=G, acc_unit="counts", gyro_unit="counts", rig=tmp_path / "rig.yaml")
+    out = capsys.readouterr().out
+    assert "accel scale, counts per m/s^2" in out
+    assert "2 samples missing in 1 gap(s), the longest 30 ms after 8.99 s" in out
+    assert "split at a gap of 3600 s after 63.49 s" in out
+    assert "30 rows (0.18%) repeat the one before; dropped" in out
+    section = read_rig(tmp_path / "rig.yaml").imu_intrinsics
+    assert section is not None
+    assert section.gyro is not None
+    assert section.gyro.scale == pytest.approx((4800.0 * Sensor().gyro_scale).tolist(), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("t_s,u_px\n0,1\n1,2\n", "log.csv: has no IMU"),
+        (HEAD_IMU_INTRINSICS + "0,0,0,0,0,0,9.8\n", "log.csv: has 1 IMU sample"),
+        (
+            HEAD_IMU_INTRINSICS + "".join(f"{i},0,0,0,0,0,0\n" for i in range(200)),
+            "log.csv: all IMU readings are zero",
+        ),
+        (
+            HEAD_IMU_INTRINSICS + "".join(f"{i},nan,nan,nan,nan,nan,nan\n" for i in range(200)),
+            "hold no number",
+        ),
+        (
+            HEAD_IMU_INTRINSICS + "".join(f"{i},0,0,0.{i},9.{i},1,1.{i}\n" for i in range(9)),
+            "gx is stuck at 0",
+        ),
+        (HEAD_IMU_INTRINSICS + "1,0,0,0,9,1,1\n0,0.1,0,0,9,1,1\n", "log.csv, line 3: t_s goes back"),
+    ],
+)
+def test_bad_input_is_one_sentence_in_imu_intrinsics(tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "log.csv").write_text(text)
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])}
+    program = "from calib.cli.main import main; main()"
+    command = [sys.executable, "-c", program, "imu", "intrinsics", "log.csv"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 3
+    assert done.stdout == ""
+    assert words in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert not (tmp_path / "rig.yaml").exists()
+
+
+def test_the_recording_of_imu_tk_with_figures(
+    shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = outside(shared_data / "imu_tk")
+    intrinsics(
+        accel=folder / "xsens_acc.mat.gz",
+        gyro=folder / "xsens_gyro.mat.gz",
+        gravity=9.81744,
+        acc_unit="counts",
+        gyro_unit="counts",
+        rig=tmp_path / "rig.yaml",
+        figures=tmp_path / "figures",
+    )
+    out = capsys.readouterr().out
+    assert "verdict: ok" in out
+    assert "the gyroscope's bias follows the pose" in out
+    section = read_rig(tmp_path / "rig.yaml").imu_intrinsics
+    assert section is not None
+    assert section.accel.scale == pytest.approx([414.42, 412.05, 414.61], rel=1e-3)
+    assert section.accel.rms_mps2 is not None
+    assert section.accel.rms_mps2 <= 0.00165
+    assert {path.name for path in (tmp_path / "figures").iterdir()} == {"imu_poses.png", "imu_residuals.png"}
+
+
+@pytest.fixture(scope="module")
+def logs_imu_drift(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Two logs at rest and one in motion of the simulated rig."""
+    folder = tmp_path_factory.mktemp("logs")
+    out = {}
+    for name, scenario, seed in (("a", "static", 0), ("b", "static", 1), ("moves", "chirp", 0)):
+        run = run_scenario(make_scenario(scenario), SimulatedRig(), seed, "truth", 20.0)
+        out[name] = folder / f"{name}.csv"
+        out[name].write_text(log_text(log_of(run)))
+    return out
+
+
+def test_the_table_and_what_it_warns_of(calib: Run, logs_imu_drift: dict[str, Path], tmp_path: Path) -> None:
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(
+        "orientation_filter: {Kp_per_s: 1.0, Ki_per_s2: 0.25, rate_hz: 100.0, recommended: tuned, "
+        "recommended_by: reference, verdict: ok}\n"
+    )
+    before = rig.read_bytes()
+    ended = calib("imu", "drift", *logs_imu_drift.values(), "--no-peers", "--rig", rig)
+    assert ended.code == 0
+    assert "a slope alone does not rank filters" in ended.out
+    assert "rejects a constant gyro bias entirely" in ended.out
+    assert "slope over the logs, deg/s" in ended.out
+    for name in ("on the chip", "gyroscope alone", "accelerometer alone", "MM tuned", "with up vector"):
+        assert name in ended.out
+    assert rig.read_bytes() == before
+    assert "moves.csv: 20 s at 100 Hz" in ended.out
+
+
+def test_one_json_document(calib: Run, logs_imu_drift: dict[str, Path], tmp_path: Path) -> None:
+    words = ("imu", "drift", *logs_imu_drift.values(), "--no-peers", "--json", "--rig", tmp_path / "rig.yaml")
+    ended = calib(*words)
+    assert ended.code == 0
+    document = json.loads(ended.out)
+    assert (document["schema"], document["verb"]) == (1, "imu drift")
+    section = document["drift"]
+    assert section["provenance"]["inputs"] == {path.name: hash_of(path) for path in logs_imu_drift.values()}
+    rest, _, moves = section["logs"]
+    # The simulated gyroscope has a bias of about 0.006 rad/s, the chip drifts by about 0.145 degrees/s.
+    assert rest["methods"]["gyroscope alone"]["slope_degps"] == pytest.approx(-0.35, abs=0.03)
+    assert 0.02 < rest["methods"]["on the chip"]["slope_degps"] < 0.4
+    low, high = rest["methods"]["MM 3/3"]["interval_degps"]
+    assert low < 0.0 < high
+    assert rest["methods"]["MM 3/3"]["allan_100s_deg"] is None
+    assert rest["methods"]["MM 3/3"]["rmse_deg"] is None
+    assert 0.0 < moves["methods"]["MM 3/3"]["rmse_deg"] < moves["methods"]["accelerometer alone"]["rmse_deg"]
+    assert moves["methods"]["gyroscope alone"]["lag_ms"] == pytest.approx(-5.0, abs=2.0)
+    assert any("no section orientation_filter" in sentence for sentence in rest["skipped"])
+    spread = section["methods"]["gyroscope alone"]
+    slopes = [log["methods"]["gyroscope alone"]["slope_degps"] for log in section["logs"]]
+    assert spread["mean_degps"] == pytest.approx(np.mean(slopes))
+    assert spread["spread_degps"] == pytest.approx(np.std(slopes, ddof=1))
+    assert calib(*words).out == ended.out
+    assert not (tmp_path / "rig.yaml").exists()
+
+
+def test_filters_of_others_run_on_the_same_log(
+    calib: Run, logs_imu_drift: dict[str, Path], tmp_path: Path
+) -> None:
+    ended = calib("imu", "drift", logs_imu_drift["moves"], "--json", "--rig", tmp_path / "rig.yaml")
+    methods = json.loads(ended.out)["drift"]["logs"][0]["methods"]
+    skipped = json.loads(ended.out)["drift"]["logs"][0]["skipped"]
+    for name in ("Mahony", "Madgwick", "imufusion", "VQF"):
+        if missing(name):
+            assert any(sentence.startswith(f"{name}: the package") for sentence in skipped)
+        else:
+            assert methods[name]["rmse_deg"] < methods["accelerometer alone"]["rmse_deg"]
+            assert f"running {name}" in ended.err
+
+
+@pytest.mark.slow
+def test_figures_are_drawn_in_imu_drift(calib: Run, logs_imu_drift: dict[str, Path], tmp_path: Path) -> None:
+    words = ("imu", "drift", *logs_imu_drift.values(), "--no-peers", "--rig", tmp_path / "rig.yaml")
+    assert calib(*words, "--figures", tmp_path / "figures").code == 0
+    found = sorted(path.name for path in (tmp_path / "figures").iterdir())
+    assert found == ["drift_angles.png", "drift_motion_3.png", "drift_slopes.png"]
+
+
+def test_repeats_and_gaps_are_handled_and_reported(calib: Run, tmp_path: Path) -> None:
+    t = 0.01 * np.arange(3000)
+    t[2000:] += 3600.0
+    rows = np.sort(np.concatenate([np.delete(np.arange(3000), [1000]), np.arange(100, 700, 100)]))
+    log = _write(tmp_path / "log.csv", _at_rest()[rows], t[rows])
+    ended = calib("imu", "drift", log, "--no-peers", "--rig", tmp_path / "rig.yaml")
+    assert ended.code == 0
+    assert "1 samples missing in 1 gap(s), the longest 20 ms after 9.99 s" in ended.out
+    assert "split at a gap of 3600 s after 19.99 s" in ended.out
+    assert "6 rows (0.20%) repeat the one before; dropped" in ended.out
+    # The gyroscope alone is begun anew after the hour.
+    line = next(line for line in ended.out.splitlines() if "gyroscope alone" in line)
+    assert float(line.split()[3]) == pytest.approx(-0.34, abs=0.03)
+
+
+def test_units_are_named_and_converted(calib: Run, tmp_path: Path) -> None:
+    scale = np.array([180.0 / np.pi] * 3 + [1.0 / 9.80665] * 3)
+    log = _write(tmp_path / "log.csv", _at_rest() * scale)
+    words = ("imu", "drift", log, "--no-peers", "--rig", tmp_path / "rig.yaml")
+    ended = calib(*words)
+    assert (ended.code, "so it is in g" in ended.sentence) == (3, True)
+    assert "give --acc-unit g" in ended.sentence
+    ended = calib(*words, "--acc-unit", "g")
+    assert ended.code == 3
+    assert "give --gyro-unit deg/s" in ended.sentence
+    ended = calib(*words, "--acc-unit", "g", "--gyro-unit", "deg/s", "--json")
+    slope = json.loads(ended.out)["drift"]["logs"][0]["methods"]["gyroscope alone"]["slope_degps"]
+    assert slope == pytest.approx(-np.degrees(0.006), abs=0.02)
+
+
+_STUCK = HEAD + "".join(f"{i / 100},0,0,{i % 7 / 1000},9.8,0.2,{i % 5 / 10}\n" for i in range(500))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("t_s,u_px\n0,1\n1,2\n", "log.csv: has no IMU"),
+        (HEAD + "0,0,0,0,0,0,9.8\n", "log.csv: has 1 IMU sample"),
+        (HEAD + "".join(f"{i},0,0,0,0,0,0\n" for i in range(200)), "log.csv: all IMU readings are zero"),
+        (_STUCK, "log.csv: ax never changes, it is stuck at 9.8"),
+        (HEAD + "".join(f"{i},nan,nan,nan,nan,nan,nan\n" for i in range(200)), "has no readings in gz_radps"),
+        (HEAD + "1,0,0,0,9,1,1\n0,0.1,0,0,9,1,1\n", "log.csv, line 3: t_s goes back"),
+        (HEAD + "0,0,0,0,9.8,0,0\n0.01,0,0,0.01,9.81,0.1,0\n", "log.csv: is 0.02 s long"),
+    ],
+)
+def test_bad_input_is_one_sentence_in_imu_drift(calib: Run, tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "log.csv").write_text(text)
+    ended = calib("imu", "drift", "log.csv", cwd=tmp_path)
+    assert ended.code == 3
+    assert ended.out == ""
+    assert words in ended.sentence
+    assert not (tmp_path / "rig.yaml").exists()
+
+
+def test_table_section_and_json(calib: Run, tmp_path: Path) -> None:
+    log, rig = write(tmp_path / "arm.csv", swung(0)), tmp_path / "rig.yaml"
+    said = calib("imu", "tune", log, "--rig", rig)
+    assert said.code == 0
+    for words in ("recommended: tuned", "held-out error, deg", "poles", "judged by truth", "verdict: ok"):
+        assert words in said.out
+    section = read_rig(rig).orientation_filter
+    assert section is not None
+    assert section.recommended_by == "reference"
+    tuned, three = section.candidates["tuned"], section.candidates["3/3"]
+    assert (section.Kp_per_s, section.Ki_per_s2) == (tuned.Kp_per_s, tuned.Ki_per_s2)
+    assert tuned.rmse_deg is not None
+    assert three.rmse_deg is not None
+    assert tuned.rmse_deg < 0.6 * three.rmse_deg
+    assert tuned.interval_deg is not None
+    assert tuned.interval_deg[0] < tuned.rmse_deg < tuned.interval_deg[1]
+    assert set(read_rig(rig).provenance.inputs["orientation_filter"]) == {"arm.csv"}
+    other = tmp_path / "other.yaml"
+    document = json.loads(calib("imu", "tune", log, "--rig", other, "--json").out)
+    assert (document["schema"], document["verb"]) == (1, "imu tune")
+    assert document["orientation_filter"]["reasons"] == section.reasons
+    assert other.read_bytes() == rig.read_bytes()
+
+
+def test_without_a_reference_and_with_figures(calib: Run, tmp_path: Path) -> None:
+    log = write(tmp_path / "arm.csv", swung(1), truth=False)
+    folder = tmp_path / "figures"
+    said = calib("imu", "tune", log, "--rig", tmp_path / "rig.yaml", "--figures", folder)
+    assert said.code == 0
+    assert "recommended: tuned" in said.out
+    assert "judged by their own smoothed angle" in said.out
+    assert sorted(path.name for path in folder.iterdir()) == ["tune_errors.png", "tune_gains.png"]
+
+
+def test_the_cameras_angle_of_a_simulated_rig(calib: Run, rig: Path, tmp_path: Path) -> None:
+    log = tmp_path / "o.csv"
+    assert calib("simulate", "orientation", "-o", log, "--rig", rig, "--duration", "15s").code == 0
+    said = calib("imu", "tune", log, "--rig", rig, "--reference", "camera")
+    assert said.code == 0
+    assert "judged by camera" in said.out
+    section = read_rig(rig).orientation_filter
+    assert section is not None
+    lag = section.logs[0].reference_lag_s
+    assert lag is not None
+    assert 0.01 < lag < 0.05
+    assert {"camera", "plane", "o.csv"} <= set(read_rig(rig).provenance.inputs["orientation_filter"])
+
+
+@pytest.fixture
+def arm() -> Arm:
+    return swung(0)
+
+
+def _refused(calib: Run, path: Path, *words: str) -> str:
+    ended = calib("imu", "tune", path, "--rig", path.parent / "rig.yaml", *words)
+    assert ended.code == 3
+    assert ended.out == ""
+    assert not (path.parent / "rig.yaml").exists()
+    return ended.sentence
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("t_s,u_px\n0,1\n1,2\n", "log.csv: has no IMU"),
+        ("t_s,ax_mps2,ay_mps2\n0,9,1\n1,9,2\n", "has no readings in gz_radps"),
+        ("t_s,ax_mps2,ay_mps2,gz_radps\n0,9.8,0,0\n", "log.csv: has 1 IMU sample"),
+        (
+            "t_s,ax_mps2,ay_mps2,gz_radps\n" + "".join(f"{i},0,0,0\n" for i in range(99)),
+            "log.csv: all IMU readings are zero",
+        ),
+        (
+            "t_s,ax_mps2,ay_mps2,gz_radps\n" + "".join(f"{i},nan,nan,nan\n" for i in range(99)),
+            "log.csv: has no readings in",
+        ),
+        ("t_s,ax_mps2,ay_mps2,gz_radps\n1,9.8,0,0.1\n0,9.7,0.1,0\n", "log.csv, line 3: t_s goes back"),
+    ],
+)
+def test_what_is_no_log_of_an_imu(calib: Run, tmp_path: Path, text: str, words: str) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(text)
+    assert words in _refused(calib, path)
+
+
+def test_units_are_refused_and_then_converted_in_imu_tune(calib: Run, arm: Arm, tmp_path: Path) -> None:
+    scaled = replace(arm, ax=arm.ax / 9.80665, ay=arm.ay / 9.80665, gz=np.degrees(arm.gz))
+    path = write(tmp_path / "log.csv", scaled)
+    assert "give --acc-unit g" in _refused(calib, path)
+    assert "give --gyro-unit deg/s" in _refused(calib, path, "--acc-unit", "g")
+    rig = tmp_path / "converted.yaml"
+    units = ("--acc-unit", "g", "--gyro-unit", "deg/s")
+    assert calib("imu", "tune", path, "--rig", rig, *units).code == 0
+    plain = tmp_path / "plain.yaml"
+    assert calib("imu", "tune", write(tmp_path / "si.csv", arm), "--rig", plain).code == 0
+    one, other = read_rig(rig).orientation_filter, read_rig(plain).orientation_filter
+    assert one is not None
+    assert other is not None
+    assert one.Kp_per_s == pytest.approx(other.Kp_per_s, rel=1e-3)
+
+
+def test_duplicates_a_short_gap_and_an_hour(calib: Run, arm: Arm, tmp_path: Path) -> None:
+    rows = np.arange(3000)
+    rows = np.sort(np.concatenate([np.delete(rows, [700, 701]), [200, 500, 900, 1300, 1700, 2500]]))
+    t = arm.t_s.copy()
+    t[1500:] += 3600.0
+    path = write(tmp_path / "log.csv", replace(arm, t_s=t), rows=rows)
+    ended = calib("imu", "tune", path, "--rig", tmp_path / "rig.yaml")
+    assert ended.code == 0
+    assert "6 rows (0.20%) repeat the one before; dropped" in ended.err
+    assert "2 samples missing in 1 gaps, the longest of 0.03 s at 6.99 s; filled" in ended.err
+    assert "split at a gap of 3600 s after 14.99 s" in ended.err
+    assert "30 s in 2 piece(s)" in ended.out
+    assert "recommended: tuned" in ended.out

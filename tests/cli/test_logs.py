@@ -1,0 +1,300 @@
+"""`calib convert, lowpass, record` from the command line: what they write, say and refuse."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bags import readings, write_bag
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from calib.core.rig import hash_of, identity, read_rig
+from calib.io.logs import MEASURED, Log, read_log, write_log
+from calib.io.serial import Frame, encoded
+from calib.stages.firmware.header import Header, header_of, identity_of
+from calib.stages.firmware.vectors import vectors
+
+from .conftest import Run
+
+
+def test_a_bag_becomes_a_table(calib: Run, tmp_path: Path) -> None:
+    bag, out = write_bag(tmp_path, "folder", readings(np.random.default_rng(0))), tmp_path / "log.csv"
+    topics = tmp_path / "mine.yaml"
+    topics.write_text("topics:\n  /imu/data: imu\n")
+    ended = calib("convert", bag, "-o", out, "--topics", topics, "--json")
+    assert ended.code == 0
+    told = json.loads(ended.out)["convert"]
+    assert told["rows"] == 100 and told["left_out"] == ["/marker", "/pwm"] and not told["truncated"]
+    assert list(read_log(out).columns) == told["columns"] == list(MEASURED[2:8])
+    assert "left out: /marker, /pwm" in calib("convert", bag, "-o", out, "--topics", topics).err
+
+
+@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_a_table_comes_back(
+    calib: Run, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    """CSV to Parquet and back gives the same bytes."""
+    count = data.draw(st.integers(1, 8))
+    names = data.draw(st.lists(st.sampled_from(MEASURED), unique=True, max_size=4))
+    cell = st.one_of(st.just(float("nan")), st.floats(-1e6, 1e6, allow_subnormal=False))
+    columns = {name: np.array(data.draw(st.lists(cell, min_size=count, max_size=count))) for name in names}
+    t_s = np.cumsum(data.draw(st.lists(st.integers(0, 10**7), min_size=count, max_size=count))) * 1e-6
+    folder = tmp_path_factory.mktemp("convert")
+    first, table, last = folder / "a.csv", folder / "b.parquet", folder / "c.csv"
+    write_log(first, Log("x", t_s, columns, np.arange(count)))
+    assert calib("convert", first, "-o", table).code == 0
+    assert calib("convert", table, "-o", last).code == 0
+    assert first.read_bytes() == last.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "code", "words"),
+    [
+        ("t_s,gz_radps\n", "out.csv", 3, "has a header but no rows"),
+        ("t_s,gz_radps\n0,1\n", "out.mcap", 2, "expected a name that ends in .csv or .parquet"),
+        ("t_s,gz_radps\n0,x\n", "out.csv", 3, "line 2: gz_radps is 'x', expected a number"),
+    ],
+)
+def test_what_cannot_be_converted(
+    calib: Run, tmp_path: Path, text: str, name: str, code: int, words: str
+) -> None:
+    log = tmp_path / "log.csv"
+    log.write_text(text)
+    ended = calib("convert", log, "-o", tmp_path / name)
+    assert ended.code == code and words in ended.err
+    assert [item.name for item in tmp_path.iterdir()] == ["log.csv"]
+
+
+def test_nothing_of_the_input_but_numbers_reaches_the_table(calib: Run, tmp_path: Path) -> None:
+    """Names of columns and cells that a spreadsheet would take for formulas stay behind."""
+    log, out = tmp_path / "log.csv", tmp_path / "out.csv"
+    log.write_text('t_s,"=cmd|\' /C calc\'!A0",@SUM(A1),gz_radps,\t+1\n0,=1+1,-2,-0.5,"=HYPERLINK(1)"\n')
+    assert calib("convert", log, "-o", out).code == 0
+    assert out.read_text() == "t_s,gz_radps\n0.000000,-0.5\n"
+    for cell in ("=1", "@1", "+1+1", "'1"):
+        log.write_text(f"t_s,gz_radps\n0,{cell}\n")
+        assert calib("convert", log, "-o", out).code == 3
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A minute at 60 Hz: slow motion, jitter, whole pixels."""
+    t = np.arange(3600) / 60.0
+    noise = np.random.default_rng(7).normal(size=(2, 3600))
+    u = np.round(158 + 40 * np.sin(0.6 * t) + 0.4 * noise[0])
+    v = np.round(100 + 10 * np.cos(0.6 * t) + 0.4 * noise[1])
+    path = tmp_path_factory.mktemp("logs") / "log.csv"
+    write_log(path, Log("log.csv", t, {"u_px": u, "v_px": v}, np.arange(3600)))
+    return path
+
+
+def test_the_nominal_filter(calib: Run, tmp_path: Path) -> None:
+    ended = calib("lowpass", "--cutoff", "1Hz", "--rate", "60Hz", cwd=tmp_path)
+    assert ended.code == 0
+    assert "butterworth, order 1: 1 Hz at 60 Hz" in ended.out
+    assert "b1 = 0.049797982, 0.049797982, 0" in ended.out
+    assert "delay: 0.1590 s for slow motion" in ended.out
+    assert "verdict: ok" in ended.out
+    section = read_rig(tmp_path / "rig.yaml").lowpass
+    assert section is not None
+    assert section.dc_delay_s == pytest.approx(0.159, abs=5e-4)
+
+
+def test_one_json_document_and_the_same_bytes(calib: Run, tmp_path: Path) -> None:
+    words = ("lowpass", "--order", "2", "--json")
+    first = calib(*words, cwd=tmp_path)
+    text = (tmp_path / "rig.yaml").read_bytes()
+    again = calib(*words, cwd=tmp_path)
+    assert first.out == again.out
+    assert (tmp_path / "rig.yaml").read_bytes() == text
+    told = json.loads(first.out)
+    assert (told["schema"], told["verb"]) == (1, "lowpass")
+    assert told["lowpass"]["dc_delay_s"] == pytest.approx(0.225, abs=5e-4)
+
+
+def test_a_suggestion_in_pixels_with_figures(calib: Run, tmp_path: Path, log: Path) -> None:
+    ended = calib("lowpass", "--suggest", log, "--jitter", "0.1px", "--figures", "drawn", cwd=tmp_path)
+    assert ended.code == 0, ended.err
+    assert "least delay for a jitter of 0.1 px" in ended.out
+    assert "taken" in ended.out
+    section = read_rig(tmp_path / "rig.yaml").lowpass
+    assert section is not None and section.log is not None
+    assert 0.09 < max(axis.jitter_after for axis in section.log.axes.values()) < 0.102
+    assert {path.name for path in (tmp_path / "drawn").iterdir()} == {
+        "lowpass_log.png",
+        "lowpass_response.png",
+    }
+    provenance = read_rig(tmp_path / "rig.yaml").provenance.inputs["lowpass"]
+    assert provenance == {"log.csv": hash_of(log)}
+
+
+def test_millimetres_with_a_plane(calib: Run, rig: Path, log: Path) -> None:
+    ended = calib("lowpass", "--log", log, "--rig", rig)
+    assert ended.code == 0, ended.err
+    assert "jitter, mm" in ended.out
+    after = read_rig(rig)
+    assert after.camera is not None and after.plane is not None and after.lowpass is not None
+    assert after.provenance.inputs["lowpass"] == {
+        "camera": identity(after.camera),
+        "log.csv": hash_of(log),
+        "plane": identity(after.plane),
+    }
+    ended = calib("lowpass", "--suggest", log, "--jitter", "0.1px", "--rig", rig)
+    assert ended.code == 2
+    assert ended.sentence == "--jitter: '0.1px' does not fit positions in millimetres"
+    assert read_rig(rig).lowpass == after.lowpass
+
+
+def test_a_poor_filter_is_written_and_says_so(calib: Run, tmp_path: Path) -> None:
+    ended = calib("lowpass", "--cutoff", "0.01Hz", "--order", "2", cwd=tmp_path)
+    assert ended.code == 1
+    assert "verdict: poor" in ended.out
+    section = read_rig(tmp_path / "rig.yaml").lowpass
+    assert section is not None and section.verdict == "poor"
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("--cutoff", "31Hz"), "the cut-off is 31 Hz at 60 samples/s"),
+        (("--cutoff=-1Hz",), "--cutoff: '-1Hz' is not positive"),
+        (("--order", "0"), "the order is 0, expected 1 to 8"),
+        (("--suggest", "LOG", "--jitter", "0.1"), "--jitter: '0.1' has no unit"),
+        (("--suggest", "LOG", "--jitter", "0.1mm"), "does not fit positions in pixels, without a plane"),
+    ],
+)
+def test_words_that_do_not_fit(
+    calib: Run, tmp_path: Path, log: Path, words: tuple[str, ...], sentence: str
+) -> None:
+    ended = calib("lowpass", *(log if word == "LOG" else word for word in words), cwd=tmp_path)
+    assert ended.code == 2
+    assert sentence in ended.sentence
+    assert not (tmp_path / "rig.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("t_s,ax_mps2\n0,1\n1,1\n", "log.csv: has no columns u_px and v_px"),
+        ("t_s,u_px,v_px\n1,1,1\n0,1,1\n", "log.csv, line 3: t_s goes back"),
+        ("t_s,u_px,v_px\n0,1,1\n0.1,1,1\n", "log.csv: has 10 camera samples/s, expected the 60 Hz"),
+        ("t_s,u_px,v_px\n", "log.csv: has a header but no rows"),
+    ],
+)
+def test_logs_that_cannot_be_used(calib: Run, tmp_path: Path, text: str, sentence: str) -> None:
+    (tmp_path / "log.csv").write_text(text)
+    ended = calib("lowpass", "--suggest", "log.csv", "--jitter", "0.1px", cwd=tmp_path)
+    assert ended.code == 3
+    assert sentence in ended.sentence
+    assert not (tmp_path / "rig.yaml").exists()
+
+
+serial = pytest.importorskip("serial")
+
+
+def _stream(header: Header, ticks: int = 90) -> bytes:
+    identity, out = int(identity_of(header)[:8], 16), b"\x00\xa5\x5a\x4ehalf a frame"
+    for k, vector in enumerate(vectors(header, ticks)):
+        w = vector.wanted
+        frame = Frame(
+            identity, 60000, k, vector.given, w.phi_rad, w.marker_m, w.head_m, w.q_m, w.pwm, w.flags
+        )
+        out += encoded(frame)
+        if k % 20 == 10:
+            out += b"\xa5\xa5\x5a\xff noise"
+    return out
+
+
+@pytest.fixture
+def board(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[bytes], str]]:
+    """A pseudo-terminal whose other end sends a stream in portions, once it has been opened; its name."""
+    opened = threading.Event()
+
+    class Port(serial.Serial):
+        def __init__(self, *words: object, **more: object) -> None:
+            super().__init__(*words, **more)
+            opened.set()
+
+    monkeypatch.setattr(serial, "Serial", Port)
+    ends: list[int] = []
+    threads: list[threading.Thread] = []
+
+    def plug(stream: bytes) -> str:
+        master, slave = pty.openpty()
+        tty.setraw(slave)
+        ends.extend((master, slave))
+
+        def send() -> None:
+            # Opening a port throws away what came before.
+            opened.wait(30.0)
+            left = stream
+            while left:
+                # A terminal may take a part only.
+                left = left[os.write(master, left[:200]) :]
+                time.sleep(0.002)
+
+        threads.append(threading.Thread(target=send, daemon=True))
+        threads[-1].start()
+        return os.ttyname(slave)
+
+    yield plug
+    for thread in threads:
+        thread.join(5.0)
+    for end in ends:
+        os.close(end)
+
+
+def test_a_board_is_recorded_and_checked(calib, rig: Path, tmp_path: Path, board) -> None:
+    header = header_of(read_rig(rig), "rig.yaml")
+    log = tmp_path / "log.csv"
+    ended = calib("record", board(_stream(header)), "-o", log, "--ticks", "90", "--duration", "30s", "--json")
+    assert ended.code == 0, ended.err
+    told = json.loads(ended.out)["record"]
+    assert (told["ticks"], told["lost"], told["restarts"]) == (90, 0, 0)
+    assert told["bytes_skipped"] > 0
+    # A log like any other.
+    known = read_log(log)
+    assert len(known) == 90
+    assert {"u_px", "ax_mps2", "gz_radps", "pwm1"} <= set(known.columns)
+    ended = calib("firmware", "--check", log, "--rig", rig)
+    assert ended.code == 0, ended.err
+    assert "90 ticks compared" in ended.out
+    assert "verdict: ok" in ended.out
+
+
+def test_a_board_that_computes_something_else_fails(calib, rig: Path, tmp_path: Path, board) -> None:
+    header = header_of(read_rig(rig), "rig.yaml")
+    log = tmp_path / "log.csv"
+    assert calib("record", board(_stream(header)), "-o", log, "--ticks", "90", "--duration", "30s").code == 0
+    lines = log.read_text().splitlines()
+    names = lines[0].split(",")
+    cells = lines[20].split(",")
+    cells[names.index("board_q1_m")] = "0.1"
+    lines[20] = ",".join(cells)
+    log.write_text("\n".join(lines) + "\n")
+    ended = calib("firmware", "--check", log, "--rig", rig, "--json")
+    assert ended.code == 1
+    assert json.loads(ended.out)["check"]["gate"] == ["tick 19 is the first that differs, in q_m"]
+
+
+def test_a_port_that_is_not_there(calib, tmp_path: Path) -> None:
+    ended = calib("record", tmp_path / "ttyNone", "-o", tmp_path / "log.csv")
+    assert ended.code == 3
+    assert "ttyNone: cannot be opened" in ended.sentence
+
+
+def test_a_port_that_says_nothing_of_use(calib, tmp_path: Path, board) -> None:
+    ended = calib("record", board(b"hello " * 100), "-o", tmp_path / "log.csv", "--duration", "0.5s")
+    assert ended.code == 3
+    assert "no frame came, expected the example sketch at 115200 baud" in ended.sentence
+    assert not (tmp_path / "log.csv").exists()
