@@ -1,0 +1,333 @@
+"""The time axis of a log: when its samples were taken, from time stamps that are measurements of a clock.
+
+A sensor takes sample k at o + k T + w(k), where w wanders slowly. A stamp adds jitter to that, samples go
+missing, and a sample that waited in a buffer bears the stamp of the one before it. Three things follow
+from the stamps, in this order.
+
+Places k. The samples missing before the i-th one, k - i, can only grow, and are the running median of
+round((t_i - o) / T) - i. Chunk by chunk is counted on from the line through those just before it, so that
+the count is held to the stamps: one late stamp adds no sample, however many there are. Where samples come in
+bursts, as from a buffer that is read now and then, the count goes by bursts, of which the last sample is
+the freshest.
+
+Wander w. Deviations of the stamps from the line are averaged over blocks of W samples. Jitter asks for long
+blocks and a clock that wanders, or a loop whose delays add up, for short ones; W is where the means of
+neighbouring blocks differ least (Allan's variance of two samples). Where single stamps are better than any
+mean, W is 1, and the times are the stamps. Where the means differ as jitter alone makes them, by the variance
+of one sample over W, nothing wanders.
+
+Steadiness. Stamps that stay within a quarter of a period of their line are a steady sensor's. Those of others
+stay as they are, and their samples are counted without gaps.
+
+So the axis spans what the stamps span, and no sample is moved by more than the jitter of its stamp. Gaps of
+more than `SPLIT_S` cut the axis into stretches, each with its own line.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.optimize import isotonic_regression
+
+from calib.core.arrays import FloatArray, IntArray
+
+SPLIT_S = 1.0
+"""Gaps that are longer are not filled."""
+
+_FIRST, _CHUNK, _RECENT = 32, 256, 512
+_FAR = 5.0
+_BLOCKS = (1, 2, 5, 10, 20, 50, 100, 300)
+"""Lengths of blocks that the wander may be averaged over."""
+_SURE = 8.0
+"""Standard deviations, about, by which blocks' means must be further apart than jitter makes them."""
+_NEGLIGIBLE_S = 2e-6
+_LEAST_SAMPLES = 8
+_UNEVEN = 0.25
+"""Deviation of the stamps of a steady sensor, in periods, at most."""
+_LATE = 0.05
+"""Stamps of a short stretch that may be off by more than half a period."""
+_WINDOW = 11
+_LAG, _LONG_LAG = 8, 64
+_CLOSE, _BURSTS = 0.25, 0.25
+"""Steps below this share of the mean one are within a burst; where so many steps are, bursts are the rule."""
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Samples that are missing: when, for how long [s], how many, and whether the axis is split there."""
+
+    at_s: float
+    duration_s: float
+    missing: int
+    split: bool
+
+
+@dataclass(frozen=True)
+class Part:
+    """Readings of a stretch, evenly sampled where the sensor is steady.
+
+    Attributes
+    ----------
+    t_s : (m,) times, rising; within a steady sensor's small gaps as well.
+    values : (m, axes), on straight lines where samples are missing.
+    rows : (k,) samples that are in it, and `places` (k,) where they are in `values`.
+    """
+
+    t_s: FloatArray
+    values: FloatArray
+    rows: IntArray
+    places: IntArray
+
+    @property
+    def start_s(self) -> float:
+        """Time of the first sample."""
+        return float(self.t_s[0])
+
+
+@dataclass(frozen=True)
+class TimeAxis:
+    """When the samples of one sensor were taken.
+
+    Attributes
+    ----------
+    stamps_s : (n,) time stamps [s], which do not go back.
+    t_s : (n,) times [s], which do not go back either.
+    places : (n,) number of each sample in its stretch, from 0, with gaps where samples are missing.
+    starts : (stretches,) first sample of each stretch.
+    period_s : of the sensor; the mean step where it is not steady, NaN where no time passes.
+    jitter_s : robust standard deviation of the stamps about the times.
+    steady : whether most samples are of steady stretches.
+    repeated : stamps that are that of the sample before.
+    """
+
+    stamps_s: FloatArray
+    t_s: FloatArray
+    places: IntArray
+    starts: IntArray
+    period_s: float
+    jitter_s: float
+    steady: bool
+    repeated: int
+
+    @property
+    def rate_hz(self) -> float:
+        """Samples per second."""
+        return 1.0 / self.period_s
+
+    @property
+    def gaps(self) -> tuple[Gap, ...]:
+        """Where samples are missing, in order of time."""
+        new = np.zeros(len(self.t_s), dtype=np.bool_)
+        new[self.starts[1:]] = True
+        skipped = np.diff(self.places, prepend=self.places[:1])
+        out = []
+        for i in np.flatnonzero(new | (skipped > 1)).tolist():
+            step = float(self.t_s[i] - self.t_s[i - 1])
+            count = max(round(step / self.period_s) - 1, 1) if new[i] else int(skipped[i]) - 1
+            out.append(Gap(float(self.t_s[i - 1]), step, count, bool(new[i])))
+        return tuple(out)
+
+    @property
+    def missing(self) -> int:
+        """Samples missing in gaps that do not split the axis."""
+        return sum(gap.missing for gap in self.gaps if not gap.split)
+
+    def parts(self, values: FloatArray) -> tuple[Part, ...]:
+        """Readings (n, axes) of these samples stretch by stretch, small gaps filled with straight lines."""
+        out = []
+        for first, last in _stretches(self.starts, len(self.t_s)):
+            places, t, held = self.places[first:last], self.t_s[first:last], values[first:last]
+            grid = np.arange(int(places[-1]) + 1)
+            if len(grid) != len(places):
+                t = np.interp(grid, places, t)
+                held = np.stack([np.interp(grid, places, column) for column in held.T], axis=1)
+            out.append(Part(t, np.ascontiguousarray(held), np.arange(first, last), places))
+        return tuple(out)
+
+
+def time_axis(stamps_s: FloatArray) -> TimeAxis:
+    """The time axis of samples with these stamps (n,) [s], which do not go back."""
+    t = np.asarray(stamps_s, dtype=np.float64)
+    steps = np.diff(t)
+    rising = steps[steps > 0.0]
+    usual = float(np.median(rising)) if len(rising) else 0.0
+    starts = np.flatnonzero(np.concatenate([[True], steps > max(SPLIT_S, 5.0 * usual)])[: len(t)])
+    times, places = t.copy(), np.zeros(len(t), dtype=np.int64)
+    samples, weighted, even = 0, 0.0, 0
+    for first, last in _stretches(starts, len(t)):
+        places[first:last] = np.arange(last - first)
+        stretch = _steady(t[first:last])
+        if stretch is not None:
+            times[first:last], places[first:last], period = stretch
+            even += last - first
+            weighted, samples = weighted + period * (last - first), samples + last - first
+    if not samples and len(t) > 1:
+        within = np.delete(steps, starts[1:] - 1)
+        weighted, samples = float(within.sum()), len(within)
+    period = weighted / samples if weighted > 0.0 else math.nan
+    jitter = 1.4826 * float(np.median(np.abs(t - times))) if len(t) else 0.0
+    return TimeAxis(t, times, places, starts, period, jitter, 2 * even > len(t), int((steps == 0.0).sum()))
+
+
+def _stretches(starts: IntArray, n: int) -> Iterator[tuple[int, int]]:
+    """First sample of each stretch, and the one behind its last."""
+    return pairwise([*starts.tolist(), n])
+
+
+def _steady(t: FloatArray) -> tuple[FloatArray, IntArray, float] | None:
+    """Times, places and period of a stretch; None for a sensor that is not steady."""
+    steps = np.diff(t)
+    steps = steps[steps > 1e-6]
+    if len(t) < _LEAST_SAMPLES or len(steps) < _LEAST_SAMPLES // 2:
+        return None
+    i, period = np.arange(len(t)), _rough_period(t, steps)
+    anchors = _anchors(t)
+    size = len(t) / len(anchors)
+    if size > 1.0:
+        # One burst may hold a sample more than the next.
+        lag = min(_LAG, len(anchors) - 1)
+        period = float(np.median((t[anchors[lag:]] - t[anchors[:-lag]]) / (anchors[lag:] - anchors[:-lag])))
+    k = _counted(t[anchors], i[anchors], period, _UNEVEN * size)
+    if k is None:
+        return None
+    origin, period, _ = _line(k, t[anchors])
+    if not period > 0.0:
+        return None
+    if size == 1.0:
+        even = origin + period * k
+        k = _with_gaps_in_place(k, (t - origin - _wander(even, t - even)) / period)
+        origin, period, _ = _line(k, t)
+    even = origin + period * k
+    wander = _wander(even, t[anchors] - even)
+    # Samples of a burst come before its last; what is missing is missing before the burst.
+    places = i + np.repeat(k - anchors, np.diff(anchors, prepend=-1)).astype(np.int64)
+    times = np.maximum.accumulate(origin + period * places + np.interp(places, k, wander))
+    far = np.abs(times[anchors] - t[anchors]) > 0.5 * size * period
+    # A late stamp stands alone; where neighbours are off as well, or the samples are few, the line is wrong.
+    if _running_median(far.astype(np.float64)).any() or (len(t) < _RECENT and far.mean() > _LATE):
+        return None
+    return times, places - places[0], period
+
+
+def _rough_period(t: FloatArray, steps: FloatArray) -> float:
+    """Over several samples jitter counts for less; where one of them is missing the time is far longer."""
+    rough = float(np.median(steps))
+    apart = (t[_LAG:] - t[:-_LAG]) / _LAG if len(t) > 2 * _LAG else steps
+    apart = apart[np.abs(apart / rough - 1.0) < 0.5 / _LAG]
+    return float(np.median(apart)) if len(apart) else rough
+
+
+def _anchors(t: FloatArray) -> IntArray:
+    """Samples (m,) whose stamps are counted by: all, or the last of each burst where bursts are the rule."""
+    everyone = np.arange(len(t))
+    if len(t) < 2 * _LONG_LAG:
+        return everyone
+    mean = float(np.median(t[_LONG_LAG:] - t[:-_LONG_LAG])) / _LONG_LAG
+    close = np.diff(t) < _CLOSE * mean
+    lasts = np.flatnonzero(np.append(~close, True))
+    return lasts if close.mean() >= _BURSTS and len(lasts) >= _FIRST else everyone
+
+
+def _running_median(values: FloatArray) -> FloatArray:
+    if len(values) < _WINDOW:
+        return values
+    half = _WINDOW // 2
+    padded = np.concatenate([values[:half][::-1], values, values[-half:][::-1]])
+    return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, _WINDOW), axis=1))
+
+
+def _on_line(t: FloatArray, i: IntArray, origin: float, period: float) -> FloatArray:
+    """Number k (n,) on the line of each of the samples i (n,), rising as they do or faster."""
+    behind = _running_median(np.rint((t - origin) / period) - i)
+    # Samples that were all late, as after a loop that stalled, are outweighed by those that follow.
+    return np.asarray(np.rint(isotonic_regression(behind).x) + i)
+
+
+def _line(k: FloatArray, t: FloatArray) -> tuple[float, float, float]:
+    """Origin, period and robust deviation of stamps (n,) over numbers (n,)."""
+    use = np.ones(len(t), dtype=np.bool_)
+    origin, period, spread = float(t[0]), 1.0, 0.0
+    for _ in range(4):
+        middle, at = float(k[use].mean()), float(t[use].mean())
+        apart = k[use] - middle
+        period = float(apart @ (t[use] - at) / max(float(apart @ apart), 1e-300))
+        origin = at - period * middle
+        off = t - origin - period * k
+        spread = max(1.4826 * float(np.median(np.abs(off[use]))), 1e-7)
+        again = np.abs(off) <= _FAR * spread
+        if again.sum() < _LEAST_SAMPLES // 2 or np.array_equal(again, use):
+            break
+        use = again
+    return origin, period, spread
+
+
+def _counted(t: FloatArray, i: IntArray, period: float, uneven: float) -> FloatArray | None:
+    """Numbers k (n,) of the samples i (n,); None where they are not steady.
+
+    Each chunk is counted on from the line through those before it.
+    """
+    k = np.zeros(len(t))
+    origin, nominal, done = float(t[0] - period * i[0]), period, 0
+    while done < len(t):
+        end = min(done + min(max(done, _FIRST), _CHUNK), len(t))
+        since = max(done - _WINDOW, 0)
+        counted = _on_line(t[since:end], i[since:end], origin, period)
+        # Numbers that are known stay; those after them go on rising.
+        k[done:end] = counted[done - since :]
+        if done:
+            k[done:end] += max(k[done - 1] + i[done] - i[done - 1] - k[done], 0.0)
+        recent = slice(max(end - _RECENT, 0), end)
+        origin, period, spread = _line(k[recent], t[recent])
+        if not 0.5 * nominal < period < 2.0 * nominal or spread > uneven * period:
+            return None
+        # The last ones are looked at once more, with those that follow.
+        done = end if end == len(t) else end - _WINDOW
+    return k
+
+
+def _with_gaps_in_place(k: FloatArray, at: FloatArray) -> FloatArray:
+    """Numbers k (n,) moved into free ones beside them where their stamps, at these numbers (n,), are nearer.
+
+    The running median knows a gap to some samples only.
+    """
+    k, nearest = np.concatenate([[-math.inf], k, [math.inf]]), np.rint(at)
+    for i in (np.flatnonzero(nearest > k[1:-1]) + 1)[::-1].tolist():
+        k[i] = max(k[i], min(nearest[i - 1], k[i + 1] - 1.0))
+    for i in (np.flatnonzero(nearest < k[1:-1]) + 1).tolist():
+        k[i] = min(k[i], max(nearest[i - 1], k[i - 1] + 1.0))
+    return k[1:-1]
+
+
+def _wander(even: FloatArray, off: FloatArray) -> FloatArray:
+    """What the clock is off its line (n,), from the deviations (n,) of the stamps at the times `even`.
+
+    Zero where the blocks' means differ by no more than jitter makes them.
+    """
+    middle, lag = _running_median(off), max(min(_LONG_LAG, len(off) // 2), 1)
+    spread = 1.4826 * float(np.median(np.abs(off - middle)))
+    # At its ends the running median lags behind a slope.
+    slope = float(np.median(np.abs(off[lag:] - off[:-lag]))) / lag
+    most = _FAR * spread + _WINDOW * slope
+    off = np.clip(off, middle - most, middle + most)
+    best, least, by, jitter, wanders = 1, math.inf, off, 0.0, False
+    for size in _BLOCKS:
+        if len(off) < 3 * size:
+            break
+        means = _block_means(off, size)
+        apart = 0.5 * float(np.mean(np.diff(means) ** 2))
+        jitter = apart if size == 1 else jitter
+        wanders |= apart * size > (1.0 + _SURE / math.sqrt(len(means))) * jitter
+        if apart < least:
+            best, least, by = size, apart, means
+    if not wanders or float(np.abs(by).max()) < _NEGLIGIBLE_S:
+        return np.zeros(len(off))
+    return np.asarray(np.interp(even, _block_means(even, best), by))
+
+
+def _block_means(values: FloatArray, size: int) -> FloatArray:
+    edges = np.linspace(0, len(values), len(values) // size + 1).astype(np.int64)[:-1]
+    return np.asarray(np.add.reduceat(values, edges) / np.diff(edges, append=len(values)))
