@@ -26,10 +26,7 @@ from calib.stages.actuator.identify import (
     made,
 )
 from calib.stages.actuator.kinematics import (
-    H13_error_m,
-    H23_error_m,
-    f_error,
-    f_series,
+    chord_ratio,
     forward,
     forward_jacobian,
     inverse,
@@ -80,11 +77,20 @@ def kin_limits() -> Values:
     return {"error_m": float(np.abs(head - [0.0, _LENGTH_M]).max())}
 
 
+def _head_error_mm(phi: FloatArray, order: int) -> tuple[FloatArray, FloatArray]:
+    """Exact less truncated x and y of the head [mm] by (3.10), kept up to a power of phi (...) [rad].
+
+    y + i x = l S(phi) exp(i phi / 2) = l sum_k (i phi)^k / (k + 1)!.
+    """
+    series = sum((1j * phi) ** k / math.factorial(k + 1) for k in range(order + 1))
+    error = 1e3 * _LENGTH_M * (chord_ratio(phi) * np.exp(0.5j * phi) - series)
+    return error.imag, error.real
+
+
 def kin_series_H() -> Values:
-    bend = np.array([0.5 * np.pi])
-    x, y = H13_error_m(bend, _LENGTH_M, 7), H23_error_m(bend, _LENGTH_M, 6)
-    before = H13_error_m(bend, _LENGTH_M, 5)
-    x_um, y_um, before_um = (float(1e6 * np.abs(error)[0]) for error in (x, y, before))
+    bend = np.array(0.5 * np.pi)
+    (x, y), (before, _) = _head_error_mm(bend, 7), _head_error_mm(bend, 5)
+    x_um, y_um, before_um = (float(1e3 * np.abs(error)) for error in (x, y, before))
     share = max(x_um, y_um) / (1e6 * _LENGTH_M)
     return {"error_x_um": x_um, "error_y_um": y_um, "error_x_order5_um": before_um, "share_of_length": share}
 
@@ -112,8 +118,18 @@ def kin_series_f() -> Values:
     return {"fractions": ", ".join(map(str, ours))} | {f"c{2 * k}": float(c) for k, c in enumerate(ours)}
 
 
+def _f_series(phi: FloatArray, order: int = 6) -> FloatArray:
+    """f by (3.14) up to a power of phi (...) [rad]."""
+    return np.polyval([float(c) for c in reversed(inverse_coefficients(order))], phi**2)
+
+
+def _f_error(phi: FloatArray, order: int = 6) -> FloatArray:
+    """Exact less truncated f."""
+    return 2.0 / chord_ratio(phi) - _f_series(phi, order)
+
+
 def kin_series_f_error() -> Values:
-    at, nearer = np.abs(f_error(np.array([0.5 * np.pi, 1.5]))).tolist()
+    at, nearer = np.abs(_f_error(np.array([0.5 * np.pi, 1.5]))).tolist()
     return {"error": at, "error_at_1p5_rad": nearer}
 
 
@@ -130,7 +146,7 @@ _TINY = 1e-17
 
 def figure_3_2() -> tuple[Plot, Values]:
     kappa = np.linspace(0.0, 0.5 * np.pi, 101)[1:] / _LENGTH_M
-    errors = {n: 1e3 * np.abs(H13_error_m(kappa * _LENGTH_M, _LENGTH_M, n)) for n in (1, 3, 5, 7, 9)}
+    errors = {n: np.abs(_head_error_mm(kappa * _LENGTH_M, n)[0]) for n in (1, 3, 5, 7, 9)}
     curves = [
         Curve(f"order {n}", kappa, np.maximum(e, _TINY), colour=k) for k, (n, e) in enumerate(errors.items())
     ]
@@ -141,7 +157,7 @@ def figure_3_2() -> tuple[Plot, Values]:
 
 def figure_3_3() -> tuple[Plot, Values]:
     phi, orders = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 201), (1, 3, 5, 7, 9, 11)
-    errors = 1e3 * np.array([H13_error_m(phi, _LENGTH_M, n) for n in orders])
+    errors = np.array([_head_error_mm(phi, n)[0] for n in orders])
     rms, largest, x = np.sqrt(np.mean(errors**2, axis=1)), np.abs(errors).max(axis=1), np.array(orders, float)
     curves = (
         Curve("largest", x, largest, "points", 1),
@@ -155,8 +171,8 @@ def figure_3_3() -> tuple[Plot, Values]:
 
 def figure_3_4() -> tuple[Plot, Values]:
     phi = np.linspace(-np.pi, np.pi, 201)
-    exact = f_series(phi) + f_error(phi)
-    curves = [Curve(f"order {n}", phi, f_series(phi, n), "dashed", k) for k, n in enumerate((0, 2, 4, 6))]
+    exact = 2.0 / chord_ratio(phi)
+    curves = [Curve(f"order {n}", phi, _f_series(phi, n), "dashed", k) for k, n in enumerate((0, 2, 4, 6))]
     plot = Plot("angle (rad)", "f", (Curve("exact", phi, exact, "line", -1), *curves))
     return plot, {"at_0": float(exact[100]), "at_pi": float(exact[-1])}
 
@@ -164,10 +180,10 @@ def figure_3_4() -> tuple[Plot, Values]:
 def figure_3_5() -> tuple[Plot, Values]:
     phi = np.linspace(0.05, np.pi, 200)
     curves = [
-        Curve(f"order {n}", phi, np.maximum(np.abs(f_error(phi, n)), _TINY), colour=k)
+        Curve(f"order {n}", phi, np.maximum(np.abs(_f_error(phi, n)), _TINY), colour=k)
         for k, n in enumerate((0, 2, 4, 6))
     ]
-    at, nearer = f_error(np.array([0.5 * np.pi, 1.5])).tolist()
+    at, nearer = _f_error(np.array([0.5 * np.pi, 1.5])).tolist()
     curves.append(Curve("pi / 2", np.array([0.5 * np.pi]), np.array([at]), "points", -1))
     plot = Plot("angle (rad)", "exact less series", tuple(curves), log_y=True, y_limits=(1e-13, 3.0))
     return plot, {"at_half_pi": at, "at_1p5": nearer}
