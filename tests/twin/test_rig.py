@@ -1,7 +1,10 @@
-"""The simulated rig from a rig.yaml: what is taken over, and one sentence for a wrong unit."""
+"""The simulated rig from a rig.yaml, and whole rig folders: one sentence for a wrong unit, truth found."""
 
 from __future__ import annotations
 
+import hashlib
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +13,13 @@ import pytest
 from calib.core.errors import BadInputError
 from calib.core.geometry import apply_homography
 from calib.core.rig import read_rig
-from calib.stages.actuator.pump import Orifice, RateLimit, static_force_N
+from calib.io.logs import check_time, read_log
+from calib.io.pictures import list_pictures
+from calib.stages.actuator.pump import static_force_N
 from calib.stages.camera.model import Camera, project
+from calib.stages.camera.read import read_board_file
 from calib.stages.camera.results import camera_from_section
+from calib.twin.folder import LOGS, write_rig_folder
 from calib.twin.rig import SimulatedRig, nominal_view, rig_from_file, workspace_homography
 from calib.twin.sensors import View
 
@@ -29,39 +36,6 @@ def rig(tmp_path: Path):
     return _rig
 
 
-def test_an_empty_file_is_the_nominal_rig(rig) -> None:
-    made = rig("provenance: {version: 0.1.0}\n")
-    assert made.plant == SimulatedRig().plant
-    assert made.pump == SimulatedRig().pump
-    assert made.imu == SimulatedRig().imu
-    assert made.plant.damping_scale == 16.0
-    assert made.free_plant.damping_scale == 3.3
-
-
-def test_numbers_of_the_actuator_are_taken_over(rig) -> None:
-    made = rig(
-        "actuator: {mass_kg: 0.02, rest_length_m: 0.07, k0_N_per_m: 50, k2_N_per_m3: 10.0,\n"
-        "  lambda1_per_s: 2, damping_scale_free_swing: 3.0, damping_scale_pumps_connected: 12,\n"
-        "  gravity_mps2: [0, 9.81], force_projection: head, sigma: {mass_kg: 0.001}, verdict: ok}\n"
-    )
-    assert (made.plant.mass_kg, made.plant.rest_length_m) == (0.02, 0.07)
-    assert made.plant.stiffness.padded == (50.0, 1092.9, 10.0, 0.0)
-    assert made.plant.creep_rates == (2.0, 10.0, -1.0)
-    assert (made.plant.damping_scale, made.free_plant.damping_scale) == (12.0, 3.0)
-    assert made.plant.gravity_mps2 == (0.0, 9.81)
-    assert made.plant.force_projection == "head"
-
-
-def test_numbers_of_the_pumps_are_taken_over(rig) -> None:
-    made = rig("pump: {lag_s: 0.5, delay_ticks: 3, falling_N_per_s: 0.5, strength: [1.0, 0.95]}\n")
-    assert (made.pump.lag_s, made.pump.delay_ticks) == (0.5, 3)
-    assert made.pump.deflation == RateLimit(0.5)
-    assert made.pump_strength == (1.0, 0.95)
-    made = rig("pump: {deflation: orifice, laminar_s: 0.9}\n")
-    assert isinstance(made.pump.deflation, Orifice)
-    assert made.pump.deflation.laminar_s == 0.9
-
-
 def test_a_measured_elongation_is_reached_with_the_rigs_own_springs(rig) -> None:
     made = rig("actuator: {k0_N_per_m: 80}\npump: {elongation_mm: [-0.1493, 3.756, -25.87, 54.13]}\n")
     force = float(static_force_N(made.pump, np.array(255.0)))
@@ -70,18 +44,6 @@ def test_a_measured_elongation_is_reached_with_the_rigs_own_springs(rig) -> None
     # Without it the pumps are as strong as they are, whatever the springs.
     unchanged = rig("actuator: {k0_N_per_m: 80}\n")
     assert unchanged.pump == SimulatedRig().pump
-
-
-def test_numbers_of_the_sensors_are_taken_over(rig) -> None:
-    made = rig(
-        "twin:\n  tracker: {latency_s: 0.04, blackouts_s: [[2, 0.4]], outlier_px: [6, 9]}\n"
-        "  imu: {mount_angle_rad: -0.05, gyro_bias_radps: [0, 0, 0.01], onchip: true}\n"
-    )
-    assert made.tracker.latency_s == 0.04
-    assert made.tracker.blackouts_s == ((2.0, 0.4),)
-    assert made.tracker.outlier_px == (6.0, 9.0)
-    assert made.imu.gyro_bias_radps == (0.0, 0.0, 0.01)
-    assert made.imu.onchip
 
 
 def test_a_calibrated_camera_and_plane_are_taken_over(rig) -> None:
@@ -105,37 +67,15 @@ def test_a_calibrated_camera_and_plane_are_taken_over(rig) -> None:
             "actuator: {rest_length_m: 65}",
             "actuator.rest_length_m is 65, expected metres between 0.005 and 1; is it in millimetres?",
         ),
-        ("actuator: {rest_length_m: -0.065}", "actuator.rest_length_m is -0.065, expected metres between"),
-        (
-            "actuator: {rest_length_mm: 65}",
-            "actuator.rest_length_mm is not a key that is known here; expected rest_length_m",
-        ),
         ("actuator: {rest_length_m: 65mm}", "actuator.rest_length_m is '65mm', expected a number (metres)"),
-        ("actuator: {mass_kg: 16.6}", "is it in grams?"),
-        ("actuator: {bending_N_per_rad2: 169.49}", "is it in mN/rad^2?"),
-        ("actuator: {mass_kg: true}", "actuator.mass_kg is True, expected a number"),
         ("actuator: {mass_kg: .nan}", "actuator.mass_kg is nan, expected a number"),
-        ("actuator: {gravity_mps2: 9.81}", "actuator.gravity_mps2 is 9.81, expected 2 numbers"),
-        ("actuator: {colour: red}", "actuator.colour is not a key that is known here"),
         ("actuator: [1, 2]", "actuator is [1, 2], expected keys with values"),
-        ("actuator: {force_projection: sideways}", "actuator: force projection: found 'sideways'"),
-        (
-            "actuator: {lambda1_per_s: -0.1047, lambda2_N_per_m: -14.98, lambda3: -1.854}",
-            "make the plant unstable: it leaves rest at 0.249 1/s",
-        ),
         (
             "pump: {lag_s: 700}",
             "pump.lag_s is 700, expected seconds between 0.001 and 60; is it in milliseconds?",
         ),
-        ("pump: {delay_ticks: 1.5}", "pump.delay_ticks is 1.5, expected a whole number"),
-        ("pump: {deflation: quick}", "pump.deflation is 'quick', expected 'rate_limit' or 'orifice'"),
         ("pump: {strength: [1, -1]}", "pump: pump strength: found (1.0, -1.0)"),
-        ("twin: {radio: {}}", "twin.radio is not a key that is known here"),
-        ("twin: {tracker: {latency_s: 25}}", "twin.tracker: tracker latency_s: found 25, expected 0 to 1"),
-        ("twin: {tracker: {latency_ms: 25}}", "twin.tracker.latency_ms is not a key that is known here"),
         ("twin: {imu: {onchip: 1}}", "twin.imu.onchip is 1, expected true or false"),
-        ("twin: {imu: {lever_m: 0.006}}", "twin.imu.lever_m is 0.006, expected a list of numbers"),
-        ("twin: {imu: {lever_m: [0, 6]}}", "twin.imu: imu lever_m: found (0.0, 6.0)"),
         ("twin: {imu: {lever_m: [0, far]}}", "twin.imu.lever_m is [0, 'far'], expected a list of numbers"),
     ],
 )
@@ -162,7 +102,92 @@ def test_the_homography_without_a_lens_model_is_the_nearest() -> None:
     assert np.allclose(H / H[2, 2], A / A[2, 2], rtol=1e-8, atol=1e-9)
 
 
-def test_a_camera_that_looks_elsewhere_is_refused() -> None:
-    view = nominal_view()
-    with pytest.raises(BadInputError, match="does not see the actuator's workspace"):
-        workspace_homography(View(view.camera, view.R_CW, view.t_CW_m + np.array([1.0, 0.0, 0.0])))
+RIG = SimulatedRig()
+
+
+def _hashes(folder: Path) -> dict[str, str]:
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+@pytest.mark.slow
+def test_the_folder_holds_pictures_plane_and_logs(tmp_path: Path, project_root: Path) -> None:
+    done: list[tuple[int, int]] = []
+    logs = write_rig_folder(tmp_path / "rig", RIG, progress=lambda i, n: done.append((i, n)))
+    assert done[-1] == (len(LOGS), len(LOGS))
+    assert [path.stem for path in logs] == list(LOGS)
+    assert len(list_pictures([tmp_path / "rig" / "images"])) == 17
+    assert len(list_pictures([tmp_path / "rig" / "images" / "plane"])) == 1
+    # The nominal camera's pictures are the shipped ones.
+    shipped = _hashes(project_root / "images")
+    assert shipped == _hashes(tmp_path / "rig" / "images")
+    assert any(path.name.startswith("static") for path in logs)
+    for path in logs:
+        log = read_log(path)
+        check_time(log)
+        assert log.unknown == ()
+        assert len(log.sampled("u_px", "v_px")) > 0.9 * len(log.sampled("pwm1"))
+        assert len(log.sampled("true_phi_rad")) == len(log)
+        at_rest = np.ptp(log.columns["true_q1_m"]) == 0.0
+        assert at_rest == path.name.startswith("static")
+    truth = json.loads((tmp_path / "rig" / "truth.json").read_text())
+    assert truth["tracker"]["latency_s"] == RIG.tracker.latency_s
+    assert truth["plant"]["mass_kg"] == RIG.plant.mass_kg
+    assert truth["view"]["camera"]["fx_px"] == RIG.view.camera.fx_px
+    again = tmp_path / "again"
+    write_rig_folder(again, RIG)
+    assert _hashes(again) == _hashes(tmp_path / "rig")
+
+
+@pytest.mark.slow
+def test_another_cameras_pictures_show_the_board_where_it_says(tmp_path: Path) -> None:
+    from calib.stages.camera.read import find_boards
+
+    nominal = nominal_view()
+    camera = Camera(
+        "brown5",
+        (640, 480),
+        520.0,
+        522.0,
+        0.0,
+        325.0,
+        236.0,
+        np.array([-0.1, 0.05, 1e-3, -5e-4, 0.0, 0.0, 0.0, 0.0]),
+    )
+    rig = replace(RIG, view=View(camera, nominal.R_CW, nominal.t_CW_m))
+    write_rig_folder(tmp_path, rig)
+    told = read_board_file(tmp_path / "images" / "plane")
+    assert told.corners and told.square_m and told.first_corner_m
+    found = find_boards(list_pictures([tmp_path / "images"]), (7, 5), told.square_m)
+    assert len(found.views) == 17
+    assert found.image_size_px == (640, 480)
+    plane = find_boards(list_pictures([tmp_path / "images" / "plane"]), (7, 5), told.square_m)
+    turn, (x0, y0) = told.angle_rad or 0.0, told.first_corner_m
+    i, j = np.meshgrid(np.arange(7), np.arange(5))
+    bx, by = told.square_m * i.ravel(), told.square_m * j.ravel()
+    world = np.stack(
+        [x0 + np.cos(turn) * bx - np.sin(turn) * by, y0 + np.sin(turn) * bx + np.cos(turn) * by], axis=1
+    )
+    expected = project(camera, world @ nominal.R_CW[:, :2].T + nominal.t_CW_m)
+    corners = plane.views[0].pixels
+    nearest = np.linalg.norm(corners[:, None] - expected[None], axis=2).min(axis=1)
+    assert nearest.max() < 0.3
+
+
+def test_a_folder_that_holds_something_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(BadInputError, match="is there already, expected a new or an empty folder"):
+        write_rig_folder(tmp_path, RIG)
+    with pytest.raises(BadInputError, match="is there already"):
+        write_rig_folder(tmp_path / "mine.txt", RIG)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_a_camera_that_does_not_see_the_plane_is_refused(tmp_path: Path) -> None:
+    nominal = nominal_view()
+    away = View(nominal.camera, nominal.R_CW, nominal.t_CW_m + np.array([0.5, 0.0, 0.0]))
+    with pytest.raises(BadInputError, match="does not see a whole board"):
+        write_rig_folder(tmp_path / "rig", replace(RIG, view=away))

@@ -1,4 +1,4 @@
-"""The simulated rig at work: against the actuator's own simulation, in time, in its log, and its refusals."""
+"""The simulated rig at work: the source's figures, the actuator's own simulation, the log."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.core.errors import BadInputError
+from calib.core.errors import BadInputError, UsageError
 from calib.io.logs import COLUMNS, log_text
 from calib.stages.actuator import simulate as integrate
-from calib.stages.actuator.kinematics import forward
 from calib.stages.actuator.parameters import Plant, Stiffness
 from calib.stages.actuator.simulate import rig_at_rest
-from calib.stages.control.laws import LoopState
+from calib.stages.control.laws import LoopState, Pid, PidState, saturate, step
 from calib.twin.rig import SimulatedRig
+from calib.twin.scenarios import SCENARIOS, Figures, make_scenario, run_scenario, step_response, swing_decay
 from calib.twin.sensors import Imu, Tracker, marker_pixels
-from calib.twin.simulate import LONGEST_S, Law, Run, Seen, log_of, simulate
+from calib.twin.simulate import Law, Run, Seen, log_of, simulate
 
 RIG = SimulatedRig()
 PERFECT = replace(
@@ -79,14 +79,6 @@ def test_a_loop_that_plays_commands_is_the_open_loop(feedback: str) -> None:
     assert len(kept) == 200
 
 
-def test_true_feedback_is_the_state_at_the_tick() -> None:
-    kept: list[Seen] = []
-    run = _run(_playing(_commands(100), kept), 100, feedback="truth")
-    assert run.seen is not None
-    assert np.array_equal(run.seen[:, 1:], run.states[:, :2])
-    assert np.allclose(run.seen[:, 0], run.phi_rad)
-
-
 def test_sensor_feedback_comes_late_and_wrong_but_close() -> None:
     t = np.arange(900) / 60.0
     pwm = 170.0 + 40.0 * np.stack([np.sin(t), np.cos(t)], axis=1)
@@ -111,12 +103,6 @@ def test_a_command_acts_after_the_delay_in_ticks() -> None:
     force = _run(pwm, 12).states[:, 8]
     assert np.all(force[: 4 + RIG.pump.delay_ticks + 1] == 0.0)
     assert force[4 + RIG.pump.delay_ticks + 1] > 0.0
-
-
-def test_unequal_pumps_bend_the_actuator() -> None:
-    rig = replace(RIG, pump_strength=(1.0, 0.9))
-    assert _run(np.full((300, 2), 255.0), 300, rig).phi_rad[-1] > 0.05
-    assert abs(_run(np.full((300, 2), 255.0), 300).phi_rad[-1]) < 1e-12
 
 
 def test_frames_show_the_past_and_samples_the_present() -> None:
@@ -144,30 +130,9 @@ def test_the_log_has_rows_of_ticks_and_of_samples_in_the_order_of_time() -> None
     assert set(log.columns) == set(COLUMNS) - {"onchip_phi_rad"}
 
 
-def test_the_true_columns_are_the_state_at_the_rows_time() -> None:
-    rig = replace(RIG, imu=replace(RIG.imu, onchip=True))
-    run = _run(_commands(300), 300, rig)
-    log = log_of(run)
-    assert len(log.sampled("onchip_phi_rad")) == 500
-    q = np.stack([log.columns["true_q1_m"], log.columns["true_q2_m"]], axis=1)
-    assert np.array_equal(q, run.trajectory.at(log.t_s)[:, :2])
-    x, y, phi = forward(q, RIG.plant.bellows_radius_m).T
-    assert np.array_equal(log.columns["true_phi_rad"], phi)
-    assert np.array_equal(log.columns["true_x_m"], x)
-    assert np.array_equal(log.columns["true_y_m"], y)
-
-
 def test_the_same_seed_gives_the_same_bytes() -> None:
     texts = [log_text(log_of(_run(_commands(120), 120, seed=seed))) for seed in (3, 3, 4)]
     assert texts[0] == texts[1] != texts[2]
-
-
-def test_the_noise_does_not_depend_on_what_the_loop_is_closed_over() -> None:
-    pwm = _commands(120)
-    truth = _run(_playing(pwm, []), 120, feedback="truth", seed=5)
-    sensors = _run(_playing(pwm, []), 120, feedback="sensors", seed=5)
-    assert np.array_equal(truth.accel_mps2, sensors.accel_mps2)
-    assert np.array_equal(truth.pixels, sensors.pixels, equal_nan=True)
 
 
 def test_a_step_too_large_for_the_stiffness_is_detected() -> None:
@@ -178,28 +143,198 @@ def test_a_step_too_large_for_the_stiffness_is_detected() -> None:
         _run(_commands(60), 60, stiff)
 
 
-def test_a_motion_that_leaves_the_model_is_detected() -> None:
-    # Bellows so soft that the pumps turn the head more than a full circle.
-    soft = replace(RIG, plant=replace(RIG.plant, stiffness=Stiffness((0.5,)), bending_N_per_rad2=0.0))
-    pwm = np.zeros((600, 2))
-    pwm[:, 0] = 255.0
-    with pytest.raises(BadInputError, match=r"simulation: at .* s a bellows has no length left"):
-        _run(pwm, 600, soft)
+WITHIN = 0.05
 
 
-@pytest.mark.parametrize("ticks", [0, -5, math.ceil(LONGEST_S * 60.0) + 1])
-def test_durations_out_of_bounds(ticks: int) -> None:
-    with pytest.raises(BadInputError, match="duration: found"):
-        _run(np.zeros((1, 2)), ticks)
+def _do(
+    name: str, duration_s: float | None = None, feedback: str = "truth", **options: str
+) -> tuple[Run, Figures]:
+    scenario = make_scenario(name, options)
+    run = run_scenario(scenario, RIG, 0, feedback, duration_s)
+    return run, scenario.figures(run)
 
 
-def test_a_feedback_that_is_not_known() -> None:
-    with pytest.raises(BadInputError, match="feedback: found 'guess', expected one of sensors, truth"):
-        _run(np.zeros((5, 2)), 5, feedback="guess")
+def test_swing_damping_frequency_and_offset() -> None:
+    _, figures = _do("swing")
+    assert figures["damping_ratio"] == pytest.approx(0.055, rel=WITHIN)
+    assert figures["frequency_hz"] == pytest.approx(4.0, rel=WITHIN)
+    assert figures["offset_after_a_period_rad"] == pytest.approx(0.041, rel=WITHIN)
+    assert figures["offset_after_1s_rad"] == pytest.approx(0.006, rel=WITHIN)
 
 
-def test_a_start_without_lengths() -> None:
-    start = rig_at_rest(RIG.plant, RIG.pump)
-    bad = replace(start, row=np.concatenate([[-0.065, 0.065], start.row[2:]]))
-    with pytest.raises(BadInputError, match="expected positive lengths"):
-        simulate(RIG, bad, np.zeros((5, 2)), 5)
+@pytest.mark.parametrize(("volt", "elongation_mm"), [(6, 1.88), (8, 11.11), (10, 21.73), (12, 26.56)])
+def test_steady_elongations(volt: int, elongation_mm: float) -> None:
+    run, figures = _do("steps", 45.0, volts=str(volt), on_s="40")
+    assert figures[f"elongation_at_{volt}V_mm"] == pytest.approx(elongation_mm, rel=WITHIN)
+    # And without any bending.
+    assert np.abs(run.phi_rad).max() < 1e-12
+
+
+def test_deflation_takes_5_s() -> None:
+    _, figures = _do("deflate")
+    assert figures["deflation_s"] == pytest.approx(5.05, rel=WITHIN)
+
+
+def test_pid_to_a_constant_angle() -> None:
+    _, figures = _do("orientation", 5.0)
+    assert figures["reach_s"] == pytest.approx(0.92, rel=WITHIN)
+    assert figures["peak_rad"] == pytest.approx(0.742, rel=WITHIN)
+    assert figures["settle_s"] == pytest.approx(2.37, rel=WITHIN)
+
+
+@pytest.mark.parametrize(("Kp", "angle_rad"), [(500, 0.375), (1000, 0.535), (2000, 0.63), (5000, 0.698)])
+def test_proportional_control_never_reaches(Kp: int, angle_rad: float) -> None:
+    _, figures = _do("orientation", 5.0, controller="p", Kp=str(Kp))
+    assert figures["reach_s"] is None
+    assert figures["peak_rad"] == pytest.approx(angle_rad, rel=WITHIN)
+
+
+def test_pd_with_feed_forward_along_the_elongation() -> None:
+    _, figures = _do("elongation")
+    assert figures["largest_error_mm"] == pytest.approx(2.00, rel=WITHIN)
+    assert figures["static_error_mm"] == pytest.approx(-0.23, rel=WITHIN)
+
+
+def test_without_feed_forward_it_stays_short_and_with_an_integral_it_winds_up() -> None:
+    _, pd = _do("elongation", controller="pd")
+    _, pid = _do("elongation", controller="pid")
+    assert pd["static_error_mm"] is not None
+    assert pid["largest_error_mm"] is not None
+    assert pd["static_error_mm"] > 10.0
+    assert pid["largest_error_mm"] > 3.0 * 2.0
+    # Nothing happens before about 2 s, as in Fig. 4.12.
+    run, _ = _do("elongation", controller="pid")
+    q = run.states[:, 0]
+    assert 1.0 < float(run.t_s[np.nonzero(q > 0.066)[0][0]]) < 3.0
+
+
+def test_clamping_halves_the_overshoot_of_a_jump_and_slows_the_first_rise() -> None:
+    _, plain = _do("orientation")
+    _, clamped = _do("orientation", controller="clamping")
+    ratio = clamped["overshoot_after_jump_rad"] / plain["overshoot_after_jump_rad"]
+    assert ratio == pytest.approx(0.5, abs=0.08)
+    assert clamped["reach_s"] > 3.0 * plain["reach_s"]
+
+
+def test_with_the_saturated_output_remembered_clamping_never_reaches() -> None:
+    pid = Pid(1000.0, 1000.0, 10.0, clamping=True)
+
+    def law(k: int, memory: LoopState, seen: Seen) -> tuple[LoopState, tuple[float, float]]:
+        error = 0.7 - seen.phi_rad
+        first, u1 = step(pid, memory.first, error)
+        second, u2 = step(pid, memory.second, -error)
+        u1, u2 = saturate(u1), saturate(u2)
+        return LoopState(PidState(u1, first.e1, first.e2), PidState(u2, second.e1, second.e2)), (u1, u2)
+
+    run = simulate(RIG, rig_at_rest(RIG.plant, RIG.pump), law, 300, 0, "truth")
+    assert run.phi_rad.max() < 0.7
+
+
+def test_the_ellipse_is_followed_with_both_chords() -> None:
+    width = {}
+    for chord in ("exact", "thesis"):
+        run, figures = _do("ellipse", chord=chord)
+        assert max(v for v in figures.values() if v is not None) < 1.0
+        late = run.t_s > 2.0
+        q = run.states[late, :2]
+        length, phi = q.mean(axis=1), run.phi_rad[late]
+        x = length * np.sinc(phi / (2.0 * np.pi)) * np.sin(0.5 * phi)
+        width[chord] = np.ptp(x)
+    assert width["exact"] == pytest.approx(0.030, abs=0.003)
+    assert width["thesis"] == pytest.approx(0.015, abs=0.003)
+
+
+def test_over_its_sensors_the_loop_still_works() -> None:
+    _, figures = _do("orientation", feedback="sensors")
+    assert figures["reach_s"] == pytest.approx(0.92, rel=0.1)
+    assert 0.68 < figures["peak_rad"] < 0.8
+    _, figures = _do("elongation", feedback="sensors")
+    assert abs(figures["static_error_mm"]) < 1.5
+    _, figures = _do("ellipse", feedback="sensors")
+    assert max(v for v in figures.values() if v is not None) < 3.0
+
+
+def test_signals_for_identification_move_both_bellows_apart() -> None:
+    for name in ("chirp", "prbs"):
+        run, figures = _do(name)
+        q = run.states[:, :2]
+        assert figures["longest_bellows_mm"] - figures["shortest_bellows_mm"] > 15.0
+        assert abs(float(np.corrcoef(q[300:].T)[0, 1])) < 0.9
+        assert np.abs(run.phi_rad).max() > 0.2
+        assert 0.0 <= run.pwm.min() <= run.pwm.max() <= 255.0
+    chirp, _ = _do("chirp", from_hz="0.5", to_hz="0.5", duration_s=20.0)
+    crossings = np.count_nonzero(np.diff(1 * (chirp.pwm[:, 0] > 170.0)) > 0)
+    assert crossings == pytest.approx(10, abs=1)
+    swept, _ = _do("chirp", duration_s=40.0)
+    middle = np.nonzero(np.diff(1 * (swept.pwm[:, 0] > 170.0)))[0]
+    assert np.diff(middle)[-1] < np.diff(middle)[0] / 10
+
+
+@pytest.mark.parametrize("name", list(SCENARIOS))
+def test_every_scenario_gives_a_log_of_the_length_asked_for(name: str) -> None:
+    for duration_s in (0.05, 1.0):
+        run, _ = _do(name, duration_s)
+        assert len(run.pwm) == round(60.0 * duration_s)
+        log = log_of(run)
+        assert log.t_s[-1] <= duration_s + 0.01
+        assert not any(word in log_text(log) for word in ("nan", "inf"))
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "words"),
+    [
+        ("wobble", {}, "SCENARIO: 'wobble' is not one of static, swing, .*, prbs, rig"),
+        ("orientation", {"Kp": "nan"}, "Kp: 'nan' is not a number"),
+        ("steps", {"volts": "6;8"}, "volts: '6;8' is not numbers separated by commas"),
+    ],
+)
+def test_words_that_are_not_known(name: str, options: dict[str, str], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        make_scenario(name, options)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "words"),
+    [
+        ("orientation", {"controller": "lqr"}, "controller: found 'lqr', expected one of p, pid, clamping"),
+        ("swing", {"length_m": "-0.065"}, "expected positive lengths"),
+        ("elongation", {"start_m": "-0.01"}, "expected positive lengths"),
+        ("prbs", {"hold_s": "0"}, "prbs hold_s: found 0 s"),
+    ],
+)
+def test_numbers_that_no_experiment_can_have(name: str, options: dict[str, str], words: str) -> None:
+    with pytest.raises(BadInputError, match=words):
+        run_scenario(make_scenario(name, options), RIG, 0, "truth", 1.0)
+
+
+T = 1e-3 * np.arange(5001)
+
+
+def _swing(zeta: float, hertz: float, offset: float) -> np.ndarray:
+    """Released at rest from 0.5 rad above an offset that decays in a third of a second."""
+    w = 2.0 * math.pi * hertz
+    wd = w * math.sqrt(1.0 - zeta * zeta)
+    shape = np.exp(-zeta * w * T) * (np.cos(wd * T) + zeta * w / wd * np.sin(wd * T))
+    return 0.5 * shape + offset * np.exp(-3.0 * T)
+
+
+@pytest.mark.parametrize("zeta", [0.02, 0.0513, 0.1])
+def test_damping_and_frequency_without_an_offset(zeta: float) -> None:
+    swing = swing_decay(T, _swing(zeta, 4.0, 0.0))
+    assert swing.damping_ratio == pytest.approx(zeta, rel=1e-4)
+    assert swing.frequency_hz == pytest.approx(4.0 * math.sqrt(1.0 - zeta**2), rel=1e-4)
+    assert np.abs(swing.offset_rad).max() < 0.5 * 0.02 + zeta
+
+
+def test_an_overshooting_response() -> None:
+    zeta, w = 0.5, 4.0
+    wd = w * math.sqrt(1.0 - zeta**2)
+    y = 0.7 * (1.0 - np.exp(-zeta * w * T) * (np.cos(wd * T) + zeta * w / wd * np.sin(wd * T)))
+    response = step_response(1e-3, y, 0.7)
+    assert response.reach_s == pytest.approx((math.pi - math.acos(zeta)) / wd, abs=1e-5)
+    assert response.peak == pytest.approx(
+        0.7 * (1.0 + math.exp(-math.pi * zeta / math.sqrt(1 - zeta**2))), rel=1e-5
+    )
+    assert response.settle_s is not None
+    assert np.all(np.abs(y[round(response.settle_s / 1e-3) :] - 0.7) <= 0.02 * 0.7)
+    assert step_response(1e-3, y[:800], 0.7).settle_s is None
