@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import re
@@ -23,6 +24,10 @@ from typer.main import get_command
 from calib.cli.app import app
 from calib.cli.docs import MANUAL, docs, manual, page_of, slug, write_manual
 from calib.core.errors import DISTRIBUTION, UsageError, pip_install
+from calib.core.rig import SECTIONS
+from calib.io.logs import COLUMNS
+from calib.io.states import STATES
+from calib.twin.scenarios import SCENARIOS
 
 ROOT = Path(__file__).resolve().parents[2]
 README = ROOT / "README.md"
@@ -166,6 +171,33 @@ def test_generated_pages_are_up_to_date(path: str) -> None:
     assert (MANUAL / path).read_text(encoding="utf-8") == generated_pages()[path], (
         "refresh it: python tests/reference_pages.py"
     )
+
+
+def test_the_reference_names_every_column_section_and_scenario() -> None:
+    files = (MANUAL / "reference" / "files.md").read_text(encoding="utf-8")
+    assert not [name for name in (*COLUMNS, *STATES, *SECTIONS) if f"`{name}`" not in files]
+    rows = re.findall(
+        r"^\| `(\w+)` \|.*\| (.*) \|$", (MANUAL / "howto" / "simulate.md").read_text(encoding="utf-8"), re.M
+    )
+    options = {name: re.findall(r"`(\w+)`", cell) for name, cell in rows}
+    assert options.pop("rig") == []
+    for name, kind in SCENARIOS.items():
+        assert options.pop(name) == [
+            field.name for field in dataclasses.fields(kind) if field.name != "duration_s"
+        ], name
+    assert not options
+
+
+def test_named_scripts_exist() -> None:
+    missing, count = [], 0
+    for path in (*documents(), ROOT / ".github" / "CONTRIBUTING.md"):
+        for name in re.findall(
+            r"(?:python|pytest -s) (tests/[\w/]+(?:\.py)?)", path.read_text(encoding="utf-8")
+        ):
+            count += 1
+            missing += [] if (ROOT / name).exists() else [f"{path.name}: {name}"]
+    assert not missing
+    assert count > 15
 
 
 def test_every_verb_is_explained_and_shown() -> None:
