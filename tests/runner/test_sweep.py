@@ -1,4 +1,4 @@
-"""A sweep in this process: all cases, what is kept, and the best and worst points."""
+"""A sweep in this process: its specification, all its cases, what is kept, the best and worst points."""
 
 from __future__ import annotations
 
@@ -11,18 +11,77 @@ import numpy as np
 import pytest
 from fleet_clusters import in_threads
 
+from calib.core.errors import BadInputError
 from calib.runner import engine as worker
 from calib.runner import sweep as sweeping
 from calib.runner.engine import Cluster, Lost
 from calib.runner.fleet import Store, Table, column, opened_store, texts
-from calib.runner.sweep import Base, Case, CaseResult, SweepSpec, run_sweep, summarise_sweep
+from calib.runner.sweep import (
+    Base,
+    Case,
+    CaseResult,
+    SweepSpec,
+    cases,
+    read_sweep,
+    run_sweep,
+    summarise_sweep,
+)
 from calib.runner.task import program
 
 pytest.importorskip("distributed")
 pytest.importorskip("pyarrow")
-
 pytestmark = pytest.mark.filterwarnings("default")
 """What Dask warns of is not ours."""
+
+_BASE = "base: {controller: pid, reference: jump}\n"
+
+
+def _read(tmp_path: Path, text: str) -> SweepSpec:
+    path = tmp_path / "s.yaml"
+    path.write_text(text)
+    return read_sweep(path)
+
+
+def test_grid_times_draws(tmp_path: Path) -> None:
+    spec = _read(
+        tmp_path,
+        _BASE + "grid:\n  pump.lag_s: [0.1, 0.2]\n  actuator.stiffness_scale: {from: 1, to: 2, count: 3}\n"
+        "draws: {count: 4, seed: 7, actuator.mass_kg: {normal: [0.05, 0.002]}, "
+        "pump.supply_V: {uniform: [11, 12]}, pump.falling_N_per_s: {log_uniform: [1, 10]}}\n"
+        "measure: [angle_rms_rad]\nnear: 0.1\n",
+    )
+    assert (spec.points, spec.cases, spec.near) == (6, 24, 0.1)
+    made = list(cases(spec))
+    assert [case.number for case in made] == list(range(24))
+    assert {case.point for case in made} == set(range(6)) and {case.draw for case in made} == set(range(4))
+    assert dict(made[4].values)["actuator.stiffness_scale"] == 1.5
+    # A draw is the same plant at every point of the grid, and another one than the other draws.
+    for name in ("actuator.mass_kg", "pump.supply_V"):
+        by_draw = np.array([dict(case.values)[name] for case in made]).reshape(6, 4)
+        assert (by_draw == by_draw[0]).all() and len(set(by_draw[0].tolist())) == 4
+    assert all(11.0 <= dict(case.values)["pump.supply_V"] <= 12.0 for case in made)
+    assert all(1.0 <= dict(case.values)["pump.falling_N_per_s"] <= 10.0 for case in made)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("grid: {pump.lag_s: [1]}\n", "base is missing"),
+        ("base: {controller: pod, reference: jump}\n", "base.controller is 'pod', expected one of p, pid"),
+        ("base: {scenario: swing, rig: none.yaml}\n", "none.yaml is not there"),
+        (_BASE + "grid: {__class__.x: [1]}\n", "is no parameter"),
+        ("base: {scenario: swing}\ngrid: {controller.pwm_high: [200]}\n", "needs a controller"),
+        (_BASE + f"grid: {{pump.lag_s: [{'9' * 390}]}}\n", "has 9{60} in it, expected numbers"),
+        ("base: {~: 1, scenario: swing, duration: {}}\n", "base has the key None"),
+        (_BASE + "draws: {count: 0}\n", "draws.count is 0"),
+        (_BASE + "grid: {pump.lag_s: [1]}\ndraws: {pump.lag_s: {normal: [1, 1]}}\n", "in grid and in draws"),
+        (_BASE + "grid: {pump.lag_s: [1]}\nnear: 2\n", "measure names none"),
+    ],
+)
+def test_what_is_no_sweep(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(BadInputError, match=said):
+        _read(tmp_path, text)
+
 
 SPEC = SweepSpec(
     Base("scenario", "orientation", "", "", "truth", 1.0, "auto"),

@@ -110,18 +110,6 @@ def test_a_square_of_white_surrounds_the_thesis_board() -> None:
         assert black[:, 1].min() >= 20.0 + 20.0, "above the footer"
 
 
-def test_the_largest_square_that_is_named_fits_and_the_next_does_not() -> None:
-    for columns, rows, page in ((7, 5, "A4"), (9, 6, "Letter"), (4, 11, "A3")):
-        with pytest.raises(BadInputError, match=rf"{columns}x{rows}.*{page}.*largest square") as error:
-            board_pdf(columns, rows, 0.2, page)
-        largest = re.search(r"fits is ([\d.]+) mm", str(error.value))
-        assert largest is not None
-        named = float(largest.group(1))
-        board_pdf(columns, rows, named / 1000, page)
-        with pytest.raises(BadInputError, match="does not fit"):
-            board_pdf(columns, rows, (named + 0.1) / 1000, page)
-
-
 @pytest.mark.parametrize(
     ("columns", "rows", "square_m", "page", "words"),
     [

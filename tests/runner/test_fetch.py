@@ -10,7 +10,9 @@ import pytest
 
 from calib.core.errors import BadInputError
 from calib.runner import task as fetch
-from calib.runner.task import local_folder
+from calib.runner.task import (
+    local_folder,
+)
 
 fsspec = pytest.importorskip("fsspec")
 
@@ -38,13 +40,6 @@ def test_what_belongs_to_a_rig_is_fetched_and_no_more(memory: Any, tmp_path: Pat
     found = {path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file()}
     assert found == {"images/a.png", "images/board.yaml", "images/plane/p.jpg", "logs/x.csv", "rig.yaml"}
     assert (root / "logs/x.csv").read_bytes() == b"logs/x.csv"
-
-
-def test_a_path_is_itself(tmp_path: Path) -> None:
-    assert local_folder(str(tmp_path), tmp_path / "scratch", 1) == tmp_path
-    assert not (tmp_path / "scratch").exists()
-    with pytest.raises(BadInputError, match="is not there, expected the rig's folder"):
-        local_folder(str(tmp_path / "none"), tmp_path / "scratch", 1)
 
 
 def test_what_is_too_large_is_refused(memory: Any, tmp_path: Path) -> None:
@@ -115,11 +110,6 @@ def test_what_may_pass_is_tried_again(
     # Two failed attempts and four folders with nothing in them; the first one is asked again each time.
     assert system.calls == calls - (error.args == ("slow",))
     assert "secret" not in str(told.value) and "key" not in str(told.value)
-
-
-def test_a_scheme_that_nobody_knows(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="is no URL that can be read"):
-        local_folder("nosuchscheme://x/y", tmp_path / "here", 1)
 
 
 def test_what_a_file_system_says_of_a_url_has_no_secret_in_it() -> None:

@@ -1,0 +1,453 @@
+"""Figures of camera, plane, lens and low-pass: legible whatever a fit came to, and true to their numbers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from figure_checks import complaints, drawn_texts, kept
+from hypothesis import given
+from hypothesis import strategies as st
+from matplotlib.quiver import Quiver
+
+from calib.core.arrays import FloatArray
+from calib.io.logs import Log, write_log
+from calib.show.style import look, plain, sheet
+from calib.stages.camera import plots as camera_figures
+from calib.stages.camera import plots as lens_figures
+from calib.stages.camera import plots as plane_figures
+from calib.stages.camera.bundle import Calibration, calibrate, covariance, rotation_exp
+from calib.stages.camera.intrinsics import Intrinsics
+from calib.stages.camera.lens import PlaneView, analyse_distortion
+from calib.stages.camera.model import Camera, View, pack, project
+from calib.stages.camera.plane import Plane, calibrate_plane
+from calib.stages.camera.plots import (
+    _cell_means,
+    _inverse_error,
+    _radial,
+    _radial_sigma,
+    arrows,
+    picture_frame,
+    residual_figure,
+    write_camera_figures,
+    write_lens_figures,
+    write_plane_figures,
+)
+from calib.stages.camera.verdict import Judgement
+from calib.stages.lowpass import plots as lowpass_figures
+from calib.stages.lowpass.filters import Design, design_lowpass
+from calib.stages.lowpass.plots import write_lowpass_figures
+from calib.stages.lowpass.stage import Positions, lowpass_section, positions_from_log
+from synthetic import CAMERA, views_of
+
+
+@given(st.text(st.characters(codec=None), max_size=60), st.integers(8, 40))
+def test_any_text_becomes_a_label_of_drawable_signs(text: str, most: int) -> None:
+    label = plain(text, most)
+    assert len(label) <= most
+    assert label.isprintable()
+    # Nothing is lost where nothing had to change.
+    ordinary = "view-01_(a)$b$.png"
+    assert plain(ordinary) == ordinary
+    assert plain(ordinary, 18) == ordinary
+
+
+def test_the_checks_see_what_is_wrong() -> None:
+    with look():
+        figure = sheet(2.0, "A title")
+        axes = figure.subplots()
+        axes.text(0.5, 0.5, "one thing", transform=axes.transAxes)
+        axes.text(0.51, 0.5, "another", transform=axes.transAxes)
+        axes.text(0.1, 0.1, "tiny", fontsize=4, transform=axes.transAxes)
+        axes.text(0.95, 0.9, "a text that leaves the sheet", transform=axes.transAxes, in_layout=False)
+        found = " ".join(complaints(figure))
+    assert "'one thing' lies on 'another'" in found
+    assert "'tiny' is too small" in found
+    assert "'a text that leaves the sheet' runs off the sheet" in found
+
+
+def result_of(
+    views: list[View],
+    size: tuple[int, int] = (640, 480),
+    model: str = "radial2",
+    fixed: tuple[str, ...] = (),
+    verdict: str = "ok",
+) -> Intrinsics:
+    """A calibration with everything the figures need, without judging it."""
+    fit = calibrate(pack(views), size, model, fixed=fixed)
+    judgement = Judgement(verdict, (), (), (), {})
+    return Intrinsics(fit, covariance(fit), judgement, (), (), "rigid", (), {})
+
+
+def _tilted(tilt_rad: float, count: int) -> Intrinsics:
+    return result_of(views_of(count, noise_px=0.1, tilt_rad=tilt_rad), verdict="unidentifiable")
+
+
+def _one_view() -> Intrinsics:
+    return result_of(
+        views_of(1, noise_px=0.1), model="pinhole", fixed=("cx_px", "cy_px"), verdict="unidentifiable"
+    )
+
+
+def _many_views() -> Intrinsics:
+    camera = replace(CAMERA, image_size_px=(1920, 1080), fx_px=1500.0, fy_px=1502.0, cx_px=965.0, cy_px=533.0)
+    views = views_of(40, noise_px=0.2, camera=camera)
+    again = [replace(v, name=f"IMG_2024_11_{k}_{v.name}.jpg") for k in range(10) for v in views]
+    return result_of(again, (1920, 1080))
+
+
+def _no_distortion_and_odd_names() -> Intrinsics:
+    camera = Camera("pinhole", (316, 208), 270.0, 271.0, 0.0, 160.0, 101.0)
+    odd = [
+        "a$b$c.png",
+        "$\\frac{.png",
+        "\u5199\u771f.png",
+        "x" * 200,
+        "line\nbreak\t.png",
+        "\udcff.png",
+        "_^{}%.png",
+    ]
+    views = views_of(len(odd), noise_px=0.05, camera=camera)
+    return result_of([replace(v, name=n) for v, n in zip(views, odd, strict=True)], (316, 208), "pinhole")
+
+
+def _upright() -> Intrinsics:
+    camera = replace(CAMERA, image_size_px=(480, 640), cx_px=236.0, cy_px=325.0)
+    return result_of(views_of(6, noise_px=0.1, camera=camera), (480, 640), "rational8")
+
+
+def _unbounded() -> Intrinsics:
+    result = _one_view()
+    size = len(result.covariance.names)
+    found = replace(
+        result.covariance,
+        intrinsics=np.diag(np.full(size, np.inf)),
+        joint=np.diag(np.full(size + 6, np.inf)),
+        poses=np.full_like(result.covariance.poses, np.inf),
+    )
+    return replace(result, covariance=found)
+
+
+def _failed() -> Intrinsics:
+    """What a fit that ended behind the camera leaves: no residuals, no covariance."""
+    result = _unbounded()
+    fit = result.calibration
+    nothing = replace(
+        fit,
+        residuals_px=np.full_like(fit.residuals_px, np.nan),
+        normal=np.full_like(fit.normal, np.nan),
+        termination="behind the camera",
+    )
+    return replace(result, calibration=nothing)
+
+
+def _not_finite() -> Intrinsics:
+    result = _failed()
+    fit = result.calibration
+    camera = replace(fit.camera, fx_px=np.nan, fy_px=np.nan, cx_px=np.nan, cy_px=np.nan)
+    block = replace(fit.block, R_CT=np.full_like(fit.block.R_CT, np.nan))
+    return replace(result, calibration=replace(fit, camera=camera, block=block))
+
+
+def _exact() -> Intrinsics:
+    return result_of(views_of(4), verdict="poor")
+
+
+def _precise() -> Intrinsics:
+    """So precise that the principal point needs many digits."""
+    camera = replace(CAMERA, image_size_px=(316, 208), fx_px=273.4, fy_px=272.6, cx_px=160.67, cy_px=101.87)
+    return result_of(views_of(17, noise_px=0.007, camera=camera), (316, 208))
+
+
+def _outliers() -> Intrinsics:
+    views = views_of(5, noise_px=0.05)
+    views[2].pixels[7] += [40.0, -25.0]
+    fit = calibrate(pack(views), (640, 480), "radial2", loss="cauchy")
+    return Intrinsics(fit, covariance(fit), Judgement("poor", (), (), (), {}), (), (), "rigid", (), {})
+
+
+CASES = {
+    "one view": _one_view,
+    "400 views": _many_views,
+    "no distortion, odd names": _no_distortion_and_odd_names,
+    "upright picture": _upright,
+    "sigma not bounded": _unbounded,
+    "no tilt": lambda: _tilted(0.0, 4),
+    "failed fit": _failed,
+    "not finite": _not_finite,
+    "no residuals": _exact,
+    "outliers": _outliers,
+    "precise": _precise,
+}
+SLOW = pytest.mark.slow
+QUICK = ("sigma not bounded", "no distortion, odd names")
+
+
+@pytest.mark.parametrize("case", [c if c in QUICK else pytest.param(c, marks=SLOW) for c in CASES])
+def test_all_figures_are_legible(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    result = CASES[case]()
+    with kept(monkeypatch, camera_figures) as figures:
+        write_camera_figures(tmp_path, result)
+    assert len(figures) == 6
+    with camera_figures.look():
+        for name, figure in figures.items():
+            assert complaints(figure) == [], name
+
+
+def _words(result: Intrinsics, name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    with kept(monkeypatch, camera_figures) as figures:
+        write_camera_figures(folder, result)
+    with camera_figures.look():
+        return "\n".join(text.get_text() for text in drawn_texts(figures[f"camera_{name}.png"]))
+
+
+def test_what_is_not_bounded_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    result = _unbounded()
+    assert "not bounded" in _words(result, "sigma", tmp_path, monkeypatch)
+    assert "not estimated" in _words(result, "coverage", tmp_path, monkeypatch)
+    assert "verdict: unidentifiable" in _words(result, "poses", tmp_path, monkeypatch)
+
+
+BROWN = Camera(
+    "brown5", (316, 208), 273.0, 272.0, 0.4, 160.0, 102.0, np.array([-0.22, 0.55, 2e-3, -3e-3, 0.05, 0, 0, 0])
+)
+FOLDING = replace(CAMERA, distortion=np.array([-0.9, 0.1, 0, 0, 0, 0, 0, 0.0]))
+PINHOLE = Camera("pinhole", (1920, 1080), 1500.0, 1500.0, 0.0, 960.0, 540.0)
+UPRIGHT = replace(CAMERA, image_size_px=(480, 640), cx_px=240.0, cy_px=320.0)
+
+
+@pytest.mark.parametrize("name", ["CAMERA", "BROWN", "FOLDING", "PINHOLE", "UPRIGHT"])
+def test_all_figures_are_legible_in_lens_figures(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera = globals()[name]
+    plane = PlaneView(np.eye(3), np.array([0.0, -0.07, 0.3]), (-0.06, 0.04, 0.06, 0.11), 0.05)
+    report = analyse_distortion(camera, plane=plane)
+    with kept(monkeypatch, lens_figures) as figures:
+        write_lens_figures(tmp_path, camera, report)
+    with lens_figures.look():
+        for file, figure in figures.items():
+            assert complaints(figure) == [], file
+        words = " ".join(
+            t.get_text().replace("\n", " ") for t in drawn_texts(figures["lens_displacement.png"])
+        )
+    assert f"verdict: {report.verdict}" in words
+    if name == "PINHOLE":
+        assert "no distortion" in words
+    if name == "FOLDING":
+        assert "folds over" in words
+
+
+def test_the_band_is_the_spread_of_repeated_calibrations() -> None:
+    radius = np.array([100.0, 200.0, 300.0])
+    clean = pack(views_of(8))
+    rng = np.random.default_rng(2)
+    curves = []
+    for _ in range(120):
+        noisy = replace(clean, pixels=clean.pixels + 0.1 * rng.standard_normal(clean.pixels.shape))
+        fit = calibrate(noisy, (640, 480), "radial2")
+        curves.append(_radial(fit.camera, radius))
+    reported = _radial_sigma(fit.camera, covariance(fit, 0.01), radius)
+    # 120 samples give a standard deviation to 6.5 %.
+    np.testing.assert_allclose(np.std(curves, axis=0, ddof=1), reported, rtol=0.2)
+
+
+@pytest.mark.parametrize("camera", [CAMERA, BROWN])
+def test_the_drawn_error_is_the_reported_one(camera: Camera) -> None:
+    report = analyse_distortion(camera)
+    width, height = camera.image_size_px
+    border = np.stack(np.meshgrid(np.linspace(0, width - 1, 80), np.linspace(0, height - 1, 60)), -1).reshape(
+        -1, 2
+    )
+    error = _inverse_error(camera, report.inverse, border)
+    assert np.isfinite(error).all()
+    assert error.max() <= report.inverse.max_error_px * 1.02 + 1e-4
+    assert error.max() > 0.5 * report.inverse.max_error_px
+
+
+WORKSPACE = (-0.06, 0.04, 0.06, 0.11)
+R_CW = rotation_exp(np.array([[0.35, -0.2, 0.1]]))[0]
+t_CW_m = np.array([0.0, -0.07, 0.25])
+
+
+def plane_of(
+    camera: Camera = CAMERA,
+    names: tuple[str, ...] = ("plane01.png",),
+    workspace_m: tuple[float, float, float, float] = WORKSPACE,
+    covariance: FloatArray | None = None,
+    points: int = 35,
+    noise_px: float = 0.1,
+) -> Plane:
+    """A plane fitted to made-up pictures of a board that covers the workspace."""
+    rng = np.random.default_rng(3)
+    grid = np.stack(np.meshgrid(np.linspace(-0.058, 0.062, 7), np.linspace(0.03, 0.11, 5)), -1).reshape(-1, 2)
+    world = grid[:: max(1, 35 // points)][:points] if points != 4 else grid[[0, 6, 28, 34]]
+    seen = project(camera, world @ R_CW[:, :2].T + t_CW_m)
+    views = [View(name, world, seen + noise_px * rng.standard_normal(seen.shape)) for name in names]
+    return calibrate_plane(camera, covariance, views, workspace_m=workspace_m)
+
+
+def _known() -> FloatArray:
+    return np.diag([0.3, 0.3, 0.2, 0.2, 0.0, 1e-3, 1e-2, *np.zeros(6)]) ** 2
+
+
+def _tiny() -> tuple[Camera, Plane]:
+    camera = replace(CAMERA, image_size_px=(316, 208), fx_px=270.0, fy_px=270.0, cx_px=160.0, cy_px=101.0)
+    return camera, plane_of(camera, covariance=_known())
+
+
+def _wide() -> tuple[Camera, Plane]:
+    camera = replace(CAMERA, image_size_px=(1920, 1080), fx_px=1500.0, fy_px=1500.0, cx_px=965.0, cy_px=533.0)
+    return camera, plane_of(camera, names=("a$b$.png", "$\\frac{.png", "\u5199\u771f.png"))
+
+
+def _ideal() -> tuple[Camera, Plane]:
+    camera = replace(CAMERA, model="pinhole", distortion=np.zeros(8))
+    return camera, plane_of(camera, noise_px=0.0)
+
+
+CASES_PLANE_FIGURES = {
+    "316x208": _tiny,
+    "1920x1080, three pictures, odd names": _wide,
+    "no distortion, no noise": _ideal,
+    "part of the workspace seen": lambda: (
+        CAMERA,
+        plane_of(workspace_m=(-0.2, 0.0, 0.2, 0.3), covariance=_known()),
+    ),
+    "nothing of the workspace seen": lambda: (CAMERA, plane_of(workspace_m=(1.0, 1.0, 1.1, 1.1))),
+    "upright workspace": lambda: (CAMERA, plane_of(workspace_m=(-0.01, 0.0, 0.02, 0.12))),
+    "four corners": lambda: (CAMERA, plane_of(points=4, covariance=_known())),
+    "twelve pictures": lambda: (CAMERA, plane_of(names=tuple(f"{k}.png" for k in range(12)))),
+}
+QUICK_PLANE_FIGURES = ("316x208", "nothing of the workspace seen")
+
+
+@pytest.mark.parametrize(
+    "case", [c if c in QUICK_PLANE_FIGURES else pytest.param(c, marks=SLOW) for c in CASES_PLANE_FIGURES]
+)
+def test_all_figures_are_legible_in_plane_figures(
+    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera, plane = CASES_PLANE_FIGURES[case]()
+    with kept(monkeypatch, plane_figures) as figures:
+        write_plane_figures(tmp_path, camera, plane)
+    assert len(figures) == 3
+    with plane_figures.look():
+        for name, figure in figures.items():
+            assert complaints(figure) == [], name
+
+
+def _words_plane_figures(plane: Plane, monkeypatch: pytest.MonkeyPatch, folder: Path) -> dict[str, str]:
+    with kept(monkeypatch, plane_figures) as figures:
+        write_plane_figures(folder, CAMERA, plane)
+    with plane_figures.look():
+        return {
+            name: " ".join(text.get_text().replace("\n", " ") for text in drawn_texts(figure))
+            for name, figure in figures.items()
+        }
+
+
+def test_what_is_not_known_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    words = _words_plane_figures(plane_of(), monkeypatch, tmp_path)
+    assert "covariance of the intrinsics is not known" in words["plane_sigma.png"]
+    words = _words_plane_figures(plane_of(workspace_m=(1.0, 1.0, 1.1, 1.1)), monkeypatch, tmp_path)
+    assert "No part of the workspace is in the picture" in words["plane_difference.png"]
+    assert "verdict: poor" in words["plane_sigma.png"]
+
+
+def _positions(folder: Path, still: bool = False, n: int = 3000) -> Positions:
+    t = np.arange(n) / 60.0
+    noise = (0.0 if still else 1.0) * np.random.default_rng(0).normal(size=(2, n))
+    u = np.round(150 + 30 * np.sin(0.4 * t) * (t > 20) + 0.4 * noise[0])
+    v = np.round(90 + 0.4 * noise[1])
+    write_log(folder / "log.csv", Log("log.csv", t, {"u_px": u, "v_px": v}, np.arange(n)))
+    return positions_from_log(folder / "log.csv", 60.0, None, None)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("cutoff", "order", "family", "still"),
+    [
+        (1.0, 1, "butterworth", False),
+        (1.0, 8, "butterworth", True),
+        (20.0, 4, "bessel", False),
+        (0.1, 3, "critical", False),
+        (0.01, 2, "butterworth", False),
+    ],
+)
+def test_all_figures_are_legible_in_lowpass_figures(
+    cutoff: float, order: int, family: str, still: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, seen = design_lowpass(Design(cutoff, 60.0, order, family)), _positions(tmp_path, still)
+    section = lowpass_section(made, WORKSPACE, seen)
+    with kept(monkeypatch, lowpass_figures) as figures:
+        write_lowpass_figures(tmp_path / "drawn", made, section, seen)
+    with lowpass_figures.look():
+        for name, figure in figures.items():
+            assert complaints(figure) == [], name
+        words = " ".join(text.get_text() for text in drawn_texts(figures["lowpass_log.png"]))
+    assert ("never changes" in words) == still
+
+
+FIT = calibrate(pack(views_of(12, noise_px=0.1)), (640, 480), "radial2")
+
+
+def _with_residuals(residuals: np.ndarray) -> Calibration:
+    return replace(FIT, residuals_px=residuals)
+
+
+def _outside(fit: Calibration) -> tuple[int, int]:
+    at = fit.observations.pixels.reshape(-1, 2)
+    means = _cell_means(fit, at, fit.residuals_px.reshape(-1, 2), fit.weights.ravel())
+    return int(means.outside.sum()), len(means.at)
+
+
+def test_chance_leaves_one_disc_in_twenty() -> None:
+    rng = np.random.default_rng(5)
+    counts = []
+    for _ in range(150):
+        noise = rng.standard_normal(FIT.residuals_px.shape) * 0.1
+        # The spread is estimated from the residuals with the fit's degrees of freedom; undo that here.
+        noise *= np.sqrt(FIT.degrees_of_freedom / (2 * FIT.observations.points))
+        fit = _with_residuals(noise)
+        counts.append(_outside(fit))
+    outside, cells = np.sum(counts, axis=0)
+    # 150 sets of about 40 cells: the share of 5 % is known to 0.3 %; the fit's freedom takes part of it.
+    assert 0.03 < outside / cells < 0.06
+
+
+def test_a_field_that_the_noise_hides_leaves_most_discs() -> None:
+    rng = np.random.default_rng(6)
+    noise = rng.standard_normal(FIT.residuals_px.shape) * 0.1
+    pixels = FIT.observations.pixels
+    swirl = 0.1 * np.stack([-(pixels[..., 1] - 240) / 240, (pixels[..., 0] - 320) / 320], axis=-1)
+    outside, cells = _outside(_with_residuals(noise + swirl))
+    assert outside > 0.4 * cells
+    with look():
+        words = " ".join(t.get_text() for t in drawn_texts(residual_figure(_with_residuals(noise + swirl))))
+    assert f"{outside} of {cells} means leave" in words.replace("\n", " ")
+
+
+def test_arrows_have_the_length_that_they_claim() -> None:
+    at = np.array([[10.0, 20.0], [50.0, 60.0], [np.nan, 1.0]])
+    vectors = np.array([[0.5, -0.25], [-1.0, 0.0], [1.0, 1.0]])
+    with look():
+        figure = sheet(3.0, "title")
+        axes = figure.subplots()
+        picture_frame(axes, (100, 80))
+        times = arrows(axes, at, vectors, 8.0)
+        words = [text.get_text() for text in drawn_texts(figure)]
+        quiver = next(artist for artist in axes.get_children() if isinstance(artist, Quiver))
+    assert times == pytest.approx(8.1, abs=0.15)
+    assert len(quiver.U) == 2, "a vector that is not finite is left out"
+    # The tips of the polygons, in the data's units.
+    for polygon, start, vector in zip(quiver.get_paths(), at, vectors, strict=False):
+        shape = quiver.get_transform().transform(polygon.vertices)
+        tip = shape[np.argmax(np.linalg.norm(shape, axis=1))]
+        pixels_per_unit = axes.transData.transform([1.0, 0.0])[0] - axes.transData.transform([0.0, 0.0])[0]
+        expected = times * vector * [1.0, -1.0] * pixels_per_unit
+        np.testing.assert_allclose(tip, expected, atol=0.02 * np.linalg.norm(expected) + 0.5)
+        del start
+    assert "1 px" in words, "the key"

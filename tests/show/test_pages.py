@@ -1,0 +1,460 @@
+"""Pages of a run, a fleet and a sweep: whole, small, harmless whatever the names, usable in a browser."""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import Iterator
+from hashlib import sha256
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+import pytest
+from chromium import Browser, browser_or_skip
+from pages import EVIL, finished_run
+from PIL import Image
+
+from calib.core.errors import BadInputError
+from calib.runner.cache import Result
+from calib.runner.fleet import Borrowing, FleetSummary, summarise, write_outcomes
+from calib.runner.sweep import Base, Point, SweepSpec, SweepSummary
+from calib.runner.task import Outcome
+from calib.show.fleet import PAGE, fleet_page_text, sweep_page_text, write_fleet_page
+from calib.show.page import (
+    _AIM_BYTES,
+    MOST_BYTES,
+    _Budget,
+    _chosen,
+    _resource,
+    data_uri,
+    decide,
+    keep_pictures,
+    kept_picture,
+    page_text,
+    render,
+    size_of,
+    small_figure,
+    write_page,
+)
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    rig = finished_run(tmp_path_factory.mktemp("page"))
+    write_page(rig)
+    return rig
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    browser = browser_or_skip(tmp_path_factory.mktemp("profile"))
+    yield browser
+    browser.close()
+
+
+_LENGTH = """(() => {
+  const line = document.querySelector('#view-picture line');
+  const along = ['x', 'y'].map((axis) => line[axis + '2'].baseVal.value - line[axis + '1'].baseVal.value);
+  return Math.hypot(...along);
+})()"""
+"""How long the first residual is drawn."""
+
+
+def _typed(name: str, value: str) -> str:
+    """Script that gives an input a value as a person would."""
+    told = f"e.value = '{value}'; e.dispatchEvent(new Event('input'));"
+    return f"(() => {{ const e = document.getElementById('{name}'); {told} }})()"
+
+
+class _Outline(HTMLParser):
+    def __init__(self) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attributes)))
+
+
+def test_nothing_leads_out_of_the_page_and_nothing_breaks_in(rig: Path) -> None:
+    text = page_text(rig)
+    outline = _Outline()
+    outline.feed(text)
+    for tag, attributes in outline.tags:
+        for name in ("src", "href", "action", "srcset"):
+            target = attributes.get(name)
+            assert target is None or target.startswith(("data:image/", "#")) or target == "", (tag, target)
+        assert not [name for name in attributes if name.startswith("on")], tag
+    assert sum(tag == "script" for tag, _ in outline.tags) == 2
+    assert "owned'</script>" not in text
+    assert not re.search(r"https?://(?!www\.w3\.org/2000/svg)", text)
+    assert text.count("49.png") == 0
+
+
+def test_same_run_same_bytes_and_no_place(rig: Path) -> None:
+    text = page_text(rig)
+    assert text == page_text(rig)
+    assert str(rig.parent) not in text and "/tmp" not in text
+    assert len(text.encode()) < MOST_BYTES
+
+
+def test_a_rig_without_a_run_gives_a_page_of_constants(rig: Path, tmp_path: Path) -> None:
+    alone = tmp_path / "rig.yaml"
+    alone.write_bytes(rig.read_bytes())
+    text = page_text(alone)
+    assert "fx_px" in text and "273.410" in text
+    assert 'class="figure"' not in text
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("actuator: {sigma: x}\npump: {sigma: {a: 1.0}}\n", "actuator.sigma is 'x'"),
+        ("actuator: {verdict: poor, reasons: 5}\n", "actuator.reasons is 5"),
+        ("pump: [1]\n", "pump is .* expected keys with values"),
+    ],
+)
+def test_sections_that_mean_nothing_are_refused_by_their_key(tmp_path: Path, text: str, says: str) -> None:
+    (tmp_path / "rig.yaml").write_text(text)
+    with pytest.raises(BadInputError, match=says):
+        page_text(tmp_path / "rig.yaml")
+
+
+def test_too_many_figures_are_named_instead(rig: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("calib.show.page.MOST_BYTES", 460_000)
+    text = page_text(rig)
+    assert len(text.encode()) < 460_000
+    assert "Left out to keep this page small" in text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [1400, 400])
+def test_in_a_browser_all_is_seen_and_nothing_overflows(rig: Path, browser: Browser, width: int) -> None:
+    browser.open(rig.with_name("report.html"), width)
+    assert browser.run("document.title") == "Calibration: no"
+    assert browser.run("document.documentElement.scrollWidth") <= width
+    browser.run("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
+    assert browser.run("document.documentElement.scrollWidth") <= width
+    wide = browser.run(
+        "[...document.querySelectorAll('main *, nav *')].filter((e) => !e.closest('.scroll, .unseen') &&"
+        f" e.getBoundingClientRect().right > {width} + 1).map((e) => e.outerHTML.slice(0, 80))"
+    )
+    assert wide == []
+    seen = browser.run(
+        "[...document.querySelectorAll('main img')].map((e) => [e.complete, e.naturalWidth, e.offsetWidth])"
+    )
+    assert len(seen) == 3 + 4
+    assert all(whole and natural > 0 and shown > 60 for whole, natural, shown in seen)
+    assert browser.errors == []
+
+
+@pytest.mark.slow
+def test_clicks_and_keys(rig: Path, browser: Browser) -> None:
+    browser.open(rig.with_name("report.html"), 1400)
+    browser.click("button.view")
+    assert browser.run("document.getElementById('view-dialog').open")
+    assert browser.run("document.querySelectorAll('#view-picture circle').length") == 4
+    first = browser.run("document.getElementById('view-title').textContent")
+    browser.key("ArrowRight", 39)
+    assert browser.run("document.getElementById('view-title').textContent") != first
+    browser.run(_typed("gain", "0"))
+    assert browser.run(_LENGTH) < 0.1
+    browser.key("Escape", 27)
+    assert not browser.run("document.getElementById('view-dialog').open")
+    browser.click("button.figure")
+    assert (
+        browser.run("document.getElementById('figure-title').textContent")
+        == "Reprojection errors of each view"
+    )
+    browser.click("#figure-dialog .close")
+    assert not browser.run("document.getElementById('figure-dialog').open")
+    assert browser.errors == []
+
+
+@pytest.mark.slow
+def test_tables_sort_and_the_filter_filters(rig: Path, browser: Browser) -> None:
+    browser.open(rig.with_name("report.html"), 1400)
+    head = "#constants-table th:nth-child(3) button"
+    cells = "[...document.querySelectorAll('#constants-table td:nth-child(3)')]"
+    values = f"{cells}.map((e) => Number(e.dataset.value))"
+    browser.click(head)
+    rising = browser.run(values)
+    assert rising == sorted(rising) and len(rising) > 10
+    browser.click(head)
+    assert browser.run(values) == sorted(rising, reverse=True)
+    assert browser.run("document.querySelector('#constants-table th:nth-child(3)').ariaSort") == "descending"
+    browser.click("#constants-table th:nth-child(4) button")
+    sigma = browser.run(
+        "[...document.querySelectorAll('#constants-table td:nth-child(4)')].map((e) => e.dataset.value)"
+    )
+    known = [float(value) for value in sigma if value]
+    assert known == sorted(known) and sigma[len(known) :] == [""] * (len(sigma) - len(known))
+    browser.run(_typed("filter", "camera k1"))
+    left = browser.run(
+        "[...document.querySelectorAll('#constants-table tbody tr')].filter((e) => !e.hidden).length"
+    )
+    assert left == 1
+    assert browser.errors == []
+
+
+@pytest.mark.slow
+def test_dark_light_print_and_keyboard(rig: Path, browser: Browser) -> None:
+    browser.media(prefers_color_scheme="dark")
+    browser.open(rig.with_name("report.html"), 1400)
+    ground = "getComputedStyle(document.body).backgroundColor"
+    dark = browser.run(ground)
+    browser.click("#theme")
+    assert browser.run(ground) != dark
+    browser.media(prefers_color_scheme="light")
+    browser.open(rig.with_name("report.html"), 1400)
+    assert browser.run(ground) != dark
+    browser.key("Tab", 9)
+    assert browser.run("document.activeElement.className") == "skip"
+    assert browser.pdf().startswith(b"%PDF")
+    named = [
+        node for node in browser.accessible() if node["role"]["value"] in ("button", "image", "link", "img")
+    ]
+    nameless = [n for n in named if not n.get("ignored") and not n.get("name", {}).get("value")]
+    # The thumbnails stand beside their names, within buttons that have one.
+    assert nameless == []
+    assert EVIL not in browser.run("document.title")
+    assert browser.errors == []
+
+
+def _drawn(root: Path, logs: int) -> list[Result | None]:
+    """Results of as many logs, each with figures of about 40 kB."""
+    made: list[Result | None] = []
+    for log in range(logs):
+        folder = root / f"replay-{log}"
+        (folder / "figures").mkdir(parents=True)
+        files = {}
+        for k, part in enumerate(("errors", "innovations", "states")):
+            noise = np.random.default_rng(3 * log + k).integers(0, 255, (200, 900), dtype=np.uint8)
+            image = Image.fromarray(np.where(np.arange(900) % 5 == 0, noise, 255).astype(np.uint8))
+            name = f"figures/replay_{log}_{part}.png"
+            image.quantize(128).save(folder / name)
+            files[name] = ""
+        made.append(Result(folder, "", 0, files))
+    return made
+
+
+@pytest.mark.parametrize(("logs", "narrow"), [(4, False), (40, False), (130, True)])
+def test_of_many_logs_the_states_come_first_and_the_page_stays_small(
+    tmp_path: Path, logs: int, narrow: bool
+) -> None:
+    results = _drawn(tmp_path, logs)
+    budget = _Budget(MOST_BYTES - 400_000)
+    shown, width_px = _chosen(results, tmp_path / "figures", budget)
+    stems = [path.stem for path in shown]
+    assert budget.left >= 0
+    assert sum(stem.endswith("states") for stem in stems) == logs
+    assert bool(width_px) == narrow
+    if logs == 4:
+        assert len(shown) == 12
+    else:
+        assert len(shown) < 3 * logs
+        assert narrow or budget.left >= MOST_BYTES - _AIM_BYTES
+
+
+def _png(path: Path, width: int, height: int, seed: int = 0) -> Path:
+    noise = np.random.default_rng(seed).integers(0, 255, (height, width, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(path)
+    return path
+
+
+def test_changed_and_missing_pictures_are_followed(tmp_path: Path) -> None:
+    path, kept = _png(tmp_path / "a.png", 60, 40), tmp_path / "kept"
+    keep_pictures([path], kept)
+    before = kept_picture("a.png", kept)
+    keep_pictures([path], kept)
+    assert kept_picture("a.png", kept) == before
+    keep_pictures([_png(path, 60, 40, seed=1)], kept)
+    assert kept_picture("a.png", kept) != before
+    keep_pictures([], kept)
+    assert kept_picture("a.png", kept) is None
+
+
+def test_a_figure_is_smaller_and_made_once(tmp_path: Path) -> None:
+    shades = np.linspace(0, 255, 600, dtype=np.uint8)
+    figure = tmp_path / "f.png"
+    Image.fromarray(np.stack([np.add.outer(shades, shades) // k for k in (1, 2, 3)], axis=-1)).save(figure)
+    small = small_figure(figure, tmp_path / "figures")
+    assert len(small) < figure.stat().st_size and size_of(small) == (600, 600)
+    assert small_figure(figure, tmp_path / "figures") == small
+    assert len(list((tmp_path / "figures").iterdir())) == 1
+    assert data_uri(small).startswith("data:image/png;base64,")
+    vector = tmp_path / "v.svg"
+    vector.write_text("<svg/>")
+    assert data_uri(small_figure(vector, tmp_path / "figures")).startswith("data:image/svg+xml;")
+
+
+def _job(stage: str, status: str = "ok", **more: Any) -> dict[str, Any]:
+    writes = {"intrinsics": ["camera"], "extrinsics": ["plane"]}.get(stage, [])
+    flashed = stage in ("intrinsics", "extrinsics", "imu-static")
+    reason = "" if status == "ok" else "for some reason"
+    return {
+        "name": stage, "stage": stage, "title": stage.title(), "log": None, "writes": writes,
+        "flashed": flashed, "status": status, "reason": reason, **more,
+    }  # fmt: skip
+
+
+def _whole(**statuses: str) -> dict[str, Any]:
+    stages = ("intrinsics", "extrinsics", "imu-static", "replay", "firmware")
+    return {"simulated": False, "jobs": [_job(s, statuses.get(s.replace("-", "_"), "ok")) for s in stages]}
+
+
+SECTIONS = {"camera": {"verdict": "ok"}, "plane": {"verdict": "ok"}}
+
+
+@pytest.mark.parametrize(
+    ("statuses", "answer"),
+    [
+        ({}, "yes"),
+        ({"replay": "poor"}, "with care"),
+        ({"imu_static": "poor"}, "not yet"),
+        ({"firmware": "poor"}, "not yet"),
+        ({"extrinsics": "blocked"}, "no"),
+        ({"firmware": "skipped"}, "no"),
+    ],
+)
+def test_answers(statuses: dict[str, str], answer: str) -> None:
+    assert decide(_whole(**statuses), SECTIONS).answer == answer
+
+
+def test_without_a_plane_not_yet() -> None:
+    assert decide(_whole(extrinsics="skipped"), {"camera": {"verdict": "ok"}}).answer == "not yet"
+
+
+def test_weak_points_are_grouped_by_reason() -> None:
+    told = _whole()
+    told["jobs"] += [_job("replay", "poor", log=f"{k}.csv", reason="the IMU is silent") for k in range(6)]
+    (sentence,) = decide(told, SECTIONS).weak
+    assert sentence == "Replay (0.csv, 1.csv, 2.csv, 3.csv and 2 more): the IMU is silent"
+
+
+def test_what_to_record_next() -> None:
+    found = decide(
+        _whole(imu_static="skipped"), {**SECTIONS, "camera": {"verdict": "ok", "advice": ["tilt it"]}}
+    )
+    assert any("at rest" in sentence for sentence in found.record)
+    assert "Intrinsics: tilt it" in found.record
+
+
+def test_the_policy_is_that_of_the_script() -> None:
+    values = {
+        "version": "1", "summary": {}, "what": "<x>", "feedback": "", "aim": "", "points": 0, "draws": 0,
+        "tables": [], "clouds": [],
+    }  # fmt: skip
+    values["summary"] = {"cases": 1, "failed": 0, "why": "", "measure": "m", "as_before": 0}
+    text = render("sweep.html.j2", ("page.css",), ("common.js",), **values)
+    (script,) = re.findall(r"<script>(.*?)</script>", text, re.S)
+    assert script == _resource("common.js")
+    digest = base64.b64encode(sha256(script.encode()).digest()).decode()
+    assert f"sha256-{digest}" in text and "&lt;x&gt;" in text and "<x>" not in text
+    both = render("sweep.html.j2", ("page.css",), ("common.js", "page.js"), **values)
+    assert _resource("common.js") + _resource("page.js") in both and f"sha256-{digest}" not in both
+    # Half of a character, as a file's name may hold.
+    assert "\\udc80" in render("sweep.html.j2", (), (), **{**values, "what": "\udc80"})
+    with pytest.raises(jinja2.UndefinedError):
+        render("sweep.html.j2", (), ())
+
+
+EVIL_FLEET = "</script><script>document.title='owned'</script><img src=x onerror=alert(1)>"
+
+
+class _Outline_fleet_page(HTMLParser):
+    def __init__(self) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+
+def _summary(path: Path, count: int, constants: int = 6) -> FleetSummary:
+    pytest.importorskip("pyarrow")
+    rng = np.random.default_rng(3)
+    known = {}
+    for k in range(1, count + 1):
+        values = {f"camera.c{i}_px": (100.0 + rng.standard_normal(), 0.1) for i in range(constants)}
+        values["camera.fx_px"] = (273.0 + 0.05 * k + 0.2 * rng.standard_normal() + 40.0 * (k == 7), 0.1)
+        bad = k == 3
+        known[f"rig{k}"] = Outcome(
+            f"rig{k}", EVIL_FLEET if k == 7 else f"S{k}", "/x", "failed" if bad else "ok", 3 if bad else 0,
+            EVIL_FLEET if bad else "", stages={"intrinsics": "failed" if bad else "ok"},
+            values={} if bad else values, seconds=1.0, peak_MB=90.0,
+        )  # fmt: skip
+    write_outcomes(path, list(known), known.get)
+    return summarise(path)[0]
+
+
+def test_whole_harmless_and_told(tmp_path: Path) -> None:
+    found = _summary(tmp_path / "x.parquet", 60)
+    text = fleet_page_text(found, Borrowing(3, {"fx_px": 0.5}, (("rig1", EVIL_FLEET),), 1, 40))
+    outline = _Outline_fleet_page()
+    outline.feed(text)
+    for tag, attributes in outline.tags:
+        for name in ("src", "href", "action", "srcset"):
+            target = attributes.get(name)
+            assert target is None or target.startswith("#"), (tag, target)
+        assert not [name for name in attributes if name.startswith("on")], tag
+    assert sum(tag == "script" for tag, _ in outline.tags) == 1
+    assert not [tag for tag, _ in outline.tags if tag == "img"]
+    assert not re.search(r"https?://", text)
+    assert "1 of 60 rigs has no result" in text and "camera.fx_px drifts" in text
+    assert "3 of 4 rigs borrowed" in text
+    # The worst first: the one without a result, then the one that stands out.
+    assert text.index("rig3</td>") < text.index("rig7</td>")
+    assert fleet_page_text(found) == fleet_page_text(_summary(tmp_path / "y.parquet", 60))
+
+
+def test_a_page_does_not_grow_with_the_fleet(tmp_path: Path) -> None:
+    few = len(fleet_page_text(_summary(tmp_path / "a.parquet", 300, 2)))
+    many = len(fleet_page_text(_summary(tmp_path / "b.parquet", 3000, 2)))
+    assert many < 1.1 * few < 400_000
+
+
+def test_in_a_browser(tmp_path: Path) -> None:
+    browser = browser_or_skip(tmp_path / "profile")
+    try:
+        write_fleet_page(tmp_path / PAGE, _summary(tmp_path / "x.parquet", 60))
+        browser.open(tmp_path / PAGE, 1100)
+        assert browser.run("document.title") == "Fleet of 60 rigs"
+        assert browser.run("document.querySelectorAll('.card svg').length") >= 7
+        browser.run("document.querySelectorAll('#table th button')[2].click()")
+        sort = "document.querySelectorAll('#table th')[2].getAttribute('aria-sort')"
+        assert browser.run(sort) == "ascending"
+        typed = "(() => { const e = document.getElementById('filter'); e.value = 'fx_px';"
+        browser.run(f"{typed} e.dispatchEvent(new Event('input')); }})()")
+        assert browser.run("document.querySelectorAll('.card:not([hidden])').length") == 1
+    finally:
+        browser.close()
+
+
+_SPEC = SweepSpec(
+    Base("controller", "pid", "jump", "", "truth", None, "auto"),
+    (("pump.lag_s", (0.1, 0.2)),),
+    (),
+    3,
+    0,
+    ("m",),
+)
+
+
+def _point(number: int, loss: float) -> Point:
+    return Point(
+        number, (("pump.lag_s", 0.1 * number),), loss, 2.0 * loss, loss, 3, (("m", loss), ("n", 7.0))
+    )
+
+
+def test_what_is_told() -> None:
+    summary = SweepSummary(
+        6, 1, 0, "<b>too heavy</b>", "m", ("m", "n"), (_point(1, 0.125),), (_point(2, 8.5),),
+        (("pump.lag_s", ((0.1, 0.125), (0.2, 8.5))),),
+    )  # fmt: skip
+    text = sweep_page_text(_SPEC, summary)
+    assert "controller pid on jump" in text and "1 of them failed: &lt;b&gt;too heavy" in text
+    assert text.index("0.125") < text.index("8.5") and "Simulated." in text and ">7<" in text
+    assert not re.search(r"https?://|src=", text)
