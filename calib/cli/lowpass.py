@@ -111,9 +111,10 @@ def lowpass(
     section = lowpass_section(made, workspace_m, seen, wanted)
     write_rig(rig, before.model_copy(update={"lowpass": section}), {"lowpass": hashes})
     if figures is not None:
-        from calib.stages.lowpass.plots import write_lowpass_figures
+        from calib.show.draw import write_figures
+        from calib.stages.lowpass.plots import plots
 
-        write_lowpass_figures(figures, made, section, seen)
+        write_figures(figures, plots(made, section, seen))
         narrate(f"figures in {figures}")
     narrate(f"lowpass written to {rig}")
     if as_json:
