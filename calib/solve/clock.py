@@ -17,7 +17,8 @@ mean, W is 1, and the times are the stamps. Where the means differ as jitter alo
 of one sample over W, nothing wanders.
 
 Steadiness. Stamps that stay within a quarter of a period of their line are a steady sensor's. Those of others
-stay as they are, and their samples are counted without gaps.
+stay as they are. What needs even samples gets those of a steady sensor as they are, and those of others on
+straight lines between them, at even times that span what the stamps do.
 
 So the axis spans what the stamps span, and no sample is moved by more than the jitter of its stamp. Gaps of
 more than `SPLIT_S` cut the axis into stretches, each with its own line.
@@ -33,7 +34,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.optimize import isotonic_regression
 
-from calib.core.arrays import FloatArray, IntArray
+from calib.core.arrays import BoolArray, FloatArray, IntArray
 
 SPLIT_S = 1.0
 """Gaps that are longer are not filled."""
@@ -68,12 +69,12 @@ class Gap:
 
 @dataclass(frozen=True)
 class Part:
-    """Readings of a stretch, evenly sampled where the sensor is steady.
+    """Readings of a stretch at even steps.
 
     Attributes
     ----------
-    t_s : (m,) times, rising; within a steady sensor's small gaps as well.
-    values : (m, axes), on straight lines where samples are missing.
+    t_s : (m,) times [s].
+    values : (m, axes), on straight lines where samples are missing or the sensor is not steady.
     rows : (k,) samples that are in it, and `places` (k,) where they are in `values`.
     """
 
@@ -81,11 +82,6 @@ class Part:
     values: FloatArray
     rows: IntArray
     places: IntArray
-
-    @property
-    def start_s(self) -> float:
-        """Time of the first sample."""
-        return float(self.t_s[0])
 
 
 @dataclass(frozen=True)
@@ -98,6 +94,7 @@ class TimeAxis:
     t_s : (n,) times [s], which do not go back either.
     places : (n,) number of each sample in its stretch, from 0, with gaps where samples are missing.
     starts : (stretches,) first sample of each stretch.
+    even : (stretches,) whether its samples were taken at even steps.
     period_s : of the sensor; the mean step where it is not steady, NaN where no time passes.
     jitter_s : robust standard deviation of the stamps about the times.
     steady : whether most samples are of steady stretches.
@@ -108,6 +105,7 @@ class TimeAxis:
     t_s: FloatArray
     places: IntArray
     starts: IntArray
+    even: BoolArray
     period_s: float
     jitter_s: float
     steady: bool
@@ -137,15 +135,18 @@ class TimeAxis:
         return sum(gap.missing for gap in self.gaps if not gap.split)
 
     def parts(self, values: FloatArray) -> tuple[Part, ...]:
-        """Readings (n, axes) of these samples stretch by stretch, small gaps filled with straight lines."""
+        """Readings (n, axes) of these samples stretch by stretch at even steps."""
         out = []
-        for first, last in _stretches(self.starts, len(self.t_s)):
-            places, t, held = self.places[first:last], self.t_s[first:last], values[first:last]
-            grid = np.arange(int(places[-1]) + 1)
-            if len(grid) != len(places):
-                t = np.interp(grid, places, t)
-                held = np.stack([np.interp(grid, places, column) for column in held.T], axis=1)
-            out.append(Part(t, np.ascontiguousarray(held), np.arange(first, last), places))
+        for (first, last), even in zip(_stretches(self.starts, len(self.t_s)), self.even, strict=True):
+            t, places, held = self.t_s[first:last], self.places[first:last], values[first:last]
+            known, wanted, times = places.astype(np.float64), np.arange(int(places[-1]) + 1.0), t
+            if not even and t[-1] > t[0]:
+                known, times = t, np.linspace(t[0], t[-1], max(round((t[-1] - t[0]) / self.period_s), 1) + 1)
+                places, wanted = np.rint((t - t[0]) / (times[1] - times[0])).astype(np.int64), times
+            if not even or len(wanted) != len(known):
+                times = np.interp(wanted, known, t)
+                held = np.stack([np.interp(wanted, known, column) for column in held.T], axis=1)
+            out.append(Part(times, np.ascontiguousarray(held), np.arange(first, last), places))
         return tuple(out)
 
 
@@ -157,20 +158,21 @@ def time_axis(stamps_s: FloatArray) -> TimeAxis:
     usual = float(np.median(rising)) if len(rising) else 0.0
     starts = np.flatnonzero(np.concatenate([[True], steps > max(SPLIT_S, 5.0 * usual)])[: len(t)])
     times, places = t.copy(), np.zeros(len(t), dtype=np.int64)
-    samples, weighted, even = 0, 0.0, 0
-    for first, last in _stretches(starts, len(t)):
+    samples, weighted, even = 0, 0.0, np.zeros(len(starts), dtype=np.bool_)
+    for k, (first, last) in enumerate(_stretches(starts, len(t))):
         places[first:last] = np.arange(last - first)
         stretch = _steady(t[first:last])
         if stretch is not None:
             times[first:last], places[first:last], period = stretch
-            even += last - first
+            even[k] = True
             weighted, samples = weighted + period * (last - first), samples + last - first
+    steady = 2 * samples > len(t)
     if not samples and len(t) > 1:
         within = np.delete(steps, starts[1:] - 1)
         weighted, samples = float(within.sum()), len(within)
     period = weighted / samples if weighted > 0.0 else math.nan
     jitter = 1.4826 * float(np.median(np.abs(t - times))) if len(t) else 0.0
-    return TimeAxis(t, times, places, starts, period, jitter, 2 * even > len(t), int((steps == 0.0).sum()))
+    return TimeAxis(t, times, places, starts, even, period, jitter, steady, int((steps == 0.0).sum()))
 
 
 def _stretches(starts: IntArray, n: int) -> Iterator[tuple[int, int]]:

@@ -27,7 +27,6 @@ from calib.stages.align.solve import (
     align,
     best_jitter_px,
     correlation,
-    even_times_of,
     judge_align,
     pictures_off,
     pieces_of,
@@ -135,36 +134,6 @@ def test_sigma_tells_the_errors_of_rigs_that_differ() -> None:
     assert ((np.abs(np.array(z)) < 1.96).sum(axis=0) >= 13).all()
     assert np.abs(offset).max() < 1e-3
     assert np.sqrt(np.mean(np.square(mount))) < math.radians(0.1)
-
-
-def _stamped(taken: FloatArray, jitter: float, repeated: float, seed: int) -> FloatArray:
-    rng = np.random.default_rng(seed)
-    t = np.maximum.accumulate(taken + jitter * rng.standard_normal(len(taken)))
-    for i in np.flatnonzero(rng.random(len(t)) < repeated):
-        t[i] = t[max(i - 1, 0)]
-    return t
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_jitter_and_repeated_stamps_leave_microseconds(seed: int) -> None:
-    taken = 3.0 + 0.0100003 * np.arange(4000)
-    found = even_times_of(_stamped(taken, 4e-4, 0.002, seed))
-    # The line through 4000 stamps has the deviation 2 * 0.4 ms / sqrt(4000) at its ends; four of that.
-    assert np.abs(found.t_s - taken).max() < 4 * 2 * 4e-4 / np.sqrt(4000)
-    # Its slope has the deviation 0.4 ms sqrt(12 / 4000^3), and four of that are allowed.
-    assert found.period_s == pytest.approx(0.0100003, abs=4 * 4e-4 * np.sqrt(12 / 4000**3))
-    assert found.jitter_s == pytest.approx(4e-4, rel=0.1)
-    assert found.missing == 0
-    assert found.repeated > 0
-
-
-def test_a_clock_that_wanders_is_followed() -> None:
-    taken = 0.01 * np.arange(12000)
-    wander = 3e-3 * np.sin(2.0 * np.pi * taken / 90.0)
-    found = even_times_of(_stamped(taken + wander, 4e-4, 0.0, 3))
-    # The blocks' medians follow it; without them the line would leave millimetres of seconds.
-    middle = slice(500, -500)
-    assert np.abs(found.t_s - taken - wander)[middle].max() < 4e-4
 
 
 AREA = 1256.0

@@ -12,9 +12,9 @@ import pytest
 from armlogs import swung
 from scipy.signal import lfilter
 
+from calib.solve.clock import Part
 from calib.stages.imu.drift import LogDrift, Measures, allan_at, analyse_drift, lag_s, slope_of
 from calib.stages.imu.mahony import Mahony, MahonySample, MahonyState, filter_log, step
-from calib.stages.imu.sampling import Part
 from calib.stages.imu.tracks import DriftLog, Tuned, on_grid, tracks_of
 from calib.stages.imu.tuning import smooth_log
 
@@ -197,7 +197,7 @@ def _log_tracks(
     values = np.stack([whole[axis] for axis in axes], axis=1)
     log = DriftLog("log.csv", axes, t, values, t, phi + 0.1, np.zeros(0), np.zeros(0))
     places = np.arange(n)
-    return log, Part(0.0, values, places, places), phi
+    return log, Part(t, values, places, places), phi
 
 
 def test_the_sensors_alone_and_the_filter() -> None:
@@ -240,7 +240,8 @@ def test_the_start_is_right_though_it_moves() -> None:
 
 def test_the_truth_on_the_grid() -> None:
     places = np.arange(100)
-    parts = [Part(0.0, np.zeros((100, 1)), places, places), Part(5.0, np.zeros((100, 1)), places, places)]
+    none = np.zeros((100, 1))
+    parts = [Part(start_s + 0.01 * places, none, places, places) for start_s in (0.0, 5.0)]
     t = np.concatenate([np.arange(0.0, 0.5, 0.02), np.arange(0.8, 3.0, 0.02)])
     angle = np.angle(np.exp(1j * (3.0 + t)))
     first, second = on_grid(t, angle, parts, 0.01)

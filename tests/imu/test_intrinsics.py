@@ -18,6 +18,7 @@ from scipy.special import stdtrit
 
 import calib.stages.imu.intrinsics
 from calib.core.rig import Rig, rig_text
+from calib.solve.clock import Part
 from calib.stages.imu.intrinsics import (
     ANGLES,
     GYRO_ANGLES,
@@ -37,7 +38,7 @@ from calib.stages.imu.intrinsics import (
     turn_directions,
 )
 from calib.stages.imu.results import intrinsics_section
-from calib.stages.imu.sampling import Part, Rest, find_rests, quiet_level, spread
+from calib.stages.imu.sampling import Rest, find_rests, quiet_level, spread
 from calib.stages.imu.section import ImuIntrinsics
 
 SENSOR = Sensor()
@@ -317,7 +318,7 @@ PERIOD_S = 0.01
 
 def _parts(values: np.ndarray) -> tuple[Part, ...]:
     rows = np.arange(len(values))
-    return (Part(0.0, values, rows, rows),)
+    return (Part(PERIOD_S * rows, values, rows, rows),)
 
 
 def _log(poses: int = 8, **how: float) -> np.ndarray:

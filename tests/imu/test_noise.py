@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calib.core.errors import BadInputError
+from calib.solve.clock import Part
 from calib.stages.imu.allan import (
     allan_variance,
     analyse,
@@ -22,7 +23,7 @@ from calib.stages.imu.allan import (
     spaced,
 )
 from calib.stages.imu.results import from_kalibr_imu, imu_section, kalibr_imu
-from calib.stages.imu.sampling import Part, regular_parts, rest_parts
+from calib.stages.imu.sampling import regular_parts, rest_parts
 from calib.stages.imu.section import Imu as Imu_of_kalibr_imu
 from calib.stages.imu.static import AXES, RestLog, Static, analyse_static, judge
 from calib.twin.sensors import HeadMotion, Imu, draw_imu_noise, measure
@@ -313,7 +314,7 @@ NOISE = np.array([2.4e-3, 0.015])
 
 def _part(values: np.ndarray, start_s: float = 5.0) -> tuple[Part, ...]:
     places = np.arange(len(values))
-    return (Part(start_s, values, places, places),)
+    return (Part(start_s + 0.01 * places, values, places, places),)
 
 
 def _still(seed: int, n: int = 6000) -> np.ndarray:

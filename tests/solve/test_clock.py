@@ -26,11 +26,14 @@ def _held(axis: TimeAxis, stamps: FloatArray, jitter_s: float) -> None:
     assert np.abs(axis.t_s - stamps).max() <= jitter_s
     assert abs((axis.t_s[-1] - axis.t_s[0]) - (stamps[-1] - stamps[0])) <= 2.0 * jitter_s
     parts = axis.parts(stamps[:, None])
-    assert [part.start_s for part in parts] == axis.t_s[axis.starts].tolist()
     assert sum(len(part.rows) for part in parts) == len(stamps)
-    for part in parts:
-        assert np.array_equal(part.t_s[part.places], axis.t_s[part.rows])
+    for part, even in zip(parts, axis.even, strict=True):
+        assert len(part.t_s) == len(part.values) > part.places[-1]
+        assert [part.t_s[0], part.t_s[-1]] == pytest.approx(axis.t_s[part.rows[[0, -1]]].tolist(), abs=1e-9)
         assert (np.diff(part.t_s) >= 0.0).all()
+        if even:
+            assert np.array_equal(part.t_s[part.places], axis.t_s[part.rows])
+            assert np.array_equal(part.values[part.places, 0], stamps[part.rows])
 
 
 KINDS = ("even", "adds up", "drifts", "bursts", "polled", "stalls")

@@ -399,7 +399,7 @@ def analyse_drift(
     _, motions = rest_parts(parts, period_s, gyro, sampling.step)
     moving = []
     for part in parts:
-        at = part.start_s + period_s * (np.arange(len(part.values)) + 0.5)
+        at = part.t_s + 0.5 * period_s
         flags = np.zeros(len(at), dtype=np.bool_)
         for motion in motions:
             flags[np.searchsorted(at, motion.from_s) : np.searchsorted(at, motion.to_s)] = True
@@ -425,7 +425,7 @@ def analyse_drift(
         period_s * sum(where.stop - where.start for _, where in stretches),
         period_s * sum(int(flags.sum()) for flags in moving),
         _upright(log),
-        tuple(part.start_s for part in parts),
+        tuple(float(part.t_s[0]) for part in parts),
         tuple(moving),
         truth,
         tuple(tracks),

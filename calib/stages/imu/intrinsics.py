@@ -15,9 +15,9 @@ from scipy.special import fdtrc
 
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
+from calib.solve.clock import Part
 from calib.stages.imu.sampling import (
     MULTIPLES,
-    Part,
     Quiet,
     Rest,
     Sampling,

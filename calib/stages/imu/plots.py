@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from calib.core.arrays import FloatArray
+from calib.core.arrays import FloatArray, IntArray
 from calib.show.style import (
     BLUE,
     GREEN,
@@ -162,15 +162,15 @@ def allan_figure(result: Static, verdict: str = "ok") -> Figure:
     return figure
 
 
-def _thinned(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _thinned(values: FloatArray) -> tuple[IntArray, FloatArray]:
     """Places and values of which no extreme is lost: least and largest of each bin."""
     n = len(values)
     size = max(1, 2 * n // _MOST_POINTS)
     if size <= 2:
-        return np.arange(n, dtype=np.float64), values
+        return np.arange(n), values
     count = n // size
     bins = values[: count * size].reshape(count, size)
-    at = size * (np.arange(count) + 0.5)
+    at = size * np.arange(count) + size // 2
     return np.repeat(at, 2), np.stack([bins.min(axis=1), bins.max(axis=1)], axis=1).ravel()
 
 
@@ -183,19 +183,19 @@ def signal_figure(result: Static, number_of_log: int = 0, verdict: str = "ok") -
     )
     figure = sheet(2.2 * _rows(result), plain(f"Readings at rest: {log.source}", 90), note, verdict)
     period = log.sampling.period_s
-    zero = min(part.start_s for part in log.parts)
+    zero = float(log.parts[0].t_s[0])
     for axes, k in _panels(figure, result):
         name = result.axes[k]
         axes.set_title(name)
         axes.grid(True)
         for part in log.parts:
             at, values = _thinned(part.values[:, k])
-            axes.plot(part.start_s - zero + period * at, values, color="#b9c0c7", linewidth=0.5)
+            axes.plot(part.t_s[at] - zero, values, color="#b9c0c7", linewidth=0.5)
             size = max(1, round(1.0 / period))
             count = len(part.values) // size
             if count:
                 means = part.values[: count * size, k].reshape(count, size).mean(axis=1)
-                middle = part.start_s - zero + period * size * (np.arange(count) + 0.5)
+                middle = part.t_s[0] - zero + period * size * (np.arange(count) + 0.5)
                 axes.plot(middle, means, color=BLUE, linewidth=1.0)
         for motion in log.motions:
             axes.axvspan(motion.from_s - zero, motion.to_s - zero, color=VERMILLION, alpha=0.25, linewidth=0)

@@ -18,11 +18,12 @@ from calib.core.files import as_text, read_bytes, shown
 from calib.core.geometry import apply_homography
 from calib.core.rig import Rig
 from calib.io.logs import ROWS_MISSING, Log, check_time, read_log
+from calib.solve.clock import Part
 from calib.stages.actuator.kinematics import MARKER_OFFSET_M
 from calib.stages.camera.model import Camera, undistort
 from calib.stages.imu.intrinsics import PoseLog
 from calib.stages.imu.mahony import accelerometer_angles
-from calib.stages.imu.sampling import MOST_GYRO_RADPS, Part, Sampling, quiet_spread, regular_parts
+from calib.stages.imu.sampling import MOST_GYRO_RADPS, Sampling, quiet_spread, regular_parts
 from calib.stages.imu.static import AXES, RestLog, is_gyro
 from calib.stages.imu.tracks import DriftLog, on_grid, planar_rate, up_vector
 from calib.stages.imu.tuning import DATA_SHEET, SHORTEST_S, Noise, Piece, smooth_log
@@ -87,7 +88,7 @@ def _check_units(log: Log, axes: tuple[str, ...], values: FloatArray, t_s: Float
     rates = values[:, gyro]
     period = max(float(np.median(np.diff(t_s))), 1e-6)
     places = np.arange(len(rates))
-    quiet = float(quiet_spread((Part(0.0, rates, places, places),), period).max())
+    quiet = float(quiet_spread((Part(t_s, rates, places, places),), period).max())
     largest, bias = float(np.abs(rates).max()), float(np.abs(middle[gyro]).max())
     why = ""
     if largest > _FASTEST_RADPS:
@@ -534,11 +535,11 @@ def _lag(
     part, rate = parts[k], rates[k]
     if len(rate) * period_s < SHORTEST_S + period_s:
         return 0.0
-    t = period_s * np.arange(len(rate), dtype=np.float64)
+    t = part.t_s
     ax, ay = (np.ascontiguousarray(part.values[:, axes.index(name)]) for name in ("ax", "ay"))
     own = smooth_log(t, accelerometer_angles(ax, ay), rate, DATA_SHEET.gyro, DATA_SHEET.walk)
     # A rate that holds for the step before its sample is half a step ahead.
-    return lag_of(seen[0], np.unwrap(seen[1]), part.start_s + t, own.phi_rad - 0.5 * period_s * rate)
+    return lag_of(seen[0], np.unwrap(seen[1]), t, own.phi_rad - 0.5 * period_s * rate)
 
 
 def read_tune_log(path: Path, how: Reading) -> TuneLog:
@@ -586,7 +587,7 @@ def read_tune_log(path: Path, how: Reading) -> TuneLog:
         references = on_grid(seen[0] - lag, seen[1], kept, period)
     for part, rate, reference in zip(kept, rates, references, strict=True):
         ax, ay = (np.ascontiguousarray(part.values[:, read.axes.index(name)]) for name in ("ax", "ay"))
-        t = period * np.arange(len(rate), dtype=np.float64)
+        t = part.t_s - part.t_s[0]
         known = reference is not None and int(np.isfinite(reference).sum()) >= _TUNELOGS_FEWEST
         flat = how.tilted or _turns_in_plane(part, read.axes, period, quiet)
         angles = accelerometer_angles(ax, ay)

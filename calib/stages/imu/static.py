@@ -11,8 +11,9 @@ from scipy.special import stdtrit
 
 from calib.core.arrays import BoolArray, FloatArray
 from calib.core.errors import BadInputError
+from calib.solve.clock import Part
 from calib.stages.imu.allan import LEAST_SAMPLES, Allan, analyse
-from calib.stages.imu.sampling import Motion, Part, Sampling, regular_parts, rest_parts
+from calib.stages.imu.sampling import Motion, Sampling, regular_parts, rest_parts
 
 # ----------------------------------------------------------------------
 # An inertial sensor at rest: bias, noise, drift of its angle, and whether the log was at rest at all.
@@ -201,7 +202,7 @@ def _axis_noise(axis: str, k: int, logs: Sequence[StaticLog], period_s: float) -
 
 def _span_s(log: StaticLog, period_s: float) -> float:
     last = log.parts[-1]
-    return last.start_s + len(last.values) * period_s - log.parts[0].start_s
+    return float(last.t_s[-1] - log.parts[0].t_s[0]) + period_s
 
 
 def analyse_static(logs: Sequence[RestLog]) -> Static:

@@ -16,8 +16,8 @@ from scipy.signal import butter
 
 from calib.core.arrays import BoolArray, FloatArray
 from calib.core.errors import BadInputError, pip_install
+from calib.solve.clock import Part
 from calib.stages.imu.mahony import Mahony, MahonyState, accelerometer_angles, filter_log
-from calib.stages.imu.sampling import Part
 
 # ----------------------------------------------------------------------
 # How far an estimated orientation is from a true one, as BROAD counts it.
@@ -419,12 +419,12 @@ def _start(phi_acc: FloatArray, rate_radps: FloatArray, period_s: float) -> floa
 def on_grid(
     t_s: FloatArray, phi_rad: FloatArray, parts: Sequence[Part], period_s: float
 ) -> tuple[FloatArray, ...]:
-    """Samples of an angle at the even grid's times, NaN before the first, after the last and in gaps."""
+    """Samples of an angle at the parts' times, NaN before the first, after the last and in gaps."""
     out = []
     whole = np.unwrap(phi_rad)
     widest = 5.0 * max(float(np.median(np.diff(t_s))), period_s)
     for part in parts:
-        at = part.start_s + period_s * np.arange(len(part.values))
+        at = part.t_s
         phi = np.interp(at, t_s, whole)
         after = np.clip(np.searchsorted(t_s, at), 1, len(t_s) - 1)
         far = (t_s[after] - t_s[after - 1] > widest) & (at > t_s[after - 1]) & (at < t_s[after])
@@ -457,8 +457,7 @@ class _Runner:
         for part, phi_acc in zip(self.parts, self.phi_acc, strict=True):
             rate = np.negative(self._of(part, "gz"))
             start = _start(phi_acc, rate, self.period_s)
-            rate[0] = 0.0
-            out.append(start + self.period_s * np.cumsum(rate))
+            out.append(start + np.cumsum(rate * np.diff(part.t_s, prepend=part.t_s[0])))
         return tuple(out)
 
     def accelerometer(self) -> tuple[FloatArray, ...]:
@@ -471,9 +470,8 @@ class _Runner:
             if tilted:
                 gyro, force = self.three(part)
                 rate = planar_rate(gyro, up_vector(force, gyro, self.period_s))
-            t = self.period_s * np.arange(len(rate), dtype=np.float64)
             start = MahonyState(_start(phi_acc, rate, self.period_s))
-            out.append(filter_log(gains, t, phi_acc, rate, start)[0])
+            out.append(filter_log(gains, part.t_s, phi_acc, rate, start)[0])
         return tuple(out)
 
     def peer(self, name: str) -> tuple[FloatArray, ...]:
@@ -497,7 +495,7 @@ def tracks_of(
 
     Parameters
     ----------
-    parts : of the log on an even grid of this period, each at least two samples long.
+    parts : of the log at even steps of this period, each at least two samples long.
     tuned : what the row "MM tuned" is made with, left out without.
     peers : run the filters of others that are installed.
     told : is called with a sentence before what may take long.

@@ -75,7 +75,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x32ABE0ECUL
+#define CALIB_ID 0x67EE4B5AUL
 
 /* Camera (2.5) and lens (B.1). */
 #define CALIB_IMAGE_WIDTH_PX 316 /* columns */
@@ -181,8 +181,8 @@
  * Angle filter (2.3), dt folded in. The integral is kept as an angle per tick, J = I dt:
  * J += KI_DT2 e, phi += KP_DT e + J - DT gz; J begins at GYRO_BIAS_DT.
  */
-#define CALIB_MM_KP_DT 0.12172471f /* Kp dt, dimensionless; Kp = 7.30348255 1/s */
-#define CALIB_MM_KI_DT2 3.70422604e-05f /* Ki dt^2, dimensionless; Ki = 0.133352143 1/s^2 */
+#define CALIB_MM_KP_DT 0.117423154f /* Kp dt, dimensionless; Kp = 7.0453893 1/s */
+#define CALIB_MM_KI_DT2 3.44704931e-05f /* Ki dt^2, dimensionless; Ki = 0.124093776 1/s^2 */
 #define CALIB_MM_DT_S 0.0163863152f /* dt of the rate over the gyroscope's scale, s; phi falls for gz > 0 */
 #define CALIB_MM_GYRO_BIAS_DT_RAD 9.48672823e-05f /* bias times the same, rad */
 #define CALIB_MM_INTEGRAL_LIMIT_RAD 0.0166666675f /* |J| stays below, rad */
