@@ -1,20 +1,29 @@
-"""The pipeline on the ATmega328P's instruction set: the same values, and what they cost."""
+"""The pipeline on the ATmega328P: the same values, what they cost, loops it closes, and the sketch."""
 
 from __future__ import annotations
 
 import math
+import subprocess
 from dataclasses import replace
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import pytest
-from firmware_build import LIMITS, avr, compare, run, write
+from firmware_build import LIMITS, NATIVE, Process, Simulated, avr, compare, host, need, run, write
+from firmware_plant import Loop
 from firmware_rigs import header, rig
 
 from calib.core.rig import Rig
-from calib.stages.firmware.conformance import MODE_POSITION, Inputs, Reference
+from calib.io.serial import Decoder
+from calib.stages.control.references import Ellipse
+from calib.stages.firmware.check import check_frames
+from calib.stages.firmware.conformance import MODE_ORIENTATION, MODE_POSITION, Inputs, Reference, reference_of
+from calib.stages.firmware.conformance import binary32 as binary32_of_loop
+from calib.stages.firmware.header import verbatim
 from calib.stages.firmware.literals import values
 from calib.stages.firmware.vectors import binary32, coherent, directed, directed_fused
+from calib.twin.rig import SimulatedRig
 
 TICK_CYCLES = 266_667
 STAGES = ("", "angle", "plane", "offset", "low-pass", "lengths", "control")
@@ -174,3 +183,148 @@ def test_a_moving_reference_is_that_of_the_set_points(tmp_path: Path) -> None:
 
 def _with(tick: Inputs, q: np.ndarray) -> Inputs:
     return binary32(replace(tick, reference=(float(q[0]), float(q[1]))))
+
+
+class _Processor(Protocol):
+    def tick(self, numbers: np.ndarray, seen: bool, mode: int) -> np.ndarray: ...
+
+
+class _Python:
+    """The reference, asked in the same way as a program."""
+
+    def __init__(self, kind: str, fused: bool) -> None:
+        self.reference = reference_of(values(header(kind).literals), fused=fused)
+
+    def tick(self, numbers: np.ndarray, seen: bool, mode: int) -> np.ndarray:
+        u, v, ax, ay, gz, first, second = numbers.tolist()
+        given = Inputs(u, v, ax, ay, gz, (first, second), seen, True, mode)
+        return np.array(self.reference.step(binary32_of_loop(given)).pwm)
+
+
+class _Host:
+    """A program on this machine, through its pipes."""
+
+    def __init__(self, command: list[str]) -> None:
+        self.process = Process(command)
+
+    def tick(self, numbers: np.ndarray, seen: bool, mode: int) -> np.ndarray:
+        u, v, ax, ay, gz, first, second = numbers.tolist()
+        self.process.send(Inputs(u, v, ax, ay, gz, (first, second), seen, True, mode))
+        return self.process.receive().numbers[0, 7:]
+
+
+class Avr:
+    """The AVR in a simulator within this process."""
+
+    def __init__(self, command: list[str]) -> None:
+        self.program = Simulated(command)
+        self._floats = self.program.record[:28].view("<f4")
+        self._pwm = self.program.result[28:36].view("<f4")
+
+    def tick(self, numbers: np.ndarray, seen: bool, mode: int) -> np.ndarray:
+        """Commands (2,) for the readings and reference (7,)."""
+        self._floats[:] = numbers
+        self.program.record[28:] = seen, 1, mode
+        self.program.tick()
+        return self._pwm.astype(np.float64)
+
+
+def closed(processor: _Processor, wanted: np.ndarray, mode: int) -> np.ndarray:
+    """Lengths (n + 1, 2) at the ticks of a loop that the processor closes; `wanted` (n, 2)."""
+    loop = Loop(SimulatedRig(), len(wanted))
+    for k, pair in enumerate(wanted):
+        seen = loop.look(k)
+        loop.record[5:] = pair
+        loop.move(k, processor.tick(loop.record, seen, mode))
+    return loop.lengths()
+
+
+def experiment(name: str) -> tuple[np.ndarray, int]:
+    """References (n, 2) at the ticks, and the controller's mode."""
+    times = np.arange(0.0, 20.0 if name == "ellipse" else 5.0, 1.0 / 60.0)
+    if name == "ellipse":
+        return Ellipse().bellows_m(times, SimulatedRig().plant.bellows_radius_m), MODE_POSITION
+    return np.full((len(times), 2), 0.7), MODE_ORIENTATION
+
+
+@pytest.mark.parametrize("name", ["ellipse", "step"])
+@pytest.mark.parametrize(
+    ("where", "kind", "fused"),
+    [("host", "nominal", False), ("avr", "nominal", False), ("avr", "twin", True)],
+)
+def test_the_loop_closed_by_the_processor_is_that_of_float64(
+    tmp_path: Path, name: str, where: str, kind: str, fused: bool
+) -> None:
+    write(tmp_path, header(kind))
+    switch = ["-DCALIB_FUSED=1"] if fused else []
+    wanted, mode = experiment(name)
+    expected = closed(_Python(kind, fused), wanted, mode)
+    program = Avr(avr(tmp_path, *switch)[0]) if where == "avr" else _Host(host(tmp_path, *switch))
+    found = closed(program, wanted, mode)
+    if isinstance(program, _Host):
+        program.process.close()
+    difference = np.abs(found - expected).max()
+    print(f"{name} on {where}, {'fused' if fused else 'MM'}: lengths differ by {difference:.2g} m at most")
+    assert difference < 1e-6
+    # The loop did something.
+    assert np.ptp(expected[:, 0]) > 0.005
+
+
+def _sketch(folder: Path) -> Path:
+    write(folder, header())
+    path = folder / "sketch.ino"
+    path.write_text(verbatim("calib_example.ino"))
+    return path
+
+
+def test_it_compiles_for_the_board(tmp_path: Path) -> None:
+    need("avr-gcc")
+    flags = ["-mmcu=atmega328p", "-Os", "-DF_CPU=16000000UL", "-std=gnu++11", "-Wall", "-Wextra", "-Werror"]
+    call = [
+        "avr-g++",
+        *flags,
+        f"-I{NATIVE / 'arduino'}",
+        "-x",
+        "c++",
+        "-c",
+        _sketch(tmp_path),
+        "-o",
+        tmp_path / "o",
+    ]
+    done = subprocess.run([str(word) for word in call], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    sizes = subprocess.run(["avr-size", tmp_path / "o"], capture_output=True, text=True, check=True).stdout
+    text, data, bss = map(int, sizes.splitlines()[1].split()[:3])
+    print(f"sketch without the Arduino core: flash {text + data}, RAM {data + bss}")
+    assert data + bss <= 300
+
+
+@pytest.mark.parametrize("mode", ["OFF", "ORIENTATION", "POSITION"])
+def test_what_it_sends_is_what_python_computes(tmp_path: Path, mode: str) -> None:
+    need("g++")
+    flags = ["-std=c++11", "-O1", "-ffp-contract=off", f"-DCALIB_EXAMPLE_MODE=CALIB_MODE_{mode}"]
+    call = [
+        "g++",
+        *flags,
+        f"-I{NATIVE / 'arduino'}",
+        "-o",
+        tmp_path / "board",
+        "-x",
+        "c++",
+        _sketch(tmp_path),
+    ]
+    done = subprocess.run(
+        [str(word) for word in [*call, NATIVE / "board.cpp"]], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    stream = subprocess.run([tmp_path / "board", "300"], capture_output=True, check=True).stdout
+    decoder = Decoder()
+    frames = list(decoder.feed(stream))
+    assert (len(frames), decoder.skipped, decoder.damaged) == (300, 0, 0)
+    assert frames[10].rate_mhz == 60000
+    assert [not f.given.marker_seen for f in frames].count(True) == 6
+    assert [k for k, f in enumerate(frames) if not f.given.imu_read] == list(range(70, 80))
+    result = check_frames(header(), frames, "board")
+    assert result.ticks == 300
+    assert result.reasons == []
+    assert result.worst["q_m"] < 2e-7

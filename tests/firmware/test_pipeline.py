@@ -1,17 +1,4 @@
-"""The pipeline in C on this machine against float64: recorded motion, random and hostile ticks.
-
-Rounding. With eps = 2^-24 = 6e-8, coordinates up to 0.3 m, and one operation losing at most eps of its
-result:
-
-- marker: numerator and denominator lose about 4 eps of their largest terms, 0.6 m / W with W >= 2.5 1/m where
-  the marker can be, so 4 x 6e-8 x (0.6 + 0.3) ~ 2e-7 m at worst and a tenth of it typically: 2e-7 m.
-- angle: the polynomial of the arc tangent is right to 2e-7 rad; the angle filter loses eps phi per tick and
-  forgets with the time constant 1 / Kp = 20 ticks: 20 x 6e-8 x 1.5 ~ 2e-6 rad: 2e-6 rad.
-- head: marker, 1e-6 d of the sine, and the low-pass, which loses eps |y| per tick and forgets in 1 / b0 = 20
-  ticks: 2e-7 + 2e-8 + 20 x 6e-8 x 0.15 ~ 4e-7 m; lengths: f and r_B phi on top, 2e-6 x r_B = 3e-8: 2e-6 m.
-- commands: gains of up to 24000 PWM/m on lengths that err by 1e-7 m where the marker can be: 2.4e-3, and the
-  integral's rounding, eps x 255 per tick as a random walk over 1e5 ticks, 5e-3: 0.01 PWM.
-"""
+"""The pipeline in C on this machine against float64: recorded motion, random and hostile ticks."""
 
 from __future__ import annotations
 
@@ -23,24 +10,62 @@ from pathlib import Path
 import numpy as np
 import pytest
 from firmware_build import LIMITS, compare, host, hostile, need, numbers, run, strew, write
+from firmware_plant import Loop
 from firmware_rigs import header, rig
 
+from calib.stages.actuator.kinematics import head_from_marker, inverse_series
+from calib.stages.actuator.simulate import rig_at_rest
+from calib.stages.camera.model import Camera, undistort
+from calib.stages.control.laws import (
+    FeedForward,
+    LoopState,
+    OrientationControl,
+    Pid,
+    PositionControl,
+    step_orientation,
+    step_position,
+)
+from calib.stages.estimator.constant_gain import Gains, Ticks, run_gains
+from calib.stages.estimator.kinematic import Setup, Start
 from calib.stages.firmware.conformance import (
+    ACCEL_WEAK,
+    ANGLE_LIMIT,
     BAD_REFERENCE,
+    CLAMPED,
     HORIZON,
     IMU_HELD,
     MARKER_HELD,
     MODE_OFF,
     MODE_ORIENTATION,
     MODE_POSITION,
+    MOVING,
+    REJECTED,
+    SATURATED,
     STALE,
+    FusedReference,
     Inputs,
     Reference,
 )
 from calib.stages.firmware.header import Header
 from calib.stages.firmware.literals import values
-from calib.stages.firmware.vectors import binary32, directed
+from calib.stages.firmware.vectors import (
+    FUSED_TICKS,
+    PERIOD,
+    Motion,
+    binary32,
+    coherent,
+    directed,
+    directed_fused,
+    vectors,
+)
+from calib.stages.imu.mahony import Mahony, MahonySample, MahonyState
+from calib.stages.imu.mahony import step as step_angle
+from calib.stages.lowpass.filters import LowPass, settled
+from calib.stages.lowpass.filters import step as step_lowpass
 from calib.stages.lowpass.section import LowPassSection
+from calib.twin.pictures import CAMERA, PLANE
+from calib.twin.rig import SimulatedRig
+from calib.twin.simulate import simulate
 
 
 @pytest.fixture(scope="module", params=["nominal", "full"])
@@ -143,13 +168,6 @@ def test_before_the_first_picture_the_pumps_are_off(built: tuple[Header, list[st
     assert (found.flags[5:] & STALE == 0).all()
 
 
-def test_a_bad_reference_stops_the_pumps_for_its_tick(built: tuple[Header, list[str], Path]) -> None:
-    _, command, _ = built
-    bad = replace(_still(), reference=(float("nan"), 0.08))
-    found = run(command, [_still()] * 10 + [bad] + [_still()] * 10)
-    assert [bool(f & BAD_REFERENCE) for f in found.flags] == [False] * 10 + [True] + [False] * 10
-
-
 def test_the_horizon_is_a_lost_marker(tmp_path: Path) -> None:
     """A plane whose horizon runs through the picture; the marker above it is held and counted."""
     made = header()
@@ -227,3 +245,331 @@ def test_low_passes_of_every_order(tmp_path: Path, order: int) -> None:
     ticks = directed(values(made.literals), 1500)
     worst, _ = compare(made, ticks, run(host(tmp_path), ticks))
     assert (worst <= LIMITS).all(), worst
+
+
+@pytest.fixture(scope="module", params=["fused", "full"])
+def built_pipeline_fused(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Header, list[str], Path]:
+    need("gcc")
+    folder = tmp_path_factory.mktemp(request.param)
+    write(folder, header(request.param))
+    return header(request.param), host(folder, "-DCALIB_FUSED=1"), folder
+
+
+def _still_pipeline_fused(made: Header, mode: int = MODE_POSITION) -> Inputs:
+    return replace(coherent(values(made.literals), PERIOD)[-1], reference=(0.08, 0.08), mode=mode)
+
+
+def test_directed_ticks_in_pipeline_fused(built_pipeline_fused: tuple[Header, list[str], Path]) -> None:
+    made, command, _ = built_pipeline_fused
+    ticks = directed_fused(values(made.literals), 2000)
+    worst, undecided = compare(made, ticks, run(command, ticks), fused=True)
+    assert (worst <= LIMITS).all(), worst
+    assert undecided <= 0.01
+
+
+@pytest.mark.slow
+def test_a_hundred_thousand_ticks_in_pipeline_fused(
+    built_pipeline_fused: tuple[Header, list[str], Path],
+) -> None:
+    """Coherent motion with random and hostile values strewn in; flags agree at every tick."""
+    made, command, _ = built_pipeline_fused
+    rng = np.random.default_rng(8)
+    period = directed_fused(values(made.literals), 10_000)
+    ticks = [one for _ in range(10) for one in period]
+    strew(ticks, rng, losses=30)
+    found = run(command, ticks)
+    assert np.isfinite(found.numbers).all()
+    worst, undecided = compare(made, ticks, found, fused=True)
+    print(f"100000 ticks: differences {worst}, undecided {undecided:.2g} PWM")
+    assert (worst <= LIMITS).all(), worst
+    assert undecided <= 0.01
+
+
+def test_nothing_is_ever_nan_in_pipeline_fused(built_pipeline_fused: tuple[Header, list[str], Path]) -> None:
+    """Every value of every input hostile at once."""
+    made, command, _ = built_pipeline_fused
+    rng = np.random.default_rng(9)
+    ticks = hostile(rng, 20_000)
+    # Pictures from anywhere, one after the other, as well.
+    ticks += [
+        binary32(replace(one, u_px=float(u), v_px=float(v), gz_radps=float(g), marker_seen=True))
+        for one, u, v, g in zip(
+            ticks,
+            rng.uniform(-1, 317, 20_000),
+            rng.uniform(-1, 209, 20_000),
+            rng.normal(0, 30, 20_000),
+            strict=True,
+        )
+    ]
+    found = run(command, ticks)
+    assert np.isfinite(found.numbers).all()
+    low, high = values(made.literals)["CALIB_PUMP_LOW_PWM"], values(made.literals)["CALIB_PUMP_HIGH_PWM"]
+    assert found.numbers[:, 7:].min() >= low
+    assert found.numbers[:, 7:].max() <= high
+    assert np.abs(found.numbers[:, 0]).max() <= float(np.float32(1.58))
+    assert np.abs(found.numbers[:, 3:7]).max() < 1.0
+
+
+def test_a_lost_sensor_degrades_and_then_stops_the_pumps(
+    built_pipeline_fused: tuple[Header, list[str], Path],
+) -> None:
+    made, command, _ = built_pipeline_fused
+    constants = values(made.literals)
+    hold, low = int(constants["CALIB_HOLD_TICKS"]), constants["CALIB_PUMP_LOW_PWM"]
+    still = _still_pipeline_fused(made)
+    for lost, flag in (({"marker_seen": False}, MARKER_HELD), ({"imu_read": False}, IMU_HELD)):
+        ticks = [still] * 2000 + [replace(still, **lost)] * (hold + 50) + [still] * 50
+        found = run(command, ticks)
+        held = slice(2000, 2000 + hold)
+        assert ((found.flags[held] & flag) != 0).all()
+        assert ((found.flags[held] & STALE) == 0).all()
+        # What is left of the sensors keeps angle and length where they were.
+        assert np.ptp(found.numbers[held, 0]) < 5e-3
+        assert np.ptp(found.numbers[held, 5:7]) < 2e-4
+        stopped = slice(2000 + hold, 2050 + hold)
+        assert ((found.flags[stopped] & STALE) != 0).all()
+        assert (found.numbers[stopped, 7:] == low).all()
+        assert ((found.flags[-50:] & STALE) == 0).all()
+
+
+def test_another_marker_is_left_out_until_it_stays(
+    built_pipeline_fused: tuple[Header, list[str], Path],
+) -> None:
+    made, command, _ = built_pipeline_fused
+    still, patience = (
+        _still_pipeline_fused(made, MODE_OFF),
+        int(values(made.literals)["CALIB_FUSED_PATIENCE"]),
+    )
+    far = replace(still, v_px=still.v_px + 25.0)
+    found = run(command, [still] * 100 + [far] + [still] * 50 + [far] * 60)
+    rejected = (found.flags & REJECTED) != 0
+    assert np.flatnonzero(rejected).tolist() == [100, *range(151, 151 + patience)]
+    assert found.extra[-1, 6] == 1 + patience
+    length = found.numbers[:, 5:7].mean(axis=1)
+    assert np.ptp(length[60 : 151 + patience]) < 1e-4
+    assert abs(length[-1] - length[140]) > 5e-3
+
+
+@pytest.mark.parametrize("mean_rate", [False, True])
+def test_the_reference_is_the_projects_estimator(mean_rate: bool) -> None:
+    """Fed with calibrated readings, `calib.stages.estimator.constant_gain` gives the same angle and
+    length."""
+    made, whole = header("fused"), rig("fused")
+    constants = values(made.literals)
+    section = whole.estimator
+    assert section is not None and section.constant_gain is not None and whole.align is not None
+    gains = Gains(**section.constant_gain.model_dump())
+    ticks = list(coherent(constants, 700))
+    for k in (90, 91, 300, 420):
+        ticks[k] = replace(ticks[k], marker_seen=False)
+    for k in (100, 350, 351):
+        ticks[k] = replace(ticks[k], imu_read=False)
+    for k in (130, 500):
+        ticks[k] = replace(ticks[k], u_px=ticks[k].u_px - 25.0)
+    reference = FusedReference(constants, mean_rate=mean_rate)
+    outs = [reference.step(one) for one in ticks]
+    c, K_a = reference.c, reference.c["FUSED_ACCEL_GAIN"]
+    rows = np.array([[c[f"FUSED_ACCEL_{i}{j}"] for j in (1, 2)] for i in (1, 2)])
+    raw = np.array([[one.ax_mps2, one.ay_mps2] for one in ticks])
+    offset = np.array([c["FUSED_ACCEL_1"], c["FUSED_ACCEL_2"]])
+    accel = (raw @ rows.T - offset) * 9.81 / K_a
+    rate = np.array([c["FUSED_HALF_BIAS_RAD"] - c["FUSED_HALF_DT_S"] * one.gz_radps for one in ticks]) * 120.0
+    lost = np.array([not one.imu_read for one in ticks])
+    accel[lost], rate[lost] = np.nan, np.nan
+    places = np.array([out.marker_m if not out.flags & MARKER_HELD else (np.nan, np.nan) for out in outs])
+    sensor = np.zeros(13)
+    sensor[6] = c["MARKER_OFFSET_M"]
+    head = np.array([0.0, c["REST_LENGTH_M"], 0.0, 0.0, 0.0, 0.0])
+    setup = Setup(np.zeros(24), np.zeros(11), Start(sensor, np.zeros(13), head), c["BELLOWS_RADIUS_M"])
+    found = run_gains(gains, setup, Ticks(np.arange(700) / 60.0, places, accel, rate), mean_rate)
+    phi, length = np.array([[out.phi_rad, 0.5 * sum(out.q_m)] for out in outs]).T
+    # The header's constants are rounded to binary32.
+    np.testing.assert_allclose(found[:, 0], phi, atol=2e-6)
+    np.testing.assert_allclose(found[:, 1], length, atol=3e-8)
+
+
+def test_the_self_test_of_the_estimator_passes(
+    built_pipeline_fused: tuple[Header, list[str], Path], tmp_path: Path
+) -> None:
+    import subprocess
+
+    made, _, folder = built_pipeline_fused
+    main = '#include "calib_selftest.h"\nint main(void) { return calib_selftest() != 0; }\n'
+    text = (folder / "calib_constants.h").read_text()
+    name = "CALIB_FUSED_MOVING_RATE"
+    wrong = text.replace(f"{name} {made.literals[name]}", f"{name} 0.02f")
+    assert wrong != text
+    codes = []
+    for constants in (text, wrong):
+        write(tmp_path, made)
+        (tmp_path / "calib_constants.h").write_text(constants)
+        (tmp_path / "main.c").write_text(main)
+        call = ["gcc", "-std=c99", "-DCALIB_FUSED=1", "-o", "main", "main.c", "-lm"]
+        subprocess.run(call, cwd=tmp_path, check=True)
+        codes.append(subprocess.run([tmp_path / "main"], check=False).returncode)
+    assert codes == [0, 1]
+
+
+TICKS = 600
+
+
+def _ticks(mode: int) -> list[Inputs]:
+    made = []
+    for k in range(TICKS):
+        phi = 0.9 * math.sin(0.02 * k)
+        made.append(
+            binary32(
+                Inputs(
+                    158.0 + 60.0 * math.sin(0.017 * k),
+                    130.0 + 40.0 * math.cos(0.011 * k),
+                    9.81 * math.cos(phi) + 0.4 * math.sin(0.5 * k),
+                    9.81 * math.sin(phi) + 0.4 * math.cos(0.7 * k),
+                    -0.9 * 0.02 * 60.0 * math.cos(0.02 * k),
+                    (0.085 + 0.02 * math.sin(0.03 * k), 0.08)
+                    if mode == MODE_POSITION
+                    else (0.7 * math.sin(0.01 * k), 0),
+                    mode=mode,
+                )
+            )
+        )
+    return made
+
+
+def _true_marker(camera: Camera, u: float, v: float) -> np.ndarray:
+    """The point of the plane that the camera shows at a pixel, by the ray through it."""
+    x, y = undistort(camera, np.array([[u, v]]))[0]
+    R, t = np.array(PLANE.R_CW), np.array(PLANE.t_m)
+    normal = R[:, 2]
+    ray = np.array([x, y, 1.0])
+    return np.asarray((R.T @ (ray * (normal @ t) / (normal @ ray) - t))[:2])
+
+
+@pytest.mark.parametrize("mode", [MODE_ORIENTATION, MODE_POSITION])
+def test_every_stage_is_the_projects_own(mode: int) -> None:
+    """Stage by stage, each fed with what the reference had before it; binary32 constants cost 1e-6."""
+    constants = values(header().literals)
+    reference = Reference(constants)
+    angle: MahonyState | None = None
+    lowpass, x, y = LowPass(), None, None
+    loop = LoopState()
+    turning = OrientationControl(Pid(1000.0, 1000.0, 10.0, clamping=True), whole_pwm=False)
+    stretching = PositionControl(Pid(15000.0, 0.0, 150.0), FeedForward(), whole_pwm=False)
+    for given in _ticks(mode):
+        out = reference.step(given)
+        if angle is None:
+            angle = MahonyState(math.atan2(given.ay_mps2, given.ax_mps2), 0.0)
+        else:
+            angle = step_angle(
+                Mahony(), angle, MahonySample(given.ax_mps2, given.ay_mps2, given.gz_radps, 1.0 / 60.0)
+            )
+        assert out.phi_rad == pytest.approx(angle.phi_rad, abs=2e-6)
+        # The polynomial undoes the lens to 0.01 px, 0.3 mm/px.
+        assert np.abs(np.array(out.marker_m) - _true_marker(CAMERA, given.u_px, given.v_px)).max() < 5e-6
+        head = head_from_marker(np.array(out.marker_m), np.array(out.phi_rad))
+        x = settled(head[0]) if x is None else step_lowpass(lowpass, x, head[0])
+        y = settled(head[1]) if y is None else step_lowpass(lowpass, y, head[1])
+        assert out.head_m == pytest.approx((x.y1, y.y1), abs=3e-7)
+        q = inverse_series(np.array([*out.head_m, out.phi_rad]), 0.0126)
+        assert out.q_m == pytest.approx(q, abs=1e-8)
+        if mode == MODE_POSITION:
+            loop, command = step_position(stretching, loop, given.reference, out.q_m)
+        else:
+            loop, command = step_orientation(turning, loop, given.reference[0], out.phi_rad)
+        assert out.pwm == pytest.approx(command.pwm, abs=1e-3)
+
+
+def test_at_rest_the_low_pass_is_exact() -> None:
+    reference = Reference(values(header("full").literals))
+    given = binary32(Inputs(150.3, 140.7, 9.7, 1.1, 0.0))
+    outs = [reference.step(given) for _ in range(3000)]
+    head = head_from_marker(
+        np.array(outs[-1].marker_m), np.array(outs[-1].phi_rad), reference.c["MARKER_OFFSET_M"]
+    )
+    assert outs[-1].head_m == pytest.approx(head, abs=1e-9)
+
+
+def test_back_calculation_brings_the_integral_back() -> None:
+    """With the angle out of reach the command stays near its limit instead of winding up."""
+    reference = Reference(values(header("full").literals))
+    given = binary32(Inputs(150.0, 140.0, 9.81, 0.0, 0.013, (1.4, 0.0), mode=MODE_ORIENTATION))
+    for _ in range(3000):
+        reference.step(given)
+    away = binary32(Inputs(150.0, 140.0, 9.81, 0.0, 0.013, (-0.3, 0.0), mode=MODE_ORIENTATION))
+    lowered = [reference.step(away).pwm[0] for _ in range(60)]
+    assert reference.c["ORIENTATION_BACK"] == pytest.approx(1.0 / (60.0 * 0.4), rel=1e-6)
+    assert lowered[-1] == reference.c["PUMP_LOW_PWM"]
+
+
+def test_the_delayed_angle_is_that_of_the_picture() -> None:
+    """With the offset of two ticks the marker is put back with the angle of two ticks ago."""
+    reference = Reference(values(header("full").literals))
+    assert reference.c["TIME_OFFSET_TICKS"] == 2
+    for given in _ticks(MODE_ORIENTATION)[:5]:
+        out = reference.step(given)
+    assert reference.memory.past[-1] == out.phi_rad
+    assert len(reference.memory.past) == 2
+
+
+@pytest.mark.parametrize("kind", ["nominal", "full"])
+def test_they_reach_every_branch_but_the_angles_limit(kind: str) -> None:
+    seen = 0
+    for vector in vectors(header(kind)):
+        seen |= vector.wanted.flags
+    for flag in (MARKER_HELD, IMU_HELD, BAD_REFERENCE, *SATURATED):
+        assert seen & flag, hex(flag)
+    if kind == "nominal":
+        assert seen & (CLAMPED[0] | CLAMPED[1])
+    assert not seen & ANGLE_LIMIT
+
+
+@pytest.mark.parametrize("kind", ["fused", "full"])
+def test_they_reach_every_branch(kind: str) -> None:
+    seen, resting = 0, 0
+    for vector in vectors(header(kind), FUSED_TICKS, fused=True):
+        seen |= vector.wanted.flags
+        resting += not vector.wanted.flags & (MOVING | MARKER_HELD)
+    for flag in (MARKER_HELD, IMU_HELD, ACCEL_WEAK, REJECTED, MOVING, BAD_REFERENCE, *SATURATED):
+        assert seen & flag, hex(flag)
+    assert resting > 10
+
+
+@pytest.mark.parametrize("kind", ["fused", "full"])
+def test_the_estimator_follows_the_motion(kind: str) -> None:
+    """Pictures, gyroscope and accelerometer tell one story: the estimate is near the motion they are of."""
+    constants = values(header(kind).literals)
+    reference = FusedReference(constants)
+    motion = Motion(constants["CALIB_REST_LENGTH_M"], PERIOD, 0.0)
+    off = []
+    for k, given in enumerate(coherent(constants, 2 * PERIOD)):
+        out = reference.step(given)
+        phi, length = motion.at(k)
+        off.append((out.phi_rad - phi, 0.5 * sum(out.q_m) - length))
+    worst = np.abs(np.array(off)[PERIOD // 2 :]).max(axis=0)
+    assert worst[0] < 0.05
+    # A steady acceleration a leaves the length a / K_v behind; here 0.15 l0 (2 pi / ticks)^2.
+    behind = 0.15 * constants["CALIB_REST_LENGTH_M"] * (2.0 * np.pi / (0.55 * PERIOD)) ** 2
+    assert worst[1] < behind / constants["CALIB_FUSED_MOVING_RATE"]
+
+
+def test_states_and_readings_are_those_of_the_twin() -> None:
+    rig, ticks = SimulatedRig(), 400
+    k = np.arange(ticks)
+    pwm = np.stack([150.0 + 80.0 * np.sin(0.05 * k), 150.0 + 80.0 * np.cos(0.03 * k)], axis=1)
+    wanted = simulate(rig, rig_at_rest(rig.plant, rig.pump), pwm, ticks, seed=5)
+    loop = Loop(rig, ticks, seed=5)
+    newest = np.searchsorted(wanted.imu.taken_s, wanted.t_s + 1e-9, side="right") - 1
+    seen = 0
+    for i in range(ticks):
+        there = loop.look(i)
+        u, v, ax, ay, gz = loop.record[:5].tolist()
+        assert there == (not math.isnan(wanted.pixels[i, 0]))
+        if there:
+            assert (u, v) == tuple(wanted.pixels[i])
+            seen += 1
+        assert np.abs(np.array([ax, ay]) - wanted.accel_mps2[newest[i], :2]).max() < 1e-9
+        assert abs(gz - wanted.gyro_radps[newest[i], 2]) < 1e-9
+        loop.move(i, pwm[i])
+    assert seen > 380
+    assert np.abs(loop.nodes - wanted.trajectory.nodes).max() < 1e-12

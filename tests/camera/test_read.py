@@ -1,15 +1,19 @@
-"""Correspondence tables and corner files: what is read, and one clear sentence for what is not."""
+"""Views from pictures, tables and corner files: order, checks, and one clear sentence for what is wrong."""
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from calib.core import workers
 from calib.core.errors import BadInputError
+from calib.stages.camera import read as boards
 from calib.stages.camera.model import Board
-from calib.stages.camera.read import read_table, read_vnl
+from calib.stages.camera.read import Told, board_of, find_boards, read_table, read_views, read_vnl
+from synthetic import views_of
 
 HEADER = "view,x_m,y_m,u_px,v_px\n"
 FOUR = "a,0,0,10,10\na,0.02,0,20,10\na,0,0.02,10,20\na,0.02,0.02,20.5,21\n"
@@ -49,32 +53,13 @@ def test_numbers_come_back_bit_for_bit(write) -> None:
     ("content", "words"),
     [
         ("", "is empty; expected a header view,x_m,y_m,u_px,v_px"),
-        ("\n# nothing\n", "is empty"),
-        (HEADER, "has a header but no points"),
         ("view,x_m,y_m,u_px\n" + FOUR, "line 1: the header lacks v_px"),
-        ("x,y,u,v\n", "line 1: the header lacks view, x_m, y_m, u_px, v_px"),
-        ("view;x_m;y_m;u_px;v_px\n", "separated by commas, found 'view;x_m"),
         ("view,x_m,y_m,u_px,v_px,u_px\n", "the header has u_px more than once"),
-        (FOUR, "line 1: the header lacks"),
-        (HEADER + FOUR + "a,1,1,nan,3\n", "line 6: u_px is 'nan', expected a finite number"),
         (HEADER + FOUR + "a,1,1,3,inf\n", "line 6: v_px is 'inf'"),
-        (HEADER + FOUR + "a,1,1,3,1e999\n", "line 6: v_px is '1e999'"),
-        (HEADER + FOUR + "a,one,1,3,4\n", "line 6: x_m is 'one'"),
         (HEADER + FOUR + "a,1_0,1,3,4\n", "line 6: x_m is '1_0'"),
-        (HEADER + FOUR + "a,1,,3,4\n", "line 6: y_m is empty"),
-        (HEADER + FOUR + " ,1,1,3,4\n", "line 6: view is empty"),
         (HEADER + FOUR + "a,1,1,3\n", "line 6: has 4 values, expected 5"),
-        (HEADER + FOUR + "a,1,1,3,4,5\n", "line 6: has 6 values, expected 5"),
-        (HEADER + FOUR + 'a,"1,1,3,4\n', "line 6: not a line of comma-separated values"),
         (HEADER + "b,1,1,3,4\n" + FOUR, r"view b \(from line 2\) has 1 points, expected at least 4"),
-        (
-            HEADER + FOUR + "a,0.020,0,99,99\n",
-            r"line 6: the point x_m = 0.02, y_m = 0 of view a was given in line 3",
-        ),
-        (HEADER + FOUR + "\u00e4,1,1,3,\u00b5\n", "line 6: v_px is '\u00b5'"),
         (HEADER.encode() + b"\xff\xfe\n", r"line 2 is not UTF-8 text \(byte 0xff\)"),
-        (HEADER.encode("utf-16"), "line 1 has a zero byte|not UTF-8"),
-        (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR", "not UTF-8 text|zero byte"),
         (HEADER + "a" * 70000, "line 2 has more than 65536 characters"),
     ],
 )
@@ -140,20 +125,10 @@ LEGEND = "# filename x y level\n"
     ("content", "words"),
     [
         ("", "is empty; expected a legend"),
-        ("a 1 2 0\n", "line 1: no legend before the data"),
-        ("# name u v\n", "line 1: the legend is 'name u v', expected '# filename x y level'"),
         (LEGEND, "no picture in it has a board"),
-        (LEGEND + "a - - -\n", "no picture in it has a board"),
-        (LEGEND + corners("a", SIX[:5]), r"line 2: a has 5 corners, expected 3x2 = 6"),
         (LEGEND + corners("b", SIX) + corners("a", SIX) + corners("a", SIX), r"line 8: a has 12 corners"),
-        (LEGEND + corners("a", SIX[:5]) + "a 1 x 0\n", "line 7: y is 'x', expected a finite number"),
-        (LEGEND + corners("a", SIX[:5]) + "a nan 1 0\n", "line 7: x is 'nan'"),
         (LEGEND + corners("a", SIX[:5]) + "a 1 1 high\n", "line 7: level is 'high'"),
-        (LEGEND + corners("a", SIX[:5]) + "a 1 1 0 7\n", "line 7: has 5 values, expected 4"),
-        (LEGEND + corners("a", SIX[:5]) + "a 1\n", "line 7: has 2 values, expected 4"),
         (LEGEND + corners("a", SIX[:3]) + "a - - -\n" * 3, "line 2: a has 3 corners that were seen"),
-        (LEGEND + "a - - -\n" * 2, "line 2: a has 2 corners, expected"),
-        ("# x y filename\n1 2\n", "line 2: has 2 values, expected 3"),
         (LEGEND.encode() + b"\0\0", "line 2 has a zero byte"),
     ],
 )
@@ -162,3 +137,125 @@ def test_a_bad_corner_file_is_answered_with_file_and_line(write, content: str | 
     with pytest.raises(BadInputError, match=words) as caught:
         read_vnl(path, 3, 2, 0.02)
     assert str(caught.value).startswith(f"{path}: ")
+
+
+SIZE = (640, 480)
+
+
+@pytest.fixture
+def table(tmp_path: Path):
+    def write(change=lambda x, y, u, v: (x, y, u, v)) -> Path:
+        rows = ["view,x_m,y_m,u_px,v_px"]
+        for view in views_of(3):
+            points = np.hstack([view.target_m, view.pixels]).tolist()
+            rows += [",".join([view.name, *map(repr, change(*point))]) for point in points]
+        path = tmp_path / "points.csv"
+        path.write_text("\n".join(rows))
+        return path
+
+    return write
+
+
+def test_a_distant_target_is_moved_to_its_origin(table) -> None:
+    path = table(lambda x, y, u, v: (x + 500.0, y - 300.0, u, v))
+    found = read_views([path], Told(image_size_px=SIZE))
+    moved = [view.target_m - truth.target_m for view, truth in zip(found.views, views_of(3), strict=True)]
+    # The same for all views, to what the table's digits hold of a millimetre at 500 m.
+    assert np.ptp(np.concatenate(moved), axis=0).max() < 1e-12
+    assert max(np.abs(view.target_m).max() for view in found.views) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda x, y, u, v: (x, y, u + 500, v), "points lie outside a picture of 640x480 px"),
+        (lambda x, y, u, v: (x, y, u, v - 480), "points lie outside a picture of 640x480 px"),
+        (lambda x, y, u, v: (x * 1e6, y, u, v), "its target lies 2e\\+05 m away, expected metres"),
+        (lambda x, y, u, v: (x * 1e-9, y * 1e-9, u, v), "its target measures 2e-10 m, expected metres"),
+    ],
+)
+def test_points_that_cannot_be(table, change, says: str) -> None:
+    with pytest.raises(BadInputError, match=says):
+        read_views([table(change)], Told(image_size_px=SIZE))
+
+
+def test_a_table_beyond_the_memory_is_refused_by_its_size(tmp_path: Path) -> None:
+    path = tmp_path / "points.csv"
+    path.write_text("view,x_m,y_m,u_px,v_px\n")
+    with path.open("r+b") as stream:
+        # A file with holes takes no room on the disk.
+        stream.truncate(2_000_000_000)
+    with pytest.raises(BadInputError, match="is larger than 500 MB"):
+        read_views([path], Told(image_size_px=SIZE))
+
+
+@pytest.fixture(scope="module")
+def shipped(project_root: Path) -> list[Path]:
+    return sorted((project_root / "images").glob("view*.png"))
+
+
+def test_views_come_in_the_order_of_the_pictures(shipped: list[Path]) -> None:
+    done: list[tuple[int, int]] = []
+    paths = [shipped[i] for i in (3, 0, 2)]
+    found = find_boards(paths, (7, 5), 0.02, lambda *progress: done.append(progress))
+    assert [view.name for view in found.views] == [path.name for path in paths]
+    assert done == [(1, 3), (2, 3), (3, 3)]
+    assert found.image_size_px == (316, 208)
+    assert found.board.square_m == 0.02
+    assert found.without == ()
+    assert list(found.hashes) == [path.name for path in paths]
+
+
+def test_few_pixels_in_memory_change_nothing(shipped: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    expected = find_boards(shipped[:3], None, 0.02)
+    monkeypatch.setattr(boards, "_KEPT_PIXELS", 316 * 208)
+    found = find_boards(shipped[:3], None, 0.02)
+    assert found.hashes == expected.hashes
+    for view, other in zip(found.views, expected.views, strict=True):
+        np.testing.assert_array_equal(view.pixels, other.pixels)
+
+
+def test_a_picture_that_changes_meanwhile(
+    shipped: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copies = [Path(shutil.copy(path, tmp_path)) for path in shipped[:2]]
+    monkeypatch.setattr(boards, "_KEPT_PIXELS", 0)
+
+    def change(done: int, total: int) -> None:
+        shutil.copy(shipped[5], copies[1])
+
+    monkeypatch.setattr(workers, "processors", lambda: 1)
+    monkeypatch.setattr(boards, "same_size", lambda pictures: change(0, 0) or pictures[0].size_px)
+    with pytest.raises(BadInputError, match=r"view02\.png: has changed since the work began"):
+        find_boards(copies, (7, 5), 0.02)
+
+
+def test_a_wrong_size_is_known_after_two_pictures(
+    shipped: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    searched = []
+    detect = boards.detect
+
+    def counted(gray, columns, rows):
+        searched.append((columns, rows))
+        return detect(gray, columns, rows)
+
+    monkeypatch.setattr(boards, "detect", counted)
+    monkeypatch.setattr(workers, "processors", lambda: 1)
+    with pytest.raises(BadInputError, match=r"no board with 9x6 .* any of 17 pictures, but one with 7x5 was"):
+        find_boards(shipped, (9, 6), 0.02)
+    assert searched == [(9, 6)] * 2
+
+
+def test_the_board_of_several_folders(tmp_path: Path) -> None:
+    one, two, none = (tmp_path / name for name in ("one", "two", "none"))
+    for folder in (one, two, none):
+        folder.mkdir()
+    (one / "board.yaml").write_text("corners: [7, 5]\nsquare_m: 0.02\n")
+    (two / "board.yaml").write_text("{square_m: 0.02, corners: [7, 5]}\n")
+    told, hashes = board_of([none, one, two / "view.png"])
+    assert (told.corners, told.square_m) == ([7, 5], 0.02)
+    assert list(hashes) == ["board.yaml"]
+    (two / "board.yaml").write_text("corners: [7, 6]\n")
+    with pytest.raises(BadInputError, match=r"two/board\.yaml: tells another board than .*one/board\.yaml"):
+        board_of([one, two])

@@ -1,0 +1,295 @@
+"""Files written whole or not at all, bounded YAML, quantities with units, and errors as a user sees them."""
+
+from __future__ import annotations
+
+import errno
+import math
+import os
+import pickle
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from calib.core import files
+from calib.core.bounded_yaml import MAX_NODES, YamlProblem, load
+from calib.core.errors import BadInputError, CalibError, ReaderGoneError, UsageError
+from calib.core.files import (
+    check_folder,
+    check_readable,
+    check_writable,
+    file_sha256,
+    read_bytes,
+    read_text,
+    read_yaml_mapping,
+    write_atomically,
+)
+from calib.core.units import parse_corners, parse_duration_s, parse_length_m, plain_number
+
+
+def test_a_file_is_replaced_whole(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    write_atomically(path, "old")
+    path.chmod(0o640)
+    write_atomically(path, "new")
+    assert path.read_text() == "new"
+    assert path.stat().st_mode & 0o777 == 0o640
+    assert [p.name for p in tmp_path.iterdir()] == ["rig.yaml"]
+
+
+@pytest.mark.parametrize("at", ["write", "fsync", "replace"])
+@pytest.mark.parametrize("failure", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()])
+def test_the_old_file_survives(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: str, failure: BaseException
+) -> None:
+    path = tmp_path / "rig.yaml"
+    write_atomically(path, "old")
+
+    def fail(*_: object, **__: object) -> None:
+        raise failure
+
+    if at == "replace":
+        monkeypatch.setattr(Path, "replace", fail)
+    elif at == "fsync":
+        monkeypatch.setattr(os, "fsync", fail)
+    else:
+        monkeypatch.setattr(files.os, "fdopen", fail)
+    expected = BadInputError if isinstance(failure, OSError) else KeyboardInterrupt
+    with pytest.raises(expected):
+        write_atomically(path, "new")
+    monkeypatch.undo()
+    assert path.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["rig.yaml"]
+
+
+def test_a_link_is_followed_and_stays(tmp_path: Path) -> None:
+    (tmp_path / "real.yaml").write_text("old")
+    (tmp_path / "rig.yaml").symlink_to("real.yaml")
+    write_atomically(tmp_path / "rig.yaml", "new")
+    assert (tmp_path / "rig.yaml").is_symlink()
+    assert (tmp_path / "real.yaml").read_text() == "new"
+
+
+def test_unwritable_places_are_known_before_work(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="no folder"):
+        check_writable(tmp_path / "nowhere" / "rig.yaml")
+    with pytest.raises(BadInputError, match="is a folder"):
+        check_writable(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("a: [1, 2", "line"),
+        ("a: !!python/object/apply:os.system [ls]\n", "not YAML"),
+        ("x: " + "[" * 3000, "not YAML"),
+        ("a: [{b: 1, c: 2, b: 3}]\n", "line 1: the key b was given before"),
+        ("a: 1\n---\nb: 2\n", "another document"),
+    ],
+)
+def test_wrong_yaml_is_one_sentence(tmp_path: Path, text: str, says: str) -> None:
+    path = tmp_path / "board.yaml"
+    path.write_text(text)
+    with pytest.raises(BadInputError, match=says) as caught:
+        read_yaml_mapping(path)
+    assert "\n" not in str(caught.value)
+    assert "board.yaml" in str(caught.value)
+
+
+def test_text_that_is_not_utf8(tmp_path: Path) -> None:
+    path = tmp_path / "points.csv"
+    path.write_bytes(b"view,\xff\xfe")
+    with pytest.raises(BadInputError, match="UTF-8"):
+        read_text(path)
+
+
+def test_what_is_no_regular_file_is_not_read(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "file").write_bytes(b"12345")
+    assert check_readable(tmp_path / "file") == 5
+    with pytest.raises(BadInputError, match="is a pipe or a device"):
+        read_bytes(tmp_path / "pipe")
+    with pytest.raises(BadInputError, match="is a folder"):
+        read_bytes(tmp_path)
+    with pytest.raises(BadInputError, match="No such file"):
+        read_bytes(tmp_path / "gone")
+    with pytest.raises(BadInputError, match="is larger than 4e-06 MB"):
+        read_bytes(tmp_path / "file", most=4)
+
+
+def test_read_only_files_and_loops_are_not_written(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    path.write_text("old")
+    path.chmod(0o444)
+    with pytest.raises(BadInputError, match="is read-only"):
+        write_atomically(path, "new")
+    assert path.read_text() == "old"
+    (tmp_path / "loop").symlink_to("loop")
+    with pytest.raises(BadInputError, match="leads back to itself"):
+        write_atomically(tmp_path / "loop", "new")
+
+
+def test_devices_are_written_through() -> None:
+    write_atomically(Path("/dev/null"), "x")
+    assert Path("/dev/null").is_char_device()
+
+
+def test_folders_are_known_before_work(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    check_folder(tmp_path / "a" / "b")
+    assert not (tmp_path / "a").exists()
+    with pytest.raises(BadInputError, match="file is a file"):
+        check_folder(tmp_path / "file" / "b")
+
+
+def test_the_hash_of_a_file_of_any_size(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_bytes(b"abc")
+    assert file_sha256(path) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    for other, says in ((tmp_path, "is a folder"), (tmp_path / "none", "cannot be read")):
+        with pytest.raises(BadInputError, match=says):
+            file_sha256(other)
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(BadInputError, match="is a pipe or a device"):
+        file_sha256(tmp_path / "pipe")
+
+
+DOUBLING = "".join(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n" for i in range(1, 40))
+BOMBS = {
+    "aliases": ("a0: &a0 [x, x]\n" + DOUBLING, f"expands to more than {MAX_NODES} values"),
+    "pairs": (
+        "a0: &a0 [x, x]\n" + "".join(f"a{i}: &a{i} !!pairs [k: *a{i - 1}]\n" for i in range(1, 3)),
+        "line 2: has the tag !!pairs",
+    ),
+    "ordered": ("a: !!omap [k: 1]\n", "line 1: has the tag !!omap"),
+    "sexagesimal": ("a: 1" + ":1" * 400_000, "line 1: is not YAML that can be read: a number of 800001"),
+    "hexadecimal": ("a: 0x" + "f" * 5000, "a number of 5002"),
+    "float": ("a: !!float 1" + ":1" * 5000, "a number of 10001"),
+    "blocks": ("? " * 100_000 + "a", "nested more than 40 deep"),
+    "itself": ("a: &a [*a]\n", "expands to more than"),
+    "code": ("a: !!python/object/apply:os.system [ls]", "is not YAML: could not determine a constructor"),
+    "no boolean": ("a: !!bool maybe", "is not YAML that can be read"),
+    "no date": ("a: !!timestamp today", "is not YAML that can be read"),
+    "zero byte": ("a: \0", "is not YAML: control characters are not allowed"),
+}
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_what_grows_is_refused_with_its_line(name: str) -> None:
+    text, says = BOMBS[name]
+    with pytest.raises(YamlProblem) as refused:
+        load(text)
+    assert says in str(refused.value)
+    assert str(refused.value).isprintable()
+
+
+LEAVES = st.none() | st.booleans() | st.integers(-(10**30), 10**30) | st.floats(allow_nan=False) | st.text()
+VALUES = st.recursive(
+    LEAVES, lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner), max_leaves=30
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(VALUES)
+def test_what_is_written_comes_back(value: object) -> None:
+    text = yaml.safe_dump(value, allow_unicode=True)
+    assert load(text) == yaml.safe_load(text)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.text(alphabet="ab:&*<>-?[]{}!|%#'\"\n 01.~=@`,\t\\", max_size=60))
+def test_any_text_is_loaded_or_refused_in_one_line(text: str) -> None:
+    try:
+        load(text)
+    except YamlProblem as problem:
+        assert "\n" not in str(problem)
+        assert str(problem).endswith(problem.said)
+
+
+@pytest.mark.parametrize(
+    ("text", "metres"), [("20mm", 0.02), ("2 cm", 0.02), ("0.02m", 0.02), ("1in", 0.0254), ("2e1mm", 0.02)]
+)
+def test_lengths(text: str, metres: float) -> None:
+    assert parse_length_m(text, "--square") == pytest.approx(metres, rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "20",
+        "0mm",
+        "nan mm",
+        "20 mm mm",
+    ],
+)
+def test_wrong_lengths_name_the_option(text: str) -> None:
+    with pytest.raises(UsageError, match="--square"):
+        parse_length_m(text, "--square")
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"), [("10s", 10.0), ("500 ms", 0.5), ("2min", 120.0), ("1.5h", 5400.0)]
+)
+def test_durations(text: str, seconds: float) -> None:
+    assert parse_duration_s(text, "--duration") == pytest.approx(seconds, rel=1e-15)
+    with pytest.raises(UsageError, match="--duration"):
+        parse_duration_s(f"-{text}", "--duration")
+
+
+@given(st.integers(3, 200), st.integers(3, 200), st.sampled_from(["x", "X", ",", " x "]))
+def test_corners(columns: int, rows: int, by: str) -> None:
+    assert parse_corners(f"{columns}{by}{rows}") == (columns, rows)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "7",
+        "7x5x3",
+        "7 5",
+    ],
+)
+def test_wrong_corners(text: str) -> None:
+    with pytest.raises(UsageError, match="--corners"):
+        parse_corners(text)
+
+
+@pytest.mark.parametrize(("word", "value"), [("1.5", 1.5), ("-2e-3", -2e-3), ("inf", math.inf), (".5", 0.5)])
+def test_plain_number_reads_decimals(word: str, value: float) -> None:
+    assert plain_number(word) == value
+
+
+@pytest.mark.parametrize(
+    "word",
+    [
+        "",
+        "1,5",
+        "1 2",
+    ],
+)
+def test_plain_number_takes_no_other_words(word: str) -> None:
+    assert plain_number(word) is None
+
+
+def test_exit_codes() -> None:
+    assert (CalibError.exit_code, BadInputError.exit_code, UsageError.exit_code) == (3, 3, 2)
+    assert ReaderGoneError("").exit_code == 141
+
+
+@given(st.text())
+def test_a_message_moves_no_cursor(text: str) -> None:
+    shown = str(BadInputError(text))
+    assert shown.isprintable()
+    assert not text.isprintable() or shown == text
+
+
+def test_what_was_quoted_stays_to_be_seen() -> None:
+    assert str(BadInputError("a.csv: view \x1b[2J\n is é")) == r"a.csv: view \x1b[2J\n is é"
+
+
+def test_an_error_goes_between_processes() -> None:
+    error = pickle.loads(pickle.dumps(BadInputError("a\nb")))
+    assert isinstance(error, BadInputError)
+    assert str(error) == r"a\nb"

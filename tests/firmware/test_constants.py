@@ -1,0 +1,514 @@
+"""Constants of the header: found again in the world, compiled to NumPy's bits, one header for one rig."""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from estimatorlogs import NOISE
+from firmware_build import need, warnings, write
+from firmware_rigs import header, rig
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calib.core.errors import BadInputError
+from calib.core.rig import Rig
+from calib.stages.actuator.parameters import Stiffness
+from calib.stages.actuator.pump import ElongationForce
+from calib.stages.camera.model import project, undistort
+from calib.stages.control.laws import Pid, PidState, step
+from calib.stages.estimator.constant_gain import design, tick_noise
+from calib.stages.estimator.kinematic import Setup, Start
+from calib.stages.estimator.sensors import sensor_values, view_coefficients
+from calib.stages.firmware.constants import (
+    MIDDLE_M,
+    Known,
+    control_groups,
+    fused_group,
+    motion_groups,
+    plane_constants,
+    put_right,
+)
+from calib.stages.firmware.header import header_of, header_text, identity_of
+from calib.stages.firmware.literals import (
+    Constant,
+    Group,
+    Table,
+    Whole,
+    comment_text,
+    float_literal,
+    literals,
+    values,
+)
+from calib.twin.pictures import CAMERA, PLANE
+
+HOSTILE = {"*/ int x; /*": "1", "??/\n#error": "2", 'quote".png': "3", "ünï\u202e.png": "4", "\\": "5"}
+COMPILERS = [
+    ("gcc", "-std=c99"),
+    ("gcc", "-std=c11"),
+    ("gcc", "-std=c17"),
+    ("clang", "-std=c99"),
+    ("clang", "-std=c11"),
+    ("clang", "-std=c17"),
+    ("g++", "-std=c++11"),
+    ("g++", "-std=c++17"),
+    ("g++", "-std=c++20"),
+    ("avr-gcc", "-std=c99"),
+    ("avr-gcc", "-std=c99 -DCALIB_PROGMEM"),
+    ("avr-gcc", "-std=c++11 -DCALIB_PROGMEM"),
+]
+
+
+def _compiled(folder: Path, compiler: str, flags: str, text: str) -> subprocess.CompletedProcess[str]:
+    need(compiler)
+    words = flags.split()
+    words += ["-x", "c++" if "++" in flags else "c"]
+    if compiler == "avr-gcc":
+        words += ["-mmcu=atmega328p", "-Os"]
+    (folder / "unit.c").write_text(text)
+    call = [compiler, *words, *warnings, "-c", "unit.c", "-o", "unit.o"]
+    return subprocess.run(call, cwd=folder, capture_output=True, text=True, check=False)
+
+
+def test_same_rig_same_bytes() -> None:
+    again = header_of(rig().model_copy(deep=True), "elsewhere/rig.yaml")
+    assert header_text(again) == header_text(header())
+    assert identity_of(again) == identity_of(header())
+
+
+@pytest.mark.parametrize("fused", [0, 1])
+@pytest.mark.parametrize(("compiler", "flags"), COMPILERS, ids=lambda v: v.replace(" ", ""))
+def test_every_constant_compiles_to_numpys_bits(
+    tmp_path: Path, compiler: str, flags: str, fused: int
+) -> None:
+    made = replace(header("full"), inputs=HOSTILE)
+    write(tmp_path, made)
+    floats = {n: v for n, v in made.literals.items() if v.endswith("f")}
+    body = ",\n".join(name for name in floats if "[" not in name)
+    unit = (
+        '#include "calib_pipeline.h"\n#include "calib_selftest.h"\n'
+        f"extern const float values[];\nconst float values[] = {{\n{body}\n}};\n"
+        "extern unsigned wrong(void);\nunsigned wrong(void) { return calib_selftest(); }\n"
+        "extern float entry(int i);\n"
+        "float entry(int i) { return CALIB_TABLE_READ(&calib_ff_table_pwm[i]); }\n"
+    )
+    done = _compiled(tmp_path, compiler, f"{flags} -DCALIB_FUSED={fused}", unit)
+    assert done.returncode == 0, done.stderr
+    thing = (tmp_path / "unit.o").read_bytes()
+    scalars = [np.float32(v[:-1]) for n, v in floats.items() if "[" not in n]
+    table = [np.float32(v[:-1]) for n, v in floats.items() if "[" in n]
+    assert np.array(scalars, dtype="<f4").tobytes() in thing
+    assert np.array(table, dtype="<f4").tobytes() in thing
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("#define CALIB_EXPECT_SCHEMA 99", "another schema"),
+        ("#define CALIB_EXPECT_TICK_RATE_MHZ 100000", "tick rate"),
+        ("#define CALIB_EXPECT_PUMP_HIGH 200", "beyond what the program allows its pumps"),
+        ("#include <float.h>\n#undef FLT_MANT_DIG\n#define FLT_MANT_DIG 53", "IEEE 754 binary32"),
+    ],
+)
+def test_what_does_not_fit_does_not_compile(tmp_path: Path, line: str, message: str) -> None:
+    write(tmp_path, header())
+    done = _compiled(tmp_path, "gcc", "-std=c99", f'{line}\n#include "calib_constants.h"\n')
+    assert done.returncode != 0
+    assert message in done.stderr
+    fits = "#define CALIB_EXPECT_SCHEMA 3\n#define CALIB_EXPECT_TICK_RATE_MHZ 60000\n"
+    fits += "#define CALIB_EXPECT_PUMP_HIGH 255\n"
+    done = _compiled(tmp_path, "gcc", "-std=c99", f'{fits}#include "calib_pipeline.h"\n')
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_rig_without_what_the_fused_estimator_needs_does_not_compile(tmp_path: Path) -> None:
+    bare = header_of(rig("fused").model_copy(update={"align": None}), "rig.yaml")
+    write(tmp_path, bare)
+    assert "Fused estimator: none. rig.yaml lacks align." in (tmp_path / "calib_constants.h").read_text()
+    for fused in (0, 1):
+        unit = '#include "calib_pipeline.h"\n'
+        done = _compiled(tmp_path, "gcc", f"-std=c99 -DCALIB_FUSED={fused}", unit)
+        assert (done.returncode == 0) == (fused == 0)
+    assert "rig.yaml lacks what CALIB_FUSED needs" in done.stderr
+
+
+def test_a_header_without_a_plane_has_no_pipeline(tmp_path: Path) -> None:
+    bare = header_of(rig().model_copy(update={"plane": None}), "rig.yaml")
+    write(tmp_path, header())
+    (tmp_path / "calib_constants.h").write_text(header_text(bare))
+    done = _compiled(tmp_path, "gcc", "-std=c99", '#include "calib_pipeline.h"\n')
+    assert done.returncode != 0
+    assert "has no plane yet" in done.stderr
+
+
+def test_cppcheck_finds_nothing(tmp_path: Path) -> None:
+    need("cppcheck")
+    write(tmp_path, header("full"))
+    unit = '#include "calib_selftest.h"\nint main(void) { return (int)calib_selftest(); }\n'
+    (tmp_path / "unit.c").write_text(unit)
+    call = ["cppcheck", "--std=c99", "--enable=warning,performance,portability", "--inline-suppr", "--force"]
+    call += ["--error-exitcode=1", "--quiet", "-DCALIB_STAGE(n)=", "unit.c"]
+    for fused in (0, 1):
+        own = [*call, f"-DCALIB_FUSED={fused}"]
+        done = subprocess.run(own, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+
+
+@given(st.floats(width=32, allow_nan=False, allow_infinity=False, allow_subnormal=False))
+def test_literals_read_back_bit_for_bit(value: float) -> None:
+    literal = float_literal(value, "x")
+    assert re.fullmatch(r"-?\d+\.\d+(e[+-]\d+)?f", literal)
+    assert struct.pack("f", np.float32(literal[:-1])) == struct.pack("f", np.float32(value) + np.float32(0.0))
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 1e39, 1e-40, 5e-324])
+def test_what_a_float_cannot_hold_is_refused_by_name(value: float) -> None:
+    with pytest.raises(BadInputError, match=r"camera\.k1"):
+        float_literal(value, "camera.k1")
+
+
+@given(st.text())
+def test_no_text_leaves_its_comment(text: str) -> None:
+    safe = comment_text(text)
+    assert "*/" not in safe
+    assert "/*" not in safe
+    assert "??" not in safe
+    assert "\\" not in safe
+    assert "\n" not in safe
+    assert safe.isascii()
+
+
+def test_values_are_what_a_compiler_reads() -> None:
+    items = (Constant("A", 0.1, ""), Whole("N", 3, ""), Table("t", (0.2, -1.5), ""))
+    found = values(literals((Group(("",), items),)))
+    assert found == {"A": float(np.float32(0.1)), "N": 3.0, "t[0]": float(np.float32(0.2)), "t[1]": -1.5}
+
+
+WORKSPACE = (-0.06, 0.04, 0.06, 0.11)
+
+
+def _A(scale: float = 1.0) -> np.ndarray:
+    K = np.array([[CAMERA.fx_px, CAMERA.skew_px, CAMERA.cx_px], [0, CAMERA.fy_px, CAMERA.cy_px], [0, 0, 1]])
+    R = np.array(PLANE.R_CW)
+    return np.asarray(scale * K @ np.column_stack([R[:, 0], R[:, 1], PLANE.t_m]))
+
+
+def _made(scale: float = 1.0):
+    R, t = np.array(PLANE.R_CW), np.array(PLANE.t_m)
+    return plane_constants(CAMERA, R, t, np.linalg.inv(_A(scale)), WORKSPACE, "ok")
+
+
+def _points() -> tuple[np.ndarray, np.ndarray]:
+    world = np.stack(np.meshgrid(np.linspace(-0.05, 0.05, 11), np.linspace(0.05, 0.1, 6)), axis=-1).reshape(
+        -1, 2
+    )
+    R, t = np.array(PLANE.R_CW), np.array(PLANE.t_m)
+    return world, project(CAMERA, world @ R[:, :2].T + t)
+
+
+def _mapped(H: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    out = np.column_stack([points, np.ones(len(points))]) @ H.T
+    return out[:, :2] / out[:, 2:], out[:, 2]
+
+
+def test_both_ways_through_the_plane_find_the_world() -> None:
+    made = _made()
+    world, pixels = _points()
+    found, W = _mapped(made.from_normalised, undistort(CAMERA, pixels))
+    assert np.abs(found - world).max() < 1e-9
+    # 1/s of (2.12) is the reciprocal depth.
+    depth = (world @ np.array(PLANE.R_CW)[2, :2]) + PLANE.t_m[2]
+    assert np.allclose(W * depth, 1.0)
+    assert made.from_raw is not None
+    raw, _ = _mapped(made.from_raw, pixels)
+    assert 1e-5 < np.abs(raw - world).max() < 1.2 * made.raw_error_m
+
+
+def test_an_alignments_shift_and_stretch_are_undone() -> None:
+    """Places that the calibrated plane shows as the estimator's model of it does come out right."""
+    from calib.stages.estimator.sensors import view_coefficients
+
+    shift, stretch = (3e-4, -2e-4), 2e-3
+    middle = view_coefficients(CAMERA, np.eye(3), np.zeros(3))[22:24]
+    assert tuple(middle) == MIDDLE_M
+    world, _ = _points()
+    shown = world + np.array(shift) + stretch * (world - middle)
+    R, t = np.array(PLANE.R_CW), np.array(PLANE.t_m)
+    pixels = project(CAMERA, shown @ R[:, :2].T + t)
+    right = put_right(_made(), shift, stretch)
+    found, W = _mapped(right.from_normalised, undistort(CAMERA, pixels))
+    assert np.abs(found - world).max() < 1e-9
+    assert (W > 0.0).all()
+    align = rig("full").align
+    assert align is not None
+    moved = align.model_copy(update={"plane_shift_m": list(shift), "plane_stretch": stretch})
+    made = header_of(rig("full").model_copy(update={"align": moved}), "rig.yaml")
+    assert made.camera.plane is not None
+    plain = header("full").camera.plane
+    assert plain is not None
+    np.testing.assert_allclose(
+        made.camera.plane.from_normalised, put_right(plain, shift, stretch).from_normalised, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("scale", [-3.0, 0.01, 100.0])
+def test_the_scale_of_a_homography_does_not_matter(scale: float) -> None:
+    """A homography is known up to a factor; the horizon's test needs it fixed, sign included."""
+    assert np.allclose(_made(scale).from_normalised, _made().from_normalised)
+    assert _made(scale).least == pytest.approx(_made().least)
+
+
+def test_the_horizon_lies_beyond_the_workspace() -> None:
+    made = _made()
+    world, pixels = _points()
+    assert made.from_raw is not None
+    for H, points, least in (
+        (made.from_normalised, undistort(CAMERA, pixels), made.least[0]),
+        (made.from_raw, pixels, made.least[1]),
+    ):
+        assert 0.0 < least < 0.2 * _mapped(H, points)[1].min()
+    assert len(world)
+
+
+def test_a_lens_that_firmware_cannot_undo_is_marked() -> None:
+    section = rig().camera
+    assert section is not None
+    bent = section.model_copy(update={"distortion": section.distortion.model_copy(update={"k1": -50.0})})
+    for camera, verdict, ok in ((section, "ok", "1"), (bent, "poor", "0")):
+        made = header_of(rig().model_copy(update={"camera": camera, "plane": None}), "rig.yaml")
+        assert (made.camera.verdict, made.literals["CALIB_CAMERA_OK"]) == (verdict, ok)
+
+
+def _of(kind: str) -> dict[str, float]:
+    return values(literals(control_groups(Known(rig(kind), "rig.yaml"), 60.0)))
+
+
+def _summed(c: dict[str, float], errors: np.ndarray, clamping: bool) -> np.ndarray:
+    KPDI, KD, half = (c[f"CALIB_ORIENTATION_{n}_PWM_PER_RAD"] for n in ("KPDI", "KD_PER_DT", "KI_HALF_DT"))
+    P = e1 = 0.0
+    out = []
+    for e in errors:
+        u = KPDI * e + (P - KD * e1)
+        if clamping and not 0.0 <= u <= 255.0:
+            u, P = u - half * (e + e1), P + half * (e - e1)
+        else:
+            P += 2.0 * half * e
+        e1 = e
+        out.append(u)
+    return np.array(out)
+
+
+@pytest.mark.parametrize("clamping", [False, True])
+def test_the_summed_form_is_the_incremental_one(clamping: bool) -> None:
+    """Random errors that cross both limits, against `calib.stages.control.laws`."""
+    errors = 0.15 * np.cumsum(np.random.default_rng(1).normal(0.0, 0.3, 400))
+    pid, state, wanted = Pid(1000.0, 1000.0, 10.0, clamping=clamping), PidState(), []
+    for e in errors.tolist():
+        state, u = step(pid, state, e)
+        wanted.append(u)
+    found = _summed(_of("nominal"), errors, clamping)
+    assert np.abs(found - wanted).max() < 1e-6 * np.abs(wanted).max() + 1e-3
+
+
+def test_the_nominal_table_holds_the_lengths_of_the_pump() -> None:
+    """PWM values of the table give the table's elongations by (2.13)."""
+    c = _of("nominal")
+    size, pump = int(c["CALIB_FF_TABLE_SIZE"]), ElongationForce()
+    pwm = np.array([c[f"calib_ff_table_pwm[{i}]"] for i in range(size)])
+    reached = 1e-3 * np.polyval(pump.elongation_mm, pump.supply_V * pwm / 255.0)
+    inside = pwm < 253.0
+    assert inside.sum() >= 12
+    assert np.abs(np.maximum(reached, 0.0) - 0.002 * np.arange(size))[inside].max() < 2e-5
+    assert (np.diff(pwm) > 0.0).all()
+
+
+def test_the_tuned_table_balances_the_springs() -> None:
+    c, tuned = _of("full"), rig("full").controller
+    assert tuned is not None
+    assert c["CALIB_FF_USE_TABLE"] == 1.0
+    force, pwm = np.array(tuned.feedforward.force_pwm).T
+    spring = Stiffness((47.7, 1092.9))
+    for i in range(3, int(c["CALIB_FF_TABLE_SIZE"]) - 1):
+        eps = 0.002 * i
+        wanted = spring.secant(eps) * eps / 0.99
+        assert np.interp(c[f"calib_ff_table_pwm[{i}]"], pwm, force) == pytest.approx(wanted, rel=1e-5)
+
+
+def _values(whole: Rig, rate_hz: float = 60.0) -> dict[str, float]:
+    return values(literals((_group(whole, rate_hz),)))
+
+
+def _group(whole: Rig, rate_hz: float = 60.0) -> Group:
+    return fused_group(Known(whole, "rig.yaml"), rate_hz, header("fused").camera.plane)
+
+
+def _with(section: str, **changes: object) -> Rig:
+    whole = rig("fused")
+    return whole.model_copy(update={section: getattr(whole, section).model_copy(update=changes)})
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.05, -1.2, 2.5])
+def test_the_accelerometers_map_undoes_bias_scale_and_mount(alpha: float) -> None:
+    whole = _with("align", mount_angle_rad=alpha, accel_scale=[0.01, -0.02], accel_bias_mps2=[0.2, -0.1])
+    c = _values(whole)
+    phi = 0.4
+    force = 9.81 * np.array([math.cos(phi + alpha), math.sin(phi + alpha)])
+    reading = force * np.array([1.01, 0.98]) + np.array([0.2, -0.1])
+    A, B = (
+        c[f"CALIB_FUSED_ACCEL_{i}1"] * reading[0]
+        + c[f"CALIB_FUSED_ACCEL_{i}2"] * reading[1]
+        - c[f"CALIB_FUSED_ACCEL_{i}"]
+        for i in (1, 2)
+    )
+    gain = c["CALIB_FUSED_ACCEL_GAIN"]
+    assert np.array([A, B]) == pytest.approx(gain * np.array([math.cos(phi), math.sin(phi)]), abs=1e-6 * gain)
+
+
+def test_the_gyroscopes_map_undoes_bias_and_scale() -> None:
+    c = _values(_with("align", gyro_scale=0.01, gyro_bias_radps=0.02))
+    reading = -1.01 * 1.5 + 0.02
+    half = c["CALIB_FUSED_HALF_BIAS_RAD"] - c["CALIB_FUSED_HALF_DT_S"] * reading
+    assert half == pytest.approx(0.5 * 1.5 / 60.0, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("late_ticks", "remembered", "part"), [(0.0, 0, 0.0), (0.3, 1, 0.7), (2.0, 2, 0.0), (7.5, 8, 0.5)]
+)
+def test_the_age_of_a_picture_in_parts_of_a_tick(late_ticks: float, remembered: int, part: float) -> None:
+    c = _values(_with("align", time_offset_s=late_ticks / 60.0))
+    assert c["CALIB_FUSED_TICKS"] == remembered
+    assert c["CALIB_FUSED_PART"] == pytest.approx(part, abs=1e-6)
+    assert c["CALIB_FUSED_DELAY_TICKS"] == pytest.approx(late_ticks, abs=1e-6)
+
+
+def test_without_tuned_gains_they_are_for_the_noise_of_the_alignment() -> None:
+    """As `calib.stages.estimator.constant_gain` finds it from the set-up, to second order in the angle."""
+    whole = _with("align", jitter_px=0.3, imu_lever_m=0.006)
+    whole = whole.model_copy(update={"estimator": None})
+    group, c = _group(whole), _values(whole)
+    assert group.notes[-1] == "Gains for the noise in align."
+    assert _group(rig("fused")).notes[-1] == "Gains of estimator.constant_gain."
+    section = whole.align
+    assert section is not None
+    noise = NOISE.copy()
+    noise[0], noise[3], noise[4] = 0.3, section.accel_noise_mps2[0], section.gyro_noise_radps
+    values_ = {"marker_offset_m": section.marker_offset_m, "imu_lever_m": 0.006}
+    start = Start(sensor_values(values_), np.zeros(13), np.array([0.0, 0.065, 0.0, 0.0, 0.0, 0.0]))
+    view = view_coefficients(CAMERA, np.array(PLANE.R_CW), np.array(PLANE.t_m))
+    gains = design(
+        tick_noise(Setup(view, noise, start, 0.0126)), 60.0, 0.025, 0.0325 + section.marker_offset_m
+    )
+    for name, wanted in (
+        ("MOVING_LENGTH", gains.moving_length),
+        ("REST_LENGTH", gains.rest_length),
+        ("ACCEL_GAIN", gains.accel_phi),
+        ("PHI_PER_M", gains.camera_phi / gains.lever_m),
+    ):
+        assert c[f"CALIB_FUSED_{name}"] == pytest.approx(wanted, rel=0.03)
+
+
+def _of_constants_motion(kind: str) -> dict[str, float]:
+    return values(literals(motion_groups(Known(rig(kind), "rig.yaml"))))
+
+
+@pytest.mark.parametrize("phi", [-1.2, 0.0, 0.7])
+def test_the_accelerometers_angle_is_right_at_every_angle(phi: float) -> None:
+    """Biases and scales by themselves, not only what they make of the angle at rest."""
+    c = _of_constants_motion("full")
+    alpha = c["CALIB_IMU_MOUNT_ANGLE_RAD"]
+    ax = 1.004 * 9.81 * math.cos(phi + alpha) + 0.1
+    ay = 0.997 * 9.81 * math.sin(phi + alpha) + 0.1
+    x = ax - c["CALIB_IMU_ACCEL_BIAS_X_MPS2"]
+    y = (ay - c["CALIB_IMU_ACCEL_BIAS_Y_MPS2"]) * c["CALIB_IMU_ACCEL_RATIO"]
+    assert math.atan2(y, x) - alpha == pytest.approx(phi, abs=1e-6)
+
+
+def test_the_state_variable_form_is_the_section() -> None:
+    """Impulse responses of the pipeline's form and of the difference equation that the header prints."""
+    c = _of_constants_motion("full")
+    A1, A2, A3 = (c[f"CALIB_LOWPASS_PAIR1_A{i}"] for i in (1, 2, 3))
+    b, a = (
+        [c[f"CALIB_LOWPASS_1_B{i}"] for i in range(3)],
+        [1.0, c["CALIB_LOWPASS_1_A1"], c["CALIB_LOWPASS_1_A2"]],
+    )
+    from scipy.signal import lfilter
+
+    impulse = np.zeros(400)
+    impulse[0] = 1.0
+    s1 = s2 = 0.0
+    found = []
+    for x in impulse:
+        v3 = x - s2
+        v1, y = A1 * s1 + A2 * v3, s2 + A2 * s1 + A3 * v3
+        s1, s2 = 2.0 * v1 - s1, 2.0 * y - s2
+        found.append(y)
+    assert np.abs(np.array(found) - lfilter(b, a, impulse)).max() < 1e-7
+
+
+@pytest.mark.parametrize(("offset_s", "ticks"), [(0.0, 0), (-0.004, 0), (0.02, 1), (0.1, 6)])
+def test_the_time_offset_in_whole_ticks(offset_s: float, ticks: int) -> None:
+    align = rig("full").align
+    assert align is not None
+    moved = rig("full").model_copy(update={"align": align.model_copy(update={"time_offset_s": offset_s})})
+    c = values(literals(motion_groups(Known(moved, "rig.yaml"))))
+    assert c["CALIB_TIME_OFFSET_TICKS"] == ticks
+    assert ticks / 60.0 + c["CALIB_TIME_OFFSET_REST_S"] == pytest.approx(offset_s, abs=1e-8)
+
+
+def test_the_bias_of_the_imu_at_rest_is_used_without_align() -> None:
+    imu = {
+        "rate_hz": 100.0,
+        "gyro_bias_radps": [0.0, 0.0, 0.021],
+        **{
+            f"{kind}_{what}": [0.1, 0.1, 0.1]
+            for kind, whats in (
+                (
+                    "gyro",
+                    ("noise_radps_per_sqrt_Hz", "instability_radps", "walk_radps2_per_sqrt_Hz", "step_radps"),
+                ),
+                (
+                    "accel",
+                    ("noise_mps2_per_sqrt_Hz", "instability_mps2", "walk_mps3_per_sqrt_Hz", "step_mps2"),
+                ),
+            )
+            for what in whats
+        },
+        "accel_mean_mps2": [9.8, 0.0, 0.0],
+        "verdict": "ok",
+    }
+    known = Known(Rig.model_validate({"imu": imu}), "rig.yaml")
+    c = values(literals(motion_groups(known)))
+    assert c["CALIB_IMU_GYRO_BIAS_RADPS"] == pytest.approx(0.021)
+    assert c["CALIB_MM_GYRO_BIAS_DT_RAD"] == pytest.approx(0.021 / 60.0)
+    assert "imu.gyro_bias_radps" not in " ".join(group.defaults for group in header("full").groups)
+
+
+def _calib(*words: str, cwd: Path) -> None:
+    call = [sys.executable, "-c", "from calib.cli.main import main; main()", *words]
+    done = subprocess.run(call, cwd=cwd, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_shipped_pictures_give_the_shipped_firmware(tmp_path: Path, project_root: Path) -> None:
+    rig = str(tmp_path / "rig.yaml")
+    _calib("intrinsics", "images", "--rig", rig, cwd=project_root)
+    _calib("extrinsics", "images/plane", "--rig", rig, cwd=project_root)
+    made = tmp_path / "firmware_constants"
+    _calib("firmware", "-o", str(made), "--rig", rig, cwd=project_root)
+    folder = project_root / "firmware_constants"
+    assert sorted(p.name for p in made.iterdir()) == sorted(p.name for p in folder.iterdir())
+    for path in made.iterdir():
+        assert (folder / path.name).read_bytes() == path.read_bytes(), path.name
+    shipped = folder / "calib_constants.h"
+    text = shipped.read_text()
+    focal = re.search(r"CALIB_CAMERA_FX_PX (\S+)f", text)
+    assert focal is not None
+    # The truth is in tests/truth/pictures.json: 273.4; sigma is 0.043.
+    assert abs(float(focal.group(1)) - 273.4) < 0.2

@@ -1,0 +1,220 @@
+"""What a board sends: frames found again after anything, recordings, and the check against the reference."""
+
+from __future__ import annotations
+
+import binascii
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from firmware_rigs import header
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from calib.core.errors import BadInputError
+from calib.io.logs import read_log
+from calib.io.serial import Decoder, Frame, Recording, checksum, csv_header, csv_row, encoded, record
+from calib.stages.firmware.check import check_frames, read_frames
+from calib.stages.firmware.conformance import Inputs
+from calib.stages.firmware.header import identity_of
+from calib.stages.firmware.vectors import binary32, vectors
+
+floats = st.floats(width=32, allow_nan=False)
+
+
+def frame(sequence: int, value: float = 0.25, **more: object) -> Frame:
+    """A frame with this sequence number."""
+    inputs = Inputs(158.0, 80.5, 9.81, value, -0.125, (0.08, 0.0805), mode=2)
+    return Frame(
+        0xDEADBEEF,
+        60000,
+        sequence,
+        binary32(inputs),
+        value,
+        (0.5, 1.0),
+        (0.25, 2.0),
+        (0.0625, 4.0),
+        (1.0, 255.0),
+        3,
+    )
+
+
+@given(st.binary(max_size=64))
+def test_the_checksum_is_the_one_of_the_standard_library(data: bytes) -> None:
+    assert checksum(data) == binascii.crc_hqx(data, 0xFFFF)
+
+
+@given(st.integers(0, 65535), floats)
+def test_there_and_back(sequence: int, value: float) -> None:
+    sent = frame(sequence, value)
+    decoder = Decoder()
+    assert list(decoder.feed(encoded(sent))) == [sent]
+    assert decoder.skipped == 0
+
+
+@settings(max_examples=200)
+@given(st.lists(st.binary(max_size=90), min_size=1, max_size=6), st.integers(1, 50))
+def test_every_whole_frame_is_found_between_garbage(garbage: list[bytes], portion: int) -> None:
+    """Whatever stands between frames, even beginnings of frames, costs none of them."""
+    sent = [frame(k) for k in range(len(garbage))]
+    stream = b"".join(noise + encoded(f) for noise, f in zip(garbage, sent, strict=True))
+    # A false start may wait for as many bytes as a frame has.
+    stream += bytes(90)
+    decoder = Decoder()
+    found = [f for i in range(0, len(stream), portion) for f in decoder.feed(stream[i : i + portion])]
+    assert found == sent
+
+
+def test_a_damaged_byte_costs_its_own_frame_only() -> None:
+    stream = bytearray(b"".join(encoded(frame(k)) for k in range(3)))
+    stream[len(stream) // 2] ^= 0x10
+    assert [f.sequence for f in Decoder().feed(bytes(stream) + bytes(90))] == [0, 2]
+
+
+def _frames(count: int, first: int = 0) -> list[Frame]:
+    vector = vectors(header(), 2)[0]
+    w = vector.wanted
+    one = Frame(1, 60000, 0, vector.given, w.phi_rad, w.marker_m, w.head_m, w.q_m, w.pwm, w.flags)
+    return [replace(one, sequence=(first + k) & 0xFFFF) for k in range(count)]
+
+
+def _recorded(stream: bytes, portion: int = 61) -> Recording:
+    parts = [stream[i : i + portion] for i in range(0, len(stream), portion)]
+
+    def read() -> bytes:
+        return parts.pop(0)
+
+    return record(read, lambda ticks: bool(parts))
+
+
+def test_lost_and_damaged_frames_are_counted_and_leave_a_gap_in_time() -> None:
+    frames = [encoded(f) for f in _frames(10)]
+    frames[4] = b""
+    frames[7] = frames[7][:20] + b"?" + frames[7][21:]
+    result = _recorded(b"garbage" + b"".join(frames))
+    assert (result.ticks, result.lost, result.damaged, result.restarts) == (8, 2, 1, 0)
+    times = [round(60.0 * float(line.split(",")[0])) for line in result.text.splitlines()[1:]]
+    assert times == [0, 1, 2, 3, 5, 6, 8, 9]
+
+
+def test_a_restart_begins_the_log_anew() -> None:
+    stream = b"".join(encoded(f) for f in [*_frames(5, 100), *_frames(3)])
+    result = _recorded(stream)
+    assert (result.ticks, result.restarts, result.lost) == (3, 1, 0)
+
+
+def test_ctrl_c_keeps_what_came() -> None:
+    frames = [encoded(f) for f in _frames(4)]
+
+    def read() -> bytes:
+        if not frames:
+            raise KeyboardInterrupt
+        return frames.pop(0)
+
+    assert record(read, lambda ticks: True).ticks == 4
+
+
+def _frames_check(ticks: int = 120) -> list[Frame]:
+    identity = int(identity_of(header())[:8], 16)
+    made = []
+    for k, vector in enumerate(vectors(header(), ticks)):
+        w = vector.wanted
+        made.append(
+            Frame(identity, 60000, k, vector.given, w.phi_rad, w.marker_m, w.head_m, w.q_m, w.pwm, w.flags)
+        )
+    return made
+
+
+def _log(path: Path, frames: list[Frame]) -> Path:
+    path.write_text(csv_header() + "".join(csv_row(f, k) for k, f in enumerate(frames)))
+    return path
+
+
+def test_a_good_board_passes(tmp_path: Path) -> None:
+    result = check_frames(header(), read_frames(_log(tmp_path / "log.csv", _frames_check())), "log.csv")
+    assert (result.ticks, result.reasons, result.missing_after, result.flags_differ) == (120, [], None, 0)
+    # Nine digits of the log, times 24000 PWM/m.
+    assert max(result.worst.values()) < 1e-5
+
+
+def test_a_board_with_the_fused_estimator_is_known_by_its_flags(tmp_path: Path) -> None:
+    identity = int(identity_of(header("fused"))[:8], 16)
+    frames = []
+    for k, vector in enumerate(vectors(header("fused"), 120, fused=True)):
+        w = vector.wanted
+        frames.append(
+            Frame(identity, 60000, k, vector.given, w.phi_rad, w.marker_m, w.head_m, w.q_m, w.pwm, w.flags)
+        )
+    result = check_frames(header("fused"), read_frames(_log(tmp_path / "log.csv", frames)), "log.csv")
+    assert (result.ticks, result.reasons, result.flags_differ) == (120, [], 0)
+    without = [replace(frame, identity=int(identity_of(header())[:8], 16)) for frame in frames]
+    with pytest.raises(BadInputError, match=r"log\.csv: the board runs the fused estimator, for which"):
+        check_frames(header(), without, "log.csv")
+
+
+def test_a_wrong_value_is_named_with_its_tick() -> None:
+    frames = _frames_check()
+    frames[41] = replace(frames[41], q_m=(frames[41].q_m[0] + 1e-5, frames[41].q_m[1]))
+    result = check_frames(header(), frames, "log.csv")
+    assert result.reasons == ["tick 41 is the first that differs, in q_m"]
+    frames[30] = replace(frames[30], flags=frames[30].flags ^ 0x10)
+    result = check_frames(header(), frames, "log.csv")
+    assert result.reasons == ["tick 30 is the first that differs, in flags"]
+    assert result.flags_differ == 1
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text("t_s,u_px\n0,1\n")
+    with pytest.raises(BadInputError, match="has no column sequence, expected a log of calib record"):
+        read_frames(path)
+    path.write_text(csv_header())
+    with pytest.raises(BadInputError, match="holds no tick of a board"):
+        read_frames(path)
+    _log(path, _frames_check(3))
+    path.write_text(path.read_text().replace(",60000,", ",sixty,", 1))
+    with pytest.raises(BadInputError, match=r"line 2 is no tick of a board"):
+        read_frames(path)
+
+
+FRAME = Frame(
+    7, 60_000, 0, Inputs(160.0, 104.0, 9.75, 0.25, -0.5, (0.065, 0.066), True, True, 0), 0.125, (0.0, 0.08),
+    (0.0, 0.065), (0.065, 0.065), (128.0, 64.0), 0,
+)  # fmt: skip
+
+
+def _frames_log_serial(count: int = 300) -> list[Frame]:
+    frames = []
+    for k in range(count):
+        given = replace(FRAME.given, u_px=float(k), marker_seen=k % 3 != 0, imu_read=k % 7 != 0)
+        frames.append(replace(FRAME, sequence=k, given=given))
+    return frames
+
+
+@pytest.mark.parametrize("ending", [".bin", ".serial"])
+def test_frames_are_rows(ending: str, tmp_path: Path) -> None:
+    frames, path, table = _frames_log_serial(), tmp_path / f"log{ending}", tmp_path / "log.csv"
+    path.write_bytes(b"boot: hello\r\n\xa5" + b"".join(map(encoded, frames)) + encoded(frames[0])[:20])
+    table.write_text(csv_header() + "".join(csv_row(frame, k) for k, frame in enumerate(frames)))
+    log, same = read_log(path), read_log(table)
+    assert log.columns.keys() == same.columns.keys() and log.t_s.tolist() == same.t_s.tolist()
+    for name, values in log.columns.items():
+        assert np.array_equal(values, same.columns[name], equal_nan=True), name
+    assert len(log.sampled("u_px")) == 200 and log.t_s[60] == pytest.approx(1.0)
+
+
+def test_lost_frames_leave_a_gap_and_a_restart_begins_anew(tmp_path: Path) -> None:
+    frames, path = _frames_log_serial(), tmp_path / "log.bin"
+    path.write_bytes(b"".join(encoded(frame) for frame in (*frames[:50], *frames[:10], *frames[20:])))
+    log = read_log(path)
+    assert len(log) == 290
+    assert np.diff(log.t_s).max() == pytest.approx(11 / 60)
+
+
+@pytest.mark.parametrize("data", [b"", b"t_s,u_px\n0,1\n", bytes(range(256)) * 40, b"\xa5\x5a" * 5000])
+def test_no_frame_at_all(data: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "log.bin"
+    path.write_bytes(data)
+    with pytest.raises(BadInputError, match=r"log\.bin: holds no frame of the example sketch, only \d+"):
+        read_log(path)

@@ -1,0 +1,366 @@
+"""Logs and states: what is written is read, numbers bit for bit, one clear sentence for what is not."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import math
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+import calib.io.logs as logs
+from calib.core.errors import BadInputError
+from calib.io.cells import GENERAL, POWERS, TIME, WHOLE, scan, table_bytes
+from calib.io.logs import Log, iter_log, log_text, read_log, write_log
+from calib.io.states import ENDINGS, STATES, states_writer
+
+SMALL = (
+    "t_s,u_px,v_px,ax_mps2,gz_radps,pwm1\n"
+    "0.000,160,104,,,128\n"
+    "0.004,,,9.81,0.01,\n"
+    "0.014,,,9.79,-0.02,\n"
+    "0.017,161,104,,,130\n"
+)
+
+
+@pytest.fixture
+def write(tmp_path: Path):
+    def _write(content: str | bytes, name: str = "log.csv") -> Path:
+        path = tmp_path / name
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return path
+
+    return _write
+
+
+def test_rows_of_two_rates_interleave(write) -> None:
+    log = read_log(write(SMALL))
+    assert log.t_s.tolist() == [0.0, 0.004, 0.014, 0.017]
+    assert log.sampled("u_px", "v_px").tolist() == [0, 3]
+    assert log.sampled("ax_mps2").tolist() == [1, 2]
+    assert log.columns["gz_radps"][log.sampled("gz_radps")].tolist() == [0.01, -0.02]
+    assert log.sampled("gy_radps").tolist() == []
+    assert log.sampled().tolist() == []
+    assert list(log.columns) == ["u_px", "v_px", "ax_mps2", "gz_radps", "pwm1"]
+    assert (log.unknown, log.not_finite, log.truncated, len(log)) == ((), 0, False, 4)
+
+
+def test_nan_and_infinite_cells_count_as_blank(write) -> None:
+    log = read_log(write("t_s,ax_mps2,gz_radps\n0,nan,1\n1,-inf,NaN\n2,3,Infinity\n"))
+    assert log.not_finite == 4
+    assert log.sampled("ax_mps2").tolist() == [2]
+    assert log.sampled("gz_radps").tolist() == [0]
+
+
+def test_a_line_that_is_still_being_written_is_left_out(write) -> None:
+    log = read_log(write(SMALL + "0.02,16"))
+    assert log.truncated
+    assert len(log) == 4
+
+
+def test_blocks_give_the_same_as_the_whole(write, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    rows = "".join(
+        f"{0.01 * i:.6f},{v:.9g},{'' if i % 3 else i}\n" for i, v in enumerate(rng.normal(size=500))
+    )
+    path = write("t_s,ax_mps2,pwm1\n" + rows)
+    whole = read_log(path)
+    for size in (7, 64, 1000):
+        monkeypatch.setattr(logs, "_BLOCK_BYTES", max(size, 40))
+        pieces = list(iter_log(path))
+        assert len(pieces) > 5
+        assert all(len(piece) for piece in pieces)
+        joined = read_log(path)
+        assert np.array_equal(joined.t_s, whole.t_s)
+        assert np.array_equal(joined.lines, whole.lines)
+        assert np.array_equal(joined.columns["pwm1"], whole.columns["pwm1"], equal_nan=True)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.lists(
+        st.tuples(*[st.one_of(st.just(math.nan), st.floats(-1e6, 1e6, allow_subnormal=False))] * 3),
+        min_size=1,
+        max_size=30,
+    )
+)
+def test_what_is_written_is_read(
+    tmp_path_factory: pytest.TempPathFactory, rows: list[tuple[float, ...]]
+) -> None:
+    values = np.array(rows)
+    t = 0.01 * np.arange(len(rows))
+    names = ("u_px", "ax_mps2", "true_q1_m")
+    columns = {name: values[:, k].copy() for k, name in enumerate(names)}
+    log = Log("made", t, columns, np.arange(len(rows)))
+    path = tmp_path_factory.mktemp("logs") / "log.csv"
+    write_log(path, log)
+    back = read_log(path)
+    assert np.allclose(back.t_s, t, rtol=0.0, atol=1e-6)
+    for name in names:
+        assert np.allclose(back.columns[name], columns[name], rtol=1e-8, atol=0.0, equal_nan=True)
+    # And once more: nine digits are nine digits.
+    assert log_text(back) == path.read_text()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "log.csv: is empty, expected a header and rows"),
+        ("t_s,ax_mps2\n", "log.csv: has a header but no rows"),
+        ("t_s;ax_mps2\n1;2\n", "has no column t_s.*separated by commas"),
+        ("t_s,ax_mps2\n0,1\n1,abc\n", "line 3: ax_mps2 is 'abc', expected a number"),
+        ("t_s,ax_mps2\n0,1\n,2\n", "line 3: has no time t_s, expected a number"),
+        ("t_s,ax_mps2\n0,1\ninf,2\n", "line 3: has no time t_s"),
+        ('t_s,ax_mps2\n0,"1\n', "line 2: is not comma-separated"),
+        (b"t_s,a\0b\n0,1\n", "line 1: has a zero byte"),
+        ("t_s," + ",".join(f"c{i}" for i in range(2000)) + "\n", "line 1: has 2001 columns"),
+    ],
+)
+def test_one_sentence_for_what_is_wrong(write, text: str | bytes, words: str) -> None:
+    with pytest.raises(BadInputError, match=words) as found:
+        read_log(write(text))
+    assert "\n" not in str(found.value)
+
+
+def test_a_line_without_an_end_is_not_read_into_memory(write, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(logs, "_BLOCK_BYTES", 1000)
+    with pytest.raises(BadInputError, match="line 3: does not end"):
+        read_log(write("t_s,ax_mps2\n0,1\n" + "7" * 5000))
+
+
+def test_a_log_beyond_the_memory_is_refused_while_it_is_read(write, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write("t_s,u_px\n" + "".join(f"{k},1\n" for k in range(4000)))
+    monkeypatch.setattr(logs, "_BLOCK_BYTES", 1000)
+    monkeypatch.setattr(logs, "_MOST_CELLS", 6000)
+    with pytest.raises(BadInputError, match="million cells, which is more than is read at once"):
+        read_log(path)
+    assert sum(len(block) for block in iter_log(path)) == 4000
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("pyarrow") is None, reason="pyarrow (extra logs) is not installed"
+)
+def test_parquet_holds_the_same_as_csv(tmp_path: Path, write) -> None:
+    import pyarrow
+    import pyarrow.parquet
+
+    log = read_log(write(SMALL))
+    write_log(tmp_path / "log.parquet", log)
+    back = read_log(tmp_path / "log.parquet")
+    assert log_text(back) == log_text(log)
+    table = pyarrow.table({"t_s": [0.0, 1.0], "ax_mps2": [1, None], "note": ["a", "b"]})
+    pyarrow.parquet.write_table(table, tmp_path / "other.parquet")
+    other = read_log(tmp_path / "other.parquet")
+    assert other.unknown == ("note",)
+    assert other.sampled("ax_mps2").tolist() == [0]
+    pyarrow.parquet.write_table(pyarrow.table({"t_s": ["a"]}), tmp_path / "words.parquet")
+    with pytest.raises(BadInputError, match="t_s holds string, expected numbers"):
+        read_log(tmp_path / "words.parquet")
+    with pytest.raises(BadInputError, match="is not a Parquet file"):
+        read_log(write(b"not parquet", "log.parquet"))
+
+
+def _scan(text: str, columns: int) -> tuple[np.ndarray, np.ndarray, list[list[int]]]:
+    raw = np.frombuffer(text.encode(), dtype=np.uint8)
+    rows = text.count("\n")
+    values, lines = np.empty((rows, columns)), np.empty(rows, dtype=np.int64)
+    odd = np.empty((text.count(",") + rows + 1, 4), dtype=np.int64)
+    slots = np.arange(columns, dtype=np.int64)
+    n, _, strange = scan(raw, slots, POWERS, values, lines, odd)
+    return values[:n], lines[:n], odd[:strange].tolist()
+
+
+def _bits(value: float) -> bytes:
+    return struct.pack("<d", value)
+
+
+@settings(deadline=None)  # the first call compiles
+@given(
+    st.floats(allow_nan=False, allow_infinity=False, width=64), st.sampled_from(["r", ".9g", ".6f", ".3e"])
+)
+@example(-0.0, "r")
+@example(9007199254740993.0, "r")
+@example(5e-324, "r")
+def test_what_it_reads_has_the_bits_of_float(value: float, form: str) -> None:
+    text = repr(value) if form == "r" else format(value, form)
+    values, _, odd = _scan(f"{text},1\n", 2)
+    if odd:
+        # Left to the caller, whole and in its place.
+        assert [odd[0][0], odd[0][1], text] == [0, 0, f"{text},1\n"[odd[0][2] : odd[0][3]]]
+    else:
+        assert _bits(values[0, 0]) == _bits(float(text))
+    assert values[0, 1] == 1.0
+
+
+@settings(deadline=None)  # the first call compiles
+@given(
+    st.lists(
+        st.lists(st.sampled_from(["", " ", "1", "-2.5"]), min_size=3, max_size=3), min_size=1, max_size=20
+    )
+)
+def test_blank_cells_are_nan_and_blank_lines_no_rows(rows: list[list[str]]) -> None:
+    text = "".join(",".join(row) + ("\r\n" if i % 2 else "\n\n") for i, row in enumerate(rows))
+    values, lines, odd = _scan(text, 3)
+    expected = np.array([[float(c) if c.strip() else math.nan for c in row] for row in rows])
+    assert odd == []
+    assert np.array_equal(values, expected, equal_nan=True)
+    assert all(
+        text.split("\n")[line].rstrip("\r") == ",".join(row) for line, row in zip(lines, rows, strict=True)
+    )
+
+
+FORMATS = {TIME: ".6f", GENERAL: ".9g", WHOLE: ".0f"}
+
+
+def expected(values: np.ndarray, kinds: list[int]) -> bytes:
+    lines = []
+    for row in values.tolist():
+        cells = ["" if v != v else format(v, FORMATS[k]) for v, k in zip(row, kinds, strict=True)]
+        lines.append(",".join(cells) + "\n")
+    return "".join(lines).encode()
+
+
+def check(values: np.ndarray, kinds: list[int]) -> None:
+    assert table_bytes(values, np.array(kinds)) == expected(values, kinds)
+
+
+def test_rounding_at_the_edge() -> None:
+    """Ten digits that end in 5 are ties or next to one; neighbours of powers of ten change their exponent."""
+    rng = np.random.default_rng(2)
+    ties = (np.floor(10.0 ** rng.uniform(8, 9, 5000)) + 0.5) * 10.0 ** rng.integers(-20, 4, 5000)
+    powers = 10.0 ** np.arange(-40, 23)
+    edges = np.concatenate([powers, np.nextafter(powers, 0.0), np.nextafter(powers, np.inf)])
+    micro = np.floor(rng.uniform(0, 1e9, 5000)) * 1e-6 + 5e-7
+    for values in (ties, np.nextafter(ties, 0.0), np.nextafter(ties, np.inf), edges, 999999999.5 / edges):
+        check(values[:, None], [GENERAL])
+    check(micro[:, None], [TIME])
+    check(np.nextafter(micro, 0.0)[:, None], [TIME])
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(st.floats(), min_size=1, max_size=6), st.sampled_from([TIME, GENERAL, WHOLE]))
+@example([struct.unpack("<d", b"\xff" * 6 + b"\xef\x7f")[0]], GENERAL)
+@example([-0.0, 0.0, -1e-9], TIME)
+@example([-0.0, 0.0, -1.0], WHOLE)
+@example([9.999999995, 99999.99995, 0.00001234565, 1e9, 123456789.5], GENERAL)
+def test_any_double(cells: list[float], kind: int) -> None:
+    check(np.array([cells]), [kind] * len(cells))
+
+
+def test_an_interrupted_file_leaves_the_old_one(tmp_path: Path) -> None:
+    path = tmp_path / "states.csv"
+    path.write_text("old\n")
+
+    def broken() -> None:
+        with states_writer(path) as states:
+            states.add(np.zeros((1, len(STATES))))
+            raise ValueError
+
+    with pytest.raises(ValueError):
+        broken()
+    assert path.read_text() == "old\n"
+    assert [item.name for item in tmp_path.iterdir()] == ["states.csv"]
+
+
+def _rows(count: int = 40) -> np.ndarray:
+    """Rows of `STATES` with blanks, counts and weights of every size."""
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=(count, len(STATES))) * 10.0 ** rng.uniform(-9, 3, (count, len(STATES)))
+    values[:, 0] = 1e-6 * np.cumsum(rng.integers(1, 20000, count))
+    for k, name in enumerate(STATES):
+        if name.startswith("gated"):
+            values[:, k] = rng.choice([0.0, 1.0, np.nan], count)
+        elif name == "flags":
+            values[:, k] = rng.integers(0, 128, count)
+        elif name.startswith("nis"):
+            values[rng.random(count) < 0.5, k] = np.nan
+    return values
+
+
+def _same(one: np.ndarray, other: np.ndarray, rtol: float = 0.0) -> None:
+    assert one.shape == other.shape
+    np.testing.assert_allclose(one, other, rtol=rtol, atol=0.0, equal_nan=True)
+
+
+def _written(path: Path, values: np.ndarray) -> Path:
+    with states_writer(path) as states:
+        for begin in range(0, len(values), 7):
+            states.add(values[begin : begin + 7])
+    return path
+
+
+def test_parquet_holds_the_rows_bit_for_bit(tmp_path: Path) -> None:
+    from pyarrow import parquet
+
+    values = _rows()
+    table = parquet.read_table(_written(tmp_path / "states.parquet", values))
+    assert tuple(table.column_names) == STATES
+    assert str(table.schema.field("flags").type) == "int64"
+    _same(np.stack([column.cast("float64").to_numpy() for column in table.columns], axis=1), values)
+
+
+def test_mcap_holds_states_and_poses(tmp_path: Path) -> None:
+    """The package's own reader finds an index, schemas and every message."""
+    from mcap.reader import make_reader
+
+    values = _rows()
+    path = _written(tmp_path / "states.mcap", values)
+    read, poses = [], []
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary is not None and summary.statistics is not None
+        assert summary.statistics.message_count == 2 * len(values)
+        names = {schema.name: json.loads(schema.data) for schema in summary.schemas.values()}
+        for _, channel, message in reader.iter_messages():
+            body = json.loads(message.data)
+            stamp = body["timestamp"]["sec"] * 10**9 + body["timestamp"]["nsec"]
+            assert message.log_time == message.publish_time == stamp
+            (read if channel.topic == "/states" else poses).append(body)
+    assert set(names) == {"calib.States", "foxglove.PoseInFrame"}
+    assert list(names["calib.States"]["properties"]) == ["timestamp", *STATES]
+    found = np.array([[np.nan if body[name] is None else body[name] for name in STATES] for body in read])
+    _same(found, values, rtol=5.1e-9)
+    for body, row in zip(poses, values, strict=True):
+        assert body["frame_id"] == "world"
+        place, turn = body["pose"]["position"], body["pose"]["orientation"]
+        x, y, phi = (row[STATES.index(name)] for name in ("x_m", "y_m", "phi_rad"))
+        assert (place["x"], place["y"]) == pytest.approx((x, y), rel=1e-8)
+        # The turned y axis is the arc's tangent at the head, (sin phi, cos phi).
+        w, z = turn["w"], turn["z"]
+        assert (-2 * w * z, w * w - z * z) == pytest.approx((math.sin(phi), math.cos(phi)), abs=1e-8)
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_the_same_rows_give_the_same_bytes(ending: str, tmp_path: Path) -> None:
+    one, other = (_written(tmp_path / f"{name}{ending}", _rows()) for name in "ab")
+    assert one.read_bytes() == other.read_bytes()
+
+
+@pytest.mark.parametrize("ending", [".parquet", ".mcap"])
+def test_an_interrupted_binary_file_leaves_nothing(ending: str, tmp_path: Path) -> None:
+    def broken() -> None:
+        with states_writer(tmp_path / f"states{ending}") as states:
+            states.add(_rows())
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        broken()
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_full_disk_is_one_sentence(ending: str, tmp_path: Path) -> None:
+    path = tmp_path / f"states{ending}"
+    path.symlink_to("/dev/full")
+    rows = np.tile(_rows(), (500, 1))
+    rows[:, 0] = np.arange(len(rows))
+    with pytest.raises(BadInputError) as caught:
+        _written(path, rows)
+    assert str(caught.value) == f"{path}: cannot be written: No space left on device"
