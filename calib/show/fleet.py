@@ -313,12 +313,14 @@ def cloud_svg(name: str, measure: str, points: tuple[tuple[float, float], ...]) 
     x0, x1, y0, y1 = min(xs), max(xs), min(ys), max(ys)
     floor = _SWEEP_PAGE_HIGH - _SWEEP_PAGE_BELOW
     label = escape(f"{measure} over {name}")
-    out = [f'<svg class="plot" viewBox="0 0 {_WIDE:g} {_HIGH:g}" role="img" aria-label="{label}">']
+    box = f"0 0 {_SWEEP_PAGE_WIDE:g} {_SWEEP_PAGE_HIGH:g}"
+    out = [f'<svg class="plot" viewBox="{box}" role="img" aria-label="{label}">']
     for x, y in points:
         u = _SWEEP_PAGE_LEFT + (x - x0) / (x1 - x0 or 1.0) * (_SWEEP_PAGE_WIDE - 2 * _SWEEP_PAGE_LEFT)
         v = floor - (y - y0) / (y1 - y0 or 1.0) * (floor - _SWEEP_PAGE_TOP)
         out.append(f'<circle class="dot" cx="{u:.1f}" cy="{v:.1f}" r="2.4"/>')
-    out.append(f'<line class="axis" x1="{_LEFT}" x2="{_WIDE - _LEFT}" y1="{floor}" y2="{floor}"/>')
+    left, right = _SWEEP_PAGE_LEFT, _SWEEP_PAGE_WIDE - _SWEEP_PAGE_LEFT
+    out.append(f'<line class="axis" x1="{left}" x2="{right}" y1="{floor}" y2="{floor}"/>')
     for x, y, text, anchor in (
         (_SWEEP_PAGE_LEFT, _SWEEP_PAGE_HIGH - 6, f"{x0:.4g}", "start"),
         (_SWEEP_PAGE_WIDE - _SWEEP_PAGE_LEFT, _SWEEP_PAGE_HIGH - 6, f"{x1:.4g}", "end"),

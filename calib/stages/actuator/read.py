@@ -397,7 +397,7 @@ def _from_pictures(log: Log, rig: Rig, rig_path: Path) -> tuple[Head, float]:
     if len(t) < _IDENTIFYING_FEWEST:
         raise BadInputError(
             f"{log.source}: {len(t)} of {len(rows)} pictures show the marker where it can be, "
-            f"expected at least {_FEWEST}"
+            f"expected at least {_IDENTIFYING_FEWEST}"
         )
     return (np.array(t), np.array(heads), np.array(whitening)), delay_s
 
@@ -545,8 +545,8 @@ def read_track(
     if len(t) < _IDENTIFYING_FEWEST or t[-1] - t[0] < _IDENTIFYING_SHORTEST_S:
         span = float(t[-1] - t[0]) if len(t) else 0.0
         raise BadInputError(
-            f"{log.source}: too short: {len(t)} poses over {span:.3g} s, expected at least {_FEWEST} and "
-            f"{_SHORTEST_S:g} s"
+            f"{log.source}: too short: {len(t)} poses over {span:.3g} s, expected at least "
+            f"{_IDENTIFYING_FEWEST} and {_IDENTIFYING_SHORTEST_S:g} s"
         )
     t = np.maximum(t, 0.0)
     spread = np.linalg.inv(W[:20])
