@@ -133,15 +133,6 @@ def test_coriolis_matrix_of_335() -> None:
         assert dq @ swept == pytest.approx(0.5 * dq @ rate @ dq, rel=1e-5, abs=1e-10)
 
 
-def test_head_projection_at_07_rad() -> None:
-    """The printed projection: the identity straight, [[1.25, 0.25], [-0.33, 0.67]] at 0.7 rad."""
-    plant = Plant(force_projection="head")
-    bent = kin.bellows_from_configuration(np.array([0.7 / 0.065, 0.065]), plant.bellows_radius_m)
-    assert dyn.force_map(plant, bent) == pytest.approx(np.array([[1.25, 0.25], [-0.33, 0.67]]), abs=0.005)
-    assert dyn.force_map(plant, np.array([0.07, 0.07])) == pytest.approx(np.eye(2), abs=1e-15)
-    assert dyn.force_map(Plant(), bent) == pytest.approx(np.eye(2))
-
-
 def test_head_projection_against_the_bellows_ends() -> None:
     """P[r, i] = t . d r_Bi / dq_r with r_Bi from the homogeneous transform (3.32)."""
     plant, h = Plant(force_projection="head"), 1e-6
@@ -208,16 +199,6 @@ def test_linearised_plant_against_differences(plant: Plant, q: tuple[float, floa
     for j, step in enumerate(np.eye(6) * h):
         column = (derivative(c, state + step, *hold) - derivative(c, state - step, *hold)) / (2 * h)
         assert A[:, j] == pytest.approx(column, rel=1e-5, abs=2e-3)
-
-
-def test_rotational_share_of_a_swing() -> None:
-    """About 42 % with Table 3.1, not the 20 % of the text; 25 % at the marker's radius."""
-    plant = Plant()
-    q, dq = np.array([0.065, 0.065]), np.array([0.1, -0.1])
-    moving, turning = dyn.kinetic_energy_J(plant, q, dq)
-    assert float(turning / (moving + turning)) == pytest.approx(0.42, abs=0.005)
-    wide = 0.5 * plant.mass_kg * ((0.0325 + 0.015) * 0.1 / plant.bellows_radius_m) ** 2
-    assert float(turning) / (wide + float(turning)) == pytest.approx(0.25, abs=0.005)
 
 
 UNDAMPED = replace(Plant(), damping_ratio=0.0, creep=None)
@@ -352,16 +333,6 @@ def test_ticks_are_the_open_loop() -> None:
         state, rows = tick(PUMPED, pump, state, (u1, u2))
         assert rows.shape == (17, len(STATE))
         assert rows[-1] == pytest.approx(whole.states[k + 1], abs=1e-12)
-
-
-def test_motion_stays_under_constant_forces() -> None:
-    """Held at its equilibrium the plant does not move."""
-    plant = Plant()
-    q = np.array([0.08, 0.07])
-    force = dyn.resisting_forces(plant, q, np.zeros(2))
-    row = state_row(plant, float(kin.angle(q, 0.0126)), 0.075, (float(force[0]), float(force[1])))
-    motion = swing(plant, row, 1.0)
-    assert np.abs(motion.q_m - q).max() < 1e-14
 
 
 @pytest.mark.parametrize(

@@ -12,14 +12,11 @@ from identifytrials import SIGMA, log_file, rig_file, track, varied
 from calib.core.errors import BadInputError
 from calib.io.logs import Log, read_log, write_log
 from calib.stages.actuator.identify import (
-    COMPONENTS,
-    EXPERIMENTS,
     Nominal,
     Problem,
     Solution,
     Start,
     Track,
-    candidates,
     colour_of,
     decrement,
     first_guess,
@@ -28,7 +25,6 @@ from calib.stages.actuator.identify import (
     heads_of,
     held_back,
     jacobian,
-    made,
     prospects,
     residuals,
     solve,
@@ -38,10 +34,8 @@ from calib.stages.actuator.identify import (
 )
 from calib.stages.actuator.identify_pump import Shape, fit_static_map
 from calib.stages.actuator.parameters import Plant
-from calib.stages.actuator.pump import TICK_S, Orifice, Pump
-from calib.stages.actuator.read import TrackSource, read_track, start_in_motion, swing_at_beginning
-from calib.stages.actuator.simulate import simulate_batch, state_row
-from calib.stages.actuator.validate import IMPROVED, NOMINAL, ORIGINAL, compare, estimated_start, validate_log
+from calib.stages.actuator.read import TrackSource, read_track, start_in_motion
+from calib.stages.actuator.validate import IMPROVED, ORIGINAL, compare, validate_log
 from calib.twin.rig import SimulatedRig
 
 TRUTH = {
@@ -190,16 +184,6 @@ def test_a_log_that_is_cut_out_of_a_longer_one_gives_the_same_parameters() -> No
     assert max(away) > 6.0
 
 
-def test_every_parameter_changes_something() -> None:
-    nominal = replace(Nominal(), pump=Pump(deflation=Orifice()))
-    for start in (Nominal(), nominal):
-        base = values_of(start)
-        for hoses in (False, True):
-            for name in candidates(start, not hoses, hoses, static_map=True):
-                changed = made(start, {name: 1.1 * base[name]}, hoses, 1.0 / 60.0)
-                assert changed != made(start, {}, hoses, 1.0 / 60.0), name
-
-
 def _coloured(one: Track, seed: int, memory: float = 0.9) -> Track:
     rng = np.random.default_rng(seed)
     e = rng.standard_normal((len(one.t_s), 2))
@@ -299,43 +283,6 @@ def test_interpolated_heads_agree_with_fine_steps(kind: str) -> None:
     assert np.abs(moved - rate)[0, inner].max() < 0.05 * np.abs(rate).max()
 
 
-def test_a_start_in_motion_continues_a_longer_run() -> None:
-    one = track("prbs", duration_s=4.0, noise=0.0)
-    nominal = Nominal()
-    plant, pump = made(nominal, {}, True, TICK_S)
-    tick = 110
-    states, _ = simulate_batch([plant], [pump], one.pwm, state_row(plant), 12, 1)
-    row = states[0, tick - 1]
-    r = plant.bellows_radius_m
-    begin = Start(
-        float(row[0] - row[1]) / (2.0 * r),
-        0.5 * float(row[0] + row[1]),
-        float(row[2] - row[3]) / (2.0 * r),
-        0.5 * float(row[2] + row[3]),
-        *row[4:6].tolist(),
-        *row[8:10].tolist(),
-        *row[6:8].tolist(),
-    )
-    assert np.allclose(begin.row(plant), row, atol=1e-12)
-    late = one.t_s >= (tick + 3) * TICK_S
-    rows = {"head": one.head[late], "whitening": one.whitening[late]}
-    rest = Start(0.0, plant.rest_length_m)
-    whole, _ = heads_of(replace(one, t_s=one.t_s[late], **rows), nominal, [{}], [rest], 0.0, 1)
-    cut = replace(one, pwm=one.pwm[tick:], t_s=one.t_s[late] - tick * TICK_S, moving=begin, **rows)
-    late_run, _ = heads_of(cut, nominal, [{}], [begin], 0.0, 1)
-    # The commands that were on their way are like the first one here.
-    assert np.abs(whole - late_run).max() < 1e-9
-    assert cut.unknown == COMPONENTS and one.unknown == ("phi_rad", "length_m")
-
-
-def test_the_experiments_are_those_of_the_source() -> None:
-    names = [one.name for one in EXPERIMENTS(0.065, 1.0 / 60.0)]
-    assert names == ["static", "swing", "step", "ellipse", "elongation"]
-    for one in EXPERIMENTS(0.065, 1.0 / 60.0):
-        assert one.pwm.shape == (480, 2)
-        assert 0.0 <= one.pwm.min() <= one.pwm.max() <= 255.0
-
-
 def test_experiments_shrink_and_rest_does_not() -> None:
     found = fit_tracks(
         Nominal(), [track("free", phi_rad=p, seed=k) for k, p in enumerate((0.5, -0.4))], threads=1
@@ -378,18 +325,6 @@ def test_an_offset_that_creeps_does_not_count() -> None:
     assert decrement(T, _swing(offset=0.04)).zeta == pytest.approx(0.05, rel=0.05)
 
 
-def test_outliers_make_no_peaks() -> None:
-    rng = np.random.default_rng(0)
-    errors = []
-    for _ in range(20):
-        phi = _swing() + 0.008 * rng.standard_normal(len(T))
-        phi[rng.integers(0, 480, 4)] += rng.choice([-0.4, 0.4], 4)
-        found = decrement(T, phi, 0.008)
-        errors.append((found.zeta - 0.05) / found.sigma)
-    assert np.median(np.abs(errors)) < 2.0
-    assert abs(np.median(errors)) < 1.5
-
-
 U = np.arange(100.0, 256.0, 5.0)
 
 
@@ -405,16 +340,6 @@ def test_truth_is_recovered_beside_outliers(sign: float) -> None:
     assert U[10] in found.outliers
     assert found.scatter == pytest.approx(0.2, rel=0.5)
     assert abs(found.of(np.array([found.saturates_pwm]))[0]) == pytest.approx(0.95 * abs(found.end))
-
-
-def test_deviations_are_those_of_repeated_tables() -> None:
-    ends, sigmas = [], []
-    for seed in range(16):
-        noise = 0.3 * np.random.default_rng(seed).standard_normal(len(U))
-        found = fit_static_map("t", U, 20.0 * Shape(95.0, 30.0).of(U) + noise)
-        ends.append(found.end)
-        sigmas.append(found.sigma["end"])
-    assert np.std(ends) == pytest.approx(np.mean(sigmas), rel=0.5)
 
 
 EPS = np.linspace(0.002, 0.027, 12)
@@ -483,16 +408,6 @@ def test_pictures_give_the_true_pose_with_the_noise_that_is_said(folder: Path) -
     assert seen.delay_s == pytest.approx(0.025)
 
 
-def test_commands_fall_on_even_ticks(folder: Path) -> None:
-    one = _read(folder, "prbs.csv").track
-    assert one.hoses
-    assert one.tick_s == pytest.approx(1.0 / 60.0)
-    log = read_log(folder / "prbs.csv")
-    rows = log.sampled("pwm1", "pwm2")
-    assert np.array_equal(one.pwm[: len(rows), 0], log.columns["pwm1"][rows])
-    assert not _read(folder, "swing.csv").track.hoses
-
-
 def test_a_swing_that_is_held_first_begins_where_it_is_let_go(folder: Path) -> None:
     log = read_log(folder / "swing.csv")
     t = np.concatenate([np.arange(60) / 60.0, log.t_s + 1.0])
@@ -525,34 +440,6 @@ def test_states_stand_in_for_pictures(folder: Path) -> None:
 
 
 PLANT = Plant()
-
-
-def _swing_identifystart(
-    rate: float, noise: float, seed: int, w: float = 25.0
-) -> tuple[np.ndarray, np.ndarray]:
-    t = np.arange(120) / 60.0
-    a, zeta = 0.3, 0.05
-    b = rate / w + zeta * a
-    phi = 0.01 + np.exp(-zeta * w * t) * (a * np.cos(w * t) + b * np.sin(w * t))
-    return t, phi + noise * np.random.default_rng(seed).standard_normal(len(t))
-
-
-def test_rate_and_angle_of_a_swing_at_its_beginning() -> None:
-    z = []
-    for seed in range(10):
-        t, phi = _swing_identifystart(-3.0, 0.008, seed)
-        at_0, rate, sigma, fastest = swing_at_beginning(t, phi)
-        assert at_0 == pytest.approx(0.31, abs=0.02) and fastest == pytest.approx(25.0 * 0.3, rel=0.15)
-        z.append((rate + 3.0) / sigma)
-    # Frequency and damping are not known, which adds to what the linear fit says.
-    assert np.sqrt(np.mean(np.square(z))) < 3.0
-
-
-def test_a_wrong_picture_does_not_decide() -> None:
-    t, phi = _swing_identifystart(-3.0, 0.002, 0)
-    clean = swing_at_beginning(t, phi)[1]
-    phi[30] += 2.0
-    assert swing_at_beginning(t, phi)[1] == pytest.approx(clean, abs=0.3)
 
 
 def _started(one: Track, from_s: float = 0.0) -> object:
@@ -629,33 +516,3 @@ def test_a_log_with_its_true_parameters(tmp_path: Path) -> None:
     # The marker's place comes in whole pixels of a third of a millimetre and more.
     assert 1e-4 < seen.errors[IMPROVED]["q1"].rms < 1e-3
     assert seen.errors[IMPROVED]["q1"].fit_percent > seen.errors[ORIGINAL]["q1"].fit_percent
-
-
-def test_the_start_is_the_estimators_and_no_models(tmp_path: Path) -> None:
-    path = tmp_path / "rig.yaml"
-    known = rig_file(path)
-    log = log_file(tmp_path / "log.csv", SimulatedRig(), "swing", 0, 3.0)
-    whole = read_log(log)
-    late = whole.t_s >= 0.76
-    cut = tmp_path / "cut.csv"
-    columns = {name: values[late] for name, values in whole.columns.items()}
-    write_log(cut, replace(whole, t_s=whole.t_s[late], columns=columns, lines=whole.lines[late]))
-    found = estimated_start(cut, known, path, float(whole.t_s[late][0]))
-    assert found is not None
-    q = np.stack([whole.columns["true_q1_m"], whole.columns["true_q2_m"]], axis=1)
-    k = int(np.argmax(late))
-    turn, stretch = np.array([1.0, -1.0]) / (2.0 * 0.0126), np.array([0.5, 0.5])
-    rate = (q[k + 1] - q[k - 1]) / (whole.t_s[k + 1] - whole.t_s[k - 1])
-    assert found.phi_rad == pytest.approx(float(q[k] @ turn), abs=0.02)
-    assert found.length_m == pytest.approx(float(q[k] @ stretch), abs=5e-4)
-    assert found.dphi_radps == pytest.approx(float(rate @ turn), abs=0.3)
-    assert abs(found.dphi_radps) > 1.5
-    told, said = validate_log(cut, known, path)
-    assert told.start == "estimator" and any("begins in motion" in sentence for sentence in said)
-    # The swing goes on as the model says; from rest it would be another one.
-    assert told.errors[NOMINAL]["phi"].rms < 0.015
-    assert told.errors[ORIGINAL]["phi"].rms > 3.0 * told.errors[NOMINAL]["phi"].rms
-    blind = tmp_path / "blind.csv"
-    no_imu = {name: v for name, v in columns.items() if name[:2] not in ("ax", "ay", "az", "gx", "gy", "gz")}
-    write_log(blind, replace(whole, t_s=whole.t_s[late], columns=no_imu, lines=whole.lines[late]))
-    assert estimated_start(blind, known, path, 0.8) is None

@@ -10,7 +10,6 @@ import pytest
 from identifytrials import FLOW_TRUTH, LAG_TRUTH, pump_records
 from outside import outside
 
-from calib.core.errors import BadInputError
 from calib.core.rig import Rig
 from calib.stages.actuator.identify_pump import (
     LAG,
@@ -124,21 +123,6 @@ def test_the_lag_is_the_exponential_that_it_should_be() -> None:
     assert np.allclose(told, expected, atol=2e-3)
 
 
-def test_dead_time_shifts_and_is_smooth() -> None:
-    for model, theta in (
-        (LAG, [0.05, 30.0, 0.6, FREE]),
-        (ORIFICE, [0.05, 30.0, 0.2, 5e-3, FREE, 20.0, 0.05]),
-    ):
-        base = np.array(theta)
-        near = [
-            simulate_pump(model, np.concatenate([[d], base[1:]]), _record(_step()))
-            for d in (0.05, 0.0501, 0.0502)
-        ]
-        first, second = near[1] - near[0], near[2] - near[1]
-        assert np.abs(first - second).max() < 0.1 * np.abs(first).max() + 1e-9
-        assert np.abs(first).max() < 0.02
-
-
 def test_the_flow_in_follows_the_law_of_the_orifice() -> None:
     """Without hose and leak the fall of g - p is the emptying of `Orifice` with the same coefficients."""
     a, b, level = 0.3, 0.01, 30.0
@@ -225,21 +209,6 @@ def test_columns_are_recognised(tmp_path: Path, head: str, unit: str) -> None:
     assert np.allclose(table.record.value, _rows()[:, 2], atol=1e-4)
 
 
-def test_settled_values_are_taken_apart_by_mode(tmp_path: Path) -> None:
-    path = tmp_path / "static.csv"
-    rows = [
-        f"{mode},{100 + 10 * k},{sign * k},{3 * k}"
-        for mode, sign in (("in", 1), ("out", -1))
-        for k in range(8)
-    ]
-    rows = [f"{r.rsplit(',', 1)[0]},{3 * i}" for i, r in enumerate(rows)]
-    path.write_text("mode,pwm_input,pressure_kpa,timestamp\n" + "\n".join(rows) + "\n")
-    table = read_pump_table(path)
-    assert table.record is None
-    assert [s.name for s in table.settled] == ["static.csv, in", "static.csv, out"]
-    assert table.settled[1].value[-1] == -7.0
-
-
 def test_real_tables(shared_data: Path) -> None:
     folder = outside(shared_data / "softbot")
     for path in sorted(folder.glob("sweep_*.csv")):
@@ -248,31 +217,3 @@ def test_real_tables(shared_data: Path) -> None:
         assert record.pwm.max() == 255.0
     parts = read_pump_table(next(folder.glob("calibration_raw*.csv"))).settled
     assert [len(s.pwm) for s in parts] == [30, 30]
-
-
-def _broken(kind: str) -> np.ndarray:
-    rows = _rows()
-    if kind == "back":
-        rows[50:, 0] -= 0.5
-    elif kind == "jump":
-        rows[50:, 0] += 100.0
-    elif kind == "range":
-        rows[10, 1] = 400.0
-    elif kind == "nan":
-        rows[10:30, 2] = np.nan
-    elif kind == "short":
-        rows = rows[:8]
-    return rows
-
-
-@pytest.mark.parametrize(
-    ("kind", "words"),
-    [
-        ("back", "line 52: time goes back"),
-        ("range", "line 12: PWM is 400, expected 0 to 255"),
-        ("short", "has 8 rows over 0.14 s"),
-    ],
-)
-def test_what_is_wrong_is_said_with_its_line(tmp_path: Path, kind: str, words: str) -> None:
-    with pytest.raises(BadInputError, match=words):
-        read_pump_table(_write(tmp_path / "a.csv", "t_s,pwm,pressure_kPa", _broken(kind)))

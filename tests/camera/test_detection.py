@@ -15,7 +15,7 @@ from calib.io.pictures import list_pictures, read_picture
 from calib.stages.camera.bundle import calibrate
 from calib.stages.camera.corners import detect, find_size
 from calib.stages.camera.model import Board, Camera, View, pack
-from calib.twin.scene import Light, PrintedBoard, Sensor, corner_pixels, pose_facing, render
+from calib.twin.scene import PrintedBoard, Sensor, corner_pixels, pose_facing, render
 
 LENS = np.array([-0.22, 0.12, 0, 0, 0, 0, 0, 0.0])
 VGA = Camera("radial2", (640, 480), 545.0, 545.0, 0.0, 323.3, 237.9, LENS)
@@ -137,24 +137,6 @@ def test_hard_pictures_are_found_and_honest(what: str, sensor: dict[str, float])
     assert detection.refined.mean() > 0.9
     # Sigma from the fits themselves covers the error.
     assert error < 4 * np.median(detection.sigma_px) + 0.01
-
-
-def test_uneven_light_and_shadow() -> None:
-    printed = PrintedBoard(Board(9, 6, 0.025))
-    pose = pose_facing(VGA, printed, (320, 240), 0.42, tilt_rad=0.4, azimuth_rad=1.0)
-    light = Light(gradient=(0.35, -0.25), vignetting=0.4)
-    gray = render(VGA, printed, pose, light=light, sensor=Sensor(), background=0.3, seed=2)
-    detection = detect(gray, 9, 6)
-    assert detection is not None
-    assert np.sqrt(np.mean((detection.pixels - corner_pixels(VGA, printed, pose)) ** 2)) < 0.03
-
-
-def test_another_size_is_not_reported_as_the_one_asked_for() -> None:
-    gray, _ = _picture(VGA, Board(9, 6, 0.025), 2)
-    for columns, rows in ((8, 6), (9, 5), (8, 5), (7, 4), (10, 6), (6, 6)):
-        assert detect(gray, columns, rows) is None
-    assert find_size(gray) == (9, 6)
-    assert find_size([gray, _picture(VGA, Board(9, 6, 0.025), 4)[0]]) == (9, 6)
 
 
 def test_the_same_on_any_number_of_threads() -> None:

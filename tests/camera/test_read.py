@@ -13,7 +13,6 @@ from calib.core.errors import BadInputError
 from calib.stages.camera import read as boards
 from calib.stages.camera.model import Board
 from calib.stages.camera.read import Told, board_of, find_boards, read_table, read_views, read_vnl
-from synthetic import views_of
 
 HEADER = "view,x_m,y_m,u_px,v_px\n"
 FOUR = "a,0,0,10,10\na,0.02,0,20,10\na,0,0.02,10,20\na,0.02,0.02,20.5,21\n"
@@ -94,18 +93,6 @@ def test_a_corner_file_is_read_row_by_row(write) -> None:
     assert np.array_equal(views[1].pixels, SIX + 5)
 
 
-def test_corners_that_were_not_seen_are_left_out(write) -> None:
-    rows = corners("a", SIX).splitlines()
-    rows[1], rows[4] = "a - - -", "a 19 21 -1"
-    (view,) = read_vnl(write("# filename x y level\n" + "\n".join(rows), "c.vnl"), 3, 2, 0.02)
-    kept = [0, 2, 3, 5]
-    assert np.array_equal(view.target_m, BOARD.points_m()[kept])
-    assert np.array_equal(view.pixels, SIX[kept])
-    nothing = "".join("b - - -\n" for _ in range(6))
-    (view,) = read_vnl(write("# filename x y level\n" + nothing + corners("a", SIX), "d.vnl"), 3, 2, 0.02)
-    assert view.name == "a"
-
-
 def test_a_mirrored_grid_is_named_anew_and_shows_the_same_corners(write) -> None:
     flipped = SIX.reshape(2, 3, 2)[:, ::-1].reshape(-1, 2)
     (view,) = read_vnl(write("# filename x y level\n" + corners("a", flipped), "c.vnl"), 3, 2, 0.02)
@@ -142,43 +129,6 @@ def test_a_bad_corner_file_is_answered_with_file_and_line(write, content: str | 
 SIZE = (640, 480)
 
 
-@pytest.fixture
-def table(tmp_path: Path):
-    def write(change=lambda x, y, u, v: (x, y, u, v)) -> Path:
-        rows = ["view,x_m,y_m,u_px,v_px"]
-        for view in views_of(3):
-            points = np.hstack([view.target_m, view.pixels]).tolist()
-            rows += [",".join([view.name, *map(repr, change(*point))]) for point in points]
-        path = tmp_path / "points.csv"
-        path.write_text("\n".join(rows))
-        return path
-
-    return write
-
-
-def test_a_distant_target_is_moved_to_its_origin(table) -> None:
-    path = table(lambda x, y, u, v: (x + 500.0, y - 300.0, u, v))
-    found = read_views([path], Told(image_size_px=SIZE))
-    moved = [view.target_m - truth.target_m for view, truth in zip(found.views, views_of(3), strict=True)]
-    # The same for all views, to what the table's digits hold of a millimetre at 500 m.
-    assert np.ptp(np.concatenate(moved), axis=0).max() < 1e-12
-    assert max(np.abs(view.target_m).max() for view in found.views) < 0.2
-
-
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        (lambda x, y, u, v: (x, y, u + 500, v), "points lie outside a picture of 640x480 px"),
-        (lambda x, y, u, v: (x, y, u, v - 480), "points lie outside a picture of 640x480 px"),
-        (lambda x, y, u, v: (x * 1e6, y, u, v), "its target lies 2e\\+05 m away, expected metres"),
-        (lambda x, y, u, v: (x * 1e-9, y * 1e-9, u, v), "its target measures 2e-10 m, expected metres"),
-    ],
-)
-def test_points_that_cannot_be(table, change, says: str) -> None:
-    with pytest.raises(BadInputError, match=says):
-        read_views([table(change)], Told(image_size_px=SIZE))
-
-
 def test_a_table_beyond_the_memory_is_refused_by_its_size(tmp_path: Path) -> None:
     path = tmp_path / "points.csv"
     path.write_text("view,x_m,y_m,u_px,v_px\n")
@@ -204,15 +154,6 @@ def test_views_come_in_the_order_of_the_pictures(shipped: list[Path]) -> None:
     assert found.board.square_m == 0.02
     assert found.without == ()
     assert list(found.hashes) == [path.name for path in paths]
-
-
-def test_few_pixels_in_memory_change_nothing(shipped: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    expected = find_boards(shipped[:3], None, 0.02)
-    monkeypatch.setattr(boards, "_KEPT_PIXELS", 316 * 208)
-    found = find_boards(shipped[:3], None, 0.02)
-    assert found.hashes == expected.hashes
-    for view, other in zip(found.views, expected.views, strict=True):
-        np.testing.assert_array_equal(view.pixels, other.pixels)
 
 
 def test_a_picture_that_changes_meanwhile(

@@ -20,13 +20,9 @@ from calib.stages.camera.checks import (
     best_change,
     best_next_view,
     best_split,
-    coverage,
     evidence,
-    gain,
-    lens_shape,
     misfit,
     overdispersion,
-    repeated_views,
     screen,
     straightened,
     target_shape,
@@ -74,14 +70,6 @@ def test_two_cameras_are_told_apart_view_by_view() -> None:
     group = sentence.split("cameras: ")[1].split(" from one")[0].split(", ")
     assert len({name[0] for name in group}) == 1
     assert len(group) == 13
-
-
-def test_the_shape_of_the_board_is_measured() -> None:
-    rng = np.random.default_rng(4)
-    _, found = _judged(take(rng, camera_of(), 17, recipe=Recipe(aspect=1.05)), (640, 480), "radial2")
-    assert "1.05" in found.reasons[0]
-    _, found = _judged(take(rng, camera_of(), 17, recipe=Recipe(bow_m=0.003)), (640, 480), "radial2")
-    assert "bent by about 3." in found.reasons[0] or "bent by about 2.9" in found.reasons[0]
 
 
 def test_a_lens_model_that_is_too_poor_is_said_and_not_taken_for_a_bent_board() -> None:
@@ -242,16 +230,6 @@ def test_pictures_of_each_failure(name: str, right: tuple[str, ...]) -> None:
         assert (found.verdict == "ok") == (name == "good")
 
 
-def test_good_views_are_ok() -> None:
-    result = calibrate_camera(views_of(17, 2, 0.15), (640, 480))
-    assert result.judgement.verdict == "ok", result.judgement.reasons
-    assert result.calibration.camera.model == "radial2"
-    assert [c.name for c in result.models] == ["pinhole", "radial2", "radial3", "brown5", "rational8"]
-    assert set(result.seconds) == {"solve", "covariance", "judge"}
-    off = abs(result.calibration.camera.fx_px - 530.0)
-    assert off < 4 * result.covariance.sigma()["fx_px"]
-
-
 def test_outliers_are_rejected_and_named() -> None:
     views = views_of(15, 3, 0.1)
     views[4].pixels[10] += [6.0, -5.0]
@@ -327,69 +305,6 @@ def test_a_view_in_disorder_is_named(seed: int) -> None:
     assert found.advice[0] == "Leave out view05."
 
 
-USUAL = Recipe()
-
-
-def _fit(recipe: Recipe = USUAL, count: int = 12, seed: int = 0) -> Calibration:
-    return calibrate(
-        pack(take(np.random.default_rng(seed), camera_of(), count, recipe=recipe)), (640, 480), "radial2"
-    )
-
-
-def test_tilts_are_those_that_were_made() -> None:
-    found = coverage(_fit(Recipe(tilt_deg=(19.0, 21.0))))
-    np.testing.assert_allclose(found.tilts_deg, 20.0, atol=1.5)
-    assert 30 < found.spread_deg < 43
-    assert found.weaker_spread_deg > 5
-    parallel = coverage(_fit(Recipe(tilt_deg=(20.0, 20.5), azimuth_deg=30.0, roll_deg=0.5)))
-    assert parallel.spread_deg < 3
-    one_axis = coverage(_fit(Recipe(tilt_deg=(0.0, 40.0), azimuth_deg=0.0, roll_deg=0.0)))
-    assert one_axis.spread_deg > 20
-    assert one_axis.weaker_spread_deg < 3
-
-
-def test_shares_of_the_image() -> None:
-    full = coverage(_fit(count=40))
-    assert full.area_share > 0.7
-    assert full.cells_share > 0.8
-    assert not full.empty.any()
-    assert 0.7 < full.radius_share <= 1.0
-    small = coverage(_fit(Recipe(fill=(0.15, 0.2), spread=0.05)))
-    assert small.area_share < 0.1
-    assert small.empty.sum() >= 6
-    assert not small.empty[1, 1]
-
-
-def test_copies_are_found_through_noise() -> None:
-    rng = np.random.default_rng(2)
-    views = take(rng, camera_of(), 8)
-    again = [
-        replace(views[i], pixels=views[i].pixels + 0.05 * rng.standard_normal((35, 2))) for i in (1, 1, 6)
-    ]
-    fit = calibrate(pack([*views, *again]), (640, 480), "radial2")
-    np.testing.assert_array_equal(repeated_views(fit, 0.5), [0, 1, 2, 3, 4, 5, 6, 7, 1, 1, 6])
-    np.testing.assert_array_equal(repeated_views(fit, 1e-6), np.arange(11))
-
-
-def test_mirrored_views_are_seen_from_behind() -> None:
-    views = take(np.random.default_rng(3), camera_of(), 8)
-    turned = [replace(v, target_m=v.target_m * [-1.0, 1.0]) if i == 2 else v for i, v in enumerate(views)]
-    found = coverage(calibrate(pack(turned), (640, 480), "radial2"))
-    np.testing.assert_array_equal(np.flatnonzero(found.mirrored), [2])
-    assert found.spread_deg < 90
-
-
-def test_a_lens_that_folds() -> None:
-    fit = _fit()
-    fine = lens_shape(fit)
-    assert fine.image_shown == 1.0
-    assert 0.5 < fine.image_slope <= fine.seen_slope < 1.0
-    folding = replace(fit, camera=replace(fit.camera, distortion=np.array([-0.9, 0, 0, 0, 0, 0, 0, 0.0])))
-    found = lens_shape(folding)
-    assert found.image_shown < 1.0
-    assert found.image_slope <= 0.0
-
-
 def _views(count: int = 12, seed: int = 0) -> list[View]:
     return take(np.random.default_rng(seed), camera_of(), count)
 
@@ -412,15 +327,6 @@ def test_what_is_no_view_of_a_plane_is_named() -> None:
     np.testing.assert_array_equal(np.flatnonzero(found.on_a_line), [4, 6])
     np.testing.assert_array_equal(np.flatnonzero(found.few), [5])
     np.testing.assert_array_equal(np.flatnonzero(found.unusable), [1, 3, 4, 5, 6])
-
-
-def test_noise_alone_is_no_misfit() -> None:
-    found = _misfit(_views())
-    assert not found.bad_views.any()
-    assert not found.bad_points.any()
-    assert found.rms_px == pytest.approx(found.typical_px, rel=0.1)
-    assert found.heavy_share == pytest.approx(0.055, abs=0.03)
-    assert found.repeated == pytest.approx(1.0, abs=0.35)
 
 
 def test_a_bad_view_and_bad_points_are_found() -> None:
@@ -470,36 +376,6 @@ def test_cost_of_a_view_under_another_camera(model: str) -> None:
     expected = found.cost + 2 * found.b @ shift + np.einsum("g,ngh,h->n", shift, found.S, shift)
     rise = costs - found.cost
     np.testing.assert_allclose(expected - found.cost, rise, atol=2e-3 * np.abs(rise).max())
-
-
-def test_gain_of_a_group_is_what_fitting_it_alone_gains() -> None:
-    fit = _fit_evidence(16)
-    found = evidence(fit)
-    group = np.arange(8)
-    alone = calibrate(fit.observations.select(group), (640, 480), "radial2")
-    fall = found.cost[group].sum() - alone.squared_sum
-    assert float(gain(found.S[group].sum(axis=0), found.b[group].sum(axis=0))) == pytest.approx(
-        fall, rel=0.02
-    )
-
-
-def test_deformation_has_the_slope_of_the_cost() -> None:
-    fit = _fit_evidence(8)
-    points = fit.observations.target_m.shape[1]
-    basis = np.random.default_rng(2).standard_normal((1, 2, 3, points))
-    found = evidence(fit, basis, ("one", "two"))
-    assert found.names[-2:] == ("one", "two")
-    step = 1e-7
-    for k in range(2):
-        costs = []
-        for sign in (1.0, -1.0):
-            seen = fit.observations.displaced(sign * step * basis[0, k].T)
-            there = minimise(fit.block, seen, NOTHING)
-            assert there.at is not None
-            costs.append((there.at.residuals**2).sum(axis=(1, 2)))
-        slope = (costs[0] - costs[1]) / (2 * step)
-        np.testing.assert_allclose(2 * found.b[:, found.intrinsics + k], slope, rtol=1e-3, atol=1e-3)
-    np.testing.assert_allclose(found.camera_only().S, evidence(fit).S, rtol=1e-9, atol=1e-6)
 
 
 def test_overdispersion_sees_errors_shared_by_a_view() -> None:
@@ -566,14 +442,6 @@ def test_one_camera_stays_below_what_chance_reaches() -> None:
     assert np.median(splits) < 1.0
 
 
-def test_a_bent_board_is_not_a_second_camera() -> None:
-    views = take(np.random.default_rng(1), camera_of(), 25, recipe=Recipe(bow_m=0.001))
-    fit = _fit_two_cameras(views)
-    straightened = best_split(_prepared(fit))
-    assert straightened is not None
-    assert straightened.ratio < 1.4
-
-
 def test_a_lens_that_the_model_cannot_follow_is_not_a_second_camera() -> None:
     camera = camera_of(lens=(-0.29, 0.107, 0.0015, -0.0003))
     fit = _fit_two_cameras(take(np.random.default_rng(2), camera, 20))
@@ -584,33 +452,11 @@ def test_a_lens_that_the_model_cannot_follow_is_not_a_second_camera() -> None:
     assert split.ratio < 1.4
 
 
-def _fit_next_view(recipe: Recipe, count: int = 10, seed: int = 0) -> Calibration:
-    return calibrate(
-        pack(take(np.random.default_rng(seed), camera_of(), count, recipe=recipe)), (640, 480), "radial2"
-    )
-
-
 def _advice(fit: Calibration) -> Candidate:
     found = best_next_view(fit, evidence(fit).S.sum(axis=0))
     assert found is not None
     assert 0.0 < found.remaining < 1.0
     return found
-
-
-def test_parallel_views_want_a_tilted_one() -> None:
-    found = _advice(_fit_next_view(Recipe(tilt_deg=(0.0, 4.0))))
-    assert found.tilt_deg >= 30.0
-    assert found.away in ("left", "right", "top", "bottom")
-
-
-def test_views_on_the_left_want_one_on_the_right() -> None:
-    rng = np.random.default_rng(1)
-    views = [
-        v for v in take(rng, camera_of(), 60, recipe=Recipe(fill=(0.3, 0.45))) if v.pixels[:, 0].max() < 380
-    ]
-    fit = calibrate(pack(views), (640, 480), "radial2")
-    assert len(views) > 5
-    assert "right" in _advice(fit).where
 
 
 def test_advice_beats_more_of_the_same() -> None:

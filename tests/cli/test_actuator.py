@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -75,28 +72,6 @@ def test_swings_fill_the_section(calib: Run, rig: Path, swings: list[Path], tmp_
     assert calib("simulate", "swing", "-o", tmp_path / "x.csv", "--rig", rig, "--duration", "1s").code == 0
 
 
-def test_one_document_and_the_same_bytes(
-    calib: Run, rig_text: str, swings: list[Path], tmp_path: Path
-) -> None:
-    texts, document = [], {}
-    for name in ("a.yaml", "b.yaml"):
-        path = tmp_path / name
-        path.write_text(rig_text)
-        ended = calib("identify", "logs", *swings, "--rig", path, "--json", "--no-hold-back")
-        document = json.loads(ended.out)
-        texts.append(path.read_bytes())
-    assert texts[0] == texts[1]
-    assert (document["schema"], document["verb"]) == (1, "identify")
-    assert set(document["identify"]["parameters"]) == set(document["identify"]["correlation"]["order"])
-    assert {p["name"] for p in document["identify"]["next"]} == {
-        "static",
-        "swing",
-        "step",
-        "ellipse",
-        "elongation",
-    }
-
-
 def test_logs_that_cannot_be_used_end_in_a_sentence(
     calib: Run, rig: Path, swings: list[Path], tmp_path: Path
 ) -> None:
@@ -137,20 +112,6 @@ def test_a_log_at_rest_names_what_it_cannot_tell(calib: Run, rig: Path, tmp_path
     assert ended.code == 3
     for words in ("cannot tell any parameter", "stiffness_scale", "bending_N_per_rad2", "lambda1_per_s"):
         assert words in ended.sentence
-
-
-def test_a_log_that_excites_little_is_unidentifiable(calib: Run, rig: Path, tmp_path: Path) -> None:
-    steps = log_file(tmp_path / "steps.csv", SimulatedRig(), "steps", 0, 8.0)
-    ended = calib("identify", steps, "--rig", rig)
-    assert ended.code == 1
-    assert "verdict: unidentifiable" in ended.out
-    assert "bending_N_per_rad2 is not identifiable from these logs" in ended.out
-    assert "next experiment" in ended.out
-
-
-def test_usage(calib: Run, rig: Path, swings: list[Path]) -> None:
-    assert calib("identify", *swings, "--states", swings[0], "--rig", rig).code == 2
-    assert calib("identify", "--help").code == 0
 
 
 def test_a_pump_and_both_its_models(calib: Run, tables: list[Path], tmp_path: Path) -> None:
@@ -214,18 +175,6 @@ def _rig(folder: Path, **sections: Any) -> Path:
     return path
 
 
-def test_a_log_against_the_original_model_alone(calib: Run, tmp_path: Path, log: Path) -> None:
-    rig = _rig(tmp_path)
-    before = rig.read_bytes()
-    ended = calib("validate", log, "--rig", rig)
-    assert ended.code == 0, ended.err
-    assert "swing.csv: " in ended.out and "from pictures, hoses off" in ended.out
-    assert "phi, rad, original" in ended.out and "phi, rad, nominal" in ended.out
-    assert "improved" not in ended.out and "start by the estimator" in ended.out
-    assert "has no section actuator or pump: the improved model has nominal parameters" in ended.err
-    assert rig.read_bytes() == before
-
-
 def test_both_models_in_one_table_and_figures(calib: Run, tmp_path: Path, log: Path) -> None:
     rig = _rig(tmp_path, actuator={"stiffness_scale": 0.8, "damping_scale_free_swing": 5.0})
     drawn = tmp_path / "drawn"
@@ -243,22 +192,6 @@ def test_both_models_in_one_table_and_figures(calib: Run, tmp_path: Path, log: P
     assert [path.name for path in drawn.iterdir()] == ["validate_model.png"]
 
 
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (("LOG", "--states", "a.csv", "--states", "b.csv"), "2 files for 1 logs"),
-        (("LOG", "--states", "a.csv", "--truth"), "--truth: takes the true columns"),
-    ],
-)
-def test_options_that_do_not_go_together(
-    calib: Run, tmp_path: Path, log: Path, words: tuple[str, ...], sentence: str
-) -> None:
-    given = [log if word == "LOG" else word for word in words]
-    ended = calib("validate", *given, cwd=tmp_path)
-    assert ended.code == 2 and sentence in ended.sentence
-    assert not list(tmp_path.iterdir())
-
-
 def test_bad_input_is_one_sentence(calib: Run, tmp_path: Path, log: Path) -> None:
     ended = calib("validate", log, cwd=tmp_path)
     assert ended.code == 3 and "camera" in ended.sentence
@@ -271,15 +204,6 @@ def test_bad_input_is_one_sentence(calib: Run, tmp_path: Path, log: Path) -> Non
     assert ended.code == 3 and "short.csv" in ended.sentence
 
 
-SHORT = "0.5s"
-
-
-def _calib(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])}
-    command = [sys.executable, "-c", "from calib.cli.main import main; main()", "simulate", *words]
-    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-
-
 def test_a_log_and_its_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     simulate("swing", tmp_path / "log.csv", duration="2s")
     shown = capsys.readouterr()
@@ -288,26 +212,6 @@ def test_a_log_and_its_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert f"swing: 2 s, 320 rows written to {tmp_path / 'log.csv'}" in shown.out
     assert "damping_ratio 0.055" in shown.out
     assert "simulated" in shown.err
-
-
-def test_one_json_document(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    simulate(
-        "orientation", tmp_path / "log.csv", 3, "truth", SHORT, ["controller=p", "Kp = 500"], as_json=True
-    )
-    document = json.loads(capsys.readouterr().out)
-    assert (document["schema"], document["verb"]) == (1, "simulate")
-    told = document["simulate"]
-    assert (told["scenario"], told["seed"], told["feedback"]) == ("orientation", 3, "truth")
-    assert (told["rows"], told["duration_s"]) == (80, 0.5)
-    assert told["figures"]["reach_s"] is None
-    assert told["figures"]["peak_rad"] > 0.0
-
-
-def test_the_same_seed_writes_the_same_bytes(tmp_path: Path) -> None:
-    for name, seed in (("a", 7), ("b", 7), ("c", 8)):
-        simulate("orientation", tmp_path / name, seed, duration=SHORT)
-    a, b, c = ((tmp_path / name).read_bytes() for name in "abc")
-    assert a == b != c
 
 
 @pytest.mark.parametrize(
@@ -337,29 +241,3 @@ def test_input_that_cannot_be_used(tmp_path: Path, arguments: dict[str, object],
     with pytest.raises(BadInputError, match=words):
         simulate(**{"scenario": "swing", "output": tmp_path / "log.csv", **arguments})
     assert not any(tmp_path.iterdir())
-
-
-@pytest.mark.slow
-def test_exit_codes_and_one_sentence_each(tmp_path: Path) -> None:
-    (tmp_path / "mm.yaml").write_text("actuator: {rest_length_m: 65}\n")
-    (tmp_path / "creep.yaml").write_text(
-        "actuator: {lambda1_per_s: -0.1047, lambda2_N_per_m: -14.98, lambda3: -1.854}\n"
-    )
-    (tmp_path / "stiff.yaml").write_text(
-        "actuator: {k0_N_per_m: 100000, k1_N_per_m2: 10000000, mass_kg: 0.0001}\n"
-    )
-    for words, code, sentence in (
-        (("swing", "-o", "log.csv", "--duration", SHORT), 0, "swing: 0.5 s"),
-        (("swing",), 2, "output"),
-        (("wobble", "-o", "x.csv"), 2, "SCENARIO: 'wobble' is not one of"),
-        (("swing", "-o", "x.csv", "--rig", "mm.yaml"), 3, "is it in millimetres?"),
-        (("swing", "-o", "x.csv", "--rig", "creep.yaml"), 3, "make the plant unstable"),
-        (("swing", "-o", "x.csv", "--rig", "stiff.yaml"), 3, "is too large for its stiffness and damping"),
-    ):
-        ended = _calib(tmp_path, *words)
-        assert ended.returncode == code, (words, ended.stderr)
-        assert sentence in ended.stdout + ended.stderr
-        assert "Traceback" not in ended.stderr
-        if code == 3:
-            assert ended.stderr.count("\n") == 1
-    assert not (tmp_path / "x.csv").exists()

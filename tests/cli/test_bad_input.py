@@ -234,32 +234,6 @@ def test_a_wrong_board_file(calib, pictures, tmp_path, text: str) -> None:
     assert BOARDS[text] in ended.sentence
 
 
-def test_a_board_file_that_is_no_file(calib, pictures, tmp_path) -> None:
-    path = pictures(2) / "board.yaml"
-    for make, says in (
-        (path.mkdir, "is a folder, expected a file"),
-        (lambda: path.symlink_to("gone"), "cannot be read: No such file"),
-        (lambda: os.mkfifo(path), "is a pipe or a device, expected a file"),
-        (lambda: path.write_bytes(bytes(range(256))), "is not UTF-8 text"),
-    ):
-        make()
-        ended = calib("intrinsics", path.parent, "--rig", tmp_path / "rig.yaml")
-        assert ended.code == 3
-        assert says in ended.sentence
-        path.rmdir() if path.is_dir() else path.unlink()
-
-
-def test_folders_with_different_boards(calib, pictures, tmp_path) -> None:
-    first = pictures(2, "corners: [7, 5]\nsquare_m: 0.02\n")
-    other = pictures(0, "corners: [7, 5]\nsquare_m: 0.03\n", name="other")
-    (first / "view02.png").rename(other / "view02.png")
-    ended = calib("intrinsics", first, other, *RADIAL2, "--rig", tmp_path / "rig.yaml")
-    assert ended.code == 3
-    assert "tells another board than" in ended.sentence
-    (other / "board.yaml").write_text("square_m: 0.02\ncorners: [7, 5]\n")
-    assert calib("intrinsics", first, other, *RADIAL2, "--rig", tmp_path / "rig.yaml").code == 1
-
-
 RIGS = {
     b"services:\n  web: {image: nginx}\n": "is not a rig.yaml: it has 'services', expected sections",
     b"": "holds nothing",

@@ -24,18 +24,6 @@ def test_run_compares_controllers(calib: Run, tmp_path: Path) -> None:
     assert not (tmp_path / "rig.yaml").exists()
 
 
-def test_run_as_one_json_document_and_the_same_again(calib: Run, tmp_path: Path) -> None:
-    words = ("control", "run", "elongation", "--duration", "2s", "--json", "--seed", "3")
-    first, again = calib(*words, cwd=tmp_path), calib(*words, cwd=tmp_path)
-    assert first.code == 0 and first.out == again.out
-    told = json.loads(first.out)
-    assert (told["schema"], told["verb"]) == (1, "control run")
-    runs = {one["controller"]: one for one in told["control"]["runs"]}
-    assert set(runs) == {"pd", "pd+ff", "pd+map", "torque"}
-    assert max(runs["torque"]["rms_mm"]) < min(runs["pd"]["rms_mm"])
-    assert runs["pd"]["rise_s"] is None and told["control"]["possible"] is True
-
-
 @pytest.mark.slow
 def test_tune_writes_the_section_that_run_then_uses(calib: Run, tmp_path: Path) -> None:
     ended = calib("control", "tune", "--figures", "drawn", cwd=tmp_path)
@@ -139,19 +127,6 @@ def test_rigs_that_cannot_be_controlled(
 
 
 @pytest.mark.parametrize(
-    "limits",
-    [
-        "200,100",
-        "0.5,200",
-    ],
-)
-def test_limits_that_no_motor_has(calib: Run, tmp_path: Path, limits: str) -> None:
-    ended = calib("control", "check", "ellipse", "--pwm-limits", limits, cwd=tmp_path)
-    assert ended.code == 3
-    assert "PWM limits:" in ended.sentence
-
-
-@pytest.mark.parametrize(
     ("words", "sentence"),
     [
         (("run", "step", "--controller", "lqr"), "--controller: 'lqr' is not one of p, pid"),
@@ -162,18 +137,4 @@ def test_limits_that_no_motor_has(calib: Run, tmp_path: Path, limits: str) -> No
 def test_words_that_do_not_fit(calib: Run, tmp_path: Path, words: tuple[str, ...], sentence: str) -> None:
     ended = calib("control", *words, cwd=tmp_path)
     assert ended.code == 2
-    assert sentence in ended.sentence
-
-
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (("run", "circle"), "circle: is no such file and none of the references elongation"),
-        (("run", "step", "--controller", "tuned-pid"), "no gains have been tuned"),
-        (("tune", "--gain-margin", "99"), "no gains reach a gain margin of 99"),
-    ],
-)
-def test_what_is_not_there(calib: Run, tmp_path: Path, words: tuple[str, ...], sentence: str) -> None:
-    ended = calib("control", *words, cwd=tmp_path)
-    assert ended.code == 3
     assert sentence in ended.sentence

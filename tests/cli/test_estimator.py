@@ -64,19 +64,6 @@ def test_a_rig_is_aligned(calib: Run, logs: dict[str, Log], rig: Path, tmp_path:
     }  # fmt: skip
 
 
-def test_json_and_the_same_bytes(calib: Run, logs: dict[str, Log], rig: Path, tmp_path: Path) -> None:
-    path, again = _put(tmp_path, "swing", logs["swing"]), tmp_path / "again.yaml"
-    again.write_bytes(rig.read_bytes())
-    first = calib("align", path, "--rig", rig, "--json")
-    assert calib("align", path, "--rig", again).code == first.code
-    assert rig.read_bytes() == again.read_bytes()
-    document = json.loads(first.out)
-    assert (document["schema"], document["verb"]) == (1, "align")
-    section = document["align"]
-    assert len(section["covariance"]["values"]) == len(section["covariance"]["order"]) == 13
-    assert set(section["sigma"]) >= {"time_offset_s", "mount_angle_rad", "rest_angle_rad", "accel_bias_mps2"}
-
-
 def test_at_rest_the_offset_is_not_observable(
     calib: Run, logs: dict[str, Log], rig: Path, tmp_path: Path
 ) -> None:
@@ -245,34 +232,6 @@ def test_a_log_becomes_states_with_their_deviations(
     assert 1e3 * np.sqrt(np.mean(error[late] ** 2)) == pytest.approx(told["rmse"]["q1_mm"], rel=1e-3)
 
 
-def test_the_same_log_gives_the_same_bytes(
-    calib: Run, aligned: Path, log_file: Callable[..., Path], tmp_path: Path
-) -> None:
-    path, both = log_file(), [tmp_path / "a.csv", tmp_path / "b.csv"]
-    said = [calib("replay", path, "--rig", aligned, "-o", states).out for states in both]
-    assert both[0].read_bytes() == both[1].read_bytes()
-    assert said[0] == said[1] and "RMSE after 2 s" in said[0] and "baseline" in said[0]
-
-
-def test_smoothing_is_better(calib: Run, aligned: Path, log_file: Callable[..., Path]) -> None:
-    ended = calib("replay", log_file("elongation"), "--rig", aligned, "--smooth", "--json")
-    told = json.loads(ended.out)["replay"]["logs"][0]
-    assert told["estimator"] == "smoothed"
-    assert told["rmse"]["mean_q_mm"] < 0.8 * told["compared"]["filter"]["mean_q_mm"]
-
-
-def test_the_baseline_can_be_asked_for(
-    calib: Run, aligned: Path, log_file: Callable[..., Path], tmp_path: Path
-) -> None:
-    states = tmp_path / "states.csv"
-    ended = calib("replay", log_file(), "--rig", aligned, "--estimator", "baseline", "-o", states, "--json")
-    told = json.loads(ended.out)["replay"]["logs"][0]
-    assert ended.code == 0 and told["estimator"] == "baseline"
-    assert told["rmse"]["mean_q_mm"] > told["compared"]["fused"]["mean_q_mm"]
-    assert "sigma_q1_m" not in states.read_text().splitlines()[0]
-    assert calib("replay", log_file(), "--estimator", "baseline", "--smooth").code == 2
-
-
 def test_several_logs_go_to_a_folder_with_figures(
     calib: Run, aligned: Path, log_file: Callable[..., Path], tmp_path: Path
 ) -> None:
@@ -286,13 +245,6 @@ def test_several_logs_go_to_a_folder_with_figures(
     assert len(list((tmp_path / "figures").glob("*.png"))) == 6
 
 
-def test_without_align_it_works_and_says_what_is_assumed(
-    calib: Run, rig: Path, log_file: Callable[..., Path]
-) -> None:
-    ended = calib("replay", log_file("ellipse"), "--rig", rig)
-    assert "no section align" in ended.out
-
-
 def test_one_sensor_alone_is_degraded(calib: Run, aligned: Path, log_file: Callable[..., Path]) -> None:
     blind = log_file("ellipse", 0, without("u_px", "v_px"))
     ended = calib("replay", blind, "--rig", aligned)
@@ -302,19 +254,6 @@ def test_one_sensor_alone_is_degraded(calib: Run, aligned: Path, log_file: Calla
     )
     ended = calib("replay", numb, "--rig", aligned)
     assert ended.code == 1 and "has no IMU" in ended.out
-
-
-def test_pictures_need_a_camera_and_a_plane(
-    calib: Run, rig: Path, log_file: Callable[..., Path], tmp_path: Path
-) -> None:
-    path = log_file()
-    ended = calib("replay", path, "--rig", tmp_path / "none.yaml")
-    assert ended.code == 3 and "no camera" in ended.sentence and "calib intrinsics" in ended.sentence
-    document = yaml.safe_load(rig.read_text())
-    del document["plane"]
-    rig.write_text(yaml.safe_dump(document))
-    ended = calib("replay", path, "--rig", rig)
-    assert ended.code == 3 and "no plane" in ended.sentence and "calib extrinsics" in ended.sentence
 
 
 def test_logs_that_cannot_be_used_end_in_a_sentence(calib: Run, rig: Path, tmp_path: Path) -> None:
@@ -399,16 +338,6 @@ def test_names_of_several_logs_stay_in_the_folder(
     ended = calib("replay", *logs, "--rig", aligned, "-o", out, "--format", "parquet")
     assert ended.code == 3 and "is a link out of" in ended.err and ended.err.count("\n") == 1
     assert elsewhere.read_text() == "mine"
-
-
-def test_a_log_too_long_to_be_smoothed_is_refused(
-    calib: Run, aligned: Path, log_file: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("calib.stages.estimator.replay._SMOOTHED_ROWS", 100)
-    path = log_file("swing")
-    ended = calib("replay", path, "--rig", aligned, "--smooth", "--model", "kinematic")
-    assert ended.code == 3 and "has more than 100 rows, which smoothing would hold in memory" in ended.err
-    assert calib("replay", path, "--rig", aligned, "--model", "kinematic").code == 0
 
 
 @pytest.fixture

@@ -98,30 +98,6 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_the_nominal_filter(calib: Run, tmp_path: Path) -> None:
-    ended = calib("lowpass", "--cutoff", "1Hz", "--rate", "60Hz", cwd=tmp_path)
-    assert ended.code == 0
-    assert "butterworth, order 1: 1 Hz at 60 Hz" in ended.out
-    assert "b1 = 0.049797982, 0.049797982, 0" in ended.out
-    assert "delay: 0.1590 s for slow motion" in ended.out
-    assert "verdict: ok" in ended.out
-    section = read_rig(tmp_path / "rig.yaml").lowpass
-    assert section is not None
-    assert section.dc_delay_s == pytest.approx(0.159, abs=5e-4)
-
-
-def test_one_json_document_and_the_same_bytes(calib: Run, tmp_path: Path) -> None:
-    words = ("lowpass", "--order", "2", "--json")
-    first = calib(*words, cwd=tmp_path)
-    text = (tmp_path / "rig.yaml").read_bytes()
-    again = calib(*words, cwd=tmp_path)
-    assert first.out == again.out
-    assert (tmp_path / "rig.yaml").read_bytes() == text
-    told = json.loads(first.out)
-    assert (told["schema"], told["verb"]) == (1, "lowpass")
-    assert told["lowpass"]["dc_delay_s"] == pytest.approx(0.225, abs=5e-4)
-
-
 def test_a_suggestion_in_pixels_with_figures(calib: Run, tmp_path: Path, log: Path) -> None:
     ended = calib("lowpass", "--suggest", log, "--jitter", "0.1px", "--figures", "drawn", cwd=tmp_path)
     assert ended.code == 0, ended.err
@@ -291,10 +267,3 @@ def test_a_port_that_is_not_there(calib, tmp_path: Path) -> None:
     ended = calib("record", tmp_path / "ttyNone", "-o", tmp_path / "log.csv")
     assert ended.code == 3
     assert "ttyNone: cannot be opened" in ended.sentence
-
-
-def test_a_port_that_says_nothing_of_use(calib, tmp_path: Path, board) -> None:
-    ended = calib("record", board(b"hello " * 100), "-o", tmp_path / "log.csv", "--duration", "0.5s")
-    assert ended.code == 3
-    assert "no frame came, expected the example sketch at 115200 baud" in ended.sentence
-    assert not (tmp_path / "log.csv").exists()

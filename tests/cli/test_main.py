@@ -12,12 +12,9 @@ from pathlib import Path
 
 import pytest
 import typer
-from pages import finished_run
 
 from calib.cli.diff import diff
 from calib.cli.doctor import doctor
-from calib.cli.report import report
-from calib.core.errors import BadInputError
 from calib.runner.doctor import Check
 
 VERBS = ("intrinsics", "extrinsics", "distortion", "firmware", "board", "export", "import")
@@ -114,24 +111,6 @@ def test_other_ends(calib, monkeypatch, failure: BaseException, code: int, says:
     ended = calib("firmware")
     assert ended.code == code
     assert says in ended.sentence
-
-
-def test_json_is_one_document_also_when_the_verdict_is_not_ok(
-    calib, pictures, project_root, tmp_path
-) -> None:
-    rig = ("--json", "--rig", tmp_path / "rig.yaml")
-    for words, code in (
-        (("intrinsics", pictures(1), "--model", "radial2"), 1),
-        (("extrinsics", project_root / "images" / "plane"), 1),
-        (("distortion",), 0),
-        (("firmware", "-o", tmp_path), 1),
-        (("export", "ros"), 0),
-    ):
-        ended = calib(*words, *rig)
-        assert ended.code == code, words
-        document = json.loads(ended.out)
-        assert (document["schema"], document["verb"]) == (1, words[0])
-    assert calib("board", "-o", tmp_path / "b.pdf", "--json").out.startswith('{\n "schema": 1')
 
 
 def test_narration_goes_to_stderr_without_colour(process, pictures, tmp_path) -> None:
@@ -317,25 +296,6 @@ def test_missing_library_ends_with_one(
     assert told["gate"] == ["numpy"]
 
 
-def test_page_beside_the_rig_and_elsewhere(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rig = finished_run(tmp_path)
-    report(rig)
-    page = rig.with_name("report.html")
-    assert page.read_text().startswith("<!doctype html>")
-    assert "report.html: " in capsys.readouterr().out
-    report(rig, tmp_path / "other.html", as_json=True)
-    told = json.loads(capsys.readouterr().out)
-    assert told["verb"] == "report" and told["bytes"] == page.stat().st_size
-    assert (tmp_path / "other.html").read_bytes() == page.read_bytes()
-
-
-def test_what_is_not_there(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="no such file"):
-        report(tmp_path / "rig.yaml")
-    with pytest.raises(BadInputError, match="no folder"):
-        report(tmp_path / "rig.yaml", tmp_path / "none" / "page.html")
-
-
 RIG = """camera: {{model: pinhole, image_size_px: [316, 208], fx_px: {fx}, fy_px: 272.6, cx_px: 160.7,
   cy_px: 101.9, sigma: {{fx_px: 0.03}}, verdict: ok}}
 """
@@ -353,16 +313,3 @@ def test_table_and_document(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     told = json.loads(capsys.readouterr().out)
     assert told["significant"] is False and told["plane"] is None
     assert told["changes"][0]["sigmas"] == pytest.approx(0.1 / (0.03 * 2**0.5))
-
-
-def test_long_lists_are_cut_short_unless_asked_for(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    a, b = tmp_path / "a.yaml", tmp_path / "b.yaml"
-    for path, value in ((a, 1.0), (b, 2.0)):
-        keys = ", ".join(f"k{i}_m: {value + i}" for i in range(40))
-        path.write_text(f"actuator: {{{keys}}}\n{RIG.format(fx=273.4)}")
-    diff(a, b)
-    assert "20 more (--all shows them)" in capsys.readouterr().out
-    diff(a, b, every=True)
-    assert "k39_m" in capsys.readouterr().out

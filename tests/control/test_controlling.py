@@ -137,20 +137,6 @@ def _tracking(reference: Reference, q: np.ndarray, pwm: np.ndarray | None = None
     return tracking(reference, q, np.zeros_like(q) if pwm is None else pwm, R, 0.0, 255.0)
 
 
-def test_a_constant_error_is_its_own_rms() -> None:
-    reference = built_in(NOMINAL, "ellipse")
-    q = reference.q_m + np.array([1e-3, -1e-3])
-    q[:120] += 0.005
-    found = _tracking(reference, q)
-    assert found.rms_mm == pytest.approx((1.0, 1.0))
-    assert found.largest_mm == pytest.approx(1.0)
-    assert found.angle_rms_rad == pytest.approx(1e-3 / R)
-    assert found.rms_from_start_mm[0] == pytest.approx(math.sqrt(0.9 + 0.1 * 36.0))
-    assert found.rise_s is None and found.jump_overshoot_rad is None
-    # An error in the angle alone moves the head sideways by about half of l times the angle.
-    assert found.head_rms_mm == pytest.approx(1e3 * 0.5 * 0.08 * 1e-3 / R, rel=0.1)
-
-
 def test_the_figures_of_a_step_and_a_jump() -> None:
     reference = built_in(NOMINAL, "jump")
     t = reference.t_s

@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import signal
 
-from calib.core.errors import BadInputError
 from calib.stages.actuator.simulate import RigState, simulate
 from calib.stages.control.laws import Model, Pid, PidState, feed_forward_pwm, holding_force
 from calib.stages.control.laws import step as step_pid
@@ -34,7 +33,6 @@ from calib.stages.control.tuning import (
     Criterion,
     Tuned,
     holds,
-    operating_angles,
     orientation_loop,
     position_loop,
     tune_orientation,
@@ -133,8 +131,20 @@ def test_an_integrator_has_the_margins_of_the_book(k: float) -> None:
 
 
 @pytest.mark.parametrize("model", [NOMINAL, ORIFICE])
-@pytest.mark.parametrize("phi", [0.15, 0.4, 0.8])
-@pytest.mark.parametrize("gains", [(470.0, 1000.0, 0.0), (350.0, 300.0, 10.0), (600.0, 0.0, 0.0)])
+@pytest.mark.parametrize(
+    "phi",
+    [
+        0.15,
+        0.8,
+    ],
+)
+@pytest.mark.parametrize(
+    "gains",
+    [
+        (470.0, 1000.0, 0.0),
+        (600.0, 0.0, 0.0),
+    ],
+)
 def test_the_gain_margin_by_brute_force(model: object, phi: float, gains: tuple[float, ...]) -> None:
     loop = orientation_loop(model, Pid(*gains), tuple(bent_rest(model, phi)))
     (found,) = loop_margins(loop)
@@ -159,13 +169,6 @@ def test_the_delay_margin_by_brute_force() -> None:
     assert ticks >= 3
     assert spectral_radius(closed_loop(series(loop, delay(ticks, H)))) < 1.0
     assert spectral_radius(closed_loop(series(loop, delay(ticks + 1, H)))) > 1.0
-
-
-def test_an_unstable_loop_says_so() -> None:
-    """The source's PID on the nominal model: at 0.5 rad its loop is unstable for small motion."""
-    loop = orientation_loop(NOMINAL, Pid(1000.0, 1000.0, 10.0), tuple(bent_rest(NOMINAL, 0.5)))
-    assert not loop_margins(loop)[0].stable
-    assert gain_to_instability(loop) == 1.0
 
 
 @settings(max_examples=30)
@@ -217,8 +220,3 @@ def test_the_limit_is_used(orientation: Tuned, position: Tuned) -> None:
             for point in tuned.points
         ]
         assert not all(kept)
-
-
-def test_a_demand_beyond_the_delay_is_refused() -> None:
-    with pytest.raises(BadInputError, match="no gains reach a gain margin of 90"):
-        tune_orientation(NOMINAL, Criterion(90.0, math.radians(89.9), 1.001), operating_angles(NOMINAL)[:1])

@@ -20,7 +20,6 @@ from calib.stages.control.read import read_reference
 from calib.stages.control.references import (
     BUILT_IN,
     Ellipse,
-    PolynomialElongation,
     built_in,
     check_workspace,
     resampled,
@@ -68,31 +67,12 @@ RADIUS_M = 0.0126
 TURN_S = np.linspace(0.0, 20.0, 2001)
 
 
-def test_elongation_starts_flat_peaks_at_5_s_and_is_held() -> None:
-    setpoint, h = PolynomialElongation(), 1e-6
-    q = setpoint.bellows_m(np.array([0.0, h, 5.0 - h, 5.0, 5.0 + h, 10.0]))
-    assert np.array_equal(q[:, 0], q[:, 1])
-    assert q[0, 0] == 0.067
-    assert q[3:, 0] == pytest.approx(0.090, abs=1e-12)
-    assert abs(q[1, 0] - q[0, 0]) / h < 1e-7
-    assert abs(q[3, 0] - q[2, 0]) / h < 1e-7
-    # As printed, without the hold, it would want a bellows of negative length.
-    printed = 0.0670 + 0.00276 * 10.0**2 - 0.000368 * 10.0**3
-    assert printed == pytest.approx(-0.025, abs=1e-12)
-
-
 def test_the_exact_chord_gives_the_drawn_ellipse_back() -> None:
     ellipse = Ellipse()
     wanted, reached = ellipse.pose(TURN_S), forward(ellipse.bellows_m(TURN_S, RADIUS_M), RADIUS_M)
     assert np.abs(reached - wanted).max() < 1e-15
     x, y = reached[:, 0], reached[:, 1]
     assert np.abs((x / 0.015) ** 2 + ((y - 0.078) / 0.010) ** 2 - 1.0).max() < 1e-12
-
-
-def test_the_thesis_chord_halves_the_width() -> None:
-    reached = forward(Ellipse(chord="thesis").bellows_m(TURN_S, RADIUS_M), RADIUS_M)
-    assert np.abs(reached[:, 0]).max() == pytest.approx(0.0075, abs=1e-4)
-    assert np.ptp(reached[:, 1]) == pytest.approx(0.020, abs=2e-4)
 
 
 def _ellipse(period_s: float) -> np.ndarray:

@@ -9,15 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from align_trials import MOTIONS, Trial, align_log, draw, known, prior_settings, scores, twin_log
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.stats import norm
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
-from calib.core.rig import Camera, Distortion, Geometry, Plane, Rig, read_rig, write_rig
-from calib.io.logs import Log, write_log
-from calib.stages.align.read import align_section, read_align_log, settings_from_rig, with_drawn_marker
+from calib.core.rig import Camera, Distortion, Geometry, Plane, Rig
+from calib.io.logs import Log
+from calib.stages.align.read import settings_from_rig, with_drawn_marker
 from calib.stages.align.solve import (
     AlignLog,
     Alignment,
@@ -26,8 +24,6 @@ from calib.stages.align.solve import (
     Stretch,
     align,
     best_jitter_px,
-    correlation,
-    judge_align,
     pictures_off,
     pieces_of,
     pixel_terms,
@@ -47,7 +43,6 @@ from calib.stages.align.spline import (
     normal_sums,
     states_of,
 )
-from calib.stages.estimator.read import Periods, setup_from_rig
 from calib.stages.estimator.sensors import SENSOR, SIZE, sensor_values, view_coefficients
 from calib.twin.rig import SimulatedRig, nominal_view
 
@@ -282,21 +277,6 @@ def test_the_response_is_that_of_changed_readings() -> None:
     assert again.sensor[0] - fit.sensor[0] == pytest.approx(predicted[0], rel=0.05)
 
 
-KNOTS = Knots.over(1.0, 3.0, 0.05)
-
-
-# The first example compiles.
-@settings(deadline=None)
-@given(st.lists(st.floats(0.5, 3.5), min_size=1, max_size=20))
-def test_bases_sum_to_one_and_their_derivatives_to_zero(times: list[float]) -> None:
-    t = np.array(times)
-    _, basis = basis_rows(KNOTS, t)
-    scale = 1.0 + np.abs(basis).max(axis=2)
-    assert np.abs(basis[:, 0].sum(axis=1) - 1.0).max() < 1e-10 * scale[:, 0].max()
-    assert np.abs(basis[:, 1].sum(axis=1)).max() < 1e-10 * scale[:, 1].max()
-    assert np.abs(basis[:, 2].sum(axis=1)).max() < 1e-10 * scale[:, 2].max()
-
-
 def test_a_swing_of_four_hertz_is_met_with_its_acceleration() -> None:
     knots = Knots.over(0.0, 1.0, 0.02)
     omega = 2.0 * np.pi * 4.0
@@ -380,18 +360,6 @@ def swing() -> AlignLog:
     return align_log(twin_log(RIG, "swing", {"phi_rad": "0.5"}, 1))
 
 
-def test_a_swing_shows_offset_and_mount(swing: AlignLog) -> None:
-    pieces, said = pieces_of([swing], NUMBERS, MEAN_ALIGN_START)
-    first = start(pieces, [swing], 0.0)
-    assert said == []
-    assert first.moves
-    assert first.time_offset_s == pytest.approx(0.025, abs=0.0051)
-    assert first.factor == pytest.approx(1.0, abs=0.05)
-    assert first.mount_angle_rad == pytest.approx(0.0158, abs=0.01)
-    shown = correlation(pieces)
-    assert shown.offset_s[np.argmax(shown.value)] == pytest.approx(0.025, abs=0.0051)
-
-
 @pytest.mark.parametrize(("factor", "words"), [(57.2958, "in deg/s"), (-1.0, "the other way round")])
 def test_a_gyroscope_in_other_units_is_refused(swing: AlignLog, factor: float, words: str) -> None:
     wrong = replace(swing, readings=swing.readings * np.array([1.0, 1.0, factor]))
@@ -436,47 +404,6 @@ def _rig_file() -> Rig:
     return Rig(camera=camera, plane=plane)
 
 
-def _changed(log: Log, **columns: object) -> Log:
-    kept = dict(log.columns)
-    for name, value in columns.items():
-        if value is None:
-            kept.pop(name)
-        else:
-            kept[name] = np.asarray(value)
-    return replace(log, columns=kept)
-
-
-def test_a_marker_outside_of_the_picture_counts_as_blank(log: Log, tmp_path: Path) -> None:
-    u = log.columns["u_px"].copy()
-    rows = np.flatnonzero(np.isfinite(u))
-    u[rows[:7]] = -40.0
-    write_log(tmp_path / "log.csv", _changed(log, u_px=u))
-    read, said = read_align_log(tmp_path / "log.csv", SIZE_ALIGNING)
-    assert read is not None
-    assert len(read.pixels) == len(rows) - 7
-    assert "7 pictures put the marker outside the image" in said[0]
-
-
-def test_the_section_is_what_the_estimator_reads(log: Log, tmp_path: Path) -> None:
-    whole = _rig_file()
-    logs = [align_log(log)]
-    found = align(logs, settings_from_rig(whole, Path("rig.yaml"), logs))
-    section = align_section(found, judge_align(found))
-    path = tmp_path / "rig.yaml"
-    write_rig(path, whole.model_copy(update={"align": section}), {})
-    back = read_rig(path)
-    assert back.align == section
-    assert section.covariance is not None
-    assert section.covariance.order == list(SENSOR)
-    setup, _ = setup_from_rig(back, path, Periods(1 / 60, 0.01, 1.0, False, 100, 100))
-    for name in ("time_offset_s", "mount_angle_rad", "gyro_scale", "gyro_bias_radps", "marker_offset_m"):
-        k = SENSOR.index(name)
-        assert setup.start.sensor[k] == found.sensor[k]
-        assert setup.start.sensor_sigma[k] == pytest.approx(found.sigma[k])
-    truth = known(RIG).truth
-    assert abs(section.time_offset_s - truth[SENSOR.index("time_offset_s")]) < 1e-3
-
-
 def _mixture(found: Alignment, drawn: float, sigma: float, doubt: float) -> tuple[FloatArray, FloatArray]:
     """Mean and covariance after a reading of d of two kinds, by information matrices and their sum."""
     at = SENSOR.index("marker_offset_m")
@@ -517,15 +444,6 @@ def test_the_drawing_is_one_more_reading_of_the_marker(log: Log, apart: float) -
         assert told.sigma[SENSOR.index("imu_lever_m")] < 0.7 * found.sigma[SENSOR.index("imu_lever_m")]
         assert told.rest_angle_sigma <= found.rest_angle_sigma
         assert "as drawn" in said[0] and "measure it" not in said[0]
-
-
-def test_a_drawing_that_nobody_wrote_down_is_doubted_more(log: Log) -> None:
-    found = align([align_log(log)], settings_from_rig(_rig_file(), Path("rig.yaml"), []))
-    nominal, said = with_drawn_marker(found, Geometry())
-    written, _ = with_drawn_marker(found, Geometry(marker_offset_m=0.015))
-    at = SENSOR.index("marker_offset_m")
-    assert written.sigma[at] < nominal.sigma[at] < found.sigma[at]
-    assert "measure it and write it down" in said[0]
 
 
 def test_sigma_grows_where_the_marker_is_not_where_it_was_drawn() -> None:

@@ -21,7 +21,6 @@ from calib.stages.actuator.pump import Orifice, Pump, RateLimit, pump_coefficien
 from calib.stages.actuator.simulate import derivative, run
 from calib.stages.estimator import driven as driven_smoother
 from calib.stages.estimator.consistency import Tally
-from calib.stages.estimator.constant_gain import Gains, run_gains, ticks_of
 from calib.stages.estimator.driven import (
     CAMERA,
     DRIVEN,
@@ -47,7 +46,7 @@ from calib.stages.estimator.driven import (
 from calib.stages.estimator.kinematic import OUT, Rows, Setup
 from calib.stages.estimator.noise import WALKS, driven_likelihood, scaled, tune_driven
 from calib.stages.estimator.read import drive_from_rig
-from calib.stages.estimator.tuning import gain_section, tuned_section
+from calib.stages.estimator.tuning import tuned_section
 
 TARGET_MM = {"static": 0.04, "swing": 0.11, "ellipse": 0.05, "step": 0.06, "elongation": 0.07}
 """Means over the seeds below; an alignment as in `estimatorlogs.SIGMA` alone leaves 0.03 mm."""
@@ -524,30 +523,6 @@ def test_what_was_identified_together_stays_together() -> None:
     bending = PARAMETER.index("bending")
     assert np.count_nonzero(drive.covariance[bending]) == 1
     assert drive.sigma[bending] == Drive().sigma[bending]
-
-
-def test_what_was_estimated_apart_since_is_independent() -> None:
-    drive = drive_from_rig(_identified((0.022, 0.36, 0.014, 0.02, 0.0194, 0.1), 0.9, lag_sigma=0.021), HERE)
-    assert drive.covariance is not None
-    lag = PARAMETER.index("lag")
-    assert np.count_nonzero(drive.covariance[lag]) == 1
-    assert drive.sigma[lag] == pytest.approx(0.03)
-
-
-def test_what_was_hardly_identified_is_no_wider_than_rigs_differ() -> None:
-    drive = drive_from_rig(_identified((0.5, 4.0, 0.6, 0.02, 0.0194, 0.1), 0.3), HERE)
-    nominal = dict(zip(PARAMETER, Drive().sigma, strict=True))
-    for name in ("stiffness", "creep_stiffness", "lag"):
-        assert drive.sigma[PARAMETER.index(name)] == pytest.approx(np.hypot(nominal[name], 0.003))
-
-
-def test_constant_gains_are_those_of_the_set_up_and_stay_finite() -> None:
-    rig, log = simulated("ellipse", 1)
-    setup, rows = setup_for(rig, 1), rows_from(log)
-    section = gain_section(setup, 60.0)
-    assert section is not None
-    assert section.delay_ticks == pytest.approx(60.0 * float(setup.start.sensor[7]))
-    assert np.isfinite(run_gains(Gains(**section.model_dump()), setup, ticks_of(setup, rows))).all()
 
 
 def test_a_log_with_commands_tunes_the_driven_model_too(

@@ -20,7 +20,6 @@ import calib.stages.actuator
 import calib.stages.estimator
 from calib.core.arrays import FloatArray
 from calib.core.rig import Rig
-from calib.io.logs import Log
 from calib.stages.actuator.kinematics import forward as forward_of_sensors
 from calib.stages.estimator import reference, sensors, smoother
 from calib.stages.estimator.baseline import Baseline, BaselineSetup
@@ -47,9 +46,9 @@ from calib.stages.estimator.kinematic import (
     starting_state,
 )
 from calib.stages.estimator.noise import jitter_px, log_likelihood, tune
-from calib.stages.estimator.read import Periods, noise_at_rest, periods, rows_of, setup_from_rig, truth_of
+from calib.stages.estimator.read import Periods, setup_from_rig
 from calib.stages.estimator.reference import camera_terms, imu_terms
-from calib.stages.estimator.replay import Trace, judged
+from calib.stages.estimator.replay import judged
 from calib.stages.estimator.sensors import SENSOR, SIZE, truncated, update_terms
 from calib.stages.estimator.smoother import Events, banked, events_of, forward
 from calib.twin.rig import SimulatedRig, nominal_view, workspace_homography
@@ -456,17 +455,6 @@ def test_missing_samples_are_counted() -> None:
     assert np.abs(error[500:]).max() < 4e-4
 
 
-def test_jumps_start_the_clock_again() -> None:
-    true, stamps = jittered()
-    for jump in (3600.0, -3.0, 0.005):
-        moved, shifted = true.copy(), stamps.copy()
-        moved[1500:] += jump
-        shifted[1500:] += jump
-        error = even_times(new_clock(PERIOD), shifted) - moved
-        assert np.isfinite(error).all()
-        assert rms(error[2200:]) < 0.3 * 4e-4
-
-
 @pytest.mark.parametrize("jitter", [0.2, 0.5])
 def test_jitter_is_recovered_from_whole_pixels(jitter: float) -> None:
     nominal = SimulatedRig()
@@ -680,22 +668,6 @@ def test_it_is_the_firmware_of_the_simulated_rig() -> None:
 GOOD = {"degrees": 2, "readings": 900, "gated": 2, "nis": 2.1, "inside": 0.95, "correlation": 0.02}
 
 
-@pytest.mark.parametrize(("rows", "step"), [(100, 1), (12_000, 1), (30_000, 4), (200_000, 32)])
-def test_a_trace_keeps_every_k_th_row_whatever_the_blocks(rows: int, step: int) -> None:
-    values = np.arange(float(rows))[:, None]
-    for size in (rows, 997, 4096):
-        trace = Trace()
-        for begin in range(0, rows, size):
-            trace.add(values[begin : begin + size])
-        kept = trace.values[:, 0]
-        assert len(kept) <= 12_000 + 4096
-        steps = np.unique(np.diff(kept))
-        assert len(steps) == 1
-        if size == 997:
-            assert steps[0] == step
-    assert Trace().values.shape == (0, 0)
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -708,13 +680,6 @@ def test_a_trace_keeps_every_k_th_row_whatever_the_blocks(rows: int, step: int) 
 def test_innovations_that_contradict_their_covariance_are_poor(change: dict[str, float], words: str) -> None:
     reasons, _ = judged({"camera": {**GOOD, **change}}, {}, 1000)
     assert len(reasons) == 1 and words in reasons[0]
-
-
-@pytest.mark.parametrize("correlation", [0.8, -0.8])
-def test_innovations_that_are_not_white_are_remarked_on(correlation: float) -> None:
-    reasons, remarks = judged({"accel": {**GOOD, "correlation": correlation}}, {}, 1000)
-    assert reasons == []
-    assert remarks == [f"the innovations of the accel are not white: {correlation:.2f} with the one before"]
 
 
 ALIGN = {
@@ -736,47 +701,6 @@ ALIGN = {
     "verdict": "ok",
 }
 BLIND = Periods(math.nan, 0.01, 0.0, False, 0, 100)
-
-
-def log_of_replaying(t: list[float], **columns: list[float]) -> Log:
-    made = {name: np.array(values) for name, values in columns.items()}
-    return Log("made", np.array(t), made, np.arange(len(t)))
-
-
-def test_commands_in_rows_of_their_own_are_no_clock_of_the_camera() -> None:
-    nan = math.nan
-    log = log_of_replaying(
-        [0.0, 0.01, 0.02, 0.03],
-        u_px=[1.5, nan, nan, nan],
-        v_px=[2.0, nan, nan, nan],
-        pwm1=[nan, 5.0, 5.0, 5.0],
-        gz_radps=[nan, nan, nan, 0.1],
-    )
-    found = periods(log)
-    assert not found.ticks and found.grid_px == 0.0 and math.isnan(found.camera_s)
-    assert rows_of(log, found.ticks).kinds.tolist() == [1, 0, 0, 2]
-    assert truth_of(log) is None
-
-
-def test_noise_is_that_at_rest_unless_the_moving_rig_shakes() -> None:
-    size = {
-        "rate_hz": 100.0, "gyro_noise_radps_per_sqrt_Hz": [None, None, 2e-4],
-        "accel_noise_mps2_per_sqrt_Hz": [1.8e-3, 1e-3, None],
-    }  # fmt: skip
-    others = (
-        "gyro_bias_radps", "gyro_instability_radps", "gyro_walk_radps2_per_sqrt_Hz", "accel_mean_mps2",
-        "accel_instability_mps2", "accel_walk_mps3_per_sqrt_Hz", "gyro_step_radps", "accel_step_mps2",
-    )  # fmt: skip
-    imu = {**{name: [None, None, None] for name in others}, **size, "verdict": "ok"}
-    made = Rig.model_validate({"align": ALIGN, "imu": imu})
-    # 0.02 in the alignment: a little more than 0.018 at rest, twice as much as 0.01.
-    np.testing.assert_allclose(noise_at_rest(made, BLIND), [0.018, 0.02, 0.002])
-    np.testing.assert_allclose(
-        setup_from_rig(made, Path("rig.yaml"), BLIND)[0].noise[2:5], [0.02, 0.02, 0.003]
-    )
-    tuned = {"jitter_px": 0.5, "verdict": "ok", "accel_noise_mps2": 0.03}
-    assert noise_at_rest(Rig.model_validate({"imu": imu, "estimator": tuned}), BLIND) is None
-    assert noise_at_rest(Rig.model_validate({"align": ALIGN}), BLIND) is None
 
 
 def test_the_covariance_of_the_alignment_is_carried() -> None:

@@ -38,10 +38,7 @@ from calib.stages.firmware.constants import (
 )
 from calib.stages.firmware.header import header_of, header_text, identity_of
 from calib.stages.firmware.literals import (
-    Constant,
     Group,
-    Table,
-    Whole,
     comment_text,
     float_literal,
     literals,
@@ -128,26 +125,6 @@ def test_what_does_not_fit_does_not_compile(tmp_path: Path, line: str, message: 
     assert done.returncode == 0, done.stderr
 
 
-def test_a_rig_without_what_the_fused_estimator_needs_does_not_compile(tmp_path: Path) -> None:
-    bare = header_of(rig("fused").model_copy(update={"align": None}), "rig.yaml")
-    write(tmp_path, bare)
-    assert "Fused estimator: none. rig.yaml lacks align." in (tmp_path / "calib_constants.h").read_text()
-    for fused in (0, 1):
-        unit = '#include "calib_pipeline.h"\n'
-        done = _compiled(tmp_path, "gcc", f"-std=c99 -DCALIB_FUSED={fused}", unit)
-        assert (done.returncode == 0) == (fused == 0)
-    assert "rig.yaml lacks what CALIB_FUSED needs" in done.stderr
-
-
-def test_a_header_without_a_plane_has_no_pipeline(tmp_path: Path) -> None:
-    bare = header_of(rig().model_copy(update={"plane": None}), "rig.yaml")
-    write(tmp_path, header())
-    (tmp_path / "calib_constants.h").write_text(header_text(bare))
-    done = _compiled(tmp_path, "gcc", "-std=c99", '#include "calib_pipeline.h"\n')
-    assert done.returncode != 0
-    assert "has no plane yet" in done.stderr
-
-
 def test_cppcheck_finds_nothing(tmp_path: Path) -> None:
     need("cppcheck")
     write(tmp_path, header("full"))
@@ -183,12 +160,6 @@ def test_no_text_leaves_its_comment(text: str) -> None:
     assert "\\" not in safe
     assert "\n" not in safe
     assert safe.isascii()
-
-
-def test_values_are_what_a_compiler_reads() -> None:
-    items = (Constant("A", 0.1, ""), Whole("N", 3, ""), Table("t", (0.2, -1.5), ""))
-    found = values(literals((Group(("",), items),)))
-    assert found == {"A": float(np.float32(0.1)), "N": 3.0, "t[0]": float(np.float32(0.2)), "t[1]": -1.5}
 
 
 WORKSPACE = (-0.06, 0.04, 0.06, 0.11)
@@ -258,13 +229,6 @@ def test_an_alignments_shift_and_stretch_are_undone() -> None:
     )
 
 
-@pytest.mark.parametrize("scale", [-3.0, 0.01, 100.0])
-def test_the_scale_of_a_homography_does_not_matter(scale: float) -> None:
-    """A homography is known up to a factor; the horizon's test needs it fixed, sign included."""
-    assert np.allclose(_made(scale).from_normalised, _made().from_normalised)
-    assert _made(scale).least == pytest.approx(_made().least)
-
-
 def test_the_horizon_lies_beyond_the_workspace() -> None:
     made = _made()
     world, pixels = _points()
@@ -275,15 +239,6 @@ def test_the_horizon_lies_beyond_the_workspace() -> None:
     ):
         assert 0.0 < least < 0.2 * _mapped(H, points)[1].min()
     assert len(world)
-
-
-def test_a_lens_that_firmware_cannot_undo_is_marked() -> None:
-    section = rig().camera
-    assert section is not None
-    bent = section.model_copy(update={"distortion": section.distortion.model_copy(update={"k1": -50.0})})
-    for camera, verdict, ok in ((section, "ok", "1"), (bent, "poor", "0")):
-        made = header_of(rig().model_copy(update={"camera": camera, "plane": None}), "rig.yaml")
-        assert (made.camera.verdict, made.literals["CALIB_CAMERA_OK"]) == (verdict, ok)
 
 
 def _of(kind: str) -> dict[str, float]:
@@ -371,23 +326,6 @@ def test_the_accelerometers_map_undoes_bias_scale_and_mount(alpha: float) -> Non
     assert np.array([A, B]) == pytest.approx(gain * np.array([math.cos(phi), math.sin(phi)]), abs=1e-6 * gain)
 
 
-def test_the_gyroscopes_map_undoes_bias_and_scale() -> None:
-    c = _values(_with("align", gyro_scale=0.01, gyro_bias_radps=0.02))
-    reading = -1.01 * 1.5 + 0.02
-    half = c["CALIB_FUSED_HALF_BIAS_RAD"] - c["CALIB_FUSED_HALF_DT_S"] * reading
-    assert half == pytest.approx(0.5 * 1.5 / 60.0, rel=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("late_ticks", "remembered", "part"), [(0.0, 0, 0.0), (0.3, 1, 0.7), (2.0, 2, 0.0), (7.5, 8, 0.5)]
-)
-def test_the_age_of_a_picture_in_parts_of_a_tick(late_ticks: float, remembered: int, part: float) -> None:
-    c = _values(_with("align", time_offset_s=late_ticks / 60.0))
-    assert c["CALIB_FUSED_TICKS"] == remembered
-    assert c["CALIB_FUSED_PART"] == pytest.approx(part, abs=1e-6)
-    assert c["CALIB_FUSED_DELAY_TICKS"] == pytest.approx(late_ticks, abs=1e-6)
-
-
 def test_without_tuned_gains_they_are_for_the_noise_of_the_alignment() -> None:
     """As `calib.stages.estimator.constant_gain` finds it from the set-up, to second order in the angle."""
     whole = _with("align", jitter_px=0.3, imu_lever_m=0.006)
@@ -450,16 +388,6 @@ def test_the_state_variable_form_is_the_section() -> None:
         s1, s2 = 2.0 * v1 - s1, 2.0 * y - s2
         found.append(y)
     assert np.abs(np.array(found) - lfilter(b, a, impulse)).max() < 1e-7
-
-
-@pytest.mark.parametrize(("offset_s", "ticks"), [(0.0, 0), (-0.004, 0), (0.02, 1), (0.1, 6)])
-def test_the_time_offset_in_whole_ticks(offset_s: float, ticks: int) -> None:
-    align = rig("full").align
-    assert align is not None
-    moved = rig("full").model_copy(update={"align": align.model_copy(update={"time_offset_s": offset_s})})
-    c = values(literals(motion_groups(Known(moved, "rig.yaml"))))
-    assert c["CALIB_TIME_OFFSET_TICKS"] == ticks
-    assert ticks / 60.0 + c["CALIB_TIME_OFFSET_REST_S"] == pytest.approx(offset_s, abs=1e-8)
 
 
 def test_the_bias_of_the_imu_at_rest_is_used_without_align() -> None:

@@ -159,15 +159,6 @@ def test_a_lost_sensor_holds_and_then_stops_the_pumps(built: tuple[Header, list[
         assert found.extra[-1, 3] == 50
 
 
-def test_before_the_first_picture_the_pumps_are_off(built: tuple[Header, list[str], Path]) -> None:
-    made, command, _ = built
-    found = run(command, [replace(_still(), marker_seen=False)] * 5 + [replace(_still(MODE_OFF))] * 2)
-    assert ((found.flags[:5] & STALE) != 0).all()
-    rest = values(made.literals)["CALIB_REST_LENGTH_M"]
-    assert found.numbers[0, 5:7].mean() == pytest.approx(rest, abs=1e-7)
-    assert (found.flags[5:] & STALE == 0).all()
-
-
 def test_the_horizon_is_a_lost_marker(tmp_path: Path) -> None:
     """A plane whose horizon runs through the picture; the marker above it is held and counted."""
     made = header()
@@ -478,38 +469,6 @@ def test_every_stage_is_the_projects_own(mode: int) -> None:
         else:
             loop, command = step_orientation(turning, loop, given.reference[0], out.phi_rad)
         assert out.pwm == pytest.approx(command.pwm, abs=1e-3)
-
-
-def test_at_rest_the_low_pass_is_exact() -> None:
-    reference = Reference(values(header("full").literals))
-    given = binary32(Inputs(150.3, 140.7, 9.7, 1.1, 0.0))
-    outs = [reference.step(given) for _ in range(3000)]
-    head = head_from_marker(
-        np.array(outs[-1].marker_m), np.array(outs[-1].phi_rad), reference.c["MARKER_OFFSET_M"]
-    )
-    assert outs[-1].head_m == pytest.approx(head, abs=1e-9)
-
-
-def test_back_calculation_brings_the_integral_back() -> None:
-    """With the angle out of reach the command stays near its limit instead of winding up."""
-    reference = Reference(values(header("full").literals))
-    given = binary32(Inputs(150.0, 140.0, 9.81, 0.0, 0.013, (1.4, 0.0), mode=MODE_ORIENTATION))
-    for _ in range(3000):
-        reference.step(given)
-    away = binary32(Inputs(150.0, 140.0, 9.81, 0.0, 0.013, (-0.3, 0.0), mode=MODE_ORIENTATION))
-    lowered = [reference.step(away).pwm[0] for _ in range(60)]
-    assert reference.c["ORIENTATION_BACK"] == pytest.approx(1.0 / (60.0 * 0.4), rel=1e-6)
-    assert lowered[-1] == reference.c["PUMP_LOW_PWM"]
-
-
-def test_the_delayed_angle_is_that_of_the_picture() -> None:
-    """With the offset of two ticks the marker is put back with the angle of two ticks ago."""
-    reference = Reference(values(header("full").literals))
-    assert reference.c["TIME_OFFSET_TICKS"] == 2
-    for given in _ticks(MODE_ORIENTATION)[:5]:
-        out = reference.step(given)
-    assert reference.memory.past[-1] == out.phi_rad
-    assert len(reference.memory.past) == 2
 
 
 @pytest.mark.parametrize("kind", ["nominal", "full"])

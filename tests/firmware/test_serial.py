@@ -66,12 +66,6 @@ def test_every_whole_frame_is_found_between_garbage(garbage: list[bytes], portio
     assert found == sent
 
 
-def test_a_damaged_byte_costs_its_own_frame_only() -> None:
-    stream = bytearray(b"".join(encoded(frame(k)) for k in range(3)))
-    stream[len(stream) // 2] ^= 0x10
-    assert [f.sequence for f in Decoder().feed(bytes(stream) + bytes(90))] == [0, 2]
-
-
 def _frames(count: int, first: int = 0) -> list[Frame]:
     vector = vectors(header(), 2)[0]
     w = vector.wanted
@@ -96,12 +90,6 @@ def test_lost_and_damaged_frames_are_counted_and_leave_a_gap_in_time() -> None:
     assert (result.ticks, result.lost, result.damaged, result.restarts) == (8, 2, 1, 0)
     times = [round(60.0 * float(line.split(",")[0])) for line in result.text.splitlines()[1:]]
     assert times == [0, 1, 2, 3, 5, 6, 8, 9]
-
-
-def test_a_restart_begins_the_log_anew() -> None:
-    stream = b"".join(encoded(f) for f in [*_frames(5, 100), *_frames(3)])
-    result = _recorded(stream)
-    assert (result.ticks, result.restarts, result.lost) == (3, 1, 0)
 
 
 def test_ctrl_c_keeps_what_came() -> None:
@@ -210,11 +198,3 @@ def test_lost_frames_leave_a_gap_and_a_restart_begins_anew(tmp_path: Path) -> No
     log = read_log(path)
     assert len(log) == 290
     assert np.diff(log.t_s).max() == pytest.approx(11 / 60)
-
-
-@pytest.mark.parametrize("data", [b"", b"t_s,u_px\n0,1\n", bytes(range(256)) * 40, b"\xa5\x5a" * 5000])
-def test_no_frame_at_all(data: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "log.bin"
-    path.write_bytes(data)
-    with pytest.raises(BadInputError, match=r"log\.bin: holds no frame of the example sketch, only \d+"):
-        read_log(path)

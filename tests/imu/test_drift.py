@@ -15,7 +15,7 @@ from scipy.signal import lfilter
 from calib.solve.clock import Part
 from calib.stages.imu.drift import LogDrift, Measures, allan_at, analyse_drift, lag_s, slope_of
 from calib.stages.imu.mahony import Mahony, MahonySample, MahonyState, filter_log, step
-from calib.stages.imu.tracks import DriftLog, Tuned, on_grid, tracks_of
+from calib.stages.imu.tracks import DriftLog, Tuned, tracks_of
 from calib.stages.imu.tuning import smooth_log
 
 AXES = ("gx", "gy", "gz", "ax", "ay", "az")
@@ -147,18 +147,6 @@ def test_the_interval_holds_the_slope(noise: Noise, n: int) -> None:
     assert np.median(np.abs(values)) < 1e3
 
 
-def test_a_certain_slope_and_one_that_is_not() -> None:
-    rng = np.random.default_rng(1)
-    sigmas = [slope_of([_white(rng, 6000)], 0.01).sigma for _ in range(15)]
-    walk = slope_of([_walk(rng, 6000)], 0.01)
-    ordinary = np.sqrt(12.0 / 6000) / 60.0
-    # Slow noise that the log cannot exclude makes it larger.
-    assert 0.8 * ordinary < np.median(sigmas) < 4.0 * ordinary
-    assert walk.rho == 1.0
-    # A walk of one per sample ends sqrt(6000) away in 60 s; a straight line's slope has 6 / 5 of that.
-    assert walk.sigma == pytest.approx(np.sqrt(1.2 * 6000) / 60.0, rel=0.35)
-
-
 def test_allan_deviation_against_allantools() -> None:
     y = _both(np.random.default_rng(2), 30000)
     for tau in (1.0, 100.0):
@@ -228,28 +216,6 @@ def test_the_sensors_alone_and_the_filter() -> None:
         gz, ax, ay = part.values[k, 2:5].tolist()
         state = step(Mahony(), state, MahonySample(ax, ay, gz, PERIOD))
         assert state.phi_rad == pytest.approx(angles["MM 3/3"][k], abs=1e-12)
-
-
-def test_the_start_is_right_though_it_moves() -> None:
-    log, part, _ = _log_tracks(bias=0.0)
-    found, _ = tracks_of(log, [part], PERIOD, peers=False)
-    angles = {track.name: track.phi_rad[0] for track in found}
-    assert angles["gyroscope alone"][0] == pytest.approx(0.0, abs=0.007)
-    assert angles["MM 3/3"][0] == pytest.approx(0.0, abs=0.007)
-
-
-def test_the_truth_on_the_grid() -> None:
-    places = np.arange(100)
-    none = np.zeros((100, 1))
-    parts = [Part(start_s + 0.01 * places, none, places, places) for start_s in (0.0, 5.0)]
-    t = np.concatenate([np.arange(0.0, 0.5, 0.02), np.arange(0.8, 3.0, 0.02)])
-    angle = np.angle(np.exp(1j * (3.0 + t)))
-    first, second = on_grid(t, angle, parts, 0.01)
-    at = 0.01 * np.arange(100)
-    inside = (at <= 0.48) | (at >= 0.8)
-    assert np.allclose(first[inside], 3.0 + at[inside])
-    assert np.isnan(first[~inside]).all()
-    assert np.isnan(second).all()
 
 
 N, K = math.radians(0.01), 1e-4

@@ -11,7 +11,6 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calib.core.errors import BadInputError
 from calib.solve.clock import Part
 from calib.stages.imu.allan import (
     allan_variance,
@@ -142,36 +141,6 @@ def test_motion_is_left_out_and_makes_it_poor() -> None:
     assert found.noise[2].bias == pytest.approx(IMU.gyro_bias_radps[2], abs=3e-4)
 
 
-def test_a_stuck_axis_is_named() -> None:
-    log, _ = rest_log(IMU, 60.0, 5)
-    values = log.values.copy()
-    values[:, 1] = -0.0031
-    found = analyse_static([replace(log, values=values)])
-    assert found.noise[1].allan is None
-    judged = judge(found)
-    assert judged.verdict == "poor"
-    assert any("gy never changes: it is stuck at -0.0031" in reason for reason in judged.reasons)
-
-
-def test_logs_that_do_not_go_together() -> None:
-    one, _ = rest_log(IMU, 10.0, 7)
-    other, _ = rest_log(replace(IMU, rate_hz=50.0), 10.0, 7, "other.csv")
-    with pytest.raises(
-        BadInputError, match=r"other\.csv: is sampled at 50 Hz, expected 100 Hz as in log\.csv"
-    ):
-        analyse_static([one, other])
-    with pytest.raises(BadInputError, match=r"other\.csv: has the axes gx, gy, expected gx, gy, gz"):
-        analyse_static([one, replace(other, axes=("gx", "gy"), values=other.values[:, :2])])
-    with pytest.raises(BadInputError, match="expected at least one"):
-        analyse_static([])
-    short = replace(one, t_s=one.t_s[:50], values=one.values[:50])
-    with pytest.raises(BadInputError, match=r"log\.csv: has 50 IMU samples without a long gap"):
-        analyse_static([short])
-    shaken = replace(one, values=one.values + 0.5 * np.sin(np.arange(len(one.t_s)))[:, None])
-    with pytest.raises(BadInputError, match=r"log\.csv: is never at rest"):
-        analyse_static([shaken])
-
-
 def _nbs14() -> np.ndarray:
     n, out = 1234567890, []
     for _ in range(1000):
@@ -192,18 +161,6 @@ def test_the_same_as_allantools(walk: float) -> None:
     m = spaced(len(y))
     _, theirs, _, _ = allantools.oadev(y, rate=100.0, data_type="freq", taus=m / 100.0)
     assert np.allclose(np.sqrt(allan_variance([y], m)), theirs, rtol=1e-10)
-
-
-def test_a_log_in_parts_gives_the_mean_over_its_second_differences() -> None:
-    rng = np.random.default_rng(2)
-    long, short, m = rng.normal(size=400), rng.normal(size=60), np.array([1, 8, 40])
-    both = allan_variance([long, short, np.zeros(1)], m)
-    one, other = allan_variance([long], m), allan_variance([short], m)
-    assert np.isnan(other[2])
-    M1, M2 = 401 - 2 * m, np.maximum(61 - 2 * m, 0)
-    assert np.allclose(both, (one * M1 + np.nan_to_num(other) * M2) / (M1 + M2))
-    with pytest.raises(BadInputError, match="found 0, expected 1 or more"):
-        allan_variance([long], np.array([0]))
 
 
 @pytest.mark.parametrize(("kind", "alpha"), [(0, 0), (1, -1), (2, -2)])
@@ -321,13 +278,6 @@ def _still(seed: int, n: int = 6000) -> np.ndarray:
     return NOISE * np.random.default_rng(seed).normal(size=(n, 2)) + [0.006, 9.81]
 
 
-def test_rest_is_rest() -> None:
-    for seed in range(40):
-        parts, motions = rest_parts(_part(_still(seed)), 0.01, GYRO, NONE)
-        assert motions == ()
-        assert len(parts[0].values) == 6000
-
-
 def test_a_walking_bias_and_a_coarse_step_are_rest() -> None:
     rng = np.random.default_rng(1)
     walk = np.cumsum(1e-4 * rng.normal(size=(60_000, 2)), axis=0)
@@ -369,25 +319,6 @@ def test_rate_and_jitter() -> None:
     assert len(parts) == 1
     assert np.array_equal(parts[0].values, values)
     assert np.isnan(sampling.step).all()
-
-
-def test_stamps_that_repeat_are_samples_of_their_own() -> None:
-    t, values = _log()
-    late = np.random.default_rng(1).choice(np.arange(1, 5999), 12, replace=False)
-    for i in sorted(late.tolist()):
-        t[i] = t[i - 1]
-    sampling, parts = regular_parts(t, values, GYRO)
-    assert (sampling.repeated_stamps, sampling.repeated_rows, sampling.missing) == (12, 0, 0)
-    assert np.array_equal(parts[0].values, values)
-
-
-def test_rows_written_twice_are_dropped() -> None:
-    t, values = _log()
-    rows = np.sort(np.concatenate([np.arange(6000), np.arange(100, 5900, 480)]))
-    sampling, parts = regular_parts(t[rows], values[rows], GYRO)
-    assert sampling.repeated_rows == 13
-    assert sampling.gaps == ()
-    assert np.array_equal(parts[0].values, values)
 
 
 def test_a_short_gap_is_filled_and_the_time_axis_kept() -> None:
@@ -485,19 +416,3 @@ def test_a_file_as_kalibr_writes_it(nested: bool) -> None:
     assert isinstance(imu, Imu_of_kalibr_imu) and imu.rate_hz == 200.0 and imu.verdict == "poor"
     for name, value in zip(KEYS.values(), EUROC, strict=True):
         assert getattr(imu, name) == [value] * 3
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"update_rate": None}, "update_rate is None, expected a number"),
-        ({"gyroscope_random_walk": "fast\n"}, r"gyroscope_random_walk is 'fast\n', expected a number"),
-        ({"accelerometer_noise_density": float("nan")}, "accelerometer_noise_density is nan, expected"),
-    ],
-)
-def test_what_is_wrong_is_named(change: dict[str, object], words: str) -> None:
-    with pytest.raises(BadInputError) as caught:
-        from_kalibr_imu({**yaml.safe_load(TEXT), **change})
-    assert words in str(caught.value)
-    with pytest.raises(BadInputError, match="update_rate is missing"):
-        from_kalibr_imu(dict.fromkeys(KEYS, 1.0))

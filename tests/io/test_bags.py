@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import bz2
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-import lz4.frame
 import numpy as np
 import pytest
 from bags import KINDS, KINDS_OF_FORMAT, NAMES, START_NS, Message, _ros, readings, write_bag
@@ -18,7 +16,7 @@ from calib.core.errors import BadInputError
 from calib.io import unpacking as log_unpacking
 from calib.io.bags import WINDOW_S, Field, Topic, TopicMap, reader_of, rows_from_messages, topic_map
 from calib.io.logs import read_log
-from calib.io.unpacking import BoundedFile, BoundedPath, unpacked
+from calib.io.unpacking import BoundedFile, BoundedPath
 
 COLUMNS = {
     "imu": ("ax_mps2", "ay_mps2", "az_mps2", "gx_radps", "gy_radps", "gz_radps"),
@@ -139,14 +137,6 @@ def _refused(path: Path, topics: Path | None = None) -> str:
     return str(caught.value)
 
 
-def test_without_a_topic_that_is_known(tmp_path: Path) -> None:
-    names = {**NAMES, "marker": "/blob"}
-    path = write_bag(tmp_path, "ros1", readings(np.random.default_rng(0))[1:2], names)
-    said = _refused(path)
-    assert "has no topic that is known by itself, found /blob (geometry_msgs/PointStamped)" in said
-    assert "log.topics.yaml" in said
-
-
 @pytest.mark.parametrize("form", KINDS_OF_FORMAT)
 def test_damaged_bytes_are_refused_or_read_never_raised(form: str, tmp_path: Path) -> None:
     path = write_bag(tmp_path, form, readings(np.random.default_rng(0), 0.2))
@@ -165,15 +155,6 @@ def test_damaged_bytes_are_refused_or_read_never_raised(form: str, tmp_path: Pat
             refused += 1
             assert str(error).startswith(str(tmp_path))
     assert refused > 3
-
-
-def test_a_bag_that_is_not_there_and_one_that_is_a_pipe(tmp_path: Path) -> None:
-    import os
-
-    assert "cannot be read: No such file" in _refused(tmp_path / "none.mcap")
-    pipe = tmp_path / "pipe.bag"
-    os.mkfifo(pipe)
-    assert "is a pipe" in _refused(pipe)
 
 
 @pytest.mark.parametrize("packing", ["ZSTD", "LZ4", "NONE"])
@@ -237,14 +218,6 @@ def rows(
     blocks = list(rows_from_messages("log", Messages(items), topics))
     columns = [np.concatenate([block.columns[name] for block in blocks]) for name in topics.columns]
     return np.column_stack([np.concatenate([block.t_s for block in blocks]), *columns]), blocks
-
-
-def test_the_epoch_is_the_first_row_and_a_simulated_time_is_kept() -> None:
-    start = 1_700_000_000_000_000_000
-    late, _ = rows([("/b", start + k, {"g": k}) for k in (1000, 0, 2000)])
-    assert late[:, 0].tolist() == [0.0, 1e-6, 2e-6] and late[:, 3].tolist() == [0, 1000, 2000]
-    early, _ = rows([("/b", 3_000_000_000 + k, {"g": k}) for k in range(2)])
-    assert early[:, 0].tolist() == [3.0, 3.000000001]
 
 
 @pytest.mark.parametrize(
@@ -317,15 +290,6 @@ def test_a_file_that_is_wrong(text: str, words: str, tmp_path: Path) -> None:
     assert words in said and said.startswith(str(tmp_path / "mine.yaml")) and "\n" not in said
 
 
-def test_two_imus_have_to_be_told_apart(tmp_path: Path) -> None:
-    two = (*TOPICS, Topic("/imu\n2", "sensor_msgs/Imu"))
-    with pytest.raises(BadInputError) as caught:
-        topic_map(tmp_path / "log.bag", two)
-    assert "has 2 topics of sensor_msgs/Imu: /imu (sensor_msgs/Imu), /imu\\n2 (" in str(caught.value)
-    assert "log.topics.yaml" in str(caught.value)
-    assert len(_map('topics: {"/imu\\n2": imu}\n', tmp_path, two).topics) == 1
-
-
 json_values = st.recursive(
     st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=3)),
     lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(st.sampled_from("ab"), inner)),
@@ -350,21 +314,6 @@ MOST = 100_000
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(log_unpacking, "MOST_BYTES", MOST)
-
-
-def _packed(packing: str, data: bytes) -> bytes:
-    if packing == "bz2":
-        return bz2.compress(data)
-    return bytes(lz4.frame.compress(data) if packing == "lz4" else log_unpacking._zstd().compress(data))
-
-
-@pytest.mark.usefixtures("small")
-@pytest.mark.parametrize("packing", ["bz2", "lz4", "zstd"])
-def test_up_to_a_bound(packing: str) -> None:
-    data = np.random.default_rng(0).bytes(MOST)
-    assert unpacked(packing, _packed(packing, data)) == data
-    with pytest.raises(ValueError, match="a part of it unpacks to more than 0 MB"):
-        unpacked(packing, _packed(packing, b"\0" * (MOST + 1)))
 
 
 def _ros1(path: Path, packing: str, count: int) -> Path:

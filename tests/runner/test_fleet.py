@@ -7,7 +7,6 @@ import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,7 @@ from calib.core.rig import Camera, CovarianceTable, Distortion, Provenance, Rig,
 from calib.runner import engine as cluster
 from calib.runner import engine as worker
 from calib.runner import fleet as running
-from calib.runner.engine import Cluster, check_survey, connected, survey
+from calib.runner.engine import Cluster, connected
 from calib.runner.finishing import finish
 from calib.runner.fleet import BORROWED, Store, Table, column, opened_store, read_prior, run_fleet, texts
 from calib.runner.graph import Command, run_here
@@ -123,17 +122,6 @@ def test_csv_and_yaml_say_the_same(tmp_path: Path) -> None:
     assert from_csv.ignored == ("made by",)
 
 
-def test_options_for_all_and_for_one(tmp_path: Path) -> None:
-    yaml = tmp_path / "m.yml"
-    yaml.write_text(
-        "options: {model: radial2, square: 20mm}\nrigs:\n- {name: a, path: a}\n"
-        "- {name: b, path: b, model: brown5}\n"
-    )
-    a, b = read_manifest(yaml).rigs
-    assert dict(a.options) == {"model": "radial2", "square": "20mm"}
-    assert dict(b.options) == {"model": "brown5", "square": "20mm"}
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -153,21 +141,6 @@ def test_what_is_no_manifest_is_told_with_its_line(tmp_path: Path, text: str, sa
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("rigs: 3\n", "no list rigs"),
-        ("rigs: [{name: [1], path: a}]\n", "name is"),
-        ("rigs: [{name: a, path: b}]\noptions: 3\n", "options is no mapping"),
-    ],
-)
-def test_what_is_no_yaml_manifest(tmp_path: Path, text: str, said: str) -> None:
-    path = tmp_path / "m.yaml"
-    path.write_text(text)
-    with pytest.raises(BadInputError, match=said):
-        read_manifest(path)
-
-
 @given(st.text(max_size=12))
 def test_a_name_that_is_taken_is_a_safe_folder(name: str) -> None:
     from calib.runner.task import _problem_of_name
@@ -181,17 +154,6 @@ def test_no_secret_is_kept() -> None:
     assert without_secrets("https://user:word@host:1/a/b?key=1") == "https://host:1/a/b"
     assert without_secrets("s3://bucket/a") == "s3://bucket/a"
     assert without_secrets("/data/a?b@c") == "/data/a?b@c"
-
-
-def test_workers_with_another_program_are_refused() -> None:
-    mine = replace(survey(), blas_threads="1")
-    assert check_survey({"tcp://a": mine, "tcp://b": mine}, mine) == ()
-    with pytest.raises(BadInputError, match=r"worker tcp://b: has calib 9\.9"):
-        check_survey({"tcp://a": mine, "tcp://b": replace(mine, version="9.9", program="x")}, mine)
-    with pytest.raises(BadInputError, match="another source of calib"):
-        check_survey({"tcp://b": replace(mine, program="x")}, mine)
-    (remark,) = check_survey({"tcp://a": mine, "tcp://b": replace(mine, blas_threads="")}, mine)
-    assert "1 of 2 workers" in remark and "OPENBLAS_NUM_THREADS" in remark
 
 
 @pytest.mark.parametrize(
@@ -237,21 +199,6 @@ def test_the_bytes_are_those_of_single_verbs(tmp_path: Path, project_root: Path)
         ("distortion",),
     )
     assert (ended.out / "rig.yaml").read_bytes() == single
-
-
-@pytest.mark.slow
-def test_pictures_alone_and_a_page(tmp_path: Path, project_root: Path) -> None:
-    root = tmp_path / "rig"
-    root.mkdir()
-    for path in (project_root / "images").iterdir():
-        if path.is_file():
-            shutil.copy(path, root)
-    ended = run_stages(rig_folder(root), "camera", (), tmp_path / "out", page=True)
-    assert ended.code == 0 and ended.stages["extrinsics"] == "skipped"
-    assert (ended.out / "rig.yaml").read_bytes() == _verbs(
-        tmp_path, ("intrinsics", str(root)), ("distortion",)
-    )
-    assert "report.html" in ended.files and "view17.png" in (ended.out / "report.html").read_text()
 
 
 def test_what_a_rig_folder_holds(tmp_path: Path) -> None:

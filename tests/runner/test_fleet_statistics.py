@@ -111,25 +111,6 @@ def test_borrowing_is_closer_to_the_truth_and_its_covariance_is_honest() -> None
     assert np.all(np.mean(after, axis=0) < np.mean(before, axis=0))
 
 
-def test_a_fleet_whose_rigs_are_alike_has_no_spread_of_its_own() -> None:
-    rng = np.random.default_rng(3)
-    V = np.tile(np.eye(3), (50, 1, 1))
-    found = _group(MU + rng.standard_normal((50, 3)), V)
-    assert np.linalg.eigvalsh(found.between).min() >= -1e-12
-    assert np.trace(found.between) < 1.0
-    after = posterior(found, MU + np.array([1.0, 0.0, 0.0]), np.eye(3))
-    assert np.trace(after.covariance) < 0.5 * 3.0
-
-
-def test_own_sigma_takes_its_part_of_the_spread_and_of_z() -> None:
-    x = np.array([-1.0, 0.0, 1.0])
-    found = spread_of(x, np.array([1.0, 1.0, 1.0]))
-    assert found.between**2 + 1.0 == pytest.approx(found.scale**2)
-    # A rig that is itself poorly known stands out less at the same distance.
-    z = robust_z(np.array([1.0, 1.0]), np.array([1.0, 5.0]), found)
-    assert z[0] == pytest.approx(1.0 / found.scale) and 0.0 < z[1] < z[0]
-
-
 @given(
     st.lists(st.floats(-1e6, 1e6), min_size=3, max_size=40),
     st.floats(0.1, 10.0),

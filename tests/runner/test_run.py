@@ -22,8 +22,8 @@ from running_trials import CALLS, Inline, make_folder, run_small
 
 from calib.core.errors import BadInputError
 from calib.core.rig import SECTIONS
-from calib.runner.folder import read_folder, with_topics
-from calib.runner.graph import HIDDEN, STAGES, Done, jobs_of, opened
+from calib.runner.folder import read_folder
+from calib.runner.graph import HIDDEN, STAGES, Done, opened
 from calib.runner.outputs import exit_code, read_summary
 from calib.show.page import keep_pictures, page_text, write_page
 
@@ -102,17 +102,6 @@ def test_a_poor_result_is_used_and_kept_poor(tmp_path: Path) -> None:
         assert _status(ended)["firmware"] == "ok"
         assert exit_code(ended) == 1
     assert CALLS.count("first") == 1
-
-
-def test_a_section_that_the_person_wrote_is_used_where_nothing_learns_it(tmp_path: Path) -> None:
-    root = make_folder(tmp_path / "rig")
-    (root / "rig.yaml").write_text("first: {value_m: 0.5}\ngeometry: {workspace_m: [0, 0, 1, 1]}\n")
-    for path in (root / "images").iterdir():
-        path.unlink()
-    run_small(root, tmp_path / "out")
-    rig = yaml.safe_load((tmp_path / "out" / "rig.yaml").read_text())
-    assert rig["second"]["twice_m"] == 1.0
-    assert rig["geometry"]["workspace_m"] == [0.0, 0.0, 1.0, 1.0]
 
 
 def test_a_damaged_result_is_made_again(tmp_path: Path) -> None:
@@ -341,21 +330,6 @@ def test_files_that_cannot_grow(
     assert _bytes(out) == wanted
 
 
-def test_kinds_of_logs_and_their_columns(tmp_path: Path) -> None:
-    root = make_folder(tmp_path / "rig")
-    (root / "logs" / "static1.csv").write_text("# a note\n\nt_s, gz_radps\n0,1\n")
-    (root / "logs" / "poses.csv").write_text("t_s,ax_mps2\n")
-    (root / "logs" / "notes.txt").write_text("none")
-    (root / "logs" / ".hidden.csv").write_text("t_s\n")
-    folder = read_folder(root)
-    assert {log.slug: log.kind for log in folder.logs} == {
-        "one": "motion", "two": "motion", "poses": "poses", "static1": "rest",
-    }  # fmt: skip
-    static = next(log for log in folder.logs if log.kind == "rest")
-    assert static.columns == ("t_s", "gz_radps")
-    assert static.has("gz_radps") and not static.has("ax_mps2")
-
-
 @pytest.mark.parametrize("make", ["nothing", "empty", "file"])
 def test_what_is_no_rig_folder(tmp_path: Path, make: str) -> None:
     path = tmp_path / "rig"
@@ -396,28 +370,6 @@ def test_odd_names_stay_inside_and_run(tmp_path: Path, name: str) -> None:
     assert all(part.isascii() and part.isprintable() for part in states)
 
 
-def test_bags_are_logs_with_the_file_that_explains_them(tmp_path: Path) -> None:
-    import numpy as np
-    from bags import readings, write_bag
-
-    root = make_folder(tmp_path / "rig")
-    bag = write_bag(root / "logs", "json", readings(np.random.default_rng(0), 0.2))
-    log = next(log for log in read_folder(root).logs if log.path == bag)
-    assert log.has("u_px", "gz_radps", "pwm1") and not log.has("true_q1_m")
-    topics = root / "logs" / "log.topics.yaml"
-    topics.write_text("topics:\n  /imu/data: {gz_radps: gz_radps}\n")
-    folder = read_folder(root)
-    log = next(log for log in folder.logs if log.path == bag)
-    assert log.columns == ("gz_radps",) and topics in folder.files()
-    assert with_topics([bag, bag]) == (bag, topics)
-    topics.rename(tmp_path / "elsewhere.yaml")
-    topics.symlink_to(tmp_path / "elsewhere.yaml")
-    assert all(log.path != bag for log in read_folder(root).logs)
-    topics.unlink()
-    bag.write_bytes(b"\x89MCAP0\r\nbroken")
-    assert next(log for log in read_folder(root).logs if log.path == bag).columns is None
-
-
 def test_every_stage_comes_after_what_it_reads() -> None:
     written: dict[str, str] = {}
     for stage in STAGES:
@@ -428,17 +380,6 @@ def test_every_stage_comes_after_what_it_reads() -> None:
             # A section that a later stage writes would make the two wait for each other.
             assert name in written or not later, (stage.name, name)
         written |= dict.fromkeys(stage.writes, stage.name)
-
-
-def test_plane_with_a_link_out_is_not_handed_to_the_verb(tmp_path: Path) -> None:
-    root = make_folder(tmp_path / "rig")
-    (root / "images" / "plane").mkdir()
-    (root / "images" / "plane" / "p.png").write_bytes(b"p")
-    (tmp_path / "secret.png").write_bytes(b"s")
-    (root / "images" / "plane" / "q.png").symlink_to(tmp_path / "secret.png")
-    jobs = {job.name: job for job in jobs_of(read_folder(root))}
-    assert jobs["extrinsics"].planned is None
-    assert "link out of the folder" in jobs["extrinsics"].reason
 
 
 WRONG: tuple[Any, ...] = (None, 0, 1.5, True, "", "<script>alert(1)</script>", [], {}, [1], ["a"], {"a": 1})

@@ -99,17 +99,6 @@ def test_every_board_that_fits_lies_inside_the_printable_page(columns: int, rows
         assert black[:, 1].min() >= 24.0 - 1e-6, "white between the squares and the ruler"
 
 
-def test_a_square_of_white_surrounds_the_thesis_board() -> None:
-    for page in PAGES_MM:
-        pdf = board_pdf(7, 5, 0.02, page)
-        black = _rectangles(pdf)
-        width, height = _page_mm(pdf)
-        assert black[:, 0].min() >= 20.0
-        assert (black[:, 0] + black[:, 2]).max() <= width - 20.0
-        assert (black[:, 1] + black[:, 3]).max() <= height - 20.0
-        assert black[:, 1].min() >= 20.0 + 20.0, "above the footer"
-
-
 @pytest.mark.parametrize(
     ("columns", "rows", "square_m", "page", "words"),
     [

@@ -31,7 +31,6 @@ from calib.stages.camera.plots import (
     _radial_sigma,
     arrows,
     picture_frame,
-    residual_figure,
     write_camera_figures,
     write_lens_figures,
     write_plane_figures,
@@ -196,20 +195,6 @@ def test_all_figures_are_legible(case: str, tmp_path: Path, monkeypatch: pytest.
             assert complaints(figure) == [], name
 
 
-def _words(result: Intrinsics, name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    with kept(monkeypatch, camera_figures) as figures:
-        write_camera_figures(folder, result)
-    with camera_figures.look():
-        return "\n".join(text.get_text() for text in drawn_texts(figures[f"camera_{name}.png"]))
-
-
-def test_what_is_not_bounded_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    result = _unbounded()
-    assert "not bounded" in _words(result, "sigma", tmp_path, monkeypatch)
-    assert "not estimated" in _words(result, "coverage", tmp_path, monkeypatch)
-    assert "verdict: unidentifiable" in _words(result, "poses", tmp_path, monkeypatch)
-
-
 BROWN = Camera(
     "brown5", (316, 208), 273.0, 272.0, 0.4, 160.0, 102.0, np.array([-0.22, 0.55, 2e-3, -3e-3, 0.05, 0, 0, 0])
 )
@@ -339,24 +324,6 @@ def test_all_figures_are_legible_in_plane_figures(
             assert complaints(figure) == [], name
 
 
-def _words_plane_figures(plane: Plane, monkeypatch: pytest.MonkeyPatch, folder: Path) -> dict[str, str]:
-    with kept(monkeypatch, plane_figures) as figures:
-        write_plane_figures(folder, CAMERA, plane)
-    with plane_figures.look():
-        return {
-            name: " ".join(text.get_text().replace("\n", " ") for text in drawn_texts(figure))
-            for name, figure in figures.items()
-        }
-
-
-def test_what_is_not_known_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    words = _words_plane_figures(plane_of(), monkeypatch, tmp_path)
-    assert "covariance of the intrinsics is not known" in words["plane_sigma.png"]
-    words = _words_plane_figures(plane_of(workspace_m=(1.0, 1.0, 1.1, 1.1)), monkeypatch, tmp_path)
-    assert "No part of the workspace is in the picture" in words["plane_difference.png"]
-    assert "verdict: poor" in words["plane_sigma.png"]
-
-
 def _positions(folder: Path, still: bool = False, n: int = 3000) -> Positions:
     t = np.arange(n) / 60.0
     noise = (0.0 if still else 1.0) * np.random.default_rng(0).normal(size=(2, n))
@@ -415,18 +382,6 @@ def test_chance_leaves_one_disc_in_twenty() -> None:
     outside, cells = np.sum(counts, axis=0)
     # 150 sets of about 40 cells: the share of 5 % is known to 0.3 %; the fit's freedom takes part of it.
     assert 0.03 < outside / cells < 0.06
-
-
-def test_a_field_that_the_noise_hides_leaves_most_discs() -> None:
-    rng = np.random.default_rng(6)
-    noise = rng.standard_normal(FIT.residuals_px.shape) * 0.1
-    pixels = FIT.observations.pixels
-    swirl = 0.1 * np.stack([-(pixels[..., 1] - 240) / 240, (pixels[..., 0] - 320) / 320], axis=-1)
-    outside, cells = _outside(_with_residuals(noise + swirl))
-    assert outside > 0.4 * cells
-    with look():
-        words = " ".join(t.get_text() for t in drawn_texts(residual_figure(_with_residuals(noise + swirl))))
-    assert f"{outside} of {cells} means leave" in words.replace("\n", " ")
 
 
 def test_arrows_have_the_length_that_they_claim() -> None:

@@ -20,9 +20,8 @@ from PIL import Image
 from calib.core.errors import BadInputError
 from calib.runner.cache import Result
 from calib.runner.fleet import Borrowing, FleetSummary, summarise, write_outcomes
-from calib.runner.sweep import Base, Point, SweepSpec, SweepSummary
 from calib.runner.task import Outcome
-from calib.show.fleet import PAGE, fleet_page_text, sweep_page_text, write_fleet_page
+from calib.show.fleet import PAGE, fleet_page_text, write_fleet_page
 from calib.show.page import (
     _AIM_BYTES,
     MOST_BYTES,
@@ -31,8 +30,6 @@ from calib.show.page import (
     _resource,
     data_uri,
     decide,
-    keep_pictures,
-    kept_picture,
     page_text,
     render,
     size_of,
@@ -100,14 +97,6 @@ def test_same_run_same_bytes_and_no_place(rig: Path) -> None:
     assert len(text.encode()) < MOST_BYTES
 
 
-def test_a_rig_without_a_run_gives_a_page_of_constants(rig: Path, tmp_path: Path) -> None:
-    alone = tmp_path / "rig.yaml"
-    alone.write_bytes(rig.read_bytes())
-    text = page_text(alone)
-    assert "fx_px" in text and "273.410" in text
-    assert 'class="figure"' not in text
-
-
 @pytest.mark.parametrize(
     ("text", "says"),
     [
@@ -120,13 +109,6 @@ def test_sections_that_mean_nothing_are_refused_by_their_key(tmp_path: Path, tex
     (tmp_path / "rig.yaml").write_text(text)
     with pytest.raises(BadInputError, match=says):
         page_text(tmp_path / "rig.yaml")
-
-
-def test_too_many_figures_are_named_instead(rig: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("calib.show.page.MOST_BYTES", 460_000)
-    text = page_text(rig)
-    assert len(text.encode()) < 460_000
-    assert "Left out to keep this page small" in text
 
 
 @pytest.mark.slow
@@ -258,24 +240,6 @@ def test_of_many_logs_the_states_come_first_and_the_page_stays_small(
         assert narrow or budget.left >= MOST_BYTES - _AIM_BYTES
 
 
-def _png(path: Path, width: int, height: int, seed: int = 0) -> Path:
-    noise = np.random.default_rng(seed).integers(0, 255, (height, width, 3), dtype=np.uint8)
-    Image.fromarray(noise).save(path)
-    return path
-
-
-def test_changed_and_missing_pictures_are_followed(tmp_path: Path) -> None:
-    path, kept = _png(tmp_path / "a.png", 60, 40), tmp_path / "kept"
-    keep_pictures([path], kept)
-    before = kept_picture("a.png", kept)
-    keep_pictures([path], kept)
-    assert kept_picture("a.png", kept) == before
-    keep_pictures([_png(path, 60, 40, seed=1)], kept)
-    assert kept_picture("a.png", kept) != before
-    keep_pictures([], kept)
-    assert kept_picture("a.png", kept) is None
-
-
 def test_a_figure_is_smaller_and_made_once(tmp_path: Path) -> None:
     shades = np.linspace(0, 255, 600, dtype=np.uint8)
     figure = tmp_path / "f.png"
@@ -332,14 +296,6 @@ def test_weak_points_are_grouped_by_reason() -> None:
     told["jobs"] += [_job("replay", "poor", log=f"{k}.csv", reason="the IMU is silent") for k in range(6)]
     (sentence,) = decide(told, SECTIONS).weak
     assert sentence == "Replay (0.csv, 1.csv, 2.csv, 3.csv and 2 more): the IMU is silent"
-
-
-def test_what_to_record_next() -> None:
-    found = decide(
-        _whole(imu_static="skipped"), {**SECTIONS, "camera": {"verdict": "ok", "advice": ["tilt it"]}}
-    )
-    assert any("at rest" in sentence for sentence in found.record)
-    assert "Intrinsics: tilt it" in found.record
 
 
 def test_the_policy_is_that_of_the_script() -> None:
@@ -431,30 +387,3 @@ def test_in_a_browser(tmp_path: Path) -> None:
         assert browser.run("document.querySelectorAll('.card:not([hidden])').length") == 1
     finally:
         browser.close()
-
-
-_SPEC = SweepSpec(
-    Base("controller", "pid", "jump", "", "truth", None, "auto"),
-    (("pump.lag_s", (0.1, 0.2)),),
-    (),
-    3,
-    0,
-    ("m",),
-)
-
-
-def _point(number: int, loss: float) -> Point:
-    return Point(
-        number, (("pump.lag_s", 0.1 * number),), loss, 2.0 * loss, loss, 3, (("m", loss), ("n", 7.0))
-    )
-
-
-def test_what_is_told() -> None:
-    summary = SweepSummary(
-        6, 1, 0, "<b>too heavy</b>", "m", ("m", "n"), (_point(1, 0.125),), (_point(2, 8.5),),
-        (("pump.lag_s", ((0.1, 0.125), (0.2, 8.5))),),
-    )  # fmt: skip
-    text = sweep_page_text(_SPEC, summary)
-    assert "controller pid on jump" in text and "1 of them failed: &lt;b&gt;too heavy" in text
-    assert text.index("0.125") < text.index("8.5") and "Simulated." in text and ">7<" in text
-    assert not re.search(r"https?://|src=", text)

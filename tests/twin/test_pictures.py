@@ -27,7 +27,6 @@ from calib.twin.scene import (
     expose,
     pose_facing,
     render,
-    rotation,
 )
 from calib.twin.sensors import clutter, gaussian_noise
 
@@ -106,13 +105,6 @@ def test_plane_truth_places_the_board_in_the_world(images: Path, known: dict[str
     assert np.abs(_found(picture, corners) - corners).max() < 0.3
     assert 0.25 <= t[2] <= 0.30
     assert 2.0 < np.degrees(np.arccos(R[2, 2])) < 8.0
-
-
-def test_board_files_say_what_is_true(images: Path) -> None:
-    assert (images / "board.yaml").read_text() == "corners: [7, 5]\nsquare_m: 0.020\n"
-    assert (images / "plane" / "board.yaml").read_text() == (
-        "corners: [7, 5]\nsquare_m: 0.020\nfirst_corner_m: [-0.058, 0.022]\nangle_rad: 0.05\n"
-    )
 
 
 def test_opencv_calibrates_the_camera_back(images: Path) -> None:
@@ -253,16 +245,6 @@ def _random_pose(rng: np.random.Generator, printed: PrintedBoard) -> Pose:
     return pose_facing(CAMERA_SHEET, printed, pixel, rng.uniform(0.25, 0.6), tilt, azimuth, roll)
 
 
-def test_rotation_is_a_rotation_that_tilts_by_the_angle() -> None:
-    rng = np.random.default_rng(0)
-    for tilt, azimuth, roll in rng.uniform(-1.4, 1.4, (50, 3)):
-        R = rotation(tilt, azimuth, roll)
-        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-15)
-        assert np.linalg.det(R) == pytest.approx(1.0)
-        assert R[2, 2] == pytest.approx(math.cos(tilt))
-        np.testing.assert_allclose(rotation(0.0, azimuth, roll), rotation(0.0, 0.0, roll), atol=1e-15)
-
-
 def test_aspect_stretches_rows_and_bow_is_a_parabola_over_the_corners() -> None:
     printed = PrintedBoard(BOARD_SHEET, aspect=1.25, bow_m=(0.003, 0.001))
     points = printed.points_m()
@@ -293,13 +275,6 @@ def test_noise_is_standard_normal() -> None:
     assert abs(stats.kurtosis(noise) - (-1.2 / 16)) < 0.05
     quantiles = np.quantile(noise, [0.0228, 0.1587, 0.8413, 0.9772])
     np.testing.assert_allclose(quantiles, [-2.0, -1.0, 1.0, 2.0], atol=0.03)
-
-
-def test_clutter_depends_on_its_seed_only() -> None:
-    first = clutter((316, 208), 5)
-    assert first.shape == (208, 316)
-    assert np.array_equal(first, clutter((316, 208), 5))
-    assert not np.array_equal(first, clutter((316, 208), 6))
 
 
 @pytest.mark.parametrize("seed", range(6))

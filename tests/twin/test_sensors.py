@@ -107,15 +107,6 @@ def test_frames_are_exposed_earlier_than_they_are_read() -> None:
     assert np.allclose(noise.stamp_s, FRAMES, atol=1e-6)
 
 
-def test_pixels_are_whole_and_nearest() -> None:
-    q = _bellows(500)
-    tracker = replace(CLEAN, grid_px=1.0)
-    noise = draw_tracker_noise(tracker, FRAMES[:500], 0)
-    whole = track(VIEW, tracker, noise, slice(0, 500), q, RADIUS_M)
-    assert np.array_equal(whole, np.rint(whole))
-    assert np.abs(whole - marker_pixels(VIEW, CLEAN, q, RADIUS_M)).max() <= 0.5
-
-
 def test_jitter_has_the_deviation_asked_for() -> None:
     error = _still(replace(CLEAN, jitter_px=0.3)) - _still(CLEAN)
     assert np.std(error, axis=0) == pytest.approx([0.3, 0.3], rel=0.02)
@@ -171,15 +162,6 @@ def _still_imu_sensor(phi: np.ndarray) -> HeadMotion:
 def _read(imu: Imu, motion: HeadMotion, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     n = len(motion.phi_rad)
     return measure(imu, draw_imu_noise(imu, n / imu.rate_hz, seed), slice(0, n), motion)
-
-
-def test_at_rest_it_reads_gravity_at_its_angle() -> None:
-    phi = np.linspace(-1.2, 1.2, 49)
-    for mount in (0.0, 0.3):
-        force, rate = _read(replace(CLEAN_IMU_SENSOR, mount_angle_rad=mount), _still_imu_sensor(phi))
-        assert np.allclose(np.arctan2(force[:, 1], force[:, 0]), phi + mount, atol=1e-12)
-        assert np.allclose(np.linalg.norm(force, axis=1), 9.81)
-        assert np.array_equal(rate, np.zeros((49, 3)))
 
 
 def test_its_axes_are_right_handed_and_x_points_to_the_base() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +14,7 @@ from calib.stages.actuator.parameters import Plant, Stiffness
 from calib.stages.actuator.simulate import rig_at_rest
 from calib.stages.control.laws import LoopState, Pid, PidState, saturate, step
 from calib.twin.rig import SimulatedRig
-from calib.twin.scenarios import SCENARIOS, Figures, make_scenario, run_scenario, step_response, swing_decay
+from calib.twin.scenarios import SCENARIOS, Figures, make_scenario, run_scenario
 from calib.twin.sensors import Imu, Tracker, marker_pixels
 from calib.twin.simulate import Law, Run, Seen, log_of, simulate
 
@@ -97,14 +96,6 @@ def test_sensor_feedback_comes_late_and_wrong_but_close() -> None:
     assert 8 <= int(np.argmin(misfit)) <= 14
 
 
-def test_a_command_acts_after_the_delay_in_ticks() -> None:
-    pwm = np.zeros((12, 2))
-    pwm[4:] = 255.0
-    force = _run(pwm, 12).states[:, 8]
-    assert np.all(force[: 4 + RIG.pump.delay_ticks + 1] == 0.0)
-    assert force[4 + RIG.pump.delay_ticks + 1] > 0.0
-
-
 def test_frames_show_the_past_and_samples_the_present() -> None:
     pwm = _commands(240)
     late = replace(PERFECT, tracker=replace(PERFECT.tracker, latency_s=0.03))
@@ -162,19 +153,6 @@ def test_swing_damping_frequency_and_offset() -> None:
     assert figures["offset_after_1s_rad"] == pytest.approx(0.006, rel=WITHIN)
 
 
-@pytest.mark.parametrize(("volt", "elongation_mm"), [(6, 1.88), (8, 11.11), (10, 21.73), (12, 26.56)])
-def test_steady_elongations(volt: int, elongation_mm: float) -> None:
-    run, figures = _do("steps", 45.0, volts=str(volt), on_s="40")
-    assert figures[f"elongation_at_{volt}V_mm"] == pytest.approx(elongation_mm, rel=WITHIN)
-    # And without any bending.
-    assert np.abs(run.phi_rad).max() < 1e-12
-
-
-def test_deflation_takes_5_s() -> None:
-    _, figures = _do("deflate")
-    assert figures["deflation_s"] == pytest.approx(5.05, rel=WITHIN)
-
-
 def test_pid_to_a_constant_angle() -> None:
     _, figures = _do("orientation", 5.0)
     assert figures["reach_s"] == pytest.approx(0.92, rel=WITHIN)
@@ -182,17 +160,17 @@ def test_pid_to_a_constant_angle() -> None:
     assert figures["settle_s"] == pytest.approx(2.37, rel=WITHIN)
 
 
-@pytest.mark.parametrize(("Kp", "angle_rad"), [(500, 0.375), (1000, 0.535), (2000, 0.63), (5000, 0.698)])
+@pytest.mark.parametrize(
+    ("Kp", "angle_rad"),
+    [
+        (500, 0.375),
+        (5000, 0.698),
+    ],
+)
 def test_proportional_control_never_reaches(Kp: int, angle_rad: float) -> None:
     _, figures = _do("orientation", 5.0, controller="p", Kp=str(Kp))
     assert figures["reach_s"] is None
     assert figures["peak_rad"] == pytest.approx(angle_rad, rel=WITHIN)
-
-
-def test_pd_with_feed_forward_along_the_elongation() -> None:
-    _, figures = _do("elongation")
-    assert figures["largest_error_mm"] == pytest.approx(2.00, rel=WITHIN)
-    assert figures["static_error_mm"] == pytest.approx(-0.23, rel=WITHIN)
 
 
 def test_without_feed_forward_it_stays_short_and_with_an_integral_it_winds_up() -> None:
@@ -242,16 +220,6 @@ def test_the_ellipse_is_followed_with_both_chords() -> None:
         width[chord] = np.ptp(x)
     assert width["exact"] == pytest.approx(0.030, abs=0.003)
     assert width["thesis"] == pytest.approx(0.015, abs=0.003)
-
-
-def test_over_its_sensors_the_loop_still_works() -> None:
-    _, figures = _do("orientation", feedback="sensors")
-    assert figures["reach_s"] == pytest.approx(0.92, rel=0.1)
-    assert 0.68 < figures["peak_rad"] < 0.8
-    _, figures = _do("elongation", feedback="sensors")
-    assert abs(figures["static_error_mm"]) < 1.5
-    _, figures = _do("ellipse", feedback="sensors")
-    assert max(v for v in figures.values() if v is not None) < 3.0
 
 
 def test_signals_for_identification_move_both_bellows_apart() -> None:
@@ -305,36 +273,3 @@ def test_words_that_are_not_known(name: str, options: dict[str, str], words: str
 def test_numbers_that_no_experiment_can_have(name: str, options: dict[str, str], words: str) -> None:
     with pytest.raises(BadInputError, match=words):
         run_scenario(make_scenario(name, options), RIG, 0, "truth", 1.0)
-
-
-T = 1e-3 * np.arange(5001)
-
-
-def _swing(zeta: float, hertz: float, offset: float) -> np.ndarray:
-    """Released at rest from 0.5 rad above an offset that decays in a third of a second."""
-    w = 2.0 * math.pi * hertz
-    wd = w * math.sqrt(1.0 - zeta * zeta)
-    shape = np.exp(-zeta * w * T) * (np.cos(wd * T) + zeta * w / wd * np.sin(wd * T))
-    return 0.5 * shape + offset * np.exp(-3.0 * T)
-
-
-@pytest.mark.parametrize("zeta", [0.02, 0.0513, 0.1])
-def test_damping_and_frequency_without_an_offset(zeta: float) -> None:
-    swing = swing_decay(T, _swing(zeta, 4.0, 0.0))
-    assert swing.damping_ratio == pytest.approx(zeta, rel=1e-4)
-    assert swing.frequency_hz == pytest.approx(4.0 * math.sqrt(1.0 - zeta**2), rel=1e-4)
-    assert np.abs(swing.offset_rad).max() < 0.5 * 0.02 + zeta
-
-
-def test_an_overshooting_response() -> None:
-    zeta, w = 0.5, 4.0
-    wd = w * math.sqrt(1.0 - zeta**2)
-    y = 0.7 * (1.0 - np.exp(-zeta * w * T) * (np.cos(wd * T) + zeta * w / wd * np.sin(wd * T)))
-    response = step_response(1e-3, y, 0.7)
-    assert response.reach_s == pytest.approx((math.pi - math.acos(zeta)) / wd, abs=1e-5)
-    assert response.peak == pytest.approx(
-        0.7 * (1.0 + math.exp(-math.pi * zeta / math.sqrt(1 - zeta**2))), rel=1e-5
-    )
-    assert response.settle_s is not None
-    assert np.all(np.abs(y[round(response.settle_s / 1e-3) :] - 0.7) <= 0.02 * 0.7)
-    assert step_response(1e-3, y[:800], 0.7).settle_s is None
