@@ -1,3 +1,53 @@
-"""Calibrate a cheap camera and an IMU on a machine, down to the constants in its firmware."""
+"""Calibrate a cheap camera and an IMU on a machine, down to the constants in its firmware.
+
+    import calib
+    rig = calib.Rig.load("rig.yaml", missing_ok=True)
+    rig.camera = calib.intrinsics("images/")
+    rig.plane = calib.extrinsics("images/plane/", rig)
+    rig.save("rig.yaml")
+
+Each verb of the command line is a function here: it takes paths (or a pattern), the rig, and the verb's
+options in SI units, and returns the section of rig.yaml with its verdict. Names are loaded when they are
+first used.
+"""
+
+from __future__ import annotations
+
+import importlib
+from types import SimpleNamespace
+from typing import Any
 
 __version__ = "0.1.0"
+
+_CLASSES = {
+    "Rig": "calib.core.rig",
+    "Verdict": "calib.core.verdict",
+    "Finding": "calib.core.verdict",
+}
+"""Names of the front door that are no verbs, and where they are."""
+_VERBS = ("intrinsics", "extrinsics", "distortion")
+_GROUPS: dict[str, tuple[str, ...]] = {}
+"""Verbs of two words: `calib.imu.static` is `calib imu static`."""
+
+__all__ = ["Finding", "Rig", "Verdict", "distortion", "extrinsics", "intrinsics"]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _CLASSES:
+        value: Any = getattr(importlib.import_module(_CLASSES[name]), name)
+    elif name in _VERBS:
+        from calib.stages import function
+
+        value = function(name)
+    elif name in _GROUPS:
+        from calib.stages import function
+
+        value = SimpleNamespace(**{word: function(f"{name} {word}") for word in _GROUPS[name]})
+    else:
+        raise AttributeError(f"module 'calib' has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*__all__, "__version__"])

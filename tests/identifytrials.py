@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from calib.core.rig import Camera, Distortion, Plane, Rig, write_rig
+from calib.core.rig import Rig, write_rig
 from calib.io.logs import write_log
 from calib.stages.actuator.identify import Nominal, Track, made, values_of
 from calib.stages.actuator.identify_pump import PumpRecord, simulate_pump
 from calib.stages.actuator.parameters import Creep
 from calib.stages.actuator.pump import TICK_S, RateLimit
 from calib.stages.actuator.simulate import rig_at_rest, simulate
+from calib.stages.camera.section import Camera, Distortion, Plane
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.simulate import log_of

@@ -99,8 +99,9 @@ def align(
     A free swing shows the time offset, slow motion to large angles all the rest. Writes the section align
     of the rig's file. Exits 1 when the verdict is not ok.
     """
-    from calib.core.files import check_folder, check_writable, shown
-    from calib.core.rig import Geometry, hash_of, read_rig, section_json, write_rig
+    from calib.core.files import check_folder, check_writable, hash_of, shown
+    from calib.core.result import section_json
+    from calib.core.rig import Geometry, read_rig, write_rig
     from calib.core.units import parse_length_m
     from calib.stages.align.read import align_section, read_align_log, settings_from_rig, with_drawn_marker
     from calib.stages.align.solve import align as find

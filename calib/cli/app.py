@@ -8,7 +8,7 @@ import typer
 
 from calib import __version__
 from calib.cli.align import align
-from calib.cli.camera import board, distortion, export_camera, extrinsics, import_camera, intrinsics
+from calib.cli.camera import board, export_camera, import_camera
 from calib.cli.common import telling
 from calib.cli.control import control
 from calib.cli.convert import convert
@@ -27,6 +27,8 @@ from calib.cli.run import run
 from calib.cli.simulate import simulate
 from calib.cli.sweep import sweep
 from calib.cli.validate import validate
+from calib.cli.verbs import verb
+from calib.stages import stage
 
 app = typer.Typer(
     name="calib",
@@ -54,9 +56,9 @@ def _options(
 
 
 app.command("run")(telling(run))
-app.command("intrinsics")(intrinsics)
-app.command("extrinsics")(extrinsics)
-app.command("distortion")(distortion)
+app.command("intrinsics")(verb(stage("intrinsics")))
+app.command("extrinsics")(verb(stage("extrinsics")))
+app.command("distortion")(verb(stage("distortion")))
 app.command("lowpass")(lowpass)
 app.add_typer(imu, name="imu")
 app.command("align")(telling(align))

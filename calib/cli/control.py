@@ -49,13 +49,12 @@ def _limits(text: str | None) -> tuple[float, float] | None:
 
 def _known(path: Path, limits: str | None) -> tuple[Rig, SimulatedRig, Model]:
     from calib.core.rig import read_rig
-    from calib.stages.camera.results import camera_from_section
     from calib.stages.control.stage import control_model
     from calib.twin.rig import rig_from_file
 
     typed = _limits(limits)
     rig = read_rig(path)
-    camera = None if rig.camera is None else camera_from_section(rig.camera)
+    camera = None if rig.camera is None else rig.camera.optics
     machine = rig_from_file(rig, str(path), camera)
     return rig, machine, control_model(machine, rig.controller, typed)
 
@@ -266,7 +265,8 @@ def tune(
     """
     from calib.core.errors import BadInputError
     from calib.core.files import check_folder, check_writable
-    from calib.core.rig import section_json, write_rig
+    from calib.core.result import section_json
+    from calib.core.rig import write_rig
     from calib.core.units import parse_angle_rad
     from calib.stages.control.laws import ComputedTorque, design_observer
     from calib.stages.control.results import controller_section, source_margins
@@ -313,7 +313,7 @@ def _hashes(known: Rig) -> dict[str, str]:
     import yaml
 
     from calib.core.files import sha256
-    from calib.core.rig import section_json
+    from calib.core.result import section_json
 
     extra, out = known.model_extra or {}, {}
     for name in ("actuator", "pump"):

@@ -51,7 +51,7 @@ def firmware(
     plane = header.camera.plane
     verdicts = (("camera", header.camera.verdict), ("plane", plane.verdict if plane else ""))
     weak = [f"{name} is {verdict}" for name, verdict in verdicts if verdict not in ("ok", "")]
-    if header.camera.verdict != whole.camera.verdict:
+    if header.camera.verdict != whole.camera.verdict.word:
         error, covered = header.camera.inverse.max_error_px, header.camera.inverse.covered
         weak.append(f"the lens is undone to {error:.3g} px only, over {covered:.0%} of the picture")
     if as_json:

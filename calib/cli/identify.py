@@ -216,8 +216,8 @@ def logs(
 
     Writes the sections actuator and, where a log has commands, pump. Exits 1 when the verdict is not ok.
     """
-    from calib.core.files import check_folder, check_writable, shown
-    from calib.core.rig import hash_of, read_rig, write_rig
+    from calib.core.files import check_folder, check_writable, hash_of, shown
+    from calib.core.rig import read_rig, write_rig
     from calib.stages.actuator.read import read_track
     from calib.stages.actuator.results import (
         identified_json,
@@ -286,8 +286,8 @@ def pump(
 
     Writes the section pump. Exits 1 when something is left that the PWM does not explain.
     """
-    from calib.core.files import check_folder, check_writable, shown
-    from calib.core.rig import hash_of, read_rig, write_rig
+    from calib.core.files import check_folder, check_writable, hash_of, shown
+    from calib.core.rig import read_rig, write_rig
     from calib.stages.actuator.read import read_pump_table
     from calib.stages.actuator.results import plain_section, with_sections
     from calib.stages.actuator.stage import identify_pump, pump_section
@@ -336,8 +336,8 @@ def stiffness(
 
     Writes k0 .. k3 of one bellows to the section actuator.
     """
-    from calib.core.files import check_folder, check_writable, shown
-    from calib.core.rig import hash_of, read_rig, write_rig
+    from calib.core.files import check_folder, check_writable, hash_of, shown
+    from calib.core.rig import read_rig, write_rig
     from calib.stages.actuator.identify import fit_stiffness
     from calib.stages.actuator.read import read_displacements
     from calib.stages.actuator.results import plain_section, stiffness_section, with_sections

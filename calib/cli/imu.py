@@ -111,8 +111,9 @@ def static(
 
     Writes the section imu of the rig's file. Exits 1 when the verdict is not ok.
     """
-    from calib.core.files import check_folder, check_writable, shown, write_atomically
-    from calib.core.rig import hash_of, read_rig, section_json, write_rig
+    from calib.core.files import check_folder, check_writable, hash_of, shown, write_atomically
+    from calib.core.result import section_json
+    from calib.core.rig import read_rig, write_rig
     from calib.stages.imu.read import read_rest_log
     from calib.stages.imu.results import imu_section, kalibr_imu
     from calib.stages.imu.static import RestLog, analyse_static, judge
@@ -242,8 +243,9 @@ def intrinsics(
     degrees at a time through the circle. Writes the section imu_intrinsics of the rig's file. Exits 1
     when the verdict is not ok.
     """
-    from calib.core.files import check_folder, check_writable, shown
-    from calib.core.rig import hash_of, read_rig, section_json, write_rig
+    from calib.core.files import check_folder, check_writable, hash_of, shown
+    from calib.core.result import section_json
+    from calib.core.rig import read_rig, write_rig
     from calib.stages.imu.intrinsics import find_intrinsics, judge_intrinsics
     from calib.stages.imu.read import read_pose_files, read_pose_log
     from calib.stages.imu.results import intrinsics_section
@@ -389,9 +391,9 @@ def tune(
     """
     import numpy as np
 
-    from calib.core.files import check_folder, check_writable, shown
-    from calib.core.rig import hash_of, identity, read_rig, section_json, write_rig
-    from calib.stages.camera.results import camera_from_section, current_plane
+    from calib.core.files import check_folder, check_writable, hash_of, shown
+    from calib.core.result import identity, section_json
+    from calib.core.rig import read_rig, write_rig
     from calib.stages.imu.read import Reading, TuneLog, read_tune_log, sensor_noise
     from calib.stages.imu.results import filter_section
     from calib.stages.imu.tuning import tune as find
@@ -403,9 +405,9 @@ def tune(
     hashes: dict[str, str] = {}
     how = Reading(acc_unit, gyro_unit, rate == "up", reference)
     if reference in ("auto", "camera"):
-        plane = current_plane(before, str(rig))
+        plane = before.current_plane(str(rig))
         if plane is not None and before.camera is not None:
-            how = replace(how, camera=camera_from_section(before.camera), A_inverse=np.array(plane.A_inverse))
+            how = replace(how, camera=before.camera.optics, A_inverse=np.array(plane.A_inverse))
     read: list[TuneLog] = []
     for path in logs:
         log = read_tune_log(path, how)
@@ -516,8 +518,8 @@ def drift(
 
     Tuned gains are read from the rig's file, to which nothing is written.
     """
-    from calib.core.files import check_folder, shown
-    from calib.core.rig import hash_of, read_rig
+    from calib.core.files import check_folder, hash_of, shown
+    from calib.core.rig import read_rig
     from calib.stages.imu.drift import analyse_drift
     from calib.stages.imu.read import read_drift_log
     from calib.stages.imu.results import drift_document, tuned_filter

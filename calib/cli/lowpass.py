@@ -55,10 +55,10 @@ def lowpass(
     Uses the sections camera and plane of the rig's file for millimetres; without them jitter is in
     pixels. Exits 1 when the verdict is not ok.
     """
-    from calib.core.files import check_folder, check_writable
-    from calib.core.rig import Geometry, hash_of, identity, read_rig, section_json, write_rig
+    from calib.core.files import check_folder, check_writable, hash_of
+    from calib.core.result import identity, section_json
+    from calib.core.rig import Geometry, read_rig, write_rig
     from calib.core.units import parse_frequency_hz, parse_jitter
-    from calib.stages.camera.results import camera_from_section, current_plane
     from calib.stages.lowpass.filters import Design, design_lowpass, jitter_after
     from calib.stages.lowpass.filters import suggest as choose
     from calib.stages.lowpass.stage import lowpass_section, positions_from_log
@@ -79,8 +79,8 @@ def lowpass(
     if figures is not None:
         check_folder(figures)
     before = read_rig(rig)
-    plane = current_plane(before, str(rig))
-    camera = None if before.camera is None or plane is None else camera_from_section(before.camera)
+    plane = before.current_plane(str(rig))
+    camera = None if before.camera is None or plane is None else before.camera.optics
     A_inverse = None
     hashes: dict[str, str] = {}
     if plane is not None and before.camera is not None and (log or suggest):

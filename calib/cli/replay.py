@@ -97,8 +97,9 @@ def replay(
 
     Exits 1 when the innovations of a log contradict its covariance or a sensor is missing.
     """
-    from calib.core.files import check_folder, check_writable, make_folder, shown
-    from calib.core.rig import hash_of, read_rig, section_json, write_rig
+    from calib.core.files import check_folder, check_writable, hash_of, make_folder, shown
+    from calib.core.result import section_json
+    from calib.core.rig import read_rig, write_rig
     from calib.runner.folder import inside, slug
     from calib.stages.estimator.replay import replay_log
 

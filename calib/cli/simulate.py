@@ -67,10 +67,9 @@ def simulate(
     machine = SimulatedRig()
     if rig is not None:
         from calib.core.rig import read_rig
-        from calib.stages.camera.results import camera_from_section
 
         known = read_rig(rig)
-        camera = None if known.camera is None else camera_from_section(known.camera)
+        camera = None if known.camera is None else known.camera.optics
         machine = rig_from_file(known, str(rig), camera)
     told: dict[str, Any] = {"scenario": scenario, "seed": seed, "feedback": feedback}
     if scenario == "rig":

@@ -86,6 +86,14 @@ def file_sha256(path: Path) -> str:
         raise BadInputError(f"{shown(path)}: cannot be read: {error.strerror or error}") from error
 
 
+def hash_of(path: Path) -> str:
+    """SHA-256 of a file of any size, or of the names and files in a bag's folder."""
+    if (path / "metadata.yaml").is_file():
+        files = sorted(item for item in path.iterdir() if item.is_file())
+        return sha256("".join(f"{item.name!a} {file_sha256(item)}\n" for item in files).encode())
+    return file_sha256(path)
+
+
 def read_yaml_mapping(path: Path) -> dict[str, Any]:
     """A YAML file whose top level is a mapping; bounded in size and depth, aliases included.
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import importlib
-import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import yaml
 from pydantic import (
@@ -15,47 +14,12 @@ from pydantic import (
     ValidationError,
     ValidationInfo,
     field_validator,
-    model_validator,
 )
 
 from calib import __version__
 from calib.core.errors import BadInputError
-from calib.core.files import file_sha256, one_line, read_yaml_mapping, sha256, shown, write_atomically
-
-# ----------------------------------------------------------------------
-# What the sections of rig.yaml are made of: kinds of numbers, short lists, covariance matrices.
-
-Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
-Count = Annotated[int, Field(ge=0, strict=True)]
-Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
-Row3 = Annotated[list[Number], Field(min_length=3, max_length=3)]
-Matrix3 = Annotated[list[Row3], Field(min_length=3, max_length=3)]
-PerAxis = Annotated[list[Number | None], Field(min_length=3, max_length=3)]
-"""x, y, z; null for what was not measured or cannot be told."""
-Sizes = Annotated[list[NotNegative | None], Field(min_length=3, max_length=3)]
-"""As `PerAxis`, of what is not negative."""
-
-
-class Section(BaseModel):
-    """A section or a part of one: keys that it does not know are refused."""
-
-    model_config = ConfigDict(extra="forbid", defer_build=True)
-
-
-class CovarianceTable(Section):
-    """A covariance matrix with the names of its rows."""
-
-    order: list[str]
-    values: list[list[Number]]
-
-    @model_validator(mode="after")
-    def _square(self) -> CovarianceTable:
-        if len(self.values) != len(self.order) or any(len(row) != len(self.order) for row in self.values):
-            raise ValueError(f"expected {len(self.order)} rows and columns, as many as names in order")
-        return self
-
+from calib.core.files import one_line, read_yaml_mapping, shown, write_atomically
+from calib.core.result import Section, identity, section_json
 
 # ----------------------------------------------------------------------
 # rig.yaml: the one file that holds what was learnt about a rig.
@@ -67,13 +31,15 @@ class CovarianceTable(Section):
 
 if TYPE_CHECKING:
     from calib.stages.align.section import Align
+    from calib.stages.camera.section import Camera, Lens, Plane
     from calib.stages.control.section import Controller
     from calib.stages.estimator.section import Estimator
     from calib.stages.imu.section import Imu, ImuIntrinsics, OrientationFilter
     from calib.stages.lowpass.section import LowPass
 else:
     # Their schemas take a tenth of a second to build and are loaded where a file has these sections.
-    Align = Controller = Estimator = OrientationFilter = Imu = ImuIntrinsics = LowPass = Any
+    Align = Camera = Controller = Estimator = Imu = ImuIntrinsics = Any
+    Lens = LowPass = OrientationFilter = Plane = Any
 
 
 SECTIONS = (
@@ -96,6 +62,9 @@ SECTIONS = (
 """Sections in the order of the file."""
 
 _LATER = {
+    "camera": ("calib.stages.camera.section", "Camera"),
+    "plane": ("calib.stages.camera.section", "Plane"),
+    "lens": ("calib.stages.camera.section", "Lens"),
     "imu": ("calib.stages.imu.section", "Imu"),
     "imu_intrinsics": ("calib.stages.imu.section", "ImuIntrinsics"),
     "orientation_filter": ("calib.stages.imu.section", "OrientationFilter"),
@@ -106,14 +75,7 @@ _LATER = {
 }
 """Sections with modules of their own, and what they are there."""
 
-Verdict = Annotated[str, Field(pattern="^(ok|poor|unidentifiable|inconsistent)$")]
-Model = Annotated[str, Field(pattern="^(pinhole|radial2|radial3|brown5|rational8)$")]
-Focal = Annotated[float, Field(ge=1e-3, le=1e7, allow_inf_nan=False, strict=True)]
-Pixels = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False, strict=True)]
-Coefficient = Annotated[float, Field(ge=-1e30, le=1e30, allow_inf_nan=False, strict=True)]
 Metres = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False, strict=True)]
-Side = Annotated[int, Field(ge=1, le=100_000, strict=True)]
-Sigma = dict[str, NotNegative | None]
 
 
 class Geometry(Section):
@@ -132,95 +94,6 @@ class Geometry(Section):
         if value[0] >= value[2] or value[1] >= value[3]:
             raise ValueError("expected [least x, least y, greatest x, greatest y]")
         return value
-
-
-class Distortion(Section):
-    """Coefficients of `calib.stages.camera.model`; absent ones are zero."""
-
-    k1: Coefficient = 0.0
-    k2: Coefficient = 0.0
-    p1: Coefficient = 0.0
-    p2: Coefficient = 0.0
-    k3: Coefficient = 0.0
-    k4: Coefficient = 0.0
-    k5: Coefficient = 0.0
-    k6: Coefficient = 0.0
-
-
-class Camera(Section):
-    """Intrinsics, what they are worth, and why."""
-
-    model: Model
-    image_size_px: Annotated[list[Side], Field(min_length=2, max_length=2)]
-    fx_px: Focal
-    fy_px: Focal
-    skew_px: Pixels = 0.0
-    cx_px: Pixels
-    cy_px: Pixels
-    distortion: Distortion = Distortion()
-    sigma: Sigma = {}
-    covariance: CovarianceTable | None = None
-    rms_px: NotNegative | None = None
-    mean_error_px: NotNegative | None = None
-    projection_sigma_px: Sigma = {}
-    views: Count = 0
-    points: Count = 0
-    board: str | None = None
-    loss: str | None = None
-    termination: str | None = None
-    rejected: list[str] = []
-    verdict: Verdict
-    reasons: list[str] = []
-    remarks: list[str] = []
-    advice: list[str] = []
-
-
-class Plane(Section):
-    """The actuator's plane seen by the camera: A maps world metres to pixels (2.9 with K)."""
-
-    R_CW: Matrix3
-    t_CW_m: Row3
-    A_px_per_m: Matrix3
-    A_inverse: Matrix3
-    sigma: Sigma = {}
-    rms_px: NotNegative
-    rms_mm: NotNegative
-    sigma_marker_mm: Sigma = {}
-    without_intrinsics: dict[str, Number] = {}
-    pictures: Count = 0
-    points: Count = 0
-    orientation: str = ""
-    verdict: Verdict
-    reasons: list[str] = []
-
-
-class InverseLens(Section):
-    """The polynomial of `calib.stages.camera.lens`."""
-
-    radial: list[Number]
-    decentering_steps: Count
-    max_error_px: NotNegative | None
-    covered: Annotated[float, Field(ge=0, le=1)]
-
-
-class Lens(Section):
-    """What lens distortion does over the picture and costs on the plane."""
-
-    kind: str
-    max_px: Number
-    mean_px: Number
-    region_px: Annotated[list[Number], Field(min_length=4, max_length=4)]
-    region_max_px: Number
-    region_mean_px: Number
-    region_sigma_px: Number | None = None
-    monotonic: bool
-    plane_max_mm: Number | None = None
-    plane_mean_mm: Number | None = None
-    refitted_max_mm: Number | None = None
-    refitted_mean_mm: Number | None = None
-    inverse: InverseLens
-    verdict: Literal["negligible", "matters"]
-    reasons: list[str] = []
 
 
 class Provenance(Section):
@@ -254,6 +127,35 @@ class Rig(BaseModel):
         module, name = _LATER[str(info.field_name)]
         kind: type[BaseModel] = getattr(importlib.import_module(module), name)
         return None if value is None else kind.model_validate(value)
+
+    def current_plane(self, source: Path | str) -> Plane | None:
+        """The plane; `BadInputError` where it was calibrated with another camera than the rig's."""
+        if self.plane is None or self.camera is None:
+            return None
+        known = self.provenance.inputs.get("plane", {}).get("camera")
+        if known is not None and known != identity(self.camera):
+            raise BadInputError(
+                f"{shown(source)}: plane was calibrated with another camera than the one in camera; "
+                "run calib extrinsics again"
+            )
+        return self.plane
+
+    def outdated(self) -> list[str]:
+        """Sentences for sections that were computed from others than the rig now has."""
+        now = {
+            name: identity(section)
+            for name, section in (("camera", self.camera), ("plane", self.plane))
+            if section is not None
+        }
+        sentences = []
+        for name, verb in (("plane", "extrinsics"), ("lens", "distortion")):
+            known = self.provenance.inputs.get(name, {})
+            changed = [other for other in now if other in known and known[other] != now[other]]
+            if getattr(self, name) is not None and changed:
+                sentences.append(
+                    f"{name} in the file is of an earlier {' and '.join(changed)}; run calib {verb} again"
+                )
+        return sentences
 
 
 _EXPECTED = {
@@ -356,17 +258,6 @@ def _check_plane(path: Path, plane: Plane) -> None:
         raise BadInputError(f"{shown(path)}: plane.A_inverse is not the inverse of plane.A_px_per_m")
 
 
-def section_json(section: BaseModel) -> dict[str, Any]:
-    """A section as plain values, unset optional parts left out."""
-    return {
-        key: value
-        for key, value in section.model_dump(mode="json").items()
-        if value is not None
-        and value != {}
-        and not (key in ("rejected", "remarks", "advice") and value == [])
-    }
-
-
 def _plain(rig: Rig) -> dict[str, Any]:
     extra = rig.model_extra or {}
     out: dict[str, Any] = {}
@@ -390,11 +281,6 @@ def rig_text(rig: Rig) -> str:
     )
 
 
-def identity(section: BaseModel) -> str:
-    """SHA-256 of a section's values, to tell later whether something was computed from them."""
-    return sha256(yaml.safe_dump(section_json(section), sort_keys=True).encode())
-
-
 def write_rig(path: Path, rig: Rig, inputs: dict[str, dict[str, str]]) -> Rig:
     """Replace the file atomically; `inputs` holds the SHA-256 of each input by section and name."""
     merged = {**rig.provenance.inputs, **inputs}
@@ -402,16 +288,3 @@ def write_rig(path: Path, rig: Rig, inputs: dict[str, dict[str, str]]) -> Rig:
     rig = rig.model_copy(update={"provenance": Provenance(inputs=ordered)})
     write_atomically(path, rig_text(rig))
     return rig
-
-
-def finite_or_none(value: float) -> float | None:
-    """A standard deviation for the file: null where the data do not bound it."""
-    return float(value) if math.isfinite(value) else None
-
-
-def hash_of(path: Path) -> str:
-    """SHA-256 of a file of any size, or of the names and files in a bag's folder."""
-    if (path / "metadata.yaml").is_file():
-        files = sorted(item for item in path.iterdir() if item.is_file())
-        return sha256("".join(f"{item.name!a} {file_sha256(item)}\n" for item in files).encode())
-    return file_sha256(path)

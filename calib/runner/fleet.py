@@ -22,7 +22,8 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.core.errors import EXIT_INTERNAL, BadInputError
 from calib.core.files import check_folder, check_writable, make_folder, sha256, shown, write_atomically
-from calib.core.rig import Camera, CovarianceTable, Rig, read_rig, rig_text
+from calib.core.result import CovarianceTable
+from calib.core.rig import Rig, read_rig, rig_text
 from calib.runner.cache import held
 from calib.runner.engine import LIMIT_S, Broken, Cluster, Lost, Overdue, Task, run_tasks
 from calib.runner.folder import digest_of
@@ -42,6 +43,7 @@ from calib.runner.task import (
     without_secrets,
 )
 from calib.show.values import unit_of
+from calib.stages.camera.section import Camera
 
 # ----------------------------------------------------------------------
 # Outcomes as rows of a Parquet file, in blocks, and one column of it at a time.
@@ -928,7 +930,7 @@ def read_prior(folder: Path) -> Prior:
             continue
         members.add(fingerprint(rig))
         found = constants_of(rig.camera)
-        if verdict == "ok" and rig.camera.verdict == "ok" and not out and found is not None:
+        if verdict == "ok" and rig.camera.verdict.ok and not out and found is not None:
             gathered.setdefault(found[0], []).append(found[1:])
     groups, remarks = {}, []
     for kind, rigs in gathered.items():
@@ -1011,7 +1013,7 @@ def borrowed_camera(camera: Camera, group: Group, found: Posterior) -> Camera:
             "sigma": {**camera.sigma, **dict(zip(group.order, sigma.tolist(), strict=True))},
             "covariance": CovarianceTable(order=list(group.order), values=found.covariance.tolist()),
             "projection_sigma_px": {},
-            "remarks": [*camera.remarks, remark],
+            "remarks_": [*camera.verdict.remarks, remark],
         }
     )
 

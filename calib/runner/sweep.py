@@ -29,7 +29,6 @@ from calib.core.units import parse_duration_s
 from calib.runner.engine import LIMIT_S, Broken, Cluster, Lost, Overdue, Task, run_tasks
 from calib.runner.fleet import HIDDEN, Store, Table, column, texts, write_table
 from calib.runner.task import needed, program
-from calib.stages.camera.results import camera_from_section
 from calib.stages.control.stage import control_model, run_controller
 from calib.stages.control.tuning import Tracking
 from calib.twin.rig import SimulatedRig, rig_from_file
@@ -468,7 +467,7 @@ def _rig(document: dict[str, Any]) -> Rig:
 
 
 def _machine(rig: Rig) -> SimulatedRig:
-    camera = None if rig.camera is None else camera_from_section(rig.camera)
+    camera = None if rig.camera is None else rig.camera.optics
     return rig_from_file(rig, str(_HERE), camera)
 
 

@@ -22,10 +22,10 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.core.files import shown
-from calib.core.rig import Geometry, Rig, read_rig, section_json
+from calib.core.result import section_json
+from calib.core.rig import Geometry, Rig, read_rig
 from calib.show.values import Constant, constants
 from calib.stages.camera.model import project, undistort
-from calib.stages.camera.results import camera_from_section
 
 SIGNIFICANT = 3.0
 """Standard deviations from which on a difference is called significant."""
@@ -197,13 +197,13 @@ def _seen(rig: Rig, world_m: FloatArray) -> FloatArray:
     assert rig.camera is not None and rig.plane is not None
     points_W = np.column_stack([world_m, np.zeros(len(world_m))])
     points_C = points_W @ np.array(rig.plane.R_CW).T + np.array(rig.plane.t_CW_m)
-    return project(camera_from_section(rig.camera), points_C)
+    return project(rig.camera.optics, points_C)
 
 
 def _read_back(rig: Rig, pixels: FloatArray) -> FloatArray:
     """Points (n, 2) of the plane at distorted pixels (n, 2)."""
     assert rig.camera is not None and rig.plane is not None
-    camera = camera_from_section(rig.camera)
+    camera = rig.camera.optics
     rays = np.column_stack([undistort(camera, pixels), np.ones(len(pixels))])
     p = rays @ camera.K.T @ np.array(rig.plane.A_inverse).T
     return np.asarray(p[:, :2] / p[:, 2:])

@@ -1,1 +1,85 @@
-"""The stages of a calibration: each folder has its mathematics, its section of rig.yaml and its verb."""
+"""The stages of a calibration: each folder has its mathematics, its section of rig.yaml and its verb.
+
+`STAGES` lists them in the order of a calibration; all that is derived from a stage looks here.
+"""
+
+from __future__ import annotations
+
+import glob
+import importlib
+import inspect
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from calib.core.errors import BadInputError
+from calib.core.stage import Files, Stage, options_of
+
+if TYPE_CHECKING:
+    from calib.core.rig import Rig
+
+STAGES = {
+    "intrinsics": "calib.stages.camera.stage",
+    "extrinsics": "calib.stages.camera.stage",
+    "distortion": "calib.stages.camera.stage",
+}
+"""Module of each stage by the words of its verb; the last word is its name there."""
+
+
+def stage(name: str) -> Stage:
+    """The stage with this verb."""
+    found: Stage = getattr(importlib.import_module(STAGES[name]), name.split()[-1])
+    return found
+
+
+def expanded(sources: Any) -> tuple[Path, ...]:
+    """Paths from a path, a pattern such as `logs/swing*.csv`, or several of them."""
+    if sources is None:
+        return ()
+    if isinstance(sources, str | Path):
+        text = str(sources)
+        if not glob.has_magic(text) or Path(text).exists():
+            return (Path(text),)
+        matches = sorted(glob.glob(text))  # noqa: PTH207  a pattern may be absolute
+        if not matches:
+            raise BadInputError(f"{text}: matches no file")
+        return tuple(Path(one) for one in matches)
+    return tuple(path for one in sources for path in expanded(one))
+
+
+def function(name: str) -> Callable[..., Any]:
+    """The Python function of a stage: `calib.NAME(sources, rig, option=value)` returns its result."""
+    made = stage(name)
+
+    def call(
+        sources: str | Path | Sequence[str | Path] | None = None, rig: Rig | None = None, **options: Any
+    ) -> Any:
+        from calib.core.rig import Rig
+
+        files = Files(expanded(sources), narrate=logging.getLogger("calib").info)
+        return made.run(files, Rig() if rig is None else rig, options_of(made.options, options))
+
+    def call_without_sources(rig: Rig | None = None, **options: Any) -> Any:
+        return call(None, rig, **options)
+
+    public: Any = call if made.sources else call_without_sources
+    kind = inspect.Parameter
+    parameters = [
+        kind("rig", kind.POSITIONAL_OR_KEYWORD, default=None),
+        *(
+            kind(one.name, kind.KEYWORD_ONLY, default=None if one.default is MISSING else one.default)
+            for one in fields(made.options)
+        ),
+    ]
+    if made.sources:
+        parameters.insert(0, kind("sources", kind.POSITIONAL_OR_KEYWORD, default=kind.empty))
+    options = "\n".join(f"    {one.name} : {one.metadata['words']}" for one in fields(made.options))
+    public.__name__ = public.__qualname__ = name.split()[-1]
+    public.__doc__ = made.summary.rstrip() + (
+        f"\n\n    Options\n    -------\n{options}\n    " if options else ""
+    )
+    public.__signature__ = inspect.Signature(parameters)
+    made_function: Callable[..., Any] = public
+    return made_function

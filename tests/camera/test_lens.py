@@ -54,7 +54,7 @@ def test_the_figures_of_the_source_document() -> None:
     assert report.max_px == pytest.approx(3.6, abs=0.05)
     assert report.kind == "mustache"
     assert report.monotonic
-    assert report.verdict == "matters"
+    assert report.effect == "matters"
     assert report.inverse.max_error_px <= 0.006
 
 

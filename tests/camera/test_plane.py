@@ -8,6 +8,7 @@ import pytest
 
 from calib.core.errors import BadInputError
 from calib.core.geometry import apply_homography, fit_homography, map_jacobian
+from calib.core.verdict import Verdict
 from calib.stages.camera.model import Board, Camera, View, camera_from_vector, project, vector_from_camera
 from calib.stages.camera.plane import (
     calibrate_plane,
@@ -61,7 +62,7 @@ def test_exact_pixels_give_the_plane_back(camera: Camera) -> None:
     assert np.abs(plane.A / expected - 1.0).max() < 1e-10
     assert plane.rms_px < 1e-10
     assert plane.rms_mm < 1e-10
-    assert plane.verdict == "ok"
+    assert plane.verdict.word == "ok"
 
 
 @pytest.mark.parametrize("camera", [THESIS, SKEWED, IDEAL], ids=["thesis", "skewed brown5", "pinhole"])
@@ -482,7 +483,7 @@ def several(count: int, tilt_rad: float = 0.3, distance_m: float = 0.3) -> list[
 @pytest.mark.parametrize("count", [1, 4])
 def test_good_pictures_are_ok(tilt: float, distance: float, count: int) -> None:
     plane = calibrate_plane(THESIS, COVARIANCE, several(count, tilt, distance), camera_rms_px=0.14)
-    assert (plane.verdict, plane.reasons, plane.notes) == ("ok", (), ())
+    assert plane.verdict == Verdict()
 
 
 def test_a_camera_that_moved_between_pictures_is_noticed() -> None:
@@ -490,8 +491,8 @@ def test_a_camera_that_moved_between_pictures_is_noticed() -> None:
     views = several(3)
     views.append(picture_plane_checks("moved.png", R, t + np.array([0.0008, 0.0, 0.0]), seed=9))
     plane = calibrate_plane(THESIS, COVARIANCE, views)
-    assert plane.verdict == "inconsistent"
-    assert "moved.png" in plane.reasons[0]
+    assert plane.verdict.word == "inconsistent"
+    assert "moved.png" in plane.verdict.reasons[0]
     assert plane.pictures[3].moved_px > 2 * plane.pictures[0].moved_px
 
 
@@ -513,8 +514,8 @@ def test_false_alarms_of_movement_are_rare() -> None:
 def test_squares_that_are_not_square_are_noticed() -> None:
     view = picture_plane_checks("a", *pose_at(0.1, 0.25), world=WORLD * np.array([1.0, 1.06]))
     plane = calibrate_plane(THESIS, COVARIANCE, [View("a", WORLD, view.pixels)])
-    assert plane.verdict == "poor"
-    assert any("proportions of the board" in reason for reason in plane.reasons)
+    assert plane.verdict.word == "poor"
+    assert any("proportions of the board" in reason for reason in plane.verdict.reasons)
 
 
 def test_two_tilts_that_fit_alike_are_told() -> None:
@@ -528,10 +529,10 @@ def test_two_tilts_that_fit_alike_are_told() -> None:
             [picture_plane_checks("a", R, t, 0.5, far, seed=seed)],
             workspace_m=(-0.2, -0.1, 0.2, 0.2),
         )
-        told += any("tilted the other way" in reason for reason in plane.reasons)
+        told += any("tilted the other way" in reason for reason in plane.verdict.reasons)
     near = calibrate_plane(far, None, [picture_plane_checks("a", *pose_at(0.6, 0.4), 0.5, far)])
     assert told >= 3
-    assert near.verdict == "ok"
+    assert near.verdict.word == "ok"
 
 
 @pytest.mark.parametrize(

@@ -70,7 +70,8 @@ def test_a_wrong_size_is_answered_with_what_was_found(calib, pictures, tmp_path)
 def test_a_table(calib, points, tmp_path) -> None:
     rig = tmp_path / "rig.yaml"
     ended = calib("intrinsics", points, *SIZE, *RADIAL2, "--skew", "--rig", rig)
-    assert "640x480 px, 6 views, 324 points" in ended.out
+    assert re.search(r"picture, px +640 x 480", ended.out)
+    assert re.search(r"views +6\b", ended.out) and re.search(r"points +324\b", ended.out)
     camera = _camera(rig)
     assert camera["fx_px"] == pytest.approx(530.0, abs=5 * camera["sigma"]["fx_px"])
     assert "skew_px" in camera["sigma"]
@@ -197,7 +198,7 @@ def folder(project_root, tmp_path):
 def test_the_shipped_plane(calib, project_root, rig) -> None:
     ended = calib("extrinsics", project_root / "images" / "plane", "--rig", rig)
     assert ended.code == 0
-    assert "mm on the plane" in ended.out
+    assert "RMS on the plane, mm" in ended.out
     assert "corner (0, 0) was taken at pixel (107.6, 64.7)" in ended.out
     whole = yaml.safe_load(rig.read_text())
     A, A_inverse = np.array(whole["plane"]["A_px_per_m"]), np.array(whole["plane"]["A_inverse"])
@@ -253,8 +254,8 @@ def test_a_plane_of_another_camera_is_not_used(calib, rig, points, folder, tmp_p
 def test_the_shipped_camera(calib, rig) -> None:
     ended = calib("distortion", "--rig", rig)
     assert ended.code == 0
-    assert "mustache distortion, radial2" in ended.out
-    assert "verdict: matters" in ended.out
+    assert re.search(r"kind +mustache", ended.out)
+    assert re.search(r"effect +matters", ended.out)
     whole = yaml.safe_load(rig.read_text())
     assert whole["lens"]["inverse"]["max_error_px"] < 0.01
     assert set(whole["provenance"]["inputs"]["lens"]) == {"camera", "plane"}
@@ -268,7 +269,7 @@ def test_a_lens_that_cannot_be_undone(calib, rig, k1: str) -> None:
     rig.write_text(yaml.safe_dump({"camera": camera}))
     ended = calib("distortion", "--rig", rig)
     assert ended.code == 0
-    assert "verdict: matters" in ended.out
+    assert re.search(r"effect +matters", ended.out)
     ended = calib("firmware", "--rig", rig, "-o", rig.parent)
     assert ended.code == 1
     assert "the lens is undone to" in ended.err
@@ -282,11 +283,11 @@ def test_a_covariance_that_is_none(calib, rig) -> None:
     for change, says in (
         (
             {"order": ["fx_px", *table["order"][:-1]]},
-            "camera.covariance.order has 'fx_px', expected intrinsics, each once",
+            "expected intrinsics in order, each once, not 'fx_px'",
         ),
-        ({"order": ["f", *table["order"][1:]]}, "camera.covariance.order has 'f'"),
+        ({"order": ["f", *table["order"][1:]]}, "each once, not 'f'"),
         ({"values": table["values"][1:]}, "expected 6 rows and columns"),
-        ({"values": [[-9.0, *table["values"][0][1:]], *table["values"][1:]]}, "is not a covariance matrix"),
+        ({"values": [[-9.0, *table["values"][0][1:]], *table["values"][1:]]}, "expected a covariance matrix"),
     ):
         whole["camera"]["covariance"] = table | change
         rig.write_text(yaml.safe_dump(whole))

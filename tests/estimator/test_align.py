@@ -13,7 +13,7 @@ from scipy.stats import norm
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
-from calib.core.rig import Camera, Distortion, Geometry, Plane, Rig
+from calib.core.rig import Geometry, Rig
 from calib.io.logs import Log
 from calib.stages.align.read import settings_from_rig, with_drawn_marker
 from calib.stages.align.solve import (
@@ -43,6 +43,7 @@ from calib.stages.align.spline import (
     normal_sums,
     states_of,
 )
+from calib.stages.camera.section import Camera, Distortion, Plane
 from calib.stages.estimator.sensors import SENSOR, SIZE, sensor_values, view_coefficients
 from calib.twin.rig import SimulatedRig, nominal_view
 

@@ -69,7 +69,6 @@ def check(data: bytes, folder: Path) -> None:
     from calib.core.errors import BadInputError
     from calib.core.rig import read_rig, rig_text
     from calib.runner.graph import sections_of
-    from calib.stages.camera.results import outdated
 
     path, again = folder / "rig.yaml", folder / "again.yaml"
     path.write_bytes(data)
@@ -78,7 +77,7 @@ def check(data: bytes, folder: Path) -> None:
     again.write_text(text, encoding="utf-8")
     if len(text) < 500_000:
         assert rig_text(read_rig(again)) == text
-    outdated(rig)
+    rig.outdated()
     for use in (_sections, _page, _difference, _constants, _formats):
         try:
             use(path)
@@ -127,16 +126,15 @@ def _constants(path: Path) -> None:
 def _formats(path: Path) -> None:
     from calib.core.rig import read_rig
     from calib.stages.camera.formats import from_opencv, from_ros, to_kalibr, to_opencv, to_ros
-    from calib.stages.camera.results import camera_covariance, camera_from_section, current_plane
 
     whole = read_rig(path)
     if whole.camera is None:
         return
-    camera = camera_from_section(whole.camera)
+    camera = whole.camera.optics
     for there, back in ((to_ros, from_ros), (to_opencv, from_opencv)):
         assert back(there(camera)).K.tolist() == camera.K.tolist()
-    current_plane(whole, "rig.yaml")
-    camera_covariance(whole.camera, "rig.yaml")
+    whole.current_plane("rig.yaml")
+    assert whole.camera.intrinsic_covariance is not None or whole.camera.covariance is None
     to_kalibr(camera)
 
 

@@ -17,7 +17,6 @@ from calib.io.logs import check_time, read_log
 from calib.io.pictures import list_pictures
 from calib.stages.camera.model import Camera, project
 from calib.stages.camera.read import read_board_file
-from calib.stages.camera.results import camera_from_section
 from calib.twin.folder import LOGS, write_rig_folder
 from calib.twin.rig import SimulatedRig, nominal_view, rig_from_file, workspace_homography
 from calib.twin.sensors import View
@@ -29,7 +28,7 @@ def rig(tmp_path: Path):
         path = tmp_path / "rig.yaml"
         path.write_text(text)
         read = read_rig(path)
-        camera = None if read.camera is None else camera_from_section(read.camera)
+        camera = None if read.camera is None else read.camera.optics
         return rig_from_file(read, "rig.yaml", camera)
 
     return _rig

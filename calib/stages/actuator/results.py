@@ -13,7 +13,8 @@ from pydantic import BaseModel
 
 from calib.core.errors import BadInputError
 from calib.core.files import shown
-from calib.core.rig import CovarianceTable, Rig, finite_or_none, section_json
+from calib.core.result import CovarianceTable, finite_or_none, section_json
+from calib.core.rig import Rig
 from calib.stages.actuator.identify import (
     PARAMETERS,
     Colour,

@@ -14,16 +14,8 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from calib.core.errors import BadInputError
 from calib.core.files import shown
-from calib.core.rig import (
-    CovarianceTable,
-    NotNegative,
-    Number,
-    Pair,
-    Positive,
-    Rig,
-    Section,
-    validation_sentence,
-)
+from calib.core.result import CovarianceTable, NotNegative, Number, Pair, Positive, Section
+from calib.core.rig import Rig, validation_sentence
 
 Verdict = Literal["ok", "poor", "unidentifiable"]
 Kind = TypeVar("Kind", bound=BaseModel)

@@ -12,7 +12,8 @@ import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
-from calib.core.rig import Rig, finite_or_none
+from calib.core.result import finite_or_none
+from calib.core.rig import Rig
 from calib.stages.actuator.identify import (
     Decrement,
     Nominal,

@@ -13,11 +13,11 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.core.files import shown
-from calib.core.rig import Geometry, Rig, finite_or_none
+from calib.core.result import finite_or_none
+from calib.core.rig import Geometry, Rig
 from calib.io.logs import Log, check_time, read_log
 from calib.stages.align.section import Align, AlignCovariance, AlignLogCheck
 from calib.stages.align.solve import AlignJudgement, AlignLog, Alignment, LogCheck, Settings, rest_angle
-from calib.stages.camera.results import camera_from_section, current_plane
 from calib.stages.estimator.noise import grid_px
 from calib.stages.estimator.sensors import SENSOR, sensor_values, view_coefficients
 
@@ -144,12 +144,12 @@ def settings_from_rig(
     source = shown(path)
     if rig.camera is None:
         raise BadInputError(f"{source}: has no camera, which an alignment needs; run calib intrinsics first")
-    plane = current_plane(rig, str(path))
+    plane = rig.current_plane(str(path))
     if plane is None:
         raise BadInputError(f"{source}: has no plane, which an alignment needs; run calib extrinsics first")
     x0, y0, x1, y1 = (rig.geometry or Geometry()).workspace_m
     view = view_coefficients(
-        camera_from_section(rig.camera),
+        rig.camera.optics,
         np.array(plane.R_CW),
         np.array(plane.t_CW_m),
         (0.5 * (x0 + x1), 0.5 * (y0 + y1)),

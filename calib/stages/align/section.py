@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from calib.core.rig import Count, CovarianceTable, NotNegative, Number, Pair, Section
+from calib.core.result import Count, CovarianceTable, NotNegative, Number, Pair, Section
 
 Angle = Annotated[float, Field(ge=-7.0, le=7.0, allow_inf_nan=False, strict=True)]
 Seconds = Annotated[float, Field(ge=-10.0, le=10.0, allow_inf_nan=False, strict=True)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -282,7 +282,7 @@ class DistortionReport:
         covariance of the intrinsics; None where that is not known.
     plane : cost on the plane, None where no plane is known or none of it is seen.
     inverse : polynomial that undoes the distortion.
-    verdict, reasons : "negligible" or "matters", and why.
+    effect, why : "negligible" or "matters", and why.
     """
 
     kind: str
@@ -297,8 +297,8 @@ class DistortionReport:
     region_sigma_px: float | None
     plane: PlaneCost | None
     inverse: InversePolynomial
-    verdict: str
-    reasons: tuple[str, ...]
+    effect: Literal["negligible", "matters"]
+    why: str
 
 
 def displacement_field(camera: Camera, pixels: FloatArray) -> FloatArray:
@@ -437,7 +437,7 @@ def analyse_distortion(
         sigma = projection_sigma_px(camera, camera_covariance, at)
     _, fold = fold_radius(camera)
     corner = _corner_radius(camera)
-    verdict, reasons = _judge(inside, sigma, plane, cost)
+    effect, why = _judge(inside, sigma, plane, cost)
     return DistortionReport(
         kind=distortion_kind(camera),
         max_px=float(whole.max()),
@@ -451,8 +451,8 @@ def analyse_distortion(
         region_sigma_px=None if sigma is None else float(sigma.min()),
         plane=cost,
         inverse=fit_inverse(camera, tolerance_px),
-        verdict=verdict,
-        reasons=reasons,
+        effect=effect,
+        why=why,
     )
 
 
@@ -480,9 +480,10 @@ def _on_plane(camera: Camera, plane: PlaneView) -> tuple[PlaneCost | None, Regio
 
 def _judge(
     inside: FloatArray, sigma: FloatArray | None, plane: PlaneView | None, cost: PlaneCost | None
-) -> tuple[str, tuple[str, ...]]:
+) -> tuple[Literal["negligible", "matters"], str]:
     if inside.max() == 0.0:
-        return "negligible", (
+        return (
+            "negligible",
             "the camera's model has no distortion; whether the lens has none shows in the residuals",
         )
     if cost is not None and plane is not None and plane.sigma_mm is not None:
@@ -499,8 +500,9 @@ def _judge(
             f"{sigma[worst]:.3f} px"
         )
     else:
-        return "matters", (
+        return (
+            "matters",
             f"the displacement reaches {inside.max():.2f} px in the region and no sigma is known to hold it "
             "against",
         )
-    return ("negligible" if small else "matters"), (reason,)
+    return ("negligible" if small else "matters"), reason

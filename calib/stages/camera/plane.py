@@ -10,6 +10,7 @@ import numpy as np
 from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.core.errors import BadInputError
 from calib.core.geometry import Homography, apply_homography, fit_homography, map_jacobian
+from calib.core.verdict import Finding, Verdict
 from calib.stages.camera.model import Board, Camera, View, project, undistort
 from calib.stages.camera.pose import Pose, fit_pose, plane_map, pose_derivatives
 
@@ -259,8 +260,8 @@ def judge(
     sigma: PositionSigma,
     workspace_m: tuple[float, float, float, float],
     camera_rms_px: float | None,
-) -> tuple[str, tuple[str, ...], tuple[str, ...]]:
-    """Verdict, its reasons, and notes that do not lower it."""
+) -> Verdict:
+    """What speaks against a plane, and notes that do not."""
     world_m = np.concatenate([view.target_m for view in views])
     pixels = np.concatenate([view.pixels for view in views])
     moved = _moved(comparison)
@@ -286,8 +287,14 @@ def judge(
     freedom = 2 * len(np.unique(np.round(world_m, 9), axis=0)) - 6
     if freedom < _FEW_FREEDOMS:
         notes.append(f"the sigma rests on {freedom} degrees of freedom only and is rough")
-    verdict = "inconsistent" if moved else "unidentifiable" if lost else "poor" if poor else "ok"
-    return verdict, tuple(moved + lost + poor), tuple(notes)
+    return Verdict.of(
+        [
+            *(Finding("inconsistent", text) for text in moved),
+            *(Finding("unidentifiable", text) for text in lost),
+            *(Finding("poor", text) for text in poor),
+            *(Finding("remark", text) for text in notes),
+        ]
+    )
 
 
 def _moved(comparison: Comparison) -> list[str]:
@@ -442,8 +449,7 @@ class Plane:
     sigma : standard deviations of a marker's position over the workspace.
     direct : homography from metres to distorted pixels, fitted without intrinsics.
     direct_difference_mm : (N,) distance between the two maps at `sigma.points_m`.
-    verdict, reasons : "ok", "poor", "unidentifiable" or "inconsistent", and why it is not ok.
-    notes : remarks that do not lower the verdict.
+    verdict : whether to trust it.
     """
 
     R_CW: FloatArray
@@ -464,9 +470,7 @@ class Plane:
     sigma: PositionSigma
     direct: Homography
     direct_difference_mm: FloatArray
-    verdict: str
-    reasons: tuple[str, ...]
-    notes: tuple[str, ...]
+    verdict: Verdict
 
     @property
     def A_inverse(self) -> FloatArray:
@@ -546,7 +550,7 @@ def calibrate_plane(
         box = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
     sigma = position_sigma(camera, camera_covariance, pose, workspace_grid(box))
     direct = fit_homography(world_m, pixels, groups)
-    verdict, reasons, notes = judge(camera, views, pose, comparison, sigma, box, camera_rms_px)
+    verdict = judge(camera, views, pose, comparison, sigma, box, camera_rms_px)
 
     error_px = np.linalg.norm(pose.residuals_px, axis=1)
     read_m = plane_map(camera, pose.R_CW, pose.t_CW_m, pixels)
@@ -572,8 +576,6 @@ def calibrate_plane(
         direct=direct,
         direct_difference_mm=_difference_mm(camera, pose, direct, sigma.points_m),
         verdict=verdict,
-        reasons=reasons,
-        notes=notes,
     )
 
 

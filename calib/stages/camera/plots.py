@@ -837,7 +837,7 @@ def _displacement(camera: Camera, report: DistortionReport) -> Figure:
     most, mean = number(report.max_px, "px"), number(report.mean_px, "px")
     region_most, region_mean = number(report.region_max_px, "px"), number(report.region_mean_px, "px")
     note = (
-        f"Kind: {plain(report.kind)}; verdict: {plain(report.verdict)}. Whole picture: up to {most}, mean "
+        f"Kind: {plain(report.kind)}; it {plain(report.effect)}. Whole picture: up to {most}, mean "
         f"{mean}. Region of interest (box): up to {region_most}, mean {region_mean}."
     )
     if report.plane is not None:
@@ -980,7 +980,7 @@ def _sigma(plane: Plane) -> Figure:
         2.0 * _panel_in(plane, 0.46 * WIDTH_IN),
         "How well a marker's position is known over the workspace",
         note,
-        plane.verdict,
+        plane.verdict.word,
     )
     panels = figure.subplots(2, 2).ravel()
     norm = _common_colours(finite)
@@ -1038,7 +1038,7 @@ def _difference(camera: Camera, plane: Plane) -> Figure:
         _panel_in(plane, 0.8 * WIDTH_IN),
         "What it costs to leave the lens out, over the workspace",
         note,
-        plane.verdict,
+        plane.verdict.word,
     )
     axes = figure.subplots()
     _workspace(axes, plane)
@@ -1068,7 +1068,7 @@ def _picture(camera: Camera, plane: Plane) -> Figure:
         panel_height_in(0.88 * WIDTH_IN, camera.image_size_px),
         "The plane in the picture: corners, their residuals, and the workspace",
         note,
-        plane.verdict,
+        plane.verdict.word,
     )
     axes = figure.subplots()
     picture_frame(axes, camera.image_size_px, margin=0.02)
@@ -1162,7 +1162,7 @@ def write_camera_figures(folder: Path, result: Intrinsics) -> list[Path]:
     Raises `BadInputError` where the folder or a file cannot be written.
     """
     figure_folder(folder)
-    fit, verdict = result.calibration, result.judgement.verdict
+    fit, verdict = result.calibration, result.judgement.verdict.word
     seen = fit.observations.pixels[fit.observations.present]
     written = []
     with look():

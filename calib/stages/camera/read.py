@@ -16,8 +16,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from calib.core.arrays import FloatArray, GrayImage
 from calib.core.errors import BadInputError, UsageError
-from calib.core.files import check_readable, read_yaml_mapping, shown
-from calib.core.rig import hash_of, validation_sentence
+from calib.core.files import check_readable, hash_of, read_yaml_mapping, shown
+from calib.core.rig import validation_sentence
 from calib.core.units import plain_number
 from calib.core.workers import Workers
 from calib.io.pictures import Picture, list_pictures, read_picture, same_size

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from calib.core.arrays import FloatArray, IntArray
+from calib.core.verdict import Finding, Severity, Verdict
 from calib.stages.camera.bundle import Calibration, Covariance, covariance, projection_sigma_px
 from calib.stages.camera.checks import (
     Coverage,
@@ -40,24 +41,6 @@ from calib.stages.camera.checks import (
 
 # ----------------------------------------------------------------------
 # What a check has found about a calibration, and the limits that a finding is held against.
-
-OK = "ok"
-POOR = "poor"
-INCONSISTENT = "inconsistent"
-UNIDENTIFIABLE = "unidentifiable"
-REMARK = "remark"
-
-VERDICTS = (OK, POOR, INCONSISTENT, UNIDENTIFIABLE)
-"""From the best to the worst; the worst finding decides."""
-
-
-@dataclass(frozen=True)
-class Finding:
-    """A sentence, its weight (one of `VERDICTS` but `OK`, or `REMARK`) and what to do about it."""
-
-    kind: str
-    text: str
-    advice: str = ""
 
 
 def listed(names: Sequence[str], most: int = 6) -> str:
@@ -171,34 +154,34 @@ def of_solution(calibration: Calibration, unique: int, limits: Limits) -> list[F
     short = calibration.decrement
     if calibration.termination == "behind the camera":
         text = "No camera was found that has all points of the board in front of it."
-        out.append(Finding(UNIDENTIFIABLE, text))
+        out.append(Finding("unidentifiable", text))
     elif calibration.termination == "singular":
         text = (
             "The normal equations are singular: the views leave a direction of the parameters entirely free."
         )
-        out.append(Finding(UNIDENTIFIABLE, text, MORE_TILT))
+        out.append(Finding("unidentifiable", text, MORE_TILT))
     elif not calibration.converged and not short < 0.1:
         text = (
             f"The solver stopped ({calibration.termination}) after {calibration.evaluations} evaluations, "
             f"{short:.2g} standard deviations short of a minimum (up to {limits.decrement:g} does not "
             "matter): the views leave a direction nearly free."
         )
-        out.append(Finding(REMARK if short < limits.decrement else UNIDENTIFIABLE, text))
+        out.append(Finding("remark" if short < limits.decrement else "unidentifiable", text))
     if calibration.degrees_of_freedom <= 0:
         text = (
             f"{points} points in {views} views give no more equations than there are unknowns, "
             "so nothing checks the answer."
         )
-        out.append(Finding(UNIDENTIFIABLE, text, _MORE_VIEWS))
+        out.append(Finding("unidentifiable", text, _MORE_VIEWS))
     if unique < 2:
         text = "There is only one view of the board, which hardly tells focal length and distance apart."
-        out.append(Finding(UNIDENTIFIABLE, text, _MORE_VIEWS))
+        out.append(Finding("unidentifiable", text, _MORE_VIEWS))
     elif unique < limits.views:
         text = (
             f"{unique} different views are too few to check one against the others; "
             f"{limits.views} are the least."
         )
-        out.append(Finding(POOR, text, _MORE_VIEWS))
+        out.append(Finding("poor", text, _MORE_VIEWS))
     return out
 
 
@@ -213,7 +196,7 @@ def of_lens(found: Lens, calibration: Calibration, reach: float) -> list[Finding
             "a pixel: distortion has taken the place of something else."
         )
         rational = camera.model == "rational8"
-        kind = POOR if rational else UNIDENTIFIABLE
+        kind: Severity = "poor" if rational else "unidentifiable"
         out.append(Finding(kind, text, "Use a simpler lens model." if rational else MORE_TILT))
     elif found.image_shown < 1.0 or found.image_slope <= 0.0:
         lost = 100 * (1 - found.image_shown)
@@ -221,7 +204,7 @@ def of_lens(found: Lens, calibration: Calibration, reach: float) -> list[Finding
             f"The distortion curve folds over inside of the picture: {lost:.0f} % of its border cannot be "
             f"undistorted (up to 10 is good; points were seen {100 * reach:.0f} % of the way to the corners)."
         )
-        out.append(Finding(POOR if lost > 10.0 else REMARK, text, _IN_CORNERS))
+        out.append(Finding("poor" if lost > 10.0 else "remark", text, _IN_CORNERS))
     focal = min(camera.fx_px, camera.fy_px)
     if not 0.25 * width < focal < 30 * width:
         text = (
@@ -229,7 +212,7 @@ def of_lens(found: Lens, calibration: Calibration, reach: float) -> list[Finding
             "lenses that this model suits have 0.25 to 30."
         )
         free = not 0.15 * width < focal < 100 * width
-        out.append(Finding(UNIDENTIFIABLE if free else POOR, text, MORE_TILT))
+        out.append(Finding("unidentifiable" if free else "poor", text, MORE_TILT))
     return out
 
 
@@ -243,26 +226,26 @@ def of_focal(sigma_share: float, interval: FocalInterval | None, limits: Limits)
             f"considered; up to {100 * limits.focal_poor:.0f} is good, {100 * limits.focal_free:.0f} means "
             "that it is free)."
         )
-        kind = REMARK if sigma_share < limits.focal_poor else POOR
-        out.append(Finding(kind if sigma_share < limits.focal_free else UNIDENTIFIABLE, text, MORE_TILT))
+        kind: Severity = "remark" if sigma_share < limits.focal_poor else "poor"
+        out.append(Finding(kind if sigma_share < limits.focal_free else "unidentifiable", text, MORE_TILT))
     if interval is None:
         return out
     if interval.lower_cost:
         text = "Moving the focal length lowers the cost: the solver had not found the minimum."
-        out.append(Finding(UNIDENTIFIABLE, text, MORE_TILT))
+        out.append(Finding("unidentifiable", text, MORE_TILT))
     elif not interval.bounded:
         text = (
             f"The views fit a focal length of {_range(interval)} about as well as the "
             f"{interval.fx_px:.0f} px found: its 95 % interval has no end."
         )
-        out.append(Finding(UNIDENTIFIABLE, text, MORE_TILT))
+        out.append(Finding("unidentifiable", text, MORE_TILT))
     elif interval.half_width_share > 2 * limits.focal_poor:
         text = (
             f"Focal lengths from {interval.low_px:.1f} to {interval.high_px:.1f} px fit the views about "
             f"equally well (95 % interval; {200 * limits.focal_poor:.0f} % to either side is good)."
         )
         free = interval.half_width_share > 2 * limits.focal_free
-        out.append(Finding(UNIDENTIFIABLE if free else POOR, text, MORE_TILT))
+        out.append(Finding("unidentifiable" if free else "poor", text, MORE_TILT))
     return out
 
 
@@ -281,7 +264,9 @@ def of_denominator(sigma_share: float, limits: Limits) -> list[Finding]:
         f"The coefficients k4, k5 and k6 are not determined; with them free the focal length is known to "
         f"{known} (up to {100 * limits.focal_free:.0f} does not matter, as distortion makes up for it)."
     )
-    return [Finding(REMARK if sigma_share < limits.focal_free else POOR, text, "Use a simpler lens model.")]
+    return [
+        Finding("remark" if sigma_share < limits.focal_free else "poor", text, "Use a simpler lens model.")
+    ]
 
 
 def of_richer(fit: Calibration, wide: Calibration, limits: Limits) -> list[Finding]:
@@ -294,7 +279,7 @@ def of_richer(fit: Calibration, wide: Calibration, limits: Limits) -> list[Findi
         f"the RMS falls from {fit.rms_px:.3f} to {wide.rms_px:.3f} px."
     )
     serious = drop > limits.lens_poor and fit.rms_px - wide.rms_px > limits.lens_poor_px
-    return [Finding(POOR if serious else REMARK, text, "Use a richer lens model.")]
+    return [Finding("poor" if serious else "remark", text, "Use a richer lens model.")]
 
 
 def of_projection(sigma_px: float, width: int, limits: Limits) -> list[Finding]:
@@ -308,7 +293,7 @@ def of_projection(sigma_px: float, width: int, limits: Limits) -> list[Finding]:
     )
     if not np.isfinite(sigma_px):
         text = "Where points were seen nothing bounds the error of the pixels that the camera predicts."
-    return [Finding(POOR, text, "Take more pictures, with the board tilted and close.")]
+    return [Finding("poor", text, "Take more pictures, with the board tilted and close.")]
 
 
 def of_starts(
@@ -331,7 +316,7 @@ def of_starts(
                 f"{rms:.3f} px, below the {calibration.rms_px:.3f} px of fx = {fx:.1f} px: "
                 "the answer is not the best one."
             )
-            return [Finding(UNIDENTIFIABLE, text, MORE_TILT)]
+            return [Finding("unidentifiable", text, MORE_TILT)]
         equal = end.cost < own + chance and apart > max(0.02, 5 * inflation * sigma_fx_px / fx)
         rival = end.cost < limits.rival_cost * own and apart > limits.rival_focal
         if (equal or rival) and end.termination == "converged":
@@ -339,7 +324,7 @@ def of_starts(
                 f"Two cameras fit the views about equally well: fx = {fx:.1f} px with RMS "
                 f"{calibration.rms_px:.3f} px and fx = {other:.1f} px with RMS {rms:.3f} px."
             )
-            return [Finding(UNIDENTIFIABLE, text, MORE_TILT)]
+            return [Finding("unidentifiable", text, MORE_TILT)]
     return []
 
 
@@ -366,10 +351,10 @@ def of_screening(found: Screening, names: tuple[str, ...]) -> list[Finding]:
     ):
         some = [names[i] for i in np.flatnonzero(which)]
         if len(some) == len(names):
-            out.append(Finding(UNIDENTIFIABLE, f"All views show {what}."))
+            out.append(Finding("unidentifiable", f"All views show {what}."))
         elif some:
             text = f"{listed(some)} {'shows' if len(some) == 1 else 'show'} {what}."
-            out.append(Finding(INCONSISTENT, text, f"Leave out {listed(some)}."))
+            out.append(Finding("inconsistent", text, f"Leave out {listed(some)}."))
     return out
 
 
@@ -391,7 +376,7 @@ def of_copies(first: IntArray, names: tuple[str, ...], ratio: float, limits: Lim
     if ratio > 1.05:
         text += f"; with the copies the standard deviations come out {ratio:.1f} times too small"
     many = len(first) - len(copies) <= limits.repeat_share * len(first)
-    return [Finding(POOR if many else REMARK, text + ".", "Remove the copies." if many else "")]
+    return [Finding("poor" if many else "remark", text + ".", "Remove the copies." if many else "")]
 
 
 def of_coverage(found: Coverage, calibration: Calibration, limits: Limits) -> list[Finding]:
@@ -404,26 +389,26 @@ def of_coverage(found: Coverage, calibration: Calibration, limits: Limits) -> li
             f"{found.spread_deg:.1f} degrees (at least {limits.spread_poor_deg:.0f} are needed), and focal "
             "length shows only in boards that are tilted differently."
         )
-        kind = UNIDENTIFIABLE if found.spread_deg < limits.spread_free_deg else POOR
+        kind: Severity = "unidentifiable" if found.spread_deg < limits.spread_free_deg else "poor"
         out.append(Finding(kind, text, MORE_TILT))
     if found.area_share < limits.area_poor:
         text = (
             f"All points together span {100 * found.area_share:.0f} % of the picture "
             f"(at least {100 * limits.area_poor:.0f} are needed); the lens elsewhere is a guess."
         )
-        out.append(Finding(POOR, text, _CLOSER))
+        out.append(Finding("poor", text, _CLOSER))
     elif found.radius_share < 0.75:
         text = (
             f"Points reach {100 * found.radius_share:.0f} % of the way to the picture's corners; "
             "beyond, the distortion is extrapolated."
         )
-        out.append(Finding(REMARK, text, _CORNERS))
+        out.append(Finding("remark", text, _CORNERS))
     if found.view_share < limits.view_poor:
         text = (
             f"The board fills only {100 * found.view_share:.1f} % of a typical picture "
             f"(at least {100 * limits.view_poor:.0f} are needed)."
         )
-        out.append(Finding(POOR, text, _CLOSER))
+        out.append(Finding("poor", text, _CLOSER))
     return out + _of_order(found, calibration) + _of_frame(found, calibration, limits)
 
 
@@ -437,7 +422,7 @@ def _of_order(found: Coverage, calibration: Calibration) -> list[Finding]:
         f"{listed(names)} {'shows' if len(names) == 1 else 'show'} the board mirrored with respect to the "
         "other views: the points are listed in another order."
     )
-    return [Finding(INCONSISTENT, text, "Give the points of all views in the same order.")]
+    return [Finding("inconsistent", text, "Give the points of all views in the same order.")]
 
 
 def _of_frame(found: Coverage, calibration: Calibration, limits: Limits) -> list[Finding]:
@@ -450,7 +435,7 @@ def _of_frame(found: Coverage, calibration: Calibration, limits: Limits) -> list
             f"{100 * found.outside_share:.1f} % of the points lie outside of the picture of {width}x{height} "
             "pixels: its size is wrong, or u and v are swapped."
         )
-        kind = INCONSISTENT if found.outside_share > 0.01 else POOR
+        kind: Severity = "inconsistent" if found.outside_share > 0.01 else "poor"
         out.append(Finding(kind, text, "Check the image size and the order of u and v."))
     off = max(
         abs(camera.cx_px - 0.5 * (width - 1)) / width,
@@ -463,7 +448,7 @@ def _of_frame(found: Coverage, calibration: Calibration, limits: Limits) -> list
             f"The principal point ({camera.cx_px:.0f}, {camera.cy_px:.0f}) is {100 * off:.0f} % of the "
             f"picture's side away from its centre (up to {100 * limits.centre_poor:.0f} is usual): {why}."
         )
-        out.append(Finding(POOR if off > limits.centre_poor or swapped else REMARK, text))
+        out.append(Finding("poor" if off > limits.centre_poor or swapped else "remark", text))
     return out
 
 
@@ -482,7 +467,7 @@ def of_misfit(found: Misfit, calibration: Calibration, limits: Limits) -> list[F
             f"{good:.2f} px: misplaced corners, another board, or motion during the exposure."
         )
         advice = f"Leave out {listed([names[i] for i in worse], 4)}, or look at the corners there."
-        out.append(Finding(INCONSISTENT, text, advice))
+        out.append(Finding("inconsistent", text, advice))
     else:
         odd = np.flatnonzero(found.view_rms_px > max(limits.view_remark * found.typical_px, 0.1))
         if len(odd):
@@ -491,7 +476,7 @@ def of_misfit(found: Misfit, calibration: Calibration, limits: Limits) -> list[F
                 f"{detail}: RMS more than {limits.view_remark:.0f} times that of a typical view "
                 f"({found.typical_px:.2f} px)."
             )
-            out.append(Finding(REMARK, text))
+            out.append(Finding("remark", text))
     limit = limits.rms_px * max(1.0, max(calibration.camera.image_size_px) / 1000)
     if found.typical_px > limit:
         text = (
@@ -499,7 +484,7 @@ def of_misfit(found: Misfit, calibration: Calibration, limits: Limits) -> list[F
             "the corners, the board's description or the lens model is wrong."
         )
         advice = "Look at the corners, check the number of squares and try a richer lens model."
-        out.append(Finding(INCONSISTENT if found.typical_px > 3 * limit else POOR, text, advice))
+        out.append(Finding("inconsistent" if found.typical_px > 3 * limit else "poor", text, advice))
     count = int(found.bad_points.sum())
     if count:
         share = count / max(found.points, 1)
@@ -511,7 +496,7 @@ def of_misfit(found: Misfit, calibration: Calibration, limits: Limits) -> list[F
         )
         many = share > limits.points_poor
         advice = "Use a robust loss, or look at these corners." if many else ""
-        out.append(Finding(POOR if many else REMARK, text, advice))
+        out.append(Finding("poor" if many else "remark", text, advice))
     return out + _of_pattern(found, limits)
 
 
@@ -523,13 +508,13 @@ def _of_pattern(found: Misfit, limits: Limits) -> list[Finding]:
             f"Errors repeat at the same corners of the board from view to view, {found.repeated:.1f} times "
             "what independent errors would leave: the printed board is not exactly as described."
         )
-        out.append(Finding(REMARK, text))
+        out.append(Finding("remark", text))
     if found.heavy_share > limits.heavy_remark:
         text = (
             f"The worst percent of the points holds {100 * found.heavy_share:.0f} % of the squared error "
             "(five is normal)."
         )
-        out.append(Finding(REMARK, text, "Use a robust loss, or look at these corners."))
+        out.append(Finding("remark", text, "Use a robust loss, or look at these corners."))
     return out
 
 
@@ -568,7 +553,7 @@ def of_split(found: Split | None, in_order: bool, calibration: Calibration, limi
             f"length or centre that differs for certain by {100 * limits.split_least:.1f} %, which would "
             "matter."
         )
-        return [Finding(REMARK, text)]
+        return [Finding("remark", text)]
     if in_order:
         text = (
             f"From {names[int(second[0])]} on the camera differs from the one before {sure}: the lens was "
@@ -580,7 +565,7 @@ def of_split(found: Split | None, in_order: bool, calibration: Calibration, limi
             f"the other views from another {sure}."
         )
     advice = "Calibrate the two groups separately, with focus and zoom locked."
-    return [Finding(INCONSISTENT, text, advice)]
+    return [Finding("inconsistent", text, advice)]
 
 
 def of_target(found: TargetShape | None, calibration: Calibration, limits: Limits) -> list[Finding]:
@@ -597,7 +582,7 @@ def of_target(found: TargetShape | None, calibration: Calibration, limits: Limit
     if off > limits.aspect_remark and off > limits.aspect_sigma * found.aspect_sigma:
         text = f"{squares[0].upper()}{squares[1:]}, not square as said."
         advice = "Measure the printed squares along both sides; print without scaling."
-        out.append(Finding(INCONSISTENT if off > limits.aspect_bad else REMARK, text, advice))
+        out.append(Finding("inconsistent" if off > limits.aspect_bad else "remark", text, advice))
     elif pixel > limits.pixel_aspect:
         # The board is cleared only where its aspect is known well and is one.
         cleared = found.aspect_sigma < 0.2 * pixel and off < 2.5 * found.aspect_sigma
@@ -607,7 +592,7 @@ def of_target(found: TargetShape | None, calibration: Calibration, limits: Limit
             else f": the pixels or the squares are not square ({squares}), and these views cannot tell which."
         )
         advice = "" if cleared else "Take pictures with the board turned by 90 degrees in its plane."
-        out.append(Finding(REMARK if cleared else POOR, text, advice))
+        out.append(Finding("remark" if cleared else "poor", text, advice))
     return out + _of_flatness(found, limits)
 
 
@@ -621,7 +606,9 @@ def _of_flatness(found: TargetShape, limits: Limits) -> list[Finding]:
             f"{1e3 * found.size_m:.0f} mm ({found.bow_significance:.0f} standard deviations; up to "
             f"{100 * limits.bow_bad:.0f} % is good), which moves the focal length by {100 * moved:.1f} %."
         )
-        kind = INCONSISTENT if bend > limits.bow_bad else POOR if moved > limits.bow_focal else REMARK
+        kind: Severity = (
+            "inconsistent" if bend > limits.bow_bad else "poor" if moved > limits.bow_focal else "remark"
+        )
         return [
             Finding(kind, text, "Glue the board to a flat plate, or let its shape be fitted (--board warp).")
         ]
@@ -630,7 +617,7 @@ def _of_flatness(found: TargetShape, limits: Limits) -> list[Finding]:
             "The focal length hangs on the board's flatness: a bend of half a percent of its size "
             f"({5 * found.size_m:.1f} mm) would move it by {100 * found.focal_per_bow:.1f} %."
         )
-        return [Finding(REMARK, text, MORE_TILT)]
+        return [Finding("remark", text, MORE_TILT)]
     return []
 
 
@@ -656,21 +643,9 @@ _LEFT_OUT_WEIGHT = 0.5
 
 @dataclass(frozen=True)
 class Judgement:
-    """Verdict on a calibration.
+    """Verdict on a calibration, and what its sentences are made from, by name, as far as it is finite."""
 
-    Attributes
-    ----------
-    verdict : "ok", "poor", "inconsistent" or "unidentifiable".
-    reasons : sentences that explain a verdict other than ok, the worst first.
-    remarks : sentences about what does not matter enough.
-    advice : what to do, in order; last the picture to take next.
-    numbers : what the sentences are made from, by name, as far as it is finite.
-    """
-
-    verdict: str
-    reasons: tuple[str, ...]
-    remarks: tuple[str, ...]
-    advice: tuple[str, ...]
+    verdict: Verdict
     numbers: dict[str, float] = field(default_factory=dict)
 
 
@@ -687,13 +662,13 @@ def judge(
     observations = calibration.observations
     numbers: dict[str, float] = {"views": observations.views}
     findings = of_screening(screen(observations), observations.names)
-    if any(one.kind == INCONSISTENT for one in findings):
+    if any(one.severity == "inconsistent" for one in findings):
         # What else is wrong follows from the views that are none.
         return _concluded(findings, None, numbers)
     if not np.all(np.isfinite(calibration.block.intrinsics)) or not np.all(np.isfinite(calibration.normal)):
         findings += of_solution(calibration, observations.views, limits)
-        if not any(one.kind == UNIDENTIFIABLE for one in findings):
-            findings.append(Finding(UNIDENTIFIABLE, "The solver found no camera that fits the views."))
+        if not any(one.severity == "unidentifiable" for one in findings):
+            findings.append(Finding("unidentifiable", "The solver found no camera that fits the views."))
         return _concluded(findings, None, numbers)
     fit, copies = _without_copies(_plain(calibration), found, limits, numbers)
     findings += copies + of_solution(calibration, fit.observations.views, limits)
@@ -846,8 +821,8 @@ def _contradictions(fit: Calibration, limits: Limits, numbers: dict[str, float])
     mixed = of_split(split, False, wide, limits)
     # A split in order is found by both; what matters is told, and then what chance explains less.
     if late and mixed and change is not None and split is not None:
-        if late[0].kind != mixed[0].kind:
-            return findings + [one for one in late + mixed if one.kind != REMARK]
+        if late[0].severity != mixed[0].severity:
+            return findings + [one for one in late + mixed if one.severity != "remark"]
         return findings + (mixed if split.ratio > change.ratio else late)
     return findings + late + mixed
 
@@ -868,27 +843,16 @@ def _inside(covered: Coverage) -> FloatArray:
 
 
 def _concluded(findings: list[Finding], fit: Calibration | None, numbers: dict[str, float]) -> Judgement:
-    """The worst finding decides; reasons in order of weight."""
-    weights = [VERDICTS.index(one.kind) for one in findings if one.kind != REMARK]
-    verdict = VERDICTS[max(weights, default=0)]
-    failing = sorted((f for f in findings if f.kind != REMARK), key=lambda f: -VERDICTS.index(f.kind))
-    advice: list[str] = []
-    for one in [*failing, *(f for f in findings if f.kind == REMARK)]:
-        if one.advice and one.advice not in advice:
-            advice.append(one.advice)
+    verdict = Verdict.of(findings)
     # Where views contradict each other, more of them settle nothing.
-    if fit is not None and verdict != INCONSISTENT:
-        advice.extend(_next_picture(fit, verdict))
-    return Judgement(
-        verdict,
-        tuple(f.text for f in failing),
-        tuple(f.text for f in findings if f.kind == REMARK),
-        tuple(advice),
-        {name: float(value) for name, value in numbers.items() if np.isfinite(value)},
-    )
+    if fit is not None and verdict.word != "inconsistent":
+        verdict = Verdict.of(
+            [*findings, *(Finding("remark", "", text) for text in _next_picture(fit, verdict))]
+        )
+    return Judgement(verdict, {name: float(value) for name, value in numbers.items() if np.isfinite(value)})
 
 
-def _next_picture(fit: Calibration, verdict: str) -> list[str]:
+def _next_picture(fit: Calibration, verdict: Verdict) -> list[str]:
     width = max(fit.camera.image_size_px)
     if not 0.2 * width < min(fit.camera.fx_px, fit.camera.fy_px) < 50 * width:
         return []
@@ -908,7 +872,7 @@ def _next_picture(fit: Calibration, verdict: str) -> list[str]:
     gain = 100 * (1 - best.remaining)
     word = (
         "The picture that would help most"
-        if verdict != OK
+        if not verdict.ok
         else "If you take another picture, the most useful"
     )
     return [

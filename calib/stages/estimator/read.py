@@ -20,7 +20,6 @@ from calib.stages.actuator.parameters import Creep, Plant, Stiffness, pumps_conn
 from calib.stages.actuator.pump import ElongationForce, Orifice, Pump, RateLimit
 from calib.stages.actuator.section import Actuator, PumpSection, section_of
 from calib.stages.align.section import Align, AlignCovariance
-from calib.stages.camera.results import camera_from_section, current_plane
 from calib.stages.estimator.baseline import BaselineSetup, undistorting_nothing
 from calib.stages.estimator.driven import PARAMETER, Drive
 from calib.stages.estimator.kinematic import LEVELS, Kinematic, Level, Rows, Setup, Start
@@ -332,15 +331,13 @@ def setup_from_rig(rig: Rig, path: Path, found: Periods) -> tuple[Setup, list[st
     workspace = (rig.geometry or Geometry()).workspace_m
     view = np.zeros(24)
     if found.camera:
-        plane = current_plane(rig, str(path))
+        plane = rig.current_plane(str(path))
         if rig.camera is None:
             raise BadInputError(f"{source}: has no camera, which pictures need; run calib intrinsics first")
         if plane is None:
             raise BadInputError(f"{source}: has no plane, which pictures need; run calib extrinsics first")
         middle = (0.5 * (workspace[0] + workspace[2]), 0.5 * (workspace[1] + workspace[3]))
-        view = view_coefficients(
-            camera_from_section(rig.camera), np.array(plane.R_CW), np.array(plane.t_CW_m), middle
-        )
+        view = view_coefficients(rig.camera.optics, np.array(plane.R_CW), np.array(plane.t_CW_m), middle)
     else:
         said.append("no pictures: the length is known from the prior alone, the result is degraded")
     if not found.imu:

@@ -91,11 +91,10 @@ def identity_of(header: Header) -> str:
 
 def _camera_constants(whole: Rig, source: str) -> CameraConstants:
     from calib.core.rig import Geometry
-    from calib.stages.camera.results import camera_from_section, current_plane
 
     section = whole.camera
     assert section is not None
-    camera = camera_from_section(section)
+    camera = section.optics
     inverse = fit_inverse(camera)
     undone = inverse.max_error_px <= _INVERSE_PX and inverse.covered >= _INVERSE_SHARE
     named = dict(zip(COEFFICIENTS, camera.distortion.tolist(), strict=True))
@@ -109,7 +108,7 @@ def _camera_constants(whole: Rig, source: str) -> CameraConstants:
     }
     plane: PlaneConstants | None = None
     align = whole.align
-    known = current_plane(whole, source)
+    known = whole.current_plane(source)
     if known is not None:
         x0, y0, x1, y1 = (whole.geometry or Geometry()).workspace_m
         plane = plane_constants(
@@ -118,12 +117,12 @@ def _camera_constants(whole: Rig, source: str) -> CameraConstants:
             np.array(known.t_CW_m),
             np.array(known.A_inverse),
             (x0, y0, x1, y1),
-            known.verdict,
+            known.verdict.word,
         )
         if align is not None:
             x, y = align.plane_shift_m
             plane = put_right(plane, (x, y), align.plane_stretch)
-    verdict = section.verdict if undone or section.verdict != "ok" else "poor"
+    verdict = section.verdict.word if undone or not section.verdict.ok else "poor"
     return CameraConstants(camera.image_size_px, section.model, verdict, intrinsics, inverse, plane)
 
 

@@ -11,7 +11,8 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.core.files import one_line
-from calib.core.rig import Rig, finite_or_none
+from calib.core.result import finite_or_none
+from calib.core.rig import Rig
 from calib.stages.imu.allan import Term
 from calib.stages.imu.drift import NOT_A_RANKING, LogDrift, Measures, spread_of
 from calib.stages.imu.intrinsics import (

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from calib.core.rig import Count, Matrix3, NotNegative, Number, Pair, PerAxis, Positive, Section, Sizes
+from calib.core.result import Count, Matrix3, NotNegative, Number, Pair, PerAxis, Positive, Section, Sizes
 
 # ----------------------------------------------------------------------
 # The section `imu` of rig.yaml.

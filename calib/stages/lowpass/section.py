@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from calib.core.rig import Count, NotNegative, Number, Positive, Row3, Section
+from calib.core.result import Count, NotNegative, Number, Positive, Row3, Section
 
 
 class LowPassSection(Section):

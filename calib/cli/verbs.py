@@ -1,0 +1,100 @@
+"""The verb of a stage: its options from their declaration, its words and JSON from its result."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import Annotated, Any, get_type_hints
+
+import typer
+
+from calib.cli.common import FiguresOption, JsonOption, RigOption, document, narrate, progress_bar, say
+from calib.core.errors import EXIT_POOR
+from calib.core.stage import Files, Stage, options_of
+
+
+def verb(stage: Stage) -> Callable[..., None]:
+    """The function that typer makes a command of."""
+    flags = [one.name for one in fields(stage.options)]
+
+    def command(**values: Any) -> None:
+        sources = values.get("sources")
+        paths = () if sources is None else (sources,) if isinstance(sources, Path) else tuple(sources)
+        options = options_of(
+            stage.options, {name: values[name] for name in flags if values[name] is not None}
+        )
+        files = Files(paths, rig_path=values["rig"], narrate=narrate, progress=progress_bar)
+        _run(stage, files, options, values["figures"], values["as_json"])
+
+    command.__name__ = stage.name.split()[-1]
+    command.__doc__ = stage.summary
+    command.__signature__ = inspect.Signature(_parameters(stage))  # type: ignore[attr-defined]  # typer reads it
+    return command
+
+
+def _parameters(stage: Stage) -> list[inspect.Parameter]:
+    kind = inspect.Parameter.KEYWORD_ONLY
+    out: list[inspect.Parameter] = []
+    if stage.sources:
+        shape: Any = list[Path] if stage.several else Path
+        default: Any = inspect.Parameter.empty
+        if stage.optional:
+            shape, default = shape | None, None
+        argument = typer.Argument(help=stage.sources, metavar=stage.metavar or None, show_default=False)
+        out.append(inspect.Parameter("sources", kind, default=default, annotation=Annotated[shape, argument]))
+    hints = get_type_hints(stage.options)
+    for one in fields(stage.options):
+        meta, default = one.metadata, None if one.default is MISSING else one.default
+        # What has a parser is typed with its unit, and has its default in the help's words.
+        shape = str | None if meta["parse"] is not None else hints[one.name]
+        name = "--" + (meta["flag"] or one.name.replace("_", "-"))
+        switch = typer.Option(name, help=meta["words"], metavar=meta["metavar"] or None)
+        default = None if meta["parse"] is not None else default
+        out.append(inspect.Parameter(one.name, kind, default=default, annotation=Annotated[shape, switch]))
+    if stage.draw is not None:
+        out.append(inspect.Parameter("figures", kind, default=None, annotation=FiguresOption))
+    out.append(inspect.Parameter("rig", kind, default=Path("rig.yaml"), annotation=RigOption))
+    out.append(inspect.Parameter("as_json", kind, default=False, annotation=JsonOption))
+    return out
+
+
+def _run(stage: Stage, files: Files, options: Any, figures: Path | None, as_json: bool) -> None:
+    from calib.core.files import check_folder, check_writable, shown
+    from calib.core.result import section_json
+    from calib.core.rig import read_rig, write_rig
+    from calib.core.words import as_text, described
+
+    if stage.writes:
+        check_writable(files.rig_path)
+    if figures is not None:
+        check_folder(figures)
+    before = read_rig(files.rig_path)
+    outcome = stage.run(files, before, options)
+    sections = stage.sections(outcome)
+    after = before
+    if sections:
+        after = write_rig(
+            files.rig_path,
+            before.model_copy(update=sections),
+            {name: one.inputs for name, one in sections.items()},
+        )
+    if figures is not None and stage.draw is not None:
+        stage.draw(figures, outcome)
+        narrate(f"figures in {shown(figures)}")
+    if as_json:
+        written = {name: section_json(one) for name, one in sections.items()}
+        document(stage.name, written | stage.document(outcome))
+    else:
+        blocks = [] if stage.words is None else list(stage.words(outcome))
+        for one in sections.values():
+            blocks += described(one)
+        for line in as_text(blocks):
+            say(line)
+    for name in sections:
+        narrate(f"{name} written to {shown(files.rig_path)}")
+    for sentence in () if stage.remarks is None else stage.remarks(after):
+        narrate(sentence)
+    if not stage.verdict(outcome).ok:
+        raise typer.Exit(EXIT_POOR)

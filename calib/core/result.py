@@ -1,0 +1,174 @@
+"""Results: the class that a stage's `solve` returns is the section of rig.yaml.
+
+A field says once what it is: its label and digits in `quantity`, its unit by the end of its key, its range
+by its type. Terminal, page, JSON, notebook and manual are made from that (`calib.core.words`). Standard
+deviations stand under `sigma` by key, the verdict beside them. Arrays that figures are drawn from ride
+along as `evidence` and are not written.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, Self
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, model_validator
+
+from calib.core.errors import BadInputError
+from calib.core.files import sha256
+from calib.core.verdict import Verdict, Word
+
+Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
+Count = Annotated[int, Field(ge=0, strict=True)]
+Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
+Row3 = Annotated[list[Number], Field(min_length=3, max_length=3)]
+Matrix3 = Annotated[list[Row3], Field(min_length=3, max_length=3)]
+PerAxis = Annotated[list[Number | None], Field(min_length=3, max_length=3)]
+"""x, y, z; null for what was not measured or cannot be told."""
+Sizes = Annotated[list[NotNegative | None], Field(min_length=3, max_length=3)]
+"""As `PerAxis`, of what is not negative."""
+Sigma = dict[str, NotNegative | None]
+"""Standard deviations by key; null where the data do not bound one."""
+
+
+def quantity(
+    default: Any = ..., *, label: str, show: str = "", digits: int | None = None, **limits: Any
+) -> Any:
+    """A field of a section that a person reads.
+
+    Parameters
+    ----------
+    label : words for terminal, page and manual.
+    show : unit to show it in, where that is not the unit of the file ("ms" of a time, "deg" of an angle).
+    digits : digits behind the point where there is no standard deviation to say how many.
+    limits : `ge`, `gt`, `le`, `lt` as in pydantic.
+    """
+    return Field(default, title=label, json_schema_extra={"show": show, "digits": digits}, **limits)
+
+
+class Section(BaseModel):
+    """A section of rig.yaml or a part of one: keys that it does not know are refused."""
+
+    model_config = ConfigDict(extra="forbid", defer_build=True)
+
+
+class CovarianceTable(Section):
+    """A covariance matrix with the names of its rows."""
+
+    order: list[str]
+    values: list[list[Number]]
+
+    @model_validator(mode="after")
+    def _square(self) -> CovarianceTable:
+        if len(self.values) != len(self.order) or any(len(row) != len(self.order) for row in self.values):
+            raise ValueError(f"expected {len(self.order)} rows and columns, as many as names in order")
+        if not self.order:
+            return self
+        import numpy as np
+
+        values = np.array(self.values)
+        scale = np.sqrt(np.abs(np.diag(values)))
+        scale = np.where(scale > 0, scale, 1.0)
+        normal = values / scale / scale[:, None]
+        if not np.allclose(normal, normal.T, atol=1e-6) or np.linalg.eigvalsh(normal)[0] < -1e-6:
+            raise ValueError("expected a covariance matrix: symmetric, with no negative variance")
+        return self
+
+
+class Result(Section):
+    """A section that a stage has computed, with its verdict.
+
+    In the file the verdict is four keys: `verdict`, its word, and the sentences `reasons`, `remarks` and
+    `advice`. In Python `verdict` is a `Verdict`; a result is made with the keys of `judged`.
+    """
+
+    model_config = ConfigDict(serialize_by_alias=True)
+
+    word_: Word = Field(alias="verdict")
+    reasons_: list[str] = Field(default=[], alias="reasons")
+    remarks_: list[str] = Field(default=[], alias="remarks")
+    advice_: list[str] = Field(default=[], alias="advice")
+
+    _evidence: Any = PrivateAttr(default=None)
+    _inputs: dict[str, str] = PrivateAttr(default_factory=dict)
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the result can be trusted."""
+        return Verdict.stored(self.word_, self.reasons_, self.remarks_, self.advice_)
+
+    @property
+    def evidence(self) -> Any:
+        """What the result was made from: fits, residuals, curves; not in the file.
+
+        Raises `BadInputError` for a section that was read from a file.
+        """
+        if self._evidence is None:
+            name = type(self).__name__
+            raise BadInputError(f"this {name} was read from a file, which holds no data for figures")
+        return self._evidence
+
+    @property
+    def inputs(self) -> dict[str, str]:
+        """SHA-256 of each input by its name; empty for a section that was read from a file."""
+        return self._inputs
+
+    def with_evidence(self, evidence: Any) -> Self:
+        """The same result with what it was made from."""
+        self._evidence = evidence
+        return self
+
+    def with_inputs(self, inputs: Mapping[str, str]) -> Self:
+        """The same result with the hashes of its inputs."""
+        self._inputs = dict(inputs)
+        return self
+
+    def _repr_html_(self) -> str:
+        from calib.core.words import as_html, described
+
+        return as_html(described(self))
+
+    def __str__(self) -> str:
+        from calib.core.words import as_text, described
+
+        return "\n".join(as_text(described(self)))
+
+
+def judged(verdict: Verdict) -> dict[str, Any]:
+    """The keys of a verdict, to make a `Result` with: `Camera(..., **judged(verdict))`."""
+    return {
+        "verdict": verdict.word,
+        "reasons": verdict.reasons,
+        "remarks": verdict.remarks,
+        "advice": verdict.advice,
+    }
+
+
+_LAST = ("verdict", "reasons", "remarks", "advice")
+_UNWRITTEN = ("rejected", "remarks", "advice")
+"""Lists that are not written where they are empty."""
+
+
+def section_json(section: BaseModel) -> dict[str, Any]:
+    """A section as plain values in the order of the file: unset parts left out, the verdict last."""
+    values = section.model_dump(mode="json", by_alias=True)
+    ordered = {key: values[key] for key in values if key not in _LAST}
+    ordered |= {key: values[key] for key in _LAST if key in values}
+    return {
+        key: value
+        for key, value in ordered.items()
+        if value is not None and value != {} and not (key in _UNWRITTEN and value == [])
+    }
+
+
+def identity(section: BaseModel) -> str:
+    """SHA-256 of a section's values, to tell later whether something was computed from them."""
+    return sha256(yaml.safe_dump(section_json(section), sort_keys=True).encode())
+
+
+def finite_or_none(value: float) -> float | None:
+    """A standard deviation for the file: null where the data do not bound it."""
+    return float(value) if math.isfinite(value) else None

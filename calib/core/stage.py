@@ -1,0 +1,192 @@
+"""The shape of a stage: `read` touches files, `solve` is the mathematics, all else is derived.
+
+From a `Stage` follow the verb of the command line with its options, the function `calib.NAME`, the words
+and the JSON document, and the stage's place in a run. A stage's module is loaded for every verb's help, so
+it imports what it works with inside of its functions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+from calib.core.errors import BadInputError, UsageError
+
+if TYPE_CHECKING:
+    from calib.core.result import Result
+    from calib.core.rig import Rig
+    from calib.core.verdict import Verdict
+    from calib.core.words import Block
+
+
+class ProgressCall(Protocol):
+    """Reports how much is done."""
+
+    def __call__(self, done: int, total: int) -> None: ...
+
+
+@contextmanager
+def _silent(label: str) -> Iterator[ProgressCall]:
+    del label
+    yield lambda done, total: None
+
+
+@dataclass
+class Files:
+    """What a stage may read, and who hears about it.
+
+    Attributes
+    ----------
+    paths : what a person named.
+    rig_path : the rig's file, for sentences.
+    output : where -o leads, None without.
+    narrate : takes a sentence for the person who watches. progress : a bar with a label.
+    hashes : SHA-256 of what was read, by name, for the provenance.
+    """
+
+    paths: tuple[Path, ...] = ()
+    rig_path: Path = Path("rig.yaml")
+    output: Path | None = None
+    narrate: Callable[[str], None] = lambda sentence: None
+    progress: Callable[[str], AbstractContextManager[ProgressCall]] = _silent
+    hashes: dict[str, str] = field(default_factory=dict)
+
+    def taken(self, path: Path) -> str:
+        """Note that a file is an input; its name without folders, the same wherever the folder lies."""
+        from calib.core.files import hash_of, shown
+
+        name = shown(path.name)
+        if name in self.hashes:
+            name = f"{name} ({len(self.hashes) + 1})"
+        self.hashes[name] = hash_of(path)
+        return name
+
+
+def option(
+    default: Any, words: str, *, flag: str = "", metavar: str = "", parse: Callable[[str], Any] | None = None
+) -> Any:
+    """A field of a stage's options.
+
+    Parameters
+    ----------
+    words : help for the command line and the manual. flag : its name there, where it is not the field's.
+    parse : reads text with a unit into SI; a value that is no text is taken as it is.
+    """
+    return field(default=default, metadata={"words": words, "flag": flag, "metavar": metavar, "parse": parse})
+
+
+@dataclass(frozen=True)
+class NoOptions:
+    """A stage without options."""
+
+
+def options_of(kind: type[Any], values: Mapping[str, Any]) -> Any:
+    """Options of this class from a verb's or a caller's values, texts parsed.
+
+    Raises `UsageError` for a name that is none, with the nearest one.
+    """
+    known = {one.name: one for one in fields(kind)}
+    parsed: dict[str, Any] = {}
+    for name, value in values.items():
+        if name not in known:
+            import difflib
+
+            near = difflib.get_close_matches(name, known, 1)
+            hint = f"; did you mean {near[0]}?" if near else f", expected one of {', '.join(known)}"
+            raise UsageError(f"{name} is not an option{hint}")
+        parse = known[name].metadata.get("parse")
+        parsed[name] = parse(value) if parse is not None and isinstance(value, str) else value
+    return kind(**parsed)
+
+
+def _no_evidence(outcome: Any) -> dict[str, Any]:
+    del outcome
+    return {}
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One step of a calibration.
+
+    Attributes
+    ----------
+    name : words of its verb. title : its heading.
+    summary : help of the verb and docstring of the function.
+    read : (files, rig, options) -> what `solve` takes. Raises `BadInputError`.
+    solve : mathematics; a `Result`, or a tuple of them in the order of `writes`.
+    options : a dataclass of `option` fields.
+    sources : help for the paths on the command line, "" for a stage without. several : whether there may
+        be many. optional : whether there may be none.
+    writes : sections of rig.yaml. needs : those without which it cannot run. uses : those that it reads
+        where they are.
+    document : what --json prints beside the sections. words : blocks in front of the sections' own.
+    draw : writes figures into a folder.
+    remarks : sentences about the rig as it is after the stage.
+    """
+
+    name: str
+    title: str
+    summary: str
+    read: Callable[[Files, Rig, Any], Any]
+    solve: Callable[[Any], Any]
+    options: type[Any] = NoOptions
+    sources: str = ""
+    several: bool = True
+    optional: bool = False
+    metavar: str = ""
+    writes: tuple[str, ...] = ()
+    needs: tuple[str, ...] = ()
+    uses: tuple[str, ...] = ()
+    document: Callable[[Any], dict[str, Any]] = _no_evidence
+    words: Callable[[Any], Sequence[Block]] | None = None
+    draw: Callable[[Path, Any], object] | None = None
+    remarks: Callable[[Rig], Sequence[str]] | None = None
+
+    def run(self, files: Files, rig: Rig, options: Any) -> Any:
+        """Read and solve; every result knows the hashes of its inputs.
+
+        Raises `BadInputError` where a section is missing, or where the answer is none that rig.yaml holds.
+        """
+        from pydantic import ValidationError
+
+        from calib.core.files import shown
+
+        for name in self.needs:
+            if getattr(rig, name) is None:
+                raise BadInputError(
+                    f"{shown(files.rig_path)}: has no {name} yet; run calib {_VERBS[name]} first"
+                )
+        inputs = self.read(files, rig, options)
+        try:
+            outcome = self.solve(inputs)
+        except ValidationError as error:
+            # A fit to nonsense can end anywhere.
+            first = error.errors()[0]
+            key = ".".join(str(part) for part in first["loc"])
+            raise BadInputError(
+                f"no useful answer follows from this input: {key} came out as {first['input']!r:.40}"
+            ) from error
+        for result in self.sections(outcome).values():
+            result.with_inputs(files.hashes)
+        return outcome
+
+    def sections(self, outcome: Any) -> dict[str, Result]:
+        """The sections of rig.yaml that an outcome holds, by name."""
+        if not self.writes:
+            return {}
+        parts = outcome if isinstance(outcome, tuple) else (outcome,)
+        return {name: part for name, part in zip(self.writes, parts, strict=True) if part is not None}
+
+    def verdict(self, outcome: Any) -> Verdict:
+        """All findings on an outcome."""
+        from calib.core.verdict import Verdict
+
+        judged = self.sections(outcome).values() if self.writes else (outcome,)
+        return Verdict.of(finding for one in judged for finding in one.verdict.findings)
+
+
+_VERBS = {"camera": "intrinsics", "plane": "extrinsics", "align": "align", "imu": "imu static"}
+"""Verb that makes a section."""

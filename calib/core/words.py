@@ -1,0 +1,316 @@
+"""A result in words: the same blocks for the terminal, the page and a notebook, from the fields' own labels.
+
+A field is shown when `quantity` gave it a label. Its unit is the end of its key, as everywhere in rig.yaml,
+unless the field asks for another one to be shown in.
+"""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from calib.core.result import Result
+from calib.core.verdict import Verdict
+
+BLANK = "\N{EN DASH}"
+"""What stands for a value that is not there."""
+
+UNITS = {
+    "_radps2_per_sqrt_Hz": "rad/s²/√Hz",
+    "_radps_per_sqrt_Hz": "rad/s/√Hz",
+    "_mps3_per_sqrt_Hz": "m/s³/√Hz",
+    "_mps2_per_sqrt_Hz": "m/s²/√Hz",
+    "_degps_per_sqrt_hz": "°/s/√Hz",
+    "_deg_per_sqrt_hz": "°/√Hz",
+    "_rad_per_sqrt_s": "rad/√s",
+    "_m_per_sqrt_s": "m/√s",
+    "_pwm_per_rad_s": "PWM/(rad s)",
+    "_pwm_s_per_rad": "PWM s/rad",
+    "_pwm_per_m_s": "PWM/(m s)",
+    "_pwm_s_per_m": "PWM s/m",
+    "_pwm_per_rad": "PWM/rad",
+    "_pwm_per_m": "PWM/m",
+    "_N_per_rad2": "N/rad²",
+    "_N_per_m4": "N/m⁴",
+    "_N_per_m3": "N/m³",
+    "_N_per_m2": "N/m²",
+    "_N_per_m": "N/m",
+    "_N_per_s": "N/s",
+    "_Ns_per_m": "N s/m",
+    "_px_per_m": "px/m",
+    "_s2_per_N": "s²/N",
+    "_per_s2": "1/s²",
+    "_per_s": "1/s",
+    "_radps2": "rad/s²",
+    "_radps": "rad/s",
+    "_degps": "°/s",
+    "_mps2": "m/s²",
+    "_mps": "m/s",
+    "_kgm2": "kg m²",
+    "_kPa": "kPa",
+    "_ticks": "ticks",
+    "_rad": "rad",
+    "_deg": "°",
+    "_pwm": "PWM",
+    "_px": "px",
+    "_mm": "mm",
+    "_hz": "Hz",
+    "_Hz": "Hz",
+    "_db": "dB",
+    "_kg": "kg",
+    "_N": "N",
+    "_V": "V",
+    "_m": "m",
+    "_s": "s",
+}
+
+_SCALES = {
+    ("m", "mm"): 1e3,
+    ("s", "ms"): 1e3,
+    ("rad", "mrad"): 1e3,
+    ("rad", "°"): math.degrees(1.0),
+    ("rad/s", "°/s"): math.degrees(1.0),
+    ("kg", "g"): 1e3,
+    ("", "%"): 1e2,
+}
+"""What a value in the unit of the file is multiplied by to be shown in another."""
+
+_AXES = ("x", "y", "z")
+_LONGEST = 60
+"""Text longer than this stands in a line of its own."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of cells under a head; the first column stands left, the others right."""
+
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    title: str = ""
+
+
+@dataclass(frozen=True)
+class Line:
+    """A sentence; `kind` is "" or "verdict", "reason", "remark", "advice"."""
+
+    text: str
+    kind: str = ""
+
+
+Block = Table | Line
+
+
+def unit_of(key: str) -> str:
+    """Unit at the end of a key, "" for a number without one."""
+    return next((unit for end, unit in UNITS.items() if key.endswith(end)), "")
+
+
+def number(value: float | None, sigma: float | None = None, places: int | None = None) -> str:
+    """A value with the digits that its deviation leaves, else with `places`, else with six figures."""
+    if value is None or not math.isfinite(value):
+        return BLANK
+    if isinstance(value, int):
+        return str(value)
+    if sigma is not None and math.isfinite(sigma) and sigma > 0.0:
+        places = 1 - math.floor(math.log10(sigma))
+        if not (0 <= places <= 12 and abs(value) < 1e9):
+            places = None
+    return f"{value:.6g}" if places is None else f"{value:.{places}f}"
+
+
+def described(result: BaseModel) -> list[Block]:
+    """A result as tables and sentences: its quantities, its lists of parts, its verdict."""
+    blocks = list(_parts(result, ""))
+    if isinstance(result, Result):
+        blocks += of_verdict(result.verdict)
+    return blocks
+
+
+def of_verdict(verdict: Verdict) -> list[Line]:
+    """The verdict's word and sentences."""
+    return [
+        Line(f"verdict: {verdict.word}", "verdict"),
+        *(Line(text, "reason") for text in verdict.reasons),
+        *(Line(text, "remark") for text in verdict.remarks),
+        *(Line(text, "advice") for text in verdict.advice),
+    ]
+
+
+def _parts(section: BaseModel, prefix: str) -> Iterator[Block]:
+    scalars: list[tuple[str, ...]] = []
+    vectors: list[tuple[str, ...]] = []
+    later: list[Block] = []
+    sigmas = getattr(section, "sigma", None)
+    for key, field, value in _labelled(section):
+        label = f"{prefix}{field.title}"
+        if isinstance(value, BaseModel):
+            later += _parts(value, f"{label} ")
+            scalars += _unlabelled(value, sigmas, f"{label} ")
+        elif isinstance(value, Mapping) and value and isinstance(next(iter(value.values())), BaseModel):
+            later.append(_listed(label, value))
+        elif isinstance(value, Mapping):
+            unit, scale, places = _shown(key, field)
+            for name, one in value.items():
+                # A table of values may hold several units, each at the end of its name.
+                own = _shown(name, field)[0] or unit
+                cell = one if isinstance(one, str) else number(_scaled(one, scale), None, places)
+                scalars.append((_with_unit(f"{label} {name}", own), cell, ""))
+        elif isinstance(value, list) and value and isinstance(value[0], BaseModel):
+            later.append(_listed(label, {str(i): one for i, one in enumerate(value)}, numbered=False))
+        elif isinstance(value, list) and all(isinstance(one, int) for one in value):
+            unit, _, _ = _shown(key, field)
+            scalars.append((_with_unit(label, unit), " x ".join(str(one) for one in value), ""))
+        elif isinstance(value, str) and len(value) > _LONGEST:
+            later.append(Line(f"{label}: {value}"))
+        elif (
+            isinstance(value, list)
+            and len(value) in (2, 3)
+            and not any(isinstance(v, str | list) for v in value)
+        ):
+            unit, scale, places = _shown(key, field)
+            vectors.append((_with_unit(label, unit), *_vector(value, _sigma(sigmas, key), scale, places)))
+        elif isinstance(value, list):
+            scalars.append((label, ", ".join(str(one) for one in value), ""))
+        else:
+            unit, scale, places = _shown(key, field)
+            sigma = _sigma(sigmas, key)
+            sigma = sigma if isinstance(sigma, int | float) else None
+            unbounded = isinstance(sigmas, Mapping) and key in sigmas and sigma is None
+            if isinstance(value, bool | str):
+                scalars.append((label, _word(value), ""))
+                continue
+            wide = _scaled(sigma, scale)
+            bar = "not bounded" if unbounded else "" if wide is None else number(wide, wide)
+            scalars.append((_with_unit(label, unit), number(_scaled(value, scale), wide, places), bar))
+    if scalars:
+        bars = any(row[2] for row in scalars)
+        head: tuple[str, ...] = ("", "value", "sigma") if bars else ("", "value")
+        yield Table(head, tuple(row if bars else row[:2] for row in scalars))
+    if vectors:
+        longest = max(len(row) for row in vectors)
+        head = ("", *_AXES[: longest - 1])
+        yield Table(head, tuple((*row, *("",) * (longest - len(row))) for row in vectors))
+    yield from later
+
+
+def _unlabelled(part: BaseModel, sigmas: Any, prefix: str) -> Iterator[tuple[str, str, str]]:
+    """Numbers of a part whose keys are their own labels, as k1: those that are not zero or were estimated."""
+    for key, field in type(part).model_fields.items():
+        value, sigma = getattr(part, key), _sigma(sigmas, key)
+        if field.title is None and isinstance(value, float) and (value != 0.0 or sigma is not None):
+            bar = number(sigma, sigma) if isinstance(sigma, float) else ""
+            yield (f"{prefix}{key}", number(value, sigma if isinstance(sigma, float) else None), bar)
+
+
+def _word(value: bool | str) -> str:
+    return value if isinstance(value, str) else "yes" if value else "no"
+
+
+def _labelled(section: BaseModel) -> Iterator[tuple[str, FieldInfo, Any]]:
+    for key, field in type(section).model_fields.items():
+        value = getattr(section, key)
+        if field.title and value is not None and value != [] and value != {}:
+            yield key, field, value
+
+
+def _shown(key: str, field: FieldInfo) -> tuple[str, float, int | None]:
+    """Unit that a field is shown in, what its value is multiplied by for it, digits behind the point."""
+    extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
+    unit = unit_of(key)
+    show = {"deg": "°", "deg/s": "°/s"}.get(str(extra.get("show") or ""), str(extra.get("show") or ""))
+    places = extra.get("digits")
+    scale = _SCALES[unit, show] if show and show != unit else 1.0
+    return show or unit, scale, places if isinstance(places, int) else None
+
+
+def _scaled(value: float | None, scale: float) -> float | None:
+    return value if value is None or scale == 1.0 else value * scale
+
+
+def _with_unit(label: str, unit: str) -> str:
+    return f"{label}, {unit}" if unit else label
+
+
+def _sigma(sigmas: Any, key: str) -> Any:
+    if isinstance(sigmas, Mapping):
+        return sigmas.get(key)
+    return getattr(sigmas, key, None)
+
+
+def _vector(values: Sequence[Any], sigma: Any, scale: float, places: int | None) -> list[str]:
+    bars = sigma if isinstance(sigma, list) and len(sigma) == len(values) else [None] * len(values)
+    out = []
+    for value, bar in zip(values, bars, strict=True):
+        wide = _scaled(bar, scale)
+        text = number(_scaled(value, scale), wide, places)
+        out.append(f"{text} ± {number(wide, wide)}" if wide is not None and text != BLANK else text)
+    return out
+
+
+def _listed(label: str, parts: Mapping[str, Any], numbered: bool = True) -> Table:
+    """Parts of one kind as a table, a row for each."""
+    columns: dict[str, FieldInfo] = {}
+    for one in parts.values():
+        columns |= {
+            key: field for key, field, value in _labelled(one) if not isinstance(value, BaseModel | Mapping)
+        }
+    head = [_with_unit(str(field.title), _shown(key, field)[0]) for key, field in columns.items()]
+    rows = []
+    for name, one in parts.items():
+        cells = [] if not numbered else [name]
+        sigmas = getattr(one, "sigma", None)
+        for key, field in columns.items():
+            value = getattr(one, key)
+            _, scale, places = _shown(key, field)
+            if isinstance(value, list):
+                cells.append(
+                    " ".join(
+                        v if isinstance(v, str) else number(_scaled(v, scale), None, places) for v in value
+                    )
+                )
+            elif isinstance(value, bool | str):
+                cells.append(_word(value))
+            else:
+                cells.append(*_vector([value], [_sigma(sigmas, key)], scale, places))
+        rows.append(tuple(cells))
+    return Table(((label, *head) if numbered else tuple(head)), tuple(rows), label)
+
+
+def as_text(blocks: Sequence[Block]) -> list[str]:
+    """Blocks as lines for a terminal."""
+    out: list[str] = []
+    for block in blocks:
+        if isinstance(block, Line):
+            lead = {"reason": "  - ", "remark": "  (remark) ", "advice": "  next: "}.get(block.kind, "")
+            out.append(f"{lead}{block.text}")
+            continue
+        if block.title and block.head[0] != block.title:
+            out.append(f"{block.title}:")
+        whole = [block.head, *block.rows]
+        widths = [max(len(row[i]) for row in whole) for i in range(len(block.head))]
+        for row in whole:
+            cells = [row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True))]
+            out.append("  " + "  ".join(cells).rstrip())
+    return out
+
+
+def as_html(blocks: Sequence[Block]) -> str:
+    """Blocks as HTML, for a notebook and for the page."""
+    out: list[str] = []
+    for block in blocks:
+        if isinstance(block, Line):
+            out.append(f'<p class="{block.kind or "line"}">{html.escape(block.text)}</p>')
+            continue
+        title = f"<caption>{html.escape(block.title)}</caption>" if block.title else ""
+        head = "".join(f"<th>{html.escape(cell)}</th>" for cell in block.head)
+        rows = "".join(
+            "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in block.rows
+        )
+        out.append(f"<table>{title}<thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>")
+    return "\n".join(out)

@@ -1,0 +1,201 @@
+"""The sections `camera`, `plane` and `lens` of rig.yaml."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from calib.core.result import (
+    Count,
+    CovarianceTable,
+    Matrix3,
+    NotNegative,
+    Number,
+    Result,
+    Row3,
+    Section,
+    Sigma,
+    quantity,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from calib.core.arrays import FloatArray
+    from calib.stages.camera import model as optics
+
+Model = Annotated[str, Field(pattern="^(pinhole|radial2|radial3|brown5|rational8)$")]
+Focal = Annotated[float, Field(ge=1e-3, le=1e7, allow_inf_nan=False, strict=True)]
+Pixels = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False, strict=True)]
+Coefficient = Annotated[float, Field(ge=-1e30, le=1e30, allow_inf_nan=False, strict=True)]
+Side = Annotated[int, Field(ge=1, le=100_000, strict=True)]
+
+
+_INTRINSICS = (
+    "fx_px", "fy_px", "skew_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"
+)  # fmt: skip
+
+
+class Distortion(Section):
+    """Coefficients of `calib.stages.camera.model`; absent ones are zero."""
+
+    k1: Coefficient = 0.0
+    k2: Coefficient = 0.0
+    p1: Coefficient = 0.0
+    p2: Coefficient = 0.0
+    k3: Coefficient = 0.0
+    k4: Coefficient = 0.0
+    k5: Coefficient = 0.0
+    k6: Coefficient = 0.0
+
+
+class Camera(Result):
+    """Intrinsics, what they are worth, and why."""
+
+    model: Model = quantity(label="model")
+    image_size_px: Annotated[list[Side], Field(min_length=2, max_length=2)] = quantity(label="picture")
+    fx_px: Focal = quantity(label="focal length fx", digits=3)
+    fy_px: Focal = quantity(label="focal length fy", digits=3)
+    skew_px: Pixels = quantity(0.0, label="skew", digits=3)
+    cx_px: Pixels = quantity(label="centre cx", digits=3)
+    cy_px: Pixels = quantity(label="centre cy", digits=3)
+    distortion: Distortion = quantity(Distortion(), label="distortion", digits=5)
+    sigma: Sigma = {}
+    covariance: CovarianceTable | None = None
+    rms_px: NotNegative | None = quantity(None, label="RMS", digits=4)
+    mean_error_px: NotNegative | None = quantity(None, label="mean error", digits=4)
+    projection_sigma_px: Sigma = quantity({}, label="projection sigma", digits=3)
+    views: Count = quantity(0, label="views")
+    points: Count = quantity(0, label="points")
+    board: str | None = quantity(None, label="board")
+    loss: str | None = None
+    termination: str | None = None
+    rejected: list[str] = []
+
+    @property
+    def optics(self) -> optics.Camera:
+        """The camera as the equations take it."""
+        import numpy as np
+
+        from calib.stages.camera.model import COEFFICIENTS
+        from calib.stages.camera.model import Camera as Optics
+
+        width, height = self.image_size_px
+        coefficients = np.array([getattr(self.distortion, name) for name in COEFFICIENTS])
+        return Optics(
+            self.model,
+            (width, height),
+            self.fx_px,
+            self.fy_px,
+            self.skew_px,
+            self.cx_px,
+            self.cy_px,
+            coefficients,
+        )
+
+    @property
+    def intrinsic_covariance(self) -> FloatArray | None:
+        """Covariance (13, 13) in the order of `model.INTRINSICS`, None where it is not known."""
+        if self.covariance is None or not self.covariance.order:
+            return None
+        import numpy as np
+
+        from calib.stages.camera.model import INTRINSICS
+
+        index = [INTRINSICS.index(name) for name in self.covariance.order]
+        whole = np.zeros((len(INTRINSICS), len(INTRINSICS)))
+        whole[np.ix_(index, index)] = np.array(self.covariance.values)
+        return whole
+
+    @field_validator("covariance")
+    @classmethod
+    def _of_intrinsics(cls, table: CovarianceTable | None) -> CovarianceTable | None:
+        order = [] if table is None else table.order
+        wrong = next((name for name in order if name not in _INTRINSICS or order.count(name) > 1), None)
+        if wrong is not None:
+            raise ValueError(f"expected intrinsics in order, each once, not {wrong!r}")
+        return table
+
+    def undistort(self, pixels: ArrayLike) -> FloatArray:
+        """Pixels (n, 2) where a pinhole camera with the same intrinsics would have seen them."""
+        import numpy as np
+
+        from calib.stages.camera.model import undistort
+
+        camera = self.optics
+        plain = undistort(camera, np.asarray(pixels, dtype=np.float64).reshape(-1, 2))
+        return plain @ camera.K[:2, :2].T + camera.K[:2, 2]
+
+
+class Plane(Result):
+    """The actuator's plane seen by the camera: A maps world metres to pixels (2.9 with K)."""
+
+    R_CW: Matrix3
+    t_CW_m: Row3 = quantity(label="camera to plane")
+    A_px_per_m: Matrix3
+    A_inverse: Matrix3
+    sigma: Sigma = {}
+    rms_px: NotNegative = quantity(label="RMS", digits=4)
+    rms_mm: NotNegative = quantity(label="RMS on the plane", digits=4)
+    sigma_marker_mm: Sigma = quantity({}, label="sigma of a marker", digits=4)
+    without_intrinsics: dict[str, Number] = quantity({}, label="homography alone", digits=4)
+    pictures: Count = quantity(0, label="pictures")
+    points: Count = quantity(0, label="points")
+    orientation: str = quantity("", label="orientation")
+
+    def to_world(self, pixels: ArrayLike, camera: Camera | None = None) -> FloatArray:
+        """Places on the plane (n, 2) in metres of pixels (n, 2).
+
+        Parameters
+        ----------
+        camera : undoes the lens; without it the pixels are those of a pinhole camera.
+        """
+        import numpy as np
+
+        from calib.core.geometry import apply_homography
+
+        ideal = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+        return apply_homography(
+            np.array(self.A_inverse), ideal if camera is None else camera.undistort(ideal)
+        )
+
+
+class InverseLens(Section):
+    """The polynomial of `calib.stages.camera.lens`."""
+
+    radial: list[Number]
+    decentering_steps: Count
+    max_error_px: NotNegative | None
+    covered: Annotated[float, Field(ge=0, le=1)]
+
+
+class Lens(Result):
+    """What lens distortion does over the picture and costs on the plane.
+
+    That a lens matters is no defect: `effect` says it, and the verdict stays ok.
+    """
+
+    kind: str = quantity(label="kind")
+    max_px: Number = quantity(label="distortion, at most", digits=3)
+    mean_px: Number = quantity(label="distortion, mean", digits=3)
+    region_px: Annotated[list[Number], Field(min_length=4, max_length=4)]
+    region_max_px: Number = quantity(label="in the region, at most", digits=3)
+    region_mean_px: Number = quantity(label="in the region, mean", digits=3)
+    region_sigma_px: Number | None = quantity(None, label="sigma in the region", digits=3)
+    monotonic: bool = quantity(label="one-to-one")
+    plane_max_mm: Number | None = quantity(None, label="neglected, on the plane at most", digits=3)
+    plane_mean_mm: Number | None = quantity(None, label="neglected, on the plane on average", digits=3)
+    refitted_max_mm: Number | None = quantity(None, label="with the plane refitted, at most", digits=3)
+    refitted_mean_mm: Number | None = quantity(None, label="with the plane refitted, on average", digits=3)
+    inverse: InverseLens
+    effect: Literal["negligible", "matters"] = quantity(label="effect")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_schema_1(cls, values: Any) -> Any:
+        """Files of schema 1 hold the effect as the verdict."""
+        if isinstance(values, dict) and values.get("verdict") in ("negligible", "matters"):
+            later = {**values, "effect": values["verdict"], "verdict": "ok"}
+            return {**later, "remarks": later.pop("reasons", [])}
+        return values

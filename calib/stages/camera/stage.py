@@ -1,0 +1,564 @@
+"""The stages of the camera: intrinsics, the actuator's plane, and what the lens costs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from calib.core.errors import BadInputError
+from calib.core.stage import Files, NoOptions, Stage, option
+from calib.core.units import parse_corners, parse_image_size, parse_region_px, parse_square_m
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from calib.core.arrays import FloatArray
+    from calib.core.rig import Rig
+    from calib.core.words import Block
+    from calib.stages.camera import lens, model, plane
+    from calib.stages.camera.intrinsics import Candidate, Choices, Intrinsics
+    from calib.stages.camera.section import Camera, Lens, Plane
+
+# ----------------------------------------------------------------------
+# `calib intrinsics`: pictures or a table of correspondences in, the camera with error bars out.
+
+
+@dataclass(frozen=True)
+class IntrinsicsOptions:
+    """How a camera is calibrated."""
+
+    corners: tuple[int, int] | None = option(
+        None,
+        "Inner corners, columns x rows, as 7x5. [default: board.yaml, else found]",
+        metavar="CxR",
+        parse=parse_corners,
+    )
+    square_m: float | None = option(
+        None,
+        "Side of a square with its unit, as 20mm. [default: board.yaml]",
+        flag="square",
+        metavar="LENGTH",
+        parse=parse_square_m,
+    )
+    image_size_px: tuple[int, int] | None = option(
+        None,
+        "Size of the pictures in px, for tables, as 640x480.",
+        flag="image-size",
+        metavar="WxH",
+        parse=parse_image_size,
+    )
+    model: Literal["auto", "pinhole", "radial2", "radial3", "brown5", "rational8"] = option(
+        "auto", "Lens model; auto compares all on views held back."
+    )
+    skew: bool = option(False, "Estimate the skew as well.")
+    loss: Literal["none", "huber", "cauchy"] = option("none", "Robust loss of the residuals.")
+    board: Literal["rigid", "warp", "released", "auto"] = option(
+        "rigid", "The board: flat, bent by two parameters, with free corners, or compared."
+    )
+    reject: bool = option(False, "Leave out points that lie far off, and say which.")
+
+
+@dataclass(frozen=True)
+class IntrinsicsInputs:
+    """Views of a target, names of pictures without one, and how to calibrate."""
+
+    views: Sequence[model.View]
+    image_size_px: tuple[int, int]
+    without: tuple[str, ...]
+    choices: Choices
+    detect_s: float
+
+
+@dataclass(frozen=True)
+class CameraEvidence:
+    """What a camera was made from."""
+
+    fit: Intrinsics
+    without: tuple[str, ...]
+    seconds: Mapping[str, float]
+
+
+def _read_intrinsics(files: Files, rig: Rig, options: IntrinsicsOptions) -> IntrinsicsInputs:
+    import time
+
+    from calib.stages.camera.intrinsics import Choices
+    from calib.stages.camera.read import Told, read_views
+
+    del rig
+    began = time.perf_counter()
+    with files.progress("finding boards") as progress:
+        views = read_views(
+            list(files.paths), Told(options.corners, options.square_m, options.image_size_px), progress
+        )
+    for remark in views.remarks:
+        files.narrate(remark)
+    files.hashes.update(views.hashes)
+    choices = Choices(options.model, options.skew, options.loss, options.board, options.reject)
+    detect_s = time.perf_counter() - began
+    return IntrinsicsInputs(views.views, views.image_size_px, tuple(views.without), choices, detect_s)
+
+
+def _solve_intrinsics(inputs: IntrinsicsInputs) -> Camera:
+    """Calibrate, judge, and assemble the section."""
+    import numpy as np
+
+    from calib.core.result import CovarianceTable, finite_or_none, judged
+    from calib.stages.camera.bundle import projection_sigma_px
+    from calib.stages.camera.intrinsics import calibrate_camera
+    from calib.stages.camera.section import Camera
+
+    result = calibrate_camera(inputs.views, inputs.image_size_px, inputs.choices)
+    fit, known = result.calibration, result.covariance
+    sigma_px = projection_sigma_px(fit, known, image_grid(fit.camera.image_size_px))
+    bounded = sigma_px[np.isfinite(sigma_px)]
+    projection = {
+        "distance_m": known.distance_m,
+        "median": float(np.median(bounded)) if len(bounded) else None,
+        "max": float(bounded.max()) if len(bounded) == len(sigma_px) else None,
+    }
+    whole = bool(np.all(np.isfinite(known.intrinsics)))
+    finite = bool(np.isfinite(fit.rms_px))
+    return Camera(
+        **_optics(fit.camera),
+        sigma={name: finite_or_none(value) for name, value in known.sigma().items()},
+        covariance=CovarianceTable(order=list(known.names), values=known.intrinsics.tolist())
+        if whole
+        else None,
+        rms_px=fit.rms_px if finite else None,
+        mean_error_px=fit.mean_error_px if finite else None,
+        projection_sigma_px=projection,
+        views=fit.observations.views,
+        points=fit.observations.points,
+        board=result.board,
+        loss=fit.loss,
+        termination=fit.termination,
+        rejected=list(result.rejected),
+        **judged(result.judgement.verdict),
+    ).with_evidence(CameraEvidence(result, inputs.without, {"detect": inputs.detect_s, **result.seconds}))
+
+
+def image_grid(image_size_px: tuple[int, int], columns: int = 17, rows: int = 13) -> FloatArray:
+    """Pixels (rows * columns, 2) spread over the whole picture, its borders included."""
+    import numpy as np
+
+    u, v = np.meshgrid(
+        np.linspace(0, image_size_px[0] - 1, columns), np.linspace(0, image_size_px[1] - 1, rows)
+    )
+    return np.stack([u.ravel(), v.ravel()], axis=1)
+
+
+def _optics(camera: model.Camera) -> dict[str, Any]:
+    """The keys of the section that say what the camera is."""
+    from calib.stages.camera.model import COEFFICIENTS, MODELS
+    from calib.stages.camera.section import Distortion
+
+    named = dict(zip(COEFFICIENTS, camera.distortion.tolist(), strict=True))
+    kept = {n: v for n, v in named.items() if n in (*MODELS["brown5"], *MODELS[camera.model])}
+    return {
+        "model": camera.model,
+        "image_size_px": list(camera.image_size_px),
+        "fx_px": camera.fx_px,
+        "fy_px": camera.fy_px,
+        "skew_px": camera.skew_px,
+        "cx_px": camera.cx_px,
+        "cy_px": camera.cy_px,
+        "distortion": Distortion(**kept),
+    }
+
+
+def imported_camera(camera: model.Camera, source: str) -> Camera:
+    """The section of a camera that another tool calibrated: values without error bars."""
+    from calib.stages.camera.section import Camera
+
+    reason = f"Imported from a {source} file, which holds no error bars and no views to judge by."
+    return Camera(**_optics(camera), verdict="poor", reasons=[reason])
+
+
+def _camera_document(camera: Camera) -> dict[str, Any]:
+    evidence: CameraEvidence = camera.evidence
+    fit = evidence.fit.calibration
+
+    def compared(candidates: Sequence[Candidate]) -> list[dict[str, Any]]:
+        return [
+            {
+                "name": one.name,
+                "parameters": one.parameters,
+                "fitted_rms_px": one.fitted_rms_px,
+                "held_back_rms_px": one.held_back_rms_px,
+            }
+            for one in candidates
+        ]
+
+    per_view = [
+        {
+            "view": name,
+            "points": int(present.sum()),
+            "rms_px": rms,
+            "points_px": pixels[present].round(2).tolist(),
+            "residuals_px": residuals[present].round(4).tolist(),
+        }
+        for name, present, rms, pixels, residuals in zip(
+            fit.observations.names,
+            fit.observations.present,
+            fit.view_rms_px.tolist(),
+            fit.observations.pixels,
+            fit.residuals_px,
+            strict=True,
+        )
+    ]
+    return {
+        "models": compared(evidence.fit.models),
+        "boards": compared(evidence.fit.boards),
+        "pictures_without_board": list(evidence.without),
+        "per_view": per_view,
+        "seconds": dict(evidence.seconds),
+    }
+
+
+def _camera_words(camera: Camera) -> list[Block]:
+    from calib.core.words import Line, Table
+
+    evidence: CameraEvidence = camera.evidence
+    blocks: list[Block] = []
+    for what, candidates in (("model", evidence.fit.models), ("board", evidence.fit.boards)):
+        if candidates:
+            rows = tuple(
+                (one.name, str(one.parameters), f"{one.fitted_rms_px:.4f}", f"{one.held_back_rms_px:.4f}")
+                for one in candidates
+            )
+            head = (what, "parameters", "fitted", "held back")
+            blocks.append(Table(head, rows, f"{what}s compared, RMS in px"))
+    blocks += [Line(f"no board in {name}") for name in evidence.without]
+    blocks += [Line(f"rejected: {sentence}") for sentence in camera.rejected]
+    return blocks
+
+
+def _draw_camera(folder: Path, camera: Camera) -> object:
+    from calib.stages.camera.plots import write_camera_figures
+
+    return write_camera_figures(folder, camera.evidence.fit)
+
+
+def _outdated(rig: Rig) -> list[str]:
+    return rig.outdated()
+
+
+intrinsics = Stage(
+    "intrinsics",
+    "Camera",
+    """Calibrate the camera from views of a checkerboard.
+
+    Writes the section camera of the rig's file. Exits 1 when the verdict is not ok.
+    """,
+    _read_intrinsics,
+    _solve_intrinsics,
+    IntrinsicsOptions,
+    sources="A folder of pictures (its sub-folders are not read) or single pictures; or a table of "
+    "correspondences view,x_m,y_m,u_px,v_px (.csv); or corners of mrgingham or mrcal (.vnl).",
+    writes=("camera",),
+    document=_camera_document,
+    words=_camera_words,
+    draw=_draw_camera,
+    remarks=_outdated,
+)
+
+
+# ----------------------------------------------------------------------
+# `calib extrinsics`: the board lying in the actuator's plane in, the homography in millimetres out.
+
+
+@dataclass(frozen=True)
+class PlaneInputs:
+    """Views of the board in world metres, and the camera that saw them."""
+
+    camera: Camera
+    views: Sequence[model.View]
+    workspace_m: tuple[float, float, float, float]
+    orientation: tuple[str, ...]
+    without: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class PlaneEvidence:
+    """What a plane was made from."""
+
+    camera: model.Camera
+    fit: plane.Plane
+    orientation: tuple[str, ...]
+    without: tuple[str, ...]
+
+
+def _read_plane(files: Files, rig: Rig, options: NoOptions) -> PlaneInputs:
+    from calib.core.files import shown
+    from calib.core.result import identity
+    from calib.core.rig import Geometry
+    from calib.io.pictures import list_pictures
+    from calib.stages.camera.model import View
+    from calib.stages.camera.plane import settle_orientation, world_points_m
+    from calib.stages.camera.read import BOARD_FILE, board_of, find_boards
+
+    del options
+    assert rig.camera is not None
+    source = files.paths[0] if files.paths else Path("images/plane")
+    pictures = list_pictures([source])
+    stated, board_hash = board_of([source])
+    board_file = shown((source if source.is_dir() else source.parent) / BOARD_FILE)
+    for key in ("corners", "square_m", "first_corner_m", "angle_rad"):
+        if getattr(stated, key) is None:
+            raise BadInputError(
+                f"{board_file}: {key} is missing; the plane needs to know where the board lies"
+            )
+    assert stated.corners and stated.square_m and stated.first_corner_m and stated.angle_rad is not None
+    with files.progress("finding boards") as progress:
+        search = find_boards(
+            pictures,
+            (stated.corners[0], stated.corners[1]),
+            stated.square_m,
+            progress,
+            rig.camera.optics.image_size_px,
+        )
+    world_m = world_points_m(search.board, stated.first_corner_m, stated.angle_rad)
+    views, orientation = [], []
+    for view in search.views:
+        placed = settle_orientation(
+            view.pixels, search.board, stated.angle_rad, stated.first_corner_px, view.name
+        )
+        kept = slice(None) if view.measured is None else placed.reordered(view.measured, search.board)
+        views.append(View(view.name, world_m[kept], placed.pixels[kept]))
+        orientation.append(f"{view.name}: {placed.how}")
+    x0, y0, x1, y1 = (rig.geometry or Geometry()).workspace_m
+    files.hashes.update({**search.hashes, **board_hash, "camera": identity(rig.camera)})
+    return PlaneInputs(rig.camera, views, (x0, y0, x1, y1), tuple(orientation), tuple(search.without))
+
+
+def _solve_plane(inputs: PlaneInputs) -> Plane:
+    """Fit, judge, and assemble the section; a plane is no better than its camera."""
+    import numpy as np
+
+    from calib.core.result import finite_or_none, judged
+    from calib.core.verdict import Finding, Verdict
+    from calib.stages.camera.plane import calibrate_plane
+    from calib.stages.camera.section import Plane
+
+    optics = inputs.camera.optics
+    fit = calibrate_plane(
+        optics,
+        inputs.camera.intrinsic_covariance,
+        inputs.views,
+        workspace_m=inputs.workspace_m,
+        camera_rms_px=inputs.camera.rms_px,
+    )
+    sigma = np.sqrt(np.diag(fit.covariance))
+    names = ("rotation_x_rad", "rotation_y_rad", "rotation_z_rad", "tx_m", "ty_m", "tz_m")
+
+    def largest(values: FloatArray | None) -> float | None:
+        if values is None or not np.isfinite(values).any():
+            return None
+        return float(np.nanmax(np.linalg.norm(values, axis=1)))
+
+    difference = fit.direct_difference_mm[np.isfinite(fit.direct_difference_mm)]
+    without = {}
+    if len(difference):
+        without = {
+            "rms_px": float(fit.direct.rms_px),
+            "difference_max_mm": float(difference.max()),
+            "difference_mean_mm": float(difference.mean()),
+        }
+    findings = list(fit.verdict.findings)
+    if not inputs.camera.verdict.ok:
+        word = inputs.camera.verdict.word
+        text = f"The camera's own verdict is {word}, and the plane is no better than that."
+        findings.insert(0, Finding("poor", text))
+    return Plane(
+        R_CW=fit.R_CW.tolist(),
+        t_CW_m=fit.t_CW_m.tolist(),
+        A_px_per_m=fit.A.tolist(),
+        A_inverse=fit.A_inverse.tolist(),
+        sigma=dict(zip(names, (finite_or_none(s) for s in sigma), strict=True)),
+        rms_px=fit.rms_px,
+        rms_mm=fit.rms_mm,
+        sigma_marker_mm={
+            "intrinsics_max": largest(fit.sigma.intrinsics_mm),
+            "plane_max": largest(fit.sigma.plane_mm),
+            "calibration_max": largest(fit.sigma.calibration_mm),
+            "quantisation_max": largest(fit.sigma.quantisation_mm),
+            "total_max": largest(fit.sigma.total_mm),
+        },
+        without_intrinsics=without,
+        pictures=len(fit.pictures),
+        points=fit.points,
+        orientation=" ".join(inputs.orientation),
+        **judged(Verdict.of(findings)),
+    ).with_evidence(PlaneEvidence(optics, fit, inputs.orientation, inputs.without))
+
+
+def _plane_document(result: Plane) -> dict[str, Any]:
+    return {"pictures_without_board": list(result.evidence.without)}
+
+
+def _plane_words(result: Plane) -> list[Block]:
+    from calib.core.words import Line, Table
+
+    rows = tuple(tuple(f"{value:.4f}" for value in row) for row in result.A_px_per_m)
+    return [
+        Table(("x, px/m", "y, px/m", "1, px"), rows, "A, world metres to pixels (2.9, with K)"),
+        *(Line(f"no board in {name}") for name in result.evidence.without),
+    ]
+
+
+def _draw_plane(folder: Path, result: Plane) -> object:
+    from calib.stages.camera.plots import write_plane_figures
+
+    return write_plane_figures(folder, result.evidence.camera, result.evidence.fit)
+
+
+extrinsics = Stage(
+    "extrinsics",
+    "Plane of motion",
+    """Find the actuator's plane: its homography, with error bars in millimetres.
+
+    Needs the section camera of the rig's file and writes the section plane. Exits 1 when the verdict is
+    not ok.
+    """,
+    _read_plane,
+    _solve_plane,
+    sources="Folder with pictures of the board lying in the plane, and with a board.yaml that says where: "
+    "corners, square_m, first_corner_m: [x, y], angle_rad. [default: images/plane]",
+    several=False,
+    optional=True,
+    writes=("plane",),
+    needs=("camera",),
+    document=_plane_document,
+    words=_plane_words,
+    draw=_draw_plane,
+    remarks=_outdated,
+)
+
+
+# ----------------------------------------------------------------------
+# `calib distortion`: what the lens's distortion costs, in pixels and on the plane.
+
+
+@dataclass(frozen=True)
+class LensOptions:
+    """Where the lens is looked at."""
+
+    region_px: tuple[float, float, float, float] | None = option(
+        None,
+        "Region of interest in px, as 78,52,238,156. [default: around the plane's workspace, without a plane "
+        "the middle]",
+        flag="region",
+        metavar="U0,V0,U1,V1",
+        parse=parse_region_px,
+    )
+
+
+@dataclass(frozen=True)
+class LensInputs:
+    """A camera, what is needed of its plane, and a region of interest."""
+
+    camera: Camera
+    plane: lens.PlaneView | None
+    region_px: tuple[float, float, float, float] | None
+
+
+@dataclass(frozen=True)
+class LensEvidence:
+    """What a judgement of a lens was made from."""
+
+    camera: model.Camera
+    report: lens.DistortionReport
+
+
+def _read_lens(files: Files, rig: Rig, options: LensOptions) -> LensInputs:
+    import numpy as np
+
+    from calib.core.result import identity
+    from calib.core.rig import Geometry
+    from calib.stages.camera.lens import PlaneView
+
+    assert rig.camera is not None
+    files.hashes["camera"] = identity(rig.camera)
+    view = None
+    current = rig.current_plane(files.rig_path)
+    if current is not None:
+        files.hashes["plane"] = identity(current)
+        x0, y0, x1, y1 = (rig.geometry or Geometry()).workspace_m
+        sigma_mm = current.sigma_marker_mm.get("calibration_max")
+        view = PlaneView(np.array(current.R_CW), np.array(current.t_CW_m), (x0, y0, x1, y1), sigma_mm)
+    if not rig.camera.verdict.ok:
+        word = rig.camera.verdict.word
+        files.narrate(f"the camera's own verdict is {word}; what follows is no better than that")
+    return LensInputs(rig.camera, view, options.region_px)
+
+
+def _solve_lens(inputs: LensInputs) -> Lens:
+    from calib.core.result import finite_or_none
+    from calib.stages.camera.lens import analyse_distortion
+    from calib.stages.camera.section import InverseLens, Lens
+
+    optics = inputs.camera.optics
+    report = analyse_distortion(
+        optics, inputs.camera.intrinsic_covariance, plane=inputs.plane, region_px=inputs.region_px
+    )
+    cost, inverse = report.plane, report.inverse
+    return Lens(
+        kind=report.kind,
+        max_px=report.max_px,
+        mean_px=report.mean_px,
+        region_px=[float(value) for value in report.region_px],
+        region_max_px=report.region_max_px,
+        region_mean_px=report.region_mean_px,
+        region_sigma_px=report.region_sigma_px,
+        monotonic=report.monotonic,
+        plane_max_mm=None if cost is None else cost.max_mm,
+        plane_mean_mm=None if cost is None else cost.mean_mm,
+        refitted_max_mm=None if cost is None else cost.refitted_max_mm,
+        refitted_mean_mm=None if cost is None else cost.refitted_mean_mm,
+        inverse=InverseLens(
+            radial=list(inverse.radial),
+            decentering_steps=inverse.decentering_steps,
+            max_error_px=finite_or_none(inverse.max_error_px),
+            covered=inverse.covered,
+        ),
+        effect=report.effect,
+        verdict="ok",
+        remarks=[report.why],
+    ).with_evidence(LensEvidence(optics, report))
+
+
+def _lens_words(result: Lens) -> list[Block]:
+    from calib.core.words import Line, Table
+
+    inverse = result.inverse
+    error = "without bound" if inverse.max_error_px is None else f"at most {inverse.max_error_px:.4f} px"
+    rows = tuple((f"c{i}", f"{value:.9g}") for i, value in enumerate(inverse.radial, start=1))
+    return [
+        Table(("", "value"), rows, "inverse polynomial"),
+        Line(f"{inverse.decentering_steps} decentering steps, error {error} over {inverse.covered:.0%}"),
+    ]
+
+
+def _draw_lens(folder: Path, result: Lens) -> object:
+    from calib.stages.camera.plots import write_lens_figures
+
+    return write_lens_figures(folder, result.evidence.camera, result.evidence.report)
+
+
+distortion = Stage(
+    "distortion",
+    "Lens",
+    """Say what lens distortion costs, and find the polynomial that undoes it.
+
+    Needs the section camera of the rig's file, uses the section plane, and writes the section lens.
+    """,
+    _read_lens,
+    _solve_lens,
+    LensOptions,
+    writes=("lens",),
+    needs=("camera",),
+    uses=("plane",),
+    words=_lens_words,
+    draw=_draw_lens,
+)
