@@ -257,8 +257,8 @@ def _class_of(kind: type[BaseModel], title: str) -> type[BaseModel]:
 
 
 def meanings(kind: type[BaseModel]) -> dict[str, str]:
-    """What the docstring's list of attributes, and the text behind single fields, say of each key."""
-    out: dict[str, str] = {}
+    """What labels, the docstring's list of attributes and the text behind single fields say of each key."""
+    out = {name: field.title for name, field in kind.model_fields.items() if field.title}
     for one in reversed(kind.__mro__[: kind.__mro__.index(BaseModel)]):
         listed = (inspect.getdoc(one) or "").partition("Attributes\n----------\n")[2]
         entries = re.split(r"(?:^|(?<=[.,] )|\n)((?:[\w*]+, )*[\w*]+) : ", listed)

@@ -30,7 +30,10 @@ def verb(stage: Stage) -> Callable[..., None]:
 
     command.__name__ = stage.name.split()[-1]
     command.__doc__ = stage.summary
-    command.__signature__ = inspect.Signature(_parameters(stage))  # type: ignore[attr-defined]  # typer reads it
+    parameters = _parameters(stage)
+    # What typer and help() read.
+    command.__annotations__ = {one.name: one.annotation for one in parameters}
+    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # no function has it before
     return command
 
 
