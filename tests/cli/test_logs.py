@@ -17,7 +17,9 @@ from bags import readings, write_bag
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from calib.core.rig import hash_of, identity, read_rig
+from calib.core.files import hash_of
+from calib.core.result import identity
+from calib.core.rig import read_rig
 from calib.io.logs import MEASURED, Log, read_log, write_log
 from calib.io.serial import Frame, encoded
 from calib.stages.firmware.header import Header, header_of, identity_of

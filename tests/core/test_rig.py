@@ -11,8 +11,10 @@ import pytest
 import yaml
 
 from calib.core.errors import BadInputError
-from calib.core.rig import Camera, Rig, identity, read_rig, rig_text, write_rig
+from calib.core.result import identity
+from calib.core.rig import Rig, read_rig, rig_text, write_rig
 from calib.show.diff import diff_rigs
+from calib.stages.camera.section import Camera
 
 CAMERA = Camera(
     model="radial2",
@@ -55,7 +57,7 @@ def test_sections_of_later_versions_survive(tmp_path: Path) -> None:
         (("[316, 208]", "[316]"), r"camera\.image_size_px"),
         (("fx_px: 273.4", "fx_px: 273e0"), r"camera\.fx_px is '273e0', expected a number \(without quotes"),
         (("[316, 208]", "[316, 208.0]"), r"camera\.image_size_px\.1 is 208\.0, expected a whole number"),
-        (("verdict: ok", "verdict: 1"), r"camera\.verdict is 1, expected text"),
+        (("verdict: ok", "verdict: 1"), r"camera\.verdict is 1, expected 'ok'"),
     ],
 )
 def test_wrong_values_name_file_key_value_and_what_was_expected(

@@ -183,7 +183,7 @@ def test_a_chunk_that_unpacks_to_too_much_is_refused(
 
 
 def test_the_hash_of_a_folder_is_that_of_its_files(tmp_path: Path) -> None:
-    from calib.core.rig import hash_of
+    from calib.core.files import hash_of
 
     path = write_bag(tmp_path, "sqlite", readings(np.random.default_rng(0), 0.2))
     before = hash_of(path)
