@@ -2,37 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from itertools import combinations
-from pathlib import Path
-from types import ModuleType
 from typing import Any
 
-import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure as Drawing
 from matplotlib.text import Text
+
+from calib.core.plot import Arrows, Bars, Curve, Field, Figure, Mark, Ribbon, Shape
+from calib.show.draw import draw, look
 
 WIDTH_PX, SMALLEST_PX = 1000.0, 11.5
 """Width at which a figure has to be legible, and the size of letters that still is."""
 
 
-@contextmanager
-def kept(monkeypatch: pytest.MonkeyPatch, module: ModuleType) -> Iterator[dict[str, Figure]]:
-    """The figures that a module would save, by name, instead of files."""
-    figures: dict[str, Figure] = {}
-
-    def keep(figure: Figure, path: Path) -> Path:
-        figures[path.name] = figure
-        return path
-
-    with monkeypatch.context() as patch:
-        patch.setattr(module, "save", keep)
-        yield figures
-
-
-def drawn_texts(figure: Figure) -> list[Text]:
+def drawn_texts(figure: Drawing) -> list[Text]:
     """All texts that reach the sheet when the figure is drawn."""
     found: list[Text] = []
     draw = Text.draw
@@ -44,7 +28,8 @@ def drawn_texts(figure: Figure) -> list[Text]:
 
     Text.draw = noted
     try:
-        FigureCanvasAgg(figure).draw()
+        with look():
+            FigureCanvasAgg(figure).draw()
     finally:
         Text.draw = draw
     return found
@@ -59,8 +44,29 @@ def _box(text: Text) -> tuple[float, float, float, float]:
     return box.x0, box.y0, box.x1, box.y1
 
 
+def words_of(figure: Figure) -> str:
+    """All words of a figure, as they are drawn but without line breaks."""
+    return " ".join(text.get_text().replace("\n", " ") for text in drawn_texts(draw(figure)))
+
+
 def complaints(figure: Figure) -> list[str]:
-    """What makes the words of a figure hard to read, empty where nothing does."""
+    """What is wrong with a figure: panels without anything in them, and words that are hard to read."""
+    out = [
+        f"panel {k} is empty"
+        for k, panel in enumerate(figure.panels, start=1)
+        if not panel.empty and not any(_something(mark) for mark in panel.marks)
+    ]
+    return out + complaints_of(draw(figure))
+
+
+def _something(mark: Mark) -> bool:
+    """Whether a mark shows data."""
+    values = {Curve: "y", Ribbon: "low", Bars: "length", Shape: "points", Field: "values", Arrows: "vectors"}
+    return any(isinstance(mark, kind) and getattr(mark, name).size for kind, name in values.items())
+
+
+def complaints_of(figure: Drawing) -> list[str]:
+    """What makes the words of a drawing hard to read, empty where nothing does."""
     texts = drawn_texts(figure)
     width, height = figure.bbox.width, figure.bbox.height
     out = []

@@ -56,7 +56,7 @@ def _parameters(stage: Stage) -> list[inspect.Parameter]:
         switch = typer.Option(name, help=meta["words"], metavar=meta["metavar"] or None)
         default = None if meta["parse"] is not None else default
         out.append(inspect.Parameter(one.name, kind, default=default, annotation=Annotated[shape, switch]))
-    if stage.draw is not None:
+    if stage.plots is not None:
         out.append(inspect.Parameter("figures", kind, default=None, annotation=FiguresOption))
     out.append(inspect.Parameter("rig", kind, default=Path("rig.yaml"), annotation=RigOption))
     out.append(inspect.Parameter("as_json", kind, default=False, annotation=JsonOption))
@@ -83,8 +83,10 @@ def _run(stage: Stage, files: Files, options: Any, figures: Path | None, as_json
             before.model_copy(update=sections),
             {name: one.inputs for name, one in sections.items()},
         )
-    if figures is not None and stage.draw is not None:
-        stage.draw(figures, outcome)
+    if figures is not None and stage.plots is not None:
+        from calib.show.draw import write_figures
+
+        write_figures(figures, stage.plots(outcome))
         narrate(f"figures in {shown(figures)}")
     if as_json:
         written = {name: section_json(one) for name, one in sections.items()}

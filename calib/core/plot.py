@@ -14,29 +14,20 @@ from typing import Literal
 
 import numpy as np
 
-from calib.core.arrays import FloatArray
+from calib.core.arrays import AnyArray, FloatArray
 from calib.core.files import one_line
 
 Hue = Literal[
-    "ink",
-    "grey",
-    "silver",
-    "shade",
-    "blue",
-    "sky",
-    "ice",
-    "green",
-    "mint",
-    "orange",
-    "ochre",
-    "red",
-    "purple",
-]
+    "ink", "grey", "silver", "shade", "blue", "sky", "ice", "green", "mint", "orange", "ochre", "peach",
+    "red", "purple",
+]  # fmt: skip
 Colour = Hue | float
 Kind = Literal[
     "line", "dashed", "dotted", "points", "cloud", "crosses", "pluses", "squares", "diamonds", "marks"
 ]
 """How a curve is drawn: as a line, as markers, as dots of a pixel ("cloud") or as short strokes ("marks")."""
+
+Align = Literal["left", "center", "right"]
 
 SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 WIDTH_IN = 9.2
@@ -57,8 +48,8 @@ class Curve:
     spread : (n,) half lengths of error bars along y, or `across`, along x.
     """
 
-    x: FloatArray
-    y: FloatArray
+    x: AnyArray
+    y: AnyArray
     label: str = ""
     kind: Kind = "line"
     colour: Colour | FloatArray = "blue"
@@ -104,8 +95,8 @@ class Rule:
 class Bars:
     """Bars from 0 to (n,) `length` at (n,) places, `across` from left to right, `width` of them thick."""
 
-    at: FloatArray
-    length: FloatArray
+    at: AnyArray
+    length: AnyArray
     width: float = 0.8
     colour: Colour | FloatArray = "blue"
     across: bool = False
@@ -165,7 +156,7 @@ class Text:
     y: float
     words: str
     colour: Colour = "ink"
-    align: Literal["left", "center", "right"] = "center"
+    align: Align = "center"
     bold: bool = False
 
 
@@ -300,6 +291,14 @@ def magnified(reach: float, longest: float) -> float:
         return 1.0
     unit = 10.0 ** (math.floor(math.log10(ratio)) - 1)
     return float(f"{max(math.floor(ratio / unit), 1) * unit:.2g}")
+
+
+def round_down(value: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten that is not above a positive value; 1 for others."""
+    if not (math.isfinite(value) and value > 0.0):
+        return 1.0
+    power = 10.0 ** math.floor(math.log10(value) + 1e-12)
+    return power * max(step for step in (1.0, 2.0, 5.0) if step * power <= value * (1 + 1e-9) or step == 1.0)
 
 
 def short(text: str, most: int) -> str:

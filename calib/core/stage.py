@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from calib.core.errors import BadInputError, UsageError
 
 if TYPE_CHECKING:
+    from calib.core.plot import Figure
     from calib.core.result import Result
     from calib.core.rig import Rig
     from calib.core.verdict import Verdict
@@ -123,7 +124,7 @@ class Stage:
     writes : sections of rig.yaml. needs : those without which it cannot run. uses : those that it reads
         where they are.
     document : what --json prints beside the sections. words : blocks in front of the sections' own.
-    draw : writes figures into a folder.
+    plots : figures by the names of their files, without drawing them.
     remarks : sentences about the rig as it is after the stage.
     """
 
@@ -142,7 +143,7 @@ class Stage:
     uses: tuple[str, ...] = ()
     document: Callable[[Any], dict[str, Any]] = _no_evidence
     words: Callable[[Any], Sequence[Block]] | None = None
-    draw: Callable[[Path, Any], object] | None = None
+    plots: Callable[[Any], dict[str, Figure]] | None = None
     remarks: Callable[[Rig], Sequence[str]] | None = None
 
     def run(self, files: Files, rig: Rig, options: Any) -> Any:

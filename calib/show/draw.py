@@ -57,12 +57,13 @@ from calib.core.plot import (
     Text,
     number,
     rectangle,
+    round_down,
 )
 
 HUES = {
     "ink": "#1d2730", "grey": "#66727d", "silver": "#b9c0c7", "shade": "#e9ecef", "blue": "#0072B2",
     "sky": "#56B4E9", "ice": "#e1eef7", "green": "#009E73", "mint": "#dff1ea", "orange": "#E69F00",
-    "ochre": "#fdeccc", "red": "#D55E00", "purple": "#CC79A7",
+    "ochre": "#fdeccc", "peach": "#f6cfb2", "red": "#D55E00", "purple": "#CC79A7",
 }  # fmt: skip
 _HATCHES: dict[object, tuple[str, str]] = {"ochre": ("//", HUES["orange"]), "shade": ("///", HUES["silver"])}
 _INK, _GREY = HUES["ink"], HUES["grey"]
@@ -144,6 +145,9 @@ def draw(figure: Figure) -> Drawing:
         for axes, panel in zip(placed, figure.panels, strict=True):
             _panel(axes, panel)
         _legend(drawing, [axes for axes in placed if axes.get_legend() is None])
+        if any(panel.equal for panel in figure.panels):
+            # Room for labels is first measured around panels that do not have their shape yet.
+            layout.execute(drawing)
         return drawing
 
 
@@ -236,8 +240,8 @@ def _panel(axes: Axes, panel: Plot) -> None:
         axes.set_aspect("equal", adjustable="box" if fixed else "datalim", anchor="N")
     for order, mark in zip(count(1), panel.marks):
         _mark(axes, mark, 2.0 + 0.01 * order)
-    wide, high = _share(axes)
-    for name, axis, most in (("x", axes.xaxis, 13.0 * wide), ("y", axes.yaxis, 3.0 * high)):
+    wide, high = _size_in(axes)
+    for name, axis, most in (("x", axes.xaxis, 1.5 * wide), ("y", axes.yaxis, 3.0 * high)):
         if not (name == "y" and panel.names):
             _ticks(axis, panel.linear_within, name in panel.whole, int(np.clip(round(most), 4, 10)))
     if not panel.x:
@@ -258,15 +262,20 @@ def _panel(axes: Axes, panel: Plot) -> None:
         axes.set_yticks([])
 
 
-def _share(axes: Any) -> tuple[float, float]:
-    """Width of a panel's cell as a share of the sheet, and its height in inches."""
-    cell = axes.get_subplotspec().get_position(axes.figure)
-    return cell.width, cell.height * axes.figure.get_figheight()
+def _size_in(axes: Any) -> tuple[float, float]:
+    """Width and height of a panel in inches, about, with the labels beside it."""
+    figure = axes.figure
+    cell = axes.get_subplotspec().get_position(figure)
+    wide, high = cell.width * figure.get_figwidth(), cell.height * figure.get_figheight()
+    if axes.get_aspect() != "auto" and axes.get_adjustable() == "box":
+        shape = abs(np.ptp(axes.get_xlim()) / np.ptp(axes.get_ylim()))
+        wide, high = min(wide, high * shape), min(high, wide / shape)
+    return wide, high
 
 
 def _empty(axes: Axes, sentence: str) -> None:
     """A panel with nothing to draw says why."""
-    words = "\n".join(textwrap.wrap(plain(sentence), 40 if _share(axes)[0] > 0.3 else 20))
+    words = "\n".join(textwrap.wrap(plain(sentence), int(np.clip(9.0 * _size_in(axes)[0], 12, 40))))
     axes.text(
         0.5, 0.5, words, transform=axes.transAxes, ha="center", va="center", color=_GREY, fontsize=11,
         zorder=9.0, bbox={"facecolor": "white", "edgecolor": "#d3d8dd", "boxstyle": "round,pad=0.6"},
@@ -357,7 +366,8 @@ def _mark(axes: Axes, mark: Mark, z: float) -> None:
         case Text():
             axes.text(
                 mark.x, mark.y, plain(mark.words), color=colour(mark.colour), ha=mark.align, va="center",
-                fontsize=9.0, weight="bold" if mark.bold else "normal", path_effects=_HALO, zorder=z,
+                fontsize=9.0, weight="bold" if mark.bold else "normal", zorder=z,
+                bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0, "alpha": 0.85},
             )  # fmt: skip
 
 
@@ -432,19 +442,15 @@ def _arrows(axes: Axes, arrows: Arrows, z: float) -> None:
         color=colour(arrows.colour), zorder=z,
     )  # fmt: skip
     longest = float(np.quantile(np.hypot(*vectors.T), 0.98))
-    if arrows.unit and longest > 0.0:
+    wide, high = _size_in(axes)
+    # Above a narrow panel there is no room beside the title, which tells how long the arrows are.
+    if arrows.unit and longest > 0.0 and wide > 0.7 * high:
         length = round_down(1.3 * longest)
         left, right = sorted(axes.get_xlim())
         start = 1.0 - length * arrows.times / (right - left)
-        axes.quiverkey(drawn, start, 1.035, length, f"{length:g} {arrows.unit}", labelpos="W", labelsep=0.05)
-
-
-def round_down(value: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is not above a positive value; 1 for others."""
-    if not (math.isfinite(value) and value > 0.0):
-        return 1.0
-    power = 10.0 ** math.floor(math.log10(value) + 1e-12)
-    return power * max(step for step in (1.0, 2.0, 5.0) if step * power <= value * (1 + 1e-9) or step == 1.0)
+        axes.quiverkey(
+            drawn, start, 1.0 + 0.17 / high, length, f"{length:g} {arrows.unit}", labelpos="W", labelsep=0.05
+        )
 
 
 # ----------------------------------------------------------------------

@@ -1,40 +1,38 @@
-"""Figures of camera, plane, lens and low-pass: legible whatever a fit came to, and true to their numbers."""
+"""All figures of all stages: legible whatever a result came to, and true to their numbers."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from figure_checks import complaints, drawn_texts, kept
+from figure_checks import complaints, complaints_of, drawn_texts, words_of
 from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.quiver import Quiver
 
 from calib.core.arrays import FloatArray
+from calib.core.plot import Arrows, Curve, Figure, Plot, Text, magnified, short
+from calib.core.verdict import Verdict, Word
 from calib.io.logs import Log, write_log
-from calib.show.draw import draw
-from calib.show.style import look, plain, sheet
-from calib.stages.camera import plots as camera_figures
-from calib.stages.camera import plots as lens_figures
-from calib.stages.camera import plots as plane_figures
+from calib.show.draw import draw, plain
 from calib.stages.camera.bundle import Calibration, calibrate, covariance, rotation_exp
 from calib.stages.camera.intrinsics import Intrinsics
 from calib.stages.camera.lens import PlaneView, analyse_distortion
 from calib.stages.camera.model import Camera, View, pack, project
 from calib.stages.camera.plane import Plane, calibrate_plane
 from calib.stages.camera.plots import (
-    _cell_means,
-    _inverse_error,
-    _radial,
-    _radial_sigma,
-    arrows,
-    picture_frame,
-    write_camera_figures,
-    write_lens_figures,
-    write_plane_figures,
+    cell_means,
+    inverse_error,
+    lens_plots,
+    picture,
+    plane_plots,
+    radial_displacement,
+    radial_sigma,
 )
+from calib.stages.camera.plots import plots as camera_plots
 from calib.stages.camera.verdict import Judgement
 from calib.stages.lowpass.filters import Design, design_lowpass
 from calib.stages.lowpass.plots import plots as lowpass_plots
@@ -44,27 +42,27 @@ from synthetic import CAMERA, views_of
 
 @given(st.text(st.characters(codec=None), max_size=60), st.integers(8, 40))
 def test_any_text_becomes_a_label_of_drawable_signs(text: str, most: int) -> None:
-    label = plain(text, most)
+    label = short(text, most)
     assert len(label) <= most
-    assert label.isprintable()
+    assert label.isprintable() and plain(label).isprintable()
     # Nothing is lost where nothing had to change.
     ordinary = "view-01_(a)$b$.png"
-    assert plain(ordinary) == ordinary
-    assert plain(ordinary, 18) == ordinary
+    assert plain(short(ordinary, 18)) == ordinary
 
 
 def test_the_checks_see_what_is_wrong() -> None:
-    with look():
-        figure = sheet(2.0, "A title")
-        axes = figure.subplots()
-        axes.text(0.5, 0.5, "one thing", transform=axes.transAxes)
-        axes.text(0.51, 0.5, "another", transform=axes.transAxes)
-        axes.text(0.1, 0.1, "tiny", fontsize=4, transform=axes.transAxes)
-        axes.text(0.95, 0.9, "a text that leaves the sheet", transform=axes.transAxes, in_layout=False)
-        found = " ".join(complaints(figure))
+    marks = (Text(0.5, 0.5, "one thing"), Text(0.51, 0.5, "another"), Text(3.0, 0.0, "off"))
+    panel = Plot("x", "y", (Curve(np.zeros(2), np.ones(2)), *marks), x_limits=(0.0, 1.0), y_limits=(0.0, 1.0))
+    figure = Figure("A title", "A note", (panel, Plot("x", "y")), 2.0, columns=2)
+    drawing = draw(figure)
+    for text in drawing.axes[0].texts:
+        text.set_in_layout(False)
+    drawing.axes[0].title.set(text="tiny", fontsize=4)
+    found = " ".join([*complaints(figure), *complaints_of(drawing)])
     assert "'one thing' lies on 'another'" in found
     assert "'tiny' is too small" in found
-    assert "'a text that leaves the sheet' runs off the sheet" in found
+    assert "'off' runs off the sheet" in found
+    assert "panel 2 is empty" in found
 
 
 def result_of(
@@ -72,11 +70,11 @@ def result_of(
     size: tuple[int, int] = (640, 480),
     model: str = "radial2",
     fixed: tuple[str, ...] = (),
-    verdict: str = "ok",
+    verdict: Word = "ok",
 ) -> Intrinsics:
     """A calibration with everything the figures need, without judging it."""
     fit = calibrate(pack(views), size, model, fixed=fixed)
-    judgement = Judgement(verdict, (), (), (), {})
+    judgement = Judgement(Verdict.stored(verdict))
     return Intrinsics(fit, covariance(fit), judgement, (), (), "rigid", (), {})
 
 
@@ -164,35 +162,7 @@ def _outliers() -> Intrinsics:
     views = views_of(5, noise_px=0.05)
     views[2].pixels[7] += [40.0, -25.0]
     fit = calibrate(pack(views), (640, 480), "radial2", loss="cauchy")
-    return Intrinsics(fit, covariance(fit), Judgement("poor", (), (), (), {}), (), (), "rigid", (), {})
-
-
-CASES = {
-    "one view": _one_view,
-    "400 views": _many_views,
-    "no distortion, odd names": _no_distortion_and_odd_names,
-    "upright picture": _upright,
-    "sigma not bounded": _unbounded,
-    "no tilt": lambda: _tilted(0.0, 4),
-    "failed fit": _failed,
-    "not finite": _not_finite,
-    "no residuals": _exact,
-    "outliers": _outliers,
-    "precise": _precise,
-}
-SLOW = pytest.mark.slow
-QUICK = ("sigma not bounded", "no distortion, odd names")
-
-
-@pytest.mark.parametrize("case", [c if c in QUICK else pytest.param(c, marks=SLOW) for c in CASES])
-def test_all_figures_are_legible(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    result = CASES[case]()
-    with kept(monkeypatch, camera_figures) as figures:
-        write_camera_figures(tmp_path, result)
-    assert len(figures) == 6
-    with camera_figures.look():
-        for name, figure in figures.items():
-            assert complaints(figure) == [], name
+    return Intrinsics(fit, covariance(fit), Judgement(Verdict.stored("poor")), (), (), "rigid", (), {})
 
 
 BROWN = Camera(
@@ -203,28 +173,6 @@ PINHOLE = Camera("pinhole", (1920, 1080), 1500.0, 1500.0, 0.0, 960.0, 540.0)
 UPRIGHT = replace(CAMERA, image_size_px=(480, 640), cx_px=240.0, cy_px=320.0)
 
 
-@pytest.mark.parametrize("name", ["CAMERA", "BROWN", "FOLDING", "PINHOLE", "UPRIGHT"])
-def test_all_figures_are_legible_in_lens_figures(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    camera = globals()[name]
-    plane = PlaneView(np.eye(3), np.array([0.0, -0.07, 0.3]), (-0.06, 0.04, 0.06, 0.11), 0.05)
-    report = analyse_distortion(camera, plane=plane)
-    with kept(monkeypatch, lens_figures) as figures:
-        write_lens_figures(tmp_path, camera, report)
-    with lens_figures.look():
-        for file, figure in figures.items():
-            assert complaints(figure) == [], file
-        words = " ".join(
-            t.get_text().replace("\n", " ") for t in drawn_texts(figures["lens_displacement.png"])
-        )
-    assert f"verdict: {report.verdict}" in words
-    if name == "PINHOLE":
-        assert "no distortion" in words
-    if name == "FOLDING":
-        assert "folds over" in words
-
-
 def test_the_band_is_the_spread_of_repeated_calibrations() -> None:
     radius = np.array([100.0, 200.0, 300.0])
     clean = pack(views_of(8))
@@ -233,8 +181,8 @@ def test_the_band_is_the_spread_of_repeated_calibrations() -> None:
     for _ in range(120):
         noisy = replace(clean, pixels=clean.pixels + 0.1 * rng.standard_normal(clean.pixels.shape))
         fit = calibrate(noisy, (640, 480), "radial2")
-        curves.append(_radial(fit.camera, radius))
-    reported = _radial_sigma(fit.camera, covariance(fit, 0.01), radius)
+        curves.append(radial_displacement(fit.camera, radius))
+    reported = radial_sigma(fit.camera, covariance(fit, 0.01), radius)
     # 120 samples give a standard deviation to 6.5 %.
     np.testing.assert_allclose(np.std(curves, axis=0, ddof=1), reported, rtol=0.2)
 
@@ -246,7 +194,7 @@ def test_the_drawn_error_is_the_reported_one(camera: Camera) -> None:
     border = np.stack(np.meshgrid(np.linspace(0, width - 1, 80), np.linspace(0, height - 1, 60)), -1).reshape(
         -1, 2
     )
-    error = _inverse_error(camera, report.inverse, border)
+    error = inverse_error(camera, report.inverse, border)
     assert np.isfinite(error).all()
     assert error.max() <= report.inverse.max_error_px * 1.02 + 1e-4
     assert error.max() > 0.5 * report.inverse.max_error_px
@@ -293,37 +241,6 @@ def _ideal() -> tuple[Camera, Plane]:
     return camera, plane_of(camera, noise_px=0.0)
 
 
-CASES_PLANE_FIGURES = {
-    "316x208": _tiny,
-    "1920x1080, three pictures, odd names": _wide,
-    "no distortion, no noise": _ideal,
-    "part of the workspace seen": lambda: (
-        CAMERA,
-        plane_of(workspace_m=(-0.2, 0.0, 0.2, 0.3), covariance=_known()),
-    ),
-    "nothing of the workspace seen": lambda: (CAMERA, plane_of(workspace_m=(1.0, 1.0, 1.1, 1.1))),
-    "upright workspace": lambda: (CAMERA, plane_of(workspace_m=(-0.01, 0.0, 0.02, 0.12))),
-    "four corners": lambda: (CAMERA, plane_of(points=4, covariance=_known())),
-    "twelve pictures": lambda: (CAMERA, plane_of(names=tuple(f"{k}.png" for k in range(12)))),
-}
-QUICK_PLANE_FIGURES = ("316x208", "nothing of the workspace seen")
-
-
-@pytest.mark.parametrize(
-    "case", [c if c in QUICK_PLANE_FIGURES else pytest.param(c, marks=SLOW) for c in CASES_PLANE_FIGURES]
-)
-def test_all_figures_are_legible_in_plane_figures(
-    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    camera, plane = CASES_PLANE_FIGURES[case]()
-    with kept(monkeypatch, plane_figures) as figures:
-        write_plane_figures(tmp_path, camera, plane)
-    assert len(figures) == 3
-    with plane_figures.look():
-        for name, figure in figures.items():
-            assert complaints(figure) == [], name
-
-
 def _positions(folder: Path, still: bool = False, n: int = 3000) -> Positions:
     t = np.arange(n) / 60.0
     noise = (0.0 if still else 1.0) * np.random.default_rng(0).normal(size=(2, n))
@@ -333,28 +250,90 @@ def _positions(folder: Path, still: bool = False, n: int = 3000) -> Positions:
     return positions_from_log(folder / "log.csv", 60.0, None, None)
 
 
-@pytest.mark.slow
+def _lens(camera: Camera) -> dict[str, Figure]:
+    plane = PlaneView(np.eye(3), np.array([0.0, -0.07, 0.3]), WORKSPACE, 0.05)
+    return lens_plots(camera, analyse_distortion(camera, plane=plane))
+
+
+def _low_pass(cutoff: float, order: int, family: str, folder: Path, still: bool = False) -> dict[str, Figure]:
+    made, seen = design_lowpass(Design(cutoff, 60.0, order, family)), _positions(folder, still)
+    return lowpass_plots(made, lowpass_section(made, WORKSPACE, seen), seen)
+
+
+CASES: dict[str, Callable[[Path], dict[str, Figure]]] = {
+    "camera: one view": lambda _: camera_plots(_one_view()),
+    "camera: 400 views": lambda _: camera_plots(_many_views()),
+    "camera: no distortion, odd names": lambda _: camera_plots(_no_distortion_and_odd_names()),
+    "camera: upright picture": lambda _: camera_plots(_upright()),
+    "camera: sigma not bounded": lambda _: camera_plots(_unbounded()),
+    "camera: no tilt": lambda _: camera_plots(_tilted(0.0, 4)),
+    "camera: failed fit": lambda _: camera_plots(_failed()),
+    "camera: not finite": lambda _: camera_plots(_not_finite()),
+    "camera: no residuals": lambda _: camera_plots(_exact()),
+    "camera: outliers": lambda _: camera_plots(_outliers()),
+    "camera: precise": lambda _: camera_plots(_precise()),
+    "lens: usual": lambda _: _lens(CAMERA),
+    "lens: Brown": lambda _: _lens(BROWN),
+    "lens: folding": lambda _: _lens(FOLDING),
+    "lens: pinhole": lambda _: _lens(PINHOLE),
+    "lens: upright": lambda _: _lens(UPRIGHT),
+    "plane: 316x208": lambda _: plane_plots(*_tiny()),
+    "plane: 1920x1080, three pictures, odd names": lambda _: plane_plots(*_wide()),
+    "plane: no distortion, no noise": lambda _: plane_plots(*_ideal()),
+    "plane: part of the workspace": lambda _: plane_plots(
+        CAMERA, plane_of(workspace_m=(-0.2, 0.0, 0.2, 0.3), covariance=_known())
+    ),
+    "plane: nothing of the workspace": lambda _: plane_plots(
+        CAMERA, plane_of(workspace_m=(1.0, 1.0, 1.1, 1.1))
+    ),
+    "plane: upright workspace": lambda _: plane_plots(CAMERA, plane_of(workspace_m=(-0.01, 0.0, 0.02, 0.12))),
+    "plane: four corners": lambda _: plane_plots(CAMERA, plane_of(points=4, covariance=_known())),
+    "plane: twelve pictures": lambda _: plane_plots(
+        CAMERA, plane_of(names=tuple(f"{k}.png" for k in range(12)))
+    ),
+    "low-pass: order 1": lambda folder: _low_pass(1.0, 1, "butterworth", folder),
+    "low-pass: still log": lambda folder: _low_pass(1.0, 8, "butterworth", folder, still=True),
+    "low-pass: fast Bessel": lambda folder: _low_pass(20.0, 4, "bessel", folder),
+    "low-pass: slow critical": lambda folder: _low_pass(0.1, 3, "critical", folder),
+    "low-pass: very slow": lambda folder: _low_pass(0.01, 2, "butterworth", folder),
+}
+QUICK = (
+    "camera: sigma not bounded",
+    "camera: no distortion, odd names",
+    "lens: Brown",
+    "plane: 316x208",
+    "plane: nothing of the workspace",
+    "low-pass: order 1",
+)
+
+
 @pytest.mark.parametrize(
-    ("cutoff", "order", "family", "still"),
+    "name", [c if c in QUICK else pytest.param(c, marks=pytest.mark.slow) for c in CASES]
+)
+def test_all_figures_are_legible(name: str, tmp_path: Path) -> None:
+    figures = CASES[name](tmp_path)
+    assert figures
+    for stem, figure in figures.items():
+        assert complaints(figure) == [], stem
+
+
+@pytest.mark.parametrize(
+    ("name", "stem", "words"),
     [
-        (1.0, 1, "butterworth", False),
-        (1.0, 8, "butterworth", True),
-        (20.0, 4, "bessel", False),
-        (0.1, 3, "critical", False),
-        (0.01, 2, "butterworth", False),
+        ("camera: sigma not bounded", "camera_sigma", "not bounded"),
+        ("camera: sigma not bounded", "camera_coverage", "not estimated"),
+        ("camera: sigma not bounded", "camera_poses", "verdict: unidentifiable"),
+        ("lens: pinhole", "lens_displacement", "no distortion"),
+        ("lens: folding", "lens_displacement", "folds over"),
+        ("lens: Brown", "lens_displacement", "; it matters"),
+        ("plane: twelve pictures", "plane_sigma", "covariance of the intrinsics is not known"),
+        ("plane: nothing of the workspace", "plane_difference", "No part of the workspace is in the picture"),
+        ("plane: nothing of the workspace", "plane_sigma", "verdict: poor"),
+        ("low-pass: still log", "lowpass_log", "v never changes"),
     ],
 )
-def test_all_figures_are_legible_in_lowpass_figures(
-    cutoff: float, order: int, family: str, still: bool, tmp_path: Path
-) -> None:
-    made, seen = design_lowpass(Design(cutoff, 60.0, order, family)), _positions(tmp_path, still)
-    section = lowpass_section(made, WORKSPACE, seen)
-    figures = {name: draw(figure) for name, figure in lowpass_plots(made, section, seen).items()}
-    with look():
-        for name, figure in figures.items():
-            assert complaints(figure) == [], name
-        words = " ".join(text.get_text() for text in drawn_texts(figures["lowpass_log"]))
-    assert ("never changes" in words) == still
+def test_what_is_not_known_is_said(name: str, stem: str, words: str, tmp_path: Path) -> None:
+    assert words in words_of(CASES[name](tmp_path)[stem])
 
 
 FIT = calibrate(pack(views_of(12, noise_px=0.1)), (640, 480), "radial2")
@@ -366,7 +345,7 @@ def _with_residuals(residuals: np.ndarray) -> Calibration:
 
 def _outside(fit: Calibration) -> tuple[int, int]:
     at = fit.observations.pixels.reshape(-1, 2)
-    means = _cell_means(fit, at, fit.residuals_px.reshape(-1, 2), fit.weights.ravel())
+    means = cell_means(fit, at, fit.residuals_px.reshape(-1, 2), fit.weights.ravel())
     return int(means.outside.sum()), len(means.at)
 
 
@@ -387,21 +366,18 @@ def test_chance_leaves_one_disc_in_twenty() -> None:
 def test_arrows_have_the_length_that_they_claim() -> None:
     at = np.array([[10.0, 20.0], [50.0, 60.0], [np.nan, 1.0]])
     vectors = np.array([[0.5, -0.25], [-1.0, 0.0], [1.0, 1.0]])
-    with look():
-        figure = sheet(3.0, "title")
-        axes = figure.subplots()
-        picture_frame(axes, (100, 80))
-        times = arrows(axes, at, vectors, 8.0)
-        words = [text.get_text() for text in drawn_texts(figure)]
-        quiver = next(artist for artist in axes.get_children() if isinstance(artist, Quiver))
+    times = magnified(8.0, 0.98)
+    figure = Figure("title", "", (picture((100, 80), (Arrows(at, vectors, times, "px"),)),), 3.0)
+    drawing = draw(figure)
+    assert "1 px" in [text.get_text() for text in drawn_texts(drawing)], "the key"
+    (axes,) = drawing.axes
+    quiver = next(artist for artist in axes.get_children() if isinstance(artist, Quiver))
     assert times == pytest.approx(8.1, abs=0.15)
     assert len(quiver.U) == 2, "a vector that is not finite is left out"
     # The tips of the polygons, in the data's units.
-    for polygon, start, vector in zip(quiver.get_paths(), at, vectors, strict=False):
+    pixels_per_unit = axes.transData.transform([1.0, 0.0])[0] - axes.transData.transform([0.0, 0.0])[0]
+    for polygon, vector in zip(quiver.get_paths(), vectors, strict=False):
         shape = quiver.get_transform().transform(polygon.vertices)
         tip = shape[np.argmax(np.linalg.norm(shape, axis=1))]
-        pixels_per_unit = axes.transData.transform([1.0, 0.0])[0] - axes.transData.transform([0.0, 0.0])[0]
         expected = times * vector * [1.0, -1.0] * pixels_per_unit
         np.testing.assert_allclose(tip, expected, atol=0.02 * np.linalg.norm(expected) + 0.5)
-        del start
-    assert "1 px" in words, "the key"

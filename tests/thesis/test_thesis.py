@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from figure_checks import complaints, drawn_texts
+from figure_checks import complaints_of as complaints
+from figure_checks import drawn_texts
 
 from calib.show.style import look
 from calib.stages.actuator.dynamics import coriolis_matrix, mass_matrix

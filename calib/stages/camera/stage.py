@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from calib.core.arrays import FloatArray
+    from calib.core.plot import Figure
     from calib.core.rig import Rig
     from calib.core.words import Block
     from calib.stages.camera import lens, model, plane
@@ -234,10 +235,10 @@ def _camera_words(camera: Camera) -> list[Block]:
     return blocks
 
 
-def _draw_camera(folder: Path, camera: Camera) -> object:
-    from calib.stages.camera.plots import write_camera_figures
+def _camera_plots(camera: Camera) -> dict[str, Figure]:
+    from calib.stages.camera.plots import plots
 
-    return write_camera_figures(folder, camera.evidence.fit)
+    return plots(camera.evidence.fit)
 
 
 def _outdated(rig: Rig) -> list[str]:
@@ -259,7 +260,7 @@ intrinsics = Stage(
     writes=("camera",),
     document=_camera_document,
     words=_camera_words,
-    draw=_draw_camera,
+    plots=_camera_plots,
     remarks=_outdated,
 )
 
@@ -407,10 +408,10 @@ def _plane_words(result: Plane) -> list[Block]:
     ]
 
 
-def _draw_plane(folder: Path, result: Plane) -> object:
-    from calib.stages.camera.plots import write_plane_figures
+def _plane_plots(result: Plane) -> dict[str, Figure]:
+    from calib.stages.camera.plots import plane_plots
 
-    return write_plane_figures(folder, result.evidence.camera, result.evidence.fit)
+    return plane_plots(result.evidence.camera, result.evidence.fit)
 
 
 extrinsics = Stage(
@@ -431,7 +432,7 @@ extrinsics = Stage(
     needs=("camera",),
     document=_plane_document,
     words=_plane_words,
-    draw=_draw_plane,
+    plots=_plane_plots,
     remarks=_outdated,
 )
 
@@ -540,10 +541,10 @@ def _lens_words(result: Lens) -> list[Block]:
     ]
 
 
-def _draw_lens(folder: Path, result: Lens) -> object:
-    from calib.stages.camera.plots import write_lens_figures
+def _lens_plots(result: Lens) -> dict[str, Figure]:
+    from calib.stages.camera.plots import lens_plots
 
-    return write_lens_figures(folder, result.evidence.camera, result.evidence.report)
+    return lens_plots(result.evidence.camera, result.evidence.report)
 
 
 distortion = Stage(
@@ -560,5 +561,5 @@ distortion = Stage(
     needs=("camera",),
     uses=("plane",),
     words=_lens_words,
-    draw=_draw_lens,
+    plots=_lens_plots,
 )
