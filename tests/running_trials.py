@@ -7,12 +7,14 @@ import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import yaml
+
 from calib.core.errors import BadInputError
 from calib.core.files import sha256, write_atomically
 from calib.core.rig import read_rig, write_rig
 from calib.runner.folder import Folder, LogFile, read_folder
-from calib.runner.graph import Command, Done, Planned, Runner, Stage, opened
-from calib.runner.outputs import publish, summary
+from calib.runner.graph import HIDDEN, Command, Done, Planned, Runner, Stage, opened
+from calib.runner.outputs import decide, publish, summary
 
 __all__ = ["CALLS", "STAGES", "Inline", "make_folder", "run_small"]
 
@@ -141,3 +143,9 @@ def run_small(
         ended = runner.run()
         publish(runner, ended, summary(runner, ended, False))
     return ended
+
+
+def exit_code(out: Path) -> int:
+    """Exit code of the run that left its results here."""
+    told = json.loads((out / HIDDEN / "run.json").read_text(encoding="utf-8"))
+    return decide(told, yaml.safe_load((out / "rig.yaml").read_text(encoding="utf-8"))).exit_code

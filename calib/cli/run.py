@@ -42,14 +42,15 @@ def run(
 ) -> None:
     """Calibrate a whole rig: every stage from pictures and logs to the firmware and a page to read.
 
-    Stages whose inputs have not changed are not run again; one that fails stops only what needs it. Exits
-    1 when the page does not say that the firmware can be flashed, 3 when a stage has failed.
+    Stages whose inputs have not changed are not run again; one that fails stops only what needs it. Pictures
+    alone are the calibration of a camera. Exits 0 when the firmware can be flashed, 1 when it cannot or
+    something is weak, 3 when a stage has failed.
     """
     from calib.core.workers import processors
     from calib.runner.folder import read_folder
     from calib.runner.graph import HIDDEN, Pool, Runner, opened
-    from calib.runner.outputs import exit_code, publish, summary
-    from calib.show.page import decide, keep_pictures, write_page
+    from calib.runner.outputs import decide, publish, summary
+    from calib.show.page import keep_pictures, write_page
 
     seen = None if folder is None else read_folder(folder, follow_links)
     with opened(output, folder) as interrupted, Pool(jobs or processors()) as pool:
@@ -67,7 +68,6 @@ def run(
         files = publish(runner, ended, told)
         keep_pictures(seen.pictures, output / HIDDEN / "pictures")
         write_page(output / "rig.yaml")
-    code = exit_code(ended)
     decision = decide(told, runner.sections().values)
     if as_json:
         document("run", {"run": told, "decision": decision.as_json(), "files": [*files, "report.html"]})
@@ -77,8 +77,8 @@ def run(
         for sentence in decision.weak:
             say(f"  - {sentence}")
     narrate(f"page written to {output / 'report.html'}")
-    if code:
-        raise typer.Exit(code)
+    if decision.exit_code:
+        raise typer.Exit(decision.exit_code)
 
 
 @cache

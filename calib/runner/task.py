@@ -32,7 +32,7 @@ from calib.core.units import parse_corners, parse_square_m
 from calib.runner.cache import key_of, program_digest
 from calib.runner.folder import Folder, folder_digests, read_folder
 from calib.runner.graph import STAGES, Command, Done, Planned, Runner, Stage, opened, run_here
-from calib.runner.outputs import exit_code, publish, summary
+from calib.runner.outputs import decide, publish, summary
 
 # ----------------------------------------------------------------------
 # The packages of the extra `fleet`, loaded when they are first needed.
@@ -594,7 +594,8 @@ def run_stages(
             keep_pictures(folder.pictures, out / HIDDEN / "pictures")
             write_page(out / "rig.yaml")
             files = [*files, "report.html"]
-    code = exit_code(ended) if kind == "run" else _camera_code(ended)
+    decision = decide(told, runner.sections().values)
+    code = decision.exit_code if kind == "run" else _camera_code(ended)
     reasons = tuple(f"{done.job.stage.title}: {done.reason}" for done in ended if done.status in _TELLING)
     return Ended(code, {done.job.name: done.status for done in ended}, reasons, out, tuple(files))
 
