@@ -144,9 +144,10 @@ def align(
     write_rig(rig, before.model_copy(update={"align": section}), {"align": hashes})
     narrate(f"align written to {shown(rig)}")
     if figures is not None:
-        from calib.stages.align.plots import write_align_figures
+        from calib.show.draw import write_figures
+        from calib.stages.align.plots import plots
 
-        write_align_figures(figures, found, section.verdict)
+        write_figures(figures, plots(found, section.verdict))
         narrate(f"figures in {shown(figures)}")
     if as_json:
         document("align", {"align": section_json(section)})

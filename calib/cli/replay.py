@@ -146,9 +146,10 @@ def replay(
         if states is not None:
             narrate(f"states written to {shown(states)}")
     if figures is not None:
-        from calib.stages.estimator.plots import write_replay_figures
+        from calib.show.draw import write_figures
+        from calib.stages.estimator.plots import plots
 
-        write_replay_figures(figures, results)
+        write_figures(figures, plots(results))
         narrate(f"figures in {shown(figures)}")
     if as_json:
         document("replay", {**told, "replay": {"logs": [result.as_json() for result in results]}})

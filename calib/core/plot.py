@@ -269,7 +269,7 @@ def thinned(x: FloatArray, y: FloatArray, most: int = MOST_POINTS) -> tuple[Floa
     return np.repeat(x[starts], 2), np.column_stack([low, high]).ravel()
 
 
-def every(values: FloatArray, most: int = MOST_POINTS) -> FloatArray:
+def every(values: AnyArray, most: int = MOST_POINTS) -> AnyArray:
     """Every so many of (n, ...) values, at most `most` of them."""
     return values[:: max(1, -(-len(values) // most))]
 

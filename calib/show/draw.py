@@ -76,7 +76,7 @@ _FONT = "DejaVu Sans"
 _DPI, _COARSE_DPI = 130, 90
 """Figures of which there are many are coarser, so that a page has room for them."""
 _LINE_IN, _TITLE_IN = 0.19, 0.235
-_COLOURS, _NEARLY_WHITE = 128, 252
+_COLOURS, _FEW, _NEARLY_WHITE = 128, 48, 252
 _TAG_IN = 2.15
 """Width that is kept free for the verdict."""
 _HALO = (patheffects.withStroke(linewidth=3.0, foreground="white"),)
@@ -163,7 +163,7 @@ def save(figure: Figure, path: Path) -> Path:
     rows, columns = canvas.get_width_height()[::-1]
     pixels = np.frombuffer(canvas.buffer_rgba(), dtype=np.uint8).reshape(rows, columns, 4)[:, :, :3]
     few = Image.fromarray(pixels.copy()).quantize(
-        _COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE
+        _FEW if figure.coarse else _COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE
     )
     palette = np.array(few.getpalette(), dtype=np.uint8).reshape(-1, 3)
     few.putpalette(np.where(palette.min(axis=1, keepdims=True) >= _NEARLY_WHITE, 255, palette).tobytes())
@@ -243,7 +243,7 @@ def _panel(axes: Axes, panel: Plot) -> None:
     wide, high = _size_in(axes)
     for name, axis, most in (("x", axes.xaxis, 1.5 * wide), ("y", axes.yaxis, 3.0 * high)):
         if not (name == "y" and panel.names):
-            _ticks(axis, panel.linear_within, name in panel.whole, int(np.clip(round(most), 4, 10)))
+            _ticks(axis, panel.linear_within, name in panel.whole, int(np.clip(round(most), 5, 10)))
     if not panel.x:
         axes.tick_params(axis="x", labelbottom=False)
     if panel.bare:

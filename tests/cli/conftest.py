@@ -14,7 +14,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from figure_checks import complaints
 
+from calib.core.plot import Figure
 from synthetic import views_of
 
 COMMAND = (sys.executable, "-c", "from calib.cli.main import main; main()")
@@ -43,11 +45,23 @@ Run = Callable[..., Ended]
 
 @pytest.fixture(scope="session")
 def calib() -> Run:
-    """Runs `main` with these words in this process; a Python warning is an error there."""
+    """Runs `main` with these words in this process, where a Python warning is an error.
+
+    Figures that it draws must be legible.
+    """
     from calib.cli.main import main
+    from calib.show import draw
 
     def run(*words: str | Path, cwd: Path | None = None) -> Ended:
         out, err = io.StringIO(), io.StringIO()
+        illegible: dict[str, list[str]] = {}
+
+        def save(figure: Figure, path: Path) -> Path:
+            if found := complaints(figure):
+                illegible[path.name] = found
+            return saved(figure, path)
+
+        saved = draw.save
         with (
             pytest.MonkeyPatch.context() as patch,
             contextlib.redirect_stdout(out),
@@ -56,8 +70,10 @@ def calib() -> Run:
         ):
             patch.setattr(sys, "argv", ["calib", *map(str, words)])
             patch.setattr(sys, "warnoptions", ["error"])
+            patch.setattr(draw, "save", save)
             with pytest.raises(SystemExit) as left:
                 main()
+        assert not illegible
         assert isinstance(left.value.code, int)
         return Ended(left.value.code, out.getvalue(), err.getvalue())
 
