@@ -41,14 +41,6 @@ def fleet(
         ),
     ] = "1h",
     pages: Annotated[bool, typer.Option("--pages", help="Make the page of each rig as well.")] = False,
-    prior: Annotated[
-        Path | None,
-        typer.Option(
-            "--prior",
-            help="Results of an earlier fleet, from which each rig's camera may borrow: camera-prior.yaml "
-            "beside its own rig.yaml, which stays as it is.",
-        ),
-    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Calibrate many rigs on many processes, and compare them with each other.
@@ -58,8 +50,7 @@ def fleet(
     """
     from calib.core.files import shown
     from calib.core.units import parse_duration_s
-    from calib.runner.finishing import finish
-    from calib.runner.fleet import check_apart, read_prior, run_fleet
+    from calib.runner.fleet import check_apart, finish, run_fleet
     from calib.runner.task import FleetOptions, read_manifest, twice_told
     from calib.show.fleet import PAGE, write_fleet_page
 
@@ -71,25 +62,22 @@ def fleet(
     for sentence in twice_told(known.rigs):
         narrate(f"{shown(manifest)}: {sentence}")
     check_apart(output, known.rigs)
-    borrowed = None if prior is None else read_prior(prior)
-    for sentence in () if borrowed is None else borrowed.remarks:
-        narrate(sentence)
     with opened_out(output, "calib fleet", ("fleet.parquet", PAGE)) as store:
         options = FleetOptions(pages=pages)
         with processes(store, scheduler, workers, retries) as cluster, progress_bar("rigs") as progress:
             counts = run_fleet(store, cluster, known, options, retries, progress, narrate, limit_s)
-        summary, told = finish(store, known, borrowed)
-        write_fleet_page(output / PAGE, summary, told)
+        summary = finish(store, known)
+        write_fleet_page(output / PAGE, summary)
     if as_json:
-        document("fleet", {"fleet": _as_json(summary, counts, told)})
+        document("fleet", {"fleet": _as_json(summary, counts)})
     else:
-        _tell(summary, counts, told, output)
+        _tell(summary, counts, output)
     narrate(f"page written to {output / PAGE}")
     if any(verdict != "ok" for verdict in summary.verdicts):
         raise typer.Exit(EXIT_POOR)
 
 
-def _as_json(summary: FleetSummary, counts: Counts, told: Any) -> dict[str, Any]:
+def _as_json(summary: FleetSummary, counts: Counts) -> dict[str, Any]:
     return {
         "rigs": summary.rigs,
         "verdicts": summary.verdicts,
@@ -116,14 +104,13 @@ def _as_json(summary: FleetSummary, counts: Counts, told: Any) -> dict[str, Any]
             {"name": look.name, "serial": look.serial, "verdict": look.verdict, "z": look.z, "why": look.why}
             for look in summary.looks
         ],
-        "prior": None if told is None else told.as_json(),
     }
 
 
 _MOST_TOLD = 20
 
 
-def _tell(summary: FleetSummary, counts: Counts, told: Any, output: Path) -> None:
+def _tell(summary: FleetSummary, counts: Counts, output: Path) -> None:
     from calib.core.files import shown
 
     words = ", ".join(f"{count} {verdict}" for verdict, count in summary.verdicts.items())
@@ -148,7 +135,4 @@ def _tell(summary: FleetSummary, counts: Counts, told: Any, output: Path) -> Non
         say(f"look at {look.name}: {look.verdict}{', ' if look.why else ''}{look.why}")
     if summary.to_look_at > _MOST_TOLD:
         say(f"... and {summary.to_look_at - _MOST_TOLD} more, in the page")
-    if told is not None:
-        for sentence in told.sentences():
-            say(sentence)
     say(f"{shown(output)}: fleet.parquet, fleet.html and a folder for each rig in rigs/")

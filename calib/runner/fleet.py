@@ -22,8 +22,6 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.core.errors import EXIT_INTERNAL, BadInputError
 from calib.core.files import check_folder, check_writable, make_folder, sha256, shown, write_atomically
-from calib.core.result import CovarianceTable
-from calib.core.rig import Rig, read_rig, rig_text
 from calib.runner.cache import held
 from calib.runner.engine import LIMIT_S, Broken, Cluster, Lost, Overdue, Task, run_tasks
 from calib.runner.folder import digest_of
@@ -43,7 +41,6 @@ from calib.runner.task import (
     without_secrets,
 )
 from calib.show.values import unit_of
-from calib.stages.camera.section import Camera
 
 # ----------------------------------------------------------------------
 # Outcomes as rows of a Parquet file, in blocks, and one column of it at a time.
@@ -761,317 +758,6 @@ def _verb(path: Path) -> str:
 
 
 # ----------------------------------------------------------------------
-# What a fleet says of a rig that it has not seen: the distribution of its cameras, and what a rig borrows.
-#
-# The constants of rig i are theta_i ~ N(mu, T), its calibration gives x_i ~ N(theta_i, V_i). By the method
-# of
-# moments T = S - mean(V_i), with S the covariance of the x_i over the rigs, made positive semi-definite in
-# the
-# coordinates in which mean(V_i) is the identity; then mu by generalised least squares, C = (sum W_i)^-1 and
-# W_i = (T + V_i)^-1 (DerSimonian and Laird 1986, for vectors Jackson, White and Thompson 2010). A new rig
-# with
-# x and V has, with P = T + D + C,
-#
-#     theta | x ~ N(mu + G (x - mu), P - G P),    G = P (P + V)^-1
-#
-# (Carlin and Louis 2000, 3.3). D is two standard errors of T, 2 lambda_j sqrt(2 / (n - 1)) for the
-# eigenvalue
-# lambda_j of S in those coordinates: a T that came out too small would make rigs too sure of themselves (by
-# simulation the mean of e' Cov^-1 e is then 2.9 of 3 with 20 rigs, 2.7 with 200). A group needs more than
-# two
-# rigs for each constant. A rig for which (x - mu)' (P + V)^-1 (x - mu) is larger than chance is not one of
-# this fleet, and does not borrow.
-
-_BESIDE = 2
-_SURE = 2.0
-_PRIOR_CHANCE = 1e-3
-
-
-@dataclass(frozen=True)
-class Group:
-    """Cameras of one lens model and picture size.
-
-    Attributes
-    ----------
-    order : names of the k constants. mean : mu (k,). rigs : how many.
-    between, slack, of_mean : T, D and C, each (k, k).
-    """
-
-    order: tuple[str, ...]
-    mean: FloatArray
-    between: FloatArray
-    slack: FloatArray
-    of_mean: FloatArray
-    rigs: int
-
-
-@dataclass(frozen=True)
-class Posterior:
-    """What a rig has after borrowing.
-
-    Attributes
-    ----------
-    mean, covariance : (k,) and (k, k). chance : of a rig of this fleet to lie as far off or farther.
-    """
-
-    mean: FloatArray
-    covariance: FloatArray
-    chance: float
-
-    @property
-    def belongs(self) -> bool:
-        """Whether the rig may be one of the fleet."""
-        return self.chance >= _PRIOR_CHANCE
-
-
-Kind = tuple[str, tuple[int, ...], tuple[str, ...]]
-
-
-@dataclass(frozen=True)
-class Prior:
-    """A fleet as a prior.
-
-    Attributes
-    ----------
-    groups : by model, picture size and names of the constants. members : fingerprints of its rigs' inputs.
-    digest : SHA-256 of all of it. remarks : on what could not be used.
-    """
-
-    groups: dict[Kind, Group]
-    members: frozenset[str]
-    digest: str
-    remarks: tuple[str, ...]
-
-
-def constants_of(camera: Camera) -> tuple[Kind, FloatArray, FloatArray] | None:
-    """Kind of a camera, its constants (k,) and their covariance (k, k); None without a covariance."""
-    known = camera.covariance
-    if known is None or not known.order:
-        return None
-    values = {**camera.model_dump(), **camera.distortion.model_dump()}
-    order = tuple(known.order)
-    if any(not isinstance(values.get(name), float) for name in order):
-        return None
-    V = np.array(known.values, dtype=np.float64)
-    x = np.array([values[name] for name in order], dtype=np.float64)
-    return (camera.model, tuple(camera.image_size_px), order), x, 0.5 * (V + V.T)
-
-
-def fingerprint(rig: Rig) -> str:
-    """SHA-256 of the pictures that a rig's camera was calibrated from; two of the same are one rig."""
-    inputs = rig.provenance.inputs.get("camera", {})
-    return sha256("\n".join(sorted(inputs.values())).encode())
-
-
-def group_of(order: tuple[str, ...], x: FloatArray, V: FloatArray) -> Group | None:
-    """The distribution behind rigs with constants (n, k) and covariances (n, k, k), None for too few."""
-    n, k = x.shape
-    if n < _BESIDE * k + 2:
-        return None
-    S, usual = np.atleast_2d(np.cov(x, rowvar=False)), V.mean(axis=0)
-    scale = np.sqrt(np.diag(usual))
-    try:
-        L = scale[:, None] * np.linalg.cholesky(usual / scale / scale[:, None])
-    except np.linalg.LinAlgError:
-        return None
-    half = np.linalg.solve(L, np.linalg.solve(L, S).T)
-    eigenvalues, Q = np.linalg.eigh(0.5 * (half + half.T))
-    root = L @ Q
-    T = (root * np.maximum(eigenvalues - 1.0, 0.0)) @ root.T
-    D = (root * _SURE * np.maximum(eigenvalues, 0.0) * math.sqrt(2.0 / (n - 1))) @ root.T
-    W = _inverse(T + V, scale)
-    C = _inverse(W.sum(axis=0)[None] * scale * scale[:, None], np.ones(k))[0] * scale * scale[:, None]
-    mu = C @ np.einsum("nij,nj->i", W, x)
-    return Group(order, mu, T, D, 0.5 * (C + C.T), n)
-
-
-def _inverse(A: FloatArray, scale: FloatArray) -> FloatArray:
-    """Inverses of symmetric (n, k, k), constants of very different size brought to one first."""
-    normal = A / scale / scale[:, None]
-    return np.asarray(np.linalg.pinv(normal, hermitian=True) / scale / scale[:, None])
-
-
-def posterior(group: Group, x: FloatArray, V: FloatArray) -> Posterior:
-    """What follows for a rig with constants x (k,) and their covariance V (k, k)."""
-    from scipy.special import chdtrc
-
-    P = group.between + group.slack + group.of_mean
-    scale = np.sqrt(np.diag(P + V))
-    inverse = _inverse((P + V)[None], scale)[0]
-    off = x - group.mean
-    G = P @ inverse
-    covariance = P - G @ P
-    return Posterior(
-        group.mean + G @ off,
-        0.5 * (covariance + covariance.T),
-        float(chdtrc(len(x), max(float(off @ inverse @ off), 0.0))),
-    )
-
-
-def read_prior(folder: Path) -> Prior:
-    """The prior in the results of an earlier fleet: of its rigs that are ok and do not stand out.
-
-    Raises `BadInputError` where there is no such fleet, or too few rigs of any kind.
-    """
-    path = folder / "fleet.parquet"
-    if not path.is_file():
-        raise BadInputError(f"{shown(folder)}: has no fleet.parquet, expected the results of calib fleet")
-    try:
-        with Table(path) as table:
-            names, verdicts = texts(table, "name"), texts(table, "verdict")
-            standing = table.read("stands_out").to_pylist()
-    except (OSError, ValueError, KeyError) as error:
-        raise BadInputError(f"{shown(path)}: is no table of a fleet: {error}") from error
-    gathered: dict[Kind, list[tuple[FloatArray, FloatArray]]] = {}
-    members: set[str] = set()
-    for name, verdict, out in zip(names, verdicts, standing, strict=True):
-        rig = read_rig(folder / "rigs" / name / "rig.yaml") if verdict in ("ok", "poor") else Rig()
-        if rig.camera is None:
-            continue
-        members.add(fingerprint(rig))
-        found = constants_of(rig.camera)
-        if verdict == "ok" and rig.camera.verdict.ok and not out and found is not None:
-            gathered.setdefault(found[0], []).append(found[1:])
-    groups, remarks = {}, []
-    for kind, rigs in gathered.items():
-        made = group_of(kind[2], np.array([x for x, _ in rigs]), np.array([V for _, V in rigs]))
-        if made is None:
-            few = f"{len(rigs)} rigs with {kind[0]} are too few for {len(kind[2])} constants"
-            remarks.append(f"{shown(folder)}: {few}; nothing is borrowed from them")
-        else:
-            groups[kind] = made
-    if not groups:
-        why = remarks[0] if remarks else f"{shown(folder)}: has no cameras that are ok"
-        raise BadInputError(f"{why}; this fleet is no prior")
-    digest = sha256("\n".join(sorted(members)).encode())
-    return Prior(groups, frozenset(members), digest, tuple(remarks))
-
-
-# ----------------------------------------------------------------------
-# Rigs that borrow from a prior: each gets a camera-prior.yaml beside its own rig.yaml, which stays as it
-# is.
-#
-# The verdict is the one that the rig's own pictures gave; what was borrowed is said in the file.
-
-BORROWED = "camera-prior.yaml"
-_MOST_NAMED = 50
-
-
-@dataclass(frozen=True)
-class Borrowing:
-    """What came of a prior.
-
-    Attributes
-    ----------
-    borrowed : rigs that did. shrunk : median over them of sigma after over sigma before, by constant.
-    refused : rigs that did not, with the reason; no more than fifty of `not_borrowed`.
-    fleet : rigs behind the prior.
-    """
-
-    borrowed: int
-    shrunk: dict[str, float]
-    refused: tuple[tuple[str, str], ...]
-    not_borrowed: int
-    fleet: int
-
-    def as_json(self) -> dict[str, Any]:
-        """For the document."""
-        return {
-            "rigs_of_the_prior": self.fleet,
-            "borrowed": self.borrowed,
-            "sigma_after_over_before": self.shrunk,
-            "not_borrowed": self.not_borrowed,
-            "refused": [{"name": name, "why": why} for name, why in self.refused],
-        }
-
-    def sentences(self) -> list[str]:
-        """For people."""
-        whole = self.borrowed + self.not_borrowed
-        out = [
-            f"{self.borrowed} of {whole} rigs borrowed from a prior of {self.fleet} rigs: {BORROWED} beside "
-            "rig.yaml; verdicts are those without it"
-        ]
-        out += [f"{name} did not borrow: {why}" for name, why in self.refused[:5]]
-        return out
-
-
-def borrowed_camera(camera: Camera, group: Group, found: Posterior) -> Camera:
-    """A camera with what it has after borrowing; what its own fit said of it stays, and it says so."""
-    values = dict(zip(group.order, found.mean.tolist(), strict=True))
-    sigma = np.sqrt(np.maximum(np.diag(found.covariance), 0.0))
-    lens = {name: value for name, value in values.items() if name in type(camera.distortion).model_fields}
-    others = {name: value for name, value in values.items() if name not in lens}
-    remark = (
-        f"Borrowed: these constants are shrunk to the distribution of {group.rigs} rigs of a fleet "
-        "(empirical Bayes) and are not those of this rig's pictures alone; RMS, verdict and reasons are of "
-        "the fit without it."
-    )
-    return camera.model_copy(
-        update={
-            **others,
-            "distortion": camera.distortion.model_copy(update=lens),
-            "sigma": {**camera.sigma, **dict(zip(group.order, sigma.tolist(), strict=True))},
-            "covariance": CovarianceTable(order=list(group.order), values=found.covariance.tolist()),
-            "projection_sigma_px": {},
-            "remarks_": [*camera.verdict.remarks, remark],
-        }
-    )
-
-
-def borrow(store: Store, manifest: Manifest, prior: Prior) -> Borrowing:
-    """Write a `BORROWED` for each rig that may have one, and remove one that it may not have any more."""
-    refused: list[tuple[str, str]] = []
-    ratios: dict[str, list[float]] = {}
-    borrowed = not_borrowed = 0
-    for spec in manifest.rigs:
-        why = _borrow(store, spec.name, prior, ratios)
-        if not why:
-            borrowed += 1
-            continue
-        not_borrowed += 1
-        store.result(spec.name, BORROWED).unlink(missing_ok=True)
-        if len(refused) < _MOST_NAMED:
-            refused.append((spec.name, why))
-    shrunk = {name: float(np.median(values)) for name, values in ratios.items()}
-    rigs = sum(group.rigs for group in prior.groups.values())
-    return Borrowing(borrowed, shrunk, tuple(refused), not_borrowed, rigs)
-
-
-def _borrow(store: Store, name: str, prior: Prior, ratios: dict[str, list[float]]) -> str:
-    """Why a rig does not borrow, "" when it has."""
-    outcome = store.outcome(name)
-    if outcome is None or "rig.yaml" not in outcome.files:
-        return "it has no result"
-    rig = read_rig(store.result(name, "rig.yaml"))
-    if rig.camera is None:
-        return "it has no camera"
-    if fingerprint(rig) in prior.members:
-        return "it is itself one of the prior's rigs"
-    found = constants_of(rig.camera)
-    if found is None:
-        return "its camera has no covariance"
-    kind, x, V = found
-    group = prior.groups.get(kind)
-    if group is None:
-        size = "x".join(str(side) for side in kind[1])
-        return f"the prior has no rigs enough with {kind[0]} and pictures of {size} px"
-    after = posterior(group, x, V)
-    if not after.belongs:
-        return f"it is not like the prior's rigs (a chance of {after.chance:.1e})"
-    camera = borrowed_camera(rig.camera, group, after)
-    inputs = {"camera": {**rig.provenance.inputs.get("camera", {}), "fleet prior": prior.digest}}
-    provenance = rig.provenance.model_copy(update={"inputs": inputs})
-    text = rig_text(Rig(geometry=rig.geometry, camera=camera, provenance=provenance))
-    write_atomically(store.result(name, BORROWED), text)
-    for i, constant in enumerate(group.order):
-        if V[i, i] > 0.0:
-            ratios.setdefault(constant, []).append(
-                math.sqrt(max(float(after.covariance[i, i]), 0.0) / float(V[i, i]))
-            )
-    return ""
-
-
-# ----------------------------------------------------------------------
 # A fleet from its manifest to its outcomes: what still holds is left alone, all else is done.
 
 Progress = Callable[[int, int], None]
@@ -1142,3 +828,23 @@ def _answer(spec: RigSpec, result: Any) -> Answer:
         status, sentence = "broken", f"internal error: {words}"
     blank = Outcome(spec.name, spec.serial, without_secrets(spec.source), status, EXIT_INTERNAL, sentence)
     return Answer(blank, {})
+
+
+def finish(store: Store, manifest: Manifest) -> FleetSummary:
+    """Write fleet.parquet and return the summary. Raises `BadInputError` when a file cannot be written."""
+    pa = needed("pyarrow")
+    between, final = store.out / HIDDEN / "rows.parquet", store.out / "fleet.parquet"
+    write_outcomes(between, [rig.name for rig in manifest.rigs], store.outcome)
+    try:
+        summary, worst, which = summarise(between)
+        known = np.isfinite(worst)
+        added = {
+            "outlier_z": pa.array(worst, mask=~known),
+            "outlier_of": pa.array(which, type=pa.string()),
+            "stands_out": pa.array(known & (worst > summary.limit)),
+        }
+        with_columns(between, final, added)
+    finally:
+        with contextlib.suppress(OSError):
+            between.unlink()
+    return summary

@@ -11,7 +11,7 @@ from typing import Any
 
 from calib import __version__
 from calib.core.files import write_atomically
-from calib.runner.fleet import Borrowing, ConstantSummary, FleetSummary
+from calib.runner.fleet import ConstantSummary, FleetSummary
 from calib.runner.sweep import Point, SweepSpec, SweepSummary
 from calib.show.page import render
 from calib.show.values import BLANK, SIGMA, digits
@@ -125,12 +125,12 @@ class _Card:
     more: int
 
 
-def write_fleet_page(path: Path, summary: FleetSummary, borrowing: Borrowing | None = None) -> None:
+def write_fleet_page(path: Path, summary: FleetSummary) -> None:
     """Write the page atomically. Raises `BadInputError` when it cannot be written."""
-    write_atomically(path, fleet_page_text(summary, borrowing))
+    write_atomically(path, fleet_page_text(summary))
 
 
-def fleet_page_text(summary: FleetSummary, borrowing: Borrowing | None = None) -> str:
+def fleet_page_text(summary: FleetSummary) -> str:
     """The whole page."""
     told = sorted(summary.constants, key=_interest)
     answer, headline = _answer(summary)
@@ -140,7 +140,6 @@ def fleet_page_text(summary: FleetSummary, borrowing: Borrowing | None = None) -
         SCRIPT,
         version=__version__,
         summary=summary,
-        borrowing=borrowing,
         answer=answer,
         headline=headline,
         verdicts=[

@@ -57,8 +57,6 @@ def test_what_cannot_be(calib: Callable[..., Any], tmp_path: Path, monkeypatch: 
     assert code == 3 and "none.csv: cannot be read" in said
     code, said = ended(manifest, "-o", manifest / "out")
     assert code == 3 and "is a file" in said
-    code, said = ended(manifest, "-o", tmp_path / "out", "--prior", tmp_path)
-    assert code == 3 and "has no fleet.parquet" in said
     code, said = ended(manifest, "-o", tmp_path / "out", "--scheduler", "tcp://x:1", "--workers", "2")
     assert code == 2 and "--workers" in said
     code, said = ended(manifest, "-o", tmp_path / "out", "--timeout", "never")

@@ -19,7 +19,8 @@ from PIL import Image
 
 from calib.core.errors import BadInputError
 from calib.runner.cache import Result
-from calib.runner.fleet import Borrowing, FleetSummary, summarise, write_outcomes
+from calib.runner.fleet import FleetSummary, summarise, write_outcomes
+from calib.runner.outputs import decide
 from calib.runner.task import Outcome
 from calib.show.fleet import PAGE, fleet_page_text, write_fleet_page
 from calib.show.page import (
@@ -29,7 +30,6 @@ from calib.show.page import (
     _chosen,
     _resource,
     data_uri,
-    decide,
     page_text,
     render,
     size_of,
@@ -287,8 +287,13 @@ def test_answers(statuses: dict[str, str], answer: str) -> None:
     assert decide(_whole(**statuses), SECTIONS).answer == answer
 
 
-def test_without_a_plane_not_yet() -> None:
-    assert decide(_whole(extrinsics="skipped"), {"camera": {"verdict": "ok"}}).answer == "not yet"
+def test_without_a_plane_logs_cannot_be_flashed_and_pictures_alone_can() -> None:
+    told = _whole(extrinsics="skipped")
+    camera = {"camera": {"verdict": "ok"}}
+    logged = decide(told | {"logs": ["swing.csv"]}, camera)
+    assert (logged.answer, logged.exit_code) == ("not yet", 1)
+    pictures = decide(told | {"logs": []}, camera)
+    assert (pictures.answer, pictures.exit_code) == ("yes", 0)
 
 
 def test_weak_points_are_grouped_by_reason() -> None:
@@ -348,7 +353,7 @@ def _summary(path: Path, count: int, constants: int = 6) -> FleetSummary:
 
 def test_whole_harmless_and_told(tmp_path: Path) -> None:
     found = _summary(tmp_path / "x.parquet", 60)
-    text = fleet_page_text(found, Borrowing(3, {"fx_px": 0.5}, (("rig1", EVIL_FLEET),), 1, 40))
+    text = fleet_page_text(found)
     outline = _Outline_fleet_page()
     outline.feed(text)
     for tag, attributes in outline.tags:
@@ -360,7 +365,6 @@ def test_whole_harmless_and_told(tmp_path: Path) -> None:
     assert not [tag for tag, _ in outline.tags if tag == "img"]
     assert not re.search(r"https?://", text)
     assert "1 of 60 rigs has no result" in text and "camera.fx_px drifts" in text
-    assert "3 of 4 rigs borrowed" in text
     # The worst first: the one without a result, then the one that stands out.
     assert text.index("rig3</td>") < text.index("rig7</td>")
     assert fleet_page_text(found) == fleet_page_text(_summary(tmp_path / "y.parquet", 60))
