@@ -254,9 +254,10 @@ def logs(
     write_rig(rig, with_sections(before, sections), dict.fromkeys(sections, hashes))
     narrate(f"{' and '.join(sections)} written to {shown(rig)}")
     if figures is not None:
-        from calib.stages.actuator.plots import write_identify_figures
+        from calib.show.draw import write_figures
+        from calib.stages.actuator.plots import plots
 
-        write_identify_figures(figures, found)
+        write_figures(figures, plots(found))
         narrate(f"figures in {shown(figures)}")
     if as_json:
         told = {name: plain_section(section) for name, section in sections.items()}
@@ -305,9 +306,10 @@ def pump(
     write_rig(rig, with_sections(before, {"pump": section}), {"pump": hashes})
     narrate(f"pump written to {shown(rig)}")
     if figures is not None:
-        from calib.stages.actuator.plots import write_pump_figures
+        from calib.show.draw import write_figures
+        from calib.stages.actuator.plots import pump_plots
 
-        write_pump_figures(figures, found, section.verdict or "ok")
+        write_figures(figures, pump_plots(found, section.verdict or "ok"))
         narrate(f"figures in {shown(figures)}")
     if as_json:
         told: dict[str, Any] = {"pump": plain_section(section)}
@@ -356,9 +358,10 @@ def stiffness(
     )
     narrate(f"actuator written to {shown(rig)}")
     if figures is not None:
-        from calib.stages.actuator.plots import write_stiffness_figure
+        from calib.show.draw import write_figures
+        from calib.stages.actuator.plots import stiffness_plots
 
-        write_stiffness_figure(figures, eps, force, fits, best)
+        write_figures(figures, stiffness_plots(eps, force, fits, best))
         narrate(f"figures in {shown(figures)}")
     laws = [
         {

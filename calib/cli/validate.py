@@ -124,9 +124,10 @@ def validate(
     compared = _compared(logs, states, truth, no_pwm, rig)
     result: dict[str, Any] = {"logs": [_log_json(one) for one in compared]}
     if figures is not None:
-        from calib.stages.actuator.plots import write_validate_figures
+        from calib.show.draw import write_figures
+        from calib.stages.actuator.plots import validate_plots
 
-        result["figures"] = [path.name for path in write_validate_figures(figures, compared)]
+        result["figures"] = [path.name for path in write_figures(figures, validate_plots(compared))]
         narrate(f"figures in {shown(figures)}")
     if as_json:
         document("validate", {"validate": result})

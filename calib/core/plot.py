@@ -17,17 +17,14 @@ import numpy as np
 from calib.core.arrays import AnyArray, FloatArray
 from calib.core.files import one_line
 
-Hue = Literal[
+HUES = (
     "ink", "grey", "silver", "shade", "blue", "sky", "ice", "green", "mint", "orange", "ochre", "peach",
     "red", "purple",
-]  # fmt: skip
-Colour = Hue | float
-Kind = Literal[
-    "line", "dashed", "dotted", "points", "cloud", "crosses", "pluses", "squares", "diamonds", "marks"
-]
+)  # fmt: skip
+Colour = str | float
+"""One of `HUES`, or a place on the scale."""
+KINDS = ("line", "dashed", "dotted", "points", "cloud", "crosses", "pluses", "squares", "diamonds", "marks")
 """How a curve is drawn: as a line, as markers, as dots of a pixel ("cloud") or as short strokes ("marks")."""
-
-Align = Literal["left", "center", "right"]
 
 SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 WIDTH_IN = 9.2
@@ -42,7 +39,7 @@ class Curve:
 
     Attributes
     ----------
-    label : in the legend; empty for none.
+    label : in the legend; empty for none. kind : of `KINDS`.
     colour : (n,) places on the scale colour each marker by itself.
     size : width of the line or size of the markers in points, 0 for what is usual.
     spread : (n,) half lengths of error bars along y, or `across`, along x.
@@ -51,7 +48,7 @@ class Curve:
     x: AnyArray
     y: AnyArray
     label: str = ""
-    kind: Kind = "line"
+    kind: str = "line"
     colour: Colour | FloatArray = "blue"
     size: float = 0.0
     spread: FloatArray | None = None
@@ -88,7 +85,7 @@ class Rule:
     axis: Literal["x", "y"]
     at: float
     colour: Colour = "grey"
-    kind: Literal["line", "dashed", "dotted"] = "line"
+    kind: str = "line"
 
 
 @dataclass(frozen=True)
@@ -109,7 +106,7 @@ class Shape:
     points: FloatArray
     fill: Colour | None = None
     edge: Colour | None = "ink"
-    kind: Literal["line", "dashed"] = "line"
+    kind: str = "line"
     opacity: float = 1.0
     hatched: bool = False
 
@@ -150,13 +147,13 @@ class Arrows:
 
 @dataclass(frozen=True)
 class Text:
-    """Words at a place of the axes."""
+    """Words at a place of the axes; `align` says whether it is their "left", "center" or "right"."""
 
     x: float
     y: float
     words: str
     colour: Colour = "ink"
-    align: Align = "center"
+    align: str = "center"
     bold: bool = False
 
 

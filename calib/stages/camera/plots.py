@@ -15,7 +15,6 @@ from calib.core.geometry import apply_homography
 from calib.core.plot import (
     SIGMA,
     WIDTH_IN,
-    Align,
     Arrows,
     Band,
     Bars,
@@ -23,7 +22,6 @@ from calib.core.plot import (
     Curve,
     Field,
     Figure,
-    Hue,
     Mark,
     Plot,
     Ribbon,
@@ -923,7 +921,6 @@ def _world_axes(camera: Camera, plane: Plane) -> list[Mark]:
     else:
         return []
     marks: list[Mark] = []
-    axes: tuple[tuple[FloatArray, str, Hue, Align], ...]
     axes = ((ends[1], "x", "red", "left"), (ends[2], "y", "green", "right"))
     for end, name, colour, align in axes:
         marks.append(Arrows(ends[:1], end[None] - ends[:1], colour=colour))

@@ -15,7 +15,6 @@ from calib.core.plot import (
     Band,
     Curve,
     Figure,
-    Hue,
     Mark,
     Plot,
     Ribbon,
@@ -41,7 +40,7 @@ _SENSORS = (
     ("accelerometer x, y", ("e_ax", "e_ay"), "gated_accel"),
     ("gyroscope z", ("e_gz",), "gated_gyro"),
 )
-_TWO: tuple[Hue, ...] = ("blue", "grey")
+_TWO = ("blue", "grey")
 _INNOVATIONS = [OUT.index(name) for _, names, _ in _SENSORS for name in names]
 
 
@@ -72,7 +71,7 @@ def _figure(title: str, note: str, result: Replayed, panels: Sequence[Plot]) -> 
     return Figure(title, note, tuple(shared), 6.6, result.verdict, coarse=True)
 
 
-def _line(t: FloatArray, values: FloatArray, label: str, colour: Hue, size: float = 0.9) -> list[Mark]:
+def _line(t: FloatArray, values: FloatArray, label: str, colour: str, size: float = 0.9) -> list[Mark]:
     known = bool(np.isfinite(values).any())
     return [Curve(*thinned(t, values), label, "line", colour, size)] if known else []
 
