@@ -218,7 +218,6 @@ def written(form: str, values: np.ndarray, how: int = cv2.FILE_STORAGE_WRITE) ->
     "kind",
     [
         "float64",
-        "uint8",
         "int16",
     ],
 )

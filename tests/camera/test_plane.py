@@ -368,9 +368,7 @@ def detections(board: Board, pixels: np.ndarray) -> list[np.ndarray]:
     "angle_deg",
     [
         -180.0,
-        -90.0,
         0.0,
-        90.0,
         180.0,
     ],
 )

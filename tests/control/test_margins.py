@@ -152,7 +152,13 @@ def test_the_gain_margin_by_brute_force(model: object, phi: float, gains: tuple[
     assert found.gain == pytest.approx(gain_to_instability(loop), rel=1e-3)
 
 
-@pytest.mark.parametrize("q", [(0.07, 0.07), (0.078, 0.078), (0.085, 0.072)])
+@pytest.mark.parametrize(
+    "q",
+    [
+        (0.07, 0.07),
+        (0.085, 0.072),
+    ],
+)
 @pytest.mark.parametrize("sensing", [False, True])
 def test_each_channel_of_the_position_loop_by_brute_force(q: tuple[float, float], sensing: bool) -> None:
     loop = position_loop(NOMINAL, Pid(18000.0, 0.0, 180.0), q, sensing)

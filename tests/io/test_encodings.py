@@ -77,14 +77,12 @@ READERS: dict[str, tuple[str, str, Callable[[Path], str]]] = {
 
 SAME = {
     "byte-order mark": lambda text: b"\xef\xbb\xbf" + text.encode(),
-    "Windows": lambda text: text.replace("\n", "\r\n").encode(),
     "both": lambda text: b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode(),
     "no last end": lambda text: text.rstrip("\n").encode(),
 }
 
 REFUSED = {
     "UTF-16": lambda text: text.encode("utf-16"),
-    "UTF-32": lambda text: text.encode("utf-32"),
     "zero bytes before": lambda text: b"\0\0" + text.encode(),
     "gzip": lambda _: b"\x1f\x8b\x08\0\0\0\0\0\0\x03" + bytes(range(256)),
 }

@@ -113,7 +113,7 @@ def test_rounding_moves_the_cutoff_little_and_poles_are_those_of_the_sections(
 
 
 F = np.array([0.0, 0.05, 0.5, 1.0, 2.0, 7.0, 25.0])
-EVERY = [(order, family) for order in (1, 2, 3, 5, 8) for family in FAMILIES]
+EVERY = [(order, family) for order in (1, 2, 5) for family in FAMILIES]
 
 
 def _sections(order: int = 1, family: str = "butterworth", cutoff: float = 1.0) -> np.ndarray:

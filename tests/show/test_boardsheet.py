@@ -85,7 +85,7 @@ def _page_mm(pdf: bytes) -> np.ndarray:
 
 
 @pytest.mark.parametrize("page", sorted(PAGES_MM))
-@pytest.mark.parametrize(("columns", "rows"), [(2, 2), (7, 5), (5, 7), (9, 6), (4, 11), (20, 3)])
+@pytest.mark.parametrize(("columns", "rows"), [(2, 2), (7, 5), (20, 3)])
 def test_every_board_that_fits_lies_inside_the_printable_page(columns: int, rows: int, page: str) -> None:
     for square_mm in (3.0, 8.0, 12.5):
         pdf = board_pdf(columns, rows, square_mm / 1000, page)
