@@ -19,7 +19,6 @@ from calib.cli.firmware import firmware
 from calib.cli.fleet import fleet
 from calib.cli.identify import identify
 from calib.cli.imu import imu
-from calib.cli.lowpass import lowpass
 from calib.cli.record import record
 from calib.cli.replay import replay
 from calib.cli.report import report
@@ -59,7 +58,7 @@ app.command("run")(telling(run))
 app.command("intrinsics")(verb(stage("intrinsics")))
 app.command("extrinsics")(verb(stage("extrinsics")))
 app.command("distortion")(verb(stage("distortion")))
-app.command("lowpass")(lowpass)
+app.command("lowpass")(verb(stage("lowpass")))
 app.add_typer(imu, name="imu")
 app.command("align")(telling(align))
 app.command("replay")(telling(replay))

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, get_args, get_type_hints
 
 from calib.core.errors import BadInputError, UsageError
 
@@ -90,6 +90,7 @@ def options_of(kind: type[Any], values: Mapping[str, Any]) -> Any:
     Raises `UsageError` for a name that is none, with the nearest one.
     """
     known = {one.name: one for one in fields(kind)}
+    hints = get_type_hints(kind)
     parsed: dict[str, Any] = {}
     for name, value in values.items():
         if name not in known:
@@ -98,7 +99,7 @@ def options_of(kind: type[Any], values: Mapping[str, Any]) -> Any:
             near = difflib.get_close_matches(name, known, 1)
             hint = f"; did you mean {near[0]}?" if near else f", expected one of {', '.join(known)}"
             raise UsageError(f"{name} is not an option{hint}")
-        parse = known[name].metadata.get("parse")
+        parse = known[name].metadata.get("parse") or (Path if Path in get_args(hints[name]) else None)
         parsed[name] = parse(value) if parse is not None and isinstance(value, str) else value
     return kind(**parsed)
 

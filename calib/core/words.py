@@ -160,7 +160,7 @@ def _parts(section: BaseModel, prefix: str) -> Iterator[Block]:
                 # A table of values may hold several units, each at the end of its name.
                 own = _shown(name, field)[0] or unit
                 cell = one if isinstance(one, str) else number(_scaled(one, scale), None, places)
-                scalars.append((_with_unit(f"{label} {name}", own), cell, ""))
+                scalars.append((_with_unit(f"{label} {_as_words(name)}", own), cell, ""))
         elif isinstance(value, list) and value and isinstance(value[0], BaseModel):
             later.append(_listed(label, {str(i): one for i, one in enumerate(value)}, numbered=False))
         elif isinstance(value, list) and all(isinstance(one, int) for one in value):
@@ -231,6 +231,12 @@ def _shown(key: str, field: FieldInfo) -> tuple[str, float, int | None]:
 
 def _scaled(value: float | None, scale: float) -> float | None:
     return value if value is None or scale == 1.0 else value * scale
+
+
+def _as_words(name: str) -> str:
+    """A key without its unit."""
+    end = next((end for end in UNITS if name.endswith(end)), "")
+    return name.removesuffix(end).replace("_", " ")
 
 
 def _with_unit(label: str, unit: str) -> str:

@@ -24,6 +24,7 @@ STAGES = {
     "intrinsics": "calib.stages.camera.stage",
     "extrinsics": "calib.stages.camera.stage",
     "distortion": "calib.stages.camera.stage",
+    "lowpass": "calib.stages.lowpass.stage",
 }
 """Module of each stage by the words of its verb; the last word is its name there."""
 

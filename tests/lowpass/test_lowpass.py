@@ -37,7 +37,7 @@ from calib.stages.lowpass.filters import (
     step,
     suggest,
 )
-from calib.stages.lowpass.stage import lowpass_section, positions_from_log
+from calib.stages.lowpass.stage import Inputs, positions_from_log, solve
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.sensors import marker_pixels
@@ -351,7 +351,7 @@ def test_positions_are_the_markers_on_the_plane(tmp_path: Path) -> None:
 
 
 def test_a_filter_that_single_precision_spoils_is_poor() -> None:
-    section = lowpass_section(design_lowpass(Design(0.01, 60.0, 2)), WORKSPACE)
-    assert section.verdict == "poor"
-    assert "Rounded to single precision it cuts at" in section.reasons[0]
-    assert "comes to rest up to" in section.reasons[1]
+    verdict = solve(Inputs(design_lowpass(Design(0.01, 60.0, 2)), WORKSPACE)).verdict
+    assert verdict.word == "poor"
+    assert "Rounded to single precision it cuts at" in verdict.reasons[0]
+    assert "comes to rest up to" in verdict.reasons[1]

@@ -36,7 +36,8 @@ from calib.stages.camera.plots import plots as camera_plots
 from calib.stages.camera.verdict import Judgement
 from calib.stages.lowpass.filters import Design, design_lowpass
 from calib.stages.lowpass.plots import plots as lowpass_plots
-from calib.stages.lowpass.stage import Positions, lowpass_section, positions_from_log
+from calib.stages.lowpass.stage import Inputs, Positions, positions_from_log
+from calib.stages.lowpass.stage import solve as solve_lowpass
 from synthetic import CAMERA, views_of
 
 
@@ -257,7 +258,7 @@ def _lens(camera: Camera) -> dict[str, Figure]:
 
 def _low_pass(cutoff: float, order: int, family: str, folder: Path, still: bool = False) -> dict[str, Figure]:
     made, seen = design_lowpass(Design(cutoff, 60.0, order, family)), _positions(folder, still)
-    return lowpass_plots(made, lowpass_section(made, WORKSPACE, seen), seen)
+    return lowpass_plots(made, solve_lowpass(Inputs(made, WORKSPACE, seen)), seen)
 
 
 CASES: dict[str, Callable[[Path], dict[str, Figure]]] = {

@@ -88,7 +88,7 @@ def _response(filter_: Filter, section: LowPass, title: str) -> Figure:
         y_limits=(0.0, 1.08 + step["overshoot"]),
     )
     panels = (gain, delay, rise, _poles(np.array(section.poles)))
-    return Figure(f"Low-pass: {title}", note, panels, 6.2, section.verdict, columns=2)
+    return Figure(f"Low-pass: {title}", note, panels, 6.2, section.verdict.word, columns=2)
 
 
 def _poles(z: FloatArray) -> Plot:
@@ -146,7 +146,7 @@ def _on_log(filter_: Filter, section: LowPass, positions: Positions, title: str)
         note,
         tuple(panels),
         6.2,
-        section.verdict,
+        section.verdict.word,
         columns=2,
         widths=(1.75, 1.0),
     )

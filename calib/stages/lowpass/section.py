@@ -6,14 +6,14 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from calib.core.result import Count, NotNegative, Number, Positive, Row3, Section
+from calib.core.result import Count, NotNegative, Number, Positive, Result, Row3, Section, quantity
 
 
 class LowPassSection(Section):
     """b0 b1 b2 and 1 a1 a2 of a second-order section; values that binary32 holds exactly."""
 
-    b: Row3
-    a: Row3
+    b: Row3 = quantity(label="b", digits=9)
+    a: Row3 = quantity(label="a", digits=9)
 
 
 class LowPassAxis(Section):
@@ -27,28 +27,28 @@ class LowPassAxis(Section):
         gain there; empty at rest.
     """
 
-    jitter_before: NotNegative
-    jitter_after: NotNegative
-    motion_hz: NotNegative
-    motion_changed: NotNegative
-    quantisation_hz: list[Number] = []
-    quantisation_db: list[Number] = []
+    jitter_before: NotNegative = quantity(label="jitter", digits=4)
+    jitter_after: NotNegative = quantity(label="filtered", digits=4)
+    motion_hz: NotNegative = quantity(label="motion up to", digits=2)
+    motion_changed: NotNegative = quantity(label="changed", show="%", digits=0)
+    quantisation_hz: list[Number] = quantity([], label="pixel grid at", digits=1)
+    quantisation_db: list[Number] = quantity([], label="gain there", digits=0)
 
 
 class LowPassLog(Section):
     """What the filter does to a log."""
 
-    name: str
-    unit: Literal["mm", "px"]
-    rate_hz: Positive
-    ticks: Count
-    held: Count
-    dropped: Count
-    pieces: Count
-    axes: dict[str, LowPassAxis]
+    name: str = quantity(label="file")
+    unit: Literal["mm", "px"] = quantity(label="jitter in")
+    rate_hz: Positive = quantity(label="rate", digits=3)
+    ticks: Count = quantity(label="ticks")
+    held: Count = quantity(label="held")
+    dropped: Count = quantity(label="dropped")
+    pieces: Count = quantity(label="pieces")
+    axes: dict[str, LowPassAxis] = quantity(label="coordinate")
 
 
-class LowPass(Section):
+class LowPass(Result):
     """The low-pass of the positions, its delay, and what rounding does to it.
 
     Attributes
@@ -63,25 +63,24 @@ class LowPass(Section):
     wanted_jitter : what was asked for, in the log's unit.
     """
 
-    family: Literal["butterworth", "bessel", "critical"]
-    order: Annotated[int, Field(ge=1, le=8, strict=True)]
-    cutoff_hz: Positive
-    rate_hz: Positive
-    sections: Annotated[list[LowPassSection], Field(min_length=1, max_length=4)]
-    rounded_cutoff_hz: Positive
-    pole_radius: Positive
+    family: Literal["butterworth", "bessel", "critical"] = quantity(label="family")
+    order: Annotated[int, Field(ge=1, le=8, strict=True)] = quantity(label="order")
+    cutoff_hz: Positive = quantity(label="cut-off")
+    rate_hz: Positive = quantity(label="rate")
+    sections: Annotated[list[LowPassSection], Field(min_length=1, max_length=4)] = quantity(
+        label="coefficients"
+    )
+    rounded_cutoff_hz: Positive = quantity(label="cut-off, rounded to float")
+    pole_radius: Positive = quantity(label="poles within a radius of", digits=5)
     poles: list[list[Number]] = []
-    dc_delay_s: Positive
-    largest_delay_s: Positive
-    step: dict[str, Number] = {}
-    attenuation_db: dict[str, Number] = {}
-    noise_gain: Positive
-    dead_band_mm: dict[str, Number | None] = {}
-    wanted_jitter: NotNegative | None = None
-    log: LowPassLog | None = None
-    verdict: Literal["ok", "poor"]
-    reasons: list[str] = []
-    remarks: list[str] = []
+    dc_delay_s: Positive = quantity(label="delay of slow motion", digits=4)
+    largest_delay_s: Positive = quantity(label="delay up to the cut-off, at most", digits=4)
+    step: dict[str, Number] = quantity({}, label="step response:", digits=3)
+    attenuation_db: dict[str, Number] = quantity({}, label="gain at", digits=1)
+    noise_gain: Positive = quantity(label="variance of white noise", digits=4)
+    dead_band_mm: dict[str, Number | None] = quantity({}, label="dead band")
+    wanted_jitter: NotNegative | None = quantity(None, label="jitter asked for", digits=4)
+    log: LowPassLog | None = quantity(None, label="log")
 
     @model_validator(mode="after")
     def _consistent(self) -> LowPass:

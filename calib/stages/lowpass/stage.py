@@ -1,43 +1,28 @@
-"""The low-pass of a rig: the positions in its logs, and its section of rig.yaml."""
+"""The stage of the low-pass: a design, or the filter of least delay for a log, and what it costs."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Literal, cast
+from typing import TYPE_CHECKING, Literal, cast
 
-import numpy as np
+from calib.core.errors import BadInputError, UsageError
+from calib.core.stage import Files, Stage, option
+from calib.core.units import parse_frequency_hz, parse_jitter
+from calib.core.verdict import Finding, Verdict
 
-from calib.core.arrays import FloatArray
-from calib.core.errors import BadInputError
-from calib.core.geometry import apply_homography
-from calib.io.logs import check_time, read_log
-from calib.stages.camera.model import Camera, undistort
-from calib.stages.lowpass.filters import (
-    Filter,
-    Spectrum,
-    Ticks,
-    cutoff_hz,
-    dc_delay_s,
-    dead_band_binary32,
-    decibels,
-    digital_poles,
-    fixed_point,
-    frequency_response,
-    grid_step,
-    group_delay_s,
-    jitter_after,
-    motion_lost,
-    noise_gain,
-    on_ticks,
-    quantisation_hz,
-    sampling_rate_hz,
-    spectrum,
-    step_response,
-)
-from calib.stages.lowpass.section import LowPass, LowPassAxis, LowPassLog, LowPassSection
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from calib.core.arrays import FloatArray
+    from calib.core.plot import Figure
+    from calib.core.rig import Rig
+    from calib.core.words import Block
+    from calib.stages.camera.model import Camera
+    from calib.stages.lowpass.filters import Filter, Spectrum, Suggestion, Ticks
+    from calib.stages.lowpass.section import LowPass, LowPassLog
 
 _RATE_OFF = 0.05
 _CUTOFF_OFF = 0.01
@@ -46,6 +31,43 @@ _STICKS_MM = 0.01
 """A tenth of what a pixel of the rig's camera leaves after averaging; more would be seen."""
 _TIMES_CUTOFF = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
 _PARTS_OF_RATE = (0.1, 0.25, 0.45)
+_SHOWN = 5
+"""Candidates beside the filter that was chosen."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What filter is designed, or chosen, and for which log."""
+
+    cutoff_hz: float | None = option(
+        None,
+        "Frequency at which half the power is left. [default: 1Hz]",
+        flag="cutoff",
+        metavar="FREQUENCY",
+        parse=partial(parse_frequency_hz, what="--cutoff"),
+    )
+    rate_hz: float = option(
+        60.0,
+        "Rate at which the firmware runs the filter. [default: 60Hz]",
+        flag="rate",
+        metavar="FREQUENCY",
+        parse=partial(parse_frequency_hz, what="--rate"),
+    )
+    order: int | None = option(None, "1 to 8. [default: 1; with --suggest the one of least delay]")
+    family: Literal["butterworth", "bessel", "critical"] | None = option(
+        None, "Of the filter. [default: butterworth; with --suggest the best]"
+    )
+    suggest: Path | None = option(
+        None, "Choose the filter of least delay from this log's own spectrum.", metavar="LOG"
+    )
+    jitter: tuple[float, str] | None = option(
+        None,
+        "Jitter that --suggest may leave (standard deviation), as 0.1mm or 0.3px. [default: what the filter "
+        "of --cutoff leaves]",
+        metavar="LENGTH",
+        parse=parse_jitter,
+    )
+    log: Path | None = option(None, "Log to show the filter on. [default: that of --suggest]", metavar="LOG")
 
 
 @dataclass(frozen=True)
@@ -72,6 +94,37 @@ class Positions:
     spectra: tuple[Spectrum, Spectrum]
 
 
+@dataclass(frozen=True)
+class Inputs:
+    """What a low-pass is made from.
+
+    Attributes
+    ----------
+    filter : as asked for.
+    workspace_m : where the marker can be; the smallest power of two beyond it is full scale in Q15.
+    positions : of the log to judge the filter on.
+    suggest : of the log to choose the filter by, among `orders` and `families` (all where empty).
+    wanted : jitter that the chosen filter may leave, in the positions' unit; None for that of `filter`.
+    """
+
+    filter: Filter
+    workspace_m: Sequence[float]
+    positions: Positions | None = None
+    suggest: Positions | None = None
+    wanted: float | None = None
+    orders: tuple[int, ...] = ()
+    families: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a low-pass is drawn from."""
+
+    filter: Filter
+    positions: Positions | None
+    choice: Suggestion | None
+
+
 def positions_from_log(
     path: Path, rate_hz: float | None, camera: Camera | None, A_inverse: FloatArray | None
 ) -> Positions:
@@ -85,6 +138,13 @@ def positions_from_log(
     Raises `BadInputError` for a log without camera, with too few samples, whose time runs backwards,
     whose marker lies beyond the plane's horizon, or of another rate.
     """
+    import numpy as np
+
+    from calib.core.geometry import apply_homography
+    from calib.io.logs import check_time, read_log
+    from calib.stages.camera.model import undistort
+    from calib.stages.lowpass.filters import on_ticks, sampling_rate_hz, spectrum
+
     log = read_log(path)
     check_time(log)
     rows = log.sampled("u_px", "v_px")
@@ -124,66 +184,88 @@ def positions_from_log(
     return Positions(log.source, unit, names, own, ticks, on_ticks(t, pixels, rate), spectra)
 
 
-def _log_section(filter_: Filter, seen: Positions) -> LowPassLog:
-    scale = 1e3 if seen.unit == "m" else 1.0
-    delay_s = dc_delay_s(filter_.sections, seen.ticks.rate_hz)
-    axes = {}
-    for i, (name, of) in enumerate(zip(seen.names, seen.spectra, strict=True)):
-        # The grid is the picture's: u for x and v for y, which a camera that looks along the normal shows so.
-        pixels = seen.pixels.longest.values[:, i]
-        f = np.full(3, np.nan)
-        if of.motion_hz > 0.0:
-            f = quantisation_hz(pixels, grid_step(pixels), seen.ticks.rate_hz)
-        known = bool(np.isfinite(f).all())
-        H = frequency_response(filter_.sections, f[: 3 * known], seen.ticks.rate_hz)
-        axes[name] = LowPassAxis(
-            jitter_before=scale * of.jitter,
-            jitter_after=scale * jitter_after(of, filter_.sections),
-            motion_hz=of.motion_hz,
-            motion_changed=motion_lost(of, filter_.sections, delay_s),
-            quantisation_hz=f[: 3 * known].tolist(),
-            quantisation_db=decibels(H).tolist(),
-        )
-    return LowPassLog(
-        name=Path(seen.source).name,
-        unit="mm" if seen.unit == "m" else "px",
-        rate_hz=seen.rate_hz,
-        ticks=sum(len(piece.t_s) for piece in seen.ticks.pieces),
-        held=seen.ticks.held,
-        dropped=seen.ticks.dropped,
-        pieces=len(seen.ticks.pieces),
-        axes=axes,
+def _read(files: Files, rig: Rig, options: Options) -> Inputs:
+    import numpy as np
+
+    from calib.core.result import identity
+    from calib.core.rig import Geometry
+    from calib.stages.lowpass.filters import Design, design_lowpass
+
+    if options.jitter is not None and options.suggest is None:
+        raise UsageError("--jitter: is for --suggest, which chooses the filter")
+    if options.jitter is not None and options.cutoff_hz is not None:
+        raise UsageError("--cutoff: does not go with --jitter, from which the cut-off follows")
+    try:
+        order = 1 if options.order is None else options.order
+        design = Design(options.cutoff_hz or 1.0, options.rate_hz, order, options.family or "butterworth")
+        made = design_lowpass(design)
+    except BadInputError as error:
+        raise UsageError(str(error)) from error
+    plane, camera = rig.current_plane(files.rig_path), rig.camera
+    optics = A_inverse = None
+    if plane is not None and camera is not None and (options.log or options.suggest):
+        optics, A_inverse = camera.optics, np.array(plane.A_inverse)
+        files.hashes |= {"camera": identity(camera), "plane": identity(plane)}
+
+    def positions(path: Path | None) -> Positions | None:
+        if path is None:
+            return None
+        read = positions_from_log(path, options.rate_hz, optics, A_inverse)
+        files.taken(path)
+        return read
+
+    suggest = positions(options.suggest)
+    wanted, unit = options.jitter or (None, "")
+    if suggest is not None and wanted is not None and unit != suggest.unit:
+        asked = f"{1e3 * wanted:g}mm" if unit == "m" else f"{wanted:g}px"
+        has = "millimetres" if suggest.unit == "m" else "pixels, without a plane in the rig's file"
+        raise UsageError(f"--jitter: {asked!r} does not fit positions in {has}")
+    return Inputs(
+        made,
+        (rig.geometry or Geometry()).workspace_m,
+        suggest if options.log in (None, options.suggest) else positions(options.log),
+        suggest,
+        wanted,
+        () if options.order is None else (options.order,),
+        () if options.family is None else (options.family,),
     )
 
 
-def lowpass_section(
-    filter_: Filter, workspace_m: Sequence[float], seen: Positions | None = None, wanted: float | None = None
-) -> LowPass:
-    """The `lowpass` section of a filter.
+def solve(inputs: Inputs) -> LowPass:
+    """Design or choose the filter, judge it, and assemble the section.
 
-    Parameters
-    ----------
-    workspace_m : where the marker can be; the smallest power of two beyond it is full scale in Q15.
-    seen : the log to judge the filter on.
-    wanted : jitter that was asked for, in the log's unit.
+    Raises `BadInputError` where no filter leaves so little jitter, or none is needed.
     """
-    design, sections = filter_.design, filter_.sections
-    rate = design.rate_hz
-    rounded = cutoff_hz(sections, rate)
-    band = np.linspace(0.0, design.cutoff_hz, 201)
-    answer = step_response(sections, rate)
+    import numpy as np
+
+    from calib.core.result import judged
+    from calib.stages.lowpass import filters
+    from calib.stages.lowpass.section import LowPass, LowPassSection
+
+    made, positions, wanted, choice = inputs.filter, inputs.positions, inputs.wanted, None
+    if inputs.suggest is not None:
+        spectra = inputs.suggest.spectra
+        if wanted is None:
+            wanted = max(filters.jitter_after(of, made.sections) for of in spectra)
+        try:
+            choice = filters.suggest(spectra, wanted, inputs.orders, inputs.families, inputs.suggest.unit)
+        except BadInputError as error:
+            raise BadInputError(f"{inputs.suggest.source}: {error}") from error
+        made = choice.best.filter
+    design, sections, rate = made.design, made.sections, made.design.rate_hz
+    rounded = filters.cutoff_hz(sections, rate)
+    answer = filters.step_response(sections, rate)
     f = sorted(
         {c for c in (k * design.cutoff_hz for k in _TIMES_CUTOFF) if c < 0.5 * rate}
         | {k * rate for k in _PARTS_OF_RATE}
     )
-    largest = max(abs(value) for value in workspace_m)
-    full_scale_m = 2.0 ** math.ceil(math.log2(largest)) if largest > 0.0 else 1.0
-    step_mm = 1e3 * full_scale_m / 32768.0
-    integer = fixed_point(filter_)
-    float_mm = 1e3 * largest * dead_band_binary32(filter_)
-    reasons, remarks = _judged(filter_, rounded, seen)
-    if float_mm > _STICKS_MM:
-        reasons.append(f"In single precision the output comes to rest up to {float_mm:.2g} mm away.")
+    gains = filters.decibels(filters.frequency_response(sections, np.array(f), rate))
+    band = np.linspace(0.0, design.cutoff_hz, 201)
+    largest = max(abs(value) for value in inputs.workspace_m)
+    step_mm = 1e3 * (2.0 ** math.ceil(math.log2(largest)) if largest > 0.0 else 1.0) / 32768.0
+    integer = filters.fixed_point(made)
+    float_mm = 1e3 * largest * filters.dead_band_binary32(made)
+    verdict = Verdict.of([*_of_rounding(made, rounded, float_mm), *_of_log(made, positions)])
     return LowPass(
         family=cast("Literal['butterworth', 'bessel', 'critical']", design.family),
         order=design.order,
@@ -191,64 +273,160 @@ def lowpass_section(
         rate_hz=rate,
         sections=[LowPassSection(b=row[:3].tolist(), a=row[3:].tolist()) for row in sections],
         rounded_cutoff_hz=rounded,
-        pole_radius=filter_.pole_radius,
-        poles=[[float(p.real), float(p.imag)] for p in digital_poles(sections)],
-        dc_delay_s=dc_delay_s(sections, rate),
-        largest_delay_s=float(group_delay_s(sections, band, rate).max()),
+        pole_radius=made.pole_radius,
+        poles=[[float(p.real), float(p.imag)] for p in filters.digital_poles(sections)],
+        dc_delay_s=filters.dc_delay_s(sections, rate),
+        largest_delay_s=float(filters.group_delay_s(sections, band, rate).max()),
         step={"rise_s": answer.rise_s, "settling_s": answer.settling_s, "overshoot": answer.overshoot},
-        attenuation_db={
-            f"{c:.4g}Hz": float(d)
-            for c, d in zip(f, decibels(frequency_response(sections, np.array(f), rate)), strict=True)
-        },
-        noise_gain=noise_gain(sections),
+        attenuation_db={f"{c:.4g}Hz": gain for c, gain in zip(f, gains.tolist(), strict=True)},
+        noise_gain=filters.noise_gain(sections),
         dead_band_mm={
             "q15_step": step_mm,
             "q15": step_mm * integer.dead_band if integer.usable else None,
             "q15_seen": step_mm * integer.stuck if integer.usable else None,
             "float": float_mm,
         },
-        wanted_jitter=wanted if wanted is None or seen is None or seen.unit == "px" else 1e3 * wanted,
-        log=None if seen is None else _log_section(filter_, seen),
-        verdict="poor" if reasons else "ok",
-        reasons=reasons,
-        remarks=remarks,
+        wanted_jitter=wanted if wanted is None or _scale(positions) == 1.0 else 1e3 * wanted,
+        log=None if positions is None else _log_section(made, positions),
+        **judged(verdict),
+    ).with_evidence(Evidence(made, positions, choice))
+
+
+def _scale(positions: Positions | None) -> float:
+    """What the positions' unit is multiplied by for the file's."""
+    return 1.0 if positions is None or positions.unit == "px" else 1e3
+
+
+def _log_section(made: Filter, positions: Positions) -> LowPassLog:
+    import numpy as np
+
+    from calib.stages.lowpass import filters
+    from calib.stages.lowpass.section import LowPassAxis, LowPassLog
+
+    scale, ticks = _scale(positions), positions.ticks
+    delay_s = filters.dc_delay_s(made.sections, ticks.rate_hz)
+    axes = {}
+    for i, (name, of) in enumerate(zip(positions.names, positions.spectra, strict=True)):
+        # The grid is the picture's: u for x and v for y, which a camera that looks along the normal shows so.
+        pixels = positions.pixels.longest.values[:, i]
+        f = np.full(3, np.nan)
+        if of.motion_hz > 0.0:
+            f = filters.quantisation_hz(pixels, filters.grid_step(pixels), ticks.rate_hz)
+        f = f[np.isfinite(f)]
+        axes[name] = LowPassAxis(
+            jitter_before=scale * of.jitter,
+            jitter_after=scale * filters.jitter_after(of, made.sections),
+            motion_hz=of.motion_hz,
+            motion_changed=filters.motion_lost(of, made.sections, delay_s),
+            quantisation_hz=f.tolist(),
+            quantisation_db=filters.decibels(
+                filters.frequency_response(made.sections, f, ticks.rate_hz)
+            ).tolist(),
+        )
+    return LowPassLog(
+        name=Path(positions.source).name,
+        unit="px" if positions.unit == "px" else "mm",
+        rate_hz=positions.rate_hz,
+        ticks=sum(len(piece.t_s) for piece in ticks.pieces),
+        held=ticks.held,
+        dropped=ticks.dropped,
+        pieces=len(ticks.pieces),
+        axes=axes,
     )
 
 
-def _judged(filter_: Filter, rounded_hz: float, seen: Positions | None) -> tuple[list[str], list[str]]:
-    """Reasons why the filter is poor, and remarks that do not make it so."""
-    design = filter_.design
-    reasons: list[str] = []
-    remarks: list[str] = []
-    if abs(rounded_hz / design.cutoff_hz - 1.0) > _CUTOFF_OFF:
-        reasons.append(
-            f"Rounded to single precision it cuts at {rounded_hz:.4g} Hz, not at {design.cutoff_hz:g} Hz."
+def _of_rounding(made: Filter, rounded_hz: float, float_mm: float) -> Iterator[Finding]:
+    """Findings on what single precision makes of the filter."""
+    asked_hz = made.design.cutoff_hz
+    if abs(rounded_hz / asked_hz - 1.0) > _CUTOFF_OFF:
+        yield Finding(
+            "poor", f"Rounded to single precision it cuts at {rounded_hz:.4g} Hz, not at {asked_hz:g} Hz."
         )
-    if seen is None:
-        return reasons, remarks
-    unsure = [name for name, of in zip(seen.names, seen.spectra, strict=True) if not of.flat]
+    if float_mm > _STICKS_MM:
+        yield Finding("poor", f"In single precision the output comes to rest up to {float_mm:.2g} mm away.")
+
+
+def _of_log(made: Filter, positions: Positions | None) -> Iterator[Finding]:
+    """Findings on what the filter does to a log."""
+    from calib.stages.lowpass.filters import dc_delay_s, motion_lost
+
+    if positions is None:
+        return
+    spectra, ticks = positions.spectra, positions.ticks
+    unsure = [name for name, of in zip(positions.names, spectra, strict=True) if not of.flat]
     if unsure:
-        reasons.append(
+        yield Finding(
+            "poor",
             f"The spectrum of {' and '.join(unsure)} does not fall to a floor: motion and jitter cannot "
-            "be told apart; use a log at rest."
+            "be told apart; use a log at rest.",
         )
-    delay_s = dc_delay_s(filter_.sections, design.rate_hz)
-    changed = max(motion_lost(of, filter_.sections, delay_s) for of in seen.spectra)
+    delay_s = dc_delay_s(made.sections, made.design.rate_hz)
+    changed = max(motion_lost(of, made.sections, delay_s) for of in spectra)
     if changed > _TOO_MUCH_CHANGED:
-        remarks.append(
+        yield Finding(
+            "remark",
             f"{changed:.0%} of this log's motion does not come through unchanged; it reaches "
-            f"{max(of.motion_hz for of in seen.spectra):.3g} Hz."
+            f"{max(of.motion_hz for of in spectra):.3g} Hz.",
         )
-    outliers = max(of.outliers for of in seen.spectra)
+    outliers = max(of.outliers for of in spectra)
     if outliers:
-        remarks.append(
-            f"{outliers} outliers are not counted as jitter; the filter passes them on, smeared out."
+        yield Finding(
+            "remark",
+            f"{outliers} outliers are not counted as jitter; the filter passes them on, smeared out.",
         )
-    total = sum(len(piece.t_s) for piece in seen.ticks.pieces)
-    if seen.ticks.held > 0.05 * total:
-        remarks.append(
-            f"{seen.ticks.held} of {total} ticks have no sample of their own and hold the one before."
+    total = sum(len(piece.t_s) for piece in ticks.pieces)
+    if ticks.held > 0.05 * total:
+        yield Finding(
+            "remark", f"{ticks.held} of {total} ticks have no sample of their own and hold the one before."
         )
-    if len(seen.ticks.pieces) > 1:
-        remarks.append(f"Gaps split the log into {len(seen.ticks.pieces)} pieces; the longest was used.")
-    return reasons, remarks
+    if len(ticks.pieces) > 1:
+        yield Finding("remark", f"Gaps split the log into {len(ticks.pieces)} pieces; the longest was used.")
+
+
+def _words(result: LowPass) -> list[Block]:
+    """The filters that a log leaves to choose from."""
+    from calib.core.words import Table
+
+    evidence: Evidence = result.evidence
+    choice = evidence.choice
+    if choice is None:
+        return []
+    rows = tuple(
+        (
+            f"{one.filter.design.family} {one.filter.design.order}",
+            f"{one.filter.design.cutoff_hz:g}",
+            f"{one.delay_s:.4f}",
+            f"{one.motion_lost:.0%}",
+            "taken" if one is choice.best else "",
+        )
+        for one in choice.candidates[:_SHOWN]
+    )
+    head = ("filter", "cut-off, Hz", "delay, s", "motion changed", "")
+    unit = "" if result.log is None else result.log.unit
+    title = f"least delay for a jitter of {result.wanted_jitter:.3g} {unit}; the same jitter with others"
+    return [Table(head, rows, title)]
+
+
+def _plots(result: LowPass) -> dict[str, Figure]:
+    from calib.stages.lowpass.plots import plots
+
+    evidence: Evidence = result.evidence
+    return plots(evidence.filter, result, evidence.positions)
+
+
+lowpass = Stage(
+    "lowpass",
+    "Low-pass",
+    """Design the low-pass of the positions, with its delay, and write the section lowpass.
+
+    Uses the sections camera and plane of the rig's file for millimetres; without them jitter is in
+    pixels. Exits 1 when the verdict is not ok.
+    """,
+    _read,
+    solve,
+    Options,
+    writes=("lowpass",),
+    uses=("camera", "plane"),
+    words=_words,
+    plots=_plots,
+)
