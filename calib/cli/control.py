@@ -123,9 +123,10 @@ def run(
             progress(done, len(names))
             outcomes.append(run_controller(name, machine, model, wanted, known.controller, seed, feedback))
     if figures is not None:
-        from calib.stages.control.plots import write_run_figures
+        from calib.show.draw import write_figures
+        from calib.stages.control.plots import run_plots
 
-        write_run_figures(figures, model, wanted, outcomes)
+        write_figures(figures, run_plots(model, wanted, outcomes))
         narrate(f"figures in {figures}")
     told: dict[str, Any] = {"feedback": feedback, "seed": seed, **check_json(wanted, found)}
     if as_json:
@@ -214,9 +215,10 @@ def check(
         write_reference(slow, slower or wanted)
         narrate(f"reference written to {slow}")
     if figures is not None:
-        from calib.stages.control.plots import write_check_figures
+        from calib.show.draw import write_figures
+        from calib.stages.control.plots import check_plots
 
-        write_check_figures(figures, model, wanted, found, slower)
+        write_figures(figures, check_plots(model, wanted, found, slower))
         narrate(f"figures in {figures}")
     if as_json:
         document("control check", {"control": told})
@@ -294,9 +296,10 @@ def tune(
     source = source_margins(model, orientation, position)
     write_rig(rig, known.model_copy(update={"controller": section}), {"controller": _hashes(known)})
     if figures is not None:
-        from calib.stages.control.plots import write_tune_figures
+        from calib.show.draw import write_figures
+        from calib.stages.control.plots import tune_plots
 
-        write_tune_figures(figures, model, section, orientation, position)
+        write_figures(figures, tune_plots(model, section, orientation, position))
         narrate(f"figures in {figures}")
     narrate(f"controller written to {rig}")
     if as_json:

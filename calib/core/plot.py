@@ -26,6 +26,8 @@ Colour = str | float
 KINDS = ("line", "dashed", "dotted", "points", "cloud", "crosses", "pluses", "squares", "diamonds", "marks")
 """How a curve is drawn: as a line, as markers, as dots of a pixel ("cloud") or as short strokes ("marks")."""
 
+Limits = tuple[float, float]
+
 SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 WIDTH_IN = 9.2
 """Width of every figure, in inches of its letters."""
@@ -131,7 +133,7 @@ class Field:
     levels: FloatArray | None = None
     outlined: FloatArray | None = None
     even: bool = False
-    scale: tuple[float, float] | None = None
+    scale: Limits | None = None
 
 
 @dataclass(frozen=True)
@@ -181,8 +183,8 @@ class Plot:
     y: str = ""
     marks: tuple[Mark, ...] = ()
     title: str = ""
-    x_limits: tuple[float, float] | None = None
-    y_limits: tuple[float, float] | None = None
+    x_limits: Limits | None = None
+    y_limits: Limits | None = None
     log: str = ""
     linear_within: float = 0.0
     whole: str = ""
@@ -271,7 +273,7 @@ def every(values: AnyArray, most: int = MOST_POINTS) -> AnyArray:
     return values[:: max(1, -(-len(values) // most))]
 
 
-def central(values: FloatArray, outside: float, room: float) -> tuple[float, float] | None:
+def central(values: FloatArray, outside: float, room: float) -> Limits | None:
     """Limits that a few outliers do not widen: without a percentage at both ends, with a share as room."""
     finite = values[np.isfinite(values)]
     if len(finite) == 0:

@@ -249,9 +249,10 @@ def _panel(axes: Axes, panel: Plot) -> None:
     if panel.bare:
         axes.set_axis_off()
     if panel.legend:
-        frame: Any = {"frameon": True, "framealpha": 0.9, "edgecolor": "none", "handlelength": 1.4}
         place: Any = panel.legend
-        axes.legend(loc=place, title=panel.legend_title or None, title_fontsize=9.0, **frame)
+        columns = 1 + (len(axes.get_legend_handles_labels()[1]) > 3)
+        title = panel.legend_title or None
+        axes.legend(loc=place, ncols=columns, title=title, title_fontsize=9.0, handlelength=1.4)
     if panel.corner:
         box = {"facecolor": "white", "edgecolor": "none", "pad": 1.5, "alpha": 0.9}
         words = plain(panel.corner)

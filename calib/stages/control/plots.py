@@ -3,35 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.patches import Circle
 
-from calib.show.style import (
-    BLUE,
-    GREEN,
-    GREY,
-    INK,
-    ORANGE,
-    PURPLE,
-    SHADE,
-    SKY,
-    VERMILLION,
-    figure_folder,
-    look,
+from calib.core.plot import (
+    Curve,
+    Field,
+    Figure,
+    Limits,
+    Mark,
+    Plot,
+    Rule,
+    Shape,
+    circle,
     number,
-    plain,
-    save,
-    sheet,
-    view_colours,
+    short,
+    spaced,
 )
 from calib.stages.actuator.kinematics import angle, forward, length
-from calib.stages.control.laws import Model, Pid, holding_force, largest_force_N
-from calib.stages.control.linear import break_at, frequencies, response
+from calib.stages.control.laws import Model, holding_force, largest_force_N
+from calib.stages.control.linear import System, break_at, frequencies, response
 from calib.stages.control.references import Reference
 from calib.stages.control.section import Controller
 from calib.stages.control.stage import Outcome
@@ -44,106 +37,72 @@ from calib.stages.control.tuning import (
     position_loop,
 )
 
-_COLOURS = (BLUE, ORANGE, GREEN, VERMILLION, PURPLE, SKY)
-_MOST = 6
+_HUES = ("blue", "orange", "green", "red", "purple", "sky")
 
 
-def write_run_figures(
-    folder: Path, model: Model, reference: Reference, outcomes: Sequence[Outcome]
-) -> list[Path]:
-    """Draw runs of controllers into a folder made if needed; the files written.
-
-    Raises `BadInputError` where the folder or a file cannot be written.
-    """
-    figure_folder(folder)
-    shown = list(outcomes)[-_MOST:]
-    with look():
-        figure = _angles(model, reference, shown) if reference.kind == "angle" else _lengths(reference, shown)
-        return [save(figure, folder / "control_run.png")]
+def run_plots(model: Model, reference: Reference, outcomes: Sequence[Outcome]) -> dict[str, Figure]:
+    """`control_run`: at most the last six runs of controllers."""
+    shown = list(outcomes)[-len(_HUES) :]
+    angles = reference.kind == "angle"
+    return {"control_run": _angles(model, reference, shown) if angles else _lengths(reference, shown)}
 
 
-def _grid(axes: Axes, x: str, y: str, title: str) -> None:
-    axes.set_xlabel(x)
-    axes.set_ylabel(y)
-    axes.set_title(title)
-    axes.grid()
+def _over_time(y: str, marks: Sequence[Mark], title: str, limits: Limits | None = None) -> Plot:
+    return Plot("time (s)", y, tuple(marks), title, y_limits=limits)
 
 
-def _legend(figure: Figure, axes: Axes) -> None:
-    """Below all panels, where no line is."""
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 7), handlelength=1.4)
-
-
-def _commands(axes: Axes, outcomes: Sequence[Outcome], pump: int) -> None:
-    for colour, one in zip(_COLOURS, outcomes, strict=False):
-        axes.plot(one.run.t_s, one.run.pwm[:, pump], color=colour, linewidth=1.0)
-    axes.set_ylim(-10.0, 265.0)
-    _grid(axes, "time (s)", "PWM", f"Commands of pump {pump + 1}")
+def _commands(outcomes: Sequence[Outcome]) -> list[Plot]:
+    curves = [
+        [Curve(one.run.t_s, pwm, colour=hue, size=1.0) for pwm in one.run.pwm.T]
+        for hue, one in zip(_HUES, outcomes, strict=False)
+    ]
+    return [
+        _over_time("PWM", pump, f"Commands of pump {k}", (-10.0, 265.0))
+        for k, pump in enumerate(zip(*curves, strict=True), start=1)
+    ]
 
 
 def _angles(model: Model, reference: Reference, outcomes: Sequence[Outcome]) -> Figure:
-    note = (
-        "Simulated. RMS of the angle: "
-        + ", ".join(f"{plain(o.controller)} {number(o.figures.angle_rms_rad, 'rad')}" for o in outcomes)
-        + "."
-    )
-    figure = sheet(6.4, f"Angle of the head: {plain(reference.name, 50)}", note)
-    axes = figure.subplot_mosaic([["phi", "phi"], ["one", "two"]], height_ratios=[1.35, 1.0])
-    top = axes["phi"]
-    top.plot(reference.t_s, reference.phi_rad, color=INK, linewidth=1.6, linestyle="--", label="reference")
-    for colour, one in zip(_COLOURS, outcomes, strict=False):
+    errors = (f"{one.controller} {number(one.figures.angle_rms_rad, 'rad')}" for one in outcomes)
+    note = f"Simulated. RMS of the angle: {', '.join(errors)}."
+    marks = [Curve(reference.t_s, reference.phi_rad, "reference", "dashed", "ink", 1.6)]
+    for hue, one in zip(_HUES, outcomes, strict=False):
         phi = angle(one.run.states[:, :2], model.plant.bellows_radius_m)
-        top.plot(one.run.t_s, phi, color=colour, linewidth=1.4, label=plain(one.controller))
-    _grid(top, "time (s)", "angle (rad)", "True angle")
-    _legend(figure, top)
-    _commands(axes["one"], outcomes, 0)
-    _commands(axes["two"], outcomes, 1)
-    return figure
+        marks.append(Curve(one.run.t_s, phi, one.controller, colour=hue, size=1.4))
+    panels = (_over_time("angle (rad)", marks, "True angle"), *_commands(outcomes))
+    title = f"Angle of the head: {short(reference.name, 50)}"
+    return Figure(title, note, panels, 6.4, mosaic=("AA", "BC"), heights=(1.35, 1.0))
 
 
 def _lengths(reference: Reference, outcomes: Sequence[Outcome]) -> Figure:
-    parts = [f"{plain(o.controller)} {number(o.figures.head_rms_mm, 'mm')}" for o in outcomes]
-    note = f"Simulated. RMS of the head's place: {', '.join(parts)}."
-    figure = sheet(8.6, f"Lengths of the bellows: {plain(reference.name, 50)}", note)
-    axes = figure.subplot_mosaic([["q", "q"], ["e1", "e2"], ["one", "two"]], height_ratios=[1.3, 1.0, 0.9])
-    top, t = axes["q"], reference.t_s
-    for i, style in ((0, "--"), (1, ":")):
-        label = f"reference of bellows {i + 1}"
-        top.plot(t, 1e3 * reference.q_m[:, i], color=INK, linewidth=1.6, linestyle=style, label=label)
-    for colour, one in zip(_COLOURS, outcomes, strict=False):
+    errors = (f"{one.controller} {number(one.figures.head_rms_mm, 'mm')}" for one in outcomes)
+    note = f"Simulated. RMS of the head's place: {', '.join(errors)}."
+    t, q_mm = reference.t_s, 1e3 * reference.q_m
+    lengths = [
+        Curve(t, q_mm[:, i], f"reference of bellows {i + 1}", kind, "ink", 1.6)
+        for i, kind in enumerate(("dashed", "dotted"))
+    ]
+    missed: tuple[list[Mark], list[Mark]] = ([], [])
+    worst = []
+    for hue, one in zip(_HUES, outcomes, strict=False):
         q = 1e3 * one.run.states[:, :2]
-        top.plot(t, q[:, 0], color=colour, linewidth=1.2, label=plain(one.controller))
-        top.plot(t, q[:, 1], color=colour, linewidth=1.2)
-    _grid(top, "time (s)", "length (mm)", "True lengths")
-    _legend(figure, top)
-    errors = [1e3 * (reference.q_m - one.run.states[:, :2]) for one in outcomes]
-    worst = sorted(float(np.percentile(np.abs(e), 99)) for e in errors)
+        worst.append(float(np.percentile(np.abs(q_mm - q), 99)))
+        for i in (0, 1):
+            lengths.append(Curve(t, q[:, i], "" if i else one.controller, colour=hue, size=1.2))
+            missed[i].append(Curve(t, q_mm[:, i] - q[:, i], colour=hue, size=1.1))
+    worst.sort()
     # One controller that is far off would flatten the others.
     limit = 1.15 * (worst[-1] if len(worst) < 2 or worst[-1] < 4.0 * worst[-2] else worst[-2]) or 1.0
-    for i, name in ((0, "e1"), (1, "e2")):
-        for colour, e in zip(_COLOURS, errors, strict=False):
-            axes[name].plot(t, e[:, i], color=colour, linewidth=1.1)
-        axes[name].set_ylim(-limit, limit)
-        _grid(axes[name], "time (s)", "error (mm)", f"Error of bellows {i + 1}")
-    _commands(axes["one"], outcomes, 0)
-    _commands(axes["two"], outcomes, 1)
-    return figure
+    panels = [_over_time("length (mm)", lengths, "True lengths")]
+    for k, marks in enumerate(missed, start=1):
+        panels.append(_over_time("error (mm)", marks, f"Error of bellows {k}", (-limit, limit)))
+    title = f"Lengths of the bellows: {short(reference.name, 50)}"
+    panels += _commands(outcomes)
+    return Figure(title, note, tuple(panels), 8.6, mosaic=("AA", "BC", "DE"), heights=(1.3, 1.0, 0.9))
 
 
-def write_tune_figures(
-    folder: Path, model: Model, section: Controller, orientation: Tuned, position: Tuned
-) -> list[Path]:
-    """Draw the tuned loops at their operating points into a folder; the files written.
-
-    Raises `BadInputError` where the folder or a file cannot be written.
-    """
-    figure_folder(folder)
-    with look():
-        return [save(_bode(model, section, orientation, position), folder / "control_margins.png")]
-
-
-def _bode(model: Model, section: Controller, orientation: Tuned, position: Tuned) -> Figure:
+def tune_plots(model: Model, section: Controller, orientation: Tuned, position: Tuned) -> dict[str, Figure]:
+    """`control_margins`: the tuned loops at their operating points."""
     turn, move, wanted = section.orientation, section.position, section.criterion
     note = (
         f"Every rest keeps a gain margin of {wanted.gain_margin:g} and a phase margin of "
@@ -151,99 +110,86 @@ def _bode(model: Model, section: Controller, orientation: Tuned, position: Tuned
         f"{turn.Ki_pwm_per_rad_s:g} / {turn.Kd_pwm_s_per_rad:g}. Lengths: PD {move.Kp_pwm_per_m:g} / "
         f"{move.Kd_pwm_s_per_m:g}. Grey circles: distance 1 / Ms from -1."
     )
-    figure = sheet(7.6, "Open loops on the model: gain, phase and distance from -1", note, section.verdict)
-    panels = figure.subplots(3, 2)
+    loops = (
+        _loop(model, "angle", orientation_loop, orientation, wanted.sensitivity),
+        _loop(model, "lengths", position_loop, position, wanted.sensitivity),
+    )
+    panels = tuple(panel for row in zip(*loops, strict=True) for panel in row)
+    title = "Open loops on the model: gain, phase and distance from -1"
+    return {"control_margins": Figure(title, note, panels, 7.6, section.verdict, columns=2)}
+
+
+def _loop(
+    model: Model, name: str, loop_of: Callable[..., System], tuned: Tuned, sensitivity: float
+) -> tuple[Plot, Plot, Plot]:
+    """Gain, phase and Nyquist's curve of a loop at each rest."""
     w = frequencies(model.tick_s, 1200)
     f = w / (2.0 * np.pi)
-    for column, (name, tuned) in enumerate((("angle", orientation), ("lengths", position))):
-        gain, phase, nyquist = panels[:, column]
-        nyquist.add_patch(
-            Circle((-1.0, 0.0), 1.0 / wanted.sensitivity, facecolor=SHADE, edgecolor=GREY, linewidth=0.8)
-        )
-        nyquist.plot([-1.0], [0.0], "+", color=INK, markersize=9)
-        for colour, point in zip(view_colours(len(tuned.points)), tuned.points, strict=True):
-            pid: Pid = tuned.pid
-            make = orientation_loop if name == "angle" else position_loop
-            L = break_at(response(make(model, pid, point.q_m), w), 0)
-            label = " ".join(f"{1e3 * q:.1f}" for q in point.q_m)
-            gain.plot(f, 20.0 * np.log10(np.maximum(np.abs(L), 1e-12)), color=colour, label=label)
-            phase.plot(f, np.degrees(np.unwrap(np.angle(L))), color=colour)
-            nyquist.plot(L.real, L.imag, color=colour, linewidth=1.2)
-        for axes in (gain, phase):
-            axes.set_xscale("log")
-            axes.set_xlim(0.02, f[-1])
-            axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-        gain.axhline(0.0, color=INK, linewidth=0.8)
-        gain.set_ylim(-50.0, 40.0)
-        gain.legend(loc="lower left", ncols=2, title="q1 q2 at rest (mm)", fontsize=9, title_fontsize=9)
-        _grid(gain, "frequency (Hz)", "gain (dB)", f"Loop of the {name}")
-        phase.axhline(-180.0, color=INK, linewidth=0.8)
-        phase.set_ylim(-400.0, 20.0)
-        _grid(phase, "frequency (Hz)", "phase (deg)", f"Phase, loop of the {name}")
-        nyquist.set_aspect("equal", adjustable="box")
-        nyquist.set_xlim(-2.2, 1.2)
-        nyquist.set_ylim(-1.3, 1.0)
-        _grid(nyquist, "real part", "imaginary part", f"Nyquist, loop of the {name}")
-    return figure
+    gain: list[Mark] = [Rule("y", 0.0, "ink")]
+    phase: list[Mark] = [Rule("y", -180.0, "ink")]
+    minus_one = Curve(np.array([-1.0]), np.zeros(1), kind="pluses", colour="ink", size=9.0)
+    nyquist: list[Mark] = [Shape(circle(-1.0, 0.0, 1.0 / sensitivity), "shade", "grey"), minus_one]
+    for hue, point in zip(spaced(len(tuned.points)).tolist(), tuned.points, strict=True):
+        L = break_at(response(loop_of(model, tuned.pid, point.q_m), w), 0)
+        label = " ".join(f"{1e3 * q:.1f}" for q in point.q_m)
+        gain.append(Curve(f, 20.0 * np.log10(np.maximum(np.abs(L), 1e-12)), label, colour=hue))
+        phase.append(Curve(f, np.degrees(np.unwrap(np.angle(L))), colour=hue))
+        nyquist.append(Curve(L.real, L.imag, colour=hue))
+    x, title, limits = "frequency (Hz)", f"loop of the {name}", (0.02, float(f[-1]))
+    gains = Plot(x, "gain (dB)", tuple(gain), title.capitalize(), limits, (-50.0, 40.0), log="x")
+    phases = Plot(x, "phase (deg)", tuple(phase), f"Phase, {title}", limits, (-400.0, 20.0), log="x")
+    x, y, limits = "real part", "imaginary part", (-2.2, 1.2)
+    around = Plot(x, y, tuple(nyquist), f"Nyquist, {title}", limits, (-1.3, 1.0), equal=True)
+    legend = "q1 q2 at rest (mm)"
+    return replace(gains, legend="lower left", legend_title=legend), phases, around
 
 
-def write_check_figures(
-    folder: Path, model: Model, reference: Reference, found: Following, slower: Reference | None = None
-) -> list[Path]:
-    """Draw what the pumps reach and how far they follow a reference; the files written.
-
-    Raises `BadInputError` where the folder or a file cannot be written.
-    """
-    figure_folder(folder)
-    with look():
-        return [save(_check(model, reference, found, slower), folder / "control_check.png")]
-
-
-def _reachable(axes: Axes, model: Model) -> None:
-    plant = model.plant
-    phi_most, l_most = 1.1 * largest_angle(model), longest_m(model)
-    phi = np.linspace(-phi_most, phi_most, 161)
-    rest = plant.rest_length_m
-    span = l_most - rest
-    l = np.linspace(rest - 0.1 * span, l_most + 0.05 * span, 121)  # noqa: E741  the source's symbol
-    turned = plant.bellows_radius_m * phi[None, :]
-    q = np.stack([l[:, None] + turned, l[:, None] - turned], axis=-1)
-    F = holding_force(plant, q)
-    spare = np.minimum(F, largest_force_N(model) - F).min(axis=-1)
-    axes.contourf(phi, 1e3 * l, spare, levels=[0.0, np.inf], colors=["#d8e9f4"])
-    axes.contour(phi, 1e3 * l, spare, levels=[0.0], colors=[BLUE], linewidths=1.2)
-
-
-def _check(model: Model, reference: Reference, found: Following, slower: Reference | None) -> Figure:
-    if found.possible:
-        note = "The pumps can follow it."
-    else:
-        note = f"The pumps cannot follow it from {found.at_s:.2f} s on: {plain(found.reason)}."
+def check_plots(
+    model: Model, reference: Reference, following: Following, slower: Reference | None = None
+) -> dict[str, Figure]:
+    """`control_check`: what the pumps reach, and how far they follow a reference."""
+    note = "The pumps can follow it."
+    if not following.possible:
+        note = f"The pumps cannot follow it from {following.at_s:.2f} s on: {following.reason}."
         if slower is not None:
             note += f" Slowed down to {slower.duration_s:.2f} s they can."
-    verdict = "ok" if found.possible else "poor"
-    figure = sheet(6.6, f"Can the pumps follow {plain(reference.name, 50)}?", note, verdict)
-    (place, force), (head, missing) = figure.subplots(2, 2)
-    r, t = model.plant.bellows_radius_m, reference.t_s
-    _reachable(place, model)
-    for one, colour, style in ((slower, ORANGE, "--"), (reference, INK, "-")):
+    t, r = reference.t_s, model.plant.bellows_radius_m
+    place, head = [_reachable(model)], []
+    for one, hue, kind in ((slower, "orange", "dashed"), (reference, "ink", "line")):
         if one is not None:
-            place.plot(angle(one.q_m, r), 1e3 * length(one.q_m), color=colour, linestyle=style, linewidth=1.4)
-            p = forward(one.q_m, r)
-            head.plot(1e3 * p[:, 0], 1e3 * p[:, 1], color=colour, linestyle=style, linewidth=1.4)
-    _grid(place, "angle (rad)", "length (mm)", "Blue: what the pumps can hold; line: reference")
-    head.invert_yaxis()
-    head.set_aspect("equal", adjustable="datalim")
-    _grid(head, "x (mm)", "y (mm)", "Head, as the camera sees it")
-    most = float(found.given_N.max())
-    for i, colour in ((0, BLUE), (1, VERMILLION)):
-        force.plot(t, found.wanted_N[:, i], color=colour, linewidth=1.2, label=f"wanted, bellows {i + 1}")
-        force.plot(t, found.given_N[:, i], color=colour, linewidth=1.6, linestyle=":")
-        missing.plot(t, 1e3 * found.missing_m[:, i], color=colour, linewidth=1.4)
-    force.set_ylim(-0.25 * max(most, 0.2), 1.45 * max(most, 0.2))
-    _grid(force, "time (s)", "force (N)", "Dotted: the nearest that the pumps can give")
-    force.legend(loc="upper right", handlelength=1.4)
-    if found.at_s is not None:
-        missing.axvline(found.at_s, color=GREY, linewidth=1.2, linestyle="--")
-    _grid(missing, "time (s)", "missing (mm)", "Lengths that are missing")
-    return figure
+            p = 1e3 * forward(one.q_m, r)
+            place.append(Curve(angle(one.q_m, r), 1e3 * length(one.q_m), "", kind, hue, 1.4))
+            head.append(Curve(p[:, 0], p[:, 1], "", kind, hue, 1.4))
+    force: list[Mark] = []
+    missing: list[Mark] = []
+    for i, hue in enumerate(("blue", "red")):
+        force.append(Curve(t, following.wanted_N[:, i], f"wanted, bellows {i + 1}", colour=hue, size=1.2))
+        force.append(Curve(t, following.given_N[:, i], "", "dotted", hue, 1.6))
+        missing.append(Curve(t, 1e3 * following.missing_m[:, i], colour=hue, size=1.4))
+    if following.at_s is not None:
+        missing.append(Rule("x", following.at_s, kind="dashed"))
+    most = max(float(following.given_N.max()), 0.2)
+    above = "Dotted: the nearest that the pumps can give"
+    panels = (
+        Plot("angle (rad)", "length (mm)", tuple(place), "Blue: what the pumps can hold; line: reference"),
+        _over_time("force (N)", force, above, (-0.25 * most, 1.45 * most)),
+        Plot("x (mm)", "y (mm)", tuple(head), "Head, as the camera sees it", equal=True, down=True),
+        _over_time("missing (mm)", missing, "Lengths that are missing"),
+    )
+    title = f"Can the pumps follow {short(reference.name, 50)}?"
+    verdict = "ok" if following.possible else "poor"
+    return {"control_check": Figure(title, note, panels, 6.6, verdict, columns=2)}
+
+
+def _reachable(model: Model) -> Mark:
+    """Where the pumps can hold the head, over its angle and the length in mm."""
+    plant, rest = model.plant, model.plant.rest_length_m
+    phi_most, l_most = 1.1 * largest_angle(model), longest_m(model)
+    phi = np.linspace(-phi_most, phi_most, 161)
+    l = np.linspace(rest - 0.1 * (l_most - rest), l_most + 0.05 * (l_most - rest), 121)  # noqa: E741  the source's symbol
+    turned = plant.bellows_radius_m * phi[None, :]
+    F = holding_force(plant, np.stack([l[:, None] + turned, l[:, None] - turned], axis=-1))
+    spare = np.minimum(F, largest_force_N(model) - F).min(axis=-1)
+    levels = np.array([0.0, spare.max()])
+    # One light shade.
+    return Field(phi, 1e3 * l, spare, levels=levels, outlined=levels[:1], scale=(0.0, 3.0 * levels[1]))
