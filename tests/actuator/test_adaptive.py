@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from adaptive import Method, simulate_adaptive, swing_adaptive
 from calib.core.arrays import FloatArray
 from calib.stages.actuator import dynamics as dyn
-from calib.stages.actuator.adaptive import Method, simulate_adaptive, swing_adaptive
 from calib.stages.actuator.parameters import Plant, pumps_connected
 from calib.stages.actuator.pump import Pump, RateLimit, delayed, static_force_N
 from calib.stages.actuator.simulate import state_row

@@ -16,12 +16,12 @@ import sympy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from adaptive import simulate_adaptive, swing_adaptive
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.stages.actuator import dynamics as dyn
 from calib.stages.actuator import kinematics as kin
 from calib.stages.actuator import simulate as kernel
-from calib.stages.actuator.adaptive import simulate_adaptive, swing_adaptive
 from calib.stages.actuator.dynamics import coefficients, rates
 from calib.stages.actuator.parameters import (
     Plant,

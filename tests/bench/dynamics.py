@@ -27,12 +27,12 @@ import numpy as np
 import sympy
 from scipy.integrate import solve_ivp
 
-sys.path[:0] = [str(Path(__file__).resolve().parents[2]), str(Path(__file__).resolve().parent)]
+sys.path[:0] = [str(Path(__file__).resolve().parents[n]) for n in (2, 1, 0)]
 
 from _rows import Row, interleaved, print_rows
 
+from adaptive import simulate_adaptive, swing_adaptive
 from calib.core.arrays import FloatArray
-from calib.stages.actuator.adaptive import simulate_adaptive, swing_adaptive
 from calib.stages.actuator.dynamics import coefficients
 from calib.stages.actuator.parameters import Plant, Stiffness, free_swing, pumps_connected
 from calib.stages.actuator.pump import Orifice, Pump, delayed, pump_coefficients, static_force_N

@@ -155,13 +155,6 @@ def configuration(q_m: FloatArray, bellows_radius_m: float) -> FloatArray:
     return np.stack([angle(q_m, bellows_radius_m) / ell, ell], axis=-1)
 
 
-def bellows_from_configuration(k: FloatArray, bellows_radius_m: float) -> FloatArray:
-    """Lengths of the bellows (..., 2) [m] of curvature and length (..., 2), the inverse of (3.3)."""
-    kappa, ell = _parts(k, 2, "configuration")
-    half = bellows_radius_m * kappa * ell
-    return np.stack([ell + half, ell - half], axis=-1)
-
-
 def pose_from_configuration(k: FloatArray) -> FloatArray:
     """Head (..., 3) [m, m, rad] of curvature and length (..., 2) (3.6), exact at zero curvature."""
     kappa, ell = _parts(k, 2, "configuration")

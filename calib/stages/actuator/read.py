@@ -359,10 +359,6 @@ def states_beside(path: Path) -> Path | None:
     return None
 
 
-def _whitening(by: FloatArray, sigma: FloatArray) -> FloatArray:
-    return np.asarray(by / sigma[..., None])
-
-
 def _from_pictures(log: Log, rig: Rig, rig_path: Path) -> tuple[Head, float]:
     rows = log.sampled("u_px", "v_px")
     if not len(rows):

@@ -84,23 +84,6 @@ def canonical_turn(points: FloatArray, colours: FloatArray, columns: int, rows: 
     return max(turns, key=rightward)
 
 
-def orderings(pixels: FloatArray, columns: int, rows: int) -> tuple[FloatArray, ...]:
-    """The same corners in every order that a board of this shape allows, the given one first.
-
-    Parameters
-    ----------
-    pixels : (columns * rows, 2), row by row.
-
-    Returns
-    -------
-    The order after no and half a turn, or for square boards after 0, 1, 2, 3 quarter turns; each
-    (columns * rows, 2) and none mirrored.
-    """
-    grid = pixels.reshape(rows, columns, 2)
-    turns = range(4) if columns == rows else (0, 2)
-    return tuple(np.ascontiguousarray(np.rot90(grid, turn)).reshape(-1, 2) for turn in turns)
-
-
 # ----------------------------------------------------------------------
 # Is a refined grid a whole checkerboard? What a texture, or a part of a larger board, gets wrong.
 

@@ -83,18 +83,6 @@ def inclination_error(estimate: FloatArray, truth: FloatArray) -> FloatArray:
     return np.asarray(2.0 * np.arctan2(np.hypot(x, y), np.hypot(w, z)))
 
 
-def heading_error(estimate: FloatArray, truth: FloatArray) -> FloatArray:
-    """Turn (n,) [rad] about the vertical, 0 to pi."""
-    w, _, _, z = _error(estimate, truth).T
-    return np.asarray(2.0 * np.arctan2(z, w))
-
-
-def total_error(estimate: FloatArray, truth: FloatArray) -> FloatArray:
-    """Angle (n,) [rad] of the whole turn between the two, 0 to pi."""
-    w, x, y, z = _error(estimate, truth).T
-    return np.asarray(2.0 * np.arctan2(np.sqrt(x * x + y * y + z * z), w))
-
-
 def rms_in_motion(error_rad: FloatArray, moving: BoolArray) -> float:
     """Root mean square of the errors (n,) where it moves and the truth is known, NaN for none."""
     counted = error_rad[moving & np.isfinite(error_rad)]
