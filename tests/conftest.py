@@ -25,6 +25,36 @@ def pytest_runtest_makereport() -> Generator[None, Any, Any]:
     return report
 
 
+SMOKE = (
+    "core",
+    "solve",
+    "camera/test_lens.py",
+    "actuator/test_kinematics.py",
+    "io/test_logs.py",
+    "lowpass",
+    "firmware/test_constants.py",
+)
+"""A part of every floor of the house, for the inner loop: `pytest -m smoke`."""
+
+
+def _is_smoke(path: Path) -> bool:
+    return any(path.is_relative_to(ROOT / "tests" / part) for part in SMOKE)
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """With `-m smoke` the other files are not even read, which alone takes longer."""
+    if config.getoption("markexpr") == "smoke" and collection_path.name.startswith("test_"):
+        return None if _is_smoke(collection_path) else True
+    return None
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what the inner loop runs."""
+    for item in items:
+        if _is_smoke(item.path) and not item.get_closest_marker("slow"):
+            item.add_marker(pytest.mark.smoke)
+
+
 @pytest.fixture(scope="session")
 def project_root() -> Path:
     """The checkout under test."""
