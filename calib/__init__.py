@@ -25,11 +25,11 @@ _CLASSES = {
     "Finding": "calib.core.verdict",
 }
 """Names of the front door that are no verbs, and where they are."""
-_VERBS = ("intrinsics", "extrinsics", "distortion", "lowpass")
+_VERBS = ("intrinsics", "extrinsics", "distortion", "lowpass", "align")
 _GROUPS: dict[str, tuple[str, ...]] = {}
 """Verbs of two words: `calib.imu.static` is `calib imu static`."""
 
-__all__ = ["Finding", "Rig", "Verdict", "distortion", "extrinsics", "intrinsics", "lowpass"]
+__all__ = ["Finding", "Rig", "Verdict", "align", "distortion", "extrinsics", "intrinsics", "lowpass"]
 
 
 def __getattr__(name: str) -> Any:

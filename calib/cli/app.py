@@ -7,7 +7,6 @@ import sys
 import typer
 
 from calib import __version__
-from calib.cli.align import align
 from calib.cli.camera import board, export_camera, import_camera
 from calib.cli.common import telling
 from calib.cli.control import control
@@ -60,7 +59,7 @@ app.command("extrinsics")(verb(stage("extrinsics")))
 app.command("distortion")(verb(stage("distortion")))
 app.command("lowpass")(verb(stage("lowpass")))
 app.add_typer(imu, name="imu")
-app.command("align")(telling(align))
+app.command("align")(telling(verb(stage("align"))))
 app.command("replay")(telling(replay))
 app.add_typer(identify, name="identify")
 app.add_typer(control, name="control")

@@ -25,6 +25,7 @@ STAGES = {
     "extrinsics": "calib.stages.camera.stage",
     "distortion": "calib.stages.camera.stage",
     "lowpass": "calib.stages.lowpass.stage",
+    "align": "calib.stages.align.stage",
 }
 """Module of each stage by the words of its verb; the last word is its name there."""
 

@@ -29,7 +29,7 @@ def plots(fit: Alignment, verdict: str = "ok") -> dict[str, Figure]:
 
 def _residuals(fit: Alignment, log: int, verdict: str) -> Figure:
     """Residuals of one log with the sensors as assumed beforehand and as estimated."""
-    title = f"Residuals: {short(fit.logs[log].source, 78)}"
+    title = f"Residuals: {short(fit.logs[log].name, 78)}"
     note = (
         "Measured minus predicted by the fitted motion. Orange: with the time offset and the scales assumed "
         "beforehand, without mount angle and biases. Blue: with those estimated. Red crosses: pictures taken "

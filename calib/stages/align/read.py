@@ -1,25 +1,20 @@
-"""From logs and a rig.yaml to an alignment, and to the section `align`."""
+"""Readings of logs and what is known beforehand, for an alignment."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
-from calib.core.files import shown
-from calib.core.result import finite_or_none
 from calib.core.rig import Geometry, Rig
 from calib.io.logs import Log, check_time, read_log
-from calib.stages.align.section import Align, AlignCovariance, AlignLogCheck
-from calib.stages.align.solve import AlignJudgement, AlignLog, Alignment, LogCheck, Settings, rest_angle
+from calib.stages.align.solve import AlignLog, Settings
 from calib.stages.estimator.noise import grid_px
-from calib.stages.estimator.sensors import SENSOR, sensor_values, view_coefficients
+from calib.stages.estimator.sensors import sensor_values, view_coefficients
 
 PRIOR: dict[str, tuple[float, float]] = {
     "gyro_bias_radps": (0.0, 0.1),
@@ -44,10 +39,6 @@ _LEAST_SCALE = 5e-4
 _FASTEST_RADPS = 45.0
 _ABOUT_G = (4.0, 25.0)
 _IN_G = (0.85, 1.15)
-_DOUBT = {True: 0.02, False: 0.1}
-"""Probability that the marker is not where its drawing says: with one written down, and without."""
-_ELSEWHERE_M = 3e-3
-_MARKER = SENSOR.index("marker_offset_m")
 
 
 def _column(log: Log, name: str) -> FloatArray:
@@ -137,16 +128,13 @@ def _prior(rig: Rig) -> dict[str, tuple[float, float]]:
 def settings_from_rig(
     rig: Rig, path: Path, logs: Sequence[AlignLog], marker_offset_m: float | None = None
 ) -> Settings:
-    """What is known beforehand, from the rig's file.
+    """What is known beforehand, from the rig's file, which has a camera and a plane.
 
-    Raises `BadInputError` without a camera or a plane.
+    Raises `BadInputError` for a plane of another camera.
     """
-    source = shown(path)
-    if rig.camera is None:
-        raise BadInputError(f"{source}: has no camera, which an alignment needs; run calib intrinsics first")
-    plane = rig.current_plane(str(path))
-    if plane is None:
-        raise BadInputError(f"{source}: has no plane, which an alignment needs; run calib extrinsics first")
+    plane = rig.current_plane(path)
+    assert rig.camera is not None
+    assert plane is not None
     x0, y0, x1, y1 = (rig.geometry or Geometry()).workspace_m
     view = view_coefficients(
         rig.camera.optics,
@@ -171,109 +159,4 @@ def settings_from_rig(
         sensor_values({name: sigma for name, (_, sigma) in values.items()}),
         grid_px(pixels),
         **walks,
-    )
-
-
-def with_drawn_marker(found: Alignment, geometry: Geometry) -> tuple[Alignment, list[str]]:
-    """An alignment with what the rig's drawing says of the marker's offset d, and a sentence on that.
-
-    Along the straight actuator d and the length are one number. Logs part them only by the angle between
-    chord and tangent, to some tenths of a millimetre, since the scales of gyroscope and accelerometer take
-    the same share of it. So the drawing counts as one more reading of d, of two kinds: right to its
-    deviation, or, with the probability `_DOUBT`, off by about `_ELSEWHERE_M`. Each kind is weighed by how
-    well the logs bear it, and mean and covariance are those of the mixture: the further apart drawing and
-    logs are, the larger is sigma, until the logs alone are left.
-    """
-    written = "marker_offset_m" in geometry.model_fields_set
-    drawn, sigma = geometry.marker_offset_m, geometry.marker_offset_sigma_m
-    value, by = float(found.sensor[_MARKER]), found.covariance[_MARKER]
-    doubt, away = _DOUBT[written], drawn - value
-    sums = by[_MARKER] + np.array([sigma, math.hypot(sigma, _ELSEWHERE_M)]) ** 2
-    likely = np.array([1.0 - doubt, doubt]) * np.exp(-0.5 * away * away / sums) / np.sqrt(sums)
-    weight = likely / likely.sum()
-    # Both kinds move all quantities along their covariance with d, by these amounts of d per variance.
-    pulls = away / sums
-    pull = float(weight @ pulls)
-    spread = float(weight @ (1.0 / sums) - weight @ (pulls - pull) ** 2)
-    sensor = found.sensor + by * pull
-    covariance = found.covariance - spread * np.outer(by, by)
-    angle, gradient = rest_angle(sensor)
-    mixed = replace(
-        found,
-        sensor=sensor,
-        covariance=covariance,
-        rest_angle_rad=angle,
-        rest_angle_sigma=math.sqrt(float(gradient @ covariance @ gradient)),
-    )
-    both = (
-        f"the marker's offset d: {_mm(drawn, sigma)} as drawn (geometry.marker_offset_m), "
-        f"{_mm(value, math.sqrt(float(by[_MARKER])))} by the logs alone, "
-        f"{_mm(float(sensor[_MARKER]), math.sqrt(float(covariance[_MARKER, _MARKER])))} together"
-    )
-    if weight[0] < 0.5:
-        return mixed, [f"{both}; drawing and logs contradict each other, and the logs are believed"]
-    if not written:
-        both += "; lengths err as much as it does, so measure it and write it down: nobody has for this rig"
-    return mixed, [both]
-
-
-def _mm(value_m: float, sigma_m: float) -> str:
-    return f"{1e3 * value_m:.2f} +- {1e3 * sigma_m:.2f} mm"
-
-
-def _log_check(log: LogCheck) -> AlignLogCheck:
-    return AlignLogCheck(
-        name=log.source,
-        duration_s=log.duration_s,
-        stretches=log.stretches,
-        pictures=log.pictures,
-        outliers=log.outliers,
-        samples=log.samples,
-        camera_rate_hz=finite_or_none(log.camera_rate_hz),
-        imu_rate_hz=finite_or_none(log.imu_rate_hz),
-        camera_jitter_s=finite_or_none(log.camera_jitter_s),
-        imu_jitter_s=finite_or_none(log.imu_jitter_s),
-        repeated_stamps=log.repeated,
-        missing=log.missing,
-        turned_rad=log.turned_rad,
-        camera_rms_px=finite_or_none(log.camera_rms_px),
-        gyro_rms_radps=finite_or_none(log.gyro_rms_radps),
-        accel_rms_mps2=finite_or_none(log.accel_rms_mps2),
-    )
-
-
-def align_section(found: Alignment, judgement: AlignJudgement) -> Align:
-    """The `align` section of an alignment."""
-    value = dict(zip(SENSOR, found.sensor.tolist(), strict=True))
-    sigma = dict(zip(SENSOR, found.sigma.tolist(), strict=True))
-    single = (
-        "time_offset_s", "mount_angle_rad", "gyro_scale", "gyro_bias_radps", "imu_lever_m", "marker_offset_m",
-    )  # fmt: skip
-    pairs = {
-        "accel_bias_mps2": ("accel_bias_x_mps2", "accel_bias_y_mps2"),
-        "accel_scale": ("accel_scale_x", "accel_scale_y"),
-        "plane_shift_m": ("shift_x_m", "shift_y_m"),
-    }
-    values: dict[str, Any] = {name: value[name] for name in single}
-    values |= {key: [value[name] for name in names] for key, names in pairs.items()}
-    sigmas: dict[str, float | list[float] | None] = {name: sigma[name] for name in single}
-    sigmas |= {key: [sigma[name] for name in names] for key, names in pairs.items()}
-    sigmas |= {"rest_angle_rad": found.rest_angle_sigma, "plane_stretch": sigma["stretch"]}
-    noise = found.noise
-    return Align(
-        **values,
-        rest_angle_rad=found.rest_angle_rad,
-        plane_stretch=value["stretch"],
-        sigma=sigmas,
-        prior_sigma=dict(zip(SENSOR, found.prior.tolist(), strict=True)),
-        covariance=AlignCovariance(order=list(SENSOR), values=found.covariance.tolist()),
-        jitter_px=noise.jitter_px,
-        outlier_share=noise.share,
-        accel_noise_mps2=noise.imu[:2].tolist(),
-        gyro_noise_radps=float(noise.imu[2]),
-        logs=[_log_check(log) for log in found.logs],
-        verdict=judgement.verdict,
-        reasons=judgement.reasons,
-        remarks=judgement.remarks,
-        advice=judgement.advice,
     )

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from calib.core.result import Count, CovarianceTable, NotNegative, Number, Pair, Section
+from calib.core.result import Count, CovarianceTable, NotNegative, Number, Pair, Result, Section, quantity
 
 Angle = Annotated[float, Field(ge=-7.0, le=7.0, allow_inf_nan=False, strict=True)]
 Seconds = Annotated[float, Field(ge=-10.0, le=10.0, allow_inf_nan=False, strict=True)]
@@ -15,6 +15,21 @@ Metres = Annotated[float, Field(ge=-1.0, le=1.0, allow_inf_nan=False, strict=Tru
 Share = Annotated[float, Field(gt=-1.0, le=10.0, allow_inf_nan=False, strict=True)]
 SharePair = Annotated[list[Share], Field(min_length=2, max_length=2)]
 MetresPair = Annotated[list[Metres], Field(min_length=2, max_length=2)]
+
+
+SENSORS_OF = {
+    "time_offset_s": ("time_offset_s",),
+    "mount_angle_rad": ("mount_angle_rad",),
+    "gyro_scale": ("gyro_scale",),
+    "gyro_bias_radps": ("gyro_bias_radps",),
+    "accel_bias_mps2": ("accel_bias_x_mps2", "accel_bias_y_mps2"),
+    "accel_scale": ("accel_scale_x", "accel_scale_y"),
+    "imu_lever_m": ("imu_lever_m",),
+    "marker_offset_m": ("marker_offset_m",),
+    "plane_shift_m": ("shift_x_m", "shift_y_m"),
+    "plane_stretch": ("stretch",),
+}
+"""Keys of the section and the quantities of `calib.stages.estimator.sensors.SENSOR` that they hold."""
 
 
 class AlignCovariance(CovarianceTable):
@@ -31,29 +46,32 @@ class AlignCovariance(CovarianceTable):
         return self
 
 
-class AlignLogCheck(Section):
-    """A log's part: readings that were used, clocks, and residuals; see
-    `calib.stages.align.solve.LogCheck`."""
+class LogCheck(Section):
+    """A log's part in the fit: the IMU's samples and the pictures that were used, clocks and residuals.
 
-    name: str
-    duration_s: NotNegative
+    `outliers` are pictures that more likely show something else than the marker, `turned_rad` is the
+    standard deviation of phi over the log.
+    """
+
+    name: str = quantity(label="log")
+    duration_s: NotNegative = quantity(label="duration", digits=2)
     stretches: Count
-    pictures: Count
-    outliers: Count
-    samples: Count
+    pictures: Count = quantity(label="pictures")
+    outliers: Count = quantity(label="outliers")
+    samples: Count = quantity(label="IMU samples")
     camera_rate_hz: NotNegative | None = None
     imu_rate_hz: NotNegative | None = None
-    camera_jitter_s: NotNegative | None = None
-    imu_jitter_s: NotNegative | None = None
+    camera_jitter_s: NotNegative | None = quantity(None, label="camera's jitter", show="ms", digits=2)
+    imu_jitter_s: NotNegative | None = quantity(None, label="IMU's jitter", show="ms", digits=2)
     repeated_stamps: Count = 0
     missing: Count = 0
-    turned_rad: NotNegative = 0.0
-    camera_rms_px: NotNegative | None = None
+    turned_rad: NotNegative = quantity(0.0, label="phi RMS", show="deg", digits=3)
+    camera_rms_px: NotNegative | None = quantity(None, label="pictures RMS", digits=2)
     gyro_rms_radps: NotNegative | None = None
     accel_rms_mps2: NotNegative | None = None
 
 
-class Align(Section):
+class Align(Result):
     """Camera and IMU in line.
 
     Attributes
@@ -67,29 +85,26 @@ class Align(Section):
     sigma : standard deviations by key. prior_sigma : what was known beforehand, by `covariance.order`.
     covariance : of all of them; the marginal deviations of values that are hardly told apart are large while
         their combination is known.
-    jitter_px, outlier_share, accel_noise_mps2, gyro_noise_radps : noise of single readings.
+    jitter_px, outlier_share, accel_noise_mps2, gyro_noise_radps : noise of single readings; the tracker's
+        jitter before pixels are rounded.
     """
 
-    time_offset_s: Seconds
-    mount_angle_rad: Angle
-    rest_angle_rad: Angle
-    gyro_scale: Share
-    gyro_bias_radps: Number
-    accel_bias_mps2: Pair
-    accel_scale: SharePair
-    imu_lever_m: Metres
-    marker_offset_m: Metres
-    plane_shift_m: MetresPair
-    plane_stretch: Share
+    time_offset_s: Seconds = quantity(label="time offset of pictures", show="ms")
+    mount_angle_rad: Angle = quantity(label="mount angle", show="deg")
+    rest_angle_rad: Angle = quantity(label="angle read at rest at phi = 0", show="deg")
+    gyro_scale: Share = quantity(label="gyro scale error", show="%")
+    gyro_bias_radps: Number = quantity(label="gyro bias", show="deg/s")
+    accel_bias_mps2: Pair = quantity(label="accel bias")
+    accel_scale: SharePair = quantity(label="accel scale error", show="%")
+    imu_lever_m: Metres = quantity(label="IMU along the head", show="mm")
+    marker_offset_m: Metres = quantity(label="marker offset d", show="mm")
+    plane_shift_m: MetresPair = quantity(label="shift of the plane", show="mm")
+    plane_stretch: Share = quantity(label="stretch of the plane", show="%")
     sigma: dict[str, NotNegative | list[NotNegative] | None] = {}
     prior_sigma: dict[str, NotNegative] = {}
     covariance: AlignCovariance | None = None
-    jitter_px: NotNegative
-    outlier_share: NotNegative
-    accel_noise_mps2: Pair
-    gyro_noise_radps: NotNegative
-    logs: list[AlignLogCheck] = []
-    verdict: Literal["ok", "poor", "unidentifiable"]
-    reasons: list[str] = []
-    remarks: list[str] = []
-    advice: list[str] = []
+    jitter_px: NotNegative = quantity(label="tracker's jitter", digits=2)
+    outlier_share: NotNegative = quantity(label="outliers", show="%", digits=2)
+    accel_noise_mps2: Pair = quantity(label="accel noise", digits=4)
+    gyro_noise_radps: NotNegative = quantity(label="gyro noise", digits=4)
+    logs: list[LogCheck] = quantity([], label="log")

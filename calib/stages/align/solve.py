@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal
 
 import numpy as np
 from numba import njit
@@ -14,7 +13,11 @@ from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_bande
 
 from calib.core.arrays import BoolArray, FloatArray
 from calib.core.errors import BadInputError
+from calib.core.result import finite_or_none
+from calib.core.rig import Geometry
+from calib.core.verdict import Finding, Verdict
 from calib.solve.clock import TimeAxis, time_axis
+from calib.stages.align.section import LogCheck
 from calib.stages.align.spline import (
     BAND,
     Knots,
@@ -332,6 +335,8 @@ _TIMES_FELT = 20.0
 _RESTING = (1e-3, 3e-4)
 _LEAST_CREEP_M = 1e-4
 _UNFELT_MPS2 = 0.1
+_MISFIT = 1e-3
+"""Share of the power that readings of a right-handed accelerometer miss by; biases of 0.3 m/s^2 give 5e-4."""
 
 
 @dataclass(frozen=True)
@@ -656,6 +661,35 @@ def _mount(stretches: Sequence[Stretch]) -> float:
     return middle + float(np.median((whole - middle + math.pi) % (2.0 * math.pi) - math.pi))
 
 
+def check_accelerometer(
+    stretches: Sequence[Stretch], source: str, sensor: FloatArray, gravity_mps2: float, across_m: float
+) -> None:
+    """Refuse an accelerometer whose axes are mirrored, which no mount angle explains.
+
+    With p = x + i y of the predicted specific force and r of the readings, the least sum of |r - e^(ia) p|^2
+    over all mount angles a is sum |r|^2 + sum |p|^2 - 2 |sum r p*|; for axes that are swapped or of which one
+    has the wrong sign p* stands for p.
+
+    Parameters
+    ----------
+    sensor : (13,) of `SENSOR` with the mount angle 0.
+    """
+    power, straight, mirrored = 0.0, 0j, 0j
+    for stretch in stretches:
+        rows = imu_rows(gravity_mps2, across_m, stretch.knots, stretch.start, sensor, stretch.imu_s)
+        p, r = (values[:, 0] + 1j * values[:, 1] for values in (rows.predicted, stretch.readings))
+        p, r = p[np.isfinite(r)], r[np.isfinite(r)]
+        power += float((np.abs(p) ** 2 + np.abs(r) ** 2).sum())
+        straight, mirrored = straight + complex(r @ p.conj()), mirrored + complex(r @ p)
+    off, off_mirrored = power - 2.0 * abs(straight), power - 2.0 * abs(mirrored)
+    if off > _MISFIT * power and off_mirrored < 0.5 * off:
+        raise BadInputError(
+            f"{source}: ax_mps2 and ay_mps2 turn the other way round than the camera sees, so they are "
+            "swapped or one has the wrong sign, expected a right-handed IMU, its x axis from the head to the "
+            "base"
+        )
+
+
 def start(pieces: Sequence[Piece], logs: Sequence[AlignLog], usual_offset_s: float) -> Started:
     """First guess of all that the fit needs.
 
@@ -875,37 +909,6 @@ class Settings:
 
 
 @dataclass(frozen=True)
-class LogCheck:
-    """A log's part in the fit.
-
-    Attributes
-    ----------
-    pictures, outliers : used, and those that more likely show something else.
-    samples, duration_s, stretches : of the IMU.
-    camera_rate_hz, imu_rate_hz, camera_jitter_s, imu_jitter_s, repeated, missing : of the clocks.
-    turned_rad : standard deviation of phi over the log.
-    camera_rms_px, gyro_rms_radps, accel_rms_mps2 : residuals.
-    """
-
-    source: str
-    pictures: int
-    outliers: int
-    samples: int
-    duration_s: float
-    stretches: int
-    camera_rate_hz: float
-    imu_rate_hz: float
-    camera_jitter_s: float
-    imu_jitter_s: float
-    repeated: int
-    missing: int
-    turned_rad: float
-    camera_rms_px: float
-    gyro_rms_radps: float
-    accel_rms_mps2: float
-
-
-@dataclass(frozen=True)
 class Trace:
     """Residuals of a stretch for figures, with the first guess of the sensors and with the fit.
 
@@ -935,6 +938,7 @@ class Alignment:
     rest_angle_rad, rest_angle_sigma : what the accelerometer reads at phi = 0 at rest.
     noise, converged, steps : of the fit. moves : the first guess could see the offset. factor : of the
         gyroscope against the camera.
+    left_out : sentences on gaps and logs that were not used.
     """
 
     sensor: FloatArray
@@ -951,7 +955,7 @@ class Alignment:
     logs: tuple[LogCheck, ...]
     traces: tuple[Trace, ...]
     correlation: Correlation
-    said: tuple[str, ...]
+    left_out: tuple[str, ...]
 
     @property
     def sigma(self) -> FloatArray:
@@ -1024,22 +1028,22 @@ def _check(
         return 1.0 / value if invert else value
 
     return LogCheck(
-        source=log.source,
+        name=log.source,
         pictures=len(good),
         outliers=int((good < 0.5).sum()),
         samples=len(imu),
         duration_s=sum(float(stretches[i].imu_s[-1] - stretches[i].imu_s[0]) for i in own),
         stretches=len(own),
-        camera_rate_hz=middle([piece.camera.period_s for piece in mine], True),
-        imu_rate_hz=middle([piece.imu.period_s for piece in mine], True),
-        camera_jitter_s=middle([piece.camera.jitter_s for piece in mine]),
-        imu_jitter_s=middle([piece.imu.jitter_s for piece in mine]),
-        repeated=sum(piece.camera.repeated + piece.imu.repeated for piece in mine),
+        camera_rate_hz=finite_or_none(middle([piece.camera.period_s for piece in mine], True)),
+        imu_rate_hz=finite_or_none(middle([piece.imu.period_s for piece in mine], True)),
+        camera_jitter_s=finite_or_none(middle([piece.camera.jitter_s for piece in mine])),
+        imu_jitter_s=finite_or_none(middle([piece.imu.jitter_s for piece in mine])),
+        repeated_stamps=sum(piece.camera.repeated + piece.imu.repeated for piece in mine),
         missing=sum(piece.camera.missing + piece.imu.missing for piece in mine),
         turned_rad=float(np.std(np.concatenate(phi))) if phi else 0.0,
-        camera_rms_px=_rms(np.concatenate(pictures)) if pictures else math.nan,
-        gyro_rms_radps=_rms(imu[:, 2]),
-        accel_rms_mps2=_rms(imu[:, :2]),
+        camera_rms_px=finite_or_none(_rms(np.concatenate(pictures))) if pictures else None,
+        gyro_rms_radps=finite_or_none(_rms(imu[:, 2])),
+        accel_rms_mps2=finite_or_none(_rms(imu[:, :2])),
     )
 
 
@@ -1058,6 +1062,11 @@ def align(logs: Sequence[AlignLog], settings: Settings) -> Alignment:
             "expected pictures of the marker on the head"
         )
     mean = settings.mean.copy()
+    mean[_MOUNT] = 0.0
+    if first.moves:
+        check_accelerometer(
+            first.stretches, logs[pieces[0].log].source, mean, settings.gravity_mps2, settings.across_m
+        )
     mean[_MOUNT] = first.mount_angle_rad
     problem = Problem(
         settings.view, settings.gravity_mps2, settings.across_m, settings.grid_px, _OUTLIER_AREA_PX2,
@@ -1119,53 +1128,37 @@ _SWING = "a log of a free swing, let go at 20 degrees, shows the time offset wit
 _TILT = "slow motion to large angles both ways tells the mount angle from the accelerometer's bias"
 
 
-@dataclass
-class AlignJudgement:
-    """Verdict ok, poor or unidentifiable, with sentences."""
-
-    verdict: Literal["ok", "poor", "unidentifiable"] = "ok"
-    reasons: list[str] = field(default_factory=list)
-    remarks: list[str] = field(default_factory=list)
-    advice: list[str] = field(default_factory=list)
-
-    def lower(self, to: Literal["poor", "unidentifiable"], reason: str) -> None:
-        """A reason why the verdict is not better."""
-        if self.verdict != "unidentifiable":
-            self.verdict = to
-        self.reasons.append(reason)
-
-
-def _data(found: Alignment, out: AlignJudgement) -> None:
+def _data(found: Alignment) -> Iterator[Finding]:
     pictures = sum(log.pictures for log in found.logs)
     outliers = sum(log.outliers for log in found.logs)
     share = outliers / max(pictures, 1)
     if share > _OUTLIERS[0]:
-        out.lower(
+        yield Finding(
             "unidentifiable" if share > _OUTLIERS[1] else "poor",
             f"{100.0 * share:.0f} % of {pictures} pictures show something else than the marker",
         )
     duration = sum(log.duration_s for log in found.logs)
     if duration < _SHORT_S:
-        out.lower(
+        yield Finding(
             "poor", f"the logs are too short: {duration:.2g} s together, expected {_SHORT_S:g} s or more"
         )
     if not found.converged:
-        out.lower("poor", f"the fit has not converged after {found.steps} steps")
+        yield Finding("poor", f"the fit has not converged after {found.steps} steps")
     if found.noise.jitter_px > _JITTER_PX:
-        out.lower(
+        yield Finding(
             "poor",
             f"pictures miss the fit by {found.noise.jitter_px:.2g} px; camera, plane or constant curvature "
             "do not hold",
         )
     turned = max((log.turned_rad for log in found.logs), default=0.0)
     if turned > _TURNED_RAD and abs(found.factor - 1.0) > _FACTOR:
-        out.lower(
+        yield Finding(
             "unidentifiable" if abs(found.factor - 1.0) > _NO_FACTOR else "poor",
             f"the camera sees {found.factor:.2g} times the turn that the gyroscope feels",
         )
 
 
-def _known(found: Alignment, out: AlignJudgement) -> None:
+def _known(found: Alignment) -> Iterator[Finding]:
     sigma = found.sigma
     offset = float(sigma[SENSOR.index("time_offset_s")])
     if offset > _OFFSET_S[0]:
@@ -1174,13 +1167,13 @@ def _known(found: Alignment, out: AlignJudgement) -> None:
         if turned < _TURNED_RAD:
             why = f": the logs hardly move (phi by {math.degrees(turned):.2g} degrees)"
         words = "is not observable, its deviation is" if offset > _OFFSET_S[1] else "has a deviation of"
-        out.lower(
+        yield Finding(
             "unidentifiable" if offset > _OFFSET_S[1] else "poor",
             f"the time offset {words} {1e3 * offset:.2g} ms, expected 1 ms{why}",
+            _SWING,
         )
-        out.advice.append(_SWING)
     if found.rest_angle_sigma > _REST_RAD:
-        out.lower(
+        yield Finding(
             "poor",
             f"the angle read at rest is known to {math.degrees(found.rest_angle_sigma):.2g} degrees, "
             "expected 0.1 degrees",
@@ -1188,7 +1181,8 @@ def _known(found: Alignment, out: AlignJudgement) -> None:
     for k, name in enumerate(SENSOR):
         away = abs(found.sensor[k] - found.mean[k]) / found.prior[k]
         if away > _BEYOND_PRIOR:
-            out.lower("poor", f"{NAMES[name]} came out as {found.sensor[k]:.3g}, which is not to be expected")
+            text = f"{NAMES[name]} came out as {found.sensor[k]:.3g}, which is not to be expected"
+            yield Finding("poor", text)
 
 
 def _groups(tied: BoolArray) -> list[list[int]]:
@@ -1205,41 +1199,93 @@ def _groups(tied: BoolArray) -> list[list[int]]:
     return groups
 
 
-def _separable(found: Alignment, out: AlignJudgement) -> None:
+def _separable(found: Alignment) -> Iterator[Finding]:
     sigma = found.sigma
     R = found.covariance / sigma / sigma[:, None]
     mount, bias = SENSOR.index("mount_angle_rad"), SENSOR.index("accel_bias_y_mps2")
     unlearnt = [k for k in range(len(SENSOR)) if sigma[k] > _NOTHING_LEARNT * found.prior[k]]
     if sigma[mount] > 2.0 * found.rest_angle_sigma or R[mount, bias] < -_INSEPARABLE:
-        out.remarks.append(
+        yield Finding(
+            "remark",
             "the mount angle and the accelerometer's bias along y are nearly one number "
             f"(correlation {R[mount, bias]:.3f}): together, as the angle read at rest at phi = 0, they are "
             f"{math.degrees(found.rest_angle_rad):.3f} +- {math.degrees(found.rest_angle_sigma):.3f} deg, "
             f"the mount angle alone {math.degrees(found.sensor[mount]):.2f} +- "
-            f"{math.degrees(sigma[mount]):.2f} deg"
+            f"{math.degrees(sigma[mount]):.2f} deg",
+            _TILT if sigma[mount] > _REST_RAD else "",
         )
-        if sigma[mount] > _REST_RAD:
-            out.advice.append(_TILT)
     for group in _groups(np.abs(R) > _INSEPARABLE):
         if set(group) != {mount, bias}:
             words = [NAMES[SENSOR[k]] for k in group]
-            out.remarks.append(
+            yield Finding(
+                "remark",
                 f"hardly told apart from each other: {', '.join(words[:-1])} and {words[-1]}; what they do "
-                "together is known much better than each, see the covariance"
+                "together is known much better than each, see the covariance",
             )
     if unlearnt:
-        out.remarks.append(
-            "the logs say next to nothing of " + ", ".join(NAMES[SENSOR[k]] for k in unlearnt)
-            + ": as assumed beforehand"
-        )  # fmt: skip
+        names = ", ".join(NAMES[SENSOR[k]] for k in unlearnt)
+        yield Finding("remark", f"the logs say next to nothing of {names}: as assumed beforehand")
 
 
-def judge_align(found: Alignment) -> AlignJudgement:
-    """Verdict on an alignment."""
-    out = AlignJudgement()
-    _data(found, out)
-    _known(found, out)
-    _separable(found, out)
+def judge(found: Alignment) -> Verdict:
+    """Verdict on an alignment by its logs alone."""
+    findings = [*_data(found), *_known(found), *_separable(found)]
     if not np.isfinite(found.covariance).all():
-        out.lower("unidentifiable", "the covariance is not finite")
-    return out
+        findings.append(Finding("unidentifiable", "the covariance is not finite"))
+    return Verdict.of([*findings, *(Finding("remark", text) for text in found.left_out)])
+
+
+# ----------------------------------------------------------------------
+# The marker's offset by the rig's drawing.
+
+_DOUBT = {True: 0.02, False: 0.1}
+"""Probability that the marker is not where its drawing says: with one written down, and without."""
+_ELSEWHERE_M = 3e-3
+_MARKER = SENSOR.index("marker_offset_m")
+
+
+def with_drawn_marker(found: Alignment, geometry: Geometry) -> tuple[Alignment, Finding]:
+    """An alignment with what the rig's drawing says of the marker's offset d, and a remark on that.
+
+    Along the straight actuator d and the length are one number. Logs part them only by the angle between
+    chord and tangent, to some tenths of a millimetre, since the scales of gyroscope and accelerometer take
+    the same share of it. So the drawing counts as one more reading of d, of two kinds: right to its
+    deviation, or, with the probability `_DOUBT`, off by about `_ELSEWHERE_M`. Each kind is weighed by how
+    well the logs bear it, and mean and covariance are those of the mixture: the further apart drawing and
+    logs are, the larger is sigma, until the logs alone are left.
+    """
+    written = "marker_offset_m" in geometry.model_fields_set
+    drawn, sigma = geometry.marker_offset_m, geometry.marker_offset_sigma_m
+    value, by = float(found.sensor[_MARKER]), found.covariance[_MARKER]
+    doubt, away = _DOUBT[written], drawn - value
+    sums = by[_MARKER] + np.array([sigma, math.hypot(sigma, _ELSEWHERE_M)]) ** 2
+    likely = np.array([1.0 - doubt, doubt]) * np.exp(-0.5 * away * away / sums) / np.sqrt(sums)
+    weight = likely / likely.sum()
+    # Both kinds move all quantities along their covariance with d, by these amounts of d per variance.
+    pulls = away / sums
+    pull = float(weight @ pulls)
+    spread = float(weight @ (1.0 / sums) - weight @ (pulls - pull) ** 2)
+    sensor = found.sensor + by * pull
+    covariance = found.covariance - spread * np.outer(by, by)
+    angle, gradient = rest_angle(sensor)
+    mixed = replace(
+        found,
+        sensor=sensor,
+        covariance=covariance,
+        rest_angle_rad=angle,
+        rest_angle_sigma=math.sqrt(float(gradient @ covariance @ gradient)),
+    )
+    both = (
+        f"the marker's offset d: {_mm(drawn, sigma)} as drawn (geometry.marker_offset_m), "
+        f"{_mm(value, math.sqrt(float(by[_MARKER])))} by the logs alone, "
+        f"{_mm(float(sensor[_MARKER]), math.sqrt(float(covariance[_MARKER, _MARKER])))} together"
+    )
+    if weight[0] < 0.5:
+        both += "; drawing and logs contradict each other, and the logs are believed"
+    elif not written:
+        both += "; lengths err as much as it does, so measure it and write it down: nobody has for this rig"
+    return mixed, Finding("remark", both)
+
+
+def _mm(value_m: float, sigma_m: float) -> str:
+    return f"{1e3 * value_m:.2f} +- {1e3 * sigma_m:.2f} mm"

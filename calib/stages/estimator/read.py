@@ -19,7 +19,7 @@ from calib.io.logs import Log, iter_log
 from calib.stages.actuator.parameters import Creep, Plant, Stiffness, pumps_connected
 from calib.stages.actuator.pump import ElongationForce, Orifice, Pump, RateLimit
 from calib.stages.actuator.section import Actuator, PumpSection, section_of
-from calib.stages.align.section import Align, AlignCovariance
+from calib.stages.align.section import SENSORS_OF, Align, AlignCovariance
 from calib.stages.estimator.baseline import BaselineSetup, undistorting_nothing
 from calib.stages.estimator.driven import PARAMETER, Drive
 from calib.stages.estimator.kinematic import LEVELS, Kinematic, Level, Rows, Setup, Start
@@ -191,7 +191,7 @@ def _from_align(rig: Rig) -> tuple[dict[str, tuple[float, float]], FloatArray | 
         return values, None, said
     found = _named_values(align)
     sigmas = {name: values[name][1] for name in SENSOR}
-    for key, names in _ALIGNED.items():
+    for key, names in SENSORS_OF.items():
         deviations = align.sigma.get(key)
         for k, name in enumerate(names):
             one = deviations[k] if isinstance(deviations, list) and k < len(deviations) else deviations
@@ -199,24 +199,10 @@ def _from_align(rig: Rig) -> tuple[dict[str, tuple[float, float]], FloatArray | 
                 sigmas[name] = max(one, 1e-9)
     values = {name: (found[name], sigmas[name]) for name in SENSOR}
     covariance = None if align.covariance is None else _covariance(align.covariance, sigmas)
-    if align.verdict != "ok":
-        said.append(f"the alignment's own verdict is {align.verdict}")
+    if not align.verdict.ok:
+        said.append(f"the alignment's own verdict is {align.verdict.word}")
     return values, covariance, said
 
-
-_ALIGNED = {
-    "gyro_bias_radps": ("gyro_bias_radps",),
-    "accel_bias_mps2": ("accel_bias_x_mps2", "accel_bias_y_mps2"),
-    "mount_angle_rad": ("mount_angle_rad",),
-    "gyro_scale": ("gyro_scale",),
-    "imu_lever_m": ("imu_lever_m",),
-    "marker_offset_m": ("marker_offset_m",),
-    "time_offset_s": ("time_offset_s",),
-    "plane_shift_m": ("shift_x_m", "shift_y_m"),
-    "plane_stretch": ("stretch",),
-    "accel_scale": ("accel_scale_x", "accel_scale_y"),
-}
-"""Keys of the section `align` and the quantities of `sensors.SENSOR` that they hold."""
 
 _BETWEEN_LOGS = {"gyro_bias_radps": 1e-4, "accel_bias_x_mps2": 1e-3, "accel_bias_y_mps2": 1e-3}
 """How far biases walk between the logs of the alignment and another one."""
@@ -224,7 +210,7 @@ _BETWEEN_LOGS = {"gyro_bias_radps": 1e-4, "accel_bias_x_mps2": 1e-3, "accel_bias
 
 def _named_values(align: Align) -> dict[str, float]:
     out: dict[str, float] = {}
-    for key, names in _ALIGNED.items():
+    for key, names in SENSORS_OF.items():
         value = getattr(align, key)
         out |= dict(zip(names, value if isinstance(value, list) else [value], strict=True))
     return out

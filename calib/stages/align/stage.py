@@ -1,0 +1,126 @@
+"""Camera and IMU in line: time offset, mount angle, scales and biases from logs in motion."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from calib.core.errors import BadInputError
+from calib.core.stage import Files, Stage, option
+from calib.core.units import parse_length_m
+
+if TYPE_CHECKING:
+    from calib.core.plot import Figure
+    from calib.core.rig import Geometry, Rig
+    from calib.stages.align.section import Align
+    from calib.stages.align.solve import AlignLog, Settings
+
+
+@dataclass(frozen=True)
+class AlignOptions:
+    """What a person has measured."""
+
+    marker_offset_m: float | None = option(
+        None,
+        "Marker beyond the head, such as 15mm, measured to 1 mm.",
+        flag="marker-offset",
+        metavar="LENGTH",
+        parse=lambda text: parse_length_m(text, "--marker-offset"),
+    )
+
+
+@dataclass(frozen=True)
+class AlignInputs:
+    """Readings, what is known beforehand, and the drawing of the marker; None where it was measured."""
+
+    logs: Sequence[AlignLog]
+    settings: Settings
+    drawn: Geometry | None
+
+
+def _read(files: Files, rig: Rig, options: AlignOptions) -> AlignInputs:
+    from calib.core.rig import Geometry
+    from calib.stages.align.read import read_align_log, settings_from_rig
+
+    rig.current_plane(files.rig_path)
+    assert rig.camera is not None
+    width, height = rig.camera.image_size_px
+    logs: list[AlignLog] = []
+    remarks: list[str] = []
+    for path in files.paths:
+        log, sentences = read_align_log(path, (width, height))
+        remarks += sentences
+        if log is not None:
+            logs.append(replace(log, source=files.taken(path)))
+    if not logs:
+        raise BadInputError(remarks[-1])
+    for sentence in remarks:
+        files.narrate(sentence)
+    settings = settings_from_rig(rig, files.rig_path, logs, options.marker_offset_m)
+    drawn = None if options.marker_offset_m is not None else rig.geometry or Geometry()
+    return AlignInputs(logs, settings, drawn)
+
+
+def _solve(inputs: AlignInputs) -> Align:
+    """Fit, judge by the logs alone, weigh the drawing in, and assemble the section."""
+    import numpy as np
+
+    from calib.core.result import finite_or_none, judged
+    from calib.core.verdict import Verdict
+    from calib.stages.align.section import SENSORS_OF, Align, AlignCovariance
+    from calib.stages.align.solve import align as fit
+    from calib.stages.align.solve import judge, with_drawn_marker
+    from calib.stages.estimator.sensors import SENSOR
+
+    found = fit(inputs.logs, inputs.settings)
+    verdict = judge(found)
+    if inputs.drawn is not None:
+        found, remark = with_drawn_marker(found, inputs.drawn)
+        verdict = Verdict.of([*verdict.findings, remark])
+
+    def by_key(values: Mapping[str, Any]) -> dict[str, Any]:
+        listed = {key: [values[name] for name in names] for key, names in SENSORS_OF.items()}
+        return {key: some if len(some) > 1 else some[0] for key, some in listed.items()}
+
+    sigma = dict(zip(SENSOR, map(finite_or_none, found.sigma.tolist()), strict=True))
+    bounded = bool(np.isfinite(found.covariance).all())
+    return Align(
+        **by_key(dict(zip(SENSOR, found.sensor.tolist(), strict=True))),
+        rest_angle_rad=found.rest_angle_rad,
+        sigma=by_key(sigma) | {"rest_angle_rad": finite_or_none(found.rest_angle_sigma)},
+        prior_sigma=dict(zip(SENSOR, found.prior.tolist(), strict=True)),
+        covariance=AlignCovariance(order=list(SENSOR), values=found.covariance.tolist()) if bounded else None,
+        jitter_px=found.noise.jitter_px,
+        outlier_share=found.noise.share,
+        accel_noise_mps2=found.noise.imu[:2].tolist(),
+        gyro_noise_radps=float(found.noise.imu[2]),
+        logs=list(found.logs),
+        **judged(verdict),
+    ).with_evidence(found)
+
+
+def _plots(result: Align) -> dict[str, Figure]:
+    from calib.stages.align.plots import plots
+
+    return plots(result.evidence, result.verdict.word)
+
+
+align = Stage(
+    "align",
+    "Camera and IMU together",
+    """Find time offset, mount angle, scales and biases between camera and IMU from logs in motion.
+
+    A free swing shows the time offset, slow motion to large angles all the rest. Writes the section align
+    of the rig's file. Exits 1 when the verdict is not ok.
+    """,
+    _read,
+    _solve,
+    AlignOptions,
+    sources="Logs of the rig in motion, static ones as well.",
+    metavar="LOG...",
+    writes=("align",),
+    needs=("camera", "plane"),
+    uses=("geometry", "imu", "imu_intrinsics"),
+    plots=_plots,
+)
