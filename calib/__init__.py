@@ -25,24 +25,29 @@ _CLASSES = {
     "Finding": "calib.core.verdict",
 }
 """Names of the front door that are no verbs, and where they are."""
-_VERBS = ("intrinsics", "extrinsics", "distortion", "lowpass", "align")
-_GROUPS: dict[str, tuple[str, ...]] = {}
-"""Verbs of two words: `calib.imu.static` is `calib imu static`."""
 
-__all__ = ["Finding", "Rig", "Verdict", "align", "distortion", "extrinsics", "intrinsics", "lowpass"]
+__all__ = [
+    "Finding",
+    "Rig",
+    "Verdict",
+    "align",
+    "control",
+    "distortion",
+    "extrinsics",
+    "intrinsics",
+    "lowpass",
+]
 
 
 def __getattr__(name: str) -> Any:
     if name in _CLASSES:
         value: Any = getattr(importlib.import_module(_CLASSES[name]), name)
-    elif name in _VERBS:
-        from calib.stages import function
+    elif name in __all__:
+        from calib.stages import STAGES, function
 
-        value = function(name)
-    elif name in _GROUPS:
-        from calib.stages import function
-
-        value = SimpleNamespace(**{word: function(f"{name} {word}") for word in _GROUPS[name]})
+        # Verbs of two words: `calib.imu.static` is `calib imu static`.
+        group = {one.split()[-1]: function(one) for one in STAGES if one.startswith(f"{name} ")}
+        value = SimpleNamespace(**group) if group else function(name)
     else:
         raise AttributeError(f"module 'calib' has no attribute {name!r}")
     globals()[name] = value

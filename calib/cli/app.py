@@ -9,7 +9,6 @@ import typer
 from calib import __version__
 from calib.cli.camera import board, export_camera, import_camera
 from calib.cli.common import telling
-from calib.cli.control import control
 from calib.cli.convert import convert
 from calib.cli.diff import diff
 from calib.cli.docs import docs
@@ -25,7 +24,7 @@ from calib.cli.run import run
 from calib.cli.simulate import simulate
 from calib.cli.sweep import sweep
 from calib.cli.validate import validate
-from calib.cli.verbs import verb
+from calib.cli.verbs import group, verb
 from calib.stages import stage
 
 app = typer.Typer(
@@ -62,7 +61,9 @@ app.add_typer(imu, name="imu")
 app.command("align")(telling(verb(stage("align"))))
 app.command("replay")(telling(replay))
 app.add_typer(identify, name="identify")
-app.add_typer(control, name="control")
+app.add_typer(
+    group("control", "Try controllers on the identified model before the hardware."), name="control"
+)
 app.command("validate")(telling(validate))
 app.command("firmware")(firmware)
 app.command("fleet")(telling(fleet))

@@ -13,6 +13,7 @@ import typer
 from calib.cli.common import FiguresOption, JsonOption, RigOption, document, narrate, progress_bar, say
 from calib.core.errors import EXIT_POOR
 from calib.core.stage import Files, Stage, options_of
+from calib.stages import STAGES, stage
 
 
 def verb(stage: Stage) -> Callable[..., None]:
@@ -25,8 +26,8 @@ def verb(stage: Stage) -> Callable[..., None]:
         options = options_of(
             stage.options, {name: values[name] for name in flags if values[name] is not None}
         )
-        files = Files(paths, rig_path=values["rig"], narrate=narrate, progress=progress_bar)
-        _run(stage, files, options, values["figures"], values["as_json"])
+        files = Files(paths, values["rig"], values.get("output"), narrate, progress_bar)
+        _run(stage, files, options, values.get("figures"), values["as_json"])
 
     command.__name__ = stage.name.split()[-1]
     command.__doc__ = stage.summary
@@ -51,16 +52,29 @@ def _parameters(stage: Stage) -> list[inspect.Parameter]:
     for one in fields(stage.options):
         meta, default = one.metadata, None if one.default is MISSING else one.default
         # What has a parser is typed with its unit, and has its default in the help's words.
-        shape = str | None if meta["parse"] is not None else hints[one.name]
+        shape = str | None if meta["parse"] is not None else _several(hints[one.name])
         name = "--" + (meta["flag"] or one.name.replace("_", "-"))
-        switch = typer.Option(name, help=meta["words"], metavar=meta["metavar"] or None)
+        switch = typer.Option(name, help=meta["words"], metavar=meta["metavar"] or None, min=meta["least"])
         default = None if meta["parse"] is not None else default
         out.append(inspect.Parameter(one.name, kind, default=default, annotation=Annotated[shape, switch]))
+    if stage.output is not None:
+        made = stage.output
+        switch = typer.Option(*made.flags, help=made.words, metavar=made.metavar or None)
+        shape = Path if made.default is not None else Path | None
+        out.append(
+            inspect.Parameter("output", kind, default=made.default, annotation=Annotated[shape, switch])
+        )
     if stage.plots is not None:
         out.append(inspect.Parameter("figures", kind, default=None, annotation=FiguresOption))
     out.append(inspect.Parameter("rig", kind, default=Path("rig.yaml"), annotation=RigOption))
     out.append(inspect.Parameter("as_json", kind, default=False, annotation=JsonOption))
     return out
+
+
+def _several(hint: Any) -> Any:
+    """A type as typer takes it: what may be repeated is a list there."""
+    words = tuple[str, ...]
+    return list[str] if hint == words else list[str] | None if hint == words | None else hint
 
 
 def _run(stage: Stage, files: Files, options: Any, figures: Path | None, as_json: bool) -> None:
@@ -71,6 +85,8 @@ def _run(stage: Stage, files: Files, options: Any, figures: Path | None, as_json
 
     if stage.writes:
         check_writable(files.rig_path)
+    if stage.output is not None and files.output is not None:
+        (check_folder if stage.output.folder else check_writable)(files.output)
     if figures is not None:
         check_folder(figures)
     before = read_rig(files.rig_path)
@@ -83,6 +99,9 @@ def _run(stage: Stage, files: Files, options: Any, figures: Path | None, as_json
             before.model_copy(update=sections),
             {name: one.inputs for name, one in sections.items()},
         )
+    if stage.output is not None and files.output is not None:
+        for sentence in stage.output.write(files.output, outcome):
+            narrate(sentence)
     if figures is not None and stage.plots is not None:
         from calib.show.draw import write_figures
 
@@ -103,3 +122,12 @@ def _run(stage: Stage, files: Files, options: Any, figures: Path | None, as_json
         narrate(sentence)
     if not stage.verdict(outcome).ok:
         raise typer.Exit(EXIT_POOR)
+
+
+def group(name: str, words: str) -> typer.Typer:
+    """The verbs of two words that begin with this one."""
+    made = typer.Typer(name=name, help=words, no_args_is_help=True)
+    for one in STAGES:
+        if one.startswith(f"{name} "):
+            made.command(one.split()[-1])(verb(stage(one)))
+    return made

@@ -29,6 +29,10 @@ class ProgressCall(Protocol):
     def __call__(self, done: int, total: int) -> None: ...
 
 
+Progress = Callable[[str], AbstractContextManager[ProgressCall]]
+"""Opens a bar with a label, which is advanced by what it yields."""
+
+
 @contextmanager
 def _silent(label: str) -> Iterator[ProgressCall]:
     del label
@@ -52,7 +56,7 @@ class Files:
     rig_path: Path = Path("rig.yaml")
     output: Path | None = None
     narrate: Callable[[str], None] = lambda sentence: None
-    progress: Callable[[str], AbstractContextManager[ProgressCall]] = _silent
+    progress: Progress = _silent
     hashes: dict[str, str] = field(default_factory=dict)
 
     def taken(self, path: Path) -> str:
@@ -67,7 +71,13 @@ class Files:
 
 
 def option(
-    default: Any, words: str, *, flag: str = "", metavar: str = "", parse: Callable[[str], Any] | None = None
+    default: Any,
+    words: str,
+    *,
+    flag: str = "",
+    metavar: str = "",
+    parse: Callable[[str], Any] | None = None,
+    least: int | None = None,
 ) -> Any:
     """A field of a stage's options.
 
@@ -75,8 +85,29 @@ def option(
     ----------
     words : help for the command line and the manual. flag : its name there, where it is not the field's.
     parse : reads text with a unit into SI; a value that is no text is taken as it is.
+    least : smallest value of a number.
     """
-    return field(default=default, metadata={"words": words, "flag": flag, "metavar": metavar, "parse": parse})
+    meta = {"words": words, "flag": flag, "metavar": metavar, "parse": parse, "least": least}
+    return field(default=default, metadata=meta)
+
+
+@dataclass(frozen=True)
+class Output:
+    """A file or folder that a verb writes beside rig.yaml.
+
+    Attributes
+    ----------
+    words : help. flags, metavar : on the command line. default : written even where it is not asked for.
+    write : writes an outcome there; sentences about what was written.
+    folder : whether it is a folder.
+    """
+
+    words: str
+    write: Callable[[Path, Any], Sequence[str]]
+    flags: tuple[str, ...] = ("-o", "--output")
+    metavar: str = ""
+    default: Path | None = None
+    folder: bool = False
 
 
 @dataclass(frozen=True)
@@ -124,6 +155,7 @@ class Stage:
         be many. optional : whether there may be none.
     writes : sections of rig.yaml. needs : those without which it cannot run. uses : those that it reads
         where they are.
+    output : what the verb writes beside rig.yaml.
     document : what --json prints beside the sections. words : blocks in front of the sections' own.
     plots : figures by the names of their files, without drawing them.
     remarks : sentences about the rig as it is after the stage.
@@ -142,6 +174,7 @@ class Stage:
     writes: tuple[str, ...] = ()
     needs: tuple[str, ...] = ()
     uses: tuple[str, ...] = ()
+    output: Output | None = None
     document: Callable[[Any], dict[str, Any]] = _no_evidence
     words: Callable[[Any], Sequence[Block]] | None = None
     plots: Callable[[Any], dict[str, Figure]] | None = None

@@ -110,6 +110,17 @@ def parse_image_size(text: str, what: str = "--image-size") -> tuple[int, int]:
     return width, height
 
 
+def parse_pwm_limits(text: str, what: str = "--pwm-limits") -> tuple[float, float]:
+    """Two PWM values from '0,255'."""
+    try:
+        low, high = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise UsageError(f"{what}: {text!r} is not two numbers, expected for instance 0,255") from error
+    if not (math.isfinite(low) and math.isfinite(high)):
+        raise UsageError(f"{what}: {text!r} is not two finite numbers, expected for instance 0,255")
+    return low, high
+
+
 def parse_region_px(text: str, what: str = "--region") -> tuple[float, float, float, float]:
     """A box in pixels from 'u0,v0,u1,v1', left before right and upper before lower."""
     try:

@@ -126,7 +126,7 @@ def number(value: float | None, sigma: float | None = None, places: int | None =
 
 def described(result: BaseModel) -> list[Block]:
     """A result as tables and sentences: its quantities, its lists of parts, its verdict."""
-    blocks = list(_parts(result, ""))
+    blocks = list(_parts(result))
     if isinstance(result, Result):
         blocks += of_verdict(result.verdict)
     return blocks
@@ -142,18 +142,39 @@ def of_verdict(verdict: Verdict) -> list[Line]:
     ]
 
 
-def _parts(section: BaseModel, prefix: str) -> Iterator[Block]:
-    scalars: list[tuple[str, ...]] = []
-    vectors: list[tuple[str, ...]] = []
+Rows = list[tuple[str, ...]]
+
+
+def _parts(section: BaseModel) -> Iterator[Block]:
+    """Numbers in a table, x y z in another, then lists and long texts."""
+    scalars, vectors, later = _gathered(section, "")
+    if scalars:
+        bars = any(row[2] for row in scalars)
+        head: tuple[str, ...] = ("", "value", "sigma") if bars else ("", "value")
+        yield Table(head, tuple(row if bars else row[:2] for row in scalars))
+    if vectors:
+        longest = max(len(row) for row in vectors)
+        head = ("", *_AXES[: longest - 1])
+        yield Table(head, tuple((*row, *("",) * (longest - len(row))) for row in vectors))
+    yield from later
+
+
+def _gathered(section: BaseModel, prefix: str) -> tuple[Rows, Rows, list[Block]]:
+    """Rows of numbers and of vectors, and what stands by itself, of a section and its parts."""
+    scalars: Rows = []
+    vectors: Rows = []
     later: list[Block] = []
     sigmas = getattr(section, "sigma", None)
     for key, field, value in _labelled(section):
         label = f"{prefix}{field.title}"
         if isinstance(value, BaseModel):
-            later += _parts(value, f"{label} ")
+            inner = _gathered(value, f"{label} ")
+            scalars += inner[0]
+            vectors += inner[1]
+            later += inner[2]
             scalars += _unlabelled(value, sigmas, f"{label} ")
         elif isinstance(value, Mapping) and value and isinstance(next(iter(value.values())), BaseModel):
-            later.append(_listed(label, value))
+            later.append(listed(label, value))
         elif isinstance(value, Mapping):
             unit, scale, places = _shown(key, field)
             for name, one in value.items():
@@ -162,7 +183,7 @@ def _parts(section: BaseModel, prefix: str) -> Iterator[Block]:
                 cell = one if isinstance(one, str) else number(_scaled(one, scale), None, places)
                 scalars.append((_with_unit(f"{label} {_as_words(name)}", own), cell, ""))
         elif isinstance(value, list) and value and isinstance(value[0], BaseModel):
-            later.append(_listed(label, {str(i): one for i, one in enumerate(value)}, numbered=False))
+            later.append(listed(label, value))
         elif isinstance(value, list) and all(isinstance(one, int) for one in value):
             unit, _, _ = _shown(key, field)
             scalars.append((_with_unit(label, unit), " x ".join(str(one) for one in value), ""))
@@ -188,15 +209,7 @@ def _parts(section: BaseModel, prefix: str) -> Iterator[Block]:
             wide = _scaled(sigma, scale)
             bar = "not bounded" if unbounded else "" if wide is None else number(wide, wide)
             scalars.append((_with_unit(label, unit), number(_scaled(value, scale), wide, places), bar))
-    if scalars:
-        bars = any(row[2] for row in scalars)
-        head: tuple[str, ...] = ("", "value", "sigma") if bars else ("", "value")
-        yield Table(head, tuple(row if bars else row[:2] for row in scalars))
-    if vectors:
-        longest = max(len(row) for row in vectors)
-        head = ("", *_AXES[: longest - 1])
-        yield Table(head, tuple((*row, *("",) * (longest - len(row))) for row in vectors))
-    yield from later
+    return scalars, vectors, later
 
 
 def _unlabelled(part: BaseModel, sigmas: Any, prefix: str) -> Iterator[tuple[str, str, str]]:
@@ -259,17 +272,18 @@ def _vector(values: Sequence[Any], sigma: Any, scale: float, places: int | None)
     return out
 
 
-def _listed(label: str, parts: Mapping[str, Any], numbered: bool = True) -> Table:
-    """Parts of one kind as a table, a row for each."""
+def listed(label: str, parts: Mapping[str, Any] | Sequence[Any]) -> Table:
+    """Parts of one kind as a table, a row for each, with their names in front where they have some."""
+    named = parts if isinstance(parts, Mapping) else {str(i): one for i, one in enumerate(parts)}
     columns: dict[str, FieldInfo] = {}
-    for one in parts.values():
+    for one in named.values():
         columns |= {
             key: field for key, field, value in _labelled(one) if not isinstance(value, BaseModel | Mapping)
         }
     head = [_with_unit(str(field.title), _shown(key, field)[0]) for key, field in columns.items()]
     rows = []
-    for name, one in parts.items():
-        cells = [] if not numbered else [name]
+    for name, one in named.items():
+        cells = [name] if named is parts else []
         sigmas = getattr(one, "sigma", None)
         for key, field in columns.items():
             value = getattr(one, key)
@@ -285,7 +299,7 @@ def _listed(label: str, parts: Mapping[str, Any], numbered: bool = True) -> Tabl
             else:
                 cells.append(*_vector([value], [_sigma(sigmas, key)], scale, places))
         rows.append(tuple(cells))
-    return Table(((label, *head) if numbered else tuple(head)), tuple(rows), label)
+    return Table(((label, *head) if named is parts else tuple(head)), tuple(rows), label)
 
 
 def as_text(blocks: Sequence[Block]) -> list[str]:

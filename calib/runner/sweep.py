@@ -29,7 +29,7 @@ from calib.core.units import parse_duration_s
 from calib.runner.engine import LIMIT_S, Broken, Cluster, Lost, Overdue, Task, run_tasks
 from calib.runner.fleet import HIDDEN, Store, Table, column, texts, write_table
 from calib.runner.task import needed, program
-from calib.stages.control.stage import control_model, run_controller
+from calib.stages.control.trial import control_model, run_controller
 from calib.stages.control.tuning import Tracking
 from calib.twin.rig import SimulatedRig, rig_from_file
 
@@ -249,7 +249,7 @@ def _base(where: str, told: Mapping[str, Any], path: Path) -> Base:
 
 def _check_names(where: str, kind: str, name: str, other: str) -> None:
     from calib.stages.control.references import BUILT_IN
-    from calib.stages.control.stage import CONTROLLERS
+    from calib.stages.control.trial import CONTROLLERS
     from calib.twin.scenarios import SCENARIOS
 
     if kind == "controller":

@@ -26,6 +26,9 @@ STAGES = {
     "distortion": "calib.stages.camera.stage",
     "lowpass": "calib.stages.lowpass.stage",
     "align": "calib.stages.align.stage",
+    "control run": "calib.stages.control.stage",
+    "control check": "calib.stages.control.stage",
+    "control tune": "calib.stages.control.stage",
 }
 """Module of each stage by the words of its verb; the last word is its name there."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -28,8 +29,8 @@ def test_run_compares_controllers(calib: Run, tmp_path: Path) -> None:
 def test_tune_writes_the_section_that_run_then_uses(calib: Run, tmp_path: Path) -> None:
     ended = calib("control", "tune", "--figures", "drawn", cwd=tmp_path)
     assert ended.code == 0, ended.err
-    assert "orientation: Kp = 470 PWM/rad, Ki = 1000 PWM/rad/s" in ended.out
-    assert "orientation, PID 1000/1000/10" in ended.out and "unstable" in ended.out
+    assert re.search(r"orientation Kp, PWM/rad +470\n", ended.out)
+    assert "margins of the source's PID 1000/1000/10" in ended.out
     assert "verdict: ok" in ended.out
     text = (tmp_path / "rig.yaml").read_text()
     section = read_rig(tmp_path / "rig.yaml").controller
@@ -56,7 +57,7 @@ def test_check_names_the_first_second_and_writes_a_slower_one(calib: Run, tmp_pa
     (tmp_path / "fast.csv").write_text("\n".join(["t_s,x_m,y_m", *rows]) + "\n")
     ended = calib("control", "check", "fast.csv", "--slow", "slow.csv", "--figures", "f", cwd=tmp_path)
     assert ended.code == 1
-    assert "verdict: the pumps cannot follow it from 4.5" in ended.out
+    assert "verdict: poor\n  - the pumps cannot follow it from 4.5" in ended.out
     assert "bellows 2 would have to deflate at" in ended.out
     assert (tmp_path / "f" / "control_check.png").exists()
     ended = calib("control", "check", "slow.csv", "--json", cwd=tmp_path)
@@ -113,7 +114,7 @@ def test_references_that_cannot_be_used(
     [
         ("actuator: {lambda1_per_s: -0.1047, lambda2_N_per_m: -14.98, lambda3: -1.854}\n", "make the plant"),
         ("pump: {lag_s: 700}\n", "rig.yaml: pump.lag_s is 700, expected seconds between"),
-        ("controller: {pwm_low: 9.0}\n", "rig.yaml: controller.tick_s is missing"),
+        ("controller: {pwm_low: 9.0, verdict: ok}\n", "rig.yaml: controller.tick_s is missing"),
     ],
 )
 def test_rigs_that_cannot_be_controlled(

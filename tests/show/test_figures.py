@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from calib.core.plot import Arrows, Curve, Figure, Plot, Text, magnified, short
 from calib.core.verdict import Verdict, Word
 from calib.io.logs import Log, write_log
 from calib.show.draw import draw, plain
+from calib.stages import function, stage
 from calib.stages.camera.bundle import Calibration, calibrate, covariance, rotation_exp
 from calib.stages.camera.intrinsics import Intrinsics
 from calib.stages.camera.lens import PlaneView, analyse_distortion
@@ -261,6 +263,12 @@ def _low_pass(cutoff: float, order: int, family: str, folder: Path, still: bool 
     return lowpass_plots(made, solve_lowpass(Inputs(made, WORKSPACE, seen)), seen)
 
 
+def _control(verb: str, *sources: str, **options: Any) -> dict[str, Figure]:
+    plots = stage(f"control {verb}").plots
+    assert plots is not None
+    return plots(function(f"control {verb}")(*sources, **options))
+
+
 CASES: dict[str, Callable[[Path], dict[str, Figure]]] = {
     "camera: one view": lambda _: camera_plots(_one_view()),
     "camera: 400 views": lambda _: camera_plots(_many_views()),
@@ -297,6 +305,11 @@ CASES: dict[str, Callable[[Path], dict[str, Figure]]] = {
     "low-pass: fast Bessel": lambda folder: _low_pass(20.0, 4, "bessel", folder),
     "low-pass: slow critical": lambda folder: _low_pass(0.1, 3, "critical", folder),
     "low-pass: very slow": lambda folder: _low_pass(0.01, 2, "butterworth", folder),
+    "control: an angle run": lambda _: _control("run", "jump", feedback="truth"),
+    "control: lengths run": lambda _: _control("run", "ellipse", duration_s=4.0),
+    "control: a jump checked": lambda _: _control("check", "jump"),
+    "control: an ellipse checked": lambda _: _control("check", "ellipse", duration_s=8.0),
+    "control: tuned": lambda _: _control("tune"),
 }
 QUICK = (
     "camera: sigma not bounded",
@@ -305,6 +318,7 @@ QUICK = (
     "plane: 316x208",
     "plane: nothing of the workspace",
     "low-pass: order 1",
+    "control: a jump checked",
 )
 
 
@@ -331,6 +345,7 @@ def test_all_figures_are_legible(name: str, tmp_path: Path) -> None:
         ("plane: nothing of the workspace", "plane_difference", "No part of the workspace is in the picture"),
         ("plane: nothing of the workspace", "plane_sigma", "verdict: poor"),
         ("low-pass: still log", "lowpass_log", "v never changes"),
+        ("control: a jump checked", "control_check", "verdict: poor"),
     ],
 )
 def test_what_is_not_known_is_said(name: str, stem: str, words: str, tmp_path: Path) -> None:

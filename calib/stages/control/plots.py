@@ -27,7 +27,7 @@ from calib.stages.control.laws import Model, holding_force, largest_force_N
 from calib.stages.control.linear import System, break_at, frequencies, response
 from calib.stages.control.references import Reference
 from calib.stages.control.section import Controller
-from calib.stages.control.stage import Outcome
+from calib.stages.control.trial import Outcome
 from calib.stages.control.tuning import (
     Following,
     Tuned,
@@ -116,7 +116,7 @@ def tune_plots(model: Model, section: Controller, orientation: Tuned, position: 
     )
     panels = tuple(panel for row in zip(*loops, strict=True) for panel in row)
     title = "Open loops on the model: gain, phase and distance from -1"
-    return {"control_margins": Figure(title, note, panels, 7.6, section.verdict, columns=2)}
+    return {"control_margins": Figure(title, note, panels, 7.6, section.verdict.word, columns=2)}
 
 
 def _loop(

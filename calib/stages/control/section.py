@@ -17,7 +17,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from calib.core.result import Row3, Section
+from calib.core.result import Result, Row3, Section, quantity
 
 Number = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False, strict=True)]
 Positive = Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False, strict=True)]
@@ -30,28 +30,34 @@ Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
 class ControllerCriterion(Section):
     """Margins that the gains keep at every operating point."""
 
-    gain_margin: Annotated[float, Field(gt=1, lt=100, allow_inf_nan=False, strict=True)]
-    phase_margin_rad: Annotated[float, Field(gt=0, lt=1.5708, allow_inf_nan=False, strict=True)]
-    sensitivity: Annotated[float, Field(gt=1, lt=100, allow_inf_nan=False, strict=True)]
+    gain_margin: Annotated[float, Field(gt=1, lt=100, allow_inf_nan=False, strict=True)] = quantity(
+        label="gain margin"
+    )
+    phase_margin_rad: Annotated[float, Field(gt=0, lt=1.5708, allow_inf_nan=False, strict=True)] = quantity(
+        label="phase margin", show="deg", digits=1
+    )
+    sensitivity: Annotated[float, Field(gt=1, lt=100, allow_inf_nan=False, strict=True)] = quantity(
+        label="sensitivity"
+    )
 
 
 class OrientationGains(Section):
     """PID of the angle with back-calculation; `sign` is that of the error of bellows 1."""
 
-    Kp_pwm_per_rad: NotNegative
-    Ki_pwm_per_rad_s: NotNegative
-    Kd_pwm_s_per_rad: NotNegative
-    back_calculation_s: Positive
-    falling_share: NotNegative | None = None
+    Kp_pwm_per_rad: NotNegative = quantity(label="Kp")
+    Ki_pwm_per_rad_s: NotNegative = quantity(label="Ki")
+    Kd_pwm_s_per_rad: NotNegative = quantity(label="Kd")
+    back_calculation_s: Positive = quantity(label="back-calculation")
+    falling_share: NotNegative | None = quantity(None, label="share of the falling rate")
     sign: Literal[1, -1] = 1
 
 
 class PositionGains(Section):
     """PD of the lengths beside the feed-forward."""
 
-    Kp_pwm_per_m: NotNegative
-    Ki_pwm_per_m_s: NotNegative = 0.0
-    Kd_pwm_s_per_m: NotNegative
+    Kp_pwm_per_m: NotNegative = quantity(label="Kp")
+    Ki_pwm_per_m_s: NotNegative = quantity(0.0, label="Ki")
+    Kd_pwm_s_per_m: NotNegative = quantity(label="Kd")
 
 
 class StaticMap(Section):
@@ -83,40 +89,44 @@ class ComputedTorqueGains(Section):
 class ControllerMargins(Section):
     """Margins of a loop at a rest; null where nothing limits them."""
 
-    loop: Literal["orientation", "position"]
-    q_m: Pair
-    stable: bool
-    gain: NotNegative | None = None
-    phase_rad: NotNegative | None = None
-    delay_s: NotNegative | None = None
-    crossover_hz: NotNegative
-    sensitivity: Positive
+    loop: Literal["orientation", "position"] = quantity(label="loop")
+    q_m: Pair = quantity(label="q1 q2", show="mm", digits=1)
+    stable: bool = quantity(label="stable")
+    gain: NotNegative | None = quantity(None, label="gain margin", digits=2)
+    phase_rad: NotNegative | None = quantity(None, label="phase margin", show="deg", digits=1)
+    delay_s: NotNegative | None = quantity(None, label="delay margin", show="ms", digits=0)
+    crossover_hz: NotNegative = quantity(label="crossover", digits=2)
+    sensitivity: Positive = quantity(label="sensitivity", digits=2)
 
 
-class Controller(Section):
+class AntiWindup(Section):
+    """What a controller does on the model after a step and a jump back."""
+
+    overshoot_after_jump_rad: Number = quantity(label="overshoot after the jump", digits=4)
+    rise_s: Number = quantity(label="first step to 95 %", digits=2)
+
+
+class Controller(Result):
     """Gains that were tuned on the model.
 
     Attributes
     ----------
     lag_s, delay_ticks, falling_N_per_s : of the pumps, for `falling_share`.
-    anti_windup : overshoot after the jump [rad] and time to 95 % of the first step [s], by controller.
     """
 
-    tick_s: Positive
-    pwm_low: Pwm = 0.0
-    pwm_high: Pwm = 255.0
-    criterion: ControllerCriterion
-    orientation: OrientationGains
-    position: PositionGains
+    tick_s: Positive = quantity(label="tick", show="ms", digits=3)
+    pwm_low: Pwm = quantity(0.0, label="least command")
+    pwm_high: Pwm = quantity(255.0, label="greatest command")
+    criterion: ControllerCriterion = quantity(label="demanded")
+    orientation: OrientationGains = quantity(label="orientation")
+    position: PositionGains = quantity(label="position")
     feedforward: StaticMap
     computed_torque: ComputedTorqueGains | None = None
     lag_s: Positive
     delay_ticks: Annotated[int, Field(ge=0, le=1000, strict=True)]
     falling_N_per_s: Positive | None = None
-    margins: list[ControllerMargins] = []
-    anti_windup: dict[str, dict[str, Number]] = {}
-    verdict: Literal["ok", "poor"]
-    reasons: list[str] = []
+    margins: list[ControllerMargins] = quantity([], label="margins")
+    anti_windup: dict[str, AntiWindup] = quantity({}, label="anti-windup")
 
     @model_validator(mode="after")
     def _ordered(self) -> Controller:

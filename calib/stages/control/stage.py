@@ -1,305 +1,620 @@
-"""Controllers on the simulated rig: which there are, one run of each, and the anti-windup by trial.
-
-This module runs the twin on purpose. What is tried here is a controller before the hardware: the twin
-with the identified parameters is the plant, its sensors are simulated, and nothing that was recorded
-is processed.
-
-    p, pid, clamping        angle, with the source's gains (4.1 - 4.4)
-    back                    the same PID with back-calculation
-    pd, pd+ff, pd+map       lengths; without feed-forward, with the line of (4.6), with the identified map
-    torque                  lengths; computed torque with the observer
-    tuned-pid, tuned-pd     back-calculation and map with the gains of the section `controller`
-
-Any of them runs on any reference: one given as an angle has the lengths of one pump alone, one given as
-lengths has an angle.
-"""
+"""The stages of control: controllers tried on the simulated rig, references checked, gains tuned."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+import math
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
+from calib.core.errors import BadInputError, UsageError
+from calib.core.stage import Files, Output, Stage, option
+from calib.core.units import parse_angle_rad, parse_duration_s, parse_pwm_limits
+from calib.core.verdict import Finding, Verdict
 
-from calib.core.arrays import FloatArray
-from calib.core.errors import BadInputError
-from calib.stages.camera.model import undistort
-from calib.stages.control.laws import (
-    BackCalculation,
-    BackOrientation,
-    ComputedTorque,
-    FeedForward,
-    LoopState,
-    Model,
-    OrientationControl,
-    Pid,
-    PositionControl,
-    computed_torque_step,
-    correct,
-    design_observer,
-    feed_forward_pwm,
-    predict,
-    saturate,
-    start_back_orientation,
-    start_observer,
-    step_back_orientation,
-    step_orientation,
-    step_position,
-    wanted_motion,
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from calib.core.arrays import FloatArray
+    from calib.core.plot import Figure
+    from calib.core.rig import Rig
+    from calib.core.stage import Progress
+    from calib.core.words import Block
+    from calib.stages.control.laws import Model, Pid
+    from calib.stages.control.references import Reference
+    from calib.stages.control.section import AntiWindup, Controller, ControllerMargins, StaticMap
+    from calib.stages.control.trial import Outcome
+    from calib.stages.control.tuning import Criterion, Following, Point, Tuned
+    from calib.twin.rig import SimulatedRig
+
+_REFERENCE = (
+    "elongation, step, jump, ellipse, a CSV with t_s and q1_m, q2_m, or x_m, y_m, or phi_rad, "
+    "or a recorded log."
 )
-from calib.stages.control.references import Reference, built_in
-from calib.stages.control.section import Controller
-from calib.stages.control.tuning import Tracking, tracking
-from calib.twin.rig import SimulatedRig
-from calib.twin.scenarios import at_rest
-from calib.twin.simulate import Law, Run, Seen, simulate
+_LIMITS = "PWM values between which commands stay, as 0,255."
+_DURATION = "Length of a reference by name, such as 30s."
 
-Pair = tuple[float, float]
 
-CONTROLLERS = (
-    "p", "pid", "clamping", "back", "pd", "pd+ff", "pd+map", "torque", "tuned-pid", "tuned-pd",
-)  # fmt: skip
+def _wanted(
+    files: Files, rig: Rig, duration_s: float | None, limits: tuple[float, float] | None
+) -> tuple[SimulatedRig, Model, Reference]:
+    """The machine, what controllers know of it, and the reference that was named."""
+    from calib.core.rig import Geometry
+    from calib.stages.control.read import wanted_reference
+    from calib.stages.control.references import check_workspace
+    from calib.stages.control.trial import controlled
 
-_ANGLE = ("p", "pid", "clamping", "back", "tuned-pid", "torque")
-_LENGTHS = ("pd", "pd+ff", "pd+map", "tuned-pd", "torque")
-_SOURCE_PID = Pid(1000.0, 1000.0, 10.0)
-_SOURCE_PD = {"ellipse": Pid(10000.0, 0.0, 1000.0)}
-_PD = Pid(15000.0, 0.0, 150.0)
-_BACK_S, _SHARE = 4.0, 0.4
+    machine, model = controlled(rig, files.rig_path, limits)
+    wanted = wanted_reference(str(files.paths[0]), model, duration_s, rig, files.rig_path)
+    x0, y0, x1, y1 = (rig.geometry or Geometry()).workspace_m
+    check_workspace(model, wanted, (x0, y0, x1, y1))
+    return machine, model, wanted
+
+
+# ----------------------------------------------------------------------
+# `calib control run`: controllers along a reference on the simulated rig.
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """A controller on a reference.
+class RunOptions:
+    """Which controllers are run, and on what."""
+
+    controllers: tuple[str, ...] | None = option(
+        None,
+        "p, pid, clamping, back, pd, pd+ff, pd+map, torque, tuned-pid, tuned-pd; may be repeated. "
+        "[default: all that suit the reference]",
+        flag="controller",
+    )
+    feedback: Literal["sensors", "truth"] = option(
+        "sensors", "What controllers get: sensors, simulated with their noise, or truth."
+    )
+    seed: int = option(0, "Seed of the sensors' noise.", least=0)
+    duration_s: float | None = option(
+        None, _DURATION, flag="duration", parse=partial(parse_duration_s, what="--duration")
+    )
+    pwm_limits: tuple[float, float] | None = option(None, _LIMITS, parse=parse_pwm_limits)
+
+
+@dataclass(frozen=True)
+class RunInputs:
+    """A machine, controllers by name, and the reference that they follow."""
+
+    machine: SimulatedRig
+    model: Model
+    wanted: Reference
+    controllers: Sequence[str]
+    section: Controller | None
+    options: RunOptions
+    progress: Progress
+
+
+@dataclass(frozen=True)
+class Runs:
+    """How well controllers follow a reference.
 
     Attributes
     ----------
-    controller : its name.
-    run : the simulated run.
-    figures : errors and all that.
-    estimate_m : (n, 2) lengths by the observer, None without one.
-    limited : share of the ticks in which the pumps could not give what was wanted, None where unknown.
+    follow : how far the pumps can follow it, whatever the controller.
     """
 
-    controller: str
-    run: Run
-    figures: Tracking
-    estimate_m: FloatArray | None
-    limited: float | None
+    model: Model
+    reference: Reference
+    follow: Following
+    outcomes: Sequence[Outcome]
+    feedback: str
+    seed: int
+
+    @property
+    def verdict(self) -> Verdict:
+        """A comparison is neither good nor bad; what the pumps cannot do is a remark."""
+        if self.follow.possible:
+            return Verdict()
+        text = f"the pumps cannot follow it: at {self.follow.at_s:.2f} s {self.follow.reason}"
+        return Verdict((Finding("remark", text),))
 
 
-def control_model(rig: SimulatedRig, section: Controller | None = None, limits: Pair | None = None) -> Model:
-    """What controllers know of a rig. Raises `BadInputError` for PWM limits that no motor has."""
-    low, high = (0.0, 255.0) if section is None else (section.pwm_low, section.pwm_high)
-    if limits is not None:
-        low, high = limits
-    return Model(rig.plant, rig.pump, rig.pump_strength, low, high)
+def _read_run(files: Files, rig: Rig, options: RunOptions) -> RunInputs:
+    from calib.stages.control.trial import CONTROLLERS, controllers_for
+
+    for name in options.controllers or ():
+        if name not in CONTROLLERS:
+            raise UsageError(f"--controller: {name!r} is not one of {', '.join(CONTROLLERS)}")
+    machine, model, wanted = _wanted(files, rig, options.duration_s, options.pwm_limits)
+    names = options.controllers or controllers_for(wanted, rig.controller)
+    files.narrate("simulated: a model of a rig, not the rig")
+    return RunInputs(machine, model, wanted, names, rig.controller, options, files.progress)
 
 
-def controllers_for(reference: Reference, section: Controller | None) -> tuple[str, ...]:
-    """Controllers that suit the kind of a reference, tuned ones only where they have been tuned."""
-    names = _ANGLE if reference.kind == "angle" else _LENGTHS
-    return tuple(name for name in names if section is not None or not name.startswith("tuned"))
+def _solve_run(inputs: RunInputs) -> Runs:
+    from calib.stages.control.trial import run_controller
+    from calib.stages.control.tuning import follow
+
+    model, wanted, options = inputs.model, inputs.wanted, inputs.options
+    outcomes = []
+    with inputs.progress("simulating") as progress:
+        for done, name in enumerate(inputs.controllers):
+            progress(done, len(inputs.controllers))
+            outcomes.append(
+                run_controller(
+                    name, inputs.machine, model, wanted, inputs.section, options.seed, options.feedback
+                )
+            )
+    found = follow(model, wanted.path_m(model.plant.rest_length_m))
+    return Runs(model, wanted, found, outcomes, options.feedback, options.seed)
 
 
-def _orientation(model: Model, reference: Reference, pid: Pid) -> Law:
-    control = OrientationControl(replace(pid, low=model.low_pwm, high=model.high_pwm, tick_s=model.tick_s))
-    wanted = reference.phi_rad.tolist()
-
-    def law(k: int, memory: LoopState, seen: Seen) -> tuple[LoopState, Pair]:
-        memory, command = step_orientation(control, memory, wanted[k], seen.phi_rad)
-        return memory, _limited(model, command.pwm)
-
-    return law
-
-
-def _limited(model: Model, pwm: Pair) -> Pair:
-    u1, u2 = (min(max(u, model.low_pwm), model.high_pwm) for u in pwm)
-    return u1, u2
-
-
-def _back(reference: Reference, back: BackOrientation) -> Law:
-    state = [start_back_orientation(back)]
-    wanted = reference.phi_rad.tolist()
-
-    def law(k: int, memory: LoopState, seen: Seen) -> tuple[LoopState, Pair]:
-        state[0], pwm = step_back_orientation(back, state[0], wanted[k], seen.phi_rad)
-        return memory, pwm
-
-    return law
-
-
-def _position(model: Model, reference: Reference, pid: Pid, extra: str) -> Law:
-    control = PositionControl(
-        replace(pid, tick_s=model.tick_s), FeedForward() if extra == "line" else None, whole_pwm=False
-    )
-    rows = reference.q_m.tolist()
-    added = feed_forward_pwm(model, reference.q_m) if extra == "map" else np.zeros_like(reference.q_m)
-
-    def law(k: int, memory: LoopState, seen: Seen) -> tuple[LoopState, Pair]:
-        memory, command = step_position(control, memory, (rows[k][0], rows[k][1]), seen.q_m)
-        if extra == "map":
-            # The map goes on top of what the controller would send, which is not yet limited.
-            u = command.feedback[0] + added[k, 0], command.feedback[1] + added[k, 1]
-        else:
-            u = command.pwm
-        u1, u2 = (saturate(value, True, model.low_pwm, model.high_pwm) for value in u)
-        return memory, (u1, u2)
-
-    return law
-
-
-class _Torque:
-    """Computed torque with its observer; keeps what it believed for the figures."""
-
-    def __init__(
-        self, rig: SimulatedRig, model: Model, reference: Reference, control: ComputedTorque, sensors: bool
-    ) -> None:
-        tracker = rig.tracker
-        latency = tracker.latency_s if sensors else 0.0
-        self.observer = design_observer(model, latency_s=latency, marker_offset_m=tracker.marker_offset_m)
-        self.state = start_observer(self.observer)
-        self.wanted = wanted_motion(model, reference.q_m)
-        self.control, self.sensors = control, sensors
-        view = rig.view
-        self.camera = view.camera
-        A = view.camera.K @ np.column_stack([view.R_CW[:, :2], view.t_CW_m])
-        self.to_plane = np.linalg.inv(A) @ view.camera.K
-        self.estimates: list[FloatArray] = []
-        self.limited = 0
-
-    def _marker(self, seen: Seen) -> Pair:
-        if seen.marker_px[0] != seen.marker_px[0]:
-            return float("nan"), float("nan")
-        ray = undistort(self.camera, np.array([seen.marker_px]))[0]
-        p = self.to_plane @ np.array([ray[0], ray[1], 1.0])
-        return float(p[0] / p[2]), float(p[1] / p[2])
-
-    def __call__(self, k: int, memory: LoopState, seen: Seen) -> tuple[LoopState, Pair]:
-        if self.sensors:
-            rate = -sum(row[2] for row in seen.imu) / len(seen.imu) if seen.imu else float("nan")
-            self.state = correct(self.observer, self.state, self._marker(seen), rate)
-        else:
-            y = self.state.y.copy()
-            y[:2] = seen.q_m
-            self.state = self.state._replace(y=y)
-        self.estimates.append(self.state.y[:2].copy())
-        command = computed_torque_step(self.control, self.observer, self.state, self.wanted, k)
-        self.limited += any(command.limited)
-        self.state = predict(self.observer, self.state, command.pwm)
-        return memory, command.pwm
-
-
-def _tuned(section: Controller | None) -> Controller:
-    if section is None:
-        raise BadInputError("controller: no gains have been tuned, run calib control tune first")
-    return section
-
-
-def _back_of(model: Model, pid: Pid, back_s: float, share: float | None, sign: int = 1) -> BackOrientation:
-    control = BackCalculation(pid.Kp, pid.Ki, pid.Kd, back_s, model.tick_s)
-    return BackOrientation(control, model, float("inf") if share is None else share, sign)
-
-
-def _law(
-    name: str,
-    rig: SimulatedRig,
-    model: Model,
-    reference: Reference,
-    section: Controller | None,
-    sensors: bool,
-) -> Law:
-    if name == "p":
-        return _orientation(model, reference, Pid(_SOURCE_PID.Kp))
-    if name in ("pid", "clamping"):
-        return _orientation(model, reference, replace(_SOURCE_PID, clamping=name == "clamping"))
-    if name == "back":
-        return _back(reference, _back_of(model, _SOURCE_PID, _BACK_S, _SHARE))
-    if name == "tuned-pid":
-        own = _tuned(section).orientation
-        pid = Pid(own.Kp_pwm_per_rad, own.Ki_pwm_per_rad_s, own.Kd_pwm_s_per_rad)
-        return _back(reference, _back_of(model, pid, own.back_calculation_s, own.falling_share, own.sign))
-    if name == "tuned-pd":
-        gains = _tuned(section).position
-        pid = Pid(gains.Kp_pwm_per_m, gains.Ki_pwm_per_m_s, gains.Kd_pwm_s_per_m)
-        return _position(model, reference, pid, "map")
-    if name == "torque":
-        known = None if section is None else section.computed_torque
-        control = (
-            ComputedTorque()
-            if known is None
-            else ComputedTorque(known.horizon_ticks, known.Kp_per_s2, known.Kd_per_s)
-        )
-        return _Torque(rig, model, reference, control, sensors)
-    pid = _SOURCE_PD.get(reference.name, _PD)
-    return _position(model, reference, pid, {"pd": "", "pd+ff": "line", "pd+map": "map"}[name])
-
-
-def run_controller(
-    name: str,
-    rig: SimulatedRig,
-    model: Model,
-    reference: Reference,
-    section: Controller | None = None,
-    seed: int = 0,
-    feedback: str = "sensors",
-) -> Outcome:
-    """Run a controller along a reference, from rest.
-
-    Parameters
-    ----------
-    rig : what is controlled. model : what the controller knows of it.
-    feedback : "sensors" or "truth".
-
-    Raises `BadInputError` for another name, tuned gains that are not there, and as `simulate`.
-    """
-    if name not in CONTROLLERS:
-        raise BadInputError(f"controller: found {name!r}, expected one of {', '.join(CONTROLLERS)}")
-    law = _law(name, rig, model, reference, section, feedback == "sensors")
-    run = simulate(rig, at_rest(rig), law, len(reference.q_m), seed, feedback)
-    figures = tracking(
-        reference, run.states[:, :2], run.pwm, rig.plant.bellows_radius_m, model.low_pwm, model.high_pwm
-    )
-    if isinstance(law, _Torque):
-        return Outcome(name, run, figures, np.array(law.estimates), law.limited / len(run.pwm))
-    return Outcome(name, run, figures, None, None)
-
-
-_TIMES_S = (0.5, 1.0, 2.0, 4.0)
-_SHARES = (0.25, 0.4, 0.7)
-
-
-def tune_back_calculation(
-    rig: SimulatedRig, model: Model, pid: Pid, progress: Callable[[int, int], None] = lambda done, total: None
-) -> tuple[float, float, dict[str, dict[str, float]]]:
-    """Time and share of the falling rate with the least overshoot after the jump, and what each does.
-
-    Only such settings count whose first step is at 95 % no later than with clamping, a tick apart; where
-    there is none the fastest is taken. The true state is fed back, so that noise decides nothing.
-    """
-    reference = built_in(model, "jump")
-    clamped = _jump(rig, model, reference, _orientation(model, reference, replace(pid, clamping=True)))
-    plain = _jump(rig, model, reference, _orientation(model, reference, pid))
-    best: tuple[tuple[float, float], float, float, dict[str, float]] | None = None
-    trials: Sequence[Pair] = [(T, share) for T in _TIMES_S for share in _SHARES]
-    for done, (T, share) in enumerate(trials):
-        progress(done, len(trials))
-        found = _jump(rig, model, reference, _back(reference, _back_of(model, pid, T, share)))
-        late = max(found["rise_s"] - clamped["rise_s"] - model.tick_s, 0.0)
-        merit = (round(late, 6), found["overshoot_after_jump_rad"])
-        if best is None or merit < best[0]:
-            best = merit, T, share, found
-    assert best is not None
-    return best[1], best[2], {"pid": plain, "clamping": clamped, "back_calculation": best[3]}
-
-
-def _jump(rig: SimulatedRig, model: Model, reference: Reference, law: Law) -> dict[str, float]:
-    run = simulate(rig, at_rest(rig), law, len(reference.q_m), 0, "truth")
-    figures = tracking(
-        reference, run.states[:, :2], run.pwm, rig.plant.bellows_radius_m, model.low_pwm, model.high_pwm
-    )
-    never = reference.duration_s
+def _followed(reference: Reference, found: Following) -> dict[str, Any]:
+    """Whether a reference can be followed, and by how much not, as plain values."""
     return {
-        "overshoot_after_jump_rad": figures.jump_overshoot_rad or 0.0,
-        "rise_s": never if figures.rise_s is None else figures.rise_s,
+        "reference": reference.name,
+        "duration_s": reference.duration_s,
+        "possible": found.possible,
+        "at_s": found.at_s,
+        "reason": found.reason,
+        "missing_mm": found.missing_mm,
+        "fastest_rise_N_per_s": found.fastest_rise_N_per_s,
+        "fastest_fall_N_per_s": found.fastest_fall_N_per_s,
+        "approach_s": found.approach_s,
     }
+
+
+def _run_document(runs: Runs) -> dict[str, Any]:
+    rows = []
+    for one in runs.outcomes:
+        limited = {} if one.limited is None else {"limited": one.limited}
+        rows.append({"controller": one.controller, **asdict(one.figures), **limited})
+    followed = _followed(runs.reference, runs.follow)
+    return {"control": {"feedback": runs.feedback, "seed": runs.seed, **followed, "runs": rows}}
+
+
+def _run_words(runs: Runs) -> list[Block]:
+    from calib.core.words import BLANK, Line, Table
+
+    def cell(value: float | None, digits: int) -> str:
+        return BLANK if value is None or math.isnan(value) else f"{value:.{digits}f}"
+
+    reference, rows = runs.reference, []
+    if reference.kind == "lengths":
+        head = ["rms q1 mm", "rms q2 mm", "rms head mm", "largest mm", "rms rad"]
+    else:
+        head = ["rms rad", "largest rad", "to 95 % s", "reach s", "overshoot", "settle s"]
+        head += ["after jump", "settle s"] if reference.jump_s is not None else []
+    for one in runs.outcomes:
+        f = one.figures
+        if reference.kind == "lengths":
+            row = [cell(v, 3) for v in (*f.rms_mm, f.head_rms_mm, f.largest_mm)] + [cell(f.angle_rms_rad, 4)]
+        else:
+            row = [cell(f.angle_rms_rad, 4), cell(f.largest_rad, 4), cell(f.rise_s, 2), cell(f.reach_s, 2)]
+            row += [cell(f.overshoot_rad, 4), cell(f.settling_s, 2)]
+            row += [cell(f.jump_overshoot_rad, 4), cell(f.jump_settling_s, 2)]
+        saturated = " ".join(f"{share:.0%}" for share in f.saturation)
+        rows.append((one.controller, *row[: len(head)], saturated, f"{f.changes_pwm:.1f}"))
+    rate_hz = 1.0 / runs.model.tick_s
+    first = f"{reference.name}: {reference.duration_s:g} s at {rate_hz:g} Hz, feedback from {runs.feedback}"
+    table = Table(("", *head, "saturated", "PWM steps"), tuple(rows))
+    return [Line(first), table, *(Line(text) for text in runs.verdict.remarks)]
+
+
+def _run_plots(runs: Runs) -> dict[str, Figure]:
+    from calib.stages.control.plots import run_plots
+
+    return run_plots(runs.model, runs.reference, runs.outcomes)
+
+
+run = Stage(
+    "control run",
+    "Controllers tried",
+    """Run controllers along a reference on the simulated rig, from rest, and compare their errors.
+
+    The plant is that of the sections actuator and pump, the nominal one without.
+    """,
+    _read_run,
+    _solve_run,
+    RunOptions,
+    sources=_REFERENCE,
+    metavar="REFERENCE",
+    several=False,
+    uses=("actuator", "pump", "controller"),
+    document=_run_document,
+    words=_run_words,
+    plots=_run_plots,
+)
+
+
+# ----------------------------------------------------------------------
+# `calib control check`: whether the pumps can follow a reference at all.
+
+
+@dataclass(frozen=True)
+class CheckOptions:
+    """What is checked."""
+
+    duration_s: float | None = option(
+        None, _DURATION, flag="duration", parse=partial(parse_duration_s, what="--duration")
+    )
+    pwm_limits: tuple[float, float] | None = option(None, _LIMITS, parse=parse_pwm_limits)
+
+
+@dataclass(frozen=True)
+class Checked:
+    """Whether the pumps can follow a reference.
+
+    Attributes
+    ----------
+    slower : the reference slowed down so far that they can; None where they can, and where no slowness helps.
+    moved_m : by how much its lengths were moved onto what the pumps can hold.
+    never : why no slowness helps.
+    """
+
+    model: Model
+    reference: Reference
+    follow: Following
+    slower: Reference | None = None
+    moved_m: float = 0.0
+    never: str = ""
+
+    @property
+    def verdict(self) -> Verdict:
+        """Poor from the first second on at which the pumps cannot follow."""
+        if self.follow.possible:
+            return Verdict()
+        text = f"the pumps cannot follow it from {self.follow.at_s:.2f} s on: {self.follow.reason}"
+        findings = [Finding("poor", text)]
+        findings.append(Finding("poor", f"up to {self.follow.missing_mm:.2f} mm are missing"))
+        if self.slower is None:
+            findings.append(Finding("poor", self.never))
+        else:
+            advice = f"slowed down to {self.slower.duration_s:.2f} s they can (--slow writes it)"
+            if self.moved_m > 0.0:
+                moved = f"{1e3 * self.moved_m:.2f} mm"
+                advice += f", with lengths moved by up to {moved} onto what the pumps can hold"
+            findings.append(Finding("remark", "", advice))
+        return Verdict.of(findings)
+
+
+def _read_check(files: Files, rig: Rig, options: CheckOptions) -> tuple[Model, Reference]:
+    _, model, wanted = _wanted(files, rig, options.duration_s, options.pwm_limits)
+    return model, wanted
+
+
+def _solve_check(inputs: tuple[Model, Reference]) -> Checked:
+    from calib.stages.control.references import from_lengths
+    from calib.stages.control.tuning import brought_in, follow, slowed
+
+    model, wanted = inputs
+    path_m = wanted.path_m(model.plant.rest_length_m)
+    found = follow(model, path_m)
+    if found.possible:
+        return Checked(model, wanted, found)
+    try:
+        q_m, _ = slowed(model, path_m)
+        slower = from_lengths(model, f"{wanted.name}, slowed", q_m)
+    except BadInputError as error:
+        return Checked(model, wanted, found, never=str(error))
+    return Checked(model, wanted, found, slower, brought_in(model, path_m)[1])
+
+
+def _check_document(checked: Checked) -> dict[str, Any]:
+    from calib.stages.control.laws import largest_force_N
+    from calib.stages.control.tuning import largest_angle, longest_m
+
+    reach = {
+        "greatest_angle_rad": largest_angle(checked.model),
+        "greatest_length_m": longest_m(checked.model),
+        "greatest_force_N": largest_force_N(checked.model).tolist(),
+    }
+    told = {**_followed(checked.reference, checked.follow), "reachable": reach}
+    if checked.slower is not None:
+        told |= {"slowed_s": checked.slower.duration_s, "moved_mm": 1e3 * checked.moved_m}
+    if checked.never:
+        told["never"] = checked.never
+    return {"control": told}
+
+
+def _check_words(checked: Checked) -> list[Block]:
+    from calib.core.words import Line, of_verdict
+    from calib.stages.control.tuning import largest_angle, longest_m
+
+    found, reference = checked.follow, checked.reference
+    return [
+        Line(
+            f"{reference.name}: {reference.duration_s:g} s; forces rise by up to "
+            f"{found.fastest_rise_N_per_s:.3g} N/s and fall by up to {found.fastest_fall_N_per_s:.3g} N/s"
+        ),
+        Line(
+            f"the pumps reach {1e3 * longest_m(checked.model):.2f} mm straight and "
+            f"{largest_angle(checked.model):.3f} rad bent; the start takes {found.approach_s:.2f} s from rest"
+        ),
+        *of_verdict(checked.verdict),
+    ]
+
+
+def _check_plots(checked: Checked) -> dict[str, Figure]:
+    from calib.stages.control.plots import check_plots
+
+    return check_plots(checked.model, checked.reference, checked.follow, checked.slower)
+
+
+def _write_slower(path: Path, checked: Checked) -> list[str]:
+    from calib.core.files import shown
+    from calib.stages.control.read import write_reference
+
+    if checked.never:
+        return []
+    write_reference(path, checked.slower or checked.reference)
+    return [f"reference written to {shown(path)}"]
+
+
+check = Stage(
+    "control check",
+    "Reference checked",
+    """Whether the pumps can follow a reference, and the first second at which they cannot.
+
+    Exits 1 when they cannot.
+    """,
+    _read_check,
+    _solve_check,
+    CheckOptions,
+    sources=_REFERENCE,
+    metavar="REFERENCE",
+    several=False,
+    uses=("actuator", "pump", "controller"),
+    output=Output(
+        "Write the reference slowed down so far that the pumps follow it.",
+        _write_slower,
+        flags=("--slow",),
+        metavar="CSV",
+    ),
+    document=_check_document,
+    words=_check_words,
+    plots=_check_plots,
+)
+
+
+# ----------------------------------------------------------------------
+# `calib control tune`: gains with margins at every operating point, and the anti-windup by trial.
+
+
+@dataclass(frozen=True)
+class TuneOptions:
+    """Margins that the gains have to keep."""
+
+    gain_margin: float = option(2.0, "Least gain margin, a factor.")
+    phase_margin_rad: float = option(
+        math.pi / 3.0,
+        "Least phase margin, such as 60deg. [default: 60deg]",
+        flag="phase-margin",
+        parse=partial(parse_angle_rad, what="--phase-margin"),
+    )
+    sensitivity: float = option(2.0, "Greatest peak of the sensitivity.")
+    pwm_limits: tuple[float, float] | None = option(None, _LIMITS, parse=parse_pwm_limits)
+
+
+@dataclass(frozen=True)
+class TuneInputs:
+    """A machine, what controllers know of it, and what is asked of them."""
+
+    machine: SimulatedRig
+    model: Model
+    criterion: Criterion
+    progress: Progress
+
+
+@dataclass(frozen=True)
+class ControllerEvidence:
+    """What gains were chosen from.
+
+    Attributes
+    ----------
+    source : margins that the source's gains have at the same points, by their names.
+    """
+
+    model: Model
+    orientation: Tuned
+    position: Tuned
+    source: dict[str, list[ControllerMargins]]
+
+
+def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
+    from calib.stages.control.trial import controlled
+    from calib.stages.control.tuning import Criterion
+
+    try:
+        criterion = Criterion(options.gain_margin, options.phase_margin_rad, options.sensitivity)
+    except BadInputError as error:
+        raise UsageError(str(error)) from error
+    machine, model = controlled(rig, files.rig_path, options.pwm_limits)
+    files.hashes.update(_hashes(rig))
+    return TuneInputs(machine, model, criterion, files.progress)
+
+
+def _hashes(rig: Rig) -> dict[str, str]:
+    """SHA-256 of the sections that the gains follow from, where the file has them."""
+    import yaml
+
+    from calib.core.files import sha256
+    from calib.core.result import section_json
+
+    extra, out = rig.model_extra or {}, {}
+    for name in ("actuator", "pump"):
+        # A section without a schema is a mapping.
+        values = extra.get(name)
+        if values is None and name in type(rig).model_fields and getattr(rig, name) is not None:
+            values = section_json(getattr(rig, name))
+        if values is not None:
+            out[name] = sha256(yaml.safe_dump(values, sort_keys=True).encode())
+    return out
+
+
+def _solve_tune(inputs: TuneInputs) -> Controller:
+    """Tune both loops on the model and the anti-windup by trial, judge, and assemble the section."""
+    from calib.core.result import finite_or_none, judged
+    from calib.stages.actuator.pump import RateLimit
+    from calib.stages.control.laws import ComputedTorque, design_observer
+    from calib.stages.control.section import (
+        AntiWindup,
+        ComputedTorqueGains,
+        Controller,
+        ControllerCriterion,
+        OrientationGains,
+        PositionGains,
+    )
+    from calib.stages.control.trial import tune_back_calculation
+    from calib.stages.control.tuning import tune_orientation, tune_position
+
+    model, criterion, tracker = inputs.model, inputs.criterion, inputs.machine.tracker
+    orientation, position = tune_orientation(model, criterion), tune_position(model, criterion)
+    turn, move = orientation.pid, position.pid
+    with inputs.progress("anti-windup") as progress:
+        back_s, share, trials = tune_back_calculation(inputs.machine, model, turn, progress)
+    anti_windup = {name: AntiWindup(**values) for name, values in trials.items()}
+    torque = ComputedTorque()
+    observer = design_observer(model, latency_s=tracker.latency_s, marker_offset_m=tracker.marker_offset_m)
+    law = model.pump.deflation
+    return Controller(
+        tick_s=model.tick_s,
+        pwm_low=model.low_pwm,
+        pwm_high=model.high_pwm,
+        criterion=ControllerCriterion(
+            gain_margin=criterion.gain,
+            phase_margin_rad=criterion.phase_rad,
+            sensitivity=criterion.sensitivity,
+        ),
+        orientation=OrientationGains(
+            Kp_pwm_per_rad=turn.Kp,
+            Ki_pwm_per_rad_s=turn.Ki,
+            Kd_pwm_s_per_rad=turn.Kd,
+            back_calculation_s=back_s,
+            falling_share=finite_or_none(share),
+        ),
+        position=PositionGains(Kp_pwm_per_m=move.Kp, Ki_pwm_per_m_s=move.Ki, Kd_pwm_s_per_m=move.Kd),
+        feedforward=_static_map(model),
+        computed_torque=ComputedTorqueGains(
+            horizon_ticks=torque.horizon_ticks,
+            Kp_per_s2=torque.Kp_per_s2,
+            Kd_per_s=torque.Kd_per_s,
+            latency_s=observer.latency_s,
+            observer_gain=[[float(f"{v:.6g}") for v in row] for row in observer.gain],
+        ),
+        lag_s=model.pump.lag_s,
+        delay_ticks=model.pump.delay_ticks,
+        falling_N_per_s=finite_or_none(law.falling_N_per_s) if isinstance(law, RateLimit) else None,
+        margins=[*_margins("orientation", orientation.points), *_margins("position", position.points)],
+        anti_windup=anti_windup,
+        **judged(_judge(anti_windup["clamping"], anti_windup["back_calculation"], model.tick_s)),
+    ).with_evidence(ControllerEvidence(model, orientation, position, _source(model, orientation, position)))
+
+
+def _judge(clamped: AntiWindup, back: AntiWindup, tick_s: float) -> Verdict:
+    """Poor where back-calculation is not worth its name."""
+    findings = []
+    over, limit = back.overshoot_after_jump_rad, clamped.overshoot_after_jump_rad
+    if over > max(limit / 3.0, 1e-3):
+        text = f"After the jump back-calculation overshoots by {over:.3f} rad, more than a third of "
+        findings.append(Finding("poor", f"{text}clamping's {limit:.3f} rad."))
+    if back.rise_s > clamped.rise_s + tick_s + 1e-9:
+        text = f"The first step is at 95 % after {back.rise_s:.2f} s, later than with clamping "
+        findings.append(Finding("poor", f"{text}({clamped.rise_s:.2f} s)."))
+    return Verdict.of(findings)
+
+
+def _margins(loop: Literal["orientation", "position"], points: Sequence[Point]) -> list[ControllerMargins]:
+    """Margins at operating points for the file."""
+    from calib.core.result import finite_or_none
+    from calib.stages.control.section import ControllerMargins
+
+    return [
+        ControllerMargins(
+            loop=loop,
+            q_m=[float(f"{q:.6g}") for q in point.q_m],
+            stable=bool(point.margins.stable),
+            gain=finite_or_none(point.margins.gain),
+            phase_rad=finite_or_none(point.margins.phase_rad),
+            delay_s=finite_or_none(point.margins.delay_s),
+            crossover_hz=float(point.margins.crossover_hz),
+            sensitivity=float(point.margins.sensitivity),
+        )
+        for point in points
+    ]
+
+
+def _source(model: Model, orientation: Tuned, position: Tuned) -> dict[str, list[ControllerMargins]]:
+    """Margins that the source's gains have at the same points."""
+    from calib.stages.control.laws import Pid
+    from calib.stages.control.tuning import orientation_loop, points_of, position_loop
+
+    h = model.tick_s
+    turn, slow, fast = (
+        Pid(*gains, tick_s=h) for gains in ((1e3, 1e3, 10.0), (1.5e4, 0.0, 150.0), (1e4, 0.0, 1e3))
+    )
+    bent, straight = ([point.q_m for point in tuned.points] for tuned in (orientation, position))
+
+    def both(pid: Pid) -> list[ControllerMargins]:
+        return _margins("position", points_of(partial(position_loop, model, pid), straight))
+
+    angle = _margins("orientation", points_of(partial(orientation_loop, model, turn), bent))
+    return {"PID 1000/1000/10": angle, "PD 15000/150": both(slow), "PD 10000/1000": both(fast)}
+
+
+_MAP_ROWS = 41
+
+
+def _static_map(model: Model) -> StaticMap:
+    import numpy as np
+
+    from calib.stages.control.laws import largest_force_N, pwm_of_force
+    from calib.stages.control.section import StaticMap
+
+    plant = model.plant
+    most = float(largest_force_N(model).max())
+    # Close together at small forces, where the map is steepest. Strengths apply to the force first.
+    force: FloatArray = most / max(model.strength) * np.linspace(0.0, 1.0, _MAP_ROWS) ** 2
+    scaled = force[:, None] * np.array(model.strength)
+    pwm = pwm_of_force(model, np.maximum(scaled, 1e-9))[:, 0]
+    return StaticMap(
+        rest_length_m=plant.rest_length_m,
+        bellows_radius_m=plant.bellows_radius_m,
+        stiffness_N_per_m=[plant.stiffness_scale * k for k in plant.stiffness.padded],
+        bending_N_per_rad2=plant.bending_N_per_rad2,
+        strength=list(model.strength),
+        force_pwm=[[float(f"{F:.6g}"), float(f"{u:.6g}")] for F, u in zip(force, pwm, strict=True)],
+    )
+
+
+def _tune_document(section: Controller) -> dict[str, Any]:
+    from calib.core.result import section_json
+
+    source = section.evidence.source
+    return {"source_margins": {name: [section_json(row) for row in rows] for name, rows in source.items()}}
+
+
+def _tune_words(section: Controller) -> list[Block]:
+    from calib.core.words import listed
+
+    return [listed(f"margins of the source's {name}", rows) for name, rows in section.evidence.source.items()]
+
+
+def _tune_plots(section: Controller) -> dict[str, Figure]:
+    from calib.stages.control.plots import tune_plots
+
+    fit: ControllerEvidence = section.evidence
+    return tune_plots(fit.model, section, fit.orientation, fit.position)
+
+
+tune = Stage(
+    "control tune",
+    "Controllers",
+    """Tune the loops on the model to margins at every operating point; write the section controller.
+
+    Exits 1 when the anti-windup does not do what it is for.
+    """,
+    _read_tune,
+    _solve_tune,
+    TuneOptions,
+    writes=("controller",),
+    uses=("actuator", "pump", "twin"),
+    document=_tune_document,
+    words=_tune_words,
+    plots=_tune_plots,
+)

@@ -147,6 +147,11 @@ class Following:
     fastest_fall_N_per_s: float
     approach_s: float
 
+    @property
+    def missing_mm(self) -> float:
+        """The most that is missing of either bellows."""
+        return 1e3 * float(np.abs(self.missing_m).max())
+
 
 def _nearest(model: Model, wanted: FloatArray) -> FloatArray:
     h, most = model.tick_s, largest_force_N(model)

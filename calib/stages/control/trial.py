@@ -1,0 +1,317 @@
+"""Controllers on the simulated rig: which there are, one run of each, and the anti-windup by trial.
+
+This module runs the twin on purpose. What is tried here is a controller before the hardware: the twin
+with the identified parameters is the plant, its sensors are simulated, and nothing that was recorded
+is processed.
+
+    p, pid, clamping        angle, with the source's gains (4.1 - 4.4)
+    back                    the same PID with back-calculation
+    pd, pd+ff, pd+map       lengths; without feed-forward, with the line of (4.6), with the identified map
+    torque                  lengths; computed torque with the observer
+    tuned-pid, tuned-pd     back-calculation and map with the gains of the section `controller`
+
+Any of them runs on any reference: one given as an angle has the lengths of one pump alone, one given as
+lengths has an angle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from calib.core.arrays import FloatArray
+from calib.core.errors import BadInputError
+from calib.core.rig import Rig
+from calib.stages.camera.model import undistort
+from calib.stages.control.laws import (
+    BackCalculation,
+    BackOrientation,
+    ComputedTorque,
+    FeedForward,
+    LoopState,
+    Model,
+    OrientationControl,
+    Pid,
+    PositionControl,
+    computed_torque_step,
+    correct,
+    design_observer,
+    feed_forward_pwm,
+    predict,
+    saturate,
+    start_back_orientation,
+    start_observer,
+    step_back_orientation,
+    step_orientation,
+    step_position,
+    wanted_motion,
+)
+from calib.stages.control.references import Reference, built_in
+from calib.stages.control.section import Controller
+from calib.stages.control.tuning import Tracking, tracking
+from calib.twin.rig import SimulatedRig, rig_from_file
+from calib.twin.scenarios import at_rest
+from calib.twin.simulate import Law, Run, Seen, simulate
+
+Pair = tuple[float, float]
+
+CONTROLLERS = (
+    "p", "pid", "clamping", "back", "pd", "pd+ff", "pd+map", "torque", "tuned-pid", "tuned-pd",
+)  # fmt: skip
+
+_ANGLE = ("p", "pid", "clamping", "back", "tuned-pid", "torque")
+_LENGTHS = ("pd", "pd+ff", "pd+map", "tuned-pd", "torque")
+_SOURCE_PID = Pid(1000.0, 1000.0, 10.0)
+_SOURCE_PD = {"ellipse": Pid(10000.0, 0.0, 1000.0)}
+_PD = Pid(15000.0, 0.0, 150.0)
+_BACK_S, _SHARE = 4.0, 0.4
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A controller on a reference.
+
+    Attributes
+    ----------
+    controller : its name.
+    run : the simulated run.
+    figures : errors and all that.
+    estimate_m : (n, 2) lengths by the observer, None without one.
+    limited : share of the ticks in which the pumps could not give what was wanted, None where unknown.
+    """
+
+    controller: str
+    run: Run
+    figures: Tracking
+    estimate_m: FloatArray | None
+    limited: float | None
+
+
+def controlled(rig: Rig, source: Path, limits: Pair | None) -> tuple[SimulatedRig, Model]:
+    """A simulated machine with the parameters of a rig, and what controllers know of it.
+
+    Raises `BadInputError` for values that make no machine.
+    """
+    camera = None if rig.camera is None else rig.camera.optics
+    machine = rig_from_file(rig, str(source), camera)
+    return machine, control_model(machine, rig.controller, limits)
+
+
+def control_model(rig: SimulatedRig, section: Controller | None = None, limits: Pair | None = None) -> Model:
+    """What controllers know of a rig. Raises `BadInputError` for PWM limits that no motor has."""
+    low, high = (0.0, 255.0) if section is None else (section.pwm_low, section.pwm_high)
+    if limits is not None:
+        low, high = limits
+    return Model(rig.plant, rig.pump, rig.pump_strength, low, high)
+
+
+def controllers_for(reference: Reference, section: Controller | None) -> tuple[str, ...]:
+    """Controllers that suit the kind of a reference, tuned ones only where they have been tuned."""
+    names = _ANGLE if reference.kind == "angle" else _LENGTHS
+    return tuple(name for name in names if section is not None or not name.startswith("tuned"))
+
+
+def _orientation(model: Model, reference: Reference, pid: Pid) -> Law:
+    control = OrientationControl(replace(pid, low=model.low_pwm, high=model.high_pwm, tick_s=model.tick_s))
+    wanted = reference.phi_rad.tolist()
+
+    def law(k: int, memory: LoopState, seen: Seen) -> tuple[LoopState, Pair]:
+        memory, command = step_orientation(control, memory, wanted[k], seen.phi_rad)
+        return memory, _limited(model, command.pwm)
+
+    return law
+
+
+def _limited(model: Model, pwm: Pair) -> Pair:
+    u1, u2 = (min(max(u, model.low_pwm), model.high_pwm) for u in pwm)
+    return u1, u2
+
+
+def _back(reference: Reference, back: BackOrientation) -> Law:
+    state = [start_back_orientation(back)]
+    wanted = reference.phi_rad.tolist()
+
+    def law(k: int, memory: LoopState, seen: Seen) -> tuple[LoopState, Pair]:
+        state[0], pwm = step_back_orientation(back, state[0], wanted[k], seen.phi_rad)
+        return memory, pwm
+
+    return law
+
+
+def _position(model: Model, reference: Reference, pid: Pid, extra: str) -> Law:
+    control = PositionControl(
+        replace(pid, tick_s=model.tick_s), FeedForward() if extra == "line" else None, whole_pwm=False
+    )
+    rows = reference.q_m.tolist()
+    added = feed_forward_pwm(model, reference.q_m) if extra == "map" else np.zeros_like(reference.q_m)
+
+    def law(k: int, memory: LoopState, seen: Seen) -> tuple[LoopState, Pair]:
+        memory, command = step_position(control, memory, (rows[k][0], rows[k][1]), seen.q_m)
+        if extra == "map":
+            # The map goes on top of what the controller would send, which is not yet limited.
+            u = command.feedback[0] + added[k, 0], command.feedback[1] + added[k, 1]
+        else:
+            u = command.pwm
+        u1, u2 = (saturate(value, True, model.low_pwm, model.high_pwm) for value in u)
+        return memory, (u1, u2)
+
+    return law
+
+
+class _Torque:
+    """Computed torque with its observer; keeps what it believed for the figures."""
+
+    def __init__(
+        self, rig: SimulatedRig, model: Model, reference: Reference, control: ComputedTorque, sensors: bool
+    ) -> None:
+        tracker = rig.tracker
+        latency = tracker.latency_s if sensors else 0.0
+        self.observer = design_observer(model, latency_s=latency, marker_offset_m=tracker.marker_offset_m)
+        self.state = start_observer(self.observer)
+        self.wanted = wanted_motion(model, reference.q_m)
+        self.control, self.sensors = control, sensors
+        view = rig.view
+        self.camera = view.camera
+        A = view.camera.K @ np.column_stack([view.R_CW[:, :2], view.t_CW_m])
+        self.to_plane = np.linalg.inv(A) @ view.camera.K
+        self.estimates: list[FloatArray] = []
+        self.limited = 0
+
+    def _marker(self, seen: Seen) -> Pair:
+        if seen.marker_px[0] != seen.marker_px[0]:
+            return float("nan"), float("nan")
+        ray = undistort(self.camera, np.array([seen.marker_px]))[0]
+        p = self.to_plane @ np.array([ray[0], ray[1], 1.0])
+        return float(p[0] / p[2]), float(p[1] / p[2])
+
+    def __call__(self, k: int, memory: LoopState, seen: Seen) -> tuple[LoopState, Pair]:
+        if self.sensors:
+            rate = -sum(row[2] for row in seen.imu) / len(seen.imu) if seen.imu else float("nan")
+            self.state = correct(self.observer, self.state, self._marker(seen), rate)
+        else:
+            y = self.state.y.copy()
+            y[:2] = seen.q_m
+            self.state = self.state._replace(y=y)
+        self.estimates.append(self.state.y[:2].copy())
+        command = computed_torque_step(self.control, self.observer, self.state, self.wanted, k)
+        self.limited += any(command.limited)
+        self.state = predict(self.observer, self.state, command.pwm)
+        return memory, command.pwm
+
+
+def _tuned(section: Controller | None) -> Controller:
+    if section is None:
+        raise BadInputError("controller: no gains have been tuned, run calib control tune first")
+    return section
+
+
+def _back_of(model: Model, pid: Pid, back_s: float, share: float | None, sign: int = 1) -> BackOrientation:
+    control = BackCalculation(pid.Kp, pid.Ki, pid.Kd, back_s, model.tick_s)
+    return BackOrientation(control, model, float("inf") if share is None else share, sign)
+
+
+def _law(
+    name: str,
+    rig: SimulatedRig,
+    model: Model,
+    reference: Reference,
+    section: Controller | None,
+    sensors: bool,
+) -> Law:
+    if name == "p":
+        return _orientation(model, reference, Pid(_SOURCE_PID.Kp))
+    if name in ("pid", "clamping"):
+        return _orientation(model, reference, replace(_SOURCE_PID, clamping=name == "clamping"))
+    if name == "back":
+        return _back(reference, _back_of(model, _SOURCE_PID, _BACK_S, _SHARE))
+    if name == "tuned-pid":
+        own = _tuned(section).orientation
+        pid = Pid(own.Kp_pwm_per_rad, own.Ki_pwm_per_rad_s, own.Kd_pwm_s_per_rad)
+        return _back(reference, _back_of(model, pid, own.back_calculation_s, own.falling_share, own.sign))
+    if name == "tuned-pd":
+        gains = _tuned(section).position
+        pid = Pid(gains.Kp_pwm_per_m, gains.Ki_pwm_per_m_s, gains.Kd_pwm_s_per_m)
+        return _position(model, reference, pid, "map")
+    if name == "torque":
+        known = None if section is None else section.computed_torque
+        control = (
+            ComputedTorque()
+            if known is None
+            else ComputedTorque(known.horizon_ticks, known.Kp_per_s2, known.Kd_per_s)
+        )
+        return _Torque(rig, model, reference, control, sensors)
+    pid = _SOURCE_PD.get(reference.name, _PD)
+    return _position(model, reference, pid, {"pd": "", "pd+ff": "line", "pd+map": "map"}[name])
+
+
+def run_controller(
+    name: str,
+    rig: SimulatedRig,
+    model: Model,
+    reference: Reference,
+    section: Controller | None = None,
+    seed: int = 0,
+    feedback: str = "sensors",
+) -> Outcome:
+    """Run a controller along a reference, from rest.
+
+    Parameters
+    ----------
+    rig : what is controlled. model : what the controller knows of it.
+    feedback : "sensors" or "truth".
+
+    Raises `BadInputError` for another name, tuned gains that are not there, and as `simulate`.
+    """
+    if name not in CONTROLLERS:
+        raise BadInputError(f"controller: found {name!r}, expected one of {', '.join(CONTROLLERS)}")
+    law = _law(name, rig, model, reference, section, feedback == "sensors")
+    run = simulate(rig, at_rest(rig), law, len(reference.q_m), seed, feedback)
+    figures = tracking(
+        reference, run.states[:, :2], run.pwm, rig.plant.bellows_radius_m, model.low_pwm, model.high_pwm
+    )
+    if isinstance(law, _Torque):
+        return Outcome(name, run, figures, np.array(law.estimates), law.limited / len(run.pwm))
+    return Outcome(name, run, figures, None, None)
+
+
+_TIMES_S = (0.5, 1.0, 2.0, 4.0)
+_SHARES = (0.25, 0.4, 0.7)
+
+
+def tune_back_calculation(
+    rig: SimulatedRig, model: Model, pid: Pid, progress: Callable[[int, int], None] = lambda done, total: None
+) -> tuple[float, float, dict[str, dict[str, float]]]:
+    """Time and share of the falling rate with the least overshoot after the jump, and what each does.
+
+    Only such settings count whose first step is at 95 % no later than with clamping, a tick apart; where
+    there is none the fastest is taken. The true state is fed back, so that noise decides nothing.
+    """
+    reference = built_in(model, "jump")
+    clamped = _jump(rig, model, reference, _orientation(model, reference, replace(pid, clamping=True)))
+    plain = _jump(rig, model, reference, _orientation(model, reference, pid))
+    best: tuple[tuple[float, float], float, float, dict[str, float]] | None = None
+    trials: Sequence[Pair] = [(T, share) for T in _TIMES_S for share in _SHARES]
+    for done, (T, share) in enumerate(trials):
+        progress(done, len(trials))
+        found = _jump(rig, model, reference, _back(reference, _back_of(model, pid, T, share)))
+        late = max(found["rise_s"] - clamped["rise_s"] - model.tick_s, 0.0)
+        merit = (round(late, 6), found["overshoot_after_jump_rad"])
+        if best is None or merit < best[0]:
+            best = merit, T, share, found
+    assert best is not None
+    return best[1], best[2], {"pid": plain, "clamping": clamped, "back_calculation": best[3]}
+
+
+def _jump(rig: SimulatedRig, model: Model, reference: Reference, law: Law) -> dict[str, float]:
+    run = simulate(rig, at_rest(rig), law, len(reference.q_m), 0, "truth")
+    figures = tracking(
+        reference, run.states[:, :2], run.pwm, rig.plant.bellows_radius_m, model.low_pwm, model.high_pwm
+    )
+    never = reference.duration_s
+    return {
+        "overshoot_after_jump_rad": figures.jump_overshoot_rad or 0.0,
+        "rise_s": never if figures.rise_s is None else figures.rise_s,
+    }
