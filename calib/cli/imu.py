@@ -144,9 +144,10 @@ def static(
         write_atomically(imu_yaml, kalibr_imu(section))
         narrate(f"Kalibr's imu.yaml written to {shown(imu_yaml)}")
     if figures is not None:
-        from calib.stages.imu.plots import write_imu_figures
+        from calib.show.draw import write_figures
+        from calib.stages.imu.plots import static_plots
 
-        write_imu_figures(figures, result, section.verdict)
+        write_figures(figures, static_plots(result, section.verdict))
         narrate(f"figures in {shown(figures)}")
     if as_json:
         document("imu static", {"imu": section_json(section)})
@@ -271,9 +272,10 @@ def intrinsics(
     write_rig(rig, before.model_copy(update={"imu_intrinsics": section}), {"imu_intrinsics": hashes})
     narrate(f"imu_intrinsics written to {shown(rig)}")
     if figures is not None:
-        from calib.stages.imu.plots import write_imu_intrinsics_figures
+        from calib.show.draw import write_figures
+        from calib.stages.imu.plots import intrinsics_plots
 
-        write_imu_intrinsics_figures(figures, result, section.verdict)
+        write_figures(figures, intrinsics_plots(result, section.verdict))
         narrate(f"figures in {shown(figures)}")
     if as_json:
         document("imu intrinsics", {"imu_intrinsics": section_json(section)})
@@ -436,9 +438,10 @@ def tune(
     write_rig(rig, before.model_copy(update={"orientation_filter": section}), {"orientation_filter": hashes})
     narrate(f"orientation_filter written to {shown(rig)}")
     if figures is not None:
-        from calib.stages.imu.plots import write_tune_figures
+        from calib.show.draw import write_figures
+        from calib.stages.imu.plots import tune_plots
 
-        write_tune_figures(figures, result, pieces, section)
+        write_figures(figures, tune_plots(result, pieces, section))
         narrate(f"figures in {shown(figures)}")
     if as_json:
         document("imu tune", {"orientation_filter": section_json(section)})
@@ -540,9 +543,10 @@ def drift(
         remarks += said
     results: list[LogDrift] = [analyse_drift(log, tuned, peers, narrate) for log in read]
     if figures is not None:
-        from calib.stages.imu.plots import write_drift_figures
+        from calib.show.draw import write_figures
+        from calib.stages.imu.plots import drift_plots
 
-        write_drift_figures(figures, results)
+        write_figures(figures, drift_plots(results))
         narrate(f"figures in {shown(figures)}")
     section = drift_document(results, hashes, tuned, remarks)
     if as_json:

@@ -258,7 +258,7 @@ def spaced(count: int) -> FloatArray:
     return np.arange(count) / max(count - 1, 1)
 
 
-def thinned(x: FloatArray, y: FloatArray, most: int = MOST_POINTS) -> tuple[FloatArray, FloatArray]:
+def thinned(x: AnyArray, y: AnyArray, most: int = MOST_POINTS) -> tuple[AnyArray, AnyArray]:
     """At most about `most` points of a line (n,), the least and the largest of each stretch."""
     size = -(-2 * len(y) // most)
     if size <= 2:
