@@ -315,7 +315,7 @@ _LIBRARIES = (
     "scipy.optimize",
     "scipy.signal",
     "numba",
-    "calib.show.style",
+    "calib.show.draw",
 )
 """What most verbs need and takes long to load; the first of them sets up the others."""
 

@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 import yaml
 
+from calib.core.plot import Plot
 from thesis import control, mechanics, sensing
-from thesis.plot import Plot
+from thesis.plot import curves_of
 from thesis.runs import Values
 
 KINDS = ("math", "plant", "data")
@@ -198,7 +199,7 @@ def words(examined: Sequence[Examined]) -> list[str]:
 
 def golden_figure(plot: Plot | None, values: Values) -> dict[str, Any]:
     """What a test holds of a figure: its values, and of each curve the size and means of x, y and |y|."""
-    curves = [] if plot is None else plot.curves
+    curves = [] if plot is None else curves_of(plot)
     means = [[float(np.nanmean(v)) for v in (curve.x, curve.y, np.abs(curve.y))] for curve in curves]
     return {"values": values, "curves": [[len(c.x), *mean] for c, mean in zip(curves, means, strict=True)]}
 

@@ -15,6 +15,7 @@ import math
 import numpy as np
 
 from calib.core.arrays import FloatArray
+from calib.core.plot import Band, Curve, Plot
 from calib.stages.actuator.kinematics import forward, inverse
 from calib.stages.actuator.pump import PWM_MAX, ElongationForce
 from calib.stages.control.laws import (
@@ -33,7 +34,7 @@ from calib.stages.control.laws import (
 from calib.stages.control.references import AngleSteps, Ellipse, PolynomialElongation
 from calib.twin.scenarios import StepResponse, at_rest, step_response
 from calib.twin.simulate import Run, Seen, simulate
-from thesis.plot import Band, Curve, Plot
+from thesis.plot import curve, curves_of
 from thesis.runs import (
     RigMaker,
     Values,
@@ -133,7 +134,7 @@ def _angle_run(controller: str, gain: int = 1000, seconds: float = 5.0, feedback
 
 def _angle_reference(run: Run) -> Curve:
     reference = AngleSteps((_ANGLE_RAD, _JUMP_RAD), (_JUMP_S,)).angle_rad(run.t_s + 1e-9)
-    return Curve("reference", run.t_s, reference, "dotted", -1)
+    return curve("reference", run.t_s, reference, "dotted", -1)
 
 
 def unsaturated(run: Run, pid: Pid) -> FloatArray:
@@ -149,13 +150,13 @@ def _response(run: Run, phi: FloatArray) -> StepResponse:
     return step_response(run.tick_s, phi[run.t_s < _JUMP_S - 1e-6], _ANGLE_RAD)
 
 
-_LIMITS = (Band(PWM_MAX, 1e6, "beyond 255", True), Band(-1e6, PWM_MIN, "below 0", True))
+_LIMITS = (Band("y", PWM_MAX, 1e6, "beyond 255"), Band("y", -1e6, PWM_MIN, "below 0"))
 
 
 def figure_4_2() -> tuple[Plot, Values]:
     runs = {gain: _angle_run("p", gain) for gain in _GAINS}
     curves = [
-        Curve(f"Kp = {gain}", run.t_s, seen(run)[:, 0], colour=k)
+        curve(f"Kp = {gain}", run.t_s, seen(run)[:, 0], colour=k)
         for k, (gain, run) in enumerate(runs.items())
     ]
     plot = Plot("time (s)", "angle (rad)", (*curves, _angle_reference(runs[500])))
@@ -167,19 +168,19 @@ def figure_4_3() -> tuple[Plot, Values]:
     for k, gain in enumerate(_GAINS):
         run = _angle_run("p", gain)
         u = unsaturated(run, Pid(float(gain)))[:, 0]
-        curves.append(Curve(f"Kp = {gain}", run.t_s, u, colour=k))
+        curves.append(curve(f"Kp = {gain}", run.t_s, u, colour=k))
         values[f"first_{gain}_pwm"] = float(u[0])
         values[f"free_{gain}_s"] = first_time_s(run, u < PWM_MAX)
     label = "output of the driving controller (PWM)"
-    return Plot("time (s)", label, tuple(curves), _LIMITS[:1], y_limits=(0.0, 3700.0)), values
+    return Plot("time (s)", label, (_LIMITS[0], *curves), y_limits=(0.0, 3700.0)), values
 
 
 def figure_4_4() -> tuple[Plot, Values]:
     run, model = _angle_run("pid"), _angle_run("pid", feedback="truth")
     ours, true = _response(run, seen(run)[:, 0]), _response(model, model.phi_rad)
     curves = (
-        Curve("seen by the firmware", run.t_s, seen(run)[:, 0], colour=0),
-        Curve("fed with the true state", model.t_s, model.phi_rad, "dashed", 1),
+        curve("seen by the firmware", run.t_s, seen(run)[:, 0], colour=0),
+        curve("fed with the true state", model.t_s, model.phi_rad, "dashed", 1),
         _angle_reference(run),
     )
     return Plot("time (s)", "angle (rad)", curves), {
@@ -195,10 +196,10 @@ def figure_4_5() -> tuple[Plot, Values]:
     run = _angle_run("pid")
     u = unsaturated(run, _PID)
     curves = (
-        Curve("driving controller (the source's u2)", run.t_s, u[:, 0], colour=0),
-        Curve("the other", run.t_s, u[:, 1], colour=1),
+        curve("driving controller (the source's u2)", run.t_s, u[:, 0], colour=0),
+        curve("the other", run.t_s, u[:, 1], colour=1),
     )
-    return Plot("time (s)", "output (PWM)", curves, _LIMITS, y_limits=(-1400.0, 1400.0)), {
+    return Plot("time (s)", "output (PWM)", (*_LIMITS, *curves), y_limits=(-1400.0, 1400.0)), {
         "free_s": first_time_s(run, u[:, 0] < PWM_MAX),
         "late_pwm": float(u[-60:, 0].mean()),
         "first_pwm": float(u[0, 0]),
@@ -228,8 +229,8 @@ def _jumps() -> dict[str, tuple[Curve, Curve, Run]]:
     out = {}
     for k, (name, pid) in enumerate((("PID", _PID), ("PID with clamping", _CLAMPED))):
         run = _angle_run("clamping" if pid.clamping else "pid", seconds=10.0)
-        angle = Curve(name, run.t_s, seen(run)[:, 0], colour=k)
-        output = Curve(name, run.t_s, unsaturated(run, pid)[:, 0], colour=k)
+        angle = curve(name, run.t_s, seen(run)[:, 0], colour=k)
+        output = curve(name, run.t_s, unsaturated(run, pid)[:, 0], colour=k)
         out["clamping" if pid.clamping else "pid"] = angle, output, run
     return out
 
@@ -247,7 +248,7 @@ def figure_4_7() -> tuple[Plot, Values]:
 def figure_4_8() -> tuple[Plot, Values]:
     curves = [output for _, output, _ in _jumps().values()]
     label = "output of the driving controller (PWM)"
-    return Plot("time (s)", label, tuple(curves), _LIMITS, y_limits=(-700.0, 900.0)), {
+    return Plot("time (s)", label, (*_LIMITS, *curves), y_limits=(-700.0, 900.0)), {
         f"{name}_below_s": float(np.sum(output.y[run.t_s >= _JUMP_S] < PWM_MIN) * run.tick_s)
         for name, (_, output, run) in _jumps().items()
     }
@@ -258,8 +259,8 @@ def figure_4_9() -> tuple[Plot, Values]:
     curves, values = [], {"saturated_percent": _saturated_percent(nominal)}
     for k, (name, (controller, gain)) in enumerate(cases.items()):
         run, model = (_angle_run(controller, gain, feedback=feedback) for feedback in ("sensors", "truth"))
-        curves.append(Curve(name, run.t_s, seen(run)[:, 0], "line", k))
-        curves.append(Curve("", model.t_s, model.phi_rad, "dashed", k))
+        curves.append(curve(name, run.t_s, seen(run)[:, 0], "line", k))
+        curves.append(curve("", model.t_s, model.phi_rad, "dashed", k))
         off = float(1e3 * (seen(run)[:, 0] - model.phi_rad)[-60:].mean())
         values[f"off_{name.replace('Kp = ', 'p')}_mrad"] = off
     return Plot("time (s)", "angle (rad)", tuple(curves)), values
@@ -355,8 +356,8 @@ def figure_4_11() -> tuple[Plot, Values]:
     q = np.concatenate([np.linspace(0.062, line.from_m - 1e-9, 40), np.linspace(line.from_m, 0.097, 160)])
     output = np.array([feed_forward(line, value) for value in q.tolist()])
     curves = (
-        Curve("(4.6)", 1e3 * q, output, colour=0),
-        Curve("steady lengths of (2.13), corrected", 1e3 * steady, pwm, "dashed", 1),
+        curve("(4.6)", 1e3 * q, output, colour=0),
+        curve("steady lengths of (2.13), corrected", 1e3 * steady, pwm, "dashed", 1),
     )
     values: Values = {"at_91mm_pwm": feed_forward(line, 0.091), "saturates_mm": 1e3 * line.saturates_at_m}
     return Plot("wanted length of a bellows (mm)", "feed-forward (PWM)", curves), values
@@ -367,12 +368,12 @@ def figure_4_12() -> tuple[Plot, Values]:
     curves, values = [], {}
     for k, (name, words) in enumerate(names.items()):
         run = _length_run(name)
-        curves.append(Curve(words, run.t_s, _seen_length_mm(run), colour=k))
+        curves.append(curve(words, run.t_s, _seen_length_mm(run), colour=k))
         errors = 1e3 * (_set_point_m(run) - lengths_m(run))
         values[f"rms_{name.replace('+', '_')}_mm"] = float(np.sqrt(np.mean(errors**2)))
         values[f"end_{name.replace('+', '_')}_mm"] = float(_true_length_mm(run)[-1])
     values["pid_moves_s"] = _moves_s(_length_run("pid"))
-    reference = Curve("reference", run.t_s, 1e3 * _set_point_m(run)[:, 0], "dotted", -1)
+    reference = curve("reference", run.t_s, 1e3 * _set_point_m(run)[:, 0], "dotted", -1)
     return Plot("time (s)", "length of the actuator (mm)", (*curves, reference)), values
 
 
@@ -380,8 +381,8 @@ def figure_4_13() -> tuple[Plot, Values]:
     run = _length_run("pd+ff")
     errors, true = (1e3 * (_set_point_m(run) - q) for q in (seen(run)[:, 1:], lengths_m(run)))
     q1, q2 = errors[run.t_s >= 6.0].mean(axis=0).tolist()
-    curves = tuple(Curve(f"bellows {i + 1}", run.t_s, errors[:, i], colour=i) for i in range(2))
-    return Plot("time (s)", "reference less length (mm)", curves, (Band(6.0, 10.0, "static"),)), {
+    curves = tuple(curve(f"bellows {i + 1}", run.t_s, errors[:, i], colour=i) for i in range(2))
+    return Plot("time (s)", "reference less length (mm)", (Band("x", 6.0, 10.0, "static"), *curves)), {
         "largest_mm": float(np.abs(errors).max()),
         "largest_true_mm": float(np.abs(true).max()),
         "static_q1_mm": q1,
@@ -398,10 +399,10 @@ def figure_4_22() -> tuple[Plot, Values]:
     early = run.t_s <= 3.0
     t = run.t_s[early]
     curves = (
-        Curve("printed damping", t, _true_length_mm(printed)[early], colour=1),
-        Curve("nominal model", t, _true_length_mm(model)[early], colour=0),
-        Curve("seen by the firmware", t, _seen_length_mm(run)[early], "points", -1),
-        Curve("reference", t, 1e3 * _set_point_m(run)[early, 0], "dotted", -1),
+        curve("printed damping", t, _true_length_mm(printed)[early], colour=1),
+        curve("nominal model", t, _true_length_mm(model)[early], colour=0),
+        curve("seen by the firmware", t, _seen_length_mm(run)[early], "points", -1),
+        curve("reference", t, 1e3 * _set_point_m(run)[early, 0], "dotted", -1),
     )
     return Plot("time (s)", "length of the actuator (mm)", curves), {"swings_back_mm": _rebound_mm(printed)}
 
@@ -410,8 +411,8 @@ def figure_4_23() -> tuple[Plot, Values]:
     run = _length_run("pd+ff", _START_M)
     off = _true_length_mm(_length_model(nominal)) - _seen_length_mm(run)
     values: Values = {"largest_mm": float(np.abs(off).max()), "late_mm": float(off[run.t_s >= 6.0].mean())}
-    curve = Curve("nominal model less run", run.t_s, off, colour=0)
-    return Plot("time (s)", "model less run (mm)", (curve,)), values
+    off_by = curve("nominal model less run", run.t_s, off, colour=0)
+    return Plot("time (s)", "model less run (mm)", (off_by,)), values
 
 
 # Ellipse (4.2)
@@ -493,7 +494,7 @@ def phases(reference_m: FloatArray, tick_s: float) -> tuple[Band, ...]:
         edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(int)))
         if len(edges):
             longest = int(np.argmax(np.diff(edges)[::2]))
-            out.append(Band(edges[2 * longest] * tick_s, edges[2 * longest + 1] * tick_s, name))
+            out.append(Band("x", edges[2 * longest] * tick_s, edges[2 * longest + 1] * tick_s, name))
     return tuple(out)
 
 
@@ -509,9 +510,9 @@ def _head_mm(q_m: FloatArray) -> FloatArray:
 def _place(run: Run, reference_m: FloatArray) -> tuple[Plot, Values]:
     ours, reference, true = (_head_mm(q) for q in (seen(run)[:, 1:], reference_m, lengths_m(run)))
     curves = (
-        Curve("seen by the firmware", *ours.T, colour=0),
-        Curve("reference", *reference.T, "dashed", -1),
-        Curve("start", *ours[:1].T, "points", 1),
+        curve("seen by the firmware", *ours.T, colour=0),
+        curve("reference", *reference.T, "dashed", -1),
+        curve("start", *ours[:1].T, "points", 1),
     )
     return Plot("x (mm)", "y (mm), away from the base", curves, equal=True, down=True), {
         "rms_mm": float(_late_rms(run, np.linalg.norm(true - reference, axis=1))),
@@ -522,10 +523,10 @@ def _place(run: Run, reference_m: FloatArray) -> tuple[Plot, Values]:
 def _lengths(run: Run, reference_m: FloatArray) -> tuple[Plot, Values]:
     ours, reference = 1e3 * seen(run)[:, 1:], 1e3 * reference_m
     curves = (
-        Curve("bellows 1", run.t_s, ours[:, 0], colour=0),
-        Curve("bellows 2", run.t_s, ours[:, 1], colour=1),
-        Curve("references", run.t_s, reference[:, 0], "dashed", -1),
-        Curve("", run.t_s, reference[:, 1], "dashed", -1),
+        curve("bellows 1", run.t_s, ours[:, 0], colour=0),
+        curve("bellows 2", run.t_s, ours[:, 1], colour=1),
+        curve("references", run.t_s, reference[:, 0], "dashed", -1),
+        curve("", run.t_s, reference[:, 1], "dashed", -1),
     )
     values: Values = {"least_ref_mm": float(reference.min()), "greatest_ref_mm": float(reference.max())}
     return Plot("time (s)", "length of a bellows (mm)", curves), values
@@ -536,8 +537,8 @@ def _errors(run: Run, reference_m: FloatArray) -> tuple[Plot, Values]:
     ours, true = (1e3 * (reference_m - q) for q in (seen(run)[:, 1:], lengths_m(run)))
     inside = np.any([(t >= band.begin) & (t < band.end) for band in bands], axis=0)
     q1, q2 = _late_rms(run, ours).tolist()
-    curves = tuple(Curve(f"bellows {i + 1}", t, ours[:, i], colour=i) for i in range(2))
-    return Plot("time (s)", "reference less length (mm)", curves, bands, y_limits=(-4.0, 4.0)), {
+    curves = tuple(curve(f"bellows {i + 1}", t, ours[:, i], colour=i) for i in range(2))
+    return Plot("time (s)", "reference less length (mm)", (*bands, *curves), y_limits=(-4.0, 4.0)), {
         "rms_q1_mm": q1,
         "rms_q2_mm": q2,
         "between_mm": float(np.abs(true[~inside & (t >= 2.0)]).max()),
@@ -578,8 +579,8 @@ def _reference_angle_rad() -> FloatArray:
 def figure_4_17() -> tuple[Plot, Values]:
     run, reference = _ellipse_run(), _reference_angle_rad()
     curves = (
-        Curve("seen by the firmware", run.t_s, seen(run)[:, 0], colour=0),
-        Curve("reference", run.t_s, reference, "dashed", -1),
+        curve("seen by the firmware", run.t_s, seen(run)[:, 0], colour=0),
+        curve("reference", run.t_s, reference, "dashed", -1),
     )
     return Plot("time (s)", "angle (rad)", curves), {"greatest_ref_rad": float(np.abs(reference).max())}
 
@@ -588,8 +589,8 @@ def figure_4_18() -> tuple[Plot, Values]:
     run, reference = _ellipse_run(), _reference_angle_rad()
     error = reference - seen(run)[:, 0]
     turns = np.flatnonzero(np.diff(np.sign(np.gradient(reference)))[3:-3]) + 3
-    curve = Curve("error", run.t_s, error, colour=0)
-    return Plot("time (s)", "reference less angle (rad)", (curve,), y_limits=(-0.1, 0.1)), {
+    off_by = curve("error", run.t_s, error, colour=0)
+    return Plot("time (s)", "reference less angle (rad)", (off_by,), y_limits=(-0.1, 0.1)), {
         "rms_mrad": float(1e3 * _late_rms(run, error)),
         "turns": " and ".join(f"{t:.1f} s" for t in run.t_s[turns].tolist()),
     }
@@ -609,10 +610,10 @@ def figure_4_21() -> tuple[Plot, Values]:
 
 def figure_4_24() -> tuple[Plot, Values]:
     plot, _ = figure_4_14()
-    run, reference, start = plot.curves
+    run, reference, start = curves_of(plot)
     head = _head_mm(lengths_m(_ellipse_model()))
     apart = _late_rms(_ellipse_model(), np.linalg.norm(head - _head_mm(_recorded_m()), axis=1))
-    curves = (run, reference, Curve("nominal model", *head.T, colour=1), start)
+    curves = (run, reference, curve("nominal model", *head.T, colour=1), start)
     return Plot(plot.x, plot.y, curves, equal=True, down=True), {"apart_mm": float(apart)}
 
 
@@ -622,9 +623,9 @@ def figure_4_25() -> tuple[Plot, Values]:
     curves = []
     for i in range(2):
         curves += [
-            Curve(f"bellows {i + 1}, firmware", run.t_s, ours[:, i], colour=i),
-            Curve(f"bellows {i + 1}, model", run.t_s, model[:, i], "dashed", i),
-            Curve("" if i else "references", run.t_s, reference[:, i], "dotted", -1),
+            curve(f"bellows {i + 1}, firmware", run.t_s, ours[:, i], colour=i),
+            curve(f"bellows {i + 1}, model", run.t_s, model[:, i], "dashed", i),
+            curve("" if i else "references", run.t_s, reference[:, i], "dotted", -1),
         ]
     q1, q2 = _late_rms(run, model - ours).tolist()
     return Plot("time (s)", "length of a bellows (mm)", tuple(curves)), {"rms_q1_mm": q1, "rms_q2_mm": q2}

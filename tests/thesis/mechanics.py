@@ -14,6 +14,7 @@ from fractions import Fraction
 import numpy as np
 
 from calib.core.arrays import FloatArray
+from calib.core.plot import Band, Plot
 from calib.stages.actuator.dynamics import coriolis_matrix, kinetic_energy_J, linearised, mass_matrix
 from calib.stages.actuator.identify import (
     Nominal,
@@ -41,7 +42,7 @@ from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import at_rest, elongation_mm, fall_time_s, tick_times
 from calib.twin.sensors import normal, stream
 from calib.twin.simulate import Run, simulate
-from thesis.plot import Band, Curve, Plot
+from thesis.plot import curve
 from thesis.runs import (
     PRINTED_C_DMP,
     PRINTED_C_SPR,
@@ -148,10 +149,10 @@ def figure_3_2() -> tuple[Plot, Values]:
     kappa = np.linspace(0.0, 0.5 * np.pi, 101)[1:] / _LENGTH_M
     errors = {n: np.abs(_head_error_mm(kappa * _LENGTH_M, n)[0]) for n in (1, 3, 5, 7, 9)}
     curves = [
-        Curve(f"order {n}", kappa, np.maximum(e, _TINY), colour=k) for k, (n, e) in enumerate(errors.items())
+        curve(f"order {n}", kappa, np.maximum(e, _TINY), colour=k) for k, (n, e) in enumerate(errors.items())
     ]
     labels = "curvature (1/m)", "exact less series, size (mm)"
-    plot = Plot(*labels, tuple(curves), log_y=True, y_limits=(1e-9, 30.0))
+    plot = Plot(*labels, tuple(curves), log="y", y_limits=(1e-9, 30.0))
     return plot, {f"order_{n}_mm": float(e[-1]) for n, e in errors.items()}
 
 
@@ -160,32 +161,32 @@ def figure_3_3() -> tuple[Plot, Values]:
     errors = np.array([_head_error_mm(phi, n)[0] for n in orders])
     rms, largest, x = np.sqrt(np.mean(errors**2, axis=1)), np.abs(errors).max(axis=1), np.array(orders, float)
     curves = (
-        Curve("largest", x, largest, "points", 1),
-        Curve("", x, largest, "dotted", 1),
-        Curve("RMS", x, rms, "points", 0),
-        Curve("", x, rms, "dotted", 0),
+        curve("largest", x, largest, "points", 1),
+        curve("", x, largest, "dotted", 1),
+        curve("RMS", x, rms, "points", 0),
+        curve("", x, rms, "dotted", 0),
     )
     values: Values = {f"rms_{n}_mm": float(v) for n, v in zip(orders, rms, strict=True)}
-    return Plot("order of the series", "error (mm)", curves, log_y=True), values
+    return Plot("order of the series", "error (mm)", curves, log="y"), values
 
 
 def figure_3_4() -> tuple[Plot, Values]:
     phi = np.linspace(-np.pi, np.pi, 201)
     exact = 2.0 / chord_ratio(phi)
-    curves = [Curve(f"order {n}", phi, _f_series(phi, n), "dashed", k) for k, n in enumerate((0, 2, 4, 6))]
-    plot = Plot("angle (rad)", "f", (Curve("exact", phi, exact, "line", -1), *curves))
+    curves = [curve(f"order {n}", phi, _f_series(phi, n), "dashed", k) for k, n in enumerate((0, 2, 4, 6))]
+    plot = Plot("angle (rad)", "f", (curve("exact", phi, exact, "line", -1), *curves))
     return plot, {"at_0": float(exact[100]), "at_pi": float(exact[-1])}
 
 
 def figure_3_5() -> tuple[Plot, Values]:
     phi = np.linspace(0.05, np.pi, 200)
     curves = [
-        Curve(f"order {n}", phi, np.maximum(np.abs(_f_error(phi, n)), _TINY), colour=k)
+        curve(f"order {n}", phi, np.maximum(np.abs(_f_error(phi, n)), _TINY), colour=k)
         for k, n in enumerate((0, 2, 4, 6))
     ]
     at, nearer = _f_error(np.array([0.5 * np.pi, 1.5])).tolist()
-    curves.append(Curve("pi / 2", np.array([0.5 * np.pi]), np.array([at]), "points", -1))
-    plot = Plot("angle (rad)", "exact less series", tuple(curves), log_y=True, y_limits=(1e-13, 3.0))
+    curves.append(curve("pi / 2", np.array([0.5 * np.pi]), np.array([at]), "points", -1))
+    plot = Plot("angle (rad)", "exact less series", tuple(curves), log="y", y_limits=(1e-13, 3.0))
     return plot, {"at_half_pi": at, "at_1p5": nearer}
 
 
@@ -349,7 +350,7 @@ def _energies_mJ() -> tuple[FloatArray, FloatArray, FloatArray]:
 
 def figure_3_7() -> tuple[Plot, Values]:
     t, moving, turning = _energies_mJ()
-    curves = (Curve("moving", t, moving, colour=0), Curve("turning", t, turning, colour=1))
+    curves = (curve("moving", t, moving, colour=0), curve("turning", t, turning, colour=1))
     values: Values = {
         "ratio": float(turning.sum() / moving.sum()), "greatest_moving_mJ": float(moving.max())
     }  # fmt: skip
@@ -363,9 +364,9 @@ def figure_3_8() -> tuple[Plot, Values]:
     percent = np.where(some, 100.0 * turning / np.where(some, whole, 1.0), np.nan)
     mean, span = float(100.0 * turning.sum() / whole.sum()), t[[0, -1]]
     curves = (
-        Curve("at each moment", t, percent, colour=0),
-        Curve("over the swing", span, np.full(2, mean), "dashed", -1),
-        Curve("in the text", span, np.full(2, 20.0), "dotted", 1),
+        curve("at each moment", t, percent, colour=0),
+        curve("over the swing", span, np.full(2, mean), "dashed", -1),
+        curve("in the text", span, np.full(2, 20.0), "dotted", 1),
     )
     plot = Plot("time (s)", "share of the rotation (%)", curves, y_limits=(0.0, 105.0))
     return plot, {"percent": mean, "straight_percent": dyn_ke_share()["percent"]}
@@ -390,10 +391,10 @@ def figure_3_9() -> tuple[Plot, Values]:
     eps, force, fits = _weighed()
     fine = np.linspace(0.0, float(eps.max()) * 1.03, 120)
     curves = [
-        Curve(name, 1e3 * fine, fit.force_N(fine), colour=k)
+        curve(name, 1e3 * fine, fit.force_N(fine), colour=k)
         for k, (name, fit) in enumerate(zip(_LAWS, fits, strict=True))
     ]
-    measured = Curve("simulated weights", 1e3 * eps, force, "points", -1)
+    measured = curve("simulated weights", 1e3 * eps, force, "points", -1)
     values: Values = {f"left_out_{k + 1}_mN": 1e3 * fit.left_out_rms_N for k, fit in enumerate(fits)}
     return Plot("displacement (mm)", "force on the actuator (N)", (measured, *curves)), values
 
@@ -401,13 +402,13 @@ def figure_3_9() -> tuple[Plot, Values]:
 def figure_3_10() -> tuple[Plot, Values]:
     eps, force, fits = _weighed()
     fine, law = np.linspace(0.0, float(eps.max()) * 1.03, 120), nominal().plant.stiffness
-    curves = [Curve("force over displacement", 1e3 * eps[1:], force[1:] / eps[1:], "points", -1)]
+    curves = [curve("force over displacement", 1e3 * eps[1:], force[1:] / eps[1:], "points", -1)]
     curves += [
-        Curve(name, 1e3 * fine, np.asarray(np.polyval(fit.coefficients[::-1], fine)), colour=k)
+        curve(name, 1e3 * fine, np.asarray(np.polyval(fit.coefficients[::-1], fine)), colour=k)
         for k, (name, fit) in enumerate(zip(_LAWS, fits, strict=True))
     ]
     truth = 2.0 * np.array([law.secant(e) for e in fine.tolist()])
-    curves.append(Curve("truth", 1e3 * fine, truth, "dotted", -1))
+    curves.append(curve("truth", 1e3 * fine, truth, "dotted", -1))
     (k0, k1), (sigma_k0, sigma_k1) = fits[1].coefficients.tolist(), fits[1].sigma.tolist()
     return Plot("displacement (mm)", "stiffness (N/m)", tuple(curves)), {
         "k0_N_per_m": k0, "sigma_k0_N_per_m": sigma_k0,
@@ -512,8 +513,8 @@ def figure_3_11() -> tuple[Plot, Values]:
     t, phi = _swing(other_rig).t_s, _seen_column(2)
     decay = decrement(t, phi, _SIGMA[0])
     curves = (
-        Curve("as the camera shows it", t, phi, colour=0),
-        Curve("peaks that are used", decay.peak_at_s, decay.peak, "points", 1),
+        curve("as the camera shows it", t, phi, colour=0),
+        curve("peaks that are used", decay.peak_at_s, decay.peak, "points", 1),
     )
     return Plot("time (s)", "angle (rad)", curves), {
         "zeta": decay.zeta, "sigma_zeta": decay.sigma, "frequency_hz": decay.frequency_hz
@@ -523,8 +524,8 @@ def figure_3_11() -> tuple[Plot, Values]:
 def figure_3_12() -> tuple[Plot, Values]:
     t, q1, rest = _swing(other_rig).t_s, _seen_column(0), 1e3 * nominal().plant.rest_length_m
     curves = (
-        Curve("as the camera shows it", t, q1, colour=0),
-        Curve("rest length", t[[0, -1]], np.full(2, rest), "dotted", -1),
+        curve("as the camera shows it", t, q1, colour=0),
+        curve("rest length", t[[0, -1]], np.full(2, rest), "dotted", -1),
     )
     values: Values = {"first_mm": float(q1[:3].mean()), "last_mm": float(q1[-30:].mean())}
     return Plot("time (s)", "length of bellows 1 (mm)", curves), values
@@ -536,7 +537,7 @@ def _against(rig: Callable[[], SimulatedRig], column: int) -> tuple[Plot, Values
     model, true = (scale * _columns(_swing(one))[:, column] for one in (rig, other_rig))
     norm = float(np.linalg.norm(model - seen))
     name, colour = ("original model", 1) if rig is first_model else ("improved model", 0)
-    curves = (Curve("simulated rig", t, seen, "points", -1), Curve(name, t, model, colour=colour))
+    curves = (curve("simulated rig", t, seen, "points", -1), curve(name, t, model, colour=colour))
     label = "angle (rad)" if column == 2 else f"length of bellows {column + 1} (mm)"
     return Plot("time (s)", label, curves), {
         "samples": len(t),
@@ -675,8 +676,8 @@ def figure_3_16() -> tuple[Plot, Values]:
     seen, true = np.array(rows), np.array([run.phi_rad[-1] for run in runs])
     mean, spread = seen.mean(axis=1), T_OF_TWO * seen.std(axis=1, ddof=1) / math.sqrt(3)
     curves = (
-        Curve("mean of three seconds, 95 %", volts, mean, "bars", -1, spread),
-        Curve("truth", volts, true, "line", 0),
+        curve("mean of three seconds, 95 %", volts, mean, "points", -1, spread),
+        curve("truth", volts, true, "line", 0),
     )
     values: Values = {"at_12V_rad": float(true[-1]), "bias_mrad": float(1e3 * np.mean(mean - true))}
     return Plot("motor input (V)", "angle (rad)", curves), values
@@ -690,10 +691,10 @@ def figure_3_17() -> tuple[Plot, Values]:
     bending = plant.bending_N_per_rad2 * phi * np.abs(phi)
     pump = ends[:, STATE.index("force1_N")]
     curves = (
-        Curve("spring of the driven bellows (3.38)", phi, force[:, 0], colour=0),
-        Curve("spring of the other", phi, force[:, 1], "points", 1),
-        Curve("k phi^2 of (3.44)", phi, bending, "dashed", 2),
-        Curve("driving pump", phi, pump, "points", -1),
+        curve("spring of the driven bellows (3.38)", phi, force[:, 0], colour=0),
+        curve("spring of the other", phi, force[:, 1], "points", 1),
+        curve("k phi^2 of (3.44)", phi, bending, "dashed", 2),
+        curve("driving pump", phi, pump, "points", -1),
     )
     last = {"phi_rad": phi, "spring_N": force[:, 0], "bending_N": bending, "pump_N": pump}
     return Plot("angle (rad)", "force (N)", curves), {name: float(v[-1]) for name, v in last.items()}
@@ -704,8 +705,8 @@ def figure_3_23() -> tuple[Plot, Values]:
     for k, volt in enumerate(("6.0", "8.0", "10.0", "12.0")):
         other, model = (tried("deflate", 8.0, rig=r, volt=volt, off_at_s="100") for r in (other_rig, nominal))
         name = f"{float(volt):g}"
-        curves.append(Curve(f"{name} V", other.t_s, seen_elongation_mm(other), "line", k))
-        curves.append(Curve("", model.t_s, elongation_mm(model), "dashed", k))
+        curves.append(curve(f"{name} V", other.t_s, seen_elongation_mm(other), "line", k))
+        curves.append(curve("", model.t_s, elongation_mm(model), "dashed", k))
         values[f"off_{name}V_mm"] = float(elongation_mm(model)[-1] - elongation_mm(other)[-1])
     return Plot("time (s)", "elongation (mm)", tuple(curves)), values
 
@@ -713,12 +714,12 @@ def figure_3_23() -> tuple[Plot, Values]:
 def figure_3_24() -> tuple[Plot, Values]:
     other, limited, printed = (tried("deflate", 14.0, rig=r) for r in (leaking_rig, nominal, printed_rate))
     curves = (
-        Curve("rig with an orifice", other.t_s, seen_elongation_mm(other), "points", -1),
-        Curve("falling limit of 0.4 N/s", limited.t_s, elongation_mm(limited), colour=0),
-        Curve("printed limit of 2 N/s", printed.t_s, elongation_mm(printed), "dashed", 1),
+        curve("rig with an orifice", other.t_s, seen_elongation_mm(other), "points", -1),
+        curve("falling limit of 0.4 N/s", limited.t_s, elongation_mm(limited), colour=0),
+        curve("printed limit of 2 N/s", printed.t_s, elongation_mm(printed), "dashed", 1),
     )
-    on = Band(0.0, 5.0, "motors on")
-    plot = Plot("time (s)", "elongation (mm)", curves, (on,), y_limits=(-1.5, 31.0))
+    on = Band("x", 0.0, 5.0, "motors on")
+    plot = Plot("time (s)", "elongation (mm)", (on, *curves), y_limits=(-1.5, 31.0))
     return plot, {
         f"deflation_{name}_s": fall_time_s(run.tick_s, elongation_mm(run)[300:]) or math.nan
         for name, run in (("orifice", other), ("0p4", limited), ("2", printed))

@@ -14,6 +14,7 @@ from scipy.integrate import solve_ivp
 from scipy.ndimage import median_filter
 
 from calib.core.arrays import FloatArray
+from calib.core.plot import Plot
 from calib.stages.actuator.kinematics import forward, head_from_marker, marker_from_head, transform
 from calib.stages.actuator.pump import ElongationForce
 from calib.stages.camera.bundle import Calibration, calibrate
@@ -26,7 +27,7 @@ from calib.twin.rig import workspace_homography
 from calib.twin.scenarios import elongation_mm
 from calib.twin.scene import PrintedBoard, corner_pixels
 from calib.twin.simulate import Run
-from thesis.plot import Curve, Plot
+from thesis.plot import curve
 from thesis.runs import Values, angles_rad, figure, once, share_of_way_s, tried
 
 _LOGS = range(5)
@@ -110,7 +111,7 @@ def figure_2_4() -> tuple[Plot, Values]:
     for seed in _LOGS:
         run = tried("static", 60.0, seed=seed)
         t, phi = run.imu.taken_s[::20], np.degrees(run.onchip_rad[::20])
-        curves.append(Curve(f"log {seed + 1}", t, phi - phi[0], colour=seed))
+        curves.append(curve(f"log {seed + 1}", t, phi - phi[0], colour=seed))
     slopes = [figure("onchip_drift_degps", "static", 60.0, seed=seed) for seed in _LOGS]
     values: Values = {
         "mean_degps": float(np.mean(slopes)), "least_degps": min(slopes), "greatest_degps": max(slopes)
@@ -125,10 +126,10 @@ def figure_2_6() -> tuple[Plot, Values]:
     turned = acc[0] + np.concatenate([[0.0], np.cumsum(0.5 * (gyro[1:] + gyro[:-1]) * np.diff(t))])
     kept, truth = _filtered(run, Mahony()), angles_rad(run, t)
     curves = (
-        Curve("accelerometer", t, acc, colour=5),
-        Curve("gyroscope, integrated", t, turned, colour=1),
-        Curve("filter", t, kept, colour=0),
-        Curve("truth", t, truth, "dashed", -1),
+        curve("accelerometer", t, acc, colour=5),
+        curve("gyroscope, integrated", t, turned, colour=1),
+        curve("filter", t, kept, colour=0),
+        curve("truth", t, truth, "dashed", -1),
     )
     return Plot("time (s)", "angle (rad)", curves), {
         "accelerometer_mrad": float(1e3 * np.std(acc - truth)),
@@ -301,8 +302,8 @@ def figure_2_10() -> tuple[Plot, Values]:
     held = (run.t_s >= 3.0) & (run.t_s < 5.0)
     rough, fine = (float(1e3 * np.std(np.diff(v[held]))) for v in (x, smooth))
     curves = (
-        Curve("from the camera", run.t_s, 1e3 * x, colour=0),
-        Curve("after the low-pass", run.t_s, 1e3 * smooth, colour=1),
+        curve("from the camera", run.t_s, 1e3 * x, colour=0),
+        curve("after the low-pass", run.t_s, 1e3 * smooth, colour=1),
     )
     values: Values = {"rough_mm": rough, "fine_mm": fine, "delay_ms": 1e3 * dc_delay_s(low, 60.0)}
     return Plot("time (s)", "x of the marker (mm)", curves), values
@@ -330,9 +331,9 @@ def figure_2_11() -> tuple[Plot, Values]:
     cubic = np.polyfit(volts[active], mean[active], 3)
     text = np.asarray(np.polyval(ElongationForce().elongation_mm, fine))
     curves = (
-        Curve("mean of three runs, 95 %", volts, mean, "bars", -1, spread),
-        Curve("cubic through them", fine, np.asarray(np.polyval(cubic, fine)), colour=0),
-        Curve("(2.13) with 3.756 for 3.376", fine, text, "dashed", 1),
+        curve("mean of three runs, 95 %", volts, mean, "points", -1, spread),
+        curve("cubic through them", fine, np.asarray(np.polyval(cubic, fine)), colour=0),
+        curve("(2.13) with 3.756 for 3.376", fine, text, "dashed", 1),
     )
     values: Values = {"at_12V_mm": float(mean[-1]), "at_4V_mm": float(mean[0]), "cubic_u3": float(cubic[0])}
     return Plot("motor input (V)", "elongation (mm)", curves), values
@@ -342,6 +343,6 @@ def figure_2_12() -> tuple[Plot, Values]:
     curves, values = [], {}
     for k, volt in enumerate((6.0, 8.0, 10.0, 12.0)):
         run = _step(volt, k)
-        curves.append(Curve(f"{volt:g} V", run.t_s, seen_elongation_mm(run), colour=k))
+        curves.append(curve(f"{volt:g} V", run.t_s, seen_elongation_mm(run), colour=k))
         values[f"to_63_percent_{volt:g}V_s"] = share_of_way_s(run, elongation_mm(run), 1.0 - math.exp(-1.0))
     return Plot("time (s)", "elongation (mm)", tuple(curves)), values

@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from figure_checks import complaints_of as complaints
-from figure_checks import drawn_texts
+from figure_checks import complaints, words_of
 
-from calib.show.style import look
+from calib.core.plot import KINDS as CURVES
 from calib.stages.actuator.dynamics import coriolis_matrix, mass_matrix
 from calib.stages.actuator.kinematics import forward_jacobian
 from calib.stages.actuator.parameters import Plant
@@ -36,10 +35,10 @@ from thesis.book import (
     row,
     words,
 )
-from thesis.plot import KINDS as CURVES
+from thesis.plot import curves_of
 from thesis.robustness import varied
 from thesis.runs import nominal, tried, use
-from thesis.sheets import draw, write_figures
+from thesis.sheets import figure, write_figures
 
 GOLDEN = json.loads(Path(__file__).with_name("golden.json").read_text())
 """Written by `python tests/thesis --golden`; a difference is to be explained, not refreshed away."""
@@ -79,19 +78,17 @@ def test_every_figure_is_whole_and_as_before(drawing: Drawing) -> None:
     if plot is None:
         assert drawing.boxes and drawing.wires
         return
-    labels = [curve.label for curve in plot.curves if curve.label]
+    labels = [curve.label for curve in curves_of(plot) if curve.label]
     assert labels and len(set(labels)) == len(labels)
-    for curve in plot.curves:
+    for curve in curves_of(plot):
         assert curve.kind in CURVES and len(curve.x) == len(curve.y) > 0
         assert np.isfinite(curve.x).all() and np.isfinite(curve.y).mean() > 0.5
 
 
 def _legible(drawing: Drawing) -> None:
-    with look():
-        figure = draw(drawing, *drawing.make())
-        assert complaints(figure) == []
-        texts = " ".join(text.get_text() for text in drawn_texts(figure)).replace("\n", " ")
-    assert f"Figure {drawing.number}, simulated." in texts
+    one = figure(drawing, *drawing.make())
+    assert complaints(one) == []
+    assert f"Figure {drawing.number}, simulated." in words_of(one)
 
 
 @pytest.mark.parametrize("number", ["3.17", "4.3", "4.10", "4.16"])
@@ -216,7 +213,7 @@ def test_values_are_those_of_closed_forms(claim: str, value: str, expected: floa
 
 def test_forces_are_in_balance_in_the_steady_angle() -> None:
     plot, _ = mechanics.figure_3_17()
-    spring, other, bending, pump = (curve.y for curve in plot.curves)
+    spring, other, bending, pump = (curve.y for curve in curves_of(plot))
     assert pump == pytest.approx(spring + bending, abs=0.01)
     assert other == pytest.approx(bending, abs=0.01)
 
