@@ -9,6 +9,7 @@ A colour is the name of a hue, or a place from 0 to 1 on a scale for things in a
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -181,7 +182,7 @@ class Plot:
 
     x: str = ""
     y: str = ""
-    marks: tuple[Mark, ...] = ()
+    marks: Sequence[Mark] = ()
     title: str = ""
     x_limits: Limits | None = None
     y_limits: Limits | None = None
@@ -214,7 +215,7 @@ class Figure:
 
     title: str
     note: str
-    panels: tuple[Plot, ...]
+    panels: Sequence[Plot]
     height_in: float
     verdict: str = "ok"
     columns: int = 1

@@ -21,19 +21,18 @@ from calib.io.logs import Log, write_log
 from calib.show.draw import draw, plain
 from calib.stages import function, stage
 from calib.stages.camera.bundle import Calibration, calibrate, covariance, rotation_exp
+from calib.stages.camera.checks import cell_means
 from calib.stages.camera.intrinsics import Intrinsics
-from calib.stages.camera.lens import PlaneView, analyse_distortion
-from calib.stages.camera.model import Camera, View, pack, project
-from calib.stages.camera.plane import Plane, calibrate_plane
-from calib.stages.camera.plots import (
-    cell_means,
+from calib.stages.camera.lens import (
+    PlaneView,
+    analyse_distortion,
     inverse_error,
-    lens_plots,
-    picture,
-    plane_plots,
     radial_displacement,
     radial_sigma,
 )
+from calib.stages.camera.model import Camera, View, pack, project
+from calib.stages.camera.plane import Plane, calibrate_plane
+from calib.stages.camera.plots import lens_plots, picture, plane_plots
 from calib.stages.camera.plots import plots as camera_plots
 from calib.stages.camera.verdict import Judgement
 from calib.stages.lowpass.filters import Design, design_lowpass

@@ -50,7 +50,7 @@ def _scheme(drawing: Drawing, values: Values) -> Plot:
         edge(np.concatenate([wire for wire, *_ in drawing.wires]), axis=0) for edge in (np.min, np.max)
     )
     limits = ((low[0] - 0.4, high[0] + 0.4), (low[1] - 0.6, high[1] + 0.9))
-    return Plot("", "", tuple(marks), "", *limits, equal=True, bare=True)
+    return Plot("", "", marks, "", *limits, equal=True, bare=True)
 
 
 def _thin(mark: Mark) -> Mark:

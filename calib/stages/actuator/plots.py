@@ -73,7 +73,7 @@ def _motion(result: Identified) -> Figure:
                 Plot("time (s)", y, marks, "" if column else short(track.name, 40), y_limits=limits)
             )
     high, verdict = 2.0 * len(tracks) + 0.3, result.judgement.verdict
-    return Figure("Simulated against measured", note, tuple(panels), high, verdict, columns=2)
+    return Figure("Simulated against measured", note, panels, high, verdict, columns=2)
 
 
 def _measured(t: FloatArray, values: FloatArray) -> Curve:
@@ -120,7 +120,7 @@ def _parameters(result: Identified) -> Figure:
         marks.append(Curve(after, np.arange(len(names)), one.name, kind, hue, 5.0))
     labels = tuple(f"{name} ({PARAMETERS[name].symbol})" for name in names)
     title = f"What is known of the parameters ({SIGMA} / value)"
-    panel = Plot("%", "", tuple(marks), grid="x", names=labels)
+    panel = Plot("%", "", marks, grid="x", names=labels)
     return Figure(title, note, (panel,), 1.1 + 0.36 * len(names))
 
 
@@ -139,7 +139,7 @@ def _damping(result: Identified) -> Figure:
             fitted = "" if of_fit is None else f", that of the fit {of_fit:.4f}"
             title = f"{short(track.name, 30)}: zeta {d.zeta:.4f} +- {d.sigma:.1g}{fitted}"
             panels.append(Plot("time (s)", "angle (rad)", marks, title, y_limits=(-top, top)))
-    whole = tuple(panels) or (Plot(empty="no free swing with enough peaks"),)
+    whole = panels or (Plot(empty="no free swing with enough peaks"),)
     return Figure("Damping by peaks", note, whole, 2.1 * len(whole), result.judgement.verdict)
 
 
@@ -157,8 +157,7 @@ def stiffness_plots(
         left.append(Curve(1e3 * x, fit.force_N(x), name, "line", hue, size))
         right.append(Curve(1e3 * x, fit.force_N(x) / x, name, "line", hue, size))
     panels = tuple(
-        Plot("elongation (mm)", y, tuple(marks))
-        for y, marks in (("force (N)", left), ("stiffness (N/m)", right))
+        Plot("elongation (mm)", y, marks) for y, marks in (("force (N)", left), ("stiffness (N/m)", right))
     )
     note = "Laws through zero; the thick one is used."
     return {"identify_stiffness": Figure("Springs", note, panels, 3.5, columns=2)}
@@ -202,9 +201,9 @@ def _runs(result: PumpFound, verdict: str) -> Figure:
             errors.append(f"{held[model].get(record.name, rms):.2f}")
         title = f"{short(record.name, 20)}: {' / '.join(errors)}"
         x, y = "time (s)" if i + 3 >= len(records) else "", "" if i % 3 else result.unit
-        panels.append(Plot(x, y, tuple(marks), title, (0.0, longest)))
+        panels.append(Plot(x, y, marks, title, (0.0, longest)))
     title, high = "The pump's models against the recordings", 2.1 * -(-len(records) // 3) + 0.3
-    return Figure(title, note, tuple(panels), high, verdict, columns=3)
+    return Figure(title, note, panels, high, verdict, columns=3)
 
 
 def _left_over(result: PumpFound, verdict: str) -> Figure:
@@ -226,7 +225,7 @@ def _left_over(result: PumpFound, verdict: str) -> Figure:
         )
         y = "" if panels else f"error ({result.unit})"
         panels.append(Plot("time (s)", y, marks, model, y_limits=(-most, most)))
-    return Figure("What is left over", note, tuple(panels), 3.0, verdict, columns=len(panels))
+    return Figure("What is left over", note, panels, 3.0, verdict, columns=len(panels))
 
 
 def _static(result: PumpFound, verdict: str) -> Figure:
@@ -243,7 +242,7 @@ def _static(result: PumpFound, verdict: str) -> Figure:
         at, value = np.array(group.pwm[1:2]), np.array([group.value])
         marks.append(Curve(at, value, kind="squares", colour="red", size=5.0))
         marks.append(Text(at[0] - 3.0, value[0], f"{len(group.names)} runs", align="right"))
-    return Figure("Static map", note, (Plot("PWM", result.unit, tuple(marks)),), 3.6, verdict)
+    return Figure("Static map", note, (Plot("PWM", result.unit, marks),), 3.6, verdict)
 
 
 # ----------------------------------------------------------------------
@@ -294,7 +293,7 @@ def _validation(one: Comparison) -> Figure:
             left.append(Curve(t, simulated, model, "line", _VALIDATED[model], 1.1))
             right.append(Curve(t, measured - simulated, "", "line", _VALIDATED[model], 0.9))
         x, limits = "time (s)" if row == len(QUANTITIES) - 1 else "", (float(t[0]), float(t[-1]))
-        panels.append(Plot(x, y, tuple(left), "" if row else "Curves", limits))
-        panels.append(Plot(x, "", tuple(right), "" if row else "Measured less simulated", limits))
+        panels.append(Plot(x, y, left, "" if row else "Curves", limits))
+        panels.append(Plot(x, "", right, "" if row else "Measured less simulated", limits))
     title = f"Model against log: {short(one.name, 50)}"
-    return Figure(title, note, tuple(panels), 6.6, columns=2, widths=(1.5, 1.0), coarse=True)
+    return Figure(title, note, panels, 6.6, columns=2, widths=(1.5, 1.0), coarse=True)

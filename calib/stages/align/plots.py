@@ -40,7 +40,7 @@ def _residuals(fit: Alignment, log: int, verdict: str) -> Figure:
     for y, sensor, channel in _ROWS:
         x = "time (s)" if y == _ROWS[-1][0] else ""
         panels.append(_panel(traces, sensor, channel, x, y))
-    return Figure(title, note, tuple(panels), 7.4, verdict, coarse=True)
+    return Figure(title, note, panels, 7.4, verdict, coarse=True)
 
 
 def _panel(traces: list[Trace], sensor: str, channel: int, x: str, y: str) -> Plot:
@@ -62,7 +62,7 @@ def _panel(traces: list[Trace], sensor: str, channel: int, x: str, y: str) -> Pl
         marks += [_cloud(t, old, limit, "before"), _cloud(t[good], new[good], limit, "after")]
         bad = np.clip(new[~good], -0.95 * limit, 0.95 * limit)
         marks.append(Curve(t[~good], bad, kind="crosses", colour="red"))
-    return Plot(x, y, tuple(marks), x_limits=(0.0, end - zero), y_limits=(-limit, limit), grid="y")
+    return Plot(x, y, marks, x_limits=(0.0, end - zero), y_limits=(-limit, limit), grid="y")
 
 
 def _cloud(t: FloatArray, values: FloatArray, limit: float, label: str) -> Curve:

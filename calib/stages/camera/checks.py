@@ -156,12 +156,19 @@ def coverage(calibration: Calibration) -> Coverage:
 
 
 def _cells(pixels: FloatArray, camera: Camera, columns: int, rows: int) -> BoolArray:
-    width, height = camera.image_size_px
-    column = np.clip((pixels[:, 0] + 0.5) / width * columns, 0, columns - 1).astype(np.int64)
-    row = np.clip((pixels[:, 1] + 0.5) / height * rows, 0, rows - 1).astype(np.int64)
+    column, row = cell_of(pixels, camera.image_size_px, columns, rows)
     hit = np.zeros((rows, columns), dtype=np.bool_)
     hit[row, column] = True
     return hit
+
+
+def cell_of(
+    pixels: FloatArray, image_size_px: tuple[int, int], columns: int, rows: int
+) -> tuple[IntArray, IntArray]:
+    """Column and row of the cell of the picture in which each pixel (n, 2) lies."""
+    column = np.clip((pixels[:, 0] + 0.5) / image_size_px[0] * columns, 0, columns - 1).astype(np.int64)
+    row = np.clip((pixels[:, 1] + 0.5) / image_size_px[1] * rows, 0, rows - 1).astype(np.int64)
+    return column, row
 
 
 def _widest_angle_deg(normals: FloatArray) -> float:
@@ -232,6 +239,55 @@ def _least_slope(camera: Camera, radius: float) -> float:
     radial[2:4] = 0.0
     distorted, _ = distort(r, np.zeros_like(r), radial)
     return float(np.min(np.diff(distorted) / np.diff(r)))
+
+
+# ----------------------------------------------------------------------
+# Residuals over the picture: chance points every way, what is left unexplained agrees with its neighbours.
+
+_LEAST_IN_CELL = 6
+"""Points from which a cell's mean residual says something."""
+
+
+@dataclass(frozen=True)
+class Means:
+    """Mean residuals of cells of the picture.
+
+    Attributes
+    ----------
+    at, mean : (n, 2) centres of the cells and mean residuals, px.
+    by_chance : (n,) radius that 95 % of such means stay within when the errors are chance, px.
+    outside : (n,) which do not.
+    reach_px : what an arrow may take without running into the next cell's.
+    """
+
+    at: FloatArray
+    mean: FloatArray
+    by_chance: FloatArray
+    outside: BoolArray
+    reach_px: float
+
+
+def cell_means(fit: Calibration, at: FloatArray, vectors: FloatArray, weights: FloatArray) -> Means:
+    """Means over about 8 x 6 cells, with the weights of a robust loss where there is one."""
+    width, height = fit.camera.image_size_px
+    columns = 8 if width >= height else max(3, round(8 * width / height))
+    rows = max(2, round(columns * height / width))
+    column, row = cell_of(at, (width, height), columns, rows)
+    cell = row * columns + column
+    used = np.bincount(cell, minlength=rows * columns) >= _LEAST_IN_CELL
+    total = np.stack([np.bincount(cell, weights * vectors[:, k], rows * columns) for k in (0, 1)], axis=1)
+    weight = np.bincount(cell, weights, rows * columns)[used]
+    mean = total[used] / weight[:, None]
+    centre = np.stack(np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5), axis=-1).reshape(-1, 2)
+    # 95 % of two-dimensional Gaussian vectors are shorter than 2.448 standard deviations.
+    by_chance = 2.448 * fit.sigma_px / np.sqrt(weight)
+    return Means(
+        at=centre[used] * [width / columns, height / rows] - 0.5,
+        mean=mean,
+        by_chance=by_chance,
+        outside=np.hypot(mean[:, 0], mean[:, 1]) > by_chance,
+        reach_px=0.6 * min(width / columns, height / rows),
+    )
 
 
 # ----------------------------------------------------------------------

@@ -10,7 +10,16 @@ import numpy as np
 from calib.core.arrays import AnyArray, BoolArray, FloatArray
 from calib.core.errors import BadInputError
 from calib.core.geometry import apply_homography, fit_homography
-from calib.stages.camera.model import Camera, distort, project, undistort
+from calib.stages.camera.bundle import Covariance
+from calib.stages.camera.model import (
+    INTRINSICS,
+    Camera,
+    camera_from_vector,
+    distort,
+    project,
+    undistort,
+    vector_from_camera,
+)
 from calib.stages.camera.plane import visible, workspace_grid
 from calib.stages.camera.pose import projection_with_derivatives
 
@@ -344,7 +353,7 @@ def distortion_kind(camera: Camera) -> str:
     radial[2:4] = 0.0
     steps = np.diff(distort(r, np.zeros_like(r), radial)[0] / r)
     rise, fall = float(steps[steps > 0].sum()), float(-steps[steps < 0].sum())
-    seen_px = r[-1] * _focal(camera)
+    seen_px = r[-1] * focal_px(camera)
     if max(rise, fall) * seen_px < 1e-9:
         # The numerator and the denominator of the rational model cancel.
         return "decentering" if p1 or p2 else "none"
@@ -353,7 +362,8 @@ def distortion_kind(camera: Camera) -> str:
     return "pincushion" if rise > fall else "barrel"
 
 
-def _focal(camera: Camera) -> float:
+def focal_px(camera: Camera) -> float:
+    """Geometric mean of the focal lengths."""
     return float(np.sqrt(camera.fx_px * camera.fy_px))
 
 
@@ -446,8 +456,8 @@ def analyse_distortion(
         region_max_px=float(inside.max()),
         region_mean_px=float(inside.mean()),
         monotonic=corner < fold,
-        fold_px=fold * _focal(camera),
-        corner_px=corner * _focal(camera),
+        fold_px=fold * focal_px(camera),
+        corner_px=corner * focal_px(camera),
         region_sigma_px=None if sigma is None else float(sigma.min()),
         plane=cost,
         inverse=fit_inverse(camera, tolerance_px),
@@ -506,3 +516,50 @@ def _judge(
             "against",
         )
     return ("negligible" if small else "matters"), reason
+
+
+# ----------------------------------------------------------------------
+# What figures show of a lens.
+
+
+def ideal_pixels(camera: Camera, pixels: FloatArray) -> FloatArray:
+    """Where a lens without distortion shows what is seen at pixels (n, 2)."""
+    ideal = undistort(camera, pixels)
+    return np.asarray(np.column_stack([ideal, np.ones(len(ideal))]) @ camera.K[:2].T)
+
+
+def radial_displacement(camera: Camera, radius_px: FloatArray) -> FloatArray:
+    """Displacement along the radius at ideal radii, the radial part of the model alone, pixels."""
+    k1, k2, _, _, k3, k4, k5, k6 = camera.distortion
+    r2 = (radius_px / focal_px(camera)) ** 2
+    factor = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    return np.asarray(radius_px * (factor - 1.0))
+
+
+def radial_sigma(camera: Camera, covariance: Covariance, radius_px: FloatArray) -> FloatArray:
+    """Standard deviation of `radial_displacement` to first order, infinite where views do not bound it."""
+    if not np.all(np.isfinite(covariance.intrinsics)):
+        return np.full(len(radius_px), np.inf)
+    vector = vector_from_camera(camera)
+    rows = []
+    for name, sigma in covariance.sigma().items():
+        step = np.zeros(len(vector))
+        step[INTRINSICS.index(name)] = 1e-4 * sigma or 1e-9
+        ahead, behind = (
+            radial_displacement(
+                camera_from_vector(camera.model, camera.image_size_px, vector + sign * step), radius_px
+            )
+            for sign in (1.0, -1.0)
+        )
+        rows.append((ahead - behind) / (2.0 * step.sum()))
+    J = np.array(rows).reshape(-1, len(radius_px))
+    variance = np.einsum("pr,pq,qr->r", J, covariance.intrinsics, J)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+
+def inverse_error(camera: Camera, inverse: InversePolynomial, pixels: FloatArray) -> FloatArray:
+    """Distance in pixels (n,) between both inverses, NaN where the lens model has none."""
+    exact, shown = exact_inverse(camera, pixels)
+    approximate = undistort_by_polynomial(inverse, distorted_normalised(camera, pixels))
+    error = np.linalg.norm((approximate - exact) @ camera.K[:2, :2].T, axis=1)
+    return np.asarray(np.where(shown, error, np.nan))

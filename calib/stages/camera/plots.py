@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -39,7 +39,7 @@ from calib.core.plot import (
     spaced,
 )
 from calib.stages.camera.bundle import Calibration, Covariance, projection_sigma_px
-from calib.stages.camera.checks import hull
+from calib.stages.camera.checks import Means, cell_means, cell_of, hull
 from calib.stages.camera.intrinsics import Candidate, Intrinsics
 from calib.stages.camera.lens import (
     DistortionReport,
@@ -47,15 +47,19 @@ from calib.stages.camera.lens import (
     displacement_field,
     distorted_normalised,
     distortion_kind,
-    exact_inverse,
+    focal_px,
     fold_radius,
+    ideal_pixels,
+    inverse_error,
     pixel_grid,
-    undistort_by_polynomial,
+    radial_displacement,
+    radial_sigma,
 )
-from calib.stages.camera.model import INTRINSICS, Camera, camera_from_vector, undistort, vector_from_camera
+from calib.stages.camera.model import Camera, undistort, vector_from_camera
 from calib.stages.camera.plane import Plane, to_pixels, visible
 
 Size = tuple[int, int]
+_RADIUS = "distance from the principal point (px)"
 
 
 def plots(result: Intrinsics) -> dict[str, Figure]:
@@ -120,13 +124,6 @@ def _grid_over(size: Size, across: int) -> tuple[FloatArray, FloatArray, FloatAr
     return u, v, np.stack(np.meshgrid(u, v), axis=-1)
 
 
-def _cells(pixels: FloatArray, size: Size, columns: int, rows: int) -> tuple[IntArray, IntArray]:
-    """Column and row of the cell of the picture in which each pixel (n, 2) lies."""
-    column = np.clip((pixels[:, 0] + 0.5) / size[0] * columns, 0, columns - 1).astype(np.int64)
-    row = np.clip((pixels[:, 1] + 0.5) / size[1] * rows, 0, rows - 1).astype(np.int64)
-    return column, row
-
-
 # ----------------------------------------------------------------------
 # What the fit leaves over: how large the residuals are, view by view, and where they point.
 
@@ -135,8 +132,6 @@ _MOST_NAMED = 26
 _ROUNDING_PX = 1e-9
 """No corner is measured to this; residuals below it are those of arithmetic."""
 _MOST_ARROWS = 720
-_LEAST_IN_CELL = 6
-"""Points from which a cell's mean residual is worth an arrow."""
 
 
 def _points(fit: Calibration) -> tuple[IntArray, ...]:
@@ -194,7 +189,7 @@ def _cloud(fit: Calibration) -> Plot:
     outside = int(np.any(np.abs(residuals) > limit, axis=1).sum())
     farther = f"Each point; {outside} farther out, up to {number(float(distance.max()), 'px')}"
     title = farther if outside else "Each point, coloured as its view"
-    return Plot(x, y, tuple(marks), title, (-limit, limit), (-limit, limit), equal=True, down=True)
+    return Plot(x, y, marks, title, (-limit, limit), (-limit, limit), equal=True, down=True)
 
 
 def _residuals(fit: Calibration, verdict: str) -> Figure:
@@ -213,9 +208,9 @@ def _residuals(fit: Calibration, verdict: str) -> Figure:
         nothing = f"no residuals: the fit ended as {fit.termination!r}"
     elif float(np.abs(vectors).max()) < _ROUNDING_PX:
         nothing = "the residuals are rounding errors"
-    panels = (
-        (picture(size, (), empty=nothing),) * 2 if nothing else (_each(size, at, vectors), _mean(size, means))
-    )
+    panels = (_each(size, at, vectors), _mean(size, means))
+    if nothing:
+        panels = (picture(size, (), empty=nothing),) * 2
     title = "Where the residuals point, over the picture"
     return Figure(title, note, panels, panel_height_in(0.5, size), verdict, columns=2)
 
@@ -239,7 +234,7 @@ def _times(vectors: FloatArray, reach: float) -> float:
 
 def _mean(size: Size, means: Means) -> Plot:
     if len(means.at) == 0:
-        return picture(size, (), empty=f"no cell of the picture holds {_LEAST_IN_CELL} points or more")
+        return picture(size, (), empty="no cell of the picture holds enough points")
     lengths = np.maximum(np.hypot(*means.mean.T), means.by_chance)
     times = magnified(means.reach_px, float(np.quantile(lengths, 0.9)))
     discs = [
@@ -248,48 +243,6 @@ def _mean(size: Size, means: Means) -> Plot:
     ]
     arrows = Arrows(means.at, means.mean, times, "px")
     return picture(size, (*discs, arrows), f"Mean of each cell, drawn {times:g} times")
-
-
-@dataclass(frozen=True)
-class Means:
-    """Mean residuals of cells of the picture.
-
-    Attributes
-    ----------
-    at, mean : (n, 2) centres of the cells and mean residuals, px.
-    by_chance : (n,) radius that 95 % of such means stay within when the errors are chance, px.
-    outside : (n,) which do not.
-    reach_px : what an arrow may take without running into the next cell's.
-    """
-
-    at: FloatArray
-    mean: FloatArray
-    by_chance: FloatArray
-    outside: BoolArray
-    reach_px: float
-
-
-def cell_means(fit: Calibration, at: FloatArray, vectors: FloatArray, weights: FloatArray) -> Means:
-    """Means over about 8 x 6 cells, with the weights of a robust loss where there is one."""
-    width, height = fit.camera.image_size_px
-    columns = 8 if width >= height else max(3, round(8 * width / height))
-    rows = max(2, round(columns * height / width))
-    column, row = _cells(at, (width, height), columns, rows)
-    cell = row * columns + column
-    used = np.bincount(cell, minlength=rows * columns) >= _LEAST_IN_CELL
-    total = np.stack([np.bincount(cell, weights * vectors[:, k], rows * columns) for k in (0, 1)], axis=1)
-    weight = np.bincount(cell, weights, rows * columns)[used]
-    mean = total[used] / weight[:, None]
-    centre = np.stack(np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5), axis=-1).reshape(-1, 2)
-    # 95 % of two-dimensional Gaussian vectors are shorter than 2.448 standard deviations.
-    by_chance = 2.448 * fit.sigma_px / np.sqrt(weight)
-    return Means(
-        at=centre[used] * [width / columns, height / rows] - 0.5,
-        mean=mean,
-        by_chance=by_chance,
-        outside=np.hypot(mean[:, 0], mean[:, 1]) > by_chance,
-        reach_px=0.6 * min(width / columns, height / rows),
-    )
 
 
 # ----------------------------------------------------------------------
@@ -347,10 +300,9 @@ def _rays(camera: Camera) -> FloatArray:
     width, height = camera.image_size_px
     corners = rectangle(0.0, 0.0, width - 1.0, height - 1.0)
     ideal = undistort(camera, corners)
-    plain_y = (corners[:, 1] - camera.cy_px) / camera.fy_px
-    plain_x = (corners[:, 0] - camera.cx_px - camera.skew_px * plain_y) / camera.fx_px
-    ideal = np.where(np.isfinite(ideal), ideal, np.stack([plain_x, plain_y], axis=1))
-    return np.column_stack([ideal, np.ones(4)])
+    return np.column_stack(
+        [np.where(np.isfinite(ideal), ideal, distorted_normalised(camera, corners)), np.ones(4)]
+    )
 
 
 def _scene(fit: Calibration, usable: list[int], colours: FloatArray) -> Plot:
@@ -376,7 +328,7 @@ def _scene(fit: Calibration, usable: list[int], colours: FloatArray) -> Plot:
     marks += [Shape(np.stack([np.zeros(3), corner]) @ _LOOK.T) for corner in cone]
     drawn = [one.points if isinstance(one, Shape) else [[one.x, one.y]] for one in marks]
     (left, below), (right, above) = (edge(np.concatenate(drawn), axis=0) for edge in (np.min, np.max))
-    return Plot(marks=tuple(marks), x_limits=(left, right), y_limits=(below, above), equal=True, bare=True)
+    return Plot(marks=marks, x_limits=(left, right), y_limits=(below, above), equal=True, bare=True)
 
 
 def _on_sheet(place: FloatArray, k: int, value: float) -> tuple[float, float]:
@@ -404,9 +356,8 @@ def _floor(points: FloatArray) -> list[Shape | Text]:
         out = np.array(outwards, dtype=np.float64)
         for value in step * np.arange(math.ceil(low[k] / step), math.floor(high[k] / step) + 1):
             far = corner - (high - low) * out if k < 2 else corner - 0.02 * widest * out
-            marks.append(
-                Shape(np.stack([_on_sheet(corner, k, value), _on_sheet(far, k, value)]), edge="silver")
-            )
+            ends = np.array([_on_sheet(corner, k, value), _on_sheet(far, k, value)])
+            marks.append(Shape(ends, edge="silver"))
             marks.append(Text(*_on_sheet(corner + 0.06 * widest * out, k, value), f"{value:g}", "grey"))
         # The middle of the axis that leads away would be behind its own numbers.
         middle = float(low[k] if k == 1 else 0.5 * (low + high)[k])
@@ -426,7 +377,7 @@ def _coverage(fit: Calibration, sigma: Covariance, verdict: str) -> Figure:
     """All points over the picture with empty cells shaded, the principal point, and points by radius."""
     camera, size = fit.camera, fit.camera.image_size_px
     pixels = fit.observations.pixels[fit.observations.present]
-    filled = set(zip(*(part.tolist() for part in _cells(pixels, size, _COLUMNS, _ROWS)), strict=True))
+    filled = set(zip(*(part.tolist() for part in cell_of(pixels, size, _COLUMNS, _ROWS)), strict=True))
     wide, high = size[0] / _COLUMNS, size[1] / _ROWS
     note = (
         f"{len(filled)} of {_COLUMNS * _ROWS} cells of the picture hold points; the others are hatched. "
@@ -489,11 +440,8 @@ def _radii(size: Size, centre: FloatArray, pixels: FloatArray) -> Plot:
     reached = float(radius.max())
     last = max(last, reached)
     marks = (histogram(radius, 24, 0.0, last), Band("x", reached, last, colour="ochre", hatched=True))
-    x, title = (
-        "distance from the principal point (px)",
-        f"Points reach {100 * reached / last:.0f} % of the radius",
-    )
-    return Plot(x, "points", marks, title, (0.0, last), grid="")
+    title = f"Points reach {100 * reached / last:.0f} % of the radius"
+    return Plot(_RADIUS, "points", marks, title, (0.0, last), grid="")
 
 
 def _projection_sigma(fit: Calibration, sigma: Covariance, verdict: str) -> Figure:
@@ -544,7 +492,7 @@ def _comparison(what: str, candidates: Sequence[Candidate], chosen: str, verdict
         "RMS over views that the model was fitted to and over views held back. The simplest model is taken "
         f"that no richer one beats on views held back: {short(chosen, 20)}."
     )
-    panel = Plot("RMS (px)", "", tuple(marks), x_limits=(low, limit), grid="x", names=names)
+    panel = Plot("RMS (px)", "", marks, x_limits=(low, limit), grid="x", names=names)
     title = f"Which {what} predicts views that it has not seen"
     return Figure(title, note, (panel,), 0.42 * len(candidates) + 1.3, verdict)
 
@@ -578,7 +526,7 @@ def _distortion(fit: Calibration, covariance: Covariance, verdict: str) -> Figur
         )
     marks: tuple[Mark, ...] = ()
     if np.any(camera.distortion) and _finite(camera):
-        outline = _ideal_pixels(camera, hull(pixels))
+        outline = ideal_pixels(camera, hull(pixels))
         marks = (Shape(outline[np.isfinite(outline).all(axis=1)], kind="dashed"),)
     panels = (_map(camera, marks), _along_radius(camera, covariance, pixels))
     return _lens_figure(camera, "How far lens distortion moves what is seen", note, panels, verdict)
@@ -591,21 +539,10 @@ def _lens_figure(
     return Figure(title, note, panels, high, verdict, columns=2, widths=(1.55, 1.0))
 
 
-def _ideal_pixels(camera: Camera, pixels: FloatArray) -> FloatArray:
-    """Where a lens without distortion shows what is seen at pixels (n, 2)."""
-    ideal = undistort(camera, pixels)
-    return np.asarray(np.column_stack([ideal, np.ones(len(ideal))]) @ camera.K[:2].T)
-
-
-def _focal(camera: Camera) -> float:
-    return math.sqrt(abs(camera.fx_px * camera.fy_px))
-
-
-def _before_fold(camera: Camera, pixels: FloatArray) -> BoolArray:
+def _shown_once(camera: Camera, pixels: FloatArray) -> BoolArray:
     """Which ideal pixels (..., 2) the lens model shows once only."""
-    y = (pixels[..., 1] - camera.cy_px) / camera.fy_px
-    x = (pixels[..., 0] - camera.cx_px - camera.skew_px * y) / camera.fx_px
-    return np.asarray(np.hypot(x, y) < fold_radius(camera)[0])
+    radius = np.linalg.norm(distorted_normalised(camera, pixels), axis=-1)
+    return np.asarray(radius < fold_radius(camera)[0])
 
 
 def _map(camera: Camera, marks: tuple[Mark, ...]) -> Plot:
@@ -617,43 +554,14 @@ def _map(camera: Camera, marks: tuple[Mark, ...]) -> Plot:
         return picture(size, marks, empty="no distortion: every point is seen where an ideal lens shows it")
     u, v, pixels = _grid_over(size, 81)
     length = np.linalg.norm(displacement_field(camera, pixels), axis=-1)
-    field = Field(u, v, np.where(_before_fold(camera, pixels), length, np.nan), "px", even=True)
+    field = Field(u, v, np.where(_shown_once(camera, pixels), length, np.nan), "px", even=True)
     u, _, pixels = _grid_over(size, 15)
     at = pixels[1:-1, 1:-1].reshape(-1, 2)
-    at = at[_before_fold(camera, at)]
+    at = at[_shown_once(camera, at)]
     vectors = displacement_field(camera, at)
     times = _times(vectors, float(u[1]))
     arrows = Arrows(at, vectors, times, "px", "red")
     return picture(size, (field, arrows, *marks), f"Displacement in px; arrows drawn {times:g} times")
-
-
-def radial_displacement(camera: Camera, radius_px: FloatArray) -> FloatArray:
-    """Displacement along the radius at ideal radii, the radial part of the model alone, pixels."""
-    k1, k2, _, _, k3, k4, k5, k6 = camera.distortion
-    r2 = (radius_px / _focal(camera)) ** 2
-    factor = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-    return np.asarray(radius_px * (factor - 1.0))
-
-
-def radial_sigma(camera: Camera, covariance: Covariance, radius_px: FloatArray) -> FloatArray:
-    """Standard deviation of `radial_displacement` to first order, infinite where views do not bound it."""
-    if not np.all(np.isfinite(covariance.intrinsics)):
-        return np.full(len(radius_px), np.inf)
-    vector = vector_from_camera(camera)
-    rows = []
-    for name, sigma in covariance.sigma().items():
-        step = np.zeros(len(vector))
-        step[INTRINSICS.index(name)] = 1e-4 * sigma or 1e-9
-        ahead, behind = (
-            radial_displacement(
-                camera_from_vector(camera.model, camera.image_size_px, vector + sign * step), radius_px
-            )
-            for sign in (1.0, -1.0)
-        )
-        rows.append((ahead - behind) / (2.0 * step.sum()))
-    J = np.array(rows).reshape(-1, len(radius_px))
-    variance = np.einsum("pr,pq,qr->r", J, covariance.intrinsics, J)
-    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
 def _along_radius(
@@ -663,13 +571,13 @@ def _along_radius(
 
     With the uncertainty of a calibration, and how far its pixels (n, 2) reached.
     """
-    x, y = "distance from the principal point (px)", "moved outwards (px)"
+    x, y = _RADIUS, "moved outwards (px)"
     centre = np.array([camera.cx_px, camera.cy_px])
     corner = np.array(camera.image_size_px) - 1.0
     last = float(np.linalg.norm(np.maximum(centre, corner - centre)))
     if not (math.isfinite(last) and _finite(camera)):
         return Plot(x, y, empty="not bounded")
-    fold = min(fold_radius(camera)[0] * _focal(camera), last)
+    fold = min(fold_radius(camera)[0] * focal_px(camera), last)
     radius = np.linspace(0.0, fold, 241)
     moved = radial_displacement(camera, radius)
     bottom, top = float(moved.min()), float(moved.max())
@@ -687,15 +595,14 @@ def _along_radius(
             title += f", {SIGMA} not bounded"
     marks.append(Curve(radius, moved, size=2.2))
     if pixels is not None:
-        reached = float(
-            np.nanmax(np.append(np.linalg.norm(_ideal_pixels(camera, pixels) - centre, axis=1), 0.0))
-        )
+        distance = np.linalg.norm(ideal_pixels(camera, pixels) - centre, axis=1)
+        reached = float(np.nanmax(np.append(distance, 0.0)))
         if reached < last:
             marks.append(Band("x", reached, last, colour="ochre", hatched=True))
     if fold < last:
         marks.append(Rule("x", fold, "ink", "dotted"))
         title = "Along the radius, to where the model folds over"
-    return Plot(x, y, tuple(marks), title, (0.0, last), (bottom - 0.06 * span, top + 0.06 * span))
+    return Plot(x, y, marks, title, (0.0, last), (bottom - 0.06 * span, top + 0.06 * span))
 
 
 def _displacement(camera: Camera, report: DistortionReport) -> Figure:
@@ -718,9 +625,8 @@ def _displacement(camera: Camera, report: DistortionReport) -> Figure:
     box = rectangle(u0, v0, u1 - u0, v1 - v0)
     end = float(np.linalg.norm(box - [camera.cx_px, camera.cy_px], axis=1).max())
     right = _along_radius(camera)
-    right = replace(
-        right, marks=(*right.marks, Rule("x", end, "red")), title="Along the radius; red: end of the region"
-    )
+    marks, title = (*right.marks, Rule("x", end, "red")), "Along the radius; red: end of the region"
+    right = replace(right, marks=marks, title=title)
     panels = (_map(camera, (Shape(box, edge="red"),)), right)
     return _lens_figure(camera, "What lens distortion does to the picture", note, panels)
 
@@ -743,18 +649,10 @@ def _inverse(camera: Camera, inverse: InversePolynomial) -> Figure:
     if inverse.tolerance_px <= 4.0 * largest or largest == 0.0:
         marks.append(Rule("y", inverse.tolerance_px, "red", "dashed"))
         largest = max(largest, inverse.tolerance_px)
-    x, title = "distance from the principal point (px)", "Error over the radius"
-    right = Plot(x, "error (px)", tuple(marks), title, (0.0, float(radius.max())), (0.0, 1.15 * largest))
+    limits = ((0.0, float(radius.max())), (0.0, 1.15 * largest))
+    right = Plot(_RADIUS, "error (px)", marks, "Error over the radius", *limits)
     panels = (picture(size, (field,), "Error over the picture"), right)
     return _lens_figure(camera, "How well the firmware's polynomial undoes the lens", note, panels)
-
-
-def inverse_error(camera: Camera, inverse: InversePolynomial, pixels: FloatArray) -> FloatArray:
-    """Distance in pixels (n,) between both inverses, NaN where the lens model has none."""
-    exact, shown = exact_inverse(camera, pixels)
-    approximate = undistort_by_polynomial(inverse, distorted_normalised(camera, pixels))
-    error = np.linalg.norm((approximate - exact) @ camera.K[:2, :2].T, axis=1)
-    return np.asarray(np.where(shown, error, np.nan))
 
 
 # ----------------------------------------------------------------------
@@ -786,7 +684,7 @@ def _workspace(plane: Plane, marks: Sequence[Mark], title: str = "", empty: str 
     """World axes in mm, y downwards as the camera sees it."""
     x0, y0, x1, y1 = (1e3 * value for value in plane.workspace_m)
     limits = ((x0, x1), (y0, y1))
-    return Plot("x (mm)", "y (mm)", tuple(marks), title, *limits, grid="", equal=True, down=True, empty=empty)
+    return Plot("x (mm)", "y (mm)", marks, title, *limits, grid="", equal=True, down=True, empty=empty)
 
 
 def _plane_height_in(plane: Plane, share: float) -> float:
@@ -822,7 +720,7 @@ def _plane_sigma(plane: Plane) -> Figure:
         field = Field(*_grid(plane, lengths[name]), "mm", even=True, scale=scale)
         panels.append(_workspace(plane, (field,), f"{name}: {most}"))
     title, high = "How well a marker's position is known over the workspace", _plane_height_in(plane, 0.46)
-    return Figure(title, note, tuple(panels), 2.0 * high, plane.verdict.word, columns=2)
+    return Figure(title, note, panels, 2.0 * high, plane.verdict.word, columns=2)
 
 
 def _plane_difference(camera: Camera, plane: Plane) -> Figure:
@@ -833,9 +731,8 @@ def _plane_difference(camera: Camera, plane: Plane) -> Figure:
     seen = visible(camera, plane.R_CW, plane.t_CW_m, points_m.reshape(-1, 2)).reshape(_FINE, _FINE)
     without = np.asarray(np.linalg.inv(plane.direct.H), dtype=np.float64)
     moved_mm = np.full(points_m.shape, np.nan)
-    moved_mm[seen] = 1e3 * (
-        apply_homography(without, to_pixels(plane, camera, points_m[seen])) - points_m[seen]
-    )
+    pixels = to_pixels(plane, camera, points_m[seen])
+    moved_mm[seen] = 1e3 * (apply_homography(without, pixels) - points_m[seen])
     length = np.linalg.norm(moved_mm, axis=-1)
     finite = length[np.isfinite(length)]
     corners = 1e3 * plane.corners_m
@@ -877,9 +774,8 @@ def _plane_picture(camera: Camera, plane: Plane) -> Figure:
         part = slice(first, first + one.points)
         first += one.points
         colour: Colour = "blue" if count == 1 else float(spaced(count)[k])
-        label = (
-            f"{short(one.name, 22)}, RMS {number(one.rms_px, 'px')}" if 1 < count <= _MOST_IN_LEGEND else ""
-        )
+        words = f"{short(one.name, 22)}, RMS {number(one.rms_px, 'px')}"
+        label = words if 1 < count <= _MOST_IN_LEGEND else ""
         at = plane.corners_px[part]
         marks.append(Curve(at[:, 0], at[:, 1], label, "points", colour))
         marks.append(Arrows(at, plane.residuals_px[part], times, "" if k else "px", colour))

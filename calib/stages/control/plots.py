@@ -48,7 +48,7 @@ def run_plots(model: Model, reference: Reference, outcomes: Sequence[Outcome]) -
 
 
 def _over_time(y: str, marks: Sequence[Mark], title: str, limits: Limits | None = None) -> Plot:
-    return Plot("time (s)", y, tuple(marks), title, y_limits=limits)
+    return Plot("time (s)", y, marks, title, y_limits=limits)
 
 
 def _commands(outcomes: Sequence[Outcome]) -> list[Plot]:
@@ -98,7 +98,7 @@ def _lengths(reference: Reference, outcomes: Sequence[Outcome]) -> Figure:
         panels.append(_over_time("error (mm)", marks, f"Error of bellows {k}", (-limit, limit)))
     title = f"Lengths of the bellows: {short(reference.name, 50)}"
     panels += _commands(outcomes)
-    return Figure(title, note, tuple(panels), 8.6, mosaic=("AA", "BC", "DE"), heights=(1.3, 1.0, 0.9))
+    return Figure(title, note, panels, 8.6, mosaic=("AA", "BC", "DE"), heights=(1.3, 1.0, 0.9))
 
 
 def tune_plots(model: Model, section: Controller, orientation: Tuned, position: Tuned) -> dict[str, Figure]:
@@ -136,10 +136,10 @@ def _loop(
         phase.append(Curve(f, np.degrees(np.unwrap(np.angle(L))), colour=hue))
         nyquist.append(Curve(L.real, L.imag, colour=hue))
     x, title, limits = "frequency (Hz)", f"loop of the {name}", (0.02, float(f[-1]))
-    gains = Plot(x, "gain (dB)", tuple(gain), title.capitalize(), limits, (-50.0, 40.0), log="x")
-    phases = Plot(x, "phase (deg)", tuple(phase), f"Phase, {title}", limits, (-400.0, 20.0), log="x")
+    gains = Plot(x, "gain (dB)", gain, title.capitalize(), limits, (-50.0, 40.0), log="x")
+    phases = Plot(x, "phase (deg)", phase, f"Phase, {title}", limits, (-400.0, 20.0), log="x")
     x, y, limits = "real part", "imaginary part", (-2.2, 1.2)
-    around = Plot(x, y, tuple(nyquist), f"Nyquist, {title}", limits, (-1.3, 1.0), equal=True)
+    around = Plot(x, y, nyquist, f"Nyquist, {title}", limits, (-1.3, 1.0), equal=True)
     legend = "q1 q2 at rest (mm)"
     return replace(gains, legend="lower left", legend_title=legend), phases, around
 
@@ -171,9 +171,9 @@ def check_plots(
     most = max(float(following.given_N.max()), 0.2)
     above = "Dotted: the nearest that the pumps can give"
     panels = (
-        Plot("angle (rad)", "length (mm)", tuple(place), "Blue: what the pumps can hold; line: reference"),
+        Plot("angle (rad)", "length (mm)", place, "Blue: what the pumps can hold; line: reference"),
         _over_time("force (N)", force, above, (-0.25 * most, 1.45 * most)),
-        Plot("x (mm)", "y (mm)", tuple(head), "Head, as the camera sees it", equal=True, down=True),
+        Plot("x (mm)", "y (mm)", head, "Head, as the camera sees it", equal=True, down=True),
         _over_time("missing (mm)", missing, "Lengths that are missing"),
     )
     title = f"Can the pumps follow {short(reference.name, 50)}?"

@@ -68,7 +68,7 @@ def _figure(title: str, note: str, result: Replayed, panels: Sequence[Plot]) -> 
     shared = [replace(one, x_limits=(float(t[0]), float(t[-1]))) for one in panels]
     shared[-1] = replace(shared[-1], x="time (s)")
     title = f"{title}: {short(result.source, 78)}"
-    return Figure(title, note, tuple(shared), 6.6, result.verdict, coarse=True)
+    return Figure(title, note, shared, 6.6, result.verdict, coarse=True)
 
 
 def _line(t: FloatArray, values: FloatArray, label: str, colour: str, size: float = 0.9) -> list[Mark]:
@@ -103,7 +103,7 @@ def _states(result: Replayed) -> Figure:
         if gated.any():
             marks.append(Curve(every(t[gated]), every(value[gated]), "gated picture", "marks", "red", 6.0))
         # The bands of the start would press all else flat.
-        panels.append(Plot("", y, tuple(marks), y_limits=central(value, 0.5, 0.25)))
+        panels.append(Plot("", y, marks, y_limits=central(value, 0.5, 0.25)))
     return _figure("States", note, result, panels)
 
 
@@ -124,7 +124,7 @@ def _innovations(result: Replayed) -> Figure:
             marks.append(Curve(t[some], value[some], kind="cloud", colour=colour))
             marks.append(Curve(t[gated], value[gated], kind="crosses", colour="red"))
         empty = "" if np.isfinite(_named(trace, names[0])).any() else "not sampled"
-        panels.append(Plot("", y, tuple(marks), y_limits=(-6.0, 6.0), grid="y", empty=empty))
+        panels.append(Plot("", y, marks, y_limits=(-6.0, 6.0), grid="y", empty=empty))
     return _figure("Innovations", note, result, panels)
 
 
@@ -141,5 +141,5 @@ def _errors(result: Replayed) -> Figure:
             *_line(t, other, "baseline", "orange"),
             *_line(t, error, "estimate", "blue"),
         ]
-        panels.append(Plot("", y, tuple(marks), y_limits=central(np.concatenate([error, other]), 0.5, 0.25)))
+        panels.append(Plot("", y, marks, y_limits=central(np.concatenate([error, other]), 0.5, 0.25)))
     return _figure("Errors", note, result, panels)

@@ -105,7 +105,7 @@ def _deviation(noise: AxisNoise) -> Plot:
     marks.append(Curve(a.tau_s[some], whole[some], "fitted", colour="orange", size=2.2))
     marks.append(Curve(a.tau_s, a.deviation, "measured", colour="ink", size=1.2))
     limits = (float(np.nanmin(a.low)) / 12.0, 1.6 * float(np.nanmax(a.high)))
-    return Plot(x, y, tuple(marks), noise.axis, y_limits=limits, log="xy", corner="\n".join(words))
+    return Plot(x, y, marks, noise.axis, y_limits=limits, log="xy", corner="\n".join(words))
 
 
 def _readings(axes: Sequence[str], log: StaticLog, verdict: str) -> Figure:
@@ -126,9 +126,9 @@ def _readings(axes: Sequence[str], log: StaticLog, verdict: str) -> Figure:
             means = part.values[: count * size, k].reshape(count, size).mean(axis=1)
             middle = part.t_s[0] - zero + period * size * (np.arange(count) + 0.5)
             marks.append(Curve(middle, means, size=1.0))
-        panels.append(Plot("time (s)", _y(axis), tuple(marks), axis))
+        panels.append(Plot("time (s)", _y(axis), marks, axis))
     title, mosaic = f"Readings at rest: {short(log.source, 70)}", _by_axis(axes)
-    return Figure(title, note, tuple(panels), 2.2 * len(mosaic), verdict, mosaic=mosaic)
+    return Figure(title, note, panels, 2.2 * len(mosaic), verdict, mosaic=mosaic)
 
 
 def _drift(result: Static, verdict: str) -> Figure:
@@ -158,7 +158,7 @@ def _drift(result: Static, verdict: str) -> Figure:
         )
         limits = (0.4, len(drifts) + 0.6)
         panels.append(Plot("log", "slope (degrees/s)", marks, title, limits, whole="x", grid="y"))
-    return Figure("Drift of the angle, log by log", note, tuple(panels), 3.4, verdict, columns=2)
+    return Figure("Drift of the angle, log by log", note, panels, 3.4, verdict, columns=2)
 
 
 # ----------------------------------------------------------------------
@@ -209,7 +209,7 @@ def _disc(at: FloatArray, rings_deg: Sequence[float], centre: str, title: str) -
     for name, x, y in (("x", 1, 0), ("-x", -1, 0), ("y", 0, 1), ("-y", 0, -1), (centre, 0.03, 0.03)):
         marks.append(Text(1.12 * x, 1.12 * y, name, "grey"))
     marks.append(Curve(at[:, 0], at[:, 1], kind="points", size=6.0))
-    return Plot("", "", tuple(marks), title, (-1.25, 1.25), (-1.25, 1.25), equal=True, bare=True)
+    return Plot("", "", marks, title, (-1.25, 1.25), (-1.25, 1.25), equal=True, bare=True)
 
 
 def _residuals(result: Intrinsics, verdict: str) -> Figure:
@@ -305,7 +305,7 @@ def _angles(logs: Sequence[LogDrift]) -> Figure:
         empty = "" if marks else "nothing to draw"
         panels.append(Plot("time (s)", "" if i % 3 else "angle (degrees)", marks, name, empty=empty))
     high = 2.1 * -(-len(names) // 3) + (0.3 if len(logs) > 1 else 0.0)
-    return Figure("Drift of the angle", note, tuple(panels), high, columns=3)
+    return Figure("Drift of the angle", note, panels, high, columns=3)
 
 
 def _change(log: LogDrift, name: str, colour: Colour, logs: int) -> list[Curve]:
@@ -340,7 +340,7 @@ def _slopes(logs: Sequence[LogDrift]) -> Figure:
         half = np.nan_to_num(np.degrees([m.slope.high - m.slope.low for m in have]) / 2.0)
         marks.append(Curve(value, at, kind="points", colour=hue, spread=half, across=True))
     x = "slope (degrees/s)"
-    panel = Plot(x, "", tuple(marks), log="x", linear_within=0.01, grid="x", names=tuple(names))
+    panel = Plot(x, "", marks, log="x", linear_within=0.01, grid="x", names=tuple(names))
     return Figure("Slope by method", note, (panel,), 0.9 + 0.34 * len(names))
 
 
@@ -385,8 +385,8 @@ def _in_motion(log: LogDrift) -> Figure:
     limits = (float(t[0]), float(t[-1]))
     y = "error (degrees)" if truth is not None else "difference (degrees)"
     panels = (
-        Plot("", "angle (degrees)", tuple(above), x_limits=limits),
-        Plot("time (s)", y, tuple(below), x_limits=limits),
+        Plot("", "angle (degrees)", above, x_limits=limits),
+        Plot("time (s)", y, below, x_limits=limits),
     )
     return Figure(f"In motion: {short(log.source, 78)}", note, panels, 4.9)
 
@@ -443,9 +443,9 @@ def _gains(result: Tuning, dt_s: float, verdict: str) -> Figure:
             ):
                 marks.append(Curve(np.array([x]), np.array([y]), one.name, kind, hue, 8.0))
     panels = (
-        Plot("Kp (1/s)", "Ki (1/s\N{SUPERSCRIPT TWO})", tuple(left), above, log="xy"),
-        Plot("noise gain (variance)", "settling to 2 % (s)", tuple(middle), "Noise and settling", log="xy"),
-        Plot("lag of a step (s)", "peak per bias (s)", tuple(right), "Lag and bias", log="xy"),
+        Plot("Kp (1/s)", "Ki (1/s\N{SUPERSCRIPT TWO})", left, above, log="xy"),
+        Plot("noise gain (variance)", "settling to 2 % (s)", middle, "Noise and settling", log="xy"),
+        Plot("lag of a step (s)", "peak per bias (s)", right, "Lag and bias", log="xy"),
     )
     title = f"Gains of the angle filter: {result.recommended.name}"
     return Figure(title, note, panels, 3.9, verdict, columns=3)
@@ -476,7 +476,7 @@ def _tuning_errors(result: Tuning, pieces: Sequence[Piece], verdict: str) -> Fig
     limits = (float(t[0]), float(t[-1]))
     panels = (
         Plot("", "angle (degrees)", above, f"Grey: accelerometer; black: {by}", limits),
-        Plot("time (s)", "error (degrees)", tuple(below), x_limits=limits),
+        Plot("time (s)", "error (degrees)", below, x_limits=limits),
     )
     title = f"Errors over time: {short(piece.source, 70)}"
     return Figure(title, f"Against {by}.", panels, 4.6, verdict)

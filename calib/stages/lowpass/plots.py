@@ -38,14 +38,14 @@ _LOWEST_DB = -80.0
 
 def plots(filter_: Filter, section: LowPass, positions: Positions | None = None) -> dict[str, Figure]:
     """`lowpass_response`, and with the log's positions `lowpass_log`."""
-    title = f"{section.family}, order {section.order}, {section.cutoff_hz:g} Hz at {section.rate_hz:g} Hz"
-    figures = {"lowpass_response": _response(filter_, section, title)}
+    design = f"{section.family}, order {section.order}, {section.cutoff_hz:g} Hz at {section.rate_hz:g} Hz"
+    figures = {"lowpass_response": _response(filter_, section, design)}
     if positions is not None:
-        figures["lowpass_log"] = _on_log(filter_, section, positions, title)
+        figures["lowpass_log"] = _on_log(filter_, section, positions, design)
     return figures
 
 
-def _response(filter_: Filter, section: LowPass, title: str) -> Figure:
+def _response(filter_: Filter, section: LowPass, design: str) -> Figure:
     """Gain, group delay, step response and poles."""
     step, rate, cut = section.step, section.rate_hz, section.cutoff_hz
     overshoot = f"overshoots by {step['overshoot']:.1%}" if step["overshoot"] else "no overshoot"
@@ -55,59 +55,40 @@ def _response(filter_: Filter, section: LowPass, title: str) -> Figure:
         f"{overshoot}. Coefficients rounded to single precision."
     )
     f = np.geomspace(min(0.02 * cut, 1e-3 * rate), 0.4999 * rate, 800)
-    range_hz, at_cut = (float(f[0]), 0.5 * rate), Rule("x", cut, "red", "dashed")
+    x, limits, at_cut = "frequency (Hz)", (float(f[0]), 0.5 * rate), Rule("x", cut, "red", "dashed")
     grid = [hz for axis in section.log.axes.values() for hz in axis.quantisation_hz] if section.log else []
-    crossed = (Band("x", min(grid), max(grid), colour="ochre"),) if grid else ()
-    response = decibels(frequency_response(filter_.sections, f, rate))
-    gain = Plot(
-        "frequency (Hz)",
-        "gain (dB)",
-        (*crossed, Curve(f, response, size=2.0), at_cut),
-        "Gain; red: cut-off" + ("; shaded: pixel grid crossed" if grid else ""),
-        x_limits=range_hz,
-        y_limits=(_LOWEST_DB, 5.0),
-        log="x",
-    )
-    late = group_delay_s(filter_.sections, f, rate)
-    delay = Plot(
-        "frequency (Hz)",
-        "delay (s)",
-        (Curve(f, late, size=2.0), at_cut),
-        f"Group delay: {number(section.dc_delay_s, 's')} at 0 Hz; red: cut-off",
-        x_limits=range_hz,
-        y_limits=(0.0, 1.15 * max(section.largest_delay_s, section.dc_delay_s)),
-        log="x",
-    )
+    crossed: list[Mark] = [Band("x", min(grid), max(grid), colour="ochre")] if grid else []
+    marks = (*crossed, Curve(f, decibels(frequency_response(filter_.sections, f, rate)), size=2.0), at_cut)
+    title = "Gain; red: cut-off" + ("; shaded: pixel grid crossed" if grid else "")
+    gain = Plot(x, "gain (dB)", marks, title, limits, (_LOWEST_DB, 5.0), log="x")
+    late = (Curve(f, group_delay_s(filter_.sections, f, rate), size=2.0), at_cut)
+    most = 1.15 * max(section.largest_delay_s, section.dc_delay_s)
+    title = f"Group delay: {number(section.dc_delay_s, 's')} at 0 Hz; red: cut-off"
+    delay = Plot(x, "delay (s)", late, title, limits, (0.0, most), log="x")
     answer = step_response(filter_.sections, rate)
-    rise = Plot(
-        "time after the step (s)",
-        "answer to a step of 1",
-        (Band("y", 0.98, 1.02, colour="mint"), Rule("y", 1.0), Curve(answer.t_s, answer.values, size=2.0)),
-        "Step response; green: within 2 %",
-        x_limits=(0.0, max(1.6 * step["settling_s"], 8.0 / rate)),
-        y_limits=(0.0, 1.08 + step["overshoot"]),
-    )
+    within, curve = Band("y", 0.98, 1.02, colour="mint"), Curve(answer.t_s, answer.values, size=2.0)
+    x, y, title = "time after the step (s)", "answer to a step of 1", "Step response; green: within 2 %"
+    limits, high = (0.0, max(1.6 * step["settling_s"], 8.0 / rate)), 1.08 + step["overshoot"]
+    rise = Plot(x, y, (within, Rule("y", 1.0), curve), title, limits, (0.0, high))
     panels = (gain, delay, rise, _poles(np.array(section.poles)))
-    return Figure(f"Low-pass: {title}", note, panels, 6.2, section.verdict.word, columns=2)
+    return Figure(f"Low-pass: {design}", note, panels, 6.2, section.verdict.word, columns=2)
 
 
 def _poles(z: FloatArray) -> Plot:
     """Poles (n, 2) in the z plane, drawn around the part of the unit circle where they lie."""
     reach = 1.35 * max(float(np.abs(z[:, 1]).max()), 1.0 - float(z[:, 0].min()), 0.02)
     reach = min(reach, 1.1)
-    unit = Shape(circle(0.0, 0.0, 1.0), edge="grey")
-    return Plot(
-        "real part",
-        "imaginary part",
-        (unit, Rule("y", 0.0), Curve(z[:, 0], z[:, 1], kind="crosses", colour="red", size=8.0)),
-        "Poles; grey: unit circle",
-        x_limits=(1.0 - 1.6 * reach, 1.0 + 0.6 * reach),
-        y_limits=(-reach, reach),
-        equal=True,
+    marks = (
+        Shape(circle(0.0, 0.0, 1.0), edge="grey"),
+        Rule("y", 0.0),
+        Curve(z[:, 0], z[:, 1], kind="crosses", colour="red", size=8.0),
     )
+    x_limits, y_limits = (1.0 - 1.6 * reach, 1.0 + 0.6 * reach), (-reach, reach)
+    title = "Poles; grey: unit circle"
+    return Plot("real part", "imaginary part", marks, title, x_limits, y_limits, equal=True)
 
 
-def _on_log(filter_: Filter, section: LowPass, positions: Positions, title: str) -> Figure:
+def _on_log(filter_: Filter, section: LowPass, positions: Positions, design: str) -> Figure:
     """Each coordinate before and after the filter, and its spectrum."""
     log = section.log
     assert log is not None
@@ -125,31 +106,14 @@ def _on_log(filter_: Filter, section: LowPass, positions: Positions, title: str)
     t, before = piece.t_s[window], scale * piece.values[window]
     after = scale * filter_signal(filter_.sections, piece.values)[window]
     panels = []
-    for i, (name, of) in enumerate(zip(positions.names, positions.spectra, strict=True)):
-        curves = (
-            Curve(*thinned(t, before[:, i]), size=0.9),
-            Curve(t, after[:, i], colour="orange", size=2.2),
-        )
-        panels.append(
-            Plot(
-                "time (s)",
-                f"{name} ({log.unit})",
-                curves,
-                f"{name}; blue: as logged, orange: filtered",
-                x_limits=(float(t[0]), float(t[-1])),
-                y_limits=central(before[:, i], 0.5, 0.12),
-            )
-        )
+    for name, of, old, new in zip(positions.names, positions.spectra, before.T, after.T, strict=True):
+        curves = (Curve(*thinned(t, old), size=0.9), Curve(t, new, colour="orange", size=2.2))
+        words, x_limits = f"{name}; blue: as logged, orange: filtered", (float(t[0]), float(t[-1]))
+        limits = central(old, 0.5, 0.12)
+        panels.append(Plot("time (s)", f"{name} ({log.unit})", curves, words, x_limits, limits))
         panels.append(_spectrum(of, filter_, scale, name, log.unit))
-    return Figure(
-        f"A log before and after the low-pass: {title}",
-        note,
-        tuple(panels),
-        6.2,
-        section.verdict.word,
-        columns=2,
-        widths=(1.75, 1.0),
-    )
+    title = f"A log before and after the low-pass: {design}"
+    return Figure(title, note, panels, 6.2, section.verdict.word, columns=2, widths=(1.75, 1.0))
 
 
 def log_window(t_s: FloatArray, values: FloatArray, length_s: float = _WINDOW_S) -> slice:
@@ -177,11 +141,8 @@ def _spectrum(of: Spectrum, filter_: Filter, scale: float, name: str, unit: str)
     ]
     if of.motion_hz > 0.0:
         marks.append(Rule("x", of.motion_hz, "ink", "dotted"))
-    return Plot(
-        "frequency (Hz)",
-        f"{unit} per root Hz",
-        tuple(marks),
+    title, limits = (
         "Spectrum; green: jitter's floor",
-        y_limits=(max(1e-3 * float(np.median(whole)), 1e-7 * top), 2.0 * top),
-        log="xy",
+        (max(1e-3 * float(np.median(whole)), 1e-7 * top), 2.0 * top),
     )
+    return Plot("frequency (Hz)", f"{unit} per root Hz", marks, title, y_limits=limits, log="xy")
