@@ -34,6 +34,7 @@ __all__ = [
     "control",
     "distortion",
     "extrinsics",
+    "imu",
     "intrinsics",
     "lowpass",
 ]

@@ -16,7 +16,6 @@ from calib.cli.doctor import doctor
 from calib.cli.firmware import firmware
 from calib.cli.fleet import fleet
 from calib.cli.identify import identify
-from calib.cli.imu import imu
 from calib.cli.record import record
 from calib.cli.replay import replay
 from calib.cli.report import report
@@ -57,7 +56,7 @@ app.command("intrinsics")(verb(stage("intrinsics")))
 app.command("extrinsics")(verb(stage("extrinsics")))
 app.command("distortion")(verb(stage("distortion")))
 app.command("lowpass")(verb(stage("lowpass")))
-app.add_typer(imu, name="imu")
+app.add_typer(group("imu", "Understand an IMU: its bias, its noise, its drift."), name="imu")
 app.command("align")(telling(verb(stage("align"))))
 app.command("replay")(telling(replay))
 app.add_typer(identify, name="identify")

@@ -112,14 +112,14 @@ def _camera_text(to: str, rig: Path, name: str) -> tuple[str, str]:
 def _imu_text(rig: Path, topic: str | None) -> tuple[str, str]:
     from calib.core.files import one_line, shown
     from calib.core.rig import read_rig
-    from calib.stages.imu.results import kalibr_imu
+    from calib.stages.imu.formats import to_kalibr
 
     if topic is not None and not re.fullmatch(r"[A-Za-z~/][\w~/]*", topic, re.ASCII):
         raise UsageError(f"--name: {one_line(topic)[:60]!r} is no topic, expected for instance /imu0")
     section = read_rig(rig).imu
     if section is None:
         raise BadInputError(f"{shown(rig)}: has no imu yet; run calib imu static first")
-    return kalibr_imu(section, topic or "/imu0"), section.verdict
+    return to_kalibr(section, topic or "/imu0"), section.verdict.word
 
 
 def import_camera(
@@ -164,13 +164,13 @@ def _import_imu(source: Path, rig: Path, as_json: bool) -> None:
     from calib.core.files import check_writable, read_bytes, read_yaml_mapping, sha256, shown
     from calib.core.result import section_json
     from calib.core.rig import read_rig, write_rig
-    from calib.stages.imu.results import from_kalibr_imu
+    from calib.stages.imu.formats import from_kalibr
 
     check_writable(rig)
     before = read_rig(rig)
     digest = sha256(read_bytes(source, _MAX_BYTES))
     try:
-        section = from_kalibr_imu(read_yaml_mapping(source))
+        section = from_kalibr(read_yaml_mapping(source))
     except BadInputError as error:
         place = shown(source)
         raise BadInputError(str(error) if str(error).startswith(place) else f"{place}: {error}") from error

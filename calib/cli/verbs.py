@@ -10,7 +10,16 @@ from typing import Annotated, Any, get_type_hints
 
 import typer
 
-from calib.cli.common import FiguresOption, JsonOption, RigOption, document, narrate, progress_bar, say
+from calib.cli.common import (
+    FiguresOption,
+    JsonOption,
+    RigOption,
+    document,
+    narrate,
+    progress_bar,
+    say,
+    telling,
+)
 from calib.core.errors import EXIT_POOR
 from calib.core.stage import Files, Stage, options_of
 from calib.stages import STAGES, stage
@@ -129,5 +138,5 @@ def group(name: str, words: str) -> typer.Typer:
     made = typer.Typer(name=name, help=words, no_args_is_help=True)
     for one in STAGES:
         if one.startswith(f"{name} "):
-            made.command(one.split()[-1])(verb(stage(one)))
+            made.command(one.split()[-1])(telling(verb(stage(one))))
     return made

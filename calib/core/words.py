@@ -29,6 +29,7 @@ UNITS = {
     "_degps_per_sqrt_hz": "°/s/√Hz",
     "_deg_per_sqrt_hz": "°/√Hz",
     "_rad_per_sqrt_s": "rad/√s",
+    "_rad_per_sqrt_Hz": "rad/√Hz",
     "_m_per_sqrt_s": "m/√s",
     "_pwm_per_rad_s": "PWM/(rad s)",
     "_pwm_s_per_rad": "PWM s/rad",
@@ -60,6 +61,7 @@ UNITS = {
     "_pwm": "PWM",
     "_px": "px",
     "_mm": "mm",
+    "_ms": "ms",
     "_hz": "Hz",
     "_Hz": "Hz",
     "_db": "dB",
@@ -82,6 +84,8 @@ _SCALES = {
 """What a value in the unit of the file is multiplied by to be shown in another."""
 
 _AXES = ("x", "y", "z")
+_WIDEST = 108
+"""Characters of a table's line."""
 _LONGEST = 60
 """Text longer than this stands in a line of its own."""
 
@@ -164,7 +168,7 @@ def _gathered(section: BaseModel, prefix: str) -> tuple[Rows, Rows, list[Block]]
     scalars: Rows = []
     vectors: Rows = []
     later: list[Block] = []
-    sigmas = getattr(section, "sigma", None)
+    sigmas, bounds = getattr(section, "sigma", None), getattr(section, "below", None)
     for key, field, value in _labelled(section):
         label = f"{prefix}{field.title}"
         if isinstance(value, BaseModel):
@@ -177,11 +181,14 @@ def _gathered(section: BaseModel, prefix: str) -> tuple[Rows, Rows, list[Block]]
             later.append(listed(label, value))
         elif isinstance(value, Mapping):
             unit, scale, places = _shown(key, field)
+            bars = _sigma(sigmas, key)
             for name, one in value.items():
                 # A table of values may hold several units, each at the end of its name.
-                own = _shown(name, field)[0] or unit
-                cell = one if isinstance(one, str) else number(_scaled(one, scale), None, places)
-                scalars.append((_with_unit(f"{label} {_as_words(name)}", own), cell, ""))
+                own = unit_of(name) or unit
+                wide = _scaled(bars.get(name), scale) if isinstance(bars, Mapping) else None
+                cell = one if isinstance(one, str) else number(_scaled(one, scale), wide, places)
+                bar = "" if wide is None else number(wide, wide)
+                scalars.append((_with_unit(f"{label} {_as_words(name)}", own), cell, bar))
         elif isinstance(value, list) and value and isinstance(value[0], BaseModel):
             later.append(listed(label, value))
         elif isinstance(value, list) and all(isinstance(one, int) for one in value):
@@ -195,7 +202,8 @@ def _gathered(section: BaseModel, prefix: str) -> tuple[Rows, Rows, list[Block]]
             and not any(isinstance(v, str | list) for v in value)
         ):
             unit, scale, places = _shown(key, field)
-            vectors.append((_with_unit(label, unit), *_vector(value, _sigma(sigmas, key), scale, places)))
+            cells = _vector(value, _sigma(sigmas, key), scale, places, _sigma(bounds, key))
+            vectors.append((_with_unit(label, unit), *cells))
         elif isinstance(value, list):
             scalars.append((label, ", ".join(str(one) for one in value), ""))
         else:
@@ -262,24 +270,45 @@ def _sigma(sigmas: Any, key: str) -> Any:
     return getattr(sigmas, key, None)
 
 
-def _vector(values: Sequence[Any], sigma: Any, scale: float, places: int | None) -> list[str]:
-    bars = sigma if isinstance(sigma, list) and len(sigma) == len(values) else [None] * len(values)
+def _vector(
+    values: Sequence[Any], sigma: Any, scale: float, places: int | None, below: Any = None
+) -> list[str]:
+    """Values with their deviations, and the bounds of those that have no value."""
+    bars, bounds = (
+        one if isinstance(one, list) and len(one) == len(values) else [None] * len(values)
+        for one in (sigma, below)
+    )
     out = []
-    for value, bar in zip(values, bars, strict=True):
+    for value, bar, bound in zip(values, bars, bounds, strict=True):
         wide = _scaled(bar, scale)
         text = number(_scaled(value, scale), wide, places)
-        out.append(f"{text} ± {number(wide, wide)}" if wide is not None and text != BLANK else text)
+        if text == BLANK:
+            out.append(text if bound is None else f"< {_scaled(bound, scale):.2g}")
+        else:
+            out.append(text if wide is None else f"{text} ± {number(wide, wide)}")
     return out
+
+
+def _cell(value: Any, scale: float, places: int | None) -> str:
+    """A value, or those of a list, of a list of lists with commas between the inner ones."""
+    if isinstance(value, list):
+        cells = [_cell(one, scale, places) for one in value]
+        return (", " if any(isinstance(one, list) for one in value) else " ").join(cells)
+    return _word(value) if isinstance(value, bool | str) else number(_scaled(value, scale), None, places)
 
 
 def listed(label: str, parts: Mapping[str, Any] | Sequence[Any]) -> Table:
     """Parts of one kind as a table, a row for each, with their names in front where they have some."""
     named = parts if isinstance(parts, Mapping) else {str(i): one for i, one in enumerate(parts)}
+    shown = {
+        key
+        for one in named.values()
+        for key, _, value in _labelled(one)
+        if not isinstance(value, BaseModel | Mapping)
+    }
     columns: dict[str, FieldInfo] = {}
     for one in named.values():
-        columns |= {
-            key: field for key, field, value in _labelled(one) if not isinstance(value, BaseModel | Mapping)
-        }
+        columns |= {key: field for key, field in type(one).model_fields.items() if key in shown}
     head = [_with_unit(str(field.title), _shown(key, field)[0]) for key, field in columns.items()]
     rows = []
     for name, one in named.items():
@@ -288,14 +317,8 @@ def listed(label: str, parts: Mapping[str, Any] | Sequence[Any]) -> Table:
         for key, field in columns.items():
             value = getattr(one, key)
             _, scale, places = _shown(key, field)
-            if isinstance(value, list):
-                cells.append(
-                    " ".join(
-                        v if isinstance(v, str) else number(_scaled(v, scale), None, places) for v in value
-                    )
-                )
-            elif isinstance(value, bool | str):
-                cells.append(_word(value))
+            if isinstance(value, list | bool | str):
+                cells.append(_cell(value, scale, places))
             else:
                 cells.append(*_vector([value], [_sigma(sigmas, key)], scale, places))
         rows.append(tuple(cells))
@@ -314,10 +337,24 @@ def as_text(blocks: Sequence[Block]) -> list[str]:
             out.append(f"{block.title}:")
         whole = [block.head, *block.rows]
         widths = [max(len(row[i]) for row in whole) for i in range(len(block.head))]
-        for row in whole:
-            cells = [row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True))]
-            out.append("  " + "  ".join(cells).rstrip())
+        for columns in _in_sheets(widths):
+            for row in whole:
+                cells = [row[0].ljust(widths[0]), *(row[i].rjust(widths[i]) for i in columns)]
+                out.append("  " + "  ".join(cells).rstrip())
     return out
+
+
+def _in_sheets(widths: Sequence[int]) -> list[list[int]]:
+    """Columns behind the first, in as many tables below each other as a line's width asks for."""
+    sheets: list[list[int]] = [[]]
+    used = widths[0]
+    for i, width in enumerate(widths[1:], 1):
+        if sheets[-1] and used + 2 + width > _WIDEST:
+            sheets.append([])
+            used = widths[0]
+        sheets[-1].append(i)
+        used += 2 + width
+    return sheets
 
 
 def as_html(blocks: Sequence[Block]) -> str:

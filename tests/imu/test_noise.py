@@ -21,10 +21,11 @@ from calib.stages.imu.allan import (
     design,
     spaced,
 )
-from calib.stages.imu.results import from_kalibr_imu, imu_section, kalibr_imu
+from calib.stages.imu.formats import from_kalibr, to_kalibr
 from calib.stages.imu.sampling import regular_parts, rest_parts
-from calib.stages.imu.section import Imu as Imu_of_kalibr_imu
-from calib.stages.imu.static import AXES, RestLog, Static, analyse_static, judge
+from calib.stages.imu.section import Imu as ImuSection
+from calib.stages.imu.stage import solve_static
+from calib.stages.imu.static import AXES, RestLog, analyse_static, judge
 from calib.twin.sensors import HeadMotion, Imu, draw_imu_noise, measure
 
 IMU = Imu(gyro_scale=(0.0, 0.0, 0.0), accel_scale=(0.0, 0.0, 0.0), mount_angle_rad=0.0)
@@ -49,7 +50,7 @@ def test_the_simulated_sensor_is_recovered() -> None:
     log, _ = rest_log(IMU, 300.0, 1)
     found = analyse_static([log])
     assert found.rate_hz == pytest.approx(100.0, rel=1e-4)
-    assert judge(found).verdict == "ok"
+    assert judge(found).ok
     for k, noise in enumerate(found.noise):
         gyro = k < 3
         density = IMU.gyro_noise if gyro else IMU.accel_noise
@@ -135,7 +136,7 @@ def test_motion_is_left_out_and_makes_it_poor() -> None:
     moved[2000:2300, 2] += 0.3 * np.sin(0.05 * np.arange(300))
     found = analyse_static([replace(log, values=moved)])
     judged = judge(found)
-    assert judged.verdict == "poor"
+    assert judged.word == "poor"
     assert "log.csv: moves from 20.0 to 23.0 s, seen most in gz" in judged.reasons[0]
     assert found.logs[0].gyro is None
     assert found.noise[2].bias == pytest.approx(IMU.gyro_bias_radps[2], abs=3e-4)
@@ -348,19 +349,17 @@ def test_a_long_gap_splits() -> None:
     assert parts[1].rows[0] == 4000
 
 
-def _result(axes: tuple[str, ...] = AXES, walk: float = 0.0, n: int = 12_000) -> Static:
+def _result(axes: tuple[str, ...] = AXES, walk: float = 0.0, n: int = 12_000) -> ImuSection:
     rng = np.random.default_rng(0)
     values = 1e-3 * rng.normal(size=(n, len(axes))) + walk * np.cumsum(
         rng.normal(size=(n, len(axes))), axis=0
     )
-    return analyse_static([RestLog("a.csv", axes, 0.01 * np.arange(n), values, np.zeros(0), np.zeros(0))])
+    return solve_static([RestLog("a.csv", axes, 0.01 * np.arange(n), values, np.zeros(0), np.zeros(0))])
 
 
 def test_kalibr_gets_the_worst_axis_in_continuous_time() -> None:
     # 1e-3 at 100 Hz is a density of 1e-4.
-    result = _result(walk=1e-4)
-    section = imu_section(result, judge(result))
-    text = kalibr_imu(section)
+    text = to_kalibr(_result(walk=1e-4))
     document = yaml.safe_load(text)
     assert set(document) == {
         "accelerometer_noise_density",
@@ -392,7 +391,7 @@ TEXT = (
 sizes = st.floats(1e-12, 1e3, allow_nan=False)
 
 
-def _same(one: Imu_of_kalibr_imu, other: Imu_of_kalibr_imu) -> None:
+def _same(one: ImuSection, other: ImuSection) -> None:
     """Equal to the seven digits that are written."""
     assert one.rate_hz == pytest.approx(other.rate_hz, rel=6e-7, abs=6e-7)
     for name in KEYS.values():
@@ -402,17 +401,17 @@ def _same(one: Imu_of_kalibr_imu, other: Imu_of_kalibr_imu) -> None:
 
 @given(st.tuples(sizes, sizes, sizes, sizes), st.floats(1e-3, 1e5))
 def test_there_and_back(values: tuple[float, ...], rate_hz: float) -> None:
-    imu = from_kalibr_imu({**dict(zip(KEYS, values, strict=True)), "update_rate": rate_hz})
-    text = kalibr_imu(imu, "/imu")
-    again = from_kalibr_imu(yaml.safe_load(text))
+    imu = from_kalibr({**dict(zip(KEYS, values, strict=True)), "update_rate": rate_hz})
+    text = to_kalibr(imu, "/imu")
+    again = from_kalibr(yaml.safe_load(text))
     _same(again, imu)
-    assert kalibr_imu(again, "/imu") == text
+    assert to_kalibr(again, "/imu") == text
 
 
 @pytest.mark.parametrize("nested", [False, True])
 def test_a_file_as_kalibr_writes_it(nested: bool) -> None:
     document = yaml.safe_load(TEXT)
-    imu = from_kalibr_imu({"imu0": document} if nested else document)
-    assert isinstance(imu, Imu_of_kalibr_imu) and imu.rate_hz == 200.0 and imu.verdict == "poor"
+    imu = from_kalibr({"imu0": document} if nested else document)
+    assert isinstance(imu, ImuSection) and imu.rate_hz == 200.0 and imu.verdict.word == "poor"
     for name, value in zip(KEYS.values(), EUROC, strict=True):
         assert getattr(imu, name) == [value] * 3

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Literal
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -264,7 +265,7 @@ class LogDrift:
 
     source: str
     sampling: Sampling
-    against: str
+    against: Literal["truth", "rest", "nothing"]
     judged_s: float
     moving_s: float
     upright: float

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,6 +15,7 @@ from scipy.special import fdtrc
 
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
+from calib.core.verdict import Finding, Verdict
 from calib.solve.clock import Part
 from calib.stages.imu.sampling import (
     MULTIPLES,
@@ -25,6 +26,7 @@ from calib.stages.imu.sampling import (
     find_rests,
     quiet_level,
     regular_parts,
+    sampling_findings,
     spread,
 )
 from calib.stages.imu.static import is_gyro
@@ -1093,35 +1095,6 @@ _OFF_ANGLE_RAD = math.radians(15.0)
 _ROUGH_TURNS_RAD, _WRONG_TURNS_RAD = 0.03, 0.2
 _TIMES_OTHERS = 6.0
 _LEAST_TRAVEL_RAD = 0.3
-_MOST_MISSING = 0.02
-
-
-@dataclass(frozen=True)
-class IntrinsicsJudgement:
-    """Verdict "ok", "poor", "unidentifiable" or "inconsistent", with sentences."""
-
-    verdict: str
-    reasons: tuple[str, ...]
-    remarks: tuple[str, ...]
-    advice: tuple[str, ...]
-
-
-class _Notes:
-    """Sentences as they are found, and the worst verdict among them."""
-
-    _ORDER = ("ok", "poor", "unidentifiable", "inconsistent")
-
-    def __init__(self) -> None:
-        self.verdict = "ok"
-        self.reasons: list[str] = []
-        self.remarks: list[str] = []
-        self.advice: list[str] = []
-
-    def because(self, verdict: str, sentence: str, advice: str = "") -> None:
-        self.verdict = max(self.verdict, verdict, key=self._ORDER.index)
-        self.reasons.append(sentence)
-        if advice and advice not in self.advice:
-            self.advice.append(advice)
 
 
 def protocol(planar: bool) -> str:
@@ -1137,14 +1110,14 @@ def protocol(planar: bool) -> str:
     )
 
 
-def _sides(accel: Accelerometer, notes: _Notes) -> None:
+def _sides(accel: Accelerometer) -> Iterator[Finding]:
     u = accel.directions
     for k, axis in enumerate("xyz"[: u.shape[1]]):
         for sign, word in ((1.0, "up"), (-1.0, "down")):
             best = float((sign * u[:, k]).max())
             if best < _NEAR:
                 nearest = math.degrees(math.acos(max(-1.0, best)))
-                notes.because(
+                yield Finding(
                     "poor",
                     f"no rest with the {axis} axis {word}: the nearest is {nearest:.0f} degrees from it",
                     f"add rests with the {axis} axis {word}",
@@ -1160,15 +1133,15 @@ def _name(accel: Accelerometer, place: int) -> str:
     return f"misalignment {ANGLES[d][place - 2 * d]}"
 
 
-def _of_accelerometer(result: Intrinsics, accel: Accelerometer, notes: _Notes) -> None:
+def _of_accelerometer(result: Intrinsics, accel: Accelerometer) -> Iterator[Finding]:
     d, g = len(accel.bias), result.gravity_mps2
     if result.log.accel_unit == "m/s2" or accel.span >= LEAST_SPAN:
-        _sides(accel, notes)
+        yield from _sides(accel)
     if accel.span < LEAST_SPAN:
         mixed = np.flatnonzero(np.abs(accel.weakest) > 0.3).tolist()
         words = [_name(accel, place) for place in mixed]
         names = " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
-        notes.because("unidentifiable", f"the poses do not tell {names} apart", protocol(result.planar))
+        yield Finding("unidentifiable", f"the poses do not tell {names} apart", protocol(result.planar))
         return
     size = np.concatenate([g * accel.scale, accel.scale, np.ones(len(accel.angles))])
     limit = np.repeat([LIMITS["bias_g"], LIMITS["scale"], LIMITS["angle_rad"]], [d, d, len(accel.angles)])
@@ -1179,23 +1152,26 @@ def _of_accelerometer(result: Intrinsics, accel: Accelerometer, notes: _Notes) -
             shown = (
                 f"{value:.2g} g" if place < d else f"{value:.2g} rad" if place >= 2 * d else f"{value:.2%}"
             )
-            notes.because(
+            yield Finding(
                 "unidentifiable" if relative[place] > _USELESS else "poor",
                 f"accelerometer, {_name(accel, place)}: known to {shown} only",
                 protocol(result.planar),
             )
     if not accel.skewed:
-        notes.remarks.append("the poses do not tell the accelerometer's misalignment; it is taken to be zero")
-        notes.advice.append("rests with two axes both at 45 degrees would show the misalignment")
+        yield Finding(
+            "remark",
+            "the poses do not tell the accelerometer's misalignment; it is taken to be zero",
+            "rests with two axes both at 45 degrees would show the misalignment",
+        )
     if accel.dof <= 0:
-        notes.because(
+        yield Finding(
             "poor",
             f"{len(result.rests)} rests for as many parameters: nothing is left to check them by, and sigma "
             "is that of the noise alone",
             protocol(result.planar),
         )
     elif accel.rms_mps2 > _LARGEST_RMS_G * g:
-        notes.because(
+        yield Finding(
             "inconsistent",
             f"the rests disagree by {accel.rms_mps2:.3g} m/s^2, more than a bias, a scale and angles explain",
             "hold each pose still, far from what vibrates",
@@ -1205,7 +1181,7 @@ def _of_accelerometer(result: Intrinsics, accel: Accelerometer, notes: _Notes) -
     worst = int(np.argmax(r))
     if accel.dof >= 6 and r[worst] > max(_TIMES_OTHERS * others, 1e-3 * g):
         rest = result.rests[worst]
-        notes.because(
+        yield Finding(
             "poor",
             f"the rest from {rest.from_s:.1f} to {rest.to_s:.1f} s is off by {r[worst]:.2g} m/s^2, "
             f"{r[worst] / max(others, 1e-12):.0f} times what the others are",
@@ -1214,14 +1190,14 @@ def _of_accelerometer(result: Intrinsics, accel: Accelerometer, notes: _Notes) -
     if result.log.accel_unit == "m/s2":
         off = float(np.abs(accel.scale - 1.0).max())
         if off > _OFF_SCALE:
-            notes.because(
+            yield Finding(
                 "inconsistent",
                 f"a scale comes out as {accel.scale[int(np.argmax(np.abs(accel.scale - 1.0)))]:.3g}, so the "
                 "readings are not in the unit that was named, or gravity is another",
                 "check --acc-unit and --gravity",
             )
     if accel.skewed and float(np.abs(accel.angles).max(initial=0.0)) > _OFF_ANGLE_RAD:
-        notes.because(
+        yield Finding(
             "inconsistent",
             f"two axes come out {math.degrees(float(np.abs(accel.angles).max())):.0f} degrees from a right "
             "angle",
@@ -1237,17 +1213,17 @@ def _swapped(P: FloatArray) -> str:
     return ", ".join(words)
 
 
-def _of_gyroscope(result: Intrinsics, gyro: Gyroscope, notes: _Notes) -> None:
+def _of_gyroscope(result: Intrinsics, gyro: Gyroscope) -> Iterator[Finding]:
     if result.foreign is not None:
         mirror = "; that mirrors it" if np.linalg.det(result.foreign) < 0.0 else ""
-        notes.because(
+        yield Finding(
             "inconsistent",
             f"the gyroscope's axes are not the accelerometer's: {_swapped(result.foreign)}{mirror}",
             "put the gyroscope's columns into the accelerometer's order and signs",
         )
         return
     if gyro.rms_rad > _WRONG_TURNS_RAD:
-        notes.because(
+        yield Finding(
             "inconsistent",
             f"the turns miss gravity's direction by {math.degrees(gyro.rms_rad):.0f} degrees: the rates are "
             "not in the unit that was named, or gyroscope and accelerometer do not belong together",
@@ -1255,7 +1231,7 @@ def _of_gyroscope(result: Intrinsics, gyro: Gyroscope, notes: _Notes) -> None:
         )
         return
     if gyro.rms_rad > _ROUGH_TURNS_RAD:
-        notes.because(
+        yield Finding(
             "poor",
             f"the turns miss gravity's direction by {math.degrees(gyro.rms_rad):.2g} degrees",
             "turn more slowly, in a second or two, and log at 100 Hz or more",
@@ -1263,7 +1239,7 @@ def _of_gyroscope(result: Intrinsics, gyro: Gyroscope, notes: _Notes) -> None:
     used = np.isfinite(gyro.scale)
     off = gyro.scale[used][int(np.argmax(np.abs(gyro.scale[used] - 1.0)))]
     if result.log.gyro_unit == "rad/s" and abs(off - 1.0) > _OFF_SCALE:
-        notes.because(
+        yield Finding(
             "inconsistent",
             f"a scale of the gyroscope comes out as {off:.3g}, so its readings are not in the unit that was "
             "named",
@@ -1272,7 +1248,7 @@ def _of_gyroscope(result: Intrinsics, gyro: Gyroscope, notes: _Notes) -> None:
     for k in np.flatnonzero(used).tolist():
         travel = float(gyro.travel_rad[k])
         if travel < _LEAST_TRAVEL_RAD:
-            notes.because(
+            yield Finding(
                 "poor",
                 f"hardly a turn about the {'xyz'[k]} axis: {math.degrees(travel):.0f} degrees",
                 f"turn by 90 degrees or more about the {'xyz'[k]} axis between rests",
@@ -1281,7 +1257,7 @@ def _of_gyroscope(result: Intrinsics, gyro: Gyroscope, notes: _Notes) -> None:
     sigma = np.concatenate([gyro.scale_sigma / np.abs(gyro.scale), gyro.angle_sigma])
     unknown = [name for name, one in zip(names, sigma.tolist(), strict=True) if one == math.inf]
     if unknown:
-        notes.because(
+        yield Finding(
             "unidentifiable",
             f"{len(gyro.turns_s)} turn(s) do not tell the gyroscope's {len(unknown)} parameters",
             protocol(result.planar),
@@ -1289,76 +1265,65 @@ def _of_gyroscope(result: Intrinsics, gyro: Gyroscope, notes: _Notes) -> None:
     for name, one in zip(names, sigma.tolist(), strict=True):
         if LIMITS["gyro"] < one < math.inf:
             shown = f"{one:.2%}" if name.startswith("scale") else f"{one:.2g} rad"
-            notes.because(
+            yield Finding(
                 "unidentifiable" if one > _USELESS * LIMITS["gyro"] else "poor",
                 f"gyroscope, {name}: known to {shown} only",
                 protocol(result.planar),
             )
     if gyro.bias.sensitivity is not None:
-        notes.remarks.append(
-            "the gyroscope's bias follows the pose; its sensitivity to the specific force is fitted as well"
+        yield Finding(
+            "remark",
+            "the gyroscope's bias follows the pose; its sensitivity to the specific force is fitted as well",
         )
 
 
-def _of_log(result: Intrinsics, notes: _Notes) -> None:
-    s = result.sampling
-    for gap in s.gaps:
-        if gap.split:
-            notes.remarks.append(f"split at a gap of {gap.duration_s:.4g} s after {gap.at_s:.2f} s")
-    short = [gap for gap in s.gaps if not gap.split]
-    if short:
-        longest = max(short, key=lambda gap: gap.duration_s)
-        sentence = (
-            f"{s.missing} samples missing in {len(short)} gap(s), the longest {1e3 * longest.duration_s:.3g} "
-            f"ms after {longest.at_s:.2f} s; filled by straight lines"
-        )
-        if s.missing > _MOST_MISSING * s.samples:
-            notes.because("poor", sentence)
-        else:
-            notes.remarks.append(sentence)
-    if s.repeated_rows:
-        share = s.repeated_rows / (s.samples + s.repeated_rows)
-        notes.remarks.append(f"{s.repeated_rows} rows ({share:.2%}) repeat the one before; dropped")
+def _of_log(result: Intrinsics) -> Iterator[Finding]:
+    """Findings on how the log was sampled, and on its start."""
+    si = result.log.accel_unit == "m/s2" and result.log.gyro_unit == "rad/s"
+    yield from sampling_findings(result.sampling, result.log.axes if si else ())
     if result.turns_lost:
-        notes.remarks.append(f"{result.turns_lost} turn(s) not used: readings are missing in them")
-    for axis, count in zip(result.log.axes, s.at_limit.tolist(), strict=True):
-        if count and result.log.accel_unit == "m/s2" and result.log.gyro_unit == "rad/s":
-            notes.because("poor", f"{axis} is at the end of its range in {count} samples")
+        yield Finding("remark", f"{result.turns_lost} turn(s) not used: readings are missing in them")
     if result.quiet.initial_s == 0.0 and result.has_gyro:
-        notes.because(
+        yield Finding(
             "poor",
             "the log does not begin at rest; the gyroscope's bias is that of its longest rest",
             "let the sensor lie still for 30 s at the start",
         )
 
 
-def judge_intrinsics(result: Intrinsics) -> IntrinsicsJudgement:
-    """Verdict of a calibration of an IMU."""
-    notes = _Notes()
-    _of_log(result, notes)
-    if result.planar and not result.asked:
-        notes.remarks.append("all poses lie in the plane of x and y: ax, ay and gz alone are calibrated")
-    if result.planar:
-        lean = "" if math.isnan(result.lean_rad) else (
-            f"; by az it leans by {math.degrees(result.lean_rad):.1f} degrees at most, which would make the "
-            f"scales {1.0 - math.cos(result.lean_rad):.2g} too small"
-        )  # fmt: skip
-        notes.remarks.append("the plane is taken to stand upright" + lean)
+def _of_plane(result: Intrinsics) -> Iterator[Finding]:
+    """Findings on a calibration of x, y and gz alone."""
+    if not result.planar:
+        return
+    if not result.asked:
+        yield Finding("remark", "all poses lie in the plane of x and y: ax, ay and gz alone are calibrated")
+    lean = "" if math.isnan(result.lean_rad) else (
+        f"; by az it leans by {math.degrees(result.lean_rad):.1f} degrees at most, which would make the "
+        f"scales {1.0 - math.cos(result.lean_rad):.2g} too small"
+    )  # fmt: skip
+    yield Finding("remark", "the plane is taken to stand upright" + lean)
+
+
+def _of_sensors(result: Intrinsics) -> Iterator[Finding]:
+    """Findings on the accelerometer and on the gyroscope, or on why there is none."""
     if result.accel is None:
-        needed = 4 if result.planar else 6
-        notes.because(
+        yield Finding(
             "unidentifiable",
-            f"{len(result.rests)} rest(s) in {result.poses} pose(s) are fewer than the {needed} that bias "
-            "and scale need",
+            f"{len(result.rests)} rest(s) in {result.poses} pose(s) are fewer than the "
+            f"{4 if result.planar else 6} that bias and scale need",
             protocol(result.planar),
         )
     else:
-        _of_accelerometer(result, result.accel, notes)
+        yield from _of_accelerometer(result, result.accel)
     if result.gyro is not None:
-        _of_gyroscope(result, result.gyro, notes)
+        yield from _of_gyroscope(result, result.gyro)
     elif not result.has_gyro:
-        needed_axes = "gz" if result.planar else "gx, gy and gz"
-        notes.remarks.append(f"without {needed_axes} the gyroscope is not calibrated")
+        needed = "gz" if result.planar else "gx, gy and gz"
+        yield Finding("remark", f"without {needed} the gyroscope is not calibrated")
     elif result.accel is not None and result.accel.span >= LEAST_SPAN:
-        notes.because("unidentifiable", "no turn between two rests is there to calibrate the gyroscope by")
-    return IntrinsicsJudgement(notes.verdict, tuple(notes.reasons), tuple(notes.remarks), tuple(notes.advice))
+        yield Finding("unidentifiable", "no turn between two rests is there to calibrate the gyroscope by")
+
+
+def judge_intrinsics(result: Intrinsics) -> Verdict:
+    """Verdict of a calibration of an IMU."""
+    return Verdict.of([*_of_log(result), *_of_plane(result), *_of_sensors(result)])

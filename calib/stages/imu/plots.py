@@ -400,8 +400,8 @@ _PAIRS = {"3/3": ("red", "squares"), "tuned": ("green", "points"), "riccati": ("
 def tune_plots(result: Tuning, pieces: Sequence[Piece], section: OrientationFilter) -> dict[str, Figure]:
     """`tune_gains` and `tune_errors`."""
     return {
-        "tune_gains": _gains(result, 1.0 / section.rate_hz, section.verdict),
-        "tune_errors": _tuning_errors(result, pieces, section.verdict),
+        "tune_gains": _gains(result, 1.0 / section.rate_hz, section.verdict.word),
+        "tune_errors": _tuning_errors(result, pieces, section.verdict.word),
     }
 
 

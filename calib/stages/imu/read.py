@@ -23,7 +23,13 @@ from calib.stages.actuator.kinematics import MARKER_OFFSET_M
 from calib.stages.camera.model import Camera, undistort
 from calib.stages.imu.intrinsics import PoseLog
 from calib.stages.imu.mahony import accelerometer_angles
-from calib.stages.imu.sampling import MOST_GYRO_RADPS, Sampling, quiet_spread, regular_parts
+from calib.stages.imu.sampling import (
+    MOST_GYRO_RADPS,
+    Sampling,
+    quiet_spread,
+    regular_parts,
+    sampling_findings,
+)
 from calib.stages.imu.static import AXES, RestLog, is_gyro
 from calib.stages.imu.tracks import DriftLog, on_grid, planar_rate, up_vector
 from calib.stages.imu.tuning import DATA_SHEET, SHORTEST_S, Noise, Piece, smooth_log
@@ -440,34 +446,6 @@ def sensor_noise(rig: Rig, logs: Sequence[TuneLog]) -> tuple[Noise, str]:
     return DATA_SHEET, "a data sheet"
 
 
-def _sampling_said(source: str, sampling: Sampling) -> list[str]:
-    said = []
-    if sampling.repeated_rows:
-        share = sampling.repeated_rows / (sampling.samples + sampling.repeated_rows)
-        said.append(f"{source}: {sampling.repeated_rows} rows ({share:.2%}) repeat the one before; dropped")
-    if sampling.repeated_stamps:
-        share = sampling.repeated_stamps / sampling.samples
-        said.append(
-            f"{source}: {sampling.repeated_stamps} samples ({share:.2%}) bear the stamp of the one before; "
-            "put on an even grid"
-        )
-    filled = [gap for gap in sampling.gaps if not gap.split]
-    if filled:
-        longest = max(filled, key=lambda gap: gap.duration_s)
-        said.append(
-            f"{source}: {sampling.missing} samples missing in {len(filled)} gaps, the longest of "
-            f"{longest.duration_s:.3g} s at {longest.at_s:.5g} s; filled with straight lines"
-        )
-    said += [
-        f"{source}: split at a gap of {gap.duration_s:.5g} s after {gap.at_s:.5g} s"
-        for gap in sampling.gaps
-        if gap.split
-    ]
-    if any(sampling.at_limit):
-        said.append(f"{source}: {int(sampling.at_limit.sum())} readings are at the end of the sensor's range")
-    return said
-
-
 def _wanted(log: Log, read: DriftLog, how: Reading) -> str:
     """Which reference the log is judged by."""
     seen = len(log.sampled("u_px", "v_px")) >= _TUNELOGS_FEWEST
@@ -560,7 +538,7 @@ def read_tune_log(path: Path, how: Reading) -> TuneLog:
         )
     sampling, parts = regular_parts(read.t_s, read.values, is_gyro(read.axes), log.source)
     period = sampling.period_s
-    said += _sampling_said(log.source, sampling)
+    said += [one.text for one in sampling_findings(sampling, read.axes, log.source)]
     kept = [part for part in parts if len(part.values) * period >= _SHORTEST_S]
     if not kept:
         raise BadInputError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.core.errors import BadInputError
+from calib.core.verdict import Finding
 from calib.solve.clock import Gap, Part, time_axis
 
 # ----------------------------------------------------------------------
@@ -56,6 +58,48 @@ class Sampling:
     def missing(self) -> int:
         """Samples missing in gaps that were filled."""
         return sum(gap.missing for gap in self.gaps if not gap.split)
+
+
+_MOST_MISSING = 0.02
+
+
+def sampling_findings(
+    s: Sampling, axes: Sequence[str] = (), source: str = "", most_repeated: float = 1.0
+) -> Iterator[Finding]:
+    """What is to be known about how a log was sampled.
+
+    Parameters
+    ----------
+    axes : whose readings at the end of their range are named.
+    most_repeated : share of repeated rows above which the log is poor.
+    """
+    lead = f"{source}: " if source else ""
+    for gap in s.gaps:
+        if gap.split:
+            yield Finding("remark", f"{lead}split at a gap of {gap.duration_s:.4g} s after {gap.at_s:.2f} s")
+    for axis, count in zip(axes, s.at_limit.tolist(), strict=False):
+        if count:
+            yield Finding("poor", f"{lead}{axis} is at the end of its range in {count} samples")
+    short = [gap for gap in s.gaps if not gap.split]
+    if short:
+        longest = max(short, key=lambda gap: gap.duration_s)
+        yield Finding(
+            "poor" if s.missing > _MOST_MISSING * s.samples else "remark",
+            f"{lead}{s.missing} samples missing in {len(short)} gap(s), the longest "
+            f"{1e3 * longest.duration_s:.3g} ms after {longest.at_s:.2f} s; filled by straight lines",
+        )
+    if s.repeated_rows:
+        share = s.repeated_rows / (s.samples + s.repeated_rows)
+        yield Finding(
+            "poor" if share > most_repeated else "remark",
+            f"{lead}{s.repeated_rows} rows ({share:.2%}) repeat the one before; dropped",
+        )
+    if s.repeated_stamps:
+        yield Finding(
+            "remark",
+            f"{lead}{s.repeated_stamps} time stamps ({s.repeated_stamps / s.samples:.2%}) repeat the one "
+            "before with other readings; counted as samples of their own",
+        )
 
 
 def _step(values: FloatArray) -> float:

@@ -6,7 +6,19 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from calib.core.result import Count, Matrix3, NotNegative, Number, Pair, PerAxis, Positive, Section, Sizes
+from calib.core.result import (
+    Count,
+    Matrix3,
+    NotNegative,
+    Number,
+    Pair,
+    PerAxis,
+    Positive,
+    Result,
+    Section,
+    Sizes,
+    quantity,
+)
 
 # ----------------------------------------------------------------------
 # The section `imu` of rig.yaml.
@@ -15,33 +27,33 @@ from calib.core.result import Count, Matrix3, NotNegative, Number, Pair, PerAxis
 class ImuDrift(Section):
     """Slopes of an angle, one for each log: mean and standard deviation from log to log."""
 
-    mean_degps: Number
-    spread_degps: NotNegative | None = None
-    logs: Count
+    mean_degps: Number = quantity(label="mean", digits=4)
+    spread_degps: NotNegative | None = quantity(None, label="from log to log", digits=4)
+    logs: Count = quantity(label="logs")
 
 
 class ImuLog(Section):
     """How a log was sampled, and the drift of the angle in it (Fig. 2.4)."""
 
-    name: str
-    duration_s: Positive
-    rest_s: Positive
-    samples: Count
-    rate_hz: Positive
-    jitter_s: NotNegative
-    missing: Count
-    gaps: Count
-    splits: Count
-    repeated_rows: Count
-    repeated_stamps: Count
+    name: str = quantity(label="log")
+    duration_s: Positive = quantity(label="length", digits=1)
+    rest_s: Positive = quantity(label="at rest", digits=1)
+    samples: Count = quantity(label="samples")
+    rate_hz: Positive = quantity(label="rate", digits=3)
+    jitter_s: NotNegative = quantity(label="jitter", show="ms", digits=3)
+    missing: Count = quantity(label="missing")
+    gaps: Count = quantity(label="gaps")
+    splits: Count = quantity(label="splits")
+    repeated_rows: Count = quantity(label="repeated rows")
+    repeated_stamps: Count = quantity(label="repeated stamps")
     moves_s: list[Annotated[list[Number], Field(min_length=2, max_length=2)]] = []
-    gyro_degps: Number | None = None
-    gyro_sigma_degps: NotNegative | None = None
-    onchip_degps: Number | None = None
-    onchip_sigma_degps: NotNegative | None = None
+    gyro_degps: Number | None = quantity(None, label="drift by -gz", digits=4)
+    gyro_sigma_degps: NotNegative | None = quantity(None, label="sigma", digits=4)
+    onchip_degps: Number | None = quantity(None, label="by the chip", digits=4)
+    onchip_sigma_degps: NotNegative | None = quantity(None, label="sigma", digits=4)
 
 
-class Imu(Section):
+class Imu(Result):
     """The sensor at rest; lists hold x, y, z, null for what was not logged or cannot be told.
 
     Attributes
@@ -55,25 +67,21 @@ class Imu(Section):
     drift : by the gyroscope (-gz integrated) and by the chip.
     """
 
-    rate_hz: Positive
-    gyro_bias_radps: PerAxis
-    gyro_noise_radps_per_sqrt_Hz: Sizes
-    gyro_instability_radps: Sizes
-    gyro_walk_radps2_per_sqrt_Hz: Sizes
-    accel_mean_mps2: PerAxis
-    accel_noise_mps2_per_sqrt_Hz: Sizes
-    accel_instability_mps2: Sizes
-    accel_walk_mps3_per_sqrt_Hz: Sizes
+    rate_hz: Positive = quantity(label="rate", digits=3)
+    gyro_bias_radps: PerAxis = quantity(label="gyro bias")
+    gyro_noise_radps_per_sqrt_Hz: Sizes = quantity(label="gyro noise N")
+    gyro_instability_radps: Sizes = quantity(label="gyro instability B")
+    gyro_walk_radps2_per_sqrt_Hz: Sizes = quantity(label="gyro random walk K")
+    accel_mean_mps2: PerAxis = quantity(label="accel mean, with gravity")
+    accel_noise_mps2_per_sqrt_Hz: Sizes = quantity(label="accel noise N")
+    accel_instability_mps2: Sizes = quantity(label="accel instability B")
+    accel_walk_mps3_per_sqrt_Hz: Sizes = quantity(label="accel random walk K")
     sigma: dict[str, Sizes] = {}
     below: dict[str, Sizes] = {}
-    gyro_step_radps: Sizes
-    accel_step_mps2: Sizes
-    drift: dict[str, ImuDrift] = {}
-    logs: list[ImuLog] = []
-    verdict: Literal["ok", "poor"]
-    reasons: list[str] = []
-    remarks: list[str] = []
-    advice: list[str] = []
+    gyro_step_radps: Sizes = quantity(label="gyro step")
+    accel_step_mps2: Sizes = quantity(label="accel step")
+    drift: dict[str, ImuDrift] = quantity({}, label="drift of the angle")
+    logs: list[ImuLog] = quantity([], label="logs")
 
 
 # ----------------------------------------------------------------------
@@ -109,14 +117,14 @@ class AccelIntrinsics(Section):
     rms_mps2 : of | |a| - g | over the rests; `disagreement_mps2` is what noise does not explain of it.
     """
 
-    unit: Literal["m/s2", "counts"]
-    bias: PerAxis
-    scale: PerAxis
-    misalignment_rad: Angles = {}
+    unit: Literal["m/s2", "counts"] = quantity(label="readings in")
+    bias: PerAxis = quantity(label="bias")
+    scale: PerAxis = quantity(label="scale")
+    misalignment_rad: Angles = quantity({}, label="misalignment", show="mrad", digits=3)
     sigma: IntrinsicsSigma
     matrix: Matrix3 | None = None
-    rms_mps2: NotNegative | None = None
-    disagreement_mps2: NotNegative | None = None
+    rms_mps2: NotNegative | None = quantity(None, label="rests differ from g by (RMS)", digits=6)
+    disagreement_mps2: NotNegative | None = quantity(None, label="rests disagree beyond noise by", digits=6)
 
 
 class GyroIntrinsics(Section):
@@ -131,19 +139,19 @@ class GyroIntrinsics(Section):
     rms_rad : by which the turns miss the direction of gravity.
     """
 
-    unit: Literal["rad/s", "counts"]
-    bias: PerAxis
-    scale: PerAxis
-    misalignment_rad: Angles = {}
+    unit: Literal["rad/s", "counts"] = quantity(label="readings in")
+    bias: PerAxis = quantity(label="bias")
+    scale: PerAxis = quantity(label="scale")
+    misalignment_rad: Angles = quantity({}, label="misalignment", show="mrad", digits=3)
     sigma: GyroSigma
     matrix: Matrix3 | None = None
-    start_bias: PerAxis
+    start_bias: PerAxis = quantity(label="bias at the start")
     sensitivity: Matrix3 | None = None
-    rms_rad: NotNegative
-    turns: Count
+    rms_rad: NotNegative = quantity(label="turns miss gravity by (RMS)", show="deg", digits=4)
+    turns: Count = quantity(label="turns")
 
 
-class ImuIntrinsics(Section):
+class ImuIntrinsics(Result):
     """Bias, scale and misalignment of an IMU from rests in many poses.
 
     Attributes
@@ -158,22 +166,18 @@ class ImuIntrinsics(Section):
     thresholds : root mean square residual by multiple [m/s^2], null for too few rests.
     """
 
-    gravity_mps2: Positive
-    planar: bool
-    rate_hz: Positive
-    rests: Count
-    poses: Count
-    rest_s: NotNegative
-    degrees_of_freedom: Annotated[int, Field(strict=True)] | None = None
-    initial_rest_s: NotNegative
-    threshold: Positive
+    gravity_mps2: Positive = quantity(label="gravity")
+    planar: bool = quantity(label="in the plane alone")
+    rate_hz: Positive = quantity(label="rate", digits=3)
+    rests: Count = quantity(label="rests")
+    poses: Count = quantity(label="poses more than 5 degrees apart")
+    rest_s: NotNegative = quantity(label="at rest", digits=2)
+    degrees_of_freedom: Annotated[int, Field(strict=True)] | None = quantity(None, label="degrees of freedom")
+    initial_rest_s: NotNegative = quantity(label="rest at the start", digits=2)
+    threshold: Positive = quantity(label="threshold, times the spread at rest")
     thresholds: dict[str, NotNegative | None] = {}
-    accel: AccelIntrinsics
-    gyro: GyroIntrinsics | None = None
-    verdict: Literal["ok", "poor", "unidentifiable", "inconsistent"]
-    reasons: list[str] = []
-    remarks: list[str] = []
-    advice: list[str] = []
+    accel: AccelIntrinsics = quantity(label="accel")
+    gyro: GyroIntrinsics | None = quantity(None, label="gyro")
 
 
 # ----------------------------------------------------------------------
@@ -195,22 +199,22 @@ class FilterCandidate(Section):
     whole_rmse_deg : error on the whole logs, which "tuned" was tuned on.
     """
 
-    Kp_per_s: Positive
-    Ki_per_s2: NotNegative
-    poles: list[Pair]
-    bandwidth_hz: NotNegative
-    noise_gain: NotNegative
+    Kp_per_s: Positive = quantity(label="Kp", digits=4)
+    Ki_per_s2: NotNegative = quantity(label="Ki", digits=4)
+    poles: list[Pair] = quantity(label="poles", digits=4)
+    bandwidth_hz: NotNegative = quantity(label="bandwidth", digits=3)
+    noise_gain: NotNegative = quantity(label="noise", digits=5)
     bias_gain_s: NotNegative
-    bias_peak_s: NotNegative
-    settling_s: NotNegative | None
+    bias_peak_s: NotNegative = quantity(label="peak of a bias", digits=3)
+    settling_s: NotNegative | None = quantity(label="settles in", digits=2)
     bias_settling_s: NotNegative | None
-    lag_s: NotNegative | None
-    rmse_deg: NotNegative | None = None
-    interval_deg: Pair | None = None
+    lag_s: NotNegative | None = quantity(label="lag", digits=2)
+    rmse_deg: NotNegative | None = quantity(None, label="held-out error", digits=3)
+    interval_deg: Pair | None = quantity(None, label="95 % interval", digits=3)
     less_than_3_3_deg: Number | None = None
-    less_interval_deg: Pair | None = None
-    confidence: Annotated[float, Field(ge=0, le=1)] | None = None
-    whole_rmse_deg: NotNegative | None = None
+    less_interval_deg: Pair | None = quantity(None, label="less that of 3/3", digits=3)
+    confidence: NotNegative | None = quantity(None, label="surely less", show="%", digits=1, le=1)
+    whole_rmse_deg: NotNegative | None = quantity(None, label="error on whole logs", digits=3)
 
 
 class FilterLog(Section):
@@ -225,23 +229,23 @@ class FilterLog(Section):
     smoothed_sigma_deg, bias_degps : of the smoothed angle and of its rate.
     """
 
-    name: str
-    duration_s: Positive
-    samples: Count
-    missing: Count
-    pieces: Count
+    name: str = quantity(label="log")
+    duration_s: Positive = quantity(label="length", digits=1)
+    samples: Count = quantity(label="samples")
+    missing: Count = quantity(label="missing")
+    pieces: Count = quantity(label="pieces")
     repeated_rows: Count
     repeated_stamps: Count
-    reference: str | None = None
+    reference: str | None = quantity(None, label="judged by")
     reference_offset_deg: Number | None = None
-    reference_lag_s: Number | None = None
+    reference_lag_s: Number | None = quantity(None, label="which is late by", show="ms", digits=1)
     rate_error_degps_per_sqrt_Hz: NotNegative | None = None
     angle_error_deg_per_sqrt_Hz: NotNegative | None = None
-    smoothed_sigma_deg: NotNegative | None = None
-    bias_degps: Number | None = None
+    smoothed_sigma_deg: NotNegative | None = quantity(None, label="smoothed angle's sigma", digits=3)
+    bias_degps: Number | None = quantity(None, label="bias", digits=4)
 
 
-class OrientationFilter(Section):
+class OrientationFilter(Result):
     """Gains of the angle filter (2.3) and why they are these.
 
     Attributes
@@ -254,20 +258,98 @@ class OrientationFilter(Section):
     rate_of_angle : "-gz", or "up vector" for a sensor that is not in plane.
     """
 
-    Kp_per_s: Positive
-    Ki_per_s2: NotNegative
-    rate_hz: Positive
-    recommended: str
-    recommended_by: Literal["reference", "smoothed", "default"]
-    rate_of_angle: Literal["-gz", "up vector"] = "-gz"
+    Kp_per_s: Positive = quantity(label="Kp", digits=4)
+    Ki_per_s2: NotNegative = quantity(label="Ki", digits=4)
+    rate_hz: Positive = quantity(label="rate", digits=3)
+    recommended: str = quantity(label="recommended")
+    recommended_by: Literal["reference", "smoothed", "default"] = quantity(label="by")
+    rate_of_angle: Literal["-gz", "up vector"] = quantity("-gz", label="rate of the angle by")
     sigma: dict[str, NotNegative | None] = {}
     halves: list[Pair] = []
-    candidates: dict[str, FilterCandidate] = {}
-    densities: dict[str, NotNegative] = {}
-    densities_from: str = ""
-    judged_s: NotNegative = 0.0
-    block_s: NotNegative | None = None
-    logs: list[FilterLog] = []
-    verdict: Literal["ok", "poor"]
-    reasons: list[str] = []
+    candidates: dict[str, FilterCandidate] = quantity({}, label="gains")
+    densities: dict[str, NotNegative] = quantity({}, label="density")
+    densities_from: str = quantity("", label="densities from")
+    judged_s: NotNegative = quantity(0.0, label="judged over", digits=1)
+    block_s: NotNegative | None = quantity(None, label="blocks of the bootstrap", digits=2)
+    logs: list[FilterLog] = quantity([], label="logs")
+
+
+# ----------------------------------------------------------------------
+# What `calib imu drift` finds; it is printed and not written.
+
+
+class DriftMethod(Section):
+    """How the angle of one method drifts on a log; null for what the log does not show.
+
+    Attributes
+    ----------
+    offset_deg : mean error, against the accelerometer's mean angle where there is no truth.
+    slope_degps, sigma_degps, interval_degps : slope of the error, its deviation and 95 % interval.
+    allan_1s_deg, allan_100s_deg : Allan deviation of the error averaged over so long.
+    rmse_deg, lag_ms : error and lateness in motion, without the constant mount offset.
+    """
+
+    offset_deg: Number | None = quantity(label="offset", digits=3)
+    slope_degps: Number | None = quantity(label="slope", digits=5)
+    sigma_degps: NotNegative | None
+    interval_degps: Annotated[list[Number | None], Field(min_length=2, max_length=2)] = quantity(
+        label="95 % interval", digits=5
+    )
+    allan_1s_deg: NotNegative | None = quantity(label="Allan 1 s", digits=4)
+    allan_100s_deg: NotNegative | None = quantity(label="100 s", digits=4)
+    rmse_deg: NotNegative | None = quantity(label="RMSE", digits=3)
+    lag_ms: Number | None = quantity(label="lag", digits=1)
+
+
+class DriftOfLog(Section):
+    """A log and what every method makes of it.
+
+    Attributes
+    ----------
+    against, about : what the angles are held against: "truth", "rest" or "nothing", and the same in words.
+    judged_s, moving_s : length of what slope, offset and Allan deviation rest on, and of motion.
+    skipped : sentences about methods that were left out.
+    """
+
+    name: str
+    duration_s: Positive
+    rate_hz: Positive
+    jitter_s: NotNegative
+    missing: Count
+    gaps: Count
+    splits: Count
+    repeated_rows: Count
+    repeated_stamps: Count
+    against: Literal["truth", "rest", "nothing"]
+    about: str
+    judged_s: NotNegative
+    moving_s: NotNegative
+    methods: dict[str, DriftMethod]
+    skipped: list[str] = []
     remarks: list[str] = []
+
+
+class DriftSlopes(Section):
+    """Slopes of one method over several logs."""
+
+    mean_degps: Number | None = quantity(label="mean", digits=5)
+    spread_degps: NotNegative | None = quantity(label="spread", digits=5)
+    logs: Count = quantity(label="logs")
+
+
+class DriftGains(Section):
+    """Gains of the tuned filter, out of the section `orientation_filter`."""
+
+    Kp_per_s: Positive
+    Ki_per_s2: NotNegative
+    rate_of_angle: Literal["-gz", "up vector"]
+
+
+class Drift(Result):
+    """How the angles of logs drift by every way of getting them; `note` says what does not follow."""
+
+    note: str
+    logs: list[DriftOfLog]
+    methods: dict[str, DriftSlopes] = quantity(label="slope over the logs")
+    provenance: dict[str, dict[str, str]]
+    tuned: DriftGains | None = None
