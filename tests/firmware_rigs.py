@@ -175,7 +175,7 @@ def rig(kind: str = "nominal") -> Rig:
             },
             "actuator": {"bellows_radius_m": 0.0131, "rest_length_m": 0.066},
         }
-    return Rig.model_validate(sections)
+    return Rig.of(sections, "rig.yaml")
 
 
 @cache

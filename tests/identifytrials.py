@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from calib.core.rig import Rig, write_rig
+from calib.core.rig import Rig
 from calib.io.logs import write_log
-from calib.stages.actuator.identify import Nominal, Track, made, values_of
+from calib.stages.actuator.identify import Track, made, values_of
 from calib.stages.actuator.identify_pump import PumpRecord, simulate_pump
+from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import Creep
 from calib.stages.actuator.pump import TICK_S, RateLimit
 from calib.stages.actuator.simulate import rig_at_rest, simulate
@@ -45,7 +46,7 @@ def track(
     delay_s: float = 0.025,
 ) -> Track:
     """A track from `integrate.simulate` with steps of its own: "free", "steps" or "prbs"."""
-    nominal = Nominal()
+    nominal = Machine()
     n = round(duration_s / TICK_S)
     plant, pump = made(nominal, {**values_of(nominal), **(values or {})}, kind != "free", TICK_S)
     start = rig_at_rest(plant, pump, phi_rad if kind == "free" else 0.0)
@@ -126,7 +127,7 @@ def rig_file(path: Path, **sections: Any) -> Rig:
         verdict="ok",
     )
     rig = Rig(camera=camera, plane=plane, **sections)
-    write_rig(path, rig, {})
+    rig.save(path)
     return rig
 
 

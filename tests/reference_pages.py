@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import ast
 import fnmatch
-import importlib
 import inspect
 import itertools
 import math
@@ -28,8 +27,7 @@ import typer
 from pydantic import BaseModel
 
 from calib.cli.app import app
-from calib.core.rig import _LATER, SECTIONS, Rig
-from calib.stages.actuator.section import Actuator, PumpSection
+from calib.core.rig import KINDS, kind_of
 
 MANUAL = Path(__file__).resolve().parent.parent / "calib" / "docs"
 
@@ -206,18 +204,8 @@ def rig_page() -> str:
 
 
 def sections() -> dict[str, type[BaseModel]]:
-    """The class of each section of rig.yaml, in the order of the file; `twin` has none."""
-    out: dict[str, type[BaseModel]] = {"actuator": Actuator, "pump": PumpSection}
-    for name, (module, kind) in _LATER.items():
-        out[name] = getattr(importlib.import_module(module), kind)
-    for name, field in Rig.model_fields.items():
-        kinds = [
-            one for one in (field.annotation, *typing.get_args(field.annotation)) if inspect.isclass(one)
-        ]
-        model = next((one for one in kinds if issubclass(one, BaseModel)), None)
-        if model is not None:
-            out[name] = model
-    return {name: out[name] for name in SECTIONS if name in out}
+    """The class of each section of rig.yaml, in the order of the file."""
+    return {name: kind_of(name) for name in KINDS}
 
 
 def _keys(

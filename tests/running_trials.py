@@ -11,10 +11,12 @@ import yaml
 
 from calib.core.errors import BadInputError
 from calib.core.files import sha256, write_atomically
-from calib.core.rig import read_rig, write_rig
+from calib.core.rig import Rig
 from calib.runner.folder import Folder, LogFile, read_folder
 from calib.runner.graph import HIDDEN, Command, Done, Planned, Runner, Stage, opened
 from calib.runner.outputs import decide, publish, summary
+from calib.stages.estimator.section import Estimator
+from calib.twin.section import Twin, TwinTracker
 
 __all__ = ["CALLS", "STAGES", "Inline", "make_folder", "run_small"]
 
@@ -65,26 +67,28 @@ class Inline:
     def _work(self, command: Command, code: int) -> None:
         rig_path = _option(command.words, "--rig")
         assert rig_path is not None
-        rig = read_rig(rig_path)
+        rig = Rig.load(rig_path)
         inputs = [Path(word) for word in command.words if word.endswith((".csv", ".png"))]
         digest = sha256(
             b"".join(path.read_bytes() for path in inputs if path.parent.name in ("logs", "images"))
         )
         if command.words[0] == "first":
-            section = {"value_m": int(digest[:6], 16) * 1e-6, "verdict": "poor" if code else "ok"}
-            section |= {"reasons": ["it is weak"] if code else []}
-            rig = rig.model_validate({**rig.model_dump(exclude_none=True), "first": section})
-            write_rig(rig_path, rig, {"first": {path.name: digest for path in inputs}})
+            rig.estimator = Estimator(
+                jitter_px=1e-6 + int(digest[:6], 16) * 1e-6,
+                verdict="poor" if code else "ok",
+                reasons=["it is weak"] if code else [],
+            )
+            rig.save(rig_path, {"estimator": {path.name: digest for path in inputs}})
         elif command.words[0] == "second":
-            known = (rig.model_extra or {})["first"]["value_m"]
-            rig = rig.model_validate({**rig.model_dump(exclude_none=True), "second": {"twice_m": 2 * known}})
-            write_rig(rig_path, rig, {"second": {}})
+            assert rig.estimator is not None
+            rig.twin = Twin(tracker=TwinTracker(jitter_px=2.0 * rig.estimator.jitter_px))
+            rig.save(rig_path, {"twin": {}})
         output = _option(command.words, "-o")
         if output is not None and output.suffix:
             write_atomically(output, f"t_s\n{digest}\n")
         elif output is not None:
             output.mkdir()
-            write_atomically(output / "header.h", f"// {sorted((rig.model_extra or {}).items())}\n")
+            write_atomically(output / "header.h", f"// {sorted(rig.values().items())}\n")
         figures = _option(command.words, "--figures")
         if figures is not None:
             figures.mkdir(exist_ok=True)
@@ -110,13 +114,13 @@ def _log(log: LogFile) -> Planned | str:
 
 
 STAGES = (
-    Stage("first", "First", ("first",), _pictures, writes=("first",), flashed=True),
-    Stage("second", "Second", ("second",), _nothing, writes=("second",), needs=("first",)),
+    Stage("first", "First", ("first",), _pictures, writes=("estimator",), flashed=True),
+    Stage("second", "Second", ("second",), _nothing, writes=("twin",), needs=("estimator",)),
     Stage("lone", "Lone", ("lone",), _nothing),
-    Stage("each", "Each", ("each",), None, _log, needs=("first",), output="states.csv"),
-    Stage("absent", "Absent", ("absent",), _nothing, writes=("absent",)),
-    Stage("firmware", "Firmware", ("firmware",), _nothing, needs=("first",),
-          uses=("second", "absent"), output="firmware", figures=False),
+    Stage("each", "Each", ("each",), None, _log, needs=("estimator",), output="states.csv"),
+    Stage("absent", "Absent", ("absent",), _nothing, writes=("lens",)),
+    Stage("firmware", "Firmware", ("firmware",), _nothing, needs=("estimator",),
+          uses=("twin", "lens"), output="firmware", figures=False),
 )  # fmt: skip
 
 

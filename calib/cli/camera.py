@@ -94,10 +94,10 @@ def export_camera(
 
 def _camera_text(to: str, rig: Path, name: str) -> tuple[str, str]:
     from calib.core.files import shown
-    from calib.core.rig import read_rig
+    from calib.core.rig import Rig
     from calib.stages.camera.formats import to_kalibr, to_opencv, to_ros
 
-    section = read_rig(rig).camera
+    section = Rig.load(rig, missing_ok=True).camera
     if section is None:
         raise BadInputError(f"{shown(rig)}: has no camera yet; run calib intrinsics first")
     camera = section.optics
@@ -111,12 +111,12 @@ def _camera_text(to: str, rig: Path, name: str) -> tuple[str, str]:
 
 def _imu_text(rig: Path, topic: str | None) -> tuple[str, str]:
     from calib.core.files import one_line, shown
-    from calib.core.rig import read_rig
+    from calib.core.rig import Rig
     from calib.stages.imu.formats import to_kalibr
 
     if topic is not None and not re.fullmatch(r"[A-Za-z~/][\w~/]*", topic, re.ASCII):
         raise UsageError(f"--name: {one_line(topic)[:60]!r} is no topic, expected for instance /imu0")
-    section = read_rig(rig).imu
+    section = Rig.load(rig, missing_ok=True).imu
     if section is None:
         raise BadInputError(f"{shown(rig)}: has no imu yet; run calib imu static first")
     return to_kalibr(section, topic or "/imu0"), section.verdict.word
@@ -134,12 +134,12 @@ def import_camera(
         return
     from calib.core.files import as_text, check_writable, read_bytes, sha256, shown
     from calib.core.result import section_json
-    from calib.core.rig import read_rig, write_rig
+    from calib.core.rig import Rig
     from calib.stages.camera.formats import from_kalibr, from_opencv, from_ros
     from calib.stages.camera.stage import imported_camera
 
     check_writable(rig)
-    before = read_rig(rig)
+    before = Rig.load(rig, missing_ok=True)
     data = read_bytes(source, _MAX_BYTES)
     text = as_text(source, data)
     try:
@@ -147,34 +147,34 @@ def import_camera(
     except BadInputError as error:
         raise BadInputError(f"{shown(source)}: {error}") from error
     section = imported_camera(camera, from_)
-    after = write_rig(
-        rig, before.model_copy(update={"camera": section}), {"camera": {shown(source.name): sha256(data)}}
-    )
+    before.camera = section
+    before.save(rig, {"camera": {shown(source.name): sha256(data)}})
     if as_json:
         document("import", {"camera": section_json(section)})
     else:
         say(f"camera {camera.model}, {camera.image_size_px[0]}x{camera.image_size_px[1]} px")
         say("it comes without error bars, so its verdict is poor until calib intrinsics has seen pictures")
     narrate(f"camera written to {shown(rig)}")
-    for sentence in after.outdated():
+    for sentence in before.outdated():
         narrate(sentence)
 
 
 def _import_imu(source: Path, rig: Path, as_json: bool) -> None:
     from calib.core.files import check_writable, read_bytes, read_yaml_mapping, sha256, shown
     from calib.core.result import section_json
-    from calib.core.rig import read_rig, write_rig
+    from calib.core.rig import Rig
     from calib.stages.imu.formats import from_kalibr
 
     check_writable(rig)
-    before = read_rig(rig)
+    before = Rig.load(rig, missing_ok=True)
     digest = sha256(read_bytes(source, _MAX_BYTES))
     try:
         section = from_kalibr(read_yaml_mapping(source))
     except BadInputError as error:
         place = shown(source)
         raise BadInputError(str(error) if str(error).startswith(place) else f"{place}: {error}") from error
-    write_rig(rig, before.model_copy(update={"imu": section}), {"imu": {shown(source.name): digest}})
+    before.imu = section
+    before.save(rig, {"imu": {shown(source.name): digest}})
     if as_json:
         document("import", {"imu": section_json(section)})
     else:

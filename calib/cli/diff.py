@@ -11,7 +11,7 @@ import typer
 from calib.cli.common import JsonOption, document, say, table
 
 if TYPE_CHECKING:
-    from calib.show.diff import Change, RigDiff
+    from calib.core.diff import Change, RigDiff
 
 __all__ = ["diff"]
 
@@ -28,9 +28,9 @@ def diff(
 
     Exits 0 whatever has changed; the two are taken as independent of each other.
     """
-    from calib.show.diff import diff_rigs
+    from calib.core.rig import Rig
 
-    found = diff_rigs(before, after)
+    found = Rig.load(before).diff(Rig.load(after))
     if as_json:
         document(
             "diff",
@@ -87,13 +87,13 @@ def _tell(found: RigDiff, every: bool) -> None:
 
 
 def _row(change: Change) -> list[str]:
-    from calib.show.values import digits
+    from calib.core.words import number
 
     assert change.before is not None and change.after is not None
     return [
         f"{change.section}.{change.name}",
-        digits(change.before, change.sigma),
-        digits(change.after, change.sigma),
+        number(change.before, change.sigma),
+        number(change.after, change.sigma),
         f"{change.after - change.before:+.3g}",
         change.unit,
         "-" if change.sigmas is None else f"{change.sigmas:.1f}",

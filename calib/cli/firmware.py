@@ -33,14 +33,14 @@ def firmware(
     computes something else.
     """
     from calib.core.files import shown
-    from calib.core.rig import read_rig
+    from calib.core.rig import Rig
     from calib.stages.firmware.header import header_of
 
     if check is None:
         from calib.core.files import check_folder
 
         check_folder(output)
-    whole = read_rig(rig)
+    whole = Rig.load(rig, missing_ok=True)
     if whole.camera is None:
         raise BadInputError(f"{shown(rig)}: has no camera yet; run calib intrinsics first")
     header = header_of(whole, shown(rig))

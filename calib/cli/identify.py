@@ -93,8 +93,8 @@ def tell_pump(found: PumpFound, section: PumpSection) -> None:
         head = ["static map", f"at PWM 255, {unit}", "dead zone, PWM", "scale, PWM", "95 % at PWM", "scatter"]
         for line in table(head, rows):
             say(line)
-    say(f"verdict: {section.verdict}")
-    for sentence in (*section.reasons, *section.remarks):
+    say(f"verdict: {section.verdict.word}")
+    for sentence in (*section.verdict.reasons, *section.verdict.remarks):
         say(f"  - {sentence}")
 
 
@@ -217,15 +217,10 @@ def logs(
     Writes the sections actuator and, where a log has commands, pump. Exits 1 when the verdict is not ok.
     """
     from calib.core.files import check_folder, check_writable, hash_of, shown
-    from calib.core.rig import read_rig, write_rig
+    from calib.core.result import section_json
+    from calib.core.rig import Rig
     from calib.stages.actuator.read import read_track
-    from calib.stages.actuator.results import (
-        identified_json,
-        nominal_of,
-        plain_section,
-        sections_from,
-        with_sections,
-    )
+    from calib.stages.actuator.results import beginning, identified_json, sections_from
     from calib.stages.actuator.stage import identify_logs
 
     if states and len(states) != len(paths):
@@ -235,12 +230,12 @@ def logs(
     check_writable(rig)
     if figures is not None:
         check_folder(figures)
-    before = read_rig(rig)
-    nominal = nominal_of(before, rig)
+    before = Rig.load(rig, missing_ok=True)
+    nominal, stated = beginning(before)
     sources, hashes = [], {}
     for k, path in enumerate(paths):
         given = states[k] if states else None
-        source = read_track(path, before, rig, nominal.plant.bellows_radius_m, given, truth, no_pwm)
+        source = read_track(path, before, rig, nominal, given, truth, no_pwm)
         name = shown(path.name)
         hashes[name if name not in hashes else f"{name} ({k + 1})"] = hash_of(path)
         if source.states is not None:
@@ -249,9 +244,9 @@ def logs(
             narrate(sentence)
         sources.append(source)
     with progress_bar("identifying") as progress:
-        found = identify_logs(nominal, sources, static_map, hold_back, progress)
-    sections = sections_from(found, before, rig)
-    write_rig(rig, with_sections(before, sections), dict.fromkeys(sections, hashes))
+        found = identify_logs(nominal, sources, static_map, hold_back, progress, stated)
+    sections = sections_from(found, before)
+    before.with_sections(sections).save(rig, dict.fromkeys(sections, hashes))
     narrate(f"{' and '.join(sections)} written to {shown(rig)}")
     if figures is not None:
         from calib.show.draw import write_figures
@@ -260,7 +255,7 @@ def logs(
         write_figures(figures, plots(found))
         narrate(f"figures in {shown(figures)}")
     if as_json:
-        told = {name: plain_section(section) for name, section in sections.items()}
+        told = {name: section_json(section) for name, section in sections.items()}
         document("identify", {**told, "identify": identified_json(found)})
     else:
         _tell(found)
@@ -288,31 +283,32 @@ def pump(
     Writes the section pump. Exits 1 when something is left that the PWM does not explain.
     """
     from calib.core.files import check_folder, check_writable, hash_of, shown
-    from calib.core.rig import read_rig, write_rig
+    from calib.core.result import section_json
+    from calib.core.rig import Rig
     from calib.stages.actuator.read import read_pump_table
-    from calib.stages.actuator.results import plain_section, with_sections
     from calib.stages.actuator.stage import identify_pump, pump_section
 
     check_writable(rig)
     if figures is not None:
         check_folder(figures)
-    before = read_rig(rig)
+    before = Rig.load(rig, missing_ok=True)
     tables = [read_pump_table(path, time, pwm, value, unit) for path in paths]
     kept_out = [read_pump_table(path, time, pwm, value, unit) for path in held or []]
     with progress_bar("identifying") as progress:
         found = identify_pump(tables, kept_out, progress)
-    section = pump_section(found, before, rig)
+    section = pump_section(found, before)
     hashes = {shown(path.name): hash_of(path) for path in paths}
-    write_rig(rig, with_sections(before, {"pump": section}), {"pump": hashes})
+    before.pump = section
+    before.save(rig, {"pump": hashes})
     narrate(f"pump written to {shown(rig)}")
     if figures is not None:
         from calib.show.draw import write_figures
         from calib.stages.actuator.plots import pump_plots
 
-        write_figures(figures, pump_plots(found, section.verdict or "ok"))
+        write_figures(figures, pump_plots(found, section.verdict.word))
         narrate(f"figures in {shown(figures)}")
     if as_json:
-        told: dict[str, Any] = {"pump": plain_section(section)}
+        told: dict[str, Any] = {"pump": section_json(section)}
         if kept_out:
             told["held"] = {
                 model: {h.name: {"rms": h.rms, "ahead_rms": h.ahead} for h in rows}
@@ -321,7 +317,7 @@ def pump(
         document("identify pump", told)
     else:
         tell_pump(found, section)
-    if section.verdict != "ok":
+    if not section.verdict.ok:
         raise typer.Exit(EXIT_POOR)
 
 
@@ -339,23 +335,22 @@ def stiffness(
     Writes k0 .. k3 of one bellows to the section actuator.
     """
     from calib.core.files import check_folder, check_writable, hash_of, shown
-    from calib.core.rig import read_rig, write_rig
+    from calib.core.result import section_json
+    from calib.core.rig import Rig
     from calib.stages.actuator.identify import fit_stiffness
     from calib.stages.actuator.read import read_displacements
-    from calib.stages.actuator.results import plain_section, stiffness_section, with_sections
+    from calib.stages.actuator.results import stiffness_section
 
     check_writable(rig)
     if figures is not None:
         check_folder(figures)
-    before = read_rig(rig)
+    before = Rig.load(rig, missing_ok=True)
     eps, force = read_displacements(path)
     fits, best = fit_stiffness(shown(path), eps, force)
-    section = stiffness_section(fits[best], per == "actuator", before, rig)
-    write_rig(
-        rig,
-        with_sections(before, {"actuator": section}),
-        {"actuator": {**before.provenance.inputs.get("actuator", {}), shown(path.name): hash_of(path)}},
-    )
+    section = stiffness_section(fits[best], per == "actuator", before)
+    learnt = before.provenance.inputs.get("actuator", {})
+    before.actuator = section
+    before.save(rig, {"actuator": {**learnt, shown(path.name): hash_of(path)}})
     narrate(f"actuator written to {shown(rig)}")
     if figures is not None:
         from calib.show.draw import write_figures
@@ -378,7 +373,7 @@ def stiffness(
     if as_json:
         document(
             "identify stiffness",
-            {"actuator": plain_section(section), "stiffness": {"per": per, "laws": laws}},
+            {"actuator": section_json(section), "stiffness": {"per": per, "laws": laws}},
         )
         return
     rows = []

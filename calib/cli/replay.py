@@ -99,7 +99,7 @@ def replay(
     """
     from calib.core.files import check_folder, check_writable, hash_of, make_folder, shown
     from calib.core.result import section_json
-    from calib.core.rig import read_rig, write_rig
+    from calib.core.rig import Rig
     from calib.runner.folder import inside, slug
     from calib.stages.estimator.replay import replay_log
 
@@ -112,18 +112,15 @@ def replay(
         check_writable(rig)
     if figures is not None:
         check_folder(figures)
-    known = read_rig(rig)
+    known = Rig.load(rig, missing_ok=True)
     told: dict[str, Any] = {}
     if tune:
         from calib.stages.estimator.tuning import tuned_section
 
         with progress_bar("tuning") as progress:
             section = tuned_section(logs, known, rig, progress, topics)
-        known = write_rig(
-            rig,
-            known.model_copy(update={"estimator": section}),
-            {"estimator": {shown(path.name): hash_of(path) for path in logs}},
-        )
+        known.estimator = section
+        known.save(rig, {"estimator": {shown(path.name): hash_of(path) for path in logs}})
         told["estimator"] = section_json(section)
         narrate(f"estimator written to {shown(rig)}")
     if output is not None and several:

@@ -49,7 +49,6 @@ def simulate(
     as_json: JsonOption = False,
 ) -> None:
     """Simulate an experiment and write its log, with the truth in columns of its own."""
-    from calib.core.errors import BadInputError
     from calib.core.files import check_writable, shown
     from calib.core.units import parse_duration_s
     from calib.io.logs import write_log
@@ -62,15 +61,11 @@ def simulate(
         raise UsageError(f"--feedback: {feedback!r} is not one of {', '.join(FEEDBACKS)}")
     options = _options(settings or [])
     duration_s = None if duration is None else parse_duration_s(duration, "--duration")
-    if rig is not None and not rig.exists():
-        raise BadInputError(f"{shown(rig)}: cannot be read: there is no such file")
     machine = SimulatedRig()
     if rig is not None:
-        from calib.core.rig import read_rig
+        from calib.core.rig import Rig
 
-        known = read_rig(rig)
-        camera = None if known.camera is None else known.camera.optics
-        machine = rig_from_file(known, str(rig), camera)
+        machine = rig_from_file(Rig.load(rig))
     told: dict[str, Any] = {"scenario": scenario, "seed": seed, "feedback": feedback}
     if scenario == "rig":
         if options or duration_s is not None:

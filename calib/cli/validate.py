@@ -79,17 +79,17 @@ def _log_json(one: Comparison) -> dict[str, Any]:
 def _compared(
     logs: list[Path], states: list[Path] | None, truth: bool, no_pwm: bool, rig: Path
 ) -> list[Comparison]:
-    from calib.core.rig import read_rig
+    from calib.core.rig import Rig
     from calib.stages.actuator.validate import IMPROVED, validate_log
 
-    known, out = read_rig(rig), []
+    known, out = Rig.load(rig, missing_ok=True), []
     for k, path in enumerate(logs):
         one, said = validate_log(path, known, rig, states[k] if states else None, truth, no_pwm)
         for sentence in said:
             narrate(sentence)
         out.append(one)
     if IMPROVED not in out[0].errors:
-        narrate(f"{rig} has no section actuator or pump: the improved model has nominal parameters")
+        narrate(f"{rig} has no section known, actuator or pump: the improved model has nominal parameters")
     return out
 
 

@@ -89,7 +89,7 @@ def _several(hint: Any) -> Any:
 def _run(stage: Stage, files: Files, options: Any, figures: Path | None, as_json: bool) -> None:
     from calib.core.files import check_folder, check_writable, shown
     from calib.core.result import section_json
-    from calib.core.rig import read_rig, write_rig
+    from calib.core.rig import Rig
     from calib.core.words import as_text, described
 
     if stage.writes:
@@ -98,16 +98,12 @@ def _run(stage: Stage, files: Files, options: Any, figures: Path | None, as_json
         (check_folder if stage.output.folder else check_writable)(files.output)
     if figures is not None:
         check_folder(figures)
-    before = read_rig(files.rig_path)
-    outcome = stage.run(files, before, options)
+    rig = Rig.load(files.rig_path, missing_ok=True)
+    outcome = stage.run(files, rig, options)
     sections = stage.sections(outcome)
-    after = before
     if sections:
-        after = write_rig(
-            files.rig_path,
-            before.model_copy(update=sections),
-            {name: one.inputs for name, one in sections.items()},
-        )
+        rig = rig.with_sections(sections)
+        rig.save(files.rig_path)
     if stage.output is not None and files.output is not None:
         for sentence in stage.output.write(files.output, outcome):
             narrate(sentence)
@@ -127,7 +123,7 @@ def _run(stage: Stage, files: Files, options: Any, figures: Path | None, as_json
             say(line)
     for name in sections:
         narrate(f"{name} written to {shown(files.rig_path)}")
-    for sentence in () if stage.remarks is None else stage.remarks(after):
+    for sentence in () if stage.remarks is None else stage.remarks(rig):
         narrate(sentence)
     if not stage.verdict(outcome).ok:
         raise typer.Exit(EXIT_POOR)

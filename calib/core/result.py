@@ -13,7 +13,15 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Self
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
 
 from calib.core.errors import BadInputError
 from calib.core.files import sha256
@@ -53,6 +61,16 @@ class Section(BaseModel):
     """A section of rig.yaml or a part of one: keys that it does not know are refused."""
 
     model_config = ConfigDict(extra="forbid", defer_build=True)
+
+
+class Statement(Section):
+    """A part of rig.yaml that a person writes: what is not set is not written."""
+
+    @model_serializer(mode="wrap")
+    def _set_alone(self, whole: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        values: dict[str, Any] = whole(self)
+        chosen = self.model_fields_set
+        return {key: one for key, one in values.items() if key in chosen and one is not None and one != {}}
 
 
 class CovarianceTable(Section):

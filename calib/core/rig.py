@@ -1,79 +1,66 @@
-"""rig.yaml: the one file that holds what was learnt about a rig."""
+"""rig.yaml: the one file that holds what is known of a rig and what was learnt about it.
+
+Each verb reads the sections that it needs and writes its own. Every key carries its unit, every estimated
+value has its standard deviation under `sigma`, and `provenance` names the inputs by their SHA-256, so that
+the same inputs give the same bytes. A standard deviation that the data do not bound is null.
+
+`schema` is the version of the file. In schema 1, which files without it have, a person's word and an
+estimate share the sections `actuator` and `pump`; they are parted when such a file is read.
+"""
 
 from __future__ import annotations
 
 import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import yaml
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    ValidationError,
-    ValidationInfo,
-    field_validator,
-)
+from pydantic import BaseModel, Field, field_validator
 
 from calib import __version__
 from calib.core.errors import BadInputError
 from calib.core.files import one_line, read_yaml_mapping, shown, write_atomically
-from calib.core.result import Section, identity, section_json
-
-# ----------------------------------------------------------------------
-# rig.yaml: the one file that holds what was learnt about a rig.
-#
-# Each verb reads the sections that it needs and writes its own. Every key carries its unit, every
-# estimated value has its standard deviation under `sigma`, and `provenance` names the inputs by their
-# SHA-256, so that the same inputs give the same bytes. A standard deviation that the data do not
-# bound is null.
+from calib.core.result import Result, Section, identity, section_json
+from calib.core.schema import nearest, quoted, validated
 
 if TYPE_CHECKING:
+    from calib.core.diff import RigDiff
+    from calib.stages.actuator.machine import Machine
+    from calib.stages.actuator.parameters import Plant
+    from calib.stages.actuator.section import Actuator, Known, PumpSection
     from calib.stages.align.section import Align
     from calib.stages.camera.section import Camera, Lens, Plane
     from calib.stages.control.section import Controller
     from calib.stages.estimator.section import Estimator
     from calib.stages.imu.section import Imu, ImuIntrinsics, OrientationFilter
     from calib.stages.lowpass.section import LowPass
-else:
-    # Their schemas take a tenth of a second to build and are loaded where a file has these sections.
-    Align = Camera = Controller = Estimator = Imu = ImuIntrinsics = Any
-    Lens = LowPass = OrientationFilter = Plane = Any
+    from calib.twin.section import Twin
 
+SCHEMA = 2
+"""Version of the files that are written."""
 
-SECTIONS = (
-    "geometry",
-    "camera",
-    "plane",
-    "lens",
-    "imu",
-    "imu_intrinsics",
-    "orientation_filter",
-    "lowpass",
-    "align",
-    "actuator",
-    "pump",
-    "estimator",
-    "controller",
-    "twin",
-    "provenance",
-)
-"""Sections in the order of the file."""
-
-_LATER = {
-    "camera": ("calib.stages.camera.section", "Camera"),
-    "plane": ("calib.stages.camera.section", "Plane"),
-    "lens": ("calib.stages.camera.section", "Lens"),
-    "imu": ("calib.stages.imu.section", "Imu"),
-    "imu_intrinsics": ("calib.stages.imu.section", "ImuIntrinsics"),
-    "orientation_filter": ("calib.stages.imu.section", "OrientationFilter"),
-    "lowpass": ("calib.stages.lowpass.section", "LowPass"),
-    "align": ("calib.stages.align.section", "Align"),
-    "estimator": ("calib.stages.estimator.section", "Estimator"),
-    "controller": ("calib.stages.control.section", "Controller"),
+KINDS = {
+    "known": "calib.stages.actuator.section.Known",
+    "geometry": "calib.core.rig.Geometry",
+    "camera": "calib.stages.camera.section.Camera",
+    "plane": "calib.stages.camera.section.Plane",
+    "lens": "calib.stages.camera.section.Lens",
+    "imu": "calib.stages.imu.section.Imu",
+    "imu_intrinsics": "calib.stages.imu.section.ImuIntrinsics",
+    "orientation_filter": "calib.stages.imu.section.OrientationFilter",
+    "lowpass": "calib.stages.lowpass.section.LowPass",
+    "align": "calib.stages.align.section.Align",
+    "actuator": "calib.stages.actuator.section.Actuator",
+    "pump": "calib.stages.actuator.section.PumpSection",
+    "estimator": "calib.stages.estimator.section.Estimator",
+    "controller": "calib.stages.control.section.Controller",
+    "twin": "calib.twin.section.Twin",
+    "provenance": "calib.core.rig.Provenance",
 }
-"""Sections with modules of their own, and what they are there."""
+"""Sections in the order of the file and what they are. A schema takes a tenth of a second to build, so each
+is loaded where a file has its section."""
 
 Metres = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False, strict=True)]
 
@@ -103,11 +90,14 @@ class Provenance(Section):
     inputs: dict[str, dict[str, str]] = {}
 
 
-class Rig(BaseModel):
-    """The whole file. Sections of later versions are kept as they are."""
+@dataclass
+class Rig:
+    """The whole file, its sections as attributes; None for one that it has not.
 
-    model_config = ConfigDict(extra="allow", defer_build=True)
+    `schema` is the version of the file that it was read from.
+    """
 
+    known: Known | None = None
     geometry: Geometry | None = None
     camera: Camera | None = None
     plane: Plane | None = None
@@ -117,16 +107,141 @@ class Rig(BaseModel):
     orientation_filter: OrientationFilter | None = None
     lowpass: LowPass | None = None
     align: Align | None = None
+    actuator: Actuator | None = None
+    pump: PumpSection | None = None
     estimator: Estimator | None = None
     controller: Controller | None = None
-    provenance: Provenance = Provenance()
+    twin: Twin | None = None
+    provenance: Provenance = field(default_factory=Provenance)
+    schema: int = field(default=SCHEMA, compare=False)
 
-    @field_validator(*_LATER, mode="plain")
-    @classmethod
-    def _loaded(cls, value: Any, info: ValidationInfo) -> BaseModel | None:
-        module, name = _LATER[str(info.field_name)]
-        kind: type[BaseModel] = getattr(importlib.import_module(module), name)
-        return None if value is None else kind.model_validate(value)
+    @staticmethod
+    def load(path: Path | str, missing_ok: bool = False) -> Rig:
+        """The rig in this file; with `missing_ok` an empty one where there is no file.
+
+        Raises `BadInputError`, also for a file of another kind (it would be written over), for sections and
+        keys that are not known, and for values that contradict each other.
+        """
+        file = Path(path)
+        if not file.exists():
+            if missing_ok:
+                return Rig()
+            raise BadInputError(f"{shown(file)}: cannot be read: there is no such file")
+        return Rig.of(read_yaml_mapping(file), file)
+
+    @staticmethod
+    def of(document: Mapping[str, Any], source: Path | str) -> Rig:
+        """The rig of a file's contents; `source` is its name for sentences. Raises as `load`."""
+        schema = _schema_of(document, source)
+        unknown = [name for name in document if name not in KINDS and name != "schema"]
+        if len(unknown) == len([name for name in document if name != "schema"]) and "schema" not in document:
+            has = ", ".join(quoted(name) for name in unknown[:3]) or "nothing"
+            raise BadInputError(
+                f"{shown(source)}: is not a rig.yaml: it has {has}, expected sections as camera or provenance"
+            )
+        if unknown:
+            name = str(unknown[0])
+            raise BadInputError(
+                f"{shown(source)}: {one_line(name)} is not a section that is known here{nearest(name, KINDS)}"
+            )
+        sections = {name: document[name] for name in KINDS if document.get(name) is not None}
+        rig = Rig(schema=schema)
+        for name, values in sections.items():
+            identified = schema > 1 and name in ("actuator", "pump")
+            if identified and isinstance(values, dict) and "verdict" not in values:
+                raise BadInputError(
+                    f"{shown(source)}: {name} has no verdict, so it is not of calib identify; what you know "
+                    f"belongs under known: {{{name}: ...}}"
+                )
+            if schema > 1 or name not in ("actuator", "pump"):
+                setattr(rig, name, validated(kind_of(name), values, source, name))
+        if schema == 1 and ("actuator" in sections or "pump" in sections):
+            from calib.stages.actuator.section import parted
+
+            learnt = rig.provenance.inputs
+            old = {name: (sections.get(name), name in learnt) for name in ("actuator", "pump")}
+            rig.actuator, rig.pump, rig.known = parted(old, rig.known, source)
+        if rig.known or rig.actuator or rig.pump:
+            rig._check(source)
+        return rig
+
+    def _check(self, source: Path | str) -> None:
+        """Refuse values of actuator and pumps that no rig can have together."""
+        from calib.stages.actuator.parameters import SUPPLY_V
+        from calib.stages.actuator.section import plant_from, standing
+
+        parts = standing(self)
+        try:
+            plant_from({key: value for key, (value, _) in parts["actuator"].items()})
+        except BadInputError as error:
+            raise BadInputError(f"{shown(source)}: actuator: {error}") from error
+        supply, _ = parts["pump"].get("supply_V", (SUPPLY_V, None))
+        dead, _ = parts["pump"].get("dead_zone_V", (0.0, None))
+        if dead > supply:
+            raise BadInputError(
+                f"{shown(source)}: pump.dead_zone_V is {dead:g}, expected at most the supply's {supply:g} V"
+            )
+
+    def values(self) -> dict[str, Any]:
+        """Sections as plain values, in the order of the file."""
+        sections = {name: getattr(self, name) for name in KINDS}
+        return {name: section_json(one) for name, one in sections.items() if one is not None}
+
+    def text(self) -> str:
+        """The file's text; the same rig gives the same text."""
+        return yaml.safe_dump(
+            {"schema": SCHEMA, **self.values()},
+            sort_keys=False,
+            default_flow_style=None,
+            width=110,
+            allow_unicode=True,
+        )
+
+    def save(self, path: Path | str, inputs: Mapping[str, Mapping[str, str]] | None = None) -> None:
+        """Replace the file atomically.
+
+        Parameters
+        ----------
+        inputs : SHA-256 of each input by section and name, beside those that results carry.
+        """
+        merged: dict[str, Mapping[str, str]] = dict(self.provenance.inputs)
+        for one in fields(self):
+            section = getattr(self, one.name)
+            if isinstance(section, Result) and section.inputs:
+                merged[one.name] = section.inputs
+        merged |= inputs or {}
+        ordered = {name: dict(sorted(merged[name].items())) for name in sorted(merged)}
+        self.provenance, self.schema = Provenance(inputs=ordered), SCHEMA
+        write_atomically(Path(path), self.text())
+
+    def with_sections(self, sections: Mapping[str, Any]) -> Rig:
+        """The same rig with other sections, by name."""
+        return replace(self, **sections)
+
+    def diff(self, other: Rig) -> RigDiff:
+        """What differs in a later calibration, in standard deviations and on the plane."""
+        from calib.core.diff import diff_rigs
+
+        return diff_rigs(self, other)
+
+    @property
+    def plant(self) -> Plant:
+        """The plant: nominal values, over them what was estimated, over it what is known.
+
+        Raises `BadInputError` for values that no plant can have together.
+        """
+        from calib.stages.actuator.section import plant_from, standing
+
+        return plant_from({key: value for key, (value, _) in standing(self)["actuator"].items()})
+
+    @property
+    def machine(self) -> Machine:
+        """The plant with its pumps, by the same rule."""
+        from calib.stages.actuator.machine import machine_from
+        from calib.stages.actuator.section import standing
+
+        values = standing(self)
+        return machine_from(*({k: v for k, (v, _) in values[name].items()} for name in ("actuator", "pump")))
 
     def current_plane(self, source: Path | str) -> Plane | None:
         """The plane; `BadInputError` where it was calibrated with another camera than the rig's."""
@@ -158,133 +273,20 @@ class Rig(BaseModel):
         return sentences
 
 
-_EXPECTED = {
-    "bool_type": "true or false",
-    "dict_type": "keys with values",
-    "finite_number": "a finite number",
-    "float_type": "a number",
-    "int_type": "a whole number",
-    "int_from_float": "a whole number",
-    "list_type": "a list",
-    "model_attributes_type": "keys with values",
-    "model_type": "keys with values",
-    "string_type": "text",
-}
-"""What pydantic's kinds of error ask for, in words."""
+def kind_of(name: str) -> type[BaseModel]:
+    """The schema of a section."""
+    module, _, kind = KINDS[name].rpartition(".")
+    found: type[BaseModel] = getattr(importlib.import_module(module), kind)
+    return found
 
 
-def validation_sentence(path: Path, error: ValidationError) -> str:
-    """One sentence for the first thing that is wrong: file, key, value, and what was expected."""
-    first = error.errors()[0]
-    kind, value = first["type"], first.get("input")
-    key = one_line(".".join(str(part) for part in first["loc"]))
-    if kind == "missing":
-        return f"{shown(path)}: {key} is missing"
-    if kind == "extra_forbidden":
-        return f"{shown(path)}: {key} is not a key that is known here"
-    message = first["msg"]
-    expected = message[0].lower() + message[1:]
-    expected = (
-        expected.removeprefix("value error, ").removeprefix("input should be ").removeprefix("expected ")
-    )
-    expected = _EXPECTED.get(kind, expected)
-    if kind in ("too_short", "too_long"):
-        limit = first["ctx"].get("min_length", first["ctx"].get("max_length"))
-        expected = f"{limit} values"
-    hint = ""
-    if isinstance(value, str) and kind in ("float_type", "int_type") and _reads_as_number(value):
-        hint = " (without quotes, and in YAML an exponent needs a point and a sign, as 2.0e-2)"
-    return f"{shown(path)}: {key} is {_short(value)}, expected {expected}{hint}"
-
-
-def _reads_as_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
-def _short(value: Any) -> str:
-    text = one_line(repr(value))
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
-def read_rig(path: Path) -> Rig:
-    """The rig in this file, an empty one where there is no file.
-
-    Raises `BadInputError`, also for a file of another kind (it would be written over) and for values
-    that contradict each other.
-    """
-    if not path.exists():
-        return Rig()
-    document = read_yaml_mapping(path)
-    if not any(name in document for name in SECTIONS):
-        found = ", ".join(_short(name) for name in list(document)[:3]) or "nothing"
+def _schema_of(document: Mapping[str, Any], source: Path | str) -> int:
+    schema = document.get("schema", 1)
+    if isinstance(schema, bool) or not isinstance(schema, int) or schema < 1:
+        raise BadInputError(f"{shown(source)}: schema is {quoted(schema)}, expected 1 or {SCHEMA}")
+    if schema > SCHEMA:
         raise BadInputError(
-            f"{shown(path)}: is not a rig.yaml: it has {found}, expected sections as camera or provenance"
+            f"{shown(source)}: schema is {schema}, and this version of calib reads files up to {SCHEMA}; "
+            "it was written by a later one, which reads it"
         )
-    try:
-        rig = Rig.model_validate(document)
-    except ValidationError as error:
-        raise BadInputError(validation_sentence(path, error)) from error
-    if rig.camera is not None:
-        _check_camera(path, rig.camera)
-    if rig.plane is not None:
-        _check_plane(path, rig.plane)
-    return rig
-
-
-def _check_camera(path: Path, camera: Camera) -> None:
-    from calib.stages.camera.model import COEFFICIENTS, MODELS
-
-    for name in COEFFICIENTS:
-        value = getattr(camera.distortion, name)
-        if value != 0.0 and name not in MODELS[camera.model]:
-            raise BadInputError(
-                f"{shown(path)}: camera.distortion.{name} is {value:g}, but {camera.model} has no {name}"
-            )
-
-
-def _check_plane(path: Path, plane: Plane) -> None:
-    import numpy as np
-
-    R, A, A_inverse = np.array(plane.R_CW), np.array(plane.A_px_per_m), np.array(plane.A_inverse)
-    if not np.allclose(R @ R.T, np.eye(3), atol=1e-6) or np.linalg.det(R) < 0:
-        raise BadInputError(f"{shown(path)}: plane.R_CW is not a rotation")
-    if not any(plane.t_CW_m):
-        raise BadInputError(f"{shown(path)}: plane.t_CW_m is zero, expected the way from camera to plane")
-    if not np.allclose(A_inverse @ A, np.eye(3), atol=1e-6):
-        raise BadInputError(f"{shown(path)}: plane.A_inverse is not the inverse of plane.A_px_per_m")
-
-
-def _plain(rig: Rig) -> dict[str, Any]:
-    extra = rig.model_extra or {}
-    out: dict[str, Any] = {}
-    for name in SECTIONS:
-        section = getattr(rig, name, None)
-        if isinstance(section, BaseModel):
-            out[name] = section_json(section)
-        elif name in extra:
-            out[name] = extra[name]
-    for name, section in extra.items():
-        out.setdefault(name, section)
-    # The provenance comes last.
-    out["provenance"] = out.pop("provenance")
-    return out
-
-
-def rig_text(rig: Rig) -> str:
-    """The file's text; the same rig gives the same text."""
-    return yaml.safe_dump(
-        _plain(rig), sort_keys=False, default_flow_style=None, width=110, allow_unicode=True
-    )
-
-
-def write_rig(path: Path, rig: Rig, inputs: dict[str, dict[str, str]]) -> Rig:
-    """Replace the file atomically; `inputs` holds the SHA-256 of each input by section and name."""
-    merged = {**rig.provenance.inputs, **inputs}
-    ordered = {section: dict(sorted(merged[section].items())) for section in sorted(merged)}
-    rig = rig.model_copy(update={"provenance": Provenance(inputs=ordered)})
-    write_atomically(path, rig_text(rig))
-    return rig
+    return schema

@@ -21,6 +21,8 @@ from calib.core.verdict import Verdict
 BLANK = "\N{EN DASH}"
 """What stands for a value that is not there."""
 
+SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
+
 UNITS = {
     "_radps2_per_sqrt_Hz": "rad/s²/√Hz",
     "_radps_per_sqrt_Hz": "rad/s/√Hz",

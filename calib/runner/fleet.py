@@ -22,6 +22,7 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.core.errors import EXIT_INTERNAL, BadInputError
 from calib.core.files import check_folder, check_writable, make_folder, sha256, shown, write_atomically
+from calib.core.words import unit_of
 from calib.runner.cache import held
 from calib.runner.engine import LIMIT_S, Broken, Cluster, Lost, Overdue, Task, run_tasks
 from calib.runner.folder import digest_of
@@ -40,7 +41,6 @@ from calib.runner.task import (
     to_json,
     without_secrets,
 )
-from calib.show.values import unit_of
 
 # ----------------------------------------------------------------------
 # Outcomes as rows of a Parquet file, in blocks, and one column of it at a time.

@@ -18,11 +18,9 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, Protocol
 
-from pydantic import ValidationError
-
 from calib.core.errors import EXIT_DONE, EXIT_POOR, BadInputError
-from calib.core.files import check_folder, make_folder, one_line, read_yaml_mapping, shown, write_atomically
-from calib.core.rig import Rig, read_rig, rig_text, validation_sentence
+from calib.core.files import check_folder, make_folder, one_line, shown, write_atomically
+from calib.core.rig import SCHEMA, Rig
 from calib.runner.cache import Result, held, key_of, load, remove, store
 from calib.runner.folder import Folder, LogFile, folder_digests, with_topics
 
@@ -64,18 +62,15 @@ class Sections:
     def text(self, source: Path) -> str:
         """Text of a rig's file with these sections; `source` is named should they not be valid."""
         inputs = {name: dict(sorted(self.inputs[name].items())) for name in sorted(self.inputs)}
-        try:
-            return rig_text(Rig.model_validate({**self.values, "provenance": {"inputs": inputs}}))
-        except ValidationError as error:
-            raise BadInputError(validation_sentence(source, error)) from error
+        return Rig.of({"schema": SCHEMA, **self.values, "provenance": {"inputs": inputs}}, source).text()
 
 
 def sections_of(path: Path) -> Sections:
-    """Sections of a rig's file. Raises `BadInputError` as `read_rig` does."""
-    read_rig(path)
-    document = read_yaml_mapping(path)
-    provenance = document.pop("provenance", None) or {}
-    return Sections(document, dict(provenance.get("inputs") or {}))
+    """Sections of a rig's file. Raises `BadInputError` as `Rig.load` does."""
+    rig = Rig.load(path)
+    values = rig.values()
+    del values["provenance"]
+    return Sections(values, rig.provenance.inputs)
 
 
 # ----------------------------------------------------------------------

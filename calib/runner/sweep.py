@@ -19,12 +19,11 @@ from typing import Any
 
 import numpy as np
 import yaml
-from pydantic import ValidationError
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError, CalibError
 from calib.core.files import one_line, read_yaml_mapping, sha256, shown, write_atomically
-from calib.core.rig import Rig, validation_sentence
+from calib.core.rig import SCHEMA, Rig
 from calib.core.units import parse_duration_s
 from calib.runner.engine import LIMIT_S, Broken, Cluster, Lost, Overdue, Task, run_tasks
 from calib.runner.fleet import HIDDEN, Store, Table, column, texts, write_table
@@ -263,12 +262,11 @@ def _rig_text(where: str, rig: str | None, path: Path) -> str:
     if rig is None:
         return ""
     from calib.core.files import read_text
-    from calib.core.rig import read_rig
 
     file = path.absolute().parent / rig
     if not file.is_file():
         raise BadInputError(f"{where}: base.rig: {shown(file)} is not there")
-    read_rig(file)
+    Rig.load(file)
     return read_text(file)
 
 
@@ -404,8 +402,8 @@ def run_case(base: Base, case: Case, seed: int, scratch: str = "") -> dict[str, 
     # The same noise for a draw wherever it is in the grid: differences are then those of the parameters.
     noise = 100_003 * seed + case.draw
     changed, options = _changed(case)
-    known = _rig(_known(base.rig, changed))
-    plant = _machine(_rig(_document(base.rig, changed)))
+    known = Rig.of(_known(base.rig, changed), _HERE)
+    plant = rig_from_file(Rig.of(_document(base.rig, changed), _HERE))
     if base.kind == "controller":
         return _controlled(base, known, plant, noise)
     from calib.twin.scenarios import make_scenario, run_scenario
@@ -440,10 +438,12 @@ def _parsed(text: str) -> dict[str, Any]:
 
 
 def _document(text: str, changed: Mapping[str, Any]) -> dict[str, Any]:
-    """The base rig's file with these changes."""
-    whole = copy.deepcopy(_parsed(text))
+    """The base rig's file with these changes; those of actuator and pump are what is known of the plant."""
+    whole = copy.deepcopy(_parsed(text)) or {"schema": SCHEMA}
     for key, value in changed.items():
         *path, last = key.split(".")
+        if path[0] in ("actuator", "pump"):
+            path = ["known", *path]
         part = whole
         for name in path:
             part = part.setdefault(name, {})
@@ -459,22 +459,10 @@ def _known(text: str, changed: Mapping[str, Any]) -> dict[str, Any]:
     return _document(text, own)
 
 
-def _rig(document: dict[str, Any]) -> Rig:
-    try:
-        return Rig.model_validate(document)
-    except ValidationError as error:
-        raise BadInputError(validation_sentence(_HERE, error)) from error
-
-
-def _machine(rig: Rig) -> SimulatedRig:
-    camera = None if rig.camera is None else rig.camera.optics
-    return rig_from_file(rig, str(_HERE), camera)
-
-
 def _controlled(base: Base, known: Rig, plant: SimulatedRig, seed: int) -> dict[str, float | None]:
     from calib.stages.control.references import built_in
 
-    model = control_model(_machine(known), known.controller)
+    model = control_model(rig_from_file(known), known.controller)
     reference = built_in(model, base.other, base.duration_s)
     outcome = run_controller(base.name, plant, model, reference, known.controller, seed, base.feedback)
     return _of_tracking(outcome.figures)

@@ -730,8 +730,8 @@ def _kept(out: Path, names: tuple[str, ...], pages: bool) -> dict[str, bytes]:
 
 
 def _values(rig: Path) -> dict[str, tuple[float, float | None]]:
+    from calib.core.constants import constants
     from calib.runner.graph import sections_of
-    from calib.show.values import constants
 
     return {f"{one.section}.{one.name}": (one.value, one.sigma) for one in constants(sections_of(rig).values)}
 

@@ -11,10 +11,10 @@ from typing import Any
 
 from calib import __version__
 from calib.core.files import write_atomically
+from calib.core.words import BLANK, SIGMA, number
 from calib.runner.fleet import ConstantSummary, FleetSummary
 from calib.runner.sweep import Point, SweepSpec, SweepSummary
 from calib.show.page import render
-from calib.show.values import BLANK, SIGMA, digits
 
 # ----------------------------------------------------------------------
 # Small pictures of a fleet as SVG text: a constant's histogram, and its values over the serial numbers.
@@ -60,8 +60,8 @@ def histogram_svg(one: ConstantSummary) -> str:
             out.append(
                 f'<text class="far" x="{x:.1f}" y="{_TOP + 10:.1f}" text-anchor="{anchor}">{told}</text>'
             )
-    out.append(_text(_LEFT, digits(one.low, one.spread.scale or None), "start"))
-    out.append(_text(_WIDE - _LEFT, digits(one.high, one.spread.scale or None), "end"))
+    out.append(_text(_LEFT, number(one.low, one.spread.scale or None), "start"))
+    out.append(_text(_WIDE - _LEFT, number(one.high, one.spread.scale or None), "end"))
     return "".join([*out, "</svg>"])
 
 
@@ -197,7 +197,7 @@ def _facts(one: ConstantSummary) -> list[tuple[str, str]]:
     unit = f" {one.unit}" if one.unit else ""
     own = f"{spread.own:.2g}{unit}" if math.isfinite(spread.own) else BLANK
     return [
-        ("median", f"{digits(spread.median, spread.scale or None)}{unit}"),
+        ("median", f"{number(spread.median, spread.scale or None)}{unit}"),
         (f"spread, 1{SIGMA}", f"{spread.scale:.2g}{unit}"),
         ("of it between rigs", f"{spread.between:.2g}{unit}"),
         (f"a rig's own {SIGMA}", own),
@@ -220,7 +220,7 @@ def _card(one: ConstantSummary) -> _Card:
         drift_svg(one),
         sentence,
         one.drifts,
-        tuple((name, digits(value, one.spread.scale or None), f"{z:+.1f}") for name, value, z in one.out[:8]),
+        tuple((name, number(value, one.spread.scale or None), f"{z:+.1f}") for name, value, z in one.out[:8]),
         max(0, one.standing_out - 8),
     )
 
@@ -232,7 +232,7 @@ def _row(one: ConstantSummary) -> Sequence[tuple[str, float | None]]:
         return (text or f"{value:.3g}", value) if math.isfinite(value) else ("", None)
 
     return [
-        cell(spread.median, digits(spread.median, spread.scale or None)),
+        cell(spread.median, number(spread.median, spread.scale or None)),
         cell(spread.scale),
         cell(spread.between),
         cell(spread.own),

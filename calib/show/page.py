@@ -16,14 +16,14 @@ from pathlib import Path
 from typing import Any
 
 from calib import __version__
+from calib.core.constants import constants
 from calib.core.errors import BadInputError
-from calib.core.files import make_folder, read_bytes, read_yaml_mapping, sha256, shown, write_atomically
-from calib.core.rig import read_rig
+from calib.core.files import make_folder, read_bytes, sha256, write_atomically
+from calib.core.rig import Rig
+from calib.core.words import BLANK, SIGMA, number, unit_of
 from calib.runner.cache import Result, load
 from calib.runner.graph import HIDDEN
 from calib.runner.outputs import decide, read_summary
-from calib.show.values import BLANK, SIGMA, constants, digits, short, unit_of
-from calib.stages.actuator.section import Actuator, PumpSection, section_of
 
 # ----------------------------------------------------------------------
 # Pages from their templates: each is one file, with its style and its script in it.
@@ -284,8 +284,8 @@ def _with_sigma(values: Values, key: str, unit: str, factor: float = 1.0) -> str
     if not isinstance(value, int | float):
         return ""
     if not isinstance(sigma, int | float):
-        return f"{digits(factor * value)} {unit}".strip()
-    return f"{digits(factor * value, factor * sigma)} ± {factor * sigma:.2g} {unit}".strip()
+        return f"{number(factor * value)} {unit}".strip()
+    return f"{number(factor * value, factor * sigma)} ± {factor * sigma:.2g} {unit}".strip()
 
 
 def _camera(section: Values, _: Values) -> list[Fact]:
@@ -464,6 +464,13 @@ def _head(name: str) -> str:
     return f"{name[: end - 1].replace('_', ' ')}, {unit}"
 
 
+def short(value: float) -> str:
+    """A value to four digits, whole numbers as they are."""
+    if isinstance(value, int) or (value == round(value) and abs(value) < 1e7):
+        return str(round(value))
+    return f"{value:.0f}" if 1e4 <= abs(value) < 1e7 else f"{value:.4g}"
+
+
 def _cell(value: Any) -> Cell:
     if value is None or value == []:
         return Cell(BLANK)
@@ -546,13 +553,8 @@ def write_page(rig: Path, output: Path | None = None) -> Path:
 
 def page_text(rig: Path) -> str:
     """The whole page. Raises `BadInputError` for a rig.yaml that is not there or cannot be read."""
-    if not rig.exists():
-        raise BadInputError(f"{shown(rig)}: cannot be read: there is no such file")
-    whole = read_rig(rig)
-    for name, kind in (("actuator", Actuator), ("pump", PumpSection)):
-        section_of(whole, name, kind, rig)
-    sections = read_yaml_mapping(rig)
-    provenance = sections.pop("provenance", None) or {}
+    sections = Rig.load(rig).values()
+    provenance = sections.pop("provenance")
     hidden = rig.parent / HIDDEN
     told = read_summary(hidden / "run.json") or _summary_of(sections)
     budget = _Budget(MOST_BYTES - _ROOM_BYTES)
@@ -573,7 +575,7 @@ def page_text(rig: Path) -> str:
                 "section": c.section,
                 "name": c.name,
                 "value": c.value,
-                "text": digits(c.value, c.sigma),
+                "text": number(c.value, c.sigma),
                 "unit": c.unit,
                 "sigma": c.sigma,
                 "share": c.share,

@@ -9,7 +9,6 @@ import numpy as np
 from numba import njit
 
 from calib.core.arrays import BoolArray, FloatArray
-from calib.core.errors import BadInputError
 from calib.stages.actuator.dynamics import Coefficients
 from calib.stages.actuator.kinematics import (
     MARKER_OFFSET_M,
@@ -319,8 +318,6 @@ class Tracker:
     dropouts : probability that nothing is found in a frame.
     blackouts_s : pairs (start, duration) without any frame.
     stamp_jitter_s : standard deviation of the time stamps.
-
-    Raises `BadInputError` for values that no tracker has.
     """
 
     marker_offset_m: float = MARKER_OFFSET_M
@@ -332,23 +329,6 @@ class Tracker:
     dropouts: float = 0.004
     blackouts_s: tuple[tuple[float, float], ...] = ()
     stamp_jitter_s: float = 2e-4
-
-    def __post_init__(self) -> None:
-        for name, most in (("marker_offset_m", 0.5), ("latency_s", 1.0), ("stamp_jitter_s", 0.1)):
-            value = getattr(self, name)
-            if not 0.0 <= value <= most:
-                raise BadInputError(f"tracker {name}: found {value:g}, expected 0 to {most:g}")
-        for name in ("jitter_px", "grid_px"):
-            if not 0.0 <= getattr(self, name) < math.inf:
-                raise BadInputError(f"tracker {name}: found {getattr(self, name):g}, expected zero or more")
-        for name in ("outliers", "dropouts"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise BadInputError(f"tracker {name}: found {getattr(self, name):g}, expected a probability")
-        if len(self.outlier_px) != 2 or not 0.0 <= self.outlier_px[0] <= self.outlier_px[1] < math.inf:
-            raise BadInputError(f"tracker outlier_px: found {self.outlier_px}, expected (least, most)")
-        for pair in self.blackouts_s:
-            if len(pair) != 2 or not all(0.0 <= value < math.inf for value in pair):
-                raise BadInputError(f"tracker blackouts_s: found {pair}, expected (start, duration)")
 
 
 @dataclass(frozen=True)
@@ -471,8 +451,6 @@ class Imu:
     onchip : whether the fusion on the chip is logged too.
     onchip_drift_radps, onchip_spread : mean of its drift over many logs, and the deviation of a log's
         drift from it as a share of it (Fig. 2.4).
-
-    Raises `BadInputError` for values that no sensor has.
     """
 
     rate_hz: float = 100.0
@@ -496,47 +474,6 @@ class Imu:
     onchip: bool = False
     onchip_drift_radps: float = 0.145 * _DEG
     onchip_spread: float = 0.4
-
-    def __post_init__(self) -> None:
-        if not 1.0 <= self.rate_hz <= 1e5:
-            raise BadInputError(f"imu rate_hz: found {self.rate_hz:g}, expected 1 to 100000 Hz")
-        for name in (
-            "gyro_noise",
-            "accel_noise",
-            "gyro_walk",
-            "accel_walk",
-            "gyro_step_radps",
-            "accel_step_mps2",
-            "stamp_jitter_s",
-            "onchip_spread",
-        ):
-            if not 0.0 <= getattr(self, name) < math.inf:
-                raise BadInputError(f"imu {name}: found {getattr(self, name):g}, expected zero or more")
-        for name in ("gyro_range_radps", "accel_range_mps2"):
-            if not getattr(self, name) > 0.0:
-                raise BadInputError(f"imu {name}: found {getattr(self, name):g}, expected a positive number")
-        if not 0.0 <= self.duplicated_stamps < 1.0:
-            raise BadInputError(
-                f"imu duplicated_stamps: found {self.duplicated_stamps:g}, expected a share below 1"
-            )
-        for name, most in (("mount_angle_rad", math.pi), ("onchip_drift_radps", 1.0)):
-            if not abs(getattr(self, name)) <= most:
-                raise BadInputError(
-                    f"imu {name}: found {getattr(self, name):g}, expected {-most:.3g} to {most:.3g}"
-                )
-        for name, size, most in (
-            ("lever_m", 2, 0.5),
-            ("gravity_mps2", 2, 100.0),
-            ("gyro_scale", 3, 0.5),
-            ("accel_scale", 3, 0.5),
-            ("gyro_bias_radps", 3, 10.0),
-            ("accel_bias_mps2", 3, 50.0),
-        ):
-            values = getattr(self, name)
-            if len(values) != size or not all(abs(value) <= most for value in values):
-                raise BadInputError(
-                    f"imu {name}: found {tuple(values)}, expected {size} numbers of at most {most:g}"
-                )
 
 
 @dataclass(frozen=True)

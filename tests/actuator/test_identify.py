@@ -12,7 +12,6 @@ from identifytrials import SIGMA, log_file, rig_file, track, varied
 from calib.core.errors import BadInputError
 from calib.io.logs import Log, read_log, write_log
 from calib.stages.actuator.identify import (
-    Nominal,
     Problem,
     Solution,
     Start,
@@ -33,8 +32,10 @@ from calib.stages.actuator.identify import (
     values_of,
 )
 from calib.stages.actuator.identify_pump import Shape, fit_static_map
+from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import Plant
 from calib.stages.actuator.read import TrackSource, read_track, start_in_motion
+from calib.stages.actuator.section import Known, KnownActuator, KnownPump
 from calib.stages.actuator.validate import IMPROVED, ORIGINAL, compare, validate_log
 from calib.twin.rig import SimulatedRig
 
@@ -49,7 +50,7 @@ TRUTH = {
 
 def test_swings_without_noise_give_the_truth() -> None:
     tracks = [track("free", TRUTH, phi, noise=0.0) for phi in (0.5, -0.35)]
-    found = fit_tracks(Nominal(), tracks, threads=1)
+    found = fit_tracks(Machine(), tracks, threads=1)
     for name, value in TRUTH.items():
         assert found.values[name] == pytest.approx(value, rel=0.01), name
     assert found.fixed == {"lambda3": "lambda2 and lambda3 enter only as a product; kept at -1"}
@@ -69,7 +70,7 @@ def test_pumps_without_noise_give_the_truth() -> None:
         track("prbs", truth, noise=0.1, duration_s=8.0),
         track("steps", truth, noise=0.1, duration_s=8.0),
     ]
-    found = fit_tracks(Nominal(), tracks, threads=1)
+    found = fit_tracks(Machine(), tracks, threads=1)
     for name, value in truth.items():
         assert found.values[name] == pytest.approx(value, rel=0.03), name
 
@@ -81,17 +82,39 @@ def test_another_thing_in_place_of_the_marker_does_not_pull() -> None:
         head = one.head.copy()
         head[np.random.default_rng(seed).integers(0, len(head), 5)] += [0.3, 0.01]
         tracks.append(replace(one, head=head))
-    found = fit_tracks(Nominal(), tracks, threads=1)
+    found = fit_tracks(Machine(), tracks, threads=1)
     assert found.values["stiffness_scale"] == pytest.approx(1.15, rel=0.02)
     assert found.values["damping_scale_free_swing"] == pytest.approx(2.8, rel=0.05)
 
 
 def test_what_a_log_cannot_tell_is_named_and_fixed() -> None:
     """Two pumps alike never bend the rig, so nothing is said about bending."""
-    found = fit_tracks(Nominal(), [track("steps", duration_s=8.0)], threads=1)
+    found = fit_tracks(Machine(), [track("steps", duration_s=8.0)], threads=1)
     assert "bending_N_per_rad2" not in found.values
     assert "the logs" in found.fixed["bending_N_per_rad2"]
     assert "lag_s" in found.values
+
+
+def test_what_a_person_states_is_fixed_or_a_prior() -> None:
+    tracks = [track("free", TRUTH, phi, seed=k) for k, phi in enumerate((0.5, -0.35))]
+    nominal = replace(Machine(), plant=replace(Machine().plant, stiffness_scale=1.15))
+    fixed = fit_tracks(nominal, tracks, threads=1, stated={"stiffness_scale": 0.0})
+    assert "stiffness_scale" not in fixed.values and "stiffness_scale" not in fixed.fixed
+    free, tight = (
+        uncertainty(fit_tracks(nominal, tracks, threads=1, stated={"stiffness_scale": sigma})).sigma
+        for sigma in (10.0, 1e-5)
+    )
+    assert tight["stiffness_scale"] == pytest.approx(1e-5, rel=0.02)
+    assert tight["stiffness_scale"] < 0.1 * free["stiffness_scale"]
+    # A swing tells ratios to the moment of inertia, of which the mass makes m l0^2 / 4.
+    doubt = fit_tracks(nominal, tracks, threads=1, stated={"mass_kg": 0.05 * 0.0166})
+    table = uncertainty(doubt)
+    assert table.sigma["mass_kg"] == pytest.approx(0.05 * 0.0166, rel=0.05)
+    turning = 0.25 * nominal.plant.mass_kg * nominal.plant.rest_length_m**2
+    share = turning / (turning + nominal.plant.inertia_kgm2)
+    assert table.sigma["stiffness_scale"] == pytest.approx(0.05 * 1.15 * share, rel=0.1)
+    both = [doubt.problem.names.index(name) for name in ("mass_kg", "stiffness_scale")]
+    assert table.correlation[both[0], both[1]] > 0.95
 
 
 NAMES = (
@@ -106,12 +129,12 @@ NAMES = (
 
 def _problem() -> Problem:
     tracks = [track("free", duration_s=1.5), track("prbs", duration_s=1.5), track("steps", duration_s=1.5)]
-    return Problem(Nominal(), tracks, NAMES, {}, threads=1)
+    return Problem(Machine(), tracks, NAMES, {}, threads=1)
 
 
 def test_derivatives_are_those_of_the_residuals() -> None:
     problem = _problem()
-    x = first_guess(problem, values_of(Nominal()))
+    x = first_guess(problem, values_of(Machine()))
     x[problem.layout.offset : problem.layout.start] += 1e-3
     base, J = jacobian(problem, x)
     assert np.allclose(base, residuals(problem, x[None])[0], atol=1e-6)
@@ -144,11 +167,11 @@ def test_a_log_in_motion_has_its_start_among_the_unknowns() -> None:
     moving = Start(0.1, 0.07, -0.5, 0.01, 0.02, -0.01, 0.5, 0.3, 0.4, 0.2)
     tracks = [track("free", duration_s=1.5), _cut(track("prbs", duration_s=2.5), 1.0, moving)]
     free = _cut(track("free", duration_s=2.5), 0.5, Start(0.1, 0.065, -2.0))
-    problem = Problem(Nominal(), [*tracks, free], NAMES, {}, threads=1)
+    problem = Problem(Machine(), [*tracks, free], NAMES, {}, threads=1)
     layout = problem.layout
     assert layout.starts == (2, 10, 6)
     assert layout.of_start(1) == slice(layout.start + 2, layout.start + 12)
-    x = first_guess(problem, values_of(Nominal()))
+    x = first_guess(problem, values_of(Machine()))
     assert starts_of(problem, x)[1] == moving
     assert starts_of(problem, x)[2].dphi_radps == -2.0
     x[layout.start :] += 1e-3 * problem.scales()[layout.start :]
@@ -169,18 +192,18 @@ def test_a_log_that_is_cut_out_of_a_longer_one_gives_the_same_parameters() -> No
     whole = track("prbs", values, duration_s=14.0)
     late = whole.t_s >= 4.03
     at = whole.t_s[late] - 4.0
-    guess = start_in_motion(at - 0.025, whole.head[late], True, Nominal().plant, SIGMA[0])
+    guess = start_in_motion(at - 0.025, whole.head[late], True, Machine().plant, SIGMA[0])
     assert guess is not None
     cut = _cut(whole, 4.0, guess)
-    found = fit_tracks(Nominal(), [cut], delay_s=0.025, threads=1)
+    found = fit_tracks(Machine(), [cut], delay_s=0.025, threads=1)
     known = uncertainty(found)
     for name, value in found.values.items():
-        truth = values.get(name, values_of(Nominal())[name])
+        truth = values.get(name, values_of(Machine())[name])
         assert abs(value - truth) < 3.5 * known.sigma[name], name
     # Taken to begin at rest, the same rows give another rig.
-    rest = fit_tracks(Nominal(), [replace(cut, moving=None)], delay_s=0.025, threads=1)
+    rest = fit_tracks(Machine(), [replace(cut, moving=None)], delay_s=0.025, threads=1)
     sure = uncertainty(rest)
-    away = [abs(v - values.get(n, values_of(Nominal())[n])) / sure.sigma[n] for n, v in rest.values.items()]
+    away = [abs(v - values.get(n, values_of(Machine())[n])) / sure.sigma[n] for n, v in rest.values.items()]
     assert max(away) > 6.0
 
 
@@ -195,7 +218,7 @@ def _coloured(one: Track, seed: int, memory: float = 0.9) -> Track:
 @pytest.fixture(scope="module")
 def solution() -> Solution:
     tracks = [track("free", phi_rad=phi, seed=k) for k, phi in enumerate((0.5, -0.4))]
-    return fit_tracks(Nominal(), tracks, threads=1)
+    return fit_tracks(Machine(), tracks, threads=1)
 
 
 def test_coloured_residuals_raise_the_deviations(solution: Solution) -> None:
@@ -240,8 +263,8 @@ def test_recovery_on_twenty_rigs(tmp_path: Path) -> None:
         tracks = []
         for k, phi in enumerate(("0.5", "-0.4", "0.6")):
             path = log_file(tmp_path / f"{k}.csv", rig, "swing", 10 * seed + k, 8.0, phi_rad=phi)
-            tracks.append(read_track(path, known, rig_yaml, 0.0126).track)
-        found = fit_tracks(Nominal(), tracks)
+            tracks.append(read_track(path, known, rig_yaml, Machine()).track)
+        found = fit_tracks(Machine(), tracks)
         sigma = uncertainty(found).sigma
         assert set(found.fixed) == {"lambda3"}
         z += [(value - truth[name]) / sigma[name] for name, value in found.values.items()]
@@ -261,8 +284,8 @@ def test_recovery_with_the_pumps_connected(tmp_path: Path) -> None:
         tracks = []
         for k, (kind, duration_s) in enumerate((("prbs", 15.0), ("deflate", 12.0))):
             path = log_file(tmp_path / f"{kind}.csv", rig, kind, 10 * seed + k, duration_s)
-            tracks.append(read_track(path, known, rig_yaml, 0.0126).track)
-        found = fit_tracks(Nominal(), tracks)
+            tracks.append(read_track(path, known, rig_yaml, Machine()).track)
+        found = fit_tracks(Machine(), tracks)
         sigma = uncertainty(found).sigma
         assert {"lag_s", "strength1", "strength2", "falling_N_per_s"} <= set(found.values)
         z += [(value - truth[name]) / sigma[name] for name, value in found.values.items()]
@@ -274,10 +297,10 @@ def test_recovery_with_the_pumps_connected(tmp_path: Path) -> None:
 def test_interpolated_heads_agree_with_fine_steps(kind: str) -> None:
     one = track(kind, noise=0.0)
     start = Start(0.5 if kind == "free" else 0.0, 0.065)
-    head, rate = heads_of(one, Nominal(), [{}], [start], 0.025)
+    head, rate = heads_of(one, Machine(), [{}], [start], 0.025)
     # The track's own values lie on straight lines between steps of 1.7 ms.
     assert np.abs(head[0] - one.head).max() < 3e-4
-    later, _ = heads_of(one, Nominal(), [{}], [start], 0.026)
+    later, _ = heads_of(one, Machine(), [{}], [start], 0.026)
     moved = (head - later) / 1e-3
     inner = (one.t_s > 0.1) & (one.t_s < one.t_s[-1] - 0.1)
     assert np.abs(moved - rate)[0, inner].max() < 0.05 * np.abs(rate).max()
@@ -285,7 +308,7 @@ def test_interpolated_heads_agree_with_fine_steps(kind: str) -> None:
 
 def test_experiments_shrink_and_rest_does_not() -> None:
     found = fit_tracks(
-        Nominal(), [track("free", phi_rad=p, seed=k) for k, p in enumerate((0.5, -0.4))], threads=1
+        Machine(), [track("free", phi_rad=p, seed=k) for k, p in enumerate((0.5, -0.4))], threads=1
     )
     known = uncertainty(found)
     ahead = {p.name: p for p in prospects(found, known)}
@@ -299,7 +322,7 @@ def test_experiments_shrink_and_rest_does_not() -> None:
 
 
 def test_what_could_not_be_told_is_what_is_asked_for() -> None:
-    found = fit_tracks(Nominal(), [track("steps", duration_s=8.0)], threads=1)
+    found = fit_tracks(Machine(), [track("steps", duration_s=8.0)], threads=1)
     best = prospects(found, uncertainty(found))[0]
     assert best.name in ("swing", "step", "ellipse")
     assert best.relative["bending_N_per_rad2"] < 0.2
@@ -381,7 +404,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _read(folder: Path, name: str, **options: object) -> TrackSource:
     rig = rig_file(folder / "rig.yaml")
-    return read_track(folder / name, rig, folder / "rig.yaml", RADIUS, **options)
+    return read_track(folder / name, rig, folder / "rig.yaml", Machine(), **options)
 
 
 def _changed(folder: Path, name: str, **columns: np.ndarray | None) -> Path:
@@ -473,7 +496,7 @@ def test_pumps_that_are_on_already_are_seen_by_the_pose() -> None:
 def test_the_true_model_leaves_the_noise_and_another_one_more() -> None:
     values = {"stiffness_scale": 1.3, "bending_N_per_rad2": 0.25}
     source = TrackSource(track("prbs", values, noise=0.0), "truth", 0.025, ())
-    nominal = Nominal()
+    nominal = Machine()
     plant = replace(nominal.plant, stiffness_scale=1.3, bending_N_per_rad2=0.25)
     found = compare(source, {ORIGINAL: nominal, IMPROVED: replace(nominal, plant=plant)}, 0.0126)
     assert found.errors[IMPROVED]["phi"].rms < 1e-3
@@ -490,7 +513,7 @@ def test_one_wrong_picture_does_not_decide() -> None:
     head = seen.head.copy()
     head[100] += (1.0, 0.02)
     clean, wrong = (
-        compare(TrackSource(replace(seen, head=h), "pictures", 0.025, ()), {ORIGINAL: Nominal()}, 0.0126)
+        compare(TrackSource(replace(seen, head=h), "pictures", 0.025, ()), {ORIGINAL: Machine()}, 0.0126)
         for h in (seen.head, head)
     )
     assert wrong.replaced == clean.replaced + 1
@@ -505,7 +528,8 @@ def test_a_log_with_its_true_parameters(tmp_path: Path) -> None:
     pump = {key: truth[key] for key in ("lag_s", "falling_N_per_s")}
     pump["strength"] = [truth["strength1"], truth["strength2"]]
     path = tmp_path / "rig.yaml"
-    known = rig_file(path, actuator={**actuator, "lambda3": -1.0}, pump=pump)
+    stated = Known(actuator=KnownActuator(**actuator, lambda3=-1.0), pump=KnownPump(**pump))
+    known = rig_file(path, known=stated)
     log = log_file(tmp_path / "log.csv", rig, "prbs", 1, 6.0)
     found, _ = validate_log(log, known, path, truth=True)
     assert found.how == "truth" and found.hoses

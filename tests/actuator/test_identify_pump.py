@@ -154,9 +154,9 @@ def found() -> PumpFound:
 
 
 def test_a_pump_that_is_a_lag_is_found_to_be_one(found: PumpFound) -> None:
-    section = pump_section(found, Rig(), PATH)
+    section = pump_section(found, Rig())
     assert section.lag_s == pytest.approx(0.5, rel=0.02)
-    assert section.delay_ticks == 4.0
+    assert section.delay_ticks == 4
     assert section.identified is not None
     assert section.identified.better == LAG
     # The recordings' own map is a line through zero, and the data say so.

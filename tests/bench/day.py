@@ -28,7 +28,7 @@ import numpy as np
 import yaml
 
 from calib.core.arrays import FloatArray
-from calib.core.rig import read_rig
+from calib.core.rig import Rig
 from calib.io.cells import GENERAL, TIME, table_bytes
 from calib.io.logs import COLUMNS, TRUE, Log, iter_log
 from calib.io.states import STATES, states_writer
@@ -133,7 +133,7 @@ def _shown(name: str, count: int, call: Callable[[], Any]) -> Any:
 def _stages(
     path: Path, rig_path: Path, ending: str, model: str, folder: Path, count: int, show: Show
 ) -> None:
-    rig = read_rig(rig_path)
+    rig = Rig.load(rig_path)
     setup, found, stream, _ = prepared(path, rig, rig_path)
     first = next(stream)
     estimate = estimator_of(setup, drive_for(model, first, found, rig, path, rig_path), model)

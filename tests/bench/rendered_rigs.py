@@ -36,7 +36,7 @@ import numpy as np
 from drivenlogs import varied_drive
 from estimatorlogs import truth_of_sensors
 
-from calib.core.rig import read_rig
+from calib.core.rig import Rig
 from calib.io.logs import log_text
 from calib.stages.align.solve import rest_angle
 from calib.stages.estimator.replay import Replayed, replay_log
@@ -162,7 +162,7 @@ def _nis(found: list[Replayed]) -> str:
 
 def misaligned(folder: Path, rig: SimulatedRig) -> tuple[float, float]:
     """How far the alignment is off: the delay [ms], and the angle that a straight head reads [deg]."""
-    found = read_rig(folder / "rig.yaml").align
+    found = Rig.load(folder / "rig.yaml").align
     assert found is not None
     late = found.time_offset_s - rig.tracker.latency_s
     turned = found.rest_angle_rad - rest_angle(truth_of_sensors(rig))[0]
@@ -206,7 +206,7 @@ def main() -> None:
             off.append(misaligned(folder, drawn(seed, given.off)))
             for way, (file, how) in WAYS.items():
                 path = folder / file
-                rig = read_rig(path)
+                rig = Rig.load(path)
                 for name in REPLAYED:
                     found = replay_log(folder / "replayed" / f"{name}.csv", rig, path, **how)
                     results[way][name].append(found)

@@ -16,6 +16,7 @@ from calib.cli.simulate import simulate
 from calib.core.errors import BadInputError, UsageError
 from calib.io.logs import read_log
 from calib.stages.actuator.identify_pump import LAG
+from calib.stages.actuator.section import Known, KnownActuator
 from calib.twin.rig import SimulatedRig
 
 from .conftest import Run
@@ -70,6 +71,34 @@ def test_swings_fill_the_section(calib: Run, rig: Path, swings: list[Path], tmp_
     assert (tmp_path / "figures" / "identify_motion.png").exists()
     # The simulation takes the file as it is.
     assert calib("simulate", "swing", "-o", tmp_path / "x.csv", "--rig", rig, "--duration", "1s").code == 0
+
+
+def test_no_result_is_its_own_prior(calib: Run, rig: Path, swings: list[Path], tmp_path: Path) -> None:
+    first = rig.with_name("first.yaml")
+    assert calib("identify", *swings, "--rig", rig, "--no-hold-back").code in (0, 1)
+    first.write_bytes(rig.read_bytes())
+    assert calib("identify", *swings, "--rig", rig, "--no-hold-back").code in (0, 1)
+    assert rig.read_bytes() == first.read_bytes()
+    # Nor does it matter what another result in the file says.
+    wrong = yaml.safe_load(rig.read_text())
+    wrong["actuator"] |= {"stiffness_scale": 1.3, "damping_scale_free_swing": 9.0, "lambda1_per_s": 7.0}
+    wrong["pump"] = {"lag_s": 1.9, "sigma": {"lag_s": 0.01}, "verdict": "poor"}
+    rig.write_text(yaml.safe_dump(wrong, sort_keys=False))
+    assert calib("identify", *swings, "--rig", rig, "--no-hold-back").code in (0, 1)
+    assert yaml.safe_load(rig.read_text())["actuator"] == yaml.safe_load(first.read_text())["actuator"]
+
+
+def test_what_is_known_is_kept_and_said(calib: Run, rig: Path, swings: list[Path]) -> None:
+    known = {"stiffness_scale": 1.0, "mass_kg": 0.0166, "sigma": {"mass_kg": 2e-4}}
+    rig.write_text(rig.read_text() + yaml.safe_dump({"known": {"actuator": known}}))
+    ended = calib("identify", *swings, "--rig", rig, "--no-hold-back")
+    assert ended.code in (0, 1)
+    assert "not estimated, for known states it: stiffness_scale" in ended.out
+    assert "known with a standard deviation, which went in: mass_kg" in ended.out
+    after = yaml.safe_load(rig.read_text())
+    assert after["known"]["actuator"] == known
+    assert "stiffness_scale" not in after["actuator"]
+    assert after["actuator"]["sigma"]["mass_kg"] <= 2e-4
 
 
 def test_logs_that_cannot_be_used_end_in_a_sentence(
@@ -176,7 +205,9 @@ def _rig(folder: Path, **sections: Any) -> Path:
 
 
 def test_both_models_in_one_table_and_figures(calib: Run, tmp_path: Path, log: Path) -> None:
-    rig = _rig(tmp_path, actuator={"stiffness_scale": 0.8, "damping_scale_free_swing": 5.0})
+    rig = _rig(
+        tmp_path, known=Known(actuator=KnownActuator(stiffness_scale=0.8, damping_scale_free_swing=5.0))
+    )
     drawn = tmp_path / "drawn"
     ended = calib("validate", log, "--rig", rig, "--figures", drawn, "--json")
     assert ended.code == 0, ended.err
@@ -195,9 +226,6 @@ def test_both_models_in_one_table_and_figures(calib: Run, tmp_path: Path, log: P
 def test_bad_input_is_one_sentence(calib: Run, tmp_path: Path, log: Path) -> None:
     ended = calib("validate", log, cwd=tmp_path)
     assert ended.code == 3 and "camera" in ended.sentence
-    rig = _rig(tmp_path, actuator={"stiffness_scale": -1.0})
-    ended = calib("validate", log, "--rig", rig)
-    assert ended.code == 3 and "actuator.stiffness_scale" in ended.sentence
     short = tmp_path / "short.csv"
     short.write_text("\n".join(log.read_text().splitlines()[:40]) + "\n")
     ended = calib("validate", short, "--rig", _rig(tmp_path))

@@ -210,15 +210,15 @@ def test_odd_file_names(calib, process, pictures, project_root, gray, tmp_path) 
     assert header.count(" * input camera/") == len(ODD_NAMES) + 1
     ended = calib("intrinsics", *RADIAL2, "--rig", rig, "--", "-dash.png", cwd=folder)
     assert ended.code == 1
-    assert "1 views, 35 points" in ended.out
+    assert "board found in 1 of 1 pictures" in ended.err
 
 
 BOARDS = {
     "corners: [7]": "corners is [7], expected 2 values",
     "corners: [7, '5']": "corners.1 is '5', expected a whole number (without quotes",
-    "corners: [-7, 5]": "corners.0 is -7, expected greater than or equal to 3",
+    "corners: [-7, 5]": "corners.0 is -7, expected 3 to 200",
     "square_m: 2e-2": "square_m is '2e-2', expected a number (without quotes, and in YAML an exponent needs",
-    "square_m: 0": "square_m is 0, expected greater than",
+    "square_m: 0": "square_m is 0, expected at least 1e-05 and below 10 m",
     "corner: [7, 5]": "corner is not a key that is known here",
     "corners: [7": "board.yaml, line 2: is not YAML",
     "\x01": "is not YAML",
@@ -259,14 +259,14 @@ def test_a_wrong_rig_file_is_left_alone(calib, pictures, tmp_path, number: int) 
 
 
 CONTRADICTIONS = (
-    ("fx_px: 2", "fx_px: 0.0 #", "camera.fx_px is 0.0, expected greater than"),
+    ("fx_px: 2", "fx_px: 0.0 #", "camera.fx_px is 0, expected 0.001 to 1e+07 px"),
     ("[316, 208]", "[316.0, 208]", "camera.image_size_px.0 is 316.0, expected a whole number"),
     ("rms_px: 0", "rms_px: .inf #", "camera.rms_px is inf, expected a finite number"),
     ("  fx_px: 2", "  fx_px: 2\n  fx_px: 2", "the key fx_px was given before"),
     (
         "  A_inverse:\n  - [0.",
         "  A_inverse:\n  - [1.",
-        "plane.A_inverse is not the inverse of plane.A_px_per_m",
+        "plane.A_inverse is not the inverse of A_px_per_m",
     ),
     ("fx_px: 27", "fx_px: 28", "plane was calibrated with another camera"),
 )

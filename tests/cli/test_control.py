@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.core.rig import read_rig
+from calib.core.rig import Rig
 
 from .conftest import Run
 
@@ -33,7 +33,7 @@ def test_tune_writes_the_section_that_run_then_uses(calib: Run, tmp_path: Path) 
     assert "margins of the source's PID 1000/1000/10" in ended.out
     assert "verdict: ok" in ended.out
     text = (tmp_path / "rig.yaml").read_text()
-    section = read_rig(tmp_path / "rig.yaml").controller
+    section = Rig.load(tmp_path / "rig.yaml").controller
     assert section is not None
     assert section.orientation.Kp_pwm_per_rad == 470.0
     assert all(row.stable and (row.gain or 99.0) > 1.96 for row in section.margins)
@@ -113,7 +113,7 @@ def test_references_that_cannot_be_used(
     ("text", "sentence"),
     [
         ("actuator: {lambda1_per_s: -0.1047, lambda2_N_per_m: -14.98, lambda3: -1.854}\n", "make the plant"),
-        ("pump: {lag_s: 700}\n", "rig.yaml: pump.lag_s is 700, expected seconds between"),
+        ("pump: {lag_s: 700}\n", "rig.yaml: pump.lag_s is 700, expected 0.001 to 60 s"),
         ("controller: {pwm_low: 9.0, verdict: ok}\n", "rig.yaml: controller.tick_s is missing"),
     ],
 )

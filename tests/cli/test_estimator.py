@@ -14,7 +14,7 @@ from align_trials import twin_log
 from estimatorlogs import simulated
 
 from calib.core.arrays import FloatArray
-from calib.core.rig import read_rig
+from calib.core.rig import Rig
 from calib.io.logs import Log, write_log
 from calib.io.states import STATES
 from calib.twin.rig import SimulatedRig
@@ -50,7 +50,7 @@ def test_a_rig_is_aligned(calib: Run, logs: dict[str, Log], rig: Path, tmp_path:
     assert done.code == 0, done.err
     assert "verdict: ok" in done.out
     assert "time offset of pictures, ms" in done.out
-    section = read_rig(rig).align
+    section = Rig.load(rig).align
     assert section is not None
     # Nothing but the logs and the calibrated camera and plane; the truth is that of the simulated rig.
     assert section.time_offset_s == pytest.approx(0.025, abs=1e-3)
@@ -58,7 +58,7 @@ def test_a_rig_is_aligned(calib: Run, logs: dict[str, Log], rig: Path, tmp_path:
     offset = section.sigma["time_offset_s"]
     assert isinstance(offset, float)
     assert abs(section.time_offset_s - 0.025) < 4.0 * offset
-    assert set(read_rig(rig).provenance.inputs["align"]) == {"swing.csv", "ellipse.csv"}
+    assert set(Rig.load(rig).provenance.inputs["align"]) == {"swing.csv", "ellipse.csv"}
     assert {path.name for path in figures.iterdir()} == {
         "align_correlation.png", "align_residuals_1.png", "align_residuals_2.png",
     }  # fmt: skip
@@ -72,7 +72,7 @@ def test_at_rest_the_offset_is_not_observable(
     assert "verdict: unidentifiable" in done.out
     assert "the logs hardly move" in done.out
     assert "the mount angle and the accelerometer's bias along y are nearly one number" in done.out
-    section = read_rig(rig).align
+    section = Rig.load(rig).align
     assert section is not None
     rest = section.sigma["rest_angle_rad"]
     assert isinstance(rest, float)
@@ -140,7 +140,7 @@ def test_an_hour_of_jump_splits_the_log(calib: Run, logs: dict[str, Log], rig: P
     done = calib("align", _put(tmp_path, "log", log), "--rig", rig)
     assert done.code in (0, 1)
     assert "split at 1 gap(s)" in done.out
-    section = read_rig(rig).align
+    section = Rig.load(rig).align
     assert section is not None
     assert section.logs[0].stretches == 2
     assert section.time_offset_s == pytest.approx(0.025, abs=1e-3)
@@ -389,7 +389,7 @@ def test_the_driven_model_wants_commands(calib: Run, rig: Path, tmp_path: Path) 
 
 
 def test_a_plant_that_cannot_be_is_named(calib: Run, rig: Path, ellipse: Path) -> None:
-    rig.write_text(rig.read_text() + "\npump: {lag_s: -1.0}\n")
+    rig.write_text(rig.read_text() + "\nknown: {pump: {lag_s: -1.0}}\n")
     refused = calib("replay", str(ellipse), "--rig", str(rig))
     assert refused.code == 3
     assert "pump.lag_s" in refused.err

@@ -22,7 +22,7 @@ from outside import outside
 
 from calib.cli.verbs import verb
 from calib.core.errors import BadInputError
-from calib.core.rig import read_rig
+from calib.core.rig import Rig
 from calib.io.logs import log_text, read_log
 from calib.stages import stage
 from calib.stages.imu.tracks import missing
@@ -77,7 +77,7 @@ def test_section_table_and_kalibr(
     shown = capsys.readouterr()
     assert "verdict: ok" in shown.out
     assert "drift of the angle" in shown.out
-    after = read_rig(rig)
+    after = Rig.load(rig)
     assert after.geometry is not None
     section = after.imu
     assert section is not None
@@ -101,7 +101,7 @@ def test_motion_is_poor_but_written(tmp_path: Path, capsys: pytest.CaptureFixtur
         static([_write(tmp_path / "log.csv", values)], rig=tmp_path / "rig.yaml")
     assert ending.value.exit_code == 1
     assert "log.csv: moves from 10.0 to 12.0 s, seen most in gz" in capsys.readouterr().out
-    section = read_rig(tmp_path / "rig.yaml").imu
+    section = Rig.load(tmp_path / "rig.yaml").imu
     assert section is not None
     assert section.verdict.word == "poor"
     assert section.logs[0].moves_s == [[pytest.approx(10.0, abs=0.05), pytest.approx(12.0, abs=0.05)]]
@@ -129,7 +129,7 @@ def test_units_are_refused_and_then_converted(tmp_path: Path) -> None:
         static([path], acc_unit="g", rig=tmp_path / "rig.yaml")
     assert not (tmp_path / "rig.yaml").exists()
     static([path], acc_unit="g", gyro_unit="deg/s", rig=tmp_path / "rig.yaml")
-    section = read_rig(tmp_path / "rig.yaml").imu
+    section = Rig.load(tmp_path / "rig.yaml").imu
     assert section is not None
     assert section.gyro_bias_radps[2] == pytest.approx(0.006, abs=2e-4)
 
@@ -169,7 +169,7 @@ def test_a_recording_of_a_real_sensor(shared_data: Path, tmp_path: Path) -> None
     rest = table[table[:, 0] - table[0, 0] < 11.0]
     log = _write(tmp_path / "log.csv", rest[:, 1:], rest[:, 0])
     static([log], acc_unit="g", gyro_unit="deg/s", rig=tmp_path / "rig.yaml")
-    section = read_rig(tmp_path / "rig.yaml").imu
+    section = Rig.load(tmp_path / "rig.yaml").imu
     assert section is not None
     # A sensor of this kind has about 0.01 deg/s/sqrt(Hz).
     densities = np.degrees([value for value in section.gyro_noise_radps_per_sqrt_Hz if value is not None])
@@ -202,7 +202,7 @@ def test_a_plane_with_its_short_protocol(tmp_path: Path, capsys: pytest.CaptureF
         tmp_path / "good.csv", pose_log(tilts(np.radians(np.arange(0, 720, 45))), Sensor())
     )
     intrinsics(good, gravity=G, planar=True, rig=tmp_path / "rig.yaml")
-    section = read_rig(tmp_path / "rig.yaml").imu_intrinsics
+    section = Rig.load(tmp_path / "rig.yaml").imu_intrinsics
     assert section is not None
     assert section.planar
     assert section.accel.scale[:2] == pytest.approx([1.012, 0.991], abs=5e-4)
@@ -225,7 +225,7 @@ def test_units_are_refused_and_then_converted_in_imu_intrinsics(tmp_path: Path) 
         intrinsics(path, acc_unit="g", rig=rig)
     assert not rig.exists()
     intrinsics(path, gravity=G, acc_unit="g", gyro_unit="deg/s", rig=rig)
-    section = read_rig(rig).imu_intrinsics
+    section = Rig.load(rig).imu_intrinsics
     assert section is not None
     assert section.accel.scale == pytest.approx([1.012, 0.991, 1.006], abs=3e-4)
 
@@ -274,7 +274,7 @@ def test_the_recording_of_imu_tk_with_figures(
     out = capsys.readouterr().out
     assert "verdict: ok" in out
     assert "the gyroscope's bias follows the pose" in out
-    section = read_rig(tmp_path / "rig.yaml").imu_intrinsics
+    section = Rig.load(tmp_path / "rig.yaml").imu_intrinsics
     assert section is not None
     assert section.accel.scale == pytest.approx([414.42, 412.05, 414.61], rel=1e-3)
     assert section.accel.rms_mps2 is not None
@@ -383,12 +383,12 @@ def test_the_cameras_angle_of_a_simulated_rig(calib: Run, rig: Path, tmp_path: P
     said = calib("imu", "tune", log, "--rig", rig, "--reference", "camera")
     assert said.code == 0
     assert "judged by" in said.out and "camera" in said.out
-    section = read_rig(rig).orientation_filter
+    section = Rig.load(rig).orientation_filter
     assert section is not None
     lag = section.logs[0].reference_lag_s
     assert lag is not None
     assert 0.01 < lag < 0.05
-    assert {"camera", "plane", "o.csv"} <= set(read_rig(rig).provenance.inputs["orientation_filter"])
+    assert {"camera", "plane", "o.csv"} <= set(Rig.load(rig).provenance.inputs["orientation_filter"])
 
 
 @pytest.fixture
@@ -428,7 +428,7 @@ def test_units_are_refused_and_then_converted_in_imu_tune(calib: Run, arm: Arm, 
     assert calib("imu", "tune", path, "--rig", rig, *units).code == 0
     plain = tmp_path / "plain.yaml"
     assert calib("imu", "tune", write(tmp_path / "si.csv", arm), "--rig", plain).code == 0
-    one, other = read_rig(rig).orientation_filter, read_rig(plain).orientation_filter
+    one, other = Rig.load(rig).orientation_filter, Rig.load(plain).orientation_filter
     assert one is not None
     assert other is not None
     assert one.Kp_per_s == pytest.approx(other.Kp_per_s, rel=1e-3)
@@ -445,6 +445,6 @@ def test_duplicates_a_short_gap_and_an_hour(calib: Run, arm: Arm, tmp_path: Path
     assert "6 rows (0.20%) repeat the one before; dropped" in ended.err
     assert "2 samples missing in 1 gap(s), the longest 30 ms after 6.99 s; filled" in ended.err
     assert "split at a gap of 3600 s after 14.99 s" in ended.err
-    section = read_rig(tmp_path / "rig.yaml").orientation_filter
+    section = Rig.load(tmp_path / "rig.yaml").orientation_filter
     assert section is not None and section.recommended == "tuned"
     assert section.logs[0].pieces == 2 and section.logs[0].duration_s == pytest.approx(30.0, abs=0.1)

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from calib.core.files import hash_of
 from calib.core.result import identity
-from calib.core.rig import read_rig
+from calib.core.rig import Rig
 from calib.io.logs import MEASURED, Log, read_log, write_log
 from calib.io.serial import Frame, encoded
 from calib.stages.firmware.header import Header, header_of, identity_of
@@ -105,14 +105,14 @@ def test_a_suggestion_in_pixels_with_figures(calib: Run, tmp_path: Path, log: Pa
     assert ended.code == 0, ended.err
     assert "least delay for a jitter of 0.1 px" in ended.out
     assert "taken" in ended.out
-    section = read_rig(tmp_path / "rig.yaml").lowpass
+    section = Rig.load(tmp_path / "rig.yaml").lowpass
     assert section is not None and section.log is not None
     assert 0.09 < max(axis.jitter_after for axis in section.log.axes.values()) < 0.102
     assert {path.name for path in (tmp_path / "drawn").iterdir()} == {
         "lowpass_log.png",
         "lowpass_response.png",
     }
-    provenance = read_rig(tmp_path / "rig.yaml").provenance.inputs["lowpass"]
+    provenance = Rig.load(tmp_path / "rig.yaml").provenance.inputs["lowpass"]
     assert provenance == {"log.csv": hash_of(log)}
 
 
@@ -120,7 +120,7 @@ def test_millimetres_with_a_plane(calib: Run, rig: Path, log: Path) -> None:
     ended = calib("lowpass", "--log", log, "--rig", rig)
     assert ended.code == 0, ended.err
     assert "log jitter in" in ended.out and "mm" in ended.out
-    after = read_rig(rig)
+    after = Rig.load(rig)
     assert after.camera is not None and after.plane is not None and after.lowpass is not None
     assert after.provenance.inputs["lowpass"] == {
         "camera": identity(after.camera),
@@ -130,14 +130,14 @@ def test_millimetres_with_a_plane(calib: Run, rig: Path, log: Path) -> None:
     ended = calib("lowpass", "--suggest", log, "--jitter", "0.1px", "--rig", rig)
     assert ended.code == 2
     assert ended.sentence == "--jitter: '0.1px' does not fit positions in millimetres"
-    assert read_rig(rig).lowpass == after.lowpass
+    assert Rig.load(rig).lowpass == after.lowpass
 
 
 def test_a_poor_filter_is_written_and_says_so(calib: Run, tmp_path: Path) -> None:
     ended = calib("lowpass", "--cutoff", "0.01Hz", "--order", "2", cwd=tmp_path)
     assert ended.code == 1
     assert "verdict: poor" in ended.out
-    section = read_rig(tmp_path / "rig.yaml").lowpass
+    section = Rig.load(tmp_path / "rig.yaml").lowpass
     assert section is not None and section.verdict.word == "poor"
 
 
@@ -233,7 +233,7 @@ def board(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[bytes], str]]:
 
 
 def test_a_board_is_recorded_and_checked(calib, rig: Path, tmp_path: Path, board) -> None:
-    header = header_of(read_rig(rig), "rig.yaml")
+    header = header_of(Rig.load(rig), "rig.yaml")
     log = tmp_path / "log.csv"
     ended = calib("record", board(_stream(header)), "-o", log, "--ticks", "90", "--duration", "30s", "--json")
     assert ended.code == 0, ended.err
@@ -251,7 +251,7 @@ def test_a_board_is_recorded_and_checked(calib, rig: Path, tmp_path: Path, board
 
 
 def test_a_board_that_computes_something_else_fails(calib, rig: Path, tmp_path: Path, board) -> None:
-    header = header_of(read_rig(rig), "rig.yaml")
+    header = header_of(Rig.load(rig), "rig.yaml")
     log = tmp_path / "log.csv"
     assert calib("record", board(_stream(header)), "-o", log, "--ticks", "90", "--duration", "30s").code == 0
     lines = log.read_text().splitlines()

@@ -76,10 +76,10 @@ def test_usage_ends_with_two(calib, words: tuple[str, ...], says: str) -> None:
 
 
 def test_a_mistake_of_the_program_is_one_sentence(calib, monkeypatch, tmp_path) -> None:
-    def broken(*_: object) -> None:
+    def broken(*_: object, **__: object) -> None:
         raise RuntimeError("first line\nsecond\x1b line")
 
-    monkeypatch.setattr("calib.core.rig.read_rig", broken)
+    monkeypatch.setattr("calib.core.rig.Rig.load", broken)
     monkeypatch.delenv("CALIB_DEBUG", raising=False)
     ended = calib("firmware", "--rig", "rig.yaml", cwd=tmp_path)
     assert ended.code == 70
@@ -102,10 +102,10 @@ def test_a_mistake_of_the_program_is_one_sentence(calib, monkeypatch, tmp_path) 
     ],
 )
 def test_other_ends(calib, monkeypatch, failure: BaseException, code: int, says: str) -> None:
-    def fail(*_: object) -> None:
+    def fail(*_: object, **__: object) -> None:
         raise failure
 
-    monkeypatch.setattr("calib.core.rig.read_rig", fail)
+    monkeypatch.setattr("calib.core.rig.Rig.load", fail)
     # Threads that other tests have left behind are not this command's.
     monkeypatch.setattr("calib.cli.main._still_working", lambda: False)
     ended = calib("firmware")

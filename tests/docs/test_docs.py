@@ -24,7 +24,7 @@ from typer.main import get_command
 from calib.cli.app import app
 from calib.cli.docs import MANUAL, docs, manual, page_of, slug, write_manual
 from calib.core.errors import DISTRIBUTION, UsageError, pip_install
-from calib.core.rig import SECTIONS
+from calib.core.rig import KINDS
 from calib.io.logs import COLUMNS
 from calib.io.states import STATES
 from calib.twin.scenarios import SCENARIOS
@@ -175,7 +175,7 @@ def test_generated_pages_are_up_to_date(path: str) -> None:
 
 def test_the_reference_names_every_column_section_and_scenario() -> None:
     files = (MANUAL / "reference" / "files.md").read_text(encoding="utf-8")
-    assert not [name for name in (*COLUMNS, *STATES, *SECTIONS) if f"`{name}`" not in files]
+    assert not [name for name in (*COLUMNS, *STATES, *KINDS) if f"`{name}`" not in files]
     rows = re.findall(
         r"^\| `(\w+)` \|.*\| (.*) \|$", (MANUAL / "howto" / "simulate.md").read_text(encoding="utf-8"), re.M
     )

@@ -483,7 +483,6 @@ def test_windows_make_little_difference(monkeypatch: pytest.MonkeyPatch) -> None
     assert (difference < 0.5 * whole[late, 10:12]).all()
 
 
-HERE = Path("rig.yaml")
 _TOLD = ("stiffness_scale", "lambda2_N_per_m", "lag_s", "strength1", "strength2", "damping_scale_free_swing")
 
 
@@ -492,23 +491,26 @@ def _identified(sigma: tuple[float, ...], correlation: float, lag_sigma: float |
     share = np.full((len(sigma), len(sigma)), correlation) + (1.0 - correlation) * np.eye(len(sigma))
     table = {"order": list(_TOLD), "values": (share * np.outer(sigma, sigma)).tolist()}
     k, c, lag, first, second, free = sigma
-    return Rig.model_validate(
+    return Rig.of(
         {
+            "schema": 2,
             "actuator": {
+                "verdict": "ok",
                 "stiffness_scale": 1.1, "lambda2_N_per_m": 9.0, "damping_scale_free_swing": 3.0,
                 "sigma": {"stiffness_scale": k, "lambda2_N_per_m": c, "damping_scale_free_swing": free},
                 "covariance": table,
             },
             "pump": {
-                "lag_s": 0.7, "strength": [1.0, 0.97],
+                "verdict": "ok", "lag_s": 0.7, "strength": [1.0, 0.97],
                 "sigma": {"lag_s": lag if lag_sigma is None else lag_sigma, "strength": [first, second]},
             },
-        }
+        },
+        "rig.yaml",
     )  # fmt: skip
 
 
 def test_what_was_identified_together_stays_together() -> None:
-    drive = drive_from_rig(_identified((0.022, 0.36, 0.014, 0.02, 0.0194, 0.1), 0.98), HERE)
+    drive = drive_from_rig(_identified((0.022, 0.36, 0.014, 0.02, 0.0194, 0.1), 0.98))
     assert drive.covariance is not None
     np.testing.assert_allclose(np.sqrt(np.diag(drive.covariance)), drive.sigma, rtol=1e-12)
     assert np.linalg.eigvalsh(drive.covariance).min() > 0.0

@@ -706,7 +706,7 @@ BLIND = Periods(math.nan, 0.01, 0.0, False, 0, 100)
 def test_the_covariance_of_the_alignment_is_carried() -> None:
     order = ["mount_angle_rad", "accel_bias_y_mps2"]
     values = [[1e-4, -9.8e-4], [-9.8e-4, 9.7e-3]]
-    made = Rig.model_validate({"align": {**ALIGN, "covariance": {"order": order, "values": values}}})
+    made = Rig.of({"align": {**ALIGN, "covariance": {"order": order, "values": values}}}, "rig.yaml")
     setup, _ = setup_from_rig(made, Path("rig.yaml"), BLIND)
     P = setup.start.covariance()
     at = [6 + SENSOR.index(name) for name in order]

@@ -158,7 +158,7 @@ def test_the_budget_of_the_fused_tick(tmp_path: Path) -> None:
 def _with_integral(plain: Rig) -> Rig:
     control = rig("full").controller
     assert control is not None
-    return plain.model_copy(update={"controller": control})
+    return plain.with_sections({"controller": control})
 
 
 def test_a_moving_reference_is_that_of_the_set_points(tmp_path: Path) -> None:

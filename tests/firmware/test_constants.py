@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import re
 import struct
@@ -29,7 +30,7 @@ from calib.stages.estimator.kinematic import Setup, Start
 from calib.stages.estimator.sensors import sensor_values, view_coefficients
 from calib.stages.firmware.constants import (
     MIDDLE_M,
-    Known,
+    Lookup,
     control_groups,
     fused_group,
     motion_groups,
@@ -75,7 +76,7 @@ def _compiled(folder: Path, compiler: str, flags: str, text: str) -> subprocess.
 
 
 def test_same_rig_same_bytes() -> None:
-    again = header_of(rig().model_copy(deep=True), "elsewhere/rig.yaml")
+    again = header_of(copy.deepcopy(rig()), "elsewhere/rig.yaml")
     assert header_text(again) == header_text(header())
     assert identity_of(again) == identity_of(header())
 
@@ -220,7 +221,7 @@ def test_an_alignments_shift_and_stretch_are_undone() -> None:
     align = rig("full").align
     assert align is not None
     moved = align.model_copy(update={"plane_shift_m": list(shift), "plane_stretch": stretch})
-    made = header_of(rig("full").model_copy(update={"align": moved}), "rig.yaml")
+    made = header_of(rig("full").with_sections({"align": moved}), "rig.yaml")
     assert made.camera.plane is not None
     plain = header("full").camera.plane
     assert plain is not None
@@ -242,7 +243,7 @@ def test_the_horizon_lies_beyond_the_workspace() -> None:
 
 
 def _of(kind: str) -> dict[str, float]:
-    return values(literals(control_groups(Known(rig(kind), "rig.yaml"), 60.0)))
+    return values(literals(control_groups(Lookup(rig(kind), "rig.yaml"), 60.0)))
 
 
 def _summed(c: dict[str, float], errors: np.ndarray, clamping: bool) -> np.ndarray:
@@ -301,12 +302,12 @@ def _values(whole: Rig, rate_hz: float = 60.0) -> dict[str, float]:
 
 
 def _group(whole: Rig, rate_hz: float = 60.0) -> Group:
-    return fused_group(Known(whole, "rig.yaml"), rate_hz, header("fused").camera.plane)
+    return fused_group(Lookup(whole, "rig.yaml"), rate_hz, header("fused").camera.plane)
 
 
 def _with(section: str, **changes: object) -> Rig:
     whole = rig("fused")
-    return whole.model_copy(update={section: getattr(whole, section).model_copy(update=changes)})
+    return whole.with_sections({section: getattr(whole, section).model_copy(update=changes)})
 
 
 @pytest.mark.parametrize("alpha", [0.0, 0.05, -1.2, 2.5])
@@ -329,7 +330,7 @@ def test_the_accelerometers_map_undoes_bias_scale_and_mount(alpha: float) -> Non
 def test_without_tuned_gains_they_are_for_the_noise_of_the_alignment() -> None:
     """As `calib.stages.estimator.constant_gain` finds it from the set-up, to second order in the angle."""
     whole = _with("align", jitter_px=0.3, imu_lever_m=0.006)
-    whole = whole.model_copy(update={"estimator": None})
+    whole = whole.with_sections({"estimator": None})
     group, c = _group(whole), _values(whole)
     assert group.notes[-1] == "Gains for the noise in align."
     assert _group(rig("fused")).notes[-1] == "Gains of estimator.constant_gain."
@@ -353,7 +354,7 @@ def test_without_tuned_gains_they_are_for_the_noise_of_the_alignment() -> None:
 
 
 def _of_constants_motion(kind: str) -> dict[str, float]:
-    return values(literals(motion_groups(Known(rig(kind), "rig.yaml"))))
+    return values(literals(motion_groups(Lookup(rig(kind), "rig.yaml"))))
 
 
 @pytest.mark.parametrize("phi", [-1.2, 0.0, 0.7])
@@ -411,8 +412,8 @@ def test_the_bias_of_the_imu_at_rest_is_used_without_align() -> None:
         "accel_mean_mps2": [9.8, 0.0, 0.0],
         "verdict": "ok",
     }
-    known = Known(Rig.model_validate({"imu": imu}), "rig.yaml")
-    c = values(literals(motion_groups(known)))
+    lookup = Lookup(Rig.of({"imu": imu}, "rig.yaml"), "rig.yaml")
+    c = values(literals(motion_groups(lookup)))
     assert c["CALIB_IMU_GYRO_BIAS_RADPS"] == pytest.approx(0.021)
     assert c["CALIB_MM_GYRO_BIAS_DT_RAD"] == pytest.approx(0.021 / 60.0)
     assert "imu.gyro_bias_radps" not in " ".join(group.defaults for group in header("full").groups)

@@ -231,7 +231,7 @@ def test_low_passes_of_every_order(tmp_path: Path, order: int) -> None:
     rows = design_lowpass(Design(3.0, 60.0, order)).sections.tolist()
     sections = [LowPassSection(b=row[:3], a=row[3:]) for row in rows]
     other = section.model_copy(update={"order": order, "cutoff_hz": 3.0, "sections": sections})
-    made = header_of(rig().model_copy(update={"lowpass": other}), "rig.yaml")
+    made = header_of(rig().with_sections({"lowpass": other}), "rig.yaml")
     write(tmp_path, made)
     ticks = directed(values(made.literals), 1500)
     worst, _ = compare(made, ticks, run(host(tmp_path), ticks))

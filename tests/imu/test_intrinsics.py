@@ -18,7 +18,7 @@ from scipy.special import stdtrit
 
 import calib.stages.imu.intrinsics
 from calib.core.result import section_json
-from calib.core.rig import Rig, rig_text
+from calib.core.rig import Rig
 from calib.core.verdict import Verdict
 from calib.solve.clock import Part
 from calib.stages.imu.intrinsics import (
@@ -479,7 +479,7 @@ def test_axes_and_units_that_contradict_are_inconsistent(good: PoseLog) -> None:
 
 def _section(log: PoseLog, planar: bool = False) -> ImuIntrinsics:
     section = solve_intrinsics(IntrinsicsInputs(log, G, planar))
-    again = Rig.model_validate(yaml.safe_load(rig_text(Rig(imu_intrinsics=section)))).imu_intrinsics
+    again = Rig.of(yaml.safe_load(Rig(imu_intrinsics=section).text()), "rig.yaml").imu_intrinsics
     assert again is not None and section_json(again) == section_json(section)
     return section
 

@@ -11,7 +11,7 @@ import yaml
 
 from calib.cli.camera import import_camera
 from calib.core.errors import BadInputError
-from calib.core.rig import read_rig
+from calib.core.rig import Rig
 from calib.io.logs import log_text, read_log
 from calib.io.serial import encoded, frame_from_row, record
 from calib.stages.actuator.read import read_pump_table
@@ -64,7 +64,7 @@ def _table(path: Path) -> str:
 
 
 READERS: dict[str, tuple[str, str, Callable[[Path], str]]] = {
-    "rig": ("rig.yaml", RIG, lambda path: repr(read_rig(path))),
+    "rig": ("rig.yaml", RIG, lambda path: repr(Rig.load(path))),
     "board": ("board.yaml", BOARD, lambda path: repr(read_board_file(path.parent))),
     "log": ("log.csv", LOG, lambda path: log_text(read_log(path))),
     "points": ("points.csv", POINTS, lambda path: _views(read_table(path))),

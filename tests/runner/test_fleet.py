@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from calib.core.errors import BadInputError
 from calib.core.files import sha256
 from calib.core.result import CovarianceTable
-from calib.core.rig import Provenance, Rig, rig_text
+from calib.core.rig import Provenance, Rig
 from calib.runner import engine as cluster
 from calib.runner import engine as worker
 from calib.runner import fleet as running
@@ -249,7 +249,7 @@ def _fleet(out: Path, rigs: dict[str, Rig]) -> Iterator[tuple[Store, Manifest]]:
 
     with opened_store(out, "calib fleet", ()) as (store, _):
         for name, rig in rigs.items():
-            text = rig_text(rig).encode()
+            text = rig.text().encode()
             assert rig.camera is not None
             scratch = out / "one.yaml"
             scratch.write_bytes(text)

@@ -21,7 +21,7 @@ from pages import finished_run
 from running_trials import CALLS, Inline, exit_code, make_folder, run_small
 
 from calib.core.errors import BadInputError
-from calib.core.rig import SECTIONS
+from calib.core.rig import KINDS
 from calib.runner.folder import read_folder
 from calib.runner.graph import HIDDEN, STAGES, Done, opened
 from calib.runner.outputs import read_summary
@@ -376,7 +376,7 @@ def test_every_stage_comes_after_what_it_reads() -> None:
     written: dict[str, str] = {}
     for stage in STAGES:
         for name in (*stage.needs, *stage.uses):
-            assert name in SECTIONS
+            assert name in KINDS
             later = [other.name for other in STAGES if name in other.writes]
             assert not later or name in written or name not in stage.needs, (stage.name, name)
             # A section that a later stage writes would make the two wait for each other.

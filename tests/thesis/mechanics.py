@@ -17,7 +17,6 @@ from calib.core.arrays import FloatArray
 from calib.core.plot import Band, Plot
 from calib.stages.actuator.dynamics import coriolis_matrix, kinetic_energy_J, linearised, mass_matrix
 from calib.stages.actuator.identify import (
-    Nominal,
     Solution,
     StiffnessFit,
     Track,
@@ -35,6 +34,7 @@ from calib.stages.actuator.kinematics import (
     pose_from_configuration,
     transform,
 )
+from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import PRINTED_CREEP, Plant, growth_rate_per_s
 from calib.stages.actuator.pump import PWM_MAX, ElongationForce, PolynomialForce, static_force_N
 from calib.stages.actuator.simulate import STATE
@@ -490,12 +490,12 @@ def _track(phi_rad: float) -> Track:
 @once
 def fitted() -> Solution:
     """The improved model: the parameters of Table 3.2 from three swings, of which none is shown."""
-    return fit_tracks(Nominal(), [_track(phi) for phi in _FITTED_RAD], delay_s=0.0, threads=1)
+    return fit_tracks(Machine(), [_track(phi) for phi in _FITTED_RAD], delay_s=0.0, threads=1)
 
 
 def fitted_rig() -> SimulatedRig:
     """The nominal rig with the fitted plant."""
-    plant, _ = made(Nominal(), fitted().values, False, nominal().pump.tick_s)
+    plant, _ = made(Machine(), fitted().values, False, nominal().pump.tick_s)
     return replace(nominal(), plant=plant, free_damping_scale=plant.damping_scale)
 
 

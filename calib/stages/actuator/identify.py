@@ -11,8 +11,10 @@ from scipy.optimize import least_squares
 
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
-from calib.stages.actuator.parameters import DAMPING_SCALE_FREE, DAMPING_SCALE_PUMPS, Creep, Plant
+from calib.stages.actuator.machine import Machine
+from calib.stages.actuator.parameters import Creep, Plant
 from calib.stages.actuator.pump import ElongationForce, Orifice, Pump, RateLimit
+from calib.stages.actuator.section import CREEP
 from calib.stages.actuator.simulate import simulate_batch, state_row
 
 # ----------------------------------------------------------------------
@@ -35,7 +37,8 @@ KNOTS_V = (6.0, 8.0, 10.0, 12.0)
 class Spec:
     """One parameter: unit, bounds, the size of a typical change, and what it acts on.
 
-    `acts` is "all", "free" (swings with the hoses off) or "pumps"; `symbol` is the source's.
+    `acts` is "all", "free" (swings with the hoses off) or "pumps"; "prior" for one that no log can tell, so
+    that it is among the unknowns only with a prior. `symbol` is the source's.
     """
 
     unit: str
@@ -47,6 +50,7 @@ class Spec:
 
 
 PARAMETERS: dict[str, Spec] = {
+    "mass_kg": Spec("kg", 1e-4, 10.0, 0.002, "prior", "m"),
     "stiffness_scale": Spec("", 0.05, 20.0, 0.2, "all", "c_spr"),
     "damping_scale_free_swing": Spec("", 0.01, 200.0, 1.0, "free", "c_dmp"),
     "damping_scale_pumps_connected": Spec("", 0.01, 500.0, 5.0, "pumps", "c_dmp"),
@@ -81,34 +85,13 @@ class StrengthForce(ElongationForce):
         return np.asarray(super().force_N(pwm) * np.array(self.strength))
 
 
-@dataclass(frozen=True)
-class Nominal:
-    """The rig as it is known before: what is not estimated, and where searches start.
-
-    `plant` has the damping of connected pumps; `free_damping_scale` is c_dmp with the hoses off.
-    """
-
-    plant: Plant = field(default_factory=lambda: replace(Plant(), damping_scale=DAMPING_SCALE_PUMPS))
-    free_damping_scale: float = DAMPING_SCALE_FREE
-    pump: Pump = field(default_factory=Pump)
-    strength: tuple[float, float] = (1.0, 1.0)
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.pump.static, ElongationForce):
-            raise BadInputError("pump: found a polynomial of the force, expected elongation_mm")
-        if not self.plant.creep_rates[2] < 0.0 < self.plant.creep_rates[0]:
-            raise BadInputError(
-                "actuator: found creep that is not passive to start from, expected lambda1 > 0 > lambda3"
-            )
-
-
 def elongation_polynomial(elongation_mm: Sequence[float]) -> tuple[float, float, float, float]:
     """Coefficients of u^3 .. 1 through the steady elongations [mm] at `KNOTS_V`."""
     a, b, c, d = np.polyfit(KNOTS_V, np.asarray(elongation_mm, dtype=np.float64), 3).tolist()
     return a, b, c, d
 
 
-def values_of(nominal: Nominal) -> dict[str, float]:
+def values_of(nominal: Machine) -> dict[str, float]:
     """All parameters of a rig by name."""
     plant, pump = nominal.plant, nominal.pump
     l1, l2, l3 = plant.creep_rates
@@ -118,6 +101,7 @@ def values_of(nominal: Nominal) -> dict[str, float]:
     assert isinstance(pump.static, ElongationForce)
     knots = np.polyval(pump.static.elongation_mm, KNOTS_V).tolist()
     return {
+        "mass_kg": plant.mass_kg,
         "stiffness_scale": plant.stiffness_scale,
         "damping_scale_free_swing": nominal.free_damping_scale,
         "damping_scale_pumps_connected": plant.damping_scale,
@@ -135,23 +119,28 @@ def values_of(nominal: Nominal) -> dict[str, float]:
     }
 
 
-def candidates(nominal: Nominal, free: bool, pumps: bool, static_map: bool) -> tuple[str, ...]:
+def candidates(
+    nominal: Machine, free: bool, pumps: bool, static_map: bool, stated: Mapping[str, float] | None = None
+) -> tuple[str, ...]:
     """Parameters that logs of these kinds can tell at all, lambda3 with them.
 
     Parameters
     ----------
     free, pumps : whether there are swings with the hoses off, and logs with commands.
     static_map : estimate the elongations at `KNOTS_V` instead of the strength of the first pump.
+    stated : standard deviations of what a person states; those of deviation zero are fixed.
     """
+    stated = stated or {}
     wanted = {"all"} | ({"free"} if free else set()) | ({"pumps"} if pumps else set())
-    names = [name for name, spec in PARAMETERS.items() if spec.acts in wanted]
+    wanted |= {"prior"} if stated.get("mass_kg") else set()
+    names = [name for name, spec in PARAMETERS.items() if spec.acts in wanted and stated.get(name) != 0.0]
     orifice = isinstance(nominal.pump.deflation, Orifice)
     left_out = {"falling_N_per_s"} if orifice else {"laminar_s", "turbulent_s2_per_N"}
     left_out |= {"strength1"} if static_map else set(_ELONGATIONS)
     return tuple(name for name in names if name not in left_out)
 
 
-def made(nominal: Nominal, values: Mapping[str, float], hoses: bool, tick_s: float) -> tuple[Plant, Pump]:
+def made(nominal: Machine, values: Mapping[str, float], hoses: bool, tick_s: float) -> tuple[Plant, Pump]:
     """Plant and pump with some parameters changed.
 
     Parameters
@@ -163,6 +152,7 @@ def made(nominal: Nominal, values: Mapping[str, float], hoses: bool, tick_s: flo
     plant = nominal.plant
     plant = replace(
         plant,
+        mass_kg=v["mass_kg"],
         stiffness_scale=v["stiffness_scale"],
         damping_scale=v["damping_scale_pumps_connected" if hoses else "damping_scale_free_swing"],
         bending_N_per_rad2=v["bending_N_per_rad2"],
@@ -280,7 +270,7 @@ class Track:
 
 def heads_of(
     track: Track,
-    nominal: Nominal,
+    nominal: Machine,
     sets: Sequence[Mapping[str, float]],
     starts: Sequence[Start],
     delay_s: float,
@@ -405,15 +395,26 @@ class Problem:
     ----------
     names : parameters that are estimated. held : values of others that differ from the nominal ones.
     delay_s, delay_sigma_s : what is known of the rows' delay.
+    stated : standard deviations of nominal values that a person states; zero for those that are exact.
     """
 
-    nominal: Nominal
+    nominal: Machine
     tracks: Sequence[Track]
     names: tuple[str, ...]
     held: Mapping[str, float]
     delay_s: float = CAMERA_DELAY_S
     delay_sigma_s: float = _DELAY_SIGMA_S
     threads: int = 2
+    stated: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def priors(self) -> list[tuple[int, float, float]]:
+        """Index, mean and standard deviation of each unknown parameter that a person states."""
+        sigma = [self.stated.get(name, 0.0) for name in self.names]
+        if not any(sigma):
+            return []
+        mean = values_of(self.nominal)
+        return [(k, mean[name], s) for k, (name, s) in enumerate(zip(self.names, sigma, strict=True)) if s]
 
     @property
     def layout(self) -> Layout:
@@ -491,6 +492,7 @@ def _priors(problem: Problem, x: FloatArray) -> FloatArray:
         if track.moving is not None:
             guess = np.array(astuple(track.moving))[2 : layout.starts[k]]
             parts.append((x[layout.of_start(k)][2:] - guess) / _start_sigma(track))
+    parts.append(np.array([(x[k] - mean) / sigma for k, mean, sigma in problem.priors]))
     return np.concatenate(parts)
 
 
@@ -568,7 +570,11 @@ def jacobian(problem: Problem, x: FloatArray) -> tuple[FloatArray, FloatArray]:
             rows = np.zeros((layout.starts[k] - 2, layout.size))
             rows[:, layout.of_start(k)][:, 2:] = np.diag(1.0 / _start_sigma(track))
             priors.append(rows)
-    return np.concatenate([*errors, _priors(problem, x)]), np.vstack([*blocks, *priors])
+    stated = problem.priors
+    rows = np.zeros((len(stated), layout.size))
+    for row, (k, _, sigma) in enumerate(stated):
+        rows[row, k] = 1.0 / sigma
+    return np.concatenate([*errors, _priors(problem, x)]), np.vstack([*blocks, *priors, rows])
 
 
 # ----------------------------------------------------------------------
@@ -757,14 +763,17 @@ def _spread(problem: Problem, values: Mapping[str, float], seed: int) -> FloatAr
     x = first_guess(problem, values)
     out = np.tile(x, (CANDIDATES, 1))
     P = len(problem.names)
-    out[1:, :P] *= np.exp(rng.uniform(-0.7, 0.7, (CANDIDATES - 1, P)))
+    apart = rng.uniform(-0.7, 0.7, (CANDIDATES - 1, P))
+    out[1:, :P] *= np.exp(apart)
+    for k, mean, sigma in problem.priors:
+        out[1:, k] = mean + sigma * apart[:, k]
     low, high = problem.bounds()
     out[:, :P] = np.clip(out[:, :P], low[:P] * 1.001, high[:P] * 0.999)
     return out
 
 
 def fit_tracks(
-    nominal: Nominal,
+    nominal: Machine,
     tracks: Sequence[Track],
     static_map: bool = False,
     delay_s: float | None = None,
@@ -772,13 +781,16 @@ def fit_tracks(
     threads: int = 2,
     seed: int = 0,
     progress: Progress | None = None,
+    stated: Mapping[str, float] | None = None,
 ) -> Solution:
     """Estimate all parameters that these logs can tell.
 
     Parameters
     ----------
-    static_map : see `identify_parameters.candidates`.
+    nominal : what is not estimated, and where the search starts.
+    static_map : see `candidates`.
     delay_s, delay_sigma_s : what is known of the delay of the measured rows.
+    stated : standard deviations of the values in `nominal` that a person states; zero fixes a value.
 
     Raises
     ------
@@ -786,11 +798,17 @@ def fit_tracks(
     """
     if not tracks:
         raise BadInputError("identify: found no log, expected at least one")
-    names = candidates(nominal, any(not t.hoses for t in tracks), any(t.hoses for t in tracks), static_map)
+    free, pumps = any(not t.hoses for t in tracks), any(t.hoses for t in tracks)
+    names = candidates(nominal, free, pumps, static_map, stated)
+    l1, _, l3 = nominal.plant.creep_rates
+    if not l3 < 0.0 < l1 and set(CREEP) & set(names):
+        raise BadInputError(
+            "actuator: found creep that is not passive to start from, expected lambda1 > 0 > lambda3"
+        )
     if not any(_moves(track) for track in tracks):
         raise _blind(dict.fromkeys(names, "the rig does not move"))
     known = values_of(nominal)
-    problem = Problem(nominal, tracks, names, {}, threads=threads)
+    problem = Problem(nominal, tracks, names, {}, threads=threads, stated=stated or {})
     if delay_s is not None:
         problem = replace(problem, delay_s=delay_s)
     if delay_sigma_s is not None:
@@ -1018,7 +1036,7 @@ def held_back(solution: Solution) -> list[HeldLog]:
 def _told_by(name: str, kinds: set[bool]) -> bool:
 
     acts = PARAMETERS[name].acts
-    return acts == "all" or (acts == "pumps") in kinds
+    return acts in ("all", "prior") or (acts == "pumps") in kinds
 
 
 # ----------------------------------------------------------------------
@@ -1346,11 +1364,12 @@ def _information(
     if not np.isfinite(head).all():
         return None
     track = replace(track, head=head[0])
-    mine = candidates(problem.nominal, not one.hoses, one.hoses, False)
+    mine = candidates(problem.nominal, not one.hoses, one.hoses, False, problem.stated)
     more = tuple(name for name in mine if name not in names and name != "lambda3")
     if any(name.startswith("elongation") for name in names):
         more = tuple(name for name in more if name != "strength1")
-    alone = replace(problem, tracks=[track], names=names + more, held=values, delay_s=0.0)
+    # The priors of what is stated are in the information so far.
+    alone = replace(problem, tracks=[track], names=names + more, held=values, delay_s=0.0, stated={})
     x = first_guess(alone, values)
     x[alone.layout.start :] = one.start.phi_rad, one.start.length_m
     residual, J = jacobian(alone, x)
@@ -1484,7 +1503,11 @@ def judge(
     """Judge an identification from what was computed of it."""
     blind = {name: why for name, why in solution.fixed.items() if "enter only" not in why}
     reasons = [f"{name} is not identifiable from these logs: {why}" for name, why in blind.items()]
-    remarks = [f"{why}" for why in solution.fixed.values() if "enter only" in why]
+    remarks = [why for why in solution.fixed.values() if "enter only" in why]
+    fixed = [name for name, sigma in solution.problem.stated.items() if not sigma]
+    priors = [solution.problem.names[k] for k, _, _ in solution.problem.priors]
+    remarks += [f"not estimated, for known states it: {', '.join(fixed)}"] if fixed else []
+    remarks += [f"known with a standard deviation, which went in: {', '.join(priors)}"] if priors else []
     for name, value in solution.values.items():
         relative = known.sigma[name] / max(abs(value), 1e-12)
         if relative > _MOST_RELATIVE:

@@ -34,6 +34,9 @@ DAMPING_SCALE_PUMPS = 16.0
 
 FORCE_PROJECTIONS = ("virtual_work", "head")
 
+SUPPLY_V = 12.0
+"""Of the pumps at PWM 255."""
+
 LONGEST_ELONGATION_M = 0.04
 """Up to here a stiffness law has to stay positive; 12 V reach 0.0266 m."""
 

@@ -46,7 +46,7 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.stages.actuator.kinematics import inlined
-from calib.stages.actuator.parameters import Stiffness
+from calib.stages.actuator.parameters import SUPPLY_V, Stiffness
 
 PWM_MAX = 255.0
 TICK_S = 1.0 / 60.0
@@ -68,7 +68,7 @@ class ElongationForce:
 
     elongation_mm: tuple[float, float, float, float] = (-0.1493, 3.756, -25.87, 54.13)
     stiffness: Stiffness = field(default_factory=Stiffness)
-    supply_V: float = 12.0
+    supply_V: float = SUPPLY_V
     dead_zone_V: float = 4.7
 
     def force_N(self, pwm: FloatArray) -> FloatArray:

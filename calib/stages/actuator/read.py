@@ -18,9 +18,9 @@ from calib.core.units import plain_number
 from calib.io.logs import Log, check_time, read_log
 from calib.stages.actuator.identify import Start, Track, without_outliers
 from calib.stages.actuator.identify_pump import PumpRecord
+from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import Plant
 from calib.stages.actuator.pump import TICK_S
-from calib.stages.actuator.results import nominal_of
 from calib.stages.control.laws import holding_force
 from calib.stages.estimator.read import periods, setup_from_rig
 from calib.stages.estimator.sensors import SIZE, invert_marker, marker
@@ -494,7 +494,7 @@ def read_track(
     path: Path,
     rig: Rig,
     rig_path: Path,
-    bellows_radius_m: float,
+    nominal: Machine,
     states: Path | None = None,
     truth: bool = False,
     no_pwm: bool = False,
@@ -503,6 +503,8 @@ def read_track(
 
     Parameters
     ----------
+    nominal : the machine as it is known; its radius makes an angle of true lengths, its springs hold the head
+        at the start of a log that begins in motion.
     states : states file to take the pose from; without pictures one beside the log is looked for.
     truth : take the true columns.
     no_pwm : logs without commands are swings with the hoses off.
@@ -520,7 +522,7 @@ def read_track(
     if states is None and not truth and not len(log.sampled("u_px", "v_px")):
         states = states_beside(path)
     if truth:
-        (t, head, W), how = _from_truth(log, bellows_radius_m), "truth"
+        (t, head, W), how = _from_truth(log, nominal.plant.bellows_radius_m), "truth"
     elif states is not None:
         (t, head, W), how = _from_states(states), "states"
         said.append(f"{log.source}: takes the pose from {shown(states)}")
@@ -550,7 +552,7 @@ def read_track(
     # What a picture shows was so one delay earlier.
     seen_s = t - delay_s
     known = seen_s >= 0.0
-    moving = start_in_motion(seen_s[known], head[known], hoses, nominal_of(rig, rig_path).plant, noise)
+    moving = start_in_motion(seen_s[known], head[known], hoses, nominal.plant, noise)
     if moving is not None:
         said.append(
             f"{log.source}: begins in motion ({moving.phi_rad:.3f} rad, {moving.dphi_radps:+.2f} rad/s); its "

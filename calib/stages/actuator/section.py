@@ -1,63 +1,157 @@
-"""The sections `actuator` and `pump` of rig.yaml: what a person knows of them and what was identified.
+"""The sections `known`, `actuator` and `pump` of rig.yaml: what a person states, and what was identified.
 
-Both stay plain mappings in the file and for those who only simulate (`calib.twin.rig` names what is wrong
-with a number in the unit that was expected). These schemas are for what is identified and for reading it
-back: values, and beside them `sigma`, `covariance`, verdict, reasons, remarks and advice.
+`known` holds a person's word, `actuator` and `pump` what `calib identify` has estimated; all have the same
+keys. `in_force` says which value holds: the nominal one, over it an estimate, over it what is known. A known
+value with a standard deviation is a prior; an estimate has it in itself and holds instead.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import Field, ValidationInfo, field_validator
 
-from calib.core.errors import BadInputError
-from calib.core.files import shown
-from calib.core.result import CovarianceTable, NotNegative, Number, Pair, Positive, Section
-from calib.core.rig import Rig, validation_sentence
+from calib.core.files import one_line
+from calib.core.result import CovarianceTable, NotNegative, Number, Result, Section, Statement, quantity
+from calib.core.schema import nearest, validated
 
-Verdict = Literal["ok", "poor", "unidentifiable"]
-Kind = TypeVar("Kind", bound=BaseModel)
+if TYPE_CHECKING:
+    from calib.core.rig import Rig
+    from calib.stages.actuator.parameters import Plant
+
+Acceleration = Annotated[float, Field(ge=-100.0, le=100.0, allow_inf_nan=False, strict=True)]
+Factor = Annotated[float, Field(ge=0.0, le=10.0, allow_inf_nan=False, strict=True)]
+Millimetres = Annotated[float, Field(ge=-1e4, le=1e4, allow_inf_nan=False, strict=True)]
+Deviations = dict[str, NotNegative | list[NotNegative | None] | None]
+"""Standard deviations by key, a list where the value is one; null where nothing bounds it."""
+
+LAW = ("k0_N_per_m", "k1_N_per_m2", "k2_N_per_m3", "k3_N_per_m4")
+"""Keys of the springs' law (3.38), which `calib identify stiffness` estimates."""
+CREEP = ("lambda1_per_s", "lambda2_N_per_m", "lambda3")
+KNOTS = ("elongation_6V_mm", "elongation_8V_mm", "elongation_10V_mm", "elongation_12V_mm")
+"""Elongations that `elongation_mm` is fitted to; keys of its `sigma`."""
 
 
-class _Judged(Section):
-    """What every identified section has beside its values.
+class ActuatorParameters(Section):
+    """Mechanical parameters, see `calib.stages.actuator.parameters`; absent ones are nominal.
 
     Attributes
     ----------
-    sigma : standard deviations by key, a list where the value is one; null where nothing bounds it.
+    kind : of the actuator; absent means two bellows side by side.
     """
 
-    sigma: dict[str, NotNegative | list[NotNegative | None] | None] = {}
-    covariance: CovarianceTable | None = None
-    verdict: Verdict | None = None
-    reasons: list[str] = []
-    remarks: list[str] = []
-    advice: list[str] = []
-
-
-class Actuator(_Judged):
-    """Mechanical parameters, see `calib.stages.actuator.parameters`; absent ones are nominal."""
-
-    mass_kg: Positive | None = None
-    inertia_kgm2: NotNegative | None = None
-    bellows_radius_m: Positive | None = None
-    rest_length_m: Positive | None = None
-    k0_N_per_m: Positive | None = None
-    k1_N_per_m2: Number | None = None
-    k2_N_per_m3: Number | None = None
-    k3_N_per_m4: Number | None = None
-    stiffness_scale: Positive | None = None
-    damping_ratio: NotNegative | None = None
-    damping_scale_free_swing: NotNegative | None = None
-    damping_scale_pumps_connected: NotNegative | None = None
-    bending_N_per_rad2: NotNegative | None = None
-    lambda1_per_s: Number | None = None
-    lambda2_N_per_m: Number | None = None
-    lambda3: Number | None = None
-    gravity_mps2: Pair | None = None
+    kind: Literal["two_bellows"] = "two_bellows"
+    mass_kg: Number | None = quantity(None, label="mass", ge=1e-4, le=10.0)
+    inertia_kgm2: Number | None = quantity(None, label="inertia", ge=0.0, le=0.1)
+    bellows_radius_m: Number | None = quantity(
+        None, label="bellows' distance from the middle", ge=1e-3, le=0.2
+    )
+    rest_length_m: Number | None = quantity(None, label="length at rest", ge=5e-3, le=1.0)
+    k0_N_per_m: Number | None = quantity(None, label="spring k0", ge=0.1, le=1e5)
+    k1_N_per_m2: Number | None = quantity(None, label="spring k1", ge=-1e7, le=1e7)
+    k2_N_per_m3: Number | None = quantity(None, label="spring k2", ge=-1e10, le=1e10)
+    k3_N_per_m4: Number | None = quantity(None, label="spring k3", ge=-1e13, le=1e13)
+    stiffness_scale: Number | None = quantity(None, label="stiffness, of the nominal", ge=0.01, le=100.0)
+    damping_ratio: Number | None = quantity(None, label="damping ratio", ge=0.0, le=10.0)
+    damping_scale_free_swing: Number | None = quantity(None, label="damping, hoses off", ge=0.0, le=1e3)
+    damping_scale_pumps_connected: Number | None = quantity(
+        None, label="damping, pumps connected", ge=0.0, le=1e3
+    )
+    bending_N_per_rad2: Number | None = quantity(None, label="bending", ge=0.0, le=20.0)
+    lambda1_per_s: Number | None = quantity(None, label="creep lambda1", ge=-1e4, le=1e4)
+    lambda2_N_per_m: Number | None = quantity(None, label="creep lambda2", ge=-1e5, le=1e5)
+    lambda3: Number | None = quantity(None, label="creep lambda3", ge=-1e3, le=1e3)
+    gravity_mps2: Annotated[list[Acceleration], Field(min_length=2, max_length=2)] | None = None
     force_projection: Literal["virtual_work", "head"] | None = None
+
+
+class PumpParameters(Section):
+    """Both pumps, see `calib.stages.actuator.pump`; absent values are nominal.
+
+    Attributes
+    ----------
+    elongation_mm : measured on the rig, so that where it is given its forces follow from the rig's own
+        springs, otherwise from the nominal ones.
+    strength : factors on the static forces of both pumps, which are never quite alike.
+    """
+
+    lag_s: Number | None = quantity(None, label="lag", ge=1e-3, le=60.0)
+    delay_ticks: Annotated[int, Field(strict=True)] | None = quantity(None, label="delay", ge=0, le=1000)
+    tick_s: Number | None = quantity(None, label="tick", ge=1e-3, le=0.1)
+    supply_V: Number | None = quantity(None, label="supply", ge=1.0, le=100.0)
+    dead_zone_V: Number | None = quantity(None, label="dead zone", ge=0.0, le=100.0)
+    elongation_mm: Annotated[list[Millimetres], Field(min_length=4, max_length=4)] | None = None
+    deflation: Literal["rate_limit", "orifice"] | None = None
+    falling_N_per_s: Number | None = quantity(None, label="deflation", ge=1e-3, le=1e3)
+    laminar_s: Number | None = quantity(None, label="deflation, laminar", ge=1e-3, le=60.0)
+    turbulent_s2_per_N: Number | None = quantity(None, label="deflation, turbulent", ge=0.0, le=1e3)
+    strength: Annotated[list[Factor], Field(min_length=2, max_length=2)] | None = quantity(
+        None, label="strength of the pumps"
+    )
+
+
+def _checked(sigma: Deviations, kind: type[Section], values: dict[str, Any], needed: bool) -> Deviations:
+    """Deviations whose keys are those of a section; `needed` where a value has to stand beside each."""
+    keys = (*kind.model_fields, *(KNOTS if issubclass(kind, PumpParameters) else ()))
+    for name, one in sigma.items():
+        if name not in keys:
+            raise ValueError(f"expected keys of the section, {one_line(name)} is none{nearest(name, keys)}")
+        value = values.get("elongation_mm" if name in KNOTS else name)
+        size = len(value) if isinstance(value, list) and name not in KNOTS else 0
+        if needed and value is None:
+            raise ValueError(f"expected a value beside the standard deviation of {name}")
+        if value is not None and size != (len(one) if isinstance(one, list) else 0):
+            raise ValueError(f"expected {f'{size} numbers' if size else 'a number'} for {name}")
+    return sigma
+
+
+class KnownActuator(ActuatorParameters, Statement):
+    """What a person states of the actuator: fixed, or with its standard deviation a prior."""
+
+    sigma: Deviations = {}
+
+    @field_validator("sigma")
+    @classmethod
+    def _of_values(cls, sigma: Deviations, info: ValidationInfo) -> Deviations:
+        return _checked(sigma, cls, info.data, needed=True)
+
+
+class KnownPump(PumpParameters, Statement):
+    """What a person states of the pumps: fixed, or with its standard deviation a prior."""
+
+    sigma: Deviations = {}
+
+    @field_validator("sigma")
+    @classmethod
+    def _of_values(cls, sigma: Deviations, info: ValidationInfo) -> Deviations:
+        return _checked(sigma, cls, info.data, needed=True)
+
+
+class Known(Statement):
+    """What a person states of the rig; no verb writes it."""
+
+    actuator: KnownActuator | None = None
+    pump: KnownPump | None = None
+
+
+class Actuator(ActuatorParameters, Result):
+    """Mechanical parameters that `calib identify` has estimated.
+
+    Attributes
+    ----------
+    covariance : of all that the logs told together, the pumps' parameters with it.
+    """
+
+    sigma: Deviations = {}
+    covariance: CovarianceTable | None = None
+
+    @field_validator("sigma")
+    @classmethod
+    def _of_values(cls, sigma: Deviations, info: ValidationInfo) -> Deviations:
+        return _checked(sigma, cls, info.data, needed=False)
 
 
 class PumpModel(Section):
@@ -101,44 +195,137 @@ class PumpIdentified(Section):
     unexplained: list[str] = []
 
 
-class PumpSection(_Judged):
-    """Both pumps, see `calib.stages.actuator.pump`; absent values are nominal."""
+class PumpSection(PumpParameters, Result):
+    """Parameters of the pumps that `calib identify` has estimated."""
 
-    lag_s: Positive | None = None
-    delay_ticks: Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)] | None = None
-    tick_s: Positive | None = None
-    supply_V: Positive | None = None
-    dead_zone_V: NotNegative | None = None
-    elongation_mm: Annotated[list[Number], Field(min_length=4, max_length=4)] | None = None
-    deflation: Literal["rate_limit", "orifice"] | None = None
-    falling_N_per_s: Positive | None = None
-    laminar_s: Positive | None = None
-    turbulent_s2_per_N: NotNegative | None = None
-    strength: Pair | None = None
+    sigma: Deviations = {}
+    covariance: CovarianceTable | None = None
     identified: PumpIdentified | None = None
 
-    @model_validator(mode="after")
-    def _whole_ticks(self) -> PumpSection:
-        if self.delay_ticks is not None and self.delay_ticks != int(self.delay_ticks):
-            raise ValueError("expected a whole number of ticks")
-        return self
+    @field_validator("sigma")
+    @classmethod
+    def _of_values(cls, sigma: Deviations, info: ValidationInfo) -> Deviations:
+        return _checked(sigma, cls, info.data, needed=False)
 
 
-def section_of(rig: Rig, name: str, kind: type[Kind], path: Path) -> Kind:
-    """A section of a rig by its schema, empty where the file has none.
+# ----------------------------------------------------------------------
+# Files of schema 1, in which both words share a section: what was estimated has a standard deviation.
 
-    Raises `BadInputError` naming file and key.
+_ESTIMATED_TOGETHER = (LAW, CREEP)
+
+
+def parted(
+    old: Mapping[str, tuple[Any, bool]], known: Known | None, source: Path | str
+) -> tuple[Actuator | None, PumpSection | None, Known | None]:
+    """The sections `actuator`, `pump` and `known` of those of schema 1.
+
+    A section without a verdict is a person's. Of one with a verdict, or with inputs in the provenance, what
+    has no standard deviation is.
+
+    Parameters
+    ----------
+    old : values of `actuator` and `pump` or None, and whether the provenance names inputs of them.
+    known : of the file, which holds over what is found here.
+
+    Raises `BadInputError` as `Rig.load`.
     """
-    raw: Any = getattr(rig, name, None)
-    if raw is None:
-        raw = (rig.model_extra or {}).get(name, {})
-    if isinstance(raw, kind):
-        return raw
-    if not isinstance(raw, dict):
-        raise BadInputError(f"{shown(path)}: {name} is {raw!r}, expected keys with values")
-    try:
-        return kind.model_validate(raw)
-    except ValidationError as error:
-        sentence = validation_sentence(path, error)
-        key = sentence.split(": ", 1)[1]
-        raise BadInputError(f"{shown(path)}: {name}.{key}") from error
+    kinds: dict[str, tuple[type[Result], type[Section]]] = {
+        "actuator": (Actuator, KnownActuator), "pump": (PumpSection, KnownPump)
+    }  # fmt: skip
+    estimates: dict[str, Any] = {}
+    stated: dict[str, Any] = {}
+    for name, (values, learnt) in old.items():
+        if values is None:
+            continue
+        estimate, statement = kinds[name]
+        if not isinstance(values, dict) or not (learnt or _VERBS & values.keys()):
+            stated[name] = validated(statement, values, source, name)
+            continue
+        whole = validated(estimate, {"verdict": "ok", **values}, source, name)
+        mine = _stated_keys(values, statement)
+        left = {key: value for key, value in values.items() if key not in mine}
+        estimates[name] = estimate.model_validate({"verdict": "ok", **left})
+        if mine:
+            stated[name] = statement.model_validate({key: getattr(whole, key) for key in mine})
+    for name, one in stated.items():
+        later = getattr(known, name, None)
+        if later is not None:
+            sigma = {**one.sigma, **later.sigma}
+            stated[name] = one.model_copy(update={**later.model_dump(exclude_none=True), "sigma": sigma})
+    if stated:
+        known = Known(**{name: stated.get(name, getattr(known, name, None)) for name in kinds})
+    return estimates.get("actuator"), estimates.get("pump"), known
+
+
+_VERBS = {"verdict", "reasons", "remarks", "advice", "covariance", "identified"}
+"""Keys that verbs alone write."""
+
+
+def _stated_keys(values: Mapping[str, Any], kind: type[Section]) -> list[str]:
+    """Keys of a section of schema 1 that no identification has estimated."""
+    sigma = values.get("sigma") or {}
+    estimated = {*sigma, "kind", "sigma"}
+    for together in _ESTIMATED_TOGETHER:
+        estimated |= set(together) if estimated & set(together) else set()
+    estimated |= {"elongation_mm"} if estimated & set(KNOTS) else set()
+    return [key for key in values if key in kind.model_fields and key not in estimated]
+
+
+# ----------------------------------------------------------------------
+# The one way from sections to a plant.
+
+
+def in_force(
+    estimated: Actuator | PumpSection | None, known: KnownActuator | KnownPump | None
+) -> dict[str, tuple[Any, Any]]:
+    """Value and standard deviation of each key that is not nominal; a deviation is None where none stands.
+
+    What is known holds over what was estimated, but for a prior, which the estimate has in itself.
+    """
+    out: dict[str, tuple[Any, Any]] = {}
+    for section in (estimated, known):
+        if section is None:
+            continue
+        for key, value in section:
+            if value is None or key not in _VALUES:
+                continue
+            sigma = section.sigma.get(key)
+            if section is known and sigma is not None and key in out:
+                continue
+            out[key] = value, sigma
+    return out
+
+
+Standing = Mapping[str, tuple[Any, Any]]
+"""Values in force and their standard deviations by key."""
+
+
+def standing(rig: Rig) -> dict[str, Standing]:
+    """What is in force of the sections `actuator` and `pump`."""
+    known = rig.known or Known()
+    return {"actuator": in_force(rig.actuator, known.actuator), "pump": in_force(rig.pump, known.pump)}
+
+
+_VALUES = frozenset({*ActuatorParameters.model_fields, *PumpParameters.model_fields})
+_PLAIN = ("mass_kg", "inertia_kgm2", "bellows_radius_m", "rest_length_m", "stiffness_scale", "damping_ratio",
+          "bending_N_per_rad2", "force_projection")  # fmt: skip
+
+
+def plant_from(values: Mapping[str, Any]) -> Plant:
+    """The plant with the pumps connected, of values by the keys of `ActuatorParameters`.
+
+    Raises `BadInputError` for values that no plant can have together.
+    """
+    from calib.stages.actuator.parameters import Creep, Stiffness, pumps_connected
+
+    plant = pumps_connected()
+    changed = {key: values[key] for key in _PLAIN if key in values}
+    if "gravity_mps2" in values:
+        changed["gravity_mps2"] = tuple(values["gravity_mps2"])
+    if "damping_scale_pumps_connected" in values:
+        changed["damping_scale"] = values["damping_scale_pumps_connected"]
+    if any(key in values for key in LAW):
+        law = [values.get(key, k) for key, k in zip(LAW, plant.stiffness.padded, strict=True)]
+        changed["stiffness"] = Stiffness(tuple(law))
+    creep = [values.get(key, rate) for key, rate in zip(CREEP, plant.creep_rates, strict=True)]
+    return replace(plant, creep=Creep(*creep), **changed)

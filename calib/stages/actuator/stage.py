@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
-from calib.core.result import finite_or_none
+from calib.core.result import finite_or_none, section_json
 from calib.core.rig import Rig
 from calib.stages.actuator.identify import (
     Decrement,
-    Nominal,
     Progress,
     Solution,
     colour_of,
@@ -51,10 +49,12 @@ from calib.stages.actuator.identify_pump import (
     rms_of,
     settled_groups,
 )
+from calib.stages.actuator.machine import Machine
+from calib.stages.actuator.parameters import SUPPLY_V
 from calib.stages.actuator.pump import PWM_MAX, TICK_S
 from calib.stages.actuator.read import PumpTable, TrackSource
 from calib.stages.actuator.results import Identified
-from calib.stages.actuator.section import PumpIdentified, PumpModel, PumpSection, StaticMapSection, section_of
+from calib.stages.actuator.section import KnownPump, PumpIdentified, PumpModel, PumpSection, StaticMapSection
 
 # ----------------------------------------------------------------------
 # The whole identification of a rig from its logs, and of a pump from its tables, step by step.
@@ -94,19 +94,22 @@ def _decrements(solution: Solution) -> dict[str, tuple[Decrement, float | None]]
 
 
 def identify_logs(
-    nominal: Nominal,
+    nominal: Machine,
     sources: Sequence[TrackSource],
     static_map: bool = False,
     hold_back: bool = True,
     progress: Progress | None = None,
+    stated: Mapping[str, float] | None = None,
 ) -> Identified:
     """Parameters of the actuator and the pumps from logs, with all that says what they are worth.
+
+    `nominal` and `stated` are those of `results.beginning`.
 
     Raises `BadInputError` where the logs can tell nothing.
     """
     delay_s = float(np.median([source.delay_s for source in sources]))
     tracks = [source.track for source in sources]
-    solution = fit_tracks(nominal, tracks, static_map, delay_s, progress=progress)
+    solution = fit_tracks(nominal, tracks, static_map, delay_s, progress=progress, stated=stated)
     known = uncertainty(solution)
     colours = colour_of(solution)
     held = held_back(solution) if hold_back else []
@@ -346,27 +349,28 @@ def _model(found: PumpFound, name: str) -> PumpModel:
     )
 
 
-def pump_section(found: PumpFound, rig: Rig, path: Path) -> PumpSection:
+def pump_section(found: PumpFound, rig: Rig) -> PumpSection:
     """The section, with lag and dead time of the linear model where a recording tells them.
 
-    Levels in kPa are no forces: they stay under `identified`.
+    Levels in kPa are no forces: they stay under `identified`. What logs have told of forces stays.
     """
     verdict, reasons, remarks = judge_pump(found)
-    before = section_of(rig, "pump", PumpSection, path)
-    update: dict[str, Any] = {"verdict": verdict, "reasons": reasons, "remarks": remarks}
-    sigma: dict[str, Any] = dict(before.sigma)
+    before: dict[str, Any] = {} if rig.pump is None else section_json(rig.pump)
+    stated = rig.known.pump if rig.known is not None and rig.known.pump is not None else KnownPump()
+    update: dict[str, Any] = {"verdict": verdict, "reasons": reasons, "remarks": remarks, "advice": []}
+    sigma: dict[str, Any] = before.get("sigma", {})
     if found.fits:
         lag = found.fits[LAG]
-        tick_s = before.tick_s or TICK_S
+        tick_s = stated.tick_s or before.get("tick_s", TICK_S)
         update |= {
             "lag_s": lag.values["lag_s"],
-            "delay_ticks": float(round(lag.values["dead_time_s"] / tick_s)),
+            "delay_ticks": round(lag.values["dead_time_s"] / tick_s),
         }
         sigma |= {"lag_s": lag.sigma["lag_s"], "delay_ticks": lag.sigma["dead_time_s"] / tick_s}
         dead = lag.shape.dead_pwm
         if dead > 0.0:
             of = [m for m in found.maps if m.shape == lag.shape]
-            supply = before.supply_V or 12.0
+            supply = stated.supply_V or before.get("supply_V", SUPPLY_V)
             update["dead_zone_V"] = supply * dead / PWM_MAX
             sigma["dead_zone_V"] = finite_or_none(supply * of[0].sigma["dead_pwm"] / PWM_MAX) if of else None
     maps = {
@@ -395,4 +399,4 @@ def pump_section(found: PumpFound, rig: Rig, path: Path) -> PumpSection:
             "unexplained": unexplained(found),
         }
     )
-    return before.model_copy(update=update | {"sigma": sigma, "identified": identified})
+    return PumpSection.model_validate(before | update | {"sigma": sigma, "identified": identified})

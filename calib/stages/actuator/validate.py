@@ -11,8 +11,8 @@ Errors are measured less simulated, of q1, q2 and phi, and of each
     fit    100 (1 - norm / norm of the measured values about their mean) in percent
 
 Three models are compared: the original one of 3.3, without bending and creep and with the damping of (3.41);
-the improved one of 3.4 with nominal parameters; and, where the rig's file has a section `actuator` or `pump`,
-the improved one with those. Rows that stand away from their neighbours are replaced by them
+the improved one of 3.4 with nominal parameters; and, where the rig's file knows or estimates an actuator or a
+pump, the improved one with those. Rows that stand away from their neighbours are replaced by them
 first, as single wrong pictures would decide over an L2 norm.
 """
 
@@ -27,10 +27,10 @@ import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.core.rig import Rig
-from calib.stages.actuator.identify import Nominal, Start, Track, heads_of, without_outliers
+from calib.stages.actuator.identify import Start, Track, heads_of, without_outliers
+from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import Creep, Plant
 from calib.stages.actuator.read import TrackSource, read_track
-from calib.stages.actuator.results import nominal_of
 from calib.stages.control.laws import holding_force
 
 ORIGINAL, NOMINAL, IMPROVED = "original", "nominal", "improved"
@@ -132,7 +132,7 @@ def estimated_start(path: Path, rig: Rig, rig_path: Path, begin_s: float) -> Sta
     return Start(half * (q1 - q2), 0.5 * (q1 + q2), half * (dq1 - dq2), 0.5 * (dq1 + dq2))
 
 
-def _begun(track: Track, start: Start, nominal: Nominal) -> Track:
+def _begun(track: Track, start: Start, nominal: Machine) -> Track:
     """The track begun as a start says: with its rates and forces where it is in motion, else at rest."""
     if track.moving is None:
         return track
@@ -145,7 +145,7 @@ def _begun(track: Track, start: Start, nominal: Nominal) -> Track:
 
 
 def compare(
-    source: TrackSource, models: Mapping[str, Nominal], bellows_radius_m: float, start: Start | None = None
+    source: TrackSource, models: Mapping[str, Machine], bellows_radius_m: float, start: Start | None = None
 ) -> Comparison:
     """A log against models by name, each simulated from the log's start.
 
@@ -179,16 +179,15 @@ def compare(
     )
 
 
-def models_of(rig: Rig, rig_path: Path) -> dict[str, Nominal]:
-    """The original model, the nominal one, and the improved one where the file has actuator or pump.
+def models_of(rig: Rig) -> dict[str, Machine]:
+    """The original model, the nominal one, and the improved one where the rig has an actuator or a pump.
 
     Mass, lengths and springs of the original model are the nominal ones.
     """
     first = replace(Plant(), damping_scale=1.0, bending_N_per_rad2=0.0, creep=Creep(1.0, 0.0, -1.0))
-    models = {ORIGINAL: Nominal(plant=first, free_damping_scale=1.0), NOMINAL: Nominal()}
-    extra = rig.model_extra or {}
-    if any(getattr(rig, name, None) is not None or name in extra for name in ("actuator", "pump")):
-        models[IMPROVED] = nominal_of(rig, rig_path)
+    models = {ORIGINAL: Machine(plant=first, free_damping_scale=1.0), NOMINAL: Machine()}
+    if rig.actuator or rig.pump or rig.known:
+        models[IMPROVED] = rig.machine
     return models
 
 
@@ -208,12 +207,12 @@ def validate_log(
 
     Raises
     ------
-    BadInputError as `read_track`, and for sections that no rig has.
+    BadInputError as `read_track`.
     """
-    models = models_of(rig, rig_path)
-    radius = models.get(IMPROVED, models[NOMINAL]).plant.bellows_radius_m
-    source = read_track(path, rig, rig_path, radius, states, truth, no_pwm)
+    models = models_of(rig)
+    machine = models.get(IMPROVED, models[NOMINAL])
+    source = read_track(path, rig, rig_path, machine, states, truth, no_pwm)
     start = None
     if source.source == "pictures":
         start = estimated_start(path, rig, rig_path, source.begin_s)
-    return compare(source, models, radius, start), source.said
+    return compare(source, models, machine.plant.bellows_radius_m, start), source.said

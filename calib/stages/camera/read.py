@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from calib.core.arrays import FloatArray, GrayImage
 from calib.core.errors import BadInputError, UsageError
 from calib.core.files import check_readable, hash_of, read_yaml_mapping, shown
-from calib.core.rig import validation_sentence
+from calib.core.schema import validated
 from calib.core.units import plain_number
 from calib.core.workers import Workers
 from calib.io.pictures import Picture, list_pictures, read_picture, same_size
@@ -64,10 +64,7 @@ def read_board_file(folder: Path) -> BoardFile:
     path = folder / BOARD_FILE
     if not path.exists() and not path.is_symlink():
         return BoardFile()
-    try:
-        return BoardFile.model_validate(read_yaml_mapping(path))
-    except ValidationError as error:
-        raise BadInputError(validation_sentence(path, error)) from error
+    return validated(BoardFile, read_yaml_mapping(path), path)
 
 
 def board_of(sources: Sequence[Path]) -> tuple[BoardFile, dict[str, str]]:

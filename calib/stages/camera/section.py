@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
@@ -18,6 +18,7 @@ from calib.core.result import (
     Sigma,
     quantity,
 )
+from calib.core.schema import contradiction
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -108,6 +109,15 @@ class Camera(Result):
         whole[np.ix_(index, index)] = np.array(self.covariance.values)
         return whole
 
+    @model_validator(mode="after")
+    def _coefficients_of_the_model(self) -> Self:
+        from calib.stages.camera.model import MODELS
+
+        for name, value in self.distortion:
+            if value != 0.0 and name not in MODELS[self.model]:
+                raise contradiction(f"distortion.{name} is {value:g}, but {self.model} has no {name}")
+        return self
+
     @field_validator("covariance")
     @classmethod
     def _of_intrinsics(cls, table: CovarianceTable | None) -> CovarianceTable | None:
@@ -143,6 +153,29 @@ class Plane(Result):
     pictures: Count = quantity(0, label="pictures")
     points: Count = quantity(0, label="points")
     orientation: str = quantity("", label="orientation")
+
+    @model_validator(mode="after")
+    def _a_pose_and_its_homography(self) -> Self:
+        import numpy as np
+
+        R, A, A_inverse = np.array(self.R_CW), np.array(self.A_px_per_m), np.array(self.A_inverse)
+        if not np.allclose(R @ R.T, np.eye(3), atol=1e-6) or np.linalg.det(R) < 0:
+            raise contradiction("R_CW is not a rotation")
+        if not any(self.t_CW_m):
+            raise contradiction("t_CW_m is zero, expected the way from camera to plane")
+        if not np.allclose(A_inverse @ A, np.eye(3), atol=1e-6):
+            raise contradiction("A_inverse is not the inverse of A_px_per_m")
+        return self
+
+    def to_pixels(self, world_m: ArrayLike, camera: Camera) -> FloatArray:
+        """Pixels (n, 2), lens and all, at which the camera sees places on the plane (n, 2) in metres."""
+        import numpy as np
+
+        from calib.stages.camera.model import project
+
+        places = np.asarray(world_m, dtype=np.float64).reshape(-1, 2)
+        points = places @ np.array(self.R_CW)[:, :2].T + np.array(self.t_CW_m)
+        return project(camera.optics, points)
 
     def to_world(self, pixels: ArrayLike, camera: Camera | None = None) -> FloatArray:
         """Places on the plane (n, 2) in metres of pixels (n, 2).

@@ -45,7 +45,7 @@ def _wanted(
     from calib.stages.control.references import check_workspace
     from calib.stages.control.trial import controlled
 
-    machine, model = controlled(rig, files.rig_path, limits)
+    machine, model = controlled(rig, limits)
     wanted = wanted_reference(str(files.paths[0]), model, duration_s, rig, files.rig_path)
     x0, y0, x1, y1 = (rig.geometry or Geometry()).workspace_m
     check_workspace(model, wanted, (x0, y0, x1, y1))
@@ -424,27 +424,17 @@ def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
         criterion = Criterion(options.gain_margin, options.phase_margin_rad, options.sensitivity)
     except BadInputError as error:
         raise UsageError(str(error)) from error
-    machine, model = controlled(rig, files.rig_path, options.pwm_limits)
+    machine, model = controlled(rig, options.pwm_limits)
     files.hashes.update(_hashes(rig))
     return TuneInputs(machine, model, criterion, files.progress)
 
 
 def _hashes(rig: Rig) -> dict[str, str]:
     """SHA-256 of the sections that the gains follow from, where the file has them."""
-    import yaml
+    from calib.core.result import identity
 
-    from calib.core.files import sha256
-    from calib.core.result import section_json
-
-    extra, out = rig.model_extra or {}, {}
-    for name in ("actuator", "pump"):
-        # A section without a schema is a mapping.
-        values = extra.get(name)
-        if values is None and name in type(rig).model_fields and getattr(rig, name) is not None:
-            values = section_json(getattr(rig, name))
-        if values is not None:
-            out[name] = sha256(yaml.safe_dump(values, sort_keys=True).encode())
-    return out
+    sections = {"known": rig.known, "actuator": rig.actuator, "pump": rig.pump}
+    return {name: identity(one) for name, one in sections.items() if one is not None}
 
 
 def _solve_tune(inputs: TuneInputs) -> Controller:

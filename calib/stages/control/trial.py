@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -90,13 +89,9 @@ class Outcome:
     limited: float | None
 
 
-def controlled(rig: Rig, source: Path, limits: Pair | None) -> tuple[SimulatedRig, Model]:
-    """A simulated machine with the parameters of a rig, and what controllers know of it.
-
-    Raises `BadInputError` for values that make no machine.
-    """
-    camera = None if rig.camera is None else rig.camera.optics
-    machine = rig_from_file(rig, str(source), camera)
+def controlled(rig: Rig, limits: Pair | None) -> tuple[SimulatedRig, Model]:
+    """A simulated machine with the parameters of a rig, and what controllers know of it."""
+    machine = rig_from_file(rig)
     return machine, control_model(machine, rig.controller, limits)
 
 

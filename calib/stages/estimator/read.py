@@ -6,19 +6,16 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from pydantic import BaseModel
 
 from calib.core.arrays import BoolArray, FloatArray
 from calib.core.errors import BadInputError
 from calib.core.files import shown
+from calib.core.result import CovarianceTable
 from calib.core.rig import Geometry, Rig
 from calib.io.logs import Log, iter_log
-from calib.stages.actuator.parameters import Creep, Plant, Stiffness, pumps_connected
-from calib.stages.actuator.pump import ElongationForce, Orifice, Pump, RateLimit
-from calib.stages.actuator.section import Actuator, PumpSection, section_of
+from calib.stages.actuator.section import Standing, standing
 from calib.stages.align.section import SENSORS_OF, Align, AlignCovariance
 from calib.stages.estimator.baseline import BaselineSetup, undistorting_nothing
 from calib.stages.estimator.driven import PARAMETER, Drive
@@ -155,22 +152,6 @@ def blocks(path: Path, topics: Path | None = None) -> Iterator[Log]:
         raise BadInputError(f"{shown(path)}: has a header but no rows")
 
 
-def _section(rig: Rig, name: str) -> Mapping[str, Any]:
-    """A section as a mapping, whether it has a schema or not; empty without one."""
-    section = getattr(rig, name, None)
-    if section is None:
-        section = (rig.model_extra or {}).get(name)
-    if isinstance(section, BaseModel):
-        section = section.model_dump()
-    return section if isinstance(section, Mapping) else {}
-
-
-def _number(source: str, section: str, key: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise BadInputError(f"{source}: {section}.{key} is {value!r}, expected a number")
-    return float(value)
-
-
 def _from_align(rig: Rig) -> tuple[dict[str, tuple[float, float]], FloatArray | None, list[str]]:
     """Values and deviations of the sensors, their covariance, and sentences for what is only assumed."""
     values, said = dict(DEFAULTS), []
@@ -297,16 +278,6 @@ def noise_at_rest(rig: Rig, found: Periods) -> tuple[float, float, float] | None
     return x, y, z
 
 
-def _actuator(rig: Rig, source: str, key: str, default: float) -> float:
-    section = _section(rig, "actuator")
-    if key not in section:
-        return default
-    value = _number(source, "actuator", key, section[key])
-    if not value > 0.0:
-        raise BadInputError(f"{source}: actuator.{key} is {value:g}, expected a positive number")
-    return value
-
-
 def setup_from_rig(rig: Rig, path: Path, found: Periods) -> tuple[Setup, list[str]]:
     """The estimator's set-up, and sentences about what is assumed.
 
@@ -330,18 +301,16 @@ def setup_from_rig(rig: Rig, path: Path, found: Periods) -> tuple[Setup, list[st
         said.append("no IMU: angle and length come from the camera alone, the result is degraded")
     values, covariance, assumed = _from_align(rig)
     said += assumed
-    nominal = Plant()
-    rest = _actuator(rig, source, "rest_length_m", nominal.rest_length_m)
-    head = np.array([0.0, rest + 0.004, 0.0, 0.0, 0.0, 0.0])
+    plant = rig.plant
+    head = np.array([0.0, plant.rest_length_m + 0.004, 0.0, 0.0, 0.0, 0.0])
     start = Start(
         sensor_values({name: values[name][0] for name in SENSOR}),
         sensor_values({name: values[name][1] for name in SENSOR}),
         head,
         sensor_covariance=covariance,
     )
-    radius = _actuator(rig, source, "bellows_radius_m", nominal.bellows_radius_m)
     setup = Setup(
-        view, _noise(rig, found), start, radius, process=_process(rig),
+        view, _noise(rig, found), start, plant.bellows_radius_m, process=_process(rig),
         camera_period_s=found.camera_s, imu_period_s=found.imu_s,
     )  # fmt: skip
     return setup, said
@@ -382,62 +351,6 @@ def pwm_of(log: Log) -> FloatArray:
     return np.stack([log.columns.get(name, missing) for name in ("pwm1", "pwm2")], axis=1)
 
 
-def _or(value: float | None, default: float) -> float:
-    return default if value is None else value
-
-
-def _plant(section: Actuator) -> Plant:
-    nominal = pumps_connected()
-    names = ("k0_N_per_m", "k1_N_per_m2", "k2_N_per_m3", "k3_N_per_m4")
-    law = tuple(_or(getattr(section, n), k) for n, k in zip(names, nominal.stiffness.padded, strict=True))
-    creep, gravity = Creep(), section.gravity_mps2 or nominal.gravity_mps2
-    return Plant(
-        mass_kg=_or(section.mass_kg, nominal.mass_kg),
-        inertia_kgm2=_or(section.inertia_kgm2, nominal.inertia_kgm2),
-        bellows_radius_m=_or(section.bellows_radius_m, nominal.bellows_radius_m),
-        rest_length_m=_or(section.rest_length_m, nominal.rest_length_m),
-        stiffness=Stiffness(law),
-        stiffness_scale=_or(section.stiffness_scale, nominal.stiffness_scale),
-        damping_ratio=_or(section.damping_ratio, nominal.damping_ratio),
-        damping_scale=_or(section.damping_scale_pumps_connected, nominal.damping_scale),
-        bending_N_per_rad2=_or(section.bending_N_per_rad2, nominal.bending_N_per_rad2),
-        creep=Creep(
-            _or(section.lambda1_per_s, creep.lambda1_per_s),
-            _or(section.lambda2_N_per_m, creep.lambda2_N_per_m),
-            _or(section.lambda3, creep.lambda3),
-        ),
-        gravity_mps2=(gravity[0], gravity[1]),
-        force_projection=section.force_projection or nominal.force_projection,
-    )
-
-
-def _pump(section: PumpSection, plant: Plant) -> Pump:
-    nominal, static = Pump(), ElongationForce()
-    static = replace(
-        static,
-        supply_V=_or(section.supply_V, static.supply_V),
-        dead_zone_V=_or(section.dead_zone_V, static.dead_zone_V),
-    )
-    if section.elongation_mm is not None:
-        # Measured on this rig, so its forces follow from this rig's springs.
-        a, b, c, d = section.elongation_mm
-        static = replace(static, elongation_mm=(a, b, c, d), stiffness=plant.stiffness)
-    limit, orifice = RateLimit(), Orifice()
-    deflation: RateLimit | Orifice = RateLimit(_or(section.falling_N_per_s, limit.falling_N_per_s))
-    if section.deflation == "orifice":
-        deflation = Orifice(
-            _or(section.laminar_s, orifice.laminar_s),
-            _or(section.turbulent_s2_per_N, orifice.turbulent_s2_per_N),
-        )
-    return Pump(
-        static,
-        deflation,
-        _or(section.lag_s, nominal.lag_s),
-        int(_or(section.delay_ticks, nominal.delay_ticks)),
-        _or(section.tick_s, nominal.tick_s),
-    )
-
-
 _SIGMA = {
     "stiffness": ("actuator", "stiffness_scale"),
     "log_damping": ("actuator", "damping_scale_pumps_connected"),
@@ -454,80 +367,62 @@ _SIGMA = {
 """Whose standard deviation, as a share of the value, a parameter has."""
 
 
-def _deviation(section: Actuator | PumpSection, key: str, at: int, relative: bool) -> float | None:
-    sigma, value = section.sigma.get(key), getattr(section, key)
+def _deviation(values: Standing, key: str, at: int, relative: bool) -> float | None:
+    value, sigma = values.get(key, (None, None))
     if isinstance(sigma, list):
-        sigma, value = sigma[at], value[at] if isinstance(value, list) else value
-    if sigma is None or value is None or not math.isfinite(sigma):
+        sigma, value = sigma[at], value[at]
+    if sigma is None:
         return None
     if not relative:
         return float(sigma)
     return max(float(sigma) / abs(float(value)), _LEAST_SHARE) if value else None
 
 
-def _driving_covariance(actuator: Actuator, pump: PumpSection, sigma: dict[str, float]) -> FloatArray | None:
+def _driving_covariance(
+    table: CovarianceTable, sections: Mapping[str, Standing], sigma: dict[str, float]
+) -> FloatArray:
     """Covariance (11, 11) of the parameters: their deviations with the correlations of the identification.
 
     What was estimated apart since then, so that the deviation in the file is another one, is independent.
     """
-    table, out = actuator.covariance, np.diag(np.array(list(sigma.values())) ** 2)
-    if table is None:
-        return None
+    out = np.diag(np.array(list(sigma.values())) ** 2)
     rows, names = [], []
     for name, (section, key) in _SIGMA.items():
         row = name if key == "strength" else key
-        known = actuator if section == "actuator" else pump
-        told = _deviation(known, key, int(name == "strength2"), relative=False)
-        if not told or row not in table.order:
+        deviation = _deviation(sections[section], key, int(name == "strength2"), relative=False)
+        if not deviation or row not in table.order:
             continue
         at = table.order.index(row)
-        if math.isclose(told * told, table.values[at][at], rel_tol=2e-3):
+        if math.isclose(deviation * deviation, table.values[at][at], rel_tol=2e-3):
             rows.append(at)
             names.append(name)
     spread = np.sqrt([table.values[k][k] for k in rows])
     places = [PARAMETER.index(name) for name in names]
     together = np.array(table.values)[np.ix_(rows, rows)]
     correlation = 0.5 * (together + together.T) / np.outer(spread, spread)
-    deviation = np.array([sigma[name] for name in names])
-    out[np.ix_(places, places)] = correlation * np.outer(deviation, deviation)
+    deviations = np.array([sigma[name] for name in names])
+    out[np.ix_(places, places)] = correlation * np.outer(deviations, deviations)
     out[places, places] += _APART**2
     return np.asarray(out)
 
 
-def drive_from_rig(rig: Rig, path: Path) -> Drive:
-    """Plant and pumps with their deviations; what the file lacks is nominal.
-
-    Raises `BadInputError` naming file and key for values that no plant has.
-    """
-    actuator = section_of(rig, "actuator", Actuator, path)
-    pump = section_of(rig, "pump", PumpSection, path)
-    try:
-        plant = _plant(actuator)
-        made = _pump(pump, plant)
-    except BadInputError as error:
-        raise BadInputError(f"{shown(path)}: actuator and pump: {error}") from error
-    nominal = Drive()
+def drive_from_rig(rig: Rig) -> Drive:
+    """Plant and pumps with their deviations; what the rig lacks is nominal."""
+    machine, nominal, sections = rig.machine, Drive(), standing(rig)
+    table = None if rig.actuator is None else rig.actuator.covariance
     sigma = dict(zip(PARAMETER, nominal.sigma, strict=True))
     for name, (section, key) in _SIGMA.items():
-        known = actuator if section == "actuator" else pump
-        found = _deviation(known, key, int(name == "strength2"), name != "rest_length_m")
-        if found is not None:
+        one = _deviation(sections[section], key, int(name == "strength2"), name != "rest_length_m")
+        if one is not None:
             # What was hardly identified differs from other rigs as they do from each other.
-            sigma[name] = found if actuator.covariance is None else min(found, sigma[name])
-    if actuator.covariance is not None and "mass_kg" not in actuator.sigma:
-        # Forces, springs and mass have one scale, which the identification takes from the mass.
-        sigma["mass"] = _LEAST_SHARE
-    covariance = _driving_covariance(actuator, pump, sigma)
-    if covariance is not None:
-        deviation = np.sqrt(np.diag(covariance))
-        correlation = covariance / np.outer(deviation, deviation)
-        if not (np.abs(correlation).max() < 1.01 and np.linalg.eigvalsh(correlation)[0] > 0.0):
-            raise BadInputError(
-                f"{shown(path)}: actuator.covariance has correlations that no quantities have, expected a "
-                "positive definite matrix"
-            )
-        sigma = dict(zip(PARAMETER, deviation.tolist(), strict=True))
-    strength = pump.strength or list(nominal.strength)
+            sigma[name] = one if table is None else min(one, sigma[name])
+    covariance = None
+    if table is not None:
+        if sections["actuator"].get("mass_kg", (None, None))[1] is None:
+            # Forces, springs and mass have one scale, which the identification takes from the mass.
+            sigma["mass"] = _LEAST_SHARE
+        covariance = _driving_covariance(table, sections, sigma)
+        sigma = dict(zip(PARAMETER, np.sqrt(np.diag(covariance)).tolist(), strict=True))
     tuned = rig.estimator.driven if rig.estimator is not None else None
     if tuned is not None:
         nominal = replace(
@@ -538,10 +433,10 @@ def drive_from_rig(rig: Rig, path: Path) -> Drive:
         )
     return replace(
         nominal,
-        plant=plant,
-        pump=made,
-        strength=(strength[0], strength[1]),
-        free_damping_scale=_or(actuator.damping_scale_free_swing, nominal.free_damping_scale),
+        plant=machine.plant,
+        pump=machine.pump,
+        strength=machine.strength,
+        free_damping_scale=machine.free_damping_scale,
         sigma=tuple(sigma.values()),
         covariance=covariance,
     )

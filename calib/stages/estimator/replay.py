@@ -405,7 +405,7 @@ def replay_log(
     baseline = Baseline(baseline_setup(setup, rig, rig_path, found)) if found.camera and found.imu else None
     first = next(stream)
     stream = chain([first], stream)
-    drive = drive_for(model, first, found, rig, path, rig_path)
+    drive = drive_for(model, first, found, rig, path)
     estimate = estimator_of(setup, drive, model)
     shares = Shares()
     parts = path.iterdir() if path.is_dir() else (path,)
@@ -476,12 +476,12 @@ class Shares:
         return self.driven / self.rows if self.rows else None
 
 
-def drive_for(model: str, first: Log, found: Any, rig: Rig, path: Path, rig_path: Path) -> Drive | None:
+def drive_for(model: str, first: Log, found: Any, rig: Rig, path: Path) -> Drive | None:
     if model == "kinematic":
         return None
     told = has_commands(first)
     if told and found.camera and found.imu:
-        return replace(drive_from_rig(rig, rig_path), imu_noise=noise_at_rest(rig, found))
+        return replace(drive_from_rig(rig), imu_noise=noise_at_rest(rig, found))
     if model == "driven":
         lacks = "commands (pwm1, pwm2)" if not told else "pictures" if not found.camera else "IMU samples"
         raise BadInputError(

@@ -72,8 +72,8 @@ def tuned_section(
     Raises `BadInputError` for logs that cannot be used, or without camera and IMU.
     """
     every, told, first, at_rest = [], [], None, None
-    bare = rig.model_copy(update={"estimator": None})
-    drive = drive_from_rig(bare, rig_path)
+    bare = replace(rig, estimator=None)
+    drive = drive_from_rig(bare)
     for path in logs:
         setup, found, stream, _ = prepared(path, bare, rig_path, topics)
         if not (found.camera and found.imu):

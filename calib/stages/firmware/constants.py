@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydantic import BaseModel
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
@@ -16,10 +14,11 @@ from calib.core.geometry import fit_homography
 from calib.stages.actuator.kinematics import MARKER_OFFSET_M, inverse_coefficients
 from calib.stages.actuator.parameters import LONGEST_ELONGATION_M, Plant
 from calib.stages.actuator.pump import PWM_MAX, ElongationForce
+from calib.stages.actuator.section import standing
 from calib.stages.camera.lens import InversePolynomial
 from calib.stages.camera.model import Camera, project
 from calib.stages.control.laws import PWM_MIN, FeedForward, Pid
-from calib.stages.control.section import StaticMap
+from calib.stages.control.section import OrientationGains, StaticMap
 from calib.stages.estimator.constant_gain import (
     ALONE,
     BOOST,
@@ -41,95 +40,50 @@ if TYPE_CHECKING:
 
 # ----------------------------------------------------------------------
 # Values of rig.yaml by their keys, with the nominal actuator's where the file has none.
-#
-# Sections that this version reads as models and those that it only carries along are asked in the same
-# way: `number("actuator.bellows_radius_m", 0.0126)`. What came from a default is remembered, so that the
-# header can say so.
-
-_DEEPEST = 8
 
 
-def _child(node: object, part: str) -> object:
-    if isinstance(node, Mapping):
-        return node.get(part)
-    if isinstance(node, list | tuple):
-        return node[int(part)] if part.isdigit() and int(part) < len(node) else None
-    if isinstance(node, BaseModel):
-        extra = node.model_extra or {}
-        return getattr(node, part) if part in type(node).model_fields else extra.get(part)
-    return None
-
-
-class Known:
-    """The rig's values; `defaults` collects the keys that it did not have.
+class Lookup:
+    """Numbers of a rig by dotted keys, such as `align.accel_bias_mps2.0`; keeps the keys that it lacked.
 
     Parameters
     ----------
-    rig : as read from the file.
     source : the file's name for messages.
     """
 
     def __init__(self, rig: Rig, source: str) -> None:
         self.rig, self.source = rig, source
+        self._standing = standing(rig)
         self._missing: list[str] = []
 
-    def node(self, key: str) -> object:
-        """What stands at a dotted key, None for nothing."""
-        node: object = self.rig
-        for part in key.split(".", _DEEPEST):
-            node = _child(node, part)
+    def find(self, key: str) -> Any:
+        """What stands at a key, None for nothing."""
+        name, *parts = key.split(".")
+        if name in self._standing and parts:
+            value, _ = self._standing[name].get(parts[0], (None, None))
+            return value
+        node = getattr(self.rig, name)
+        for part in parts:
             if node is None:
                 return None
+            node = node[int(part)] if isinstance(node, list) else getattr(node, part)
         return node
 
     def number(self, key: str, default: float, least: float = -math.inf, most: float = math.inf) -> float:
-        """A finite number between `least` and `most`; null and a missing key give the default.
+        """The number at a key, the default where there is none.
 
-        Raises `BadInputError` for anything else.
+        Raises `BadInputError` for one beyond what the firmware can run with.
         """
-        value = self.node(key)
+        value = self.find(key)
         if value is None:
             self._missing.append(key)
             return default
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise BadInputError(f"{self.source}: {key} is {value!r}, expected a number")
         if not least <= value <= most:
             raise BadInputError(
                 f"{self.source}: {key} is {value:g}, expected {least:g} to {most:g} for the firmware"
             )
         return float(value)
 
-    def choice(self, key: str, default: int, of: tuple[int, ...]) -> int:
-        """A whole number out of a few; true and false count as 1 and 0.
-
-        Raises `BadInputError` for anything else.
-        """
-        value = self.node(key)
-        if value is None:
-            self._missing.append(key)
-            return default
-        if not isinstance(value, int) or int(value) not in of:
-            words = " or ".join(map(str, of))
-            raise BadInputError(f"{self.source}: {key} is {value!r}, expected {words}")
-        return int(value)
-
-    def numbers(self, key: str, default: tuple[float, ...], least: int, most: int) -> tuple[float, ...]:
-        """A list of `least` to `most` finite numbers.
-
-        Raises `BadInputError` for anything else.
-        """
-        value = self.node(key)
-        if value is None:
-            self._missing.append(key)
-            return default
-        listed = list(value) if isinstance(value, list | tuple) else []
-        if not least <= len(listed) <= most or not all(
-            isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in listed
-        ):
-            raise BadInputError(f"{self.source}: {key} is {value!r}, expected {least} to {most} numbers")
-        return tuple(float(v) for v in listed)
-
-    def told(self) -> str:
+    def defaults(self) -> str:
         """The keys that took defaults since the last call, in words; empty when there were none."""
         missing, self._missing = self._missing, []
         if not missing:
@@ -436,17 +390,17 @@ _BIAS_LIMIT_RADPS = 1.0
 _LONGEST_OFFSET_TICKS = 8
 
 
-def tick_rate_hz(known: Known) -> float:
+def tick_rate_hz(lookup: Lookup) -> float:
     """Rate of the control loop: that of the low-pass, or 60 Hz."""
-    return known.number("lowpass.rate_hz", 60.0, 1.0, 1000.0)
+    return lookup.number("lowpass.rate_hz", 60.0, 1.0, 1000.0)
 
 
-def _tick_group(known: Known, rate_hz: float) -> Group:
-    offset_s = known.number("align.time_offset_s", 0.0, -1.0, 1.0)
+def _tick_group(lookup: Lookup, rate_hz: float) -> Group:
+    offset_s = lookup.number("align.time_offset_s", 0.0)
     ticks = round(offset_s * rate_hz)
     if not 0 <= ticks <= _LONGEST_OFFSET_TICKS:
         raise BadInputError(
-            f"{known.source}: align.time_offset_s is {offset_s:g} s, {ticks} ticks; "
+            f"{lookup.source}: align.time_offset_s is {offset_s:g} s, {ticks} ticks; "
             f"expected 0 to {_LONGEST_OFFSET_TICKS} ticks, by which the pictures are late"
         )
     return Group(
@@ -469,25 +423,25 @@ def _tick_group(known: Known, rate_hz: float) -> Group:
                 "what the whole ticks leave of that, s, unused",
             ),
         ),
-        known.told(),
+        lookup.defaults(),
     )
 
 
-def _imu_groups(known: Known, rate_hz: float) -> tuple[Group, Group]:
+def _imu_groups(lookup: Lookup, rate_hz: float) -> tuple[Group, Group]:
     dt = 1.0 / rate_hz
     bias, ratio = [0.0, 0.0], 1.0
-    if known.node("align") is not None:
-        mount = math.remainder(known.number("align.mount_angle_rad", 0.0), 2.0 * math.pi)
-        bias = [known.number(f"align.accel_bias_mps2.{i}", 0.0, -5.0, 5.0) for i in range(2)]
-        x, y = (1.0 + known.number(f"align.accel_scale.{i}", 0.0, -0.5, 0.5) for i in range(2))
+    if lookup.find("align") is not None:
+        mount = math.remainder(lookup.number("align.mount_angle_rad", 0.0), 2.0 * math.pi)
+        bias = [lookup.number(f"align.accel_bias_mps2.{i}", 0.0) for i in range(2)]
+        x, y = (1.0 + lookup.number(f"align.accel_scale.{i}", 0.0) for i in range(2))
         ratio = x / y
-        gyro = known.number("align.gyro_bias_radps", 0.0, -1.0, 1.0)
-        scale = 1.0 + known.number("align.gyro_scale", 0.0, -0.5, 0.5)
+        gyro = lookup.number("align.gyro_bias_radps", 0.0)
+        scale = 1.0 + lookup.number("align.gyro_scale", 0.0)
     else:
-        mount, scale = known.number("align.rest_angle_rad", 0.0), 1.0
-        gyro = known.number("imu.gyro_bias_radps.2", 0.0, -1.0, 1.0)
-        if known.node("imu_intrinsics.accel.unit") == "m/s2":
-            bias = [known.number(f"imu_intrinsics.accel.bias.{i}", 0.0, -5.0, 5.0) for i in range(2)]
+        mount, scale = lookup.number("align.rest_angle_rad", 0.0), 1.0
+        gyro = lookup.number("imu.gyro_bias_radps.2", 0.0)
+        if lookup.find("imu_intrinsics.accel.unit") == "m/s2":
+            bias = [lookup.number(f"imu_intrinsics.accel.bias.{i}", 0.0) for i in range(2)]
     signs = [1, 1, 1]
     imu = Group(
         (
@@ -519,10 +473,10 @@ def _imu_groups(known: Known, rate_hz: float) -> tuple[Group, Group]:
                 "CALIB_IMU_ACCEL_WEAK_MPS2", _WEAK_MPS2, "|ax| and |ay| below say nothing of phi, m/s^2"
             ),
         ),
-        known.told(),
+        lookup.defaults(),
     )
-    Kp = known.number("orientation_filter.Kp_per_s", 3.0, 0.0, rate_hz)
-    Ki = known.number("orientation_filter.Ki_per_s2", 3.0, 0.0, rate_hz * rate_hz)
+    Kp = lookup.number("orientation_filter.Kp_per_s", 3.0, 0.0, rate_hz)
+    Ki = lookup.number("orientation_filter.Ki_per_s2", 3.0, 0.0, rate_hz * rate_hz)
     mahony = Group(
         (
             "Angle filter (2.3), dt folded in. The integral is kept as an angle per tick, J = I dt:",
@@ -544,33 +498,28 @@ def _imu_groups(known: Known, rate_hz: float) -> tuple[Group, Group]:
                 "|phi| stays below; range of the sine in the pipeline, rad",
             ),
         ),
-        known.told(),
+        lookup.defaults(),
     )
     return imu, mahony
 
 
-def _sections(known: Known, rate_hz: float) -> list[tuple[tuple[float, ...], tuple[float, ...]]]:
+def _sections(lookup: Lookup, rate_hz: float) -> list[tuple[tuple[float, ...], tuple[float, ...]]]:
     """(b0, b1, b2), (a1, a2) of each section; order one has b2 = a2 = 0 and comes last."""
-    count = known.node("lowpass.sections")
-    if not isinstance(count, list):
-        known.number("lowpass.cutoff_hz", 1.0)
+    if lookup.rig.lowpass is None:
+        lookup.number("lowpass.cutoff_hz", 1.0)
         # Rounded so that the gain at rest is one, as the sections of rig.yaml are.
         a1 = float(np.float32(coefficients(LowPass(1.0, rate_hz))[1]))
         b0 = 0.5 * (1.0 + a1)
         return [((b0, b0, 0.0), (a1, 0.0))]
-    found = []
-    for i in range(len(count)):
-        b = known.numbers(f"lowpass.sections.{i}.b", (), 3, 3)
-        a = known.numbers(f"lowpass.sections.{i}.a", (), 3, 3)
-        found.append((b, a[1:]))
-    return sorted(found, key=lambda section: section[1][1] == 0.0)
+    sections = [(tuple(one.b), tuple(one.a[1:])) for one in lookup.rig.lowpass.sections]
+    return sorted(sections, key=lambda section: section[1][1] == 0.0)
 
 
-def _lowpass_group(known: Known, rate_hz: float) -> Group:
+def _lowpass_group(lookup: Lookup, rate_hz: float) -> Group:
     items: list[Constant | Whole] = []
     pairs = 0
     single = False
-    for i, (b, a) in enumerate(_sections(known, rate_hz), start=1):
+    for i, (b, a) in enumerate(_sections(lookup, rate_hz), start=1):
         stem = f"CALIB_LOWPASS_{i}"
         for j, value in enumerate(b):
             items.append(Constant(f"{stem}_B{j}", value, f"b{j}, dimensionless"))
@@ -582,7 +531,7 @@ def _lowpass_group(known: Known, rate_hz: float) -> Group:
             continue
         D = 2.0 / (2.0 * b[0] - a[0])
         if not D > 0.0 or not b[0] > 0.0:
-            raise BadInputError(f"{known.source}: lowpass.sections.{i - 1} is no low-pass of bilinear form")
+            raise BadInputError(f"{lookup.source}: lowpass.sections.{i - 1} is no low-pass of bilinear form")
         pairs += 1
         g = math.sqrt(b[0] * D)
         for name, value in (("A1", 1.0 / D), ("A2", g / D), ("A3", b[0])):
@@ -595,19 +544,19 @@ def _lowpass_group(known: Known, rate_hz: float) -> Group:
         Whole("CALIB_LOWPASS_PAIRS", pairs, "sections of order two"),
         Whole("CALIB_LOWPASS_SINGLES", int(single), "sections of order one"),
     ]
-    return Group(notes, (*counts, *items), known.told())
+    return Group(notes, (*counts, *items), lookup.defaults())
 
 
-def _kinematics_groups(known: Known) -> tuple[Group, Group]:
+def _kinematics_groups(lookup: Lookup) -> tuple[Group, Group]:
     plant = Plant()
-    radius = known.number("actuator.bellows_radius_m", plant.bellows_radius_m, 1e-3, 0.2)
-    rest = known.number("actuator.rest_length_m", plant.rest_length_m, 5e-3, 1.0)
-    body = known.told()
-    offset = known.number("align.marker_offset_m", MARKER_OFFSET_M, -0.5, 0.5)
+    radius = lookup.number("actuator.bellows_radius_m", plant.bellows_radius_m)
+    rest = lookup.number("actuator.rest_length_m", plant.rest_length_m)
+    body = lookup.defaults()
+    offset = lookup.number("align.marker_offset_m", MARKER_OFFSET_M)
     marker = Group(
         ("Marker to head (A.1): x = X - d sin(phi), y = Y - d cos(phi).",),
         (Constant("CALIB_MARKER_OFFSET_M", offset, "d, m; positive beyond the head"),),
-        known.told(),
+        lookup.defaults(),
     )
     series = [float(c) for c in inverse_coefficients()]
     return marker, Group(
@@ -631,16 +580,16 @@ def _kinematics_groups(known: Known) -> tuple[Group, Group]:
     )
 
 
-def motion_groups(known: Known) -> tuple[Group, ...]:
+def motion_groups(lookup: Lookup) -> tuple[Group, ...]:
     """Groups of the header from the tick to the kinematics.
 
     Raises `BadInputError` for values of rig.yaml that the firmware cannot run with.
     """
-    rate_hz = tick_rate_hz(known)
-    tick = _tick_group(known, rate_hz)
-    imu, mahony = _imu_groups(known, rate_hz)
-    lowpass = _lowpass_group(known, rate_hz)
-    marker, kinematics = _kinematics_groups(known)
+    rate_hz = tick_rate_hz(lookup)
+    tick = _tick_group(lookup, rate_hz)
+    imu, mahony = _imu_groups(lookup, rate_hz)
+    lowpass = _lowpass_group(lookup, rate_hz)
+    marker, kinematics = _kinematics_groups(lookup)
     return tick, imu, mahony, marker, lowpass, kinematics
 
 
@@ -660,27 +609,25 @@ def motion_groups(known: Known) -> tuple[Group, ...]:
 _ORIENTATION = Pid(1000.0, 1000.0, 10.0, clamping=True)
 _POSITION = Pid(15000.0, 0.0, 150.0)
 _TABLE_STEP_M = 0.002
-_LARGEST_GAIN = 1e7
 
 
 def _pid_group(
-    known: Known, name: str, title: str, units: tuple[str, str], default: Pid, rate_hz: float
+    lookup: Lookup, name: str, title: str, units: tuple[str, str], default: Pid, rate_hz: float
 ) -> Group:
     stem, key, (unit, words) = f"CALIB_{name.upper()}", f"controller.{name}", units
 
     def gain(which: str, value: float) -> float:
-        return known.number(f"{key}.{which}", value, -_LARGEST_GAIN, _LARGEST_GAIN)
+        return lookup.number(f"{key}.{which}", value)
 
     Kp = gain(f"Kp_pwm_per_{words}", default.Kp)
     Ki = gain(f"Ki_pwm_per_{words}_s", default.Ki)
     Kd = gain(f"Kd_pwm_s_per_{words}", default.Kd)
-    if known.node(f"{key}.falling_share") is not None:
-        title += " falling_share is left out: the lower limit is CALIB_PUMP_LOW_PWM."
-    back_s = known.node(f"{key}.back_calculation_s")
-    back = 0.0
-    clamping = int(default.clamping)
-    if back_s is not None:
-        clamping, back = 0, 1.0 / (rate_hz * known.number(f"{key}.back_calculation_s", 1.0, 1e-6, 1e6))
+    clamping, back = int(default.clamping), 0.0
+    tuned = lookup.find(key)
+    if isinstance(tuned, OrientationGains):
+        clamping, back = 0, 1.0 / (rate_hz * tuned.back_calculation_s)
+        if tuned.falling_share is not None:
+            title += " falling_share is left out: the lower limit is CALIB_PUMP_LOW_PWM."
     derivative, half = Kd * rate_hz, 0.5 * Ki / rate_hz
     per = f"PWM_PER_{unit}"
     return Group(
@@ -704,7 +651,7 @@ def _pid_group(
             ),
             Constant(f"{stem}_E2_{per}", derivative, f"Kd / dt, PWM/{words}"),
         ),
-        known.told(),
+        lookup.defaults(),
     )
 
 
@@ -730,11 +677,11 @@ def _tuned_table(map_: StaticMap, low_pwm: float) -> tuple[float, tuple[float, .
     return first, tuple(float(v) for v in held[: max(last, 2)])
 
 
-def _feedforward_group(known: Known, low_pwm: float) -> Group:
+def _feedforward_group(lookup: Lookup, low_pwm: float) -> Group:
     line = FeedForward()
     at, offset, slope, limit = line.from_m, line.offset_pwm, line.slope_pwm_per_m, line.limit_pwm
     first, values = _nominal_table()
-    tuned = known.node("controller.feedforward")
+    tuned = lookup.find("controller.feedforward")
     if isinstance(tuned, StaticMap):
         first, values = _tuned_table(tuned, low_pwm)
         told = "The table: controller.feedforward at phi = 0, without bending; the line: (4.6)."
@@ -766,21 +713,21 @@ def _feedforward_group(known: Known, low_pwm: float) -> Group:
     )
 
 
-def _limits(known: Known) -> tuple[float, float]:
-    low = known.number("controller.pwm_low", PWM_MIN, 0.0, PWM_MAX)
-    high = known.number("controller.pwm_high", PWM_MAX, 0.0, PWM_MAX)
+def _limits(lookup: Lookup) -> tuple[float, float]:
+    low = lookup.number("controller.pwm_low", PWM_MIN)
+    high = lookup.number("controller.pwm_high", PWM_MAX)
     if not low < high or high != round(high) or low != round(low):
         raise BadInputError(
-            f"{known.source}: controller.pwm_low and pwm_high are {low:g} and {high:g}, "
+            f"{lookup.source}: controller.pwm_low and pwm_high are {low:g} and {high:g}, "
             "expected rising whole numbers"
         )
     return low, high
 
 
-def _pump_group(known: Known, low: float, high: float) -> Group:
+def _pump_group(lookup: Lookup, low: float, high: float) -> Group:
     pump = ElongationForce()
-    supply = known.number("pump.supply_V", pump.supply_V, 1.0, 100.0)
-    dead = known.number("pump.dead_zone_V", pump.dead_zone_V, 0.0, supply)
+    supply = lookup.number("pump.supply_V", pump.supply_V)
+    dead = lookup.number("pump.dead_zone_V", pump.dead_zone_V)
     return Group(
         ("Pumps.",),
         (
@@ -792,36 +739,41 @@ def _pump_group(known: Known, low: float, high: float) -> Group:
             ),
             Constant("CALIB_PUMP_SUPPLY_V", supply, "at PWM 255, V, for information"),
         ),
-        known.told(),
+        lookup.defaults(),
     )
 
 
-def control_groups(known: Known, rate_hz: float) -> tuple[Group, ...]:
+def control_groups(lookup: Lookup, rate_hz: float) -> tuple[Group, ...]:
     """Groups of the header for both controllers, the feed-forward and the pumps.
 
     Raises `BadInputError` for values of rig.yaml that the firmware cannot run with.
     """
-    tick_s = known.number("controller.tick_s", 1.0 / rate_hz)
+    tick_s = lookup.number("controller.tick_s", 1.0 / rate_hz)
     if abs(tick_s * rate_hz - 1.0) > 1e-6:
         raise BadInputError(
-            f"{known.source}: controller.tick_s is {tick_s:g} s, but the low-pass runs at {rate_hz:g} Hz; "
+            f"{lookup.source}: controller.tick_s is {tick_s:g} s, but the low-pass runs at {rate_hz:g} Hz; "
             "expected the same tick for both"
         )
-    low, high = _limits(known)
-    pumps = _pump_group(known, low, high)
+    low, high = _limits(lookup)
+    pumps = _pump_group(lookup, low, high)
     angle = _pid_group(
-        known, "orientation", "Control of the angle, PID (4.1), (4.4).", ("RAD", "rad"), _ORIENTATION, rate_hz
+        lookup,
+        "orientation",
+        "Control of the angle, PID (4.1), (4.4).",
+        ("RAD", "rad"),
+        _ORIENTATION,
+        rate_hz,
     )
-    sign = known.choice("controller.orientation.sign", 1, (1, -1))
+    sign = round(lookup.number("controller.orientation.sign", 1))
     crossed = Group(
         ("Which bellows a positive error of the angle drives (4.1).",),
         (Whole("CALIB_ORIENTATION_SIGN", sign, "1: bellows 1; -1: the hoses are crossed"),),
-        known.told(),
+        lookup.defaults(),
     )
     lengths = _pid_group(
-        known, "position", "Control of both lengths, PD (4.5), (4.8).", ("M", "m"), _POSITION, rate_hz
+        lookup, "position", "Control of both lengths, PD (4.5), (4.8).", ("M", "m"), _POSITION, rate_hz
     )
-    return pumps, angle, crossed, lengths, _feedforward_group(known, low)
+    return pumps, angle, crossed, lengths, _feedforward_group(lookup, low)
 
 
 # ----------------------------------------------------------------------
@@ -841,41 +793,41 @@ _FUSED_WEAK_MPS2 = 1.0
 _GRAVITY_MPS2 = 9.81
 
 
-def _designed(known: Known, rate_hz: float, plane: PlaneConstants) -> Gains:
+def _designed(lookup: Lookup, rate_hz: float, plane: PlaneConstants) -> Gains:
     """Gains for the noise that the alignment has found, at the head's rest; a tracker of whole pixels."""
-    rest = known.number("actuator.rest_length_m", Plant().rest_length_m, 5e-3, 1.0)
-    d = known.number("align.marker_offset_m", 0.0, -0.5, 0.5)
+    rest = lookup.number("actuator.rest_length_m", Plant().rest_length_m)
+    d = lookup.number("align.marker_offset_m", 0.0)
     # How places of the marker change with a pixel there, by the undistorted plane.
     H = np.linalg.inv(plane.from_ideal)
     at = H @ np.array([0.0, rest + d, 1.0])
     by_place = (H[:2, :2] - np.outer(at[:2] / at[2], H[2, :2])) / at[2]
-    pixel = math.hypot(known.number("align.jitter_px", 0.3, 0.0, 100.0), math.sqrt(1.0 / 12.0))
+    pixel = math.hypot(lookup.number("align.jitter_px", 0.3), math.sqrt(1.0 / 12.0))
     across, along = pixel * np.linalg.norm(np.linalg.inv(by_place), axis=1)
     lever = 0.5 * rest + d
-    reach = 0.5 * rest + known.number("align.imu_lever_m", 0.0, -0.5, 0.5)
-    shaken = math.hypot(known.number("align.accel_noise_mps2.0", 0.0), SHAKING_RADPS2 * reach)
+    reach = 0.5 * rest + lookup.number("align.imu_lever_m", 0.0)
+    shaken = math.hypot(lookup.number("align.accel_noise_mps2.0", 0.0), SHAKING_RADPS2 * reach)
     noise = TickNoise(
         float(across) / lever,
         float(along),
-        known.number("align.gyro_noise_radps", 0.0, 0.0, 10.0),
+        lookup.number("align.gyro_noise_radps", 0.0),
         shaken / _GRAVITY_MPS2,
     )
-    return design(noise, rate_hz, _delay_ticks(known, rate_hz) / rate_hz, lever)
+    return design(noise, rate_hz, _delay_ticks(lookup, rate_hz) / rate_hz, lever)
 
 
-def _delay_ticks(known: Known, rate_hz: float) -> float:
-    delay = known.number("align.time_offset_s", 0.0, -1.0, 1.0) * rate_hz
+def _delay_ticks(lookup: Lookup, rate_hz: float) -> float:
+    delay = lookup.number("align.time_offset_s", 0.0) * rate_hz
     # As far as the whole ticks of the other filters reach.
     if not -0.5 <= delay <= MOST_DELAY_TICKS + 0.5:
         raise BadInputError(
-            f"{known.source}: align.time_offset_s is {delay / rate_hz:g} s, {delay:.3g} ticks; "
+            f"{lookup.source}: align.time_offset_s is {delay / rate_hz:g} s, {delay:.3g} ticks; "
             f"expected pictures that are 0 to {MOST_DELAY_TICKS} ticks late"
         )
     return min(max(delay, 0.0), float(MOST_DELAY_TICKS))
 
 
-def _delay_items(known: Known, rate_hz: float) -> list[Item]:
-    delay = _delay_ticks(known, rate_hz)
+def _delay_items(lookup: Lookup, rate_hz: float) -> list[Item]:
+    delay = _delay_ticks(lookup, rate_hz)
     ticks = math.ceil(delay - _WHOLE)
     return [
         Whole("CALIB_FUSED_TICKS", ticks, "angles that are remembered, ceil(D)"),
@@ -884,12 +836,12 @@ def _delay_items(known: Known, rate_hz: float) -> list[Item]:
     ]
 
 
-def _imu_items(known: Known, rate_hz: float, accel_gain: float) -> list[Item]:
-    bias = [known.number(f"align.accel_bias_mps2.{i}", 0.0, -5.0, 5.0) for i in range(2)]
-    scale = [1.0 + known.number(f"align.accel_scale.{i}", 0.0, -0.5, 0.5) for i in range(2)]
-    alpha = known.number("align.mount_angle_rad", 0.0)
-    turned = 0.5 / (rate_hz * (1.0 + known.number("align.gyro_scale", 0.0, -0.5, 0.5)))
-    gyro = known.number("align.gyro_bias_radps", 0.0, -1.0, 1.0)
+def _imu_items(lookup: Lookup, rate_hz: float, accel_gain: float) -> list[Item]:
+    bias = [lookup.number(f"align.accel_bias_mps2.{i}", 0.0) for i in range(2)]
+    scale = [1.0 + lookup.number(f"align.accel_scale.{i}", 0.0) for i in range(2)]
+    alpha = lookup.number("align.mount_angle_rad", 0.0)
+    turned = 0.5 / (rate_hz * (1.0 + lookup.number("align.gyro_scale", 0.0)))
+    gyro = lookup.number("align.gyro_bias_radps", 0.0)
     k = accel_gain / _GRAVITY_MPS2
     ca, sa = k * math.cos(alpha), k * math.sin(alpha)
     rows = ((ca / scale[0], sa / scale[1]), (-sa / scale[0], ca / scale[1]))
@@ -910,7 +862,7 @@ def _imu_items(known: Known, rate_hz: float, accel_gain: float) -> list[Item]:
     ]
 
 
-def fused_group(known: Known, rate_hz: float, plane: PlaneConstants | None) -> Group:
+def fused_group(lookup: Lookup, rate_hz: float, plane: PlaneConstants | None) -> Group:
     """The group of the header; CALIB_HAS_FUSED is 0 where rig.yaml lacks plane or alignment.
 
     The gains are those of `estimator.constant_gain`, or for the noise in `align` where there are none of this
@@ -918,23 +870,23 @@ def fused_group(known: Known, rate_hz: float, plane: PlaneConstants | None) -> G
 
     Raises `BadInputError` for pictures too late or too early.
     """
-    missing = [name for name, there in (("plane", plane), ("align", known.node("align"))) if there is None]
+    missing = [name for name, there in (("plane", plane), ("align", lookup.find("align"))) if there is None]
     if missing or plane is None:
         notes = ("Fused estimator: none. rig.yaml lacks " + " and ".join(missing) + ".",)
         return Group(notes, (Whole("CALIB_HAS_FUSED", 0, "for #if; CALIB_FUSED 1 does not compile"),))
-    delay = _delay_items(known, rate_hz)
-    tuned = known.node("estimator.constant_gain")
+    delay = _delay_items(lookup, rate_hz)
+    tuned = lookup.find("estimator.constant_gain")
     if isinstance(tuned, EstimatorGain) and abs(tuned.rate_hz / rate_hz - 1.0) <= 1e-6:
         gain, told = Gains(**tuned.model_dump()), "Gains of estimator.constant_gain."
     else:
-        gain, told = _designed(known, rate_hz, plane), "Gains for the noise in align."
+        gain, told = _designed(lookup, rate_hz, plane), "Gains for the noise in align."
         if tuned is not None:
             told += " Those of estimator.constant_gain are for another tick."
     per = 1.0 / gain.lever_m
     items: list[Item] = [
         Whole("CALIB_HAS_FUSED", 1, "for #if"),
         *delay,
-        *_imu_items(known, rate_hz, gain.accel_phi),
+        *_imu_items(lookup, rate_hz, gain.accel_phi),
         Constant("CALIB_FUSED_PHI_PER_M", gain.camera_phi * per, "K_c / lever, rad/m"),
         Constant("CALIB_FUSED_ALONE_PHI_PER_M", ALONE * per, "the same without the IMU, rad/m"),
         Constant("CALIB_FUSED_BOOST_PHI_PER_M", BOOST * per, "the same after a start, rad/m"),
@@ -961,5 +913,5 @@ def fused_group(known: Known, rate_hz: float, plane: PlaneConstants | None) -> G
             told,
         ),
         tuple(items),
-        known.told(),
+        lookup.defaults(),
     )

@@ -20,7 +20,7 @@ from calib.stages.camera.lens import fit_inverse
 from calib.stages.camera.model import COEFFICIENTS, MODELS
 from calib.stages.firmware.constants import (
     CameraConstants,
-    Known,
+    Lookup,
     PlaneConstants,
     camera_groups,
     control_groups,
@@ -138,11 +138,11 @@ def header_of(whole: Rig, source: str) -> Header:
     Raises `BadInputError` for values that the firmware cannot run with, by their key.
     """
     camera = _camera_constants(whole, source)
-    known = Known(whole, source)
-    rate_hz = tick_rate_hz(known)
-    known.told()
-    motion = (*motion_groups(known), fused_group(known, rate_hz, camera.plane))
-    groups = (*camera_groups(camera), *motion, *control_groups(known, rate_hz))
+    lookup = Lookup(whole, source)
+    rate_hz = tick_rate_hz(lookup)
+    lookup.defaults()
+    motion = (*motion_groups(lookup), fused_group(lookup, rate_hz, camera.plane))
+    groups = (*camera_groups(camera), *motion, *control_groups(lookup, rate_hz))
     inputs = {
         f"{section}/{name}": digest
         for section, named in whole.provenance.inputs.items()

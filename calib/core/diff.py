@@ -14,18 +14,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from calib.core.arrays import FloatArray
-from calib.core.errors import BadInputError
-from calib.core.files import shown
-from calib.core.result import section_json
-from calib.core.rig import Geometry, Rig, read_rig
-from calib.show.values import Constant, constants
-from calib.stages.camera.model import project, undistort
+from calib.core.constants import Constant, constants
+from calib.core.rig import Geometry, Rig
 
 SIGNIFICANT = 3.0
 """Standard deviations from which on a difference is called significant."""
@@ -104,9 +98,8 @@ class RigDiff:
         )
 
 
-def diff_rigs(before: Path, after: Path) -> RigDiff:
-    """Compare two rig.yaml. Raises `BadInputError` for files that cannot be read."""
-    old, new = _read(before), _read(after)
+def diff_rigs(old: Rig, new: Rig) -> RigDiff:
+    """Compare two rigs."""
     a, b = _sections(old), _sections(new)
     left, right = _by_name(a), _by_name(b)
     changes = [_change(left.get(key), right.get(key)) for key in dict.fromkeys([*left, *right])]
@@ -129,20 +122,8 @@ def diff_rigs(before: Path, after: Path) -> RigDiff:
     )
 
 
-def _read(path: Path) -> Rig:
-    if not path.exists():
-        raise BadInputError(f"{shown(path)}: cannot be read: there is no such file")
-    return read_rig(path)
-
-
 def _sections(rig: Rig) -> dict[str, dict[str, Any]]:
-    named = {
-        name: section_json(getattr(rig, name))
-        for name in type(rig).model_fields
-        if name != "provenance" and getattr(rig, name) is not None
-    }
-    extra = {name: value for name, value in (rig.model_extra or {}).items() if isinstance(value, dict)}
-    return {**named, **extra}
+    return {name: values for name, values in rig.values().items() if name != "provenance"}
 
 
 def _by_name(sections: Mapping[str, Any]) -> dict[tuple[str, str], Constant]:
@@ -177,7 +158,8 @@ def _on_plane(old: Rig, new: Rig) -> PlaneChange | None:
     columns, rows = _GRID
     x, y = np.meshgrid(np.linspace(x0, x1, columns), np.linspace(y0, y1, rows))
     world = np.column_stack([x.ravel(), y.ravel()])
-    apart = 1e3 * np.linalg.norm(_read_back(new, _seen(old, world)) - world, axis=1)
+    seen = old.plane.to_pixels(world, old.camera)
+    apart = 1e3 * np.linalg.norm(new.plane.to_world(seen, new.camera) - world, axis=1)
     if not np.isfinite(apart).any():
         return None
     worst = int(np.nanargmax(apart))
@@ -190,20 +172,3 @@ def _on_plane(old: Rig, new: Rig) -> PlaneChange | None:
         (float(world[worst, 0]), float(world[worst, 1])),
         sigma,
     )
-
-
-def _seen(rig: Rig, world_m: FloatArray) -> FloatArray:
-    """Distorted pixels (n, 2) of points (n, 2) of the plane."""
-    assert rig.camera is not None and rig.plane is not None
-    points_W = np.column_stack([world_m, np.zeros(len(world_m))])
-    points_C = points_W @ np.array(rig.plane.R_CW).T + np.array(rig.plane.t_CW_m)
-    return project(rig.camera.optics, points_C)
-
-
-def _read_back(rig: Rig, pixels: FloatArray) -> FloatArray:
-    """Points (n, 2) of the plane at distorted pixels (n, 2)."""
-    assert rig.camera is not None and rig.plane is not None
-    camera = rig.camera.optics
-    rays = np.column_stack([undistort(camera, pixels), np.ones(len(pixels))])
-    p = rays @ camera.K.T @ np.array(rig.plane.A_inverse).T
-    return np.asarray(p[:, :2] / p[:, 2:])

@@ -1,0 +1,177 @@
+"""Values of a file against their schema, and one sentence for what is wrong: file, key, value, expectation.
+
+Ranges stand in the schemas once. Here they become words, with the question that mostly answers it: was the
+number typed in another unit?
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import PydanticCustomError
+
+from calib.core.errors import BadInputError
+from calib.core.files import one_line, shown
+
+Kind = TypeVar("Kind", bound=BaseModel)
+
+_EXPECTED = {
+    "bool_type": "true or false",
+    "dict_type": "keys with values",
+    "finite_number": "a finite number",
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "list_type": "a list",
+    "model_attributes_type": "keys with values",
+    "model_type": "keys with values",
+    "string_type": "text",
+}
+"""What pydantic's kinds of error ask for, in words."""
+
+_OUT_OF_RANGE = ("greater_than", "greater_than_equal", "less_than", "less_than_equal")
+
+_SMALLER = {
+    "m": (1e-3, "millimetres"),
+    "s": (1e-3, "milliseconds"),
+    "kg": (1e-3, "grams"),
+    "V": (1e-3, "millivolt"),
+    "N/rad²": (1e-3, "mN/rad²"),
+    "rad": (math.radians(1.0), "degrees"),
+    "rad/s": (math.radians(1.0), "degrees per second"),
+}
+"""Units that a number too large is often typed in, and what they are of the right one."""
+
+
+def validated(kind: type[Kind], values: Any, source: Path | str, key: str = "") -> Kind:
+    """Values as the model that their schema asks for.
+
+    Parameters
+    ----------
+    source : the file's name, and key : where in it the values stand, for the sentence.
+
+    Raises `BadInputError` for the first thing that is wrong.
+    """
+    try:
+        return kind.model_validate(values)
+    except ValidationError as error:
+        raise BadInputError(f"{shown(source)}: {_sentence(kind, error, key)}") from error
+
+
+def contradiction(text: str) -> PydanticCustomError:
+    """An error that a model's validator raises of values that cannot stand together; `text` names the key."""
+    return PydanticCustomError("contradiction", "{text}", {"text": text})
+
+
+def nearest(name: str, names: Iterable[str]) -> str:
+    """The end of a sentence that asks for the most alike of some names; empty where none is."""
+    alike = difflib.get_close_matches(name, list(names), 1)
+    return f"; did you mean {alike[0]}?" if alike else ""
+
+
+def quoted(value: Any) -> str:
+    """A value of a file as a sentence shows it."""
+    text = one_line(repr(value))
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _sentence(kind: type[BaseModel], error: ValidationError, under: str) -> str:
+    first = error.errors()[0]
+    how, value = first["type"], first.get("input")
+    place, part, around = _place(kind, first["loc"])
+    key = one_line(".".join(str(name) for name in (*([under] if under else []), *place)))
+    if how == "contradiction":
+        return f"{key}.{first['msg']}"
+    if how == "missing":
+        return f"{key} is missing"
+    if how == "extra_forbidden":
+        return f"{key} is not a key that is known here{nearest(str(place[-1]), around.get('properties', {}))}"
+    message = first["msg"]
+    expected = message[0].lower() + message[1:]
+    for lead in ("value error, ", "input should be ", "expected "):
+        expected = expected.removeprefix(lead)
+    expected = _EXPECTED.get(how, expected)
+    if how in ("too_short", "too_long"):
+        limit = first["ctx"].get("min_length", first["ctx"].get("max_length"))
+        expected = f"{limit} values"
+    elif how in _OUT_OF_RANGE and isinstance(value, int | float):
+        expected = _range(part, _unit(place), value)
+        return f"{key} is {value:g}, expected {expected}"
+    elif how in ("float_type", "int_type") and isinstance(value, str) and _reads_as_number(value):
+        expected += " (without quotes, and in YAML an exponent needs a point and a sign, as 2.0e-2)"
+    elif how == "float_type" and _unit(place):
+        expected += f" ({_unit(place)})"
+    return f"{key} is {quoted(value)}, expected {expected}"
+
+
+def _unit(place: list[int | str]) -> str:
+    """Unit at the end of the last key that has one."""
+    from calib.core.words import unit_of
+
+    return next((unit for part in reversed(place) if (unit := unit_of(str(part)))), "")
+
+
+def _range(part: Mapping[str, Any], unit: str, value: float) -> str:
+    """What a number may be, from its JSON schema, and whether it looks like one in another unit."""
+    least = part.get("minimum", part.get("exclusiveMinimum"))
+    most = part.get("maximum", part.get("exclusiveMaximum"))
+    above = "above" if "exclusiveMinimum" in part else "at least"
+    below = "below" if "exclusiveMaximum" in part else "at most"
+    of = f" {unit}" if unit else ""
+    if most is None:
+        return f"{above} {least:g}{of}"
+    if least is None:
+        return f"{below} {most:g}{of}"
+    factor, other = _SMALLER.get(unit, (0.0, ""))
+    asked = f"; is it in {other}?" if other and value > most and least <= factor * value <= most else ""
+    if "exclusiveMinimum" in part or "exclusiveMaximum" in part:
+        return f"{above} {least:g} and {below} {most:g}{of}{asked}"
+    return f"{least:g} to {most:g}{of}{asked}"
+
+
+def _place(
+    kind: type[BaseModel], loc: tuple[int | str, ...]
+) -> tuple[list[int | str], dict[str, Any], dict[str, Any]]:
+    """Keys that lead to a place in a model, and the JSON schemas of what stands there and around it.
+
+    Of a value that may be of several kinds, pydantic puts the kind among the keys; it is left out here.
+    """
+    whole = kind.model_json_schema()
+    part: dict[str, Any] = whole
+    around, place = part, []
+    for name in loc:
+        kinds = _kinds(part, whole)
+        if len(kinds) > 1:
+            part = next(one for one in kinds if (one.get("type") == "array") == str(name).startswith("list"))
+            continue
+        around = kinds[0]
+        place.append(name)
+        if isinstance(name, int):
+            part = around.get("items", {})
+        else:
+            part = around.get("properties", {}).get(name) or around.get("additionalProperties") or {}
+    return place, (_kinds(part, whole) or [{}])[0], around
+
+
+def _kinds(part: Any, whole: dict[str, Any]) -> list[dict[str, Any]]:
+    """What a value may be, references followed, null left out."""
+    if not isinstance(part, dict):
+        return [{}]
+    if "$ref" in part:
+        return _kinds(whole["$defs"][part["$ref"].rpartition("/")[2]], whole)
+    if "anyOf" in part:
+        return [kind for one in part["anyOf"] if one.get("type") != "null" for kind in _kinds(one, whole)]
+    return [part]
+
+
+def _reads_as_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
