@@ -18,12 +18,8 @@ import numpy as np
 from calib.core.arrays import AnyArray, FloatArray
 from calib.core.files import one_line
 
-HUES = (
-    "ink", "grey", "silver", "shade", "blue", "sky", "ice", "green", "mint", "orange", "ochre", "peach",
-    "red", "purple",
-)  # fmt: skip
 Colour = str | float
-"""One of `HUES`, or a place on the scale."""
+"""A place, or ink, grey, silver, shade, blue, sky, ice, green, mint, orange, ochre, peach, red or purple."""
 KINDS = ("line", "dashed", "dotted", "points", "cloud", "crosses", "pluses", "squares", "diamonds", "marks")
 """How a curve is drawn: as a line, as markers, as dots of a pixel ("cloud") or as short strokes ("marks")."""
 

@@ -18,7 +18,7 @@ from calib.core.arrays import FloatArray
 from calib.core.plot import Arrows, Curve, Figure, Plot, Text, magnified, short
 from calib.core.verdict import Verdict, Word
 from calib.io.logs import Log, write_log
-from calib.show.draw import draw, plain
+from calib.show.draw import draw, plain, write_figures
 from calib.stages import function, stage
 from calib.stages.camera.bundle import Calibration, calibrate, covariance, rotation_exp
 from calib.stages.camera.checks import cell_means
@@ -329,6 +329,13 @@ def test_all_figures_are_legible(name: str, tmp_path: Path) -> None:
     assert figures
     for stem, figure in figures.items():
         assert complaints(figure) == [], stem
+
+
+def test_files_are_the_same_bytes_again(tmp_path: Path) -> None:
+    figures = CASES["low-pass: order 1"](tmp_path)
+    first, again = (write_figures(tmp_path / name, figures) for name in ("a", "b"))
+    assert [path.name for path in first] == [f"{name}.png" for name in figures]
+    assert all(a.read_bytes() == b.read_bytes() for a, b in zip(first, again, strict=True))
 
 
 @pytest.mark.parametrize(
