@@ -12,7 +12,9 @@ import pytest
 from figure_checks import complaints, complaints_of, drawn_texts, words_of
 from hypothesis import given
 from hypothesis import strategies as st
+from imu_poses import G, Sensor, pose_log, sphere_poses, tilts
 from matplotlib.quiver import Quiver
+from scipy.spatial.transform import Rotation
 
 from calib.core.arrays import FloatArray
 from calib.core.plot import Arrows, Curve, Figure, Plot, Text, magnified, short
@@ -20,6 +22,9 @@ from calib.core.verdict import Verdict, Word
 from calib.io.logs import Log, write_log
 from calib.show.draw import draw, plain, write_figures
 from calib.stages import function, stage
+from calib.stages.actuator.identify_pump import Group, fit_static_map
+from calib.stages.actuator.plots import pump_plots
+from calib.stages.actuator.stage import PumpFound
 from calib.stages.camera.bundle import Calibration, calibrate, covariance, rotation_exp
 from calib.stages.camera.checks import cell_means
 from calib.stages.camera.intrinsics import Intrinsics
@@ -35,6 +40,9 @@ from calib.stages.camera.plane import Plane, calibrate_plane
 from calib.stages.camera.plots import lens_plots, picture, plane_plots
 from calib.stages.camera.plots import plots as camera_plots
 from calib.stages.camera.verdict import Judgement
+from calib.stages.imu.intrinsics import find_intrinsics
+from calib.stages.imu.plots import intrinsics_plots, static_plots
+from calib.stages.imu.static import RestLog, analyse_static
 from calib.stages.lowpass.filters import Design, design_lowpass
 from calib.stages.lowpass.plots import plots as lowpass_plots
 from calib.stages.lowpass.stage import Inputs, Positions, positions_from_log
@@ -268,6 +276,29 @@ def _control(verb: str, *sources: str, **options: Any) -> dict[str, Figure]:
     return plots(function(f"control {verb}")(*sources, **options))
 
 
+def _at_rest(axes: tuple[str, ...], stuck: bool = False) -> dict[str, Figure]:
+    """An IMU at rest that is moved once; without a chip's own angle."""
+    values = 1e-2 * np.random.default_rng(3).standard_normal((6000, len(axes))) + np.arange(len(axes))
+    values[2000:2100, 0] += 0.5 * np.sin(0.1 * np.arange(100))
+    values[:, -1] = 0.25 if stuck else values[:, -1]
+    log = RestLog("log.csv", axes, 0.01 * np.arange(6000), values, np.zeros(0), np.zeros(0))
+    return static_plots(analyse_static([log]), "poor")
+
+
+def _posed(poses: list[Rotation], planar: bool = False) -> dict[str, Figure]:
+    return intrinsics_plots(find_intrinsics(pose_log(poses, Sensor()), G, planar))
+
+
+def _settled() -> dict[str, Figure]:
+    """A pump's table of settled values with an outlier, and runs that settle elsewhere."""
+    pwm = np.linspace(0.0, 255.0, 18)
+    value = 26.0 * np.clip(pwm - 40.0, 0.0, None) / 215.0
+    value[9] += 8.0
+    groups = (Group(12.0, 0.2, (120.0, 180.0), ("a", "b")), Group(24.0, 0.2, (240.0, 240.0), ("c",)))
+    maps = (fit_static_map("settled.csv", pwm, value),)
+    return pump_plots(PumpFound("kPa", (), {}, {}, {}, maps, groups, (), (), ()), "ok")
+
+
 CASES: dict[str, Callable[[Path], dict[str, Figure]]] = {
     "camera: one view": lambda _: camera_plots(_one_view()),
     "camera: 400 views": lambda _: camera_plots(_many_views()),
@@ -299,6 +330,12 @@ CASES: dict[str, Callable[[Path], dict[str, Figure]]] = {
     "plane: twelve pictures": lambda _: plane_plots(
         CAMERA, plane_of(names=tuple(f"{k}.png" for k in range(12)))
     ),
+    "IMU: three axes move": lambda _: _at_rest(("gz", "ax", "ay")),
+    "IMU: an axis is stuck": lambda _: _at_rest(("gx", "gy", "gz", "ax", "ay", "az"), stuck=True),
+    "IMU: poses all around": lambda _: _posed(sphere_poses(24)),
+    "IMU: poses in a plane": lambda _: _posed(tilts(np.radians(np.arange(0, 720, 45))), planar=True),
+    "IMU: one pose": lambda _: _posed(tilts(np.zeros(2))),
+    "pump: settled values": lambda _: _settled(),
     "low-pass: order 1": lambda folder: _low_pass(1.0, 1, "butterworth", folder),
     "low-pass: still log": lambda folder: _low_pass(1.0, 8, "butterworth", folder, still=True),
     "low-pass: fast Bessel": lambda folder: _low_pass(20.0, 4, "bessel", folder),
@@ -350,6 +387,8 @@ def test_files_are_the_same_bytes_again(tmp_path: Path) -> None:
         ("plane: twelve pictures", "plane_sigma", "covariance of the intrinsics is not known"),
         ("plane: nothing of the workspace", "plane_difference", "No part of the workspace is in the picture"),
         ("plane: nothing of the workspace", "plane_sigma", "verdict: poor"),
+        ("IMU: an axis is stuck", "imu_allan", "never changes"),
+        ("IMU: an axis is stuck", "imu_drift", "not logged, or the logs move"),
         ("low-pass: still log", "lowpass_log", "v never changes"),
         ("control: a jump checked", "control_check", "verdict: poor"),
     ],
