@@ -33,7 +33,7 @@ KINDS_OF_FORMAT = ("ros1", "sqlite", "folder", "mcap", "json")
 def readings(rng: np.random.Generator, seconds: float = 1.0) -> list[Message]:
     """IMU at 100 Hz, marker and commands at 60 Hz."""
     out: list[Message] = [
-        ("imu", START_NS + 10_000_000 * k, tuple(rng.normal(size=6).tolist()))
+        ("imu", START_NS + 10_000_000 * k, (9.81, *rng.normal(size=5).tolist()))
         for k in range(int(100 * seconds))
     ]
     for k in range(int(60 * seconds)):

@@ -29,12 +29,13 @@ def convert(
     import numpy as np
 
     from calib.core.files import shown
+    from calib.core.stage import LogOptions
     from calib.io.logs import iter_log
     from calib.io.states import states_writer
 
     if output.suffix.lower() not in (".csv", ".parquet"):
         raise UsageError(f"{shown(output)}: expected a name that ends in .csv or .parquet")
-    stream = iter_log(log, topics)
+    stream = iter_log(log, LogOptions(topics=topics))
     block = next(stream, None)
     if block is None:
         raise BadInputError(f"{shown(log)}: has a header but no rows")

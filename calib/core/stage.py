@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, get_args, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args, get_type_hints
 
 from calib.core.errors import BadInputError, UsageError
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from calib.core.rig import Rig
     from calib.core.verdict import Verdict
     from calib.core.words import Block
+    from calib.io.logs import Log
 
 
 class ProgressCall(Protocol):
@@ -50,6 +51,7 @@ class Files:
     output : where -o leads, None without.
     narrate : takes a sentence for the person who watches. progress : a bar with a label.
     hashes : SHA-256 of what was read, by name, for the provenance.
+    remarks : sentences on what was read, which are narrated once all of it is.
     """
 
     paths: tuple[Path, ...] = ()
@@ -58,6 +60,15 @@ class Files:
     narrate: Callable[[str], None] = lambda sentence: None
     progress: Progress = _silent
     hashes: dict[str, str] = field(default_factory=dict)
+    remarks: list[str] = field(default_factory=list)
+
+    def log(self, path: Path, options: LogOptions) -> Log:
+        """A log. Raises `BadInputError` as `calib.io.logs.read_log`."""
+        from calib.io.logs import read_log
+
+        log = read_log(path, options)
+        self.remarks += log.remarks()
+        return log
 
     def taken(self, path: Path) -> str:
         """Note that a file is an input; its name without folders, the same wherever the folder lies."""
@@ -108,6 +119,36 @@ class Output:
     metavar: str = ""
     default: Path | None = None
     folder: bool = False
+
+
+AccUnit = Literal["m/s2", "g", "mg", "counts"]
+GyroUnit = Literal["rad/s", "deg/s", "mdeg/s", "counts"]
+
+
+@dataclass(frozen=True)
+class LogOptions:
+    """What a person states of logs; a stage that takes some has these beside its own options.
+
+    Attributes
+    ----------
+    acc_unit, gyro_unit : units of `calib.io.columns.UNITS`, None for what names, files or readings say.
+    columns : a columns.yaml, None for the one beside the log.
+    topics : what is where in a bag, see `calib.io.bags`.
+    """
+
+    acc_unit: AccUnit | None = option(None, "Unit of ax, ay, az in the logs, else as names or readings say.")
+    gyro_unit: GyroUnit | None = option(
+        None, "Unit of gx, gy, gz in the logs, else as names or readings say."
+    )
+    columns: Path | None = option(
+        None, "What the columns of the logs are, else columns.yaml or NAME.columns.yaml beside them."
+    )
+    topics: Path | None = option(
+        None, "Which topic of a bag is which column, else NAME.topics.yaml beside the bag."
+    )
+
+
+NOTHING_STATED = LogOptions()
 
 
 @dataclass(frozen=True)
@@ -195,6 +236,8 @@ class Stage:
                     f"{shown(files.rig_path)}: has no {name} yet; run calib {_VERBS[name]} first"
                 )
         inputs = self.read(files, rig, options)
+        for sentence in files.remarks:
+            files.narrate(sentence)
         try:
             outcome = self.solve(inputs)
         except ValidationError as error:

@@ -7,6 +7,7 @@ import json
 import math
 import operator
 import re
+import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -19,7 +20,8 @@ import numpy as np
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError, CalibError, pip_install
 from calib.core.files import check_readable, one_line, read_yaml_mapping, shown
-from calib.io.logs import COLUMNS, Log
+from calib.io.columns import COLUMNS
+from calib.io.logs import Log
 from calib.io.unpacking import (
     MOST_BYTES,
     BoundedFile,
@@ -433,7 +435,7 @@ def rows_from_messages(source: str, stream: Source, topics: TopicMap) -> Iterato
         lines = np.arange(first, first + len(stamps), dtype=np.int64)
         first += len(stamps)
         named = {name: np.ascontiguousarray(values[:, k]) for k, name in enumerate(columns)}
-        return Log(source, t_s, named, lines, unknown, infinite)
+        return Log(source, t_s, named, lines, unknown=unknown, not_finite=infinite)
 
     try:
         waiting = (sorter.stamps, sorter.values)
@@ -588,7 +590,7 @@ class _Mcap:
         reader = self._make[self._indexed]()
         try:
             yield from reader.iter_messages(topics=names, log_time_order=self._jumbled)
-        except self._errors.EndOfFile:
+        except (self._errors.EndOfFile, struct.error):
             self.truncated = True
 
     def messages(self, names: Iterable[str]) -> Iterator[tuple[str, int, Any]]:

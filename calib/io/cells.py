@@ -1,4 +1,10 @@
-"""Cells of tables: decimal numbers read and written by compiled code, digit for digit as Python's."""
+"""Tables as text: rows of numbers as comma-separated lines by compiled code, digit for digit as Python's.
+
+A number |v| 10^(8-e) with nine digits before its point has, after at most three products with powers of
+ten that double precision holds exactly, an error below 4e-7; where its fraction is not that close to one
+half, the rounded digits are those of exact arithmetic. What is closer, and what is not finite, is left to
+Python's own formatting, row by row, so the text never depends on which of the two wrote it.
+"""
 
 from __future__ import annotations
 
@@ -10,174 +16,13 @@ from numba import njit
 
 from calib.core.arrays import FloatArray, IntArray
 
-# ----------------------------------------------------------------------
-# The compiled scanner of log files: decimal numbers out of comma-separated lines, exactly rounded.
-#
-# A number of at most 19 digits m 10^e with |m| < 2^53 and |e| <= 22 is the correctly rounded quotient
-# or product of two numbers that double precision holds exactly (Clinger 1990), so the compiled loop
-# gives the same bits as Python's `float`. Anything else (longer numbers, `nan`, words, quotes) is left
-# to the caller, cell by cell, with its place.
-
-ODD_COLUMNS = ("row", "slot", "start", "end")
-"""What is noted about a cell that is left to the caller; slot -1 is a whole line."""
-
 POWERS: FloatArray = np.array([10.0**k for k in range(23)])
 """10^0 .. 10^22, all exact."""
-
-_EXACT = 1 << 53
-_COMMA, _NEWLINE, _RETURN, _SPACE, _TAB, _QUOTE, _HASH = 44, 10, 13, 32, 9, 34, 35
-_PLUS, _MINUS, _DOT, _ZERO, _NINE, _E, _SMALL_E = 43, 45, 46, 48, 57, 69, 101
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def scan(
-    text: npt.NDArray[np.uint8],
-    slots: IntArray,
-    powers: FloatArray,
-    values: FloatArray,
-    lines: IntArray,
-    odd: IntArray,
-) -> tuple[int, int, int]:
-    """Numbers of whole lines, each ended by a line feed.
-
-    Parameters
-    ----------
-    text : (bytes,) of the lines.
-    slots : (columns,) for each column of the file its column in `values`, or -1 to pass over it.
-    powers : 10^0 .. 10^22.
-    values : (rows, slots) written; NaN where a cell is blank or left to the caller.
-    lines : (rows,) written, number of each row's line, from 0.
-    odd : (cells, 4) written, see `ODD_COLUMNS`, places within `text`.
-
-    Returns
-    -------
-    rows, lines, and cells left to the caller.
-    """
-    columns = slots.shape[0]
-    size = text.shape[0]
-    rows, line, strange = 0, 0, 0
-    i = 0
-    while i < size:
-        start_of_line = i
-        # An empty line is no row, and neither is a comment.
-        j = i
-        while j < size and (text[j] == _SPACE or text[j] == _TAB or text[j] == _RETURN):
-            j += 1
-        comment = j < size and text[j] == _HASH
-        while comment and j < size and text[j] != _NEWLINE:
-            j += 1
-        if j < size and text[j] == _NEWLINE:
-            i = j + 1
-            line += 1
-            continue
-        for slot in range(values.shape[1]):
-            values[rows, slot] = np.nan
-        column = 0
-        whole = False
-        ended = False
-        while not ended:
-            # One cell: text[begin:i] up to a comma or the end of the line.
-            begin = i
-            while i < size and (text[i] == _SPACE or text[i] == _TAB):
-                i += 1
-            slot = slots[column] if column < columns else -1
-            if slot >= 0:
-                negative = False
-                if i < size and (text[i] == _MINUS or text[i] == _PLUS):
-                    negative = text[i] == _MINUS
-                    i += 1
-                m, digits, exponent = 0, 0, 0
-                while i < size and _ZERO <= text[i] <= _NINE:
-                    if digits < 19:
-                        m = m * 10 + (text[i] - _ZERO)
-                    digits += 1
-                    i += 1
-                if i < size and text[i] == _DOT:
-                    i += 1
-                    while i < size and _ZERO <= text[i] <= _NINE:
-                        if digits < 19:
-                            m = m * 10 + (text[i] - _ZERO)
-                        digits += 1
-                        exponent -= 1
-                        i += 1
-                good = 0 < digits <= 18
-                if good and i < size and (text[i] == _E or text[i] == _SMALL_E):
-                    i += 1
-                    down = False
-                    if i < size and (text[i] == _MINUS or text[i] == _PLUS):
-                        down = text[i] == _MINUS
-                        i += 1
-                    power, places = 0, 0
-                    while i < size and _ZERO <= text[i] <= _NINE:
-                        if places < 4:
-                            power = power * 10 + (text[i] - _ZERO)
-                        places += 1
-                        i += 1
-                    good = 0 < places <= 4
-                    exponent += -power if down else power
-                while i < size and (text[i] == _SPACE or text[i] == _TAB or text[i] == _RETURN):
-                    i += 1
-                at_end = i < size and (text[i] == _COMMA or text[i] == _NEWLINE)
-                blank = digits == 0 and at_end
-                if blank:
-                    for k in range(begin, i):
-                        blank = blank and (text[k] == _SPACE or text[k] == _TAB or text[k] == _RETURN)
-                if good and at_end and m < _EXACT and -22 <= exponent <= 22:
-                    value = m * powers[exponent] if exponent >= 0 else m / powers[-exponent]
-                    values[rows, slot] = -value if negative else value
-                elif not blank:
-                    odd[strange, 0], odd[strange, 1], odd[strange, 2] = rows, slot, begin
-                    while i < size and text[i] != _COMMA and text[i] != _NEWLINE:
-                        whole = whole or text[i] == _QUOTE
-                        i += 1
-                    for k in range(begin, i):
-                        whole = whole or text[k] == _QUOTE
-                    odd[strange, 3] = i
-                    strange += 1
-            else:
-                while i < size and text[i] != _COMMA and text[i] != _NEWLINE:
-                    whole = whole or text[i] == _QUOTE
-                    i += 1
-            column += 1
-            ended = i >= size or text[i] == _NEWLINE
-            i += 1
-        if whole or column != columns:
-            # Quoted cells may hold commas and a line may be too short: the caller looks at all of it.
-            while strange > 0 and odd[strange - 1, 0] == rows and odd[strange - 1, 1] >= 0:
-                strange -= 1
-            odd[strange, 0], odd[strange, 1], odd[strange, 2], odd[strange, 3] = (
-                rows,
-                -1,
-                start_of_line,
-                i - 1,
-            )
-            strange += 1
-        lines[rows] = line
-        rows += 1
-        line += 1
-    return rows, line, strange
-
-
-# ----------------------------------------------------------------------
-# The compiled writer of tables: rows of numbers as comma-separated text, digit for digit as Python's.
-#
-# A number |v| 10^(8-e) with nine digits before its point has, after at most three products with powers of
-# ten that double precision holds exactly, an error below 4e-7; where its fraction is not that close to one
-# half, the rounded digits are those of exact arithmetic. What is closer, and what is not finite, is left to
-# Python's own formatting, row by row, so the text never depends on which of the two wrote it.
 
 TIME, GENERAL, WHOLE = 0, 1, 2
 """Kinds of columns: six decimals; nine significant digits, shortest; no decimals. NaN is blank."""
 
-(
-    _TEXTCELLS_COMMA,
-    _TEXTCELLS_NEWLINE,
-    _TEXTCELLS_DOT,
-    _TEXTCELLS_ZERO,
-    _TEXTCELLS_MINUS,
-    _TEXTCELLS_PLUS,
-    _TEXTCELLS_E,
-) = 44, 10, 46, 48, 45, 43, 101
+_COMMA, _NEWLINE, _DOT, _ZERO, _MINUS, _PLUS, _E = 44, 10, 46, 48, 45, 43, 101
 _WIDEST = 26
 _FORMATS = {TIME: ".6f", GENERAL: ".9g", WHOLE: ".0f"}
 
@@ -191,7 +36,7 @@ def _whole(value: int, out: npt.NDArray[np.uint8], at: int) -> int:
         size += 1
     for k in range(at + size - 1, at - 1, -1):
         rest = value // 10
-        out[k] = _TEXTCELLS_ZERO + value - 10 * rest
+        out[k] = _ZERO + value - 10 * rest
         value = rest
     return at + size
 
@@ -212,9 +57,9 @@ def _time(value: float, out: npt.NDArray[np.uint8], at: int) -> int:
     if micro == 1000000:
         whole, micro = whole + 1, 0
     at = _whole(whole, out, at)
-    out[at] = _TEXTCELLS_DOT
+    out[at] = _DOT
     for k in range(at + 6, at, -1):
-        out[k] = _TEXTCELLS_ZERO + micro % 10
+        out[k] = _ZERO + micro % 10
         micro //= 10
     return at + 7
 
@@ -237,10 +82,10 @@ def _digits(rest: Any, out: npt.NDArray[np.uint8], at: int, digits: int, before:
     point = 1 if digits > before else 0
     for k in range(digits - 1, -1, -1):
         cut = rest // np.uint32(10)
-        out[at + k + (point if k >= before else 0)] = _TEXTCELLS_ZERO + rest - np.uint32(10) * cut
+        out[at + k + (point if k >= before else 0)] = _ZERO + rest - np.uint32(10) * cut
         rest = cut
     if point:
-        out[at + before] = _TEXTCELLS_DOT
+        out[at + before] = _DOT
     return at + digits + point
 
 
@@ -249,9 +94,9 @@ def _general(value: float, powers: FloatArray, out: npt.NDArray[np.uint8], at: i
     """Nine significant digits without zeros behind; -1 where it is left to the caller."""
     if value == 0.0:
         if np.signbit(value):
-            out[at] = _TEXTCELLS_MINUS
+            out[at] = _MINUS
             at += 1
-        out[at] = _TEXTCELLS_ZERO
+        out[at] = _ZERO
         return at + 1
     size = abs(value)
     if not 1e-50 < size < 1e25:
@@ -283,28 +128,28 @@ def _general(value: float, powers: FloatArray, out: npt.NDArray[np.uint8], at: i
         rest //= np.uint32(10)
         digits -= 1
     if value < 0.0:
-        out[at] = _TEXTCELLS_MINUS
+        out[at] = _MINUS
         at += 1
     if -4 <= e < 0:
-        out[at], out[at + 1] = _TEXTCELLS_ZERO, _TEXTCELLS_DOT
+        out[at], out[at + 1] = _ZERO, _DOT
         at += 2
         for _ in range(-e - 1):
-            out[at] = _TEXTCELLS_ZERO
+            out[at] = _ZERO
             at += 1
         return _digits(rest, out, at, digits, digits)
     before = 1 if e < -4 or e >= 9 else e + 1
     if digits <= before:
         at = _digits(rest, out, at, digits, digits)
         for _ in range(before - digits):
-            out[at] = _TEXTCELLS_ZERO
+            out[at] = _ZERO
             at += 1
     else:
         at = _digits(rest, out, at, digits, before)
     if before == e + 1:
         return at
-    out[at], out[at + 1] = _TEXTCELLS_E, _TEXTCELLS_MINUS if e < 0 else _TEXTCELLS_PLUS
+    out[at], out[at + 1] = _E, _MINUS if e < 0 else _PLUS
     size_of_e = abs(e)
-    out[at + 2], out[at + 3] = _TEXTCELLS_ZERO + size_of_e // 10, _TEXTCELLS_ZERO + size_of_e % 10
+    out[at + 2], out[at + 3] = _ZERO + size_of_e // 10, _ZERO + size_of_e % 10
     return at + 4
 
 
@@ -318,7 +163,7 @@ def _rows(
         begin = at
         for j in range(values.shape[1]):
             if j > 0:
-                out[at] = _TEXTCELLS_COMMA
+                out[at] = _COMMA
                 at += 1
             value = values[i, j]
             if np.isnan(value):
@@ -333,7 +178,7 @@ def _rows(
             if end < 0:
                 return i, begin
             at = end
-        out[at] = _TEXTCELLS_NEWLINE
+        out[at] = _NEWLINE
         at += 1
     return values.shape[0], at
 

@@ -1,59 +1,53 @@
 """Logs: time stamps with the readings of camera, IMU and pumps, as CSV, Parquet or bags.
 
-A CSV log has a header and one row per sample: `t_s` and any of `COLUMNS`, in any order. A blank cell means
-that this sensor was not sampled in that row, so a 60 Hz camera and a 100 Hz IMU may interleave. Columns of
-other names are kept out of the way: they are named in `Log.unknown` and not read. Blank lines and lines
-that begin with # are passed over. A cell that says nan or inf counts as blank; how many there were is in
-`Log.not_finite`. A last line that is cut short, as in a log that is still being written, is left out.
+A log in text has a header and one row per sample: a time and any of `calib.io.columns.COLUMNS`, in any order,
+and under other names and in other units as far as `calib.io.columns` knows them. A blank cell means that this
+sensor was not sampled in that row, so a 60 Hz camera and a 100 Hz IMU may interleave. Cells are separated by
+commas, semicolons or tabs; where not by commas, numbers may have a decimal comma. Other columns are kept out
+of the way: they are named in `Log.unknown` and not read. Blank lines and lines that begin with # are passed
+over; without a header the last of these, or columns.yaml, names the columns. A cell that says nan or inf
+counts as blank; how many there were is in `Log.not_finite`. A last line that is cut short, as in a log that
+is still being written, is left out.
 
-Nothing is said here about whether the numbers make sense; `check_time` is there for verbs that need
-time to run forward.
-
-Reading goes in blocks, so that a log longer than the memory can be streamed (`iter_log`); `read_log`
-holds the whole and refuses more than 200 million cells.
+Reading goes in blocks, so that a log longer than the memory can be streamed (`iter_log`); `read_log` holds
+the whole and refuses more than 200 million cells. Text is parsed by pyarrow; a block that it declines is
+read line by line, which gives the same numbers, or a sentence with the number of the line.
 """
 
 from __future__ import annotations
 
 import csv
-import importlib
 import io
 import math
-from collections.abc import Iterable, Iterator, Mapping
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
 from calib.core.arrays import FloatArray, IntArray
-from calib.core.errors import BadInputError, pip_install
+from calib.core.errors import BadInputError
 from calib.core.files import shown, write_atomically
+from calib.core.stage import NOTHING_STATED, LogOptions
 from calib.core.units import plain_number
-
-MEASURED = (
-    "u_px",
-    "v_px",
-    "ax_mps2",
-    "ay_mps2",
-    "az_mps2",
-    "gx_radps",
-    "gy_radps",
-    "gz_radps",
-    "pwm1",
-    "pwm2",
-    "onchip_phi_rad",
+from calib.io.columns import (
+    COLUMNS,
+    UNITS,
+    ColumnMap,
+    ColumnsFile,
+    column_map,
+    find_columns,
+    kind_of,
+    known_name,
+    read_columns_file,
+    settled,
 )
-"""What a rig logs; `u_px, v_px` is the marker in distorted pixels, `onchip_phi_rad` the IMU's own angle."""
 
-TRUE = ("true_q1_m", "true_q2_m", "true_phi_rad", "true_x_m", "true_y_m")
-"""What only the simulated rig knows, at the row's `t_s`; (x, y) is the head. For scoring."""
-
-COLUMNS = (*MEASURED, *TRUE)
-
-BLANK = " and count as blank"
-ROWS_MISSING = "; their rows count as missing"
-"""What cells that are not finite count as, for `Log.passed_over`."""
+if TYPE_CHECKING:
+    from calib.io.signals import Signals
 
 _BLOCK_BYTES = 1 << 20
 _LONGEST_LINE = 1 << 16
@@ -62,22 +56,23 @@ _MOST_CELLS = 200_000_000
 """Numbers that `read_log` takes, 1.6 GB; blocks have no such limit."""
 
 
-def passed_over(not_finite: int, truncated: bool, counts: str = BLANK) -> list[str]:
-    """Sentences on cells that are not finite, with what they count as, and on a last line cut short."""
-    said = [f"{not_finite} cells say nan or inf{counts}"] if not_finite else []
-    return [*said, "the last line is cut short and left out"] if truncated else said
+def passed_over(not_finite: int, truncated: bool) -> list[str]:
+    """Sentences on cells that are not finite and on a last line cut short."""
+    cells = [f"{not_finite} cells say nan or inf and count as blank"] if not_finite else []
+    return [*cells, "the last line is cut short and left out"] if truncated else cells
 
 
 @dataclass(frozen=True)
 class Log:
-    """Rows of a log.
+    """Rows of a log in SI.
 
     Attributes
     ----------
     source : name for messages.
-    t_s : (n,) time stamps [s], as they are in the file.
+    t_s : (n,) time stamps [s].
     columns : (n,) values by name, NaN where a cell is blank; only columns that the file has.
     lines : (n,) number of each row's line in the file, or of the row in a table without lines.
+    map : where the columns come from; None for a log that was not read from a file.
     unknown : names of the columns that were not read.
     not_finite : cells that said nan or inf; in Parquet nan is a blank.
     truncated : whether the last line was cut short and left out.
@@ -87,6 +82,7 @@ class Log:
     t_s: FloatArray
     columns: Mapping[str, FloatArray]
     lines: IntArray
+    map: ColumnMap | None = None
     unknown: tuple[str, ...] = ()
     not_finite: int = 0
     truncated: bool = False
@@ -100,126 +96,187 @@ class Log:
             return np.zeros(0, dtype=np.int64)
         return np.nonzero(np.logical_and.reduce([~np.isnan(self.columns[name]) for name in names]))[0]
 
-    def passed_over(self, counts: str = BLANK) -> list[str]:
-        """Sentences on cells that are not finite, with what they count as, and on a last line cut short."""
-        return [f"{self.source}: {one}" for one in passed_over(self.not_finite, self.truncated, counts)]
+    def unit(self, name: str) -> str:
+        """The unit in which a column stands in the file, that of its name for a log that was made up."""
+        return self.map.sources[name].unit if self.map is not None else next(iter(UNITS[kind_of(name)]))
 
+    def signals(
+        self, *names: str, optional: Sequence[str] = (), counts: bool = False, partly: bool = False
+    ) -> Signals:
+        """Readings of these columns and of those optional ones that the log has.
 
-def check_time(log: Log) -> None:
-    """Raise `BadInputError` at the first row whose time is earlier than that of the row before."""
-    back = np.nonzero(np.diff(log.t_s) < 0.0)[0]
-    if len(back):
-        i = int(back[0]) + 1
-        raise BadInputError(
-            f"{log.source}, line {log.lines[i]}: t_s goes back from {log.t_s[i - 1]:.6f} "
-            f"to {log.t_s[i]:.6f}, expected time to run forward"
-        )
+        Raises `BadInputError` as `calib.io.signals.signals_of`.
+        """
+        from calib.io.signals import signals_of
+
+        return signals_of(self, names, tuple(optional), counts, partly)
+
+    def remarks(self) -> list[str]:
+        """Sentences on what the columns were read as, on cells that are not finite, on a cut last line."""
+        read_as = self.map.narration if self.map is not None else ""
+        passed = passed_over(self.not_finite, self.truncated)
+        return [*([read_as] if read_as else []), *(f"{self.source}: {one}" for one in passed)]
 
 
 @dataclass(frozen=True)
-class _Layout:
-    """Which column of the file goes where."""
+class _Block:
+    """Cells of some rows as they are in the file, by column, `t_s` among them; NaN where one is blank."""
+
+    cells: Mapping[str, FloatArray]
+    lines: IntArray
+    not_finite: int = 0
+    truncated: bool = False
+
+
+@dataclass(frozen=True)
+class _Text:
+    """How a text is made up: its columns, the mark between cells, that in numbers, and what may be read."""
 
     source: str
-    header: tuple[str, ...]
-    known: tuple[str, ...]
-    slots: IntArray
+    columns: ColumnMap
+    separator: str
+    decimal: str
 
     @property
-    def unknown(self) -> tuple[str, ...]:
-        return tuple(name for name in self.header if name not in self.known)
+    def slots(self) -> dict[str, int]:
+        """Number of each column that is read, in the file."""
+        return {name: self.columns.names.index(one.column) for name, one in self.columns.sources.items()}
 
 
-def _layout(source: str, line: int, header: Iterable[str]) -> _Layout:
-    names = tuple(name.strip() for name in header)
-    if len(names) > _MAX_COLUMNS:
-        raise BadInputError(
-            f"{source}, line {line}: has {len(names)} columns, expected at most {_MAX_COLUMNS}"
-        )
-    for name in ("t_s", *COLUMNS):
-        if names.count(name) > 1:
-            raise BadInputError(f"{source}, line {line}: has the column {name} twice")
-    if "t_s" not in names:
-        found = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
-        hint = ""
-        if len(names) == 1 and any(mark in names[0] for mark in ";\t"):
-            hint = " (columns are separated by commas)"
-        raise BadInputError(f"{source}, line {line}: has no column t_s, found {shown(found[:200])!r}{hint}")
-    known = ("t_s", *(name for name in COLUMNS if name in names))
-    slots = np.array([known.index(name) if name in known else -1 for name in names], dtype=np.int64)
-    return _Layout(source, names, known, slots)
+def _logs(columns: ColumnMap, blocks: Iterator[_Block]) -> Iterator[Log]:
+    """Blocks in SI; the readings of the first tell the units that nobody states."""
+    first = next((block for block in blocks if len(block.lines)), None)
+    if first is None:
+        return
+    known = settled(columns, first.cells)
+    unknown = known.unknown
+    for block in chain([first], blocks):
+        named = {n: known.sources[n].si(kind_of(n), v) for n, v in block.cells.items() if n != "t_s"}
+        t_s = known.sources["t_s"].si("time", block.cells["t_s"])
+        yield Log(known.source, t_s, named, block.lines, known, unknown, block.not_finite, block.truncated)
 
 
-def _number(layout: _Layout, text: str, slot: int, line: int) -> float:
-    """A cell that is not a plain number: NaN for blank, inf for what says nan or inf."""
-    word = text.strip()
+def _number(text: _Text, word: str, column: str, line: int) -> float:
+    """A cell: NaN for blank, inf for what says nan or inf."""
+    word = word.strip()
     if not word:
         return math.nan
-    value = plain_number(word)
+    value = plain_number(word.replace(",", ".") if text.decimal == "," else word)
     if value is None:
         raise BadInputError(
-            f"{layout.source}, line {line}: {layout.known[slot]} is {shown(word[:40])!r}, expected a number"
+            f"{text.source}, line {line}: {column} is {shown(word[:40])!r}, expected a number"
         )
     return value if math.isfinite(value) else math.inf
 
 
-def _cells(layout: _Layout, text: str, line: int) -> list[str]:
+def _split(where: str, line: str, separator: str) -> list[str]:
     try:
-        cells = next(csv.reader([text], strict=True))
+        return next(csv.reader([line], delimiter=separator, strict=True))
     except (csv.Error, StopIteration) as error:
-        raise BadInputError(f"{layout.source}, line {line}: is not comma-separated: {error}") from error
-    if len(cells) != len(layout.header):
-        raise BadInputError(
-            f"{layout.source}, line {line}: has {len(cells)} cells, "
-            f"expected {len(layout.header)} as in the header"
-        )
-    return cells
+        kind = {",": "comma", ";": "semicolon", "\t": "tab"}[separator]
+        raise BadInputError(f"{where}: is not {kind}-separated: {error}") from error
 
 
-def _block(layout: _Layout, text: bytes, first_line: int) -> tuple[Log, int]:
+_PASSED_OVER = re.compile(rb"(?:^|\n)[ \t\r]*(?:[#\n]|$)")
+"""A blank line or a comment."""
+
+
+def _parsed(text: _Text, data: bytes, first_line: int) -> tuple[_Block, int]:
     """Rows of whole lines, and the number of the next line."""
-    from calib.io.cells import POWERS, scan
-
-    raw = np.frombuffer(text, dtype=np.uint8)
-    most = text.count(b"\n")
-    values = np.empty((most, len(layout.known)))
-    lines = np.empty(most, dtype=np.int64)
-    odd = np.empty((text.count(b",") + most + 1, 4), dtype=np.int64)
-    rows, passed, strange = scan(raw, layout.slots, POWERS, values, lines, odd)
-    values, lines = values[:rows], lines[:rows] + first_line
-    for row, slot, start, end in odd[:strange].tolist():
-        piece, line = text[start:end].decode("utf-8", "replace"), int(lines[row])
-        if slot >= 0:
-            values[row, slot] = _number(layout, piece, slot, line)
-            continue
-        for at, cell in zip(layout.slots.tolist(), _cells(layout, piece.rstrip("\r"), line), strict=True):
-            if at >= 0:
-                values[row, at] = _number(layout, cell, at, line)
-    return _log(layout, values, lines), first_line + passed
-
-
-def _log(layout: _Layout, values: FloatArray, lines: IntArray) -> Log:
-    bad = np.nonzero(~np.isfinite(values[:, 0]))[0]
+    count = data.count(b"\n")
+    lines = np.arange(first_line, first_line + count, dtype=np.int64)
+    if _PASSED_OVER.search(data, 0, len(data) - 1):
+        every = data.split(b"\n")[:-1]
+        rows = [n for n, line in enumerate(every) if line.strip() and not line.lstrip().startswith(b"#")]
+        data, lines = b"".join(every[n] + b"\n" for n in rows), lines[rows]
+    block = _by_pyarrow(text, data, lines) or _by_lines(text, data, lines)
+    bad = np.nonzero(~np.isfinite(block.cells["t_s"]))[0]
     if len(bad):
-        raise BadInputError(f"{layout.source}, line {lines[bad[0]]}: has no time t_s, expected a number")
-    # Blank cells are NaN already; words that say nan or inf were read as inf to tell them apart.
+        raise BadInputError(f"{text.source}, line {block.lines[bad[0]]}: has no time t_s, expected a number")
+    return block, first_line + count
+
+
+def _by_pyarrow(text: _Text, data: bytes, lines: IntArray) -> _Block | None:
+    """The rows by pyarrow; None where it declines, or may see other rows than there are lines."""
+    import pyarrow
+    from pyarrow import csv as arrow_csv
+
+    if not len(lines):
+        return None
+    named = [str(k) for k in range(len(text.columns.names))]
+    wanted = {name: str(slot) for name, slot in text.slots.items()}
+    try:
+        table = arrow_csv.read_csv(
+            pyarrow.py_buffer(data),
+            read_options=arrow_csv.ReadOptions(
+                column_names=named, use_threads=False, block_size=len(data) + 1
+            ),
+            parse_options=arrow_csv.ParseOptions(delimiter=text.separator, ignore_empty_lines=False),
+            convert_options=arrow_csv.ConvertOptions(
+                column_types=dict.fromkeys(wanted.values(), pyarrow.float64()),
+                include_columns=list(wanted.values()),
+                null_values=[""],
+                decimal_point=text.decimal,
+            ),
+        )
+    except pyarrow.ArrowInvalid:
+        return None
+    if table.num_rows != len(lines):
+        return None
+    cells, odd = {}, 0
+    for name, number in wanted.items():
+        column = table.column(number)
+        values = np.array(column.to_numpy(), dtype=np.float64)
+        infinite = np.isinf(values)
+        odd += int(np.count_nonzero(np.isnan(values))) - column.null_count + int(np.count_nonzero(infinite))
+        values[infinite] = np.nan
+        cells[name] = values
+    return _Block(cells, lines, odd)
+
+
+def _by_lines(text: _Text, data: bytes, lines: IntArray) -> _Block:
+    """The rows line by line, with a sentence for what cannot be read."""
+    values = np.empty((len(lines), len(text.slots)))
+    count = len(text.columns.names)
+    for row, (raw, line) in enumerate(zip(data.split(b"\n"), lines.tolist(), strict=False)):
+        where = f"{text.source}, line {line}"
+        cells = _split(where, raw.decode("utf-8", "replace").rstrip("\r"), text.separator)
+        if len(cells) != count:
+            raise BadInputError(f"{where}: has {len(cells)} cells, expected {count} as in the header")
+        for k, (name, slot) in enumerate(text.slots.items()):
+            values[row, k] = _number(text, cells[slot], name, line)
     infinite = np.isinf(values)
-    values = np.where(infinite, np.nan, values)
-    columns = {name: np.ascontiguousarray(values[:, k]) for k, name in enumerate(layout.known) if k > 0}
-    return Log(
-        layout.source,
-        np.ascontiguousarray(values[:, 0]),
-        columns,
-        lines,
-        layout.unknown,
-        int(infinite.sum()),
-    )
+    values[infinite] = np.nan
+    cells_of = {name: np.ascontiguousarray(values[:, k]) for k, name in enumerate(text.slots)}
+    return _Block(cells_of, lines, int(infinite.sum()))
 
 
-def _header(stream: BinaryIO, source: str) -> tuple[_Layout, int]:
-    """The layout by the first line that is neither blank nor a comment, and the number of the next."""
-    line, raw = 1, stream.readline(_LONGEST_LINE)
+def _separator(line: str) -> str:
+    """The mark between the cells of a first line, which may hold decimal commas or marks in quotes."""
+    for mark in ";\t":
+        if line.count(mark) > line.count(",") or (mark in line and _numeric(line.split(mark), mark)):
+            return mark
+    return ","
+
+
+def _numeric(cells: Sequence[str], separator: str) -> bool:
+    """Whether cells are those of a row and not of a header."""
+    words = [cell.strip() for cell in cells if cell.strip()]
+    if separator != ",":
+        words = [word.replace(",", ".") for word in words]
+    return bool(words) and all(plain_number(word) is not None for word in words)
+
+
+def _opened(stream: BinaryIO, source: str, path: Path, options: LogOptions) -> tuple[_Text, bytes, int]:
+    """How the text is made up, the beginning of its rows, which was read on the way, and their line.
+
+    The header is the first line that is neither blank nor a comment.
+    """
+    given = options.columns or find_columns(path)
+    file = None if given is None else read_columns_file(given)
+    line, comment, raw = 1, "", stream.readline(_LONGEST_LINE)
     while raw.endswith(b"\n") and (not raw.strip() or raw.lstrip(b"\xef\xbb\xbf").startswith(b"#")):
+        comment = raw.decode("utf-8-sig", "replace").lstrip("#% ").rstrip("\r\n") or comment
         line, raw = line + 1, stream.readline(_LONGEST_LINE)
     where = f"{source}, line {line}"
     if not raw.strip():
@@ -232,108 +289,191 @@ def _header(stream: BinaryIO, source: str) -> tuple[_Layout, int]:
         raise BadInputError(f"{where}: is not UTF-8 text (byte {error.start}), expected a header") from error
     if "\0" in text:
         raise BadInputError(f"{where}: has a zero byte, expected a text file")
-    try:
-        return _layout(source, line, next(csv.reader([text.rstrip("\r\n")], strict=True))), line + 1
-    except csv.Error as error:
-        raise BadInputError(f"{where}: is not comma-separated: {error}") from error
+    separator = (file and file.separator) or _separator(text)
+    names = _split(where, text.rstrip("\r\n"), separator)
+    if len(names) > _MAX_COLUMNS:
+        raise BadInputError(f"{where}: has {len(names)} columns, expected at most {_MAX_COLUMNS}")
+    rows = b""
+    if _numeric(names, separator):
+        names, rows = _without_header(where, path, names, comment, separator, file), raw
+    columns = column_map(source, path, line, names, file, options)
+    start = rows + stream.read(_BLOCK_BYTES)
+    head = start[: 1 << 14].decode("utf-8", "replace")
+    comma = separator != "," and bool(re.search(r"(?:^|[\s;])[-+]?\d+,\d+(?:[eE][-+]?\d+)?(?:$|[\s;])", head))
+    decimal = (file and file.decimal) or ("," if comma else ".")
+    return _Text(source, columns, separator, decimal), start, line if rows else line + 1
 
 
-def iter_rows(stream: BinaryIO, source: str) -> Iterator[Log]:
-    """Blocks of the rows of a CSV log that is open; raises as `iter_log`."""
-    layout, line = _header(stream, source)
+def _without_header(
+    where: str, path: Path, cells: list[str], comment: str, separator: str, file: ColumnsFile | None
+) -> list[str]:
+    """Names of a file's columns that begins with numbers: columns.yaml's or those of the comment above."""
+    numbers = [str(k + 1) for k in range(len(cells))]
+    if file is not None and file.names:
+        if len(file.names) != len(cells):
+            raise BadInputError(
+                f"{where}: has {len(cells)} cells, expected {len(file.names)} as in the names of "
+                f"{shown(file.path)}"
+            )
+        return list(file.names)
+    if file is not None and any(one.column in numbers for one in file.sources.values()):
+        return numbers
+    named = [name.strip() for name in comment.split(separator)]
+    if len(named) == len(cells) and any((known_name(name) or ("",))[0] == "t_s" for name in named):
+        return named
+    raise BadInputError(
+        f"{where}: holds numbers, expected a header; add to {shown(path.with_name('columns.yaml'))} the line "
+        f"names: [t_s, ...] with the names of its {len(cells)} columns"
+    )
+
+
+def iter_rows(
+    stream: BinaryIO, source: str, path: Path | None = None, options: LogOptions = NOTHING_STATED
+) -> Iterator[Log]:
+    """Blocks of the rows of a text log that is open; raises as `iter_log`.
+
+    Parameters
+    ----------
+    path : where it lies, beside which columns.yaml is looked for.
+    """
+    text, data, line = _opened(stream, source, path or Path(source), options)
+    yield from _logs(text.columns, _blocks(text, stream, data, line))
+
+
+def _blocks(text: _Text, stream: BinaryIO, data: bytes, line: int) -> Iterator[_Block]:
     rest = b""
-    while data := stream.read(_BLOCK_BYTES):
+    while data:
         cut = data.rfind(b"\n") + 1
         if cut == 0:
             rest += data
             if len(rest) > 2 * _BLOCK_BYTES:
-                raise BadInputError(f"{source}, line {line}: does not end, expected a text file")
-            continue
-        block, line = _block(layout, rest + data[:cut], line)
-        rest = data[cut:]
-        if len(block):
-            yield block
-    if rest.strip():
-        yield _last(layout, rest, line)
+                raise BadInputError(f"{text.source}, line {line}: does not end, expected a text file")
+        else:
+            block, line = _parsed(text, rest + data[:cut], line)
+            rest = data[cut:]
+            if len(block.lines):
+                yield block
+        data = stream.read(_BLOCK_BYTES)
+    if not rest.strip() or rest.lstrip().startswith(b"#"):
+        return
+    # The last line without its end: a row, or the beginning of one.
+    if rest.count(text.separator.encode()) < len(text.columns.names) - 1:
+        nothing = {name: np.empty(0) for name in text.slots}
+        yield _Block(nothing, np.empty(0, dtype=np.int64), truncated=True)
+    else:
+        yield _parsed(text, rest + b"\n", line)[0]
 
 
-def _iter_csv(path: Path) -> Iterator[Log]:
+def _iter_csv(path: Path, options: LogOptions) -> Iterator[Log]:
     try:
         with path.open("rb") as stream:
-            yield from iter_rows(stream, shown(path))
+            yield from iter_rows(stream, shown(path), path, options)
     except OSError as error:
         raise BadInputError(f"{shown(path)}: cannot be read: {error.strerror or error}") from error
 
 
-def _last(layout: _Layout, text: bytes, line: int) -> Log:
-    """The last line without its end: a row, or the beginning of one."""
-    nothing = _log(layout, np.empty((0, len(layout.known))), np.empty(0, dtype=np.int64))
-    if text.count(b",") < len(layout.header) - 1:
-        return replace(nothing, truncated=True)
-    return _block(layout, text + b"\n", line)[0]
+def _iter_parquet(path: Path, options: LogOptions) -> Iterator[Log]:
+    from pyarrow import parquet
 
-
-def _iter_parquet(path: Path) -> Iterator[Log]:
     source = shown(path)
-    try:
-        parquet: Any = importlib.import_module("pyarrow.parquet")
-    except ImportError as error:
-        raise BadInputError(f"{source}: reading Parquet needs pyarrow: {pip_install('logs')}") from error
+    given = options.columns or find_columns(path)
     try:
         file = parquet.ParquetFile(path, pre_buffer=False)
-        layout = _layout(source, 1, file.schema_arrow.names)
-        first = 1
-        for batch in file.iter_batches(batch_size=65536, columns=list(layout.known)):
-            columns = [_parquet_column(layout, batch.column(name), name) for name in layout.known]
-            values = np.stack(columns, axis=1)
-            values[:, 1:][np.isneginf(values[:, 1:])] = np.inf
-            yield _log(layout, values, np.arange(first, first + len(values), dtype=np.int64))
-            first += len(values)
+        named = read_columns_file(given) if given is not None else None
+        columns = column_map(source, path, 1, file.schema_arrow.names, named, options)
+        yield from _logs(columns, _parquet_blocks(file, columns))
     except (OSError, ValueError) as error:
         if isinstance(error, BadInputError):
             raise
         raise BadInputError(f"{source}: is not a Parquet file that can be read: {error}") from error
 
 
-def _parquet_column(layout: _Layout, column: Any, name: str) -> FloatArray:
+def _parquet_blocks(file: Any, columns: ColumnMap) -> Iterator[_Block]:
+    first, read = 1, [one.column for one in columns.sources.values()]
+    for batch in file.iter_batches(batch_size=65536, columns=read):
+        cells, odd = {}, 0
+        for name, one in columns.sources.items():
+            values = _parquet_column(columns.source, batch.column(one.column), one.column).copy()
+            infinite = np.isinf(values)
+            values[infinite] = np.nan
+            cells[name], odd = values, odd + int(infinite.sum())
+        lines = np.arange(first, first + len(batch), dtype=np.int64)
+        bad = np.nonzero(~np.isfinite(cells["t_s"]))[0]
+        if len(bad):
+            raise BadInputError(f"{columns.source}, line {lines[bad[0]]}: has no time t_s, expected a number")
+        first += len(batch)
+        yield _Block(cells, lines, odd)
+
+
+def _parquet_column(source: str, column: Any, name: str) -> FloatArray:
     try:
         return np.asarray(column.cast("float64").to_numpy(zero_copy_only=False), dtype=np.float64)
     except Exception as error:
-        raise BadInputError(f"{layout.source}: {name} holds {column.type}, expected numbers") from error
+        raise BadInputError(f"{source}: {name} holds {column.type}, expected numbers") from error
 
 
-def iter_log(path: Path, topics: Path | None = None) -> Iterator[Log]:
-    """Blocks of a log in turn, each a `Log` of some ten thousand rows at most; a block may have none.
+def _iter_bag(path: Path, options: LogOptions) -> Iterator[Log]:
+    """A bag's rows, of which what its topics and `options` say are the units."""
+    from calib.io.bags import iter_bag
 
-    CSV, Parquet, a bag (see `calib.io.bags`), of which `topics` may say what is where, or what a board with
-    the sketch sent (`calib.io.serial`).
+    blocks = iter_bag(path, options.topics)
+    first = next(blocks, None)
+    if first is None:
+        return
+    given = options.columns or find_columns(path)
+    file = None if given is None else read_columns_file(given)
+    columns = column_map(first.source, path, 1, ("t_s", *first.columns), file, options)
+    cells = (
+        _Block({"t_s": b.t_s, **b.columns}, b.lines, b.not_finite, b.truncated)
+        for b in chain([first], blocks)
+    )
+    yield from (replace(log, unknown=first.unknown) for log in _logs(columns, cells))
+
+
+def log_of(source: str, path: Path, cells: Mapping[str, FloatArray], options: LogOptions) -> Log:
+    """A log of columns (n,) by name, `t_s` among them, that were read from a file of another kind.
+
+    Raises `BadInputError` for units that contradict the readings.
+    """
+    given = options.columns or find_columns(path)
+    file = None if given is None else read_columns_file(given)
+    columns = column_map(source, path, 1, tuple(cells), file, options)
+    lines = np.arange(1, len(cells["t_s"]) + 1, dtype=np.int64)
+    (log,) = _logs(columns, iter([_Block(cells, lines)]))
+    return log
+
+
+def iter_log(path: Path, options: LogOptions = NOTHING_STATED) -> Iterator[Log]:
+    """Blocks of a log in turn, each a `Log` of some ten thousand rows at most.
+
+    Text, Parquet, a bag (see `calib.io.bags`), or what a board with the sketch sent (`calib.io.serial`).
 
     Raises
     ------
     BadInputError
-        For a file that cannot be read, has no `t_s`, a row without time or with too few cells, or a cell
-        that is no number: with the number of the line.
+        For a file that cannot be read, has no time, a row without time or with too few cells, or a cell that
+        is no number, with the number of the line; for units that are not known or contradict the readings.
     """
-    from calib.io.bags import is_bag, iter_bag
+    from calib.io.bags import is_bag
     from calib.io.serial import STREAMS, iter_stream
 
     if is_bag(path):
-        return iter_bag(path, topics)
-    if topics is not None:
+        return _iter_bag(path, options)
+    if options.topics is not None:
         raise BadInputError(f"{shown(path)}: has columns, expected a bag where topics are given")
     ending = path.suffix.lower()
     if ending in STREAMS:
         return iter_stream(path)
-    return _iter_parquet(path) if ending == ".parquet" else _iter_csv(path)
+    return _iter_parquet(path, options) if ending == ".parquet" else _iter_csv(path, options)
 
 
-def read_log(path: Path, topics: Path | None = None) -> Log:
+def read_log(path: Path, options: LogOptions = NOTHING_STATED) -> Log:
     """A whole log, of at most 200 million cells that are read.
 
     Raises `BadInputError` as `iter_log`, and for a log without rows or with more cells.
     """
     blocks, cells = list[Log](), 0
-    for block in iter_log(path, topics):
+    for block in iter_log(path, options):
         blocks.append(block)
         cells += len(block) * (2 + len(block.columns))
         if cells > _MOST_CELLS:
@@ -341,17 +481,16 @@ def read_log(path: Path, topics: Path | None = None) -> Log:
                 f"{shown(path)}: has more than {_MOST_CELLS // 1_000_000} million cells, which is more than "
                 "is read at once; cut it into parts"
             )
-    if not sum(len(block) for block in blocks):
+    if not blocks:
         raise BadInputError(f"{shown(path)}: has a header but no rows")
     first = blocks[0]
-    return Log(
-        first.source,
-        np.concatenate([block.t_s for block in blocks]),
-        {name: np.concatenate([block.columns[name] for block in blocks]) for name in first.columns},
-        np.concatenate([block.lines for block in blocks]),
-        first.unknown,
-        sum(block.not_finite for block in blocks),
-        blocks[-1].truncated,
+    return replace(
+        first,
+        t_s=np.concatenate([block.t_s for block in blocks]),
+        columns={name: np.concatenate([block.columns[name] for block in blocks]) for name in first.columns},
+        lines=np.concatenate([block.lines for block in blocks]),
+        not_finite=sum(block.not_finite for block in blocks),
+        truncated=blocks[-1].truncated,
     )
 
 
@@ -368,15 +507,15 @@ def log_text(log: Log) -> str:
     return ",".join(["t_s", *names]) + "\n" + table_bytes(values, kinds).decode()
 
 
-def _parquet_bytes(log: Log, path: Path) -> bytes:
-    try:
-        arrow: Any = importlib.import_module("pyarrow")
-        parquet: Any = importlib.import_module("pyarrow.parquet")
-    except ImportError as error:
-        raise BadInputError(f"{shown(path)}: writing Parquet needs pyarrow: {pip_install('logs')}") from error
+def _parquet_bytes(log: Log) -> bytes:
+    import pyarrow
+    from pyarrow import parquet
+
     table = {"t_s": log.t_s, **{name: log.columns[name] for name in COLUMNS if name in log.columns}}
     sink = io.BytesIO()
-    parquet.write_table(arrow.table({k: arrow.array(v, from_pandas=True) for k, v in table.items()}), sink)
+    parquet.write_table(
+        pyarrow.table({k: pyarrow.array(v, from_pandas=True) for k, v in table.items()}), sink
+    )
     return sink.getvalue()
 
 
@@ -386,4 +525,4 @@ def write_log(path: Path, log: Log) -> None:
     Raises `BadInputError` where the place cannot be written.
     """
     parquet = path.suffix.lower() == ".parquet"
-    write_atomically(path, _parquet_bytes(log, path) if parquet else log_text(log))
+    write_atomically(path, _parquet_bytes(log) if parquet else log_text(log))

@@ -178,14 +178,11 @@ class CsvStates:
 class ParquetStates:
     """Row groups of some hundred thousand rows; counts are integers, NaN is null."""
 
-    def __init__(self, stream: IO[bytes], names: tuple[str, ...], path: Path) -> None:
-        try:
-            self._arrow: Any = importlib.import_module("pyarrow")
-            parquet: Any = importlib.import_module("pyarrow.parquet")
-        except ImportError as error:
-            raise BadInputError(
-                f"{shown(path)}: writing Parquet needs pyarrow: {pip_install('logs')}"
-            ) from error
+    def __init__(self, stream: IO[bytes], names: tuple[str, ...]) -> None:
+        import pyarrow
+        from pyarrow import parquet
+
+        self._arrow: Any = pyarrow
         kinds = {True: self._arrow.int64(), False: self._arrow.float64()}
         self._schema = self._arrow.schema([(name, kinds[is_whole(name)]) for name in names])
         # Values hardly repeat, so a dictionary saves nothing; their first bytes do, which this encoding puts
@@ -230,7 +227,7 @@ class ParquetStates:
 def _opened(path: Path, stream: IO[bytes], names: tuple[str, ...]) -> StatesFile:
     ending = path.suffix.lower()
     if ending == ".parquet":
-        return ParquetStates(stream, names, path)
+        return ParquetStates(stream, names)
     if ending == ".mcap":
         return McapStates(stream, names, path)
     return CsvStates(stream, names)

@@ -40,6 +40,7 @@ _LIBRARIES = (
     ("filterpy", "filterpy", (2, 0)),
     ("matplotlib", "matplotlib", (3, 9)),
     ("numba", "numba", (0, 60)),
+    ("pyarrow", "pyarrow", (15, 0)),
     ("typer", "typer", (0, 20)),
     ("pydantic", "pydantic", (2, 8)),
     ("pyyaml", "yaml", (6, 0)),
@@ -49,7 +50,6 @@ _LIBRARIES = (
 """Distribution, module and least version of what every installation has."""
 
 _EXTRAS = (
-    ("pyarrow", "pyarrow", f"logs in Parquet: {pip_install('logs')}"),
     ("mcap", "mcap", f"logs and states in MCAP: {pip_install('logs')}"),
     ("rosbags", "rosbags", f"logs in ROS bags: {pip_install('logs')}"),
     ("pyserial", "serial", f"calib record: {pip_install('serial')}"),

@@ -30,7 +30,8 @@ import yaml
 from calib.core.arrays import FloatArray
 from calib.core.rig import Rig
 from calib.io.cells import GENERAL, TIME, table_bytes
-from calib.io.logs import COLUMNS, TRUE, Log, iter_log
+from calib.io.columns import COLUMNS, TRUE
+from calib.io.logs import Log, iter_log
 from calib.io.states import STATES, states_writer
 from calib.stages.estimator.consistency import Tally
 from calib.stages.estimator.kinematic import OUT

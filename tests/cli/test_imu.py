@@ -41,6 +41,8 @@ def _called(name: str) -> Callable[..., None]:
 
 
 static, intrinsics = _called("imu static"), _called("imu intrinsics")
+ZEROS = "".join(f"{i / 100},0,0,0,0,0,0\n" for i in range(200))
+BLANKS = ZEROS.replace(",0", ",nan")
 HEAD = "t_s,gx_radps,gy_radps,gz_radps,ax_mps2,ay_mps2,az_mps2\n"
 
 
@@ -139,8 +141,11 @@ def test_units_are_refused_and_then_converted(tmp_path: Path) -> None:
     [
         ("t_s,u_px\n0,1\n1,2\n", "log.csv: has no IMU"),
         (HEAD + "0,0,0,0,0,0,9.8\n", "log.csv: has 1 IMU sample"),
-        (HEAD + "".join(f"{i},0,0,0,0,0,0\n" for i in range(200)), "log.csv: all IMU readings are zero"),
-        (HEAD + "".join(f"{i},nan,nan,nan,nan,nan,nan\n" for i in range(200)), "hold no number"),
+        (
+            HEAD + ZEROS,
+            "log.csv: all IMU readings are zero",
+        ),
+        (HEAD + BLANKS, "hold no number"),
         (HEAD + "1,0,0,0,9,1,1\n0,0.1,0,0,9,1,1\n", "log.csv, line 3: t_s goes back"),
     ],
 )
@@ -235,11 +240,11 @@ def test_units_are_refused_and_then_converted_in_imu_intrinsics(tmp_path: Path) 
     [
         ("t_s,u_px\n0,1\n1,2\n", "log.csv: has no IMU"),
         (
-            HEAD_IMU_INTRINSICS + "".join(f"{i},0,0,0,0,0,0\n" for i in range(200)),
+            HEAD_IMU_INTRINSICS + ZEROS,
             "log.csv: all IMU readings are zero",
         ),
         (
-            HEAD_IMU_INTRINSICS + "".join(f"{i},nan,nan,nan,nan,nan,nan\n" for i in range(200)),
+            HEAD_IMU_INTRINSICS + BLANKS,
             "hold no number",
         ),
         (HEAD_IMU_INTRINSICS + "1,0,0,0,9,1,1\n0,0.1,0,0,9,1,1\n", "log.csv, line 3: t_s goes back"),
@@ -353,8 +358,14 @@ _STUCK = HEAD + "".join(f"{i / 100},0,0,{i % 7 / 1000},9.8,0.2,{i % 5 / 10}\n" f
     ("text", "words"),
     [
         ("t_s,u_px\n0,1\n1,2\n", "log.csv: has no IMU"),
-        (HEAD + "".join(f"{i},0,0,0,0,0,0\n" for i in range(200)), "log.csv: all IMU readings are zero"),
-        (HEAD + "".join(f"{i},nan,nan,nan,nan,nan,nan\n" for i in range(200)), "has no readings in gz_radps"),
+        (
+            HEAD + ZEROS,
+            "log.csv: all IMU readings are zero",
+        ),
+        (
+            HEAD + BLANKS,
+            "gz_radps, ax_mps2 and ay_mps2 hold no number",
+        ),
         (HEAD + "0,0,0,0,9.8,0,0\n0.01,0,0,0.01,9.81,0.1,0\n", "log.csv: is 0.02 s long"),
     ],
 )

@@ -20,7 +20,8 @@ from hypothesis import strategies as st
 from calib.core.files import hash_of
 from calib.core.result import identity
 from calib.core.rig import Rig
-from calib.io.logs import MEASURED, Log, read_log, write_log
+from calib.io.columns import MEASURED
+from calib.io.logs import Log, read_log, write_log
 from calib.io.serial import Frame, encoded
 from calib.stages.firmware.header import Header, header_of, identity_of
 from calib.stages.firmware.vectors import vectors

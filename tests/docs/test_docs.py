@@ -25,7 +25,7 @@ from calib.cli.app import app
 from calib.cli.docs import MANUAL, docs, manual, page_of, slug, write_manual
 from calib.core.errors import DISTRIBUTION, UsageError, pip_install
 from calib.core.rig import KINDS
-from calib.io.logs import COLUMNS
+from calib.io.columns import COLUMNS
 from calib.io.states import STATES
 from calib.twin.scenarios import SCENARIOS
 

@@ -14,7 +14,7 @@ from scipy.optimize import brentq
 from scipy.signal import bessel, butter, group_delay, sos2tf, sosfilt, sosfreqz
 
 from calib.core.errors import BadInputError
-from calib.io.logs import write_log
+from calib.io.logs import read_log, write_log
 from calib.stages.actuator.kinematics import marker_from_head
 from calib.stages.lowpass.filters import (
     FAMILIES,
@@ -339,7 +339,7 @@ def test_positions_are_the_markers_on_the_plane(tmp_path: Path) -> None:
     run = run_scenario(make_scenario("ellipse"), rig, 2, "sensors", 8.0)
     log = log_of(run)
     write_log(tmp_path / "log.csv", log)
-    seen = positions_from_log(tmp_path / "log.csv", 60.0, rig.view.camera, _plane(rig))
+    seen = positions_from_log(read_log(tmp_path / "log.csv"), 60.0, rig.view.camera, _plane(rig))
     assert (seen.unit, seen.names) == ("m", ("x", "y"))
     piece = seen.ticks.longest
     truth = {name: log.columns[f"true_{name}"] for name in ("x_m", "y_m", "phi_rad")}

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from calib.core.arrays import FloatArray
 from calib.core.plot import Arrows, Curve, Figure, Plot, Text, magnified, short
 from calib.core.verdict import Verdict, Word
-from calib.io.logs import Log, write_log
+from calib.io.logs import Log, read_log, write_log
 from calib.show.draw import draw, plain, write_figures
 from calib.stages import function, stage
 from calib.stages.actuator.identify_pump import Group, fit_static_map
@@ -257,7 +257,7 @@ def _positions(folder: Path, still: bool = False, n: int = 3000) -> Positions:
     u = np.round(150 + 30 * np.sin(0.4 * t) * (t > 20) + 0.4 * noise[0])
     v = np.round(90 + 0.4 * noise[1])
     write_log(folder / "log.csv", Log("log.csv", t, {"u_px": u, "v_px": v}, np.arange(n)))
-    return positions_from_log(folder / "log.csv", 60.0, None, None)
+    return positions_from_log(read_log(folder / "log.csv"), 60.0, None, None)
 
 
 def _lens(camera: Camera) -> dict[str, Figure]:

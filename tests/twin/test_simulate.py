@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from calib.core.errors import BadInputError, UsageError
-from calib.io.logs import COLUMNS, log_text
+from calib.io.columns import COLUMNS
+from calib.io.logs import log_text
 from calib.stages.actuator import simulate as integrate
 from calib.stages.actuator.parameters import Plant, Stiffness
 from calib.stages.actuator.simulate import rig_at_rest

@@ -15,7 +15,8 @@ from calib.core.errors import BadInputError
 from calib.core.files import read_text, shown
 from calib.core.rig import Rig
 from calib.core.units import plain_number
-from calib.io.logs import Log, check_time, read_log
+from calib.io.logs import Log, read_log
+from calib.io.signals import check_time
 from calib.stages.actuator.identify import Start, Track, without_outliers
 from calib.stages.actuator.identify_pump import PumpRecord
 from calib.stages.actuator.machine import Machine
@@ -515,7 +516,7 @@ def read_track(
     no marker, or a rig without camera or plane where the pictures are needed.
     """
     log = read_log(path)
-    said = log.passed_over()
+    said = log.remarks()
     _check_clock(log)
     begin, tick_s, pwm = _commands(log, no_pwm)
     delay_s = 0.0

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.core.arrays import FloatArray
+from calib.core.arrays import BoolArray
 from calib.core.errors import BadInputError
 from calib.core.rig import Geometry, Rig
-from calib.io.logs import Log, check_time, read_log
+from calib.io.logs import Log
 from calib.stages.align.solve import AlignLog, Settings
 from calib.stages.estimator.noise import grid_px
 from calib.stages.estimator.sensors import sensor_values, view_coefficients
@@ -36,69 +36,53 @@ PRIOR: dict[str, tuple[float, float]] = {
 _LEAST_SHIFT_M = 1e-5
 _LEAST_BIAS_MPS2 = 0.02
 _LEAST_SCALE = 5e-4
-_FASTEST_RADPS = 45.0
 _ABOUT_G = (4.0, 25.0)
-_IN_G = (0.85, 1.15)
+_ACCEL = ("ax_mps2", "ay_mps2")
 
 
-def _column(log: Log, name: str) -> FloatArray:
-    return log.columns[name] if name in log.columns else np.full(len(log), np.nan)
+def align_log(log: Log, image_size_px: tuple[int, int]) -> tuple[AlignLog | None, list[str]]:
+    """Pictures and IMU samples of a log, and sentences on what was passed over.
 
+    None where the log has no picture or no gyroscope, of which a sentence says so.
 
-def _check_imu(source: str, readings: FloatArray) -> None:
-    gz = readings[np.isfinite(readings[:, 2]), 2]
-    if len(gz) and not np.ptp(gz) > 0.0:
-        raise BadInputError(f"{source}: gz_radps is always {gz[0]:g}, expected the noise of a sensor")
-    if len(gz) and float(np.abs(gz).max()) > _FASTEST_RADPS:
-        raise BadInputError(
-            f"{source}: gz_radps reaches {float(np.abs(gz).max()):.4g}, so it is in deg/s, expected rad/s"
-        )
+    Raises `BadInputError` for time that runs backwards, and sensors that are stuck or contradict each other.
+    """
+    remarks: list[str] = []
+    camera = log.signals("u_px", "v_px") if len(log.sampled("u_px", "v_px")) else None
+    inside: BoolArray = np.zeros(0, dtype=np.bool_)
+    if camera is not None:
+        width, height = image_size_px
+        at = camera.values
+        inside = np.all((at >= -0.5) & (at <= np.array([width, height]) - 0.5), axis=1)
+        if not inside.all():
+            remarks.append(
+                f"{log.source}: {int((~inside).sum())} pictures put the marker outside the image; they count "
+                "as blank"
+            )
+    if not len(log.sampled("gz_radps")):
+        return None, [*remarks, f"{log.source}: has no gyroscope (gz_radps), which an alignment needs"]
+    if camera is None or not inside.any():
+        lacking = f"{log.source}: has no picture of the marker (u_px, v_px), which an alignment needs"
+        return None, [*remarks, lacking]
+    imu = log.signals("gz_radps", optional=_ACCEL, partly=True)
+    imu.refuse_stuck(*imu.names)
+    imu.refuse_mirrored()
+    readings = np.full((len(imu), 3), np.nan)
+    for k, name in enumerate((*_ACCEL, "gz_radps")):
+        if name in imu.names:
+            readings[:, k] = imu[name]
     both = np.isfinite(readings[:, :2]).all(axis=1)
     if not both.any():
-        return
-    norm = float(np.median(np.hypot(readings[both, 0], readings[both, 1])))
-    if _IN_G[0] <= norm <= _IN_G[1]:
-        raise BadInputError(
-            f"{source}: ax_mps2 and ay_mps2 are {norm:.3g} together, so they are in g, expected m/s^2"
-        )
-    if not _ABOUT_G[0] <= norm <= _ABOUT_G[1]:
-        raise BadInputError(
-            f"{source}: ax_mps2 and ay_mps2 are {norm:.4g} together, expected about 9.81 m/s^2: an IMU whose "
-            "x and y axes lie in the plane"
-        )
-
-
-def read_align_log(path: Path, image_size_px: tuple[int, int]) -> tuple[AlignLog | None, list[str]]:
-    """Pictures and IMU samples of a file, and sentences on what was passed over.
-
-    None where the log has no picture or no IMU sample, of which a sentence says so.
-
-    Raises `BadInputError` for a file that is no log, time that runs backwards, and other units.
-    """
-    log = read_log(path)
-    check_time(log)
-    said = log.passed_over()
-    pixels = np.stack([_column(log, "u_px"), _column(log, "v_px")], axis=1)
-    seen = np.isfinite(pixels).all(axis=1)
-    width, height = image_size_px
-    inside = seen & (pixels >= -0.5).all(axis=1) & (pixels <= np.array([width, height]) - 0.5).all(axis=1)
-    if (seen & ~inside).any():
-        count = int((seen & ~inside).sum())
-        said.append(f"{log.source}: {count} pictures put the marker outside the image; they count as blank")
-    names = ("ax_mps2", "ay_mps2", "gz_radps")
-    readings = np.stack([_column(log, name) for name in names], axis=1)
-    readings = np.where(np.isfinite(readings), readings, np.nan)
-    felt = np.isfinite(readings).any(axis=1)
-    if not np.isfinite(readings[:, 2]).any():
-        said.append(f"{log.source}: has no gyroscope (gz_radps), which an alignment needs")
-        return None, said
-    if not inside.any():
-        said.append(f"{log.source}: has no picture of the marker (u_px, v_px), which an alignment needs")
-        return None, said
-    _check_imu(log.source, readings)
-    if not np.isfinite(readings[:, :2]).any():
-        said.append(f"{log.source}: has no accelerometer; the mount angle stays unknown")
-    return AlignLog(log.source, log.t_s[inside], pixels[inside], log.t_s[felt], readings[felt]), said
+        remarks.append(f"{log.source}: has no accelerometer; the mount angle stays unknown")
+    else:
+        norm = float(np.median(np.hypot(readings[both, 0], readings[both, 1])))
+        if not _ABOUT_G[0] <= norm <= _ABOUT_G[1]:
+            raise BadInputError(
+                f"{log.source}: ax_mps2 and ay_mps2 are {norm:.4g} together, expected about 9.81 m/s^2: an "
+                "IMU whose x and y axes lie in the plane"
+            )
+    pictures = camera.stamps_s[inside], camera.values[inside]
+    return AlignLog(log.source, *pictures, imu.stamps_s, readings), remarks
 
 
 def _prior(rig: Rig) -> dict[str, tuple[float, float]]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from calib.core.errors import BadInputError
-from calib.core.stage import Files, Stage, option
+from calib.core.stage import Files, LogOptions, Stage, option
 from calib.core.units import parse_length_m
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class AlignOptions:
+class AlignOptions(LogOptions):
     """What a person has measured."""
 
     marker_offset_m: float | None = option(
@@ -41,22 +41,19 @@ class AlignInputs:
 
 def _read(files: Files, rig: Rig, options: AlignOptions) -> AlignInputs:
     from calib.core.rig import Geometry
-    from calib.stages.align.read import read_align_log, settings_from_rig
+    from calib.stages.align.read import align_log, settings_from_rig
 
     rig.current_plane(files.rig_path)
     assert rig.camera is not None
     width, height = rig.camera.image_size_px
     logs: list[AlignLog] = []
-    remarks: list[str] = []
     for path in files.paths:
-        log, sentences = read_align_log(path, (width, height))
-        remarks += sentences
+        log, remarks = align_log(files.log(path, options), (width, height))
+        files.remarks += remarks
         if log is not None:
             logs.append(replace(log, source=files.taken(path)))
     if not logs:
-        raise BadInputError(remarks[-1])
-    for sentence in remarks:
-        files.narrate(sentence)
+        raise BadInputError(files.remarks[-1])
     settings = settings_from_rig(rig, files.rig_path, logs, options.marker_offset_m)
     drawn = None if options.marker_offset_m is not None else rig.geometry or Geometry()
     return AlignInputs(logs, settings, drawn)

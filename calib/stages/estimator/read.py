@@ -14,6 +14,7 @@ from calib.core.errors import BadInputError
 from calib.core.files import shown
 from calib.core.result import CovarianceTable
 from calib.core.rig import Geometry, Rig
+from calib.core.stage import LogOptions
 from calib.io.logs import Log, iter_log
 from calib.stages.actuator.section import Standing, standing
 from calib.stages.align.section import SENSORS_OF, Align, AlignCovariance
@@ -139,7 +140,7 @@ def blocks(path: Path, topics: Path | None = None) -> Iterator[Log]:
     Raises `BadInputError` for one without rows, camera and IMU.
     """
     rows, known = 0, False
-    for block in iter_log(path, topics):
+    for block in iter_log(path, LogOptions(topics=topics)):
         if not known and not any(name in block.columns for name in _READINGS):
             raise BadInputError(
                 f"{shown(path)}: has neither camera nor IMU, expected columns as u_px, v_px or gz_radps"

@@ -389,7 +389,7 @@ def analyse_drift(
         if axis not in log.axes:
             raise BadInputError(f"{log.source}: has no readings of {axis}, expected gz, ax and ay")
     gyro = is_gyro(log.axes)
-    sampling, every = regular_parts(log.t_s, log.values, gyro, log.source)
+    sampling, every = regular_parts(log.t_s, log.values, gyro, log.source, log.repeated_rows)
     period_s = sampling.period_s
     parts = tuple(part for part in every if len(part.values) * period_s >= _SHORTEST_S)
     if not parts:

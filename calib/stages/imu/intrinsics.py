@@ -837,6 +837,7 @@ class PoseLog:
     t_s : (n,) time stamps that do not go back.
     values : (n, axes) finite readings.
     accel_unit, gyro_unit : "m/s2" or "counts", "rad/s" or "counts".
+    repeated_rows : that were written twice and are left out. findings : on the sensors.
     """
 
     source: str
@@ -845,6 +846,8 @@ class PoseLog:
     values: FloatArray
     accel_unit: str = "m/s2"
     gyro_unit: str = "rad/s"
+    repeated_rows: int = 0
+    findings: tuple[Finding, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -1020,7 +1023,7 @@ def find_intrinsics(log: PoseLog, gravity_mps2: float = 9.80665, planar: bool = 
     """
     columns = _columns(log, planar)
     gyro_axes = is_gyro(log.axes)
-    sampling, parts = regular_parts(log.t_s, log.values, gyro_axes, log.source)
+    sampling, parts = regular_parts(log.t_s, log.values, gyro_axes, log.source, log.repeated_rows)
     si = log.accel_unit != "counts"
     s = spread(parts, columns, sampling.period_s)
     quiet = quiet_level(s, sampling.step[columns])
@@ -1326,4 +1329,4 @@ def _of_sensors(result: Intrinsics) -> Iterator[Finding]:
 
 def judge_intrinsics(result: Intrinsics) -> Verdict:
     """Verdict of a calibration of an IMU."""
-    return Verdict.of([*_of_log(result), *_of_plane(result), *_of_sensors(result)])
+    return Verdict.of([*_of_log(result), *_of_plane(result), *_of_sensors(result), *result.log.findings])

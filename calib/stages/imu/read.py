@@ -17,7 +17,11 @@ from calib.core.errors import BadInputError
 from calib.core.files import as_text, read_bytes, shown
 from calib.core.geometry import apply_homography
 from calib.core.rig import Rig
-from calib.io.logs import ROWS_MISSING, Log, check_time, read_log
+from calib.core.stage import LogOptions
+from calib.core.verdict import Finding
+from calib.io.columns import ACCEL, GYRO
+from calib.io.logs import Log, log_of
+from calib.io.signals import IMU, IN_PLANE, Signals
 from calib.solve.clock import Part
 from calib.stages.actuator.kinematics import MARKER_OFFSET_M
 from calib.stages.camera.model import Camera, undistort
@@ -34,114 +38,48 @@ from calib.stages.imu.static import AXES, RestLog, is_gyro
 from calib.stages.imu.tracks import DriftLog, on_grid, planar_rate, up_vector
 from calib.stages.imu.tuning import DATA_SHEET, SHORTEST_S, Noise, Piece, smooth_log
 
-# ----------------------------------------------------------------------
-# Readings of an IMU at rest from logs, in SI, with what is wrong about them said in a sentence.
-#
-# A sensor at rest feels g, so that specific forces in g or in raw counts give themselves away, and no
-# sensor turns faster or is louder at rest than the limits below, so that deg/s do.
-
-ACCEL_UNITS = {"m/s2": 1.0, "g": 9.80665}
-GYRO_UNITS = {"rad/s": 1.0, "deg/s": math.pi / 180.0}
-
-_COLUMN = {axis: f"{axis}_{'radps' if axis[0] == 'g' else 'mps2'}" for axis in AXES}
-_FASTEST_RADPS = 45.0
-_LARGEST_BIAS_RADPS = 0.35
-_ABOUT_G = (8.3, 11.3)
+_AXIS = dict(zip(IMU, AXES, strict=True))
+"""Axes by column."""
 
 
-def _axes(log: Log) -> tuple[str, ...]:
-    named = [axis for axis in AXES if _COLUMN[axis] in log.columns]
-    if not named:
+def _readings(log: Log, *needed: str, counts: bool = False) -> Signals:
+    """Readings of an IMU: the columns needed and all others of it that the log has, in the order of `IMU`.
+
+    Raises `BadInputError` for a log without them, and for readings that are all zero.
+    """
+    there = [name for name in IMU if name in needed or np.isfinite(log.columns.get(name, np.nan)).any()]
+    if not any(name in log.columns for name in IMU):
         raise BadInputError(
             f"{log.source}: has no IMU, expected columns as gz_radps, ax_mps2 and ay_mps2 beside t_s"
         )
-    axes = tuple(axis for axis in named if bool(np.isfinite(log.columns[_COLUMN[axis]]).any()))
-    if not axes:
-        raise BadInputError(
-            f"{log.source}: the IMU's columns {', '.join(_COLUMN[a] for a in named)} hold no number"
-        )
-    return axes
-
-
-def _check_changes(log: Log, axes: tuple[str, ...], values: FloatArray) -> None:
-    if len(values) < 2:
-        raise BadInputError(f"{log.source}: has {len(values)} IMU sample, expected a log of minutes at rest")
-    if not values.any():
+    if not there:
+        raise BadInputError(f"{log.source}: the IMU's columns hold no number")
+    signals = log.signals(*there, optional=IMU, counts=counts)
+    if len(signals) < 2:
+        raise BadInputError(f"{log.source}: has {len(signals)} IMU sample, expected a log of some seconds")
+    if not signals.values.any():
         raise BadInputError(f"{log.source}: all IMU readings are zero, expected noise and gravity")
-    if not np.ptp(values, axis=0).any():
+    return signals
+
+
+def _angle(log: Log, name: str) -> tuple[FloatArray, FloatArray]:
+    """Times (k,) and readings (k,) of an angle, empty where it is not logged."""
+    rows = log.sampled(name)
+    return log.t_s[rows], log.columns[name][rows] if len(rows) else np.zeros(0)
+
+
+def rest_log(log: Log) -> RestLog:
+    """The IMU's readings of a log at rest. Raises `BadInputError` for readings that never change."""
+    signals = _readings(log)
+    if signals.stuck == signals.names:
         raise BadInputError(
-            f"{log.source}: no IMU reading ever changes ({', '.join(axes)}), expected noise of a sensor"
+            f"{log.source}: no IMU reading ever changes ({', '.join(signals.names)}), expected noise"
         )
-
-
-def _check_units(log: Log, axes: tuple[str, ...], values: FloatArray, t_s: FloatArray) -> None:
-    gyro = is_gyro(axes)
-    middle = np.median(values, axis=0)
-    if int((~gyro).sum()) == 3:
-        norm = float(np.median(np.linalg.norm(values[:, ~gyro], axis=1)))
-        if 0.85 <= norm <= 1.15:
-            raise BadInputError(
-                f"{log.source}: the specific force at rest is {norm:.4g}, so it is in g, expected m/s^2; "
-                "give --acc-unit g"
-            )
-        if not _ABOUT_G[0] <= norm <= _ABOUT_G[1]:
-            kind = "raw counts" if norm > 150.0 else "no unit that is known here"
-            raise BadInputError(
-                f"{log.source}: the specific force at rest is {norm:.4g} ({kind}), expected about 9.81 m/s^2"
-            )
-    if not gyro.any():
-        return
-    rates = values[:, gyro]
-    period = max(float(np.median(np.diff(t_s))), 1e-6)
-    places = np.arange(len(rates))
-    quiet = float(quiet_spread((Part(t_s, rates, places, places),), period).max())
-    largest, bias = float(np.abs(rates).max()), float(np.abs(middle[gyro]).max())
-    why = ""
-    if largest > _FASTEST_RADPS:
-        why = f"reaches {largest:.4g}"
-    elif bias > _LARGEST_BIAS_RADPS:
-        why = f"has a bias of {bias:.3g}"
-    elif quiet > MOST_GYRO_RADPS:
-        why = f"is never quieter than {quiet:.3g}"
-    if why:
-        raise BadInputError(
-            f"{log.source}: the gyroscope {why}, which no gyroscope at rest does in rad/s; if it is in "
-            "deg/s, give --gyro-unit deg/s"
-        )
-
-
-def rest_log(log: Log, acc_unit: str = "m/s2", gyro_unit: str = "rad/s") -> RestLog:
-    """The IMU's readings of a log in SI.
-
-    Raises
-    ------
-    BadInputError for a log without an IMU or without readings, whose time runs backwards, whose readings
-    never change, and for units that are obviously others.
-    """
-    axes = _axes(log)
-    rows = log.sampled(*(_COLUMN[axis] for axis in axes))
-    if len(rows) == 0:
-        raise BadInputError(
-            f"{log.source}: no row has all of {', '.join(_COLUMN[a] for a in axes)}, expected them together"
-        )
-    check_time(log)
-    factor = np.where(is_gyro(axes), GYRO_UNITS[gyro_unit], ACCEL_UNITS[acc_unit])
-    values = np.stack([log.columns[_COLUMN[axis]][rows] for axis in axes], axis=1) * factor
-    t_s = log.t_s[rows]
-    _check_changes(log, axes, values)
-    _check_units(log, axes, values, t_s)
-    chip = log.sampled("onchip_phi_rad")
-    angle = log.columns["onchip_phi_rad"][chip] if len(chip) else np.zeros(0)
-    return RestLog(log.source, axes, t_s, values, log.t_s[chip], angle)
-
-
-def read_rest_log(
-    path: Path, acc_unit: str = "m/s2", gyro_unit: str = "rad/s"
-) -> tuple[RestLog, Sequence[str]]:
-    """`rest_log` of a file, and sentences about what was passed over in it."""
-    log = read_log(path)
-    said = log.passed_over(ROWS_MISSING)
-    return rest_log(log, acc_unit, gyro_unit), said
+    axes = tuple(_AXIS[name] for name in signals.names)
+    return RestLog(
+        log.source, axes, signals.stamps_s, signals.values, *_angle(log, "onchip_phi_rad"),
+        signals.repeated_rows, signals.findings,
+    )  # fmt: skip
 
 
 # ----------------------------------------------------------------------
@@ -198,175 +136,25 @@ def lag_of(late_t_s: FloatArray, late_rad: FloatArray, t_s: FloatArray, phi_rad:
     return float(_LAGS_S[k] + (0.5 * 0.001 * (a - c) / bend if bend > 0.0 else 0.0))
 
 
-# ----------------------------------------------------------------------
-# Readings of an IMU from logs in which it may move, in SI, with what is wrong about them said.
-#
-# A sensor in motion is no measure of its own units, so the calmest tenth of the log is looked at: there
-# the specific force is about g. The gyroscope has to turn about as far as the accelerometer's angle within
-# a second; in deg/s it turns 57 times as far. Where the log is at rest throughout, the limits of its noise
-# and bias hold as well.
+def drift_log(log: Log) -> DriftLog:
+    """The IMU's readings and the angles of a log in which it may move.
 
-_DRIFTLOGS_COLUMN = {f"a{x}": f"a{x}_mps2" for x in "xyz"} | {f"g{x}": f"g{x}_radps" for x in "xyz"}
-_ORDER = ("gx", "gy", "gz", "ax", "ay", "az")
-_NEEDED = ("gz", "ax", "ay")
-_DRIFTLOGS_FASTEST_RADPS = 45.0
-_DRIFTLOGS_LARGEST_BIAS_RADPS = 0.35
-_DRIFTLOGS_ABOUT_G = (7.0, 13.0)
-_CALM = 0.1
-_WINDOW = 50
-_FARTHER = 12.0
-_LEAST_TURN_RAD = 0.05
-_REST_RAD = 0.02
-
-
-def _driftlogs_axes(log: Log) -> tuple[str, ...]:
-    named = [axis for axis in _ORDER if _DRIFTLOGS_COLUMN[axis] in log.columns]
-    if not named:
-        raise BadInputError(
-            f"{log.source}: has no IMU, expected columns as gz_radps, ax_mps2 and ay_mps2 beside t_s"
-        )
-    axes = tuple(axis for axis in named if bool(np.isfinite(log.columns[_DRIFTLOGS_COLUMN[axis]]).any()))
-    lacking = [axis for axis in _NEEDED if axis not in axes]
-    if lacking:
-        raise BadInputError(
-            f"{log.source}: has no readings in {', '.join(_COLUMN[axis] for axis in lacking)}, expected "
-            "gz_radps, ax_mps2 and ay_mps2"
-        )
-    return axes
-
-
-def _driftlogs_check_changes(log: Log, axes: tuple[str, ...], values: FloatArray) -> tuple[str, ...]:
-    """The axes that never change, of those that the angle does not need."""
-    if len(values) < 2:
-        raise BadInputError(f"{log.source}: has {len(values)} IMU sample, expected a log of some seconds")
-    if not values.any():
-        raise BadInputError(f"{log.source}: all IMU readings are zero, expected noise and gravity")
-    stuck = tuple(axis for axis, span in zip(axes, np.ptp(values, axis=0), strict=True) if span == 0.0)
-    for axis in _NEEDED:
-        if axis in stuck:
-            at = float(values[0, axes.index(axis)])
-            raise BadInputError(
-                f"{log.source}: {axis} never changes, it is stuck at {at:.6g}; expected noise of a sensor"
-            )
-    return stuck
-
-
-def _windows(values: FloatArray) -> FloatArray:
-    size = min(_WINDOW, len(values))
-    count = len(values) // size
-    return values[: count * size].reshape(count, size, -1)
-
-
-def _check_force(log: Log, axes: tuple[str, ...], calm: FloatArray) -> None:
-    which = [k for k, axis in enumerate(axes) if axis[0] == "a"]
-    norm = float(np.median(np.linalg.norm(calm[:, :, which], axis=2)))
-    if 0.85 <= norm <= 1.15:
-        raise BadInputError(
-            f"{log.source}: the specific force is {norm:.4g} where the log is calm, so it is in g, expected "
-            "m/s^2; give --acc-unit g"
-        )
-    if len(which) == 3 and not _DRIFTLOGS_ABOUT_G[0] <= norm <= _DRIFTLOGS_ABOUT_G[1]:
-        kind = "raw counts" if norm > 150.0 else "no unit that is known here"
-        raise BadInputError(
-            f"{log.source}: the specific force is {norm:.4g} where the log is calm ({kind}), expected about "
-            "9.81 m/s^2"
-        )
-
-
-def _turning(axes: tuple[str, ...], values: FloatArray, t_s: FloatArray) -> tuple[float, float, float]:
-    """RMS [rad] within windows of a second of the accelerometer's angle and of -gz summed up, and the
-    spread of the accelerometer's angle over the whole log."""
-    phi = np.unwrap(np.arctan2(values[:, axes.index("ay")], values[:, axes.index("ax")]))
-    turned = np.concatenate([[0.0], np.cumsum(-values[1:, axes.index("gz")] * np.diff(t_s))])
-    period = max(float(np.median(np.diff(t_s))), 1e-6)
-    size = min(max(round(1.0 / period), 4), len(phi))
-    count = len(phi) // size
-    by_acc, by_gyro = (
-        float(np.median(x[: count * size].reshape(count, size).std(axis=1))) for x in (phi, turned)
-    )
-    return by_acc, by_gyro, float(phi.std())
-
-
-def _check_rates(
-    log: Log, axes: tuple[str, ...], values: FloatArray, calm: FloatArray, t_s: FloatArray
-) -> None:
-    which = [k for k, axis in enumerate(axes) if axis[0] == "g"]
-    largest = float(np.abs(values[:, which]).max())
-    quiet = float(np.median(calm[:, :, which].std(axis=1), axis=0).max())
-    bias = float(np.abs(np.median(calm[:, :, which], axis=(0, 1))).max())
-    by_acc, by_gyro, spread = _turning(axes, values, t_s)
-    at_rest = spread < _REST_RAD
-    why = ""
-    if largest > _DRIFTLOGS_FASTEST_RADPS:
-        why = f"reaches {largest:.4g}"
-    elif by_gyro > max(_LEAST_TURN_RAD, _FARTHER * by_acc):
-        why = f"turns {by_gyro / max(by_acc, 1e-6):.3g} times as far as the accelerometer's angle"
-    elif at_rest and bias > _DRIFTLOGS_LARGEST_BIAS_RADPS:
-        why = f"has a bias of {bias:.3g}"
-    elif at_rest and quiet > MOST_GYRO_RADPS:
-        why = f"is never quieter than {quiet:.3g}"
-    if why:
-        raise BadInputError(
-            f"{log.source}: the gyroscope {why}, which no gyroscope does in rad/s; if it is in deg/s, give "
-            "--gyro-unit deg/s"
-        )
-
-
-def drift_log(log: Log, acc_unit: str = "m/s2", gyro_unit: str = "rad/s") -> tuple[DriftLog, tuple[str, ...]]:
-    """The IMU's readings and the angles of a log in SI, and sentences about axes that were left out.
-
-    Raises
-    ------
-    BadInputError for a log without gz, ax and ay, whose time runs backwards, whose readings never change,
-    and for units that are obviously others.
+    Raises `BadInputError` for a log without gz, ax and ay, and where one of these never changes.
     """
-    axes = _driftlogs_axes(log)
-    rows = log.sampled(*(_DRIFTLOGS_COLUMN[axis] for axis in axes))
-    if len(rows) == 0:
-        raise BadInputError(
-            f"{log.source}: no row has all of {', '.join(_COLUMN[a] for a in axes)}, expected them together"
+    signals = _readings(log, *IN_PLANE)
+    signals.refuse_stuck(*IN_PLANE)
+    left_out = tuple(
+        Finding(
+            "remark", f"{log.source}: {name} never changes, it is stuck at {signals[name][0]:.6g}; left out"
         )
-    check_time(log)
-    factor = np.array([(GYRO_UNITS[gyro_unit] if a[0] == "g" else ACCEL_UNITS[acc_unit]) for a in axes])
-    values = np.stack([log.columns[_DRIFTLOGS_COLUMN[axis]][rows] for axis in axes], axis=1) * factor
-    t_s = log.t_s[rows]
-    stuck = _driftlogs_check_changes(log, axes, values)
-    windows = _windows(values)
-    # Relative to each axis's own middle, so that units play no part.
-    loud = windows.std(axis=1)
-    loud = (loud / np.maximum(np.median(loud, axis=0), 1e-12)).max(axis=1)
-    calm = windows[np.argsort(loud, kind="stable")[: max(math.ceil(_CALM * len(windows)), 1)]]
-    _check_force(log, axes, calm)
-    _check_rates(log, axes, values, calm, t_s)
-    said = []
-    if stuck:
-        keep = [k for k, axis in enumerate(axes) if axis not in stuck]
-        for axis in stuck:
-            at = float(values[0, axes.index(axis)])
-            said.append(f"{log.source}: {axis} never changes, it is stuck at {at:.6g}; left out")
-        axes, values = tuple(axes[k] for k in keep), values[:, keep]
-    chip, true = log.sampled("onchip_phi_rad"), log.sampled("true_phi_rad")
-    empty = np.zeros(0)
+        for name in signals.stuck
+    )
+    kept = signals.without(*signals.stuck)
     return DriftLog(
-        log.source,
-        axes,
-        t_s,
-        values,
-        log.t_s[chip],
-        log.columns["onchip_phi_rad"][chip] if len(chip) else empty,
-        log.t_s[true],
-        log.columns["true_phi_rad"][true] if len(true) else empty,
-    ), tuple(said)
-
-
-def read_drift_log(
-    path: Path, acc_unit: str = "m/s2", gyro_unit: str = "rad/s"
-) -> tuple[DriftLog, Sequence[str]]:
-    """`drift_log` of a file, and sentences about what was passed over in it."""
-    log = read_log(path)
-    said = log.passed_over(ROWS_MISSING)
-    found, more = drift_log(log, acc_unit, gyro_unit)
-    return found, [*said, *more]
+        log.source, tuple(_AXIS[name] for name in kept.names), kept.stamps_s, kept.values,
+        *_angle(log, "onchip_phi_rad"), *_angle(log, "true_phi_rad"),
+        kept.repeated_rows, (*left_out, *kept.findings),
+    )  # fmt: skip
 
 
 # ----------------------------------------------------------------------
@@ -386,14 +174,11 @@ class Reading:
 
     Attributes
     ----------
-    acc_unit, gyro_unit : of the columns.
     tilted : take the rate from the up vector (`calib.stages.imu.tracks`) and not -gz.
     reference : one of `REFERENCES`; auto takes the first of truth and camera that the log has.
     camera, A_inverse : of the rig, None where it has no plane.
     """
 
-    acc_unit: str = "m/s2"
-    gyro_unit: str = "rad/s"
     tilted: bool = False
     reference: str = "auto"
     camera: Camera | None = None
@@ -409,7 +194,7 @@ class TuneLog:
     pieces : without gaps of more than a second.
     reference : "truth", "camera", "onchip" or "" for none, and by how much it came late.
     quiet_radps : standard deviation of gz in the quiet windows.
-    said : what is to be known about the log.
+    said : what is to be known about the log. findings : on its sensors.
     """
 
     source: str
@@ -419,6 +204,7 @@ class TuneLog:
     lag_s: float
     quiet_radps: float
     said: tuple[str, ...]
+    findings: tuple[Finding, ...] = ()
 
 
 def sensor_noise(rig: Rig, logs: Sequence[TuneLog]) -> tuple[Noise, str]:
@@ -520,23 +306,22 @@ def _lag(
     return lag_of(seen[0], np.unwrap(seen[1]), t, own.phi_rad - 0.5 * period_s * rate)
 
 
-def read_tune_log(path: Path, how: Reading) -> TuneLog:
+def tune_log(log: Log, how: Reading) -> TuneLog:
     """A log's angles and rates.
 
     Raises
     ------
-    BadInputError as `calib.stages.imu.read.drift_log`, for a reference that was asked for and is not
+    BadInputError as `drift_log`, for a reference that was asked for and is not
     there, for missing axes where the up vector is asked for, and for a log without a second of samples.
     """
-    log = read_log(path)
-    read, more = drift_log(log, how.acc_unit, how.gyro_unit)
-    said = [*more, *log.passed_over(ROWS_MISSING)]
+    read = drift_log(log)
+    said = [finding.text for finding in read.findings if finding.severity == "remark"]
     lacking = [f"{k}{x}" for k in "ga" for x in "xyz" if f"{k}{x}" not in read.axes]
     if how.tilted and lacking:
         raise BadInputError(
             f"{log.source}: has no readings of {', '.join(lacking)}, expected all six axes for --rate up"
         )
-    sampling, parts = regular_parts(read.t_s, read.values, is_gyro(read.axes), log.source)
+    sampling, parts = regular_parts(read.t_s, read.values, is_gyro(read.axes), log.source, read.repeated_rows)
     period = sampling.period_s
     said += [one.text for one in sampling_findings(sampling, read.axes, log.source)]
     kept = [part for part in parts if len(part.values) * period >= _SHORTEST_S]
@@ -575,7 +360,7 @@ def read_tune_log(path: Path, how: Reading) -> TuneLog:
             f"{log.source}: the sensor tilts out of the plane, where -gz is not the rate of the angle; "
             "--rate up takes it from the up vector"
         )
-    return TuneLog(log.source, sampling, tuple(pieces), named, lag, quiet, tuple(said))
+    return TuneLog(log.source, sampling, tuple(pieces), named, lag, quiet, tuple(said), read.findings)
 
 
 # ----------------------------------------------------------------------
@@ -585,140 +370,31 @@ def read_tune_log(path: Path, how: Reading) -> TuneLog:
 # compressed with gzip. The gyroscope's readings are put on the accelerometer's times by straight lines
 # where they have others.
 
-_POSELOGS_COLUMN = {axis: f"{axis}_{'radps' if axis[0] == 'g' else 'mps2'}" for axis in AXES}
-_POSELOGS_FASTEST_RADPS = 45.0
-_POSELOGS_LARGEST_BIAS_RADPS = 0.35
-_POSELOGS_ABOUT_G = (7.5, 12.5)
 _MOST_BYTES = 500_000_000
-_ODD_COUNTS = 150.0
 
 
-def _poselogs_check_changes(source: str, axes: tuple[str, ...], values: FloatArray, planar: bool) -> None:
-    if len(values) < 2:
-        raise BadInputError(f"{source}: has {len(values)} IMU sample, expected rests in many poses")
-    if not values.any():
-        raise BadInputError(f"{source}: all IMU readings are zero, expected noise and gravity")
-    for axis, column in zip(axes, values.T, strict=True):
-        if float(np.ptp(column)) == 0.0:
-            hint = "; give --planar to do without it" if axis in ("az", "gx", "gy") and not planar else ""
-            raise BadInputError(
-                f"{source}: {axis} is stuck at {column[0]:g}, expected readings that follow the poses{hint}"
-            )
+def pose_log(log: Log, planar: bool = False) -> PoseLog:
+    """The IMU's readings of a log in many poses, counts as they are; `planar` keeps what lies in the plane.
 
-
-def _check_accel(source: str, accel: FloatArray, unit: str) -> None:
-    """The length of the specific force is about g most of the time, if two axes lie in the plane too."""
-    if unit == "counts":
-        return
-    length = float(np.median(np.linalg.norm(accel, axis=1)))
-    if unit == "m/s2" and accel.shape[1] == 2 and length < 0.7:
-        # Two axes may be far from the vertical; only what cannot be m/s^2 is named.
-        return
-    if unit == "m/s2" and 0.7 <= length <= 1.3:
-        raise BadInputError(
-            f"{source}: the specific force is mostly {length:.4g}, so it is in g, expected m/s^2; "
-            "give --acc-unit g"
-        )
-    if length > _ODD_COUNTS:
-        raise BadInputError(
-            f"{source}: the specific force is mostly {length:.4g}, so it is in raw counts, expected m/s^2; "
-            "give --acc-unit counts"
-        )
-    if not _POSELOGS_ABOUT_G[0] <= length <= _POSELOGS_ABOUT_G[1] and accel.shape[1] == 3:
-        raise BadInputError(
-            f"{source}: the specific force is mostly {length:.4g} m/s^2, expected about 9.81; see --acc-unit"
-        )
-
-
-def _check_gyro(source: str, gyro: FloatArray, unit: str) -> None:
-    """No sensor that is put from pose to pose turns this fast or rests at such a rate."""
-    if unit == "counts":
-        return
-    largest, middle = float(np.abs(gyro).max()), float(np.abs(np.median(gyro, axis=0)).max())
-    why = ""
-    if largest > _POSELOGS_FASTEST_RADPS:
-        why = f"reaches {largest:.4g} rad/s"
-    elif middle > _POSELOGS_LARGEST_BIAS_RADPS:
-        why = f"has a bias of {middle:.3g} rad/s"
-    if not why:
-        return
-    other = "counts" if middle > _ODD_COUNTS else "deg/s"
-    if unit == other:
-        raise BadInputError(f"{source}: the gyroscope {why}, which none does; see --gyro-unit")
-    raise BadInputError(
-        f"{source}: the gyroscope {why}, which none does that is put from pose to pose; if it is in {other}, "
-        f"give --gyro-unit {other}"
-    )
-
-
-def _made(
-    source: str,
-    axes: tuple[str, ...],
-    t_s: FloatArray,
-    values: FloatArray,
-    units: tuple[str, str],
-    planar: bool,
-) -> PoseLog:
-    """The readings in SI or counts, looked at. With `planar` only what lies in the plane is kept."""
-    accel_unit, gyro_unit = units
-    if planar:
-        kept = [k for k, axis in enumerate(axes) if axis not in ("gx", "gy")]
-        # A lean of the plane is read from az; stuck, it tells nothing.
-        kept = [k for k in kept if axes[k] != "az" or float(np.ptp(values[:, k])) > 0.0]
-        axes, values = tuple(axes[k] for k in kept), values[:, kept]
-    gyro = is_gyro(axes)
-    factor = np.where(gyro, GYRO_UNITS.get(gyro_unit, 1.0), ACCEL_UNITS.get(accel_unit, 1.0))
-    values = values * factor
-    _poselogs_check_changes(source, axes, values, planar)
-    in_plane = [axis in ("ax", "ay") or (axis == "az" and not planar) for axis in axes]
-    _check_accel(source, values[:, in_plane], accel_unit)
-    if gyro.any():
-        _check_gyro(source, values[:, gyro], gyro_unit)
-    return PoseLog(
-        source,
-        axes,
-        t_s,
-        values,
-        "counts" if accel_unit == "counts" else "m/s2",
-        "counts" if gyro_unit == "counts" else "rad/s",
-    )
-
-
-def pose_log(log: Log, acc_unit: str = "m/s2", gyro_unit: str = "rad/s", planar: bool = False) -> PoseLog:
-    """The IMU's readings of a log; with the unit "counts" its columns are taken as they are.
-
-    Raises
-    ------
-    BadInputError for a log without an accelerometer or without readings, whose time runs backwards, with
-    an axis that never changes, and for units that are obviously others.
+    Raises `BadInputError` for a log without an accelerometer, and with an axis that never changes.
     """
-    named = [axis for axis in AXES if _POSELOGS_COLUMN[axis] in log.columns]
-    axes = tuple(axis for axis in named if bool(np.isfinite(log.columns[_POSELOGS_COLUMN[axis]]).any()))
-    if not named:
-        raise BadInputError(f"{log.source}: has no IMU, expected columns as ax_mps2, ay_mps2 and gz_radps")
-    if not axes:
-        raise BadInputError(
-            f"{log.source}: the IMU's columns {', '.join(_COLUMN[a] for a in named)} hold no number"
-        )
-    if "ax" not in axes or "ay" not in axes:
-        raise BadInputError(f"{log.source}: has no accelerometer, expected columns ax_mps2 and ay_mps2")
-    rows = log.sampled(*(_POSELOGS_COLUMN[axis] for axis in axes))
-    if len(rows) == 0:
-        raise BadInputError(
-            f"{log.source}: no row has all of {', '.join(_COLUMN[a] for a in axes)}, expected them together"
-        )
-    check_time(log)
-    values = np.stack([log.columns[_POSELOGS_COLUMN[axis]][rows] for axis in axes], axis=1)
-    return _made(log.source, axes, log.t_s[rows], values, (acc_unit, gyro_unit), planar)
-
-
-def read_pose_log(
-    path: Path, acc_unit: str = "m/s2", gyro_unit: str = "rad/s", planar: bool = False
-) -> tuple[PoseLog, Sequence[str]]:
-    """`pose_log` of a file, and sentences about what was passed over in it."""
-    log = read_log(path)
-    said = log.passed_over(ROWS_MISSING)
-    return pose_log(log, acc_unit, gyro_unit, planar), said
+    signals = _readings(log, "ax_mps2", "ay_mps2", counts=True)
+    if planar:
+        # A lean of the plane is read from az; stuck, it tells nothing.
+        signals = signals.without("gx_radps", "gy_radps", *({"az_mps2"} & set(signals.stuck)))
+    hint = "" if planar else "; give --planar to do without az, gx and gy"
+    signals.refuse_stuck(*signals.names, hint=hint)
+    raw = {name for name in signals.names if log.unit(name) == "counts"}
+    return PoseLog(
+        log.source,
+        tuple(_AXIS[name] for name in signals.names),
+        signals.stamps_s,
+        signals.values,
+        "counts" if raw & set(ACCEL) else "m/s2",
+        "counts" if raw & set(GYRO) else "rad/s",
+        signals.repeated_rows,
+        signals.findings,
+    )
 
 
 def _unpacked(path: Path) -> bytes:
@@ -768,34 +444,27 @@ def _four_numbers(path: Path) -> FloatArray:
     return values
 
 
-def read_pose_files(
-    accel: Path,
-    gyro: Path | None = None,
-    acc_unit: str = "m/s2",
-    gyro_unit: str = "rad/s",
-    planar: bool = False,
-) -> tuple[PoseLog, Sequence[str]]:
-    """Readings from a file of the accelerometer, and one of the gyroscope, and sentences about them.
+def read_pose_files(accel: Path, gyro: Path | None, options: LogOptions) -> tuple[Log, list[str]]:
+    """A log from a file of the accelerometer and one of the gyroscope, and sentences about them.
 
-    Raises `BadInputError` as `pose_log`, for lines that are not four numbers, and for files of different
-    times.
+    Raises `BadInputError` for lines that are not four numbers, for files of different times, and for units as
+    any log.
     """
     a = _four_numbers(accel)
     source = shown(accel)
-    said: list[str] = []
-    if gyro is None:
-        return _made(source, ("ax", "ay", "az"), a[:, 0], a[:, 1:], (acc_unit, gyro_unit), planar), said
-    w = _four_numbers(gyro)
-    rates = w[:, 1:]
-    if len(w) != len(a) or not np.array_equal(w[:, 0], a[:, 0]):
-        inside = (a[:, 0] >= w[0, 0]) & (a[:, 0] <= w[-1, 0])
-        if inside.sum() < 0.5 * len(a):
-            raise BadInputError(
-                f"{shown(gyro)}: runs from {w[0, 0]:g} to {w[-1, 0]:g} s, expected the times of {source}, "
-                f"{a[0, 0]:g} to {a[-1, 0]:g} s"
-            )
-        a = a[inside]
-        rates = np.stack([np.interp(a[:, 0], w[:, 0], column) for column in w.T[1:]], axis=1)
-        said.append(f"{shown(gyro)}: has other times than {source}; put on those by straight lines")
-    values = np.hstack([rates, a[:, 1:]])
-    return _made(source, AXES, a[:, 0], values, (acc_unit, gyro_unit), planar), said
+    remarks: list[str] = []
+    cells = {"t_s": a[:, 0]} | {name: a[:, 1 + k] for k, name in enumerate(ACCEL)}
+    if gyro is not None:
+        w = _four_numbers(gyro)
+        if len(w) != len(a) or not np.array_equal(w[:, 0], a[:, 0]):
+            inside = (a[:, 0] >= w[0, 0]) & (a[:, 0] <= w[-1, 0])
+            if inside.sum() < 0.5 * len(a):
+                raise BadInputError(
+                    f"{shown(gyro)}: runs from {w[0, 0]:g} to {w[-1, 0]:g} s, expected the times of "
+                    f"{source}, {a[0, 0]:g} to {a[-1, 0]:g} s"
+                )
+            cells = {name: column[inside] for name, column in cells.items()}
+            w = np.stack([cells["t_s"], *(np.interp(cells["t_s"], w[:, 0], c) for c in w.T[1:])], axis=1)
+            remarks.append(f"{shown(gyro)}: has other times than {source}; put on those by straight lines")
+        cells |= {name: w[:, 1 + k] for k, name in enumerate(GYRO)}
+    return log_of(source, accel, cells, options), remarks

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -17,8 +17,8 @@ from calib.solve.clock import Gap, Part, time_axis
 # ----------------------------------------------------------------------
 # How a log was sampled: rate, jitter, gaps, repeated rows and stamps, steps, readings at their limit.
 #
-# When the samples were taken says `calib.solve.clock`. A row that repeats both stamp and readings is one
-# sample written twice, and is dropped before.
+# When the samples were taken says `calib.solve.clock`. Rows that repeat both stamp and readings are one
+# sample written twice, and are dropped before (`calib.io.signals`).
 
 _G = 9.80665
 _GYRO_RANGES = tuple(math.radians(r) for r in (125.0, 250.0, 500.0, 1000.0, 2000.0, 4000.0))
@@ -74,6 +74,12 @@ def sampling_findings(
     most_repeated : share of repeated rows above which the log is poor.
     """
     lead = f"{source}: " if source else ""
+    if not s.steady:
+        yield Finding(
+            "remark",
+            f"{lead}the steps of the time stamps are uneven; the stamps are taken as they are, and where "
+            "even samples are needed they lie on straight lines between",
+        )
     for gap in s.gaps:
         if gap.split:
             yield Finding("remark", f"{lead}split at a gap of {gap.duration_s:.4g} s after {gap.at_s:.2f} s")
@@ -131,7 +137,7 @@ def _at_limit(values: FloatArray, gyro: bool) -> int:
 
 
 def regular_parts(
-    t_s: FloatArray, values: FloatArray, gyro: BoolArray, source: str = "log"
+    t_s: FloatArray, values: FloatArray, gyro: BoolArray, source: str = "log", repeated_rows: int = 0
 ) -> tuple[Sampling, tuple[Part, ...]]:
     """Readings at even steps, in parts without long gaps, and how they were sampled.
 
@@ -140,6 +146,7 @@ def regular_parts(
     t_s : (n,) time stamps that do not go back.
     values : (n, axes) finite readings.
     gyro : (axes,) which axes are rates of rotation; the others are specific forces.
+    repeated_rows : that were written twice and left out before.
 
     Raises
     ------
@@ -147,25 +154,23 @@ def regular_parts(
     """
     if len(t_s) < 2:
         raise BadInputError(f"{source}: has {len(t_s)} IMU sample(s), expected a log at rest")
-    again = (np.diff(t_s) == 0.0) & np.all(np.diff(values, axis=0) == 0.0, axis=1)
-    rows = np.flatnonzero(np.concatenate([[True], ~again]))
-    axis, kept = time_axis(t_s[rows]), values[rows]
+    axis = time_axis(t_s)
     if not axis.period_s > 0.0:
-        raise BadInputError(f"{source}: all {len(rows)} IMU samples have the time {t_s[0]:g} s")
-    parts = tuple(replace(part, rows=rows[part.rows]) for part in axis.parts(kept))
+        raise BadInputError(f"{source}: all {len(t_s)} IMU samples have the time {t_s[0]:g} s")
+    parts = axis.parts(values)
     sampling = Sampling(
-        samples=len(rows),
+        samples=len(t_s),
         duration_s=axis.period_s * sum(len(part.values) for part in parts),
         period_s=axis.period_s,
         rate_hz=axis.rate_hz,
         jitter_s=axis.jitter_s,
         steady=axis.steady,
-        repeated_rows=int(again.sum()),
+        repeated_rows=repeated_rows,
         repeated_stamps=axis.repeated,
         gaps=axis.gaps,
-        step=np.array([_step(column) for column in kept.T]),
+        step=np.array([_step(column) for column in values.T]),
         at_limit=np.array(
-            [_at_limit(column, bool(g)) for column, g in zip(kept.T, gyro, strict=True)], dtype=np.int64
+            [_at_limit(column, bool(g)) for column, g in zip(values.T, gyro, strict=True)], dtype=np.int64
         ),
     )
     return sampling, parts

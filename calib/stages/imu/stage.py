@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from calib.core.errors import BadInputError, UsageError
-from calib.core.stage import Files, Output, Stage, option
+from calib.core.stage import Files, LogOptions, Output, Stage, option
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -39,14 +39,6 @@ if TYPE_CHECKING:
     from calib.stages.imu.tuning import Candidate, Noise, Tuning
 
 _SAME_RATE = 0.02
-
-
-@dataclass(frozen=True)
-class UnitOptions:
-    """Units of the columns."""
-
-    acc_unit: Literal["m/s2", "g"] = option("m/s2", "Unit of ax, ay, az in the logs.")
-    gyro_unit: Literal["rad/s", "deg/s"] = option("rad/s", "Unit of gx, gy, gz in the logs.")
 
 
 def _degrees(value: float) -> float | None:
@@ -89,18 +81,13 @@ _SENSORS = (
 """First letter of a sensor's axes, and its keys: mean, then N, B and K, then the step."""
 
 
-def _read_static(files: Files, rig: Rig, options: UnitOptions) -> list[RestLog]:
-    from calib.stages.imu.read import read_rest_log
+def _read_static(files: Files, rig: Rig, options: LogOptions) -> list[RestLog]:
+    from calib.stages.imu.read import rest_log
 
     del rig
-    logs: list[RestLog] = []
-    for path in files.paths:
-        log, remarks = read_rest_log(path, options.acc_unit, options.gyro_unit)
-        for sentence in remarks:
-            files.narrate(sentence)
-        # What is written to the rig's file does not depend on the folder.
-        logs.append(replace(log, source=files.taken(path)))
-    return logs
+    # What is written to the rig's file does not depend on the folder.
+    read = [(path, rest_log(files.log(path, options))) for path in files.paths]
+    return [replace(log, source=files.taken(path)) for path, log in read]
 
 
 def solve_static(logs: Sequence[RestLog]) -> Imu:
@@ -108,6 +95,7 @@ def solve_static(logs: Sequence[RestLog]) -> Imu:
     import numpy as np
 
     from calib.core.result import finite_or_none, judged
+    from calib.core.verdict import Verdict
     from calib.stages.imu.section import Imu
     from calib.stages.imu.static import analyse_static, judge
 
@@ -161,7 +149,7 @@ def solve_static(logs: Sequence[RestLog]) -> Imu:
                 if slopes
             },
             "logs": [_rest_log(log) for log in result.logs],
-            **judged(judge(result)),
+            **judged(Verdict.of([*judge(result).findings, *(one for log in logs for one in log.findings)])),
         }
     ).with_evidence(result)
 
@@ -216,7 +204,7 @@ static = Stage(
     """,
     _read_static,
     solve_static,
-    UnitOptions,
+    LogOptions,
     sources="Logs of the rig at rest.",
     metavar="LOG...",
     writes=("imu",),
@@ -231,15 +219,13 @@ static = Stage(
 
 
 @dataclass(frozen=True)
-class IntrinsicsOptions:
+class IntrinsicsOptions(LogOptions):
     """What is calibrated, and the inputs' units."""
 
     accel: Path | None = option(None, "Instead of LOG: lines of t x y z, may be gzipped.")
     gyro: Path | None = option(None, "The gyroscope's file beside --accel.")
     gravity: float = option(9.80665, "Gravity where the log was taken, m/s^2.")
     planar: bool = option(False, "Calibrate ax, ay and gz alone, from tilts about z.")
-    acc_unit: Literal["m/s2", "g", "counts"] = option("m/s2", "Unit of ax, ay, az in the input.")
-    gyro_unit: Literal["rad/s", "deg/s", "counts"] = option("rad/s", "Unit of gx, gy, gz in the input.")
 
 
 @dataclass(frozen=True)
@@ -252,7 +238,7 @@ class IntrinsicsInputs:
 
 
 def _read_intrinsics(files: Files, rig: Rig, options: IntrinsicsOptions) -> IntrinsicsInputs:
-    from calib.stages.imu.read import read_pose_files, read_pose_log
+    from calib.stages.imu.read import pose_log, read_pose_files
 
     del rig
     if not 1.0 <= options.gravity <= 30.0:
@@ -260,13 +246,12 @@ def _read_intrinsics(files: Files, rig: Rig, options: IntrinsicsOptions) -> Intr
     accel, gyro = options.accel, options.gyro
     if bool(files.paths) == (accel is not None) or (gyro is not None and accel is None):
         raise UsageError("give a LOG, or --accel FILE with --gyro FILE beside it")
-    units = (options.acc_unit, options.gyro_unit, options.planar)
     if accel is not None:
-        log, remarks = read_pose_files(accel, gyro, *units)
+        whole, remarks = read_pose_files(accel, gyro, options)
+        files.remarks += [*remarks, *whole.remarks()]
     else:
-        log, remarks = read_pose_log(files.paths[0], *units)
-    for sentence in remarks:
-        files.narrate(sentence)
+        whole = files.log(files.paths[0], options)
+    log = pose_log(whole, options.planar)
     for path in (*files.paths, accel, gyro):
         if path is not None:
             files.taken(path)
@@ -418,7 +403,7 @@ _RINGS = 0.5
 
 
 @dataclass(frozen=True)
-class TuneOptions(UnitOptions):
+class TuneOptions(LogOptions):
     """By what gains are judged."""
 
     reference: Literal["auto", "truth", "camera", "onchip", "none"] = option(
@@ -446,9 +431,9 @@ def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
 
     from calib.core.files import shown
     from calib.core.result import identity
-    from calib.stages.imu.read import Reading, read_tune_log, sensor_noise
+    from calib.stages.imu.read import Reading, sensor_noise, tune_log
 
-    how = Reading(options.acc_unit, options.gyro_unit, options.rate == "up", options.reference)
+    how = Reading(options.rate == "up", options.reference)
     camera, plane = rig.camera, None
     if options.reference in ("auto", "camera"):
         plane = rig.current_plane(files.rig_path)
@@ -456,9 +441,8 @@ def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
         how = replace(how, camera=camera.optics, A_inverse=np.array(plane.A_inverse))
     logs: list[TuneLog] = []
     for path in files.paths:
-        log = read_tune_log(path, how)
-        for sentence in log.said:
-            files.narrate(sentence)
+        log = tune_log(files.log(path, options), how)
+        files.remarks += log.said
         name = files.taken(path)
         # What is written to the rig's file does not depend on the folder.
         logs.append(replace(log, source=name, pieces=tuple(replace(p, source=name) for p in log.pieces)))
@@ -499,6 +483,7 @@ def solve_tune(inputs: TuneInputs) -> OrientationFilter:
         by = "reference" if result.judge == "reference" else "smoothed"
     severity: Literal["poor", "remark"] = "poor" if result.judge == "none" else "remark"
     findings = [Finding(severity, text) for text in result.reasons]
+    findings += [one for log in logs for one in log.findings if one.severity != "remark"]
     firsts = np.cumsum([0, *(len(log.pieces) for log in logs)]).tolist()
     return OrientationFilter(
         Kp_per_s=gains.Kp,
@@ -670,7 +655,7 @@ _INTERVALS = (
 
 
 @dataclass(frozen=True)
-class DriftOptions(UnitOptions):
+class DriftOptions(LogOptions):
     """Which filters are compared."""
 
     peers: bool = option(True, "Run the filters of the extra peers as well.", flag="peers/--no-peers")
@@ -678,10 +663,9 @@ class DriftOptions(UnitOptions):
 
 @dataclass(frozen=True)
 class DriftInputs:
-    """Logs, remarks on reading them, their hashes, the rig's gains, and whether filters of others run."""
+    """Logs, their hashes, the rig's gains, and whether filters of others run."""
 
     logs: Sequence[DriftLog]
-    remarks: Sequence[str]
     hashes: dict[str, str]
     tuned: Tuned | None
     peers: bool
@@ -690,26 +674,22 @@ class DriftInputs:
 
 def _read_drift(files: Files, rig: Rig, options: DriftOptions) -> DriftInputs:
     from calib.stages.imu.mahony import Mahony
-    from calib.stages.imu.read import read_drift_log
+    from calib.stages.imu.read import drift_log
     from calib.stages.imu.tracks import Tuned
 
-    logs: list[DriftLog] = []
-    remarks: list[str] = []
-    for path in files.paths:
-        log, more = read_drift_log(path, options.acc_unit, options.gyro_unit)
-        logs.append(replace(log, source=files.taken(path)))
-        remarks += more
+    read = [(path, drift_log(files.log(path, options))) for path in files.paths]
+    logs = [replace(log, source=files.taken(path)) for path, log in read]
     tuned, section = None, rig.orientation_filter
     if section is not None:
         gains = Mahony(section.Kp_per_s, section.Ki_per_s2)
         tuned = Tuned(gains, section.rate_of_angle == "up vector")
-    return DriftInputs(logs, remarks, dict(files.hashes), tuned, options.peers, files.narrate)
+    return DriftInputs(logs, dict(files.hashes), tuned, options.peers, files.narrate)
 
 
 def solve_drift(inputs: DriftInputs) -> Drift:
     """Every way of getting the angle on every log, and how each drifts."""
     from calib.core.result import judged
-    from calib.core.verdict import Finding, Verdict
+    from calib.core.verdict import Verdict
     from calib.stages.imu.drift import NOT_A_RANKING, analyse_drift, spread_of
     from calib.stages.imu.section import Drift, DriftGains, DriftSlopes
 
@@ -732,7 +712,7 @@ def solve_drift(inputs: DriftInputs) -> Drift:
             Ki_per_s2=tuned.gains.Ki,
             rate_of_angle="up vector" if tuned.up_vector else "-gz",
         ),
-        **judged(Verdict.of(Finding("remark", text) for text in inputs.remarks)),
+        **judged(Verdict.of(finding for log in inputs.logs for finding in log.findings)),
     ).with_evidence(logs)
 
 

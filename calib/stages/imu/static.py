@@ -55,6 +55,7 @@ class RestLog:
     t_s : (n,) time stamps that do not go back.
     values : (n, axes) finite readings, rad/s and m/s^2.
     onchip_t_s, onchip_phi_rad : (k,) the chip's own angle, empty where it is not logged.
+    repeated_rows : that were written twice and are left out. findings : on the sensors.
     """
 
     source: str
@@ -63,6 +64,8 @@ class RestLog:
     values: FloatArray
     onchip_t_s: FloatArray
     onchip_phi_rad: FloatArray
+    repeated_rows: int = 0
+    findings: tuple[Finding, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -149,7 +152,7 @@ def _slope(t_s: FloatArray, angle_rad: FloatArray) -> Drift | None:
 
 def _rest_of(log: RestLog) -> StaticLog:
     gyro = is_gyro(log.axes)
-    sampling, parts = regular_parts(log.t_s, log.values, gyro, log.source)
+    sampling, parts = regular_parts(log.t_s, log.values, gyro, log.source, log.repeated_rows)
     still, motions = rest_parts(parts, sampling.period_s, gyro, sampling.step)
     samples = sum(len(part.values) for part in still)
     if max((len(part.values) for part in still), default=0) < LEAST_SAMPLES:

@@ -16,6 +16,7 @@ from scipy.signal import butter
 
 from calib.core.arrays import BoolArray, FloatArray
 from calib.core.errors import BadInputError, pip_install
+from calib.core.verdict import Finding
 from calib.solve.clock import Part
 from calib.stages.imu.mahony import Mahony, MahonyState, accelerometer_angles, filter_log
 
@@ -363,6 +364,7 @@ class DriftLog:
     values : (n, axes) finite readings, rad/s and m/s^2.
     onchip_t_s, onchip_phi_rad : (k,) the chip's own angle, empty where it is not logged.
     true_t_s, true_phi_rad : (m,) the true angle, likewise.
+    repeated_rows : that were written twice and are left out. findings : on the sensors.
     """
 
     source: str
@@ -373,6 +375,8 @@ class DriftLog:
     onchip_phi_rad: FloatArray
     true_t_s: FloatArray
     true_phi_rad: FloatArray
+    repeated_rows: int = 0
+    findings: tuple[Finding, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -129,18 +129,6 @@ class Ticks:
         return max(self.pieces, key=lambda piece: len(piece.t_s))
 
 
-def sampling_rate_hz(t_s: FloatArray) -> float:
-    """Samples per second from the median of the steps of time (n,) [s]; equal stamps are passed over.
-
-    Raises `BadInputError` where there are not two different times.
-    """
-    steps = np.diff(t_s)
-    steps = steps[steps > 0.0]
-    if len(steps) == 0:
-        raise BadInputError("has no two samples at different times, expected a series")
-    return float(1.0 / np.median(steps))
-
-
 def on_ticks(t_s: FloatArray, values: FloatArray, rate_hz: float) -> Ticks:
     """The samples (n, d), taken at times (n,) that do not run backwards, one per tick.
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast
 
 from calib.core.errors import BadInputError, UsageError
-from calib.core.stage import Files, Stage, option
+from calib.core.stage import Files, LogOptions, Stage, option
 from calib.core.units import parse_frequency_hz, parse_jitter
 from calib.core.verdict import Finding, Verdict
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from calib.core.plot import Figure
     from calib.core.rig import Rig
     from calib.core.words import Block
+    from calib.io.logs import Log
     from calib.stages.camera.model import Camera
     from calib.stages.lowpass.filters import Filter, Spectrum, Suggestion, Ticks
     from calib.stages.lowpass.section import LowPass, LowPassLog
@@ -36,7 +37,7 @@ _SHOWN = 5
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(LogOptions):
     """What filter is designed, or chosen, and for which log."""
 
     cutoff_hz: float | None = option(
@@ -126,7 +127,7 @@ class Evidence:
 
 
 def positions_from_log(
-    path: Path, rate_hz: float | None, camera: Camera | None, A_inverse: FloatArray | None
+    log: Log, rate_hz: float | None, camera: Camera | None, A_inverse: FloatArray | None
 ) -> Positions:
     """The marker in a log, one position per tick.
 
@@ -141,22 +142,11 @@ def positions_from_log(
     import numpy as np
 
     from calib.core.geometry import apply_homography
-    from calib.io.logs import check_time, read_log
     from calib.stages.camera.model import undistort
-    from calib.stages.lowpass.filters import on_ticks, sampling_rate_hz, spectrum
+    from calib.stages.lowpass.filters import on_ticks, spectrum
 
-    log = read_log(path)
-    check_time(log)
-    rows = log.sampled("u_px", "v_px")
-    if any(name not in log.columns for name in ("u_px", "v_px")):
-        raise BadInputError(f"{log.source}: has no columns u_px and v_px, expected a log with the camera")
-    if len(rows) < 2:
-        count = "one row" if len(rows) else "no row"
-        raise BadInputError(
-            f"{log.source}: has {count} in which the camera saw the marker, expected a series"
-        )
-    t = log.t_s[rows]
-    pixels = np.stack([log.columns["u_px"][rows], log.columns["v_px"][rows]], axis=1)
+    signals = log.signals("u_px", "v_px")
+    pixels = signals.values
     values, unit, names = pixels, "px", ("u", "v")
     if camera is not None and A_inverse is not None:
         rays = undistort(camera, pixels)
@@ -166,22 +156,24 @@ def positions_from_log(
         if len(lost):
             u, v = pixels[lost[0]]
             raise BadInputError(
-                f"{log.source}, line {log.lines[rows[lost[0]]]}: the marker at ({u:g}, {v:g}) px is not on "
+                f"{log.source}, line {signals.lines[lost[0]]}: the marker at ({u:g}, {v:g}) px is not on "
                 "the rig's plane, expected a log of this rig's camera"
             )
     try:
-        own = sampling_rate_hz(t)
+        if not signals.axis.period_s > 0.0:
+            raise BadInputError("has no two pictures of the marker at different times, expected a series")
+        own = signals.axis.rate_hz
         rate = own if rate_hz is None else rate_hz
         if abs(own / rate - 1.0) > _RATE_OFF:
             raise BadInputError(
                 f"has {own:.4g} camera samples/s, expected the {rate:g} Hz that the filter is designed for"
             )
-        ticks = on_ticks(t, values, rate)
+        ticks = on_ticks(signals.t_s, values, rate)
         piece = ticks.longest.values
         spectra = (spectrum(piece[:, 0], rate), spectrum(piece[:, 1], rate))
     except BadInputError as error:
         raise BadInputError(f"{log.source}: {error}") from error
-    return Positions(log.source, unit, names, own, ticks, on_ticks(t, pixels, rate), spectra)
+    return Positions(log.source, unit, names, own, ticks, on_ticks(signals.t_s, pixels, rate), spectra)
 
 
 def _read(files: Files, rig: Rig, options: Options) -> Inputs:
@@ -210,7 +202,7 @@ def _read(files: Files, rig: Rig, options: Options) -> Inputs:
     def positions(path: Path | None) -> Positions | None:
         if path is None:
             return None
-        read = positions_from_log(path, options.rate_hz, optics, A_inverse)
+        read = positions_from_log(files.log(path, options), options.rate_hz, optics, A_inverse)
         files.taken(path)
         return read
 

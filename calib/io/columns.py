@@ -1,0 +1,680 @@
+"""What the columns of a log are: names that people give them, units, and the evidence for both.
+
+A log is to have `t_s` and any of `COLUMNS`. Other names are looked up in one table (`accel_x`, `Gyroscope Z
+(deg/s)`, `millis`). A unit stands in the name, or a person states it on the command line or in columns.yaml;
+what nobody states is inferred from the readings, if they are evidence enough, and what contradicts them is
+refused, whoever stated it:
+
+    time           the samples come at 4 to 4000 Hz in one unit only
+    accelerations  where the log is calm the specific force is g
+    rates          the gyroscope turns with the accelerometer's angle, neither 57 times as far nor not at
+                   all; at rest it is neither louder nor quieter than sensors are
+
+columns.yaml lies beside the logs; `NAME.columns.yaml` goes before it for one of them:
+
+    names: [t_s, u_px, v_px]                        of a file without a header, in its order
+    units: {time: ms, accel: g, gyro: deg/s}        of all columns of a kind
+    t_s: {column: millis, unit: ms}                 of one column: its name in the file, its unit,
+    gz_radps: {column: gyro_z, factor: -1}          and SI = (cell - offset) * factor * unit
+    ax_mps2: {column: raw_x, unit: counts, factor: 0.0024, offset: 32768}
+    separator: ";"
+    decimal: ","
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.core.arrays import FloatArray
+from calib.core.errors import BadInputError
+from calib.core.files import one_line, read_yaml_mapping, shown
+from calib.core.stage import LogOptions
+
+MEASURED = (
+    "u_px",
+    "v_px",
+    "ax_mps2",
+    "ay_mps2",
+    "az_mps2",
+    "gx_radps",
+    "gy_radps",
+    "gz_radps",
+    "pwm1",
+    "pwm2",
+    "onchip_phi_rad",
+)
+"""What a rig logs; `u_px, v_px` is the marker in distorted pixels, `onchip_phi_rad` the IMU's own angle."""
+
+TRUE = ("true_q1_m", "true_q2_m", "true_phi_rad", "true_x_m", "true_y_m")
+"""What only the simulated rig knows, at the row's `t_s`; (x, y) is the head. For scoring."""
+
+COLUMNS = (*MEASURED, *TRUE)
+
+ACCEL = ("ax_mps2", "ay_mps2", "az_mps2")
+GYRO = ("gx_radps", "gy_radps", "gz_radps")
+
+GRAVITY_MPS2 = 9.80665
+_DEGREE = math.pi / 180.0
+
+UNITS: dict[str, dict[str, float]] = {
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+    "accel": {"m/s2": 1.0, "g": GRAVITY_MPS2, "mg": 1e-3 * GRAVITY_MPS2, "counts": 1.0},
+    "gyro": {"rad/s": 1.0, "deg/s": _DEGREE, "mdeg/s": 1e-3 * _DEGREE, "counts": 1.0},
+    "angle": {"rad": 1.0, "deg": _DEGREE},
+    "pixel": {"px": 1.0},
+    "pwm": {"pwm": 1.0, "percent": 2.55},
+}
+"""Units of each kind of column in SI; the first is that of the column's own name. Counts stay counts."""
+
+_SPELLED = {
+    "s": "s sec secs second seconds", "ms": "ms msec msecs millis millisecond milliseconds",
+    "us": "us µs μs usec micros microsecond microseconds", "ns": "ns nanos nanosecond nanoseconds",
+    "m/s2": "m/s2 m/s^2 m/s² m/s/s ms2 mps2 m_s2 ms-2 ms^-2", "g": "g gs gee", "mg": "mg",
+    "rad/s": "rad/s rads radps rad_s rad/sec", "deg/s": "deg/s °/s dps degps degs deg_s deg/sec",
+    "mdeg/s": "mdps mdeg/s", "rad": "rad", "deg": "deg degree degrees °", "px": "px pixel pixels pix",
+    "counts": "raw lsb count counts adc", "percent": "% percent",
+}  # fmt: skip
+_UNIT = {word: unit for unit, words in _SPELLED.items() for word in words.split()}
+
+_AXIS = re.compile(
+    r"(?:(?P<accel>a|acc|accel|accelerometer|acceleration|linearacceleration|specificforce)"
+    r"|(?P<gyro>g|gyr|gyro|gyroscope|w|omega|angularvelocity|angularrate))(?:rss)?(?P<axis>[xyz])"
+)
+_TIME = re.compile(r"t|ts|time|timestamp|timestamps|stamp|clock|elapsed|headerstamp")
+_NAMED_BY_UNIT = {"millis": "ms", "micros": "us", "nanos": "ns", "seconds": "s", "secs": "s", "ms": "ms"}
+_PIXEL = re.compile(r"(?:pixel|px|marker|cam|camera|image|img|blob|pixy)?(?P<axis>[uv])")
+_PIXEL_XY = re.compile(r"(?:pixel|px|marker|blob|pixy)(?P<axis>[xy])")
+_PWM = re.compile(r"(?:pwm|duty|valve|cmd|command|pump)(?P<number>[12])")
+_CHIP = re.compile(r"(?:onchip|chip|fused|fusion)(?:phi|angle)")
+_DEVICES = ("imu", "bno055", "bno", "mpu6050", "mpu", "sensor", "field", "data", "msg")
+
+_RESERVED = ("names", "units", "separator", "decimal")
+_RATES_HZ = (4.0, 4000.0)
+_SLOWEST_S, _FASTEST_S = 0.9, 2e-5
+"""Steps of a stated unit that are refused: no camera and no IMU samples once a second or at 50 kHz."""
+_FEWEST = 20
+_ABOUT_G = (0.7, 1.33)
+_IN_PLANE_G = (0.85, 1.15)
+"""Specific force of a calm log over g, of three axes and of two, which may lean out of the plane."""
+_CALM, _CALM_WINDOW = 0.1, 50
+_FASTEST_RADPS = 45.0
+_LARGEST_BIAS_RADPS = 0.35
+_LOUDEST_RADPS, _QUIETEST_RADPS = 0.02, 1.5e-4
+"""Spread of a gyroscope at rest: no sensor is louder, and none of those on cheap boards is quieter."""
+_REST_RAD = 0.02
+_FARTHER = 12.0
+_LEAST_TURN_RAD = 0.05
+_AGREES = 0.3
+_BLOCK_S, _BLOCK_3D_S = 1.0, 0.25
+_MOST_EVIDENCE = 100_000
+
+
+def kind_of(column: str) -> str:
+    """The kind of a column of `COLUMNS` or of `t_s`, a key of `UNITS`; empty for truth."""
+    if column == "t_s":
+        return "time"
+    for kind, names in (("accel", ACCEL), ("gyro", GYRO), ("pixel", MEASURED[:2]), ("pwm", MEASURED[8:10])):
+        if column in names:
+            return kind
+    return "angle" if column == "onchip_phi_rad" else ""
+
+
+def known_name(name: str) -> tuple[str, str] | None:
+    """The column that a name in a file means, and the unit that it states or ""; None for another."""
+    name = name.strip()
+    if name == "t_s" or name in COLUMNS:
+        return name, next(iter(UNITS.get(kind_of(name), {"": 1.0})))
+    unit = ""
+    if bracket := re.fullmatch(r"(.*?)[\[(]([^\])]*)[\])]", name):
+        unit = _UNIT.get(re.sub(r"[\s·*]|\^-1", "", bracket[2].lower()), "")
+        if not unit:
+            return None
+        name = bracket[1]
+    words = re.findall(r"[a-zµμ°%]+|\d+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower())
+    while len(words) > 1 and (words[0] in _DEVICES or "".join(words[:2]) in _DEVICES):
+        words = words[1 if words[0] in _DEVICES else 2 :]
+    if not unit:
+        for last in (3, 2, 1):
+            stated = _UNIT.get("".join(words[-last:])) or _UNIT.get("/".join(words[-last:]))
+            if len(words) > last and stated:
+                return _column("".join(words[:-last]), stated)
+    return _column("".join(words), unit)
+
+
+def _column(word: str, unit: str) -> tuple[str, str] | None:
+    """The column of a bare name, where the unit is one of its kind."""
+    column = ""
+    if axis := _AXIS.fullmatch(word):
+        column = f"a{axis['axis']}_mps2" if axis["accel"] else f"g{axis['axis']}_radps"
+    elif _TIME.fullmatch(word):
+        column = "t_s"
+    elif word in _NAMED_BY_UNIT and unit in ("", _NAMED_BY_UNIT[word]):
+        column, unit = "t_s", _NAMED_BY_UNIT[word]
+    elif pixel := _PIXEL.fullmatch(word):
+        column = f"{pixel['axis']}_px"
+    elif (pixel := _PIXEL_XY.fullmatch(word)) or (unit == "px" and word in ("x", "y")):
+        column = "u_px" if (pixel["axis"] if pixel else word) == "x" else "v_px"
+    elif pwm := _PWM.fullmatch(word):
+        column = f"pwm{pwm['number']}"
+    elif _CHIP.fullmatch(word):
+        column = "onchip_phi_rad"
+    if not column or (unit and unit not in UNITS[kind_of(column)]):
+        return None
+    if kind_of(column) in ("pixel", "pwm"):
+        unit = unit or next(iter(UNITS[kind_of(column)]))
+    return column, unit
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a column comes from: its name in the file, and SI = (cell - offset) * factor * unit.
+
+    `unit` is "" until the readings were looked at; `stated` is who states it: "", "name", "file" or "option".
+    """
+
+    column: str
+    unit: str = ""
+    stated: str = ""
+    factor: float = 1.0
+    offset: float = 0.0
+
+    def si(self, kind: str, cells: FloatArray) -> FloatArray:
+        """Cells in SI."""
+        scale = self.factor * UNITS[kind][self.unit] if kind else self.factor
+        if self.offset:
+            cells = cells - self.offset
+        return cells if scale == 1.0 else np.asarray(cells * scale)
+
+
+@dataclass(frozen=True)
+class ColumnsFile:
+    """A columns.yaml: sources by column, units by kind, names for want of a header, and the text's marks."""
+
+    path: Path
+    sources: Mapping[str, Source]
+    units: Mapping[str, str]
+    names: tuple[str, ...] = ()
+    separator: str = ""
+    decimal: str = ""
+
+
+def find_columns(log: Path) -> Path | None:
+    """The columns.yaml of a log, None without."""
+    places = (log.with_name(f"{log.stem}.columns.yaml"), log.with_name("columns.yaml"))
+    return next((place for place in places if place.is_file()), None)
+
+
+def read_columns_file(path: Path) -> ColumnsFile:
+    """A columns.yaml. Raises `BadInputError` naming the key for what is wrong with it."""
+    where, document = shown(path), read_yaml_mapping(path)
+    allowed = ("t_s", *COLUMNS, *_RESERVED)
+    for key in document:
+        if key not in allowed:
+            near = difflib.get_close_matches(key, allowed, 1)
+            hint = f", did you mean {near[0]}" if near else f", expected t_s, {', '.join(MEASURED[:3])}, ..."
+            raise BadInputError(f"{where}: {one_line(key)[:60]} is not known{hint}")
+    names = document.get("names", [])
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise BadInputError(f"{where}: names is {_short(names)}, expected a list of columns")
+    units = document.get("units", {})
+    if not isinstance(units, dict):
+        raise BadInputError(f"{where}: units is {_short(units)}, expected for instance {{accel: g}}")
+    for kind, unit in units.items():
+        if kind not in UNITS or not isinstance(unit, str) or unit not in UNITS[kind]:
+            expected = ", ".join(UNITS.get(kind, UNITS))
+            raise BadInputError(f"{where}: units.{_word(kind)} is {_short(unit)}, expected one of {expected}")
+    marks = {}
+    for key, known in (("separator", (",", ";", "\t")), ("decimal", (".", ","))):
+        marks[key] = document.get(key, "")
+        if marks[key] and marks[key] not in known:
+            raise BadInputError(f"{where}: {key} is {_short(marks[key])}, expected one of {known}")
+    columns = [key for key in document if key not in _RESERVED]
+    sources = {key: _source(f"{where}: {key}", key, document[key]) for key in columns}
+    return ColumnsFile(path, sources, units, tuple(names), marks["separator"], marks["decimal"])
+
+
+def _source(where: str, column: str, entry: Any) -> Source:
+    entry = {"column": entry} if isinstance(entry, str | int) else entry
+    keys = ("column", "unit", "factor", "offset")
+    if not isinstance(entry, dict) or any(key not in keys for key in entry):
+        raise BadInputError(f"{where} is {_short(entry)}, expected a column's name or {', '.join(keys)}")
+    named = entry.get("column", column)
+    if isinstance(named, bool) or not isinstance(named, str | int):
+        raise BadInputError(f"{where}.column is {_short(named)}, expected a name or a number from 1")
+    kind = kind_of(column)
+    unit = entry.get("unit", "")
+    if unit and (not kind or unit not in UNITS[kind]):
+        known = ", ".join(UNITS.get(kind, ()))
+        raise BadInputError(f"{where}.unit is {_short(unit)}, expected one of {known}")
+    numbers = [entry.get("factor", 1.0), entry.get("offset", 0.0)]
+    for key, value in zip(keys[2:], numbers, strict=True):
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise BadInputError(f"{where}.{key} is {_short(value)}, expected a number")
+    if unit == "counts" and "factor" in entry:
+        # A factor makes SI of counts.
+        unit = next(iter(UNITS[kind]))
+    return Source(str(named), unit, "file" if unit else "", float(numbers[0]), float(numbers[1]))
+
+
+def _short(value: Any) -> str:
+    return one_line(repr(value))[:60]
+
+
+def _word(value: Any) -> str:
+    return one_line(str(value))[:40]
+
+
+@dataclass(frozen=True)
+class ColumnMap:
+    """Which column of a file is what.
+
+    Attributes
+    ----------
+    source : the log's name for messages. folder : where its columns.yaml is or would be, for messages.
+    names : of the file's columns. sources : by column, `t_s` among them.
+    evidence : for each kind whose unit the readings tell, how.
+    """
+
+    source: str
+    folder: str
+    names: tuple[str, ...]
+    sources: Mapping[str, Source]
+    evidence: Mapping[str, str]
+
+    @property
+    def unknown(self) -> tuple[str, ...]:
+        """Names of the file's columns that are not read."""
+        read = {source.column for source in self.sources.values()}
+        return tuple(name for name in self.names if name not in read)
+
+    @property
+    def narration(self) -> str:
+        """A sentence on columns that are not what their names say by themselves; empty for none."""
+        words = {"time": "time", "accel": "accelerations", "gyro": "rates", "angle": "the chip's angle"}
+        groups: dict[tuple[str, str], list[str]] = {}
+        for column, source in self.sources.items():
+            kind = kind_of(column)
+            own = next(iter(UNITS.get(kind, {"": 1.0})))
+            if source.column != column or source.unit != own or source.factor != 1.0 or source.offset:
+                in_unit = f" in {source.unit}" if kind in words else ""
+                groups.setdefault((kind, f"{words.get(kind, column)}{in_unit}"), []).append(source.column)
+        parts = []
+        for (kind, what), columns in groups.items():
+            why = f" ({self.evidence[kind]})" if kind in self.evidence else ""
+            parts.append(f"{what} from {', '.join(f'`{one_line(name)[:40]}`' for name in columns)}{why}")
+        return f"{self.source}: read as: {'; '.join(parts)}" if parts else ""
+
+    def text(self) -> str:
+        """A columns.yaml that says the same."""
+        lines = []
+        for column, source in self.sources.items():
+            entry = [f"column: {_yaml(source.column)}"]
+            entry += [f"unit: {source.unit}"] if kind_of(column) else []
+            entry += [f"factor: {source.factor!r}"] if source.factor != 1.0 else []
+            entry += [f"offset: {source.offset!r}"] if source.offset else []
+            lines.append(f"{column}: {{{', '.join(entry)}}}\n")
+        return "".join(lines)
+
+
+def _yaml(word: str) -> str:
+    return word if re.fullmatch(r"[A-Za-z_]\w*", word) else json.dumps(word, ensure_ascii=False)
+
+
+def column_map(
+    source: str, log: Path, line: int, names: Sequence[str], file: ColumnsFile | None, options: LogOptions
+) -> ColumnMap:
+    """Which of the columns `names` of a file is what, by their names and by what a person states.
+
+    Raises `BadInputError` for no time, for a column that two names mean, and for a name that comes twice.
+    """
+    where = f"{source}, line {line}"
+    names = tuple(name.strip() for name in names)
+    add = shown(file.path if file else log.with_name("columns.yaml"))
+    stated = dict(file.sources) if file else {}
+    found: dict[str, list[tuple[str, str]]] = {}
+    for name in names:
+        known = known_name(name)
+        if known is not None:
+            found.setdefault(known[0], []).append((name, known[1]))
+    for pair in (("u_px", "v_px"),):
+        if not all(name in found or name in stated for name in pair):
+            found = {k: v for k, v in found.items() if k not in pair or k in names}
+    sources: dict[str, Source] = {}
+    for column in ("t_s", *COLUMNS):
+        if column in stated:
+            at, given = _named(names, stated[column].column), stated[column]
+            known = known_name(at) if at is not None else None
+            if at is not None and known and not given.unit and known[1] in UNITS.get(kind_of(column), ()):
+                given = replace(given, unit=known[1], stated="name")
+            if at is not None:
+                sources[column] = replace(given, column=at)
+            continue
+        candidates = [(name, unit) for name, unit in found.get(column, []) if name == column] or [
+            one for one in found.get(column, []) if one[0] not in {s.column for s in stated.values()}
+        ]
+        if column == "t_s":
+            candidates = [one for one in candidates if one[1]] or candidates
+        if len(candidates) > 1:
+            if candidates[0][0] == candidates[1][0]:
+                raise BadInputError(f"{where}: has the column {one_line(candidates[0][0])[:40]} twice")
+            both = " and ".join(f"`{one_line(name)[:40]}`" for name, _ in candidates[:2])
+            raise BadInputError(
+                f"{where}: {both} may both be {column}; add to {add} which it is, such as the line "
+                f"{column}: {_yaml(candidates[0][0])}"
+            )
+        if candidates:
+            name, unit = candidates[0]
+            sources[column] = Source(name, unit, "name" if unit else "")
+    if "t_s" not in sources:
+        listed = one_line(", ".join(names[:6]) + (", ..." if len(names) > 6 else ""))[:200]
+        raise BadInputError(
+            f"{where}: has no column t_s, found {listed!r}; if one of them is the time, add to {add} "
+            "the line t_s: {column: NAME, unit: s}"
+        )
+    for column, given in sources.items():
+        kind = kind_of(column)
+        option = {"accel": options.acc_unit, "gyro": options.gyro_unit}.get(kind)
+        if option is not None:
+            sources[column] = replace(given, unit=option, stated="option")
+        elif given.stated != "file" and file is not None and kind in file.units:
+            sources[column] = replace(given, unit=file.units[kind], stated="file")
+        elif not given.unit and given.factor != 1.0:
+            sources[column] = replace(given, unit=next(iter(UNITS[kind])), stated="file")
+    return ColumnMap(source, add, names, sources, {})
+
+
+def _named(names: tuple[str, ...], column: str) -> str | None:
+    """The name in the file of a column that columns.yaml gives by name or by number from 1."""
+    if column in names:
+        return column
+    return names[int(column) - 1] if column.isdigit() and 1 <= int(column) <= len(names) else None
+
+
+def settled(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMap:
+    """The map with all units, from what is stated and from the first readings of the log.
+
+    Parameters
+    ----------
+    cells : (n,) by column, as they are in the file, NaN where a cell is blank.
+
+    Raises
+    ------
+    BadInputError for a unit that the readings contradict, and for one that nobody states and that they do not
+    tell either: with the line for columns.yaml.
+    """
+    cells = {name: values[:_MOST_EVIDENCE] for name, values in cells.items()}
+    # Damaged files hold any number.
+    with np.errstate(all="ignore"):
+        for step in (_with_time, _with_accel, _with_gyro):
+            columns = step(columns, cells)
+    for column, source in columns.sources.items():
+        if kind_of(column) and not source.unit:
+            raise BadInputError(
+                f"{columns.source}: {column} from `{one_line(source.column)[:40]}` has no unit; add to "
+                f"{columns.folder} the line {_line(column, source, '|'.join(UNITS[kind_of(column)]))}"
+            )
+    return columns
+
+
+def _line(column: str, source: Source, unit: str) -> str:
+    return f"{column}: {{column: {_yaml(source.column)}, unit: {unit}}}"
+
+
+def _of(columns: ColumnMap, names: Sequence[str]) -> list[str]:
+    return [name for name in names if name in columns.sources]
+
+
+def _with(columns: ColumnMap, names: Sequence[str], unit: str, why: str) -> ColumnMap:
+    """The map with a unit for those of the columns that have none."""
+    known = {n: replace(columns.sources[n], unit=unit) for n in names if not columns.sources[n].unit}
+    evidence = {kind_of(names[0]): why} if known else {}
+    return replace(columns, sources={**columns.sources, **known}, evidence={**columns.evidence, **evidence})
+
+
+def _together(cells: Mapping[str, FloatArray], columns: ColumnMap, names: Sequence[str]) -> FloatArray:
+    """Rows (m, names) in which all of these columns have a reading, scaled but in the file's unit."""
+    values = np.stack(
+        [(cells[name] - columns.sources[name].offset) * columns.sources[name].factor for name in names],
+        axis=1,
+    )
+    return np.asarray(values[np.isfinite(values).all(axis=1)])
+
+
+def _with_time(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMap:
+    source = columns.sources["t_s"]
+    sensors = [cells[name] for name in _of(columns, (*ACCEL, *GYRO))] or [
+        cells[name] for name in _of(columns, ("u_px",))
+    ]
+    rows = (
+        np.isfinite(np.stack(sensors)).any(axis=0) if sensors else np.ones(len(cells["t_s"]), dtype=np.bool_)
+    )
+    steps = np.diff((cells["t_s"][rows]) * source.factor)
+    steps = steps[steps > 0.0]
+    step = float(np.median(steps)) if len(steps) >= _FEWEST else math.nan
+    units = UNITS["time"]
+    likely = [unit for unit, scale in units.items() if _RATES_HZ[0] <= 1.0 / (step * scale) < _RATES_HZ[1]]
+    if source.unit:
+        if source.stated == "file":
+            return columns
+        if step * units[source.unit] > _SLOWEST_S or step * units[source.unit] < _FASTEST_S:
+            guess = likely[0] if likely else "ms"
+            rate = 1.0 / (step * units[source.unit])
+            raise BadInputError(
+                f"{columns.source}: {one_line(source.column)[:40]} steps by {step:.6g}, in {source.unit} "
+                f"that is {rate:.4g} samples/s, which no camera and no IMU of a rig has; if it is in "
+                f"{guess}, add to {columns.folder} the line {_line('t_s', source, guess)}"
+            )
+        return columns
+    if len(likely) != 1:
+        raise BadInputError(
+            f"{columns.source}: cannot tell the unit of the time `{one_line(source.column)[:40]}` from "
+            f"{len(steps)} steps; add to {columns.folder} the line {_line('t_s', source, 's|ms|us')}"
+        )
+    return _with(columns, ["t_s"], likely[0], f"{1.0 / (step * units[likely[0]]):.4g} samples/s")
+
+
+def calm_windows(values: FloatArray) -> FloatArray:
+    """The calmest tenth (w, size, axes) of windows of some 50 readings (n, axes), at least one."""
+    size = min(_CALM_WINDOW, len(values))
+    count = len(values) // size
+    windows = values[: count * size].reshape(count, size, -1)
+    # Relative to each axis's own middle, so that units play no part.
+    loud = windows.std(axis=1)
+    loud = (loud / np.maximum(np.median(loud, axis=0), 1e-12)).max(axis=1)
+    return windows[np.argsort(loud, kind="stable")[: max(math.ceil(_CALM * count), 1)]]
+
+
+def _with_accel(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMap:
+    names = _of(columns, ACCEL)
+    if not names or all(columns.sources[name].unit == "counts" for name in names):
+        return columns
+    values = _together(cells, columns, names)
+    stated = {columns.sources[name].unit for name in names} - {""}
+    if names[:2] != ["ax_mps2", "ay_mps2"] or len(values) < _FEWEST or len(stated) > 1:
+        return columns
+    if not values.any():
+        return columns
+    norm = float(np.median(np.linalg.norm(calm_windows(values), axis=2)))
+    bounds = _ABOUT_G if len(names) == 3 else _IN_PLANE_G
+    units = UNITS["accel"]
+    likely = [u for u in ("m/s2", "g", "mg") if bounds[0] <= norm * units[u] / GRAVITY_MPS2 <= bounds[1]]
+    found = f"the specific force is {norm:.4g} where the log is calm"
+    unit = next(iter(stated), "")
+    if unit in ("", *likely) and likely:
+        return _with(columns, names, likely[0], found)
+    wide = len(names) == 2 and norm * units[unit or "m/s2"] < _ABOUT_G[1] * GRAVITY_MPS2
+    if likely:
+        advice = _advice("acc", "accel", likely[0], columns)
+        raise BadInputError(f"{columns.source}: {found}, so it is in {likely[0]}, not in {unit}; {advice}")
+    if unit and wide:
+        # Two axes may be far from the vertical.
+        return columns
+    what = "no unit that is known here"
+    if norm > 150.0:
+        what = "raw counts, which calib imu intrinsics --acc-unit counts finds the scale of"
+    raise BadInputError(
+        f"{columns.source}: {found} ({what}), expected about 9.81 m/s^2; for a scale add to {columns.folder} "
+        f"a line for each axis, such as {names[0]}: {{column: {_yaml(columns.sources[names[0]].column)}, "
+        f"factor: {GRAVITY_MPS2 / norm if norm > 0.0 else 1.0:.4g}}}"
+    )
+
+
+def _advice(option: str, kind: str, unit: str, columns: ColumnMap) -> str:
+    return f"give --{option}-unit {unit} or add to {columns.folder} the line units: {{{kind}: {unit}}}"
+
+
+@dataclass(frozen=True)
+class Turning:
+    """How a gyroscope turns beside the direction of the specific force.
+
+    Attributes
+    ----------
+    flat : whether gravity stays in the plane of x and y.
+    by_force_rad, by_gyro_rad : turn within a second, RMS in the median window, the latter in the rates' unit.
+    spread_rad : of the force's angle in the plane over the log.
+    misfit : for each factor on the rates, what it leaves of the force's turns, as a share of them.
+    turned_rad : the force's turns from block to block, RMS.
+    """
+
+    flat: bool
+    by_force_rad: float
+    by_gyro_rad: float
+    spread_rad: float
+    misfit: Mapping[float, float]
+    turned_rad: float
+
+
+def turning(t_s: FloatArray, force: FloatArray, rates: FloatArray, factors: Sequence[float]) -> Turning:
+    """Compare the turns of a gyroscope with those of the specific force.
+
+    In the plane the force's direction is atan2(ay, ax) and turns by -gz. Blocks of a second are averaged, as
+    a head that swings fast feels its own acceleration more than gravity. Out of the plane the direction u
+    follows du/dt = -w x u.
+
+    Parameters
+    ----------
+    t_s : (n,) times. force : (n, 2 or 3) in any unit. rates : (n,) -gz, or (n, 3) about x, y and z.
+    factors : to try on the rates.
+    """
+    phi = np.unwrap(np.arctan2(force[:, 1], force[:, 0]))
+    z = -rates if rates.ndim == 1 else rates[:, 2]
+    angle = np.concatenate([[0.0], np.cumsum(-z[1:] * np.diff(t_s))])
+    period = max(float(np.median(np.diff(t_s))), 1e-6)
+    size = min(max(round(1.0 / period), 4), len(phi))
+    count = len(phi) // size
+    by_force, by_gyro = (
+        float(np.median(x[: count * size].reshape(count, size).std(axis=1))) for x in (phi, angle)
+    )
+    unit = force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-12)
+    flat = rates.ndim == 1 or force.shape[1] == 2 or float(np.median(np.abs(unit[:, 2]))) < 0.35
+    size = min(max(round((_BLOCK_S if flat else _BLOCK_3D_S) / period), 2), len(phi))
+    edges = np.arange(0, len(phi) - size + 1, size)
+    if flat:
+        means = np.add.reduceat(np.exp(1j * phi), edges)[: len(edges)]
+        turn = np.add.reduceat(angle, edges)[: len(edges)] / size
+        turned = np.angle(means[1:] / means[:-1])
+        misfit = {f: np.angle(np.exp(1j * (turned - f * np.diff(turn)))) for f in factors}
+    else:
+        means3 = np.add.reduceat(unit, edges, axis=0)[: len(edges)]
+        means3 /= np.maximum(np.linalg.norm(means3, axis=1, keepdims=True), 1e-12)
+        steps = np.concatenate([np.zeros((1, 3)), rates[1:] * np.diff(t_s)[:, None]])
+        turn3 = np.diff(np.add.reduceat(np.cumsum(steps, axis=0), edges, axis=0)[: len(edges)] / size, axis=0)
+        turned = np.linalg.norm(np.diff(means3, axis=0), axis=1)
+        misfit = {f: np.linalg.norm(means3[1:] - _turned(means3[:-1], -f * turn3), axis=1) for f in factors}
+    whole = float(np.sqrt(np.mean(turned**2))) if len(turned) else 0.0
+    share = {f: float(np.sqrt(np.mean(off**2))) / whole if whole > 0.0 else 1.0 for f, off in misfit.items()}
+    return Turning(flat, by_force, by_gyro, float(phi.std()), share, whole)
+
+
+def _turned(u: FloatArray, by: FloatArray) -> FloatArray:
+    """Vectors (n, 3) turned by rotation vectors (n, 3), Rodrigues' formula."""
+    angle = np.linalg.norm(by, axis=1, keepdims=True)
+    k = by / np.maximum(angle, 1e-12)
+    along = (k * u).sum(axis=1, keepdims=True)
+    return np.asarray(u * np.cos(angle) + np.cross(k, u) * np.sin(angle) + k * along * (1.0 - np.cos(angle)))
+
+
+def _with_gyro(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMap:
+    names = _of(columns, GYRO)
+    if not names or all(columns.sources[name].unit == "counts" for name in names):
+        return columns
+    stated = {columns.sources[name].unit for name in names} - {""}
+    values = _together(cells, columns, names)
+    if len(stated) > 1 or len(values) < _FEWEST:
+        return columns
+    unit, scales = next(iter(stated), ""), {u: UNITS["gyro"][u] for u in ("rad/s", "deg/s", "mdeg/s")}
+    wrong = {u: _implausible(s, columns, cells, names, values) for u, s in scales.items()}
+    likely = [u for u in scales if not wrong[u]]
+    if unit:
+        if not wrong[unit]:
+            return columns
+        other = next((u for u in likely if u != unit), "deg/s" if unit == "rad/s" else "rad/s")
+        raise BadInputError(
+            f"{columns.source}: the gyroscope {wrong[unit]}, which none does in {unit}; if it is in {other}, "
+            f"{_advice('gyro', 'gyro', other, columns)}"
+        )
+    if len(likely) == 1:
+        others = "; ".join(f"in {u} it {wrong[u]}" for u in ("rad/s", "deg/s") if wrong[u])
+        return _with(columns, names, likely[0], others)
+    first = one_line(columns.sources[names[0]].column)[:40]
+    raise BadInputError(
+        f"{columns.source}: cannot tell whether `{first}` is in rad/s or in deg/s, as "
+        f"{'either is possible' if likely else 'neither fits'}; "
+        f"{_advice('gyro', 'gyro', 'rad/s|deg/s', columns)}"
+    )
+
+
+def _implausible(
+    scale: float,
+    columns: ColumnMap,
+    cells: Mapping[str, FloatArray],
+    names: Sequence[str],
+    values: FloatArray,
+) -> str:
+    """Why rates (n, axes) cannot be in a unit of this many rad/s; empty where they can."""
+    largest = scale * float(np.abs(values).max())
+    if largest > _FASTEST_RADPS:
+        return f"reaches {largest:.4g} rad/s"
+    accel = _of(columns, ACCEL)
+    if "gz_radps" not in names or "ax_mps2" not in accel or "ay_mps2" not in accel:
+        return ""
+    every = _together(cells, columns, ["t_s", *accel, *names])
+    if len(every) < 2 * _CALM_WINDOW:
+        return ""
+    t = every[:, 0] * UNITS["time"][columns.sources["t_s"].unit]
+    force, rates = every[:, 1 : 1 + len(accel)], every[:, 1 + len(accel) :]
+    whole = len(accel) == 3 and len(names) == 3
+    others = [f for u, f in UNITS["gyro"].items() if u != "counts" and not math.isclose(f, scale)]
+    found = turning(
+        t, force, rates if whole else -rates[:, names.index("gz_radps")], [scale, -scale, *others]
+    )
+    mine = min(found.misfit[scale], found.misfit[-scale])
+    if found.turned_rad > _LEAST_TURN_RAD and mine > _AGREES:
+        better = min((found.misfit[f] for f in others), default=1.0)
+        if better < _AGREES:
+            return "does not turn with the accelerometer's angle"
+    if found.flat and scale * found.by_gyro_rad > max(_LEAST_TURN_RAD, _FARTHER * found.by_force_rad):
+        times = scale * found.by_gyro_rad / max(found.by_force_rad, 1e-6)
+        return f"turns {times:.3g} times as far as the accelerometer's angle"
+    if found.spread_rad < _REST_RAD:
+        calm = calm_windows(every[:, 1:])[:, :, len(accel) :]
+        bias = scale * float(np.abs(np.median(calm, axis=(0, 1))).max())
+        spread = scale * np.median(calm.std(axis=1), axis=0)
+        if bias > _LARGEST_BIAS_RADPS:
+            return f"has a bias of {bias:.3g} rad/s at rest"
+        if float(spread.max()) > _LOUDEST_RADPS:
+            return f"is never quieter than {float(spread.max()):.3g} rad/s"
+        if 0.0 < float(spread.max()) < _QUIETEST_RADPS and not any(
+            columns.sources[name].unit for name in names
+        ):
+            return f"is as quiet as {float(spread.max()):.2g} rad/s"
+    return ""

@@ -1,0 +1,223 @@
+"""Columns of logs as people have them: names, units, marks, and the evidence where nobody states them."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.core.arrays import FloatArray
+from calib.core.errors import BadInputError
+from calib.core.stage import LogOptions
+from calib.io.columns import COLUMNS, known_name
+from calib.io.logs import Log, read_log, write_log
+
+G, DEGREE = 9.80665, math.pi / 180.0
+NAMED = "t_s ax_mps2 ay_mps2 az_mps2 gx_radps gy_radps gz_radps"
+AXES = ("ax_mps2", "ay_mps2", "az_mps2", "gx_radps", "gy_radps", "gz_radps")
+
+
+def _imu(moving: bool = True, seed: int = 0) -> tuple[FloatArray, FloatArray]:
+    """Times and readings of a sensor in the plane: slow bending, or rest, and the noise of a cheap chip."""
+    rng = np.random.default_rng(seed)
+    t = 0.01 * np.arange(3000)
+    phi = (0.5 if moving else 0.0) * np.sin(1.3 * t)
+    rate = (0.65 if moving else 0.0) * np.cos(1.3 * t)
+    zero = np.zeros_like(t)
+    values = np.stack([G * np.cos(phi), G * np.sin(phi), zero, zero, zero, -rate], axis=1)
+    return t, values + rng.normal(size=values.shape) * ([0.015] * 3 + [0.0025] * 3) + 0.004
+
+
+def _written(
+    path: Path, names: list[str], columns: list[FloatArray], mark: str = ",", comma: str = ".", head: str = ""
+) -> Path:
+    table = np.column_stack(columns)
+    rows = [mark.join(f"{value:.9g}".replace(".", comma) for value in row) for row in table]
+    path.write_text("\n".join([head or mark.join(names), *rows, ""]), encoding="utf-8-sig")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "column"),
+    [
+        ("millis", ("t_s", "ms")),
+        ("Time (ms)", ("t_s", "ms")),
+        ("timestamp [ns]", ("t_s", "ns")),
+        ("time_us", ("t_s", "us")),
+        ("timestamp", ("t_s", "")),
+        ("accel_x", ("ax_mps2", "")),
+        ("ax", ("ax_mps2", "")),
+        ("Accelerometer X (g)", ("ax_mps2", "g")),
+        ("imu.linear_acceleration.y", ("ay_mps2", "")),
+        ("a_RS_S_z [m s^-2]", ("az_mps2", "m/s2")),
+        ("gyro_z", ("gz_radps", "")),
+        ("GyroZ_dps", ("gz_radps", "deg/s")),
+        ("w_RS_S_x [rad s^-1]", ("gx_radps", "rad/s")),
+        ("Gyroscope Y (deg/s)", ("gy_radps", "deg/s")),
+        ("u", ("u_px", "px")),
+        ("pixy_y", ("v_px", "px")),
+        ("duty1", ("pwm1", "pwm")),
+        ("onchip_phi_deg", ("onchip_phi_rad", "deg")),
+        ("Magnetometer X (uT)", None),
+        ("temperature", None),
+        ("gear", None),
+        ("mag_x", None),
+        ("ax_uT", None),
+    ],
+)
+def test_names_that_people_give(name: str, column: tuple[str, str] | None) -> None:
+    assert known_name(name) == column
+
+
+def test_the_names_of_the_format_mean_themselves() -> None:
+    for name in ("t_s", *COLUMNS):
+        found = known_name(name)
+        assert found is not None
+        assert found[0] == name
+
+
+@pytest.mark.parametrize("moving", [True, False])
+@pytest.mark.parametrize(("acc", "gyro"), [("g", "deg/s"), ("m/s2", "rad/s"), ("mg", "mdeg/s")])
+@pytest.mark.parametrize(("time", "scale"), [("s", 1.0), ("ms", 1e3), ("us", 1e6)])
+def test_units_are_inferred_from_the_readings(
+    tmp_path: Path, moving: bool, acc: str, gyro: str, time: str, scale: float
+) -> None:
+    t, values = _imu(moving)
+    per = (
+        {"g": 1 / G, "m/s2": 1.0, "mg": 1e3 / G}[acc],
+        {"deg/s": 1 / DEGREE, "rad/s": 1.0, "mdeg/s": 1e3 / DEGREE}[gyro],
+    )
+    columns = [scale * t, *(per[0] * values[:, :3]).T, *(per[1] * values[:, 3:]).T]
+    path = _written(tmp_path / "log.csv", ["time", "ax", "ay", "az", "gx", "gy", "gz"], columns)
+    log = read_log(path)
+    assert np.allclose(log.t_s, t)
+    assert np.allclose(np.stack([log.columns[name] for name in AXES], axis=1), values, rtol=1e-6, atol=1e-6)
+    assert log.map is not None
+    assert f"read as: time in {time} from `time` (" in log.map.narration
+    assert f"accelerations in {acc} from `ax`, `ay`, `az` (the specific force is" in log.map.narration
+    assert f"rates in {gyro} from `gx`, `gy`, `gz` (in " in log.map.narration
+    # What was inferred can be stated, and is read the same.
+    (tmp_path / "columns.yaml").write_text(log.map.text())
+    again = read_log(path)
+    assert again.map is not None and not again.map.evidence
+    for name in AXES:
+        assert np.array_equal(again.columns[name], log.columns[name])
+
+
+@pytest.mark.parametrize(("mark", "comma"), [(";", ","), (";", "."), ("\t", ",")])
+def test_marks_of_other_countries(tmp_path: Path, mark: str, comma: str) -> None:
+    t, values = _imu()
+    names = ["t_s", *AXES]
+    log = read_log(_written(tmp_path / "log.csv", names, [t, *values.T], mark, comma))
+    plain = read_log(_written(tmp_path / "plain.csv", names, [t, *values.T]))
+    assert all(np.array_equal(log.columns[name], plain.columns[name]) for name in AXES)
+
+
+def test_a_file_without_a_header(tmp_path: Path) -> None:
+    t, values = _imu()
+    columns = [1e3 * t, *values[:, [0, 1, 5]].T]
+    path = _written(tmp_path / "log.csv", [], columns, head="# a logger, 2024")
+    with pytest.raises(BadInputError, match=r"line 2: holds numbers.*yaml the line names: \[t_s.*4 columns"):
+        read_log(path)
+    (tmp_path / "columns.yaml").write_text("names: [millis, ax, ay, gz]\n")
+    named = read_log(path)
+    text = "t_s: {column: 1, unit: ms}\nax_mps2: 2\nay_mps2: 3\ngz_radps: 4\n"
+    (tmp_path / "columns.yaml").write_text(text)
+    numbered = read_log(path)
+    (tmp_path / "columns.yaml").unlink()
+    above = read_log(_written(path, [], columns, head="#millis,ax,ay,gz"))
+    for log in (named, numbered, above):
+        assert np.allclose(log.t_s, t)
+        assert np.allclose(log.columns["gz_radps"], values[:, 5])
+
+
+@pytest.mark.parametrize(
+    ("names", "factors", "options", "words"),
+    [
+        # A name that states another unit than the readings have.
+        (NAMED, (1e3, 1, 1), {}, r"t_s steps by 10, in s that is 0.1 .* line t_s: \{column: t_s, unit: ms\}"),
+        (NAMED, (1, 1 / G, 1), {}, r"is in g, not in m/s2; give --acc-unit g or .*units: \{accel: g\}"),
+        (NAMED, (1, 1, 1 / DEGREE), {}, r"in deg/s, give --gyro-unit deg/s or .*units: \{gyro: deg/s\}"),
+        # A person who does.
+        (NAMED, (1, 1, 1), {"acc_unit": "g"}, "is in m/s2, not in g; give --acc-unit m/s2"),
+        (NAMED, (1, 1, 1), {"gyro_unit": "deg/s"}, "none does in deg/s; if it is in rad/s"),
+        # No unit that is known.
+        ("t ax ay az gx gy gz", (1, 1670, 1), {}, r"raw counts.*ax_mps2: \{column: ax, factor:"),
+        (NAMED, (1, 3, 1), {}, "the specific force is 29.* where the log is calm"),
+        # Two columns for one.
+        ("time ax accel_x az gx gy gz", (1, 1, 1), {}, "`ax` and `accel_x` may both be ax_mps2"),
+        ("time stamp ay az gx gy gz", (1, 1, 1), {}, "`time` and `stamp` may both be t_s"),
+    ],
+)
+def test_what_the_readings_contradict_is_refused_with_what_to_do(
+    tmp_path: Path, names: str, factors: tuple[float, float, float], options: dict[str, str], words: str
+) -> None:
+    t, values = _imu()
+    columns = [factors[0] * t, *(factors[1] * values[:, :3]).T, *(factors[2] * values[:, 3:]).T]
+    path = _written(tmp_path / "log.csv", names.split(), columns)
+    with pytest.raises(BadInputError, match=words):
+        read_log(path, LogOptions(**options))  # type: ignore[arg-type]
+
+
+def test_a_unit_that_a_person_states(tmp_path: Path) -> None:
+    t, values = _imu()
+    columns = [t, *(values[:, :3] / G).T, *(values[:, 3:] / DEGREE).T]
+    path = _written(tmp_path / "log.csv", ["t_s", *AXES], columns)
+    by_option = read_log(path, LogOptions("g", "deg/s"))
+    (tmp_path / "log.columns.yaml").write_text("units: {accel: g, gyro: deg/s}\n")
+    by_file = read_log(path)
+    for log in (by_option, by_file):
+        assert np.allclose(np.stack([log.columns[name] for name in AXES], axis=1), values, atol=1e-6)
+
+
+def test_a_gyroscope_at_rest_that_may_be_either_is_not_guessed(tmp_path: Path) -> None:
+    t, values = _imu(moving=False)
+    columns = [t, *values[:, :3].T, 4.0 * values[:, 5]]
+    path = _written(tmp_path / "log.csv", ["t", "ax", "ay", "az", "gz"], columns)
+    words = "cannot tell whether `gz` is in rad/s or in deg/s, as either is possible"
+    with pytest.raises(BadInputError, match=words):
+        read_log(path)
+    assert len(read_log(path, LogOptions(gyro_unit="deg/s"))) == 3000
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("gz_radsp: gz\n", "gz_radsp is not known, did you mean gz_radps"),
+        ("gz_radps: {column: gz, unit: m}\n", "gz_radps.unit is 'm', expected one of rad/s, deg/s"),
+        ("gz_radps: {col: gz}\n", "expected a column's name or column, unit, factor, offset"),
+        ("gz_radps: {column: gz, factor: much}\n", "gz_radps.factor is 'much', expected a number"),
+        ("units: {accel: lb}\n", "units.accel is 'lb', expected one of m/s2, g"),
+        ("names: 3\n", "names is 3, expected a list"),
+        ("separator: '|'\n", "separator is '|', expected one of"),
+    ],
+)
+def test_a_columns_file_that_is_wrong(tmp_path: Path, text: str, words: str) -> None:
+    t, values = _imu()
+    path = _written(tmp_path / "log.csv", ["t_s", "gz_radps"], [t, values[:, 5]])
+    (tmp_path / "columns.yaml").write_text(text)
+    with pytest.raises(BadInputError, match=words):
+        read_log(path)
+
+
+def test_a_recording_of_somebody_else(shared_data: Path) -> None:
+    log = read_log(shared_data / "imufusion" / "sensor_data.csv")
+    assert sorted(log.columns) == sorted(AXES)
+    assert log.unknown == ("Magnetometer X (uT)", "Magnetometer Y (uT)", "Magnetometer Z (uT)")
+    start = log.t_s < 2.0
+    force = np.stack([log.columns[name][start] for name in AXES[:3]], axis=1)
+    assert np.median(np.linalg.norm(force, axis=1)) == pytest.approx(G, rel=0.02)
+    # The sensor turns by a third of a turn at a time, no faster than a hand.
+    assert 1.0 < np.abs(log.columns["gz_radps"]).max() < 12.0
+
+
+def test_parquet_has_units_too(tmp_path: Path) -> None:
+    t, values = _imu()
+    columns = {name: v / G if name[0] == "a" else v for name, v in zip(AXES, values.T, strict=True)}
+    path = tmp_path / "log.parquet"
+    write_log(path, Log("log", t, columns, np.arange(3000)))
+    with pytest.raises(BadInputError, match="give --acc-unit g"):
+        read_log(path)
+    assert np.allclose(read_log(path, LogOptions(acc_unit="g")).columns["ax_mps2"], values[:, 0])

@@ -1,0 +1,115 @@
+"""From a log to arrays, and what is wrong about its sensors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calib.core.arrays import FloatArray
+from calib.core.errors import BadInputError
+from calib.io.logs import Log
+from calib.io.signals import IN_PLANE, Watch
+
+G = 9.80665
+
+
+def _log(**changes: Any) -> Log:
+    rng = np.random.default_rng(0)
+    t = 0.01 * np.arange(3000)
+    phi = 0.5 * np.sin(1.3 * t)
+    columns: dict[str, FloatArray] = {
+        "gz_radps": -0.65 * np.cos(1.3 * t) + 0.003 * rng.normal(size=3000),
+        "ax_mps2": G * np.cos(phi) + 0.02 * rng.normal(size=3000),
+        "ay_mps2": G * np.sin(phi) + 0.02 * rng.normal(size=3000),
+    }
+    for name, value in changes.items():
+        columns[name] = np.broadcast_to(value, (3000,)).copy()
+    return Log("log.csv", t, columns, np.arange(2, 3002))
+
+
+def test_rows_with_all_columns() -> None:
+    log = _log(u_px=np.where(np.arange(3000) % 3 == 0, 100.0, np.nan))
+    both = log.signals("u_px", "gz_radps")
+    assert len(both) == 1000
+    assert both.lines[:2].tolist() == [2, 5]
+    assert np.array_equal(both["gz_radps"], log.columns["gz_radps"][::3])
+    assert both.axis.rate_hz == pytest.approx(100.0 / 3.0)
+    either = log.signals("u_px", optional=("gz_radps", "gx_radps"), partly=True)
+    assert (len(either), either.names) == (3000, ("u_px", "gz_radps"))
+
+
+def test_rows_that_were_written_twice_are_one_sample() -> None:
+    log = _log()
+    rows = np.sort(np.concatenate([np.arange(3000), np.arange(100, 2900, 480)]))
+    twice = Log("log.csv", log.t_s[rows], {k: v[rows] for k, v in log.columns.items()}, log.lines[rows])
+    signals = twice.signals(*IN_PLANE)
+    assert (len(signals), signals.repeated_rows) == (3000, 6)
+    assert np.array_equal(signals["ax_mps2"], log.columns["ax_mps2"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "severity", "words"),
+    [
+        ({}, "", ""),
+        ({"gz_radps": 0.01}, "inconsistent", "gz_radps never changes, it is stuck at 0.01"),
+        ({"ax_mps2": np.nan}, "poor", "ax_mps2 has no reading in any row"),
+    ],
+)
+def test_a_watch_sees_what_is_stuck_or_absent(changes: dict[str, Any], severity: str, words: str) -> None:
+    log, watch = _log(**changes), Watch()
+    for part in np.array_split(np.arange(3000), 7):
+        columns = {name: values[part] for name, values in log.columns.items()}
+        watch.add(Log("log.csv", log.t_s[part], columns, log.lines[part]))
+    found = watch.findings()
+    assert [(one.severity, one.text) for one in found] == ([(severity, words)] if words else [])
+
+
+def test_axes_that_are_swapped_or_mirrored() -> None:
+    right = _log()
+    ax, ay, gz = (right.columns[name] for name in ("ax_mps2", "ay_mps2", "gz_radps"))
+    assert right.signals(*IN_PLANE).findings == ()
+    (swapped,) = _log(ax_mps2=ay, ay_mps2=ax).signals(*IN_PLANE).findings
+    assert swapped.severity == "inconsistent"
+    assert "ax_mps2 and ay_mps2 are swapped" in swapped.text
+    assert "the lines ax_mps2: ay_mps2 and ay_mps2: ax_mps2" in swapped.advice
+    (mirrored,) = _log(gz_radps=-gz).signals(*IN_PLANE).findings
+    assert "gz_radps, or one of ax_mps2 and ay_mps2, has the wrong sign" in mirrored.text
+    assert "gz_radps: {column: gz_radps, factor: -1}" in mirrored.advice
+    with pytest.raises(BadInputError, match="turns against the gyroscope's: ax_mps2 and ay_mps2 are swapped"):
+        _log(ax_mps2=ay, ay_mps2=ax).signals(*IN_PLANE).refuse_mirrored()
+
+
+def test_a_head_that_swings_is_not_mirrored() -> None:
+    """At 3 Hz the head's own acceleration outweighs gravity, and the angle by ax and ay is the other way."""
+    t = 0.01 * np.arange(3000)
+    phi, w = 0.3 * np.sin(19.0 * t), 19.0
+    log = _log(
+        gz_radps=-0.3 * w * np.cos(19.0 * t),
+        ax_mps2=G * np.cos(phi),
+        ay_mps2=G * np.sin(phi) - 0.06 * w**2 * phi,
+    )
+    assert log.signals(*IN_PLANE).findings == ()
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (("u_px",), "log.csv: has no u_px, expected u_px beside t_s"),
+        (("gx_radps", "gz_radps"), "log.csv: has no gx_radps, expected gx_radps and gz_radps beside t_s"),
+        (("gy_radps",), "log.csv: gy_radps holds no number"),
+    ],
+)
+def test_what_is_not_there(names: tuple[str, ...], words: str) -> None:
+    with pytest.raises(BadInputError, match=words):
+        _log(gy_radps=np.nan).signals(*names)
+
+
+def test_time_that_goes_back_and_axes_that_are_stuck() -> None:
+    log = _log(ay_mps2=0.5)
+    with pytest.raises(BadInputError, match=r"ay_mps2 never changes, it is stuck at 0.5; expected the noise"):
+        log.signals(*IN_PLANE).refuse_stuck(*IN_PLANE)
+    log.t_s[10] = 0.0
+    with pytest.raises(BadInputError, match=r"log.csv, line 12: t_s goes back from 0.090000 to 0.000000"):
+        log.signals("gz_radps")
