@@ -13,8 +13,9 @@ from calib.core.errors import BadInputError
 from calib.core.files import sha256, write_atomically
 from calib.core.rig import Rig
 from calib.runner.folder import Folder, LogFile, read_folder
-from calib.runner.graph import HIDDEN, Command, Done, Planned, Runner, Stage, opened
+from calib.runner.graph import HIDDEN, Done, Planned, Runner, Stage, opened
 from calib.runner.outputs import decide, publish, summary
+from calib.runner.work import DOCUMENT, FIGURES, MESSAGES, RIG, Work
 from calib.stages.estimator.section import Estimator
 from calib.twin.section import Twin, TwinTracker
 
@@ -26,12 +27,8 @@ CALLS: list[str] = []
 Act = Callable[[list[str], Path], int]
 
 
-def _option(words: tuple[str, ...], name: str) -> Path | None:
-    return Path(words[words.index(name) + 1]) if name in words else None
-
-
 class Inline:
-    """Runs a command at once; `acts` holds exit codes by the name of the command, 0 for the others."""
+    """Carries out a work at once; `codes` holds exit codes by its name, 0 for the others."""
 
     def __init__(
         self, codes: dict[str, int] | None = None, during: Callable[[str], None] | None = None
@@ -43,58 +40,57 @@ class Inline:
     def free(self) -> bool:
         return not self._ended
 
-    def start(self, command: Command) -> None:
-        CALLS.append(command.name)
-        code = self.codes.get(command.name, 0)
+    def start(self, work: Work) -> None:
+        CALLS.append(work.name)
+        code = self.codes.get(work.name, 0)
         if code in (0, 1):
-            code = self._guarded(command, code)
+            code = self._guarded(work, code)
         else:
-            command.stderr.write_text(f"calib: {command.name} cannot\n")
+            (work.folder / MESSAGES).write_text(f"calib: {work.name} cannot\n")
         if self.during is not None:
-            self.during(command.name)
-        self._ended.append((command.name, code))
+            self.during(work.name)
+        self._ended.append((work.name, code))
 
-    def _guarded(self, command: Command, code: int) -> int:
+    def _guarded(self, work: Work, code: int) -> int:
         """As the command line ends a verb that cannot write."""
         try:
-            self._work(command, code)
+            self._work(work, code)
             return code
         except (OSError, BadInputError) as error:
             with contextlib.suppress(OSError):
-                command.stderr.write_text(f"calib: {error}\n")
+                (work.folder / MESSAGES).write_text(f"calib: {error}\n")
             return 3
 
-    def _work(self, command: Command, code: int) -> None:
-        rig_path = _option(command.words, "--rig")
-        assert rig_path is not None
+    def _work(self, work: Work, code: int) -> None:
+        rig_path = work.folder / RIG
         rig = Rig.load(rig_path)
-        inputs = [Path(word) for word in command.words if word.endswith((".csv", ".png"))]
+        inputs = list(work.paths)
         digest = sha256(
             b"".join(path.read_bytes() for path in inputs if path.parent.name in ("logs", "images"))
         )
-        if command.words[0] == "first":
+        if work.verb == "first":
             rig.estimator = Estimator(
                 jitter_px=1e-6 + int(digest[:6], 16) * 1e-6,
                 verdict="poor" if code else "ok",
                 reasons=["it is weak"] if code else [],
             )
             rig.save(rig_path, {"estimator": {path.name: digest for path in inputs}})
-        elif command.words[0] == "second":
+        elif work.verb == "second":
             assert rig.estimator is not None
             rig.twin = Twin(tracker=TwinTracker(jitter_px=2.0 * rig.estimator.jitter_px))
             rig.save(rig_path, {"twin": {}})
-        output = _option(command.words, "-o")
+        output = work.folder / work.output if work.output else None
         if output is not None and output.suffix:
             write_atomically(output, f"t_s\n{digest}\n")
         elif output is not None:
             output.mkdir()
             write_atomically(output / "header.h", f"// {sorted(rig.values().items())}\n")
-        figures = _option(command.words, "--figures")
-        if figures is not None:
+        if work.figures:
+            figures = work.folder / FIGURES
             figures.mkdir(exist_ok=True)
             write_atomically(figures / "some_figure.svg", "<svg xmlns='http://www.w3.org/2000/svg'/>")
-        command.stdout.write_text(json.dumps({"schema": 1, "verb": command.words[0], "seconds": {"a": 1.5}}))
-        command.stderr.write_text(f"written to {rig_path}\nsaid by {command.name}\n")
+        (work.folder / DOCUMENT).write_text(json.dumps({"schema": 1, "verb": work.verb}))
+        (work.folder / MESSAGES).write_text(f"said by {work.name}\n")
 
     def finished(self) -> Iterator[tuple[str, int]]:
         ended, self._ended = self._ended, []
@@ -102,7 +98,7 @@ class Inline:
 
 
 def _pictures(folder: Folder) -> Planned | str:
-    return Planned(tuple(map(str, folder.pictures)), folder.pictures) if folder.pictures else "no pictures"
+    return Planned(folder.pictures, folder.pictures) if folder.pictures else "no pictures"
 
 
 def _nothing(_: Folder) -> Planned | str:
@@ -110,7 +106,7 @@ def _nothing(_: Folder) -> Planned | str:
 
 
 def _log(log: LogFile) -> Planned | str:
-    return Planned((str(log.path),), (log.path,))
+    return Planned((log.path,), (log.path,))
 
 
 STAGES = (

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from calib.cli.common import JsonOption, document, narrate, progress_bar, say, table
-from calib.core.errors import BadInputError
+from calib.core.errors import EXIT_DONE
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from calib.runner.folder import Folder
-    from calib.runner.graph import Done, Pool
+    from calib.runner.graph import Done
 
 __all__ = ["is_available", "run"]
 
@@ -58,7 +58,7 @@ def run(
             narrate("the last run here was interrupted; going on where it stopped")
         if seen is None:
             narrate("no folder given: a simulated rig is calibrated, not a real one")
-            seen = _simulated(output, pool)
+            seen = _simulated(output)
         for sentence in seen.left_out:
             narrate(sentence)
         with progress_bar("calibrating") as progress:
@@ -100,12 +100,14 @@ def _all_verbs() -> Any:
     return typer.main.get_command(app)
 
 
-def _simulated(output: Path, pool: Pool) -> Folder:
+def _simulated(output: Path) -> Folder:
     """The folder of a simulated rig, made beside the results unless this program has made it before."""
     from calib.core.files import make_folder
     from calib.runner.cache import key_of, load, remove, store
     from calib.runner.folder import read_folder
-    from calib.runner.graph import HIDDEN, Command
+    from calib.runner.graph import HIDDEN
+    from calib.twin.folder import write_rig_folder
+    from calib.twin.rig import SimulatedRig
 
     hidden = output / HIDDEN
     place, key = hidden / "stages" / "simulate", key_of(("simulate", "rig"), {}, "")
@@ -113,15 +115,8 @@ def _simulated(output: Path, pool: Pool) -> Folder:
         work = hidden / "work" / "simulate"
         remove(work)
         make_folder(work)
-        words = ("simulate", "rig", "-o", str((work / "rig").absolute()))
-        pool.start(Command("simulate", words, work / "document.txt", work / "messages.txt"))
-        code = next(code for _, code in pool.finished())
-        if code:
-            said = (work / "messages.txt").read_text(encoding="utf-8", errors="replace").strip()
-            raise BadInputError(f"the simulated rig could not be made: {said or f'exit code {code}'}")
-        for name in ("document.txt", "messages.txt"):
-            (work / name).unlink()
-        store(work, place, key, code, hidden / "work" / "old-simulate")
+        write_rig_folder(work / "rig", SimulatedRig())
+        store(work, place, key, EXIT_DONE, hidden / "work" / "old-simulate")
     return read_folder(place / "rig")
 
 

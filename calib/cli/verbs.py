@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 from collections.abc import Callable
 from dataclasses import MISSING, fields
 from pathlib import Path
@@ -14,7 +15,7 @@ from calib.cli.common import (
     FiguresOption,
     JsonOption,
     RigOption,
-    document,
+    emit,
     narrate,
     progress_bar,
     say,
@@ -87,34 +88,16 @@ def _several(hint: Any) -> Any:
 
 
 def _run(stage: Stage, files: Files, options: Any, figures: Path | None, as_json: bool) -> None:
-    from calib.core.files import check_folder, check_writable, shown
-    from calib.core.result import section_json
-    from calib.core.rig import Rig
+    from calib.core.files import shown
     from calib.core.words import as_text, described
+    from calib.runner.work import carry_out, document_of
 
-    if stage.writes:
-        check_writable(files.rig_path)
-    if stage.output is not None and files.output is not None:
-        (check_folder if stage.output.folder else check_writable)(files.output)
-    if figures is not None:
-        check_folder(figures)
-    rig = Rig.load(files.rig_path, missing_ok=True)
-    outcome = stage.run(files, rig, options)
+    outcome, after = carry_out(stage, files, options, files.rig_path, figures)
     sections = stage.sections(outcome)
-    if sections:
-        rig = rig.with_sections(sections)
-        rig.save(files.rig_path)
-    if stage.output is not None and files.output is not None:
-        for sentence in stage.output.write(files.output, outcome):
-            narrate(sentence)
-    if figures is not None and stage.plots is not None:
-        from calib.show.draw import write_figures
-
-        write_figures(figures, stage.plots(outcome))
+    if figures is not None:
         narrate(f"figures in {shown(figures)}")
     if as_json:
-        written = {name: section_json(one) for name, one in sections.items()}
-        document(stage.name, written | stage.document(outcome))
+        emit(json.dumps(document_of(stage, outcome), indent=1, allow_nan=False, ensure_ascii=True) + "\n")
     else:
         blocks = [] if stage.words is None else list(stage.words(outcome))
         for one in sections.values():
@@ -123,7 +106,7 @@ def _run(stage: Stage, files: Files, options: Any, figures: Path | None, as_json
             say(line)
     for name in sections:
         narrate(f"{name} written to {shown(files.rig_path)}")
-    for sentence in () if stage.remarks is None else stage.remarks(rig):
+    for sentence in () if stage.remarks is None else stage.remarks(after):
         narrate(sentence)
     if not stage.verdict(outcome).ok:
         raise typer.Exit(EXIT_POOR)

@@ -176,6 +176,14 @@ def options_of(kind: type[Any], values: Mapping[str, Any]) -> Any:
     return kind(**parsed)
 
 
+def name_of_flag(kind: type[Any], flag: str) -> str:
+    """Name of the option that has this flag on the command line. Raises `UsageError` where there is none."""
+    for one in fields(kind):
+        if flag == (one.metadata["flag"] or one.name.replace("_", "-")):
+            return one.name
+    raise UsageError(f"--{flag} is not an option")
+
+
 def _no_evidence(outcome: Any) -> dict[str, Any]:
     del outcome
     return {}

@@ -11,7 +11,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
@@ -23,6 +23,7 @@ from calib.core.files import check_folder, make_folder, one_line, shown, write_a
 from calib.core.rig import SCHEMA, Rig
 from calib.runner.cache import Result, held, key_of, load, remove, store
 from calib.runner.folder import Folder, LogFile, folder_digests, with_topics
+from calib.runner.work import Work, perform
 
 # ----------------------------------------------------------------------
 # Sections of the rig's file, handed from stage to stage.
@@ -87,10 +88,11 @@ _PUMP = ("pwm1", "pwm2")
 
 @dataclass(frozen=True)
 class Planned:
-    """Arguments of a stage's verb, without those that all stages have, and the files that it reads."""
+    """What a stage reads and its options, and all files that it depends on."""
 
-    arguments: tuple[str, ...]
+    paths: tuple[Path, ...]
     inputs: tuple[Path, ...]
+    options: Mapping[str, Any] = field(default_factory=dict)
 
 
 Plan = Callable[[Folder], Planned | str]
@@ -145,8 +147,8 @@ class Job:
     reason: str = ""
 
 
-def _given(paths: tuple[Path, ...], *more: str) -> Planned:
-    return Planned((*(str(path) for path in paths), *more), with_topics(paths))
+def _given(paths: tuple[Path, ...], **options: Any) -> Planned:
+    return Planned(paths, with_topics(paths), options)
 
 
 def _logs(folder: Folder, kind: str, *columns: str) -> tuple[Path, ...]:
@@ -162,7 +164,7 @@ def _intrinsics(folder: Folder) -> Planned | str:
         return "no pictures in images/"
     linked = _linked(folder, "images/board.yaml")
     board = () if folder.board is None else (folder.board,)
-    return linked or Planned(tuple(map(str, folder.pictures)), (*folder.pictures, *board))
+    return linked or Planned(folder.pictures, (*folder.pictures, *board))
 
 
 def _extrinsics(folder: Folder) -> Planned | str:
@@ -171,7 +173,7 @@ def _extrinsics(folder: Folder) -> Planned | str:
     if linked := _linked(folder, "images/plane/"):
         return linked
     board = () if folder.plane_board is None else (folder.plane_board,)
-    return Planned((str(folder.root / "images" / "plane"),), (*folder.plane, *board))
+    return Planned((folder.root / "images" / "plane",), (*folder.plane, *board))
 
 
 def _static(folder: Folder) -> Planned | str:
@@ -192,14 +194,14 @@ def _moving(folder: Folder) -> Planned | str:
 def _drift(folder: Folder) -> Planned | str:
     logs = (*_logs(folder, "rest", *_IMU), *_logs(folder, "motion", *_IMU)[:1])
     # What is installed beside calib must not change the page.
-    return _given(logs, "--no-peers") if logs else "no logs of an IMU in logs/"
+    return _given(logs, no_peers=True) if logs else "no logs of an IMU in logs/"
 
 
 def _lowpass(folder: Folder) -> Planned | str:
     logs = _logs(folder, "motion", *_CAMERA)
     if not logs:
         return Planned((), ())
-    return Planned(("--log", str(logs[0])), with_topics(logs[:1]))
+    return Planned((), with_topics(logs[:1]), {"log": logs[0]})
 
 
 def _both(folder: Folder) -> Planned | str:
@@ -210,7 +212,7 @@ def _both(folder: Folder) -> Planned | str:
 def _identify(folder: Folder) -> Planned | str:
     logs = _logs(folder, "motion", *_CAMERA, *_PUMP)
     # A fit without each log in turn takes as many times as long, and is left to the verb.
-    return _given(logs, "--no-hold-back") if logs else "no logs with camera and PWM in logs/"
+    return _given(logs, no_hold_back=True) if logs else "no logs with camera and PWM in logs/"
 
 
 def _driven(folder: Folder) -> Planned | str:
@@ -225,7 +227,7 @@ def _nothing(_: Folder) -> Planned | str:
 def _replay(log: LogFile) -> Planned | str:
     if not (log.has(*_CAMERA) or log.has(*_IMU)):
         return "the log has neither a camera nor an IMU"
-    return Planned((str(log.path),), with_topics([log.path]))
+    return Planned((log.path,), with_topics([log.path]))
 
 
 _OPTICS = ("camera", "plane")
@@ -317,34 +319,24 @@ _LIBRARIES = (
 _Process = tuple[multiprocessing.process.BaseProcess, Connection]
 
 
-@dataclass(frozen=True)
-class Command:
-    """A verb to run: its words, and files for what it says on stdout and stderr."""
-
-    name: str
-    words: tuple[str, ...]
-    stdout: Path
-    stderr: Path
-
-
 class Runs(Protocol):
-    """What runs commands: `start` while `free`, then the names and exit codes of `finished` ones."""
+    """What carries out works: `start` while `free`, then names and exit codes of `finished` ones."""
 
     @property
     def free(self) -> bool:
-        """Whether another command can start."""
+        """Whether another work can start."""
 
-    def start(self, command: Command) -> None:
-        """Start a command."""
+    def start(self, work: Work) -> None:
+        """Start a work."""
 
     def finished(self) -> Iterator[tuple[str, int]]:
-        """Wait until at least one command has ended."""
+        """Wait until at least one has ended."""
 
 
 def _serve(channel: Connection, parent: int, ahead: bool) -> None:
-    """Life of a process: commands in, exit codes out, until the other end closes.
+    """Life of a process: works in, exit codes out, until the other end closes.
 
-    One that is started `ahead` of its first command loads meanwhile what most of them need.
+    One that is started `ahead` of its first work loads meanwhile what most of them need.
     """
     # Ctrl-C reaches all processes of a terminal; the first one answers for all.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -358,37 +350,18 @@ def _serve(channel: Connection, parent: int, ahead: bool) -> None:
             importlib.import_module(name)
     while True:
         try:
-            command = channel.recv()
+            work = channel.recv()
         except EOFError:
             return
-        code = run_here(command)
+        code = perform(work)
         try:
             channel.send(code)
         except OSError:
             return
 
 
-def run_here(command: Command) -> int:
-    """Run a verb in this process and return its exit code; one at a time, for it takes over stdout."""
-    from calib.cli.main import main
-
-    before = sys.argv, sys.stdout, sys.stderr
-    how: Any = {"mode": "w", "encoding": "utf-8", "errors": "backslashreplace"}
-    try:
-        with command.stdout.open(**how) as out, command.stderr.open(**how) as told:
-            sys.argv, sys.stdout, sys.stderr = ["calib", *command.words], out, told
-            try:
-                main()
-            except SystemExit as leaving:
-                return leaving.code if isinstance(leaving.code, int) else 0
-    except OSError:
-        return _LOST
-    finally:
-        sys.argv, sys.stdout, sys.stderr = before
-
-
 class Pool:
-    """A few processes that run verbs; use with `with`."""
+    """A few processes that carry out works; use with `with`."""
 
     def __init__(self, count: int) -> None:
         self._context = multiprocessing.get_context("spawn")
@@ -408,16 +381,16 @@ class Pool:
 
     @property
     def free(self) -> bool:
-        """Whether another command can start."""
+        """Whether another work can start."""
         return len(self._busy) < self._count
 
-    def start(self, command: Command) -> None:
-        """Hand a command to an idle process, or to a new one; with the first, another is made ready."""
+    def start(self, work: Work) -> None:
+        """Hand a work to an idle process, or to a new one; with the first, another is made ready."""
         first = not (self._idle or self._busy)
         process, channel = self._idle.pop() if self._idle else self._made(ahead=False)
-        self._busy[command.name] = process, channel
+        self._busy[work.name] = process, channel
         with contextlib.suppress(OSError):
-            channel.send(command)
+            channel.send(work)
         if first and self._count > 1:
             self._idle.append(self._made(ahead=True))
 
@@ -429,7 +402,7 @@ class Pool:
         return process, channel
 
     def finished(self) -> Iterator[tuple[str, int]]:
-        """Names and exit codes of commands that have ended; waits for at least one."""
+        """Names and exit codes of works that have ended; waits for at least one."""
         ready: list[object] = []
         while not ready and self._busy:
             # The wait is a short one, again and again, so that Ctrl-C is answered.
@@ -627,10 +600,11 @@ class Runner:
             self._finish(self._blocked(job, lacking))
             return None
         inputs = {self.folder.name_of(path): self._digests[path] for path in job.planned.inputs}
-        names = {str(path): self.folder.name_of(path) for path in job.planned.inputs}
-        root = str(self.folder.root) + os.sep
-        words = tuple(names.get(word, word.removeprefix(root)) for word in job.planned.arguments)
-        key = key_of((*job.stage.verb, *words), inputs, known.canonical())
+        named = [self.folder.name_of(path) for path in job.planned.paths]
+        options = {name: self._said(value) for name, value in job.planned.options.items()}
+        key = key_of(
+            (*job.stage.verb, *named, json.dumps(options, sort_keys=True)), inputs, known.canonical()
+        )
         kept = None if self.fresh else load(self.out / HIDDEN / "stages" / job.name, key)
         if kept is not None and kept.code in _USABLE:
             self._finish(self._judged(job, kept, reused=True))
@@ -639,16 +613,25 @@ class Runner:
         remove(work)
         make_folder(work)
         write_atomically(work / "rig.yaml", known.text(self.folder.rig or self.out / "rig.yaml"))
-        arguments = [*job.stage.verb, "--json", "--rig", str(work / "rig.yaml")]
-        if job.stage.figures:
-            arguments += ["--figures", str(work / "figures")]
-        if job.stage.output:
-            arguments += ["-o", str(work / job.stage.output)]
-        # Names that begin with a dash are no options: all paths here begin with a slash.
-        arguments += job.planned.arguments
         self._began[job.name] = time.monotonic()
-        self.runs.start(Command(job.name, tuple(arguments), work / "document.json", work / "messages.txt"))
+        stage = job.stage
+        self.runs.start(
+            Work(
+                job.name,
+                " ".join(stage.verb),
+                self.folder.root,
+                work,
+                job.planned.paths,
+                job.planned.options,
+                stage.figures,
+                stage.output,
+            )
+        )
         return job, key, work
+
+    def _said(self, value: Any) -> Any:
+        """An option's value, the same wherever the folder lies."""
+        return self.folder.name_of(value) if isinstance(value, Path) else value
 
     def _blocked(self, job: Job, section: str) -> Done:
         for done in self.done.values():
@@ -665,30 +648,9 @@ class Runner:
             name = one_line(self.folder.name_of(changed))
             self._finish(Done(job, "failed", f"{name} changed while it was read; run it again"))
             return
-        self._tidy(work)
         hidden = self.out / HIDDEN
         result = store(work, hidden / "stages" / job.name, key, code, hidden / "work" / f"old-{job.name}")
         self._finish(self._judged(job, result, reused=False))
-
-    def _tidy(self, work: Path) -> None:
-        """Leave nothing in a result that differs from run to run: durations, places."""
-        document, messages = work / "document.json", work / "messages.txt"
-        with contextlib.suppress(OSError, ValueError):
-            told = json.loads(document.read_text(encoding="utf-8"))
-            if isinstance(told, dict):
-                told.pop("seconds", None)
-                write_atomically(document, json.dumps(told, indent=1) + "\n")
-        with contextlib.suppress(OSError):
-            text = messages.read_text(encoding="utf-8", errors="replace")
-            root, place = str(self.folder.root) + os.sep, str(work)
-            kept = [line.replace(root, "") for line in text.splitlines() if place not in line]
-            if not any(line.startswith("calib: ") for line in kept):
-                # What the verb ended with is told even where it names our place.
-                kept += [
-                    line.replace(place + os.sep, "").replace(root, "")
-                    for line in text.splitlines() if line.startswith("calib: ")
-                ]  # fmt: skip
-            write_atomically(messages, "".join(f"{line}\n" for line in kept))
 
     def _judged(self, job: Job, result: Result, reused: bool) -> Done:
         if result.code not in _USABLE:

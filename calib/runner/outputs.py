@@ -60,9 +60,13 @@ def summary(runner: Runner, ended: Sequence[Done], simulated: bool) -> dict[str,
 
 def _command(folder: Folder, job: Job) -> list[str]:
     """Words of the command as a person would type them in the folder."""
-    root = f"{folder.root}{os.sep}"
-    words = () if job.planned is None else job.planned.arguments
-    return ["calib", *job.stage.verb, *(one_line(word.removeprefix(root)) for word in words)]
+    words: list[str] = []
+    if job.planned is not None:
+        words += [folder.name_of(path) for path in job.planned.paths]
+        for name, value in job.planned.options.items():
+            said = [] if value is True else [folder.name_of(value) if isinstance(value, Path) else str(value)]
+            words += [f"--{name.replace('_', '-')}", *said]
+    return ["calib", *job.stage.verb, *map(one_line, words)]
 
 
 def _named(folder: Folder, path: Path) -> str:

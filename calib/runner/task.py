@@ -28,11 +28,14 @@ from calib.core.errors import (
     pip_install,
 )
 from calib.core.files import make_folder, one_line, read_text, read_yaml_mapping, sha256, shown
+from calib.core.stage import name_of_flag
 from calib.core.units import parse_corners, parse_square_m
 from calib.runner.cache import key_of, program_digest
 from calib.runner.folder import Folder, folder_digests, read_folder
-from calib.runner.graph import STAGES, Command, Done, Planned, Runner, Stage, opened, run_here
+from calib.runner.graph import STAGES, Done, Planned, Runner, Stage, opened
 from calib.runner.outputs import decide, publish, summary
+from calib.runner.work import Work, perform
+from calib.stages import stage as calib_stage
 
 # ----------------------------------------------------------------------
 # The packages of the extra `fleet`, loaded when they are first needed.
@@ -506,22 +509,22 @@ class Ended:
 
 
 class _Here:
-    """Runs each command at once, in this process."""
+    """Carries out each work at once, in this process."""
 
     def __init__(self) -> None:
         self._ended: list[tuple[str, int]] = []
 
     @property
     def free(self) -> bool:
-        """Whether another command can start."""
+        """Whether another work can start."""
         return not self._ended
 
-    def start(self, command: Command) -> None:
-        """Run a command to its end."""
-        self._ended.append((command.name, run_here(command)))
+    def start(self, work: Work) -> None:
+        """Carry out a work to its end."""
+        self._ended.append((work.name, perform(work)))
 
     def finished(self) -> Iterator[tuple[str, int]]:
-        """The command that was run."""
+        """The work that was carried out."""
         ended, self._ended = self._ended, []
         yield from ended
 
@@ -552,24 +555,25 @@ def kind_of(folder: Folder) -> str:
     return "run" if folder.logs else "camera"
 
 
-def _given(stage: Stage, folder: Folder, words: tuple[str, ...]) -> Stage:
-    """A stage with more words in its command."""
+def _given(stage: Stage, folder: Folder, options: Mapping[str, str]) -> Stage:
+    """A stage with more options."""
     planned = "" if stage.plan is None else stage.plan(folder)
-    if not words or not isinstance(planned, Planned):
+    if not options or not isinstance(planned, Planned):
         return stage
-    told = Planned((*planned.arguments, *words), planned.inputs)
-    return replace(stage, plan=lambda _: told)
+    more = replace(planned, options={**planned.options, **options})
+    return replace(stage, plan=lambda _: more)
 
 
 def _stages(
     folder: Folder, kind: str, options: Sequence[tuple[str, str]], figures: bool
 ) -> tuple[Stage, ...]:
-    words = tuple(word for key, value in options for word in (f"--{key}", value))
+    kind_of_options = calib_stage("intrinsics").options
+    given = {name_of_flag(kind_of_options, flag): value for flag, value in options}
     wanted = [stage for stage in STAGES if kind == "run" or stage.name in CAMERA_STAGES]
     out = []
     for stage in wanted:
         if stage.name == "intrinsics":
-            stage = _given(stage, folder, words)
+            stage = _given(stage, folder, given)
         out.append(stage if figures else replace(stage, figures=False))
     return tuple(out)
 

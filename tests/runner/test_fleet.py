@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import shutil
 import socket
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,7 +26,6 @@ from calib.runner import engine as worker
 from calib.runner import fleet as running
 from calib.runner.engine import Cluster, connected
 from calib.runner.fleet import Store, Table, column, finish, opened_store, run_fleet, texts
-from calib.runner.graph import Command, run_here
 from calib.runner.task import (
     Answer,
     FleetOptions,
@@ -178,9 +179,15 @@ def test_nobody_at_the_address(
 
 
 def _verbs(tmp_path: Path, *commands: tuple[str, ...]) -> bytes:
-    rig, said = tmp_path / "single.yaml", tmp_path / "said.txt"
+    rig = tmp_path / "single.yaml"
     for words in commands:
-        assert run_here(Command("x", (*words, "--rig", str(rig)), said, said)) == 0, said.read_text()
+        done = subprocess.run(
+            [sys.executable, "-m", "calib", *words, "--rig", str(rig)],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
     return rig.read_bytes()
 
 

@@ -1,0 +1,173 @@
+"""One stage carried out: read, solved, written into the rig's file, drawn; for a verb, and for a run.
+
+A run hands `Work` to a process; what comes of it lies in the work's folder: rig.yaml with the sections, the
+stage's document, its messages, its figures and what it wrote beside them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import math
+import os
+import sys
+import traceback
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from calib.core.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERNAL, EXIT_POOR, CalibError
+from calib.core.files import check_folder, check_writable, one_line, write_atomically
+from calib.core.result import section_json
+from calib.core.rig import Rig
+from calib.core.stage import Files, Stage, options_of
+from calib.stages import STAGES, stage
+
+DOCUMENT, MESSAGES, RIG, FIGURES = "document.json", "messages.txt", "rig.yaml", "figures"
+"""What a work leaves in its folder."""
+
+
+@dataclass(frozen=True)
+class Work:
+    """A stage to carry out.
+
+    Attributes
+    ----------
+    name : unique. verb : words of the stage. paths : what it reads, below `root`.
+    options : values by the names of the stage's options.
+    folder : with the rig.yaml that the stage may see; takes what comes of it.
+    figures : whether it draws. output : name of what it writes beside rig.yaml, "" for nothing.
+    """
+
+    name: str
+    verb: str
+    root: Path
+    folder: Path
+    paths: tuple[Path, ...] = ()
+    options: Mapping[str, Any] = field(default_factory=dict)
+    figures: bool = True
+    output: str = ""
+
+
+def carry_out(
+    made: Stage, files: Files, options: Any, rig_path: Path, figures: Path | None = None
+) -> tuple[Any, Rig]:
+    """Run a stage and write its sections, its output and its figures; its outcome, and the rig after it.
+
+    Nothing is read before it is known that all can be written. Raises `BadInputError`.
+    """
+    if made.writes:
+        check_writable(rig_path)
+    if made.output is not None and files.output is not None:
+        (check_folder if made.output.folder else check_writable)(files.output)
+    if figures is not None:
+        check_folder(figures)
+    rig = Rig.load(rig_path, missing_ok=True)
+    outcome = made.run(files, rig, options)
+    sections = made.sections(outcome)
+    if sections:
+        rig = rig.with_sections(sections)
+        rig.save(rig_path)
+    if made.output is not None and files.output is not None:
+        for sentence in made.output.write(files.output, outcome):
+            files.narrate(sentence)
+    if figures is not None and made.plots is not None:
+        from calib.show.draw import write_figures
+
+        write_figures(figures, made.plots(outcome))
+    return outcome, rig
+
+
+def document_of(made: Stage, outcome: Any) -> dict[str, Any]:
+    """The JSON document of an outcome; what is not finite becomes null."""
+    sections = {name: section_json(one) for name, one in made.sections(outcome).items()}
+    whole: dict[str, Any] = _finite({"schema": 1, "verb": made.name, **sections, **made.document(outcome)})
+    return whole
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Mapping):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return value
+
+
+def perform(work: Work) -> int:
+    """Carry out a work in this process; its exit code, as that of the verb would be."""
+    if work.verb not in STAGES:
+        return _typed(work)
+    messages: list[str] = []
+    files = Files(
+        work.paths, output=work.folder / work.output if work.output else None, narrate=messages.append
+    )
+    made = stage(work.verb)
+    try:
+        options = options_of(made.options, work.options)
+        figures = work.folder / FIGURES if work.figures and made.plots is not None else None
+        outcome, _ = carry_out(made, files, options, work.folder / RIG, figures)
+        told = document_of(made, outcome)
+        # Nothing in a result differs from run to run.
+        told.pop("seconds", None)
+        write_atomically(work.folder / DOCUMENT, json.dumps(told, indent=1) + "\n")
+        code = EXIT_DONE if made.verdict(outcome).ok else EXIT_POOR
+    except CalibError as error:
+        messages.append(f"calib: {error}")
+        code = error.exit_code
+    except MemoryError:
+        messages.append("calib: out of memory; the input is larger than this machine can hold")
+        code = EXIT_BAD_INPUT
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        messages.append(f"calib: {where}{error.strerror or error}")
+        code = EXIT_BAD_INPUT
+    except Exception as error:
+        if os.environ.get("CALIB_DEBUG") == "1":
+            traceback.print_exc()
+        messages.append(f"calib: internal error: {type(error).__name__}: {error}; please report it")
+        code = EXIT_INTERNAL
+    places = (f"{work.root}{os.sep}", f"{work.folder}{os.sep}")
+    with contextlib.suppress(OSError):
+        write_atomically(work.folder / MESSAGES, "".join(f"{_nowhere(line, places)}\n" for line in messages))
+    return code
+
+
+def _nowhere(line: str, places: tuple[str, ...]) -> str:
+    for place in places:
+        line = line.replace(place, "")
+    return one_line(" ".join(line.split()))
+
+
+def _typed(work: Work) -> int:
+    """Carry out a verb that is no stage yet as if it had been typed."""
+    from calib.cli.main import main
+
+    words = ["calib", *work.verb.split(), "--json", "--rig", str(work.folder / RIG)]
+    words += ["--figures", str(work.folder / FIGURES)] if work.figures else []
+    words += ["-o", str(work.folder / work.output)] if work.output else []
+    words += [f"--{name.replace('_', '-')}" for name in work.options]
+    before, out, err = (sys.argv, sys.stdout, sys.stderr), io.StringIO(), io.StringIO()
+    try:
+        sys.argv, sys.stdout, sys.stderr = [*words, *map(str, work.paths)], out, err
+        try:
+            main()
+            code = 0
+        except SystemExit as leaving:
+            code = leaving.code if isinstance(leaving.code, int) else 0
+    finally:
+        sys.argv, sys.stdout, sys.stderr = before
+    with contextlib.suppress(ValueError):
+        told = json.loads(out.getvalue())
+        told.pop("seconds", None)
+        write_atomically(work.folder / DOCUMENT, json.dumps(told, indent=1) + "\n")
+    kept = [
+        _nowhere(line, (f"{work.root}{os.sep}", f"{work.folder}{os.sep}"))
+        for line in err.getvalue().splitlines()
+        if str(work.folder) not in line or line.startswith("calib: ")
+    ]
+    write_atomically(work.folder / MESSAGES, "".join(f"{line}\n" for line in kept))
+    return code
