@@ -194,7 +194,7 @@ def _moving(folder: Folder) -> Planned | str:
 def _drift(folder: Folder) -> Planned | str:
     logs = (*_logs(folder, "rest", *_IMU), *_logs(folder, "motion", *_IMU)[:1])
     # What is installed beside calib must not change the page.
-    return _given(logs, no_peers=True) if logs else "no logs of an IMU in logs/"
+    return _given(logs, peers=False) if logs else "no logs of an IMU in logs/"
 
 
 def _lowpass(folder: Folder) -> Planned | str:

@@ -64,8 +64,11 @@ def _command(folder: Folder, job: Job) -> list[str]:
     if job.planned is not None:
         words += [folder.name_of(path) for path in job.planned.paths]
         for name, value in job.planned.options.items():
-            said = [] if value is True else [folder.name_of(value) if isinstance(value, Path) else str(value)]
-            words += [f"--{name.replace('_', '-')}", *said]
+            flag = name.replace("_", "-")
+            if isinstance(value, bool):
+                words.append(f"--{flag}" if value else f"--no-{flag}")
+            else:
+                words += [f"--{flag}", folder.name_of(value) if isinstance(value, Path) else str(value)]
     return ["calib", *job.stage.verb, *map(one_line, words)]
 
 
