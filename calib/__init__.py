@@ -23,6 +23,7 @@ _CLASSES = {
     "Rig": "calib.core.rig",
     "Verdict": "calib.core.verdict",
     "Finding": "calib.core.verdict",
+    "plots": "calib.show.draw",
 }
 """Names of the front door that are no verbs, and where they are."""
 
@@ -37,6 +38,7 @@ __all__ = [
     "imu",
     "intrinsics",
     "lowpass",
+    "plots",
 ]
 
 

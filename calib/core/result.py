@@ -112,6 +112,7 @@ class Result(Section):
 
     _evidence: Any = PrivateAttr(default=None)
     _inputs: dict[str, str] = PrivateAttr(default_factory=dict)
+    _stage: str = PrivateAttr(default="")
 
     @property
     def verdict(self) -> Verdict:
@@ -139,10 +140,21 @@ class Result(Section):
         self._evidence = evidence
         return self
 
-    def with_inputs(self, inputs: Mapping[str, str]) -> Self:
-        """The same result with the hashes of its inputs."""
-        self._inputs = dict(inputs)
+    @property
+    def stage(self) -> str:
+        """Words of the verb that made it; empty for a section that was read from a file."""
+        return self._stage
+
+    def made_by(self, stage: str, inputs: Mapping[str, str]) -> Self:
+        """The same result with the stage that made it and the hashes of its inputs."""
+        self._stage, self._inputs = stage, dict(inputs)
         return self
+
+    def __eq__(self, other: object) -> bool:
+        """Whether both say the same in a file; what figures are drawn from is left out."""
+        return type(other) is type(self) and section_json(self) == section_json(other)
+
+    __hash__ = None  # type: ignore[assignment]  # its fields can change
 
     def _repr_html_(self) -> str:
         from calib.core.words import as_html, described

@@ -256,7 +256,7 @@ class Stage:
                 f"no useful answer follows from this input: {key} came out as {first['input']!r:.40}"
             ) from error
         for result in self.sections(outcome).values():
-            result.with_inputs(files.hashes)
+            result.made_by(self.name, files.hashes)
         return outcome
 
     def sections(self, outcome: Any) -> dict[str, Result]:

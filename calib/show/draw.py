@@ -59,6 +59,7 @@ from calib.core.plot import (
     rectangle,
     round_down,
 )
+from calib.core.result import Result
 
 HUES = {
     "ink": "#1d2730", "grey": "#66727d", "silver": "#b9c0c7", "shade": "#e9ecef", "blue": "#0072B2",
@@ -149,6 +150,19 @@ def draw(figure: Figure) -> Drawing:
             # Room for labels is first measured around panels that do not have their shape yet.
             layout.execute(drawing)
         return drawing
+
+
+def plots(result: Result) -> dict[str, Drawing]:
+    """The figures of a result by their names, drawn: `plots(rig.camera)["coverage"]`.
+
+    Raises `BadInputError` for a section that was read from a file.
+    """
+    from calib.stages import stage
+
+    # Reading the evidence first says so where there is none.
+    made = stage(result.stage) if result.evidence is not None and result.stage else None
+    figures = {} if made is None or made.plots is None else made.plots(result)
+    return {name.split("_", 1)[-1]: draw(figure) for name, figure in figures.items()}
 
 
 def save(figure: Figure, path: Path) -> Path:
