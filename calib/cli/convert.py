@@ -7,38 +7,57 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.common import JsonOption, document, narrate, progress_bar, say
+from calib.cli.common import (
+    AccUnitOption,
+    ColumnsOption,
+    GyroUnitOption,
+    JsonOption,
+    TopicsOption,
+    document,
+    narrate,
+    progress_bar,
+    say,
+)
 from calib.core.errors import BadInputError, UsageError
-
-__all__ = ["convert"]
 
 
 def convert(
     log: Annotated[Path, typer.Argument(help="Log: .csv, .parquet, .mcap, .bag, .db3 or a ROS 2 folder.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Log to write, .csv or .parquet.")],
-    topics: Annotated[
+    acc_unit: AccUnitOption = None,
+    gyro_unit: GyroUnitOption = None,
+    columns: ColumnsOption = None,
+    topics: TopicsOption = None,
+    save_columns: Annotated[
         Path | None,
-        typer.Option(help="Which topic of a bag is which column; else NAME.topics.yaml beside the bag."),
+        typer.Option("--save-columns", help="Write what the columns were read as, as a columns.yaml."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write a log as CSV or Parquet, block by block; bags by their topics.
+    """Write a log as CSV or Parquet in SI, block by block; bags by their topics.
 
     Time is written to the microsecond and values to nine digits in CSV, as they are in Parquet.
     """
     import numpy as np
 
-    from calib.core.files import shown
+    from calib.core.files import check_writable, shown, write_atomically
     from calib.core.stage import LogOptions
     from calib.io.logs import iter_log
+    from calib.io.signals import refuse_counts
     from calib.io.states import states_writer
 
     if output.suffix.lower() not in (".csv", ".parquet"):
         raise UsageError(f"{shown(output)}: expected a name that ends in .csv or .parquet")
-    stream = iter_log(log, LogOptions(topics=topics))
+    if save_columns is not None:
+        check_writable(save_columns)
+    stream = iter_log(log, LogOptions(acc_unit, gyro_unit, columns, topics))
     block = next(stream, None)
     if block is None:
         raise BadInputError(f"{shown(log)}: has a header but no rows")
+    refuse_counts(block, tuple(block.columns))
+    read_as = block.map
+    if read_as is not None and read_as.narration:
+        narrate(read_as.narration)
     names = tuple(block.columns)
     rows, blank, truncated = 0, 0, False
     with states_writer(output, ("t_s", *names)) as writer, progress_bar(f"converting {log.name}") as progress:
@@ -50,6 +69,8 @@ def convert(
             if following is None:
                 break
             block = following
+    if save_columns is not None and read_as is not None:
+        write_atomically(save_columns, read_as.text())
     told = {
         "log": shown(output),
         "rows": rows,

@@ -9,7 +9,10 @@ import typer
 from typer.core import TyperGroup
 
 from calib.cli.common import (
+    AccUnitOption,
+    ColumnsOption,
     FiguresOption,
+    GyroUnitOption,
     JsonOption,
     RigOption,
     document,
@@ -208,6 +211,9 @@ def logs(
     hold_back: Annotated[
         bool, typer.Option("--hold-back/--no-hold-back", help="Predict each log from a fit to the others.")
     ] = True,
+    acc_unit: AccUnitOption = None,
+    gyro_unit: GyroUnitOption = None,
+    columns: ColumnsOption = None,
     figures: FiguresOption = None,
     rig: RigOption = Path("rig.yaml"),
     as_json: JsonOption = False,
@@ -219,6 +225,7 @@ def logs(
     from calib.core.files import check_folder, check_writable, hash_of, shown
     from calib.core.result import section_json
     from calib.core.rig import Rig
+    from calib.core.stage import LogOptions
     from calib.stages.actuator.read import read_track
     from calib.stages.actuator.results import beginning, identified_json, sections_from
     from calib.stages.actuator.stage import identify_logs
@@ -232,10 +239,11 @@ def logs(
         check_folder(figures)
     before = Rig.load(rig, missing_ok=True)
     nominal, stated = beginning(before)
+    options = LogOptions(acc_unit, gyro_unit, columns)
     sources, hashes = [], {}
     for k, path in enumerate(paths):
         given = states[k] if states else None
-        source = read_track(path, before, rig, nominal, given, truth, no_pwm)
+        source = read_track(path, before, rig, nominal, given, truth, no_pwm, options)
         name = shown(path.name)
         hashes[name if name not in hashes else f"{name} ({k + 1})"] = hash_of(path)
         if source.states is not None:

@@ -7,8 +7,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from calib.cli.common import FiguresOption, JsonOption, RigOption, document, narrate, say, table
+from calib.cli.common import (
+    AccUnitOption,
+    ColumnsOption,
+    FiguresOption,
+    GyroUnitOption,
+    JsonOption,
+    RigOption,
+    document,
+    narrate,
+    say,
+    table,
+)
 from calib.core.errors import UsageError
+from calib.core.stage import LogOptions
 
 if TYPE_CHECKING:
     from calib.stages.actuator.validate import Comparison
@@ -77,14 +89,14 @@ def _log_json(one: Comparison) -> dict[str, Any]:
 
 
 def _compared(
-    logs: list[Path], states: list[Path] | None, truth: bool, no_pwm: bool, rig: Path
+    logs: list[Path], states: list[Path] | None, truth: bool, no_pwm: bool, rig: Path, options: LogOptions
 ) -> list[Comparison]:
     from calib.core.rig import Rig
     from calib.stages.actuator.validate import IMPROVED, validate_log
 
     known, out = Rig.load(rig, missing_ok=True), []
     for k, path in enumerate(logs):
-        one, said = validate_log(path, known, rig, states[k] if states else None, truth, no_pwm)
+        one, said = validate_log(path, known, rig, states[k] if states else None, truth, no_pwm, options)
         for sentence in said:
             narrate(sentence)
         out.append(one)
@@ -103,6 +115,9 @@ def validate(
     no_pwm: Annotated[
         bool, typer.Option("--no-pwm", help="Logs without commands are swings with the hoses off.")
     ] = False,
+    acc_unit: AccUnitOption = None,
+    gyro_unit: GyroUnitOption = None,
+    columns: ColumnsOption = None,
     figures: FiguresOption = None,
     rig: RigOption = Path("rig.yaml"),
     as_json: JsonOption = False,
@@ -121,7 +136,8 @@ def validate(
         raise UsageError("--truth: takes the true columns, --states does not apply")
     if figures is not None:
         check_folder(figures)
-    compared = _compared(logs, states, truth, no_pwm, rig)
+    options = LogOptions(acc_unit, gyro_unit, columns)
+    compared = _compared(logs, states, truth, no_pwm, rig, options)
     result: dict[str, Any] = {"logs": [_log_json(one) for one in compared]}
     if figures is not None:
         from calib.show.draw import write_figures

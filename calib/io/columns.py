@@ -105,6 +105,8 @@ _FEWEST = 20
 _ABOUT_G = (0.7, 1.33)
 _IN_PLANE_G = (0.85, 1.15)
 """Specific force of a calm log over g, of three axes and of two, which may lean out of the plane."""
+_STRANGE_G = (0.4, 2.5)
+"""Specific force over g outside of which a unit that is stated is not believed."""
 _CALM, _CALM_WINDOW = 0.1, 50
 _FASTEST_RADPS = 45.0
 _LARGEST_BIAS_RADPS = 0.35
@@ -511,12 +513,13 @@ def _with_accel(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMa
     unit = next(iter(stated), "")
     if unit in ("", *likely) and likely:
         return _with(columns, names, likely[0], found)
-    wide = len(names) == 2 and norm * units[unit or "m/s2"] < _ABOUT_G[1] * GRAVITY_MPS2
-    if likely:
+    least = 0.0 if len(names) == 2 else _STRANGE_G[0]
+    fits = bool(unit) and least <= norm * units[unit] / GRAVITY_MPS2 <= _STRANGE_G[1]
+    if likely and not (fits and len(names) == 2 and columns.sources[names[0]].stated != "name"):
         advice = _advice("acc", "accel", likely[0], columns)
         raise BadInputError(f"{columns.source}: {found}, so it is in {likely[0]}, not in {unit}; {advice}")
-    if unit and wide:
-        # Two axes may be far from the vertical.
+    if fits:
+        # Two axes may be far from the vertical, and a short log be never calm.
         return columns
     what = "no unit that is known here"
     if norm > 150.0:

@@ -164,7 +164,7 @@ def test_words_that_do_not_fit(
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("t_s,ax_mps2\n0,1\n1,1\n", "log.csv: has no columns u_px and v_px"),
+        ("t_s,ax_mps2\n0,1\n1,1\n", "log.csv: has no u_px and v_px, expected u_px"),
         ("t_s,u_px,v_px\n1,1,1\n0,1,1\n", "log.csv, line 3: t_s goes back"),
         ("t_s,u_px,v_px\n0,1,1\n0.1,1,1\n", "log.csv: has 10 camera samples/s, expected the 60 Hz"),
         ("t_s,u_px,v_px\n", "log.csv: has a header but no rows"),

@@ -14,6 +14,7 @@ from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.core.files import read_text, shown
 from calib.core.rig import Rig
+from calib.core.stage import NOTHING_STATED, LogOptions
 from calib.core.units import plain_number
 from calib.io.logs import Log, read_log
 from calib.io.signals import check_time
@@ -361,11 +362,11 @@ def states_beside(path: Path) -> Path | None:
 
 
 def _from_pictures(log: Log, rig: Rig, rig_path: Path) -> tuple[Head, float]:
-    rows = log.sampled("u_px", "v_px")
-    if not len(rows):
+    if not len(log.sampled("u_px", "v_px")):
         raise BadInputError(
             f"{log.source}: has no marker, expected u_px and v_px, or the states of calib replay beside it"
         )
+    pictures = log.signals("u_px", "v_px")
     found = periods(log)
     setup, _ = setup_from_rig(rig, rig_path, found)
     sensor = setup.start.sensor.copy()
@@ -377,8 +378,7 @@ def _from_pictures(log: Log, rig: Rig, rig_path: Path) -> tuple[Head, float]:
     sigma = math.sqrt(float(setup.noise[0]) ** 2 + float(setup.noise[1]) ** 2 / 12.0)
     guess = (0.0, rest)
     t, heads, whitening = [], [], []
-    pixels = np.stack([log.columns["u_px"][rows], log.columns["v_px"][rows]], axis=1)
-    for at, (u, v) in zip(log.t_s[rows].tolist(), pixels.tolist(), strict=True):
+    for at, (u, v) in zip(pictures.t_s.tolist(), pictures.values.tolist(), strict=True):
         for phi, length in (guess, (0.0, rest)):
             phi, length, good = invert_marker(setup.view, sensor, u, v, phi, length)
             if good:
@@ -393,7 +393,7 @@ def _from_pictures(log: Log, rig: Rig, rig_path: Path) -> tuple[Head, float]:
         whitening.append([by_u[:2] / sigma, by_v[:2] / sigma])
     if len(t) < _IDENTIFYING_FEWEST:
         raise BadInputError(
-            f"{log.source}: {len(t)} of {len(rows)} pictures show the marker where it can be, "
+            f"{log.source}: {len(t)} of {len(pictures)} pictures show the marker where it can be, "
             f"expected at least {_IDENTIFYING_FEWEST}"
         )
     return (np.array(t), np.array(heads), np.array(whitening)), delay_s
@@ -449,9 +449,8 @@ def _check_clock(log: Log) -> None:
 
 def _commands(log: Log, no_pwm: bool) -> tuple[float, float, FloatArray]:
     """Time of the first tick, tick and commands (n, 2) held to an even grid."""
-    rows = log.sampled("pwm1", "pwm2")
     end = float(log.t_s[-1])
-    if not len(rows):
+    if not len(log.sampled("pwm1", "pwm2")):
         if not no_pwm:
             raise BadInputError(
                 f"{log.source}: has no commands, expected pwm1 and pwm2; for a swing with the hoses off give "
@@ -459,20 +458,20 @@ def _commands(log: Log, no_pwm: bool) -> tuple[float, float, FloatArray]:
             )
         begin = float(log.t_s[0])
         return begin, TICK_S, np.zeros((max(math.ceil((end - begin) / TICK_S) + 1, 2), 2))
-    t = log.t_s[rows]
-    pwm = np.stack([log.columns["pwm1"][rows], log.columns["pwm2"][rows]], axis=1)
+    commands = log.signals("pwm1", "pwm2")
+    t, pwm = commands.t_s, commands.values
     wrong = np.nonzero(((pwm < 0.0) | (pwm > 255.0)).any(axis=1))[0]
     if len(wrong):
         k = int(wrong[0])
         raise BadInputError(
-            f"{log.source}, line {log.lines[rows[k]]}: pwm is {pwm[k].tolist()}, expected 0 to 255"
+            f"{log.source}, line {commands.lines[k]}: pwm is {pwm[k].tolist()}, expected 0 to 255"
         )
-    tick_s = float(np.median(np.diff(t))) if len(t) > 2 else TICK_S
+    tick_s = commands.axis.period_s if len(t) > 2 else TICK_S
     # A nominal rate that the stamps only scatter about is exact.
     tick_s = TICK_S if abs(tick_s / TICK_S - 1.0) < 0.01 else tick_s
     if not tick_s * _MOST_TICKS > end - float(t[0]):
         raise BadInputError(
-            f"{log.source}: its commands are {tick_s:g} s apart in the median, over {end - float(t[0]):g} s; "
+            f"{log.source}: its commands are {tick_s:g} s apart, over {end - float(t[0]):g} s; "
             "expected ticks of some milliseconds"
         )
     n = max(math.ceil((end - float(t[0])) / tick_s) + 1, 2)
@@ -499,6 +498,7 @@ def read_track(
     states: Path | None = None,
     truth: bool = False,
     no_pwm: bool = False,
+    options: LogOptions = NOTHING_STATED,
 ) -> TrackSource:
     """A log as a track.
 
@@ -509,13 +509,14 @@ def read_track(
     states : states file to take the pose from; without pictures one beside the log is looked for.
     truth : take the true columns.
     no_pwm : logs without commands are swings with the hoses off.
+    options : what a person states of the log.
 
     Raises
     ------
     BadInputError for a log that is too short, jumps in time, has no commands or commands out of range,
     no marker, or a rig without camera or plane where the pictures are needed.
     """
-    log = read_log(path)
+    log = read_log(path, options)
     said = log.remarks()
     _check_clock(log)
     begin, tick_s, pwm = _commands(log, no_pwm)

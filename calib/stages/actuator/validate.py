@@ -27,6 +27,7 @@ import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.core.rig import Rig
+from calib.core.stage import NOTHING_STATED, LogOptions
 from calib.stages.actuator.identify import Start, Track, heads_of, without_outliers
 from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import Creep, Plant
@@ -198,12 +199,13 @@ def validate_log(
     states: Path | None = None,
     truth: bool = False,
     no_pwm: bool = False,
+    options: LogOptions = NOTHING_STATED,
 ) -> tuple[Comparison, Sequence[str]]:
     """A log against the original and the improved model, and sentences about how it was read.
 
     Parameters
     ----------
-    states, truth, no_pwm : as in `calib.stages.actuator.read.read_track`.
+    states, truth, no_pwm, options : as in `calib.stages.actuator.read.read_track`.
 
     Raises
     ------
@@ -211,7 +213,7 @@ def validate_log(
     """
     models = models_of(rig)
     machine = models.get(IMPROVED, models[NOMINAL])
-    source = read_track(path, rig, rig_path, machine, states, truth, no_pwm)
+    source = read_track(path, rig, rig_path, machine, states, truth, no_pwm, options)
     start = None
     if source.source == "pictures":
         start = estimated_start(path, rig, rig_path, source.begin_s)
