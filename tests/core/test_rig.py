@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from calib.core.errors import BadInputError
-from calib.core.result import identity, section_json
+from calib.core.result import CovarianceTable, identity, section_json
 from calib.core.rig import KINDS, Rig, kind_of
 from calib.core.schema import validated
 from calib.stages.actuator.machine import Machine
@@ -266,3 +267,40 @@ def test_every_section_comes_back_from_the_file_as_it_was(name: str, data: st.Da
     back = validated(kind, document[name], "rig.yaml", name)
     assert section_json(back) == section_json(section)
     assert Rig().with_sections({name: back}).text() == text
+
+
+def _floats(schema: Any) -> Iterator[dict[str, Any]]:
+    """Every schema of a float inside of a pydantic core schema."""
+    if isinstance(schema, dict):
+        if schema.get("type") == "float":
+            yield schema
+        for part in schema.values():
+            yield from _floats(part)
+    elif isinstance(schema, list | tuple):
+        for part in schema:
+            yield from _floats(part)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_every_number_is_finite(name: str) -> None:
+    kind = kind_of(name)
+    kind.model_rebuild(force=True)
+    numbers = list(_floats(kind.__pydantic_core_schema__))
+    assert all(one.get("allow_inf_nan") is False for one in numbers)
+    assert numbers or name == "provenance"
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        [[1.0, 0.2], [0.1, 1.0]],
+        [[1.0, 1.2], [1.2, 1.0]],
+        [[-1.0, 0.0], [0.0, 1.0]],
+        [[0.0, 0.1], [0.1, 1.0]],
+        [[1.0, 0.0]],
+        [[1.0, math.nan], [math.nan, 1.0]],
+    ],
+)
+def test_what_is_no_covariance_is_refused(values: list[list[float]]) -> None:
+    with pytest.raises(ValidationError):
+        CovarianceTable(order=["a", "b"], values=values)

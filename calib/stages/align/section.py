@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from typing import Annotated
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from calib.core.result import Count, CovarianceTable, NotNegative, Number, Pair, Result, Section, quantity
+from calib.core.result import Count, CovarianceTable, NotNegative, Result, Section, quantity
 
 Angle = Annotated[float, Field(ge=-7.0, le=7.0, allow_inf_nan=False, strict=True)]
 Seconds = Annotated[float, Field(ge=-10.0, le=10.0, allow_inf_nan=False, strict=True)]
 Metres = Annotated[float, Field(ge=-1.0, le=1.0, allow_inf_nan=False, strict=True)]
-Share = Annotated[float, Field(gt=-1.0, le=10.0, allow_inf_nan=False, strict=True)]
+Share = Annotated[float, Field(ge=-0.5, le=0.5, allow_inf_nan=False, strict=True)]
+Rate = Annotated[float, Field(ge=-1.0, le=1.0, allow_inf_nan=False, strict=True)]
+Bias = Annotated[float, Field(ge=-5.0, le=5.0, allow_inf_nan=False, strict=True)]
 SharePair = Annotated[list[Share], Field(min_length=2, max_length=2)]
 MetresPair = Annotated[list[Metres], Field(min_length=2, max_length=2)]
 
@@ -30,20 +31,6 @@ SENSORS_OF = {
     "plane_stretch": ("stretch",),
 }
 """Keys of the section and the quantities of `calib.stages.estimator.sensors.SENSOR` that they hold."""
-
-
-class AlignCovariance(CovarianceTable):
-    """Covariance with the names of its rows, those of `calib.stages.estimator.sensors.SENSOR`."""
-
-    @model_validator(mode="after")
-    def _positive(self) -> AlignCovariance:
-        V = self.values
-        for i in range(len(V)):
-            for j in range(len(V)):
-                limit = math.sqrt(max(V[i][i], 0.0) * max(V[j][j], 0.0)) * (1.0 + 1e-6)
-                if abs(V[i][j] - V[j][i]) > 1e-6 * limit or abs(V[i][j]) > limit:
-                    raise ValueError("expected a covariance matrix")
-        return self
 
 
 class LogCheck(Section):
@@ -93,8 +80,8 @@ class Align(Result):
     mount_angle_rad: Angle = quantity(label="mount angle", show="deg")
     rest_angle_rad: Angle = quantity(label="angle read at rest at phi = 0", show="deg")
     gyro_scale: Share = quantity(label="gyro scale error", show="%")
-    gyro_bias_radps: Number = quantity(label="gyro bias", show="deg/s")
-    accel_bias_mps2: Pair = quantity(label="accel bias")
+    gyro_bias_radps: Rate = quantity(label="gyro bias", show="deg/s")
+    accel_bias_mps2: Annotated[list[Bias], Field(min_length=2, max_length=2)] = quantity(label="accel bias")
     accel_scale: SharePair = quantity(label="accel scale error", show="%")
     imu_lever_m: Metres = quantity(label="IMU along the head", show="mm")
     marker_offset_m: Metres = quantity(label="marker offset d", show="mm")
@@ -102,9 +89,11 @@ class Align(Result):
     plane_stretch: Share = quantity(label="stretch of the plane", show="%")
     sigma: dict[str, NotNegative | list[NotNegative] | None] = {}
     prior_sigma: dict[str, NotNegative] = {}
-    covariance: AlignCovariance | None = None
+    covariance: CovarianceTable | None = None
     jitter_px: NotNegative = quantity(label="tracker's jitter", digits=2)
     outlier_share: NotNegative = quantity(label="outliers", show="%", digits=2)
-    accel_noise_mps2: Pair = quantity(label="accel noise", digits=4)
+    accel_noise_mps2: Annotated[list[NotNegative], Field(min_length=2, max_length=2)] = quantity(
+        label="accel noise", digits=4
+    )
     gyro_noise_radps: NotNegative = quantity(label="gyro noise", digits=4)
     logs: list[LogCheck] = quantity([], label="log")

@@ -63,9 +63,9 @@ def _solve(inputs: AlignInputs) -> Align:
     """Fit, judge by the logs alone, weigh the drawing in, and assemble the section."""
     import numpy as np
 
-    from calib.core.result import finite_or_none, judged
+    from calib.core.result import CovarianceTable, finite_or_none, judged
     from calib.core.verdict import Verdict
-    from calib.stages.align.section import SENSORS_OF, Align, AlignCovariance
+    from calib.stages.align.section import SENSORS_OF, Align
     from calib.stages.align.solve import align as fit
     from calib.stages.align.solve import judge, with_drawn_marker
     from calib.stages.estimator.sensors import SENSOR
@@ -87,7 +87,7 @@ def _solve(inputs: AlignInputs) -> Align:
         rest_angle_rad=found.rest_angle_rad,
         sigma=by_key(sigma) | {"rest_angle_rad": finite_or_none(found.rest_angle_sigma)},
         prior_sigma=dict(zip(SENSOR, found.prior.tolist(), strict=True)),
-        covariance=AlignCovariance(order=list(SENSOR), values=found.covariance.tolist()) if bounded else None,
+        covariance=CovarianceTable(order=list(SENSOR), values=found.covariance.tolist()) if bounded else None,
         jitter_px=found.noise.jitter_px,
         outlier_share=found.noise.share,
         accel_noise_mps2=found.noise.imu[:2].tolist(),

@@ -200,7 +200,7 @@ class InverseLens(Section):
     radial: list[Number]
     decentering_steps: Count
     max_error_px: NotNegative | None
-    covered: Annotated[float, Field(ge=0, le=1)]
+    covered: Number = Field(ge=0, le=1)
 
 
 class Lens(Result):

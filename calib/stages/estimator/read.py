@@ -17,7 +17,7 @@ from calib.core.rig import Geometry, Rig
 from calib.core.stage import LogOptions
 from calib.io.logs import Log, iter_log
 from calib.stages.actuator.section import Standing, standing
-from calib.stages.align.section import SENSORS_OF, Align, AlignCovariance
+from calib.stages.align.section import SENSORS_OF, Align
 from calib.stages.estimator.baseline import BaselineSetup, undistorting_nothing
 from calib.stages.estimator.driven import PARAMETER, Drive
 from calib.stages.estimator.kinematic import LEVELS, Kinematic, Level, Rows, Setup, Start
@@ -198,7 +198,7 @@ def _named_values(align: Align) -> dict[str, float]:
     return out
 
 
-def _covariance(table: AlignCovariance, sigmas: Mapping[str, float]) -> FloatArray:
+def _covariance(table: CovarianceTable, sigmas: Mapping[str, float]) -> FloatArray:
     """Covariance (13, 13) of `sensors.SENSOR`; those that the table lacks stand alone."""
     V = np.diag([sigmas[name] ** 2 for name in SENSOR])
     known = [name for name in table.order if name in SENSOR]

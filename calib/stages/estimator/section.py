@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from calib.core.result import Section
+from calib.core.result import Number, Section
 
 Positive = Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False, strict=True)]
 NotNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False, strict=True)]
@@ -73,7 +73,7 @@ class Estimator(Section):
     levels: list[EstimatorLevel] = []
     driven: EstimatorDriven | None = None
     constant_gain: EstimatorGain | None = None
-    gain_per_row: float | None = None
+    gain_per_row: Number | None = None
     logs: list[str] = []
     verdict: Literal["ok", "poor"]
     reasons: list[str] = []

@@ -23,6 +23,9 @@ from calib.core.result import (
 # ----------------------------------------------------------------------
 # The section `imu` of rig.yaml.
 
+Rate = Annotated[float, Field(ge=-10.0, le=10.0, allow_inf_nan=False, strict=True)]
+Rates = Annotated[list[Rate | None], Field(min_length=3, max_length=3)]
+
 
 class ImuDrift(Section):
     """Slopes of an angle, one for each log: mean and standard deviation from log to log."""
@@ -68,7 +71,7 @@ class Imu(Result):
     """
 
     rate_hz: Positive = quantity(label="rate", digits=3)
-    gyro_bias_radps: PerAxis = quantity(label="gyro bias")
+    gyro_bias_radps: Rates = quantity(label="gyro bias")
     gyro_noise_radps_per_sqrt_Hz: Sizes = quantity(label="gyro noise N")
     gyro_instability_radps: Sizes = quantity(label="gyro instability B")
     gyro_walk_radps2_per_sqrt_Hz: Sizes = quantity(label="gyro random walk K")
