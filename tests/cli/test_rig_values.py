@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,7 @@ def _verbs(rig: Path, log: Path, out: Path) -> list[tuple[str | Path, ...]]:
         ("identify", log, "--rig", rig),
         ("align", log, "--rig", rig),
         ("report", rig),
+        ("run", rig.parent, "-o", out / "out"),
         ("diff", rig, rig),
     ]
 
@@ -45,6 +47,8 @@ def test_every_verb_refuses_it_in_the_same_sentence(
     assert text.startswith("schema: 2\n")
     rig.write_text((text if bad["schema"] == 2 else text.removeprefix("schema: 2\n")) + bad["line"] + "\n")
     before = rig.read_bytes()
+    (tmp_path / "logs").mkdir()
+    shutil.copy(log, tmp_path / "logs")
     for words in _verbs(rig, log, tmp_path):
         ended = calib(*words)
         assert (ended.code, ended.sentence) == (3, f"{rig}: {bad['says']}"), words
