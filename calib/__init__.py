@@ -35,6 +35,7 @@ __all__ = [
     "control",
     "distortion",
     "extrinsics",
+    "firmware",
     "imu",
     "intrinsics",
     "lowpass",

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.stages.firmware.conformance import FusedReference, Inputs, Outputs, Reference, binary32
-from calib.stages.firmware.header import Header, header_text, verbatim
-from calib.stages.firmware.literals import values
+from calib.io.serial import Inputs
+from calib.stages.firmware.conformance import FusedReference, Outputs, Reference, binary32
+from calib.stages.firmware.header import Header, verbatim
 from calib.stages.firmware.vectors import TOLERANCE, selftest_text
 
 __all__ = [
@@ -62,7 +62,7 @@ def need(tool: str) -> None:
 
 def write(folder: Path, header: Header) -> None:
     """The header's files, as `calib firmware` writes them."""
-    (folder / "calib_constants.h").write_text(header_text(header))
+    (folder / "calib_constants.h").write_text(header.text)
     (folder / "calib_pipeline.h").write_text(verbatim("calib_pipeline.h"))
     (folder / "calib_selftest.h").write_text(selftest_text(header))
 
@@ -207,7 +207,7 @@ def compare(
 
     What the fused estimator may have decided otherwise lies within a micrometre of its limits.
     """
-    constants = values(header.literals)
+    constants = header.values
     reference = FusedReference(constants, undistort, mean_rate) if fused else Reference(constants, undistort)
     wanted, undecided = [], 0.0
     for k, given in enumerate(ticks):

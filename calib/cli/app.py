@@ -13,7 +13,6 @@ from calib.cli.convert import convert
 from calib.cli.diff import diff
 from calib.cli.docs import docs
 from calib.cli.doctor import doctor
-from calib.cli.firmware import firmware
 from calib.cli.fleet import fleet
 from calib.cli.identify import identify
 from calib.cli.record import record
@@ -64,7 +63,7 @@ app.add_typer(
     group("control", "Try controllers on the identified model before the hardware."), name="control"
 )
 app.command("validate")(telling(validate))
-app.command("firmware")(firmware)
+app.command("firmware")(verb(stage("firmware")))
 app.command("fleet")(telling(fleet))
 app.command("sweep")(telling(sweep))
 app.command("record")(record)

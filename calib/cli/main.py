@@ -13,7 +13,7 @@ import sys
 import threading
 import traceback
 import warnings
-from typing import NoReturn
+from typing import NoReturn, TextIO
 
 from calib.core.compiled import choose_folder
 from calib.core.errors import (
@@ -140,15 +140,23 @@ def _prepare_streams(debug: bool) -> None:
 
 
 def _flushed(code: int) -> int:
-    """Exit code after all of stdout has been written, or could not be."""
+    """Exit code after all of stdout has been written, or could not be; narration may be lost."""
     try:
         sys.stdout.flush()
-        return code
     except BrokenPipeError:
         code = code or EXIT_READER_GONE
+        _emptied(sys.stdout)
     except OSError as error:
         code = _ended(f"standard output: cannot be written: {error.strerror or error}", EXIT_BAD_INPUT)
-    # What is left in the buffer would be tried again, and complained of, at the interpreter's end.
-    with contextlib.suppress(OSError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _emptied(sys.stdout)
+    try:
+        sys.stderr.flush()
+    except OSError:
+        _emptied(sys.stderr)
     return code
+
+
+def _emptied(stream: TextIO) -> None:
+    """What is left in the buffer would be tried again, and complained of, at the interpreter's end."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())

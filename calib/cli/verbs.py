@@ -97,7 +97,8 @@ def _run(stage: Stage, files: Files, options: Any, figures: Path | None, as_json
     if figures is not None:
         narrate(f"figures in {shown(figures)}")
     if as_json:
-        emit(json.dumps(document_of(stage, outcome), indent=1, allow_nan=False, ensure_ascii=True) + "\n")
+        whole = document_of(stage, outcome, files.written)
+        emit(json.dumps(whole, indent=1, allow_nan=False, ensure_ascii=True) + "\n")
     else:
         blocks = [] if stage.words is None else list(stage.words(outcome))
         for one in sections.values():

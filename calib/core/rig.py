@@ -197,6 +197,15 @@ class Rig:
             allow_unicode=True,
         )
 
+    @property
+    def inputs(self) -> dict[str, Mapping[str, str]]:
+        """SHA-256 of each input by section and name: those of the file, and those that results carry."""
+        sections = {one.name: getattr(self, one.name) for one in fields(self)}
+        carried = {
+            name: one.inputs for name, one in sections.items() if isinstance(one, Result) and one.inputs
+        }
+        return {**self.provenance.inputs, **carried}
+
     def save(self, path: Path | str, inputs: Mapping[str, Mapping[str, str]] | None = None) -> None:
         """Replace the file atomically.
 
@@ -204,12 +213,7 @@ class Rig:
         ----------
         inputs : SHA-256 of each input by section and name, beside those that results carry.
         """
-        merged: dict[str, Mapping[str, str]] = dict(self.provenance.inputs)
-        for one in fields(self):
-            section = getattr(self, one.name)
-            if isinstance(section, Result) and section.inputs:
-                merged[one.name] = section.inputs
-        merged |= inputs or {}
+        merged = {**self.inputs, **(inputs or {})}
         ordered = {name: dict(sorted(merged[name].items())) for name in sorted(merged)}
         self.provenance, self.schema = Provenance(inputs=ordered), SCHEMA
         write_atomically(Path(path), self.text())
@@ -247,7 +251,7 @@ class Rig:
         """The plane; `BadInputError` where it was calibrated with another camera than the rig's."""
         if self.plane is None or self.camera is None:
             return None
-        known = self.provenance.inputs.get("plane", {}).get("camera")
+        known = self.inputs.get("plane", {}).get("camera")
         if known is not None and known != identity(self.camera):
             raise BadInputError(
                 f"{shown(source)}: plane was calibrated with another camera than the one in camera; "
@@ -264,7 +268,7 @@ class Rig:
         }
         sentences = []
         for name, verb in (("plane", "extrinsics"), ("lens", "distortion")):
-            known = self.provenance.inputs.get(name, {})
+            known = self.inputs.get(name, {})
             changed = [other for other in now if other in known and known[other] != now[other]]
             if getattr(self, name) is not None and changed:
                 sentences.append(

@@ -52,6 +52,7 @@ class Files:
     narrate : takes a sentence for the person who watches. progress : a bar with a label.
     hashes : SHA-256 of what was read, by name, for the provenance.
     remarks : sentences on what was read, which are narrated once all of it is.
+    written : names of the files that the outcome was written to beside rig.yaml.
     """
 
     paths: tuple[Path, ...] = ()
@@ -61,6 +62,7 @@ class Files:
     progress: Progress = _silent
     hashes: dict[str, str] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
+    written: list[str] = field(default_factory=list)
 
     def log(self, path: Path, options: LogOptions) -> Log:
         """A log. Raises `BadInputError` as `calib.io.logs.read_log`."""
@@ -109,12 +111,12 @@ class Output:
     Attributes
     ----------
     words : help. flags, metavar : on the command line. default : written even where it is not asked for.
-    write : writes an outcome there; sentences about what was written.
-    folder : whether it is a folder.
+    write : writes an outcome there; the files written.
+    folder : whether it is a folder, whose files --json names.
     """
 
     words: str
-    write: Callable[[Path, Any], Sequence[str]]
+    write: Callable[[Path, Any], Sequence[Path]]
     flags: tuple[str, ...] = ("-o", "--output")
     metavar: str = ""
     default: Path | None = None

@@ -11,7 +11,6 @@ from pathlib import Path
 from calib.core.errors import BadInputError
 from calib.core.files import check_readable, shown
 from calib.io.logs import Log, iter_rows
-from calib.stages.firmware.conformance import Inputs
 
 # ----------------------------------------------------------------------
 # Frames that the sketch sends: found in a stream of bytes, checked, and written as a log.
@@ -35,6 +34,33 @@ BOARD_COLUMNS = (
 """Columns of the log that are the board's own."""
 
 _LOG_COLUMNS = ("t_s", "u_px", "v_px", "ax_mps2", "ay_mps2", "gz_radps", "pwm1", "pwm2")
+
+
+MODE_OFF, MODE_ORIENTATION, MODE_POSITION = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """One tick's readings, as `calib_inputs`.
+
+    Attributes
+    ----------
+    u_px, v_px : marker as the camera reports it.
+    ax_mps2, ay_mps2, gz_radps : IMU.
+    reference : angle [rad] and anything, or both lengths [m].
+    marker_seen, imu_read : whether something came in.
+    mode : of the controller.
+    """
+
+    u_px: float
+    v_px: float
+    ax_mps2: float
+    ay_mps2: float
+    gz_radps: float
+    reference: tuple[float, float] = (0.0, 0.0)
+    marker_seen: bool = True
+    imu_read: bool = True
+    mode: int = MODE_OFF
 
 
 @dataclass(frozen=True)

@@ -692,5 +692,7 @@ def _reason(job: Job, part: Sections, result: Result) -> str:
         for log in logs if isinstance(logs, list) else []:
             if isinstance(log, dict) and log.get("reasons"):
                 return str(log["reasons"][0])
-    said = result.messages()
+    gate, said = result.document().get("gate"), result.messages()
+    if isinstance(gate, list):
+        return ", ".join(str(one) for one in gate)
     return said[-1] if said else "fails its quality gate"

@@ -13,13 +13,13 @@ import math
 import os
 import sys
 import traceback
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from calib.core.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERNAL, EXIT_POOR, CalibError
-from calib.core.files import check_folder, check_writable, one_line, write_atomically
+from calib.core.files import check_folder, check_writable, one_line, shown, write_atomically
 from calib.core.result import section_json
 from calib.core.rig import Rig
 from calib.core.stage import Files, Stage, options_of
@@ -71,8 +71,11 @@ def carry_out(
         rig = rig.with_sections(sections)
         rig.save(rig_path)
     if made.output is not None and files.output is not None:
-        for sentence in made.output.write(files.output, outcome):
-            files.narrate(sentence)
+        files.written = [path.name for path in made.output.write(files.output, outcome)]
+        if files.written and made.output.folder:
+            files.narrate(f"{', '.join(files.written)} written to {shown(files.output)}")
+        elif files.written:
+            files.narrate(f"{shown(files.output)} written")
     if figures is not None and made.plots is not None:
         from calib.show.draw import write_figures
 
@@ -80,11 +83,19 @@ def carry_out(
     return outcome, rig
 
 
-def document_of(made: Stage, outcome: Any) -> dict[str, Any]:
-    """The JSON document of an outcome; what is not finite becomes null."""
-    sections = {name: section_json(one) for name, one in made.sections(outcome).items()}
-    whole: dict[str, Any] = _finite({"schema": 1, "verb": made.name, **sections, **made.document(outcome)})
-    return whole
+def document_of(made: Stage, outcome: Any, written: Sequence[str] = ()) -> dict[str, Any]:
+    """The JSON document of an outcome; what is not finite becomes null.
+
+    Parameters
+    ----------
+    written : names of the files that it was written to, which the document of a folder lists.
+    """
+    whole: dict[str, Any] = {"schema": 1, "verb": made.name}
+    whole |= {name: section_json(one) for name, one in made.sections(outcome).items()}
+    if written and made.output is not None and made.output.folder:
+        whole["files"] = list(written)
+    finite: dict[str, Any] = _finite(whole | made.document(outcome))
+    return finite
 
 
 def _finite(value: Any) -> Any:
@@ -110,7 +121,7 @@ def perform(work: Work) -> int:
         options = options_of(made.options, work.options)
         figures = work.folder / FIGURES if work.figures and made.plots is not None else None
         outcome, _ = carry_out(made, files, options, work.folder / RIG, figures)
-        told = document_of(made, outcome)
+        told = document_of(made, outcome, files.written)
         # Nothing in a result differs from run to run.
         told.pop("seconds", None)
         write_atomically(work.folder / DOCUMENT, json.dumps(told, indent=1) + "\n")

@@ -33,6 +33,7 @@ STAGES = {
     "control run": "calib.stages.control.stage",
     "control check": "calib.stages.control.stage",
     "control tune": "calib.stages.control.stage",
+    "firmware": "calib.stages.firmware.stage",
 }
 """Module of each stage by the words of its verb; the last word is its name there."""
 

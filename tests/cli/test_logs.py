@@ -23,7 +23,7 @@ from calib.core.rig import Rig
 from calib.io.columns import MEASURED
 from calib.io.logs import Log, read_log, write_log
 from calib.io.serial import Frame, encoded
-from calib.stages.firmware.header import Header, header_of, identity_of
+from calib.stages.firmware.header import Header, header_of
 from calib.stages.firmware.vectors import vectors
 
 from .conftest import Run
@@ -182,7 +182,7 @@ serial = pytest.importorskip("serial")
 
 
 def _stream(header: Header, ticks: int = 90) -> bytes:
-    identity, out = int(identity_of(header)[:8], 16), b"\x00\xa5\x5a\x4ehalf a frame"
+    identity, out = header.identity, b"\x00\xa5\x5a\x4ehalf a frame"
     for k, vector in enumerate(vectors(header, ticks)):
         w = vector.wanted
         frame = Frame(

@@ -15,13 +15,11 @@ from firmware_plant import Loop
 from firmware_rigs import header, rig
 
 from calib.core.rig import Rig
-from calib.io.serial import Decoder
+from calib.io.serial import MODE_ORIENTATION, MODE_POSITION, Decoder, Inputs
 from calib.stages.control.references import Ellipse
 from calib.stages.firmware.check import check_frames
-from calib.stages.firmware.conformance import MODE_ORIENTATION, MODE_POSITION, Inputs, Reference, reference_of
-from calib.stages.firmware.conformance import binary32 as binary32_of_loop
+from calib.stages.firmware.conformance import Reference, reference_of
 from calib.stages.firmware.header import verbatim
-from calib.stages.firmware.literals import values
 from calib.stages.firmware.vectors import binary32, coherent, directed, directed_fused
 from calib.twin.rig import SimulatedRig
 
@@ -38,7 +36,7 @@ def test_the_same_values_as_in_float64(tmp_path: Path, kind: str, undistort: int
     command, sizes = avr(
         tmp_path, f"-DCALIB_UNDISTORT={undistort}", *(["-DCALIB_PROGMEM"] if progmem else [])
     )
-    ticks = directed(values(made.literals), 1500)
+    ticks = directed(made.values, 1500)
     found = run(command, ticks)
     worst, undecided = compare(made, ticks, found, bool(undistort))
     print(f"{kind}, undistort {undistort}: differences {worst}, {sizes}, stack {found.stack}")
@@ -54,7 +52,7 @@ def test_the_fused_estimator_gives_the_same_values(tmp_path: Path, kind: str, un
     made = header(kind)
     write(tmp_path, made)
     command, sizes = avr(tmp_path, "-DCALIB_FUSED=1", f"-DCALIB_UNDISTORT={undistort}")
-    ticks = directed_fused(values(made.literals), 1500, bool(undistort))
+    ticks = directed_fused(made.values, 1500, bool(undistort))
     found = run(command, ticks)
     worst, undecided = compare(made, ticks, found, bool(undistort), fused=True)
     print(f"{kind}, fused, undistort {undistort}: differences {worst}, {sizes}, stack {found.stack}")
@@ -140,7 +138,7 @@ def test_the_budget_of_the_fused_tick(tmp_path: Path) -> None:
     """Undistortion, fused estimator, reference point and PD with feed-forward, in every tick."""
     made = header("fused")
     still, moving = (0.08, 0.085), [(0.015 * math.sin(0.02 * k), 0.078) for k in range(1200)]
-    ticks = coherent(values(made.literals), len(moving))
+    ticks = coherent(made.values, len(moving))
     write(tmp_path, made)
     for name, flags, wanted, most in (
         ("fused, undistortion, constant reference", (), [still] * len(moving), 20_000),
@@ -166,9 +164,9 @@ def test_a_moving_reference_is_that_of_the_set_points(tmp_path: Path) -> None:
     from calib.stages.control.references import Ellipse
 
     ellipse, times = Ellipse(), np.linspace(0.0, 20.0, 400)
-    wanted = ellipse.bellows_m(times, values(header().literals)["CALIB_BELLOWS_RADIUS_M"])
+    wanted = ellipse.bellows_m(times, header().values["CALIB_BELLOWS_RADIUS_M"])
     pose = ellipse.pose(times)
-    reference = Reference(values(header().literals))
+    reference = Reference(header().values)
     found = np.array([reference.reference_point(x, y) for x, y, _ in pose.tolist()])
     assert np.abs(found - wanted).max() < 1e-9
     write(tmp_path, header())
@@ -193,12 +191,12 @@ class _Python:
     """The reference, asked in the same way as a program."""
 
     def __init__(self, kind: str, fused: bool) -> None:
-        self.reference = reference_of(values(header(kind).literals), fused=fused)
+        self.reference = reference_of(header(kind).values, fused=fused)
 
     def tick(self, numbers: np.ndarray, seen: bool, mode: int) -> np.ndarray:
         u, v, ax, ay, gz, first, second = numbers.tolist()
         given = Inputs(u, v, ax, ay, gz, (first, second), seen, True, mode)
-        return np.array(self.reference.step(binary32_of_loop(given)).pwm)
+        return np.array(self.reference.step(binary32(given)).pwm)
 
 
 class _Host:
@@ -326,5 +324,5 @@ def test_what_it_sends_is_what_python_computes(tmp_path: Path, mode: str) -> Non
     assert [k for k, f in enumerate(frames) if not f.given.imu_read] == list(range(70, 80))
     result = check_frames(header(), frames, "board")
     assert result.ticks == 300
-    assert result.reasons == []
+    assert result.verdict.ok
     assert result.worst["q_m"] < 2e-7

@@ -12,14 +12,8 @@ import pytest
 from firmware_build import LIMITS, NATIVE, need, numbers, run, write
 from firmware_rigs import header, rig
 
-from calib.stages.firmware.conformance import (
-    MODE_ORIENTATION,
-    MODE_POSITION,
-    FusedReference,
-    Inputs,
-    Reference,
-)
-from calib.stages.firmware.header import header_text
+from calib.io.serial import MODE_ORIENTATION, MODE_POSITION, Inputs
+from calib.stages.firmware.conformance import FusedReference, Reference
 from calib.stages.firmware.literals import float_literal, values
 from calib.stages.firmware.vectors import binary32, coherent, directed, directed_fused, pixel_of
 
@@ -185,7 +179,7 @@ def test_a_constant_of_the_fused_estimator_that_is_off_is_seen(tmp_path: Path) -
     """By a thousandth, or by one where it counts ticks: off by five times what rounding gives."""
     need("gcc")
     made = header("fused")
-    constants, text = values(made.literals), header_text(made)
+    constants, text = made.values, made.text
     write(tmp_path, made)
     ticks = _stimulus_fused(constants)
     plain = run(_build_fused(tmp_path, text), ticks)
@@ -217,7 +211,7 @@ def test_a_constant_of_the_fused_estimator_that_is_off_is_seen(tmp_path: Path) -
 def test_a_constant_that_is_off_by_a_thousandth_is_seen(tmp_path: Path, kind: str, undistort: int) -> None:
     need("gcc")
     made = header(kind)
-    constants, text = values(made.literals), header_text(made)
+    constants, text = made.values, made.text
     assert _coherent(constants)
     write(tmp_path, made)
     ticks = _stimulus(constants)

@@ -13,6 +13,7 @@ from firmware_build import LIMITS, compare, host, hostile, need, numbers, run, s
 from firmware_plant import Loop
 from firmware_rigs import header, rig
 
+from calib.io.serial import MODE_OFF, MODE_ORIENTATION, MODE_POSITION, Inputs
 from calib.stages.actuator.kinematics import head_from_marker, inverse_series
 from calib.stages.actuator.simulate import rig_at_rest
 from calib.stages.camera.model import Camera, undistort
@@ -35,19 +36,14 @@ from calib.stages.firmware.conformance import (
     HORIZON,
     IMU_HELD,
     MARKER_HELD,
-    MODE_OFF,
-    MODE_ORIENTATION,
-    MODE_POSITION,
     MOVING,
     REJECTED,
     SATURATED,
     STALE,
     FusedReference,
-    Inputs,
     Reference,
 )
 from calib.stages.firmware.header import Header
-from calib.stages.firmware.literals import values
 from calib.stages.firmware.vectors import (
     FUSED_TICKS,
     PERIOD,
@@ -101,7 +97,7 @@ def _logged(ticks: int, seed: int) -> list[Inputs]:
 
 def test_directed_ticks(built: tuple[Header, list[str], Path]) -> None:
     made, command, _ = built
-    ticks = directed(values(made.literals), 4000)
+    ticks = directed(made.values, 4000)
     worst, undecided = compare(made, ticks, run(command, ticks))
     assert (worst <= LIMITS).all(), worst
     assert undecided <= 0.01
@@ -113,7 +109,7 @@ def test_a_hundred_thousand_ticks(built: tuple[Header, list[str], Path]) -> None
     made, command, _ = built
     rng = np.random.default_rng(6)
     ticks = list(_logged(10_000, 3))
-    ticks += directed(values(made.literals), 100_000 - len(ticks))
+    ticks += directed(made.values, 100_000 - len(ticks))
     strew(ticks, rng, losses=20)
     assert len(ticks) == 100_000
     found = run(command, ticks)
@@ -131,7 +127,7 @@ def test_nothing_is_ever_nan(built: tuple[Header, list[str], Path]) -> None:
     ticks = hostile(rng, 20_000)
     found = run(command, ticks)
     assert np.isfinite(found.numbers).all()
-    low, high = values(made.literals)["CALIB_PUMP_LOW_PWM"], values(made.literals)["CALIB_PUMP_HIGH_PWM"]
+    low, high = made.values["CALIB_PUMP_LOW_PWM"], made.values["CALIB_PUMP_HIGH_PWM"]
     assert found.numbers[:, 7:].min() >= low
     assert found.numbers[:, 7:].max() <= high
     assert (found.duty == np.floor(found.numbers[:, 7:] + 0.5)).all()
@@ -144,8 +140,8 @@ def _still(mode: int = MODE_POSITION) -> Inputs:
 
 def test_a_lost_sensor_holds_and_then_stops_the_pumps(built: tuple[Header, list[str], Path]) -> None:
     made, command, _ = built
-    hold = int(values(made.literals)["CALIB_HOLD_TICKS"])
-    low = values(made.literals)["CALIB_PUMP_LOW_PWM"]
+    hold = int(made.values["CALIB_HOLD_TICKS"])
+    low = made.values["CALIB_PUMP_LOW_PWM"]
     for lost, flag in (({"marker_seen": False}, MARKER_HELD), ({"imu_read": False}, IMU_HELD)):
         ticks = [_still()] * 200 + [replace(_still(), **lost)] * (hold + 50) + [_still()] * 50
         found = run(command, ticks)
@@ -203,7 +199,7 @@ def test_signs_of_the_imus_axes(tmp_path: Path) -> None:
     made = header()
     write(tmp_path, made)
     path = tmp_path / "calib_constants.h"
-    constants = values(made.literals)
+    constants = made.values
     text = path.read_text()
     for axis in ("AX", "AY", "GZ"):
         constants[f"CALIB_IMU_SIGN_{axis}"] = -1.0
@@ -233,7 +229,7 @@ def test_low_passes_of_every_order(tmp_path: Path, order: int) -> None:
     other = section.model_copy(update={"order": order, "cutoff_hz": 3.0, "sections": sections})
     made = header_of(rig().with_sections({"lowpass": other}), "rig.yaml")
     write(tmp_path, made)
-    ticks = directed(values(made.literals), 1500)
+    ticks = directed(made.values, 1500)
     worst, _ = compare(made, ticks, run(host(tmp_path), ticks))
     assert (worst <= LIMITS).all(), worst
 
@@ -249,12 +245,12 @@ def built_pipeline_fused(
 
 
 def _still_pipeline_fused(made: Header, mode: int = MODE_POSITION) -> Inputs:
-    return replace(coherent(values(made.literals), PERIOD)[-1], reference=(0.08, 0.08), mode=mode)
+    return replace(coherent(made.values, PERIOD)[-1], reference=(0.08, 0.08), mode=mode)
 
 
 def test_directed_ticks_in_pipeline_fused(built_pipeline_fused: tuple[Header, list[str], Path]) -> None:
     made, command, _ = built_pipeline_fused
-    ticks = directed_fused(values(made.literals), 2000)
+    ticks = directed_fused(made.values, 2000)
     worst, undecided = compare(made, ticks, run(command, ticks), fused=True)
     assert (worst <= LIMITS).all(), worst
     assert undecided <= 0.01
@@ -267,7 +263,7 @@ def test_a_hundred_thousand_ticks_in_pipeline_fused(
     """Coherent motion with random and hostile values strewn in; flags agree at every tick."""
     made, command, _ = built_pipeline_fused
     rng = np.random.default_rng(8)
-    period = directed_fused(values(made.literals), 10_000)
+    period = directed_fused(made.values, 10_000)
     ticks = [one for _ in range(10) for one in period]
     strew(ticks, rng, losses=30)
     found = run(command, ticks)
@@ -296,7 +292,7 @@ def test_nothing_is_ever_nan_in_pipeline_fused(built_pipeline_fused: tuple[Heade
     ]
     found = run(command, ticks)
     assert np.isfinite(found.numbers).all()
-    low, high = values(made.literals)["CALIB_PUMP_LOW_PWM"], values(made.literals)["CALIB_PUMP_HIGH_PWM"]
+    low, high = made.values["CALIB_PUMP_LOW_PWM"], made.values["CALIB_PUMP_HIGH_PWM"]
     assert found.numbers[:, 7:].min() >= low
     assert found.numbers[:, 7:].max() <= high
     assert np.abs(found.numbers[:, 0]).max() <= float(np.float32(1.58))
@@ -307,7 +303,7 @@ def test_a_lost_sensor_degrades_and_then_stops_the_pumps(
     built_pipeline_fused: tuple[Header, list[str], Path],
 ) -> None:
     made, command, _ = built_pipeline_fused
-    constants = values(made.literals)
+    constants = made.values
     hold, low = int(constants["CALIB_HOLD_TICKS"]), constants["CALIB_PUMP_LOW_PWM"]
     still = _still_pipeline_fused(made)
     for lost, flag in (({"marker_seen": False}, MARKER_HELD), ({"imu_read": False}, IMU_HELD)):
@@ -331,7 +327,7 @@ def test_another_marker_is_left_out_until_it_stays(
     made, command, _ = built_pipeline_fused
     still, patience = (
         _still_pipeline_fused(made, MODE_OFF),
-        int(values(made.literals)["CALIB_FUSED_PATIENCE"]),
+        int(made.values["CALIB_FUSED_PATIENCE"]),
     )
     far = replace(still, v_px=still.v_px + 25.0)
     found = run(command, [still] * 100 + [far] + [still] * 50 + [far] * 60)
@@ -348,7 +344,7 @@ def test_the_reference_is_the_projects_estimator(mean_rate: bool) -> None:
     """Fed with calibrated readings, `calib.stages.estimator.constant_gain` gives the same angle and
     length."""
     made, whole = header("fused"), rig("fused")
-    constants = values(made.literals)
+    constants = made.values
     section = whole.estimator
     assert section is not None and section.constant_gain is not None and whole.align is not None
     gains = Gains(**section.constant_gain.model_dump())
@@ -440,7 +436,7 @@ def _true_marker(camera: Camera, u: float, v: float) -> np.ndarray:
 @pytest.mark.parametrize("mode", [MODE_ORIENTATION, MODE_POSITION])
 def test_every_stage_is_the_projects_own(mode: int) -> None:
     """Stage by stage, each fed with what the reference had before it; binary32 constants cost 1e-6."""
-    constants = values(header().literals)
+    constants = header().values
     reference = Reference(constants)
     angle: MahonyState | None = None
     lowpass, x, y = LowPass(), None, None
@@ -497,7 +493,7 @@ def test_they_reach_every_branch(kind: str) -> None:
 @pytest.mark.parametrize("kind", ["fused", "full"])
 def test_the_estimator_follows_the_motion(kind: str) -> None:
     """Pictures, gyroscope and accelerometer tell one story: the estimate is near the motion they are of."""
-    constants = values(header(kind).literals)
+    constants = header(kind).values
     reference = FusedReference(constants)
     motion = Motion(constants["CALIB_REST_LENGTH_M"], PERIOD, 0.0)
     off = []

@@ -14,10 +14,8 @@ from hypothesis import strategies as st
 
 from calib.core.errors import BadInputError
 from calib.io.logs import read_log
-from calib.io.serial import Decoder, Frame, Recording, checksum, csv_header, csv_row, encoded, record
+from calib.io.serial import Decoder, Frame, Inputs, Recording, checksum, csv_header, csv_row, encoded, record
 from calib.stages.firmware.check import check_frames, read_frames
-from calib.stages.firmware.conformance import Inputs
-from calib.stages.firmware.header import identity_of
 from calib.stages.firmware.vectors import binary32, vectors
 
 floats = st.floats(width=32, allow_nan=False)
@@ -104,7 +102,7 @@ def test_ctrl_c_keeps_what_came() -> None:
 
 
 def _frames_check(ticks: int = 120) -> list[Frame]:
-    identity = int(identity_of(header())[:8], 16)
+    identity = header().identity
     made = []
     for k, vector in enumerate(vectors(header(), ticks)):
         w = vector.wanted
@@ -121,13 +119,18 @@ def _log(path: Path, frames: list[Frame]) -> Path:
 
 def test_a_good_board_passes(tmp_path: Path) -> None:
     result = check_frames(header(), read_frames(_log(tmp_path / "log.csv", _frames_check())), "log.csv")
-    assert (result.ticks, result.reasons, result.missing_after, result.flags_differ) == (120, [], None, 0)
+    assert (result.ticks, result.verdict.reasons, result.missing_after, result.flags_differ) == (
+        120,
+        [],
+        None,
+        0,
+    )
     # Nine digits of the log, times 24000 PWM/m.
     assert max(result.worst.values()) < 1e-5
 
 
 def test_a_board_with_the_fused_estimator_is_known_by_its_flags(tmp_path: Path) -> None:
-    identity = int(identity_of(header("fused"))[:8], 16)
+    identity = header("fused").identity
     frames = []
     for k, vector in enumerate(vectors(header("fused"), 120, fused=True)):
         w = vector.wanted
@@ -135,8 +138,8 @@ def test_a_board_with_the_fused_estimator_is_known_by_its_flags(tmp_path: Path) 
             Frame(identity, 60000, k, vector.given, w.phi_rad, w.marker_m, w.head_m, w.q_m, w.pwm, w.flags)
         )
     result = check_frames(header("fused"), read_frames(_log(tmp_path / "log.csv", frames)), "log.csv")
-    assert (result.ticks, result.reasons, result.flags_differ) == (120, [], 0)
-    without = [replace(frame, identity=int(identity_of(header())[:8], 16)) for frame in frames]
+    assert (result.ticks, result.verdict.reasons, result.flags_differ) == (120, [], 0)
+    without = [replace(frame, identity=header().identity) for frame in frames]
     with pytest.raises(BadInputError, match=r"log\.csv: the board runs the fused estimator, for which"):
         check_frames(header(), without, "log.csv")
 
@@ -145,10 +148,10 @@ def test_a_wrong_value_is_named_with_its_tick() -> None:
     frames = _frames_check()
     frames[41] = replace(frames[41], q_m=(frames[41].q_m[0] + 1e-5, frames[41].q_m[1]))
     result = check_frames(header(), frames, "log.csv")
-    assert result.reasons == ["tick 41 is the first that differs, in q_m"]
+    assert result.verdict.reasons == ["tick 41 is the first that differs, in q_m"]
     frames[30] = replace(frames[30], flags=frames[30].flags ^ 0x10)
     result = check_frames(header(), frames, "log.csv")
-    assert result.reasons == ["tick 30 is the first that differs, in flags"]
+    assert result.verdict.reasons == ["tick 30 is the first that differs, in flags"]
     assert result.flags_differ == 1
 
 

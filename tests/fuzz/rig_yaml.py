@@ -114,11 +114,11 @@ def _difference(path: Path) -> None:
 
 def _constants(path: Path) -> None:
     from calib.core.rig import Rig
-    from calib.stages.firmware.header import header_of, header_text
+    from calib.stages.firmware.header import header_of
 
     whole = Rig.load(path)
     if whole.camera is not None:
-        text = header_text(header_of(whole, "rig.yaml"))
+        text = header_of(whole, "rig.yaml").text
         assert text.isascii() or text.isprintable
 
 

@@ -16,6 +16,7 @@ from calib.core.result import (
     Row3,
     Section,
     Sigma,
+    finite_or_none,
     quantity,
 )
 from calib.core.schema import contradiction
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
     from calib.core.arrays import FloatArray
     from calib.stages.camera import model as optics
+    from calib.stages.camera.lens import InversePolynomial
 
 Model = Annotated[str, Field(pattern="^(pinhole|radial2|radial3|brown5|rational8)$")]
 Focal = Annotated[float, Field(ge=1e-3, le=1e7, allow_inf_nan=False, strict=True)]
@@ -201,6 +203,16 @@ class InverseLens(Section):
     decentering_steps: Count
     max_error_px: NotNegative | None
     covered: Number = Field(ge=0, le=1)
+
+    @staticmethod
+    def of(fit: InversePolynomial) -> InverseLens:
+        """What of a fit the file holds."""
+        return InverseLens(
+            radial=list(fit.radial),
+            decentering_steps=fit.decentering_steps,
+            max_error_px=finite_or_none(fit.max_error_px),
+            covered=fit.covered,
+        )
 
 
 class Lens(Result):

@@ -495,7 +495,6 @@ def _read_lens(files: Files, rig: Rig, options: LensOptions) -> LensInputs:
 
 
 def _solve_lens(inputs: LensInputs) -> Lens:
-    from calib.core.result import finite_or_none
     from calib.stages.camera.lens import analyse_distortion
     from calib.stages.camera.section import InverseLens, Lens
 
@@ -503,7 +502,7 @@ def _solve_lens(inputs: LensInputs) -> Lens:
     report = analyse_distortion(
         optics, inputs.camera.intrinsic_covariance, plane=inputs.plane, region_px=inputs.region_px
     )
-    cost, inverse = report.plane, report.inverse
+    cost = report.plane
     return Lens(
         kind=report.kind,
         max_px=report.max_px,
@@ -517,12 +516,7 @@ def _solve_lens(inputs: LensInputs) -> Lens:
         plane_mean_mm=None if cost is None else cost.mean_mm,
         refitted_max_mm=None if cost is None else cost.refitted_max_mm,
         refitted_mean_mm=None if cost is None else cost.refitted_mean_mm,
-        inverse=InverseLens(
-            radial=list(inverse.radial),
-            decentering_steps=inverse.decentering_steps,
-            max_error_px=finite_or_none(inverse.max_error_px),
-            covered=inverse.covered,
-        ),
+        inverse=InverseLens.of(report.inverse),
         effect=report.effect,
         verdict="ok",
         remarks=[report.why],

@@ -336,14 +336,13 @@ def _check_plots(checked: Checked) -> dict[str, Figure]:
     return check_plots(checked.model, checked.reference, checked.follow, checked.slower)
 
 
-def _write_slower(path: Path, checked: Checked) -> list[str]:
-    from calib.core.files import shown
+def _write_slower(path: Path, checked: Checked) -> list[Path]:
     from calib.stages.control.read import write_reference
 
     if checked.never:
         return []
     write_reference(path, checked.slower or checked.reference)
-    return [f"reference written to {shown(path)}"]
+    return [path]
 
 
 check = Stage(

@@ -9,15 +9,16 @@ from __future__ import annotations
 
 import csv
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from calib.core.errors import BadInputError
 from calib.core.files import read_bytes, shown
+from calib.core.verdict import Finding, Verdict
 from calib.io.serial import BOARD_COLUMNS, Frame, frame_from_row
 from calib.stages.firmware.conformance import BY_FUSED, BY_MEAN_RATE, CLAMPED, Outputs, reference_of
-from calib.stages.firmware.header import Header, identity_of
-from calib.stages.firmware.literals import values
+from calib.stages.firmware.header import Header
 from calib.stages.firmware.vectors import TOLERANCE
 
 _CLAMP_BITS = CLAMPED[0] | CLAMPED[1]
@@ -44,12 +45,16 @@ class Check:
     first_bad: tuple[int, str] | None
 
     @property
-    def reasons(self) -> list[str]:
-        """Why the board failed; empty when it passed."""
-        if self.first_bad is None:
-            return []
-        tick, what = self.first_bad
-        return [f"tick {tick} is the first that differs, in {what}"]
+    def verdict(self) -> Verdict:
+        """Poor for a board that computes something else."""
+        findings = []
+        if self.first_bad is not None:
+            tick, what = self.first_bad
+            findings.append(Finding("poor", f"tick {tick} is the first that differs, in {what}"))
+        if self.missing_after is not None:
+            text = f"a frame is missing after tick {self.missing_after - 1}; what follows was not compared"
+            findings.append(Finding("remark", text))
+        return Verdict.of(findings)
 
 
 def read_frames(path: Path) -> list[Frame]:
@@ -88,7 +93,9 @@ def _differences(frame: Frame, wanted: Outputs) -> dict[str, float]:
     return {name: value if math.isfinite(value) else math.inf for name, value in found.items()}
 
 
-def check_frames(header: Header, frames: list[Frame], source: str, undistort: bool | None = None) -> Check:
+def check_frames(
+    header: Header, frames: Sequence[Frame], source: str, undistort: bool | None = None
+) -> Check:
     """Compare the ticks of a board with the reference.
 
     Parameters
@@ -99,8 +106,7 @@ def check_frames(header: Header, frames: list[Frame], source: str, undistort: bo
 
     Raises `BadInputError` for a board with another header and for a log that does not begin at the start.
     """
-    digest = identity_of(header)
-    identity = int(digest[:8], 16)
+    identity = header.identity
     first = frames[0]
     if first.identity != identity:
         raise BadInputError(
@@ -112,9 +118,9 @@ def check_frames(header: Header, frames: list[Frame], source: str, undistort: bo
             f"{source}: begins with tick {first.sequence}, expected 0: record from the board's start"
         )
     by_fused, by_mean = bool(first.flags & BY_FUSED), bool(first.flags & BY_MEAN_RATE)
-    if by_fused and header.literals["CALIB_HAS_FUSED"] != "1":
+    if by_fused and not header.values["CALIB_HAS_FUSED"]:
         raise BadInputError(f"{source}: the board runs the fused estimator, for which rig.yaml has no gains")
-    reference = reference_of(values(header.literals), undistort, by_fused, by_mean)
+    reference = reference_of(header.values, undistort, by_fused, by_mean)
     worst = dict.fromkeys(TOLERANCE, 0.0)
     differ, bad, ticks, lost = 0, None, 0, None
     for tick, frame in enumerate(frames):

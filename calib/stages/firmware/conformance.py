@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from calib.io.serial import MODE_OFF, MODE_ORIENTATION, MODE_POSITION, Inputs
+
 # ----------------------------------------------------------------------
 # What the firmware has to compute, in float64: the reference that C, AVR and boards are held against.
 #
@@ -22,8 +24,6 @@ import numpy as np
 # value was
 # from the limit where it would have decided otherwise.
 
-MODE_OFF, MODE_ORIENTATION, MODE_POSITION = 0, 1, 2
-
 MARKER_HELD, HORIZON, IMU_HELD, ACCEL_WEAK = 0x1, 0x2, 0x4, 0x8
 ANGLE_LIMIT, STALE, BAD_REFERENCE = 0x10, 0x20, 0x40
 CLAMPED, SATURATED = (0x80, 0x100), (0x200, 0x400)
@@ -35,30 +35,6 @@ REFERENCE_LIMIT = 6.3
 _NEVER = 0xFFFF
 
 Pair = tuple[float, float]
-
-
-@dataclass(frozen=True)
-class Inputs:
-    """One tick's readings, as `calib_inputs`.
-
-    Attributes
-    ----------
-    u_px, v_px : marker as the camera reports it.
-    ax_mps2, ay_mps2, gz_radps : IMU.
-    reference : angle [rad] and anything, or both lengths [m].
-    marker_seen, imu_read : whether something came in.
-    mode : of the controller.
-    """
-
-    u_px: float
-    v_px: float
-    ax_mps2: float
-    ay_mps2: float
-    gz_radps: float
-    reference: tuple[float, float] = (0.0, 0.0)
-    marker_seen: bool = True
-    imu_read: bool = True
-    mode: int = MODE_OFF
 
 
 def binary32(given: Inputs) -> Inputs:

@@ -15,8 +15,8 @@ from calib.stages.actuator.kinematics import MARKER_OFFSET_M, inverse_coefficien
 from calib.stages.actuator.parameters import LONGEST_ELONGATION_M, Plant
 from calib.stages.actuator.pump import PWM_MAX, ElongationForce
 from calib.stages.actuator.section import standing
-from calib.stages.camera.lens import InversePolynomial
 from calib.stages.camera.model import Camera, project
+from calib.stages.camera.section import InverseLens
 from calib.stages.control.laws import PWM_MIN, FeedForward, Pid
 from calib.stages.control.section import OrientationGains, StaticMap
 from calib.stages.estimator.constant_gain import (
@@ -157,7 +157,7 @@ class CameraConstants:
     model: str
     verdict: str
     intrinsics: dict[str, float]
-    inverse: InversePolynomial
+    inverse: InverseLens
     plane: PlaneConstants | None
 
 
@@ -254,9 +254,8 @@ def _lens_group(camera: CameraConstants) -> Group:
             "Decentering: x and y as above, then CALIB_LENS_DECENTERING_STEPS times the same from",
             "xd - (2 p1 x y + p2 (r2 + 2 x^2)), yd - (p1 (r2 + 2 y^2) + 2 p2 x y) with r2 = x^2 + y^2.",
         ]
-    notes.append(
-        f"Error at most {inverse.max_error_px:.4f} px over {100 * inverse.covered:.0f} % of the picture."
-    )
+    error = "without bound" if inverse.max_error_px is None else f"at most {inverse.max_error_px:.4f} px"
+    notes.append(f"Error {error} over {100 * inverse.covered:.0f} % of the picture.")
     items: list[Constant | Whole | Macro] = [
         Whole("CALIB_LENS_INVERSE_ORDER", len(inverse.radial), "number of coefficients c"),
         Whole("CALIB_LENS_DECENTERING_STEPS", inverse.decentering_steps, "0: no decentering"),

@@ -9,15 +9,21 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from importlib import resources
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import jinja2
 import numpy as np
 
 from calib import __version__
+from calib.core.files import make_folder, write_atomically
+from calib.core.result import identity
+from calib.core.verdict import Finding, Verdict
 from calib.stages.camera.lens import fit_inverse
 from calib.stages.camera.model import COEFFICIENTS, MODELS
+from calib.stages.camera.section import InverseLens
 from calib.stages.firmware.constants import (
     CameraConstants,
     Lookup,
@@ -30,13 +36,27 @@ from calib.stages.firmware.constants import (
     put_right,
     tick_rate_hz,
 )
-from calib.stages.firmware.literals import Constant, Group, Macro, Table, Whole, comment_text, literals
+from calib.stages.firmware.literals import (
+    Constant,
+    Group,
+    Macro,
+    Table,
+    Whole,
+    comment_text,
+    literals,
+    values,
+)
 
 if TYPE_CHECKING:
     from calib.core.rig import Rig
+    from calib.stages.camera.section import Camera
 
 SCHEMA = 3
 """Raised when a constant changes its name, unit or meaning."""
+
+FLASHED = ("camera", "plane", "imu", "orientation_filter", "lowpass", "align", "controller")
+"""Sections whose verdicts say whether the header can be flashed."""
+_UNREAD = "see CALIB_CAMERA_OK and CALIB_PLANE_OK, do not flash it unread"
 
 _INVERSE_PX = 0.1
 _INVERSE_SHARE = 0.9
@@ -45,27 +65,87 @@ _INVERSE_SHARE = 0.9
 
 @dataclass(frozen=True)
 class Header:
-    """What goes into calib_constants.h.
+    """What goes into calib_constants.h, and the files around it.
 
     Attributes
     ----------
     camera : intrinsics, lens and plane.
     groups : all constants in the order of the file.
     inputs : SHA-256 of each input by name.
+    verdict : of the sections that the constants come from.
     """
 
     camera: CameraConstants
     groups: tuple[Group, ...]
     inputs: Mapping[str, str]
+    verdict: Verdict
 
-    @property
+    @cached_property
     def literals(self) -> dict[str, str]:
-        """Every value as it stands in the file, by name."""
+        """Every value as it stands in the file, by name. Raises `BadInputError` for what no float holds."""
         return literals(self.groups)
 
+    @cached_property
+    def values(self) -> dict[str, float]:
+        """Every value as a compiler reads it, by name."""
+        return values(self.literals)
 
-def environment() -> jinja2.Environment:
-    """Templates of C text; `comment` makes text safe inside a comment."""
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of schema and values; its first eight digits are CALIB_ID."""
+        canonical = "\n".join(f"{name} {literal}" for name, literal in self.literals.items())
+        return hashlib.sha256(f"{SCHEMA}\n{canonical}\n".encode()).hexdigest()
+
+    @property
+    def identity(self) -> int:
+        """CALIB_ID."""
+        return int(self.digest[:8], 16)
+
+    @property
+    def text(self) -> str:
+        """calib_constants.h."""
+        plane = self.camera.plane
+        return rendered(
+            "calib_constants.h.j2",
+            header=self,
+            camera=self.camera,
+            plane_verdict=plane.verdict if plane else "",
+            digest=self.digest,
+            groups=[
+                {
+                    "notes": [*group.notes, *([group.defaults] if group.defaults else [])],
+                    "lines": _lines(group, self.literals),
+                }
+                for group in self.groups
+            ],
+            inputs=dict(sorted(self.inputs.items())),
+        )
+
+    def write(self, folder: Path | str) -> list[Path]:
+        """Write the header and, where there is a plane, pipeline, self-test and sketch; the files written.
+
+        Raises `BadInputError` where the folder cannot be written.
+        """
+        from calib.stages.firmware.vectors import selftest_text
+
+        where = Path(folder)
+        texts = {"calib_constants.h": self.text}
+        if self.camera.plane is not None:
+            texts["calib_pipeline.h"] = verbatim("calib_pipeline.h")
+            texts["calib_selftest.h"] = selftest_text(self)
+            # The Arduino IDE wants a sketch to bear the name of its folder.
+            texts[f"{where.resolve().name or 'calib_example'}.ino"] = verbatim("calib_example.ino")
+        make_folder(where)
+        for name, text in texts.items():
+            write_atomically(where / name, text)
+        return [where / name for name in texts]
+
+    def __str__(self) -> str:
+        return self.text
+
+
+def rendered(template: str, header: Header, **more: Any) -> str:
+    """Text in C of a template; `comment` makes text safe inside a comment."""
     made = jinja2.Environment(
         loader=jinja2.FunctionLoader(verbatim),
         undefined=jinja2.StrictUndefined,
@@ -75,7 +155,8 @@ def environment() -> jinja2.Environment:
         keep_trailing_newline=True,
     )
     made.filters["comment"] = comment_text
-    return made
+    common = {"schema": SCHEMA, "version": __version__, "identity": f"{header.identity:08X}"}
+    return made.get_template(template).render(**common, **more)
 
 
 def verbatim(name: str) -> str:
@@ -83,10 +164,19 @@ def verbatim(name: str) -> str:
     return resources.files("calib.stages.firmware").joinpath("templates", name).read_text("utf-8")
 
 
-def identity_of(header: Header) -> str:
-    """SHA-256 of schema and values; its first eight digits are CALIB_ID."""
-    canonical = "\n".join(f"{name} {literal}" for name, literal in header.literals.items())
-    return hashlib.sha256(f"{SCHEMA}\n{canonical}\n".encode()).hexdigest()
+def _inverse(whole: Rig, camera: Camera) -> InverseLens:
+    """The polynomial of the section lens where that is of this camera, else a new one."""
+    if whole.lens is not None and whole.inputs.get("lens", {}).get("camera") == identity(camera):
+        return whole.lens.inverse
+    return InverseLens.of(fit_inverse(camera.optics))
+
+
+def _undone(inverse: InverseLens) -> bool:
+    return (
+        inverse.max_error_px is not None
+        and inverse.max_error_px <= _INVERSE_PX
+        and inverse.covered >= _INVERSE_SHARE
+    )
 
 
 def _camera_constants(whole: Rig, source: str) -> CameraConstants:
@@ -95,8 +185,7 @@ def _camera_constants(whole: Rig, source: str) -> CameraConstants:
     section = whole.camera
     assert section is not None
     camera = section.optics
-    inverse = fit_inverse(camera)
-    undone = inverse.max_error_px <= _INVERSE_PX and inverse.covered >= _INVERSE_SHARE
+    inverse = _inverse(whole, section)
     named = dict(zip(COEFFICIENTS, camera.distortion.tolist(), strict=True))
     intrinsics = {
         "fx_px": section.fx_px,
@@ -122,8 +211,30 @@ def _camera_constants(whole: Rig, source: str) -> CameraConstants:
         if align is not None:
             x, y = align.plane_shift_m
             plane = put_right(plane, (x, y), align.plane_stretch)
-    verdict = section.verdict.word if undone or not section.verdict.ok else "poor"
+    verdict = section.verdict.word if _undone(inverse) or not section.verdict.ok else "poor"
     return CameraConstants(camera.image_size_px, section.model, verdict, intrinsics, inverse, plane)
+
+
+def _judge(whole: Rig, camera: CameraConstants) -> Verdict:
+    """As bad as the worst of the sections that the constants come from, and as the lens is undone."""
+    findings = []
+    for name in FLASHED:
+        section = getattr(whole, name)
+        # With an alignment the header takes nothing from a log at rest.
+        if section is None or (name == "imu" and whole.align is not None):
+            continue
+        word = section.verdict.word
+        if word != "ok":
+            advice = _UNREAD if name in ("camera", "plane") else ""
+            findings.append(Finding(word, f"{name} is {word}", advice))
+    inverse = camera.inverse
+    if not _undone(inverse):
+        error = "without bound" if inverse.max_error_px is None else f"to {inverse.max_error_px:.3g} px only"
+        text = f"the lens is undone {error}, over {inverse.covered:.0%} of the picture"
+        findings.append(Finding("poor", text, _UNREAD))
+    if camera.plane is None:
+        findings.append(Finding("remark", "no plane yet, which the pipeline needs", "run calib extrinsics"))
+    return Verdict.of(findings)
 
 
 def header_of(whole: Rig, source: str) -> Header:
@@ -145,12 +256,12 @@ def header_of(whole: Rig, source: str) -> Header:
     groups = (*camera_groups(camera), *motion, *control_groups(lookup, rate_hz))
     inputs = {
         f"{section}/{name}": digest
-        for section, named in whole.provenance.inputs.items()
+        for section, named in whole.inputs.items()
         for name, digest in named.items()
         # Sections that name others as inputs; only files are inputs of the header.
         if name not in ("camera", "plane") and (section != "plane" or camera.plane is not None)
     }
-    return Header(camera, groups, inputs)
+    return Header(camera, groups, inputs, _judge(whole, camera))
 
 
 def _lines(group: Group, literal: Mapping[str, str]) -> list[str]:
@@ -168,30 +279,3 @@ def _lines(group: Group, literal: Mapping[str, str]) -> list[str]:
             lines += [f"    {', '.join(entries[i : i + 6])}," for i in range(0, len(entries), 6)]
             lines.append("};")
     return lines
-
-
-def header_text(header: Header) -> str:
-    """calib_constants.h. Raises `BadInputError` for a value that a float cannot hold."""
-    literal = header.literals
-    digest = identity_of(header)
-    groups = [
-        {
-            "notes": [*group.notes, *([group.defaults] if group.defaults else [])],
-            "lines": _lines(group, literal),
-        }
-        for group in header.groups
-    ]
-    return (
-        environment()
-        .get_template("calib_constants.h.j2")
-        .render(
-            schema=SCHEMA,
-            version=__version__,
-            digest=digest,
-            identity=digest[:8].upper(),
-            camera=header.camera,
-            plane_verdict=header.camera.plane.verdict if header.camera.plane else "",
-            groups=groups,
-            inputs=dict(sorted(header.inputs.items())),
-        )
-    )

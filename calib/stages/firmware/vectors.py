@@ -9,18 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.core.errors import BadInputError
-from calib.stages.firmware.conformance import (
-    MODE_OFF,
-    MODE_ORIENTATION,
-    MODE_POSITION,
-    Inputs,
-    Outputs,
-    Reference,
-    binary32,
-    reference_of,
-)
-from calib.stages.firmware.header import SCHEMA, Header, environment, identity_of
-from calib.stages.firmware.literals import float_literal, values
+from calib.io.serial import MODE_OFF, MODE_ORIENTATION, MODE_POSITION, Inputs
+from calib.stages.firmware.conformance import Outputs, Reference, binary32, reference_of
+from calib.stages.firmware.header import Header, rendered
+from calib.stages.firmware.literals import float_literal
 
 # ----------------------------------------------------------------------
 # Golden vectors: a short run that drives every constant, with what the reference makes of it.
@@ -79,7 +71,7 @@ def directed(constants: Mapping[str, float], ticks: int) -> list[Inputs]:
 
 def vectors(header: Header, ticks: int = 48, fused: bool = False) -> list[Vector]:
     """Golden vectors of a header that has a plane; `fused` for CALIB_FUSED 1."""
-    constants = values(header.literals)
+    constants = header.values
     reference = reference_of(constants, fused=fused)
     given = directed_fused(constants, ticks, period=ticks) if fused else directed(constants, ticks)
     return [Vector(one, reference.step(one)) for one in given]
@@ -100,24 +92,14 @@ def _lines(vector: Vector) -> list[str]:
 
 def selftest_text(header: Header) -> str:
     """calib_selftest.h of a header that has a plane."""
-    from calib import __version__
-
-    fused = header.literals["CALIB_HAS_FUSED"] == "1"
-
-    return (
-        environment()
-        .get_template("calib_selftest.h.j2")
-        .render(
-            version=__version__,
-            schema=SCHEMA,
-            identity=identity_of(header)[:8].upper(),
-            undistort=int(Reference(values(header.literals)).undistort),
-            rows=[_lines(vector) for vector in vectors(header)],
-            fused_rows=[_lines(vector) for vector in vectors(header, FUSED_TICKS, fused=True)]
-            if fused
-            else [],
-            tolerance=TOLERANCE,
-        )
+    fused = vectors(header, FUSED_TICKS, fused=True) if header.values["CALIB_HAS_FUSED"] else []
+    return rendered(
+        "calib_selftest.h.j2",
+        header,
+        undistort=int(Reference(header.values).undistort),
+        rows=[_lines(vector) for vector in vectors(header)],
+        fused_rows=[_lines(vector) for vector in fused],
+        tolerance=TOLERANCE,
     )
 
 

@@ -171,12 +171,12 @@ def _rest_log(log: StaticLog) -> ImuLog:
     )
 
 
-def _write_kalibr(path: Path, imu: Imu) -> list[str]:
-    from calib.core.files import shown, write_atomically
+def _write_kalibr(path: Path, imu: Imu) -> list[Path]:
+    from calib.core.files import write_atomically
     from calib.stages.imu.formats import to_kalibr
 
     write_atomically(path, to_kalibr(imu))
-    return [f"Kalibr's imu.yaml written to {shown(path)}"]
+    return [path]
 
 
 def _static_plots(imu: Imu) -> dict[str, Figure]:

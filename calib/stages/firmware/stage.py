@@ -1,0 +1,119 @@
+"""The stage of the firmware: the header with its pipeline out, or a board's log held against it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from calib.core.errors import BadInputError
+from calib.core.stage import Files, Output, Stage, option
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from calib.core.rig import Rig
+    from calib.core.words import Block
+    from calib.io.serial import Frame
+    from calib.stages.firmware.check import Check
+    from calib.stages.firmware.header import Header
+
+
+@dataclass(frozen=True)
+class FirmwareOptions:
+    """Whether a board is checked."""
+
+    check: Path | None = option(
+        None, "Compare a log of calib record with this rig instead of writing.", metavar="LOG"
+    )
+
+
+@dataclass(frozen=True)
+class FirmwareInputs:
+    """A rig with its file's name, and the frames of a board with the name of their log."""
+
+    rig: Rig
+    source: str
+    frames: Sequence[Frame] | None = None
+    log: str = ""
+
+
+def _read(files: Files, rig: Rig, options: FirmwareOptions) -> FirmwareInputs:
+    from calib.core.files import shown
+
+    source = shown(files.rig_path)
+    if options.check is None:
+        return FirmwareInputs(rig, source)
+    from calib.stages.firmware.check import read_frames
+
+    log = Path(options.check)
+    if rig.plane is None:
+        raise BadInputError(f"{source}: has no plane yet, so no board can run it; run calib extrinsics first")
+    return FirmwareInputs(rig, source, read_frames(log), shown(log))
+
+
+def _solve(inputs: FirmwareInputs) -> Header | Check:
+    from calib.stages.firmware.check import check_frames
+    from calib.stages.firmware.header import header_of
+
+    header = header_of(inputs.rig, inputs.source)
+    return header if inputs.frames is None else check_frames(header, inputs.frames, inputs.log)
+
+
+def _write(folder: Path, outcome: Header | Check) -> list[Path]:
+    from calib.stages.firmware.header import Header
+
+    return outcome.write(folder) if isinstance(outcome, Header) else []
+
+
+def _document(outcome: Header | Check) -> dict[str, Any]:
+    from calib.stages.firmware.header import Header
+    from calib.stages.firmware.vectors import TOLERANCE
+
+    gate = outcome.verdict.reasons or "passed"
+    if isinstance(outcome, Header):
+        return {"constants": len(outcome.literals), "gate": gate}
+    return {
+        "check": {
+            "ticks": outcome.ticks,
+            "lost_after": outcome.missing_after,
+            "worst": outcome.worst,
+            "tolerance": TOLERANCE,
+            "flags_differ": outcome.flags_differ,
+            "gate": gate,
+        }
+    }
+
+
+def _words(outcome: Header | Check) -> list[Block]:
+    from calib.core.words import Line, Table, of_verdict
+    from calib.stages.firmware.header import Header
+    from calib.stages.firmware.vectors import TOLERANCE
+
+    if isinstance(outcome, Header):
+        return [Line(f"{len(outcome.literals)} constants"), *of_verdict(outcome.verdict)]
+    rows = tuple((name, f"{worst:.2g}", f"{TOLERANCE[name]:g}") for name, worst in outcome.worst.items())
+    head = ("", "differs at most", "allowed")
+    return [Line(f"{outcome.ticks} ticks compared"), Table(head, rows), *of_verdict(outcome.verdict)]
+
+
+firmware = Stage(
+    "firmware",
+    "Firmware",
+    """Write the header, the pipeline in C, its self-test and an Arduino sketch, or check a board's log.
+
+    Exits 1 when the verdict of a section that the constants come from is not ok (all is written and says so),
+    or when a board computes something else.
+    """,
+    _read,
+    _solve,
+    FirmwareOptions,
+    needs=("camera",),
+    uses=("plane", "lens", "imu", "imu_intrinsics", "orientation_filter", "lowpass", "align", "actuator",
+          "pump", "estimator", "controller"),
+    output=Output(
+        "Folder to write into.", _write, default=Path("firmware_constants"), folder=True
+    ),
+    document=_document,
+    words=_words,
+)  # fmt: skip
