@@ -24,7 +24,7 @@ def done(out: Path) -> int:
 def workers(parent: int) -> list[int]:
     """Worker processes of a run: they were spawned, and they are not the tracker of resources."""
     found = subprocess.run(
-        ["ps", "-o", "pid=,args=", "--ppid", str(parent)], capture_output=True, text=True, check=False
+        ["ps", "-ww", "-o", "pid=,args=", "--ppid", str(parent)], capture_output=True, text=True, check=False
     )
     return [int(line.split()[0]) for line in found.stdout.splitlines() if "spawn_main" in line]
 

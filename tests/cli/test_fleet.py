@@ -127,7 +127,7 @@ def test_killed_worker_killed_client_and_single_runs_end_in_the_same(
         children = workers(process.pid)
         process.kill()
         process.wait()
-    assert all_gone(children)
+    assert children and all_gone(children)
     before = {path: path.stat().st_mtime_ns for path in other.glob("rigs/*/rig.yaml")}
     with started(environment, "fleet", manifest, "-o", other, "--workers", 1, "--json") as process:
         said, told = process.communicate()
@@ -261,7 +261,7 @@ def test_killed_client_and_killed_worker_end_in_the_same(environment: dict[str, 
         children = workers(process.pid)
         process.kill()
         process.wait()
-    assert all_gone(children)
+    assert children and all_gone(children)
     assert not (out / "sweep.parquet").exists()
     kept = {path: path.stat().st_mtime_ns for path in (out / ".fleet" / "outcomes").glob("*.json")}
     assert 2 <= len(kept) < 16
