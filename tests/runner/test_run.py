@@ -105,6 +105,17 @@ def test_a_poor_result_is_used_and_kept_poor(tmp_path: Path) -> None:
     assert CALLS.count("first") == 1
 
 
+def test_what_a_person_states_is_kept_and_an_old_result_is_not(tmp_path: Path) -> None:
+    root = make_folder(tmp_path / "rig")
+    text = "estimator: {jitter_px: 99.0, verdict: ok}\nactuator: {mass_kg: 0.018}\n"
+    (root / "rig.yaml").write_text(text + "geometry: {workspace_m: [0, 0, 1, 1]}\n")
+    run_small(root, tmp_path / "out")
+    rig = yaml.safe_load((tmp_path / "out" / "rig.yaml").read_text())
+    assert rig["known"] == {"actuator": {"mass_kg": 0.018}}
+    assert rig["geometry"]["workspace_m"] == [0.0, 0.0, 1.0, 1.0]
+    assert rig["estimator"]["jitter_px"] < 20.0
+
+
 def test_a_damaged_result_is_made_again(tmp_path: Path) -> None:
     root, out = make_folder(tmp_path / "rig"), tmp_path / "out"
     run_small(root, out)
