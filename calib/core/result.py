@@ -43,7 +43,13 @@ Sigma = dict[str, NotNegative | None]
 
 
 def quantity(
-    default: Any = ..., *, label: str, show: str = "", digits: int | None = None, **limits: Any
+    default: Any = ...,
+    *,
+    label: str,
+    show: str = "",
+    digits: int | None = None,
+    fact: bool | tuple[str | int, ...] = False,
+    **limits: Any,
 ) -> Any:
     """A field of a section that a person reads.
 
@@ -52,9 +58,12 @@ def quantity(
     label : words for terminal, page and manual.
     show : unit to show it in, where that is not the unit of the file ("ms" of a time, "deg" of an angle).
     digits : digits behind the point where there is no standard deviation to say how many.
+    fact : whether it stands at the head of its stage on the page; of a list or mapping which items do.
     limits : `ge`, `gt`, `le`, `lt` as in pydantic.
     """
-    return Field(default, title=label, json_schema_extra={"show": show, "digits": digits}, **limits)
+    shown = list(fact) if isinstance(fact, tuple) else fact
+    extra: dict[str, Any] = {"show": show, "digits": digits, "fact": shown}
+    return Field(default, title=label, json_schema_extra=extra, **limits)
 
 
 class Section(BaseModel):

@@ -138,6 +138,34 @@ def described(result: BaseModel) -> list[Block]:
     return blocks
 
 
+def facts(section: BaseModel) -> list[tuple[str, str]]:
+    """The few values that stand for a section, as label and text with unit; those that it has."""
+    sigmas = getattr(section, "sigma", None)
+    out: list[tuple[str, str]] = []
+    for key, field, value in _labelled(section):
+        extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
+        wanted = extra.get("fact")
+        unit, scale, places = _shown(key, field)
+        if isinstance(wanted, list):
+            for item in wanted:
+                name = _AXES[item] if isinstance(item, int) else _as_words(str(item))
+                one = value[item] if isinstance(item, int) else _item(value, str(item))
+                own = unit or unit_of(str(item))
+                out.append(
+                    (f"{field.title} {name}", f"{number(_scaled(one, scale), None, places)} {own}".strip())
+                )
+        elif wanted and isinstance(value, bool | str):
+            out.append((str(field.title), _word(value)))
+        elif wanted:
+            (text,) = _vector([value], [_sigma(sigmas, key)], scale, places)
+            out.append((str(field.title), f"{text} {unit}".strip()))
+    return [(label, text) for label, text in out if not text.startswith(BLANK)]
+
+
+def _item(value: Any, name: str) -> Any:
+    return value.get(name) if isinstance(value, Mapping) else getattr(value, name, None)
+
+
 def of_verdict(verdict: Verdict) -> list[Line]:
     """The verdict's word and sentences."""
     return [

@@ -7,9 +7,8 @@ import contextlib
 import hashlib
 import io
 import json
-import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -20,9 +19,10 @@ from calib.core.constants import constants
 from calib.core.errors import BadInputError
 from calib.core.files import make_folder, read_bytes, sha256, write_atomically
 from calib.core.rig import Rig
-from calib.core.words import BLANK, SIGMA, number, unit_of
+from calib.core.words import BLANK, SIGMA, facts, number, unit_of
 from calib.runner.cache import Result, load
 from calib.runner.graph import HIDDEN
+from calib.runner.graph import STAGES as STEPS
 from calib.runner.outputs import decide, read_summary
 
 # ----------------------------------------------------------------------
@@ -266,142 +266,6 @@ def caption(stem: str, logs: Sequence[str] = ()) -> str:
     return stem.replace("_", " ")
 
 
-def facts(stage: str, section: Values, document: Values) -> list[Fact]:
-    """The few figures at the head of a stage, each with its unit."""
-    made = _FACTS.get(stage)
-    return [] if made is None else [(label, text) for label, text in made(section, document) if text]
-
-
-def _value(values: Values, key: str, unit: str | None = None, factor: float = 1.0) -> str:
-    value = values.get(key)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        return ""
-    return f"{short(factor * value)} {unit_of(key) if unit is None else unit}".strip()
-
-
-def _with_sigma(values: Values, key: str, unit: str, factor: float = 1.0) -> str:
-    value, sigma = values.get(key), (values.get("sigma") or {}).get(key)
-    if not isinstance(value, int | float):
-        return ""
-    if not isinstance(sigma, int | float):
-        return f"{number(factor * value)} {unit}".strip()
-    return f"{number(factor * value, factor * sigma)} ± {factor * sigma:.2g} {unit}".strip()
-
-
-def _camera(section: Values, _: Values) -> list[Fact]:
-    sigma = section.get("projection_sigma_px") or {}
-    return [
-        ("focal length", _with_sigma(section, "fx_px", "px")),
-        ("RMS", _value(section, "rms_px")),
-        ("views", _value(section, "views", "")),
-        ("points", _value(section, "points", "")),
-        (f"projection {SIGMA}, worst", _value(sigma, "max", "px") or "not bounded"),
-        ("lens model", str(section.get("model", ""))),
-    ]
-
-
-def _plane(section: Values, _: Values) -> list[Fact]:
-    sigma = section.get("sigma_marker_mm") or {}
-    return [
-        ("RMS on the plane", _value(section, "rms_mm")),
-        (f"calibration {SIGMA}, worst", _value(sigma, "calibration_max", "mm")),
-        (f"whole-pixel {SIGMA}", _value(sigma, "quantisation_max", "mm")),
-        ("without the lens, up to", _value(section.get("without_intrinsics") or {}, "difference_max_mm")),
-    ]
-
-
-def _lens(section: Values, _: Values) -> list[Fact]:
-    return [
-        ("kind", str(section.get("kind", ""))),
-        ("displacement, worst", _value(section, "max_px")),
-        ("neglecting it, up to", _value(section, "plane_max_mm")),
-        ("inverse's error", _value(section.get("inverse") or {}, "max_error_px")),
-    ]
-
-
-def _imu(section: Values, _: Values) -> list[Fact]:
-    bias = section.get("gyro_bias_radps") or [None] * 3
-    noise = section.get("gyro_noise_radps_per_sqrt_Hz") or [None] * 3
-    drift = (section.get("drift") or {}).get("gyro") or {}
-    return [
-        ("rate", _value(section, "rate_hz")),
-        ("gyro bias z", _value({"v": bias[2]}, "v", "rad/s")),
-        ("gyro noise z", _value({"v": noise[2]}, "v", "rad/s/√Hz")),
-        ("drift of the angle", _value(drift, "mean_degps")),
-    ]
-
-
-def _tune(section: Values, _: Values) -> list[Fact]:
-    candidates = section.get("candidates") or {}
-    chosen = candidates.get(str(section.get("recommended"))) or {}
-    return [
-        ("recommended", str(section.get("recommended", ""))),
-        ("Kp", _value(section, "Kp_per_s")),
-        ("Ki", _value(section, "Ki_per_s2")),
-        ("held-out error", _value(chosen, "rmse_deg")),
-        ("of 3/3", _value(candidates.get("3/3") or {}, "rmse_deg")),
-    ]
-
-
-def _lowpass(section: Values, _: Values) -> list[Fact]:
-    return [
-        ("filter", f"{section.get('family', '')}, order {section.get('order', '')}"),
-        ("cut-off", _value(section, "cutoff_hz")),
-        ("delay at rest", _value(section, "dc_delay_s", "ms", 1e3)),
-        ("rate", _value(section, "rate_hz")),
-    ]
-
-
-def _align(section: Values, _: Values) -> list[Fact]:
-    degree = math.degrees(1.0)
-    return [
-        ("time offset", _with_sigma(section, "time_offset_s", "ms", 1e3)),
-        ("rest angle", _with_sigma(section, "rest_angle_rad", "°", degree)),
-        ("gyro bias", _with_sigma(section, "gyro_bias_radps", "°/s", degree)),
-        ("tracker's jitter", _value(section, "jitter_px")),
-    ]
-
-
-def _identify(section: Values, _: Values) -> list[Fact]:
-    return [
-        ("stiffness, of the nominal", _with_sigma(section, "stiffness_scale", "")),
-        ("bending", _with_sigma(section, "bending_N_per_rad2", "N/rad²")),
-        ("pumps' lag", _with_sigma(section, "lag_s", "s")),
-        ("deflation", _with_sigma(section, "falling_N_per_s", "N/s")),
-    ]
-
-
-def _control(section: Values, _: Values) -> list[Fact]:
-    turn, move = section.get("orientation") or {}, section.get("position") or {}
-    return [
-        ("angle, Kp", _value(turn, "Kp_pwm_per_rad")),
-        ("angle, Ki", _value(turn, "Ki_pwm_per_rad_s")),
-        ("lengths, Kp", _value(move, "Kp_pwm_per_m")),
-        ("tick", _value(section, "tick_s", "ms", 1e3)),
-    ]
-
-
-def _firmware(_: Values, document: Values) -> list[Fact]:
-    return [
-        ("constants", _value(document, "constants", "")),
-        ("files", ", ".join(str(name) for name in document.get("files") or ())),
-    ]
-
-
-_FACTS: dict[str, Callable[[Values, Values], list[Fact]]] = {
-    "intrinsics": _camera,
-    "extrinsics": _plane,
-    "distortion": _lens,
-    "imu-static": _imu,
-    "imu-tune": _tune,
-    "lowpass": _lowpass,
-    "align": _align,
-    "identify": _identify,
-    "control": _control,
-    "firmware": _firmware,
-}
-
-
 def tables(document: Values) -> list[Table]:
     """A table for each list or mapping of records in a verb's document, in its order."""
     out: list[Table] = []
@@ -513,21 +377,6 @@ _STATUS = {
     "skipped": "no data",
     "missing": "not available",
 }
-_STAGE_OF = {
-    "camera": ("intrinsics", "Camera"),
-    "plane": ("extrinsics", "Plane of motion"),
-    "lens": ("distortion", "Lens"),
-    "imu": ("imu-static", "IMU at rest"),
-    "imu_intrinsics": ("imu-intrinsics", "IMU in poses"),
-    "orientation_filter": ("imu-tune", "Angle filter"),
-    "lowpass": ("lowpass", "Low-pass"),
-    "align": ("align", "Camera and IMU together"),
-    "actuator": ("identify", "Model of the actuator"),
-    "pump": ("identify", "Model of the actuator"),
-    "estimator": ("estimator", "Noise of the estimator"),
-    "controller": ("control", "Controllers"),
-}
-_FLASHED = ("camera", "plane", "imu", "orientation_filter", "lowpass", "align", "controller")
 
 
 @dataclass
@@ -553,14 +402,15 @@ def write_page(rig: Path, output: Path | None = None) -> Path:
 
 def page_text(rig: Path) -> str:
     """The whole page. Raises `BadInputError` for a rig.yaml that is not there or cannot be read."""
-    sections = Rig.load(rig).values()
+    whole = Rig.load(rig)
+    sections = whole.values()
     provenance = sections.pop("provenance")
     hidden = rig.parent / HIDDEN
     told = read_summary(hidden / "run.json") or _summary_of(sections)
     budget = _Budget(MOST_BYTES - _ROOM_BYTES)
     views = _views(hidden, _Budget(_VIEWS_BYTES))
     budget.left -= sum(len(view["image"]) for view in views)
-    stages = _stages(told, sections, hidden, budget)
+    stages = _stages(told, sections, whole, hidden, budget)
     return render(
         "page.html.j2",
         ("page.css",),
@@ -600,21 +450,26 @@ def _as_script(value: Any) -> str:
 def _summary_of(sections: Mapping[str, Any]) -> dict[str, Any]:
     """A summary for a rig.yaml that no run has made: each section is a stage."""
     jobs = []
-    for name, values in sections.items():
-        if name in _STAGE_OF and isinstance(values, dict):
-            stage, title = _STAGE_OF[name]
-            poor = values.get("verdict", "ok") in ("poor", "unidentifiable", "inconsistent")
+    steps = [(name, step) for step in STEPS for name in step.writes]
+    for name, step in steps:
+        values = sections.get(name)
+        if isinstance(values, dict):
+            poor = values.get("verdict", "ok") != "ok"
             reasons = values.get("reasons") or [f"its verdict is {values.get('verdict')}"]
-            job: dict[str, Any] = {
-                "name": stage,
-                "stage": stage,
-                "title": title,
-                "verb": "",
-                "log": None,
-                "inputs": [],
-            }
-            state = {"status": "poor" if poor else "ok", "reason": str(reasons[0]) if poor else ""}
-            jobs.append({**job, "writes": [name], "flashed": name in _FLASHED, **state})
+            jobs.append(
+                {
+                    "name": step.name,
+                    "stage": step.name,
+                    "title": step.title,
+                    "verb": "",
+                    "log": None,
+                    "inputs": [],
+                    "writes": [name],
+                    "flashed": step.flashed,
+                    "status": "poor" if poor else "ok",
+                    "reason": str(reasons[0]) if poor else "",
+                }
+            )
     return {"simulated": False, "pictures": 0, "logs": [], "left_out": [], "jobs": jobs, "alone": True}
 
 
@@ -644,7 +499,7 @@ def _views(hidden: Path, budget: _Budget) -> list[dict[str, Any]]:
 
 
 def _stages(
-    told: Mapping[str, Any], sections: Mapping[str, Any], hidden: Path, budget: _Budget
+    told: Mapping[str, Any], sections: Mapping[str, Any], rig: Rig, hidden: Path, budget: _Budget
 ) -> list[dict[str, Any]]:
     """A part of the page for each stage, with all its jobs; figures first of stages that run once."""
     grouped: dict[str, list[dict[str, Any]]] = {}
@@ -654,7 +509,7 @@ def _stages(
     for several in (False, True):
         for name, jobs in grouped.items():
             if (len(jobs) > 1) == several:
-                made[name] = _stage(name, jobs, sections, hidden, budget)
+                made[name] = _stage(name, jobs, sections, rig, hidden, budget)
     return [made[name] for name in grouped]
 
 
@@ -662,6 +517,7 @@ def _stage(
     name: str,
     jobs: list[dict[str, Any]],
     sections: Mapping[str, Any],
+    rig: Rig,
     hidden: Path,
     budget: _Budget,
 ) -> dict[str, Any]:
@@ -696,7 +552,7 @@ def _stage(
         "title": jobs[0]["title"],
         "status": _STATUS.get(status, status),
         "kind": status,
-        "facts": facts(name, section, document) if status in ("ok", "poor") else [],
+        "facts": _facts(jobs, rig, document) if status in ("ok", "poor") else [],
         "reasons": list(section.get("reasons") or ()),
         "remarks": [
             *(section.get("remarks") or ()),
@@ -708,6 +564,20 @@ def _stage(
         "several": len(parts) > 1,
         "flashed": bool(jobs[0]["flashed"]),
     }
+
+
+def _facts(jobs: list[dict[str, Any]], rig: Rig, document: Mapping[str, Any]) -> list[Fact]:
+    """The few values at the head of a stage: those of its sections, or what the firmware's verb counts."""
+    out = [
+        fact
+        for name in dict.fromkeys(name for job in jobs for name in job["writes"])
+        if (section := getattr(rig, name, None)) is not None
+        for fact in facts(section)
+    ]
+    if "constants" in document and "files" in document:
+        out.append(("constants", str(document["constants"])))
+        out.append(("files", ", ".join(str(name) for name in document["files"] or ())))
+    return out
 
 
 def _merged(sections: list[Any]) -> dict[str, Any]:

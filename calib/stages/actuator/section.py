@@ -54,13 +54,15 @@ class ActuatorParameters(Section):
     k1_N_per_m2: Number | None = quantity(None, label="spring k1", ge=-1e7, le=1e7)
     k2_N_per_m3: Number | None = quantity(None, label="spring k2", ge=-1e10, le=1e10)
     k3_N_per_m4: Number | None = quantity(None, label="spring k3", ge=-1e13, le=1e13)
-    stiffness_scale: Number | None = quantity(None, label="stiffness, of the nominal", ge=0.01, le=100.0)
+    stiffness_scale: Number | None = quantity(
+        None, label="stiffness, of the nominal", fact=True, ge=0.01, le=100.0
+    )
     damping_ratio: Number | None = quantity(None, label="damping ratio", ge=0.0, le=10.0)
     damping_scale_free_swing: Number | None = quantity(None, label="damping, hoses off", ge=0.0, le=1e3)
     damping_scale_pumps_connected: Number | None = quantity(
         None, label="damping, pumps connected", ge=0.0, le=1e3
     )
-    bending_N_per_rad2: Number | None = quantity(None, label="bending", ge=0.0, le=20.0)
+    bending_N_per_rad2: Number | None = quantity(None, label="bending", fact=True, ge=0.0, le=20.0)
     lambda1_per_s: Number | None = quantity(None, label="creep lambda1", ge=-1e4, le=1e4)
     lambda2_N_per_m: Number | None = quantity(None, label="creep lambda2", ge=-1e5, le=1e5)
     lambda3: Number | None = quantity(None, label="creep lambda3", ge=-1e3, le=1e3)
@@ -78,14 +80,14 @@ class PumpParameters(Section):
     strength : factors on the static forces of both pumps, which are never quite alike.
     """
 
-    lag_s: Number | None = quantity(None, label="lag", ge=1e-3, le=60.0)
+    lag_s: Number | None = quantity(None, label="lag", fact=True, ge=1e-3, le=60.0)
     delay_ticks: Annotated[int, Field(strict=True)] | None = quantity(None, label="delay", ge=0, le=1000)
     tick_s: Number | None = quantity(None, label="tick", ge=1e-3, le=0.1)
     supply_V: Number | None = quantity(None, label="supply", ge=1.0, le=100.0)
     dead_zone_V: Number | None = quantity(None, label="dead zone", ge=0.0, le=100.0)
     elongation_mm: Annotated[list[Millimetres], Field(min_length=4, max_length=4)] | None = None
     deflation: Literal["rate_limit", "orifice"] | None = None
-    falling_N_per_s: Number | None = quantity(None, label="deflation", ge=1e-3, le=1e3)
+    falling_N_per_s: Number | None = quantity(None, label="deflation", fact=True, ge=1e-3, le=1e3)
     laminar_s: Number | None = quantity(None, label="deflation, laminar", ge=1e-3, le=60.0)
     turbulent_s2_per_N: Number | None = quantity(None, label="deflation, turbulent", ge=0.0, le=1e3)
     strength: Annotated[list[Factor], Field(min_length=2, max_length=2)] | None = quantity(

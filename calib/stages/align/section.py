@@ -76,11 +76,11 @@ class Align(Result):
         jitter before pixels are rounded.
     """
 
-    time_offset_s: Seconds = quantity(label="time offset of pictures", show="ms")
+    time_offset_s: Seconds = quantity(label="time offset of pictures", show="ms", fact=True)
     mount_angle_rad: Angle = quantity(label="mount angle", show="deg")
-    rest_angle_rad: Angle = quantity(label="angle read at rest at phi = 0", show="deg")
+    rest_angle_rad: Angle = quantity(label="angle read at rest at phi = 0", show="deg", fact=True)
     gyro_scale: Share = quantity(label="gyro scale error", show="%")
-    gyro_bias_radps: Rate = quantity(label="gyro bias", show="deg/s")
+    gyro_bias_radps: Rate = quantity(label="gyro bias", show="deg/s", fact=True)
     accel_bias_mps2: Annotated[list[Bias], Field(min_length=2, max_length=2)] = quantity(label="accel bias")
     accel_scale: SharePair = quantity(label="accel scale error", show="%")
     imu_lever_m: Metres = quantity(label="IMU along the head", show="mm")
@@ -90,7 +90,7 @@ class Align(Result):
     sigma: dict[str, NotNegative | list[NotNegative] | None] = {}
     prior_sigma: dict[str, NotNegative] = {}
     covariance: CovarianceTable | None = None
-    jitter_px: NotNegative = quantity(label="tracker's jitter", digits=2)
+    jitter_px: NotNegative = quantity(label="tracker's jitter", digits=2, fact=True)
     outlier_share: NotNegative = quantity(label="outliers", show="%", digits=2)
     accel_noise_mps2: Annotated[list[NotNegative], Field(min_length=2, max_length=2)] = quantity(
         label="accel noise", digits=4

@@ -56,9 +56,9 @@ class Distortion(Section):
 class Camera(Result):
     """Intrinsics, what they are worth, and why."""
 
-    model: Model = quantity(label="model")
+    model: Model = quantity(label="model", fact=True)
     image_size_px: Annotated[list[Side], Field(min_length=2, max_length=2)] = quantity(label="picture")
-    fx_px: Focal = quantity(label="focal length fx", digits=3)
+    fx_px: Focal = quantity(label="focal length fx", digits=3, fact=True)
     fy_px: Focal = quantity(label="focal length fy", digits=3)
     skew_px: Pixels = quantity(0.0, label="skew", digits=3)
     cx_px: Pixels = quantity(label="centre cx", digits=3)
@@ -66,10 +66,10 @@ class Camera(Result):
     distortion: Distortion = quantity(Distortion(), label="distortion", digits=5)
     sigma: Sigma = {}
     covariance: CovarianceTable | None = None
-    rms_px: NotNegative | None = quantity(None, label="RMS", digits=4)
+    rms_px: NotNegative | None = quantity(None, label="RMS", digits=4, fact=True)
     mean_error_px: NotNegative | None = quantity(None, label="mean error", digits=4)
-    projection_sigma_px: Sigma = quantity({}, label="projection sigma", digits=3)
-    views: Count = quantity(0, label="views")
+    projection_sigma_px: Sigma = quantity({}, label="projection sigma", digits=3, fact=("max",))
+    views: Count = quantity(0, label="views", fact=True)
     points: Count = quantity(0, label="points")
     board: str | None = quantity(None, label="board")
     loss: str | None = None
@@ -149,8 +149,10 @@ class Plane(Result):
     A_inverse: Matrix3
     sigma: Sigma = {}
     rms_px: NotNegative = quantity(label="RMS", digits=4)
-    rms_mm: NotNegative = quantity(label="RMS on the plane", digits=4)
-    sigma_marker_mm: Sigma = quantity({}, label="sigma of a marker", digits=4)
+    rms_mm: NotNegative = quantity(label="RMS on the plane", digits=4, fact=True)
+    sigma_marker_mm: Sigma = quantity(
+        {}, label="sigma of a marker", digits=4, fact=("calibration_max", "quantisation_max")
+    )
     without_intrinsics: dict[str, Number] = quantity({}, label="homography alone", digits=4)
     pictures: Count = quantity(0, label="pictures")
     points: Count = quantity(0, label="points")
@@ -221,20 +223,20 @@ class Lens(Result):
     That a lens matters is no defect: `effect` says it, and the verdict stays ok.
     """
 
-    kind: str = quantity(label="kind")
-    max_px: Number = quantity(label="distortion, at most", digits=3)
+    kind: str = quantity(label="kind", fact=True)
+    max_px: Number = quantity(label="distortion, at most", digits=3, fact=True)
     mean_px: Number = quantity(label="distortion, mean", digits=3)
     region_px: Annotated[list[Number], Field(min_length=4, max_length=4)]
     region_max_px: Number = quantity(label="in the region, at most", digits=3)
     region_mean_px: Number = quantity(label="in the region, mean", digits=3)
     region_sigma_px: Number | None = quantity(None, label="sigma in the region", digits=3)
     monotonic: bool = quantity(label="one-to-one")
-    plane_max_mm: Number | None = quantity(None, label="neglected, on the plane at most", digits=3)
+    plane_max_mm: Number | None = quantity(None, label="neglected, on the plane at most", digits=3, fact=True)
     plane_mean_mm: Number | None = quantity(None, label="neglected, on the plane on average", digits=3)
     refitted_max_mm: Number | None = quantity(None, label="with the plane refitted, at most", digits=3)
     refitted_mean_mm: Number | None = quantity(None, label="with the plane refitted, on average", digits=3)
     inverse: InverseLens
-    effect: Literal["negligible", "matters"] = quantity(label="effect")
+    effect: Literal["negligible", "matters"] = quantity(label="effect", fact=True)
 
     @model_validator(mode="before")
     @classmethod

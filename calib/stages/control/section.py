@@ -114,12 +114,12 @@ class Controller(Result):
     lag_s, delay_ticks, falling_N_per_s : of the pumps, for `falling_share`.
     """
 
-    tick_s: Positive = quantity(label="tick", show="ms", digits=3)
+    tick_s: Positive = quantity(label="tick", show="ms", digits=3, fact=True)
     pwm_low: Pwm = quantity(0.0, label="least command")
     pwm_high: Pwm = quantity(255.0, label="greatest command")
     criterion: ControllerCriterion = quantity(label="demanded")
-    orientation: OrientationGains = quantity(label="orientation")
-    position: PositionGains = quantity(label="position")
+    orientation: OrientationGains = quantity(label="orientation", fact=("Kp_pwm_per_rad", "Ki_pwm_per_rad_s"))
+    position: PositionGains = quantity(label="position", fact=("Kp_pwm_per_m",))
     feedforward: StaticMap
     computed_torque: ComputedTorqueGains | None = None
     lag_s: Positive

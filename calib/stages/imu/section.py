@@ -70,9 +70,9 @@ class Imu(Result):
     drift : by the gyroscope (-gz integrated) and by the chip.
     """
 
-    rate_hz: Positive = quantity(label="rate", digits=3)
-    gyro_bias_radps: Rates = quantity(label="gyro bias")
-    gyro_noise_radps_per_sqrt_Hz: Sizes = quantity(label="gyro noise N")
+    rate_hz: Positive = quantity(label="rate", digits=3, fact=True)
+    gyro_bias_radps: Rates = quantity(label="gyro bias", fact=(2,))
+    gyro_noise_radps_per_sqrt_Hz: Sizes = quantity(label="gyro noise N", fact=(2,))
     gyro_instability_radps: Sizes = quantity(label="gyro instability B")
     gyro_walk_radps2_per_sqrt_Hz: Sizes = quantity(label="gyro random walk K")
     accel_mean_mps2: PerAxis = quantity(label="accel mean, with gravity")
@@ -261,10 +261,10 @@ class OrientationFilter(Result):
     rate_of_angle : "-gz", or "up vector" for a sensor that is not in plane.
     """
 
-    Kp_per_s: Positive = quantity(label="Kp", digits=4)
-    Ki_per_s2: NotNegative = quantity(label="Ki", digits=4)
+    Kp_per_s: Positive = quantity(label="Kp", digits=4, fact=True)
+    Ki_per_s2: NotNegative = quantity(label="Ki", digits=4, fact=True)
     rate_hz: Positive = quantity(label="rate", digits=3)
-    recommended: str = quantity(label="recommended")
+    recommended: str = quantity(label="recommended", fact=True)
     recommended_by: Literal["reference", "smoothed", "default"] = quantity(label="by")
     rate_of_angle: Literal["-gz", "up vector"] = quantity("-gz", label="rate of the angle by")
     sigma: dict[str, NotNegative | None] = {}

@@ -63,9 +63,9 @@ class LowPass(Result):
     wanted_jitter : what was asked for, in the log's unit.
     """
 
-    family: Literal["butterworth", "bessel", "critical"] = quantity(label="family")
-    order: Annotated[int, Field(ge=1, le=8, strict=True)] = quantity(label="order")
-    cutoff_hz: Positive = quantity(label="cut-off")
+    family: Literal["butterworth", "bessel", "critical"] = quantity(label="family", fact=True)
+    order: Annotated[int, Field(ge=1, le=8, strict=True)] = quantity(label="order", fact=True)
+    cutoff_hz: Positive = quantity(label="cut-off", fact=True)
     rate_hz: Positive = quantity(label="rate")
     sections: Annotated[list[LowPassSection], Field(min_length=1, max_length=4)] = quantity(
         label="coefficients"
@@ -73,7 +73,7 @@ class LowPass(Result):
     rounded_cutoff_hz: Positive = quantity(label="cut-off, rounded to float")
     pole_radius: Positive = quantity(label="poles within a radius of", digits=5)
     poles: list[list[Number]] = []
-    dc_delay_s: Positive = quantity(label="delay of slow motion", digits=4)
+    dc_delay_s: Positive = quantity(label="delay of slow motion", digits=4, fact=True)
     largest_delay_s: Positive = quantity(label="delay up to the cut-off, at most", digits=4)
     step: dict[str, Number] = quantity({}, label="step response:", digits=3)
     attenuation_db: dict[str, Number] = quantity({}, label="gain at", digits=1)
