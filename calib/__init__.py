@@ -40,6 +40,7 @@ __all__ = [
     "intrinsics",
     "lowpass",
     "plots",
+    "replay",
 ]
 
 

@@ -16,7 +16,6 @@ from calib.cli.doctor import doctor
 from calib.cli.fleet import fleet
 from calib.cli.identify import identify
 from calib.cli.record import record
-from calib.cli.replay import replay
 from calib.cli.report import report
 from calib.cli.run import run
 from calib.cli.simulate import simulate
@@ -57,7 +56,7 @@ app.command("distortion")(verb(stage("distortion")))
 app.command("lowpass")(verb(stage("lowpass")))
 app.add_typer(group("imu", "Understand an IMU: its bias, its noise, its drift."), name="imu")
 app.command("align")(telling(verb(stage("align"))))
-app.command("replay")(telling(replay))
+app.command("replay")(telling(verb(stage("replay"))))
 app.add_typer(identify, name="identify")
 app.add_typer(
     group("control", "Try controllers on the identified model before the hardware."), name="control"

@@ -36,8 +36,17 @@ def verb(stage: Stage) -> Callable[..., None]:
         options = options_of(
             stage.options, {name: values[name] for name in flags if values[name] is not None}
         )
-        files = Files(paths, values["rig"], values.get("output"), narrate, progress_bar)
-        _run(stage, files, options, values.get("figures"), values["as_json"])
+        figures = values.get("figures")
+        files = Files(
+            paths,
+            values["rig"],
+            values.get("output"),
+            narrate,
+            progress_bar,
+            figures=figures is not None,
+            keep=False,
+        )
+        _run(stage, files, options, figures, values["as_json"])
 
     command.__name__ = stage.name.split()[-1]
     command.__doc__ = stage.summary
@@ -101,7 +110,7 @@ def _run(stage: Stage, files: Files, options: Any, figures: Path | None, as_json
         emit(json.dumps(whole, indent=1, allow_nan=False, ensure_ascii=True) + "\n")
     else:
         blocks = [] if stage.words is None else list(stage.words(outcome))
-        for one in sections.values():
+        for one in stage.results(outcome):
             blocks += described(one)
         for line in as_text(blocks):
             say(line)

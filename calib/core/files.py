@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import stat
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,8 @@ from calib.core.errors import BadInputError
 
 _MAX_BYTES = 500_000_000
 _MAX_YAML_BYTES = 1_000_000
+_SAFE = frozenset("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789-_.")
+_LONGEST = 80
 
 
 def one_line(text: str) -> str:
@@ -24,6 +28,23 @@ def one_line(text: str) -> str:
 def shown(path: Path | str) -> str:
     """A path as an error message shows it, see `one_line`."""
     return one_line(str(path))
+
+
+def inside(path: Path, root: Path) -> bool:
+    """Whether a path, links followed, lies in a folder."""
+    return Path(os.path.realpath(path)).is_relative_to(Path(os.path.realpath(root)))
+
+
+def slug(name: str, taken: Iterable[str] = ()) -> str:
+    """A file's stem as a safe name: no separators, control characters or leading dots and dashes.
+
+    Where something had to be changed, or the name is taken, six digits of the name's hash tell it apart.
+    """
+    raw = name.encode("utf-8", "surrogateescape")
+    text = "".join(c if c in _SAFE else "_" for c in name).lstrip(".-")[:_LONGEST]
+    if text != name or not text or text.lower() in {other.lower() for other in taken}:
+        text = f"{text or 'log'}_{hashlib.sha256(raw).hexdigest()[:6]}"
+    return text
 
 
 def check_readable(path: Path) -> int:

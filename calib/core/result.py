@@ -9,8 +9,8 @@ along as `evidence` and are not written.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Annotated, Any, Self
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import yaml
 from pydantic import (
@@ -26,6 +26,9 @@ from pydantic import (
 from calib.core.errors import BadInputError
 from calib.core.files import sha256
 from calib.core.verdict import Verdict, Word
+
+if TYPE_CHECKING:
+    from calib.core.words import Block
 
 Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
@@ -165,6 +168,10 @@ class Result(Section):
 
     __hash__ = None  # type: ignore[assignment]  # its fields can change
 
+    def more_words(self) -> Sequence[Block]:
+        """Tables between the quantities and the verdict that no field makes by itself."""
+        return ()
+
     def _repr_html_(self) -> str:
         from calib.core.words import as_html, described
 
@@ -191,11 +198,16 @@ _UNWRITTEN = ("rejected", "remarks", "advice")
 """Lists that are not written where they are empty."""
 
 
-def section_json(section: BaseModel) -> dict[str, Any]:
-    """A section as plain values in the order of the file: unset parts left out, the verdict last."""
+def section_json(section: BaseModel, whole: bool = False) -> dict[str, Any]:
+    """A section as plain values in the order of the file, the verdict last.
+
+    Unset and empty parts are left out, unless the `whole` is asked for.
+    """
     values = section.model_dump(mode="json", by_alias=True)
     ordered = {key: values[key] for key in values if key not in _LAST}
     ordered |= {key: values[key] for key in _LAST if key in values}
+    if whole:
+        return ordered
     return {
         key: value
         for key, value in ordered.items()

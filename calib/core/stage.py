@@ -49,6 +49,8 @@ class Files:
     paths : what a person named.
     rig_path : the rig's file, for sentences.
     output : where -o leads, None without.
+    figures : whether what figures are drawn from is wanted. keep : whether arrays are wanted in memory that a
+        verb writes or leaves.
     narrate : takes a sentence for the person who watches. progress : a bar with a label.
     hashes : SHA-256 of what was read, by name, for the provenance.
     remarks : sentences on what was read, which are narrated once all of it is.
@@ -63,6 +65,8 @@ class Files:
     hashes: dict[str, str] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
     written: list[str] = field(default_factory=list)
+    figures: bool = True
+    keep: bool = True
 
     def log(self, path: Path, options: LogOptions) -> Log:
         """A log. Raises `BadInputError` as `calib.io.logs.read_log`."""
@@ -111,12 +115,13 @@ class Output:
     Attributes
     ----------
     words : help. flags, metavar : on the command line. default : written even where it is not asked for.
-    write : writes an outcome there; the files written.
+    write : writes an outcome there; the files written. None where the stage itself writes, as one does that
+        answers for more than fits into memory.
     folder : whether it is a folder, whose files --json names.
     """
 
     words: str
-    write: Callable[[Path, Any], Sequence[Path]]
+    write: Callable[[Path, Any], Sequence[Path]] | None
     flags: tuple[str, ...] = ("-o", "--output")
     metavar: str = ""
     default: Path | None = None
@@ -191,6 +196,10 @@ def _no_evidence(outcome: Any) -> dict[str, Any]:
     return {}
 
 
+def _parts(outcome: Any) -> tuple[Result | None, ...]:
+    return outcome if isinstance(outcome, tuple) else (outcome,)
+
+
 @dataclass(frozen=True)
 class Stage:
     """One step of a calibration.
@@ -200,12 +209,13 @@ class Stage:
     name : words of its verb. title : its heading.
     summary : help of the verb and docstring of the function.
     read : (files, rig, options) -> what `solve` takes. Raises `BadInputError`.
-    solve : mathematics; a `Result`, or a tuple of them in the order of `writes`.
+    solve : mathematics; a `Result`, a tuple of them in the order of `writes`, or a list of others.
     options : a dataclass of `option` fields.
     sources : help for the paths on the command line, "" for a stage without. several : whether there may
         be many. optional : whether there may be none.
-    writes : sections of rig.yaml. needs : those without which it cannot run. uses : those that it reads
-        where they are.
+    writes : sections of rig.yaml. parts : those of an outcome that is a list.
+    on_request : option without which nothing is written into rig.yaml.
+    needs : sections without which it cannot run. uses : those that it reads where they are.
     output : what the verb writes beside rig.yaml.
     document : what --json prints beside the sections. words : blocks in front of the sections' own.
     plots : figures by the names of their files, without drawing them.
@@ -223,6 +233,8 @@ class Stage:
     optional: bool = False
     metavar: str = ""
     writes: tuple[str, ...] = ()
+    parts: Callable[[Any], tuple[Result | None, ...]] = _parts
+    on_request: str = ""
     needs: tuple[str, ...] = ()
     uses: tuple[str, ...] = ()
     output: Output | None = None
@@ -265,15 +277,24 @@ class Stage:
         """The sections of rig.yaml that an outcome holds, by name."""
         if not self.writes:
             return {}
-        parts = outcome if isinstance(outcome, tuple) else (outcome,)
-        return {name: part for name, part in zip(self.writes, parts, strict=True) if part is not None}
+        parts = zip(self.writes, self.parts(outcome), strict=True)
+        return {name: part for name, part in parts if part is not None}
+
+    def results(self, outcome: Any) -> list[Result]:
+        """All results of an outcome, sections of rig.yaml last."""
+        others = outcome if isinstance(outcome, list) else []
+        return [*others, *self.sections(outcome).values()]
 
     def verdict(self, outcome: Any) -> Verdict:
         """All findings on an outcome."""
         from calib.core.verdict import Verdict
 
-        judged = self.sections(outcome).values() if self.writes else (outcome,)
+        judged = self.results(outcome) or [outcome]
         return Verdict.of(finding for one in judged for finding in one.verdict.findings)
+
+    def writes_rig(self, options: Any) -> bool:
+        """Whether sections of rig.yaml are written with these options."""
+        return bool(self.writes) and (not self.on_request or bool(getattr(options, self.on_request)))
 
 
 _VERBS = {"camera": "intrinsics", "plane": "extrinsics", "align": "align", "imu": "imu static"}

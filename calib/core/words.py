@@ -134,6 +134,7 @@ def described(result: BaseModel) -> list[Block]:
     """A result as tables and sentences: its quantities, its lists of parts, its verdict."""
     blocks = list(_parts(result))
     if isinstance(result, Result):
+        blocks += result.more_words()
         blocks += of_verdict(result.verdict)
     return blocks
 

@@ -214,6 +214,10 @@ class Watch:
         if not self._known and all(name in log.columns and name in self.names for name in IN_PLANE):
             self._known, self._mirrored = _mirrored(log)
 
+    def has(self, *names: str) -> bool:
+        """Whether each of these columns has a reading."""
+        return all(self._count.get(name) for name in names)
+
     def findings(self, stuck: bool = True) -> list[Finding]:
         """What is wrong about the sensors, with `stuck` those among them that never change."""
         out = []

@@ -7,21 +7,17 @@ must not bring files of this machine into a page that is passed on.
 from __future__ import annotations
 
 import csv
-import hashlib
-import os
 import stat
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from calib.core.errors import BadInputError
-from calib.core.files import file_sha256, one_line, shown
+from calib.core.files import file_sha256, inside, one_line, shown, slug
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm")
 _LOGS = (".csv", ".parquet", ".mcap", ".bag", ".db3")
 _HEAD_BYTES = 1 << 16
-_SAFE = frozenset("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789-_.")
-_LONGEST = 80
 
 
 @dataclass(frozen=True)
@@ -79,23 +75,6 @@ class Folder:
     def name_of(self, path: Path) -> str:
         """Name relative to the folder, the same wherever the folder lies."""
         return path.relative_to(self.root).as_posix()
-
-
-def inside(path: Path, root: Path) -> bool:
-    """Whether a path, links followed, lies in a folder."""
-    return Path(os.path.realpath(path)).is_relative_to(Path(os.path.realpath(root)))
-
-
-def slug(name: str, taken: Iterable[str] = ()) -> str:
-    """A file's stem as a safe name: no separators, control characters or leading dots and dashes.
-
-    Where something had to be changed, or the name is taken, six digits of the name's hash tell it apart.
-    """
-    raw = name.encode("utf-8", "surrogateescape")
-    text = "".join(c if c in _SAFE else "_" for c in name).lstrip(".-")[:_LONGEST]
-    if text != name or not text or text.lower() in {other.lower() for other in taken}:
-        text = f"{text or 'log'}_{hashlib.sha256(raw).hexdigest()[:6]}"
-    return text
 
 
 def read_folder(root: Path, follow_links: bool = False) -> Folder:

@@ -489,10 +489,10 @@ def _filtered(base: Base, known: Rig, run: Any, scratch: str) -> dict[str, float
         write_log(path, log_of(run, "log"))
         replayed = replay_log(path, known, _HERE, base.name, model=base.model)
     out = {name: _or_none(value) for name, value in replayed.rmse.items()}
-    for other, errors in replayed.others.items():
+    for other, errors in replayed.compared.items():
         out |= {f"{other}_{name}": _or_none(value) for name, value in errors.items()}
     for sensor, check in replayed.sensors.items():
-        out[f"nis_{sensor}"] = _or_none(check.get("nis"))
+        out[f"nis_{sensor}"] = _or_none(check.nis)
     return out
 
 

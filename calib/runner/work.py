@@ -58,10 +58,11 @@ def carry_out(
 
     Nothing is read before it is known that all can be written. Raises `BadInputError`.
     """
-    if made.writes:
+    if made.writes_rig(options):
         check_writable(rig_path)
-    if made.output is not None and files.output is not None:
-        (check_folder if made.output.folder else check_writable)(files.output)
+    output = made.output if files.output is not None else None
+    if output is not None and output.write is not None and files.output is not None:
+        (check_folder if output.folder else check_writable)(files.output)
     if figures is not None:
         check_folder(figures)
     rig = Rig.load(rig_path, missing_ok=True)
@@ -70,9 +71,9 @@ def carry_out(
     if sections:
         rig = rig.with_sections(sections)
         rig.save(rig_path)
-    if made.output is not None and files.output is not None:
-        files.written = [path.name for path in made.output.write(files.output, outcome)]
-        if files.written and made.output.folder:
+    if output is not None and output.write is not None and files.output is not None:
+        files.written = [path.name for path in output.write(files.output, outcome)]
+        if files.written and output.folder:
             files.narrate(f"{', '.join(files.written)} written to {shown(files.output)}")
         elif files.written:
             files.narrate(f"{shown(files.output)} written")
@@ -114,7 +115,11 @@ def perform(work: Work) -> int:
         return _typed(work)
     messages: list[str] = []
     files = Files(
-        work.paths, output=work.folder / work.output if work.output else None, narrate=messages.append
+        work.paths,
+        output=work.folder / work.output if work.output else None,
+        narrate=messages.append,
+        figures=work.figures,
+        keep=False,
     )
     made = stage(work.verb)
     try:
@@ -143,7 +148,9 @@ def perform(work: Work) -> int:
         code = EXIT_INTERNAL
     places = (f"{work.root}{os.sep}", f"{work.folder}{os.sep}")
     with contextlib.suppress(OSError):
-        write_atomically(work.folder / MESSAGES, "".join(f"{_nowhere(line, places)}\n" for line in messages))
+        # Where a work puts what it writes is nobody's concern.
+        kept = [one for one in messages if str(work.folder) not in one or one.startswith("calib: ")]
+        write_atomically(work.folder / MESSAGES, "".join(f"{_nowhere(line, places)}\n" for line in kept))
     return code
 
 

@@ -30,6 +30,7 @@ STAGES = {
     "imu tune": "calib.stages.imu.stage",
     "imu drift": "calib.stages.imu.stage",
     "align": "calib.stages.align.stage",
+    "replay": "calib.stages.estimator.stage",
     "control run": "calib.stages.control.stage",
     "control check": "calib.stages.control.stage",
     "control tune": "calib.stages.control.stage",
@@ -60,16 +61,26 @@ def expanded(sources: Any) -> tuple[Path, ...]:
 
 
 def function(name: str) -> Callable[..., Any]:
-    """The Python function of a stage: `calib.NAME(sources, rig, option=value)` returns its result."""
+    """The Python function of a stage: `calib.NAME(sources, rig, option=value)` returns its result.
+
+    Of a stage that answers for each file by itself it is a list, or the one result of one file.
+    """
     made = stage(name)
+    streams = made.output is not None and made.output.write is None
 
     def call(
         sources: str | Path | Sequence[str | Path] | None = None, rig: Rig | None = None, **options: Any
     ) -> Any:
         from calib.core.rig import Rig
 
-        files = Files(expanded(sources), narrate=logging.getLogger("calib").info)
-        return made.run(files, Rig() if rig is None else rig, options_of(made.options, options))
+        output = options.pop("output", None) if streams else None
+        files = Files(
+            expanded(sources),
+            output=None if output is None else Path(output),
+            narrate=logging.getLogger("calib").info,
+        )
+        outcome = made.run(files, Rig() if rig is None else rig, options_of(made.options, options))
+        return outcome[0] if isinstance(outcome, list) and len(outcome) == 1 else outcome
 
     def call_without_sources(rig: Rig | None = None, **options: Any) -> Any:
         return call(None, rig, **options)
@@ -83,6 +94,8 @@ def function(name: str) -> Callable[..., Any]:
             for one in fields(made.options)
         ),
     ]
+    if streams:
+        parameters.insert(1, kind("output", kind.KEYWORD_ONLY, default=None))
     if made.sources:
         parameters.insert(0, kind("sources", kind.POSITIONAL_OR_KEYWORD, default=kind.empty))
     options = "\n".join(f"    {one.name} : {one.metadata['words']}" for one in fields(made.options))

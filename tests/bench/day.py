@@ -36,7 +36,7 @@ from calib.io.states import STATES, states_writer
 from calib.stages.estimator.consistency import Tally
 from calib.stages.estimator.kinematic import OUT
 from calib.stages.estimator.read import rows_of, truth_of
-from calib.stages.estimator.replay import drive_for, estimator_of, prepared
+from calib.stages.estimator.replay import drive_for, estimator_of, opened
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.simulate import log_of
@@ -135,9 +135,9 @@ def _stages(
     path: Path, rig_path: Path, ending: str, model: str, folder: Path, count: int, show: Show
 ) -> None:
     rig = Rig.load(rig_path)
-    setup, found, stream, _ = prepared(path, rig, rig_path)
-    first = next(stream)
-    estimate = estimator_of(setup, drive_for(model, first, found, rig, path, rig_path), model)
+    log = opened(path, rig, rig_path)
+    setup, found = log.setup, log.periods
+    estimate = estimator_of(setup, drive_for(log, rig, model), model)
     blocks = list(islice(iter_log(path), count))
     n = sum(len(block) for block in blocks)
     show(f"read {path.suffix}", n, lambda: list(islice(iter_log(path), count)))

@@ -39,7 +39,8 @@ from estimatorlogs import truth_of_sensors
 from calib.core.rig import Rig
 from calib.io.logs import log_text
 from calib.stages.align.solve import rest_angle
-from calib.stages.estimator.replay import Replayed, replay_log
+from calib.stages.estimator.replay import replay_log
+from calib.stages.estimator.section import Replayed
 from calib.twin.folder import write_rig_folder
 from calib.twin.pictures import CAMERA, PLANE
 from calib.twin.rig import SimulatedRig
@@ -61,9 +62,9 @@ WAYS: dict[str, tuple[str, dict[str, Any]]] = {
     "thesis": ("rig.yaml", {"estimator": "baseline"}),
     "kinematic": ("rig.yaml", {"model": "kinematic"}),
     "driven": ("rig.yaml", {}),
-    "smoothed": ("rig.yaml", {"smooth": True}),
+    "smoothed": ("rig.yaml", {"smoothed": True}),
     "driven, identified": ("identified.yaml", {}),
-    "smoothed, identified": ("identified.yaml", {"smooth": True}),
+    "smoothed, identified": ("identified.yaml", {"smoothed": True}),
 }
 """The rig's file, and how a log is replayed."""
 TARGET = {
@@ -155,8 +156,8 @@ def _nis(found: list[Replayed]) -> str:
     cells = []
     for name in ("camera", "accel", "gyro"):
         checks = [one.sensors[name] for one in found if name in one.sensors]
-        inside = np.mean([c["low"] <= c["nis"] <= c["high"] for c in checks])
-        cells.append(f"{np.mean([c['nis'] / c['degrees'] for c in checks]):.2f} {100.0 * inside:3.0f}%")
+        inside = np.mean([c.low <= c.nis <= c.high for c in checks])
+        cells.append(f"{np.mean([c.nis / c.degrees for c in checks]):.2f} {100.0 * inside:3.0f}%")
     return "  ".join(cells)
 
 

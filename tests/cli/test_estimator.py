@@ -112,14 +112,17 @@ def _backwards(t: FloatArray) -> FloatArray:
         (lambda log: (log, {"ax_mps2": None, "ay_mps2": None, "gz_radps": None}), "has no gyroscope"),
         (lambda log: (_times(log, _backwards), {}), "t_s goes back"),
         (lambda log: (_first(log, 4), {}), "has no stretch of 1 s"),
-        (lambda log: (log, {"gz_radps": 57.2958 * log.columns["gz_radps"]}), "in deg/s, expected rad/s"),
+        (lambda log: (log, {"gz_radps": 57.2958 * log.columns["gz_radps"]}), "the gyroscope reaches 584"),
         (lambda log: (log, {"gz_radps": -log.columns["gz_radps"]}), "the other way round"),
         (
             lambda log: (log, {"ax_mps2": log.columns["ay_mps2"], "ay_mps2": log.columns["ax_mps2"]}),
             "swapped or one has the wrong sign",
         ),
         (lambda log: (log, {"ay_mps2": -log.columns["ay_mps2"]}), "swapped or one has the wrong sign"),
-        (lambda log: (log, {"gz_radps": 0.0 * log.columns["gz_radps"]}), "gz_radps is always"),
+        (
+            lambda log: (log, {"gz_radps": 0.0 * log.columns["gz_radps"]}),
+            "gz_radps never changes, it is stuck at 0",
+        ),
         (lambda log: (log, {"u_px": log.columns["u_px"] + 4000.0}), "has no picture of the marker"),
     ],
 )

@@ -20,6 +20,7 @@ import calib.stages.actuator
 import calib.stages.estimator
 from calib.core.arrays import FloatArray
 from calib.core.rig import Rig
+from calib.io.signals import Watch
 from calib.stages.actuator.kinematics import forward as forward_of_sensors
 from calib.stages.estimator import reference, sensors, smoother
 from calib.stages.estimator.baseline import Baseline, BaselineSetup
@@ -46,9 +47,10 @@ from calib.stages.estimator.kinematic import (
     starting_state,
 )
 from calib.stages.estimator.noise import jitter_px, log_likelihood, tune
-from calib.stages.estimator.read import Periods, setup_from_rig
+from calib.stages.estimator.read import READINGS, Periods, setup_from_rig
 from calib.stages.estimator.reference import camera_terms, imu_terms
-from calib.stages.estimator.replay import judged
+from calib.stages.estimator.replay import consistent, sampled
+from calib.stages.estimator.section import SensorCheck
 from calib.stages.estimator.sensors import SENSOR, SIZE, truncated, update_terms
 from calib.stages.estimator.smoother import Events, banked, events_of, forward
 from calib.twin.rig import SimulatedRig, nominal_view, workspace_homography
@@ -523,7 +525,7 @@ def test_coloured_innovations_are_seen() -> None:
     tally = Tally(R)
     tally.add(out)
     check = tally.check("camera")
-    assert check is not None and check.correlation > 5.0 * check.bound
+    assert check is not None and check.correlation > 5.0 * check.correlation_bound
     assert tally.rmse() == {}
 
 
@@ -678,8 +680,31 @@ GOOD = {"degrees": 2, "readings": 900, "gated": 2, "nis": 2.1, "inside": 0.95, "
     ],
 )
 def test_innovations_that_contradict_their_covariance_are_poor(change: dict[str, float], words: str) -> None:
-    reasons, _ = judged({"camera": {**GOOD, **change}}, {}, 1000)
-    assert len(reasons) == 1 and words in reasons[0]
+    found = list(consistent({"camera": SensorCheck(**{**GOOD, **change})}, {}, 1000))
+    assert [one.severity for one in found] == ["poor"] and words in found[0].text
+
+
+def test_sensors_that_are_gated_out_missing_or_stuck_are_poor() -> None:
+    gated = SensorCheck(degrees=2, readings=0, gated=2000)
+    assert [(one.severity, one.text) for one in consistent({"accel": gated}, {}, 1000)] == [
+        ("poor", "all 2000 readings of the accel were gated out")
+    ]
+    log = simulated("ellipse")[1]
+    for names, value, words in (
+        ((), 0.0, ""),
+        (READINGS[:2], np.nan, "the log has no pictures"),
+        (READINGS[2:], np.nan, "the log has no IMU samples"),
+        (("gz_radps",), np.nan, "the log has no gyroscope (gz_radps)"),
+        (("ax_mps2",), np.nan, "the log has no accelerometer (ax_mps2, ay_mps2)"),
+        (("ay_mps2",), 0.25, "ay_mps2 never changes, it is stuck at 0.25"),
+        (("u_px", "v_px"), 80.0, ""),
+    ):
+        columns = dict(log.columns) | {name: np.full(len(log), value) for name in names}
+        watch = Watch(READINGS)
+        watch.add(replace(log, columns=columns))
+        found = list(sampled(watch))
+        assert [one.text for one in found] == ([words] if words else [])
+        assert all(one.severity in ("poor", "inconsistent") for one in found)
 
 
 ALIGN = {

@@ -113,20 +113,20 @@ def _cleaned(track: Track) -> tuple[Track, int]:
 def estimated_start(path: Path, rig: Rig, rig_path: Path, begin_s: float) -> Start | None:
     """Angle, length and their rates at a time of a log [s] by the estimator; None where it lacks a sensor.
 
-    Raises `BadInputError` as `calib.stages.estimator.replay.prepared`.
+    Raises `BadInputError` as `calib.stages.estimator.replay.opened`.
     """
-    from calib.stages.estimator.replay import first_rows, prepared
+    from calib.stages.estimator.replay import opened, smoothed_rows
 
-    setup, found, stream, _ = prepared(path, rig, rig_path)
-    if not (found.camera and found.imu):
+    log = opened(path, rig, rig_path)
+    if not log.both:
         return None
-    rows = first_rows(setup, found, stream, begin_s + _SECONDS)
+    rows = smoothed_rows(log, begin_s + _SECONDS)
     t, q, dq = rows[:, 0], rows[:, 1:3], rows[:, 3:5]
     known = np.isfinite(rows[:, :5]).all(axis=1)
     if not known.any():
         return None
     k = int(np.argmin(np.where(known, np.abs(t - begin_s), np.inf)))
-    half = 0.5 / setup.bellows_radius_m
+    half = 0.5 / log.setup.bellows_radius_m
     # From the row's own time to the beginning.
     q1, q2 = (q[k] + (begin_s - t[k]) * dq[k]).tolist()
     dq1, dq2 = dq[k].tolist()

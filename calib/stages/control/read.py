@@ -178,13 +178,12 @@ def is_recorded(path: Path) -> bool:
 def recorded_reference(path: Path, rig: Rig, rig_path: Path, model: Model) -> Reference:
     """The lengths that a log of camera and IMU shows, at the model's ticks.
 
-    Raises `BadInputError` as `calib.stages.estimator.replay.prepared`, and where the estimator knows too
+    Raises `BadInputError` as `calib.stages.estimator.replay.opened`, and where the estimator knows too
     little.
     """
-    from calib.stages.estimator.replay import first_rows, prepared
+    from calib.stages.estimator.replay import opened, smoothed_rows
 
-    setup, found, stream, _ = prepared(path, rig, rig_path)
-    rows = first_rows(setup, found, stream, math.inf)
+    rows = smoothed_rows(opened(path, rig, rig_path), math.inf)
     rows = rows[np.isfinite(rows[:, :3]).all(axis=1)]
     rows = rows[np.concatenate([[True], np.diff(rows[:, 0]) > 0.0])] if len(rows) else rows
     if len(rows) < _CONTROLREFERENCE_FEWEST:

@@ -16,7 +16,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from calib.core.arrays import FloatArray
+from calib.core.result import finite_or_none
 from calib.stages.estimator.kinematic import OUT
+from calib.stages.estimator.section import SensorCheck
 
 SENSORS = {"camera": 2, "accel": 2, "gyro": 1}
 """Readings of each sensor at a time."""
@@ -54,28 +56,6 @@ def nees(out: FloatArray, q_m: FloatArray, phi_rad: FloatArray, bellows_radius_m
     e_p = out[:, 5] - phi_rad
     determinant = np.maximum(var_l * sp**2 - cross**2, 1e-12 * var_l * sp**2)
     return np.asarray((sp**2 * e_l**2 - 2.0 * cross * e_l * e_p + var_l * e_p**2) / determinant)
-
-
-@dataclass(frozen=True)
-class SensorCheck:
-    """Verdict on one sensor's innovations.
-
-    Attributes
-    ----------
-    count, gated : readings used and gated.
-    nis, low, high : mean, and the 95 % band of white innovations.
-    inside : share of readings within the 95 % band of a single one.
-    correlation, bound : with the reading before, the largest of its axes, and its 95 % bound.
-    """
-
-    count: int
-    gated: int
-    nis: float
-    low: float
-    high: float
-    inside: float
-    correlation: float
-    bound: float
 
 
 @dataclass
@@ -164,15 +144,23 @@ class Tally:
         }
 
     def check(self, name: str) -> SensorCheck | None:
-        """What a sensor's innovations say, None where it was never used after the first two seconds."""
-        sums = self.sensors[name]
-        count = int(sums[0])
+        """What a sensor's innovations say, None where it had no reading after the first two seconds."""
+        sums, degrees = self.sensors[name], SENSORS[name]
+        count, gated = int(sums[0]), int(sums[1])
         if count == 0:
-            return None
-        low, high = chi_square_band(SENSORS[name], count)
-        axes = range(SENSORS[name])
-        correlations = [sums[4 + 2 * k] / sums[5 + 2 * k] if sums[5 + 2 * k] > 0.0 else 0.0 for k in axes]
+            return SensorCheck(degrees=degrees, readings=0, gated=gated) if gated else None
+        low, high = chi_square_band(degrees, count)
+        correlations = [
+            sums[4 + 2 * k] / sums[5 + 2 * k] if sums[5 + 2 * k] > 0.0 else 0.0 for k in range(degrees)
+        ]
         return SensorCheck(
-            count, int(sums[1]), float(sums[2] / count), low, high, float(sums[3] / count),
-            float(max(correlations, key=abs)), correlation_band(count),
-        )  # fmt: skip
+            degrees=degrees,
+            readings=count,
+            gated=gated,
+            nis=finite_or_none(sums[2] / count),
+            low=low,
+            high=high,
+            inside=float(sums[3] / count),
+            correlation=finite_or_none(max(correlations, key=abs)),
+            correlation_bound=correlation_band(count),
+        )

@@ -48,7 +48,7 @@ class Level:
     name : for what it is made.
     accel_phi_radps2, accel_length_mps2 : standard deviation of the acceleration.
     memory_s : T_a of both. friction_s : T_v of the length; that of phi is infinite.
-    walk_phi, walk_length : density of w_p [rad/sqrt(s), m/sqrt(s)].
+    walk_phi_rad_per_sqrt_s, walk_length_m_per_sqrt_s : density of w_p.
     """
 
     name: str
@@ -56,15 +56,15 @@ class Level:
     accel_length_mps2: float
     memory_s: float
     friction_s: float
-    walk_phi: float
-    walk_length: float
+    walk_phi_rad_per_sqrt_s: float
+    walk_length_m_per_sqrt_s: float
 
     def numbers(self) -> list[float]:
         """(1/T_a, 1/T_v, density of w_a, of w_p) of phi and then of the length."""
         b, c = 1.0 / self.friction_s, 1.0 / self.memory_s
         return [
-            c, 0.0, 2.0 * self.accel_phi_radps2**2 * c, self.walk_phi**2,
-            c, b, 2.0 * self.accel_length_mps2**2 * c, self.walk_length**2,
+            c, 0.0, 2.0 * self.accel_phi_radps2**2 * c, self.walk_phi_rad_per_sqrt_s**2,
+            c, b, 2.0 * self.accel_length_mps2**2 * c, self.walk_length_m_per_sqrt_s**2,
         ]  # fmt: skip
 
 

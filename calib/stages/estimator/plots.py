@@ -26,7 +26,7 @@ from calib.core.plot import (
 from calib.stages.estimator.kinematic import OUT
 
 if TYPE_CHECKING:
-    from calib.stages.estimator.replay import Replayed
+    from calib.stages.estimator.section import Replayed
 
 _BASELINE = len(OUT)
 _TRUTH = len(OUT) + 3
@@ -51,9 +51,9 @@ def plots(results: Sequence[Replayed]) -> dict[str, Figure]:
     for k, (result, stem) in enumerate(zip(results, stems, strict=True)):
         name = f"replay_{stem}_{k + 1}" if stems.count(stem) > 1 else f"replay_{stem}"
         figures[f"{name}_states"] = _states(result)
-        if np.isfinite(result.trace[:, _INNOVATIONS]).any():
+        if np.isfinite(result.evidence.trace[:, _INNOVATIONS]).any():
             figures[f"{name}_innovations"] = _innovations(result)
-        if np.isfinite(result.trace[:, _TRUTH]).any():
+        if np.isfinite(result.evidence.trace[:, _TRUTH]).any():
             figures[f"{name}_errors"] = _errors(result)
     return figures
 
@@ -64,11 +64,11 @@ def _named(trace: FloatArray, name: str) -> FloatArray:
 
 def _figure(title: str, note: str, result: Replayed, panels: Sequence[Plot]) -> Figure:
     """Panels over the same time, its name under the last one."""
-    t = _named(result.trace, "t_s")
+    t = _named(result.evidence.trace, "t_s")
     shared = [replace(one, x_limits=(float(t[0]), float(t[-1]))) for one in panels]
     shared[-1] = replace(shared[-1], x="time (s)")
     title = f"{title}: {short(result.source, 78)}"
-    return Figure(title, note, shared, 6.6, result.verdict, coarse=True)
+    return Figure(title, note, shared, 6.6, result.verdict.word, coarse=True)
 
 
 def _line(t: FloatArray, values: FloatArray, label: str, colour: str, size: float = 0.9) -> list[Mark]:
@@ -78,7 +78,7 @@ def _line(t: FloatArray, values: FloatArray, label: str, colour: str, size: floa
 
 def _states(result: Replayed) -> Figure:
     """Lengths and angle over time with their bands, the baseline and the truth where it is known."""
-    trace, t = result.trace, _named(result.trace, "t_s")
+    trace, t = result.evidence.trace, _named(result.evidence.trace, "t_s")
     note = (
         f"Blue: estimate with its 2{SIGMA} band. Orange: the source's pipeline with its 1 Hz low-pass. "
         "Black: truth, where the log knows it. Red marks: pictures that were gated out."
@@ -109,7 +109,7 @@ def _states(result: Replayed) -> Figure:
 
 def _innovations(result: Replayed) -> Figure:
     """Innovations of each sensor over their standard deviation, gated ones marked."""
-    trace, t = result.trace, _named(result.trace, "t_s")
+    trace, t = result.evidence.trace, _named(result.evidence.trace, "t_s")
     note = (
         f"An honest covariance keeps 95 % within the grey band of 2{SIGMA}, without a pattern. "
         "Red: gated out and not used; marks at the edge lie beyond it."
@@ -130,7 +130,7 @@ def _innovations(result: Replayed) -> Figure:
 
 def _errors(result: Replayed) -> Figure:
     """Errors against the truth with the 2-sigma band, the baseline's beside them."""
-    trace, t = result.trace, _named(result.trace, "t_s")
+    trace, t = result.evidence.trace, _named(result.evidence.trace, "t_s")
     note = f"Grey: 2{SIGMA} of the estimate. Blue: its error. Orange: the error of the source's pipeline."
     panels = []
     for k, (y, name, sigma, factor) in enumerate(_QUANTITIES):

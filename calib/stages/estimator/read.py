@@ -29,7 +29,8 @@ from calib.stages.estimator.sensors import SENSOR, sensor_values, view_coefficie
 #
 # Logs are read block by block; nothing grows with their length.
 
-_READINGS = ("u_px", "v_px", "ax_mps2", "ay_mps2", "gz_radps")
+READINGS = ("u_px", "v_px", "ax_mps2", "ay_mps2", "gz_radps")
+"""Columns of `kinematic.Rows.readings`."""
 _TRUTH = ("true_q1_m", "true_q2_m", "true_phi_rad")
 
 DEFAULTS: dict[str, tuple[float, float]] = {
@@ -91,7 +92,7 @@ def _kinds(log: Log, readings: FloatArray, ticks: bool) -> tuple[BoolArray, Bool
 
 
 def _readings(log: Log) -> FloatArray:
-    values = np.stack([_column(log, name) for name in _READINGS], axis=1)
+    values = np.stack([_column(log, name) for name in READINGS], axis=1)
     return np.where(np.isfinite(values), values, np.nan)
 
 
@@ -134,14 +135,14 @@ def truth_of(log: Log) -> FloatArray | None:
     return np.stack([log.columns[name] for name in _TRUTH], axis=1)
 
 
-def blocks(path: Path, topics: Path | None = None) -> Iterator[Log]:
-    """Blocks with rows of a log; `topics` as for `iter_log`.
+def blocks(path: Path, options: LogOptions) -> Iterator[Log]:
+    """Blocks with rows of a log; `options` as for `iter_log`.
 
     Raises `BadInputError` for one without rows, camera and IMU.
     """
     rows, known = 0, False
-    for block in iter_log(path, LogOptions(topics=topics)):
-        if not known and not any(name in block.columns for name in _READINGS):
+    for block in iter_log(path, options):
+        if not known and not any(name in block.columns for name in READINGS):
             raise BadInputError(
                 f"{shown(path)}: has neither camera nor IMU, expected columns as u_px, v_px or gz_radps"
             )
@@ -219,12 +220,7 @@ def _process(rig: Rig) -> Kinematic:
     tuned = rig.estimator
     if tuned is None or not tuned.levels:
         return Kinematic(LEVELS)
-    levels = []
-    for level in tuned.levels:
-        walks = level.walk_phi_rad_per_sqrt_s, level.walk_length_m_per_sqrt_s
-        accelerations = level.accel_phi_radps2, level.accel_length_mps2
-        levels.append(Level(level.name, *accelerations, level.memory_s, level.friction_s, *walks))
-    return Kinematic(tuple(levels))
+    return Kinematic(tuple(Level(**level.model_dump()) for level in tuned.levels))
 
 
 _SHAKEN = 1.6

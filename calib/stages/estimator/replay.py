@@ -1,19 +1,22 @@
-"""Logs through an estimator: states written, errors and consistency summed, a verdict."""
+"""One log through an estimator, block by block: states written, errors and consistency summed, a verdict.
+
+A log of a day has millions of rows, so nothing here grows with its length but what a caller asks to keep.
+Smoothing alone needs the whole log in memory.
+"""
 
 from __future__ import annotations
 
 import contextlib
-import math
-import queue
 import subprocess
 import sys
-import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -21,15 +24,27 @@ from calib.core.arrays import FloatArray
 from calib.core.compilation import on_compiling
 from calib.core.errors import BadInputError
 from calib.core.files import shown
+from calib.core.result import finite_or_none, judged
 from calib.core.rig import Rig
+from calib.core.stage import NOTHING_STATED, LogOptions, ProgressCall
+from calib.core.verdict import Finding, Verdict
 from calib.io.logs import Log, passed_over
-from calib.io.states import STATES, StatesFile, states_writer
+from calib.io.signals import Watch
+from calib.io.states import STATES, states_writer
 from calib.stages.estimator.baseline import BASELINE, Baseline
 from calib.stages.estimator.consistency import SENSORS, Tally
-from calib.stages.estimator.driven import Drive
+from calib.stages.estimator.driven import (
+    Drive,
+    DrivenFilter,
+    Handover,
+    blended,
+    smooth_both,
+    smooth_driven,
+)
 from calib.stages.estimator.kinematic import FLAGS, NOISE, OUT, Filter, Rows, Setup, Start
 from calib.stages.estimator.noise import jitter_px
 from calib.stages.estimator.read import (
+    READINGS,
     Periods,
     baseline_setup,
     blocks,
@@ -42,149 +57,102 @@ from calib.stages.estimator.read import (
     setup_from_rig,
     truth_of,
 )
+from calib.stages.estimator.section import Errors, Held, Replayed, SensorCheck
 from calib.stages.estimator.sensors import SENSOR
 from calib.stages.estimator.smoother import smooth
 
-# ----------------------------------------------------------------------
-# Stages of a stream in threads of their own: what is read ahead, and what is left for another to finish.
-#
-# Compiled loops and file operations let go of the interpreter's lock, so reading, filtering and writing a
-# long log keep two cores busy. Items come and go in their order, a few at a time, so neither the results
-# nor
-# the memory depend on the threads. An error of one stage ends the others and is raised to the caller.
-
 T = TypeVar("T")
 
+# ----------------------------------------------------------------------
+# Reading ahead and writing behind, each in a thread of its own.
+#
+# Compiled loops and file operations let go of the interpreter's lock, so reading, filtering and writing a
+# long log keep two cores busy. Items come and go in their order, a few at a time, so neither the results nor
+# the memory depend on the threads.
+
 _DEPTH = 4
-_WAIT_S = 0.1
-_END = object()
-
-
-def _put(items: queue.Queue[Any], item: Any, over: threading.Event) -> bool:
-    """Add an item; False when the other side has ended."""
-    while not over.is_set():
-        with contextlib.suppress(queue.Full):
-            items.put(item, timeout=_WAIT_S)
-            return True
-    return False
 
 
 def ahead(source: Iterable[T], depth: int = _DEPTH) -> Iterator[T]:
     """The items of a source that another thread goes through, at most `depth` of them ahead."""
-    items: queue.Queue[Any] = queue.Queue(depth)
-    over = threading.Event()
-    failed: list[BaseException] = []
-
-    def produce() -> None:
+    iterator = iter(source)
+    with ThreadPoolExecutor(1) as pool:
+        waiting = deque(pool.submit(next, iterator, None) for _ in range(depth))
         try:
-            for item in source:
-                if not _put(items, item, over):
-                    return
-        except BaseException as error:  # it is raised again where the items are taken
-            failed.append(error)
-        _put(items, _END, over)
-
-    thread = threading.Thread(target=produce, daemon=True)
-    thread.start()
-    try:
-        while (item := items.get()) is not _END:
-            yield item
-        if failed:
-            raise failed[0]
-    finally:
-        over.set()
-        thread.join()
+            while (item := waiting.popleft().result()) is not None:
+                waiting.append(pool.submit(next, iterator, None))
+                yield item
+        finally:
+            for one in waiting:
+                one.cancel()
 
 
 @contextmanager
 def behind(finish: Callable[[T], None], depth: int = _DEPTH) -> Iterator[Callable[[T], None]]:
     """A function that hands items to another thread, which finishes them in their order.
 
-    All are finished when the block ends. An error in `finish` is raised by the next item or at the end.
+    All are finished when the block ends. An error in `finish` is raised by a later item or at the end.
     """
-    items: queue.Queue[Any] = queue.Queue(depth)
-    over = threading.Event()
-    failed: list[BaseException] = []
+    waiting: deque[Future[None]] = deque()
+    with ThreadPoolExecutor(1) as pool:
 
-    def consume() -> None:
-        try:
-            while (item := items.get()) is not _END:
-                finish(item)
-        except BaseException as error:  # it is raised again where the items come from
-            failed.append(error)
-            over.set()
+        def hand(item: T) -> None:
+            if len(waiting) >= depth:
+                waiting.popleft().result()
+            waiting.append(pool.submit(finish, item))
 
-    thread = threading.Thread(target=consume, daemon=True)
-    thread.start()
-
-    def hand(item: T) -> None:
-        if not _put(items, item, over):
-            raise failed[0]
-
-    try:
         yield hand
-    finally:
-        # After an error, too, the thread ends before what it writes to is closed.
-        _put(items, _END, over)
-        thread.join()
-    if failed:
-        raise failed[0]
+        for one in waiting:
+            one.result()
 
 
 # ----------------------------------------------------------------------
-# Compiling the estimator's functions at their first use, half of them in a process of its own.
-#
-# Numba holds a lock while it compiles, so threads gain nothing. What another process has compiled is found
-# in
-# numba's cache on disk. Where there is none, or no second processor, everything is compiled here.
+# Compiling at the first use, half of it in a process of its own: numba holds a lock while it compiles, so
+# threads gain nothing. What another process has compiled is in numba's cache on disk.
 
 _LONGEST_S = 600.0
 _COMMAND = (
-    "import sys; sys.path[:] = {path!r}; from calib.stages.estimator.replay import serve; serve({smoothed})"
+    "import sys; sys.path[:] = {path!r}; "
+    "from calib.stages.estimator.replay import compile_filters; compile_filters(True, {smoothed})"
 )
 
 
-def _few() -> Rows:
-    """Three samples of an IMU at rest, enough for every function to be called."""
+def compile_filters(driven: bool, smoothed: bool) -> None:
+    """Have the functions of the kinematic or of the driven filter compiled, with `smoothed` its smoother's.
+
+    What is compiled depends on types alone, so three samples of an IMU at rest and any set-up will do.
+    """
     readings = np.full((3, 5), np.nan)
     readings[:, 2:] = 9.81, 0.0, 0.0
-    return Rows(np.array([0.0, 0.01, 0.02]), readings, np.full(3, 2))
-
-
-def _nominal() -> Setup:
-    """Any set-up: what is compiled depends on the types alone."""
+    rows, pwm = Rows(np.array([0.0, 0.01, 0.02]), readings, np.full(3, 2)), np.full((3, 2), np.nan)
     start = Start(np.zeros(len(SENSOR)), np.ones(len(SENSOR)))
-    return Setup(np.ones(24), np.ones(len(NOISE)), start, 0.02)
-
-
-def warm(setup: Setup, smoothed: bool = False) -> None:
-    """Have the kinematic filter's functions, and with `smoothed` its smoother's, before the first row."""
-    rows = _few()
-    out = Filter(setup).run(rows)
-    if smoothed:
-        smooth(setup, rows, out)
+    setup = Setup(np.ones(24), np.ones(len(NOISE)), start, 0.02)
+    if driven:
+        out = DrivenFilter(setup, Drive()).run(rows, pwm)
+        if smoothed:
+            smooth_driven(setup, Drive(), rows, pwm, out)
+    else:
+        out = Filter(setup).run(rows)
+        if smoothed:
+            smooth(setup, rows, out)
 
 
 @contextmanager
-def driven_elsewhere(wanted: bool, smoothed: bool = False) -> Iterator[None]:
-    """Compile the driven model's functions in another process when anything is compiled in this block.
+def _compiling_both(smoothed: bool) -> Iterator[None]:
+    """When anything is compiled in this block, compile the driven filter in another process meanwhile.
 
     It has ended when the block ends. Where all is in numba's cache nothing is started.
     """
     started: list[subprocess.Popen[bytes]] = []
 
     def start() -> None:
-        command = _COMMAND.format(path=sys.path, smoothed=smoothed)
+        command = [sys.executable, "-c", _COMMAND.format(path=sys.path, smoothed=smoothed)]
+        quiet = subprocess.DEVNULL
         with contextlib.suppress(OSError):
-            started.append(
-                subprocess.Popen(
-                    [sys.executable, "-c", command],
-                    stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-                )
-            )  # fmt: skip
+            started.append(subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet))
 
     try:
-        with on_compiling(start) if wanted else contextlib.nullcontext():
+        with on_compiling(start):
             yield
         for other in started:
             with contextlib.suppress(subprocess.TimeoutExpired):
@@ -195,18 +163,105 @@ def driven_elsewhere(wanted: bool, smoothed: bool = False) -> Iterator[None]:
             other.wait()
 
 
-def serve(smoothed: bool) -> None:
-    """Compile what the driven model needs, in a process of its own."""
-    from calib.stages.estimator.driven import DrivenFilter, smooth_driven
+# ----------------------------------------------------------------------
+# A log that is open, with the set-up that its beginning and the rig ask for.
 
-    rows, pwm, setup, drive = _few(), np.full((3, 2), np.nan), _nominal(), Drive()
-    out = DrivenFilter(setup, drive).run(rows, pwm)
-    if smoothed:
-        smooth_driven(setup, drive, rows, pwm, out)
+MODELS = ("auto", "kinematic", "driven")
+_JITTER_ROWS = 6000
+
+
+@dataclass
+class OpenLog:
+    """A log and how to filter it.
+
+    Attributes
+    ----------
+    stream : all its blocks. first : the first of them.
+    remarks : on what is assumed, and once the stream has ended on what was passed over.
+    """
+
+    path: Path
+    setup: Setup
+    periods: Periods
+    first: Log
+    stream: Iterator[Log]
+    remarks: list[str]
+
+    @property
+    def both(self) -> bool:
+        """Whether it has pictures and IMU samples."""
+        return bool(self.periods.camera and self.periods.imu)
+
+    @property
+    def size(self) -> int:
+        """Bytes on disk."""
+        parts = self.path.iterdir() if self.path.is_dir() else (self.path,)
+        return sum(part.stat().st_size for part in parts)
+
+
+def opened(path: Path, rig: Rig, rig_path: Path, options: LogOptions = NOTHING_STATED) -> OpenLog:
+    """A log with its set-up; the tracker's jitter comes from its beginning where the rig has no estimator.
+
+    Raises `BadInputError` for a log or a rig that cannot be used.
+    """
+    stream = blocks(path, options)
+    first = next(stream)
+    found = periods(first)
+    setup, remarks = setup_from_rig(rig, rig_path, found)
+    if first.map is not None and first.map.narration:
+        remarks.append(first.map.narration)
+    if rig.estimator is None and found.camera:
+        rows = rows_of(first, found.ticks)
+        part = Rows(rows.t_s[:_JITTER_ROWS], rows.readings[:_JITTER_ROWS], rows.kinds[:_JITTER_ROWS])
+        noise = setup.noise.copy()
+        noise[0] = jitter_px(setup, [part]).value
+        setup = replace(setup, noise=noise)
+    return OpenLog(path, setup, found, first, _noted(chain([first], stream), remarks), remarks)
+
+
+def _noted(stream: Iterator[Log], remarks: list[str]) -> Iterator[Log]:
+    """The blocks, and at their end sentences on what was passed over in them."""
+    cells, truncated = 0, False
+    for log in stream:
+        cells += log.not_finite
+        truncated = log.truncated
+        yield log
+    remarks.extend(passed_over(cells, truncated))
+
+
+def drive_for(log: OpenLog, rig: Rig, model: str) -> Drive | None:
+    """The driven model, None where it is not wanted or, with "auto", where the log lacks what it needs.
+
+    Raises `BadInputError` where "driven" is asked for and the log lacks it.
+    """
+    if model == "kinematic":
+        return None
+    commands = has_commands(log.first)
+    if commands and log.both:
+        return replace(drive_from_rig(rig), imu_noise=noise_at_rest(rig, log.periods))
+    if model == "driven":
+        found = log.periods
+        lacks = "commands (pwm1, pwm2)" if not commands else "pictures" if not found.camera else "IMU samples"
+        raise BadInputError(
+            f"{shown(log.path)}: the driven model needs commands, camera and IMU, found no {lacks}"
+        )
+    return None
+
+
+def estimator_of(setup: Setup, drive: Drive | None, model: str) -> Callable[[Rows, Log], FloatArray]:
+    """The filter as a function of rows and the block that they come from; it returns rows of `OUT`."""
+    if drive is None:
+        kinematic = Filter(setup)
+        return lambda rows, log: kinematic.run(rows)
+    run = (DrivenFilter if model == "driven" else Handover)(setup, drive).run
+    return lambda rows, log: run(rows, pwm_of(log))
 
 
 # ----------------------------------------------------------------------
-# A whole log through filter and smoother; the states written are those of the smoother.
+# A whole log through filter and smoother.
+
+_SMOOTHED_ROWS = 1_000_000
+"""The smoother keeps 1.6 kB for each row with the kinematic model alone."""
 
 
 def joined(parts: list[Rows]) -> Rows:
@@ -218,36 +273,34 @@ def joined(parts: list[Rows]) -> Rows:
     )
 
 
-def first_rows(setup: Setup, found: Periods, stream: Iterable[Log], until_s: float) -> np.ndarray:
+def smoothed_rows(log: OpenLog, until_s: float) -> FloatArray:
     """Rows (n, len(OUT)) of the kinematic smoother up to a time of the log [s], which may be its end."""
     parts = []
-    for log in stream:
-        rows = rows_of(log, found.ticks)
+    for block in log.stream:
+        rows = rows_of(block, log.periods.ticks)
         some = rows.t_s <= until_s
         parts.append(Rows(rows.t_s[some], rows.readings[some], rows.kinds[some]))
         if not some.all():
             break
     whole = joined(parts)
-    return np.asarray(smooth(setup, whole, Filter(setup).run(whole)))
+    return smooth(log.setup, whole, Filter(log.setup).run(whole))
 
 
-def smooth_log(
-    setup: Setup, found: Periods, stream: Iterable[Log], output: Path | None, drive: Drive | None = None
-) -> tuple[Tally, Tally, list[np.ndarray]]:
-    """Sums of the smoother and of the filter, and for figures its rows with the truth, block by block.
+@dataclass(frozen=True)
+class Smoothed:
+    """Rows of `OUT` of a whole log by the filter and by the smoother, and the truth (n, 3)."""
 
-    With a `drive` both models are smoothed and weighed.
+    filtered: FloatArray
+    out: FloatArray
+    truth: FloatArray
 
-    Raises `BadInputError` where `output` cannot be written.
-    """
-    fused, parts, outs, truths = Filter(setup), [], [], []
-    both, pwm, driven, kinematic = None, [], [], []
-    if drive is not None:
-        from calib.stages.estimator.driven import Handover, blended, smooth_both
 
-        both = Handover(setup, drive)
+def smooth_log(setup: Setup, ticks: bool, stream: Iterable[Log], drive: Drive | None = None) -> Smoothed:
+    """A log filtered block by block and smoothed as a whole; with a `drive` both models are weighed."""
+    parts, outs, truths, pwm, driven, kinematic = [], [], [], [], [], []
+    fused, both = Filter(setup), None if drive is None else Handover(setup, drive)
     for log in stream:
-        rows, truth = rows_of(log, found.ticks), truth_of(log)
+        rows, truth = rows_of(log, ticks), truth_of(log)
         parts.append(rows)
         if both is None:
             outs.append(fused.run(rows))
@@ -258,38 +311,33 @@ def smooth_log(
             driven.append(one)
             kinematic.append(other)
         truths.append(np.full((len(log), 3), np.nan) if truth is None else truth)
-    whole, filtered, truth = joined(parts), np.concatenate(outs), np.concatenate(truths)
+    whole, filtered = joined(parts), np.concatenate(outs)
     if drive is None:
-        smoothed = smooth(setup, whole, filtered)
+        out = smooth(setup, whole, filtered)
     else:
-        smoothed = smooth_both(
-            setup, drive, whole, np.concatenate(pwm), np.concatenate(driven), np.concatenate(kinematic)
-        )
-    before, after = Tally(setup.bellows_radius_m), Tally(setup.bellows_radius_m)
-    before.add(filtered, truth)
-    after.add(smoothed, truth)
-    if output is not None:
-        with states_writer(output) as states:
-            states.add(smoothed[:, [OUT.index(name) for name in STATES]])
-    traced = np.concatenate([smoothed, np.full((len(whole), 3), np.nan), truth], axis=1)
-    return after, before, [traced]
+        commands = np.concatenate(pwm)
+        out = smooth_both(setup, drive, whole, commands, np.concatenate(driven), np.concatenate(kinematic))
+    return Smoothed(filtered, out, np.concatenate(truths))
+
+
+def _watched(stream: Iterator[Log], watch: Watch) -> Iterator[Log]:
+    """The blocks of a log that may be held in memory as a whole, with a watch over its sensors."""
+    rows = 0
+    for log in stream:
+        watch.add(log)
+        rows += len(log)
+        if rows > _SMOOTHED_ROWS:
+            raise BadInputError(
+                f"{log.source}: has more than {_SMOOTHED_ROWS} rows, which smoothing would hold in memory; "
+                "leave --smooth out or cut the log"
+            )
+        yield log
 
 
 # ----------------------------------------------------------------------
-# One log through an estimator: states written, errors and consistency summed, a verdict.
+# Sums over the blocks of a log.
 
-MODELS = ("auto", "kinematic", "driven")
-
-_JITTER_ROWS = 6000
 _MOST_POINTS = 6000
-_NIS_FACTOR = 2.0
-_GATED_SHARE = 0.05
-_INSIDE_SHARE = 0.7
-_CORRELATED = 0.6
-_SMOOTHED_ROWS = 1_000_000
-"""The smoother keeps 1.6 kB for each row with the kinematic model alone."""
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass
@@ -320,216 +368,35 @@ class Trace:
         return np.concatenate(self.rows) if self.rows else np.zeros((0, 0))
 
 
-@dataclass(frozen=True)
-class Replayed:
-    """What a log has come to.
+@dataclass
+class Sums:
+    """What is summed over the rows of `OUT` of a log.
 
     Attributes
     ----------
-    source, rows, duration_s, estimator : of the log.
-    rmse, others : errors against the truth by `Tally.rmse`, of this estimator and of another.
-    sensors : consistency by sensor. flags : rows by flag. jitter_px : that was used.
-    driven_share : of the rows, in which the driven model spoke; None where there was none.
-    trace : rows for figures: `setup.OUT`, then q1, q2, phi of the baseline, then the truth.
+    fused, baseline : errors and consistency. watch : over the sensors. trace : None where no figure is
+    wanted. weighed, driven : rows with two models, and those in which the driven one speaks.
     """
 
-    source: str
-    rows: int
-    duration_s: float
-    estimator: str
-    rmse: dict[str, float]
-    others: dict[str, dict[str, float]]
-    sensors: dict[str, dict[str, float]]
-    flags: dict[str, int]
-    jitter_px: float | None
-    verdict: str
-    reasons: list[str]
-    remarks: list[str]
-    trace: FloatArray
-    driven_share: float | None = None
-
-    def as_json(self) -> dict[str, Any]:
-        """For the document."""
-        names = (
-            "source", "rows", "duration_s", "estimator", "rmse", "sensors", "flags", "jitter_px", "verdict",
-            "reasons", "remarks", "driven_share",
-        )  # fmt: skip
-        out = {name: getattr(self, name) for name in names}
-        return out | {"compared": self.others}
-
-
-def prepared(
-    path: Path, rig: Rig, rig_path: Path, topics: Path | None = None
-) -> tuple[Setup, Any, Iterator[Log], list[str]]:
-    """Set-up, periods, all blocks of the log, and sentences on what is assumed."""
-    stream = blocks(path, topics)
-    first = next(stream)
-    found = periods(first)
-    setup, said = setup_from_rig(rig, rig_path, found)
-    if rig.estimator is None and found.camera:
-        head = rows_of(first, found.ticks)
-        count = min(len(head), _JITTER_ROWS)
-        part = replace(head, t_s=head.t_s[:count], readings=head.readings[:count], kinds=head.kinds[:count])
-        noise = setup.noise.copy()
-        noise[0] = jitter_px(setup, [part]).value
-        setup = replace(setup, noise=noise)
-    return setup, found, chain([first], stream), said
-
-
-def replay_log(
-    path: Path,
-    rig: Rig,
-    rig_path: Path,
-    estimator: str = "fused",
-    smooth: bool = False,
-    output: Path | None = None,
-    progress: Progress | None = None,
-    traced: bool = False,
-    model: str = "auto",
-    topics: Path | None = None,
-) -> Replayed:
-    """Run one log, block by block, and write its states; `smooth` needs the whole log in memory.
-
-    `model` is one of `MODELS`: driven by the commands or kinematic, "auto" both where the log has commands,
-    camera and IMU, each speaking where it is the better.
-
-    Raises `BadInputError` for a log or a rig that cannot be used.
-    """
-    with driven_elsewhere(estimator == "fused" and model != "kinematic", smooth):
-        setup, found, stream, said = prepared(path, rig, rig_path, topics)
-        warm(setup, smooth)
-    if estimator == "baseline" and not (found.camera and found.imu):
-        raise BadInputError(f"{shown(path)}: the baseline needs camera and IMU, and the log lacks one")
-    tally, trace = Tally(setup.bellows_radius_m), Trace()
-    baseline_tally = Tally(setup.bellows_radius_m)
-    baseline = Baseline(baseline_setup(setup, rig, rig_path, found)) if found.camera and found.imu else None
-    first = next(stream)
-    stream = chain([first], stream)
-    drive = drive_for(model, first, found, rig, path)
-    estimate = estimator_of(setup, drive, model)
-    shares = Shares()
-    parts = path.iterdir() if path.is_dir() else (path,)
-    size = sum(part.stat().st_size for part in parts)
-
-    def run(states: StatesFile | None) -> None:
-        done = 0
-
-        def finish(item: tuple[Log, Rows, FloatArray]) -> None:
-            log, rows, out = item
-            truth = truth_of(log)
-            shares.add(out)
-            tally.add(out, truth)
-            other = np.full((len(log), 3), np.nan) if traced else None
-            if baseline is not None and (truth is not None or traced or estimator == "baseline"):
-                held = baseline.run(rows)
-                other = held[:, 1:4]
-                baseline_tally.add(_as_out(held), truth)
-                if estimator == "baseline" and states is not None:
-                    states.add(held)
-            if estimator == "fused" and states is not None:
-                states.add(out[:, _COLUMNS])
-            if traced:
-                known = np.full((len(log), 3), np.nan) if truth is None else truth
-                trace.add(np.concatenate([out, other, known], axis=1))
-
-        with behind(finish) as hand:
-            for log in ahead(_told(stream, said)):
-                rows = rows_of(log, found.ticks)
-                hand((log, rows, estimate(rows, log)))
-                done += len(log)
-                if progress is not None:
-                    progress(min(done * 80, size), size)
-
-    if smooth:
-        after, before, traces = smooth_log(setup, found, _bounded(_told(stream, said)), output, drive)
-        shares.add(traces[0])
-        result = _result(path, "smoothed", setup, found, after, before, said, traces[0], True)
-        result = replace(result, driven_share=shares.value)
-        return replace(result, others={"filter": _errors(before, True)} if before.scored else {})
-    if output is None:
-        run(None)
-    else:
-        with states_writer(output, STATES if estimator == "fused" else BASELINE) as states:
-            run(states)
-    result = _result(
-        path, estimator, setup, found, tally, baseline_tally, said, trace.values, baseline is not None
-    )
-    return replace(result, driven_share=shares.value)
-
-
-@dataclass
-class Shares:
-    """In how many rows the driven model has spoken."""
-
-    rows: int = 0
+    fused: Tally
+    baseline: Tally
+    watch: Watch = field(default_factory=lambda: Watch(READINGS))
+    trace: Trace | None = None
+    weighed: int = 0
     driven: int = 0
 
-    def add(self, out: FloatArray) -> None:
-        """Rows of `setup.OUT` that follow."""
+    def add(self, out: FloatArray, truth: FloatArray | None, held: FloatArray | None = None) -> None:
+        """Rows that follow, with the truth (n, 3) and rows of the baseline where there are any."""
         weight = out[:, OUT.index("driven_weight")]
-        self.rows += int(np.isfinite(weight).sum())
+        self.weighed += int(np.isfinite(weight).sum())
         self.driven += int(np.count_nonzero(weight >= 0.5))
-
-    @property
-    def value(self) -> float | None:
-        """Their share, None without a driven model."""
-        return self.driven / self.rows if self.rows else None
-
-
-def drive_for(model: str, first: Log, found: Any, rig: Rig, path: Path) -> Drive | None:
-    if model == "kinematic":
-        return None
-    told = has_commands(first)
-    if told and found.camera and found.imu:
-        return replace(drive_from_rig(rig), imu_noise=noise_at_rest(rig, found))
-    if model == "driven":
-        lacks = "commands (pwm1, pwm2)" if not told else "pictures" if not found.camera else "IMU samples"
-        raise BadInputError(
-            f"{shown(path)}: the driven model needs commands, camera and IMU, found no {lacks}"
-        )
-    return None
-
-
-def estimator_of(setup: Setup, drive: Drive | None, model: str) -> Callable[[Rows, Log], FloatArray]:
-    """The estimator as a function of rows and the log that they come from."""
-    if drive is None:
-        fused = Filter(setup)
-        return lambda rows, log: fused.run(rows)
-    if model == "driven":
-        from calib.stages.estimator.driven import DrivenFilter
-
-        alone = DrivenFilter(setup, drive)
-        return lambda rows, log: alone.run(rows, pwm_of(log))
-    from calib.stages.estimator.driven import Handover
-
-    both = Handover(setup, drive)
-    return lambda rows, log: both.run(rows, pwm_of(log))
-
-
-def _told(stream: Iterator[Log], said: list[str]) -> Iterator[Log]:
-    """The blocks, and at their end sentences on what was passed over in them."""
-    cells, truncated = 0, False
-    for log in stream:
-        cells += log.not_finite
-        truncated = log.truncated
-        yield log
-    said.extend(passed_over(cells, truncated))
-
-
-def _bounded(stream: Iterator[Log]) -> Iterator[Log]:
-    """The blocks of a log that may be held in memory as a whole."""
-    rows = 0
-    for log in stream:
-        rows += len(log)
-        if rows > _SMOOTHED_ROWS:
-            raise BadInputError(
-                f"{log.source}: has more than {_SMOOTHED_ROWS} rows, which smoothing would hold in memory; "
-                "leave --smooth out or cut the log"
-            )
-        yield log
-
-
-_COLUMNS = [OUT.index(name) for name in STATES]
+        self.fused.add(out, truth)
+        if held is not None:
+            self.baseline.add(_as_out(held), truth)
+        if self.trace is not None:
+            blank = np.full((len(out), 3), np.nan)
+            parts = (out, blank if held is None else held[:, 1:4], blank if truth is None else truth)
+            self.trace.add(np.concatenate(parts, axis=1))
 
 
 def _as_out(held: FloatArray) -> FloatArray:
@@ -541,90 +408,213 @@ def _as_out(held: FloatArray) -> FloatArray:
     return out
 
 
-def _errors(tally: Tally, own: bool) -> dict[str, float]:
-    rmse = tally.rmse()
-    return rmse if own else {k: rmse[k] for k in ("q1_mm", "q2_mm", "mean_q_mm", "phi_deg") if k in rmse}
+# ----------------------------------------------------------------------
+# Rules.
+
+_NIS_FACTOR = 2.0
+_GATED_SHARE = 0.05
+_INSIDE_SHARE = 0.7
+_CORRELATED = 0.6
+_FLAGGED_SHARE = 0.05
 
 
-def _checks(tally: Tally) -> dict[str, dict[str, float]]:
-    out = {}
-    for name, degrees in SENSORS.items():
-        check = tally.check(name)
-        if check is not None:
-            out[name] = {
-                "degrees": degrees,
-                "readings": check.count,
-                "gated": check.gated,
-                "nis": check.nis,
-                "low": check.low,
-                "high": check.high,
-                "inside": check.inside,
-                "correlation": check.correlation,
-                "correlation_bound": check.bound,
-            }
-    return out
+def sampled(watch: Watch) -> Iterator[Finding]:
+    """Findings on sensors that are not there, do not move, or contradict each other."""
+    camera, gyro, accel = (watch.has(*names) for names in (READINGS[:2], READINGS[4:], READINGS[2:4]))
+    if not camera:
+        yield Finding("poor", "the log has no pictures")
+    if not (gyro or accel):
+        yield Finding("poor", "the log has no IMU samples")
+    elif not gyro:
+        yield Finding("poor", "the log has no gyroscope (gz_radps)")
+    elif not accel:
+        yield Finding("poor", "the log has no accelerometer (ax_mps2, ay_mps2)")
+    yield from (one for one in watch.findings() if one.severity == "inconsistent")
 
 
-def judged(
-    checks: dict[str, dict[str, float]], flags: dict[str, int], rows: int
-) -> tuple[list[str], list[str]]:
-    """Reasons why a result is poor, and remarks."""
-    reasons, remarks = [], []
+def consistent(checks: Mapping[str, SensorCheck], flags: Mapping[str, int], rows: int) -> Iterator[Finding]:
+    """Findings on innovations that contradict their covariance, and on stretches without a sensor."""
     for name, check in checks.items():
-        ratio = check["nis"] / check["degrees"]
-        if not 1.0 / (2.0 * _NIS_FACTOR) <= ratio <= _NIS_FACTOR:
-            reasons.append(
-                f"the innovations of the {name} are {ratio:.2g} times what the covariance expects; "
-                "calib replay --tune learns the noise of this rig"
-            )
-        share = check["gated"] / max(check["readings"] + check["gated"], 1)
-        if share > _GATED_SHARE:
-            reasons.append(f"{100.0 * share:.0f} % of the {name}'s readings were gated out")
-        if check["inside"] < _INSIDE_SHARE:
-            reasons.append(
-                f"only {100.0 * check['inside']:.0f} % of the {name}'s innovations lie in their 95 % band"
-            )
-        if abs(check["correlation"]) > _CORRELATED:
-            remarks.append(
-                f"the innovations of the {name} are not white: {check['correlation']:.2f} with the one before"
-            )
-    for name, sentence in (
+        if check.nis is not None and check.inside is not None and check.correlation is not None:
+            ratio = check.nis / check.degrees
+            if not 1.0 / (2.0 * _NIS_FACTOR) <= ratio <= _NIS_FACTOR:
+                yield Finding(
+                    "poor",
+                    f"the innovations of the {name} are {ratio:.2g} times what the covariance expects; "
+                    "calib replay --tune learns the noise of this rig",
+                )
+            if check.inside < _INSIDE_SHARE:
+                share = f"{100.0 * check.inside:.0f} % of the {name}'s innovations"
+                yield Finding("poor", f"only {share} lie in their 95 % band")
+            if abs(check.correlation) > _CORRELATED:
+                value = f"{check.correlation:.2f}"
+                text = f"the innovations of the {name} are not white: {value} with the one before"
+                yield Finding("remark", text)
+        if not check.readings:
+            yield Finding("poor", f"all {check.gated} readings of the {name} were gated out")
+        elif check.gated > _GATED_SHARE * (check.readings + check.gated):
+            share = f"{100.0 * check.gated / (check.readings + check.gated):.0f} % of the {name}'s readings"
+            yield Finding("poor", f"{share} were gated out")
+    for flag, sentence in (
         ("camera_silent", "the camera is silent"),
         ("imu_silent", "the IMU is silent"),
         ("held_by_prior", "no sensor bounds length or angle, the prior does"),
         ("not_started", "nothing is known yet"),
     ):
-        if flags.get(name, 0) > 0.05 * rows:
-            reasons.append(f"{sentence} in {100.0 * flags[name] / rows:.0f} % of the rows")
+        if flags.get(flag, 0) > _FLAGGED_SHARE * rows:
+            yield Finding("poor", f"{sentence} in {100.0 * flags[flag] / rows:.0f} % of the rows")
     if flags.get("time_jump"):
-        reasons.append(f"the time jumps {flags['time_jump']} times; the filter starts again after each")
+        yield Finding(
+            "poor", f"the time jumps {flags['time_jump']} times; the filter starts again after each"
+        )
     if flags.get("restarted"):
-        remarks.append(f"the filter started again {flags['restarted']} times after rejecting all readings")
+        text = f"the filter started again {flags['restarted']} times after rejecting all readings"
+        yield Finding("remark", text)
     if flags.get("late"):
-        remarks.append(f"{flags['late']} readings came too late to be used")
-    return reasons, remarks
+        yield Finding("remark", f"{flags['late']} readings came too late to be used")
 
 
-def _result(
-    path: Path, estimator: str, setup: Setup, found: Any, tally: Tally, baseline: Tally, said: list[str],
-    trace: FloatArray, compared: bool,
-) -> Replayed:  # fmt: skip
-    checks = _checks(tally)
-    flags = {name: tally.flags.get(bit, 0) for name, bit in FLAGS.items() if tally.flags.get(bit, 0)}
-    own = estimator != "baseline"
-    reasons, remarks = judged(checks, flags, max(tally.rows, 1)) if own else ([], [])
-    if own and not found.camera:
-        reasons.insert(0, "the log has no pictures")
-    if own and not found.imu:
-        reasons.insert(0, "the log has no IMU samples")
-    first, second = (tally, baseline) if own else (baseline, tally)
-    others = {}
-    if compared and second.scored:
-        others["baseline" if own else "fused"] = _errors(second, not own)
-    duration = tally.end_s - tally.start_s
+# ----------------------------------------------------------------------
+# The whole of it.
+
+_COLUMNS = [OUT.index(name) for name in STATES]
+
+
+def replay_log(
+    path: Path,
+    rig: Rig,
+    rig_path: Path,
+    estimator: str = "fused",
+    model: str = "auto",
+    smoothed: bool = False,
+    options: LogOptions = NOTHING_STATED,
+    output: Path | None = None,
+    progress: ProgressCall | None = None,
+    figures: bool = False,
+    keep: bool = False,
+) -> Replayed:
+    """Run one log and write its states.
+
+    Parameters
+    ----------
+    estimator : "fused", or "baseline" for the low-pass pipeline that it replaces.
+    model : one of `MODELS`: driven by the commands or kinematic, "auto" both where the log has commands,
+        camera and IMU, each speaking where it is the better.
+    smoothed : look at the whole log, forward and backward.
+    options : what a person states of the log.
+    output : file for the states. keep : hold them in memory where there is none.
+    figures : keep a trace of the rows for figures.
+
+    Raises `BadInputError` for a log or a rig that cannot be used.
+    """
+    driven = estimator == "fused" and model != "kinematic"
+    with _compiling_both(smoothed) if driven else contextlib.nullcontext():
+        compile_filters(False, smoothed)
+        log = opened(path, rig, rig_path, options)
+    fused = estimator == "fused"
+    if not fused and not log.both:
+        raise BadInputError(f"{shown(path)}: the baseline needs camera and IMU, and the log lacks one")
+    drive = drive_for(log, rig, model)
+    radius_m = log.setup.bellows_radius_m
+    sums = Sums(Tally(radius_m), Tally(radius_m), trace=Trace() if figures else None)
+    columns = STATES if fused else BASELINE
+    kept: list[FloatArray] = []
+    compared: dict[str, Errors] = {}
+    with _states_to(output, columns, kept.append if keep else None) as write:
+        if smoothed:
+            whole = smooth_log(log.setup, log.periods.ticks, _watched(log.stream, sums.watch), drive)
+            sums.add(whole.out, whole.truth)
+            filtered = Tally(radius_m)
+            filtered.add(whole.filtered, whole.truth)
+            if filtered.scored:
+                compared["filter"] = filtered.rmse()
+            write(whole.out[:, _COLUMNS])
+        else:
+            baseline = Baseline(baseline_setup(log.setup, rig, rig_path, log.periods)) if log.both else None
+            _stream(log, estimator_of(log.setup, drive, model), baseline, fused, sums, write, progress)
+            if fused and sums.baseline.scored:
+                compared["baseline"] = _lengths_and_angle(sums.baseline)
+            elif not fused and sums.fused.scored:
+                compared["fused"] = sums.fused.rmse()
+    states = np.concatenate(kept) if kept else None
+    trace = sums.trace.values if sums.trace is not None else np.zeros((0, 0))
+    name = estimator if not smoothed else "smoothed"
+    return _replayed(log, name, sums, compared).with_evidence(Held(trace, columns, states))
+
+
+@contextmanager
+def _states_to(
+    output: Path | None, columns: tuple[str, ...], keep: Callable[[FloatArray], None] | None
+) -> Iterator[Callable[[FloatArray], None]]:
+    """Where states go: into a file, to a caller, or nowhere."""
+    if output is not None:
+        with states_writer(output, columns) as file:
+            yield file.add
+    else:
+        yield keep or (lambda rows: None)
+
+
+def _stream(
+    log: OpenLog,
+    estimate: Callable[[Rows, Log], FloatArray],
+    baseline: Baseline | None,
+    fused: bool,
+    sums: Sums,
+    write: Callable[[FloatArray], None],
+    progress: ProgressCall | None,
+) -> None:
+    """Filter block by block, reading ahead and summing and writing behind."""
+    done, size = 0, log.size
+
+    def finish(item: tuple[Log, Rows, FloatArray]) -> None:
+        block, rows, out = item
+        truth, held = truth_of(block), None
+        if baseline is not None and (truth is not None or sums.trace is not None or not fused):
+            held = baseline.run(rows)
+        sums.watch.add(block)
+        sums.add(out, truth, held)
+        if fused or held is None:
+            write(out[:, _COLUMNS])
+        else:
+            write(held)
+
+    with behind(finish) as hand:
+        for block in ahead(log.stream):
+            rows = rows_of(block, log.periods.ticks)
+            hand((block, rows, estimate(rows, block)))
+            done += len(block)
+            if progress is not None:
+                progress(min(done * 80, size), size)
+
+
+def _lengths_and_angle(tally: Tally) -> Errors:
+    rmse = tally.rmse()
+    return {key: rmse[key] for key in ("q1_mm", "q2_mm", "mean_q_mm", "phi_deg") if key in rmse}
+
+
+def _replayed(log: OpenLog, estimator: str, sums: Sums, compared: dict[str, Errors]) -> Replayed:
+    """Judge, and put together what is shown."""
+    tally, own = sums.fused, estimator != "baseline"
+    checks = {name: check for name in SENSORS if (check := tally.check(name)) is not None}
+    flags = {name: tally.flags[bit] for name, bit in FLAGS.items() if tally.flags.get(bit)}
+    share = sums.driven / sums.weighed if own and sums.weighed else None
+    findings: list[Finding] = []
+    if own:
+        findings += [*sampled(sums.watch), *consistent(checks, flags, max(tally.rows, 1))]
+    if share is not None and share < 0.99:
+        rest = f"in {100.0 * (1.0 - share):.0f} % of the rows the kinematic model spoke"
+        findings.append(Finding("remark", f"{rest}, which explained them better"))
+    assumed = [Finding("remark", text) for text in log.remarks]
     return Replayed(
-        shown(path.name), tally.rows, duration if math.isfinite(duration) else 0.0, estimator,
-        _errors(first, own), others, checks if own else {}, flags if own else {},
-        float(setup.noise[0]) if found.camera else None, "poor" if reasons else "ok", reasons,
-        [*said, *remarks], trace,
-    )  # fmt: skip
+        source=shown(log.path.name),
+        rows=tally.rows,
+        duration_s=finite_or_none(tally.end_s - tally.start_s) or 0.0,
+        estimator=estimator,
+        driven_share=share,
+        jitter_px=float(log.setup.noise[0]) if log.periods.camera else None,
+        rmse=tally.rmse() if own else _lengths_and_angle(sums.baseline),
+        compared=compared,
+        sensors=checks if own else {},
+        flags=flags if own else {},
+        **judged(Verdict.of([*assumed, *findings])),
+    )

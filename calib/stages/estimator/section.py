@@ -1,12 +1,20 @@
-"""The section `estimator` of rig.yaml: what `calib replay --tune` learns of the noise."""
+"""The section `estimator` of rig.yaml, which `calib replay --tune` writes, and what a log comes to."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+import importlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import Field
+from pydantic import Field, PrivateAttr
 
-from calib.core.result import Number, Section
+from calib.core.errors import BadInputError
+from calib.core.result import Count, Number, Result, Section, Sigma, quantity
+from calib.core.words import BLANK, Block, Table
+
+if TYPE_CHECKING:
+    from calib.core.arrays import FloatArray
 
 Positive = Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False, strict=True)]
 NotNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False, strict=True)]
@@ -54,7 +62,7 @@ class EstimatorDriven(Section):
     walk_forces_N_per_sqrt_s: Positive
 
 
-class Estimator(Section):
+class Estimator(Result):
     """Noise of the sensors and of the process, by maximum likelihood of innovations.
 
     Attributes
@@ -66,14 +74,139 @@ class Estimator(Section):
     gain_per_row : log likelihood that the tuning has won, per row of the logs.
     """
 
-    jitter_px: Positive
-    accel_noise_mps2: Positive | None = None
-    gyro_noise_radps: Positive | None = None
-    sigma: dict[str, NotNegative | None] = {}
+    jitter_px: Positive = quantity(label="tracker's jitter", digits=3)
+    accel_noise_mps2: Positive | None = quantity(None, label="accel noise", digits=4)
+    gyro_noise_radps: Positive | None = quantity(None, label="gyro noise", digits=4)
+    sigma: Sigma = {}
     levels: list[EstimatorLevel] = []
     driven: EstimatorDriven | None = None
     constant_gain: EstimatorGain | None = None
-    gain_per_row: Number | None = None
-    logs: list[str] = []
-    verdict: Literal["ok", "poor"]
-    reasons: list[str] = []
+    gain_per_row: float | None = quantity(None, label="log likelihood won per row", digits=4)
+    logs: list[str] = quantity([], label="logs")
+
+
+# ----------------------------------------------------------------------
+# A replayed log. It is no section of rig.yaml, but has a verdict and words as one has.
+
+Errors = dict[str, float]
+"""Errors against the truth after the first two seconds, by `consistency.Tally.rmse`."""
+
+_ERRORS = {
+    "q1_mm": ("q1, mm", 3),
+    "q2_mm": ("q2, mm", 3),
+    "mean_q_mm": ("mean, mm", 3),
+    "phi_deg": ("phi, \N{DEGREE SIGN}", 4),
+    "nees": ("NEES (2)", 2),
+}
+"""Those that are shown, and their digits behind the point."""
+
+
+class SensorCheck(Section):
+    """Innovations of a sensor after the first two seconds.
+
+    Attributes
+    ----------
+    degrees : readings at a time. readings, gated : used, and gated out.
+    nis, low, high : mean NIS and the 95 % band of white innovations; null where every reading was gated out.
+    inside : share of readings within the 95 % band of a single one.
+    correlation, correlation_bound : with the reading before, the largest of its axes, and its 95 % bound.
+    """
+
+    degrees: Count = quantity(label="degrees")
+    readings: Count = quantity(label="readings")
+    gated: Count = quantity(0, label="gated")
+    nis: Number | None = quantity(None, label="NIS", digits=2)
+    low: Number | None = quantity(None, label="95 % from", digits=2)
+    high: Number | None = quantity(None, label="to", digits=2)
+    inside: Number | None = quantity(None, label="inside", show="%", digits=1)
+    correlation: Number | None = quantity(None, label="correlation", digits=2)
+    correlation_bound: Number | None = None
+
+
+@dataclass(frozen=True)
+class Held:
+    """Arrays of a replayed log.
+
+    Attributes
+    ----------
+    trace : rows for figures, thinned out: `kinematic.OUT`, then q1, q2, phi of the baseline, then the truth.
+    columns : of the states. states : (n, columns), None where they were written to a file or not wanted.
+    """
+
+    trace: FloatArray
+    columns: tuple[str, ...]
+    states: FloatArray | None
+
+
+class Replayed(Result):
+    """What a log has come to: its states, errors against a truth, consistency, and a verdict.
+
+    Attributes
+    ----------
+    source, rows, duration_s : of the log. estimator : "fused", "smoothed" or "baseline".
+    driven_share : of the rows, in which the driven model speaks; null where there is none.
+    rmse, compared : errors against the truth, of this estimator and of others.
+    sensors : consistency by sensor. flags : rows by flag. jitter_px : of the tracker, that was used.
+    """
+
+    source: str = quantity(label="log")
+    rows: Count = quantity(label="rows")
+    duration_s: Number = quantity(label="duration", digits=2)
+    estimator: str = quantity(label="estimator")
+    driven_share: Number | None = quantity(None, label="driven model speaks in", show="%", digits=0)
+    jitter_px: Number | None = quantity(None, label="tracker's jitter", digits=2)
+    rmse: Errors = {}
+    compared: dict[str, Errors] = {}
+    sensors: dict[str, SensorCheck] = quantity({}, label="sensor")
+    flags: dict[str, int] = {}
+
+    _tuned: Estimator | None = PrivateAttr(default=None)
+
+    @property
+    def tuned(self) -> Estimator | None:
+        """The noise that was learnt from the logs before they were replayed, None without `tune`."""
+        return self._tuned
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the states."""
+        held: Held = self.evidence
+        return held.columns
+
+    @property
+    def states(self) -> FloatArray:
+        """The states (n, columns). Raises `BadInputError` where they were written to a file."""
+        held: Held = self.evidence
+        if held.states is None:
+            raise BadInputError(
+                f"the states of {self.source} were written to a file and are not held as well"
+            )
+        return held.states
+
+    def to_pandas(self) -> Any:
+        """The states as a pandas DataFrame. Raises `BadInputError` without pandas."""
+        try:
+            pandas = importlib.import_module("pandas")
+        except ImportError as error:
+            raise BadInputError("a table for pandas needs pandas: pip install pandas") from error
+        return pandas.DataFrame(self.states, columns=list(self.columns))
+
+    def save(self, path: str | Path) -> None:
+        """Write the states as .csv, .parquet or .mcap. Raises `BadInputError`."""
+        from calib.io.states import states_writer
+
+        with states_writer(Path(path), self.columns) as file:
+            file.add(self.states)
+
+    def more_words(self) -> list[Block]:
+        """Errors of this estimator and of others, side by side."""
+        if not self.rmse:
+            return []
+
+        def cells(name: str, errors: Errors) -> tuple[str, ...]:
+            shown = ((errors.get(key), places) for key, (_, places) in _ERRORS.items())
+            return (name, *(BLANK if value is None else f"{value:.{places}f}" for value, places in shown))
+
+        head = ("RMSE after 2 s", *(label for label, _ in _ERRORS.values()))
+        rows = [cells("this", self.rmse), *(cells(name, errors) for name, errors in self.compared.items())]
+        return [Table(head, tuple(rows), head[0])]

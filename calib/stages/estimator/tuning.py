@@ -11,13 +11,16 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.core.files import shown
+from calib.core.result import judged
 from calib.core.rig import Rig
+from calib.core.stage import NOTHING_STATED, LogOptions, ProgressCall
+from calib.core.verdict import Finding, Verdict
 from calib.stages.estimator.constant_gain import MOST_DELAY_TICKS, design, tick_noise
 from calib.stages.estimator.driven import Drive
 from calib.stages.estimator.kinematic import Rows, Setup
 from calib.stages.estimator.noise import tune
 from calib.stages.estimator.read import drive_from_rig, noise_at_rest, pwm_of, rows_of
-from calib.stages.estimator.replay import Progress, joined, prepared
+from calib.stages.estimator.replay import joined, opened
 from calib.stages.estimator.section import Estimator, EstimatorDriven, EstimatorGain, EstimatorLevel
 
 _MOST_ROWS = 20_000
@@ -36,7 +39,7 @@ def gain_section(setup: Setup, rate_hz: float) -> EstimatorGain | None:
 
 
 def _driven_section(
-    setup: Setup, drive: Drive, logs: Sequence[tuple[Rows, FloatArray]], progress: Progress | None
+    setup: Setup, drive: Drive, logs: Sequence[tuple[Rows, FloatArray]], progress: ProgressCall | None
 ) -> tuple[EstimatorDriven | None, dict[str, float | None]]:
     """Walks of the driven model from the first 6,000 rows of the logs with commands, and their deviations."""
     from calib.stages.estimator.noise import tune_driven
@@ -64,8 +67,8 @@ def tuned_section(
     logs: Sequence[Path],
     rig: Rig,
     rig_path: Path,
-    progress: Progress | None = None,
-    topics: Path | None = None,
+    progress: ProgressCall | None = None,
+    options: LogOptions = NOTHING_STATED,
 ) -> Estimator:
     """Noise by maximum likelihood on the first 20,000 rows of each log, of both models where commands are.
 
@@ -75,12 +78,12 @@ def tuned_section(
     bare = replace(rig, estimator=None)
     drive = drive_from_rig(bare)
     for path in logs:
-        setup, found, stream, _ = prepared(path, bare, rig_path, topics)
-        if not (found.camera and found.imu):
+        source = opened(path, bare, rig_path, options)
+        if not source.both:
             raise BadInputError(f"{shown(path)}: tuning needs camera and IMU, and the log lacks one")
         parts, commands, count = [], [], 0
-        for log in stream:
-            parts.append(rows_of(log, found.ticks))
+        for log in source.stream:
+            parts.append(rows_of(log, source.periods.ticks))
             commands.append(pwm_of(log))
             count += len(log)
             if count >= _MOST_ROWS:
@@ -88,7 +91,7 @@ def tuned_section(
         every.append(joined(parts))
         told.append((every[-1], np.concatenate(commands)))
         if first is None:
-            first, at_rest = setup, noise_at_rest(bare, found)
+            first, at_rest = source.setup, noise_at_rest(bare, source.periods)
     if first is None:
         raise BadInputError("LOG: none given, expected at least one")
     found_noise = tune(first, every, progress)
@@ -96,30 +99,18 @@ def tuned_section(
     sigma |= {name: factor.sigma for name, factor in found_noise.factors.items()}
     driven, more = _driven_section(found_noise.setup, replace(drive, imu_noise=at_rest), told, progress)
     sigma |= more
-    reasons = []
+    findings = []
     if found_noise.jitter_px.sigma is None:
-        reasons.append("the logs do not bound the tracker's jitter")
+        findings.append(Finding("poor", "the logs do not bound the tracker's jitter"))
     else:
         sigma["jitter_px"] = found_noise.jitter_px.sigma * found_noise.jitter_px.value
     return Estimator(
         jitter_px=found_noise.jitter_px.value,
         sigma=sigma,
-        levels=[
-            EstimatorLevel(
-                name=level.name,
-                accel_phi_radps2=level.accel_phi_radps2,
-                accel_length_mps2=level.accel_length_mps2,
-                memory_s=level.memory_s,
-                friction_s=level.friction_s,
-                walk_phi_rad_per_sqrt_s=level.walk_phi,
-                walk_length_m_per_sqrt_s=level.walk_length,
-            )
-            for level in found_noise.setup.process.levels
-        ],
+        levels=[EstimatorLevel(**asdict(level)) for level in found_noise.setup.process.levels],
         driven=driven,
         constant_gain=gain_section(found_noise.setup, rig.lowpass.rate_hz if rig.lowpass else _TICK_HZ),
         gain_per_row=(found_noise.after - found_noise.before) / max(found_noise.rows, 1),
         logs=[shown(path.name) for path in logs],
-        verdict="poor" if reasons else "ok",
-        reasons=reasons,
+        **judged(Verdict.of(findings)),
     )

@@ -1,0 +1,158 @@
+"""Lengths, angle and pose from logs of camera and IMU; with --tune the noise is learnt from them first.
+
+Logs may be longer than memory, so `solve` reads and writes block by block; what `read` hands over are paths.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from calib.core.errors import BadInputError, UsageError
+from calib.core.stage import Files, LogOptions, Output, Stage, option
+
+if TYPE_CHECKING:
+    from calib.core.plot import Figure
+    from calib.core.rig import Rig
+    from calib.stages.estimator.section import Estimator, Replayed
+
+
+@dataclass(frozen=True)
+class ReplayOptions(LogOptions):
+    """Which estimator, and what it may use."""
+
+    states_format: Literal["csv", "parquet", "mcap"] = option(
+        "csv", "Of the states of several logs.", flag="format"
+    )
+    estimator: Literal["fused", "baseline"] = option(
+        "fused", "The fused filter, or the low-pass pipeline that it replaces."
+    )
+    model: Literal["auto", "kinematic", "driven"] = option(
+        "auto",
+        "Driven by the commands in the log, kinematic, or (auto) whichever explains the log better.",
+    )
+    smooth: bool = option(False, "Look at the whole log, forward and backward.")
+    tune: bool = option(False, "Learn the noise from these logs; written to the rig's file.")
+
+
+@dataclass(frozen=True)
+class ReplayInputs:
+    """Logs with the files for their states, and the rig."""
+
+    files: Files
+    rig: Rig
+    options: ReplayOptions
+    outputs: Sequence[Path | None]
+
+
+def _read(files: Files, rig: Rig, options: ReplayOptions) -> ReplayInputs:
+    from calib.core.files import check_folder, check_writable, make_folder
+
+    if options.estimator == "baseline" and (options.smooth or options.tune):
+        raise UsageError("--estimator baseline: cannot be smoothed or tuned")
+    outputs: list[Path | None] = [files.output] * len(files.paths)
+    if files.output is not None and len(files.paths) > 1:
+        check_folder(files.output)
+        make_folder(files.output)
+        outputs = _names(files.paths, files.output, options.states_format)
+    elif files.output is not None:
+        check_writable(files.output)
+    if options.tune:
+        for path in files.paths:
+            files.taken(path)
+    return ReplayInputs(files, rig, options, outputs)
+
+
+def _names(paths: Sequence[Path], folder: Path, ending: str) -> list[Path | None]:
+    """A file in a folder for the states of each log.
+
+    Names of logs may hold anything, and two logs in different folders may share one.
+    """
+    from calib.core.files import inside, shown, slug
+
+    slugs: list[str] = []
+    out: list[Path | None] = []
+    for path in paths:
+        slugs.append(slug(path.stem, slugs))
+        states = folder / f"{slugs[-1]}_states.{ending}"
+        if states.is_symlink() and not inside(states, folder):
+            raise BadInputError(f"{shown(states)}: is a link out of {shown(folder)}, nothing was written")
+        out.append(states)
+    return out
+
+
+def _solve(inputs: ReplayInputs) -> list[Replayed]:
+    from calib.core.files import shown
+    from calib.stages.estimator.replay import replay_log
+
+    files, rig, options = inputs.files, inputs.rig, inputs.options
+    tuned = None
+    if options.tune:
+        from calib.stages.estimator.tuning import tuned_section
+
+        with files.progress("tuning") as progress:
+            tuned = tuned_section(files.paths, rig, files.rig_path, progress, options)
+        rig = rig.with_sections({"estimator": tuned})
+    results = []
+    for path, output in zip(files.paths, inputs.outputs, strict=True):
+        with files.progress(f"replaying {path.name}") as progress:
+            result = replay_log(
+                path,
+                rig,
+                files.rig_path,
+                options.estimator,
+                options.model,
+                options.smooth,
+                options,
+                output,
+                progress,
+                files.figures,
+                files.keep,
+            )
+        result._tuned = tuned
+        results.append(result)
+        if output is not None:
+            files.narrate(f"states written to {shown(output)}")
+    return results
+
+
+def _tuned(results: list[Replayed]) -> tuple[Estimator | None]:
+    return (results[0].tuned,)
+
+
+def _document(results: list[Replayed]) -> dict[str, Any]:
+    from calib.core.result import section_json
+
+    return {"replay": {"logs": [section_json(one, whole=True) for one in results]}}
+
+
+def _plots(results: list[Replayed]) -> dict[str, Figure]:
+    from calib.stages.estimator.plots import plots
+
+    return plots(results)
+
+
+replay = Stage(
+    "replay",
+    "States",
+    """Estimate lengths, angle and pose from logs, with standard deviations and what they are worth.
+
+    Exits 1 when the innovations of a log contradict its covariance or a sensor is missing.
+    """,
+    _read,
+    _solve,
+    ReplayOptions,
+    sources="Logs of camera and IMU.",
+    metavar="LOG...",
+    output=Output(
+        "States to write, .csv, .parquet or .mcap; with several logs a folder, made if needed.", None
+    ),
+    writes=("estimator",),
+    parts=_tuned,
+    on_request="tune",
+    uses=("camera", "plane", "geometry", "imu", "align", "actuator", "pump", "estimator"),
+    document=_document,
+    plots=_plots,
+)
