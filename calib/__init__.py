@@ -27,6 +27,9 @@ _CLASSES = {
 }
 """Names of the front door that are no verbs, and where they are."""
 
+_BY_DEFAULT = {"identify": "identify logs"}
+"""Verb of two words that its first word alone stands for."""
+
 __all__ = [
     "Finding",
     "Rig",
@@ -36,6 +39,7 @@ __all__ = [
     "distortion",
     "extrinsics",
     "firmware",
+    "identify",
     "imu",
     "intrinsics",
     "lowpass",
@@ -52,7 +56,8 @@ def __getattr__(name: str) -> Any:
 
         # Verbs of two words: `calib.imu.static` is `calib imu static`.
         group = {one.split()[-1]: function(one) for one in STAGES if one.startswith(f"{name} ")}
-        value = SimpleNamespace(**group) if group else function(name)
+        alone = _BY_DEFAULT.get(name, name)
+        value = function(alone) if alone in STAGES else SimpleNamespace(**group)
     else:
         raise AttributeError(f"module 'calib' has no attribute {name!r}")
     globals()[name] = value

@@ -9,10 +9,7 @@ import typer
 from typer.core import TyperGroup
 
 from calib.cli.common import (
-    AccUnitOption,
-    ColumnsOption,
     FiguresOption,
-    GyroUnitOption,
     JsonOption,
     RigOption,
     document,
@@ -22,12 +19,13 @@ from calib.cli.common import (
     table,
     telling,
 )
-from calib.core.errors import EXIT_POOR, UsageError
+from calib.cli.verbs import verb
+from calib.core.errors import EXIT_POOR
+from calib.stages import stage
 
 if TYPE_CHECKING:
-    from calib.stages.actuator.results import Identified
+    from calib.stages.actuator.pump_results import PumpFound
     from calib.stages.actuator.section import PumpSection
-    from calib.stages.actuator.stage import PumpFound
 
 # ----------------------------------------------------------------------
 # What `calib identify pump` says on stdout.
@@ -39,7 +37,7 @@ def _cell(value: float | None, digits: int = 3) -> str:
 
 def tell_pump(found: PumpFound, section: PumpSection) -> None:
     """Parameters, errors on files that were not fitted, static maps, and what is not explained."""
-    from calib.stages.actuator.stage import parameter_rows
+    from calib.stages.actuator.pump_results import parameter_rows
 
     unit = found.unit
     for model, fit in found.fits.items():
@@ -129,148 +127,6 @@ def _identify() -> None:
     pass
 
 
-def _tell(found: Identified) -> None:
-    from calib.stages.actuator.identify import PARAMETERS
-
-    solution, known = found.solution, found.uncertainty
-    rows = [
-        [
-            name,
-            f"{value:.5g}",
-            f"{known.sigma[name]:.2g}",
-            PARAMETERS[name].unit or "-",
-            PARAMETERS[name].symbol,
-            f"{known.inflation[name]:.1f}",
-        ]
-        for name, value in solution.values.items()
-    ]
-    head = ["parameter", "value", "sigma", "unit", "symbol", "raised"]
-    for line in table(head, rows):
-        say(line)
-    say("sigma is one standard deviation; raised, by how much for coloured residuals")
-    names = list(solution.problem.names)
-    if len(names) > 1:
-        matrix = [[n, *(f"{c:+.2f}" for c in row)] for n, row in zip(names, known.correlation, strict=True)]
-        for line in table(["correlation", *(PARAMETERS[n].symbol for n in names)], matrix):
-            say(line)
-    for name, why in solution.fixed.items():
-        say(f"fixed: {name}: {why}")
-    by_name = {h.name: h for h in found.held}
-    rows = []
-    for track, (phi, length), colour in zip(solution.problem.tracks, found.rms, found.colours, strict=True):
-        held = by_name.get(track.name)
-        rows.append(
-            [
-                track.name,
-                "on" if track.hoses else "off",
-                str(len(track.t_s)),
-                f"{1e3 * phi:.3g}",
-                f"{1e3 * length:.3g}",
-                "-" if held is None else f"{1e3 * held.held_phi_rad:.3g}",
-                "-" if held is None else f"{1e3 * held.held_length_m:.3g}",
-                "yes" if colour.white else f"no ({100.0 * colour.outside:.0f} %)",
-            ]
-        )
-    head = ["RMS of", "hoses", "poses", "phi, mrad", "length, mm", "held phi", "held length", "white"]
-    for line in table(head, rows):
-        say(line)
-    if found.decrements:
-        rows = []
-        for name, (d, of_fit) in found.decrements.items():
-            fitted = "-" if of_fit is None else f"{of_fit:.4f}"
-            rows.append(
-                [name, f"{d.zeta:.4f}", f"{d.sigma:.1g}", fitted, f"{d.frequency_hz:.3f}", str(d.outliers)]
-            )
-        for line in table(["damping of", "zeta by peaks", "sigma", "of the fit", "f, Hz", "outliers"], rows):
-            say(line)
-    if found.prospects:
-        rows = [[p.name, p.worst, f"{100.0 * p.worst_relative:.2g} %"] for p in found.prospects]
-        for line in table(["after one more", "least known", "relative sigma"], rows):
-            say(line)
-    say(f"verdict: {found.judgement.verdict}")
-    for sentence in (*found.judgement.reasons, *found.judgement.remarks, *found.judgement.advice):
-        say(f"  - {sentence}")
-
-
-def logs(
-    paths: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs of camera and commands.")],
-    states: Annotated[
-        list[Path] | None,
-        typer.Option(help="States of calib replay to use instead of the pictures, for the logs in turn."),
-    ] = None,
-    truth: Annotated[
-        bool, typer.Option("--truth", help="Take the true columns of a simulated log, to test the method.")
-    ] = False,
-    no_pwm: Annotated[
-        bool, typer.Option("--no-pwm", help="Logs without commands are swings with the hoses off.")
-    ] = False,
-    static_map: Annotated[
-        bool,
-        typer.Option("--static-map", help="Estimate the steady elongations at 6, 8, 10 and 12 V as well."),
-    ] = False,
-    hold_back: Annotated[
-        bool, typer.Option("--hold-back/--no-hold-back", help="Predict each log from a fit to the others.")
-    ] = True,
-    acc_unit: AccUnitOption = None,
-    gyro_unit: GyroUnitOption = None,
-    columns: ColumnsOption = None,
-    figures: FiguresOption = None,
-    rig: RigOption = Path("rig.yaml"),
-    as_json: JsonOption = False,
-) -> None:
-    """Identify stiffness, damping, bending, creep and the pumps from logs of motion.
-
-    Writes the sections actuator and, where a log has commands, pump. Exits 1 when the verdict is not ok.
-    """
-    from calib.core.files import check_folder, check_writable, hash_of, shown
-    from calib.core.result import section_json
-    from calib.core.rig import Rig
-    from calib.core.stage import LogOptions
-    from calib.stages.actuator.read import read_track
-    from calib.stages.actuator.results import beginning, identified_json, sections_from
-    from calib.stages.actuator.stage import identify_logs
-
-    if states and len(states) != len(paths):
-        raise UsageError(f"--states: {len(states)} files for {len(paths)} logs, expected one for each")
-    if truth and states:
-        raise UsageError("--truth: takes the true columns, --states does not apply")
-    check_writable(rig)
-    if figures is not None:
-        check_folder(figures)
-    before = Rig.load(rig, missing_ok=True)
-    nominal, stated = beginning(before)
-    options = LogOptions(acc_unit, gyro_unit, columns)
-    sources, hashes = [], {}
-    for k, path in enumerate(paths):
-        given = states[k] if states else None
-        source = read_track(path, before, rig, nominal, given, truth, no_pwm, options)
-        name = shown(path.name)
-        hashes[name if name not in hashes else f"{name} ({k + 1})"] = hash_of(path)
-        if source.states is not None:
-            hashes[shown(source.states.name)] = hash_of(source.states)
-        for sentence in source.said:
-            narrate(sentence)
-        sources.append(source)
-    with progress_bar("identifying") as progress:
-        found = identify_logs(nominal, sources, static_map, hold_back, progress, stated)
-    sections = sections_from(found, before)
-    before.with_sections(sections).save(rig, dict.fromkeys(sections, hashes))
-    narrate(f"{' and '.join(sections)} written to {shown(rig)}")
-    if figures is not None:
-        from calib.show.draw import write_figures
-        from calib.stages.actuator.plots import plots
-
-        write_figures(figures, plots(found))
-        narrate(f"figures in {shown(figures)}")
-    if as_json:
-        told = {name: section_json(section) for name, section in sections.items()}
-        document("identify", {**told, "identify": identified_json(found)})
-    else:
-        _tell(found)
-    if found.judgement.verdict != "ok":
-        raise typer.Exit(EXIT_POOR)
-
-
 def pump(
     paths: Annotated[
         list[Path], typer.Argument(metavar="TABLE...", help="Tables of time, PWM and pressure.")
@@ -293,8 +149,8 @@ def pump(
     from calib.core.files import check_folder, check_writable, hash_of, shown
     from calib.core.result import section_json
     from calib.core.rig import Rig
+    from calib.stages.actuator.pump_results import identify_pump, pump_section
     from calib.stages.actuator.read import read_pump_table
-    from calib.stages.actuator.stage import identify_pump, pump_section
 
     check_writable(rig)
     if figures is not None:
@@ -396,6 +252,6 @@ def stiffness(
         say(line)
 
 
-identify.command("logs")(telling(logs))
+identify.command("logs")(telling(verb(stage("identify logs"))))
 identify.command("pump")(telling(pump))
 identify.command("stiffness")(stiffness)

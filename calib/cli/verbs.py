@@ -92,8 +92,11 @@ def _parameters(stage: Stage) -> list[inspect.Parameter]:
 
 def _several(hint: Any) -> Any:
     """A type as typer takes it: what may be repeated is a list there."""
-    words = tuple[str, ...]
-    return list[str] if hint == words else list[str] | None if hint == words | None else hint
+    for one in (str, Path):
+        many: Any = tuple[one, ...]  # type: ignore[valid-type]  # it is a value here
+        if hint in (many, many | None):
+            return list[one] if hint == many else list[one] | None  # type: ignore[valid-type]
+    return hint
 
 
 def _run(stage: Stage, files: Files, options: Any, figures: Path | None, as_json: bool) -> None:

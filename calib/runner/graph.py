@@ -212,7 +212,7 @@ def _both(folder: Folder) -> Planned | str:
 def _identify(folder: Folder) -> Planned | str:
     logs = _logs(folder, "motion", *_CAMERA, *_PUMP)
     # A fit without each log in turn takes as many times as long, and is left to the verb.
-    return _given(logs, no_hold_back=True) if logs else "no logs with camera and PWM in logs/"
+    return _given(logs, hold_back=False) if logs else "no logs with camera and PWM in logs/"
 
 
 def _driven(folder: Folder) -> Planned | str:

@@ -30,6 +30,7 @@ STAGES = {
     "imu tune": "calib.stages.imu.stage",
     "imu drift": "calib.stages.imu.stage",
     "align": "calib.stages.align.stage",
+    "identify logs": "calib.stages.actuator.stage",
     "replay": "calib.stages.estimator.stage",
     "control run": "calib.stages.control.stage",
     "control check": "calib.stages.control.stage",

@@ -25,8 +25,8 @@ from calib.stages.actuator.identify_pump import (
     simulate_pump,
 )
 from calib.stages.actuator.pump import Orifice
+from calib.stages.actuator.pump_results import PumpFound, identify_pump, judge_pump, pump_section, unexplained
 from calib.stages.actuator.read import PumpTable, Settled, read_pump_table
-from calib.stages.actuator.stage import PumpFound, identify_pump, judge_pump, pump_section, unexplained
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,10 @@ import pytest
 import yaml
 from identifytrials import log_file, pump_records, rig_file
 
+import calib as python
 from calib.cli.simulate import simulate
 from calib.core.errors import BadInputError, UsageError
+from calib.core.rig import Rig
 from calib.io.logs import read_log
 from calib.stages.actuator.identify_pump import LAG
 from calib.stages.actuator.section import Known, KnownActuator
@@ -71,6 +73,14 @@ def test_swings_fill_the_section(calib: Run, rig: Path, swings: list[Path], tmp_
     assert (tmp_path / "figures" / "identify_motion.png").exists()
     # The simulation takes the file as it is.
     assert calib("simulate", "swing", "-o", tmp_path / "x.csv", "--rig", rig, "--duration", "1s").code == 0
+
+
+def test_the_function_returns_both_sections(rig: Path, swings: list[Path]) -> None:
+    actuator, pump = python.identify(str(swings[0].parent / "swing*.csv"), Rig.load(rig), hold_back=False)
+    assert pump is None
+    assert abs(actuator.stiffness_scale - 1.0) < 4.0 * actuator.sigma["stiffness_scale"]
+    assert set(actuator.inputs) == {path.name for path in swings}
+    assert {"motion", "residuals", "parameters"} <= set(python.plots(actuator))
 
 
 def test_no_result_is_its_own_prior(calib: Run, rig: Path, swings: list[Path], tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from calib.show.draw import draw, plain, write_figures
 from calib.stages import function, stage
 from calib.stages.actuator.identify_pump import Group, fit_static_map
 from calib.stages.actuator.plots import pump_plots
-from calib.stages.actuator.stage import PumpFound
+from calib.stages.actuator.pump_results import PumpFound
 from calib.stages.camera.bundle import Calibration, calibrate, covariance, rotation_exp
 from calib.stages.camera.checks import cell_means
 from calib.stages.camera.intrinsics import Intrinsics

@@ -11,6 +11,7 @@ from scipy.optimize import least_squares
 
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
+from calib.core.verdict import Finding, Verdict
 from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import Creep, Plant
 from calib.stages.actuator.pump import ElongationForce, Orifice, Pump, RateLimit
@@ -1438,16 +1439,6 @@ _FAR_ROWS = 0.05
 _BY_NATURE = ("lambda3",)
 
 
-@dataclass(frozen=True)
-class Judgement:
-    """Verdict "ok", "poor" or "unidentifiable", with sentences."""
-
-    verdict: str
-    reasons: tuple[str, ...]
-    remarks: tuple[str, ...]
-    advice: tuple[str, ...]
-
-
 def _bounds(solution: Solution) -> list[str]:
     out = []
     for name, value in solution.values.items():
@@ -1458,27 +1449,34 @@ def _bounds(solution: Solution) -> list[str]:
     return out
 
 
-def _of_fit(solution: Solution, known: Uncertainty, colours: Sequence[Colour]) -> tuple[list[str], list[str]]:
-    reasons, remarks = _bounds(solution), []
+def _of_fit(solution: Solution, known: Uncertainty, colours: Sequence[Colour]) -> list[Finding]:
+    out = [Finding("poor", text) for text in _bounds(solution)]
+
+    def poor(text: str) -> None:
+        out.append(Finding("poor", text))
+
+    def remark(text: str) -> None:
+        out.append(Finding("remark", text))
+
     if known.scale > _MOST_SCALE:
-        reasons.append(
+        poor(
             f"the residuals are {known.scale:.1f} times what the sensor's noise explains; the model misses "
             "something, or the camera's jitter is larger than the rig's file says"
         )
     worst = max(known.inflation, key=lambda n: known.inflation[n])
     if known.inflation[worst] > _MOST_INFLATION:
-        reasons.append(
+        poor(
             f"the residuals are so coloured that the deviation of {worst} had to be raised "
             f"{known.inflation[worst]:.1f} times"
         )
     for colour in colours:
         if not colour.white:
-            remarks.append(
+            remark(
                 f"{colour.name}: residuals are not white ({100.0 * colour.outside:.0f} % of the lags outside "
                 f"the 95 % band, {max(colour.first, key=abs):+.2f} from row to row); deviations are raised"
             )
         if colour.share_far > _FAR_ROWS:
-            reasons.append(f"{colour.name}: {100.0 * colour.share_far:.0f} % of the poses are far off")
+            poor(f"{colour.name}: {100.0 * colour.share_far:.0f} % of the poses are far off")
     names = solution.problem.names
     close = [
         f"{names[i]} and {names[j]} {float(known.correlation[i, j]):+.2f}"
@@ -1487,10 +1485,10 @@ def _of_fit(solution: Solution, known: Uncertainty, colours: Sequence[Colour]) -
         if abs(float(known.correlation[i, j])) > _STRONG
     ]
     if close:
-        remarks.append(f"hardly told apart, by their correlation: {', '.join(close)}")
+        remark(f"hardly told apart, by their correlation: {', '.join(close)}")
     if solution.starts > 1 and solution.agreeing == 1:
-        remarks.append(f"one of {solution.starts} starts alone came to this minimum; there may be others")
-    return reasons, remarks
+        remark(f"one of {solution.starts} starts alone came to this minimum; there may be others")
+    return out
 
 
 def judge(
@@ -1499,34 +1497,39 @@ def judge(
     colours: Sequence[Colour],
     held: Sequence[HeldLog],
     next_ones: Sequence[Prospect],
-) -> Judgement:
+) -> Verdict:
     """Judge an identification from what was computed of it."""
-    blind = {name: why for name, why in solution.fixed.items() if "enter only" not in why}
-    reasons = [f"{name} is not identifiable from these logs: {why}" for name, why in blind.items()]
-    remarks = [why for why in solution.fixed.values() if "enter only" in why]
+    out = []
+    for name, why in solution.fixed.items():
+        if "enter only" in why:
+            out.append(Finding("remark", why))
+        else:
+            out.append(Finding("unidentifiable", f"{name} is not identifiable from these logs: {why}"))
     fixed = [name for name, sigma in solution.problem.stated.items() if not sigma]
+    if fixed:
+        out.append(Finding("remark", f"not estimated, for known states it: {', '.join(fixed)}"))
     priors = [solution.problem.names[k] for k, _, _ in solution.problem.priors]
-    remarks += [f"not estimated, for known states it: {', '.join(fixed)}"] if fixed else []
-    remarks += [f"known with a standard deviation, which went in: {', '.join(priors)}"] if priors else []
+    if priors:
+        out.append(Finding("remark", f"known with a standard deviation, which went in: {', '.join(priors)}"))
     for name, value in solution.values.items():
         relative = known.sigma[name] / max(abs(value), 1e-12)
         if relative > _MOST_RELATIVE:
-            reasons.append(f"{name} is known to {100.0 * relative:.0f} % only")
-    more, said = _of_fit(solution, known, colours)
+            out.append(Finding("poor", f"{name} is known to {100.0 * relative:.0f} % only"))
+    out += _of_fit(solution, known, colours)
     for log in held:
         if log.held_phi_rad > _MOST_HELD * log.fitted_phi_rad + 1e-4:
-            more.append(
+            text = (
                 f"{log.name}: held back, its angle is predicted to {1e3 * log.held_phi_rad:.3g} mrad, "
                 f"fitted to {1e3 * log.fitted_phi_rad:.3g} mrad"
             )
+            out.append(Finding("poor", text))
     if not held:
-        said.append("one log alone: nothing is left to check the parameters on")
-    advice = []
+        out.append(Finding("remark", "one log alone: nothing is left to check the parameters on"))
     if next_ones:
         best = next_ones[0]
-        advice.append(
+        advice = (
             f"next experiment: {best.name} ({best.what}); it would leave {best.worst} as the least known, "
             f"to {100.0 * best.worst_relative:.2g} %"
         )
-    verdict = "unidentifiable" if blind else "poor" if reasons or more else "ok"
-    return Judgement(verdict, tuple(reasons + more), tuple(remarks + said), tuple(advice))
+        out.append(Finding("remark", "", advice))
+    return Verdict.of(out)

@@ -25,8 +25,8 @@ from calib.core.plot import (
 )
 from calib.stages.actuator.identify import PARAMETERS, StiffnessFit
 from calib.stages.actuator.identify_pump import LAG, ORIFICE, simulate_pump
-from calib.stages.actuator.results import Identified
-from calib.stages.actuator.stage import PumpFound, simulated_heads
+from calib.stages.actuator.pump_results import PumpFound
+from calib.stages.actuator.results import Identified, simulated_heads
 from calib.stages.actuator.validate import IMPROVED, NOMINAL, ORIGINAL, QUANTITIES, Comparison
 
 _HUES = ("blue", "green", "orange", "grey")
@@ -72,7 +72,7 @@ def _motion(result: Identified) -> Figure:
             panels.append(
                 Plot("time (s)", y, marks, "" if column else short(track.name, 40), y_limits=limits)
             )
-    high, verdict = 2.0 * len(tracks) + 0.3, result.judgement.verdict
+    high, verdict = 2.0 * len(tracks) + 0.3, result.verdict.word
     return Figure("Simulated against measured", note, panels, high, verdict, columns=2)
 
 
@@ -105,7 +105,7 @@ def _residuals(result: Identified) -> Figure:
         Plot("lag (rows)", "correlation", (Band("y", -white, white), *marks)),
         Plot("residual / deviation", "density", (replace(bars, colour="silver"), normal)),
     )
-    return Figure("Residuals", note, panels, 3.5, result.judgement.verdict, columns=2)
+    return Figure("Residuals", note, panels, 3.5, result.verdict.word, columns=2)
 
 
 def _parameters(result: Identified) -> Figure:
@@ -140,7 +140,7 @@ def _damping(result: Identified) -> Figure:
             title = f"{short(track.name, 30)}: zeta {d.zeta:.4f} +- {d.sigma:.1g}{fitted}"
             panels.append(Plot("time (s)", "angle (rad)", marks, title, y_limits=(-top, top)))
     whole = panels or (Plot(empty="no free swing with enough peaks"),)
-    return Figure("Damping by peaks", note, whole, 2.1 * len(whole), result.judgement.verdict)
+    return Figure("Damping by peaks", note, whole, 2.1 * len(whole), result.verdict.word)
 
 
 def stiffness_plots(

@@ -1,4 +1,4 @@
-"""The sections `actuator` and `pump` of rig.yaml: a rig to start an identification from, and its results."""
+"""Identification from logs: the machine it starts from, all that it finds, and the sections of rig.yaml."""
 
 from __future__ import annotations
 
@@ -9,24 +9,38 @@ from typing import Any
 
 import numpy as np
 
-from calib.core.result import CovarianceTable, finite_or_none, section_json
+from calib.core.arrays import FloatArray
+from calib.core.errors import BadInputError
+from calib.core.result import CovarianceTable, finite_or_none, judged, section_json
 from calib.core.rig import Rig
+from calib.core.verdict import Verdict
 from calib.stages.actuator.identify import (
     PARAMETERS,
     Colour,
     Decrement,
     HeldLog,
-    Judgement,
+    Progress,
     Prospect,
     Solution,
     StiffnessFit,
     Uncertainty,
+    colour_of,
+    decrement,
     elongation_polynomial,
+    fit_tracks,
+    heads_of,
+    held_back,
+    judge,
+    prospects,
+    rms_by_track,
+    starts_of,
+    uncertainty,
     values_of,
 )
 from calib.stages.actuator.identify_pump import LAG
 from calib.stages.actuator.machine import Machine, machine_from
 from calib.stages.actuator.parameters import Stiffness
+from calib.stages.actuator.read import TrackSource
 from calib.stages.actuator.section import CREEP, KNOTS, LAW, Actuator, Known, PumpSection, in_force
 
 
@@ -42,7 +56,7 @@ class Identified:
     prospects: tuple[Prospect, ...]
     decrements: Mapping[str, tuple[Decrement, float | None]]
     sources: Mapping[str, str]
-    judgement: Judgement
+    verdict: Verdict
 
 
 def beginning(rig: Rig) -> tuple[Machine, dict[str, float]]:
@@ -88,6 +102,73 @@ _OF_TABLES = ("tick_s", "supply_V", "dead_zone_V")
 """Values of the pumps that logs do not tell."""
 
 
+def simulated_heads(solution: Solution) -> list[FloatArray]:
+    """Angle [rad] and length [m] (m, 2) of the identified rig at each log's poses, the offsets with them."""
+    problem = solution.problem
+    layout, starts = problem.layout, starts_of(problem, solution.x)
+    out = []
+    for k, track in enumerate(problem.tracks):
+        delay = float(solution.x[layout.delay + layout.delays[k]])
+        head, _ = heads_of(
+            track, problem.nominal, [problem.values(solution.x)], [starts[k]], delay, problem.threads
+        )
+        out.append(np.asarray(head[0] + solution.x[layout.offset : layout.delay]))
+    return out
+
+
+def _decrements(solution: Solution) -> dict[str, tuple[Decrement, float | None]]:
+    """Damping of the free swings by peaks, and that of the fitted swing by the same rule."""
+    out: dict[str, tuple[Decrement, float | None]] = {}
+    for track, head in zip(solution.problem.tracks, simulated_heads(solution), strict=True):
+        if track.hoses:
+            continue
+        noise = float(np.median(np.sqrt(np.sum(np.linalg.inv(track.whitening)[:, 0] ** 2, axis=1))))
+        try:
+            seen = decrement(track.t_s, track.head[:, 0], noise)
+        except BadInputError:
+            continue
+        try:
+            fitted = decrement(track.t_s, head[:, 0], noise).zeta
+        except BadInputError:
+            fitted = None
+        out[track.name] = (seen, fitted)
+    return out
+
+
+def identify_logs(
+    nominal: Machine,
+    sources: Sequence[TrackSource],
+    static_map: bool = False,
+    hold_back: bool = True,
+    progress: Progress | None = None,
+    stated: Mapping[str, float] | None = None,
+) -> Identified:
+    """Parameters of the actuator and the pumps from logs, with all that says what they are worth.
+
+    `nominal` and `stated` are those of `beginning`.
+
+    Raises `BadInputError` where the logs can tell nothing.
+    """
+    delay_s = float(np.median([source.delay_s for source in sources]))
+    tracks = [source.track for source in sources]
+    solution = fit_tracks(nominal, tracks, static_map, delay_s, progress=progress, stated=stated)
+    known = uncertainty(solution)
+    colours = colour_of(solution)
+    held = held_back(solution) if hold_back else []
+    ahead = prospects(solution, known)
+    return Identified(
+        solution,
+        known,
+        colours,
+        tuple(rms_by_track(solution.problem, solution.residual)),
+        tuple(held),
+        ahead,
+        _decrements(solution),
+        {source.track.name: source.source for source in sources},
+        judge(solution, known, colours, held, ahead),
+    )
+
+
 def _delay(found: Identified) -> tuple[float, float] | None:
     """Dead time of the pumps [s] beyond that of the rig's file, and its deviation; None without pumps."""
     problem = found.solution.problem
@@ -107,18 +188,13 @@ def _sigma_of(known: Uncertainty, names: list[str]) -> dict[str, Any]:
     return {name: finite_or_none(known.sigma[name]) for name in names if name in known.sigma}
 
 
-def sections_from(found: Identified, rig: Rig) -> dict[str, Actuator | PumpSection]:
-    """The sections of an identification; `pump` is there only when a log has commands.
+def sections_from(found: Identified, rig: Rig) -> tuple[Actuator, PumpSection | None]:
+    """The sections of an identification; that of the pumps only where a log has commands.
 
     Of what the file says, the springs stay, and the damping that no log here can tell.
     """
     values, uncertainty = found.solution.values, found.uncertainty
-    judged: dict[str, Any] = {
-        "verdict": found.judgement.verdict,
-        "reasons": list(found.judgement.reasons),
-        "remarks": list(found.judgement.remarks),
-        "advice": list(found.judgement.advice),
-    }
+    judgement = judged(found.verdict)
     problem = found.solution.problem
     names = list(problem.names)
     kinds = {track.hoses for track in problem.tracks}
@@ -133,12 +209,8 @@ def sections_from(found: Identified, rig: Rig) -> dict[str, Actuator | PumpSecti
     section |= {name: values[name] for name in mine}
     sigma |= _sigma_of(uncertainty, mine)
     table = CovarianceTable(order=names, values=uncertainty.covariance.tolist())
-    out: dict[str, Actuator | PumpSection] = {
-        "actuator": Actuator(**section, sigma=sigma, covariance=table, **judged)
-    }
-    if True in kinds:
-        out["pump"] = _pump(found, rig, judged)
-    return out
+    actuator = Actuator(**section, sigma=sigma, covariance=table, **judgement).with_evidence(found)
+    return actuator, _pump(found, rig, judgement).with_evidence(found) if True in kinds else None
 
 
 def _kept(
@@ -151,7 +223,7 @@ def _kept(
     return values, {key: before.sigma[key] for key in values if key in before.sigma}
 
 
-def _pump(found: Identified, rig: Rig, judged: dict[str, Any]) -> PumpSection:
+def _pump(found: Identified, rig: Rig, judgement: dict[str, Any]) -> PumpSection:
     values, uncertainty = found.solution.values, found.uncertainty
     problem = found.solution.problem
     nominal = problem.nominal
@@ -186,7 +258,7 @@ def _pump(found: Identified, rig: Rig, judged: dict[str, Any]) -> PumpSection:
             )
     identified = None if rig.pump is None else rig.pump.identified
     return PumpSection(
-        **section, sigma=sigma, identified=identified, **judged | {"remarks": remarks, "advice": []}
+        **section, sigma=sigma, identified=identified, **judgement | {"remarks": remarks, "advice": []}
     )
 
 

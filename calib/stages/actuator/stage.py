@@ -1,402 +1,198 @@
-"""Identification of actuator and pumps, from files to sections."""
+"""The stage of the actuator: stiffness, damping, bending, creep and the pumps from logs of motion."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
+from calib.core.errors import UsageError
+from calib.core.stage import Files, LogOptions, Stage, option
 
-from calib.core.arrays import FloatArray
-from calib.core.errors import BadInputError
-from calib.core.result import finite_or_none, section_json
-from calib.core.rig import Rig
-from calib.stages.actuator.identify import (
-    Decrement,
-    Progress,
-    Solution,
-    colour_of,
-    decrement,
-    fit_tracks,
-    heads_of,
-    held_back,
-    judge,
-    prospects,
-    rms_by_track,
-    starts_of,
-    uncertainty,
-)
-from calib.stages.actuator.identify_pump import (
-    LAG,
-    MODELS,
-    ORIFICE,
-    Departure,
-    Group,
-    Held,
-    Parameter,
-    PumpFit,
-    PumpRecord,
-    Shape,
-    StaticMap,
-    cross_validate,
-    departures,
-    fit_pump,
-    fit_static_map,
-    jumps,
-    rms_ahead,
-    rms_of,
-    settled_groups,
-)
-from calib.stages.actuator.machine import Machine
-from calib.stages.actuator.parameters import SUPPLY_V
-from calib.stages.actuator.pump import PWM_MAX, TICK_S
-from calib.stages.actuator.read import PumpTable, TrackSource
-from calib.stages.actuator.results import Identified
-from calib.stages.actuator.section import KnownPump, PumpIdentified, PumpModel, PumpSection, StaticMapSection
+if TYPE_CHECKING:
+    from calib.core.plot import Figure
+    from calib.core.rig import Rig
+    from calib.core.stage import Progress
+    from calib.core.words import Block
+    from calib.stages.actuator.machine import Machine
+    from calib.stages.actuator.read import TrackSource
+    from calib.stages.actuator.results import Identified
+    from calib.stages.actuator.section import Actuator, PumpSection
 
-# ----------------------------------------------------------------------
-# The whole identification of a rig from its logs, and of a pump from its tables, step by step.
+    Sections = tuple[Actuator, PumpSection | None]
 
 
-def simulated_heads(solution: Solution) -> list[FloatArray]:
-    """Angle [rad] and length [m] (m, 2) of the identified rig at each log's poses, the offsets with them."""
-    problem = solution.problem
-    layout, starts = problem.layout, starts_of(problem, solution.x)
-    out = []
-    for k, track in enumerate(problem.tracks):
-        delay = float(solution.x[layout.delay + layout.delays[k]])
-        head, _ = heads_of(
-            track, problem.nominal, [problem.values(solution.x)], [starts[k]], delay, problem.threads
-        )
-        out.append(np.asarray(head[0] + solution.x[layout.offset : layout.delay]))
-    return out
+@dataclass(frozen=True)
+class LogsOptions(LogOptions):
+    """Where the pose comes from, and what is estimated."""
 
-
-def _decrements(solution: Solution) -> dict[str, tuple[Decrement, float | None]]:
-    """Damping of the free swings by peaks, and that of the fitted swing by the same rule."""
-    out: dict[str, tuple[Decrement, float | None]] = {}
-    for track, head in zip(solution.problem.tracks, simulated_heads(solution), strict=True):
-        if track.hoses:
-            continue
-        noise = float(np.median(np.sqrt(np.sum(np.linalg.inv(track.whitening)[:, 0] ** 2, axis=1))))
-        try:
-            seen = decrement(track.t_s, track.head[:, 0], noise)
-        except BadInputError:
-            continue
-        try:
-            fitted = decrement(track.t_s, head[:, 0], noise).zeta
-        except BadInputError:
-            fitted = None
-        out[track.name] = (seen, fitted)
-    return out
-
-
-def identify_logs(
-    nominal: Machine,
-    sources: Sequence[TrackSource],
-    static_map: bool = False,
-    hold_back: bool = True,
-    progress: Progress | None = None,
-    stated: Mapping[str, float] | None = None,
-) -> Identified:
-    """Parameters of the actuator and the pumps from logs, with all that says what they are worth.
-
-    `nominal` and `stated` are those of `results.beginning`.
-
-    Raises `BadInputError` where the logs can tell nothing.
-    """
-    delay_s = float(np.median([source.delay_s for source in sources]))
-    tracks = [source.track for source in sources]
-    solution = fit_tracks(nominal, tracks, static_map, delay_s, progress=progress, stated=stated)
-    known = uncertainty(solution)
-    colours = colour_of(solution)
-    held = held_back(solution) if hold_back else []
-    ahead = prospects(solution, known)
-    return Identified(
-        solution,
-        known,
-        colours,
-        tuple(rms_by_track(solution.problem, solution.residual)),
-        tuple(held),
-        ahead,
-        _decrements(solution),
-        {source.track.name: source.source for source in sources},
-        judge(solution, known, colours, held, ahead),
+    states: tuple[Path, ...] | None = option(
+        None, "States of calib replay to use instead of the pictures, for the logs in turn."
+    )
+    truth: bool = option(False, "Take the true columns of a simulated log, to test the method.")
+    no_pwm: bool = option(False, "Logs without commands are swings with the hoses off.")
+    static_map: bool = option(False, "Estimate the steady elongations at 6, 8, 10 and 12 V as well.")
+    hold_back: bool = option(
+        True, "Predict each log from a fit to the others.", flag="hold-back/--no-hold-back"
     )
 
 
 @dataclass(frozen=True)
-class PumpFound:
-    """Everything that `calib identify pump` has found.
+class LogsInputs:
+    """Tracks, the machine to start from, and what a person states of it with standard deviations.
 
     Attributes
     ----------
-    unit : of the values. records : recordings over time.
-    fits, held : by model. asked : errors on recordings that were kept out on purpose, by model.
-    maps : static maps. groups, departs, leaps : what is not explained.
+    rig : holds what logs do not tell.
     """
 
-    unit: str
-    records: tuple[PumpRecord, ...]
-    fits: dict[str, PumpFit]
-    held: dict[str, list[Held]]
-    asked: dict[str, list[Held]]
-    maps: tuple[StaticMap, ...]
-    groups: tuple[Group, ...]
-    departs: tuple[Departure, ...]
-    leaps: tuple[tuple[str, float, float], ...]
-    said: tuple[str, ...]
-
-    @property
-    def main_group(self) -> Group | None:
-        """The largest group of runs, None where all settle alike or too few do."""
-        if len(self.groups) < 2:
-            return None
-        return max(self.groups, key=lambda g: len(g.names))
-
-    def held_rms(self, model: str, names: Sequence[str] | None = None) -> float | None:
-        """RMS over recordings that were not fitted, each counting alike; None without any."""
-        some = [h.rms for h in self.held[model] if names is None or h.name in names]
-        return float(np.sqrt(np.mean(np.square(some)))) if some else None
-
-    @property
-    def better(self) -> str | None:
-        """The model with the smaller error on recordings not fitted; None without recordings."""
-        if not self.fits:
-            return None
-        return min(self.fits, key=lambda m: self.held_rms(m) or self.fits[m].rms)
+    tracks: Sequence[TrackSource]
+    nominal: Machine
+    stated: Mapping[str, float]
+    rig: Rig
+    options: LogsOptions
+    progress: Progress
 
 
-def _chosen_shape(records: Sequence[PumpRecord], maps: Sequence[StaticMap]) -> Shape:
-    """The static map's shape that lets the plain lag fit best: a straight line, or one of the tables'."""
-    rising = [m for m in maps if m.end * float(np.median([r.value[-1] for r in records])) > 0.0]
-    shapes = [Shape(), *(m.shape for m in rising)]
-    if len(shapes) == 1:
-        return shapes[0]
-    # Judged by the model that a drop of the PWM can tell anything about.
-    costs = [fit_pump(records, LAG, shape).cost for shape in shapes]
-    return shapes[int(np.argmin(costs))]
+def _read(files: Files, rig: Rig, options: LogsOptions) -> LogsInputs:
+    from calib.stages import expanded
+    from calib.stages.actuator.read import read_track
+    from calib.stages.actuator.results import beginning
+
+    states = expanded(options.states)
+    if states and len(states) != len(files.paths):
+        raise UsageError(f"--states: {len(states)} files for {len(files.paths)} logs, expected one for each")
+    if options.truth and states:
+        raise UsageError("--truth: takes the true columns, --states does not apply")
+    nominal, stated = beginning(rig)
+    tracks = []
+    for k, path in enumerate(files.paths):
+        given = states[k] if states else None
+        track = read_track(path, rig, files.rig_path, nominal, given, options.truth, options.no_pwm, options)
+        files.taken(path)
+        if track.states is not None:
+            files.taken(track.states)
+        files.remarks += track.said
+        tracks.append(track)
+    return LogsInputs(tracks, nominal, stated, rig, options, files.progress)
 
 
-def identify_pump(
-    tables: Sequence[PumpTable], kept_out: Sequence[PumpTable] = (), progress: Progress | None = None
-) -> PumpFound:
-    """Dead time, lag, static map and flow of a pump, both models compared on recordings not fitted.
+def _solve(inputs: LogsInputs) -> Sections:
+    from calib.stages.actuator.results import identify_logs, sections_from
 
-    Parameters
-    ----------
-    kept_out : tables that are predicted and not fitted.
-
-    Raises
-    ------
-    BadInputError for tables of different units, and where nothing changes in any.
-    """
-    units = {table.unit for table in (*tables, *kept_out)}
-    if len(units) != 1:
-        raise BadInputError(f"pump: found tables in {' and '.join(sorted(units))}, expected one unit")
-    said = [sentence for table in tables for sentence in table.said]
-    records = []
-    for table in tables:
-        record = table.record
-        if record is None:
-            continue
-        if not np.ptp(record.pwm) and float(np.ptp(record.value)) < 1e-9:
-            said.append(f"{record.name}: neither PWM nor value ever changes; left out")
-            continue
-        records.append(record)
-    settled = [part for table in tables for part in table.settled]
-    maps = [fit_static_map(part.name, part.pwm, part.value) for part in settled]
-    if not records and not maps:
-        raise BadInputError("pump: neither PWM nor value ever changes in these tables, expected steps")
-    fits: dict[str, PumpFit] = {}
-    held: dict[str, list[Held]] = {}
-    asked: dict[str, list[Held]] = {}
-    if records:
-        shape = _chosen_shape(records, maps)
-        for done, model in enumerate(MODELS):
-            if progress is not None:
-                progress(done, len(MODELS))
-            fits[model] = fit_pump(records, model, shape)
-            held[model] = cross_validate(fits[model], records)
-            outside = [table.record for table in kept_out if table.record is not None]
-            asked[model] = [Held(r.name, rms_of(fits[model], r), rms_ahead(fits[model], r)) for r in outside]
-    return PumpFound(
-        units.pop(),
-        tuple(records),
-        fits,
-        held,
-        asked,
-        tuple(maps),
-        settled_groups(records) if records else (),
-        departures(fits[ORIFICE], records) if records else (),
-        jumps(records),
-        tuple(said),
-    )
-
-
-# ----------------------------------------------------------------------
-# What was found of a pump, judged and as the section `pump` of rig.yaml.
-
-_MOST_SHARE = 0.05
-_MOST_VAGUE = 0.5
-_FREE = 1e5
-
-
-def unexplained(found: PumpFound) -> list[str]:
-    """Sentences on what no function of the PWM explains."""
-    out, unit = [], found.unit
-    main = found.main_group
-    if main is not None:
-        parts = [
-            f"{len(g.names)} at {g.value:.1f} {unit} ({', '.join(g.names)}; "
-            f"PWM {g.pwm[0]:.0f} .. {g.pwm[1]:.0f})"
-            for g in found.groups
-        ]
-        out.append(f"runs near full PWM settle apart: {'; '.join(parts)}; PWM does not say which")
-    for d in found.departs:
-        moved = "after the PWM had moved" if d.pwm_moved else "while the PWM stood still"
-        out.append(
-            f"{d.name} leaves the model {d.at_s:.2f} s after its start, {moved}, by {d.error:+.2f} {unit}"
+    options = inputs.options
+    with inputs.progress("identifying") as progress:
+        found = identify_logs(
+            inputs.nominal, inputs.tracks, options.static_map, options.hold_back, progress, inputs.stated
         )
-    for name, size, before in found.leaps:
-        out.append(
-            f"{name} begins with a jump of {size:.1f} {unit} within 0.1 s from {before:.2f} {unit}, as if "
-            "the chamber had been under pressure behind a closed valve"
+    return sections_from(found, inputs.rig)
+
+
+def _evidence(outcome: Sections | Actuator | PumpSection) -> Identified:
+    one = outcome[0] if isinstance(outcome, tuple) else outcome
+    found: Identified = one.evidence
+    return found
+
+
+def _document(sections: Sections) -> dict[str, Any]:
+    from calib.stages.actuator.results import identified_json
+
+    return {"identify": identified_json(_evidence(sections))}
+
+
+def _words(sections: Sections) -> list[Block]:
+    """What the logs tell of each parameter, how the parameters hang together, and how well each log fits."""
+    from calib.core.words import BLANK, Line, Table
+    from calib.stages.actuator.identify import PARAMETERS
+
+    found = _evidence(sections)
+    solution, known = found.solution, found.uncertainty
+    rows = [
+        (
+            name,
+            f"{value:.5g}",
+            f"{known.sigma[name]:.2g}",
+            PARAMETERS[name].unit or BLANK,
+            PARAMETERS[name].symbol,
+            f"{known.inflation[name]:.1f}",
         )
-    for m in found.maps:
-        if m.outliers:
-            values = ", ".join(f"{u:g}" for u in m.outliers)
-            out.append(
-                f"{m.name}: the settled values at PWM {values} lie off the map by more than four scatters"
-            )
-    return out
-
-
-def judge_pump(found: PumpFound) -> tuple[str, list[str], list[str]]:
-    """Verdict, reasons and remarks."""
-    reasons, remarks = unexplained(found), list(dict.fromkeys(found.said))
-    if not found.fits:
-        remarks.append(
-            "settled values alone: neither dead time nor lag can be told, expected a recording over time"
-        )
-        return "unidentifiable" if not found.maps else "poor" if reasons else "ok", reasons, remarks
-    better = found.better
-    assert better is not None
-    fit = found.fits[better]
-    span = max(float(r.value.max() - r.value.min()) for r in found.records)
-    rms = found.held_rms(better)
-    if rms is None:
-        remarks.append("one recording alone: no error on recordings not fitted")
-    elif rms > _MOST_SHARE * span:
-        reasons.append(
-            f"on recordings not fitted the {better} is off by {rms:.2f} {found.unit} (RMS), "
-            f"{100.0 * rms / span:.0f} % of the range"
-        )
-    for name, sigma in fit.sigma.items():
-        value = abs(fit.values[name])
-        if (
-            name not in ("laminar_s", "turbulent_s2", "hose_per_s", "chamber_s")
-            and sigma > _MOST_VAGUE * value
-        ):
-            reasons.append(
-                f"{name} of the {better} is known to {100.0 * sigma / max(value, 1e-12):.0f} % only"
-            )
-    if found.fits[LAG].shape.dead_pwm == 0.0:
-        remarks.append(
-            "dead zone and shape of the static map are not told by these recordings; it is taken as a "
-            "straight line through zero (settled values at several PWM tell it)"
-        )
-    return "poor" if reasons else "ok", reasons, remarks
-
-
-def _unit(parameter: Parameter, unit: str) -> str:
-    if parameter.name == "rising_limit_per_s":
-        return f"{unit}/s"
-    return {"y": unit, "1/y": f"s^2/{unit}"}.get(parameter.unit, parameter.unit)
-
-
-def parameter_rows(fit: PumpFit, unit: str) -> list[tuple[str, float, float | None, str, str]]:
-    """Name, value, standard deviation, unit and remark of each parameter."""
-    rows = []
-    for parameter in MODELS[fit.model]:
-        value = fit.values[parameter.name]
-        rows.append(
+        for name, value in solution.values.items()
+    ]
+    blocks: list[Block] = [
+        Table(("parameter", "value", "sigma", "unit", "symbol", "raised"), tuple(rows)),
+        Line("sigma is one standard deviation; raised, by how much for coloured residuals"),
+    ]
+    names = solution.problem.names
+    if len(names) > 1:
+        matrix = [(n, *(f"{c:+.2f}" for c in row)) for n, row in zip(names, known.correlation, strict=True)]
+        blocks.append(Table(("correlation", *(PARAMETERS[n].symbol for n in names)), tuple(matrix)))
+    blocks += [Line(f"fixed: {name}: {why}") for name, why in solution.fixed.items()]
+    held = {one.name: one for one in found.held}
+    fits = []
+    for track, (phi, length), colour in zip(solution.problem.tracks, found.rms, found.colours, strict=True):
+        one = held.get(track.name)
+        fits.append(
             (
-                parameter.name,
-                value,
-                fit.sigma.get(parameter.name),
-                _unit(parameter, unit),
-                fit.fixed.get(parameter.name, ""),
+                track.name,
+                "on" if track.hoses else "off",
+                str(len(track.t_s)),
+                f"{1e3 * phi:.3g}",
+                f"{1e3 * length:.3g}",
+                BLANK if one is None else f"{1e3 * one.held_phi_rad:.3g}",
+                BLANK if one is None else f"{1e3 * one.held_length_m:.3g}",
+                "yes" if colour.white else f"no ({100.0 * colour.outside:.0f} %)",
             )
         )
-    return rows
+    head = ("RMS of", "hoses", "poses", "phi, mrad", "length, mm", "held phi", "held length", "white")
+    blocks.append(Table(head, tuple(fits)))
+    if found.decrements:
+        peaks = []
+        for name, (d, of_fit) in found.decrements.items():
+            fitted = BLANK if of_fit is None else f"{of_fit:.4f}"
+            cells = (f"{d.zeta:.4f}", f"{d.sigma:.1g}", fitted, f"{d.frequency_hz:.3f}", str(d.outliers))
+            peaks.append((name, *cells))
+        columns = ("damping of", "zeta by peaks", "sigma", "of the fit", "f, Hz", "outliers")
+        blocks.append(Table(columns, tuple(peaks)))
+    if found.prospects:
+        after = [(one.name, one.worst, f"{100.0 * one.worst_relative:.2g} %") for one in found.prospects]
+        blocks.append(Table(("after one more", "least known", "relative sigma"), tuple(after)))
+    return blocks
 
 
-def _model(found: PumpFound, name: str) -> PumpModel:
-    fit, main = found.fits[name], found.main_group
-    held = found.held[name]
-    return PumpModel(
-        parameters={n: v for n, v in fit.values.items() if n in fit.sigma},
-        sigma={n: finite_or_none(s) for n, s in fit.sigma.items()},
-        fixed=fit.fixed,
-        fitted_rms=fit.rms,
-        held_rms=found.held_rms(name),
-        held_rms_in_main_group=None if main is None else found.held_rms(name, main.names),
-        held_by_file={h.name: h.rms for h in held},
-        ahead_by_file={h.name: finite_or_none(h.ahead) for h in held},
-    )
+def _plots(outcome: Sections | Actuator | PumpSection) -> dict[str, Figure]:
+    """Figures of an identification; each of its sections has them all."""
+    from calib.stages.actuator.plots import plots
+
+    return plots(_evidence(outcome))
 
 
-def pump_section(found: PumpFound, rig: Rig) -> PumpSection:
-    """The section, with lag and dead time of the linear model where a recording tells them.
+logs = Stage(
+    "identify logs",
+    "Model of the actuator",
+    """Identify stiffness, damping, bending, creep and the pumps from logs of motion.
 
-    Levels in kPa are no forces: they stay under `identified`. What logs have told of forces stays.
-    """
-    verdict, reasons, remarks = judge_pump(found)
-    before: dict[str, Any] = {} if rig.pump is None else section_json(rig.pump)
-    stated = rig.known.pump if rig.known is not None and rig.known.pump is not None else KnownPump()
-    update: dict[str, Any] = {"verdict": verdict, "reasons": reasons, "remarks": remarks, "advice": []}
-    sigma: dict[str, Any] = before.get("sigma", {})
-    if found.fits:
-        lag = found.fits[LAG]
-        tick_s = stated.tick_s or before.get("tick_s", TICK_S)
-        update |= {
-            "lag_s": lag.values["lag_s"],
-            "delay_ticks": round(lag.values["dead_time_s"] / tick_s),
-        }
-        sigma |= {"lag_s": lag.sigma["lag_s"], "delay_ticks": lag.sigma["dead_time_s"] / tick_s}
-        dead = lag.shape.dead_pwm
-        if dead > 0.0:
-            of = [m for m in found.maps if m.shape == lag.shape]
-            supply = stated.supply_V or before.get("supply_V", SUPPLY_V)
-            update["dead_zone_V"] = supply * dead / PWM_MAX
-            sigma["dead_zone_V"] = finite_or_none(supply * of[0].sigma["dead_pwm"] / PWM_MAX) if of else None
-    maps = {
-        m.name: StaticMapSection(
-            end=m.end,
-            dead_pwm=m.shape.dead_pwm,
-            scale_pwm=m.shape.scale_pwm,
-            saturates_pwm=m.saturates_pwm,
-            scatter=m.scatter,
-            sigma={k: finite_or_none(s) for k, s in m.sigma.items()},
-            outliers_pwm=list(m.outliers),
-        )
-        for m in found.maps
-        if math.isfinite(m.shape.scale_pwm)
-    }
-    identified = PumpIdentified.model_validate(
-        {
-            "unit": found.unit,
-            "models": {name: _model(found, name) for name in found.fits},
-            "better": found.better,
-            "static": maps,
-            "groups": [
-                {"value": g.value, "spread": g.spread, "pwm": list(g.pwm), "files": list(g.names)}
-                for g in found.groups
-            ],
-            "unexplained": unexplained(found),
-        }
-    )
-    return PumpSection.model_validate(before | update | {"sigma": sigma, "identified": identified})
+    Writes the sections actuator and, where a log has commands, pump. Exits 1 when the verdict is not ok.
+    """,
+    _read,
+    _solve,
+    LogsOptions,
+    sources="Logs of camera and commands.",
+    metavar="LOG...",
+    writes=("actuator", "pump"),
+    uses=(
+        "camera",
+        "plane",
+        "imu",
+        "imu_intrinsics",
+        "align",
+        "estimator",
+        "geometry",
+        "known",
+        "actuator",
+        "pump",
+    ),
+    document=_document,
+    words=_words,
+    plots=_plots,
+)
