@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from calib.io.serial import Inputs
-from calib.stages.firmware.conformance import FusedReference, Outputs, Reference, binary32
+from calib.stages.firmware.conformance import FusedReference, Reference, binary32
 from calib.stages.firmware.header import Header, verbatim
 from calib.stages.firmware.vectors import TOLERANCE, selftest_text
 
@@ -101,8 +101,7 @@ def avr(folder: Path, *flags: str) -> tuple[list[str], dict[str, int]]:
 
 def pack(given: Inputs) -> bytes:
     """The record that program.c takes."""
-    numbers = (given.u_px, given.v_px, given.ax_mps2, given.ay_mps2, given.gz_radps, *given.reference)
-    return struct.pack("<7f3B", *numbers, given.marker_seen, given.imu_read, given.mode)
+    return struct.pack("<7f3B", *given.numbers, given.marker_seen, given.imu_read, given.mode)
 
 
 @dataclass(frozen=True)
@@ -190,11 +189,6 @@ class Process:
         self.process.stdout.close()
 
 
-def numbers(wanted: Outputs) -> list[float]:
-    """The nine numbers of the reference in the order of `Ticks.numbers`."""
-    return [wanted.phi_rad, *wanted.marker_m, *wanted.head_m, *wanted.q_m, *wanted.pwm]
-
-
 def compare(
     header: Header,
     ticks: Sequence[Inputs],
@@ -216,7 +210,7 @@ def compare(
         assert out.flags == found.flags[k], said
         undecided = max(undecided, out.undecided_pwm)
         assert out.undecided_m <= 1e-6, (k, out.undecided_m)
-        wanted.append(numbers(out))
+        wanted.append(out.numbers)
     return np.abs(found.numbers - np.array(wanted)).max(axis=0), undecided
 
 

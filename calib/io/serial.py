@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -62,6 +62,45 @@ class Inputs:
     imu_read: bool = True
     mode: int = MODE_OFF
 
+    @staticmethod
+    def of(numbers: Sequence[float], sensors: int, mode: int) -> Inputs:
+        """Inputs from `numbers`, `sensors` and mode."""
+        u, v, ax, ay, gz, r1, r2 = map(float, numbers)
+        return Inputs(u, v, ax, ay, gz, (r1, r2), bool(sensors & 1), bool(sensors & 2), mode)
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """Marker, IMU and reference: seven numbers."""
+        return (self.u_px, self.v_px, self.ax_mps2, self.ay_mps2, self.gz_radps, *self.reference)
+
+    @property
+    def sensors(self) -> int:
+        """1 for a marker and 2 for a sample of the IMU."""
+        return int(self.marker_seen) + 2 * int(self.imu_read)
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """What a tick gives, as `calib_outputs`, without the whole numbers for a timer."""
+
+    phi_rad: float
+    marker_m: tuple[float, float]
+    head_m: tuple[float, float]
+    q_m: tuple[float, float]
+    pwm: tuple[float, float]
+    flags: int
+
+    @staticmethod
+    def of(numbers: Sequence[float], flags: int) -> Outputs:
+        """Outputs from `numbers` and flags."""
+        phi, X, Y, x, y, q1, q2, p1, p2 = numbers
+        return Outputs(phi, (X, Y), (x, y), (q1, q2), (p1, p2), flags)
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """Angle, marker, head, lengths, commands: nine numbers."""
+        return (self.phi_rad, *self.marker_m, *self.head_m, *self.q_m, *self.pwm)
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -70,25 +109,13 @@ class Frame:
     Attributes
     ----------
     identity : CALIB_ID of its header. rate_mhz : ticks in 1000 s. sequence : counts up to 65535.
-    given : inputs.
-    phi_rad, marker_m, head_m, q_m, pwm, flags : outputs.
     """
 
     identity: int
     rate_mhz: int
     sequence: int
     given: Inputs
-    phi_rad: float
-    marker_m: tuple[float, float]
-    head_m: tuple[float, float]
-    q_m: tuple[float, float]
-    pwm: tuple[float, float]
-    flags: int
-
-    @property
-    def outputs(self) -> tuple[float, ...]:
-        """phi, marker, head, lengths, commands: nine numbers."""
-        return (self.phi_rad, *self.marker_m, *self.head_m, *self.q_m, *self.pwm)
+    out: Outputs
 
 
 def checksum(data: bytes) -> int:
@@ -101,36 +128,11 @@ def checksum(data: bytes) -> int:
     return crc
 
 
-def _frame(
-    identity: int,
-    rate_mhz: int,
-    sequence: int,
-    sensors: int,
-    mode: int,
-    numbers: tuple[float, ...],
-    flags: int,
-) -> Frame:
-    u, v, ax, ay, gz, r1, r2 = numbers[:7]
-    given = Inputs(u, v, ax, ay, gz, (r1, r2), bool(sensors & 1), bool(sensors & 2), mode)
-    phi, X, Y, x, y, q1, q2, p1, p2 = numbers[7:]
-    return Frame(identity, rate_mhz, sequence, given, phi, (X, Y), (x, y), (q1, q2), (p1, p2), flags)
-
-
 def encoded(frame: Frame) -> bytes:
     """The frame as a board sends it."""
-    given = frame.given
-    sensors = int(given.marker_seen) + 2 * int(given.imu_read)
-    into = (given.u_px, given.v_px, given.ax_mps2, given.ay_mps2, given.gz_radps, *given.reference)
-    payload = _PAYLOAD.pack(
-        frame.identity,
-        frame.rate_mhz,
-        frame.sequence,
-        sensors,
-        given.mode,
-        *into,
-        *frame.outputs,
-        frame.flags,
-    )
+    given, out = frame.given, frame.out
+    head = (frame.identity, frame.rate_mhz, frame.sequence, given.sensors, given.mode)
+    payload = _PAYLOAD.pack(*head, *given.numbers, *out.numbers, out.flags)
     body = bytes([len(payload)]) + payload
     return _SYNC + body + struct.pack("<H", checksum(body))
 
@@ -180,7 +182,8 @@ class Decoder:
                 continue
             identity, rate, sequence, sensors, mode, *rest = _PAYLOAD.unpack(body[1:])
             del waiting[:end]
-            yield _frame(identity, rate, sequence, sensors, mode, tuple(rest[:-1]), rest[-1])
+            given, out = Inputs.of(rest[:7], sensors, mode), Outputs.of(rest[7:-1], rest[-1])
+            yield Frame(identity, rate, sequence, given, out)
 
 
 def csv_header() -> str:
@@ -204,9 +207,10 @@ def csv_row(frame: Frame, tick: int) -> str:
     imu = [text(v) for v in (g.ax_mps2, g.ay_mps2, g.gz_radps)]
     time = f"{1e3 * tick / frame.rate_mhz:.9g}" if frame.rate_mhz else "0"
     whole = [frame.sequence, frame.rate_mhz, frame.identity, int(g.marker_seen), int(g.imu_read), g.mode]
-    board = [g.u_px, g.v_px, *g.reference, *frame.outputs[:7]]
-    cells = [time, *marker, *(imu if g.imu_read else ["", "", ""]), *map(text, frame.pwm), *map(str, whole)]
-    return ",".join([*cells, *map(text, board), str(frame.flags)]) + "\n"
+    board = [g.u_px, g.v_px, *g.reference, *frame.out.numbers[:7]]
+    sensors = [*marker, *(imu if g.imu_read else ["", "", ""])]
+    cells = [time, *sensors, *map(text, frame.out.pwm), *map(str, whole), *map(text, board)]
+    return ",".join([*cells, str(frame.out.flags)]) + "\n"
 
 
 def frame_from_row(row: dict[str, str]) -> Frame:
@@ -215,15 +219,13 @@ def frame_from_row(row: dict[str, str]) -> Frame:
     imu = [float(row[name]) if row[name] else 0.0 for name in ("ax_mps2", "ay_mps2", "gz_radps")]
     sensors = int(number["marker_seen"]) + 2 * int(number["imu_read"])
     into = (number["board_u_px"], number["board_v_px"], *imu, number["reference_1"], number["reference_2"])
-    out = tuple(number[name] for name in BOARD_COLUMNS[10:17])
-    return _frame(
+    out = [number[name] for name in (*BOARD_COLUMNS[10:17], "pwm1", "pwm2")]
+    return Frame(
         int(number["calib_id"]),
         int(number["rate_mhz"]),
         int(number["sequence"]),
-        sensors,
-        int(number["mode"]),
-        (*into, *out, number["pwm1"], number["pwm2"]),
-        int(number["board_flags"]),
+        Inputs.of(into, sensors, int(number["mode"])),
+        Outputs.of(out, int(number["board_flags"])),
     )
 
 

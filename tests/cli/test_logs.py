@@ -185,9 +185,7 @@ def _stream(header: Header, ticks: int = 90) -> bytes:
     identity, out = header.identity, b"\x00\xa5\x5a\x4ehalf a frame"
     for k, vector in enumerate(vectors(header, ticks)):
         w = vector.wanted
-        frame = Frame(
-            identity, 60000, k, vector.given, w.phi_rad, w.marker_m, w.head_m, w.q_m, w.pwm, w.flags
-        )
+        frame = Frame(identity, 60000, k, vector.given, w)
         out += encoded(frame)
         if k % 20 == 10:
             out += b"\xa5\xa5\x5a\xff noise"

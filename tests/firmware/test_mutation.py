@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from firmware_build import LIMITS, NATIVE, need, numbers, run, write
+from firmware_build import LIMITS, NATIVE, need, run, write
 from firmware_rigs import header, rig
 
 from calib.io.serial import MODE_ORIENTATION, MODE_POSITION, Inputs
@@ -185,7 +185,7 @@ def test_a_constant_of_the_fused_estimator_that_is_off_is_seen(tmp_path: Path) -
     plain = run(_build_fused(tmp_path, text), ticks)
     reference = FusedReference(constants)
     wanted = [reference.step(t, int(f)) for t, f in zip(ticks, plain.flags, strict=True)]
-    table = np.array([numbers(out) for out in wanted])
+    table = np.array([out.numbers for out in wanted])
     rounding = np.abs(plain.numbers - table).max(axis=0)
     assert (rounding <= LIMITS).all(), rounding
     assert _coherent_fused(constants)
@@ -218,7 +218,7 @@ def test_a_constant_that_is_off_by_a_thousandth_is_seen(tmp_path: Path, kind: st
     reference = Reference(constants, bool(undistort))
     plain = run(_build(tmp_path, text, undistort), ticks)
     wanted = [reference.step(t, int(f)) for t, f in zip(ticks, plain.flags, strict=True)]
-    table = np.array([numbers(out) for out in wanted])
+    table = np.array([out.numbers for out in wanted])
     flags = np.array([out.flags for out in wanted])
 
     def seen(command: list[str]) -> bool:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from firmware_build import LIMITS, compare, host, hostile, need, numbers, run, strew, write
+from firmware_build import LIMITS, compare, host, hostile, need, run, strew, write
 from firmware_plant import Loop
 from firmware_rigs import header, rig
 
@@ -199,7 +199,7 @@ def test_signs_of_the_imus_axes(tmp_path: Path) -> None:
     made = header()
     write(tmp_path, made)
     path = tmp_path / "calib_constants.h"
-    constants = made.values
+    constants = dict(made.values)
     text = path.read_text()
     for axis in ("AX", "AY", "GZ"):
         constants[f"CALIB_IMU_SIGN_{axis}"] = -1.0
@@ -213,7 +213,7 @@ def test_signs_of_the_imus_axes(tmp_path: Path) -> None:
     write(plain, made)
     assert np.array_equal(found.numbers, run(host(plain), upright).numbers)
     reference = Reference(constants)
-    wanted = np.array([numbers(reference.step(t, int(f))) for t, f in zip(turned, found.flags, strict=True)])
+    wanted = np.array([reference.step(t, int(f)).numbers for t, f in zip(turned, found.flags, strict=True)])
     assert (np.abs(found.numbers - wanted).max(axis=0) <= LIMITS).all()
 
 

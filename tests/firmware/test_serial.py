@@ -14,7 +14,18 @@ from hypothesis import strategies as st
 
 from calib.core.errors import BadInputError
 from calib.io.logs import read_log
-from calib.io.serial import Decoder, Frame, Inputs, Recording, checksum, csv_header, csv_row, encoded, record
+from calib.io.serial import (
+    Decoder,
+    Frame,
+    Inputs,
+    Outputs,
+    Recording,
+    checksum,
+    csv_header,
+    csv_row,
+    encoded,
+    record,
+)
 from calib.stages.firmware.check import check_frames, read_frames
 from calib.stages.firmware.vectors import binary32, vectors
 
@@ -29,12 +40,7 @@ def frame(sequence: int, value: float = 0.25, **more: object) -> Frame:
         60000,
         sequence,
         binary32(inputs),
-        value,
-        (0.5, 1.0),
-        (0.25, 2.0),
-        (0.0625, 4.0),
-        (1.0, 255.0),
-        3,
+        Outputs(value, (0.5, 1.0), (0.25, 2.0), (0.0625, 4.0), (1.0, 255.0), 3),
     )
 
 
@@ -67,7 +73,7 @@ def test_every_whole_frame_is_found_between_garbage(garbage: list[bytes], portio
 def _frames(count: int, first: int = 0) -> list[Frame]:
     vector = vectors(header(), 2)[0]
     w = vector.wanted
-    one = Frame(1, 60000, 0, vector.given, w.phi_rad, w.marker_m, w.head_m, w.q_m, w.pwm, w.flags)
+    one = Frame(1, 60000, 0, vector.given, w)
     return [replace(one, sequence=(first + k) & 0xFFFF) for k in range(count)]
 
 
@@ -106,9 +112,7 @@ def _frames_check(ticks: int = 120) -> list[Frame]:
     made = []
     for k, vector in enumerate(vectors(header(), ticks)):
         w = vector.wanted
-        made.append(
-            Frame(identity, 60000, k, vector.given, w.phi_rad, w.marker_m, w.head_m, w.q_m, w.pwm, w.flags)
-        )
+        made.append(Frame(identity, 60000, k, vector.given, w))
     return made
 
 
@@ -134,9 +138,7 @@ def test_a_board_with_the_fused_estimator_is_known_by_its_flags(tmp_path: Path) 
     frames = []
     for k, vector in enumerate(vectors(header("fused"), 120, fused=True)):
         w = vector.wanted
-        frames.append(
-            Frame(identity, 60000, k, vector.given, w.phi_rad, w.marker_m, w.head_m, w.q_m, w.pwm, w.flags)
-        )
+        frames.append(Frame(identity, 60000, k, vector.given, w))
     result = check_frames(header("fused"), read_frames(_log(tmp_path / "log.csv", frames)), "log.csv")
     assert (result.ticks, result.verdict.reasons, result.flags_differ) == (120, [], 0)
     without = [replace(frame, identity=header().identity) for frame in frames]
@@ -146,10 +148,12 @@ def test_a_board_with_the_fused_estimator_is_known_by_its_flags(tmp_path: Path) 
 
 def test_a_wrong_value_is_named_with_its_tick() -> None:
     frames = _frames_check()
-    frames[41] = replace(frames[41], q_m=(frames[41].q_m[0] + 1e-5, frames[41].q_m[1]))
+    q1, q2 = frames[41].out.q_m
+    frames[41] = replace(frames[41], out=replace(frames[41].out, q_m=(q1 + 1e-5, q2)))
     result = check_frames(header(), frames, "log.csv")
     assert result.verdict.reasons == ["tick 41 is the first that differs, in q_m"]
-    frames[30] = replace(frames[30], flags=frames[30].flags ^ 0x10)
+    other = replace(frames[30].out, flags=frames[30].out.flags ^ 0x10)
+    frames[30] = replace(frames[30], out=other)
     result = check_frames(header(), frames, "log.csv")
     assert result.verdict.reasons == ["tick 30 is the first that differs, in flags"]
     assert result.flags_differ == 1
@@ -170,8 +174,8 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
 
 
 FRAME = Frame(
-    7, 60_000, 0, Inputs(160.0, 104.0, 9.75, 0.25, -0.5, (0.065, 0.066), True, True, 0), 0.125, (0.0, 0.08),
-    (0.0, 0.065), (0.065, 0.065), (128.0, 64.0), 0,
+    7, 60_000, 0, Inputs(160.0, 104.0, 9.75, 0.25, 0.0, (0.065, 0.066), True, True, 0),
+    Outputs(0.125, (0.0, 0.08), (0.0, 0.065), (0.065, 0.065), (128.0, 64.0), 0),
 )  # fmt: skip
 
 

@@ -16,8 +16,8 @@ from pathlib import Path
 from calib.core.errors import BadInputError
 from calib.core.files import read_bytes, shown
 from calib.core.verdict import Finding, Verdict
-from calib.io.serial import BOARD_COLUMNS, Frame, frame_from_row
-from calib.stages.firmware.conformance import BY_FUSED, BY_MEAN_RATE, CLAMPED, Outputs, reference_of
+from calib.io.serial import BOARD_COLUMNS, Frame, Outputs, frame_from_row
+from calib.stages.firmware.conformance import BY_FUSED, BY_MEAN_RATE, CLAMPED, reference_of
 from calib.stages.firmware.header import Header
 from calib.stages.firmware.vectors import TOLERANCE
 
@@ -81,15 +81,10 @@ def read_frames(path: Path) -> list[Frame]:
     return frames
 
 
-def _differences(frame: Frame, wanted: Outputs) -> dict[str, float]:
-    pairs = {
-        "phi_rad": [(frame.phi_rad, wanted.phi_rad)],
-        "marker_m": zip(frame.marker_m, wanted.marker_m, strict=True),
-        "q_m": zip(frame.head_m + frame.q_m, wanted.head_m + wanted.q_m, strict=True),
-        "pwm": zip(frame.pwm, wanted.pwm, strict=True),
-    }
+def _differences(out: Outputs, wanted: Outputs) -> dict[str, float]:
+    off = [abs(a - b) for a, b in zip(out.numbers, wanted.numbers, strict=True)]
+    found = {"phi_rad": off[0], "marker_m": max(off[1:3]), "q_m": max(off[3:7]), "pwm": max(off[7:])}
     # NaN of a board is no small difference.
-    found = {name: max(abs(a - b) for a, b in pair) for name, pair in pairs.items()}
     return {name: value if math.isfinite(value) else math.inf for name, value in found.items()}
 
 
@@ -117,7 +112,7 @@ def check_frames(
         raise BadInputError(
             f"{source}: begins with tick {first.sequence}, expected 0: record from the board's start"
         )
-    by_fused, by_mean = bool(first.flags & BY_FUSED), bool(first.flags & BY_MEAN_RATE)
+    by_fused, by_mean = bool(first.out.flags & BY_FUSED), bool(first.out.flags & BY_MEAN_RATE)
     if by_fused and not header.values["CALIB_HAS_FUSED"]:
         raise BadInputError(f"{source}: the board runs the fused estimator, for which rig.yaml has no gains")
     reference = reference_of(header.values, undistort, by_fused, by_mean)
@@ -127,10 +122,10 @@ def check_frames(
         if frame.sequence != tick & 0xFFFF:
             lost = tick
             break
-        wanted = reference.step(frame.given, frame.flags)
-        found = _differences(frame, wanted)
+        wanted = reference.step(frame.given, frame.out.flags)
+        found = _differences(frame.out, wanted)
         over = [name for name, value in found.items() if value > TOLERANCE[name]]
-        if (frame.flags ^ wanted.flags) & ~_CLAMP_BITS:
+        if (frame.out.flags ^ wanted.flags) & ~_CLAMP_BITS:
             differ += 1
             over.append("flags")
         if wanted.undecided_pwm > TOLERANCE["pwm"]:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from calib.io.serial import MODE_OFF, MODE_ORIENTATION, MODE_POSITION, Inputs
+from calib.io.serial import MODE_OFF, MODE_ORIENTATION, MODE_POSITION, Inputs, Outputs
 
 # ----------------------------------------------------------------------
 # What the firmware has to compute, in float64: the reference that C, AVR and boards are held against.
@@ -39,25 +39,13 @@ Pair = tuple[float, float]
 
 def binary32(given: Inputs) -> Inputs:
     """Inputs as the firmware gets them."""
-
-    def near(value: float) -> float:
-        with np.errstate(over="ignore"):
-            return float(np.float32(value))
-
-    return replace(
-        given,
-        u_px=near(given.u_px),
-        v_px=near(given.v_px),
-        ax_mps2=near(given.ax_mps2),
-        ay_mps2=near(given.ay_mps2),
-        gz_radps=near(given.gz_radps),
-        reference=(near(given.reference[0]), near(given.reference[1])),
-    )
+    with np.errstate(over="ignore"):
+        return Inputs.of(np.array(given.numbers, dtype=np.float32).tolist(), given.sensors, given.mode)
 
 
 @dataclass(frozen=True)
-class Outputs:
-    """As `calib_outputs`, without the whole numbers for a timer.
+class Wanted(Outputs):
+    """What a tick has to give.
 
     Attributes
     ----------
@@ -65,12 +53,6 @@ class Outputs:
     undecided_m : the same of the fused estimator's gate and of its telling rest from motion.
     """
 
-    phi_rad: float
-    marker_m: tuple[float, float]
-    head_m: tuple[float, float]
-    q_m: tuple[float, float]
-    pwm: tuple[float, float]
-    flags: int
     undecided_pwm: float = 0.0
     undecided_m: float = 0.0
 
@@ -330,7 +312,7 @@ class Reference:
             m.past = [*m.past[1:], phi]
         return flags, head, q, 0.0
 
-    def step(self, given: Inputs, decided: int | None = None) -> Outputs:
+    def step(self, given: Inputs, decided: int | None = None) -> Wanted:
         """One tick.
 
         Parameters
@@ -341,7 +323,7 @@ class Reference:
         flags, head, q, undecided_m = self._estimate(given, decided)
         m = self.memory
         pwm, driven, undecided = self._control(given, q, decided)
-        return Outputs(m.phi, m.marker, head, q, pwm, flags | driven, undecided, undecided_m)
+        return Wanted(m.phi, m.marker, head, q, pwm, flags | driven, undecided, undecided_m)
 
 
 # ----------------------------------------------------------------------

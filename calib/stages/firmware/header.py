@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import jinja2
@@ -86,9 +87,9 @@ class Header:
         return literals(self.groups)
 
     @cached_property
-    def values(self) -> dict[str, float]:
+    def values(self) -> Mapping[str, float]:
         """Every value as a compiler reads it, by name."""
-        return values(self.literals)
+        return MappingProxyType(values(self.literals))
 
     @cached_property
     def digest(self) -> str:

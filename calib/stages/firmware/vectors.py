@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.core.errors import BadInputError
-from calib.io.serial import MODE_OFF, MODE_ORIENTATION, MODE_POSITION, Inputs
-from calib.stages.firmware.conformance import Outputs, Reference, binary32, reference_of
+from calib.io.serial import MODE_OFF, MODE_ORIENTATION, MODE_POSITION, Inputs, Outputs
+from calib.stages.firmware.conformance import Reference, binary32, reference_of
 from calib.stages.firmware.header import Header, rendered
 from calib.stages.firmware.literals import float_literal
 
@@ -79,15 +79,12 @@ def vectors(header: Header, ticks: int = 48, fused: bool = False) -> list[Vector
 
 def _lines(vector: Vector) -> list[str]:
     given, wanted = vector.given, vector.wanted
-    sensors = int(given.marker_seen) + 2 * int(given.imu_read)
-    into = [given.u_px, given.v_px, given.ax_mps2, given.ay_mps2, given.gz_radps, *given.reference]
-    out = [wanted.phi_rad, *wanted.marker_m, *wanted.head_m, *wanted.q_m, *wanted.pwm]
 
-    def row(numbers: list[float]) -> str:
+    def row(*numbers: float) -> str:
         # Zero where a value is too small for a normal float.
         return ", ".join(float_literal(v if abs(v) > 1e-30 else 0.0, "calib_selftest_rows") for v in numbers)
 
-    return [row([*into, float(sensors), float(given.mode)]), row(out), row([float(wanted.flags)])]
+    return [row(*given.numbers, given.sensors, given.mode), row(*wanted.numbers), row(wanted.flags)]
 
 
 def selftest_text(header: Header) -> str:
