@@ -114,7 +114,7 @@ _LOUDEST_RADPS, _QUIETEST_RADPS = 0.02, 1.5e-4
 """Spread of a gyroscope at rest: no sensor is louder, and none of those on cheap boards is quieter."""
 _REST_RAD = 0.02
 _FARTHER = 12.0
-_LEAST_TURN_RAD = 0.05
+_LEAST_TURN_RAD, _LEAST_NOISE_RAD = 0.05, 1e-5
 _AGREES = 0.3
 _BLOCK_S, _BLOCK_3D_S = 1.0, 0.25
 _MOST_EVIDENCE = 100_000
@@ -665,7 +665,9 @@ def _implausible(
         better = min((found.misfit[f] for f in others), default=1.0)
         if better < _AGREES:
             return "does not turn with the accelerometer's angle"
-    if found.flat and scale * found.by_gyro_rad > max(_LEAST_TURN_RAD, _FARTHER * found.by_force_rad):
+    # An accelerometer that is stuck says nothing about the gyroscope.
+    felt = found.by_force_rad > _LEAST_NOISE_RAD
+    if felt and found.flat and scale * found.by_gyro_rad > max(_LEAST_TURN_RAD, _FARTHER * found.by_force_rad):
         times = scale * found.by_gyro_rad / max(found.by_force_rad, 1e-6)
         return f"turns {times:.3g} times as far as the accelerometer's angle"
     if found.spread_rad < _REST_RAD:
