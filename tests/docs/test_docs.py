@@ -14,6 +14,7 @@ import tempfile
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from chromium import browser_or_skip
@@ -31,8 +32,8 @@ from calib.twin.scenarios import SCENARIOS
 
 ROOT = Path(__file__).resolve().parents[2]
 README = ROOT / "README.md"
-NOT_RUN = {"tour.md"}
-"""Pages whose Python is not run here; each says so."""
+WITH_FILES = {"tour.md"}
+"""Pages whose Python needs files of its own and has a test of its own."""
 
 FENCE = re.compile(r"^(?P<indent> *)```(?P<kind>\w*)\n(?P<text>.*?)^ *```$", re.S | re.M)
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
@@ -58,7 +59,7 @@ def python_pages() -> list[Path]:
     return [
         path
         for path in documents()
-        if path.name not in NOT_RUN and any(blocks(path.read_text(encoding="utf-8"), "python"))
+        if path.name not in WITH_FILES and any(blocks(path.read_text(encoding="utf-8"), "python"))
     ]
 
 
@@ -77,12 +78,26 @@ def test_python_blocks_run_and_leave_nothing(
     assert sorted(item.name for item in ROOT.iterdir()) == before
 
 
-@pytest.mark.parametrize("name", sorted(NOT_RUN))
-def test_pages_that_are_not_run_say_so(name: str) -> None:
-    text = (MANUAL / name).read_text(encoding="utf-8")
-    assert "not yet run by the tests" in text
-    for _, block in blocks(text, "python"):
-        compile(block, name, "exec")
+def test_the_tour_runs_as_in_a_notebook(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On the shipped pictures and three short logs of the simulated rig, one statement after the other."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(ROOT / "images", "images")
+    Path("logs").mkdir()
+    for scenario, seconds in (("static", 10), ("swing", 6), ("ellipse", 6)):
+        words = ["simulate", scenario, "-o", f"logs/{scenario}.csv", "--duration", f"{seconds}s"]
+        subprocess.run([sys.executable, "-m", "calib", *words], check=True, capture_output=True)
+    words = ["intrinsics", "images", "--rig", "old.yaml"]
+    subprocess.run([sys.executable, "-m", "calib", *words], check=True, capture_output=True)
+    ((_, block),) = blocks((MANUAL / "tour.md").read_text(encoding="utf-8"), "python")
+    names: dict[str, Any] = {}
+    exec(compile(block, "tour.md", "exec"), names)
+    rig, states = names["rig"], names["states"]
+    assert rig.camera.verdict.ok and rig.align.sigma["time_offset_s"] < 1e-3
+    assert states.to_pandas()["sigma_q1_m"].notna().all()
+    saved = names["calib"].Rig.load("rig.yaml")
+    assert saved.camera == rig.camera and saved.actuator == rig.actuator
+    assert Path("firmware_constants/calib_constants.h").is_file()
+    assert "<table>" in rig.camera._repr_html_()
 
 
 def test_the_tutorial_prints_what_it_shows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
