@@ -667,7 +667,8 @@ def _implausible(
             return "does not turn with the accelerometer's angle"
     # An accelerometer that is stuck says nothing about the gyroscope.
     felt = found.by_force_rad > _LEAST_NOISE_RAD
-    if felt and found.flat and scale * found.by_gyro_rad > max(_LEAST_TURN_RAD, _FARTHER * found.by_force_rad):
+    least_rad = max(_LEAST_TURN_RAD, _FARTHER * found.by_force_rad)
+    if felt and found.flat and scale * found.by_gyro_rad > least_rad:
         times = scale * found.by_gyro_rad / max(found.by_force_rad, 1e-6)
         return f"turns {times:.3g} times as far as the accelerometer's angle"
     if found.spread_rad < _REST_RAD:

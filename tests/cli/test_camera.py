@@ -272,7 +272,7 @@ def test_a_lens_that_cannot_be_undone(calib, rig, k1: str) -> None:
     assert re.search(r"effect +matters", ended.out)
     ended = calib("firmware", "--rig", rig, "-o", rig.parent)
     assert ended.code == 1
-    assert "the lens is undone to" in ended.err
+    assert "the lens is undone" in ended.out
     assert "#define CALIB_CAMERA_OK 0" in (rig.parent / "calib_constants.h").read_text()
 
 

@@ -84,7 +84,7 @@ def test_a_mistake_of_the_program_is_one_sentence(calib, monkeypatch, tmp_path) 
     ended = calib("firmware", "--rig", "rig.yaml", cwd=tmp_path)
     assert ended.code == 70
     assert ended.sentence.startswith(
-        "internal error: RuntimeError: first line second\\x1b line (calib.cli.verbs"
+        "internal error: RuntimeError: first line second\\x1b line (calib.runner.work"
     )
     assert "please report" in ended.sentence
     monkeypatch.setenv("CALIB_DEBUG", "1")

@@ -19,7 +19,7 @@ from calib.stages.camera.read import read_board_file, read_table, read_vnl
 from calib.stages.control.read import _series
 from calib.stages.firmware.check import read_frames
 
-RIG = "geometry: {workspace_m: [0.0, 0.0, 0.1, 0.1]}\ntwin: {note: text}\n"
+RIG = "geometry: {workspace_m: [0.0, 0.0, 0.1, 0.1]}\ntwin: {tracker: {jitter_px: 0.1}}\n"
 BOARD = "corners: [7, 5]\nsquare_m: 0.02\n"
 LOG = "t_s,u_px,v_px,note\n0.0,1.5,2.5,x\n0.1,,,y\n0.2,2.5,3.5,z\n"
 POINTS = "view,x_m,y_m,u_px,v_px\na,0,0,1,1\na,1,0,2,1\na,0,1,1,2\na,1,1,2,2\n"

@@ -81,7 +81,7 @@ class Estimator(Result):
     levels: list[EstimatorLevel] = []
     driven: EstimatorDriven | None = None
     constant_gain: EstimatorGain | None = None
-    gain_per_row: float | None = quantity(None, label="log likelihood won per row", digits=4)
+    gain_per_row: Number | None = quantity(None, label="log likelihood won per row", digits=4)
     logs: list[str] = quantity([], label="logs")
 
 
