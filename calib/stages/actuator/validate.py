@@ -110,14 +110,16 @@ def _cleaned(track: Track) -> tuple[Track, int]:
     return replace(track, head=head), int(wrong.sum())
 
 
-def estimated_start(path: Path, rig: Rig, rig_path: Path, begin_s: float) -> Start | None:
+def estimated_start(
+    path: Path, rig: Rig, rig_path: Path, begin_s: float, options: LogOptions = NOTHING_STATED
+) -> Start | None:
     """Angle, length and their rates at a time of a log [s] by the estimator; None where it lacks a sensor.
 
     Raises `BadInputError` as `calib.stages.estimator.replay.opened`.
     """
     from calib.stages.estimator.replay import opened, smoothed_rows
 
-    log = opened(path, rig, rig_path)
+    log = opened(path, rig, rig_path, options)
     if not log.both:
         return None
     rows = smoothed_rows(log, begin_s + _SECONDS)
@@ -216,5 +218,5 @@ def validate_log(
     source = read_track(path, rig, rig_path, machine, states, truth, no_pwm, options)
     start = None
     if source.source == "pictures":
-        start = estimated_start(path, rig, rig_path, source.begin_s)
+        start = estimated_start(path, rig, rig_path, source.begin_s, options)
     return compare(source, models, machine.plant.bellows_radius_m, start), source.said
