@@ -182,6 +182,10 @@ class Result(Section):
 
         return "\n".join(as_text(described(self)))
 
+    def __repr__(self) -> str:
+        """The words of `str`: what a person sees who types a result's name."""
+        return str(self)
+
 
 def judged(verdict: Verdict) -> dict[str, Any]:
     """The keys of a verdict, to make a `Result` with: `Camera(..., **judged(verdict))`."""
