@@ -8,7 +8,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from calib.cli.common import JsonOption, document, narrate, progress_bar, say, table
+from calib.cli.common import (
+    AccUnitOption,
+    ColumnsOption,
+    GyroUnitOption,
+    JsonOption,
+    document,
+    narrate,
+    progress_bar,
+    say,
+    table,
+)
 from calib.core.errors import EXIT_DONE
 
 if TYPE_CHECKING:
@@ -35,6 +45,9 @@ def run(
     follow_links: Annotated[
         bool, typer.Option("--follow-links", help="Take files that are links out of the folder as well.")
     ] = False,
+    acc_unit: AccUnitOption = None,
+    gyro_unit: GyroUnitOption = None,
+    columns: ColumnsOption = None,
     jobs: Annotated[
         int | None, typer.Option(min=1, max=64, help="Stages at a time. [default: one per processor]")
     ] = None,
@@ -46,13 +59,18 @@ def run(
     alone are the calibration of a camera. Exits 0 when the firmware can be flashed, 1 when it cannot or
     something is weak, 3 when a stage has failed.
     """
+    from calib.core.stage import LogOptions
     from calib.core.workers import processors
+    from calib.io.columns import read_columns_file
     from calib.runner.folder import read_folder
     from calib.runner.graph import HIDDEN, Pool, Runner, opened
     from calib.runner.outputs import decide, publish, summary
     from calib.show.page import keep_pictures, write_page
 
-    seen = None if folder is None else read_folder(folder, follow_links)
+    stated = LogOptions(acc_unit, gyro_unit, None if columns is None else columns.absolute())
+    if columns is not None:
+        read_columns_file(columns)
+    seen = None if folder is None else read_folder(folder, follow_links, stated)
     with opened(output, folder) as interrupted, Pool(jobs or processors()) as pool:
         if interrupted is not None:
             narrate("the last run here was interrupted; going on where it stopped")

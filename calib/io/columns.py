@@ -616,7 +616,8 @@ def _with_gyro(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMap
         return columns
     unit, scales = next(iter(stated), ""), {u: UNITS["gyro"][u] for u in ("rad/s", "deg/s", "mdeg/s")}
     wrong = {u: _implausible(s, columns, cells, names, values) for u, s in scales.items()}
-    likely = [u for u in scales if not wrong[u]]
+    # Few boards send mdeg/s, which makes small of nearly any readings.
+    likely = [u for u in ("rad/s", "deg/s") if not wrong[u]] or [u for u in ("mdeg/s",) if not wrong[u]]
     if unit:
         if not wrong[unit]:
             return columns

@@ -467,6 +467,29 @@ def iter_log(path: Path, options: LogOptions = NOTHING_STATED) -> Iterator[Log]:
     return _iter_parquet(path, options) if ending == ".parquet" else _iter_csv(path, options)
 
 
+def columns_of(path: Path, options: LogOptions = NOTHING_STATED) -> tuple[str, ...] | None:
+    """Columns that a log has by its header, whatever is in them; None where it cannot be told."""
+    from calib.io.bags import is_bag
+    from calib.io.serial import STREAMS
+
+    try:
+        if is_bag(path) or path.suffix.lower() in (".parquet", *STREAMS):
+            return tuple(next(iter_log(path, options)).columns)
+        with path.open("rb") as stream:
+            text, _, _ = _opened(stream, shown(path), path, options)
+        return tuple(name for name in text.columns.sources if name != "t_s")
+    except (BadInputError, OSError, StopIteration):
+        return None
+
+
+def beside(path: Path) -> list[Path]:
+    """Files beside a log that say what is in it: which topic of a bag is which column, and columns.yaml."""
+    from calib.io.bags import find_topics, is_bag
+
+    found = [find_topics(path) if is_bag(path) else None, find_columns(path)]
+    return [one for one in found if one is not None]
+
+
 def read_log(path: Path, options: LogOptions = NOTHING_STATED) -> Log:
     """A whole log, of at most 200 million cells that are read.
 

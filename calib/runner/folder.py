@@ -6,7 +6,6 @@ must not bring files of this machine into a page that is passed on.
 
 from __future__ import annotations
 
-import csv
 import stat
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -14,10 +13,10 @@ from pathlib import Path
 
 from calib.core.errors import BadInputError
 from calib.core.files import file_sha256, inside, one_line, shown, slug
+from calib.core.stage import NOTHING_STATED, LogOptions
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm")
-_LOGS = (".csv", ".parquet", ".mcap", ".bag", ".db3")
-_HEAD_BYTES = 1 << 16
+_LOGS = (".csv", ".tsv", ".parquet", ".mcap", ".bag", ".db3")
 
 
 @dataclass(frozen=True)
@@ -51,6 +50,7 @@ class Folder:
     logs : in the order of their names.
     rig : the folder's own rig.yaml, None without.
     left_out : sentences on files that were not taken.
+    options : what a person states of the logs.
     """
 
     root: Path
@@ -61,6 +61,7 @@ class Folder:
     logs: tuple[LogFile, ...]
     rig: Path | None
     left_out: tuple[str, ...]
+    options: LogOptions = NOTHING_STATED
 
     def files(self) -> tuple[Path, ...]:
         """Every file that is read."""
@@ -69,7 +70,7 @@ class Folder:
             *self.pictures,
             *self.plane,
             *(path for path in single if path is not None),
-            *with_topics(log.path for log in self.logs),
+            *with_beside(log.path for log in self.logs),
         )
 
     def name_of(self, path: Path) -> str:
@@ -77,8 +78,13 @@ class Folder:
         return path.relative_to(self.root).as_posix()
 
 
-def read_folder(root: Path, follow_links: bool = False) -> Folder:
-    """What a rig folder holds. Raises `BadInputError` where there is no such folder, or nothing in it."""
+def read_folder(root: Path, follow_links: bool = False, options: LogOptions = NOTHING_STATED) -> Folder:
+    """What a rig folder holds; `options` are what a person states of its logs.
+
+    Raises `BadInputError` where there is no such folder, or nothing in it.
+    """
+    from calib.io.logs import columns_of
+
     if not root.is_dir():
         what = "is a file" if root.exists() else "is not there"
         raise BadInputError(f"{shown(root)}: {what}, expected a folder with images/ and logs/")
@@ -102,16 +108,16 @@ def read_folder(root: Path, follow_links: bool = False) -> Folder:
     plane, plane_board = _pictures(root / "images" / "plane", taken)
     logs: list[LogFile] = []
     for path in _listed(root / "logs", _LOGS):
-        if all(taken(part) for part in with_topics([path])):
+        if all(taken(part) for part in with_beside([path])):
             name = slug(path.stem, (log.slug for log in logs))
-            logs.append(LogFile(path, name, _columns(path), _kind(path.name)))
+            logs.append(LogFile(path, name, columns_of(path, options), _kind(path.name)))
     own = root / "rig.yaml"
     rig = own if own.is_file() and taken(own) else None
     if not (pictures or plane or logs):
         raise BadInputError(
             f"{shown(root)}: holds no pictures in images/ and no logs in logs/; see calib run --help"
         )
-    return Folder(root, pictures, board, plane, plane_board, tuple(logs), rig, tuple(left_out))
+    return Folder(root, pictures, board, plane, plane_board, tuple(logs), rig, tuple(left_out), options)
 
 
 def _named(path: Path, root: Path) -> str:
@@ -141,36 +147,11 @@ def _kind(name: str) -> str:
     return "motion"
 
 
-def with_topics(logs: Iterable[Path]) -> tuple[Path, ...]:
-    """Logs, each followed by the file beside it that says which topic of a bag is which column."""
-    from calib.io.bags import find_topics, is_bag
+def with_beside(logs: Iterable[Path]) -> tuple[Path, ...]:
+    """Logs, each followed by the files beside it that say what is in it."""
+    from calib.io.logs import beside
 
-    listed: list[Path] = []
-    for path in logs:
-        topics = find_topics(path) if is_bag(path) else None
-        listed += [path] if topics is None else [path, topics]
-    return tuple(dict.fromkeys(listed))
-
-
-def _columns(path: Path) -> tuple[str, ...] | None:
-    """Names in the header of a CSV, columns of another log; whether they make sense the verbs say."""
-    if path.suffix.lower() != ".csv":
-        from calib.io.logs import iter_log
-
-        try:
-            return tuple(next(iter_log(path)).columns)
-        except (BadInputError, StopIteration):
-            return None
-    try:
-        with path.open("rb") as stream:
-            head = stream.read(_HEAD_BYTES).decode("utf-8-sig", "replace")
-    except OSError:
-        return None
-    lines = [line for line in head.splitlines() if line.strip() and not line.startswith("#")]
-    try:
-        return tuple(name.strip() for name in next(csv.reader(lines[:1]), []))
-    except csv.Error:
-        return None
+    return tuple(dict.fromkeys(part for path in logs for part in (path, *beside(path))))
 
 
 def digest_of(path: Path) -> str:

@@ -13,7 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, Protocol
@@ -22,7 +22,7 @@ from calib.core.errors import EXIT_DONE, EXIT_POOR, BadInputError
 from calib.core.files import check_folder, make_folder, one_line, shown, write_atomically
 from calib.core.rig import SCHEMA, Rig
 from calib.runner.cache import Result, held, key_of, load, remove, store
-from calib.runner.folder import Folder, LogFile, folder_digests, with_topics
+from calib.runner.folder import Folder, LogFile, digest_of, folder_digests, with_beside
 from calib.runner.work import Work, perform
 
 # ----------------------------------------------------------------------
@@ -148,7 +148,7 @@ class Job:
 
 
 def _given(paths: tuple[Path, ...], **options: Any) -> Planned:
-    return Planned(paths, with_topics(paths), options)
+    return Planned(paths, with_beside(paths), options)
 
 
 def _logs(folder: Folder, kind: str, *columns: str) -> tuple[Path, ...]:
@@ -201,7 +201,7 @@ def _lowpass(folder: Folder) -> Planned | str:
     logs = _logs(folder, "motion", *_CAMERA)
     if not logs:
         return Planned((), ())
-    return Planned((), with_topics(logs[:1]), {"log": logs[0]})
+    return Planned((), with_beside(logs[:1]), {"log": logs[0]})
 
 
 def _both(folder: Folder) -> Planned | str:
@@ -227,7 +227,7 @@ def _nothing(_: Folder) -> Planned | str:
 def _replay(log: LogFile) -> Planned | str:
     if not (log.has(*_CAMERA) or log.has(*_IMU)):
         return "the log has neither a camera nor an IMU"
-    return Planned((log.path,), with_topics([log.path]))
+    return Planned((log.path,), with_beside([log.path]))
 
 
 _OPTICS = ("camera", "plane")
@@ -601,7 +601,8 @@ class Runner:
             return None
         inputs = {self.folder.name_of(path): self._digests[path] for path in job.planned.inputs}
         named = [self.folder.name_of(path) for path in job.planned.paths]
-        options = {name: self._said(value) for name, value in job.planned.options.items()}
+        chosen = {**self._stated(job.planned), **job.planned.options}
+        options = {name: self._said(value) for name, value in chosen.items()}
         key = key_of(
             (*job.stage.verb, *named, json.dumps(options, sort_keys=True)), inputs, known.canonical()
         )
@@ -622,16 +623,24 @@ class Runner:
                 self.folder.root,
                 work,
                 job.planned.paths,
-                job.planned.options,
+                chosen,
                 stage.figures,
                 stage.output,
             )
         )
         return job, key, work
 
+    def _stated(self, planned: Planned) -> dict[str, Any]:
+        """What a person states of logs, for a stage that reads some."""
+        logs = {log.path for log in self.folder.logs}
+        stated = asdict(self.folder.options) if logs & set(planned.inputs) else {}
+        return {name: value for name, value in stated.items() if value is not None}
+
     def _said(self, value: Any) -> Any:
-        """An option's value, the same wherever the folder lies."""
-        return self.folder.name_of(value) if isinstance(value, Path) else value
+        """An option's value, the same wherever the folder lies; of a file elsewhere what it holds."""
+        if not isinstance(value, Path):
+            return value
+        return self.folder.name_of(value) if value.is_relative_to(self.folder.root) else digest_of(value)
 
     def _blocked(self, job: Job, section: str) -> Done:
         for done in self.done.values():

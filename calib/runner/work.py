@@ -167,7 +167,8 @@ def _typed(work: Work) -> int:
     words = ["calib", *work.verb.split(), "--json", "--rig", str(work.folder / RIG)]
     words += ["--figures", str(work.folder / FIGURES)] if work.figures else []
     words += ["-o", str(work.folder / work.output)] if work.output else []
-    words += [f"--{name.replace('_', '-')}" for name in work.options]
+    for name, value in work.options.items():
+        words += [f"--{name.replace('_', '-')}", *([] if value is True else [str(value)])]
     before, out, err = (sys.argv, sys.stdout, sys.stderr), io.StringIO(), io.StringIO()
     try:
         sys.argv, sys.stdout, sys.stderr = [*words, *map(str, work.paths)], out, err

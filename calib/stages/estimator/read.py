@@ -16,6 +16,8 @@ from calib.core.result import CovarianceTable
 from calib.core.rig import Geometry, Rig
 from calib.core.stage import LogOptions
 from calib.io.logs import Log, iter_log
+from calib.io.signals import refuse_counts
+from calib.solve.clock import time_axis
 from calib.stages.actuator.section import Standing, standing
 from calib.stages.align.section import SENSORS_OF, Align
 from calib.stages.estimator.baseline import BaselineSetup, undistorting_nothing
@@ -63,7 +65,8 @@ class Periods:
 
     Attributes
     ----------
-    camera_s, imu_s : median distance of samples [s], NaN where there are too few.
+    camera_s, imu_s : distance of samples [s], NaN where there are too few.
+    camera_even, imu_even : whether they are taken at even steps, so that their times are better than stamps.
     grid_px : 1 for whole pixels, 0 for others.
     ticks : whether rows with commands and without IMU are ticks of the camera's clock.
     camera, imu : samples.
@@ -75,6 +78,8 @@ class Periods:
     ticks: bool
     camera: int
     imu: int
+    camera_even: bool = True
+    imu_even: bool = True
 
 
 def _column(log: Log, name: str) -> FloatArray:
@@ -96,12 +101,6 @@ def _readings(log: Log) -> FloatArray:
     return np.where(np.isfinite(values), values, np.nan)
 
 
-def _period(t_s: FloatArray) -> float:
-    steps = np.diff(t_s)
-    steps = steps[steps > 1e-5]
-    return float(np.median(steps)) if len(steps) >= 5 else math.nan
-
-
 def periods(log: Log) -> Periods:
     """Rates and pixel grid from the first block of a log."""
     readings = _readings(log)
@@ -110,14 +109,12 @@ def periods(log: Log) -> Periods:
     # Commands stand in the rows of pictures when most of those rows have one.
     use = bool(ticks.any()) and int((ticks & seen).sum()) >= 0.5 * int(ticks.sum()) > 0
     camera = seen | ticks if use else seen
+    # Time that goes back starts the filter again, and says nothing of the period.
+    first, second = (time_axis(np.maximum.accumulate(log.t_s[rows])) for rows in (camera, imu))
     return Periods(
-        _period(log.t_s[camera]),
-        _period(log.t_s[imu]),
-        grid_px(readings),
-        use,
-        int(seen.sum()),
-        int(imu.sum()),
-    )
+        first.period_s, second.period_s, grid_px(readings), use, int(seen.sum()), int(imu.sum()),
+        first.steady, second.steady,
+    )  # fmt: skip
 
 
 def rows_of(log: Log, ticks: bool) -> Rows:
@@ -146,6 +143,8 @@ def blocks(path: Path, options: LogOptions) -> Iterator[Log]:
             raise BadInputError(
                 f"{shown(path)}: has neither camera nor IMU, expected columns as u_px, v_px or gz_radps"
             )
+        if not known:
+            refuse_counts(block, READINGS)
         known = True
         if len(block):
             rows += len(block)
@@ -308,7 +307,8 @@ def setup_from_rig(rig: Rig, path: Path, found: Periods) -> tuple[Setup, list[st
     )
     setup = Setup(
         view, _noise(rig, found), start, plant.bellows_radius_m, process=_process(rig),
-        camera_period_s=found.camera_s, imu_period_s=found.imu_s,
+        camera_period_s=found.camera_s if found.camera_even else math.nan,
+        imu_period_s=found.imu_s if found.imu_even else math.nan,
     )  # fmt: skip
     return setup, said
 

@@ -315,7 +315,7 @@ def tune_log(log: Log, how: Reading) -> TuneLog:
     there, for missing axes where the up vector is asked for, and for a log without a second of samples.
     """
     read = drift_log(log)
-    said = [finding.text for finding in read.findings if finding.severity == "remark"]
+    said = [f"{log.source}: {one.text}" for one in read.findings if one.severity == "remark"]
     lacking = [f"{k}{x}" for k in "ga" for x in "xyz" if f"{k}{x}" not in read.axes]
     if how.tilted and lacking:
         raise BadInputError(

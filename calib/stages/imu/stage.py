@@ -47,6 +47,13 @@ def _degrees(value: float) -> float | None:
     return finite_or_none(math.degrees(value))
 
 
+def _of_sensors(logs: Sequence[RestLog | DriftLog | TuneLog]) -> Iterator[Finding]:
+    """Findings on the sensors of logs, which are named."""
+    for log in logs:
+        for one in log.findings:
+            yield replace(one, text=f"{log.source}: {one.text}")
+
+
 def _sampled(s: Any) -> dict[str, Any]:
     """Keys that say how a log was sampled."""
     return {
@@ -149,7 +156,7 @@ def solve_static(logs: Sequence[RestLog]) -> Imu:
                 if slopes
             },
             "logs": [_rest_log(log) for log in result.logs],
-            **judged(Verdict.of([*judge(result).findings, *(one for log in logs for one in log.findings)])),
+            **judged(Verdict.of([*judge(result).findings, *_of_sensors(logs)])),
         }
     ).with_evidence(result)
 
@@ -483,7 +490,7 @@ def solve_tune(inputs: TuneInputs) -> OrientationFilter:
         by = "reference" if result.judge == "reference" else "smoothed"
     severity: Literal["poor", "remark"] = "poor" if result.judge == "none" else "remark"
     findings = [Finding(severity, text) for text in result.reasons]
-    findings += [one for log in logs for one in log.findings if one.severity != "remark"]
+    findings += [one for one in _of_sensors(logs) if one.severity != "remark"]
     firsts = np.cumsum([0, *(len(log.pieces) for log in logs)]).tolist()
     return OrientationFilter(
         Kp_per_s=gains.Kp,
@@ -712,7 +719,7 @@ def solve_drift(inputs: DriftInputs) -> Drift:
             Ki_per_s2=tuned.gains.Ki,
             rate_of_angle="up vector" if tuned.up_vector else "-gz",
         ),
-        **judged(Verdict.of(finding for log in inputs.logs for finding in log.findings)),
+        **judged(Verdict.of(_of_sensors(inputs.logs))),
     ).with_evidence(logs)
 
 

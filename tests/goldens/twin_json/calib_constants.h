@@ -75,7 +75,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x67EE4B5AUL
+#define CALIB_ID 0x0264FFA1UL
 
 /* Camera (2.5) and lens (B.1). */
 #define CALIB_IMAGE_WIDTH_PX 316 /* columns */
@@ -319,9 +319,9 @@
 #define CALIB_FF_TABLE_SIZE 15 /* entries */
 /* PWM that holds a bellows at FROM + 0.002 m times the index */
 static const float calib_ff_table_pwm[15] CALIB_IN_FLASH = {
-    99.75f, 128.213684f, 139.698013f, 149.123322f, 157.550827f, 165.456009f,
-    173.08812f, 180.61026f, 188.183029f, 195.974625f, 204.195206f, 213.202911f,
-    223.804626f, 240.690048f, 253.5f,
+    99.75f, 128.212112f, 139.695755f, 149.120453f, 157.547455f, 165.452164f,
+    173.083664f, 180.60527f, 188.177307f, 195.968048f, 204.187561f, 213.193314f,
+    223.79158f, 240.65033f, 253.5f,
 };
 
 #if defined(CALIB_EXPECT_TICK_RATE_MHZ)

@@ -75,7 +75,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x45AEC97DUL
+#define CALIB_ID 0x861D8316UL
 
 /* Camera (2.5) and lens (B.1). */
 #define CALIB_IMAGE_WIDTH_PX 316 /* columns */
@@ -319,9 +319,9 @@
 #define CALIB_FF_TABLE_SIZE 15 /* entries */
 /* PWM that holds a bellows at FROM + 0.002 m times the index */
 static const float calib_ff_table_pwm[15] CALIB_IN_FLASH = {
-    99.75f, 128.272415f, 139.782333f, 149.230362f, 157.67662f, 165.599258f,
-    173.254471f, 180.796387f, 188.396317f, 196.219681f, 204.48024f, 213.560852f,
-    224.291412f, 242.171616f, 253.5f,
+    99.75f, 128.273148f, 139.783386f, 149.231689f, 157.678177f, 165.601028f,
+    173.256531f, 180.798706f, 188.398972f, 196.222733f, 204.48378f, 213.565292f,
+    224.297455f, 242.190018f, 253.5f,
 };
 
 #if defined(CALIB_EXPECT_TICK_RATE_MHZ)
