@@ -18,9 +18,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import numpy as np
 from sets import BAD, camera_of, good_set, take
 
+from calib.core.verdict import WORDS
 from calib.stages.camera.bundle import calibrate, covariance
 from calib.stages.camera.model import MODELS, View, pack
-from calib.stages.camera.verdict import VERDICTS, judge
+from calib.stages.camera.verdict import judge
 
 
 def _verdict(views: list[View], size_px: tuple[int, int], model: str) -> tuple[str, float]:
@@ -28,15 +29,15 @@ def _verdict(views: list[View], size_px: tuple[int, int], model: str) -> tuple[s
     known = covariance(fit)
     began = time.process_time()
     found = judge(fit, known)
-    return found.verdict, time.process_time() - began
+    return found.verdict.word, time.process_time() - began
 
 
 def _row(name: str, tally: Counter[str]) -> None:
-    print(f"{name:48s}" + "".join(f"{tally[verdict] or '.':>16}" for verdict in VERDICTS))
+    print(f"{name:48s}" + "".join(f"{tally[verdict] or '.':>16}" for verdict in WORDS))
 
 
 def main(count: int) -> None:
-    print(" " * 48 + "".join(f"{verdict:>16}" for verdict in VERDICTS))
+    print(" " * 48 + "".join(f"{verdict:>16}" for verdict in WORDS))
     for model in MODELS:
         tally: Counter[str] = Counter()
         for seed in range(count):
