@@ -9,10 +9,12 @@ import contextlib
 import io
 import os
 import re
+import signal
 import sys
 import threading
 import traceback
 import warnings
+from collections.abc import Iterator
 from typing import NoReturn, TextIO
 
 from calib.core.compiled import choose_folder
@@ -34,6 +36,8 @@ os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 choose_folder()
 
 _EXIT_INTERRUPTED = 130
+_AGAIN_S = 3.0
+"""How long the answer to Ctrl-C may take before it is raised again."""
 
 
 def main() -> NoReturn:
@@ -47,11 +51,34 @@ def main() -> NoReturn:
     with warnings.catch_warnings():
         if not sys.warnoptions and not debug:
             warnings.simplefilter("ignore")
-        code = _flushed(_run(debug))
+        with _interrupts_that_are_not_lost():
+            code = _flushed(_run(debug))
     if code == _EXIT_INTERRUPTED and _still_working():
         # Nothing waits for threads and processes that are still searching, or were just being started.
         os._exit(code)
     sys.exit(code)
+
+
+@contextlib.contextmanager
+def _interrupts_that_are_not_lost() -> Iterator[None]:
+    """Raise Ctrl-C again where it came while nothing could be raised, as in a finaliser or a callback."""
+    ours = threading.current_thread() is threading.main_thread() and hasattr(signal, "setitimer")
+    if not ours or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+
+    def interrupt(*_: object) -> None:
+        signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _still_working() -> bool:
@@ -99,6 +126,8 @@ def _ended(message: str, code: int) -> int:
 
 
 def _interrupted() -> int:
+    if hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread():
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
     return _ended("interrupted; files that were there before are unchanged or whole", _EXIT_INTERRUPTED)
 
 

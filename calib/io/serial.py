@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import signal
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -276,8 +277,9 @@ def record(read: Callable[[], bytes], more: Callable[[int], bool]) -> Recording:
                 lines.append(csv_row(frame, tick))
                 last = frame
     except KeyboardInterrupt:
-        # Stopping by hand is the usual end; what came so far is the log.
-        pass
+        # Stopping by hand is the usual end; what came so far is the log, and nothing may stop its writing.
+        if hasattr(signal, "setitimer"):
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
     return Recording("".join(lines), len(lines) - 1, lost, restarts, decoder.skipped, decoder.damaged)
 
 
