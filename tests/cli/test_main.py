@@ -221,6 +221,8 @@ def test_an_interruption_while_boards_are_searched(environment, tmp_path) -> Non
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        # An earlier test may have left this process deaf to Ctrl-C, which a child inherits.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509  one call
     )
     assert started.stdout is not None
     assert started.stdout.readline().startswith("searching")
