@@ -1,7 +1,7 @@
 /*
  * calib_constants.h - constants of one rig, written by calib 0.1.0. Do not edit.
  *
- * SHA-256 of the values: 3197c976c04f1ecffd8204ab2a28f544ae55984da981595c464ed90b81f6acf1
+ * SHA-256 of the values: 2c7033224a956d95eee5f970f2eba1e52fdde07bd3cbfb789c47570b24853342
  * input camera/board.yaml: f77bc61378d4ff28baac9883646ca1bf8dc43576acf495b4800377effe06e39b
  * input camera/view01.png: a8a5d43cd237c318df2372ece67ce52fa2a09171cff9447bb68af2394a832c30
  * input camera/view02.png: 74159ff201b50cc6f7316fa06817c34155aa126f4f03cb7415b51f5489fcb730
@@ -61,7 +61,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x3197C976UL
+#define CALIB_ID 0x2C703322UL
 
 /* Camera (2.5) and lens (B.1). */
 #define CALIB_IMAGE_WIDTH_PX 316 /* columns */
@@ -163,6 +163,9 @@
 #define CALIB_IMU_ACCEL_LIMIT_MPS2 400.0f /* readings beyond are lost, m/s^2 */
 #define CALIB_IMU_RATE_LIMIT_RADPS 60.0f /* readings beyond are lost, rad/s */
 #define CALIB_IMU_ACCEL_WEAK_MPS2 1.0f /* |ax| and |ay| below say nothing of phi, m/s^2 */
+
+/* Angle filter: (2.3). */
+#define CALIB_LEVELLING 0 /* 1: the levelling filter, for #if */
 
 /*
  * Angle filter (2.3), dt folded in. The integral is kept as an angle per tick, J = I dt:

@@ -145,7 +145,7 @@ def _lowpass() -> dict[str, Any]:
 
 @cache
 def rig(kind: str = "nominal") -> Rig:
-    """A rig with camera and plane; "full" with every section.
+    """A rig with camera and plane; "full" with every section, "levelling" the same with that angle filter.
 
     "fused" has what that estimator needs, "twin" the same with the sensors of the nominal simulated rig.
     """
@@ -155,7 +155,7 @@ def rig(kind: str = "nominal") -> Rig:
         sections |= {"align": {**_align(), "time_offset_s": 0.025}, "estimator": _estimator(0.025)}
     if kind == "twin":
         sections |= {"align": _align() | _twin(), "estimator": _estimator(0.025)}
-    if kind == "full":
+    if kind in ("full", "levelling"):
         lens = {"k1": -0.2201, "k2": 0.5494, "p1": 0.002, "p2": -0.003, "k3": 0.0}
         camera = _camera(model="brown5", distortion=lens, skew_px=0.8)
         sections = {
@@ -175,6 +175,8 @@ def rig(kind: str = "nominal") -> Rig:
             },
             "actuator": {"bellows_radius_m": 0.0131, "rest_length_m": 0.066},
         }
+    if kind == "levelling":
+        sections["orientation_filter"] |= {"filter": "levelling", "tau_s": 1.5, "velocity_mps": 0.05}
     return Rig.of(sections, "rig.yaml")
 
 

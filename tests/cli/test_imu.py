@@ -383,7 +383,7 @@ def test_without_a_reference_and_with_figures(calib: Run, tmp_path: Path) -> Non
     folder = tmp_path / "figures"
     said = calib("imu", "tune", log, "--rig", tmp_path / "rig.yaml", "--figures", folder)
     assert said.code == 0
-    assert re.search(r"recommended +tuned", said.out)
+    assert re.search(r"recommended +levelling", said.out)
     assert "judged by their own smoothed angle" in said.out
     assert sorted(path.name for path in folder.iterdir()) == ["tune_errors.png", "tune_gains.png"]
 
@@ -457,5 +457,5 @@ def test_duplicates_a_short_gap_and_an_hour(calib: Run, arm: Arm, tmp_path: Path
     assert "2 samples missing in 1 gap(s), the longest 30 ms after 6.99 s; filled" in ended.err
     assert "split at a gap of 3600 s after 14.99 s" in ended.err
     section = Rig.load(tmp_path / "rig.yaml").orientation_filter
-    assert section is not None and section.recommended == "tuned"
+    assert section is not None and section.recommended == "levelling"
     assert section.logs[0].pieces == 2 and section.logs[0].duration_s == pytest.approx(30.0, abs=0.1)

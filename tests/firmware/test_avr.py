@@ -29,7 +29,7 @@ STAGES = ("", "angle", "plane", "offset", "low-pass", "lengths", "control")
 
 @pytest.mark.parametrize("progmem", [False, True])
 @pytest.mark.parametrize("undistort", [0, 1])
-@pytest.mark.parametrize("kind", ["nominal", "full"])
+@pytest.mark.parametrize("kind", ["nominal", "full", "levelling"])
 def test_the_same_values_as_in_float64(tmp_path: Path, kind: str, undistort: int, progmem: bool) -> None:
     made = header(kind)
     write(tmp_path, made)
@@ -43,7 +43,8 @@ def test_the_same_values_as_in_float64(tmp_path: Path, kind: str, undistort: int
     assert (worst <= LIMITS).all(), worst
     assert undecided <= 0.01
     assert sizes["flash"] <= 8192
-    assert sizes["ram"] + found.stack <= 300 + 60 * (kind == "full")
+    tables = 4 * 17 * 4 * (kind == "levelling" and not progmem)
+    assert sizes["ram"] + found.stack <= 300 + 60 * (kind != "nominal") + tables + 20 * (kind == "levelling")
 
 
 @pytest.mark.parametrize("undistort", [0, 1])

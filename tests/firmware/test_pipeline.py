@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from armlogs import swung
 from firmware_build import LIMITS, compare, host, hostile, need, run, strew, write
 from firmware_plant import Loop
 from firmware_rigs import header, rig
@@ -54,6 +55,7 @@ from calib.stages.firmware.vectors import (
     directed_fused,
     vectors,
 )
+from calib.stages.imu.levelling import Levelling, level_log
 from calib.stages.imu.mahony import Mahony, MahonySample, MahonyState
 from calib.stages.imu.mahony import step as step_angle
 from calib.stages.lowpass.filters import LowPass, settled
@@ -64,7 +66,7 @@ from calib.twin.rig import SimulatedRig
 from calib.twin.simulate import simulate
 
 
-@pytest.fixture(scope="module", params=["nominal", "full"])
+@pytest.fixture(scope="module", params=["nominal", "full", "levelling"])
 def built(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Header, list[str], Path]:
@@ -431,6 +433,30 @@ def _true_marker(camera: Camera, u: float, v: float) -> np.ndarray:
     normal = R[:, 2]
     ray = np.array([x, y, 1.0])
     return np.asarray((R.T @ (ray * (normal @ t) / (normal @ ray) - t))[:2])
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_levelling_filter_is_the_projects_own(seed: int) -> None:
+    """But for gains that stand in a table of 17 instead of changing with every tick."""
+    arm = swung(seed, rate_hz=60.0, duration_s=60.0, bias_radps=0.02)
+    constants = dict(header("levelling").values) | {
+        "CALIB_IMU_ACCEL_BIAS_X_MPS2": 0.0,
+        "CALIB_IMU_ACCEL_BIAS_Y_MPS2": 0.0,
+        "CALIB_IMU_ACCEL_RATIO": 1.0,
+        "CALIB_IMU_MOUNT_ANGLE_RAD": 0.0,
+        "CALIB_MM_GYRO_BIAS_DT_RAD": 0.0,
+        "CALIB_MM_DT_S": 1.0 / 60.0,
+    }
+    reference = Reference(constants)
+    readings = zip(arm.ax.tolist(), arm.ay.tolist(), arm.gz.tolist(), strict=True)
+    phi = [
+        reference.step(Inputs(100.0, 100.0, ax, ay, gz, (0.078, 0.078), True, True, MODE_POSITION)).phi_rad
+        for ax, ay, gz in readings
+    ]
+    wanted = level_log(Levelling(1.5, 0.05), arm.t_s, arm.phi_acc, -arm.gz)[0]
+    error, late = np.degrees(np.array(phi) - wanted), arm.t_s > 5.0
+    assert np.abs(error).max() < 0.2
+    assert error[late].std() < 0.05 * np.degrees((wanted - arm.phi)[late].std())
 
 
 @pytest.mark.parametrize("mode", [MODE_ORIENTATION, MODE_POSITION])

@@ -197,8 +197,10 @@ def test_the_sensors_alone_and_the_filter() -> None:
         "gyroscope alone",
         "accelerometer alone",
         "MM 3/3",
-        "MM tuned",
+        "levelling",
+        "tuned",
         "MM 3/3 with up vector",
+        "levelling in three axes",
     ]
     assert skipped == []
     t = PERIOD * np.arange(len(phi))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 
@@ -69,26 +68,6 @@ class View:
     target_m: FloatArray
     pixels: FloatArray
     measured: BoolArray | None = None
-
-
-@dataclass(frozen=True)
-class LeftOut:
-    """A file, a picture or points of it that are there and not used.
-
-    Attributes
-    ----------
-    name : of the file or view.
-    why : the rest of a sentence that begins with the name.
-    kind : "file" (no picture), "unreadable", "size" (another one than the others'), "no board", "view"
-        or "points" (do not agree with the others).
-    """
-
-    name: str
-    why: str
-    kind: Literal["file", "unreadable", "size", "no board", "view", "points"]
-
-    def __str__(self) -> str:
-        return f"{self.name}: {self.why}"
 
 
 @dataclass(frozen=True)

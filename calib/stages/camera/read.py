@@ -20,9 +20,9 @@ from calib.core.files import check_readable, hash_of, read_yaml_mapping, shown
 from calib.core.schema import validated
 from calib.core.units import plain_number
 from calib.core.workers import Workers
-from calib.io.pictures import SUFFIXES, Picture, list_pictures, read_picture, usual_size
+from calib.io.pictures import Picture, list_pictures, read_picture, same_size
 from calib.stages.camera.corners import Detection, detect, find_size
-from calib.stages.camera.model import Board, LeftOut, View
+from calib.stages.camera.model import Board, View
 
 # ----------------------------------------------------------------------
 # board.yaml, and the search for its board in a set of pictures.
@@ -98,15 +98,15 @@ class BoardSearch:
     image_size_px : width and height of all pictures.
     views : one for each picture with the board; the names are the files'.
     detections : as `views`.
-    left_out : pictures that are not used: unreadable, of another size, or without the board.
-    hashes : SHA-256 of every picture that could be read by name.
+    without : names of pictures where the board was not found.
+    hashes : SHA-256 of every picture by name.
     """
 
     board: Board
     image_size_px: tuple[int, int]
     views: tuple[View, ...]
     detections: tuple[Detection, ...]
-    left_out: tuple[LeftOut, ...]
+    without: tuple[str, ...]
     hashes: dict[str, str]
 
 
@@ -119,9 +119,6 @@ def find_boards(
 ) -> BoardSearch:
     """Decode pictures and find the board in each, several at a time.
 
-    Pictures that cannot be decoded, and those of another size than `image_size_px` (by default than most
-    of them have), are left out.
-
     Parameters
     ----------
     corners : inner corners, columns and rows; found in the pictures when None.
@@ -131,65 +128,26 @@ def find_boards(
 
     Raises
     ------
-    BadInputError : no picture that can be read, none of the size, or no board in any; when another board
-        is there the message says which.
+    BadInputError : a picture that cannot be read, pictures of several sizes, or no board in any; when
+        another board is there the message says which.
     """
-    read = dict(zip(paths, _read(paths), strict=True))
-    pictures = {path: one for path, one in read.items() if isinstance(one, Picture)}
-    if not pictures:
-        raise next(one for one in read.values() if isinstance(one, BadInputError))
-    size_px = image_size_px or usual_size(list(pictures.values()))
-    usable = {path: one for path, one in pictures.items() if one.size_px == size_px}
-    if not usable:
-        which = list(pictures.values())
-        width, height = which[0].size_px
-        raise BadInputError(
-            f"{_names(which)}: {_is_or_are(which)} {width}x{height} px, expected {size_px[0]}x{size_px[1]} px"
-        )
-    with Workers(_Album(list(usable), list(usable.values())), len(usable)) as workers:
-        search = _Search(workers, list(usable.values()), size_px, square_m, progress).run(corners)
-    boardless = {one.name: one for one in search.left_out}
-    left_out = [
-        _not_read(path, one) if isinstance(one, BadInputError)
-        else _of_another_size(one, size_px, len(usable)) if path not in usable
-        else boardless.get(one.name)
-        for path, one in read.items()
-    ]  # fmt: skip
-    return replace(
-        search,
-        left_out=tuple(one for one in left_out if one is not None),
-        hashes={one.name: one.sha256 for one in pictures.values()},
-    )
+    pictures = _read(paths)
+    with Workers(_Album(paths, pictures), len(paths)) as workers:
+        return _Search(workers, pictures, square_m, progress).run(corners, image_size_px)
 
 
-def _not_read(path: Path, error: BadInputError) -> LeftOut:
-    return LeftOut(shown(path.name), str(error).removeprefix(f"{shown(path)}: "), "unreadable")
-
-
-def _of_another_size(picture: Picture, size_px: tuple[int, int], others: int) -> LeftOut:
-    (width, height), (w, h) = picture.size_px, size_px
-    turned = ", as if turned by a quarter" if (width, height) == (h, w) else ""
-    why = f"is {width}x{height} px{turned}; {others} others are {w}x{h} px"
-    return LeftOut(picture.name, why, "size")
-
-
-def _read(paths: Sequence[Path]) -> list[Picture | BadInputError]:
-    """All pictures, or why they cannot be read; the pixels only of as many as memory surely has room for."""
-    kept, pictures = 0, list[Picture | BadInputError]()
+def _read(paths: Sequence[Path]) -> list[Picture]:
+    """All pictures; the pixels only of as many as memory surely has room for."""
+    kept, pictures = 0, []
     with Workers(None, len(paths), large=True) as workers:
         for picture in workers.in_order(_picture, paths):
-            if isinstance(picture, Picture):
-                kept += picture.gray.size
-                picture = picture if kept <= _KEPT_PIXELS else picture.without_pixels()
-            pictures.append(picture)
+            kept += picture.gray.size
+            pictures.append(picture if kept <= _KEPT_PIXELS else picture.without_pixels())
     return pictures
 
 
-def _picture(_: None, path: Path) -> Picture | BadInputError:
-    try:
-        return read_picture(path)
-    except BadInputError as error:
-        return error
+def _picture(_: None, path: Path) -> Picture:
+    return read_picture(path)
 
 
 @dataclass(frozen=True)
@@ -223,14 +181,20 @@ class _Search:
 
     workers: Workers[_Album]
     pictures: Sequence[Picture]
-    size_px: tuple[int, int]
     square_m: float
     progress: Callable[[int, int], None]
     done: int = 0
     sizes: dict[int, tuple[int, int] | None] = field(default_factory=dict)
 
-    def run(self, corners: tuple[int, int] | None) -> BoardSearch:
-        pictures, count = self.pictures, len(self.pictures)
+    def run(self, corners: tuple[int, int] | None, expected_px: tuple[int, int] | None) -> BoardSearch:
+        pictures = self.pictures
+        size_px = same_size(pictures)
+        if expected_px is not None and size_px != expected_px:
+            raise BadInputError(
+                f"{_names(pictures)}: {_is_or_are(pictures)} {size_px[0]}x{size_px[1]} px, "
+                f"expected {expected_px[0]}x{expected_px[1]} px"
+            )
+        count = len(pictures)
         sample = list(range(0, count, max(1, count // _SIZE_SAMPLE)))
         wanted = corners or self._common_size(sample) or self._common_size(range(count))
         if wanted is None:
@@ -246,20 +210,15 @@ class _Search:
         if not any(found.values()):
             raise BadInputError(_not_found(pictures, wanted, self._common_size(sample)))
         board = Board(*wanted, self.square_m)
-        why = f"shows no board with {wanted[0]}x{wanted[1]} inner corners that can be read"
         target = board.points_m()
         seen = [(picture, detection) for i, picture in enumerate(pictures) if (detection := found[i])]
         return BoardSearch(
             board=board,
-            image_size_px=self.size_px,
+            image_size_px=size_px,
             views=tuple(View(p.name, target, d.pixels, d.refined) for p, d in seen),
             detections=tuple(detection for _, detection in seen),
-            left_out=tuple(
-                LeftOut(picture.name, why, "no board")
-                for i, picture in enumerate(pictures)
-                if found[i] is None
-            ),
-            hashes={},
+            without=tuple(picture.name for i, picture in enumerate(pictures) if found[i] is None),
+            hashes={picture.name: picture.sha256 for picture in pictures},
         )
 
     def _detect(self, which: Sequence[int], corners: tuple[int, int]) -> dict[int, Detection | None]:
@@ -609,14 +568,14 @@ class ViewSet:
     views : one for each picture with a board.
     image_size_px : width and height.
     hashes : SHA-256 of each input by its name.
-    left_out : files that are there and not used.
+    without : names of pictures without a board.
     remarks : sentences for the person who watches.
     """
 
     views: tuple[View, ...]
     image_size_px: tuple[int, int]
     hashes: dict[str, str]
-    left_out: tuple[LeftOut, ...]
+    without: tuple[str, ...]
     remarks: tuple[str, ...]
 
 
@@ -718,21 +677,9 @@ def _from_pictures(sources: Sequence[Path], told: Told, progress: Callable[[int,
     if corners is None:
         remarks.append(f"found a board with {found.board.columns}x{found.board.rows} inner corners")
     remarks.append(f"board found in {len(found.views)} of {len(paths)} pictures")
-    left_out = (*found.left_out, *_no_pictures(sources))
-    return ViewSet(found.views, found.image_size_px, {**found.hashes, **hashes}, left_out, tuple(remarks))
-
-
-def _no_pictures(sources: Sequence[Path]) -> list[LeftOut]:
-    """Files of folders that are not read at all."""
-    inside = [path for source in sources if source.is_dir() for path in sorted(source.iterdir())]
-    return [
-        LeftOut(shown(path.name), f"is no picture ({', '.join(kind[1:] for kind in SUFFIXES)})", "file")
-        for path in inside
-        if path.is_file()
-        and path.suffix.lower() not in SUFFIXES
-        and not path.name.startswith(".")
-        and path.name != BOARD_FILE
-    ]
+    return ViewSet(
+        found.views, found.image_size_px, {**found.hashes, **hashes}, found.without, tuple(remarks)
+    )
 
 
 def _text(value: Sequence[int] | float) -> str:

@@ -61,6 +61,10 @@ class Wanted(Outputs):
 class _Memory:
     phi: float = 0.0
     integral: float = 0.0
+    level: float = 0.0
+    before: float = 0.0
+    ticks: int = 0
+    step: int = 0
     marker: tuple[float, float] = (0.0, 0.0)
     lowpass: list[list[float]] = field(default_factory=list)
     sum: list[float] = field(default_factory=lambda: [0.0, 0.0])
@@ -125,6 +129,10 @@ class Reference:
         ax = c["IMU_SIGN_AX"] * ax - c["IMU_ACCEL_BIAS_X_MPS2"]
         ay = c["IMU_ACCEL_RATIO"] * (c["IMU_SIGN_AY"] * ay - c["IMU_ACCEL_BIAS_Y_MPS2"])
         gz = c["IMU_SIGN_GZ"] * gz
+        levelling = bool(c["LEVELLING"])
+        if levelling and m.imu_age != _NEVER:
+            m.phi += m.integral - 0.5 * c["MM_DT_S"] * (gz + m.before)
+        m.before = gz
         if max(abs(ax), abs(ay)) <= c["IMU_ACCEL_WEAK_MPS2"]:
             if m.imu_age == _NEVER:
                 self._counted("imu")
@@ -134,6 +142,14 @@ class Reference:
             e = math.remainder(math.atan2(ay, ax) - c["IMU_MOUNT_ANGLE_RAD"] - m.phi, 2.0 * math.pi)
         if m.imu_age == _NEVER:
             m.phi = e
+        elif levelling:
+            i, S = m.step, m.level + e
+            m.phi += c[f"calib_levelling_angle[{i}]"] * S
+            m.integral = clip(m.integral + c[f"calib_levelling_bias[{i}]"] * S, c["MM_INTEGRAL_LIMIT_RAD"])
+            m.level = S - c[f"calib_levelling_sum[{i}]"] * S
+            if i < c["LEVELLING_STEPS"] - 1:
+                m.ticks += 1
+                m.step += m.ticks >= c[f"calib_levelling_until[{i}]"]
         else:
             m.integral = clip(m.integral + c["MM_KI_DT2"] * e, c["MM_INTEGRAL_LIMIT_RAD"])
             m.phi += c["MM_KP_DT"] * e + m.integral - c["MM_DT_S"] * gz

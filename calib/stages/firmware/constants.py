@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,6 +34,8 @@ from calib.stages.estimator.constant_gain import (
 )
 from calib.stages.estimator.section import EstimatorGain
 from calib.stages.firmware.literals import Constant, Group, Item, Macro, Table, Whole
+from calib.stages.imu.levelling import Levelling, settled
+from calib.stages.imu.levelling import gains as gains_of
 from calib.stages.lowpass.filters import LowPass, coefficients
 
 if TYPE_CHECKING:
@@ -372,6 +375,12 @@ def camera_groups(camera: CameraConstants) -> tuple[Group, ...]:
 #     J   += (Ki dt^2) e                       e = atan2(ay, ax) - mount - phi, wrapped to half a turn
 #     phi += (Kp dt) e + J - dt gz,                J = bias dt at the start
 #
+# The levelling filter takes V of `calib.stages.imu.levelling` as a sum of angles over ticks, S = V / dt. Its
+# gains stand in a table for the ticks at which they change, the last for ever.
+#
+#     phi += J - dt (gz + gz of the tick before) / 2,   S += e
+#     phi += A S,   J += B S,   S -= C S
+#
 # A section of the low-pass of order one, b0 (1 + z^-1) / (1 + a1 z^-1), runs in the trapezoidal form
 # v = b0 (x - s), y = s + v, s' = y + v: one product, and y = x exactly at rest. A section of order two runs
 # as a state-variable filter with three gains derived from b0, a1, a2 (Simper 2013), at rest as exact:
@@ -426,7 +435,7 @@ def _tick_group(lookup: Lookup, rate_hz: float) -> Group:
     )
 
 
-def _imu_groups(lookup: Lookup, rate_hz: float) -> tuple[Group, Group]:
+def _imu_groups(lookup: Lookup, rate_hz: float) -> tuple[Group, Group, Group]:
     dt = 1.0 / rate_hz
     bias, ratio = [0.0, 0.0], 1.0
     if lookup.find("align") is not None:
@@ -474,6 +483,9 @@ def _imu_groups(lookup: Lookup, rate_hz: float) -> tuple[Group, Group]:
         ),
         lookup.defaults(),
     )
+    angle = (
+        _levelling_group(lookup, rate_hz) if lookup.find("orientation_filter.filter") == "levelling" else None
+    )
     Kp = lookup.number("orientation_filter.Kp_per_s", 3.0, 0.0, rate_hz)
     Ki = lookup.number("orientation_filter.Ki_per_s2", 3.0, 0.0, rate_hz * rate_hz)
     mahony = Group(
@@ -499,7 +511,44 @@ def _imu_groups(lookup: Lookup, rate_hz: float) -> tuple[Group, Group]:
         ),
         lookup.defaults(),
     )
-    return imu, mahony
+    levelled = angle or Group(
+        ("Angle filter: (2.3).",), (Whole("CALIB_LEVELLING", 0, "1: the levelling filter, for #if"),)
+    )
+    return imu, levelled, mahony
+
+
+_LEVELLING_STEPS = 17
+
+
+def _levelling_group(lookup: Lookup, rate_hz: float) -> Group:
+    """Gains of the levelling filter from the first tick on, constant over stretches that grow."""
+    tau_s = lookup.number("orientation_filter.tau_s", Levelling.tau_s, 2.0 / rate_hz, 100.0)
+    velocity = lookup.number("orientation_filter.velocity_mps", Levelling.velocity_mps, 1e-4, 100.0)
+    filter_ = Levelling(tau_s, velocity)
+    dt, last = 1.0 / rate_hz, min(round(3.0 * filter_.bias_tau_s * rate_hz), 0xFFFF)
+    edges = np.unique(np.round(np.geomspace(1.0, last, _LEVELLING_STEPS))).astype(int)
+    gains = gains_of(filter_, dt, last)
+    rows = [gains[a - 1 : b - 1].mean(axis=0) for a, b in pairwise(edges.tolist())]
+    table = np.array([*rows, settled(filter_, dt)]) * [1.0, dt, dt * dt]
+    return Group(
+        (
+            f"Angle filter: levelling, tau {tau_s:g} s, velocity {velocity:g} m/s; S is a sum of angles:",
+            "phi += J - DT (gz + gz before) / 2, S += e; then phi += ANGLE S, J += BIAS S, S -= SUM S.",
+        ),
+        (
+            Whole("CALIB_LEVELLING", 1, "1: the levelling filter, for #if"),
+            Whole("CALIB_LEVELLING_STEPS", len(table), "entries of each table; the last holds for ever"),
+            Table(
+                "calib_levelling_until",
+                tuple(map(float, [*(edges[1:] - 1), 0.0])),
+                "ticks for which each holds",
+            ),
+            Table("calib_levelling_angle", tuple(table[:, 1].tolist()), "ANGLE, dimensionless"),
+            Table("calib_levelling_bias", tuple(table[:, 2].tolist()), "BIAS, dimensionless"),
+            Table("calib_levelling_sum", tuple(table[:, 0].tolist()), "SUM, dimensionless"),
+        ),
+        lookup.defaults(),
+    )
 
 
 def _sections(lookup: Lookup, rate_hz: float) -> list[tuple[tuple[float, ...], tuple[float, ...]]]:
@@ -586,10 +635,10 @@ def motion_groups(lookup: Lookup) -> tuple[Group, ...]:
     """
     rate_hz = tick_rate_hz(lookup)
     tick = _tick_group(lookup, rate_hz)
-    imu, mahony = _imu_groups(lookup, rate_hz)
+    imu, levelling, mahony = _imu_groups(lookup, rate_hz)
     lowpass = _lowpass_group(lookup, rate_hz)
     marker, kinematics = _kinematics_groups(lookup)
-    return tick, imu, mahony, marker, lowpass, kinematics
+    return tick, imu, levelling, mahony, marker, lowpass, kinematics
 
 
 # ----------------------------------------------------------------------

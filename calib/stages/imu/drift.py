@@ -210,7 +210,7 @@ def lag_s(
 # judged is the error of their angle against
 #
 # - the true angle, where the log has one: everywhere, without the first seconds of a part for slope,
-#   offset and Allan deviation, and while it moves for RMSE and lag;
+#   offset, Allan deviation and RMSE; while it moves for RMSE and lag;
 # - otherwise a constant, in each stretch at rest, again without the stretch's first seconds, in which
 #   filters settle. A log that never rests then shows nothing.
 #
@@ -338,7 +338,11 @@ def _measure(
         offset = float(np.average(wrapped(np.array(offsets)), weights=lengths))
     rmse, lag = math.nan, math.nan
     if truth is not None:
-        off = [(e - t)[np.isfinite(e - t) & m] for e, t, m in zip(track.phi_rad, truth, moving, strict=True)]
+        off = []
+        for e, t, m in zip(track.phi_rad, truth, moving, strict=True):
+            late = _settled(0, len(t), period_s)
+            error = (e - t)[late]
+            off.append(error[np.isfinite(error) & m[late]])
         off = [_no_turns(error) for error in off if len(error)]
         if off:
             # Parts may be whole turns apart.
@@ -377,7 +381,7 @@ def analyse_drift(
 
     Parameters
     ----------
-    tuned : what the row "MM tuned" is made with, left out without.
+    tuned : what the row "tuned" is made with, left out without.
     peers : run the filters of others that are installed.
     told : is called with a sentence before what may take long.
 

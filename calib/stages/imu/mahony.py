@@ -152,7 +152,7 @@ def _run_many(
         _run(t, phi_acc, w, gains[j, 0], gains[j, 1], phi_0, integral_0, out_phi[j], unused)
 
 
-def _checked(
+def checked(
     t_s: FloatArray, phi_acc_rad: FloatArray, rate_radps: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     t, phi_acc, w = (np.ascontiguousarray(x, dtype=np.float64) for x in (t_s, phi_acc_rad, rate_radps))
@@ -189,7 +189,7 @@ def filter_log(
     ------
     BadInputError for lengths that differ, time that goes back and values that are not finite.
     """
-    t, phi_acc, w = _checked(t_s, phi_acc_rad, rate_radps)
+    t, phi_acc, w = checked(t_s, phi_acc_rad, rate_radps)
     state = MahonyState(float(phi_acc[0]), 0.0) if start is None else start
     phi, integral = np.empty(len(t)), np.empty(len(t))
     back = _run(
@@ -216,7 +216,7 @@ def filter_many(
     start: MahonyState | None = None,
 ) -> FloatArray:
     """Angles (gains, n) of `filter_log` for each pair of gains; a pair that is unstable may overflow."""
-    t, phi_acc, w = _checked(t_s, phi_acc_rad, rate_radps)
+    t, phi_acc, w = checked(t_s, phi_acc_rad, rate_radps)
     state = MahonyState(float(phi_acc[0]), 0.0) if start is None else start
     gains = np.array([(p.Kp, p.Ki) for p in parameters], dtype=np.float64).reshape(-1, 2)
     phi = np.empty((len(gains), len(t)))

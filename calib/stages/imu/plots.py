@@ -32,10 +32,10 @@ from calib.core.plot import (
 from calib.stages.imu.allan import model_variance
 from calib.stages.imu.drift import LogDrift
 from calib.stages.imu.intrinsics import Accelerometer, Intrinsics
-from calib.stages.imu.mahony import filter_log, wrapped
+from calib.stages.imu.mahony import Mahony, wrapped
 from calib.stages.imu.section import OrientationFilter
 from calib.stages.imu.static import AxisNoise, Static, StaticLog
-from calib.stages.imu.tuning import Piece, Tuning, frontier
+from calib.stages.imu.tuning import Piece, Tuning, frontier, run_filter
 
 # ----------------------------------------------------------------------
 # At rest: Allan deviation with what explains it, readings over time, drift by log.
@@ -266,7 +266,9 @@ _METHODS = {
     "accelerometer alone": ("grey", 0.9),
     "gyroscope alone": ("red", 0.9),
     "MM 3/3": ("blue", 1.6),
-    "MM tuned": ("purple", 1.4),
+    "tuned": ("purple", 1.4),
+    "levelling": ("orange", 1.2),
+    "levelling in three axes": ("ink", 1.2),
     "VQF": ("green", 0.9),
 }
 """Those that are drawn in motion, with colour and width."""
@@ -432,7 +434,7 @@ def _gains(result: Tuning, dt_s: float, verdict: str) -> Figure:
     ]
     right: list[Mark] = [Curve(f.lag_s, f.bias_peak_s, kind="points", colour="silver")]
     for one in result.candidates:
-        if one.name in _PAIRS:
+        if isinstance(one.gains, Mahony):
             (hue, kind), gains = _PAIRS[one.name], one.gains
             # The grid's nearest pair stands for it: the facts change slowly.
             k = int(np.argmin(np.log(f.Kp / gains.Kp) ** 2 + np.log(f.Ki / max(gains.Ki, 1e-9)) ** 2))
@@ -452,7 +454,7 @@ def _gains(result: Tuning, dt_s: float, verdict: str) -> Figure:
 
 
 def _tuning_errors(result: Tuning, pieces: Sequence[Piece], verdict: str) -> Figure:
-    """Angle of the longest piece, and the errors of 3/3 and of the tuned or recommended pair."""
+    """Angle of the longest piece, and the errors of 3/3 and of the tuned filters."""
     k = int(np.argmax([len(piece.t_s) for piece in pieces]))
     piece, own = pieces[k], result.smoothed[k]
     if result.judge == "reference" and piece.reference_rad is not None:
@@ -468,11 +470,13 @@ def _tuning_errors(result: Tuning, pieces: Sequence[Piece], verdict: str) -> Fig
         Curve(every(t), every(np.degrees(target)), colour="ink"),
     )
     below: list[Mark] = [Rule("y", 0.0)]
-    for one in [one for one in result.candidates if one.name in _PAIRS][:2]:
-        phi = filter_log(one.gains, t, piece.phi_acc_rad, piece.rate_radps)[0]
-        error = np.degrees(wrapped(phi - target))
+    for one in result.candidates:
+        if one.name == "riccati":
+            continue
+        error = np.degrees(wrapped(run_filter(one.gains, t, piece.phi_acc_rad, piece.rate_radps) - target))
         if np.isfinite(error).any():
-            below.append(Curve(*thinned(t, error), one.name, colour=_PAIRS[one.name][0], size=1.0))
+            hue = _PAIRS[one.name][0] if one.name in _PAIRS else "purple"
+            below.append(Curve(*thinned(t, error), one.name, colour=hue, size=1.0))
     limits = (float(t[0]), float(t[-1]))
     panels = (
         Plot("", "angle (degrees)", above, f"Grey: accelerometer; black: {by}", limits),

@@ -188,10 +188,11 @@ class ImuIntrinsics(Result):
 
 
 class FilterCandidate(Section):
-    """A pair of gains, what it does, and its held-out error.
+    """An angle filter, what it does, and its held-out error.
 
     Attributes
     ----------
+    Kp_per_s, Ki_per_s2 : of (2.3); tau_s, velocity_mps : of the levelling filter.
     poles : discrete, real and imaginary parts.
     bandwidth_hz : of the accelerometer's part.
     noise_gain : variance of the angle over that of white noise on the accelerometer's angle.
@@ -199,11 +200,13 @@ class FilterCandidate(Section):
     settling_s : of an error of the angle, `bias_settling_s` of the bias; null where it never does.
     rmse_deg, interval_deg : held-out error and its 95 % interval; null without a judge.
     less_than_3_3_deg, less_interval_deg, confidence : error less that of 3/3, how surely it is less.
-    whole_rmse_deg : error on the whole logs, which "tuned" was tuned on.
+    whole_rmse_deg : error on the whole logs, which "tuned" and "levelling" were tuned on.
     """
 
-    Kp_per_s: Positive = quantity(label="Kp", digits=4)
-    Ki_per_s2: NotNegative = quantity(label="Ki", digits=4)
+    Kp_per_s: Positive | None = quantity(None, label="Kp", digits=4)
+    Ki_per_s2: NotNegative | None = quantity(None, label="Ki", digits=4)
+    tau_s: Positive | None = quantity(None, label="time constant", digits=2)
+    velocity_mps: Positive | None = quantity(None, label="velocity", digits=2)
     poles: list[Pair] = quantity(label="poles", digits=4)
     bandwidth_hz: NotNegative = quantity(label="bandwidth", digits=3)
     noise_gain: NotNegative = quantity(label="noise", digits=5)
@@ -249,25 +252,32 @@ class FilterLog(Section):
 
 
 class OrientationFilter(Result):
-    """Gains of the angle filter (2.3) and why they are these.
+    """The angle filter, its parameters and why they are these.
 
     Attributes
     ----------
+    filter : "mahony" is that of (2.3), "levelling" the one with a bounded velocity.
+    Kp_per_s, Ki_per_s2 : gains of (2.3), for whatever runs it.
+    tau_s, velocity_mps : of the levelling filter; null where it was not tried.
     rate_hz : of the logs.
     recommended, recommended_by : the candidate, and "reference", "smoothed" or "default".
-    sigma : half of what the gains of the logs' halves differ by, for tuned gains.
-    halves : best Kp, Ki of the first and of the second halves.
+    sigma : of tuned gains, by leaving parts of the logs out (jackknife).
+    held_out : best Kp, Ki without each part of the logs; older versions wrote `halves`.
     densities, densities_from : of the Riccati equation, and where they are from.
     rate_of_angle : "-gz", or "up vector" for a sensor that is not in plane.
     """
 
-    Kp_per_s: Positive = quantity(label="Kp", digits=4, fact=True)
-    Ki_per_s2: NotNegative = quantity(label="Ki", digits=4, fact=True)
+    filter: Literal["mahony", "levelling"] = quantity("mahony", label="filter", fact=True)
+    Kp_per_s: Positive = quantity(label="Kp", digits=4)
+    Ki_per_s2: NotNegative = quantity(label="Ki", digits=4)
+    tau_s: Positive | None = quantity(None, label="time constant", digits=2)
+    velocity_mps: Positive | None = quantity(None, label="velocity", digits=2)
     rate_hz: Positive = quantity(label="rate", digits=3)
     recommended: str = quantity(label="recommended", fact=True)
     recommended_by: Literal["reference", "smoothed", "default"] = quantity(label="by")
     rate_of_angle: Literal["-gz", "up vector"] = quantity("-gz", label="rate of the angle by")
     sigma: dict[str, NotNegative | None] = {}
+    held_out: list[Pair] = []
     halves: list[Pair] = []
     candidates: dict[str, FilterCandidate] = quantity({}, label="gains")
     densities: dict[str, NotNegative] = quantity({}, label="density")
@@ -341,10 +351,13 @@ class DriftSlopes(Section):
 
 
 class DriftGains(Section):
-    """Gains of the tuned filter, out of the section `orientation_filter`."""
+    """Parameters of the tuned filter, out of the section `orientation_filter`."""
 
-    Kp_per_s: Positive
-    Ki_per_s2: NotNegative
+    filter: Literal["mahony", "levelling"]
+    Kp_per_s: Positive | None = None
+    Ki_per_s2: NotNegative | None = None
+    tau_s: Positive | None = None
+    velocity_mps: Positive | None = None
     rate_of_angle: Literal["-gz", "up vector"]
 
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     )
     from calib.stages.imu.static import AxisNoise, RestLog, StaticLog
     from calib.stages.imu.tracks import DriftLog, Tuned
-    from calib.stages.imu.tuning import Candidate, Noise, Tuning
+    from calib.stages.imu.tuning import AngleFilter, Candidate, Noise, Tuning
 
 _SAME_RATE = 0.02
 
@@ -472,6 +472,7 @@ def solve_tune(inputs: TuneInputs) -> OrientationFilter:
 
     from calib.core.result import finite_or_none, judged
     from calib.core.verdict import Finding, Verdict
+    from calib.stages.imu.levelling import Levelling
     from calib.stages.imu.section import OrientationFilter
     from calib.stages.imu.tuning import tune
 
@@ -479,12 +480,14 @@ def solve_tune(inputs: TuneInputs) -> OrientationFilter:
     pieces = [piece for log in logs for piece in log.pieces]
     result = tune(pieces, inputs.noise)
     dt_s = float(np.median([log.sampling.period_s for log in logs]))
-    chosen, gains = result.recommended, result.recommended.gains
-    halves = [] if result.halves is None else [[one.Kp, one.Ki] for one in result.halves]
+    chosen, mahony = result.recommended, result.mahony
+    levelling = next((one.gains for one in result.candidates if isinstance(one.gains, Levelling)), None)
+    held_out = [[one.Kp, one.Ki] for one in result.held_out]
     sigma: dict[str, float | None] = {}
-    if halves and chosen.name == "tuned":
-        apart = [0.5 * abs(first - second) for first, second in zip(*halves, strict=True)]
-        sigma = dict(zip(("Kp_per_s", "Ki_per_s2"), apart, strict=True))
+    if held_out and chosen.name == "tuned":
+        # The jackknife's deviation.
+        spread = np.std(np.array(held_out), axis=0) * math.sqrt(len(held_out) - 1)
+        sigma = dict(zip(("Kp_per_s", "Ki_per_s2"), spread.tolist(), strict=True))
     by: Literal["reference", "smoothed", "default"] = "default"
     if chosen.name != "3/3":
         by = "reference" if result.judge == "reference" else "smoothed"
@@ -493,14 +496,17 @@ def solve_tune(inputs: TuneInputs) -> OrientationFilter:
     findings += [one for one in _of_sensors(logs) if one.severity != "remark"]
     firsts = np.cumsum([0, *(len(log.pieces) for log in logs)]).tolist()
     return OrientationFilter(
-        Kp_per_s=gains.Kp,
-        Ki_per_s2=gains.Ki,
+        filter="levelling" if chosen.gains is levelling else "mahony",
+        Kp_per_s=mahony.Kp,
+        Ki_per_s2=mahony.Ki,
+        tau_s=None if levelling is None else levelling.tau_s,
+        velocity_mps=None if levelling is None else levelling.velocity_mps,
         rate_hz=1.0 / dt_s,
         recommended=chosen.name,
         recommended_by=by,
         rate_of_angle="up vector" if inputs.tilted else "-gz",
         sigma=sigma,
-        halves=halves,
+        held_out=held_out,
         candidates={one.name: _candidate(one, dt_s) for one in result.candidates},
         densities={
             "gyro_radps_per_sqrt_Hz": result.noise.gyro,
@@ -515,6 +521,15 @@ def solve_tune(inputs: TuneInputs) -> OrientationFilter:
     ).with_evidence((result, pieces))
 
 
+def _parameters(gains: AngleFilter) -> dict[str, float]:
+    """The parameters of a filter by their keys."""
+    from calib.stages.imu.mahony import Mahony
+
+    if isinstance(gains, Mahony):
+        return {"Kp_per_s": gains.Kp, "Ki_per_s2": gains.Ki}
+    return {"tau_s": gains.tau_s, "velocity_mps": gains.velocity_mps}
+
+
 def _candidate(one: Candidate, dt_s: float) -> FilterCandidate:
     from calib.core.result import finite_or_none
     from calib.stages.imu.section import FilterCandidate
@@ -525,8 +540,7 @@ def _candidate(one: Candidate, dt_s: float) -> FilterCandidate:
 
     facts = gain_facts(one.gains, dt_s)
     return FilterCandidate(
-        Kp_per_s=one.gains.Kp,
-        Ki_per_s2=one.gains.Ki,
+        **_parameters(one.gains),
         poles=[[p.real, p.imag] for p in facts.poles],
         bandwidth_hz=facts.bandwidth_hz,
         noise_gain=facts.noise_gain,
@@ -570,22 +584,15 @@ def _filter_log(log: TuneLog, result: Tuning, first: int) -> FilterLog:
 def _of_tuning(result: Tuning, logs: Sequence[TuneLog], tilted: bool) -> Iterator[Finding]:
     """What is to be known of the gains, and of the logs that they are from."""
     from calib.core.verdict import Finding
+    from calib.stages.imu.mahony import Mahony
 
-    chosen, base = result.recommended, result.candidates[0]
-    damping = chosen.gains.Kp / (2.0 * math.sqrt(chosen.gains.Ki)) if chosen.gains.Ki > 0.0 else math.inf
-    if damping < _RINGS:
+    gains, base = result.recommended.gains, result.candidates[0]
+    if isinstance(gains, Mahony) and gains.Kp < 2.0 * _RINGS * math.sqrt(gains.Ki):
         yield Finding(
             "remark",
-            f"The pair is damped by {damping:.2f} only and rings: it serves a start from an unknown bias; "
-            "a bias that is subtracted before allows a calmer one.",
+            f"The pair is damped by {gains.Kp / (2.0 * math.sqrt(gains.Ki)):.2f} only and rings: it serves a "
+            "start from an unknown bias; a bias that is subtracted before allows a calmer one.",
         )
-    for one in result.candidates[3:]:
-        if one.rmse_rad < 0.9 * min(chosen.rmse_rad, base.rmse_rad):
-            yield Finding(
-                "remark",
-                f"With gains that start large, {one.name}, {math.degrees(one.rmse_rad):.3f} deg are left, as "
-                "the bias is learnt in a second or so.",
-            )
     for one in result.candidates[1:]:
         if one.name == "riccati" and one.whole_rad > 1.5 * base.whole_rad:
             yield Finding(
@@ -620,14 +627,14 @@ def _tune_words(section: OrientationFilter) -> list[Block]:
     del section
     return [
         Line("noise: variance of the angle over that of the accelerometer's; peak: angle per rate's bias"),
-        Line("each half of the logs is judged with gains of the other"),
+        Line("each part of the logs is judged with gains of the others"),
     ]
 
 
 tune = Stage(
     "imu tune",
     "Angle filter",
-    """Tune the angle filter on logs, judge it on parts it was not tuned on, and keep 3/3 unless it wins.
+    """Tune angle filters on logs, judge them on parts they were not tuned on, and keep 3/3 unless one wins.
 
     Uses the sections imu, camera and plane of the rig's file where they are, and writes its section
     orientation_filter. Exits 1 when the logs do not allow a judgement.
@@ -649,7 +656,7 @@ tune = Stage(
 
 _LEAST_UPRIGHT = 0.1
 _ABOUT = {
-    "truth": "error against true_phi_rad; slope, offset and Allan deviation without the first seconds",
+    "truth": "error against true_phi_rad, without the first seconds",
     "rest": "angle in the stretches at rest, without their first seconds; the offset is against the "
     "accelerometer's mean angle",
     "nothing": "the log never rests and has no true_phi_rad, so that it shows no drift",
@@ -680,6 +687,7 @@ class DriftInputs:
 
 
 def _read_drift(files: Files, rig: Rig, options: DriftOptions) -> DriftInputs:
+    from calib.stages.imu.levelling import Levelling
     from calib.stages.imu.mahony import Mahony
     from calib.stages.imu.read import drift_log
     from calib.stages.imu.tracks import Tuned
@@ -688,7 +696,9 @@ def _read_drift(files: Files, rig: Rig, options: DriftOptions) -> DriftInputs:
     logs = [replace(log, source=files.taken(path)) for path, log in read]
     tuned, section = None, rig.orientation_filter
     if section is not None:
-        gains = Mahony(section.Kp_per_s, section.Ki_per_s2)
+        gains: AngleFilter = Mahony(section.Kp_per_s, section.Ki_per_s2)
+        if section.filter == "levelling" and section.tau_s and section.velocity_mps:
+            gains = Levelling(section.tau_s, section.velocity_mps)
         tuned = Tuned(gains, section.rate_of_angle == "up vector")
     return DriftInputs(logs, dict(files.hashes), tuned, options.peers, files.narrate)
 
@@ -698,6 +708,7 @@ def solve_drift(inputs: DriftInputs) -> Drift:
     from calib.core.result import judged
     from calib.core.verdict import Verdict
     from calib.stages.imu.drift import NOT_A_RANKING, analyse_drift, spread_of
+    from calib.stages.imu.mahony import Mahony
     from calib.stages.imu.section import Drift, DriftGains, DriftSlopes
 
     tuned = inputs.tuned
@@ -715,8 +726,8 @@ def solve_drift(inputs: DriftInputs) -> Drift:
         tuned=None
         if tuned is None
         else DriftGains(
-            Kp_per_s=tuned.gains.Kp,
-            Ki_per_s2=tuned.gains.Ki,
+            filter="mahony" if isinstance(tuned.gains, Mahony) else "levelling",
+            **_parameters(tuned.gains),
             rate_of_angle="up vector" if tuned.up_vector else "-gz",
         ),
         **judged(Verdict.of(_of_sensors(inputs.logs))),

@@ -18,7 +18,9 @@ from calib.core.arrays import BoolArray, FloatArray
 from calib.core.errors import BadInputError, pip_install
 from calib.core.verdict import Finding
 from calib.solve.clock import Part
-from calib.stages.imu.mahony import Mahony, MahonyState, accelerometer_angles, filter_log
+from calib.stages.imu.levelling import Levelling, level_three
+from calib.stages.imu.mahony import Mahony, MahonyState, accelerometer_angles
+from calib.stages.imu.tuning import AngleFilter, run_filter
 
 # ----------------------------------------------------------------------
 # How far an estimated orientation is from a true one, as BROAD counts it.
@@ -389,9 +391,9 @@ class Track:
 
 @dataclass(frozen=True)
 class Tuned:
-    """Gains of the row "MM tuned", and whether its rate is that by the up vector instead of -gz."""
+    """The filter of the row "tuned", and whether its rate is that by the up vector instead of -gz."""
 
-    gains: Mahony
+    gains: AngleFilter
     up_vector: bool = False
 
 
@@ -455,7 +457,7 @@ class _Runner:
     def accelerometer(self) -> tuple[FloatArray, ...]:
         return tuple(np.unwrap(phi) for phi in self.phi_acc)
 
-    def mahony(self, gains: Mahony, tilted: bool = False) -> tuple[FloatArray, ...]:
+    def planar(self, gains: AngleFilter, tilted: bool = False) -> tuple[FloatArray, ...]:
         out = []
         for part, phi_acc in zip(self.parts, self.phi_acc, strict=True):
             rate: FloatArray = np.negative(self._of(part, "gz"))
@@ -463,7 +465,16 @@ class _Runner:
                 gyro, force = self.three(part)
                 rate = planar_rate(gyro, up_vector(force, gyro, self.period_s))
             start = MahonyState(_start(phi_acc, rate, self.period_s))
-            out.append(filter_log(gains, part.t_s, phi_acc, rate, start)[0])
+            out.append(run_filter(gains, part.t_s, phi_acc, rate, start))
+        return tuple(out)
+
+    def levelling(self) -> tuple[FloatArray, ...]:
+        """In three axes."""
+        out = []
+        for part in self.parts:
+            gyro, force = self.three(part)
+            up = level_three(Levelling(), part.t_s, force, gyro)
+            out.append(np.unwrap(np.arctan2(up[:, 1], up[:, 0])))
         return tuple(out)
 
     def peer(self, name: str) -> tuple[FloatArray, ...]:
@@ -488,7 +499,7 @@ def tracks_of(
     Parameters
     ----------
     parts : of the log at even steps of this period, each at least two samples long.
-    tuned : what the row "MM tuned" is made with, left out without.
+    tuned : what the row "tuned" is made with, left out without.
     peers : run the filters of others that are installed.
     told : is called with a sentence before what may take long.
     """
@@ -501,18 +512,23 @@ def tracks_of(
         skipped.append("on the chip: the log has no column onchip_phi_rad")
     found.append(Track("gyroscope alone", runner.gyroscope()))
     found.append(Track("accelerometer alone", runner.accelerometer()))
-    found.append(Track("MM 3/3", runner.mahony(Mahony())))
+    found.append(Track("MM 3/3", runner.planar(Mahony())))
+    found.append(Track("levelling", runner.planar(Levelling())))
     if tuned is None:
-        skipped.append("MM tuned: the rig's file has no section orientation_filter")
+        skipped.append("tuned: the rig's file has no section orientation_filter")
     elif tuned.up_vector and runner.lacking:
-        skipped.append("MM tuned: it was tuned with the up vector, which needs three axes of both sensors")
+        skipped.append("tuned: it was tuned with the up vector, which needs three axes of both sensors")
     else:
-        found.append(Track("MM tuned", runner.mahony(tuned.gains, tuned.up_vector)))
+        found.append(Track("tuned", runner.planar(tuned.gains, tuned.up_vector)))
     if runner.lacking:
         which = ", ".join(runner.lacking)
-        skipped.append(f"MM 3/3 with up vector, peers: these need three axes, and {which} is not in the log")
+        skipped.append(
+            f"MM 3/3 with up vector, levelling in three axes, peers: these need three axes, and {which} is "
+            "not in the log"
+        )
         return found, skipped
-    found.append(Track("MM 3/3 with up vector", runner.mahony(Mahony(), tilted=True)))
+    found.append(Track("MM 3/3 with up vector", runner.planar(Mahony(), tilted=True)))
+    found.append(Track("levelling in three axes", runner.levelling()))
     for name in (name for name in PEERS if name != "VQF offline") if peers else ():
         if package := missing(name):
             skipped.append(f"{name}: the package {package} is not installed: {pip_install('peers')}")

@@ -13,7 +13,33 @@ from scipy.stats import norm, t
 
 from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.core.errors import BadInputError
+from calib.stages.imu.levelling import Levelling, level_log
+from calib.stages.imu.levelling import system as levelling_system
 from calib.stages.imu.mahony import Mahony, MahonyState, advance, filter_log, wrapped
+
+AngleFilter = Mahony | Levelling
+"""What can be asked for an angle."""
+
+
+def run_filter(
+    gains: AngleFilter,
+    t_s: FloatArray,
+    phi_acc_rad: FloatArray,
+    rate_radps: FloatArray,
+    start: MahonyState | None = None,
+) -> FloatArray:
+    """Angle (n,) of either filter over a log, see `calib.stages.imu.mahony.filter_log`."""
+    if isinstance(gains, Levelling):
+        return level_log(gains, t_s, phi_acc_rad, rate_radps, start)[0]
+    return filter_log(gains, t_s, phi_acc_rad, rate_radps, start)[0]
+
+
+def words_of(gains: AngleFilter) -> str:
+    """The filter's parameters in words."""
+    if isinstance(gains, Levelling):
+        return f"time constant {gains.tau_s:g} s, velocity {gains.velocity_mps:g} m/s"
+    return f"gains Kp {gains.Kp:g}, Ki {gains.Ki:g}"
+
 
 # ----------------------------------------------------------------------
 # The angle filter as a linear system, and gains from noise.
@@ -73,8 +99,7 @@ class GainFacts:
 
     Attributes
     ----------
-    poles : the two, discrete; stable inside of the unit circle.
-    damping : Kp / (2 sqrt(Ki)), infinite without Ki.
+    poles : discrete; stable inside of the unit circle.
     bandwidth_hz : where the accelerometer's part has fallen by 3 dB.
     noise_gain : variance of the angle over that of white noise on phi_acc.
     bias_gain_s : angle left by a constant bias of the rate [rad per rad/s].
@@ -84,8 +109,7 @@ class GainFacts:
     lag_s : time after which a step that the accelerometer alone sees is followed half way.
     """
 
-    poles: tuple[complex, complex]
-    damping: float
+    poles: tuple[complex, ...]
     bandwidth_hz: float
     noise_gain: float
     bias_gain_s: float
@@ -100,7 +124,10 @@ class GainFacts:
         return max(abs(p) for p in self.poles) < 1.0
 
 
-def _system(gains: Mahony, dt: float) -> tuple[FloatArray, FloatArray]:
+def _system(gains: AngleFilter, dt: float) -> tuple[FloatArray, FloatArray]:
+    """A (m, m) and B (m,) of the settled filter; the state begins with the angle and the integral."""
+    if isinstance(gains, Levelling):
+        return levelling_system(gains, dt)
     whole = dt * (gains.Kp + gains.Ki * dt)
     A = np.array([[1.0 - whole, dt], [-gains.Ki * dt, 1.0]])
     return A, np.array([whole, gains.Ki * dt])
@@ -109,9 +136,9 @@ def _system(gains: Mahony, dt: float) -> tuple[FloatArray, FloatArray]:
 def _bandwidth_hz(A: FloatArray, B: FloatArray, dt: float) -> float:
     f = np.geomspace(1e-5, 0.5, 4000) / dt
     z = np.exp(2j * math.pi * f * dt)
-    # (z - A)^-1 B for its first row, times z: phi_k hears of v_k at once.
-    determinant = (z - A[0, 0]) * (z - A[1, 1]) - A[0, 1] * A[1, 0]
-    gain = np.abs(z * ((z - A[1, 1]) * B[0] + A[0, 1] * B[1]) / determinant)
+    # The first element of (z - A)^-1 B, times z: phi_k hears of v_k at once.
+    inner = z[:, None, None] * np.eye(len(B)) - A
+    gain = np.abs(z * np.linalg.solve(inner, np.broadcast_to(B[:, None], (len(z), len(B), 1)))[:, 0, 0])
     below = np.flatnonzero(gain < math.sqrt(0.5))
     beyond = below[below > int(np.argmax(gain))]
     return float(f[beyond[0]]) if len(beyond) else 0.5 / dt
@@ -123,7 +150,7 @@ def _settled(values: FloatArray, dt: float) -> float:
 
 
 def _powers(A: FloatArray, x: FloatArray, steps: int) -> FloatArray:
-    """A^k x (steps, 2) by doubling."""
+    """A^k x (steps, m) by doubling."""
     out = x[:, None]
     power = A
     while out.shape[1] < steps:
@@ -132,8 +159,8 @@ def _powers(A: FloatArray, x: FloatArray, steps: int) -> FloatArray:
     return out[:, :steps].T
 
 
-def gain_facts(gains: Mahony, dt_s: float) -> GainFacts:
-    """Poles, bandwidth, noise, rejection of a bias and settling of a pair of gains.
+def gain_facts(gains: AngleFilter, dt_s: float) -> GainFacts:
+    """Poles, bandwidth, noise, rejection of a bias and settling of a filter with its settled gains.
 
     Raises `BadInputError` for a step that is not positive and for gains that are unstable with it.
     """
@@ -142,16 +169,15 @@ def gain_facts(gains: Mahony, dt_s: float) -> GainFacts:
     A, B = _system(gains, dt_s)
     poles = np.linalg.eigvals(A)
     size = float(np.abs(poles[np.abs(poles - 1.0) > 1e-12]).max(initial=0.0))
-    if size >= 1.0 or gains.Kp == 0.0:
+    only = isinstance(gains, Mahony) and gains.Ki == 0.0
+    if size >= 1.0 or (isinstance(gains, Mahony) and gains.Kp == 0.0):
         raise BadInputError(
-            f"gains Kp {gains.Kp:g}, Ki {gains.Ki:g} at steps of {dt_s:g} s: are not stable, expected "
-            f"0 < Kp < {2.0 / dt_s:g}"
+            f"{words_of(gains)} at steps of {dt_s:g} s: are not stable, expected 0 < Kp < {2.0 / dt_s:g}"
         )
-    only = gains.Ki == 0.0
-    damping = math.inf if only else gains.Kp / (2.0 * math.sqrt(gains.Ki))
     steps = min(math.ceil(math.log(1e-3) / math.log(size)) + 2, _LONGEST_STEPS)
-    start = _powers(A, np.array([1.0, 0.0]), steps)[:, 0]
-    toward = _powers(A, np.array([0.0, 1.0]), steps)
+    unit = np.eye(len(B))
+    start = _powers(A, unit[0], steps)[:, 0]
+    toward = _powers(A, unit[1], steps)
     # Of a bias that appears at once the angle is the sum of what each step adds.
     biased = dt_s * np.cumsum(start)
     if only:
@@ -163,8 +189,7 @@ def gain_facts(gains: Mahony, dt_s: float) -> GainFacts:
     follow = np.cumsum(_powers(A, B, steps)[:, 0])
     half = np.flatnonzero(follow >= 0.5)
     return GainFacts(
-        poles=(complex(poles[0]), complex(poles[1])),
-        damping=damping,
+        poles=tuple(complex(pole) for pole in poles),
         bandwidth_hz=_bandwidth_hz(A, B, dt_s),
         noise_gain=noise,
         bias_gain_s=left,
@@ -212,138 +237,6 @@ def riccati(noise: Noise, dt_s: float) -> Mahony:
     return Mahony(float(L[0]) / dt_s - Ki * dt_s, Ki)
 
 
-def equivalent_noise(gains: Mahony, accel: float) -> Noise:
-    """Densities whose Kalman filter settles to these gains, for dt -> 0 and a given accelerometer.
-
-    Below a damping of 1 / sqrt(2) there are none; the gyroscope's is then taken as nearly none.
-    """
-    square = max(gains.Kp**2 - 2.0 * gains.Ki, 1e-4 * gains.Kp**2)
-    return Noise(accel * math.sqrt(square), accel * gains.Ki, accel)
-
-
-# ----------------------------------------------------------------------
-# The angle filter with gains that start large: a Kalman filter of angle and gyro bias from a prior.
-#
-# The constant gains of (2.3) take many seconds to learn the bias. A Kalman filter that starts from what is
-# known of it, a standard deviation, learns it as fast as the accelerometer's noise allows, and settles to
-# the gains of `calib.stages.imu.tuning.riccati`. With P of (phi, I) and I = -b one sample is
-#
-#     s = P11 + r / dt,   Kp_k + Ki_k dt = (P11 + dt P12) / (s dt),   Ki_k = P12 / (s dt),
-#     P <- F (P - P1 P1' / s) F' + diag(N^2, K^2) dt,   F = [[1, dt], [0, 1]],
-#
-# after which the step is (2.3) with Kp_k and Ki_k.
-
-_TURN = 2.0 * math.pi
-
-
-@dataclass(frozen=True)
-class Prior:
-    """What is known before the first sample: standard deviations of the angle [rad] and bias [rad/s]."""
-
-    angle_rad: float = 0.1
-    bias_radps: float = 0.05
-
-
-@dataclass(frozen=True)
-class Started:
-    """Angle and integral after each sample (n,), the gains that were used, and the last deviations.
-
-    `sigma_phi_rad` and `sigma_bias_radps` (n,) are those that the filter itself believes in.
-    """
-
-    phi_rad: FloatArray
-    integral_radps: FloatArray
-    Kp_per_s: FloatArray
-    Ki_per_s2: FloatArray
-    sigma_phi_rad: FloatArray
-    sigma_bias_radps: FloatArray
-
-
-@njit(cache=True, nogil=True)
-def _run(
-    t: FloatArray,
-    phi_acc: FloatArray,
-    w: FloatArray,
-    q: float,
-    q_b: float,
-    r: float,
-    phi: float,
-    integral: float,
-    P11: float,
-    P22: float,
-    out: FloatArray,
-) -> None:
-    P12 = 0.0
-    before = t[0]
-    Kp = Ki = 0.0
-    for k in range(len(t)):
-        dt = t[k] - before
-        before = t[k]
-        if dt > 0.0:
-            s = P11 + r / dt
-            whole = (P11 + dt * P12) / (s * dt)
-            Ki = P12 / (s * dt)
-            Kp = whole - Ki * dt
-            a11, a12, a22 = P11 - P11 * P11 / s, P12 - P11 * P12 / s, P22 - P12 * P12 / s
-            P11 = a11 + 2.0 * dt * a12 + dt * dt * a22 + q * dt
-            P12 = a12 + dt * a22
-            P22 = a22 + q_b * dt
-            e = phi_acc[k] - phi
-            e -= _TURN * np.rint(e / _TURN)
-            integral += Ki * e * dt
-            phi += (Kp * e + integral + w[k]) * dt
-        out[0, k] = phi
-        out[1, k] = integral
-        out[2, k] = Kp
-        out[3, k] = Ki
-        out[4, k] = math.sqrt(P11)
-        out[5, k] = math.sqrt(P22)
-
-
-def filter_from_prior(
-    noise: Noise,
-    prior: Prior,
-    t_s: FloatArray,
-    phi_acc_rad: FloatArray,
-    rate_radps: FloatArray,
-    start: MahonyState | None = None,
-) -> Started:
-    """The filter over a log, from the first accelerometer's angle or a given state.
-
-    Parameters
-    ----------
-    t_s, phi_acc_rad, rate_radps : (n,) as of `calib.stages.imu.mahony.filter_log`.
-
-    Raises
-    ------
-    BadInputError for lengths that differ, time that goes back, and values that are not finite.
-    """
-    t, phi_acc, w = (np.ascontiguousarray(x, dtype=np.float64) for x in (t_s, phi_acc_rad, rate_radps))
-    if t.ndim != 1 or t.shape != phi_acc.shape or t.shape != w.shape or len(t) == 0:
-        raise BadInputError(
-            f"angle filter: found times {t.shape}, angles {phi_acc.shape} and rates {w.shape}, "
-            "expected as many of each and at least one"
-        )
-    if not (np.isfinite(phi_acc).all() and np.isfinite(w).all() and (np.diff(t) >= 0.0).all()):
-        raise BadInputError("angle filter: expected finite readings and time that runs forward")
-    state = MahonyState(float(phi_acc[0]), 0.0) if start is None else start
-    out = np.empty((6, len(t)))
-    _run(
-        t,
-        phi_acc,
-        w,
-        noise.gyro**2,
-        noise.walk**2,
-        noise.accel**2,
-        state.phi_rad,
-        state.integral_radps,
-        prior.angle_rad**2,
-        prior.bias_radps**2,
-        out,
-    )
-    return Started(*out)
-
-
 # ----------------------------------------------------------------------
 # Held-out errors of filters, compared by a block bootstrap.
 #
@@ -376,8 +269,8 @@ class Candidate:
 
     Attributes
     ----------
-    name : "3/3", "tuned", "riccati", or one of these "from a prior".
-    gains : those that would be used, of the settled filter.
+    name : "3/3", "tuned", "riccati" or "levelling".
+    gains : those that would be used.
     rmse_rad, low_rad, high_rad : held-out error and its 95 % interval.
     less_rad, less_low_rad, less_high_rad : error less that of 3/3, and its 95 % interval.
     confidence : share of the resamples in which it is less, NaN where nothing was judged.
@@ -385,7 +278,7 @@ class Candidate:
     """
 
     name: str
-    gains: Mahony
+    gains: AngleFilter
     rmse_rad: float
     low_rad: float
     high_rad: float
@@ -403,10 +296,10 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Row:
-    """A filter's errors (n_i,) in each piece, NaN where it is not judged, and its error on the whole."""
+    """A filter's held-out errors (n_i,) in each log, NaN where not judged, and its error on the whole."""
 
     name: str
-    gains: Mahony
+    gains: AngleFilter
     errors_rad: Sequence[FloatArray]
     whole_rad: float
 
@@ -873,22 +766,19 @@ def frontier(noise: Noise, dt_s: float, kp: int = 25, dampings: int = 17) -> Fro
 
 
 # ----------------------------------------------------------------------
-# Gains of the angle filter from logs, tuned on one part and judged on the other.
+# Filters from logs, tuned on some parts and judged on the others.
 #
-# The judge is a reference angle where the logs have one, and the log's own smoothed angle where they do not
-# (`calib.stages.imu.tuning`). For Gaussian errors the latter is no makeshift: the expected square of a
-# filter's
-# error, given the log, is the square of its distance from the smoothed angle plus the smoother's variance,
-# which no gains change. It holds as far as the smoother's model does, so a log that contradicts the model
-# has no judge of its own.
+# The judge is a reference angle where the logs have one, and the log's own smoothed angle where they do not.
+# For Gaussian errors the latter is no makeshift: the expected square of a filter's error, given the log, is
+# the square of its distance from the smoothed angle plus the smoother's variance, which no gains change. It
+# holds as far as the smoother's model does, so a log that contradicts the model has no judge of its own.
 #
-# A filter runs over each log from its first sample with an empty integral, as firmware does. For the
-# judgement each half counts as a log of its own, so that both have a bias to learn; it starts at the angle
-# that it is judged by, as logs start at rest and halves do not. The best gains of the first half are judged
-# on the second and those of the second on the first: together these errors are the held-out ones of
-# "tuned". Whether they are less than those of 3/3 is asked of a block bootstrap
-# (`calib.stages.imu.tuning`). Only
-# a pair that wins with 95 % is recommended; the pair itself is then that of the whole logs.
+# A filter runs over each log from its first sample with an empty integral, as firmware does. It is judged
+# when it has had five seconds to settle: logs that begin in a swing begin with any angle. The logs are
+# cut into parts; the errors of a tuned filter in a part are those of the parameters that are best in all
+# other parts. Whether they are less than those of 3/3 is asked of a block bootstrap. Only a filter that wins
+# with 95 % is recommended, with the parameters that are best in all parts; of several that win, the one with
+# the least held-out error.
 #
 # Of pairs within 3 % of the least error the best damped is taken: a short log does not tell them apart,
 # and a pair that rings has fitted the log's start.
@@ -897,6 +787,14 @@ THREE = Mahony(3.0, 3.0)
 _ALIKE = 1.03
 _LEAST_JUDGED_S = 8.0
 _WORSE = 100.0
+_SETTLE_S = 5.0
+_SETTLE_SHARE = 0.25
+_PART_S = 8.0
+_MOST_PARTS = 8
+"""Parts of a log: eight where it is longer than a minute, none shorter than some swings."""
+_TAU_S = (0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
+_VELOCITY_MPS = (0.01, 0.03, 0.1, 0.3)
+"""Levelling filters that are tried: from a filter that trusts the accelerometer to one that a walk allows."""
 
 
 @dataclass(frozen=True)
@@ -935,9 +833,9 @@ class Tuning:
     ----------
     judge : "reference", "smoothed", or "none" where nothing could be judged.
     candidates : with 3/3 first; without errors (NaN) where nothing could be judged.
-    recommended : one of them that has constant gains.
+    recommended : one of them.
     reasons : why.
-    halves : best gains of the first and of the second halves.
+    held_out : best gains Kp, Ki without each part, empty where nothing could be judged.
     surface : None where nothing could be judged.
     smoothed : of each piece, None where it is too short.
     noise : densities of the sensor with the accelerometer's in motion.
@@ -949,13 +847,19 @@ class Tuning:
     candidates: tuple[Candidate, ...]
     recommended: Candidate
     reasons: tuple[str, ...]
-    halves: tuple[Mahony, Mahony] | None
+    held_out: tuple[Mahony, ...]
     surface: Surface | None
     smoothed: tuple[Smoothed | None, ...]
     noise: Noise
     offset_rad: tuple[float, ...]
     judged_s: float
     block_s: float
+
+    @property
+    def mahony(self) -> Mahony:
+        """Gains of (2.3): the recommended ones, else the best of those that win, else 3/3."""
+        pairs = [self.recommended, *sorted(self.candidates, key=lambda one: one.rmse_rad)]
+        return next((p.gains for p in pairs if isinstance(p.gains, Mahony) and p.wins), THREE)
 
 
 @njit(cache=True, nogil=True)
@@ -964,15 +868,15 @@ def _squares(
     phi_acc: FloatArray,
     w: FloatArray,
     target: FloatArray,
-    start: float,
+    part: IntArray,
     gains: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Adds the sums of squared errors to out (gains,); NaN targets do not count."""
+    """Adds the sums of squared errors to out (gains, parts); NaN targets do not count."""
     turn = 2.0 * math.pi
     for j in range(len(gains)):
         Kp, Ki = gains[j, 0], gains[j, 1]
-        phi, integral, before, total = start, 0.0, t[0], 0.0
+        phi, integral, before = phi_acc[0], 0.0, t[0]
         for k in range(len(t)):
             dt = t[k] - before
             before = t[k]
@@ -980,39 +884,50 @@ def _squares(
             d = phi - target[k]
             if d == d:
                 d -= turn * np.rint(d / turn)
-                total += d * d
-        out[j] += total
+                out[j, part[k]] += d * d
 
 
 @dataclass(frozen=True)
 class _Judged:
-    """Readings with the angle that they are judged by, NaN where they are not, and the filter's start."""
+    """Readings with the angle that they are judged by, NaN where they are not, and each sample's part."""
 
     t_s: FloatArray
     phi_acc_rad: FloatArray
     rate_radps: FloatArray
     target: FloatArray
-    start: MahonyState
+    part: IntArray
 
-    def halves(self) -> tuple[_Judged, _Judged]:
-        """Two logs, each with half of what is judged."""
-        known = np.flatnonzero(np.isfinite(self.target))
-        m = int(known[len(known) // 2])
-        return self._part(slice(0, m)), self._part(slice(m, None))
+    def errors(self, gains: AngleFilter) -> FloatArray:
+        """Errors (n,) of a filter that runs from the first sample on."""
+        return wrapped(run_filter(gains, self.t_s, self.phi_acc_rad, self.rate_radps) - self.target)
 
-    def _part(self, rows: slice) -> _Judged:
-        target = self.target[rows]
-        first = float(target[0]) if math.isfinite(target[0]) else float(self.phi_acc_rad[rows][0])
-        return _Judged(
-            self.t_s[rows], self.phi_acc_rad[rows], self.rate_radps[rows], target, MahonyState(first)
+
+def _parted(pieces: Sequence[tuple[Piece, FloatArray]], dt_s: float) -> tuple[tuple[_Judged, ...], int]:
+    """Logs in parts that are judged for as long as each other, and how many parts there are."""
+    out, count = [], 0
+    for piece, target in pieces:
+        known = np.cumsum(np.isfinite(target))
+        parts = int(np.clip(known[-1] * dt_s / _PART_S, 2, _MOST_PARTS))
+        part = count + np.minimum(parts * known // (known[-1] + 1), parts - 1)
+        t, phi_acc, w, known_angle = (
+            np.ascontiguousarray(x, dtype=np.float64)
+            for x in (piece.t_s, piece.phi_acc_rad, piece.rate_radps, target)
         )
+        out.append(_Judged(t, phi_acc, w, known_angle, part))
+        count += parts
+    return tuple(out), count
 
 
-def _sums(judged: Sequence[_Judged], gains: Sequence[Mahony]) -> FloatArray:
-    pairs = np.array([(g.Kp, g.Ki) for g in gains])
-    out = np.zeros(len(gains))
+def _sums(judged: Sequence[_Judged], filters: Sequence[AngleFilter], parts: int) -> FloatArray:
+    """Sums (filters, parts) of squared errors, infinite where they overflow."""
+    out = np.zeros((len(filters), parts))
+    pairs = np.array([(g.Kp, g.Ki) for g in filters if isinstance(g, Mahony)])
     for one in judged:
-        _squares(one.t_s, one.phi_acc_rad, one.rate_radps, one.target, one.start.phi_rad, pairs, out)
+        if len(pairs):
+            _squares(one.t_s, one.phi_acc_rad, one.rate_radps, one.target, one.part, pairs, out)
+            continue
+        for row, gains in zip(out, filters, strict=True):
+            row += np.bincount(one.part, np.nan_to_num(one.errors(gains)) ** 2, parts)
     return np.where(np.isfinite(out), out, np.inf)
 
 
@@ -1024,17 +939,17 @@ def _pick(gains: Sequence[Mahony], errors: FloatArray) -> Mahony:
     return gains[min((k for k in near if rank[k] == most), key=lambda k: float(errors[k]))]
 
 
-def _search(judged: Sequence[_Judged], dt_s: float) -> tuple[Mahony, Surface]:
-    """Best gains of these logs, and the errors over the grid."""
+def _search(judged: Sequence[_Judged], dt_s: float, parts: int) -> tuple[Mahony, tuple[Mahony, ...], Surface]:
+    """Best gains of (2.3) for these logs, those without each part, and the errors over the grid."""
     K, Z = gain_grid(dt_s)
     tried = [damped(k, z) for k in K.tolist() for z in Z.tolist()]
-    sums = _sums(judged, tried)
+    sums = _sums(judged, tried, parts)
     count = sum(int(np.isfinite(one.target).sum()) for one in judged)
-    surface = Surface(K, Z, np.sqrt(sums / count).reshape(len(K), len(Z)))
+    surface = Surface(K, Z, np.sqrt(sums.sum(axis=1) / count).reshape(len(K), len(Z)))
     step_k, step_z = float(K[1] / K[0]), float(Z[1] / Z[0])
     for _ in range(3):
         step_k, step_z = math.sqrt(step_k), math.sqrt(step_z)
-        at = tried[int(np.argmin(sums))]
+        at = tried[int(np.argmin(sums.sum(axis=1)))]
         zeta = at.Kp / (2.0 * math.sqrt(at.Ki))
         more = [
             damped(
@@ -1046,18 +961,33 @@ def _search(judged: Sequence[_Judged], dt_s: float) -> tuple[Mahony, Surface]:
             if (i, j) != (0, 0)
         ]
         tried += more
-        sums = np.concatenate([sums, _sums(judged, more)])
-    return _pick(tried, sums), surface
+        sums = np.concatenate([sums, _sums(judged, more, parts)])
+    whole = sums.sum(axis=1)
+    return _pick(tried, whole), tuple(_pick(tried, whole - own) for own in sums.T), surface
 
 
-def _errors(judged: _Judged, gains: Mahony) -> FloatArray:
-    one = judged
-    return wrapped(filter_log(gains, one.t_s, one.phi_acc_rad, one.rate_radps, one.start)[0] - one.target)
+def _search_levelling(
+    judged: Sequence[_Judged], dt_s: float, parts: int
+) -> tuple[Levelling, tuple[Levelling, ...]]:
+    """Best levelling filter for these logs, and those without each part."""
+    tried = [Levelling(tau, v) for tau in _TAU_S if tau >= 2.0 * dt_s for v in _VELOCITY_MPS]
+    sums = _sums(judged, tried, parts)
+    whole = sums.sum(axis=1)
+    return tried[int(np.argmin(whole))], tuple(tried[int(np.argmin(whole - own))] for own in sums.T)
 
 
-def _errors_from_prior(judged: _Judged, noise: Noise, prior: Prior) -> FloatArray:
-    run = filter_from_prior(noise, prior, judged.t_s, judged.phi_acc_rad, judged.rate_radps, judged.start)
-    return wrapped(run.phi_rad - judged.target)
+def _crossed(judged: Sequence[_Judged], filters: Sequence[AngleFilter]) -> list[FloatArray]:
+    """Errors of each log, in each part those of the filter that has not seen it."""
+    out = []
+    for one in judged:
+        runs = {filters[k]: one.errors(filters[k]) for k in np.unique(one.part).tolist()}
+        out.append(
+            np.select(
+                [one.part == k for k in range(len(filters)) if filters[k] in runs],
+                [runs[f] for f in filters if f in runs],
+            )
+        )
+    return out
 
 
 def _smoothed(piece: Piece, sensor: Noise) -> Smoothed | None:
@@ -1081,14 +1011,13 @@ def _offset(piece: Piece, smoothed: Smoothed | None) -> float:
     return middle + float(wrapped(known - middle).mean())
 
 
-def tune(pieces: Sequence[Piece], sensor: Noise, prior: Prior | None = None) -> Tuning:
-    """Gains for these logs, and whether they are worth more than 3/3.
+def tune(pieces: Sequence[Piece], sensor: Noise) -> Tuning:
+    """A filter for these logs, and whether it is worth more than 3/3.
 
     Parameters
     ----------
     pieces : logs of the same rate; where one has a reference, only those that have one are judged.
     sensor : densities of the sensor; the accelerometer's is that of a log too short to tell its own.
-    prior : of the start in "from a prior".
 
     Raises `BadInputError` for no logs at all.
     """
@@ -1103,7 +1032,7 @@ def tune(pieces: Sequence[Piece], sensor: Noise, prior: Prior | None = None) -> 
     noise = Noise(sensor.gyro, sensor.walk, accel)
     dt_s = float(np.median([(p.t_s[-1] - p.t_s[0]) / max(len(p.t_s) - 1, 1) for p in pieces]))
     judge = "reference" if any(p.reference_rad is not None for p in pieces) else "smoothed"
-    judged, offsets, reasons = [], [], []
+    with_target, offsets, reasons = [], [], []
     for piece, own in zip(pieces, smoothed, strict=True):
         offset = 0.0
         target: FloatArray | None = None if own is None else own.phi_rad
@@ -1123,10 +1052,11 @@ def tune(pieces: Sequence[Piece], sensor: Noise, prior: Prior | None = None) -> 
             target = None
         offsets.append(offset)
         if target is not None:
-            arrays = (piece.t_s, piece.phi_acc_rad, piece.rate_radps, target)
-            t, phi_acc, w, known_angle = (np.ascontiguousarray(x, dtype=np.float64) for x in arrays)
-            judged.append(_Judged(t, phi_acc, w, known_angle, MahonyState(float(phi_acc[0]))))
-    judged_s = sum(float(np.isfinite(one.target).sum()) for one in judged) * dt_s
+            span_s = float(piece.t_s[-1] - piece.t_s[0])
+            late = piece.t_s - piece.t_s[0] >= min(_SETTLE_S, _SETTLE_SHARE * span_s)
+            with_target.append((piece, np.where(late, target, np.nan)))
+    judged_s = sum(float(np.isfinite(target).sum()) for _, target in with_target) * dt_s
+    settled = riccati(noise, dt_s)
     if judged_s < _LEAST_JUDGED_S:
         reasons.append(
             f"There are {judged_s:.3g} s to judge gains by, expected at least {_LEAST_JUDGED_S:g} s: "
@@ -1135,14 +1065,14 @@ def tune(pieces: Sequence[Piece], sensor: Noise, prior: Prior | None = None) -> 
         nan = math.nan
         unknown = tuple(
             Candidate(name, gains, nan, nan, nan, nan, nan, nan, nan, nan)
-            for name, gains in (("3/3", THREE), ("riccati", riccati(noise, dt_s)))
+            for name, gains in (("3/3", THREE), ("riccati", settled))
         )
         return Tuning(
             judge="none",
             candidates=unknown,
             recommended=unknown[0],
             reasons=tuple(reasons),
-            halves=None,
+            held_out=(),
             surface=None,
             smoothed=smoothed,
             noise=noise,
@@ -1150,29 +1080,20 @@ def tune(pieces: Sequence[Piece], sensor: Noise, prior: Prior | None = None) -> 
             judged_s=judged_s,
             block_s=nan,
         )
-    tuned, surface = _search(judged, dt_s)
-    firsts, seconds = zip(*(one.halves() for one in judged), strict=True)
-    of_first, of_second = _search(firsts, dt_s)[0], _search(seconds, dt_s)[0]
-    settled = riccati(noise, dt_s)
-    start = prior or Prior()
-    parts = [*firsts, *seconds]
+    judged, parts = _parted(with_target, dt_s)
+    tuned, held_out, surface = _search(judged, dt_s, parts)
+    levelling, levelling_held_out = _search_levelling(judged, dt_s, parts)
 
-    def plain(name: str, gains: Mahony) -> Row:
-        whole = rms([_errors(one, gains) for one in judged])
-        return Row(name, gains, [_errors(one, gains) for one in parts], whole)
+    def row(name: str, gains: AngleFilter, held_out: Sequence[AngleFilter] = ()) -> Row:
+        errors = [one.errors(gains) for one in judged]
+        return Row(name, gains, _crossed(judged, held_out) if held_out else errors, rms(errors))
 
-    def started(name: str, gains: Mahony, density: Noise) -> Row:
-        whole = rms([_errors_from_prior(one, density, start) for one in judged])
-        return Row(name, gains, [_errors_from_prior(one, density, start) for one in parts], whole)
-
-    crossed = [_errors(one, of_second) for one in firsts] + [_errors(one, of_first) for one in seconds]
     candidates, block_s = compared(
         [
-            plain("3/3", THREE),
-            Row("tuned", tuned, crossed, rms([_errors(one, tuned) for one in judged])),
-            plain("riccati", settled),
-            started("3/3 from a prior", THREE, equivalent_noise(THREE, accel)),
-            started("riccati from a prior", settled, noise),
+            row("3/3", THREE),
+            row("tuned", tuned, held_out),
+            row("riccati", settled),
+            row("levelling", levelling, levelling_held_out),
         ],
         dt_s,
     )
@@ -1182,7 +1103,7 @@ def tune(pieces: Sequence[Piece], sensor: Noise, prior: Prior | None = None) -> 
         candidates,
         recommended,
         (*reasons, *why),
-        (of_first, of_second),
+        held_out,
         surface,
         smoothed,
         noise,
@@ -1193,17 +1114,18 @@ def tune(pieces: Sequence[Piece], sensor: Noise, prior: Prior | None = None) -> 
 
 
 def _recommended(candidates: Sequence[Candidate], judge: str) -> tuple[Candidate, tuple[str, ...]]:
-    """The first of tuned and riccati that wins, else 3/3, and why."""
+    """The best of those that win, else 3/3, and why."""
     by = "the reference" if judge == "reference" else "the log's own smoothed angle"
     base = candidates[0]
-    said: list[str] = []
-    for one in candidates[1:3]:
-        held = " on parts that it was not tuned on" if one.name == "tuned" else ""
-        errors = (
+    reasons = []
+    for one in candidates[1:]:
+        held = "" if one.name == "riccati" else " on parts that it was not tuned on"
+        wanted = "" if one.wins else f", expected {100.0 * CONFIDENCE:g} %"
+        reasons.append(
             f"By {by} {one.name} leaves {math.degrees(one.rmse_rad):.3f} deg{held}, 3/3 "
-            f"{math.degrees(base.rmse_rad):.3f} deg; it is better with {100.0 * one.confidence:.3g} %"
+            f"{math.degrees(base.rmse_rad):.3f} deg; it is better with "
+            f"{100.0 * one.confidence:.3g} %{wanted}."
         )
-        if one.wins:
-            return one, (*said, f"{errors}, and recommended.")
-        said.append(f"{errors}, expected {100.0 * CONFIDENCE:g} %.")
-    return base, (*said, "3/3 is kept.")
+    best = min((one for one in candidates if one.wins), key=lambda one: one.rmse_rad, default=base)
+    reasons.append(f"{best.name} is {'kept' if best is base else 'recommended'}.")
+    return best, tuple(reasons)

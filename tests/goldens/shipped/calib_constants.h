@@ -61,7 +61,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x3197C976UL
+#define CALIB_ID 0x2C703322UL
 
 /* Camera (2.5) and lens (B.1). */
 #define CALIB_IMAGE_WIDTH_PX 316 /* columns */
@@ -163,6 +163,9 @@
 #define CALIB_IMU_ACCEL_LIMIT_MPS2 400.0f /* readings beyond are lost, m/s^2 */
 #define CALIB_IMU_RATE_LIMIT_RADPS 60.0f /* readings beyond are lost, rad/s */
 #define CALIB_IMU_ACCEL_WEAK_MPS2 1.0f /* |ax| and |ay| below say nothing of phi, m/s^2 */
+
+/* Angle filter: (2.3). */
+#define CALIB_LEVELLING 0 /* 1: the levelling filter, for #if */
 
 /*
  * Angle filter (2.3), dt folded in. The integral is kept as an angle per tick, J = I dt:

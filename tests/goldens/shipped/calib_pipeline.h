@@ -155,6 +155,11 @@ typedef struct {
     uint8_t boost, moving, rejected;
 #else
     float integral_rad;                   /* J of (2.3), from the gyroscope's known bias on */
+#if CALIB_LEVELLING
+    float sum_rad, before_radps;          /* S, and gz of the tick before */
+    uint16_t ticks;                       /* taken so far, up to the last change of the gains */
+    uint8_t step;                         /* entry of the tables of gains */
+#endif
     float lowpass[2][CALIB_LOWPASS_STATES];
 #if CALIB_TIME_OFFSET_TICKS > 0
     float past_rad[CALIB_TIME_OFFSET_TICKS];
@@ -335,7 +340,7 @@ static inline uint8_t calib_sampled(const calib_inputs *in) {
 #endif
 
 #if !CALIB_FUSED
-/* Angle filter (2.3). Returns flags. */
+/* Angle filter: (2.3), or levelling. Returns flags. */
 static inline uint16_t calib_angle(calib_state *state, const calib_inputs *in) {
     float ax, ay, gz, e = 0.0f, phi = state->phi_rad;
     uint16_t flags = 0;
@@ -345,6 +350,12 @@ static inline uint16_t calib_angle(calib_state *state, const calib_inputs *in) {
     ax = CALIB_AX(in);
     ay = CALIB_AY(in);
     gz = CALIB_GZ(in);
+#if CALIB_LEVELLING
+    if (state->imu_age != CALIB_NEVER) {
+        phi += state->integral_rad - (0.5f * CALIB_MM_DT_S) * (gz + state->before_radps);
+    }
+    state->before_radps = gz;
+#endif
     /* Differences, because a compiler may leave out x - 0 and x * 1, but not x + 0. */
     ax = ax - CALIB_IMU_ACCEL_BIAS_X_MPS2;
     ay = (ay - CALIB_IMU_ACCEL_BIAS_Y_MPS2) * CALIB_IMU_ACCEL_RATIO;
@@ -362,9 +373,24 @@ static inline uint16_t calib_angle(calib_state *state, const calib_inputs *in) {
     if (state->imu_age == CALIB_NEVER) {
         phi = e;
     } else {
+#if CALIB_LEVELLING
+        uint8_t i = state->step;
+        float S = state->sum_rad + e;
+        phi += CALIB_TABLE_READ(&calib_levelling_angle[i]) * S;
+        state->integral_rad = calib_clip(state->integral_rad + CALIB_TABLE_READ(&calib_levelling_bias[i]) * S,
+                                         CALIB_MM_INTEGRAL_LIMIT_RAD);
+        state->sum_rad = S - CALIB_TABLE_READ(&calib_levelling_sum[i]) * S;
+        if (i < CALIB_LEVELLING_STEPS - 1u) {
+            state->ticks = (uint16_t)(state->ticks + 1u);
+            if ((float)state->ticks >= CALIB_TABLE_READ(&calib_levelling_until[i])) {
+                state->step = (uint8_t)(i + 1u);
+            }
+        }
+#else
         float J = calib_clip(state->integral_rad + CALIB_MM_KI_DT2 * e, CALIB_MM_INTEGRAL_LIMIT_RAD);
         state->integral_rad = J;
         phi += CALIB_MM_KP_DT * e + (J - CALIB_MM_DT_S * gz);
+#endif
     }
     if (!calib_within(phi, CALIB_PHI_LIMIT_RAD)) {
         phi = calib_clip(phi, CALIB_PHI_LIMIT_RAD);

@@ -1,0 +1,304 @@
+"""The levelling filter of the angle: a gyroscope levelled by a velocity that stays bounded."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numba import njit
+
+from calib.core.arrays import FloatArray
+from calib.core.errors import BadInputError
+from calib.stages.imu.mahony import MahonyState, checked
+
+# ----------------------------------------------------------------------
+# What an accelerometer shows of the angle is right on the average only: its errors are the sensor's own
+# accelerations, over g. The filter (2.3) treats them as white noise. They are not: they are the derivative
+# of a velocity, and an instrument that stays on a table has a velocity that stays bounded. So the filter
+# integrates the difference between the accelerometer's angle and its own,
+#
+#     phi' = w + I + K1 V,   I' = K2 V,   V' = (phi_acc - phi) - K0 V,
+#
+# and takes V, which is velocity / g plus the integral of the angle's error [rad s], for a measurement of
+# zero with the velocity's noise. It is the third-order levelling loop of inertial navigation (Britting,
+# Inertial Navigation Systems Analysis, 1971, section 7.2) without the Earth's rate. An acceleration of 0.2 s
+# and back reaches the angle by a tenth of what (2.3) with the same time constant lets through.
+#
+# With a density r of the velocity, q of the rate's error in motion and q_b of the bias' walk the gains are
+# those of the Kalman filter of (V, angle's error, bias). Without a bias it settles to the poles of
+# s^2 + sqrt(2) w0 s + w0^2, w0^4 = q / r, which is what the time constant tau = sqrt(2) / w0 names. The
+# gains start large, from what is known before the first sample, and settle as the bias gets known.
+#
+# In three axes the angle's place is taken by the up vector u in the sensor's axes, V is a vector in them too,
+# phi_acc - phi becomes a / g - u, and both turn with the sensor,
+#
+#     u' = u x (w - b) + K1 V,   V' = V x (w - b) + (a / g - u) - K0 V,   b' = K2 u x V.
+#
+# A bias about the vertical does not show in this; at rest the mean rate shows it.
+
+_G = 9.80665
+_TURN = 2.0 * math.pi
+_LASTING_S = 0.3
+"""Time for which a velocity lasts: its density is 2 sigma^2 times this."""
+
+
+@dataclass(frozen=True)
+class Levelling:
+    """Parameters of the filter.
+
+    Attributes
+    ----------
+    tau_s : time constant of the settled angle.
+    velocity_mps : standard deviation of the sensor's velocity; with the next two it makes the start.
+    angle_rad, bias_radps : standard deviations of the angle and of the rate's bias at the first sample.
+    bias_tau_s : time constant of the settled bias.
+
+    Raises `BadInputError` for values that are not positive and finite.
+    """
+
+    tau_s: float = 2.0
+    velocity_mps: float = 0.1
+    angle_rad: float = 0.1
+    bias_radps: float = 0.02
+    bias_tau_s: float = 25.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0.0 < value < math.inf:
+                raise BadInputError(
+                    f"{name} of the levelling filter: found {value:g}, expected more than zero"
+                )
+
+    @property
+    def densities(self) -> tuple[float, float, float]:
+        """r [rad^2 s^3], q [rad^2/s] and q_b [rad^2/s^3]."""
+        r = 2.0 * (self.velocity_mps / _G) ** 2 * _LASTING_S
+        q = r * (math.sqrt(2.0) / self.tau_s) ** 4
+        return r, q, q / self.bias_tau_s**2
+
+    @property
+    def start(self) -> tuple[float, float, float]:
+        """Variances of V, the angle's error and the bias at the first sample."""
+        return (self.velocity_mps / _G) ** 2, self.angle_rad**2, self.bias_radps**2
+
+
+@njit(cache=True, nogil=True)
+def _gains(P: FloatArray, dt: float, r: float, q: float, q_b: float, K: FloatArray) -> None:
+    """Propagates P (vv, ve, vb, ee, eb, bb) over a step and an update; fills K of V, angle and bias."""
+    vv, ve, vb, ee, eb, bb = P[0], P[1], P[2], P[3], P[4], P[5]
+    ee += 2.0 * dt * eb + dt * dt * bb + q * dt
+    eb += dt * bb
+    bb += q_b * dt
+    ve += dt * vb
+    vv += 2.0 * dt * ve + dt * dt * ee
+    ve += dt * ee
+    vb += dt * eb
+    s = vv + r / dt
+    K[0], K[1], K[2] = vv / s, ve / s, vb / s
+    P[0], P[1], P[2] = vv - vv * K[0], ve - vv * K[1], vb - vv * K[2]
+    P[3], P[4], P[5] = ee - ve * K[1], eb - ve * K[2], bb - vb * K[2]
+
+
+@njit(cache=True, nogil=True)
+def _run(
+    t: FloatArray,
+    phi_acc: FloatArray,
+    w: FloatArray,
+    densities: tuple[float, float, float],
+    P: FloatArray,
+    phi: float,
+    integral: float,
+    out_phi: FloatArray,
+    out_integral: FloatArray,
+) -> None:
+    r, q, q_b = densities
+    K = np.zeros(3)
+    V = 0.0
+    for k in range(len(t)):
+        dt = t[k] - t[max(k - 1, 0)]
+        if dt > 0.0:
+            phi += dt * (0.5 * (w[k - 1] + w[k]) + integral)
+            e = phi_acc[k] - phi
+            V += dt * (e - _TURN * np.rint(e / _TURN))
+            _gains(P, dt, r, q, q_b, K)
+            phi += K[1] * V
+            integral += K[2] * V
+            V -= K[0] * V
+        out_phi[k] = phi
+        out_integral[k] = integral
+
+
+@njit(cache=True, nogil=True)
+def _table(densities: tuple[float, float, float], P: FloatArray, dt: float, out: FloatArray) -> None:
+    for k in range(len(out)):
+        _gains(P, dt, densities[0], densities[1], densities[2], out[k])
+
+
+def _covariance(parameters: Levelling) -> FloatArray:
+    vv, ee, bb = parameters.start
+    return np.array([vv, 0.0, 0.0, ee, 0.0, bb])
+
+
+@lru_cache(maxsize=256)
+def gains(parameters: Levelling, dt_s: float, steps: int) -> FloatArray:
+    """Gains (steps, 3) of V, angle [1/s] and integral [1/s^2] at steps of dt, from the first step on.
+
+    Raises `BadInputError` for a step that is not positive or longer than half the time constant.
+    """
+    if not 0.0 < dt_s <= 0.5 * parameters.tau_s:
+        raise BadInputError(
+            f"step: found {dt_s:g} s, expected more than zero and at most half of the levelling filter's "
+            f"time constant {parameters.tau_s:g} s"
+        )
+    out = np.empty((steps, 3))
+    _table(parameters.densities, _covariance(parameters), dt_s, out)
+    out.setflags(write=False)
+    return out
+
+
+def settled(parameters: Levelling, dt_s: float) -> FloatArray:
+    """Gains (3,) of V, angle and integral that are left after a long time."""
+    steps = math.ceil(12.0 * (parameters.bias_tau_s + parameters.tau_s) / dt_s)
+    return np.asarray(gains(parameters, dt_s, steps)[-1])
+
+
+def system(parameters: Levelling, dt_s: float) -> tuple[FloatArray, FloatArray]:
+    """A (3, 3) and B (3,) of the settled filter in (phi, I, V), driven by phi_acc."""
+    K0, K1, K2 = settled(parameters, dt_s).tolist()
+    feed = np.array([K1, K2, 1.0 - K0])
+    ahead = np.array([[1.0, dt_s, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
+    return ahead + np.outer(feed, [-dt_s, -dt_s * dt_s, 1.0]), dt_s * feed
+
+
+def level_log(
+    parameters: Levelling,
+    t_s: FloatArray,
+    phi_acc_rad: FloatArray,
+    rate_radps: FloatArray,
+    start: MahonyState | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """Angle and integral after each sample of a log; the rate is taken as straight between samples.
+
+    Parameters
+    ----------
+    t_s, phi_acc_rad, rate_radps, start : as of `calib.stages.imu.mahony.filter_log`.
+
+    Returns
+    -------
+    phi_rad (n,), not wrapped, and integral_radps (n,), which goes to minus the bias of the rate.
+
+    Raises
+    ------
+    BadInputError for lengths that differ, time that goes back and values that are not finite.
+    """
+    t, phi_acc, w = checked(t_s, phi_acc_rad, rate_radps)
+    if not (np.isfinite(phi_acc).all() and np.isfinite(w).all() and (np.diff(t) >= 0.0).all()):
+        raise BadInputError("angle filter: expected finite readings and time that runs forward")
+    state = MahonyState(float(phi_acc[0]), 0.0) if start is None else start
+    phi, integral = np.empty(len(t)), np.empty(len(t))
+    _run(
+        t,
+        phi_acc,
+        w,
+        parameters.densities,
+        _covariance(parameters),
+        state.phi_rad,
+        state.integral_radps,
+        phi,
+        integral,
+    )
+    return phi, integral
+
+
+# ----------------------------------------------------------------------
+# Three axes. At rest the bias follows the mean rate: readings have stayed near their means over half a second
+# for two seconds, and the direction of the specific force has not turned, which a slow rotation would show.
+
+_MEAN_S = 0.5
+_REST_S = 2.0
+_QUIET_RADPS = 0.02
+_QUIET_G = 0.05
+_TURNED_G = 0.015
+"""Rest: readings this near to their means, and a mean force that has moved by no more since rest began."""
+
+
+@njit(cache=True, nogil=True)
+def _turned(x: FloatArray, w: FloatArray, dt: float) -> None:
+    """x <- x + (x x w) dt to the second order: a vector at rest in the world, seen by a sensor that turns."""
+    a, b, c = dt * w[0], dt * w[1], dt * w[2]
+    d0, d1, d2 = x[1] * c - x[2] * b, x[2] * a - x[0] * c, x[0] * b - x[1] * a
+    x[0] += d0 + 0.5 * (d1 * c - d2 * b)
+    x[1] += d1 + 0.5 * (d2 * a - d0 * c)
+    x[2] += d2 + 0.5 * (d0 * b - d1 * a)
+
+
+@njit(cache=True, nogil=True)
+def _run_three(
+    t: FloatArray,
+    force: FloatArray,
+    gyro: FloatArray,
+    densities: tuple[float, float, float],
+    P: FloatArray,
+    out: FloatArray,
+) -> None:
+    r, q, q_b = densities
+    K = np.zeros(3)
+    u, V, b = force[0].copy(), np.zeros(3), np.zeros(3)
+    mean_w, mean_f, at_rest = gyro[0].copy(), force[0].copy(), force[0].copy()
+    still = 0.0
+    out[0] = u
+    for k in range(1, len(t)):
+        dt = t[k] - t[k - 1]
+        if dt > 0.0:
+            w = 0.5 * (gyro[k - 1] + gyro[k]) - b
+            _turned(u, w, dt)
+            _turned(V, w, dt)
+            V += dt * (force[k] - u)
+            _gains(P, dt, r, q, q_b, K)
+            b += K[2] * np.cross(u, V)
+            u += K[1] * V
+            V -= K[0] * V
+            share = min(dt / min(t[k] - t[0] + dt, _MEAN_S), 1.0)
+            mean_w += share * (gyro[k] - mean_w)
+            mean_f += share * (force[k] - mean_f)
+            quiet = (
+                np.abs(gyro[k] - mean_w).max() < _QUIET_RADPS
+                and np.abs(force[k] - mean_f).max() < _QUIET_G
+                and (still < _REST_S / 2 or np.abs(mean_f - at_rest).max() < _TURNED_G)
+            )
+            still = still + dt if quiet else 0.0
+            if still < _REST_S / 2:
+                at_rest[:] = mean_f
+            if still >= _REST_S:
+                b += min(dt / (2.0 * _MEAN_S), 1.0) * (mean_w - b)
+        out[k] = u
+
+
+def level_three(
+    parameters: Levelling, t_s: FloatArray, force_mps2: FloatArray, gyro_radps: FloatArray
+) -> FloatArray:
+    """Up vectors (n, 3) in the sensor's axes, of length about one, after each sample of a log.
+
+    Parameters
+    ----------
+    t_s : (n,) time stamps that do not go back.
+    force_mps2, gyro_radps : (n, 3) finite readings.
+
+    Raises
+    ------
+    BadInputError for shapes that differ, time that goes back and values that are not finite.
+    """
+    t = np.ascontiguousarray(t_s, dtype=np.float64)
+    force, gyro = (np.ascontiguousarray(x, dtype=np.float64) for x in (force_mps2, gyro_radps))
+    if force.shape != (len(t), 3) or gyro.shape != (len(t), 3) or len(t) == 0:
+        raise BadInputError(
+            f"levelling filter: found times {t.shape}, specific forces {force.shape} and rates {gyro.shape}, "
+            "expected (n,), (n, 3) and (n, 3)"
+        )
+    if not (np.isfinite(force).all() and np.isfinite(gyro).all() and (np.diff(t) >= 0.0).all()):
+        raise BadInputError("levelling filter: expected finite readings and time that runs forward")
+    out = np.empty_like(force)
+    _run_three(t, force / _G, gyro, parameters.densities, _covariance(parameters), out)
+    return out
