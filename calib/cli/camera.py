@@ -22,34 +22,62 @@ if TYPE_CHECKING:
     pass
 
 # ----------------------------------------------------------------------
-# `calib board`: a checkerboard to print, at exact scale.
+# `calib board`: a checkerboard or ChArUco board to print, at exact scale.
 
 
 def board(
     output: Annotated[Path, typer.Option("-o", "--output", help="PDF to write.")] = Path("board.pdf"),
-    corners: Annotated[str, typer.Option(metavar="CxR", help="Inner corners, columns x rows.")] = "7x5",
+    corners: Annotated[str, typer.Option(metavar="CxR", help="Inner corners, columns x rows.")] = "8x5",
     square: Annotated[
         str, typer.Option(metavar="LENGTH", help="Side of a square with its unit: mm, cm, m or in.")
     ] = "20mm",
     page: Annotated[Literal["A4", "Letter"], typer.Option(help="Paper.")] = "A4",
+    charuco: Annotated[
+        bool, typer.Option("--charuco", help="With markers, by which any part of the board is recognised.")
+    ] = False,
+    dictionary: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Markers of --charuco. [default: 4X4_50 or larger]")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write a printable PDF of the checkerboard, with a ruler to check the printer's scale."""
+    """Write a printable PDF of a checkerboard or ChArUco board, with a ruler to check the printer's scale.
+
+    Half a turn changes the default board, so that every picture shows which corner is the first. A board
+    whose columns and rows of corners are both even or both odd looks the same from either end.
+    """
     from calib.core.files import write_atomically
     from calib.core.units import parse_corners, parse_square_m
     from calib.show.boardsheet import board_pdf
+    from calib.stages.camera.model import Board
+    from calib.stages.camera.read import known_dictionary
 
     columns, rows = parse_corners(corners)
     square_m = parse_square_m(square)
-    write_atomically(output, board_pdf(columns, rows, square_m, page))
+    markers = None
+    if dictionary is not None and not charuco:
+        raise UsageError("--dictionary: goes with --charuco")
+    if charuco:
+        count = (columns + 1) * (rows + 1) // 2
+        enough = next((n for n in (50, 100, 250, 1000) if n >= count), 1000)
+        markers = known_dictionary(dictionary or f"4X4_{enough}", "--dictionary", UsageError)
+    write_atomically(output, board_pdf(columns, rows, square_m, page, markers))
     if as_json:
-        document("board", {"corners": [columns, rows], "square_m": square_m, "page": page})
+        about = {"corners": [columns, rows], "square_m": square_m, "page": page}
+        document("board", about if markers is None else {**about, "dictionary": markers})
         return
-    say(f"{output}: {columns}x{rows} inner corners, squares of {square_m * 1e3:g} mm, {page}")
+    kind = "" if markers is None else f", ChArUco with markers of {markers}"
+    say(f"{output}: {columns}x{rows} inner corners, squares of {square_m * 1e3:g} mm, {page}{kind}")
     say("print at 100 %, without fitting to the page, and measure the ruler")
+    if markers is None and Board(columns, rows, square_m).half_turn_looks_the_same:
+        say(
+            "this board looks the same after half a turn: no picture shows which corner is the first; "
+            "8x5 corners or --charuco do"
+        )
     say("board.yaml for the pictures' folder:")
     say(f"corners: [{columns}, {rows}]")
     say(f"square_m: {square_m:g}")
+    if markers is not None:
+        say(f"dictionary: {markers}")
 
 
 # ----------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""A checkerboard to print: one page of vector PDF at exact scale, with a ruler to check the printer's.
+"""A checkerboard or ChArUco board to print: a page of vector PDF at exact scale, with a ruler to check it.
 
 The page is drawn in millimetres from its lower left corner; the transformation at the head of the
 content stream turns them into the 1/72 inch of PDF (ISO 32000-1, 8.3.2). The same arguments give
@@ -10,8 +10,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import cv2
+import numpy as np
+
 from calib.core.errors import BadInputError
 from calib.stages.camera.model import Board
+from calib.stages.camera.targets import dictionary_of
 
 PAGES_MM: dict[str, tuple[float, float]] = {
     "A4": (210.0, 297.0),
@@ -28,6 +32,8 @@ _FOOTER_MM = 14.0
 _SMALLEST_GAP_MM = 4.0
 """White between the squares and the footer, without which finders fail."""
 _RULER_MM = 100
+MARKER_SHARE = 0.75
+"""Side of a marker over that of its square."""
 
 
 @dataclass(frozen=True)
@@ -96,6 +102,34 @@ def _squares(columns: int, rows: int, layout: _Layout) -> list[str]:
     return [*commands, "f"]
 
 
+def _markers(columns: int, rows: int, layout: _Layout, dictionary: str) -> list[str]:
+    """Black cells of the markers, numbered row by row in the white squares.
+
+    All are one path, so that renderers leave no seams between cells.
+    """
+    marks = dictionary_of(dictionary)
+    cells = marks.markerSize + 2
+    if (columns + 1) * (rows + 1) // 2 > len(marks.bytesList):
+        raise BadInputError(
+            f"a board of {columns}x{rows} inner corners needs {(columns + 1) * (rows + 1) // 2} markers, "
+            f"and {dictionary} has {len(marks.bytesList)}"
+        )
+    cell = MARKER_SHARE * layout.square / cells
+    margin = 0.5 * (1.0 - MARKER_SHARE) * layout.square
+    commands: list[str] = []
+    places = [(i, j) for j in range(rows + 1) for i in range((j + 1) % 2, columns + 1, 2)]
+    for number, (i, j) in enumerate(places):
+        black = cv2.aruco.generateImageMarker(marks, number, cells) < 128
+        left = layout.left + i * layout.square + margin
+        top = layout.bottom + (rows + 1 - j) * layout.square - margin
+        for row, line in enumerate(black):
+            edges = np.flatnonzero(np.diff(np.concatenate([[0], line, [0]]).astype(int)))
+            for first, end in edges.reshape(-1, 2):
+                box = (left + first * cell, top - (row + 1) * cell, (end - first) * cell, cell)
+                commands.append(" ".join(_number(value) for value in box) + " re")
+    return [*commands, "f"]
+
+
 def _line(x0: float, y0: float, x1: float, y1: float) -> str:
     return f"{_number(x0)} {_number(y0)} m {_number(x1)} {_number(y1)} l S"
 
@@ -158,8 +192,12 @@ def _document(width_mm: float, height_mm: float, commands: list[str]) -> bytes:
     return bytes(out)
 
 
-def board_pdf(columns: int, rows: int, square_m: float, page: str = "A4") -> bytes:
+def board_pdf(
+    columns: int, rows: int, square_m: float, page: str = "A4", dictionary: str | None = None
+) -> bytes:
     """PDF of a checkerboard with columns x rows inner corners and squares of `square_m` metres.
+
+    With a dictionary of markers it is a ChArUco board as OpenCV 4.6 and later number it.
 
     The page lies upright or across, whichever leaves more white around the squares: one square where
     it fits, never less than the printer's border and a gap to the ruler below.
@@ -189,13 +227,18 @@ def board_pdf(columns: int, rows: int, square_m: float, page: str = "A4") -> byt
         f"Print at 100 % (actual size); the ruler must measure {_RULER_MM} mm.",
         "Glue it flat onto a stiff plate.",
     ]
-    if Board(columns, rows, square_m).half_turn_looks_the_same:
+    if dictionary is not None:
+        marker = f"{MARKER_SHARE * square:g} mm, {dictionary}"
+        words[0] = f"calib board --charuco: {columns} x {rows} inner corners, square {square:g} mm, {page}"
+        words[2] += f" Markers {marker}, upper left square black."
+    elif Board(columns, rows, square_m).half_turn_looks_the_same:
         words[2] += " Half a turn leaves this board unchanged."
     ruler_x, ruler_y = _UNPRINTABLE_MM + 4.0, _UNPRINTABLE_MM + 4.5
     text_x = ruler_x + _RULER_MM + 10.0
     lines = [_text(text_x, ruler_y + 4.0 - 3.2 * k, 7.0, line) for k, line in enumerate(words)]
     commands = [
         *_squares(columns, rows, layout),
+        *([] if dictionary is None else _markers(columns, rows, layout, dictionary)),
         *_ruler(ruler_x, ruler_y),
         *lines,
         *_crop_marks(columns, rows, layout),

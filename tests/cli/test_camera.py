@@ -112,8 +112,8 @@ def test_options_that_do_not_go_with_a_table(calib, points, project_root, tmp_pa
     rig = ("--rig", tmp_path / "rig.yaml")
     for words, says in (
         ([points], "a table does not tell the size of the pictures; give --image-size"),
-        ([points, *SIZE, "--corners", "9x6"], "--corners and --square do not go with it"),
-        ([points, *SIZE, "--square", "25mm"], "--corners and --square do not go with it"),
+        ([points, *SIZE, "--corners", "9x6"], "--corners, --square and --dictionary do not go with it"),
+        ([points, *SIZE, "--square", "25mm"], "do not go with it"),
         ([points, points, *SIZE], "a table is given alone"),
         ([project_root / "images", points, *SIZE], "a table is given alone"),
     ):
@@ -305,7 +305,9 @@ def test_the_default_board(calib, tmp_path) -> None:
     data = (tmp_path / "board.pdf").read_bytes()
     assert data.startswith(b"%PDF")
     told = ended.out.splitlines()
-    assert yaml.safe_load("\n".join(told[-2:])) == {"corners": [7, 5], "square_m": 0.02}
+    assert yaml.safe_load("\n".join(told[-2:])) == {"corners": [8, 5], "square_m": 0.02}
+    assert "half a turn" not in ended.out
+    assert "looks the same after half a turn" in calib("board", "--corners", "7x5", cwd=tmp_path).out
     calib("board", "-o", "again.pdf", cwd=tmp_path)
     assert (tmp_path / "again.pdf").read_bytes() == data
 
@@ -315,6 +317,10 @@ def test_the_default_board(calib, tmp_path) -> None:
     [
         (("--corners", "20x20", "--square", "50mm"), "does not fit on A4: the largest square that fits is"),
         (("--square", "0.01mm"), "a square needs a side of at least 0.5 mm"),
+        (
+            ("--corners", "14x9", "--square", "12mm", "--charuco", "--dictionary", "4x4_50"),
+            "needs 75 markers",
+        ),
     ],
 )
 def test_boards_that_cannot_be_printed(calib, tmp_path, words: tuple[str, ...], says: str) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from calib.core.errors import BadInputError
-from calib.show.boardsheet import PAGES_MM, board_pdf
+from calib.show.boardsheet import MARKER_SHARE, PAGES_MM, board_pdf
 
 DPI = 200
 PX_PER_MM = DPI / 25.4
@@ -130,3 +130,16 @@ def test_the_file_is_the_same_every_time_and_its_table_of_objects_is_right() -> 
     length = re.search(rb"/Length (\d+) >>\nstream\n", pdf)
     assert length is not None
     assert pdf[length.end() + int(length.group(1)) :].startswith(b"\nendstream")
+
+
+def test_opencv_reads_the_printed_markers(pdftoppm: str, tmp_path: Path) -> None:
+    """As its own layout of today numbers them, at the size that the sheet says."""
+    picture = _raster(pdftoppm, board_pdf(8, 5, 0.02, "A4", "5X5_100"), tmp_path)
+    markers = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
+    board = cv2.aruco.CharucoBoard((9, 6), 0.02, MARKER_SHARE * 0.02, markers)
+    corners, ids, _, found = cv2.aruco.CharucoDetector(board).detectBoard(picture)
+    assert sorted(ids.ravel()) == list(range(40))
+    assert sorted(found.ravel()) == list(range(27))
+    at = board.getChessboardCorners()[ids.ravel(), :2] * 1000 * PX_PER_MM
+    away = corners.reshape(-1, 2) - at
+    assert np.abs(away - away.mean(axis=0)).max() < 1.0

@@ -310,13 +310,14 @@ def _refuse_unusable(views: Sequence[View], choices: Choices) -> None:
     if choices.skew and len(views) < 3:
         raise BadInputError(f"a camera with skew needs at least 3 views, found {len(views)}")
     for view in views:
-        if len(view.pixels) < 4:
-            raise BadInputError(f"view {view.name}: has {len(view.pixels)} points, expected at least 4")
-        for points, where in ((view.target_m, "on the target"), (view.pixels, "in the picture")):
+        target_m, pixels = view.counted()
+        if len(pixels) < 4:
+            raise BadInputError(f"view {view.name}: has {len(pixels)} points, expected at least 4")
+        for points, where in ((target_m, "on the target"), (pixels, "in the picture")):
             spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
             if spread[1] <= 1e-6 * spread[0]:
                 raise BadInputError(f"view {view.name}: all its points lie on one line {where}")
-    total = sum(len(view.pixels) for view in views)
+    total = sum(len(view.counted()[1]) for view in views)
     if choices.model != "auto":
         unknown = len(free_intrinsics(choices.model, choices.skew)) + 6 * len(views)
         if 2 * total <= unknown:

@@ -69,6 +69,11 @@ class View:
     pixels: FloatArray
     measured: BoolArray | None = None
 
+    def counted(self) -> tuple[FloatArray, FloatArray]:
+        """Target and pixels of the points that were measured."""
+        kept = slice(None) if self.measured is None else self.measured
+        return self.target_m[kept], self.pixels[kept]
+
 
 @dataclass(frozen=True)
 class Observations:

@@ -6,8 +6,9 @@ import csv
 import math
 from array import array
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated
 
@@ -15,14 +16,25 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from calib.core.arrays import FloatArray, GrayImage
-from calib.core.errors import BadInputError, UsageError
-from calib.core.files import check_readable, hash_of, read_yaml_mapping, shown
+from calib.core.errors import BadInputError, CalibError, UsageError
+from calib.core.files import check_readable, hash_of, one_line, read_yaml_mapping, shown
 from calib.core.schema import validated
 from calib.core.units import plain_number
 from calib.core.workers import Workers
 from calib.io.pictures import Picture, list_pictures, read_picture, same_size
 from calib.stages.camera.corners import Detection, detect, find_size
 from calib.stages.camera.model import Board, View
+from calib.stages.camera.targets import (
+    DICTIONARIES,
+    Layout,
+    Markers,
+    detect_charuco,
+    dictionary_named,
+    find_markers,
+    in_place,
+    recognise,
+    with_rows,
+)
 
 # ----------------------------------------------------------------------
 # board.yaml, and the search for its board in a set of pictures.
@@ -47,13 +59,15 @@ class BoardFile(BaseModel):
 
     `corners` counts inner corners, columns x rows. `first_corner_m` is the world position of corner
     (0, 0), `angle_rad` the direction of the columns axis, `first_corner_px` where a picture shows
-    corner (0, 0), for boards that look the same after half a turn.
+    corner (0, 0), for boards that look the same after half a turn. `dictionary` is that of a ChArUco
+    board's markers, as 4X4_50; without it such a board is found by itself.
     """
 
     model_config = ConfigDict(extra="forbid")
 
     corners: Annotated[list[Count], Field(min_length=2, max_length=2)] | None = None
     square_m: Metres | None = None
+    dictionary: Annotated[str, Field(max_length=40)] | None = None
     first_corner_m: Position | None = None
     angle_rad: Angle | None = None
     first_corner_px: Pixel | None = None
@@ -64,7 +78,22 @@ def read_board_file(folder: Path) -> BoardFile:
     path = folder / BOARD_FILE
     if not path.exists() and not path.is_symlink():
         return BoardFile()
-    return validated(BoardFile, read_yaml_mapping(path), path)
+    file = validated(BoardFile, read_yaml_mapping(path), path)
+    if file.dictionary is not None:
+        file.dictionary = known_dictionary(file.dictionary, f"{shown(path)}: dictionary")
+    return file
+
+
+def known_dictionary(text: str, where: str, error: type[CalibError] = BadInputError) -> str:
+    """The name of a dictionary of markers as OpenCV has it. Raises `error`, naming `where` it stands."""
+    name = dictionary_named(text)
+    if name is None:
+        nearest = get_close_matches(text.upper(), DICTIONARIES, 1, 0.0)[0]
+        raise error(
+            f"{where}: {one_line(text)[:40]!r} is no dictionary of markers, expected one of OpenCV's, "
+            f"as {nearest}"
+        )
+    return name
 
 
 def board_of(sources: Sequence[Path]) -> tuple[BoardFile, dict[str, str]]:
@@ -77,7 +106,7 @@ def board_of(sources: Sequence[Path]) -> tuple[BoardFile, dict[str, str]]:
         file = read_board_file(folder)
         if file == BoardFile():
             continue
-        if hashes and (file.corners, file.square_m) != (told.corners, told.square_m):
+        if hashes and _of_board(file) != _of_board(told):
             raise BadInputError(
                 f"{shown(folder / BOARD_FILE)}: tells another board than {shown(where / BOARD_FILE)}; "
                 "pictures of different boards cannot be calibrated together"
@@ -86,6 +115,10 @@ def board_of(sources: Sequence[Path]) -> tuple[BoardFile, dict[str, str]]:
             told, where = file, folder
             hashes[BOARD_FILE] = hash_of(folder / BOARD_FILE)
     return told, hashes
+
+
+def _of_board(file: BoardFile) -> tuple[object, ...]:
+    return file.corners, file.square_m, file.dictionary
 
 
 @dataclass(frozen=True)
@@ -100,6 +133,7 @@ class BoardSearch:
     detections : as `views`.
     without : names of pictures where the board was not found.
     hashes : SHA-256 of every picture by name.
+    layout : of the markers of a ChArUco board, which say which way it lies; None for a plain board.
     """
 
     board: Board
@@ -108,6 +142,7 @@ class BoardSearch:
     detections: tuple[Detection, ...]
     without: tuple[str, ...]
     hashes: dict[str, str]
+    layout: Layout | None = None
 
 
 def find_boards(
@@ -116,6 +151,7 @@ def find_boards(
     square_m: float,
     progress: Callable[[int, int], None] = lambda done, total: None,
     image_size_px: tuple[int, int] | None = None,
+    dictionary: str | None = None,
 ) -> BoardSearch:
     """Decode pictures and find the board in each, several at a time.
 
@@ -125,6 +161,7 @@ def find_boards(
     square_m : length of a square.
     progress : called with pictures done and pictures in all.
     image_size_px : the size that the pictures have to have, if that is known.
+    dictionary : of the markers of a ChArUco board; without it a plain board is looked for first.
 
     Raises
     ------
@@ -133,7 +170,7 @@ def find_boards(
     """
     pictures = _read(paths)
     with Workers(_Album(paths, pictures), len(paths)) as workers:
-        return _Search(workers, pictures, square_m, progress).run(corners, image_size_px)
+        return _Search(workers, pictures, square_m, progress).run(corners, image_size_px, dictionary)
 
 
 def _read(paths: Sequence[Path]) -> list[Picture]:
@@ -171,6 +208,21 @@ def _detection(album: _Album, what: tuple[int, tuple[int, int]]) -> Detection | 
     return detect(album.gray(i), *corners)
 
 
+def _markers(album: _Album, what: tuple[int, str]) -> Markers:
+    i, dictionary = what
+    return find_markers(album.gray(i), dictionary)
+
+
+def _charuco(album: _Album, what: tuple[int, Markers, Layout]) -> Detection | None:
+    i, markers, layout = what
+    return detect_charuco(album.gray(i), markers, layout)
+
+
+def _layout(album: _Album, what: tuple[tuple[int, ...], str | None]) -> Layout | None:
+    which, dictionary = what
+    return recognise([album.gray(i) for i in which], dictionary)
+
+
 def _size(album: _Album, i: int) -> tuple[int, int] | None:
     return find_size(album.gray(i))
 
@@ -186,7 +238,9 @@ class _Search:
     done: int = 0
     sizes: dict[int, tuple[int, int] | None] = field(default_factory=dict)
 
-    def run(self, corners: tuple[int, int] | None, expected_px: tuple[int, int] | None) -> BoardSearch:
+    def run(
+        self, corners: tuple[int, int] | None, expected_px: tuple[int, int] | None, dictionary: str | None
+    ) -> BoardSearch:
         pictures = self.pictures
         size_px = same_size(pictures)
         if expected_px is not None and size_px != expected_px:
@@ -196,30 +250,96 @@ class _Search:
             )
         count = len(pictures)
         sample = list(range(0, count, max(1, count // _SIZE_SAMPLE)))
-        wanted = corners or self._common_size(sample) or self._common_size(range(count))
-        if wanted is None:
-            raise BadInputError(f"{_names(pictures)}: no checkerboard found in {_count(count)}")
+        if dictionary is not None:
+            return self._with_markers(corners, self._layout(sample, dictionary), dictionary)
+        wanted = corners or self._common_size(sample)
         found: dict[int, Detection | None] = {}
         # A wrong size is known after a few pictures; looking for it in all of them would take long.
         for part, share in ((sample[:2], 1.0), (sample[2:], 0.5)):
+            if wanted is None:
+                break
             found |= self._detect(part, wanted)
             other = None if any(found.values()) else self._common_size(sample, share)
             if other is not None and sorted(other) != sorted(wanted):
                 raise BadInputError(_not_found(pictures, wanted, other))
+        if not any(found.values()):
+            layout = self._layout(sample, None)
+            if layout is not None:
+                return self._with_markers(corners, layout, layout.dictionary)
+            wanted = wanted or self._common_size(range(count))
+        if wanted is None:
+            raise BadInputError(f"{_names(pictures)}: no checkerboard found in {_count(count)}")
         found |= self._detect([i for i in range(count) if i not in found], wanted)
         if not any(found.values()):
             raise BadInputError(_not_found(pictures, wanted, self._common_size(sample)))
-        board = Board(*wanted, self.square_m)
+        return self._search(Board(*wanted, self.square_m), found, None)
+
+    def _search(
+        self, board: Board, found: Mapping[int, Detection | None], layout: Layout | None
+    ) -> BoardSearch:
         target = board.points_m()
-        seen = [(picture, detection) for i, picture in enumerate(pictures) if (detection := found[i])]
+        seen = [(picture, detection) for i, picture in enumerate(self.pictures) if (detection := found[i])]
         return BoardSearch(
             board=board,
-            image_size_px=size_px,
+            image_size_px=same_size(self.pictures),
             views=tuple(View(p.name, target, d.pixels, d.refined) for p, d in seen),
             detections=tuple(detection for _, detection in seen),
-            without=tuple(picture.name for i, picture in enumerate(pictures) if found[i] is None),
-            hashes={picture.name: picture.sha256 for picture in pictures},
+            without=tuple(picture.name for i, picture in enumerate(self.pictures) if found[i] is None),
+            hashes={picture.name: picture.sha256 for picture in self.pictures},
+            layout=layout,
         )
+
+    def _layout(self, sample: Sequence[int], dictionary: str | None) -> Layout | None:
+        """What board of markers the sample shows; of a stated dictionary, what any of the pictures does."""
+        for which in (sample, range(len(self.pictures)) if dictionary else ()):
+            layout = next(iter(self.workers.in_order(_layout, [(tuple(which), dictionary)])))
+            if layout is not None:
+                return layout
+        return None
+
+    def _with_markers(
+        self, corners: tuple[int, int] | None, layout: Layout | None, dictionary: str
+    ) -> BoardSearch:
+        pictures, every = self.pictures, range(len(self.pictures))
+        if layout is None:
+            raise BadInputError(
+                f"{_names(pictures)}: no ChArUco board with markers of {dictionary} found in "
+                f"{_count(len(every))}"
+            )
+        if layout.kind == "grid":
+            raise BadInputError(
+                f"{_names(pictures)}: these pictures show a grid of {layout.dictionary} markers, "
+                f"{layout.columns} in a row; calib reads checkerboards and ChArUco boards"
+            )
+        markers = list(self.workers.in_order(_markers, [(i, layout.dictionary) for i in every]))
+        kept = [in_place(one, layout)[0].ids for one in markers]
+        layout = with_rows(layout, kept) or layout
+        if corners is not None:
+            layout = self._as_stated(corners, layout)
+        board = Board(layout.columns - 1, layout.rows - 1, self.square_m)
+        found: dict[int, Detection | None] = {}
+        work = [(i, markers[i], layout) for i in every]
+        for i, detection in zip(every, self.workers.in_order(_charuco, work), strict=True):
+            found[i] = detection
+            self.done += 1
+            self.progress(self.done, len(pictures))
+        if not any(found.values()):
+            raise BadInputError(
+                f"{_names(pictures)}: no picture shows 3x3 corners of the ChArUco board "
+                f"({layout.dictionary}, {board.columns}x{board.rows} inner corners)"
+            )
+        return self._search(board, found, layout)
+
+    def _as_stated(self, corners: tuple[int, int], layout: Layout) -> Layout:
+        """The layout with as many rows as stated, of which some may never have been seen."""
+        columns, rows = layout.columns - 1, layout.rows - 1
+        stated = next((c for c in (corners, corners[::-1]) if c[0] == columns and c[1] >= rows), None)
+        if stated is None:
+            raise BadInputError(
+                f"{_names(self.pictures)}: no board with {corners[0]}x{corners[1]} inner corners found in "
+                f"{_count(len(self.pictures))}, but a ChArUco board with {columns}x{rows} was"
+            )
+        return replace(layout, rows=stated[1] + 1)
 
     def _detect(self, which: Sequence[int], corners: tuple[int, int]) -> dict[int, Detection | None]:
         found: dict[int, Detection | None] = {}
@@ -557,6 +677,7 @@ class Told:
     corners: tuple[int, int] | None = None
     square_m: float | None = None
     image_size_px: tuple[int, int] | None = None
+    dictionary: str | None = None
 
 
 @dataclass(frozen=True)
@@ -605,9 +726,10 @@ def _from_table(path: Path, told: Told) -> ViewSet:
         )
     remarks: tuple[str, ...] = ()
     if path.suffix.lower() == ".csv":
-        if told.corners is not None or told.square_m is not None:
+        if told.corners is not None or told.square_m is not None or told.dictionary is not None:
             raise UsageError(
-                f"{shown(path)}: a table holds its target in metres; --corners and --square do not go with it"
+                f"{shown(path)}: a table holds its target in metres; --corners, --square and --dictionary do "
+                "not go with it"
             )
         views = read_table(path)
     else:
@@ -664,17 +786,30 @@ def _from_pictures(sources: Sequence[Path], told: Told, progress: Callable[[int,
     file, hashes = board_of(sources)
     corners = told.corners or (None if file.corners is None else (file.corners[0], file.corners[1]))
     square_m = file.square_m if told.square_m is None else told.square_m
+    dictionary = (
+        None if told.dictionary is None else known_dictionary(told.dictionary, "--dictionary", UsageError)
+    )
     remarks = []
     if square_m is None:
         remarks.append(_NO_SQUARE)
     for option, here, there in (
         ("--corners", told.corners, file.corners),
         ("--square", told.square_m, file.square_m),
+        ("--dictionary", dictionary, file.dictionary),
     ):
         if here is not None and there is not None and _text(here) != _text(there):
             remarks.append(f"{option}: {_text(here)} is used, not {_text(there)} of board.yaml")
-    found = find_boards(paths, corners, 1.0 if square_m is None else square_m, progress, told.image_size_px)
-    if corners is None:
+    found = find_boards(
+        paths,
+        corners,
+        1.0 if square_m is None else square_m,
+        progress,
+        told.image_size_px,
+        dictionary or file.dictionary,
+    )
+    if found.layout is not None:
+        remarks.append(_of_markers(found.layout))
+    elif corners is None:
         remarks.append(f"found a board with {found.board.columns}x{found.board.rows} inner corners")
     remarks.append(f"board found in {len(found.views)} of {len(paths)} pictures")
     return ViewSet(
@@ -682,5 +817,17 @@ def _from_pictures(sources: Sequence[Path], told: Told, progress: Callable[[int,
     )
 
 
-def _text(value: Sequence[int] | float) -> str:
+def _of_markers(layout: Layout) -> str:
+    text = (
+        f"found a ChArUco board with {layout.columns - 1}x{layout.rows - 1} inner corners and markers of "
+        f"{layout.dictionary}"
+    )
+    if layout.first_white:
+        text += "; a marker in its top left square, as OpenCV before 4.6 printed boards (legacy pattern)"
+    return text
+
+
+def _text(value: Sequence[int] | float | str) -> str:
+    if isinstance(value, str):
+        return value
     return f"{value:g} m" if isinstance(value, float | int) else "x".join(str(part) for part in value)

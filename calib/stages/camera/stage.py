@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -41,6 +41,11 @@ class IntrinsicsOptions:
         flag="square",
         metavar="LENGTH",
         parse=parse_square_m,
+    )
+    dictionary: str | None = option(
+        None,
+        "Markers of a ChArUco board, as 4X4_50. [default: board.yaml, else found]",
+        metavar="NAME",
     )
     image_size_px: tuple[int, int] | None = option(
         None,
@@ -90,7 +95,9 @@ def _read_intrinsics(files: Files, rig: Rig, options: IntrinsicsOptions) -> Intr
     began = time.perf_counter()
     with files.progress("finding boards") as progress:
         views = read_views(
-            list(files.paths), Told(options.corners, options.square_m, options.image_size_px), progress
+            list(files.paths),
+            Told(options.corners, options.square_m, options.image_size_px, options.dictionary),
+            progress,
         )
     for remark in views.remarks:
         files.narrate(remark)
@@ -318,10 +325,16 @@ def _read_plane(files: Files, rig: Rig, options: NoOptions) -> PlaneInputs:
             stated.square_m,
             progress,
             rig.camera.optics.image_size_px,
+            stated.dictionary,
         )
     world_m = world_points_m(search.board, stated.first_corner_m, stated.angle_rad)
     views, orientation = [], []
     for view in search.views:
+        if search.layout is not None:
+            view = replace(view, target_m=world_m)
+            views.append(View(view.name, *view.counted()))
+            orientation.append(f"{view.name}: The board's markers say which corner is (0, 0).")
+            continue
         placed = settle_orientation(
             view.pixels, search.board, stated.angle_rad, stated.first_corner_px, view.name
         )

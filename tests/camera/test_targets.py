@@ -1,0 +1,88 @@
+"""ChArUco boards against rendered truth and OpenCV's own reading."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from boards import Drawing, charuco, inner_corners, pose, render
+
+from calib.io.pictures import list_pictures, read_picture
+from calib.stages.camera.corners import detect, find_size
+from calib.stages.camera.read import find_boards
+from calib.stages.camera.targets import detect_charuco, find_markers, recognise
+
+BOARDS = {
+    "usual": (charuco(8, 6, cv2.aruco.DICT_4X4_50, 0.75), 0.7),
+    "before OpenCV 4.6": (charuco(9, 6, cv2.aruco.DICT_5X5_100, 0.7, legacy=True), 0.7),
+    "thin margins": (charuco(8, 6, cv2.aruco.DICT_6X6_250, 0.85), 0.5),
+    "AprilTags": (charuco(7, 5, cv2.aruco.DICT_APRILTAG_36h11, 0.8), 1.0),
+}
+
+
+def _pictures(drawing: Drawing, count: int, blur_px: float) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    poses = [pose(drawing, seed) for seed in range(count)]
+    pictures = [render(drawing, *p, blur_px=blur_px, seed=k) for k, p in enumerate(poses)]
+    return pictures, [inner_corners(drawing, *p) for p in poses]
+
+
+@pytest.mark.parametrize("name", BOARDS)
+def test_corners_against_truth_and_opencv(name: str) -> None:
+    """Boards cut by the border: more corners than OpenCV finds, each at most half as far off."""
+    drawing, blur_px = BOARDS[name]
+    pictures, truth = _pictures(drawing, 5, blur_px)
+    layout = recognise(pictures)
+    assert layout is not None
+    assert (layout.columns, layout.rows, layout.first_white) == (
+        drawing.columns, drawing.rows, name == "before OpenCV 4.6",
+    )  # fmt: skip
+    ours, theirs = [], []
+    for gray, true in zip(pictures, truth, strict=True):
+        detection = detect_charuco(gray, find_markers(gray, layout.dictionary), layout)
+        if detection is not None:
+            ours.append((detection.pixels - true)[detection.refined])
+        corners, ids, _, _ = cv2.aruco.CharucoDetector(drawing.board).detectBoard(gray)
+        if ids is not None:
+            theirs.append(corners.reshape(-1, 2) - true[ids.ravel()])
+    away, opencv = np.concatenate(ours), np.concatenate(theirs)
+    assert len(away) > len(opencv)
+    assert np.sqrt(np.mean(away**2)) < min(0.02, 0.5 * np.sqrt(np.mean(opencv**2)))
+    assert np.abs(away).max() < 0.25
+
+
+def test_a_charuco_board_is_no_plain_board() -> None:
+    drawing, blur_px = BOARDS["usual"]
+    for gray in _pictures(drawing, 3, blur_px)[0]:
+        assert find_size(gray) is None
+        assert detect(gray, drawing.columns - 1, drawing.rows - 1) is None
+
+
+def test_nothing_has_markers_that_has_none(project_root: Path) -> None:
+    rng = np.random.default_rng(0)
+    views = [read_picture(path).gray for path in list_pictures([project_root / "images"])[:2]]
+    clutter = rng.integers(0, 255, (30, 40), dtype=np.uint8)
+    blocks = cv2.resize(clutter, (640, 480), interpolation=cv2.INTER_NEAREST)
+    assert recognise([*views, np.full((200, 300), 90, dtype=np.uint8), blocks]) is None
+
+
+def test_public_pictures_are_fitted_better_than_by_opencv(shared_data: Path) -> None:
+    """17 photographs of a screen; OpenCV's detector with its best marker length, its calibration 5 + 4."""
+    from calib.stages.camera.intrinsics import Choices, calibrate_camera
+
+    paths = list_pictures([shared_data / "pv_charuco"])
+    found = find_boards(paths, None, 1.0)
+    assert found.layout is not None and found.layout.dictionary == "4X4_50"
+    assert (found.board.columns, found.board.rows, len(found.views)) == (7, 7, 17)
+    fit = calibrate_camera(found.views, found.image_size_px, Choices(model="brown5")).calibration
+    markers = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    board = cv2.aruco.CharucoBoard((8, 8), 1.0, 0.75, markers)
+    detector = cv2.aruco.CharucoDetector(board)
+    points = []
+    for path in paths:
+        corners, ids, _, _ = detector.detectBoard(read_picture(path).gray)
+        points.append(board.matchImagePoints(corners, ids))
+    rms = cv2.calibrateCamera(*zip(*points, strict=True), found.image_size_px, None, None)[0]
+    assert fit.observations.points > sum(len(target) for target, _ in points)
+    assert fit.rms_px < 0.8 * rms
