@@ -290,14 +290,6 @@ def _eight_bits(decoded: AnyArray) -> GrayImage:
     return np.clip(np.rint(values, out=values), 0, 255, out=values).astype(np.uint8)
 
 
-def same_size(pictures: Sequence[Picture]) -> tuple[int, int]:
-    """The size that all pictures have; `BadInputError` names two that differ."""
-    first = pictures[0]
-    for other in pictures[1:]:
-        if other.size_px != first.size_px:
-            a, b = first.size_px, other.size_px
-            raise BadInputError(
-                f"{shown(other.name)}: is {b[0]}x{b[1]} px, but {shown(first.name)} is {a[0]}x{a[1]} px; "
-                "pictures of one camera have one size"
-            )
-    return first.size_px
+def usual_size(pictures: Sequence[Picture]) -> tuple[int, int]:
+    """The size that most pictures have; in a tie that of the first of them."""
+    return Counter(picture.size_px for picture in pictures).most_common(1)[0][0]

@@ -152,7 +152,7 @@ def test_views_come_in_the_order_of_the_pictures(shipped: list[Path]) -> None:
     assert done == [(1, 3), (2, 3), (3, 3)]
     assert found.image_size_px == (316, 208)
     assert found.board.square_m == 0.02
-    assert found.without == ()
+    assert found.left_out == ()
     assert list(found.hashes) == [path.name for path in paths]
 
 
@@ -166,7 +166,7 @@ def test_a_picture_that_changes_meanwhile(
         shutil.copy(shipped[5], copies[1])
 
     monkeypatch.setattr(workers, "processors", lambda: 1)
-    monkeypatch.setattr(boards, "same_size", lambda pictures: change(0, 0) or pictures[0].size_px)
+    monkeypatch.setattr(boards, "usual_size", lambda pictures: change(0, 0) or pictures[0].size_px)
     with pytest.raises(BadInputError, match=r"view02\.png: has changed since the work began"):
         find_boards(copies, (7, 5), 0.02)
 

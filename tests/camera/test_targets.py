@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from boards import Drawing, charuco, inner_corners, pose, render
 
+from calib.core.errors import BadInputError
 from calib.io.pictures import list_pictures, read_picture
 from calib.stages.camera.corners import detect, find_size
 from calib.stages.camera.read import find_boards
@@ -86,3 +87,48 @@ def test_public_pictures_are_fitted_better_than_by_opencv(shared_data: Path) -> 
     rms = cv2.calibrateCamera(*zip(*points, strict=True), found.image_size_px, None, None)[0]
     assert fit.observations.points > sum(len(target) for target, _ in points)
     assert fit.rms_px < 0.8 * rms
+
+
+def _circles(columns: int, rows: int, kind: str) -> Drawing:
+    wide = 2 * columns + 1 if kind == "asymmetric" else columns + 1
+    image = np.full((96 * (rows + 1), 96 * wide), 255, dtype=np.uint8)
+    for i, j in np.ndindex(rows, columns):
+        x = 2 * j + i % 2 + 1 if kind == "asymmetric" else j + 1
+        cv2.circle(image, (96 * x, 96 * (i + 1)), 29 if kind == "symmetric" else 48, 0, -1)
+    return Drawing(image, wide, rows + 1)
+
+
+def _april_grid() -> Drawing:
+    """Kalibr's: numbered from below, frames of two cells, a black square between four tags."""
+    tags = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36H11)
+    image = np.full((6 * 124 + 28, 6 * 124 + 28), 255, dtype=np.uint8)
+    for row, column in np.ndindex(6, 6):
+        tag = cv2.aruco.generateImageMarker(tags, 6 * (5 - row) + column, 96, borderBits=2)
+        image[124 * row + 28 : 124 * row + 124, 124 * column + 28 : 124 * column + 124] = np.rot90(tag)
+    for row, column in np.ndindex(7, 7):
+        image[124 * row : 124 * row + 28, 124 * column : 124 * column + 28] = 0
+    return Drawing(image, 8, 8)
+
+
+@pytest.mark.parametrize(
+    ("drawing", "says"),
+    [
+        (
+            _circles(4, 11, "asymmetric"),
+            "the pictures show an asymmetric grid of circles, 4x11; calib reads check",
+        ),
+        (
+            _circles(9, 6, "symmetric"),
+            "the pictures show a symmetric grid of circles, 9x6; calib reads check",
+        ),
+        (
+            _april_grid(),
+            "the pictures show a grid of APRILTAG_36H11 markers, 6x6; calib reads checkerboards and Ch",
+        ),
+    ],
+)
+def test_other_targets_are_named(drawing: Drawing, says: str, tmp_path: Path) -> None:
+    for seed in range(3):
+        cv2.imwrite(str(tmp_path / f"{seed}.png"), render(drawing, *pose(drawing, seed, 0.7, 0.1)))
+    with pytest.raises(BadInputError, match=says):
+        find_boards(list_pictures([tmp_path]), None, 1.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
@@ -73,6 +74,26 @@ class View:
         """Target and pixels of the points that were measured."""
         kept = slice(None) if self.measured is None else self.measured
         return self.target_m[kept], self.pixels[kept]
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A file, a picture or points of it that are there and not used.
+
+    Attributes
+    ----------
+    name : of the file or view.
+    why : the rest of a sentence that begins with the name.
+    kind : "file" (no picture), "unreadable", "size" (another one than the others'), "no board", "view"
+        or "points" (do not agree with the others).
+    """
+
+    name: str
+    why: str
+    kind: Literal["file", "unreadable", "size", "no board", "view", "points"]
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.why}"
 
 
 @dataclass(frozen=True)

@@ -21,9 +21,9 @@ from calib.core.files import check_readable, hash_of, one_line, read_yaml_mappin
 from calib.core.schema import validated
 from calib.core.units import plain_number
 from calib.core.workers import Workers
-from calib.io.pictures import Picture, list_pictures, read_picture, same_size
+from calib.io.pictures import SUFFIXES, Picture, list_pictures, read_picture, usual_size
 from calib.stages.camera.corners import Detection, detect, find_size
-from calib.stages.camera.model import Board, View
+from calib.stages.camera.model import Board, LeftOut, View
 from calib.stages.camera.targets import (
     DICTIONARIES,
     Layout,
@@ -32,6 +32,7 @@ from calib.stages.camera.targets import (
     dictionary_named,
     find_markers,
     in_place,
+    name_of,
     recognise,
     with_rows,
 )
@@ -131,8 +132,8 @@ class BoardSearch:
     image_size_px : width and height of all pictures.
     views : one for each picture with the board; the names are the files'.
     detections : as `views`.
-    without : names of pictures where the board was not found.
-    hashes : SHA-256 of every picture by name.
+    left_out : pictures that are not used: unreadable, of another size, or without the board.
+    hashes : SHA-256 of every picture that could be read by name.
     layout : of the markers of a ChArUco board, which say which way it lies; None for a plain board.
     """
 
@@ -140,7 +141,7 @@ class BoardSearch:
     image_size_px: tuple[int, int]
     views: tuple[View, ...]
     detections: tuple[Detection, ...]
-    without: tuple[str, ...]
+    left_out: tuple[LeftOut, ...]
     hashes: dict[str, str]
     layout: Layout | None = None
 
@@ -155,6 +156,9 @@ def find_boards(
 ) -> BoardSearch:
     """Decode pictures and find the board in each, several at a time.
 
+    Pictures that cannot be decoded, and those of another size than `image_size_px` (by default than most
+    of them have), are left out.
+
     Parameters
     ----------
     corners : inner corners, columns and rows; found in the pictures when None.
@@ -165,26 +169,65 @@ def find_boards(
 
     Raises
     ------
-    BadInputError : a picture that cannot be read, pictures of several sizes, or no board in any; when
-        another board is there the message says which.
+    BadInputError : no picture that can be read, none of the size, or no board in any; when another board
+        is there the message says which.
     """
-    pictures = _read(paths)
-    with Workers(_Album(paths, pictures), len(paths)) as workers:
-        return _Search(workers, pictures, square_m, progress).run(corners, image_size_px, dictionary)
+    read = dict(zip(paths, _read(paths), strict=True))
+    pictures = {path: one for path, one in read.items() if isinstance(one, Picture)}
+    if not pictures:
+        raise next(one for one in read.values() if isinstance(one, BadInputError))
+    size_px = image_size_px or usual_size(list(pictures.values()))
+    usable = {path: one for path, one in pictures.items() if one.size_px == size_px}
+    if not usable:
+        which = list(pictures.values())
+        width, height = which[0].size_px
+        raise BadInputError(
+            f"{_names(which)}: {_is_or_are(which)} {width}x{height} px, expected {size_px[0]}x{size_px[1]} px"
+        )
+    with Workers(_Album(list(usable), list(usable.values())), len(usable)) as workers:
+        search = _Search(workers, list(usable.values()), size_px, square_m, progress).run(corners, dictionary)
+    boardless = {one.name: one for one in search.left_out}
+    left_out = [
+        _not_read(path, one) if isinstance(one, BadInputError)
+        else _of_another_size(one, size_px, len(usable)) if path not in usable
+        else boardless.get(one.name)
+        for path, one in read.items()
+    ]  # fmt: skip
+    return replace(
+        search,
+        left_out=tuple(one for one in left_out if one is not None),
+        hashes={one.name: one.sha256 for one in pictures.values()},
+    )
 
 
-def _read(paths: Sequence[Path]) -> list[Picture]:
-    """All pictures; the pixels only of as many as memory surely has room for."""
-    kept, pictures = 0, []
+def _not_read(path: Path, error: BadInputError) -> LeftOut:
+    return LeftOut(shown(path.name), str(error).removeprefix(f"{shown(path)}: "), "unreadable")
+
+
+def _of_another_size(picture: Picture, size_px: tuple[int, int], others: int) -> LeftOut:
+    (width, height), (w, h) = picture.size_px, size_px
+    turned = ", as if turned by a quarter" if (width, height) == (h, w) else ""
+    why = f"is {width}x{height} px{turned}; {others} others are {w}x{h} px"
+    return LeftOut(picture.name, why, "size")
+
+
+def _read(paths: Sequence[Path]) -> list[Picture | BadInputError]:
+    """All pictures, or why they cannot be read; the pixels only of as many as memory surely has room for."""
+    kept, pictures = 0, list[Picture | BadInputError]()
     with Workers(None, len(paths), large=True) as workers:
         for picture in workers.in_order(_picture, paths):
-            kept += picture.gray.size
-            pictures.append(picture if kept <= _KEPT_PIXELS else picture.without_pixels())
+            if isinstance(picture, Picture):
+                kept += picture.gray.size
+                picture = picture if kept <= _KEPT_PIXELS else picture.without_pixels()
+            pictures.append(picture)
     return pictures
 
 
-def _picture(_: None, path: Path) -> Picture:
-    return read_picture(path)
+def _picture(_: None, path: Path) -> Picture | BadInputError:
+    try:
+        return read_picture(path)
+    except BadInputError as error:
+        return error
 
 
 @dataclass(frozen=True)
@@ -223,6 +266,10 @@ def _layout(album: _Album, what: tuple[tuple[int, ...], str | None]) -> Layout |
     return recognise([album.gray(i) for i in which], dictionary)
 
 
+def _other_target(album: _Album, which: tuple[int, ...]) -> str | None:
+    return name_of([album.gray(i) for i in which])
+
+
 def _size(album: _Album, i: int) -> tuple[int, int] | None:
     return find_size(album.gray(i))
 
@@ -233,22 +280,14 @@ class _Search:
 
     workers: Workers[_Album]
     pictures: Sequence[Picture]
+    size_px: tuple[int, int]
     square_m: float
     progress: Callable[[int, int], None]
     done: int = 0
     sizes: dict[int, tuple[int, int] | None] = field(default_factory=dict)
 
-    def run(
-        self, corners: tuple[int, int] | None, expected_px: tuple[int, int] | None, dictionary: str | None
-    ) -> BoardSearch:
-        pictures = self.pictures
-        size_px = same_size(pictures)
-        if expected_px is not None and size_px != expected_px:
-            raise BadInputError(
-                f"{_names(pictures)}: {_is_or_are(pictures)} {size_px[0]}x{size_px[1]} px, "
-                f"expected {expected_px[0]}x{expected_px[1]} px"
-            )
-        count = len(pictures)
+    def run(self, corners: tuple[int, int] | None, dictionary: str | None) -> BoardSearch:
+        pictures, count = self.pictures, len(self.pictures)
         sample = list(range(0, count, max(1, count // _SIZE_SAMPLE)))
         if dictionary is not None:
             return self._with_markers(corners, self._layout(sample, dictionary), dictionary)
@@ -266,6 +305,9 @@ class _Search:
             layout = self._layout(sample, None)
             if layout is not None:
                 return self._with_markers(corners, layout, layout.dictionary)
+            other_target = next(iter(self.workers.in_order(_other_target, [tuple(sample)])))
+            if other_target is not None:
+                raise BadInputError(f"{_names(pictures)}: {_shows(pictures)} {other_target}; {_READS}")
             wanted = wanted or self._common_size(range(count))
         if wanted is None:
             raise BadInputError(f"{_names(pictures)}: no checkerboard found in {_count(count)}")
@@ -277,15 +319,21 @@ class _Search:
     def _search(
         self, board: Board, found: Mapping[int, Detection | None], layout: Layout | None
     ) -> BoardSearch:
+        what = "ChArUco board" if layout else "board"
+        why = f"shows no {what} with {board.columns}x{board.rows} inner corners that can be read"
         target = board.points_m()
         seen = [(picture, detection) for i, picture in enumerate(self.pictures) if (detection := found[i])]
         return BoardSearch(
             board=board,
-            image_size_px=same_size(self.pictures),
+            image_size_px=self.size_px,
             views=tuple(View(p.name, target, d.pixels, d.refined) for p, d in seen),
             detections=tuple(detection for _, detection in seen),
-            without=tuple(picture.name for i, picture in enumerate(self.pictures) if found[i] is None),
-            hashes={picture.name: picture.sha256 for picture in self.pictures},
+            left_out=tuple(
+                LeftOut(picture.name, why, "no board")
+                for i, picture in enumerate(self.pictures)
+                if found[i] is None
+            ),
+            hashes={},
             layout=layout,
         )
 
@@ -308,8 +356,8 @@ class _Search:
             )
         if layout.kind == "grid":
             raise BadInputError(
-                f"{_names(pictures)}: these pictures show a grid of {layout.dictionary} markers, "
-                f"{layout.columns} in a row; calib reads checkerboards and ChArUco boards"
+                f"{_names(pictures)}: {_shows(pictures)} a grid of {layout.dictionary} markers, "
+                f"{layout.columns}x{layout.rows}; {_READS}"
             )
         markers = list(self.workers.in_order(_markers, [(i, layout.dictionary) for i in every]))
         kept = [in_place(one, layout)[0].ids for one in markers]
@@ -369,6 +417,16 @@ def _not_found(pictures: Sequence[Picture], wanted: tuple[int, int], other: tupl
         f"{_names(pictures)}: no board with {wanted[0]}x{wanted[1]} inner corners found in "
         f"{_count(len(pictures))}, {instead}"
     )
+
+
+_READS = (
+    "calib reads checkerboards and ChArUco boards, and points of any other flat target from a table "
+    "view,x_m,y_m,u_px,v_px"
+)
+
+
+def _shows(pictures: Sequence[Picture]) -> str:
+    return "the picture shows" if len(pictures) == 1 else "the pictures show"
 
 
 def _is_or_are(pictures: Sequence[Picture]) -> str:
@@ -689,14 +747,14 @@ class ViewSet:
     views : one for each picture with a board.
     image_size_px : width and height.
     hashes : SHA-256 of each input by its name.
-    without : names of pictures without a board.
+    left_out : files that are there and not used.
     remarks : sentences for the person who watches.
     """
 
     views: tuple[View, ...]
     image_size_px: tuple[int, int]
     hashes: dict[str, str]
-    without: tuple[str, ...]
+    left_out: tuple[LeftOut, ...]
     remarks: tuple[str, ...]
 
 
@@ -812,9 +870,21 @@ def _from_pictures(sources: Sequence[Path], told: Told, progress: Callable[[int,
     elif corners is None:
         remarks.append(f"found a board with {found.board.columns}x{found.board.rows} inner corners")
     remarks.append(f"board found in {len(found.views)} of {len(paths)} pictures")
-    return ViewSet(
-        found.views, found.image_size_px, {**found.hashes, **hashes}, found.without, tuple(remarks)
-    )
+    left_out = (*found.left_out, *_no_pictures(sources))
+    return ViewSet(found.views, found.image_size_px, {**found.hashes, **hashes}, left_out, tuple(remarks))
+
+
+def _no_pictures(sources: Sequence[Path]) -> list[LeftOut]:
+    """Files of folders that are not read at all."""
+    inside = [path for source in sources if source.is_dir() for path in sorted(source.iterdir())]
+    return [
+        LeftOut(shown(path.name), f"is no picture ({', '.join(kind[1:] for kind in SUFFIXES)})", "file")
+        for path in inside
+        if path.is_file()
+        and path.suffix.lower() not in SUFFIXES
+        and not path.name.startswith(".")
+        and path.name != BOARD_FILE
+    ]
 
 
 def _of_markers(layout: Layout) -> str:

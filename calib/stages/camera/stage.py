@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from calib.core.words import Block
     from calib.stages.camera import lens, model, plane
     from calib.stages.camera.intrinsics import Candidate, Choices, Intrinsics
+    from calib.stages.camera.model import LeftOut
     from calib.stages.camera.section import Camera, Lens, Plane
 
 # ----------------------------------------------------------------------
@@ -67,11 +68,11 @@ class IntrinsicsOptions:
 
 @dataclass(frozen=True)
 class IntrinsicsInputs:
-    """Views of a target, names of pictures without one, and how to calibrate."""
+    """Views of a target, files that are not used, and how to calibrate."""
 
     views: Sequence[model.View]
     image_size_px: tuple[int, int]
-    without: tuple[str, ...]
+    left_out: tuple[LeftOut, ...]
     choices: Choices
     detect_s: float
 
@@ -81,7 +82,7 @@ class CameraEvidence:
     """What a camera was made from."""
 
     fit: Intrinsics
-    without: tuple[str, ...]
+    left_out: tuple[LeftOut, ...]
     seconds: Mapping[str, float]
 
 
@@ -104,7 +105,7 @@ def _read_intrinsics(files: Files, rig: Rig, options: IntrinsicsOptions) -> Intr
     files.hashes.update(views.hashes)
     choices = Choices(options.model, options.skew, options.loss, options.board, options.reject)
     detect_s = time.perf_counter() - began
-    return IntrinsicsInputs(views.views, views.image_size_px, tuple(views.without), choices, detect_s)
+    return IntrinsicsInputs(views.views, views.image_size_px, views.left_out, choices, detect_s)
 
 
 def _solve_intrinsics(inputs: IntrinsicsInputs) -> Camera:
@@ -143,7 +144,7 @@ def _solve_intrinsics(inputs: IntrinsicsInputs) -> Camera:
         termination=fit.termination,
         rejected=list(result.rejected),
         **judged(result.judgement.verdict),
-    ).with_evidence(CameraEvidence(result, inputs.without, {"detect": inputs.detect_s, **result.seconds}))
+    ).with_evidence(CameraEvidence(result, inputs.left_out, {"detect": inputs.detect_s, **result.seconds}))
 
 
 def image_grid(image_size_px: tuple[int, int], columns: int = 17, rows: int = 13) -> FloatArray:
@@ -218,10 +219,14 @@ def _camera_document(camera: Camera) -> dict[str, Any]:
     return {
         "models": compared(evidence.fit.models),
         "boards": compared(evidence.fit.boards),
-        "pictures_without_board": list(evidence.without),
+        "not_used": _not_used(evidence.left_out),
         "per_view": per_view,
         "seconds": dict(evidence.seconds),
     }
+
+
+def _not_used(left_out: Sequence[LeftOut]) -> list[dict[str, str]]:
+    return [{"file": one.name, "why": one.why} for one in left_out]
 
 
 def _camera_words(camera: Camera) -> list[Block]:
@@ -237,7 +242,7 @@ def _camera_words(camera: Camera) -> list[Block]:
             )
             head = (what, "parameters", "fitted", "held back")
             blocks.append(Table(head, rows, f"{what}s compared, RMS in px"))
-    blocks += [Line(f"no board in {name}") for name in evidence.without]
+    blocks += [Line(f"not used: {one}") for one in evidence.left_out]
     blocks += [Line(f"rejected: {sentence}") for sentence in camera.rejected]
     return blocks
 
@@ -284,7 +289,7 @@ class PlaneInputs:
     views: Sequence[model.View]
     workspace_m: tuple[float, float, float, float]
     orientation: tuple[str, ...]
-    without: tuple[str, ...]
+    left_out: tuple[LeftOut, ...]
 
 
 @dataclass(frozen=True)
@@ -294,7 +299,7 @@ class PlaneEvidence:
     camera: model.Camera
     fit: plane.Plane
     orientation: tuple[str, ...]
-    without: tuple[str, ...]
+    left_out: tuple[LeftOut, ...]
 
 
 def _read_plane(files: Files, rig: Rig, options: NoOptions) -> PlaneInputs:
@@ -343,7 +348,7 @@ def _read_plane(files: Files, rig: Rig, options: NoOptions) -> PlaneInputs:
         orientation.append(f"{view.name}: {placed.how}")
     x0, y0, x1, y1 = (rig.geometry or Geometry()).workspace_m
     files.hashes.update({**search.hashes, **board_hash, "camera": identity(rig.camera)})
-    return PlaneInputs(rig.camera, views, (x0, y0, x1, y1), tuple(orientation), tuple(search.without))
+    return PlaneInputs(rig.camera, views, (x0, y0, x1, y1), tuple(orientation), search.left_out)
 
 
 def _solve_plane(inputs: PlaneInputs) -> Plane:
@@ -404,11 +409,11 @@ def _solve_plane(inputs: PlaneInputs) -> Plane:
         points=fit.points,
         orientation=" ".join(inputs.orientation),
         **judged(Verdict.of(findings)),
-    ).with_evidence(PlaneEvidence(optics, fit, inputs.orientation, inputs.without))
+    ).with_evidence(PlaneEvidence(optics, fit, inputs.orientation, inputs.left_out))
 
 
 def _plane_document(result: Plane) -> dict[str, Any]:
-    return {"pictures_without_board": list(result.evidence.without)}
+    return {"not_used": _not_used(result.evidence.left_out)}
 
 
 def _plane_words(result: Plane) -> list[Block]:
@@ -417,7 +422,7 @@ def _plane_words(result: Plane) -> list[Block]:
     rows = tuple(tuple(f"{value:.4f}" for value in row) for row in result.A_px_per_m)
     return [
         Table(("x, px/m", "y, px/m", "1, px"), rows, "A, world metres to pixels (2.9, with K)"),
-        *(Line(f"no board in {name}") for name in result.evidence.without),
+        *(Line(f"not used: {one}") for one in result.evidence.left_out),
     ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -47,6 +48,7 @@ _FEWEST_MARKERS = 6
 """Fewer agree by chance with one of the many numberings."""
 _MOST_COLUMNS = 60
 _NEIGHBOURS = 4
+_TURN = np.array([[0.0, -1.0], [1.0, 0.0]])
 _MARKER_SHARE = (0.25, 0.97)
 """Side of a marker over that of its square, or over the pitch of a grid."""
 _OFF = 0.2
@@ -204,15 +206,19 @@ def _layout_of(pictures: Sequence[Markers], dictionary: str) -> Layout | None:
         board = np.concatenate(
             [(p := layout.places(m.ids))[j] - p[i] for m, i, j, _ in pairs], dtype=np.float64
         )
-        share, good = _share(board, step)
+        # Makers of grids turn their markers as they like.
+        turns = (_TURN @ board.T).T, -board, -(_TURN @ board.T).T
+        every = [_share(one, step) for one in (board, *(turns if layout.kind == "grid" else ()))]
+        share, good = max(every, key=lambda one: float(np.mean(one[1])))
         agreeing = float(np.mean(good))
         if _MARKER_SHARE[0] < share < _MARKER_SHARE[1] and (best is None or agreeing > best[0]):
             best = agreeing, layout
     if best is None or best[0] < _AGREEING:
         return None
-    layout = best[1]
-    kept = [in_place(markers, layout)[0].ids for markers in pictures]
-    return with_rows(replace(layout, dictionary=dictionary), kept)
+    layout = replace(best[1], dictionary=dictionary)
+    if layout.kind == "grid":
+        return with_rows(layout, [markers.ids for markers in pictures])
+    return with_rows(layout, [in_place(markers, layout)[0].ids for markers in pictures])
 
 
 def with_rows(layout: Layout, ids: Sequence[IntArray]) -> Layout | None:
@@ -432,3 +438,52 @@ def detect_charuco(gray: GrayImage, markers: Markers, layout: Layout) -> Detecti
     part = np.s_[v0:v1, u0:u1]
     sure = (count[part] > 1) | (grid.sigma_px < _UNSURE * np.median(grid.sigma_px[grid.refined]))
     return _ordered(grid, beside[part] & sure, (int(u0), int(v0)), layout, far)
+
+
+# ----------------------------------------------------------------------
+# Grids of circles and grids of markers are recognised, so that they can be named; they are not read.
+
+_CIRCLES_PIXELS = 300_000
+_CIRCLES = (12, 300)
+"""Round spots of a picture that may show a grid of circles."""
+_ROUND = 0.83
+"""4 pi area / perimeter^2: of a square pi / 4, of a circle seen at 60 degrees 0.84."""
+_MOST_SPOTS = 1.3
+"""Round spots over the circles of the grid."""
+
+
+def circle_grid(gray: GrayImage) -> tuple[str, int, int] | None:
+    """What grid of circles OpenCV finds: "symmetric" or "asymmetric", circles in a row, and rows."""
+    zoom = min(1.0, float(np.sqrt(_CIRCLES_PIXELS / gray.size)))
+    small = cv2.resize(gray, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_AREA) if zoom < 1.0 else gray
+    parameters = cv2.SimpleBlobDetector.Params()
+    parameters.filterByCircularity, parameters.minCircularity = True, _ROUND
+    spots = cv2.SimpleBlobDetector.create(parameters)
+    for image in (small, cv2.bitwise_not(small)):
+        count = len(spots.detect(image))
+        if not _CIRCLES[0] <= count <= _CIRCLES[1]:
+            continue
+        sizes = [
+            (columns, rows, kind)
+            for columns in range(3, 30)
+            for rows in range(3, 30)
+            for kind in ("symmetric", "asymmetric")
+            if columns * rows <= count <= _MOST_SPOTS * columns * rows
+            and (columns >= rows if kind == "symmetric" else rows <= 4 * columns)
+        ]
+        for columns, rows, kind in sorted(sizes, key=lambda size: -size[0] * size[1]):
+            flag = cv2.CALIB_CB_SYMMETRIC_GRID if kind == "symmetric" else cv2.CALIB_CB_ASYMMETRIC_GRID
+            if cv2.findCirclesGrid(image, (columns, rows), flags=flag, blobDetector=spots)[0]:
+                return kind, columns, rows
+    return None
+
+
+def name_of(pictures: Sequence[GrayImage]) -> str | None:
+    """What most of these pictures show that calib does not read; None where that is nothing known."""
+    counts = Counter(grid for gray in pictures if (grid := circle_grid(gray)))
+    if not counts:
+        return None
+    (kind, columns, rows), many = counts.most_common(1)[0]
+    if many < max(1, len(pictures) // 3):
+        return None
+    return f"{'an' if kind == 'asymmetric' else 'a'} {kind} grid of circles, {columns}x{rows}"
