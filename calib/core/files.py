@@ -13,6 +13,10 @@ from typing import Any
 from calib.core.errors import BadInputError
 
 _MAX_BYTES = 500_000_000
+PICTURES = (
+    ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".heic", ".heif", ".avif",
+)  # fmt: skip
+"""Endings of picture files."""
 _MAX_YAML_BYTES = 1_000_000
 _SAFE = frozenset("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789-_.")
 _LONGEST = 80

@@ -475,14 +475,20 @@ def iter_bag(path: Path, topics: Path | None = None) -> Iterator[Log]:
         Without the extra logs, for a bag that cannot be read, a topic it lacks, a field that its messages
         lack, and a value that is no number.
     """
+    with opened_bag(path) as stream:
+        yield from rows_from_messages(shown(path), stream, topic_map(path, stream.topics, topics))
+
+
+@contextmanager
+def opened_bag(path: Path) -> Iterator[Source]:
+    """The messages of a bag; what goes wrong while they are read is a `BadInputError` as well."""
     source = shown(path)
     if path.is_file() or not path.is_dir():
         check_readable(path)
     opened = _mcap if path.is_file() and path.suffix.lower() == ".mcap" else _rosbag
     try:
         with opened(path) as stream:
-            found = topic_map(path, stream.topics, topics)
-            yield from rows_from_messages(source, stream, found)
+            yield stream
     except CalibError:
         raise
     except OSError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import re
 import struct
@@ -17,8 +18,8 @@ import cv2
 import numpy as np
 
 from calib.core.arrays import AnyArray, GrayImage
-from calib.core.errors import BadInputError
-from calib.core.files import read_bytes, sha256, shown
+from calib.core.errors import BadInputError, pip_install
+from calib.core.files import PICTURES, read_bytes, sha256, shown
 
 # ----------------------------------------------------------------------
 # How many pixels the header of a picture declares: known before anything is decoded or allocated.
@@ -26,13 +27,16 @@ from calib.core.files import read_bytes, sha256, shown
 # A few kilobytes can decode to gigabytes, and OpenCV takes the memory for all of a picture before it looks
 # at the data. OpenCV's own limit is read when its library loads, which nobody here controls.
 #
-# Formats: PNG (W3C), JPEG (T.81, B.2.2), TIFF 6.0 and BigTIFF, BMP, WebP (RFC 9649), Netpbm.
+# Formats: PNG (W3C), JPEG (T.81, B.2.2), TIFF 6.0 and BigTIFF, BMP, WebP (RFC 9649), Netpbm, HEIF and AVIF
+# (ISO/IEC 23008-12).
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _NETPBM = re.compile(rb"P[1-6](?:\s+|#[^\n]*\n)+(\d{1,9})(?:\s+|#[^\n]*\n)+(\d{1,9})\s")
 _TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
 _TIFF_KINDS = {1: "B", 3: "H", 4: "I", 16: "Q"}
 _MOST_TAGS = 1000
+_HEIF_BYTES = 1_000_000
+"""Within so many bytes properties are looked for."""
 _MARKER = re.compile(rb"\xff[^\xff]", re.DOTALL)
 _MOST_SEGMENTS = 10_000
 _SOF = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -52,6 +56,8 @@ def declared_pixels(data: bytes) -> int | None:
             width, height = _bmp(data)
         elif data[:4] == b"RIFF" and data[8:12] == b"WEBP":
             width, height = _webp(data)
+        elif data[4:8] == b"ftyp":
+            width, height = _heif(data)
         else:
             found = _NETPBM.match(data)
             width, height = (0, 0) if found is None else (int(found[1]), int(found[2]))
@@ -113,6 +119,15 @@ def _webp(data: bytes) -> tuple[int, int]:
     return width & 0x3FFF, height & 0x3FFF
 
 
+def _heif(data: bytes) -> tuple[int, int]:
+    """The largest of the sizes in the file's properties (`ispe`): tiles are smaller than the whole."""
+    sizes = [(0, 0)]
+    at = -1
+    while (at := data.find(b"ispe", at + 1, _HEIF_BYTES)) >= 0:
+        sizes.append(struct.unpack_from(">II", data, at + 8))
+    return max(sizes, key=lambda size: size[0] * size[1])
+
+
 # ----------------------------------------------------------------------
 # Picture files: which there are, whether they are whole, and their pixels as grey values.
 #
@@ -120,11 +135,10 @@ def _webp(data: bytes) -> tuple[int, int]:
 # that was held upright for one view has not changed its lens.
 
 os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm")
 _MAX_PIXELS = 200_000_000
-_PICTURES_PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
 _JPEG_DAMAGE = ("premature end", "bad huffman", "bad arithmetic", "found marker", "inconsistent progression")
 """Complaints of libjpeg after which parts of the picture are made up. Extraneous bytes are not among
@@ -176,7 +190,7 @@ def list_pictures(sources: Sequence[Path]) -> list[Path]:
             except OSError as error:
                 raise BadInputError(f"{shown(source)}: cannot be listed: {error.strerror}") from error
             if not inside:
-                kinds = ", ".join(suffix[1:] for suffix in SUFFIXES)
+                kinds = ", ".join(suffix[1:] for suffix in PICTURES)
                 raise BadInputError(f"{shown(source)}: holds no pictures, expected files of {kinds}")
             found += sorted(inside, key=_natural)
         elif source.exists():
@@ -189,17 +203,25 @@ def list_pictures(sources: Sequence[Path]) -> list[Path]:
     return found
 
 
+def holds_pictures(folder: Path) -> bool:
+    """Whether a folder has pictures in it, its sub-folders left out."""
+    try:
+        return any(_is_picture_file(path) for path in folder.iterdir())
+    except OSError:
+        return False
+
+
 def _is_picture_file(path: Path) -> bool:
     """Whether a folder's entry is to be read; a link that leads nowhere is, so that it is complained of."""
-    if path.suffix.lower() not in SUFFIXES or path.name.startswith("."):
+    if path.suffix.lower() not in PICTURES or path.name.startswith("."):
         return False
     return path.is_file() or (path.is_symlink() and not path.exists())
 
 
 def _incomplete(data: bytes) -> str | None:
     """What is wrong with the file as a container, or None."""
-    if data.startswith(_PICTURES_PNG):
-        at = len(_PICTURES_PNG)
+    if data.startswith(_PNG):
+        at = len(_PNG)
         while at + 12 <= len(data):
             length, kind = struct.unpack(">I4s", data[at : at + 8])
             end = at + 12 + length
@@ -221,31 +243,56 @@ def read_picture(path: Path) -> Picture:
     that their brightest 0.1 % are white. Raises `BadInputError` for what is not a whole picture.
     """
     data = read_bytes(path)
+    return decoded_picture(data, shown(path), shown(path.name), sha256(data))
+
+
+def decoded_picture(data: bytes, where: str, name: str, digest: str) -> Picture:
+    """As `read_picture`, from bytes; `where` begins the sentence of what is wrong with them."""
     if not data:
-        raise BadInputError(f"{shown(path)}: is empty, expected a picture")
+        raise BadInputError(f"{where}: is empty, expected a picture")
     problem = _incomplete(data)
     if problem is not None:
-        raise BadInputError(f"{shown(path)}: {problem}")
+        raise BadInputError(f"{where}: {problem}")
     pixels = declared_pixels(data)
     if pixels is None:
         what = (
             "a truncated or damaged JPEG" if data.startswith(_JPEG) else "not a picture that can be decoded"
         )
-        raise BadInputError(f"{shown(path)}: is {what}")
+        raise BadInputError(f"{where}: is {what}")
     if pixels > _MAX_PIXELS:
-        raise BadInputError(f"{shown(path)}: has more than {_MAX_PIXELS // 1_000_000} million pixels")
+        raise BadInputError(f"{where}: has more than {_MAX_PIXELS // 1_000_000} million pixels")
     if data.startswith(_JPEG):
         decoded, complaints = _decoded_with_complaints(data)
         damage = next((line for line in complaints.splitlines() if _tells_of_damage(line)), None)
         if decoded is None or damage is not None:
             why = "" if damage is None else f" ({damage.removeprefix('Corrupt JPEG data: ')[:80]})"
-            raise BadInputError(f"{shown(path)}: is a truncated or damaged JPEG{why}")
+            raise BadInputError(f"{where}: is a truncated or damaged JPEG{why}")
+    elif data[4:8] == b"ftyp" and b"avif" not in data[8:40]:
+        decoded = _heic(data, where)
     else:
         decoded = _decoded(data)
     if decoded is None or decoded.size == 0:
-        raise BadInputError(f"{shown(path)}: is not a picture that can be decoded")
+        raise BadInputError(f"{where}: is not a picture that can be decoded")
     height, width = decoded.shape[:2]
-    return Picture(shown(path.name), sha256(data), _eight_bits(decoded), (width, height))
+    return Picture(name, digest, eight_bits(decoded), (width, height))
+
+
+def _heic(data: bytes, where: str) -> AnyArray | None:
+    """A HEIC picture, turned back to the sensor's own rows: its decoder holds it upright."""
+    try:
+        pillow_heif = importlib.import_module("pillow_heif")
+    except ImportError as error:
+        raise BadInputError(
+            f"{where}: reading HEIC needs the package pillow-heif: {pip_install('pictures')}"
+        ) from error
+    try:
+        image = pillow_heif.open_heif(data, convert_hdr_to_8bit=True).to_pillow()
+        decoded = np.asarray(image.convert("L"))
+    except Exception:
+        # Damaged bytes make the package raise nearly anything.
+        return None
+    at = data.find(b"irot", 0, _HEIF_BYTES)
+    return np.ascontiguousarray(np.rot90(decoded, -(data[at + 4] & 3) if at >= 0 else 0))
 
 
 def _decoded(data: bytes) -> AnyArray | None:
@@ -274,7 +321,8 @@ def _tells_of_damage(complaint: str) -> bool:
     return any(word in complaint.lower() for word in _JPEG_DAMAGE)
 
 
-def _eight_bits(decoded: AnyArray) -> GrayImage:
+def eight_bits(decoded: AnyArray) -> GrayImage:
+    """Grey values of any depth as 8 bits, the brightest 0.1 % white."""
     if decoded.dtype == np.uint8:
         return np.ascontiguousarray(decoded, dtype=np.uint8)
     values = decoded.astype(np.float32)

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calib.core.errors import BadInputError
-from calib.core.files import file_sha256, inside, one_line, shown, slug
+from calib.core.files import PICTURES, file_sha256, inside, one_line, shown, slug
 from calib.core.stage import NOTHING_STATED, LogOptions
 
-_PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm")
 _LOGS = (".csv", ".tsv", ".parquet", ".mcap", ".bag", ".db3")
 
 
@@ -125,7 +124,7 @@ def _named(path: Path, root: Path) -> str:
 
 
 def _pictures(folder: Path, taken: Callable[[Path], bool]) -> tuple[tuple[Path, ...], Path | None]:
-    pictures = tuple(path for path in _listed(folder, _PICTURES) if taken(path))
+    pictures = tuple(path for path in _listed(folder, PICTURES) if taken(path))
     board = folder / "board.yaml"
     return pictures, board if board.exists() and taken(board) else None
 

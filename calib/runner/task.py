@@ -27,7 +27,7 @@ from calib.core.errors import (
     CalibError,
     pip_install,
 )
-from calib.core.files import make_folder, one_line, read_text, read_yaml_mapping, sha256, shown
+from calib.core.files import PICTURES, make_folder, one_line, read_text, read_yaml_mapping, sha256, shown
 from calib.core.stage import name_of_flag
 from calib.core.units import parse_corners, parse_square_m
 from calib.runner.cache import key_of, program_digest
@@ -378,9 +378,7 @@ def from_json(text: str) -> Outcome | None:
 MOST_BYTES = 4_000_000_000
 _MOST_FILES = 20_000
 _PIECE = 1 << 20
-_SUFFIXES = (
-    ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".csv", ".parquet", ".yaml",
-)  # fmt: skip
+_SUFFIXES = (*PICTURES, ".csv", ".parquet", ".yaml")
 _FOLDERS = ("", "images", "images/plane", "logs")
 _FINAL = (FileNotFoundError, NotADirectoryError, IsADirectoryError, PermissionError, NotImplementedError)
 """Another attempt would end in the same; the last is fsspec's for what a kind of URL cannot do."""
@@ -494,7 +492,6 @@ def _copied(system: Any, remote: str, target: Path, most: int, told: str) -> int
 # Figures are drawn only for a page; they change no number.
 
 CAMERA_STAGES = ("intrinsics", "extrinsics", "distortion")
-_PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm")
 
 
 @dataclass(frozen=True)
@@ -538,7 +535,7 @@ def rig_folder(root: Path) -> Folder:
         return read_folder(root)
     root = root.absolute()
     try:
-        found = sorted(path for path in root.iterdir() if path.suffix.lower() in _PICTURES and path.is_file())
+        found = sorted(path for path in root.iterdir() if path.suffix.lower() in PICTURES and path.is_file())
     except OSError as error:
         raise BadInputError(f"{shown(root)}: cannot be listed: {error.strerror or error}") from error
     pictures = tuple(path for path in found if not path.is_symlink() and not path.name.startswith("."))

@@ -17,11 +17,13 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from calib.core.arrays import FloatArray, GrayImage
 from calib.core.errors import BadInputError, CalibError, UsageError
-from calib.core.files import check_readable, hash_of, one_line, read_yaml_mapping, shown
+from calib.core.files import PICTURES, check_readable, hash_of, one_line, read_yaml_mapping, shown
 from calib.core.schema import validated
 from calib.core.units import plain_number
 from calib.core.workers import Workers
-from calib.io.pictures import SUFFIXES, Picture, list_pictures, read_picture, usual_size
+from calib.io.frames import Frames, is_recording, read_frames
+from calib.io.pictures import Picture, holds_pictures, list_pictures, read_picture, usual_size
+from calib.stages.camera.choice import most_informative
 from calib.stages.camera.corners import Detection, detect, find_size
 from calib.stages.camera.model import Board, LeftOut, View
 from calib.stages.camera.targets import (
@@ -153,6 +155,7 @@ def find_boards(
     progress: Callable[[int, int], None] = lambda done, total: None,
     image_size_px: tuple[int, int] | None = None,
     dictionary: str | None = None,
+    frames: Sequence[Picture] = (),
 ) -> BoardSearch:
     """Decode pictures and find the board in each, several at a time.
 
@@ -165,6 +168,7 @@ def find_boards(
     square_m : length of a square.
     progress : called with pictures done and pictures in all.
     image_size_px : the size that the pictures have to have, if that is known.
+    frames : further pictures, decoded already.
     dictionary : of the markers of a ChArUco board; without it a plain board is looked for first.
 
     Raises
@@ -172,7 +176,7 @@ def find_boards(
     BadInputError : no picture that can be read, none of the size, or no board in any; when another board
         is there the message says which.
     """
-    read = dict(zip(paths, _read(paths), strict=True))
+    read = dict(zip(paths, _read(paths), strict=True)) | {Path(one.name): one for one in frames}
     pictures = {path: one for path, one in read.items() if isinstance(one, Picture)}
     if not pictures:
         raise next(one for one in read.values() if isinstance(one, BadInputError))
@@ -736,6 +740,7 @@ class Told:
     square_m: float | None = None
     image_size_px: tuple[int, int] | None = None
     dictionary: str | None = None
+    topic: str | None = None
 
 
 @dataclass(frozen=True)
@@ -761,7 +766,7 @@ class ViewSet:
 def read_views(
     sources: Sequence[Path], told: Told, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> ViewSet:
-    """Views from folders of pictures and single pictures, or from one table.
+    """Views from folders of pictures, single pictures and recordings, or from one table.
 
     Raises `BadInputError` for what cannot be read, and `UsageError` for options that do not go with
     these sources.
@@ -840,14 +845,25 @@ def _near_origin(views: Sequence[View]) -> tuple[View, ...]:
 
 
 def _from_pictures(sources: Sequence[Path], told: Told, progress: Callable[[int, int], None]) -> ViewSet:
-    paths = list_pictures(sources)
+    remarks: list[str] = []
+    sources = [meant_folder(source, "images", remarks) for source in sources]
+    recordings = [read_frames(source, told.topic) for source in sources if is_recording(source)]
+    if told.topic is not None and not recordings:
+        raise UsageError("--topic: goes with a bag")
+    folders = [source for source in sources if not is_recording(source)]
+    for folder in folders:
+        inside = sorted(folder.iterdir()) if folder.is_dir() and not holds_pictures(folder) else []
+        if any(is_recording(path) for path in inside):
+            name = next(shown(path.name) for path in inside if is_recording(path))
+            raise BadInputError(f"{shown(folder)}: holds no pictures, but {name}; give that recording itself")
+    paths = list_pictures(folders) if folders else []
+    frames = [picture for one in recordings for picture in one.pictures]
     file, hashes = board_of(sources)
     corners = told.corners or (None if file.corners is None else (file.corners[0], file.corners[1]))
     square_m = file.square_m if told.square_m is None else told.square_m
     dictionary = (
         None if told.dictionary is None else known_dictionary(told.dictionary, "--dictionary", UsageError)
     )
-    remarks = []
     if square_m is None:
         remarks.append(_NO_SQUARE)
     for option, here, there in (
@@ -864,24 +880,60 @@ def _from_pictures(sources: Sequence[Path], told: Told, progress: Callable[[int,
         progress,
         told.image_size_px,
         dictionary or file.dictionary,
+        frames,
     )
     if found.layout is not None:
         remarks.append(_of_markers(found.layout))
     elif corners is None:
         remarks.append(f"found a board with {found.board.columns}x{found.board.rows} inner corners")
-    remarks.append(f"board found in {len(found.views)} of {len(paths)} pictures")
-    left_out = (*found.left_out, *_no_pictures(sources))
-    return ViewSet(found.views, found.image_size_px, {**found.hashes, **hashes}, left_out, tuple(remarks))
+    remarks.append(f"board found in {len(found.views)} of {len(paths) + len(frames)} pictures")
+    views, hashes = found.views, {**found.hashes, **hashes}
+    left_out = [*found.left_out, *_no_pictures(folders)]
+    for one in recordings:
+        views, remark = _of_recording(one, views, found.image_size_px)
+        remarks.append(remark)
+        names = {picture.name for picture in one.pictures}
+        hashes = {name: value for name, value in hashes.items() if name not in names} | {
+            one.source: one.sha256
+        }
+        # Of a recording most frames are left out; the remark counts them.
+        left_out = [file for file in left_out if file.name not in names]
+    return ViewSet(views, found.image_size_px, hashes, tuple(left_out), tuple(remarks))
+
+
+def _of_recording(
+    frames: Frames, views: tuple[View, ...], image_size_px: tuple[int, int]
+) -> tuple[tuple[View, ...], str]:
+    """The views without those frames of a recording that add little, and what was chosen."""
+    names = {picture.name for picture in frames.pictures}
+    own = [view for view in views if view.name in names]
+    kept = {own[k].name for k in most_informative(own, image_size_px)}
+    remark = (
+        f"{frames.source}: {frames.count} frames, looked at the sharpest of each of {len(names)} stretches, "
+        f"board in {len(own)}, used {len(kept)} that say most of the camera"
+    )
+    return tuple(view for view in views if view.name not in names or view.name in kept), remark
+
+
+def meant_folder(source: Path, inside: str, remarks: list[str]) -> Path:
+    """The folder of pictures that is meant where the folder of a rig is given; says so in `remarks`."""
+    place = source / inside
+    if not source.is_dir() or is_recording(source) or not place.is_dir() or holds_pictures(source):
+        return source
+    remarks.append(f"{shown(source)}: holds no pictures itself; taking those in {shown(place)}")
+    return place
 
 
 def _no_pictures(sources: Sequence[Path]) -> list[LeftOut]:
     """Files of folders that are not read at all."""
     inside = [path for source in sources if source.is_dir() for path in sorted(source.iterdir())]
+    kinds = ", ".join(kind[1:] for kind in PICTURES)
+    recording = "is a recording; give it by itself, not its folder"
     return [
-        LeftOut(shown(path.name), f"is no picture ({', '.join(kind[1:] for kind in SUFFIXES)})", "file")
+        LeftOut(shown(path.name), recording if is_recording(path) else f"is no picture ({kinds})", "file")
         for path in inside
         if path.is_file()
-        and path.suffix.lower() not in SUFFIXES
+        and path.suffix.lower() not in PICTURES
         and not path.name.startswith(".")
         and path.name != BOARD_FILE
     ]

@@ -48,6 +48,7 @@ class IntrinsicsOptions:
         "Markers of a ChArUco board, as 4X4_50. [default: board.yaml, else found]",
         metavar="NAME",
     )
+    topic: str | None = option(None, "Image topic of a bag. [default: the only one]", metavar="NAME")
     image_size_px: tuple[int, int] | None = option(
         None,
         "Size of the pictures in px, for tables, as 640x480.",
@@ -97,7 +98,7 @@ def _read_intrinsics(files: Files, rig: Rig, options: IntrinsicsOptions) -> Intr
     with files.progress("finding boards") as progress:
         views = read_views(
             list(files.paths),
-            Told(options.corners, options.square_m, options.image_size_px, options.dictionary),
+            Told(options.corners, options.square_m, options.image_size_px, options.dictionary, options.topic),
             progress,
         )
     for remark in views.remarks:
@@ -267,8 +268,9 @@ intrinsics = Stage(
     _read_intrinsics,
     _solve_intrinsics,
     IntrinsicsOptions,
-    sources="A folder of pictures (its sub-folders are not read) or single pictures; or a table of "
-    "correspondences view,x_m,y_m,u_px,v_px (.csv); or corners of mrgingham or mrcal (.vnl).",
+    sources="A folder of pictures (its sub-folders are not read), single pictures, a video, or a bag with an "
+    "image topic; or a table of correspondences view,x_m,y_m,u_px,v_px (.csv); or corners of mrgingham or "
+    "mrcal (.vnl).",
     writes=("camera",),
     document=_camera_document,
     words=_camera_words,
@@ -309,11 +311,14 @@ def _read_plane(files: Files, rig: Rig, options: NoOptions) -> PlaneInputs:
     from calib.io.pictures import list_pictures
     from calib.stages.camera.model import View
     from calib.stages.camera.plane import settle_orientation, world_points_m
-    from calib.stages.camera.read import BOARD_FILE, board_of, find_boards
+    from calib.stages.camera.read import BOARD_FILE, board_of, find_boards, meant_folder
 
     del options
     assert rig.camera is not None
-    source = files.paths[0] if files.paths else Path("images/plane")
+    remarks: list[str] = []
+    source = meant_folder(files.paths[0] if files.paths else Path("images/plane"), "images/plane", remarks)
+    for remark in remarks:
+        files.narrate(remark)
     pictures = list_pictures([source])
     stated, board_hash = board_of([source])
     board_file = shown((source if source.is_dir() else source.parent) / BOARD_FILE)

@@ -1,0 +1,226 @@
+"""Frames of videos and of the image topics of bags: the sharpest of each stretch, in bounded memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from calib.core.arrays import GrayImage
+from calib.core.errors import BadInputError, UsageError
+from calib.core.files import check_readable, hash_of, one_line, shown
+from calib.io.pictures import Picture, decoded_picture, eight_bits
+
+# ----------------------------------------------------------------------
+# One pass over the frames. A stretch is a run of frames, of which the sharpest is kept; when there are too
+# many stretches, neighbours are joined and stretches are twice as long from then on. So the number of
+# frames need not be known, and the same file gives the same frames.
+
+VIDEOS = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv", ".mjpeg")
+_STRETCHES = 40
+"""Between so many and twice as many frames are looked at."""
+_FEWEST_STRETCHES = 8
+_KEPT_PIXELS = 150_000_000
+_SHARPNESS_PIXELS = 500_000
+_MOST_PIXELS = 200_000_000
+
+
+@dataclass(frozen=True)
+class Frames:
+    """The sharpest frame of each stretch of a recording.
+
+    Attributes
+    ----------
+    source : name of the file. sha256 : of the file. count : frames in all.
+    pictures : named by source and number of the frame.
+    """
+
+    source: str
+    sha256: str
+    count: int
+    pictures: tuple[Picture, ...]
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a path is a video or a bag."""
+    from calib.io.bags import is_bag
+
+    return not (path.is_dir() and not is_bag(path)) and (path.suffix.lower() in VIDEOS or is_bag(path))
+
+
+def read_frames(path: Path, topic: str | None = None) -> Frames:
+    """Frames of a video, or of the image topic of a bag (the only one, or `topic`).
+
+    Raises
+    ------
+    BadInputError : no video or bag that can be read, no picture in it, or several image topics.
+    UsageError : a topic for a video.
+    """
+    if path.suffix.lower() in VIDEOS:
+        if topic is not None:
+            raise UsageError(f"--topic: {shown(path)} is a video, and a topic goes with a bag")
+        stream = _of_video(path)
+    else:
+        stream = _of_bag(path, topic)
+    name = shown(path.name)
+    kept, count = _sharpest(stream)
+    if not count:
+        raise BadInputError(f"{shown(path)}: holds no picture that can be decoded")
+    digest = hash_of(path)
+    pictures = tuple(
+        Picture(f"{name} frame {number:05d}", digest, gray, (gray.shape[1], gray.shape[0]))
+        for number, gray in kept
+    )
+    return Frames(name, digest, count, pictures)
+
+
+@dataclass(frozen=True)
+class _Best:
+    number: int
+    sharpness: float
+    gray: GrayImage
+
+
+def _sharpest(stream: Iterable[GrayImage]) -> tuple[list[tuple[int, GrayImage]], int]:
+    """Number and picture of the sharpest frame of each stretch, and how many frames there were."""
+    stretches: list[_Best] = []
+    length, count = 1, 0
+    for number, gray in enumerate(stream):
+        count += 1
+        most = 2 * max(_FEWEST_STRETCHES, min(_STRETCHES, _KEPT_PIXELS // (2 * gray.size)))
+        one = _Best(number, _sharpness(gray), gray)
+        if number // length < len(stretches):
+            stretches[-1] = _sharper(stretches[-1], one)
+        else:
+            # A decoder may hand out the same memory again.
+            stretches.append(replace(one, gray=gray.copy()))
+        if len(stretches) > most:
+            pairs = [stretches[k : k + 2] for k in range(0, len(stretches), 2)]
+            stretches = [_sharper(pair[0], pair[-1]) for pair in pairs]
+            length *= 2
+    return [(one.number, one.gray) for one in stretches], count
+
+
+def _sharper(before: _Best, after: _Best) -> _Best:
+    if after.sharpness <= before.sharpness:
+        return before
+    return replace(after, gray=after.gray.copy())
+
+
+def _sharpness(gray: GrayImage) -> float:
+    """Mean square of the second differences; pixels are left out, not averaged, which would hide a blur."""
+    n = 1 + gray.size // _SHARPNESS_PIXELS
+    rows, columns = gray[::n].astype(np.int16), gray[:, ::n].astype(np.int16)
+    along, down = np.diff(rows, 2, axis=1), np.diff(columns, 2, axis=0)
+    return sum(float(np.mean(np.square(d, dtype=np.float32))) if d.size else 0.0 for d in (along, down))
+
+
+def _of_video(path: Path) -> Iterator[GrayImage]:
+    check_readable(path)
+    video = cv2.VideoCapture(str(path), cv2.CAP_ANY)
+    try:
+        # As with pictures, the sensor's own pixels count, however the camera was held.
+        video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+        if not video.isOpened():
+            raise BadInputError(f"{shown(path)}: is not a video that can be read")
+        while True:
+            there, frame = video.read()
+            if not there:
+                return
+            if frame.shape[0] * frame.shape[1] > _MOST_PIXELS:
+                raise BadInputError(
+                    f"{shown(path)}: its frames have more than {_MOST_PIXELS // 1_000_000} million pixels"
+                )
+            yield _gray(frame)
+    finally:
+        video.release()
+
+
+def _gray(frame: np.ndarray[Any, Any]) -> GrayImage:
+    gray = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+    return np.asarray(gray, dtype=np.uint8)
+
+
+# ----------------------------------------------------------------------
+# Messages of sensor_msgs/Image (encodings of sensor_msgs/image_encodings) and CompressedImage.
+
+_IMAGE, _COMPRESSED = "sensor_msgs/Image", "sensor_msgs/CompressedImage"
+_COLOURS = {
+    "rgb8": (3, cv2.COLOR_RGB2GRAY),
+    "bgr8": (3, cv2.COLOR_BGR2GRAY),
+    "8UC3": (3, cv2.COLOR_BGR2GRAY),
+    "rgba8": (4, cv2.COLOR_RGBA2GRAY),
+    "bgra8": (4, cv2.COLOR_BGRA2GRAY),
+    # ROS names the pattern by the first two pixels of the first row, OpenCV by those of the second.
+    "bayer_rggb8": (1, cv2.COLOR_BayerBG2GRAY),
+    "bayer_bggr8": (1, cv2.COLOR_BayerRG2GRAY),
+    "bayer_gbrg8": (1, cv2.COLOR_BayerGR2GRAY),
+    "bayer_grbg8": (1, cv2.COLOR_BayerGB2GRAY),
+    "yuv422": (2, cv2.COLOR_YUV2GRAY_UYVY),
+    "uyvy": (2, cv2.COLOR_YUV2GRAY_UYVY),
+    "yuv422_yuy2": (2, cv2.COLOR_YUV2GRAY_YUY2),
+    "yuyv": (2, cv2.COLOR_YUV2GRAY_YUY2),
+}
+_GREY = {"mono8": "u1", "8UC1": "u1", "mono16": "u2", "16UC1": "u2"}
+
+
+def _of_bag(path: Path, topic: str | None) -> Iterator[GrayImage]:
+    from calib.io.bags import opened_bag
+
+    with opened_bag(path) as stream:
+        kinds = {one.name: one.kind for one in stream.topics if one.kind in (_IMAGE, _COMPRESSED)}
+        listed = ", ".join(one_line(name)[:80] for name in kinds) or "none"
+        if topic is not None and topic not in kinds:
+            raise BadInputError(f"{shown(path)}: has no image topic {one_line(topic)[:80]}; found {listed}")
+        if not kinds:
+            raise BadInputError(
+                f"{shown(path)}: holds no pictures, expected a topic of {_IMAGE} or {_COMPRESSED}"
+            )
+        if topic is None and len(kinds) > 1:
+            raise BadInputError(f"{shown(path)}: has several image topics, choose with --topic: {listed}")
+        chosen = topic or next(iter(kinds))
+        where = f"{shown(path)}: {one_line(chosen)[:80]}"
+        damage: BadInputError | None = None
+        count = 0
+        for _, _, message in stream.messages([chosen]):
+            try:
+                if kinds[chosen] == _COMPRESSED:
+                    gray = decoded_picture(bytes(message.data), where, where, "").gray
+                else:
+                    gray = _of_message(message, where)
+            except BadInputError as error:
+                # One damaged frame among many is no loss; if there is no other, it is the reason.
+                damage = damage or error
+                continue
+            count += 1
+            yield gray
+        if damage is not None and not count:
+            raise damage
+
+
+def _of_message(message: Any, where: str) -> GrayImage:
+    """Grey values of a sensor_msgs/Image."""
+    encoding = str(message.encoding)
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    channels, code = _COLOURS.get(encoding, (1, None))
+    kind = np.dtype(_GREY.get(encoding, "u1")).newbyteorder(">" if message.is_bigendian else "<")
+    if code is None and encoding not in _GREY:
+        known = ", ".join([*_GREY, *_COLOURS])
+        raise BadInputError(
+            f"{where}: has pictures in {one_line(encoding)[:40]!r}, expected {known} or compressed ones"
+        )
+    data = np.frombuffer(bytes(message.data), dtype=np.uint8)
+    row = width * channels * kind.itemsize
+    if min(height, width) < 1 or step < row or len(data) < height * step:
+        raise BadInputError(
+            f"{where}: a picture of {width}x{height} px in {encoding} has {len(data)} bytes in rows of {step}"
+        )
+    rows = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :row])
+    if code is None:
+        return eight_bits(rows.view(kind).reshape(height, width))
+    pixels = rows.reshape(height, width, channels) if channels > 1 else rows.reshape(height, width)
+    return np.asarray(cv2.cvtColor(pixels, code), dtype=np.uint8)
