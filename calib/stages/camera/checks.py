@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from calib.stages.camera.bundle import (
     Calibration,
     calibrate,
     homographies,
+    joint_jacobian,
     minimise,
     poses_from_homographies,
     poses_with_camera,
@@ -970,6 +972,10 @@ _WORTH = 3.0
 """Fall of the cost, in variances, that a coefficient has to bring."""
 _LEAST = 3
 """Views that a group needs."""
+_LEAST_IN_ALL = 8
+"""Of fewer any three may differ from the rest by what is odd about each."""
+_ODD_VIEWS = 6
+"""Views without each of which the finding has to stand."""
 _PRIOR = {"fx_px": 0.3, "fy_px": 0.3, "cx_px": 0.15, "cy_px": 0.15, "skew_px": 0.05}
 """How far two cameras may differ, over the focal length; coefficients of distortion by one."""
 
@@ -984,6 +990,8 @@ class Split:
     statistic : T2, see the module.
     chance : what T2 reaches with one camera: mean and 3.5 standard deviations of replicates.
     rms_px, split_rms_px : before and after.
+    apart_px : root mean square distance, over the directions that were seen, of where the two cameras show
+        them, one turned to meet the other.
     difference : intrinsics of the second group less those of the first, by name.
     sigma : its standard deviation with the overdispersion within the groups, by name.
     """
@@ -993,6 +1001,7 @@ class Split:
     chance: float
     rms_px: float
     split_rms_px: float
+    apart_px: float
     difference: dict[str, float]
     sigma: dict[str, float]
 
@@ -1059,8 +1068,11 @@ def _groups(problem: _Problem, second: BoolArray) -> tuple[FloatArray, FloatArra
     return S, b, np.asarray(d, dtype=np.float64)
 
 
-def _reassigned(problem: _Problem, second: BoolArray) -> BoolArray:
-    """Divisions (T, N) after moving every view to the camera that suits it until nothing moves."""
+def _reassigned(problem: _Problem, second: BoolArray, least: int = _LEAST) -> BoolArray:
+    """Divisions (T, N) after moving every view to the camera that suits it until nothing moves.
+
+    Each camera keeps `least` views.
+    """
     N = len(problem.b)
     for _ in range(_ROUNDS):
         _, _, d = _groups(problem, second)
@@ -1069,7 +1081,7 @@ def _reassigned(problem: _Problem, second: BoolArray) -> BoolArray:
         pushed = np.tensordot(both, problem.S, axes=(1, 1))
         better = 2 * apart @ problem.b.T + np.einsum("tng,tg->tn", pushed, apart)
         rank = np.argsort(np.argsort(better, axis=1), axis=1)
-        new = ((better < 0) | (rank < _LEAST)) & (rank < N - _LEAST)
+        new = ((better < 0) | (rank < least)) & (rank < N - least)
         if np.array_equal(new, second):
             break
         second = new
@@ -1135,10 +1147,25 @@ def _reach(statistics: list[float]) -> float:
     return float(np.mean(statistics) + _QUANTILE * np.std(statistics, ddof=1))
 
 
+def _sturdy(problem: _Problem, search: Callable[[_Problem], float]) -> float:
+    """Least of what a search finds without one of the oddest views, or without the two oddest of ten or more.
+
+    A bad picture or two, each with a camera of its own, must not make innocent views a second camera.
+    """
+    odd = np.argsort(-_statistic(problem, np.eye(len(problem.b), dtype=np.bool_))[1])[:_ODD_VIEWS]
+    least = min(search(_without(problem, odd[k : k + 1])) for k in range(len(odd)))
+    return least if len(problem.b) < 10 else min(least, search(_without(problem, odd[:2])))
+
+
 def _described(
-    problem: _Problem, scale: FloatArray, calibration: Calibration, second: BoolArray, chance: float
+    problem: _Problem,
+    scale: FloatArray,
+    calibration: Calibration,
+    second: BoolArray,
+    statistic: float,
+    chance: float,
 ) -> Split:
-    statistic, fall, phi2 = (float(value[0]) for value in _statistic(problem, second[None]))
+    _, fall, phi2 = (float(value[0]) for value in _statistic(problem, second[None]))
     S, _, d = _groups(problem, second[None])
     points = calibration.observations.points
     variance = calibration.sigma_px**2
@@ -1154,48 +1181,80 @@ def _described(
         chance,
         calibration.rms_px,
         float(np.sqrt(max(problem.cost - fall, 0.0) * variance / points)),
+        _apart_px(calibration, difference),
         dict(zip(names, difference.tolist(), strict=True)),
         dict(zip(names, sigma.tolist(), strict=True)),
     )
 
 
+def _apart_px(calibration: Calibration, difference: FloatArray) -> float:
+    """Root mean square change of the pixels seen by a change of the free intrinsics, and the best turn."""
+    block, observations = calibration.block, calibration.observations
+    points = observations.target_m @ block.R_CT.transpose(0, 2, 1) + block.t_CT_m[:, None]
+    used = points[observations.present]
+    J = joint_jacobian(calibration, used[:: max(1, len(used) // 500)])
+    P = len(difference)
+    moved, turned = (J[..., :P] @ difference).ravel(), J[..., P : P + 3].reshape(-1, 3)
+    left = moved - turned @ np.linalg.lstsq(turned, moved, rcond=None)[0]
+    return float(np.sqrt(2 * np.mean(left**2)))
+
+
+def _without(problem: _Problem, odd: IntArray) -> _Problem:
+    """The same without some views, centred on the others' solution."""
+    N = len(problem.b)
+    kept = ~np.isin(np.arange(N), odd)
+    S, b = problem.S[kept], problem.b[kept]
+    whole = b.sum(axis=0)
+    inverse = scaled_inverse(S.sum(axis=0))
+    cost = problem.cost * kept.sum() / N
+    return _Problem(S, b - S @ (inverse @ whole), cost, problem.freedom)
+
+
 def best_split(calibration: Calibration, seed: int = 0) -> Split | None:
-    """The two groups of views that differ most, or None below six views.
+    """The two groups of views that differ most, or None below eight views.
 
     Parameters
     ----------
     calibration : best `widened` and `straightened`, without robust loss.
     seed : of the random starts and the replicates.
     """
-    if calibration.observations.views < 2 * _LEAST:
+    if calibration.observations.views < _LEAST_IN_ALL:
         return None
     rng = np.random.default_rng(seed)
     problem, scale = _problem(evidence(calibration), calibration)
     second = _reassigned(problem, _beginnings(problem, rng))
     statistics = _statistic(problem, second)[0]
     best = second[int(np.argmax(statistics))]
-    reached = []
-    for made in _replicates(problem, rng):
-        ends = _reassigned(made, _beginnings(made, rng)[:6])
-        reached.append(float(_statistic(made, ends)[0].max()))
-    chance = _reach(reached)
+
+    def search(made: _Problem, least: int = _LEAST) -> float:
+        ends = _reassigned(made, _beginnings(made, rng)[:6], least)
+        return float(_statistic(made, ends)[0].max())
+
+    chance = _reach([search(made) for made in _replicates(problem, rng)])
+    statistic = min(float(statistics.max()), _sturdy(problem, lambda one: search(one, 2)))
     if best.sum() > len(best) / 2:
         best = ~best
-    return _described(problem, scale, calibration, best, chance)
+    return _described(problem, scale, calibration, best, statistic, chance)
 
 
 def best_change(calibration: Calibration, seed: int = 1) -> Split | None:
-    """The view from which on the camera differs most from before, or None below six views."""
+    """The view from which on the camera differs most from before, or None below eight views."""
     N = calibration.observations.views
-    if N < 2 * _LEAST:
+    if N < _LEAST_IN_ALL:
         return None
     rng = np.random.default_rng(seed)
     problem, scale = _problem(evidence(calibration), calibration)
-    cuts = np.unique(np.linspace(_LEAST, N - _LEAST, 60).astype(np.int64))
-    second = np.arange(N) >= cuts[:, None]
+
+    def cuts(views: int, least: int) -> BoolArray:
+        at = np.unique(np.linspace(least, views - least, 60).astype(np.int64))
+        return np.asarray(np.arange(views) >= at[:, None])
+
+    second = cuts(N, _LEAST)
     statistics = _statistic(problem, second)[0]
     chance = _reach([float(_statistic(made, second)[0].max()) for made in _replicates(problem, rng)])
-    return _described(problem, scale, calibration, second[int(np.argmax(statistics))], chance)
+    sturdy = _sturdy(problem, lambda one: float(_statistic(one, cuts(len(one.b), 2))[0].max()))
+    statistic = min(float(statistics.max()), sturdy)
+    return _described(problem, scale, calibration, second[int(np.argmax(statistics))], statistic, chance)
 
 
 # ----------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""From views of a target to a judged camera: model choice, rejection, fit, covariance, verdict."""
+"""From views of a target to a judged camera: model choice, triage, fit, covariance, verdict."""
 
 from __future__ import annotations
 
@@ -8,13 +8,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.core.arrays import BoolArray, FloatArray, IntArray
+from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
+from calib.core.verdict import Finding
 from calib.core.workers import Workers
 from calib.stages.camera.bundle import Calibration, Covariance, calibrate, covariance, refit_poses
 from calib.stages.camera.checks import best_of_starts, lens_shape, screen
-from calib.stages.camera.model import MODELS, Block, Observations, View, free_intrinsics, pack
-from calib.stages.camera.verdict import Judgement, judge, of_screening
+from calib.stages.camera.model import MODELS, Block, LeftOut, Observations, View, free_intrinsics, pack
+from calib.stages.camera.triage import Triage, triage
+from calib.stages.camera.verdict import Judgement, judge, of_leaving, of_screening, two_cameras
 
 # ----------------------------------------------------------------------
 # Choosing a lens model and a board model by views that were held back.
@@ -249,13 +251,15 @@ def simplest_good(candidates: Sequence[Candidate]) -> int:
 
 
 # ----------------------------------------------------------------------
-# From views of a target to a judged camera: model choice, rejection, fit, covariance, verdict.
+# From views of a target to a judged camera: model choice, triage, fit, covariance, verdict.
 
-_REJECT_SIGMAS = 5.0
-_REJECT_SHARE = 0.3
-"""A view that loses more of its points than this is left out whole."""
 _HOPELESS = 0.02
 """RMS over the picture's larger side from which on the points belong to no camera at all."""
+_TRIAGES = 3
+"""Times that a model is chosen; bad views can make the first choice wrong."""
+_FAR_BETTER = 0.5
+"""Squared error of a typical view over that by the chosen model."""
+_NO_PLANE = "shows points that no camera sees on a flat board: in another order, or of another board"
 _LOWER = 1.0 - 1e-6
 """Cost of another start over that of the fit below which the fit is not the best one."""
 
@@ -270,14 +274,14 @@ class Choices:
     skew : estimate the skew.
     loss : one of `levenberg.LOSSES`.
     board : one of `selection.BOARDS`, or "auto" for the choice by views held back.
-    reject : leave out points that lie far off, and say which.
+    keep_all : use views and points that do not agree with the others as well; they are named all the same.
     """
 
     model: str = "auto"
     skew: bool = False
     loss: str = "none"
     board: str = "rigid"
-    reject: bool = False
+    keep_all: bool = False
 
 
 @dataclass(frozen=True)
@@ -289,7 +293,7 @@ class Intrinsics:
     calibration, covariance, judgement : the fit, its error bars, and the verdict on it.
     models, boards : what was compared on views held back; empty where nothing was.
     board : the board model used.
-    rejected : one sentence for each point or view left out.
+    left_out : files, views and points that are not used, and why.
     seconds : wall time of "solve" (model choice included), "covariance" and "judge".
     """
 
@@ -299,32 +303,45 @@ class Intrinsics:
     models: tuple[Candidate, ...]
     boards: tuple[Candidate, ...]
     board: str
-    rejected: tuple[str, ...]
+    left_out: tuple[LeftOut, ...]
     seconds: dict[str, float]
 
 
-def _refuse_unusable(views: Sequence[View], choices: Choices) -> None:
-    """Raise `BadInputError` where no answer could follow from these views."""
+def _usable(views: Sequence[View], choices: Choices) -> tuple[list[View], list[LeftOut]]:
+    """Views that can be views of a plane, and the others.
+
+    Raises `BadInputError` where no answer could follow from what is left.
+    """
     if not views:
         raise BadInputError("there are no views to calibrate from")
-    if choices.skew and len(views) < 3:
-        raise BadInputError(f"a camera with skew needs at least 3 views, found {len(views)}")
-    for view in views:
-        target_m, pixels = view.counted()
-        if len(pixels) < 4:
-            raise BadInputError(f"view {view.name}: has {len(pixels)} points, expected at least 4")
-        for points, where in ((target_m, "on the target"), (pixels, "in the picture")):
-            spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-            if spread[1] <= 1e-6 * spread[0]:
-                raise BadInputError(f"view {view.name}: all its points lie on one line {where}")
-    total = sum(len(view.counted()[1]) for view in views)
+    left_out = [LeftOut(view.name, why, "view") for view in views if (why := _unusable(view))]
+    names = {one.name for one in left_out}
+    usable = [view for view in views if view.name not in names]
+    if not usable:
+        raise BadInputError(f"view {left_out[0]}")
+    if choices.skew and len(usable) < 3:
+        raise BadInputError(f"a camera with skew needs at least 3 views, found {len(usable)}")
+    total = sum(len(view.counted()[1]) for view in usable)
     if choices.model != "auto":
-        unknown = len(free_intrinsics(choices.model, choices.skew)) + 6 * len(views)
+        unknown = len(free_intrinsics(choices.model, choices.skew)) + 6 * len(usable)
         if 2 * total <= unknown:
             raise BadInputError(
-                f"{len(views)} views with {total} points cannot fix the {unknown} unknowns of the model "
+                f"{len(usable)} views with {total} points cannot fix the {unknown} unknowns of the model "
                 f"{choices.model}"
             )
+    return usable, left_out
+
+
+def _unusable(view: View) -> str:
+    """Why a view tells nothing, "" where it may."""
+    target_m, pixels = view.counted()
+    if len(pixels) < 4:
+        return f"has {len(pixels)} points, expected at least 4"
+    for points, where in ((target_m, "on the target"), (pixels, "in the picture")):
+        spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+        if spread[1] <= 1e-6 * spread[0]:
+            return f"all its points lie on one line {where}"
+    return ""
 
 
 def _chosen_model(
@@ -346,92 +363,110 @@ def _chosen_model(
     return best.name, fit, tuple(candidate for candidate, _ in found)
 
 
-def _outliers(fit: Calibration) -> tuple[BoolArray, list[str]]:
-    """Points to leave out (N, M) and a sentence for each, from a fit with a robust loss."""
-    distance = np.linalg.norm(fit.residuals_px, axis=2)
-    present = fit.observations.present
-    # The median of a Rayleigh distribution is 1.1774 sigma.
-    sigma = float(np.median(distance[present])) / 1.1774
-    far = present & (np.nan_to_num(distance) > _REJECT_SIGMAS * sigma)
-    share = far.sum(axis=1) / present.sum(axis=1)
-    sentences: list[str] = []
-    for i, name in enumerate(fit.observations.names):
-        if share[i] > _REJECT_SHARE:
-            far[i] = present[i]
-            sentences.append(
-                f"{name}: left out whole; {share[i]:.0%} of its points lie more than "
-                f"{_REJECT_SIGMAS:g} sigma off"
-            )
-            continue
-        for j in np.flatnonzero(far[i]):
-            u, v = fit.observations.pixels[i, j]
-            sentences.append(
-                f"{name}: point {j} at ({u:.1f}, {v:.1f}) left out; it lies {distance[i, j]:.2f} px off, "
-                f"{distance[i, j] / sigma:.0f} sigma"
-            )
-    return far, sentences
-
-
-def _without(observations: Observations, rejected: BoolArray) -> Observations:
-    left = observations.without(rejected)
-    return left.select(np.flatnonzero(left.present.sum(axis=1) >= 4))
-
-
 # Views that belong to no camera overflow; what is not finite is looked for at each stage.
 @np.errstate(all="ignore")
 def calibrate_camera(
-    views: Sequence[View], image_size_px: tuple[int, int], choices: Choices = Choices()
+    views: Sequence[View],
+    image_size_px: tuple[int, int],
+    choices: Choices = Choices(),
+    left_out: Sequence[LeftOut] = (),
 ) -> Intrinsics:
     """Calibrate a camera and judge the result.
 
-    One view leaves the principal point at the picture's centre. Raises `BadInputError` where no
-    answer could follow; an answer that the data do not support comes with its verdict instead.
+    Views and points that do not agree with the others are left out. One view leaves the principal point at
+    the picture's centre. Raises `BadInputError` where no answer could follow; an answer that the data do
+    not support comes with its verdict instead.
+
+    Parameters
+    ----------
+    left_out : files that were left out before; the verdict considers how many.
     """
-    _refuse_unusable(views, choices)
     began = time.perf_counter()
-    observations = pack(views)
-    fixed = ("cx_px", "cy_px") if observations.views == 1 else ()
-    rejected: list[str] = []
-    if choices.reject:
-        model = "radial2" if choices.model == "auto" else choices.model
-        robust = calibrate(observations, image_size_px, model, skew=choices.skew, fixed=fixed, loss="cauchy")
-        far, rejected = _outliers(robust)
-        observations = _without(observations, far)
-        if observations.views < 1:
-            raise BadInputError("no view is left after leaving out points that lie far off")
-    model, start, models = _chosen_model(observations, image_size_px, choices, fixed)
-    fit = calibrate(
-        observations,
-        image_size_px,
-        model,
-        skew=choices.skew,
-        fixed=fixed,
-        loss=choices.loss,
-        start=None if start is None else start.block,
-    )
+    usable, unusable = _usable(views, choices)
+    everything = pack(usable)
+    screening = screen(everything)
+    if not screening.unusable.all():
+        unusable += [
+            LeftOut(everything.names[i], _NO_PLANE, "view") for i in np.flatnonzero(screening.unusable)
+        ]
+        everything = everything.select(np.flatnonzero(~screening.unusable))
+    fixed = ("cx_px", "cy_px") if everything.views == 1 else ()
+    sorted_out, models = _sorted_out(everything, image_size_px, choices, fixed)
+    leaving = [*left_out, *unusable, *sorted_out.left_out]
+    not_used = [*left_out, *unusable] if choices.keep_all else leaving
+    fit = sorted_out.calibration
+    findings = of_leaving(leaving, fit.observations.views, choices.keep_all)
+    if any(one.severity == "inconsistent" for one in findings):
+        findings += two_cameras(sorted_out.everything)
+    if choices.keep_all:
+        fit = sorted_out.everything
+    if choices.loss != "none":
+        fit = calibrate(
+            fit.observations,
+            image_size_px,
+            fit.camera.model,
+            skew=choices.skew,
+            fixed=fixed,
+            loss=choices.loss,
+            start=fit.block,
+        )
     board = choices.board
     boards: tuple[Candidate, ...] = ()
     if board != "rigid":
         fit, board, boards = _with_board(fit, choices)
     if fit.termination == "behind the camera":
-        raise _no_camera(observations, "a solution has points behind the camera")
+        raise _no_camera(fit.observations, "a solution has points behind the camera")
     solved = time.perf_counter()
     sigma = covariance(fit)
     covered = time.perf_counter()
-    judgement = _judged(fit, sigma)
+    judgement = _judged(fit, sigma, findings)
     if judgement.numbers.get("lowest_start_cost_share", 1.0) < _LOWER:
         better = best_of_starts(fit)
         if better is not fit:
             fit, sigma = better, covariance(better)
-            judgement = _judged(fit, sigma)
+            judgement = _judged(fit, sigma, findings)
     judged = time.perf_counter()
     seconds = {"solve": solved - began, "covariance": covered - solved, "judge": judged - covered}
-    return Intrinsics(fit, sigma, judgement, models, boards, board, tuple(rejected), seconds)
+    return Intrinsics(fit, sigma, judgement, models, boards, board, tuple(not_used), seconds)
 
 
-def _judged(fit: Calibration, sigma: Covariance) -> Judgement:
+def _sorted_out(
+    everything: Observations, image_size_px: tuple[int, int], choices: Choices, fixed: tuple[str, ...]
+) -> tuple[Triage, tuple[Candidate, ...]]:
+    """The views that agree, by the model that views held back choose among them."""
+
+    def by(model: str, start: Block | None = None) -> Triage:
+        fit = calibrate(everything, image_size_px, model, skew=choices.skew, fixed=fixed, start=start)
+        return Triage.of_all(fit) if fit.termination == "behind the camera" else triage(fit)
+
+    observations, before = everything, ""
+    for _ in range(_TRIAGES):
+        model, start, models = _chosen_model(observations, image_size_px, choices, fixed)
+        if model == before:
+            break
+        # The start has the poses of the views that the model was chosen by, which may be fewer.
+        found = by(model, start.block if start is not None and observations is everything else None)
+        better = _better_for_most(model, models)
+        # A model that is too simple blames views that the lens tells most of.
+        if found.left_out and better and len((other := by(better)).left_out) < len(found.left_out):
+            found, model = other, better
+        if not found.left_out or choices.model != "auto":
+            break
+        observations, before = found.calibration.observations, model
+    return found, models
+
+
+def _better_for_most(model: str, models: Sequence[Candidate]) -> str:
+    """The model that is far better than the chosen one for a typical view that was held back, or ""."""
+    medians = {one.name: float(np.median(one.per_view_px2)) for one in models}
+    medians = {name: value for name, value in medians.items() if np.isfinite(value)}
+    best = min(medians, key=lambda name: medians[name], default=model)
+    return best if best != model and medians[best] < _FAR_BETTER * medians.get(model, np.inf) else ""
+
+
+def _judged(fit: Calibration, sigma: Covariance, findings: Sequence[Finding]) -> Judgement:
     try:
-        return judge(fit, sigma)
+        return judge(fit, sigma, findings=findings)
     except (np.linalg.LinAlgError, ValueError, IndexError) as error:
         # Points that no camera sees on a flat board leave the checks without a linear system to solve.
         if fit.rms_px < _HOPELESS * max(fit.camera.image_size_px):

@@ -64,7 +64,9 @@ class IntrinsicsOptions:
     board: Literal["rigid", "warp", "released", "auto"] = option(
         "rigid", "The board: flat, bent by two parameters, with free corners, or compared."
     )
-    reject: bool = option(False, "Leave out points that lie far off, and say which.")
+    keep_all: bool = option(
+        False, "Use pictures and points as well that do not agree with the others; by default they leave."
+    )
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,6 @@ class CameraEvidence:
     """What a camera was made from."""
 
     fit: Intrinsics
-    left_out: tuple[LeftOut, ...]
     seconds: Mapping[str, float]
 
 
@@ -104,7 +105,7 @@ def _read_intrinsics(files: Files, rig: Rig, options: IntrinsicsOptions) -> Intr
     for remark in views.remarks:
         files.narrate(remark)
     files.hashes.update(views.hashes)
-    choices = Choices(options.model, options.skew, options.loss, options.board, options.reject)
+    choices = Choices(options.model, options.skew, options.loss, options.board, options.keep_all)
     detect_s = time.perf_counter() - began
     return IntrinsicsInputs(views.views, views.image_size_px, views.left_out, choices, detect_s)
 
@@ -118,7 +119,7 @@ def _solve_intrinsics(inputs: IntrinsicsInputs) -> Camera:
     from calib.stages.camera.intrinsics import calibrate_camera
     from calib.stages.camera.section import Camera
 
-    result = calibrate_camera(inputs.views, inputs.image_size_px, inputs.choices)
+    result = calibrate_camera(inputs.views, inputs.image_size_px, inputs.choices, inputs.left_out)
     fit, known = result.calibration, result.covariance
     sigma_px = projection_sigma_px(fit, known, image_grid(fit.camera.image_size_px))
     bounded = sigma_px[np.isfinite(sigma_px)]
@@ -143,9 +144,9 @@ def _solve_intrinsics(inputs: IntrinsicsInputs) -> Camera:
         board=result.board,
         loss=fit.loss,
         termination=fit.termination,
-        rejected=list(result.rejected),
+        rejected=[str(one) for one in result.left_out if one.kind in ("view", "points")],
         **judged(result.judgement.verdict),
-    ).with_evidence(CameraEvidence(result, inputs.left_out, {"detect": inputs.detect_s, **result.seconds}))
+    ).with_evidence(CameraEvidence(result, {"detect": inputs.detect_s, **result.seconds}))
 
 
 def image_grid(image_size_px: tuple[int, int], columns: int = 17, rows: int = 13) -> FloatArray:
@@ -220,7 +221,7 @@ def _camera_document(camera: Camera) -> dict[str, Any]:
     return {
         "models": compared(evidence.fit.models),
         "boards": compared(evidence.fit.boards),
-        "not_used": _not_used(evidence.left_out),
+        "not_used": _not_used(evidence.fit.left_out),
         "per_view": per_view,
         "seconds": dict(evidence.seconds),
     }
@@ -243,8 +244,7 @@ def _camera_words(camera: Camera) -> list[Block]:
             )
             head = (what, "parameters", "fitted", "held back")
             blocks.append(Table(head, rows, f"{what}s compared, RMS in px"))
-    blocks += [Line(f"not used: {one}") for one in evidence.left_out]
-    blocks += [Line(f"rejected: {sentence}") for sentence in camera.rejected]
+    blocks += [Line(f"not used: {one}") for one in evidence.fit.left_out]
     return blocks
 
 

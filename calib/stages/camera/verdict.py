@@ -38,6 +38,7 @@ from calib.stages.camera.checks import (
     target_shape,
     widened,
 )
+from calib.stages.camera.model import LeftOut
 
 # ----------------------------------------------------------------------
 # What a check has found about a calibration, and the limits that a finding is held against.
@@ -57,6 +58,7 @@ class Limits:
     Attributes
     ----------
     views : unique views below which nothing is left over to check the answer with.
+    leaving_bad : share of the pictures that may be left out.
     focal_remark, focal_poor, focal_free : relative standard deviation of a focal length. Distances
         told by the camera are off by the same share.
     spread_poor_deg, spread_free_deg : largest angle between two boards. Focal length comes from
@@ -81,6 +83,8 @@ class Limits:
     split_sigma, split_least : largest difference of an intrinsic over its standard deviation, and
         the difference of focal length or principal point, as a share of the focal length or
         width, that matters.
+    split_px : distance of where the two cameras show the same direction, root mean square, that
+        matters, at up to 1000 pixels' width.
     aspect_bad, aspect_remark, aspect_sigma : squares that are not square, as a share, and over its
         standard deviation. Printers stretch by up to half a percent.
     pixel_aspect : fx over fy where the board cannot tell whether it is to blame.
@@ -93,6 +97,7 @@ class Limits:
     """
 
     views: int = 4
+    leaving_bad: float = 0.2
     focal_remark: float = 0.015
     focal_poor: float = 0.03
     focal_free: float = 0.10
@@ -120,6 +125,7 @@ class Limits:
     change_ratio: float = 1.3
     split_sigma: float = 4.0
     split_least: float = 0.007
+    split_px: float = 0.3
     aspect_bad: float = 0.007
     aspect_remark: float = 0.003
     aspect_sigma: float = 4.0
@@ -358,6 +364,42 @@ def of_screening(found: Screening, names: tuple[str, ...]) -> list[Finding]:
     return out
 
 
+def of_leaving(
+    left_out: Sequence[LeftOut], used: int, kept: bool, limits: Limits | None = None
+) -> list[Finding]:
+    """Views that were left out; more than a fifth of them says that something is wrong with the whole.
+
+    Parameters
+    ----------
+    used : views that agree. kept : whether the others are used all the same.
+    """
+    limits = Limits() if limits is None else limits
+    views = [one for one in left_out if one.kind == "view"]
+    if kept:
+        advice = "Leave it out: calibrate without --keep-all."
+        return [
+            Finding("inconsistent", f"{one.name}, used all the same: {one.why}.", advice) for one in views
+        ]
+    out = []
+    kinds: tuple[tuple[list[LeftOut], str, Severity], ...] = (
+        (views, "left out for disagreeing with the others", "inconsistent"),
+        ([o for o in left_out if o.kind in ("unreadable", "size")], "damaged or of another size", "poor"),
+    )
+    for some, what, severity in kinds:
+        if not some:
+            continue
+        share = len(some) / (used + len(some))
+        text = (
+            f"{len(some)} of {used + len(some)} pictures {'is' if len(some) == 1 else 'are'} {what}: "
+            f"{listed([one.name for one in some], 20)}"
+        )
+        many = share > limits.leaving_bad
+        if many:
+            text += f"; that is more than {100 * limits.leaving_bad:.0f} % of them"
+        out.append(Finding(severity if many else "remark", f"{text}."))
+    return out
+
+
 def of_copies(first: IntArray, names: tuple[str, ...], ratio: float, limits: Limits) -> list[Finding]:
     """Views that show the board where another view does.
 
@@ -532,32 +574,33 @@ def of_split(found: Split | None, in_order: bool, calibration: Calibration, limi
         for name, value in scale.items()
         if shift.get(name, 0.0) > limits.split_sigma
         and abs(found.difference[name]) > limits.split_least * value
+        and found.apart_px > limits.split_px * max(1.0, width / 1000)
     ]
     strongest = max(telling or shift, key=lambda name: shift[name])
     if shift[strongest] < limits.split_sigma:
         return []
     by = ", ".join(
         f"{name.removesuffix('_px')} by {found.difference[name]:+.1f} px"
-        for name in ("fx_px", "cx_px", "cy_px")
-        if name in shift
+        for name in telling or [one for one in scale if one in shift]
     )
     sure = (
-        f"({by}; {strongest.removesuffix('_px')} by {shift[strongest]:.0f} standard deviations; the RMS "
-        f"falls from {found.rms_px:.3f} to {found.split_rms_px:.3f} px, {found.ratio:.1f} times what chance "
-        "explains)"
+        f"({by}; {strongest.removesuffix('_px')} by {shift[strongest]:.0f} standard deviations; directions "
+        f"by {found.apart_px:.1f} px; the RMS falls from {found.rms_px:.3f} to {found.split_rms_px:.3f} px, "
+        f"{found.ratio:.1f} times what chance explains)"
     )
     second = np.flatnonzero(found.second)
     if not telling:
         text = (
-            f"{listed([names[i] for i in second], 20)} would have a camera of their own {sure}, but no focal "
-            f"length or centre that differs for certain by {100 * limits.split_least:.1f} %, which would "
-            "matter."
+            f"{listed([names[i] for i in second], 20)} would have a camera of their own {sure}, but not one "
+            f"whose focal length or centre differs for certain by {100 * limits.split_least:.1f} %, and "
+            f"directions by {limits.split_px:g} px, which would matter."
         )
         return [Finding("remark", text)]
     if in_order:
+        what = "the lens was refocused or zoomed" if {"fx_px", "fy_px"} & set(telling) else "the lens moved"
         text = (
-            f"From {names[int(second[0])]} on the camera differs from the one before {sure}: the lens was "
-            "refocused or zoomed, or the camera changed."
+            f"From {names[int(second[0])]} on the camera differs from the one before {sure}: {what}, or the "
+            "camera changed."
         )
     else:
         text = (
@@ -650,19 +693,24 @@ class Judgement:
 
 
 def judge(
-    calibration: Calibration, found: Covariance | None = None, limits: Limits | None = None
+    calibration: Calibration,
+    found: Covariance | None = None,
+    limits: Limits | None = None,
+    findings: Sequence[Finding] = (),
 ) -> Judgement:
     """Judge a calibration by its views alone.
 
     Parameters
     ----------
     found : its covariance, for the ratio of standard deviations that copies of views make; optional.
+    findings : what is there to say already, as of views that were left out.
     """
     limits = Limits() if limits is None else limits
     observations = calibration.observations
     numbers: dict[str, float] = {"views": observations.views}
-    findings = of_screening(screen(observations), observations.names)
-    if any(one.severity == "inconsistent" for one in findings):
+    unusable = of_screening(screen(observations), observations.names)
+    findings = [*findings, *unusable]
+    if any(one.severity == "inconsistent" for one in unusable):
         # What else is wrong follows from the views that are none.
         return _concluded(findings, None, numbers)
     if not np.all(np.isfinite(calibration.block.intrinsics)) or not np.all(np.isfinite(calibration.normal)):
@@ -812,6 +860,15 @@ def _contradictions(fit: Calibration, limits: Limits, numbers: dict[str, float])
             focal_share_per_half_percent_bow=shape.focal_per_bow,
         )
         wide = straightened(wide, shape.displacement_m)
+    return findings + _two_cameras(wide, limits, numbers)
+
+
+def two_cameras(calibration: Calibration) -> list[Finding]:
+    """Whether views come from two cameras, or from one that was refocused on the way."""
+    return _two_cameras(widened(_sampled(conditioned(calibration))), Limits(), {})
+
+
+def _two_cameras(wide: Calibration, limits: Limits, numbers: dict[str, float]) -> list[Finding]:
     change, split = best_change(wide), best_split(wide)
     if change is not None:
         numbers["change_ratio"] = change.ratio
@@ -822,9 +879,9 @@ def _contradictions(fit: Calibration, limits: Limits, numbers: dict[str, float])
     # A split in order is found by both; what matters is told, and then what chance explains less.
     if late and mixed and change is not None and split is not None:
         if late[0].severity != mixed[0].severity:
-            return findings + [one for one in late + mixed if one.severity != "remark"]
-        return findings + (mixed if split.ratio > change.ratio else late)
-    return findings + late + mixed
+            return [one for one in late + mixed if one.severity != "remark"]
+        return mixed if split.ratio > change.ratio else late
+    return late + mixed
 
 
 def _sampled(fit: Calibration) -> Calibration:

@@ -1,0 +1,407 @@
+"""Which views and points a camera is calibrated from: those that agree with the others.
+
+Each view is asked what the others say without it. About a fit, view i costs (see `checks.evidence`)
+
+    c_i(d) = c_i + 2 b_i' d + d' S_i d
+
+when the camera moves by d and the view's pose follows. The others alone put the camera at
+
+    d_-i = -(sum_j S_j)^-1 sum_j b_j,   j over the core without i,
+
+one step that a refit without the view confirms. There the view's own wish is the score
+beta_i = b_i + S_i d_-i. With A = sum_j S_j = L L' and L^-1 S_i L^-T = Q diag(lambda) Q', its components
+y = Q' L^-1 beta_i are independent, of variance sigma_i^2 lambda + phi^2 sigma^2 lambda^2: noise of the
+view, and of the others. So
+
+    T_i = sum_k y_k^2 / (lambda_k (r_i^2 + lambda_k) phi^2 sigma^2)
+
+is chi-squared with as many degrees of freedom as the view tells components about. r_i = sigma_i / sigma is
+the view's noise over a typical view's, from what is left when the view has a camera of its own, and phi^2 is
+the median of the core's T_i over its expectation: real views disagree more than white noise of their
+corners would make them, and what is normal among them makes no outlier.
+
+A view leaves where it is odd and where that matters: not one of the two alone. A single view far off moves
+the fit towards itself and makes others look odd. So the first core are the six tenths of the views that
+agree best among themselves (concentration steps, as for least trimmed squares); the camera is then fitted
+to those that do not leave, and all views are asked again until nothing changes. A view may return.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from scipy import stats
+
+from calib.core.arrays import BoolArray, FloatArray, IntArray
+from calib.stages.camera.bundle import Calibration, joint_jacobian, minimise, poses_with_camera
+from calib.stages.camera.checks import evidence, resolved, scaled_inverse
+from calib.stages.camera.model import Block, LeftOut, Observations, project
+from calib.stages.camera.verdict import listed
+
+_LEAST_VIEWS = 5
+"""Views below which none can be told to disagree with the others."""
+_CORE_SHARE = 0.6
+_CONCENTRATION_STEPS = 8
+_ODD_STARTS = 6
+_SCALE = 1.6
+"""Scatter of all views over that of a core of them from which on the core is believed. Views of one camera
+reach it in one set of fifty, half of the sets with a skew that the model lacks."""
+_ROUNDS = 8
+_CHANCE = 1e-3
+"""Probability of T_i by chance below which a view is odd."""
+_ODD_NOISE = 3.0
+"""Noise of a view over a typical view's above which it is odd."""
+_MOVED_SIGMAS = 1.0
+_MOVED_PX = 0.02
+"""A view matters that moves a parameter, and a direction in the picture, by more than this; pixels at up to
+1000 pixels' width."""
+_MISFIT = 5.0
+_MISFIT_PX = 0.5
+"""A view matters as well whose RMS is this many times that of the quieter views, and this many pixels."""
+_POINT = 8.0
+_POINT_PX = 0.5
+"""A point leaves that lies this many medians, and pixels, off."""
+_POINTS_SHARE = 0.3
+"""A view that loses more of its points than this leaves whole."""
+_TOLD = 1e-3
+"""What a view tells of a direction, over what the others do, below which it is silent there."""
+_MEDIAN_CHI2 = 0.87
+"""Median of chi-squared over its degrees of freedom, for four to eight of them."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How each of N views agrees with a core of them.
+
+    Attributes
+    ----------
+    shift : (N, G) by which the free intrinsics move when the view is left out, or joins the core.
+    moved : (N,) largest of these in standard deviations of the core's, overdispersion included.
+    moved_px : (N,) farthest that a direction among those seen moves in the picture.
+    chance : (N,) probability of so much disagreement by chance.
+    noise_px, noise : (N,) standard deviation of a coordinate in the view with a camera of its own, and
+        over a typical view's.
+    rms_px : (N,) of the view seen by the camera of the fit.
+    misfit : (N,) the same over that of the quieter half of the core.
+    sigma : (G,) standard deviation of the free intrinsics from the core.
+    scale_px : standard deviation phi sigma by which the core's views disagree.
+    """
+
+    shift: FloatArray
+    moved: FloatArray
+    moved_px: FloatArray
+    chance: FloatArray
+    noise_px: FloatArray
+    noise: FloatArray
+    rms_px: FloatArray
+    misfit: FloatArray
+    sigma: FloatArray
+    scale_px: float
+
+    def leaving(self, width_px: int) -> BoolArray:
+        """Views that are odd, and matter."""
+        scale = max(1.0, width_px / 1000)
+        odd = (self.chance < _CHANCE) | (self.noise > _ODD_NOISE)
+        moves = (self.moved > _MOVED_SIGMAS) & (self.moved_px > _MOVED_PX * scale)
+        misfits = (self.misfit > _MISFIT) & (self.rms_px > _MISFIT_PX)
+        return np.asarray(odd & moves | misfits)
+
+
+@dataclass(frozen=True)
+class _Disagreement:
+    """T_i over its degrees of freedom and what else follows from it, for N views and a core."""
+
+    S_core: FloatArray
+    d: FloatArray
+    score: FloatArray
+    ratio: FloatArray
+    chance: FloatArray
+    variance: FloatArray
+    typical: float
+    phi2: float
+
+
+def _disagreement(
+    S: FloatArray, b: FloatArray, cost: FloatArray, measured: IntArray, core: BoolArray
+) -> _Disagreement:
+    """T_i of every view against the core without it; S scaled to order one."""
+    G = b.shape[1]
+    inside = core[:, None].astype(np.float64)
+    S_core, b_core = S[core].sum(axis=0), b[core].sum(axis=0)
+    # A direction that the core leaves free is held by next to nothing, so that the view decides it alone.
+    A = S_core - inside[..., None] * S + 1e-9 * np.trace(S_core) / G * np.eye(G)
+    d = -np.linalg.solve(A, (b_core - inside * b)[..., None])[..., 0]
+    score = b + np.einsum("ngh,nh->ng", S, d)
+    values, vectors = np.linalg.eigh(A)
+    root = vectors / np.sqrt(np.maximum(values, 1e-15 * values[:, -1:]))[:, None]
+    told, Q = np.linalg.eigh(root.transpose(0, 2, 1) @ S @ root)
+    y2 = np.einsum("ngk,ng->nk", root @ Q, score) ** 2
+    counts = told > _TOLD
+    told = np.where(counts, told, 1.0)
+    freedom = counts.sum(axis=1)
+    there = cost + 2 * (b * d).sum(axis=1) + np.einsum("ng,ngh,nh->n", d, S, d)
+    own = there - np.where(counts, y2 / told, 0.0).sum(axis=1)
+    variance = np.maximum(own, 0.0) / np.maximum(measured - 6 - freedom, 1)
+    typical = max(float(np.median(variance[core])), 1e-12)
+    white = np.where(counts, y2 / (told * (1 + told)), 0.0).sum(axis=1) / np.maximum(freedom, 1) / typical
+    phi2 = max(float(np.median(white[core])) / _MEDIAN_CHI2, 1.0)
+    r2 = np.clip(variance / typical, 1.0, _ODD_NOISE**2)[:, None]
+    T = np.where(counts, y2 / (told * (r2 + told)), 0.0).sum(axis=1) / (typical * phi2)
+    # The median of few views is uncertain; about a third of their components fix it.
+    second = max(float(freedom[core].sum()) / 3, 2.0)
+    chance = stats.f.sf(T / np.maximum(freedom, 1), np.maximum(freedom, 1), second)
+    chance = np.where(freedom > 0, chance, 1.0)
+    return _Disagreement(S_core, d, score, T / np.maximum(freedom, 1), chance, variance, typical, phi2)
+
+
+def _first_core(S: FloatArray, b: FloatArray, cost: FloatArray, measured: IntArray) -> BoolArray:
+    """The six tenths of the views that fit one camera best, (N,).
+
+    Concentration starts from all views and from those without one or two that would gain most by a camera of
+    their own: a single view that tells much draws the fit so far that the others look odd.
+    """
+    N = len(b)
+    size = min(max(int(np.ceil(_CORE_SHARE * N)), 4), N)
+    every = np.ones(N, dtype=np.bool_)
+    whole = S.sum(axis=0)
+    others = whole - S + 1e-9 * np.trace(whole) / len(whole) * np.eye(len(whole))
+    gain = np.einsum("ng,ng->n", b, np.linalg.solve(others, b[..., None])[..., 0])
+    odd = np.argsort(-gain)[:_ODD_STARTS]
+    starts = [every, *(every & (np.arange(N) != i) for i in odd)]
+    starts += [every & ~np.isin(np.arange(N), pair) for pair in combinations(odd, 2)]
+    best, least = every, np.inf
+    for core in starts:
+        for _ in range(_CONCENTRATION_STEPS):
+            order = np.argsort(_disagreement(S, b, cost, measured, core).ratio, kind="stable")
+            new = np.isin(np.arange(N), order[:size])
+            if np.array_equal(new, core):
+                break
+            core = new
+        d = -scaled_inverse(S[core].sum(axis=0)) @ b[core].sum(axis=0)
+        there = (cost + 2 * b @ d + np.einsum("g,ngh,h->n", d, S, d))[core].sum()
+        if there / measured[core].sum() < least:
+            best, least = core, there / measured[core].sum()
+    return best
+
+
+def agreement(calibration: Calibration, core: BoolArray | None = None) -> Agreement:
+    """How the views agree with the core (N,), by default with the views that agree best among themselves.
+
+    Parameters
+    ----------
+    calibration : camera of the core, with the poses of all views; the target rigid, without robust loss.
+    """
+    found = evidence(calibration)
+    unit = 1.0 / np.sqrt(np.maximum(np.diag(found.S.sum(axis=0)), 1e-300))
+    S, b = found.S * unit[:, None] * unit, found.b * unit
+    if core is None:
+        core = _first_core(S, b, found.cost, found.measured)
+    one = _disagreement(S, b, found.cost, found.measured, core)
+    cov = scaled_inverse(one.S_core) * one.typical * one.phi2
+    sigma = np.sqrt(np.maximum(np.diag(cov), 0.0))
+    # Leaving the core moves the camera from the core's solution to d; joining it, by one step to the view.
+    centre = -scaled_inverse(one.S_core) @ b[core].sum(axis=0)
+    joined = np.linalg.solve(one.S_core + S + 1e-12 * np.eye(len(sigma)), one.score[..., None])[..., 0]
+    shift = np.where(core[:, None], one.d - centre, joined)
+    rms = np.sqrt(found.cost / np.maximum(found.measured / 2, 1))
+    quiet = np.sort(rms[core])[: (int(core.sum()) + 1) // 2]
+    noise = np.sqrt(one.variance)
+    return Agreement(
+        shift=shift * unit,
+        moved=np.max(np.abs(shift) / np.maximum(sigma, 1e-300), axis=1, initial=0.0),
+        moved_px=_moved_px(calibration, shift * unit),
+        chance=one.chance,
+        noise_px=noise,
+        noise=noise / np.sqrt(one.typical),
+        rms_px=rms,
+        misfit=rms / max(float(np.median(quiet)), 1e-12),
+        sigma=sigma * unit,
+        scale_px=float(np.sqrt(one.typical * one.phi2)),
+    )
+
+
+def _moved_px(calibration: Calibration, shift: FloatArray) -> FloatArray:
+    """Farthest that changes (N, G) of the intrinsics move one of the directions that were seen, (N,)."""
+    block, observations = calibration.block, calibration.observations
+    points = observations.target_m @ block.R_CT.transpose(0, 2, 1) + block.t_CT_m[:, None]
+    used = points[observations.present]
+    some = used[:: max(1, len(used) // 300)]
+    J = joint_jacobian(calibration, some)[:, :, : shift.shape[1]]
+    return np.asarray(np.linalg.norm(np.einsum("mcg,ng->nmc", J, shift), axis=2).max(axis=1))
+
+
+# ----------------------------------------------------------------------
+# The search: fit, ask, leave out, until nothing changes.
+
+
+@dataclass(frozen=True)
+class Triage:
+    """What is left of a set of views.
+
+    Attributes
+    ----------
+    calibration : from the views and points that are left.
+    everything : from all of them.
+    left_out : a sentence for each view that leaves, and for each with points that do.
+    """
+
+    calibration: Calibration
+    everything: Calibration
+    left_out: tuple[LeftOut, ...]
+    scale_px: float = 0.0
+
+    @staticmethod
+    def of_all(calibration: Calibration) -> Triage:
+        """Nothing leaves."""
+        return Triage(calibration, calibration, ())
+
+
+def triage(calibration: Calibration) -> Triage:
+    """Leave out views and points that do not agree with the others.
+
+    The search begins with all views, and with the core that agrees best, which a few bad views among few
+    cannot hide from. Where the two end differently the one that keeps more is taken, unless the other's
+    views agree much better.
+
+    Parameters
+    ----------
+    calibration : of all views by the model that is used, the target rigid, without robust loss.
+    """
+    whole = _settled(calibration, False)
+    core = _settled(calibration, True)
+    if len(core.left_out) > len(whole.left_out) and whole.scale_px < _SCALE * core.scale_px:
+        return whole
+    return core
+
+
+def _settled(calibration: Calibration, robust: bool) -> Triage:
+    """The search from all views, or from the core that agrees best."""
+    everything = calibration.observations
+    views = everything.views
+    width = max(calibration.camera.image_size_px)
+    kept, far = np.ones(views, dtype=np.bool_), np.zeros(everything.present.shape, dtype=np.bool_)
+    reasons: dict[int, str] = {}
+    scale_px = 0.0
+    fit = calibration
+    for turn in range(_ROUNDS):
+        whole, seen = _with_all(fit, kept, everything, far)
+        new_far, distance = _far_points(whole.residuals_px, kept)
+        share = new_far.sum(axis=1) / everything.present.sum(axis=1)
+        nowhere = "no pose of the board explains it with the other views' camera"
+        why = {int(i): nowhere for i in np.flatnonzero(~seen)}
+        for i in np.flatnonzero(share > _POINTS_SHARE):
+            why[int(i)] = f"{share[i]:.0%} of its points lie far from where the others put them"
+        if views - len(why) >= _LEAST_VIEWS and len(fit.free):
+            usable = np.flatnonzero([i not in why for i in range(views)])
+            part = replace(
+                whole,
+                observations=whole.observations.select(usable),
+                block=replace(whole.block, R_CT=whole.block.R_CT[usable], t_CT_m=whole.block.t_CT_m[usable]),
+            )
+            asked = agreement(part, None if robust and turn < 2 else kept[usable])
+            scale_px = asked.scale_px
+            # A view is asked again without its far points before it leaves for them.
+            fresh = kept & (new_far & ~far).any(axis=1)
+            leaves = asked.leaving(width) & ~fresh[usable]
+            why |= {
+                int(usable[k]): _sentence(asked, int(k), part, int((~leaves).sum()))
+                for k in np.flatnonzero(leaves)
+            }
+        reasons |= why
+        new = np.array([i not in why for i in range(views)])
+        # Two views that take turns both leave.
+        new &= kept if turn > _ROUNDS // 2 else True
+        new_far &= new[:, None]
+        if np.array_equal(new, kept) and np.array_equal(new_far, far):
+            break
+        if new.sum() < min(_LEAST_VIEWS - 1, views):
+            return Triage.of_all(calibration)
+        kept, far = new, new_far
+        fit = resolved(replace(whole, observations=everything.without(far)), np.flatnonzero(kept))
+    left = [LeftOut(everything.names[i], reasons[int(i)], "view") for i in np.flatnonzero(~kept)]
+    return Triage(fit, calibration, (*left, *_of_points(distance, everything, far)), scale_px)
+
+
+def _with_all(
+    fit: Calibration, kept: BoolArray, everything: Observations, far: BoolArray
+) -> tuple[Calibration, BoolArray]:
+    """The fit with the poses of all views fitted to its camera, and which views (N,) that was possible for.
+
+    Residuals are those of all points, the far ones included.
+    """
+    near = everything.without(far)
+    R_CT, t_CT_m = np.tile(np.eye(3), (len(kept), 1, 1)), np.tile(fit.block.t_CT_m[:1], (len(kept), 1))
+    R_CT[kept], t_CT_m[kept] = fit.block.R_CT, fit.block.t_CT_m
+    seen = kept.copy()
+    others = np.flatnonzero(~kept)
+    if len(others):
+        R, t = poses_with_camera(fit.camera, near.select(others))
+        usable = np.isfinite(R).all(axis=(1, 2)) & np.isfinite(t).all(axis=1)
+        for i, R_start, t_start in zip(others[usable], R[usable], t[usable], strict=True):
+            # One by one: a view that ends behind the camera must not stop the others.
+            start = Block(fit.block.intrinsics, R_start[None], t_start[None], np.zeros(0))
+            found = minimise(start, near.select([i]), np.zeros(0, dtype=np.int64))
+            seen[i] = found.at is not None
+            R_CT[i], t_CT_m[i] = found.block.R_CT[0], found.block.t_CT_m[0]
+    points = everything.target_m @ R_CT.transpose(0, 2, 1) + t_CT_m[:, None]
+    residuals = project(fit.camera, points) - everything.pixels
+    residuals[~everything.present | ~seen[:, None]] = np.nan
+    block = Block(fit.block.intrinsics, R_CT, t_CT_m, np.zeros(0))
+    return replace(fit, observations=near, block=block, residuals_px=residuals), seen
+
+
+def _far_points(residuals_px: FloatArray, kept: BoolArray) -> tuple[BoolArray, FloatArray]:
+    """Points (N, M) far off beside the others of their view and of the views that stay, and how far, px."""
+    distance = np.linalg.norm(residuals_px, axis=2)
+    there = np.isfinite(distance)
+    typical = float(np.median(distance[there & kept[:, None]]))
+    own = np.array([np.median(d[on]) if on.any() else typical for d, on in zip(distance, there, strict=True)])
+    limit = np.maximum(_POINT * np.maximum(own, typical), _POINT_PX)
+    return np.asarray(there & (np.nan_to_num(distance) > limit[:, None])), distance
+
+
+def _sentence(asked: Agreement, i: int, calibration: Calibration, others: int) -> str:
+    """Why a view leaves."""
+    names = calibration.free_names
+    k = int(np.argmax(np.abs(asked.shift[i]) / np.maximum(asked.sigma, 1e-300)))
+    name, unit = names[k].removesuffix("_px"), " px" if names[k].endswith("_px") else ""
+    moved = (
+        f"it alone would move {name} by {abs(asked.shift[i, k]):.3g}{unit}, {asked.moved[i]:.1f} standard "
+        f"deviations, and directions in the picture by up to {asked.moved_px[i]:.2g} px"
+    )
+    if asked.chance[i] < _CHANCE:
+        return (
+            f"shows another camera than the {others} views that agree (zoom, focus, rolling shutter or a "
+            f"bent board); {moved}"
+        )
+    if asked.noise[i] > _ODD_NOISE:
+        return (
+            f"its corners scatter by {asked.noise_px[i]:.2g} px, {asked.noise[i]:.1f} times as much as those "
+            f"of a typical view (motion, blur or another board); {moved}"
+        )
+    return (
+        f"its RMS by the camera of the other views is {asked.rms_px[i]:.2f} px, {asked.misfit[i]:.0f} times "
+        "that of the quieter ones"
+    )
+
+
+def _of_points(distance: FloatArray, everything: Observations, far: BoolArray) -> list[LeftOut]:
+    """A sentence for each view that loses points."""
+    out = []
+    for i in np.flatnonzero(far.any(axis=1)):
+        lost = np.flatnonzero(far[i])
+        where = listed(
+            [
+                f"{j} at ({u:.1f}, {v:.1f})"
+                for j, (u, v) in zip(lost, everything.pixels[i, lost], strict=True)
+            ],
+            4,
+        )
+        why = (
+            f"without {len(lost)} of its points, up to {np.max(distance[i, lost]):.2f} px from where the "
+            f"others put them: {where}"
+        )
+        out.append(LeftOut(everything.names[i], why, "points"))
+    return out
