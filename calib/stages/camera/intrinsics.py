@@ -393,11 +393,22 @@ def calibrate_camera(
     fixed = ("cx_px", "cy_px") if everything.views == 1 else ()
     sorted_out, models = _sorted_out(everything, image_size_px, choices, fixed)
     leaving = [*left_out, *unusable, *sorted_out.left_out]
+    findings = of_leaving(leaving, sorted_out.calibration.observations.views, choices.keep_all)
+    if sorted_out.left_out:
+        several = two_cameras(sorted_out.everything)
+        if any(one.severity == "inconsistent" for one in findings):
+            findings += several
+        elif any(one.severity == "inconsistent" for one in several):
+            # Of two cameras that share the views neither is the odd one, and no view is to blame.
+            model, start, models = _chosen_model(everything, image_size_px, choices, fixed)
+            first = None if start is None else start.block
+            sorted_out = Triage.of_all(
+                calibrate(everything, image_size_px, model, skew=choices.skew, fixed=fixed, start=first)
+            )
+            leaving = [*left_out, *unusable]
+            findings = of_leaving(leaving, everything.views, choices.keep_all)
     not_used = [*left_out, *unusable] if choices.keep_all else leaving
     fit = sorted_out.calibration
-    findings = of_leaving(leaving, fit.observations.views, choices.keep_all)
-    if any(one.severity == "inconsistent" for one in findings):
-        findings += two_cameras(sorted_out.everything)
     if choices.keep_all:
         fit = sorted_out.everything
     if choices.loss != "none":
