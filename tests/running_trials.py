@@ -10,8 +10,9 @@ from pathlib import Path
 import yaml
 
 from calib.core.errors import BadInputError
-from calib.core.files import sha256, write_atomically
+from calib.core.files import sha256
 from calib.core.rig import Rig
+from calib.core.writing import write_atomically
 from calib.runner.folder import Folder, LogFile, read_folder
 from calib.runner.graph import HIDDEN, Done, Planned, Runner, Stage, opened
 from calib.runner.outputs import decide, publish, summary

@@ -19,7 +19,7 @@ from calib.cli.common import (
 from calib.core.errors import BadInputError, UsageError
 
 if TYPE_CHECKING:
-    pass
+    from calib.core.writing import Kind
 
 # ----------------------------------------------------------------------
 # `calib board`: a checkerboard or ChArUco board to print, at exact scale.
@@ -45,9 +45,9 @@ def board(
     Half a turn changes the default board, so that every picture shows which corner is the first. A board
     whose columns and rows of corners are both even or both odd looks the same from either end.
     """
-    from calib.core.files import write_atomically
     from calib.core.units import parse_corners, parse_square_m
-    from calib.show.boardsheet import board_pdf
+    from calib.core.writing import write_atomically
+    from calib.show.boardsheet import BOARD_PDF, board_pdf
     from calib.stages.camera.model import Board
     from calib.stages.camera.read import known_dictionary
 
@@ -60,7 +60,7 @@ def board(
         count = (columns + 1) * (rows + 1) // 2
         enough = next((n for n in (50, 100, 250, 1000) if n >= count), 1000)
         markers = known_dictionary(dictionary or f"4X4_{enough}", "--dictionary", UsageError)
-    write_atomically(output, board_pdf(columns, rows, square_m, page, markers))
+    write_atomically(output, board_pdf(columns, rows, square_m, page, markers), BOARD_PDF)
     if as_json:
         about = {"corners": [columns, rows], "square_m": square_m, "page": page}
         document("board", about if markers is None else {**about, "dictionary": markers})
@@ -105,19 +105,32 @@ def export_camera(
     as_json: JsonOption = False,
 ) -> None:
     """Write the camera as ROS camera_info, OpenCV FileStorage or Kalibr camchain, the IMU as imu.yaml."""
-    from calib.core.files import shown, write_atomically
+    from calib.core.command import note_inputs
+    from calib.core.files import shown
+    from calib.core.writing import check_writable, write_atomically
 
+    kind = _kind_of(to)
+    if output is not None:
+        note_inputs([rig])
+        check_writable(output, kind)
     what = "IMU" if to == "kalibr-imu" else "camera"
     text, verdict = _imu_text(rig, name) if what == "IMU" else _camera_text(to, rig, name or "camera")
     if verdict != "ok":
         narrate(f"the {what}'s verdict is {verdict}; the format cannot say so")
     if output is not None:
-        write_atomically(output, text)
+        write_atomically(output, text, kind)
         narrate(f"{to} {what} written to {shown(output)}")
     if as_json:
         document("export", {"format": to, "verdict": verdict, "text": text})
     elif output is None:
         emit(text.rstrip("\n") + "\n")
+
+
+def _kind_of(to: str) -> Kind:
+    from calib.stages.camera.formats import FILES
+    from calib.stages.imu.formats import IMU_YAML
+
+    return FILES.get(to, IMU_YAML)
 
 
 def _camera_text(to: str, rig: Path, name: str) -> tuple[str, str]:
@@ -160,13 +173,14 @@ def import_camera(
     if from_ == "kalibr-imu":
         _import_imu(source, rig, as_json)
         return
-    from calib.core.files import as_text, check_writable, read_bytes, sha256, shown
+    from calib.core.files import as_text, read_bytes, sha256, shown
     from calib.core.result import section_json
-    from calib.core.rig import Rig
+    from calib.core.rig import SECTIONS, Rig
+    from calib.core.writing import check_writable
     from calib.stages.camera.formats import from_kalibr, from_opencv, from_ros
     from calib.stages.camera.stage import imported_camera
 
-    check_writable(rig)
+    check_writable(rig, SECTIONS)
     before = Rig.load(rig, missing_ok=True)
     data = read_bytes(source, _MAX_BYTES)
     text = as_text(source, data)
@@ -188,12 +202,13 @@ def import_camera(
 
 
 def _import_imu(source: Path, rig: Path, as_json: bool) -> None:
-    from calib.core.files import check_writable, read_bytes, read_yaml_mapping, sha256, shown
+    from calib.core.files import read_bytes, read_yaml_mapping, sha256, shown
     from calib.core.result import section_json
-    from calib.core.rig import Rig
+    from calib.core.rig import SECTIONS, Rig
+    from calib.core.writing import check_writable
     from calib.stages.imu.formats import from_kalibr
 
-    check_writable(rig)
+    check_writable(rig, SECTIONS)
     before = Rig.load(rig, missing_ok=True)
     digest = sha256(read_bytes(source, _MAX_BYTES))
     try:

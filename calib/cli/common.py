@@ -16,6 +16,7 @@ import typer
 
 from calib.core.errors import CalibError, ReaderGoneError
 from calib.core.files import one_line
+from calib.core.writing import stdout_is_taken
 
 # ----------------------------------------------------------------------
 # Telling a person who waits that functions are being compiled.
@@ -88,9 +89,9 @@ def say(message: str = "") -> None:
 
 
 def emit(text: str) -> None:
-    """Text of the result as it is, on stdout."""
+    """Text of the result as it is, on stdout; on stderr where a file was asked for there."""
     try:
-        sys.stdout.write(text)
+        (sys.stderr if stdout_is_taken() else sys.stdout).write(text)
     except BrokenPipeError as error:
         raise ReaderGoneError("") from error
     except OSError as error:

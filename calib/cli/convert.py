@@ -40,16 +40,21 @@ def convert(
     """
     import numpy as np
 
-    from calib.core.files import check_writable, shown, write_atomically
+    from calib.core.command import note_inputs
+    from calib.core.files import shown
     from calib.core.stage import LogOptions
-    from calib.io.logs import iter_log
+    from calib.core.writing import check_writable, write_atomically, writes_through
+    from calib.io.columns import COLUMNS_FILE
+    from calib.io.logs import LOG, beside, iter_log
     from calib.io.signals import refuse_counts
     from calib.io.states import states_writer
 
-    if output.suffix.lower() not in (".csv", ".parquet"):
+    if output.suffix.lower() not in (".csv", ".parquet") and not writes_through(output):
         raise UsageError(f"{shown(output)}: expected a name that ends in .csv or .parquet")
+    note_inputs([log, *beside(log), *(path for path in (columns, topics) if path is not None)])
+    check_writable(output, LOG)
     if save_columns is not None:
-        check_writable(save_columns)
+        check_writable(save_columns, COLUMNS_FILE)
     stream = iter_log(log, LogOptions(acc_unit, gyro_unit, columns, topics))
     block = next(stream, None)
     if block is None:
@@ -60,7 +65,10 @@ def convert(
         narrate(read_as.narration)
     names = tuple(block.columns)
     rows, blank, truncated = 0, 0, False
-    with states_writer(output, ("t_s", *names)) as writer, progress_bar(f"converting {log.name}") as progress:
+    with (
+        states_writer(output, ("t_s", *names), LOG) as writer,
+        progress_bar(f"converting {log.name}") as progress,
+    ):
         while True:
             writer.add(np.column_stack([block.t_s, *(block.columns[name] for name in names)]))
             rows, blank, truncated = rows + len(block), blank + block.not_finite, block.truncated
@@ -70,7 +78,7 @@ def convert(
                 break
             block = following
     if save_columns is not None and read_as is not None:
-        write_atomically(save_columns, read_as.text())
+        write_atomically(save_columns, read_as.text(), COLUMNS_FILE)
     told = {
         "log": shown(output),
         "rows": rows,

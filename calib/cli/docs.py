@@ -14,6 +14,7 @@ import typer
 from calib import __version__
 from calib.cli.common import JsonOption, document, emit, narrate, say
 from calib.core.errors import BadInputError, UsageError
+from calib.core.writing import Kind, holds
 
 if TYPE_CHECKING:
     from markdown_it import MarkdownIt
@@ -104,12 +105,15 @@ def page_of(topic: str, pages: list[Page]) -> Page:
     raise UsageError(f"the manual has no page {topic[:60]!r}; {hint}")
 
 
+PAGE = Kind("a page of the manual", (".html",), holds(b" - calib</title>"))
+
+
 def write_manual(pages: list[Page], folder: Path) -> Path:
     """Write all pages as HTML into a folder and return its absolute path."""
     import jinja2
     from markupsafe import Markup
 
-    from calib.core.files import make_folder, write_atomically
+    from calib.core.writing import make_folder, write_atomically
 
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
     template = environment.from_string((MANUAL / "page.html.j2").read_text(encoding="utf-8"))
@@ -128,9 +132,8 @@ def write_manual(pages: list[Page], folder: Path) -> Path:
         # The Markdown is the package's own, and HTML inside it is escaped.
         body = Markup(markdown.render(page.text))
         make_folder(path.parent)
-        write_atomically(
-            path, template.render(title=page.title, version=__version__, groups=groups, body=body)
-        )
+        text = template.render(title=page.title, version=__version__, groups=groups, body=body)
+        write_atomically(path, text, PAGE)
     return folder
 
 
@@ -165,7 +168,7 @@ def _cache() -> Path:
     """The user's cache, since the pages outlive the command; a temporary folder if it cannot be written."""
     import tempfile
 
-    from calib.core.files import make_folder
+    from calib.core.writing import make_folder
 
     system = {"win32": os.environ.get("LOCALAPPDATA"), "darwin": "~/Library/Caches"}
     base = system.get(sys.platform) or os.environ.get("XDG_CACHE_HOME") or "~/.cache"

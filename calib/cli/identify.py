@@ -146,15 +146,18 @@ def pump(
 
     Writes the section pump. Exits 1 when something is left that the PWM does not explain.
     """
-    from calib.core.files import check_folder, check_writable, hash_of, shown
+    from calib.core.command import note_inputs
+    from calib.core.files import hash_of, shown
     from calib.core.result import section_json
-    from calib.core.rig import Rig
+    from calib.core.rig import SECTIONS, Rig
+    from calib.core.writing import check_figures, check_writable
     from calib.stages.actuator.pump_results import identify_pump, pump_section
     from calib.stages.actuator.read import read_pump_table
 
-    check_writable(rig)
+    note_inputs([*paths, *(held or [])])
+    check_writable(rig, SECTIONS)
     if figures is not None:
-        check_folder(figures)
+        check_figures(figures)
     before = Rig.load(rig, missing_ok=True)
     tables = [read_pump_table(path, time, pwm, value, unit) for path in paths]
     kept_out = [read_pump_table(path, time, pwm, value, unit) for path in held or []]
@@ -198,16 +201,19 @@ def stiffness(
 
     Writes k0 .. k3 of one bellows to the section actuator.
     """
-    from calib.core.files import check_folder, check_writable, hash_of, shown
+    from calib.core.command import note_inputs
+    from calib.core.files import hash_of, shown
     from calib.core.result import section_json
-    from calib.core.rig import Rig
+    from calib.core.rig import SECTIONS, Rig
+    from calib.core.writing import check_figures, check_writable
     from calib.stages.actuator.identify import fit_stiffness
     from calib.stages.actuator.read import read_displacements
     from calib.stages.actuator.results import stiffness_section
 
-    check_writable(rig)
+    note_inputs([path])
+    check_writable(rig, SECTIONS)
     if figures is not None:
-        check_folder(figures)
+        check_figures(figures)
     before = Rig.load(rig, missing_ok=True)
     eps, force = read_displacements(path)
     fits, best = fit_stiffness(shown(path), eps, force)

@@ -15,7 +15,7 @@ import threading
 import traceback
 import warnings
 from collections.abc import Iterator
-from typing import NoReturn, TextIO
+from typing import Any, NoReturn, TextIO
 
 from calib.core.compiled import choose_folder
 from calib.core.errors import (
@@ -61,24 +61,36 @@ def main() -> NoReturn:
 
 @contextlib.contextmanager
 def _interrupts_that_are_not_lost() -> Iterator[None]:
-    """Raise Ctrl-C again where it came while nothing could be raised, as in a finaliser or a callback."""
-    ours = threading.current_thread() is threading.main_thread() and hasattr(signal, "setitimer")
-    if not ours or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+    """Take SIGTERM and the terminal's end as Ctrl-C, and raise it again where it came while nothing could be
+    raised, as in a finaliser or a callback."""
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
+    again = hasattr(signal, "setitimer")
 
     def interrupt(*_: object) -> None:
-        signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
+        if again:
+            signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGALRM, interrupt)
-    signal.signal(signal.SIGINT, interrupt)
+    # What whoever started this process has told it to ignore stays ignored.
+    taken: dict[int, Any] = {
+        number: before
+        for number in (getattr(signal, name, None) for name in ("SIGINT", "SIGTERM", "SIGHUP"))
+        if number is not None
+        and (before := signal.getsignal(number)) in (signal.default_int_handler, signal.SIG_DFL)
+    }
+    if again and taken:
+        taken[signal.SIGALRM] = signal.getsignal(signal.SIGALRM)
+    for number in taken:
+        signal.signal(number, interrupt)
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        if again:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+        for number, before in taken.items():
+            signal.signal(number, before)
 
 
 def _still_working() -> bool:
@@ -90,11 +102,13 @@ def _still_working() -> bool:
 def _run(debug: bool) -> int:
     try:
         from calib.cli.app import app
+        from calib.core.command import one_command
 
         empty = next((word for word in sys.argv[1:] if not word or re.fullmatch(r"--[a-z-]+=", word)), None)
         if empty is not None:
             raise UsageError(f"an argument is empty: {empty!r}")
-        app(prog_name="calib")
+        with one_command():
+            app(prog_name="calib")
     except SystemExit as leaving:
         code = leaving.code if isinstance(leaving.code, int) else EXIT_DONE
         if code == _EXIT_INTERRUPTED:

@@ -23,8 +23,10 @@ def record(
     as_json: JsonOption = False,
 ) -> None:
     """Record a board's ticks: camera, IMU and commands as a log, and what the board made of them."""
-    from calib.core.files import check_writable, shown, write_atomically
+    from calib.core.files import shown
     from calib.core.units import parse_duration_s
+    from calib.core.writing import check_writable, write_atomically
+    from calib.io.logs import LOG
     from calib.io.serial import record as run
 
     try:
@@ -32,7 +34,11 @@ def record(
     except ModuleNotFoundError as error:
         raise UsageError(f"calib record needs pyserial: {pip_install('serial')}") from error
     duration_s = None if duration is None else parse_duration_s(duration, "--duration")
-    check_writable(output)
+    if output.is_file() and output.stat().st_size:
+        raise BadInputError(
+            f"{shown(output)}: is there, and a recording cannot be made again; give another name, or move it"
+        )
+    check_writable(output, LOG)
     try:
         line = serial.Serial(port, baud, timeout=0.1)
     except (serial.SerialException, OSError, ValueError) as error:
@@ -61,7 +67,7 @@ def record(
         result = run(read, more)
     if not result.ticks:
         raise BadInputError(f"{shown(port)}: no frame came, expected the example sketch at {baud} baud")
-    write_atomically(output, result.text)
+    write_atomically(output, result.text, LOG)
     told = {
         "log": shown(output),
         "ticks": result.ticks,

@@ -23,11 +23,14 @@ def report(
     as_json: JsonOption = False,
 ) -> None:
     """Write the page of a calibration again: one HTML file that needs no network."""
-    from calib.core.files import check_writable, shown
-    from calib.show.page import write_page
+    from calib.core.command import note_inputs
+    from calib.core.files import shown
+    from calib.core.writing import check_writable
+    from calib.show.page import PAGE, write_page
 
     target = rig.parent / "report.html" if output is None else output
-    check_writable(target)
+    note_inputs([rig])
+    check_writable(target, PAGE)
     write_page(rig, target)
     size = target.stat().st_size
     if as_json:

@@ -120,7 +120,7 @@ def _all_verbs() -> Any:
 
 def _simulated(output: Path) -> Folder:
     """The folder of a simulated rig, made beside the results unless this program has made it before."""
-    from calib.core.files import make_folder
+    from calib.core.writing import make_folder
     from calib.runner.cache import key_of, load, remove, store
     from calib.runner.folder import read_folder
     from calib.runner.graph import HIDDEN

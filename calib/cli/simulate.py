@@ -49,9 +49,10 @@ def simulate(
     as_json: JsonOption = False,
 ) -> None:
     """Simulate an experiment and write its log, with the truth in columns of its own."""
-    from calib.core.files import check_writable, shown
+    from calib.core.files import shown
     from calib.core.units import parse_duration_s
-    from calib.io.logs import write_log
+    from calib.core.writing import check_writable
+    from calib.io.logs import SIMULATED, write_log
     from calib.twin.folder import write_rig_folder
     from calib.twin.rig import SimulatedRig, rig_from_file
     from calib.twin.scenarios import make_scenario, run_scenario
@@ -76,10 +77,10 @@ def simulate(
         lines = [f"rig folder with {len(logs)} logs written to {output}"]
     else:
         plan = make_scenario(scenario, options)
-        check_writable(output)
+        check_writable(output, SIMULATED)
         run = run_scenario(plan, machine, seed, feedback, duration_s)
         log = log_of(run, shown(output))
-        write_log(output, log)
+        write_log(output, log, SIMULATED)
         figures = plan.figures(run)
         told |= {
             "duration_s": len(run.pwm) * run.tick_s,

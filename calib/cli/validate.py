@@ -128,14 +128,15 @@ def validate(
     parameters, and to that with the sections actuator and pump, from the estimator's state at its start.
     Exits 0 whatever comes of it.
     """
-    from calib.core.files import check_folder, shown
+    from calib.core.files import shown
+    from calib.core.writing import check_figures
 
     if states and len(states) != len(logs):
         raise UsageError(f"--states: {len(states)} files for {len(logs)} logs, expected one for each")
     if truth and states:
         raise UsageError("--truth: takes the true columns, --states does not apply")
     if figures is not None:
-        check_folder(figures)
+        check_figures(figures)
     options = LogOptions(acc_unit, gyro_unit, columns)
     compared = _compared(logs, states, truth, no_pwm, rig, options)
     result: dict[str, Any] = {"logs": [_log_json(one) for one in compared]}

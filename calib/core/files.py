@@ -1,8 +1,7 @@
-"""Reading and replacing files: whole, atomic, and with errors of one sentence."""
+"""Names and reading of files, with errors of one sentence; `calib.core.writing` writes them."""
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import os
 import stat
@@ -10,6 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from calib.core.command import note_inputs
 from calib.core.errors import BadInputError
 
 _MAX_BYTES = 500_000_000
@@ -52,7 +52,16 @@ def slug(name: str, taken: Iterable[str] = ()) -> str:
 
 
 def check_readable(path: Path) -> int:
-    """Size in bytes of a regular file. Raises `BadInputError` for all else: a pipe may never end."""
+    """Size in bytes of a regular file, which is an input of the command from now on.
+
+    Raises `BadInputError` for all else: a pipe may never end.
+    """
+    size = _size(path)
+    note_inputs([path])
+    return size
+
+
+def _size(path: Path) -> int:
     try:
         status = path.stat()
     except OSError as error:
@@ -103,7 +112,7 @@ def file_sha256(path: Path) -> str:
     """SHA-256 of a file of any size in hexadecimal, or a `BadInputError` that says why not."""
     import hashlib
 
-    check_readable(path)
+    _size(path)
     try:
         with path.open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
@@ -139,111 +148,3 @@ def read_yaml_mapping(path: Path) -> dict[str, Any]:
     if wrong is not None:
         raise BadInputError(f"{shown(path)}: the key {wrong!r} is not text")
     return document
-
-
-def _target(path: Path) -> Path:
-    """The file that a path stands for, symbolic links followed."""
-    if not path.is_symlink() or _is_device(path):
-        return path
-    target = Path(os.path.realpath(path))
-    if target.is_symlink():
-        raise BadInputError(f"{shown(path)}: is a symbolic link that leads back to itself")
-    return target
-
-
-def check_writable(path: Path) -> None:
-    """Fail before long work when `path` cannot be written afterwards."""
-    target = _target(path)
-    parent = target.parent
-    if target.is_dir():
-        raise BadInputError(f"{shown(path)}: is a folder, expected a file to write")
-    if not parent.is_dir():
-        raise BadInputError(f"{shown(path)}: cannot be written: there is no folder {shown(parent)}")
-    if target.exists() and not (target.stat().st_mode & 0o222 and os.access(target, os.W_OK)):
-        raise BadInputError(f"{shown(path)}: cannot be written: it is read-only")
-    if _is_device(target):
-        return
-    if not os.access(parent, os.W_OK | os.X_OK):
-        raise BadInputError(f"{shown(path)}: cannot be written: no permission in {shown(parent.resolve())}")
-
-
-def check_folder(path: Path) -> None:
-    """Fail before long work when `make_folder` or writing into this folder cannot succeed afterwards."""
-    there = path
-    while not there.exists() and there != there.parent:
-        there = there.parent
-    if not there.is_dir():
-        raise BadInputError(f"{shown(path)}: cannot be made a folder: {shown(there)} is a file")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise BadInputError(f"{shown(path)}: cannot be written: no permission in {shown(there.resolve())}")
-
-
-def _is_device(path: Path) -> bool:
-    """Whether this is there and can only be written through, as /dev/null or a pipe."""
-    return path.exists() and not path.is_file() and not path.is_dir()
-
-
-def make_folder(path: Path) -> None:
-    """Create a folder to write into, or a `BadInputError` that says why not."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise BadInputError(f"{shown(path)}: cannot be made a folder: {error.strerror or error}") from error
-
-
-def write_atomically(path: Path, data: bytes | str) -> None:
-    """Replace a file so that at every moment either the old or the new contents are there whole.
-
-    A temporary file beside it is written, flushed to the disk and renamed; devices and pipes are
-    written through. Raises `BadInputError` when the disk is full or the place cannot be written; the
-    old file then survives.
-    """
-    import tempfile
-
-    raw = data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data
-    check_writable(path)
-    target = _target(path)
-    temporary: str | None = None
-    try:
-        if _is_device(target):
-            target.write_bytes(raw)
-            return
-        descriptor, temporary = tempfile.mkstemp(
-            prefix=f".{target.name[:40]}.", suffix=".tmp", dir=target.parent
-        )
-        with os.fdopen(descriptor, "wb") as stream:
-            stream.write(raw)
-            stream.flush()
-            os.fsync(stream.fileno())
-        _take_over(target, Path(temporary))
-        Path(temporary).replace(target)
-    except OSError as error:
-        raise BadInputError(f"{shown(path)}: cannot be written: {error.strerror or error}") from error
-    finally:
-        if temporary is not None:
-            # After the renaming there is none; one that cannot be removed is no reason to fail.
-            with contextlib.suppress(OSError):
-                Path(temporary).unlink()
-    with contextlib.suppress(OSError):
-        folder = os.open(target.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
-
-
-def _take_over(old: Path, new: Path) -> None:
-    """Give a file the mode and, where allowed, the owner of the one that it replaces."""
-    if not old.exists():
-        new.chmod(0o666 & ~_umask())
-        return
-    status = old.stat()
-    with contextlib.suppress(OSError):
-        os.chown(new, status.st_uid, status.st_gid)
-    new.chmod(status.st_mode & 0o777)
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

@@ -10,7 +10,9 @@ estimate share the sections `actuator` and `pump`; they are parted when such a f
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -21,9 +23,10 @@ from pydantic import BaseModel, Field, field_validator
 
 from calib import __version__
 from calib.core.errors import BadInputError
-from calib.core.files import one_line, read_yaml_mapping, shown, write_atomically
+from calib.core.files import one_line, read_yaml_mapping, shown
 from calib.core.result import Result, Section, identity, section_json
 from calib.core.schema import nearest, quoted, validated
+from calib.core.writing import Kind, head, write_atomically
 
 if TYPE_CHECKING:
     from calib.core.diff import RigDiff
@@ -61,6 +64,18 @@ KINDS = {
 }
 """Sections in the order of the file and what they are. A schema takes a tenth of a second to build, so each
 is loaded where a file has its section."""
+
+
+def _holds_sections(path: Path) -> bool:
+    names = {name.decode() for name in re.findall(rb"^([A-Za-z_]\w*):", head(path), re.MULTILINE)}
+    if not names:
+        with contextlib.suppress(BadInputError):
+            names = set(read_yaml_mapping(path))
+    return bool(names) and names <= {"schema", *KINDS}
+
+
+SECTIONS = Kind("sections of a rig", (".yaml", ".yml"), _holds_sections, merged=True)
+"""The file itself, for those who write it."""
 
 Metres = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False, strict=True)]
 
@@ -216,7 +231,7 @@ class Rig:
         merged = {**self.inputs, **(inputs or {})}
         ordered = {name: dict(sorted(merged[name].items())) for name in sorted(merged)}
         self.provenance, self.schema = Provenance(inputs=ordered), SCHEMA
-        write_atomically(Path(path), self.text())
+        write_atomically(Path(path), self.text(), SECTIONS)
 
     def with_sections(self, sections: Mapping[str, Any]) -> Rig:
         """The same rig with other sections, by name."""

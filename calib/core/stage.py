@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from calib.core.rig import Rig
     from calib.core.verdict import Verdict
     from calib.core.words import Block
+    from calib.core.writing import Kind
     from calib.io.logs import Log
 
 
@@ -115,17 +116,19 @@ class Output:
     Attributes
     ----------
     words : help. flags, metavar : on the command line. default : written even where it is not asked for.
-    write : writes an outcome there; the files written. None where the stage itself writes, as one does that
-        answers for more than fits into memory.
+    write : writes an outcome to `Files.output`; the files written. None where the stage itself writes, as one
+        does that answers for more than fits into memory.
     folder : whether it is a folder, whose files --json names.
+    kind : gives the kind of the file.
     """
 
     words: str
-    write: Callable[[Path, Any], Sequence[Path]] | None
+    write: Callable[[Files, Any], Sequence[Path]] | None
     flags: tuple[str, ...] = ("-o", "--output")
     metavar: str = ""
     default: Path | None = None
     folder: bool = False
+    kind: Callable[[], Kind] | None = None
 
 
 AccUnit = Literal["m/s2", "g", "mg", "counts"]

@@ -73,6 +73,7 @@ def _serve(shared: object, pipe: Connection, parent: int) -> None:
     """What a worker process does: items in, results out, until told to end."""
     # Ctrl-C reaches all processes of a terminal; the first one answers for all.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     # A pipe that brothers and sisters hold open as well does not tell of the parent's end.
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL))
     if os.getppid() != parent:

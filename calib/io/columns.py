@@ -38,6 +38,7 @@ from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.core.files import one_line, read_yaml_mapping, shown
 from calib.core.stage import LogOptions
+from calib.core.writing import Kind, head
 
 MEASURED = (
     "u_px",
@@ -325,6 +326,14 @@ class ColumnMap:
             entry += [f"offset: {source.offset!r}"] if source.offset else []
             lines.append(f"{column}: {{{', '.join(entry)}}}\n")
         return "".join(lines)
+
+
+def _is_written(path: Path) -> bool:
+    lines = head(path).splitlines()
+    return all(re.fullmatch(rb"[a-z0-9_]+: \{column: .+\}", line) for line in lines)
+
+
+COLUMNS_FILE = Kind("a columns.yaml", (".yaml", ".yml"), _is_written)
 
 
 def _yaml(word: str) -> str:

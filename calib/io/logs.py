@@ -30,11 +30,13 @@ import numpy as np
 
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
-from calib.core.files import shown, write_atomically
+from calib.core.files import shown
 from calib.core.stage import NOTHING_STATED, LogOptions
 from calib.core.units import plain_number
+from calib.core.writing import Kind, column_names, write_atomically
 from calib.io.columns import (
     COLUMNS,
+    TRUE,
     UNITS,
     ColumnMap,
     ColumnsFile,
@@ -542,10 +544,19 @@ def _parquet_bytes(log: Log) -> bytes:
     return sink.getvalue()
 
 
-def write_log(path: Path, log: Log) -> None:
+def _holds_log(path: Path) -> bool:
+    names = column_names(path)
+    return names[0] == "t_s" and set(names[1:]) <= set(COLUMNS)
+
+
+LOG = Kind("a log", (".csv", ".parquet"), _holds_log)
+SIMULATED = Kind("a simulated log", LOG.endings, lambda path: not set(TRUE).isdisjoint(column_names(path)))
+
+
+def write_log(path: Path, log: Log, kind: Kind = LOG) -> None:
     """Write a log atomically, as Parquet where the name ends so and as CSV otherwise.
 
     Raises `BadInputError` where the place cannot be written.
     """
     parquet = path.suffix.lower() == ".parquet"
-    write_atomically(path, _parquet_bytes(log) if parquet else log_text(log))
+    write_atomically(path, _parquet_bytes(log) if parquet else log_text(log), kind)

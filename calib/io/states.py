@@ -6,8 +6,6 @@ import contextlib
 import importlib
 import json
 import math
-import os
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +15,8 @@ import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError, pip_install
-from calib.core.files import check_writable, shown
+from calib.core.files import shown
+from calib.core.writing import Kind, column_names, head, replacing
 
 # ----------------------------------------------------------------------
 # States as MCAP: JSON messages that Foxglove and PlotJuggler show without a plug-in.
@@ -129,6 +128,18 @@ STATES = (
 
 ENDINGS = (".csv", ".parquet", ".mcap")
 """Of the formats; any other ending is written as CSV."""
+
+
+def _holds_states(path: Path) -> bool:
+    start = head(path, 512)
+    if start.startswith(b"\x89MCAP0"):
+        # The header names the library.
+        return b"calib" in start
+    return column_names(path)[: len(_FIRST)] == _FIRST
+
+
+_FIRST = STATES[:6]
+STATES_FILE = Kind("states", ENDINGS, _holds_states)
 
 _GROUP_ROWS = 1 << 17
 
@@ -243,37 +254,12 @@ def _filled(states: StatesFile) -> Iterator[StatesFile]:
 
 
 @contextmanager
-def states_writer(path: Path, names: tuple[str, ...] = STATES) -> Iterator[StatesFile]:
-    """Write a states file block by block; it appears under its name when it is whole.
+def states_writer(
+    path: Path, names: tuple[str, ...] = STATES, kind: Kind = STATES_FILE
+) -> Iterator[StatesFile]:
+    """Write a table block by block, as states or another `kind`; it appears under its name when it is whole.
 
     Raises `BadInputError` where the place cannot be written, or the format needs the extra logs.
     """
-    check_writable(path)
-    target = Path(os.path.realpath(path))
-    temporary: Path | None = None
-    try:
-        if target.exists() and not target.is_file():
-            with target.open("wb") as stream:
-                yield from _filled(_opened(path, stream, names))
-            return
-        descriptor, name = tempfile.mkstemp(prefix=f".{target.name[:40]}.", suffix=".tmp", dir=target.parent)
-        temporary = Path(name)
-        with os.fdopen(descriptor, "wb") as stream:
-            yield from _filled(_opened(path, stream, names))
-            stream.flush()
-            os.fsync(stream.fileno())
-        mode = target.stat().st_mode & 0o777 if target.exists() else 0o666 & ~_umask()
-        temporary.chmod(mode)
-        temporary.replace(target)
-    except OSError as error:
-        raise BadInputError(f"{shown(path)}: cannot be written: {error.strerror or error}") from error
-    finally:
-        if temporary is not None:
-            with contextlib.suppress(OSError):
-                temporary.unlink()
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+    with replacing(path, kind) as stream:
+        yield from _filled(_opened(path, stream, names))

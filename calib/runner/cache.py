@@ -6,7 +6,6 @@ import contextlib
 import json
 import os
 import shutil
-import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,7 +15,8 @@ from typing import Any
 
 from calib import __version__
 from calib.core.errors import BadInputError
-from calib.core.files import sha256, shown, write_atomically
+from calib.core.files import sha256, shown
+from calib.core.writing import try_lock, write_atomically
 from calib.runner.folder import digest_of
 
 # ----------------------------------------------------------------------
@@ -24,23 +24,6 @@ from calib.runner.folder import digest_of
 #
 # The lock is the operating system's on an open file, so that it ends with its process, however that ends.
 # The process's number in the file is for the message only: a file that is left behind locks nothing.
-
-
-def _try_lock(descriptor: int) -> bool:
-    try:
-        if sys.platform == "win32":
-            import msvcrt
-
-            # Beyond the text, which others have to be able to read.
-            os.lseek(descriptor, 1 << 20, os.SEEK_SET)
-            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
-        else:
-            import fcntl
-
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return False
-    return True
 
 
 def _holder(path: Path) -> str:
@@ -62,7 +45,7 @@ def held(path: Path, folder: Path, verb: str = "calib run") -> Iterator[int | No
     except OSError as error:
         raise BadInputError(f"{shown(path)}: cannot be written: {error.strerror or error}") from error
     try:
-        if not _try_lock(descriptor):
+        if not try_lock(descriptor):
             raise BadInputError(
                 f"{shown(folder)}: another {verb}{_holder(path)} is at work there; wait for it, or give "
                 "another folder"

@@ -21,7 +21,8 @@ from typing import Any
 
 from calib import __version__
 from calib.core.errors import BadInputError
-from calib.core.files import make_folder, one_line
+from calib.core.files import one_line
+from calib.core.writing import make_folder
 from calib.runner.task import needed, program
 
 # ----------------------------------------------------------------------

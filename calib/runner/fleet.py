@@ -21,8 +21,9 @@ import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import EXIT_INTERNAL, BadInputError
-from calib.core.files import check_folder, check_writable, make_folder, sha256, shown, write_atomically
+from calib.core.files import sha256, shown
 from calib.core.words import unit_of
+from calib.core.writing import check_folder, check_writable, make_folder, replacing, sweep, write_atomically
 from calib.runner.cache import held
 from calib.runner.engine import LIMIT_S, Broken, Cluster, Lost, Overdue, Task, run_tasks
 from calib.runner.folder import digest_of
@@ -173,20 +174,12 @@ def with_columns(source: Path, path: Path, added: dict[str, Any]) -> None:
 
 
 def _write(path: Path, schema: Any, blocks: Iterator[Any]) -> None:
-    between = path.with_name(f".{path.name}.tmp")
-    try:
-        with between.open("wb") as stream:
-            with needed("pyarrow.parquet").ParquetWriter(stream, schema, compression="zstd") as writer:
-                for block in blocks:
-                    writer.write_batch(block)
-            stream.flush()
-            os.fsync(stream.fileno())
-        between.replace(path)
-    except OSError as error:
-        raise BadInputError(f"{shown(path)}: cannot be written: {error.strerror or error}") from error
-    finally:
-        with contextlib.suppress(OSError):
-            between.unlink()
+    with (
+        replacing(path) as stream,
+        needed("pyarrow.parquet").ParquetWriter(stream, schema, compression="zstd") as writer,
+    ):
+        for block in blocks:
+            writer.write_batch(block)
 
 
 # ----------------------------------------------------------------------
@@ -730,10 +723,12 @@ def opened_store(out: Path, verb: str, outputs: tuple[str, ...]) -> Iterator[tup
     for path in (hidden, out / "rigs", hidden / "outcomes", hidden / "scratch"):
         if path.is_symlink():
             raise BadInputError(f"{shown(path)}: is a symbolic link, expected a place in the output folder")
-    if (out / "rigs").exists() and not hidden.exists():
-        raise BadInputError(
-            f"{shown(out / 'rigs')}: is there, and is not the work of {verb}; expected another output folder"
-        )
+    for name in ("rigs", *outputs):
+        if (out / name).exists() and not hidden.exists():
+            raise BadInputError(
+                f"{shown(out / name)}: is there, and is not the work of {verb}; expected another output "
+                "folder"
+            )
     make_folder(hidden / "outcomes")
     for name in outputs:
         check_writable(out / name)
@@ -744,9 +739,7 @@ def opened_store(out: Path, verb: str, outputs: tuple[str, ...]) -> Iterator[tup
             raise BadInputError(f"{shown(out)}: holds the results of {before}, expected another folder")
         write_atomically(told, json.dumps({"verb": verb}) + "\n")
         for folder in (out, hidden / "outcomes", hidden):
-            for left in folder.glob(".*.tmp"):
-                with contextlib.suppress(OSError):
-                    left.unlink()
+            sweep(folder)
         yield Store(out), interrupted is not None
         shutil.rmtree(hidden / "scratch", ignore_errors=True)
 

@@ -19,8 +19,9 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from calib.core.errors import EXIT_DONE, EXIT_POOR, BadInputError
-from calib.core.files import check_folder, make_folder, one_line, shown, write_atomically
+from calib.core.files import inside, one_line, shown
 from calib.core.rig import SCHEMA, Rig
+from calib.core.writing import check_folder, make_folder, sweep, write_atomically
 from calib.runner.cache import Result, held, key_of, load, remove, store
 from calib.runner.folder import Folder, LogFile, digest_of, folder_digests, with_beside
 from calib.runner.work import Work, perform
@@ -461,11 +462,13 @@ def opened(out: Path, folder: Path | None) -> Iterator[int | None]:
     Raises `BadInputError` when another run is at work there, when it is the folder that is read, and for
     links that would lead a write out of it.
     """
-    if folder is not None and os.path.realpath(out) in (
-        os.path.realpath(folder), os.path.realpath(folder / "images"),
-        os.path.realpath(folder / "images" / "plane"), os.path.realpath(folder / "logs"),
-    ):  # fmt: skip
-        raise BadInputError(f"{shown(out)}: is the folder that is read, expected another one for the results")
+    if folder is not None and (
+        os.path.realpath(out) == os.path.realpath(folder)
+        or any(inside(out, folder / name) for name in ("images", "logs"))
+    ):
+        raise BadInputError(
+            f"{shown(out)}: lies in the folder that is read, expected another one for the results"
+        )
     check_folder(out)
     hidden = out / HIDDEN
     ours = [hidden / name for name in ("work", "stages", "pictures", "figures")]
@@ -473,24 +476,19 @@ def opened(out: Path, folder: Path | None) -> Iterator[int | None]:
     for path in (hidden, *ours, *public):
         if path.is_symlink():
             raise BadInputError(f"{shown(path)}: is a symbolic link, expected a place in the output folder")
+    for path in public:
+        if path.exists() and not hidden.exists():
+            raise BadInputError(
+                f"{shown(path)}: is there, and is not the work of calib run; expected another output folder"
+            )
     make_folder(hidden)
     with held(hidden / "lock", out) as interrupted:
         remove(hidden / "work")
-        _sweep(out)
+        for place in (out, hidden, hidden / "pictures", hidden / "figures"):
+            sweep(place)
         make_folder(hidden / "work")
         make_folder(hidden / "stages")
         yield interrupted
-
-
-def _sweep(out: Path) -> None:
-    """Remove what an interrupted write has left beside the file that it was about."""
-    hidden = out / HIDDEN
-    left = [path for name in ("rig.yaml", "report.html") for path in out.glob(f".{name}.*.tmp")]
-    for folder in (hidden, hidden / "pictures", hidden / "figures"):
-        left += folder.glob(".*.tmp")
-    for path in left:
-        with contextlib.suppress(OSError):
-            path.unlink()
 
 
 def _stamp(path: Path) -> tuple[int, int, int]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +13,8 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from calib.core.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_POOR, BadInputError
-from calib.core.files import make_folder, one_line, read_text, shown, write_atomically
+from calib.core.files import one_line, read_text, shown
+from calib.core.writing import make_folder, replacing, write_atomically
 from calib.runner.folder import Folder, digest_of
 from calib.runner.graph import HIDDEN, Done, Job, Runner
 
@@ -95,7 +95,7 @@ def publish(runner: Runner, ended: Sequence[Done], told: dict[str, Any]) -> list
     # Named first and written then: a file of ours is never forgotten.
     _list(out, sorted({*before, *names}))
     for name in names:
-        _copy(wanted[name], out / name, out / HIDDEN / "work")
+        _copy(wanted[name], out / name)
     left = [name for name in sorted(set(before) - set(names)) if not _removed(out, out / name)]
     for folder in {str(Path(name).parent) for name in before} - {str(Path(name).parent) for name in names}:
         with contextlib.suppress(OSError):
@@ -143,22 +143,15 @@ def _write(path: Path, text: str) -> None:
     write_atomically(path, raw)
 
 
-def _copy(source: Path, target: Path, work: Path) -> None:
+def _copy(source: Path, target: Path) -> None:
     """Copy a file of any size into place in one step."""
     make_folder(target.parent)
     if target.is_symlink() or (target.exists() and not target.is_file()):
         raise BadInputError(f"{shown(target)}: is no file of a run, and was not replaced")
     if target.is_file() and digest_of(target) == digest_of(source):
         return
-    between = work / f"copy-{target.name}"
-    try:
-        shutil.copyfile(source, between)
-        with between.open("rb+") as stream:
-            stream.flush()
-            os.fsync(stream.fileno())
-        between.replace(target)
-    except OSError as error:
-        raise BadInputError(f"{shown(target)}: cannot be written: {error.strerror or error}") from error
+    with replacing(target) as stream, source.open("rb") as whole:
+        shutil.copyfileobj(whole, stream)
 
 
 # ----------------------------------------------------------------------

@@ -22,9 +22,10 @@ import yaml
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError, CalibError
-from calib.core.files import one_line, read_yaml_mapping, sha256, shown, write_atomically
+from calib.core.files import one_line, read_yaml_mapping, sha256, shown
 from calib.core.rig import SCHEMA, Rig
 from calib.core.units import parse_duration_s
+from calib.core.writing import write_atomically
 from calib.runner.engine import LIMIT_S, Broken, Cluster, Lost, Overdue, Task, run_tasks
 from calib.runner.fleet import HIDDEN, Store, Table, column, texts, write_table
 from calib.runner.task import needed, program

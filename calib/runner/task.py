@@ -27,9 +27,10 @@ from calib.core.errors import (
     CalibError,
     pip_install,
 )
-from calib.core.files import PICTURES, make_folder, one_line, read_text, read_yaml_mapping, sha256, shown
+from calib.core.files import PICTURES, one_line, read_text, read_yaml_mapping, sha256, shown
 from calib.core.stage import name_of_flag
 from calib.core.units import parse_corners, parse_square_m
+from calib.core.writing import make_folder
 from calib.runner.cache import key_of, program_digest
 from calib.runner.folder import Folder, folder_digests, read_folder
 from calib.runner.graph import STAGES, Done, Planned, Runner, Stage, opened

@@ -14,15 +14,17 @@ import os
 import sys
 import traceback
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+from calib.core.command import one_command
 from calib.core.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERNAL, EXIT_POOR, CalibError
-from calib.core.files import check_folder, check_writable, one_line, shown, write_atomically
+from calib.core.files import one_line, shown
 from calib.core.result import section_json
-from calib.core.rig import Rig
+from calib.core.rig import SECTIONS, Rig
 from calib.core.stage import Files, Stage, options_of
+from calib.core.writing import check_figures, check_folder, check_writable, write_atomically
 from calib.stages import STAGES, stage
 
 DOCUMENT, MESSAGES, RIG, FIGURES = "document.json", "messages.txt", "rig.yaml", "figures"
@@ -58,13 +60,24 @@ def carry_out(
 
     Nothing is read before it is known that all can be written. Raises `BadInputError`.
     """
+    values = (getattr(options, one.name) for one in fields(options))
+    with one_command([*files.paths, *(value for value in values if isinstance(value, Path))]):
+        return _carried_out(made, files, options, rig_path, figures)
+
+
+def _carried_out(
+    made: Stage, files: Files, options: Any, rig_path: Path, figures: Path | None
+) -> tuple[Any, Rig]:
     if made.writes_rig(options):
-        check_writable(rig_path)
+        check_writable(rig_path, SECTIONS)
     output = made.output if files.output is not None else None
     if output is not None and output.write is not None and files.output is not None:
-        (check_folder if output.folder else check_writable)(files.output)
+        if output.folder:
+            check_folder(files.output)
+        else:
+            check_writable(files.output, None if output.kind is None else output.kind())
     if figures is not None:
-        check_folder(figures)
+        check_figures(figures)
     rig = Rig.load(rig_path, missing_ok=True)
     outcome = made.run(files, rig, options)
     sections = made.sections(outcome)
@@ -72,7 +85,7 @@ def carry_out(
         rig = rig.with_sections(sections)
         rig.save(rig_path)
     if output is not None and output.write is not None and files.output is not None:
-        files.written = [path.name for path in output.write(files.output, outcome)]
+        files.written = [path.name for path in output.write(files, outcome)]
         if files.written and output.folder:
             files.narrate(f"{', '.join(files.written)} written to {shown(files.output)}")
         elif files.written:

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from calib.core.errors import BadInputError
+from calib.core.writing import Kind, holds
 from calib.stages.camera.model import Board
 from calib.stages.camera.targets import dictionary_of
 
@@ -190,6 +191,9 @@ def _document(width_mm: float, height_mm: float, commands: list[str]) -> bytes:
     out += b"".join(b"%010d 00000 n \n" % offset for offset in offsets)
     out += b"trailer\n<< /Size %d /Root 1 0 R >>\nstartxref\n%d\n%%%%EOF\n" % (len(objects) + 1, start)
     return bytes(out)
+
+
+BOARD_PDF = Kind("a board to print", (".pdf",), holds(b"%PDF", b"(calib board", most=1 << 24))
 
 
 def board_pdf(

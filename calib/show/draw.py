@@ -39,7 +39,7 @@ from PIL import Image
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
-from calib.core.files import shown, write_atomically
+from calib.core.files import shown
 from calib.core.plot import (
     WIDTH_IN,
     Arrows,
@@ -60,6 +60,7 @@ from calib.core.plot import (
     round_down,
 )
 from calib.core.result import Result
+from calib.core.writing import Kind, begins, write_atomically
 
 HUES = {
     "ink": "#1d2730", "grey": "#66727d", "silver": "#b9c0c7", "shade": "#e9ecef", "blue": "#0072B2",
@@ -165,6 +166,9 @@ def plots(result: Result) -> dict[str, Drawing]:
     return {name.split("_", 1)[-1]: draw(figure) for name, figure in figures.items()}
 
 
+FIGURE = Kind("a figure", (".png",), begins(b"\x89PNG"))
+
+
 def save(figure: Figure, path: Path) -> Path:
     """Write a figure as PNG, atomically and without dates: the same figure gives the same bytes.
 
@@ -183,7 +187,7 @@ def save(figure: Figure, path: Path) -> Path:
     few.putpalette(np.where(palette.min(axis=1, keepdims=True) >= _NEARLY_WHITE, 255, palette).tobytes())
     buffer = io.BytesIO()
     few.save(buffer, format="png", compress_level=6)
-    write_atomically(path, buffer.getvalue())
+    write_atomically(path, buffer.getvalue(), FIGURE)
     return path
 
 

@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from calib import __version__
-from calib.core.files import write_atomically
 from calib.core.words import BLANK, SIGMA, number
+from calib.core.writing import write_atomically
 from calib.runner.fleet import ConstantSummary, FleetSummary
 from calib.runner.sweep import Point, SweepSpec, SweepSummary
+from calib.show.page import PAGE as A_PAGE
 from calib.show.page import render
 
 # ----------------------------------------------------------------------
@@ -127,7 +128,7 @@ class _Card:
 
 def write_fleet_page(path: Path, summary: FleetSummary) -> None:
     """Write the page atomically. Raises `BadInputError` when it cannot be written."""
-    write_atomically(path, fleet_page_text(summary))
+    write_atomically(path, fleet_page_text(summary), A_PAGE)
 
 
 def fleet_page_text(summary: FleetSummary) -> str:
@@ -258,7 +259,7 @@ _SWEEP_PAGE_WIDE, _SWEEP_PAGE_HIGH, _SWEEP_PAGE_LEFT, _SWEEP_PAGE_BELOW, _SWEEP_
 
 def write_sweep_page(path: Path, spec: SweepSpec, summary: SweepSummary) -> None:
     """Write the page atomically. Raises `BadInputError` when it cannot be written."""
-    write_atomically(path, sweep_page_text(spec, summary))
+    write_atomically(path, sweep_page_text(spec, summary), A_PAGE)
 
 
 def sweep_page_text(spec: SweepSpec, summary: SweepSummary) -> str:

@@ -17,9 +17,10 @@ from typing import Any
 from calib import __version__
 from calib.core.constants import constants
 from calib.core.errors import BadInputError
-from calib.core.files import make_folder, read_bytes, sha256, write_atomically
+from calib.core.files import read_bytes, sha256
 from calib.core.rig import Rig
 from calib.core.words import BLANK, SIGMA, facts, number, unit_of
+from calib.core.writing import Kind, holds, make_folder, write_atomically
 from calib.runner.cache import Result, load
 from calib.runner.graph import HIDDEN
 from calib.runner.graph import STAGES as STEPS
@@ -392,11 +393,14 @@ class _Budget:
         return True
 
 
+PAGE = Kind("a page", (".html", ".htm"), holds(b'<p class="brand">calib', most=1 << 20))
+
+
 def write_page(rig: Path, output: Path | None = None) -> Path:
     """Write the page of a rig.yaml, `report.html` beside it by default. Raises `BadInputError`."""
     target = rig.parent / "report.html" if output is None else output
     text = page_text(rig)
-    write_atomically(target, text)
+    write_atomically(target, text, PAGE)
     return target
 
 

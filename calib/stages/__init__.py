@@ -14,6 +14,7 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from calib.core.command import one_command
 from calib.core.errors import BadInputError
 from calib.core.stage import Files, Stage, options_of
 
@@ -80,7 +81,8 @@ def function(name: str) -> Callable[..., Any]:
             output=None if output is None else Path(output),
             narrate=logging.getLogger("calib").info,
         )
-        outcome = made.run(files, Rig() if rig is None else rig, options_of(made.options, options))
+        with one_command(files.paths):
+            outcome = made.run(files, Rig() if rig is None else rig, options_of(made.options, options))
         return outcome[0] if isinstance(outcome, list) and len(outcome) == 1 else outcome
 
     def call_without_sources(rig: Rig | None = None, **options: Any) -> Any:

@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 
 from calib.core.errors import BadInputError
-from calib.core.files import shown, write_atomically
+from calib.core.files import shown
+from calib.core.writing import write_atomically
 from calib.io.logs import log_text
 from calib.twin.pictures import (
     BOARD,
@@ -104,12 +105,12 @@ def _write_pictures(view: View, folder: Path) -> None:
         picture = render(
             view.camera, PrintedBoard(BOARD), shot.pose, light=shot.light, sensor=shot.sensor, seed=shot.seed
         )
-        (folder / shot.path).write_bytes(png_bytes(picture))
+        write_atomically(folder / shot.path, png_bytes(picture))
     board = f"corners: [{BOARD.columns}, {BOARD.rows}]\nsquare_m: {BOARD.square_m:.3f}\n"
     x, y = PLANE.first_corner_m
     place = f"first_corner_m: [{x:.3f}, {y:.3f}]\nangle_rad: {PLANE.angle_rad:.2f}\n"
-    (folder / "board.yaml").write_bytes(board.encode())
-    (folder / "plane" / "board.yaml").write_bytes((board + place).encode())
+    write_atomically(folder / "board.yaml", board)
+    write_atomically(folder / "plane" / "board.yaml", board + place)
 
 
 def _plain(value: Any) -> Any:

@@ -22,6 +22,7 @@ import numpy as np
 
 from calib.core.arrays import FloatArray, GrayImage
 from calib.core.errors import CalibError, UsageError
+from calib.core.writing import write_atomically
 from calib.stages.camera.model import Board, Camera
 from calib.twin.scene import Light, Pose, PrintedBoard, Sensor, corner_pixels, pose_facing, render, rotation
 
@@ -205,7 +206,7 @@ def write_pictures(folder: Path) -> list[Path]:
             CAMERA, PrintedBoard(BOARD), shot.pose, light=shot.light, sensor=shot.sensor, seed=shot.seed
         )
         written.append(folder / shot.path)
-        written[-1].write_bytes(png_bytes(image))
+        write_atomically(written[-1], png_bytes(image))
     board = f"corners: [{BOARD.columns}, {BOARD.rows}]\nsquare_m: {BOARD.square_m:.3f}\n"
     x, y = PLANE.first_corner_m
     place = f"first_corner_m: [{x:.3f}, {y:.3f}]\nangle_rad: {PLANE.angle_rad:.2f}\n"
@@ -213,7 +214,7 @@ def write_pictures(folder: Path) -> list[Path]:
         (folder / "board.yaml", board),
         (folder / "plane" / "board.yaml", board + place),
     ):
-        path.write_bytes(text.encode())
+        write_atomically(path, text)
         written.append(path)
     return written
 
@@ -226,7 +227,7 @@ def main(arguments: list[str]) -> int:
         write_pictures(Path(arguments[0]))
         if len(arguments) == 2:
             text = json.dumps(truth(), indent=1) + "\n"
-            Path(arguments[1]).write_bytes(text.encode())
+            write_atomically(Path(arguments[1]), text)
     except CalibError as error:
         sys.stderr.write(f"{error}\n")
         return error.exit_code

@@ -13,20 +13,12 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calib.core import files
+from calib.core import writing
 from calib.core.bounded_yaml import MAX_NODES, YamlProblem, load
 from calib.core.errors import BadInputError, CalibError, ReaderGoneError, UsageError
-from calib.core.files import (
-    check_folder,
-    check_readable,
-    check_writable,
-    file_sha256,
-    read_bytes,
-    read_text,
-    read_yaml_mapping,
-    write_atomically,
-)
+from calib.core.files import check_readable, file_sha256, read_bytes, read_text, read_yaml_mapping
 from calib.core.units import parse_corners, parse_duration_s, parse_length_m, plain_number
+from calib.core.writing import check_folder, check_writable, write_atomically
 
 
 def test_a_file_is_replaced_whole(tmp_path: Path) -> None:
@@ -55,7 +47,7 @@ def test_the_old_file_survives(
     elif at == "fsync":
         monkeypatch.setattr(os, "fsync", fail)
     else:
-        monkeypatch.setattr(files.os, "fdopen", fail)
+        monkeypatch.setattr(writing.os, "fdopen", fail)
     expected = BadInputError if isinstance(failure, OSError) else KeyboardInterrupt
     with pytest.raises(expected):
         write_atomically(path, "new")

@@ -247,7 +247,8 @@ def test_any_double(cells: list[float], kind: int) -> None:
 
 def test_an_interrupted_file_leaves_the_old_one(tmp_path: Path) -> None:
     path = tmp_path / "states.csv"
-    path.write_text("old\n")
+    old = ",".join(STATES) + "\n"
+    path.write_text(old)
 
     def broken() -> None:
         with states_writer(path) as states:
@@ -256,7 +257,7 @@ def test_an_interrupted_file_leaves_the_old_one(tmp_path: Path) -> None:
 
     with pytest.raises(ValueError):
         broken()
-    assert path.read_text() == "old\n"
+    assert path.read_text() == old
     assert [item.name for item in tmp_path.iterdir()] == ["states.csv"]
 
 

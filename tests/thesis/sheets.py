@@ -14,8 +14,8 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 
-from calib.core.files import write_atomically
 from calib.core.plot import Arrows, Curve, Figure, Mark, Plot, Shape, Text, circle, every, rectangle
+from calib.core.writing import write_atomically
 from calib.show.draw import draw, figure_folder, look
 from thesis.book import Drawing
 from thesis.runs import Values

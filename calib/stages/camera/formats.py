@@ -19,6 +19,7 @@ import yaml
 from calib.core.arrays import FloatArray
 from calib.core.bounded_yaml import MAX_NODES, YamlProblem, expands_beyond, load
 from calib.core.errors import BadInputError
+from calib.core.writing import Kind, holds
 from calib.stages.camera.model import COEFFICIENTS, MODELS, Camera
 
 # ----------------------------------------------------------------------
@@ -218,6 +219,15 @@ _BROWN = len(MODELS["brown5"])
 _BEYOND_RATIONAL = ("s1", "s2", "s3", "s4", "tau_x", "tau_y")
 """OpenCV's thin prism and tilted sensor, which no model here has."""
 _SKEW_LIMIT = 1e-12
+
+
+_YAML = (".yaml", ".yml")
+FILES = {
+    "ros": Kind("a camera_info of ROS", _YAML, holds(b"camera_matrix:", b"distortion_model:")),
+    "opencv": Kind("a FileStorage of OpenCV", _YAML, holds(b"%YAML", b"!!opencv-matrix")),
+    "kalibr": Kind("a camchain of Kalibr", _YAML, holds(b"cam0:", b"camera_model:")),
+}
+"""Kinds of files by the names of the formats."""
 
 
 def to_ros(camera: Camera, name: str = "camera") -> str:

@@ -11,8 +11,9 @@ import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
-from calib.core.files import read_text, shown, write_atomically
+from calib.core.files import read_text, shown
 from calib.core.rig import Rig
+from calib.core.writing import Kind, column_names, write_atomically
 from calib.stages.actuator.kinematics import inverse
 from calib.stages.control.laws import Model
 from calib.stages.control.references import (
@@ -140,9 +141,13 @@ def reference_of(text: str, model: Model, duration_s: float | None = None) -> Re
     return read_reference(path, model)
 
 
+_HEAD = ("t_s", "q1_m", "q2_m", "phi_rad")
+REFERENCE = Kind("a reference", (".csv",), lambda path: column_names(path) == _HEAD)
+
+
 def reference_text(reference: Reference) -> str:
     """CSV with time and lengths."""
-    rows = ["t_s,q1_m,q2_m,phi_rad"]
+    rows = [",".join(_HEAD)]
     for t, (q1, q2), phi in zip(
         reference.t_s.tolist(), reference.q_m.tolist(), reference.phi_rad.tolist(), strict=True
     ):
@@ -152,7 +157,7 @@ def reference_text(reference: Reference) -> str:
 
 def write_reference(path: Path, reference: Reference) -> None:
     """Write a reference atomically. Raises `BadInputError` where the place cannot be written."""
-    write_atomically(path, reference_text(reference))
+    write_atomically(path, reference_text(reference), REFERENCE)
 
 
 # ----------------------------------------------------------------------

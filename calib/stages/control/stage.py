@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from calib.core.rig import Rig
     from calib.core.stage import Progress
     from calib.core.words import Block
+    from calib.core.writing import Kind
     from calib.stages.control.laws import Model, Pid
     from calib.stages.control.references import Reference
     from calib.stages.control.section import AntiWindup, Controller, ControllerMargins, StaticMap
@@ -336,13 +337,19 @@ def _check_plots(checked: Checked) -> dict[str, Figure]:
     return check_plots(checked.model, checked.reference, checked.follow, checked.slower)
 
 
-def _write_slower(path: Path, checked: Checked) -> list[Path]:
+def _reference_kind() -> Kind:
+    from calib.stages.control.read import REFERENCE
+
+    return REFERENCE
+
+
+def _write_slower(files: Files, checked: Checked) -> list[Path]:
     from calib.stages.control.read import write_reference
 
-    if checked.never:
+    if checked.never or files.output is None:
         return []
-    write_reference(path, checked.slower or checked.reference)
-    return [path]
+    write_reference(files.output, checked.slower or checked.reference)
+    return [files.output]
 
 
 check = Stage(
@@ -364,6 +371,7 @@ check = Stage(
         _write_slower,
         flags=("--slow",),
         metavar="CSV",
+        kind=_reference_kind,
     ),
     document=_check_document,
     words=_check_words,

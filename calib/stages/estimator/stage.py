@@ -48,7 +48,8 @@ class ReplayInputs:
 
 
 def _read(files: Files, rig: Rig, options: ReplayOptions) -> ReplayInputs:
-    from calib.core.files import check_folder, check_writable, make_folder
+    from calib.core.writing import check_folder, check_writable, make_folder
+    from calib.io.states import STATES_FILE
 
     if options.estimator == "baseline" and (options.smooth or options.tune):
         raise UsageError("--estimator baseline: cannot be smoothed or tuned")
@@ -58,7 +59,7 @@ def _read(files: Files, rig: Rig, options: ReplayOptions) -> ReplayInputs:
         make_folder(files.output)
         outputs = _names(files.paths, files.output, options.states_format)
     elif files.output is not None:
-        check_writable(files.output)
+        check_writable(files.output, STATES_FILE)
     if options.tune:
         for path in files.paths:
             files.taken(path)
@@ -71,6 +72,8 @@ def _names(paths: Sequence[Path], folder: Path, ending: str) -> list[Path | None
     Names of logs may hold anything, and two logs in different folders may share one.
     """
     from calib.core.files import inside, shown, slug
+    from calib.core.writing import check_writable
+    from calib.io.states import STATES_FILE
 
     slugs: list[str] = []
     out: list[Path | None] = []
@@ -79,6 +82,7 @@ def _names(paths: Sequence[Path], folder: Path, ending: str) -> list[Path | None
         states = folder / f"{slugs[-1]}_states.{ending}"
         if states.is_symlink() and not inside(states, folder):
             raise BadInputError(f"{shown(states)}: is a link out of {shown(folder)}, nothing was written")
+        check_writable(states, STATES_FILE)
         out.append(states)
     return out
 

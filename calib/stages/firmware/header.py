@@ -19,9 +19,9 @@ import jinja2
 import numpy as np
 
 from calib import __version__
-from calib.core.files import make_folder, write_atomically
 from calib.core.result import identity
 from calib.core.verdict import Finding, Verdict
+from calib.core.writing import Kind, begins, make_folder, write_atomically
 from calib.stages.camera.lens import fit_inverse
 from calib.stages.camera.model import COEFFICIENTS, MODELS
 from calib.stages.camera.section import InverseLens
@@ -122,8 +122,15 @@ class Header:
             inputs=dict(sorted(self.inputs.items())),
         )
 
+    @staticmethod
+    def sketch(folder: Path) -> str:
+        """Name of the sketch in a folder: the Arduino IDE wants it to bear the folder's."""
+        return f"{folder.resolve().name or 'calib_example'}.ino"
+
     def write(self, folder: Path | str) -> list[Path]:
         """Write the header and, where there is a plane, pipeline, self-test and sketch; the files written.
+
+        A sketch that is there and says something else is left as it is: it is an example to be changed.
 
         Raises `BadInputError` where the folder cannot be written.
         """
@@ -134,15 +141,22 @@ class Header:
         if self.camera.plane is not None:
             texts["calib_pipeline.h"] = verbatim("calib_pipeline.h")
             texts["calib_selftest.h"] = selftest_text(self)
-            # The Arduino IDE wants a sketch to bear the name of its folder.
-            texts[f"{where.resolve().name or 'calib_example'}.ino"] = verbatim("calib_example.ino")
+            texts[self.sketch(where)] = verbatim("calib_example.ino")
         make_folder(where)
+        written = []
         for name, text in texts.items():
-            write_atomically(where / name, text)
-        return [where / name for name in texts]
+            path = where / name
+            if name.endswith(".ino") and path.is_file() and path.read_bytes() != text.encode():
+                continue
+            write_atomically(path, text, HEADER)
+            written.append(path)
+        return written
 
     def __str__(self) -> str:
         return self.text
+
+
+HEADER = Kind("a source of the firmware", (".h", ".ino"), begins(b"/*\n * calib_"))
 
 
 def rendered(template: str, header: Header, **more: Any) -> str:

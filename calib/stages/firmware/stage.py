@@ -60,10 +60,17 @@ def _solve(inputs: FirmwareInputs) -> Header | Check:
     return header if inputs.frames is None else check_frames(header, inputs.frames, inputs.log)
 
 
-def _write(folder: Path, outcome: Header | Check) -> list[Path]:
+def _write(files: Files, outcome: Header | Check) -> list[Path]:
+    from calib.core.files import shown
     from calib.stages.firmware.header import Header
 
-    return outcome.write(folder) if isinstance(outcome, Header) else []
+    if files.output is None or not isinstance(outcome, Header):
+        return []
+    written = outcome.write(files.output)
+    sketch = files.output / outcome.sketch(files.output)
+    if sketch.exists() and sketch not in written:
+        files.narrate(f"{shown(sketch)}: was changed since calib wrote it, and is left as it is")
+    return written
 
 
 def _document(outcome: Header | Check) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from typing import Any
 
 from calib.core.errors import BadInputError
 from calib.core.files import one_line
+from calib.core.writing import Kind, holds
 from calib.stages.imu.section import Imu
 
 _KEYS = {
@@ -78,6 +79,9 @@ def _largest(section: Imu, key: str) -> tuple[float | None, bool]:
         return None, False
     largest = max([*estimates, *limits])
     return largest, largest not in estimates
+
+
+IMU_YAML = Kind("an imu.yaml of Kalibr", (".yaml", ".yml"), holds(b"rostopic: ", b"update_rate: "))
 
 
 def to_kalibr(section: Imu, topic: str = "/imu0") -> str:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from calib.core.rig import Rig
     from calib.core.verdict import Finding
     from calib.core.words import Block
+    from calib.core.writing import Kind
     from calib.stages.imu.drift import LogDrift, Measures
     from calib.stages.imu.intrinsics import Gyroscope, Intrinsics, PoseLog
     from calib.stages.imu.read import TuneLog
@@ -178,12 +179,19 @@ def _rest_log(log: StaticLog) -> ImuLog:
     )
 
 
-def _write_kalibr(path: Path, imu: Imu) -> list[Path]:
-    from calib.core.files import write_atomically
-    from calib.stages.imu.formats import to_kalibr
+def _imu_yaml() -> Kind:
+    from calib.stages.imu.formats import IMU_YAML
 
-    write_atomically(path, to_kalibr(imu))
-    return [path]
+    return IMU_YAML
+
+
+def _write_kalibr(files: Files, imu: Imu) -> list[Path]:
+    from calib.core.writing import write_atomically
+    from calib.stages.imu.formats import IMU_YAML, to_kalibr
+
+    assert files.output is not None
+    write_atomically(files.output, to_kalibr(imu), IMU_YAML)
+    return [files.output]
 
 
 def _static_plots(imu: Imu) -> dict[str, Figure]:
@@ -215,7 +223,7 @@ static = Stage(
     sources="Logs of the rig at rest.",
     metavar="LOG...",
     writes=("imu",),
-    output=Output("Kalibr's imu.yaml to write as well.", _write_kalibr, ("--imu-yaml",)),
+    output=Output("Kalibr's imu.yaml to write as well.", _write_kalibr, ("--imu-yaml",), kind=_imu_yaml),
     words=_static_words,
     plots=_static_plots,
 )
