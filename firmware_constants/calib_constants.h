@@ -1,7 +1,7 @@
 /*
  * calib_constants.h - constants of one rig, written by calib 0.1.0. Do not edit.
  *
- * SHA-256 of the values: 2c7033224a956d95eee5f970f2eba1e52fdde07bd3cbfb789c47570b24853342
+ * SHA-256 of the values: e01c96bda509d141c9ad8b52eda1485b02d338fcd7dfe2ee03764c142f51eab5
  * input camera/board.yaml: f77bc61378d4ff28baac9883646ca1bf8dc43576acf495b4800377effe06e39b
  * input camera/view01.png: a8a5d43cd237c318df2372ece67ce52fa2a09171cff9447bb68af2394a832c30
  * input camera/view02.png: 74159ff201b50cc6f7316fa06817c34155aa126f4f03cb7415b51f5489fcb730
@@ -61,7 +61,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x2C703322UL
+#define CALIB_ID 0xE01C96BDUL
 
 /* Camera (2.5) and lens (B.1). */
 #define CALIB_IMAGE_WIDTH_PX 316 /* columns */
@@ -70,13 +70,13 @@
 #define CALIB_CAMERA_GREATEST_U_PX 315.5f /* greatest u inside the picture, px; the least is -0.5 */
 #define CALIB_CAMERA_GREATEST_V_PX 207.5f /* greatest v inside the picture, px; the least is -0.5 */
 #define CALIB_CAMERA_HAS_LENS 1 /* 0: no distortion, default of CALIB_UNDISTORT */
-#define CALIB_CAMERA_FX_PX 273.409546f /* focal length along u, px; sigma_mu of (2.5) */
+#define CALIB_CAMERA_FX_PX 273.409576f /* focal length along u, px; sigma_mu of (2.5) */
 #define CALIB_CAMERA_FY_PX 272.603973f /* focal length along v, px; sigma_nu of (2.5) */
 #define CALIB_CAMERA_SKEW_PX 0.0f /* skew, px; gamma of (2.5) */
-#define CALIB_CAMERA_CX_PX 160.670013f /* principal point, px from the centre of the left column; mu_0 of (2.5) */
-#define CALIB_CAMERA_CY_PX 101.869606f /* principal point, px from the centre of the top row; nu_0 of (2.5) */
-#define CALIB_CAMERA_K1 -0.220018402f /* lens, dimensionless, OpenCV's order and signs */
-#define CALIB_CAMERA_K2 0.549356937f /* lens, dimensionless, OpenCV's order and signs */
+#define CALIB_CAMERA_CX_PX 160.670029f /* principal point, px from the centre of the left column; mu_0 of (2.5) */
+#define CALIB_CAMERA_CY_PX 101.869591f /* principal point, px from the centre of the top row; nu_0 of (2.5) */
+#define CALIB_CAMERA_K1 -0.220018521f /* lens, dimensionless, OpenCV's order and signs */
+#define CALIB_CAMERA_K2 0.549357474f /* lens, dimensionless, OpenCV's order and signs */
 
 /*
  * Inverse lens, normalised coordinates: yd = (v - cy) / fy, xd = (u - cx - skew yd) / fx, then
@@ -87,38 +87,38 @@
 #define CALIB_LENS_DECENTERING_STEPS 0 /* 0: no decentering */
 #define CALIB_CAMERA_HAS_SKEW 0 /* for #if */
 #define CALIB_CAMERA_PER_FX 0.00365751656f /* 1 / fx, 1/px */
-#define CALIB_CAMERA_PER_FY 0.00366832525f /* 1 / fy, 1/px */
-#define CALIB_LENS_INVERSE_C1 0.217687085f /* coefficient of r2^1, dimensionless */
-#define CALIB_LENS_INVERSE_C2 -0.333740503f /* coefficient of r2^2, dimensionless */
-#define CALIB_LENS_INVERSE_C3 -1.56922519f /* coefficient of r2^3, dimensionless */
-#define CALIB_LENS_INVERSE_C4 3.4366219f /* coefficient of r2^4, dimensionless */
-#define CALIB_LENS_INVERSE_C5 -2.06394172f /* coefficient of r2^5, dimensionless */
+#define CALIB_CAMERA_PER_FY 0.00366832502f /* 1 / fy, 1/px */
+#define CALIB_LENS_INVERSE_C1 0.217687204f /* coefficient of r2^1, dimensionless */
+#define CALIB_LENS_INVERSE_C2 -0.333740741f /* coefficient of r2^2, dimensionless */
+#define CALIB_LENS_INVERSE_C3 -1.56922758f /* coefficient of r2^3, dimensionless */
+#define CALIB_LENS_INVERSE_C4 3.4366281f /* coefficient of r2^4, dimensionless */
+#define CALIB_LENS_INVERSE_C5 -2.06394625f /* coefficient of r2^5, dimensionless */
 #define CALIB_LENS_INVERSE_P(r2) (1.0f + (r2) * (CALIB_LENS_INVERSE_C1 + (r2) * (CALIB_LENS_INVERSE_C2 + (r2) * (CALIB_LENS_INVERSE_C3 + (r2) * (CALIB_LENS_INVERSE_C4 + (r2) * (CALIB_LENS_INVERSE_C5)))))) /* P by Horner's scheme */
 
 /* Plane of the actuator, without the shift and stretch that align has found. */
 #define CALIB_HAS_PLANE 1 /* for #if */
 #define CALIB_PLANE_OK 1 /* 0: the plane failed its gate */
 #define CALIB_PLANE_INVERSE_11 0.00365899038f /* row 1, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
-#define CALIB_PLANE_INVERSE_12 -8.8428118e-05f /* row 1, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
+#define CALIB_PLANE_INVERSE_12 -8.84281471e-05f /* row 1, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
 #define CALIB_PLANE_INVERSE_13 -0.59911108f /* row 1, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
-#define CALIB_PLANE_INVERSE_21 7.93001309e-05f /* row 2, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
+#define CALIB_PLANE_INVERSE_21 7.93001382e-05f /* row 2, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
 #define CALIB_PLANE_INVERSE_22 0.00362181547f /* row 2, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
 #define CALIB_PLANE_INVERSE_23 -0.160717785f /* row 2, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
-#define CALIB_PLANE_INVERSE_31 -0.000315899641f /* row 3, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
-#define CALIB_PLANE_INVERSE_32 -0.000872946228f /* row 3, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
+#define CALIB_PLANE_INVERSE_31 -0.000315899902f /* row 3, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
+#define CALIB_PLANE_INVERSE_32 -0.000872945704f /* row 3, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
 #define CALIB_PLANE_INVERSE_33 3.76397467f /* row 3, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
 
 /* The same from normalised undistorted coordinates, for CALIB_UNDISTORT 1. */
 #define CALIB_PLANE_NORMALISED_11 1.00040293f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_12 -0.0241058562f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_13 -0.0202291384f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_21 0.0216814131f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_12 -0.0241058655f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_13 -0.02022909f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_21 0.0216814149f /* row 2, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_22 0.987321317f /* row 2, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_23 0.220976308f /* row 2, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_31 -0.0863699839f /* row 3, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_32 -0.237968609f /* row 3, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_23 0.220976233f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_31 -0.0863700584f /* row 3, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_32 -0.237968475f /* row 3, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_33 3.62429237f /* row 3, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_LEAST_PER_M 0.356375545f /* 1/s below this: behind the horizon, 1/m */
+#define CALIB_PLANE_LEAST_PER_M 0.356375515f /* 1/s below this: behind the horizon, 1/m */
 
 /*
  * The same from pixels as the camera reports them, fitted over the workspace, for
@@ -126,14 +126,14 @@
  */
 #define CALIB_HAS_RAW_PLANE 1 /* 0: the workspace is not in sight */
 #define CALIB_PLANE_RAW_11 0.00369097712f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_12 -8.82029344e-05f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_12 -8.82029635e-05f /* row 1, distorted px to m */
 #define CALIB_PLANE_RAW_13 -0.6043787f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_21 7.21787364e-05f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_21 7.21787583e-05f /* row 2, distorted px to m */
 #define CALIB_PLANE_RAW_22 0.00363199529f /* row 2, distorted px to m */
 #define CALIB_PLANE_RAW_23 -0.160419032f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_31 -0.000436221279f /* row 3, distorted px to m */
-#define CALIB_PLANE_RAW_32 -0.00111492141f /* row 3, distorted px to m */
-#define CALIB_PLANE_RAW_33 3.81185985f /* row 3, distorted px to m */
+#define CALIB_PLANE_RAW_31 -0.000436221308f /* row 3, distorted px to m */
+#define CALIB_PLANE_RAW_32 -0.0011149213f /* row 3, distorted px to m */
+#define CALIB_PLANE_RAW_33 3.81185961f /* row 3, distorted px to m */
 #define CALIB_PLANE_RAW_LEAST_PER_M 0.35496065f /* 1/s below this: behind the horizon, 1/m */
 
 /*

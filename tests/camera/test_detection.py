@@ -13,7 +13,7 @@ import pytest
 from calib.core.arrays import FloatArray, GrayImage
 from calib.io.pictures import list_pictures, read_picture
 from calib.stages.camera.bundle import calibrate
-from calib.stages.camera.corners import detect, find_size
+from calib.stages.camera.corners import Detection, detect, find_size
 from calib.stages.camera.model import Board, Camera, View, pack
 from calib.twin.scene import PrintedBoard, Sensor, corner_pixels, pose_facing, render
 
@@ -67,9 +67,83 @@ def _opencv_classic(gray: GrayImage, size: tuple[int, int]) -> FloatArray | None
     return cv2.cornerSubPix(gray, corners, (5, 5), (-1, -1), ends).reshape(-1, 2) if found else None
 
 
-def _opencv_sb(gray: GrayImage, size: tuple[int, int]) -> FloatArray | None:
-    found, corners = cv2.findChessboardCornersSB(gray, size, flags=cv2.CALIB_CB_ACCURACY)
+def _opencv_sb(gray: GrayImage, size: tuple[int, int], flags: int = 0) -> FloatArray | None:
+    found, corners = cv2.findChessboardCornersSB(gray, size, flags=cv2.CALIB_CB_ACCURACY | flags)
     return corners.reshape(-1, 2) if found else None
+
+
+def _opencv_exhaustive(gray: GrayImage, size: tuple[int, int]) -> FloatArray | None:
+    return _opencv_sb(gray, size, cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE)
+
+
+def _unsharp(radius_px: float, gain: float) -> Callable[[GrayImage], GrayImage]:
+    def sharpened(gray: GrayImage) -> GrayImage:
+        picture = gray.astype(np.float32)
+        halo = gain * (picture - cv2.GaussianBlur(picture, (0, 0), radius_px))
+        return np.clip(picture + halo, 0, 255).astype(np.uint8)
+
+    return sharpened
+
+
+def _otsu(gray: GrayImage) -> GrayImage:
+    return np.asarray(cv2.threshold(gray, 0, 255, cv2.THRESH_BINARY | cv2.THRESH_OTSU)[1])
+
+
+def _jpeg(gray: GrayImage) -> GrayImage:
+    return np.asarray(cv2.imdecode(cv2.imencode(".jpg", gray, [cv2.IMWRITE_JPEG_QUALITY, 10])[1], 0))
+
+
+def _gamma(power: float) -> Callable[[GrayImage], GrayImage]:
+    return lambda gray: np.asarray(255 * (gray / 255) ** power).astype(np.uint8)
+
+
+VARIANTS: dict[str, Callable[[GrayImage], GrayImage]] = {
+    "as taken": lambda gray: gray,
+    "sharpened 1 px": _unsharp(1.0, 3.0),
+    "sharpened 2 px": _unsharp(2.0, 2.0),
+    "sharpened 3 px": _unsharp(3.0, 4.0),
+    "two tones": _otsu,
+    "JPEG 10": _jpeg,
+    "bright": _gamma(0.4),
+    "dark": _gamma(2.5),
+    "blurred": lambda gray: np.asarray(cv2.GaussianBlur(gray, (0, 0), 2.0)),
+    "median": lambda gray: np.asarray(cv2.medianBlur(gray, 5)),
+    "half": lambda gray: np.asarray(cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)),
+    "double": lambda gray: np.asarray(cv2.resize(gray, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)),
+    "pale": lambda gray: (100 + 0.15 * gray).astype(np.uint8),
+}
+
+
+@pytest.mark.parametrize(
+    ("folder", "size", "variant"),
+    [
+        ("gloworm_qvga", (8, 6), "sharpened 1 px"),
+        ("gloworm_qvga", (8, 6), "sharpened 3 px"),
+        ("opencv_left", (9, 6), "two tones"),
+    ],
+)
+def test_sharpened_boards_are_found(
+    shared_data: Path, folder: str, size: tuple[int, int], variant: str
+) -> None:
+    for path in list_pictures([shared_data / folder]):
+        found = detect(VARIANTS[variant](read_picture(path).gray), *size)
+        assert found is not None, path.name
+        assert found.refined.mean() > 0.9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize(
+    ("folder", "size"),
+    [("opencv_left", (9, 6)), ("gloworm_qvga", (8, 6)), ("udacity_lane", (9, 6)), ("ocam_fish2", (8, 6))],
+)
+def test_as_many_boards_as_the_best_of_opencvs_finders(
+    shared_data: Path, folder: str, size: tuple[int, int], variant: str
+) -> None:
+    grays = [VARIANTS[variant](read_picture(path).gray) for path in list_pictures([shared_data / folder])]
+    finders = (_opencv_classic, _opencv_sb, _opencv_exhaustive)
+    theirs = [sum(find(gray, size) is not None for gray in grays) for find in finders]
+    assert sum(detect(gray, *size) is not None for gray in grays) >= max(theirs)
 
 
 @pytest.mark.parametrize(("camera", "most_px"), [(VGA, 0.02), (PIXY, 0.025)], ids=["640x480", "316x208"])
@@ -92,6 +166,47 @@ def test_error_against_rendered_truth_is_below_opencvs(camera: Camera, most_px: 
     rmse = {name: float(np.sqrt(np.mean(values))) for name, values in errors.items() if values}
     assert rmse["ours"] <= most_px
     assert all(rmse["ours"] < value for name, value in rmse.items() if name != "ours"), rmse
+
+
+PARALLEL = 0.04
+"""Roll of a board whose edges run almost along the pixels, rad."""
+LARGE = Camera("pinhole", (1280, 960), 1100.0, 1100.0, 0.0, 640.3, 478.9, np.zeros(8))
+
+
+def _error(detection: Detection | None, truth: FloatArray) -> FloatArray:
+    assert detection is not None
+    pixels = detection.pixels
+    return min((pixels - truth, pixels[::-1] - truth), key=lambda error: float(np.sum(error**2)))
+
+
+@pytest.mark.parametrize(
+    ("camera", "size", "roll_rad", "blur_px", "after"),
+    [
+        (PIXY, (9, 6), PARALLEL, 0.3, "as taken"),
+        (VGA, (9, 6), PARALLEL, 0.3, "as taken"),
+        # Squares of 200 px, which are averaged over blocks where edges are blurred.
+        (LARGE, (4, 3), PARALLEL, 0.3, "as taken"),
+        (LARGE, (4, 3), PARALLEL, 0.7, "as taken"),
+        (LARGE, (4, 3), None, 3.0, "as taken"),
+        (VGA, (9, 6), None, 0.7, "sharpened 1 px"),
+        (VGA, (9, 6), PARALLEL, 0.7, "sharpened 2 px"),
+        (VGA, (9, 6), None, 0.7, "sharpened 2 px"),
+    ],
+)
+def test_sharp_edges_are_placed_to_a_hundredth_of_a_pixel(
+    camera: Camera, size: tuple[int, int], roll_rad: float | None, blur_px: float, after: str
+) -> None:
+    """RMSE of at most .012 px, or what the noise allows, and an honest sigma."""
+    errors, sigmas = [], []
+    for seed in range(4):
+        gray, truth = _picture(camera, Board(*size, 0.025), seed, roll_rad, blur_px=blur_px, gamma=1.0)
+        detection = detect(VARIANTS[after](gray), *size)
+        errors.append(_error(detection, truth))
+        sigmas.append(detection.sigma_px)
+    rmse, sigma = np.sqrt(np.mean(np.square(errors))), np.sqrt(np.mean(np.square(sigmas)))
+    assert rmse < max(0.012, 1.2 * sigma)
+    assert rmse < 2.5 * sigma
+    assert np.max(np.abs(errors)) < 0.1
 
 
 @pytest.mark.parametrize("size", [(7, 5), (9, 6), (4, 4), (5, 4)])

@@ -22,7 +22,6 @@ from calib.stages.camera.lattice import (
 )
 from calib.stages.camera.refine import (
     Refined,
-    fit_corners,
     frames_of,
     misshape,
     part_around,
@@ -91,6 +90,8 @@ _UNREFINED_SHARE = 0.1
 _MISFIT = 0.08
 """Largest typical distance of a corner from where the others place it, in squares."""
 _MEDIAN_RESIDUAL = 0.25
+_CLOSE_MISFIT = 0.02
+"""Misfit, in squares, of a grid below which corners may have another shape."""
 _LEAST_AMPLITUDE = 2.5
 """Grey levels."""
 _CONTINUES = 0.4
@@ -152,7 +153,7 @@ def fault_of(gray: GrayImage, grid: Refined) -> str | None:
         return "corners that are none"
     if np.median(np.abs(grid.amplitude)) < _LEAST_AMPLITUDE:
         return "too little contrast"
-    if np.median(grid.residual) > _MEDIAN_RESIDUAL:
+    if np.median(grid.residual) > _MEDIAN_RESIDUAL and not grid.misfit_px < _CLOSE_MISFIT * square:
         return "corners of another shape"
     if not grid.misfit_px < _MISFIT * square:
         return "corners off the grid"
@@ -192,7 +193,7 @@ def surroundings(gray: GrayImage, grid: Refined) -> Surroundings:
     for v, v1 in ((0, 1), (-1, -2)):
         for u, u1 in ((0, 1), (-1, -2)):
             place[v, u] = place[v, u1] + place[v1, u] - place[v1, u1]
-    part = part_around(gray, place)
+    part = part_around(gray, place, grid.k, grid.halo_px)
     if part is None:
         return Surroundings(nothing, nothing)
     image, local = part.image, part.points
@@ -211,7 +212,7 @@ def surroundings(gray: GrayImage, grid: Refined) -> Surroundings:
     chosen = np.flatnonzero((inside & (parity * half_step > 0.5 * least) & (unlike < 1.0)).ravel())
     found: BoolArray = np.zeros(rows * columns, dtype=np.bool_)
     if len(chosen):
-        fit = fit_corners(image, local.reshape(-1, 2)[chosen], frames.take(chosen), _ITERATIONS, _REACH_PX)
+        fit = part.fit(local.reshape(-1, 2)[chosen], frames.take(chosen), _ITERATIONS, _REACH_PX)
         square = np.minimum(np.linalg.norm(frames.along, axis=1), np.linalg.norm(frames.across, axis=1))
         near = np.linalg.norm(fit.points - local.reshape(-1, 2)[chosen], axis=1) < 0.3 * square[chosen]
         strong = parity.ravel()[chosen] * fit.amplitude > least

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -27,11 +27,19 @@ from calib.stages.camera.lattice import extrapolated
 #
 #     I = (1 + g_x x + g_y y) (b + a erf(d1 / w) erf(d2 / w))
 #
-# Light that is not even scales dark and bright alike, hence one gradient g. The eleven parameters u0, v0,
+# Light that is not even scales dark and bright alike, hence one gradient g. The parameters u0, v0,
 # alpha, beta, w, b, a, g_x, g_y, kappa, lambda of each corner are found by Levenberg-Marquardt. The
 # curvatures are measured much better by the row and column of corners than by a single window: that
-# value and its standard deviation enter as one more observation. The window is a parallelogram along
-# the board, so that the model holds in all of it.
+# value and its standard deviation enter as one more observation. So do the tones b and a of the start,
+# weakly: in a picture that is full everywhere nothing else holds them. The window is a parallelogram
+# along the board, so that the model holds in all of it.
+#
+# A camera that sharpens adds h times the difference between the picture and itself blurred by a Gaussian
+# of standard deviation r. Of the product of two edges that leaves
+#
+#     (1 + h) erf(d1 / w) erf(d2 / w) - h erf(d1 / w') erf(d2 / w'),   w'^2 = w^2 + 2 r^2,
+#
+# with h for a twelfth parameter; r is one for the whole picture.
 
 WINDOW = 0.45
 """Half the window's width over the local square: the next corner must not come in."""
@@ -43,11 +51,16 @@ _STEP_SIGMA = 0.05
 _WHITE = np.float32(255.0)
 _NOISE, _LEAST_NOISE = 0.04, 1.0
 _LEAST_BEND_SIGMA = 1e-6
-_WARM_RESIDUAL = 0.3
+_WARM_RESIDUAL = 0.5
 _START_WIDTH_PX = 1.2
-_WIDTH_PX = (0.3, 12.0)
+_WIDTH_PX = (0.408, 12.0)
+"""The least width is that of a pixel's aperture: sqrt(2 / 12) px."""
 _PARAMETERS = 11
-_BENDS = slice(9, 11)
+_WIDTH = 4
+_OBSERVED = np.array([5, 6, 9, 10])
+"""Parameters that are observed beside the picture: b, a, kappa and lambda."""
+_TONE_SIGMA = 5.0
+"""Standard deviation of the tones of the start, grey levels."""
 _UNKNOWN_BEND = 3e-3
 _PART_PIXELS, _LEAST_PART = 24_000, 8
 """Corners are fitted in parts of about so many pixels, whose arrays stay in the processor's cache."""
@@ -90,7 +103,7 @@ class LocalFit:
     residual : (N,) RMS of the fit over |amplitude|.
     width_px : (N,) sqrt(2) times the standard deviation of the blur.
     window : (N,) half the width of the window over the local square.
-    parameters : (N, 11) as the fit holds them, to start another one.
+    parameters : (N, 11) as the fit holds them, to start another one, or (N, 12) with h.
     converged : (N,) whether the last step was small and the window held enough of the corner.
     """
 
@@ -216,27 +229,32 @@ def _edge(d: _Float32, w: _Float32) -> tuple[_Float32, _Float32, _Float32]:
     return np.copysign(1.0 - series * bell, z), slope, -slope * z
 
 
-def _model(q: _Float32, win: _Windows, room: _Float32) -> tuple[_Float32, _Float32]:
-    """Residuals (N, M) and the Jacobian of the model (N, 11, M), in `room`, both zero outside the window."""
+def _model(q: _Float32, win: _Windows, room: _Float32, halo_px: float) -> tuple[_Float32, _Float32]:
+    """Residuals (N, M) and the Jacobian of the model (N, P, M), in `room`, both zero outside the window."""
     u0, v0, alpha, beta, w, b, a, gx, gy, kappa, lam = (q[:, k, None] for k in range(_PARAMETERS))
     x, y = win.x - u0, win.y - v0
     c1, s1, c2, s2 = np.cos(alpha), np.sin(alpha), np.cos(beta), np.sin(beta)
     t1, t2 = c1 * x + s1 * y, c2 * x + s2 * y
     n1, n2 = c1 * y - s1 * x, s2 * x - c2 * y
     k1t, k2t = kappa * t1, lam * t2
-    E1, G1, W1 = _edge(n1 - 0.5 * k1t * t1, w)
-    E2, G2, W2 = _edge(n2 + 0.5 * k2t * t2, w)
-    light = (1.0 + gx * x + gy * y) * win.weight
-    P = E1 * E2
-    tone = b + a * P
+    d1, d2 = n1 - 0.5 * k1t * t1, n2 + 0.5 * k2t * t2
+    P, P1, P2, Pw = _crossing(d1, d2, w)
     J = room[: len(q)]
-    by_d1, by_d2 = a * light * G1 * E2, a * light * E1 * G2
+    light = (1.0 + gx * x + gy * y) * win.weight
+    if halo_px:
+        h, wide = q[:, _PARAMETERS, None], np.sqrt(w * w + np.float32(2.0 * halo_px**2))
+        Q, Q1, Q2, Qw = _crossing(d1, d2, wide)
+        J[:, _PARAMETERS] = a * light * (P - Q)
+        P, P1, P2 = P + h * (P - Q), P1 + h * (P1 - Q1), P2 + h * (P2 - Q2)
+        Pw = Pw + h * (Pw - Qw * (w / wide))
+    tone = b + a * P
+    by_d1, by_d2 = a * light * P1, a * light * P2
     toned = win.weight * tone
     J[:, 0] = by_d1 * (s1 + k1t * c1) - by_d2 * (s2 + k2t * c2) - gx * toned
     J[:, 1] = by_d1 * (k1t * s1 - c1) + by_d2 * (c2 - k2t * s2) - gy * toned
     J[:, 2] = by_d1 * (-t1 - k1t * n1)
     J[:, 3] = by_d2 * (t2 - k2t * n2)
-    J[:, 4] = a * light * (W1 * E2 + E1 * W2)
+    J[:, 4] = a * light * Pw
     J[:, 5] = light
     J[:, 6] = light * P
     J[:, 7] = x * toned
@@ -252,15 +270,22 @@ def _model(q: _Float32, win: _Windows, room: _Float32) -> tuple[_Float32, _Float
     return (win.grey * win.weight - shown).astype(np.float32, copy=False), J
 
 
+def _crossing(d1: _Float32, d2: _Float32, w: _Float32) -> tuple[_Float32, _Float32, _Float32, _Float32]:
+    """erf(d1 / w) erf(d2 / w) and its derivatives by d1, d2 and w."""
+    E1, G1, W1 = _edge(d1, w)
+    E2, G2, W2 = _edge(d2, w)
+    return E1 * E2, G1 * E2, E1 * G2, W1 * E2 + E1 * W2
+
+
 def _start(points: FloatArray, frames: Frames, win: _Windows, room: _Float32) -> FloatArray:
-    """Parameters (N, 11) with position and directions of the grid, and the grey levels that fit them."""
-    q = np.zeros((len(points), _PARAMETERS))
+    """Parameters (N, P) with position and directions of the grid, and the grey levels that fit them."""
+    q = np.zeros((len(points), room.shape[1]))
     q[:, :2] = points - win.centre
     q[:, 2] = np.arctan2(frames.along[:, 1], frames.along[:, 0])
     q[:, 3] = np.arctan2(frames.across[:, 1], frames.across[:, 0])
     q[:, 4] = _START_WIDTH_PX
-    q[:, _BENDS] = frames.bends
-    _, J = _model(q.astype(np.float32), win, room)
+    q[:, 9:11] = frames.bends
+    _, J = _model(q.astype(np.float32), win, room, 0.0)
     ones, P = J[:, 5].astype(np.float64), J[:, 6].astype(np.float64)
     grey = win.grey * win.weight
     n, sum_p, sum_pp = ones.sum(axis=1), P.sum(axis=1), (P * P).sum(axis=1)
@@ -279,6 +304,7 @@ def fit_corners(
     reach_px: int = REACH_PX,
     window: float = WINDOW,
     warm: LocalFit | None = None,
+    halo_px: float = 0.0,
 ) -> LocalFit:
     """Fit the blurred corner around each of N points.
 
@@ -290,6 +316,7 @@ def fit_corners(
     reach_px : most pixels that a window reaches to each side of its corner.
     window : half the width of a window over the local square.
     warm : an earlier fit of the same corners, whose other parameters are taken for a start.
+    halo_px : r of a picture that was sharpened, 0 of others.
     """
     extent = (2.0 * window) ** 2 * np.abs(
         frames.along[:, 0] * frames.across[:, 1] - frames.along[:, 1] * frames.across[:, 0]
@@ -299,48 +326,51 @@ def fit_corners(
     for first in range(0, max(len(points), 1), count):
         part = np.arange(first, min(first + count, len(points)))
         before = None if warm is None else warm.take(part)
-        fits.append(_fit_part(image, points[part], frames.take(part), iterations, reach_px, window, before))
+        win = _windows(image, points[part], frames.take(part), window, reach_px)
+        fits.append(_fit_part(win, points[part], frames.take(part), iterations, window, before, halo_px))
     return fits[0] if len(fits) == 1 else _joined(fits)
 
 
 def _fit_part(
-    image: _Float32,
+    win: _Windows,
     points: FloatArray,
     frames: Frames,
     iterations: int,
-    reach_px: int,
     window: float,
     warm: LocalFit | None,
+    halo_px: float,
 ) -> LocalFit:
-    N = len(points)
-    win = _windows(image, points, frames, window, reach_px)
-    room = np.empty((N, _PARAMETERS, win.x.shape[1]), dtype=np.float32)
+    N, P = len(points), _PARAMETERS + (halo_px > 0.0)
+    room = np.empty((N, P, win.x.shape[1]), dtype=np.float32)
     q = _start(points, frames, win, room)
+    # Weight of the further observations, for residuals of the size that the fit will leave.
+    noise = np.maximum(_NOISE * np.abs(q[:, 6, None]), _LEAST_NOISE)
+    sigmas = np.column_stack([np.full((N, 2), _TONE_SIGMA), frames.bend_sigmas])
+    prior = (noise / np.maximum(sigmas, _LEAST_BEND_SIGMA)) ** 2
+    observed = np.column_stack([q[:, 5:7], frames.bends])
     if warm is not None:
         kept = warm.residual < _WARM_RESIDUAL
         q[kept, 2:9] = warm.parameters[kept, 2:9]
-    freedom = np.maximum(win.weight.sum(axis=1).astype(np.float64) - _PARAMETERS, 1.0)
+        if halo_px and warm.parameters.shape[1] == P:
+            q[kept, _PARAMETERS] = warm.parameters[kept, _PARAMETERS]
+    freedom = np.maximum(win.weight.sum(axis=1).astype(np.float64) - P, 1.0)
     damping, converged = np.full(N, 1e-3), np.zeros(N, dtype=bool)
-    # Weight of the curvatures' own observation, for residuals of the size that the fit will leave.
-    noise = np.maximum(_NOISE * np.abs(q[:, 6]), _LEAST_NOISE)
-    prior = (noise[:, None] / np.maximum(frames.bend_sigmas, _LEAST_BEND_SIGMA)) ** 2
-    r, J = _model(q.astype(np.float32), win, room)
-    normal, gradient, cost = _equations(q, r, J, prior, frames.bends)
+    r, J = _model(q.astype(np.float32), win, room, halo_px)
+    normal, gradient, cost = _equations(q, r, J, prior, observed)
     active = np.arange(N)
-    diagonal = np.arange(_PARAMETERS)
+    diagonal = np.arange(P)
     for _ in range(iterations):
         N_a, g_a = normal[active], gradient[active]
         A = N_a.copy()
         A[:, diagonal, diagonal] *= 1.0 + damping[active, None]
         A[:, diagonal, diagonal] += 1e-6
-        step = np.linalg.solve(A, g_a[:, :, None])[:, :, 0]
+        step = _bounded_step(A, g_a, q[active, _WIDTH])
         length = np.hypot(step[:, 0], step[:, 1])
         step /= np.maximum(1.0, np.maximum(length, 4.0 * np.abs(step[:, 2:4]).max(axis=1)))[:, None]
         foreseen = np.einsum("ni,ni->n", step, 2.0 * g_a - np.einsum("nij,nj->ni", N_a, step))
         trial = q[active] + step
-        trial[:, 4] = np.clip(trial[:, 4], *_WIDTH_PX)
-        r, J = _model(trial.astype(np.float32), win.take(active) if len(active) < N else win, room)
-        equations = _equations(trial, r, J, prior[active], frames.bends[active])
+        r, J = _model(trial.astype(np.float32), win.take(active) if len(active) < N else win, room, halo_px)
+        equations = _equations(trial, r, J, prior[active], observed[active])
         gain = (cost[active] - equations[2]) / np.maximum(foreseen, 1e-9)
         better = equations[2] <= cost[active] * (1 + 1e-6)
         # A step is small when it is so in pixels, or against the fit's own uncertainty.
@@ -357,17 +387,29 @@ def _fit_part(
     return _result(q, win, window, normal, cost, freedom, converged)
 
 
+def _bounded_step(A: FloatArray, g: FloatArray, width: FloatArray) -> FloatArray:
+    """Solution (N, P) of A s = g; a width that would leave its bounds is held there and the rest solved."""
+    step = np.asarray(np.linalg.solve(A, g[:, :, None])[:, :, 0])
+    low, high = _WIDTH_PX
+    out = (width + step[:, _WIDTH] < low) | (width + step[:, _WIDTH] > high)
+    if np.any(out):
+        held, right = A[out], g[out]
+        held[:, _WIDTH] = np.arange(A.shape[1]) == _WIDTH
+        right[:, _WIDTH] = np.clip(width + step[:, _WIDTH], low, high)[out] - width[out]
+        step[out] = np.linalg.solve(held, right[:, :, None])[:, :, 0]
+    return step
+
+
 def _equations(
-    q: FloatArray, r: _Float32, J: _Float32, prior: FloatArray, bends: FloatArray
+    q: FloatArray, r: _Float32, J: _Float32, prior: FloatArray, observed: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Normal matrix (N, 11, 11), right side (N, 11) and cost (N,), with the observed curvatures."""
+    """Normal matrix (N, P, P), right side (N, P) and cost (N,), with the observed parameters (N, 4)."""
     normal = (J @ J.transpose(0, 2, 1)).astype(np.float64)
     gradient = (J @ r[:, :, None])[:, :, 0].astype(np.float64)
     cost = np.einsum("nm,nm->n", r, r, dtype=np.float64)
-    off = bends - q[:, _BENDS]
-    both = np.arange(_PARAMETERS)[_BENDS]
-    normal[:, both, both] += prior
-    gradient[:, _BENDS] += prior * off
+    off = observed - q[:, _OBSERVED]
+    normal[:, _OBSERVED, _OBSERVED] += prior
+    gradient[:, _OBSERVED] += prior * off
     return normal, gradient, cost + np.sum(prior * off**2, axis=1)
 
 
@@ -381,7 +423,7 @@ def _result(
     converged: BoolArray,
 ) -> LocalFit:
     scale = np.sqrt(np.maximum(np.einsum("nii->ni", normal), 1e-12))
-    scaled = normal / (scale[:, :, None] * scale[:, None, :]) + 1e-7 * np.eye(_PARAMETERS)
+    scaled = normal / (scale[:, :, None] * scale[:, None, :]) + 1e-7 * np.eye(q.shape[1])
     inverse = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
     variance = cost / freedom
     sigma = np.sqrt(np.maximum(0.5 * (inverse[:, 0, 0] + inverse[:, 1, 1]) * variance, 0.0))
@@ -598,7 +640,7 @@ class _Fit:
 # ----------------------------------------------------------------------
 # Sub-pixel refinement of a grid of corners.
 #
-# Each corner is fitted on its own (`cornerfit`). Then the corners check each other (`gridmodel`): one that
+# Each corner is fitted on its own. Then the corners check each other (`predict`): one that
 # did not converge, has the wrong colours or disagrees with the others is fitted again from where the
 # others place it. A corner that still fails is not a measurement: it is reported at its predicted place,
 # with a large sigma and `refined` false, and never at the place where the search began.
@@ -607,10 +649,17 @@ class _Fit:
 # covers the same share of the square, and averaging loses nothing that the blur has not lost.
 
 _SQUARE_PX = 40.0
-"""Squares of twice this size and more are averaged down to it."""
+"""Squares of twice this size and more are averaged down to it, where that leaves their edges blurred."""
+_LEAST_WIDTH_PX = 0.9
+"""Width of an edge below which its place depends on where it falls between the pixels."""
 _FIRST_ITERATIONS = 4
 _FIRST_REACH_PX = 8
-_LARGEST_RESIDUAL = 0.4
+_HALOS_PX = (0.8, 1.6, 3.0)
+_HALO_MISSHAPE = 0.05
+"""Typical misshape from which on halos are tried."""
+_HALO_GAIN = 0.8
+"""Misshape with a halo over that without, at most, for a halo to be believed."""
+_LARGEST_RESIDUAL = 0.8
 """RMS of a fit over the amplitude; clutter is above it."""
 _LEAST_SHARE = 0.1
 """Least amplitude of a corner over the picture's median."""
@@ -644,6 +693,7 @@ class Refined:
     narrow : whether a corner had to be fitted with a smaller window than usual.
     refined : False where a corner could not be measured and its predicted place is given.
     misfit_px : typical distance of a corner from where the others place it.
+    k, halo_px : of the part that was fitted, see `Part`.
     """
 
     points: FloatArray
@@ -653,6 +703,8 @@ class Refined:
     narrow: BoolArray
     refined: BoolArray
     misfit_px: float
+    k: int
+    halo_px: float
 
     @property
     def sign(self) -> int:
@@ -679,6 +731,7 @@ class Part:
     k, origin : a pixel (x, y) of the part is at k (x, y) + (k - 1) / 2 + origin in the picture.
     lens : the centre and half diagonal of the picture, in pixels of the part.
     noise : standard deviation of the noise, grey levels.
+    halo_px : as in `fit_corners`.
     """
 
     image: _RefineFloat32
@@ -687,6 +740,7 @@ class Part:
     origin: FloatArray
     lens: Lens
     noise: float
+    halo_px: float = 0.0
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -697,6 +751,18 @@ class Part:
         """Pixels of the picture from pixels of the part."""
         return np.asarray(points * self.k + 0.5 * (self.k - 1) + self.origin)
 
+    def fit(
+        self,
+        points: FloatArray,
+        frames: Frames,
+        iterations: int = _ITERATIONS,
+        reach_px: int = REACH_PX,
+        window: float = WINDOW,
+        warm: LocalFit | None = None,
+    ) -> LocalFit:
+        """The corners near points (N, 2) of the part, as `fit_corners`."""
+        return fit_corners(self.image, points, frames, iterations, reach_px, window, warm, self.halo_px)
+
 
 def _noise(image: _RefineFloat32) -> float:
     """Standard deviation of the noise, from the median of a mask that is blind to edges (Immerkaer 1996)."""
@@ -704,9 +770,14 @@ def _noise(image: _RefineFloat32) -> float:
     return float(np.median(np.abs(cv2.filter2D(image, cv2.CV_32F, mask)[1:-1, 1:-1])) / (6.0 * 0.6745))
 
 
-def part_around(gray: GrayImage, points: FloatArray) -> Part | None:
-    """The part of a picture that holds a grid (rows, columns, 2); None when that is next to nothing."""
-    k = max(1, int(square_px(points) // _SQUARE_PX))
+def part_around(
+    gray: GrayImage, points: FloatArray, k: int | None = None, halo_px: float = 0.0
+) -> Part | None:
+    """The part of a picture that holds a grid (rows, columns, 2); None when that is next to nothing.
+
+    It is averaged over blocks of k pixels, by default such that squares keep about 40 px.
+    """
+    k = max(1, int(square_px(points) // _SQUARE_PX)) if k is None else k
     height, width = gray.shape
     square = float(np.max(np.abs(np.gradient(points, axis=0)) + np.abs(np.gradient(points, axis=1))))
     low = np.floor((points.reshape(-1, 2).min(axis=0) - square) / k).astype(int) * k
@@ -723,7 +794,7 @@ def part_around(gray: GrayImage, points: FloatArray) -> Part | None:
     lens = Lens(
         (0.5 * np.array([width - 1, height - 1]) - shift) / k, 0.5 * float(np.hypot(width, height)) / k
     )
-    return Part(image, (points - shift) / k, k, origin, lens, _noise(image))
+    return Part(image, (points - shift) / k, k, origin, lens, _noise(image), halo_px)
 
 
 def _colours(fit: LocalFit, shape: tuple[int, int]) -> FloatArray:
@@ -768,7 +839,7 @@ def _closer_looked(part: Part, fit: LocalFit, frames: Frames) -> LocalFit:
     doubtful = np.flatnonzero((fit.residual > _DISTURBED * typical + 0.02) | ~fit.converged)
     if len(doubtful) == 0:
         return fit
-    again = fit_corners(part.image, fit.points[doubtful], frames.take(doubtful), window=_CLOSE_WINDOW)
+    again = part.fit(fit.points[doubtful], frames.take(doubtful), window=_CLOSE_WINDOW)
     use = again.converged & (again.residual < np.where(fit.converged, 0.7 * fit.residual, np.inf)[doubtful])
     return _merged(fit, again, doubtful, use)
 
@@ -812,7 +883,7 @@ def _rescued(part: Part, fit: LocalFit) -> tuple[LocalFit, BoolArray, Prediction
         doubtful = np.flatnonzero(~good | ~(check.away < check.bound))
         if len(doubtful) == 0:
             return fit, good, prediction
-        again = fit_corners(part.image, check.placed[doubtful], check.frames.take(doubtful), window=window)
+        again = part.fit(check.placed[doubtful], check.frames.take(doubtful), window=window)
         trial = _merged(fit, again, doubtful, np.ones(len(doubtful), dtype=np.bool_))
         near = np.linalg.norm(again.points - check.placed[doubtful], axis=1)
         use = _trusted(part, trial)[doubtful] & (~good[doubtful] | (near < 0.7 * check.away[doubtful]))
@@ -831,6 +902,40 @@ def _rescued(part: Part, fit: LocalFit) -> tuple[LocalFit, BoolArray, Prediction
     return None if last is None else (fit, good, last)
 
 
+def _begun(gray: GrayImage, points: FloatArray) -> tuple[Part, LocalFit] | None:
+    """The part of the picture around a grid and a first fit of its corners.
+
+    Blocks become smaller until the edges in the part are blurred.
+    """
+    part = part_around(gray, points)
+    while part is not None:
+        start = part.points
+        first = part.fit(start.reshape(-1, 2), frames_of(start), _FIRST_ITERATIONS, _FIRST_REACH_PX)
+        width = float(np.median(first.width_px))
+        if part.k == 1 or width >= _LEAST_WIDTH_PX:
+            return _sharpened(part, first)
+        part = part_around(gray, points, min(part.k - 1, max(1, int(part.k * width))))
+    return None
+
+
+def _sharpened(part: Part, first: LocalFit) -> tuple[Part, LocalFit]:
+    """The same with the halo that fits best, where the corners are not those of a picture as taken."""
+    plain = float(np.median(misshape(first, part.noise)))
+    if plain < _HALO_MISSHAPE:
+        return part, first
+    start = part.points
+    best, least = (part, first), _HALO_GAIN * plain
+    for halo_px in _HALOS_PX:
+        other = replace(part, halo_px=halo_px)
+        fit = other.fit(
+            start.reshape(-1, 2), frames_of(start), _FIRST_ITERATIONS, _FIRST_REACH_PX, warm=first
+        )
+        found = float(np.median(misshape(fit, part.noise)))
+        if found < least:
+            best, least = (other, fit), found
+    return best
+
+
 def refine(gray: GrayImage, points: FloatArray) -> Refined | None:
     """Refine a grid of corners to a small fraction of a pixel.
 
@@ -843,13 +948,11 @@ def refine(gray: GrayImage, points: FloatArray) -> Refined | None:
     -------
     None where fewer than six corners could be fitted.
     """
-    part = part_around(gray, points)
-    if part is None:
+    begun = _begun(gray, points)
+    if begun is None:
         return None
+    part, first = begun
     shape, start = part.shape, part.points
-    first = fit_corners(
-        part.image, start.reshape(-1, 2), frames_of(start), _FIRST_ITERATIONS, _FIRST_REACH_PX
-    )
     # A misplaced corner would spoil the curvatures of its row and column.
     sound = _sound(part, first)
     rough = predict(first.points.reshape(start.shape), sound.reshape(shape), part.lens)
@@ -860,7 +963,7 @@ def refine(gray: GrayImage, points: FloatArray) -> Refined | None:
     moved = np.where(stays[:, None], first.points, rough.points.reshape(-1, 2)).reshape(start.shape)
     fit = first
     for _ in range(_PASSES):
-        fit = fit_corners(part.image, moved.reshape(-1, 2), frames_of(moved), warm=fit)
+        fit = part.fit(moved.reshape(-1, 2), frames_of(moved), warm=fit)
         before, moved = (
             moved,
             np.where(_sound(part, fit)[:, None], fit.points, moved.reshape(-1, 2)).reshape(start.shape),
@@ -883,4 +986,6 @@ def refine(gray: GrayImage, points: FloatArray) -> Refined | None:
         narrow=(fit.window < WINDOW).reshape(shape),
         refined=good.reshape(shape),
         misfit_px=part.k * prediction.spread_px,
+        k=part.k,
+        halo_px=part.halo_px,
     )
