@@ -86,12 +86,13 @@ def canonical_turn(points: FloatArray, colours: FloatArray, columns: int, rows: 
 # ----------------------------------------------------------------------
 # Is a refined grid a whole checkerboard? What a texture, or a part of a larger board, gets wrong.
 
-_UNREFINED_SHARE = 0.1
+_UNREFINED_SHARE, _CLOSE_UNREFINED_SHARE = 0.1, 0.25
+"""Largest share of corners that could not be measured, and the same in a close grid."""
 _MISFIT = 0.08
 """Largest typical distance of a corner from where the others place it, in squares."""
 _MEDIAN_RESIDUAL = 0.25
-_CLOSE_MISFIT = 0.02
-"""Misfit, in squares, of a grid below which corners may have another shape."""
+_CLOSE_MISFIT = 0.03
+"""Misfit, in squares, below which a grid is close: its corners may have another shape."""
 _LEAST_AMPLITUDE = 2.5
 """Grey levels."""
 _CONTINUES = 0.4
@@ -149,11 +150,12 @@ def fault_of(gray: GrayImage, grid: Refined) -> str | None:
     shape = grid.refined.shape
     if np.any(grid.points < -0.5) or np.any(grid.points > np.array([width, height]) - 0.5):
         return "corners outside the picture"
-    if np.sum(~grid.refined) > _UNREFINED_SHARE * grid.refined.size:
+    close = grid.misfit_px < _CLOSE_MISFIT * square
+    if np.mean(~grid.refined) > (_CLOSE_UNREFINED_SHARE if close else _UNREFINED_SHARE):
         return "corners that are none"
     if np.median(np.abs(grid.amplitude)) < _LEAST_AMPLITUDE:
         return "too little contrast"
-    if np.median(grid.residual) > _MEDIAN_RESIDUAL and not grid.misfit_px < _CLOSE_MISFIT * square:
+    if np.median(grid.residual) > _MEDIAN_RESIDUAL and not close:
         return "corners of another shape"
     if not grid.misfit_px < _MISFIT * square:
         return "corners off the grid"
