@@ -11,9 +11,10 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.stages.camera.checks import image_outline
 from calib.stages.camera.model import Board, Camera, View, project, undistort
+from calib.stages.camera.pose import fit_pose
 from calib.twin.scene import rotation
 
-__all__ = ["BAD", "SIZES", "Recipe", "camera_of", "good_set", "take"]
+__all__ = ["BAD", "SIZES", "SPOILS", "Recipe", "camera_of", "good_set", "sheared", "take"]
 
 SIZES = ((316, 208), (320, 240), (640, 480), (752, 480), (1280, 720), (1280, 960), (1920, 1080))
 _SMALL = Board(7, 5, 0.020)
@@ -282,3 +283,47 @@ BAD: dict[str, tuple[Maker, tuple[str, ...]]] = {
     "image size too large": (_resized((1280, 960)), ("poor",)),
 }
 """Sets that must not be blessed: how to make them, and the verdicts that are right."""
+
+
+# ----------------------------------------------------------------------
+# One view of a good set spoilt: its pixels as another camera, a moved board or a bad picture would give them.
+
+Spoil = Callable[[View, Camera, np.random.Generator], FloatArray]
+
+
+def _zoomed(factor: float) -> Spoil:
+    def spoilt(view: View, camera: Camera, rng: np.random.Generator) -> FloatArray:
+        middle = 0.5 * (np.array(camera.image_size_px) - 1)
+        return (view.pixels - middle) * factor + middle
+
+    return spoilt
+
+
+def sheared(view: View, camera: Camera, rng: np.random.Generator) -> FloatArray:
+    return view.pixels + np.outer(view.pixels[:, 1] / camera.image_size_px[1], [8.0, 0.0])
+
+
+def _wavy(view: View, camera: Camera, rng: np.random.Generator) -> FloatArray:
+    return view.pixels + 2.0 * np.sin(2 * np.pi * view.pixels[:, ::-1] / 120)
+
+
+def _mirrored(view: View, camera: Camera, rng: np.random.Generator) -> FloatArray:
+    """The picture mirrored, its columns listed as the detector does."""
+    mirrored = np.array([camera.image_size_px[0] - 1.0, 0.0]) + view.pixels * [-1.0, 1.0]
+    return mirrored.reshape(5, 7, 2)[:, ::-1].reshape(-1, 2)
+
+
+def _of_another(view: View, camera: Camera, rng: np.random.Generator) -> FloatArray:
+    seen = fit_pose(camera, view.target_m, view.pixels)
+    points = np.column_stack([view.target_m, np.zeros(len(view.target_m))]) @ seen.R_CW.T + seen.t_CW_m
+    return project(replace(camera, fx_px=1.06 * camera.fx_px, cx_px=camera.cx_px + 12.0), points)
+
+
+def _blurred(view: View, camera: Camera, rng: np.random.Generator) -> FloatArray:
+    return view.pixels + rng.normal(0.0, 1.0, view.pixels.shape)
+
+
+SPOILS: dict[str, Spoil] = {
+    "blur": _blurred, "shear 8 px": sheared, "zoom 0.9": _zoomed(0.9), "zoom 0.97": _zoomed(0.97),
+    "wavy 2 px": _wavy, "mirrored": _mirrored, "another camera": _of_another,
+}  # fmt: skip

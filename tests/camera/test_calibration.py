@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sets import Recipe, camera_of, take
+from outside import outside
+from sets import SPOILS, Recipe, camera_of, take
 
 from calib.stages.camera.bundle import (
     Calibration,
@@ -33,9 +35,12 @@ from calib.stages.camera.checks import (
     target_shape,
 )
 from calib.stages.camera.intrinsics import (
+    Candidate,
     board_basis,
+    calibrate_camera,
     candidates_by_board,
     candidates_by_model,
+    chosen_lens,
     simplest_good,
 )
 from calib.stages.camera.model import (
@@ -52,6 +57,7 @@ from calib.stages.camera.model import (
     undistort,
     vector_from_camera,
 )
+from calib.stages.camera.read import Told, read_views
 from synthetic import BOARD, CAMERA, views_of
 
 LENS = {"k1": -0.25, "k2": 0.1, "k3": 0.02, "p1": 1e-3, "p2": -5e-4, "k4": 0.05, "k5": 0.02, "k6": -0.01}
@@ -363,6 +369,88 @@ def test_the_true_lens_is_chosen(truth: str) -> None:
     fitted = [candidate.fitted_rms_px for candidate, _ in found]
     assert all(b <= a * (1 + 1e-4) for a, b in pairwise(fitted[:4]))
     assert names[simplest_good([candidate for candidate, _ in found])] == truth
+
+
+def _candidate(name: str, *view_px: float, soundness: int = 3) -> Candidate:
+    squared = np.array(view_px) ** 2
+    return Candidate(name, 4, float(view_px[0]), float(np.sqrt(squared.mean())), squared, soundness)
+
+
+def test_one_view_does_not_hide_that_a_richer_model_is_better() -> None:
+    simple, rich = [2.8] * 15 + [12.8], [0.09] * 15 + [0.14]
+    assert simplest_good([_candidate("simple", *simple), _candidate("rich", *rich)]) == 1
+    # Nor does a view that the richer model alone cannot explain, where it is far better for the others.
+    assert simplest_good([_candidate("simple", *simple), _candidate("rich", *rich[:15], 15.0)]) == 1
+    assert simplest_good([_candidate("simple", *[0.3] * 15), _candidate("rich", *[0.29] * 14, 3.0)]) == 0
+
+
+def test_a_richer_model_needs_pixels_and_more_than_chance() -> None:
+    rng = np.random.default_rng(0)
+    noise = 0.2 * np.exp(0.1 * rng.standard_normal(20))
+    assert simplest_good([_candidate("simple", *noise), _candidate("rich", *(noise - 1e-5))]) == 0
+    assert simplest_good([_candidate("simple", *noise), _candidate("rich", *(noise - 5e-3))]) == 1
+    # At 4000 pixels' width a fiftieth of a pixel counts.
+    assert simplest_good([_candidate("simple", *noise), _candidate("rich", *(noise - 5e-4))], 4000) == 0
+    other = 0.2 * np.exp(0.1 * rng.standard_normal(20))
+    assert simplest_good([_candidate("simple", *noise), _candidate("rich", *other)]) == 0
+    # Three views tell little of chance; a fifth less is taken all the same.
+    assert simplest_good([_candidate("simple", 0.3, 0.2, 0.4), _candidate("rich", 0.2, 0.19, 0.2)]) == 1
+    assert simplest_good([_candidate("simple", 0.3, 0.2, 0.4), _candidate("rich", 0.3, 0.19, 0.39)]) == 0
+
+
+def test_a_lens_that_folds_is_chosen_only_where_the_others_are_hopeless() -> None:
+    folding = _candidate("radial3", *[0.1] * 12, soundness=1)
+    assert chosen_lens([_candidate("radial2", *[0.25] * 12), folding], 640) == 0
+    assert chosen_lens([_candidate("radial2", *[4.2] * 12), folding], 640) == 1
+    assert chosen_lens([_candidate("radial2", *[4.2] * 12), replace(folding, soundness=0)], 640) == 0
+
+
+def _equidistant(field_deg: float) -> Camera:
+    """A lens that shows angles as lengths nearly, which no polynomial follows far."""
+    return camera_of((640, 480), field_deg, (7 / 9, 64 / 945, 0, 0, 0, 10 / 9, 5 / 21), "rational8")
+
+
+SIMULATED = {
+    "pinhole": camera_of(lens=(), model="pinhole"),
+    "radial2": camera_of(),
+    "brown5": camera_of(lens=(-0.25, 0.1, 0.003, -0.002), model="brown5"),
+    "rational8, 100 degrees": _equidistant(100.0),
+    "rational8, 120 degrees": _equidistant(120.0),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bad", [0, 1, 2])
+@pytest.mark.parametrize("name", SIMULATED)
+def test_the_chosen_lens_is_nearly_the_best(name: str, bad: int) -> None:
+    """Held-back RMS at most 1.2 times that of the best sound candidate, with up to two bad views."""
+    camera, ratios = SIMULATED[name], []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        noise = (0.05, 0.1, 0.3)[seed % 3]
+        views = take(rng, camera, (8, 11, 16)[seed % 3] + bad, recipe=Recipe(noise_px=noise))
+        for k in range(bad):
+            spoil = SPOILS[list(SPOILS)[(seed + 3 * k) % len(SPOILS)]]
+            views[k] = replace(views[k], pixels=spoil(views[k], camera, rng))
+        found = calibrate_camera(views, camera.image_size_px)
+        chosen = next(one for one in found.models if one.name == found.calibration.camera.model)
+        best = min(one.held_back_rms_px for one in found.models if one.soundness >= chosen.soundness)
+        ratios.append(chosen.held_back_rms_px / best)
+    print(f"{name}, {bad} bad: {max(ratios):.2f}")
+    assert max(ratios) <= 1.2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name", ["gloworm_qvga", "ocam_fish2", "opencv_left", "pv_charuco", "sks_charuco_left", "udacity_lane"]
+)
+def test_the_chosen_lens_is_nearly_the_best_for_real_pictures(name: str, shared_data: Path) -> None:
+    told = Told(square_m=0.02) if name in ("pv_charuco", "sks_charuco_left") else Told()
+    views = read_views([outside(shared_data / name)], told)
+    found = calibrate_camera(views.views, views.image_size_px)
+    chosen = next(one for one in found.models if one.name == found.calibration.camera.model)
+    best = min(one.held_back_rms_px for one in found.models if one.soundness)
+    assert chosen.held_back_rms_px <= 1.2 * best
 
 
 @pytest.mark.parametrize("truth", ["rigid", "warp", "released"])

@@ -15,15 +15,17 @@ from calib.stages.camera.lens import (
     distorted_normalised,
     distortion_kind,
     fit_inverse,
-    fold_radius,
     pixel_grid,
     projection_sigma_px,
+    shown_once,
     undistort_by_polynomial,
 )
 from calib.stages.camera.model import (
     Camera,
     camera_from_vector,
     distort,
+    fold_radius,
+    one_to_one_reach,
     project,
     undistort,
     vector_from_camera,
@@ -232,12 +234,14 @@ def test_single_precision_is_enough() -> None:
     [
         ([-0.2201, 0.5494, 0, 0, 0, 0, 0, 0], np.inf),
         ([0.3, 0.1, 0, 0, 0, 0, 0, 0], np.inf),
+        # A pole next to a zero.
+        ([-1.0, 0, 0, 0, 0, -1.0 / 0.98, 0, 0], np.sqrt(0.98)),
         # d/dr (r - r^3 / 3) = 0 at r = 1.
         ([-1 / 3, 0, 0, 0, 0, 0, 0, 0], 1.0),
         # r / (1 + r^2) is greatest at r = 1.
         ([0, 0, 0, 0, 0, 1.0, 0, 0], 1.0),
         # r / (1 - r^2) rises up to its pole.
-        ([0, 0, 0, 0, 0, -1.0, 0, 0], np.inf),
+        ([0, 0, 0, 0, 0, -1.0, 0, 0], 1.0),
         ([0] * 8, np.inf),
     ],
 )
@@ -245,6 +249,27 @@ def test_where_the_radial_curve_folds(distortion: list[float], radius: float) ->
     camera = replace(THESIS, distortion=np.array(distortion, dtype=float))
     found, distorted = fold_radius(camera)
     assert found == pytest.approx(radius)
-    if np.isfinite(radius):
+    if distortion[5] < 0.0:
+        assert distorted == np.inf
+    elif np.isfinite(radius):
         top = distort(np.array([radius]), np.zeros(1), camera.distortion)[0][0]
         assert distorted == pytest.approx(top)
+
+
+@pytest.mark.parametrize(
+    ("distortion", "reach"),
+    [([-1 / 3, 0, 0, 0, 0, 0, 0, 0], 2 / 3), ([0, 0, 0, 0, 0, -1.0, 0, 0], 1.0), ([0.3] + [0.0] * 7, np.inf)],
+)
+def test_a_lens_shows_nothing_beyond_its_fold_or_pole(distortion: list[float], reach: float) -> None:
+    # The corner is at a normalised radius of 1.25.
+    camera = Camera("rational8", (801, 601), 400.0, 400.0, 0.0, 400.0, 300.0, np.array(distortion))
+    assert one_to_one_reach(camera) == pytest.approx(reach / 1.25)
+    report = analyse_distortion(camera)
+    assert report.monotonic == (reach > 1.25)
+    # Beyond a pole displacements come from the other side of it, and reach thousands of pixels.
+    at = pixel_grid(camera.image_size_px, most=3000).reshape(-1, 2)
+    shown = np.isfinite(undistort(camera, at)).all(axis=1)
+    radius = np.linalg.norm(undistort(camera, at), axis=1)
+    assert not np.any(radius[shown] > fold_radius(camera)[0])
+    assert shown_once(camera, at).all() == (fold_radius(camera)[0] > 1.25)
+    assert report.max_px < 1000.0

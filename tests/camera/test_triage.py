@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
-from sets import SIZES, Recipe, camera_of, take
+from sets import SIZES, SPOILS, Recipe, camera_of, sheared, take
 
 from calib.core.arrays import FloatArray, GrayImage
 from calib.io.pictures import list_pictures, read_picture, usual_size
@@ -16,51 +16,12 @@ from calib.stages.camera.bundle import calibrate, covariance
 from calib.stages.camera.checks import evidence, overdispersion, resolved
 from calib.stages.camera.corners import detect
 from calib.stages.camera.intrinsics import Choices, Intrinsics, calibrate_camera
-from calib.stages.camera.model import Board, Camera, View, pack, project
+from calib.stages.camera.model import Board, Camera, View, pack
 from calib.stages.camera.pose import fit_pose
 from calib.stages.camera.triage import agreement, triage
 from calib.twin.scene import Pose, PrintedBoard, render
 
 SIZE = (640, 480)
-Spoil = Callable[[View, Camera, np.random.Generator], FloatArray]
-
-
-def _zoomed(factor: float) -> Spoil:
-    def spoilt(view: View, camera: Camera, rng: np.random.Generator) -> FloatArray:
-        middle = 0.5 * (np.array(camera.image_size_px) - 1)
-        return (view.pixels - middle) * factor + middle
-
-    return spoilt
-
-
-def _sheared(view: View, camera: Camera, rng: np.random.Generator) -> FloatArray:
-    return view.pixels + np.outer(view.pixels[:, 1] / camera.image_size_px[1], [8.0, 0.0])
-
-
-def _wavy(view: View, camera: Camera, rng: np.random.Generator) -> FloatArray:
-    return view.pixels + 2.0 * np.sin(2 * np.pi * view.pixels[:, ::-1] / 120)
-
-
-def _mirrored(view: View, camera: Camera, rng: np.random.Generator) -> FloatArray:
-    """The picture mirrored, its columns listed as the detector does."""
-    mirrored = np.array([camera.image_size_px[0] - 1.0, 0.0]) + view.pixels * [-1.0, 1.0]
-    return mirrored.reshape(5, 7, 2)[:, ::-1].reshape(-1, 2)
-
-
-def _of_another(view: View, camera: Camera, rng: np.random.Generator) -> FloatArray:
-    seen = fit_pose(camera, view.target_m, view.pixels)
-    points = np.column_stack([view.target_m, np.zeros(len(view.target_m))]) @ seen.R_CW.T + seen.t_CW_m
-    return project(replace(camera, fx_px=1.06 * camera.fx_px, cx_px=camera.cx_px + 12.0), points)
-
-
-def _blurred(view: View, camera: Camera, rng: np.random.Generator) -> FloatArray:
-    return view.pixels + rng.normal(0.0, 1.0, view.pixels.shape)
-
-
-SPOILS: dict[str, Spoil] = {
-    "blur": _blurred, "shear 8 px": _sheared, "zoom 0.9": _zoomed(0.9), "zoom 0.97": _zoomed(0.97),
-    "wavy 2 px": _wavy, "mirrored": _mirrored, "another camera": _of_another,
-}  # fmt: skip
 
 
 def _sigma(fit: Intrinsics) -> FloatArray:
@@ -96,7 +57,7 @@ def test_one_step_without_a_view_agrees_with_a_fit_without_it() -> None:
     rng = np.random.default_rng(4)
     camera = camera_of()
     views = take(rng, camera, 12)
-    views[3] = replace(views[3], pixels=_sheared(views[3], camera, rng))
+    views[3] = replace(views[3], pixels=sheared(views[3], camera, rng))
     fit = calibrate(pack(views), SIZE, "radial2")
     asked = agreement(fit, np.ones(12, dtype=np.bool_))
     for i in range(12):
@@ -151,7 +112,7 @@ def test_more_than_a_fifth_leaving_is_a_finding() -> None:
     camera = camera_of()
     views = take(rng, camera, 12, recipe=Recipe(tilt_deg=(15.0, 40.0)))
     for i in range(3):
-        views[i] = replace(views[i], pixels=_sheared(views[i], camera, rng))
+        views[i] = replace(views[i], pixels=sheared(views[i], camera, rng))
     verdict = calibrate_camera(views, SIZE, Choices("radial2")).judgement.verdict
     assert verdict.word == "inconsistent"
     assert verdict.reasons[0].startswith(

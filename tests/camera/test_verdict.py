@@ -30,7 +30,7 @@ from calib.stages.camera.checks import (
 )
 from calib.stages.camera.corners import detect
 from calib.stages.camera.intrinsics import Choices, calibrate_camera
-from calib.stages.camera.model import MODELS, Board, Camera, View, pack
+from calib.stages.camera.model import MODELS, Board, Camera, View, one_to_one_reach, pack
 from calib.stages.camera.pose import fit_pose
 from calib.stages.camera.verdict import Judgement, judge
 from calib.twin.pictures import BOARD, CAMERA
@@ -44,13 +44,34 @@ def _judged(views: list[View], size_px: tuple[int, int], model: str) -> tuple[Ca
 
 
 @pytest.mark.parametrize("model", list(MODELS))
-@pytest.mark.parametrize("seed", [2, 3])
+@pytest.mark.parametrize("seed", [2, 10])
 def test_good_sets_are_blessed(model: str, seed: int) -> None:
     views, camera = good_set(seed, model)
     _, found = _judged(views, camera.image_size_px, model)
     assert found.verdict.word == "ok", found.verdict.reasons
     assert found.verdict.reasons == []
     assert len(found.verdict.advice) >= 1
+
+
+def test_a_lens_that_is_not_one_to_one_over_the_picture_is_poor_by_name_and_no_candidate() -> None:
+    # Noise fits a pole into the picture, with a zero next to it: the RMS is as good as any.
+    views, camera = good_set(3, "rational8")
+    fit, found = _judged(views, camera.image_size_px, "rational8")
+    assert one_to_one_reach(fit.camera) < 1.0
+    assert fit.rms_px < calibrate(pack(views), camera.image_size_px, "brown5").rms_px
+    assert found.verdict.word == "poor"
+    chosen = calibrate_camera(views, camera.image_size_px)
+    assert one_to_one_reach(chosen.calibration.camera) > 1.05
+    assert chosen.judgement.verdict.word == "ok"
+
+
+def test_a_border_that_nothing_was_seen_near_is_poor() -> None:
+    camera = camera_of(lens=(-0.3, 0.15, 0.0, 0.0, -0.05), model="brown5")
+    views = take(np.random.default_rng(3), camera, 12, recipe=Recipe(fill=(0.3, 0.4), spread=0.06))
+    _, found = _judged(views, (640, 480), "brown5")
+    assert found.verdict.word == "poor"
+    assert any("at the picture's border the camera predicts" in one for one in found.verdict.reasons)
+    assert found.numbers["border_sigma_px"] > 6.4
 
 
 @pytest.mark.parametrize("name", list(BAD))

@@ -561,6 +561,22 @@ def starting_block(
     return start
 
 
+def equidistant_start(observations: Observations, image_size_px: tuple[int, int], focal_px: float) -> Block:
+    """A lens that shows angles as lengths, as wide ones nearly do, and the poses of the views it then has.
+
+    The rational model's atan(r) / r = (1 + 7/9 r2 + 64/945 r2^2) / (1 + 10/9 r2 + 5/21 r2^2) (Pade) is right
+    to a percent up to 60 degrees from the axis. Poses are NaN where it cannot show a view.
+    """
+    width, height = image_size_px
+    intrinsics = np.zeros(len(INTRINSICS))
+    intrinsics[:4] = focal_px, focal_px, 0.5 * (width - 1), 0.5 * (height - 1)
+    for name, value in (("k1", 7 / 9), ("k2", 64 / 945), ("k4", 10 / 9), ("k5", 5 / 21)):
+        intrinsics[INTRINSICS.index(name)] = value
+    camera = camera_from_vector("rational8", image_size_px, intrinsics)
+    R_CT, t_CT_m = poses_with_camera(camera, observations)
+    return Block(intrinsics, R_CT, t_CT_m, np.zeros(0))
+
+
 def calibrate(
     observations: Observations,
     image_size_px: tuple[int, int],

@@ -24,8 +24,10 @@ from calib.stages.camera.model import (
     Observations,
     camera_from_vector,
     distort,
+    fold_radius,
     free_intrinsics,
     jacobian,
+    one_to_one_reach,
     project,
     undistort,
 )
@@ -38,6 +40,8 @@ from calib.stages.camera.model import (
 # among themselves; a board that never leans in any view is the worst case of that.
 
 _DIRECTIONS = 72
+ONE_TO_ONE_REACH = 1.05
+"""How far a lens has to be one-to-one, over the distance of the picture's farthest corner."""
 _MAX_PAIRED = 2000
 """Views above which repeats are sought among the first ones only."""
 
@@ -87,11 +91,18 @@ class Lens:
         relative to the centre.
     image_slope : the same out to the image's corners; zero or less where the lens folds over.
     image_shown : share of points along the image's border that the model can show at all.
+    reach : `model.one_to_one_reach`.
     """
 
     seen_slope: float
     image_slope: float
     image_shown: float
+    reach: float
+
+    @property
+    def one_to_one(self) -> bool:
+        """Whether no two directions share a pixel, over the whole picture and a margin."""
+        return self.seen_slope > 0.0 and self.image_shown == 1.0 and self.reach > ONE_TO_ONE_REACH
 
 
 def hull(points: FloatArray) -> FloatArray:
@@ -231,16 +242,18 @@ def lens_shape(calibration: Calibration) -> Lens:
         seen_slope=_least_slope(camera, seen),
         image_slope=image_slope if shown.all() else min(image_slope, 0.0),
         image_shown=float(shown.mean()),
+        reach=one_to_one_reach(camera),
     )
 
 
 def _least_slope(camera: Camera, radius: float) -> float:
-    """Least slope of the radial curve up to an undistorted radius."""
+    """Least slope of the radial curve up to an undistorted radius, at most zero beyond a pole."""
     r = np.linspace(0.0, radius, 201)
     radial = camera.distortion.copy()
     radial[2:4] = 0.0
     distorted, _ = distort(r, np.zeros_like(r), radial)
-    return float(np.min(np.diff(distorted) / np.diff(r)))
+    least = float(np.min(np.diff(distorted) / np.diff(r)))
+    return least if radius < fold_radius(camera)[0] else min(least, 0.0)
 
 
 # ----------------------------------------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,8 +12,16 @@ from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
 from calib.core.verdict import Finding
 from calib.core.workers import Workers
-from calib.stages.camera.bundle import Calibration, Covariance, calibrate, covariance, refit_poses
-from calib.stages.camera.checks import best_of_starts, lens_shape, screen
+from calib.stages.camera.bundle import (
+    Calibration,
+    Covariance,
+    calibrate,
+    covariance,
+    equidistant_start,
+    projection_sigma_px,
+    refit_poses,
+)
+from calib.stages.camera.checks import best_of_starts, image_outline, lens_shape, screen
 from calib.stages.camera.model import MODELS, Block, LeftOut, Observations, View, free_intrinsics, pack
 from calib.stages.camera.triage import Triage, triage
 from calib.stages.camera.verdict import Judgement, judge, of_leaving, of_screening, two_cameras
@@ -23,8 +31,10 @@ from calib.stages.camera.verdict import Judgement, judge, of_leaving, of_screeni
 #
 # A richer model always fits the views it was fitted to better. Each candidate is therefore fitted to
 # some views and judged on the others, where only the six numbers of a view's pose are fitted anew.
-# Among the candidates whose error on held-back views cannot be told from the best one's (a paired
-# comparison over views) the simplest is taken.
+# The simplest candidate is taken that no richer one beats: by the logarithms of the ratios of the views'
+# errors (a paired t test; a view that no model explains, or one alone, weighs no more than another), and
+# by pixels. A lens model that is not one-to-one over the picture, or whose projection is anybody's guess at
+# its border, is no candidate, however well it fits where points were seen.
 
 BOARDS = ("rigid", "warp", "released")
 """Board models: flat with nominal corners; a paraboloid of two bows; every corner free."""
@@ -33,8 +43,22 @@ _FOLDS = 6
 _MAX_ITERATIONS = 40
 _ENOUGH = 1e-2
 """Of a standard deviation: far more than a comparison of held-back views needs."""
-_SIGNIFICANT = 2.0
-"""Standard errors by which a richer model has to win."""
+_CHANCE = 0.023
+"""Probability of a win by chance below which a richer model wins; two standard errors of many views."""
+_GAIN_PX = 0.005
+"""Error that a richer model has to take away in a typical view, at up to 1000 pixels' width."""
+_WORSE = 1.2
+"""Held-back error over that of the best candidate above which a model is not taken, significance or not."""
+_HOPELESS_RATIO = 3.0
+"""Held-back error of the sound models over that of the others above which they give way."""
+_LESS, _SAME = 0.95, 1.01
+"""RMS of the rational model over the simpler ones' below which it is worth more starts, and over the least of
+its own below which a fit without a pole is preferred."""
+_EQUIDISTANT = (0.3, 0.5)
+"""Focal lengths of wide lenses to start from, over the picture's larger side."""
+_SOUND = 3
+_BORDER_SHARE = 0.05
+"""Standard deviation of projection at the picture's border, over the width, above which a lens is a guess."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +72,8 @@ class Candidate:
     fitted_rms_px : RMS over all views when fitted to all of them.
     held_back_rms_px : RMS over views held back; NaN where a fold could not be fitted.
     per_view_px2 : (N,) mean squared residual vector of each view while it was held back.
+    soundness : 3 when the lens is one-to-one over the picture and known to its border, 2 when it is
+        one-to-one there, 1 when it is where points were seen, 0 when it folds among them.
     """
 
     name: str
@@ -55,6 +81,15 @@ class Candidate:
     fitted_rms_px: float
     held_back_rms_px: float
     per_view_px2: FloatArray
+    soundness: int = _SOUND
+
+    @property
+    def flaw(self) -> str:
+        """Why it is no candidate, "" where it is one."""
+        if self.soundness == _SOUND:
+            return ""
+        known = "not known at the picture's border"
+        return known if self.soundness == _SOUND - 1 else "not one-to-one over the picture"
 
 
 def board_basis(target_m: FloatArray, kind: str) -> FloatArray | None:
@@ -149,10 +184,19 @@ def _on_fold(judges: _Judges, job: tuple[int, int]) -> FloatArray:
     return np.where(known.any(axis=1), total / np.maximum(known.sum(axis=1), 1), np.nan)
 
 
-def _candidate(name: str, fit: Calibration, per_view: FloatArray) -> Candidate:
+def _soundness(fit: Calibration) -> int:
+    """`Candidate.soundness` of a lens."""
+    shape = lens_shape(fit)
+    if not shape.one_to_one:
+        return int(shape.seen_slope > 0.0)
+    border = projection_sigma_px(fit, covariance(fit), image_outline(fit.camera))
+    return _SOUND if np.all(border < _BORDER_SHARE * max(fit.camera.image_size_px)) else 2
+
+
+def _candidate(name: str, fit: Calibration, per_view: FloatArray, soundness: int = 3) -> Candidate:
     counts = fit.observations.present.sum(axis=1)
     mean = float(np.sqrt(np.sum(per_view * counts) / counts.sum()))
-    return Candidate(name, len(fit.free) + len(fit.block.deformation), fit.rms_px, mean, per_view)
+    return Candidate(name, len(fit.free) + len(fit.block.deformation), fit.rms_px, mean, per_view, soundness)
 
 
 def candidates_by_model(
@@ -186,10 +230,49 @@ def candidates_by_model(
         )
         if fit.termination in ("behind the camera", "singular"):
             continue
+        if model == "rational8" and not skew and not fixed:
+            fit = _sturdier(fit, fits)
         start = fit.block
         fits.append(fit)
     held = _on_held_back(fits, skew, fixed)
-    return [(_candidate(fit.camera.model, fit, held[i]), fit) for i, fit in enumerate(fits)]
+    return [(_candidate(fit.camera.model, fit, held[i], _soundness(fit)), fit) for i, fit in enumerate(fits)]
+
+
+def _sturdier(fit: Calibration, simpler: Sequence[Calibration]) -> Calibration:
+    """The rational model from another start, where the simpler ones fold or it does.
+
+    Its cost has many minima. A simpler model that folds leads into a wrong one, and noise alone makes some
+    with a pole in the picture, next to a zero that hides it.
+    """
+    sound = [lens_shape(one).one_to_one for one in (*simpler, fit)]
+    if not fit.rms_px < _LESS * min(
+        (one.rms_px for one, good in zip(simpler, sound, strict=False) if good), default=np.inf
+    ):
+        return fit
+    if all(sound):
+        return fit
+    observations, size = fit.observations, fit.camera.image_size_px
+
+    def fitted(start: Block, fixed: tuple[str, ...] = ()) -> Calibration:
+        return calibrate(
+            observations,
+            size,
+            "rational8",
+            fixed=fixed,
+            loss=fit.loss,
+            start=start,
+            max_iterations=_MAX_ITERATIONS,
+            tolerance=_ENOUGH,
+        )
+
+    starts = [equidistant_start(observations, size, share * max(size)) for share in _EQUIDISTANT]
+    starts = [start for start in starts if np.all(np.isfinite(start.t_CT_m))]
+    if simpler:
+        starts.append(fitted(simpler[-1].block, ("k6",)).block)
+    fits = [fit, *(fitted(start) for start in starts)]
+    fits = [one for one in fits if np.isfinite(one.rms_px)]
+    least = min(one.rms_px for one in fits)
+    return min(fits, key=lambda one: (one.rms_px > _SAME * least, not lens_shape(one).one_to_one, one.rms_px))
 
 
 def candidates_by_board(
@@ -231,23 +314,62 @@ def candidates_by_board(
     return [(_candidate(names[i], fit, held[i]), fit) for i, fit in enumerate(fits)]
 
 
-def simplest_good(candidates: Sequence[Candidate]) -> int:
+def simplest_good(candidates: Sequence[Candidate], width_px: int = 0) -> int:
     """Index of the simplest candidate that the richer ones do not beat on views held back.
 
-    The difference of mean squared residuals is compared with its standard error over views.
+    Parameters
+    ----------
+    width_px : larger side of the picture; the pixels that matter grow with it above 1000.
     """
+    gain_px = _GAIN_PX * max(1.0, width_px / 1000)
     chosen = 0
     for index in range(1, len(candidates)):
-        better = candidates[chosen].per_view_px2 - candidates[index].per_view_px2
-        if not np.all(np.isfinite(candidates[index].per_view_px2)):
-            continue
-        if not np.all(np.isfinite(candidates[chosen].per_view_px2)):
-            chosen = index
-            continue
-        error = np.std(better, ddof=1) / np.sqrt(len(better)) if len(better) > 1 else np.inf
-        if np.mean(better) > _SIGNIFICANT * error:
+        if _beats(candidates[index], candidates[chosen], gain_px):
             chosen = index
     return chosen
+
+
+def chosen_lens(candidates: Sequence[Candidate], width_px: int) -> int:
+    """Index of the simplest good lens model among the sound ones.
+
+    A sound model that leaves far larger errors than one that is not gives way: a lens that is known where
+    points were seen is worth more than one that is right nowhere, and the verdict says what it is.
+    """
+    usable = [
+        one.held_back_rms_px for one in candidates if one.soundness and np.isfinite(one.held_back_rms_px)
+    ]
+    for least in (3, 2, 1):
+        index = [i for i, one in enumerate(candidates) if one.soundness >= least]
+        if index:
+            best = index[simplest_good([candidates[i] for i in index], width_px)]
+            if not candidates[best].held_back_rms_px > _HOPELESS_RATIO * min(usable, default=np.inf):
+                return best
+    return simplest_good(candidates, width_px)
+
+
+def _beats(richer: Candidate, simpler: Candidate, gain_px: float) -> bool:
+    """Whether a richer model is better by more than chance, and by more than a few thousandths of a pixel."""
+    a, b = richer.per_view_px2, simpler.per_view_px2
+    if not np.all(np.isfinite(a)):
+        return False
+    if not np.all(np.isfinite(b)):
+        return True
+    typical = float(np.median(b) - np.median(a))
+    if not typical > gain_px**2:
+        return False
+    if (
+        np.median(b) > _WORSE**2 * np.median(a)
+        and simpler.held_back_rms_px > _WORSE * richer.held_back_rms_px
+    ):
+        return True
+    if len(a) < 2:
+        return False
+    # SciPy takes longer to load than most models to fit.
+    from scipy.special import stdtr
+
+    ratio = np.log(np.maximum(b, 1e-300) / np.maximum(a, 1e-300))
+    error = float(np.std(ratio, ddof=1)) / np.sqrt(len(ratio))
+    return bool(stdtr(len(ratio) - 1, -float(np.mean(ratio)) / max(error, 1e-300)) < _CHANCE)
 
 
 # ----------------------------------------------------------------------
@@ -345,7 +467,11 @@ def _unusable(view: View) -> str:
 
 
 def _chosen_model(
-    observations: Observations, image_size_px: tuple[int, int], choices: Choices, fixed: tuple[str, ...]
+    observations: Observations,
+    image_size_px: tuple[int, int],
+    choices: Choices,
+    fixed: tuple[str, ...],
+    excluded: tuple[str, ...] = (),
 ) -> tuple[str, Calibration | None, tuple[Candidate, ...]]:
     """The lens model, a fit of it to start from, and the comparison that chose it."""
     if choices.model != "auto":
@@ -357,10 +483,9 @@ def _chosen_model(
     )
     if not found:
         return "radial2", None, ()
-    # A lens that folds the picture where points were seen is none, however well it fits.
-    sound = [one for one in found if lens_shape(one[1]).seen_slope > 0.0] or found
-    best, fit = sound[simplest_good([candidate for candidate, _ in sound])]
-    return best.name, fit, tuple(candidate for candidate, _ in found)
+    candidates = tuple(replace(one, soundness=0) if one.name in excluded else one for one, _ in found)
+    best = chosen_lens(candidates, max(image_size_px))
+    return candidates[best].name, found[best][1], candidates
 
 
 # Views that belong to no camera overflow; what is not finite is looked for at each stage.
@@ -442,7 +567,11 @@ def calibrate_camera(
 
 
 def _sorted_out(
-    everything: Observations, image_size_px: tuple[int, int], choices: Choices, fixed: tuple[str, ...]
+    everything: Observations,
+    image_size_px: tuple[int, int],
+    choices: Choices,
+    fixed: tuple[str, ...],
+    excluded: tuple[str, ...] = (),
 ) -> tuple[Triage, tuple[Candidate, ...]]:
     """The views that agree, by the model that views held back choose among them."""
 
@@ -452,27 +581,37 @@ def _sorted_out(
 
     observations, before = everything, ""
     for _ in range(_TRIAGES):
-        model, start, models = _chosen_model(observations, image_size_px, choices, fixed)
+        model, start, models = _chosen_model(observations, image_size_px, choices, fixed, excluded)
         if model == before:
             break
         # The start has the poses of the views that the model was chosen by, which may be fewer.
         found = by(model, start.block if start is not None and observations is everything else None)
         better = _better_for_most(model, models)
-        # A model that is too simple blames views that the lens tells most of.
-        if found.left_out and better and len((other := by(better)).left_out) < len(found.left_out):
-            found, model = other, better
+        if better is not None:
+            other = by(better.name)
+            if better.soundness < _SOUND and len(other.left_out) > len(found.left_out):
+                # Behind the errors of a model that is too simple a bad view hides.
+                observations, before = other.calibration.observations, ""
+                continue
+            # A model that is too simple blames views that the lens tells most of.
+            if better.soundness == _SOUND and len(other.left_out) < len(found.left_out):
+                found, model = other, better.name
         if not found.left_out or choices.model != "auto":
             break
         observations, before = found.calibration.observations, model
+    promised = next((one.soundness for one in models if one.name == model), 0)
+    if promised == _SOUND > _soundness(found.calibration):
+        # A few more steps, or other views, took the lens where it may not go.
+        return _sorted_out(everything, image_size_px, choices, fixed, (*excluded, model))
     return found, models
 
 
-def _better_for_most(model: str, models: Sequence[Candidate]) -> str:
-    """The model that is far better than the chosen one for a typical view that was held back, or ""."""
+def _better_for_most(model: str, models: Sequence[Candidate]) -> Candidate | None:
+    """The model that is far better than the chosen one for a typical view that was held back."""
     medians = {one.name: float(np.median(one.per_view_px2)) for one in models}
-    medians = {name: value for name, value in medians.items() if np.isfinite(value)}
-    best = min(medians, key=lambda name: medians[name], default=model)
-    return best if best != model and medians[best] < _FAR_BETTER * medians.get(model, np.inf) else ""
+    best = min(models, key=lambda one: np.nan_to_num(medians[one.name], nan=np.inf), default=None)
+    far = best is not None and medians[best.name] < _FAR_BETTER * medians.get(model, np.inf)
+    return best if far else None
 
 
 def _judged(fit: Calibration, sigma: Covariance, findings: Sequence[Finding]) -> Judgement:
@@ -500,7 +639,7 @@ def _with_board(rigid: Calibration, choices: Choices) -> tuple[Calibration, str,
         return rigid, "rigid", ()
     if choices.board == "auto":
         found = candidates_by_board(rigid, choices.skew, BOARDS)
-        best = simplest_good([candidate for candidate, _ in found])
+        best = simplest_good([candidate for candidate, _ in found], max(rigid.camera.image_size_px))
         return found[best][1], found[best][0].name, tuple(candidate for candidate, _ in found)
     observations = rigid.observations
     basis = board_basis(observations.target_m[0], choices.board)

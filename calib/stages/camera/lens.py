@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -15,7 +15,11 @@ from calib.stages.camera.model import (
     INTRINSICS,
     Camera,
     camera_from_vector,
+    corner_radius,
     distort,
+    focal_px,
+    fold_radius,
+    one_to_one_reach,
     project,
     undistort,
     vector_from_camera,
@@ -101,28 +105,6 @@ def distorted_normalised(camera: Camera, pixels: AnyArray) -> AnyArray:
     return np.stack([x, y], axis=-1)
 
 
-def fold_radius(camera: Camera) -> tuple[float, float]:
-    """Where the radial curve r L(r) stops rising: undistorted radius r and distorted radius r L(r).
-
-    Normalised; infinite where it rises for ever or up to a pole of L. With L = N / D in rho = r^2 the
-    slope vanishes where N D + 2 rho (N' D - N D') = 0. Beyond it two points share a pixel.
-    """
-    k1, k2, _, _, k3, k4, k5, k6 = camera.distortion
-    N, D = np.polynomial.Polynomial([1, k1, k2, k3]), np.polynomial.Polynomial([1, k4, k5, k6])
-    rho = np.polynomial.Polynomial([0, 1])
-
-    def first_root(polynomial: Any) -> float:
-        roots = polynomial.trim().roots()
-        real = roots[(np.abs(roots.imag) < 1e-9 * np.maximum(1.0, np.abs(roots))) & (roots.real > 0)].real
-        return float(real.min()) if len(real) else np.inf
-
-    fold = first_root(N * D + 2 * rho * (N.deriv() * D - N * D.deriv()))
-    if not np.isfinite(fold) or first_root(D) < fold:
-        return np.inf, np.inf
-    radius = float(np.sqrt(fold))
-    return radius, radius * float(N(fold) / D(fold))
-
-
 def undistort_by_polynomial(inverse: InversePolynomial, distorted: AnyArray) -> AnyArray:
     """Normalised undistorted coordinates (..., 2) of distorted ones, in the precision of the input."""
     kind = distorted.dtype.type
@@ -146,14 +128,9 @@ def _times_radial(radial: tuple[float, ...], x: AnyArray, y: AnyArray) -> tuple[
 
 
 def exact_inverse(camera: Camera, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Normalised undistorted coordinates (M, 2) by Newton's method, and which pixels have them (M,).
-
-    Pixels that only a part of the curve beyond its fold could show count as having none.
-    """
+    """Normalised undistorted coordinates (M, 2) by Newton's method, and which pixels have them (M,)."""
     ideal = undistort(camera, pixels)
-    with np.errstate(invalid="ignore"):
-        inside = np.linalg.norm(ideal, axis=1) < fold_radius(camera)[0]
-    return ideal, np.asarray(np.isfinite(ideal).all(axis=1) & inside)
+    return ideal, np.asarray(np.isfinite(ideal).all(axis=1))
 
 
 def fit_inverse(camera: Camera, tolerance_px: float = 0.01) -> InversePolynomial:
@@ -281,12 +258,10 @@ class DistortionReport:
     Attributes
     ----------
     kind : see `distortion_kind`.
-    max_px, mean_px : length of the displacement over the whole picture.
+    max_px, mean_px : length of the displacement over the picture, as far as the lens shows it once.
     region_px : box that `region_*` are taken over.
     region_max_px, region_mean_px : the same over the region of interest.
-    monotonic : whether the radial curve rises throughout the picture.
-    fold_px, corner_px : distance from the principal point at which the radial curve stops rising
-        (infinite if never), and of the corner farthest from it; distorted, of the mean focal length.
+    monotonic : whether the lens model is one-to-one throughout the picture.
     region_sigma_px : standard deviation of projection over the region at its least, from the
         covariance of the intrinsics; None where that is not known.
     plane : cost on the plane, None where no plane is known or none of it is seen.
@@ -301,8 +276,6 @@ class DistortionReport:
     region_max_px: float
     region_mean_px: float
     monotonic: bool
-    fold_px: float
-    corner_px: float
     region_sigma_px: float | None
     plane: PlaneCost | None
     inverse: InversePolynomial
@@ -348,7 +321,8 @@ def distortion_kind(camera: Camera) -> str:
         if k1 * k2 < 0:
             return "mustache"
         return "pincushion" if k1 + k2 > 0 else "barrel"
-    r = np.linspace(0.0, min(_corner_radius(camera), fold_radius(camera)[0]), 500)[1:]
+    # A pole itself has no value.
+    r = np.linspace(0.0, min(corner_radius(camera), 0.999 * fold_radius(camera)[0]), 500)[1:]
     radial = camera.distortion.copy()
     radial[2:4] = 0.0
     steps = np.diff(distort(r, np.zeros_like(r), radial)[0] / r)
@@ -360,21 +334,6 @@ def distortion_kind(camera: Camera) -> str:
     if min(rise, fall) * seen_px > _TURN_PX:
         return "mustache"
     return "pincushion" if rise > fall else "barrel"
-
-
-def focal_px(camera: Camera) -> float:
-    """Geometric mean of the focal lengths."""
-    return float(np.sqrt(camera.fx_px * camera.fy_px))
-
-
-def _corner_radius(camera: Camera) -> float:
-    """Largest normalised radius of the picture's corners."""
-    width, height = camera.image_size_px
-    v = np.array([0.0, 0.0, height - 1.0, height - 1.0])
-    u = np.array([0.0, width - 1.0, 0.0, width - 1.0])
-    y = (v - camera.cy_px) / camera.fy_px
-    x = (u - camera.cx_px - camera.skew_px * y) / camera.fx_px
-    return float(np.hypot(x, y).max())
 
 
 def projection_sigma_px(camera: Camera, covariance: FloatArray, pixels: FloatArray) -> FloatArray:
@@ -439,14 +398,13 @@ def analyse_distortion(
             f"the region {list(region)} is not a box [u0, v0, u1, v1] inside the picture of {width}x{height} "
             "px"
         )
-    whole = np.linalg.norm(displacement_field(camera, pixel_grid(camera.image_size_px)), axis=-1)
-    at = pixel_grid(camera.image_size_px, region).reshape(-1, 2)
-    inside = np.linalg.norm(displacement_field(camera, at), axis=1)
+    everywhere, at = (_once(camera, pixel_grid(camera.image_size_px, box)) for box in (None, region))
+    whole, inside = (
+        np.linalg.norm(displacement_field(camera, pixels), axis=1) for pixels in (everywhere, at)
+    )
     sigma = None
     if camera_covariance is not None and np.all(np.isfinite(camera_covariance)):
         sigma = projection_sigma_px(camera, camera_covariance, at)
-    _, fold = fold_radius(camera)
-    corner = _corner_radius(camera)
     effect, why = _judge(inside, sigma, plane, cost)
     return DistortionReport(
         kind=distortion_kind(camera),
@@ -455,15 +413,28 @@ def analyse_distortion(
         region_px=region,
         region_max_px=float(inside.max()),
         region_mean_px=float(inside.mean()),
-        monotonic=corner < fold,
-        fold_px=fold * focal_px(camera),
-        corner_px=corner * focal_px(camera),
+        monotonic=one_to_one_reach(camera) > 1.0,
         region_sigma_px=None if sigma is None else float(sigma.min()),
         plane=cost,
         inverse=fit_inverse(camera, tolerance_px),
         effect=effect,
         why=why,
     )
+
+
+def shown_once(camera: Camera, pixels: FloatArray) -> BoolArray:
+    """Which ideal pixels (..., 2) the lens model shows once only, and not far outside of the picture."""
+    x, y = np.moveaxis(distorted_normalised(camera, pixels), -1, 0)
+    once = np.hypot(x, y) < fold_radius(camera)[0]
+    # Next to a pole displacements have no bound.
+    xd, yd = distort(np.where(once, x, 0.0), np.where(once, y, 0.0), camera.distortion)
+    return np.asarray(once & (np.hypot(xd, yd) < 2.0 * corner_radius(camera)))
+
+
+def _once(camera: Camera, pixels: FloatArray) -> FloatArray:
+    """Those of ideal pixels (rows, columns, 2) that are shown once, (n, 2); all where none is."""
+    kept = shown_once(camera, pixels)
+    return pixels[kept] if kept.any() else pixels.reshape(-1, 2)
 
 
 def _on_plane(camera: Camera, plane: PlaneView) -> tuple[PlaneCost | None, Region | None]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -315,8 +315,58 @@ def undistort(camera: Camera, pixels: FloatArray, iterations: int = 30) -> Float
         solved = np.hypot(xd - xd_now, yd - yd_now) < 1e-10
         xx, xy, yx, yy = _distort_jacobian(x, y, camera.distortion)
         # Both eigenvalues positive: beyond the fold the picture of the point's antipode has none.
-        solved &= (xx * yy - xy * yx > 0.0) & (xx + yy > 0.0)
+        solved &= (xx * yy - xy * yx > 0.0) & (xx + yy > 0.0) & (np.hypot(x, y) < fold_radius(camera)[0])
     return np.where(solved[..., None], np.stack([x, y], axis=-1), np.nan)
+
+
+# ----------------------------------------------------------------------
+# How far a lens model is one-to-one. Beyond a fold of its radial curve two directions share a pixel; what
+# lies beyond a pole of the rational model comes into the picture from the other side.
+
+
+def focal_px(camera: Camera) -> float:
+    """Geometric mean of the focal lengths."""
+    return float(np.sqrt(camera.fx_px * camera.fy_px))
+
+
+def corner_radius(camera: Camera) -> float:
+    """Largest normalised radius of the picture's corners."""
+    width, height = camera.image_size_px
+    v = np.array([0.0, 0.0, height - 1.0, height - 1.0])
+    u = np.array([0.0, width - 1.0, 0.0, width - 1.0])
+    y = (v - camera.cy_px) / camera.fy_px
+    x = (u - camera.cx_px - camera.skew_px * y) / camera.fx_px
+    return float(np.hypot(x, y).max())
+
+
+def fold_radius(camera: Camera) -> tuple[float, float]:
+    """Where the radial curve r L(r) stops rising, at a fold or a pole: radii r and r L(r).
+
+    Normalised; infinite where it rises for ever, the distorted radius also at a pole. With L = N / D in
+    rho = r^2 the slope vanishes where N D + 2 rho (N' D - N D') = 0.
+    """
+    k1, k2, _, _, k3, k4, k5, k6 = camera.distortion
+    N, D = np.polynomial.Polynomial([1, k1, k2, k3]), np.polynomial.Polynomial([1, k4, k5, k6])
+    rho = np.polynomial.Polynomial([0, 1])
+
+    def first_root(polynomial: Any) -> float:
+        roots = polynomial.trim().roots()
+        real = roots[(np.abs(roots.imag) < 1e-9 * np.maximum(1.0, np.abs(roots))) & (roots.real > 0)].real
+        return float(real.min()) if len(real) else np.inf
+
+    fold, pole = first_root(N * D + 2 * rho * (N.deriv() * D - N * D.deriv())), first_root(D)
+    if pole < fold:
+        return float(np.sqrt(pole)), np.inf
+    radius = float(np.sqrt(fold))
+    return radius, radius * float(N(fold) / D(fold)) if np.isfinite(fold) else np.inf
+
+
+def one_to_one_reach(camera: Camera) -> float:
+    """How far the radial curve is one-to-one, over the distance of the picture's farthest corner.
+
+    Both the picture and the ideal one that undistortion makes of it have to lie inside.
+    """
+    return float(min(fold_radius(camera)) / corner_radius(camera))
 
 
 # ----------------------------------------------------------------------

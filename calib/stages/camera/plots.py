@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
-from calib.core.arrays import BoolArray, FloatArray, IntArray
+from calib.core.arrays import FloatArray, IntArray
 from calib.core.geometry import apply_homography
 from calib.core.plot import (
     SIGMA,
@@ -47,15 +47,14 @@ from calib.stages.camera.lens import (
     displacement_field,
     distorted_normalised,
     distortion_kind,
-    focal_px,
-    fold_radius,
     ideal_pixels,
     inverse_error,
     pixel_grid,
     radial_displacement,
     radial_sigma,
+    shown_once,
 )
-from calib.stages.camera.model import Camera, undistort, vector_from_camera
+from calib.stages.camera.model import Camera, focal_px, fold_radius, undistort, vector_from_camera
 from calib.stages.camera.plane import Plane, to_pixels, visible
 
 Size = tuple[int, int]
@@ -539,12 +538,6 @@ def _lens_figure(
     return Figure(title, note, panels, high, verdict, columns=2, widths=(1.55, 1.0))
 
 
-def _shown_once(camera: Camera, pixels: FloatArray) -> BoolArray:
-    """Which ideal pixels (..., 2) the lens model shows once only."""
-    radius = np.linalg.norm(distorted_normalised(camera, pixels), axis=-1)
-    return np.asarray(radius < fold_radius(camera)[0])
-
-
 def _map(camera: Camera, marks: tuple[Mark, ...]) -> Plot:
     """Length of the displacement as a map with arrows on it, under other marks."""
     size = camera.image_size_px
@@ -554,10 +547,10 @@ def _map(camera: Camera, marks: tuple[Mark, ...]) -> Plot:
         return picture(size, marks, empty="no distortion: every point is seen where an ideal lens shows it")
     u, v, pixels = _grid_over(size, 81)
     length = np.linalg.norm(displacement_field(camera, pixels), axis=-1)
-    field = Field(u, v, np.where(_shown_once(camera, pixels), length, np.nan), "px", even=True)
+    field = Field(u, v, np.where(shown_once(camera, pixels), length, np.nan), "px", even=True)
     u, _, pixels = _grid_over(size, 15)
     at = pixels[1:-1, 1:-1].reshape(-1, 2)
-    at = at[_shown_once(camera, at)]
+    at = at[shown_once(camera, at)]
     vectors = displacement_field(camera, at)
     times = _times(vectors, float(u[1]))
     arrows = Arrows(at, vectors, times, "px", "red")
@@ -577,7 +570,9 @@ def _along_radius(
     last = float(np.linalg.norm(np.maximum(centre, corner - centre)))
     if not (math.isfinite(last) and _finite(camera)):
         return Plot(x, y, empty="not bounded")
-    fold = min(fold_radius(camera)[0] * focal_px(camera), last)
+    radius_of_fold, distorted = fold_radius(camera)
+    # Next to a pole the curve leaves every scale.
+    fold = min((1.0 if math.isfinite(distorted) else 0.98) * radius_of_fold * focal_px(camera), last)
     radius = np.linspace(0.0, fold, 241)
     moved = radial_displacement(camera, radius)
     bottom, top = float(moved.min()), float(moved.max())

@@ -197,6 +197,7 @@ def _camera_document(camera: Camera) -> dict[str, Any]:
                 "parameters": one.parameters,
                 "fitted_rms_px": one.fitted_rms_px,
                 "held_back_rms_px": one.held_back_rms_px,
+                "flaw": one.flaw,
             }
             for one in candidates
         ]
@@ -244,6 +245,9 @@ def _camera_words(camera: Camera) -> list[Block]:
             )
             head = (what, "parameters", "fitted", "held back")
             blocks.append(Table(head, rows, f"{what}s compared, RMS in px"))
+            unsound = ", ".join(f"{one.name} ({one.flaw})" for one in candidates if one.flaw)
+            if unsound:
+                blocks.append(Line(f"no candidate: {unsound}"))
     blocks += [Line(f"not used: {one}") for one in evidence.fit.left_out]
     return blocks
 

@@ -11,6 +11,7 @@ from calib.core.arrays import FloatArray, IntArray
 from calib.core.verdict import Finding, Severity, Verdict
 from calib.stages.camera.bundle import Calibration, Covariance, covariance, projection_sigma_px
 from calib.stages.camera.checks import (
+    ONE_TO_ONE_REACH,
     Coverage,
     FocalInterval,
     Lens,
@@ -26,6 +27,7 @@ from calib.stages.camera.checks import (
     coverage,
     evidence,
     focal_interval,
+    image_outline,
     inside_hull,
     lens_shape,
     misfit,
@@ -66,6 +68,7 @@ class Limits:
     area_poor : share of the image that the points span.
     view_poor : share of the image that a typical view spans.
     projection_share : standard deviation of projection inside of what was seen, over the width.
+    border_share : the same at the picture's border; poor where half of it is worse.
     centre_poor, centre_remark : offset of the principal point from the image's centre, over its side.
     lens_remark, lens_poor, lens_poor_px : share, and pixels, of the RMS that a richer lens model would
         take away.
@@ -106,6 +109,7 @@ class Limits:
     area_poor: float = 0.20
     view_poor: float = 0.01
     projection_share: float = 0.002
+    border_share: float = 0.01
     centre_poor: float = 0.15
     centre_remark: float = 0.10
     lens_remark: float = 0.1
@@ -204,13 +208,14 @@ def of_lens(found: Lens, calibration: Calibration, reach: float) -> list[Finding
         rational = camera.model == "rational8"
         kind: Severity = "poor" if rational else "unidentifiable"
         out.append(Finding(kind, text, "Use a simpler lens model." if rational else MORE_TILT))
-    elif found.image_shown < 1.0 or found.image_slope <= 0.0:
-        lost = 100 * (1 - found.image_shown)
+    elif not found.one_to_one:
         text = (
-            f"The distortion curve folds over inside of the picture: {lost:.0f} % of its border cannot be "
-            f"undistorted (up to 10 is good; points were seen {100 * reach:.0f} % of the way to the corners)."
+            f"The lens model is one-to-one up to {100 * found.reach:.0f} % of the way to the picture's "
+            f"corners only ({100 * ONE_TO_ONE_REACH:.0f} is good; points were seen {100 * reach:.0f} % of "
+            f"the way); {100 * (1 - found.image_shown):.0f} % of the picture's border cannot be undistorted."
         )
-        out.append(Finding("poor" if lost > 10.0 else "remark", text, _IN_CORNERS))
+        inside = found.reach <= 1.0 or found.image_shown < 1.0
+        out.append(Finding("poor" if inside else "remark", text, _IN_CORNERS))
     focal = min(camera.fx_px, camera.fy_px)
     if not 0.25 * width < focal < 30 * width:
         text = (
@@ -300,6 +305,19 @@ def of_projection(sigma_px: float, width: int, limits: Limits) -> list[Finding]:
     if not np.isfinite(sigma_px):
         text = "Where points were seen nothing bounds the error of the pixels that the camera predicts."
     return [Finding("poor", text, "Take more pictures, with the board tilted and close.")]
+
+
+def of_border(sigma_px: FloatArray, width: int, limits: Limits) -> list[Finding]:
+    """Standard deviation of projection, inflated, at points (n,) along the picture's border."""
+    limit, median, most = limits.border_share * width, float(np.median(sigma_px)), float(sigma_px.max())
+    if most <= limit:
+        return []
+    known = f"to {most:.1f} px only" if np.isfinite(most) else "without any bound on their error"
+    text = (
+        f"Somewhere at the picture's border the camera predicts pixels {known} (standard deviation; "
+        f"{limit:.1f} is good, half of the border is within {median:.1f})."
+    )
+    return [Finding("poor" if median > limit else "remark", text, _IN_CORNERS)]
 
 
 def of_starts(
@@ -736,6 +754,10 @@ def judge(
         least = _focal_share(calibration, covariance(calibration) if found is None else found, 1.0)
     findings += _uncertainty(sturdy, covered, least, limits, numbers)
     findings += _contradictions(sturdy, limits, numbers)
+    border = _border_sigma_px(fit, sturdy)
+    if len(border):
+        findings += of_border(border, max(fit.camera.image_size_px), limits)
+        numbers["border_sigma_px"] = float(border.max())
     lens = lens_shape(fit)
     findings += of_lens(lens, fit, covered.radius_share)
     numbers.update(
@@ -835,6 +857,18 @@ def _uncertainty(
         radius_share=covered.radius_share,
     )
     return findings
+
+
+def _border_sigma_px(fit: Calibration, sturdy: Calibration) -> FloatArray:
+    """Standard deviation of projection, inflated, at the points of the border that the lens can show.
+
+    The denominator of the rational model counts, unless nothing bounds it.
+    """
+    known = covariance(fit)
+    if not np.all(np.isfinite(known.joint)):
+        fit, known = sturdy, covariance(sturdy)
+    sigma = overdispersion(evidence(fit)) * projection_sigma_px(fit, known, image_outline(fit.camera))
+    return np.asarray(sigma[~np.isnan(sigma)])
 
 
 def _focal_share(fit: Calibration, known: Covariance, inflation: float) -> float:
