@@ -121,6 +121,7 @@ def _run(stage: Stage, files: Files, options: Any, figures: Path | None, as_json
         narrate(f"{name} written to {shown(files.rig_path)}")
     for sentence in () if stage.remarks is None else stage.remarks(after):
         narrate(sentence)
+    files.finish()
     if not stage.verdict(outcome).ok:
         raise typer.Exit(EXIT_POOR)
 

@@ -46,6 +46,14 @@ class UsageError(CalibError):
     exit_code = EXIT_USAGE
 
 
+class SomeFailedError(CalibError):
+    """Some of several files could not be worked on; each had its sentence, and the others are done."""
+
+    def __init__(self, message: str, exit_code: int) -> None:
+        super().__init__(message)
+        self.exit_code = exit_code
+
+
 class ReaderGoneError(CalibError):
     """Nobody reads stdout any more, as when `head` has seen enough; there is no one to tell."""
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args, get_type_hints
 
-from calib.core.errors import BadInputError, UsageError
+from calib.core.errors import EXIT_INTERNAL, BadInputError, CalibError, SomeFailedError, UsageError
 
 if TYPE_CHECKING:
     from calib.core.plot import Figure
@@ -56,6 +56,7 @@ class Files:
     hashes : SHA-256 of what was read, by name, for the provenance.
     remarks : sentences on what was read, which are narrated once all of it is.
     written : names of the files that the outcome was written to beside rig.yaml.
+    failed : by the path of a file that could not be worked on, the exit code that it alone would have.
     """
 
     paths: tuple[Path, ...] = ()
@@ -66,6 +67,7 @@ class Files:
     hashes: dict[str, str] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
     written: list[str] = field(default_factory=list)
+    failed: dict[Path, int] = field(default_factory=dict)
     figures: bool = True
     keep: bool = True
 
@@ -76,6 +78,35 @@ class Files:
         log = read_log(path, options)
         self.remarks += log.remarks()
         return log
+
+    @contextmanager
+    def one_of_several(self, path: Path) -> Iterator[None]:
+        """Work on a file; what goes wrong is narrated, where there are others that can be worked on."""
+        try:
+            yield
+        except CalibError as error:
+            self._fails(path, error, str(error), error.exit_code)
+        except (ArithmeticError, ValueError) as error:
+            from calib.core.files import shown
+
+            words = f"{shown(path)}: internal error: {type(error).__name__}: {error}; please report it"
+            self._fails(path, error, words, EXIT_INTERNAL)
+
+    def _fails(self, path: Path, error: Exception, words: str, exit_code: int) -> None:
+        if len(self.paths) < 2:
+            raise error
+        self.narrate(words)
+        self.failed[path] = exit_code
+
+    def finish(self) -> None:
+        """End the work, whose outcome has been told. Raises `SomeFailedError` where files have failed."""
+        if self.failed:
+            from calib.core.files import shown
+
+            names = ", ".join(shown(path.name) for path in self.failed)
+            raise SomeFailedError(
+                f"{len(self.failed)} of {len(self.paths)} files failed: {names}", max(self.failed.values())
+            )
 
     def taken(self, path: Path) -> str:
         """Note that a file is an input; its name without folders, the same wherever the folder lies."""

@@ -143,6 +143,7 @@ def perform(work: Work) -> int:
         # Nothing in a result differs from run to run.
         told.pop("seconds", None)
         write_atomically(work.folder / DOCUMENT, json.dumps(told, indent=1) + "\n")
+        files.finish()
         code = EXIT_DONE if made.verdict(outcome).ok else EXIT_POOR
     except CalibError as error:
         messages.append(f"calib: {error}")

@@ -83,6 +83,7 @@ def function(name: str) -> Callable[..., Any]:
         )
         with one_command(files.paths):
             outcome = made.run(files, Rig() if rig is None else rig, options_of(made.options, options))
+        files.finish()
         return outcome[0] if isinstance(outcome, list) and len(outcome) == 1 else outcome
 
     def call_without_sources(rig: Rig | None = None, **options: Any) -> Any:

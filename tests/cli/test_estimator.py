@@ -276,6 +276,29 @@ def test_logs_that_cannot_be_used_end_in_a_sentence(calib: Run, rig: Path, tmp_p
         assert ended.code == 3 and expected in ended.sentence
 
 
+def test_a_log_that_fails_does_not_keep_others_from_being_written(
+    calib: Run, aligned: Path, log_file: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bad, odd, good = tmp_path / "bad.csv", log_file("swing", 1), log_file("swing", 0)
+    bad.write_text("t_s,u_px,v_px\n0.0,1.0,x\n")
+    smoothed = "calib.stages.estimator.replay.smooth_log"
+
+    def fails(*_: object) -> None:
+        raise np.linalg.LinAlgError("singular")
+
+    ended = calib("replay", bad, good, "--rig", aligned, "-o", tmp_path / "one", "--json")
+    assert ended.code == 3
+    assert "line 2: v_px is 'x'" in ended.err
+    assert ended.sentence == "1 of 2 files failed: bad.csv"
+    assert [log["source"] for log in json.loads(ended.out)["replay"]["logs"]] == [good.name]
+    assert len(list((tmp_path / "one").iterdir())) == 1
+    monkeypatch.setattr(smoothed, fails)
+    ended = calib("replay", bad, odd, "--rig", aligned, "--smooth")
+    assert ended.code == 70
+    assert f"{odd.name}: internal error: LinAlgError: singular" in ended.err
+    assert ended.sentence == f"2 of 2 files failed: bad.csv, {odd.name}"
+
+
 @pytest.mark.slow
 def test_tuning_writes_the_estimator_section(
     calib: Run, aligned: Path, log_file: Callable[..., Path]

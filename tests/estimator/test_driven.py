@@ -28,6 +28,7 @@ from calib.stages.estimator.driven import (
     IMU,
     INVOLVED,
     PARAMETER,
+    TRACE,
     WORK,
     Drive,
     DrivenFilter,
@@ -283,7 +284,9 @@ def test_what_is_considered_stays_and_the_rest_learns(kind: int) -> None:
     out, H, work, report, gated = np.zeros(n), np.zeros((3, n)), np.zeros(WORK), np.empty(12), np.zeros(3)
     measure(kind, x, P, plant, view, CONSTANTS, noise, 0.0, H, out, work)
     z = np.array([out[0] + 0.5, out[1] - 0.4, out[2] + 0.002, 0.0])
-    driven_event(x, P, kind, z, plant, view, CONSTANTS, noise, work, False, report, gated)
+    driven_event(
+        x, P, kind, z, plant, view, CONSTANTS, noise, work, False, report, gated, np.empty((0, TRACE))
+    )
     held = [28, 29, 31, 32, 33]
     np.testing.assert_array_equal(x[held], before_x[held])
     np.testing.assert_array_equal(P[np.ix_(held, held)], before_P[np.ix_(held, held)])
@@ -468,6 +471,33 @@ def test_smoothing_lessens_the_error(name: str) -> None:
     filtered_mm, smoothed_mm, nees = np.mean(figures, axis=0)
     assert smoothed_mm < 0.85 * filtered_mm
     assert nees < 8.0
+
+
+def test_after_a_gap_the_forces_are_not_taken_as_none() -> None:
+    rig, log = driven_log("elongation", 1)
+    rows, pwm, setup = rows_from(log), commands_of(log), setup_for(rig, 1)
+    some = (log.t_s < 4.0) | (log.t_s > 7.0)
+    rows, pwm, true = part(rows, some), pwm[some], truth(log)[some]
+    filtered = DrivenFilter(setup, Drive()).run(rows, pwm)
+    smoothed = driven_smoother.smooth_driven(setup, Drive(), rows, pwm, filtered)
+    late = rows.t_s > 7.5
+    assert np.abs(filtered[late, 1] - true[late, 0]).max() < 1e-3
+    assert np.abs(smoothed[late, 1] - true[late, 0]).max() < 5e-4
+
+
+@pytest.mark.parametrize("name", ["static", "swing", "step"])
+def test_smoothing_stands_readings_that_are_thought_exact(name: str) -> None:
+    """An IMU that is a hundred times as noisy as it is said to be."""
+    rig, log = driven_log(name, 3)
+    setup, rows, pwm = setup_for(rig, 3), rows_from(log), commands_of(log)
+    noise = setup.noise.copy()
+    noise[2:5] = 1e-4
+    setup = replace(setup, noise=noise)
+    filtered = DrivenFilter(setup, Drive()).run(rows, pwm)
+    smoothed = driven_smoother.smooth_driven(setup, Drive(), rows, pwm, filtered)
+    known = np.isfinite(smoothed[:, 1])
+    assert known[rows.t_s > 0.5].all()
+    assert np.abs(smoothed[known, 1] - truth(log)[known, 0]).max() < 5e-3
 
 
 def test_windows_make_little_difference(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -338,6 +338,9 @@ SIZE_D = len(DRIVEN)
 WORK = (24, SIZE_D)
 """Shape of the scratch: p, x0, three gradients, terms, segments, accelerations, and F P."""
 
+TRACE = 2 * SIZE_D + 2
+"""Length of what a reading leaves; the last number is 0 where there was none."""
+
 _TELLING = 9.0
 _MARGIN_PX2 = 0.25
 _SWING_RADPS = 25.0
@@ -380,6 +383,17 @@ def _update(x: FloatArray, P: FloatArray, innovation: float, S: float, p: FloatA
         x[i] += gain * move
         for j in range(n):
             P[i, j] -= gain * p[j]
+
+
+@compiled()
+def _leave(trace: FloatArray, row: int, H: FloatArray, p: FloatArray, innovation: float, S: float) -> None:
+    """Write what a reading did: gradient, gain, innovation / S and 1 / S; p as `_update` leaves it."""
+    if trace.shape[0] == 0:
+        return
+    n, root = H.shape[0], 1.0 / math.sqrt(S)
+    for j in range(n):
+        trace[row, j], trace[row, n + j] = H[j], p[j] * root
+    trace[row, 2 * n], trace[row, 2 * n + 1] = innovation / S, 1.0 / S
 
 
 @compiled()
@@ -526,7 +540,7 @@ def _chi_square(
 def driven_event(
     x: FloatArray, P: FloatArray, kind: int, z: FloatArray, plant: FloatArray, view: FloatArray,
     constants: FloatArray, noise: FloatArray, work: FloatArray, again: bool, report: FloatArray,
-    gated: FloatArray,
+    gated: FloatArray, trace: FloatArray,
 ) -> None:  # fmt: skip
     """Update a predicted state by an event, in place.
 
@@ -537,7 +551,10 @@ def driven_event(
     plant : (22,). view, constants, noise : as in `kernel.event`.
     work : scratch of the shape `WORK`. report : (12,) of `kernel.REPORT`, written to.
     again : whether the event is done once more; then `gated` (3,) holds.
+    trace : (3, `TRACE`) what each reading did, for the smoother; (0, `TRACE`) for nothing.
     """
+    for k in range(trace.shape[0]):
+        trace[k, TRACE - 1] = 0.0
     if not again:
         for k in range(report.shape[0]):
             report[k] = math.nan
@@ -546,8 +563,11 @@ def driven_event(
     H, p, out, e = work[2:5], work[0], work[5], work[10]
     if kind == HOSES:
         for k in range(x.shape[0]):
-            p[k] = P[k, 13]
-        _update(x, P, -x[13], P[13, 13] + z[0] * z[0], p)
+            H[0, k], p[k] = 0.0, P[k, 13]
+        H[0, 13] = 1.0
+        y, S = -x[13], P[13, 13] + z[0] * z[0]
+        _update(x, P, y, S, p)
+        _leave(trace, 0, H[0], p, y, S)
     elif kind == CAMERA:
         measure(kind, x, P, plant, view, constants, noise, stamp, H, out, work)
         e[0], e[1] = z[0] - out[0], z[1] - out[1]
@@ -570,6 +590,7 @@ def driven_event(
                 y, S, log_z = update_terms(e[k] - moved, spread, out[3 + k], noise[1])
                 log_l += log_z
                 _update(x, P, y, S, p)
+                _leave(trace, k, H[k], p, y, S)
     elif kind == IMU:
         measure(kind, x, P, plant, view, constants, noise, stamp, H, out, work)
         for k in range(3):
@@ -600,6 +621,7 @@ def driven_event(
                 y -= H[k, i] * (x[i] - x0[i])
             log_l -= 0.5 * (y * y / S + math.log(2.0 * math.pi * S))
             _update(x, P, y, S, p)
+            _leave(trace, order, H[k], p, y, S)
     report[11] = log_l
 
 
@@ -622,6 +644,8 @@ assert SIZE_D == 36
 _LOCKED_OUT = 5.5
 """So many pictures rejected, IMU readings twice so many, and the filter starts again."""
 _BEFORE_S = 0.03
+_LOST_N = 0.5
+"""Deviation of lag, force and creep after a restart: a third of what a pump can do."""
 _LAST, _REJECTED, _FIRST, _REJECTED_IMU, _BEGUN = range(5)
 _NEWEST, _COUNT, _STARTED, _PENDING, _SWITCH, _HOSES = range(6)
 _SWITCHES = 128
@@ -647,14 +671,23 @@ def write_row(x: FloatArray, P: FloatArray, dt: float, radius: float, out: Float
 
 @compiled()
 def begin_again(
-    x: FloatArray, P: FloatArray, x0: FloatArray, P0: FloatArray, view: FloatArray, u: float, v: float
-) -> bool:
-    """Start a state (36,) from its prior and a picture; what has been learnt may be wrong and goes."""
+    x: FloatArray, P: FloatArray, x0: FloatArray, P0: FloatArray, view: FloatArray, u: float, v: float,
+    again: bool, g1: float, g2: float,
+) -> bool:  # fmt: skip
+    """Start a state (36,) from its prior and a picture; what has been learnt may be wrong and goes.
+
+    A log begins at rest. In its middle, `again`, the forces may be anything, most likely the static ones of
+    the last command, g1 and g2 [N].
+    """
     phi, length, found = invert_marker(view, x0[INVOLVED:], u, v, 0.0, x0[1])
     if not (found and 0.2 * x0[1] < length < 3.0 * x0[1]):
         return False
     copy_state(x, P, x0, P0)
     x[0], x[1] = phi, length
+    if again:
+        x[6], x[7], x[8], x[9] = g1, g2, g1, g2
+        for i in range(4, 10):
+            P[i, i] = _LOST_N * _LOST_N
     return True
 
 
@@ -676,7 +709,8 @@ def run_driven(
     camera_clock: FloatArray, imu_clock: FloatArray, x0: FloatArray, P0: FloatArray, plant: FloatArray,
     walk: FloatArray, view: FloatArray, constants: FloatArray, noise: FloatArray, radius: float,
     delay: float, action: float, hoses_sigma: float, z: FloatArray, report: FloatArray, spare: FloatArray,
-    spare_x: FloatArray, spare_P: FloatArray, F: FloatArray, work: FloatArray, out: FloatArray,
+    spare_x: FloatArray, spare_P: FloatArray, F: FloatArray, work: FloatArray, untraced: FloatArray,
+    out: FloatArray,
 ) -> None:  # fmt: skip
     """Rows (n,), (n, 5), (n,), (n, 2), (n,) through the ring of the last events; writes `out`.
 
@@ -765,7 +799,10 @@ def run_driven(
                         x, P, ring_t[before], ring_t[now], plant, walk, switch_t, switch_g, whole[_SWITCH],
                         F, work,
                     )  # fmt: skip
-                if i == 0 and begin and begin_again(x, P, x0, P0, view, z[0], z[1]):
+                if i == 0 and begin and begin_again(
+                    x, P, x0, P0, view, z[0], z[1], not math.isnan(real[_BEGUN]),
+                    switch_g[whole[_SWITCH], 0], switch_g[whole[_SWITCH], 1],
+                ):  # fmt: skip
                     if whole[_STARTED] == 1:
                         flags |= 1
                     whole[_STARTED], whole[_PENDING] = 1, 0
@@ -782,7 +819,7 @@ def run_driven(
                     continue
                 driven_event(
                     x, P, ring_kind[now], ring_z[now], plant, view, constants, noise, work, i > 0,
-                    report if i == 0 else spare, ring_gated[now],
+                    report if i == 0 else spare, ring_gated[now], untraced,
                 )  # fmt: skip
                 if not sound(x, P):
                     copy_state(x, P, x0, P0)
@@ -845,7 +882,7 @@ class DrivenFilter:
         self._numbers, self._walk, self._noise = drive.numbers(), drive.walk(setup), drive.noise(setup)
         self._scratch = (
             np.empty(4), np.empty(12), np.empty(12), np.empty(n), np.empty((n, n)),
-            np.zeros((DYNAMIC, INVOLVED)), np.zeros(WORK),
+            np.zeros((DYNAMIC, INVOLVED)), np.zeros(WORK), np.empty((0, TRACE)),
         )  # fmt: skip
 
     def run(self, rows: Rows, pwm: FloatArray) -> FloatArray:
@@ -873,22 +910,29 @@ assert SIZE == 19
 
 
 # ----------------------------------------------------------------------
-# The driven smoother: forward with the commands, backward by Rauch, Tung and Striebel (1965).
+# The driven smoother: forward with the commands, backward by Bryson and Frazier (1963).
 #
-# Events stand in the order of their times as in `smoother`, pictures at their exposure. With the
-# transition F
-# of `driven_model.jacobian`, its noise Q, P' = F P F' + Q and C = P F' P'^-1
+# Events stand in the order of their times as in `smoother`, pictures at their exposure. The forward pass
+# leaves what each reading did, and for each step the transition F of `jacobian`; backward each reading with
+# the gain k, L = I - k H, turns y into L' y + H' innovation / S and Y into L' Y L + H' H / S, each step turns
+# them into F' y and F' Y F, and
 #
-#     x_N += C (x_N+1 - x'),   P_N += C (P_N+1 - P') C'.
+#     x_N = x + P y,   P_N = P - P Y P.
+#
+# Nothing is inverted. F' only shrinks what a damped actuator forgets, where the F^-1 that is hidden in the
+# gain of Rauch, Tung and Striebel (1965) lets it grow. k is the whole gain, also for what is considered and
+# not learnt: Y is then at most P^-1 of a filter that learns it, so that P_N is positive.
 #
 # Only twelve of the states move, the others are carried over as they are. Where the forward filter starts
-# again the chain is cut: what comes later says nothing of what was before. The backward pass begins anew
-# every
-# `WINDOW` events, from events `OVERLAP` further on.
+# again, or the log is silent for longer than `LONGEST_GAP_S`, the chain is cut: what comes later says nothing
+# of what was before. The backward pass begins anew every `WINDOW` events, from events `OVERLAP` further on.
 
 WINDOW, OVERLAP = 6000, 3000
+LONGEST_GAP_S = 2.0
 _SMOOTHER_BEFORE_S, _SMOOTHER_LOCKED_OUT = 0.03, 5.5
 _SMOOTHER_STARTED, _SMOOTHER_PENDING, _SMOOTHER_HOSES = range(3)
+_SHOWN = np.array([0, 1, 2, 3, INVOLVED])
+"""States that the output needs: the motion and the gyroscope's bias."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -896,10 +940,10 @@ def _forward(
     t: FloatArray, before_s: float, first_s: float, kinds: IntArray, readings: FloatArray, x: FloatArray,
     P: FloatArray, whole: IntArray, rejected: FloatArray, switch_t: FloatArray, switch_g: FloatArray,
     x0: FloatArray, P0: FloatArray, plant: FloatArray, walk: FloatArray, view: FloatArray,
-    constants: FloatArray, noise: FloatArray, kept_x: FloatArray, kept_P: FloatArray, ahead: FloatArray,
+    constants: FloatArray, noise: FloatArray, kept_x: FloatArray, kept_P: FloatArray, trace: FloatArray,
     F: FloatArray, chained: BoolArray, alive: BoolArray, keep: int, hoses_sigma: float,
 ) -> None:  # fmt: skip
-    """The filter over events, keeping all states; those of the event `keep` and its counters are left."""
+    """The filter over events, keeping what is shown; state and counters after the event `keep` are left."""
     work, report, gated = np.zeros(WORK), np.empty(12), np.zeros(3)
     own_x, own_P, counters, marks = x.copy(), P.copy(), rejected.copy(), whole.copy()
     last = 0
@@ -909,19 +953,37 @@ def _forward(
             last += 1
         F[k] = 0.0
         chained[k] = False
+        trace[k, :, TRACE - 1] = 0.0
+        if t[k] - begin > LONGEST_GAP_S:
+            whole[_SMOOTHER_STARTED], whole[_SMOOTHER_PENDING] = 0, 0
+            rejected[:2] = 0.0
         if whole[_SMOOTHER_STARTED] == 1:
             for i in range(DYNAMIC):
                 F[k, i, i] = 1.0
             predict_driven(x, P, begin, t[k], plant, walk, switch_t, switch_g, last, F[k], work)
             chained[k] = True
-        ahead[k] = x[:DYNAMIC]
         kind, z = kinds[k], readings[k]
         if kind == HOSES:
             whole[_SMOOTHER_HOSES] = 1
         waits = (whole[_SMOOTHER_STARTED] == 0 or whole[_SMOOTHER_PENDING] == 1) and t[
             k
         ] > first_s + _SMOOTHER_BEFORE_S
-        if waits and kind == CAMERA and begin_again(x, P, x0, P0, view, z[0], z[1]):
+        if (
+            waits
+            and kind == CAMERA
+            and begin_again(
+                x,
+                P,
+                x0,
+                P0,
+                view,
+                z[0],
+                z[1],
+                not math.isnan(rejected[2]),
+                switch_g[last, 0],
+                switch_g[last, 1],
+            )
+        ):
             whole[_SMOOTHER_STARTED], whole[_SMOOTHER_PENDING] = 1, 0
             chained[k] = False
             rejected[2] = t[k]
@@ -930,7 +992,7 @@ def _forward(
         if kind == IMU and t[k] < rejected[2] + SETTLING_S:
             z[0], z[1] = math.nan, math.nan
         if whole[_SMOOTHER_STARTED] == 1 and kind != 0:
-            driven_event(x, P, kind, z, plant, view, constants, noise, work, False, report, gated)
+            driven_event(x, P, kind, z, plant, view, constants, noise, work, False, report, gated, trace[k])
             for i in range(3):
                 if report[8 + i] == 1.0:
                     rejected[min(i, 1)] += 1.0
@@ -943,7 +1005,8 @@ def _forward(
             elif rejected[0] > _SMOOTHER_LOCKED_OUT or rejected[1] > 2.0 * _SMOOTHER_LOCKED_OUT:
                 whole[_SMOOTHER_PENDING] = 1
                 rejected[:2] = 0.0
-        kept_x[k], kept_P[k] = x, P
+        for i in range(len(_SHOWN)):
+            kept_x[k, i], kept_P[k, i] = x[_SHOWN[i]], P[_SHOWN[i]]
         alive[k] = whole[_SMOOTHER_STARTED] == 1
         if k == keep:
             own_x[:], own_P[:], counters[:], marks[:] = x, P, rejected, whole
@@ -952,51 +1015,59 @@ def _forward(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _backward(
-    t: FloatArray, walk: FloatArray, F: FloatArray, ahead: FloatArray, chained: BoolArray, kept_x: FloatArray,
+    t: FloatArray, F: FloatArray, trace: FloatArray, chained: BoolArray, rows: IntArray, kept_x: FloatArray,
     kept_P: FloatArray,
 ) -> None:  # fmt: skip
-    """Over the kept states, in place."""
-    n = kept_x.shape[1]
-    normal, cross, FP = np.empty((n, n)), np.empty((n, n)), np.empty((DYNAMIC, n))
-    P, scale, move, change = np.empty((n, n)), np.empty(n), np.empty(n), np.empty((n, n))
-    for k in range(len(t) - 2, -1, -1):
-        if not chained[k + 1] or not t[k + 1] > t[k]:
-            if chained[k + 1]:
-                kept_x[k], kept_P[k] = kept_x[k + 1], kept_P[k + 1]
-            continue
-        G = F[k + 1]
-        P[:] = kept_P[k]
-        carry(P, G, walk, t[k + 1] - t[k], FP)
-        # FP is F P of the moving part; below it P itself.
-        for i in range(n):
-            scale[i] = 1.0 / math.sqrt(P[i, i])
-        for i in range(n):
-            for j in range(n):
-                normal[i, j] = P[i, j] * scale[i] * scale[j]
-                cross[i, j] = (FP[i, j] if i < DYNAMIC else kept_P[k, i, j]) * scale[i]
-            normal[i, i] += 1e-12
-        gain = np.linalg.solve(normal, cross).T
-        for i in range(n):
-            before = ahead[k + 1, i] if i < DYNAMIC else kept_x[k, i]
-            move[i] = (kept_x[k + 1, i] - before) * scale[i]
-            for j in range(n):
-                change[i, j] = (kept_P[k + 1, i, j] - P[i, j]) * scale[i] * scale[j]
-        kept_x[k] += gain @ move
-        added = gain @ change @ gain.T
-        for i in range(n):
-            for j in range(n):
-                kept_P[k, i, j] += 0.5 * (added[i, j] + added[j, i])
-            kept_P[k, i, i] = max(kept_P[k, i, i], 1e-24)
+    """Over what `_forward` kept, in place; of kept_P (n, 5, 36) the first five columns become smoothed ones.
+
+    `rows` tells at which events (>= 0) states are wanted.
+    """
+    shown, n = kept_P.shape[1], kept_P.shape[2]
+    y, Y, Yk = np.zeros(n), np.zeros((n, n)), np.empty(n)
+    for k in range(len(t) - 1, -1, -1):
+        if rows[k] >= 0:
+            P = kept_P[k]
+            kept_x[k] += P @ y
+            P[:, :shown] -= P @ Y @ P.T
+        for reading in range(2, -1, -1):
+            H, gain, weight = (
+                trace[k, reading, :n],
+                trace[k, reading, n : 2 * n],
+                trace[k, reading, 2 * n + 1],
+            )
+            if weight == 0.0:
+                continue
+            change = trace[k, reading, 2 * n] - gain @ y
+            for i in range(n):
+                y[i] += H[i] * change
+            Yk[:] = Y @ gain
+            weight += gain @ Yk
+            for i in range(n):
+                half = 0.5 * weight * H[i] - Yk[i]
+                for j in range(n):
+                    Y[i, j] += half * H[j] + H[i] * (0.5 * weight * H[j] - Yk[j])
+        if not chained[k]:
+            y[:], Y[:] = 0.0, 0.0
+        elif k and t[k] > t[k - 1]:
+            moved = F[k].T @ y[:DYNAMIC]
+            moved[DYNAMIC:] += y[DYNAMIC:INVOLVED]
+            y[:INVOLVED] = moved
+            FY = F[k].T @ Y[:DYNAMIC]
+            FY[DYNAMIC:] += Y[DYNAMIC:INVOLVED]
+            Y[:INVOLVED, :INVOLVED] = np.ascontiguousarray(FY[:, :DYNAMIC]) @ F[k]
+            Y[:INVOLVED, DYNAMIC:INVOLVED] += FY[:, DYNAMIC:INVOLVED]
+            Y[:INVOLVED, INVOLVED:] = FY[:, INVOLVED:]
+            Y[INVOLVED:, :INVOLVED] = FY[:, INVOLVED:].T
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _write(
-    kept_x: FloatArray, kept_P: FloatArray, kinds: IntArray, rows: IntArray, alive: BoolArray, radius: float,
-    out: FloatArray,
-) -> None:  # fmt: skip
-    for k in range(len(kinds)):
-        if kinds[k] == 0 and rows[k] >= 0 and alive[k]:
-            write_row(kept_x[k], kept_P[k], 0.0, radius, out[rows[k]])
+def _write(kept_x: FloatArray, kept_P: FloatArray, rows: IntArray, radius: float, out: FloatArray) -> None:
+    x, P = np.zeros(INVOLVED + 1), np.zeros((4, 4))
+    for k in range(len(rows)):
+        if rows[k] >= 0:
+            x[:4], x[INVOLVED] = kept_x[k, :4], kept_x[k, 4]
+            P[:] = kept_P[k, :4, :4]
+            write_row(x, P, 0.0, radius, out[rows[k]])
 
 
 def _timeline(
@@ -1023,7 +1094,7 @@ def _timeline(
     for k in np.nonzero(np.diff(t) > 0.95 * LONGEST_S)[0]:
         # No step is taken in parts, so that each has one transition. Longer silences are a cut.
         gap = t[k + 1] - t[k]
-        if gap < 2.0:
+        if gap <= LONGEST_GAP_S:
             fill = np.linspace(t[k], t[k + 1], math.ceil(gap / (0.95 * LONGEST_S)) + 1)[1:-1]
             extra_t.append(fill)
             extra_kind.append(np.zeros(len(fill), dtype=np.int64))
@@ -1049,30 +1120,29 @@ def smooth_driven(setup: Setup, drive: Drive, rows: Rows, pwm: FloatArray, outpu
     x, P = drive.start(setup)
     x0, P0 = x.copy(), P.copy()
     constants = np.array([setup.gravity_mps2, setup.lever_across_m])
-    whole, rejected = np.zeros(3, dtype=np.int64), np.zeros(3)
+    whole, rejected = np.zeros(3, dtype=np.int64), np.array([0.0, 0.0, np.nan])
     plant, walk, noise = drive.numbers(), drive.walk(setup), drive.noise(setup)
     out = outputs.copy()
     out[:, 1:13] = np.nan
-    n, size = len(t), len(DRIVEN)
+    n, size, shown = len(t), len(DRIVEN), len(_SHOWN)
     begin, before = 0, float(t[0]) if n else 0.0
     first = float(rows.t_s[0]) - max(float(setup.start.sensor[7]), 0.0) if n else 0.0
     while begin < n:
         end = min(begin + WINDOW, n)
         stop = min(end + OVERLAP, n)
         part, count = slice(begin, stop), stop - begin
-        kept_x, kept_P = np.empty((count, size)), np.empty((count, size, size))
-        ahead, F = np.empty((count, DYNAMIC)), np.empty((count, DYNAMIC, INVOLVED))
+        kept_x, kept_P = np.empty((count, shown)), np.empty((count, shown, size))
+        trace, F = np.empty((count, 3, TRACE)), np.empty((count, DYNAMIC, INVOLVED))
         chained, alive = np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
         _forward(
             t[part], before, first, kinds[part], readings[part], x, P, whole, rejected, switch_t, switch_g,
-            x0, P0, plant, walk, setup.view, constants, noise, kept_x, kept_P, ahead, F, chained,
+            x0, P0, plant, walk, setup.view, constants, noise, kept_x, kept_P, trace, F, chained,
             alive, end - begin - 1, drive.sigma[1],
         )  # fmt: skip
-        _backward(t[part], walk, F, ahead, chained, kept_x, kept_P)
-        own = slice(0, end - begin)
-        _write(
-            kept_x[own], kept_P[own], kinds[begin:end], at[begin:end], alive[own], setup.bellows_radius_m, out
-        )
+        wanted = np.where(alive & (kinds[part] == 0), at[part], -1)
+        wanted[end - begin :] = -1
+        _backward(t[part], F, trace, chained, wanted, kept_x, kept_P)
+        _write(kept_x, kept_P, wanted, setup.bellows_radius_m, out)
         before = float(t[end - 1])
         begin = end
     return out

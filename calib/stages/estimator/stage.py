@@ -101,7 +101,7 @@ def _solve(inputs: ReplayInputs) -> list[Replayed]:
         rig = rig.with_sections({"estimator": tuned})
     results = []
     for path, output in zip(files.paths, inputs.outputs, strict=True):
-        with files.progress(f"replaying {path.name}") as progress:
+        with files.one_of_several(path), files.progress(f"replaying {path.name}") as progress:
             result = replay_log(
                 path,
                 rig,
@@ -115,10 +115,12 @@ def _solve(inputs: ReplayInputs) -> list[Replayed]:
                 files.figures,
                 files.keep,
             )
-        result._tuned = tuned
-        results.append(result)
-        if output is not None:
-            files.narrate(f"states written to {shown(output)}")
+            result._tuned = tuned
+            results.append(result)
+            if output is not None:
+                files.narrate(f"states written to {shown(output)}")
+    if not results:
+        files.finish()
     return results
 
 
