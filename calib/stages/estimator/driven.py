@@ -10,6 +10,7 @@ from numba import njit
 
 from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.stages.actuator.dynamics import Coefficients, coefficients, rates
+from calib.stages.actuator.kinematics import chord_decay_w, chord_ratio_w
 from calib.stages.actuator.parameters import DAMPING_SCALE_FREE, Plant, pumps_connected
 from calib.stages.actuator.pump import Pump, PumpCoefficients, advance_pump, pump_coefficients, static_force_N
 from calib.stages.estimator.kinematic import (
@@ -46,11 +47,12 @@ from calib.stages.estimator.smoother import events_of, smooth
 # sensors of `sensors.SENSOR`.
 #
 # The motion is that of `calib.stages.actuator.dynamics.rates` and
-# `calib.stages.actuator.pump.advance_pump`, in Runge-Kutta steps
-# of at most `STEP_S`. A command acts as the static force that it settles at, constant between the times at
-# which commands take effect; a step of the filter is cut there (`Segments`). The Jacobian is by forward
-# differences of the same steps, over the 23 columns that the motion depends on; those of the sensors are
-# those of the identity.
+# `calib.stages.actuator.pump.advance_pump`, in Runge-Kutta steps of at most `longest_step_s`: as damping and
+# springs are uncertain, so is what is stiff. At equal steps an L-stable Rosenbrock method of third order
+# (ROS34PW2) errs five to forty times as much. A command acts as the static force that it settles at,
+# constant between the times at which commands take effect; a step of the filter is cut there (`cut`). The
+# Jacobian is by forward differences of the same steps, over the 23 columns that the motion depends on; those
+# of the sensors are those of the identity.
 
 MOVING = (
     "phi_rad", "length_m", "dphi_radps", "dlength_mps", "z_sum_N", "z_difference_N",
@@ -75,8 +77,9 @@ PLANT = (
 )  # fmt: skip
 """Nominal values, those of `Coefficients` and then of `PumpCoefficients`, as the vector `plant`."""
 
-STEP_S = 0.0035
-"""Longest Runge-Kutta step; the stiffest mode, 200 1/s, is then within 1e-4 of its own course."""
+STEP_S, STEP_RATE, LEAST_STEP_S = 0.0035, 1.5, 5e-5
+"""Longest Runge-Kutta step, the most that it may be times the stiffest rate, and the shortest step, for 30
+times the damping of a rig with its hoses on. From 2.78 on a step makes what it should damp grow."""
 
 _NUDGE = np.array([1e-6, 1e-7, 1e-5, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6,
                    1e-5, 1e-5, 1e-5, 1e-5, 1e-5, 1e-5, 1e-5, 1e-7, 1e-5, 1e-5, 1e-5])  # fmt: skip
@@ -100,7 +103,33 @@ def _coefficients(plant: FloatArray, x: FloatArray) -> Coefficients:
 
 
 @compiled()
-def flow(plant: FloatArray, x: FloatArray, segments: FloatArray, count: int, out: FloatArray) -> None:
+def longest_step_s(plant: FloatArray, x: FloatArray) -> float:
+    """Longest Runge-Kutta step [s] from a state (23,) or more: `STEP_S`, less where it is stiff.
+
+    The traces of M^-1 D and M^-1 K, of dampers and springs in (l, phi), bound their eigenvalues.
+    """
+    c = _coefficients(plant, x)
+    length, phi = x[1], x[0]
+    S = chord_ratio_w(phi * phi)
+    a = length * phi * chord_decay_w(phi * phi) / S
+    by_l, by_phi = 1.0 / (c.m * S * S), 1.0 / (0.25 * c.m * length * length * S * S + c.J)
+    damping, springs = 0.0, 0.0
+    for side in (-1.0, 1.0):
+        stretch = max(length + side * c.r * phi - c.l0, 0.0)
+        k = c.k0 + stretch * (c.k1 + stretch * (c.k2 + stretch * c.k3))
+        tangent = c.k0 + stretch * (2.0 * c.k1 + stretch * (3.0 * c.k2 + stretch * 4.0 * c.k3))
+        share = by_l + by_phi * (a + side * c.r) ** 2
+        damping += share * c.damping * math.sqrt(k)
+        springs += share * abs(tangent)
+    springs += by_phi * 4.0 * c.r * c.bending * abs(phi)
+    rate = damping + math.sqrt(springs)
+    return max(STEP_RATE / rate, LEAST_STEP_S) if rate * STEP_S > STEP_RATE else STEP_S
+
+
+@compiled()
+def flow(
+    plant: FloatArray, x: FloatArray, segments: FloatArray, count: int, longest_s: float, out: FloatArray
+) -> None:
     """State of the moving part (12,) after the segments.
 
     Parameters
@@ -108,6 +137,7 @@ def flow(plant: FloatArray, x: FloatArray, segments: FloatArray, count: int, out
     plant : (22,) of `PLANT`.
     x : (23,) or more, of `DRIVEN`.
     segments : (count, 3) or more rows: duration [s] and the nominal static forces of both pumps [N].
+    longest_s : step. States that are compared have to take the same steps.
     """
     c = _coefficients(plant, x)
     lag_s, deflation = plant[18] * _factor(x[17]), _factor(x[18])
@@ -119,7 +149,7 @@ def flow(plant: FloatArray, x: FloatArray, segments: FloatArray, count: int, out
     x1, x2, f1, f2, d1, d2 = x[6], x[7], x[8], x[9], x[10], x[11]
     strength1, strength2 = _factor(x[15]), _factor(x[16])
     for k in range(count):
-        parts = max(math.ceil(segments[k, 0] / STEP_S - 1e-9), 1)
+        parts = max(math.ceil(segments[k, 0] / longest_s - 1e-9), 1)
         h = segments[k, 0] / parts
         decay = math.exp(-0.5 * h / lag_s)
         g1, g2 = strength1 * segments[k, 1], strength2 * segments[k, 2]
@@ -156,12 +186,13 @@ def jacobian(
 
     Twelve more entries of out are scratch; x is nudged on the way and then as before.
     """
-    flow(plant, x, segments, count, out)
+    longest_s = longest_step_s(plant, x)
+    flow(plant, x, segments, count, longest_s, out)
     moved = out[DYNAMIC:]
     for k in range(INVOLVED):
         step, own = _NUDGE[k], x[k]
         x[k] = own + step
-        flow(plant, x, segments, count, moved)
+        flow(plant, x, segments, count, longest_s, moved)
         x[k] = own
         for i in range(DYNAMIC):
             F[i, k] = (moved[i] - out[i]) / step
@@ -335,8 +366,8 @@ LONGEST_S = 0.02
 """Longer steps are taken in parts."""
 
 SIZE_D = len(DRIVEN)
-WORK = (24, SIZE_D)
-"""Shape of the scratch: p, x0, three gradients, terms, segments, accelerations, and F P."""
+WORK = (25, SIZE_D)
+"""Shape of the scratch: p, x0, three gradients, terms, segments, accelerations, F P, and what is learnt."""
 
 TRACE = 2 * SIZE_D + 2
 """Length of what a reading leaves; the last number is 0 where there was none."""
@@ -363,8 +394,30 @@ def copy_state(to_x: FloatArray, to_P: FloatArray, x: FloatArray, P: FloatArray)
 
 
 @compiled()
-def _update(x: FloatArray, P: FloatArray, innovation: float, S: float, p: FloatArray) -> None:
-    """Update in place by an innovation with variance S; p = P H' is used up."""
+def _consider(x: FloatArray, P: FloatArray, plant: FloatArray, learnt: FloatArray) -> None:
+    """Which entries of a state (36,) readings change: 1, and 0 for what is considered and not learnt.
+
+    Considered is the geometry: lever, marker offset, shift and stretch of the plane. So is what multiplies a
+    quantity that may be none: the product of both errors would pass for knowledge. At rest the damping went
+    to seven times its value and the stiffness 30 % up, both sure of it. Of a head that does not move these
+    are damping, mass and creep; stiffness, bending and pumps, too, where nothing stretches the bellows.
+    """
+    for k in range(x.shape[0]):
+        learnt[k] = 1.0
+    learnt[28], learnt[29], learnt[31], learnt[32], learnt[33] = 0.0, 0.0, 0.0, 0.0, 0.0
+    if x[2] * x[2] > _TELLING * P[2, 2] or x[3] * x[3] > _TELLING * P[3, 3]:
+        return
+    learnt[13], learnt[20], learnt[21], learnt[22] = 0.0, 0.0, 0.0, 0.0
+    stretch = abs(x[1] - plant[3] - x[19]) + plant[2] * abs(x[0])
+    if stretch * stretch < _TELLING * (P[1, 1] - 2.0 * P[1, 19] + P[19, 19]):
+        learnt[12], learnt[14], learnt[15], learnt[16], learnt[17], learnt[18] = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+
+
+@compiled()
+def _update(
+    x: FloatArray, P: FloatArray, innovation: float, S: float, p: FloatArray, learnt: FloatArray
+) -> None:
+    """Update in place by an innovation with variance S; p = P H' is used up. `learnt` as of `_consider`."""
     n = x.shape[0]
     root = 1.0 / math.sqrt(S)
     for j in range(n):
@@ -372,13 +425,9 @@ def _update(x: FloatArray, P: FloatArray, innovation: float, S: float, p: FloatA
     move = innovation * root
     for i in range(n):
         gain = p[i]
-        # Lever, marker offset, shift and stretch of the plane.
-        if i == 28 or i == 29 or 31 <= i <= 33:
-            for j in range(28):
-                P[i, j] -= gain * p[j]
-            P[i, 30] -= gain * p[30]
-            P[i, 34] -= gain * p[34]
-            P[i, 35] -= gain * p[35]
+        if learnt[i] == 0.0:
+            for j in range(n):
+                P[i, j] -= gain * learnt[j] * p[j]
             continue
         x[i] += gain * move
         for j in range(n):
@@ -561,12 +610,15 @@ def driven_event(
     log_l = 0.0
     stamp = max(noise[6 if kind == CAMERA else 7] ** 2, z[3])
     H, p, out, e = work[2:5], work[0], work[5], work[10]
+    learnt = work[24]
+    _consider(x, P, plant, learnt)
     if kind == HOSES:
         for k in range(x.shape[0]):
             H[0, k], p[k] = 0.0, P[k, 13]
         H[0, 13] = 1.0
         y, S = -x[13], P[13, 13] + z[0] * z[0]
-        _update(x, P, y, S, p)
+        learnt[13] = 1.0
+        _update(x, P, y, S, p, learnt)
         _leave(trace, 0, H[0], p, y, S)
     elif kind == CAMERA:
         measure(kind, x, P, plant, view, constants, noise, stamp, H, out, work)
@@ -589,7 +641,7 @@ def driven_event(
                     moved += H[k, i] * (x[i] - x0[i])
                 y, S, log_z = update_terms(e[k] - moved, spread, out[3 + k], noise[1])
                 log_l += log_z
-                _update(x, P, y, S, p)
+                _update(x, P, y, S, p, learnt)
                 _leave(trace, k, H[k], p, y, S)
     elif kind == IMU:
         measure(kind, x, P, plant, view, constants, noise, stamp, H, out, work)
@@ -620,7 +672,7 @@ def driven_event(
             for i in range(x.shape[0]):
                 y -= H[k, i] * (x[i] - x0[i])
             log_l -= 0.5 * (y * y / S + math.log(2.0 * math.pi * S))
-            _update(x, P, y, S, p)
+            _update(x, P, y, S, p, learnt)
             _leave(trace, order, H[k], p, y, S)
     report[11] = log_l
 
@@ -644,11 +696,15 @@ assert SIZE_D == 36
 _LOCKED_OUT = 5.5
 """So many pictures rejected, IMU readings twice so many, and the filter starts again."""
 _BEFORE_S = 0.03
+FASTEST_MPS = 1.0
+"""No rig's bellows change their lengths faster: a swing from 0.7 rad reaches a quarter of it."""
 _LOST_N = 0.5
 """Deviation of lag, force and creep after a restart: a third of what a pump can do."""
 _LAST, _REJECTED, _FIRST, _REJECTED_IMU, _BEGUN = range(5)
 _NEWEST, _COUNT, _STARTED, _PENDING, _SWITCH, _HOSES = range(6)
 _SWITCHES = 128
+SILENT_S = 0.1
+"""A row so long after the last reading carries the state on with it."""
 
 
 @compiled()
@@ -692,9 +748,9 @@ def begin_again(
 
 
 @compiled()
-def sound(x: FloatArray, P: FloatArray) -> bool:
-    """Whether a state is one."""
-    good = abs(x[0]) < 3.0 and 1e-3 < x[1] < 1.0
+def sound(x: FloatArray, P: FloatArray, radius: float) -> bool:
+    """Whether a state is one that a rig can have."""
+    good = abs(x[0]) < 3.0 and 1e-3 < x[1] < 1.0 and abs(x[3]) + radius * abs(x[2]) < FASTEST_MPS
     for i in range(x.shape[0]):
         good = good and abs(x[i]) < 1e4 and 0.0 < P[i, i] < 1e6
         good = good and abs(P[0, i]) + abs(P[1, i]) + abs(P[2, i]) + abs(P[3, i]) < 1e6
@@ -741,8 +797,14 @@ def run_driven(
             switch_t[to] = max(tick + action, switch_t[whole[_SWITCH]])
             switch_g[to, 0], switch_g[to, 1] = forces[row, 0], forces[row, 1]
             whole[_SWITCH] = to
-        for turn in range(3):
-            if turn == 0:
+        for turn in range(4):
+            if turn == 3:
+                # Without readings the state itself goes on, one picture behind.
+                newest = whole[_NEWEST]
+                if whole[_COUNT] == 0 or not stamp - ring_t[newest] > delay + SILENT_S:
+                    continue
+                kind, when = 0, stamp - delay
+            elif turn == 0:
                 # Its own event, so that it is done again with those around it.
                 if whole[_HOSES] == 1 or not driven[row] > 0.0:
                     continue
@@ -811,7 +873,7 @@ def run_driven(
                         x[13], P[13, 13] = 0.0, hoses_sigma * hoses_sigma
                 if ring_kind[now] == IMU and ring_t[now] < real[_BEGUN] + SETTLING_S:
                     ring_z[now, 0], ring_z[now, 1], ring_gated[now, 1] = math.nan, math.nan, 1.0
-                if whole[_STARTED] == 0 and ring_kind[now] != HOSES:
+                if (whole[_STARTED] == 0 and ring_kind[now] != HOSES) or ring_kind[now] == 0:
                     for k in range(12):
                         report[k] = math.nan
                     for k in range(3):
@@ -821,13 +883,13 @@ def run_driven(
                     x, P, ring_kind[now], ring_z[now], plant, view, constants, noise, work, i > 0,
                     report if i == 0 else spare, ring_gated[now], untraced,
                 )  # fmt: skip
-                if not sound(x, P):
+                if not sound(x, P, radius):
                     copy_state(x, P, x0, P0)
                     whole[_PENDING] = 1
                     flags |= 1
             whole[_NEWEST] = (newest + 1) % size
             whole[_COUNT] = min(whole[_COUNT] + 1, size)
-            if kind == HOSES:
+            if kind == HOSES or kind == 0:
                 continue
             likelihood = out[row, 24]
             for k in range(12):
@@ -853,11 +915,12 @@ def run_driven(
                 spare_x, spare_P, ring_t[here], stamp, plant, walk, switch_t, switch_g, whole[_SWITCH], F,
                 work,
             )  # fmt: skip
-            if not sound(spare_x, spare_P):
+            if not sound(spare_x, spare_P, radius):
                 copy_state(spare_x, spare_P, x0, P0)
             write_row(spare_x, spare_P, 0.0, radius, out[row])
         else:
-            write_row(ring_x[here], ring_P[here], min(max(ahead, -0.02), 1e-3), radius, out[row])
+            back_s = min(max(ahead, -max(delay, 1e-3)), 1e-3)
+            write_row(ring_x[here], ring_P[here], back_s, radius, out[row])
         out[row, 25] = flags
 
 
@@ -941,7 +1004,7 @@ def _forward(
     P: FloatArray, whole: IntArray, rejected: FloatArray, switch_t: FloatArray, switch_g: FloatArray,
     x0: FloatArray, P0: FloatArray, plant: FloatArray, walk: FloatArray, view: FloatArray,
     constants: FloatArray, noise: FloatArray, kept_x: FloatArray, kept_P: FloatArray, trace: FloatArray,
-    F: FloatArray, chained: BoolArray, alive: BoolArray, keep: int, hoses_sigma: float,
+    F: FloatArray, chained: BoolArray, alive: BoolArray, keep: int, hoses_sigma: float, radius: float,
 ) -> None:  # fmt: skip
     """The filter over events, keeping what is shown; state and counters after the event `keep` are left."""
     work, report, gated = np.zeros(WORK), np.empty(12), np.zeros(3)
@@ -998,7 +1061,7 @@ def _forward(
                     rejected[min(i, 1)] += 1.0
                 elif report[8 + i] == 0.0:
                     rejected[min(i, 1)] *= 0.7
-            if not sound(x, P):
+            if not sound(x, P, radius):
                 x[:], P[:] = x0, P0
                 chained[k] = False
                 whole[_SMOOTHER_PENDING] = 1
@@ -1137,7 +1200,7 @@ def smooth_driven(setup: Setup, drive: Drive, rows: Rows, pwm: FloatArray, outpu
         _forward(
             t[part], before, first, kinds[part], readings[part], x, P, whole, rejected, switch_t, switch_g,
             x0, P0, plant, walk, setup.view, constants, noise, kept_x, kept_P, trace, F, chained,
-            alive, end - begin - 1, drive.sigma[1],
+            alive, end - begin - 1, drive.sigma[1], setup.bellows_radius_m,
         )  # fmt: skip
         wanted = np.where(alive & (kinds[part] == 0), at[part], -1)
         wanted[end - begin :] = -1
