@@ -34,7 +34,7 @@ from calib.stages.actuator.identify import (
 from calib.stages.actuator.identify_pump import Shape, fit_static_map
 from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import Plant
-from calib.stages.actuator.read import TrackSource, read_track, start_in_motion
+from calib.stages.actuator.read import TrackSource, let_go, read_track, start_in_motion
 from calib.stages.actuator.section import Known, KnownActuator, KnownPump
 from calib.stages.actuator.validate import IMPROVED, ORIGINAL, compare, validate_log
 from calib.twin.rig import SimulatedRig
@@ -443,6 +443,41 @@ def test_a_swing_that_is_held_first_begins_where_it_is_let_go(folder: Path) -> N
     source = _read(folder, "held.csv")
     assert any("let go at" in sentence for sentence in source.said)
     assert source.track.t_s[-1] == pytest.approx(4.0, abs=0.15)
+
+
+@pytest.mark.parametrize("gyro", [True, False])
+def test_a_pixel_that_flickers_does_not_let_the_head_go(folder: Path, gyro: bool) -> None:
+    log = read_log(folder / "swing.csv")
+    held = np.arange(0.0, 2.0, 1.0 / 60.0)
+    rng = np.random.default_rng(1)
+    columns = {}
+    for name, values in log.columns.items():
+        first = values[log.sampled(name)[0]]
+        before = np.full(len(held), first)
+        if name == "u_px":
+            before += (rng.random(len(held)) < 0.5).astype(np.float64)
+        if name == "gz_radps":
+            before += rng.normal(0.0, 0.003, len(held))
+        if gyro or name != "gz_radps":
+            columns[name] = np.concatenate([before, values])
+    t = np.concatenate([held, log.t_s + 2.0])
+    path = folder / "flickering.csv"
+    write_log(path, Log("held", t, columns, np.arange(len(t), dtype=np.int64)))
+    source = _read(folder, "flickering.csv")
+    assert source.begin_s == pytest.approx(2.0, abs=0.005 if gyro else 0.03)
+
+
+@pytest.mark.parametrize("jitter_px", [0.1, 0.3, 0.45])
+def test_whole_pixels_of_a_held_head_are_no_swing(jitter_px: float) -> None:
+    """Held for 3 s at any place in a pixel of 0.023 rad, then let go from a small angle."""
+    rng, pixel = np.random.default_rng(0), 0.023
+    t = np.arange(600) / 60.0
+    s = np.maximum(t - 3.0, 0.0)
+    for place in np.linspace(0.15, 0.15 + pixel, 100):
+        phi = place * np.exp(-1.2 * s) * np.cos(25.0 * s)
+        seen = pixel * np.round(phi / pixel + rng.normal(0.0, jitter_px, len(t)))
+        at = let_go(t, seen, pixel * float(np.hypot(jitter_px, 0.29)))
+        assert at is not None and 3.0 <= t[at] < 3.1
 
 
 def test_states_stand_in_for_pictures(folder: Path) -> None:

@@ -328,6 +328,8 @@ LONGEST_S = 120.0
 _IDENTIFYING_SHORTEST_S = 1.0
 _IDENTIFYING_FEWEST = 40
 _GAP_S = 0.5
+_HELD_S, _HELD_FEWEST = 0.25, 20
+_OF_SWING = 0.1
 _BEFORE_RELEASE_S = 0.03
 _MOST_TICKS = 10_000_000
 _LATE_S = 0.01
@@ -480,14 +482,45 @@ def _commands(log: Log, no_pwm: bool) -> tuple[float, float, FloatArray]:
     return float(t[0]), tick_s, pwm[latest]
 
 
-def _release(t: FloatArray, phi: FloatArray) -> float | None:
-    """Time shortly before a swing that is held for a while is let go; None where it begins at once."""
-    noise = float(np.median(np.abs(np.diff(phi[:20])))) + 1e-6
-    away = np.abs(phi - np.median(phi[:5])) > max(6.0 * noise, 0.02)
-    moving = np.nonzero(away[:-1] & away[1:])[0]
-    if len(moving) and t[moving[0]] - t[0] > 0.25:
-        return float(t[moving[0]]) - _BEFORE_RELEASE_S
-    return None
+def let_go(t_s: FloatArray, away: FloatArray, noise: float) -> int | None:
+    """Reading at which a head that is held for a while is first seen to swing; None where it swings at once.
+
+    This reading and the next are away from the held ones, by more than noise and by a share of what the
+    swing reaches: the tremor of a hand and the flicker of a pixel are no swing.
+
+    Parameters
+    ----------
+    t_s, away : (n,) times [s], and angle or rate of the head.
+    noise : standard deviation of a reading.
+    """
+    held = t_s <= t_s[0] + _HELD_S
+    apart = np.abs(away - np.median(away[held]))
+    both = np.minimum(apart[:-1], apart[1:])
+    swings = np.nonzero(both > max(_SURE * noise, _OF_SWING * both.max(initial=0.0)))[0]
+    return int(swings[0]) if len(swings) and not held[swings[0]] else None
+
+
+def release_s(log: Log, t_s: FloatArray, phi: FloatArray, noise_rad: float) -> float | None:
+    """Time of the log at which a free swing begins that is held before; None where it begins at once.
+
+    A gyroscope tells it from the rate, which rises from nothing; without one the pictures' angles do.
+
+    Parameters
+    ----------
+    t_s, phi : (n,) stamps of the pictures [s] and their angles. noise_rad : deviation of one of them.
+    """
+    if len(log.sampled("gz_radps")) <= _HELD_FEWEST:
+        k = let_go(t_s, phi, noise_rad)
+        return None if k is None else float(t_s[k]) - _BEFORE_RELEASE_S
+    gyro = log.signals("gz_radps")
+    first = gyro.values[gyro.t_s <= gyro.t_s[0] + _HELD_S, 0]
+    rate = gyro.values[:, 0] - np.median(first)
+    k = let_go(gyro.t_s, rate, 1.4826 * float(np.median(np.abs(first - np.median(first)))))
+    if k is None:
+        return None
+    rise = (rate[k + 1] - rate[k]) / (gyro.t_s[k + 1] - gyro.t_s[k])
+    since = rate[k] / rise if rise * rate[k] > 0.0 else 0.0
+    return float(gyro.t_s[k] - min(since, gyro.t_s[k] - gyro.t_s[k - 1]))
 
 
 def read_track(
@@ -532,11 +565,13 @@ def read_track(
         (t, head, W), delay_s = _from_pictures(log, rig, rig_path)
         how = "pictures"
     hoses = bool(pwm.any())
-    if not hoses and len(t) > 20:
-        let_go = _release(t, head[:, 0])
-        if let_go is not None:
-            begin, pwm = let_go, np.zeros((max(math.ceil((t[-1] - let_go) / tick_s) + 1, 2), 2))
-            said.append(f"{log.source}: let go at {let_go:.2f} s; what is before is left out")
+    spread = np.linalg.inv(W[:20])
+    noise = float(np.median(np.linalg.norm(spread[:, 0], axis=1)))
+    if not hoses and len(t) > _HELD_FEWEST:
+        at = release_s(log, t, head[:, 0], noise)
+        if at is not None:
+            begin, pwm = at, np.zeros((max(math.ceil((t[-1] - at) / tick_s) + 1, 2), 2))
+            said.append(f"{log.source}: let go at {at:.2f} s; what is before is left out")
     inside = (t >= begin - 0.5 * tick_s) & (t <= begin + LONGEST_S)
     if t[-1] > begin + LONGEST_S:
         said.append(f"{log.source}: only the first {LONGEST_S:g} s are used")
@@ -549,8 +584,6 @@ def read_track(
             f"{_IDENTIFYING_FEWEST} and {_IDENTIFYING_SHORTEST_S:g} s"
         )
     t = np.maximum(t, 0.0)
-    spread = np.linalg.inv(W[:20])
-    noise = float(np.median(np.linalg.norm(spread[:, 0], axis=1)))
     # What a picture shows was so one delay earlier.
     seen_s = t - delay_s
     known = seen_s >= 0.0
