@@ -44,6 +44,7 @@ def diff(
                 ],
                 "only_before": list(found.only_before),
                 "only_after": list(found.only_after),
+                "others": {section: list(keys) for section, keys in found.others.items()},
                 "other_inputs": list(found.inputs),
                 "compared": found.compared,
                 "significant": found.significant,
@@ -65,9 +66,13 @@ def _tell(found: RigDiff, every: bool) -> None:
             say(line)
     if len(rows) < len(both):
         say(f"  {len(both) - len(rows)} more (--all shows them)")
+    alone = [
+        c for c in found.changes if c.section.partition(".")[0] not in (*found.only_before, *found.only_after)
+    ]
     for words, names in (
-        ("only before", found.only_before),
-        ("only after", found.only_after),
+        ("only before", [*found.only_before, *(f"{c.section}.{c.name}" for c in alone if c.after is None)]),
+        ("only after", [*found.only_after, *(f"{c.section}.{c.name}" for c in alone if c.before is None)]),
+        ("also different", [f"{section} ({', '.join(keys)})" for section, keys in found.others.items()]),
         ("learnt from other inputs", found.inputs),
     ):
         if names:
@@ -83,7 +88,9 @@ def _tell(found: RigDiff, every: bool) -> None:
             f"a marker in the workspace is read {plane.mean_mm:.4f} mm elsewhere on average, "
             f"{plane.largest_mm:.4f} mm at most{bar}: {_judged(plane.significant)}"
         )
-    say(f"in all: {'significant' if found.significant else 'nothing beyond the error bars'}")
+    bare = sum(change.significant is None for change in both)
+    also = f"; {bare} without error bars differ{'s' * (bare == 1)}" if bare else ""
+    say(f"in all: {'significant' if found.significant else 'nothing beyond the error bars'}{also}")
 
 
 def _row(change: Change) -> list[str]:

@@ -12,7 +12,8 @@ whole pixels, which is no property of a calibration.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -78,6 +79,7 @@ class RigDiff:
     plane : None where a side has no camera or plane.
     verdicts : section, verdict before, verdict after, where they differ.
     only_before, only_after : sections of one side.
+    others : keys by section that differ and hold no constants: choices, deviations, evidence.
     inputs : sections learnt from other inputs.
     compared : how many constants both have.
     """
@@ -87,6 +89,7 @@ class RigDiff:
     verdicts: tuple[tuple[str, str, str], ...]
     only_before: tuple[str, ...]
     only_after: tuple[str, ...]
+    others: dict[str, tuple[str, ...]]
     inputs: tuple[str, ...]
     compared: int
 
@@ -117,6 +120,7 @@ def diff_rigs(old: Rig, new: Rig) -> RigDiff:
         tuple(verdicts),
         tuple(name for name in a if name not in b),
         tuple(name for name in b if name not in a),
+        _others(a, b, {f"{section}.{name}" for section, name in left.keys() | right.keys()}),
         tuple(name for name in learnt_a if name in learnt_b and learnt_a[name] != learnt_b[name]),
         len(left.keys() & right.keys()),
     )
@@ -130,8 +134,40 @@ def _by_name(sections: Mapping[str, Any]) -> dict[tuple[str, str], Constant]:
     return {
         (c.section, c.name): c
         for c in constants(sections)
-        if c.name not in _NOT_LEARNT and c.section != "geometry" and not c.name.startswith(_EVIDENCE)
+        if c.name not in _NOT_LEARNT and not c.name.startswith(_EVIDENCE)
     }
+
+
+def _others(a: Mapping[str, Any], b: Mapping[str, Any], compared: set[str]) -> dict[str, tuple[str, ...]]:
+    """Keys of sections on both sides below which something else than the constants `compared` differs."""
+    out: dict[str, tuple[str, ...]] = {}
+    for section in (name for name in a if name in b):
+        here, there = dict(_leaves(a[section], section)), dict(_leaves(b[section], section))
+        differ = [
+            leaf for leaf in dict.fromkeys([*here, *there])
+            if leaf not in compared and here.get(leaf, _NONE) != there.get(leaf, _NONE)
+        ]  # fmt: skip
+        keys = dict.fromkeys(re.split(r"[.[]", leaf)[1] for leaf in differ)
+        if found := tuple(key for key in keys if key not in _VERDICT):
+            out[section] = found
+    return out
+
+
+_NONE = object()
+_VERDICT = ("verdict", "reasons", "remarks", "advice")
+"""Keys that `verdicts` tells of."""
+
+
+def _leaves(value: Any, name: str) -> Iterator[tuple[str, Any]]:
+    """Single values with the names that constants have."""
+    if isinstance(value, dict):
+        for key, part in value.items():
+            yield from _leaves(part, f"{name}.{key}")
+    elif isinstance(value, list):
+        for i, part in enumerate(value):
+            yield from _leaves(part, f"{name}[{i}]")
+    else:
+        yield name, value
 
 
 def _change(before: Constant | None, after: Constant | None) -> Change | None:

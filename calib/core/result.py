@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import yaml
@@ -25,6 +26,7 @@ from pydantic import (
 
 from calib.core.errors import BadInputError
 from calib.core.files import sha256
+from calib.core.schema import contradiction, quoted
 from calib.core.verdict import Verdict, Word
 
 if TYPE_CHECKING:
@@ -69,6 +71,12 @@ def quantity(
     return Field(default, title=label, json_schema_extra=extra, **limits)
 
 
+_ROUNDED = 1e-5
+"""Part of a covariance that rounding and a least-squares solution may take away."""
+_NOTHING = 1e-18
+"""A covariance with a value that is fixed."""
+
+
 class Section(BaseModel):
     """A section of rig.yaml or a part of one: keys that it does not know are refused."""
 
@@ -92,20 +100,42 @@ class CovarianceTable(Section):
     values: list[list[Number]]
 
     @model_validator(mode="after")
-    def _square(self) -> CovarianceTable:
-        if len(self.values) != len(self.order) or any(len(row) != len(self.order) for row in self.values):
-            raise ValueError(f"expected {len(self.order)} rows and columns, as many as names in order")
-        if not self.order:
-            return self
+    def _of_variances(self) -> CovarianceTable:
+        order, values = self.order, self.values
+        if len(values) != len(order) or any(len(row) != len(order) for row in values):
+            raise contradiction(f"values: expected {len(order)} rows and columns, as many as names in order")
+        twice = next((name for name in order if order.count(name) > 1), None)
+        if twice is not None:
+            raise contradiction(f"order names {quoted(twice)} twice")
+        for i, name in enumerate(order):
+            if values[i][i] < 0.0:
+                raise contradiction(f"values.{i}.{i} is {values[i][i]:g}, expected a variance of {name}")
+        for i, j in combinations(range(len(order)), 2):
+            most = math.sqrt(values[i][i]) * math.sqrt(values[j][j])
+            if abs(values[i][j] - values[j][i]) > _ROUNDED * max(most, abs(values[i][j])):
+                raise contradiction(
+                    f"values.{i}.{j} is {values[i][j]:g} and values.{j}.{i} {values[j][i]:g}, expected one "
+                    f"covariance of {order[i]} and {order[j]}"
+                )
+            if abs(values[i][j]) > (1.0 + _ROUNDED) * most + _NOTHING:
+                raise contradiction(
+                    f"values.{i}.{j} is {values[i][j]:g}, expected at most {most:g} in size by the variances "
+                    f"of {order[i]} and {order[j]}"
+                )
+        if len(order) > 2 and self._least_eigenvalue() < -_ROUNDED:
+            raise contradiction(
+                "values is not positive semidefinite, so that no errors have these covariances"
+            )
+        return self
+
+    def _least_eigenvalue(self) -> float:
+        """Of the correlations."""
         import numpy as np
 
         values = np.array(self.values)
-        scale = np.sqrt(np.abs(np.diag(values)))
-        scale = np.where(scale > 0, scale, 1.0)
-        normal = values / scale / scale[:, None]
-        if not np.allclose(normal, normal.T, atol=1e-6) or np.linalg.eigvalsh(normal)[0] < -1e-6:
-            raise ValueError("expected a covariance matrix: symmetric, with no negative variance")
-        return self
+        scale = np.sqrt(np.diag(values))
+        scale = np.where(scale > 0.0, scale, 1.0)
+        return float(np.linalg.eigvalsh(values / scale / scale[:, None])[0])
 
 
 class Result(Section):

@@ -77,7 +77,8 @@ def _holds_sections(path: Path) -> bool:
 SECTIONS = Kind("sections of a rig", (".yaml", ".yml"), _holds_sections, merged=True)
 """The file itself, for those who write it."""
 
-Metres = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False, strict=True)]
+Metres = Annotated[float, Field(ge=-10.0, le=10.0, allow_inf_nan=False, strict=True)]
+Offset = Annotated[float, Field(ge=-0.5, le=0.5, allow_inf_nan=False, strict=True)]
 
 
 class Geometry(Section):
@@ -86,8 +87,8 @@ class Geometry(Section):
     workspace_m: Annotated[list[Metres], Field(min_length=4, max_length=4)] = [-0.06, 0.04, 0.06, 0.11]
     """Where the marker can be, world metres: least x, least y, greatest x, greatest y."""
 
-    marker_offset_m: Metres = 0.015
-    marker_offset_sigma_m: Annotated[Metres, Field(gt=0.0)] = 5e-5
+    marker_offset_m: Offset = 0.015
+    marker_offset_sigma_m: Annotated[Offset, Field(gt=0.0)] = 5e-5
     """Marker beyond the head along its tangent (A.1), and how well a drawing or a caliper tells it."""
 
     @field_validator("workspace_m")
@@ -231,6 +232,8 @@ class Rig:
         merged = {**self.inputs, **(inputs or {})}
         ordered = {name: dict(sorted(merged[name].items())) for name in sorted(merged)}
         self.provenance, self.schema = Provenance(inputs=ordered), SCHEMA
+        # What a program has set may be anything, and a file that cannot be read back helps nobody.
+        Rig.of({"schema": SCHEMA, **self.values()}, path)
         write_atomically(Path(path), self.text(), SECTIONS)
 
     def with_sections(self, sections: Mapping[str, Any]) -> Rig:

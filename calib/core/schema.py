@@ -36,6 +36,9 @@ _EXPECTED = {
 
 _OUT_OF_RANGE = ("greater_than", "greater_than_equal", "less_than", "less_than_equal")
 
+_MOST = 1e40
+"""Of any number in a file, so that sums of squares and their products can be formed."""
+
 _SMALLER = {
     "m": (1e-3, "millimetres"),
     "s": (1e-3, "milliseconds"),
@@ -57,10 +60,20 @@ def validated(kind: type[Kind], values: Any, source: Path | str, key: str = "") 
 
     Raises `BadInputError` for the first thing that is wrong.
     """
+    _refuse_endless(values, source, key)
     try:
         return kind.model_validate(values)
     except ValidationError as error:
         raise BadInputError(f"{shown(source)}: {_sentence(kind, error, key)}") from error
+
+
+def _refuse_endless(value: Any, source: Path | str, key: str) -> None:
+    """Raise `BadInputError` for numbers whose products are beyond what a float holds."""
+    parts = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for name, part in parts:
+        _refuse_endless(part, source, f"{key}.{name}" if key else str(name))
+    if isinstance(value, int | float) and math.isfinite(value) and abs(value) > _MOST:
+        raise BadInputError(f"{shown(source)}: {one_line(key)} is {value:g}, expected at most {_MOST:g}")
 
 
 def contradiction(text: str) -> PydanticCustomError:
@@ -106,6 +119,8 @@ def _sentence(kind: type[BaseModel], error: ValidationError, under: str) -> str:
         expected += " (without quotes, and in YAML an exponent needs a point and a sign, as 2.0e-2)"
     elif how == "float_type" and _unit(place):
         expected += f" ({_unit(place)})"
+    if isinstance(value, dict):
+        return f"{key}: expected {expected}"
     return f"{key} is {quoted(value)}, expected {expected}"
 
 

@@ -141,6 +141,55 @@ def test_without_error_bars_nothing_is_called_significant(tmp_path: Path) -> Non
     assert found.plane is not None and found.plane.significant is None
 
 
+def test_all_of_a_rig_is_compared(tmp_path: Path) -> None:
+    """Choices, deviations, what a person states and single keys, not the constants alone."""
+    a, b = _rig(tmp_path / "a.yaml"), _rig(tmp_path / "b.yaml", model="brown5", sigma={"fx_px": 0.06})
+    assert b.geometry is not None
+    b.geometry.marker_offset_m = 0.02
+    found = a.diff(b)
+    assert [(c.section, c.name) for c in found.changes] == [("geometry", "marker_offset_m")]
+    assert found.others == {"camera": ("model", "sigma")}
+    assert a.diff(a).others == {}
+
+
+def _places(value: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    parts = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, part in parts:
+        yield from _places(part, (*place, key))
+    if isinstance(value, float):
+        yield place
+
+
+@pytest.mark.parametrize("value", [math.nan, -math.inf, 1e300])
+def test_no_number_of_a_whole_rig_may_be_endless(project_root: Path, value: float) -> None:
+    whole = yaml.safe_load((project_root / "tests" / "goldens" / "twin_run" / "rig.yaml").read_text())
+    del whole["schema"], whole["provenance"]
+    # One of each list will do.
+    alike = {tuple("#" if isinstance(key, int) else key for key in place): place for place in _places(whole)}
+    assert len(alike) > 200
+    for section, *keys, last in alike.values():
+        part = whole[section]
+        for key in keys:
+            part = part[key]
+        kept, part[last] = part[last], value
+        with pytest.raises(BadInputError, match=rf"rig\.yaml: {section}\."):
+            validated(kind_of(section), whole[section], "rig.yaml", section)
+        part[last] = kept
+
+
+@pytest.mark.parametrize("value", [math.nan, -math.inf, 1e300, -1.0])
+def test_what_cannot_be_read_back_is_not_written(tmp_path: Path, value: float) -> None:
+    path = tmp_path / "rig.yaml"
+    rig = _rig(path)
+    rig.save(path)
+    before = path.read_bytes()
+    assert rig.camera is not None
+    rig.camera.fx_px = value
+    with pytest.raises(BadInputError, match=r"rig\.yaml: camera\.fx_px is "):
+        rig.save(path)
+    assert path.read_bytes() == before
+
+
 def test_a_value_in_force_is_known_or_estimated_or_nominal() -> None:
     rig = Rig.of(
         {
@@ -244,6 +293,16 @@ _ONE = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
 CONSISTENT: dict[str, dict[str, Any]] = {
     "camera": {"model": "rational8"},
     "plane": {"R_CW": _ONE, "t_CW_m": [0.0, 0.0, 1.0], "A_px_per_m": _ONE, "A_inverse": _ONE},
+    "controller": {
+        "feedforward": {
+            "rest_length_m": 0.065,
+            "bellows_radius_m": 0.0126,
+            "stiffness_N_per_m": [48.0, 1092.9, 0.0, 0.0],
+            "bending_N_per_rad2": 0.2,
+            "strength": [1.0, 0.9],
+            "force_pwm": [[0.0, 128.0], [3.5, 255.0]],
+        },
+    },
     "lowpass": {"order": 1, "sections": [{"b": [0.5, 0.5, 0.0], "a": [1.0, 0.0, 0.0]}]},
 }
 """Values that a section's own rules tie together."""

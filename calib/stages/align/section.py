@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from calib.core.result import Count, CovarianceTable, NotNegative, Result, Section, quantity
+from calib.core.schema import contradiction, nearest, quoted
 
 Angle = Annotated[float, Field(ge=-7.0, le=7.0, allow_inf_nan=False, strict=True)]
 Seconds = Annotated[float, Field(ge=-10.0, le=10.0, allow_inf_nan=False, strict=True)]
@@ -14,6 +15,7 @@ Metres = Annotated[float, Field(ge=-1.0, le=1.0, allow_inf_nan=False, strict=Tru
 Share = Annotated[float, Field(ge=-0.5, le=0.5, allow_inf_nan=False, strict=True)]
 Rate = Annotated[float, Field(ge=-1.0, le=1.0, allow_inf_nan=False, strict=True)]
 Bias = Annotated[float, Field(ge=-5.0, le=5.0, allow_inf_nan=False, strict=True)]
+Noise = Annotated[float, Field(ge=0.0, le=1e3, allow_inf_nan=False, strict=True)]
 SharePair = Annotated[list[Share], Field(min_length=2, max_length=2)]
 MetresPair = Annotated[list[Metres], Field(min_length=2, max_length=2)]
 
@@ -90,10 +92,19 @@ class Align(Result):
     sigma: dict[str, NotNegative | list[NotNegative] | None] = {}
     prior_sigma: dict[str, NotNegative] = {}
     covariance: CovarianceTable | None = None
-    jitter_px: NotNegative = quantity(label="tracker's jitter", digits=2, fact=True)
-    outlier_share: NotNegative = quantity(label="outliers", show="%", digits=2)
-    accel_noise_mps2: Annotated[list[NotNegative], Field(min_length=2, max_length=2)] = quantity(
+    jitter_px: NotNegative = quantity(label="tracker's jitter", digits=2, fact=True, le=1e3)
+    outlier_share: NotNegative = quantity(label="outliers", show="%", digits=2, le=1.0)
+    accel_noise_mps2: Annotated[list[Noise], Field(min_length=2, max_length=2)] = quantity(
         label="accel noise", digits=4
     )
-    gyro_noise_radps: NotNegative = quantity(label="gyro noise", digits=4)
+    gyro_noise_radps: Noise = quantity(label="gyro noise", digits=4)
     logs: list[LogCheck] = quantity([], label="log")
+
+    @field_validator("covariance")
+    @classmethod
+    def _of_sensors(cls, table: CovarianceTable | None) -> CovarianceTable | None:
+        names = [name for several in SENSORS_OF.values() for name in several]
+        for name in () if table is None else table.order:
+            if name not in names:
+                raise contradiction(f"order has {quoted(name)}, which align lacks{nearest(name, names)}")
+        return table

@@ -13,13 +13,12 @@ from calib.core.result import (
     NotNegative,
     Number,
     Result,
-    Row3,
     Section,
     Sigma,
     finite_or_none,
     quantity,
 )
-from calib.core.schema import contradiction
+from calib.core.schema import contradiction, nearest, quoted
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -32,6 +31,7 @@ Model = Annotated[str, Field(pattern="^(pinhole|radial2|radial3|brown5|rational8
 Focal = Annotated[float, Field(ge=1e-3, le=1e7, allow_inf_nan=False, strict=True)]
 Pixels = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False, strict=True)]
 Coefficient = Annotated[float, Field(ge=-1e30, le=1e30, allow_inf_nan=False, strict=True)]
+Metres = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False, strict=True)]
 Side = Annotated[int, Field(ge=1, le=100_000, strict=True)]
 
 
@@ -124,9 +124,11 @@ class Camera(Result):
     @classmethod
     def _of_intrinsics(cls, table: CovarianceTable | None) -> CovarianceTable | None:
         order = [] if table is None else table.order
-        wrong = next((name for name in order if name not in _INTRINSICS or order.count(name) > 1), None)
+        wrong = next((name for name in order if name not in _INTRINSICS), None)
         if wrong is not None:
-            raise ValueError(f"expected intrinsics in order, each once, not {wrong!r}")
+            raise contradiction(
+                f"order has {quoted(wrong)}, which is no intrinsic{nearest(wrong, _INTRINSICS)}"
+            )
         return table
 
     def undistort(self, pixels: ArrayLike) -> FloatArray:
@@ -144,7 +146,7 @@ class Plane(Result):
     """The actuator's plane seen by the camera: A maps world metres to pixels (2.9 with K)."""
 
     R_CW: Matrix3
-    t_CW_m: Row3 = quantity(label="camera to plane")
+    t_CW_m: Annotated[list[Metres], Field(min_length=3, max_length=3)] = quantity(label="camera to plane")
     A_px_per_m: Matrix3
     A_inverse: Matrix3
     sigma: Sigma = {}

@@ -15,14 +15,16 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from calib.core.result import Result, Row3, Section, quantity
+from calib.core.schema import contradiction
 
 Number = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False, strict=True)]
 Positive = Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False, strict=True)]
 NotNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False, strict=True)]
-Pwm = Annotated[float, Field(ge=0, le=255, allow_inf_nan=False, strict=True)]
+_MOST_PWM = 255.0
+Pwm = Annotated[float, Field(ge=0, le=_MOST_PWM, allow_inf_nan=False, strict=True)]
 Count = Annotated[int, Field(ge=1, le=1000, strict=True)]
 Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
 
@@ -68,12 +70,22 @@ class StaticMap(Section):
     below the first force the PWM is `pwm_low`.
     """
 
-    rest_length_m: Positive
-    bellows_radius_m: Positive
+    rest_length_m: Positive = Field(le=1.0)
+    bellows_radius_m: Positive = Field(le=0.2)
     stiffness_N_per_m: Annotated[list[Number], Field(min_length=4, max_length=4)]
     bending_N_per_rad2: NotNegative
     strength: Pair
     force_pwm: Annotated[list[Pair], Field(min_length=2, max_length=64)]
+
+    @field_validator("force_pwm")
+    @classmethod
+    def _rising(cls, pairs: list[list[float]]) -> list[list[float]]:
+        for k, (force, pwm) in enumerate(pairs):
+            if not 0.0 <= pwm <= _MOST_PWM:
+                raise contradiction(f"{k}.1 is {pwm:g}, expected 0 to {_MOST_PWM:g} PWM")
+            if k and not force > pairs[k - 1][0]:
+                raise contradiction(f"{k}.0 is {force:g}, expected more than {pairs[k - 1][0]:g} N before it")
+        return pairs
 
 
 class ComputedTorqueGains(Section):
@@ -82,7 +94,7 @@ class ComputedTorqueGains(Section):
     horizon_ticks: Count
     Kp_per_s2: NotNegative
     Kd_per_s: NotNegative
-    latency_s: NotNegative
+    latency_s: NotNegative = Field(le=10.0)
     observer_gain: Annotated[list[Row3], Field(min_length=9, max_length=9)]
 
 
@@ -114,7 +126,7 @@ class Controller(Result):
     lag_s, delay_ticks, falling_N_per_s : of the pumps, for `falling_share`.
     """
 
-    tick_s: Positive = quantity(label="tick", show="ms", digits=3, fact=True)
+    tick_s: Positive = quantity(label="tick", show="ms", digits=3, fact=True, le=10.0)
     pwm_low: Pwm = quantity(0.0, label="least command")
     pwm_high: Pwm = quantity(255.0, label="greatest command")
     criterion: ControllerCriterion = quantity(label="demanded")
@@ -122,7 +134,7 @@ class Controller(Result):
     position: PositionGains = quantity(label="position", fact=("Kp_pwm_per_m",))
     feedforward: StaticMap
     computed_torque: ComputedTorqueGains | None = None
-    lag_s: Positive
+    lag_s: Positive = Field(le=60.0)
     delay_ticks: Annotated[int, Field(ge=0, le=1000, strict=True)]
     falling_N_per_s: Positive | None = None
     margins: list[ControllerMargins] = quantity([], label="margins")

@@ -74,9 +74,9 @@ class Estimator(Result):
     gain_per_row : log likelihood that the tuning has won, per row of the logs.
     """
 
-    jitter_px: Positive = quantity(label="tracker's jitter", digits=3)
-    accel_noise_mps2: Positive | None = quantity(None, label="accel noise", digits=4)
-    gyro_noise_radps: Positive | None = quantity(None, label="gyro noise", digits=4)
+    jitter_px: Positive = quantity(label="tracker's jitter", digits=3, le=1e3)
+    accel_noise_mps2: Positive | None = quantity(None, label="accel noise", digits=4, le=1e3)
+    gyro_noise_radps: Positive | None = quantity(None, label="gyro noise", digits=4, le=1e3)
     sigma: Sigma = {}
     levels: list[EstimatorLevel] = []
     driven: EstimatorDriven | None = None

@@ -25,6 +25,10 @@ from calib.core.result import (
 
 Rate = Annotated[float, Field(ge=-10.0, le=10.0, allow_inf_nan=False, strict=True)]
 Rates = Annotated[list[Rate | None], Field(min_length=3, max_length=3)]
+Force = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False, strict=True)]
+Forces = Annotated[list[Force | None], Field(min_length=3, max_length=3)]
+Small = Annotated[float, Field(ge=0, le=1e3, allow_inf_nan=False, strict=True)]
+Noises = Annotated[list[Small | None], Field(min_length=3, max_length=3)]
 
 
 class ImuDrift(Section):
@@ -70,19 +74,19 @@ class Imu(Result):
     drift : by the gyroscope (-gz integrated) and by the chip.
     """
 
-    rate_hz: Positive = quantity(label="rate", digits=3, fact=True)
+    rate_hz: Positive = quantity(label="rate", digits=3, fact=True, le=1e6)
     gyro_bias_radps: Rates = quantity(label="gyro bias", fact=(2,))
-    gyro_noise_radps_per_sqrt_Hz: Sizes = quantity(label="gyro noise N", fact=(2,))
-    gyro_instability_radps: Sizes = quantity(label="gyro instability B")
-    gyro_walk_radps2_per_sqrt_Hz: Sizes = quantity(label="gyro random walk K")
-    accel_mean_mps2: PerAxis = quantity(label="accel mean, with gravity")
-    accel_noise_mps2_per_sqrt_Hz: Sizes = quantity(label="accel noise N")
-    accel_instability_mps2: Sizes = quantity(label="accel instability B")
-    accel_walk_mps3_per_sqrt_Hz: Sizes = quantity(label="accel random walk K")
+    gyro_noise_radps_per_sqrt_Hz: Noises = quantity(label="gyro noise N", fact=(2,))
+    gyro_instability_radps: Noises = quantity(label="gyro instability B")
+    gyro_walk_radps2_per_sqrt_Hz: Noises = quantity(label="gyro random walk K")
+    accel_mean_mps2: Forces = quantity(label="accel mean, with gravity")
+    accel_noise_mps2_per_sqrt_Hz: Noises = quantity(label="accel noise N")
+    accel_instability_mps2: Noises = quantity(label="accel instability B")
+    accel_walk_mps3_per_sqrt_Hz: Noises = quantity(label="accel random walk K")
     sigma: dict[str, Sizes] = {}
     below: dict[str, Sizes] = {}
-    gyro_step_radps: Sizes = quantity(label="gyro step")
-    accel_step_mps2: Sizes = quantity(label="accel step")
+    gyro_step_radps: Noises = quantity(label="gyro step")
+    accel_step_mps2: Noises = quantity(label="accel step")
     drift: dict[str, ImuDrift] = quantity({}, label="drift of the angle")
     logs: list[ImuLog] = quantity([], label="logs")
 
@@ -268,11 +272,11 @@ class OrientationFilter(Result):
     """
 
     filter: Literal["mahony", "levelling"] = quantity("mahony", label="filter", fact=True)
-    Kp_per_s: Positive = quantity(label="Kp", digits=4)
-    Ki_per_s2: NotNegative = quantity(label="Ki", digits=4)
-    tau_s: Positive | None = quantity(None, label="time constant", digits=2)
-    velocity_mps: Positive | None = quantity(None, label="velocity", digits=2)
-    rate_hz: Positive = quantity(label="rate", digits=3)
+    Kp_per_s: Positive = quantity(label="Kp", digits=4, le=1e4)
+    Ki_per_s2: NotNegative = quantity(label="Ki", digits=4, le=1e6)
+    tau_s: Positive | None = quantity(None, label="time constant", digits=2, le=1e5)
+    velocity_mps: Positive | None = quantity(None, label="velocity", digits=2, le=1e3)
+    rate_hz: Positive = quantity(label="rate", digits=3, le=1e6)
     recommended: str = quantity(label="recommended", fact=True)
     recommended_by: Literal["reference", "smoothed", "default"] = quantity(label="by")
     rate_of_angle: Literal["-gz", "up vector"] = quantity("-gz", label="rate of the angle by")

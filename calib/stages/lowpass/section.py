@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from calib.core.result import Count, NotNegative, Number, Positive, Result, Row3, Section, quantity
+from calib.core.schema import contradiction
 
 
 class LowPassSection(Section):
@@ -65,13 +66,13 @@ class LowPass(Result):
 
     family: Literal["butterworth", "bessel", "critical"] = quantity(label="family", fact=True)
     order: Annotated[int, Field(ge=1, le=8, strict=True)] = quantity(label="order", fact=True)
-    cutoff_hz: Positive = quantity(label="cut-off", fact=True)
-    rate_hz: Positive = quantity(label="rate")
+    cutoff_hz: Positive = quantity(label="cut-off", fact=True, le=1e6)
+    rate_hz: Positive = quantity(label="rate", le=1e6)
     sections: Annotated[list[LowPassSection], Field(min_length=1, max_length=4)] = quantity(
         label="coefficients"
     )
     rounded_cutoff_hz: Positive = quantity(label="cut-off, rounded to float")
-    pole_radius: Positive = quantity(label="poles within a radius of", digits=5)
+    pole_radius: Positive = quantity(label="poles within a radius of", digits=5, lt=1.0)
     poles: list[list[Number]] = []
     dc_delay_s: Positive = quantity(label="delay of slow motion", digits=4, fact=True)
     largest_delay_s: Positive = quantity(label="delay up to the cut-off, at most", digits=4)
@@ -85,8 +86,16 @@ class LowPass(Result):
     @model_validator(mode="after")
     def _consistent(self) -> LowPass:
         if len(self.sections) != (self.order + 1) // 2:
-            raise ValueError(f"expected {(self.order + 1) // 2} sections for order {self.order}")
-        for section in self.sections:
-            if section.a[0] != 1.0 or sum(section.b) != sum(section.a):
-                raise ValueError("expected sections with a = [1, a1, a2] and b of the same sum as a")
+            raise contradiction(
+                f"sections has {len(self.sections)}, expected {(self.order + 1) // 2} for order {self.order}"
+            )
+        for k, section in enumerate(self.sections):
+            one, a1, a2 = section.a
+            if one != 1.0 or sum(section.b) != sum(section.a):
+                raise contradiction(
+                    f"sections.{k}: expected a = [1, a1, a2] and b of the same sum as a, found "
+                    f"{section.a} and {section.b}"
+                )
+            if abs(a2) >= 1.0 or abs(a1) >= 1.0 + a2:
+                raise contradiction(f"sections.{k}.a is {section.a}, which is not stable")
         return self
