@@ -1,8 +1,8 @@
 /*
  * calib_constants.h - constants of one rig, written by calib 0.1.0. Do not edit.
  *
- * SHA-256 of the values: e01c96bda509d141c9ad8b52eda1485b02d338fcd7dfe2ee03764c142f51eab5
- * input camera/board.yaml: f77bc61378d4ff28baac9883646ca1bf8dc43576acf495b4800377effe06e39b
+ * SHA-256 of the values: 6ff616eb003c6fed460e99a1a1543d0a47fb87c9829e813aeced49a8771bd15b
+ * input camera/board.yaml: 2faa55cc9d27939d305dee84ddcd112fdaa4d3eec0edf39fb2588b871f258696
  * input camera/view01.png: a8a5d43cd237c318df2372ece67ce52fa2a09171cff9447bb68af2394a832c30
  * input camera/view02.png: 74159ff201b50cc6f7316fa06817c34155aa126f4f03cb7415b51f5489fcb730
  * input camera/view03.png: 1e369415755ab0b924c7236dca9bdf332aca8be5bb68ddf818d59c942605e415
@@ -20,7 +20,7 @@
  * input camera/view15.png: a3a47ad3a959862a0e0411ba26011e2335c24b3034ac870014badcfce50a40bd
  * input camera/view16.png: 39cdb1fa7ec12742b9d19a36925f40f605e0f96a7074c4124a291493c9fc77d4
  * input camera/view17.png: d079e58065fbda9899912b44411c49c55d19ef4ee0e826188525af37167011fe
- * input plane/board.yaml: cc046d6ef28e4ce45c9c8a661650f7a1bd43c1536ffc4840447c90ae18b616bf
+ * input plane/board.yaml: 4491c3109110a8397568c583401c3f9cb9990a1f596442b37d8fc90bb74fe29d
  * input plane/plane01.png: 44ce3bea1b9432ad86f014168bb8dcd05d8f275edf8efd43c6c8d1c4fe0cc711
  * camera: radial2, verdict ok
  * plane: verdict ok
@@ -61,7 +61,11 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0xE01C96BDUL
+#define CALIB_ID 0x6FF616EBUL
+
+/* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
+#define CALIB_RIG_OK 1 /* 0: a section that they come from is not ok */
+#define CALIB_SIMULATED 1 /* 1: they come from a simulated rig or rendered pictures */
 
 /* Camera (2.5) and lens (B.1). */
 #define CALIB_IMAGE_WIDTH_PX 316 /* columns */
@@ -160,8 +164,8 @@
 #define CALIB_IMU_ACCEL_RATIO 1.0f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
 #define CALIB_IMU_GYRO_BIAS_RADPS 0.0f /* gz at rest, rad/s; sign as read */
 #define CALIB_IMU_MOUNT_ANGLE_RAD 0.0f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
-#define CALIB_IMU_ACCEL_LIMIT_MPS2 400.0f /* readings beyond are lost, m/s^2 */
-#define CALIB_IMU_RATE_LIMIT_RADPS 60.0f /* readings beyond are lost, rad/s */
+#define CALIB_IMU_ACCEL_LIMIT_MPS2 157.0f /* readings beyond are lost, m/s^2 */
+#define CALIB_IMU_RATE_LIMIT_RADPS 35.0f /* readings beyond are lost, rad/s */
 #define CALIB_IMU_ACCEL_WEAK_MPS2 1.0f /* |ax| and |ay| below say nothing of phi, m/s^2 */
 
 /* Angle filter: (2.3). */
@@ -286,6 +290,17 @@ static const float calib_ff_table_pwm[15] CALIB_IN_FLASH = {
     173.377716f, 180.938293f, 188.555145f, 196.396774f, 204.687546f, 213.799484f,
     224.553818f, 240.382324f, 253.525574f,
 };
+
+/*
+ * Envelope, see calib_guard.h: the pumps stop where the actuator leaves it.
+ * Defaults of the nominal actuator, not in rig.yaml: envelope.least_length_m, envelope.greatest_length_m, envelope.angle_rad, envelope.rate_mps, envelope.full_power_s, envelope.apart_m.
+ */
+#define CALIB_ENVELOPE_LEAST_M 0.0450000018f /* shortest length of a bellows, m */
+#define CALIB_ENVELOPE_GREATEST_M 0.115000002f /* longest length of a bellows, m */
+#define CALIB_ENVELOPE_ANGLE_RAD 1.5f /* greatest bending to each side, rad */
+#define CALIB_ENVELOPE_STEP_M 0.00833333377f /* greatest change of a length in a tick, m; 0.5 m/s */
+#define CALIB_ENVELOPE_FULL_TICKS 180 /* ticks that a pump may stay at its greatest command */
+#define CALIB_ENVELOPE_APART_M 0.0120000001f /* marker from where the angle puts it at most, m */
 
 #if defined(CALIB_EXPECT_TICK_RATE_MHZ)
 #if CALIB_EXPECT_TICK_RATE_MHZ != CALIB_TICK_RATE_MHZ

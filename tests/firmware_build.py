@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from firmware_rigs import header
 
 from calib.io.serial import Inputs
 from calib.stages.firmware.conformance import FusedReference, Reference, binary32
@@ -22,6 +23,8 @@ from calib.stages.firmware.vectors import TOLERANCE, selftest_text
 __all__ = [
     "HOSTILE",
     "LIMITS",
+    "NATIVE",
+    "Built",
     "Process",
     "Simulated",
     "Ticks",
@@ -32,6 +35,7 @@ __all__ = [
     "need",
     "pack",
     "run",
+    "sketch",
     "strew",
     "warnings",
     "write",
@@ -51,8 +55,16 @@ warnings = [
 ]
 
 
+ARDUINO = Path("/usr/share/arduino/hardware/arduino/avr")
+"""The Arduino core, as Debian's package arduino-core-avr puts it."""
+
+
 def need(tool: str) -> None:
     """Skip without a tool."""
+    if tool == "arduino":
+        if not ARDUINO.exists():
+            pytest.skip("arduino-core-avr is not installed")
+        return
     there = Path("/usr/include/simavr/sim_avr.h").exists() if tool == "simavr" else shutil.which(tool)
     if tool == "avr-gcc" and there:
         there = Path("/usr/lib/avr/include/avr/io.h").exists()
@@ -64,6 +76,7 @@ def write(folder: Path, header: Header) -> None:
     """The header's files, as `calib firmware` writes them."""
     (folder / "calib_constants.h").write_text(header.text)
     (folder / "calib_pipeline.h").write_text(verbatim("calib_pipeline.h"))
+    (folder / "calib_guard.h").write_text(verbatim("calib_guard.h"))
     (folder / "calib_selftest.h").write_text(selftest_text(header))
 
 
@@ -97,6 +110,46 @@ def avr(folder: Path, *flags: str) -> tuple[list[str], dict[str, int]]:
     text, data, bss = map(int, sizes.splitlines()[1].split()[:3])
     command = [str(runner), str(made), places["in"], places["out"], places["_end"]]
     return command, {"flash": text + data, "ram": data + bss}
+
+
+@dataclass(frozen=True)
+class Built:
+    """The sketch with the Arduino core: the command that runs it, and its sizes in bytes."""
+
+    command: list[str]
+    flash: int
+    ram: int
+
+
+def sketch(folder: Path, mode: str, *flags: str) -> Built:
+    """The example sketch for the ATmega328P with the Arduino core, and the simulated rig around it."""
+    for tool in ("avr-gcc", "simavr", "gcc", "arduino"):
+        need(tool)
+    write(folder, header())
+    source, made, rig = folder / "sketch.cpp", folder / "sketch.elf", folder / "rig"
+    source.write_text(verbatim("calib_example.ino"))
+    core, wire = ARDUINO / "cores" / "arduino", ARDUINO / "libraries" / "Wire" / "src"
+    names = ("main", "HardwareSerial", "HardwareSerial0", "Print", "Stream", "abi", "new")
+    cpp = [*(core / f"{name}.cpp" for name in names), wire / "Wire.cpp"]
+    plain = [*sorted(core.glob("wiring*.c")), core / "hooks.c", wire / "utility" / "twi.c"]
+    target = ["-mmcu=atmega328p", "-Os", "-DF_CPU=16000000UL", "-DARDUINO=10819", "-DARDUINO_ARCH_AVR"]
+    target += ["-ffunction-sections", "-fdata-sections", "-fno-exceptions", "-w"]
+    standard = ARDUINO / "variants" / "standard"
+    target += [f"-I{path}" for path in (folder, core, standard, wire, wire / "utility")]
+    objects = []
+    for path in (*cpp, *plain):
+        objects.append(folder / f"{path.name}.o")
+        tool = ["avr-gcc"] if path.suffix == ".c" else ["avr-g++", "-std=gnu++11", "-fno-threadsafe-statics"]
+        _compile([*tool, *target, "-c", path, "-o", objects[-1]])
+    ours = [*(flag for flag in target if flag != "-w"), "-std=gnu++11", "-Wall", "-Wextra", "-Werror"]
+    chosen = [f"-DCALIB_EXAMPLE_MODE=CALIB_MODE_{mode}", "-DCALIB_I_KNOW=1", *flags]
+    _compile(["avr-g++", *ours, *chosen, "-fno-threadsafe-statics", "-c", source, "-o", folder / "sketch.o"])
+    linked = ["-Wl,--gc-sections", "-o", made, folder / "sketch.o", *objects, "-lm"]
+    _compile(["avr-gcc", "-mmcu=atmega328p", "-Os", *linked])
+    _compile(["gcc", "-O2", "-o", rig, NATIVE / "rig.c", "-lsimavr", "-lm"])
+    sizes = subprocess.run(["avr-size", made], capture_output=True, text=True, check=True).stdout
+    text, data, bss = map(int, sizes.splitlines()[1].split()[:3])
+    return Built([str(rig), str(made)], text + data, data + bss)
 
 
 def pack(given: Inputs) -> bytes:

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from calib.stages.camera.section import Camera, Lens, Plane
     from calib.stages.control.section import Controller
     from calib.stages.estimator.section import Estimator
+    from calib.stages.firmware.section import Envelope
     from calib.stages.imu.section import Imu, ImuIntrinsics, OrientationFilter
     from calib.stages.lowpass.section import LowPass
     from calib.twin.section import Twin
@@ -47,6 +48,7 @@ SCHEMA = 2
 KINDS = {
     "known": "calib.stages.actuator.section.Known",
     "geometry": "calib.core.rig.Geometry",
+    "envelope": "calib.stages.firmware.section.Envelope",
     "camera": "calib.stages.camera.section.Camera",
     "plane": "calib.stages.camera.section.Plane",
     "lens": "calib.stages.camera.section.Lens",
@@ -115,6 +117,7 @@ class Rig:
 
     known: Known | None = None
     geometry: Geometry | None = None
+    envelope: Envelope | None = None
     camera: Camera | None = None
     plane: Plane | None = None
     lens: Lens | None = None

@@ -24,7 +24,9 @@ from calib.io.logs import Log, iter_rows
 # them, the board's own: everything that is needed to compute the tick again.
 
 _SYNC = b"\xa5\x5a"
-_PAYLOAD = struct.Struct("<IIHBB7f9fH")
+_PAYLOAD = struct.Struct("<IIHBB7f9fH5B")
+_UNGUARDED = struct.Struct("<IIHBB7f9fH")
+"""Of sketches before the guard."""
 
 BOARD_COLUMNS = (
     "sequence", "rate_mhz", "calib_id", "marker_seen", "imu_read", "mode",
@@ -33,6 +35,9 @@ BOARD_COLUMNS = (
     "board_q1_m", "board_q2_m", "board_flags",
 )  # fmt: skip
 """Columns of the log that are the board's own."""
+
+GUARD_COLUMNS = ("duty_1", "duty_2", "guard_state", "guard_fault", "kept_fault")
+"""Those of the guard, which older logs lack."""
 
 _LOG_COLUMNS = ("t_s", "u_px", "v_px", "ax_mps2", "ay_mps2", "gz_radps", "pwm1", "pwm2")
 
@@ -103,6 +108,52 @@ class Outputs:
         return (self.phi_rad, *self.marker_m, *self.head_m, *self.q_m, *self.pwm)
 
 
+GUARD_RUN, GUARD_FAULT = 2, 3
+FAULTS = {
+    1: "the IMU was lost",
+    2: "the IMU was frozen",
+    3: "the camera was lost",
+    4: "the camera was frozen",
+    5: "marker and angle disagreed",
+    6: "a reference was beyond the envelope",
+    7: "the loop was late",
+    8: "the computer fell silent",
+    16: "the actuator was beyond the envelope",
+    17: "a length changed faster than the envelope allows",
+    18: "a pump was at full power for too long",
+    19: "the self-test failed",
+    20: "the watchdog stopped the loop",
+}
+"""What CALIB_FAULT_... of the guard mean."""
+
+
+@dataclass(frozen=True)
+class Guard:
+    """What the guard of a board said in a tick.
+
+    Attributes
+    ----------
+    duty : whole numbers that drove the pumps. state : 0 boot, 1 armed, 2 run, 3 fault. fault : a key of
+        `FAULTS`, 0 for none. kept : of the last reset.
+    """
+
+    duty: tuple[int, int] = (0, 0)
+    state: int = 0
+    fault: int = 0
+    kept: int = 0
+
+    @staticmethod
+    def of(numbers: Sequence[int]) -> Guard:
+        """The guard from `numbers`."""
+        first, second, state, fault, kept = numbers
+        return Guard((first, second), state, fault, kept)
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """Duty, state, fault, kept: five numbers."""
+        return (*self.duty, self.state, self.fault, self.kept)
+
+
 @dataclass(frozen=True)
 class Frame:
     """One tick of a board.
@@ -110,6 +161,7 @@ class Frame:
     Attributes
     ----------
     identity : CALIB_ID of its header. rate_mhz : ticks in 1000 s. sequence : counts up to 65535.
+    guard : None of sketches without one.
     """
 
     identity: int
@@ -117,6 +169,7 @@ class Frame:
     sequence: int
     given: Inputs
     out: Outputs
+    guard: Guard | None = None
 
 
 def checksum(data: bytes) -> int:
@@ -133,7 +186,9 @@ def encoded(frame: Frame) -> bytes:
     """The frame as a board sends it."""
     given, out = frame.given, frame.out
     head = (frame.identity, frame.rate_mhz, frame.sequence, given.sensors, given.mode)
-    payload = _PAYLOAD.pack(*head, *given.numbers, *out.numbers, out.flags)
+    numbers = (*head, *given.numbers, *out.numbers, out.flags)
+    guard = frame.guard
+    payload = _UNGUARDED.pack(*numbers) if guard is None else _PAYLOAD.pack(*numbers, *guard.numbers)
     body = bytes([len(payload)]) + payload
     return _SYNC + body + struct.pack("<H", checksum(body))
 
@@ -168,7 +223,7 @@ class Decoder:
             if len(waiting) < 3:
                 return
             length = waiting[2]
-            if length != _PAYLOAD.size:
+            if length not in (_PAYLOAD.size, _UNGUARDED.size):
                 self.skipped += 1
                 del waiting[:1]
                 continue
@@ -181,15 +236,17 @@ class Decoder:
                 self.skipped += 1
                 del waiting[:1]
                 continue
-            identity, rate, sequence, sensors, mode, *rest = _PAYLOAD.unpack(body[1:])
+            kind = _PAYLOAD if length == _PAYLOAD.size else _UNGUARDED
+            identity, rate, sequence, sensors, mode, *rest = kind.unpack(body[1:])
             del waiting[:end]
-            given, out = Inputs.of(rest[:7], sensors, mode), Outputs.of(rest[7:-1], rest[-1])
-            yield Frame(identity, rate, sequence, given, out)
+            given, out = Inputs.of(rest[:7], sensors, mode), Outputs.of(rest[7:16], rest[16])
+            guard = Guard.of(rest[17:]) if kind is _PAYLOAD else None
+            yield Frame(identity, rate, sequence, given, out, guard)
 
 
 def csv_header() -> str:
     """First line of a log of frames."""
-    return ",".join((*_LOG_COLUMNS, *BOARD_COLUMNS)) + "\n"
+    return ",".join((*_LOG_COLUMNS, *BOARD_COLUMNS, *GUARD_COLUMNS)) + "\n"
 
 
 def csv_row(frame: Frame, tick: int) -> str:
@@ -211,7 +268,8 @@ def csv_row(frame: Frame, tick: int) -> str:
     board = [g.u_px, g.v_px, *g.reference, *frame.out.numbers[:7]]
     sensors = [*marker, *(imu if g.imu_read else ["", "", ""])]
     cells = [time, *sensors, *map(text, frame.out.pwm), *map(str, whole), *map(text, board)]
-    return ",".join([*cells, str(frame.out.flags)]) + "\n"
+    guard = [""] * len(GUARD_COLUMNS) if frame.guard is None else map(str, frame.guard.numbers)
+    return ",".join([*cells, str(frame.out.flags), *guard]) + "\n"
 
 
 def frame_from_row(row: dict[str, str]) -> Frame:
@@ -221,12 +279,14 @@ def frame_from_row(row: dict[str, str]) -> Frame:
     sensors = int(number["marker_seen"]) + 2 * int(number["imu_read"])
     into = (number["board_u_px"], number["board_v_px"], *imu, number["reference_1"], number["reference_2"])
     out = [number[name] for name in (*BOARD_COLUMNS[10:17], "pwm1", "pwm2")]
+    guard = [row.get(name) for name in GUARD_COLUMNS]
     return Frame(
         int(number["calib_id"]),
         int(number["rate_mhz"]),
         int(number["sequence"]),
         Inputs.of(into, sensors, int(number["mode"])),
         Outputs.of(out, int(number["board_flags"])),
+        Guard.of([int(value or 0) for value in guard]) if all(guard) else None,
     )
 
 

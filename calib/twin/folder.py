@@ -35,6 +35,7 @@ from calib.twin.pictures import (
     plane_shot,
     png_bytes,
     shots,
+    write_board_files,
     write_pictures,
 )
 from calib.twin.rig import SimulatedRig
@@ -106,11 +107,7 @@ def _write_pictures(view: View, folder: Path) -> None:
             view.camera, PrintedBoard(BOARD), shot.pose, light=shot.light, sensor=shot.sensor, seed=shot.seed
         )
         write_atomically(folder / shot.path, png_bytes(picture))
-    board = f"corners: [{BOARD.columns}, {BOARD.rows}]\nsquare_m: {BOARD.square_m:.3f}\n"
-    x, y = PLANE.first_corner_m
-    place = f"first_corner_m: [{x:.3f}, {y:.3f}]\nangle_rad: {PLANE.angle_rad:.2f}\n"
-    write_atomically(folder / "board.yaml", board)
-    write_atomically(folder / "plane" / "board.yaml", board + place)
+    write_board_files(folder)
 
 
 def _plain(value: Any) -> Any:

@@ -207,15 +207,17 @@ def write_pictures(folder: Path) -> list[Path]:
         )
         written.append(folder / shot.path)
         write_atomically(written[-1], png_bytes(image))
-    board = f"corners: [{BOARD.columns}, {BOARD.rows}]\nsquare_m: {BOARD.square_m:.3f}\n"
+    return [*written, *write_board_files(folder)]
+
+
+def write_board_files(folder: Path) -> list[Path]:
+    """Write the board.yaml of a folder of pictures and of its folder `plane`; their paths."""
+    board = f"corners: [{BOARD.columns}, {BOARD.rows}]\nsquare_m: {BOARD.square_m:.3f}\nsimulated: true\n"
     x, y = PLANE.first_corner_m
     place = f"first_corner_m: [{x:.3f}, {y:.3f}]\nangle_rad: {PLANE.angle_rad:.2f}\n"
-    for path, text in (
-        (folder / "board.yaml", board),
-        (folder / "plane" / "board.yaml", board + place),
-    ):
+    written = [folder / "board.yaml", folder / "plane" / "board.yaml"]
+    for path, text in zip(written, (board, board + place), strict=True):
         write_atomically(path, text)
-        written.append(path)
     return written
 
 

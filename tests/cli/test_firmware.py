@@ -13,8 +13,8 @@ import yaml
 def test_the_header(calib, rig) -> None:
     ended = calib("firmware", "--rig", rig, "-o", rig.parent / "new" / "out")
     path = rig.parent / "new" / "out" / "calib_constants.h"
-    names = ["calib_constants.h", "calib_pipeline.h", "calib_selftest.h", "out.ino"]
-    assert (ended.code, ended.out) == (0, "145 constants\nverdict: ok\n")
+    names = ["calib_constants.h", "calib_guard.h", "calib_pipeline.h", "calib_selftest.h", "out.ino"]
+    assert (ended.code, ended.out) == (0, "153 constants\nverdict: ok\n")
     assert ended.err == f"{', '.join(names)} written to {path.parent}\n"
     assert sorted(p.name for p in path.parent.iterdir()) == names
     text = path.read_text("ascii")
@@ -84,7 +84,7 @@ def test_a_rig_without_a_plane(calib, rig) -> None:
     rig.write_text(text[: text.index("\nplane:")] + "\n")
     ended = calib("firmware", "--rig", rig, "-o", rig.parent)
     assert ended.code == 0
-    assert "114 constants\n" in ended.out and "no plane yet" in ended.out
+    assert "122 constants\n" in ended.out and "no plane yet" in ended.out
     text = (rig.parent / "calib_constants.h").read_text()
     assert "#define CALIB_HAS_PLANE 0" in text
     assert "CALIB_PLANE_INVERSE" not in text

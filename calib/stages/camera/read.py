@@ -63,7 +63,8 @@ class BoardFile(BaseModel):
     `corners` counts inner corners, columns x rows. `first_corner_m` is the world position of corner
     (0, 0), `angle_rad` the direction of the columns axis, `first_corner_px` where a picture shows
     corner (0, 0), for boards that look the same after half a turn. `dictionary` is that of a ChArUco
-    board's markers, as 4X4_50; without it such a board is found by itself.
+    board's markers, as 4X4_50; without it such a board is found by itself. `simulated` says that the
+    pictures are renderings.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -74,6 +75,7 @@ class BoardFile(BaseModel):
     first_corner_m: Position | None = None
     angle_rad: Angle | None = None
     first_corner_px: Pixel | None = None
+    simulated: bool = False
 
 
 def read_board_file(folder: Path) -> BoardFile:
@@ -761,6 +763,7 @@ class ViewSet:
     hashes: dict[str, str]
     left_out: tuple[LeftOut, ...]
     remarks: tuple[str, ...]
+    simulated: bool = False
 
 
 def read_views(
@@ -898,7 +901,7 @@ def _from_pictures(sources: Sequence[Path], told: Told, progress: Callable[[int,
         }
         # Of a recording most frames are left out; the remark counts them.
         left_out = [file for file in left_out if file.name not in names]
-    return ViewSet(views, found.image_size_px, hashes, tuple(left_out), tuple(remarks))
+    return ViewSet(views, found.image_size_px, hashes, tuple(left_out), tuple(remarks), file.simulated)
 
 
 def _of_recording(

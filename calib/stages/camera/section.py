@@ -75,6 +75,7 @@ class Camera(Result):
     loss: str | None = None
     termination: str | None = None
     rejected: list[str] = []
+    simulated: bool = False
 
     @property
     def optics(self) -> optics.Camera:
@@ -159,6 +160,7 @@ class Plane(Result):
     pictures: Count = quantity(0, label="pictures")
     points: Count = quantity(0, label="points")
     orientation: str = quantity("", label="orientation")
+    simulated: bool = False
 
     @model_validator(mode="after")
     def _a_pose_and_its_homography(self) -> Self:

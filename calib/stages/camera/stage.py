@@ -78,6 +78,7 @@ class IntrinsicsInputs:
     left_out: tuple[LeftOut, ...]
     choices: Choices
     detect_s: float
+    simulated: bool
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,9 @@ def _read_intrinsics(files: Files, rig: Rig, options: IntrinsicsOptions) -> Intr
     files.hashes.update(views.hashes)
     choices = Choices(options.model, options.skew, options.loss, options.board, options.keep_all)
     detect_s = time.perf_counter() - began
-    return IntrinsicsInputs(views.views, views.image_size_px, views.left_out, choices, detect_s)
+    return IntrinsicsInputs(
+        views.views, views.image_size_px, views.left_out, choices, detect_s, views.simulated
+    )
 
 
 def _solve_intrinsics(inputs: IntrinsicsInputs) -> Camera:
@@ -145,6 +148,7 @@ def _solve_intrinsics(inputs: IntrinsicsInputs) -> Camera:
         loss=fit.loss,
         termination=fit.termination,
         rejected=[str(one) for one in result.left_out if one.kind in ("view", "points")],
+        simulated=inputs.simulated,
         **judged(result.judgement.verdict),
     ).with_evidence(CameraEvidence(result, {"detect": inputs.detect_s, **result.seconds}))
 
@@ -296,6 +300,7 @@ class PlaneInputs:
     workspace_m: tuple[float, float, float, float]
     orientation: tuple[str, ...]
     left_out: tuple[LeftOut, ...]
+    simulated: bool
 
 
 @dataclass(frozen=True)
@@ -357,7 +362,9 @@ def _read_plane(files: Files, rig: Rig, options: NoOptions) -> PlaneInputs:
         orientation.append(f"{view.name}: {placed.how}")
     x0, y0, x1, y1 = (rig.geometry or Geometry()).workspace_m
     files.hashes.update({**search.hashes, **board_hash, "camera": identity(rig.camera)})
-    return PlaneInputs(rig.camera, views, (x0, y0, x1, y1), tuple(orientation), search.left_out)
+    return PlaneInputs(
+        rig.camera, views, (x0, y0, x1, y1), tuple(orientation), search.left_out, stated.simulated
+    )
 
 
 def _solve_plane(inputs: PlaneInputs) -> Plane:
@@ -417,6 +424,7 @@ def _solve_plane(inputs: PlaneInputs) -> Plane:
         pictures=len(fit.pictures),
         points=fit.points,
         orientation=" ".join(inputs.orientation),
+        simulated=inputs.simulated,
         **judged(Verdict.of(findings)),
     ).with_evidence(PlaneEvidence(optics, fit, inputs.orientation, inputs.left_out))
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from calib.core.errors import BadInputError
 from calib.core.files import read_bytes, shown
 from calib.core.verdict import Finding, Verdict
-from calib.io.serial import BOARD_COLUMNS, Frame, Outputs, frame_from_row
+from calib.io.serial import BOARD_COLUMNS, FAULTS, GUARD_RUN, Frame, Outputs, frame_from_row
 from calib.stages.firmware.conformance import BY_FUSED, BY_MEAN_RATE, CLAMPED, reference_of
 from calib.stages.firmware.header import Header
 from calib.stages.firmware.vectors import TOLERANCE
@@ -36,6 +36,7 @@ class Check:
     worst : largest difference by quantity of `vectors.TOLERANCE`.
     flags_differ : ticks whose flags were others.
     first_bad : the first tick beyond a tolerance, with the quantity; None where there is none.
+    faults : of the guard, with the first tick of each.
     """
 
     ticks: int
@@ -43,6 +44,7 @@ class Check:
     worst: dict[str, float]
     flags_differ: int
     first_bad: tuple[int, str] | None
+    faults: dict[int, int]
 
     @property
     def verdict(self) -> Verdict:
@@ -53,6 +55,9 @@ class Check:
             findings.append(Finding("poor", f"tick {tick} is the first that differs, in {what}"))
         if self.missing_after is not None:
             text = f"a frame is missing after tick {self.missing_after - 1}; what follows was not compared"
+            findings.append(Finding("remark", text))
+        for fault, tick in self.faults.items():
+            text = f"from tick {tick} on the guard held the pumps off: {FAULTS.get(fault, f'fault {fault}')}"
             findings.append(Finding("remark", text))
         return Verdict.of(findings)
 
@@ -79,6 +84,14 @@ def read_frames(path: Path) -> list[Frame]:
     if not frames:
         raise BadInputError(f"{shown(path)}: holds no tick of a board")
     return frames
+
+
+def _driven(frame: Frame) -> bool:
+    """Whether the pumps got what the tick commanded, or nothing where the guard says so."""
+    if frame.guard is None:
+        return True
+    wanted = frame.out.pwm if frame.guard.state == GUARD_RUN else (0.0, 0.0)
+    return all(abs(duty - pwm) <= 0.5 for duty, pwm in zip(frame.guard.duty, wanted, strict=True))
 
 
 def _differences(out: Outputs, wanted: Outputs) -> dict[str, float]:
@@ -118,6 +131,7 @@ def check_frames(
     reference = reference_of(header.values, undistort, by_fused, by_mean)
     worst = dict.fromkeys(TOLERANCE, 0.0)
     differ, bad, ticks, lost = 0, None, 0, None
+    faults: dict[int, int] = {}
     for tick, frame in enumerate(frames):
         if frame.sequence != tick & 0xFFFF:
             lost = tick
@@ -132,8 +146,12 @@ def check_frames(
             over.append("the decision to clamp")
         if wanted.undecided_m > _UNDECIDED_M:
             over.append("the decision on rest, motion or a marker to leave out")
+        if not _driven(frame):
+            over.append("what drives the pumps")
+        if frame.guard is not None and frame.guard.fault:
+            faults.setdefault(frame.guard.fault, tick)
         if over and bad is None:
             bad = (tick, over[0])
         worst = {name: max(worst[name], value) for name, value in found.items()}
         ticks += 1
-    return Check(ticks, lost, worst, differ, bad)
+    return Check(ticks, lost, worst, differ, bad, faults)

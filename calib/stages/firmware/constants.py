@@ -34,6 +34,7 @@ from calib.stages.estimator.constant_gain import (
 )
 from calib.stages.estimator.section import EstimatorGain
 from calib.stages.firmware.literals import Constant, Group, Item, Macro, Table, Whole
+from calib.stages.firmware.section import Envelope
 from calib.stages.imu.levelling import Levelling, settled
 from calib.stages.imu.levelling import gains as gains_of
 from calib.stages.lowpass.filters import LowPass, coefficients
@@ -391,8 +392,8 @@ PHI_LIMIT_RAD = 1.58
 """Largest angle of the head that the firmware's sine and cosine are made for."""
 
 _HOLD_S = 1.0
-_ACCEL_LIMIT_MPS2 = 400.0
-_RATE_LIMIT_RADPS = 60.0
+_ACCEL_LIMIT_MPS2 = 157.0
+_RATE_LIMIT_RADPS = 35.0
 _WEAK_MPS2 = 1.0
 _BIAS_LIMIT_RADPS = 1.0
 _LONGEST_OFFSET_TICKS = 8
@@ -821,7 +822,64 @@ def control_groups(lookup: Lookup, rate_hz: float) -> tuple[Group, ...]:
     lengths = _pid_group(
         lookup, "position", "Control of both lengths, PD (4.5), (4.8).", ("M", "m"), _POSITION, rate_hz
     )
-    return pumps, angle, crossed, lengths, _feedforward_group(lookup, low)
+    return pumps, angle, crossed, lengths, _feedforward_group(lookup, low), _envelope_group(lookup, rate_hz)
+
+
+_SHORTEST_M, _LONGEST_M = 0.5 * LONGEST_ELONGATION_M, 1.25 * LONGEST_ELONGATION_M
+"""By how much a bellows may be shorter and longer than at rest."""
+
+
+def _envelope_group(lookup: Lookup, rate_hz: float) -> Group:
+    """Limits of the guard, from the actuator's rest length and radius where a person states none."""
+    plant, told = Plant(), Envelope()
+    rest = lookup.number("actuator.rest_length_m", plant.rest_length_m)
+    radius = lookup.number("actuator.bellows_radius_m", plant.bellows_radius_m)
+    lookup.defaults()
+    least = lookup.number("envelope.least_length_m", max(rest - _SHORTEST_M, 0.1 * rest))
+    greatest = lookup.number("envelope.greatest_length_m", rest + _LONGEST_M)
+    angle = lookup.number("envelope.angle_rad", min(_LONGEST_M / (2.0 * radius), 1.5))
+    rate = lookup.number("envelope.rate_mps", told.rate_mps)
+    full = lookup.number("envelope.full_power_s", told.full_power_s)
+    apart = lookup.number("envelope.apart_m", told.apart_m)
+    if not least < greatest:
+        raise BadInputError(
+            f"{lookup.source}: envelope.least_length_m is {least:g}, expected less than the greatest, "
+            f"{greatest:g}"
+        )
+    ticks = min(max(round(full * rate_hz), 1), 65000)
+    return Group(
+        ("Envelope, see calib_guard.h: the pumps stop where the actuator leaves it.",),
+        (
+            Constant("CALIB_ENVELOPE_LEAST_M", least, "shortest length of a bellows, m"),
+            Constant("CALIB_ENVELOPE_GREATEST_M", greatest, "longest length of a bellows, m"),
+            Constant("CALIB_ENVELOPE_ANGLE_RAD", angle, "greatest bending to each side, rad"),
+            Constant(
+                "CALIB_ENVELOPE_STEP_M",
+                rate / rate_hz,
+                f"greatest change of a length in a tick, m; {rate:g} m/s",
+            ),
+            Whole("CALIB_ENVELOPE_FULL_TICKS", ticks, "ticks that a pump may stay at its greatest command"),
+            Constant(
+                "CALIB_ENVELOPE_APART_M",
+                apart,
+                "marker from where the angle puts it at most, m",
+            ),
+        ),
+        lookup.defaults(),
+    )
+
+
+def trust_group(ok: bool, simulated: bool) -> Group:
+    """Whether the constants may drive a real rig."""
+    return Group(
+        ("Whether these constants may drive a rig. The guard compiles for a board only where they may.",),
+        (
+            Whole("CALIB_RIG_OK", int(ok), "0: a section that they come from is not ok"),
+            Whole(
+                "CALIB_SIMULATED", int(simulated), "1: they come from a simulated rig or rendered pictures"
+            ),
+        ),
+    )
 
 
 # ----------------------------------------------------------------------

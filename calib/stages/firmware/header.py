@@ -36,6 +36,7 @@ from calib.stages.firmware.constants import (
     plane_constants,
     put_right,
     tick_rate_hz,
+    trust_group,
 )
 from calib.stages.firmware.literals import (
     Constant,
@@ -139,6 +140,7 @@ class Header:
         where = Path(folder)
         texts = {"calib_constants.h": self.text}
         if self.camera.plane is not None:
+            texts["calib_guard.h"] = verbatim("calib_guard.h")
             texts["calib_pipeline.h"] = verbatim("calib_pipeline.h")
             texts["calib_selftest.h"] = selftest_text(self)
             texts[self.sketch(where)] = verbatim("calib_example.ino")
@@ -268,7 +270,16 @@ def header_of(whole: Rig, source: str) -> Header:
     rate_hz = tick_rate_hz(lookup)
     lookup.defaults()
     motion = (*motion_groups(lookup), fused_group(lookup, rate_hz, camera.plane))
-    groups = (*camera_groups(camera), *motion, *control_groups(lookup, rate_hz))
+    verdict = _judge(whole, camera)
+    simulated = whole.twin is not None or any(
+        section is not None and section.simulated for section in (whole.camera, whole.plane)
+    )
+    groups = (
+        trust_group(verdict.ok, simulated),
+        *camera_groups(camera),
+        *motion,
+        *control_groups(lookup, rate_hz),
+    )
     inputs = {
         f"{section}/{name}": digest
         for section, named in whole.inputs.items()
@@ -276,7 +287,7 @@ def header_of(whole: Rig, source: str) -> Header:
         # Sections that name others as inputs; only files are inputs of the header.
         if name not in ("camera", "plane") and (section != "plane" or camera.plane is not None)
     }
-    return Header(camera, groups, inputs, _judge(whole, camera))
+    return Header(camera, groups, inputs, verdict)
 
 
 def _lines(group: Group, literal: Mapping[str, str]) -> list[str]:

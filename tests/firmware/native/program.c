@@ -2,6 +2,7 @@
  * One tick after the other, for a host (records on stdin and stdout) and for an AVR under a simulator that
  * fills `in` when GPIOR0 becomes 1 and fetches `out` when it becomes 2. CALIB_MOVING: the reference is a point
  * (x, y) that has to be turned into lengths in the same tick. CALIB_SELFTEST: the self-test instead of a tick.
+ * CALIB_GUARDED: the guard before and after the tick, made to run in every one.
  */
 #ifdef __AVR__
 #include <avr/io.h>
@@ -13,7 +14,10 @@
 #include <string.h>
 #endif
 
-#ifdef CALIB_SELFTEST
+#ifdef CALIB_GUARDED
+#include "calib_guard.h"
+static calib_guard guard;
+#elif defined(CALIB_SELFTEST)
 #include "calib_selftest.h"
 #else
 #include "calib_pipeline.h"
@@ -34,7 +38,14 @@ static void one_tick(void) {
         calib_reference_point(x, y, in.reference);
     }
 #endif
+#ifdef CALIB_GUARDED
+    guard.state = CALIB_RUN;
+    in.mode = calib_guard_mode(&guard, in.mode, in.reference);
+#endif
     calib_tick(&state, &in, &out);
+#ifdef CALIB_GUARDED
+    calib_guard_tick(&guard, &state, &in, &out);
+#endif
 }
 
 #ifdef __AVR__

@@ -61,7 +61,11 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0xE01C96BDUL
+#define CALIB_ID 0x6FF616EBUL
+
+/* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
+#define CALIB_RIG_OK 1 /* 0: a section that they come from is not ok */
+#define CALIB_SIMULATED 1 /* 1: they come from a simulated rig or rendered pictures */
 
 /* Camera (2.5) and lens (B.1). */
 #define CALIB_IMAGE_WIDTH_PX 316 /* columns */
@@ -160,8 +164,8 @@
 #define CALIB_IMU_ACCEL_RATIO 1.0f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
 #define CALIB_IMU_GYRO_BIAS_RADPS 0.0f /* gz at rest, rad/s; sign as read */
 #define CALIB_IMU_MOUNT_ANGLE_RAD 0.0f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
-#define CALIB_IMU_ACCEL_LIMIT_MPS2 400.0f /* readings beyond are lost, m/s^2 */
-#define CALIB_IMU_RATE_LIMIT_RADPS 60.0f /* readings beyond are lost, rad/s */
+#define CALIB_IMU_ACCEL_LIMIT_MPS2 157.0f /* readings beyond are lost, m/s^2 */
+#define CALIB_IMU_RATE_LIMIT_RADPS 35.0f /* readings beyond are lost, rad/s */
 #define CALIB_IMU_ACCEL_WEAK_MPS2 1.0f /* |ax| and |ay| below say nothing of phi, m/s^2 */
 
 /* Angle filter: (2.3). */
@@ -285,6 +289,17 @@ static const float calib_ff_table_pwm[15] CALIB_IN_FLASH = {
     173.377716f, 180.938293f, 188.555145f, 196.396774f, 204.687546f, 213.799484f,
     224.553818f, 240.382324f, 253.525574f,
 };
+
+/*
+ * Envelope, see calib_guard.h: the pumps stop where the actuator leaves it.
+ * Defaults of the nominal actuator, not in rig.yaml: envelope.least_length_m, envelope.greatest_length_m, envelope.angle_rad, envelope.rate_mps, envelope.full_power_s, envelope.apart_m.
+ */
+#define CALIB_ENVELOPE_LEAST_M 0.0450000018f /* shortest length of a bellows, m */
+#define CALIB_ENVELOPE_GREATEST_M 0.115000002f /* longest length of a bellows, m */
+#define CALIB_ENVELOPE_ANGLE_RAD 1.5f /* greatest bending to each side, rad */
+#define CALIB_ENVELOPE_STEP_M 0.00833333377f /* greatest change of a length in a tick, m; 0.5 m/s */
+#define CALIB_ENVELOPE_FULL_TICKS 180 /* ticks that a pump may stay at its greatest command */
+#define CALIB_ENVELOPE_APART_M 0.0120000001f /* marker from where the angle puts it at most, m */
 
 #if defined(CALIB_EXPECT_TICK_RATE_MHZ)
 #if CALIB_EXPECT_TICK_RATE_MHZ != CALIB_TICK_RATE_MHZ

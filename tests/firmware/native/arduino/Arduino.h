@@ -5,19 +5,26 @@
 #include <stdint.h>
 
 #define OUTPUT 1
+#define INPUT_PULLUP 2
+#define SDA 18
+#define SCL 19
 #define HIGH 1
 #define LOW 0
 #define LED_BUILTIN 13
 
 void pinMode(uint8_t pin, uint8_t mode);
 void digitalWrite(uint8_t pin, uint8_t value);
+int digitalRead(uint8_t pin);
 void analogWrite(uint8_t pin, int value);
 void delay(unsigned long ms);
+void delayMicroseconds(unsigned us);
 unsigned long micros(void);
 
 struct SerialPort {
     void begin(unsigned long baud);
     size_t write(uint8_t value);
+    int available();
+    int read();
 };
 extern SerialPort Serial;
 

@@ -1,0 +1,40 @@
+"""The section `envelope` of rig.yaml: what the firmware lets the actuator do."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from calib.core.result import Section
+
+_Length = Annotated[float, Field(gt=0, lt=10, allow_inf_nan=False, strict=True)]
+
+
+class Envelope(Section):
+    """What a person allows the actuator: the firmware's guard stops the pumps beyond."""
+
+    least_length_m: _Length | None = None
+    greatest_length_m: _Length | None = None
+    """Lengths of a bellows. Default: from 20 mm below the rest length to 50 mm above."""
+
+    angle_rad: Annotated[float, Field(gt=0, le=1.5, allow_inf_nan=False, strict=True)] | None = None
+    """Bending to each side. Default: what one bellows bends alone that is 50 mm longer."""
+
+    rate_mps: Annotated[float, Field(gt=0, le=10, allow_inf_nan=False, strict=True)] = 0.5
+    """Rate of a length."""
+
+    full_power_s: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False, strict=True)] = 3.0
+    """Time that a pump may stay at its greatest command."""
+
+    apart_m: Annotated[float, Field(gt=0, lt=1, allow_inf_nan=False, strict=True)] = 0.012
+    """Distance of the marker from where the angle puts it."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Envelope:
+        least, greatest = self.least_length_m, self.greatest_length_m
+        if least is not None and greatest is not None and least >= greatest:
+            raise ValueError(
+                f"expected least_length_m below greatest_length_m, found {least:g} and {greatest:g}"
+            )
+        return self

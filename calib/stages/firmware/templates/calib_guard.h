@@ -1,0 +1,416 @@
+/*
+ * calib_guard.h - whether the pumps may run. To be asked before and after each tick:
+ *
+ *   calib_guard guard;                                calib_guard_start(&guard) once, pumps off
+ *   calib_guard_ready(&guard, calib_selftest() == 0)  after the self-test
+ *   in.mode = calib_guard_mode(&guard, wanted, in.reference);
+ *   calib_tick(&state, &in, &out);
+ *   calib_guard_tick(&guard, &state, &in, &out);      out.duty is 0 now unless the pumps may run
+ *
+ *   BOOT    until the self-test has passed
+ *   ARMED   pumps off; RUN where a mode is wanted and the sensors were sound for CALIB_GUARD_QUIET_TICKS
+ *   RUN     pumps as commanded
+ *   FAULT   pumps off, guard.fault tells why
+ *
+ * fault                      after                                               ends
+ *   CALIB_FAULT_SELFTEST     the self-test failed                                at a reset
+ *   CALIB_FAULT_IMU_LOST     12 samples in a row lost, weightless or beyond 3 g,  by itself
+ *                            or more than a fifth of them for long
+ *   CALIB_FAULT_IMU_FROZEN   12 times the very same sample                       by itself
+ *   CALIB_FAULT_CAMERA_LOST  15 pictures without a marker, or more than a        by itself
+ *                            fifth of them for long, where a mode needs them
+ *   CALIB_FAULT_CAMERA_FROZEN the marker on one pixel while the angle turns      by itself
+ *   CALIB_FAULT_APART        marker and angle of two places for half a second    by itself
+ *   CALIB_FAULT_REACH        angle or lengths beyond the envelope for 6 ticks    by calib_guard_clear
+ *   CALIB_FAULT_RATE         lengths that change faster than the envelope says   by calib_guard_clear
+ *   CALIB_FAULT_FULL_POWER   a pump at its greatest command for longer than the  by calib_guard_clear
+ *                            envelope says
+ *   CALIB_FAULT_REFERENCE    a reference beyond the envelope, at once            with the next good one
+ *   CALIB_FAULT_LATE, _HOST  told by the program: ticks too late, host silent    by themselves
+ * What ends by itself does so after CALIB_GUARD_QUIET_TICKS without a cause, doubled with each of CALIB_GUARD_TRIES;
+ * then it stays as well. The envelope stands in calib_constants.h.
+ */
+#ifndef CALIB_GUARD_H
+#define CALIB_GUARD_H
+
+#include "calib_pipeline.h"
+
+#if (!CALIB_RIG_OK || CALIB_SIMULATED) && defined(__AVR__) && !defined(CALIB_I_KNOW)
+#error "calib: these constants are not ok or of a simulated rig, calib_constants.h says which; CALIB_I_KNOW 1 takes them"
+#endif
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/* guard.state */
+#define CALIB_BOOT 0
+#define CALIB_ARMED 1
+#define CALIB_RUN 2
+#define CALIB_FAULT 3
+
+/* guard.fault; those from CALIB_FAULT_STAYS on end by calib_guard_clear alone. */
+#define CALIB_FAULT_NONE 0
+#define CALIB_FAULT_IMU_LOST 1
+#define CALIB_FAULT_IMU_FROZEN 2
+#define CALIB_FAULT_CAMERA_LOST 3
+#define CALIB_FAULT_CAMERA_FROZEN 4
+#define CALIB_FAULT_APART 5
+#define CALIB_FAULT_REFERENCE 6
+#define CALIB_FAULT_LATE 7
+#define CALIB_FAULT_HOST 8
+#define CALIB_FAULT_STAYS 16
+#define CALIB_FAULT_REACH 16
+#define CALIB_FAULT_RATE 17
+#define CALIB_FAULT_FULL_POWER 18
+#define CALIB_FAULT_SELFTEST 19
+#define CALIB_FAULT_WATCHDOG 20 /* of a program that keeps it over a reset */
+
+#define CALIB_GUARD_QUIET_TICKS 30
+#define CALIB_GUARD_TRIES 5
+#define CALIB_GUARD_SOUND_TICKS 600 /* in RUN, after which the tries begin anew */
+
+/* A bad tick counts four times what a good one takes away: a fifth of bad ones is too many. */
+#define CALIB_GUARD_BAD 4
+#define CALIB_GUARD_IMU_BAD (12 * CALIB_GUARD_BAD)
+#define CALIB_GUARD_CAMERA_BAD (15 * CALIB_GUARD_BAD)
+#define CALIB_GUARD_SAME 12
+#define CALIB_GUARD_SHAKEN_MPS2 30.0f /* specific force that a rig has for moments only */
+#define CALIB_GUARD_FROZEN_RAD 0.25f /* angle that moves the marker by pixels */
+#define CALIB_GUARD_FROZEN 6
+#define CALIB_GUARD_APART (8 * CALIB_GUARD_BAD) /* in fourths of the ticks, as the rate */
+#define CALIB_GUARD_REACH (6 * CALIB_GUARD_BAD)
+#define CALIB_GUARD_RATE (2 * CALIB_GUARD_BAD)
+
+typedef struct {
+    uint32_t imu[3], pixel[2];            /* bits of the last sample, and of the last marker */
+    float marker_m[2], tangent;           /* of the last fourth tick: marker, tangent of half the angle */
+    float phi_rad;                        /* angle when the marker came to that pixel */
+    float q_m[2];                         /* lengths four ticks ago */
+    uint16_t full[2];                     /* ticks at full power, less those below it */
+    uint16_t quiet, sound;                /* ticks without a cause; ticks in RUN */
+    uint8_t imu_bad, imu_same, camera_bad, frozen, apart, reach, rate;
+    uint8_t state, fault, tries, known, needs_camera, turn, shown;
+} calib_guard;
+
+static inline void calib_guard_start(calib_guard *guard) {
+    memset(guard, 0, sizeof *guard);
+}
+
+/* One bad or good tick for a count that stops at its limit, so that it soon is 0 again. */
+static inline uint8_t calib_guard_counted(uint8_t count, uint8_t bad, uint8_t limit) {
+    if (bad) {
+        return count > limit - CALIB_GUARD_BAD ? limit : (uint8_t)(count + CALIB_GUARD_BAD);
+    }
+    return count ? (uint8_t)(count - 1u) : 0;
+}
+
+/* Something is wrong: pumps off from now on. Of several causes the one that stays is kept. */
+static inline void calib_guard_fault(calib_guard *guard, uint8_t fault) {
+    guard->quiet = 0;
+    if (guard->state == CALIB_FAULT && guard->fault >= CALIB_FAULT_STAYS) {
+        return;
+    }
+    if (guard->state != CALIB_FAULT && fault != CALIB_FAULT_REFERENCE && guard->tries < 255) {
+        guard->tries++;
+    }
+    guard->state = CALIB_FAULT;
+    guard->fault = fault;
+}
+
+/* After the self-test. */
+static inline void calib_guard_ready(calib_guard *guard, uint8_t passed) {
+    if (passed && guard->state == CALIB_BOOT) {
+        guard->state = CALIB_ARMED;
+    } else if (!passed) {
+        calib_guard_fault(guard, CALIB_FAULT_SELFTEST);
+    }
+}
+
+/* A person has looked: back to ARMED, but not from a failed self-test. */
+static inline void calib_guard_clear(calib_guard *guard) {
+    if (guard->state == CALIB_FAULT && guard->fault != CALIB_FAULT_SELFTEST) {
+        guard->state = CALIB_ARMED;
+        guard->fault = CALIB_FAULT_NONE;
+        guard->tries = 0;
+        guard->quiet = 0;
+        guard->reach = 0;
+        guard->rate = 0;
+        guard->full[0] = 0;
+        guard->full[1] = 0;
+    }
+}
+
+/* Whether a length is within the envelope; false for NaN. */
+static inline uint8_t calib_guard_length(float q_m) {
+    return (uint8_t)(calib_within(q_m, CALIB_ENVELOPE_GREATEST_M) && !calib_negative(q_m) &&
+                     calib_bits(q_m) >= calib_bits(CALIB_ENVELOPE_LEAST_M));
+}
+
+/* The mode for this tick: the wanted one where the pumps may run, else CALIB_MODE_OFF. */
+static inline uint8_t calib_guard_mode(calib_guard *guard, uint8_t wanted, const float *reference) {
+    uint8_t good = 1;
+    if (wanted == CALIB_MODE_ORIENTATION) {
+        good = calib_within(reference[0], CALIB_ENVELOPE_ANGLE_RAD);
+    } else if (wanted == CALIB_MODE_POSITION) {
+        good = (uint8_t)(calib_guard_length(reference[0]) && calib_guard_length(reference[1]));
+    } else {
+        wanted = CALIB_MODE_OFF;
+    }
+    guard->needs_camera = (uint8_t)(CALIB_FUSED || wanted == CALIB_MODE_POSITION);
+    if (!good && guard->state != CALIB_BOOT) {
+        calib_guard_fault(guard, CALIB_FAULT_REFERENCE);
+    } else if (guard->fault == CALIB_FAULT_REFERENCE) {
+        guard->state = CALIB_ARMED;
+        guard->fault = CALIB_FAULT_NONE;
+    }
+    if (wanted == CALIB_MODE_OFF) {
+        if (guard->state == CALIB_RUN) {
+            guard->state = CALIB_ARMED;
+        }
+    } else if (guard->state == CALIB_ARMED && guard->quiet >= CALIB_GUARD_QUIET_TICKS) {
+        guard->state = CALIB_RUN;
+        guard->sound = 0;
+    }
+    return guard->state == CALIB_RUN ? wanted : CALIB_MODE_OFF;
+}
+
+/* Health of the IMU in this tick. */
+static inline uint8_t calib_guard_imu(calib_guard *guard, const calib_state *state, const calib_inputs *in,
+                                      uint16_t flags) {
+    uint8_t lost = (uint8_t)(state->imu_age != 0 || (flags & CALIB_ACCEL_WEAK) ||
+                             !calib_within(in->ax_mps2, CALIB_GUARD_SHAKEN_MPS2) ||
+                             !calib_within(in->ay_mps2, CALIB_GUARD_SHAKEN_MPS2));
+    guard->imu_bad = calib_guard_counted(guard->imu_bad, lost, CALIB_GUARD_IMU_BAD);
+    if (in->imu_read) {
+        uint32_t ax = calib_bits(in->ax_mps2), ay = calib_bits(in->ay_mps2), gz = calib_bits(in->gz_radps);
+        if (guard->known && ax == guard->imu[0] && ay == guard->imu[1] && gz == guard->imu[2]) {
+            guard->imu_same = guard->imu_same < 255 ? (uint8_t)(guard->imu_same + 1u) : 255;
+        } else {
+            guard->imu_same = 0;
+        }
+        guard->imu[0] = ax;
+        guard->imu[1] = ay;
+        guard->imu[2] = gz;
+        guard->known = 1;
+    }
+    if (guard->imu_same >= CALIB_GUARD_SAME) {
+        return CALIB_FAULT_IMU_FROZEN;
+    }
+    return guard->imu_bad >= CALIB_GUARD_IMU_BAD ? CALIB_FAULT_IMU_LOST : CALIB_FAULT_NONE;
+}
+
+/* Health of the camera, by itself and against the angle; the latter is spread over four ticks. */
+static inline uint8_t calib_guard_camera(calib_guard *guard, const calib_state *state, const calib_inputs *in,
+                                         const calib_outputs *out) {
+    uint8_t lost = (uint8_t)(state->marker_age != 0);
+    guard->camera_bad = calib_guard_counted(guard->camera_bad, lost, CALIB_GUARD_CAMERA_BAD);
+    if (!lost) {
+        uint32_t u = calib_bits(in->u_px), v = calib_bits(in->v_px);
+        if (u != guard->pixel[0] || v != guard->pixel[1]) {
+            guard->pixel[0] = u;
+            guard->pixel[1] = v;
+            guard->phi_rad = out->phi_rad;
+            guard->frozen = 0;
+        } else if (calib_within(out->phi_rad - guard->phi_rad, CALIB_GUARD_FROZEN_RAD)) {
+            guard->frozen = 0;
+        } else if (guard->frozen < CALIB_GUARD_FROZEN) {
+            guard->frozen++;
+        }
+    }
+    if (guard->turn == 0) {
+        float phi = out->phi_rad;
+        /* The tangent of half the angle, to 0.03 up to 1.4 rad. */
+        guard->tangent = phi * (0.5f + phi * phi * 0.0416666679f);
+        guard->marker_m[0] = out->marker_m[0];
+        guard->marker_m[1] = out->marker_m[1];
+        guard->shown = (uint8_t)!lost;
+    } else if (guard->turn == 1 && guard->shown) {
+        float across = guard->marker_m[0] - guard->tangent * (guard->marker_m[1] + CALIB_MARKER_OFFSET_M);
+        uint8_t off = (uint8_t)!calib_within(across, CALIB_ENVELOPE_APART_M);
+        guard->apart = calib_guard_counted(guard->apart, off, CALIB_GUARD_APART);
+    }
+    if (guard->camera_bad >= CALIB_GUARD_CAMERA_BAD) {
+        return CALIB_FAULT_CAMERA_LOST;
+    }
+    if (guard->frozen >= CALIB_GUARD_FROZEN) {
+        return CALIB_FAULT_CAMERA_FROZEN;
+    }
+    return guard->apart >= CALIB_GUARD_APART ? CALIB_FAULT_APART : CALIB_FAULT_NONE;
+}
+
+/* Whether the actuator is where and, every fourth tick, as fast as the envelope allows; lengths need the camera. */
+static inline uint8_t calib_guard_envelope(calib_guard *guard, const calib_outputs *out, uint8_t lengths) {
+    uint8_t i, beyond = (uint8_t)!calib_within(out->phi_rad, CALIB_ENVELOPE_ANGLE_RAD), fast = 0;
+    for (i = 0; i < 2; i++) {
+        if (lengths && !calib_guard_length(out->q_m[i])) {
+            beyond = 1;
+        }
+        if (guard->turn == 2) {
+            if (lengths && !calib_within(out->q_m[i] - guard->q_m[i], 4.0f * CALIB_ENVELOPE_STEP_M)) {
+                fast = 1;
+            }
+            guard->q_m[i] = out->q_m[i];
+        }
+        if (out->duty[i] < CALIB_PUMP_HIGH) {
+            guard->full[i] = guard->full[i] ? (uint16_t)(guard->full[i] - 1u) : 0;
+        } else if (++guard->full[i] >= CALIB_ENVELOPE_FULL_TICKS) {
+            return CALIB_FAULT_FULL_POWER;
+        }
+    }
+    guard->reach = calib_guard_counted(guard->reach, beyond, CALIB_GUARD_REACH);
+    if (guard->turn == 2) {
+        guard->rate = calib_guard_counted(guard->rate, fast, CALIB_GUARD_RATE);
+    }
+    guard->turn = (uint8_t)((guard->turn + 1u) & 3u);
+    if (guard->reach >= CALIB_GUARD_REACH) {
+        return CALIB_FAULT_REACH;
+    }
+    return guard->rate >= CALIB_GUARD_RATE ? CALIB_FAULT_RATE : CALIB_FAULT_NONE;
+}
+
+/* After a tick: out->duty stays where the pumps may run, and is 0 elsewhere. */
+static inline void calib_guard_tick(calib_guard *guard, const calib_state *state, const calib_inputs *in,
+                                    calib_outputs *out) {
+    uint8_t imu = calib_guard_imu(guard, state, in, out->flags);
+    uint8_t camera = calib_guard_camera(guard, state, in, out);
+    /* A camera that shows something must not show something else, needed or not. */
+    uint8_t fault = camera == CALIB_FAULT_CAMERA_LOST && !guard->needs_camera ? CALIB_FAULT_NONE : camera;
+    uint8_t envelope = calib_guard_envelope(guard, out, (uint8_t)(camera == CALIB_FAULT_NONE));
+    if (imu) {
+        fault = imu;
+    }
+    if (guard->state == CALIB_RUN) {
+        if (!fault) {
+            fault = envelope;
+        }
+        if (fault) {
+            calib_guard_fault(guard, fault);
+        } else if (guard->tries && ++guard->sound >= CALIB_GUARD_SOUND_TICKS) {
+            guard->tries = 0;
+        }
+    }
+    if (fault || guard->imu_bad || state->imu_age == CALIB_NEVER ||
+        (guard->needs_camera && (guard->camera_bad || state->marker_age == CALIB_NEVER))) {
+        guard->quiet = 0;
+    } else if (guard->quiet < 0xFFFFu) {
+        guard->quiet++;
+    }
+    if (guard->state == CALIB_FAULT && guard->fault < CALIB_FAULT_STAYS && guard->fault != CALIB_FAULT_REFERENCE &&
+        guard->tries <= CALIB_GUARD_TRIES && guard->quiet >= ((uint16_t)(CALIB_GUARD_QUIET_TICKS << guard->tries))) {
+        guard->state = CALIB_ARMED;
+        guard->fault = CALIB_FAULT_NONE;
+    }
+    if (guard->state != CALIB_RUN) {
+        out->duty[0] = 0;
+        out->duty[1] = 0;
+    }
+}
+
+/* One tick of a sound rig for the self-test, k its number. */
+static inline void calib_guard_sound(calib_state *state, calib_inputs *in, calib_outputs *out, uint8_t k) {
+    state->imu_age = 0;
+    state->marker_age = 0;
+    in->imu_read = 1;
+    in->ax_mps2 = 9.0f + 0.01f * (float)k;
+    in->u_px = (float)k;
+    in->reference[0] = CALIB_ENVELOPE_LEAST_M;
+    in->reference[1] = CALIB_ENVELOPE_LEAST_M;
+    out->flags = 0;
+    out->phi_rad = 0.0f;
+    out->marker_m[0] = 0.0f;
+    out->marker_m[1] = CALIB_REST_LENGTH_M;
+    out->q_m[0] = CALIB_ENVELOPE_LEAST_M;
+    out->q_m[1] = CALIB_ENVELOPE_LEAST_M;
+    out->duty[0] = 100;
+    out->duty[1] = 100;
+}
+
+/* Ticks until one fault stops pumps that run; 0 when they did not run before it, 255 when it never stopped them. */
+static inline uint8_t calib_guard_try(uint8_t fault) {
+    calib_guard guard;
+    calib_state state;
+    calib_inputs in;
+    calib_outputs out;
+    uint8_t k;
+    memset(&state, 0, sizeof state);
+    memset(&in, 0, sizeof in);
+    memset(&out, 0, sizeof out);
+    calib_guard_start(&guard);
+    for (k = 0; k < CALIB_GUARD_QUIET_TICKS + 2; k++) {
+        calib_guard_sound(&state, &in, &out, k);
+        if (k == 1) {
+            calib_guard_ready(&guard, 1);
+        }
+        in.mode = calib_guard_mode(&guard, CALIB_MODE_POSITION, in.reference);
+        calib_guard_tick(&guard, &state, &in, &out);
+        if (k < CALIB_GUARD_QUIET_TICKS && out.duty[0]) {
+            return 0;
+        }
+    }
+    if (!out.duty[0] || guard.state != CALIB_RUN) {
+        return 0;
+    }
+    for (k = 1; k < 255; k++) {
+        calib_guard_sound(&state, &in, &out, k);
+        switch (fault) {
+        case CALIB_FAULT_IMU_LOST:
+            state.imu_age = 1;
+            break;
+        case CALIB_FAULT_IMU_FROZEN:
+            in.ax_mps2 = 9.0f;
+            break;
+        case CALIB_FAULT_CAMERA_LOST:
+            state.marker_age = 1;
+            break;
+        case CALIB_FAULT_CAMERA_FROZEN:
+            in.u_px = 0.0f;
+            out.phi_rad = k > 1 ? 2.0f * CALIB_GUARD_FROZEN_RAD : 0.0f;
+            break;
+        case CALIB_FAULT_APART:
+            out.marker_m[0] = 2.0f * CALIB_ENVELOPE_APART_M;
+            break;
+        case CALIB_FAULT_REFERENCE:
+            in.reference[1] = 2.0f * CALIB_ENVELOPE_GREATEST_M;
+            break;
+        case CALIB_FAULT_REACH:
+            out.q_m[1] = 2.0f * CALIB_ENVELOPE_GREATEST_M;
+            break;
+        case CALIB_FAULT_RATE:
+            out.q_m[1] = CALIB_ENVELOPE_LEAST_M + ((k & 4) ? 5.0f * CALIB_ENVELOPE_STEP_M : 0.0f);
+            break;
+        default:
+            guard.full[1] = CALIB_ENVELOPE_FULL_TICKS - 1;
+            out.duty[1] = CALIB_PUMP_HIGH;
+            break;
+        }
+        in.mode = calib_guard_mode(&guard, CALIB_MODE_POSITION, in.reference);
+        calib_guard_tick(&guard, &state, &in, &out);
+        if (!out.duty[0] && !out.duty[1]) {
+            return guard.state == CALIB_FAULT && guard.fault == fault ? k : 255;
+        }
+    }
+    return 255;
+}
+
+/* 0 when every fault stops the pumps in its time, else the first that does not. */
+static inline uint8_t calib_guard_selftest(void) {
+    static const uint8_t faults[9] = {CALIB_FAULT_IMU_LOST,  CALIB_FAULT_IMU_FROZEN, CALIB_FAULT_CAMERA_LOST,
+                                      CALIB_FAULT_CAMERA_FROZEN, CALIB_FAULT_APART,  CALIB_FAULT_REFERENCE,
+                                      CALIB_FAULT_REACH,     CALIB_FAULT_RATE,       CALIB_FAULT_FULL_POWER};
+    static const uint8_t ticks[9] = {12, 13, 15, 8, 33, 1, 6, 12, 1};
+    uint8_t i, taken;
+    for (i = 0; i < 9; i++) {
+        taken = calib_guard_try(faults[i]);
+        if (taken == 0 || taken > ticks[i]) {
+            return faults[i];
+        }
+    }
+    return 0;
+}
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif /* CALIB_GUARD_H */

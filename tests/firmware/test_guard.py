@@ -1,0 +1,210 @@
+"""The guard: every fault stops the pumps in its time, on the real instruction set and Arduino core."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from firmware_build import Built, need, sketch, warnings, write
+from firmware_rigs import header
+
+from calib.io.serial import GUARD_FAULT, GUARD_RUN, Decoder, Frame
+from calib.twin.pictures import CAMERA, PLANE
+
+IMU_LOST, IMU_FROZEN, CAMERA_LOST, CAMERA_FROZEN, APART, REFERENCE = range(1, 7)
+LATE, HOST, REACH, RATE, FULL_POWER, SELFTEST, WATCHDOG = 7, 8, 16, 17, 18, 19, 20
+AT_MS, UNTIL_MS, END_MS = 3000.0, 4500.0, 7500.0
+
+
+@dataclass(frozen=True)
+class Ended:
+    """A run of the board.
+
+    Attributes
+    ----------
+    on_before_ms, on_during_ms : with a pump on before the fault, and from 400 ms after its beginning.
+    off_after_ms : when both were off for good, -1 for never. runs : whether a pump is on at the end.
+    """
+
+    on_before_ms: float
+    on_during_ms: float
+    off_after_ms: float
+    runs: bool
+    frames: list[Frame]
+
+    @property
+    def faults(self) -> set[int]:
+        """That were told."""
+        return {f.guard.fault for f in self.frames if f.guard is not None} - {0}
+
+
+def _marker(length_m: float) -> list[str]:
+    R, t = np.array(PLANE.R_CW), np.array(PLANE.t_m)
+    seen = CAMERA.K @ (R[:, :2] @ np.array([0.0, length_m + 0.015]) + t)
+    return [f"{value:.2f}" for value in seen[:2] / seen[2]]
+
+
+def _run(
+    board: Built, fault: str, at_ms: float = AT_MS, until_ms: float = UNTIL_MS, end_ms: float = END_MS
+) -> Ended:
+    times = [f"{value:.3f}" for value in (at_ms, until_ms, end_ms)]
+    places = [*_marker(0.065), *_marker(0.105)]
+    done = subprocess.run([*board.command, fault, *times, *places], capture_output=True, check=True)
+    found = re.search(rb"result (\S+) (\S+) (\S+) (\d)", done.stderr)
+    assert found is not None
+    before, during, after = (float(value) for value in found.groups()[:3])
+    return Ended(before, during, after, found.group(4) == b"1", list(Decoder().feed(done.stdout)))
+
+
+@pytest.fixture(scope="module")
+def board(tmp_path_factory: pytest.TempPathFactory) -> Built:
+    """The sketch in position mode, in the simulator."""
+    return sketch(tmp_path_factory.mktemp("board"), "POSITION")
+
+
+FAULTS = {
+    # fault: what the guard says, milliseconds until the pumps are off, whether it works again afterwards
+    "bus_hang": (None, 150, True),
+    "imu_nack": (IMU_LOST, 230, True),
+    "imu_slow": (IMU_LOST, 230, True),
+    "imu_zero": (IMU_FROZEN, 230, True),
+    "imu_frozen": (IMU_FROZEN, 230, True),
+    "imu_saturated": (IMU_LOST, 230, True),
+    "imu_garbage": (IMU_LOST, 300, True),
+    "blob_lost": (CAMERA_LOST, 280, True),
+    "blob_elsewhere": (APART, 600, True),
+    "bad_checksum": (CAMERA_LOST, 280, True),
+    "pixy_error": (CAMERA_LOST, 280, True),
+    "pixy_nack": (CAMERA_LOST, 280, True),
+    "camera_slow": (CAMERA_LOST, 280, True),
+    "marker_frozen": (CAMERA_FROZEN, 400, True),
+    "beyond_reach": (REACH, 200, False),
+}
+
+
+def test_without_a_fault_it_starts_and_runs(board: Built) -> None:
+    ended = _run(board, "none", 2500.0, 2500.0, 4000.0)
+    assert ended.runs and ended.on_before_ms > 500.0
+    assert not ended.faults
+    # Frames say what drove the pumps, which stood still until the sensors had been sound.
+    driven = [f.guard.duty for f in ended.frames if f.guard is not None and f.guard.state == GUARD_RUN]
+    assert driven and max(map(max, driven)) > 50
+    still = [f.guard.duty for f in ended.frames if f.guard is not None and f.guard.state != GUARD_RUN]
+    assert len(still) > 30 and set(still) == {(0, 0)}
+
+
+@pytest.mark.parametrize("fault", ["bus_hang", "imu_nack", "imu_frozen", "marker_frozen", "beyond_reach"])
+def test_a_fault_stops_the_pumps(board: Built, fault: str) -> None:
+    _stops(board, fault, AT_MS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("shift_ms", np.linspace(0.0, 180.0, 12).round(2))
+def test_a_fault_at_any_time_stops_the_pumps(board: Built, fault: str, shift_ms: float) -> None:
+    """Times spread over eleven ticks, so that the bus is cut at different bytes."""
+    _stops(board, fault, AT_MS + 1.37 * shift_ms)
+
+
+def _stops(board: Built, fault: str, at_ms: float) -> None:
+    said, within_ms, again = FAULTS[fault]
+    ended = _run(board, fault, at_ms, at_ms + UNTIL_MS - AT_MS, at_ms + END_MS - AT_MS)
+    assert ended.on_before_ms > 300.0
+    assert 0.0 <= ended.off_after_ms <= within_ms
+    assert ended.runs == again
+    if said is None:
+        assert ended.frames[-1].guard is not None and ended.frames[-1].guard.kept == WATCHDOG
+    else:
+        assert said in ended.faults
+
+
+def test_a_bus_that_hangs_from_the_start_keeps_the_pumps_off(board: Built) -> None:
+    ended = _run(board, "bus_hang", 0.0, 2000.0, 5500.0)
+    assert ended.off_after_ms == pytest.approx(0.0, abs=1.0)
+    assert ended.runs
+
+
+def test_a_sensor_that_is_deaf_at_first_is_started_later(board: Built) -> None:
+    ended = _run(board, "deaf_start", 5000.0, 5000.0, 5000.0)
+    assert ended.runs
+
+
+def test_another_chip_is_not_believed(board: Built) -> None:
+    ended = _run(board, "wrong_id", 0.0, 4000.0, 4000.0)
+    assert not ended.runs and ended.on_during_ms == 0.0
+
+
+def test_a_pump_at_full_power_without_effect_is_stopped(board: Built) -> None:
+    ended = _run(board, "stuck", 0.0, 7500.0, 7500.0)
+    assert not ended.runs and ended.faults == {FULL_POWER}
+    assert ended.on_during_ms <= 3100.0
+    assert ended.frames[-1].guard is not None and ended.frames[-1].guard.state == GUARD_FAULT
+
+
+def test_a_reset_leaves_the_pumps_off_until_all_is_sound(board: Built) -> None:
+    ended = _run(board, "reset", AT_MS, AT_MS + 400.0, END_MS)
+    assert 0.0 <= ended.off_after_ms <= 1.0
+    assert ended.runs
+
+
+def test_a_silent_computer_stops_the_pumps(tmp_path: Path) -> None:
+    board = sketch(tmp_path, "POSITION", "-DCALIB_EXAMPLE_HEARTBEAT=1")
+    ended = _run(board, "none", 2000.0, 4000.0, 4000.0)
+    assert ended.faults == {HOST} and not ended.runs
+
+
+def test_every_fault_is_tried_by_the_self_test_in_all_builds(tmp_path: Path) -> None:
+    write(tmp_path, header("fused"))
+    (tmp_path / "guard.c").write_text(
+        '#include "calib_guard.h"\nint main(void) { return calib_guard_selftest(); }\n'
+    )
+    for compiler, standard, kind in (("gcc", "c99", "c"), ("clang", "c99", "c"), ("g++", "c++11", "c++")):
+        need(compiler)
+        for fused in (0, 1):
+            made = tmp_path / f"{compiler}{fused}"
+            flags = [*warnings, f"-std={standard}", "-O2", f"-DCALIB_FUSED={fused}", f"-I{tmp_path}"]
+            call = [compiler, *flags, "-x", kind, tmp_path / "guard.c", "-lm", "-o", made]
+            done = subprocess.run(list(map(str, call)), capture_output=True, text=True, check=False)
+            assert done.returncode == 0, done.stderr
+            assert subprocess.run([made], check=False).returncode == 0
+
+
+_MUTANTS = [
+    ("guard->imu_bad >= CALIB_GUARD_IMU_BAD", "0"),
+    ("guard->imu_same >= CALIB_GUARD_SAME)", "0)"),
+    ("guard->camera_bad >= CALIB_GUARD_CAMERA_BAD", "0"),
+    ("guard->frozen >= CALIB_GUARD_FROZEN)", "0)"),
+    ("guard->apart >= CALIB_GUARD_APART", "0"),
+    ("guard->reach >= CALIB_GUARD_REACH", "0"),
+    ("guard->rate >= CALIB_GUARD_RATE", "0"),
+    (">= CALIB_ENVELOPE_FULL_TICKS", ">= 65535u"),
+    ("calib_guard_fault(guard, fault);", "(void)fault;"),
+    ("out->duty[0] = 0;", ""),
+    ("out->duty[0] = 0;", "out->duty[0] = 255;"),
+    ("guard->state = CALIB_FAULT;\n", "\n"),
+    ("guard->quiet >= CALIB_GUARD_QUIET_TICKS)", "1)"),
+    ("calib_guard_length(reference[0]) && calib_guard_length(reference[1])", "1"),
+    ("#define CALIB_GUARD_SAME 12", "#define CALIB_GUARD_SAME 200"),
+    ("#define CALIB_GUARD_IMU_BAD (12 *", "#define CALIB_GUARD_IMU_BAD (60 *"),
+]
+
+
+@pytest.mark.parametrize("at", range(len(_MUTANTS)))
+def test_a_guard_that_is_broken_fails_its_self_test(tmp_path: Path, at: int) -> None:
+    need("gcc")
+    write(tmp_path, header())
+    path, (before, after) = tmp_path / "calib_guard.h", _MUTANTS[at]
+    text = path.read_text()
+    assert before in text
+    path.write_text(text.replace(before, after, 1))
+    (tmp_path / "guard.c").write_text(
+        '#include "calib_guard.h"\nint main(void) { return calib_guard_selftest(); }\n'
+    )
+    made = tmp_path / "guard"
+    call = ["gcc", "-std=c99", "-O1", f"-I{tmp_path}", tmp_path / "guard.c", "-lm", "-o", made]
+    subprocess.run(list(map(str, call)), check=True, capture_output=True)
+    assert subprocess.run([made], check=False).returncode != 0
