@@ -73,6 +73,9 @@ def _parameters(stage: Stage) -> list[inspect.Parameter]:
         # What has a parser is typed with its unit, and has its default in the help's words.
         shape = str | None if meta["parse"] is not None else _several(hints[one.name])
         name = "--" + (meta["flag"] or one.name.replace("_", "-"))
+        if hints[one.name] == bool | None:
+            # Left open it is neither.
+            name += f"/--no-{name.removeprefix('--')}"
         switch = typer.Option(name, help=meta["words"], metavar=meta["metavar"] or None, min=meta["least"])
         default = None if meta["parse"] is not None else default
         out.append(inspect.Parameter(one.name, kind, default=default, annotation=Annotated[shape, switch]))

@@ -31,11 +31,18 @@ from calib.stages.camera.checks import (
     TargetShape,
     best_of_starts,
     conditioned,
+    evidence,
     focal_interval,
+    overdispersion,
+    skew_left_out,
     target_shape,
 )
+from calib.stages.camera.corners import detect
 from calib.stages.camera.intrinsics import (
     Candidate,
+    Choices,
+    Intrinsics,
+    LensModel,
     board_basis,
     calibrate_camera,
     candidates_by_board,
@@ -58,6 +65,10 @@ from calib.stages.camera.model import (
     vector_from_camera,
 )
 from calib.stages.camera.read import Told, read_views
+from calib.twin.pictures import BOARD as TWIN_BOARD
+from calib.twin.pictures import CAMERA as SHIPPED
+from calib.twin.pictures import shots
+from calib.twin.scene import PrintedBoard, render
 from synthetic import BOARD, CAMERA, views_of
 
 LENS = {"k1": -0.25, "k2": 0.1, "k3": 0.02, "p1": 1e-3, "p2": -5e-4, "k4": 0.05, "k5": 0.02, "k6": -0.01}
@@ -419,6 +430,10 @@ SIMULATED = {
 }
 
 
+def _chosen(found: Intrinsics) -> Candidate:
+    return next(one for one in found.models if one.lens == LensModel.of(found.calibration))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("bad", [0, 1, 2])
 @pytest.mark.parametrize("name", SIMULATED)
@@ -433,7 +448,7 @@ def test_the_chosen_lens_is_nearly_the_best(name: str, bad: int) -> None:
             spoil = SPOILS[list(SPOILS)[(seed + 3 * k) % len(SPOILS)]]
             views[k] = replace(views[k], pixels=spoil(views[k], camera, rng))
         found = calibrate_camera(views, camera.image_size_px)
-        chosen = next(one for one in found.models if one.name == found.calibration.camera.model)
+        chosen = _chosen(found)
         best = min(one.held_back_rms_px for one in found.models if one.soundness >= chosen.soundness)
         ratios.append(chosen.held_back_rms_px / best)
     print(f"{name}, {bad} bad: {max(ratios):.2f}")
@@ -448,9 +463,96 @@ def test_the_chosen_lens_is_nearly_the_best_for_real_pictures(name: str, shared_
     told = Told(square_m=0.02) if name in ("pv_charuco", "sks_charuco_left") else Told()
     views = read_views([outside(shared_data / name)], told)
     found = calibrate_camera(views.views, views.image_size_px)
-    chosen = next(one for one in found.models if one.name == found.calibration.camera.model)
+    chosen = _chosen(found)
     best = min(one.held_back_rms_px for one in found.models if one.soundness)
     assert chosen.held_back_rms_px <= 1.2 * best
+
+
+@pytest.mark.parametrize("skew_px", [0.0, 1.0])
+@pytest.mark.parametrize("roll_deg", [5.0, 180.0])
+def test_a_skew_is_chosen_where_the_views_show_one(skew_px: float, roll_deg: float) -> None:
+    camera = replace(camera_of(), skew_px=skew_px)
+    views = take(np.random.default_rng(2), camera, 14, recipe=Recipe(roll_deg=roll_deg))
+    found = calibrate_camera(views, (640, 480))
+    assert LensModel.of(found.calibration) == LensModel("radial2", skew_px != 0.0)
+    assert found.calibration.camera.skew_px == pytest.approx(skew_px, abs=0.3)
+    assert [one.name for one in found.models if one.lens.skew] == (
+        [f"{name}, skew" for name in MODELS] if skew_px else []
+    )
+    never = calibrate_camera(views, (640, 480), Choices(skew=False))
+    assert never.calibration.camera.skew_px == 0.0
+    forced = calibrate_camera(views, (640, 480), Choices(skew=True))
+    assert "skew_px" in forced.calibration.free_names
+    assert calibrate_camera(views, (640, 480), Choices("radial2")).calibration.camera.skew_px == 0.0
+
+
+def test_a_sheared_board_is_no_skew() -> None:
+    target = np.array([[x, y] for y in range(5) for x in range(7)]) * 0.02
+    sheared = target + np.outer(target[:, 1], [0.003, 0.0])
+    views = take(np.random.default_rng(1), camera_of(), 14, sheared)
+    fit = calibrate(pack([replace(view, target_m=target) for view in views]), (640, 480), "radial2")
+    told = skew_left_out(fit)
+    assert told.shear_chi2 > 9.0
+    found = calibrate_camera([replace(view, target_m=target) for view in views], (640, 480))
+    assert "skew_px" not in found.calibration.free_names
+
+
+def test_one_step_tells_the_skew_that_a_fit_finds() -> None:
+    camera = replace(camera_of(), skew_px=0.8)
+    observations = pack(take(np.random.default_rng(5), camera, 14))
+    told = skew_left_out(calibrate(observations, (640, 480), "radial2"))
+    fit = calibrate(observations, (640, 480), "radial2", skew=True)
+    sigma = covariance(fit).sigma()["skew_px"] * overdispersion(evidence(fit))
+    assert told.skew_px == pytest.approx(fit.camera.skew_px, abs=0.1 * sigma)
+    assert told.sigma_px == pytest.approx(sigma, rel=0.05)
+    assert 0.05 < told.moved_px < 0.4
+
+
+def test_real_pictures_without_a_skew_get_none(shared_data: Path) -> None:
+    views = read_views([outside(shared_data / "opencv_left")], Told())
+    assert LensModel.of(calibrate_camera(views.views, views.image_size_px).calibration) == LensModel("brown5")
+
+
+def _twin(seed: int) -> tuple[Camera, list[View]]:
+    """A camera like that of the shipped pictures, with a skew of a pixel, and corners of ten renderings."""
+    rng = np.random.default_rng([seed, 16])
+    scale = rng.uniform(0.97, 1.05)
+    camera = replace(
+        SHIPPED,
+        fx_px=SHIPPED.fx_px * scale,
+        fy_px=SHIPPED.fy_px * scale * rng.uniform(0.997, 1.003),
+        cx_px=SHIPPED.cx_px + rng.uniform(-4.0, 4.0),
+        cy_px=SHIPPED.cy_px + rng.uniform(-4.0, 4.0),
+        skew_px=float(rng.normal()),
+        distortion=SHIPPED.distortion * rng.uniform(0.6, 1.1),
+    )
+    views = []
+    for k in rng.permutation(17)[:10]:
+        shot = shots()[k]
+        pose = replace(shot.pose, t_m=shot.pose.t_m + rng.uniform(-0.008, 0.008, 3))
+        light, sensor, noise = shot.light, shot.sensor, int(rng.integers(1 << 30))
+        picture = render(camera, PrintedBoard(TWIN_BOARD), pose, light=light, sensor=sensor, seed=noise)
+        seen = detect(picture, TWIN_BOARD.columns, TWIN_BOARD.rows)
+        if seen is not None:
+            views.append(View(f"{k:02d}", TWIN_BOARD.points_m(), seen.pixels, seen.refined))
+    return camera, views
+
+
+@pytest.mark.slow
+def test_sigma_covers_the_truth_of_rendered_twins_with_skew() -> None:
+    """|z| < 2 for 93 to 97 % of the parameters of 100 twins; prints it by parameter."""
+    z: dict[str, list[float]] = {}
+    for seed in range(100):
+        camera, views = _twin(seed)
+        found = calibrate_camera(views, camera.image_size_px)
+        off = found.calibration.block.intrinsics - vector_from_camera(camera)
+        for name, sigma in found.covariance.sigma().items():
+            z.setdefault(name, []).append(float(off[INTRINSICS.index(name)] / sigma))
+    inside = {name: float(np.mean(np.abs(values) < 2.0)) for name, values in z.items()}
+    print({name: (len(values), round(inside[name], 2)) for name, values in z.items()})
+    share = float(np.mean(np.abs(np.concatenate(list(z.values()))) < 2.0))
+    print(f"|z| < 2 for {share:.1%}")
+    assert 0.93 <= share <= 0.97
 
 
 @pytest.mark.parametrize("truth", ["rigid", "warp", "released"])
@@ -474,7 +576,7 @@ def test_the_true_board_is_chosen(truth: str) -> None:
     observations = replace(
         observations, pixels=observations.pixels + 0.1 * rng.standard_normal(observations.pixels.shape)
     )
-    found = candidates_by_board(calibrate(observations, (640, 480), "radial2"), skew=False)
+    found = candidates_by_board(calibrate(observations, (640, 480), "radial2"))
     names = [candidate.name for candidate, _ in found]
     assert names == ["rigid", "warp", "released"]
     assert names[simplest_good([candidate for candidate, _ in found])] == truth

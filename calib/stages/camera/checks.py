@@ -554,6 +554,46 @@ def evidence(
     )
 
 
+@dataclass(frozen=True)
+class Skew:
+    """What the views say of a skew that a calibration leaves out.
+
+    Attributes
+    ----------
+    skew_px, sigma_px : one step to it, everything else following, and its standard deviation, the views'
+        overdispersion included.
+    moved_px : root mean square change of the directions seen, in the picture.
+    shear_chi2 : by how much a sheared board lowers the cost more than the skew does, over the variance.
+    """
+
+    skew_px: float
+    sigma_px: float
+    moved_px: float
+    shear_chi2: float
+
+
+def skew_left_out(calibration: Calibration) -> Skew:
+    """The skew that a calibration without one would have."""
+    free = np.sort(np.append(calibration.free, INTRINSICS.index("skew_px")))
+    freed = replace(calibration, free=free)
+    found = evidence(freed)
+    S, b = found.S.sum(axis=0), found.b.sum(axis=0)
+    inverse, fall = scaled_inverse(S), float(gain(S, b))
+    step = -inverse @ b
+    left = max(calibration.squared_sum - fall, 0.0) / max(calibration.degrees_of_freedom - 1, 1)
+    # Scatter of the views about the step, where the skew is taken out.
+    inflation = overdispersion(replace(found, b=found.b + found.S @ step, sigma_px=float(np.sqrt(left))))
+    at = found.names.index("skew_px")
+    sheared = evidence(calibration, _basis(calibration)[0][:, 1:2], ("shear",))
+    other = float(gain(sheared.S.sum(axis=0), sheared.b.sum(axis=0)))
+    return Skew(
+        float(step[at]),
+        inflation * float(np.sqrt(max(inverse[at, at], 0.0) * left)),
+        apart_px(freed, step),
+        (other - fall) / max(left * inflation**2, 1e-300),
+    )
+
+
 def scaled_inverse(S: FloatArray, floor: float = 1e-13) -> FloatArray:
     """Pseudo-inverse of symmetric matrices (..., G, G) after scaling their diagonals to one.
 
@@ -1194,13 +1234,13 @@ def _described(
         chance,
         calibration.rms_px,
         float(np.sqrt(max(problem.cost - fall, 0.0) * variance / points)),
-        _apart_px(calibration, difference),
+        apart_px(calibration, difference),
         dict(zip(names, difference.tolist(), strict=True)),
         dict(zip(names, sigma.tolist(), strict=True)),
     )
 
 
-def _apart_px(calibration: Calibration, difference: FloatArray) -> float:
+def apart_px(calibration: Calibration, difference: FloatArray) -> float:
     """Root mean square change of the pixels seen by a change of the free intrinsics, and the best turn."""
     block, observations = calibration.block, calibration.observations
     points = observations.target_m @ block.R_CT.transpose(0, 2, 1) + block.t_CT_m[:, None]

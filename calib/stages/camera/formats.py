@@ -336,7 +336,7 @@ def to_kalibr(camera: Camera, name: str = "cam0") -> str:
     """
     if camera.skew_px != 0.0:
         raise BadInputError(
-            f"skew_px is {camera.skew_px:g} and a Kalibr camchain cannot express it; calibrate without skew"
+            f"skew_px is {camera.skew_px:g} and a Kalibr camchain cannot express it; calibrate with --no-skew"
         )
     for index, value in enumerate(camera.distortion.tolist()):
         if index >= 4 and value != 0.0:

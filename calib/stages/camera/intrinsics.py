@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from calib.stages.camera.bundle import (
     projection_sigma_px,
     refit_poses,
 )
-from calib.stages.camera.checks import best_of_starts, image_outline, lens_shape, screen
+from calib.stages.camera.checks import best_of_starts, image_outline, lens_shape, screen, skew_left_out
 from calib.stages.camera.model import MODELS, Block, LeftOut, Observations, View, free_intrinsics, pack
 from calib.stages.camera.triage import Triage, triage
 from calib.stages.camera.verdict import Judgement, judge, of_leaving, of_screening, two_cameras
@@ -56,9 +57,26 @@ _LESS, _SAME = 0.95, 1.01
 its own below which a fit without a pole is preferred."""
 _EQUIDISTANT = (0.3, 0.5)
 """Focal lengths of wide lenses to start from, over the picture's larger side."""
+_SKEW_SIGMAS, _SKEW_PX = 3.0, 0.01
+"""Standard deviations, and pixels by which directions move at up to 1000 pixels' width, that make a skew."""
 _SOUND = 3
 _BORDER_SHARE = 0.05
 """Standard deviation of projection at the picture's border, over the width, above which a lens is a guess."""
+
+
+class LensModel(NamedTuple):
+    """A key of `model.MODELS`, and whether the skew is estimated."""
+
+    model: str
+    skew: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.model}, skew" if self.skew else self.model
+
+    @staticmethod
+    def of(fit: Calibration) -> LensModel:
+        """That of a fit."""
+        return LensModel(fit.camera.model, "skew_px" in fit.free_names)
 
 
 @dataclass(frozen=True)
@@ -82,6 +100,12 @@ class Candidate:
     held_back_rms_px: float
     per_view_px2: FloatArray
     soundness: int = _SOUND
+
+    @property
+    def lens(self) -> LensModel:
+        """The lens model of this name."""
+        model, _, skew = self.name.partition(", ")
+        return LensModel(model, bool(skew))
 
     @property
     def flaw(self) -> str:
@@ -135,11 +159,10 @@ class _Judges:
 
     fits: Sequence[Calibration]
     folds: Sequence[IntArray]
-    skew: bool
     fixed: tuple[str, ...]
 
 
-def _on_held_back(fits: Sequence[Calibration], skew: bool, fixed: tuple[str, ...]) -> FloatArray:
+def _on_held_back(fits: Sequence[Calibration], fixed: tuple[str, ...]) -> FloatArray:
     """Mean squared residual vector (len(fits), N) of each view by a camera that has not seen it."""
     if not fits:
         return np.zeros((0, 0))
@@ -147,7 +170,7 @@ def _on_held_back(fits: Sequence[Calibration], skew: bool, fixed: tuple[str, ...
     folds = _folds(views)
     squared = np.full((len(fits), views), np.nan)
     jobs = [(i, k) for i in range(len(fits)) for k in range(len(folds))]
-    with Workers(_Judges(fits, folds, skew, fixed), len(jobs)) as workers:
+    with Workers(_Judges(fits, folds, fixed), len(jobs)) as workers:
         for (i, k), found in zip(jobs, workers.in_order(_on_fold, jobs), strict=True):
             squared[i, folds[k]] = found
     return squared
@@ -164,7 +187,7 @@ def _on_fold(judges: _Judges, job: tuple[int, int]) -> FloatArray:
         observations.select(kept),
         whole.camera.image_size_px,
         whole.camera.model,
-        skew=judges.skew,
+        skew=LensModel.of(whole).skew,
         fixed=judges.fixed,
         basis=whole.basis,
         loss=whole.loss,
@@ -234,8 +257,10 @@ def candidates_by_model(
             fit = _sturdier(fit, fits)
         start = fit.block
         fits.append(fit)
-    held = _on_held_back(fits, skew, fixed)
-    return [(_candidate(fit.camera.model, fit, held[i], _soundness(fit)), fit) for i, fit in enumerate(fits)]
+    held = _on_held_back(fits, fixed)
+    return [
+        (_candidate(str(LensModel.of(fit)), fit, held[i], _soundness(fit)), fit) for i, fit in enumerate(fits)
+    ]
 
 
 def _sturdier(fit: Calibration, simpler: Sequence[Calibration]) -> Calibration:
@@ -276,7 +301,7 @@ def _sturdier(fit: Calibration, simpler: Sequence[Calibration]) -> Calibration:
 
 
 def candidates_by_board(
-    rigid: Calibration, skew: bool, kinds: Sequence[str] = BOARDS
+    rigid: Calibration, kinds: Sequence[str] = BOARDS
 ) -> list[tuple[Candidate, Calibration]]:
     """The same camera model with each board model, judged on views held back.
 
@@ -301,7 +326,7 @@ def candidates_by_board(
                 observations,
                 size,
                 rigid.camera.model,
-                skew=skew,
+                skew=LensModel.of(rigid).skew,
                 basis=basis,
                 loss=rigid.loss,
                 start=rigid.block,
@@ -310,7 +335,7 @@ def candidates_by_board(
             continue
         names.append(kind)
         fits.append(fit)
-    held = _on_held_back(fits, skew, ())
+    held = _on_held_back(fits, ())
     return [(_candidate(names[i], fit, held[i]), fit) for i, fit in enumerate(fits)]
 
 
@@ -393,14 +418,14 @@ class Choices:
     Attributes
     ----------
     model : a key of `model.MODELS`, or "auto" for the choice by views held back.
-    skew : estimate the skew.
+    skew : estimate the skew; None where views held back may choose it with the model.
     loss : one of `levenberg.LOSSES`.
     board : one of `selection.BOARDS`, or "auto" for the choice by views held back.
     keep_all : use views and points that do not agree with the others as well; they are named all the same.
     """
 
     model: str = "auto"
-    skew: bool = False
+    skew: bool | None = None
     loss: str = "none"
     board: str = "rigid"
     keep_all: bool = False
@@ -445,7 +470,7 @@ def _usable(views: Sequence[View], choices: Choices) -> tuple[list[View], list[L
         raise BadInputError(f"a camera with skew needs at least 3 views, found {len(usable)}")
     total = sum(len(view.counted()[1]) for view in usable)
     if choices.model != "auto":
-        unknown = len(free_intrinsics(choices.model, choices.skew)) + 6 * len(usable)
+        unknown = len(free_intrinsics(choices.model, bool(choices.skew))) + 6 * len(usable)
         if 2 * total <= unknown:
             raise BadInputError(
                 f"{len(usable)} views with {total} points cannot fix the {unknown} unknowns of the model "
@@ -472,20 +497,48 @@ def _chosen_model(
     choices: Choices,
     fixed: tuple[str, ...],
     excluded: tuple[str, ...] = (),
-) -> tuple[str, Calibration | None, tuple[Candidate, ...]]:
+) -> tuple[LensModel, Calibration | None, tuple[Candidate, ...]]:
     """The lens model, a fit of it to start from, and the comparison that chose it."""
+    asked = bool(choices.skew)
     if choices.model != "auto":
-        return choices.model, None, ()
+        return LensModel(choices.model, asked), None, ()
     if observations.views < 3:
-        return ("radial2" if observations.views == 2 else "pinhole"), None, ()
-    found = candidates_by_model(
-        observations, image_size_px, skew=choices.skew, fixed=fixed, loss=choices.loss
+        return LensModel("radial2" if observations.views == 2 else "pinhole", asked), None, ()
+    width = max(image_size_px)
+
+    def compared(skew: bool) -> tuple[list[Candidate], list[Calibration], int]:
+        found = candidates_by_model(observations, image_size_px, skew=skew, fixed=fixed, loss=choices.loss)
+        candidates = [replace(one, soundness=0) if one.name in excluded else one for one, _ in found]
+        return candidates, [fit for _, fit in found], chosen_lens(candidates, width)
+
+    candidates, fits, best = compared(asked)
+    if not fits:
+        return LensModel("radial2", asked), None, ()
+    if choices.skew is None and _skewed(fits[best]):
+        others, other_fits, other = compared(True)
+        # Decentering that a lens lacks must not pass for skew.
+        lenses = ("brown5", other_fits[other].camera.model) if other_fits else ()
+        same = [fit for fit in fits if fit.camera.model in lenses]
+        if same and all(map(_skewed, same)) and not _worse(others[other], candidates[best]):
+            return LensModel.of(other_fits[other]), other_fits[other], (*candidates, *others)
+        candidates += others
+    return LensModel.of(fits[best]), fits[best], tuple(candidates)
+
+
+def _skewed(fit: Calibration) -> bool:
+    """Whether the views show a skew that a fit without one leaves out, and that matters."""
+    found = skew_left_out(fit)
+    return (
+        abs(found.skew_px) > _SKEW_SIGMAS * found.sigma_px
+        and found.moved_px > _SKEW_PX * max(1.0, max(fit.camera.image_size_px) / 1000)
+        and found.shear_chi2 < _SKEW_SIGMAS**2
     )
-    if not found:
-        return "radial2", None, ()
-    candidates = tuple(replace(one, soundness=0) if one.name in excluded else one for one, _ in found)
-    best = chosen_lens(candidates, max(image_size_px))
-    return candidates[best].name, found[best][1], candidates
+
+
+def _worse(candidate: Candidate, other: Candidate) -> bool:
+    """Whether a candidate is the less sound one, or predicts a typical view less well."""
+    ratio = np.log(candidate.per_view_px2 / other.per_view_px2)
+    return candidate.soundness < other.soundness or not np.mean(ratio) <= 0.0
 
 
 # Views that belong to no camera overflow; what is not finite is looked for at each stage.
@@ -525,10 +578,10 @@ def calibrate_camera(
             findings += several
         elif any(one.severity == "inconsistent" for one in several):
             # Of two cameras that share the views neither is the odd one, and no view is to blame.
-            model, start, models = _chosen_model(everything, image_size_px, choices, fixed)
+            lens, start, models = _chosen_model(everything, image_size_px, choices, fixed)
             first = None if start is None else start.block
             sorted_out = Triage.of_all(
-                calibrate(everything, image_size_px, model, skew=choices.skew, fixed=fixed, start=first)
+                calibrate(everything, image_size_px, lens.model, skew=lens.skew, fixed=fixed, start=first)
             )
             leaving = [*left_out, *unusable]
             findings = of_leaving(leaving, everything.views, choices.keep_all)
@@ -541,7 +594,7 @@ def calibrate_camera(
             fit.observations,
             image_size_px,
             fit.camera.model,
-            skew=choices.skew,
+            skew=LensModel.of(fit).skew,
             fixed=fixed,
             loss=choices.loss,
             start=fit.block,
@@ -575,42 +628,42 @@ def _sorted_out(
 ) -> tuple[Triage, tuple[Candidate, ...]]:
     """The views that agree, by the model that views held back choose among them."""
 
-    def by(model: str, start: Block | None = None) -> Triage:
-        fit = calibrate(everything, image_size_px, model, skew=choices.skew, fixed=fixed, start=start)
+    def by(lens: LensModel, start: Block | None = None) -> Triage:
+        fit = calibrate(everything, image_size_px, lens.model, skew=lens.skew, fixed=fixed, start=start)
         return Triage.of_all(fit) if fit.termination == "behind the camera" else triage(fit)
 
-    observations, before = everything, ""
+    observations, before = everything, None
     for _ in range(_TRIAGES):
-        model, start, models = _chosen_model(observations, image_size_px, choices, fixed, excluded)
-        if model == before:
+        lens, start, models = _chosen_model(observations, image_size_px, choices, fixed, excluded)
+        if lens == before:
             break
         # The start has the poses of the views that the model was chosen by, which may be fewer.
-        found = by(model, start.block if start is not None and observations is everything else None)
-        better = _better_for_most(model, models)
+        found = by(lens, start.block if start is not None and observations is everything else None)
+        better = _better_for_most(str(lens), models)
         if better is not None:
-            other = by(better.name)
+            other = by(better.lens)
             if better.soundness < _SOUND and len(other.left_out) > len(found.left_out):
                 # Behind the errors of a model that is too simple a bad view hides.
-                observations, before = other.calibration.observations, ""
+                observations, before = other.calibration.observations, None
                 continue
             # A model that is too simple blames views that the lens tells most of.
             if better.soundness == _SOUND and len(other.left_out) < len(found.left_out):
-                found, model = other, better.name
+                found, lens = other, better.lens
         if not found.left_out or choices.model != "auto":
             break
-        observations, before = found.calibration.observations, model
-    promised = next((one.soundness for one in models if one.name == model), 0)
+        observations, before = found.calibration.observations, lens
+    promised = next((one.soundness for one in models if one.name == str(lens)), 0)
     if promised == _SOUND > _soundness(found.calibration):
         # A few more steps, or other views, took the lens where it may not go.
-        return _sorted_out(everything, image_size_px, choices, fixed, (*excluded, model))
+        return _sorted_out(everything, image_size_px, choices, fixed, (*excluded, str(lens)))
     return found, models
 
 
-def _better_for_most(model: str, models: Sequence[Candidate]) -> Candidate | None:
+def _better_for_most(lens: str, models: Sequence[Candidate]) -> Candidate | None:
     """The model that is far better than the chosen one for a typical view that was held back."""
     medians = {one.name: float(np.median(one.per_view_px2)) for one in models}
     best = min(models, key=lambda one: np.nan_to_num(medians[one.name], nan=np.inf), default=None)
-    far = best is not None and medians[best.name] < _FAR_BETTER * medians.get(model, np.inf)
+    far = best is not None and medians[best.name] < _FAR_BETTER * medians.get(lens, np.inf)
     return best if far else None
 
 
@@ -638,7 +691,7 @@ def _with_board(rigid: Calibration, choices: Choices) -> tuple[Calibration, str,
     if choices.board == "auto" and rigid.observations.views < 3:
         return rigid, "rigid", ()
     if choices.board == "auto":
-        found = candidates_by_board(rigid, choices.skew, BOARDS)
+        found = candidates_by_board(rigid)
         best = simplest_good([candidate for candidate, _ in found], max(rigid.camera.image_size_px))
         return found[best][1], found[best][0].name, tuple(candidate for candidate, _ in found)
     observations = rigid.observations
@@ -651,7 +704,7 @@ def _with_board(rigid: Calibration, choices: Choices) -> tuple[Calibration, str,
         observations,
         rigid.camera.image_size_px,
         rigid.camera.model,
-        skew=choices.skew,
+        skew=LensModel.of(rigid).skew,
         basis=basis,
         loss=choices.loss,
         start=rigid.block,

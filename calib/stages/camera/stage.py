@@ -59,7 +59,9 @@ class IntrinsicsOptions:
     model: Literal["auto", "pinhole", "radial2", "radial3", "brown5", "rational8"] = option(
         "auto", "Lens model; auto compares all on views held back."
     )
-    skew: bool = option(False, "Estimate the skew as well.")
+    skew: bool | None = option(
+        None, "Estimate the skew, or never. [default: with --model auto where the views show one]"
+    )
     loss: Literal["none", "huber", "cauchy"] = option("none", "Robust loss of the residuals.")
     board: Literal["rigid", "warp", "released", "auto"] = option(
         "rigid", "The board: flat, bent by two parameters, with free corners, or compared."
