@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
+from itertools import count
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, BinaryIO
 
 import typer
 
@@ -22,10 +23,13 @@ def record(
     baud: Annotated[int, typer.Option(min=300, help="Speed of the port.")] = 115200,
     as_json: JsonOption = False,
 ) -> None:
-    """Record a board's ticks: camera, IMU and commands as a log, and what the board made of them."""
+    """Record a board's ticks: camera, IMU and commands as a log, and what the board made of them.
+
+    Ticks are written as they come. A board that restarts begins another log beside the first.
+    """
     from calib.core.files import shown
     from calib.core.units import parse_duration_s
-    from calib.core.writing import check_writable, write_atomically
+    from calib.core.writing import check_writable
     from calib.io.logs import LOG
     from calib.io.serial import record as run
 
@@ -63,23 +67,55 @@ def record(
             return False
         return duration_s is None or passed < duration_s
 
-    with line:
-        result = run(read, more)
-    if not result.ticks:
+    logs: list[tuple[Path, BinaryIO]] = []
+
+    def write(number: int, text: str) -> None:
+        """Append at once: what came is on the disk when the computer stops."""
+        if number == len(logs):
+            path = output if number == 0 else _beside(output)
+            try:
+                logs.append((path, path.open("ab")))
+            except OSError as error:
+                raise BadInputError(f"{shown(path)}: cannot be written: {_reason(error)}") from error
+            if number:
+                narrate(f"the board restarted; from there on the log is {shown(path)}")
+        stream = logs[number][1]
+        stream.write(text.encode())
+        stream.flush()
+
+    try:
+        with line:
+            result = run(read, more, write)
+    finally:
+        for _, stream in logs:
+            stream.close()
+    if not result.runs:
         raise BadInputError(f"{shown(port)}: no frame came, expected the example sketch at {baud} baud")
-    write_atomically(output, result.text, LOG)
+    if result.opening:
+        narrate(f"opening the port restarted the board; {result.opening} ticks from before are left out")
     told = {
-        "log": shown(output),
-        "ticks": result.ticks,
-        "lost": result.lost,
-        "restarts": result.restarts,
+        "logs": [
+            {"log": shown(path), "ticks": one.ticks, "lost": one.lost}
+            for (path, _), one in zip(logs, result.runs, strict=True)
+        ],
+        "restarts": len(result.runs) - 1,
+        "ticks_before_opening": result.opening,
         "damaged_frames": result.damaged,
         "bytes_skipped": result.skipped,
     }
     if as_json:
         document("record", {"record": told})
-    else:
-        say(f"{result.ticks} ticks written to {shown(output)}, {result.lost} lost, {result.damaged} damaged")
+        return
+    for (path, _), one in zip(logs, result.runs, strict=True):
+        say(f"{one.ticks} ticks written to {shown(path)}, {one.lost} lost")
+    if result.damaged:
+        say(f"{result.damaged} frames came damaged")
+
+
+def _beside(output: Path) -> Path:
+    """A name for the log of a further start that is not taken."""
+    numbered = (output.with_stem(f"{output.stem}-{k}") for k in count(2))
+    return next(path for path in numbered if not path.exists())
 
 
 def _reason(error: Exception) -> str:

@@ -294,60 +294,92 @@ def frame_from_row(row: dict[str, str]) -> Frame:
 # Recording a board: from reads of a port to the text of a log.
 
 
+_OPENING_S = 3.0
+"""Opening a port restarts the usual boards; what came from before that, in less time, is of no run."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """What came from one start of a board: rows, and sequence numbers that never came."""
+
+    ticks: int
+    lost: int
+
+
 @dataclass(frozen=True)
 class Recording:
     """What came in.
 
     Attributes
     ----------
-    text : the log. ticks : its rows. lost : sequence numbers that never came. restarts : of the board.
+    runs : one for each start of the board. opening : ticks from before the port's opening restarted it.
     skipped : bytes outside frames. damaged : frames with a wrong checksum.
     """
 
-    text: str
-    ticks: int
-    lost: int
-    restarts: int
+    runs: tuple[Run, ...]
+    opening: int
     skipped: int
     damaged: int
 
 
-def record(read: Callable[[], bytes], more: Callable[[int], bool]) -> Recording:
-    """Read until told to stop; a board that restarts begins the log anew.
+def record(
+    read: Callable[[], bytes], more: Callable[[int], bool], write: Callable[[int, str], None]
+) -> Recording:
+    """Read until told to stop; each start of the board is a log of its own.
 
     Parameters
     ----------
     read : the next bytes of the port, b"" when none came within its timeout.
-    more : whether to go on, given the ticks so far.
+    more : whether to go on, given the ticks so far of the run at hand.
+    write : appends text to the log of a run, counted from 0, as it comes; to the first after `_OPENING_S`.
     """
-    decoder, lines = Decoder(), [csv_header()]
+    decoder = Decoder()
+    lines, held = [csv_header()], True
+    runs: list[Run] = []
     last: Frame | None = None
-    tick = lost = restarts = 0
+    ticks = tick = lost = opening = 0
     try:
-        while more(len(lines) - 1):
+        while more(ticks):
             for frame in decoder.feed(read()):
                 if last is not None and frame.sequence == 0 and last.sequence != 0xFFFF:
-                    # What an earlier start sent belongs to another run.
-                    lines, last, tick, lost = [csv_header()], None, 0, 0
-                    restarts += 1
+                    if held:
+                        opening = ticks
+                    else:
+                        write(len(runs), "".join(lines))
+                        runs.append(Run(ticks, lost))
+                    lines, last, held = [csv_header()], None, False
+                    ticks = tick = lost = 0
                 if last is not None:
                     step = (frame.sequence - last.sequence) & 0xFFFF
                     lost += max(step - 1, 0)
                     tick += step
                 lines.append(csv_row(frame, tick))
+                ticks += 1
                 last = frame
+                held = held and 1e3 * tick < _OPENING_S * frame.rate_mhz
+            if not held:
+                write(len(runs), "".join(lines))
+                lines.clear()
     except KeyboardInterrupt:
         # Stopping by hand is the usual end; what came so far is the log, and nothing may stop its writing.
         if hasattr(signal, "setitimer"):
             signal.setitimer(signal.ITIMER_REAL, 0.0)
-    return Recording("".join(lines), len(lines) - 1, lost, restarts, decoder.skipped, decoder.damaged)
+    except BadInputError:
+        # The board is gone; what it sent is not.
+        if ticks:
+            write(len(runs), "".join(lines))
+        raise
+    if ticks:
+        write(len(runs), "".join(lines))
+        runs.append(Run(ticks, lost))
+    return Recording(tuple(runs), opening, decoder.skipped, decoder.damaged)
 
 
 # ----------------------------------------------------------------------
 # The bytes that a board with the example sketch sent, kept in a file, as a log.
 #
-# What `calib record` does with a port: frames are found and checked, a board that restarts begins the log
-# anew, and lost frames leave a gap in the time.
+# What `calib record` does with a port: frames are found and checked, lost frames leave a gap in the time.
+# Where the board restarted the log is that of its last start.
 
 STREAMS = (".bin", ".serial")
 """Endings of such files."""
@@ -363,6 +395,7 @@ def iter_stream(path: Path) -> Iterator[Log]:
     if size > _MOST_BYTES:
         raise BadInputError(f"{shown(path)}: is larger than {_MOST_BYTES / 1e6:g} MB")
     ended = False
+    logs: dict[int, list[str]] = {}
 
     def read() -> bytes:
         nonlocal ended
@@ -372,14 +405,17 @@ def iter_stream(path: Path) -> Iterator[Log]:
 
     try:
         with path.open("rb") as stream:
-            result = record(read, lambda ticks: not ended)
+            result = record(
+                read, lambda ticks: not ended, lambda run, text: logs.setdefault(run, []).append(text)
+            )
     except OSError as error:
         raise BadInputError(f"{shown(path)}: cannot be read: {error.strerror or error}") from error
     if not ended:
         # For a port Ctrl-C is the end of the log; of a file it would be half.
         raise KeyboardInterrupt
-    if not result.ticks:
+    if not result.runs:
         raise BadInputError(
             f"{shown(path)}: holds no frame of the example sketch, only {result.skipped} other bytes"
         )
-    yield from iter_rows(io.BytesIO(result.text.encode()), shown(path))
+    text = "".join(logs[len(result.runs) - 1])
+    yield from iter_rows(io.BytesIO(text.encode()), shown(path))

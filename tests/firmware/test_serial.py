@@ -20,6 +20,7 @@ from calib.io.serial import (
     Inputs,
     Outputs,
     Recording,
+    Run,
     checksum,
     csv_header,
     csv_row,
@@ -77,22 +78,24 @@ def _frames(count: int, first: int = 0) -> list[Frame]:
     return [replace(one, sequence=(first + k) & 0xFFFF) for k in range(count)]
 
 
-def _recorded(stream: bytes, portion: int = 61) -> Recording:
+def _recorded(stream: bytes, portion: int = 61) -> tuple[Recording, dict[int, str]]:
     parts = [stream[i : i + portion] for i in range(0, len(stream), portion)]
+    logs: dict[int, str] = {}
 
-    def read() -> bytes:
-        return parts.pop(0)
+    def write(run: int, text: str) -> None:
+        logs[run] = logs.get(run, "") + text
 
-    return record(read, lambda ticks: bool(parts))
+    return record(lambda: parts.pop(0), lambda ticks: bool(parts), write), logs
 
 
 def test_lost_and_damaged_frames_are_counted_and_leave_a_gap_in_time() -> None:
     frames = [encoded(f) for f in _frames(10)]
     frames[4] = b""
     frames[7] = frames[7][:20] + b"?" + frames[7][21:]
-    result = _recorded(b"garbage" + b"".join(frames))
-    assert (result.ticks, result.lost, result.damaged, result.restarts) == (8, 2, 1, 0)
-    times = [round(60.0 * float(line.split(",")[0])) for line in result.text.splitlines()[1:]]
+    result, logs = _recorded(b"garbage" + b"".join(frames))
+    assert result.runs == (Run(8, 2),)
+    assert (result.damaged, result.opening) == (1, 0)
+    times = [round(60.0 * float(line.split(",")[0])) for line in logs[0].splitlines()[1:]]
     assert times == [0, 1, 2, 3, 5, 6, 8, 9]
 
 
@@ -104,7 +107,30 @@ def test_ctrl_c_keeps_what_came() -> None:
             raise KeyboardInterrupt
         return frames.pop(0)
 
-    assert record(read, lambda ticks: True).ticks == 4
+    written: list[str] = []
+    result = record(read, lambda ticks: True, lambda run, text: written.append(text))
+    assert result.runs == (Run(4, 0),)
+    assert len("".join(written).splitlines()) == 5
+
+
+def test_each_start_of_the_board_is_a_log_and_what_opening_cut_short_is_none() -> None:
+    frames = [encoded(f) for f in _frames(400)]
+    result, logs = _recorded(b"".join((*frames[:40], *frames, *frames[:250], *frames[:3])))
+    assert result.runs == (Run(400, 0), Run(250, 0), Run(3, 0))
+    assert result.opening == 40
+    assert [len(logs[k].splitlines()) for k in range(3)] == [401, 251, 4]
+
+
+def test_ticks_are_written_as_they_come() -> None:
+    frames, seen = [encoded(f) for f in _frames(400)], []
+    written: list[str] = []
+
+    def read() -> bytes:
+        seen.append("".join(written).count("\n"))
+        return frames.pop(0)
+
+    record(read, lambda ticks: bool(frames), lambda run, text: written.append(text))
+    assert seen[100] == 0 and seen[300] == 301
 
 
 def _frames_check(ticks: int = 120) -> list[Frame]:
