@@ -103,13 +103,22 @@ def tell_pump(found: PumpFound, section: PumpSection) -> None:
 # `calib identify`: parameters of the actuator and its pumps from logs and tables, with error bars.
 
 
+def _of_arm(args: list[str]) -> bool:
+    """Whether the first argument that is a file is a log of a pressure-driven arm."""
+    from calib.io.columns import is_arm_log
+    from calib.io.logs import columns_of
+
+    first = next((path for path in map(Path, args) if path.is_file()), None)
+    return first is not None and is_arm_log(columns_of(first) or ())
+
+
 class _LogsByDefault(TyperGroup):
-    """`calib identify LOG...` is `calib identify logs LOG...`."""
+    """`calib identify LOG...` is `calib identify logs LOG...`, or `identify arm` of logs with pressures."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         helps = ctx.help_option_names
         if args and args[0] not in self.commands and args[0] not in helps:
-            args = ["logs", *args]
+            args = ["arm" if _of_arm(args) else "logs", *args]
         return super().parse_args(ctx, args)
 
 
@@ -259,5 +268,6 @@ def stiffness(
 
 
 identify.command("logs")(telling(verb(stage("identify logs"))))
+identify.command("arm")(telling(verb(stage("identify arm"))))
 identify.command("pump")(telling(pump))
 identify.command("stiffness")(stiffness)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -105,6 +106,42 @@ def _compared(
     return out
 
 
+def _validate_arm(logs: list[Path], rig: Path, options: Any, as_json: bool) -> None:
+    """Free-run errors of the section arm on logs of pressures and poses."""
+    from calib.core.errors import BadInputError
+    from calib.core.files import shown
+    from calib.core.rig import Rig
+    from calib.stages.arm.stage import validate as held
+
+    known = Rig.load(rig)
+    if known.arm is None:
+        raise BadInputError(f"{shown(rig)}: has no arm yet; run calib identify arm first")
+    errors, said = held(logs, known, options)
+    for sentence in said:
+        narrate(sentence)
+    told = {
+        name: {
+            "angle_rad": one.angle_rad,
+            "chord_m": one.chord_m,
+            "angle_by_pressure_rad": one.by_pressure_rad,
+            "pressure_kpa": one.pressure_kpa,
+        }
+        for name, one in errors.items()
+    }
+    if as_json:
+        finite = {n: {k: x if math.isfinite(x) else None for k, x in one.items()} for n, one in told.items()}
+        document("validate", {"validate": {"arm": finite}})
+        return
+    scales = (math.degrees(1.0), 1e3, math.degrees(1.0), 1.0)
+    rows = [
+        [name, *(_cell(x * k, ".2f") for x, k in zip(one.values(), scales, strict=True))]
+        for name, one in told.items()
+    ]
+    head = ["free run, RMS", "angle, deg", "chord, mm", "angle by pressure, deg", "pressure, kPa"]
+    for line in table(head, rows):
+        say(line)
+
+
 def validate(
     logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs to hold the models against.")],
     states: Annotated[
@@ -118,6 +155,13 @@ def validate(
     acc_unit: AccUnitOption = None,
     gyro_unit: GyroUnitOption = None,
     columns: ColumnsOption = None,
+    load: Annotated[
+        list[str] | None,
+        typer.Option(help="Mass at the tip of an arm's logs, NAME=MASS.", metavar="NAME=MASS"),
+    ] = None,
+    day: Annotated[
+        list[str] | None, typer.Option(help="Day of an arm's logs, NAME=DAY.", metavar="NAME=DAY")
+    ] = None,
     figures: FiguresOption = None,
     rig: RigOption = Path("rig.yaml"),
     as_json: JsonOption = False,
@@ -126,10 +170,13 @@ def validate(
 
     A log's commands are played to the original model of the source, to the improved one with nominal
     parameters, and to that with the sections actuator and pump, from the estimator's state at its start.
+    Logs of pressures are played to the section arm, from the first readings alone.
     Exits 0 whatever comes of it.
     """
     from calib.core.files import shown
     from calib.core.writing import check_figures
+    from calib.io.columns import is_arm_log
+    from calib.io.logs import columns_of
 
     if states and len(states) != len(logs):
         raise UsageError(f"--states: {len(states)} files for {len(logs)} logs, expected one for each")
@@ -138,6 +185,13 @@ def validate(
     if figures is not None:
         check_figures(figures)
     options = LogOptions(acc_unit, gyro_unit, columns)
+    if all(is_arm_log(columns_of(path, options) or ()) for path in logs):
+        from calib.stages.arm.stage import Options
+
+        _validate_arm(
+            logs, rig, Options(columns=columns, load=tuple(load or ()), day=tuple(day or ())), as_json
+        )
+        return
     compared = _compared(logs, states, truth, no_pwm, rig, options)
     result: dict[str, Any] = {"logs": [_log_json(one) for one in compared]}
     if figures is not None:

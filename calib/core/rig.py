@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from calib.stages.actuator.parameters import Plant
     from calib.stages.actuator.section import Actuator, Known, PumpSection
     from calib.stages.align.section import Align
+    from calib.stages.arm.section import Arm
     from calib.stages.camera.section import Camera, Lens, Plane
     from calib.stages.control.section import Controller
     from calib.stages.estimator.section import Estimator
@@ -59,6 +60,7 @@ KINDS = {
     "align": "calib.stages.align.section.Align",
     "actuator": "calib.stages.actuator.section.Actuator",
     "pump": "calib.stages.actuator.section.PumpSection",
+    "arm": "calib.stages.arm.section.Arm",
     "estimator": "calib.stages.estimator.section.Estimator",
     "controller": "calib.stages.control.section.Controller",
     "twin": "calib.twin.section.Twin",
@@ -128,6 +130,7 @@ class Rig:
     align: Align | None = None
     actuator: Actuator | None = None
     pump: PumpSection | None = None
+    arm: Arm | None = None
     estimator: Estimator | None = None
     controller: Controller | None = None
     twin: Twin | None = None

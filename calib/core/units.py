@@ -10,6 +10,7 @@ from calib.core.errors import UsageError
 _LENGTHS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
 _FREQUENCIES = {"hz": 1.0, "khz": 1e3}
 _ANGLES = {"deg": math.pi / 180.0, "rad": 1.0}
+_MASSES = {"g": 1e-3, "kg": 1.0}
 _DURATIONS = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
 _QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-zA-Z]*)\s*")
 _PAIR = re.compile(r"\s*(\d{1,6})\s*[xX\u00d7,]\s*(\d{1,6})\s*")
@@ -64,6 +65,14 @@ def parse_jitter(text: str, what: str = "--jitter") -> tuple[float, str]:
     if value <= 0.0:
         raise UsageError(f"{what}: {text!r} is not positive")
     return value, "px" if text.strip().lower().endswith("px") else "m"
+
+
+def parse_mass_kg(text: str, what: str) -> float:
+    """Kilograms from '200g' or '0.2 kg'; not negative."""
+    value = _quantity(text, _MASSES, what, "200g")
+    if value < 0.0:
+        raise UsageError(f"{what}: {text!r} is negative")
+    return value
 
 
 def parse_frequency_hz(text: str, what: str) -> float:

@@ -57,6 +57,7 @@ UNITS = {
     "_mps": "m/s",
     "_kgm2": "kg m²",
     "_kPa": "kPa",
+    "_kpa": "kPa",
     "_ticks": "ticks",
     "_rad": "rad",
     "_deg": "°",

@@ -58,7 +58,17 @@ MEASURED = (
 TRUE = ("true_q1_m", "true_q2_m", "true_phi_rad", "true_x_m", "true_y_m")
 """What only the simulated rig knows, at the row's `t_s`; (x, y) is the head. For scoring."""
 
-COLUMNS = (*MEASURED, *TRUE)
+CHAMBERS = 3
+COMMANDED = tuple(f"p_cmd{k + 1}_kpa" for k in range(CHAMBERS))
+PRESSURES = tuple(f"p{k + 1}_kpa" for k in range(CHAMBERS))
+"""Commands to pressure valves, and pressures of the chambers above that of the air."""
+
+POSITION = tuple(f"{of}_{axis}_m" for of in ("base", "tip") for axis in "xyz")
+QUATERNION = tuple(f"{of}_q{part}" for of in ("base", "tip") for part in "wxyz")
+POSE = (*POSITION, *QUATERNION, "tip_phi_rad")
+"""Base and tip by motion capture; or the tip in the plane, as `tip_x_m, tip_y_m, tip_phi_rad`."""
+
+COLUMNS = (*MEASURED, *COMMANDED, *PRESSURES, *POSE, *TRUE)
 
 ACCEL = ("ax_mps2", "ay_mps2", "az_mps2")
 GYRO = ("gx_radps", "gy_radps", "gz_radps")
@@ -73,8 +83,10 @@ UNITS: dict[str, dict[str, float]] = {
     "angle": {"rad": 1.0, "deg": _DEGREE},
     "pixel": {"px": 1.0},
     "pwm": {"pwm": 1.0, "percent": 2.55},
+    "pressure": {"kPa": 1.0, "Pa": 1e-3, "bar": 100.0, "psi": 6.894757},
+    "length": {"m": 1.0, "mm": 1e-3},
 }
-"""Units of each kind of column in SI; the first is that of the column's own name. Counts stay counts."""
+"""Units of each kind of column in that of the column's own name, which is the first. Counts stay counts."""
 
 _SPELLED = {
     "s": "s sec secs second seconds", "ms": "ms msec msecs millis millisecond milliseconds",
@@ -83,6 +95,7 @@ _SPELLED = {
     "rad/s": "rad/s rads radps rad_s rad/sec", "deg/s": "deg/s °/s dps degps degs deg_s deg/sec",
     "mdeg/s": "mdps mdeg/s", "rad": "rad", "deg": "deg degree degrees °", "px": "px pixel pixels pix",
     "counts": "raw lsb count counts adc", "percent": "% percent",
+    "kPa": "kpa", "Pa": "pa pascal", "bar": "bar", "psi": "psi",
 }  # fmt: skip
 _UNIT = {word: unit for unit, words in _SPELLED.items() for word in words.split()}
 
@@ -95,6 +108,7 @@ _NAMED_BY_UNIT = {"millis": "ms", "micros": "us", "nanos": "ns", "seconds": "s",
 _PIXEL = re.compile(r"(?:pixel|px|marker|cam|camera|image|img|blob|pixy)?(?P<axis>[uv])")
 _PIXEL_XY = re.compile(r"(?:pixel|px|marker|blob|pixy)(?P<axis>[xy])")
 _PWM = re.compile(r"(?:pwm|duty|valve|cmd|command|pump)(?P<number>[12])")
+_PRESSURE = re.compile(rf"p(?P<commanded>cmd)?(?P<number>[1-{CHAMBERS}])")
 _CHIP = re.compile(r"(?:onchip|chip|fused|fusion)(?:phi|angle)")
 _DEVICES = ("imu", "bno055", "bno", "mpu6050", "mpu", "sensor", "field", "data", "msg")
 
@@ -122,13 +136,26 @@ _MOST_EVIDENCE = 100_000
 
 
 def kind_of(column: str) -> str:
-    """The kind of a column of `COLUMNS` or of `t_s`, a key of `UNITS`; empty for truth."""
+    """The kind of a column of `COLUMNS` or of `t_s`, a key of `UNITS`; empty for quaternions and truth."""
     if column == "t_s":
         return "time"
-    for kind, names in (("accel", ACCEL), ("gyro", GYRO), ("pixel", MEASURED[:2]), ("pwm", MEASURED[8:10])):
+    kinds: dict[str, tuple[str, ...]] = {
+        "accel": ACCEL,
+        "gyro": GYRO,
+        "pixel": MEASURED[:2],
+        "pwm": MEASURED[8:10],
+        "pressure": (*COMMANDED, *PRESSURES),
+        "length": POSITION,
+    }
+    for kind, names in kinds.items():
         if column in names:
             return kind
-    return "angle" if column == "onchip_phi_rad" else ""
+    return "angle" if column in ("onchip_phi_rad", "tip_phi_rad") else ""
+
+
+def is_arm_log(names: Sequence[str]) -> bool:
+    """Whether columns are those of an arm that pressures drive."""
+    return bool({*COMMANDED, *PRESSURES} & set(names))
 
 
 def known_name(name: str) -> tuple[str, str] | None:
@@ -168,6 +195,8 @@ def _column(word: str, unit: str) -> tuple[str, str] | None:
         column = "u_px" if (pixel["axis"] if pixel else word) == "x" else "v_px"
     elif pwm := _PWM.fullmatch(word):
         column = f"pwm{pwm['number']}"
+    elif unit and (pressure := _PRESSURE.fullmatch(word)):
+        column = f"p{'_cmd' if pressure['commanded'] else ''}{pressure['number']}_kpa"
     elif _CHIP.fullmatch(word):
         column = "onchip_phi_rad"
     if not column or (unit and unit not in UNITS[kind_of(column)]):

@@ -32,6 +32,7 @@ STAGES = {
     "imu drift": "calib.stages.imu.stage",
     "align": "calib.stages.align.stage",
     "identify logs": "calib.stages.actuator.stage",
+    "identify arm": "calib.stages.arm.stage",
     "replay": "calib.stages.estimator.stage",
     "control run": "calib.stages.control.stage",
     "control check": "calib.stages.control.stage",

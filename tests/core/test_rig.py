@@ -22,6 +22,8 @@ from calib.core.schema import validated
 from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import Plant
 from calib.stages.actuator.pump import Orifice, static_force_N
+from calib.stages.arm.model import NAMES as ARM_NAMES
+from calib.stages.arm.model import Assembly
 from calib.stages.camera.section import Camera
 
 CAMERA = Camera(
@@ -290,6 +292,7 @@ def _values(part: dict[str, Any], whole: dict[str, Any]) -> st.SearchStrategy[An
 
 
 _ONE = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+ARM = Assembly(("valve", "segment", "chord"))
 CONSISTENT: dict[str, dict[str, Any]] = {
     "camera": {"model": "rational8"},
     "plane": {"R_CW": _ONE, "t_CW_m": [0.0, 0.0, 1.0], "A_px_per_m": _ONE, "A_inverse": _ONE},
@@ -303,6 +306,7 @@ CONSISTENT: dict[str, dict[str, Any]] = {
             "force_pwm": [[0.0, 128.0], [3.5, 255.0]],
         },
     },
+    "arm": {"parts": list(ARM.parts), "parameters": {n: 1.0 for n in ARM_NAMES if n not in ARM.off}},
     "lowpass": {"order": 1, "sections": [{"b": [0.5, 0.5, 0.0], "a": [1.0, 0.0, 0.0]}]},
 }
 """Values that a section's own rules tie together."""

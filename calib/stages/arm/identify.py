@@ -1,0 +1,399 @@
+"""Fit an assembly to trials, and predict each trial from a fit to the others.
+
+Least squares over whole free runs, from the command and from the measured pressure, with the parameters'
+priors. Errors of a free run stay alike for seconds, so a sample counts as 1/`_ALIKE` of a reading. What
+differs from day to day is a gain with a prior of its own. Standard deviations are the larger of the
+posterior's and of the jackknife's over trials, as trials differ by more than their samples tell.
+
+Baselines are trained on the same trials: linear ARX by least squares, run free, and one lag.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.stats import t as student
+
+from calib.core.arrays import FloatArray
+from calib.stages.arm.model import (
+    DAY_SPREAD,
+    NAMES,
+    PARAMETERS,
+    PARTS,
+    STEP_S,
+    Assembly,
+    Scale,
+    Trial,
+    scale_of,
+    segment_run,
+    valve_run,
+)
+
+FULL = Assembly(tuple(part.name for part in PARTS))
+WORTH = ("quadratic", "hysteresis", "settling", "load")
+"""Parts whose worth is measured by leaving them out."""
+_SIGMA = (0.03, 0.027, 0.0045)
+"""Of pressure, angle and chord, of their scale: what assemblies of this kind leave."""
+_ALIKE, _EVERY = 100, 5
+"""Samples of one error, and of which one is looked at."""
+_MOST_KEPT = 200
+_STEP = 0.03
+"""Of the differences, in deviations of the priors; smaller ones see the valve's ports open and close."""
+_ORDERS, _ARX_STEPS_S = (8, 15), (0.1, 0.2)
+_LAGS_S = tuple(np.geomspace(0.1, 10.0, 25).tolist())
+
+
+@dataclass(frozen=True)
+class Fit:
+    """An assembly fitted to trials.
+
+    Attributes
+    ----------
+    z, sigma : (parameters,) in deviations of the priors, and the posterior's deviations of these.
+    gains : of each day.
+    """
+
+    assembly: Assembly
+    scale: Scale
+    z: FloatArray
+    sigma: FloatArray
+    gains: Mapping[str, float]
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Parameters by name."""
+        return self.assembly.values(self.z, self.scale)
+
+
+@dataclass(frozen=True)
+class Held:
+    """Free-run errors on a trial that was not fitted, RMS; NaN where something was not logged.
+
+    `angle_rad`, `chord_m` from the command; `by_pressure_rad` from the measured pressure.
+    """
+
+    angle_rad: float
+    chord_m: float
+    by_pressure_rad: float
+    pressure_kpa: float = math.nan
+
+
+@dataclass(frozen=True)
+class Identification:
+    """What trials tell of an arm.
+
+    Attributes
+    ----------
+    fit, sigma : to all trials, and standard deviations by name that hold between trials.
+    held : by trial. others : held errors of other assemblies and of baselines, by name and trial.
+    coverage : share of the samples of left-out trials in the 95 % interval that the others' errors give.
+    """
+
+    trials: tuple[Trial, ...]
+    fit: Fit
+    sigma: Mapping[str, float]
+    held: Mapping[str, Held]
+    others: Mapping[str, Mapping[str, Held]]
+    coverage: float
+
+
+_Valve = Callable[[Trial, Mapping[str, float]], FloatArray]
+
+
+def _remembered() -> _Valve:
+    """`valve_run` that keeps what it found: most steps of a fit change the segment alone."""
+    kept: dict[tuple[str, tuple[float, ...]], FloatArray] = {}
+
+    def run(trial: Trial, values: Mapping[str, float]) -> FloatArray:
+        key = (trial.name, tuple(values[one.name] for one in PARTS[0].parameters))
+        if key not in kept:
+            if len(kept) > _MOST_KEPT:
+                kept.clear()
+            kept[key] = valve_run(trial, values)
+        return kept[key]
+
+    return run
+
+
+def _runs(
+    trials: Sequence[Trial], values: Mapping[str, float], gains: Mapping[str, float], valve: _Valve
+) -> Iterator[tuple[FloatArray, FloatArray, int]]:
+    """Simulated and measured values with the number of their kind."""
+    for one in trials:
+        pressures = [one.pressure_kpa] if len(one.pressure_kpa) else []
+        if len(one.command_kpa):
+            pressures.append(valve(one, values))
+            if len(one.pressure_kpa):
+                yield pressures[-1], one.pressure_kpa, 0
+        if len(one.angle_rad):
+            for pressure in pressures:
+                angle, chord = segment_run(one, values, pressure, gains.get(one.day, 1.0))
+                yield angle, one.angle_rad, 1
+                yield chord, one.chord_m, 2
+
+
+def fit(trials: Sequence[Trial], assembly: Assembly, scale: Scale, start: Fit | None = None) -> Fit:
+    """The assembly with the smallest squared errors and deviations from its priors."""
+    days = sorted({one.day for one in trials})
+    sizes = [s * x for s, x in zip(_SIGMA, (scale.pressure_kpa, scale.angle_rad, scale.chord_m), strict=True)]
+    count, valve = len(PARAMETERS), _remembered()
+
+    def gains(z: FloatArray) -> dict[str, float]:
+        return {day: math.exp(DAY_SPREAD * x) for day, x in zip(days, z[count:].tolist(), strict=True)}
+
+    def residuals(z: FloatArray) -> FloatArray:
+        parts = [z]
+        for simulated, measured, kind in _runs(trials, assembly.values(z[:count], scale), gains(z), valve):
+            parts.append((simulated - measured)[::_EVERY] / (sizes[kind] * math.sqrt(_ALIKE / _EVERY)))
+        return np.clip(np.nan_to_num(np.concatenate(parts), nan=1e3), -1e3, 1e3)
+
+    def jacobian(z: FloatArray) -> FloatArray:
+        columns = []
+        for k in range(len(z)):
+            ahead, behind = z.copy(), z.copy()
+            ahead[k] += _STEP
+            behind[k] -= _STEP
+            columns.append((residuals(ahead) - residuals(behind)) / (2.0 * _STEP))
+        return np.stack(columns, axis=1)
+
+    begin = np.zeros(count + len(days))
+    if start is not None:
+        begin[:count] = start.z
+        begin[count:] = [math.log(start.gains.get(day, 1.0)) / DAY_SPREAD for day in days]
+    found = least_squares(residuals, begin, jac=jacobian, max_nfev=10 if start else 25, ftol=1e-3)
+    slopes = jacobian(found.x)
+    covariance = np.linalg.inv(slopes.T @ slopes)
+    return Fit(assembly, scale, found.x[:count], np.sqrt(np.diag(covariance))[:count], gains(found.x))
+
+
+def _rms(error: FloatArray) -> float:
+    return float(np.sqrt(np.mean(error**2))) if len(error) else math.nan
+
+
+def errors_of(made: Fit, trial: Trial) -> Held:
+    """Free-run errors of a fit on a trial."""
+    return errors_by(made.values, made.gains.get(trial.day, 1.0), trial)
+
+
+def errors_by(values: Mapping[str, float], gain: float, trial: Trial) -> Held:
+    """Free-run errors on a trial, of parameters by name and the gain of its day."""
+    angle = chord = pressure = by_pressure = np.zeros(0)
+    if len(trial.command_kpa):
+        run = valve_run(trial, values)
+        if len(trial.angle_rad):
+            phi, length = segment_run(trial, values, run, gain)
+            angle, chord = phi - trial.angle_rad, length - trial.chord_m
+        if len(trial.pressure_kpa):
+            pressure = run - trial.pressure_kpa
+    if len(trial.pressure_kpa) and len(trial.angle_rad):
+        by_pressure = segment_run(trial, values, trial.pressure_kpa, gain)[0] - trial.angle_rad
+    return Held(_rms(angle), _rms(chord), _rms(by_pressure), _rms(pressure))
+
+
+# ----------------------------------------------------------------------
+# Baselines.
+
+
+def _thinned(values: FloatArray, step_s: float) -> FloatArray:
+    size = round(step_s / STEP_S)
+    return np.asarray(values[: len(values) // size * size].reshape(-1, size).mean(axis=1))
+
+
+def _arx_rows(u: FloatArray, y: FloatArray, order: int) -> FloatArray:
+    k = np.arange(order, len(y))
+    past = [y[k - i] for i in range(1, order + 1)] + [u[k - i] for i in range(1, order + 1)]
+    return np.column_stack([*past, np.ones(len(k))])
+
+
+def _arx_error(
+    train: Sequence[tuple[FloatArray, FloatArray]], test: tuple[FloatArray, FloatArray], order: int
+) -> float:
+    """Free-run RMS of ARX, begun from the first measured values."""
+    rows = np.concatenate([_arx_rows(u, y, order) for u, y in train])
+    weights = np.linalg.lstsq(rows, np.concatenate([y[order:] for _, y in train]), rcond=None)[0]
+    u, y = test
+    out = y.copy()
+    # An unstable model does not leave thrice the range that it has seen.
+    low = min(float(one.min()) for _, one in train)
+    high = max(float(one.max()) for _, one in train)
+    low, high = low - (high - low), high + (high - low)
+    for k in range(order, len(y)):
+        past = np.concatenate([out[k - order : k][::-1], u[k - order : k][::-1], [1.0]])
+        out[k] = min(max(float(weights @ past), low), high)
+    return _rms(out - y)
+
+
+def _lag_error(train: Sequence[tuple[FloatArray, FloatArray]], test: tuple[FloatArray, FloatArray]) -> float:
+    """Free-run RMS of one linear lag, its time the best of a grid."""
+
+    def lagged(u: FloatArray, lag_s: float) -> FloatArray:
+        from scipy.signal import lfilter
+
+        a = math.exp(-STEP_S / lag_s)
+        return np.asarray(lfilter([1.0 - a], [1.0, -a], u, zi=[a * u[0]])[0])
+
+    best = (math.inf, 0.0, np.zeros(2))
+    for lag_s in _LAGS_S:
+        rows = np.concatenate([np.stack([lagged(u, lag_s), np.ones(len(u))], axis=1) for u, _ in train])
+        y = np.concatenate([y for _, y in train])
+        line = np.linalg.lstsq(rows, y, rcond=None)[0]
+        best = min(best, (_rms(rows @ line - y), lag_s, line), key=lambda one: one[0])
+    u, y = test
+    return _rms(np.stack([lagged(u, best[1]), np.ones(len(u))], axis=1) @ best[2] - y)
+
+
+_Error = Callable[[Sequence[tuple[FloatArray, FloatArray]], tuple[FloatArray, FloatArray]], float]
+
+
+def _by_baseline(error: _Error, train: Sequence[Trial], trial: Trial, step_s: float = STEP_S) -> Held:
+    def of(inputs: str, outputs: str) -> float:
+        pairs = [
+            (_thinned(getattr(one, inputs), step_s), _thinned(getattr(one, outputs), step_s))
+            for one in (*train, trial)
+            if len(getattr(one, inputs)) and len(getattr(one, outputs))
+        ]
+        used = len(getattr(trial, inputs)) and len(getattr(trial, outputs))
+        return error(pairs[:-1], pairs[-1]) if used and len(pairs) > 1 else math.nan
+
+    return Held(of("command_kpa", "angle_rad"), of("command_kpa", "chord_m"), of("pressure_kpa", "angle_rad"))
+
+
+def baselines(trials: Sequence[Trial]) -> dict[str, dict[str, Held]]:
+    """Held errors of ARX and of a lag by name and trial.
+
+    They are trained on the others of the same day where there are two at least, as they know no days.
+    """
+    out: dict[str, dict[str, Held]] = {}
+    for trial in trials:
+        others = [one for one in trials if one is not trial]
+        same = [one for one in others if one.day == trial.day and one.load_kg == trial.load_kg]
+        train = same if len(same) > 1 else others
+        for step_s in _ARX_STEPS_S:
+            for order in _ORDERS:
+
+                def arx(
+                    train: Sequence[tuple[FloatArray, FloatArray]],
+                    test: tuple[FloatArray, FloatArray],
+                    order: int = order,
+                ) -> float:
+                    return _arx_error(train, test, order)
+
+                name = f"ARX {order} at {1.0 / step_s:g} Hz"
+                out.setdefault(name, {})[trial.name] = _by_baseline(arx, train, trial, step_s)
+        out.setdefault("a lag", {})[trial.name] = _by_baseline(_lag_error, train, trial)
+    return out
+
+
+# ----------------------------------------------------------------------
+# Held trials, deviations between trials, parts.
+
+
+def held_fits(trials: Sequence[Trial], made: Fit) -> dict[str, Fit]:
+    """Fits to all trials but one, by the name of that one."""
+    return {
+        one.name: fit([other for other in trials if other is not one], made.assembly, made.scale, made)
+        for one in trials
+    }
+
+
+def _deviations(made: Fit, held: Mapping[str, Fit]) -> dict[str, float]:
+    """Standard deviations of the parameters: the posterior's or the jackknife's, the larger."""
+    n, out = len(held), {}
+    for k, (name, parameter) in enumerate(zip(NAMES, PARAMETERS, strict=True)):
+        half = 0.5 * made.sigma[k]
+        spread = parameter.value(made.z[k] + half, made.scale) - parameter.value(made.z[k] - half, made.scale)
+        others = np.array([one.values[name] for one in held.values()])
+        between = math.sqrt((n - 1) / n * float(np.sum((others - others.mean()) ** 2))) if n > 1 else 0.0
+        out[name] = 0.0 if name in made.assembly.off else max(abs(spread), between)
+    return out
+
+
+def half_width(errors: Sequence[float]) -> float:
+    """Half the 95 % interval of a further trial's samples, from the RMS errors of held trials."""
+    found = [x for x in errors if math.isfinite(x)]
+    if len(found) < 2:
+        return math.nan
+    return float(student.ppf(0.975, len(found))) * math.sqrt(sum(x * x for x in found) / len(found))
+
+
+def _coverage(trials: Sequence[Trial], held: Mapping[str, Fit], errors: Mapping[str, Held]) -> float:
+    inside = total = 0
+    for one in trials:
+        wide = half_width([errors[other.name].angle_rad for other in trials if other is not one])
+        if not (len(one.command_kpa) and len(one.angle_rad)) or math.isnan(wide):
+            continue
+        made = held[one.name]
+        angle, _ = segment_run(one, made.values, valve_run(one, made.values), made.gains.get(one.day, 1.0))
+        inside += int(np.sum(np.abs(angle - one.angle_rad) <= wide))
+        total += len(one.angle_rad)
+    return inside / total if total else math.nan
+
+
+def identify(
+    trials: Sequence[Trial],
+    compare: bool = True,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Identification:
+    """Fit the assembly, hold each trial back, and compare other assemblies and baselines.
+
+    Parameters
+    ----------
+    compare : whether the parts' worth is measured, which takes as long again for each.
+    """
+    scale = scale_of(trials)
+    loaded = any(one.load_kg > 0.0 for one in trials)
+    assembly = FULL.without("creep") if loaded else FULL.without("creep", "load")
+    variants = {f"without {name}": assembly.without(name) for name in WORTH if name in assembly.parts} | {
+        "with creep": Assembly((*assembly.parts, "creep"))
+    }
+    chosen = variants if compare and len(trials) > 1 else {}
+    steps = 1 + (1 + len(chosen))
+    made = fit(trials, assembly, scale)
+    progress(1, steps)
+    held = held_fits(trials, made) if len(trials) > 1 else {}
+    errors = {one.name: errors_of(held[one.name], one) for one in trials if one.name in held}
+    progress(2, steps)
+    others: dict[str, Mapping[str, Held]] = {}
+    for k, (name, other) in enumerate(chosen.items()):
+        fits = held_fits(trials, fit(trials, other, scale, made))
+        others[name] = {one.name: errors_of(fits[one.name], one) for one in trials}
+        progress(3 + k, steps)
+    if len(trials) > 1:
+        others |= baselines(trials)
+    coverage = _coverage(trials, held, errors) if held else math.nan
+    return Identification(tuple(trials), made, _deviations(made, held), errors, others, coverage)
+
+
+def best_baseline(found: Identification, quantity: str) -> str:
+    """Name of the ARX with the smallest mean error of a quantity of `Held`."""
+    arx = [name for name in found.others if name.startswith("ARX")]
+    return min(arx, key=lambda name: mean_of(found.others[name], quantity), default="")
+
+
+def mean_of(errors: Mapping[str, Held], quantity: str) -> float:
+    """Mean over the trials that have it, NaN without one."""
+    values = [getattr(one, quantity) for one in errors.values()]
+    values = [x for x in values if math.isfinite(x)]
+    return sum(values) / len(values) if values else math.nan
+
+
+def gained(found: Identification, baseline: str, quantity: str) -> tuple[float, float]:
+    """By how much smaller the mean held error is than a baseline's, and half its paired 95 % interval.
+
+    Both are shares of the baseline's mean; the half is NaN for fewer than two trials.
+    """
+    pairs = [
+        (getattr(found.others[baseline][name], quantity), getattr(one, quantity))
+        for name, one in found.held.items()
+    ]
+    less = np.array([a - b for a, b in pairs if math.isfinite(a) and math.isfinite(b)])
+    mean = mean_of(found.others[baseline], quantity)
+    if not len(less):
+        return math.nan, math.nan
+    n = len(less)
+    half = float(student.ppf(0.975, n - 1)) * float(less.std(ddof=1)) / math.sqrt(n) if n > 1 else math.nan
+    return float(less.mean()) / mean, half / mean

@@ -1,0 +1,291 @@
+"""From logs of pressures and motion capture to trials on a regular grid, and what the recordings show.
+
+The tip's rotation in the frame of the base turns about one axis where the motion is planar: the direction of
+the largest spread of the rotation vectors. The angle is their part along it, and grows with bending.
+A quaternion that maps the world to the body instead of the body to the world turns against the chord from
+base to tip.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.core.arrays import FloatArray
+from calib.core.errors import BadInputError
+from calib.core.verdict import Finding
+from calib.io.columns import COMMANDED, POSITION, PRESSURES, QUATERNION
+from calib.io.logs import Log
+from calib.io.signals import check_time
+from calib.stages.arm.model import STEP_S, Trial
+
+_PLANAR = ("tip_x_m", "tip_y_m", "tip_phi_rad")
+_FEWEST_S = 5.0
+_JUMP_RAD = math.radians(0.7)
+"""Between neighbours at 90 Hz: no arm of this kind turns as fast as 60 deg/s."""
+_TILTED_RAD = math.radians(5.0)
+_LEAST_TURN_RAD = math.radians(2.0)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """How motion capture is to be read.
+
+    Attributes
+    ----------
+    axis : (3,) of the bending, in the frame of the base; None for poses in the plane.
+    conjugated : whether quaternions map the world to the body.
+    leans : turn of the chord over that of the tip.
+    planar_deg : angle between the axis and the normal of the tip's path.
+    direction : (3,) from base to tip of the straight arm, in the frame of the base.
+    """
+
+    axis: FloatArray | None
+    conjugated: bool = False
+    leans: float = math.nan
+    planar_deg: float = math.nan
+    direction: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What of a log is used: rows (n,) of time, and the columns that it has.
+
+    Attributes
+    ----------
+    command, pressure : (n,) kPa of the driven chamber, NaN where a cell is blank; None without.
+    turned : (n, 3) rotation vectors of the tip in the frame of the base [rad]. chord : (n, 3) from base to
+        tip [m]. Both None for poses in the plane, or without motion capture.
+    planar : (n, 2) angle [rad] and chord [m] in the plane, None without.
+    chamber : number of the driven chamber. findings : on the sensors.
+    """
+
+    name: str
+    source: str
+    t_s: FloatArray
+    command: FloatArray | None
+    pressure: FloatArray | None
+    turned: FloatArray | None
+    chord: FloatArray | None
+    planar: FloatArray | None
+    chamber: int
+    findings: tuple[Finding, ...]
+
+
+def _times(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Hamilton products of quaternions (n, 4), w first."""
+    w, x, y, z = a.T
+    p, q, r, s = b.T
+    return np.stack(
+        [w * p - x * q - y * r - z * s, w * q + x * p + y * s - z * r, w * r - x * s + y * p + z * q,
+         w * s + x * r - y * q + z * p], axis=1
+    )  # fmt: skip
+
+
+def _vector(q: FloatArray) -> FloatArray:
+    """Rotation vectors (n, 3) of unit quaternions (n, 4)."""
+    q = np.where(q[:, :1] < 0.0, -q, q)
+    size = np.linalg.norm(q[:, 1:], axis=1)
+    angle = 2.0 * np.arctan2(size, q[:, 0])
+    return np.asarray(q[:, 1:] * (angle / np.maximum(size, 1e-12))[:, None])
+
+
+def _poses(log: Log) -> tuple[FloatArray, FloatArray]:
+    """Rotation vectors and chords (n, 3) in the frame of the base, NaN in rows without a pose.
+
+    Raises `BadInputError` for quaternions that are none.
+    """
+    read = {name: log.columns[name] for name in (*POSITION, *QUATERNION)}
+    base, tip = (np.stack([read[f"{of}_q{k}"] for k in "wxyz"], axis=1) for of in ("base", "tip"))
+    for of, q in (("base", base), ("tip", tip)):
+        norm = np.linalg.norm(q, axis=1)
+        wrong = np.nonzero(np.abs(norm - 1.0) > 0.02)[0]
+        if len(wrong):
+            raise BadInputError(
+                f"{log.source}, line {log.lines[wrong[0]]}: the quaternion {of}_qw, ... has norm "
+                f"{norm[wrong[0]]:.4g}, expected 1"
+            )
+    back = base * [1.0, -1.0, -1.0, -1.0]
+    turned = _vector(_times(back, tip))
+    apart = np.stack([read[f"tip_{k}_m"] - read[f"base_{k}_m"] for k in "xyz"], axis=1)
+    return turned, apart
+
+
+def _frozen(log: Log, name: str, names: Sequence[str], driven: int) -> list[Finding]:
+    constant = [n for k, n in enumerate(names) if k != driven and n in log.columns and not _varies(log, n)]
+    if not constant:
+        return []
+    return [Finding("remark", f"{name}: {', '.join(constant)} never change: frozen, not used")]
+
+
+def _varies(log: Log, name: str) -> bool:
+    return bool(np.nanmax(log.columns[name]) > np.nanmin(log.columns[name]))
+
+
+def _driven(log: Log) -> int:
+    """Number of the driven chamber from 0. Raises `BadInputError` where none or several are."""
+    for names in (COMMANDED, PRESSURES):
+        moving = [
+            k for k, n in enumerate(names)
+            if n in log.columns and np.isfinite(log.columns[n]).any() and _varies(log, n)
+        ]  # fmt: skip
+        if len(moving) == 1:
+            return moving[0]
+        if moving:
+            raise BadInputError(
+                f"{log.source}: {', '.join(names[k] for k in moving)} change, expected one driven chamber"
+            )
+    raise BadInputError(f"{log.source}: no command and no pressure changes, expected one driven chamber")
+
+
+def recording_of(log: Log, name: str) -> Recording:
+    """The columns of an arm's log.
+
+    Raises `BadInputError` for time that goes back, a log of less than 5 s, quaternions that are none, and
+    where not one chamber alone is driven.
+    """
+    check_time(log)
+    t = log.t_s
+    if len(t) < 2 or t[-1] - t[0] < _FEWEST_S:
+        raise BadInputError(f"{log.source}: is shorter than {_FEWEST_S:g} s, expected a whole trial")
+    driven = _driven(log)
+    findings = [*_frozen(log, name, PRESSURES, driven)]
+    turned = chord = planar = None
+    if all(one in log.columns for one in (*POSITION, *QUATERNION)):
+        turned, chord = _poses(log)
+        findings += _jumps(log, name, turned)
+    elif all(one in log.columns for one in _PLANAR):
+        x, y, phi = (log.columns[one] for one in _PLANAR)
+        planar = np.stack([phi, np.hypot(x, y)], axis=1)
+        findings += _jumps(log, name, phi[:, None])
+    command, pressure = (log.columns.get(names[driven]) for names in (COMMANDED, PRESSURES))
+    return Recording(
+        name, log.source, t, command, pressure, turned, chord, planar, driven + 1, tuple(findings)
+    )
+
+
+def _jumps(log: Log, name: str, turned: FloatArray) -> list[Finding]:
+    step = np.linalg.norm(np.diff(turned, axis=0), axis=1)
+    far = np.nonzero(step > _JUMP_RAD)[0]
+    if not len(far):
+        return []
+    return [
+        Finding(
+            "remark",
+            f"{name}, line {log.lines[far[0] + 1]}: motion capture jumps by "
+            f"{math.degrees(step[far[0]]):.1f} deg from one sample to the next; {len(far)} such jumps in all",
+        )
+    ]
+
+
+def frame_of(recordings: Sequence[Recording]) -> Frame:
+    """The axis of bending, the quaternions' convention and the straight arm's direction.
+
+    Raises `BadInputError` where the tip turns by less than 2 deg.
+    """
+    with_poses = [
+        (one.turned, one.chord) for one in recordings if one.turned is not None and one.chord is not None
+    ]
+    if not with_poses:
+        return Frame(None)
+    turned, chord = (np.concatenate(parts) for parts in zip(*with_poses, strict=True))
+    seen = np.isfinite(turned).all(axis=1) & np.isfinite(chord).all(axis=1)
+    turned, chord = turned[seen], chord[seen]
+    values, axes = np.linalg.eigh(np.cov(turned.T))
+    axis = axes[:, -1]
+    if math.sqrt(values[-1]) < _LEAST_TURN_RAD:
+        raise BadInputError(
+            f"{recordings[0].source}: the tip turns by {math.degrees(math.sqrt(values[-1])):.2g} deg (RMS), "
+            "expected the arm to bend"
+        )
+    # About each recording's own middle, as base and camera may be moved between days.
+    centred = np.concatenate([one - np.nanmean(one, axis=0) for _, one in with_poses])[seen]
+    _, paths = np.linalg.eigh(np.cov(centred.T))
+    normal = paths[:, 0]
+    planar = math.degrees(math.acos(min(abs(float(axis @ normal)), 1.0)))
+    # Turn of the chord about the path's normal, against the tip's.
+    first = np.median(chord[: max(len(chord) // 100, 1)], axis=0)
+    first = first - normal * (first @ normal)
+    normal = normal if normal @ axis > 0.0 else -normal
+    side = np.cross(normal, first)
+    heading = np.arctan2(chord @ side, chord @ first)
+    angle = turned @ axis
+    leans, offset = np.polyfit(angle, heading, 1)
+    conjugated = bool(leans < 0.0)
+    straight = first * math.cos(offset) + side * math.sin(offset)
+    # The angle grows with bending, whatever way that is.
+    if -float(np.percentile(angle, 1.0)) > float(np.percentile(angle, 99.0)):
+        axis = -axis
+    return Frame(axis, conjugated, abs(float(leans)), planar, straight / np.linalg.norm(straight))
+
+
+def frame_findings(frame: Frame) -> list[Finding]:
+    """What the poses show of the arm and of the motion capture, in sentences."""
+    if frame.axis is None or frame.direction is None:
+        return []
+    x, y, z = frame.axis
+    u, v, w = frame.direction
+    said = [
+        Finding(
+            "remark",
+            f"bends about ({x:.2f}, {y:.2f}, {z:.2f}) of the base, straight it points along "
+            f"({u:.2f}, {v:.2f}, {w:.2f}); the chord turns by {frame.leans:.2f} of the tip's angle",
+        )
+    ]
+    if math.radians(frame.planar_deg) > _TILTED_RAD:
+        said.append(
+            Finding(
+                "remark",
+                f"the axis of bending stands {frame.planar_deg:.0f} deg off the normal of the tip's path: "
+                "the tip's marker twists or base and world are tilted; the angle is the part about the axis",
+            )
+        )
+    if frame.conjugated:
+        said.append(
+            Finding(
+                "remark",
+                "the tip turns against its chord: quaternions look conjugated (world to body); the angle is "
+                "counted as it grows with bending",
+            )
+        )
+    return said
+
+
+def trial_of(recording: Recording, frame: Frame, day: str, load_kg: float) -> Trial:
+    """The recording on the grid: commands as means over the steps, readings between their neighbours.
+
+    Raises `BadInputError` where nothing but a command was logged.
+    """
+    t = recording.t_s
+    grid = np.arange(t[0], t[-1] - STEP_S, STEP_S)
+    none = np.zeros(0)
+    pressure = none if recording.pressure is None else _between(grid, t, recording.pressure)
+    angle = chord = none
+    if recording.turned is not None and recording.chord is not None and frame.axis is not None:
+        angle = _between(grid, t, recording.turned @ frame.axis)
+        chord = _between(grid, t, np.linalg.norm(recording.chord, axis=1))
+    elif recording.planar is not None:
+        angle, chord = (_between(grid, t, column) for column in recording.planar.T)
+    command = none if recording.command is None else _means(grid, t, recording.command)
+    if not len(pressure) and not len(angle):
+        raise BadInputError(f"{recording.source}: has neither pressure nor pose, expected one of them")
+    return Trial(recording.name, day, load_kg, grid - grid[0], command, pressure, angle, chord)
+
+
+def _between(grid: FloatArray, t: FloatArray, values: FloatArray) -> FloatArray:
+    seen = np.isfinite(values)
+    return np.interp(grid, t[seen], values[seen]) if seen.any() else np.zeros(0)
+
+
+def _means(grid: FloatArray, t: FloatArray, values: FloatArray) -> FloatArray:
+    """Means over the grid's steps of a signal that is held from sample to sample."""
+    seen = np.isfinite(values)
+    if not seen.any():
+        return np.zeros(0)
+    t, values = t[seen], values[seen]
+    integral = np.concatenate([[0.0], np.cumsum(values[:-1] * np.diff(t))])
+    edges = np.append(grid, grid[-1] + STEP_S)
+    return np.asarray(np.diff(np.interp(edges, t, integral)) / STEP_S)

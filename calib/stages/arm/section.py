@@ -1,0 +1,84 @@
+"""The section `arm` of rig.yaml: a bending arm under a pressure valve that `calib identify` has assembled."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import model_validator
+
+from calib.core.result import NotNegative, Number, Positive, Result, Row3, Section, Sigma, quantity
+from calib.stages.arm.model import NAMES, PARAMETERS, PARTS, Assembly
+
+
+class HeldTrial(Section):
+    """Free-run errors on a trial that was not fitted, RMS over the whole trial."""
+
+    angle_rad: NotNegative | None = None
+    chord_m: NotNegative | None = None
+    angle_by_pressure_rad: NotNegative | None = None
+
+
+class Arm(Result):
+    """An assembly of parts, identified from logs of pressure and motion capture.
+
+    Attributes
+    ----------
+    parts : that play a part. parameters : by name.
+    days : gain of each day, see `calib.stages.arm.model`.
+    bending_axis : in the frame of the base; absent for poses in the plane.
+    interval_rad : half the 95 % interval of the angle of a further trial, from the errors on held trials.
+    coverage : share of the samples of held trials inside the interval that the others' errors give.
+    held : free-run errors on each trial from a fit to the others.
+    """
+
+    kind: Literal["pressure_arm"] = "pressure_arm"
+    parts: list[str]
+    parameters: dict[str, Number]
+    sigma: Sigma = {}
+    days: dict[str, Positive] = {}
+    bending_axis: Row3 | None = None
+    chord_leans: NotNegative | None = quantity(None, label="chord's turn, of the tip's", digits=2)
+    angle_error_rad: NotNegative | None = quantity(
+        None, label="angle of a held trial", show="deg", digits=2, fact=True
+    )
+    chord_error_m: NotNegative | None = quantity(
+        None, label="chord of a held trial", show="mm", digits=2, fact=True
+    )
+    by_pressure_error_rad: NotNegative | None = quantity(
+        None, label="angle by pressure", show="deg", digits=2
+    )
+    interval_rad: NotNegative | None = quantity(None, label="95 % of a trial within", show="deg", digits=1)
+    coverage: NotNegative | None = quantity(None, label="held samples inside", show="%", digits=0)
+    held: dict[str, HeldTrial] = {}
+
+    @model_validator(mode="after")
+    def _assembled(self) -> Arm:
+        known = [part.name for part in PARTS]
+        needed = [part.name for part in PARTS if not part.off]
+        if any(one not in known for one in self.parts) or any(one not in self.parts for one in needed):
+            raise ValueError(f"expected parts of {', '.join(known)}, with {', '.join(needed)}")
+        if set(self.parameters) != set(NAMES) - set(self.assembly.off):
+            raise ValueError("expected the parameters of its parts, all of them")
+        wrong = [p.name for p in PARAMETERS if p.positive and self.parameters.get(p.name, 1.0) <= 0.0]
+        if wrong:
+            raise ValueError(f"expected {wrong[0]} above 0")
+        return self
+
+    @property
+    def assembly(self) -> Assembly:
+        """The parts that play a part."""
+        return Assembly(tuple(self.parts))
+
+    @property
+    def values(self) -> dict[str, float]:
+        """All parameters, those of parts that are left out included."""
+        return self.parameters | self.assembly.off
+
+    def gain_of(self, day: str) -> float:
+        """A day's gain; of a day that was not seen the mean of those that were."""
+        if day in self.days or not self.days:
+            return self.days.get(day, 1.0)
+        product = 1.0
+        for one in self.days.values():
+            product *= one
+        return float(product ** (1.0 / len(self.days)))

@@ -1,0 +1,324 @@
+"""The stage of a bending arm: an assembly from logs of pressure and motion capture, proved on held trials."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from calib.core.errors import UsageError
+from calib.core.stage import Files, LogOptions, Progress, Stage, option
+from calib.core.verdict import Finding, Verdict
+
+if TYPE_CHECKING:
+    from calib.core.rig import Rig
+    from calib.core.words import Block
+    from calib.stages.arm.identify import Held, Identification
+    from calib.stages.arm.model import Trial
+    from calib.stages.arm.read import Frame
+    from calib.stages.arm.section import Arm
+
+_FEWEST = 3
+_UNTOLD = 0.8
+"""Posterior over prior deviation above which logs tell nothing of a parameter."""
+_FAR = 2.0
+"""A held trial is far from the others with this many times their median error."""
+_SHORT = 0.01
+_LEAST_RAD = math.radians(0.5)
+
+
+@dataclass(frozen=True)
+class Options(LogOptions):
+    """What a person knows of the trials."""
+
+    load: tuple[str, ...] | None = option(
+        None,
+        "Mass at the tip of the logs with this name, as 1009_4=200g; may be repeated.",
+        metavar="NAME=MASS",
+    )
+    day: tuple[str, ...] | None = option(
+        None,
+        "Day of the logs with this name, as run3=monday; else what stands before the last _ of the name.",
+        metavar="NAME=DAY",
+    )
+    compare: bool = option(
+        True, "Measure what each part is worth on held trials.", flag="compare/--no-compare"
+    )
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Trials, how motion capture is read, and what the recordings show."""
+
+    trials: tuple[Trial, ...]
+    frame: Frame
+    findings: tuple[Finding, ...]
+    compare: bool
+    progress: Progress
+
+
+def _said(words: Iterable[str], flag: str, names: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Names of logs and what is stated of them. Raises `UsageError` for names that are none."""
+    for one in words:
+        pattern, _, value = one.partition("=")
+        hits = [name for name in names if fnmatchcase(name, pattern)]
+        if not hits or not value:
+            raise UsageError(
+                f"{flag}: {one!r} names no log, expected NAME=VALUE with a NAME of {', '.join(names)}"
+            )
+        yield from ((name, value) for name in hits)
+
+
+def read_trials(
+    files: Files, options: Options, frame: Frame | None = None
+) -> tuple[tuple[Trial, ...], Frame, tuple[Finding, ...]]:
+    """Trials of the files, the frame of their poses, and findings.
+
+    Parameters
+    ----------
+    frame : that an identification has found; found here without.
+
+    Raises
+    ------
+    BadInputError as `calib.stages.arm.read`; `UsageError` for statements about logs that are not there.
+    """
+    from calib.core.units import parse_mass_kg
+    from calib.stages.arm.read import frame_findings, frame_of, recording_of, trial_of
+
+    names = [path.stem for path in files.paths]
+    if len(set(names)) < len(names):
+        raise UsageError(f"logs: {', '.join(names)} are not all different, expected a name for each")
+    loads = {n: parse_mass_kg(mass, "--load") for n, mass in _said(options.load or (), "--load", names)}
+    days = {name: name.rpartition("_")[0] or name for name in names}
+    days |= dict(_said(options.day or (), "--day", names))
+    recordings = []
+    for path in files.paths:
+        recordings.append(recording_of(files.log(path, options), path.stem))
+        files.taken(path)
+    found = frame_of(recordings) if frame is None else frame
+    trials = tuple(trial_of(one, found, days[one.name], loads.get(one.name, 0.0)) for one in recordings)
+    loaded = ", ".join(f"{name} {kg:g} kg" for name, kg in loads.items()) or "none"
+    files.remarks.append(f"days: {', '.join(sorted(set(days.values())))}; loads: {loaded}")
+    findings = [finding for one in recordings for finding in one.findings]
+    return trials, found, (*findings, *frame_findings(found))
+
+
+def _read(files: Files, rig: Rig, options: Options) -> Inputs:
+    del rig
+    trials, frame, findings = read_trials(files, options)
+    return Inputs(trials, frame, findings, options.compare, files.progress)
+
+
+def _known(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _solve(inputs: Inputs) -> Arm:
+    from calib.core.result import judged
+    from calib.stages.arm.identify import half_width, identify, mean_of
+    from calib.stages.arm.section import Arm, HeldTrial
+
+    with inputs.progress("identifying") as progress:
+        found = identify(inputs.trials, inputs.compare, progress)
+    made, off = found.fit, found.fit.assembly.off
+    axis = inputs.frame.axis
+    return Arm(
+        parts=list(made.assembly.parts),
+        parameters={name: float(value) for name, value in made.values.items() if name not in off},
+        sigma={name: float(value) for name, value in found.sigma.items() if name not in off},
+        days={name: float(value) for name, value in made.gains.items()},
+        bending_axis=None if axis is None else axis.tolist(),
+        chord_leans=_known(inputs.frame.leans),
+        angle_error_rad=_known(mean_of(found.held, "angle_rad")),
+        chord_error_m=_known(mean_of(found.held, "chord_m")),
+        by_pressure_error_rad=_known(mean_of(found.held, "by_pressure_rad")),
+        interval_rad=_known(half_width([one.angle_rad for one in found.held.values()])),
+        coverage=_known(found.coverage),
+        held={
+            name: HeldTrial(
+                angle_rad=_known(one.angle_rad),
+                chord_m=_known(one.chord_m),
+                angle_by_pressure_rad=_known(one.by_pressure_rad),
+            )
+            for name, one in found.held.items()
+        },
+        **judged(Verdict.of((*inputs.findings, *judge(found)))),
+    ).with_evidence(found)
+
+
+def judge(found: Identification) -> Iterator[Finding]:
+    """What the held trials, the baselines and the posterior say of an identification."""
+    from calib.stages.arm.identify import best_baseline, gained
+
+    if not any(len(one.angle_rad) for one in found.trials):
+        yield Finding("poor", "no log has a pose, so the valve alone is identified", "log base and tip")
+        return
+    if len(found.trials) < _FEWEST:
+        yield Finding(
+            "poor",
+            f"{len(found.trials)} trials do not tell how trials differ, expected at least {_FEWEST}",
+            "record more trials: other commands, another day",
+        )
+    for quantity, words in (
+        ("angle_rad", "angle"),
+        ("chord_m", "chord"),
+        ("by_pressure_rad", "angle by pressure"),
+    ):
+        name = best_baseline(found, quantity)
+        mean, half = gained(found, name, quantity) if name else (math.nan, math.nan)
+        if math.isnan(mean):
+            continue
+        text = (
+            f"{words}: error on held trials {100.0 * mean:.0f} +- {100.0 * half:.0f} % smaller than that of "
+            f"{name} (paired, 95 %)"
+        )
+        yield Finding("remark" if mean > 0.0 else "poor", text)
+    yield from _far(found)
+    yield from _untold(found)
+    values = found.fit.values
+    for one in found.trials:
+        if not len(one.angle_rad):
+            continue
+        phi = float(one.angle_rad[0])
+        curve = values["chord_m"] + values["chord_m_per_rad"] * phi + values["chord_m_per_rad2"] * phi**2
+        short = curve - float(one.chord_m[0])
+        if short > _SHORT * values["chord_m"]:
+            yield Finding(
+                "remark", f"{one.name} starts {1e3 * short:.1f} mm too short: a vented start, it settles"
+            )
+
+
+def _far(found: Identification) -> Iterator[Finding]:
+    for name, one in found.held.items():
+        others = sorted(
+            x.angle_rad for n, x in found.held.items() if n != name and math.isfinite(x.angle_rad)
+        )
+        if len(others) < _FEWEST - 1 or one.angle_rad - others[len(others) // 2] < _LEAST_RAD:
+            continue
+        if one.angle_rad > _FAR * others[len(others) // 2]:
+            yield Finding(
+                "poor",
+                f"{name} is predicted to {math.degrees(one.angle_rad):.1f} deg from the others, which reach "
+                f"{math.degrees(others[len(others) // 2]):.1f} deg: it alone holds its day, load or range",
+                f"record another trial like {name}",
+            )
+
+
+def _untold(found: Identification) -> Iterator[Finding]:
+    from calib.stages.arm.model import PARAMETERS
+
+    off = found.fit.assembly.off
+    untold = [
+        p
+        for p, s in zip(PARAMETERS, found.fit.sigma.tolist(), strict=True)
+        if s > _UNTOLD and p.name not in off
+    ]
+    for one in untold:
+        yield Finding(
+            "remark", f"{one.name} is the prior's, these logs do not tell it: it takes {one.identified_by}"
+        )
+    if "load" not in found.fit.assembly.parts:
+        yield Finding(
+            "remark",
+            "area, stiffness and lever arm are one number, bends_rad_per_kpa, without a known load",
+            "record a trial with a known mass at the tip and state it with --load",
+        )
+
+
+def _words(arm: Arm) -> list[Block]:
+    """Parameters with what identifies them, and one table of errors on trials held back."""
+    from calib.core.words import BLANK, Line, Table
+    from calib.stages.arm.identify import mean_of
+    from calib.stages.arm.model import PARTS
+
+    found: Identification = arm.evidence
+    rows = [
+        (part.name, one.name, f"{arm.parameters[one.name]:.4g}", f"{arm.sigma[one.name] or 0.0:.2g}",
+         one.unit or BLANK, one.identified_by)
+        for part in PARTS
+        if part.name in arm.parts
+        for one in part.parameters
+    ]  # fmt: skip
+    blocks: list[Block] = [
+        Table(("part", "parameter", "value", "sigma", "unit", "identified by"), tuple(rows)),
+        Line("sigma holds between trials: the larger of the posterior's and of the jackknife's over trials"),
+        Line("gain of the day: " + ", ".join(f"{day} {gain:.3f}" for day, gain in arm.days.items())),
+    ]
+
+    def cells(errors: dict[str, Held], quantity: str, scale: float) -> list[str]:
+        values = [getattr(one, quantity) * scale for one in errors.values()]
+        values.append(mean_of(errors, quantity) * scale)
+        return [BLANK if math.isnan(x) else f"{x:.2f}" for x in values]
+
+    models = {"assembly": found.held, **found.others} if found.held else {}
+    for quantity, scale, title in (
+        ("angle_rad", 180.0 / math.pi, "held trials, angle from the command, deg RMS"),
+        ("chord_m", 1e3, "held trials, chord from the command, mm RMS"),
+        ("by_pressure_rad", 180.0 / math.pi, "held trials, angle from the pressure, deg RMS"),
+    ):
+        if models and math.isfinite(mean_of(found.held, quantity)):
+            table = tuple((name, *cells(dict(errors), quantity, scale)) for name, errors in models.items())
+            blocks.append(Table(("model", *found.held, "mean"), table, title))
+    return blocks
+
+
+def _document(arm: Arm) -> dict[str, Any]:
+    found: Identification = arm.evidence
+    return {
+        "models": {
+            model: {
+                name: {
+                    "angle_rad": _known(one.angle_rad),
+                    "chord_m": _known(one.chord_m),
+                    "angle_by_pressure_rad": _known(one.by_pressure_rad),
+                }
+                for name, one in errors.items()
+            }
+            for model, errors in {"assembly": found.held, **found.others}.items()
+        }
+    }
+
+
+def validate(paths: Sequence[Path], rig: Rig, options: Options) -> tuple[dict[str, Held], Sequence[str]]:
+    """Free-run errors of the rig's arm on logs, by name, and sentences on how they were read.
+
+    Raises `BadInputError` as `read_trials`.
+    """
+    import numpy as np
+
+    from calib.stages.arm.identify import errors_by
+    from calib.stages.arm.read import Frame
+
+    arm = rig.arm
+    assert arm is not None
+    axis = arm.bending_axis
+    files = Files(tuple(paths))
+    trials, _, findings = read_trials(files, options, Frame(None if axis is None else np.array(axis)))
+    errors = {one.name: errors_by(arm.values, arm.gain_of(one.day), one) for one in trials}
+    unseen = [
+        f"{one.name}: day {one.day} is not in the rig, its gain is the mean"
+        for one in trials
+        if one.day not in arm.days
+    ]
+    return errors, [*files.remarks, *(one.text for one in findings), *unseen]
+
+
+arm = Stage(
+    "identify arm",
+    "Bending arm",
+    """Identify a bending arm under a pressure valve from logs of pressures and motion capture.
+
+    Writes the section arm. Exits 1 when the verdict is not ok.
+    """,
+    _read,
+    _solve,
+    Options,
+    sources="Logs of commands, pressures and poses.",
+    metavar="LOG...",
+    writes=("arm",),
+    document=_document,
+    words=_words,
+)

@@ -1,0 +1,146 @@
+"""A bending arm under a pressure valve: truth recovered, trials held back, poses read, bad logs refused."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from armtrials import SCALE, TRUE, columns_of, simulated
+
+from calib.core.arrays import FloatArray
+from calib.core.errors import BadInputError
+from calib.io.columns import known_name
+from calib.io.logs import Log, read_log
+from calib.stages.arm.identify import FULL, best_baseline, errors_by, fit, gained, half_width, identify
+from calib.stages.arm.model import NAMES, Trial, segment_run
+from calib.stages.arm.read import frame_findings, frame_of, recording_of, trial_of
+
+
+@pytest.fixture(scope="module")
+def trials() -> list[Trial]:
+    """Two trials of each of two days."""
+    days = (("a", 1.0), ("a", 1.0), ("b", 1.1), ("b", 1.1))
+    return [simulated(f"{day}_{k}", k, day, gain=gain) for k, (day, gain) in enumerate(days)]
+
+
+def test_a_fit_predicts_trials_that_it_has_not_seen(trials: list[Trial]) -> None:
+    made = fit(trials, FULL.without("creep", "load"), SCALE)
+    unseen = errors_by(made.values, made.gains["b"], simulated("b_2", 7, "b", gain=1.1))
+    assert math.degrees(unseen.angle_rad) < 0.5
+    assert unseen.chord_m < 5e-4
+    assert abs(made.values["lag_s"] / TRUE["lag_s"] - 1.0) < 0.1
+    assert abs(made.gains["b"] / made.gains["a"] - 1.1) < 0.03
+
+
+def test_an_identification_beats_black_boxes_and_says_by_how_much(trials: list[Trial]) -> None:
+    found = identify(trials, compare=False)
+    assert set(found.held) == {"a_0", "a_1", "b_2", "b_3"}
+    name = best_baseline(found, "angle_rad")
+    mean, half = gained(found, name, "angle_rad")
+    assert mean > 0.2
+    assert half > 0.0
+    assert found.coverage > 0.9
+    assert found.sigma["lag_s"] > 0.0
+    assert "load" not in found.fit.assembly.parts
+
+
+def test_a_part_that_is_off_plays_no_part() -> None:
+    one = simulated("a", 1)
+    off = FULL.without("creep", "hysteresis", "settling", "load").values(np.zeros(len(NAMES)), SCALE)
+    p = np.full(len(one.t_s), 100.0)
+    angle, _ = segment_run(one, off, p)
+    rest = off["rest_rad"] + 100.0 * off["bends_rad_per_kpa"] + 1e4 * off["bends_rad_per_kpa2"]
+    expected = rest + (one.angle_rad[0] - rest) * np.exp(-one.t_s / off["lag_s"])
+    np.testing.assert_allclose(angle, expected, atol=1e-9)
+
+
+def test_a_load_bends_an_upright_arm_further() -> None:
+    plain, loaded = simulated("a", 1), simulated("a", 1, load_kg=0.2)
+    assert loaded.angle_rad[1000:].mean() > plain.angle_rad[1000:].mean() + math.radians(0.5)
+
+
+def test_the_interval_of_one_more_trial_follows_from_the_errors_on_held_ones() -> None:
+    assert half_width([1.0, 1.0, 1.0]) == pytest.approx(3.18, abs=0.01)
+    assert math.isnan(half_width([1.0]))
+
+
+# ----------------------------------------------------------------------
+# Logs.
+
+
+def _log(columns: dict[str, FloatArray], trial: Trial) -> Log:
+    return Log("a.csv", trial.t_s, columns, np.arange(len(trial.t_s)) + 2)
+
+
+@pytest.mark.parametrize("conjugated", [False, True])
+def test_plane_axis_and_convention_are_found(conjugated: bool) -> None:
+    trial = simulated("a", 1)
+    recording = recording_of(_log(columns_of(trial, conjugated), trial), "a")
+    frame = frame_of([recording])
+    assert frame.axis is not None
+    assert frame.direction is not None
+    assert abs(frame.axis[2]) > 0.999
+    assert frame.direction[1] > 0.99
+    assert frame.leans == pytest.approx(0.55, abs=0.02)
+    assert frame.conjugated == conjugated
+    assert any("look conjugated" in one.text for one in frame_findings(frame)) == conjugated
+    again = trial_of(recording, frame, "a", 0.0)
+    np.testing.assert_allclose(again.angle_rad, trial.angle_rad[: len(again.angle_rad)], atol=2e-3)
+
+
+def test_poses_in_the_plane_give_the_same_trial() -> None:
+    trial = simulated("a", 1)
+    recording = recording_of(_log(columns_of(trial, planar=True), trial), "a")
+    again = trial_of(recording, frame_of([recording]), "a", 0.0)
+    np.testing.assert_allclose(again.chord_m, trial.chord_m[: len(again.chord_m)], atol=2e-4)
+
+
+def test_frozen_channels_and_jumps_are_findings() -> None:
+    trial = simulated("a", 1)
+    columns = columns_of(trial)
+    columns["tip_qz"] = columns["tip_qz"].copy()
+    columns["tip_qz"][700] += 0.02
+    texts = [one.text for one in recording_of(_log(columns, trial), "a").findings]
+    assert any("p2_kpa, p3_kpa never change" in text for text in texts)
+    assert any("line 702: motion capture jumps by 2." in text for text in texts)
+
+
+def test_what_is_no_single_driven_arm_is_refused() -> None:
+    trial = simulated("a", 1)
+    both = columns_of(trial) | {"p_cmd2_kpa": trial.command_kpa}
+    with pytest.raises(BadInputError, match="p_cmd1_kpa, p_cmd2_kpa change, expected one driven chamber"):
+        recording_of(_log(both, trial), "a")
+    bad = columns_of(trial)
+    bad["tip_qw"] = 2.0 * bad["tip_qw"]
+    with pytest.raises(BadInputError, match=r"line 2: the quaternion tip_qw, \.\.\. has norm 1\.9"):
+        recording_of(_log(bad, trial), "a")
+
+
+def test_pressures_are_read_by_their_unit(tmp_path: Path) -> None:
+    assert known_name("p1_psi") == ("p1_kpa", "psi")
+    assert known_name("P_cmd2 (bar)") == ("p_cmd2_kpa", "bar")
+    assert known_name("p1") is None
+    rows = "\n".join(f"{0.01 * k:.2f},{k % 7}" for k in range(40))
+    (tmp_path / "a.csv").write_text(f"t_s,p1_psi\n{rows}\n", encoding="utf-8")
+    assert read_log(tmp_path / "a.csv").columns["p1_kpa"][1] == pytest.approx(6.894757)
+
+
+# ----------------------------------------------------------------------
+# A real arm.
+
+
+@pytest.mark.slow
+def test_held_trials_of_a_real_arm_are_predicted_better_than_by_arx(shared_data: Path) -> None:
+    folder = shared_data / "softarm"
+    names = ["1006_1", "1006_4", "1006_7", "1009_1", "1009_4"]
+    recordings = [recording_of(read_log(folder / f"{name}.csv"), name) for name in names]
+    frame = frame_of(recordings)
+    assert frame.conjugated
+    assert 0.53 < frame.leans < 0.57
+    trials = [trial_of(r, frame, r.name[:4], 0.2 if r.name == "1009_4" else 0.0) for r in recordings]
+    found = identify(trials, compare=False)
+    for quantity in ("angle_rad", "chord_m", "by_pressure_rad"):
+        mean, _ = gained(found, best_baseline(found, quantity), quantity)
+        assert mean > 0.2, quantity

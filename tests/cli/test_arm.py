@@ -1,0 +1,39 @@
+"""`calib identify` and `calib validate` on logs of an arm that pressures drive."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import yaml
+from armtrials import simulated, written
+
+from .conftest import Run
+
+
+def test_an_arm_is_identified_and_predicted(calib: Run, tmp_path: Path) -> None:
+    days = (("a", 1.0), ("a", 1.0), ("b", 1.1), ("b", 1.1))
+    trials = [simulated(f"{day}_{k}", k, day, gain=gain) for k, (day, gain) in enumerate(days)]
+    names = [written(tmp_path, one).name for one in trials]
+    ended = calib("identify", *names, "--no-compare", cwd=tmp_path)
+    assert ended.code == 0, ended.err
+    assert "held trials, angle from the command" in ended.out
+    assert "verdict: ok" in ended.out
+    text = (tmp_path / "rig.yaml").read_text(encoding="utf-8")
+    assert set(yaml.safe_load(text)["arm"]["days"]) == {"a", "b"}
+    assert str(tmp_path) not in text
+    further = written(tmp_path, simulated("c_1", 9)).name
+    ended = calib("validate", further, cwd=tmp_path)
+    assert ended.code == 0, ended.err
+    assert "day c is not in the rig" in ended.err
+    assert float(ended.out.splitlines()[1].split()[1]) < 3.0
+
+
+def test_what_is_stated_of_other_logs_and_rigs_without_an_arm_are_refused(calib: Run, tmp_path: Path) -> None:
+    name = written(tmp_path, simulated("a_1", 1)).name
+    ended = calib("identify", name, "--load", "z=1kg", cwd=tmp_path)
+    assert ended.code == 2
+    assert "--load: 'z=1kg' names no log" in ended.sentence
+    (tmp_path / "rig.yaml").write_text("schema: 2\n", encoding="utf-8")
+    ended = calib("validate", name, cwd=tmp_path)
+    assert ended.code == 3
+    assert "has no arm yet; run calib identify arm first" in ended.sentence
