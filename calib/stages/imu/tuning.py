@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
-from scipy.stats import norm, t
+from scipy.special import ndtri, stdtrit
 
 from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.core.errors import BadInputError
@@ -327,7 +327,7 @@ def _resampled(blocks: int, length: int) -> IntArray:
 def _widening(runs: float) -> float:
     """By how much deviations of the draws from the estimate are too small, for a number of runs."""
     m = max(runs, 2.0)
-    return math.sqrt(m / (m - 1.0)) * float(t.ppf(0.975, 1.5 * m) / norm.ppf(0.975))
+    return math.sqrt(m / (m - 1.0)) * float(stdtrit(1.5 * m, 0.975) / ndtri(0.975))
 
 
 def rms(errors: Sequence[FloatArray]) -> float:
