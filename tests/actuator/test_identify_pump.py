@@ -23,6 +23,7 @@ from calib.stages.actuator.identify_pump import (
     cross_validate,
     fit_pump,
     simulate_pump,
+    with_run_sigma,
 )
 from calib.stages.actuator.pump import Orifice
 from calib.stages.actuator.pump_results import PumpFound, identify_pump, judge_pump, pump_section, unexplained
@@ -82,6 +83,38 @@ def test_a_real_pump(shared_data: Path) -> None:
         rms[model] = float(np.sqrt(np.mean([v**2 for name, v in held.items() if name not in gone])))
     assert rms[ORIFICE] < 0.6
     assert rms[ORIFICE] < 0.6 * rms[LAG]
+
+
+@pytest.mark.slow
+def test_intervals_contain_where_real_runs_settle(shared_data: Path) -> None:
+    """Each held run, those that leave the others by 5 kPa included; errors of the free runs are bounded."""
+    folder = outside(shared_data / "softbot")
+    found = identify_pump([read_pump_table(path) for path in sorted(folder.glob("sweep_*.csv"))])
+    assert found.better is not None
+    settles = found.settles(found.better)
+    assert settles is not None
+    level, half, inside, count = settles
+    assert (inside, count) == (8, 8)
+    assert level - half < 29.3
+    assert level + half > 35.1
+    errors = {h.name: h.rms for h in found.held[found.better]}
+    jumping = [errors.pop("sweep_kp_15.csv"), errors.pop("sweep_ki_500.csv")]
+    assert max(jumping) < 3.9
+    assert max(errors.values()) < 1.0
+
+
+@pytest.mark.parametrize("levels", [(30.0,) * 4, (30.0, 30.0, 30.0, 35.0)])
+def test_the_level_has_a_sigma_that_holds_from_run_to_run(levels: tuple[float, ...]) -> None:
+    rng = np.random.default_rng(1)
+    runs = []
+    for k, level in enumerate(levels):
+        clean = simulate_pump(LAG, np.array([0.05, level, 0.6, FREE]), _record(_step()), start_s=-1.0)
+        runs.append(PumpRecord(f"run{k}", T, _step(), clean + 0.05 * rng.standard_normal(len(T))))
+    fit = fit_pump(runs, LAG)
+    wide, between = with_run_sigma(fit, cross_validate(fit, runs))
+    assert wide.sigma["level"] >= fit.sigma["level"]
+    assert between < 0.1 if len(set(levels)) == 1 else 2.0 < between < 5.0
+    assert wide.sigma["level"] == pytest.approx(math.hypot(fit.sigma["level"], between))
 
 
 @pytest.mark.slow

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations, pairwise
 
 import numpy as np
@@ -12,7 +12,7 @@ from numba import njit
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
-from calib.core.arrays import FloatArray
+from calib.core.arrays import BoolArray, FloatArray
 from calib.core.errors import BadInputError
 from calib.stages.actuator.pump import PWM_MAX
 
@@ -278,11 +278,16 @@ class PumpFit:
 
 @dataclass(frozen=True)
 class Held:
-    """Errors on a recording that was not fitted: free run, and `_AHEAD_S` ahead of measured values."""
+    """Errors on a recording that was not fitted: free run, and `_AHEAD_S` ahead of measured values.
+
+    `settles` is by how much it ends above the free run, over its last second; NaN where it does not run near
+    full PWM then.
+    """
 
     name: str
     rms: float
     ahead: float
+    settles: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -564,8 +569,37 @@ def cross_validate(fit: PumpFit, records: Sequence[PumpRecord]) -> list[Held]:
         if not others:
             return []
         again = fit_pump(others, fit.model, fit.shape, fit.theta)
-        out.append(Held(held.name, rms_of(again, held), rms_ahead(again, held)))
+        out.append(held_by(again, held))
     return out
+
+
+def held_by(fit: PumpFit, record: PumpRecord) -> Held:
+    """Errors of a fit on a recording that it has not seen."""
+    late = _near_full(record)
+    off = record.value - simulate_pump(fit.model, fit.theta, record, fit.shape)
+    settles = float(np.mean(off[late])) if late is not None else math.nan
+    return Held(record.name, rms_of(fit, record), rms_ahead(fit, record), settles)
+
+
+def _near_full(record: PumpRecord) -> BoolArray | None:
+    """Rows of a run's last second, where it runs near full PWM then and changes at all."""
+    late = record.t_s >= record.t_s[-1] - _SETTLED_S
+    full = float(np.median(record.pwm[late])) >= 0.85 * 255.0 and float(np.ptp(record.value)) > 0.0
+    return late if full else None
+
+
+def with_run_sigma(fit: PumpFit, held: Sequence[Held]) -> tuple[PumpFit, float]:
+    """The fit with a level whose deviation holds for a further run, and what runs add to it.
+
+    Runs of one pump settle apart for reasons that no PWM tells. How the samples of a run scatter says nothing
+    of that; by how much held runs end off their prediction does. NaN for fewer than two.
+    """
+    ends = np.array([one.settles for one in held if math.isfinite(one.settles)])
+    if len(ends) < 2 or "level" not in fit.sigma:
+        return fit, math.nan
+    between = float(np.sqrt(np.mean(ends**2)))
+    sigma = {**fit.sigma, "level": math.hypot(fit.sigma["level"], between)}
+    return replace(fit, sigma=sigma), between
 
 
 # ----------------------------------------------------------------------
@@ -611,9 +645,9 @@ def settled_groups(records: Sequence[PumpRecord]) -> tuple[Group, ...]:
     """
     ends = []
     for record in records:
-        late = record.t_s >= record.t_s[-1] - _SETTLED_S
-        pwm = record.pwm[late]
-        if float(np.median(pwm)) >= 0.85 * 255.0 and float(np.ptp(record.value)) > 0.0:
+        late = _near_full(record)
+        if late is not None:
+            pwm = record.pwm[late]
             value = float(np.median(record.value[late]))
             ends.append((value, record.name, float(np.quantile(pwm, 0.05)), float(pwm.max())))
     ends.sort()

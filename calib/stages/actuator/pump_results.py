@@ -29,10 +29,10 @@ from calib.stages.actuator.identify_pump import (
     departures,
     fit_pump,
     fit_static_map,
+    held_by,
     jumps,
-    rms_ahead,
-    rms_of,
     settled_groups,
+    with_run_sigma,
 )
 from calib.stages.actuator.parameters import SUPPLY_V
 from calib.stages.actuator.pump import PWM_MAX, TICK_S
@@ -51,6 +51,7 @@ class PumpFound:
     ----------
     unit : of the values. records : recordings over time.
     fits, held : by model. asked : errors on recordings that were kept out on purpose, by model.
+    between : standard deviation of where a run settles about the fit, by model.
     maps : static maps. groups, departs, leaps : what is not explained.
     """
 
@@ -59,6 +60,7 @@ class PumpFound:
     fits: dict[str, PumpFit]
     held: dict[str, list[Held]]
     asked: dict[str, list[Held]]
+    between: dict[str, float]
     maps: tuple[StaticMap, ...]
     groups: tuple[Group, ...]
     departs: tuple[Departure, ...]
@@ -76,6 +78,23 @@ class PumpFound:
         """RMS over recordings that were not fitted, each counting alike; None without any."""
         some = [h.rms for h in self.held[model] if names is None or h.name in names]
         return float(np.sqrt(np.mean(np.square(some)))) if some else None
+
+    def settles(self, model: str) -> tuple[float, float, int, int] | None:
+        """Level, half its 95 % interval for a further run, and how many of the held runs end inside that
+        which the others give, of how many; None where fewer than three were held.
+
+        Three deviations hold 95 % of any distribution with one peak (Vysochanskij and Petunin 1980).
+        """
+        ends = [h.settles for h in self.held[model] if math.isfinite(h.settles)]
+        if len(ends) < _FEWEST_RUNS or "level" not in self.fits[model].sigma:
+            return None
+        inside = sum(
+            abs(end)
+            <= 3.0 * math.hypot(*(other for j, other in enumerate(ends) if j != k)) / math.sqrt(len(ends) - 1)
+            for k, end in enumerate(ends)
+        )
+        fit = self.fits[model]
+        return fit.values["level"], 3.0 * fit.sigma["level"], inside, len(ends)
 
     @property
     def better(self) -> str | None:
@@ -129,6 +148,7 @@ def identify_pump(
     fits: dict[str, PumpFit] = {}
     held: dict[str, list[Held]] = {}
     asked: dict[str, list[Held]] = {}
+    between: dict[str, float] = {}
     if records:
         shape = _chosen_shape(records, maps)
         for done, model in enumerate(MODELS):
@@ -136,14 +156,16 @@ def identify_pump(
                 progress(done, len(MODELS))
             fits[model] = fit_pump(records, model, shape)
             held[model] = cross_validate(fits[model], records)
+            fits[model], between[model] = with_run_sigma(fits[model], held[model])
             outside = [table.record for table in kept_out if table.record is not None]
-            asked[model] = [Held(r.name, rms_of(fits[model], r), rms_ahead(fits[model], r)) for r in outside]
+            asked[model] = [held_by(fits[model], r) for r in outside]
     return PumpFound(
         units.pop(),
         tuple(records),
         fits,
         held,
         asked,
+        between,
         tuple(maps),
         settled_groups(records) if records else (),
         departures(fits[ORIFICE], records) if records else (),
@@ -156,6 +178,7 @@ def identify_pump(
 # What was found of a pump, judged and as the section `pump` of rig.yaml.
 
 _MOST_SHARE = 0.05
+_FEWEST_RUNS = 3
 _MOST_VAGUE = 0.5
 _FREE = 1e5
 
@@ -219,6 +242,13 @@ def judge_pump(found: PumpFound) -> tuple[str, list[str], list[str]]:
             reasons.append(
                 f"{name} of the {better} is known to {100.0 * sigma / max(value, 1e-12):.0f} % only"
             )
+    settles = found.settles(better)
+    if settles is not None:
+        level, half, inside, count = settles
+        remarks.append(
+            f"a further run settles at {level:.1f} +- {half:.1f} {found.unit} at full PWM (95 %); "
+            f"of {count} runs that were held back {inside} end inside what the others give"
+        )
     if found.fits[LAG].shape.dead_pwm == 0.0:
         remarks.append(
             "dead zone and shape of the static map are not told by these recordings; it is taken as a "
@@ -259,6 +289,7 @@ def _model(found: PumpFound, name: str) -> PumpModel:
         fixed=fit.fixed,
         fitted_rms=fit.rms,
         held_rms=found.held_rms(name),
+        level_between_runs=finite_or_none(found.between[name]),
         held_rms_in_main_group=None if main is None else found.held_rms(name, main.names),
         held_by_file={h.name: h.rms for h in held},
         ahead_by_file={h.name: finite_or_none(h.ahead) for h in held},

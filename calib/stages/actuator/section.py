@@ -157,12 +157,18 @@ class Actuator(ActuatorParameters, Result):
 
 
 class PumpModel(Section):
-    """One model of the pump in a table: parameters with sigma, and errors on recordings not fitted."""
+    """One model of the pump in a table: parameters with sigma, and errors on recordings not fitted.
+
+    Attributes
+    ----------
+    level_between_runs : standard deviation of where runs settle about the level, which `sigma` has in it.
+    """
 
     parameters: dict[str, Number]
     sigma: dict[str, NotNegative | None]
     fixed: dict[str, str] = {}
     fitted_rms: NotNegative
+    level_between_runs: NotNegative | None = None
     held_rms: NotNegative | None = None
     held_rms_in_main_group: NotNegative | None = None
     held_by_file: dict[str, NotNegative] = {}
