@@ -513,6 +513,30 @@ def test_real_pictures_without_a_skew_get_none(shared_data: Path) -> None:
     assert LensModel.of(calibrate_camera(views.views, views.image_size_px).calibration) == LensModel("brown5")
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["gloworm_qvga", "opencv_left", "pv_charuco", "udacity_lane"])
+def test_halves_of_real_sets_differ_by_sigma(name: str, shared_data: Path) -> None:
+    """Parameters from one half of the views and the other, over the sigma of their difference."""
+    views = read_views([outside(shared_data / name)], Told(square_m=0.02) if name == "pv_charuco" else Told())
+    whole = calibrate_camera(views.views, views.image_size_px).calibration
+    observations, lens, z = whole.observations, LensModel.of(whole), []
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        order = rng.permutation(observations.views)
+        halves = [
+            calibrate(observations.select(part), views.image_size_px, lens.model, skew=lens.skew)
+            for part in np.array_split(order, 2)
+        ]
+        variance = [
+            np.diag(covariance(half, (residual_inflation(half) * half.sigma_px) ** 2).intrinsics)
+            for half in halves
+        ]
+        apart = (halves[0].block.intrinsics - halves[1].block.intrinsics)[whole.free]
+        z.append(apart / np.sqrt(variance[0] + variance[1]))
+    assert np.mean(np.abs(z) < 2.0) > 0.8
+    assert 0.5 < np.sqrt(np.median(np.square(z)) / 0.455) < 1.5
+
+
 def _twin(seed: int) -> tuple[Camera, list[View]]:
     """A camera like that of the shipped pictures, with a skew of a pixel, and corners of ten renderings."""
     rng = np.random.default_rng([seed, 16])

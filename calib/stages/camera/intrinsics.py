@@ -21,6 +21,7 @@ from calib.stages.camera.bundle import (
     equidistant_start,
     projection_sigma_px,
     refit_poses,
+    residual_inflation,
 )
 from calib.stages.camera.checks import best_of_starts, image_outline, lens_shape, screen, skew_left_out
 from calib.stages.camera.model import MODELS, Block, LeftOut, Observations, View, free_intrinsics, pack
@@ -437,7 +438,7 @@ class Intrinsics:
 
     Attributes
     ----------
-    calibration, covariance, judgement : the fit, its error bars, and the verdict on it.
+    calibration, covariance, judgement : the fit, its error bars by the scatter of the views, and the verdict.
     models, boards : what was compared on views held back; empty where nothing was.
     board : the board model used.
     left_out : files, views and points that are not used, and why.
@@ -606,14 +607,14 @@ def calibrate_camera(
     if fit.termination == "behind the camera":
         raise _no_camera(fit.observations, "a solution has points behind the camera")
     solved = time.perf_counter()
-    sigma = covariance(fit)
+    sigma = _by_the_views(fit)
     covered = time.perf_counter()
-    judgement = _judged(fit, sigma, findings)
+    judgement = _judged(fit, findings)
     if judgement.numbers.get("lowest_start_cost_share", 1.0) < _LOWER:
         better = best_of_starts(fit)
         if better is not fit:
-            fit, sigma = better, covariance(better)
-            judgement = _judged(fit, sigma, findings)
+            fit, sigma = better, _by_the_views(better)
+            judgement = _judged(fit, findings)
     judged = time.perf_counter()
     seconds = {"solve": solved - began, "covariance": covered - solved, "judge": judged - covered}
     return Intrinsics(fit, sigma, judgement, models, boards, board, tuple(not_used), seconds)
@@ -667,9 +668,18 @@ def _better_for_most(lens: str, models: Sequence[Candidate]) -> Candidate | None
     return best if far else None
 
 
-def _judged(fit: Calibration, sigma: Covariance, findings: Sequence[Finding]) -> Judgement:
+def _by_the_views(fit: Calibration) -> Covariance:
+    """The covariance by which the views really scatter.
+
+    Blur, print and lens leave errors that are smooth over a view, so that views disagree by more than the
+    noise of their corners would let them: two to three times as much on real pictures.
+    """
+    return covariance(fit, (residual_inflation(fit) * fit.sigma_px) ** 2)
+
+
+def _judged(fit: Calibration, findings: Sequence[Finding]) -> Judgement:
     try:
-        return judge(fit, sigma, findings=findings)
+        return judge(fit, covariance(fit), findings=findings)
     except (np.linalg.LinAlgError, ValueError, IndexError) as error:
         # Points that no camera sees on a flat board leave the checks without a linear system to solve.
         if fit.rms_px < _HOPELESS * max(fit.camera.image_size_px):

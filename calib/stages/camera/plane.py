@@ -437,7 +437,8 @@ class Plane:
     ----------
     R_CW, t_CW_m : (3, 3) and (3,), world to camera.
     A : (3, 3), homography (2.9) from metres to ideal pixels; s is the depth in metres.
-    covariance : (6, 6) of (rotation vector on the left, t) from the noise of the corners, rad and m.
+    covariance : (6, 6) of (rotation vector on the left, t), rad and m: from the noise of the corners and
+        from the intrinsics, where their covariance is known.
     rms_px, mean_error_px : reprojection error over all corners.
     rms_mm, mean_error_mm : distance on the plane between where corners are and where they are read.
     sigma_px : standard deviation of one pixel coordinate, from the residuals.
@@ -560,7 +561,7 @@ def calibrate_plane(
         R_CW=pose.R_CW,
         t_CW_m=pose.t_CW_m,
         A=camera.K @ np.column_stack([pose.R_CW[:, :2], pose.t_CW_m]),
-        covariance=pose.covariance,
+        covariance=_pose_covariance(pose, camera_covariance),
         rms_px=float(np.sqrt(np.mean(error_px**2))),
         mean_error_px=float(np.mean(error_px)),
         rms_mm=float(np.sqrt(np.mean(error_mm**2))),
@@ -577,6 +578,15 @@ def calibrate_plane(
         direct_difference_mm=_difference_mm(camera, pose, direct, sigma.points_m),
         verdict=verdict,
     )
+
+
+def _pose_covariance(pose: Pose, camera_covariance: FloatArray | None) -> FloatArray:
+    """Covariance (6, 6) of the pose: its own fit, and what it takes over from the intrinsics, E cov(c) E'."""
+    if camera_covariance is None:
+        return pose.covariance
+    if not np.all(np.isfinite(camera_covariance)):
+        return np.diag(np.full(6, np.inf))
+    return np.asarray(pose.covariance + pose.by_intrinsics @ camera_covariance @ pose.by_intrinsics.T)
 
 
 def _same_points(world_m: FloatArray) -> IntArray:
