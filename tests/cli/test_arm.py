@@ -28,6 +28,21 @@ def test_an_arm_is_identified_and_predicted(calib: Run, tmp_path: Path) -> None:
     assert float(ended.out.splitlines()[1].split()[1]) < 3.0
 
 
+def test_what_logs_without_commands_do_not_tell_is_named(calib: Run, tmp_path: Path) -> None:
+    names = []
+    for k in range(3):
+        path = written(tmp_path, simulated(f"a_{k}", k))
+        lines = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()]
+        left = [j for j, name in enumerate(lines[0]) if not name.startswith("p_cmd")]
+        path.write_text("\n".join(",".join(row[j] for j in left) for row in lines) + "\n", encoding="utf-8")
+        names.append(path.name)
+    ended = calib("identify", *names, "--no-compare", cwd=tmp_path)
+    assert ended.code == 0, ended.err
+    assert "leak_per_s: the prior's, these logs do not tell; it takes steps of the command" in ended.out
+    assert "held trials, angle from the pressure" in ended.out
+    assert "angle from the command" not in ended.out
+
+
 def test_what_is_stated_of_other_logs_and_rigs_without_an_arm_are_refused(calib: Run, tmp_path: Path) -> None:
     name = written(tmp_path, simulated("a_1", 1)).name
     ended = calib("identify", name, "--load", "z=1kg", cwd=tmp_path)

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from calib.core.arrays import FloatArray
 from calib.stages.arm.model import (
@@ -317,7 +317,7 @@ def half_width(errors: Sequence[float]) -> float:
     found = [x for x in errors if math.isfinite(x)]
     if len(found) < 2:
         return math.nan
-    return float(student.ppf(0.975, len(found))) * math.sqrt(sum(x * x for x in found) / len(found))
+    return float(stdtrit(len(found), 0.975)) * math.sqrt(sum(x * x for x in found) / len(found))
 
 
 def _coverage(trials: Sequence[Trial], held: Mapping[str, Fit], errors: Mapping[str, Held]) -> float:
@@ -395,5 +395,5 @@ def gained(found: Identification, baseline: str, quantity: str) -> tuple[float, 
     if not len(less):
         return math.nan, math.nan
     n = len(less)
-    half = float(student.ppf(0.975, n - 1)) * float(less.std(ddof=1)) / math.sqrt(n) if n > 1 else math.nan
+    half = float(stdtrit(n - 1, 0.975)) * float(less.std(ddof=1)) / math.sqrt(n) if n > 1 else math.nan
     return float(less.mean()) / mean, half / mean

@@ -216,9 +216,12 @@ def _untold(found: Identification) -> Iterator[Finding]:
         for p, s in zip(PARAMETERS, found.fit.sigma.tolist(), strict=True)
         if s > _UNTOLD and p.name not in off
     ]
-    for one in untold:
+    if untold:
+        takes = dict.fromkeys(one.identified_by for one in untold)
         yield Finding(
-            "remark", f"{one.name} is the prior's, these logs do not tell it: it takes {one.identified_by}"
+            "remark",
+            f"{', '.join(one.name for one in untold)}: the prior's, these logs do not tell; it takes "
+            f"{', '.join(takes)}",
         )
     if "load" not in found.fit.assembly.parts:
         yield Finding(
