@@ -6,12 +6,14 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
-from estimatorlogs import SCENARIOS, varied
+from estimatorlogs import NOISE, SCENARIOS, rows_from, truth, truth_of_sensors, varied
 
 from calib.core.arrays import FloatArray
 from calib.io.logs import Log
 from calib.stages.actuator.parameters import Creep
 from calib.stages.actuator.pump import Orifice, RateLimit
+from calib.stages.estimator.kinematic import Rows
+from calib.stages.estimator.sensors import SIZE, accelerometer, marker, view_coefficients
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.simulate import log_of
@@ -57,3 +59,33 @@ def driven_log(name: str, seed: int = 0, orifice: bool = False) -> tuple[Simulat
 def commands_of(log: Log) -> FloatArray:
     """Commands (n, 2) of a log."""
     return np.stack([log.columns["pwm1"], log.columns["pwm2"]], axis=1)
+
+
+def held_log(seed: int, held_s: float) -> tuple[SimulatedRig, Rows, FloatArray, FloatArray]:
+    """A rig whose head is held at 0.5 rad and let go at a time: rows, commands (n, 2), true q1, q2, phi."""
+    rig, log = driven_log("swing", seed)
+    rows, true, rng = rows_from(log), truth(log), np.random.default_rng(seed)
+    state, spare = np.zeros(SIZE), (np.empty(SIZE), np.empty(SIZE))
+    state[6:] = truth_of_sensors(rig)
+    state[0], state[1], state[13] = true[0, 2], true[0, :2].mean(), 0.0
+    view = rig.view
+    seen = marker(view_coefficients(view.camera, view.R_CW, view.t_CW_m), state, *spare)
+    felt = (*accelerometer(9.81, 0.0, state, *spare), state[6])
+    camera_s, imu_s = np.arange(0.0, held_s, 1.0 / 60.0), np.arange(0.0003, held_s, 1.0 / rig.imu.rate_hz)
+    readings = np.full((len(camera_s) + len(imu_s), 5), np.nan)
+    readings[: len(camera_s), :2] = np.round(seen + rng.normal(0.0, NOISE[0], (len(camera_s), 2)))
+    readings[len(camera_s) :, 2:] = felt + NOISE[2:5] * rng.standard_normal((len(imu_s), 3))
+    t, kinds = np.concatenate([camera_s, imu_s]), np.repeat([1, 2], [len(camera_s), len(imu_s)])
+    order = np.argsort(t, kind="stable")
+    pwm = np.where(kinds[order, None] == 1, 0.0, np.nan) * np.ones(2)
+    whole = Rows(
+        np.concatenate([t[order], rows.t_s + held_s]),
+        np.concatenate([readings[order], rows.readings]),
+        np.concatenate([kinds[order], rows.kinds]),
+    )
+    return (
+        rig,
+        whole,
+        np.concatenate([pwm, commands_of(log)]),
+        np.concatenate([np.tile(true[0], (len(t), 1)), true]),
+    )

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drivenlogs import commands_of, driven_log, varied_drive
+from drivenlogs import commands_of, driven_log, held_log, varied_drive
 from estimatorlogs import rows_from, setup_for, simulated, truth
 from identifytrials import rig_file
 
-from calib.core.arrays import FloatArray
+from calib.core.arrays import BoolArray, FloatArray
 from calib.core.rig import Rig
 from calib.io.logs import write_log
 from calib.stages.actuator.dynamics import coefficients
@@ -42,6 +42,7 @@ from calib.stages.estimator.driven import (
     longest_step_s,
     measure,
     new_handover,
+    pass_on,
     smooth_both,
     weigh,
 )
@@ -121,6 +122,60 @@ def test_a_head_that_is_held_and_let_go_is_found_again() -> None:
     late = log.t_s > 2.0
     error = 1e3 * (out[late, 1] - truth(log)[late, 0])
     assert np.sqrt(np.mean(error**2)) < 0.3
+
+
+def _rms_deg(out: FloatArray, true: FloatArray, some: BoolArray) -> float:
+    return float(np.degrees(np.sqrt(np.mean((out[some, 5] - true[some, 2]) ** 2))))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_head_that_is_let_go_is_followed_from_there(seed: int) -> None:
+    """The gyroscope moves most where the model has nothing that moves it."""
+    rig, rows, pwm, true = held_log(seed, 3.0)
+    setup = setup_for(rig, seed)
+    filtered = DrivenFilter(setup, Drive()).run(rows, pwm)
+    smoothed = driven_smoother.smooth_driven(setup, Drive(), rows, pwm, filtered)
+    held, first = (rows.t_s > 1.0) & (rows.t_s < 3.0), (rows.t_s > 3.03) & (rows.t_s < 4.0)
+    for out in (filtered, smoothed):
+        assert _rms_deg(out, true, held) < 0.15
+        assert _rms_deg(out, true, first) < 0.25
+        assert _rms_deg(out, true, rows.t_s > 4.0) < 0.05
+    assert np.nansum(filtered[first, OUT.index("gated_gyro")]) < 6.0
+    assert not (filtered[rows.t_s > 1.0, OUT.index("flags")].astype(int) & 1).any()
+
+
+def test_two_wrong_samples_of_the_gyroscope_are_no_hand() -> None:
+    rig, log = driven_log("ellipse", 1)
+    rows, pwm, setup = rows_from(log), commands_of(log), setup_for(rig, 1)
+    readings = rows.readings.copy()
+    wrong = np.nonzero((rows.kinds == 2) & (rows.t_s > 5.0))[0][:2]
+    readings[wrong, 2:] += np.array([[3.0, -2.0, 4.0], [-2.0, 4.0, 3.0]])
+    plain = DrivenFilter(setup, Drive()).run(rows, pwm)
+    out = DrivenFilter(setup, Drive()).run(replace(rows, readings=readings), pwm)
+    assert (out[wrong, OUT.index("gated_gyro")] == 1.0).all()
+    np.testing.assert_allclose(out[:, 1:3], plain[:, 1:3], atol=5e-5)
+    np.testing.assert_allclose(out[:, 5], plain[:, 5], atol=2e-3)
+
+
+def test_the_transition_over_a_release_is_that_of_the_whole_step() -> None:
+    plant, switches = Drive().numbers(), (np.array([-np.inf]), np.array([[1.5, 0.2]]))
+    x, x0, P0 = some_state(2), np.zeros(len(DRIVEN)), np.diag(np.full(len(DRIVEN), 1e-4))
+    x[10:12] = 0.3, -0.2
+
+    def passed(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        y, P, F = x.copy(), P0.copy(), np.zeros((DYNAMIC, INVOLVED))
+        pass_on(y, P, 0.0, 0.01, 0.004, x0, P0, plant, np.zeros(len(DRIVEN)), *switches, 0, F, np.zeros(WORK))
+        return y, P, F
+
+    y, P, F = passed(x)
+    assert (y[10:12] == 0.0).all() and (P == P.T).all()
+    for k in range(INVOLVED):
+        h = 1e-6 if k in (1, 19) else 1e-4
+        up, down = x.copy(), x.copy()
+        up[k] += h
+        down[k] -= h
+        slope = (passed(up)[0] - passed(down)[0])[:DYNAMIC] / (2.0 * h)
+        assert (np.abs(F[:, k] - slope) < 1e-3 * np.abs(F).max(axis=1) + 1e-9).all()
 
 
 def test_a_start_at_an_outlier_does_not_lock_it_out() -> None:

@@ -96,7 +96,7 @@ def _coefficients(plant: FloatArray, x: FloatArray) -> Coefficients:
     return Coefficients(
         plant[0] * _factor(x[20]), plant[1], plant[2], plant[3] + x[19],
         plant[4] * scale, plant[5] * scale, plant[6] * scale, plant[7] * scale,
-        plant[8] * math.exp(min(x[13], 3.0)) / math.sqrt(scale), plant[9] * _factor(x[14]),
+        plant[8] * math.exp(x[13]) / math.sqrt(scale), plant[9] * _factor(x[14]),
         plant[10] * _factor(x[22]), plant[11] * _factor(x[21]), plant[12],
         plant[13], plant[14], int(plant[15]), int(plant[16]),
     )  # fmt: skip
@@ -366,8 +366,8 @@ LONGEST_S = 0.02
 """Longer steps are taken in parts."""
 
 SIZE_D = len(DRIVEN)
-WORK = (25, SIZE_D)
-"""Shape of the scratch: p, x0, three gradients, terms, segments, accelerations, F P, and what is learnt."""
+WORK = (25 + DYNAMIC, SIZE_D)
+"""Shape of the scratch: p, x0, gradients, terms, segments, accelerations, F P, what is learnt, and F."""
 
 TRACE = 2 * SIZE_D + 2
 """Length of what a reading leaves; the last number is 0 where there was none."""
@@ -375,6 +375,8 @@ TRACE = 2 * SIZE_D + 2
 _TELLING = 9.0
 _MARGIN_PX2 = 0.25
 _SWING_RADPS = 25.0
+_MOST_DAMPED = 1.1
+"""Limit of `log_damping`, three times the damping that is known: a head that is held is not in honey."""
 _KNOWN_MPS = 3e-3
 """The accelerometer is left out until the length's rate is known so well."""
 SETTLING_S = 0.3
@@ -394,13 +396,13 @@ def copy_state(to_x: FloatArray, to_P: FloatArray, x: FloatArray, P: FloatArray)
 
 
 @compiled()
-def _consider(x: FloatArray, P: FloatArray, plant: FloatArray, learnt: FloatArray) -> None:
+def _consider(x: FloatArray, P: FloatArray, learnt: FloatArray) -> None:
     """Which entries of a state (36,) readings change: 1, and 0 for what is considered and not learnt.
 
     Considered is the geometry: lever, marker offset, shift and stretch of the plane. So is what multiplies a
     quantity that may be none: the product of both errors would pass for knowledge. At rest the damping went
     to seven times its value and the stiffness 30 % up, both sure of it. Of a head that does not move these
-    are damping, mass and creep; stiffness, bending and pumps, too, where nothing stretches the bellows.
+    are damping, mass and creep; stiffness, bending and pumps, too, where no pump holds it.
     """
     for k in range(x.shape[0]):
         learnt[k] = 1.0
@@ -408,8 +410,8 @@ def _consider(x: FloatArray, P: FloatArray, plant: FloatArray, learnt: FloatArra
     if x[2] * x[2] > _TELLING * P[2, 2] or x[3] * x[3] > _TELLING * P[3, 3]:
         return
     learnt[13], learnt[20], learnt[21], learnt[22] = 0.0, 0.0, 0.0, 0.0
-    stretch = abs(x[1] - plant[3] - x[19]) + plant[2] * abs(x[0])
-    if stretch * stretch < _TELLING * (P[1, 1] - 2.0 * P[1, 19] + P[19, 19]):
+    pumped = x[8] + x[9]
+    if pumped * pumped < _TELLING * (P[10, 10] + P[11, 11]):
         learnt[12], learnt[14], learnt[15], learnt[16], learnt[17], learnt[18] = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
 
 
@@ -611,7 +613,7 @@ def driven_event(
     stamp = max(noise[6 if kind == CAMERA else 7] ** 2, z[3])
     H, p, out, e = work[2:5], work[0], work[5], work[10]
     learnt = work[24]
-    _consider(x, P, plant, learnt)
+    _consider(x, P, learnt)
     if kind == HOSES:
         for k in range(x.shape[0]):
             H[0, k], p[k] = 0.0, P[k, 13]
@@ -674,6 +676,7 @@ def driven_event(
             log_l -= 0.5 * (y * y / S + math.log(2.0 * math.pi * S))
             _update(x, P, y, S, p, learnt)
             _leave(trace, order, H[k], p, y, S)
+    x[13] = min(x[13], _MOST_DAMPED)
     report[11] = log_l
 
 
@@ -688,10 +691,15 @@ assert SIZE_D == 36
 # it
 # are done again. A command acts `delay_s` after the tick that gave it, so it is known in time.
 #
-# The first command that is not zero says that the hoses are on (`HOSES`); until then the damping may be
-# that of either. When most readings are rejected for a tenth of a second, time jumps, or the state leaves
-# the
-# model, the filter starts again from the next picture: somebody may have held the head, or let it go.
+# The first command that is not zero says that the hoses are on (`HOSES`); until then the damping may be that
+# of either. When most readings are rejected for a tenth of a second, time jumps, or the state leaves the
+# model, the filter starts again from the next picture.
+#
+# Somebody may hold the head, which the disturbance forces then do, and let it go. A sample of which neither
+# gyroscope nor accelerometer agrees with the model is wrong, or comes after a release; the next one tells.
+# Where it disagrees as well and is another one, as that of a gyroscope in saturation is not, the events since
+# the last sample before the two are done again with a release at the time that the first of the two tells.
+# Where both gyroscope readings then agree it was one, else all is as it was.
 
 _LOCKED_OUT = 5.5
 """So many pictures rejected, IMU readings twice so many, and the filter starts again."""
@@ -699,7 +707,9 @@ _BEFORE_S = 0.03
 FASTEST_MPS = 1.0
 """No rig's bellows change their lengths faster: a swing from 0.7 rad reaches a quarter of it."""
 _LOST_N = 0.5
-"""Deviation of lag, force and creep after a restart: a third of what a pump can do."""
+"""Deviation of forces after a restart: a third of what a pump can do."""
+_LET_GO_RADPS = 0.3
+"""What the head's rate is off by where it is let go at a time that one sample of the gyroscope tells."""
 _LAST, _REJECTED, _FIRST, _REJECTED_IMU, _BEGUN = range(5)
 _NEWEST, _COUNT, _STARTED, _PENDING, _SWITCH, _HOSES = range(6)
 _SWITCHES = 128
@@ -728,12 +738,12 @@ def write_row(x: FloatArray, P: FloatArray, dt: float, radius: float, out: Float
 @compiled()
 def begin_again(
     x: FloatArray, P: FloatArray, x0: FloatArray, P0: FloatArray, view: FloatArray, u: float, v: float,
-    again: bool, g1: float, g2: float,
+    again: bool, driven: bool, g1: float, g2: float,
 ) -> bool:  # fmt: skip
     """Start a state (36,) from its prior and a picture; what has been learnt may be wrong and goes.
 
-    A log begins at rest. In its middle, `again`, the forces may be anything, most likely the static ones of
-    the last command, g1 and g2 [N].
+    A log begins at rest. In its middle, `again`, the forces may be anything: those of the pumps, most likely
+    the static ones of the last command, g1 and g2 [N], or where nothing was `driven` yet those of a hand.
     """
     phi, length, found = invert_marker(view, x0[INVOLVED:], u, v, 0.0, x0[1])
     if not (found and 0.2 * x0[1] < length < 3.0 * x0[1]):
@@ -742,9 +752,73 @@ def begin_again(
     x[0], x[1] = phi, length
     if again:
         x[6], x[7], x[8], x[9] = g1, g2, g1, g2
-        for i in range(4, 10):
+        for i in range(4 if driven else 10, 10 if driven else DYNAMIC):
             P[i, i] = _LOST_N * _LOST_N
     return True
+
+
+@compiled()
+def contradicted(z: FloatArray, gated: FloatArray) -> bool:
+    """Whether a sample's gyroscope contradicts a state and its accelerometer does not support it."""
+    return bool(not math.isnan(z[2]) and gated[1] == 1.0 and gated[2] == 1.0)
+
+
+@compiled()
+def let_go_time(
+    x: FloatArray, g_z: float, begin: float, end: float, plant: FloatArray, work: FloatArray
+) -> float:
+    """When, between two times, a head of this state was let go that turns at the end as a sample says."""
+    own1, own2 = x[10], x[11]
+    x[10], x[11] = 0.0, 0.0
+    ddphi, _ = accelerations(plant, x, work[8], work[9])
+    x[10], x[11] = own1, own2
+    turned = (x[23] - g_z) / (1.0 + x[27]) - x[2]
+    since = turned / ddphi if ddphi * turned > 0.0 else 0.0
+    return float(end - min(since, end - begin))
+
+
+@compiled()
+def pass_on(
+    x: FloatArray, P: FloatArray, begin: float, end: float, let_go_s: float, x0: FloatArray, P0: FloatArray,
+    plant: FloatArray, walk: FloatArray, switch_t: FloatArray, switch_g: FloatArray, last: int,
+    F: FloatArray, work: FloatArray,
+) -> None:  # fmt: skip
+    """`predict_driven` for a head that is let go at a time between, or NaN; F (12, 23) is that of the whole.
+
+    What held it were the disturbance forces. They are as at the beginning of a log from then on.
+    """
+    if math.isnan(let_go_s):
+        predict_driven(x, P, begin, end, plant, walk, switch_t, switch_g, last, F, work)
+        return
+    held, row = work[25:], work[0]
+    _stand(F)
+    predict_driven(x, P, begin, let_go_s, plant, walk, switch_t, switch_g, last, F, work)
+    for i in range(DYNAMIC):
+        for j in range(INVOLVED):
+            held[i, j] = F[i, j] if i < 10 else 0.0
+    for i in range(10, DYNAMIC):
+        for j in range(x.shape[0]):
+            P[i, j], P[j, i] = 0.0, 0.0
+    for i in range(10, DYNAMIC):
+        x[i], P[i, i] = x0[i], P0[i, i]
+    P[2, 2] += _LET_GO_RADPS * _LET_GO_RADPS
+    _stand(F)
+    predict_driven(x, P, let_go_s, end, plant, walk, switch_t, switch_g, last, F, work)
+    for i in range(DYNAMIC):
+        for j in range(INVOLVED):
+            row[j] = F[i, j] if j >= DYNAMIC else 0.0
+            for k in range(DYNAMIC):
+                row[j] += F[i, k] * held[k, j]
+        for j in range(INVOLVED):
+            F[i, j] = row[j]
+
+
+@compiled()
+def _stand(F: FloatArray) -> None:
+    """The transition (12, 23) of no time."""
+    for i in range(DYNAMIC):
+        for j in range(INVOLVED):
+            F[i, j] = 1.0 if i == j else 0.0
 
 
 @compiled()
@@ -761,7 +835,8 @@ def sound(x: FloatArray, P: FloatArray, radius: float) -> bool:
 def run_driven(
     t: FloatArray, readings: FloatArray, kinds: IntArray, forces: FloatArray, driven: FloatArray,
     ring_x: FloatArray, ring_P: FloatArray, ring_t: FloatArray, ring_z: FloatArray, ring_kind: IntArray,
-    ring_gated: FloatArray, switch_t: FloatArray, switch_g: FloatArray, whole: IntArray, real: FloatArray,
+    ring_gated: FloatArray, ring_let_go: FloatArray, switch_t: FloatArray, switch_g: FloatArray,
+    whole: IntArray, real: FloatArray,
     camera_clock: FloatArray, imu_clock: FloatArray, x0: FloatArray, P0: FloatArray, plant: FloatArray,
     walk: FloatArray, view: FloatArray, constants: FloatArray, noise: FloatArray, radius: float,
     delay: float, action: float, hoses_sigma: float, z: FloatArray, report: FloatArray, spare: FloatArray,
@@ -842,51 +917,85 @@ def run_driven(
                 ring_t[to], ring_kind[to] = ring_t[since], ring_kind[since]
                 for k in range(4):
                     ring_z[to, k] = ring_z[since, k]
+                ring_let_go[to] = ring_let_go[since]
                 for k in range(3):
                     ring_gated[to, k] = ring_gated[since, k]
             own = (newest + 1 - back) % size
-            ring_t[own], ring_kind[own] = when, kind
+            ring_t[own], ring_kind[own], ring_let_go[own] = when, kind, math.nan
+            if back > 0 and ring_let_go[(own + 1) % size] < when:
+                ring_let_go[own], ring_let_go[(own + 1) % size] = ring_let_go[(own + 1) % size], math.nan
             for k in range(4):
                 ring_z[own, k] = z[k]
             # Who holds the head until the log begins is not in the model.
             begin = (kind == CAMERA and (whole[_STARTED] == 0 or whole[_PENDING] == 1)
                      and when > real[_FIRST] + _BEFORE_S)  # fmt: skip
-            for i in range(back + 1):
-                now = (newest + 1 - back + i) % size
-                before = (now - 1) % size
-                x, P = ring_x[now], ring_P[now]
-                copy_state(x, P, ring_x[before], ring_P[before])
-                if whole[_STARTED] == 1:
-                    predict_driven(
-                        x, P, ring_t[before], ring_t[now], plant, walk, switch_t, switch_g, whole[_SWITCH],
-                        F, work,
-                    )  # fmt: skip
-                if i == 0 and begin and begin_again(
-                    x, P, x0, P0, view, z[0], z[1], not math.isnan(real[_BEGUN]),
-                    switch_g[whole[_SWITCH], 0], switch_g[whole[_SWITCH], 1],
-                ):  # fmt: skip
+            # Done again where two samples say that the head was let go, and once more where it was not.
+            first, trial, suspect = back, 0, 0
+            while True:
+                for i in range(first + 1):
+                    now = (newest + 1 - first + i) % size
+                    before = (now - 1) % size
+                    x, P = ring_x[now], ring_P[now]
+                    copy_state(x, P, ring_x[before], ring_P[before])
                     if whole[_STARTED] == 1:
+                        pass_on(
+                            x, P, ring_t[before], ring_t[now], ring_let_go[now], x0, P0, plant, walk,
+                            switch_t, switch_g, whole[_SWITCH], F, work,
+                        )  # fmt: skip
+                    if now == own and begin and begin_again(
+                        x, P, x0, P0, view, z[0], z[1], not math.isnan(real[_BEGUN]), whole[_HOSES] == 1,
+                        switch_g[whole[_SWITCH], 0], switch_g[whole[_SWITCH], 1],
+                    ):  # fmt: skip
+                        if whole[_STARTED] == 1:
+                            flags |= 1
+                        whole[_STARTED], whole[_PENDING] = 1, 0
+                        real[_BEGUN] = ring_t[now]
+                        if whole[_HOSES] == 1:
+                            x[13], P[13, 13] = 0.0, hoses_sigma * hoses_sigma
+                    if ring_kind[now] == IMU and ring_t[now] < real[_BEGUN] + SETTLING_S:
+                        ring_z[now, 0], ring_z[now, 1], ring_gated[now, 1] = math.nan, math.nan, 1.0
+                    if (whole[_STARTED] == 0 and ring_kind[now] != HOSES) or ring_kind[now] == 0:
+                        for k in range(12 if now == own else 0):
+                            report[k] = math.nan
+                        for k in range(3):
+                            ring_gated[now, k] = 1.0
+                        continue
+                    driven_event(
+                        x, P, ring_kind[now], ring_z[now], plant, view, constants, noise, work,
+                        now != own and trial == 0, report if now == own else spare, ring_gated[now],
+                        untraced,
+                    )  # fmt: skip
+                    if not sound(x, P, radius):
+                        copy_state(x, P, x0, P0)
+                        whole[_PENDING] = 1
                         flags |= 1
-                    whole[_STARTED], whole[_PENDING] = 1, 0
-                    real[_BEGUN] = ring_t[now]
-                    if whole[_HOSES] == 1:
-                        x[13], P[13, 13] = 0.0, hoses_sigma * hoses_sigma
-                if ring_kind[now] == IMU and ring_t[now] < real[_BEGUN] + SETTLING_S:
-                    ring_z[now, 0], ring_z[now, 1], ring_gated[now, 1] = math.nan, math.nan, 1.0
-                if (whole[_STARTED] == 0 and ring_kind[now] != HOSES) or ring_kind[now] == 0:
-                    for k in range(12):
-                        report[k] = math.nan
-                    for k in range(3):
-                        ring_gated[now, k] = 1.0
-                    continue
-                driven_event(
-                    x, P, ring_kind[now], ring_z[now], plant, view, constants, noise, work, i > 0,
-                    report if i == 0 else spare, ring_gated[now], untraced,
-                )  # fmt: skip
-                if not sound(x, P, radius):
-                    copy_state(x, P, x0, P0)
-                    whole[_PENDING] = 1
-                    flags |= 1
+                if trial == 0 and back == 0 and kind == IMU and when > real[_BEGUN] + SETTLING_S:
+                    # The sample before contradicts, too; since the one before that the head was let go.
+                    suspect, since = 0, 0
+                    for i in range(1, whole[_COUNT] - 1 if contradicted(ring_z[own], ring_gated[own]) else 1):
+                        now = (own - i) % size
+                        if ring_kind[now] != IMU:
+                            continue
+                        if suspect > 0:
+                            since = i
+                        if suspect > 0 or not contradicted(ring_z[now], ring_gated[now]):
+                            break
+                        suspect = i
+                    if since == 0 or ring_z[(own - suspect) % size, 2] == ring_z[own, 2]:
+                        break
+                    trial, first, before, now = 1, since - 1, (own - since) % size, (own - suspect) % size
+                    at = let_go_time(ring_x[before], ring_z[now, 2], ring_t[before], ring_t[now], plant, work)
+                    for i in range(suspect, since):
+                        now = (own - i) % size
+                        if ring_t[(now - 1) % size] <= at:
+                            ring_let_go[now] = at
+                            break
+                elif trial == 1 and ring_gated[(own - suspect) % size, 2] + ring_gated[own, 2] > 0.0:
+                    trial = 2
+                    for i in range(first + 1):
+                        ring_let_go[(own - i) % size] = math.nan
+                else:
+                    break
             whole[_NEWEST] = (newest + 1) % size
             whole[_COUNT] = min(whole[_COUNT] + 1, size)
             if kind == HOSES or kind == 0:
@@ -935,6 +1044,7 @@ class DrivenFilter:
         n = len(DRIVEN)
         self._x, self._P = np.zeros((size, n)), np.zeros((size, n, n))
         self._t, self._z, self._gated = np.zeros(size), np.zeros((size, 4)), np.zeros((size, 3))
+        self._let_go = np.full(size, np.nan)
         self._kind, self._whole = np.zeros(size, dtype=np.int64), np.zeros(6, dtype=np.int64)
         self._real = np.full(5, np.nan)
         self._switch_t, self._switch_g = np.full(_SWITCHES, -np.inf), np.zeros((_SWITCHES, 2))
@@ -955,7 +1065,8 @@ class DrivenFilter:
         driven = np.asarray(np.nan_to_num(pwm).max(axis=1, initial=0.0), dtype=np.float64)
         run_driven(
             rows.t_s, rows.readings, rows.kinds, commands(drive, pwm), driven, self._x, self._P, self._t,
-            self._z, self._kind, self._gated, self._switch_t, self._switch_g, self._whole, self._real,
+            self._z, self._kind, self._gated, self._let_go, self._switch_t, self._switch_g, self._whole,
+            self._real,
             self._camera_clock, self._imu_clock, *self._start, self._numbers, self._walk, setup.view,
             np.array([setup.gravity_mps2, setup.lever_across_m]), self._noise, setup.bellows_radius_m,
             self._delay, drive.pump.delay_ticks * drive.pump.tick_s, drive.sigma[1], *self._scratch, out,
@@ -1009,11 +1120,17 @@ def _forward(
     """The filter over events, keeping what is shown; state and counters after the event `keep` are left."""
     work, report, gated = np.zeros(WORK), np.empty(12), np.zeros(3)
     own_x, own_P, counters, marks = x.copy(), P.copy(), rejected.copy(), whole.copy()
-    last = 0
-    for k in range(len(t)):
+    good_x, good_P, good_counters, good_marks = x.copy(), P.copy(), rejected.copy(), whole.copy()
+    # The last sample that does not contradict, the next one, whether a release between is tried, and refused.
+    good, suspect, trial, agrees, let_go_s = -1, -1, 0, False, math.nan
+    last, k = 0, 0
+    while k < len(t):
         begin = t[k - 1] if k else before_s
         while last < len(switch_t) - 1 and switch_t[last + 1] <= t[k]:
             last += 1
+        while last > 0 and switch_t[last] > t[k]:
+            last -= 1
+        kind, z = kinds[k], readings[k]
         F[k] = 0.0
         chained[k] = False
         trace[k, :, TRACE - 1] = 0.0
@@ -1021,32 +1138,17 @@ def _forward(
             whole[_SMOOTHER_STARTED], whole[_SMOOTHER_PENDING] = 0, 0
             rejected[:2] = 0.0
         if whole[_SMOOTHER_STARTED] == 1:
-            for i in range(DYNAMIC):
-                F[k, i, i] = 1.0
-            predict_driven(x, P, begin, t[k], plant, walk, switch_t, switch_g, last, F[k], work)
+            now_s = let_go_s if trial == 1 and begin <= let_go_s < t[k] else math.nan
+            _stand(F[k])
+            pass_on(x, P, begin, t[k], now_s, x0, P0, plant, walk, switch_t, switch_g, last, F[k], work)
             chained[k] = True
-        kind, z = kinds[k], readings[k]
         if kind == HOSES:
             whole[_SMOOTHER_HOSES] = 1
-        waits = (whole[_SMOOTHER_STARTED] == 0 or whole[_SMOOTHER_PENDING] == 1) and t[
-            k
-        ] > first_s + _SMOOTHER_BEFORE_S
-        if (
-            waits
-            and kind == CAMERA
-            and begin_again(
-                x,
-                P,
-                x0,
-                P0,
-                view,
-                z[0],
-                z[1],
-                not math.isnan(rejected[2]),
-                switch_g[last, 0],
-                switch_g[last, 1],
-            )
-        ):
+        waits = whole[_SMOOTHER_STARTED] == 0 or whole[_SMOOTHER_PENDING] == 1
+        if waits and kind == CAMERA and t[k] > first_s + _SMOOTHER_BEFORE_S and begin_again(
+            x, P, x0, P0, view, z[0], z[1], not math.isnan(rejected[2]), whole[_SMOOTHER_HOSES] == 1,
+            switch_g[last, 0], switch_g[last, 1],
+        ):  # fmt: skip
             whole[_SMOOTHER_STARTED], whole[_SMOOTHER_PENDING] = 1, 0
             chained[k] = False
             rejected[2] = t[k]
@@ -1068,11 +1170,34 @@ def _forward(
             elif rejected[0] > _SMOOTHER_LOCKED_OUT or rejected[1] > 2.0 * _SMOOTHER_LOCKED_OUT:
                 whole[_SMOOTHER_PENDING] = 1
                 rejected[:2] = 0.0
+            if kind == IMU:
+                bad = contradicted(z, gated) and t[k] > rejected[2] + SETTLING_S
+                before = trial
+                if trial == 1:
+                    if k == suspect:
+                        agrees = gated[2] == 0.0
+                    else:
+                        trial = 0 if agrees and gated[2] == 0.0 else 2
+                elif trial == 2:
+                    trial = 0
+                elif bad and suspect >= 0 and readings[suspect, 2] != z[2]:
+                    trial = 1
+                    let_go_s = let_go_time(good_x, readings[suspect, 2], t[good], t[suspect], plant, work)
+                elif bad and suspect < 0 and good >= 0:
+                    suspect = k
+                if trial > before:
+                    k = good + 1
+                    x[:], P[:], rejected[:], whole[:] = good_x, good_P, good_counters, good_marks
+                    continue
+                if k != suspect or before == 2:
+                    good, suspect = k, -1
+                    good_x[:], good_P[:], good_counters[:], good_marks[:] = x, P, rejected, whole
         for i in range(len(_SHOWN)):
             kept_x[k, i], kept_P[k, i] = x[_SHOWN[i]], P[_SHOWN[i]]
         alive[k] = whole[_SMOOTHER_STARTED] == 1
         if k == keep:
             own_x[:], own_P[:], counters[:], marks[:] = x, P, rejected, whole
+        k += 1
     x[:], P[:], rejected[:], whole[:] = own_x, own_P, counters, marks
 
 
