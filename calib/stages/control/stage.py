@@ -318,14 +318,19 @@ def _check_words(checked: Checked) -> list[Block]:
     from calib.stages.control.tuning import largest_angle, longest_m
 
     found, reference = checked.follow, checked.reference
+    rise, fall = found.fastest_rise_N_per_s, found.fastest_fall_N_per_s
+    moved = f"forces rise by up to {rise:.3g} N/s and fall by up to {abs(fall):.3g} N/s"
+    forces = moved if rise or fall else "forces are held"
+    start = (
+        f"the start takes {found.approach_s:.2f} s from rest"
+        if math.isfinite(found.approach_s)
+        else "the start is beyond their reach"
+    )
     return [
-        Line(
-            f"{reference.name}: {reference.duration_s:g} s; forces rise by up to "
-            f"{found.fastest_rise_N_per_s:.3g} N/s and fall by up to {found.fastest_fall_N_per_s:.3g} N/s"
-        ),
+        Line(f"{reference.name}: {reference.duration_s:g} s; {forces}"),
         Line(
             f"the pumps reach {1e3 * longest_m(checked.model):.2f} mm straight and "
-            f"{largest_angle(checked.model):.3f} rad bent; the start takes {found.approach_s:.2f} s from rest"
+            f"{largest_angle(checked.model):.3f} rad bent; {start}"
         ),
         *of_verdict(checked.verdict),
     ]
