@@ -21,6 +21,7 @@ from calib.stages.camera.checks import (
     best_next_view,
     best_split,
     evidence,
+    focal_interval,
     misfit,
     overdispersion,
     screen,
@@ -30,9 +31,18 @@ from calib.stages.camera.checks import (
 )
 from calib.stages.camera.corners import detect
 from calib.stages.camera.intrinsics import Choices, calibrate_camera
-from calib.stages.camera.model import MODELS, Board, Camera, View, one_to_one_reach, pack
+from calib.stages.camera.model import (
+    MODELS,
+    Board,
+    Camera,
+    LeftOut,
+    View,
+    camera_from_vector,
+    one_to_one_reach,
+    pack,
+)
 from calib.stages.camera.pose import fit_pose
-from calib.stages.camera.verdict import Judgement, judge
+from calib.stages.camera.verdict import Judgement, judge, of_leaving
 from calib.twin.pictures import BOARD, CAMERA
 from calib.twin.scene import Pose, PrintedBoard, render
 from synthetic import views_of
@@ -490,6 +500,45 @@ def _advice(fit: Calibration) -> Candidate:
     assert found is not None
     assert 0.0 < found.remaining < 1.0
     return found
+
+
+def test_what_matters_to_no_pixel_is_no_finding() -> None:
+    """Corners to three thousandths of a pixel tell changes that nobody would see."""
+    rng, camera = np.random.default_rng(4), camera_of()
+    other = replace(camera, fx_px=1.0003 * camera.fx_px, fy_px=1.0003 * camera.fy_px)
+    exact = Recipe(noise_px=0.003)
+    views = take(rng, camera, 15, recipe=exact) + take(rng, other, 15, recipe=exact, prefix="w")
+    wide = _prepared(calibrate(pack(views), (640, 480), "radial2"))
+    change = best_change(wide)
+    assert change is not None and change.ratio > 1.3 and change.apart_px < 0.1
+    told = judge(calibrate(pack(views), (640, 480), "radial2")).verdict
+    assert told.word == "ok"
+    assert not any("camera" in one for one in told.remarks)
+
+
+def test_pictures_that_leave_count_where_they_move_the_camera() -> None:
+    some = [LeftOut(f"v{i}", "differs", "view") for i in range(4)]
+    assert [one.severity for one in of_leaving(some, 10, False, 0.02)] == ["remark"]
+    assert [one.severity for one in of_leaving(some, 10, False, 0.2)] == ["inconsistent"]
+    assert [one.severity for one in of_leaving(some, 10, False)] == ["inconsistent"]
+    damaged = [replace(one, kind="unreadable") for one in some]
+    assert [one.severity for one in of_leaving(damaged, 10, False, 0.0)] == ["poor"]
+
+
+def test_a_minimum_next_door_is_no_other_one() -> None:
+    fit = _fit_evidence(noise_px=0.01)
+    intrinsics = fit.block.intrinsics.copy()
+    sigma = covariance(fit).sigma()["fx_px"]
+    intrinsics[:2] += 3 * sigma
+    there = minimise(replace(fit.block, intrinsics=intrinsics), fit.observations, np.array([2, 3, 5, 6]))
+    assert there.at is not None
+    short = replace(
+        fit, camera=camera_from_vector("radial2", (640, 480), there.block.intrinsics), block=there.block,
+        residuals_px=there.at.residuals.transpose(0, 2, 1),
+    )  # fmt: skip
+    assert short.squared_sum > fit.squared_sum + 4 * fit.sigma_px**2
+    found = focal_interval(short, sigma, 1.0)
+    assert found.bounded and not found.lower_cost
 
 
 def test_advice_beats_more_of_the_same() -> None:

@@ -748,6 +748,8 @@ FOCAL_STARTS = (0.4, 0.7, 1.1, 1.8, 4.0)
 _CHI2_95 = 3.84
 _MAX_ITERATIONS = 60
 _MAX_VIEWS = 60
+_ELSEWHERE = 1e-3
+"""Share by which fx is another one."""
 _NEARLY = 1.02
 """Cost of five coefficients over that of the rational model below which they do."""
 
@@ -970,9 +972,10 @@ def focal_interval(calibration: Calibration, sigma_fx_px: float, inflation: floa
             if found.at is None or not np.isfinite(found.at.cost):
                 break
             now = found.at.cost - own
-            if now < -0.1 * target:
+            if now < -0.1 * target and here > _ELSEWHERE * fx:
                 lower = True
                 break
+            now = max(now, 0.0)
             if now >= target:
                 # The rise is close to a parabola between two points of its root.
                 root_at, root_now = np.sqrt(max(rise, 0.0)), np.sqrt(now)

@@ -23,10 +23,24 @@ from calib.stages.camera.bundle import (
     refit_poses,
     residual_inflation,
 )
-from calib.stages.camera.checks import best_of_starts, image_outline, lens_shape, screen, skew_left_out
+from calib.stages.camera.checks import (
+    apart_px,
+    best_of_starts,
+    image_outline,
+    lens_shape,
+    screen,
+    skew_left_out,
+)
 from calib.stages.camera.model import MODELS, Block, LeftOut, Observations, View, free_intrinsics, pack
 from calib.stages.camera.triage import Triage, triage
-from calib.stages.camera.verdict import Judgement, judge, of_leaving, of_screening, two_cameras
+from calib.stages.camera.verdict import (
+    Judgement,
+    judge,
+    of_leaving,
+    of_screening,
+    scale_of,
+    two_cameras,
+)
 
 # ----------------------------------------------------------------------
 # Choosing a lens model and a board model by views that were held back.
@@ -531,7 +545,7 @@ def _skewed(fit: Calibration) -> bool:
     found = skew_left_out(fit)
     return (
         abs(found.skew_px) > _SKEW_SIGMAS * found.sigma_px
-        and found.moved_px > _SKEW_PX * max(1.0, max(fit.camera.image_size_px) / 1000)
+        and found.moved_px > _SKEW_PX * scale_of(fit.camera)
         and found.shear_chi2 < _SKEW_SIGMAS**2
     )
 
@@ -572,7 +586,8 @@ def calibrate_camera(
     fixed = ("cx_px", "cy_px") if everything.views == 1 else ()
     sorted_out, models = _sorted_out(everything, image_size_px, choices, fixed)
     leaving = [*left_out, *unusable, *sorted_out.left_out]
-    findings = of_leaving(leaving, sorted_out.calibration.observations.views, choices.keep_all)
+    agree = sorted_out.calibration.observations.views
+    findings = of_leaving(leaving, agree, choices.keep_all, _moved_px(sorted_out))
     if sorted_out.left_out:
         several = two_cameras(sorted_out.everything)
         if any(one.severity == "inconsistent" for one in findings):
@@ -618,6 +633,13 @@ def calibrate_camera(
     judged = time.perf_counter()
     seconds = {"solve": solved - began, "covariance": covered - solved, "judge": judged - covered}
     return Intrinsics(fit, sigma, judgement, models, boards, board, tuple(not_used), seconds)
+
+
+def _moved_px(found: Triage) -> float:
+    """By how much all views and those that agree put directions apart, over `scale_of` the camera."""
+    every, some = found.everything, found.calibration
+    difference = (every.block.intrinsics - some.block.intrinsics)[some.free]
+    return apart_px(some, difference) / scale_of(some.camera)
 
 
 def _sorted_out(

@@ -40,7 +40,7 @@ from calib.stages.camera.checks import (
     target_shape,
     widened,
 )
-from calib.stages.camera.model import LeftOut
+from calib.stages.camera.model import Camera, LeftOut
 
 # ----------------------------------------------------------------------
 # What a check has found about a calibration, and the limits that a finding is held against.
@@ -60,7 +60,8 @@ class Limits:
     Attributes
     ----------
     views : unique views below which nothing is left over to check the answer with.
-    leaving_bad : share of the pictures that may be left out.
+    leaving_bad, leaving_px : share of the pictures that may be left out, and by how much those that
+        disagree have to move directions in the picture, at up to 1000 pixels' width, to count.
     focal_remark, focal_poor, focal_free : relative standard deviation of a focal length. Distances
         told by the camera are off by the same share.
     spread_poor_deg, spread_free_deg : largest angle between two boards. Focal length comes from
@@ -86,8 +87,8 @@ class Limits:
     split_sigma, split_least : largest difference of an intrinsic over its standard deviation, and
         the difference of focal length or principal point, as a share of the focal length or
         width, that matters.
-    split_px : distance of where the two cameras show the same direction, root mean square, that
-        matters, at up to 1000 pixels' width.
+    split_px, split_seen_px : distance of where the two cameras show the same direction, root mean square,
+        that matters, and that is told, at up to 1000 pixels' width.
     aspect_bad, aspect_remark, aspect_sigma : squares that are not square, as a share, and over its
         standard deviation. Printers stretch by up to half a percent.
     pixel_aspect : fx over fy where the board cannot tell whether it is to blame.
@@ -101,6 +102,7 @@ class Limits:
 
     views: int = 4
     leaving_bad: float = 0.2
+    leaving_px: float = 0.1
     focal_remark: float = 0.015
     focal_poor: float = 0.03
     focal_free: float = 0.10
@@ -130,6 +132,7 @@ class Limits:
     split_sigma: float = 4.0
     split_least: float = 0.007
     split_px: float = 0.3
+    split_seen_px: float = 0.1
     aspect_bad: float = 0.007
     aspect_remark: float = 0.003
     aspect_sigma: float = 4.0
@@ -142,6 +145,11 @@ class Limits:
     fragile: float = 0.03
     rival_cost: float = 1.10
     rival_focal: float = 0.10
+
+
+def scale_of(camera: Camera) -> float:
+    """How many times larger than at up to 1000 pixels' width errors in pixels may be."""
+    return max(1.0, max(camera.image_size_px) / 1000)
 
 
 # ----------------------------------------------------------------------
@@ -383,13 +391,18 @@ def of_screening(found: Screening, names: tuple[str, ...]) -> list[Finding]:
 
 
 def of_leaving(
-    left_out: Sequence[LeftOut], used: int, kept: bool, limits: Limits | None = None
+    left_out: Sequence[LeftOut],
+    used: int,
+    kept: bool,
+    moved_px: float = np.inf,
+    limits: Limits | None = None,
 ) -> list[Finding]:
     """Views that were left out; more than a fifth of them says that something is wrong with the whole.
 
     Parameters
     ----------
     used : views that agree. kept : whether the others are used all the same.
+    moved_px : by how much those that disagree move directions, over `scale_of` the camera.
     """
     limits = Limits() if limits is None else limits
     views = [one for one in left_out if one.kind == "view"]
@@ -411,7 +424,7 @@ def of_leaving(
             f"{len(some)} of {used + len(some)} pictures {'is' if len(some) == 1 else 'are'} {what}: "
             f"{listed([one.name for one in some], 20)}"
         )
-        many = share > limits.leaving_bad
+        many = share > limits.leaving_bad and not (some is views and moved_px < limits.leaving_px)
         if many:
             text += f"; that is more than {100 * limits.leaving_bad:.0f} % of them"
         out.append(Finding(severity if many else "remark", f"{text}."))
@@ -537,7 +550,7 @@ def of_misfit(found: Misfit, calibration: Calibration, limits: Limits) -> list[F
                 f"({found.typical_px:.2f} px)."
             )
             out.append(Finding("remark", text))
-    limit = limits.rms_px * max(1.0, max(calibration.camera.image_size_px) / 1000)
+    limit = limits.rms_px * scale_of(calibration.camera)
     if found.typical_px > limit:
         text = (
             f"The RMS error of a typical view is {found.typical_px:.2f} px (at most {limit:.1f} is good): "
@@ -592,10 +605,10 @@ def of_split(found: Split | None, in_order: bool, calibration: Calibration, limi
         for name, value in scale.items()
         if shift.get(name, 0.0) > limits.split_sigma
         and abs(found.difference[name]) > limits.split_least * value
-        and found.apart_px > limits.split_px * max(1.0, width / 1000)
+        and found.apart_px > limits.split_px * scale_of(camera)
     ]
     strongest = max(telling or shift, key=lambda name: shift[name])
-    if shift[strongest] < limits.split_sigma:
+    if shift[strongest] < limits.split_sigma or found.apart_px < limits.split_seen_px * scale_of(camera):
         return []
     by = ", ".join(
         f"{name.removesuffix('_px')} by {found.difference[name]:+.1f} px"
