@@ -372,7 +372,7 @@ def test_what_is_considered_stays_and_the_rest_learns(kind: int) -> None:
     x, P, plant, view, noise = some()
     before_x, before_P = x.copy(), P.copy()
     n = len(DRIVEN)
-    out, H, work, report, gated = np.zeros(n), np.zeros((3, n)), np.zeros(WORK), np.empty(12), np.zeros(3)
+    out, H, work, report, gated = np.zeros(n), np.zeros((3, n)), np.zeros(WORK), np.empty(12), np.zeros(4)
     measure(kind, x, P, plant, view, CONSTANTS, noise, 0.0, H, out, work)
     z = np.array([out[0] + 0.5, out[1] - 0.4, out[2] + 0.002, 0.0])
     driven_event(

@@ -12,7 +12,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from estimatorlogs import SCENARIOS, rows_from, setup_for, simulated, truth
+from estimatorlogs import SCENARIOS, rows_from, setup_for, simulated, truth, truth_of_sensors
 from numba.core.dispatcher import Dispatcher
 from scipy.stats import truncnorm
 
@@ -740,3 +740,58 @@ def test_the_covariance_of_the_alignment_is_carried() -> None:
     # Together they are known far better than either.
     both = np.array([9.81, 1.0])
     assert both @ P[np.ix_(at, at)] @ both < 1e-3 < 9.81**2 * P[at[0], at[0]]
+
+
+IMU_AT_REST = {
+    "rate_hz": 100.0,
+    "gyro_bias_radps": [0.0, 0.0, 0.002],
+    "gyro_noise_radps_per_sqrt_Hz": [3e-4] * 3,
+    "gyro_instability_radps": [None] * 3,
+    "gyro_walk_radps2_per_sqrt_Hz": [None, None, 6e-5],
+    "accel_mean_mps2": [9.81, 0.0, 0.0],
+    "accel_noise_mps2_per_sqrt_Hz": [2e-3] * 3,
+    "accel_instability_mps2": [None, 1.5e-3, None],
+    "accel_walk_mps3_per_sqrt_Hz": [None] * 3,
+    "below": {"accel_walk_mps3_per_sqrt_Hz": [5e-4, 2e-4, 5e-4]},
+    "gyro_step_radps": [5e-4] * 3,
+    "accel_step_mps2": [0.019] * 3,
+    "logs": [],
+    "drift": {"gyro": {"mean_degps": 0.1, "spread_degps": 0.05, "logs": 4}},
+    "verdict": "ok",
+}
+
+
+def test_biases_walk_and_differ_from_log_to_log_as_was_measured_at_rest() -> None:
+    aligned = {**ALIGN, "covariance": {"order": ["gyro_bias_radps"], "values": [[1e-10]]}}
+    made = Rig.of({"align": aligned, "imu": IMU_AT_REST}, "rig.yaml")
+    setup, _ = setup_from_rig(made, Path("rig.yaml"), BLIND)
+    walk, nominal = setup.process.sensor_walk, Kinematic().sensor_walk
+    assert walk[0] == 6e-5
+    # A bound of 2e-4, and an instability of 1.5e-3 within a minute.
+    assert walk[2] == pytest.approx(math.hypot(2e-4, 1.5e-3 / math.sqrt(60.0)))
+    assert walk[1] == nominal[1] and walk[3:] == nominal[3:]
+    at = 6 + SENSOR.index("gyro_bias_radps")
+    assert setup.start.covariance()[at, at] == pytest.approx(1e-10 + math.radians(0.05) ** 2 * 1.25, rel=1e-3)
+    without, _ = setup_from_rig(Rig.of({"align": aligned}, "rig.yaml"), Path("rig.yaml"), BLIND)
+    assert without.process.sensor_walk == nominal
+    assert without.start.covariance()[at, at] == pytest.approx(1e-10 + 1e-8, rel=1e-3)
+
+
+def test_a_bias_that_walks_less_leaves_a_better_angle_at_rest() -> None:
+    errors = []
+    for K in (Kinematic().sensor_walk[2], 1e-4):
+        walks = list(Kinematic().sensor_walk)
+        walks[2] = K
+        squares = []
+        for seed in (1, 2, 3, 4):
+            rig, log = simulated("static", seed)
+            setup = setup_for(rig, seed, Kinematic(sensor_walk=tuple(walks)))
+            exact = replace(
+                setup.start, sensor=truth_of_sensors(rig), sensor_sigma=0.1 * setup.start.sensor_sigma
+            )
+            out = Filter(replace(setup, start=exact)).run(rows_from(log))
+            late = log.t_s > 2.0
+            squares.append(np.mean((out[late, 5] - truth(log)[late, 2]) ** 2))
+        errors.append(math.degrees(math.sqrt(np.mean(squares))))
+    assert errors[1] < 0.95 * errors[0]
+    assert errors[1] < 0.02

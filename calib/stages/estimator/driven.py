@@ -708,6 +708,8 @@ FASTEST_MPS = 1.0
 """No rig's bellows change their lengths faster: a swing from 0.7 rad reaches a quarter of it."""
 _LOST_N = 0.5
 """Deviation of forces after a restart: a third of what a pump can do."""
+_HELD_N = (0.4, 0.05)
+"""What a hand may do: deviations of half the difference and half the sum of the forces."""
 _LET_GO_RADPS = 0.3
 """What the head's rate is off by where it is let go at a time that one sample of the gyroscope tells."""
 _LAST, _REJECTED, _FIRST, _REJECTED_IMU, _BEGUN = range(5)
@@ -752,8 +754,12 @@ def begin_again(
     x[0], x[1] = phi, length
     if again:
         x[6], x[7], x[8], x[9] = g1, g2, g1, g2
-        for i in range(4 if driven else 10, 10 if driven else DYNAMIC):
+        for i in range(4, 10 if driven else 4):
             P[i, i] = _LOST_N * _LOST_N
+        if not driven:
+            across, along = _HELD_N[0] * _HELD_N[0], _HELD_N[1] * _HELD_N[1]
+            P[10, 10], P[11, 11] = along + across, along + across
+            P[10, 11], P[11, 10] = along - across, along - across
     return True
 
 

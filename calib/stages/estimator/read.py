@@ -163,7 +163,10 @@ def _from_align(rig: Rig) -> tuple[dict[str, tuple[float, float]], FloatArray | 
     if rig.imu is not None and rig.imu.gyro_bias_radps[2] is not None:
         listed = rig.imu.sigma.get("gyro_bias_radps")
         sigma = listed[2] if listed is not None else None
-        values["gyro_bias_radps"] = (rig.imu.gyro_bias_radps[2], max(2e-4, sigma or 1e-3))
+        values["gyro_bias_radps"] = (
+            rig.imu.gyro_bias_radps[2],
+            max(2e-4, sigma or 1e-3, _between_logs(rig)["gyro_bias_radps"]),
+        )
     align = rig.align
     if align is None:
         said.append(
@@ -180,14 +183,27 @@ def _from_align(rig: Rig) -> tuple[dict[str, tuple[float, float]], FloatArray | 
             if isinstance(one, float):
                 sigmas[name] = max(one, 1e-9)
     values = {name: (found[name], sigmas[name]) for name in SENSOR}
-    covariance = None if align.covariance is None else _covariance(align.covariance, sigmas)
+    covariance = (
+        None if align.covariance is None else _covariance(align.covariance, sigmas, _between_logs(rig))
+    )
     if not align.verdict.ok:
         said.append(f"the alignment's own verdict is {align.verdict.word}")
     return values, covariance, said
 
 
 _BETWEEN_LOGS = {"gyro_bias_radps": 1e-4, "accel_bias_x_mps2": 1e-3, "accel_bias_y_mps2": 1e-3}
-"""How far biases walk between the logs of the alignment and another one."""
+"""How far biases walk between the logs of the alignment and another one, at least."""
+
+
+def _between_logs(rig: Rig) -> dict[str, float]:
+    """Deviation of biases from log to log: what logs at rest show, where they show more than the least."""
+    out = dict(_BETWEEN_LOGS)
+    seen = rig.imu.drift.get("gyro") if rig.imu is not None else None
+    if seen is not None and seen.spread_degps is not None:
+        # A spread over n logs, and the next one is n + 1.
+        spread = math.radians(seen.spread_degps) * math.sqrt(1.0 + 1.0 / seen.logs)
+        out["gyro_bias_radps"] = max(out["gyro_bias_radps"], spread)
+    return out
 
 
 def _named_values(align: Align) -> dict[str, float]:
@@ -198,14 +214,18 @@ def _named_values(align: Align) -> dict[str, float]:
     return out
 
 
-def _covariance(table: CovarianceTable, sigmas: Mapping[str, float]) -> FloatArray:
-    """Covariance (13, 13) of `sensors.SENSOR`; those that the table lacks stand alone."""
+def _covariance(
+    table: CovarianceTable, sigmas: Mapping[str, float], between: Mapping[str, float]
+) -> FloatArray:
+    """Covariance (13, 13) of `sensors.SENSOR`, with what differs between logs added; those that the table
+    lacks stand alone.
+    """
     V = np.diag([sigmas[name] ** 2 for name in SENSOR])
     known = [name for name in table.order if name in SENSOR]
     at = [SENSOR.index(name) for name in known]
     rows = [table.order.index(name) for name in known]
     V[np.ix_(at, at)] = np.array(table.values)[np.ix_(rows, rows)]
-    for name, walk in _BETWEEN_LOGS.items():
+    for name, walk in between.items():
         V[SENSOR.index(name), SENSOR.index(name)] += walk**2
     # A table that was rounded on its way through the file may have lost a digit of its smallest eigenvalue.
     V = 0.5 * (V + V.T)
@@ -215,11 +235,38 @@ def _covariance(table: CovarianceTable, sigmas: Mapping[str, float]) -> FloatArr
     return np.asarray(normal * scale * scale[:, None], dtype=np.float64)
 
 
+_MINUTE_S = 60.0
+_WALKS = (
+    ("gyro_walk_radps2_per_sqrt_Hz", "gyro_instability_radps", 2),
+    ("accel_walk_mps3_per_sqrt_Hz", "accel_instability_mps2", 1),
+)
+"""Walk and instability of the biases that turn the angle, the gyroscope's and the accelerometer's; axis."""
+
+
 def _process(rig: Rig) -> Kinematic:
-    tuned = rig.estimator
-    if tuned is None or not tuned.levels:
-        return Kinematic(LEVELS)
-    return Kinematic(tuple(Level(**level.model_dump()) for level in tuned.levels))
+    """Levels that were tuned, and walks of the biases that were measured at rest.
+
+    An instability B counts as a walk by B in a minute. Where a log was too short for more than a bound, the
+    walk is that, and at most the nominal one. Along x the nominal walk stays: it stands for what scale and
+    length make of the accelerations, too.
+    """
+    tuned, nominal = rig.estimator, Kinematic()
+    walks = list(nominal.sensor_walk)
+    for name, (walk, instability, axis) in zip(("gyro_bias_radps", "accel_bias_y_mps2"), _WALKS, strict=True):
+        if rig.imu is None:
+            break
+        at = SENSOR.index(name)
+        K, B = getattr(rig.imu, walk)[axis], getattr(rig.imu, instability)[axis] or 0.0
+        most = rig.imu.below[walk][axis] if walk in rig.imu.below else None
+        slow = B / math.sqrt(_MINUTE_S)
+        if K is not None:
+            walks[at] = math.hypot(K, slow)
+        elif most is not None:
+            walks[at] = min(walks[at], math.hypot(most, slow))
+    levels: tuple[Level, ...] = LEVELS
+    if tuned is not None and tuned.levels:
+        levels = tuple(Level(**level.model_dump()) for level in tuned.levels)
+    return Kinematic(levels, sensor_walk=tuple(walks))
 
 
 _SHAKEN = 1.6
