@@ -29,7 +29,7 @@ def record(
     """
     from calib.core.files import shown
     from calib.core.units import parse_duration_s
-    from calib.core.writing import check_writable
+    from calib.core.writing import appending, check_writable, writes_through
     from calib.io.logs import LOG
     from calib.io.serial import record as run
 
@@ -72,11 +72,8 @@ def record(
     def write(number: int, text: str) -> None:
         """Append at once: what came is on the disk when the computer stops."""
         if number == len(logs):
-            path = output if number == 0 else _beside(output)
-            try:
-                logs.append((path, path.open("ab")))
-            except OSError as error:
-                raise BadInputError(f"{shown(path)}: cannot be written: {_reason(error)}") from error
+            path = output if number == 0 or writes_through(output) else _beside(output)
+            logs.append((path, appending(path, LOG)))
             if number:
                 narrate(f"the board restarted; from there on the log is {shown(path)}")
         stream = logs[number][1]

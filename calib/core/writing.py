@@ -2,7 +2,7 @@
 
 A file appears under its name when it is whole; until then its bytes lie in a temporary file beside it, which
 is removed on errors, Ctrl-C and SIGTERM. One whose process was killed is removed by the next write into the
-folder. Pipes, devices and /dev/stdout are written through.
+folder. Recordings grow under their own name (`appending`). Pipes, devices, /dev/stdout are written through.
 
 What is there is replaced only where nothing is lost that calib cannot make again: never a file that the same
 command reads, and otherwise a file that is empty or of the `Kind` that is about to be written.
@@ -266,6 +266,19 @@ def replacing(path: Path, kind: Kind | None = None) -> Iterator[BinaryIO]:
             os.fsync(folder)
         finally:
             os.close(folder)
+
+
+def appending(path: Path, kind: Kind | None = None) -> BinaryIO:
+    """A stream to a new or empty file that grows as it is written: for what cannot be made again.
+
+    Raises `BadInputError` as `check_writable`.
+    """
+    check_writable(path, kind)
+    descriptor = _through(path)
+    try:
+        return _duplicate(descriptor) if descriptor is not None else _target(path).open("ab")
+    except OSError as error:
+        raise BadInputError(f"{shown(path)}: cannot be written: {error.strerror or error}") from error
 
 
 def write_atomically(path: Path, data: bytes | str, kind: Kind | None = None) -> None:

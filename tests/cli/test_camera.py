@@ -283,11 +283,11 @@ def test_a_covariance_that_is_none(calib, rig) -> None:
     for change, says in (
         (
             {"order": ["fx_px", *table["order"][:-1]]},
-            "expected intrinsics in order, each once, not 'fx_px'",
+            "camera.covariance.order names 'fx_px' twice",
         ),
-        ({"order": ["f", *table["order"][1:]]}, "each once, not 'f'"),
+        ({"order": ["f", *table["order"][1:]]}, "camera.covariance.order has 'f', which is no intrinsic"),
         ({"values": table["values"][1:]}, "expected 6 rows and columns"),
-        ({"values": [[-9.0, *table["values"][0][1:]], *table["values"][1:]]}, "expected a covariance matrix"),
+        ({"values": [[-9.0, *table["values"][0][1:]], *table["values"][1:]]}, "expected a variance of fx_px"),
     ):
         whole["camera"]["covariance"] = table | change
         rig.write_text(yaml.safe_dump(whole))

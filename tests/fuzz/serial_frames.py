@@ -49,18 +49,24 @@ def _check(data: bytes, folder: Path) -> None:
     assert list(map(repr, split)) == list(map(repr, frames))
     assert (parts.skipped, parts.damaged) == (whole.skipped, whole.damaged)
     waiting = pieces[::-1]
-    result = record(waiting.pop, lambda _: bool(waiting))
-    assert result.ticks <= len(frames)
-    if result.ticks:
-        path = folder / "log.csv"
-        path.write_text(result.text)
-        assert len(read_log(path)) == result.ticks
+    logs: dict[int, str] = {}
+
+    def write(run: int, text: str) -> None:
+        logs[run] = logs.get(run, "") + text
+
+    result = record(waiting.pop, lambda _: bool(waiting), write)
+    assert result.opening + sum(run.ticks for run in result.runs) <= len(frames)
+    assert sorted(logs) == list(range(len(result.runs)))
+    for number, run in enumerate(result.runs):
+        path = folder / f"log{number}.csv"
+        path.write_text(logs[number])
+        assert len(read_log(path)) == run.ticks
         try:
             again = read_frames(path)
         except BadInputError:
             # A float of a board may be no number, which no log's row is.
-            return
-        assert len(again) == result.ticks
+            continue
+        assert len(again) == run.ticks
 
 
 if __name__ == "__main__":

@@ -43,7 +43,9 @@ def _board_log() -> str:
               "pwm2", "ax_mps2", "ay_mps2", "gz_radps")  # fmt: skip
     frame = frame_from_row(row | dict.fromkeys(floats, "0.5"))
     pieces = [encoded(frame), b""]
-    return record(lambda: pieces.pop(0), lambda _: bool(pieces)).text
+    written: list[str] = []
+    record(lambda: pieces.pop(0), lambda _: bool(pieces), lambda run, text: written.append(text))
+    return "".join(written)
 
 
 def _imported(path: Path) -> str:

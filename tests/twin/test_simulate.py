@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib.core.errors import BadInputError, UsageError
-from calib.io.columns import COLUMNS
+from calib.io.columns import MEASURED, TRUE
 from calib.io.logs import log_text
 from calib.stages.actuator import simulate as integrate
 from calib.stages.actuator.parameters import Plant, Stiffness
@@ -119,7 +119,7 @@ def test_the_log_has_rows_of_ticks_and_of_samples_in_the_order_of_time() -> None
     assert np.array_equal(log.sampled("u_px", "v_px"), ticks)
     assert np.allclose(np.diff(log.t_s[ticks]), 1.0 / 60.0, atol=2e-6)
     assert np.allclose(np.diff(log.t_s[samples]), 0.01, atol=2e-6)
-    assert set(log.columns) == set(COLUMNS) - {"onchip_phi_rad"}
+    assert set(log.columns) == {*MEASURED, *TRUE} - {"onchip_phi_rad"}
 
 
 def test_the_same_seed_gives_the_same_bytes() -> None:
