@@ -98,7 +98,7 @@ def _several(hint: Any) -> Any:
     for one in (str, Path):
         many: Any = tuple[one, ...]  # type: ignore[valid-type]  # it is a value here
         if hint in (many, many | None):
-            return list[one] if hint == many else list[one] | None  # type: ignore[valid-type]
+            return list[one] if hint == many else list[one] | None  # type: ignore[valid-type]  # as above
     return hint
 
 

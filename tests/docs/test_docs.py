@@ -100,6 +100,17 @@ def test_the_tour_runs_as_in_a_notebook(tmp_path: Path, monkeypatch: pytest.Monk
     assert "<table>" in rig.camera._repr_html_()
 
 
+def test_the_readme_shows_what_its_first_command_prints(tmp_path: Path) -> None:
+    shown = next(block for _, block in blocks(README.read_text(encoding="utf-8"), "text"))
+    words = ["intrinsics", f"{ROOT / 'images'}/", "--rig", str(tmp_path / "rig.yaml")]
+    done = subprocess.run(
+        [sys.executable, "-m", "calib", *words], check=True, capture_output=True, text=True, cwd=ROOT
+    )
+    first = shown.splitlines()[0]
+    printed = done.stdout.splitlines()
+    compare(shown.splitlines(), printed[printed.index(first) :], "README.md")
+
+
 def test_the_tutorial_prints_what_it_shows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each console block, run in order. Numbers may differ by 2 % or by one in their last digit."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
