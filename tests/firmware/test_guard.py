@@ -12,7 +12,9 @@ import pytest
 from firmware_build import Built, need, sketch, warnings, write
 from firmware_rigs import header
 
+from calib.io.serial import FAULTS as FAULT_WORDS
 from calib.io.serial import GUARD_FAULT, GUARD_RUN, Decoder, Frame
+from calib.stages.firmware.header import verbatim
 from calib.twin.pictures import CAMERA, PLANE
 
 IMU_LOST, IMU_FROZEN, CAMERA_LOST, CAMERA_FROZEN, APART, REFERENCE = range(1, 7)
@@ -171,6 +173,12 @@ def test_every_fault_is_tried_by_the_self_test_in_all_builds(tmp_path: Path) -> 
             done = subprocess.run(list(map(str, call)), capture_output=True, text=True, check=False)
             assert done.returncode == 0, done.stderr
             assert subprocess.run([made], check=False).returncode == 0
+
+
+def test_a_log_knows_every_fault_of_the_guard() -> None:
+    names = re.findall(r"#define CALIB_FAULT_(\w+) (\d+)", verbatim("calib_guard.h"))
+    numbers = {int(number) for name, number in names if name not in ("NONE", "STAYS")}
+    assert numbers == set(FAULT_WORDS)
 
 
 _MUTANTS = [

@@ -22,6 +22,7 @@ from calib.stages.camera.lattice import (
 )
 from calib.stages.camera.refine import (
     Refined,
+    fit_corners,
     frames_of,
     misshape,
     part_around,
@@ -214,7 +215,7 @@ def surroundings(gray: GrayImage, grid: Refined) -> Surroundings:
     chosen = np.flatnonzero((inside & (parity * half_step > 0.5 * least) & (unlike < 1.0)).ravel())
     found: BoolArray = np.zeros(rows * columns, dtype=np.bool_)
     if len(chosen):
-        fit = part.fit(local.reshape(-1, 2)[chosen], frames.take(chosen), _ITERATIONS, _REACH_PX)
+        fit = fit_corners(part, local.reshape(-1, 2)[chosen], frames.take(chosen), _ITERATIONS, _REACH_PX)
         square = np.minimum(np.linalg.norm(frames.along, axis=1), np.linalg.norm(frames.across, axis=1))
         near = np.linalg.norm(fit.points - local.reshape(-1, 2)[chosen], axis=1) < 0.3 * square[chosen]
         strong = parity.ravel()[chosen] * fit.amplitude > least

@@ -297,26 +297,24 @@ def _start(points: FloatArray, frames: Frames, win: _Windows, room: _Float32) ->
 
 
 def fit_corners(
-    image: _Float32,
+    part: Part,
     points: FloatArray,
     frames: Frames,
     iterations: int = _ITERATIONS,
     reach_px: int = REACH_PX,
     window: float = WINDOW,
     warm: LocalFit | None = None,
-    halo_px: float = 0.0,
 ) -> LocalFit:
     """Fit the blurred corner around each of N points.
 
     Parameters
     ----------
-    image : (H, W) grey levels.
-    points : (N, 2) where to start, pixels.
+    part : of the picture.
+    points : (N, 2) where to start, pixels of the part.
     frames : steps and curvatures of the grid at the N points.
     reach_px : most pixels that a window reaches to each side of its corner.
     window : half the width of a window over the local square.
     warm : an earlier fit of the same corners, whose other parameters are taken for a start.
-    halo_px : r of a picture that was sharpened, 0 of others.
     """
     extent = (2.0 * window) ** 2 * np.abs(
         frames.along[:, 0] * frames.across[:, 1] - frames.along[:, 1] * frames.across[:, 0]
@@ -324,10 +322,10 @@ def fit_corners(
     count = max(_LEAST_PART, int(_PART_PIXELS / min(extent.max(initial=1.0), (2 * reach_px + 1) ** 2)))
     fits = []
     for first in range(0, max(len(points), 1), count):
-        part = np.arange(first, min(first + count, len(points)))
-        before = None if warm is None else warm.take(part)
-        win = _windows(image, points[part], frames.take(part), window, reach_px)
-        fits.append(_fit_part(win, points[part], frames.take(part), iterations, window, before, halo_px))
+        some = np.arange(first, min(first + count, len(points)))
+        before = None if warm is None else warm.take(some)
+        win = _windows(part.image, points[some], frames.take(some), window, reach_px)
+        fits.append(_fit_part(win, points[some], frames.take(some), iterations, window, before, part.halo_px))
     return fits[0] if len(fits) == 1 else _joined(fits)
 
 
@@ -732,7 +730,7 @@ class Part:
     k, origin : a pixel (x, y) of the part is at k (x, y) + (k - 1) / 2 + origin in the picture.
     lens : the centre and half diagonal of the picture, in pixels of the part.
     noise : standard deviation of the noise, grey levels.
-    halo_px : as in `fit_corners`.
+    halo_px : r of a picture that was sharpened, 0 of others.
     """
 
     image: _RefineFloat32
@@ -751,18 +749,6 @@ class Part:
     def to_picture(self, points: FloatArray) -> FloatArray:
         """Pixels of the picture from pixels of the part."""
         return np.asarray(points * self.k + 0.5 * (self.k - 1) + self.origin)
-
-    def fit(
-        self,
-        points: FloatArray,
-        frames: Frames,
-        iterations: int = _ITERATIONS,
-        reach_px: int = REACH_PX,
-        window: float = WINDOW,
-        warm: LocalFit | None = None,
-    ) -> LocalFit:
-        """The corners near points (N, 2) of the part, as `fit_corners`."""
-        return fit_corners(self.image, points, frames, iterations, reach_px, window, warm, self.halo_px)
 
 
 def _noise(image: _RefineFloat32) -> float:
@@ -847,7 +833,7 @@ def _closer_looked(part: Part, fit: LocalFit, frames: Frames) -> LocalFit:
     doubtful = np.flatnonzero((fit.residual > _DISTURBED * typical + 0.02) | ~fit.converged)
     if len(doubtful) == 0:
         return fit
-    again = part.fit(fit.points[doubtful], frames.take(doubtful), window=_CLOSE_WINDOW)
+    again = fit_corners(part, fit.points[doubtful], frames.take(doubtful), window=_CLOSE_WINDOW)
     use = again.converged & (again.residual < np.where(fit.converged, 0.7 * fit.residual, np.inf)[doubtful])
     return _merged(fit, again, doubtful, use)
 
@@ -891,7 +877,7 @@ def _rescued(part: Part, fit: LocalFit) -> tuple[LocalFit, BoolArray, Prediction
         doubtful = np.flatnonzero(~good | ~(check.away < check.bound))
         if len(doubtful) == 0:
             return fit, good, prediction
-        again = part.fit(check.placed[doubtful], check.frames.take(doubtful), window=window)
+        again = fit_corners(part, check.placed[doubtful], check.frames.take(doubtful), window=window)
         trial = _merged(fit, again, doubtful, np.ones(len(doubtful), dtype=np.bool_))
         near = np.linalg.norm(again.points - check.placed[doubtful], axis=1)
         use = _trusted(part, trial)[doubtful] & (~good[doubtful] | (near < 0.7 * check.away[doubtful]))
@@ -918,7 +904,7 @@ def _begun(gray: GrayImage, points: FloatArray) -> tuple[Part, LocalFit] | None:
     part = part_around(gray, points)
     while part is not None:
         start = part.points
-        first = part.fit(start.reshape(-1, 2), frames_of(start), _FIRST_ITERATIONS, _FIRST_REACH_PX)
+        first = fit_corners(part, start.reshape(-1, 2), frames_of(start), _FIRST_ITERATIONS, _FIRST_REACH_PX)
         width = float(np.median(first.width_px))
         if part.k == 1 or width >= _LEAST_WIDTH_PX:
             return _sharpened(part, first)
@@ -935,8 +921,8 @@ def _sharpened(part: Part, first: LocalFit) -> tuple[Part, LocalFit]:
     best, least = (part, first), _HALO_GAIN * plain
     for halo_px in _HALOS_PX:
         other = replace(part, halo_px=halo_px)
-        fit = other.fit(
-            start.reshape(-1, 2), frames_of(start), _FIRST_ITERATIONS, _FIRST_REACH_PX, warm=first
+        fit = fit_corners(
+            other, start.reshape(-1, 2), frames_of(start), _FIRST_ITERATIONS, _FIRST_REACH_PX, warm=first
         )
         found = float(np.median(misshape(fit, part.noise)))
         if found < least:
@@ -971,7 +957,7 @@ def refine(gray: GrayImage, points: FloatArray) -> Refined | None:
     moved = np.where(stays[:, None], first.points, rough.points.reshape(-1, 2)).reshape(start.shape)
     fit = first
     for _ in range(_PASSES):
-        fit = part.fit(moved.reshape(-1, 2), frames_of(moved), warm=fit)
+        fit = fit_corners(part, moved.reshape(-1, 2), frames_of(moved), warm=fit)
         before, moved = (
             moved,
             np.where(_sound(part, fit)[:, None], fit.points, moved.reshape(-1, 2)).reshape(start.shape),
