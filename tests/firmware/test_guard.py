@@ -73,7 +73,8 @@ FAULTS = {
     "bus_hang": (None, 150, True),
     "imu_nack": (IMU_LOST, 230, True),
     "imu_slow": (IMU_LOST, 230, True),
-    "imu_zero": (IMU_FROZEN, 230, True),
+    # Weightless for as long as it stands still, which is told a tick sooner.
+    "imu_zero": (IMU_LOST, 230, True),
     "imu_frozen": (IMU_FROZEN, 230, True),
     "imu_saturated": (IMU_LOST, 230, True),
     "imu_garbage": (IMU_LOST, 300, True),

@@ -71,7 +71,7 @@ static double angle(void) {
 }
 
 static void imu_reply(void) {
-    static short last[16];
+    static unsigned char last[16];
     double phi = angle();
     memset(reply, 0, sizeof reply);
     if (place == 0x00) {
@@ -101,10 +101,14 @@ static void imu_reply(void) {
             reply[i] = (unsigned char)(rough() * 37);
         }
     }
-    if (is("imu_frozen")) {
-        memcpy(reply, last + (place == 0x14 ? 8 : 0), 8);
-    } else {
-        memcpy(last + (place == 0x14 ? 8 : 0), reply, 8);
+    /* Its readings stand still; its registers answer. */
+    if (place == 0x08 || place == 0x14) {
+        unsigned char *kept = last + (place == 0x14 ? 8 : 0);
+        if (is("imu_frozen")) {
+            memcpy(reply, kept, 8);
+        } else {
+            memcpy(kept, reply, 8);
+        }
     }
 }
 
