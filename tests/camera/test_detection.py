@@ -357,7 +357,60 @@ def _windows(rng: np.random.Generator) -> np.ndarray:
     return image
 
 
-KINDS = [_noise, _stripes, _grating, _tiles, _bricks, _dots, _text, _endless_board, _cut_board, _windows]
+def _seen(target: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A flat target on a grey table, from a random side."""
+    height, width = target.shape
+    middle, half = np.array([WIDTH, HEIGHT]) / 2, np.array([WIDTH, HEIGHT]) * rng.uniform(0.3, 0.42)
+    corners = middle + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) + rng.uniform(-14, 14, (4, 2))
+    flat = np.array([[0, 0], [width, 0], [width, height], [0, height]], dtype=np.float32)
+    shape = cv2.getPerspectiveTransform(flat, corners.astype(np.float32))
+    image = cv2.warpPerspective(
+        target, shape, (WIDTH, HEIGHT), flags=cv2.INTER_AREA, borderMode=cv2.BORDER_CONSTANT, borderValue=150
+    )
+    return image.astype(np.float64)
+
+
+def _circles(rng: np.random.Generator) -> np.ndarray:
+    columns, rows, pitch = 9, 6, 40
+    target = np.full((pitch * (rows + 1), pitch * (columns + 1)), 235, dtype=np.uint8)
+    shift = pitch // 2 * int(rng.random() < 0.5)
+    for j in range(rows):
+        for i in range(columns):
+            centre = (pitch * (i + 1) + shift * (j % 2) - shift // 2, pitch * (j + 1))
+            cv2.circle(target, centre, int(pitch * rng.uniform(0.25, 0.3)), 30, -1)
+    return _seen(target, rng)
+
+
+def _markers(rng: np.random.Generator) -> np.ndarray:
+    kinds = (cv2.aruco.DICT_4X4_50, cv2.aruco.DICT_6X6_250, cv2.aruco.DICT_APRILTAG_36h11)
+    dictionary = cv2.aruco.getPredefinedDictionary(kinds[int(rng.integers(len(kinds)))])
+    gap = float(rng.uniform(0.1, 0.5))
+    board = cv2.aruco.GridBoard((6, 4), 1.0, gap, dictionary)
+    return _seen(board.generateImage((600, 420), marginSize=15), rng)
+
+
+def _charuco(rng: np.random.Generator) -> np.ndarray:
+    # Its squares hold markers: a plain board it is not.
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    board = cv2.aruco.CharucoBoard((7, 5), 1.0, float(rng.choice([0.65, 0.7, 0.8])), dictionary)
+    return _seen(board.generateImage((580, 420), marginSize=10), rng)
+
+
+KINDS = [
+    _noise,
+    _stripes,
+    _grating,
+    _tiles,
+    _bricks,
+    _dots,
+    _text,
+    _endless_board,
+    _cut_board,
+    _windows,
+    _circles,
+    _markers,
+    _charuco,
+]
 
 
 def _finished(image: np.ndarray, rng: np.random.Generator) -> GrayImage:

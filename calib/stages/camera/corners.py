@@ -94,6 +94,11 @@ _MISFIT = 0.08
 _MEDIAN_RESIDUAL = 0.25
 _CLOSE_MISFIT = 0.03
 """Misfit, in squares, below which a grid is close: its corners may have another shape."""
+_NEAR, _NEAR_PX = 0.06, 0.9
+"""How far from a corner the squares are looked at, in squares, and at least in pixels."""
+_NEAR_STEP = 0.7
+"""Least step there over the step between the squares' middles. Sharpened boards have .78 and more, spots
+that touch .62 and less."""
 _LEAST_AMPLITUDE = 2.5
 """Grey levels."""
 _CONTINUES = 0.4
@@ -144,6 +149,23 @@ def _squares_are_plain(smooth: _Float32, grid: Refined) -> bool:
     return bool(np.mean(uneven > _FLAT * np.maximum(local, 0.25 * step)) < _UNEVEN_SHARE)
 
 
+def _squares_meet(gray: GrayImage, grid: Refined) -> bool:
+    """Whether the squares keep their tones up to the corners, as round spots do not that only touch."""
+    p = grid.points
+    along, across = np.gradient(p, axis=1), np.gradient(p, axis=0)
+    i, j = np.indices(p.shape[:2])
+    parity = (1.0 - 2.0 * ((i + j) % 2)) * grid.sign
+
+    def step(share: float) -> float:
+        """Median step between the four squares of a corner, at a share of a square from it."""
+        one, two = share * (along + across), share * (along - across)
+        here = [sample(gray.astype(np.float32), q) for q in (p + one, p - one, p + two, p - two)]
+        return float(np.median(parity * (here[0] + here[1] - here[2] - here[3])))
+
+    near = max(_NEAR, _NEAR_PX / square_px(p))
+    return step(near) > _NEAR_STEP * step(0.5)
+
+
 def fault_of(gray: GrayImage, grid: Refined) -> str | None:
     """What speaks against a grid being a checkerboard, in a few words; None when nothing does."""
     height, width = gray.shape
@@ -156,7 +178,7 @@ def fault_of(gray: GrayImage, grid: Refined) -> str | None:
         return "corners that are none"
     if np.median(np.abs(grid.amplitude)) < _LEAST_AMPLITUDE:
         return "too little contrast"
-    if np.median(grid.residual) > _MEDIAN_RESIDUAL and not close:
+    if np.median(grid.residual) > _MEDIAN_RESIDUAL and not (close and _squares_meet(gray, grid)):
         return "corners of another shape"
     if not grid.misfit_px < _MISFIT * square:
         return "corners off the grid"
@@ -219,7 +241,9 @@ def surroundings(gray: GrayImage, grid: Refined) -> Surroundings:
         square = np.minimum(np.linalg.norm(frames.along, axis=1), np.linalg.norm(frames.across, axis=1))
         near = np.linalg.norm(fit.points - local.reshape(-1, 2)[chosen], axis=1) < 0.3 * square[chosen]
         strong = parity.ravel()[chosen] * fit.amplitude > least
-        found[chosen] = fit.converged & near & strong & (misshape(fit, part.noise) < _WORST_RESIDUAL)
+        # Corners beyond a sharpened board's are as misshapen as its own.
+        alike = misshape(fit, part.noise) < max(_WORST_RESIDUAL, 1.5 * float(np.median(grid.residual)))
+        found[chosen] = fit.converged & near & strong & alike
     hit = found.reshape(rows, columns)
     lines = (np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1])
     count = [int(inside[line].sum()) for line in lines]
