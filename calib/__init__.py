@@ -19,19 +19,23 @@ from typing import Any
 
 __version__ = "0.1.0"
 
-_CLASSES = {
-    "Rig": "calib.core.rig",
-    "Verdict": "calib.core.verdict",
-    "Finding": "calib.core.verdict",
-    "plots": "calib.show.draw",
+_PLACES = {
+    "Rig": "calib.core.rig:Rig",
+    "Log": "calib.io.logs:Log",
+    "Verdict": "calib.core.verdict:Verdict",
+    "Finding": "calib.core.verdict:Finding",
+    "plots": "calib.show.draw:plots",
+    "run": "calib.runner.outputs:calibrate",
+    "simulate": "calib.twin.scenarios:simulate",
 }
-"""Names of the front door that are no verbs, and where they are."""
+"""Names of the front door that are no stages, and where they are."""
 
 _BY_DEFAULT = {"identify": "identify logs"}
 """Verb of two words that its first word alone stands for."""
 
 __all__ = [
     "Finding",
+    "Log",
     "Rig",
     "Verdict",
     "align",
@@ -45,19 +49,25 @@ __all__ = [
     "lowpass",
     "plots",
     "replay",
+    "run",
+    "simulate",
+    "validate",
 ]
 
 
 def __getattr__(name: str) -> Any:
-    if name in _CLASSES:
-        value: Any = getattr(importlib.import_module(_CLASSES[name]), name)
+    if name in _PLACES:
+        module, _, attribute = _PLACES[name].partition(":")
+        value: Any = getattr(importlib.import_module(module), attribute)
     elif name in __all__:
         from calib.stages import STAGES, function
 
-        # Verbs of two words: `calib.imu.static` is `calib imu static`.
-        group = {one.split()[-1]: function(one) for one in STAGES if one.startswith(f"{name} ")}
         alone = _BY_DEFAULT.get(name, name)
-        value = function(alone) if alone in STAGES else SimpleNamespace(**group)
+        value = function(alone) if alone in STAGES else SimpleNamespace()
+        # Verbs of two words: `calib.imu.static` is `calib imu static`.
+        for one in STAGES:
+            if one.startswith(f"{name} "):
+                setattr(value, one.split()[-1], function(one))
     else:
         raise AttributeError(f"module 'calib' has no attribute {name!r}")
     globals()[name] = value

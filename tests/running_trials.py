@@ -14,13 +14,13 @@ from calib.core.files import sha256
 from calib.core.rig import Rig
 from calib.core.writing import write_atomically
 from calib.runner.folder import Folder, LogFile, read_folder
-from calib.runner.graph import HIDDEN, Done, Planned, Runner, Stage, opened
+from calib.runner.graph import HIDDEN, Done, Planned, Runner, Step, opened
 from calib.runner.outputs import decide, publish, summary
 from calib.runner.work import DOCUMENT, FIGURES, MESSAGES, RIG, Work
 from calib.stages.estimator.section import Estimator
 from calib.twin.section import Twin, TwinTracker
 
-__all__ = ["CALLS", "STAGES", "Inline", "make_folder", "run_small"]
+__all__ = ["CALLS", "STEPS", "Inline", "make_folder", "run_small"]
 
 CALLS: list[str] = []
 """Names of the commands that were run, in their order."""
@@ -110,14 +110,13 @@ def _log(log: LogFile) -> Planned | str:
     return Planned((log.path,), (log.path,))
 
 
-STAGES = (
-    Stage("first", "First", ("first",), _pictures, writes=("estimator",), flashed=True),
-    Stage("second", "Second", ("second",), _nothing, writes=("twin",), needs=("estimator",)),
-    Stage("lone", "Lone", ("lone",), _nothing),
-    Stage("each", "Each", ("each",), None, _log, needs=("estimator",), output="states.csv"),
-    Stage("absent", "Absent", ("absent",), _nothing, writes=("lens",)),
-    Stage("firmware", "Firmware", ("firmware",), _nothing, needs=("estimator",),
-          uses=("twin", "lens"), output="firmware", figures=False),
+STEPS = (
+    Step("first", "First", "first", _pictures, writes=("estimator",), flashed=True),
+    Step("second", "Second", "second", _nothing, writes=("twin",), needs=("estimator",)),
+    Step("lone", "Lone", "lone", _nothing),
+    Step("each", "Each", "each", None, _log, needs=("estimator",), output="states.csv"),
+    Step("firmware", "Firmware", "firmware", _nothing, needs=("estimator",),
+          uses=("twin",), output="firmware", figures=False),
 )  # fmt: skip
 
 
@@ -138,9 +137,7 @@ def run_small(
     """A whole run with the small stages."""
     folder = read_folder(root, follow_links)
     with opened(out, root):
-        runner = Runner(
-            folder, out, runs or Inline(), lambda verb: verb != ("absent",), stages=STAGES, fresh=fresh
-        )
+        runner = Runner(folder, out, runs or Inline(), steps=STEPS, fresh=fresh)
         ended = runner.run()
         publish(runner, ended, summary(runner, ended, False))
     return ended

@@ -14,14 +14,12 @@ from calib.cli.diff import diff
 from calib.cli.docs import docs
 from calib.cli.doctor import doctor
 from calib.cli.fleet import fleet
-from calib.cli.identify import identify
 from calib.cli.record import record
 from calib.cli.report import report
 from calib.cli.run import run
 from calib.cli.simulate import simulate
 from calib.cli.sweep import sweep
-from calib.cli.validate import validate
-from calib.cli.verbs import group, verb
+from calib.cli.verbs import OneByDefault, group, verb
 from calib.stages import stage
 
 app = typer.Typer(
@@ -57,11 +55,18 @@ app.command("lowpass")(verb(stage("lowpass")))
 app.add_typer(group("imu", "Understand an IMU: its bias, its noise, its drift."), name="imu")
 app.command("align")(telling(verb(stage("align"))))
 app.command("replay")(telling(verb(stage("replay"))))
-app.add_typer(identify, name="identify")
+app.add_typer(
+    group(
+        "identify",
+        "Identify the actuator from LOG..., a pump from tables, springs from weights; all with error bars.",
+        OneByDefault,
+    ),
+    name="identify",
+)
 app.add_typer(
     group("control", "Try controllers on the identified model before the hardware."), name="control"
 )
-app.command("validate")(telling(validate))
+app.command("validate")(telling(verb(stage("validate"))))
 app.command("firmware")(verb(stage("firmware")))
 app.command("fleet")(telling(fleet))
 app.command("sweep")(telling(sweep))

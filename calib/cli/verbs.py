@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
 import typer
+from typer.core import TyperGroup
 
 from calib.cli.common import (
     FiguresOption,
@@ -129,9 +130,28 @@ def _run(stage: Stage, files: Files, options: Any, figures: Path | None, as_json
         raise typer.Exit(EXIT_POOR)
 
 
-def group(name: str, words: str) -> typer.Typer:
+class OneByDefault(TyperGroup):
+    """`calib identify LOG...` is `calib identify logs LOG...`, or `identify arm` of logs with pressures."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """The arguments with the verb that they leave out."""
+        if args and args[0] not in self.commands and args[0] not in ctx.help_option_names:
+            args = ["arm" if _of_arm(args) else "logs", *args]
+        return super().parse_args(ctx, args)
+
+
+def _of_arm(args: list[str]) -> bool:
+    """Whether the first argument that is a file is a log of a pressure-driven arm."""
+    from calib.io.columns import is_arm_log
+    from calib.io.logs import columns_of
+
+    first = next((path for path in map(Path, args) if path.is_file()), None)
+    return first is not None and is_arm_log(columns_of(first) or ())
+
+
+def group(name: str, words: str, cls: type[TyperGroup] = TyperGroup) -> typer.Typer:
     """The verbs of two words that begin with this one."""
-    made = typer.Typer(name=name, help=words, no_args_is_help=True)
+    made = typer.Typer(name=name, cls=cls, help=words, no_args_is_help=True, rich_markup_mode=None)
     for one in STAGES:
         if one.startswith(f"{name} "):
             made.command(one.split()[-1])(telling(verb(stage(one))))

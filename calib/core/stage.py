@@ -303,7 +303,7 @@ class Stage:
             raise BadInputError(
                 f"no useful answer follows from this input: {key} came out as {first['input']!r:.40}"
             ) from error
-        for result in self.sections(outcome).values():
+        for result in self.results(outcome):
             result.made_by(self.name, files.hashes)
         return outcome
 

@@ -92,6 +92,15 @@ class Log:
     def __len__(self) -> int:
         return len(self.t_s)
 
+    @staticmethod
+    def load(path: str | Path, options: LogOptions = NOTHING_STATED) -> Log:
+        """The log of a file: CSV, Parquet, a bag. Raises `BadInputError` as `read_log`."""
+        return read_log(Path(path), options)
+
+    def save(self, path: str | Path) -> None:
+        """Write as .csv or .parquet; never over a recording. Raises `BadInputError`."""
+        write_log(Path(path), self, SIMULATED if set(TRUE) & set(self.columns) else LOG)
+
     def sampled(self, *names: str) -> IntArray:
         """Indices of the rows in which all these columns have a value; none where one is missing."""
         if not names or any(name not in self.columns for name in names):

@@ -25,6 +25,7 @@ from calib.core.writing import check_folder, make_folder, sweep, write_atomicall
 from calib.runner.cache import Result, held, key_of, load, remove, store
 from calib.runner.folder import Folder, LogFile, digest_of, folder_digests, with_beside
 from calib.runner.work import Work, perform
+from calib.stages import stage
 
 # ----------------------------------------------------------------------
 # Sections of the rig's file, handed from stage to stage.
@@ -76,11 +77,10 @@ def sections_of(path: Path) -> Sections:
 
 
 # ----------------------------------------------------------------------
-# The stages of a run: each is a command as a person would type it, and what it depends on.
+# The steps of a run: each is a stage, what it does with a folder, and what a run asks beyond it.
 #
-# A later verb joins by one row in `STAGES`. A stage sees only the sections of the rig's file that its row
-# names (and what the person wrote into the folder's own rig.yaml), so that what it does cannot depend on
-# anything else, and the sections that it writes are those that its row names.
+# A step sees only the sections of the rig's file that its stage names (and what the person wrote into the
+# folder's own rig.yaml), so that what it does cannot depend on anything else.
 
 _IMU = ("ax_mps2", "ay_mps2", "gz_radps")
 _CAMERA = ("u_px", "v_px")
@@ -101,24 +101,23 @@ Plan = Callable[[Folder], Planned | str]
 
 
 @dataclass(frozen=True)
-class Stage:
-    """A row of the table.
+class Step:
+    """A stage in a run.
 
     Attributes
     ----------
-    name : the stage's folder and anchor. title : its heading.
-    verb : words of the command.
-    plan : arguments and inputs for a folder; `plan_log` instead for a stage that runs once for each log.
+    name : of its folder and anchor. title : its heading. verb : words of its stage.
+    plan : arguments and inputs for a folder; `plan_log` instead for a step that runs once for each log.
     writes : sections of the rig's file. needs : sections without which it cannot run. uses : sections that
         it reads where they are.
-    output : name of what it writes with -o, "" for nothing. figures : whether it draws.
+    output : name of what it writes beside rig.yaml, "" for nothing. figures : whether it draws.
     flashed : whether its result goes into the firmware.
     seconds : about how long it takes, by which the runner begins what holds up most.
     """
 
     name: str
     title: str
-    verb: tuple[str, ...]
+    verb: str
     plan: Plan | None = None
     plan_log: Callable[[LogFile], Planned | str] | None = None
     writes: tuple[str, ...] = ()
@@ -136,13 +135,13 @@ class Job:
 
     Attributes
     ----------
-    name : unique, and safe as a path: that of the stage, or stage and log.
-    log : of a stage that runs for each log.
+    name : unique, and safe as a path: that of the step, or step and log.
+    log : of a step that runs for each log.
     planned : None where `reason` says why there is nothing to do.
     """
 
     name: str
-    stage: Stage
+    step: Step
     log: LogFile | None
     planned: Planned | None
     reason: str = ""
@@ -232,68 +231,72 @@ def _replay(log: LogFile) -> Planned | str:
 
 
 _OPTICS = ("camera", "plane")
-_SENSORS = (*_OPTICS, "lens", "imu", "imu_intrinsics", "orientation_filter", "lowpass", "align", "estimator")
-_MACHINE = ("actuator", "pump")
-
-STAGES: tuple[Stage, ...] = (
-    Stage("intrinsics", "Camera", ("intrinsics",), _intrinsics, writes=("camera",), flashed=True,
-          seconds=5.0),
-    Stage("extrinsics", "Plane of motion", ("extrinsics",), _extrinsics, writes=("plane",), needs=("camera",),
-          flashed=True, seconds=3.0),
-    Stage("distortion", "Lens", ("distortion",), _nothing, writes=("lens",), needs=("camera",),
-          uses=("plane",)),
-    Stage("imu-static", "IMU at rest", ("imu", "static"), _static, writes=("imu",), flashed=True,
-          seconds=4.0),
-    Stage("imu-intrinsics", "IMU in poses", ("imu", "intrinsics"), _poses, writes=("imu_intrinsics",),
-          uses=("imu",)),
-    Stage("imu-tune", "Angle filter", ("imu", "tune"), _moving, writes=("orientation_filter",),
-          uses=(*_OPTICS, "imu", "imu_intrinsics"), flashed=True, seconds=4.0),
-    Stage("imu-drift", "Drift of the angle", ("imu", "drift"), _drift,
-          uses=("imu", "imu_intrinsics", "orientation_filter"), seconds=2.0),
-    Stage("lowpass", "Low-pass", ("lowpass",), _lowpass, writes=("lowpass",), uses=_OPTICS, flashed=True,
-          seconds=3.0),
-    Stage("align", "Camera and IMU together", ("align",), _both, writes=("align",), needs=_OPTICS,
-          uses=("imu", "imu_intrinsics"), flashed=True, seconds=9.0),
-    Stage("identify", "Model of the actuator", ("identify", "logs"), _identify, writes=_MACHINE,
-          needs=_OPTICS, uses=_SENSORS, seconds=9.0),
-    Stage("replay", "States", ("replay",), None, _replay, needs=_OPTICS, uses=(*_SENSORS, *_MACHINE),
-          output="states.csv", seconds=2.0),
-    Stage("control", "Controllers", ("control", "tune"), _nothing, writes=("controller",),
-          uses=(*_OPTICS, *_MACHINE), flashed=True, seconds=3.0),
-    Stage("validate", "Model against log", ("validate",), _driven, needs=_OPTICS,
-          uses=(*_SENSORS, *_MACHINE, "controller"), seconds=8.0),
-    Stage("firmware", "Firmware", ("firmware",), _nothing, needs=("camera",),
-          uses=(*_SENSORS, *_MACHINE, "controller"), output="firmware", figures=False),
-)  # fmt: skip
-"""All stages, each after those whose sections it reads."""
 
 
-def urgency(stages: tuple[Stage, ...] = STAGES) -> dict[str, float]:
-    """Seconds from the start of each stage to the end of all that waits for it, by name."""
+def _step(verb: str, plan: Plan | None, name: str = "", needs: tuple[str, ...] = (), **beyond: Any) -> Step:
+    """The step of a stage; `needs` are what a run demands beyond it."""
+    made = stage(verb)
+    # What is written on request is not asked for.
+    writes = () if made.on_request else made.writes
+    return Step(
+        name or verb.replace(" ", "-"),
+        made.title,
+        verb,
+        plan,
+        writes=writes,
+        needs=(*made.needs, *needs),
+        # Its own last answer is nothing to start from.
+        uses=tuple(name for name in made.uses if name not in writes),
+        figures=made.plots is not None,
+        **beyond,
+    )
+
+
+STEPS: tuple[Step, ...] = (
+    _step("intrinsics", _intrinsics, flashed=True, seconds=5.0),
+    _step("extrinsics", _extrinsics, flashed=True, seconds=3.0),
+    _step("distortion", _nothing),
+    _step("imu static", _static, flashed=True, seconds=4.0),
+    _step("imu intrinsics", _poses),
+    _step("imu tune", _moving, flashed=True, seconds=4.0),
+    _step("imu drift", _drift, seconds=2.0),
+    _step("lowpass", _lowpass, flashed=True, seconds=3.0),
+    _step("align", _both, flashed=True, seconds=9.0),
+    _step("identify logs", _identify, "identify", _OPTICS, seconds=9.0),
+    _step("replay", None, needs=_OPTICS, plan_log=_replay, output="states.csv", seconds=2.0),
+    _step("control tune", _nothing, "control", flashed=True, seconds=3.0),
+    _step("validate", _driven, needs=_OPTICS, seconds=8.0),
+    _step("firmware", _nothing, output="firmware"),
+)
+"""All steps, each after those whose sections it reads."""
+
+
+def urgency(steps: tuple[Step, ...] = STEPS) -> dict[str, float]:
+    """Seconds from the start of each step to the end of all that waits for it, by name."""
     out: dict[str, float] = {}
-    for stage in reversed(stages):
-        waits = [out[other.name] for other in stages if other.name in out
-                 and {*other.needs, *other.uses} & set(stage.writes)]  # fmt: skip
-        out[stage.name] = stage.seconds + max(waits, default=0.0)
+    for step in reversed(steps):
+        waits = [out[other.name] for other in steps if other.name in out
+                 and {*other.needs, *other.uses} & set(step.writes)]  # fmt: skip
+        out[step.name] = step.seconds + max(waits, default=0.0)
     return out
 
 
-def jobs_of(folder: Folder, stages: tuple[Stage, ...] = STAGES) -> Iterator[Job]:
+def jobs_of(folder: Folder, steps: tuple[Step, ...] = STEPS) -> Iterator[Job]:
     """The work that a folder asks for, in the table's order."""
-    for stage in stages:
-        if stage.plan_log is not None:
+    for step in steps:
+        if step.plan_log is not None:
             if not folder.logs:
-                yield Job(stage.name, stage, None, None, "no logs in logs/")
+                yield Job(step.name, step, None, None, "no logs in logs/")
             for log in folder.logs:
-                yield _job(f"{stage.name}-{log.slug}", stage, log, stage.plan_log(log))
-        elif stage.plan is not None:
-            yield _job(stage.name, stage, None, stage.plan(folder))
+                yield _job(f"{step.name}-{log.slug}", step, log, step.plan_log(log))
+        elif step.plan is not None:
+            yield _job(step.name, step, None, step.plan(folder))
 
 
-def _job(name: str, stage: Stage, log: LogFile | None, planned: Planned | str) -> Job:
+def _job(name: str, step: Step, log: LogFile | None, planned: Planned | str) -> Job:
     if isinstance(planned, str):
-        return Job(name, stage, log, None, planned)
-    return Job(name, stage, log, planned)
+        return Job(name, step, log, None, planned)
+    return Job(name, step, log, planned)
 
 
 # ----------------------------------------------------------------------
@@ -443,7 +446,7 @@ class Done:
     Attributes
     ----------
     status : "ok", "poor", "failed"; "blocked" by one that failed; "skipped" where the folder has nothing
-        for it; "missing" where this version has no such verb.
+        for it.
     reason : one sentence for all but "ok".
     result : None where nothing was run.
     """
@@ -506,7 +509,6 @@ class Runner:
     Parameters
     ----------
     runs : what runs commands.
-    available : whether this version has a verb.
     tell : gets a line for each stage that has ended; `progress` how many there are.
     fresh : whether old results are left aside.
     """
@@ -514,10 +516,9 @@ class Runner:
     folder: Folder
     out: Path
     runs: Runs
-    available: Callable[[tuple[str, ...]], bool]
     tell: Tell = lambda _: None
     progress: Callable[[int, int], None] = lambda _done, _total: None
-    stages: tuple[Stage, ...] = STAGES
+    steps: tuple[Step, ...] = STEPS
     fresh: bool = False
     done: dict[str, Done] = field(default_factory=dict)
     _base: Sections = field(default_factory=Sections)
@@ -528,16 +529,15 @@ class Runner:
 
     def run(self) -> list[Done]:
         """Run all jobs; returns how they ended, in the table's order."""
-        jobs = list(jobs_of(self.folder, self.stages))
+        jobs = list(jobs_of(self.folder, self.steps))
         self._before = {path: _stamp(path) for path in self.folder.files()}
         self._digests = folder_digests(self.folder)
         if self.folder.rig is not None:
             told = sections_of(self.folder.rig)
-            asked = [job for job in jobs if job.planned is not None and self.available(job.stage.verb)]
-            learnt = {name for job in asked for name in job.stage.writes}
+            learnt = {name for job in jobs if job.planned is not None for name in job.step.writes}
             self._base = told.without(learnt)
-        urgent = urgency(self.stages)
-        waiting = sorted(jobs, key=lambda job: -urgent[job.stage.name])
+        urgent = urgency(self.steps)
+        waiting = sorted(jobs, key=lambda job: -urgent[job.step.name])
         running: dict[str, tuple[Job, str, Path]] = {}
         while waiting or running:
             waiting = [job for job in waiting if not self._settled(job)]
@@ -559,9 +559,9 @@ class Runner:
     def sections(self) -> Sections:
         """All that is known at the end: what the person told and what the stages have learnt."""
         whole = self._base
-        for stage in self.stages:
+        for step in self.steps:
             for name, part in self._sections.items():
-                if self.done[name].job.stage is stage:
+                if self.done[name].job.step is step:
                     whole = whole.joined(part)
         return whole
 
@@ -570,30 +570,26 @@ class Runner:
 
     def _settled(self, job: Job) -> bool:
         """Whether a job has ended without being run; it is then among `done`."""
-        stage = job.stage
-        if not self.available(stage.verb):
-            self._finish(Done(job, "missing", f"this version has no calib {' '.join(stage.verb)}"))
-            return True
         if job.planned is None:
             self._finish(Done(job, "skipped", job.reason))
             return True
         return False
 
     def _ready(self, job: Job, waiting: list[Job], running: dict[str, tuple[Job, str, Path]]) -> bool:
-        read = {*job.stage.needs, *job.stage.uses}
+        read = {*job.step.needs, *job.step.uses}
         others = [*(other for other in waiting if other is not job), *(one for one, _, _ in running.values())]
-        return not any(read & set(other.stage.writes) for other in others)
+        return not any(read & set(other.step.writes) for other in others)
 
     def _known(self, job: Job) -> Sections:
         """The sections that a job may see."""
         whole = self.sections()
-        return whole.only({*self._base.values, *job.stage.needs, *job.stage.uses}).without(job.stage.writes)
+        return whole.only({*self._base.values, *job.step.needs, *job.step.uses}).without(job.step.writes)
 
     def _start(self, job: Job) -> tuple[Job, str, Path] | None:
         """Start a job, or end it at once: blocked, or with the result that is there."""
         assert job.planned is not None
         known = self._known(job)
-        lacking = next((name for name in job.stage.needs if name not in known.values), None)
+        lacking = next((name for name in job.step.needs if name not in known.values), None)
         if lacking is not None:
             self._finish(self._blocked(job, lacking))
             return None
@@ -602,7 +598,7 @@ class Runner:
         chosen = {**self._stated(job.planned), **job.planned.options}
         options = {name: self._said(value) for name, value in chosen.items()}
         key = key_of(
-            (*job.stage.verb, *named, json.dumps(options, sort_keys=True)), inputs, known.canonical()
+            (*job.step.verb.split(), *named, json.dumps(options, sort_keys=True)), inputs, known.canonical()
         )
         kept = None if self.fresh else load(self.out / HIDDEN / "stages" / job.name, key)
         if kept is not None and kept.code in _USABLE:
@@ -613,17 +609,17 @@ class Runner:
         make_folder(work)
         write_atomically(work / "rig.yaml", known.text(self.folder.rig or self.out / "rig.yaml"))
         self._began[job.name] = time.monotonic()
-        stage = job.stage
+        step = job.step
         self.runs.start(
             Work(
                 job.name,
-                " ".join(stage.verb),
+                step.verb,
                 self.folder.root,
                 work,
                 job.planned.paths,
                 chosen,
-                stage.figures,
-                stage.output,
+                step.figures,
+                step.output,
             )
         )
         return job, key, work
@@ -642,9 +638,9 @@ class Runner:
 
     def _blocked(self, job: Job, section: str) -> Done:
         for done in self.done.values():
-            if section in done.job.stage.writes:
+            if section in done.job.step.writes:
                 if done.status in ("failed", "blocked"):
-                    return Done(job, "blocked", f"needs {section}, and {done.job.stage.title} has failed")
+                    return Done(job, "blocked", f"needs {section}, and {done.job.step.title} has failed")
                 return Done(job, "skipped", f"needs {section}: {done.reason}")
         return Done(job, "skipped", f"needs {section}, which the folder's rig.yaml has not")
 
@@ -665,13 +661,13 @@ class Runner:
             words = said[-1].removeprefix("calib: ") if said else f"ended with exit code {result.code}"
             return Done(job, "failed", words, result)
         part = Sections()
-        if job.stage.writes:
+        if job.step.writes:
             try:
-                part = sections_of(result.folder / "rig.yaml").only(job.stage.writes)
+                part = sections_of(result.folder / "rig.yaml").only(job.step.writes)
             except BadInputError as error:
                 return Done(job, "failed", str(error), result)
             if not part.values:
-                return Done(job, "failed", f"has written no {' and no '.join(job.stage.writes)}", result)
+                return Done(job, "failed", f"has written no {' and no '.join(job.step.writes)}", result)
         self._sections[job.name] = part
         if result.code == EXIT_DONE:
             return Done(job, "ok", "", result, reused)
@@ -679,18 +675,18 @@ class Runner:
 
     def _finish(self, done: Done) -> None:
         self.done[done.job.name] = done
-        words = {"missing": "not available", "blocked": "not run"}.get(done.status, done.status)
+        words = "not run" if done.status == "blocked" else done.status
         of = "" if done.job.log is None else f" of {one_line(done.job.log.path.stem)}"
         began = self._began.pop(done.job.name, None)
         how = "" if began is None else f", {time.monotonic() - began:.1f} s"
         how = ", as before" if done.reused else how
         why = f" ({done.reason})" if done.reason else ""
-        self.tell(f"{done.job.stage.title}{of}: {words}{how}{why}")
+        self.tell(f"{done.job.step.title}{of}: {words}{how}{why}")
 
 
 def _reason(job: Job, part: Sections, result: Result) -> str:
     """The first reason that a stage gives for a poor result."""
-    for name in job.stage.writes:
+    for name in job.step.writes:
         reasons = part.values.get(name, {}).get("reasons")
         if reasons:
             return str(reasons[0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -14,9 +14,14 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from calib.core.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_POOR, BadInputError
 from calib.core.files import one_line, read_text, shown
+from calib.core.rig import Rig
+from calib.core.stage import NOTHING_STATED, LogOptions
+from calib.core.workers import processors
 from calib.core.writing import make_folder, replacing, write_atomically
-from calib.runner.folder import Folder, digest_of
-from calib.runner.graph import HIDDEN, Done, Job, Runner
+from calib.io.columns import read_columns_file
+from calib.runner.cache import key_of, load, remove, store
+from calib.runner.folder import Folder, digest_of, read_folder
+from calib.runner.graph import HIDDEN, Done, Job, Pool, Runner, opened
 
 # ----------------------------------------------------------------------
 # What a run leaves in its folder: rig.yaml, states/, firmware/, and a summary for the page.
@@ -36,14 +41,14 @@ def summary(runner: Runner, ended: Sequence[Done], simulated: bool) -> dict[str,
         jobs.append(
             {
                 "name": job.name,
-                "stage": job.stage.name,
-                "title": job.stage.title,
-                "verb": " ".join(job.stage.verb),
+                "stage": job.step.name,
+                "title": job.step.title,
+                "verb": job.step.verb,
                 "log": None if job.log is None else one_line(job.log.path.name),
                 "inputs": [] if planned is None else [_named(runner.folder, path) for path in planned.inputs],
                 "command": _command(runner.folder, job),
-                "writes": list(job.stage.writes),
-                "flashed": job.stage.flashed,
+                "writes": list(job.step.writes),
+                "flashed": job.step.flashed,
                 "status": done.status,
                 "reason": done.reason,
             }
@@ -69,7 +74,7 @@ def _command(folder: Folder, job: Job) -> list[str]:
                 words.append(f"--{flag}" if value else f"--no-{flag}")
             else:
                 words += [f"--{flag}", folder.name_of(value) if isinstance(value, Path) else str(value)]
-    return ["calib", *job.stage.verb, *map(one_line, words)]
+    return ["calib", *job.step.verb.split(), *map(one_line, words)]
 
 
 def _named(folder: Folder, path: Path) -> str:
@@ -83,7 +88,7 @@ def publish(runner: Runner, ended: Sequence[Done], told: dict[str, Any]) -> list
     for done in ended:
         if done.result is None or done.status not in ("ok", "poor"):
             continue
-        output = done.job.stage.output
+        output = done.job.step.output
         if done.job.log is not None and output in done.result.files:
             wanted[f"states/{done.job.log.slug}{Path(output).suffix}"] = done.result.folder / output
         elif output:
@@ -175,7 +180,7 @@ class _Job(BaseModel):
     command: list[Text]
     writes: list[Text]
     flashed: Flag
-    status: Literal["ok", "poor", "failed", "blocked", "skipped", "missing"]
+    status: Literal["ok", "poor", "failed", "blocked", "skipped"]
     reason: Text
 
 
@@ -338,3 +343,94 @@ def _record(jobs: Sequence[Mapping[str, Any]], sections: Mapping[str, Any]) -> l
             if isinstance(section, dict):
                 out += [f"{job['title']}: {advice}" for advice in section.get("advice") or ()]
     return list(dict.fromkeys(out))
+
+
+# ----------------------------------------------------------------------
+# A whole rig: a folder in; its results, a page and the decision out.
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """A run that has ended.
+
+    Attributes
+    ----------
+    out : its folder. decision : whether it can be flashed, and why not.
+    told : its summary. ended : how each step ended. files : what it has written, by name relative to `out`.
+    """
+
+    out: Path
+    decision: Decision
+    told: dict[str, Any]
+    ended: Sequence[Done]
+    files: tuple[str, ...]
+
+    @property
+    def rig(self) -> Rig:
+        """The rig's sections."""
+        return Rig.load(self.out / "rig.yaml")
+
+
+def calibrate(
+    folder: str | Path | None = None,
+    output: str | Path = "calibration",
+    *,
+    fresh: bool = False,
+    follow_links: bool = False,
+    stated: LogOptions = NOTHING_STATED,
+    jobs: int | None = None,
+    narrate: Callable[[str], None] = lambda sentence: None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Calibrated:
+    """Calibrate a whole rig: every stage from pictures and logs to the firmware and a page to read.
+
+    Parameters
+    ----------
+    folder : with images/, images/plane/, logs/ and rig.yaml; without one a simulated rig is calibrated.
+    output : folder for the results; a later run goes on from it.
+    fresh : do all stages again. follow_links : take files that are links out of the folder as well.
+    stated : what a person states of the logs. jobs : stages at a time, by default one per processor.
+    narrate : takes sentences for the person who watches. progress : stages that have ended, and all.
+
+    Raises
+    ------
+    BadInputError for a folder without anything to work on, and for an output folder that is not ours.
+    """
+    from calib.show.page import keep_pictures, write_page
+
+    out = Path(output)
+    if stated.columns is not None:
+        read_columns_file(stated.columns)
+    root = None if folder is None else Path(folder)
+    seen = None if root is None else read_folder(root, follow_links, stated)
+    with opened(out, root) as interrupted, Pool(jobs or processors()) as pool:
+        if interrupted is not None:
+            narrate("the last run here was interrupted; going on where it stopped")
+        if seen is None:
+            narrate("no folder given: a simulated rig is calibrated, not a real one")
+            seen = _simulated(out)
+        for sentence in seen.left_out:
+            narrate(sentence)
+        runner = Runner(seen, out, pool, narrate, progress, fresh=fresh)
+        ended = runner.run()
+        told = summary(runner, ended, root is None)
+        files = publish(runner, ended, told)
+        keep_pictures(seen.pictures, out / HIDDEN / "pictures")
+        write_page(out / "rig.yaml")
+    return Calibrated(out, decide(told, runner.sections().values), told, ended, (*files, "report.html"))
+
+
+def _simulated(output: Path) -> Folder:
+    """The folder of a simulated rig, made beside the results unless this program has made it before."""
+    from calib.twin.folder import write_rig_folder
+    from calib.twin.rig import SimulatedRig
+
+    hidden = output / HIDDEN
+    place, key = hidden / "stages" / "simulate", key_of(("simulate", "rig"), {}, "")
+    if load(place, key) is None:
+        work = hidden / "work" / "simulate"
+        remove(work)
+        make_folder(work)
+        write_rig_folder(work / "rig", SimulatedRig())
+        store(work, place, key, EXIT_DONE, hidden / "work" / "old-simulate")
+    return read_folder(place / "rig")

@@ -33,10 +33,10 @@ from calib.core.units import parse_corners, parse_square_m
 from calib.core.writing import make_folder
 from calib.runner.cache import key_of, program_digest
 from calib.runner.folder import Folder, folder_digests, read_folder
-from calib.runner.graph import STAGES, Done, Planned, Runner, Stage, opened
+from calib.runner.graph import STEPS, Done, Planned, Runner, Step, opened
 from calib.runner.outputs import decide, publish, summary
 from calib.runner.work import Work, perform
-from calib.stages import stage as calib_stage
+from calib.stages import stage
 
 # ----------------------------------------------------------------------
 # The packages of the extra `fleet`, loaded when they are first needed.
@@ -553,26 +553,24 @@ def kind_of(folder: Folder) -> str:
     return "run" if folder.logs else "camera"
 
 
-def _given(stage: Stage, folder: Folder, options: Mapping[str, str]) -> Stage:
-    """A stage with more options."""
-    planned = "" if stage.plan is None else stage.plan(folder)
+def _given(step: Step, folder: Folder, options: Mapping[str, str]) -> Step:
+    """A step with more options."""
+    planned = "" if step.plan is None else step.plan(folder)
     if not options or not isinstance(planned, Planned):
-        return stage
+        return step
     more = replace(planned, options={**planned.options, **options})
-    return replace(stage, plan=lambda _: more)
+    return replace(step, plan=lambda _: more)
 
 
-def _stages(
-    folder: Folder, kind: str, options: Sequence[tuple[str, str]], figures: bool
-) -> tuple[Stage, ...]:
-    kind_of_options = calib_stage("intrinsics").options
+def _steps(folder: Folder, kind: str, options: Sequence[tuple[str, str]], figures: bool) -> tuple[Step, ...]:
+    kind_of_options = stage("intrinsics").options
     given = {name_of_flag(kind_of_options, flag): value for flag, value in options}
-    wanted = [stage for stage in STAGES if kind == "run" or stage.name in CAMERA_STAGES]
+    wanted = [step for step in STEPS if kind == "run" or step.name in CAMERA_STAGES]
     out = []
-    for stage in wanted:
-        if stage.name == "intrinsics":
-            stage = _given(stage, folder, given)
-        out.append(stage if figures else replace(stage, figures=False))
+    for step in wanted:
+        if step.name == "intrinsics":
+            step = _given(step, folder, given)
+        out.append(step if figures else replace(step, figures=False))
     return tuple(out)
 
 
@@ -580,12 +578,8 @@ def run_stages(
     folder: Folder, kind: str, options: Sequence[tuple[str, str]], out: Path, page: bool = False
 ) -> Ended:
     """Run a folder's stages into a new output folder. Raises `BadInputError` as `calib run` does."""
-    from calib.cli.run import is_available
-
     with opened(out, folder.root):
-        runner = Runner(
-            folder, out, _Here(), is_available, stages=_stages(folder, kind, options, page), fresh=True
-        )
+        runner = Runner(folder, out, _Here(), steps=_steps(folder, kind, options, page), fresh=True)
         ended = runner.run()
         told = summary(runner, ended, False)
         files = publish(runner, ended, told)
@@ -598,7 +592,7 @@ def run_stages(
             files = [*files, "report.html"]
     decision = decide(told, runner.sections().values)
     code = decision.exit_code if kind == "run" else _camera_code(ended)
-    reasons = tuple(f"{done.job.stage.title}: {done.reason}" for done in ended if done.status in _TELLING)
+    reasons = tuple(f"{done.job.step.title}: {done.reason}" for done in ended if done.status in _TELLING)
     return Ended(code, {done.job.name: done.status for done in ended}, reasons, out, tuple(files))
 
 

@@ -7,11 +7,9 @@ stage's document, its messages, its figures and what it wrote beside them.
 from __future__ import annotations
 
 import contextlib
-import io
 import json
 import math
 import os
-import sys
 import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -25,7 +23,7 @@ from calib.core.result import section_json
 from calib.core.rig import SECTIONS, Rig
 from calib.core.stage import Files, Stage, options_of
 from calib.core.writing import check_figures, check_folder, check_writable, write_atomically
-from calib.stages import STAGES, stage
+from calib.stages import stage
 
 DOCUMENT, MESSAGES, RIG, FIGURES = "document.json", "messages.txt", "rig.yaml", "figures"
 """What a work leaves in its folder."""
@@ -124,8 +122,6 @@ def _finite(value: Any) -> Any:
 
 def perform(work: Work) -> int:
     """Carry out a work in this process; its exit code, as that of the verb would be."""
-    if work.verb not in STAGES:
-        return _typed(work)
     messages: list[str] = []
     files = Files(
         work.paths,
@@ -172,35 +168,3 @@ def _nowhere(line: str, places: tuple[str, ...]) -> str:
     for place in places:
         line = line.replace(place, "")
     return one_line(" ".join(line.split()))
-
-
-def _typed(work: Work) -> int:
-    """Carry out a verb that is no stage yet as if it had been typed."""
-    from calib.cli.main import main
-
-    words = ["calib", *work.verb.split(), "--json", "--rig", str(work.folder / RIG)]
-    words += ["--figures", str(work.folder / FIGURES)] if work.figures else []
-    words += ["-o", str(work.folder / work.output)] if work.output else []
-    for name, value in work.options.items():
-        words += [f"--{name.replace('_', '-')}", *([] if value is True else [str(value)])]
-    before, out, err = (sys.argv, sys.stdout, sys.stderr), io.StringIO(), io.StringIO()
-    try:
-        sys.argv, sys.stdout, sys.stderr = [*words, *map(str, work.paths)], out, err
-        try:
-            main()
-            code = 0
-        except SystemExit as leaving:
-            code = leaving.code if isinstance(leaving.code, int) else 0
-    finally:
-        sys.argv, sys.stdout, sys.stderr = before
-    with contextlib.suppress(ValueError):
-        told = json.loads(out.getvalue())
-        told.pop("seconds", None)
-        write_atomically(work.folder / DOCUMENT, json.dumps(told, indent=1) + "\n")
-    kept = [
-        _nowhere(line, (f"{work.root}{os.sep}", f"{work.folder}{os.sep}"))
-        for line in err.getvalue().splitlines()
-        if str(work.folder) not in line or line.startswith("calib: ")
-    ]
-    write_atomically(work.folder / MESSAGES, "".join(f"{line}\n" for line in kept))
-    return code

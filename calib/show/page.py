@@ -22,8 +22,7 @@ from calib.core.rig import Rig
 from calib.core.words import BLANK, SIGMA, facts, number, unit_of
 from calib.core.writing import Kind, holds, make_folder, write_atomically
 from calib.runner.cache import Result, load
-from calib.runner.graph import HIDDEN
-from calib.runner.graph import STAGES as STEPS
+from calib.runner.graph import HIDDEN, STEPS
 from calib.runner.outputs import decide, read_summary
 
 # ----------------------------------------------------------------------
@@ -376,7 +375,6 @@ _STATUS = {
     "failed": "failed",
     "blocked": "not run",
     "skipped": "no data",
-    "missing": "not available",
 }
 
 
@@ -527,7 +525,7 @@ def _stage(
 ) -> dict[str, Any]:
     section = _merged([sections.get(n) for job in jobs for n in job["writes"]])
     logs = [str(log.get("name")) for log in section.get("logs") or () if isinstance(log, dict)]
-    ran = [job["status"] not in ("skipped", "missing", "blocked") for job in jobs]
+    ran = [job["status"] not in ("skipped", "blocked") for job in jobs]
     results = [
         load(hidden / "stages" / str(job["name"])) if one else None
         for job, one in zip(jobs, ran, strict=True)
@@ -599,7 +597,7 @@ def _merged(sections: list[Any]) -> dict[str, Any]:
 
 
 def _worst(statuses: list[str]) -> str:
-    order = ("failed", "blocked", "poor", "ok", "skipped", "missing")
+    order = ("failed", "blocked", "poor", "ok", "skipped")
     return min(statuses, key=order.index)
 
 

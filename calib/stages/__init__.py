@@ -33,10 +33,13 @@ STAGES = {
     "align": "calib.stages.align.stage",
     "identify logs": "calib.stages.actuator.stage",
     "identify arm": "calib.stages.arm.stage",
+    "identify pump": "calib.stages.actuator.stage",
+    "identify stiffness": "calib.stages.actuator.stage",
     "replay": "calib.stages.estimator.stage",
     "control run": "calib.stages.control.stage",
     "control check": "calib.stages.control.stage",
     "control tune": "calib.stages.control.stage",
+    "validate": "calib.stages.actuator.stage",
     "firmware": "calib.stages.firmware.stage",
 }
 """Module of each stage by the words of its verb; the last word is its name there."""

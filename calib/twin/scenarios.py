@@ -11,6 +11,9 @@ import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError, UsageError
+from calib.core.rig import Rig
+from calib.core.units import parse_duration_s
+from calib.io.logs import Log
 from calib.stages.actuator.simulate import RigState, rig_at_rest
 from calib.stages.control.laws import (
     FeedForward,
@@ -22,9 +25,10 @@ from calib.stages.control.laws import (
     step_position,
 )
 from calib.stages.control.references import AngleSteps, Ellipse, PolynomialElongation
-from calib.twin.rig import SimulatedRig
+from calib.twin.rig import SimulatedRig, rig_from_file
 from calib.twin.sensors import stream, uniform
-from calib.twin.simulate import Law, Run, Seen, simulate
+from calib.twin.simulate import Law, Run, Seen, log_of
+from calib.twin.simulate import simulate as run_loop
 
 # ----------------------------------------------------------------------
 # Figures by which the source describes its experiments, read off simulated runs.
@@ -178,7 +182,7 @@ class Static:
 
     def run(self, rig: SimulatedRig, ticks: int, seed: int, feedback: str) -> Run:
         rig = replace(rig, imu=replace(rig.imu, onchip=self.onchip or rig.imu.onchip))
-        return simulate(rig, at_rest(rig), np.zeros((ticks, 2)), ticks, seed, feedback)
+        return run_loop(rig, at_rest(rig), np.zeros((ticks, 2)), ticks, seed, feedback)
 
     def figures(self, run: Run) -> Figures:
         if not run.rig.imu.onchip or len(run.onchip_rad) < 2:
@@ -197,7 +201,7 @@ class SwingRelease:
 
     def run(self, rig: SimulatedRig, ticks: int, seed: int, feedback: str) -> Run:
         start = rig_at_rest(rig.free_plant, rig.pump, self.phi_rad, or_none(self.length_m))
-        return simulate(rig, start, np.zeros((ticks, 2)), ticks, seed, feedback, rig.free_plant)
+        return run_loop(rig, start, np.zeros((ticks, 2)), ticks, seed, feedback, rig.free_plant)
 
     def figures(self, run: Run) -> Figures:
         t = run.trajectory.node_s * np.arange(len(run.trajectory.nodes), dtype=np.float64)
@@ -229,7 +233,7 @@ class Steps:
         for i, volt in enumerate(self.volts):
             begin = i * (self.on_s + self.off_s)
             pwm[(t >= begin) & (t < begin + self.on_s)] = _pwm(rig, volt)
-        return simulate(rig, at_rest(rig), pwm, ticks, seed, feedback)
+        return run_loop(rig, at_rest(rig), pwm, ticks, seed, feedback)
 
     def figures(self, run: Run) -> Figures:
         mm, figures = elongation_mm(run), Figures()
@@ -251,7 +255,7 @@ class Deflate:
     def run(self, rig: SimulatedRig, ticks: int, seed: int, feedback: str) -> Run:
         on = tick_times(rig, ticks) < self.off_at_s - 1e-9
         pwm = np.where(on, _pwm(rig, self.volt), 0.0)
-        return simulate(rig, at_rest(rig), np.stack([pwm, pwm], axis=1), ticks, seed, feedback)
+        return run_loop(rig, at_rest(rig), np.stack([pwm, pwm], axis=1), ticks, seed, feedback)
 
     def figures(self, run: Run) -> Figures:
         mm, off = elongation_mm(run), round(self.off_at_s / run.tick_s)
@@ -283,7 +287,7 @@ class Chirp:
         phase = 2.0 * np.pi * cycles
         waves = np.stack([np.sin(phase), np.cos(phase)], axis=1)
         pwm = np.clip(np.floor(self.middle_pwm + self.amplitude_pwm * waves + 0.5), 0.0, 255.0)
-        return simulate(rig, at_rest(rig), pwm, ticks, seed, feedback)
+        return run_loop(rig, at_rest(rig), pwm, ticks, seed, feedback)
 
     def figures(self, run: Run) -> Figures:
         return _span(run)
@@ -306,7 +310,7 @@ class Prbs:
         hold = max(round(self.hold_s / rig.pump.tick_s), 1)
         bits = uniform(stream(seed, _PRBS), 2 * (ticks // hold + 1)).reshape(-1, 2) < 0.5
         pwm = np.repeat(np.where(bits, self.low_pwm, self.high_pwm), hold, axis=0)[:ticks]
-        return simulate(rig, at_rest(rig), np.clip(pwm, 0.0, 255.0), ticks, seed, feedback)
+        return run_loop(rig, at_rest(rig), np.clip(pwm, 0.0, 255.0), ticks, seed, feedback)
 
     def figures(self, run: Run) -> Figures:
         return _span(run)
@@ -379,7 +383,7 @@ class Orientation:
         return law
 
     def run(self, rig: SimulatedRig, ticks: int, seed: int, feedback: str) -> Run:
-        return simulate(rig, at_rest(rig), self._law(rig, ticks), ticks, seed, feedback)
+        return run_loop(rig, at_rest(rig), self._law(rig, ticks), ticks, seed, feedback)
 
     def figures(self, run: Run) -> Figures:
         jump = max(min(round(self.jump_at_s / run.tick_s), len(run.pwm)), 1)
@@ -431,7 +435,7 @@ class Elongation:
         )
         law = _position_law(control, PolynomialElongation().bellows_m(tick_times(rig, ticks)))
         start = rig_at_rest(rig.plant, rig.pump, length_m=or_none(self.start_m))
-        return simulate(rig, start, law, ticks, seed, feedback)
+        return run_loop(rig, start, law, ticks, seed, feedback)
 
     def figures(self, run: Run) -> Figures:
         error = _errors_mm(run, PolynomialElongation().bellows_m(run.t_s))
@@ -462,7 +466,7 @@ class EllipseTrack:
         pid = Pid(self.Kp, 0.0, self.Kd, tick_s=rig.pump.tick_s)
         control = PositionControl(pid, FeedForward() if self.feedforward else None)
         law = _position_law(control, self._wanted(rig, tick_times(rig, ticks)))
-        return simulate(rig, at_rest(rig), law, ticks, seed, feedback)
+        return run_loop(rig, at_rest(rig), law, ticks, seed, feedback)
 
     def figures(self, run: Run) -> Figures:
         error = _errors_mm(run, self._wanted(run.rig, run.t_s))[run.t_s >= 2.0]
@@ -569,3 +573,37 @@ def run_scenario(
     if not math.isfinite(duration):
         raise BadInputError(f"duration: found {duration}, expected a time")
     return scenario.run(rig, round(duration / rig.pump.tick_s), seed, feedback)
+
+
+def simulate(
+    scenario: str,
+    rig: Rig | None = None,
+    *,
+    seed: int = 0,
+    feedback: str = "sensors",
+    duration: float | str | None = None,
+    **settings: object,
+) -> Log:
+    """Simulate an experiment; its log has the truth in columns of its own.
+
+    Parameters
+    ----------
+    scenario : one of `SCENARIOS`. rig : what to simulate; the nominal rig without.
+    seed : of all noise; the same seed, the same log.
+    feedback : what controllers get: "sensors", filtered as in the firmware, or "truth".
+    duration : [s], or with a unit such as "10s"; that of the scenario without.
+    settings : options of the scenario, such as Kp=500.
+
+    Raises `UsageError`, `BadInputError` as `make_scenario` and `run_scenario`.
+    """
+    machine = SimulatedRig() if rig is None else rig_from_file(rig)
+    plan = make_scenario(scenario, {name: _typed(value) for name, value in settings.items()})
+    duration_s = parse_duration_s(duration, "duration") if isinstance(duration, str) else duration
+    return log_of(run_scenario(plan, machine, seed, feedback, duration_s), scenario)
+
+
+def _typed(value: object) -> str:
+    """A setting as it is typed."""
+    if isinstance(value, list | tuple):
+        return ",".join(str(one) for one in value)
+    return str(value).lower() if isinstance(value, bool) else str(value)

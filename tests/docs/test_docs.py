@@ -88,9 +88,9 @@ def test_the_tour_runs_as_in_a_notebook(tmp_path: Path, monkeypatch: pytest.Monk
         subprocess.run([sys.executable, "-m", "calib", *words], check=True, capture_output=True)
     words = ["intrinsics", "images", "--rig", "old.yaml"]
     subprocess.run([sys.executable, "-m", "calib", *words], check=True, capture_output=True)
-    ((_, block),) = blocks((MANUAL / "tour.md").read_text(encoding="utf-8"), "python")
+    parts = [block for _, block in blocks((MANUAL / "tour.md").read_text(encoding="utf-8"), "python")]
     names: dict[str, Any] = {}
-    exec(compile(block, "tour.md", "exec"), names)
+    exec(compile("".join(parts), "tour.md", "exec"), names)
     rig, states = names["rig"], names["states"]
     assert rig.camera.verdict.ok and rig.align.sigma["time_offset_s"] < 1e-3
     assert states.to_pandas()["sigma_q1_m"].notna().all()
@@ -98,6 +98,11 @@ def test_the_tour_runs_as_in_a_notebook(tmp_path: Path, monkeypatch: pytest.Monk
     assert saved.camera == rig.camera and saved.actuator == rig.actuator
     assert Path("firmware_constants/calib_constants.h").is_file()
     assert "<table>" in rig.camera._repr_html_()
+    assert set(names["calib"].plots(states)) == {
+        f"ellipse_{one}" for one in ("states", "innovations", "errors")
+    }
+    again = names["calib"].Log.load("simulated.csv")
+    assert len(again) == len(names["log"]) and "true_phi_rad" in again.columns
 
 
 def test_the_readme_shows_what_its_first_command_prints(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from running_trials import CALLS, Inline, exit_code, make_folder, run_small
 from calib.core.errors import BadInputError
 from calib.core.rig import KINDS
 from calib.runner.folder import read_folder
-from calib.runner.graph import HIDDEN, STAGES, Done, opened
+from calib.runner.graph import HIDDEN, STEPS, Done, opened
 from calib.runner.outputs import read_summary
 from calib.show.page import keep_pictures, page_text, write_page
 
@@ -385,10 +385,10 @@ def test_odd_names_stay_inside_and_run(tmp_path: Path, name: str) -> None:
 
 def test_every_stage_comes_after_what_it_reads() -> None:
     written: dict[str, str] = {}
-    for stage in STAGES:
+    for stage in STEPS:
         for name in (*stage.needs, *stage.uses):
             assert name in KINDS
-            later = [other.name for other in STAGES if name in other.writes]
+            later = [other.name for other in STEPS if name in other.writes]
             assert not later or name in written or name not in stage.needs, (stage.name, name)
             # A section that a later stage writes would make the two wait for each other.
             assert name in written or not later, (stage.name, name)

@@ -1,24 +1,31 @@
-"""The stage of the actuator: stiffness, damping, bending, creep and the pumps from logs of motion."""
+"""The stages of the actuator: its model from logs, a pump from tables, springs from weights; the check."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from calib.core.errors import UsageError
+from calib.core.errors import BadInputError, UsageError
 from calib.core.stage import Files, LogOptions, Stage, option
+from calib.core.verdict import Verdict
 
 if TYPE_CHECKING:
+    from calib.core.arrays import FloatArray
     from calib.core.plot import Figure
     from calib.core.rig import Rig
     from calib.core.stage import Progress
-    from calib.core.words import Block
+    from calib.core.words import Block, Table
+    from calib.stages.actuator.identify import StiffnessFit
     from calib.stages.actuator.machine import Machine
-    from calib.stages.actuator.read import TrackSource
+    from calib.stages.actuator.pump_results import PumpFound
+    from calib.stages.actuator.read import PumpTable, TrackSource
     from calib.stages.actuator.results import Identified
     from calib.stages.actuator.section import Actuator, PumpSection
+    from calib.stages.actuator.validate import Comparison
+    from calib.stages.arm.identify import Held
 
     Sections = tuple[Actuator, PumpSection | None]
 
@@ -195,4 +202,447 @@ logs = Stage(
     document=_document,
     words=_words,
     plots=_plots,
+)
+
+
+def _cell(value: float | None, form: str = ".3g") -> str:
+    from calib.core.words import BLANK
+
+    return BLANK if value is None or value != value else f"{value:{form}}"
+
+
+# ----------------------------------------------------------------------
+# `calib identify pump`: a pump from tables of time, PWM and pressure or force.
+
+
+@dataclass(frozen=True)
+class PumpOptions:
+    """Which column is what, and which tables are kept out of the fit."""
+
+    held: tuple[Path, ...] | None = option(None, "Table to predict and not to fit; may be repeated.")
+    time: str | None = option(None, "Column of the time, else recognised.")
+    pwm: str | None = option(None, "Column of the PWM, else recognised.")
+    value: str | None = option(None, "Column of pressure or force, else recognised.")
+    unit: Literal["kPa", "N"] | None = option(None, "Unit of that column.")
+
+
+@dataclass(frozen=True)
+class PumpInputs:
+    """Tables to fit and tables to predict, and the rig with what it holds of a pump."""
+
+    tables: Sequence[PumpTable]
+    kept_out: Sequence[PumpTable]
+    rig: Rig
+    progress: Progress
+
+
+def _read_pump(files: Files, rig: Rig, options: PumpOptions) -> PumpInputs:
+    from calib.stages import expanded
+    from calib.stages.actuator.read import read_pump_table
+
+    columns = (options.time, options.pwm, options.value, options.unit)
+    tables = [read_pump_table(path, *columns) for path in files.paths]
+    kept_out = [read_pump_table(path, *columns) for path in expanded(options.held)]
+    for path in files.paths:
+        files.taken(path)
+    return PumpInputs(tables, kept_out, rig, files.progress)
+
+
+def _solve_pump(inputs: PumpInputs) -> PumpSection:
+    from calib.stages.actuator.pump_results import identify_pump, pump_section
+
+    with inputs.progress("identifying") as progress:
+        found = identify_pump(inputs.tables, inputs.kept_out, progress)
+    return pump_section(found, inputs.rig).with_evidence(found)
+
+
+def _pump_document(section: PumpSection) -> dict[str, Any]:
+    found: PumpFound = section.evidence
+    asked = {
+        model: {one.name: {"rms": one.rms, "ahead_rms": one.ahead} for one in rows}
+        for model, rows in found.asked.items()
+    }
+    return {"held": asked} if any(asked.values()) else {}
+
+
+def _pump_words(section: PumpSection) -> list[Block]:
+    """Parameters, errors on tables that were not fitted, and static maps."""
+    from calib.core.words import Line, Table
+    from calib.stages.actuator.pump_results import parameter_rows
+
+    found: PumpFound = section.evidence
+    unit, models = found.unit, list(found.fits)
+    blocks: list[Block] = []
+    for model, fit in found.fits.items():
+        rows = [
+            (name, "off" if sigma is None else _cell(value, ".4g"), _cell(sigma, ".2g"), of)
+            for name, value, sigma, of, _ in parameter_rows(fit, unit)
+        ]
+        blocks.append(Table((model, "value", "sigma", "unit"), tuple(rows)))
+    columns = (*models, *(f"{model}, 0.5 s ahead" for model in models))
+    if models:
+        held = {model: {one.name: one for one in found.held[model]} for model in models}
+        errors = []
+        for record in found.records:
+            row = [held[model].get(record.name) for model in models]
+            cells = [_cell(None if one is None else one.rms) for one in row]
+            errors.append((record.name, *cells, *(_cell(None if one is None else one.ahead) for one in row)))
+        blank, main = ("",) * len(models), found.main_group
+        if main is not None:
+            ends = (_cell(found.held_rms(model, main.names)) for model in models)
+            errors.append((f"all that settle near {main.value:.1f} {unit}", *ends, *blank))
+        errors.append(("all", *(_cell(found.held_rms(model)) for model in models), *blank))
+        blocks.append(Table((f"RMS on files not fitted, {unit}", *columns), tuple(errors)))
+        how = "simulated from a file's PWM and its first 0.2 s, which give the start; the extras of a model"
+        blocks.append(Line(f"{how} are chosen once, on all files"))
+    asked = {model: {one.name: one for one in found.asked[model]} for model in models}
+    if models and asked[models[0]]:
+        told = []
+        for name in asked[models[0]]:
+            kept = [asked[model][name] for model in models]
+            told.append((name, *(_cell(one.rms) for one in kept), *(_cell(one.ahead) for one in kept)))
+        blocks.append(Table((f"RMS on the tables kept out, {unit}", *columns), tuple(told)))
+    maps = [
+        (
+            one.name,
+            f"{one.end:.4g} ± {_cell(one.sigma['end'], '.2g')}",
+            f"{one.shape.dead_pwm:.1f} ± {_cell(one.sigma['dead_pwm'], '.2g')}",
+            f"{one.shape.scale_pwm:.1f} ± {_cell(one.sigma['scale_pwm'], '.2g')}",
+            f"{one.saturates_pwm:.0f}",
+            _cell(one.scatter),
+        )
+        for one in found.maps
+    ]
+    if maps:
+        head = ("static map", f"at PWM 255, {unit}", "dead zone, PWM", "scale, PWM", "95 % at PWM", "scatter")
+        blocks.append(Table(head, tuple(maps)))
+    return blocks
+
+
+def _pump_plots(section: PumpSection) -> dict[str, Figure]:
+    from calib.stages.actuator.plots import pump_plots
+
+    return pump_plots(section.evidence, section.verdict.word)
+
+
+pump = Stage(
+    "identify pump",
+    "Pump",
+    """Find dead time, lag, static map and flow of a pump; compare two models on tables not fitted.
+
+    Writes the section pump. Exits 1 when something is left that the PWM does not explain.
+    """,
+    _read_pump,
+    _solve_pump,
+    PumpOptions,
+    sources="Tables of time, PWM and pressure.",
+    metavar="TABLE...",
+    writes=("pump",),
+    uses=("known", "pump"),
+    document=_pump_document,
+    words=_pump_words,
+    plots=_pump_plots,
+)
+
+
+# ----------------------------------------------------------------------
+# `calib identify stiffness`: springs from hanging weights or steady elongations.
+
+
+@dataclass(frozen=True)
+class StiffnessOptions:
+    """What was stretched."""
+
+    per: Literal["actuator", "bellows"] = option("actuator", "What the table's forces stretch.")
+
+
+@dataclass(frozen=True)
+class Springs:
+    """Elongations [m] with forces [N], the laws that were fitted to them, and which of these is used."""
+
+    name: str
+    elongation_m: FloatArray
+    force_N: FloatArray
+    fits: Sequence[StiffnessFit]
+    used: int
+    per: str
+
+
+@dataclass(frozen=True)
+class StiffnessInputs:
+    """A table's elongations [m] and forces [N], and the rig with what it holds of the actuator."""
+
+    name: str
+    elongation_m: FloatArray
+    force_N: FloatArray
+    per: str
+    rig: Rig
+
+
+def _read_stiffness(files: Files, rig: Rig, options: StiffnessOptions) -> StiffnessInputs:
+    from calib.core.files import shown
+    from calib.stages.actuator.read import read_displacements
+
+    (path,) = files.paths
+    elongation_m, force_N = read_displacements(path)
+    # The section keeps what logs have told of the other parameters.
+    files.hashes |= rig.provenance.inputs.get("actuator", {})
+    files.taken(path)
+    return StiffnessInputs(shown(path), elongation_m, force_N, options.per, rig)
+
+
+def _solve_stiffness(inputs: StiffnessInputs) -> Actuator:
+    from calib.stages.actuator.identify import fit_stiffness
+    from calib.stages.actuator.results import stiffness_section
+
+    fits, best = fit_stiffness(inputs.name, inputs.elongation_m, inputs.force_N)
+    found = Springs(inputs.name, inputs.elongation_m, inputs.force_N, fits, best, inputs.per)
+    section = stiffness_section(fits[best], inputs.per == "actuator", inputs.rig)
+    return section.with_evidence(found)
+
+
+def _stiffness_document(section: Actuator) -> dict[str, Any]:
+    found: Springs = section.evidence
+    laws = [
+        {
+            "order": fit.order,
+            "coefficients": fit.coefficients.tolist(),
+            "sigma": fit.sigma.tolist(),
+            "correlation": fit.correlation.tolist(),
+            "rms_N": fit.rms_N,
+            "left_out_rms_N": fit.left_out_rms_N,
+            "used": k == found.used,
+        }
+        for k, fit in enumerate(found.fits)
+    ]
+    return {"stiffness": {"per": found.per, "laws": laws}}
+
+
+def _stiffness_words(section: Actuator) -> list[Block]:
+    from calib.core.words import BLANK, Table
+
+    found: Springs = section.evidence
+    rows = []
+    for k, fit in enumerate(found.fits):
+        pairs = zip(fit.coefficients.tolist(), fit.sigma.tolist(), strict=True)
+        terms = [f"{c:.5g} ± {s:.2g}" for c, s in pairs]
+        terms += [BLANK] * (3 - len(terms))
+        used = " (used)" if k == found.used else ""
+        rows.append((f"order {fit.order}{used}", *terms, f"{fit.left_out_rms_N:.3g}"))
+    head = (f"of the {found.per}", "k0, N/m", "k1, N/m²", "k2, N/m³", "left out, N")
+    return [Table(head, tuple(rows))]
+
+
+def _stiffness_plots(section: Actuator) -> dict[str, Figure]:
+    from calib.stages.actuator.plots import stiffness_plots
+
+    found: Springs = section.evidence
+    return stiffness_plots(found.elongation_m, found.force_N, list(found.fits), found.used)
+
+
+stiffness = Stage(
+    "identify stiffness",
+    "Springs",
+    """Find the springs from hanging weights or steady elongations: linear and polynomial, zero at zero.
+
+    Writes k0 .. k3 of one bellows to the section actuator.
+    """,
+    _read_stiffness,
+    _solve_stiffness,
+    StiffnessOptions,
+    sources="Elongations with forces or masses.",
+    several=False,
+    metavar="TABLE",
+    writes=("actuator",),
+    uses=("actuator",),
+    document=_stiffness_document,
+    words=_stiffness_words,
+    plots=_stiffness_plots,
+)
+
+
+# ----------------------------------------------------------------------
+# `calib validate`: the models against logs.
+
+
+@dataclass(frozen=True)
+class ValidateOptions(LogOptions):
+    """Where the pose comes from, and what is known of an arm's logs."""
+
+    states: tuple[Path, ...] | None = option(
+        None, "States of calib replay to use instead of the pictures, for the logs in turn."
+    )
+    truth: bool = option(False, "Take the true columns of a simulated log.")
+    no_pwm: bool = option(False, "Logs without commands are swings with the hoses off.")
+    load: tuple[str, ...] | None = option(None, "Mass at the tip of an arm's logs.", metavar="NAME=MASS")
+    day: tuple[str, ...] | None = option(None, "Day of an arm's logs.", metavar="NAME=DAY")
+
+
+@dataclass(frozen=True)
+class Validated:
+    """What models show in place of logs.
+
+    Attributes
+    ----------
+    compared : logs of the actuator. held : free-run errors of an arm by log.
+    """
+
+    compared: tuple[Comparison, ...] = ()
+    held: Mapping[str, Held] | None = None
+    verdict: Verdict = Verdict()
+
+
+def _read_validate(files: Files, rig: Rig, options: ValidateOptions) -> Validated:
+    from calib.core.files import shown
+    from calib.io.columns import is_arm_log
+    from calib.io.logs import columns_of
+    from calib.stages import expanded
+    from calib.stages.actuator.validate import IMPROVED, validate_log
+
+    states = expanded(options.states)
+    if states and len(states) != len(files.paths):
+        raise UsageError(f"--states: {len(states)} files for {len(files.paths)} logs, expected one for each")
+    if options.truth and states:
+        raise UsageError("--truth: takes the true columns, --states does not apply")
+    if all(is_arm_log(columns_of(path, options) or ()) for path in files.paths):
+        if rig.arm is None:
+            raise BadInputError(f"{shown(files.rig_path)}: has no arm yet; run calib identify arm first")
+        # An arm's trials are read by its own stage.
+        from calib.stages.arm.stage import Options, validate
+
+        arm_options = Options(columns=options.columns, load=options.load, day=options.day)
+        return Validated(held=validate(files, rig, arm_options))
+    compared = []
+    for k, path in enumerate(files.paths):
+        one, said = validate_log(
+            path, rig, files.rig_path, states[k] if states else None, options.truth, options.no_pwm, options
+        )
+        files.remarks += said
+        compared.append(one)
+    if IMPROVED not in compared[0].errors:
+        files.remarks.append(
+            f"{shown(files.rig_path)} has no section known, actuator or pump: the improved model has "
+            "nominal parameters"
+        )
+    return Validated(tuple(compared))
+
+
+def _as_read(validated: Validated) -> Validated:
+    """Nothing is solved: reading a log asks the models already."""
+    return validated
+
+
+def _validate_document(outcome: Validated) -> dict[str, Any]:
+    if outcome.held is not None:
+        arm = {
+            name: {
+                "angle_rad": one.angle_rad,
+                "chord_m": one.chord_m,
+                "angle_by_pressure_rad": one.by_pressure_rad,
+                "pressure_kpa": one.pressure_kpa,
+            }
+            for name, one in outcome.held.items()
+        }
+        return {"validate": {"arm": arm}}
+    return {"validate": {"logs": [_log_json(one) for one in outcome.compared]}}
+
+
+def _log_json(one: Comparison) -> dict[str, Any]:
+    from calib.stages.actuator.validate import ORIGINAL, QUANTITIES
+
+    units = {name: "rad" if name == "phi" else "m" for name in QUANTITIES}
+    return {
+        "log": one.name,
+        "pose_from": one.how,
+        "start_from": one.start,
+        "pumps_connected": one.hoses,
+        "poses": len(one.t_s),
+        "duration_s": float(one.t_s[-1] - one.t_s[0]),
+        "replaced_rows": one.replaced,
+        "models": {
+            model: {
+                name: {
+                    f"norm_{units[name]}": error.norm,
+                    f"rms_{units[name]}": error.rms,
+                    "fit_percent": error.fit_percent,
+                }
+                for name, error in errors.items()
+            }
+            for model, errors in one.errors.items()
+        },
+        "smaller_by_percent": {
+            model: {name: one.improvement_percent(name, model) for name in QUANTITIES}
+            for model in one.errors
+            if model != ORIGINAL
+        },
+    }
+
+
+def _validate_words(outcome: Validated) -> list[Block]:
+    from calib.core.words import Line, Table
+
+    if outcome.held is not None:
+        scales = (math.degrees(1.0), 1e3, math.degrees(1.0), 1.0)
+        rows = []
+        for name, held in outcome.held.items():
+            values = (held.angle_rad, held.chord_m, held.by_pressure_rad, held.pressure_kpa)
+            rows.append((name, *(_cell(x * k, ".2f") for x, k in zip(values, scales, strict=True))))
+        head = ("free run, RMS", "angle, °", "chord, mm", "angle by pressure, °", "pressure, kPa")
+        return [Table(head, tuple(rows))]
+    blocks: list[Block] = []
+    for one in outcome.compared:
+        hoses = "pumps connected" if one.hoses else "hoses off"
+        start = "the estimator" if one.start == "estimator" else one.start
+        span_s = one.t_s[-1] - one.t_s[0]
+        poses = f"{one.name}: {len(one.t_s)} poses over {span_s:.4g} s from {one.how}"
+        blocks += [Line(f"{poses}, {hoses}, start by {start}"), _errors(one)]
+        if any(error.norm != error.norm for errors in one.errors.values() for error in errors.values()):
+            text = "a simulated motion leaves the model before the log ends, its errors are not known"
+            blocks.append(Line(text, "reason"))
+        if one.replaced:
+            text = f"{one.replaced} rows stood away from their neighbours and were replaced by them"
+            blocks.append(Line(text, "reason"))
+    return blocks
+
+
+def _errors(one: Comparison) -> Table:
+    from calib.core.words import Table
+    from calib.stages.actuator.validate import ORIGINAL, QUANTITIES
+
+    rows = []
+    for quantity in QUANTITIES:
+        scale, unit = (1.0, "rad") if quantity == "phi" else (1e3, "mm")
+        for model, errors in one.errors.items():
+            error = errors[quantity]
+            gained = None if model == ORIGINAL else one.improvement_percent(quantity, model)
+            cells = (_cell(scale * error.norm), _cell(scale * error.rms), _cell(error.fit_percent, ".1f"))
+            rows.append((f"{quantity}, {unit}, {model}", *cells, _cell(gained, ".1f")))
+    return Table(("error of", "L2 norm", "RMS", "fit, %", "smaller by, %"), tuple(rows))
+
+
+def _validate_plots(outcome: Validated) -> dict[str, Figure]:
+    from calib.stages.actuator.plots import validate_plots
+
+    return validate_plots(outcome.compared)
+
+
+validate = Stage(
+    "validate",
+    "Model against log",
+    """Hold the models against logs.
+
+    A log's commands are played to the original model of the source, to the improved one with nominal
+    parameters, and to that with the sections actuator and pump, from the estimator's state at its start.
+    Logs of pressures are played to the section arm, from the first readings alone.
+    Exits 0 whatever comes of it.
+    """,
+    _read_validate,
+    _as_read,
+    ValidateOptions,
+    sources="Logs to hold the models against.",
+    metavar="LOG...",
+    uses=(*logs.uses, "arm"),
+    document=_validate_document,
+    words=_validate_words,
+    plots=_validate_plots,
 )

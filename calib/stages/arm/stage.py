@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from calib.core.errors import UsageError
@@ -285,11 +284,8 @@ def _document(arm: Arm) -> dict[str, Any]:
     }
 
 
-def validate(paths: Sequence[Path], rig: Rig, options: Options) -> tuple[dict[str, Held], Sequence[str]]:
-    """Free-run errors of the rig's arm on logs, by name, and sentences on how they were read.
-
-    Raises `BadInputError` as `read_trials`.
-    """
+def validate(files: Files, rig: Rig, options: Options) -> dict[str, Held]:
+    """Free-run errors of the rig's arm on logs, by name. Raises `BadInputError` as `read_trials`."""
     import numpy as np
 
     from calib.stages.arm.identify import errors_by
@@ -298,15 +294,14 @@ def validate(paths: Sequence[Path], rig: Rig, options: Options) -> tuple[dict[st
     arm = rig.arm
     assert arm is not None
     axis = arm.bending_axis
-    files = Files(tuple(paths))
     trials, _, findings = read_trials(files, options, Frame(None if axis is None else np.array(axis)))
-    errors = {one.name: errors_by(arm.values, arm.gain_of(one.day), one) for one in trials}
-    unseen = [
+    files.remarks += [one.text for one in findings]
+    files.remarks += [
         f"{one.name}: day {one.day} is not in the rig, its gain is the mean"
         for one in trials
         if one.day not in arm.days
     ]
-    return errors, [*files.remarks, *(one.text for one in findings), *unseen]
+    return {one.name: errors_by(arm.values, arm.gain_of(one.day), one) for one in trials}
 
 
 arm = Stage(

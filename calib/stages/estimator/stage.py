@@ -134,10 +134,10 @@ def _document(results: list[Replayed]) -> dict[str, Any]:
     return {"replay": {"logs": [section_json(one, whole=True) for one in results]}}
 
 
-def _plots(results: list[Replayed]) -> dict[str, Figure]:
+def _plots(outcome: list[Replayed] | Replayed) -> dict[str, Figure]:
     from calib.stages.estimator.plots import plots
 
-    return plots(results)
+    return plots(outcome if isinstance(outcome, list) else [outcome])
 
 
 replay = Stage(

@@ -406,6 +406,7 @@ intrinsics = Stage(
     optional=True,
     metavar="LOG",
     writes=("imu_intrinsics",),
+    uses=("imu",),
     plots=_intrinsics_plots,
 )
 
@@ -653,7 +654,7 @@ tune = Stage(
     sources="Logs of the rig in motion.",
     metavar="LOG...",
     writes=("orientation_filter",),
-    uses=("imu", "camera", "plane"),
+    uses=("imu", "imu_intrinsics", "camera", "plane"),
     words=_tune_words,
     plots=_tune_plots,
 )
@@ -823,7 +824,7 @@ drift = Stage(
     DriftOptions,
     sources="Logs of the rig, at rest or in motion.",
     metavar="LOG...",
-    uses=("orientation_filter",),
+    uses=("imu", "imu_intrinsics", "orientation_filter"),
     document=_drift_document,
     words=_drift_words,
     plots=_drift_plots,
