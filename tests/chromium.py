@@ -20,24 +20,28 @@ _NAMES = ("chromium", "chromium-browser", "google-chrome")
 _PATIENCE_S = 120.0
 
 
-def browser_or_skip(folder: Path) -> Browser:
-    """A browser with its profile in this folder; skips the test without one."""
+def browser_or_skip(folder: Path, *more: str) -> Browser:
+    """A browser with its profile in this folder and further switches; skips the test without one."""
     found = next((path for path in map(shutil.which, _NAMES) if path), None)
     if found is None:
         pytest.skip("no chromium on this machine")
-    return Browser(found, folder)
+    return Browser(found, folder, *more)
 
 
 class Browser:
-    """One page in a browser; `errors` holds what the console was told of errors."""
+    """One page in a browser; `errors` holds what the console was told of errors.
 
-    def __init__(self, program: str, folder: Path) -> None:
+    `own` begins the addresses that a page may ask for; any other is an error.
+    """
+
+    def __init__(self, program: str, folder: Path, *more: str) -> None:
+        self.own = ("data:", "file:", "about:")
         to_read, to_write = os.pipe()
         from_read, from_write = os.pipe()
         words = [
             program, "--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage",
             "--hide-scrollbars", "--no-first-run", "--disable-extensions", f"--user-data-dir={folder}",
-            "--remote-debugging-pipe", "about:blank",
+            "--remote-debugging-pipe", *more, "about:blank",
         ]  # fmt: skip
         # The browser reads on descriptor 3 and writes on 4.
         shell = f'exec "$@" 3<&{to_read} 4>&{from_write}'
@@ -68,11 +72,11 @@ class Browser:
         os.close(self._write)
         os.close(self._read)
 
-    def open(self, page: Path, width: int, height: int = 900) -> None:
-        """Load a file in a window of this size and wait until all of it is there."""
+    def open(self, page: Path | str, width: int, height: int = 900) -> None:
+        """Load a file, or an address, in a window of this size and wait until all of it is there."""
         self.size(width, height)
         self._events.clear()
-        self._call("Page.navigate", url=page.as_uri())
+        self._call("Page.navigate", url=page if isinstance(page, str) else page.as_uri())
         self._until("Page.loadEventFired")
 
     def size(self, width: int, height: int = 900) -> None:
@@ -166,5 +170,5 @@ class Browser:
             self.errors.append(parameters["entry"]["text"])
         elif method == "Network.requestWillBeSent":
             url = parameters["request"]["url"]
-            if not url.startswith(("data:", "file:", "about:")):
+            if not url.startswith(self.own):
                 self.errors.append(f"asked the network for {url}")

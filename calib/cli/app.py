@@ -14,6 +14,7 @@ from calib.cli.diff import diff
 from calib.cli.docs import docs
 from calib.cli.doctor import doctor
 from calib.cli.fleet import fleet
+from calib.cli.live import live
 from calib.cli.record import record
 from calib.cli.report import report
 from calib.cli.run import run
@@ -49,6 +50,7 @@ def _options(
 
 app.command("run")(telling(run))
 app.command("intrinsics")(verb(stage("intrinsics")))
+app.command("live")(live)
 app.command("extrinsics")(verb(stage("extrinsics")))
 app.command("distortion")(verb(stage("distortion")))
 app.command("lowpass")(verb(stage("lowpass")))

@@ -288,6 +288,16 @@ def write_atomically(path: Path, data: bytes | str, kind: Kind | None = None) ->
         stream.write(raw)
 
 
+def move(path: Path, target: Path) -> None:
+    """Give a file another name on the same disk. Raises `BadInputError`, as where that name is taken."""
+    if target.exists():
+        raise BadInputError(f"{shown(target)}: is there already; {shown(path)} stays where it is")
+    try:
+        path.rename(target)
+    except OSError as error:
+        raise BadInputError(f"{shown(path)}: cannot be moved: {error.strerror or error}") from error
+
+
 @contextlib.contextmanager
 def _beside(target: Path) -> Iterator[tuple[BinaryIO, Path]]:
     """A new, locked file beside another one, which is gone afterwards under its first name."""

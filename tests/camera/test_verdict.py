@@ -496,9 +496,11 @@ def test_a_lens_that_the_model_cannot_follow_is_not_a_second_camera() -> None:
 
 
 def _advice(fit: Calibration) -> Candidate:
-    found = best_next_view(fit, evidence(fit).S.sum(axis=0))
-    assert found is not None
+    plan = best_next_view(fit, evidence(fit).S.sum(axis=0))
+    assert plan is not None
+    found = plan.best
     assert 0.0 < found.remaining < 1.0
+    assert plan.remaining(found.R_CT, found.t_m) == found.remaining
     return found
 
 

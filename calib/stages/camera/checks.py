@@ -1338,6 +1338,7 @@ class Candidate:
     away : edge of the board (as the picture shows it) that leans away, or "" without tilt.
     span_share : diagonal of the board over the diagonal of the picture.
     remaining : root of the expected squared error after it over that before.
+    R_CT, t_m : (3, 3) and (3,) pose of the board, from coordinates whose origin is its middle.
     """
 
     where: str
@@ -1345,6 +1346,37 @@ class Candidate:
     away: str
     span_share: float
     remaining: float
+    R_CT: FloatArray
+    t_m: FloatArray
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What further views would be worth.
+
+    Attributes
+    ----------
+    candidates : poses that fit into the picture, the most useful first.
+    calibration : of the views so far.
+    target_m : (M, 3) points all over the target, their origin its middle.
+    information, reference : (G, G) of the views so far, and of a view anywhere in the picture.
+    """
+
+    candidates: tuple[Candidate, ...]
+    calibration: Calibration
+    target_m: FloatArray
+    information: FloatArray
+    reference: FloatArray
+
+    @property
+    def best(self) -> Candidate:
+        """The most useful of all."""
+        return self.candidates[0]
+
+    def remaining(self, R_CT: FloatArray, t_m: FloatArray) -> float:
+        """`Candidate.remaining` of a view with this pose."""
+        S = _information(self.calibration, self.target_m, R_CT[None], t_m[None])
+        return 1.0 if S is None else float(_remaining(self.information, self.reference, S)[0])
 
 
 def _words(column: int, row: int) -> str:
@@ -1363,8 +1395,14 @@ def _rotation(tilt: float, azimuth: float) -> FloatArray:
     return np.asarray(np.eye(3) + np.sin(tilt) * S + (1 - np.cos(tilt)) * S @ S)
 
 
-def best_next_view(calibration: Calibration, information: FloatArray) -> Candidate | None:
-    """The most useful among about a hundred poses of the board that fit into the picture.
+def tilted(tilt_deg: float, away: str) -> FloatArray:
+    """Rotation (3, 3) of a board whose edge `away` in the picture leans away from the camera."""
+    azimuth = next((angle for angle, edge in _EDGES.items() if edge == away), 0)
+    return _rotation(np.radians(tilt_deg), np.radians(azimuth))
+
+
+def best_next_view(calibration: Calibration, information: FloatArray) -> Plan | None:
+    """About a hundred poses of the board that fit into the picture, the most useful first.
 
     Parameters
     ----------
@@ -1405,15 +1443,22 @@ def best_next_view(calibration: Calibration, information: FloatArray) -> Candida
     if S is None:
         return None
     reference = S.mean(axis=0)
+    remaining = _remaining(information, reference, S)
+    candidates = []
+    for i in np.argsort(remaining, kind="stable"):
+        column, row, tilt, away, span = kinds[kept[i]]
+        where = _words(column, row)
+        candidates.append(Candidate(where, tilt, away, span, float(remaining[i]), R[kept[i]], t[kept[i]]))
+    return Plan(tuple(candidates), calibration, target, information, reference)
+
+
+def _remaining(information: FloatArray, reference: FloatArray, S: FloatArray) -> FloatArray:
+    """Root (n,) of the expected squared error after views with information S (n, G, G) over that before."""
     # A direction that nothing has measured yet is held by a hundredth of one view.
     base = information + 0.01 * reference
     before = float(np.trace(reference @ scaled_inverse(base)))
     after = np.array([np.trace(reference @ scaled_inverse(base + added)) for added in S])
-    best = int(np.argmin(after))
-    column, row, tilt, away, span = kinds[kept[best]]
-    return Candidate(
-        _words(column, row), tilt, away, span, float(np.sqrt(max(after[best], 0.0) / max(before, 1e-300)))
-    )
+    return np.asarray(np.sqrt(np.maximum(after, 0.0) / max(before, 1e-300)))
 
 
 def _information(

@@ -960,9 +960,10 @@ def _next_picture(fit: Calibration, verdict: Verdict) -> list[str]:
     width = max(fit.camera.image_size_px)
     if not 0.2 * width < min(fit.camera.fx_px, fit.camera.fy_px) < 50 * width:
         return []
-    best = best_next_view(fit, evidence(fit).S.sum(axis=0))
-    if best is None:
+    plan = best_next_view(fit, evidence(fit).S.sum(axis=0))
+    if plan is None:
         return []
+    best = plan.best
     lean = (
         f"tilted by {best.tilt_deg:.0f} degrees with its {best.away} edge away from the camera"
         if best.away

@@ -1,0 +1,99 @@
+"""`calib live`: a page that leads one through the calibration of a camera."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calib.cli.common import JsonOption, document, narrate, say
+from calib.core.errors import EXIT_POOR, BadInputError, UsageError, pip_install
+
+
+def live(
+    source: Annotated[
+        str | None,
+        typer.Argument(
+            help="Number of a camera, address of a stream, a video, or a folder that is being filled with "
+            "pictures. Without it the browser's own camera.",
+            metavar="[CAMERA|URL|FOLDER]",
+            show_default=False,
+        ),
+    ] = None,
+    output: Annotated[
+        Path,
+        typer.Option("-o", "--output", help="Folder for images/ and rig.yaml; an earlier session goes on."),
+    ] = Path("live"),
+    corners: Annotated[
+        str | None,
+        typer.Option(
+            metavar="CxR", help="Inner corners, columns x rows, as 8x5. [default: board.yaml, else found]"
+        ),
+    ] = None,
+    square: Annotated[
+        str | None,
+        typer.Option(metavar="LENGTH", help="Side of a square with its unit, as 20mm. [default: board.yaml]"),
+    ] = None,
+    browser: Annotated[
+        bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")
+    ] = True,
+    as_json: JsonOption = False,
+) -> None:
+    """Calibrate a camera while you hold the board: a page shows what to do next, and when it is enough.
+
+    The page is served on this machine alone. Pictures are saved as they are taken; the section camera of
+    rig.yaml is what calib intrinsics makes of them. Done, or Ctrl-C, ends it. Exits 1 when the verdict is
+    not ok.
+    """
+    from calib.core.files import shown
+    from calib.core.result import section_json
+    from calib.core.units import parse_corners, parse_square_m
+    from calib.core.words import as_text, described
+    from calib.live.album import Album
+    from calib.live.session import Session
+    from calib.live.sources import source_of
+    from calib.stages.camera.read import Told
+
+    try:
+        from calib.live.server import Live
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("calib"):
+            raise
+        raise UsageError(f"calib live needs starlette and uvicorn: {pip_install('live')}") from error
+    told = Told(
+        None if corners is None else parse_corners(corners),
+        None if square is None else parse_square_m(square),
+    )
+    album = Album(output)
+    frames = source_of(source, album.images)
+    board, views = album.open(told)
+    stated = told.corners or (None if board.corners is None else (board.corners[0], board.corners[1]))
+    session = Session(stated, board.square_m if told.square_m is None else told.square_m)
+    session.views.update((view.name, view) for view in views)
+    if views:
+        narrate(f"{shown(album.images)}: going on with {len(views)} pictures")
+    at_work = Live(session, album, frames)
+
+    def ready(address: str) -> None:
+        narrate(f"open {address}; Done on the page, or Ctrl-C, ends it")
+        if browser:
+            import webbrowser
+
+            webbrowser.open(address)
+
+    try:
+        at_work.serve(ready)
+    except KeyboardInterrupt:
+        narrate("ended; what was taken is saved")
+    if not album.names():
+        raise BadInputError(f"{shown(album.images)}: no picture was taken")
+    camera = album.calibrate()
+    if as_json:
+        document("live", {"camera": section_json(camera), "pictures": album.names()})
+    else:
+        for line in as_text(described(camera)):
+            say(line)
+    narrate(f"camera written to {shown(album.rig)}")
+    if not camera.verdict.ok:
+        raise typer.Exit(EXIT_POOR)

@@ -1,0 +1,141 @@
+"""The folder of a live session: pictures, board.yaml, rig.yaml. What is on the disk is the session."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from calib.core.errors import BadInputError
+from calib.core.files import shown
+from calib.core.stage import Files
+from calib.core.writing import RIG_FILE, Kind, begins, make_folder, move, write_atomically
+from calib.io.pictures import holds_pictures, list_pictures
+from calib.stages.camera.model import View
+from calib.stages.camera.read import BOARD_FILE, BoardFile, Told, read_board_file, read_views
+
+if TYPE_CHECKING:
+    from calib.stages.camera.section import Camera
+
+MOST_PICTURES = 300
+"""Pictures of one session."""
+_DROPPED = "dropped"
+_PICTURE = Kind("a picture", (".png",), lambda path: False)
+"""One that is there is never written over."""
+_BOARD = Kind("a board.yaml", (".yaml",), begins(b"corners: "))
+
+
+@dataclass(frozen=True)
+class Album:
+    """A folder with `images/`, `images/board.yaml`, `images/dropped/` and `rig.yaml`."""
+
+    folder: Path
+
+    @property
+    def images(self) -> Path:
+        """Where the pictures are."""
+        return self.folder / "images"
+
+    @property
+    def rig(self) -> Path:
+        """The rig's file."""
+        return self.folder / RIG_FILE
+
+    @property
+    def dropped(self) -> Path:
+        """Pictures that are left out; sub-folders of a folder of pictures are not read."""
+        return self.images / _DROPPED
+
+    def open(self, told: Told) -> tuple[BoardFile, tuple[View, ...]]:
+        """The board as far as it is known, and the views of an earlier session.
+
+        Raises `BadInputError` where the folder cannot be made or read, or tells another board than `told`.
+        """
+        make_folder(self.images)
+        board = read_board_file(self.images)
+        if board.dictionary is not None:
+            raise BadInputError(
+                f"{shown(self.images / BOARD_FILE)}: tells a ChArUco board, expected a checkerboard; calib "
+                "intrinsics reads pictures of this one"
+            )
+        stated = None if board.corners is None else (board.corners[0], board.corners[1])
+        for flag, here, there in (
+            ("--corners", told.corners, stated),
+            ("--square", told.square_m, board.square_m),
+        ):
+            if here is not None and there is not None and here != there:
+                raise BadInputError(
+                    f"{shown(self.images / BOARD_FILE)}: tells another board than {flag} ({there}, not "
+                    f"{here}); give another folder for another board"
+                )
+        if not holds_pictures(self.images):
+            return board, ()
+        return board, read_views([self.images], told).views
+
+    def names(self) -> list[str]:
+        """Pictures that count, in the order in which they are read."""
+        return [path.name for path in list_pictures([self.images])] if holds_pictures(self.images) else []
+
+    def left_out(self) -> list[str]:
+        """Pictures that were dropped."""
+        if not self.dropped.is_dir() or not holds_pictures(self.dropped):
+            return []
+        return [path.name for path in list_pictures([self.dropped])]
+
+    def new_name(self) -> str:
+        """A name for the next picture, with a number that no picture here has."""
+        taken = [
+            int(found[1]) for name in (*self.names(), *self.left_out()) if (found := _NUMBER.search(name))
+        ]
+        return f"view{max(taken, default=0) + 1:03d}.png"
+
+    def add(self, name: str, png: bytes) -> None:
+        """Write a picture as it was taken. Raises `BadInputError`."""
+        write_atomically(self.images / name, png, _PICTURE)
+
+    def describe(self, corners: tuple[int, int], square_m: float | None) -> None:
+        """Write board.yaml where there is none."""
+        path = self.images / BOARD_FILE
+        if not path.exists():
+            square = "" if square_m is None else f"square_m: {square_m:g}\n"
+            write_atomically(path, f"corners: [{corners[0]}, {corners[1]}]\n{square}", _BOARD)
+
+    def picture(self, name: str) -> Path | None:
+        """Where a picture of this name is, dropped or not; None for what is none."""
+        for folder, names in ((self.images, self.names()), (self.dropped, self.left_out())):
+            if name in names:
+                return folder / name
+        return None
+
+    def drop(self, name: str) -> bool:
+        """Put a picture aside; whether there was one."""
+        if name not in self.names():
+            return False
+        make_folder(self.dropped)
+        move(self.images / name, self.dropped / name)
+        return True
+
+    def take_back(self, name: str) -> bool:
+        """Let a picture that was dropped count again; whether there was one."""
+        if name not in self.left_out():
+            return False
+        move(self.dropped / name, self.images / name)
+        return True
+
+    def calibrate(self) -> Camera:
+        """What `calib intrinsics images/` makes of the pictures, written into rig.yaml by its stage.
+
+        Raises `BadInputError` where they make no camera.
+        """
+        from calib.core.stage import options_of
+        from calib.runner.work import carry_out
+        from calib.stages import stage
+
+        intrinsics = stage("intrinsics")
+        files = Files((self.images,), self.rig, figures=False, keep=False)
+        camera: Camera = carry_out(intrinsics, files, options_of(intrinsics.options, {}), self.rig)[0]
+        return camera
+
+
+_NUMBER = re.compile(r"(\d{1,9})\.\w+$")

@@ -1,0 +1,475 @@
+"""The page of a live session and its websocket, on this machine alone.
+
+Every request must name this server in `Host`, come from its own page by `Origin`, and know the token in the
+address: a page of another site, even one whose name leads here, cannot drive the session. Frames, pictures
+and tabs are bounded before anything is decoded. The state is the session and its folder; a page that
+reloads gets all of it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hmac
+import json
+import secrets
+import socket
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import uvicorn
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, PlainTextResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from calib.core.arrays import AnyArray
+from calib.core.errors import BadInputError, CalibError
+from calib.core.files import read_bytes, shown
+from calib.io.pictures import declared_pixels, decoded_picture
+from calib.live.album import MOST_PICTURES, Album
+from calib.live.session import Seen, Session
+from calib.live.sources import MOST_PIXELS, Source, decode
+
+PAGE = Path(__file__).with_name("live.html")
+MOST_BYTES = 64_000_000
+"""Of one message: a picture of `MOST_PIXELS` as PNG."""
+_MOST_PREVIEW_BYTES = 4_000_000
+_MOST_WORDS = 2_000
+_MOST_TABS = 6
+_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
+_PREVIEW_PX = 800
+_SHOT_S = 5.0
+"""How long a page may take to send the whole picture that it was asked for."""
+
+
+@dataclass(eq=False)
+class _Tab:
+    """One page that is open."""
+
+    socket: WebSocket
+    sending: asyncio.Lock = field(default_factory=asyncio.Lock)
+    shot_until: float = 0.0
+    by_hand: bool = False
+
+    async def tell(self, message: dict[str, Any]) -> None:
+        """Send words; a page that has gone is no reason to fail."""
+        with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+            async with self.sending:
+                await self.socket.send_text(json.dumps(message, allow_nan=False))
+
+    async def show(self, jpeg: bytes) -> None:
+        """Send a frame, unless the page is still busy with another."""
+        if not self.sending.locked():
+            with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+                async with self.sending:
+                    await self.socket.send_bytes(jpeg)
+
+
+class Live:
+    """A session, its folder, where frames come from, and the pages that look at it."""
+
+    def __init__(self, session: Session, album: Album, source: Source | None) -> None:
+        self.session, self.album, self.source = session, album, source
+        self.token = secrets.token_urlsafe(24)
+        self.finished = threading.Event()
+        self.auto = True
+        self._lock = threading.Lock()
+        self._tabs: list[_Tab] = []
+        self._camera: _Tab | None = None
+        self._looking = ThreadPoolExecutor(1, "look")
+        self._fitting = ThreadPoolExecutor(1, "fit")
+        self._wanted, self._fits = 0, 0
+        self._by_hand = False
+        self._saved = ""
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    # ------------------------------------------------------------------
+    # What pages are told.
+
+    def state(self) -> dict[str, Any]:
+        """All that a page shows."""
+        with self._lock:
+            shown_ = self.session.shown()
+        return {
+            "type": "state",
+            **shown_,
+            "dropped": self.album.left_out(),
+            "folder": str(self.album.folder),
+            "source": "browser" if self.source is None else "single" if self.source.single else "here",
+            "saved": self._saved,
+            "auto": self.auto,
+            "fitting": self._fits < self._wanted,
+        }
+
+    async def tell_all(self, message: dict[str, Any]) -> None:
+        """Send words to every page."""
+        for tab in list(self._tabs):
+            await tab.tell(message)
+
+    async def _in(self, pool: ThreadPoolExecutor, work: Callable[..., Any], *given: Any) -> Any:
+        return await asyncio.get_running_loop().run_in_executor(pool, work, *given)
+
+    def _start(self, work: Any) -> None:
+        task = asyncio.ensure_future(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    # ------------------------------------------------------------------
+    # Frames and pictures.
+
+    def _look(self, frame: AnyArray, size_px: tuple[int, int] | None, still: bool) -> Seen:
+        gray = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+        with self._lock:
+            return self.session.look(np.asarray(gray, dtype=np.uint8), time.monotonic(), size_px, still)
+
+    def _take(self, png: bytes, by_hand: bool) -> str | Seen:
+        """Name of a picture that was taken and saved, or why it was not."""
+        gray = decoded_picture(png, "the picture", "picture", "").gray
+        with self._lock:
+            if len(self.session.views) >= MOST_PICTURES:
+                raise BadInputError(f"there are {MOST_PICTURES} pictures already, the most of one session")
+            name = self.album.new_name()
+            taken = self.session.accept(gray, name, by_hand)
+            if isinstance(taken, Seen):
+                return taken
+            assert self.session.corners is not None
+            try:
+                self.album.describe(self.session.corners, self.session.square_m)
+                self.album.add(name, png)
+            except BadInputError:
+                self.session.drop(name)
+                raise
+        return name
+
+    async def _taken(self, png: bytes, by_hand: bool) -> None:
+        try:
+            name = await self._in(self._looking, self._take, png, by_hand)
+        except CalibError as error:
+            await self.tell_all({"type": "fault", "says": str(error)})
+            return
+        if isinstance(name, Seen):
+            await self.tell_all({"type": "seen", "code": name.code, "says": name.says, "corners": None})
+            return
+        await self.tell_all({"type": "taken", "name": name})
+        await self._changed()
+
+    async def _changed(self) -> None:
+        """The pictures are others now: calibrate again, in the background."""
+        self._wanted += 1
+        await self.tell_all(self.state())
+        self._start(self._fit(self._wanted))
+
+    async def _fit(self, number: int) -> None:
+        # Of several changes in a row only the last is worth a fit.
+        await self._in(self._fitting, self._calibrate, number)
+        await self.tell_all(self.state())
+
+    def _calibrate(self, number: int) -> None:
+        if number < self._wanted:
+            return
+        fit, self._saved = None, ""
+        try:
+            if self.album.names():
+                fit = self.album.calibrate().evidence.fit
+                self._saved = str(self.album.rig)
+        except CalibError as error:
+            self._saved = f"not saved: {error}"
+        with self._lock:
+            self.session.fitted(fit)
+        self._fits = number
+
+    async def pump(self) -> None:
+        """Take frames from a source of this machine until it is over."""
+        assert self.source is not None
+        fault = ""
+        while True:
+            frame = await asyncio.to_thread(self.source.read)
+            if self.source.fault != fault:
+                fault = self.source.fault
+                await self.tell_all({"type": "camera", "fault": fault})
+            if frame is None:
+                continue
+            seen = await self._in(self._looking, self._look, frame, None, self.source.single)
+            preview = await asyncio.to_thread(_preview, frame)
+            for tab in list(self._tabs):
+                await tab.show(preview)
+            await self.tell_all(_seen(seen))
+            by_hand, self._by_hand = self._by_hand, False
+            if by_hand or (seen.take and self.auto):
+                _, png = cv2.imencode(".png", frame)
+                await self._taken(png.tobytes(), by_hand)
+
+    # ------------------------------------------------------------------
+    # A page.
+
+    async def page(self, websocket: WebSocket) -> None:
+        """Serve one tab until it closes."""
+        if len(self._tabs) >= _MOST_TABS:
+            await websocket.close(1013)
+            return
+        await websocket.accept()
+        tab = _Tab(websocket)
+        self._tabs.append(tab)
+        try:
+            await tab.tell(self.state())
+            if self.source is not None and self.source.fault:
+                await tab.tell({"type": "camera", "fault": self.source.fault})
+            while True:
+                message = await websocket.receive()
+                if message["type"] == "websocket.disconnect":
+                    return
+                if message.get("bytes") is not None:
+                    await self._frame(tab, message["bytes"])
+                else:
+                    await self._asked(tab, message.get("text") or "")
+        except WebSocketDisconnect:
+            pass
+        finally:
+            self._tabs.remove(tab)
+            if self._camera is tab:
+                self._camera = None
+                await self.tell_all({"type": "free"})
+
+    async def _asked(self, tab: _Tab, text: str) -> None:
+        asked: Any = None
+        if len(text) <= _MOST_WORDS:
+            with contextlib.suppress(ValueError, RecursionError):
+                asked = json.loads(text)
+        what = asked.get("do") if isinstance(asked, dict) else None
+        name = str(asked.get("name", "")) if isinstance(asked, dict) else ""
+        if what == "camera":
+            await self._lend(tab)
+        elif what == "take":
+            if self.source is not None:
+                self._by_hand = True
+            elif self._camera is not None:
+                await self._shoot(self._camera, by_hand=True)
+        elif what == "auto":
+            self.auto = asked.get("on") is True
+            await self.tell_all(self.state())
+        elif what in ("drop", "back"):
+            await self._put(name, what == "back")
+        elif what == "done":
+            await self._done()
+        else:
+            await tab.tell({"type": "fault", "says": "The page asked for what this version does not know."})
+
+    async def _lend(self, tab: _Tab) -> None:
+        """Let this page's camera be the one that counts."""
+        before, self._camera = self._camera, tab
+        if before is not None and before is not tab:
+            await before.tell({"type": "lent"})
+
+    async def _shoot(self, tab: _Tab, by_hand: bool) -> None:
+        tab.shot_until, tab.by_hand = time.monotonic() + _SHOT_S, by_hand
+        await tab.tell({"type": "shoot"})
+
+    async def _frame(self, tab: _Tab, data: bytes) -> None:
+        """A frame of a page's camera: a JPEG to look at, or the PNG that was asked for."""
+        if tab is not self._camera or self.source is not None:
+            return
+        pixels = declared_pixels(data) or 0
+        if not 0 < pixels <= MOST_PIXELS:
+            await tab.tell({"type": "fault", "says": f"A frame has no size, or over {MOST_PIXELS} pixels."})
+        elif data.startswith(_PNG) and time.monotonic() < tab.shot_until:
+            tab.shot_until = 0.0
+            await self._taken(data, tab.by_hand)
+        elif data.startswith(_JPEG) and len(data) <= _MOST_PREVIEW_BYTES:
+            frame = await self._in(self._looking, decode, data)
+            if frame is None:
+                await tab.tell({"type": "fault", "says": "A frame cannot be decoded."})
+                return
+            seen = await self._in(self._looking, self._look, frame, None, False)
+            for other in list(self._tabs):
+                await other.tell(_seen(seen))
+                if other is not tab:
+                    await other.show(data)
+            if seen.take and self.auto and time.monotonic() >= tab.shot_until:
+                await self._shoot(tab, by_hand=False)
+
+    async def _put(self, name: str, back: bool) -> None:
+        """Drop a picture or take it back, on the disk and in the session."""
+        try:
+            if back and self.album.take_back(name):
+                data = await asyncio.to_thread(read_bytes, self.album.images / name)
+                await self._in(self._looking, self._again, name, data)
+            elif not back and self.album.drop(name):
+                with self._lock:
+                    self.session.drop(name)
+            else:
+                raise BadInputError(f"{shown(name)}: is not there")
+        except CalibError as error:
+            await self.tell_all({"type": "fault", "says": str(error)})
+            return
+        await self._changed()
+
+    def _again(self, name: str, data: bytes) -> None:
+        gray = decoded_picture(data, shown(name), name, "").gray
+        with self._lock:
+            self.session.accept(gray, name, by_hand=True)
+
+    async def _done(self) -> None:
+        await self.tell_all({"type": "done", "folder": str(self.album.folder)})
+        self.finished.set()
+
+    # ------------------------------------------------------------------
+    # Serving.
+
+    def application(self, port: int) -> ASGIApp:
+        """The ASGI application behind its guard."""
+
+        async def html(request: Request) -> Response:
+            del request
+            nonce = secrets.token_urlsafe(16)
+            text = PAGE.read_text(encoding="utf-8").replace("{{nonce}}", nonce)
+            policy = (
+                f"default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; "
+                "img-src 'self' data:; connect-src 'self'; media-src 'self' mediastream:; "
+                "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+            )
+            return HTMLResponse(text, headers={"content-security-policy": policy})
+
+        async def thumb(request: Request) -> Response:
+            path = self.album.picture(str(request.path_params["name"]))
+            if path is None:
+                return PlainTextResponse("no such picture\n", 404)
+            return Response(await asyncio.to_thread(_thumbnail, path), media_type="image/jpeg")
+
+        @contextlib.asynccontextmanager
+        async def lifespan(_: Starlette) -> Any:
+            if self.album.names():
+                await self._changed()
+            if self.source is not None:
+                self._start(self.pump())
+            yield
+            for task in list(self._tasks):
+                task.cancel()
+
+        root = f"/{self.token}"
+        routes = [
+            Route(f"{root}/", html),
+            Route(f"{root}/picture/{{name}}", thumb),
+            WebSocketRoute(f"{root}/socket", self.page),
+        ]
+        return Guard(Starlette(routes=routes, lifespan=lifespan), self.token, port)
+
+    def serve(self, ready: Callable[[str], None]) -> None:
+        """Serve until a page says that it is done, or Ctrl-C; `ready` gets the address.
+
+        The last fit is waited for.
+        """
+        listener = socket.create_server(("127.0.0.1", 0))
+        port = int(listener.getsockname()[1])
+        config = uvicorn.Config(
+            self.application(port), log_config=None, access_log=False, server_header=False,
+            ws="websockets-sansio", ws_max_size=MOST_BYTES, lifespan="on", timeout_graceful_shutdown=1,
+        )  # fmt: skip
+        server = uvicorn.Server(config)
+        # In a thread of its own it leaves Ctrl-C to the command.
+        thread = threading.Thread(target=server.run, args=([listener],), daemon=True)
+        thread.start()
+        try:
+            ready(f"http://127.0.0.1:{port}/{self.token}/")
+            while not self.finished.wait(0.5):
+                if not thread.is_alive():
+                    raise BadInputError("the page cannot be served: the server has stopped")
+        finally:
+            server.should_exit = True
+            thread.join(5.0)
+            if self.source is not None:
+                self.source.close()
+            self._looking.shutdown(cancel_futures=True)
+            self._fitting.shutdown()
+            listener.close()
+
+
+class Guard:
+    """Lets through what comes from this server's own page and knows the token."""
+
+    def __init__(self, app: ASGIApp, token: str, port: int) -> None:
+        self._app, self._token = app, token
+        self._hosts = {f"127.0.0.1:{port}", f"localhost:{port}"}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """As an ASGI application."""
+        if scope["type"] == "lifespan":
+            await self._app(scope, receive, send)
+            return
+        status = self._refusal(scope)
+        if status is None:
+            await self._app(scope, receive, _with_headers(send))
+        elif scope["type"] == "websocket":
+            # Before it is accepted, closing is answered with 403.
+            await send({"type": "websocket.close", "code": 1008})
+        else:
+            await PlainTextResponse("refused\n", status)(scope, receive, send)
+
+    def _refusal(self, scope: Scope) -> int | None:
+        """Status of what is refused; None for what may pass."""
+        headers = [(key.decode("latin-1"), value.decode("latin-1")) for key, value in scope["headers"]]
+        hosts = [value for key, value in headers if key == "host"]
+        origins = [value for key, value in headers if key == "origin"]
+        if len(hosts) != 1 or hosts[0] not in self._hosts:
+            return 403
+        # A browser says where a websocket comes from; one without is no page of this server.
+        if len(origins) != (1 if scope["type"] == "websocket" else len(origins[:1])):
+            return 403
+        if any(one != f"http://{hosts[0]}" for one in origins):
+            return 403
+        if scope["type"] == "http" and scope["method"] not in ("GET", "HEAD"):
+            return 405
+        first = str(scope["path"]).split("/")[1] if str(scope["path"]).startswith("/") else ""
+        return None if hmac.compare_digest(first.encode(), self._token.encode()) else 404
+
+
+def _with_headers(send: Send) -> Send:
+    async def sends(message: Any) -> None:
+        if message["type"] == "http.response.start":
+            message["headers"] = [
+                *message["headers"],
+                (b"cache-control", b"no-store"),
+                # The address holds the token.
+                (b"referrer-policy", b"no-referrer"),
+                (b"x-content-type-options", b"nosniff"),
+                (b"cross-origin-resource-policy", b"same-origin"),
+                (b"cross-origin-opener-policy", b"same-origin"),
+            ]
+        await send(message)
+
+    return sends
+
+
+def _seen(seen: Seen) -> dict[str, Any]:
+    corners = None if seen.corners_px is None else np.round(seen.corners_px, 1).tolist()
+    return {
+        "type": "seen",
+        "code": seen.code,
+        "says": seen.says,
+        "corners": corners,
+        "matched": round(seen.matched, 2),
+    }
+
+
+def _smaller(frame: AnyArray, most_px: int) -> AnyArray:
+    share = most_px / max(frame.shape[:2])
+    return frame if share >= 1 else cv2.resize(frame, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
+
+
+def _preview(frame: AnyArray) -> bytes:
+    return cv2.imencode(".jpg", _smaller(frame, _PREVIEW_PX), [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
+
+
+def _thumbnail(path: Path) -> bytes:
+    frame = decode(read_bytes(path))
+    blank = np.zeros((8, 8), dtype=np.uint8)
+    return _preview(_smaller(blank if frame is None else frame, 240))

@@ -1,0 +1,525 @@
+"""A calibration while the camera runs: frames go in, what to do and when to take a picture comes out.
+
+Nothing here reads, writes or serves. A frame is looked at (`Session.look`): the board's corners, whether the
+board holds still, and how far it is from the pose that would lower the camera's uncertainty most
+(`calib.stages.camera.checks.best_next_view`). A picture is taken (`Session.accept`) where it is sharp, bright
+enough and unlike the earlier ones. A fit of the pictures so far comes back (`Session.fitted`) and moves the
+next pose.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+
+from calib.core.arrays import FloatArray, GrayImage
+from calib.stages.camera.bundle import poses_with_camera, projection_sigma_px
+from calib.stages.camera.checks import (
+    Candidate,
+    Plan,
+    best_next_view,
+    cell_of,
+    evidence,
+    image_outline,
+    tilted,
+)
+from calib.stages.camera.corners import Detection, detect, find_size, resized
+from calib.stages.camera.intrinsics import Intrinsics
+from calib.stages.camera.lattice import find_lattices, find_saddles
+from calib.stages.camera.model import Board, Camera, View, pack, project
+
+_LOOK_PX = 800
+"""Largest side of what is searched while the camera runs; larger frames are made smaller for it."""
+_STILL_S = 0.4
+_STILL_SHARE = 0.004
+"""Corners that move less than this share of the picture's width for so long hold still."""
+_BLUR_SHARE, _LEAST_BLUR_PX = 0.0035, 1.6
+"""Standard deviation of an edge's blur, over the picture's width, from which on a picture is not taken."""
+_CONTRAST = 12.0
+"""Grey levels from the middle to white below which a board is too dark."""
+_ALIKE_SHARE, _NEW_SHARE = 0.02, 0.04
+"""Distance of corners to those of an earlier picture, over the width, below which it tells little, and below
+which nobody is asked for it."""
+_MATCH_SHARE, _MATCH_DEG = 0.07, 15.0
+"""Distance of the board's outer corners from the ghost's, over the picture's diagonal, and angle between the
+boards, within which they match."""
+_GAIN_SHARE = 0.7
+"""A pose that gains this share of what the best would is as good."""
+ENOUGH = 0.05
+"""Where the best next picture would lower the uncertainty by less, the work is done."""
+_BEFORE = 3
+"""Pictures before a fit can say which pose is next."""
+_SMALL_SHARE = 0.15
+"""Least diagonal of the board over that of the picture."""
+
+Code = Literal[
+    "no board", "part", "dark", "blurred", "alike", "small", "size", "move", "hold", "taken", "enough"
+]
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a frame shows.
+
+    Attributes
+    ----------
+    corners_px : (rows, columns, 2) in pixels of the whole picture; None where no board is seen.
+    code : what `says` is about. says : one sentence of what to do.
+    take : whether a picture is to be taken now.
+    matched : 1 where the board is at the ghost, falling to 0 at a tenth of the picture away.
+    """
+
+    corners_px: FloatArray | None
+    code: Code
+    says: str
+    take: bool = False
+    matched: float = 0.0
+
+
+@dataclass(frozen=True)
+class Ghost:
+    """The next pose to show.
+
+    Attributes
+    ----------
+    lines_px : lines of the board's lattice, each (n, 2).
+    box_px : (4, 2) outer corners, in order around. normal : (3,) of the board, in the camera's frame.
+    says : one sentence. away : edge in the picture that leans away, "" without tilt.
+    gain : share by which the uncertainty would fall; None before the first fits.
+    """
+
+    lines_px: tuple[FloatArray, ...]
+    box_px: FloatArray
+    normal: FloatArray
+    says: str
+    away: str
+    gain: float | None
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What the pictures so far make of the camera, after each fit."""
+
+    pictures: int
+    fx_px: float
+    sigma_fx_px: float
+    worst_sigma_px: float
+
+
+@dataclass
+class Session:
+    """One camera, one board, the pictures so far.
+
+    Attributes
+    ----------
+    corners : inner corners, columns and rows; None until a frame shows them.
+    square_m : side of a square; intrinsics do not depend on it.
+    views : by the names of pictures, in the order in which they were taken.
+    fit : of the views, as `fitted` brought it. history : one entry for each fit.
+    """
+
+    corners: tuple[int, int] | None = None
+    square_m: float | None = None
+    size_px: tuple[int, int] | None = None
+    views: dict[str, View] = field(default_factory=dict)
+    fit: Intrinsics | None = None
+    history: list[Progress] = field(default_factory=list)
+    _plan: Plan | None = None
+    _next: Candidate | None = None
+    _past: deque[tuple[float, FloatArray]] = field(default_factory=lambda: deque(maxlen=60))
+    _waits: bool = False
+
+    # ------------------------------------------------------------------
+    # Looking at a frame.
+
+    def look(
+        self, gray: GrayImage, t_s: float, size_px: tuple[int, int] | None = None, still: bool = False
+    ) -> Seen:
+        """What one frame shows, and whether to take it.
+
+        Parameters
+        ----------
+        gray : (h, w) uint8, the picture or a smaller copy of it. t_s : when it came.
+        size_px : width and height of the whole picture, where the frame is a copy.
+        still : whether the frame is a picture that somebody took already, in whatever pose.
+        """
+        size_px = size_px or (gray.shape[1], gray.shape[0])
+        if self.size_px is not None and self.views and size_px != self.size_px:
+            return Seen(None, "size", _other_size(size_px, self.size_px))
+        self.size_px = size_px
+        n = 1
+        while max(gray.shape) / n > _LOOK_PX:
+            n += 1
+        level = resized(gray, 1.0 / n)
+        if self.corners is None:
+            self.corners = _size_of(level.image)
+            if self.corners is None:
+                self._past.clear()
+                return Seen(None, "no board", "Hold the whole board into the picture, with light on it.")
+        found = detect(level.image, *self.corners)
+        if found is None:
+            self._past.clear()
+            return Seen(None, "no board", self._sought())
+        scale = size_px[0] / level.image.shape[1]
+        grid = (found.pixels.reshape(self.corners[1], self.corners[0], 2) + 0.5) * scale - 0.5
+        hold = self._holds_still(grid, t_s)
+        fault = self._fault(level.image, found, scale)
+        if fault is not None:
+            return Seen(grid, *fault)
+        if self.enough:
+            return Seen(grid, "enough", "Enough: another picture would change little. Press Done.")
+        if self._alike(grid):
+            return Seen(grid, "alike", f"Too like an earlier picture. {self._hint(grid)}")
+        if still:
+            return Seen(grid, "taken", "Good.", take=True)
+        ghost = self.ghost()
+        near, angle = self._near(grid, ghost), self._angle_deg(grid, ghost)
+        matched = max(0.0, 1.0 - near / 0.1)
+        good = (near < _MATCH_SHARE and angle < _MATCH_DEG) or self._as_good(grid)
+        if not good:
+            return Seen(grid, "move", self._hint(grid), matched=matched)
+        if not hold:
+            return Seen(grid, "hold", "Good. Hold still.", matched=matched)
+        return Seen(grid, "taken", "Good.", take=True, matched=matched)
+
+    def _sought(self) -> str:
+        assert self.corners is not None
+        columns, rows = self.corners
+        return f"Show the whole board of {columns}x{rows} inner corners. {self.ghost().says}"
+
+    def _holds_still(self, grid: FloatArray, t_s: float) -> bool:
+        width = self._size()[0]
+        self._past.append((t_s, grid))
+        while len(self._past) > 2 and self._past[1][0] <= t_s - _STILL_S:
+            self._past.popleft()
+        long = t_s - self._past[0][0] >= _STILL_S
+        return long and all(_apart(grid, one) < _STILL_SHARE * width for _, one in self._past)
+
+    def _fault(self, gray: GrayImage, found: Detection, scale: float) -> tuple[Code, str] | None:
+        """Why a picture is not worth taking."""
+        if found.contrast < _CONTRAST:
+            return "dark", "Too dark: more light on the board."
+        width, height = self._size()
+        grid = found.pixels.reshape(found.rows, found.columns, 2)
+        if np.linalg.norm(np.ptp(found.pixels, axis=0)) * scale < _SMALL_SHARE * np.hypot(width, height):
+            return "small", "Too far away: bring the board closer."
+        if edge_blur_px(gray, grid) * scale > max(_BLUR_SHARE * width, _LEAST_BLUR_PX * scale):
+            return "blurred", "Blurred: hold still, or focus."
+        return None
+
+    def _alike(self, grid: FloatArray, share: float = _ALIKE_SHARE) -> str | None:
+        """Name of an earlier picture that shows the board in the same place."""
+        limit = share * self._size()[0]
+        turned = grid[::-1, ::-1]
+        for name, view in self.views.items():
+            if view.pixels.size == grid.size:
+                other = view.pixels.reshape(grid.shape)
+                if min(_apart(grid, other), _apart(turned, other)) < limit:
+                    return name
+        return None
+
+    # ------------------------------------------------------------------
+    # Taking a picture.
+
+    def accept(self, gray: GrayImage, name: str, by_hand: bool = False) -> View | Seen:
+        """The view that a whole picture shows, which then belongs to the session; else why it is not taken.
+
+        One that is taken by hand may be like an earlier one or blurred: who asks for it gets it.
+        """
+        size_px = (gray.shape[1], gray.shape[0])
+        if self.views and size_px != self._size():
+            return Seen(None, "size", _other_size(size_px, self._size()))
+        if self.corners is None:
+            self.corners = find_size(gray)
+        if self.corners is None:
+            return Seen(None, "no board", "Not taken: no board is seen.")
+        self.size_px = size_px
+        found = detect(gray, *self.corners)
+        if found is None:
+            return Seen(None, "no board", "Not taken: the board is not seen whole.")
+        grid = found.pixels.reshape(found.rows, found.columns, 2)
+        fault = self._fault(gray, found, 1.0)
+        if fault is not None and not by_hand:
+            return Seen(grid, *fault)
+        if not by_hand and (other := self._alike(grid)):
+            return Seen(grid, "alike", f"Too like {other}.")
+        view = View(name, self._board().points_m(), found.pixels, found.refined)
+        self.views[name] = view
+        self._past.clear()
+        self._waits = True
+        return view
+
+    def drop(self, name: str) -> View | None:
+        """Leave a picture out."""
+        return self.views.pop(name, None)
+
+    def fitted(self, fit: Intrinsics | None) -> None:
+        """Take a fit of the views, from which the next pose follows; None where they make no camera."""
+        self.fit, self._plan, self._next, self._waits = fit, None, None, False
+        if fit is None:
+            return
+        some = fit.calibration
+        if np.all(np.isfinite(some.normal)) and some.observations.views >= _BEFORE:
+            self._plan = best_next_view(some, evidence(some).S.sum(axis=0))
+        if self._plan is not None:
+            # The same picture once more would lower sigma on paper only.
+            new = (one for one in self._plan.candidates if not self._alike(self._grid_at(one), _NEW_SHARE))
+            self._next = next(new, self._plan.best)
+        worst = projection_sigma_px(some, fit.covariance, image_outline(some.camera))
+        sigma = fit.covariance.sigma().get("fx_px", np.inf)
+        known = worst[~np.isnan(worst)]
+        self.history.append(
+            Progress(
+                some.observations.views,
+                some.camera.fx_px,
+                float(sigma),
+                float(known.max()) if len(known) else np.inf,
+            )
+        )
+
+    @property
+    def enough(self) -> bool:
+        """Whether the verdict is ok and the best next picture would change little."""
+        gain = self.gain
+        return gain is not None and gain < ENOUGH and self.fit is not None and self.fit.judgement.verdict.ok
+
+    @property
+    def gain(self) -> float | None:
+        """Share by which the best next picture would lower the uncertainty; None before there is a fit."""
+        return None if self._next is None else 1.0 - self._next.remaining
+
+    # ------------------------------------------------------------------
+    # The next pose.
+
+    def ghost(self) -> Ghost:
+        """The pose to show next; before the first fits one of a few that make a start."""
+        best = self._next
+        if best is not None:
+            lean = (
+                f"tilted by {best.tilt_deg:.0f} degrees, its {best.away} edge away from the camera"
+                if best.away
+                else "parallel to the picture"
+            )
+            size = "over half of the picture" if best.span_share > 0.5 else "at a third of the picture"
+            says = f"Next: the board {best.where}, {lean}, {size}."
+            return _drawn(self._grid_at(best), best.R_CT, says, best.away, 1.0 - best.remaining)
+        camera = self._nominal()
+        away, (u, v), where = _START[len(self.views) % len(_START)]
+        R = tilted(35.0, away)
+        width, height = camera.image_size_px
+        box = np.ptp(self._board().points_m(), axis=0)
+        distance = camera.fx_px * float(np.hypot(*box)) / (0.5 * np.hypot(width, height))
+        ray = [(u - 0.5) * width / camera.fx_px, (v - 0.5) * height / camera.fx_px, 1.0]
+        says = f"Hold the board {where}, tilted, its {away} edge away from the camera."
+        grid = self._projected(camera, R, distance * np.array(ray), box)
+        return _drawn(grid, R, says, away, None)
+
+    def _grid_at(self, pose: Candidate) -> FloatArray:
+        """Corners (rows, columns, 2) of the board in a planned pose."""
+        assert self._plan is not None
+        box = np.ptp(self._plan.target_m, axis=0)[:2]
+        return self._projected(self._plan.calibration.camera, pose.R_CT, pose.t_m, box)
+
+    def _projected(self, camera: Camera, R: FloatArray, t_m: FloatArray, box_m: FloatArray) -> FloatArray:
+        columns, rows = self.corners or _USUAL
+        X, Y = np.meshgrid(
+            np.linspace(-0.5, 0.5, columns) * box_m[0], np.linspace(-0.5, 0.5, rows) * box_m[1]
+        )
+        return project(camera, np.stack([X, Y, 0.0 * X], axis=-1) @ R.T + t_m)
+
+    def _nominal(self) -> Camera:
+        """A camera to begin with: 58 degrees over the width, no distortion."""
+        if self.fit is not None and self.fit.calibration.observations.views >= _BEFORE:
+            return self.fit.calibration.camera
+        width, height = self._size()
+        return Camera(
+            "pinhole", (width, height), 0.9 * width, 0.9 * width, 0.0, (width - 1) / 2, (height - 1) / 2
+        )
+
+    def _pose(self, grid: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        """Rotation and the position of the board's middle."""
+        target = self._board().points_m()
+        target = target - 0.5 * target.max(axis=0)
+        R, t = poses_with_camera(self._nominal(), pack([View("", target, grid.reshape(-1, 2))]))
+        return (R[0], t[0]) if np.isfinite(R).all() and np.isfinite(t).all() else None
+
+    def _near(self, grid: FloatArray, ghost: Ghost) -> float:
+        """Distance of the outer corners from the ghost's, over the picture's diagonal, whatever end is up."""
+        box = _outer(grid)
+        apart = min(_apart(np.roll(box, k, axis=0), ghost.box_px) for k in range(4))
+        return apart / float(np.hypot(*self._size()))
+
+    def _angle_deg(self, grid: FloatArray, ghost: Ghost) -> float:
+        pose = self._pose(grid)
+        if pose is None:
+            return 180.0
+        return float(np.degrees(np.arccos(np.clip(pose[0][:, 2] @ ghost.normal, -1.0, 1.0))))
+
+    def _as_good(self, grid: FloatArray) -> bool:
+        """Whether this pose, though another one, gains nearly what the best would."""
+        pose = None if self._plan is None or self._waits else self._pose(grid)
+        if pose is None or self._plan is None:
+            return False
+        gain = 1.0 - self._plan.remaining(*pose)
+        return gain > max(_GAIN_SHARE * (self.gain or 0.0), ENOUGH)
+
+    def _hint(self, grid: FloatArray) -> str:
+        """What separates the board most from the ghost."""
+        ghost, size = self.ghost(), np.array(self._size(), dtype=np.float64)
+        box = _outer(grid)
+        off = (ghost.box_px.mean(axis=0) - box.mean(axis=0)) / size
+        ratio = _diagonal(ghost.box_px) / max(_diagonal(box), 1e-9)
+        if np.abs(off).max() > 0.1:
+            across = "right" if off[0] > 0.07 else "left" if off[0] < -0.07 else ""
+            down = "down" if off[1] > 0.07 else "up" if off[1] < -0.07 else ""
+            return f"Move the board {' and '.join(word for word in (across, down) if word)} in the picture."
+        if not 0.8 < ratio < 1.25:
+            return "Bring the board closer." if ratio > 1 else "Move the board away."
+        if self._angle_deg(grid, ghost) > _MATCH_DEG:
+            return f"Tilt its {ghost.away} edge away from the camera." if ghost.away else "Hold it parallel."
+        return "Turn the board as the outline shows."
+
+    def _size(self) -> tuple[int, int]:
+        return self.size_px or (640, 480)
+
+    def _board(self) -> Board:
+        return Board(*(self.corners or _USUAL), 1.0 if self.square_m is None else self.square_m)
+
+    # ------------------------------------------------------------------
+    # What a page shows.
+
+    def shown(self) -> dict[str, Any]:
+        """State for a page, as JSON takes it; pictures by name with their residuals."""
+        ghost = self.ghost()
+        fit, gain = self.fit, self.gain
+        rms: Mapping[str, float] = {}
+        why: Mapping[str, str] = {}
+        if fit is not None:
+            some = fit.calibration
+            rms = dict(zip(some.observations.names, some.view_rms_px.tolist(), strict=True))
+            why = {one.name: one.why for one in fit.left_out}
+        verdict = None if fit is None else fit.judgement.verdict
+        return {
+            "corners": self.corners,
+            "size": self._size(),
+            "pictures": [
+                {"name": name, "rms_px": _number(rms.get(name)), "why": why.get(name, "")}
+                for name in self.views
+            ],
+            "coverage": self._coverage(),
+            "tilts": self._tilts(),
+            "history": [
+                [one.pictures, _number(one.sigma_fx_px), _number(one.worst_sigma_px)] for one in self.history
+            ],
+            "fx_px": None if fit is None else _number(fit.calibration.camera.fx_px),
+            "verdict": "none yet" if verdict is None else verdict.word,
+            "reasons": []
+            if verdict is None
+            else [*verdict.reasons[:3], *([] if verdict.ok else verdict.advice[:1])],
+            "gain": _number(gain),
+            "enough": self.enough,
+            "ghost": {
+                "lines": [np.round(line, 1).tolist() for line in ghost.lines_px],
+                "box": np.round(ghost.box_px, 1).tolist(),
+                "says": ghost.says,
+            },
+        }
+
+    def _coverage(self, columns: int = 8, rows: int = 6) -> list[list[int]]:
+        """Points in each cell of the picture."""
+        counts = np.zeros((rows, columns), dtype=np.int64)
+        for view in self.views.values():
+            at = cell_of(view.counted()[1], self._size(), columns, rows)
+            np.add.at(counts, at[::-1], 1)
+        return [list(map(int, row)) for row in counts]
+
+    def _tilts(self) -> list[list[float]]:
+        """Lean (x, y) of each view's board in degrees: where its far side is, right and down."""
+        if self.fit is None:
+            return []
+        R = self.fit.calibration.block.R_CT
+        # Where a step towards (x, y) leads away from the camera, the normal leans the other way.
+        normals = -R[:, :, 2] * np.sign(R[:, 2:, 2])
+        tilt = np.degrees(np.arccos(np.clip(-normals[:, 2], -1.0, 1.0)))
+        along = normals[:, :2] / np.maximum(np.linalg.norm(normals[:, :2], axis=1, keepdims=True), 1e-9)
+        lean = np.round(tilt[:, None] * along, 1)
+        return [list(map(float, row)) for row in lean[np.isfinite(lean).all(axis=1)]]
+
+
+_USUAL = (8, 5)
+_START: tuple[tuple[str, tuple[float, float], str], ...] = (
+    ("right", (0.5, 0.5), "in the middle of the picture"),
+    ("bottom", (0.36, 0.4), "left of the middle"),
+    ("left", (0.64, 0.6), "right of the middle"),
+    ("top", (0.5, 0.5), "in the middle of the picture"),
+)
+"""Edge that leans away, and place in the picture, of the first poses."""
+
+
+def edge_blur_px(gray: GrayImage, grid: FloatArray) -> float:
+    """Standard deviation of the blur of a board's edges in pixels, in the worse of both directions.
+
+    An edge between neighbouring corners that is blurred by a Gaussian has the steepest slope
+    step / (sqrt(2 pi) sigma).
+
+    Parameters
+    ----------
+    grid : (rows, columns, 2) corners.
+    """
+    worst = 0.0
+    for a, b in ((grid[:, :-1], grid[:, 1:]), (grid[:-1], grid[1:])):
+        along = (b - a).reshape(-1, 2)
+        middle = (0.5 * (a + b)).reshape(-1, 2)
+        length = np.linalg.norm(along, axis=1)
+        across = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.maximum(length, 1e-9)[:, None]
+        at = np.linspace(-0.4, 0.4, 41) * float(np.median(length))
+        where = (middle[:, None] + at[:, None] * across[:, None]).astype(np.float32)
+        profile = cv2.remap(gray, where[..., 0], where[..., 1], cv2.INTER_LINEAR).astype(np.float64)
+        step = np.abs(profile[:, -5:].mean(axis=1) - profile[:, :5].mean(axis=1))
+        # Over a pixel or more, so that noise and the sampling do not look steep.
+        k = max(1, round(1.0 / (at[1] - at[0])))
+        slope = np.abs(profile[:, k:] - profile[:, :-k]).max(axis=1) / (k * (at[1] - at[0]))
+        worst = max(worst, float(np.median(step / np.maximum(slope, 1e-9))) / float(np.sqrt(2 * np.pi)))
+    return worst
+
+
+def _size_of(gray: GrayImage) -> tuple[int, int] | None:
+    """Inner corners of a board of unknown size, looked for only where there is some lattice."""
+    n = 1
+    while gray.size / n**2 > 120_000:
+        n += 1
+    some: Sequence[Any] = find_lattices(find_saddles(resized(gray, 1.0 / n).image), least=9)
+    return find_size(gray) if len(some) else None
+
+
+def _other_size(size_px: tuple[int, int], expected_px: tuple[int, int]) -> str:
+    return (
+        f"The camera sends {size_px[0]}x{size_px[1]} px, the pictures so far have "
+        f"{expected_px[0]}x{expected_px[1]} px: choose that size, or begin a new folder."
+    )
+
+
+def _apart(a: FloatArray, b: FloatArray) -> float:
+    """Root mean square distance of points (..., 2)."""
+    return float(np.sqrt(np.mean(np.sum((a - b) ** 2, axis=-1))))
+
+
+def _drawn(grid: FloatArray, R: FloatArray, says: str, away: str, gain: float | None) -> Ghost:
+    return Ghost((*grid, *grid.transpose(1, 0, 2)), _outer(grid), R[:, 2], says, away, gain)
+
+
+def _outer(grid: FloatArray) -> FloatArray:
+    return np.asarray(grid[[0, 0, -1, -1], [0, -1, -1, 0]])
+
+
+def _diagonal(box: FloatArray) -> float:
+    return float(np.linalg.norm(box[2] - box[0]) + np.linalg.norm(box[3] - box[1]))
+
+
+def _number(value: float | None) -> float | None:
+    return None if value is None or not np.isfinite(value) else float(value)

@@ -1,0 +1,415 @@
+"""`calib live`: the session, its folder, its server and its page."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import cv2
+import numpy as np
+import pytest
+from chromium import browser_or_skip
+from liveboards import BOARD, CAMERA, Person, follow, random_poses, write_y4m
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from calib.cli.main import main
+from calib.core.errors import BadInputError
+from calib.live.album import Album
+from calib.live.server import MOST_BYTES, Live
+from calib.live.session import ENOUGH, Seen, Session, edge_blur_px
+from calib.live.sources import MOST_PIXELS, Source, Watched, source_of
+from calib.stages.camera.bundle import calibrate, covariance, projection_sigma_px
+from calib.stages.camera.intrinsics import calibrate_camera
+from calib.stages.camera.model import View, pack
+from calib.stages.camera.read import Told
+from calib.stages.camera.stage import image_grid
+from calib.twin.scene import Light, PrintedBoard, Sensor, corner_pixels, pose_facing, render
+
+PICTURE_S = 30.0
+
+
+def session() -> Session:
+    return Session(square_m=BOARD.square_m, size_px=CAMERA.image_size_px)
+
+
+# ----------------------------------------------------------------------
+# The session.
+
+
+def test_from_the_first_frame_to_enough() -> None:
+    """A person who follows the outline gets a camera that is ok and within its sigmas of the true one."""
+    live = session()
+    poses = follow(live, Person(np.random.default_rng(0)))
+    assert live.corners == (BOARD.columns, BOARD.rows)
+    assert 8 <= len(poses) <= 25 and live.enough and live.gain is not None and live.gain < ENOUGH
+    assert live.fit is not None and live.fit.judgement.verdict.ok
+    found, sigma = live.fit.calibration.camera, live.fit.covariance.sigma()
+    for name in ("fx_px", "fy_px", "cx_px", "cy_px"):
+        assert abs(getattr(found, name) - getattr(CAMERA, name)) < 4 * sigma[name], name
+    worst = [one.worst_sigma_px for one in live.history]
+    assert worst[-1] < 0.5 * worst[3]
+    shown = live.shown()
+    assert json.dumps(shown, allow_nan=False)
+    assert sum(map(sum, shown["coverage"])) == BOARD.corners * len(poses)
+    assert len(shown["tilts"]) == len(poses) and np.abs(shown["tilts"]).max() > 25
+
+
+def test_guided_pictures_are_worth_twice_as_many_taken_at_random() -> None:
+    """Worst projection sigma of twelve pictures, at the same noise of corners, over the whole picture."""
+    noise_px, count = 0.1, 12
+
+    def worst(views: list[View]) -> float:
+        fit = calibrate(pack(views), CAMERA.image_size_px, "radial2")
+        known = covariance(fit, noise_px**2)
+        return float(np.nanmax(projection_sigma_px(fit, known, image_grid(CAMERA.image_size_px))))
+
+    guided, chance = [], []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        person, live, random = Person(rng), session(), []
+        live.corners = (BOARD.columns, BOARD.rows)
+        some = random_poses(rng)
+
+        def view(pose: Any, rng: np.random.Generator = rng) -> View:
+            pixels = corner_pixels(CAMERA, PrintedBoard(BOARD), pose)
+            return View(
+                f"{len(pixels)}", BOARD.points_m(), pixels + noise_px * rng.standard_normal(pixels.shape)
+            )
+
+        for k in range(count):
+            live.views[f"v{k}"] = view(person.pose_at(live.ghost()))
+            live.fitted(calibrate_camera(list(live.views.values()), CAMERA.image_size_px))
+            random.append(view(next(some)))
+        guided.append(worst(list(live.views.values())))
+        chance.append(worst(random))
+    ratio = float(np.median(guided) / np.median(chance))
+    print(f"worst projection sigma, {count} pictures: guided over random {ratio:.2f}")
+    assert ratio < 0.5
+
+
+def test_what_is_told_and_not_taken() -> None:
+    live, person = session(), Person(np.random.default_rng(1))
+    live.corners = (BOARD.columns, BOARD.rows)
+    pose = person.pose_at(live.ghost())
+
+    def last(codes: int, **frame: Any) -> Seen:
+        for k in range(codes):
+            seen = live.look(person.frame(pose, **frame), time.monotonic() + 0.2 * k)
+        return seen
+
+    assert last(4, motion_px=(7.0, 0.0)).code == "blurred"
+    assert last(4, motion_px=(0.0, 7.0)).code == "blurred"
+    assert last(4, light=Light(level=0.09)).code == "dark"
+    blank = render(CAMERA, background=0.4)
+    assert live.look(blank, 0.0).code == "no board"
+    taken = live.accept(person.frame(pose), "a.png")
+    assert isinstance(taken, View)
+    live.fitted(None)
+    assert last(4).code == "alike" and not last(4).take
+    again = live.accept(person.frame(pose), "b.png")
+    assert isinstance(again, Seen) and again.says == "Too like a.png."
+    assert isinstance(live.accept(person.frame(pose), "b.png", by_hand=True), View)
+    other = live.look(cv2.resize(blank, (160, 120)), 0.0)
+    assert other.code == "size" and "160x120" in other.says and "320x240" in other.says
+
+
+def test_the_blur_of_edges_is_measured() -> None:
+    pose = pose_facing(CAMERA, PrintedBoard(BOARD), (160.0, 120.0), 0.35, 0.3, 0.5)
+    grid = corner_pixels(CAMERA, PrintedBoard(BOARD), pose).reshape(BOARD.rows, BOARD.columns, 2)
+    for blur_px in (1.0, 2.0, 3.0):
+        sensor = Sensor(blur_px=blur_px, noise_grey=1.0)
+        gray = render(CAMERA, PrintedBoard(BOARD), pose, sensor=sensor, background=0.35)
+        assert edge_blur_px(gray, grid) == pytest.approx(np.hypot(blur_px, 0.29), rel=0.2)
+
+
+def test_a_frame_is_looked_at_within_150_ms() -> None:
+    pose = pose_facing(CAMERA, PrintedBoard(BOARD), (160.0, 120.0), 0.45, 0.5, 0.5)
+    gray = cv2.resize(Person(np.random.default_rng(0)).frame(pose), (640, 480))
+    live = Session(corners=(BOARD.columns, BOARD.rows))
+    spent = []
+    for k in range(8):
+        began = time.perf_counter()
+        assert live.look(gray, 0.1 * k).corners_px is not None
+        spent.append(time.perf_counter() - began)
+    assert np.median(spent) < 0.15
+
+
+# ----------------------------------------------------------------------
+# The folder.
+
+
+def test_pictures_are_never_written_over_and_an_earlier_session_goes_on(
+    tmp_path: Path, project_root: Path
+) -> None:
+    album = Album(tmp_path / "rig")
+    assert album.open(Told())[1] == ()
+    names = sorted(path.name for path in (project_root / "images").glob("view*.png"))[:5]
+    for name in names:
+        shutil.copy(project_root / "images" / name, album.images)
+    album.describe((7, 5), 0.02)
+    with pytest.raises(BadInputError, match="is there, and is not a picture"):
+        album.add(names[0], b"\x89PNG")
+    assert album.drop(names[4]) and album.left_out() == [names[4]] and album.new_name() == "view006.png"
+    with pytest.raises(BadInputError, match="is there already"):
+        shutil.copy(album.dropped / names[4], album.images / names[4])
+        album.drop(names[4])
+    (album.images / names[4]).unlink()
+    assert album.take_back(names[4]) and not album.drop("../rig.yaml") and album.picture("board.yaml") is None
+    board, views = album.open(Told())
+    assert board.corners == [7, 5] and [view.name for view in views] == names
+    with pytest.raises(BadInputError, match="tells another board than --corners"):
+        album.open(Told(corners=(8, 5)))
+
+
+def test_rig_yaml_is_what_intrinsics_writes(tmp_path: Path, project_root: Path) -> None:
+    """A folder that is being filled: its pictures are taken, and give the same bytes."""
+    watched, rig = tmp_path / "camera", tmp_path / "rig"
+    watched.mkdir()
+    for path in sorted((project_root / "images").glob("view*.png"))[:6]:
+        shutil.copy(path, watched)
+    shutil.copy(sorted(watched.iterdir())[0], watched / "view99.png")
+    (watched / "x.png").write_bytes(b"\x89PNG")
+    with served(rig, Watched(watched, lambda: time.time() + 10)) as live:
+        wait(lambda: len(live.album.names()) == 6 and live.state()["saved"] and not live.state()["fitting"])
+        wait(lambda: "x.png is not a picture" in live.source.fault)
+    assert (rig / "images" / "board.yaml").read_text() == "corners: [7, 5]\n"
+    written = (rig / "rig.yaml").read_bytes()
+    words = ["intrinsics", str(rig / "images"), "--rig", str(tmp_path / "other.yaml")]
+    subprocess.run([sys.executable, "-m", "calib", *words], check=False, capture_output=True)
+    assert (tmp_path / "other.yaml").read_bytes() == written
+    with pytest.raises(BadInputError, match="is where pictures are saved"):
+        source_of(str(rig / "images"), rig / "images")
+
+
+# ----------------------------------------------------------------------
+# The server.
+
+
+@contextlib.contextmanager
+def served(folder: Path, source: Source | None = None) -> Iterator[Any]:
+    album = Album(folder)
+    _, views = album.open(Told())
+    live = Live(Session(views={view.name: view for view in views}), album, source)
+    ready, address = threading.Event(), list[str]()
+
+    def tell(where: str) -> None:
+        address.append(where)
+        ready.set()
+
+    thread = threading.Thread(target=live.serve, args=(tell,))
+    thread.start()
+    try:
+        assert ready.wait(PICTURE_S)
+        wait(lambda: answers(address[0]))
+        live.address = address[0]  # type: ignore[attr-defined]  # for the test alone
+        yield live
+    finally:
+        live.finished.set()
+        thread.join(PICTURE_S)
+        assert not thread.is_alive()
+
+
+def answers(address: str) -> bool:
+    with contextlib.suppress(OSError):
+        return ask(address)[0] == 200
+    return False
+
+
+def wait(true: Callable[[], Any], most_s: float = PICTURE_S) -> None:
+    end = time.monotonic() + most_s
+    while not true():
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.05)
+
+
+def ask(
+    address: str, path: str = "", method: str = "GET", **headers: str
+) -> tuple[int, dict[str, str], bytes]:
+    url = urlsplit(address)
+    line = http.client.HTTPConnection("127.0.0.1", url.port, timeout=PICTURE_S)
+    try:
+        host = headers.pop("host", url.netloc)
+        line.request(method, path or url.path, headers={"Host": host, **headers})
+        answer = line.getresponse()
+        return answer.status, {k.lower(): v for k, v in answer.getheaders()}, answer.read()
+    finally:
+        line.close()
+
+
+def tab(live: Any, **more: Any) -> ClientConnection:
+    origin = "/".join(live.address.split("/")[:3])
+    where = live.address.replace("http", "ws") + "socket"
+    return connect(**{"uri": where, "origin": origin, "max_size": None} | more)
+
+
+def heard(line: ClientConnection, kind: str) -> dict[str, Any]:
+    while True:
+        got = line.recv(timeout=PICTURE_S)
+        if isinstance(got, str) and (message := json.loads(got))["type"] == kind:
+            return dict(message)
+
+
+def test_other_pages_cannot_drive_it(tmp_path: Path) -> None:
+    with served(tmp_path / "rig") as live:
+        address = live.address
+        status, headers, text = ask(address)
+        assert status == 200 and b"<title>calib live</title>" in text and b"{{nonce}}" not in text
+        policy = headers["content-security-policy"]
+        assert (
+            "default-src 'none'" in policy and "unsafe" not in policy and "frame-ancestors 'none'" in policy
+        )
+        assert headers["referrer-policy"] == "no-referrer" and headers["cache-control"] == "no-store"
+        assert b"http://" not in text.replace(b"http://www.w3.org/2000/svg", b"") and b"https://" not in text
+        port = urlsplit(address).port
+        assert ask(address, "/")[0] == 404 and ask(address, "/wrong/")[0] == 404
+        assert ask(address, host=f"evil.example:{port}")[0] == 403
+        assert ask(address, host="127.0.0.1")[0] == 403
+        assert ask(address, Origin="http://evil.example")[0] == 403
+        assert ask(address, method="POST")[0] == 405
+        assert ask(address, f"{urlsplit(address).path}picture/..%2Frig.yaml")[0] == 404
+        for wrong in (
+            {"origin": None},
+            {"origin": "http://evil.example"},
+            {"origin": f"http://localhost:{port}"},
+            {"origin": "null"},
+            {"uri": f"ws://127.0.0.1:{port}/wrong/socket"},
+        ):
+            with pytest.raises(InvalidStatus) as refused:
+                tab(live, **wrong)
+            assert refused.value.response.status_code in (403, 404)
+        with tab(live) as line:
+            assert heard(line, "state")["verdict"] == "none yet"
+
+
+def png(gray: Any) -> bytes:
+    return bytes(cv2.imencode(".png", gray)[1])
+
+
+def jpeg(gray: Any) -> bytes:
+    return bytes(cv2.imencode(".jpg", gray)[1])
+
+
+def test_a_page_sends_frames_and_what_is_too_large_is_refused(tmp_path: Path) -> None:
+    person, live_session = Person(np.random.default_rng(2)), session()
+    live_session.corners = (BOARD.columns, BOARD.rows)
+    pose = person.pose_at(live_session.ghost())
+    with served(tmp_path / "rig") as live, tab(live) as line, tab(live) as second:
+        heard(line, "state")
+        line.send(jpeg(person.frame(pose)))
+        line.send('{"do": "camera"}')
+        for _ in range(30):
+            line.send(jpeg(person.frame(pose)))
+            got = heard(line, "seen")
+            if got["code"] == "taken":
+                break
+        assert got["code"] == "taken" and len(got["corners"]) == BOARD.rows
+        heard(line, "shoot")
+        line.send(png(person.frame(pose)))
+        assert heard(second, "taken")["name"] == "view001.png"
+        assert live.album.names() == ["view001.png"]
+        # A picture that nobody asked for is none.
+        line.send(png(person.frame(pose)))
+        line.send('{"do": "nonsense"}')
+        assert "does not know" in heard(line, "fault")["says"]
+        assert live.album.names() == ["view001.png"]
+        bomb = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + (100_000).to_bytes(4, "big") * 2
+        for bad in (bomb, b"GIF89a", b"", jpeg(person.frame(pose))[:300]):
+            line.send(bad)
+            assert heard(line, "fault")["says"]
+        for bad in ("[", "[" * 5000, '{"do": 1}', "{}", "7"):
+            line.send(bad)
+            assert "does not know" in heard(line, "fault")["says"]
+        line.send('{"do": "drop", "name": "../../rig.yaml"}')
+        assert "is not there" in heard(line, "fault")["says"]
+        line.send('{"do": "drop", "name": "view001.png"}')
+        wait(lambda: live.album.left_out() == ["view001.png"])
+        line.send('{"do": "back", "name": "view001.png"}')
+        wait(lambda: live.album.names() == ["view001.png"])
+        second.send('{"do": "camera"}')
+        heard(line, "lent")
+        with contextlib.suppress(Exception):
+            line.send(b"\xff\xd8" + bytes(MOST_BYTES))
+            line.recv(timeout=PICTURE_S)
+        second.send('{"do": "done"}')
+        assert heard(second, "done")["folder"] == str(live.album.folder)
+    assert MOST_PIXELS * 3 > MOST_BYTES
+
+
+def test_the_page_in_a_browser_from_the_start_to_ok(tmp_path: Path) -> None:
+    """A fake camera shows the board where a session asks for it; the page, reloaded, knows everything."""
+    person = Person(np.random.default_rng(0))
+    poses = follow_some(person, 6)
+    write_y4m(tmp_path / "board.y4m", [person.frame(pose) for pose in poses])
+    switches = (
+        "--use-fake-ui-for-media-stream",
+        "--use-fake-device-for-media-stream",
+        f"--use-file-for-fake-video-capture={tmp_path / 'board.y4m'}",
+    )
+    with served(tmp_path / "rig") as live:
+        browser = browser_or_skip(tmp_path / "profile", *switches)
+        try:
+            browser.own = (*browser.own, live.address)
+            browser.open(live.address, 1200, 1000)
+            wait(lambda: "Press c" in browser.run("document.getElementById('says').textContent"))
+            browser.key("c", 67, "c")
+            wait(lambda: live.state()["verdict"] == "ok" and not live.state()["fitting"], 60.0)
+            count = len(live.state()["pictures"])
+            assert count >= 4
+            browser.key("a", 65, "a")
+            wait(lambda: not live.auto)
+            browser.click("#strip button")
+            wait(lambda: len(live.album.left_out()) == 1)
+            assert browser.run("document.getElementById('verdict').textContent") != "none yet"
+            browser.open(live.address, 390, 844)
+            wait(lambda: browser.run("document.querySelectorAll('#strip li').length") == count)
+            assert browser.run("document.documentElement.scrollWidth") == 390
+            assert not browser.run("document.getElementById('auto').checked")
+            browser.key("d", 68, "d")
+            assert live.finished.wait(PICTURE_S)
+            wait(lambda: "Done. Saved" in browser.run("document.getElementById('says').textContent"))
+            assert browser.errors == []
+        finally:
+            browser.close()
+
+
+def follow_some(person: Person, pictures: int) -> list[Any]:
+    return follow(session(), person, pictures)
+
+
+# ----------------------------------------------------------------------
+# The command.
+
+
+def test_what_the_command_refuses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def ends(*words: str) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["calib", "live", *words])
+        with pytest.raises(SystemExit) as left:
+            main()
+        return int(left.value.code or 0), capsys.readouterr().err
+
+    monkeypatch.chdir(tmp_path)
+    assert ends("nothing") == (
+        3,
+        "calib: nothing: does not exist, expected a camera's number, an address or a path\n",
+    )
+    (tmp_path / "x.mp4").write_text("no video")
+    code, said = ends("x.mp4")
+    assert code == 3 and "x.mp4: cannot be opened" in said
+    assert ends("--square", "20")[0] == 2
+    monkeypatch.setitem(sys.modules, "starlette.applications", None)
+    monkeypatch.delitem(sys.modules, "calib.live.server", raising=False)
+    code, said = ends()
+    assert code == 2 and "pip install 'calib-rig[live]'" in said
