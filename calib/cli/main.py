@@ -9,14 +9,13 @@ import contextlib
 import io
 import os
 import re
-import signal
 import sys
 import threading
 import traceback
 import warnings
-from collections.abc import Iterator
-from typing import Any, NoReturn, TextIO
+from typing import NoReturn, TextIO
 
+from calib.cli.interrupts import Interrupts
 from calib.core.compiled import choose_folder
 from calib.core.errors import (
     EXIT_BAD_INPUT,
@@ -36,8 +35,7 @@ os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 choose_folder()
 
 _EXIT_INTERRUPTED = 130
-_AGAIN_S = 3.0
-"""How long the answer to Ctrl-C may take before it is raised again."""
+_INTERRUPTED = "interrupted; files that were there before are unchanged or whole"
 
 
 def main() -> NoReturn:
@@ -51,46 +49,19 @@ def main() -> NoReturn:
     with warnings.catch_warnings():
         if not sys.warnoptions and not debug:
             warnings.simplefilter("ignore")
-        with _interrupts_that_are_not_lost():
-            code = _flushed(_run(debug))
+        interrupts = Interrupts()
+        with interrupts.taken(_leave):
+            code = _flushed(_run(debug, interrupts))
     if code == _EXIT_INTERRUPTED and _still_working():
         # Nothing waits for threads and processes that are still searching, or were just being started.
         os._exit(code)
     sys.exit(code)
 
 
-@contextlib.contextmanager
-def _interrupts_that_are_not_lost() -> Iterator[None]:
-    """Take SIGTERM and the terminal's end as Ctrl-C, and raise it again where it came while nothing could be
-    raised, as in a finaliser or a callback."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    again = hasattr(signal, "setitimer")
-
-    def interrupt(*_: object) -> None:
-        if again:
-            signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
-        raise KeyboardInterrupt
-
-    # What whoever started this process has told it to ignore stays ignored.
-    taken: dict[int, Any] = {
-        number: before
-        for number in (getattr(signal, name, None) for name in ("SIGINT", "SIGTERM", "SIGHUP"))
-        if number is not None
-        and (before := signal.getsignal(number)) in (signal.default_int_handler, signal.SIG_DFL)
-    }
-    if again and taken:
-        taken[signal.SIGALRM] = signal.getsignal(signal.SIGALRM)
-    for number in taken:
-        signal.signal(number, interrupt)
-    try:
-        yield
-    finally:
-        if again:
-            signal.setitimer(signal.ITIMER_REAL, 0.0)
-        for number, before in taken.items():
-            signal.signal(number, before)
+def _leave() -> None:
+    """End the process from another thread, while the main one cannot be reached."""
+    _ended(_INTERRUPTED, _EXIT_INTERRUPTED)
+    os._exit(_EXIT_INTERRUPTED)
 
 
 def _still_working() -> bool:
@@ -99,7 +70,7 @@ def _still_working() -> bool:
     return threading.active_count() > 1 or bool(multiprocessing.active_children())
 
 
-def _run(debug: bool) -> int:
+def _run(debug: bool, interrupts: Interrupts) -> int:
     try:
         from calib.cli.app import app
         from calib.core.command import one_command
@@ -112,18 +83,24 @@ def _run(debug: bool) -> int:
     except SystemExit as leaving:
         code = leaving.code if isinstance(leaving.code, int) else EXIT_DONE
         if code == _EXIT_INTERRUPTED:
-            return _interrupted()
+            interrupts.settle()
+            return _ended(_INTERRUPTED, code)
         return code
     except CalibError as error:
         return _ended(str(error), error.exit_code)
     except KeyboardInterrupt:
-        return _interrupted()
+        interrupts.settle()
+        return _ended(_INTERRUPTED, _EXIT_INTERRUPTED)
     except MemoryError:
         return _ended("out of memory; the input is larger than this machine can hold", EXIT_BAD_INPUT)
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         return _ended(f"{where}{error.strerror or error}", EXIT_BAD_INPUT)
     except Exception as error:
+        if interrupts.came:
+            # A library that drops the interruption goes on with what it has not done.
+            interrupts.settle()
+            return _ended(_INTERRUPTED, _EXIT_INTERRUPTED)
         if debug:
             traceback.print_exc()
         return _ended(
@@ -137,12 +114,6 @@ def _ended(message: str, code: int) -> int:
         with contextlib.suppress(OSError):
             sys.stderr.write(f"calib: {one_line(' '.join(message.split()))}\n")
     return code
-
-
-def _interrupted() -> int:
-    if hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread():
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-    return _ended("interrupted; files that were there before are unchanged or whole", _EXIT_INTERRUPTED)
 
 
 def _described(error: BaseException) -> str:

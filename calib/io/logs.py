@@ -30,7 +30,7 @@ import numpy as np
 
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
-from calib.core.files import shown
+from calib.core.files import check_readable, shown
 from calib.core.stage import NOTHING_STATED, LogOptions
 from calib.core.units import plain_number
 from calib.core.writing import Kind, column_names, write_atomically
@@ -55,7 +55,9 @@ _BLOCK_BYTES = 1 << 20
 _LONGEST_LINE = 1 << 16
 _MAX_COLUMNS = 1000
 _MOST_CELLS = 200_000_000
-"""Numbers that `read_log` takes, 1.6 GB; blocks have no such limit."""
+"""Numbers that `read_log` takes, 1.6 GB; blocks of text have no such limit."""
+_MOST_BYTES, _MOST_GROWTH = 1 << 28, 200
+"""What a Parquet file may unpack to: so many bytes, or so many times its own size where that is more."""
 
 
 def passed_over(not_finite: int, truncated: bool) -> list[str]:
@@ -392,11 +394,31 @@ def _iter_parquet(path: Path, options: LogOptions) -> Iterator[Log]:
         file = parquet.ParquetFile(path, pre_buffer=False)
         named = read_columns_file(given) if given is not None else None
         columns = column_map(source, path, 1, file.schema_arrow.names, named, options)
+        _check_growth(path, file.metadata, [one.column for one in columns.sources.values()])
         yield from _logs(columns, _parquet_blocks(file, columns))
     except (OSError, ValueError) as error:
         if isinstance(error, BadInputError):
             raise
         raise BadInputError(f"{source}: is not a Parquet file that can be read: {error}") from error
+
+
+def _check_growth(path: Path, metadata: Any, read: Sequence[str]) -> None:
+    """Raise `BadInputError` where the columns that are read unpack to more than their budget.
+
+    A column of equal numbers takes a few bytes however long it is, so rows count as well as what pages
+    unpack to.
+    """
+    most = max(_MOST_BYTES, _MOST_GROWTH * path.stat().st_size)
+    unpacked = 0
+    for group in map(metadata.row_group, range(metadata.num_row_groups)):
+        for column in map(group.column, range(metadata.num_columns)):
+            if column.path_in_schema in read:
+                unpacked += max(column.total_uncompressed_size, 8 * max(group.num_rows, column.num_values))
+    if unpacked > most:
+        raise BadInputError(
+            f"{shown(path)}: has {metadata.num_rows} rows, which unpack to {unpacked / 1e6:.0f} MB from "
+            f"{path.stat().st_size / 1e6:.2g}, expected at most {most / 1e6:.0f}; cut it into parts"
+        )
 
 
 def _parquet_blocks(file: Any, columns: ColumnMap) -> Iterator[_Block]:
@@ -462,12 +484,15 @@ def iter_log(path: Path, options: LogOptions = NOTHING_STATED) -> Iterator[Log]:
     Raises
     ------
     BadInputError
-        For a file that cannot be read, has no time, a row without time or with too few cells, or a cell that
-        is no number, with the number of the line; for units that are not known or contradict the readings.
+        For a pipe or a device, which may never end; for a file that cannot be read, has no time, a row
+        without time or with too few cells, or a cell that is no number, with the number of the line; for
+        units that are not known or contradict the readings; for a Parquet file that unpacks to too much.
     """
     from calib.io.bags import is_bag
     from calib.io.serial import STREAMS, iter_stream
 
+    if not (is_bag(path) and path.is_dir()):
+        check_readable(path)
     if is_bag(path):
         return _iter_bag(path, options)
     if options.topics is not None:
@@ -486,6 +511,7 @@ def columns_of(path: Path, options: LogOptions = NOTHING_STATED) -> tuple[str, .
     try:
         if is_bag(path) or path.suffix.lower() in (".parquet", *STREAMS):
             return tuple(next(iter_log(path, options)).columns)
+        check_readable(path)
         with path.open("rb") as stream:
             text, _, _ = _opened(stream, shown(path), path, options)
         return tuple(name for name in text.columns.sources if name != "t_s")

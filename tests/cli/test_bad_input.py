@@ -289,6 +289,25 @@ CONTRADICTIONS = (
 )
 
 
+@pytest.mark.parametrize(
+    "verb",
+    [
+        "replay", "align", "identify", "identify pump", "identify arm", "imu static", "imu intrinsics",
+        "imu drift", "imu tune", "validate", "convert",
+    ],
+)  # fmt: skip
+def test_a_log_that_may_never_end(calib, rig, tmp_path, verb: str) -> None:
+    pipe = tmp_path / "pipe.csv"
+    os.mkfifo(pipe)
+    rigs = ["--rig", rig] if verb.split()[0] not in ("imu", "convert") else []
+    for path in (pipe, Path("/dev/zero")):
+        ended = calib(
+            *verb.split(), path, *rigs, *(["-o", tmp_path / "out.csv"] if verb == "convert" else [])
+        )
+        assert ended.code == 3
+        assert ended.sentence == f"{path}: is a pipe or a device, expected a file"
+
+
 @pytest.mark.parametrize(("old", "new", "says"), CONTRADICTIONS)
 def test_a_rig_that_contradicts_itself(calib, rig, old: str, new: str, says: str) -> None:
     text = rig.read_text()

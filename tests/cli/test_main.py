@@ -233,6 +233,59 @@ def test_an_interruption_while_boards_are_searched(environment, tmp_path) -> Non
     assert time.monotonic() - began < 25
 
 
+_LOST = """
+import ctypes
+def compare(a, b):
+    print("in a callback", flush=True)
+    time.sleep(5)
+    return 0
+kind = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)
+ctypes.CDLL(None).qsort((ctypes.c_int * 2)(2, 1), 2, 4, kind(compare))
+raise RuntimeError("went on without what the callback does")
+"""
+_COMPILED = """
+import hashlib
+print("in a call that lasts", flush=True)
+hashlib.pbkdf2_hmac("sha256", b"x", b"y", 200_000_000)
+"""
+_SWALLOWED = """
+try:
+    print("in an import", flush=True)
+    time.sleep(5)
+except BaseException:
+    pass
+time.sleep(20)
+"""
+
+
+@pytest.mark.parametrize("body", [_LOST, _COMPILED, _SWALLOWED], ids=["callback", "compiled", "swallowed"])
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="needs POSIX signals")
+def test_an_interruption_is_answered_within_two_seconds(environment, tmp_path, body) -> None:
+    script = (
+        f"import sys, time\nimport calib.cli.main as cli\n"
+        f"def run(*_):\n    exec({body!r}, {{'time': time}})\n"
+        "import calib.cli.app as verbs\nverbs.app = lambda **_: run()\n"
+        "sys.argv = ['calib', 'doctor']\ncli.main()\n"
+    )
+    started = subprocess.Popen(
+        [sys.executable, "-c", script],
+        cwd=tmp_path,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509  one call
+    )
+    assert started.stdout is not None
+    assert started.stdout.readline().startswith("in a")
+    began = time.monotonic()
+    started.send_signal(signal.SIGINT)
+    _, err = started.communicate(timeout=25)
+    assert time.monotonic() - began < 2.0
+    assert started.returncode == 130
+    assert err == "calib: interrupted; files that were there before are unchanged or whole\n"
+
+
 @pytest.mark.slow
 def test_the_same_inputs_give_the_same_bytes(environment, project_root, tmp_path) -> None:
     images = project_root / "images"

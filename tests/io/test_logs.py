@@ -288,6 +288,21 @@ def _written(path: Path, values: np.ndarray) -> Path:
     return path
 
 
+def test_parquet_that_unpacks_to_too_much_is_refused_before_it_is_unpacked(tmp_path: Path) -> None:
+    import pyarrow
+    from pyarrow import parquet
+
+    rows = 1_000_000
+    table = pyarrow.table({name: np.zeros(rows) for name in ("t_s", "gz_radps", "other")})
+    with parquet.ParquetWriter(tmp_path / "log.parquet", table.schema) as writer:
+        for _ in range(20):
+            writer.write_table(table)
+    assert (tmp_path / "log.parquet").stat().st_size < 1_000_000
+    # The column that is not read does not count.
+    with pytest.raises(BadInputError, match=r"has 20000000 rows, which unpack to 320 MB .* at most 268"):
+        next(iter_log(tmp_path / "log.parquet"))
+
+
 def test_parquet_holds_the_rows_bit_for_bit(tmp_path: Path) -> None:
     from pyarrow import parquet
 
