@@ -14,6 +14,7 @@ from calib.stages.actuator.kinematics import chord_decay_w, chord_ratio_w
 from calib.stages.actuator.parameters import DAMPING_SCALE_FREE, Plant, pumps_connected
 from calib.stages.actuator.pump import Pump, PumpCoefficients, advance_pump, pump_coefficients, static_force_N
 from calib.stages.estimator.kinematic import (
+    FASTEST_MPS,
     OUT,
     Filter,
     Rows,
@@ -704,8 +705,6 @@ assert SIZE_D == 36
 _LOCKED_OUT = 5.5
 """So many pictures rejected, IMU readings twice so many, and the filter starts again."""
 _BEFORE_S = 0.03
-FASTEST_MPS = 1.0
-"""No rig's bellows change their lengths faster: a swing from 0.7 rad reaches a quarter of it."""
 _LOST_N = 0.5
 """Deviation of forces after a restart: a third of what a pump can do."""
 _HELD_N = (0.4, 0.05)

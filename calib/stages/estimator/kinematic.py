@@ -1228,9 +1228,11 @@ def write_columns(x: FloatArray, P: FloatArray, rows: IntArray, radius: float, o
 #
 # What goes wrong is said in `flags`: a picture or a sample that was gated; a sensor that is silent; a
 # restart
-# after half a second of rejected pictures, at a jump of the time, or from a state outside of the model; an
+# after half a second of rejected pictures, at a jump of the time, or from a state that no rig has; an
 # angle or length that no sensor sees, which the prior then holds.
 
+FASTEST_MPS = 1.0
+"""No rig's bellows change their lengths faster: a swing from 0.7 rad reaches a quarter of it."""
 _SILENT_S = 0.5
 _LOCKED_OUT_S = 0.5
 _KNOWN_M = 0.05
@@ -1286,8 +1288,10 @@ def _hold(bank: FloatArray, at: int, k: int, middle: float, sigma: float) -> Non
 
 
 @compiled()
-def _mend(bank: FloatArray, slot: int, count: int, head: FloatArray, head_sigma: FloatArray) -> int:
-    """Whether the state is still one, and what is done where it is not: flags."""
+def _mend(
+    bank: FloatArray, slot: int, count: int, head: FloatArray, head_sigma: FloatArray, radius: float
+) -> int:
+    """Whether the state is still one that a rig can have, and what is done where it is not: flags."""
     flags = 0
     for m in range(count):
         at = (slot * count + m) * RECORD
@@ -1302,6 +1306,13 @@ def _mend(bank: FloatArray, slot: int, count: int, head: FloatArray, head_sigma:
         for i in range(SIZE):
             bad += 0 if abs(bank[x + i]) < 1e6 else 1
             bad += 0 if bank[at + (WIDTH + 1) * i] > 0.0 else 1
+        if not bad and not abs(bank[x + 3]) + radius * abs(bank[x + 2]) < FASTEST_MPS:
+            # Faster than a rig: where it is stays, as unsure as the prior, and its motion is not known.
+            for i in range(6):
+                if i >= 2:
+                    bank[x + i] = head[i]
+                _clear(bank, at, i, head_sigma[i] ** 2)
+            flags |= 1
         if bad:
             # A level that has left the model starts again from the prior, all of it.
             for i in range(SIZE):
@@ -1409,7 +1420,7 @@ def run_filter(
                     switch_hz, levels, 0, walk, view, constants, noise, told, i > 0,
                     report if i == 0 else spare, ring_gated, untraced,
                 )  # fmt: skip
-                flags |= _mend(bank, now, count, head, head_sigma)
+                flags |= _mend(bank, now, count, head, head_sigma, radius)
             whole[_NEWEST] = (newest + 1) % size
             whole[_COUNT] = min(whole[_COUNT] + 1, size)
             likelihood = out[row, 24]
@@ -1447,15 +1458,18 @@ def run_filter(
         ahead = stamp - ring_t[here] if whole[_COUNT] > 0 else 0.0
         if whole[_COUNT] == 0:
             flags |= 64
-        if abs(ahead) > 0.02:
+        far = abs(ahead) > 0.02
+        if not far:
+            write_bank(bank, weights, here, ahead, levels, radius, out, row)
+            far = not max(abs(out[row, 3]), abs(out[row, 4])) < FASTEST_MPS
+        if far:
             for m in range(count):
                 weights[size, m] = weights[here, m]
                 at = (size * count + m) * RECORD
                 copy_level(bank, (here * count + m) * RECORD, at)
                 predict(bank, at, levels, 0, m, walk, ahead)
+            flags |= _mend(bank, size, count, head, head_sigma, radius)
             write_bank(bank, weights, size, 0.0, levels, radius, out, row)
-        else:
-            write_bank(bank, weights, here, ahead, levels, radius, out, row)
         if max(out[row, 10], out[row, 11]) > _KNOWN_M:
             flags |= 8
         out[row, 25] = flags

@@ -35,6 +35,8 @@ from numba import njit
 from calib.core.arrays import FloatArray, IntArray
 from calib.stages.estimator.kinematic import (
     CONSIDERED,
+    FASTEST_MPS,
+    FLAGS,
     LARGEST_STEP_S,
     OUT,
     RECORD,
@@ -321,7 +323,8 @@ def smooth(setup: Setup, rows: Rows, outputs: FloatArray) -> FloatArray:
 
     Parameters
     ----------
-    outputs : (n, len(OUT)) of the filter on the same rows; what it says of innovations and flags is kept.
+    outputs : (n, len(OUT)) of the filter on the same rows; what it says of innovations and flags is kept, and
+        all that it says where both sides of a row make the head faster than a rig.
     """
     events = events_of(setup, rows)
     levels, walk = setup.process.arrays()
@@ -377,6 +380,10 @@ def smooth(setup: Setup, rows: Rows, outputs: FloatArray) -> FloatArray:
         )  # fmt: skip
         before = float(events.t_s[end - 1])
         begin = end
+    # The smoother linearises where the filter may start again, and readings that lie carry it away.
+    lost = ~(np.isfinite(out[:, 1:13]).all(axis=1) & (np.abs(out[:, 3:5]) < FASTEST_MPS).all(axis=1))
+    out[lost] = outputs[lost]
+    out[lost, OUT.index("flags")] = out[lost, OUT.index("flags")].astype(np.int64) | FLAGS["restarted"]
     out[:, OUT.index("rest_weight")] = _of_rows(events, weights[:, 0], len(rows))
     out[:, OUT.index("swing_weight")] = _of_rows(events, weights[:, -1], len(rows))
     return out
