@@ -142,6 +142,53 @@ def test_motion_is_left_out_and_makes_it_poor() -> None:
     assert found.noise[2].bias == pytest.approx(IMU.gyro_bias_radps[2], abs=3e-4)
 
 
+def test_a_short_bump_in_a_long_log_is_cut_out_and_named() -> None:
+    log, _ = rest_log(replace(IMU, gyro_walk=0.0, accel_walk=0.0), 600.0, 4)
+    bumped = log.values.copy()
+    bumped[20000:20150] += 0.5 * np.sin(0.4 * np.arange(150))[:, None]
+    found = analyse_static([replace(log, values=bumped)])
+    judged = judge(found)
+    assert judged.word == "ok"
+    assert any("moves from 200.0 to 202.0 s" in text for text in judged.remarks)
+    assert found.noise[2].bias == pytest.approx(IMU.gyro_bias_radps[2], abs=1e-4)
+    assert found.logs[0].gyro is not None
+    # Touched, it lies in another pose afterwards.
+    bumped[20150:, 4] += 9.8 * np.radians(0.5)
+    assert "lies 0.5 deg otherwise" in " ".join(judge(analyse_static([replace(log, values=bumped)])).reasons)
+
+
+@pytest.mark.parametrize("at_s", [120.0, 451.0])
+def test_a_step_of_the_bias_is_told_with_what_it_does(at_s: float) -> None:
+    log, _ = rest_log(replace(IMU, gyro_walk=0.0, accel_walk=0.0), 600.0, 5)
+    stepped = log.values.copy()
+    stepped[round(100.0 * at_s) :, 2] += np.radians(0.1)
+    found = analyse_static([replace(log, values=stepped)])
+    (step,) = found.logs[0].steps
+    assert step.axis == 2 and step.at_s == pytest.approx(at_s, abs=3.0)
+    assert step.size == pytest.approx(np.radians(0.1), rel=0.15)
+    (told,) = [one.text for one in judge(found).findings if "steps by" in one.text]
+    assert float(told.split("turns by ")[1].split(" deg")[0]) == pytest.approx(6.0, rel=0.15)
+
+
+def test_noise_and_a_walk_are_no_steps() -> None:
+    for seed in range(12):
+        imu = replace(IMU, gyro_walk=3e-5 * 2.0 ** (seed % 6), accel_walk=3e-4)
+        assert analyse_static([rest_log(imu, 400.0, seed)[0]]).logs[0].steps == ()
+
+
+def test_coloured_noise_is_a_remark_with_its_consequence() -> None:
+    log, _ = rest_log(replace(IMU, gyro_walk=0.0, accel_walk=0.0), 1200.0, 6)
+    rng, coloured = np.random.default_rng(6), log.values.copy()
+    share = np.exp(-1.0 / (100.0 * 0.5))
+    slow = np.zeros(len(coloured))
+    for i, one in enumerate(rng.normal(size=len(slow) - 1), start=1):
+        slow[i] = share * slow[i - 1] + one
+    coloured[:, 4] += 0.005 * slow * np.sqrt(1.0 - share**2)
+    judged = judge(analyse_static([replace(log, values=coloured)]))
+    assert judged.word == "ok"
+    assert any("ay: its noise is coloured" in text and "too little" in text for text in judged.remarks)
+
+
 def _nbs14() -> np.ndarray:
     n, out = 1234567890, []
     for _ in range(1000):

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import stdtrit
 
 from calib.core.arrays import BoolArray, FloatArray
 from calib.core.errors import BadInputError
-from calib.core.verdict import Finding, Verdict
+from calib.core.verdict import Finding, Severity, Verdict
 from calib.solve.clock import Part
-from calib.stages.imu.allan import LEAST_SAMPLES, Allan, analyse
+from calib.stages.imu.allan import LEAST_SAMPLES, Allan, analyse, model_variance
 from calib.stages.imu.sampling import Motion, Sampling, regular_parts, rest_parts, sampling_findings
 
 # ----------------------------------------------------------------------
@@ -35,6 +35,11 @@ from calib.stages.imu.sampling import Motion, Sampling, regular_parts, rest_part
 # stretches, as its error is no white noise.
 #
 # A single pose does not tell an accelerometer's bias from gravity: of it the mean is given.
+#
+# A bias can jump inside a log: a BNO055 calibrates itself anew, a supply or a temperature changes. Means of a
+# second are compared before and behind each time, over 10 s and over 60 s. A step stands out from all other
+# differences of that log over as long, so that noise, flicker and a random walk, whatever their size, are
+# none; and it matters to an angle.
 
 AXES = ("gx", "gy", "gz", "ax", "ay", "az")
 """Rates of rotation [rad/s] and specific forces [m/s^2] by name."""
@@ -77,13 +82,23 @@ class Drift:
 
 
 @dataclass(frozen=True)
+class BiasStep:
+    """A jump of an axis' bias, by its number, and how large it is [rad/s or m/s^2]."""
+
+    at_s: float
+    axis: int
+    size: float
+
+
+@dataclass(frozen=True)
 class StaticLog:
     """What one log shows.
 
     Attributes
     ----------
     sampling : rate, jitter, gaps, steps.
-    motions : where it moves; `rest_s` is what is left.
+    motions : where it moves; `rest_s` is what is left, `moved_share` of the log what is not.
+    steps : jumps of a bias.
     mean : (axes,) of the rest.
     gyro, onchip : drift of the angle by -gz and by the chip, None without that column.
     """
@@ -94,8 +109,15 @@ class StaticLog:
     motions: tuple[Motion, ...]
     rest_s: float
     mean: FloatArray
+    steps: tuple[BiasStep, ...]
     gyro: Drift | None
     onchip: Drift | None
+
+    @property
+    def moved_share(self) -> float:
+        """Share of the log that is no rest."""
+        moved_s = sum(motion.to_s - motion.from_s for motion in self.motions)
+        return moved_s / max(moved_s + self.rest_s, 1e-9)
 
 
 @dataclass(frozen=True)
@@ -166,19 +188,80 @@ def _rest_of(log: RestLog) -> StaticLog:
     onchip = None
     if not motions:
         onchip = _slope(log.onchip_t_s, log.onchip_phi_rad)
-    return StaticLog(log.source, sampling, still, motions, samples * sampling.period_s, mean, None, onchip)
+    rest_s = samples * sampling.period_s
+    steps = bias_steps(still, sampling.period_s, gyro)
+    return StaticLog(log.source, sampling, still, motions, rest_s, mean, steps, None, onchip)
+
+
+_BIN_S = 1.0
+_TOGETHER_S = 10.0
+_AROUND = (10, 60)
+"""Bins on each side of a step."""
+_STANDS_OUT = 8.0
+"""Size of a step over the deviation of all differences: chance brings 5 in an hour."""
+_LEAST_STEP_RADPS, _LEAST_STEP_MPS2 = math.radians(0.005), 9.8 * math.radians(0.1)
+"""Steps that turn an angle by .3 degrees in a minute, or tilt it by .1 degrees."""
+
+
+def bias_steps(parts: Sequence[Part], period_s: float, gyro: BoolArray) -> tuple[BiasStep, ...]:
+    """Jumps of the means (axes,) of a log at rest, in the order of time.
+
+    Parameters
+    ----------
+    parts : stretches at rest. gyro : (axes,) which axes are rates of rotation.
+    """
+    size = max(1, round(_BIN_S / period_s))
+    stretches: list[tuple[list[FloatArray], list[FloatArray]]] = []
+    end_s = -math.inf
+    for part in parts:
+        count = len(part.values) // size
+        if count == 0:
+            continue
+        if part.t_s[0] - end_s > _TOGETHER_S:
+            stretches.append(([], []))
+        end_s = float(part.t_s[-1])
+        stretches[-1][0].append(part.t_s[: count * size : size])
+        stretches[-1][1].append(part.values[: count * size].reshape(count, size, -1).mean(axis=1))
+    found: list[BiasStep] = []
+    for around in _AROUND:
+        for times, values in stretches:
+            t_s, bins = np.concatenate(times), np.concatenate(values)
+            if len(bins) < 6 * around:
+                continue
+            for k in range(bins.shape[1]):
+                least = _LEAST_STEP_RADPS if gyro[k] else _LEAST_STEP_MPS2
+                for i, change in _jumps(bins[:, k], around, least):
+                    at_s = float(t_s[i])
+                    if all(one.axis != k or abs(one.at_s - at_s) > 2.0 * max(_AROUND) for one in found):
+                        found.append(BiasStep(at_s, k, change))
+    return tuple(sorted(found, key=lambda step: step.at_s))
+
+
+def _jumps(bins: FloatArray, around: int, least: float) -> Iterator[tuple[int, float]]:
+    """Bins behind which the mean over `around` bins differs from that before, and by how much."""
+    total = np.concatenate([[0.0], np.cumsum(bins - bins.mean())])
+    before = total[around:-around] - total[: -2 * around]
+    change = (total[2 * around :] - total[around:-around] - before) / around
+    middle = float(np.median(change))
+    spread = 1.4826 * float(np.median(np.abs(change - middle)))
+    change = change - middle
+    while True:
+        i = int(np.argmax(np.abs(change)))
+        size = float(change[i])
+        if abs(size) < max(least, _STANDS_OUT * spread):
+            return
+        yield i + around, size
+        change[max(0, i - 2 * around) : i + 2 * around] = 0.0
 
 
 def _with_gyro_drift(log: StaticLog, axes: tuple[str, ...], noise: tuple[AxisNoise, ...]) -> StaticLog:
-    if "gz" not in axes or log.motions:
+    if "gz" not in axes or log.moved_share > _MOVED_SHARE:
         return log
     k = axes.index("gz")
     allan = noise[k].allan
     sigma = math.nan if allan is None else allan.N.value / math.sqrt(log.rest_s)
     drift = Drift(-float(log.mean[k]), sigma)
-    return StaticLog(
-        log.source, log.sampling, log.parts, log.motions, log.rest_s, log.mean, drift, log.onchip
-    )
+    return replace(log, gyro=drift)
 
 
 def _axis_noise(axis: str, k: int, logs: Sequence[StaticLog], period_s: float) -> AxisNoise:
@@ -241,6 +324,14 @@ def analyse_static(logs: Sequence[RestLog]) -> Static:
 # ----------------------------------------------------------------------
 # What logs at rest are worth: a verdict, the reasons for it, and remarks that do not change it.
 
+_MOVED_SHARE = 0.02
+"""Share of a log in motion from which on what is left is not taken for a rest."""
+_TILTED_RAD = math.radians(0.3)
+"""Turn of gravity between the stretches at rest that makes their mean that of no pose."""
+_COLOURED = 2.0
+"""Deviation over the fitted one from which on the coefficients do not describe the noise."""
+_LONG_S = 7200.0
+"""A log that shows no random walk within this will hardly do so within the next hours."""
 _MOST_REPEATED = 0.02
 _MOST_SIGMA_OF_N = 0.10
 _LEAST_REST_S = 10.0
@@ -250,17 +341,56 @@ _SHOWN_MOTIONS = 3
 
 def _of_log(log: StaticLog, axes: tuple[str, ...]) -> Iterator[Finding]:
     """Findings on motion and on how a log was sampled."""
+    again = "log again with the rig untouched, on a table that does not shake"
     for motion in log.motions[:_SHOWN_MOTIONS]:
-        yield Finding(
-            "poor",
-            f"{log.source}: moves from {motion.from_s:.1f} to {motion.to_s:.1f} s, seen most in "
-            f"{axes[motion.axis]}; that stretch is left out",
-            advice="log again with the rig untouched, on a table that does not shake",
-        )
+        text = f"{log.source}: moves from {motion.from_s:.1f} to {motion.to_s:.1f} s, seen most in "
+        text += f"{axes[motion.axis]}; that stretch is left out"
+        if log.moved_share > _MOVED_SHARE:
+            yield Finding("poor", text, advice=again)
+        else:
+            yield Finding("remark", text)
     more = len(log.motions) - _SHOWN_MOTIONS
     if more > 0:
-        yield Finding("poor", f"{log.source}: moves {more} more times")
+        severity: Severity = "poor" if log.moved_share > _MOVED_SHARE else "remark"
+        yield Finding(severity, f"{log.source}: moves {more} more times")
+    if log.motions and (turned := _turned_rad(log, axes)) > _TILTED_RAD:
+        text = f"{log.source}: lies {math.degrees(turned):.2g} deg otherwise after it has moved; the mean of "
+        yield Finding("poor", f"{text}the accelerometer is that of no pose", advice=again)
     yield from sampling_findings(log.sampling, axes, log.source, _MOST_REPEATED)
+
+
+def _turned_rad(log: StaticLog, axes: tuple[str, ...]) -> float:
+    """Largest angle between the mean specific forces of the stretches at rest."""
+    columns = [k for k, axis in enumerate(axes) if axis.startswith("a")]
+    long = [part.values[:, columns] for part in log.parts if len(part.values) * log.sampling.period_s > 1.0]
+    if len(columns) < 2 or len(long) < 2:
+        return 0.0
+    means = np.array([values.mean(axis=0) for values in long])
+    size = max(float(np.linalg.norm(means, axis=1).mean()), 1e-9)
+    return float(np.linalg.norm(means - means[0], axis=1).max()) / size
+
+
+def _of_steps(log: StaticLog, noise: Sequence[AxisNoise]) -> Iterator[Finding]:
+    """Findings on biases that jump, and what that does to an angle."""
+    for step in log.steps[:_SHOWN_MOTIONS]:
+        one = noise[step.axis]
+        if one.axis.startswith("g"):
+            size = f"{math.degrees(step.size):+.2g} deg/s"
+            effect = (
+                f"an angle from it turns by {60.0 * math.degrees(abs(step.size)):.2g} deg in a minute more"
+            )
+        else:
+            size = f"{step.size:+.2g} m/s^2"
+            effect = f"an angle from gravity turns by up to {math.degrees(abs(step.size) / 9.8):.2g} deg"
+            advice = "see whether the rig was touched then"
+        text = f"{log.source}: the mean of {one.axis} steps by {size} at {step.at_s:.0f} s; {effect}"
+        # A step within the stated deviation of the bias is a part of that.
+        if abs(step.size) > 3.0 * one.sigma:
+            yield Finding("poor", text, advice=advice)
+        else:
+            yield Finding("remark", text)
+    if len(log.steps) > _SHOWN_MOTIONS:
+        yield Finding("remark", f"{log.source}: {len(log.steps) - _SHOWN_MOTIONS} more steps of a mean")
 
 
 def _of_axis(noise: AxisNoise) -> Iterator[Finding]:
@@ -276,13 +406,34 @@ def _of_axis(noise: AxisNoise) -> Iterator[Finding]:
         share = N.sigma / N.value if N.value > 0.0 else math.inf
         yield Finding("poor", f"{axis}: the white noise is known to {share:.0%} only; the log is too short")
     if allan.chance < _LEAST_CHANCE:
-        yield Finding("poor", f"{axis}: its deviation is not that of white noise, flicker and a random walk")
+        off, tau_s = _colour(allan)
+        text = f"{axis}: its noise is coloured, at {tau_s:.2g} s the deviation is {off:.2g} times what white "
+        text += "noise, flicker and a random walk explain"
+        if off > _COLOURED:
+            yield Finding("poor", f"{text}; N, B and K do not describe it")
+        elif off > 1.0:
+            yield Finding("remark", f"{text}; an estimator trusts it by as much too far there")
+        else:
+            yield Finding("remark", f"{text}; an estimator trusts it by as much too little there")
     elif allan.fit_s[0] > 1.5 * float(allan.tau_s[0]):
         yield Finding(
             "remark",
             f"{axis}: below {allan.fit_s[0]:.3g} s the deviation is not that of white noise "
             "(a filter in the sensor, or its step); the fit begins there",
         )
+
+
+def _colour(allan: Allan) -> tuple[float, float]:
+    """Deviation over the fitted one where they differ most, of what is sure of it, and the time of that."""
+    first, last = allan.fit_s
+    used = (allan.tau_s > 0.99 * first) & (allan.tau_s < 1.01 * last)
+    tau_s, model = allan.tau_s[used], np.sqrt(model_variance(allan.theta, allan.tau_s[used]).sum(axis=1))
+    # Two standard deviations of each side are left to chance.
+    low = allan.low[used] ** 2 / allan.deviation[used]
+    high = allan.high[used] ** 2 / allan.deviation[used]
+    sure = np.where(low > model, low / model, np.where(high < model, high / model, 1.0))
+    k = int(np.argmax(np.abs(np.log(sure))))
+    return float(sure[k]), float(tau_s[k])
 
 
 def _of_length(result: Static) -> Iterator[Finding]:
@@ -295,10 +446,11 @@ def _of_length(result: Static) -> Iterator[Finding]:
         )
     unsupported = [n.axis for n in result.noise if n.allan is not None and not n.allan.K.supported]
     if unsupported:
+        longer = "a log of several hours at rest would show the random walk of the bias"
         yield Finding(
             "remark",
             f"{longest:.4g} s do not show a random walk of {', '.join(unsupported)}; an upper bound is given",
-            advice="a log of several hours at rest would show the random walk of the bias",
+            advice="" if longest > _LONG_S else longer,
         )
 
 
@@ -307,6 +459,7 @@ def judge(result: Static) -> Verdict:
     return Verdict.of(
         [
             *(finding for log in result.logs for finding in _of_log(log, result.axes)),
+            *(finding for log in result.logs for finding in _of_steps(log, result.noise)),
             *(finding for noise in result.noise for finding in _of_axis(noise)),
             *_of_length(result),
         ]
