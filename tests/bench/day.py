@@ -36,7 +36,7 @@ from calib.io.states import STATES, states_writer
 from calib.stages.estimator.consistency import Tally
 from calib.stages.estimator.kinematic import OUT
 from calib.stages.estimator.read import rows_of, truth_of
-from calib.stages.estimator.replay import drive_for, estimator_of, opened
+from calib.stages.estimator.replay import Estimate, drive_for, opened
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.simulate import log_of
@@ -137,7 +137,7 @@ def _stages(
     rig = Rig.load(rig_path)
     log = opened(path, rig, rig_path)
     setup, found = log.setup, log.periods
-    estimate = estimator_of(setup, drive_for(log, rig, model), model)
+    estimate = Estimate(setup, drive_for(log, rig, model), model)
     blocks = list(islice(iter_log(path), count))
     n = sum(len(block) for block in blocks)
     show(f"read {path.suffix}", n, lambda: list(islice(iter_log(path), count)))

@@ -1480,6 +1480,11 @@ class Handover:
         weigh(driven, kinematic, self._memory, BEGIN, weight)
         return driven, kinematic, weight
 
+    @property
+    def sensor(self) -> FloatArray:
+        """As `Filter.sensor`; the model without commands says it, which no error of the plant turns."""
+        return self._kinematic.sensor
+
     def run(self, rows: Rows, pwm: FloatArray) -> FloatArray:
         """Estimates (n, len(OUT)) of rows with commands (n, 2); call again with the rows that follow."""
         return blended(*self.run_each(rows, pwm))

@@ -1542,6 +1542,12 @@ class Filter:
             yield self.run(rows)
 
     @property
+    def sensor(self) -> FloatArray:
+        """What the log has come to say of `sensors.SENSOR` (13,), as in `starting_state`."""
+        x, _, weights = self.state
+        return np.asarray(weights @ x[:, 6:])
+
+    @property
     def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """State (M, 19), covariance (M, 19, 19) and weights (M,) after the last event."""
         here, count = int(self._whole[0]), len(self._levels)
