@@ -459,3 +459,15 @@ def test_duplicates_a_short_gap_and_an_hour(calib: Run, arm: Arm, tmp_path: Path
     section = Rig.load(tmp_path / "rig.yaml").orientation_filter
     assert section is not None and section.recommended == "levelling"
     assert section.logs[0].pieces == 2 and section.logs[0].duration_s == pytest.approx(30.0, abs=0.1)
+
+
+def test_a_truth_in_the_log_changes_no_gain(calib: Run, tmp_path: Path) -> None:
+    log = log_of(run_scenario(make_scenario("ellipse"), SimulatedRig(), 4, "truth", 12.0))
+    kept = {name: values for name, values in log.columns.items() if not name.startswith("true_")}
+    found = []
+    for name, columns in (("with", log.columns), ("without", kept)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "log.csv").write_text(log_text(replace(log, columns=columns)))
+        words = ("--json", "--rig", tmp_path / name / "rig.yaml")
+        found.append(json.loads(calib("imu", "tune", tmp_path / name / "log.csv", *words).out))
+    assert found[0] == found[1]

@@ -175,7 +175,7 @@ class Reading:
     Attributes
     ----------
     tilted : take the rate from the up vector (`calib.stages.imu.tracks`) and not -gz.
-    reference : one of `REFERENCES`; auto takes the first of truth and camera that the log has.
+    reference : one of `REFERENCES`; auto takes the camera where the log has it.
     camera, A_inverse : of the rig, None where it has no plane.
     """
 
@@ -241,7 +241,8 @@ def _wanted(log: Log, read: DriftLog, how: Reading) -> str:
         "onchip": len(read.onchip_t_s) >= _TUNELOGS_FEWEST,
     }
     if how.reference == "auto":
-        return next((name for name in ("truth", "camera") if has[name]), "")
+        # A truth is for scores: gains that were chosen by it say nothing of a rig that has none.
+        return "camera" if has["camera"] else ""
     if how.reference == "none":
         return ""
     if not has[how.reference]:

@@ -425,7 +425,7 @@ class TuneOptions(LogOptions):
     reference: Literal["auto", "truth", "camera", "onchip", "none"] = option(
         "auto",
         "Angle to judge by: true_phi_rad, the camera's through the rig's plane, onchip_phi_rad, or none for "
-        "the log's own smoothed angle. auto: truth or camera where there is one.",
+        "the log's own smoothed angle. auto: the camera where there is one.",
     )
     rate: Literal["plane", "up"] = option(
         "plane", "Rate of the angle: -gz, or of the up vector for a sensor that is not in plane."
