@@ -20,6 +20,7 @@ from calib.cli.report import report
 from calib.cli.run import run
 from calib.cli.simulate import simulate
 from calib.cli.sweep import sweep
+from calib.cli.track import track
 from calib.cli.verbs import OneByDefault, group, verb
 from calib.stages import stage
 
@@ -73,6 +74,7 @@ app.command("firmware")(verb(stage("firmware")))
 app.command("fleet")(telling(fleet))
 app.command("sweep")(telling(sweep))
 app.command("record")(record)
+app.command("track")(track)
 app.command("convert")(convert)
 app.command("board")(board)
 app.command("simulate")(telling(simulate))

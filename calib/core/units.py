@@ -130,6 +130,17 @@ def parse_pwm_limits(text: str, what: str = "--pwm-limits") -> tuple[float, floa
     return low, high
 
 
+def parse_pixel(text: str, what: str = "--at") -> tuple[float, float]:
+    """A pixel from 'u,v'."""
+    try:
+        u, v = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise UsageError(f"{what}: {text!r} is not two numbers, expected u,v in pixels") from error
+    if not (math.isfinite(u) and math.isfinite(v)):
+        raise UsageError(f"{what}: {text!r} is not two finite numbers, expected u,v in pixels")
+    return u, v
+
+
 def parse_region_px(text: str, what: str = "--region") -> tuple[float, float, float, float]:
     """A box in pixels from 'u0,v0,u1,v1', left before right and upper before lower."""
     try:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -143,6 +145,85 @@ def _of_video(path: Path) -> Iterator[GrayImage]:
 def _gray(frame: np.ndarray[Any, Any]) -> GrayImage:
     gray = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
     return np.asarray(gray, dtype=np.uint8)
+
+
+# ----------------------------------------------------------------------
+# All frames of a video or of a camera, in colour, with their times.
+
+
+@dataclass
+class Times:
+    """What the times of frames are worth.
+
+    Attributes
+    ----------
+    arrival : whether they are those at which frames came, not those of a file. rate_hz : as the file says.
+    stamps_s : of all frames so far.
+    """
+
+    arrival: bool
+    rate_hz: float
+    stamps_s: list[float] = field(default_factory=list)
+
+    @property
+    def usable(self) -> bool:
+        """Whether they increase."""
+        return all(b > a for a, b in pairwise(self.stamps_s))
+
+    def settled_s(self) -> list[float]:
+        """Times from the first frame on; counted where the stamps do not increase. Raises `BadInputError`."""
+        if self.usable:
+            return [t - self.stamps_s[0] for t in self.stamps_s]
+        if not 1.0 <= self.rate_hz <= 1000.0:
+            raise BadInputError("the video has no times that increase, and tells no rate of frames")
+        return [k / self.rate_hz for k in range(len(self.stamps_s))]
+
+    def words(self) -> str:
+        """One sentence."""
+        steps = np.diff(self.settled_s()) * 1e3
+        if len(steps) == 0:
+            return "one frame, so no times"
+        usual, low, high = float(np.median(steps)), float(steps.min()), float(steps.max())
+        if not self.usable:
+            return f"the stamps do not increase: times are counted at the {self.rate_hz:g} Hz of the file"
+        span = f"a frame each {usual:.2f} ms ({low:.2f} to {high:.2f})"
+        if self.arrival:
+            return f"times of arrival at this computer, {span}; later than the exposure by an unknown time"
+        if high - low < 0.01 * usual + 1.0:
+            return f"times from the file, {span}: even, which says nothing of how even the camera was"
+        return f"times from the file, {span}"
+
+
+def timed_frames(source: Path | int | str) -> tuple[Times, Iterator[np.ndarray[Any, Any]]]:
+    """Frames (H, W, 3) of a video (a path), or of a camera (its number, or a stream's address) until it ends.
+
+    The `Times` grow with the frames. Raises `BadInputError` where it cannot be opened.
+    """
+    name = shown(source) if isinstance(source, Path | str) else f"camera {source}"
+    if isinstance(source, Path):
+        check_readable(source)
+    video = cv2.VideoCapture()
+    video.open(str(source) if isinstance(source, Path) else source)
+    if not video.isOpened():
+        raise BadInputError(f"{name}: is not a video or a camera that can be opened")
+    video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+    times = Times(not isinstance(source, Path), float(video.get(cv2.CAP_PROP_FPS)))
+
+    def frames() -> Iterator[np.ndarray[Any, Any]]:
+        try:
+            while True:
+                there, frame = video.read()
+                if not there or frame is None:
+                    return
+                if frame.shape[0] * frame.shape[1] > _MOST_PIXELS:
+                    raise BadInputError(f"{name}: frames have over {_MOST_PIXELS // 10**6} million pixels")
+                stamp = time.monotonic() if times.arrival else 1e-3 * video.get(cv2.CAP_PROP_POS_MSEC)
+                times.stamps_s.append(stamp)
+                yield frame
+        finally:
+            video.release()
+
+    return times, frames()
 
 
 # ----------------------------------------------------------------------

@@ -1,0 +1,188 @@
+"""`calib track`: the centre of a coloured marker in a video or before a camera, as a log."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from calib.cli.common import JsonOption, RigOption, document, narrate, progress_bar, say
+from calib.core.errors import EXIT_POOR, BadInputError, UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from calib.core.arrays import FloatArray
+    from calib.stages.camera.marker import Disc, Tracker
+
+_HEAD = "t_s,u_px,v_px,sigma_px"
+_GATE = 0.9
+"""Share of the frames that must show the marker."""
+
+
+def track(
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="VIDEO|CAMERA", help="A video, the number of a camera, or the address of a stream."
+        ),
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Log to write, .csv.")],
+    colour: Annotated[
+        str | None,
+        typer.Option(
+            metavar="COLOUR", help="The marker's: a name, #rrggbb, or a hue, as 24deg. [default: orange]"
+        ),
+    ] = None,
+    at: Annotated[
+        str | None,
+        typer.Option(
+            metavar="U,V",
+            help="Where the marker is in the first frame, px; its colour is taken from there.",
+        ),
+    ] = None,
+    pixy: Annotated[
+        bool, typer.Option("--pixy", help="Whole pixels of the middle of the blob's box, as a Pixy2 tells.")
+    ] = False,
+    diameter: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LENGTH",
+            help="Of the marker, as 12mm: gives the disc's centre in the rig's plane.",
+        ),
+    ] = None,
+    duration: Annotated[
+        str | None, typer.Option(metavar="TIME", help="How long, such as 20s; a camera else until Ctrl-C.")
+    ] = None,
+    rig: RigOption = Path("rig.yaml"),
+    as_json: JsonOption = False,
+) -> None:
+    """Make a log of a coloured disc from a video or a camera: its centre below a pixel, and how sure that is.
+
+    A frame in which the marker is not seen, or not told apart from another disc, has no row. Exits 1 when
+    fewer than 90 of 100 frames have one.
+    """
+    import numpy as np
+
+    from calib.core.files import shown
+    from calib.core.units import parse_duration_s, parse_length_m, parse_pixel
+    from calib.core.writing import Kind, check_writable, column_names, write_atomically
+    from calib.io.frames import timed_frames
+    from calib.stages.camera.marker import Colour, Tracker, colour_at, parse_colour, scatter_px
+
+    kind = Kind("a track", (".csv",), lambda path: ",".join(column_names(path)) == _HEAD)
+    start = None if at is None else parse_pixel(at, "--at")
+    limit_s = None if duration is None else parse_duration_s(duration, "--duration")
+    wanted = None if colour is None else parse_colour(colour)
+    if pixy and diameter is not None:
+        raise UsageError("--diameter: does not go with --pixy, which tells the middle of the blob's box")
+    centre = None if diameter is None else _to_disc(parse_length_m(diameter, "--diameter"), rig)
+    where = int(source) if source.isdecimal() else source if "://" in source else Path(source)
+    check_writable(output, kind)
+    times, frames = timed_frames(where)
+    if times.arrival and output.is_file() and output.stat().st_size:
+        raise BadInputError(
+            f"{shown(output)}: is there, and a recording cannot be made again; give another name, or move it"
+        )
+    if times.arrival and limit_s is None:
+        narrate("following the marker; Ctrl-C ends it")
+    tracker: Tracker | None = None
+    found: list[Disc | None] = []
+    try:
+        with progress_bar("following the marker") as progress:
+            for frame in frames:
+                if limit_s is not None and times.stamps_s[-1] - times.stamps_s[0] > limit_s:
+                    times.stamps_s.pop()
+                    break
+                if tracker is None:
+                    learnt: Colour | None = wanted
+                    if learnt is None:
+                        learnt = parse_colour("orange") if start is None else colour_at(frame, start)
+                    if learnt is None:
+                        raise BadInputError(
+                            f"{shown(source)}: there is no colour at {at} of the first frame, expected the "
+                            "marker"
+                        )
+                    tracker = Tracker(learnt, start)
+                found.append(tracker.follow(frame))
+                if start is not None and found[0] is None:
+                    raise BadInputError(
+                        f"{shown(source)}: no disc of its colour is at {at} of the first frame, expected the "
+                        "marker"
+                    )
+                progress(len(found), 0)
+    except KeyboardInterrupt:
+        if not times.arrival:
+            raise
+    seen = sum(one is not None for one in found)
+    if tracker is None or not seen:
+        raise BadInputError(f"{shown(source)}: {_why(tracker, start is not None)}")
+    nowhere = np.full(2, np.nan)
+    usual = float(np.median([one.sigma_px for one in found if one is not None]))
+    scatter = scatter_px(np.array([nowhere if one is None else one.centre_px for one in found]))
+    factor = max(1.0, scatter / usual) if np.isfinite(scatter) else 1.0
+    rows, sigmas = [_HEAD], []
+    for t_s, one in zip(times.settled_s(), found, strict=False):
+        if one is None:
+            continue
+        u, v = one.pixy_px() if pixy else one.centre_px if centre is None else centre(one.centre_px)
+        # A whole pixel is off by up to half of one, evenly.
+        sigma = 12**-0.5 if pixy else factor * one.sigma_px
+        sigmas.append(sigma)
+        rows.append(f"{t_s:.6f},{u:.{0 if pixy else 3}f},{v:.{0 if pixy else 3}f},{sigma:.3f}")
+    write_atomically(output, "\n".join(rows) + "\n", kind)
+    told: dict[str, Any] = {
+        "frames": len(found),
+        "found": seen,
+        "lost": tracker.lost,
+        "doubled": tracker.doubled,
+        "sigma_px": sorted(sigmas)[len(sigmas) // 2],
+        "times": times.words(),
+    }
+    if as_json:
+        document("track", {"track": told})
+    else:
+        say(f"marker in {seen} of {len(found)} frames, written to {shown(output)}; {tracker.lost} lost")
+        if tracker.doubled:
+            say(f"another disc of its colour in {tracker.doubled} frames")
+        say(f"sigma of the centre {told['sigma_px']:.2f} px")
+        say(told["times"])
+    if seen < _GATE * len(found):
+        raise typer.Exit(EXIT_POOR)
+
+
+def _why(tracker: Tracker | None, stated: bool) -> str:
+    if tracker is None:
+        return "holds no frame that can be decoded"
+    if tracker.doubled and not stated:
+        return (
+            f"{tracker.doubled} of {tracker.frames} frames show several discs of this colour; say with --at "
+            "where the marker is in the first frame"
+        )
+    return (
+        f"no disc of hue {tracker.colour.hue_deg:.0f} degrees in any of {tracker.frames} frames; give its "
+        "colour with --colour or --at"
+    )
+
+
+def _to_disc(diameter_m: float, rig: Path) -> Callable[[FloatArray], FloatArray]:
+    """Maps the ellipse's centre to that of the disc in the plane of the rig."""
+    from calib.core.files import shown
+    from calib.core.rig import Rig
+    from calib.stages.camera.marker import disc_centre
+
+    known = Rig.load(rig, missing_ok=True)
+    camera, plane = known.camera, known.plane
+    if camera is None or plane is None:
+        missing = "camera" if camera is None else "plane"
+        verb = "intrinsics" if camera is None else "extrinsics"
+        raise BadInputError(
+            f"{shown(rig)}: has no {missing} yet, which --diameter needs; run calib {verb} first"
+        )
+    return lambda centre: disc_centre(
+        centre,
+        0.5 * diameter_m,
+        lambda pixels: plane.to_world(pixels, camera),
+        lambda places: plane.to_pixels(places, camera),
+    )

@@ -1,0 +1,410 @@
+"""The centre of a coloured disc in a picture, below a pixel.
+
+Found coarsely: pixels of the marker's hue and saturation, joined. Then measured: along rays from the middle,
+each pixel is a mixture of marker and background,
+
+    p = a M + (1 - a) B,    a = (p - B) . (M - B) / |M - B|^2,
+
+with M the colour inside and B the colour outside of that ray, so that light, shadow and what lies beside
+the disc differ as they may. The edge is where a = 1/2, and an ellipse is fitted to the edges, less those that
+do not belong to it. Blur by motion during the exposure is symmetric about its middle, and so is the edge.
+What is no ellipse, too small, or not told apart from another one is lost rather than guessed.
+
+The ellipse's centre is not the image of the disc's centre; `disc_centre` corrects it where camera and plane
+are known.
+"""
+
+from __future__ import annotations
+
+import colorsys
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from calib.core.arrays import AnyArray, BoolArray, FloatArray
+from calib.core.errors import UsageError
+
+COLOURS = {
+    "red": 0.0, "orange": 24.0, "yellow": 55.0, "green": 120.0, "cyan": 185.0, "blue": 220.0, "purple": 280.0,
+    "pink": 330.0,
+}  # fmt: skip
+"""Hues in degrees by their names."""
+
+_HUE_DEG = 16.0
+_LEAST_SATURATION = 0.30
+_SATURATION_SHARE = 0.55
+"""Least saturation over that of the marker."""
+_LEAST_VALUE = 0.12
+_LEAST_PIXELS = 12
+_COARSE_PX = 400
+"""Width from which on the search is done at half the size."""
+_RAYS = 64
+_STEP_PX = 0.5
+_LEAST_RAYS = 0.6
+"""Share of rays that must show an edge on the ellipse."""
+_ROUND = 0.35
+"""Least ratio of the axes."""
+_FAR = 4.0
+"""Distance of an edge from the ellipse, in robust standard deviations, from which on it does not belong."""
+_SURELY_PX = 0.15
+"""Distance within which an edge always belongs."""
+_ROUGH_SHARE = 0.06
+"""Scatter of the edges over the radius above which a blob is no disc."""
+_LIGHT = (np.arange(256) / 255.0) ** 2.2
+"""Light by grey level: mixtures are mixtures of light, and cameras store about its root."""
+_FLOOR_PX = 0.02
+"""What uneven light and blur leave on rendered videos without noise."""
+_LEAST_COLOURED = 0.8
+"""Share of the pixels inside that must have the marker's colour."""
+_JUMP_RADII = 4.0
+"""Radii within which the marker is taken for the same from one frame to the next, where there are two."""
+
+
+@dataclass(frozen=True)
+class Colour:
+    """Hue in degrees and saturation from 0 to 1; None where any saturated colour of the hue will do."""
+
+    hue_deg: float
+    saturation: float | None = None
+
+
+@dataclass(frozen=True)
+class Disc:
+    """One disc in one picture.
+
+    Attributes
+    ----------
+    centre_px : (2,) centre of the ellipse. sigma_px : standard deviation of one coordinate, from the edges.
+    axes_px : (2,) half axes. box_px : left, top, right, bottom of the coloured pixels, inclusive.
+    roughness : scatter of the edges about the ellipse over the radius.
+    """
+
+    centre_px: FloatArray
+    sigma_px: float
+    axes_px: FloatArray
+    box_px: tuple[int, int, int, int]
+    roughness: float
+
+    @property
+    def radius_px(self) -> float:
+        """Geometric mean of the half axes."""
+        return float(np.sqrt(self.axes_px[0] * self.axes_px[1]))
+
+    def pixy_px(self) -> FloatArray:
+        """The centre as a Pixy2 tells it: whole pixels of the middle of the blob's box, the lower of two."""
+        left, top, right, bottom = self.box_px
+        return np.array([(left + right) // 2, (top + bottom) // 2], dtype=np.float64)
+
+
+def parse_colour(text: str) -> Colour:
+    """A colour from its name, #rrggbb, or a hue such as 24deg. Raises `UsageError`."""
+    word = text.strip().lower()
+    if word in COLOURS:
+        return Colour(COLOURS[word])
+    if re.fullmatch(r"#[0-9a-f]{6}", word):
+        hue, saturation, _ = colorsys.rgb_to_hsv(*(int(word[k : k + 2], 16) / 255 for k in (1, 3, 5)))
+        if saturation < _LEAST_SATURATION:
+            raise UsageError(f"--colour: {text} is nearly grey, expected a colour that the background lacks")
+        return Colour(360 * hue, saturation)
+    found = re.fullmatch(r"(\d+(?:\.\d*)?)\s*deg", word)
+    if found and float(found[1]) <= 360:
+        return Colour(float(found[1]))
+    raise UsageError(
+        f"--colour: {text!r} is no colour, expected {', '.join(COLOURS)}, #rrggbb or a hue such as 24deg"
+    )
+
+
+def colour_at(bgr: AnyArray, pixel: tuple[float, float]) -> Colour | None:
+    """The colour around a pixel; None outside of the picture and where it is grey."""
+    u, v = (round(value) for value in pixel)
+    height, width = bgr.shape[:2]
+    if not (0 <= u < width and 0 <= v < height):
+        return None
+    patch = bgr[max(v - 2, 0) : v + 3, max(u - 2, 0) : u + 3].reshape(-1, 3)
+    blue, green, red = (np.median(patch, axis=0) / 255.0).tolist()
+    hue, saturation, _ = colorsys.rgb_to_hsv(red, green, blue)
+    return None if saturation < _LEAST_SATURATION else Colour(360 * hue, saturation)
+
+
+def coloured(bgr: AnyArray, colour: Colour) -> BoolArray:
+    """Pixels (H, W) of a colour."""
+    hsv = cv2.cvtColor(bgr, cv2.COLOR_BGR2HSV)
+    least = _LEAST_SATURATION
+    if colour.saturation is not None:
+        least = max(least, _SATURATION_SHARE * colour.saturation)
+    low, high = colour.hue_deg - _HUE_DEG, colour.hue_deg + _HUE_DEG
+    # OpenCV's hue goes from 0 to 179 in steps of two degrees.
+    parts = [(low, high)]
+    if low < 0:
+        parts = [(0.0, high), (low + 360, 360.0)]
+    elif high > 360:
+        parts = [(low, 360.0), (0.0, high - 360)]
+    mask = np.zeros(bgr.shape[:2], dtype=np.uint8)
+    for a, b in parts:
+        floor = (round(a / 2), round(255 * least), round(255 * _LEAST_VALUE))
+        mask = np.maximum(mask, cv2.inRange(hsv, np.array(floor), np.array((round(b / 2), 255, 255))))
+    return np.asarray(mask > 0)
+
+
+def discs(bgr: AnyArray, colour: Colour) -> list[Disc]:
+    """All discs of a colour in a picture (H, W, 3) of uint8, the largest first."""
+    zoom = 2 if bgr.shape[1] >= _COARSE_PX else 1
+    small = bgr
+    if zoom == 2:
+        height, width = bgr.shape[0] // 2, bgr.shape[1] // 2
+        small = cv2.resize(bgr[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
+    mask = coloured(small, colour).astype(np.uint8)
+    count, _, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    found: list[Disc] = []
+    order = sorted(range(1, count), key=lambda k: -int(stats[k, cv2.CC_STAT_AREA]))
+    for k in order[:8]:
+        left, top, width, height, area = (int(value) for value in stats[k])
+        if area * zoom**2 < _LEAST_PIXELS:
+            break
+        if min(width, height) < _ROUND * max(width, height):
+            continue
+        middle = zoom * np.array([left + 0.5 * width, top + 0.5 * height]) - 0.5
+        radius = 0.5 * zoom * float(np.hypot(width, height) / np.sqrt(2))
+        one = measured(bgr, middle, radius, colour)
+        if one is not None and not any(
+            np.hypot(*(one.centre_px - other.centre_px)) < other.radius_px for other in found
+        ):
+            found.append(one)
+    return found
+
+
+def measured(bgr: AnyArray, middle_px: FloatArray, radius_px: float, colour: Colour) -> Disc | None:
+    """The disc around here, its centre below a pixel; None where there is none.
+
+    Parameters
+    ----------
+    middle_px, radius_px : of the blob, to a few pixels.
+    """
+    centre, radius = middle_px, radius_px
+    ellipse = None
+    for _ in range(2):
+        edges = _edges(bgr, centre, radius)
+        if edges is None:
+            return None
+        ellipse = _ellipse(*edges)
+        if ellipse is None:
+            return None
+        centre, radius = ellipse.centre_px, float(np.sqrt(ellipse.axes_px.prod()))
+    assert ellipse is not None
+    axes = np.sort(ellipse.axes_px)
+    if ellipse.share < _LEAST_RAYS or axes[0] < _ROUND * axes[1]:
+        return None
+    roughness = ellipse.scatter_px / radius
+    if radius < 1.5 or roughness > max(_ROUGH_SHARE, 0.4 / radius):
+        return None
+    box = _box(bgr, ellipse, colour)
+    if box is None:
+        return None
+    return Disc(centre, ellipse.sigma_px, ellipse.axes_px, box, roughness)
+
+
+def _edges(bgr: AnyArray, centre: FloatArray, radius: float) -> tuple[FloatArray, BoolArray] | None:
+    """Points (n, 2) where rays from the centre cross the edge, and which do."""
+    height, width = bgr.shape[:2]
+    reach = 1.6 * radius + 3.0
+    if not (0 <= centre[0] < width and 0 <= centre[1] < height and reach < max(width, height)):
+        return None
+    angle = 2 * np.pi * np.arange(_RAYS) / _RAYS
+    towards = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    r = np.arange(0.0, reach, _STEP_PX)
+    where = (centre + r[:, None] * towards[:, None]).astype(np.float32)
+    colours = cv2.remap(bgr, where[..., 0], where[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    colours = _LIGHT[colours]
+    within = r < 0.5 * radius
+    M = colours[:, within].mean(axis=1)
+    # Light may differ over the disc, and noise is large in few pixels: half of its own, half of all.
+    M = 0.5 * (M + M.mean(axis=0))
+    beyond = r > 1.25 * radius + 1.0
+    B = np.median(colours[:, beyond], axis=1)
+    across = M - B
+    square = (across**2).sum(axis=1)
+    a = ((colours - B[:, None]) * across[:, None]).sum(axis=2) / np.maximum(square, 1e-9)[:, None]
+    # The last crossing of 1/2 from inside, so that a glint within the disc is none.
+    falls = (a[:, :-1] >= 0.5) & (a[:, 1:] < 0.5) & (r[:-1] > 0.3 * radius)
+    there = falls.any(axis=1) & (square > 0.05**2)
+    k = np.where(falls.any(axis=1), np.argmax(falls, axis=1), 0)
+    i = np.arange(_RAYS)
+    share = (a[i, k] - 0.5) / np.maximum(a[i, k] - a[i, k + 1], 1e-9)
+    at = r[k] + _STEP_PX * share
+    points = centre + at[:, None] * towards
+    there &= ((points > 0) & (points < [width - 1, height - 1])).all(axis=1)
+    return points, np.asarray(there)
+
+
+@dataclass(frozen=True)
+class _Ellipse:
+    centre_px: FloatArray
+    axes_px: FloatArray
+    scatter_px: float
+    sigma_px: float
+    share: float
+
+
+def _ellipse(points: FloatArray, there: BoolArray) -> _Ellipse | None:
+    """Fit A x^2 + B x y + C y^2 + D x + E y = 1, weighted so that the residuals are distances (Sampson).
+
+    Edges that are far off leave.
+    """
+    if there.sum() < 0.5 * _RAYS:
+        return None
+    used, weight = there.copy(), np.ones(len(points))
+    origin = points[there].mean(axis=0)
+    scale = float(np.sqrt(np.mean((points[there] - origin) ** 2)))
+    x, y = ((points - origin) / max(scale, 1e-9)).T
+    terms = np.stack([x * x, x * y, y * y, x, y], axis=1)
+    for _ in range(4):
+        A, B, C, D, E = conic = np.linalg.lstsq((terms * weight[:, None])[used], weight[used], rcond=None)[0]
+        slope = np.hypot(2 * A * x + B * y + D, B * x + 2 * C * y + E)
+        weight = 1.0 / np.maximum(slope, 1e-9)
+        left = (terms @ conic - 1.0) * weight * scale
+        spread = 1.4826 * float(np.median(np.abs(left[used])))
+        used = there & (np.abs(left) < max(_FAR * spread, _SURELY_PX))
+        if used.sum() < 0.5 * _RAYS:
+            return None
+    Q = np.array([[A, 0.5 * B], [0.5 * B, C]])
+    values = np.linalg.eigvalsh(Q)
+    if not values[0] > 0.0:
+        return None
+    middle = -0.5 * np.linalg.solve(Q, np.array([D, E]))
+    axes = scale * np.sqrt((1.0 + middle @ Q @ middle) / values)
+    scatter = float(np.sqrt(np.mean(left[used] ** 2)))
+    # Neighbouring rays share pixels: about one independent edge for each pixel of the outline.
+    outline = 2 * np.pi * float(np.sqrt(axes.prod()))
+    independent = min(float(used.sum()), outline)
+    sigma = float(np.hypot(scatter * np.sqrt(2.0 / max(independent - 5.0, 1.0)), _FLOOR_PX))
+    return _Ellipse(origin + scale * middle, axes, scatter, sigma, float(used.mean()))
+
+
+def _box(bgr: AnyArray, ellipse: _Ellipse, colour: Colour) -> tuple[int, int, int, int] | None:
+    """Box of the coloured pixels in and around an ellipse; None where too few inside are."""
+    reach = float(ellipse.axes_px.max()) + 2.0
+    left, top = (max(int(value), 0) for value in np.floor(ellipse.centre_px - reach))
+    right, bottom = (int(value) for value in np.ceil(ellipse.centre_px + reach) + 1)
+    mask = coloured(np.ascontiguousarray(bgr[top:bottom, left:right]), colour)
+    v, u = np.ogrid[: mask.shape[0], : mask.shape[1]]
+    near = np.hypot(u + left - ellipse.centre_px[0], v + top - ellipse.centre_px[1])
+    inside = near < 0.8 * float(ellipse.axes_px.min())
+    if not mask[inside].mean() > _LEAST_COLOURED:
+        return None
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return left + int(columns[0]), top + int(rows[0]), left + int(columns[-1]), top + int(rows[-1])
+
+
+def disc_centre(
+    ellipse_px: FloatArray,
+    radius_m: float,
+    to_world: Callable[[FloatArray], FloatArray],
+    to_pixels: Callable[[FloatArray], FloatArray],
+) -> FloatArray:
+    """Pixels (2,) of the centre of a disc in the plane, from the centre of the ellipse that it shows.
+
+    Parameters
+    ----------
+    radius_m : of the disc.
+    to_world, to_pixels : between pixels (n, 2) and places on the plane (n, 2), metres.
+    """
+    phi = 2 * np.pi * np.arange(_RAYS) / _RAYS
+    rim = radius_m * np.stack([np.cos(phi), np.sin(phi)], axis=1)
+    guess = ellipse_px
+    for _ in range(2):
+        place = to_world(guess[None])[0]
+        fitted = _ellipse(to_pixels(place + rim), np.ones(_RAYS, dtype=np.bool_))
+        if fitted is None:
+            return np.full(2, np.nan)
+        guess = ellipse_px - (fitted.centre_px - to_pixels(place[None])[0])
+    return guess
+
+
+# ----------------------------------------------------------------------
+# Following the marker from frame to frame.
+
+_STENCIL = np.array([-1.0, 3.0, -3.0, 1.0])
+
+
+def scatter_px(centres_px: FloatArray) -> float:
+    """Standard deviation of a coordinate by third differences of a track, which a smooth motion has none of.
+
+    It sees what edges do not tell, as a codec that moves the whole marker. Motion that changes within four
+    frames counts as scatter.
+
+    Parameters
+    ----------
+    centres_px : (n, 2) one for each frame, NaN where it was lost. NaN below 20 runs of four frames.
+    """
+    if len(centres_px) < len(_STENCIL):
+        return float("nan")
+    third = sum(c * centres_px[k : len(centres_px) - 3 + k] for k, c in enumerate(_STENCIL))
+    known = np.asarray(third)[np.isfinite(third).all(axis=1)]
+    if len(known) < 20:
+        return float("nan")
+    return float(1.4826 * np.median(np.abs(known)) / np.linalg.norm(_STENCIL))
+
+
+@dataclass
+class Tracker:
+    """Follows one disc.
+
+    Attributes
+    ----------
+    colour : of the marker; its saturation is learnt from what was found.
+    start_px : where it is in the first frame; None to take the only disc.
+    frames, lost, doubled : frames in all, without the marker, and with another disc of its colour.
+    """
+
+    colour: Colour
+    start_px: tuple[float, float] | None = None
+    frames: int = 0
+    lost: int = 0
+    doubled: int = 0
+    _last: Disc | None = None
+    _step_px: FloatArray = field(default_factory=lambda: np.zeros(2))
+    _since: int = 0
+
+    def follow(self, bgr: AnyArray) -> Disc | None:
+        """The marker in the next frame; None where it is not seen, or not told apart from another."""
+        self.frames += 1
+        self._since += 1
+        found = discs(bgr, self.colour)
+        self.doubled += len(found) > 1
+        one = self._chosen(found)
+        if one is None:
+            self.lost += 1
+            return None
+        if self._last is not None:
+            step = (one.centre_px - self._last.centre_px) / self._since
+            self._step_px = step if self._since == 1 else np.zeros(2)
+        self._last, self._since = one, 0
+        return one
+
+    def _chosen(self, found: list[Disc]) -> Disc | None:
+        if not found:
+            return None
+        if self._last is None:
+            if self.start_px is not None:
+                start = np.array(self.start_px)
+                near = min(found, key=lambda one: float(np.hypot(*(one.centre_px - start))))
+                return near if np.hypot(*(near.centre_px - start)) < 1.5 * near.radius_px else None
+            # Two of a kind cannot be told apart without a person's word.
+            return found[0] if len(found) == 1 else None
+        before = self._last
+        expected = before.centre_px + self._since * self._step_px
+
+        def away(one: Disc) -> float:
+            return float(np.hypot(*(one.centre_px - expected))) / before.radius_px
+
+        alike = [one for one in found if 0.6 < one.radius_px / before.radius_px < 1.6]
+        ranked = sorted(alike, key=away)
+        reach = _JUMP_RADII * min(1 + 0.5 * (self._since - 1), 6.0)
+        if not ranked or away(ranked[0]) > reach:
+            return None
+        if len(ranked) > 1 and away(ranked[1]) < 2 * away(ranked[0]) + 1.0:
+            return None
+        return ranked[0]

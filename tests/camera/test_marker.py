@@ -1,0 +1,184 @@
+"""`calib track`: the centre of a coloured disc in rendered videos, against the truth."""
+
+from __future__ import annotations
+
+import re
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from markervideos import Scene
+
+from calib.cli.main import main
+from calib.core.arrays import AnyArray, FloatArray
+from calib.core.errors import UsageError
+from calib.io.frames import Times
+from calib.io.logs import read_log
+from calib.stages.camera.marker import Tracker, colour_at, disc_centre, discs, parse_colour
+from calib.stages.camera.model import project
+from calib.twin.pictures import CAMERA
+from calib.twin.scene import rotation
+
+
+def written(scene: Scene, path: Path, count: int, codec: str = "MJPG") -> Path:
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), scene.rate_hz, scene.size_px)
+    for _, frame in scene.frames(count):
+        video.write(frame)
+    video.release()
+    return path
+
+
+def ends(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
+    monkeypatch.setattr(sys, "argv", ["calib", "track", *map(str, words)])
+    with pytest.raises(SystemExit) as left:
+        main()
+    return int(left.value.code or 0)
+
+
+@pytest.mark.parametrize(("codec", "name", "rmse_px"), [("MJPG", "m.avi", 0.1), ("mp4v", "m.mp4", 0.2)])
+def test_a_compressed_video(
+    codec: str,
+    name: str,
+    rmse_px: float,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Light that changes, motion blur, noise, and an orange block: 0.1 px, 99 % of the frames, none wrong.
+
+    Where a codec throws most of the picture away, twice as much.
+    """
+    scene, log = Scene(other="block"), tmp_path / "log.csv"
+    assert ends(monkeypatch, written(scene, tmp_path / name, 150, codec), "-o", log) == 0
+    said = capsys.readouterr().out
+    assert "150 of 150" in said and "a frame each 16.67 ms" in said
+    track = read_log(log)
+    u, v = track.columns["u_px"], track.columns["v_px"]
+    off = np.stack([u, v], axis=1) - scene.centre_px(track.t_s)
+    assert len(u) >= 0.99 * 150
+    assert np.sqrt((off**2).sum(axis=1).mean()) < rmse_px
+    assert np.hypot(*off.T).max() < 0.5
+    table = np.loadtxt(log, delimiter=",", skiprows=1)
+    assert 0.7 < (off / table[:, 3:]).std() < 1.4
+
+
+def test_another_disc_is_told_and_not_followed() -> None:
+    scene = Scene(other="disc", noise=2.0)
+    start = scene.centre_px(0.0)
+    tracker, alone = Tracker(parse_colour("orange"), (start[0], start[1])), Tracker(parse_colour("orange"))
+    for t_s, frame in scene.frames(40):
+        one = tracker.follow(frame)
+        assert one is not None and np.hypot(*(one.centre_px - scene.centre_px(t_s))) < 0.2
+        # Without a person's word neither of two is taken.
+        assert alone.follow(frame) is None
+    assert tracker.doubled == alone.doubled == alone.lost == 40 and tracker.lost == 0
+
+
+def test_what_covers_the_marker_makes_it_lost_and_not_wrong() -> None:
+    """It passes over a block of its own colour and comes out of it."""
+    scene, tracker, off = Scene(other="way"), Tracker(parse_colour("orange")), []
+    for t_s, frame in scene.frames(60):
+        one = tracker.follow(frame)
+        if one is not None:
+            off.append(np.hypot(*(one.centre_px - scene.centre_px(t_s))))
+    assert tracker.lost >= 5 and len(off) >= 40
+    assert max(off) < 0.5
+
+
+def test_sixty_frames_a_second_on_one_core() -> None:
+    frames = [frame for _, frame in Scene(other="block").frames(20)]
+    tracker, threads, spent = Tracker(parse_colour("orange")), cv2.getNumThreads(), []
+    cv2.setNumThreads(1)
+    try:
+        for frame in frames:
+            began = time.process_time()
+            assert tracker.follow(frame) is not None
+            spent.append(time.process_time() - began)
+    finally:
+        cv2.setNumThreads(threads)
+    assert np.median(spent) < 1 / 60
+
+
+def test_a_pixy_tells_whole_pixels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, log = Scene(size_px=(316, 208), radius_px=6.0, other="none"), tmp_path / "log.csv"
+    video = written(scene, tmp_path / "m.avi", 40)
+    assert ends(monkeypatch, video, "-o", log, "--pixy", "--colour", "#ff8020") == 0
+    assert all(re.fullmatch(r"[\d.]+,\d+,\d+,0\.289", row) for row in log.read_text().splitlines()[1:])
+    track = read_log(log)
+    off = np.stack([track.columns["u_px"], track.columns["v_px"]], axis=1) - scene.centre_px(track.t_s)
+    assert np.abs(off).max() < 2.0 and np.abs(np.median(off, axis=0)).max() < 0.6
+
+
+def test_the_centre_of_the_ellipse_is_not_that_of_the_disc() -> None:
+    radius_m, place = 0.015, np.array([0.02, 0.01])
+    R, t_m = rotation(0.9, 0.7), np.array([0.0, 0.0, 0.25])
+
+    def to_pixels(places: FloatArray) -> FloatArray:
+        return project(CAMERA, np.c_[places, np.zeros(len(places))] @ R.T + t_m)
+
+    def to_world(pixels: FloatArray) -> FloatArray:
+        from scipy.optimize import fsolve
+
+        return np.array([fsolve(lambda x, p=p: to_pixels(x[None])[0] - p, place) for p in pixels])
+
+    def drawn(at: FloatArray, zoom: int) -> tuple[AnyArray, FloatArray]:
+        phi = np.linspace(0, 2 * np.pi, 720, endpoint=False)
+        rim = to_pixels(at + radius_m * np.stack([np.cos(phi), np.sin(phi)], axis=1))
+        image = np.full((208 * zoom, 316 * zoom, 3), 40, dtype=np.uint8)
+        points = np.round(((rim + 0.5) * zoom - 0.5) * 256).astype(np.int32)
+        cv2.fillPoly(image, [points], (10, 120, 240), cv2.LINE_AA, 8)
+        return image, to_pixels(at[None])[0]
+
+    image, truth = drawn(place, 4)
+    (found,) = discs(image, parse_colour("orange"))
+    ellipse = (found.centre_px + 0.5) / 4 - 0.5
+    centre = disc_centre(ellipse, radius_m, to_world, to_pixels)
+    assert np.hypot(*(ellipse - truth)) > 5 * np.hypot(*(centre - truth))
+    assert np.hypot(*(centre - truth)) < 0.02
+
+
+def test_what_times_are_worth() -> None:
+    assert Times(False, 30.0, [0.0, 0.0, 0.1]).settled_s() == [0.0, 1 / 30, 2 / 30]
+    assert "counted at the 30 Hz" in Times(False, 30.0, [0.0, 0.0, 0.1]).words()
+    assert "(20.00 to 50.00)" in Times(False, 30.0, [0.0, 0.02, 0.07]).words()
+    assert "later than the exposure" in Times(True, 30.0, [5.0, 5.02, 5.04]).words()
+
+
+def test_colours() -> None:
+    assert parse_colour("Orange").hue_deg == parse_colour("24deg").hue_deg == 24
+    assert parse_colour("#ff0000").hue_deg == 0 and parse_colour("#ff0000").saturation == 1
+    for wrong in ("gold-ish", "#777777", "400deg", ""):
+        with pytest.raises(UsageError):
+            parse_colour(wrong)
+    patch = np.zeros((20, 20, 3), dtype=np.uint8)
+    patch[...] = (0, 102, 255)
+    learnt = colour_at(patch, (10, 10))
+    assert learnt is not None and learnt.hue_deg == pytest.approx(24) and colour_at(patch, (30, 3)) is None
+
+
+def test_what_the_command_refuses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    video = written(Scene(other="disc"), tmp_path / "m.avi", 6)
+    for code, words, sentence in (
+        (3, ("m.avi", "--at", "5,5"), "there is no colour at 5,5 of the first frame"),
+        (3, ("m.avi", "--at", "300,300", "--colour", "orange"), "no disc of its colour is at 300,300"),
+        (3, ("m.avi",), "show several discs of this colour; say with --at"),
+        (3, ("m.avi", "--colour", "purple"), "no disc of hue 280 degrees in any of 6 frames"),
+        (3, ("m.avi", "--diameter", "12mm"), "rig.yaml: has no camera yet, which --diameter needs"),
+        (2, ("m.avi", "--diameter", "12mm", "--pixy"), "does not go with --pixy"),
+        (2, ("m.avi", "--colour", "mauve-ish"), "is no colour"),
+        (3, ("nothing.avi",), "nothing.avi: cannot be read"),
+    ):
+        assert ends(monkeypatch, *words, "-o", "log.csv") == code
+        assert sentence in capsys.readouterr().err
+        assert not Path("log.csv").exists()
+    assert ends(monkeypatch, video, "-o", video, "--at", "492,249") == 3
+    assert "expected .csv" in capsys.readouterr().err
+    start = Scene(other="disc").centre_px(0.0)
+    assert ends(monkeypatch, video, "-o", "log.csv", "--at", f"{start[0]:.0f},{start[1]:.0f}", "--json") == 0
+    assert '"doubled": 6' in capsys.readouterr().out
