@@ -24,10 +24,12 @@ from calib.stages.align.solve import (
     Stretch,
     align,
     best_jitter_px,
+    judge,
     pictures_off,
     pieces_of,
     pixel_terms,
     readings_off,
+    repeating,
     response,
     rest_angle,
     solve,
@@ -87,6 +89,24 @@ def test_at_rest_only_the_sum_is_known() -> None:
     assert found.sigma[MOUNT] > math.radians(1.0)
     assert found.rest_angle_sigma < math.radians(0.1)
     assert np.abs(scores(trial, found)).max() < 4.0
+
+
+@pytest.mark.parametrize("way", ["good", "late", "frozen"])
+def test_a_coordinate_that_lags_or_stands_is_not_ok(way: str) -> None:
+    trial = known(SimulatedRig())
+    logs = []
+    for k, (name, options) in enumerate((*MOTIONS, ("elongation", {}))):
+        log = align_log(twin_log(trial.rig, name, options, 70 + k))
+        pixels = log.pixels.copy()
+        if way == "late":
+            pixels[12:, 1] = log.pixels[:-12, 1]
+        elif way == "frozen":
+            pixels[:, 1] = np.median(pixels[:, 1])
+        logs.append(replace(log, pixels=pixels))
+    found = align(logs, prior_settings(trial.view))
+    words = [finding.text for finding in judge(found).findings if finding.severity == "poor"]
+    assert (repeating(found) < 0.1) == (way == "good")
+    assert any(text.startswith("pictures contradict the IMU") for text in words) == (way != "good")
 
 
 def test_outliers_dropouts_and_a_blackout_do_little() -> None:
