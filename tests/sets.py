@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.stages.camera.checks import image_outline
-from calib.stages.camera.model import Board, Camera, View, project, undistort
+from calib.stages.camera.model import FISHEYE, Board, Camera, View, project, undistort
 from calib.stages.camera.pose import fit_pose
 from calib.twin.scene import rotation
 
@@ -56,7 +56,8 @@ def camera_of(
 ) -> Camera:
     """A camera by its horizontal field of view."""
     width, height = size_px
-    focal = 0.5 * width / np.tan(np.radians(field_deg) / 2)
+    half = np.radians(field_deg) / 2
+    focal = 0.5 * width / (half if model == FISHEYE else np.tan(half))
     coefficients = np.zeros(8)
     coefficients[: len(lens)] = lens
     cx, cy = 0.5 * (width - 1) + off_centre_px[0], 0.5 * (height - 1) + off_centre_px[1]
@@ -105,6 +106,9 @@ def _lens(rng: np.random.Generator, model: str, reach: float) -> tuple[float, ..
     """Coefficients of a lens whose corners lie at the undistorted radius `reach`."""
     if model == "pinhole":
         return ()
+    if model == FISHEYE:
+        k1, k2, k3, k4 = rng.uniform(-0.04, 0.04), *rng.uniform(-0.01, 0.01, 2), 0.0
+        return k1, k2, 0.0, 0.0, k3, k4
     k1, k2 = rng.uniform(-0.18, 0.05) / reach**2, rng.uniform(0.0, 0.06) / reach**4
     if model == "radial2":
         return k1, k2
@@ -131,7 +135,8 @@ def good_set(seed: int, model: str, count: int | None = None) -> tuple[list[View
     """A seeded set that deserves to be blessed: any camera, board, noise, disturbed in half of the cases."""
     rng = np.random.default_rng([seed, 20])
     size = SIZES[rng.integers(len(SIZES))]
-    field = rng.uniform(35, 75) if model in ("pinhole", "radial2") else rng.uniform(50, 100)
+    fields = {"pinhole": (35.0, 75.0), "radial2": (35.0, 75.0), FISHEYE: (100.0, 150.0)}
+    field = rng.uniform(*fields.get(model, (50.0, 100.0)))
     while True:
         lens = _lens(rng, model, 1.25 * np.tan(np.radians(field / 2)))
         off = tuple(rng.normal(0.0, 0.012, 2) * size[0])

@@ -67,7 +67,8 @@ Progress = Callable[[int, int], None]
 def _is_nominal(view: View) -> bool:
     ours, theirs = view.camera, CAMERA
     return bool(
-        ours.image_size_px == theirs.image_size_px
+        ours.fisheye == theirs.fisheye
+        and ours.image_size_px == theirs.image_size_px
         and np.array_equal(ours.K, theirs.K)
         and np.array_equal(ours.distortion, theirs.distortion)
         and np.array_equal(view.R_CW, PLANE.R_CW)

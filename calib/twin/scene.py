@@ -263,11 +263,11 @@ class _Plan:
 
 @lru_cache(maxsize=8)
 def _rays_of(
-    size_px: tuple[int, int], K: tuple[float, ...], distortion: tuple[float, ...], pad_px: int
+    model: str, size_px: tuple[int, int], K: tuple[float, ...], distortion: tuple[float, ...], pad_px: int
 ) -> FloatArray:
     width, height = size_px
     fx, fy, skew, cx, cy = K
-    camera = Camera("rational8", size_px, fx, fy, skew, cx, cy, np.array(distortion))
+    camera = Camera(model, size_px, fx, fy, skew, cx, cy, np.array(distortion))
     v, u = np.mgrid[-pad_px : height + pad_px, -pad_px : width + pad_px].astype(np.float64)
     rays = undistort(camera, np.stack([u, v], axis=-1))
     rays.setflags(write=False)
@@ -277,7 +277,8 @@ def _rays_of(
 def _rays(camera: Camera, pad_px: int) -> FloatArray:
     """Normalised coordinates of the pixels' centres with a border of `pad_px`, kept per camera."""
     K = (camera.fx_px, camera.fy_px, camera.skew_px, camera.cx_px, camera.cy_px)
-    return _rays_of(camera.image_size_px, tuple(map(float, K)), tuple(map(float, camera.distortion)), pad_px)
+    distortion = tuple(map(float, camera.distortion))
+    return _rays_of(camera.model, camera.image_size_px, tuple(map(float, K)), distortion, pad_px)
 
 
 def _plan(sensor: Sensor) -> _Plan:

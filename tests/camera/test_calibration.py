@@ -52,15 +52,19 @@ from calib.stages.camera.intrinsics import (
 )
 from calib.stages.camera.model import (
     COEFFICIENTS,
+    FISHEYE,
     INTRINSICS,
     MODELS,
     Block,
     Camera,
     Observations,
     View,
+    fold_angle,
     free_intrinsics,
     jacobian,
     pack,
+    project,
+    rays,
     undistort,
     vector_from_camera,
 )
@@ -249,7 +253,7 @@ def _shifted(
         R[view] = rotation_exp(delta)[0] @ R[view]
     else:
         t[view, row - G - 3] += step
-    return Block(intrinsics, R, t, deformation)
+    return replace(block, intrinsics=intrinsics, R_CT=R, t_CT_m=t, deformation=deformation)
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -260,7 +264,7 @@ def test_gradients_agree_with_finite_differences(model: str, kind: str, seed: in
     observations = _observations()
     basis = board_basis(observations.target_m[0], kind)
     free = free_intrinsics(model, skew=True)
-    block = _block(seed, 0 if basis is None else len(basis))
+    block = replace(_block(seed, 0 if basis is None else len(basis)), fisheye=model == FISHEYE)
     J = jacobian(block, observations, free, basis)
     assert J is not None
     for row in range(J.shape[1] - 1):
@@ -477,7 +481,7 @@ def test_a_skew_is_chosen_where_the_views_show_one(skew_px: float, roll_deg: flo
     assert LensModel.of(found.calibration) == LensModel("radial2", skew_px != 0.0)
     assert found.calibration.camera.skew_px == pytest.approx(skew_px, abs=0.3)
     assert [one.name for one in found.models if one.lens.skew] == (
-        [f"{name}, skew" for name in MODELS] if skew_px else []
+        [f"{name}, skew" for name in MODELS if name != FISHEYE] if skew_px else []
     )
     never = calibrate_camera(views, (640, 480), Choices(skew=False))
     assert never.calibration.camera.skew_px == 0.0
@@ -690,3 +694,119 @@ def test_bow_is_measured(bow_m: float) -> None:
     assert found.bow_significance > 4
     assert found.size_m == pytest.approx(0.12)
     assert found.rms_drop > 0.05
+
+
+# ----------------------------------------------------------------------
+# The fisheye lens.
+
+WIDE = Camera(
+    FISHEYE, (748, 480), 250.0, 252.0, 0.8, 370.0, 241.0, np.array([0.03, -0.01, 0, 0, 0.004, -0.001, 0, 0])
+)
+
+
+def _directions(count: int, most_deg: float, seed: int = 0) -> np.ndarray:
+    """Directions (count, 3) evenly over angles from the axis, the axis itself among them."""
+    theta = np.linspace(0.0, np.radians(most_deg), count)
+    around = np.random.default_rng(seed).uniform(0.0, 2 * np.pi, count)
+    return np.stack([np.sin(theta) * np.cos(around), np.sin(theta) * np.sin(around), np.cos(theta)], axis=1)
+
+
+def test_a_fisheye_lens_is_opencvs() -> None:
+    points = _directions(2000, 89.0) * 0.3
+    lens = WIDE.distortion[[0, 1, 4, 5]]
+    told, _ = cv2.fisheye.projectPoints(
+        points[:, None], np.zeros(3), np.zeros(3), WIDE.K, lens, alpha=WIDE.skew_px / WIDE.fx_px
+    )
+    np.testing.assert_allclose(project(WIDE, points), told[:, 0], atol=1e-10)
+
+
+def test_a_fisheye_lens_is_undone_as_far_as_its_curve_rises() -> None:
+    directions = _directions(3000, 114.0)
+    last, most = fold_angle(WIDE)
+    assert np.radians(114.0) < last < np.radians(120.0)
+    np.testing.assert_allclose(rays(WIDE, project(WIDE, directions)), directions, atol=1e-13)
+    beyond = np.array([[WIDE.cx_px + 1.001 * most * WIDE.fx_px, WIDE.cy_px]])
+    assert np.isnan(rays(WIDE, beyond)).all()
+    ahead = directions[:, 2] > 1e-3
+    found = undistort(WIDE, project(WIDE, directions))
+    np.testing.assert_allclose(
+        found[ahead], directions[ahead, :2] / directions[ahead, 2:], rtol=1e-9, atol=1e-12
+    )
+    assert np.isnan(found[directions[:, 2] < -1e-12]).all()
+
+
+def test_gradients_of_a_fisheye_lens_agree_with_finite_differences_beside_and_behind_the_camera() -> None:
+    points = _directions(40, 114.0) * 0.3
+    everything = np.arange(len(INTRINSICS))
+    views = Observations(("",), points[None], np.zeros((1, 40, 2)), np.ones((1, 40), dtype=np.bool_))
+    here = Block(vector_from_camera(WIDE), np.eye(3)[None], np.zeros((1, 3)), np.zeros(0), fisheye=True)
+    J = jacobian(here, views, everything, None)
+    assert J is not None
+    for row in range(len(INTRINSICS) + 6):
+        step = 1e-3 if row < 5 else 1e-7
+        ahead, behind = (
+            jacobian(_shifted(here, everything, row, 0, sign * step, None), views, everything, None)
+            for sign in (1.0, -1.0)
+        )
+        assert ahead is not None and behind is not None
+        numeric = (ahead[0, -1] - behind[0, -1]) / (2 * step)
+        np.testing.assert_allclose(J[0, row], numeric, atol=1e-6 * (1.0 + np.abs(numeric).max()))
+    straight_behind = replace(views, target_m=views.target_m * [0.01, 0.01, -1.0])
+    assert jacobian(here, straight_behind, everything, None) is None
+
+
+def _of_150_degrees(seed: int, noise_px: float = 0.1, skew_px: float = 0.0, count: int = 12) -> list[View]:
+    camera = replace(
+        camera_of((748, 480), 150.0, (0.03, -0.01, 0.0, 0.0, 0.004, -0.001), FISHEYE), skew_px=skew_px
+    )
+    return take(np.random.default_rng(seed), camera, count, recipe=Recipe(noise_px=noise_px, spread=0.45))
+
+
+@pytest.mark.parametrize("skew_px", [0.0, 1.5])
+def test_a_lens_of_150_degrees_is_recovered_from_exact_views(skew_px: float) -> None:
+    views = _of_150_degrees(3, 0.0, skew_px)
+    fit = calibrate(pack(views), (748, 480), FISHEYE, skew=skew_px != 0.0)
+    truth = camera_of((748, 480), 150.0, (0.03, -0.01, 0.0, 0.0, 0.004, -0.001), FISHEYE)
+    assert fit.converged
+    assert fit.rms_px < 1e-7
+    assert fit.camera.skew_px == pytest.approx(skew_px, abs=1e-5)
+    np.testing.assert_allclose(fit.camera.K[:2, 2], truth.K[:2, 2], atol=1e-4)
+    np.testing.assert_allclose(fit.camera.distortion, truth.distortion, atol=1e-5)
+
+
+def test_sigma_covers_a_lens_of_150_degrees() -> None:
+    truth = camera_of((748, 480), 150.0, (0.03, -0.01, 0.0, 0.0, 0.004, -0.001), FISHEYE)
+    exact = _of_150_degrees(5, 0.0)
+    rng = np.random.default_rng(6)
+    z = []
+    for _ in range(100):
+        views = [replace(v, pixels=v.pixels + 0.1 * rng.standard_normal(v.pixels.shape)) for v in exact]
+        fit = calibrate(pack(views), (748, 480), FISHEYE)
+        off = (vector_from_camera(fit.camera) - vector_from_camera(truth))[fit.free]
+        # Directions that are independent of each other.
+        z.append(np.linalg.solve(np.linalg.cholesky(covariance(fit).intrinsics), off))
+    assert 0.93 < np.mean(np.abs(z) < 2.0) < 0.97
+    assert np.std(z) == pytest.approx(1.0, abs=0.07)
+
+
+def test_a_fisheye_set_is_fitted_as_opencv_does_and_its_lens_is_chosen(shared_data: Path) -> None:
+    views = read_views([outside(shared_data / "ocam_fish2")], Told())
+    fit = calibrate(pack(views.views), views.image_size_px, FISHEYE)
+    counted = [view.counted() for view in views.views]
+    boards = [np.column_stack([target, np.zeros(len(target))])[None] for target, _ in counted]
+    rms, K, lens, *_ = cv2.fisheye.calibrate(
+        boards,
+        [pixels[None] for _, pixels in counted],
+        views.image_size_px,
+        np.zeros((3, 3)),
+        np.zeros((4, 1)),
+        flags=cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW,
+        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 500, 1e-12),
+    )
+    assert fit.converged
+    assert fit.rms_px <= rms * (1 + 1e-9)
+    np.testing.assert_allclose(fit.camera.K, K, atol=1e-4)
+    np.testing.assert_allclose(fit.camera.distortion[[0, 1, 4, 5]], lens[:, 0], atol=1e-5)
+    found = calibrate_camera(views.views, views.image_size_px)
+    assert found.calibration.camera.model == FISHEYE
+    assert found.judgement.verdict.word == "ok"

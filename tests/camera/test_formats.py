@@ -7,6 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -56,7 +57,7 @@ def test_ros_and_opencv_round_trips_are_exact(model: str, skew_px: float) -> Non
     assert same(from_opencv(to_opencv(camera)), camera)
 
 
-@pytest.mark.parametrize("model", ["pinhole", "radial2"])
+@pytest.mark.parametrize("model", ["pinhole", "radial2", "fisheye4"])
 def test_kalibr_round_trips_are_exact(model: str) -> None:
     camera = camera_of(model)
     assert same(from_kalibr(to_kalibr(camera)), camera)
@@ -79,6 +80,26 @@ def test_opencv_reads_its_file_and_projects_the_same() -> None:
     assert np.array_equal(storage.getNode("camera_matrix").mat(), camera.K)
     assert np.array_equal(storage.getNode("distortion_coefficients").mat().ravel(), camera.distortion[:5])
     assert int(storage.getNode("image_width").real()) == 316
+
+
+def test_a_fisheye_lens_is_named_and_has_four_coefficients() -> None:
+    camera = camera_of("fisheye4", 0.7)
+    lens = [VALUES[name] for name in ("k1", "k2", "k3", "k4")]
+    storage = cv2.FileStorage(to_opencv(camera), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+    assert int(storage.getNode("fisheye_model").real()) == 1
+    assert storage.getNode("distortion_coefficients").mat().ravel().tolist() == lens
+    told = yaml.safe_load(to_ros(camera))
+    assert told["distortion_model"] == "equidistant"
+    assert told["distortion_coefficients"]["data"] == lens
+    told = yaml.safe_load(to_kalibr(replace(camera, skew_px=0.0)))["cam0"]
+    assert (told["camera_model"], told["distortion_model"]) == ("pinhole", "equidistant")
+    assert told["distortion_coeffs"] == lens
+    with pytest.raises(BadInputError, match="fisheye_model is 2, expected 0 or 1"):
+        from_opencv(to_opencv(camera).replace("fisheye_model: 1", "fisheye_model: 2"))
+    with pytest.raises(BadInputError, match="has 5 numbers, expected 4 of a fisheye lens"):
+        from_opencv(
+            to_opencv(camera_of("brown5")).replace("camera_matrix", "fisheye_model: 1\ncamera_matrix")
+        )
 
 
 @pytest.mark.parametrize(
@@ -184,7 +205,7 @@ def test_wrong_opencv_files_are_refused_by_key(old: str, new: str, words: str) -
     ("old", "new", "words"),
     [
         ("cam0:", "cam1:", "cam0 is missing from the camchain, which has cam1"),
-        ("radtan", "equidistant", "cam0.distortion_model is 'equidistant', expected radtan or none"),
+        ("radtan", "fov", "cam0.distortion_model is 'fov', expected radtan, equidistant or none"),
         ("intrinsics: [", "intrinsics: [one, ", "cam0.intrinsics has 5 numbers, expected 4"),
         ("intrinsics:", "intrinsic:", "cam0.intrinsics is missing"),
     ],

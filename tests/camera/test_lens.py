@@ -12,7 +12,6 @@ from calib.stages.camera.lens import (
     PlaneView,
     analyse_distortion,
     displacement_field,
-    distorted_normalised,
     distortion_kind,
     fit_inverse,
     pixel_grid,
@@ -24,6 +23,7 @@ from calib.stages.camera.model import (
     Camera,
     camera_from_vector,
     distort,
+    distorted_normalised,
     fold_radius,
     one_to_one_reach,
     project,
@@ -187,6 +187,16 @@ CAMERAS = {
         2010.0,
         1480.0,
         np.array([-0.2, 0.09, 5e-4, -4e-4, 0, 0, 0, 0]),
+    ),
+    "fisheye": Camera(
+        "fisheye4",
+        (640, 480),
+        330.0,
+        332.0,
+        0.5,
+        322.0,
+        236.0,
+        np.array([0.03, -0.01, 0, 0, 4e-3, -1e-3, 0, 0]),
     ),
     "decentering alone": Camera(
         "brown5", (640, 480), 530.0, 541.0, 0.0, 322.0, 236.0, np.array([0, 0, 2e-3, 1e-3, 0, 0, 0, 0])

@@ -22,6 +22,7 @@ from calib.core.arrays import FloatArray
 from calib.core.rig import Rig
 from calib.io.signals import Watch
 from calib.stages.actuator.kinematics import forward as forward_of_sensors
+from calib.stages.camera.model import Camera
 from calib.stages.estimator import reference, sensors, smoother
 from calib.stages.estimator.baseline import Baseline, BaselineSetup
 from calib.stages.estimator.consistency import Tally, chi_square_band, nees
@@ -556,9 +557,9 @@ MIDDLE_SENSORS = np.zeros(19)
 MIDDLE_SENSORS[1], MIDDLE_SENSORS[11], MIDDLE_SENSORS[12] = 0.07, 0.006, 0.015
 
 
-def view() -> FloatArray:
+def view(camera: Camera | None = None) -> FloatArray:
     seen = nominal_view()
-    return sensors.view_coefficients(seen.camera, seen.R_CW, seen.t_CW_m)
+    return sensors.view_coefficients(camera or seen.camera, seen.R_CW, seen.t_CW_m)
 
 
 def states(count: int) -> FloatArray:
@@ -569,33 +570,41 @@ def states(count: int) -> FloatArray:
     return np.asarray(out)
 
 
-def readings(state: FloatArray) -> tuple[FloatArray, FloatArray]:
+def readings(state: FloatArray, camera: Camera | None = None) -> tuple[FloatArray, FloatArray]:
     """All five readings (5,) and their gradients (5, 19)."""
     by = np.empty((5, 19))
-    u, v = sensors.marker(view(), state, by[0], by[1])
+    u, v = sensors.marker(view(camera), state, by[0], by[1])
     ax, ay = sensors.accelerometer(9.81, 0.002, state, by[2], by[3])
     return np.array([u, v, ax, ay, sensors.gyroscope(state, by[4])]), by
 
 
-def test_gradients_agree_with_differences() -> None:
+FISHEYE = Camera(
+    "fisheye4", (316, 208), 150.0, 151.0, 0.6, 157.0, 104.0, np.array([0.03, -0.01, 0, 0, 4e-3, -1e-3, 0, 0])
+)
+
+
+@pytest.mark.parametrize("camera", [None, FISHEYE], ids=["radial2", "fisheye4"])
+def test_gradients_agree_with_differences(camera: Camera | None) -> None:
     for state in states(60):
-        _, by = readings(state)
+        _, by = readings(state, camera)
         for k in range(19):
             h = 1e-4 * SPREAD[k]
             step = h * (np.arange(19) == k)
-            low2, low, high, high2 = (readings(state + a * step)[0] for a in (-2.0, -1.0, 1.0, 2.0))
+            low2, low, high, high2 = (readings(state + a * step, camera)[0] for a in (-2.0, -1.0, 1.0, 2.0))
             difference = (low2 - high2 + 8.0 * (high - low)) / (12.0 * h)
             np.testing.assert_allclose(by[:, k], difference, rtol=1e-6, atol=1e-6 * np.abs(by).max())
 
 
-def test_marker_agrees_with_the_simulated_camera() -> None:
+@pytest.mark.parametrize("camera", [None, FISHEYE], ids=["radial2", "fisheye4"])
+def test_marker_agrees_with_the_simulated_camera(camera: Camera | None) -> None:
+    seen = nominal_view() if camera is None else replace(nominal_view(), camera=camera)
     rows = states(40)
     rows[:, 13:] = 0.0
     rows[:, 12] = 0.015
     r = 0.0126
     q = np.stack([rows[:, 1] + r * rows[:, 0], rows[:, 1] - r * rows[:, 0]], axis=1)
-    pixels, _ = sensors.marker_rows(view(), rows)
-    np.testing.assert_allclose(pixels, marker_pixels(nominal_view(), Tracker(), q, r), rtol=0, atol=1e-9)
+    pixels, _ = sensors.marker_rows(view(camera), rows)
+    np.testing.assert_allclose(pixels, marker_pixels(seen, Tracker(), q, r), rtol=0, atol=1e-9)
     for row, pose in zip(rows, forward_of_sensors(q, r), strict=True):
         np.testing.assert_allclose(sensors.head_position(row[0], row[1]), pose[:2], atol=1e-15)
 

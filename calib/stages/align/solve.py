@@ -179,7 +179,7 @@ class Problem:
 
     Attributes
     ----------
-    view : (24,) of `sensors.view_coefficients`. gravity_mps2, across_m : g and c_n.
+    view : (25,) of `sensors.view_coefficients`. gravity_mps2, across_m : g and c_n.
     grid_px : step of the pixels, 0 for none. area_px2 : over which outliers lie.
     mean, sigma : (13,) prior of `SENSOR`.
     """
@@ -893,7 +893,7 @@ class Settings:
 
     Attributes
     ----------
-    view : (24,) of `sensors.view_coefficients`.
+    view : (25,) of `sensors.view_coefficients`.
     mean, sigma : (13,) prior of `SENSOR`. The mount angle's mean is replaced by a first guess.
     grid_px : step of the pixels. gyro_walk, accel_walk : densities K of the biases' walk.
     """

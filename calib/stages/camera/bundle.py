@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calib.core.arrays import FloatArray, IntArray
 from calib.stages.camera.model import (
+    FISHEYE,
     INTRINSICS,
     Block,
     Camera,
@@ -15,6 +16,7 @@ from calib.stages.camera.model import (
     camera_from_vector,
     free_intrinsics,
     jacobian,
+    rays,
     undistort,
     vector_from_camera,
 )
@@ -83,11 +85,12 @@ class Minimum:
 def _moved(block: Block, free: IntArray, shared: FloatArray, poses: FloatArray) -> Block:
     intrinsics = block.intrinsics.copy()
     intrinsics[free] += shared[: len(free)]
-    return Block(
-        intrinsics,
-        rotation_exp(poses[:, :3]) @ block.R_CT,
-        block.t_CT_m + poses[:, 3:],
-        block.deformation + shared[len(free) :],
+    return replace(
+        block,
+        intrinsics=intrinsics,
+        R_CT=rotation_exp(poses[:, :3]) @ block.R_CT,
+        t_CT_m=block.t_CT_m + poses[:, 3:],
+        deformation=block.deformation + shared[len(free) :],
     )
 
 
@@ -393,7 +396,9 @@ def poses_with_camera(camera: Camera, observations: Observations) -> tuple[Float
     seen = Observations(
         observations.names, observations.target_m, np.nan_to_num(ideal), usable | ~enough[:, None]
     )
-    R_CT, t_CT_m = poses_from_homographies(np.eye(3), homographies(seen))
+    # Points that a wrong lens puts at random have no pose; callers look for what is not finite.
+    with np.errstate(all="ignore"):
+        R_CT, t_CT_m = poses_from_homographies(np.eye(3), homographies(seen))
     R_CT[~enough], t_CT_m[~enough] = np.nan, np.nan
     return R_CT, t_CT_m
 
@@ -561,20 +566,54 @@ def starting_block(
     return start
 
 
-def equidistant_start(observations: Observations, image_size_px: tuple[int, int], focal_px: float) -> Block:
+_ANGLES_AS_LENGTHS = {
+    "rational8": {"k1": 7 / 9, "k2": 64 / 945, "k4": 10 / 9, "k5": 5 / 21},
+    "fisheye4": {},
+}
+"""Coefficients of a lens that shows angles as lengths: of the rational model the Pade approximant
+atan(r) / r = (1 + 7/9 r2 + 64/945 r2^2) / (1 + 10/9 r2 + 5/21 r2^2), right to a percent up to 60 degrees."""
+_WIDE_STARTS = np.geomspace(0.15, 1.5, 12)
+"""Focal lengths to begin a fisheye lens with, over the picture's larger side; 1 / pi shows half a sphere."""
+_TRIED_ITERATIONS = 12
+
+
+def equidistant_start(
+    observations: Observations,
+    image_size_px: tuple[int, int],
+    focal_px: float,
+    model: str = "rational8",
+    centre_px: tuple[float, float] | None = None,
+) -> Block:
     """A lens that shows angles as lengths, as wide ones nearly do, and the poses of the views it then has.
 
-    The rational model's atan(r) / r = (1 + 7/9 r2 + 64/945 r2^2) / (1 + 10/9 r2 + 5/21 r2^2) (Pade) is right
-    to a percent up to 60 degrees from the axis. Poses are NaN where it cannot show a view.
+    Poses are NaN where it cannot show a view.
+
+    Parameters
+    ----------
+    model : "rational8" or "fisheye4".
+    centre_px : principal point, the picture's centre by default.
     """
     width, height = image_size_px
     intrinsics = np.zeros(len(INTRINSICS))
-    intrinsics[:4] = focal_px, focal_px, 0.5 * (width - 1), 0.5 * (height - 1)
-    for name, value in (("k1", 7 / 9), ("k2", 64 / 945), ("k4", 10 / 9), ("k5", 5 / 21)):
+    intrinsics[:2] = focal_px
+    intrinsics[2:4] = centre_px or (0.5 * (width - 1), 0.5 * (height - 1))
+    for name, value in _ANGLES_AS_LENGTHS[model].items():
         intrinsics[INTRINSICS.index(name)] = value
-    camera = camera_from_vector("rational8", image_size_px, intrinsics)
+    camera = camera_from_vector(model, image_size_px, intrinsics)
     R_CT, t_CT_m = poses_with_camera(camera, observations)
-    return Block(intrinsics, R_CT, t_CT_m, np.zeros(0))
+    return Block(intrinsics, R_CT, t_CT_m, np.zeros(0), camera.fisheye)
+
+
+def _fisheye_start(observations: Observations, image_size_px: tuple[int, int], free: IntArray) -> Block:
+    """A start for a fisheye lens: the best of several focal lengths after a few steps."""
+    size = max(image_size_px)
+    starts = [equidistant_start(observations, image_size_px, share * size, FISHEYE) for share in _WIDE_STARTS]
+    starts = [start for start in starts if np.all(np.isfinite(start.t_CT_m))]
+    tried = [minimise(start, observations, free, max_iterations=_TRIED_ITERATIONS) for start in starts]
+    ends = [one for one in tried if one.at is not None]
+    if not ends:
+        return replace(starting_block(observations, image_size_px, skew=False), fisheye=True)
+    return min(ends, key=lambda one: np.inf if one.at is None else one.at.cost).block
 
 
 def calibrate(
@@ -599,16 +638,21 @@ def calibrate(
     fixed : names of intrinsics held at the start's values.
     basis : (K, 3, M) deformation of the target, which then has to be the same in all views.
     loss : one of `levenberg.LOSSES`; its scale is the median of the plain fit's residuals.
-    start : where to start; Zhang's closed form by default.
+    start : where to start; Zhang's closed form by default, for a fisheye lens the best of several focal
+        lengths. The start of another kind of lens is not used.
     tolerance : see `minimise`.
     """
     free = free_intrinsics(model, skew, fixed)
-    if start is None:
-        start = starting_block(observations, image_size_px, skew, free)
-    if basis is not None and len(start.deformation) != len(basis):
-        start = Block(start.intrinsics, start.R_CT, start.t_CT_m, np.zeros(len(basis)))
-    if basis is None and len(start.deformation):
-        start = Block(start.intrinsics, start.R_CT, start.t_CT_m, np.zeros(0))
+    if start is None or start.fisheye != (model == FISHEYE):
+        # A lens of angles and one of ratios have nothing but poses in common.
+        start = (
+            _fisheye_start(observations, image_size_px, free)
+            if model == FISHEYE
+            else starting_block(observations, image_size_px, skew, free)
+        )
+    deformations = 0 if basis is None else len(basis)
+    if len(start.deformation) != deformations:
+        start = replace(start, deformation=np.zeros(deformations))
     found = minimise(start, observations, free, basis, max_iterations=max_iterations, tolerance=tolerance)
     evaluations, scale_px = found.evaluations, 1.0
     if loss != "none":
@@ -659,7 +703,13 @@ def refit_poses(calibration: Calibration, observations: Observations) -> FloatAr
     if calibration.basis is not None:
         shape = np.tensordot(calibration.block.deformation, calibration.basis, axes=1)
         seen = seen.displaced(shape.T)
-    start = Block(vector_from_camera(calibration.camera), R_CT[usable], t_CT_m[usable], np.zeros(0))
+    start = Block(
+        vector_from_camera(calibration.camera),
+        R_CT[usable],
+        t_CT_m[usable],
+        np.zeros(0),
+        calibration.camera.fisheye,
+    )
     found = minimise(start, seen, np.zeros(0, dtype=np.int64), tolerance=ENOUGH)
     if found.at is not None:
         residuals[usable] = np.where(seen.present[..., None], found.at.residuals.transpose(0, 2, 1), np.nan)
@@ -786,7 +836,7 @@ def joint_jacobian(calibration: Calibration, points_C: FloatArray) -> FloatArray
     one = Observations(
         names=("",), target_m=points_C[None], pixels=np.zeros((1, n, 2)), present=np.ones((1, n), np.bool_)
     )
-    here = Block(calibration.block.intrinsics, np.eye(3)[None], np.zeros((1, 3)), np.zeros(0))
+    here = replace(calibration.block, R_CT=np.eye(3)[None], t_CT_m=np.zeros((1, 3)), deformation=np.zeros(0))
     J = jacobian(here, one, calibration.free, None)
     if J is None:
         return np.full((n, 2, len(calibration.free) + 6), np.nan)
@@ -805,10 +855,8 @@ def projection_sigma_px(
     ----------
     distance_m : distance of the point that is looked at; the targets' median by default.
     """
-    ideal = undistort(calibration.camera, pixels)
-    rays = np.concatenate([ideal, np.ones((len(ideal), 1))], axis=1)
     distance = found.distance_m if distance_m is None else distance_m
-    points = distance * rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    points = distance * rays(calibration.camera, pixels)
     seen = np.isfinite(points).all(axis=1)
     sigma = np.full(len(pixels), np.nan)
     if not np.all(np.isfinite(found.joint)):

@@ -18,17 +18,23 @@ from calib.stages.camera.bundle import (
     poses_with_camera,
 )
 from calib.stages.camera.model import (
+    FISHEYE,
     INTRINSICS,
     Block,
     Camera,
     Observations,
+    ahead_radius,
+    angle_curve,
     camera_from_vector,
     distort,
+    distorted_normalised,
+    fold_angle,
     fold_radius,
     free_intrinsics,
     jacobian,
     one_to_one_reach,
     project,
+    rays,
     undistort,
 )
 
@@ -220,18 +226,30 @@ def repeated_views(calibration: Calibration, limit_px: float) -> IntArray:
 
 
 def image_outline(camera: Camera, per_side: int = 9) -> FloatArray:
-    """Pixels (4 * (per_side - 1), 2) along the image's border."""
+    """Pixels (4 * (per_side - 1), 2) along the image's border, or nearer where only they show what is ahead.
+
+    The corners of a fisheye lens's picture often show nothing.
+    """
     width, height = camera.image_size_px
     u, v = np.linspace(0, width - 1, per_side), np.linspace(0, height - 1, per_side)
     top = np.stack([u[:-1], np.zeros(per_side - 1)], axis=1)
     right = np.stack([np.full(per_side - 1, width - 1.0), v[:-1]], axis=1)
-    return np.concatenate([top, right, [width - 1, height - 1] - top, [width - 1, height - 1] - right])
+    border = np.concatenate([top, right, [width - 1, height - 1] - top, [width - 1, height - 1] - right])
+    if not camera.fisheye:
+        return border
+    centre = np.array([camera.cx_px, camera.cy_px])
+    radius = np.linalg.norm(distorted_normalised(camera, border), axis=1)
+    # Rounding must not put the last ones beside the camera.
+    share = np.minimum(1.0, (1.0 - 1e-9) * ahead_radius(camera) / radius)
+    return np.asarray(centre + (border - centre) * share[:, None])
 
 
 def lens_shape(calibration: Calibration) -> Lens:
     """Whether the distortion is monotonic over the radii that were seen and over the image."""
     camera, block, observations = calibration.camera, calibration.block, calibration.observations
     points = observations.target_m @ block.R_CT.transpose(0, 2, 1) + block.t_CT_m[:, None]
+    if camera.fisheye:
+        return _fisheye_shape(camera, points[observations.present])
     radii = np.hypot(points[..., 0], points[..., 1]) / np.maximum(points[..., 2], 1e-9)
     seen = float(radii[observations.present].max())
     border = undistort(camera, image_outline(camera))
@@ -241,6 +259,25 @@ def lens_shape(calibration: Calibration) -> Lens:
     return Lens(
         seen_slope=_least_slope(camera, seen),
         image_slope=image_slope if shown.all() else min(image_slope, 0.0),
+        image_shown=float(shown.mean()),
+        reach=one_to_one_reach(camera),
+    )
+
+
+def _fisheye_shape(camera: Camera, points_C: FloatArray) -> Lens:
+    """The same by angles, which go on behind the camera; slopes are those of theta_d."""
+    last, _ = fold_angle(camera)
+
+    def least(theta: float) -> float:
+        slope = float(np.min(angle_curve(np.linspace(0.0, theta, 201), camera.distortion)[1]))
+        return slope if theta < last else min(slope, 0.0)
+
+    seen = float(np.arctan2(np.hypot(points_C[:, 0], points_C[:, 1]), points_C[:, 2]).max())
+    border = np.arccos(rays(camera, image_outline(camera))[:, 2])
+    shown = np.isfinite(border)
+    return Lens(
+        seen_slope=least(seen),
+        image_slope=least(max(seen, float(border[shown].max()) if shown.all() else last)),
         image_shown=float(shown.mean()),
         reach=one_to_one_reach(camera),
     )
@@ -743,6 +780,7 @@ def _departure(bows: FloatArray, shapes: FloatArray) -> float:
 # cost, and the searches would never end.
 
 FOCAL_STARTS = (0.4, 0.7, 1.1, 1.8, 4.0)
+FISHEYE_STARTS = (0.2, 0.3, 0.45, 0.8)
 """Focal lengths of the starts, over the longer side of the image."""
 
 _CHI2_95 = 3.84
@@ -775,7 +813,7 @@ class Start:
 def resolved(calibration: Calibration, index: IntArray) -> Calibration:
     """The calibration from some of its views only, same model and loss, started where it is."""
     camera, block = calibration.camera, calibration.block
-    start = Block(block.intrinsics, block.R_CT[index], block.t_CT_m[index], block.deformation)
+    start = replace(block, R_CT=block.R_CT[index], t_CT_m=block.t_CT_m[index])
     return calibrate(
         calibration.observations.select(index),
         camera.image_size_px,
@@ -803,7 +841,7 @@ def conditioned(calibration: Calibration) -> Calibration:
     """
     loose = [INTRINSICS.index(name) for name in ("k4", "k5", "k6")]
     kept = np.flatnonzero(~np.isin(calibration.free, loose))
-    if len(kept) == len(calibration.free):
+    if calibration.camera.fisheye or len(kept) == len(calibration.free):
         return calibration
     if all(name in calibration.free_names for name in ("k1", "k2", "p1", "p2", "k3")):
         block, camera = calibration.block, calibration.camera
@@ -826,14 +864,17 @@ def conditioned(calibration: Calibration) -> Calibration:
 
 
 def other_starts(calibration: Calibration, seed: int = 0) -> list[Start]:
-    """Minima reached from focal lengths of 0.4 to 4 image widths and principal points about the centre."""
+    """Minima reached from focal lengths of 0.4 to 4 image widths and principal points about the centre.
+
+    A fisheye lens starts from 0.2 to 0.8.
+    """
     rng = np.random.default_rng(seed)
     observations, camera = calibration.observations, calibration.camera
     width, height = camera.image_size_px
     H = homographies(observations)
     free = calibration.free
     ends = []
-    for share in FOCAL_STARTS:
+    for share in FISHEYE_STARTS if camera.fisheye else FOCAL_STARTS:
         focal = share * max(width, height)
         jitter = rng.uniform(-0.08, 0.08, 2) * (width, height)
         guess = calibration.block.intrinsics.copy()
@@ -846,11 +887,13 @@ def other_starts(calibration: Calibration, seed: int = 0) -> list[Start]:
             index = INTRINSICS.index(name)
             if index in free:
                 guess[index] = value
-        K = np.array([[guess[0], guess[4], guess[2]], [0.0, guess[1], guess[3]], [0.0, 0.0, 1.0]])
-        R_CT, t_CT_m = poses_from_homographies(K, H)
+        begin = camera_from_vector(camera.model, camera.image_size_px, guess)
+        R_CT, t_CT_m = (
+            poses_with_camera(begin, observations) if camera.fisheye else poses_from_homographies(begin.K, H)
+        )
         if not (np.all(np.isfinite(R_CT)) and np.all(np.isfinite(t_CT_m))):
             continue
-        start = Block(guess, R_CT, t_CT_m, np.zeros(0))
+        start = Block(guess, R_CT, t_CT_m, np.zeros(0), camera.fisheye)
         found = minimise(start, observations, free, max_iterations=_MAX_ITERATIONS)
         if found.at is not None:
             ends.append(Start(focal, found.block, found.at.cost, found.reason))
@@ -884,7 +927,7 @@ def best_of_starts(calibration: Calibration) -> Calibration:
         R_CT, t_CT_m = poses_with_camera(found, calibration.observations)
         if not (np.all(np.isfinite(R_CT)) and np.all(np.isfinite(t_CT_m))):
             return calibration
-        start = Block(start.intrinsics, R_CT, t_CT_m, np.zeros(0))
+        start = replace(start, R_CT=R_CT, t_CT_m=t_CT_m, deformation=np.zeros(0))
     better = calibrate(
         calibration.observations,
         camera.image_size_px,
@@ -1070,7 +1113,7 @@ class Split:
 def widened(calibration: Calibration) -> Calibration:
     """The same views with k1, k2, p1, p2 and k3 free, where the model is poorer and that helps."""
     camera, fixed = calibration.camera, held(calibration)
-    if camera.model in ("brown5", "rational8") or fixed not in ((), ("skew_px",)):
+    if camera.model in ("brown5", "rational8", FISHEYE) or fixed not in ((), ("skew_px",)):
         return calibration
     rich = calibrate(
         calibration.observations,
@@ -1467,7 +1510,7 @@ def _information(
     """Information (n, G, G) of made-up views of the target about the intrinsics."""
     n, M, P = len(R), len(target), len(calibration.free)
     made = Observations(("",) * n, target[None], np.zeros((n, M, 2)), np.ones((n, M), dtype=np.bool_))
-    block = Block(calibration.block.intrinsics, R, t, np.zeros(0))
+    block = replace(calibration.block, R_CT=R, t_CT_m=t, deformation=np.zeros(0))
     J = jacobian(block, made, calibration.free, None)
     if J is None:
         return None

@@ -20,7 +20,7 @@ from calib.core.arrays import FloatArray
 from calib.core.bounded_yaml import MAX_NODES, YamlProblem, expands_beyond, load
 from calib.core.errors import BadInputError
 from calib.core.writing import Kind, holds
-from calib.stages.camera.model import COEFFICIENTS, MODELS, Camera
+from calib.stages.camera.model import COEFFICIENTS, FISHEYE, MODELS, Camera
 
 # ----------------------------------------------------------------------
 # OpenCV's FileStorage, read without OpenCV: YAML, XML and JSON, as plain values and matrices.
@@ -210,15 +210,18 @@ def _xml(text: str) -> object:
 # Numbers are written with enough digits to come back bit for bit. What a format cannot hold is refused
 # and named, never dropped: Kalibr's radtan has no k3 and no skew. ROS's files and OpenCV's have a place
 # for the skew in K, which OpenCV's own functions then ignore. None of them holds the name of our model;
-# on reading it is the simplest one that has all coefficients that are not zero.
+# on reading it is the simplest one that has all coefficients that are not zero. A fisheye lens is named:
+# `equidistant` by ROS and Kalibr, `fisheye_model` by OpenCV's samples.
 #
 # All three count pixels from the centre of the top-left one and order the coefficients
-# k1, k2, p1, p2, k3, k4, k5, k6, as this project does.
+# k1, k2, p1, p2, k3, k4, k5, k6, as this project does; a fisheye lens's are k1, k2, k3, k4.
 
 _BROWN = len(MODELS["brown5"])
 _BEYOND_RATIONAL = ("s1", "s2", "s3", "s4", "tau_x", "tau_y")
 """OpenCV's thin prism and tilted sensor, which no model here has."""
 _SKEW_LIMIT = 1e-12
+_FISHEYE = [COEFFICIENTS.index(name) for name in MODELS[FISHEYE]]
+"""Places of the fisheye model's coefficients among `COEFFICIENTS`."""
 
 
 _YAML = (".yaml", ".yml")
@@ -231,19 +234,24 @@ FILES = {
 
 
 def to_ros(camera: Camera, name: str = "camera") -> str:
-    """ROS camera_info YAML (sensor_msgs/CameraInfo): plumb_bob, or rational_polynomial for rational8.
+    """ROS camera_info YAML (sensor_msgs/CameraInfo).
+
+    plumb_bob, rational_polynomial for rational8, or equidistant for fisheye4.
 
     The rectification is the identity and the projection matrix K, as for a single camera.
     """
-    rational = bool(np.any(camera.distortion[_BROWN:]))
-    coefficients = camera.distortion if rational else camera.distortion[:_BROWN]
+    model, coefficients = "plumb_bob", camera.distortion[:_BROWN]
+    if camera.fisheye:
+        model, coefficients = "equidistant", camera.distortion[_FISHEYE]
+    elif np.any(camera.distortion[_BROWN:]):
+        model, coefficients = "rational_polynomial", camera.distortion
     P = np.column_stack([camera.K, np.zeros(3)])
     document = {
         "image_width": int(camera.image_size_px[0]),
         "image_height": int(camera.image_size_px[1]),
         "camera_name": name,
         "camera_matrix": _matrix(camera.K),
-        "distortion_model": "rational_polynomial" if rational else "plumb_bob",
+        "distortion_model": model,
         "distortion_coefficients": _matrix(coefficients[None]),
         "rectification_matrix": _matrix(np.eye(3)),
         "projection_matrix": _matrix(P),
@@ -265,12 +273,11 @@ def from_ros(text: str) -> Camera:
     document = _mapping(text)
     size = (_whole(document, "image_width"), _whole(document, "image_height"))
     model = document.get("distortion_model")
-    lengths = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8,)}
+    lengths = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
     if not isinstance(model, str) or model not in lengths:
         raise BadInputError(
-            f"distortion_model is {_short(model)}, expected plumb_bob or rational_polynomial; no other can "
-            "be "
-            "expressed"
+            f"distortion_model is {_short(model)}, expected plumb_bob, rational_polynomial or equidistant; "
+            "no other can be expressed"
         )
     coefficients = _ros_matrix(document, "distortion_coefficients", None)
     if coefficients.size not in lengths[model]:
@@ -278,9 +285,8 @@ def from_ros(text: str) -> Camera:
             f"distortion_coefficients.data has {coefficients.size} numbers, expected {lengths[model][-1]} "
             f"for {model}"
         )
-    return _camera(
-        size, _ros_matrix(document, "camera_matrix", (3, 3)), coefficients.ravel(), "camera_matrix"
-    )
+    K = _ros_matrix(document, "camera_matrix", (3, 3))
+    return _camera(size, K, coefficients.ravel(), "camera_matrix", fisheye=model == "equidistant")
 
 
 def to_opencv(camera: Camera) -> str:
@@ -292,7 +298,10 @@ def to_opencv(camera: Camera) -> str:
     storage.write("image_height", int(camera.image_size_px[1]))
     storage.write("camera_matrix", camera.K)
     used = len(COEFFICIENTS) if np.any(camera.distortion[_BROWN:]) else _BROWN
-    storage.write("distortion_coefficients", camera.distortion[:used, None])
+    coefficients = camera.distortion[_FISHEYE] if camera.fisheye else camera.distortion[:used]
+    if camera.fisheye:
+        storage.write("fisheye_model", 1)
+    storage.write("distortion_coefficients", coefficients[:, None])
     return str(storage.releaseAndGetString())
 
 
@@ -302,32 +311,34 @@ def from_opencv(text: str) -> Camera:
     Raises
     ------
     BadInputError
-        For text that is no FileStorage, a missing or wrong key, a fisheye model, or coefficients of
-        OpenCV's thin-prism and tilted models that are not zero.
+        For text that is no FileStorage, a missing or wrong key, or coefficients of OpenCV's thin-prism
+        and tilted models that are not zero.
     """
     root = read_storage(text)
     fisheye = root.get("fisheye_model", 0)
-    if not isinstance(fisheye, int | float) or fisheye != 0:
-        raise BadInputError("fisheye_model is set, and a fisheye lens cannot be expressed")
+    if fisheye not in (0, 1):
+        raise BadInputError(f"fisheye_model is {_short(fisheye)}, expected 0 or 1")
     width, height = (_storage_whole(root, key) for key in ("image_width", "image_height"))
     K = _storage_matrix(root, "camera_matrix")
     coefficients = _storage_matrix(root, "distortion_coefficients").ravel()
     if K.shape != (3, 3):
         raise BadInputError(f"camera_matrix is {K.shape[0]}x{K.shape[1]}, expected 3x3")
-    if coefficients.size not in (4, 5, 8, 12, 14):
+    if coefficients.size not in ((4,) if fisheye else (4, 5, 8, 12, 14)):
         raise BadInputError(
-            f"distortion_coefficients has {coefficients.size} numbers, expected 4, 5, 8, 12 or 14"
+            f"distortion_coefficients has {coefficients.size} numbers, expected "
+            + ("4 of a fisheye lens" if fisheye else "4, 5, 8, 12 or 14")
         )
     for name, value in zip(_BEYOND_RATIONAL, coefficients[len(COEFFICIENTS) :], strict=False):
         if value != 0.0:
             raise BadInputError(
                 f"distortion_coefficients holds {name} = {value:g}, which cannot be expressed"
             )
-    return _camera((width, height), K, coefficients[: len(COEFFICIENTS)], "camera_matrix")
+    used = coefficients[: len(COEFFICIENTS)]
+    return _camera((width, height), K, used, "camera_matrix", fisheye=bool(fisheye))
 
 
 def to_kalibr(camera: Camera, name: str = "cam0") -> str:
-    """Kalibr camchain YAML with one pinhole-radtan camera.
+    """Kalibr camchain YAML with one camera, pinhole-radtan or for fisheye4 pinhole-equi.
 
     Raises
     ------
@@ -338,8 +349,9 @@ def to_kalibr(camera: Camera, name: str = "cam0") -> str:
         raise BadInputError(
             f"skew_px is {camera.skew_px:g} and a Kalibr camchain cannot express it; calibrate with --no-skew"
         )
+    coefficients = camera.distortion[_FISHEYE] if camera.fisheye else camera.distortion[:4]
     for index, value in enumerate(camera.distortion.tolist()):
-        if index >= 4 and value != 0.0:
+        if index >= 4 and value != 0.0 and not camera.fisheye:
             raise BadInputError(
                 f"{COEFFICIENTS[index]} is {value:g} and Kalibr's radtan (k1, k2, p1, p2) cannot express it; "
                 "calibrate with --model radial2"
@@ -349,8 +361,8 @@ def to_kalibr(camera: Camera, name: str = "cam0") -> str:
         "cam0": {
             "cam_overlaps": [],
             "camera_model": "pinhole",
-            "distortion_coeffs": [float(value) for value in camera.distortion[:4]],
-            "distortion_model": "radtan",
+            "distortion_coeffs": [float(value) for value in coefficients],
+            "distortion_model": "equidistant" if camera.fisheye else "radtan",
             "intrinsics": numbers,
             "resolution": [int(size) for size in camera.image_size_px],
             "rostopic": f"/{name}/image_raw",
@@ -360,7 +372,7 @@ def to_kalibr(camera: Camera, name: str = "cam0") -> str:
 
 
 def from_kalibr(text: str, entry: str = "cam0") -> Camera:
-    """Camera `entry` of a Kalibr camchain YAML, pinhole with radtan or no distortion.
+    """Camera `entry` of a Kalibr camchain YAML, pinhole with radtan, equidistant or no distortion.
 
     Raises
     ------
@@ -379,13 +391,14 @@ def from_kalibr(text: str, entry: str = "cam0") -> Camera:
             "expressed"
         )
     model = camera.get("distortion_model")
-    if model not in ("radtan", "none"):
+    if model not in ("radtan", "equidistant", "none"):
         raise BadInputError(
-            f"{entry}.distortion_model is {_short(model)}, expected radtan or none; no other can be expressed"
+            f"{entry}.distortion_model is {_short(model)}, expected radtan, equidistant or none; no other "
+            "can be expressed"
         )
     fx, fy, cx, cy = _numbers(camera.get("intrinsics"), f"{entry}.intrinsics", 4)
     coefficients: list[float] = []
-    if model == "radtan":
+    if model != "none":
         coefficients = _numbers(camera.get("distortion_coeffs"), f"{entry}.distortion_coeffs", 4)
     size = camera.get("resolution")
     if not (isinstance(size, list) and len(size) == 2 and all(_is_whole(value) for value in size)):
@@ -393,10 +406,13 @@ def from_kalibr(text: str, entry: str = "cam0") -> Camera:
             f"{entry}.resolution is {_short(size)}, expected two whole numbers [width, height]"
         )
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    return _camera((size[0], size[1]), K, np.array(coefficients), f"{entry}.intrinsics")
+    key = f"{entry}.intrinsics"
+    return _camera((size[0], size[1]), K, np.array(coefficients), key, fisheye=model == "equidistant")
 
 
-def _camera(size: tuple[int, int], K: FloatArray, coefficients: FloatArray, key: str) -> Camera:
+def _camera(
+    size: tuple[int, int], K: FloatArray, coefficients: FloatArray, key: str, *, fisheye: bool
+) -> Camera:
     """The camera, after a look at K and at what it is made of."""
     if min(size) < 1:
         raise BadInputError(f"the image size is {size[0]}x{size[1]}, expected positive numbers")
@@ -404,14 +420,15 @@ def _camera(size: tuple[int, int], K: FloatArray, coefficients: FloatArray, key:
     if np.abs(lower).max() > _SKEW_LIMIT or K[2, 2] != 1.0 or min(K[0, 0], K[1, 1]) <= 0.0:
         raise BadInputError(f"{key} is not an intrinsic matrix: [fx skew cx; 0 fy cy; 0 0 1] with fx, fy > 0")
     distortion = np.zeros(len(COEFFICIENTS))
-    distortion[: len(coefficients)] = coefficients
+    distortion[_FISHEYE if fisheye else slice(len(coefficients))] = coefficients
     fx, skew, cx, fy, cy = (float(value) for value in (K[0, 0], K[0, 1], K[0, 2], K[1, 1], K[1, 2]))
-    return Camera(_simplest_model(distortion), size, fx, fy, skew, cx, cy, distortion)
+    model = FISHEYE if fisheye else _simplest_model(distortion)
+    return Camera(model, size, fx, fy, skew, cx, cy, distortion)
 
 
 def _simplest_model(distortion: FloatArray) -> str:
     used = {name for name, value in zip(COEFFICIENTS, distortion, strict=True) if value != 0.0}
-    return next(model for model, names in MODELS.items() if used <= set(names))
+    return next(model for model, names in MODELS.items() if model != FISHEYE and used <= set(names))
 
 
 def _matrix(values: FloatArray) -> dict[str, Any]:

@@ -31,7 +31,16 @@ from calib.stages.camera.checks import (
     screen,
     skew_left_out,
 )
-from calib.stages.camera.model import MODELS, Block, LeftOut, Observations, View, free_intrinsics, pack
+from calib.stages.camera.model import (
+    FISHEYE,
+    MODELS,
+    Block,
+    LeftOut,
+    Observations,
+    View,
+    free_intrinsics,
+    pack,
+)
 from calib.stages.camera.triage import Triage, triage
 from calib.stages.camera.verdict import (
     Judgement,
@@ -72,6 +81,8 @@ _LESS, _SAME = 0.95, 1.01
 its own below which a fit without a pole is preferred."""
 _EQUIDISTANT = (0.3, 0.5)
 """Focal lengths of wide lenses to start from, over the picture's larger side."""
+_WIDE = float(np.radians(40.0))
+"""Angle from the axis from which on a fisheye lens is tried; below it the radial models follow its curve."""
 _SKEW_SIGMAS, _SKEW_PX = 3.0, 0.01
 """Standard deviations, and pixels by which directions move at up to 1000 pixels' width, that make a skew."""
 _SOUND = 3
@@ -206,9 +217,7 @@ def _on_fold(judges: _Judges, job: tuple[int, int]) -> FloatArray:
         fixed=judges.fixed,
         basis=whole.basis,
         loss=whole.loss,
-        start=Block(
-            whole.block.intrinsics, whole.block.R_CT[kept], whole.block.t_CT_m[kept], whole.block.deformation
-        ),
+        start=replace(whole.block, R_CT=whole.block.R_CT[kept], t_CT_m=whole.block.t_CT_m[kept]),
         max_iterations=_MAX_ITERATIONS,
         tolerance=_ENOUGH,
     )
@@ -248,13 +257,13 @@ def candidates_by_model(
 ) -> list[tuple[Candidate, Calibration]]:
     """Every lens model fitted to all views and judged on views held back, the simplest first.
 
-    A model that the views are too few for is left out.
+    A model that the views are too few for is left out, and a fisheye lens where no view is wide.
     """
     fits: list[Calibration] = []
-    start: Block | None = None
-    for model in models:
+
+    def fitted(model: str, start: Block | None) -> Calibration | None:
         if 2 * observations.points < len(free_intrinsics(model, skew, fixed)) + 6 * observations.views + 1:
-            continue
+            return None
         fit = calibrate(
             observations,
             image_size_px,
@@ -266,16 +275,34 @@ def candidates_by_model(
             max_iterations=_MAX_ITERATIONS,
             tolerance=_ENOUGH,
         )
-        if fit.termination in ("behind the camera", "singular"):
-            continue
-        if model == "rational8" and not skew and not fixed:
+        return None if fit.termination in ("behind the camera", "singular") else fit
+
+    for model in models:
+        fit = None if model == FISHEYE else fitted(model, fits[-1].block if fits else None)
+        if fit is not None and model == "rational8" and not skew and not fixed:
             fit = _sturdier(fit, fits)
-        start = fit.block
-        fits.append(fit)
+        fits += [] if fit is None else [fit]
+    if FISHEYE in models and any(map(_wide, fits)):
+        fit = fitted(FISHEYE, None)
+        fits = sorted(fits if fit is None else [*fits, fit], key=lambda one: models.index(one.camera.model))
     held = _on_held_back(fits, fixed)
     return [
         (_candidate(str(LensModel.of(fit)), fit, held[i], _soundness(fit)), fit) for i, fit in enumerate(fits)
     ]
+
+
+def _wide(fit: Calibration) -> bool:
+    """Whether points were seen far from the axis, or a lens folds among them to follow a wide one.
+
+    The rational model folds by noise alone.
+    """
+    p1, p2, p3 = (
+        np.moveaxis(fit.observations.target_m @ fit.block.R_CT.transpose(0, 2, 1), 2, 0)
+        + (fit.block.t_CT_m.T[:, :, None])
+    )
+    theta = np.arctan2(np.hypot(p1, p2), p3)[fit.observations.present]
+    folds = fit.camera.model != "rational8" and lens_shape(fit).seen_slope <= 0.0
+    return bool(theta.max() > _WIDE) or folds
 
 
 def _sturdier(fit: Calibration, simpler: Sequence[Calibration]) -> Calibration:

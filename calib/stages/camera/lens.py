@@ -17,6 +17,7 @@ from calib.stages.camera.model import (
     camera_from_vector,
     corner_radius,
     distort,
+    distorted_normalised,
     focal_px,
     fold_radius,
     one_to_one_reach,
@@ -46,6 +47,9 @@ from calib.stages.camera.pose import projection_with_derivatives
 
 _MOST_COEFFICIENTS, _MOST_STEPS = 10, 6
 _REWEIGHTINGS = 40
+_STEEPEST = float(np.tan(np.radians(75.0)))
+"""Undistorted radius up to which a fisheye lens is undone: no polynomial follows the tangent to its pole at a
+right angle."""
 _MOST_PIXELS = 200_000
 """Larger pictures are checked on a grid of about this many pixels, their borders included."""
 
@@ -61,7 +65,8 @@ class InversePolynomial:
     decentering_steps : how often the decentering is taken off.
     max_error_px : largest distance between this and the exact inverse over the picture, in undistorted
         pixels, computed in single precision as a microcontroller does.
-    covered : share of the picture that the lens model can show at all; the error is over this share.
+    covered : share of the picture that the lens model can show at all, of a fisheye lens up to 75 degrees
+        from the axis; the error is over this share.
     tolerance_px : what was asked for.
     """
 
@@ -95,14 +100,6 @@ def pixel_grid(
     u = np.linspace(u0, u1, max(2, round(columns * shrink)) if columns > 1 else 1)
     v = np.linspace(v0, v1, max(2, round(rows * shrink)) if rows > 1 else 1)
     return np.stack(np.meshgrid(u, v), axis=-1)
-
-
-def distorted_normalised(camera: Camera, pixels: AnyArray) -> AnyArray:
-    """Normalised distorted coordinates (..., 2) of pixels (..., 2), in the precision of the input."""
-    kind = pixels.dtype.type
-    y = (pixels[..., 1] - kind(camera.cy_px)) / kind(camera.fy_px)
-    x = (pixels[..., 0] - kind(camera.cx_px) - kind(camera.skew_px) * y) / kind(camera.fx_px)
-    return np.stack([x, y], axis=-1)
 
 
 def undistort_by_polynomial(inverse: InversePolynomial, distorted: AnyArray) -> AnyArray:
@@ -142,6 +139,8 @@ def fit_inverse(camera: Camera, tolerance_px: float = 0.01) -> InversePolynomial
     width, height = camera.image_size_px
     pixels = pixel_grid(camera.image_size_px, (-0.5, -0.5, width - 0.5, height - 0.5)).reshape(-1, 2)
     ideal, seen = exact_inverse(camera, pixels)
+    if camera.fisheye:
+        seen &= np.hypot(*ideal.T) < _STEEPEST
     p1, p2 = float(camera.distortion[2]), float(camera.distortion[3])
     covered = float(np.mean(seen))
     best = InversePolynomial((), p1, p2, 0, np.inf, covered, tolerance_px)
@@ -178,8 +177,8 @@ def _minimax(camera: Camera, largest: float, count: int) -> tuple[float, ...]:
     r = np.linspace(0.0, largest, 40 * (count + 5))[1:]
     radial = camera.distortion.copy()
     radial[2:4] = 0.0
-    w = distort(r, np.zeros_like(r), radial)[0]
-    if count == 0 or not radial.any():
+    w = distort(r, np.zeros_like(r), radial, camera.fisheye)[0]
+    if count == 0 or not (radial.any() or camera.fisheye):
         return ()
     rho = w * w
     top = float(rho.max())
@@ -288,7 +287,7 @@ def displacement_field(camera: Camera, pixels: FloatArray) -> FloatArray:
     "(B.1)."""
     y = (pixels[..., 1] - camera.cy_px) / camera.fy_px
     x = (pixels[..., 0] - camera.cx_px - camera.skew_px * y) / camera.fx_px
-    xd, yd = distort(x, y, camera.distortion)
+    xd, yd = distort(x, y, camera.distortion, camera.fisheye)
     return np.asarray(np.stack([xd - x, yd - y], axis=-1) @ camera.K[:2, :2].T)
 
 
@@ -313,8 +312,10 @@ def distortion_kind(camera: Camera) -> str:
     a hundredth of a pixel is mustache. Decentering alone has no radial curve.
     """
     k1, k2, p1, p2, *more = camera.distortion
-    if not np.any(camera.distortion):
+    if camera.ideal:
         return "none"
+    if camera.fisheye:
+        more = [1.0]
     if not (k1 or k2 or any(more)):
         return "decentering"
     if not (p1 or p2 or any(more)):
@@ -325,7 +326,7 @@ def distortion_kind(camera: Camera) -> str:
     r = np.linspace(0.0, min(corner_radius(camera), 0.999 * fold_radius(camera)[0]), 500)[1:]
     radial = camera.distortion.copy()
     radial[2:4] = 0.0
-    steps = np.diff(distort(r, np.zeros_like(r), radial)[0] / r)
+    steps = np.diff(distort(r, np.zeros_like(r), radial, camera.fisheye)[0] / r)
     rise, fall = float(steps[steps > 0].sum()), float(-steps[steps < 0].sum())
     seen_px = r[-1] * focal_px(camera)
     if max(rise, fall) * seen_px < 1e-9:
@@ -427,7 +428,8 @@ def shown_once(camera: Camera, pixels: FloatArray) -> BoolArray:
     x, y = np.moveaxis(distorted_normalised(camera, pixels), -1, 0)
     once = np.hypot(x, y) < fold_radius(camera)[0]
     # Next to a pole displacements have no bound.
-    xd, yd = distort(np.where(once, x, 0.0), np.where(once, y, 0.0), camera.distortion)
+    x, y = np.where(once, x, 0.0), np.where(once, y, 0.0)
+    xd, yd = distort(x, y, camera.distortion, camera.fisheye)
     return np.asarray(once & (np.hypot(xd, yd) < 2.0 * corner_radius(camera)))
 
 
@@ -501,10 +503,10 @@ def ideal_pixels(camera: Camera, pixels: FloatArray) -> FloatArray:
 
 def radial_displacement(camera: Camera, radius_px: FloatArray) -> FloatArray:
     """Displacement along the radius at ideal radii, the radial part of the model alone, pixels."""
-    k1, k2, _, _, k3, k4, k5, k6 = camera.distortion
-    r2 = (radius_px / focal_px(camera)) ** 2
-    factor = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-    return np.asarray(radius_px * (factor - 1.0))
+    radial = camera.distortion.copy()
+    radial[2:4] = 0.0
+    r = radius_px / focal_px(camera)
+    return np.asarray(focal_px(camera) * (distort(r, np.zeros_like(r), radial, camera.fisheye)[0] - r))
 
 
 def radial_sigma(camera: Camera, covariance: Covariance, radius_px: FloatArray) -> FloatArray:

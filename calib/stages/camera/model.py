@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, Self
 
 import numpy as np
 
-from calib.core.arrays import BoolArray, FloatArray, IntArray
+from calib.core.arrays import AnyArray, BoolArray, FloatArray, IntArray
 
 # ----------------------------------------------------------------------
 # The checkerboard: inner corners on a plane, in metres.
@@ -176,7 +176,7 @@ def pack(views: Sequence[View]) -> Observations:
 
 
 # ----------------------------------------------------------------------
-# The camera model: pinhole with skew and Brown's or the rational distortion.
+# The camera model: pinhole with skew and Brown's or the rational distortion, or a fisheye lens.
 #
 # A point (X, Y, Z) of the camera's frame is seen at
 #
@@ -188,6 +188,13 @@ def pack(views: Sequence[View]) -> Observations:
 #
 # which is (2.4), (2.5) and (B.1) of the source document for k1, k2 alone, and OpenCV's model with a
 # skew added (Zhang 2000). The printed (2.7), gamma = f_w tan(psi), mixes units: skew is in pixels.
+#
+# A fisheye lens (Kannala and Brandt 2006, four coefficients, OpenCV's `fisheye`) is a polynomial of the angle
+# from the axis instead, and sees points with Z <= 0 as well:
+#
+#     theta  = atan2(rho, Z),  rho = sqrt(X^2 + Y^2)
+#     theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)
+#     xd = X theta_d / rho,  yd = Y theta_d / rho
 
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """Order of the distortion coefficients everywhere, OpenCV's."""
@@ -196,10 +203,14 @@ MODELS: dict[str, tuple[str, ...]] = {
     "pinhole": (),
     "radial2": ("k1", "k2"),
     "radial3": ("k1", "k2", "k3"),
+    "fisheye4": ("k1", "k2", "k3", "k4"),
     "brown5": ("k1", "k2", "p1", "p2", "k3"),
     "rational8": COEFFICIENTS,
 }
 """Coefficients that each model frees, from the simplest to the richest."""
+
+FISHEYE = "fisheye4"
+"""The model whose coefficients are those of a polynomial of the angle."""
 
 
 def _no_distortion() -> FloatArray:
@@ -228,6 +239,16 @@ class Camera:
     distortion: FloatArray = field(default_factory=_no_distortion)
 
     @property
+    def fisheye(self) -> bool:
+        """Whether the coefficients are those of the fisheye model."""
+        return self.model == FISHEYE
+
+    @property
+    def ideal(self) -> bool:
+        """Whether the model has no distortion at all."""
+        return not (self.fisheye or np.any(self.distortion))
+
+    @property
     def K(self) -> FloatArray:
         """Intrinsic matrix (2.5), shape (3, 3), pixels."""
         return np.array(
@@ -235,8 +256,28 @@ class Camera:
         )
 
 
-def distort(x: FloatArray, y: FloatArray, distortion: FloatArray) -> tuple[FloatArray, FloatArray]:
+_SMALL = 1e-9
+"""Radius below which a direction is the axis, rad."""
+_BEHIND = 0.05
+"""Angle from straight behind the camera that no lens sees, rad."""
+
+
+def angle_curve(theta: AnyArray, distortion: FloatArray) -> tuple[AnyArray, AnyArray]:
+    """theta_d of the fisheye model and its derivative by theta, any shape, in the precision of the input."""
+    k1, k2, _, _, k3, k4, _, _ = distortion.astype(theta.dtype)
+    t2 = theta * theta
+    theta_d = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+    return theta_d, 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+
+
+def distort(
+    x: FloatArray, y: FloatArray, distortion: FloatArray, fisheye: bool = False
+) -> tuple[FloatArray, FloatArray]:
     """Distorted from undistorted normalised coordinates, any shape."""
+    if fisheye:
+        r = np.maximum(np.hypot(x, y), _SMALL)
+        scale = angle_curve(np.arctan(r), distortion)[0] / r
+        return x * scale, y * scale
     k1, k2, p1, p2, k3, k4, k5, k6 = distortion
     r2 = x * x + y * y
     radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
@@ -267,24 +308,38 @@ def project(camera: Camera, points_C: FloatArray) -> FloatArray:
 
     Parameters
     ----------
-    points_C : (..., 3) with positive Z.
+    points_C : (..., 3) with positive Z; a fisheye lens takes any.
 
     Returns
     -------
     (..., 2) distorted pixels.
     """
-    x = points_C[..., 0] / points_C[..., 2]
-    y = points_C[..., 1] / points_C[..., 2]
-    xd, yd = distort(x, y, camera.distortion)
+    if camera.fisheye:
+        rho = np.maximum(np.hypot(points_C[..., 0], points_C[..., 1]), _SMALL * np.abs(points_C[..., 2]))
+        scale = angle_curve(np.arctan2(rho, points_C[..., 2]), camera.distortion)[0] / rho
+        xd, yd = points_C[..., 0] * scale, points_C[..., 1] * scale
+    else:
+        x = points_C[..., 0] / points_C[..., 2]
+        y = points_C[..., 1] / points_C[..., 2]
+        xd, yd = distort(x, y, camera.distortion)
     u = camera.fx_px * xd + camera.skew_px * yd + camera.cx_px
     v = camera.fy_px * yd + camera.cy_px
     return np.stack([u, v], axis=-1)
 
 
+def distorted_normalised(camera: Camera, pixels: AnyArray) -> AnyArray:
+    """Normalised distorted coordinates (..., 2) of pixels (..., 2), in the precision of the input."""
+    kind = pixels.dtype.type
+    y = (pixels[..., 1] - kind(camera.cy_px)) / kind(camera.fy_px)
+    x = (pixels[..., 0] - kind(camera.cx_px) - kind(camera.skew_px) * y) / kind(camera.fx_px)
+    return np.stack([x, y], axis=-1)
+
+
 def undistort(camera: Camera, pixels: FloatArray, iterations: int = 30) -> FloatArray:
     """Normalised undistorted coordinates (x, y) of distorted pixels, by Newton's method.
 
-    Where the distortion folds over and no answer exists the result is NaN.
+    Where the distortion folds over and no answer exists the result is NaN, and where a fisheye lens shows
+    what is beside the camera or behind it.
 
     Parameters
     ----------
@@ -294,6 +349,9 @@ def undistort(camera: Camera, pixels: FloatArray, iterations: int = 30) -> Float
     -------
     (..., 2) normalised coordinates.
     """
+    if camera.fisheye:
+        ahead = rays(camera, pixels)
+        return np.where(ahead[..., 2:] > 0.0, ahead[..., :2] / np.maximum(ahead[..., 2:], 1e-300), np.nan)
     yd = (pixels[..., 1] - camera.cy_px) / camera.fy_px
     xd = (pixels[..., 0] - camera.cx_px - camera.skew_px * yd) / camera.fx_px
     x, y = xd.copy(), yd.copy()
@@ -319,6 +377,45 @@ def undistort(camera: Camera, pixels: FloatArray, iterations: int = 30) -> Float
     return np.where(solved[..., None], np.stack([x, y], axis=-1), np.nan)
 
 
+def rays(camera: Camera, pixels: FloatArray) -> FloatArray:
+    """Directions (..., 3) of length one in the camera's frame of distorted pixels (..., 2).
+
+    NaN where the lens model shows nothing. Those of a fisheye lens go on behind the camera.
+    """
+    if not camera.fisheye:
+        ideal = undistort(camera, pixels)
+        toward = np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1)
+        return np.asarray(toward / np.linalg.norm(toward, axis=-1, keepdims=True))
+    xd, yd = np.moveaxis(distorted_normalised(camera, pixels), -1, 0)
+    radius = np.hypot(xd, yd)
+    theta = _angle_of(camera, radius)
+    around = np.sin(theta) / np.maximum(radius, _SMALL)
+    return np.stack([xd * around, yd * around, np.cos(theta)], axis=-1)
+
+
+def _angle_of(camera: Camera, radius: FloatArray) -> FloatArray:
+    """theta of theta_d, by Newton's method kept between bounds; NaN beyond where theta_d grows."""
+    last, most = fold_angle(camera)
+    goal = np.where(radius < most, radius, 0.0)
+    low, high = np.zeros_like(goal), np.full_like(goal, last)
+    theta = np.minimum(goal, 0.5 * last)
+    for _ in range(_BISECTIONS):
+        theta_d, slope = angle_curve(theta, camera.distortion)
+        error = theta_d - goal
+        low, high = np.where(error <= 0.0, theta, low), np.where(error >= 0.0, theta, high)
+        after = theta - error / np.maximum(slope, _SMALL)
+        after = np.where((after < low) | (after > high), 0.5 * (low + high), after)
+        moved = np.max(np.abs(after - theta), initial=0.0)
+        theta = after
+        if moved < 1e-15:
+            break
+    return np.where(radius < most, theta, np.nan)
+
+
+_BISECTIONS = 60
+"""Halvings of an interval that reach its rounding."""
+
+
 # ----------------------------------------------------------------------
 # How far a lens model is one-to-one. Beyond a fold of its radial curve two directions share a pixel; what
 # lies beyond a pole of the rational model comes into the picture from the other side.
@@ -330,13 +427,39 @@ def focal_px(camera: Camera) -> float:
 
 
 def corner_radius(camera: Camera) -> float:
-    """Largest normalised radius of the picture's corners."""
+    """Largest normalised radius of the picture's corners, distorted, and no farther than `ahead_radius`."""
     width, height = camera.image_size_px
     v = np.array([0.0, 0.0, height - 1.0, height - 1.0])
     u = np.array([0.0, width - 1.0, 0.0, width - 1.0])
     y = (v - camera.cy_px) / camera.fy_px
     x = (u - camera.cx_px - camera.skew_px * y) / camera.fx_px
-    return float(np.hypot(x, y).max())
+    return min(float(np.hypot(x, y).max()), ahead_radius(camera))
+
+
+def ahead_radius(camera: Camera) -> float:
+    """theta_d of a right angle, beyond which a fisheye lens shows nothing that is ahead of the camera.
+
+    Infinite for other lenses, and where theta_d stops growing before.
+    """
+    right = np.array(0.5 * np.pi)
+    if not camera.fisheye or fold_angle(camera)[0] < right:
+        return np.inf
+    return float(angle_curve(right, camera.distortion)[0])
+
+
+def _first_root(polynomial: Any) -> float:
+    """The least positive root, infinite where there is none."""
+    roots = polynomial.trim().roots()
+    real = roots[(np.abs(roots.imag) < 1e-9 * np.maximum(1.0, np.abs(roots))) & (roots.real > 0)].real
+    return float(real.min()) if len(real) else np.inf
+
+
+def fold_angle(camera: Camera) -> tuple[float, float]:
+    """Where theta_d of a fisheye lens stops growing, at most straight behind: theta and theta_d."""
+    k1, k2, _, _, k3, k4, _, _ = camera.distortion
+    fold = _first_root(np.polynomial.Polynomial([1, 3 * k1, 5 * k2, 7 * k3, 9 * k4]))
+    theta = min(float(np.sqrt(fold)), np.pi)
+    return theta, float(angle_curve(np.array(theta), camera.distortion)[0])
 
 
 def fold_radius(camera: Camera) -> tuple[float, float]:
@@ -344,17 +467,16 @@ def fold_radius(camera: Camera) -> tuple[float, float]:
 
     Normalised; infinite where it rises for ever, the distorted radius also at a pole. With L = N / D in
     rho = r^2 the slope vanishes where N D + 2 rho (N' D - N D') = 0.
+    A fisheye lens has the tangent of `fold_angle` for r, infinite from a right angle on.
     """
+    if camera.fisheye:
+        theta, theta_d = fold_angle(camera)
+        return float(np.tan(theta)) if theta < 0.5 * np.pi else np.inf, theta_d
     k1, k2, _, _, k3, k4, k5, k6 = camera.distortion
     N, D = np.polynomial.Polynomial([1, k1, k2, k3]), np.polynomial.Polynomial([1, k4, k5, k6])
     rho = np.polynomial.Polynomial([0, 1])
 
-    def first_root(polynomial: Any) -> float:
-        roots = polynomial.trim().roots()
-        real = roots[(np.abs(roots.imag) < 1e-9 * np.maximum(1.0, np.abs(roots))) & (roots.real > 0)].real
-        return float(real.min()) if len(real) else np.inf
-
-    fold, pole = first_root(N * D + 2 * rho * (N.deriv() * D - N * D.deriv())), first_root(D)
+    fold, pole = _first_root(N * D + 2 * rho * (N.deriv() * D - N * D.deriv())), _first_root(D)
     if pole < fold:
         return float(np.sqrt(pole)), np.inf
     radius = float(np.sqrt(fold))
@@ -378,7 +500,13 @@ def one_to_one_reach(camera: Camera) -> float:
 #
 #     du/d(delta) = (R X) x a,   du/dt = a,   du/dw_k = a . R B_k
 #
-# where the target is X + sum_k w_k B_k when it is allowed to deform. All arrays are kept with the
+# where the target is X + sum_k w_k B_k when it is allowed to deform. The fisheye model takes p without
+# dividing by p3: with m = theta_d / rho and d^2 = rho^2 + p3^2,
+#
+#     d(p_i m)/dp_j = m [i = j] + p_i p_j (theta_d' p3 / d^2 - m) / rho^2
+#     d(p_i m)/dp3  = -p_i theta_d' / d^2
+#
+# All arrays are kept with the
 # point last, so that each line of code runs over all views and points at once.
 
 INTRINSICS = ("fx_px", "fy_px", "cx_px", "cy_px", "skew_px", *COEFFICIENTS)
@@ -394,16 +522,18 @@ class Block:
     intrinsics : (13,) in the order of `INTRINSICS`.
     R_CT, t_CT_m : (N, 3, 3) and (N, 3), pose of the target in the camera's frame.
     deformation : (K,) weights of the target's deformation, metres.
+    fisheye : `Camera.fisheye`.
     """
 
     intrinsics: FloatArray
     R_CT: FloatArray
     t_CT_m: FloatArray
     deformation: FloatArray
+    fisheye: bool = False
 
     def part(self, views: slice) -> Block:
         """The same with the poses of some views only."""
-        return Block(self.intrinsics, self.R_CT[views], self.t_CT_m[views], self.deformation)
+        return replace(self, R_CT=self.R_CT[views], t_CT_m=self.t_CT_m[views])
 
 
 def free_intrinsics(model: str, skew: bool, fixed: tuple[str, ...] = ()) -> IntArray:
@@ -422,6 +552,134 @@ def vector_from_camera(camera: Camera) -> FloatArray:
     """The vector of intrinsics (13,) of a camera."""
     five = [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.skew_px]
     return np.concatenate([five, camera.distortion])
+
+
+@dataclass(frozen=True)
+class _Ratios:
+    """Points (N, M) seen by a lens that distorts x = p1 / p3 and y = p2 / p3."""
+
+    x: FloatArray
+    y: FloatArray
+    inverse: FloatArray
+    over: FloatArray | float
+    radial: FloatArray
+    xd: FloatArray
+    yd: FloatArray
+    xd_x: FloatArray
+    cross: FloatArray
+    yd_y: FloatArray
+
+    @classmethod
+    def of(cls, p1: FloatArray, p2: FloatArray, p3: FloatArray, distortion: FloatArray) -> Self | None:
+        """None where a point is behind the camera."""
+        if p3.min() <= 0.0:
+            return None
+        k1, k2, t1, t2, k3, k4, k5, k6 = distortion
+        inverse = 1.0 / p3
+        x, y = p1 * inverse, p2 * inverse
+        xx, yy, xy = x * x, y * y, x * y
+        r2 = xx + yy
+        numerator = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        slope = k1 + r2 * (2.0 * k2 + r2 * (3.0 * k3))
+        over: FloatArray | float = 1.0
+        radial = numerator
+        if k4 or k5 or k6:
+            over = 1.0 / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+            radial = numerator * over
+            slope = (slope - radial * (k4 + r2 * (2.0 * k5 + r2 * (3.0 * k6)))) * over
+        xd = x * radial
+        yd = y * radial
+        if t1 or t2:
+            xd = xd + 2.0 * t1 * xy + t2 * (r2 + 2.0 * xx)
+            yd = yd + t1 * (r2 + 2.0 * yy) + 2.0 * t2 * xy
+        # Derivatives of the distorted by the undistorted normalised coordinates; symmetric.
+        xd_x = radial + 2.0 * xx * slope + (2.0 * t1 * y + 6.0 * t2 * x if t1 or t2 else 0.0)
+        yd_y = radial + 2.0 * yy * slope + (6.0 * t1 * y + 2.0 * t2 * x if t1 or t2 else 0.0)
+        cross = 2.0 * xy * slope + (2.0 * t1 * x + 2.0 * t2 * y if t1 or t2 else 0.0)
+        return cls(x, y, inverse, over, radial, xd, yd, xd_x, cross, yd_y)
+
+    def by_coefficient(self, name: str) -> tuple[FloatArray, FloatArray]:
+        """Derivatives of (xd, yd) by one distortion coefficient."""
+        x, y = self.x, self.y
+        r2 = x * x + y * y
+        if name == "p1":
+            return 2.0 * x * y, r2 + 2.0 * y * y
+        if name == "p2":
+            return r2 + 2.0 * x * x, 2.0 * x * y
+        power = {"k1": 1, "k2": 2, "k3": 3, "k4": 1, "k5": 2, "k6": 3}[name]
+        factor = r2 if power == 1 else r2 * r2 if power == 2 else r2 * r2 * r2
+        factor = factor * self.over
+        if name in ("k4", "k5", "k6"):
+            factor = -factor * self.radial
+        return x * factor, y * factor
+
+    def by_point(
+        self,
+        side: int,
+        focal: tuple[float, float, float],
+        a1: FloatArray,
+        a2: FloatArray,
+        a3: FloatArray,
+    ) -> None:
+        """Writes du/dp (side 0) or dv/dp (side 1) with the focal lengths and skew."""
+        fx, fy, skew = focal
+        if side == 0:
+            np.multiply(self.xd_x, fx * self.inverse, out=a1)
+            np.multiply(self.cross, fx * self.inverse, out=a2)
+            if skew:
+                a1 += skew * self.inverse * self.cross
+                a2 += skew * self.inverse * self.yd_y
+        else:
+            np.multiply(self.cross, fy * self.inverse, out=a1)
+            np.multiply(self.yd_y, fy * self.inverse, out=a2)
+        np.multiply(self.x, a1, out=a3)
+        a3 += self.y * a2
+        np.negative(a3, out=a3)
+
+
+@dataclass(frozen=True)
+class _Angles:
+    """Points (N, M) seen by a fisheye lens; `toward` are p1 / rho and p2 / rho, `by` rows of d(xd, yd)/dp."""
+
+    theta: FloatArray
+    toward: tuple[FloatArray, FloatArray]
+    xd: FloatArray
+    yd: FloatArray
+    by: tuple[tuple[FloatArray, ...], tuple[FloatArray, ...]]
+
+    @classmethod
+    def of(cls, p1: FloatArray, p2: FloatArray, p3: FloatArray, distortion: FloatArray) -> Self | None:
+        """None where a point is straight behind the camera."""
+        rho = np.maximum(np.hypot(p1, p2), _SMALL * np.abs(p3))
+        theta = np.arctan2(rho, p3)
+        if theta.max() > np.pi - _BEHIND:
+            return None
+        theta_d, slope = angle_curve(theta, distortion)
+        m, d2 = theta_d / rho, rho * rho + p3 * p3
+        bend, along = (slope * p3 / d2 - m) / (rho * rho), -slope / d2
+        cross = p1 * p2 * bend
+        by = (m + p1 * p1 * bend, cross, p1 * along), (cross, m + p2 * p2 * bend, p2 * along)
+        return cls(theta, (p1 / rho, p2 / rho), p1 * m, p2 * m, by)
+
+    def by_coefficient(self, name: str) -> tuple[FloatArray, FloatArray]:
+        """Derivatives of (xd, yd) by one distortion coefficient."""
+        power = {"k1": 3, "k2": 5, "k3": 7, "k4": 9}.get(name)
+        factor = np.zeros_like(self.theta) if power is None else self.theta**power
+        return self.toward[0] * factor, self.toward[1] * factor
+
+    def by_point(
+        self,
+        side: int,
+        focal: tuple[float, float, float],
+        a1: FloatArray,
+        a2: FloatArray,
+        a3: FloatArray,
+    ) -> None:
+        """Writes du/dp (side 0) or dv/dp (side 1) with the focal lengths and skew."""
+        fx, fy, skew = focal
+        for row, a in enumerate((a1, a2, a3)):
+            by_x, by_y = self.by[0][row], self.by[1][row]
+            a[:] = fx * by_x + skew * by_y if side == 0 else fy * by_y
 
 
 def jacobian(
@@ -447,66 +705,37 @@ def jacobian(
     p1, p2, p3 = np.moveaxis(rotated + block.t_CT_m[:, :, None], 1, 0)
     if not observations.complete:
         p3 = np.where(observations.present, p3, 1.0)
-    if p3.min() <= 0.0:
+    lens: _Angles | _Ratios | None
+    if block.fisheye:
+        lens = _Angles.of(p1, p2, p3, block.intrinsics[5:])
+    else:
+        lens = _Ratios.of(p1, p2, p3, block.intrinsics[5:])
+    if lens is None:
         return None
     fx, fy, cx, cy, skew = block.intrinsics[:5]
-    k1, k2, t1, t2, k3, k4, k5, k6 = block.intrinsics[5:]
-    inverse = 1.0 / p3
-    x, y = p1 * inverse, p2 * inverse
-    xx, yy, xy = x * x, y * y, x * y
-    r2 = xx + yy
-    numerator = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = k1 + r2 * (2.0 * k2 + r2 * (3.0 * k3))
-    over: FloatArray | float = 1.0
-    radial = numerator
-    if k4 or k5 or k6:
-        over = 1.0 / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-        radial = numerator * over
-        slope = (slope - radial * (k4 + r2 * (2.0 * k5 + r2 * (3.0 * k6)))) * over
-    xd = x * radial
-    yd = y * radial
-    if t1 or t2:
-        xd = xd + 2.0 * t1 * xy + t2 * (r2 + 2.0 * xx)
-        yd = yd + t1 * (r2 + 2.0 * yy) + 2.0 * t2 * xy
-    # Derivatives of the distorted by the undistorted normalised coordinates; symmetric.
-    xd_x = radial + 2.0 * xx * slope + (2.0 * t1 * y + 6.0 * t2 * x if t1 or t2 else 0.0)
-    yd_y = radial + 2.0 * yy * slope + (6.0 * t1 * y + 2.0 * t2 * x if t1 or t2 else 0.0)
-    cross = 2.0 * xy * slope + (2.0 * t1 * x + 2.0 * t2 * y if t1 or t2 else 0.0)
-
+    xd, yd = lens.xd, lens.yd
     shared = len(free) + (0 if basis is None else len(basis))
     out = np.empty((observations.views, shared + 7, 2, points))
     for row, index in enumerate(free):
         u, v = out[:, row, 0], out[:, row, 1]
         name = INTRINSICS[index]
         if name in ("fx_px", "cx_px", "skew_px"):
-            u[:] = {"fx_px": xd, "cx_px": 1.0, "skew_px": yd}[name]
+            u[:] = xd if name == "fx_px" else yd if name == "skew_px" else 1.0
             v[:] = 0.0
         elif name in ("fy_px", "cy_px"):
             u[:] = 0.0
             v[:] = yd if name == "fy_px" else 1.0
         else:
-            dx, dy = _by_coefficient(name, x, y, xx, yy, xy, r2, over, radial)
+            dx, dy = lens.by_coefficient(name)
             np.multiply(fx, dx, out=u)
             if skew:
                 u += skew * dy
             np.multiply(fy, dy, out=v)
     pose = out[:, shared : shared + 6]
     q1, q2, q3 = rotated[:, 0], rotated[:, 1], rotated[:, 2]
-    u_scale, v_scale = fx * inverse, fy * inverse
     for side in (0, 1):
         turn1, turn2, turn3, a1, a2, a3 = (pose[:, row, side] for row in range(6))
-        if side == 0:
-            np.multiply(xd_x, u_scale, out=a1)
-            np.multiply(cross, u_scale, out=a2)
-            if skew:
-                a1 += skew * inverse * cross
-                a2 += skew * inverse * yd_y
-        else:
-            np.multiply(cross, v_scale, out=a1)
-            np.multiply(yd_y, v_scale, out=a2)
-        np.multiply(x, a1, out=a3)
-        a3 += y * a2
-        np.negative(a3, out=a3)
+        lens.by_point(side, (fx, fy, skew), a1, a2, a3)
         np.multiply(q2, a3, out=turn1)
         turn1 -= q3 * a2
         np.multiply(q3, a1, out=turn2)
@@ -522,27 +751,3 @@ def jacobian(
     if not observations.complete:
         out *= observations.present[:, None, None, :]
     return out.reshape(observations.views, shared + 7, 2 * points)
-
-
-def _by_coefficient(
-    name: str,
-    x: FloatArray,
-    y: FloatArray,
-    xx: FloatArray,
-    yy: FloatArray,
-    xy: FloatArray,
-    r2: FloatArray,
-    over: FloatArray | float,
-    radial: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of (xd, yd) by one distortion coefficient."""
-    if name == "p1":
-        return 2.0 * xy, r2 + 2.0 * yy
-    if name == "p2":
-        return r2 + 2.0 * xx, 2.0 * xy
-    power = {"k1": 1, "k2": 2, "k3": 3, "k4": 1, "k5": 2, "k6": 3}[name]
-    factor = r2 if power == 1 else r2 * r2 if power == 2 else r2 * r2 * r2
-    factor = factor * over
-    if name in ("k4", "k5", "k6"):
-        factor = -factor * radial
-    return x * factor, y * factor

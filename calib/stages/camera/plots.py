@@ -45,7 +45,6 @@ from calib.stages.camera.lens import (
     DistortionReport,
     InversePolynomial,
     displacement_field,
-    distorted_normalised,
     distortion_kind,
     ideal_pixels,
     inverse_error,
@@ -54,7 +53,14 @@ from calib.stages.camera.lens import (
     radial_sigma,
     shown_once,
 )
-from calib.stages.camera.model import Camera, focal_px, fold_radius, undistort, vector_from_camera
+from calib.stages.camera.model import (
+    Camera,
+    distorted_normalised,
+    focal_px,
+    fold_radius,
+    undistort,
+    vector_from_camera,
+)
 from calib.stages.camera.plane import Plane, to_pixels, visible
 
 Size = tuple[int, int]
@@ -524,7 +530,7 @@ def _distortion(fit: Calibration, covariance: Covariance, verdict: str) -> Figur
             "seen."
         )
     marks: tuple[Mark, ...] = ()
-    if np.any(camera.distortion) and _finite(camera):
+    if not camera.ideal and _finite(camera):
         outline = ideal_pixels(camera, hull(pixels))
         marks = (Shape(outline[np.isfinite(outline).all(axis=1)], kind="dashed"),)
     panels = (_map(camera, marks), _along_radius(camera, covariance, pixels))
@@ -543,7 +549,7 @@ def _map(camera: Camera, marks: tuple[Mark, ...]) -> Plot:
     size = camera.image_size_px
     if not _finite(camera):
         return picture(size, (), empty="not bounded")
-    if not np.any(camera.distortion):
+    if camera.ideal:
         return picture(size, marks, empty="no distortion: every point is seen where an ideal lens shows it")
     u, v, pixels = _grid_over(size, 81)
     length = np.linalg.norm(displacement_field(camera, pixels), axis=-1)
@@ -576,9 +582,9 @@ def _along_radius(
     radius = np.linspace(0.0, fold, 241)
     moved = radial_displacement(camera, radius)
     bottom, top = float(moved.min()), float(moved.max())
-    span = max(top - bottom, 1e-3 if np.any(camera.distortion) else 2.0)
+    span = max(top - bottom, 2.0 if camera.ideal else 1e-3)
     title, marks = "Along the radius", list[Mark]((Rule("y", 0.0),))
-    if covariance is not None and np.any(camera.distortion):
+    if covariance is not None and not camera.ideal:
         sigma = radial_sigma(camera, covariance, radius)
         if np.isfinite(sigma).all():
             below, above = moved - 2 * sigma, moved + 2 * sigma

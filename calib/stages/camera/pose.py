@@ -23,8 +23,17 @@ import numpy as np
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
 from calib.core.geometry import apply_homography, fit_homography, grouped_variance
-from calib.stages.camera.model import Camera, undistort
+from calib.stages.camera.model import (
+    INTRINSICS,
+    Block,
+    Camera,
+    Observations,
+    jacobian,
+    undistort,
+    vector_from_camera,
+)
 
+_EVERY_INTRINSIC = np.arange(len(INTRINSICS))
 _MAX_ITERATIONS = 100
 _STEP_PX = 1e-9
 """Where the Gauss-Newton step moves no point by more than this, the minimum is reached."""
@@ -78,13 +87,15 @@ def projection_with_derivatives(
 
     Parameters
     ----------
-    points_C : (M, 3) with positive Z.
+    points_C : (M, 3) with positive Z; a fisheye lens takes any.
 
     Returns
     -------
     Pixels (M, 2), derivatives by the point (M, 2, 3), and by the intrinsics (M, 2, 13) in the order
-    of `projection.INTRINSICS`.
+    of `model.INTRINSICS`; NaN where a point is behind the camera.
     """
+    if camera.fisheye:
+        return _by_jacobian(camera, points_C)
     k1, k2, p1, p2, k3, k4, k5, k6 = camera.distortion
     Z = points_C[:, 2]
     x, y = points_C[:, 0] / Z, points_C[:, 1] / Z
@@ -121,6 +132,21 @@ def projection_with_derivatives(
     by_camera[:, :, 5:] = focal @ lens
     pixels = np.stack([xd, yd], axis=1) @ focal.T + np.array([camera.cx_px, camera.cy_px])
     return pixels, by_point, by_camera
+
+
+def _by_jacobian(camera: Camera, points_C: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The same from the rows of the bundle adjustment."""
+    M = len(points_C)
+    here = Block(vector_from_camera(camera), np.eye(3)[None], np.zeros((1, 3)), np.zeros(0), camera.fisheye)
+    seen = Observations(("",), points_C[None], np.zeros((1, M, 2)), np.ones((1, M), dtype=np.bool_))
+    rows = jacobian(here, seen, _EVERY_INTRINSIC, None)
+    if rows is None:
+        nothing = np.full((M, 2, len(INTRINSICS)), np.nan)
+        return nothing[..., 0], nothing[..., :3], nothing
+    # Intrinsics, rotation, translation, and last the pixels themselves.
+    by = rows[0].reshape(-1, 2, M).transpose(2, 1, 0)
+    count = len(INTRINSICS)
+    return by[..., -1], by[..., count + 3 : count + 6], by[..., :count]
 
 
 def pose_derivatives(

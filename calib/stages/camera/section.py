@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from calib.stages.camera import model as optics
     from calib.stages.camera.lens import InversePolynomial
 
-Model = Annotated[str, Field(pattern="^(pinhole|radial2|radial3|brown5|rational8)$")]
+Model = Annotated[str, Field(pattern="^(pinhole|radial2|radial3|fisheye4|brown5|rational8)$")]
 Focal = Annotated[float, Field(ge=1e-3, le=1e7, allow_inf_nan=False, strict=True)]
 Pixels = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False, strict=True)]
 Coefficient = Annotated[float, Field(ge=-1e30, le=1e30, allow_inf_nan=False, strict=True)]

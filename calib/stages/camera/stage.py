@@ -56,7 +56,7 @@ class IntrinsicsOptions:
         metavar="WxH",
         parse=parse_image_size,
     )
-    model: Literal["auto", "pinhole", "radial2", "radial3", "brown5", "rational8"] = option(
+    model: Literal["auto", "pinhole", "radial2", "radial3", "fisheye4", "brown5", "rational8"] = option(
         "auto", "Lens model; auto compares all on views held back."
     )
     skew: bool | None = option(
@@ -171,7 +171,8 @@ def _optics(camera: model.Camera) -> dict[str, Any]:
     from calib.stages.camera.section import Distortion
 
     named = dict(zip(COEFFICIENTS, camera.distortion.tolist(), strict=True))
-    kept = {n: v for n, v in named.items() if n in (*MODELS["brown5"], *MODELS[camera.model])}
+    usual = () if camera.fisheye else MODELS["brown5"]
+    kept = {n: v for n, v in named.items() if n in (*usual, *MODELS[camera.model])}
     return {
         "model": camera.model,
         "image_size_px": list(camera.image_size_px),

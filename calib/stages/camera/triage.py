@@ -37,7 +37,7 @@ from scipy import special
 from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.stages.camera.bundle import Calibration, joint_jacobian, minimise, poses_with_camera
 from calib.stages.camera.checks import evidence, resolved, scaled_inverse
-from calib.stages.camera.model import Block, LeftOut, Observations, project
+from calib.stages.camera.model import LeftOut, Observations, project
 from calib.stages.camera.verdict import listed
 
 _LEAST_VIEWS = 5
@@ -341,14 +341,14 @@ def _with_all(
         usable = np.isfinite(R).all(axis=(1, 2)) & np.isfinite(t).all(axis=1)
         for i, R_start, t_start in zip(others[usable], R[usable], t[usable], strict=True):
             # One by one: a view that ends behind the camera must not stop the others.
-            start = Block(fit.block.intrinsics, R_start[None], t_start[None], np.zeros(0))
+            start = replace(fit.block, R_CT=R_start[None], t_CT_m=t_start[None], deformation=np.zeros(0))
             found = minimise(start, near.select([i]), np.zeros(0, dtype=np.int64))
             seen[i] = found.at is not None
             R_CT[i], t_CT_m[i] = found.block.R_CT[0], found.block.t_CT_m[0]
     points = everything.target_m @ R_CT.transpose(0, 2, 1) + t_CT_m[:, None]
     residuals = project(fit.camera, points) - everything.pixels
     residuals[~everything.present | ~seen[:, None]] = np.nan
-    block = Block(fit.block.intrinsics, R_CT, t_CT_m, np.zeros(0))
+    block = replace(fit.block, R_CT=R_CT, t_CT_m=t_CT_m, deformation=np.zeros(0))
     return replace(fit, observations=near, block=block, residuals_px=residuals), seen
 
 

@@ -225,12 +225,14 @@ def of_lens(found: Lens, calibration: Calibration, reach: float) -> list[Finding
         inside = found.reach <= 1.0 or found.image_shown < 1.0
         out.append(Finding("poor" if inside else "remark", text, _IN_CORNERS))
     focal = min(camera.fx_px, camera.fy_px)
-    if not 0.25 * width < focal < 30 * width:
+    # A fisheye lens of 0.16 shows all directions within the width; its circle may be smaller than that.
+    shortest = 0.1 if camera.fisheye else 0.25
+    if not shortest * width < focal < 30 * width:
         text = (
             f"The focal length of {focal:.1f} px is {focal / width:.2f} times the picture's width; "
-            "lenses that this model suits have 0.25 to 30."
+            f"lenses that this model suits have {shortest:g} to 30."
         )
-        free = not 0.15 * width < focal < 100 * width
+        free = not 0.6 * shortest * width < focal < 100 * width
         out.append(Finding("unidentifiable" if free else "poor", text, MORE_TILT))
     return out
 

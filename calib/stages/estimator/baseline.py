@@ -65,7 +65,7 @@ def undistorting_nothing(
 
     Parameters
     ----------
-    view : (24,) of `sensors.view_coefficients`.
+    view : (25,) of `sensors.view_coefficients`.
 
     Raises `BadInputError` where the camera does not see enough of the workspace.
     """

@@ -11,7 +11,7 @@ from numba import njit
 from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.core.errors import BadInputError
 from calib.stages.actuator.kinematics import chord_ratio_w
-from calib.stages.camera.model import Camera, undistort
+from calib.stages.camera.model import FISHEYE, Camera, undistort
 from calib.stages.estimator.kinematic import Rows, Setup
 from calib.stages.estimator.sensors import marker
 
@@ -223,7 +223,8 @@ def tick_noise(setup: Setup) -> TickNoise:
 def _camera_of(view: FloatArray) -> tuple[Camera, FloatArray]:
     """The camera of `sensors.view_coefficients`, and the homography (3, 3) from its rays to the plane."""
     fx, fy, skew, cx, cy = (float(value) for value in view[9:14])
-    camera = Camera("rational8", (1, 1), fx, fy, skew, cx, cy, np.asarray(view[14:22], dtype=np.float64))
+    model = FISHEYE if view[24] else "rational8"
+    camera = Camera(model, (1, 1), fx, fy, skew, cx, cy, np.asarray(view[14:22], dtype=np.float64))
     return camera, np.asarray(np.linalg.inv(view[:9].reshape(3, 3).T), dtype=np.float64)
 
 

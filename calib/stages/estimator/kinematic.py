@@ -966,7 +966,7 @@ def event(
     z, gated : (n, 3) each, of which `row` counts: readings, and 1 where camera, accelerometer or gyroscope is
         not used.
     switch_hz, levels, walk : of `model.Kinematic`, (n, M, 8) levels of which [k] counts.
-    view, constants, noise : camera (24,), gravity and lever across (2,), `NOISE` (11,).
+    view, constants, noise : camera (25,), gravity and lever across (2,), `NOISE` (11,).
     told : (M, `expect.TOLD`) scratch.
     again : whether the event is done once more; then `gated` holds.
     report : (12,) of `REPORT`, written to.
@@ -1071,7 +1071,7 @@ class Setup:
 
     Attributes
     ----------
-    view : (24,) of `sensors.view_coefficients`; without a camera any.
+    view : (25,) of `sensors.view_coefficients`; without a camera any.
     noise : (11,) of `kernel.NOISE`.
     start : prior. `sensor[7]`, the time offset, is the delay of the pictures.
     bellows_radius_m : r_B.

@@ -329,7 +329,7 @@ def setup_from_rig(rig: Rig, path: Path, found: Periods) -> tuple[Setup, list[st
     source = shown(path)
     said: list[str] = []
     workspace = (rig.geometry or Geometry()).workspace_m
-    view = np.zeros(24)
+    view = np.zeros(25)
     if found.camera:
         plane = rig.current_plane(str(path))
         if rig.camera is None:

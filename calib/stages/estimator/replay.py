@@ -126,7 +126,7 @@ def compile_filters(driven: bool, smoothed: bool) -> None:
     readings[:, 2:] = 9.81, 0.0, 0.0
     rows, pwm = Rows(np.array([0.0, 0.01, 0.02]), readings, np.full(3, 2)), np.full((3, 2), np.nan)
     start = Start(np.zeros(len(SENSOR)), np.ones(len(SENSOR)))
-    setup = Setup(np.ones(24), np.ones(len(NOISE)), start, 0.02)
+    setup = Setup(np.ones(25), np.ones(len(NOISE)), start, 0.02)
     if driven:
         out = DrivenFilter(setup, Drive()).run(rows, pwm)
         if smoothed:

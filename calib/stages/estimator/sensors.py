@@ -200,7 +200,7 @@ _E_SERIES = _slope_series()
 def view_coefficients(
     camera: Camera, R_CW: FloatArray, t_CW_m: FloatArray, middle_m: tuple[float, float] = (0.0, 0.08)
 ) -> FloatArray:
-    """Camera and plane as the (24,) numbers that `marker` takes.
+    """Camera and plane as the (25,) numbers that `marker` takes.
 
     Parameters
     ----------
@@ -209,7 +209,7 @@ def view_coefficients(
     """
     R = np.asarray(R_CW, dtype=np.float64)
     lens = [camera.fx_px, camera.fy_px, camera.skew_px, camera.cx_px, camera.cy_px]
-    parts = [R[:, 0], R[:, 1], np.asarray(t_CW_m, dtype=np.float64), lens, camera.distortion, middle_m]
+    parts = [R[:, 0], R[:, 1], t_CW_m, lens, camera.distortion, middle_m, [float(camera.fisheye)]]
     return np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
 
 
@@ -226,6 +226,33 @@ def head_position(phi: float, length: float) -> tuple[float, float]:
 
 
 @compiled()
+def _fisheye_pixel(
+    view: FloatArray, p1: float, p2: float, p3: float
+) -> tuple[float, float, float, float, float, float]:
+    """The same by a fisheye lens (`calib.stages.camera.model`) at (p1, p2, p3) of the camera's frame."""
+    fx, fy, skew, cx, cy = view[9], view[10], view[11], view[12], view[13]
+    k1, k2, k3, k4 = view[14], view[15], view[18], view[19]
+    rho = max(math.hypot(p1, p2), 1e-9 * p3)
+    theta, d2 = math.atan2(rho, p3), rho * rho + p3 * p3
+    t2 = theta * theta
+    m = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) / rho
+    slope = 1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))
+    bend, along = (slope * p3 / d2 - m) / (rho * rho), -slope / d2
+    radial_X, radial_Y = p1 * view[0] + p2 * view[1], p1 * view[3] + p2 * view[4]
+    m_X, m_Y = bend * radial_X + along * view[2], bend * radial_Y + along * view[5]
+    xd_X, xd_Y = m * view[0] + p1 * m_X, m * view[3] + p1 * m_Y
+    yd_X, yd_Y = m * view[1] + p2 * m_X, m * view[4] + p2 * m_Y
+    return (
+        fx * p1 * m + skew * p2 * m + cx,
+        fy * p2 * m + cy,
+        fx * xd_X + skew * yd_X,
+        fx * xd_Y + skew * yd_Y,
+        fy * yd_X,
+        fy * yd_Y,
+    )
+
+
+@compiled()
 def _pixel(view: FloatArray, X: float, Y: float) -> tuple[float, float, float, float, float, float]:
     """Distorted pixel of a place in the plane and its derivatives: u, v, u_X, u_Y, v_X, v_Y.
 
@@ -236,6 +263,8 @@ def _pixel(view: FloatArray, X: float, Y: float) -> tuple[float, float, float, f
     p3 = view[2] * X + view[5] * Y + view[8]
     if not p3 > 0.0:
         return math.nan, math.nan, math.nan, math.nan, math.nan, math.nan
+    if view[24] != 0.0:
+        return _fisheye_pixel(view, p1, p2, p3)
     inverse = 1.0 / p3
     x, y = p1 * inverse, p2 * inverse
     x_X, x_Y = (view[0] - x * view[2]) * inverse, (view[3] - x * view[5]) * inverse
@@ -276,7 +305,7 @@ def marker_terms(
 
     Parameters
     ----------
-    view : (24,) of `view_coefficients`.
+    view : (25,) of `view_coefficients`.
     phi .. ddl : motion of the head. d : the marker's offset. late : the time offset.
     """
     dphi, dl = dphi - late * ddphi, dl - late * ddl
@@ -312,7 +341,7 @@ def marker(view: FloatArray, state: FloatArray, by_u: FloatArray, by_v: FloatArr
 
     Parameters
     ----------
-    view : (24,) of `view_coefficients`.
+    view : (25,) of `view_coefficients`.
     state : (19,) of `HEAD` and `SENSOR`.
     by_u, by_v : (19,) gradients, written to.
     """

@@ -16,7 +16,7 @@ from calib.stages.actuator.kinematics import MARKER_OFFSET_M, inverse_coefficien
 from calib.stages.actuator.parameters import LONGEST_ELONGATION_M, Plant
 from calib.stages.actuator.pump import PWM_MAX, ElongationForce
 from calib.stages.actuator.section import standing
-from calib.stages.camera.model import Camera, project
+from calib.stages.camera.model import FISHEYE, Camera, project
 from calib.stages.camera.section import InverseLens
 from calib.stages.control.laws import PWM_MIN, FeedForward, Pid
 from calib.stages.control.section import OrientationGains, StaticMap
@@ -333,7 +333,9 @@ def _plane_groups(plane: PlaneConstants) -> list[Group]:
 def camera_groups(camera: CameraConstants) -> tuple[Group, ...]:
     """Camera, lens and plane as groups of the header."""
     width, height = camera.image_size_px
-    lens = any(value != 0.0 for name, value in camera.intrinsics.items() if not name.endswith("_px"))
+    lens = camera.model == FISHEYE or any(
+        value != 0.0 for name, value in camera.intrinsics.items() if not name.endswith("_px")
+    )
     rows = [
         Constant(
             f"CALIB_CAMERA_{name.upper()}",
