@@ -21,7 +21,7 @@ OutOption = Annotated[
 ]
 SchedulerOption = Annotated[
     str | None,
-    typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler to work on, as tcp://host:8786."),
+    typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler to work on, as tls://host:8786."),
 ]
 WorkersOption = Annotated[
     int | None,

@@ -40,6 +40,17 @@ def fleet(
             "--timeout", metavar="TIME", help="The most time that a rig gets; one that needs more is a row."
         ),
     ] = "1h",
+    allow_scheme: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--allow-scheme",
+            metavar="SCHEME",
+            help="Kind of URL to fetch beside file, gs, https and s3, as http; may be repeated.",
+        ),
+    ] = None,
+    allow_private: Annotated[
+        bool, typer.Option("--allow-private", help="Fetch from servers of private networks, too.")
+    ] = False,
     pages: Annotated[bool, typer.Option("--pages", help="Make the page of each rig as well.")] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -51,7 +62,7 @@ def fleet(
     from calib.core.files import shown
     from calib.core.units import parse_duration_s
     from calib.runner.fleet import check_apart, finish, run_fleet
-    from calib.runner.task import FleetOptions, read_manifest, twice_told
+    from calib.runner.task import SCHEMES, Allowed, FleetOptions, read_manifest, twice_told
     from calib.show.fleet import PAGE, write_fleet_page
 
     check_places(scheduler, workers)
@@ -63,7 +74,7 @@ def fleet(
         narrate(f"{shown(manifest)}: {sentence}")
     check_apart(output, known.rigs)
     with opened_out(output, "calib fleet", ("fleet.parquet", PAGE)) as store:
-        options = FleetOptions(pages=pages)
+        options = FleetOptions(pages, allowed=Allowed((*SCHEMES, *(allow_scheme or ())), allow_private))
         with processes(store, scheduler, workers, retries) as cluster, progress_bar("rigs") as progress:
             counts = run_fleet(store, cluster, known, options, retries, progress, narrate, limit_s)
         summary = finish(store, known)

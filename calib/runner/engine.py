@@ -117,6 +117,10 @@ def _nowhere() -> int:
 # measured for the process; its scheduler lives in this process and keeps short logs, so that its memory
 # does not grow with the number of tasks. A process that dies is started again by its nanny. When this
 # process dies, however it dies, the others follow it.
+#
+# Who may talk to a scheduler may run code as the user that started it, and it listens on a port that every
+# user of this machine can reach. So both ends show a certificate that is made for this run and is not
+# written down, and there are no information pages.
 
 _CONNECT_S = 10.0
 _SHORT_LOG = 100
@@ -236,6 +240,9 @@ def _settings(retries: int) -> Iterator[None]:
         "distributed.diagnostics.computations.max-history": 1,
         "distributed.diagnostics.erred-tasks.max-history": 1,
         "distributed.worker.profile.enabled": False,
+        "distributed.scheduler.http.routes": [],
+        "distributed.worker.http.routes": [],
+        "distributed.nanny.http.routes": [],
         # A long solve may hold the interpreter for a while; a process that died is noticed by its connection.
         "distributed.scheduler.worker-ttl": "1 hour",
         "distributed.comm.timeouts.connect": f"{_CONNECT_S:g}s",
@@ -247,6 +254,7 @@ def _settings(retries: int) -> Iterator[None]:
 @contextmanager
 def _local(workers: int, scratch: Path) -> Iterator[tuple[Any, Any]]:
     distributed = needed("distributed")
+    needed("cryptography")
     shutil.rmtree(scratch, ignore_errors=True)
     make_folder(scratch)
     options: dict[str, Any] = {
@@ -254,9 +262,12 @@ def _local(workers: int, scratch: Path) -> Iterator[tuple[Any, Any]]:
         "threads_per_worker": 1,
         "processes": True,
         "host": "127.0.0.1",
-        # Without a place the information pages listen on all of the machine's addresses.
+        "protocol": "tls://",
+        "security": distributed.security.Security.temporary(),
+        # Without a place the information pages' server takes the port that all know.
         "dashboard_address": "127.0.0.1:0",
-        "worker_dashboard_address": "127.0.0.1:0",
+        "scheduler_kwargs": {"dashboard": False},
+        "worker_dashboard_address": None,
         "local_directory": str(scratch),
         "silence_logs": logging.CRITICAL + 1,
     }
@@ -298,6 +309,11 @@ def _existing(address: str) -> Iterator[Cluster]:
                 f"{told}: the workers cannot run calib {__version__}: {_words(error)}; install it there"
             ) from error
         remarks = check_survey(found, survey())
+        if not address.startswith("tls://"):
+            remarks += (
+                f"{told}: whoever reaches this scheduler can run any program on it and on its workers; use "
+                "tls:// with certificates where others share the network",
+            )
         several = [name for name, threads in cluster.processes().items() if threads > 1]
         if several:
             remarks += (

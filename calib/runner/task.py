@@ -6,12 +6,15 @@ import contextlib
 import csv
 import importlib
 import io
+import ipaddress
 import json
 import math
 import platform
 import re
+import socket
 import tempfile
 import time
+import urllib.parse
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache, partial
@@ -375,7 +378,14 @@ def from_json(text: str) -> Outcome | None:
 # What a server calls its files is not trusted: a name that leads out of the folder is refused, only files
 # that a rig folder can hold are fetched, and their number and size are limited. A fault on the way is
 # tried again; a file that is not there is not.
+#
+# A manifest may come from elsewhere. So a URL is of a scheme that is known to fetch and to do nothing
+# else, or of one that a person allows; and a server of a private network, which this machine reaches and
+# the manifest's author perhaps does not, is asked only where a person says so. Redirections are not
+# followed.
 
+SCHEMES = ("file", "gs", "https", "s3")
+"""What may be fetched unasked."""
 MOST_BYTES = 4_000_000_000
 _MOST_FILES = 20_000
 _PIECE = 1 << 20
@@ -385,10 +395,46 @@ _FINAL = (FileNotFoundError, NotADirectoryError, IsADirectoryError, PermissionEr
 """Another attempt would end in the same; the last is fsspec's for what a kind of URL cannot do."""
 
 
-def local_folder(source: str, scratch: Path, attempts: int, most_bytes: int = MOST_BYTES) -> Path:
+@dataclass(frozen=True)
+class Allowed:
+    """Schemes of URLs that are fetched, and whether servers of private networks are asked."""
+
+    schemes: tuple[str, ...] = SCHEMES
+    private: bool = False
+
+
+def check_url(url: str, allowed: Allowed) -> None:
+    """Raise `BadInputError` for a URL that is not to be fetched."""
+    told = without_secrets(url)
+    # fsspec lets one system stand on another: zip://a::https://b.
+    schemes = [part.partition("://")[0].lower() for part in url.split("::")]
+    for scheme in schemes:
+        if scheme not in allowed.schemes:
+            known = one_line(scheme)[:40]
+            raise BadInputError(
+                f"{told}: is of the scheme {known}, expected {', '.join(allowed.schemes)}; allow it with "
+                f"--allow-scheme {known}"
+            )
+    if allowed.private or not {"http", "https"} & set(schemes):
+        return
+    try:
+        found = socket.getaddrinfo(urllib.parse.urlsplit(url).hostname, None)
+    except (OSError, ValueError) as error:
+        raise BadInputError(f"{told}: its server is not known: {_words(error)}") from error
+    if not all(ipaddress.ip_address(one[4][0]).is_global for one in found):
+        raise BadInputError(f"{told}: its server is in a private network; allow that with --allow-private")
+
+
+def local_folder(
+    source: str,
+    scratch: Path,
+    attempts: int,
+    most_bytes: int = MOST_BYTES,
+    allowed: Allowed = Allowed(),
+) -> Path:
     """The rig's folder: the path itself, or `scratch` with what was fetched.
 
-    Raises `BadInputError` for a folder that is not there or cannot be had.
+    Raises `BadInputError` for a folder that is not there, cannot be had, or is not to be fetched.
     """
     if not is_url(source):
         root = Path(source)
@@ -396,12 +442,15 @@ def local_folder(source: str, scratch: Path, attempts: int, most_bytes: int = MO
             what = "is a file" if root.exists() else "is not there"
             raise BadInputError(f"{shown(root)}: {what}, expected the rig's folder")
         return root
+    check_url(source, allowed)
     return _fetched(source, scratch, attempts, most_bytes)
 
 
 def _fetched(url: str, scratch: Path, attempts: int, most_bytes: int) -> Path:
     try:
-        system, root = needed("fsspec.core").url_to_fs(url)
+        # Where a server sends one on to was not looked at.
+        words = {"allow_redirects": False} if url.lower().startswith("http") else {}
+        system, root = needed("fsspec.core").url_to_fs(url, **words)
     except ImportError as error:
         raise BadInputError(
             f"{without_secrets(url)}: needs a package that is not here: {_words(error)}"
@@ -623,12 +672,13 @@ class FleetOptions:
     Attributes
     ----------
     pages : whether each rig's page is made and brought back.
-    attempts : to fetch a file. most_bytes : of a folder that is fetched.
+    attempts : to fetch a file. most_bytes : of a folder that is fetched. allowed : what may be fetched.
     """
 
     pages: bool = False
     attempts: int = 3
     most_bytes: int = MOST_BYTES
+    allowed: Allowed = Allowed()
 
 
 @dataclass(frozen=True)
@@ -677,7 +727,7 @@ def _failed(blank: Outcome, code: int, sentence: str) -> Answer:
 
 
 def _calibrated(spec: RigSpec, options: FleetOptions, known: str, place: Path, blank: Outcome) -> Answer:
-    root = local_folder(spec.source, place / "fetched", options.attempts, options.most_bytes)
+    root = local_folder(spec.source, place / "fetched", options.attempts, options.most_bytes, options.allowed)
     folder = rig_folder(root)
     kind = kind_of(folder)
     inputs = {folder.name_of(path): digest for path, digest in folder_digests(folder).items()}

@@ -7,8 +7,10 @@ import socket
 import subprocess
 import sys
 import threading
+import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
+from http.client import HTTPException
 from pathlib import Path
 
 import numpy as np
@@ -176,6 +178,34 @@ def test_nobody_at_the_address(
         with pytest.raises(BadInputError, match=said), connected(where, 1, tmp_path / "w", 1):
             pass
     assert not (tmp_path / "w").exists()
+
+
+def test_a_stranger_on_this_machine_cannot_enter_the_local_cluster(tmp_path: Path) -> None:
+    """Not without encryption, not with a certificate of his own; and no page tells of it."""
+    import psutil
+    from distributed import Client
+    from distributed.security import Security
+
+    def listening() -> set[int]:
+        here = psutil.Process()
+        sockets = [
+            one for process in (here, *here.children(recursive=True)) for one in process.net_connections()
+        ]
+        return {one.laddr.port for one in sockets if one.status == psutil.CONN_LISTEN}
+
+    before = listening()
+    with connected(None, 1, tmp_path / "w", 1) as ours:
+        address = ours.client.scheduler.address
+        assert address.startswith("tls://127.0.0.1:")
+        assert ours.client.submit(len, "abc").result(timeout=20) == 3
+        for port in listening() - before:
+            for page in ("", "status", "info/main/workers.html", "json/counts.json", "metrics", "health"):
+                with pytest.raises((OSError, HTTPException)):
+                    urllib.request.urlopen(f"http://127.0.0.1:{port}/{page}", timeout=2)
+        strangers = ((address.replace("tls", "tcp"), None), (address, Security.temporary()))
+        for where, security in strangers:
+            with pytest.raises((OSError, TimeoutError)):
+                Client(where, security=security, timeout=3, set_as_default=False)
 
 
 def _verbs(tmp_path: Path, *commands: tuple[str, ...]) -> bytes:
