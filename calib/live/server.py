@@ -14,6 +14,7 @@ import hmac
 import json
 import secrets
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -48,6 +49,7 @@ _MOST_WORDS = 2_000
 _MOST_TABS = 6
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 _PREVIEW_PX = 800
+_SWITCH_S = 0.0005
 _SHOT_S = 5.0
 """How long a page may take to send the whole picture that it was asked for."""
 
@@ -58,6 +60,7 @@ class _Tab:
 
     socket: WebSocket
     sending: asyncio.Lock = field(default_factory=asyncio.Lock)
+    size_px: tuple[int, int] | None = None
     shot_until: float = 0.0
     by_hand: bool = False
 
@@ -90,6 +93,7 @@ class Live:
         self._fitting = ThreadPoolExecutor(1, "fit")
         self._wanted, self._fits = 0, 0
         self._by_hand = False
+        self._known: tuple[Any, Any] = (None, None)
         self._saved = ""
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -151,6 +155,13 @@ class Live:
                 raise
         return name
 
+    async def _learnt(self) -> None:
+        """Where a frame has told the size of the picture or of the board, the outline is another one."""
+        learnt = self.session.size_px, self.session.corners
+        if learnt != self._known:
+            self._known = learnt
+            await self.tell_all(self.state())
+
     async def _taken(self, png: bytes, by_hand: bool) -> None:
         try:
             name = await self._in(self._looking, self._take, png, by_hand)
@@ -200,6 +211,7 @@ class Live:
             if frame is None:
                 continue
             seen = await self._in(self._looking, self._look, frame, None, self.source.single)
+            await self._learnt()
             preview = await asyncio.to_thread(_preview, frame)
             for tab in list(self._tabs):
                 await tab.show(preview)
@@ -248,6 +260,7 @@ class Live:
         what = asked.get("do") if isinstance(asked, dict) else None
         name = str(asked.get("name", "")) if isinstance(asked, dict) else ""
         if what == "camera":
+            tab.size_px = _size_px(asked.get("size"))
             await self._lend(tab)
         elif what == "take":
             if self.source is not None:
@@ -289,7 +302,8 @@ class Live:
             if frame is None:
                 await tab.tell({"type": "fault", "says": "A frame cannot be decoded."})
                 return
-            seen = await self._in(self._looking, self._look, frame, None, False)
+            seen = await self._in(self._looking, self._look, frame, tab.size_px, False)
+            await self._learnt()
             for other in list(self._tabs):
                 await other.tell(_seen(seen))
                 if other is not tab:
@@ -375,6 +389,9 @@ class Live:
             ws="websockets-sansio", ws_max_size=MOST_BYTES, lifespan="on", timeout_graceful_shutdown=1,
         )  # fmt: skip
         server = uvicorn.Server(config)
+        # A frame is to be answered while pictures are fitted in the next thread.
+        usual = sys.getswitchinterval()
+        sys.setswitchinterval(_SWITCH_S)
         # In a thread of its own it leaves Ctrl-C to the command.
         thread = threading.Thread(target=server.run, args=([listener],), daemon=True)
         thread.start()
@@ -391,6 +408,7 @@ class Live:
             self._looking.shutdown(cancel_futures=True)
             self._fitting.shutdown()
             listener.close()
+            sys.setswitchinterval(usual)
 
 
 class Guard:
@@ -430,6 +448,14 @@ class Guard:
             return 405
         first = str(scope["path"]).split("/")[1] if str(scope["path"]).startswith("/") else ""
         return None if hmac.compare_digest(first.encode(), self._token.encode()) else 404
+
+
+def _size_px(size: Any) -> tuple[int, int] | None:
+    """Width and height of a page's camera, as far as they can be that."""
+    if not (isinstance(size, list) and len(size) == 2 and all(isinstance(side, int) for side in size)):
+        return None
+    width, height = size
+    return (width, height) if min(size) >= 8 and width * height <= MOST_PIXELS else None
 
 
 def _with_headers(send: Send) -> Send:

@@ -52,6 +52,8 @@ _LIBRARIES = (
 _EXTRAS = (
     ("mcap", "mcap", f"logs and states in MCAP: {pip_install('logs')}"),
     ("rosbags", "rosbags", f"logs in ROS bags: {pip_install('logs')}"),
+    ("uvicorn", "uvicorn", f"calib live: {pip_install('live')}"),
+    ("starlette", "starlette", f"calib live: {pip_install('live')}"),
     ("pyserial", "serial", f"calib record: {pip_install('serial')}"),
     ("ahrs", "ahrs", f"filters of others in calib imu drift: {pip_install('peers')}"),
     ("imufusion", "imufusion", f"filters of others in calib imu drift: {pip_install('peers')}"),

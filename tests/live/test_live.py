@@ -192,6 +192,25 @@ def test_rig_yaml_is_what_intrinsics_writes(tmp_path: Path, project_root: Path) 
         source_of(str(rig / "images"), rig / "images")
 
 
+def test_a_video_is_looked_at_as_a_camera_would_be(tmp_path: Path) -> None:
+    person = Person(np.random.default_rng(0))
+    video = cv2.VideoWriter(
+        str(tmp_path / "board.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 20, CAMERA.image_size_px
+    )
+    for pose in follow_some(person, 3):
+        frame = cv2.cvtColor(person.frame(pose), cv2.COLOR_GRAY2BGR)
+        for _ in range(24):
+            video.write(frame)
+    video.release()
+    with served(tmp_path / "rig", source_of(str(tmp_path / "board.avi"), tmp_path)) as live:
+        with tab(live) as line:
+            assert heard(line, "state")["source"] == "here"
+            heard(line, "taken")
+            assert "has ended" in heard(line, "camera")["fault"]
+        wait(lambda: not live.state()["fitting"])
+        assert len(live.album.names()) == 3
+
+
 # ----------------------------------------------------------------------
 # The server.
 
@@ -307,17 +326,21 @@ def test_a_page_sends_frames_and_what_is_too_large_is_refused(tmp_path: Path) ->
     with served(tmp_path / "rig") as live, tab(live) as line, tab(live) as second:
         heard(line, "state")
         line.send(jpeg(person.frame(pose)))
-        line.send('{"do": "camera"}')
+        line.send('{"do": "camera", "size": [640, 480]}')
         for _ in range(30):
             line.send(jpeg(person.frame(pose)))
             got = heard(line, "seen")
             if got["code"] == "taken":
                 break
         assert got["code"] == "taken" and len(got["corners"]) == BOARD.rows
+        # Frames are half as large as the picture.
+        assert np.max(got["corners"]) > 330 and live.state()["size"] == (640, 480)
         heard(line, "shoot")
-        line.send(png(person.frame(pose)))
+        line.send(png(cv2.resize(person.frame(pose), (640, 480))))
         assert heard(second, "taken")["name"] == "view001.png"
         assert live.album.names() == ["view001.png"]
+        line.send(jpeg(person.frame(pose)))
+        assert heard(line, "seen")["code"] == "alike"
         # A picture that nobody asked for is none.
         line.send(png(person.frame(pose)))
         line.send('{"do": "nonsense"}')
