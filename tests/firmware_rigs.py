@@ -147,10 +147,15 @@ def _lowpass() -> dict[str, Any]:
 def rig(kind: str = "nominal") -> Rig:
     """A rig with camera and plane; "full" with every section, "levelling" the same with that angle filter.
 
-    "fused" has what that estimator needs, "twin" the same with the sensors of the nominal simulated rig.
+    "fisheye" has a lens of 110 degrees. "fused" has what that estimator needs, "twin" the same with
+    the sensors of the nominal simulated rig.
     """
     camera = _camera()
     sections: dict[str, Any] = {"camera": camera, "plane": _plane(camera)}
+    if kind == "fisheye":
+        lens = {"k1": 0.03, "k2": -0.01, "k3": 0.004, "k4": -0.001}
+        camera = _camera(model="fisheye4", distortion=lens, fx_px=164.0, fy_px=164.5)
+        sections = {"camera": camera, "plane": _plane(camera)}
     if kind == "fused":
         sections |= {"align": {**_align(), "time_offset_s": 0.025}, "estimator": _estimator(0.025)}
     if kind == "twin":

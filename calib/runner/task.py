@@ -69,7 +69,7 @@ OPTIONS = ("corners", "square", "model", "loss", "board")
 """What may differ from rig to rig."""
 
 _CHOICES = {
-    "model": ("auto", "pinhole", "radial2", "radial3", "brown5", "rational8"),
+    "model": ("auto", "pinhole", "radial2", "radial3", "fisheye4", "brown5", "rational8"),
     "loss": ("none", "huber", "cauchy"),
     "board": ("rigid", "warp", "released", "auto"),
 }

@@ -28,6 +28,7 @@ from calib.stages.control.laws import Pid, PidState, step
 from calib.stages.estimator.constant_gain import design, tick_noise
 from calib.stages.estimator.kinematic import Setup, Start
 from calib.stages.estimator.sensors import sensor_values, view_coefficients
+from calib.stages.firmware.conformance import Reference
 from calib.stages.firmware.constants import (
     MIDDLE_M,
     Lookup,
@@ -201,6 +202,20 @@ def test_both_ways_through_the_plane_find_the_world() -> None:
     assert made.from_raw is not None
     raw, _ = _mapped(made.from_raw, pixels)
     assert 1e-5 < np.abs(raw - world).max() < 1.2 * made.raw_error_m
+
+
+def test_a_fisheye_lens_is_undone_over_the_workspace() -> None:
+    """By the header's polynomial alone, to a hundredth of a pixel of the ideal picture."""
+    made, section = header_of(rig("fisheye"), "rig.yaml"), rig("fisheye").camera
+    assert section is not None
+    assert made.verdict.word == "ok", made.verdict.reasons
+    reference = Reference(made.values)
+    assert reference.undistort
+    camera, (world, _) = section.optics, _points()
+    R, t = np.array(PLANE.R_CW), np.array(PLANE.t_m)
+    rays = world @ R[:, :2].T + t
+    found = np.array([reference.undistorted(u, v) for u, v in project(camera, rays)])
+    assert 164.5 * np.abs(found - rays[:, :2] / rays[:, 2:]).max() < 0.01
 
 
 def test_an_alignments_shift_and_stretch_are_undone() -> None:

@@ -66,7 +66,7 @@ from calib.twin.rig import SimulatedRig
 from calib.twin.simulate import simulate
 
 
-@pytest.fixture(scope="module", params=["nominal", "full", "levelling"])
+@pytest.fixture(scope="module", params=["nominal", "full", "levelling", "fisheye"])
 def built(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Header, list[str], Path]:

@@ -125,9 +125,13 @@ def _times_radial(radial: tuple[float, ...], x: AnyArray, y: AnyArray) -> tuple[
 
 
 def exact_inverse(camera: Camera, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Normalised undistorted coordinates (M, 2) by Newton's method, and which pixels have them (M,)."""
+    """Normalised undistorted coordinates (M, 2) by Newton's method, and which pixels have them (M,).
+
+    Of a fisheye lens those up to 75 degrees from the axis.
+    """
     ideal = undistort(camera, pixels)
-    return ideal, np.asarray(np.isfinite(ideal).all(axis=1))
+    most = _STEEPEST if camera.fisheye else np.inf
+    return ideal, np.asarray(np.isfinite(ideal).all(axis=1) & (np.hypot(*ideal.T) < most))
 
 
 def fit_inverse(camera: Camera, tolerance_px: float = 0.01) -> InversePolynomial:
@@ -139,8 +143,6 @@ def fit_inverse(camera: Camera, tolerance_px: float = 0.01) -> InversePolynomial
     width, height = camera.image_size_px
     pixels = pixel_grid(camera.image_size_px, (-0.5, -0.5, width - 0.5, height - 0.5)).reshape(-1, 2)
     ideal, seen = exact_inverse(camera, pixels)
-    if camera.fisheye:
-        seen &= np.hypot(*ideal.T) < _STEEPEST
     p1, p2 = float(camera.distortion[2]), float(camera.distortion[3])
     covered = float(np.mean(seen))
     best = InversePolynomial((), p1, p2, 0, np.inf, covered, tolerance_px)

@@ -638,7 +638,7 @@ def _inverse(camera: Camera, inverse: InversePolynomial) -> Figure:
     most, asked = number(inverse.max_error_px, "px"), number(inverse.tolerance_px, "px", 1)
     note = (
         f"{count} radial coefficient{'' if count == 1 else 's'}; largest error {most} where {asked} is asked "
-        f"for, over the {100 * inverse.covered:.0f} % of the picture that the lens model can show."
+        f"for, over the {100 * inverse.covered:.0f} % of the picture that can be undone."
     )
     u, v, pixels = _grid_over(size, 121)
     error = inverse_error(camera, inverse, pixels.reshape(-1, 2))
