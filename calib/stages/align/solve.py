@@ -1121,6 +1121,8 @@ _SHORT_S = 3.0
 _JITTER_PX = 1.5
 _REPEATS = 0.25
 """On good logs of seven rigs, wrong plants and noise twice as large among them, .07 at most."""
+_REPEATS_PX = 0.1
+"""Root mean square of what is beyond half a pixel from which on it says something."""
 _FACTOR, _NO_FACTOR = 0.2, 0.5
 _BEYOND_PRIOR = 4.0
 _NOTHING_LEARNT = 0.8
@@ -1163,15 +1165,18 @@ def _data(found: Alignment) -> Iterator[Finding]:
 def repeating(found: Alignment) -> float:
     """How much residuals of pictures repeat from one to the next: the larger correlation of u and v.
 
-    Whole pixels repeat at rest, by half of one at most, which does not count; nor do outliers.
+    Whole pixels repeat at rest, by half of one at most, which does not count; nor do outliers, nor what is
+    hardly more.
     """
-    sums = np.zeros((2, 2))
+    sums, count = np.zeros((2, 2)), 0
     for trace in found.traces:
         e = np.where(trace.good.astype(bool)[:, None], trace.camera_after, np.nan)
         beyond = np.sign(e) * np.maximum(np.abs(e) - 0.5, 0.0)
         sums[0] += np.nansum(beyond[1:] * beyond[:-1], axis=0)
         sums[1] += np.nansum(beyond**2, axis=0)
-    return float(np.max(sums[0] / np.maximum(sums[1], 1e-12)))
+        count += int(np.isfinite(beyond[:, 0]).sum())
+    matters = sums[1] > max(count, 1) * _REPEATS_PX**2
+    return float(np.max(np.where(matters, sums[0] / np.maximum(sums[1], 1e-12), 0.0)))
 
 
 def _contradicted(found: Alignment) -> Iterator[Finding]:
