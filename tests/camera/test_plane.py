@@ -53,6 +53,10 @@ SKEWED = Camera(
     236.0,
     np.array([-0.28, 0.09, 1.3e-3, -9e-4, 0.02, 0, 0, 0]),
 )
+FISHEYE = Camera(
+    "fisheye4", (316, 208), 121.0, 121.5, 0.3, 157.5, 103.5, np.array([0.03, -0.01, 0, 0, 4e-3, -1e-3, 0, 0])
+)
+"""150 degrees wide."""
 IDEAL = Camera("pinhole", (316, 208), 273.66, 270.0, 0.4, 157.5, 103.5)
 BOARD = Board(7, 5, 0.02)
 R_TRUE = rotation(np.array([0.3, -0.2, 0.1]))
@@ -65,7 +69,7 @@ def picture(camera: Camera, noise_px: float = 0.0, seed: int = 0, angle_rad: flo
     return View(f"{seed}", world, pixels + np.random.default_rng(seed).normal(0.0, noise_px, pixels.shape))
 
 
-@pytest.mark.parametrize("camera", [THESIS, SKEWED, IDEAL], ids=["thesis", "skewed brown5", "pinhole"])
+@pytest.mark.parametrize("camera", [THESIS, SKEWED, IDEAL, FISHEYE], ids=lambda camera: str(camera.model))
 def test_exact_pixels_give_the_plane_back(camera: Camera) -> None:
     plane = calibrate_plane(camera, None, [picture(camera)])
     assert np.abs(plane.R_CW - R_TRUE).max() < 1e-12
@@ -77,7 +81,7 @@ def test_exact_pixels_give_the_plane_back(camera: Camera) -> None:
     assert plane.verdict.word == "ok"
 
 
-@pytest.mark.parametrize("camera", [THESIS, SKEWED, IDEAL], ids=["thesis", "skewed brown5", "pinhole"])
+@pytest.mark.parametrize("camera", [THESIS, SKEWED, IDEAL, FISHEYE], ids=lambda camera: str(camera.model))
 def test_there_and_back_is_exact(camera: Camera) -> None:
     plane = calibrate_plane(camera, None, [picture(camera, 0.2)])
     x, y = np.meshgrid(np.linspace(-0.07, 0.07, 15), np.linspace(0.0, 0.1, 11))

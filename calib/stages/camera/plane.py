@@ -363,7 +363,12 @@ def _fit(
 
 
 def _horizon(camera: Camera, pose: Pose) -> list[str]:
-    """The denominator of (2.12) must not cross zero within the picture."""
+    """The denominator of (2.12) must not cross zero within the picture.
+
+    In that of a fisheye lens it does for any plane that is tilted; what is beyond has no place on the plane.
+    """
+    if camera.fisheye:
+        return []
     width, height = camera.image_size_px
     u, v = np.meshgrid(np.linspace(0, width - 1, 41), np.linspace(0, height - 1, 31))
     ideal = undistort(camera, np.stack([u.ravel(), v.ravel()], axis=1))

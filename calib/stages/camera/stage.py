@@ -122,11 +122,15 @@ def _solve_intrinsics(inputs: IntrinsicsInputs) -> Camera:
     from calib.core.result import CovarianceTable, finite_or_none, judged
     from calib.stages.camera.bundle import projection_sigma_px
     from calib.stages.camera.intrinsics import calibrate_camera
+    from calib.stages.camera.model import ahead_radius, distorted_normalised
     from calib.stages.camera.section import Camera
 
     result = calibrate_camera(inputs.views, inputs.image_size_px, inputs.choices, inputs.left_out)
     fit, known = result.calibration, result.covariance
-    sigma_px = projection_sigma_px(fit, known, image_grid(fit.camera.image_size_px))
+    grid = image_grid(fit.camera.image_size_px)
+    # Farther out a fisheye lens shows what is beside the camera, or nothing.
+    ahead = np.hypot(*distorted_normalised(fit.camera, grid).T) <= ahead_radius(fit.camera)
+    sigma_px = projection_sigma_px(fit, known, grid[ahead])
     bounded = sigma_px[np.isfinite(sigma_px)]
     projection = {
         "distance_m": known.distance_m,
