@@ -61,7 +61,7 @@ def fleet(
     """
     from calib.core.files import shown
     from calib.core.units import parse_duration_s
-    from calib.runner.fleet import check_apart, finish, run_fleet
+    from calib.runner.fleet import TIMINGS, check_apart, finish, run_fleet
     from calib.runner.task import SCHEMES, Allowed, FleetOptions, read_manifest, twice_told
     from calib.show.fleet import PAGE, write_fleet_page
 
@@ -73,7 +73,7 @@ def fleet(
     for sentence in twice_told(known.rigs):
         narrate(f"{shown(manifest)}: {sentence}")
     check_apart(output, known.rigs)
-    with opened_out(output, "calib fleet", ("fleet.parquet", PAGE)) as store:
+    with opened_out(output, "calib fleet", ("fleet.parquet", PAGE, TIMINGS)) as store:
         options = FleetOptions(pages, allowed=Allowed((*SCHEMES, *(allow_scheme or ())), allow_private))
         with processes(store, scheduler, workers, retries) as cluster, progress_bar("rigs") as progress:
             counts = run_fleet(store, cluster, known, options, retries, progress, narrate, limit_s)
@@ -93,7 +93,6 @@ def _as_json(summary: FleetSummary, counts: Counts) -> dict[str, Any]:
         "rigs": summary.rigs,
         "verdicts": summary.verdicts,
         "as_before": counts.as_before,
-        "seconds": summary.seconds,
         "stages": summary.stages,
         "constants": [
             {

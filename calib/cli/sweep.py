@@ -46,13 +46,14 @@ def sweep(
     """
     from calib.core.files import shown
     from calib.core.units import parse_duration_s
+    from calib.runner.fleet import TIMINGS
     from calib.runner.sweep import read_sweep, run_sweep, summarise_sweep
     from calib.show.fleet import SWEEP_PAGE, write_sweep_page
 
     check_places(scheduler, workers)
     limit_s = parse_duration_s(timeout, "--timeout")
     known = read_sweep(spec)
-    with opened_out(output, "calib sweep", ("sweep.parquet", SWEEP_PAGE)) as store:
+    with opened_out(output, "calib sweep", ("sweep.parquet", SWEEP_PAGE, TIMINGS)) as store:
         with processes(store, scheduler, workers, retries) as cluster, progress_bar("cases") as progress:
             before = run_sweep(store, cluster, known, retries, progress, narrate, limit_s)
         summary = summarise_sweep(store, known, before)

@@ -46,11 +46,10 @@ from calib.runner.task import (
 # ----------------------------------------------------------------------
 # Outcomes as rows of a Parquet file, in blocks, and one column of it at a time.
 #
-# Columns: name, serial, source, kind, verdict, code, sentence, reasons, seconds, peak_MB, `verdict.STAGE`
-# for
-# each stage, `SECTION.NAME` and `SECTION.NAME.sigma` for each constant, and at last outlier_z and
-# outlier_of,
-# the constant that stands out most against the fleet. A rig without a number has a null there.
+# Columns: name, serial, source, kind, verdict, code, sentence, reasons, `verdict.STAGE` for each stage,
+# `SECTION.NAME` and `SECTION.NAME.sigma` for each constant, and at last outlier_z and outlier_of, the
+# constant that stands out most against the fleet. A rig without a number has a null there. What each rig has
+# taken of time and memory stands in a file of its own, so that the same inputs give the same bytes here.
 
 _TEXTS = ("name", "serial", "source", "kind", "verdict", "sentence", "reasons")
 _BLOCK = 512
@@ -107,7 +106,6 @@ def write_outcomes(path: Path, names: Sequence[str], outcome: Callable[[str], Ou
             values |= dict.fromkeys(found.values)
     fields = [pa.field(name, pa.string()) for name in _TEXTS]
     fields.insert(5, pa.field("code", pa.int16()))
-    fields += [pa.field("seconds", pa.float64()), pa.field("peak_MB", pa.float64())]
     fields += [pa.field(f"verdict.{stage}", pa.string()) for stage in stages]
     for value in values:
         fields += [pa.field(value, pa.float64()), pa.field(f"{value}.sigma", pa.float64())]
@@ -131,8 +129,6 @@ def _row(outcome: Outcome) -> dict[str, Any]:
         "code": outcome.code,
         "sentence": outcome.sentence,
         "reasons": "\n".join(outcome.reasons),
-        "seconds": outcome.seconds,
-        "peak_MB": outcome.peak_MB,
     }
     row |= {f"verdict.{stage}": status for stage, status in outcome.stages.items()}
     for name, (value, sigma) in outcome.values.items():
@@ -445,7 +441,7 @@ class FleetSummary:
     ----------
     verdicts : rigs by verdict. stages : of each stage the rigs by verdict.
     constants : in the order of the file. looks : the rigs to look at, the worst first, no more than 200.
-    to_look_at : how many there are. seconds, longest_s, peak_MB : of all rigs, of one, of a process.
+    to_look_at : how many there are.
     numbered : rigs whose serial has a number. limit : |z| beyond which one stands out, NaN for too few rigs.
     """
 
@@ -455,9 +451,6 @@ class FleetSummary:
     constants: tuple[ConstantSummary, ...]
     looks: tuple[Look, ...]
     to_look_at: int
-    seconds: float
-    longest_s: float
-    peak_MB: float
     numbered: int
     limit: float
 
@@ -495,7 +488,6 @@ def summarise(path: Path) -> tuple[FleetSummary, FloatArray, list[str | None]]:
         listed = list(values)
         which = [listed[i] if i >= 0 else None for i in of.tolist()]
         verdicts = texts(table, "verdict")
-        seconds, peak = column(table, "seconds"), column(table, "peak_MB")
         stages = {
             name.removeprefix("verdict."): dict(Counter(v for v in texts(table, name) if v))
             for name in table.names
@@ -509,9 +501,6 @@ def summarise(path: Path) -> tuple[FleetSummary, FloatArray, list[str | None]]:
             tuple(constants),
             looks,
             to_look_at,
-            float(np.nansum(seconds)),
-            _largest(seconds),
-            _largest(peak),
             int(np.isfinite(numbers).sum()),
             limit,
         )
@@ -520,11 +509,6 @@ def summarise(path: Path) -> tuple[FleetSummary, FloatArray, list[str | None]]:
 
 def _or_nan(value: float | None) -> float:
     return float("nan") if value is None else value
-
-
-def _largest(values: FloatArray) -> float:
-    known = values[np.isfinite(values)]
-    return float(known.max()) if len(known) else float("nan")
 
 
 def _varies(values: FloatArray) -> bool:
@@ -823,9 +807,24 @@ def _answer(spec: RigSpec, result: Any) -> Answer:
     return Answer(blank, {})
 
 
+TIMINGS = "timings.csv"
+
+
+def write_timings(out: Path, head: str, rows: Iterable[Sequence[Any]]) -> None:
+    """Write what each rig or case has taken, as CSV. Raises `BadInputError` when it cannot be written."""
+    lines = (",".join(map(str, row)) + "\n" for row in rows)
+    write_atomically(out / TIMINGS, f"{head}\n{''.join(lines)}")
+
+
 def finish(store: Store, manifest: Manifest) -> FleetSummary:
-    """Write fleet.parquet and return the summary. Raises `BadInputError` when a file cannot be written."""
+    """Write fleet.parquet and the timings, and return the summary.
+
+    Raises `BadInputError` when a file cannot be written.
+    """
     pa = needed("pyarrow")
+    found = (store.outcome(rig.name) for rig in manifest.rigs)
+    times = ((one.name, one.seconds, one.peak_MB) for one in found if one is not None)
+    write_timings(store.out, "name,seconds,peak_MB", times)
     between, final = store.out / HIDDEN / "rows.parquet", store.out / "fleet.parquet"
     write_outcomes(between, [rig.name for rig in manifest.rigs], store.outcome)
     try:

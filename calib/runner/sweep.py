@@ -27,7 +27,7 @@ from calib.core.rig import SCHEMA, Rig
 from calib.core.units import parse_duration_s
 from calib.core.writing import write_atomically
 from calib.runner.engine import LIMIT_S, Broken, Cluster, Lost, Overdue, Task, run_tasks
-from calib.runner.fleet import HIDDEN, Store, Table, column, texts, write_table
+from calib.runner.fleet import HIDDEN, Store, Table, column, texts, write_table, write_timings
 from calib.runner.task import needed, program
 from calib.stages.control.trial import control_model, run_controller
 from calib.stages.control.tuning import Tracking
@@ -666,7 +666,6 @@ def _rows(store: Store, spec: SweepSpec, measures: tuple[str, ...]) -> Iterator[
             found = {} if one is None else one.measures
             row |= {name: found.get(name) for name in measures}
             row["sentence"] = "was not run" if one is None else one_line(one.sentence)
-            row["seconds"] = None if one is None else one.seconds
             yield row
 
 
@@ -690,12 +689,17 @@ def _measured(store: Store, spec: SweepSpec) -> tuple[str, ...]:
 
 
 def summarise_sweep(store: Store, spec: SweepSpec, as_before: int) -> SweepSummary:
-    """Write sweep.parquet and return the summary. Raises `BadInputError` for a measure that there is not."""
-    pa = needed("pyarrow")
+    """Write sweep.parquet and the timings, and return the summary.
+
+    Raises `BadInputError` for a measure that there is not.
+    """
+    pa, digest = needed("pyarrow"), _digest(spec)
+    kept = (one for number, _ in _bundles(spec) for one in _kept(store, number, digest) or [])
+    write_timings(store.out, "case,seconds", ((one.number, one.seconds) for one in kept))
     measures = _measured(store, spec)
     fields = [pa.field(name, pa.int64()) for name in ("case", "point", "draw")]
     fields += [pa.field(name, pa.float64() if _numeric(spec, name) else pa.string()) for name in spec.names]
-    fields += [pa.field(name, pa.float64()) for name in (*measures, "seconds")]
+    fields += [pa.field(name, pa.float64()) for name in measures]
     fields.append(pa.field("sentence", pa.string()))
     path = store.out / "sweep.parquet"
     write_table(path, pa.schema(fields), _rows(store, spec, measures))
