@@ -14,7 +14,8 @@ def test_the_header(calib, rig) -> None:
     ended = calib("firmware", "--rig", rig, "-o", rig.parent / "new" / "out")
     path = rig.parent / "new" / "out" / "calib_constants.h"
     names = ["calib_constants.h", "calib_guard.h", "calib_pipeline.h", "calib_selftest.h", "out.ino"]
-    assert (ended.code, ended.out) == (0, "153 constants\nverdict: ok\n")
+    told = "the rig is a simulated one: for a board its constants compile only with CALIB_I_KNOW"
+    assert (ended.code, ended.out) == (0, f"153 constants\nverdict: ok\n  (remark) {told}\n")
     assert ended.err == f"{', '.join(names)} written to {path.parent}\n"
     assert sorted(p.name for p in path.parent.iterdir()) == names
     text = path.read_text("ascii")
@@ -99,3 +100,17 @@ def test_a_number_that_no_float_holds(calib, rig) -> None:
     assert ended.code == 3
     assert "CALIB_CAMERA_SKEW_PX is 1e-42, too small for a normal float" in ended.sentence
     assert not (rig.parent / "out").exists()
+
+
+def test_a_sketch_without_the_guard_is_named_and_does_not_compile(calib, rig, tmp_path) -> None:
+    out = tmp_path / "out"
+    assert calib("firmware", "--rig", rig, "-o", out).code in (0, 1)
+    sketch = out / "out.ino"
+    old = sketch.read_text().replace('#include "calib_guard.h"\n', "").replace("SCHEMA 4", "SCHEMA 3")
+    sketch.write_text(old)
+    told = calib("firmware", "--rig", rig, "-o", out).err
+    assert "left as it is" in told and "has no guard, so that nothing stops the pumps" in told
+    assert sketch.read_text() == old
+    words = ["gcc", "-fsyntax-only", "-x", "c", "-DCALIB_EXPECT_SCHEMA=3", str(out / "calib_constants.h")]
+    compiled = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert compiled.returncode != 0 and "schema" in compiled.stderr

@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from calib.core.rig import Rig
     from calib.stages.camera.section import Camera
 
-SCHEMA = 3
+SCHEMA = 4
 """Raised when a constant changes its name, unit or meaning."""
 
 FLASHED = ("camera", "plane", "imu", "orientation_filter", "lowpass", "align", "controller")
@@ -251,7 +251,16 @@ def _judge(whole: Rig, camera: CameraConstants) -> Verdict:
         findings.append(Finding("poor", text, _UNREAD))
     if camera.plane is None:
         findings.append(Finding("remark", "no plane yet, which the pipeline needs", "run calib extrinsics"))
+    if _simulated(whole):
+        text = "the rig is a simulated one: for a board its constants compile only with CALIB_I_KNOW"
+        findings.append(Finding("remark", text))
     return Verdict.of(findings)
+
+
+def _simulated(whole: Rig) -> bool:
+    """Whether constants come from a simulated rig or from rendered pictures."""
+    optics = (one for one in (whole.camera, whole.plane) if one is not None)
+    return whole.twin is not None or any(one.simulated for one in optics)
 
 
 def header_of(whole: Rig, source: str) -> Header:
@@ -271,11 +280,8 @@ def header_of(whole: Rig, source: str) -> Header:
     lookup.defaults()
     motion = (*motion_groups(lookup), fused_group(lookup, rate_hz, camera.plane))
     verdict = _judge(whole, camera)
-    simulated = whole.twin is not None or any(
-        section is not None and section.simulated for section in (whole.camera, whole.plane)
-    )
     groups = (
-        trust_group(verdict.ok, simulated),
+        trust_group(verdict.ok, _simulated(whole)),
         *camera_groups(camera),
         *motion,
         *control_groups(lookup, rate_hz),

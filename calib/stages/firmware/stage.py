@@ -70,6 +70,11 @@ def _write(files: Files, outcome: Header | Check) -> list[Path]:
     sketch = files.output / outcome.sketch(files.output)
     if sketch.exists() and sketch not in written:
         files.narrate(f"{shown(sketch)}: was changed since calib wrote it, and is left as it is")
+        if b'#include "calib_guard.h"' not in sketch.read_bytes():
+            files.narrate(
+                f"{shown(sketch)}: has no guard, so that nothing stops the pumps when a sensor fails; move "
+                "it away, run this again, and carry your changes over"
+            )
     return written
 
 

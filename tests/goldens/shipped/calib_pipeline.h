@@ -43,7 +43,7 @@
 #include <string.h>
 
 #ifndef CALIB_EXPECT_SCHEMA
-#define CALIB_EXPECT_SCHEMA 3
+#define CALIB_EXPECT_SCHEMA 4
 #endif
 #include "calib_constants.h"
 
