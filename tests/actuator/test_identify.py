@@ -24,6 +24,8 @@ from calib.stages.actuator.identify import (
     heads_of,
     held_back,
     jacobian,
+    judge,
+    own_delays,
     prospects,
     residuals,
     solve,
@@ -250,6 +252,25 @@ def test_a_log_held_back_is_predicted_as_well_as_fitted(solution: Solution) -> N
         assert h.fitted_phi_rad == pytest.approx(SIGMA[0], rel=0.15)
     alone = replace(solution, problem=replace(solution.problem, tracks=solution.problem.tracks[:1]))
     assert held_back(alone) == []
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.2])
+def test_pictures_late_in_one_log_alone_are_named(late_s: float) -> None:
+    names = ("stiffness_scale", "damping_scale_pumps_connected", "lag_s")
+    tracks = [track("prbs"), track("steps", delay_s=0.025 + late_s)]
+    problem = Problem(Machine(), tracks, names, {}, threads=1)
+    x, cost, residual, J = solve(problem, first_guess(problem, values_of(Machine())))
+    found = Solution(problem, x, residual, J, cost, {}, 1, 1)
+    apart = {name: late / sigma for name, late, sigma in own_delays(found)}
+    verdict = judge(found, uncertainty(found), colour_of(found), [], [])
+    named = [one.text for one in verdict.findings if one.severity == "inconsistent"]
+    if late_s:
+        assert apart["steps"] > 20.0
+        assert len(named) == 1
+        assert "its pictures come" in named[0]
+    else:
+        assert max(map(abs, apart.values())) < 4.0
+        assert verdict.word == "ok"
 
 
 @pytest.mark.slow

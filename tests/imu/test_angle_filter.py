@@ -51,6 +51,7 @@ from calib.stages.imu.tuning import (
     Piece,
     Row,
     compared,
+    contradictions,
     gain_facts,
     predicted_sigma,
     riccati,
@@ -583,6 +584,48 @@ def test_near_the_best_of_all_constant_gains(seed: int, reference: bool) -> None
     assert found.recommended.name == "levelling"
     assert ours < (1.08 if reference else 1.25) * best
     assert ours < three
+
+
+def _spoilt(piece: Piece, way: str) -> Piece:
+    """A log with one of its columns as another than it says."""
+    late = np.clip(np.arange(len(piece.t_s)) - 20, 0, None)
+    rate, acc = piece.rate_radps, piece.phi_acc_rad
+    return {
+        "": piece,
+        "gz sign": replace(piece, rate_radps=-rate),
+        "gz double": replace(piece, rate_radps=2.0 * rate),
+        "gz late": replace(piece, rate_radps=rate[late]),
+        "gz of another log": replace(piece, rate_radps=-swung(5).gz),
+        "ax for ay": replace(piece, phi_acc_rad=0.5 * np.pi - acc),
+        "ay late": replace(piece, phi_acc_rad=acc[late]),
+        "ay double": replace(piece, phi_acc_rad=np.arctan(2.0 * np.tan(acc))),
+    }[way]
+
+
+@pytest.mark.parametrize("reference", [True, False])
+def test_no_gains_are_ok_from_a_log_that_contradicts_itself(reference: bool) -> None:
+    ways = ("gz sign", "gz double", "gz late", "gz of another log", "ax for ay", "ay late", "ay double")
+    for way in ways:
+        pieces = [_spoilt(_piece(3, reference), way), replace(_piece(1, reference), source="good.csv")]
+        found = contradictions(pieces, tune(pieces, DATA_SHEET))
+        assert [one.text.split(":")[0] for one in found] == ["arm.csv"], way
+        assert found[0].severity in ("poor", "inconsistent")
+
+
+@pytest.mark.parametrize("reference", [True, False])
+@pytest.mark.parametrize("lever_m", [0.05, 0.2])
+def test_a_sound_log_does_not_contradict_itself(reference: bool, lever_m: float) -> None:
+    for seed in (0, 1, 4):
+        pieces = [_piece(seed, reference, lever_m=lever_m)]
+        assert contradictions(pieces, tune(pieces, DATA_SHEET)) == []
+
+
+def test_a_sensor_that_was_mounted_otherwise_in_one_log_is_named() -> None:
+    pieces = [replace(_piece(seed, True), source=f"{seed}.csv") for seed in (0, 1, 3)]
+    seen = pieces[2].reference_rad
+    assert seen is not None
+    pieces[2] = replace(pieces[2], reference_rad=seen + 0.2)
+    assert [one.text[:5] for one in contradictions(pieces, tune(pieces, DATA_SHEET))] == ["3.csv"]
 
 
 def test_keeps_three_three_where_the_truth_is_three_three() -> None:

@@ -1437,6 +1437,8 @@ _MOST_RELATIVE = 0.25
 _STRONG = 0.95
 _FAR_ROWS = 0.05
 _BY_NATURE = ("lambda3",)
+_MOST_APART_S = 0.04
+_APART_SIGMA = 5.0
 
 
 def _bounds(solution: Solution) -> list[str]:
@@ -1491,6 +1493,51 @@ def _of_fit(solution: Solution, known: Uncertainty, colours: Sequence[Colour]) -
     return out
 
 
+def own_delays(solution: Solution) -> list[tuple[str, float, float]]:
+    """By how much each log's rows come later than those of the others [s], and the deviation of that.
+
+    One step of Gauss and Newton with a delay of the log's own among the unknowns; only for logs that share
+    one. Columns that are late in one log alone are otherwise taken for a delay between, and for a damping
+    and a creep that are not there.
+    """
+    problem, r, J = solution.problem, solution.residual, solution.J
+    layout = problem.layout
+    shared = [k for k, at in enumerate(layout.delays) if layout.delays.count(at) > 1]
+    w = weights(r)
+    WJ = J * w[:, None]
+    inverse = _inverse(WJ.T @ J)
+    spans, out = _spans(problem.tracks), []
+    for k in shared:
+        column = np.zeros(len(r))
+        column[spans[k]] = J[spans[k], layout.delay + layout.delays[k]]
+        b = WJ.T @ column
+        own = float(column @ (w * column) - b @ inverse @ b)
+        if own < 1e-6 * float(column @ (w * column)) or own <= 0.0:
+            continue
+        slope = float(column @ (w * r) - b @ inverse @ (WJ.T @ r))
+        out.append((problem.tracks[k].name, -slope / own, 1.0 / math.sqrt(own)))
+    return out
+
+
+def _apart(solution: Solution, known: Uncertainty) -> list[Finding]:
+    """The log whose rows come most clearly at another time than those of the others."""
+    raised = known.scale * max(known.inflation.values(), default=1.0)
+    far = [
+        (abs(late) / sigma, name, late)
+        for name, late, sigma in own_delays(solution)
+        if abs(late) > max(_MOST_APART_S, _APART_SIGMA * raised * sigma)
+    ]
+    if not far:
+        return []
+    _, name, late = max(far)
+    when = "later" if late > 0.0 else "earlier"
+    text = (
+        f"{name}: its pictures come {1e3 * abs(late):.0f} ms {when} after its commands than those of the "
+        "other logs"
+    )
+    return [Finding("inconsistent", text, "compare the clocks of camera and commands, log by log")]
+
+
 def judge(
     solution: Solution,
     known: Uncertainty,
@@ -1515,7 +1562,7 @@ def judge(
         relative = known.sigma[name] / max(abs(value), 1e-12)
         if relative > _MOST_RELATIVE:
             out.append(Finding("poor", f"{name} is known to {100.0 * relative:.0f} % only"))
-    out += _of_fit(solution, known, colours)
+    out += [*_of_fit(solution, known, colours), *_apart(solution, known)]
     for log in held:
         if log.held_phi_rad > _MOST_HELD * log.fitted_phi_rad + 1e-4:
             text = (

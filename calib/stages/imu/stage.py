@@ -594,7 +594,10 @@ def _of_tuning(result: Tuning, logs: Sequence[TuneLog], tilted: bool) -> Iterato
     """What is to be known of the gains, and of the logs that they are from."""
     from calib.core.verdict import Finding
     from calib.stages.imu.mahony import Mahony
+    from calib.stages.imu.tuning import contradictions
 
+    pieces = [piece for log in logs for piece in log.pieces]
+    yield from contradictions(pieces, result)
     gains, base = result.recommended.gains, result.candidates[0]
     if isinstance(gains, Mahony) and gains.Kp < 2.0 * _RINGS * math.sqrt(gains.Ki):
         yield Finding(

@@ -13,6 +13,7 @@ from scipy.special import ndtri, stdtrit
 
 from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.core.errors import BadInputError
+from calib.core.verdict import Finding, Severity
 from calib.stages.imu.levelling import Levelling, level_log
 from calib.stages.imu.levelling import system as levelling_system
 from calib.stages.imu.mahony import Mahony, MahonyState, advance, filter_log, wrapped
@@ -1129,3 +1130,137 @@ def _recommended(candidates: Sequence[Candidate], judge: str) -> tuple[Candidate
     best = min((one for one in candidates if one.wins), key=lambda one: one.rmse_rad, default=base)
     reasons.append(f"{best.name} is {'kept' if best is base else 'recommended'}.")
     return best, tuple(reasons)
+
+
+# ----------------------------------------------------------------------
+# Whether a log's sensors speak of the same motion. Gains of logs that contradict themselves are nobody's.
+#
+# Rate and reference are compared over spans of some seconds, in which the bias is a straight line; outliers
+# of the reference are cut. Thresholds are sizes that change gains, several times what sound logs show.
+
+_SPAN_S = 4.0
+_TURNS_RAD = math.radians(1.0)
+_MOST_SCALE = 0.1
+_MOST_APART = 0.3
+_MOST_APART_RAD = math.radians(2.0)
+_MOST_LATE_S = 0.06
+_LEFT_OF_FELT, _LEFT_OF_REST = 0.2, 0.35
+_LATE_S = 0.01 * np.arange(-30, 31)
+_MOST_RATE_ERROR = math.radians(0.8)
+_TIMES_THE_SENSOR = 10.0
+_MOST_TURNED_RAD = math.radians(5.0)
+
+
+def _level(t_s: FloatArray, values: FloatArray) -> FloatArray:
+    """Angles (n,) less a straight line in each span, NaN where they are or where a span has too few."""
+    out = np.full(len(values), np.nan)
+    span = ((t_s - t_s[0]) / _SPAN_S).astype(np.int64)
+    edges = np.flatnonzero(np.diff(span, prepend=-1, append=span[-1] + 1))
+    for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+        known = np.isfinite(values[a:b])
+        if int(known.sum()) < 20:
+            continue
+        t, y = t_s[a:b] - t_s[a], values[a:b]
+        line = np.polynomial.Polynomial.fit(t[known], y[known], 1)
+        out[a:b] = y - line(t)
+    return out
+
+
+def _robust_size(values: FloatArray) -> float:
+    return 1.4826 * float(np.median(np.abs(values)))
+
+
+def _against(t_s: FloatArray, rate_radps: FloatArray, seen_rad: FloatArray) -> str:
+    """How a rate contradicts a reference of its angle; empty where it does not or hardly anything turns."""
+    known = np.isfinite(seen_rad)
+    theta = np.cumsum(rate_radps * np.diff(t_s, prepend=t_s[0]))
+    a, b = _level(t_s, np.where(known, theta, np.nan)), _level(t_s, seen_rad)
+    kept = np.isfinite(a) & np.isfinite(b)
+    a, b = a[kept], b[kept]
+    if len(a) < 20 or max(float(a.std()), float(b.std())) < 2.0 * _TURNS_RAD:
+        return ""
+    scale = 1.0
+    for _ in range(3):
+        rest = b - scale * a
+        near = np.abs(rest) <= 4.0 * max(_robust_size(rest), 1e-6)
+        scale = float(a[near] @ b[near]) / max(float(a[near] @ a[near]), 1e-12)
+    left_rad = _robust_size(b - scale * a)
+    most = max(float(a.std()), float(b[np.abs(b) <= 4.0 * b.std()].std()))
+    if left_rad > max(_MOST_APART * most, _MOST_APART_RAD):
+        return f"the rate leaves {math.degrees(left_rad):.2g} of {math.degrees(most):.2g} deg unexplained"
+    # A share of the turns that noise alone could feign is no scale.
+    if abs(scale - 1.0) > _MOST_SCALE and abs(scale - 1.0) * float(a.std()) > max(_TURNS_RAD, left_rad / 3.0):
+        return f"the angle turns {scale:.3g} times as far as the rate says"
+    return ""
+
+
+def _late(t_s: FloatArray, phi_acc_rad: FloatArray, rate_radps: FloatArray) -> float:
+    """By how much the accelerometer's angle comes later than the rate's [s]; 0 where that is not clear.
+
+    What a lever adds to the accelerometer's angle grows with the angular acceleration, and in a swing
+    looks like half a period; it is taken out for each lag that is tried.
+    """
+    theta = np.cumsum(rate_radps * np.diff(t_s, prepend=t_s[0]))
+    turning = np.convolve(np.gradient(rate_radps, t_s), np.full(5, 0.2), "same")
+    felt = _level(t_s, np.unwrap(phi_acc_rad))
+    known = np.isfinite(felt)
+    if int(known.sum()) < 20 or float(_level(t_s, theta)[known].std()) < 2.0 * _TURNS_RAD:
+        return 0.0
+    rests = []
+    for late in _LATE_S.tolist():
+        left = felt - _level(t_s, np.interp(t_s - late, t_s, theta))
+        lever = _level(t_s, np.interp(t_s - late, t_s, turning))
+        fit = float(left[known] @ lever[known]) / max(float(lever[known] @ lever[known]), 1e-12)
+        rests.append(_robust_size((left - fit * lever)[known]))
+    k, zero = int(np.argmin(rests)), len(rests) // 2
+    clear = rests[k] < min(_LEFT_OF_FELT * _robust_size(felt[known]), _LEFT_OF_REST * rests[zero])
+    return float(_LATE_S[k]) if clear and k not in (0, len(rests) - 1) else 0.0
+
+
+def contradictions(pieces: Sequence[Piece], result: Tuning) -> list[Finding]:
+    """Findings on logs whose rate, accelerometer and reference do not speak of the same motion.
+
+    A rate that errs is "poor" alone, for a sensor that lies flat errs as one with wrong columns does.
+    """
+    out: dict[str, Finding] = {}
+
+    def found(source: str, what: str, severity: Severity = "inconsistent") -> None:
+        text = f"{source}: {what}"
+        out.setdefault(source, Finding(severity, text, "check the columns, signs and units of that log"))
+
+    for piece, own in zip(pieces, result.smoothed, strict=True):
+        if piece.reference_rad is not None:
+            what = _against(piece.t_s, piece.rate_radps, piece.reference_rad)
+            if what:
+                found(piece.source, f"rate and reference contradict each other: {what}")
+        if piece.in_plane and own is not None:
+            late = _late(piece.t_s, piece.phi_acc_rad, piece.rate_radps)
+            if abs(late) > _MOST_LATE_S:
+                when = "later" if late > 0.0 else "earlier"
+                found(
+                    piece.source,
+                    f"the accelerometer's angle comes {1e3 * abs(late):.0f} ms {when} than the rate's",
+                )
+            elif own.gyro_noise > max(_TIMES_THE_SENSOR * result.noise.gyro, _MOST_RATE_ERROR):
+                found(
+                    piece.source,
+                    "rate and accelerometer contradict each other: the rate errs by "
+                    f"{math.degrees(own.gyro_noise):.2g} deg/s/sqrt(Hz), the sensor by "
+                    f"{math.degrees(result.noise.gyro):.2g}",
+                    "poor",
+                )
+    offsets = [
+        (piece.source, offset)
+        for piece, offset in zip(pieces, result.offset_rad, strict=True)
+        if piece.reference_rad is not None and piece.source not in out
+    ]
+    middle = float(np.median([offset for _, offset in offsets])) if offsets else 0.0
+    for source, offset in offsets:
+        apart = float(wrapped(np.array(offset - middle)))
+        if abs(apart) > _MOST_TURNED_RAD:
+            found(
+                source,
+                f"the angle of its accelerometer differs from the reference by {math.degrees(apart):.3g} deg "
+                "more than that of the other logs, as if the sensor were mounted otherwise",
+            )
+    return list(out.values())
