@@ -77,8 +77,9 @@ class Interrupts:
             for number, handler in before.items():
                 signal.signal(number, handler)
 
-    def settle(self) -> None:
-        """Raise nothing again."""
+    @staticmethod
+    def settle() -> None:
+        """Raise nothing again: the signal is answered, and what a command does after it is done whole."""
         if _TIMED and threading.current_thread() is threading.main_thread():
             signal.setitimer(signal.ITIMER_REAL, 0.0)
 

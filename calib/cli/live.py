@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from calib.cli.common import JsonOption, document, narrate, say
+from calib.cli.interrupts import Interrupts
 from calib.core.errors import EXIT_POOR, BadInputError, UsageError, pip_install
 
 
@@ -85,6 +86,7 @@ def live(
     try:
         at_work.serve(ready)
     except KeyboardInterrupt:
+        Interrupts.settle()
         narrate("ended; what was taken is saved")
     if not album.names():
         raise BadInputError(f"{shown(album.images)}: no picture was taken")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from calib.cli.common import JsonOption, RigOption, document, narrate, progress_bar, say
+from calib.cli.interrupts import Interrupts
 from calib.core.errors import EXIT_POOR, BadInputError, UsageError
 
 if TYPE_CHECKING:
@@ -115,6 +116,7 @@ def track(
     except KeyboardInterrupt:
         if not times.arrival:
             raise
+        Interrupts.settle()
     seen = sum(one is not None for one in found)
     if tracker is None or not seen:
         raise BadInputError(f"{shown(source)}: {_why(tracker, start is not None)}")

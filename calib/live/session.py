@@ -42,9 +42,8 @@ _BLUR_SHARE, _LEAST_BLUR_PX = 0.0035, 1.6
 """Standard deviation of an edge's blur, over the picture's width, from which on a picture is not taken."""
 _CONTRAST = 12.0
 """Grey levels from the middle to white below which a board is too dark."""
-_ALIKE_SHARE, _NEW_SHARE = 0.02, 0.04
-"""Distance of corners to those of an earlier picture, over the width, below which it tells little, and below
-which nobody is asked for it."""
+_ALIKE_SHARE = 0.02
+"""Distance of corners to those of an earlier picture, over the width, below which it tells little."""
 _MATCH_SHARE, _MATCH_DEG = 0.07, 15.0
 """Distance of the board's outer corners from the ghost's, over the picture's diagonal, and angle between the
 boards, within which they match."""
@@ -130,7 +129,6 @@ class Session:
     fit: Intrinsics | None = None
     history: list[Progress] = field(default_factory=list)
     _plan: Plan | None = None
-    _next: Candidate | None = None
     _past: deque[tuple[float, FloatArray]] = field(default_factory=lambda: deque(maxlen=60))
     _waits: bool = False
 
@@ -212,9 +210,9 @@ class Session:
             return "blurred", "Blurred: hold still, or focus."
         return None
 
-    def _alike(self, grid: FloatArray, share: float = _ALIKE_SHARE) -> str | None:
+    def _alike(self, grid: FloatArray) -> str | None:
         """Name of an earlier picture that shows the board in the same place."""
-        limit = share * self._size()[0]
+        limit = _ALIKE_SHARE * self._size()[0]
         turned = grid[::-1, ::-1]
         for name, view in self.views.items():
             if view.pixels.size == grid.size:
@@ -260,16 +258,12 @@ class Session:
 
     def fitted(self, fit: Intrinsics | None) -> None:
         """Take a fit of the views, from which the next pose follows; None where they make no camera."""
-        self.fit, self._plan, self._next, self._waits = fit, None, None, False
+        self.fit, self._plan, self._waits = fit, None, False
         if fit is None:
             return
         some = fit.calibration
         if np.all(np.isfinite(some.normal)) and some.observations.views >= _BEFORE:
             self._plan = best_next_view(some, evidence(some).S.sum(axis=0))
-        if self._plan is not None:
-            # The same picture once more would lower sigma on paper only.
-            new = (one for one in self._plan.candidates if not self._alike(self._grid_at(one), _NEW_SHARE))
-            self._next = next(new, self._plan.best)
         worst = projection_sigma_px(some, fit.covariance, image_outline(some.camera))
         sigma = fit.covariance.sigma().get("fx_px", np.inf)
         known = worst[~np.isnan(worst)]
@@ -287,6 +281,11 @@ class Session:
         """Whether the verdict is ok and the best next picture would change little."""
         gain = self.gain
         return gain is not None and gain < ENOUGH and self.fit is not None and self.fit.judgement.verdict.ok
+
+    @property
+    def _next(self) -> Candidate | None:
+        """The best next picture; None before there is a fit."""
+        return None if self._plan is None else self._plan.best
 
     @property
     def gain(self) -> float | None:

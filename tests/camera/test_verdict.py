@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,7 @@ from calib.stages.camera.model import (
     camera_from_vector,
     one_to_one_reach,
     pack,
+    project,
 )
 from calib.stages.camera.pose import fit_pose
 from calib.stages.camera.verdict import Judgement, judge, of_leaving
@@ -502,6 +504,33 @@ def _advice(fit: Calibration) -> Candidate:
     assert 0.0 < found.remaining < 1.0
     assert plan.remaining(found.R_CT, found.t_m) == found.remaining
     return found
+
+
+def test_advice_repeats_no_view() -> None:
+    """Poses that were taken as advised are not advised again, which end of the board ever is up."""
+    rng, camera = np.random.default_rng(11), camera_of()
+    views = take(rng, camera, 6)
+    target = np.asarray(views[0].target_m)
+    middle = 0.5 * (target.max(axis=0) + target.min(axis=0))
+
+    def kinds(found: Sequence[Candidate]) -> list[tuple[str, float, str, float]]:
+        return [(one.where, one.tilt_deg, one.away, one.span_share) for one in found]
+
+    def plan() -> Sequence[Candidate]:
+        fit = calibrate(pack(views), (640, 480), "radial2")
+        found = best_next_view(fit, evidence(fit).S.sum(axis=0))
+        assert found is not None
+        return found.candidates
+
+    before = plan()
+    taken = before[:5]
+    for k, one in enumerate(taken):
+        pixels = project(camera, (target - middle) @ one.R_CT[:, :2].T + one.t_m)
+        noisy = pixels + 0.1 * rng.standard_normal(pixels.shape)
+        views.append(View(f"advised{k}", target, noisy[:: -1 if k % 2 else 1]))
+    after = kinds(plan())
+    assert not set(kinds(taken)) & set(after)
+    assert set(kinds(before[20:])) & set(after)
 
 
 def test_what_matters_to_no_pixel_is_no_finding() -> None:

@@ -6,6 +6,7 @@ import contextlib
 import http.client
 import json
 import shutil
+import signal
 import subprocess
 import sys
 import threading
@@ -412,6 +413,36 @@ def follow_some(person: Person, pictures: int) -> list[Any]:
 
 # ----------------------------------------------------------------------
 # The command.
+
+
+def test_ctrl_c_ends_with_the_camera_however_long_that_takes(tmp_path: Path) -> None:
+    """The interruption is raised again after a second where nobody answers it."""
+    script = (
+        "import sys, time\n"
+        "from calib.live.album import Album\n"
+        "from calib.live.server import Live\n"
+        "from calib.core.errors import BadInputError\n"
+        "def serve(*_):\n    print('serving', flush=True)\n    time.sleep(30)\n"
+        "def slow(*_):\n    time.sleep(1.6)\n    raise BadInputError('calibrated')\n"
+        "Live.serve, Album.calibrate, Album.names = serve, slow, lambda *_: ['view001.png']\n"
+        "from calib.cli.main import main\n"
+        "sys.argv = ['calib', 'live', '-o', 'rig', '--no-browser']\n"
+        "main()\n"
+    )
+    started = subprocess.Popen(
+        [sys.executable, "-c", script],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509  one call
+    )
+    assert started.stdout is not None
+    assert started.stdout.readline().startswith("serving")
+    started.send_signal(signal.SIGINT)
+    _, said = started.communicate(timeout=25)
+    assert said == "ended; what was taken is saved\ncalib: calibrated\n"
+    assert started.returncode == 3
 
 
 def test_what_the_command_refuses(
