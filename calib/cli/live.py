@@ -89,7 +89,10 @@ def live(
         Interrupts.settle()
         narrate("ended; what was taken is saved")
     if not album.names():
-        raise BadInputError(f"{shown(album.images)}: no picture was taken")
+        raise BadInputError(
+            f"{shown(album.images)}: no picture was taken; hold the board as the page outlines it, or press "
+            "space there; a video or a folder that is complete is for calib intrinsics"
+        )
     camera = album.calibrate()
     if as_json:
         document("live", {"camera": section_json(camera), "pictures": album.names()})

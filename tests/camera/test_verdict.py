@@ -533,6 +533,22 @@ def test_advice_repeats_no_view() -> None:
     assert set(kinds(before[20:])) & set(after)
 
 
+def test_the_picture_s_corners_are_asked_for_once() -> None:
+    """Board and fit reach into two thirds of the picture: each asks for its corners in its own words."""
+    rng, camera = np.random.default_rng(3), camera_of(lens=(-0.29, 0.107, 0.0015, -0.0003))
+    inner = [view for view in take(rng, camera, 60, recipe=Recipe(noise_px=0.3)) if _reach(view) < 0.66][:13]
+    assert len(inner) > 8
+    _, found = _judged(inner, (640, 480), "brown5")
+    corners = [one for one in found.verdict.advice if one.startswith("Take pictures with the board in the")]
+    assert corners == ["Take pictures with the board in the picture's corners, or use a simpler model."]
+    assert any("beyond, the distortion is extrapolated" in one for one in found.verdict.remarks)
+
+
+def _reach(view: View) -> float:
+    """How far a view's points are from the picture's middle, over the way to its corners."""
+    return float(np.linalg.norm(view.pixels - [319.5, 239.5], axis=1).max() / 400.0)
+
+
 def test_what_matters_to_no_pixel_is_no_finding() -> None:
     """Corners to three thousandths of a pixel tell changes that nobody would see."""
     rng, camera = np.random.default_rng(4), camera_of()

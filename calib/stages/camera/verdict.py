@@ -949,6 +949,9 @@ def _inside(covered: Coverage) -> FloatArray:
 
 
 def _concluded(findings: list[Finding], fit: Calibration | None, numbers: dict[str, float]) -> Judgement:
+    if any(one.advice == _IN_CORNERS for one in findings):
+        # Which says the same and more.
+        findings = [replace(one, advice=_IN_CORNERS) if one.advice == _CORNERS else one for one in findings]
     verdict = Verdict.of(findings)
     # Where views contradict each other, more of them settle nothing.
     if fit is not None and verdict.word != "inconsistent":
