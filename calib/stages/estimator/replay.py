@@ -439,16 +439,17 @@ them, the correlation stayed within .22; where a column was not what it said it 
 _AWAY = 3.2
 """Deviations: one of eight quantities is off by as much in one of a hundred logs at most."""
 _CALIBRATED = {
-    "gyro_bias_radps": "the gyroscope's bias",
-    "accel_bias_x_mps2": "the accelerometer's bias along x",
-    "accel_bias_y_mps2": "the accelerometer's bias along y",
-    "mount_angle_rad": "the mount angle",
-    "gyro_scale": "the gyroscope's scale",
-    "time_offset_s": "the time offset of the pictures",
-    "accel_scale_x": "the accelerometer's scale along x",
-    "accel_scale_y": "the accelerometer's scale along y",
+    "gyro_bias_radps": ("the gyroscope's bias", 1e-3),
+    "accel_bias_x_mps2": ("the accelerometer's bias along x", 0.01),
+    "accel_bias_y_mps2": ("the accelerometer's bias along y", 0.01),
+    "mount_angle_rad": ("the mount angle", 0.002),
+    "gyro_scale": ("the gyroscope's scale", 0.005),
+    "time_offset_s": ("the time offset of the pictures", 1e-3),
+    "accel_scale_x": ("the accelerometer's scale along x", 0.01),
+    "accel_scale_y": ("the accelerometer's scale along y", 0.01),
 }
-"""What a log may tell better than the calibration did."""
+"""What a log may tell better than the calibration did, and from which difference on that matters: .05 degrees, a
+hundredth of gravity or half of one of the motion, a millisecond."""
 _FLAGGED_SHARE = 0.05
 
 
@@ -529,10 +530,10 @@ def contradicting(setup: Setup, sensor: FloatArray, duration_s: float) -> Iterat
     (before, *_), (P, *_), _ = starting_state(setup)
     walk = np.square(setup.process.sensor_walk) * max(duration_s, 0.0)
     sigma = np.sqrt(np.diag(P)[6:] + walk)
-    for name, words in _CALIBRATED.items():
+    for name, (words, least) in _CALIBRATED.items():
         k = SENSOR.index(name)
         away = float(sensor[k] - before[6 + k])
-        if not abs(away) <= _AWAY * sigma[k]:
+        if not abs(away) <= max(_AWAY * float(sigma[k]), least):
             unit = {"radps": " rad/s", "mps2": " m/s^2", "rad": " rad", "s": " s"}.get(
                 name.rsplit("_", 1)[-1], ""
             )
