@@ -448,8 +448,8 @@ _CALIBRATED = {
     "accel_scale_x": ("the accelerometer's scale along x", 0.01),
     "accel_scale_y": ("the accelerometer's scale along y", 0.01),
 }
-"""What a log may tell better than the calibration did, and from which difference on that matters: .05 degrees, a
-hundredth of gravity or half of one of the motion, a millisecond."""
+"""What a log may tell better than the calibration did, and from which difference on that matters: .05
+degrees, a hundredth of gravity or half of one of the motion, a millisecond."""
 _FLAGGED_SHARE = 0.05
 
 

@@ -1146,7 +1146,7 @@ _MOST_APART_RAD = math.radians(2.0)
 _MOST_LATE_S = 0.06
 _LEFT_OF_FELT, _LEFT_OF_REST = 0.2, 0.35
 _LATE_S = 0.01 * np.arange(-30, 31)
-_MOST_RATE_ERROR = math.radians(0.8)
+_MOST_RATE_ERROR = math.radians(1.5)
 _TIMES_THE_SENSOR = 10.0
 _MOST_TURNED_RAD = math.radians(5.0)
 
