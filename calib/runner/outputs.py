@@ -279,7 +279,7 @@ def _answer(
         return "no", f"{_titles(broken)} failed"
     senseless = [job for job in used if _verdict(job, sections) in _MEANINGLESS]
     if senseless:
-        return "no", f"the data do not support {_titles(senseless)}"
+        return "no", f"the data do not support {_titles(senseless, plain=True)}"
     made = [job for job in jobs if job["stage"] == "firmware"]
     if not made or made[0]["status"] not in ("ok", "poor"):
         why = made[0]["reason"] if made else "it was not asked for"
