@@ -67,7 +67,7 @@
 #define CALIB_TABLE_READ(address) (*(address))
 #endif
 
-#define CALIB_SCHEMA 3
+#define CALIB_SCHEMA 4
 #if defined(CALIB_EXPECT_SCHEMA)
 #if CALIB_EXPECT_SCHEMA != CALIB_SCHEMA
 #error "calib: this header has another schema than the code expects"
@@ -75,7 +75,11 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x861D8316UL
+#define CALIB_ID 0x1D46C3CAUL
+
+/* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
+#define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok */
+#define CALIB_SIMULATED 1 /* 1: they come from a simulated rig or rendered pictures */
 
 /* Camera (2.5) and lens (B.1). */
 #define CALIB_IMAGE_WIDTH_PX 316 /* columns */
@@ -84,13 +88,13 @@
 #define CALIB_CAMERA_GREATEST_U_PX 315.5f /* greatest u inside the picture, px; the least is -0.5 */
 #define CALIB_CAMERA_GREATEST_V_PX 207.5f /* greatest v inside the picture, px; the least is -0.5 */
 #define CALIB_CAMERA_HAS_LENS 1 /* 0: no distortion, default of CALIB_UNDISTORT */
-#define CALIB_CAMERA_FX_PX 273.409546f /* focal length along u, px; sigma_mu of (2.5) */
+#define CALIB_CAMERA_FX_PX 273.409576f /* focal length along u, px; sigma_mu of (2.5) */
 #define CALIB_CAMERA_FY_PX 272.603973f /* focal length along v, px; sigma_nu of (2.5) */
 #define CALIB_CAMERA_SKEW_PX 0.0f /* skew, px; gamma of (2.5) */
-#define CALIB_CAMERA_CX_PX 160.670013f /* principal point, px from the centre of the left column; mu_0 of (2.5) */
-#define CALIB_CAMERA_CY_PX 101.869606f /* principal point, px from the centre of the top row; nu_0 of (2.5) */
-#define CALIB_CAMERA_K1 -0.220018402f /* lens, dimensionless, OpenCV's order and signs */
-#define CALIB_CAMERA_K2 0.549356937f /* lens, dimensionless, OpenCV's order and signs */
+#define CALIB_CAMERA_CX_PX 160.670029f /* principal point, px from the centre of the left column; mu_0 of (2.5) */
+#define CALIB_CAMERA_CY_PX 101.869591f /* principal point, px from the centre of the top row; nu_0 of (2.5) */
+#define CALIB_CAMERA_K1 -0.220018521f /* lens, dimensionless, OpenCV's order and signs */
+#define CALIB_CAMERA_K2 0.549357474f /* lens, dimensionless, OpenCV's order and signs */
 
 /*
  * Inverse lens, normalised coordinates: yd = (v - cy) / fy, xd = (u - cx - skew yd) / fx, then
@@ -101,38 +105,38 @@
 #define CALIB_LENS_DECENTERING_STEPS 0 /* 0: no decentering */
 #define CALIB_CAMERA_HAS_SKEW 0 /* for #if */
 #define CALIB_CAMERA_PER_FX 0.00365751656f /* 1 / fx, 1/px */
-#define CALIB_CAMERA_PER_FY 0.00366832525f /* 1 / fy, 1/px */
-#define CALIB_LENS_INVERSE_C1 0.217687085f /* coefficient of r2^1, dimensionless */
-#define CALIB_LENS_INVERSE_C2 -0.333740503f /* coefficient of r2^2, dimensionless */
-#define CALIB_LENS_INVERSE_C3 -1.56922519f /* coefficient of r2^3, dimensionless */
-#define CALIB_LENS_INVERSE_C4 3.4366219f /* coefficient of r2^4, dimensionless */
-#define CALIB_LENS_INVERSE_C5 -2.06394172f /* coefficient of r2^5, dimensionless */
+#define CALIB_CAMERA_PER_FY 0.00366832502f /* 1 / fy, 1/px */
+#define CALIB_LENS_INVERSE_C1 0.217687204f /* coefficient of r2^1, dimensionless */
+#define CALIB_LENS_INVERSE_C2 -0.333740741f /* coefficient of r2^2, dimensionless */
+#define CALIB_LENS_INVERSE_C3 -1.56922758f /* coefficient of r2^3, dimensionless */
+#define CALIB_LENS_INVERSE_C4 3.4366281f /* coefficient of r2^4, dimensionless */
+#define CALIB_LENS_INVERSE_C5 -2.06394625f /* coefficient of r2^5, dimensionless */
 #define CALIB_LENS_INVERSE_P(r2) (1.0f + (r2) * (CALIB_LENS_INVERSE_C1 + (r2) * (CALIB_LENS_INVERSE_C2 + (r2) * (CALIB_LENS_INVERSE_C3 + (r2) * (CALIB_LENS_INVERSE_C4 + (r2) * (CALIB_LENS_INVERSE_C5)))))) /* P by Horner's scheme */
 
 /* Plane of the actuator, without the shift and stretch that align has found. */
 #define CALIB_HAS_PLANE 1 /* for #if */
 #define CALIB_PLANE_OK 1 /* 0: the plane failed its gate */
-#define CALIB_PLANE_INVERSE_11 0.00365913147f /* row 1, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
-#define CALIB_PLANE_INVERSE_12 -8.84323381e-05f /* row 1, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
+#define CALIB_PLANE_INVERSE_11 0.00365913124f /* row 1, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
+#define CALIB_PLANE_INVERSE_12 -8.84323672e-05f /* row 1, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
 #define CALIB_PLANE_INVERSE_13 -0.59913069f /* row 1, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
-#define CALIB_PLANE_INVERSE_21 7.93041836e-05f /* row 2, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
+#define CALIB_PLANE_INVERSE_21 7.93041909e-05f /* row 2, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
 #define CALIB_PLANE_INVERSE_22 0.0036219582f /* row 2, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
 #define CALIB_PLANE_INVERSE_23 -0.160735831f /* row 2, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
-#define CALIB_PLANE_INVERSE_31 -0.000315899641f /* row 3, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
-#define CALIB_PLANE_INVERSE_32 -0.000872946228f /* row 3, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
+#define CALIB_PLANE_INVERSE_31 -0.000315899902f /* row 3, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
+#define CALIB_PLANE_INVERSE_32 -0.000872945704f /* row 3, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
 #define CALIB_PLANE_INVERSE_33 3.76397467f /* row 3, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
 
 /* The same from normalised undistorted coordinates, for CALIB_UNDISTORT 1. */
 #define CALIB_PLANE_NORMALISED_11 1.00044155f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_12 -0.0241070073f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_13 -0.0202265717f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_21 0.0216825232f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_12 -0.0241070148f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_13 -0.0202265233f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_21 0.0216825251f /* row 2, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_22 0.987360179f /* row 2, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_23 0.220973432f /* row 2, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_31 -0.0863699839f /* row 3, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_32 -0.237968609f /* row 3, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_23 0.220973358f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_31 -0.0863700584f /* row 3, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_32 -0.237968475f /* row 3, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_33 3.62429237f /* row 3, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_LEAST_PER_M 0.356375545f /* 1/s below this: behind the horizon, 1/m */
+#define CALIB_PLANE_LEAST_PER_M 0.356375515f /* 1/s below this: behind the horizon, 1/m */
 
 /*
  * The same from pixels as the camera reports them, fitted over the workspace, for
@@ -140,14 +144,14 @@
  */
 #define CALIB_HAS_RAW_PLANE 1 /* 0: the workspace is not in sight */
 #define CALIB_PLANE_RAW_11 0.00369111937f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_12 -8.82073728e-05f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_13 -0.604398549f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_21 7.2182891e-05f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_12 -8.82074019e-05f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_13 -0.604398489f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_21 7.21829128e-05f /* row 2, distorted px to m */
 #define CALIB_PLANE_RAW_22 0.00363213895f /* row 2, distorted px to m */
 #define CALIB_PLANE_RAW_23 -0.160437226f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_31 -0.000436221279f /* row 3, distorted px to m */
-#define CALIB_PLANE_RAW_32 -0.00111492141f /* row 3, distorted px to m */
-#define CALIB_PLANE_RAW_33 3.81185985f /* row 3, distorted px to m */
+#define CALIB_PLANE_RAW_31 -0.000436221308f /* row 3, distorted px to m */
+#define CALIB_PLANE_RAW_32 -0.0011149213f /* row 3, distorted px to m */
+#define CALIB_PLANE_RAW_33 3.81185961f /* row 3, distorted px to m */
 #define CALIB_PLANE_RAW_LEAST_PER_M 0.35496065f /* 1/s below this: behind the horizon, 1/m */
 
 /*
@@ -168,14 +172,17 @@
 #define CALIB_IMU_SIGN_AX 1 /* 1 or -1, by hand for an IMU that is not right-handed as mounted */
 #define CALIB_IMU_SIGN_AY 1 /* 1 or -1 */
 #define CALIB_IMU_SIGN_GZ 1 /* 1 or -1 */
-#define CALIB_IMU_ACCEL_BIAS_X_MPS2 -0.0136803258f /* subtracted from ax, m/s^2 */
+#define CALIB_IMU_ACCEL_BIAS_X_MPS2 -0.0136803268f /* subtracted from ax, m/s^2 */
 #define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.0682322532f /* subtracted from ay, m/s^2 */
 #define CALIB_IMU_ACCEL_RATIO 1.01684356f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
 #define CALIB_IMU_GYRO_BIAS_RADPS 0.0060058306f /* gz at rest, rad/s; sign as read */
-#define CALIB_IMU_MOUNT_ANGLE_RAD 0.0228268709f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
-#define CALIB_IMU_ACCEL_LIMIT_MPS2 400.0f /* readings beyond are lost, m/s^2 */
-#define CALIB_IMU_RATE_LIMIT_RADPS 60.0f /* readings beyond are lost, rad/s */
+#define CALIB_IMU_MOUNT_ANGLE_RAD 0.0228268839f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
+#define CALIB_IMU_ACCEL_LIMIT_MPS2 157.0f /* readings beyond are lost, m/s^2 */
+#define CALIB_IMU_RATE_LIMIT_RADPS 35.0f /* readings beyond are lost, rad/s */
 #define CALIB_IMU_ACCEL_WEAK_MPS2 1.0f /* |ax| and |ay| below say nothing of phi, m/s^2 */
+
+/* Angle filter: (2.3). */
+#define CALIB_LEVELLING 0 /* 1: the levelling filter, for #if */
 
 /*
  * Angle filter (2.3), dt folded in. The integral is kept as an angle per tick, J = I dt:
@@ -189,7 +196,7 @@
 #define CALIB_PHI_LIMIT_RAD 1.58000004f /* |phi| stays below; range of the sine in the pipeline, rad */
 
 /* Marker to head (A.1): x = X - d sin(phi), y = Y - d cos(phi). */
-#define CALIB_MARKER_OFFSET_M 0.0145891309f /* d, m; positive beyond the head */
+#define CALIB_MARKER_OFFSET_M 0.0145891318f /* d, m; positive beyond the head */
 
 /*
  * Low-pass of x and y. y_k = b0 x_k + b1 x_(k-1) + b2 x_(k-2) - a1 y_(k-1) - a2 y_(k-2): SciPy's
@@ -230,12 +237,12 @@
 #define CALIB_FUSED_PART 0.510548532f /* ceil(D) - D, share of a tick */
 #define CALIB_FUSED_DELAY_TICKS 1.48945153f /* D, ticks from the exposure of a picture to its tick */
 #define CALIB_FUSED_ACCEL_11 0.000252484402f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_12 5.86152419e-06f /* row 1, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_12 5.86152737e-06f /* row 1, of ay, rad per m/s^2 */
 #define CALIB_FUSED_ACCEL_1 -3.85401427e-06f /* row 1, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_21 -5.76443063e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_22 0.00025673717f /* row 2, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_2 -1.7438897e-05f /* row 2, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_GAIN 0.00250114966f /* K_a, share of the accelerometer's residual */
+#define CALIB_FUSED_ACCEL_21 -5.76443335e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_22 0.000256737141f /* row 2, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_2 -1.74388952e-05f /* row 2, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_GAIN 0.00250114943f /* K_a, share of the accelerometer's residual */
 #define CALIB_FUSED_ACCEL_WEAK 0.000254959188f /* |A| and |B| below say nothing of phi, rad */
 #define CALIB_FUSED_HALF_DT_S 0.00819364097f /* dt / 2 over the gyroscope's scale, s */
 #define CALIB_FUSED_HALF_BIAS_RAD 4.92096187e-05f /* bias times the same, rad */
@@ -244,7 +251,7 @@
 #define CALIB_FUSED_BOOST_PHI_PER_M 10.6181612f /* the same after a start, rad/m */
 #define CALIB_FUSED_BIAS 0.00252509769f /* K_b, share of the correction */
 #define CALIB_FUSED_MOVING_LENGTH 0.188934132f /* K_m, dimensionless */
-#define CALIB_FUSED_MOVING_RATE 0.00691442611f /* K_v, per tick */
+#define CALIB_FUSED_MOVING_RATE 0.00691442657f /* K_v, per tick */
 #define CALIB_FUSED_REST_LENGTH 0.0091134198f /* K_r, dimensionless */
 #define CALIB_FUSED_RATE_DECAY 0.935506999f /* K_d, per tick, at rest and without a picture */
 #define CALIB_FUSED_SLOW 0.0989248976f /* K_s, dimensionless */
@@ -323,6 +330,17 @@ static const float calib_ff_table_pwm[15] CALIB_IN_FLASH = {
     173.256531f, 180.798706f, 188.398972f, 196.222733f, 204.48378f, 213.565292f,
     224.297455f, 242.190018f, 253.5f,
 };
+
+/*
+ * Envelope, see calib_guard.h: the pumps stop where the actuator leaves it.
+ * Defaults of the nominal actuator, not in rig.yaml: envelope.least_length_m, envelope.greatest_length_m, envelope.angle_rad, envelope.rate_mps, envelope.full_power_s, envelope.apart_m.
+ */
+#define CALIB_ENVELOPE_LEAST_M 0.0450000018f /* shortest length of a bellows, m */
+#define CALIB_ENVELOPE_GREATEST_M 0.115000002f /* longest length of a bellows, m */
+#define CALIB_ENVELOPE_ANGLE_RAD 1.5f /* greatest bending to each side, rad */
+#define CALIB_ENVELOPE_STEP_M 0.00833333377f /* greatest change of a length in a tick, m; 0.5 m/s */
+#define CALIB_ENVELOPE_FULL_TICKS 180 /* ticks that a pump may stay at its greatest command */
+#define CALIB_ENVELOPE_APART_M 0.0120000001f /* marker from where the angle puts it at most, m */
 
 #if defined(CALIB_EXPECT_TICK_RATE_MHZ)
 #if CALIB_EXPECT_TICK_RATE_MHZ != CALIB_TICK_RATE_MHZ
