@@ -170,6 +170,19 @@ def test_a_step_of_the_bias_is_told_with_what_it_does(at_s: float) -> None:
     assert float(told.split("turns by ")[1].split(" deg")[0]) == pytest.approx(6.0, rel=0.15)
 
 
+@pytest.mark.parametrize(
+    ("axis", "size", "advice"), [(2, 0.01, "learn the bias at each rest"), (4, 0.05, "was touched then")]
+)
+def test_a_step_beyond_the_deviation_of_the_bias_makes_it_poor(axis: int, size: float, advice: str) -> None:
+    log, _ = rest_log(replace(IMU, gyro_walk=0.0, accel_walk=0.0), 720.0, 5)
+    stepped = log.values.copy()
+    stepped[30000:, axis] += size
+    judged = judge(analyse_static([replace(log, values=stepped)]))
+    assert judged.word == "poor"
+    assert any(f"the mean of {AXES[axis]} steps by" in text for text in judged.reasons)
+    assert any(advice in text for text in judged.advice)
+
+
 def test_noise_and_a_walk_are_no_steps() -> None:
     for seed in range(12):
         imu = replace(IMU, gyro_walk=3e-5 * 2.0 ** (seed % 6), accel_walk=3e-4)

@@ -376,9 +376,9 @@ def _of_steps(log: StaticLog, noise: Sequence[AxisNoise]) -> Iterator[Finding]:
         one = noise[step.axis]
         if one.axis.startswith("g"):
             size = f"{math.degrees(step.size):+.2g} deg/s"
-            effect = (
-                f"an angle from it turns by {60.0 * math.degrees(abs(step.size)):.2g} deg in a minute more"
-            )
+            turned = 60.0 * math.degrees(abs(step.size))
+            effect = f"an angle from it turns by {turned:.2g} deg more in a minute"
+            advice = "learn the bias at each rest, and keep a sensor that calibrates itself from doing so"
         else:
             size = f"{step.size:+.2g} m/s^2"
             effect = f"an angle from gravity turns by up to {math.degrees(abs(step.size) / 9.8):.2g} deg"
