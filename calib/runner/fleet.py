@@ -822,11 +822,17 @@ def finish(store: Store, manifest: Manifest) -> FleetSummary:
     Raises `BadInputError` when a file cannot be written.
     """
     pa = needed("pyarrow")
-    found = (store.outcome(rig.name) for rig in manifest.rigs)
-    times = ((one.name, one.seconds, one.peak_MB) for one in found if one is not None)
-    write_timings(store.out, "name,seconds,peak_MB", times)
     between, final = store.out / HIDDEN / "rows.parquet", store.out / "fleet.parquet"
-    write_outcomes(between, [rig.name for rig in manifest.rigs], store.outcome)
+    times: dict[str, tuple[float, float | None]] = {}
+
+    def timed(name: str) -> Outcome | None:
+        found = store.outcome(name)
+        if found is not None:
+            times[name] = found.seconds, found.peak_MB
+        return found
+
+    write_outcomes(between, [rig.name for rig in manifest.rigs], timed)
+    write_timings(store.out, "name,seconds,peak_MB", ((name, *two) for name, two in times.items()))
     try:
         summary, worst, which = summarise(between)
         known = np.isfinite(worst)

@@ -418,18 +418,16 @@ def run_case(base: Base, case: Case, seed: int, scratch: str = "") -> dict[str, 
 
 def _changed(case: Case) -> tuple[dict[str, Any], dict[str, str]]:
     """Changes to rig.yaml by their paths, and options of the scenario as they would be typed."""
+    from calib.twin.scenarios import as_typed
+
     changed, options = dict[str, Any](), dict[str, str]()
     for key, value in case.values:
         section, _, rest = key.partition(".")
         if section == "scenario":
-            options[rest] = str(value).lower() if isinstance(value, bool) else _typed(value)
+            options[rest] = as_typed(value)
         else:
             changed[key] = value
     return changed, options
-
-
-def _typed(value: float | str) -> str:
-    return value if isinstance(value, str) else repr(int(value) if value == int(value) else value)
 
 
 @lru_cache(maxsize=4)
@@ -654,7 +652,10 @@ def _results(some: tuple[Case, ...], result: Any) -> tuple[list[CaseResult], boo
     return [CaseResult(case.number, {}, words, 0.0) for case in some], True
 
 
-def _rows(store: Store, spec: SweepSpec, measures: tuple[str, ...]) -> Iterator[dict[str, Any]]:
+def _rows(
+    store: Store, spec: SweepSpec, measures: tuple[str, ...], times: dict[int, float]
+) -> Iterator[dict[str, Any]]:
+    """Rows of the table; `times` takes what each case has taken."""
     digest = _digest(spec)
     for number, bundle in _bundles(spec):
         results = {one.number: one for one in _kept(store, number, digest) or []}
@@ -666,6 +667,8 @@ def _rows(store: Store, spec: SweepSpec, measures: tuple[str, ...]) -> Iterator[
             found = {} if one is None else one.measures
             row |= {name: found.get(name) for name in measures}
             row["sentence"] = "was not run" if one is None else one_line(one.sentence)
+            if one is not None:
+                times[case.number] = one.seconds
             yield row
 
 
@@ -693,16 +696,16 @@ def summarise_sweep(store: Store, spec: SweepSpec, as_before: int) -> SweepSumma
 
     Raises `BadInputError` for a measure that there is not.
     """
-    pa, digest = needed("pyarrow"), _digest(spec)
-    kept = (one for number, _ in _bundles(spec) for one in _kept(store, number, digest) or [])
-    write_timings(store.out, "case,seconds", ((one.number, one.seconds) for one in kept))
+    pa = needed("pyarrow")
     measures = _measured(store, spec)
     fields = [pa.field(name, pa.int64()) for name in ("case", "point", "draw")]
     fields += [pa.field(name, pa.float64() if _numeric(spec, name) else pa.string()) for name in spec.names]
     fields += [pa.field(name, pa.float64()) for name in measures]
     fields.append(pa.field("sentence", pa.string()))
     path = store.out / "sweep.parquet"
-    write_table(path, pa.schema(fields), _rows(store, spec, measures))
+    times: dict[int, float] = {}
+    write_table(path, pa.schema(fields), _rows(store, spec, measures, times))
+    write_timings(store.out, "case,seconds", times.items())
     with Table(path) as table:
         said = texts(table, "sentence")
         failed = [sentence for sentence in said if sentence]

@@ -597,13 +597,15 @@ def simulate(
     Raises `UsageError`, `BadInputError` as `make_scenario` and `run_scenario`.
     """
     machine = SimulatedRig() if rig is None else rig_from_file(rig)
-    plan = make_scenario(scenario, {name: _typed(value) for name, value in settings.items()})
+    plan = make_scenario(scenario, {name: as_typed(value) for name, value in settings.items()})
     duration_s = parse_duration_s(duration, "duration") if isinstance(duration, str) else duration
     return log_of(run_scenario(plan, machine, seed, feedback, duration_s), scenario)
 
 
-def _typed(value: object) -> str:
-    """A setting as it is typed."""
+def as_typed(value: object) -> str:
+    """A setting as it is typed, such as "500" for 500.0."""
     if isinstance(value, list | tuple):
-        return ",".join(str(one) for one in value)
-    return str(value).lower() if isinstance(value, bool) else str(value)
+        return ",".join(as_typed(one) for one in value)
+    if isinstance(value, bool):
+        return str(value).lower()
+    return repr(int(value)) if isinstance(value, float) and value == math.floor(value) else str(value)

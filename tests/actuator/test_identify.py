@@ -38,7 +38,7 @@ from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import Plant
 from calib.stages.actuator.read import TrackSource, let_go, read_track, start_in_motion
 from calib.stages.actuator.section import Known, KnownActuator, KnownPump
-from calib.stages.actuator.validate import IMPROVED, ORIGINAL, compare, validate_log
+from calib.stages.actuator.validate import IMPROVED, ORIGINAL, begun_track, compare, models_of
 from calib.twin.rig import SimulatedRig
 
 TRUTH = {
@@ -554,7 +554,7 @@ def test_the_true_model_leaves_the_noise_and_another_one_more() -> None:
     source = TrackSource(track("prbs", values, noise=0.0), "truth", 0.025, ())
     nominal = Machine()
     plant = replace(nominal.plant, stiffness_scale=1.3, bending_N_per_rad2=0.25)
-    found = compare(source, {ORIGINAL: nominal, IMPROVED: replace(nominal, plant=plant)}, 0.0126)
+    found = compare(source, {ORIGINAL: nominal, IMPROVED: replace(nominal, plant=plant)})
     assert found.errors[IMPROVED]["phi"].rms < 1e-3
     assert found.errors[IMPROVED]["q1"].fit_percent > 98.0
     for quantity in ("q1", "q2", "phi"):
@@ -569,7 +569,7 @@ def test_one_wrong_picture_does_not_decide() -> None:
     head = seen.head.copy()
     head[100] += (1.0, 0.02)
     clean, wrong = (
-        compare(TrackSource(replace(seen, head=h), "pictures", 0.025, ()), {ORIGINAL: Machine()}, 0.0126)
+        compare(TrackSource(replace(seen, head=h), "pictures", 0.025, ()), {ORIGINAL: Machine()})
         for h in (seen.head, head)
     )
     assert wrong.replaced == clean.replaced + 1
@@ -587,11 +587,13 @@ def test_a_log_with_its_true_parameters(tmp_path: Path) -> None:
     stated = Known(actuator=KnownActuator(**actuator, lambda3=-1.0), pump=KnownPump(**pump))
     known = rig_file(path, known=stated)
     log = log_file(tmp_path / "log.csv", rig, "prbs", 1, 6.0)
-    found, _ = validate_log(log, known, path, truth=True)
+    track, start = begun_track(log, known, path, truth=True)
+    found = compare(track, models_of(known), start)
     assert found.how == "truth" and found.hoses
     assert found.errors[IMPROVED]["q1"].rms < 1e-5 and found.errors[IMPROVED]["phi"].rms < 1e-3
     assert found.improvement_percent("q1") > 99.0
-    seen, _ = validate_log(log, known, path)
+    track, start = begun_track(log, known, path)
+    seen = compare(track, models_of(known), start)
     assert seen.how == "pictures"
     # The marker's place comes in whole pixels of a third of a millimetre and more.
     assert 1e-4 < seen.errors[IMPROVED]["q1"].rms < 1e-3

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from calib.core.rig import Rig
     from calib.core.stage import Progress
     from calib.core.words import Block, Table
-    from calib.stages.actuator.identify import StiffnessFit
+    from calib.stages.actuator.identify import Start, StiffnessFit
     from calib.stages.actuator.machine import Machine
     from calib.stages.actuator.pump_results import PumpFound
     from calib.stages.actuator.read import PumpTable, TrackSource
@@ -26,23 +26,44 @@ if TYPE_CHECKING:
     from calib.stages.actuator.section import Actuator, PumpSection
     from calib.stages.actuator.validate import Comparison
     from calib.stages.arm.identify import Held
+    from calib.stages.arm.model import Trial
 
     Sections = tuple[Actuator, PumpSection | None]
 
 
 @dataclass(frozen=True)
-class LogsOptions(LogOptions):
-    """Where the pose comes from, and what is estimated."""
+class PoseOptions(LogOptions):
+    """Where the pose comes from."""
 
     states: tuple[Path, ...] | None = option(
         None, "States of calib replay to use instead of the pictures, for the logs in turn."
     )
     truth: bool = option(False, "Take the true columns of a simulated log, to test the method.")
     no_pwm: bool = option(False, "Logs without commands are swings with the hoses off.")
+
+
+@dataclass(frozen=True)
+class LogsOptions(PoseOptions):
+    """What is estimated."""
+
     static_map: bool = option(False, "Estimate the steady elongations at 6, 8, 10 and 12 V as well.")
     hold_back: bool = option(
         True, "Predict each log from a fit to the others.", flag="hold-back/--no-hold-back"
     )
+
+
+def _with_states(files: Files, options: PoseOptions) -> list[tuple[Path, Path | None]]:
+    """Logs with their states. Raises `UsageError` where these are not one for each, or not to be used."""
+    from calib.stages import expanded
+
+    states = expanded(options.states)
+    if not states:
+        return [(path, None) for path in files.paths]
+    if len(states) != len(files.paths):
+        raise UsageError(f"--states: {len(states)} files for {len(files.paths)} logs, expected one for each")
+    if options.truth:
+        raise UsageError("--truth: takes the true columns, --states does not apply")
+    return list(zip(files.paths, states, strict=True))
 
 
 @dataclass(frozen=True)
@@ -63,19 +84,12 @@ class LogsInputs:
 
 
 def _read(files: Files, rig: Rig, options: LogsOptions) -> LogsInputs:
-    from calib.stages import expanded
     from calib.stages.actuator.read import read_track
     from calib.stages.actuator.results import beginning
 
-    states = expanded(options.states)
-    if states and len(states) != len(files.paths):
-        raise UsageError(f"--states: {len(states)} files for {len(files.paths)} logs, expected one for each")
-    if options.truth and states:
-        raise UsageError("--truth: takes the true columns, --states does not apply")
     nominal, stated = beginning(rig)
     tracks = []
-    for k, path in enumerate(files.paths):
-        given = states[k] if states else None
+    for path, given in _with_states(files, options):
         track = read_track(path, rig, files.rig_path, nominal, given, options.truth, options.no_pwm, options)
         files.taken(path)
         if track.states is not None:
@@ -466,16 +480,20 @@ stiffness = Stage(
 
 
 @dataclass(frozen=True)
-class ValidateOptions(LogOptions):
-    """Where the pose comes from, and what is known of an arm's logs."""
+class ValidateOptions(PoseOptions):
+    """What is known of an arm's logs."""
 
-    states: tuple[Path, ...] | None = option(
-        None, "States of calib replay to use instead of the pictures, for the logs in turn."
-    )
-    truth: bool = option(False, "Take the true columns of a simulated log.")
-    no_pwm: bool = option(False, "Logs without commands are swings with the hoses off.")
     load: tuple[str, ...] | None = option(None, "Mass at the tip of an arm's logs.", metavar="NAME=MASS")
     day: tuple[str, ...] | None = option(None, "Day of an arm's logs.", metavar="NAME=DAY")
+
+
+@dataclass(frozen=True)
+class ValidateInputs:
+    """Tracks of the actuator with the estimator's starts, or trials of an arm, and the rig."""
+
+    tracks: Sequence[tuple[TrackSource, Start | None]]
+    trials: Sequence[Trial]
+    rig: Rig
 
 
 @dataclass(frozen=True)
@@ -492,44 +510,46 @@ class Validated:
     verdict: Verdict = Verdict()
 
 
-def _read_validate(files: Files, rig: Rig, options: ValidateOptions) -> Validated:
+def _read_validate(files: Files, rig: Rig, options: ValidateOptions) -> ValidateInputs:
     from calib.core.files import shown
     from calib.io.columns import is_arm_log
     from calib.io.logs import columns_of
-    from calib.stages import expanded
-    from calib.stages.actuator.validate import IMPROVED, validate_log
+    from calib.stages.actuator.validate import IMPROVED, begun_track, models_of
 
-    states = expanded(options.states)
-    if states and len(states) != len(files.paths):
-        raise UsageError(f"--states: {len(states)} files for {len(files.paths)} logs, expected one for each")
-    if options.truth and states:
-        raise UsageError("--truth: takes the true columns, --states does not apply")
+    logs = _with_states(files, options)
     if all(is_arm_log(columns_of(path, options) or ()) for path in files.paths):
         if rig.arm is None:
             raise BadInputError(f"{shown(files.rig_path)}: has no arm yet; run calib identify arm first")
         # An arm's trials are read by its own stage.
-        from calib.stages.arm.stage import Options, validate
+        from calib.stages.arm.stage import Options, held_trials
 
         arm_options = Options(columns=options.columns, load=options.load, day=options.day)
-        return Validated(held=validate(files, rig, arm_options))
-    compared = []
-    for k, path in enumerate(files.paths):
-        one, said = validate_log(
-            path, rig, files.rig_path, states[k] if states else None, options.truth, options.no_pwm, options
-        )
-        files.remarks += said
-        compared.append(one)
-    if IMPROVED not in compared[0].errors:
+        return ValidateInputs((), held_trials(files, rig.arm, arm_options), rig)
+    tracks = []
+    for path, states in logs:
+        track, start = begun_track(path, rig, files.rig_path, states, options.truth, options.no_pwm, options)
+        files.remarks += track.said
+        tracks.append((track, start))
+    if IMPROVED not in models_of(rig):
         files.remarks.append(
             f"{shown(files.rig_path)} has no section known, actuator or pump: the improved model has "
             "nominal parameters"
         )
-    return Validated(tuple(compared))
+    return ValidateInputs(tracks, (), rig)
 
 
-def _as_read(validated: Validated) -> Validated:
-    """Nothing is solved: reading a log asks the models already."""
-    return validated
+def _solve_validate(inputs: ValidateInputs) -> Validated:
+    from calib.stages.actuator.validate import compare, models_of
+
+    if inputs.trials:
+        from calib.stages.arm.identify import errors_by
+
+        arm = inputs.rig.arm
+        assert arm is not None
+        held = {one.name: errors_by(arm.values, arm.gain_of(one.day), one) for one in inputs.trials}
+        return Validated(held=held)
+    models = models_of(inputs.rig)
+    return Validated(tuple(compare(track, models, start) for track, start in inputs.tracks))
 
 
 def _validate_document(outcome: Validated) -> dict[str, Any]:
@@ -637,7 +657,7 @@ validate = Stage(
     Exits 0 whatever comes of it.
     """,
     _read_validate,
-    _as_read,
+    _solve_validate,
     ValidateOptions,
     sources="Logs to hold the models against.",
     metavar="LOG...",

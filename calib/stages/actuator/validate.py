@@ -19,7 +19,7 @@ first, as single wrong pictures would decide over an L2 norm.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -147,21 +147,19 @@ def _begun(track: Track, start: Start, nominal: Machine) -> Track:
     return replace(track, moving=replace(start, force1_N=F1, force2_N=F2, lag1_N=F1, lag2_N=F2))
 
 
-def compare(
-    source: TrackSource, models: Mapping[str, Machine], bellows_radius_m: float, start: Start | None = None
-) -> Comparison:
+def compare(source: TrackSource, models: Mapping[str, Machine], start: Start | None = None) -> Comparison:
     """A log against models by name, each simulated from the log's start.
 
     Parameters
     ----------
-    bellows_radius_m : that measured angles and lengths become bellows with.
+    models : of which the last gives the radius that measured angles and lengths become bellows with.
     start : the estimator's, the track's own without.
     """
     track, replaced = _cleaned(source.track)
     begin = track.start if start is None else start
     if track.moving is None:
         begin = Start(begin.phi_rad, begin.length_m)
-    measured = _columns(track.head, bellows_radius_m)
+    measured = _columns(track.head, list(models.values())[-1].plant.bellows_radius_m)
     simulated = {}
     for name, nominal in models.items():
         begun = _begun(track, begin, nominal)
@@ -183,7 +181,7 @@ def compare(
 
 
 def models_of(rig: Rig) -> dict[str, Machine]:
-    """The original model, the nominal one, and the improved one where the rig has an actuator or a pump.
+    """The original model, the nominal one, and last the improved one where the rig has an actuator or a pump.
 
     Mass, lengths and springs of the original model are the nominal ones.
     """
@@ -194,7 +192,7 @@ def models_of(rig: Rig) -> dict[str, Machine]:
     return models
 
 
-def validate_log(
+def begun_track(
     path: Path,
     rig: Rig,
     rig_path: Path,
@@ -202,8 +200,8 @@ def validate_log(
     truth: bool = False,
     no_pwm: bool = False,
     options: LogOptions = NOTHING_STATED,
-) -> tuple[Comparison, Sequence[str]]:
-    """A log against the original and the improved model, and sentences about how it was read.
+) -> tuple[TrackSource, Start | None]:
+    """A log's track, and the estimator's start where its pose comes from pictures.
 
     Parameters
     ----------
@@ -213,10 +211,8 @@ def validate_log(
     ------
     BadInputError as `read_track`.
     """
-    models = models_of(rig)
-    machine = models.get(IMPROVED, models[NOMINAL])
+    machine = list(models_of(rig).values())[-1]
     source = read_track(path, rig, rig_path, machine, states, truth, no_pwm, options)
-    start = None
-    if source.source == "pictures":
-        start = estimated_start(path, rig, rig_path, source.begin_s, options)
-    return compare(source, models, machine.plant.bellows_radius_m, start), source.said
+    if source.source != "pictures":
+        return source, None
+    return source, estimated_start(path, rig, rig_path, source.begin_s, options)

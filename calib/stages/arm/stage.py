@@ -284,15 +284,12 @@ def _document(arm: Arm) -> dict[str, Any]:
     }
 
 
-def validate(files: Files, rig: Rig, options: Options) -> dict[str, Held]:
-    """Free-run errors of the rig's arm on logs, by name. Raises `BadInputError` as `read_trials`."""
+def held_trials(files: Files, arm: Arm, options: Options) -> Sequence[Trial]:
+    """Trials to hold an arm against, in its plane. Raises `BadInputError` as `read_trials`."""
     import numpy as np
 
-    from calib.stages.arm.identify import errors_by
     from calib.stages.arm.read import Frame
 
-    arm = rig.arm
-    assert arm is not None
     axis = arm.bending_axis
     trials, _, findings = read_trials(files, options, Frame(None if axis is None else np.array(axis)))
     files.remarks += [one.text for one in findings]
@@ -301,7 +298,7 @@ def validate(files: Files, rig: Rig, options: Options) -> dict[str, Held]:
         for one in trials
         if one.day not in arm.days
     ]
-    return {one.name: errors_by(arm.values, arm.gain_of(one.day), one) for one in trials}
+    return trials
 
 
 arm = Stage(

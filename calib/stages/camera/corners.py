@@ -151,7 +151,7 @@ def _squares_are_plain(smooth: _Float32, grid: Refined) -> bool:
 
 def _squares_meet(gray: GrayImage, grid: Refined) -> bool:
     """Whether the squares keep their tones up to the corners, as round spots do not that only touch."""
-    p = grid.points
+    p, image = grid.points, gray.astype(np.float32)
     along, across = np.gradient(p, axis=1), np.gradient(p, axis=0)
     i, j = np.indices(p.shape[:2])
     parity = (1.0 - 2.0 * ((i + j) % 2)) * grid.sign
@@ -159,7 +159,7 @@ def _squares_meet(gray: GrayImage, grid: Refined) -> bool:
     def step(share: float) -> float:
         """Median step between the four squares of a corner, at a share of a square from it."""
         one, two = share * (along + across), share * (along - across)
-        here = [sample(gray.astype(np.float32), q) for q in (p + one, p - one, p + two, p - two)]
+        here = sample(image, np.stack([p + one, p - one, p + two, p - two]))
         return float(np.median(parity * (here[0] + here[1] - here[2] - here[3])))
 
     near = max(_NEAR, _NEAR_PX / square_px(p))
