@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import astuple, dataclass, field, fields, replace
 
 import numpy as np
@@ -189,6 +190,8 @@ def made(nominal: Machine, values: Mapping[str, float], hoses: bool, tick_s: flo
 
 SUBSTEPS = 12
 """Steps per tick of 1/60 s: 1.4 ms, of fourth order."""
+_ROUGH_SUBSTEPS = 6
+"""The same while a minimum is searched."""
 
 
 @dataclass(frozen=True)
@@ -277,6 +280,7 @@ def heads_of(
     delay_s: float,
     threads: int = 2,
     pairs: Sequence[tuple[Plant, Pump]] | None = None,
+    per_tick: int = SUBSTEPS,
 ) -> tuple[FloatArray, FloatArray]:
     """Angle and length at the track's rows, and their rates, for sets of parameters: (sets, m, 2) each.
 
@@ -284,6 +288,7 @@ def heads_of(
     ----------
     delay_s : the rows show the head as it was this much earlier.
     pairs : plants and pumps of the sets, where they have been made before.
+    per_tick : steps in 1/60 s.
 
     A set whose motion leaves the model is NaN.
     """
@@ -297,7 +302,7 @@ def heads_of(
     rows = np.stack([start.row(plant) for (plant, _), start in zip(pairs, starts, strict=True)])
     last = float(track.t_s[-1] - delay_s)
     ticks = min(max(int(np.ceil(last / track.tick_s)) + 1, 2), len(track.pwm))
-    substeps = max(round(SUBSTEPS * 60.0 * track.tick_s), 4)
+    substeps = max(round(per_tick * 60.0 * track.tick_s), 4)
     states, _ = simulate_batch(
         [p for p, _ in pairs], [u for _, u in pairs], pwm[:ticks], rows, substeps, threads
     )
@@ -397,6 +402,7 @@ class Problem:
     names : parameters that are estimated. held : values of others that differ from the nominal ones.
     delay_s, delay_sigma_s : what is known of the rows' delay.
     stated : standard deviations of nominal values that a person states; zero for those that are exact.
+    rough : for a search: steps of twice the length, differences to one side.
     """
 
     nominal: Machine
@@ -407,6 +413,12 @@ class Problem:
     delay_sigma_s: float = _DELAY_SIGMA_S
     threads: int = 2
     stated: Mapping[str, float] = field(default_factory=dict)
+    rough: bool = False
+
+    @property
+    def per_tick(self) -> int:
+        """Steps of a simulation in 1/60 s."""
+        return _ROUGH_SUBSTEPS if self.rough else SUBSTEPS
 
     @property
     def priors(self) -> list[tuple[int, float, float]]:
@@ -510,7 +522,9 @@ def residuals(problem: Problem, xs: FloatArray) -> FloatArray:
         delay = layout.delay + layout.delays[k]
         # Candidates of one batch may differ in their delay; rates shift them to their own.
         middle = float(np.mean(xs[:, delay]))
-        head, rate = heads_of(track, problem.nominal, values, starts, middle, problem.threads)
+        head, rate = heads_of(
+            track, problem.nominal, values, starts, middle, problem.threads, per_tick=problem.per_tick
+        )
         if np.ptp(xs[:, delay]) > 0.0:
             head = head - rate * (xs[:, delay] - middle)[:, None, None]
         error = track.head - head - xs[:, None, layout.offset : layout.delay]
@@ -527,10 +541,15 @@ def jacobian(problem: Problem, x: FloatArray) -> tuple[FloatArray, FloatArray]:
     P = len(problem.names)
     steps = _STEP * np.maximum(np.abs(x[:P]), scales[:P])
     up, down = np.minimum(x[:P] + steps, high[:P]), np.maximum(x[:P] - steps, low[:P])
+    start_steps = np.array(_START_STEP)
+    if problem.rough:
+        up, down = np.where(up - x[:P] >= x[:P] - down, up, down), x[:P]
+    width = np.concatenate([up - down, start_steps if problem.rough else 2.0 * start_steps])
+    sides = (1.0,) if problem.rough else (1.0, -1.0)
     base = problem.values(x)
     moved = [base]
-    for name, a, b in zip(problem.names, up.tolist(), down.tolist(), strict=True):
-        moved += [{**base, name: a}, {**base, name: b}]
+    for name, *ends in zip(problem.names, up.tolist(), down.tolist(), strict=True):
+        moved += [{**base, name: end} for end in ends[: len(sides)]]
     # Making a plant checks it, which takes as long as a short log: once for all logs of a kind.
     alike: dict[tuple[bool, float], list[tuple[Plant, Pump]]] = {}
     blocks, errors = [], []
@@ -542,15 +561,17 @@ def jacobian(problem: Problem, x: FloatArray) -> tuple[FloatArray, FloatArray]:
             alike[kind] = [made(problem.nominal, values, *kind) for values in moved]
         count = layout.starts[k]
         for name, step in zip(track.unknown, _START_STEP, strict=False):
-            sets += [base, base]
-            starts += [replace(begin, **{name: getattr(begin, name) + s * step}) for s in (1.0, -1.0)]
+            sets += [base] * len(sides)
+            starts += [replace(begin, **{name: getattr(begin, name) + s * step}) for s in sides]
         delay = layout.delay + layout.delays[k]
         pairs = [*alike[kind], *[alike[kind][0]] * (len(sets) - len(moved))]
-        head, rate = heads_of(track, problem.nominal, sets, starts, float(x[delay]), problem.threads, pairs)
+        head, rate = heads_of(
+            track, problem.nominal, sets, starts, float(x[delay]), problem.threads, pairs, problem.per_tick
+        )
         W = track.whitening
         J = np.zeros((len(track.t_s), 2, layout.size))
-        width = np.concatenate([up - down, 2.0 * np.array(_START_STEP)[:count]])
-        slope = (head[1::2] - head[2::2]) / width[:, None, None]
+        moved_to, moved_from = (head[1:], head[:1]) if problem.rough else (head[1::2], head[2::2])
+        slope = (moved_to - moved_from) / width[: P + count, None, None]
         slope = -np.einsum("mij,smj->mis", W, slope)
         J[:, :, :P] = slope[:, :, :P]
         J[:, :, layout.of_start(k)] = slope[:, :, P:]
@@ -641,10 +662,17 @@ def weights(residual: FloatArray) -> FloatArray:
     return np.asarray(1.0 / np.sqrt(1.0 + (residual / _SOFT) ** 2))
 
 
+class _Enough(Exception):
+    """A search has come as far as it was asked to."""
+
+
 def solve(
-    problem: Problem, x: FloatArray, most: int = 30
+    problem: Problem, x: FloatArray, most: int = 30, enough: float = -math.inf
 ) -> tuple[FloatArray, float, FloatArray, FloatArray]:
-    """A minimum near x: unknowns, robust cost, residuals and derivatives there."""
+    """A minimum near x, or the first point of a cost below `enough`.
+
+    Returns unknowns, robust cost, residuals and derivatives there.
+    """
     low, high = problem.bounds()
     scales = problem.scales()
     begin = np.clip(x, low + 1e-9 * scales, high - 1e-9 * scales)
@@ -657,27 +685,36 @@ def solve(
             seen[key] = jacobian(problem, at)
         return seen[key]
 
+    end = begin
+
     def rows(at: FloatArray) -> FloatArray:
-        return both(at)[0]
+        nonlocal end
+        residual = both(at)[0]
+        if _robust(residual) < enough:
+            end = at
+            raise _Enough
+        return residual
 
     def slopes(at: FloatArray) -> FloatArray:
         return both(at)[1]
 
-    found = least_squares(
-        rows,
-        begin,
-        jac=slopes,
-        bounds=(low, high),
-        x_scale=scales,
-        loss="soft_l1",
-        f_scale=_SOFT,
-        max_nfev=most,
-        xtol=1e-8,
-        ftol=1e-8,
-        gtol=1e-10,
-    )
-    residual, J = both(np.asarray(found.x, dtype=np.float64))
-    return np.asarray(found.x), float(_robust(residual)), residual, J
+    with suppress(_Enough):
+        end = least_squares(
+            rows,
+            begin,
+            jac=slopes,
+            bounds=(low, high),
+            x_scale=scales,
+            loss="soft_l1",
+            f_scale=_SOFT,
+            max_nfev=most,
+            xtol=1e-8,
+            ftol=1e-8,
+            gtol=1e-10,
+        ).x
+    end = np.array(end, dtype=np.float64)
+    residual, J = both(end)
+    return end, float(_robust(residual)), residual, J
 
 
 def informative(problem: Problem, residual: FloatArray, J: FloatArray, x: FloatArray) -> FloatArray:
@@ -841,20 +878,27 @@ def _search(
     problem: Problem, known: Mapping[str, float], seed: int, progress: Progress | None
 ) -> tuple[tuple[FloatArray, float, FloatArray, FloatArray], int, int]:
     """The best of several refined starts, how many agree with it, and of how many."""
-    spread = _spread(problem, known, seed)
-    costs = _robust(residuals(problem, spread))
-    order = np.argsort(costs, kind="stable")[:_REFINED].tolist()
+    spread, rough = _spread(problem, known, seed), replace(problem, rough=True)
+    order = np.argsort(_robust(residuals(rough, spread)), kind="stable")[:_REFINED].tolist()
     if 0 not in order:
         order.append(0)
-    found = []
+    best, costs, limit = spread[0], list[float](), math.inf
     for done, k in enumerate(order):
         if progress is not None:
             progress(done, len(order) + 1)
-        found.append(solve(problem, spread[k], 25))
-    best = min(found, key=lambda one: one[1])
-    final = solve(problem, best[0], 40)
-    limit = final[1] * 1.01 + 3.0
-    return final, sum(one[1] <= limit for one in found), len(order) if math.isfinite(final[1]) else 0
+        # A start that comes near the best minimum so far leads there: it needs no end of its own.
+        x, cost, _, _ = solve(rough, spread[k], 25, limit if done else -math.inf)
+        if not costs or cost < min(costs):
+            best, limit = x, _alike(cost)
+        costs.append(cost)
+    final = solve(problem, best, 40)
+    agreeing = sum(cost <= _alike(final[1]) for cost in costs)
+    return final, agreeing, len(order) if math.isfinite(final[1]) else 0
+
+
+def _alike(cost: float) -> float:
+    """Robust cost below which a search has come to the minimum of this cost."""
+    return 1.01 * cost + 3.0
 
 
 # ----------------------------------------------------------------------
@@ -1026,11 +1070,25 @@ def held_back(solution: Solution) -> list[HeldLog]:
         kinds = {t.hoses for t in others}
         names = tuple(name for name in problem.names if _told_by(name, kinds))
         less = replace(problem, tracks=others, names=names, held=found)
-        x, _, _, _ = solve(less, first_guess(less, found), 15)
+        x, _, _, _ = solve(less, _taken_over(solution, less), 15)
         alone = replace(problem, tracks=[track], names=(), held={**found, **less.values(x)})
-        _, _, residual, _ = solve(alone, first_guess(alone, found), 15)
+        _, _, residual, _ = solve(alone, _taken_over(solution, alone), 15)
         (phi, length) = rms_by_track(alone, residual)[0]
         out.append(HeldLog(track.name, *inside[k], phi, length))
+    return out
+
+
+def _taken_over(solution: Solution, problem: Problem) -> FloatArray:
+    """Unknowns of a problem of some of the logs, as the solution for all of them has them."""
+    whole, x = solution.problem.layout, solution.x
+    layout, out = problem.layout, np.zeros(problem.layout.size)
+    out[: layout.offset] = [solution.values[name] for name in problem.names]
+    out[layout.offset : layout.delay] = x[whole.offset : whole.delay]
+    of_track = {id(track): k for k, track in enumerate(solution.problem.tracks)}
+    for k, track in enumerate(problem.tracks):
+        at = of_track[id(track)]
+        out[layout.of_start(k)] = x[whole.of_start(at)]
+        out[layout.delay + layout.delays[k]] = x[whole.delay + whole.delays[at]]
     return out
 
 
