@@ -74,20 +74,31 @@ def log_likelihood(setup: Setup, logs: Sequence[Rows]) -> float:
 
 
 def best(values: FloatArray, likelihood: Callable[[float], float]) -> tuple[Estimate, float]:
-    """The maximum over a rising grid of positive numbers, refined in the logarithm."""
-    found = np.array([likelihood(float(value)) for value in values])
-    k = int(np.argmax(found))
+    """The maximum over a rising grid of positive numbers, refined in the logarithm.
+
+    The grid is climbed from its middle, as each likelihood is a run of the filter.
+    """
+    found = dict[int, float]()
+
+    def at(index: int) -> float:
+        if index not in found:
+            found[index] = likelihood(float(values[index])) if 0 <= index < len(values) else -math.inf
+        return found[index]
+
+    k = len(values) // 2
+    while at(k) < max(at(k - 1), at(k + 1)):
+        k += 1 if at(k + 1) > at(k - 1) else -1
     if not 0 < k < len(values) - 1:
-        return Estimate(float(values[k]), None), float(found[k])
-    x, y = np.log(values[k - 1 : k + 2]), found[k - 1 : k + 2]
+        return Estimate(float(values[k]), None), at(k)
+    x, y = np.log(values[k - 1 : k + 2]), np.array([at(k - 1), at(k), at(k + 1)])
     a, b, _ = np.polyfit(x - x[1], y - y[1], 2)
     if not a < 0.0:
-        return Estimate(float(values[k]), None), float(found[k])
+        return Estimate(float(values[k]), None), at(k)
     top = float(np.clip(-0.5 * b / a, x[0] - x[1], x[2] - x[1]))
     value = math.exp(x[1] + top)
     at_top = likelihood(value)
-    if at_top < found[k]:
-        return Estimate(float(values[k]), math.sqrt(-0.5 / a)), float(found[k])
+    if at_top < at(k):
+        return Estimate(float(values[k]), math.sqrt(-0.5 / a)), at(k)
     return Estimate(value, math.sqrt(-0.5 / a)), at_top
 
 
