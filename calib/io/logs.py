@@ -239,12 +239,23 @@ def _by_pyarrow(text: _Text, data: bytes, lines: IntArray) -> _Block | None:
     cells, odd = {}, 0
     for name, number in wanted.items():
         column = table.column(number)
-        values = np.array(column.to_numpy(), dtype=np.float64)
+        values = _floats(column)
         infinite = np.isinf(values)
         odd += int(np.count_nonzero(np.isnan(values))) - column.null_count + int(np.count_nonzero(infinite))
         values[infinite] = np.nan
         cells[name] = values
     return _Block(cells, lines, odd)
+
+
+def _floats(column: Any) -> FloatArray:
+    """Doubles (n,) of an Arrow column, NaN where it has none; `to_numpy` would load pandas."""
+    array = column.combine_chunks()
+    valid, data = array.buffers()
+    rows = slice(array.offset, array.offset + len(array))
+    values = np.frombuffer(data, dtype=np.float64)[rows].copy()
+    if valid is not None:
+        values[np.unpackbits(np.frombuffer(valid, dtype=np.uint8), bitorder="little")[rows] == 0] = np.nan
+    return values
 
 
 def _by_lines(text: _Text, data: bytes, lines: IntArray) -> _Block:

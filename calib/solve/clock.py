@@ -32,7 +32,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.optimize import isotonic_regression
 
 from calib.core.arrays import BoolArray, FloatArray, IntArray
 
@@ -245,6 +244,10 @@ def _running_median(values: FloatArray) -> FloatArray:
 def _on_line(t: FloatArray, i: IntArray, origin: float, period: float) -> FloatArray:
     """Number k (n,) on the line of each of the samples i (n,), rising as they do or faster."""
     behind = _running_median(np.rint((t - origin) / period) - i)
+    if bool(np.all(behind[1:] >= behind[:-1])):
+        return behind + i
+    from scipy.optimize import isotonic_regression
+
     # Samples that were all late, as after a loop that stalled, are outweighed by those that follow.
     return np.asarray(np.rint(isotonic_regression(behind).x) + i)
 

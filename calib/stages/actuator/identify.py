@@ -8,7 +8,6 @@ from contextlib import suppress
 from dataclasses import astuple, dataclass, field, fields, replace
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
@@ -673,6 +672,8 @@ def solve(
 
     Returns unknowns, robust cost, residuals and derivatives there.
     """
+    from scipy.optimize import least_squares
+
     low, high = problem.bounds()
     scales = problem.scales()
     begin = np.clip(x, low + 1e-9 * scales, high - 1e-9 * scales)

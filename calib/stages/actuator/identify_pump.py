@@ -9,8 +9,7 @@ from itertools import combinations, pairwise
 
 import numpy as np
 from numba import njit
-from scipy.optimize import least_squares
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from calib.core.arrays import BoolArray, FloatArray
 from calib.core.errors import BadInputError
@@ -327,6 +326,8 @@ def _solve(
 
     `without` leaves some rows out.
     """
+    from scipy.optimize import least_squares
+
     start, low, high = problem.nominal()
     scale = np.maximum(np.abs(start), 1e-3)[free]
 
@@ -399,7 +400,7 @@ def _by_chance(problem: _Problem, theta: FloatArray, free: list[int], extras: in
         left_out = problem.residual(moved)[s] / (_SCALE_SHARE * problem.span)
         rise += float(np.sum(np.sqrt(1.0 + left_out**2) - np.sqrt(1.0 + base[s] ** 2)))
     lam = max(rise, 0.0) / len(free) / len(base)
-    return 0.5 * lam * float(chi2.ppf(_CONFIDENCE, extras))
+    return 0.5 * lam * float(chdtri(extras, 1.0 - _CONFIDENCE))
 
 
 def _covariance(problem: _Problem, theta: FloatArray, free: list[int]) -> FloatArray:
@@ -766,6 +767,8 @@ def fit_static_map(name: str, pwm: FloatArray, value: FloatArray) -> StaticMap:
 
     Raises `BadInputError` for fewer than five levels of PWM or values that are all alike.
     """
+    from scipy.optimize import least_squares
+
     u, y = np.asarray(pwm, dtype=np.float64), np.asarray(value, dtype=np.float64)
     if len(np.unique(u)) < _FEWEST:
         raise BadInputError(f"{name}: has {len(np.unique(u))} levels of PWM, expected at least {_FEWEST}")

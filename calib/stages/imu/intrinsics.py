@@ -10,7 +10,6 @@ from typing import Literal
 
 import numpy as np
 from numba import njit
-from scipy.optimize import least_squares
 from scipy.special import fdtrc
 
 from calib.core.arrays import FloatArray, IntArray
@@ -294,6 +293,8 @@ def _tau(r: FloatArray, deviation: FloatArray, dof: int) -> float:
 
 def _solve(p: FloatArray, free: IntArray, x: FloatArray, g: float, deviation: FloatArray) -> FloatArray:
     """Least squares over the free parameters."""
+    from scipy.optimize import least_squares
+
     d = x.shape[1]
     units = _units(p, d, g)[free]
 
@@ -746,6 +747,8 @@ def fit_gyroscope(turns: Turns, accel: Accelerometer, si: bool) -> Gyroscope:
     accel : the accelerometer as it was fitted to the same rests.
     si : readings are in rad/s already, so that the scale is about 1.
     """
+    from scipy.optimize import least_squares
+
     planar = len(accel.bias) == 2
     bias = fit_bias(turns, accel)
     rates, across = _rates(turns, accel, bias), tangents(turns, accel)

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from scipy.signal import butter
 
 from calib.core.arrays import BoolArray, FloatArray
 from calib.core.errors import BadInputError, pip_install
@@ -240,6 +239,8 @@ def up_vector(
     if not (np.isfinite(force).all() and np.isfinite(gyro).all()):
         raise BadInputError("up vector: a reading is not finite, expected numbers")
     cutoff = min(math.sqrt(2.0) / (2.0 * math.pi * tau_s), 0.45 / period_s)
+    from scipy.signal import butter
+
     b, a = butter(2, cutoff, fs=1.0 / period_s)
     out = np.empty_like(force)
     settle = max(round(tau_s / period_s), 1)
