@@ -53,7 +53,6 @@ def simulate(
     from calib.core.units import parse_duration_s
     from calib.core.writing import check_writable
     from calib.io.logs import SIMULATED, write_log
-    from calib.twin.folder import write_rig_folder
     from calib.twin.rig import SimulatedRig, rig_from_file
     from calib.twin.scenarios import make_scenario, run_scenario
     from calib.twin.simulate import FEEDBACKS, log_of
@@ -71,6 +70,8 @@ def simulate(
     if scenario == "rig":
         if options or duration_s is not None:
             raise UsageError("rig: writes a fixed set of logs, --set and --duration do not apply")
+        from calib.twin.folder import write_rig_folder
+
         with progress_bar("simulating") as progress:
             logs = write_rig_folder(output, machine, seed, feedback, progress)
         told |= {"folder": str(output), "logs": [path.name for path in logs]}

@@ -10,10 +10,6 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import solve_discrete_lyapunov
-from scipy.ndimage import median_filter
-from scipy.optimize import brentq
-from scipy.signal import detrend, savgol_filter, sosfilt, welch
 
 from calib.core.arrays import BoolArray, ComplexArray, FloatArray
 from calib.core.errors import BadInputError
@@ -419,6 +415,7 @@ def dc_delay_s(sections: FloatArray, rate_hz: float) -> float:
 
 def cutoff_hz(sections: FloatArray, rate_hz: float) -> float:
     """Frequency [Hz] at which the power is halved."""
+    from scipy.optimize import brentq
 
     def above_half(f: float) -> float:
         return float(np.abs(frequency_response(sections, np.array([f]), rate_hz)[0])) ** 2 - 0.5
@@ -434,6 +431,8 @@ def settled_state(sections: FloatArray, first: FloatArray) -> FloatArray:
 
 def filter_signal(sections: FloatArray, x: FloatArray) -> FloatArray:
     """Filtered signal (n, ...) along the first axis, started without a transient; `x` has no NaN."""
+    from scipy.signal import sosfilt
+
     if len(x) == 0:
         return np.array(x, dtype=np.float64)
     y, _ = sosfilt(sections, x, axis=0, zi=settled_state(sections, np.asarray(x[0])))
@@ -442,6 +441,8 @@ def filter_signal(sections: FloatArray, x: FloatArray) -> FloatArray:
 
 def step_response(sections: FloatArray, rate_hz: float) -> StepResponse:
     """Answer to a step, as long as it takes to settle to a thousandth."""
+    from scipy.signal import sosfilt
+
     delay = dc_delay_s(sections, rate_hz) * rate_hz
     count = int(min(max(8.0 * delay, 16.0) + 1, 4_000_000))
     while True:
@@ -473,6 +474,8 @@ def noise_gain(sections: FloatArray) -> float:
 
     The stationary covariance P = A P A' + B B' of the cascade's state gives C P C' + D^2.
     """
+    from scipy.linalg import solve_discrete_lyapunov
+
     A, B, C, D = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.ones((1, 1))
     for b0, b1, b2, _, a1, a2 in sections:
         second = b2 != 0.0
@@ -585,6 +588,8 @@ def _without_outliers(x: FloatArray) -> tuple[FloatArray, int]:
 
     The spread is taken from the 95 % quantile: on a pixel grid more than half of the differences are zero.
     """
+    from scipy.ndimage import median_filter
+
     middle = np.asarray(median_filter(x, 5, mode="nearest"), dtype=np.float64)
     away = np.abs(x - middle)
     sigma = float(np.quantile(away, 0.95)) / 1.96
@@ -593,11 +598,15 @@ def _without_outliers(x: FloatArray) -> tuple[FloatArray, int]:
 
 
 def _density(x: FloatArray, rate_hz: float, segment: int, average: Literal["mean", "median"]) -> FloatArray:
+    from scipy.signal import welch
+
     _, P = welch(x - x.mean(), rate_hz, nperseg=segment, detrend=_without_line, average=average)
     return np.asarray(P[1:-1], dtype=np.float64)
 
 
 def _without_line(segments: FloatArray) -> FloatArray:
+    from scipy.signal import detrend
+
     return np.asarray(detrend(segments, axis=-1, type="linear"), dtype=np.float64)
 
 
@@ -652,6 +661,8 @@ def quantisation_hz(pixels: FloatArray, step_px: float, rate_hz: float) -> Float
     through half a second; what is slower than a line in two seconds is rest and not
     counted; NaN where all is. Frequencies above half the rate are folded back.
     """
+    from scipy.signal import savgol_filter
+
     window = max(5, int(0.5 * rate_hz) | 1)
     if step_px <= 0.0 or len(pixels) < window:
         return np.full(3, np.nan)
