@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from calib.core.plot import Arrows, Band, Bars, Curve, Field, Figure, Plot, Ribbon, Rule, Shape, Text
 from calib.runner.cache import store
+from calib.show.charts import chart
 from calib.show.page import keep_pictures
 
 __all__ = ["EVIL", "finished_run"]
@@ -40,6 +42,37 @@ def _png(width: int, height: int, seed: int) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(noise).resize((width, height), Image.Resampling.NEAREST).save(buffer, format="png")
     return buffer.getvalue()
+
+
+def _chart(title: str) -> bytes:
+    """A figure with all kinds of marks, on plain, logarithmic and other axes."""
+    x = np.linspace(0.0, 10.0, 2000)
+    y = np.where((x > 4.0) & (x < 5.0), np.nan, np.sin(x))
+    dots = Curve(x, 2.0 * y, kind="points", colour=x / 10.0)
+    values = np.add.outer(np.arange(5.0), np.arange(7.0)) ** 3 + 1.0
+    field = Field(np.arange(7.0), np.arange(5.0), values, "px", "error (px)")
+    panels = (
+        Plot("", "left (mm)", (Ribbon(x, y - 0.1, y + 0.1, "band"), Curve(x, y, EVIL), Rule("y", 0.0))),
+        Plot(
+            "time (s)",
+            "right (mm)",
+            (dots, Band("x", 1.0, 2.0, EVIL)),
+        ),
+        Plot(
+            "x",
+            "y",
+            (field,),
+            equal=True,
+            down=True,
+        ),
+        Plot("x", "y", (Arrows(np.zeros((2, 2)), np.eye(2), 3.0, "px"), Text(0.5, 0.5, EVIL, bold=True))),
+        Plot("f (Hz)", "", (Curve(x[1:], x[1:], spread=0.1 * x[1:], kind="squares"),), log="xy", title=EVIL),
+        Plot("n", "", (Bars(np.arange(3), np.arange(3), across=True),), names=("one", "two", EVIL)),
+        Plot("x", "y", (Shape(np.eye(3)[:, :2], "ochre", opacity=0.5),), bare=True),
+        Plot("x", "y", empty="nothing was seen"),
+    )
+    figure = Figure(title, "In plain words.", panels, 9.0, "poor", 2)
+    return json.dumps(chart(figure), allow_nan=False).encode()
 
 
 def _job(name: str, stage: str, title: str, status: str, **more: Any) -> dict[str, Any]:
@@ -87,7 +120,7 @@ def finished_run(root: Path) -> Path:
         for k, name in enumerate(names)
     ]
     document = {"models": [{"name": "radial2", "fitted_rms_px": 0.01}, {"name": EVIL, "fitted_rms_px": 0.2}]}
-    figures = {"camera_errors.png": _png(1196, 800, 5), "camera_sigma.png": _png(1196, 500, 6)}
+    figures = {"camera_errors.json": _chart("Errors"), "camera_sigma.json": _chart(EVIL)}
     _result(out, "intrinsics", {**document, "per_view": seen}, figures, f"found {EVIL}\n")
     for log in ("one", "two"):
         check = {"degrees": 2, "nis": 2.0}
@@ -102,7 +135,7 @@ def finished_run(root: Path) -> Path:
             out,
             f"replay-{log}",
             {"replay": {"logs": [told]}},
-            {f"replay_{log}_states.png": _png(1196, 900, 7)},
+            {f"replay_{log}_states.json": _chart(f"States of {log}")},
             "",
         )
     jobs = [

@@ -256,13 +256,18 @@ def spaced(count: int) -> FloatArray:
 
 
 def thinned(x: AnyArray, y: AnyArray, most: int = MOST_POINTS) -> tuple[AnyArray, AnyArray]:
-    """At most about `most` points of a line (n,), the least and the largest of each stretch."""
+    """At most about `most` points of a line (n,): least and largest of each stretch, in their order."""
     size = -(-2 * len(y) // most)
     if size <= 2:
         return x, y
     starts = np.arange(0, len(y), size)
-    low, high = np.fmin.reduceat(y, starts), np.fmax.reduceat(y, starts)
-    return np.repeat(x[starts], 2), np.column_stack([low, high]).ravel()
+    padded = np.full(len(starts) * size, np.nan)
+    padded[: len(y)] = y
+    rows = padded.reshape(-1, size)
+    least = np.where(np.isnan(rows), np.inf, rows).argmin(axis=1)
+    largest = np.where(np.isnan(rows), -np.inf, rows).argmax(axis=1)
+    kept = (starts[:, None] + np.sort(np.column_stack([least, largest]), axis=1)).ravel()
+    return x[kept], y[kept]
 
 
 def every(values: AnyArray, most: int = MOST_POINTS) -> AnyArray:

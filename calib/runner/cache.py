@@ -120,9 +120,9 @@ class Result:
         return []
 
     def figures(self) -> list[Path]:
-        """The figures, in the order of their names."""
+        """The charts of the figures, in the order of their names."""
         names = sorted(name for name in self.files if name.startswith("figures/"))
-        return [self.folder / name for name in names if name.endswith((".png", ".svg"))]
+        return [self.folder / name for name in names if name.endswith(".json")]
 
 
 @cache

@@ -95,6 +95,11 @@ def publish(runner: Runner, ended: Sequence[Done], told: dict[str, Any]) -> list
             for name in done.result.files:
                 if name.startswith(f"{output}/"):
                     wanted[name] = done.result.folder / name
+    if told["simulated"]:
+        # What was calibrated lies where one sees it.
+        root = runner.folder.root
+        files = (path for path in root.rglob("*") if path.is_file())
+        wanted |= {f"rig/{path.relative_to(root).as_posix()}": path for path in files}
     names = sorted(wanted)
     before = _listed(out)
     # Named first and written then: a file of ours is never forgotten.
@@ -102,7 +107,8 @@ def publish(runner: Runner, ended: Sequence[Done], told: dict[str, Any]) -> list
     for name in names:
         _copy(wanted[name], out / name)
     left = [name for name in sorted(set(before) - set(names)) if not _removed(out, out / name)]
-    for folder in {str(Path(name).parent) for name in before} - {str(Path(name).parent) for name in names}:
+    gone, kept = ({place for name in some for place in Path(name).parents} for some in (before, names))
+    for folder in sorted(gone - kept, reverse=True):
         with contextlib.suppress(OSError):
             (out / folder).rmdir()
     # One that could not be removed is tried again by the next run.
@@ -133,7 +139,8 @@ def _listed(out: Path) -> list[str]:
 
 def _is_ours(name: object) -> bool:
     parts = Path(name).parts if isinstance(name, str) else ()
-    return len(parts) == 2 and parts[0] in ("states", "firmware") and parts[1] not in ("..", ".")
+    kinds = {"states": (2,), "firmware": (2,), "rig": (2, 3, 4)}
+    return ".." not in parts and bool(parts) and len(parts) in kinds.get(parts[0], ())
 
 
 def _list(out: Path, names: list[str]) -> None:

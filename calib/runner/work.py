@@ -1,7 +1,7 @@
 """One stage carried out: read, solved, written into the rig's file, drawn; for a verb, and for a run.
 
 A run hands `Work` to a process; what comes of it lies in the work's folder: rig.yaml with the sections, the
-stage's document, its messages, its figures and what it wrote beside them.
+stage's document, its messages, the charts of its figures and what it wrote beside them.
 """
 
 from __future__ import annotations
@@ -133,8 +133,11 @@ def perform(work: Work) -> int:
     made = stage(work.verb)
     try:
         options = options_of(made.options, work.options)
-        figures = work.folder / FIGURES if work.figures and made.plots is not None else None
-        outcome, _ = carry_out(made, files, options, work.folder / RIG, figures)
+        outcome, _ = carry_out(made, files, options, work.folder / RIG)
+        if work.figures and made.plots is not None:
+            from calib.show.charts import write_charts
+
+            write_charts(work.folder / FIGURES, made.plots(outcome))
         told = document_of(made, outcome, files.written)
         # Nothing in a result differs from run to run.
         told.pop("seconds", None)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import contextlib
 import hashlib
-import io
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -17,38 +16,42 @@ from typing import Any
 from calib import __version__
 from calib.core.constants import constants
 from calib.core.errors import BadInputError
-from calib.core.files import read_bytes, sha256
+from calib.core.files import read_bytes, read_text, sha256
 from calib.core.rig import Rig
-from calib.core.words import BLANK, SIGMA, facts, number, unit_of
+from calib.core.words import BLANK, facts, number, unit_of
 from calib.core.writing import Kind, holds, make_folder, write_atomically
 from calib.runner.cache import Result, load
 from calib.runner.graph import HIDDEN, STEPS
 from calib.runner.outputs import decide, read_summary
+from calib.show.charts import library
 
 # ----------------------------------------------------------------------
 # Pages from their templates: each is one file, with its style and its script in it.
 
 
-def render(template: str, style: tuple[str, ...], script: tuple[str, ...], **values: Any) -> str:
+def render(
+    template: str, style: tuple[str, ...], script: tuple[str, ...], library: str = "", **values: Any
+) -> str:
     """A template of this package with what else goes into a page.
 
     Parameters
     ----------
     style, script : names of files that are put one behind the other. The page's policy lets no script run
-        but this one.
+        but this one and `library`, the text of another.
     values : what the template asks for beside them; all of it is escaped.
     """
     import jinja2
 
     words = "".join(_resource(name) for name in script)
-    digest = base64.b64encode(hashlib.sha256(words.encode()).digest()).decode()
+    hashes = [base64.b64encode(hashlib.sha256(one.encode()).digest()).decode() for one in (words, library)]
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     text = environment.from_string(_resource(template)).render(
         style="".join(_resource(name) for name in style),
         script=words,
-        script_hash=f"sha256-{digest}",
+        library=library,
+        script_hash="' '".join(f"sha256-{digest}" for digest in hashes),
         **values,
     )
     # A file's name may hold halves of characters, which no page can.
@@ -60,17 +63,14 @@ def _resource(name: str) -> str:
 
 
 # ----------------------------------------------------------------------
-# Pictures and figures small enough for one page: views as JPEG, figures with few colours.
+# Pictures small enough for one page: views as JPEG.
 #
 # What was made once is kept beside the run by the hash of its source, so that a page is rebuilt quickly
 # and without the pictures themselves.
 
 _WIDEST_PX = 640
 _QUALITY = 72
-_COLOURS = 128
 _MOST_PICTURES = 120
-_KIND_AT, _PALETTE = 25, b"\x03"
-"""Where a PNG tells how its colours are stored, and what it tells where it has few."""
 
 
 @dataclass(frozen=True)
@@ -83,22 +83,9 @@ class Embedded:
     data: bytes
 
 
-def data_uri(data: bytes) -> str:
+def data_uri(jpeg: bytes) -> str:
     """A picture as an address that needs no network."""
-    if data.startswith(b"\xff\xd8"):
-        kind = "jpeg"
-    elif data.startswith(b"\x89PNG"):
-        kind = "png"
-    else:
-        kind = "svg+xml"
-    return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
-
-
-def size_of(png: bytes) -> tuple[int, int]:
-    """Width and height of a PNG, a usual shape for anything else."""
-    if png.startswith(b"\x89PNG") and len(png) >= 24:
-        return int.from_bytes(png[16:20], "big"), int.from_bytes(png[20:24], "big")
-    return 1196, 800
+    return f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode('ascii')}"
 
 
 def _key(name: str) -> str:
@@ -154,36 +141,6 @@ def kept_picture(name: str, folder: Path) -> Embedded | None:
     return None
 
 
-def small_figure(path: Path, folder: Path, width_px: int = 0) -> bytes:
-    """A figure with as few colours as it needs, from `folder` where it has been made before.
-
-    With `width_px` it is made narrower, if it is wider than that and takes less room then.
-    """
-    raw = path.read_bytes()
-    if not raw.startswith(b"\x89PNG"):
-        return raw
-    narrower = 0 < width_px < size_of(raw)[0]
-    if not narrower and raw[_KIND_AT : _KIND_AT + 1] == _PALETTE:
-        return raw
-    place = folder / (f"{sha256(raw)}_{width_px}.png" if narrower else f"{sha256(raw)}.png")
-    with contextlib.suppress(OSError):
-        return place.read_bytes()
-    from PIL import Image
-
-    with Image.open(io.BytesIO(raw)) as whole:
-        plain = whole.convert("RGB")
-        if narrower:
-            plain = plain.resize((width_px, max(1, round(plain.height * width_px / plain.width))))
-        few = plain.quantize(_COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-        buffer = io.BytesIO()
-        few.save(buffer, format="png", compress_level=6)
-    small = min(buffer.getvalue(), raw, key=len)
-    with contextlib.suppress(BadInputError):
-        make_folder(folder)
-        write_atomically(place, small)
-    return small
-
-
 # ----------------------------------------------------------------------
 # What the page says of each stage: a few figures at its head, and tables of what the verb told.
 #
@@ -193,41 +150,6 @@ def small_figure(path: Path, folder: Path, width_px: int = 0) -> bytes:
 Values = Mapping[str, Any]
 Fact = tuple[str, str]
 
-_CAPTIONS = {
-    "camera_errors": "Reprojection errors of each view",
-    "camera_residuals": "Residuals over the picture",
-    "camera_coverage": "Where in the picture the board was seen",
-    "camera_poses": "Poses of the board",
-    "camera_sigma": "Standard deviation of a projected point over the picture",
-    "camera_distortion": "Distortion of the lens over the picture",
-    "camera_models": "Lens models compared on views held back",
-    "camera_boards": "Shapes of the board compared on views held back",
-    "plane_picture": "The board lying in the plane, with the world's axes",
-    "plane_sigma": "Standard deviation in millimetres over the workspace",
-    "plane_difference": "What a homography without the lens gets wrong",
-    "lens_displacement": "What the lens displaces, in px and mm",
-    "lens_inverse": "Error of the polynomial that undoes the lens",
-    "imu_allan": "Allan deviation of every axis",
-    "imu_drift": "Drift of the angle at rest",
-    "imu_poses": "Rests in different poses",
-    "imu_residuals": "Residuals of gravity over the poses",
-    "tune_gains": "Frontier of the angle filter's gains",
-    "tune_errors": "Errors of the angle on parts held back",
-    "drift_angles": "Angle over time, by every filter",
-    "drift_slopes": "Slopes of the angle with their intervals",
-    "lowpass_response": "Response of the low-pass",
-    "lowpass_log": "The low-pass on a log",
-    "align_correlation": "Gyroscope against camera over the time offset",
-    "control_margins": "Margins of the tuned loops",
-}
-_PARTS = {
-    "states": f"States with their 2{SIGMA} bands",
-    "errors": f"Errors against the truth, with 2{SIGMA}",
-    "innovations": "Consistency: innovations of each sensor",
-    "residuals": "Residuals",
-    "static": "Signals at rest",
-    "motion": "Angle in motion",
-}
 _ROWS = 200
 _DEEP = 4
 
@@ -247,23 +169,6 @@ class Table:
     title: str
     heads: tuple[str, ...]
     rows: tuple[tuple[Cell, ...], ...]
-
-
-def caption(stem: str, logs: Sequence[str] = ()) -> str:
-    """Words for a figure by its file's name; they serve readers who do not see it.
-
-    A number at the end of the name counts the stage's `logs`.
-    """
-    if stem in _CAPTIONS:
-        return _CAPTIONS[stem]
-    words = stem.split("_")
-    if words[-1].isdigit() and 1 <= int(words[-1]) <= len(logs):
-        words[-1] = logs[int(words[-1]) - 1]
-    for k in range(len(words) - 1, 0, -1):
-        if words[k] in _PARTS:
-            rest = " ".join(words[1:k] + words[k + 1 :])
-            return f"{_PARTS[words[k]]}{f': {rest}' if rest else ''}"
-    return stem.replace("_", " ")
 
 
 def tables(document: Values) -> list[Table]:
@@ -358,16 +263,12 @@ def _cell(value: Any) -> Cell:
 # and a policy in the page lets no script run but its own. Nothing of time or place goes in: the same
 # inputs give the same bytes.
 
-MOST_BYTES = 5_000_000
-"""A page is never larger; figures that do not fit are named instead."""
-_AIM_BYTES = 4_350_000
-"""What a page should take: beyond this, of several logs only the first figure of each is shown."""
-_NARROW_PX = 640
-"""Width of those where even they are too many."""
+MOST_BYTES = 2_200_000
+"""A page is never larger, the charts' library not counted; figures that do not fit are named instead."""
 _VIEWS_BYTES = 1_000_000
 _ROOM_BYTES = 400_000
 """What is kept for words, tables and numbers."""
-_MOST_COUNTED = 6
+_MOST_COUNTED = 3
 """Figures of one kind for each log that a stage shows, so that there is room for the states of all logs."""
 _STATUS = {
     "ok": "ok",
@@ -413,10 +314,12 @@ def page_text(rig: Path) -> str:
     views = _views(hidden, _Budget(_VIEWS_BYTES))
     budget.left -= sum(len(view["image"]) for view in views)
     stages = _stages(told, sections, whole, hidden, budget)
+    charts = any(part["figures"] for one in stages for part in one["parts"])
     return render(
         "page.html.j2",
         ("page.css",),
-        ("common.js", "page.js"),
+        ("common.js", "page.js", *(("charts.js",) if charts else ())),
+        library() if charts else "",
         decision=decide(told, sections),
         told=told,
         stages=stages,
@@ -530,7 +433,7 @@ def _stage(
         load(hidden / "stages" / str(job["name"])) if one else None
         for job, one in zip(jobs, ran, strict=True)
     ]
-    shown, width_px = _chosen(results, hidden / "figures", budget)
+    shown = _chosen(results, budget)
     parts = []
     for job, result in zip(jobs, results, strict=True):
         document = {} if result is None else result.document()
@@ -548,7 +451,6 @@ def _stage(
         )
     status = _worst([job["status"] for job in jobs])
     document = parts[0]["document"] if len(parts) == 1 else {}
-    coarse = f"of {len(jobs)} logs the figures are {width_px} px wide here, to keep this page small"
     return {
         "name": name,
         "title": jobs[0]["title"],
@@ -556,11 +458,7 @@ def _stage(
         "kind": status,
         "facts": _facts(jobs, rig, document) if status in ("ok", "poor") else [],
         "reasons": list(section.get("reasons") or ()),
-        "remarks": [
-            *(section.get("remarks") or ()),
-            *(section.get("advice") or ()),
-            *([coarse] if width_px else ()),
-        ],
+        "remarks": [*(section.get("remarks") or ()), *(section.get("advice") or ())],
         "parts": parts,
         "tables": _replay_tables(parts) if len(parts) > 1 or name == "replay" else tables(document),
         "several": len(parts) > 1,
@@ -601,29 +499,19 @@ def _worst(statuses: list[str]) -> str:
     return min(statuses, key=order.index)
 
 
-def _chosen(
-    results: list[Result | None], folder: Path, budget: _Budget
-) -> tuple[dict[Path, tuple[str, int, int]], int]:
-    """Address, width and height of the figures that are shown, and to what width in px they were narrowed.
-
-    Of several logs the first figure of each comes before the second of any, as far as the page is no larger
-    than it should be; the first ones may be narrowed, else the width is 0.
-    """
+def _chosen(results: list[Result | None], budget: _Budget) -> dict[Path, str]:
+    """Charts that are shown, as JSON; of several logs the first of each comes before the second of any."""
     ordered = [[] if result is None else sorted(result.figures(), key=_place) for result in results]
     listed = sorted(
         (k, job, path) for job, paths in enumerate(ordered) for k, path in enumerate(paths) if _counts(path)
     )
-    room = budget.left - (MOST_BYTES - _AIM_BYTES if len(results) > 1 else 0)
-    first = [data_uri(small_figure(path, folder)) for k, _, path in listed if k == 0]
-    width_px = _NARROW_PX if len(results) > 1 and sum(map(len, first)) > room else 0
     shown = {}
-    for k, _, path in listed:
-        image = small_figure(path, folder, width_px)
-        address = data_uri(image)
-        if (k == 0 or len(address) <= room) and budget.takes(address):
-            shown[path] = (address, *size_of(image))
-            room -= len(address)
-    return shown, width_px
+    for _, _, path in listed:
+        with contextlib.suppress(BadInputError, ValueError):
+            chart = _as_script(json.loads(read_text(path)))
+            if budget.takes(chart):
+                shown[path] = chart
+    return shown
 
 
 def _counts(path: Path) -> bool:
@@ -633,16 +521,20 @@ def _counts(path: Path) -> bool:
 
 
 def _figures(
-    result: Result | None, shown: Mapping[Path, tuple[str, int, int]], logs: list[str]
+    result: Result | None, shown: Mapping[Path, str], logs: list[str]
 ) -> tuple[list[dict[str, Any]], list[str]]:
+    """Charts with their words, and the names of those that are left out; a number counts the stage's logs."""
     figures, dropped = [], []
     for path in sorted([] if result is None else result.figures(), key=_place):
-        words = caption(path.stem, logs)
         if path in shown:
-            image, width, height = shown[path]
-            figures.append({"image": image, "caption": words, "width": width, "height": height})
+            told = json.loads(shown[path])
+            words = {name: told[name] for name in ("title", "note", "verdict")}
+            figures.append({"chart": shown[path], **words})
         else:
-            dropped.append(words)
+            parts = path.stem.split("_")
+            if parts[-1].isdigit() and 1 <= int(parts[-1]) <= len(logs):
+                parts[-1] = logs[int(parts[-1]) - 1]
+            dropped.append(" ".join(parts))
     return figures, dropped
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +22,7 @@ from calib.core.arrays import FloatArray
 from calib.core.plot import Arrows, Curve, Figure, Plot, Text, magnified, short
 from calib.core.verdict import Verdict, Word
 from calib.io.logs import Log, read_log, write_log
+from calib.show.charts import chart
 from calib.show.draw import draw, plain, write_figures
 from calib.stages import function, stage
 from calib.stages.actuator.identify_pump import Group, fit_static_map
@@ -303,7 +306,7 @@ def _settled() -> dict[str, Figure]:
     value[9] += 8.0
     groups = (Group(12.0, 0.2, (120.0, 180.0), ("a", "b")), Group(24.0, 0.2, (240.0, 240.0), ("c",)))
     maps = (fit_static_map("settled.csv", pwm, value),)
-    return pump_plots(PumpFound("kPa", (), {}, {}, {}, maps, groups, (), (), ()), "ok")
+    return pump_plots(PumpFound("kPa", (), {}, {}, {}, {}, maps, groups, (), (), ()), "ok")
 
 
 CASES: dict[str, Callable[[Path], dict[str, Figure]]] = {
@@ -354,6 +357,37 @@ CASES: dict[str, Callable[[Path], dict[str, Figure]]] = {
     "control: an ellipse checked": lambda _: _control("check", "ellipse", duration_s=8.0),
     "control: tuned": lambda _: _control("tune"),
 }
+
+
+def _decoded(entry: list[Any]) -> FloatArray:
+    """Numbers of an array of a chart, as the page's script reads them."""
+    kind, text, *scale = entry
+    raw = np.frombuffer(base64.b64decode(text), f"<{kind}").astype(np.float64)
+    return raw if kind == "f4" else np.where(raw == -32768.0, np.nan, scale[0] + (raw + 32767.0) * scale[1])
+
+
+def _check_chart(figure: Figure) -> None:
+    """A chart is JSON of a figure's words, panels and numbers, these to a step of 16 bits."""
+    whole = json.loads(json.dumps(chart(figure), allow_nan=False))
+    assert whole["title"] == figure.title and len(whole["panels"]) == len(figure.panels)
+    arrays = [_decoded(entry) for entry in whole["arrays"]]
+    for plot, panel in zip(figure.panels, whole["panels"], strict=True):
+        curves = (mark for mark in plot.marks if isinstance(mark, Curve) and not plot.linear_within)
+        # Of the traces these alone are told by a pointer and have a mode.
+        drawn = [one for one in panel["traces"] if "mode" in one and not {"hoverinfo", "text"} & set(one)]
+        for curve, trace in zip(curves, drawn, strict=False):
+            for axis, values in (("x", curve.x), ("y", curve.y)):
+                known = np.asarray(values, dtype=np.float64)[: len(arrays[trace[axis]["$"]])]
+                known = known[np.isfinite(known)]
+                if 0 < len(known) < 250 and len(known) == np.isfinite(values).sum():
+                    shown, room = (
+                        arrays[trace[axis]["$"]],
+                        np.ptp(known) / 65534.0 + 1e-6 * np.abs(known).max(),
+                    )
+                    assert np.nanmin(shown) == pytest.approx(known.min(), abs=room)
+                    assert np.nanmax(shown) == pytest.approx(known.max(), abs=room)
+
+
 QUICK = (
     "camera: sigma not bounded",
     "camera: no distortion, odd names",
@@ -373,6 +407,7 @@ def test_all_figures_are_legible(name: str, tmp_path: Path) -> None:
     assert figures
     for stem, figure in figures.items():
         assert complaints(figure) == [], stem
+        _check_chart(figure)
 
 
 def test_files_are_the_same_bytes_again(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import re
 from collections.abc import Iterator
 from hashlib import sha256
@@ -15,25 +16,21 @@ import numpy as np
 import pytest
 from chromium import Browser, browser_or_skip
 from pages import EVIL, finished_run
-from PIL import Image
 
 from calib.core.errors import BadInputError
 from calib.runner.cache import Result
 from calib.runner.fleet import FleetSummary, summarise, write_outcomes
 from calib.runner.outputs import decide
 from calib.runner.task import Outcome
+from calib.show.charts import library
 from calib.show.fleet import PAGE, fleet_page_text, write_fleet_page
 from calib.show.page import (
-    _AIM_BYTES,
     MOST_BYTES,
     _Budget,
     _chosen,
     _resource,
-    data_uri,
     page_text,
     render,
-    size_of,
-    small_figure,
     write_page,
 )
 
@@ -60,6 +57,14 @@ _LENGTH = """(() => {
 """How long the first residual is drawn."""
 
 
+_TO_EACH = (
+    "document.querySelectorAll('details').forEach((one) => { one.open = true; });"
+    "(async () => { for (const one of document.querySelectorAll('.chart')) {"
+    "one.scrollIntoView({behavior: 'instant'}); await new Promise((done) => setTimeout(done, 700)); } })()"
+)
+"""Opens all and looks at each chart, which is drawn when it is seen."""
+
+
 def _typed(name: str, value: str) -> str:
     """Script that gives an input a value as a person would."""
     told = f"e.value = '{value}'; e.dispatchEvent(new Event('input'));"
@@ -84,9 +89,10 @@ def test_nothing_leads_out_of_the_page_and_nothing_breaks_in(rig: Path) -> None:
             target = attributes.get(name)
             assert target is None or target.startswith(("data:image/", "#")) or target == "", (tag, target)
         assert not [name for name in attributes if name.startswith("on")], tag
-    assert sum(tag == "script" for tag, _ in outline.tags) == 2
+    # Views, the library, what is done with it, and four charts.
+    assert sum(tag == "script" for tag, _ in outline.tags) == 3 + 4
     assert "owned'</script>" not in text
-    assert not re.search(r"https?://(?!www\.w3\.org/2000/svg)", text)
+    assert not re.search(r"https?://(?!www\.w3\.org/2000/svg)", text.replace(library(), ""))
     assert text.count("49.png") == 0
 
 
@@ -94,7 +100,7 @@ def test_same_run_same_bytes_and_no_place(rig: Path) -> None:
     text = page_text(rig)
     assert text == page_text(rig)
     assert str(rig.parent) not in text and "/tmp" not in text
-    assert len(text.encode()) < MOST_BYTES
+    assert len(text.replace(library(), "").encode()) < MOST_BYTES
 
 
 @pytest.mark.parametrize(
@@ -120,15 +126,20 @@ def test_in_a_browser_all_is_seen_and_nothing_overflows(rig: Path, browser: Brow
     browser.run("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
     assert browser.run("document.documentElement.scrollWidth") <= width
     wide = browser.run(
-        "[...document.querySelectorAll('main *, nav *')].filter((e) => !e.closest('.scroll, .unseen') &&"
-        f" e.getBoundingClientRect().right > {width} + 1).map((e) => e.outerHTML.slice(0, 80))"
+        "[...document.querySelectorAll('main *, nav *')].filter((e) =>"
+        f" !e.closest('.scroll, .unseen, .canvas svg') && e.getBoundingClientRect().right > {width} + 1)"
+        ".map((e) => e.outerHTML.slice(0, 80))"
     )
     assert wide == []
     seen = browser.run(
         "[...document.querySelectorAll('main img')].map((e) => [e.complete, e.naturalWidth, e.offsetWidth])"
     )
-    assert len(seen) == 3 + 4
+    assert len(seen) == 3
     assert all(whole and natural > 0 and shown > 60 for whole, natural, shown in seen)
+    browser.run(_TO_EACH)
+    assert browser.run("document.querySelectorAll('.js-plotly-plot .main-svg').length") >= 4 * 2
+    sizes = browser.run("[...document.querySelectorAll('.canvas')].map((e) => e.scrollWidth - e.clientWidth)")
+    assert sizes == [0] * 4
     assert browser.errors == []
 
 
@@ -145,13 +156,34 @@ def test_clicks_and_keys(rig: Path, browser: Browser) -> None:
     assert browser.run(_LENGTH) < 0.1
     browser.key("Escape", 27)
     assert not browser.run("document.getElementById('view-dialog').open")
-    browser.click("button.figure")
-    assert (
-        browser.run("document.getElementById('figure-title').textContent")
-        == "Reprojection errors of each view"
+    assert browser.errors == []
+
+
+@pytest.mark.slow
+def test_charts_show_what_was_given_and_zoom_together(rig: Path, browser: Browser) -> None:
+    browser.open(rig.with_name("report.html"), 1400)
+    browser.run(_TO_EACH)
+    plot = "document.querySelector('.js-plotly-plot')"
+    line = f"{plot}.data.find((trace) => trace.mode === 'lines' && !trace.fill)"
+    x, y = browser.run(f"{line}.x"), browser.run(f"{line}.y")
+    gap = [b for b in y if b is None]
+    assert gap and len(x) == len(y) <= 520
+    off = [b - np.sin(a) for a, b in zip(x, y, strict=True) if b is not None]
+    assert np.abs(off).max() < 1e-3
+    browser.run(f"Plotly.relayout({plot}, {{'xaxis.range': [2, 3]}}).then(() => 1)")
+    # The second panel lies beside the first, the third one below it.
+    assert browser.run(f"{plot}.layout.xaxis.matches") == "x3"
+    titles = browser.run(
+        "[...document.querySelectorAll('.chart figcaption strong')].map((e) => e.textContent)"
     )
-    browser.click("#figure-dialog .close")
-    assert not browser.run("document.getElementById('figure-dialog').open")
+    assert titles == ["Errors", EVIL, "States of one", "States of two"]
+    said = browser.run(
+        "[...document.querySelectorAll('.js-plotly-plot text')].map((e) => e.textContent).join()"
+    )
+    assert EVIL in said and "nothing was seen" in said
+    assert (
+        browser.run("document.querySelectorAll('.js-plotly-plot img, .js-plotly-plot a[href]').length") == 0
+    )
     assert browser.errors == []
 
 
@@ -206,52 +238,30 @@ def test_dark_light_print_and_keyboard(rig: Path, browser: Browser) -> None:
 
 
 def _drawn(root: Path, logs: int) -> list[Result | None]:
-    """Results of as many logs, each with figures of about 40 kB."""
+    """Results of as many logs, each with charts of about 20 kB."""
     made: list[Result | None] = []
     for log in range(logs):
         folder = root / f"replay-{log}"
         (folder / "figures").mkdir(parents=True)
         files = {}
         for k, part in enumerate(("errors", "innovations", "states")):
-            noise = np.random.default_rng(3 * log + k).integers(0, 255, (200, 900), dtype=np.uint8)
-            image = Image.fromarray(np.where(np.arange(900) % 5 == 0, noise, 255).astype(np.uint8))
-            name = f"figures/replay_{log}_{part}.png"
-            image.quantize(128).save(folder / name)
+            name = f"figures/replay_{log}_{part}.json"
+            told = {"title": f"{part} {log}", "note": "", "verdict": "ok", "arrays": [str(k) * 20_000]}
+            (folder / name).write_text(json.dumps(told))
             files[name] = ""
         made.append(Result(folder, "", 0, files))
     return made
 
 
-@pytest.mark.parametrize(("logs", "narrow"), [(4, False), (40, False), (130, True)])
-def test_of_many_logs_the_states_come_first_and_the_page_stays_small(
-    tmp_path: Path, logs: int, narrow: bool
-) -> None:
+@pytest.mark.parametrize("logs", [4, 40, 130])
+def test_of_many_logs_the_states_come_first_and_the_page_stays_small(tmp_path: Path, logs: int) -> None:
     results = _drawn(tmp_path, logs)
     budget = _Budget(MOST_BYTES - 400_000)
-    shown, width_px = _chosen(results, tmp_path / "figures", budget)
-    stems = [path.stem for path in shown]
+    shown = [path.stem for path in _chosen(results, budget)]
     assert budget.left >= 0
-    assert sum(stem.endswith("states") for stem in stems) == logs
-    assert bool(width_px) == narrow
-    if logs == 4:
-        assert len(shown) == 12
-    else:
-        assert len(shown) < 3 * logs
-        assert narrow or budget.left >= MOST_BYTES - _AIM_BYTES
-
-
-def test_a_figure_is_smaller_and_made_once(tmp_path: Path) -> None:
-    shades = np.linspace(0, 255, 600, dtype=np.uint8)
-    figure = tmp_path / "f.png"
-    Image.fromarray(np.stack([np.add.outer(shades, shades) // k for k in (1, 2, 3)], axis=-1)).save(figure)
-    small = small_figure(figure, tmp_path / "figures")
-    assert len(small) < figure.stat().st_size and size_of(small) == (600, 600)
-    assert small_figure(figure, tmp_path / "figures") == small
-    assert len(list((tmp_path / "figures").iterdir())) == 1
-    assert data_uri(small).startswith("data:image/png;base64,")
-    vector = tmp_path / "v.svg"
-    vector.write_text("<svg/>")
-    assert data_uri(small_figure(vector, tmp_path / "figures")).startswith("data:image/svg+xml;")
+    states = sum(stem.endswith("states") for stem in shown)
+    assert states == min(logs, (MOST_BYTES - 400_000) // 20_100)
+    assert len(shown) == 12 if logs == 4 else len(shown) < 3 * logs
 
 
 def _job(stage: str, status: str = "ok", **more: Any) -> dict[str, Any]:

@@ -7,16 +7,6 @@
     dialog.querySelector(".close").addEventListener("click", () => dialog.close());
     dialog.addEventListener("click", (event) => { if (event.target === dialog) dialog.close(); });
   }
-  const figures = get("figure-dialog");
-  for (const button of document.querySelectorAll("button.figure")) {
-    button.addEventListener("click", () => {
-      const image = button.querySelector("img");
-      get("figure-title").textContent = image.alt;
-      get("figure-image").src = image.src;
-      get("figure-image").alt = image.alt;
-      figures.showModal();
-    });
-  }
 
   // Views: the picture with its residuals, drawn longer than they are.
   const views = JSON.parse(get("views-data").textContent);
@@ -79,12 +69,4 @@
     if (event.key === "ArrowLeft") show(current - 1);
     if (event.key === "ArrowRight") show(current + 1);
   });
-
-  // On paper everything is open.
-  let closed = [];
-  addEventListener("beforeprint", () => {
-    closed = [...document.querySelectorAll("details.log:not([open])")];
-    for (const one of closed) one.open = true;
-  });
-  addEventListener("afterprint", () => { for (const one of closed) one.open = false; });
 })();
