@@ -338,6 +338,7 @@ def pumps_at_rest(model: Model) -> PumpEstimate:
     return PumpEstimate(waiting_pwm=((0.0, 0.0),) * model.pump.delay_ticks)
 
 
+@lru_cache(maxsize=4096)
 def _arriving(model: Model, pwm: Pair) -> Pair:
     g1, g2 = force_of_pwm(model, np.array(pwm)).tolist() if any(pwm) else (0.0, 0.0)
     return g1, g2
