@@ -701,8 +701,8 @@ def test_sensors_that_are_gated_out_missing_or_stuck_are_poor() -> None:
     log = simulated("ellipse")[1]
     for names, value, words in (
         ((), 0.0, ""),
-        (READINGS[:2], np.nan, "the log has no pictures"),
-        (READINGS[2:], np.nan, "the log has no IMU samples"),
+        (READINGS[:2], np.nan, "the log has no pictures: the length is known from the prior alone"),
+        (READINGS[2:], np.nan, "the log has no IMU samples: angle and length come from the camera alone"),
         (("gz_radps",), np.nan, "the log has no gyroscope (gz_radps)"),
         (("ax_mps2",), np.nan, "the log has no accelerometer (ax_mps2, ay_mps2)"),
         (("ay_mps2",), 0.25, "ay_mps2 never changes, it is stuck at 0.25"),

@@ -338,10 +338,6 @@ def setup_from_rig(rig: Rig, path: Path, found: Periods) -> tuple[Setup, list[st
             raise BadInputError(f"{source}: has no plane, which pictures need; run calib extrinsics first")
         middle = (0.5 * (workspace[0] + workspace[2]), 0.5 * (workspace[1] + workspace[3]))
         view = view_coefficients(rig.camera.optics, np.array(plane.R_CW), np.array(plane.t_CW_m), middle)
-    else:
-        said.append("no pictures: the length is known from the prior alone, the result is degraded")
-    if not found.imu:
-        said.append("no IMU: angle and length come from the camera alone, the result is degraded")
     values, covariance, assumed = _from_align(rig)
     said += assumed
     plant = rig.plant

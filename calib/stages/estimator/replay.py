@@ -457,9 +457,9 @@ def sampled(watch: Watch) -> Iterator[Finding]:
     """Findings on sensors that are not there, do not move, or contradict each other."""
     camera, gyro, accel = (watch.has(*names) for names in (READINGS[:2], READINGS[4:], READINGS[2:4]))
     if not camera:
-        yield Finding("poor", "the log has no pictures")
+        yield Finding("poor", "the log has no pictures: the length is known from the prior alone")
     if not (gyro or accel):
-        yield Finding("poor", "the log has no IMU samples")
+        yield Finding("poor", "the log has no IMU samples: angle and length come from the camera alone")
     elif not gyro:
         yield Finding("poor", "the log has no gyroscope (gz_radps)")
     elif not accel:
@@ -497,13 +497,14 @@ def consistent(checks: Mapping[str, SensorCheck], flags: Mapping[str, int], rows
         elif check.gated > _GATED_SHARE * (check.readings + check.gated):
             share = f"{100.0 * check.gated / (check.readings + check.gated):.0f} % of the {name}'s readings"
             yield Finding("poor", f"{share} were gated out")
-    for flag, sentence in (
-        ("camera_silent", "the camera is silent"),
-        ("imu_silent", "the IMU is silent"),
-        ("held_by_prior", "no sensor bounds length or angle, the prior does"),
-        ("not_started", "nothing is known yet"),
+    # A sensor that is not in the log has a sentence of its own.
+    for flag, sentence, here in (
+        ("camera_silent", "the camera is silent", "camera" in checks),
+        ("imu_silent", "the IMU is silent", bool({"accel", "gyro"} & set(checks))),
+        ("held_by_prior", "no sensor bounds length or angle, the prior does", True),
+        ("not_started", "nothing is known yet", True),
     ):
-        if flags.get(flag, 0) > _FLAGGED_SHARE * rows:
+        if here and flags.get(flag, 0) > _FLAGGED_SHARE * rows:
             yield Finding("poor", f"{sentence} in {100.0 * flags[flag] / rows:.0f} % of the rows")
     if flags.get("time_jump"):
         yield Finding(
