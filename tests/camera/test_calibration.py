@@ -798,9 +798,11 @@ def test_a_fisheye_set_is_fitted_as_opencv_does_and_its_lens_is_chosen(shared_da
         boards,
         [pixels[None] for _, pixels in counted],
         views.image_size_px,
-        np.zeros((3, 3)),
+        # OpenCV's own start fails an assertion of `InitExtrinsics` on some processors; from 200 to 270 px
+        # all starts end here.
+        np.array([[240.0, 0.0, 374.0], [0.0, 240.0, 240.0], [0.0, 0.0, 1.0]]),
         np.zeros((4, 1)),
-        flags=cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW,
+        flags=cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW,
         criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 500, 1e-12),
     )
     assert fit.converged
