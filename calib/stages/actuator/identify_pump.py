@@ -33,15 +33,19 @@ from calib.stages.actuator.pump import PWM_MAX
 #
 # with p the pressure in the hose, z that in the chamber, and w in units of pressure per second. It is the
 # law of `calib.stages.actuator.pump.Orifice` on the way in. While the pump has never run, hose and chamber
-# are
-# taken for shut off from each other, as a valve leaves them.
+# are taken for shut off from each other, as a valve leaves them.
 #
-# Commands are held between their time stamps. A step of the simulation gets their mean over the step, so
-# that results are smooth in T_d. The steps are at most `STEP_S` and shorter for stiffer parameters.
+# Commands are held between their time stamps. The simulation goes from one command's effect to the next,
+# exactly for the lag, by steps of Runge and Kutta for the flow, and is smooth in T_d: on a grid of its own,
+# whose steps get a command's mean, slopes jump in T_d, and a search ends at one of these kinks.
 
 LAG, ORIFICE = "linear lag", "orifice flow"
 STEP_S = 2e-3
+"""Stable at the bounds of all parameters."""
+_DEAD_MOST_S = 0.5
 _START_S = 0.2
+_TICK_S = 1e-6
+"""Times that differ by less are the same."""
 _FREE = 1e6
 _PRIOR = 0.15
 """What the first measured value counts for a start, in samples."""
@@ -62,7 +66,7 @@ class Parameter:
     off: float | None = None
 
 
-_COMMON = (Parameter("dead_time_s", "s", 0.05, 0.0, 0.5), Parameter("level", "y", 1.0, 0.05, 20.0))
+_COMMON = (Parameter("dead_time_s", "s", 0.05, 0.0, _DEAD_MOST_S), Parameter("level", "y", 1.0, 0.05, 20.0))
 MODELS: dict[str, tuple[Parameter, ...]] = {
     LAG: (
         *_COMMON,
@@ -71,10 +75,10 @@ MODELS: dict[str, tuple[Parameter, ...]] = {
     ),
     ORIFICE: (
         *_COMMON,
-        Parameter("laminar_s", "s", 0.2, 0.0, 30.0, 0.0),
+        Parameter("laminar_s", "s", 0.2, 1e-3, 30.0, 0.0),
         Parameter("turbulent_s2", "1/y", 0.2, 1e-5, 100.0),
         Parameter("leak_s", "s", 10.0, 0.02, 1000.0, _FREE),
-        Parameter("hose_per_s", "1/s", 50.0, 0.0, 100.0, 0.0),
+        Parameter("hose_per_s", "1/s", 50.0, 0.1, 100.0, 0.0),
         Parameter("chamber_s", "s", 0.05, 0.01, 3.0, 1.0),
     ),
 }
@@ -119,58 +123,78 @@ class Shape:
 _STRAIGHT = Shape()
 
 
-def _drive(record: PumpRecord, shape: Shape, dead_time_s: float, step_s: float, steps: int) -> FloatArray:
-    """Mean of s(u(t - T_d)) over each step (steps,)."""
-    t, s = record.t_s - record.t_s[0], shape.of(record.pwm)
-    area = np.concatenate([[0.0], np.cumsum(s[:-1] * np.diff(t))])
-    edges = step_s * np.arange(steps + 1, dtype=np.float64) - dead_time_s
-    # Before the first row its command is taken to have been held.
-    whole = np.interp(edges, t, area) + np.where(edges < 0.0, s[0] * edges, 0.0)
-    return np.asarray(np.diff(whole) / step_s)
+@njit(cache=True, nogil=True, error_model="numpy")
+def _risen(p: float, g: float, lag_s: float, limit: float, for_s: float) -> float:
+    """Pressure of the lag after some time under one command."""
+    steep_s = max((g - p) / limit - lag_s, 0.0)
+    if for_s <= steep_s:
+        return p + limit * for_s
+    return g + (p + limit * steep_s - g) * math.exp(-(for_s - steep_s) / lag_s)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _lag(g: FloatArray, step_s: float, p: float, z: float, theta: FloatArray, out: FloatArray) -> None:
-    share, most = -math.expm1(-step_s / theta[2]), theta[3] * step_s
+def _lag(t: FloatArray, s: FloatArray, p: float, z: float, theta: FloatArray, out: FloatArray) -> None:
     p += z
-    out[0] = p
-    for k in range(len(g)):
-        p += min((theta[1] * g[k] - p) * share, most)
-        out[k + 1] = p
+    begin, i = t[0], 0
+    for k in range(len(t)):
+        g, end = theta[1] * s[k], t[k + 1] + theta[0] if k + 1 < len(t) else math.inf
+        while i < len(out) and t[i] <= end:
+            out[i] = _risen(p, g, theta[2], theta[3], t[i] - begin)
+            i += 1
+        if i == len(out):
+            break
+        p = _risen(p, g, theta[2], theta[3], end - begin)
+        begin = end
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _flow(theta: FloatArray, g: float, p: float, z: float, opened: float) -> float:
+def _flow(theta: FloatArray, g: float, p: float, z: float, hose: float) -> float:
     a, b = theta[2], theta[3]
     drop = g - p
     w = 2.0 * drop / (a + math.sqrt(a * a + 4.0 * b * drop)) if drop > 0.0 else 0.0
-    return float(w - p / theta[4] - opened * theta[5] * (p - z))
+    return float(w - p / theta[4] - hose * (p - z))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _orifice(g: FloatArray, step_s: float, p: float, z: float, theta: FloatArray, out: FloatArray) -> None:
+def _orifice(t: FloatArray, s: FloatArray, p: float, z: float, theta: FloatArray, out: FloatArray) -> None:
     z += p
-    out[0] = p
-    opened = 0.0
-    for k in range(len(g)):
-        # Opens within a step or a few, and not at once, so that the result is smooth in the dead time.
-        opened = min(1.0, opened + 4.0 * g[k])
-        drive = theta[1] * g[k]
-        p_half = p + 0.5 * step_s * _flow(theta, drive, p, z, opened)
-        z_half = z + 0.5 * step_s * opened * (p - z) / theta[6]
-        p += step_s * _flow(theta, drive, p_half, z_half, opened)
-        z += step_s * opened * (p_half - z_half) / theta[6]
-        out[k + 1] = p
-
-
-def _step_s(model: str, theta: FloatArray, span: float) -> float:
-    """A step that the midpoint rule is stable and fair with."""
-    if model == LAG:
-        return STEP_S
-    a, b = float(theta[2]), float(theta[3])
-    # The steepest slope of w over p that matters is where the drop is a hundredth of the range.
-    slope = 1.0 / max(math.sqrt(a * a + 0.04 * b * span), 1e-3)
-    return min(STEP_S, 0.8 / (slope + float(theta[5]) + 1.0 / float(theta[6])))
+    begin, i, hose, fills = t[0], 0, 0.0, 0.0
+    for k in range(len(t)):
+        if s[k] > 0.0:
+            hose, fills = theta[5], 1.0 / theta[6]
+        g, last = theta[1] * s[k], k + 1 == len(t)
+        end = t[k] + theta[0] + 1.0 if last else t[k + 1] + theta[0]
+        # The number of steps does not depend on the dead time: the error would jump with it.
+        steps = math.ceil((1.0 if last else t[k + 1] - t[k] + (_DEAD_MOST_S if k == 0 else 0.0)) / STEP_S)
+        h = (end - begin) / steps
+        for j in range(steps):
+            at = begin + j * h
+            f1, e1 = _flow(theta, g, p, z, hose), fills * (p - z)
+            q, y = p + 0.5 * h * f1, z + 0.5 * h * e1
+            f2, e2 = _flow(theta, g, q, y, hose), fills * (q - y)
+            q, y = p + 0.5 * h * f2, z + 0.5 * h * e2
+            f3, e3 = _flow(theta, g, q, y, hose), fills * (q - y)
+            q, y = p + h * f3, z + h * e3
+            f4, e4 = _flow(theta, g, q, y, hose), fills * (q - y)
+            after = p + h / 6.0 * (f1 + 2.0 * (f2 + f3) + f4)
+            z += h / 6.0 * (e1 + 2.0 * (e2 + e3) + e4)
+            slope = _flow(theta, g, after, z, hose)
+            while i < len(out) and t[i] <= at + h:
+                x = (t[i] - at) / h
+                out[i] = p + x * (
+                    h * f1
+                    + x
+                    * (
+                        3.0 * (after - p)
+                        - h * (2.0 * f1 + slope)
+                        - x * (2.0 * (after - p) - h * (f1 + slope))
+                    )
+                )
+                i += 1
+            p = after
+            if i == len(out):
+                return
+        begin = end
 
 
 def simulate_pump(
@@ -189,29 +213,22 @@ def simulate_pump(
     ----------
     theta : values in the order of `MODELS[model]`.
     """
-    t = record.t_s - record.t_s[0]
-    span = max(float(np.ptp(record.value)), 1e-9)
-    step = _step_s(model, theta, span)
-    steps = max(math.ceil(float(t[-1]) / step), 1)
-    g = _drive(record, shape, float(theta[0]), step, steps)
+    t, s = record.t_s - record.t_s[0], shape.of(record.pwm)
     run = _lag if model == LAG else _orifice
-    grid = step * np.arange(steps + 1, dtype=np.float64)
     first = float(record.value[0])
-    out = np.empty(steps + 1)
 
-    def at(offset: float) -> FloatArray:
-        run(g, step, first, offset, theta, out)
-        return np.asarray(np.interp(t, grid, out))
+    def at(offset: float, count: int) -> FloatArray:
+        out = np.empty(count)
+        run(t, s, first, offset, theta, out)
+        return out
 
-    head = t <= start_s
-    base = at(0.0)
-    if int(head.sum()) < 3:
-        return base
+    head = int(np.sum(t <= start_s + _TICK_S))
+    if head < 3:
+        return at(0.0, len(t))
     # The beginning is all but linear in the offset.
-    nudge = 0.02 * span
-    by = (at(nudge)[head] - base[head]) / nudge
-    error = (record.value - base)[head]
-    return at(float(by @ error) / (float(by @ by) + _PRIOR))
+    base, nudge = at(0.0, head), 0.02 * max(float(np.ptp(record.value)), 1e-9)
+    by = (at(nudge, head) - base) / nudge
+    return at(float(by @ (record.value[:head] - base)) / (float(by @ by) + _PRIOR), len(t))
 
 
 # ----------------------------------------------------------------------
@@ -223,13 +240,10 @@ def simulate_pump(
 # standard deviations are therefore those of a sandwich, H^-1 (sum g g^T) H^-1, with the gradient g summed
 # over whole recordings, or over stretches of a second where there are fewer than four recordings.
 #
-# A parameter that can be switched off (a limit, a leak, a hose) is taken only if the data ask for it, by
-# two
+# A parameter that can be switched off (a limit, a leak, a hose) is taken only if the data ask for it, by two
 # measures. One that they do not ask for lowers the robust cost all the same, by lambda chi^2_1 / 2, where
-# lambda = g^2 / h with the variance g^2 of its gradient and its curvature h; lambda is 1 for white noise,
-# and
-# much more for what a model misses, which is the same all along a recording. It is measured: fitted
-# without a
+# lambda = g^2 / h with the variance g^2 of its gradient and its curvature h; lambda is 1 for white noise, and
+# much more for what a model misses, which is the same all along a recording. It is measured: fitted without a
 # recording, the parameters raise the cost of what is left out by lambda each, over all recordings together.
 # So k parameters have to lower the cost by more than lambda chi^2_k(0.95) / 2. And they have to lower it by
 # `_WORTH` for each extra: the start is read off noisy values, and taking up its error, an extra that the
@@ -238,11 +252,14 @@ def simulate_pump(
 
 _WORTH = 0.03
 _CONFIDENCE = 0.95
-_AGAIN = 10
 _SCALE_SHARE = 0.01
 _AHEAD_S = 0.5
 _FEWEST_CLUSTERS = 4
 _STEP = 1e-4
+_MOST, _FARTHEST = 100, 1.0
+_STANDS, _NEAR = 1e-9, 1e-3
+"""Steps, as parts of each parameter, below which a search has ended, or is near enough to be compared."""
+_DEAD_S = 0.05
 _PUMP_FREE = 1e6
 
 
@@ -310,49 +327,66 @@ class _Problem:
         start, low, high = np.array(rows).T
         return start, low, high
 
-    def residual(self, theta: FloatArray) -> FloatArray:
-        return np.concatenate(
+    def residual(self, theta: FloatArray, without: slice | None = None) -> FloatArray:
+        """Simulated minus measured, in parts of the range that count as one; `without` leaves rows out."""
+        off = np.concatenate(
             [simulate_pump(self.model, theta, r, self.shape) - r.value for r in self.records]
         )
+        off /= _SCALE_SHARE * self.span
+        return off if without is None else np.delete(off, without)
 
     def off(self) -> FloatArray:
         return np.array([math.nan if p.off is None else p.off for p in MODELS[self.model]])
 
 
 def _solve(
-    problem: _Problem, theta: FloatArray, free: list[int], most: int = 40, without: slice | None = None
-) -> tuple[FloatArray, float, FloatArray]:
-    """Least squares over some parameters: values, robust cost per sample, and the weighted Jacobian.
+    problem: _Problem,
+    theta: FloatArray,
+    free: list[int],
+    stands: float = _STANDS,
+    without: slice | None = None,
+) -> tuple[FloatArray, float]:
+    """Least squares over some parameters: values and robust cost per sample.
 
-    `without` leaves some rows out.
+    Over logarithms: a level and a resistance that only their quotient is known of lie on a straight line
+    there. The search ends where parameters move by less than `stands` of themselves, so that its end does
+    not depend on the way. `without` leaves some rows out.
     """
     from scipy.optimize import least_squares
 
-    start, low, high = problem.nominal()
-    scale = np.maximum(np.abs(start), 1e-3)[free]
+    _, low, high = problem.nominal()
+    ratio = [k for k in free if low[k] > 0.0]
 
-    def full(x: FloatArray) -> FloatArray:
+    def inward(full: FloatArray) -> FloatArray:
+        out = full / _DEAD_S
+        out[ratio] = np.log(full[ratio])
+        return np.asarray(out[free])
+
+    def outward(x: FloatArray) -> FloatArray:
         out = theta.copy()
-        out[free] = x
+        out[free] = _DEAD_S * x
+        out[ratio] = np.exp(x[[free.index(k) for k in ratio]])
         return out
 
-    def rows(x: FloatArray) -> FloatArray:
-        out = problem.residual(full(x)) / (_SCALE_SHARE * problem.span)
-        return out if without is None else np.delete(out, without)
+    def slopes(x: FloatArray) -> FloatArray:
+        full = outward(x)
+        unit = np.array([full[k] if low[k] > 0.0 else _DEAD_S for k in free])
+        return np.asarray(_slopes(problem, full, free, without) * unit)
 
-    inside = np.clip(theta[free], low[free] + 1e-9 * scale, high[free] - 1e-9 * scale)
+    least, most = inward(low), inward(high)
+    begin = np.clip(inward(np.clip(theta, low, high)), least + 1e-9, most - 1e-9)
     found = least_squares(
-        rows,
-        inside,
-        bounds=(low[free], high[free]),
-        x_scale=scale,
+        lambda x: problem.residual(outward(x), without),
+        begin,
+        jac=slopes,
+        bounds=(least, most),
         loss="soft_l1",
-        diff_step=np.full(len(free), _STEP),
-        max_nfev=most,
-        xtol=1e-6,
-        ftol=1e-7,
+        max_nfev=_MOST,
+        xtol=stands,
+        ftol=1e-14 if stands == _STANDS else 1e-6,
+        gtol=None,
     )
-    return full(found.x), float(found.cost) / len(found.fun), np.asarray(found.jac, dtype=np.float64)
+    return outward(found.x), float(found.cost) / len(found.fun)
 
 
 def _clusters(problem: _Problem) -> list[slice]:
@@ -371,19 +405,18 @@ def _clusters(problem: _Problem) -> list[slice]:
 
 
 def _slopes(
-    problem: _Problem, theta: FloatArray, free: list[int]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Scaled residuals, their derivatives by the free parameters, and the weights of the robust loss."""
-    scale = _SCALE_SHARE * problem.span
-    base = problem.residual(theta) / scale
-    _, low, high = problem.nominal()
-    J = np.empty((len(base), len(free)))
-    for column, k in enumerate(free):
-        h = _STEP * max(abs(theta[k]), 1e-2 * (high[k] - low[k]) if theta[k] == 0.0 else 0.0)
-        moved = theta.copy()
-        moved[k] += h if moved[k] + h <= high[k] else -h
-        J[:, column] = (problem.residual(moved) / scale - base) / (moved[k] - theta[k])
-    return base, J, np.asarray(1.0 / np.sqrt(1.0 + base * base))
+    problem: _Problem, theta: FloatArray, free: list[int], without: slice | None = None
+) -> FloatArray:
+    """Derivatives of the scaled residuals by the free parameters."""
+    start, low, high = problem.nominal()
+    columns = []
+    for k in free:
+        h = _STEP * max(abs(theta[k]), abs(start[k]))
+        ahead, behind = theta.copy(), theta.copy()
+        ahead[k], behind[k] = min(theta[k] + h, high[k]), max(theta[k] - h, low[k])
+        difference = problem.residual(ahead, without) - problem.residual(behind, without)
+        columns.append(difference / (ahead[k] - behind[k]))
+    return np.column_stack(columns)
 
 
 def _inverse(H: FloatArray) -> FloatArray:
@@ -393,11 +426,11 @@ def _inverse(H: FloatArray) -> FloatArray:
 
 def _by_chance(problem: _Problem, theta: FloatArray, free: list[int], extras: int) -> float:
     """How much a number of parameters that are not needed lowers the cost per sample, at most in 95 %."""
-    base = problem.residual(theta) / (_SCALE_SHARE * problem.span)
+    base = problem.residual(theta)
     rise = 0.0
     for s in _clusters(problem):
-        moved, _, _ = _solve(problem, theta, free, _AGAIN, s)
-        left_out = problem.residual(moved)[s] / (_SCALE_SHARE * problem.span)
+        moved, _ = _solve(problem, theta, free, _NEAR, s)
+        left_out = problem.residual(moved)[s]
         rise += float(np.sum(np.sqrt(1.0 + left_out**2) - np.sqrt(1.0 + base[s] ** 2)))
     lam = max(rise, 0.0) / len(free) / len(base)
     return 0.5 * lam * float(chdtri(extras, 1.0 - _CONFIDENCE))
@@ -405,7 +438,8 @@ def _by_chance(problem: _Problem, theta: FloatArray, free: list[int], extras: in
 
 def _covariance(problem: _Problem, theta: FloatArray, free: list[int]) -> FloatArray:
     """Sandwich covariance of the free parameters under the robust loss."""
-    base, J, weight = _slopes(problem, theta, free)
+    base, J = problem.residual(theta), _slopes(problem, theta, free)
+    weight = 1.0 / np.sqrt(1.0 + base * base)
     H = (J * weight[:, None]).T @ J
     G = [J[s].T @ (weight[s] * base[s]) for s in _clusters(problem)]
     middle = sum((np.outer(g, g) for g in G), np.zeros_like(H)) * (len(G) / max(len(G) - 1, 1))
@@ -447,13 +481,13 @@ def fit_pump(
     fixed: dict[str, str] = {}
     if start is not None:
         free = [k for k in range(len(names)) if start[k] != off[k] and not _tied(model, names[k], start)]
-        theta, cost, _ = _solve(problem, start, free)
+        theta, cost = _solve(problem, start, free)
     else:
         theta, cost, free = _search(problem, nominal, off, fixed)
     covariance = _covariance(problem, theta, free)
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     safe = np.where(sigma > 0.0, sigma, 1.0)
-    residual = problem.residual(theta)
+    residual = problem.residual(theta) * _SCALE_SHARE * span
     return PumpFit(
         model,
         theta,
@@ -490,7 +524,7 @@ def _search(
             begin = plain.copy()
             begin[always[-1]] *= factor
             begin[0] = dead_time_s
-            theta, value, _ = _solve(problem, begin, always)
+            theta, value = _solve(problem, begin, always, _NEAR)
             if value < cost:
                 best, cost = theta, value
     free, first = list(always), best
@@ -503,7 +537,7 @@ def _search(
             begin = first.copy()
             begin[members] = nominal[members]
             wider = sorted(always + members)
-            theta, value, _ = _solve(problem, begin, wider)
+            theta, value = _solve(problem, begin, wider, _NEAR)
             scores[chosen] = value
             worth = value * (1.0 + _WORTH) ** count
             if worth >= lowest or _vague(problem, theta, wider, off):
@@ -523,6 +557,7 @@ def _search(
             bound = max(chances.get(with_it, 0.0) / cost, _WORTH)
             why = f"it would lower the cost by {100.0 * gain:.2g} %, where {100.0 * bound:.2g} % say nothing"
             fixed |= dict.fromkeys(group, f"off: {why if gain <= bound else 'it is not bounded'}")
+    best, cost = _solve(problem, best, free)
     return best, cost, free
 
 
