@@ -368,6 +368,9 @@ def _solve(
         out[ratio] = np.exp(x[[free.index(k) for k in ratio]])
         return out
 
+    def rows(x: FloatArray) -> FloatArray:
+        return problem.residual(outward(x), without)
+
     def slopes(x: FloatArray) -> FloatArray:
         full = outward(x)
         unit = np.array([full[k] if low[k] > 0.0 else _DEAD_S for k in free])
@@ -376,7 +379,7 @@ def _solve(
     least, most = inward(low), inward(high)
     begin = np.clip(inward(np.clip(theta, low, high)), least + 1e-9, most - 1e-9)
     found = least_squares(
-        lambda x: problem.residual(outward(x), without),
+        rows,
         begin,
         jac=slopes,
         bounds=(least, most),
