@@ -20,12 +20,13 @@ from sets import BAD, camera_of, good_set, take
 
 from calib.core.verdict import WORDS
 from calib.stages.camera.bundle import calibrate, covariance
+from calib.stages.camera.intrinsics import without_copies
 from calib.stages.camera.model import MODELS, View, pack
 from calib.stages.camera.verdict import judge
 
 
 def _verdict(views: list[View], size_px: tuple[int, int], model: str) -> tuple[str, float]:
-    fit = calibrate(pack(views), size_px, model)
+    fit = calibrate(without_copies(pack(views), size_px)[0], size_px, model)
     known = covariance(fit)
     began = time.process_time()
     found = judge(fit, known)

@@ -31,7 +31,7 @@ from calib.stages.camera.checks import (
     widened,
 )
 from calib.stages.camera.corners import detect
-from calib.stages.camera.intrinsics import Choices, calibrate_camera
+from calib.stages.camera.intrinsics import Choices, calibrate_camera, without_copies
 from calib.stages.camera.model import (
     MODELS,
     Board,
@@ -42,6 +42,7 @@ from calib.stages.camera.model import (
     one_to_one_reach,
     pack,
     project,
+    vector_from_camera,
 )
 from calib.stages.camera.pose import fit_pose
 from calib.stages.camera.verdict import Judgement, judge, of_leaving
@@ -51,7 +52,7 @@ from synthetic import views_of
 
 
 def _judged(views: list[View], size_px: tuple[int, int], model: str) -> tuple[Calibration, Judgement]:
-    fit = calibrate(pack(views), size_px, model)
+    fit = calibrate(without_copies(pack(views), size_px)[0], size_px, model)
     return fit, judge(fit, covariance(fit))
 
 
@@ -115,18 +116,84 @@ def test_a_lens_model_that_is_too_poor_is_said_and_not_taken_for_a_bent_board() 
     assert not any("not flat" in sentence for sentence in found.verdict.reasons)
 
 
-def test_a_few_copies_count_once_and_are_named() -> None:
-    views = take(np.random.default_rng(5), camera_of(), 14)
-    fit, found = _judged([*views, replace(views[3], name="again")], (640, 480), "radial2")
-    assert found.verdict.word == "ok"
-    assert found.numbers["unique_views"] == 14
-    assert any("again (as v03)" in sentence for sentence in found.verdict.remarks)
-    # With one view nineteen times over, the reported standard deviations are wrong.
-    many = [*views, *(replace(views[3], name=f"again{i}") for i in range(18))]
-    _, found = _judged(many, (640, 480), "radial2")
-    assert found.verdict.word == "poor"
-    assert "times too small" in found.verdict.reasons[0]
-    assert fit.converged
+def _frames(seed: int, still: str, count: int = 30, copies: int = 5) -> tuple[list[View], Camera]:
+    """Frames of a board; in some it lies where it lay before: the same picture, or with noise of its own."""
+    rng, camera = np.random.default_rng([seed, 35]), camera_of()
+    views = take(rng, camera, count)
+    noise = 0.1 if still == "noise" else 0.0
+    return [
+        *views,
+        *(
+            View(f"again{i}", one.target_m, one.pixels + noise * rng.standard_normal(one.pixels.shape))
+            for i, one in enumerate(views[3 : 3 + copies])
+        ),
+    ], camera
+
+
+def test_copies_leave_by_name_and_change_nothing() -> None:
+    views, _ = _frames(5, "copied")
+    # A point that a copy alone lacks changes nothing either.
+    views[-1] = replace(views[-1], measured=np.arange(35) > 0)
+    alone = calibrate_camera(views[:30], (640, 480), Choices("radial2"))
+    fit = calibrate_camera(views, (640, 480), Choices("radial2"))
+    assert [str(one) for one in fit.left_out] == [
+        f"again{i}: shows the board where v{3 + i:02d} does" for i in range(5)
+    ]
+    assert fit.judgement.verdict.word == "ok"
+    assert fit.judgement.verdict.remarks[0].startswith(
+        "again0, again1, again2, again3, again4 show the board"
+    )
+    assert fit.calibration.observations.views == 30
+    assert fit.covariance.sigma() == alone.covariance.sigma()
+    # That a picture agrees is no reason to count it twice.
+    kept = calibrate_camera(views, (640, 480), Choices("radial2", keep_all=True))
+    assert kept.covariance.sigma() == alone.covariance.sigma()
+
+
+def test_of_one_place_the_quietest_view_stays() -> None:
+    views, _ = _frames(5, "noise")
+    rng = np.random.default_rng(0)
+    blurred = [
+        replace(one, name=f"blurred{i:02d}", pixels=one.pixels + rng.normal(0.0, 0.3, one.pixels.shape))
+        for i, one in enumerate(views[:30])
+    ]
+    left, copies = without_copies(pack([*blurred, *views[:30]]), (640, 480))
+    assert left.names == tuple(one.name for one in views[:30])
+    assert str(copies[7]) == "blurred07: shows the board where v07 does"
+
+
+def test_frames_of_a_slow_board_are_not_all_copies_of_the_first() -> None:
+    """Each lies within a fifth of a pixel of the frame before, the last 20 px from the first."""
+    view = take(np.random.default_rng(2), camera_of(), 1)[0]
+    slow = [View(f"f{i:03d}", view.target_m, view.pixels + np.array([0.2 * i, 0.0])) for i in range(101)]
+    left, copies = without_copies(pack(slow), (640, 480))
+    assert left.views == 51
+    assert len(copies) == 50
+
+
+def test_points_of_their_own_make_no_copies() -> None:
+    rng, camera = np.random.default_rng(3), camera_of()
+    other = take(rng, camera, 2, target_m=rng.uniform(0, 0.15, (40, 2)))
+    halves = [View("a", other[0].target_m[:20], other[0].pixels[:20])]
+    halves += [View("b", other[0].target_m[20:], other[0].pixels[20:])]
+    halves += [View("c", other[0].target_m[5:25], other[0].pixels[5:25]), other[1]]
+    assert [one.name for one in without_copies(pack(halves), (640, 480))[1]] == ["c"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("still", ["copied", "noise"])
+def test_sigma_covers_the_truth_where_five_of_35_frames_are_copies(still: str) -> None:
+    z = []
+    for seed in range(100):
+        views, camera = _frames(seed, still)
+        fit = calibrate_camera(views, (640, 480), Choices("radial2"))
+        assert len(fit.left_out) >= 5
+        free = fit.calibration.free
+        off = (fit.calibration.block.intrinsics - vector_from_camera(camera))[free]
+        z.append(off / list(fit.covariance.sigma().values()))
+    inside = float(np.mean(np.abs(z) < 2))
+    print(f"\n{still}: |z| < 2 in {inside:.1%} of {np.size(z)}, RMS {np.sqrt(np.mean(np.square(z))):.2f}")
+    assert 0.93 < inside < 0.98
 
 
 @pytest.mark.parametrize("loss", ["huber", "cauchy"])

@@ -50,6 +50,8 @@ ONE_TO_ONE_REACH = 1.05
 """How far a lens has to be one-to-one, over the distance of the picture's farthest corner."""
 _MAX_PAIRED = 2000
 """Views above which repeats are sought among the first ones only."""
+_SAME_PX, _SAME_SHARE = 0.3, 0.004
+"""Motion of a board that is none, and as a share of the picture's width the most that noise may pass for."""
 
 
 @dataclass(frozen=True)
@@ -204,25 +206,48 @@ def _weaker_spread_deg(normals: FloatArray) -> float:
     return float(np.degrees(singular[1] / np.sqrt(len(normals) - 1)))
 
 
-def repeated_views(calibration: Calibration, limit_px: float) -> IntArray:
-    """For each view the first view that shows the board in the same place, or its own index, (N,).
+def repeated_views(observations: Observations, width_px: int) -> IntArray:
+    """For each view the one that others show the board in the same place as, often itself, (N,).
 
-    The same place: the corners of the target's box are seen within `limit_px`, root mean square.
-    Found from the poses, so that views of different points of a target can be compared.
+    The same place: the points that both show, at least half of the poorer view's, are apart by no more than
+    their noise may do, root mean square. A quadratic in the pixels, as a change of pose is to first order,
+    tells a board that moved from noise. Needs no camera, as copies must not help to choose one.
     """
-    block, camera = calibration.block, calibration.camera
-    first = np.arange(len(block.R_CT))
-    count = min(len(first), _MAX_PAIRED)
-    seen = target_box(calibration) @ block.R_CT[:count].transpose(0, 2, 1) + block.t_CT_m[:count, None]
-    # Without distortion, which may fold over outside of the image; the pixels are off by little.
-    flat = (seen[..., :2] / np.maximum(seen[..., 2:], 1e-9)).reshape(count, 8)
-    flat = flat * np.sqrt(abs(camera.fx_px * camera.fy_px))
-    square = (flat**2).sum(axis=1)
-    apart = np.maximum(square[:, None] + square - 2 * flat @ flat.T, 0.0) / 4
-    near = (apart < limit_px**2 + 1e-12 * square.max()) & (np.arange(count) < np.arange(count)[:, None])
-    for i in np.flatnonzero(near.any(axis=1)):
-        first[i] = first[int(np.argmax(near[i]))]
+    N, M = observations.present.shape
+    first = np.arange(N)
+    places = np.broadcast_to(observations.target_m[..., 0] + 1j * observations.target_m[..., 1], (N, M))
+    there, point = np.unique(places[observations.present], return_inverse=True)
+    if len(there) > 4 * M:
+        # Most views have points of their own.
+        return first
+    pixels = np.full((N, len(there), 2), np.nan)
+    pixels[np.nonzero(observations.present)[0], point] = observations.pixels[observations.present]
+    counts = observations.present.sum(axis=1)
+    kept: list[int] = []
+    for i in np.argsort(-counts, kind="stable")[:_MAX_PAIRED]:
+        apart = pixels[kept] - pixels[i]
+        common = np.isfinite(apart[..., 0])
+        shared = common.sum(axis=1)
+        squared = np.where(common[..., None], apart, 0.0)
+        near = np.sum(squared**2, axis=(1, 2)) < (3 * _SAME_SHARE * width_px) ** 2 * shared
+        for k in np.flatnonzero(near & (shared >= np.maximum(0.5 * counts[i], 4))):
+            if _same_place(apart[k, common[k]], pixels[i, common[k]], width_px):
+                first[i] = kept[k]
+                break
+        else:
+            kept.append(int(i))
     return first
+
+
+def _same_place(apart: FloatArray, pixels: FloatArray, width_px: int) -> bool:
+    """Whether differences (n, 2) of pixels (n, 2) come from noise and next to no motion."""
+    u, v = ((pixels - pixels.mean(axis=0)) / max(float(np.ptp(pixels)), 1e-9)).T
+    basis = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
+    motion = basis @ np.linalg.lstsq(basis, apart, rcond=None)[0]
+    # Each of the two views has its noise.
+    noise = np.sqrt(np.sum((apart - motion) ** 2) / (4 * max(len(apart) - 6, 1)))
+    moved = float(np.sqrt(np.mean(np.sum(motion**2, axis=1))))
+    return moved < float(np.clip(2 * noise, _SAME_PX, max(_SAME_SHARE * width_px, _SAME_PX)))
 
 
 def image_outline(camera: Camera, per_side: int = 9) -> FloatArray:

@@ -8,12 +8,13 @@ import numpy as np
 
 from calib.core.errors import BadInputError
 from calib.stages.camera.bundle import calibrate, linearise
+from calib.stages.camera.checks import repeated_views
 from calib.stages.camera.model import View, pack
 
 # A view's information about the intrinsics, with its own pose eliminated, is S_i = U_i - W_i V_i^-1 W_i'
 # (symbols of `bundle`), over the square of its residuals, so that a blurred or a smeared frame counts
 # less. Views are taken one by one, each the one that lowers the volume of the error ellipsoid most:
-# the largest log det(S + S_i).
+# the largest log det(S + S_i), of each place of the board one.
 
 MOST = 30
 _FEWEST = 20
@@ -28,8 +29,9 @@ def most_informative(views: Sequence[View], image_size_px: tuple[int, int], most
     every = list(range(len(views)))
     if len(views) <= _FEWEST:
         return every
+    packed = pack(views)
     try:
-        fit = calibrate(pack(views), image_size_px, _MODEL, tolerance=1e-2, max_iterations=40)
+        fit = calibrate(packed, image_size_px, _MODEL, tolerance=1e-2, max_iterations=40)
     except (BadInputError, np.linalg.LinAlgError):
         return every
     at = linearise(fit.block, fit.observations, fit.free, None)
@@ -44,10 +46,11 @@ def most_informative(views: Sequence[View], image_size_px: tuple[int, int], most
     scale = 1.0 / np.sqrt(np.maximum(np.einsum("nii->i", S), 1e-300))
     S = S * scale * scale[:, None]
     total = _LITTLE * np.eye(G)
+    place = repeated_views(packed, max(image_size_px))
     chosen: list[int] = []
-    while len(chosen) < min(most, len(views)):
+    while len(chosen) < min(most, len(np.unique(place))):
         gain = np.linalg.slogdet(total + S)[1] - np.linalg.slogdet(total)[1]
-        gain[chosen] = -np.inf
+        gain[np.isin(place, place[chosen])] = -np.inf
         best = int(np.argmax(gain))
         if len(chosen) >= _FEWEST and gain[best] < 2.0 * G * _WORTH:
             break

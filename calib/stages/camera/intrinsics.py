@@ -28,6 +28,7 @@ from calib.stages.camera.checks import (
     best_of_starts,
     image_outline,
     lens_shape,
+    repeated_views,
     screen,
     skew_left_out,
 )
@@ -45,6 +46,7 @@ from calib.stages.camera.triage import Triage, triage
 from calib.stages.camera.verdict import (
     Judgement,
     judge,
+    of_copies,
     of_leaving,
     of_screening,
     scale_of,
@@ -444,6 +446,7 @@ def _beats(richer: Candidate, simpler: Candidate, gain_px: float) -> bool:
 
 _HOPELESS = 0.02
 """RMS over the picture's larger side from which on the points belong to no camera at all."""
+_ROUGH = "radial2"
 _TRIAGES = 3
 """Times that a model is chosen; bad views can make the first choice wrong."""
 _FAR_BETTER = 0.5
@@ -593,9 +596,9 @@ def calibrate_camera(
 ) -> Intrinsics:
     """Calibrate a camera and judge the result.
 
-    Views and points that do not agree with the others are left out. One view leaves the principal point at
-    the picture's centre. Raises `BadInputError` where no answer could follow; an answer that the data do
-    not support comes with its verdict instead.
+    Copies of a view, and views and points that do not agree with the others, are left out. One view leaves
+    the principal point at the picture's centre. Raises `BadInputError` where no answer could follow; an
+    answer that the data do not support comes with its verdict instead.
 
     Parameters
     ----------
@@ -610,6 +613,8 @@ def calibrate_camera(
             LeftOut(everything.names[i], _NO_PLANE, "view") for i in np.flatnonzero(screening.unusable)
         ]
         everything = everything.select(np.flatnonzero(~screening.unusable))
+    everything, copies = without_copies(everything, image_size_px)
+    unusable += copies
     fixed = ("cx_px", "cy_px") if everything.views == 1 else ()
     sorted_out, models = _sorted_out(everything, image_size_px, choices, fixed)
     leaving = [*left_out, *unusable, *sorted_out.left_out]
@@ -651,6 +656,7 @@ def calibrate_camera(
     solved = time.perf_counter()
     sigma = _by_the_views(fit)
     covered = time.perf_counter()
+    findings += of_copies(copies)
     judgement = _judged(fit, findings)
     if judgement.numbers.get("lowest_start_cost_share", 1.0) < _LOWER:
         better = best_of_starts(fit)
@@ -660,6 +666,30 @@ def calibrate_camera(
     judged = time.perf_counter()
     seconds = {"solve": solved - began, "covariance": covered - solved, "judge": judged - covered}
     return Intrinsics(fit, sigma, judgement, models, boards, board, tuple(not_used), seconds)
+
+
+def without_copies(
+    observations: Observations, image_size_px: tuple[int, int]
+) -> tuple[Observations, list[LeftOut]]:
+    """One view of each place of the board, and the others by name.
+
+    Of the views with most points that is the one with the least residuals of a rough fit, or else the first.
+    """
+    first = repeated_views(observations, max(image_size_px))
+    if len(np.unique(first)) == len(first):
+        return observations, []
+    fit = calibrate(observations, image_size_px, _ROUGH, max_iterations=_MAX_ITERATIONS, tolerance=_ENOUGH)
+    rms = np.nan_to_num(np.round(fit.view_rms_px, 6))
+    order = np.lexsort((rms, -observations.present.sum(axis=1)))
+    place, best = np.unique(first[order], return_index=True)
+    own = dict(zip(place.tolist(), order[best].tolist(), strict=True))
+    names = observations.names
+    copies = [
+        LeftOut(names[i], f"shows the board where {names[own[k]]} does", "copy")
+        for i, k in enumerate(first.tolist())
+        if own[k] != i
+    ]
+    return observations.select(sorted(own.values())), copies
 
 
 def _moved_px(found: Triage) -> float:

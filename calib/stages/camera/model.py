@@ -84,13 +84,13 @@ class LeftOut:
     ----------
     name : of the file or view.
     why : the rest of a sentence that begins with the name.
-    kind : "file" (no picture), "unreadable", "size" (another one than the others'), "no board", "view"
-        or "points" (do not agree with the others).
+    kind : "file" (no picture), "unreadable", "size" (another one than the others'), "no board", "copy" (shows
+        the board where another view does), "view" or "points" (do not agree with the others).
     """
 
     name: str
     why: str
-    kind: Literal["file", "unreadable", "size", "no board", "view", "points"]
+    kind: Literal["file", "unreadable", "size", "no board", "copy", "view", "points"]
 
     def __str__(self) -> str:
         return f"{self.name}: {self.why}"

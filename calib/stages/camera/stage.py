@@ -153,7 +153,7 @@ def _solve_intrinsics(inputs: IntrinsicsInputs) -> Camera:
         board=result.board,
         loss=fit.loss,
         termination=fit.termination,
-        rejected=[str(one) for one in result.left_out if one.kind in ("view", "points")],
+        rejected=[str(one) for one in result.left_out if one.kind in ("copy", "view", "points")],
         simulated=inputs.simulated,
         **judged(result.judgement.verdict),
     ).with_evidence(CameraEvidence(result, {"detect": inputs.detect_s, **result.seconds}))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from calib.core.arrays import FloatArray, IntArray
+from calib.core.arrays import FloatArray
 from calib.core.verdict import Finding, Severity, Verdict
 from calib.stages.camera.bundle import Calibration, Covariance, covariance, projection_sigma_px
 from calib.stages.camera.checks import (
@@ -33,7 +33,6 @@ from calib.stages.camera.checks import (
     misfit,
     other_starts,
     overdispersion,
-    repeated_views,
     resolved,
     screen,
     straightened,
@@ -59,7 +58,7 @@ class Limits:
 
     Attributes
     ----------
-    views : unique views below which nothing is left over to check the answer with.
+    views : views below which nothing is left over to check the answer with.
     leaving_bad, leaving_px : share of the pictures that may be left out, and by how much those that
         disagree have to move directions in the picture, at up to 1000 pixels' width, to count.
     focal_remark, focal_poor, focal_free : relative standard deviation of a focal length. Distances
@@ -79,7 +78,6 @@ class Limits:
         outlier; share of outliers.
     heavy_remark : share of the squared residuals that the worst percent of points may hold.
     repeated_remark : error that repeats at the same points over what independent errors leave.
-    repeat_share : share of unique views below which the copies rule the answer.
     decrement : standard deviations that the solver may stop short of a minimum.
     split_ratio, change_ratio : two cameras, in any order and one after the other: the statistic over
         what chance reaches. One camera reaches 1.2 in a hundred sets, two that differ by three
@@ -125,7 +123,6 @@ class Limits:
     points_poor: float = 0.01
     heavy_remark: float = 0.2
     repeated_remark: float = 1.6
-    repeat_share: float = 0.5
     decrement: float = 2.0
     split_ratio: float = 1.5
     change_ratio: float = 1.3
@@ -165,7 +162,7 @@ _IN_CORNERS = "Take pictures with the board in the picture's corners, or use a s
 _CHI2_95 = 3.84
 
 
-def of_solution(calibration: Calibration, unique: int, limits: Limits) -> list[Finding]:
+def of_solution(calibration: Calibration, different: int, limits: Limits) -> list[Finding]:
     """Enough views and points, and a solver that arrived."""
     out = []
     views, points = calibration.observations.views, calibration.observations.points
@@ -191,12 +188,12 @@ def of_solution(calibration: Calibration, unique: int, limits: Limits) -> list[F
             "so nothing checks the answer."
         )
         out.append(Finding("unidentifiable", text, _MORE_VIEWS))
-    if unique < 2:
+    if different < 2:
         text = "There is only one view of the board, which hardly tells focal length and distance apart."
         out.append(Finding("unidentifiable", text, _MORE_VIEWS))
-    elif unique < limits.views:
+    elif different < limits.views:
         text = (
-            f"{unique} different views are too few to check one against the others; "
+            f"{different} different views are too few to check one against the others; "
             f"{limits.views} are the least."
         )
         out.append(Finding("poor", text, _MORE_VIEWS))
@@ -433,25 +430,17 @@ def of_leaving(
     return out
 
 
-def of_copies(first: IntArray, names: tuple[str, ...], ratio: float, limits: Limits) -> list[Finding]:
-    """Views that show the board where another view does.
-
-    Parameters
-    ----------
-    first : (N,) the view that each one repeats, or itself.
-    ratio : standard deviation without the copies over that with them.
-    """
-    copies = np.flatnonzero(first != np.arange(len(first)))
-    if len(copies) == 0:
+def of_copies(copies: Sequence[LeftOut]) -> list[Finding]:
+    """Views that were left out for showing the board where another view does."""
+    if not copies:
         return []
-    who = listed([f"{names[i]} (as {names[first[i]]})" for i in copies], 4)
     one = len(copies) == 1
-    verbs = ("shows", "counts") if one else ("show", "count")
-    text = f"{who} {verbs[0]} the board where another view does and {verbs[1]} once"
-    if ratio > 1.05:
-        text += f"; with the copies the standard deviations come out {ratio:.1f} times too small"
-    many = len(first) - len(copies) <= limits.repeat_share * len(first)
-    return [Finding("poor" if many else "remark", text + ".", "Remove the copies." if many else "")]
+    text = (
+        f"{listed([one.name for one in copies], 20)} {'shows' if one else 'show'} the board where another "
+        f"picture does and {'is' if one else 'are'} left out: the same place once more lowers the standard "
+        "deviations on paper only."
+    )
+    return [Finding("remark", text)]
 
 
 def of_coverage(found: Coverage, calibration: Calibration, limits: Limits) -> list[Finding]:
@@ -708,8 +697,8 @@ def _of_flatness(found: TargetShape, limits: Limits) -> list[Finding]:
 # inconsistent    the views contradict each other or the board's description
 # unidentifiable  the views do not determine a camera; its numbers mean nothing
 #
-# The worst finding decides. Remarks never do. All checks run on the unique views, without robust loss
-# (points it rejects are left out) and with the target rigid in the shape that was found for it.
+# The worst finding decides. Remarks never do. All checks run without robust loss (points it rejects are
+# left out) and with the target rigid in the shape that was found for it.
 # Above 100 views the searches (other starts, profile, two cameras) run on an even sample of 100.
 
 _SAMPLE = 100
@@ -735,7 +724,7 @@ def judge(
 
     Parameters
     ----------
-    found : its covariance, for the ratio of standard deviations that copies of views make; optional.
+    found : its covariance, where it is at hand.
     findings : what is there to say already, as of views that were left out.
     """
     limits = Limits() if limits is None else limits
@@ -751,8 +740,8 @@ def judge(
         if not any(one.severity == "unidentifiable" for one in findings):
             findings.append(Finding("unidentifiable", "The solver found no camera that fits the views."))
         return _concluded(findings, None, numbers)
-    fit, copies = _without_copies(_plain(calibration), found, limits, numbers)
-    findings += copies + of_solution(calibration, fit.observations.views, limits)
+    fit = _plain(calibration)
+    findings += of_solution(calibration, fit.observations.views, limits)
     covered = coverage(fit)
     findings += of_coverage(covered, fit, limits)
     if fit.degrees_of_freedom <= 0 or fit.observations.views < 2 or not np.all(np.isfinite(fit.normal)):
@@ -809,23 +798,6 @@ def _plain(calibration: Calibration) -> Calibration:
         loss="none",
     )
     return resolved(bare, np.arange(len(kept)))
-
-
-def _without_copies(
-    fit: Calibration, found: Covariance | None, limits: Limits, numbers: dict[str, float]
-) -> tuple[Calibration, list[Finding]]:
-    """One view of each place, refitted."""
-    width = fit.camera.image_size_px[0]
-    first = repeated_views(fit, float(np.clip(2 * fit.sigma_px, 0.3, 0.004 * width)))
-    unique = np.flatnonzero(first == np.arange(len(first)))
-    numbers["unique_views"] = len(unique)
-    if len(unique) == len(first):
-        return fit, []
-    single = resolved(fit, unique)
-    ratio = np.nan
-    if found is not None and "fx_px" in found.names and single.degrees_of_freedom > 0:
-        ratio = covariance(single).sigma()["fx_px"] / found.sigma()["fx_px"]
-    return single, of_copies(first, fit.observations.names, ratio, limits)
 
 
 def _uncertainty(
