@@ -45,7 +45,7 @@ def convert(
     from calib.core.stage import LogOptions
     from calib.core.writing import check_writable, write_atomically, writes_through
     from calib.io.columns import COLUMNS_FILE
-    from calib.io.logs import LOG, beside, iter_log
+    from calib.io.logs import LOG, beside, iter_log, passed_over
     from calib.io.signals import refuse_counts
     from calib.io.states import states_writer
 
@@ -64,7 +64,7 @@ def convert(
     if read_as is not None and read_as.narration:
         narrate(read_as.narration)
     names = tuple(block.columns)
-    rows, blank, truncated = 0, 0, False
+    rows, blank, truncated, wraps = 0, 0, False, 0
     with (
         states_writer(output, ("t_s", *names), LOG) as writer,
         progress_bar(f"converting {log.name}") as progress,
@@ -72,6 +72,7 @@ def convert(
         while True:
             writer.add(np.column_stack([block.t_s, *(block.columns[name] for name in names)]))
             rows, blank, truncated = rows + len(block), blank + block.not_finite, block.truncated
+            wraps += block.wraps
             progress(rows, 0)
             following = next(stream, None)
             if following is None:
@@ -93,7 +94,5 @@ def convert(
     say(f"{rows} rows written to {shown(output)}: t_s, {', '.join(names)}")
     if block.unknown:
         narrate(f"left out: {', '.join(block.unknown)}")
-    if blank:
-        narrate(f"{blank} cells say nan or inf and are blank now")
-    if truncated:
-        narrate("the end is cut short and left out")
+    for sentence in passed_over(blank, truncated, wraps):
+        narrate(sentence)

@@ -56,14 +56,20 @@ _LONGEST_LINE = 1 << 16
 _MAX_COLUMNS = 1000
 _MOST_CELLS = 200_000_000
 """Numbers that `read_log` takes, 1.6 GB; blocks of text have no such limit."""
+_COUNTERS = (1 << 16, 1 << 32)
+_WRAPS_WITHIN = 20.0
+"""Usual steps from the last time before a counter begins again to the first one after."""
 _MOST_BYTES, _MOST_GROWTH = 1 << 28, 200
 """What a Parquet file may unpack to: so many bytes, or so many times its own size where that is more."""
 
 
-def passed_over(not_finite: int, truncated: bool) -> list[str]:
-    """Sentences on cells that are not finite and on a last line cut short."""
-    cells = [f"{not_finite} cells say nan or inf and count as blank"] if not_finite else []
-    return [*cells, "the last line is cut short and left out"] if truncated else cells
+def passed_over(not_finite: int, truncated: bool, wraps: int) -> list[str]:
+    """Sentences on cells that are not finite, on a last line cut short, on a time that begins again."""
+    return [
+        *([f"{not_finite} cells say nan or inf and count as blank"] if not_finite else []),
+        *(["the last line is cut short and left out"] if truncated else []),
+        *([f"the time is a counter that begins again {wraps} times, and is counted on"] if wraps else []),
+    ]
 
 
 @dataclass(frozen=True)
@@ -80,6 +86,7 @@ class Log:
     unknown : names of the columns that were not read.
     not_finite : cells that said nan or inf; in Parquet nan is a blank.
     truncated : whether the last line was cut short and left out.
+    wraps : how often the counter that is the time began again.
     """
 
     source: str
@@ -90,6 +97,7 @@ class Log:
     unknown: tuple[str, ...] = ()
     not_finite: int = 0
     truncated: bool = False
+    wraps: int = 0
 
     def __len__(self) -> int:
         return len(self.t_s)
@@ -127,7 +135,7 @@ class Log:
     def remarks(self) -> list[str]:
         """Sentences on what the columns were read as, on cells that are not finite, on a cut last line."""
         read_as = self.map.narration if self.map is not None else ""
-        passed = passed_over(self.not_finite, self.truncated)
+        passed = passed_over(self.not_finite, self.truncated, self.wraps)
         return [*([read_as] if read_as else []), *(f"{self.source}: {one}" for one in passed)]
 
 
@@ -139,6 +147,7 @@ class _Block:
     lines: IntArray
     not_finite: int = 0
     truncated: bool = False
+    wraps: int = 0
 
 
 @dataclass(frozen=True)
@@ -158,6 +167,7 @@ class _Text:
 
 def _logs(columns: ColumnMap, blocks: Iterator[_Block]) -> Iterator[Log]:
     """Blocks in SI; the readings of the first tell the units that nobody states."""
+    blocks = _counted_on(blocks)
     first = next((block for block in blocks if len(block.lines)), None)
     if first is None:
         return
@@ -166,7 +176,36 @@ def _logs(columns: ColumnMap, blocks: Iterator[_Block]) -> Iterator[Log]:
     for block in chain([first], blocks):
         named = {n: known.sources[n].si(kind_of(n), v) for n, v in block.cells.items() if n != "t_s"}
         t_s = known.sources["t_s"].si("time", block.cells["t_s"])
-        yield Log(known.source, t_s, named, block.lines, known, unknown, block.not_finite, block.truncated)
+        yield Log(
+            known.source, t_s, named, block.lines, known, unknown, block.not_finite, block.truncated,
+            block.wraps,
+        )  # fmt: skip
+
+
+def _counted_on(blocks: Iterator[_Block]) -> Iterator[_Block]:
+    """Blocks whose times run on where they are those of a counter that begins again."""
+    before, size, laps = math.nan, 0, 0
+    for block in blocks:
+        t = block.cells["t_s"]
+        steps = np.diff(t, prepend=before)
+        size = size or _counter(t, steps)
+        before = float(t[-1]) if len(t) else before
+        if size:
+            again = steps < -0.5 * size
+            ahead = laps + size * np.cumsum(again)
+            laps = int(ahead[-1]) if len(t) else laps
+            block = replace(block, cells={**block.cells, "t_s": t + ahead}, wraps=int(again.sum()))
+        yield block
+
+
+def _counter(t: FloatArray, steps: FloatArray) -> int:
+    """Size of the counter that times (n,) are those of, where it begins again; 0 otherwise."""
+    back, usual = steps[steps < 0.0], steps[steps > 0.0]
+    if not len(back) or not len(usual) or not np.array_equal(t, np.floor(t)):
+        return 0
+    most = _WRAPS_WITHIN * float(np.median(usual))
+    fits = (n for n in _COUNTERS if t.min() >= 0.0 and t.max() < n and (back + n <= most).all())
+    return next(fits, 0)
 
 
 def _number(text: _Text, word: str, column: str, line: int) -> float:
@@ -562,6 +601,7 @@ def read_log(path: Path, options: LogOptions = NOTHING_STATED) -> Log:
         lines=np.concatenate([block.lines for block in blocks]),
         not_finite=sum(block.not_finite for block in blocks),
         truncated=blocks[-1].truncated,
+        wraps=sum(block.wraps for block in blocks),
     )
 
 

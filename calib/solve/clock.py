@@ -198,18 +198,21 @@ def _steady(t: FloatArray) -> tuple[FloatArray, IntArray, float] | None:
     origin, period, _ = _line(k, t[anchors])
     if not period > 0.0:
         return None
-    if size == 1.0:
-        even = origin + period * k
-        k = _with_gaps_in_place(k, (t - origin - _wander(even, t - even)) / period)
-        origin, period, _ = _line(k, t)
+    even = origin + period * k
+    off = (t[anchors] - even - _wander(even, t[anchors] - even)) / period
+    k = _with_gaps_in_place(k - anchors, np.where(np.abs(off) > 0.5 * size, np.rint(off), 0.0)) + anchors
+    origin, period, _ = _line(k, t[anchors])
     even = origin + period * k
     wander = _wander(even, t[anchors] - even)
     # Samples of a burst come before its last; what is missing is missing before the burst.
     places = i + np.repeat(k - anchors, np.diff(anchors, prepend=-1)).astype(np.int64)
     times = np.maximum.accumulate(origin + period * places + np.interp(places, k, wander))
-    far = np.abs(times[anchors] - t[anchors]) > 0.5 * size * period
+    off = np.abs(times[anchors] - t[anchors]) / (size * period)
+    far = off > 0.5
     # A late stamp stands alone; where neighbours are off as well, or the samples are few, the line is wrong.
     if _running_median(far.astype(np.float64)).any() or (len(t) < _RECENT and far.mean() > _LATE):
+        return None
+    if len(t) < 2 * _FIRST and off.max() > _UNEVEN:
         return None
     return times, places - places[0], period
 
@@ -294,17 +297,17 @@ def _counted(t: FloatArray, i: IntArray, period: float, uneven: float) -> FloatA
     return k
 
 
-def _with_gaps_in_place(k: FloatArray, at: FloatArray) -> FloatArray:
-    """Numbers k (n,) moved into free ones beside them where their stamps, at these numbers (n,), are nearer.
+def _with_gaps_in_place(missing: FloatArray, off: FloatArray) -> FloatArray:
+    """Samples missing before each (n,), which only grow, where stamps are `off` (n,) whole samples.
 
     The running median knows a gap to some samples only.
     """
-    k, nearest = np.concatenate([[-math.inf], k, [math.inf]]), np.rint(at)
-    for i in (np.flatnonzero(nearest > k[1:-1]) + 1)[::-1].tolist():
-        k[i] = max(k[i], min(nearest[i - 1], k[i + 1] - 1.0))
-    for i in (np.flatnonzero(nearest < k[1:-1]) + 1).tolist():
-        k[i] = min(k[i], max(nearest[i - 1], k[i - 1] + 1.0))
-    return k[1:-1]
+    wanted, missing = missing + off, np.concatenate([[-math.inf], missing, [math.inf]])
+    for i in (np.flatnonzero(off > 0.0) + 1)[::-1].tolist():
+        missing[i] = max(missing[i], min(wanted[i - 1], missing[i + 1]))
+    for i in (np.flatnonzero(off < 0.0) + 1).tolist():
+        missing[i] = min(missing[i], max(wanted[i - 1], missing[i - 1]))
+    return missing[1:-1]
 
 
 def _wander(even: FloatArray, off: FloatArray) -> FloatArray:

@@ -18,6 +18,7 @@ import calib.io.logs as logs
 from calib.core.errors import BadInputError
 from calib.io.cells import GENERAL, TIME, WHOLE, table_bytes
 from calib.io.logs import Log, iter_log, log_text, read_log, write_log
+from calib.io.signals import check_time
 from calib.io.states import ENDINGS, STATES, states_writer
 
 SMALL = (
@@ -373,3 +374,27 @@ def test_a_full_disk_is_one_sentence(ending: str, tmp_path: Path) -> None:
     with pytest.raises(BadInputError) as caught:
         _written(path, rows)
     assert str(caught.value) == f"{path}: cannot be written: No space left on device"
+
+
+@pytest.mark.parametrize(("bits", "name"), [(16, "millis"), (32, "millis"), (32, "micros")])
+def test_a_time_that_begins_again_is_counted_on(
+    write, monkeypatch: pytest.MonkeyPatch, bits: int, name: str
+) -> None:
+    step, unit_s = (10, 1e-3) if name == "millis" else (10_000, 1e-6)
+    counts = 2**bits - 3000 + step * np.arange(20_000)
+    rows = "".join(f"{t},{k % 7}\n" for k, t in enumerate(counts % 2**bits))
+    path = write(f"{name},u_px\n{rows}")
+    for size in (1 << 20, 1000):
+        monkeypatch.setattr(logs, "_BLOCK_BYTES", size)
+        log = read_log(path)
+        assert np.allclose(log.t_s, unit_s * counts, rtol=1e-12)
+        assert log.wraps == (4 if bits == 16 else 1)
+    assert "begins again" in log.remarks()[-1]
+
+
+@pytest.mark.parametrize("falls_to", [0, 20_000])
+def test_a_board_that_was_started_again_is_no_counter(write, falls_to: int) -> None:
+    counts = np.concatenate([30_000 + 10 * np.arange(100), falls_to + 10 * np.arange(100)])
+    log = read_log(write("millis,u_px\n" + "".join(f"{t},1\n" for t in counts)))
+    with pytest.raises(BadInputError, match="line 102: t_s goes back"):
+        check_time(log)

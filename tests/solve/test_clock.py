@@ -58,7 +58,8 @@ def clocks(draw: st.DrawFn) -> tuple[FloatArray, FloatArray, float, bool]:
         taken = taken[keep]
     gaps = [draw(st.sampled_from((0.3, 2.0, 1000.0))) for _ in range(draw(st.integers(0, 3)))]
     for gap_s in gaps:
-        taken[rng.integers(len(taken)) :] += gap_s
+        # A single sample before a gap or behind it is the hardest.
+        taken[draw(st.sampled_from((1, int(rng.integers(len(taken))), len(taken) - 1))) :] += gap_s
     stamps = taken
     if kind == "bursts":
         size = draw(st.integers(2, 40))
@@ -172,6 +173,15 @@ def test_short_stretches_are_counted_too() -> None:
         axis = time_axis(_stamped(taken, 4e-4, 0.005, seed))
         assert axis.missing == 0
         assert np.abs(axis.t_s - taken).max() < 6 * 2 * 4e-4 / np.sqrt(120)
+
+
+@pytest.mark.parametrize("at", [1, 1468, 2927])
+def test_a_single_burst_before_a_gap_stays(at: int) -> None:
+    """A logger that polls at 2.7 periods writes bursts, of which the first or the last stands alone."""
+    taken = 0.0049 * np.arange(2928)
+    taken[at:] += 0.3
+    stamps = taken[0] + np.ceil(taken / (2.7 * 0.0049)) * 2.7 * 0.0049
+    _held(time_axis(stamps), stamps, 2.7 * 0.0049)
 
 
 def test_a_long_gap_splits() -> None:

@@ -221,12 +221,11 @@ def opened(path: Path, rig: Rig, rig_path: Path, options: LogOptions = NOTHING_S
 
 def _noted(stream: Iterator[Log], remarks: list[str]) -> Iterator[Log]:
     """The blocks, and at their end sentences on what was passed over in them."""
-    cells, truncated = 0, False
+    cells, truncated, wraps = 0, False, 0
     for log in stream:
-        cells += log.not_finite
-        truncated = log.truncated
+        cells, truncated, wraps = cells + log.not_finite, log.truncated, wraps + log.wraps
         yield log
-    remarks.extend(passed_over(cells, truncated))
+    remarks.extend(passed_over(cells, truncated, wraps))
 
 
 def drive_for(log: OpenLog, rig: Rig, model: str) -> Drive | None:
