@@ -150,7 +150,7 @@ def facts(section: BaseModel) -> list[tuple[str, str]]:
         unit, scale, places = _shown(key, field)
         if isinstance(wanted, list):
             for item in wanted:
-                name = _AXES[item] if isinstance(item, int) else _as_words(str(item))
+                name = _AXES[item] if isinstance(item, int) else as_words(str(item))
                 one = value[item] if isinstance(item, int) else _item(value, str(item))
                 own = unit or unit_of(str(item))
                 out.append(
@@ -220,7 +220,7 @@ def _gathered(section: BaseModel, prefix: str) -> tuple[Rows, Rows, list[Block]]
                 wide = _scaled(bars.get(name), scale) if isinstance(bars, Mapping) else None
                 cell = one if isinstance(one, str) else number(_scaled(one, scale), wide, places)
                 bar = "" if wide is None else number(wide, wide)
-                scalars.append((_with_unit(f"{label} {_as_words(name)}", own), cell, bar))
+                scalars.append((_with_unit(f"{label} {as_words(name)}", own), cell, bar))
         elif isinstance(value, list) and value and isinstance(value[0], BaseModel):
             later.append(listed(label, value))
         elif isinstance(value, list) and all(isinstance(one, int) for one in value):
@@ -286,7 +286,7 @@ def _scaled(value: float | None, scale: float) -> float | None:
     return value if value is None or scale == 1.0 else value * scale
 
 
-def _as_words(name: str) -> str:
+def as_words(name: str) -> str:
     """A key without its unit."""
     end = next((end for end in UNITS if name.endswith(end)), "")
     return name.removesuffix(end).replace("_", " ")

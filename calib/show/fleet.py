@@ -5,96 +5,68 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from calib import __version__
-from calib.core.words import BLANK, SIGMA, number
+from calib.core.plot import Bars, Curve, Figure, Mark, Plot, Rule
+from calib.core.words import BLANK, SIGMA, as_words, number, unit_of
 from calib.core.writing import write_atomically
-from calib.runner.fleet import ConstantSummary, FleetSummary
+from calib.runner.fleet import ConstantSummary, Drift, FleetSummary
 from calib.runner.sweep import Point, SweepSpec, SweepSummary
 from calib.show.page import PAGE as A_PAGE
-from calib.show.page import render
+from calib.show.page import embedded, render
 
 # ----------------------------------------------------------------------
-# Small pictures of a fleet as SVG text: a constant's histogram, and its values over the serial numbers.
-#
-# Only numbers go into them; colours are those of the page, so that they follow its theme.
-
-_WIDE, _HIGH, _LEFT, _BELOW, _TOP = 420.0, 150.0, 8.0, 24.0, 8.0
+# Figures of a fleet: a constant's histogram, and its values over the serial numbers.
 
 
-def _start(label: str) -> list[str]:
-    return [f'<svg class="plot" viewBox="0 0 {_WIDE:g} {_HIGH:g}" role="img" aria-label="{escape(label)}">']
-
-
-def _text(x: float, text: str, anchor: str) -> str:
-    return f'<text x="{x:.1f}" y="{_HIGH - 6:.1f}" text-anchor="{anchor}">{escape(text)}</text>'
-
-
-def histogram_svg(one: ConstantSummary) -> str:
-    """Bars over the values, a line at the median, and arrows for rigs that lie outside."""
-    out = _start(f"Histogram of {one.name} over {one.spread.count} rigs")
-    if not one.counts or not one.high > one.low:
-        return "".join([*out, "</svg>"])
-    width = (_WIDE - 2 * _LEFT) / len(one.counts)
-    floor, most = _HIGH - _BELOW, max(*one.counts, 1)
-    room = floor - _TOP
-    for k, count in enumerate(one.counts):
-        if count:
-            high = room * count / most
-            x = _LEFT + k * width
-            step = (one.high - one.low) / len(one.counts)
-            told = f"{one.low + k * step:.6g} to {one.low + (k + 1) * step:.6g}: {count}"
-            out.append(
-                f'<rect class="bar" x="{x + 0.5:.1f}" y="{floor - high:.1f}" width="{width - 1:.1f}" '
-                f'height="{high:.1f}"><title>{told}</title></rect>'
-            )
-    out.append(f'<line class="axis" x1="{_LEFT}" x2="{_WIDE - _LEFT}" y1="{floor}" y2="{floor}"/>')
-    middle = _LEFT + (one.spread.median - one.low) / (one.high - one.low) * (_WIDE - 2 * _LEFT)
-    out.append(f'<line class="median" x1="{middle:.1f}" x2="{middle:.1f}" y1="{_TOP}" y2="{floor}"/>')
-    for x, count, sign in ((_LEFT, one.below, "\u2190"), (_WIDE - _LEFT, one.above, "\u2192")):
-        if count:
-            anchor = "start" if x == _LEFT else "end"
-            told = f"{sign} {count}" if x == _LEFT else f"{count} {sign}"
-            out.append(
-                f'<text class="far" x="{x:.1f}" y="{_TOP + 10:.1f}" text-anchor="{anchor}">{told}</text>'
-            )
-    out.append(_text(_LEFT, number(one.low, one.spread.scale or None), "start"))
-    out.append(_text(_WIDE - _LEFT, number(one.high, one.spread.scale or None), "end"))
-    return "".join([*out, "</svg>"])
-
-
-def drift_svg(one: ConstantSummary) -> str:
-    """Values over the serial numbers with the robust line; "" without numbers. Far values sit at the edge."""
+def constant_figure(one: ConstantSummary) -> Figure:
+    """How a constant is spread over the rigs, and what it does with the serial number."""
+    name, unit = as_words(one.name).replace(".", " "), f" {one.unit}" if one.unit else ""
+    value = f"{name} ({one.unit})" if one.unit else name
+    width = (one.high - one.low) / max(len(one.counts), 1)
+    at = one.low + width * (np.arange(len(one.counts)) + 0.5)
+    outside = [f"{n} rigs lie {word}" for n, word in ((one.below, "below"), (one.above, "above")) if n]
+    panels = [
+        Plot(
+            value,
+            "rigs",
+            (Bars(at, np.array(one.counts), width), Rule("x", one.spread.median, "ink"))
+            if width > 0.0
+            else (),
+            whole="y",
+            empty="" if width else "All rigs have the same value.",
+        )
+    ]
+    sentence = f"The line is the median{'; ' if outside else ''}{' and '.join(outside)}."
     drift = one.drift
-    if drift is None or not one.points:
-        return ""
-    out = _start(f"{one.name} over the serial number")
-    first, last = one.points[0][0], one.points[-1][0]
-    across = max(last - first, 1e-12)
-    reach = 5.0 * one.spread.scale or max(one.high - one.low, 1e-12)
-    ends = [drift.at_middle + drift.slope * (t - drift.middle) for t in (first, last)]
-    low = min(max(one.spread.low, one.spread.median - reach), *ends)
-    high = max(min(one.spread.high, one.spread.median + reach), *ends)
-    floor = _HIGH - _BELOW
+    if drift is not None and one.points:
+        serial, x = np.array(one.points).T
+        ends = serial[[0, -1]]
+        line = drift.at_middle + drift.slope * (ends - drift.middle)
+        # A few far values are drawn at the edge, so that the others are told apart.
+        reach = 5.0 * one.spread.scale or max(one.high - one.low, 1e-12)
+        low = min(max(one.spread.low, one.spread.median - reach), *line)
+        high = max(min(one.spread.high, one.spread.median + reach), *line)
+        near = (low <= x) & (x <= high)
+        marks: list[Mark] = [Curve(serial[near], x[near], kind="points")]
+        if not near.all():
+            marks.append(Curve(serial[~near], x[~near].clip(low, high), kind="crosses", colour="red"))
+        marks.append(Curve(ends, line, colour="red" if one.drifts else "ink"))
+        panels.append(Plot("serial number", value, marks))
+        word = (
+            "It drifts with the serial number" if one.drifts else "It has no drift that is more than chance"
+        )
+        sentence += f" {word}: {_with_sigma(drift)}{unit} per number, over {drift.count} rigs."
+        sentence += "" if near.all() else " Crosses are farther away than drawn."
+    return Figure(f"{name} over {one.spread.count} rigs", sentence, panels, 2.2 * len(panels))
 
-    def place(t: float, x: float) -> tuple[float, float]:
-        share = (min(max(x, low), high) - low) / max(high - low, 1e-300)
-        return _LEFT + (t - first) / across * (_WIDE - 2 * _LEFT), floor - share * (floor - _TOP)
 
-    for t, x in one.points:
-        u, v = place(t, x)
-        kind = "dot" if low <= x <= high else "dot far"
-        out.append(f'<circle class="{kind}" cx="{u:.1f}" cy="{v:.1f}" r="2"/>')
-    (x1, y1), (x2, y2) = place(first, ends[0]), place(last, ends[1])
-    kind = "drifting" if one.drifts else "median"
-    out.append(f'<line class="{kind}" x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}"/>')
-    out.append(f'<line class="axis" x1="{_LEFT}" x2="{_WIDE - _LEFT}" y1="{floor}" y2="{floor}"/>')
-    out.append(_text(_LEFT, f"number {first:g}", "start"))
-    out.append(_text(_WIDE - _LEFT, f"{last:g}", "end"))
-    return "".join([*out, "</svg>"])
+def _with_sigma(drift: Drift) -> str:
+    return f"{number(drift.slope, drift.sigma)} ± {number(drift.sigma, drift.sigma)}"
 
 
 # ----------------------------------------------------------------------
@@ -118,9 +90,7 @@ class _Card:
     name: str
     unit: str
     facts: tuple[tuple[str, str], ...]
-    histogram: str
-    drift: str
-    sentence: str
+    figure: dict[str, str]
     drifts: bool
     out: tuple[tuple[str, str, str], ...]
     more: int
@@ -139,6 +109,7 @@ def fleet_page_text(summary: FleetSummary) -> str:
         "fleet.html.j2",
         STYLE,
         SCRIPT,
+        bool(summary.constants),
         version=__version__,
         summary=summary,
         answer=answer,
@@ -207,19 +178,11 @@ def _facts(one: ConstantSummary) -> list[tuple[str, str]]:
 
 
 def _card(one: ConstantSummary) -> _Card:
-    sentence = ""
-    if one.drift is not None:
-        d = one.drift
-        word = "Drifts with the serial number" if one.drifts else "No drift that is more than chance"
-        unit = f" {one.unit}" if one.unit else ""
-        sentence = f"{word}: {d.slope:.3g} ± {d.sigma:.2g}{unit} per number, over {d.count} rigs."
     return _Card(
         one.name,
         one.unit,
         tuple(_facts(one)),
-        histogram_svg(one),
-        drift_svg(one),
-        sentence,
+        embedded(constant_figure(one)),
         one.drifts,
         tuple((name, number(value, one.spread.scale or None), f"{z:+.1f}") for name, value, z in one.out[:8]),
         max(0, one.standing_out - 8),
@@ -239,8 +202,11 @@ def _row(one: ConstantSummary) -> Sequence[tuple[str, float | None]]:
         cell(spread.own),
         cell(float(spread.count), str(spread.count)),
         cell(float(one.standing_out), str(one.standing_out)),
-        cell(drift.slope if drift else math.nan),
-        cell(drift.sigma if drift else math.nan),
+        *(
+            (cell(drift.slope, number(drift.slope, drift.sigma)), cell(drift.sigma))
+            if drift
+            else (("", None),) * 2
+        ),
     ]
 
 
@@ -248,13 +214,6 @@ def _row(one: ConstantSummary) -> Sequence[tuple[str, float | None]]:
 # The page of a sweep: the best and the worst points, and the measure over each parameter.
 
 SWEEP_PAGE = "sweep.html"
-_SWEEP_PAGE_WIDE, _SWEEP_PAGE_HIGH, _SWEEP_PAGE_LEFT, _SWEEP_PAGE_BELOW, _SWEEP_PAGE_TOP = (
-    420.0,
-    210.0,
-    8.0,
-    26.0,
-    18.0,
-)
 
 
 def write_sweep_page(path: Path, spec: SweepSpec, summary: SweepSummary) -> None:
@@ -275,6 +234,7 @@ def sweep_page_text(spec: SweepSpec, summary: SweepSummary) -> str:
         "sweep.html.j2",
         STYLE,
         SCRIPT,
+        bool(summary.clouds),
         version=__version__,
         summary=summary,
         what=what,
@@ -283,9 +243,7 @@ def sweep_page_text(spec: SweepSpec, summary: SweepSummary) -> str:
         points=spec.points,
         draws=spec.count,
         tables=tables,
-        clouds=[
-            (name, cloud_svg(name, summary.measure, points)) for name, points in summary.clouds if points
-        ],
+        clouds=[embedded(_cloud(name, summary.measure, points)) for name, points in summary.clouds if points],
     )
 
 
@@ -307,25 +265,14 @@ def _sweep_page_row(point: Point) -> list[tuple[str, Any]]:
     return out
 
 
-def cloud_svg(name: str, measure: str, points: tuple[tuple[float, float], ...]) -> str:
+def _cloud(name: str, measure: str, points: tuple[tuple[float, float], ...]) -> Figure:
     """The measure over one parameter."""
-    xs, ys = [x for x, _ in points], [y for _, y in points]
-    x0, x1, y0, y1 = min(xs), max(xs), min(ys), max(ys)
-    floor = _SWEEP_PAGE_HIGH - _SWEEP_PAGE_BELOW
-    label = escape(f"{measure} over {name}")
-    box = f"0 0 {_SWEEP_PAGE_WIDE:g} {_SWEEP_PAGE_HIGH:g}"
-    out = [f'<svg class="plot" viewBox="{box}" role="img" aria-label="{label}">']
-    for x, y in points:
-        u = _SWEEP_PAGE_LEFT + (x - x0) / (x1 - x0 or 1.0) * (_SWEEP_PAGE_WIDE - 2 * _SWEEP_PAGE_LEFT)
-        v = floor - (y - y0) / (y1 - y0 or 1.0) * (floor - _SWEEP_PAGE_TOP)
-        out.append(f'<circle class="dot" cx="{u:.1f}" cy="{v:.1f}" r="2.4"/>')
-    left, right = _SWEEP_PAGE_LEFT, _SWEEP_PAGE_WIDE - _SWEEP_PAGE_LEFT
-    out.append(f'<line class="axis" x1="{left}" x2="{right}" y1="{floor}" y2="{floor}"/>')
-    for x, y, text, anchor in (
-        (_SWEEP_PAGE_LEFT, _SWEEP_PAGE_HIGH - 6, f"{x0:.4g}", "start"),
-        (_SWEEP_PAGE_WIDE - _SWEEP_PAGE_LEFT, _SWEEP_PAGE_HIGH - 6, f"{x1:.4g}", "end"),
-        (_SWEEP_PAGE_LEFT, 11.0, f"{y1:.4g}", "start"),
-        (_SWEEP_PAGE_LEFT, floor - 3, f"{y0:.4g}", "start"),
-    ):
-        out.append(f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>')
-    return "".join([*out, "</svg>"])
+    x, y = np.array(points).T
+    panel = Plot(_headed(name), _headed(measure), (Curve(x, y, kind="points"),))
+    return Figure(f"{as_words(measure)} over {as_words(name)}", "", (panel,), 3.0)
+
+
+def _headed(name: str) -> str:
+    """A key as the name of an axis."""
+    unit = unit_of(name)
+    return as_words(name).replace(".", " ") + (f" ({unit})" if unit else "")

@@ -17,40 +17,47 @@ from calib import __version__
 from calib.core.constants import constants
 from calib.core.errors import BadInputError
 from calib.core.files import read_bytes, read_text, sha256
+from calib.core.plot import Figure
 from calib.core.rig import Rig
 from calib.core.words import BLANK, facts, number, unit_of
 from calib.core.writing import Kind, holds, make_folder, write_atomically
 from calib.runner.cache import Result, load
 from calib.runner.graph import HIDDEN, STEPS
 from calib.runner.outputs import decide, read_summary
-from calib.show.charts import library
+from calib.show.charts import chart, library
 
 # ----------------------------------------------------------------------
 # Pages from their templates: each is one file, with its style and its script in it.
 
 
 def render(
-    template: str, style: tuple[str, ...], script: tuple[str, ...], library: str = "", **values: Any
+    template: str, style: tuple[str, ...], script: tuple[str, ...], charts: bool, **values: Any
 ) -> str:
     """A template of this package with what else goes into a page.
 
     Parameters
     ----------
-    style, script : names of files that are put one behind the other. The page's policy lets no script run
-        but this one and `library`, the text of another.
+    style, script : names of files that are put one behind the other.
+    charts : whether there are figures, which are drawn by plotly.js. The page's policy lets no script run
+        but it and `script`.
     values : what the template asks for beside them; all of it is escaped.
     """
     import jinja2
 
-    words = "".join(_resource(name) for name in script)
-    hashes = [base64.b64encode(hashlib.sha256(one.encode()).digest()).decode() for one in (words, library)]
+    words = "".join(_resource(name) for name in (*script, *(("charts.js",) if charts else ())))
+    drawing = library() if charts else ""
+    hashes = [base64.b64encode(hashlib.sha256(one.encode()).digest()).decode() for one in (words, drawing)]
     environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=jinja2.FunctionLoader(_resource),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-    text = environment.from_string(_resource(template)).render(
+    text = environment.get_template(template).render(
         style="".join(_resource(name) for name in style),
         script=words,
-        library=library,
+        library=drawing,
         script_hash="' '".join(f"sha256-{digest}" for digest in hashes),
         **values,
     )
@@ -60,6 +67,18 @@ def render(
 
 def _resource(name: str) -> str:
     return (resources.files("calib.show") / "templates" / name).read_text(encoding="utf-8")
+
+
+def _as_script(value: Any) -> str:
+    """JSON that no element of a page can end."""
+    text = json.dumps(value, ensure_ascii=True, separators=(",", ":"), allow_nan=False)
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def embedded(figure: Figure) -> dict[str, str]:
+    """A figure as the templates' macro `chart` takes it."""
+    words = {"title": figure.title, "note": figure.note, "verdict": figure.verdict}
+    return {**words, "chart": _as_script(chart(figure))}
 
 
 # ----------------------------------------------------------------------
@@ -314,12 +333,11 @@ def page_text(rig: Path) -> str:
     views = _views(hidden, _Budget(_VIEWS_BYTES))
     budget.left -= sum(len(view["image"]) for view in views)
     stages = _stages(told, sections, whole, hidden, budget)
-    charts = any(part["figures"] for one in stages for part in one["parts"])
     return render(
         "page.html.j2",
         ("page.css",),
-        ("common.js", "page.js", *(("charts.js",) if charts else ())),
-        library() if charts else "",
+        ("common.js", "page.js"),
+        any(part["figures"] for one in stages for part in one["parts"]),
         decision=decide(told, sections),
         told=told,
         stages=stages,
@@ -344,12 +362,6 @@ def page_text(rig: Path) -> str:
         ],
         version=provenance.get("version", __version__),
     )
-
-
-def _as_script(value: Any) -> str:
-    """JSON that no element of a page can end."""
-    text = json.dumps(value, ensure_ascii=True, separators=(",", ":"))
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 def _summary_of(sections: Mapping[str, Any]) -> dict[str, Any]:
@@ -508,9 +520,9 @@ def _chosen(results: list[Result | None], budget: _Budget) -> dict[Path, str]:
     shown = {}
     for _, _, path in listed:
         with contextlib.suppress(BadInputError, ValueError):
-            chart = _as_script(json.loads(read_text(path)))
-            if budget.takes(chart):
-                shown[path] = chart
+            text = _as_script(json.loads(read_text(path)))
+            if budget.takes(text):
+                shown[path] = text
     return shown
 
 

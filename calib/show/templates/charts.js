@@ -56,6 +56,14 @@
     return value;
   };
 
+  // Where a trace has no words of its own: both values under the names of their axes, which hold the units.
+  const hover = (panel) => {
+    const named = panel.y.ticktext && !panel.y.title.text;
+    const lines = [panel.x.title.text && panel.x.title.text + ": %{x:.4~g}",
+      !named && panel.y.title.text && panel.y.title.text + ": %{y:.4~g}"].filter(Boolean);
+    return lines.join("<br>");
+  };
+
   const NARROW_PX = 560;
   const build = (chart, width) => {
     const look = dark() ? "dark" : "light";
@@ -112,7 +120,9 @@
         labels.add(trace.name);
         const bar = trace.colorbar ?? trace.marker?.colorbar;
         if (bar) Object.assign(bar, { x: x[1] + 0.01, xanchor: "left", y: (y[0] + y[1]) / 2, len: y[1] - y[0] });
-        traces.push({ ...trace, xaxis: "x" + id, yaxis: "y" + id, showlegend: first,
+        const under = panel.x.title.text ? panel : { ...panel, x: chart.panels[panel.follows]?.x ?? panel.x };
+        const words = hover(under) && { hovertemplate: hover(under) + "<extra>" + (trace.name ?? "") + "</extra>" };
+        traces.push({ ...words, ...trace, xaxis: "x" + id, yaxis: "y" + id, showlegend: first,
           ...(trace.name ? { legendgroup: trace.name } : {}) });
       }
       if (panel.traces.some((trace) => trace.showscale || trace.marker?.showscale)) {
