@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calib.cli.common import JsonOption, document, say, table
+from calib.cli.common import JsonOption, document, narrate, say, table
 
 if TYPE_CHECKING:
     from calib.core.diff import Change, RigDiff
@@ -22,6 +22,10 @@ def diff(
     every: Annotated[
         bool, typer.Option("--all", help="Show every constant that differs, not only the foremost.")
     ] = False,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", help="Page to write: both over the picture and on the plane."),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Compare two calibrations, in standard deviations and in millimetres on the plane.
@@ -30,7 +34,19 @@ def diff(
     """
     from calib.core.rig import Rig
 
-    found = Rig.load(before).diff(Rig.load(after))
+    one, other = Rig.load(before), Rig.load(after)
+    found = one.diff(other)
+    if output is not None:
+        from calib.core.command import note_inputs
+        from calib.core.files import shown
+        from calib.core.writing import check_writable
+        from calib.show.diff import write_diff_page
+        from calib.show.page import PAGE
+
+        note_inputs([before, after])
+        check_writable(output, PAGE)
+        write_diff_page(output, one, other, (shown(before), shown(after)), found)
+        narrate(f"page written to {shown(output)}")
     if as_json:
         document(
             "diff",

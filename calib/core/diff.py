@@ -13,14 +13,16 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from calib.core.arrays import FloatArray
 from calib.core.constants import Constant, constants
-from calib.core.rig import Geometry, Rig
+
+Sections = Mapping[str, Mapping[str, Any]]
 
 SIGNIFICANT = 3.0
 """Standard deviations from which on a difference is called significant."""
@@ -101,9 +103,10 @@ class RigDiff:
         )
 
 
-def diff_rigs(old: Rig, new: Rig) -> RigDiff:
-    """Compare two rigs."""
-    a, b = _sections(old), _sections(new)
+def compared(a: Sections, b: Sections, plane: PlaneChange | None) -> RigDiff:
+    """Compare two rigs by the plain values of their files; `plane` is what differs there."""
+    inputs = [one.get("provenance", {}).get("inputs", {}) for one in (a, b)]
+    a, b = ({name: values for name, values in one.items() if name != "provenance"} for one in (a, b))
     left, right = _by_name(a), _by_name(b)
     changes = [_change(left.get(key), right.get(key)) for key in dict.fromkeys([*left, *right])]
     differ = [change for change in changes if change is not None]
@@ -113,21 +116,16 @@ def diff_rigs(old: Rig, new: Rig) -> RigDiff:
         for name in a
         if name in b and a[name].get("verdict") != b[name].get("verdict")
     ]
-    learnt_a, learnt_b = old.provenance.inputs, new.provenance.inputs
     return RigDiff(
         tuple(differ),
-        _on_plane(old, new),
+        plane,
         tuple(verdicts),
         tuple(name for name in a if name not in b),
         tuple(name for name in b if name not in a),
         _others(a, b, {f"{section}.{name}" for section, name in left.keys() | right.keys()}),
-        tuple(name for name in learnt_a if name in learnt_b and learnt_a[name] != learnt_b[name]),
+        tuple(name for name, one in inputs[0].items() if name in inputs[1] and inputs[1][name] != one),
         len(left.keys() & right.keys()),
     )
-
-
-def _sections(rig: Rig) -> dict[str, dict[str, Any]]:
-    return {name: values for name, values in rig.values().items() if name != "provenance"}
 
 
 def _by_name(sections: Mapping[str, Any]) -> dict[tuple[str, str], Constant]:
@@ -187,24 +185,33 @@ def _change(before: Constant | None, after: Constant | None) -> Change | None:
     return Change(one.section, one.name, one.unit, before.value, after.value, sigma, sigmas)
 
 
-def _on_plane(old: Rig, new: Rig) -> PlaneChange | None:
-    if old.camera is None or new.camera is None or old.plane is None or new.plane is None:
-        return None
-    x0, y0, x1, y1 = (new.geometry or old.geometry or Geometry()).workspace_m
-    columns, rows = _GRID
-    x, y = np.meshgrid(np.linspace(x0, x1, columns), np.linspace(y0, y1, rows))
-    world = np.column_stack([x.ravel(), y.ravel()])
-    seen = old.plane.to_pixels(world, old.camera)
-    apart = 1e3 * np.linalg.norm(new.plane.to_world(seen, new.camera) - world, axis=1)
+def plane_change(
+    to_pixels: Callable[[FloatArray], FloatArray],
+    to_world: Callable[[FloatArray], FloatArray],
+    workspace_m: Sequence[float],
+    sigmas_mm: Sequence[float | None],
+) -> PlaneChange | None:
+    """What differs on the plane; None where nothing of the workspace is seen.
+
+    Parameters
+    ----------
+    to_pixels : of one calibration, from places (n, 2) in metres. to_world : of the other, back.
+    workspace_m : least x, least y, greatest x, greatest y. sigmas_mm : of both calibrations, None where not
+        known.
+    """
+    world = grid_m(workspace_m).reshape(-1, 2)
+    apart = 1e3 * np.linalg.norm(to_world(to_pixels(world)) - world, axis=1)
     if not np.isfinite(apart).any():
         return None
     worst = int(np.nanargmax(apart))
-    bars = [rig.plane.sigma_marker_mm.get("calibration_max") for rig in (old, new) if rig.plane is not None]
-    known = [bar for bar in bars if bar is not None]
+    known = [bar for bar in sigmas_mm if bar is not None]
     sigma = math.hypot(*known) if len(known) == 2 else None
-    return PlaneChange(
-        float(np.nanmean(apart)),
-        float(apart[worst]),
-        (float(world[worst, 0]), float(world[worst, 1])),
-        sigma,
-    )
+    at = (float(world[worst, 0]), float(world[worst, 1]))
+    return PlaneChange(float(np.nanmean(apart)), float(apart[worst]), at, sigma)
+
+
+def grid_m(workspace_m: Sequence[float]) -> FloatArray:
+    """Places (rows, columns, 2) at which the plane is compared."""
+    x0, y0, x1, y1 = workspace_m
+    columns, rows = _GRID
+    return np.stack(np.meshgrid(np.linspace(x0, x1, columns), np.linspace(y0, y1, rows)), axis=-1)

@@ -248,9 +248,24 @@ class Rig:
 
     def diff(self, other: Rig) -> RigDiff:
         """What differs in a later calibration, in standard deviations and on the plane."""
-        from calib.core.diff import diff_rigs
+        from calib.core.diff import compared, plane_change
 
-        return diff_rigs(self, other)
+        plane = None
+        if self.camera and other.camera and self.plane and other.plane:
+            seen, read = (self.plane, self.camera), (other.plane, other.camera)
+            plane = plane_change(
+                lambda world_m: seen[0].to_pixels(world_m, seen[1]),
+                lambda pixels: read[0].to_world(pixels, read[1]),
+                (other if other.geometry else self).workspace_m,
+                [one.sigma_marker_mm.get("calibration_max") for one in (self.plane, other.plane)],
+            )
+        return compared(self.values(), other.values(), plane)
+
+    @property
+    def workspace_m(self) -> tuple[float, float, float, float]:
+        """Where the marker can be: least x, least y, greatest x, greatest y."""
+        x0, y0, x1, y1 = (self.geometry or Geometry()).workspace_m
+        return x0, y0, x1, y1
 
     @property
     def plant(self) -> Plant:

@@ -94,7 +94,8 @@
       const y = [1 - bottom + (bottom < 0.999 ? gap(panel.x.title.text ? 50 : 24, inner.height) : 0),
         1 - top - (top > 0.001 ? gap(24, inner.height) : 0)];
       const common = { gridcolor: hues.grid, zeroline: false, linecolor: hues.grey, showline: !panel.bare,
-        ticks: panel.bare ? "" : "outside", tickcolor: hues.grey, automargin: false, visible: !panel.bare };
+        ticks: panel.bare ? "" : "outside", tickcolor: hues.grey, automargin: false, visible: !panel.bare,
+        exponentformat: "none" };
       layout["xaxis" + id] = { ...common, ...resolved(panel.x, chart, look), domain: x, anchor: "y" + id,
         showticklabels: panel.follows === null || panel.follows === undefined };
       layout["yaxis" + id] = { ...common, ...resolved(panel.y, chart, look), domain: y, anchor: "x" + id };
@@ -119,7 +120,7 @@
         const first = Boolean(trace.name) && !labels.has(trace.name);
         labels.add(trace.name);
         const bar = trace.colorbar ?? trace.marker?.colorbar;
-        if (bar) Object.assign(bar, { x: x[1] + 0.01, xanchor: "left", y: (y[0] + y[1]) / 2, len: y[1] - y[0] });
+        if (bar) Object.assign(bar, { exponentformat: "none", x: x[1] + 0.01, xanchor: "left", y: (y[0] + y[1]) / 2, len: y[1] - y[0] });
         const under = panel.x.title.text ? panel : { ...panel, x: chart.panels[panel.follows]?.x ?? panel.x };
         const words = hover(under) && { hovertemplate: hover(under) + "<extra>" + (trace.name ?? "") + "</extra>" };
         traces.push({ ...words, ...trace, xaxis: "x" + id, yaxis: "y" + id, showlegend: first,

@@ -10,7 +10,7 @@ import numpy as np
 from calib.core.arrays import AnyArray, BoolArray, FloatArray
 from calib.core.errors import BadInputError
 from calib.core.geometry import apply_homography, fit_homography
-from calib.stages.camera.bundle import Covariance
+from calib.stages.camera.bundle import Covariance, rotation_exp
 from calib.stages.camera.model import (
     INTRINSICS,
     Camera,
@@ -22,6 +22,7 @@ from calib.stages.camera.model import (
     fold_radius,
     one_to_one_reach,
     project,
+    rays,
     undistort,
     vector_from_camera,
 )
@@ -47,6 +48,7 @@ from calib.stages.camera.pose import projection_with_derivatives
 
 _MOST_COEFFICIENTS, _MOST_STEPS = 10, 6
 _REWEIGHTINGS = 40
+_ROTATION_STEPS = 8
 _STEEPEST = float(np.tan(np.radians(75.0)))
 """Undistorted radius up to which a fisheye lens is undone: no polynomial follows the tangent to its pole at a
 right angle."""
@@ -365,6 +367,30 @@ def projection_sigma_px(camera: Camera, covariance: FloatArray, pixels: FloatArr
     left = by_camera - by_turn @ turn
     variance = np.einsum("nik,kl,nil->n", left, covariance, left)
     return np.asarray(np.sqrt(np.maximum(0.5 * variance, 0.0)))
+
+
+def far_difference_px(before: Camera, after: Camera, pixels: FloatArray) -> FloatArray:
+    """Where `after` shows far points that `before` shows at these pixels, less the pixels, (N, 2).
+
+    The rotation between both that fits best over the picture is taken off, as in `projection_sigma_px`; it
+    is found by Gauss-Newton steps. NaN where one of the lenses shows nothing.
+
+    Parameters
+    ----------
+    pixels : (N, 2), distorted.
+    """
+    grid = pixel_grid(before.image_size_px, most=400).reshape(-1, 2)
+    toward, R = rays(before, grid), np.eye(3)
+    for _ in range(_ROTATION_STEPS):
+        shown, by_point, _ = projection_with_derivatives(after, toward @ R.T)
+        known = np.isfinite(shown).all(axis=1) & np.isfinite(by_point).all(axis=(1, 2))
+        if known.sum() < 3:
+            return np.full(pixels.shape, np.nan)
+        # R (I + [w]) d: the point moves by w x d.
+        by_turn = np.cross((toward @ R.T)[known, None, :], by_point[known])
+        turn = np.linalg.lstsq(by_turn.reshape(-1, 3), (grid - shown)[known].ravel(), rcond=None)[0]
+        R = rotation_exp(np.asarray(turn, dtype=np.float64)[None])[0] @ R
+    return project(after, rays(before, pixels) @ R.T) - pixels
 
 
 def analyse_distortion(
