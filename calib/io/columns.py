@@ -8,7 +8,8 @@ refused, whoever stated it:
     time           the samples come at 4 to 4000 Hz in one unit only
     accelerations  where the log is calm the specific force is g
     rates          the gyroscope turns with the accelerometer's angle, neither 57 times as far nor not at
-                   all; at rest it is neither louder nor quieter than sensors are
+                   all; at rest it is neither louder nor quieter than sensors are; a marker that it turns is
+                   about as far from the axis as a picture is large
 
 columns.yaml lies beside the logs; `NAME.columns.yaml` goes before it for one of them:
 
@@ -103,7 +104,7 @@ _AXIS = re.compile(
     r"(?:(?P<accel>a|acc|accel|accelerometer|acceleration|linearacceleration|specificforce)"
     r"|(?P<gyro>g|gyr|gyro|gyroscope|w|omega|angularvelocity|angularrate))(?:rss)?(?P<axis>[xyz])"
 )
-_TIME = re.compile(r"t|ts|time|timestamp|timestamps|stamp|clock|elapsed|headerstamp")
+_TIME = re.compile(r"t|ts|time|datetime|timestamp|timestamps|stamp|clock|elapsed|headerstamp")
 _NAMED_BY_UNIT = {"millis": "ms", "micros": "us", "nanos": "ns", "seconds": "s", "secs": "s", "ms": "ms"}
 _PIXEL = re.compile(r"(?:pixel|px|marker|cam|camera|image|img|blob|pixy)?(?P<axis>[uv])")
 _PIXEL_XY = re.compile(r"(?:pixel|px|marker|blob|pixy)(?P<axis>[xy])")
@@ -132,6 +133,10 @@ _FARTHER = 12.0
 _LEAST_TURN_RAD, _LEAST_NOISE_RAD = 0.05, 1e-5
 _AGREES = 0.3
 _BLOCK_S, _BLOCK_3D_S = 1.0, 0.25
+_MOMENT_S, _LATEST_S = 0.2, 0.2
+_MOVES_WITH, _LEAST_MOVED_PX = 0.7, 1.0
+_ARM = (0.07, 5.0)
+"""Distance of the marker from the axis that it turns about, in pictures; no 57th of that, nor 57 times."""
 _MOST_EVIDENCE = 100_000
 
 
@@ -664,6 +669,9 @@ def _with_gyro(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMap
             f"{columns.source}: the gyroscope {wrong[unit]}, which none does in {unit}; if it is in {other}, "
             f"{_advice('gyro', 'gyro', other, columns)}"
         )
+    if len(likely) == 2:
+        wrong |= {u: _too_far(scales[u], columns, cells) for u in likely}
+        likely = [u for u in likely if not wrong[u]] or likely
     if len(likely) == 1:
         others = "; ".join(f"in {u} it {wrong[u]}" for u in ("rad/s", "deg/s") if wrong[u])
         return _with(columns, names, likely[0], others)
@@ -673,6 +681,41 @@ def _with_gyro(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMap
         f"{'either is possible' if likely else 'neither fits'}; "
         f"{_advice('gyro', 'gyro', 'rad/s|deg/s', columns)}"
     )
+
+
+def _too_far(scale: float, columns: ColumnMap, cells: Mapping[str, FloatArray]) -> str:
+    """Why rates about z cannot be in a unit of this many rad/s by the marker's motion; empty where they can.
+
+    What turns with the head moves in the picture by its distance from the axis, which is neither a small part
+    of the picture nor a multiple of it.
+    """
+    if any(name not in columns.sources for name in ("gz_radps", "u_px", "v_px")):
+        return ""
+    t = cells["t_s"] * columns.sources["t_s"].factor * UNITS["time"][columns.sources["t_s"].unit]
+    turns, seen = np.isfinite(cells["gz_radps"]), np.isfinite(cells["u_px"]) & np.isfinite(cells["v_px"])
+    if min(turns.sum(), seen.sum()) < 2 * _CALM_WINDOW:
+        return ""
+    marker = np.stack([cells["u_px"][seen], cells["v_px"][seen]], axis=1)
+    rates = _together(cells, columns, ["gz_radps"])[:, 0]
+    angle = np.concatenate([[0.0], np.cumsum(scale * rates[1:] * np.diff(t[turns]))])
+    # A constant gain and lag of the pictures play no part in what both do within a moment.
+    times = np.arange(t[seen][0] + _LATEST_S, t[seen][-1] - _LATEST_S, _MOMENT_S / 4)
+    moved = np.stack([np.interp(times, t[seen], axis) for axis in marker.T], axis=1)
+    moved = moved[4:] - moved[:-4]
+    moved -= moved.mean(axis=0)
+    best, radius_px = 0.0, 0.0
+    for late_s in np.arange(-_LATEST_S, _LATEST_S, 0.01):
+        turned = np.interp(times - late_s, t[turns], angle)
+        turned = turned[4:] - turned[:-4]
+        turned -= turned.mean()
+        both, power = turned @ moved, float(turned @ turned)
+        share = float(both @ both) / max(power * float((moved**2).sum()), 1e-300)
+        if share > best:
+            best, radius_px = share, float(np.hypot(*both)) / power
+    times_picture = radius_px / float(np.abs(marker).max())
+    if best < _MOVES_WITH or float(moved.std()) < _LEAST_MOVED_PX or _ARM[0] < times_picture < _ARM[1]:
+        return ""
+    return f"turns a marker that would be {radius_px:.3g} px away from the axis"
 
 
 def _implausible(

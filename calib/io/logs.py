@@ -3,11 +3,13 @@
 A log in text has a header and one row per sample: a time and any of `calib.io.columns.COLUMNS`, in any order,
 and under other names and in other units as far as `calib.io.columns` knows them. A blank cell means that this
 sensor was not sampled in that row, so a 60 Hz camera and a 100 Hz IMU may interleave. Cells are separated by
-commas, semicolons or tabs; where not by commas, numbers may have a decimal comma. Other columns are kept out
-of the way: they are named in `Log.unknown` and not read. Blank lines and lines that begin with # are passed
-over; without a header the last of these, or columns.yaml, names the columns. A cell that says nan or inf
-counts as blank; how many there were is in `Log.not_finite`. A last line that is cut short, as in a log that
-is still being written, is left out.
+commas, semicolons or tabs; where not by commas, numbers may have a decimal comma. The text is UTF-8 or
+UTF-16, its lines end as on any system. Times may be dates, as `2024-05-01T12:00:00.25Z`. Other columns are
+kept out of the way: they are named in `Log.unknown` and not read. Blank lines and lines that begin with # are
+passed over; without a header the last of these, or columns.yaml, names the columns. A cell that says nan or
+inf counts as blank; how many there were is in `Log.not_finite`. A last line that is cut short, as in a log
+that is still being written, is left out. Where the time is a counter of 16 or 32 bits that begins again, as
+millis() does after 49.7 days and micros() after 71.6 minutes, it is counted on.
 
 Reading goes in blocks, so that a log longer than the memory can be streamed (`iter_log`); `read_log` holds
 the whole and refuses more than 200 million cells. Text is parsed by pyarrow; a block that it declines is
@@ -21,7 +23,9 @@ import io
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -152,12 +156,13 @@ class _Block:
 
 @dataclass(frozen=True)
 class _Text:
-    """How a text is made up: its columns, the mark between cells, that in numbers, and what may be read."""
+    """How a text is made up: its columns, the marks between cells and in numbers, whether times are dates."""
 
     source: str
     columns: ColumnMap
     separator: str
     decimal: str
+    dates: bool = False
 
     @property
     def slots(self) -> dict[str, int]:
@@ -213,12 +218,33 @@ def _number(text: _Text, word: str, column: str, line: int) -> float:
     word = word.strip()
     if not word:
         return math.nan
-    value = plain_number(word.replace(",", ".") if text.decimal == "," else word)
+    date = text.dates and column == "t_s"
+    value = _date_s(word) if date else plain_number(word.replace(",", ".") if text.decimal == "," else word)
     if value is None:
+        expected = _DATE if date else "a number" + f", or in all rows {_DATE}" * (column == "t_s")
         raise BadInputError(
-            f"{text.source}, line {line}: {column} is {shown(word[:40])!r}, expected a number"
+            f"{text.source}, line {line}: {column} is {shown(word[:40])!r}, expected {expected}"
         )
     return value if math.isfinite(value) else math.inf
+
+
+_DATE = "a date such as 2024-05-01T12:00:00.25"
+
+
+def _date_s(word: str) -> float | None:
+    """Seconds since 1970 of a date with a time of day, in UTC where no zone is given; None for other text."""
+    try:
+        date = datetime.fromisoformat(word)
+    except ValueError:
+        return None
+    since = (date if date.tzinfo else date.replace(tzinfo=UTC)) - datetime(1970, 1, 1, tzinfo=UTC)
+    return 1000 * (since // timedelta(microseconds=1)) / 1e9
+
+
+def _with_dates(columns: ColumnMap) -> ColumnMap:
+    """The map where the times are dates, which have been made seconds."""
+    time = replace(columns.sources["t_s"], unit="s", stated="file", factor=1.0, offset=0.0)
+    return replace(columns, sources={**columns.sources, "t_s": time}, evidence={"time": "dates"})
 
 
 def _split(where: str, line: str, separator: str) -> list[str]:
@@ -229,6 +255,7 @@ def _split(where: str, line: str, separator: str) -> list[str]:
         raise BadInputError(f"{where}: is not {kind}-separated: {error}") from error
 
 
+_NO_ZONE = re.compile(rb"\A[^\n]*?\d\d:\d\d:\d\d(?:\.\d+)?(?![\d.Z+-])")
 _PASSED_OVER = re.compile(rb"(?:^|\n)[ \t\r]*(?:[#\n]|$)")
 """A blank line or a comment."""
 
@@ -257,6 +284,9 @@ def _by_pyarrow(text: _Text, data: bytes, lines: IntArray) -> _Block | None:
         return None
     named = [str(k) for k in range(len(text.columns.names))]
     wanted = {name: str(slot) for name, slot in text.slots.items()}
+    kinds = dict.fromkeys(wanted.values(), pyarrow.float64())
+    if text.dates:
+        kinds[wanted["t_s"]] = pyarrow.timestamp("ns", None if _NO_ZONE.search(data) else "UTC")
     try:
         table = arrow_csv.read_csv(
             pyarrow.py_buffer(data),
@@ -265,7 +295,7 @@ def _by_pyarrow(text: _Text, data: bytes, lines: IntArray) -> _Block | None:
             ),
             parse_options=arrow_csv.ParseOptions(delimiter=text.separator, ignore_empty_lines=False),
             convert_options=arrow_csv.ConvertOptions(
-                column_types=dict.fromkeys(wanted.values(), pyarrow.float64()),
+                column_types=kinds,
                 include_columns=list(wanted.values()),
                 null_values=[""],
                 decimal_point=text.decimal,
@@ -287,8 +317,13 @@ def _by_pyarrow(text: _Text, data: bytes, lines: IntArray) -> _Block | None:
 
 
 def _floats(column: Any) -> FloatArray:
-    """Doubles (n,) of an Arrow column, NaN where it has none; `to_numpy` would load pandas."""
-    array = column.combine_chunks()
+    """Doubles (n,) of an Arrow column, seconds of dates, NaN for nothing; `to_numpy` would load pandas."""
+    import pyarrow
+
+    if pyarrow.types.is_timestamp(column.type):
+        whole = column.cast(pyarrow.timestamp("ns", column.type.tz)).cast("int64")
+        return _floats(whole.cast("float64", safe=False)) / 1e9
+    array = column.combine_chunks() if isinstance(column, pyarrow.ChunkedArray) else column
     valid, data = array.buffers()
     rows = slice(array.offset, array.offset + len(array))
     values = np.frombuffer(data, dtype=np.float64)[rows].copy()
@@ -327,7 +362,7 @@ def _numeric(cells: Sequence[str], separator: str) -> bool:
     words = [cell.strip() for cell in cells if cell.strip()]
     if separator != ",":
         words = [word.replace(",", ".") for word in words]
-    return bool(words) and all(plain_number(word) is not None for word in words)
+    return bool(words) and all(plain_number(w) is not None or _date_s(w) is not None for w in words)
 
 
 def _opened(stream: BinaryIO, source: str, path: Path, options: LogOptions) -> tuple[_Text, bytes, int]:
@@ -347,13 +382,13 @@ def _opened(stream: BinaryIO, source: str, path: Path, options: LogOptions) -> t
     if len(raw) == _LONGEST_LINE and not raw.endswith(b"\n"):
         raise BadInputError(f"{where}: has more than {_LONGEST_LINE} characters, expected a header")
     try:
-        text = raw.decode("utf-8-sig")
+        head = raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise BadInputError(f"{where}: is not UTF-8 text (byte {error.start}), expected a header") from error
-    if "\0" in text:
+    if "\0" in head:
         raise BadInputError(f"{where}: has a zero byte, expected a text file")
-    separator = (file and file.separator) or _separator(text)
-    names = _split(where, text.rstrip("\r\n"), separator)
+    separator = (file and file.separator) or _separator(head)
+    names = _split(where, head.rstrip("\r\n"), separator)
     if len(names) > _MAX_COLUMNS:
         raise BadInputError(f"{where}: has {len(names)} columns, expected at most {_MAX_COLUMNS}")
     rows = b""
@@ -364,7 +399,17 @@ def _opened(stream: BinaryIO, source: str, path: Path, options: LogOptions) -> t
     head = start[: 1 << 14].decode("utf-8", "replace")
     comma = separator != "," and bool(re.search(r"(?:^|[\s;])[-+]?\d+,\d+(?:[eE][-+]?\d+)?(?:$|[\s;])", head))
     decimal = (file and file.decimal) or ("," if comma else ".")
-    return _Text(source, columns, separator, decimal), start, line if rows else line + 1
+    dates = _has_dates(head, columns.names.index(columns.sources["t_s"].column), separator)
+    text = _Text(source, _with_dates(columns) if dates else columns, separator, decimal, dates)
+    return text, start, line if rows else line + 1
+
+
+def _has_dates(head: str, slot: int, separator: str) -> bool:
+    """Whether the times in the first row are dates."""
+    row = next((row for row in head.split("\n") if row.strip() and not row.lstrip().startswith("#")), "")
+    cells = row.split(separator)
+    word = cells[slot].strip().strip('"') if slot < len(cells) else ""
+    return plain_number(word) is None and _date_s(word) is not None
 
 
 def _without_header(
@@ -427,15 +472,46 @@ def _blocks(text: _Text, stream: BinaryIO, data: bytes, line: int) -> Iterator[_
         yield _parsed(text, rest + b"\n", line)[0]
 
 
+class _Recoded(io.RawIOBase):
+    """Bytes of a text in UTF-8 with the line ends of Unix."""
+
+    def __init__(self, stream: BinaryIO, encoding: str, to: str) -> None:
+        self._text = io.TextIOWrapper(stream, encoding, "replace")
+        self._to, self._rest = to, b""
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, room: Any) -> int:
+        self._rest = self._rest or self._text.read(1 << 16).encode(self._to)
+        size = min(len(room), len(self._rest))
+        room[:size], self._rest = self._rest[:size], self._rest[size:]
+        return size
+
+
+@contextmanager
+def _open_text(path: Path) -> Iterator[BinaryIO]:
+    """A stream of a text file, of UTF-16 and of line ends without a line feed made UTF-8 with them."""
+    with path.open("rb") as stream:
+        start = stream.peek()
+        if start.startswith((b"\xff\xfe", b"\xfe\xff")):
+            yield io.BufferedReader(_Recoded(stream, "utf-16", "utf-8"))
+        elif b"\r" in start and b"\n" not in start:
+            yield io.BufferedReader(_Recoded(stream, "latin-1", "latin-1"))
+        else:
+            yield stream
+
+
 def _iter_csv(path: Path, options: LogOptions) -> Iterator[Log]:
     try:
-        with path.open("rb") as stream:
+        with _open_text(path) as stream:
             yield from iter_rows(stream, shown(path), path, options)
     except OSError as error:
         raise BadInputError(f"{shown(path)}: cannot be read: {error.strerror or error}") from error
 
 
 def _iter_parquet(path: Path, options: LogOptions) -> Iterator[Log]:
+    import pyarrow
     from pyarrow import parquet
 
     source = shown(path)
@@ -444,6 +520,8 @@ def _iter_parquet(path: Path, options: LogOptions) -> Iterator[Log]:
         file = parquet.ParquetFile(path, pre_buffer=False)
         named = read_columns_file(given) if given is not None else None
         columns = column_map(source, path, 1, file.schema_arrow.names, named, options)
+        time = file.schema_arrow.field(columns.sources["t_s"].column).type
+        columns = _with_dates(columns) if pyarrow.types.is_timestamp(time) else columns
         _check_growth(path, file.metadata, [one.column for one in columns.sources.values()])
         yield from _logs(columns, _parquet_blocks(file, columns))
     except (OSError, ValueError) as error:
@@ -489,7 +567,11 @@ def _parquet_blocks(file: Any, columns: ColumnMap) -> Iterator[_Block]:
 
 
 def _parquet_column(source: str, column: Any, name: str) -> FloatArray:
+    import pyarrow
+
     try:
+        if pyarrow.types.is_timestamp(column.type):
+            return _floats(column)
         return np.asarray(column.cast("float64").to_numpy(zero_copy_only=False), dtype=np.float64)
     except Exception as error:
         raise BadInputError(f"{source}: {name} holds {column.type}, expected numbers") from error
@@ -562,7 +644,7 @@ def columns_of(path: Path, options: LogOptions = NOTHING_STATED) -> tuple[str, .
         if is_bag(path) or path.suffix.lower() in (".parquet", *STREAMS):
             return tuple(next(iter_log(path, options)).columns)
         check_readable(path)
-        with path.open("rb") as stream:
+        with _open_text(path) as stream:
             text, _, _ = _opened(stream, shown(path), path, options)
         return tuple(name for name in text.columns.sources if name != "t_s")
     except (BadInputError, OSError, StopIteration):

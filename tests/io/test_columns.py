@@ -172,6 +172,30 @@ def test_a_unit_that_a_person_states(tmp_path: Path) -> None:
         assert np.allclose(np.stack([log.columns[name] for name in AXES], axis=1), values, atol=1e-6)
 
 
+@pytest.mark.parametrize("unit", ["rad/s", "deg/s"])
+@pytest.mark.parametrize(
+    ("arm_px", "late_s", "decided"), [(60.0, 0.05, True), (60.0, 0.0, True), (3.0, 0.0, False)]
+)
+def test_a_marker_that_turns_with_the_gyroscope_tells_its_unit(
+    tmp_path: Path, unit: str, arm_px: float, late_s: float, decided: bool
+) -> None:
+    """Without an accelerometer either unit is possible; the picture is 320 px wide."""
+    t = 0.01 * np.arange(1500)
+    noise = np.random.default_rng(1).normal(size=(3, len(t)))
+    phi = 0.1 * np.sin(2.0 * (t - late_s))
+    seen = 160.0 + arm_px * phi + 0.05 * noise[0], 120.0 + 0.05 * noise[1]
+    gz = -0.2 * np.cos(2.0 * t) + 0.003 * noise[2] + 0.01
+    columns = [t, *seen, gz / (DEGREE if unit == "deg/s" else 1.0)]
+    path = _written(tmp_path / "log.csv", ["t_s", "u", "v", "gyro_z"], columns)
+    if not decided:
+        with pytest.raises(BadInputError, match="cannot tell whether `gyro_z`"):
+            read_log(path)
+        return
+    log = read_log(path)
+    assert np.allclose(log.columns["gz_radps"], gz, atol=1e-6)
+    assert log.map is not None and "px away from the axis" in log.map.narration
+
+
 def test_a_gyroscope_at_rest_that_may_be_either_is_not_guessed(tmp_path: Path) -> None:
     t, values = _imu(moving=False)
     columns = [t, *values[:, :3].T, 4.0 * values[:, 5]]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import io
 import json
 import math
 import struct
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -398,3 +400,41 @@ def test_a_board_that_was_started_again_is_no_counter(write, falls_to: int) -> N
     log = read_log(write("millis,u_px\n" + "".join(f"{t},1\n" for t in counts)))
     with pytest.raises(BadInputError, match="line 102: t_s goes back"):
         check_time(log)
+
+
+@pytest.mark.parametrize(
+    ("form", "mark", "zone"),
+    [
+        ("%Y-%m-%dT%H:%M:%S.%f", ",", "Z"),
+        ("%Y-%m-%d %H:%M:%S.%f", ",", ""),
+        ("%Y-%m-%dT%H:%M:%S.%f", ",", "+05:30"),
+        ("%Y-%m-%d %H:%M:%S,%f", ";", ""),
+    ],
+)
+def test_times_may_be_dates(write, form: str, mark: str, zone: str) -> None:
+    start = datetime(2024, 2, 29, 23, 59, 58, 250_000)
+    dates = [(start + timedelta(milliseconds=20 * k)).strftime(form) + zone for k in range(500)]
+    path = write(f"timestamp{mark}u_px\n" + "".join(f"{date}{mark}{k}\n" for k, date in enumerate(dates)))
+    log = read_log(path)
+    assert np.allclose(log.t_s - log.t_s[0], 0.02 * np.arange(500), atol=1e-6, rtol=0.0)
+    since = datetime.fromisoformat(f"2024-02-29T23:59:58.250000{zone or 'Z'}").timestamp()
+    assert log.t_s[0] == pytest.approx(since, abs=1e-6)
+    assert log.map is not None and "time in s from `timestamp` (dates)" in log.map.narration
+    # A row that only Python's reader takes makes no difference to the others.
+    path.write_text(path.read_text().replace(f"{mark}7\n", f'{mark}"7 "\n'))
+    assert np.array_equal(read_log(path).t_s, log.t_s)
+    with pytest.raises(BadInputError, match=r"line 502: t_s is '1', expected a date such as"):
+        read_log(write(path.read_text() + f"1{mark}1\n"))
+    with pytest.raises(BadInputError, match=r"line 3: t_s is '2024.*a number, or in all rows a date"):
+        read_log(write(f"t_s{mark}u_px\n1{mark}1\n{dates[0]}{mark}1\n"))
+
+
+def test_dates_in_parquet(tmp_path: Path) -> None:
+    pyarrow = pytest.importorskip("pyarrow")
+    times = pyarrow.array([1_709_251_198_250_000 + 20_000 * k for k in range(200)], pyarrow.timestamp("us"))
+    path = tmp_path / "log.parquet"
+    table = pyarrow.table({"time": times, "u_px": pyarrow.array(np.arange(200.0))})
+    importlib.import_module("pyarrow.parquet").write_table(table, path)
+    log = read_log(path)
+    assert log.t_s[0] == pytest.approx(1_709_251_198.25, abs=1e-6)
+    assert np.allclose(np.diff(log.t_s), 0.02, atol=1e-6)
