@@ -183,6 +183,15 @@ def test_a_step_beyond_the_deviation_of_the_bias_makes_it_poor(axis: int, size: 
     assert any(advice in text for text in judged.advice)
 
 
+@pytest.mark.parametrize(("scale", "word"), [(0.8, "poor"), (0.95, "ok"), (1.05, "ok"), (1.4, "poor")])
+def test_a_scale_that_no_accelerometer_has_is_poor(scale: float, word: str) -> None:
+    log, _ = rest_log(Imu(), 120.0, 1)
+    scaled = log.values * np.where([axis.startswith("a") for axis in AXES], scale, 1.0)
+    judged = judge(analyse_static([replace(log, values=scaled)]))
+    assert judged.word == word
+    assert any("times gravity" in text for text in judged.reasons) == (word == "poor")
+
+
 def test_noise_and_a_walk_are_no_steps() -> None:
     for seed in range(12):
         imu = replace(IMU, gyro_walk=3e-5 * 2.0 ** (seed % 6), accel_walk=3e-4)

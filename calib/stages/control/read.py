@@ -14,6 +14,7 @@ from calib.core.errors import BadInputError
 from calib.core.files import read_text, shown
 from calib.core.rig import Rig
 from calib.core.writing import Kind, column_names, write_atomically
+from calib.io.logs import columns_of
 from calib.stages.actuator.kinematics import inverse
 from calib.stages.control.laws import Model
 from calib.stages.control.references import (
@@ -171,13 +172,7 @@ _CONTROLREFERENCE_FEWEST = 3
 
 def is_recorded(path: Path) -> bool:
     """Whether a file is a log of pictures without a reference of its own in it."""
-    try:
-        with path.open(encoding="utf-8-sig", errors="replace") as stream:
-            header = next(csv.reader(io.StringIO(stream.readline())), [])
-    except OSError:
-        return False
-    names = {name.strip() for name in header}
-    return {"t_s", "u_px", "v_px"} <= names and not names & set(_OWN)
+    return {"u_px", "v_px"} <= set(columns_of(path) or ()) and not set(column_names(path)) & set(_OWN)
 
 
 def recorded_reference(path: Path, rig: Rig, rig_path: Path, model: Model) -> Reference:

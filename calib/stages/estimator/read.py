@@ -29,7 +29,9 @@ from calib.stages.estimator.sensors import SENSOR, sensor_values, view_coefficie
 # ----------------------------------------------------------------------
 # From a log and a rig.yaml to the estimator's rows and its set-up.
 #
-# Logs are read block by block; nothing grows with their length.
+# Logs are read block by block; nothing grows with their length. So this takes the rows as they are, each of
+# which gets its estimate, and not `Log.signals`, which needs all of a log; `refuse_counts` and `Watch` check
+# them.
 
 READINGS = ("u_px", "v_px", "ax_mps2", "ay_mps2", "gz_radps")
 """Columns of `kinematic.Rows.readings`."""

@@ -328,6 +328,8 @@ _MOVED_SHARE = 0.02
 """Share of a log in motion from which on what is left is not taken for a rest."""
 _TILTED_RAD = math.radians(0.3)
 """Turn of gravity between the stretches at rest that makes their mean that of no pose."""
+_GRAVITY_MPS2, _MOST_OFF_GRAVITY = 9.81, 0.15
+"""Cheap accelerometers are off by a few per cent in scale and some 0.08 g in bias."""
 _COLOURED = 2.0
 """Deviation over the fitted one from which on the coefficients do not describe the noise."""
 _LONG_S = 7200.0
@@ -356,6 +358,15 @@ def _of_log(log: StaticLog, axes: tuple[str, ...]) -> Iterator[Finding]:
     if log.motions and (turned := _turned_rad(log, axes)) > _TILTED_RAD:
         text = f"{log.source}: lies {math.degrees(turned):.2g} deg otherwise after it has moved; the mean of "
         yield Finding("poor", f"{text}the accelerometer is that of no pose", advice=again)
+    columns = [k for k, axis in enumerate(axes) if axis.startswith("a")]
+    force = float(np.median([np.linalg.norm(part.values[:, columns].mean(axis=0)) for part in log.parts]))
+    if len(columns) == 3 and abs(force / _GRAVITY_MPS2 - 1.0) > _MOST_OFF_GRAVITY:
+        yield Finding(
+            "poor",
+            f"{log.source}: the accelerometer reads {force:.4g} m/s^2 at rest, "
+            f"{force / _GRAVITY_MPS2:.3g} times gravity, so its noise is as wrong",
+            advice="check its unit and range, or find its scale by calib imu intrinsics",
+        )
     yield from sampling_findings(log.sampling, axes, log.source, _MOST_REPEATED)
 
 
