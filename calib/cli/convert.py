@@ -45,8 +45,7 @@ def convert(
     from calib.core.stage import LogOptions
     from calib.core.writing import check_writable, write_atomically, writes_through
     from calib.io.columns import COLUMNS_FILE
-    from calib.io.logs import LOG, beside, iter_log, passed_over
-    from calib.io.signals import refuse_counts
+    from calib.io.logs import LOG, beside, iter_log, passed_over, refuse_counts
     from calib.io.states import states_writer
 
     if output.suffix.lower() not in (".csv", ".parquet") and not writes_through(output):

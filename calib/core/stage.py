@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from calib.core.verdict import Verdict
     from calib.core.words import Block
     from calib.core.writing import Kind
-    from calib.io.logs import Log
 
 
 class ProgressCall(Protocol):
@@ -70,14 +69,6 @@ class Files:
     failed: dict[Path, int] = field(default_factory=dict)
     figures: bool = True
     keep: bool = True
-
-    def log(self, path: Path, options: LogOptions) -> Log:
-        """A log. Raises `BadInputError` as `calib.io.logs.read_log`."""
-        from calib.io.logs import read_log
-
-        log = read_log(path, options)
-        self.remarks += log.remarks()
-        return log
 
     @contextmanager
     def one_of_several(self, path: Path) -> Iterator[None]:

@@ -20,8 +20,7 @@ import numpy as np
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError, CalibError, pip_install
 from calib.core.files import check_readable, one_line, read_yaml_mapping, shown
-from calib.io.columns import COLUMNS
-from calib.io.logs import Log
+from calib.io.columns import COLUMNS, Block
 from calib.io.unpacking import (
     MOST_BYTES,
     BoundedFile,
@@ -415,17 +414,16 @@ def _chunks(source: str, stream: Source, topics: TopicMap) -> Iterator[tuple[Int
         yield stamps[:filled], values[:filled]
 
 
-def rows_from_messages(source: str, stream: Source, topics: TopicMap) -> Iterator[Log]:
+def rows_from_messages(source: str, stream: Source, topics: TopicMap) -> Iterator[Block]:
     """Blocks of a log; a block may have no rows, and there is at least one.
 
     Raises `BadInputError` for a message without an expected field.
     """
-    unknown = tuple(topic.name for topic in stream.topics if topic.name not in topics.topics)
     columns = topics.columns
     sorter = _Sorter(np.empty(0, dtype=np.int64), np.empty((0, len(columns))))
     start, first = None, 1
 
-    def made(stamps: IntArray, values: FloatArray) -> Log:
+    def made(stamps: IntArray, values: FloatArray) -> Block:
         nonlocal start, first
         infinite = int(np.count_nonzero(np.isinf(values)))
         stamps, values = _merged(stamps, np.where(np.isinf(values), np.nan, values))
@@ -435,13 +433,13 @@ def rows_from_messages(source: str, stream: Source, topics: TopicMap) -> Iterato
         lines = np.arange(first, first + len(stamps), dtype=np.int64)
         first += len(stamps)
         named = {name: np.ascontiguousarray(values[:, k]) for k, name in enumerate(columns)}
-        return Log(source, t_s, named, lines, unknown=unknown, not_finite=infinite)
+        return Block({"t_s": t_s, **named}, lines, infinite)
 
     try:
         waiting = (sorter.stamps, sorter.values)
         for following in _chunks(source, stream, topics):
             block = made(*sorter.take(*waiting, False))
-            if len(block):
+            if len(block.lines):
                 yield block
             waiting = following
         yield replace(made(*sorter.take(*waiting, True)), truncated=stream.truncated)
@@ -466,8 +464,9 @@ def is_bag(path: Path) -> bool:
     return path.suffix.lower() in BAGS or (path / "metadata.yaml").is_file()
 
 
-def iter_bag(path: Path, topics: Path | None = None) -> Iterator[Log]:
-    """Blocks of the log in a bag; `topics` is a file that says what is where, see `calib.io.bags`.
+@contextmanager
+def bag_blocks(path: Path, topics: Path | None = None) -> Iterator[tuple[tuple[str, ...], Iterator[Block]]]:
+    """Topics of a bag that are left out, and blocks of its rows; `topics` is a file that says what is where.
 
     Raises
     ------
@@ -476,7 +475,9 @@ def iter_bag(path: Path, topics: Path | None = None) -> Iterator[Log]:
         lack, and a value that is no number.
     """
     with opened_bag(path) as stream:
-        yield from rows_from_messages(shown(path), stream, topic_map(path, stream.topics, topics))
+        read = topic_map(path, stream.topics, topics)
+        left_out = tuple(topic.name for topic in stream.topics if topic.name not in read.topics)
+        yield left_out, rows_from_messages(shown(path), stream, read)
 
 
 @contextmanager

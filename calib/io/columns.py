@@ -35,7 +35,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.core.arrays import FloatArray
+from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
 from calib.core.files import one_line, read_yaml_mapping, shown
 from calib.core.stage import LogOptions
@@ -209,6 +209,24 @@ def _column(word: str, unit: str) -> tuple[str, str] | None:
     if kind_of(column) in ("pixel", "pwm"):
         unit = unit or next(iter(UNITS[kind_of(column)]))
     return column, unit
+
+
+@dataclass(frozen=True)
+class Block:
+    """Cells of some rows as they are in the file, by column, `t_s` among them; NaN where one is blank.
+
+    Attributes
+    ----------
+    lines : (n,) number of each row's line, or of the row in a table without lines.
+    not_finite : cells that said nan or inf. truncated : whether a last line was cut short and left out.
+    wraps : how often the counter that is the time began again.
+    """
+
+    cells: Mapping[str, FloatArray]
+    lines: IntArray
+    not_finite: int = 0
+    truncated: bool = False
+    wraps: int = 0
 
 
 @dataclass(frozen=True)

@@ -12,23 +12,19 @@ that is still being written, is left out. Where the time is a counter of 16 or 3
 millis() does after 49.7 days and micros() after 71.6 minutes, it is counted on.
 
 Reading goes in blocks, so that a log longer than the memory can be streamed (`iter_log`); `read_log` holds
-the whole and refuses more than 200 million cells. Text is parsed by pyarrow; a block that it declines is
-read line by line, which gives the same numbers, or a sentence with the number of the line.
+the whole and refuses more than 200 million cells. What `Log.signals` makes of a log is at the end.
 """
 
 from __future__ import annotations
 
-import csv
 import io
 import math
-import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 
@@ -36,35 +32,32 @@ from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
 from calib.core.files import check_readable, shown
 from calib.core.stage import NOTHING_STATED, LogOptions
-from calib.core.units import plain_number
+from calib.core.verdict import Finding, Severity
 from calib.core.writing import Kind, column_names, write_atomically
 from calib.io.columns import (
+    ACCEL,
     COLUMNS,
+    GYRO,
+    MEASURED,
     TRUE,
     UNITS,
+    Block,
     ColumnMap,
-    ColumnsFile,
     column_map,
     find_columns,
     kind_of,
-    known_name,
     read_columns_file,
     settled,
+    turning,
 )
+from calib.io.tables import open_text, parquet_blocks, text_blocks
+from calib.solve.clock import TimeAxis, time_axis
 
-if TYPE_CHECKING:
-    from calib.io.signals import Signals
-
-_BLOCK_BYTES = 1 << 20
-_LONGEST_LINE = 1 << 16
-_MAX_COLUMNS = 1000
 _MOST_CELLS = 200_000_000
 """Numbers that `read_log` takes, 1.6 GB; blocks of text have no such limit."""
 _COUNTERS = (1 << 16, 1 << 32)
 _WRAPS_WITHIN = 20.0
 """Usual steps from the last time before a counter begins again to the first one after."""
-_MOST_BYTES, _MOST_GROWTH = 1 << 28, 200
-"""What a Parquet file may unpack to: so many bytes, or so many times its own size where that is more."""
 
 
 def passed_over(not_finite: int, truncated: bool, wraps: int) -> list[str]:
@@ -130,10 +123,8 @@ class Log:
     ) -> Signals:
         """Readings of these columns and of those optional ones that the log has.
 
-        Raises `BadInputError` as `calib.io.signals.signals_of`.
+        Raises `BadInputError` as `signals_of`.
         """
-        from calib.io.signals import signals_of
-
         return signals_of(self, names, tuple(optional), counts, partly)
 
     def remarks(self) -> list[str]:
@@ -143,34 +134,7 @@ class Log:
         return [*([read_as] if read_as else []), *(f"{self.source}: {one}" for one in passed)]
 
 
-@dataclass(frozen=True)
-class _Block:
-    """Cells of some rows as they are in the file, by column, `t_s` among them; NaN where one is blank."""
-
-    cells: Mapping[str, FloatArray]
-    lines: IntArray
-    not_finite: int = 0
-    truncated: bool = False
-    wraps: int = 0
-
-
-@dataclass(frozen=True)
-class _Text:
-    """How a text is made up: its columns, the marks between cells and in numbers, whether times are dates."""
-
-    source: str
-    columns: ColumnMap
-    separator: str
-    decimal: str
-    dates: bool = False
-
-    @property
-    def slots(self) -> dict[str, int]:
-        """Number of each column that is read, in the file."""
-        return {name: self.columns.names.index(one.column) for name, one in self.columns.sources.items()}
-
-
-def _logs(columns: ColumnMap, blocks: Iterator[_Block]) -> Iterator[Log]:
+def _logs(columns: ColumnMap, blocks: Iterator[Block]) -> Iterator[Log]:
     """Blocks in SI; the readings of the first tell the units that nobody states."""
     blocks = _counted_on(blocks)
     first = next((block for block in blocks if len(block.lines)), None)
@@ -187,7 +151,7 @@ def _logs(columns: ColumnMap, blocks: Iterator[_Block]) -> Iterator[Log]:
         )  # fmt: skip
 
 
-def _counted_on(blocks: Iterator[_Block]) -> Iterator[_Block]:
+def _counted_on(blocks: Iterator[Block]) -> Iterator[Block]:
     """Blocks whose times run on where they are those of a counter that begins again."""
     before, size, laps = math.nan, 0, 0
     for block in blocks:
@@ -213,228 +177,6 @@ def _counter(t: FloatArray, steps: FloatArray) -> int:
     return next(fits, 0)
 
 
-def _number(text: _Text, word: str, column: str, line: int) -> float:
-    """A cell: NaN for blank, inf for what says nan or inf."""
-    word = word.strip()
-    if not word:
-        return math.nan
-    date = text.dates and column == "t_s"
-    value = _date_s(word) if date else plain_number(word.replace(",", ".") if text.decimal == "," else word)
-    if value is None:
-        expected = _DATE if date else "a number" + f", or in all rows {_DATE}" * (column == "t_s")
-        raise BadInputError(
-            f"{text.source}, line {line}: {column} is {shown(word[:40])!r}, expected {expected}"
-        )
-    return value if math.isfinite(value) else math.inf
-
-
-_DATE = "a date such as 2024-05-01T12:00:00.25"
-
-
-def _date_s(word: str) -> float | None:
-    """Seconds since 1970 of a date with a time of day, in UTC where no zone is given; None for other text."""
-    try:
-        date = datetime.fromisoformat(word)
-    except ValueError:
-        return None
-    since = (date if date.tzinfo else date.replace(tzinfo=UTC)) - datetime(1970, 1, 1, tzinfo=UTC)
-    return 1000 * (since // timedelta(microseconds=1)) / 1e9
-
-
-def _with_dates(columns: ColumnMap) -> ColumnMap:
-    """The map where the times are dates, which have been made seconds."""
-    time = replace(columns.sources["t_s"], unit="s", stated="file", factor=1.0, offset=0.0)
-    return replace(columns, sources={**columns.sources, "t_s": time}, evidence={"time": "dates"})
-
-
-def _split(where: str, line: str, separator: str) -> list[str]:
-    try:
-        return next(csv.reader([line], delimiter=separator, strict=True))
-    except (csv.Error, StopIteration) as error:
-        kind = {",": "comma", ";": "semicolon", "\t": "tab"}[separator]
-        raise BadInputError(f"{where}: is not {kind}-separated: {error}") from error
-
-
-_NO_ZONE = re.compile(rb"\A[^\n]*?\d\d:\d\d:\d\d(?:\.\d+)?(?![\d.Z+-])")
-_PASSED_OVER = re.compile(rb"(?:^|\n)[ \t\r]*(?:[#\n]|$)")
-"""A blank line or a comment."""
-
-
-def _parsed(text: _Text, data: bytes, first_line: int) -> tuple[_Block, int]:
-    """Rows of whole lines, and the number of the next line."""
-    count = data.count(b"\n")
-    lines = np.arange(first_line, first_line + count, dtype=np.int64)
-    if _PASSED_OVER.search(data, 0, len(data) - 1):
-        every = data.split(b"\n")[:-1]
-        rows = [n for n, line in enumerate(every) if line.strip() and not line.lstrip().startswith(b"#")]
-        data, lines = b"".join(every[n] + b"\n" for n in rows), lines[rows]
-    block = _by_pyarrow(text, data, lines) or _by_lines(text, data, lines)
-    bad = np.nonzero(~np.isfinite(block.cells["t_s"]))[0]
-    if len(bad):
-        raise BadInputError(f"{text.source}, line {block.lines[bad[0]]}: has no time t_s, expected a number")
-    return block, first_line + count
-
-
-def _by_pyarrow(text: _Text, data: bytes, lines: IntArray) -> _Block | None:
-    """The rows by pyarrow; None where it declines, or may see other rows than there are lines."""
-    import pyarrow
-    from pyarrow import csv as arrow_csv
-
-    if not len(lines):
-        return None
-    named = [str(k) for k in range(len(text.columns.names))]
-    wanted = {name: str(slot) for name, slot in text.slots.items()}
-    kinds = dict.fromkeys(wanted.values(), pyarrow.float64())
-    if text.dates:
-        kinds[wanted["t_s"]] = pyarrow.timestamp("ns", None if _NO_ZONE.search(data) else "UTC")
-    try:
-        table = arrow_csv.read_csv(
-            pyarrow.py_buffer(data),
-            read_options=arrow_csv.ReadOptions(
-                column_names=named, use_threads=False, block_size=len(data) + 1
-            ),
-            parse_options=arrow_csv.ParseOptions(delimiter=text.separator, ignore_empty_lines=False),
-            convert_options=arrow_csv.ConvertOptions(
-                column_types=kinds,
-                include_columns=list(wanted.values()),
-                null_values=[""],
-                decimal_point=text.decimal,
-            ),
-        )
-    except pyarrow.ArrowInvalid:
-        return None
-    if table.num_rows != len(lines):
-        return None
-    cells, odd = {}, 0
-    for name, number in wanted.items():
-        column = table.column(number)
-        values = _floats(column)
-        infinite = np.isinf(values)
-        odd += int(np.count_nonzero(np.isnan(values))) - column.null_count + int(np.count_nonzero(infinite))
-        values[infinite] = np.nan
-        cells[name] = values
-    return _Block(cells, lines, odd)
-
-
-def _floats(column: Any) -> FloatArray:
-    """Doubles (n,) of an Arrow column, seconds of dates, NaN for nothing; `to_numpy` would load pandas."""
-    import pyarrow
-
-    if pyarrow.types.is_timestamp(column.type):
-        whole = column.cast(pyarrow.timestamp("ns", column.type.tz)).cast("int64")
-        return _floats(whole.cast("float64", safe=False)) / 1e9
-    array = column.combine_chunks() if isinstance(column, pyarrow.ChunkedArray) else column
-    valid, data = array.buffers()
-    rows = slice(array.offset, array.offset + len(array))
-    values = np.frombuffer(data, dtype=np.float64)[rows].copy()
-    if valid is not None:
-        values[np.unpackbits(np.frombuffer(valid, dtype=np.uint8), bitorder="little")[rows] == 0] = np.nan
-    return values
-
-
-def _by_lines(text: _Text, data: bytes, lines: IntArray) -> _Block:
-    """The rows line by line, with a sentence for what cannot be read."""
-    values = np.empty((len(lines), len(text.slots)))
-    count = len(text.columns.names)
-    for row, (raw, line) in enumerate(zip(data.split(b"\n"), lines.tolist(), strict=False)):
-        where = f"{text.source}, line {line}"
-        cells = _split(where, raw.decode("utf-8", "replace").rstrip("\r"), text.separator)
-        if len(cells) != count:
-            raise BadInputError(f"{where}: has {len(cells)} cells, expected {count} as in the header")
-        for k, (name, slot) in enumerate(text.slots.items()):
-            values[row, k] = _number(text, cells[slot], name, line)
-    infinite = np.isinf(values)
-    values[infinite] = np.nan
-    cells_of = {name: np.ascontiguousarray(values[:, k]) for k, name in enumerate(text.slots)}
-    return _Block(cells_of, lines, int(infinite.sum()))
-
-
-def _separator(line: str) -> str:
-    """The mark between the cells of a first line, which may hold decimal commas or marks in quotes."""
-    for mark in ";\t":
-        if line.count(mark) > line.count(",") or (mark in line and _numeric(line.split(mark), mark)):
-            return mark
-    return ","
-
-
-def _numeric(cells: Sequence[str], separator: str) -> bool:
-    """Whether cells are those of a row and not of a header."""
-    words = [cell.strip() for cell in cells if cell.strip()]
-    if separator != ",":
-        words = [word.replace(",", ".") for word in words]
-    return bool(words) and all(plain_number(w) is not None or _date_s(w) is not None for w in words)
-
-
-def _opened(stream: BinaryIO, source: str, path: Path, options: LogOptions) -> tuple[_Text, bytes, int]:
-    """How the text is made up, the beginning of its rows, which was read on the way, and their line.
-
-    The header is the first line that is neither blank nor a comment.
-    """
-    given = options.columns or find_columns(path)
-    file = None if given is None else read_columns_file(given)
-    line, comment, raw = 1, "", stream.readline(_LONGEST_LINE)
-    while raw.endswith(b"\n") and (not raw.strip() or raw.lstrip(b"\xef\xbb\xbf").startswith(b"#")):
-        comment = raw.decode("utf-8-sig", "replace").lstrip("#% ").rstrip("\r\n") or comment
-        line, raw = line + 1, stream.readline(_LONGEST_LINE)
-    where = f"{source}, line {line}"
-    if not raw.strip():
-        raise BadInputError(f"{source}: is empty, expected a header and rows")
-    if len(raw) == _LONGEST_LINE and not raw.endswith(b"\n"):
-        raise BadInputError(f"{where}: has more than {_LONGEST_LINE} characters, expected a header")
-    try:
-        head = raw.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise BadInputError(f"{where}: is not UTF-8 text (byte {error.start}), expected a header") from error
-    if "\0" in head:
-        raise BadInputError(f"{where}: has a zero byte, expected a text file")
-    separator = (file and file.separator) or _separator(head)
-    names = _split(where, head.rstrip("\r\n"), separator)
-    if len(names) > _MAX_COLUMNS:
-        raise BadInputError(f"{where}: has {len(names)} columns, expected at most {_MAX_COLUMNS}")
-    rows = b""
-    if _numeric(names, separator):
-        names, rows = _without_header(where, path, names, comment, separator, file), raw
-    columns = column_map(source, path, line, names, file, options)
-    start = rows + stream.read(_BLOCK_BYTES)
-    head = start[: 1 << 14].decode("utf-8", "replace")
-    comma = separator != "," and bool(re.search(r"(?:^|[\s;])[-+]?\d+,\d+(?:[eE][-+]?\d+)?(?:$|[\s;])", head))
-    decimal = (file and file.decimal) or ("," if comma else ".")
-    dates = _has_dates(head, columns.names.index(columns.sources["t_s"].column), separator)
-    text = _Text(source, _with_dates(columns) if dates else columns, separator, decimal, dates)
-    return text, start, line if rows else line + 1
-
-
-def _has_dates(head: str, slot: int, separator: str) -> bool:
-    """Whether the times in the first row are dates."""
-    row = next((row for row in head.split("\n") if row.strip() and not row.lstrip().startswith("#")), "")
-    cells = row.split(separator)
-    word = cells[slot].strip().strip('"') if slot < len(cells) else ""
-    return plain_number(word) is None and _date_s(word) is not None
-
-
-def _without_header(
-    where: str, path: Path, cells: list[str], comment: str, separator: str, file: ColumnsFile | None
-) -> list[str]:
-    """Names of a file's columns that begins with numbers: columns.yaml's or those of the comment above."""
-    numbers = [str(k + 1) for k in range(len(cells))]
-    if file is not None and file.names:
-        if len(file.names) != len(cells):
-            raise BadInputError(
-                f"{where}: has {len(cells)} cells, expected {len(file.names)} as in the names of "
-                f"{shown(file.path)}"
-            )
-        return list(file.names)
-    if file is not None and any(one.column in numbers for one in file.sources.values()):
-        return numbers
-    named = [name.strip() for name in comment.split(separator)]
-    if len(named) == len(cells) and any((known_name(name) or ("",))[0] == "t_s" for name in named):
-        return named
-    raise BadInputError(
-        f"{where}: holds numbers, expected a header; add to {shown(path.with_name('columns.yaml'))} the line "
-        f"names: [t_s, ...] with the names of its {len(cells)} columns"
-    )
-
-
 def iter_rows(
     stream: BinaryIO, source: str, path: Path | None = None, options: LogOptions = NOTHING_STATED
 ) -> Iterator[Log]:
@@ -444,155 +186,31 @@ def iter_rows(
     ----------
     path : where it lies, beside which columns.yaml is looked for.
     """
-    text, data, line = _opened(stream, source, path or Path(source), options)
-    yield from _logs(text.columns, _blocks(text, stream, data, line))
-
-
-def _blocks(text: _Text, stream: BinaryIO, data: bytes, line: int) -> Iterator[_Block]:
-    rest = b""
-    while data:
-        cut = data.rfind(b"\n") + 1
-        if cut == 0:
-            rest += data
-            if len(rest) > 2 * _BLOCK_BYTES:
-                raise BadInputError(f"{text.source}, line {line}: does not end, expected a text file")
-        else:
-            block, line = _parsed(text, rest + data[:cut], line)
-            rest = data[cut:]
-            if len(block.lines):
-                yield block
-        data = stream.read(_BLOCK_BYTES)
-    if not rest.strip() or rest.lstrip().startswith(b"#"):
-        return
-    # The last line without its end: a row, or the beginning of one.
-    if rest.count(text.separator.encode()) < len(text.columns.names) - 1:
-        nothing = {name: np.empty(0) for name in text.slots}
-        yield _Block(nothing, np.empty(0, dtype=np.int64), truncated=True)
-    else:
-        yield _parsed(text, rest + b"\n", line)[0]
-
-
-class _Recoded(io.RawIOBase):
-    """Bytes of a text in UTF-8 with the line ends of Unix."""
-
-    def __init__(self, stream: BinaryIO, encoding: str, to: str) -> None:
-        self._text = io.TextIOWrapper(stream, encoding, "replace")
-        self._to, self._rest = to, b""
-
-    def readable(self) -> bool:
-        return True
-
-    def readinto(self, room: Any) -> int:
-        self._rest = self._rest or self._text.read(1 << 16).encode(self._to)
-        size = min(len(room), len(self._rest))
-        room[:size], self._rest = self._rest[:size], self._rest[size:]
-        return size
-
-
-@contextmanager
-def _open_text(path: Path) -> Iterator[BinaryIO]:
-    """A stream of a text file, of UTF-16 and of line ends without a line feed made UTF-8 with them."""
-    with path.open("rb") as stream:
-        start = stream.peek()
-        if start.startswith((b"\xff\xfe", b"\xfe\xff")):
-            yield io.BufferedReader(_Recoded(stream, "utf-16", "utf-8"))
-        elif b"\r" in start and b"\n" not in start:
-            yield io.BufferedReader(_Recoded(stream, "latin-1", "latin-1"))
-        else:
-            yield stream
+    yield from _logs(*text_blocks(stream, source, path or Path(source), options))
 
 
 def _iter_csv(path: Path, options: LogOptions) -> Iterator[Log]:
     try:
-        with _open_text(path) as stream:
+        with open_text(path) as stream:
             yield from iter_rows(stream, shown(path), path, options)
     except OSError as error:
         raise BadInputError(f"{shown(path)}: cannot be read: {error.strerror or error}") from error
 
 
-def _iter_parquet(path: Path, options: LogOptions) -> Iterator[Log]:
-    import pyarrow
-    from pyarrow import parquet
-
-    source = shown(path)
-    given = options.columns or find_columns(path)
-    try:
-        file = parquet.ParquetFile(path, pre_buffer=False)
-        named = read_columns_file(given) if given is not None else None
-        columns = column_map(source, path, 1, file.schema_arrow.names, named, options)
-        time = file.schema_arrow.field(columns.sources["t_s"].column).type
-        columns = _with_dates(columns) if pyarrow.types.is_timestamp(time) else columns
-        _check_growth(path, file.metadata, [one.column for one in columns.sources.values()])
-        yield from _logs(columns, _parquet_blocks(file, columns))
-    except (OSError, ValueError) as error:
-        if isinstance(error, BadInputError):
-            raise
-        raise BadInputError(f"{source}: is not a Parquet file that can be read: {error}") from error
-
-
-def _check_growth(path: Path, metadata: Any, read: Sequence[str]) -> None:
-    """Raise `BadInputError` where the columns that are read unpack to more than their budget.
-
-    A column of equal numbers takes a few bytes however long it is, so rows count as well as what pages
-    unpack to.
-    """
-    most = max(_MOST_BYTES, _MOST_GROWTH * path.stat().st_size)
-    unpacked = 0
-    for group in map(metadata.row_group, range(metadata.num_row_groups)):
-        for column in map(group.column, range(metadata.num_columns)):
-            if column.path_in_schema in read:
-                unpacked += max(column.total_uncompressed_size, 8 * max(group.num_rows, column.num_values))
-    if unpacked > most:
-        raise BadInputError(
-            f"{shown(path)}: has {metadata.num_rows} rows, which unpack to {unpacked / 1e6:.0f} MB from "
-            f"{path.stat().st_size / 1e6:.2g}, expected at most {most / 1e6:.0f}; cut it into parts"
-        )
-
-
-def _parquet_blocks(file: Any, columns: ColumnMap) -> Iterator[_Block]:
-    first, read = 1, [one.column for one in columns.sources.values()]
-    for batch in file.iter_batches(batch_size=65536, columns=read):
-        cells, odd = {}, 0
-        for name, one in columns.sources.items():
-            values = _parquet_column(columns.source, batch.column(one.column), one.column).copy()
-            infinite = np.isinf(values)
-            values[infinite] = np.nan
-            cells[name], odd = values, odd + int(infinite.sum())
-        lines = np.arange(first, first + len(batch), dtype=np.int64)
-        bad = np.nonzero(~np.isfinite(cells["t_s"]))[0]
-        if len(bad):
-            raise BadInputError(f"{columns.source}, line {lines[bad[0]]}: has no time t_s, expected a number")
-        first += len(batch)
-        yield _Block(cells, lines, odd)
-
-
-def _parquet_column(source: str, column: Any, name: str) -> FloatArray:
-    import pyarrow
-
-    try:
-        if pyarrow.types.is_timestamp(column.type):
-            return _floats(column)
-        return np.asarray(column.cast("float64").to_numpy(zero_copy_only=False), dtype=np.float64)
-    except Exception as error:
-        raise BadInputError(f"{source}: {name} holds {column.type}, expected numbers") from error
-
-
 def _iter_bag(path: Path, options: LogOptions) -> Iterator[Log]:
     """A bag's rows, of which what its topics and `options` say are the units."""
-    from calib.io.bags import iter_bag
+    from calib.io.bags import bag_blocks
 
-    blocks = iter_bag(path, options.topics)
-    first = next(blocks, None)
-    if first is None:
-        return
+    with bag_blocks(path, options.topics) as (left_out, blocks):
+        first = next(blocks)
+        columns = _stated(shown(path), path, tuple(first.cells), options)
+        yield from (replace(log, unknown=left_out) for log in _logs(columns, chain([first], blocks)))
+
+
+def _stated(source: str, path: Path, names: Sequence[str], options: LogOptions) -> ColumnMap:
+    """What columns `names` of a file that is no table are."""
     given = options.columns or find_columns(path)
-    file = None if given is None else read_columns_file(given)
-    columns = column_map(first.source, path, 1, ("t_s", *first.columns), file, options)
-    cells = (
-        _Block({"t_s": b.t_s, **b.columns}, b.lines, b.not_finite, b.truncated)
-        for b in chain([first], blocks)
-    )
-    yield from (replace(log, unknown=first.unknown) for log in _logs(columns, cells))
+    return column_map(source, path, 1, names, None if given is None else read_columns_file(given), options)
 
 
 def log_of(source: str, path: Path, cells: Mapping[str, FloatArray], options: LogOptions) -> Log:
@@ -600,11 +218,9 @@ def log_of(source: str, path: Path, cells: Mapping[str, FloatArray], options: Lo
 
     Raises `BadInputError` for units that contradict the readings.
     """
-    given = options.columns or find_columns(path)
-    file = None if given is None else read_columns_file(given)
-    columns = column_map(source, path, 1, tuple(cells), file, options)
+    columns = _stated(source, path, tuple(cells), options)
     lines = np.arange(1, len(cells["t_s"]) + 1, dtype=np.int64)
-    (log,) = _logs(columns, iter([_Block(cells, lines)]))
+    (log,) = _logs(columns, iter([Block(cells, lines)]))
     return log
 
 
@@ -621,7 +237,7 @@ def iter_log(path: Path, options: LogOptions = NOTHING_STATED) -> Iterator[Log]:
         units that are not known or contradict the readings; for a Parquet file that unpacks to too much.
     """
     from calib.io.bags import is_bag
-    from calib.io.serial import STREAMS, iter_stream
+    from calib.io.serial import STREAMS, stream_text
 
     if not (is_bag(path) and path.is_dir()):
         check_readable(path)
@@ -631,8 +247,8 @@ def iter_log(path: Path, options: LogOptions = NOTHING_STATED) -> Iterator[Log]:
         raise BadInputError(f"{shown(path)}: has columns, expected a bag where topics are given")
     ending = path.suffix.lower()
     if ending in STREAMS:
-        return iter_stream(path)
-    return _iter_parquet(path, options) if ending == ".parquet" else _iter_csv(path, options)
+        return iter_rows(io.BytesIO(stream_text(path).encode()), shown(path))
+    return _logs(*parquet_blocks(path, options)) if ending == ".parquet" else _iter_csv(path, options)
 
 
 def columns_of(path: Path, options: LogOptions = NOTHING_STATED) -> tuple[str, ...] | None:
@@ -644,9 +260,9 @@ def columns_of(path: Path, options: LogOptions = NOTHING_STATED) -> tuple[str, .
         if is_bag(path) or path.suffix.lower() in (".parquet", *STREAMS):
             return tuple(next(iter_log(path, options)).columns)
         check_readable(path)
-        with _open_text(path) as stream:
-            text, _, _ = _opened(stream, shown(path), path, options)
-        return tuple(name for name in text.columns.sources if name != "t_s")
+        with open_text(path) as stream:
+            columns, _ = text_blocks(stream, shown(path), path, options)
+        return tuple(name for name in columns.sources if name != "t_s")
     except (BadInputError, OSError, StopIteration):
         return None
 
@@ -659,8 +275,8 @@ def beside(path: Path) -> list[Path]:
     return [one for one in found if one is not None]
 
 
-def read_log(path: Path, options: LogOptions = NOTHING_STATED) -> Log:
-    """A whole log, of at most 200 million cells that are read.
+def read_log(path: Path, options: LogOptions = NOTHING_STATED, remarks: list[str] | None = None) -> Log:
+    """A whole log, of at most 200 million cells that are read; sentences on it are added to `remarks`.
 
     Raises `BadInputError` as `iter_log`, and for a log without rows or with more cells.
     """
@@ -676,7 +292,7 @@ def read_log(path: Path, options: LogOptions = NOTHING_STATED) -> Log:
     if not blocks:
         raise BadInputError(f"{shown(path)}: has a header but no rows")
     first = blocks[0]
-    return replace(
+    log = replace(
         first,
         t_s=np.concatenate([block.t_s for block in blocks]),
         columns={name: np.concatenate([block.columns[name] for block in blocks]) for name in first.columns},
@@ -685,6 +301,9 @@ def read_log(path: Path, options: LogOptions = NOTHING_STATED) -> Log:
         truncated=blocks[-1].truncated,
         wraps=sum(block.wraps for block in blocks),
     )
+    if remarks is not None:
+        remarks += log.remarks()
+    return log
 
 
 def log_text(log: Log) -> str:
@@ -728,3 +347,257 @@ def write_log(path: Path, log: Log, kind: Kind = LOG) -> None:
     """
     parquet = path.suffix.lower() == ".parquet"
     write_atomically(path, _parquet_bytes(log) if parquet else log_text(log), kind)
+
+
+# ----------------------------------------------------------------------
+# Signals: the readings of a log as arrays, and what is wrong about the sensors that they come from.
+#
+# `Log.signals` is the way from a log to arrays. It takes the rows in which all the columns that are asked for
+# have a reading, drops rows that were written twice, and holds the samples' times to the stamps
+# (`calib.solve.clock`). What it finds of sensors that are stuck, absent or turned the wrong way are findings
+# for the verdict of whoever uses them; `Watch` finds the same block by block in a log that is streamed.
+
+IMU = (*GYRO, *ACCEL)
+IN_PLANE = ("gz_radps", "ax_mps2", "ay_mps2")
+"""What the angle in the plane takes."""
+
+_NEEDED = (*IN_PLANE, "u_px", "v_px")
+"""What an estimate of the head takes; without the others it does as well."""
+_FEWEST = 20
+"""With fewer readings a sensor that never changes may be one with coarse steps."""
+_TURNED_RAD = 0.05
+_AGREES, _CONTRADICTS = 0.3, 1.0
+_WINDOW = 20_000
+
+
+@dataclass(frozen=True)
+class Signals:
+    """Readings of some columns of a log, sample by sample.
+
+    Attributes
+    ----------
+    source : name for messages.
+    names : of the columns.
+    stamps_s : (n,) time stamps, which do not go back.
+    values : (n, names) readings in SI, NaN where rows are taken that have some of them only.
+    rows, lines : (n,) rows of the log, and their lines in the file.
+    repeated_rows : rows that were written twice and are left out.
+    findings : on the sensors.
+    """
+
+    source: str
+    names: tuple[str, ...]
+    stamps_s: FloatArray
+    values: FloatArray
+    rows: IntArray
+    lines: IntArray
+    repeated_rows: int = 0
+    findings: tuple[Finding, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.stamps_s)
+
+    def __getitem__(self, name: str) -> FloatArray:
+        return np.ascontiguousarray(self.values[:, self.names.index(name)])
+
+    @cached_property
+    def axis(self) -> TimeAxis:
+        """When the samples were taken."""
+        return time_axis(self.stamps_s)
+
+    @property
+    def t_s(self) -> FloatArray:
+        """(n,) times at which the samples were taken."""
+        return self.axis.t_s
+
+    @property
+    def stuck(self) -> tuple[str, ...]:
+        """Columns of the IMU that never change."""
+        many = np.isfinite(self.values).sum(axis=0) >= _FEWEST
+        least, most = np.fmin.reduce(self.values), np.fmax.reduce(self.values)
+        named = zip(self.names, many & (most == least), strict=True)
+        return tuple(name for name, stuck in named if stuck and name in IMU)
+
+    def refuse_stuck(self, *names: str, hint: str = "") -> None:
+        """Raise `BadInputError` for the first of these columns that never changes."""
+        for name in names:
+            if name in self.stuck:
+                value = self[name][np.isfinite(self[name])][0]
+                raise BadInputError(
+                    f"{self.source}: {name} never changes, it is stuck at {value:.6g}; expected the noise of "
+                    f"a sensor{hint}"
+                )
+
+    def refuse_mirrored(self) -> None:
+        """Raise `BadInputError` where the accelerometer's angle turns against the gyroscope's."""
+        for finding in self.findings:
+            if finding.severity == "inconsistent":
+                raise BadInputError(f"{self.source}: {finding.text}; {finding.advice}")
+
+    def without(self, *names: str) -> Signals:
+        """The same without some columns."""
+        kept = [k for k, name in enumerate(self.names) if name not in names]
+        return Signals(
+            self.source, tuple(self.names[k] for k in kept), self.stamps_s, self.values[:, kept], self.rows,
+            self.lines, self.repeated_rows, self.findings,
+        )  # fmt: skip
+
+
+def check_time(log: Log) -> None:
+    """Raise `BadInputError` at the first row whose time is earlier than that of the row before."""
+    back = np.nonzero(np.diff(log.t_s) < 0.0)[0]
+    if len(back):
+        i = int(back[0]) + 1
+        raise BadInputError(
+            f"{log.source}, line {log.lines[i]}: t_s goes back from {log.t_s[i - 1]:.6f} "
+            f"to {log.t_s[i]:.6f}, expected time to run forward"
+        )
+
+
+def refuse_counts(log: Log, names: Sequence[str]) -> None:
+    """Raise `BadInputError` for the first of these columns that is in counts."""
+    for name in names:
+        if name in log.columns and log.map is not None and log.unit(name) == "counts":
+            column = log.map.sources[name].column
+            raise BadInputError(
+                f"{log.source}: {name} is in counts, expected a unit; calib imu intrinsics finds the scale: "
+                f"add it to {log.map.folder}, such as {name}: {{column: {column}, factor: 0.0024}}"
+            )
+
+
+def signals_of(
+    log: Log, names: Sequence[str], optional: Sequence[str], counts: bool, partly: bool
+) -> Signals:
+    """Readings of the columns `names`, and of those optional ones that have any.
+
+    Parameters
+    ----------
+    counts : take columns in counts as they are.
+    partly : take rows with a reading in any of the columns, not in all of them.
+
+    Raises
+    ------
+    BadInputError for columns in counts otherwise, for time that goes back, for a column that is not there or
+    holds no number, and for columns that never have a reading in the same row.
+    """
+    lacking = [name for name in names if name not in log.columns]
+    if lacking:
+        raise BadInputError(f"{log.source}: has no {_listed(lacking)}, expected {_listed(names)} beside t_s")
+    blank = [name for name in names if np.isnan(log.columns[name]).all()]
+    if blank:
+        raise BadInputError(f"{log.source}: {_listed(blank)} hold{'s' * (len(blank) == 1)} no number")
+    more = [n for n in optional if n in log.columns and n not in names and np.isfinite(log.columns[n]).any()]
+    wanted = (*names, *more)
+    if not wanted:
+        raise BadInputError(f"{log.source}: has no reading of {_listed(optional)}")
+    if not counts:
+        refuse_counts(log, wanted)
+    rows = log.sampled(*wanted) if not partly else _any(log, wanted)
+    if len(rows) == 0:
+        raise BadInputError(f"{log.source}: no row has all of {', '.join(wanted)}, expected them together")
+    check_time(log)
+    values = np.stack([log.columns[name][rows] for name in wanted], axis=1)
+    stamps = log.t_s[rows]
+    same = np.all((values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1])), axis=1)
+    twice = (np.diff(stamps) == 0.0) & same
+    if twice.any():
+        kept = np.concatenate([[True], ~twice])
+        rows, stamps, values = rows[kept], stamps[kept], values[kept]
+    watch = Watch(tuple(name for name in (*names, *optional) if name in IMU))
+    watch.add(log)
+    findings = tuple(watch.findings(stuck=False))
+    return Signals(log.source, wanted, stamps, values, rows, log.lines[rows], int(twice.sum()), findings)
+
+
+def _any(log: Log, names: Sequence[str]) -> IntArray:
+    return np.nonzero(np.logical_or.reduce([np.isfinite(log.columns[name]) for name in names]))[0]
+
+
+def _listed(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+@dataclass
+class Watch:
+    """What the blocks of a log show of its sensors.
+
+    Attributes
+    ----------
+    names : columns that are used, and so ought to have readings.
+    """
+
+    names: tuple[str, ...] = MEASURED
+    _there: dict[str, bool] = field(default_factory=dict)
+    _count: dict[str, int] = field(default_factory=dict)
+    _least: dict[str, float] = field(default_factory=dict)
+    _most: dict[str, float] = field(default_factory=dict)
+    _mirrored: Finding | None = None
+    _known: bool = False
+
+    def add(self, log: Log) -> None:
+        """Rows that follow."""
+        for name in self.names:
+            if name not in log.columns:
+                continue
+            self._there[name] = True
+            column = log.columns[name]
+            finite = column[np.isfinite(column)]
+            if len(finite):
+                self._count[name] = self._count.get(name, 0) + len(finite)
+                self._least[name] = min(self._least.get(name, math.inf), float(finite.min()))
+                self._most[name] = max(self._most.get(name, -math.inf), float(finite.max()))
+        if not self._known and all(name in log.columns and name in self.names for name in IN_PLANE):
+            self._known, self._mirrored = _mirrored(log)
+
+    def has(self, *names: str) -> bool:
+        """Whether each of these columns has a reading."""
+        return all(self._count.get(name) for name in names)
+
+    def findings(self, stuck: bool = True) -> list[Finding]:
+        """What is wrong about the sensors, with `stuck` those among them that never change."""
+        out = []
+        for name in self.names:
+            if name in self._there and not self._count.get(name):
+                severity: Severity = "poor" if name in _NEEDED else "remark"
+                out.append(Finding(severity, f"{name} has no reading in any row"))
+            elif stuck and (
+                name in IMU and self._count.get(name, 0) >= _FEWEST and self._least[name] == self._most[name]
+            ):
+                out.append(
+                    Finding(
+                        "inconsistent",
+                        f"{name} never changes, it is stuck at {self._least[name]:.6g}",
+                        "check the sensor and its wiring",
+                    )
+                )
+        return [*out, self._mirrored] if self._mirrored is not None else out
+
+
+def _mirrored(log: Log) -> tuple[bool, Finding | None]:
+    """Whether a log turns far enough to tell which way, and what is wrong about it."""
+    rows = log.sampled(*IN_PLANE)[:_WINDOW]
+    if len(rows) < 2 * _FEWEST:
+        return False, None
+    gz, ax, ay = (log.columns[name][rows] for name in IN_PLANE)
+    t_s = np.maximum.accumulate(log.t_s[rows])
+    if not t_s[-1] > t_s[0]:
+        return False, None
+    found = turning(t_s, np.stack([ax, ay], axis=1), -gz, [1.0, -1.0])
+    if found.turned_rad < _TURNED_RAD:
+        return False, None
+    if found.misfit[-1.0] > _AGREES or found.misfit[1.0] < _CONTRADICTS:
+        return found.misfit[1.0] < _AGREES, None
+    middle = math.atan2(float(np.median(ay)), float(np.median(ax)))
+    names = {n: log.map.sources[n].column if log.map is not None else n for n in IN_PLANE}
+    if abs(abs(middle) - 0.5 * math.pi) < 0.25 * math.pi:
+        what = "ax_mps2 and ay_mps2 are swapped"
+        lines = f"ax_mps2: {names['ay_mps2']} and ay_mps2: {names['ax_mps2']}"
+    else:
+        what = "gz_radps, or one of ax_mps2 and ay_mps2, has the wrong sign"
+        lines = f"gz_radps: {{column: {names['gz_radps']}, factor: -1}}"
+    folder = log.map.folder if log.map is not None else "columns.yaml"
+    return True, Finding(
+        "inconsistent",
+        f"the accelerometer's angle turns against the gyroscope's: {what}",
+        f"if so, add to {folder} the line{'s' * (' and ' in lines)} {lines}",
+    )

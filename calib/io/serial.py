@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import signal
 import struct
 from collections.abc import Callable, Iterator, Sequence
@@ -11,7 +10,6 @@ from pathlib import Path
 
 from calib.core.errors import BadInputError
 from calib.core.files import check_readable, shown
-from calib.io.logs import Log, iter_rows
 
 # ----------------------------------------------------------------------
 # Frames that the sketch sends: found in a stream of bytes, checked, and written as a log.
@@ -388,8 +386,8 @@ _CHUNK = 1 << 16
 _MOST_BYTES = 1 << 28
 
 
-def iter_stream(path: Path) -> Iterator[Log]:
-    """Blocks of the log. Raises `BadInputError` for a file without a frame, or one that is too large."""
+def stream_text(path: Path) -> str:
+    """The log as CSV. Raises `BadInputError` for a file without a frame, or one that is too large."""
 
     size = check_readable(path)
     if size > _MOST_BYTES:
@@ -417,5 +415,4 @@ def iter_stream(path: Path) -> Iterator[Log]:
         raise BadInputError(
             f"{shown(path)}: holds no frame of the example sketch, only {result.skipped} other bytes"
         )
-    text = "".join(logs[len(result.runs) - 1])
-    yield from iter_rows(io.BytesIO(text.encode()), shown(path))
+    return "".join(logs[len(result.runs) - 1])

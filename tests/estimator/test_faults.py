@@ -12,8 +12,7 @@ from estimatorlogs import rows_from, setup_for, truth
 
 from calib.core.arrays import FloatArray
 from calib.core.verdict import Finding, Verdict
-from calib.io.logs import Log
-from calib.io.signals import Watch
+from calib.io.logs import Log, Watch
 from calib.stages.estimator.consistency import SENSORS, Tally
 from calib.stages.estimator.driven import Drive
 from calib.stages.estimator.kinematic import FLAGS, OUT

@@ -50,18 +50,18 @@ def _log(data: bytes, path: Path) -> None:
     import numpy as np
 
     from calib.core.errors import BadInputError
-    from calib.io import logs
+    from calib.io import tables
     from calib.io.logs import log_text, read_log
 
     try:
         log = read_log(path)
     finally:
-        before, logs._BLOCK_BYTES = logs._BLOCK_BYTES, 48
+        before, tables._BLOCK_BYTES = tables._BLOCK_BYTES, 48
         try:
             parts, refusal = read_log(path), ""
         except BadInputError as error:
             parts, refusal = None, str(error)
-        logs._BLOCK_BYTES = before
+        tables._BLOCK_BYTES = before
     if parts is None:
         # Only a line longer than two blocks may be refused where the whole is not.
         assert "does not end" in refusal, refusal

@@ -217,8 +217,8 @@ def rows(
     items: Iterable[tuple[str, int, dict[str, Any]]], topics: TopicMap = MAP
 ) -> tuple[np.ndarray, list[Any]]:
     blocks = list(rows_from_messages("log", Messages(items), topics))
-    columns = [np.concatenate([block.columns[name] for block in blocks]) for name in topics.columns]
-    return np.column_stack([np.concatenate([block.t_s for block in blocks]), *columns]), blocks
+    names = ("t_s", *topics.columns)
+    return np.column_stack([np.concatenate([one.cells[name] for one in blocks]) for name in names]), blocks
 
 
 @pytest.mark.parametrize(

@@ -16,11 +16,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-import calib.io.logs as logs
 from calib.core.errors import BadInputError
+from calib.io import logs, tables
 from calib.io.cells import GENERAL, TIME, WHOLE, table_bytes
-from calib.io.logs import Log, iter_log, log_text, read_log, write_log
-from calib.io.signals import check_time
+from calib.io.logs import Log, check_time, iter_log, log_text, read_log, write_log
 from calib.io.states import ENDINGS, STATES, states_writer
 
 SMALL = (
@@ -75,7 +74,7 @@ def test_blocks_give_the_same_as_the_whole(write, monkeypatch: pytest.MonkeyPatc
     path = write("t_s,ax_mps2,pwm1\n" + rows)
     whole = read_log(path)
     for size in (7, 64, 1000):
-        monkeypatch.setattr(logs, "_BLOCK_BYTES", max(size, 40))
+        monkeypatch.setattr(tables, "_BLOCK_BYTES", max(size, 40))
         pieces = list(iter_log(path))
         assert len(pieces) > 5
         assert all(len(piece) for piece in pieces)
@@ -132,14 +131,14 @@ def test_one_sentence_for_what_is_wrong(write, text: str | bytes, words: str) ->
 
 
 def test_a_line_without_an_end_is_not_read_into_memory(write, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(logs, "_BLOCK_BYTES", 1000)
+    monkeypatch.setattr(tables, "_BLOCK_BYTES", 1000)
     with pytest.raises(BadInputError, match="line 3: does not end"):
         read_log(write("t_s,ax_mps2\n0,1\n" + "7" * 5000))
 
 
 def test_a_log_beyond_the_memory_is_refused_while_it_is_read(write, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write("t_s,u_px\n" + "".join(f"{k / 100},1\n" for k in range(4000)))
-    monkeypatch.setattr(logs, "_BLOCK_BYTES", 1000)
+    monkeypatch.setattr(tables, "_BLOCK_BYTES", 1000)
     monkeypatch.setattr(logs, "_MOST_CELLS", 6000)
     with pytest.raises(BadInputError, match="million cells, which is more than is read at once"):
         read_log(path)
@@ -387,7 +386,7 @@ def test_a_time_that_begins_again_is_counted_on(
     rows = "".join(f"{t},{k % 7}\n" for k, t in enumerate(counts % 2**bits))
     path = write(f"{name},u_px\n{rows}")
     for size in (1 << 20, 1000):
-        monkeypatch.setattr(logs, "_BLOCK_BYTES", size)
+        monkeypatch.setattr(tables, "_BLOCK_BYTES", size)
         log = read_log(path)
         assert np.allclose(log.t_s, unit_s * counts, rtol=1e-12)
         assert log.wraps == (4 if bits == 16 else 1)

@@ -9,8 +9,7 @@ import pytest
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
-from calib.io.logs import Log
-from calib.io.signals import IN_PLANE, Watch
+from calib.io.logs import IN_PLANE, Log, Watch
 
 G = 9.80665
 

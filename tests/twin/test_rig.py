@@ -13,9 +13,8 @@ import pytest
 from calib.core.errors import BadInputError
 from calib.core.geometry import apply_homography
 from calib.core.rig import Rig
-from calib.io.logs import read_log
+from calib.io.logs import check_time, read_log
 from calib.io.pictures import list_pictures
-from calib.io.signals import check_time
 from calib.stages.camera.model import Camera, project
 from calib.stages.camera.read import read_board_file
 from calib.twin.folder import LOGS, write_rig_folder

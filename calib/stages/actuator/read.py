@@ -16,8 +16,7 @@ from calib.core.files import read_text, shown
 from calib.core.rig import Rig
 from calib.core.stage import NOTHING_STATED, LogOptions
 from calib.core.units import plain_number
-from calib.io.logs import Log, read_log
-from calib.io.signals import check_time
+from calib.io.logs import Log, check_time, read_log
 from calib.stages.actuator.identify import Start, Track, without_outliers
 from calib.stages.actuator.identify_pump import PumpRecord
 from calib.stages.actuator.machine import Machine

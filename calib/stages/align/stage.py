@@ -41,6 +41,7 @@ class AlignInputs:
 
 def _read(files: Files, rig: Rig, options: AlignOptions) -> AlignInputs:
     from calib.core.rig import Geometry
+    from calib.io.logs import read_log
     from calib.stages.align.read import align_log, settings_from_rig
 
     rig.current_plane(files.rig_path)
@@ -48,7 +49,7 @@ def _read(files: Files, rig: Rig, options: AlignOptions) -> AlignInputs:
     width, height = rig.camera.image_size_px
     logs: list[AlignLog] = []
     for path in files.paths:
-        log, remarks = align_log(files.log(path, options), (width, height))
+        log, remarks = align_log(read_log(path, options, files.remarks), (width, height))
         files.remarks += remarks
         if log is not None:
             logs.append(replace(log, source=files.taken(path)))

@@ -18,8 +18,7 @@ from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.core.verdict import Finding
 from calib.io.columns import COMMANDED, POSITION, PRESSURES, QUATERNION
-from calib.io.logs import Log
-from calib.io.signals import check_time
+from calib.io.logs import Log, check_time
 from calib.stages.arm.model import STEP_S, Trial
 
 _PLANAR = ("tip_x_m", "tip_y_m", "tip_phi_rad")

@@ -85,6 +85,7 @@ def read_trials(
     BadInputError as `calib.stages.arm.read`; `UsageError` for statements about logs that are not there.
     """
     from calib.core.units import parse_mass_kg
+    from calib.io.logs import read_log
     from calib.stages.arm.read import frame_findings, frame_of, recording_of, trial_of
 
     names = [path.stem for path in files.paths]
@@ -95,7 +96,7 @@ def read_trials(
     days |= dict(_said(options.day or (), "--day", names))
     recordings = []
     for path in files.paths:
-        recordings.append(recording_of(files.log(path, options), path.stem))
+        recordings.append(recording_of(read_log(path, options, files.remarks), path.stem))
         files.taken(path)
     found = frame_of(recordings) if frame is None else frame
     trials = tuple(trial_of(one, found, days[one.name], loads.get(one.name, 0.0)) for one in recordings)

@@ -15,8 +15,7 @@ from calib.core.files import shown
 from calib.core.result import CovarianceTable
 from calib.core.rig import Geometry, Rig
 from calib.core.stage import LogOptions
-from calib.io.logs import Log, iter_log
-from calib.io.signals import refuse_counts
+from calib.io.logs import Log, iter_log, refuse_counts
 from calib.solve.clock import time_axis
 from calib.stages.actuator.section import Standing, standing
 from calib.stages.align.section import SENSORS_OF, Align

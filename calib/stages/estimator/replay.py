@@ -28,8 +28,7 @@ from calib.core.result import finite_or_none, judged
 from calib.core.rig import Rig
 from calib.core.stage import NOTHING_STATED, LogOptions, ProgressCall
 from calib.core.verdict import Finding, Verdict
-from calib.io.logs import Log, passed_over
-from calib.io.signals import Watch
+from calib.io.logs import Log, Watch, passed_over
 from calib.io.states import STATES, states_writer
 from calib.stages.estimator.baseline import BASELINE, Baseline
 from calib.stages.estimator.consistency import SENSORS, Tally

@@ -20,8 +20,7 @@ from calib.core.rig import Rig
 from calib.core.stage import LogOptions
 from calib.core.verdict import Finding
 from calib.io.columns import ACCEL, GYRO
-from calib.io.logs import Log, log_of
-from calib.io.signals import IMU, IN_PLANE, Signals
+from calib.io.logs import IMU, IN_PLANE, Log, Signals, log_of
 from calib.solve.clock import Part
 from calib.stages.actuator.kinematics import MARKER_OFFSET_M
 from calib.stages.camera.model import Camera, undistort

@@ -18,7 +18,7 @@ from calib.solve.clock import Gap, Part, time_axis
 # How a log was sampled: rate, jitter, gaps, repeated rows and stamps, steps, readings at their limit.
 #
 # When the samples were taken says `calib.solve.clock`. Rows that repeat both stamp and readings are one
-# sample written twice, and are dropped before (`calib.io.signals`).
+# sample written twice, and are dropped before (`calib.io.logs`).
 
 _G = 9.80665
 _GYRO_RANGES = tuple(math.radians(r) for r in (125.0, 250.0, 500.0, 1000.0, 2000.0, 4000.0))

@@ -90,11 +90,12 @@ _SENSORS = (
 
 
 def _read_static(files: Files, rig: Rig, options: LogOptions) -> list[RestLog]:
+    from calib.io.logs import read_log
     from calib.stages.imu.read import rest_log
 
     del rig
     # What is written to the rig's file does not depend on the folder.
-    read = [(path, rest_log(files.log(path, options))) for path in files.paths]
+    read = [(path, rest_log(read_log(path, options, files.remarks))) for path in files.paths]
     return [replace(log, source=files.taken(path)) for path, log in read]
 
 
@@ -253,6 +254,7 @@ class IntrinsicsInputs:
 
 
 def _read_intrinsics(files: Files, rig: Rig, options: IntrinsicsOptions) -> IntrinsicsInputs:
+    from calib.io.logs import read_log
     from calib.stages.imu.read import pose_log, read_pose_files
 
     del rig
@@ -265,7 +267,7 @@ def _read_intrinsics(files: Files, rig: Rig, options: IntrinsicsOptions) -> Intr
         whole, remarks = read_pose_files(accel, gyro, options)
         files.remarks += [*remarks, *whole.remarks()]
     else:
-        whole = files.log(files.paths[0], options)
+        whole = read_log(files.paths[0], options, files.remarks)
     log = pose_log(whole, options.planar)
     for path in (*files.paths, accel, gyro):
         if path is not None:
@@ -447,6 +449,7 @@ def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
 
     from calib.core.files import shown
     from calib.core.result import identity
+    from calib.io.logs import read_log
     from calib.stages.imu.read import Reading, sensor_noise, tune_log
 
     how = Reading(options.rate == "up", options.reference)
@@ -457,7 +460,7 @@ def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
         how = replace(how, camera=camera.optics, A_inverse=np.array(plane.A_inverse))
     logs: list[TuneLog] = []
     for path in files.paths:
-        log = tune_log(files.log(path, options), how)
+        log = tune_log(read_log(path, options, files.remarks), how)
         files.remarks += log.said
         name = files.taken(path)
         # What is written to the rig's file does not depend on the folder.
@@ -699,12 +702,13 @@ class DriftInputs:
 
 
 def _read_drift(files: Files, rig: Rig, options: DriftOptions) -> DriftInputs:
+    from calib.io.logs import read_log
     from calib.stages.imu.levelling import Levelling
     from calib.stages.imu.mahony import Mahony
     from calib.stages.imu.read import drift_log
     from calib.stages.imu.tracks import Tuned
 
-    read = [(path, drift_log(files.log(path, options))) for path in files.paths]
+    read = [(path, drift_log(read_log(path, options, files.remarks))) for path in files.paths]
     logs = [replace(log, source=files.taken(path)) for path, log in read]
     tuned, section = None, rig.orientation_filter
     if section is not None:

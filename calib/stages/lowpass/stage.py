@@ -181,6 +181,7 @@ def _read(files: Files, rig: Rig, options: Options) -> Inputs:
 
     from calib.core.result import identity
     from calib.core.rig import Geometry
+    from calib.io.logs import read_log
     from calib.stages.lowpass.filters import Design, design_lowpass
 
     if options.jitter is not None and options.suggest is None:
@@ -202,7 +203,7 @@ def _read(files: Files, rig: Rig, options: Options) -> Inputs:
     def positions(path: Path | None) -> Positions | None:
         if path is None:
             return None
-        read = positions_from_log(files.log(path, options), options.rate_hz, optics, A_inverse)
+        read = positions_from_log(read_log(path, options, files.remarks), options.rate_hz, optics, A_inverse)
         files.taken(path)
         return read
 

@@ -1,0 +1,417 @@
+"""Tables of logs: text and Parquet as blocks of numbers by column, see `calib.io.logs`.
+
+Text is parsed by pyarrow; a block that it declines is read line by line, which gives the same numbers, or a
+sentence with the number of the line.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from calib.core.arrays import FloatArray, IntArray
+from calib.core.errors import BadInputError
+from calib.core.files import shown
+from calib.core.stage import LogOptions
+from calib.core.units import plain_number
+from calib.io.columns import (
+    Block,
+    ColumnMap,
+    ColumnsFile,
+    column_map,
+    find_columns,
+    known_name,
+    read_columns_file,
+)
+
+_BLOCK_BYTES = 1 << 20
+_LONGEST_LINE = 1 << 16
+_MAX_COLUMNS = 1000
+_MOST_BYTES, _MOST_GROWTH = 1 << 28, 200
+"""What a Parquet file may unpack to: so many bytes, or so many times its own size where that is more."""
+
+
+@dataclass(frozen=True)
+class _Text:
+    """How a text is made up: its columns, the marks between cells and in numbers, whether times are dates."""
+
+    source: str
+    columns: ColumnMap
+    separator: str
+    decimal: str
+    dates: bool = False
+
+    @property
+    def slots(self) -> dict[str, int]:
+        """Number of each column that is read, in the file."""
+        return {name: self.columns.names.index(one.column) for name, one in self.columns.sources.items()}
+
+
+def _number(text: _Text, word: str, column: str, line: int) -> float:
+    """A cell: NaN for blank, inf for what says nan or inf."""
+    word = word.strip()
+    if not word:
+        return math.nan
+    date = text.dates and column == "t_s"
+    value = _date_s(word) if date else plain_number(word.replace(",", ".") if text.decimal == "," else word)
+    if value is None:
+        expected = _DATE if date else "a number" + f", or in all rows {_DATE}" * (column == "t_s")
+        raise BadInputError(
+            f"{text.source}, line {line}: {column} is {shown(word[:40])!r}, expected {expected}"
+        )
+    return value if math.isfinite(value) else math.inf
+
+
+_DATE = "a date such as 2024-05-01T12:00:00.25"
+
+
+def _date_s(word: str) -> float | None:
+    """Seconds since 1970 of a date with a time of day, in UTC where no zone is given; None for other text."""
+    try:
+        date = datetime.fromisoformat(word)
+    except ValueError:
+        return None
+    since = (date if date.tzinfo else date.replace(tzinfo=UTC)) - datetime(1970, 1, 1, tzinfo=UTC)
+    return 1000 * (since // timedelta(microseconds=1)) / 1e9
+
+
+def _with_dates(columns: ColumnMap) -> ColumnMap:
+    """The map where the times are dates, which have been made seconds."""
+    time = replace(columns.sources["t_s"], unit="s", stated="file", factor=1.0, offset=0.0)
+    return replace(columns, sources={**columns.sources, "t_s": time}, evidence={"time": "dates"})
+
+
+def _split(where: str, line: str, separator: str) -> list[str]:
+    try:
+        return next(csv.reader([line], delimiter=separator, strict=True))
+    except (csv.Error, StopIteration) as error:
+        kind = {",": "comma", ";": "semicolon", "\t": "tab"}[separator]
+        raise BadInputError(f"{where}: is not {kind}-separated: {error}") from error
+
+
+_NO_ZONE = re.compile(rb"\A[^\n]*?\d\d:\d\d:\d\d(?:\.\d+)?(?![\d.Z+-])")
+_PASSED_OVER = re.compile(rb"(?:^|\n)[ \t\r]*(?:[#\n]|$)")
+"""A blank line or a comment."""
+
+
+def _parsed(text: _Text, data: bytes, first_line: int) -> tuple[Block, int]:
+    """Rows of whole lines, and the number of the next line."""
+    count = data.count(b"\n")
+    lines = np.arange(first_line, first_line + count, dtype=np.int64)
+    if _PASSED_OVER.search(data, 0, len(data) - 1):
+        every = data.split(b"\n")[:-1]
+        rows = [n for n, line in enumerate(every) if line.strip() and not line.lstrip().startswith(b"#")]
+        data, lines = b"".join(every[n] + b"\n" for n in rows), lines[rows]
+    block = _by_pyarrow(text, data, lines) or _by_lines(text, data, lines)
+    return _timed(text.source, block), first_line + count
+
+
+def _timed(source: str, block: Block) -> Block:
+    """The block. Raises `BadInputError` for a row without time."""
+    bad = np.nonzero(~np.isfinite(block.cells["t_s"]))[0]
+    if len(bad):
+        raise BadInputError(f"{source}, line {block.lines[bad[0]]}: has no time t_s, expected a number")
+    return block
+
+
+def _by_pyarrow(text: _Text, data: bytes, lines: IntArray) -> Block | None:
+    """The rows by pyarrow; None where it declines, or may see other rows than there are lines."""
+    import pyarrow
+    from pyarrow import csv as arrow_csv
+
+    if not len(lines):
+        return None
+    named = [str(k) for k in range(len(text.columns.names))]
+    wanted = {name: str(slot) for name, slot in text.slots.items()}
+    kinds = dict.fromkeys(wanted.values(), pyarrow.float64())
+    if text.dates:
+        kinds[wanted["t_s"]] = pyarrow.timestamp("ns", None if _NO_ZONE.search(data) else "UTC")
+    try:
+        table = arrow_csv.read_csv(
+            pyarrow.py_buffer(data),
+            read_options=arrow_csv.ReadOptions(
+                column_names=named, use_threads=False, block_size=len(data) + 1
+            ),
+            parse_options=arrow_csv.ParseOptions(delimiter=text.separator, ignore_empty_lines=False),
+            convert_options=arrow_csv.ConvertOptions(
+                column_types=kinds,
+                include_columns=list(wanted.values()),
+                null_values=[""],
+                decimal_point=text.decimal,
+            ),
+        )
+    except pyarrow.ArrowInvalid:
+        return None
+    if table.num_rows != len(lines):
+        return None
+    cells, odd = {}, 0
+    for name, number in wanted.items():
+        column = table.column(number)
+        values = _floats(column)
+        infinite = np.isinf(values)
+        odd += int(np.count_nonzero(np.isnan(values))) - column.null_count + int(np.count_nonzero(infinite))
+        values[infinite] = np.nan
+        cells[name] = values
+    return Block(cells, lines, odd)
+
+
+def _floats(column: Any) -> FloatArray:
+    """Doubles (n,) of an Arrow column, seconds of dates, NaN for nothing; `to_numpy` would load pandas."""
+    import pyarrow
+
+    if pyarrow.types.is_timestamp(column.type):
+        whole = column.cast(pyarrow.timestamp("ns", column.type.tz)).cast("int64")
+        return _floats(whole.cast("float64", safe=False)) / 1e9
+    array = column.combine_chunks() if isinstance(column, pyarrow.ChunkedArray) else column
+    valid, data = array.buffers()
+    rows = slice(array.offset, array.offset + len(array))
+    values = np.frombuffer(data, dtype=np.float64)[rows].copy()
+    if valid is not None:
+        values[np.unpackbits(np.frombuffer(valid, dtype=np.uint8), bitorder="little")[rows] == 0] = np.nan
+    return values
+
+
+def _by_lines(text: _Text, data: bytes, lines: IntArray) -> Block:
+    """The rows line by line, with a sentence for what cannot be read."""
+    values = np.empty((len(lines), len(text.slots)))
+    count = len(text.columns.names)
+    for row, (raw, line) in enumerate(zip(data.split(b"\n"), lines.tolist(), strict=False)):
+        where = f"{text.source}, line {line}"
+        cells = _split(where, raw.decode("utf-8", "replace").rstrip("\r"), text.separator)
+        if len(cells) != count:
+            raise BadInputError(f"{where}: has {len(cells)} cells, expected {count} as in the header")
+        for k, (name, slot) in enumerate(text.slots.items()):
+            values[row, k] = _number(text, cells[slot], name, line)
+    infinite = np.isinf(values)
+    values[infinite] = np.nan
+    cells_of = {name: np.ascontiguousarray(values[:, k]) for k, name in enumerate(text.slots)}
+    return Block(cells_of, lines, int(infinite.sum()))
+
+
+def _separator(line: str) -> str:
+    """The mark between the cells of a first line, which may hold decimal commas or marks in quotes."""
+    for mark in ";\t":
+        if line.count(mark) > line.count(",") or (mark in line and _numeric(line.split(mark), mark)):
+            return mark
+    return ","
+
+
+def _numeric(cells: Sequence[str], separator: str) -> bool:
+    """Whether cells are those of a row and not of a header."""
+    words = [cell.strip() for cell in cells if cell.strip()]
+    if separator != ",":
+        words = [word.replace(",", ".") for word in words]
+    return bool(words) and all(plain_number(w) is not None or _date_s(w) is not None for w in words)
+
+
+def _opened(stream: BinaryIO, source: str, path: Path, options: LogOptions) -> tuple[_Text, bytes, int]:
+    """How the text is made up, the beginning of its rows, which was read on the way, and their line.
+
+    The header is the first line that is neither blank nor a comment.
+    """
+    given = options.columns or find_columns(path)
+    file = None if given is None else read_columns_file(given)
+    line, comment, raw = 1, "", stream.readline(_LONGEST_LINE)
+    while raw.endswith(b"\n") and (not raw.strip() or raw.lstrip(b"\xef\xbb\xbf").startswith(b"#")):
+        comment = raw.decode("utf-8-sig", "replace").lstrip("#% ").rstrip("\r\n") or comment
+        line, raw = line + 1, stream.readline(_LONGEST_LINE)
+    where = f"{source}, line {line}"
+    if not raw.strip():
+        raise BadInputError(f"{source}: is empty, expected a header and rows")
+    if len(raw) == _LONGEST_LINE and not raw.endswith(b"\n"):
+        raise BadInputError(f"{where}: has more than {_LONGEST_LINE} characters, expected a header")
+    try:
+        head = raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise BadInputError(f"{where}: is not UTF-8 text (byte {error.start}), expected a header") from error
+    if "\0" in head:
+        raise BadInputError(f"{where}: has a zero byte, expected a text file")
+    separator = (file and file.separator) or _separator(head)
+    names = _split(where, head.rstrip("\r\n"), separator)
+    if len(names) > _MAX_COLUMNS:
+        raise BadInputError(f"{where}: has {len(names)} columns, expected at most {_MAX_COLUMNS}")
+    rows = b""
+    if _numeric(names, separator):
+        names, rows = _without_header(where, path, names, comment, separator, file), raw
+    columns = column_map(source, path, line, names, file, options)
+    start = rows + stream.read(_BLOCK_BYTES)
+    head = start[: 1 << 14].decode("utf-8", "replace")
+    comma = separator != "," and bool(re.search(r"(?:^|[\s;])[-+]?\d+,\d+(?:[eE][-+]?\d+)?(?:$|[\s;])", head))
+    decimal = (file and file.decimal) or ("," if comma else ".")
+    dates = _has_dates(head, columns.names.index(columns.sources["t_s"].column), separator)
+    text = _Text(source, _with_dates(columns) if dates else columns, separator, decimal, dates)
+    return text, start, line if rows else line + 1
+
+
+def _has_dates(head: str, slot: int, separator: str) -> bool:
+    """Whether the times in the first row are dates."""
+    row = next((row for row in head.split("\n") if row.strip() and not row.lstrip().startswith("#")), "")
+    cells = row.split(separator)
+    word = cells[slot].strip().strip('"') if slot < len(cells) else ""
+    return plain_number(word) is None and _date_s(word) is not None
+
+
+def _without_header(
+    where: str, path: Path, cells: list[str], comment: str, separator: str, file: ColumnsFile | None
+) -> list[str]:
+    """Names of a file's columns that begins with numbers: columns.yaml's or those of the comment above."""
+    numbers = [str(k + 1) for k in range(len(cells))]
+    if file is not None and file.names:
+        if len(file.names) != len(cells):
+            raise BadInputError(
+                f"{where}: has {len(cells)} cells, expected {len(file.names)} as in the names of "
+                f"{shown(file.path)}"
+            )
+        return list(file.names)
+    if file is not None and any(one.column in numbers for one in file.sources.values()):
+        return numbers
+    named = [name.strip() for name in comment.split(separator)]
+    if len(named) == len(cells) and any((known_name(name) or ("",))[0] == "t_s" for name in named):
+        return named
+    raise BadInputError(
+        f"{where}: holds numbers, expected a header; add to {shown(path.with_name('columns.yaml'))} the line "
+        f"names: [t_s, ...] with the names of its {len(cells)} columns"
+    )
+
+
+def text_blocks(
+    stream: BinaryIO, source: str, path: Path, options: LogOptions
+) -> tuple[ColumnMap, Iterator[Block]]:
+    """Columns of a text log that is open, and its rows; columns.yaml is looked for beside `path`."""
+    text, data, line = _opened(stream, source, path, options)
+    return text.columns, _blocks(text, stream, data, line)
+
+
+def _blocks(text: _Text, stream: BinaryIO, data: bytes, line: int) -> Iterator[Block]:
+    rest = b""
+    while data:
+        cut = data.rfind(b"\n") + 1
+        if cut == 0:
+            rest += data
+            if len(rest) > 2 * _BLOCK_BYTES:
+                raise BadInputError(f"{text.source}, line {line}: does not end, expected a text file")
+        else:
+            block, line = _parsed(text, rest + data[:cut], line)
+            rest = data[cut:]
+            if len(block.lines):
+                yield block
+        data = stream.read(_BLOCK_BYTES)
+    if not rest.strip() or rest.lstrip().startswith(b"#"):
+        return
+    # The last line without its end: a row, or the beginning of one.
+    if rest.count(text.separator.encode()) < len(text.columns.names) - 1:
+        nothing = {name: np.empty(0) for name in text.slots}
+        yield Block(nothing, np.empty(0, dtype=np.int64), truncated=True)
+    else:
+        yield _parsed(text, rest + b"\n", line)[0]
+
+
+class _Recoded(io.RawIOBase):
+    """Bytes of a text in UTF-8 with the line ends of Unix."""
+
+    def __init__(self, stream: BinaryIO, encoding: str, to: str) -> None:
+        self._text = io.TextIOWrapper(stream, encoding, "replace")
+        self._to, self._rest = to, b""
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, room: Any) -> int:
+        self._rest = self._rest or self._text.read(1 << 16).encode(self._to)
+        size = min(len(room), len(self._rest))
+        room[:size], self._rest = self._rest[:size], self._rest[size:]
+        return size
+
+
+@contextmanager
+def open_text(path: Path) -> Iterator[BinaryIO]:
+    """A stream of a text file, of UTF-16 and of line ends without a line feed made UTF-8 with them."""
+    with path.open("rb") as stream:
+        start = stream.peek()
+        if start.startswith((b"\xff\xfe", b"\xfe\xff")):
+            yield io.BufferedReader(_Recoded(stream, "utf-16", "utf-8"))
+        elif b"\r" in start and b"\n" not in start:
+            yield io.BufferedReader(_Recoded(stream, "latin-1", "latin-1"))
+        else:
+            yield stream
+
+
+def parquet_blocks(path: Path, options: LogOptions) -> tuple[ColumnMap, Iterator[Block]]:
+    """Columns of a log in Parquet, and its rows."""
+    import pyarrow
+    from pyarrow import parquet
+
+    given = options.columns or find_columns(path)
+    named = read_columns_file(given) if given is not None else None
+    with _parquet_errors(shown(path)):
+        file = parquet.ParquetFile(path, pre_buffer=False)
+        columns = column_map(shown(path), path, 1, file.schema_arrow.names, named, options)
+        time = file.schema_arrow.field(columns.sources["t_s"].column).type
+        columns = _with_dates(columns) if pyarrow.types.is_timestamp(time) else columns
+        _check_growth(path, file.metadata, [one.column for one in columns.sources.values()])
+    return columns, _parquet_blocks(file, columns)
+
+
+@contextmanager
+def _parquet_errors(source: str) -> Iterator[None]:
+    try:
+        yield
+    except BadInputError:
+        raise
+    except (OSError, ValueError) as error:
+        raise BadInputError(f"{source}: is not a Parquet file that can be read: {error}") from error
+
+
+def _check_growth(path: Path, metadata: Any, read: Sequence[str]) -> None:
+    """Raise `BadInputError` where the columns that are read unpack to more than their budget.
+
+    A column of equal numbers takes a few bytes however long it is, so rows count as well as what pages
+    unpack to.
+    """
+    most = max(_MOST_BYTES, _MOST_GROWTH * path.stat().st_size)
+    unpacked = 0
+    for group in map(metadata.row_group, range(metadata.num_row_groups)):
+        for column in map(group.column, range(metadata.num_columns)):
+            if column.path_in_schema in read:
+                unpacked += max(column.total_uncompressed_size, 8 * max(group.num_rows, column.num_values))
+    if unpacked > most:
+        raise BadInputError(
+            f"{shown(path)}: has {metadata.num_rows} rows, which unpack to {unpacked / 1e6:.0f} MB from "
+            f"{path.stat().st_size / 1e6:.2g}, expected at most {most / 1e6:.0f}; cut it into parts"
+        )
+
+
+def _parquet_blocks(file: Any, columns: ColumnMap) -> Iterator[Block]:
+    first, read = 1, [one.column for one in columns.sources.values()]
+    with _parquet_errors(columns.source):
+        for batch in file.iter_batches(batch_size=65536, columns=read):
+            cells, odd = {}, 0
+            for name, one in columns.sources.items():
+                values = _parquet_column(columns.source, batch.column(one.column), one.column).copy()
+                infinite = np.isinf(values)
+                values[infinite] = np.nan
+                cells[name], odd = values, odd + int(infinite.sum())
+            block = Block(cells, np.arange(first, first + len(batch), dtype=np.int64), odd)
+            first += len(batch)
+            yield _timed(columns.source, block)
+
+
+def _parquet_column(source: str, column: Any, name: str) -> FloatArray:
+    import pyarrow
+
+    try:
+        if pyarrow.types.is_timestamp(column.type):
+            return _floats(column)
+        return np.asarray(column.cast("float64").to_numpy(zero_copy_only=False), dtype=np.float64)
+    except Exception as error:
+        raise BadInputError(f"{source}: {name} holds {column.type}, expected numbers") from error
