@@ -16,6 +16,8 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from calib.core.command import WATCHER
+
 _AGAIN_S = 1.0
 """How long the answer to a signal may take before it is raised again."""
 _LOST_S = 0.01
@@ -93,7 +95,7 @@ class Interrupts:
             if os.read(reading, 1) and not self._came.wait(_PATIENCE_S):
                 end()
 
-        watcher = threading.Thread(target=watch, daemon=True)
+        watcher = threading.Thread(target=watch, name=WATCHER, daemon=True)
         outer = signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
         # A signal to a forked child is none to this process.
         os.register_at_fork(after_in_child=lambda: signal.set_wakeup_fd(-1))

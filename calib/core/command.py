@@ -9,6 +9,9 @@ from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
 
+WATCHER = "watcher of signals"
+"""Name of the thread that waits for signals, in a system call and without locks: a fork beside it is safe."""
+
 
 @dataclass
 class Command:

@@ -17,6 +17,8 @@ PICTURES = (
     ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".heic", ".heif", ".avif",
 )  # fmt: skip
 """Endings of picture files."""
+BAGS = (".bag", ".db3", ".mcap")
+"""Endings of bags; a ROS 2 bag may also be a folder."""
 _MAX_YAML_BYTES = 1_000_000
 _SAFE = frozenset("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789-_.")
 _LONGEST = 80
@@ -148,3 +150,8 @@ def read_yaml_mapping(path: Path) -> dict[str, Any]:
     if wrong is not None:
         raise BadInputError(f"{shown(path)}: the key {wrong!r} is not text")
     return document
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path is read as a bag: by its ending, or as a folder with a bag's metadata."""
+    return path.suffix.lower() in BAGS or (path / "metadata.yaml").is_file()

@@ -31,6 +31,8 @@ from typing import Any, Generic, TypeVar, cast
 import cv2
 import numpy.ma  # noqa: F401  for its loading
 
+from calib.core.command import WATCHER
+
 # np.median and np.unique load it: once here, before the processes fork, instead of once in each.
 
 
@@ -96,7 +98,7 @@ def _may_fork(items: int) -> bool:
         items >= _FEWEST_TO_FORK
         and processors() > 1
         and sys.platform == "linux"
-        and threading.active_count() == 1
+        and {thread.name for thread in threading.enumerate()} <= {threading.main_thread().name, WATCHER}
         and not multiprocessing.current_process().daemon
         and _have_left()
     )

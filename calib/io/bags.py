@@ -453,15 +453,7 @@ def rows_from_messages(source: str, stream: Source, topics: TopicMap) -> Iterato
 # The readers are those of the packages `rosbags` and `mcap` (extra logs). Both hand out one message at a
 # time, so nothing grows with the length of a bag but its index.
 
-BAGS = (".bag", ".db3", ".mcap")
-"""Endings of bags; a ROS 2 bag may also be a folder."""
-
 _MOST_TOPICS = 10000
-
-
-def is_bag(path: Path) -> bool:
-    """Whether a path is read as a bag: by its ending, or as a folder with a bag's metadata."""
-    return path.suffix.lower() in BAGS or (path / "metadata.yaml").is_file()
 
 
 @contextmanager

@@ -14,7 +14,7 @@ import numpy as np
 
 from calib.core.arrays import GrayImage
 from calib.core.errors import BadInputError, UsageError
-from calib.core.files import check_readable, hash_of, one_line, shown
+from calib.core.files import check_readable, hash_of, is_bag, one_line, shown
 from calib.io.pictures import Picture, decoded_picture, eight_bits
 
 # ----------------------------------------------------------------------
@@ -49,8 +49,6 @@ class Frames:
 
 def is_recording(path: Path) -> bool:
     """Whether a path is a video or a bag."""
-    from calib.io.bags import is_bag
-
     return not (path.is_dir() and not is_bag(path)) and (path.suffix.lower() in VIDEOS or is_bag(path))
 
 

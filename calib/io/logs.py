@@ -30,7 +30,7 @@ import numpy as np
 
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
-from calib.core.files import check_readable, shown
+from calib.core.files import check_readable, is_bag, shown
 from calib.core.stage import NOTHING_STATED, LogOptions
 from calib.core.verdict import Finding, Severity
 from calib.core.writing import Kind, column_names, write_atomically
@@ -236,7 +236,6 @@ def iter_log(path: Path, options: LogOptions = NOTHING_STATED) -> Iterator[Log]:
         without time or with too few cells, or a cell that is no number, with the number of the line; for
         units that are not known or contradict the readings; for a Parquet file that unpacks to too much.
     """
-    from calib.io.bags import is_bag
     from calib.io.serial import STREAMS, stream_text
 
     if not (is_bag(path) and path.is_dir()):
@@ -253,7 +252,6 @@ def iter_log(path: Path, options: LogOptions = NOTHING_STATED) -> Iterator[Log]:
 
 def columns_of(path: Path, options: LogOptions = NOTHING_STATED) -> tuple[str, ...] | None:
     """Columns that a log has by its header, whatever is in them; None where it cannot be told."""
-    from calib.io.bags import is_bag
     from calib.io.serial import STREAMS
 
     try:
@@ -269,7 +267,7 @@ def columns_of(path: Path, options: LogOptions = NOTHING_STATED) -> tuple[str, .
 
 def beside(path: Path) -> list[Path]:
     """Files beside a log that say what is in it: which topic of a bag is which column, and columns.yaml."""
-    from calib.io.bags import find_topics, is_bag
+    from calib.io.bags import find_topics
 
     found = [find_topics(path) if is_bag(path) else None, find_columns(path)]
     return [one for one in found if one is not None]

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from calib.core.arrays import BoolArray, FloatArray, GrayImage
 from calib.core.errors import BadInputError
@@ -25,7 +24,6 @@ from calib.stages.camera.refine import (
     fit_corners,
     frames_of,
     misshape,
-    part_around,
     predict,
     refine,
     square_px,
@@ -113,7 +111,8 @@ _LEAST_STEP = 0.38
 _FLAT = 0.6
 """Largest difference between the quarters of a square, over the step from dark to bright."""
 
-_Float32 = npt.NDArray[np.float32]
+_SMOOTHED_PX = 12.0
+"""Side of squares from which on their tones are averages over 3 x 3 pixels."""
 
 
 def _turns_alike(points: FloatArray) -> bool:
@@ -127,9 +126,12 @@ def _turns_alike(points: FloatArray) -> bool:
     return True
 
 
-def _squares_are_plain(smooth: _Float32, grid: Refined) -> bool:
+def _squares_are_plain(grid: Refined) -> bool:
     """Whether the squares between the corners alternate and are of one tone each."""
-    p = grid.points
+    p = grid.part.from_picture(grid.points)
+    smooth = grid.part.image
+    if square_px(p) > _SMOOTHED_PX:
+        smooth = np.asarray(cv2.blur(smooth, (3, 3)))
     corners = np.stack([p[:-1, :-1], p[:-1, 1:], p[1:, :-1], p[1:, 1:]])
     middle = corners.mean(axis=0)
     quarters = sample(smooth, 0.5 * (corners + middle))
@@ -149,9 +151,9 @@ def _squares_are_plain(smooth: _Float32, grid: Refined) -> bool:
     return bool(np.mean(uneven > _FLAT * np.maximum(local, 0.25 * step)) < _UNEVEN_SHARE)
 
 
-def _squares_meet(gray: GrayImage, grid: Refined) -> bool:
+def _squares_meet(grid: Refined) -> bool:
     """Whether the squares keep their tones up to the corners, as round spots do not that only touch."""
-    p, image = grid.points, gray.astype(np.float32)
+    p = grid.part.from_picture(grid.points)
     along, across = np.gradient(p, axis=1), np.gradient(p, axis=0)
     i, j = np.indices(p.shape[:2])
     parity = (1.0 - 2.0 * ((i + j) % 2)) * grid.sign
@@ -159,7 +161,7 @@ def _squares_meet(gray: GrayImage, grid: Refined) -> bool:
     def step(share: float) -> float:
         """Median step between the four squares of a corner, at a share of a square from it."""
         one, two = share * (along + across), share * (along - across)
-        here = sample(image, np.stack([p + one, p - one, p + two, p - two]))
+        here = sample(grid.part.image, np.stack([p + one, p - one, p + two, p - two]))
         return float(np.median(parity * (here[0] + here[1] - here[2] - here[3])))
 
     near = max(_NEAR, _NEAR_PX / square_px(p))
@@ -178,19 +180,15 @@ def fault_of(gray: GrayImage, grid: Refined) -> str | None:
         return "corners that are none"
     if np.median(np.abs(grid.amplitude)) < _LEAST_AMPLITUDE:
         return "too little contrast"
-    if np.median(grid.residual) > _MEDIAN_RESIDUAL and not (close and _squares_meet(gray, grid)):
+    if np.median(grid.residual) > _MEDIAN_RESIDUAL and not (close and _squares_meet(grid)):
         return "corners of another shape"
     if not grid.misfit_px < _MISFIT * square:
         return "corners off the grid"
     if not _turns_alike(grid.points):
         return "a folded grid"
-    if min(shape) >= 2 and not _squares_are_plain(_smoothed(gray, square), grid):
+    if min(shape) >= 2 and not _squares_are_plain(grid):
         return "squares that are not plain"
     return None
-
-
-def _smoothed(gray: GrayImage, square: float) -> _Float32:
-    return np.asarray(cv2.blur(gray.astype(np.float32), (3, 3)) if square > 12.0 else gray.astype(np.float32))
 
 
 @dataclass(frozen=True)
@@ -207,22 +205,24 @@ class Surroundings:
     seen: tuple[bool, bool, bool, bool]
 
 
-def surroundings(gray: GrayImage, grid: Refined) -> Surroundings:
+def _ringed(points: FloatArray) -> FloatArray:
+    """A grid (rows, columns, 2) and the places of one more corner on each side."""
+    wide = extrapolated(points)
+    wide[1:-1, 1:-1] = points
+    for v, v1 in ((0, 1), (-1, -2)):
+        for u, u1 in ((0, 1), (-1, -2)):
+            wide[v, u] = wide[v, u1] + wide[v1, u] - wide[v1, u1]
+    return wide
+
+
+def surroundings(grid: Refined) -> Surroundings:
     """Look for another row of corners on each side.
 
     A part of a larger board is not the board: which part it is cannot be told.
     """
-    nothing = (False, False, False, False)
-    place = extrapolated(grid.points)
-    place[1:-1, 1:-1] = grid.points
-    for v, v1 in ((0, 1), (-1, -2)):
-        for u, u1 in ((0, 1), (-1, -2)):
-            place[v, u] = place[v, u1] + place[v1, u] - place[v1, u1]
-    part = part_around(gray, place, grid.k, grid.halo_px)
-    if part is None:
-        return Surroundings(nothing, nothing)
-    image, local = part.image, part.points
-    frames = frames_of(local)
+    part = grid.part
+    local = _ringed(part.from_picture(grid.points))
+    image = part.image
     rows, columns = local.shape[:2]
     outside = np.ones((rows, columns), dtype=np.bool_)
     outside[1:-1, 1:-1] = False
@@ -232,14 +232,15 @@ def surroundings(gray: GrayImage, grid: Refined) -> Surroundings:
     i, j = np.indices((rows, columns))
     parity = (1.0 - 2.0 * ((i + j) % 2)) * grid.sign
     least = _CONTINUES * float(np.median(np.abs(grid.amplitude)))
-    along, across = frames.along.reshape(local.shape), frames.across.reshape(local.shape)
+    along, across = np.gradient(local, axis=1), np.gradient(local, axis=0)
     half_step, unlike = looks_like_corners(image, local, along, across)
     chosen = np.flatnonzero((inside & (parity * half_step > 0.5 * least) & (unlike < 1.0)).ravel())
     found: BoolArray = np.zeros(rows * columns, dtype=np.bool_)
     if len(chosen):
-        fit = fit_corners(part, local.reshape(-1, 2)[chosen], frames.take(chosen), _ITERATIONS, _REACH_PX)
+        frames = frames_of(local).take(chosen)
+        fit = fit_corners(part, local.reshape(-1, 2)[chosen], frames, _ITERATIONS, _REACH_PX)
         square = np.minimum(np.linalg.norm(frames.along, axis=1), np.linalg.norm(frames.across, axis=1))
-        near = np.linalg.norm(fit.points - local.reshape(-1, 2)[chosen], axis=1) < 0.3 * square[chosen]
+        near = np.linalg.norm(fit.points - local.reshape(-1, 2)[chosen], axis=1) < 0.3 * square
         strong = parity.ravel()[chosen] * fit.amplitude > least
         # Corners beyond a sharpened board's are as misshapen as its own.
         alike = misshape(fit, part.noise) < max(_WORST_RESIDUAL, 1.5 * float(np.median(grid.residual)))
@@ -445,17 +446,13 @@ def _whole(gray: GrayImage, points: FloatArray) -> Refined | None:
         grid = refine(gray, points)
         if grid is None or fault_of(gray, grid) is not None:
             return None
-        around = surroundings(gray, grid)
+        around = surroundings(grid)
         top, bottom, left, right = around.continues
         if not any(around.continues):
             sure = grid.refined.all() and grid.narrow.mean() < _NARROW
             sure &= grid.misfit_px < _SIZE_MISFIT * square_px(grid.points)
             return grid if sure and any(around.seen) else None
-        wide = extrapolated(grid.points)
-        wide[1:-1, 1:-1] = grid.points
-        for v, v1 in ((0, 1), (-1, -2)):
-            for u, u1 in ((0, 1), (-1, -2)):
-                wide[v, u] = wide[v, u1] + wide[v1, u] - wide[v1, u1]
+        wide = _ringed(grid.points)
         rows, columns = wide.shape[:2]
         points = wide[
             0 if top else 1 : rows - (0 if bottom else 1), 0 if left else 1 : columns - (0 if right else 1)
@@ -583,7 +580,7 @@ def _best_of(gray: GrayImage, grids: Sequence[FloatArray]) -> Refined | None:
     best: Refined | None = None
     for points in grids:
         grid = refine(gray, points)
-        if grid is None or fault_of(gray, grid) is not None or any(surroundings(gray, grid).continues):
+        if grid is None or fault_of(gray, grid) is not None or any(surroundings(grid).continues):
             continue
         if best is None or square_px(grid.points) > square_px(best.points):
             best = grid

@@ -13,6 +13,7 @@ from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
 from calib.core.verdict import Finding
 from calib.core.workers import Workers
+from calib.solve.chance import tail_of_t
 from calib.stages.camera.bundle import (
     Calibration,
     Covariance,
@@ -433,12 +434,9 @@ def _beats(richer: Candidate, simpler: Candidate, gain_px: float) -> bool:
         return True
     if len(a) < 2:
         return False
-    # SciPy takes longer to load than most models to fit.
-    from scipy.special import stdtr
-
     ratio = np.log(np.maximum(b, 1e-300) / np.maximum(a, 1e-300))
     error = float(np.std(ratio, ddof=1)) / np.sqrt(len(ratio))
-    return bool(stdtr(len(ratio) - 1, -float(np.mean(ratio)) / max(error, 1e-300)) < _CHANCE)
+    return tail_of_t(len(ratio) - 1, float(np.mean(ratio)) / max(error, 1e-300)) < _CHANCE
 
 
 # ----------------------------------------------------------------------

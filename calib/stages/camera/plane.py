@@ -11,6 +11,7 @@ from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.core.errors import BadInputError
 from calib.core.geometry import Homography, apply_homography, fit_homography, map_jacobian
 from calib.core.verdict import Finding, Verdict
+from calib.solve.chance import tail_of_f
 from calib.stages.camera.model import Board, Camera, View, project, undistort
 from calib.stages.camera.pose import Pose, fit_pose, plane_map, pose_derivatives
 
@@ -233,12 +234,9 @@ def compare_pictures(
         fits.append(PictureFit(view.name, M, float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))), moved))
     if tested < 2:
         return tuple(fits), Comparison(1.0, 0.0, "", 1.0)
-    # SciPy takes longer to load than most planes to check.
-    from scipy.special import fdtrc
-
     between = max(joint - separate, 0.0) / (6 * (tested - 1))
     ratio = between / max(separate / freedom, 1e-24)
-    probability = float(fdtrc(6 * (tested - 1), freedom, ratio))
+    probability = float(tail_of_f(6 * (tested - 1), freedom, ratio))
     worst = max((fit for fit in fits if np.isfinite(fit.moved_px)), key=lambda fit: fit.moved_px)
     inflation = ratio if probability < _SCATTER_PROBABILITY else 1.0
     return tuple(fits), Comparison(probability, worst.moved_px, worst.name, max(inflation, 1.0))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -229,15 +230,36 @@ def _edge(d: _Float32, w: _Float32) -> tuple[_Float32, _Float32, _Float32]:
     return np.copysign(1.0 - series * bell, z), slope, -slope * z
 
 
-def _model(q: _Float32, win: _Windows, room: _Float32, halo_px: float) -> tuple[_Float32, _Float32]:
-    """Residuals (N, M) and the Jacobian of the model (N, P, M), in `room`, both zero outside the window."""
-    u0, v0, alpha, beta, w, b, a, gx, gy, kappa, lam = (q[:, k, None] for k in range(_PARAMETERS))
+class _Places(NamedTuple):
+    """Where the pixels (N, M) lie in the corners' own coordinates: the symbols of the equations above."""
+
+    x: _Float32
+    y: _Float32
+    t1: _Float32
+    t2: _Float32
+    n1: _Float32
+    n2: _Float32
+    d1: _Float32
+    d2: _Float32
+    w: _Float32
+
+
+def _places(q: _Float32, win: _Windows) -> _Places:
+    u0, v0, alpha, beta, w, _, _, _, _, kappa, lam = (q[:, k, None] for k in range(_PARAMETERS))
     x, y = win.x - u0, win.y - v0
     c1, s1, c2, s2 = np.cos(alpha), np.sin(alpha), np.cos(beta), np.sin(beta)
     t1, t2 = c1 * x + s1 * y, c2 * x + s2 * y
     n1, n2 = c1 * y - s1 * x, s2 * x - c2 * y
+    half = np.float32(0.5)
+    return _Places(x, y, t1, t2, n1, n2, n1 - half * kappa * t1 * t1, n2 + half * lam * t2 * t2, w)
+
+
+def _model(q: _Float32, win: _Windows, room: _Float32, halo_px: float) -> tuple[_Float32, _Float32]:
+    """Residuals (N, M) and the Jacobian of the model (N, P, M), in `room`, both zero outside the window."""
+    _, _, alpha, beta, _, b, a, gx, gy, kappa, lam = (q[:, k, None] for k in range(_PARAMETERS))
+    x, y, t1, t2, n1, n2, d1, d2, w = _places(q, win)
+    c1, s1, c2, s2 = np.cos(alpha), np.sin(alpha), np.cos(beta), np.sin(beta)
     k1t, k2t = kappa * t1, lam * t2
-    d1, d2 = n1 - 0.5 * k1t * t1, n2 + 0.5 * k2t * t2
     P, P1, P2, Pw = _crossing(d1, d2, w)
     J = room[: len(q)]
     light = (1.0 + gx * x + gy * y) * win.weight
@@ -277,18 +299,18 @@ def _crossing(d1: _Float32, d2: _Float32, w: _Float32) -> tuple[_Float32, _Float
     return E1 * E2, G1 * E2, E1 * G2, W1 * E2 + E1 * W2
 
 
-def _start(points: FloatArray, frames: Frames, win: _Windows, room: _Float32) -> FloatArray:
-    """Parameters (N, P) with position and directions of the grid, and the grey levels that fit them."""
-    q = np.zeros((len(points), room.shape[1]))
+def _start(points: FloatArray, frames: Frames, win: _Windows, count: int) -> FloatArray:
+    """Parameters (N, count) with position and directions of the grid, and the grey levels that fit them."""
+    q = np.zeros((len(points), count))
     q[:, :2] = points - win.centre
     q[:, 2] = np.arctan2(frames.along[:, 1], frames.along[:, 0])
     q[:, 3] = np.arctan2(frames.across[:, 1], frames.across[:, 0])
     q[:, 4] = _START_WIDTH_PX
     q[:, 9:11] = frames.bends
-    _, J = _model(q.astype(np.float32), win, room, 0.0)
-    ones, P = J[:, 5].astype(np.float64), J[:, 6].astype(np.float64)
+    at = _places(q.astype(np.float32), win)
+    P = np.asarray(_edge(at.d1, at.w)[0] * _edge(at.d2, at.w)[0] * win.weight, dtype=np.float64)
     grey = win.grey * win.weight
-    n, sum_p, sum_pp = ones.sum(axis=1), P.sum(axis=1), (P * P).sum(axis=1)
+    n, sum_p, sum_pp = win.weight.sum(axis=1), P.sum(axis=1), (P * P).sum(axis=1)
     sum_g, sum_gp = grey.sum(axis=1), (grey * P).sum(axis=1)
     det = np.maximum(n * sum_pp - sum_p**2, 1e-9)
     q[:, 6] = (n * sum_gp - sum_p * sum_g) / det
@@ -340,7 +362,7 @@ def _fit_part(
 ) -> LocalFit:
     N, P = len(points), _PARAMETERS + (halo_px > 0.0)
     room = np.empty((N, P, win.x.shape[1]), dtype=np.float32)
-    q = _start(points, frames, win, room)
+    q = _start(points, frames, win, P)
     # Weight of the further observations, for residuals of the size that the fit will leave.
     noise = np.maximum(_NOISE * np.abs(q[:, 6, None]), _LEAST_NOISE)
     sigmas = np.column_stack([np.full((N, 2), _TONE_SIGMA), frames.bend_sigmas])
@@ -653,6 +675,8 @@ _LEAST_WIDTH_PX = 0.9
 _FIRST_ITERATIONS = 4
 _FIRST_REACH_PX = 8
 _HALOS_PX = (0.8, 1.6, 3.0)
+_HALO_CORNERS = 16
+"""Corners that are tried with halos; a picture has one halo, and these tell it."""
 _HALO_MISSHAPE = 0.05
 """Typical misshape from which on halos are tried."""
 _HALO_GAIN = 0.8
@@ -671,9 +695,10 @@ _PASSES = 3
 _CLOSE_WINDOW = 0.28
 _DISTURBED = 1.5
 _STEADY_PX = 0.1
-"""Corners that moved farther are fitted again, with the curvatures of where they are now."""
+"""Corners that moved farther are fitted again, with the curvatures of where they are now, as those that did
+not converge are."""
 _LEAST_PICTURE_PX = 8
-_NOISE_SAMPLE = 40_000
+_NOISE_SAMPLE = 10_000
 
 _RefineFloat32 = npt.NDArray[np.float32]
 
@@ -692,7 +717,7 @@ class Refined:
     narrow : whether a corner had to be fitted with a smaller window than usual.
     refined : False where a corner could not be measured and its predicted place is given.
     misfit_px : typical distance of a corner from where the others place it.
-    k, halo_px : of the part that was fitted, see `Part`.
+    part : of the picture, in which the corners were fitted.
     """
 
     points: FloatArray
@@ -702,8 +727,7 @@ class Refined:
     narrow: BoolArray
     refined: BoolArray
     misfit_px: float
-    k: int
-    halo_px: float
+    part: Part
 
     @property
     def sign(self) -> int:
@@ -717,6 +741,12 @@ def square_px(points: FloatArray) -> float:
     along = np.linalg.norm(np.diff(points, axis=1), axis=-1)
     across = np.linalg.norm(np.diff(points, axis=0), axis=-1)
     return float(np.median(np.concatenate([along.ravel(), across.ravel()])))
+
+
+def _sides_px(points: FloatArray) -> FloatArray:
+    """The shorter side of the square at each corner of a grid (rows, columns, 2)."""
+    steps = np.stack([np.gradient(points, axis=axis) for axis in (0, 1)])
+    return np.asarray(np.linalg.norm(steps, axis=-1).min(axis=0))
 
 
 @dataclass(frozen=True)
@@ -750,6 +780,10 @@ class Part:
         """Pixels of the picture from pixels of the part."""
         return np.asarray(points * self.k + 0.5 * (self.k - 1) + self.origin)
 
+    def from_picture(self, points: FloatArray) -> FloatArray:
+        """The inverse of `to_picture`."""
+        return np.asarray((points - 0.5 * (self.k - 1) - self.origin) / self.k)
+
 
 def _noise(image: _RefineFloat32) -> float:
     """Standard deviation of the noise, from the median of a mask that is blind to edges (Immerkaer 1996).
@@ -764,18 +798,17 @@ def _noise(image: _RefineFloat32) -> float:
     return float(np.median(np.abs(across[0] - 2.0 * across[1] + across[2]))) / (6.0 * 0.6745)
 
 
-def part_around(
-    gray: GrayImage, points: FloatArray, k: int | None = None, halo_px: float = 0.0
-) -> Part | None:
-    """The part of a picture that holds a grid (rows, columns, 2); None when that is next to nothing.
+def part_around(gray: GrayImage, points: FloatArray, k: int | None = None) -> Part | None:
+    """The part of a picture that holds a grid (rows, columns, 2) and two squares around it.
 
-    It is averaged over blocks of k pixels, by default such that squares keep about 40 px.
+    It is averaged over blocks of k pixels, by default such that squares keep about 40 px. None when that is
+    next to nothing.
     """
     k = max(1, int(square_px(points) // _SQUARE_PX)) if k is None else k
     height, width = gray.shape
     square = float(np.max(np.abs(np.gradient(points, axis=0)) + np.abs(np.gradient(points, axis=1))))
-    low = np.floor((points.reshape(-1, 2).min(axis=0) - square) / k).astype(int) * k
-    high = np.ceil(points.reshape(-1, 2).max(axis=0) + square).astype(int)
+    low = np.floor((points.reshape(-1, 2).min(axis=0) - 2 * square) / k).astype(int) * k
+    high = np.ceil(points.reshape(-1, 2).max(axis=0) + 2 * square).astype(int)
     u0, v0 = max(int(low[0]), 0), max(int(low[1]), 0)
     columns, rows = (min(int(high[0]), width) - u0) // k, (min(int(high[1]), height) - v0) // k
     if min(columns, rows) < _LEAST_PICTURE_PX:
@@ -788,7 +821,7 @@ def part_around(
     lens = Lens(
         (0.5 * np.array([width - 1, height - 1]) - shift) / k, 0.5 * float(np.hypot(width, height)) / k
     )
-    return Part(image, (points - shift) / k, k, origin, lens, _noise(image), halo_px)
+    return Part(image, (points - shift) / k, k, origin, lens, _noise(image))
 
 
 def _colours(fit: LocalFit, shape: tuple[int, int]) -> FloatArray:
@@ -817,9 +850,10 @@ def _trusted(part: Part, fit: LocalFit) -> BoolArray:
     return np.asarray(fit.converged & _sound(part, fit))
 
 
-def _merged(fit: LocalFit, again: LocalFit, where: IntArray, use: BoolArray) -> LocalFit:
+def _merged(fit: LocalFit, again: LocalFit, where: IntArray, use: BoolArray | None = None) -> LocalFit:
     """`fit` with the corners `where` (indices) replaced by those of `again` that are to be used."""
     values = {}
+    use = np.ones(len(where), dtype=np.bool_) if use is None else use
     for name in LocalFit.__dataclass_fields__:
         merged = getattr(fit, name).copy()
         merged[where[use]] = getattr(again, name)[use]
@@ -827,13 +861,14 @@ def _merged(fit: LocalFit, again: LocalFit, where: IntArray, use: BoolArray) -> 
     return LocalFit(**values)
 
 
-def _closer_looked(part: Part, fit: LocalFit, frames: Frames) -> LocalFit:
+def _closer_looked(part: Part, fit: LocalFit, grid: FloatArray) -> LocalFit:
     """Fit with a smaller window the corners that something near them disturbs: a margin, a shadow, a hand."""
     typical = float(np.median(fit.residual))
     doubtful = np.flatnonzero((fit.residual > _DISTURBED * typical + 0.02) | ~fit.converged)
     if len(doubtful) == 0:
         return fit
-    again = fit_corners(part, fit.points[doubtful], frames.take(doubtful), window=_CLOSE_WINDOW)
+    frames = frames_of(grid).take(doubtful)
+    again = fit_corners(part, fit.points[doubtful], frames, window=_CLOSE_WINDOW)
     use = again.converged & (again.residual < np.where(fit.converged, 0.7 * fit.residual, np.inf)[doubtful])
     return _merged(fit, again, doubtful, use)
 
@@ -843,14 +878,14 @@ class _Check:
     """What the other corners say of each of N fits.
 
     Its place, the distance to it, the distance that is doubtful and the distance that is out of the
-    question.
+    question; `grid` (rows, columns, 2) holds the good fits and the places of the others.
     """
 
     placed: FloatArray
     away: FloatArray
     bound: FloatArray
     far: FloatArray
-    frames: Frames
+    grid: FloatArray
 
 
 def _checked(part: Part, fit: LocalFit, good: BoolArray) -> tuple[_Check, Prediction] | None:
@@ -858,12 +893,12 @@ def _checked(part: Part, fit: LocalFit, good: BoolArray) -> tuple[_Check, Predic
     if prediction is None:
         return None
     placed = prediction.points.reshape(-1, 2)
-    frames = frames_of(np.where(good[:, None], fit.points, placed).reshape(*part.shape, 2))
-    square = np.minimum(np.linalg.norm(frames.along, axis=1), np.linalg.norm(frames.across, axis=1))
+    grid = np.where(good[:, None], fit.points, placed).reshape(*part.shape, 2)
+    square = _sides_px(grid).ravel()
     away = np.linalg.norm(fit.points - placed, axis=1)
     far = _FAR * square
     bound = np.minimum(np.maximum(prediction.limit_px.ravel(), _SIGMAS * fit.sigma_px), far)
-    return _Check(placed, away, bound, far, frames), prediction
+    return _Check(placed, away, bound, far, grid), prediction
 
 
 def _rescued(part: Part, fit: LocalFit) -> tuple[LocalFit, BoolArray, Prediction] | None:
@@ -877,8 +912,8 @@ def _rescued(part: Part, fit: LocalFit) -> tuple[LocalFit, BoolArray, Prediction
         doubtful = np.flatnonzero(~good | ~(check.away < check.bound))
         if len(doubtful) == 0:
             return fit, good, prediction
-        again = fit_corners(part, check.placed[doubtful], check.frames.take(doubtful), window=window)
-        trial = _merged(fit, again, doubtful, np.ones(len(doubtful), dtype=np.bool_))
+        again = fit_corners(part, check.placed[doubtful], frames_of(check.grid).take(doubtful), window=window)
+        trial = _merged(fit, again, doubtful)
         near = np.linalg.norm(again.points - check.placed[doubtful], axis=1)
         use = _trusted(part, trial)[doubtful] & (~good[doubtful] | (near < 0.7 * check.away[doubtful]))
         fit = _merged(fit, again, doubtful, use)
@@ -914,20 +949,29 @@ def _begun(gray: GrayImage, points: FloatArray) -> tuple[Part, LocalFit] | None:
 
 def _sharpened(part: Part, first: LocalFit) -> tuple[Part, LocalFit]:
     """The same with the halo that fits best, where the corners are not those of a picture as taken."""
-    plain = float(np.median(misshape(first, part.noise)))
-    if plain < _HALO_MISSHAPE:
+    if float(np.median(misshape(first, part.noise))) < _HALO_MISSHAPE:
         return part, first
-    start = part.points
-    best, least = (part, first), _HALO_GAIN * plain
-    for halo_px in _HALOS_PX:
+    every = part.points.reshape(-1, 2)
+    frames = frames_of(part.points)
+
+    def with_halo(halo_px: float, chosen: IntArray) -> tuple[Part, LocalFit]:
         other = replace(part, halo_px=halo_px)
-        fit = fit_corners(
-            other, start.reshape(-1, 2), frames_of(start), _FIRST_ITERATIONS, _FIRST_REACH_PX, warm=first
+        return other, fit_corners(
+            other,
+            every[chosen],
+            frames.take(chosen),
+            _FIRST_ITERATIONS,
+            _FIRST_REACH_PX,
+            warm=first.take(chosen),
         )
-        found = float(np.median(misshape(fit, part.noise)))
-        if found < least:
-            best, least = (other, fit), found
-    return best
+
+    some = np.linspace(0, len(every) - 1, min(_HALO_CORNERS, len(every))).astype(np.int64)
+    best, least = 0.0, _HALO_GAIN * float(np.median(misshape(first.take(some), part.noise)))
+    for halo_px in _HALOS_PX:
+        left = float(np.median(misshape(with_halo(halo_px, some)[1], part.noise)))
+        if left < least:
+            best, least = halo_px, left
+    return with_halo(best, np.arange(len(every))) if best else (part, first)
 
 
 def refine(gray: GrayImage, points: FloatArray) -> Refined | None:
@@ -955,16 +999,21 @@ def refine(gray: GrayImage, points: FloatArray) -> Refined | None:
     away = np.linalg.norm(first.points - rough.points.reshape(-1, 2), axis=1)
     stays = sound & (away < rough.limit_px.ravel())
     moved = np.where(stays[:, None], first.points, rough.points.reshape(-1, 2)).reshape(start.shape)
-    fit = first
+    fit, unsteady = first, np.arange(len(first.points))
     for _ in range(_PASSES):
-        fit = fit_corners(part, moved.reshape(-1, 2), frames_of(moved), warm=fit)
+        again = fit_corners(
+            part, moved.reshape(-1, 2)[unsteady], frames_of(moved).take(unsteady), warm=fit.take(unsteady)
+        )
+        fit = again if len(unsteady) == len(fit.points) else _merged(fit, again, unsteady)
         before, moved = (
             moved,
             np.where(_sound(part, fit)[:, None], fit.points, moved.reshape(-1, 2)).reshape(start.shape),
         )
-        if np.max(np.abs(moved - before)) < _STEADY_PX:
+        steady = np.max(np.abs(moved - before), axis=2).ravel() < _STEADY_PX
+        unsteady = np.flatnonzero(~(steady & fit.converged))
+        if len(unsteady) == 0:
             break
-    fit = _closer_looked(part, fit, frames_of(moved))
+    fit = _closer_looked(part, fit, moved)
     rescued = _rescued(part, fit)
     if rescued is None:
         return None
@@ -980,6 +1029,5 @@ def refine(gray: GrayImage, points: FloatArray) -> Refined | None:
         narrow=(fit.window < WINDOW).reshape(shape),
         refined=good.reshape(shape),
         misfit_px=part.k * prediction.spread_px,
-        k=part.k,
-        halo_px=part.halo_px,
+        part=part,
     )

@@ -32,9 +32,9 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from scipy import special
 
 from calib.core.arrays import BoolArray, FloatArray, IntArray
+from calib.solve.chance import tail_of_f
 from calib.stages.camera.bundle import Calibration, joint_jacobian, minimise, poses_with_camera
 from calib.stages.camera.checks import evidence, resolved, scaled_inverse
 from calib.stages.camera.model import LeftOut, Observations, project
@@ -151,7 +151,7 @@ def _disagreement(
     T = np.where(counts, y2 / (told * (r2 + told)), 0.0).sum(axis=1) / (typical * phi2)
     # The median of few views is uncertain; about a third of their components fix it.
     second = max(float(freedom[core].sum()) / 3, 2.0)
-    chance = special.fdtrc(np.maximum(freedom, 1), second, T / np.maximum(freedom, 1))
+    chance = tail_of_f(np.maximum(freedom, 1), second, T / np.maximum(freedom, 1))
     chance = np.where(freedom > 0, chance, 1.0)
     return _Disagreement(S_core, d, score, T / np.maximum(freedom, 1), chance, variance, typical, phi2)
 
