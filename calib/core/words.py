@@ -153,9 +153,10 @@ def facts(section: BaseModel) -> list[tuple[str, str]]:
                 name = _AXES[item] if isinstance(item, int) else as_words(str(item))
                 one = value[item] if isinstance(item, int) else _item(value, str(item))
                 own = unit or unit_of(str(item))
-                out.append(
-                    (f"{field.title} {name}", f"{number(_scaled(one, scale), None, places)} {own}".strip())
-                )
+                bars = _sigma(sigmas, key)
+                bar = bars[item] if isinstance(bars, list) and isinstance(item, int) else None
+                (text,) = _vector([one], [bar], scale, places)
+                out.append((f"{field.title} {name}", f"{text} {own}".strip()))
         elif wanted and isinstance(value, bool | str):
             out.append((str(field.title), _word(value)))
         elif wanted:

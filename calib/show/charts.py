@@ -41,9 +41,9 @@ from calib.core.plot import (
 )
 from calib.core.writing import make_folder, write_atomically
 
-MOST_POINTS = 500
+MOST_POINTS = 400
 """Points of a line, the least and the largest of each stretch: a chart is about twice as many px wide."""
-_MOST_DOTS = 1200
+_MOST_DOTS = 900
 _MOST_CELLS = 1500
 """Of a map."""
 _PX_PER_IN = 80.0

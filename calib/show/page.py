@@ -282,10 +282,10 @@ def _cell(value: Any) -> Cell:
 # and a policy in the page lets no script run but its own. Nothing of time or place goes in: the same
 # inputs give the same bytes.
 
-MOST_BYTES = 2_200_000
+MOST_BYTES = 2_000_000
 """A page is never larger, the charts' library not counted; figures that do not fit are named instead."""
 _VIEWS_BYTES = 1_000_000
-_ROOM_BYTES = 400_000
+_ROOM_BYTES = 450_000
 """What is kept for words, tables and numbers."""
 _MOST_COUNTED = 3
 """Figures of one kind for each log that a stage shows, so that there is room for the states of all logs."""

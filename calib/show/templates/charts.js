@@ -140,8 +140,7 @@
   const config = { displaylogo: false, plotlyServerURL: "",
     modeBarButtons: [["toImage", "zoom2d", "pan2d", "zoomIn2d", "zoomOut2d", "resetScale2d"]] };
   const drawn = new Map();
-  const draw = (place) => {
-    const width = Math.floor(place.clientWidth);
+  const draw = (place, width = Math.floor(place.clientWidth)) => {
     const look = String(dark()) + width;
     if (!width || drawn.get(place) === look) return;
     drawn.set(place, look);
@@ -161,5 +160,8 @@
   const again = () => { for (const place of drawn.keys()) draw(place); };
   document.getElementById("theme").addEventListener("click", again);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", again);
-  addEventListener("beforeprint", () => { for (const place of places) draw(place); });
+  // On paper a chart has the width of a wide window, whatever window it is printed from.
+  const PRINTED_PX = 960;
+  addEventListener("beforeprint", () => { for (const place of places) if (place.clientWidth) draw(place, PRINTED_PX); });
+  addEventListener("afterprint", again);
 })();
