@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from pathlib import Path
 from typing import Annotated
 
@@ -35,6 +36,13 @@ def live(
     square: Annotated[
         str | None,
         typer.Option(metavar="LENGTH", help="Side of a square with its unit, as 20mm. [default: board.yaml]"),
+    ] = None,
+    port: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PORT",
+            help="Serial port of a board, as /dev/ttyUSB0: its recordings are made from the page too.",
+        ),
     ] = None,
     browser: Annotated[
         bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")
@@ -74,7 +82,9 @@ def live(
     session.views.update((view.name, view) for view in views)
     if views:
         narrate(f"{shown(album.images)}: going on with {len(views)} pictures")
-    at_work = Live(session, album, frames)
+    if port is not None and importlib.util.find_spec("serial") is None:
+        raise UsageError(f"--port needs pyserial: {pip_install('serial')}")
+    at_work = Live(session, album, frames, port)
 
     def ready(address: str) -> None:
         narrate(f"open {address}; Done on the page, or Ctrl-C, ends it")

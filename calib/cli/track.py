@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from calib.core.arrays import FloatArray
     from calib.stages.camera.marker import Disc, Tracker
 
-_HEAD = "t_s,u_px,v_px,sigma_px"
 _GATE = 0.9
 """Share of the frames that must show the marker."""
 
@@ -64,15 +63,21 @@ def track(
     A frame in which the marker is not seen, or not told apart from another disc, has no row. Exits 1 when
     fewer than 90 of 100 frames have one.
     """
-    import numpy as np
-
     from calib.core.files import shown
     from calib.core.units import parse_duration_s, parse_length_m, parse_pixel
     from calib.core.writing import Kind, check_writable, column_names, write_atomically
     from calib.io.frames import timed_frames
-    from calib.stages.camera.marker import Colour, Tracker, colour_at, parse_colour, scatter_px
+    from calib.stages.camera.marker import (
+        TRACK_COLUMNS,
+        Colour,
+        Tracker,
+        colour_at,
+        parse_colour,
+        track_rows,
+        track_text,
+    )
 
-    kind = Kind("a track", (".csv",), lambda path: ",".join(column_names(path)) == _HEAD)
+    kind = Kind("a track", (".csv",), lambda path: tuple(column_names(path)) == TRACK_COLUMNS)
     start = None if at is None else parse_pixel(at, "--at")
     limit_s = None if duration is None else parse_duration_s(duration, "--duration")
     wanted = None if colour is None else parse_colour(colour)
@@ -120,26 +125,14 @@ def track(
     seen = sum(one is not None for one in found)
     if tracker is None or not seen:
         raise BadInputError(f"{shown(source)}: {_why(tracker, start is not None)}")
-    nowhere = np.full(2, np.nan)
-    usual = float(np.median([one.sigma_px for one in found if one is not None]))
-    scatter = scatter_px(np.array([nowhere if one is None else one.centre_px for one in found]))
-    factor = max(1.0, scatter / usual) if np.isfinite(scatter) else 1.0
-    rows, sigmas = [_HEAD], []
-    for t_s, one in zip(times.settled_s(), found, strict=False):
-        if one is None:
-            continue
-        u, v = one.pixy_px() if pixy else one.centre_px if centre is None else centre(one.centre_px)
-        # A whole pixel is off by up to half of one, evenly.
-        sigma = 12**-0.5 if pixy else factor * one.sigma_px
-        sigmas.append(sigma)
-        rows.append(f"{t_s:.6f},{u:.{0 if pixy else 3}f},{v:.{0 if pixy else 3}f},{sigma:.3f}")
-    write_atomically(output, "\n".join(rows) + "\n", kind)
+    rows = track_rows(times.settled_s(), found, pixy, centre)
+    write_atomically(output, f"{','.join(TRACK_COLUMNS)}\n{track_text(rows, pixy)}", kind)
     told: dict[str, Any] = {
         "frames": len(found),
         "found": seen,
         "lost": tracker.lost,
         "doubled": tracker.doubled,
-        "sigma_px": sorted(sigmas)[len(sigmas) // 2],
+        "sigma_px": sorted(row[3] for row in rows)[len(rows) // 2],
         "times": times.words(),
     }
     if as_json:

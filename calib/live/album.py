@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import yaml
 
 from calib.core.errors import BadInputError
 from calib.core.files import shown
@@ -16,7 +19,7 @@ from calib.stages.camera.model import View
 from calib.stages.camera.read import BOARD_FILE, BoardFile, Told, read_board_file, read_views
 
 if TYPE_CHECKING:
-    from calib.stages.camera.section import Camera
+    from calib.stages.camera.section import Camera, Plane
 
 MOST_PICTURES = 300
 """Pictures of one session."""
@@ -36,6 +39,16 @@ class Album:
     def images(self) -> Path:
         """Where the pictures are."""
         return self.folder / "images"
+
+    @property
+    def plane(self) -> Path:
+        """Where the picture of the board in the plane of motion is."""
+        return self.images / "plane"
+
+    @property
+    def logs(self) -> Path:
+        """Where recordings are."""
+        return self.folder / "logs"
 
     @property
     def rig(self) -> Path:
@@ -123,19 +136,58 @@ class Album:
         move(self.dropped / name, self.images / name)
         return True
 
+    def lay(self, png: bytes, board: BoardFile) -> Plane:
+        """Save a picture of the board in the plane and where it lies; what `calib extrinsics` makes of it.
+
+        An earlier picture, and what was written of it, goes into `images/plane/dropped/`.
+
+        Raises `BadInputError` where it shows no plane; it is not kept then, and an earlier one stays.
+        """
+        before = [path for path in self.plane.glob("*") if path.is_file()]
+        aside = self.plane / _DROPPED
+        place = next(one for k in count(1) if not (one := aside / str(k)).exists())
+        make_folder(self.plane)
+        if before:
+            make_folder(place)
+        for path in before:
+            move(path, place / path.name)
+        new = [self.plane / BOARD_FILE, self.plane / "plane001.png"]
+        try:
+            text = yaml.safe_dump(
+                board.model_dump(exclude_unset=True), sort_keys=False, default_flow_style=None
+            )
+            write_atomically(new[0], text, _BOARD)
+            write_atomically(new[1], png, _PICTURE)
+            plane: Plane = self._carried_out("extrinsics", self.plane)
+        except BadInputError:
+            for path in new:
+                path.unlink(missing_ok=True)
+            for path in before:
+                move(place / path.name, path)
+            raise
+        return plane
+
+    def new_log(self, name: str) -> Path:
+        """Where the next recording of this name goes; no other one is there."""
+        make_folder(self.logs)
+        return next(path for k in count(1) if not (path := self.logs / f"{name}{k}.csv").exists())
+
     def calibrate(self) -> Camera:
         """What `calib intrinsics images/` makes of the pictures, written into rig.yaml by its stage.
 
         Raises `BadInputError` where they make no camera.
         """
+        camera: Camera = self._carried_out("intrinsics", self.images)
+        return camera
+
+    def _carried_out(self, verb: str, pictures: Path) -> Any:
         from calib.core.stage import options_of
         from calib.runner.work import carry_out
         from calib.stages import stage
 
-        intrinsics = stage("intrinsics")
-        files = Files((self.images,), self.rig, figures=False, keep=False)
-        camera: Camera = carry_out(intrinsics, files, options_of(intrinsics.options, {}), self.rig)[0]
-        return camera
+        made = stage(verb)
+        files = Files((pictures,), self.rig, figures=False, keep=False)
+        return carry_out(made, files, options_of(made.options, {}), self.rig)[0]
 
 
 _NUMBER = re.compile(r"(\d{1,9})\.\w+$")

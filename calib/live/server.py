@@ -36,8 +36,12 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from calib.core.arrays import AnyArray
 from calib.core.errors import BadInputError, CalibError
 from calib.core.files import read_bytes, shown
+from calib.core.rig import Rig
 from calib.io.pictures import declared_pixels, decoded_picture
 from calib.live.album import MOST_PICTURES, Album
+from calib.live.board import Board
+from calib.live.marker import Marker
+from calib.live.plane import Flat
 from calib.live.session import Seen, Session
 from calib.live.sources import MOST_PIXELS, Source, decode
 
@@ -50,6 +54,8 @@ _MOST_TABS = 6
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 _PREVIEW_PX = 800
 _SWITCH_S = 0.0005
+STEPS = ("camera", "plane", "marker", "board")
+_PLOTS_S = 0.3
 _SHOT_S = 5.0
 """How long a page may take to send the whole picture that it was asked for."""
 
@@ -63,6 +69,7 @@ class _Tab:
     size_px: tuple[int, int] | None = None
     shot_until: float = 0.0
     by_hand: bool = False
+    taken_s: float | None = None
 
     async def tell(self, message: dict[str, Any]) -> None:
         """Send words; a page that has gone is no reason to fail."""
@@ -81,8 +88,14 @@ class _Tab:
 class Live:
     """A session, its folder, where frames come from, and the pages that look at it."""
 
-    def __init__(self, session: Session, album: Album, source: Source | None) -> None:
+    def __init__(
+        self, session: Session, album: Album, source: Source | None, port: str | None = None
+    ) -> None:
         self.session, self.album, self.source = session, album, source
+        self.step = STEPS[0]
+        self.flat, self.marker = Flat(session), Marker(album)
+        self.board = None if port is None else Board(album, port)
+        self.rig = Rig.load(album.rig, missing_ok=True)
         self.token = secrets.token_urlsafe(24)
         self.finished = threading.Event()
         self.auto = True
@@ -104,9 +117,13 @@ class Live:
         """All that a page shows."""
         with self._lock:
             shown_ = self.session.shown()
+            steps = {"plane": self.flat.shown(self.rig), "marker": self.marker.shown()}
         return {
             "type": "state",
             **shown_,
+            **steps,
+            "step": self.step,
+            "board": None if self.board is None else self.board.shown(),
             "dropped": self.album.left_out(),
             "folder": str(self.album.folder),
             "source": "browser" if self.source is None else "single" if self.source.single else "here",
@@ -131,15 +148,32 @@ class Live:
     # ------------------------------------------------------------------
     # Frames and pictures.
 
-    def _look(self, frame: AnyArray, size_px: tuple[int, int] | None, still: bool) -> Seen:
-        gray = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+    def _look(
+        self, frame: AnyArray, size_px: tuple[int, int] | None, still: bool, taken_s: float | None = None
+    ) -> tuple[dict[str, Any], bool]:
+        """What a page is told of a frame, and whether it shall be taken."""
+        now = time.monotonic()
         with self._lock:
-            return self.session.look(np.asarray(gray, dtype=np.uint8), time.monotonic(), size_px, still)
+            if self.step == "board":
+                return {"type": "seen", "code": "hold", "says": "", "corners": None}, False
+            if self.step == "marker":
+                told = self.marker.follow(frame, now if taken_s is None else taken_s)
+                return {"type": "seen", "corners": None, **told}, False
+            gray = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+            gray8 = np.asarray(gray, dtype=np.uint8)
+            if self.step == "plane":
+                return _seen(self.flat.look(gray8, size_px)), False
+            seen = self.session.look(gray8, now, size_px, still)
+            return _seen(seen), seen.take and self.auto
 
     def _take(self, png: bytes, by_hand: bool) -> str | Seen:
-        """Name of a picture that was taken and saved, or why it was not."""
+        """Name of a picture that was taken and saved, or why it was not, or what else is to be done."""
         gray = decoded_picture(png, "the picture", "picture", "").gray
         with self._lock:
+            if self.step == "plane":
+                return self.flat.take(gray, png)
+            if self.step != "camera":
+                return Seen(None, "hold", "")
             if len(self.session.views) >= MOST_PICTURES:
                 raise BadInputError(f"there are {MOST_PICTURES} pictures already, the most of one session")
             name = self.album.new_name()
@@ -170,6 +204,9 @@ class Live:
             return
         if isinstance(name, Seen):
             await self.tell_all({"type": "seen", "code": name.code, "says": name.says, "corners": None})
+            if name.code == "taken":
+                await self.tell_all({"type": "taken", "name": ""})
+                await self.tell_all(self.state())
             return
         await self.tell_all({"type": "taken", "name": name})
         await self._changed()
@@ -195,8 +232,10 @@ class Live:
                 self._saved = str(self.album.rig)
         except CalibError as error:
             self._saved = f"not saved: {error}"
+        rig = Rig.load(self.album.rig, missing_ok=True)
         with self._lock:
             self.session.fitted(fit)
+            self.rig = rig
         self._fits = number
 
     async def pump(self) -> None:
@@ -210,14 +249,14 @@ class Live:
                 await self.tell_all({"type": "camera", "fault": fault})
             if frame is None:
                 continue
-            seen = await self._in(self._looking, self._look, frame, None, self.source.single)
+            seen, take = await self._in(self._looking, self._look, frame, None, self.source.single)
             await self._learnt()
             preview = await asyncio.to_thread(_preview, frame)
             for tab in list(self._tabs):
                 await tab.show(preview)
-            await self.tell_all(_seen(seen))
+            await self.tell_all(seen)
             by_hand, self._by_hand = self._by_hand, False
-            if by_hand or (seen.take and self.auto):
+            if by_hand or take:
                 _, png = cv2.imencode(".png", frame)
                 await self._taken(png.tobytes(), by_hand)
 
@@ -233,7 +272,7 @@ class Live:
         tab = _Tab(websocket)
         self._tabs.append(tab)
         try:
-            await tab.tell(self.state())
+            await tab.tell(await asyncio.to_thread(self.state))
             if self.source is not None and self.source.fault:
                 await tab.tell({"type": "camera", "fault": self.source.fault})
             while True:
@@ -262,6 +301,9 @@ class Live:
         if what == "camera":
             tab.size_px = _size_px(asked.get("size"))
             await self._lend(tab)
+        elif what == "at":
+            at_s = asked.get("t_s")
+            tab.taken_s = float(at_s) if isinstance(at_s, int | float) and 0 <= at_s < 1e9 else None
         elif what == "take":
             if self.source is not None:
                 self._by_hand = True
@@ -274,8 +316,95 @@ class Live:
             await self._put(name, what == "back")
         elif what == "done":
             await self._done()
+        elif what in self._steps:
+            try:
+                await self._in(self._fitting if what == "place" else self._looking, self._steps[what], asked)
+            except CalibError as error:
+                await self.tell_all({"type": "fault", "says": _sentence(error)})
+            await self.tell_all(await asyncio.to_thread(self.state))
         else:
             await tab.tell({"type": "fault", "says": "The page asked for what this version does not know."})
+
+    # ------------------------------------------------------------------
+    # Plane, marker and board: what a page asks of them.
+
+    @property
+    def _steps(self) -> dict[str, Callable[[dict[str, Any]], None]]:
+        return {
+            "step": self._go,
+            "point": self._point,
+            "place": self._place,
+            "again": lambda asked: self._held(self.flat.drop),
+            "colour": lambda asked: self._held(self.marker.named, str(asked.get("name", ""))),
+            "record": self._record,
+            "stop": self._stop,
+        }
+
+    def _held(self, work: Callable[..., None], *given: Any) -> None:
+        with self._lock:
+            work(*given)
+
+    def _go(self, asked: dict[str, Any]) -> None:
+        step = asked.get("name")
+        if step not in STEPS or (step == "board" and self.board is None):
+            raise BadInputError("there is no such step")
+        if step == "plane" and self.rig.camera is None:
+            raise BadInputError("the camera comes first: take its pictures")
+        self._held(self._set, step)
+
+    def _set(self, step: str) -> None:
+        self.marker.stop()
+        self.step = step
+
+    def _point(self, asked: dict[str, Any]) -> None:
+        at = asked.get("at")
+        if not (isinstance(at, list) and len(at) == 2 and all(isinstance(x, int | float) for x in at)):
+            raise BadInputError("that is no place in the picture")
+        if not all(-1e5 < x < 1e5 for x in at):
+            raise BadInputError("that is no place in the picture")
+        if self.step == "plane":
+            self._held(self.flat.choose, (at[0], at[1]))
+        elif self.step == "marker":
+            self._held(self.marker.click, (at[0], at[1]))
+
+    def _place(self, asked: dict[str, Any]) -> None:
+        """Save the board in the plane where a person says it lies, and calibrate the plane."""
+        with self._lock:
+            board, png = self.flat.place(asked), self.flat.png
+        assert png is not None
+        self.album.lay(png, board)
+        rig = Rig.load(self.album.rig)
+        with self._lock:
+            self.rig = rig
+            self.flat.drop()
+
+    def _record(self, asked: dict[str, Any]) -> None:
+        if self.step == "marker":
+            self._held(self.marker.start)
+        elif self.step == "board" and self.board is not None:
+            self._held(self.board.start, str(asked.get("name", "")))
+
+    def _stop(self, asked: dict[str, Any]) -> None:
+        del asked
+        self._held(self.marker.stop)
+        if self.board is not None:
+            self.board.stop()
+
+    async def _plots(self) -> None:
+        """Tell the pages what a board sends, as long as it does."""
+        while True:
+            await asyncio.sleep(_PLOTS_S)
+            board = self.board
+            if board is not None and board.at_work and self._tabs:
+                ended = await asyncio.to_thread(board.ended)
+                if ended:
+                    await self.tell_all(await asyncio.to_thread(self.state))
+                else:
+                    await self.tell_all({"type": "board", "board": await asyncio.to_thread(board.shown)})
+            elif self.step == "marker" and self._tabs:
+                with self._lock:
+                    told = self.marker.shown()
+                await self.tell_all({"type": "marker", "marker": told})
 
     async def _lend(self, tab: _Tab) -> None:
         """Let this page's camera be the one that counts."""
@@ -302,13 +431,13 @@ class Live:
             if frame is None:
                 await tab.tell({"type": "fault", "says": "A frame cannot be decoded."})
                 return
-            seen = await self._in(self._looking, self._look, frame, tab.size_px, False)
+            seen, take = await self._in(self._looking, self._look, frame, tab.size_px, False, tab.taken_s)
             await self._learnt()
             for other in list(self._tabs):
-                await other.tell(_seen(seen))
+                await other.tell(seen)
                 if other is not tab:
                     await other.show(data)
-            if seen.take and self.auto and time.monotonic() >= tab.shot_until:
+            if take and time.monotonic() >= tab.shot_until:
                 await self._shoot(tab, by_hand=False)
 
     async def _put(self, name: str, back: bool) -> None:
@@ -359,12 +488,21 @@ class Live:
                 return PlainTextResponse("no such picture\n", 404)
             return Response(await asyncio.to_thread(_thumbnail, path), media_type="image/jpeg")
 
+        async def held(request: Request) -> Response:
+            del request
+            png = self.flat.png
+            frame = None if png is None else await asyncio.to_thread(decode, png)
+            if frame is None:
+                return PlainTextResponse("no picture in hand\n", 404)
+            return Response(await asyncio.to_thread(_preview, frame), media_type="image/jpeg")
+
         @contextlib.asynccontextmanager
         async def lifespan(_: Starlette) -> Any:
             if self.album.names():
                 await self._changed()
             if self.source is not None:
                 self._start(self.pump())
+            self._start(self._plots())
             yield
             for task in list(self._tasks):
                 task.cancel()
@@ -373,6 +511,7 @@ class Live:
         routes = [
             Route(f"{root}/", html),
             Route(f"{root}/picture/{{name}}", thumb),
+            Route(f"{root}/held", held),
             WebSocketRoute(f"{root}/socket", self.page),
         ]
         return Guard(Starlette(routes=routes, lifespan=lifespan), self.token, port)
@@ -403,6 +542,7 @@ class Live:
         finally:
             server.should_exit = True
             thread.join(5.0)
+            self._stop({})
             if self.source is not None:
                 self.source.close()
             self._looking.shutdown(cancel_futures=True)
@@ -473,6 +613,11 @@ def _with_headers(send: Send) -> Send:
         await send(message)
 
     return sends
+
+
+def _sentence(error: CalibError) -> str:
+    text = str(error)
+    return text[:1].upper() + text[1:]
 
 
 def _seen(seen: Seen) -> dict[str, Any]:

@@ -146,27 +146,12 @@ class Session:
         size_px : width and height of the whole picture, where the frame is a copy.
         still : whether the frame is a picture that somebody took already, in whatever pose.
         """
-        size_px = size_px or (gray.shape[1], gray.shape[0])
-        if self.size_px is not None and self.views and size_px != self.size_px:
-            return Seen(None, "size", _other_size(size_px, self.size_px))
-        self.size_px = size_px
-        n = 1
-        while max(gray.shape) / n > _LOOK_PX:
-            n += 1
-        level = resized(gray, 1.0 / n)
-        if self.corners is None:
-            self.corners = _size_of(level.image)
-            if self.corners is None:
-                self._past.clear()
-                return Seen(None, "no board", "Hold the whole board into the picture, with light on it.")
-        found = detect(level.image, *self.corners)
-        if found is None:
+        found = self.found(gray, size_px)
+        if isinstance(found, Seen):
             self._past.clear()
-            return Seen(None, "no board", self._sought())
-        scale = size_px[0] / level.image.shape[1]
-        grid = (found.pixels.reshape(self.corners[1], self.corners[0], 2) + 0.5) * scale - 0.5
+            return found
+        grid, fault = found
         hold = self._holds_still(grid, t_s)
-        fault = self._fault(level.image, found, scale)
         if fault is not None:
             return Seen(grid, *fault)
         if self.enough:
@@ -184,6 +169,32 @@ class Session:
         if not hold:
             return Seen(grid, "hold", "Good. Hold still.", matched=matched)
         return Seen(grid, "taken", "Good.", take=True, matched=matched)
+
+    def found(
+        self, gray: GrayImage, size_px: tuple[int, int] | None = None
+    ) -> tuple[FloatArray, tuple[Code, str] | None] | Seen:
+        """Corners (rows, columns, 2) of the board in pixels of the whole picture, and what is wrong with it.
+
+        Else why there are none. Parameters as for `look`.
+        """
+        size_px = size_px or (gray.shape[1], gray.shape[0])
+        if self.size_px is not None and self.views and size_px != self.size_px:
+            return Seen(None, "size", _other_size(size_px, self.size_px))
+        self.size_px = size_px
+        n = 1
+        while max(gray.shape) / n > _LOOK_PX:
+            n += 1
+        level = resized(gray, 1.0 / n)
+        if self.corners is None:
+            self.corners = _size_of(level.image)
+            if self.corners is None:
+                return Seen(None, "no board", "Hold the whole board into the picture, with light on it.")
+        board = detect(level.image, *self.corners)
+        if board is None:
+            return Seen(None, "no board", self._sought())
+        scale = size_px[0] / level.image.shape[1]
+        grid = (board.pixels.reshape(self.corners[1], self.corners[0], 2) + 0.5) * scale - 0.5
+        return grid, self._fault(level.image, board, scale)
 
     def _sought(self) -> str:
         assert self.corners is not None

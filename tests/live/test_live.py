@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import http.client
 import json
+import os
+import re
 import shutil
 import signal
 import subprocess
@@ -21,11 +23,14 @@ import numpy as np
 import pytest
 from chromium import browser_or_skip
 from liveboards import BOARD, CAMERA, Person, follow, random_poses, write_y4m
+from markervideos import Scene
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from calib.cli.main import main
 from calib.core.errors import BadInputError
+from calib.io.logs import read_log
+from calib.io.serial import Frame, Inputs, Outputs, encoded
 from calib.live.album import Album
 from calib.live.server import MOST_BYTES, Live
 from calib.live.session import ENOUGH, Seen, Session, edge_blur_px
@@ -33,7 +38,7 @@ from calib.live.sources import MOST_PIXELS, Source, Watched, source_of
 from calib.stages.camera.bundle import calibrate, covariance, projection_sigma_px
 from calib.stages.camera.intrinsics import calibrate_camera
 from calib.stages.camera.model import View, pack
-from calib.stages.camera.read import Told
+from calib.stages.camera.read import BoardFile, Told
 from calib.stages.camera.stage import image_grid
 from calib.twin.scene import Light, PrintedBoard, Sensor, corner_pixels, pose_facing, render
 
@@ -66,6 +71,7 @@ def test_from_the_first_frame_to_enough() -> None:
     assert len(shown["tilts"]) == len(poses) and np.abs(shown["tilts"]).max() > 25
 
 
+@pytest.mark.slow
 def test_guided_pictures_are_worth_twice_as_many_taken_at_random() -> None:
     """Worst projection sigma of twelve pictures, at the same noise of corners, over the whole picture."""
     noise_px, count = 0.1, 12
@@ -217,10 +223,10 @@ def test_a_video_is_looked_at_as_a_camera_would_be(tmp_path: Path) -> None:
 
 
 @contextlib.contextmanager
-def served(folder: Path, source: Source | None = None) -> Iterator[Any]:
+def served(folder: Path, source: Source | None = None, port: str | None = None) -> Iterator[Any]:
     album = Album(folder)
     _, views = album.open(Told())
-    live = Live(Session(views={view.name: view for view in views}), album, source)
+    live = Live(Session(views={view.name: view for view in views}), album, source, port)
     ready, address = threading.Event(), list[str]()
 
     def tell(where: str) -> None:
@@ -368,6 +374,162 @@ def test_a_page_sends_frames_and_what_is_too_large_is_refused(tmp_path: Path) ->
         second.send('{"do": "done"}')
         assert heard(second, "done")["folder"] == str(live.album.folder)
     assert MOST_PIXELS * 3 > MOST_BYTES
+
+
+def half_a_rig(folder: Path, project_root: Path) -> bytes:
+    """A folder with pictures for the camera; the picture of its board in the plane."""
+    (folder / "images").mkdir(parents=True)
+    for path in sorted((project_root / "images").glob("view*.png"))[:8]:
+        shutil.copy(path, folder / "images")
+    (folder / "images" / "board.yaml").write_text("corners: [7, 5]\nsquare_m: 0.02\n")
+    return next((project_root / "images" / "plane").glob("*.png")).read_bytes()
+
+
+def test_the_plane_is_what_extrinsics_makes_of_the_corner_that_was_clicked(
+    tmp_path: Path, project_root: Path
+) -> None:
+    rig = tmp_path / "rig"
+    picture = half_a_rig(rig, project_root)
+    with served(rig) as live, tab(live) as line:
+        line.send('{"do": "camera", "size": [316, 208]}')
+        wait(lambda: live.rig.camera is not None and not live.state()["fitting"])
+        line.send('{"do": "place", "x_mm": 0, "y_mm": 0, "angle_deg": 0}')
+        assert "First take a picture" in heard(line, "fault")["says"]
+
+        def lay(corner: int, **place: Any) -> None:
+            line.send('{"do": "step", "name": "plane"}')
+            wait(lambda: live.step == "plane")
+            line.send(jpeg(cv2.imdecode(np.frombuffer(picture, np.uint8), 0)))
+            wait(lambda: "plane of motion?" in heard(line, "seen")["says"])
+            line.send('{"do": "take"}')
+            heard(line, "shoot")
+            line.send(picture)
+            wait(lambda: live.flat.png is not None)
+            ends = live.state()["plane"]["ends"]
+            line.send(json.dumps({"do": "point", "at": ends[corner][0]}))
+            wait(lambda: live.flat.chosen == corner)
+            for wrong in ({}, {"x_mm": "1"}, {"x_mm": float("nan"), "y_mm": 0, "angle_deg": 0}):
+                line.send(json.dumps({"do": "place", **wrong}))
+                assert "is no number" in heard(line, "fault")["says"]
+            line.send(json.dumps({"do": "place", **place}))
+            wait(lambda: live.flat.png is None)
+
+        lay(0, x_mm=-58.0, y_mm=22.0, angle_deg=2.865, square_mm=20.0)
+        first = live.rig.plane
+        assert first is not None and first.verdict.ok and live.state()["plane"]["result"]["rms_mm"] < 0.02
+        lay(1, x_mm=60.0, y_mm=100.0, angle_deg=180.0)
+        second = live.rig.plane
+        written = (rig / "rig.yaml").read_bytes()
+        # Both say the same of the plane but for where its axes are.
+        assert abs(second.t_CW_m[2] - first.t_CW_m[2]) < 0.01
+        assert second.rms_mm == pytest.approx(first.rms_mm)
+    # Nothing was written over.
+    aside = rig / "images" / "plane" / "dropped" / "1"
+    assert sorted(path.name for path in aside.iterdir()) == ["board.yaml", "plane001.png"]
+    (tmp_path / "other.yaml").write_bytes(written)
+    words = ["extrinsics", str(rig / "images" / "plane"), "--rig", str(tmp_path / "other.yaml")]
+    subprocess.run([sys.executable, "-m", "calib", *words], check=True, capture_output=True)
+    assert (tmp_path / "other.yaml").read_bytes() == written
+
+
+def test_a_picture_that_shows_no_plane_leaves_the_earlier_one(tmp_path: Path, project_root: Path) -> None:
+    rig = tmp_path / "rig"
+    picture = half_a_rig(rig, project_root)
+    album = Album(rig)
+    board = BoardFile(corners=[7, 5], square_m=0.02, first_corner_m=[0.0, 0.0], angle_rad=0.0)
+    with pytest.raises(BadInputError, match="camera"):
+        album.lay(picture, board)
+    assert [path.name for path in album.plane.iterdir()] == []
+    album.calibrate()
+    album.lay(picture, board)
+    before = {path.name: path.read_bytes() for path in album.plane.iterdir() if path.is_file()}
+    with pytest.raises(BadInputError):
+        album.lay(png(np.zeros((208, 316), np.uint8)), board)
+    assert {path.name: path.read_bytes() for path in album.plane.iterdir() if path.is_file()} == before
+
+
+def test_a_marker_is_recorded_while_one_looks_at_it(tmp_path: Path) -> None:
+    """What is on the disk grows, a click names the marker, and another disc is not followed."""
+    scene = Scene(other="disc", noise=2.0, rate_hz=30.0)
+    with served(tmp_path / "rig") as live, tab(live) as line:
+        line.send('{"do": "camera", "size": [640, 480]}')
+        line.send('{"do": "step", "name": "marker"}')
+        wait(lambda: live.step == "marker")
+        log = tmp_path / "rig" / "logs" / "track1.csv"
+        for k, (t_s, frame) in enumerate(scene.frames(30)):
+            line.send(json.dumps({"do": "at", "t_s": 5.0 + t_s}))
+            line.send(jpeg(frame))
+            seen = heard(line, "seen")
+            if k == 0:
+                assert "Several discs" in seen["says"] and "marker" not in seen
+                line.send(json.dumps({"do": "point", "at": scene.centre_px(0.0).tolist()}))
+                wait(lambda: live.marker.tracker.start_px is not None)
+                line.send('{"do": "record"}')
+                wait(lambda: live.marker.shown()["recording"] == "track1.csv")
+                line.send('{"do": "colour", "name": "green"}')
+                assert "is being recorded" in heard(line, "fault")["says"]
+            else:
+                off = np.array([seen["marker"]["u"], seen["marker"]["v"]]) - scene.centre_px(t_s)
+                assert np.hypot(*off) < 0.5
+        assert len(log.read_text().splitlines()) == 1 + 29
+        line.send('{"do": "stop"}')
+        wait(lambda: "29 of 29 frames" in live.marker.last)
+        track = read_log(log)
+        assert np.allclose(track.t_s, np.arange(29) / 30, atol=1e-6)
+        # One that sees nothing leaves nothing.
+        line.send('{"do": "record"}')
+        line.send('{"do": "stop"}')
+        wait(lambda: "nothing was recorded" in live.marker.last)
+        line.send('{"do": "colour", "name": "no colour"}')
+        assert "is no colour" in heard(line, "fault")["says"]
+    assert [path.name for path in log.parent.iterdir()] == ["track1.csv"]
+
+
+def test_a_board_is_recorded_from_the_page(tmp_path: Path) -> None:
+    pytest.importorskip("serial")
+    from pty import openpty
+    from tty import setraw
+
+    ours, theirs = openpty()
+    setraw(theirs)
+    over = threading.Event()
+
+    def send() -> None:
+        outputs = Outputs(0.25, (0.5, 1.0), (0.25, 2.0), (0.0625, 4.0), (1.0, 255.0), 3)
+        for k in range(100_000):
+            if over.wait(1 / 60):
+                return
+            given = Inputs(158.0 + 10 * np.sin(0.05 * k), 80.5, 9.81, 0.25, -0.125, (0.08, 0.0805), mode=2)
+            os.write(ours, encoded(Frame(1, 60000, k & 0xFFFF, given, outputs)))
+
+    board = threading.Thread(target=send)
+    board.start()
+    try:
+        with served(tmp_path / "rig", port=os.ttyname(theirs)) as live, tab(live) as line:
+            line.send('{"do": "step", "name": "board"}')
+            wait(lambda: live.step == "board")
+            line.send('{"do": "record", "name": "../x"}')
+            assert "no recording" in heard(line, "fault")["says"]
+            line.send('{"do": "record", "name": "static"}')
+            wait(lambda: sum(len(plot["rows"]) for plot in heard(line, "board")["board"]["plots"]) > 100)
+            line.send('{"do": "record", "name": "swing"}')
+            assert "is under way" in heard(line, "fault")["says"]
+            told = live.state()["board"]
+            assert len(told["plots"]) == 4
+            assert told["recording"] == "static1.csv"
+            line.send('{"do": "stop"}')
+            wait(lambda: not live.board.at_work)
+            assert re.search(r"\d+ ticks in .*static1.csv, \d+ lost", live.board.last), live.board.last
+            line.send('{"do": "record", "name": "static"}')
+            wait(lambda: live.board.at_work)
+        # Done ends the recording too.
+        assert not live.board.at_work
+    finally:
+        over.set()
+        board.join()
+        os.close(ours)
+        os.close(theirs)
+    assert len(read_log(tmp_path / "rig" / "logs" / "static1.csv").t_s) > 50
 
 
 def test_the_page_in_a_browser_from_the_start_to_ok(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import colorsys
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -59,6 +59,8 @@ _FLOOR_PX = 0.02
 """What uneven light and blur leave on rendered videos without noise."""
 _LEAST_COLOURED = 0.8
 """Share of the pixels inside that must have the marker's colour."""
+_AGAIN_FRAMES = 6
+"""Frames without the marker after which the only disc of its colour and size is it, wherever that is."""
 _JUMP_RADII = 4.0
 """Radii within which the marker is taken for the same from one frame to the next, where there are two."""
 
@@ -402,9 +404,50 @@ class Tracker:
 
         alike = [one for one in found if 0.6 < one.radius_px / before.radius_px < 1.6]
         ranked = sorted(alike, key=away)
+        if self._since > _AGAIN_FRAMES and len(found) == len(alike) == 1 and not self.doubled:
+            # Only one disc has ever been seen, wherever it went meanwhile.
+            return ranked[0]
         reach = _JUMP_RADII * min(1 + 0.5 * (self._since - 1), 6.0)
         if not ranked or away(ranked[0]) > reach:
             return None
         if len(ranked) > 1 and away(ranked[1]) < 2 * away(ranked[0]) + 1.0:
             return None
         return ranked[0]
+
+
+TRACK_COLUMNS = ("t_s", "u_px", "v_px", "sigma_px")
+"""Of the log that a track is written as."""
+
+
+def track_rows(
+    times_s: Sequence[float],
+    found: Sequence[Disc | None],
+    pixy: bool = False,
+    centre: Callable[[FloatArray], FloatArray] | None = None,
+) -> list[tuple[float, float, float, float]]:
+    """Time, pixel and its standard deviation of each frame that shows the marker.
+
+    Parameters
+    ----------
+    pixy : whole pixels of the middle of the blob's box. centre : maps the ellipse's centre to the disc's.
+    """
+    seen = [one for one in found if one is not None]
+    if not seen:
+        return []
+    nowhere = np.full(2, np.nan)
+    scatter = scatter_px(np.array([nowhere if one is None else one.centre_px for one in found]))
+    usual = float(np.median([one.sigma_px for one in seen]))
+    factor = max(1.0, scatter / usual) if np.isfinite(scatter) else 1.0
+    rows = []
+    for t_s, one in zip(times_s, found, strict=False):
+        if one is not None:
+            at = one.pixy_px() if pixy else one.centre_px if centre is None else centre(one.centre_px)
+            # A whole pixel is off by up to half of one, evenly.
+            rows.append((t_s, float(at[0]), float(at[1]), 12**-0.5 if pixy else factor * one.sigma_px))
+    return rows
+
+
+def track_text(rows: Sequence[tuple[float, float, float, float]], pixy: bool = False) -> str:
+    """The log of a track, without its head."""
+    places = 0 if pixy else 3
+    return "".join(f"{t:.6f},{u:.{places}f},{v:.{places}f},{sigma:.3f}\n" for t, u, v, sigma in rows)

@@ -660,8 +660,8 @@ def world_points_m(board: Board, first_corner_m: Sequence[float], angle_rad: flo
     return np.asarray(turned + np.asarray(first_corner_m, dtype=np.float64))
 
 
-def _turned(pixels: FloatArray, board: Board) -> list[tuple[int, FloatArray]]:
-    """The detected grid after 0, 1, 2, 3 quarter turns (1 and 3 on square boards only)."""
+def turns_of(pixels: FloatArray, board: Board) -> list[tuple[int, FloatArray]]:
+    """Detected corners (columns * rows, 2) after 0, 1, 2, 3 quarter turns (1 and 3 on square boards)."""
     grid = pixels.reshape(board.rows, board.columns, 2)
     turns = range(4) if board.columns == board.rows else (0, 2)
     return [(turn, np.rot90(grid, turn).reshape(-1, 2)) for turn in turns]
@@ -729,7 +729,7 @@ def settle_orientation(
             f"{name}: the grid of corners is mirrored; the rows axis must turn clockwise from the columns "
             "axis"
         )
-    candidates = _turned(pixels, board)
+    candidates = turns_of(pixels, board)
     if first_corner_px is not None:
         return _settle_by_pixel(candidates, board, angle_rad, first_corner_px, name)
 
