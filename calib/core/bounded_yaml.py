@@ -1,23 +1,18 @@
 """YAML of strangers: what a small text may grow into has a bound, and so has the time to read it.
 
-A text of a kilobyte can stand for gigabytes: by aliases of aliases, by merged keys (which a reader
-copies), by tags that hide lists from a count; and numbers of half a million digits take minutes. All of
-this is refused while the text is still a stream of events.
+A text of a kilobyte can stand for gigabytes by aliases of aliases, numbers of half a million digits take
+minutes, and the reader in C recurses without a limit. So the text is looked at first, as a stream of events.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from dataclasses import dataclass, field
 from typing import Any
 
 from calib.core.errors import BadInputError
 
-MAX_NODES = 200_000
-_MAX_DEPTH = 40
-_MAX_DIGITS = 400
-_STANDARD = "tag:yaml.org,2002:"
-_PLAIN_TAGS = ("str", "int", "float", "bool", "null", "map", "seq", "timestamp")
+_MOST_VALUES, _MAX_DEPTH, _MAX_DIGITS = 200_000, 40, 400
 _NUMBER = re.compile(r"[-+.0-9][0-9a-fA-FxXob_:.+-]*\Z")
 
 
@@ -29,90 +24,64 @@ class YamlProblem(BadInputError):
         self.said, self.line = str(BadInputError(said)), line
 
 
-def load(text: str, tags: Iterable[str] = (), loader: Any = None) -> Any:
-    """The value that a text stands for.
-
-    Parameters
-    ----------
-    tags : further tags of YAML's own name space that `loader` knows, such as "binary".
-    loader : the safe loader in C by default, which is ten times as fast as the one in Python.
+def load(text: str, loader: Any = None) -> Any:
+    """The value that a text stands for; `loader` is the safe one in C by default.
 
     Raises `YamlProblem`, also for a key that is given twice: YAML's readers would keep the last.
     """
     import yaml
 
     loader = loader or getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    known = frozenset(_STANDARD + name for name in (*_PLAIN_TAGS, *tags))
     try:
-        _check(yaml.parse(text, Loader=loader), known)
-        document = yaml.load(text, Loader=loader)
+        _check(yaml.parse(text, Loader=loader))
+        return yaml.load(text, Loader=loader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         said = getattr(error, "problem", None) or getattr(error, "reason", None) or "not readable"
         line = None if mark is None else mark.line + 1
         raise YamlProblem(f"is not YAML: {' '.join(str(said).split())}", line) from error
-    except (RecursionError, ValueError, LookupError, AttributeError) as error:
+    except (RecursionError, ValueError, LookupError, AttributeError, TypeError) as error:
         raise YamlProblem(f"is not YAML that can be read: {' '.join(str(error).split())[:200]}") from error
-    if expands_beyond(document, MAX_NODES):
-        raise YamlProblem(f"expands to more than {MAX_NODES} values")
-    return document
 
 
-def _check(events: Any, known: frozenset[str]) -> None:
-    """Raise `YamlProblem` for what must not be loaded.
+@dataclass
+class _Open:
+    """A mapping or a list that has not ended: values within, aliases counted where they stand, and keys."""
 
-    Depth has to be known before loading: the reader in C recurses without a limit.
-    """
-    open_keys: list[set[str] | None] = []
-    expects_key: list[bool] = []
-    for count, event in enumerate(events):
-        kind = type(event).__name__
-        line = event.start_mark.line + 1
-        if count > MAX_NODES:
-            raise YamlProblem(f"has more than {MAX_NODES} values before it", line)
+    anchor: str | None = None
+    is_mapping: bool = False
+    children: int = 0
+    values: int = 0
+    keys: set[str] = field(default_factory=set)
+
+
+def _check(events: Any) -> None:
+    """Raise `YamlProblem` for what must not be loaded."""
+    within, values_of = [_Open()], dict[str | None, int]()
+    for event in events:
+        kind, line = type(event).__name__, event.start_mark.line + 1
         if kind in ("MappingEndEvent", "SequenceEndEvent"):
-            open_keys.pop()
-            expects_key.pop()
-        if kind in ("ScalarEvent", "MappingStartEvent", "SequenceStartEvent"):
-            _check_tag(event.tag, known, line)
-        if kind == "ScalarEvent":
-            _check_scalar(event.value, event.implicit[0], line)
-        if kind in ("ScalarEvent", "AliasEvent", "MappingStartEvent", "SequenceStartEvent") and open_keys:
-            keys = open_keys[-1]
-            if keys is not None:
-                if expects_key[-1] and kind == "ScalarEvent":
-                    if event.value in keys:
+            ended = within.pop()
+            values_of[ended.anchor] = ended.values
+            within[-1].values += ended.values
+        elif hasattr(event, "anchor"):
+            over = within[-1]
+            over.children += 1
+            over.values += 1
+            if kind == "ScalarEvent":
+                if len(event.value) > _MAX_DIGITS and _NUMBER.match(event.value):
+                    said = f"is not YAML that can be read: a number of {len(event.value)} characters"
+                    raise YamlProblem(said, line)
+                if over.is_mapping and over.children % 2 == 1:
+                    if event.value in over.keys:
                         raise YamlProblem(f"the key {event.value[:60]} was given before", line)
-                    keys.add(event.value)
-                expects_key[-1] = not expects_key[-1]
-        if kind in ("MappingStartEvent", "SequenceStartEvent"):
-            open_keys.append(set() if kind == "MappingStartEvent" else None)
-            expects_key.append(kind == "MappingStartEvent")
-            if len(open_keys) > _MAX_DEPTH:
+                    over.keys.add(event.value)
+            elif kind == "AliasEvent":
+                itself = any(event.anchor == one.anchor for one in within)
+                over.values += _MOST_VALUES if itself else values_of.get(event.anchor, 0)
+            else:
+                within.append(_Open(event.anchor, kind == "MappingStartEvent"))
+            if len(within) > _MAX_DEPTH + 1:
                 raise YamlProblem(f"is not YAML that can be read: nested more than {_MAX_DEPTH} deep", line)
-
-
-def _check_tag(tag: str | None, known: frozenset[str], line: int) -> None:
-    # Tags of other name spaces are unknown to the loader, which says so.
-    if tag is not None and tag.startswith(_STANDARD) and ":python/" not in tag and tag not in known:
-        raise YamlProblem(f"has the tag !!{tag.removeprefix(_STANDARD)[:40]}, which nothing here needs", line)
-
-
-def _check_scalar(value: str, plain: bool, line: int) -> None:
-    if plain and value == "<<":
-        raise YamlProblem("merges keys with <<, which is not taken here; write them out", line)
-    if len(value) > _MAX_DIGITS and _NUMBER.match(value):
-        raise YamlProblem(f"is not YAML that can be read: a number of {len(value)} characters", line)
-
-
-def expands_beyond(document: Any, most: int) -> bool:
-    """Whether there are more than `most` values in a document, each alias counted where it stands."""
-    waiting = [document] if isinstance(document, dict | list) else []
-    while waiting:
-        value = waiting.pop()
-        children = value.values() if isinstance(value, dict) else value
-        most -= len(children)
-        if most < 0:
-            return True
-        waiting += [child for child in children if isinstance(child, dict | list)]
-    return False
+        if within[-1].values > _MOST_VALUES:
+            raise YamlProblem(f"expands to more than {_MOST_VALUES} values", line)

@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 
 from calib.core.arrays import FloatArray
-from calib.core.bounded_yaml import MAX_NODES, YamlProblem, expands_beyond, load
+from calib.core.bounded_yaml import YamlProblem, load
 from calib.core.errors import BadInputError
 from calib.core.writing import Kind, holds
 from calib.stages.camera.model import COEFFICIENTS, FISHEYE, MODELS, Camera
@@ -59,7 +59,7 @@ def read_storage(text: str) -> Mapping[str, Any]:
             found = _yaml(text)
     except (ElementTree.ParseError, YamlProblem, ValueError, RecursionError) as error:
         raise BadInputError(_REFUSED) from error
-    if not isinstance(found, dict) or expands_beyond(found, MAX_NODES):
+    if not isinstance(found, dict):
         raise BadInputError(_REFUSED)
     return found
 
@@ -127,7 +127,7 @@ def _binary(raw: bytes, kind: str) -> FloatArray | None:
 def _yaml(text: str) -> object:
     # OpenCV's directive with its colon is no YAML.
     text = re.sub(r"\A%YAML:[0-9.]+[^\n]*", "", text)
-    return load(_unescaped(text), (MATRIX, "binary"), _loader())
+    return load(_unescaped(text), _loader())
 
 
 def _unescaped(text: str) -> str:
