@@ -358,7 +358,13 @@ def parquet_blocks(path: Path, options: LogOptions) -> tuple[ColumnMap, Iterator
         columns = column_map(shown(path), path, 1, file.schema_arrow.names, named, options)
         time = file.schema_arrow.field(columns.sources["t_s"].column).type
         columns = _with_dates(columns) if pyarrow.types.is_timestamp(time) else columns
-        _check_growth(path, file.metadata, [one.column for one in columns.sources.values()])
+        read = [one.column for one in columns.sources.values()]
+        for name in read:
+            # A text that comes often stands in the file once.
+            kind = file.schema_arrow.field(name).type
+            if not (pyarrow.types.is_primitive(kind) or pyarrow.types.is_null(kind)):
+                raise BadInputError(f"{columns.source}: {name} holds {kind}, expected numbers")
+        _check_growth(path, file.metadata, read)
     return columns, _parquet_blocks(file, columns)
 
 

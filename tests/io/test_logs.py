@@ -437,3 +437,14 @@ def test_dates_in_parquet(tmp_path: Path) -> None:
     log = read_log(path)
     assert log.t_s[0] == pytest.approx(1_709_251_198.25, abs=1e-6)
     assert np.allclose(np.diff(log.t_s), 0.02, atol=1e-6)
+
+
+def test_texts_in_parquet_are_refused_before_they_are_unpacked(tmp_path: Path) -> None:
+    """A text of 50 MB in a thousand rows is a file of a kilobyte."""
+    pyarrow = pytest.importorskip("pyarrow")
+    texts = pyarrow.DictionaryArray.from_arrays(pyarrow.array([0] * 1000, "int32"), ["x" * 50_000_000])
+    path = tmp_path / "log.parquet"
+    table = pyarrow.table({"t_s": np.arange(1000.0), "gz_radps": texts})
+    importlib.import_module("pyarrow.parquet").write_table(table, path, compression="zstd")
+    with pytest.raises(BadInputError, match=r"gz_radps holds dictionary<.*, expected numbers"):
+        read_log(path)

@@ -6,6 +6,7 @@ import gzip
 import io
 import math
 import zlib
+from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -370,7 +371,7 @@ def tune_log(log: Log, how: Reading) -> TuneLog:
 # compressed with gzip. The gyroscope's readings are put on the accelerometer's times by straight lines
 # where they have others.
 
-_MOST_BYTES = 500_000_000
+_MOST_BYTES = 1 << 25
 
 
 def pose_log(log: Log, planar: bool = False) -> PoseLog:
@@ -398,7 +399,7 @@ def pose_log(log: Log, planar: bool = False) -> PoseLog:
 
 
 def _unpacked(path: Path) -> bytes:
-    data = read_bytes(path)
+    data = read_bytes(path, _MOST_BYTES)
     if data[:2] != b"\x1f\x8b":
         return data
     try:
@@ -414,9 +415,8 @@ def _unpacked(path: Path) -> bytes:
 def _four_numbers(path: Path) -> FloatArray:
     """Lines of time, x, y, z as an array (n, 4); rows that say nan or inf are left out."""
     text = as_text(path, _unpacked(path))
-    rows: list[list[float]] = []
-    at: list[int] = []
-    for number, line in enumerate(text.splitlines(), 1):
+    cells, at = array("d"), array("q")
+    for number, line in enumerate(io.StringIO(text, newline=None), 1):
         words = line.replace(",", " ").split()
         if not words or words[0].startswith(("#", "%")):
             continue
@@ -425,15 +425,14 @@ def _four_numbers(path: Path) -> FloatArray:
         except ValueError:
             row = []
         if len(row) != 4:
-            raise BadInputError(
-                f"{shown(path)}, line {number}: is {shown(line[:40])!r}, expected four numbers: t, x, y, z"
-            )
-        if all(np.isfinite(row)):
-            rows.append(row)
+            where, found = f"{shown(path)}, line {number}", shown(line.strip()[:40])
+            raise BadInputError(f"{where}: is {found!r}, expected four numbers: t, x, y, z")
+        if all(map(math.isfinite, row)):
+            cells.extend(row)
             at.append(number)
-    if not rows:
+    if not at:
         raise BadInputError(f"{shown(path)}: has no readings, expected lines of t, x, y, z")
-    values = np.array(rows)
+    values = np.array(cells).reshape(-1, 4)
     back = np.flatnonzero(np.diff(values[:, 0]) < 0.0)
     if len(back):
         i = int(back[0])
