@@ -9,9 +9,9 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.io.columns import COMMANDED, POSITION, PRESSURES, QUATERNION
 from calib.stages.arm.identify import FULL
-from calib.stages.arm.model import PARAMETERS, STEP_S, Scale, Trial, segment_run, valve_run
+from calib.stages.arm.model import PARAMETERS, STEP_S, Scale, Trial, drive_run, segment_run
 
-SCALE = Scale(275.0, 0.6, 0.178, 0.13)
+SCALE = Scale(275.0, 0.6, 0.178, 0.13, 275.0)
 TRUE = FULL.without("creep").values(
     np.array([0.3 if one.name != "compliance_rad_per_Nm" else 0.0 for one in PARAMETERS]), SCALE
 )
@@ -28,7 +28,7 @@ def simulated(
     command[-150:] = 7.0
     start = Trial(name, day, load_kg, STEP_S * np.arange(n), command, np.full(n, 5.0), np.full(n, 0.13),
                   np.full(n, 0.176 - 0.006 * (seed % 2)))  # fmt: skip
-    pressure = valve_run(start, TRUE)
+    pressure = drive_run(start, TRUE)
     angle, chord = segment_run(start, TRUE, pressure, gain)
     return Trial(name, day, load_kg, start.t_s, command, pressure + rng.normal(0.0, 1.0, n),
                  angle + rng.normal(0.0, 1e-3, n), chord + rng.normal(0.0, 1e-4, n))  # fmt: skip
@@ -38,7 +38,7 @@ def columns_of(trial: Trial, conjugated: bool = False, planar: bool = False) -> 
     """Columns of a log of the trial: the arm points along y and bends towards x, about z."""
     n, phi = len(trial.t_s), trial.angle_rad
     out = dict(zip((*COMMANDED, *PRESSURES), np.full((6, n), 3.0), strict=True))
-    out |= {"p_cmd1_kpa": trial.command_kpa, "p1_kpa": trial.pressure_kpa}
+    out |= {"p_cmd1_kpa": trial.command, "p1_kpa": trial.pressure_kpa}
     lean = 0.55 * phi
     x, y = trial.chord_m * np.sin(lean), trial.chord_m * np.cos(lean)
     if planar:

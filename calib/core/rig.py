@@ -69,6 +69,9 @@ KINDS = {
 """Sections in the order of the file and what they are. A schema takes a tenth of a second to build, so each
 is loaded where a file has its section."""
 
+ARM_KIND = "pressure_arm"
+"""Kind of an actuator whose section is that of an arm."""
+
 
 def _holds_sections(path: Path) -> bool:
     names = {name.decode() for name in re.findall(rb"^([A-Za-z_]\w*):", head(path), re.MULTILINE)}
@@ -167,6 +170,14 @@ class Rig:
                 f"{shown(source)}: {one_line(name)} is not a section that is known here{nearest(name, KINDS)}"
             )
         sections = {name: document[name] for name in KINDS if document.get(name) is not None}
+        # The arm is one kind of actuator, and has a section of its own beside another.
+        bends = isinstance(sections.get("actuator"), dict) and sections["actuator"].get("kind") == ARM_KIND
+        if bends and "arm" in sections:
+            raise BadInputError(
+                f"{shown(source)}: actuator is a {ARM_KIND} and there is an arm; expected one"
+            )
+        if bends:
+            sections["arm"] = sections.pop("actuator")
         rig = Rig(schema=schema)
         for name, values in sections.items():
             identified = schema > 1 and name in ("actuator", "pump")
@@ -176,7 +187,8 @@ class Rig:
                     f"belongs under known: {{{name}: ...}}"
                 )
             if schema > 1 or name not in ("actuator", "pump"):
-                setattr(rig, name, validated(kind_of(name), values, source, name))
+                where = "actuator" if bends and name == "arm" else name
+                setattr(rig, name, validated(kind_of(name), values, source, where))
         if schema == 1 and ("actuator" in sections or "pump" in sections):
             from calib.stages.actuator.section import parted
 
@@ -210,9 +222,12 @@ class Rig:
         return {name: section_json(one) for name, one in sections.items() if one is not None}
 
     def text(self) -> str:
-        """The file's text; the same rig gives the same text."""
+        """The file's text, the same for the same rig; an arm is its actuator unless there is another."""
+        sections = self.values()
+        if "actuator" not in sections:
+            sections = {"actuator" if name == "arm" else name: one for name, one in sections.items()}
         return yaml.safe_dump(
-            {"schema": SCHEMA, **self.values()},
+            {"schema": SCHEMA, **sections},
             sort_keys=False,
             default_flow_style=None,
             width=110,

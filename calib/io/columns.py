@@ -60,6 +60,7 @@ TRUE = ("true_q1_m", "true_q2_m", "true_phi_rad", "true_x_m", "true_y_m")
 """What only the simulated rig knows, at the row's `t_s`; (x, y) is the head. For scoring."""
 
 CHAMBERS = 3
+PWM = MEASURED[8:10]
 COMMANDED = tuple(f"p_cmd{k + 1}_kpa" for k in range(CHAMBERS))
 PRESSURES = tuple(f"p{k + 1}_kpa" for k in range(CHAMBERS))
 """Commands to pressure valves, and pressures of the chambers above that of the air."""
@@ -148,7 +149,7 @@ def kind_of(column: str) -> str:
         "accel": ACCEL,
         "gyro": GYRO,
         "pixel": MEASURED[:2],
-        "pwm": MEASURED[8:10],
+        "pwm": PWM,
         "pressure": (*COMMANDED, *PRESSURES),
         "length": POSITION,
     }

@@ -11,10 +11,11 @@ from armtrials import SCALE, TRUE, columns_of, simulated
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
+from calib.core.rig import Rig
 from calib.io.columns import known_name
 from calib.io.logs import Log, read_log
 from calib.stages.arm.identify import FULL, best_baseline, errors_by, fit, gained, half_width, identify
-from calib.stages.arm.model import NAMES, Trial, segment_run
+from calib.stages.arm.model import PARAMETERS, Assembly, Trial, segment_run
 from calib.stages.arm.read import frame_findings, frame_of, recording_of, trial_of
 
 
@@ -48,10 +49,10 @@ def test_an_identification_beats_black_boxes_and_says_by_how_much(trials: list[T
 
 def test_a_part_that_is_off_plays_no_part() -> None:
     one = simulated("a", 1)
-    off = FULL.without("creep", "hysteresis", "settling", "load").values(np.zeros(len(NAMES)), SCALE)
+    off = FULL.without("creep", "hysteresis", "settling", "load").values(np.zeros(len(PARAMETERS)), SCALE)
     p = np.full(len(one.t_s), 100.0)
     angle, _ = segment_run(one, off, p)
-    rest = off["rest_rad"] + 100.0 * off["bends_rad_per_kpa"] + 1e4 * off["bends_rad_per_kpa2"]
+    rest = off["rest_rad"] + 100.0 * off["bends_rad_per_kpa"] / (1.0 + 100.0 * off["stiffens_per_kpa"])
     expected = rest + (one.angle_rad[0] - rest) * np.exp(-one.t_s / off["lag_s"])
     np.testing.assert_allclose(angle, expected, atol=1e-9)
 
@@ -64,6 +65,41 @@ def test_a_load_bends_an_upright_arm_further() -> None:
 def test_the_interval_of_one_more_trial_follows_from_the_errors_on_held_ones() -> None:
     assert half_width([1.0, 1.0, 1.0]) == pytest.approx(3.18, abs=0.01)
     assert math.isnan(half_width([1.0]))
+
+
+# ----------------------------------------------------------------------
+# The file.
+
+
+def test_an_arm_is_a_kind_of_actuator_in_the_file() -> None:
+    small = Assembly(("lag", "segment", "chord"))
+    section = {
+        "kind": "pressure_arm",
+        "parts": list(small.parts),
+        "parameters": dict.fromkeys(small.names, 1.0),
+    }
+    rig = Rig.of({"schema": 2, "actuator": section | {"verdict": "ok"}}, "rig.yaml")
+    assert rig.actuator is None
+    assert rig.arm is not None
+    assert "\nactuator:\n  kind: pressure_arm\n" in rig.text()
+    before = Rig.of({"schema": 2, "arm": section | {"verdict": "ok"}}, "rig.yaml")
+    assert before.text() == rig.text()
+    with pytest.raises(BadInputError, match="actuator is a pressure_arm and there is an arm"):
+        Rig.of({"actuator": section, "arm": section}, "rig.yaml")
+    with pytest.raises(BadInputError, match=r"rig\.yaml: actuator.*expected one part of valve and lag"):
+        Rig.of(
+            {"schema": 2, "actuator": section | {"verdict": "ok", "parts": ["segment", "chord"]}}, "rig.yaml"
+        )
+
+
+def test_an_arm_of_an_earlier_model_is_kept_and_does_not_predict() -> None:
+    parts = ["valve", "segment", "quadratic", "chord"]
+    old = {"verdict": "ok", "parts": parts, "parameters": {"bends_rad_per_kpa2": -1e-6}}
+    rig = Rig.of({"schema": 2, "arm": old}, "rig.yaml")
+    assert rig.arm is not None
+    assert rig.arm.parameters == old["parameters"]
+    with pytest.raises(BadInputError, match=r"is of an earlier model.*run it again"):
+        _ = rig.arm.values
 
 
 # ----------------------------------------------------------------------
@@ -109,7 +145,7 @@ def test_frozen_channels_and_jumps_are_findings() -> None:
 
 def test_what_is_no_single_driven_arm_is_refused() -> None:
     trial = simulated("a", 1)
-    both = columns_of(trial) | {"p_cmd2_kpa": trial.command_kpa}
+    both = columns_of(trial) | {"p_cmd2_kpa": trial.command}
     with pytest.raises(BadInputError, match="p_cmd1_kpa, p_cmd2_kpa change, expected one driven chamber"):
         recording_of(_log(both, trial), "a")
     bad = columns_of(trial)

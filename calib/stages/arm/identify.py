@@ -1,9 +1,14 @@
 """Fit an assembly to trials, and predict each trial from a fit to the others.
 
-Least squares over whole free runs, from the command and from the measured pressure, with the parameters'
-priors. Errors of a free run stay alike for seconds, so a sample counts as 1/`_ALIKE` of a reading. What
-differs from day to day is a gain with a prior of its own. Standard deviations are the larger of the
-posterior's and of the jackknife's over trials, as trials differ by more than their samples tell.
+Least squares over whole free runs with the parameters' priors, in two steps: the segment from the measured
+pressure, then the drive from the command with the segment as it is, so that what a valve's model misses does
+not bend the arm's. Without a measured pressure all is fitted from the command at once. Errors of a free run
+stay alike for seconds, so a sample counts as 1/`_ALIKE` of a reading. What differs from day to day is a gain
+with a prior of its own. Standard deviations are the larger of the posterior's and of the jackknife's over
+trials, as trials differ by more than their samples tell.
+
+A trial is held back from all: fits to the others begin at the priors, or where another fit to the same others
+has ended.
 
 Baselines are trained on the same trials: linear ARX by least squares, run free, and one lag.
 """
@@ -11,36 +16,35 @@ Baselines are trained on the same trials: linear ARX by least squares, run free,
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
-from calib.core.arrays import FloatArray
+from calib.core.arrays import FloatArray, IntArray
 from calib.stages.arm.model import (
     DAY_SPREAD,
-    NAMES,
+    DRIVES,
     PARAMETERS,
     PARTS,
     STEP_S,
     Assembly,
     Scale,
     Trial,
+    drive_run,
     scale_of,
     segment_run,
-    valve_run,
 )
 
-FULL = Assembly(tuple(part.name for part in PARTS))
-WORTH = ("quadratic", "hysteresis", "settling", "load")
+FULL = Assembly(tuple(part.name for part in PARTS if part.name != "lag"))
+WORTH = ("stiffening", "hysteresis", "creep", "settling", "load")
 """Parts whose worth is measured by leaving them out."""
 _SIGMA = (0.03, 0.027, 0.0045)
 """Of pressure, angle and chord, of their scale: what assemblies of this kind leave."""
 _ALIKE, _EVERY = 100, 5
 """Samples of one error, and of which one is looked at."""
-_MOST_KEPT = 200
 _STEP = 0.03
 """Of the differences, in deviations of the priors; smaller ones see the valve's ports open and close."""
 _ORDERS, _ARX_STEPS_S = (8, 15), (0.1, 0.2)
@@ -101,73 +105,93 @@ class Identification:
     coverage: float
 
 
-_Valve = Callable[[Trial, Mapping[str, float]], FloatArray]
+class _Problem:
+    """Squared errors of trials as functions of z: parameters in deviations of their priors, then days."""
 
+    def __init__(self, trials: Sequence[Trial], assembly: Assembly, scale: Scale) -> None:
+        self.trials, self.assembly, self.scale = trials, assembly, scale
+        self.days = sorted({one.day for one in trials})
+        sizes = (scale.pressure_kpa, scale.angle_rad, scale.chord_m)
+        self.sizes = [s * x * math.sqrt(_ALIKE / _EVERY) for s, x in zip(_SIGMA, sizes, strict=True)]
 
-def _remembered() -> _Valve:
-    """`valve_run` that keeps what it found: most steps of a fit change the segment alone."""
-    kept: dict[tuple[str, tuple[float, ...]], FloatArray] = {}
+    def indices(self, drives: bool) -> IntArray:
+        """Parameters of the drive, or of the segment and the days, where they are of the assembly."""
+        mine = set(self.assembly.names)
+        of = [name for names in DRIVES.values() for name in names]
+        days = [] if drives else range(len(PARAMETERS), len(PARAMETERS) + len(self.days))
+        chosen = [k for k, p in enumerate(PARAMETERS) if p.name in mine and (p.name in of) == drives]
+        return np.array([*chosen, *days])
 
-    def run(trial: Trial, values: Mapping[str, float]) -> FloatArray:
-        key = (trial.name, tuple(values[one.name] for one in PARTS[0].parameters))
-        if key not in kept:
-            if len(kept) > _MOST_KEPT:
-                kept.clear()
-            kept[key] = valve_run(trial, values)
-        return kept[key]
+    def gains(self, z: FloatArray) -> dict[str, float]:
+        count = len(PARAMETERS)
+        return {day: math.exp(DAY_SPREAD * x) for day, x in zip(self.days, z[count:].tolist(), strict=True)}
 
-    return run
+    def _off(self, simulated: FloatArray, measured: FloatArray, kind: int) -> FloatArray:
+        return np.asarray((simulated - measured)[::_EVERY] / self.sizes[kind])
 
+    def by_pressure(self, z: FloatArray) -> list[FloatArray]:
+        """Errors of the segment under the measured pressure."""
+        values, gains, out = self.assembly.values(z[: len(PARAMETERS)], self.scale), self.gains(z), []
+        for one in self.trials:
+            if len(one.pressure_kpa) and len(one.angle_rad):
+                angle, chord = segment_run(one, values, one.pressure_kpa, gains[one.day])
+                out += [self._off(angle, one.angle_rad, 1), self._off(chord, one.chord_m, 2)]
+        return out
 
-def _runs(
-    trials: Sequence[Trial], values: Mapping[str, float], gains: Mapping[str, float], valve: _Valve
-) -> Iterator[tuple[FloatArray, FloatArray, int]]:
-    """Simulated and measured values with the number of their kind."""
-    for one in trials:
-        pressures = [one.pressure_kpa] if len(one.pressure_kpa) else []
-        if len(one.command_kpa):
-            pressures.append(valve(one, values))
+    def by_command(self, z: FloatArray) -> list[FloatArray]:
+        """Errors of drive and segment under the command."""
+        values, gains, out = self.assembly.values(z[: len(PARAMETERS)], self.scale), self.gains(z), []
+        for one in self.trials:
+            if not len(one.command):
+                continue
+            pressure = drive_run(one, values)
             if len(one.pressure_kpa):
-                yield pressures[-1], one.pressure_kpa, 0
-        if len(one.angle_rad):
-            for pressure in pressures:
-                angle, chord = segment_run(one, values, pressure, gains.get(one.day, 1.0))
-                yield angle, one.angle_rad, 1
-                yield chord, one.chord_m, 2
+                out.append(self._off(pressure, one.pressure_kpa, 0))
+            if len(one.angle_rad):
+                angle, chord = segment_run(one, values, pressure, gains[one.day])
+                out += [self._off(angle, one.angle_rad, 1), self._off(chord, one.chord_m, 2)]
+        return out
+
+    def solve(
+        self, errors: Callable[[FloatArray], Iterable[FloatArray]], z: FloatArray, free: IntArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """z with its free entries where errors and deviations are least, and the posterior's deviations."""
+
+        def residuals(x: FloatArray) -> FloatArray:
+            full = z.copy()
+            full[free] = x
+            rows = np.nan_to_num(np.concatenate([x, *errors(full)]), nan=1e3)
+            return np.asarray(np.clip(rows, -1e3, 1e3))
+
+        def jacobian(x: FloatArray) -> FloatArray:
+            steps = _STEP * np.eye(len(x))
+            return np.stack([(residuals(x + h) - residuals(x - h)) / (2.0 * _STEP) for h in steps], axis=1)
+
+        found = least_squares(residuals, z[free], jac=jacobian, max_nfev=25, ftol=1e-3)
+        slopes = jacobian(found.x)
+        out, sigma = z.copy(), np.ones_like(z)
+        out[free] = found.x
+        sigma[free] = np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)))
+        return out, sigma
 
 
 def fit(trials: Sequence[Trial], assembly: Assembly, scale: Scale, start: Fit | None = None) -> Fit:
     """The assembly with the smallest squared errors and deviations from its priors."""
-    days = sorted({one.day for one in trials})
-    sizes = [s * x for s, x in zip(_SIGMA, (scale.pressure_kpa, scale.angle_rad, scale.chord_m), strict=True)]
-    count, valve = len(PARAMETERS), _remembered()
-
-    def gains(z: FloatArray) -> dict[str, float]:
-        return {day: math.exp(DAY_SPREAD * x) for day, x in zip(days, z[count:].tolist(), strict=True)}
-
-    def residuals(z: FloatArray) -> FloatArray:
-        parts = [z]
-        for simulated, measured, kind in _runs(trials, assembly.values(z[:count], scale), gains(z), valve):
-            parts.append((simulated - measured)[::_EVERY] / (sizes[kind] * math.sqrt(_ALIKE / _EVERY)))
-        return np.clip(np.nan_to_num(np.concatenate(parts), nan=1e3), -1e3, 1e3)
-
-    def jacobian(z: FloatArray) -> FloatArray:
-        columns = []
-        for k in range(len(z)):
-            ahead, behind = z.copy(), z.copy()
-            ahead[k] += _STEP
-            behind[k] -= _STEP
-            columns.append((residuals(ahead) - residuals(behind)) / (2.0 * _STEP))
-        return np.stack(columns, axis=1)
-
-    begin = np.zeros(count + len(days))
+    problem, count = _Problem(trials, assembly, scale), len(PARAMETERS)
+    z = np.zeros(count + len(problem.days))
     if start is not None:
-        begin[:count] = start.z
-        begin[count:] = [math.log(start.gains.get(day, 1.0)) / DAY_SPREAD for day in days]
-    found = least_squares(residuals, begin, jac=jacobian, max_nfev=10 if start else 25, ftol=1e-3)
-    slopes = jacobian(found.x)
-    covariance = np.linalg.inv(slopes.T @ slopes)
-    return Fit(assembly, scale, found.x[:count], np.sqrt(np.diag(covariance))[:count], gains(found.x))
+        z[:count] = start.z
+        z[count:] = [math.log(start.gains.get(day, 1.0)) / DAY_SPREAD for day in problem.days]
+    segment, drive = problem.indices(False), problem.indices(True)
+    sigma = np.ones_like(z)
+    together = not any(len(one.pressure_kpa) and len(one.angle_rad) for one in trials)
+    if not together:
+        z, sigma = problem.solve(problem.by_pressure, z, segment)
+    if any(len(one.command) for one in trials):
+        free = np.concatenate([drive, segment]) if together else drive
+        z, by_command = problem.solve(problem.by_command, z, free)
+        sigma[free] = by_command[free]
+    return Fit(assembly, scale, z[:count], sigma[:count], problem.gains(z))
 
 
 def _rms(error: FloatArray) -> float:
@@ -182,8 +206,8 @@ def errors_of(made: Fit, trial: Trial) -> Held:
 def errors_by(values: Mapping[str, float], gain: float, trial: Trial) -> Held:
     """Free-run errors on a trial, of parameters by name and the gain of its day."""
     angle = chord = pressure = by_pressure = np.zeros(0)
-    if len(trial.command_kpa):
-        run = valve_run(trial, values)
+    if len(trial.command):
+        run = drive_run(trial, values)
         if len(trial.angle_rad):
             phi, length = segment_run(trial, values, run, gain)
             angle, chord = phi - trial.angle_rad, length - trial.chord_m
@@ -259,7 +283,7 @@ def _by_baseline(error: _Error, train: Sequence[Trial], trial: Trial, step_s: fl
         used = len(getattr(trial, inputs)) and len(getattr(trial, outputs))
         return error(pairs[:-1], pairs[-1]) if used and len(pairs) > 1 else math.nan
 
-    return Held(of("command_kpa", "angle_rad"), of("command_kpa", "chord_m"), of("pressure_kpa", "angle_rad"))
+    return Held(of("command", "angle_rad"), of("command", "chord_m"), of("pressure_kpa", "angle_rad"))
 
 
 def baselines(trials: Sequence[Trial]) -> dict[str, dict[str, Held]]:
@@ -292,10 +316,14 @@ def baselines(trials: Sequence[Trial]) -> dict[str, dict[str, Held]]:
 # Held trials, deviations between trials, parts.
 
 
-def held_fits(trials: Sequence[Trial], made: Fit) -> dict[str, Fit]:
-    """Fits to all trials but one, by the name of that one."""
+def held_fits(
+    trials: Sequence[Trial], assembly: Assembly, scale: Scale, starts: Mapping[str, Fit] | None = None
+) -> dict[str, Fit]:
+    """Fits to all trials but one, by the name of that one; `starts` are other fits to the same."""
     return {
-        one.name: fit([other for other in trials if other is not one], made.assembly, made.scale, made)
+        one.name: fit(
+            [other for other in trials if other is not one], assembly, scale, (starts or {}).get(one.name)
+        )
         for one in trials
     }
 
@@ -303,12 +331,16 @@ def held_fits(trials: Sequence[Trial], made: Fit) -> dict[str, Fit]:
 def _deviations(made: Fit, held: Mapping[str, Fit]) -> dict[str, float]:
     """Standard deviations of the parameters: the posterior's or the jackknife's, the larger."""
     n, out = len(held), {}
-    for k, (name, parameter) in enumerate(zip(NAMES, PARAMETERS, strict=True)):
+    mine = made.assembly.names
+    for k, parameter in enumerate(PARAMETERS):
+        name = parameter.name
+        if name not in mine:
+            continue
         half = 0.5 * made.sigma[k]
         spread = parameter.value(made.z[k] + half, made.scale) - parameter.value(made.z[k] - half, made.scale)
         others = np.array([one.values[name] for one in held.values()])
         between = math.sqrt((n - 1) / n * float(np.sum((others - others.mean()) ** 2))) if n > 1 else 0.0
-        out[name] = 0.0 if name in made.assembly.off else max(abs(spread), between)
+        out[name] = max(abs(spread), between)
     return out
 
 
@@ -324,10 +356,10 @@ def _coverage(trials: Sequence[Trial], held: Mapping[str, Fit], errors: Mapping[
     inside = total = 0
     for one in trials:
         wide = half_width([errors[other.name].angle_rad for other in trials if other is not one])
-        if not (len(one.command_kpa) and len(one.angle_rad)) or math.isnan(wide):
+        if not (len(one.command) and len(one.angle_rad)) or math.isnan(wide):
             continue
         made = held[one.name]
-        angle, _ = segment_run(one, made.values, valve_run(one, made.values), made.gains.get(one.day, 1.0))
+        angle, _ = segment_run(one, made.values, drive_run(one, made.values), made.gains.get(one.day, 1.0))
         inside += int(np.sum(np.abs(angle - one.angle_rad) <= wide))
         total += len(one.angle_rad)
     return inside / total if total else math.nan
@@ -345,21 +377,22 @@ def identify(
     compare : whether the parts' worth is measured, which takes as long again for each.
     """
     scale = scale_of(trials)
-    loaded = any(one.load_kg > 0.0 for one in trials)
-    assembly = FULL.without("creep") if loaded else FULL.without("creep", "load")
-    variants = {f"without {name}": assembly.without(name) for name in WORTH if name in assembly.parts} | {
-        "with creep": Assembly((*assembly.parts, "creep"))
-    }
+    assembly = FULL if any(one.load_kg > 0.0 for one in trials) else FULL.without("load")
+    if any(one.pwm for one in trials):
+        assembly = assembly.driven_by("lag")
+    variants = {f"without {name}": assembly.without(name) for name in WORTH if name in assembly.parts}
+    if "valve" in assembly.parts and any(len(one.command) for one in trials):
+        variants["a lag for the valve"] = assembly.driven_by("lag")
     chosen = variants if compare and len(trials) > 1 else {}
-    steps = 1 + (1 + len(chosen))
+    steps = 2 + len(chosen)
     made = fit(trials, assembly, scale)
     progress(1, steps)
-    held = held_fits(trials, made) if len(trials) > 1 else {}
+    held = held_fits(trials, assembly, scale) if len(trials) > 1 else {}
     errors = {one.name: errors_of(held[one.name], one) for one in trials if one.name in held}
     progress(2, steps)
     others: dict[str, Mapping[str, Held]] = {}
     for k, (name, other) in enumerate(chosen.items()):
-        fits = held_fits(trials, fit(trials, other, scale, made))
+        fits = held_fits(trials, other, scale, held)
         others[name] = {one.name: errors_of(fits[one.name], one) for one in trials}
         progress(3 + k, steps)
     if len(trials) > 1:

@@ -1,21 +1,31 @@
-"""A bending arm under a pressure valve, assembled from parts, and its free run.
+"""A bending arm, assembled from parts that drive, bend and resist, and its free run.
 
-Valve: the pilot x [kPa] integrates the command u against the outlet's pressure p. Within the overlap d
-neither port is open; supply and exhaust open as x leaves it. The outlet's line feeds the chamber, p_c:
+Valve: the pilot x [kPa] integrates the command u against the outlet's pressure p, and drains D times as fast
+as it fills. Within the overlap d neither port is open; supply and exhaust open over w as x leaves it. The
+outlet's line feeds the chamber, p_c. Flows are those of nozzles (ISO 6358, critical ratio .3, absolute
+pressures, P_0 of the air):
 
-    dx/dt   = r (u - p),  |x - p| <= (1 + w) d
-    dp/dt   = S o(x - p) (p_s - p) - (E o(p - x) + l) p - k (p - p_c),   o(e) = max(e - d, 0) / (w d)
+    dx/dt   = r (u - p), D times that for u < p,  |x - p| <= d + w
+    dp/dt   = S o(x - p) (p_s + P_0) psi((p + P_0) / (p_s + P_0)) - E o(p - x) (p + P_0) psi(P_0 / (p + P_0))
+              - l p - k (p - p_c),   o(e) = max(e - d, 0) / w
     dp_c/dt = n k (p - p_c)
 
-Segment: the angle phi [rad] follows its rest value with one viscous lag; inertia plays no part at the speeds
-of such arms. w is a stop, the elastic part of the angle's changes, of at most the hysteresis' range; c creeps
-after the angle; s is by how much the chord is too short at the start, as of an arm that was vented:
+A valve that has held a pressure makes up for its leak, so the pilot begins where supply opens.
 
-    tau dphi/dt = phi_0 + g (a p + b p^2) + C M(phi) - h w / r + q c + v s - phi
-    dw = dphi,  |w| <= r;   dc/dt = (phi - phi_0 - c) / tau_c;   ds/dt = -s exp(e p) / tau_s
+Lag, in place of a valve, as of a pump under PWM: dp/dt = (G u - p) / t, with one time up and another down.
 
-g is the day's gain. M = m g l sin(.55 phi) is the moment of a load at the tip of an upright arm of length l,
-whose chord leans by about .55 of the angle. Chord: L = c_0 + c_1 phi + c_2 phi^2 - s.
+Segment: the chamber of the arm fills, p_f, with the fill time. The angle phi [rad] follows its rest value
+with one viscous lag; inertia plays no part at the speeds of such arms. Pressure stiffens, so that the moments
+of pressure, load and hysteresis bend less under it. w is a stop, the elastic part of the angle's changes, of
+at most the hysteresis' range; c creeps after the angle; s is by how much the chord is too short at the start, as
+of an arm that was vented:
+
+    dp_f/dt = (p - p_f) / t_f
+    tau dphi/dt = phi_0 + (g a p_f + C M(phi) - h w / r) / (1 + b p_f) + q c + v s - phi
+    dw = dphi,  |w| <= r;   dc/dt = (phi - phi_0 - c) / tau_c;   ds/dt = -s exp(e p_f) / tau_s
+
+g is the gain of the day. M = m g l sin(.55 phi) is the moment of a load at the tip of an upright arm of
+length l, whose chord leans by about .55 of the angle. Chord: L = c_0 + c_1 phi + c_2 phi^2 - s.
 
 Area, stiffness and lever arm are one number, a, without a known load; with one, C separates the stiffness.
 """
@@ -33,21 +43,24 @@ from calib.core.arrays import FloatArray
 
 STEP_S = 0.02
 """Of the free run; a tenth of the fastest lag that pressures and motion capture at 90 Hz show."""
-_OPENING = 0.04
-"""w: ports open over this share of the overlap."""
+_FINER = 4
+"""Steps of the valve in one of these: a port opens within a few milliseconds."""
+_AIR_KPA = 101.3
+_CRITICAL = 0.3
 _LEANS = 0.55
 _GRAVITY_MPS2 = 9.80665
 
 
 @dataclass(frozen=True)
 class Scale:
-    """Size of what logs hold, in which priors are stated: greatest command [kPa], range of the angle [rad],
-    greatest chord [m], and the angle at rest [rad]."""
+    """Size of what logs hold, in which priors are stated: greatest pressure [kPa], range of the angle [rad],
+    greatest chord [m], the angle at rest [rad], and the greatest command [kPa or PWM]."""
 
     pressure_kpa: float
     angle_rad: float
     chord_m: float
     rest_rad: float
+    command: float
 
 
 @dataclass(frozen=True)
@@ -57,7 +70,7 @@ class Parameter:
     Attributes
     ----------
     centre, spread : prior; of the logarithm where `positive`, in units of `powers` otherwise.
-    powers : of pressure, angle and chord of the scale that make its unit.
+    powers : of pressure, angle, chord and command of the scale that make its unit.
     identified_by : what a log must hold to tell it.
     """
 
@@ -66,13 +79,13 @@ class Parameter:
     centre: float
     spread: float
     positive: bool = False
-    powers: tuple[int, int, int] = (0, 0, 0)
+    powers: tuple[int, int, int, int] = (0, 0, 0, 0)
     identified_by: str = ""
 
     def value(self, z: float, scale: Scale) -> float:
         """The number at z standard deviations of the prior from its centre."""
-        p, a, c = self.powers
-        size = scale.pressure_kpa**p * scale.angle_rad**a * scale.chord_m**c
+        p, a, c, u = self.powers
+        size = scale.pressure_kpa**p * scale.angle_rad**a * scale.chord_m**c * scale.command**u
         if self.positive:
             return size * self.centre * math.exp(self.spread * z)
         offset = scale.rest_rad if self.name == "rest_rad" else 0.0
@@ -81,44 +94,65 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Part:
-    """A part of an assembly. `off` are values with which it plays no part; empty for one that is needed."""
+    """A part of an assembly.
+
+    Attributes
+    ----------
+    off : values with which it plays no part; empty for one that is needed.
+    drives : whether it makes the pressure from the command. An assembly has one such part.
+    """
 
     name: str
     parameters: tuple[Parameter, ...]
     off: Mapping[str, float]
+    drives: bool = False
 
 
-_P, _A = (1, 0, 0), (0, 1, 0)
+_P, _A = (1, 0, 0, 0), (0, 1, 0, 0)
 _STEPS = "steps of the command up and down"
 _SLOW = "slow motion over the range"
 PARTS = (
     Part(
         "valve",
         (
-            Parameter("pilot_per_s", "1/s", 1.5, 0.5, True, identified_by=_STEPS),
-            Parameter("overlap_kpa", "kPa", 0.15, 0.6, True, _P, identified_by="commands that change sign"),
+            Parameter("pilot_per_s", "1/s", 1.0, 0.5, True, identified_by=_STEPS),
+            Parameter("pilot_drains", "", 1.0, 0.3, True, identified_by=_STEPS),
+            Parameter("overlap_kpa", "kPa", 0.1, 0.6, True, _P, identified_by="commands that change sign"),
+            Parameter("opening_kpa", "kPa", 0.03, 0.7, True, _P, identified_by="commands that change sign"),
             Parameter("supply_per_s", "1/s", 1.2, 0.4, True, identified_by="steps up"),
             Parameter("exhaust_per_s", "1/s", 1.5, 0.4, True, identified_by="steps down"),
             Parameter("supply_kpa", "kPa", 1.08, 0.07, True, _P, identified_by="long steps up"),
             Parameter("line_per_s", "1/s", 4.0, 0.6, True, identified_by=_STEPS),
-            Parameter("line_to_chamber", "", 1.1, 0.5, True, identified_by=_STEPS),
-            Parameter("leak_per_s", "1/s", 0.2, 0.5, True, identified_by="holds"),
+            Parameter("line_to_chamber", "", 0.7, 0.6, True, identified_by=_STEPS),
+            Parameter("leak_per_s", "1/s", 0.3, 0.5, True, identified_by="holds"),
         ),
         {},
+        drives=True,
+    ),
+    Part(
+        "lag",
+        (
+            Parameter("kpa_per_command", "kPa", 1.0, 0.3, True, (1, 0, 0, -1), identified_by="long steps"),
+            Parameter("rises_s", "s", 1.0, 0.7, True, identified_by="steps up"),
+            Parameter("falls_s", "s", 1.0, 0.7, True, identified_by="steps down"),
+        ),
+        {},
+        drives=True,
     ),
     Part(
         "segment",
         (
             Parameter("rest_rad", "rad", -0.1, 0.05, powers=_A, identified_by="rest"),
-            Parameter("bends_rad_per_kpa", "rad/kPa", 1.8, 0.6, powers=(-1, 1, 0), identified_by=_SLOW),
+            Parameter("bends_rad_per_kpa", "rad/kPa", 1.8, 0.6, powers=(-1, 1, 0, 0), identified_by=_SLOW),
+            Parameter("fill_s", "s", 0.3, 0.6, True, identified_by=_STEPS),
             Parameter("lag_s", "s", 1.8, 0.4, True, identified_by=_STEPS),
         ),
         {},
     ),
     Part(
-        "quadratic",
-        (Parameter("bends_rad_per_kpa2", "rad/kPa²", -0.8, 0.6, powers=(-2, 1, 0), identified_by=_SLOW),),
-        {"bends_rad_per_kpa2": 0.0},
+        "stiffening",
+        (Parameter("stiffens_per_kpa", "1/kPa", 0.8, 0.6, True, (-1, 0, 0, 0), identified_by=_SLOW),),
+        {"stiffens_per_kpa": 0.0},
     ),
     Part(
         "hysteresis",
@@ -133,7 +167,7 @@ PARTS = (
     Part(
         "creep",
         (
-            Parameter("creep", "", 0.0, 0.1, identified_by="holds of a minute"),
+            Parameter("creep", "", 0.05, 0.1, identified_by="holds of a minute"),
             Parameter("creep_s", "s", 20.0, 0.5, True, identified_by="holds of a minute"),
         ),
         {"creep": 0.0, "creep_s": 1.0},
@@ -142,26 +176,26 @@ PARTS = (
         "settling",
         (
             Parameter(
-                "settling_rad_per_m", "rad/m", 7.0, 5.0, powers=(0, 1, -1), identified_by="vented starts"
+                "settling_rad_per_m", "rad/m", 7.0, 5.0, powers=(0, 1, -1, 0), identified_by="vented starts"
             ),
             Parameter("settling_s", "s", 4.0, 0.5, True, identified_by="vented starts"),
             Parameter(
-                "settling_per_kpa", "1/kPa", 1.2, 0.8, powers=(-1, 0, 0), identified_by="vented starts"
+                "settling_per_kpa", "1/kPa", 1.2, 0.8, powers=(-1, 0, 0, 0), identified_by="vented starts"
             ),
         ),
         {"settling_rad_per_m": 0.0, "settling_s": 1.0, "settling_per_kpa": 0.0},
     ),
     Part(
         "load",
-        (Parameter("compliance_rad_per_Nm", "rad/(N m)", 0.2, 0.15, identified_by="a known load"),),
+        (Parameter("compliance_rad_per_Nm", "rad/(N m)", 0.2, 0.2, identified_by="a known load"),),
         {"compliance_rad_per_Nm": 0.0},
     ),
     Part(
         "chord",
         (
-            Parameter("chord_m", "m", 1.0, 0.02, powers=(0, 0, 1), identified_by="the tip's position"),
-            Parameter("chord_m_per_rad", "m/rad", -0.05, 0.05, powers=(0, -1, 1), identified_by=_SLOW),
-            Parameter("chord_m_per_rad2", "m/rad²", -0.07, 0.05, powers=(0, -2, 1), identified_by=_SLOW),
+            Parameter("chord_m", "m", 1.0, 0.02, powers=(0, 0, 1, 0), identified_by="the tip's position"),
+            Parameter("chord_m_per_rad", "m/rad", -0.05, 0.05, powers=(0, -1, 1, 0), identified_by=_SLOW),
+            Parameter("chord_m_per_rad2", "m/rad²", -0.07, 0.05, powers=(0, -2, 1, 0), identified_by=_SLOW),
         ),
         {},
     ),
@@ -170,7 +204,9 @@ PARTS = (
 
 PARAMETERS = tuple(one for part in PARTS for one in part.parameters)
 NAMES = tuple(one.name for one in PARAMETERS)
-_VALVE = len(PARTS[0].parameters)
+DRIVES = {part.name: tuple(one.name for one in part.parameters) for part in PARTS if part.drives}
+"""Parameters of the parts that make the pressure."""
+SEGMENT = tuple(one.name for part in PARTS if not part.drives for one in part.parameters)
 DAY_SPREAD = 0.15
 """Standard deviation of the logarithm of a day's gain: an arm is refitted, its hoses and its rubber rest."""
 
@@ -182,71 +218,111 @@ class Trial:
     Attributes
     ----------
     name, day : of the log; trials of one day share a gain. load_kg : at the tip.
-    t_s : (n,). command_kpa : (n,) means over the steps, empty where it was not logged.
+    t_s : (n,). command : (n,) kPa, or PWM, means over the steps; empty where it was not logged.
     pressure_kpa : (n,) of the driven chamber, empty where it was not logged.
     angle_rad, chord_m : (n,) of the tip, empty without motion capture.
+    pwm : whether the command is a PWM value in place of a pressure.
     """
 
     name: str
     day: str
     load_kg: float
     t_s: FloatArray
-    command_kpa: FloatArray
+    command: FloatArray
     pressure_kpa: FloatArray
     angle_rad: FloatArray
     chord_m: FloatArray
+    pwm: bool = False
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _nozzle(ratio):  # type: ignore[no-untyped-def]
+    """psi of ISO 6358 at a ratio of absolute pressures."""
+    if ratio >= 1.0:
+        return 0.0
+    beyond = max(ratio - _CRITICAL, 0.0) / (1.0 - _CRITICAL)
+    return math.sqrt(1.0 - beyond * beyond)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _valve(command, start_kpa, q, step_s):  # type: ignore[no-untyped-def]
-    rate, overlap, supply, exhaust, source, line, ratio, leak = q
+    rate, drains, overlap, opening, supply, exhaust, source, line, ratio, leak = q
     out = np.empty(len(command))
-    pilot = outlet = chamber = start_kpa
-    width = _OPENING * overlap
-    most = overlap + width
+    outlet = chamber = start_kpa
+    ahead = overlap
+    step_s /= _FINER
+    flow = step_s * line
+    held = 1.0 + ratio * flow
     for k in range(len(command)):
         out[k] = outlet
-        pilot += step_s * rate * (command[k] - outlet)
-        ahead = min(max(pilot - outlet, -most), most)
-        pilot = outlet + ahead
-        fills = supply * max(ahead - overlap, 0.0) / width
-        drains = exhaust * max(-ahead - overlap, 0.0) / width + leak
-        # Implicit in both pressures, as the line is fast.
-        flow = step_s * line
-        held = 1.0 + ratio * flow
-        outlet = (outlet + step_s * fills * source + flow * chamber / held) / (
-            1.0 + step_s * (fills + drains) + flow - flow * ratio * flow / held
-        )
-        chamber = (chamber + ratio * flow * outlet) / held
+        for _ in range(_FINER):
+            error = command[k] - outlet
+            ahead += step_s * rate * error * (drains if error < 0.0 else 1.0)
+            ahead = min(max(ahead, -overlap - opening), overlap + opening)
+            # Implicit in the pressures, as ports and line are fast: flows over the drops that drive them.
+            fills = empties = 0.0
+            if ahead > overlap and outlet < source:
+                gone = (outlet + _AIR_KPA) / (source + _AIR_KPA)
+                full = supply * (source + _AIR_KPA) * _nozzle(gone) / max(source - outlet, 1e-3)
+                fills = full * (ahead - overlap) / opening
+            elif ahead < -overlap and outlet > 0.0:
+                full = exhaust * (outlet + _AIR_KPA) * _nozzle(_AIR_KPA / (outlet + _AIR_KPA))
+                empties = full / max(outlet, 1e-3) * (-ahead - overlap) / opening
+            was = outlet
+            outlet = (outlet + step_s * fills * source + flow * chamber / held) / (
+                1.0 + step_s * (fills + empties + leak) + flow - flow * ratio * flow / held
+            )
+            chamber = (chamber + ratio * flow * outlet) / held
+            ahead -= outlet - was
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _lag(command, start_kpa, q, step_s):  # type: ignore[no-untyped-def]
+    level, rises_s, falls_s = q
+    out = np.empty(len(command))
+    pressure = start_kpa
+    for k in range(len(command)):
+        out[k] = pressure
+        ahead = level * command[k] - pressure
+        pressure += ahead * (1.0 - math.exp(-step_s / (rises_s if ahead > 0.0 else falls_s)))
     return out
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _segment(pressure, angle, chord, q, gain, moment, step_s):  # type: ignore[no-untyped-def]
-    rest, linear, lag, square, stop, reach, creep, creep_s, vented, settling_s, sooner = q[:11]
-    compliance, c0, c1, c2 = q[11:]
+    rest, linear, fill, lag, stiffens, stop, reach, creep, creep_s, vented, settling_s, sooner = q[:12]
+    compliance, c0, c1, c2 = q[12:]
     out = np.empty((len(pressure), 2))
     short = c0 + c1 * angle + c2 * angle * angle - chord
     elastic, crept = 0.0, 0.0
-    follows = 1.0 - math.exp(-step_s / lag)
+    inside = pressure[0]
+    follows, fills = 1.0 - math.exp(-step_s / lag), 1.0 - math.exp(-step_s / fill)
     for k in range(len(pressure)):
-        p = pressure[k]
         out[k, 0] = angle
         out[k, 1] = c0 + c1 * angle + c2 * angle * angle - short
-        aim = rest + gain * (linear * p + square * p * p) + compliance * moment * math.sin(_LEANS * angle)
-        change = follows * (aim - stop * elastic / reach + creep * crept + vented * short - angle)
+        inside += fills * (pressure[k] - inside)
+        bends = (
+            gain * linear * inside + compliance * moment * math.sin(_LEANS * angle) - stop * elastic / reach
+        )
+        aim = rest + bends / max(1.0 + stiffens * inside, 0.1)
+        change = follows * (aim + creep * crept + vented * short - angle)
         angle += change
         elastic = min(max(elastic + change, -reach), reach)
         crept += step_s / creep_s * (angle - rest - crept)
-        short -= step_s / settling_s * short * math.exp(min(sooner * p, 5.0))
+        short -= step_s / settling_s * short * math.exp(min(sooner * inside, 5.0))
     return out
 
 
-def valve_run(trial: Trial, values: Mapping[str, float]) -> FloatArray:
-    """Pressure [kPa] (n,) that follows from a trial's command and from its first reading alone."""
+def drive_run(trial: Trial, values: Mapping[str, float]) -> FloatArray:
+    """Pressure [kPa] (n,) that follows from a trial's command and from its first reading alone.
+
+    The drive is the one whose parameters are among `values`.
+    """
     start = trial.pressure_kpa[0] if len(trial.pressure_kpa) else 0.0
-    q = np.array([values[name] for name in NAMES[:_VALVE]])
-    return np.asarray(_valve(trial.command_kpa, start, q, STEP_S))
+    name = next(one for one, names in DRIVES.items() if names[0] in values)
+    q = np.array([values[one] for one in DRIVES[name]])
+    return np.asarray((_valve if name == "valve" else _lag)(trial.command, start, q, STEP_S))
 
 
 def segment_run(
@@ -258,7 +334,7 @@ def segment_run(
     ----------
     values : parameters by name. gain : of the day.
     """
-    q = np.array([values[name] for name in NAMES[_VALVE:]])
+    q = np.array([values[name] for name in SEGMENT])
     moment = trial.load_kg * _GRAVITY_MPS2 * values["chord_m"]
     out = _segment(pressure_kpa, trial.angle_rad[0], trial.chord_m[0], q, gain, moment, STEP_S)
     return out[:, 0], out[:, 1]
@@ -271,29 +347,42 @@ class Assembly:
     parts: tuple[str, ...]
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Parameters of its parts."""
+        return tuple(one.name for part in PARTS if part.name in self.parts for one in part.parameters)
+
+    @property
     def off(self) -> dict[str, float]:
         """Values of parameters whose parts are left out."""
         return {k: v for part in PARTS if part.name not in self.parts for k, v in part.off.items()}
 
     def values(self, z: FloatArray, scale: Scale) -> dict[str, float]:
         """Parameters at z (parameters,) standard deviations of their priors."""
-        found = {one.name: one.value(x, scale) for one, x in zip(PARAMETERS, z.tolist(), strict=True)}
-        return found | self.off
+        mine = set(self.names)
+        found = zip(PARAMETERS, z.tolist(), strict=True)
+        return {one.name: one.value(x, scale) for one, x in found if one.name in mine} | self.off
 
     def without(self, *names: str) -> Assembly:
         """The same without some parts."""
         return Assembly(tuple(one for one in self.parts if one not in names))
 
+    def driven_by(self, name: str) -> Assembly:
+        """The same with another drive."""
+        return Assembly((name, *self.without(*DRIVES).parts))
+
 
 def scale_of(trials: Sequence[Trial]) -> Scale:
-    """Size of what trials hold."""
-    pressures = [x for one in trials for x in (one.command_kpa, one.pressure_kpa) if len(x)]
+    """Size of what trials hold. Where no pressure was logged its size is that of the command."""
+    commands = [one.command for one in trials if len(one.command)]
+    pressures = [one.pressure_kpa for one in trials if len(one.pressure_kpa)]
     angles = np.concatenate([one.angle_rad for one in trials])
     chords = np.concatenate([one.chord_m for one in trials])
     low, high = (float(x) for x in np.percentile(angles, (1.0, 99.5))) if len(angles) else (0.0, 1.0)
+    command = max((float(x.max()) for x in commands), default=1.0)
     return Scale(
-        max(float(x.max()) for x in pressures),
+        max([float(x.max()) for x in pressures] + [command] * (not all(one.pwm for one in trials))),
         high - low,
         float(chords.max()) if len(chords) else 1.0,
         low,
+        command,
     )

@@ -17,7 +17,7 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.core.verdict import Finding
-from calib.io.columns import COMMANDED, POSITION, PRESSURES, QUATERNION
+from calib.io.columns import COMMANDED, POSITION, PRESSURES, PWM, QUATERNION
 from calib.io.logs import Log, check_time
 from calib.stages.arm.model import STEP_S, Trial
 
@@ -55,7 +55,8 @@ class Recording:
 
     Attributes
     ----------
-    command, pressure : (n,) kPa of the driven chamber, NaN where a cell is blank; None without.
+    command, pressure : (n,) kPa of the driven chamber, NaN where a cell is blank; None without. The command
+        is a PWM value where `pwm`.
     turned : (n, 3) rotation vectors of the tip in the frame of the base [rad]. chord : (n, 3) from base to
         tip [m]. Both None for poses in the plane, or without motion capture.
     planar : (n, 2) angle [rad] and chord [m] in the plane, None without.
@@ -72,6 +73,7 @@ class Recording:
     planar: FloatArray | None
     chamber: int
     findings: tuple[Finding, ...]
+    pwm: bool = False
 
 
 def _times(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -126,7 +128,7 @@ def _varies(log: Log, name: str) -> bool:
 
 def _driven(log: Log) -> int:
     """Number of the driven chamber from 0. Raises `BadInputError` where none or several are."""
-    for names in (COMMANDED, PRESSURES):
+    for names in (COMMANDED, PWM, PRESSURES):
         moving = [
             k for k, n in enumerate(names)
             if n in log.columns and np.isfinite(log.columns[n]).any() and _varies(log, n)
@@ -161,8 +163,11 @@ def recording_of(log: Log, name: str) -> Recording:
         planar = np.stack([phi, np.hypot(x, y)], axis=1)
         findings += _jumps(log, name, phi[:, None])
     command, pressure = (log.columns.get(names[driven]) for names in (COMMANDED, PRESSURES))
+    pwm = command is None and driven < len(PWM) and PWM[driven] in log.columns
+    if pwm:
+        command = log.columns[PWM[driven]]
     return Recording(
-        name, log.source, t, command, pressure, turned, chord, planar, driven + 1, tuple(findings)
+        name, log.source, t, command, pressure, turned, chord, planar, driven + 1, tuple(findings), pwm
     )
 
 
@@ -271,7 +276,8 @@ def trial_of(recording: Recording, frame: Frame, day: str, load_kg: float) -> Tr
     command = none if recording.command is None else _means(grid, t, recording.command)
     if not len(pressure) and not len(angle):
         raise BadInputError(f"{recording.source}: has neither pressure nor pose, expected one of them")
-    return Trial(recording.name, day, load_kg, grid - grid[0], command, pressure, angle, chord)
+    rest = (grid - grid[0], command, pressure, angle, chord, recording.pwm)
+    return Trial(recording.name, day, load_kg, *rest)
 
 
 def _between(grid: FloatArray, t: FloatArray, values: FloatArray) -> FloatArray:

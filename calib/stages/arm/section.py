@@ -6,8 +6,9 @@ from typing import Literal
 
 from pydantic import model_validator
 
+from calib.core.errors import BadInputError
 from calib.core.result import NotNegative, Number, Positive, Result, Row3, Section, Sigma, quantity
-from calib.stages.arm.model import NAMES, PARAMETERS, PARTS, Assembly
+from calib.stages.arm.model import PARAMETERS, PARTS, Assembly
 
 
 class HeldTrial(Section):
@@ -53,16 +54,26 @@ class Arm(Result):
 
     @model_validator(mode="after")
     def _assembled(self) -> Arm:
+        if self.earlier:
+            return self
         known = [part.name for part in PARTS]
-        needed = [part.name for part in PARTS if not part.off]
+        needed = [part.name for part in PARTS if not part.off and not part.drives]
         if any(one not in known for one in self.parts) or any(one not in self.parts for one in needed):
             raise ValueError(f"expected parts of {', '.join(known)}, with {', '.join(needed)}")
-        if set(self.parameters) != set(NAMES) - set(self.assembly.off):
+        drives = [part.name for part in PARTS if part.drives]
+        if sum(one in drives for one in self.parts) != 1:
+            raise ValueError(f"expected one part of {' and '.join(drives)}")
+        if set(self.parameters) != set(self.assembly.names):
             raise ValueError("expected the parameters of its parts, all of them")
         wrong = [p.name for p in PARAMETERS if p.positive and self.parameters.get(p.name, 1.0) <= 0.0]
         if wrong:
             raise ValueError(f"expected {wrong[0]} above 0")
         return self
+
+    @property
+    def earlier(self) -> bool:
+        """Whether its segment bends by the square of the pressure, as in an earlier version; it is kept."""
+        return "quadratic" in self.parts
 
     @property
     def assembly(self) -> Assembly:
@@ -71,7 +82,14 @@ class Arm(Result):
 
     @property
     def values(self) -> dict[str, float]:
-        """All parameters, those of parts that are left out included."""
+        """All parameters, those of parts that are left out included.
+
+        Raises `BadInputError` for an arm of an earlier version.
+        """
+        if self.earlier:
+            raise BadInputError(
+                "arm: is of an earlier model, expected one of calib identify arm; run it again"
+            )
         return self.parameters | self.assembly.off
 
     def gain_of(self, day: str) -> float:

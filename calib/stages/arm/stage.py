@@ -123,12 +123,12 @@ def _solve(inputs: Inputs) -> Arm:
 
     with inputs.progress("identifying") as progress:
         found = identify(inputs.trials, inputs.compare, progress)
-    made, off = found.fit, found.fit.assembly.off
+    made = found.fit
     axis = inputs.frame.axis
     return Arm(
         parts=list(made.assembly.parts),
-        parameters={name: float(value) for name, value in made.values.items() if name not in off},
-        sigma={name: float(value) for name, value in found.sigma.items() if name not in off},
+        parameters={name: float(made.values[name]) for name in made.assembly.names},
+        sigma={name: float(value) for name, value in found.sigma.items()},
         days={name: float(value) for name, value in made.gains.items()},
         bending_axis=None if axis is None else axis.tolist(),
         chord_leans=_known(inputs.frame.leans),
@@ -210,11 +210,9 @@ def _far(found: Identification) -> Iterator[Finding]:
 def _untold(found: Identification) -> Iterator[Finding]:
     from calib.stages.arm.model import PARAMETERS
 
-    off = found.fit.assembly.off
+    mine = found.fit.assembly.names
     untold = [
-        p
-        for p, s in zip(PARAMETERS, found.fit.sigma.tolist(), strict=True)
-        if s > _UNTOLD and p.name not in off
+        p for p, s in zip(PARAMETERS, found.fit.sigma.tolist(), strict=True) if s > _UNTOLD and p.name in mine
     ]
     if untold:
         takes = dict.fromkeys(one.identified_by for one in untold)
