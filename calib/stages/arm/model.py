@@ -17,8 +17,8 @@ Lag, in place of a valve, as of a pump under PWM: dp/dt = (G u - p) / t, with on
 Segment: the chamber of the arm fills, p_f, with the fill time. The angle phi [rad] follows its rest value
 with one viscous lag; inertia plays no part at the speeds of such arms. Pressure stiffens, so that the moments
 of pressure, load and hysteresis bend less under it. w is a stop, the elastic part of the angle's changes, of
-at most the hysteresis' range; c creeps after the angle; s is by how much the chord is too short at the start, as
-of an arm that was vented:
+at most the hysteresis' range; c creeps after the angle; s is by how much the chord is too short at the start,
+as of an arm that was vented:
 
     dp_f/dt = (p - p_f) / t_f
     tau dphi/dt = phi_0 + (g a p_f + C M(phi) - h w / r) / (1 + b p_f) + q c + v s - phi
