@@ -1,9 +1,10 @@
 """Boards found and their RMS beside OpenCV's finders, with the same solver, and error against rendered truth.
 
-    python tests/bench/corners.py [FOLDER ...]
+    python tests/bench/corners.py [FOLDER ...] [--truth]
 
-Folders hold pictures and a board.yaml; by default the real recordings and the shipped pictures. The model
-is radial2 without skew throughout. Milliseconds are of one picture on one core, refinement included.
+Folders hold pictures and a board.yaml; by default the real recordings and the shipped pictures, and
+renderings of four sizes; with --truth these alone. The model is radial2 without skew throughout.
+Milliseconds are of one picture on one core, refinement included.
 """
 
 from __future__ import annotations
@@ -91,40 +92,59 @@ def _turned(corners: FloatArray, truth: FloatArray) -> FloatArray:
     return min((corners, corners[::-1]), key=lambda c: float(np.nansum((c - truth) ** 2)))
 
 
-def _on_truth(width: int, height: int, count: int) -> None:
-    """Corner RMSE over rendered pictures that every finder found."""
-    rng = np.random.default_rng(width)
+TRUTH = {(316, 208): 6, (640, 480): 6, (1280, 960): 4, (4000, 3000): 1}
+"""Sizes of rendered pictures and how many of each kind."""
+
+
+def _rendered(
+    size_px: tuple[int, int], blur_px: float, along_pixels: bool, seed: int
+) -> tuple[GrayImage, FloatArray]:
+    """A board of 9 x 6 corners and the truth; along the pixels to 3 degrees, or at any angle."""
+    rng = np.random.default_rng([seed, size_px[0]])
+    width, height = size_px
     lens = np.array([-0.22, 0.12, 0, 0, 0, 0, 0, 0.0])
     f = 0.85 * width
-    camera = Camera("radial2", (width, height), f, f, 0.0, width / 2 + 3.3, height / 2 - 2.1, lens)
+    camera = Camera("radial2", size_px, f, f, 0.0, width / 2 + 3.3, height / 2 - 2.1, lens)
     printed = PrintedBoard(Board(9, 6, 0.025))
-    errors: dict[str, list[float]] = {name: [] for name in FINDERS}
-    boards = dict.fromkeys(FINDERS, 0)
-    for seed in range(count):
-        pose = pose_facing(
-            camera,
-            printed,
-            (width * rng.uniform(0.4, 0.6), height * rng.uniform(0.4, 0.6)),
-            rng.uniform(0.36, 0.6),
-            tilt_rad=rng.uniform(0, 0.7),
-            azimuth_rad=rng.uniform(0, 2 * np.pi),
-            roll_rad=rng.uniform(-0.5, 0.5),
-        )
-        sensor = Sensor(
-            blur_px=rng.uniform(0.5, 0.9), noise_grey=rng.uniform(1, 4), gamma=rng.uniform(1, 1.6)
-        )
-        gray = render(camera, printed, pose, sensor=sensor, seed=seed)
-        truth = corner_pixels(camera, printed, pose)
-        found = {name: find(gray, 9, 6) for name, find in FINDERS.items()}
-        for name, corners in found.items():
-            boards[name] += corners is not None
-        if all(c is not None for c in found.values()):
-            for name, corners in found.items():
-                errors[name].append(float(np.nanmean(np.sum((_turned(corners, truth) - truth) ** 2, axis=1))))
-    print(f"\nrendered, {count} pictures of {width}x{height} px; RMSE per coordinate over those all found")
-    print(f"{'':28}{'boards':>8}{'RMSE, px':>10}")
-    for name in FINDERS:
-        print(f"{name:28}{boards[name]:5d}/{count}{np.sqrt(np.mean(errors[name]) / 2):10.4f}")
+    pose = pose_facing(
+        camera,
+        printed,
+        (width * rng.uniform(0.4, 0.6), height * rng.uniform(0.4, 0.6)),
+        rng.uniform(0.36, 0.55),
+        tilt_rad=rng.uniform(0, 0.05 if along_pixels else 0.7),
+        azimuth_rad=rng.uniform(0, 2 * np.pi),
+        roll_rad=rng.uniform(-0.05, 0.05) if along_pixels else rng.uniform(-0.5, 0.5),
+    )
+    gray = render(camera, printed, pose, sensor=Sensor(blur_px=blur_px, noise_grey=2.0), seed=seed)
+    return gray, corner_pixels(camera, printed, pose)
+
+
+def _on_truth() -> None:
+    """Corner RMSE by size, blur and direction, beside the classic finder's and the fits' own sigma."""
+    print("\nrendered, RMSE per coordinate, px; z: over the sigma that calib gives, which is near the bound")
+    print(f"{'':34}{'calib':>8}{'classic':>9}{'ratio':>7}{'z':>6}{'boards':>8}")
+    for size_px, count in TRUTH.items():
+        for blur_px in (0.3, 0.7, 1.5, 3.0):
+            for along_pixels in (False, True):
+                squares, theirs, sigmas, boards = [], [], [], 0
+                for seed in range(count):
+                    gray, truth = _rendered(size_px, blur_px, along_pixels, seed)
+                    detection, classic = detect(gray, 9, 6), _classic(gray, 9, 6)
+                    if detection is None:
+                        continue
+                    boards += 1
+                    on = detection.refined
+                    squares.append(np.mean((_turned(detection.pixels, truth) - truth)[on] ** 2))
+                    sigmas.append(np.mean(detection.sigma_px[on] ** 2))
+                    if classic is not None:
+                        theirs.append(np.mean((_turned(classic, truth) - truth) ** 2))
+                ours, sigma = np.sqrt(np.mean(squares)), np.sqrt(np.mean(sigmas))
+                peer = np.sqrt(np.mean(theirs)) if theirs else np.nan
+                what = f"{size_px[0]}x{size_px[1]}, blur {blur_px}" + (
+                    ", along pixels" if along_pixels else ""
+                )
+                numbers = f"{ours:8.4f}{peer:9.4f}{ours / peer:7.2f}{ours / sigma:6.2f}{boards:5d}/{count}"
+                print(f"{what:34}{numbers}", flush=True)
 
 
 def main(folders: list[str]) -> None:
@@ -132,14 +152,16 @@ def main(folders: list[str]) -> None:
     cv2.setNumThreads(1)
     recordings = Path(os.environ.get("CALIB_SHARED_DATA", ROOT.parent / "shared" / "data"))
     usual = [recordings / "opencv_left", recordings / "gloworm_qvga", ROOT / "images"]
+    if folders == ["--truth"]:
+        _on_truth()
+        return
     for folder in [Path(name) for name in folders] or usual:
         if folder.is_dir():
             _on_folder(folder)
         else:
             print(f"\nno folder {folder.name}")
     if not folders:
-        _on_truth(640, 480, 30)
-        _on_truth(316, 208, 30)
+        _on_truth()
 
 
 if __name__ == "__main__":

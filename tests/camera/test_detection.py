@@ -205,7 +205,7 @@ def test_sharp_edges_are_placed_to_a_hundredth_of_a_pixel(
         sigmas.append(detection.sigma_px)
     rmse, sigma = np.sqrt(np.mean(np.square(errors))), np.sqrt(np.mean(np.square(sigmas)))
     assert rmse < max(0.012, 1.2 * sigma)
-    assert rmse < 2.5 * sigma
+    assert rmse < 1.6 * sigma
     assert np.max(np.abs(errors)) < 0.1
 
 

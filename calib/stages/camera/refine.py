@@ -54,8 +54,12 @@ _NOISE, _LEAST_NOISE = 0.04, 1.0
 _LEAST_BEND_SIGMA = 1e-6
 _WARM_RESIDUAL = 0.5
 _START_WIDTH_PX = 1.2
-_WIDTH_PX = (0.408, 12.0)
-"""The least width is that of a pixel's aperture: sqrt(2 / 12) px."""
+_APERTURE_PX2 = 1.0 / 12.0
+"""Variance of a pixel's aperture."""
+_WIDTH_PX = (float(np.sqrt(2.0 * _APERTURE_PX2)), 12.0)
+"""The least width is that of a pixel's aperture."""
+_SAMPLING_PX = 0.04
+"""Standard deviation of the place of an edge along the pixels without blur, as in rendered pictures."""
 _PARAMETERS = 11
 _WIDTH = 4
 _OBSERVED = np.array([5, 6, 9, 10])
@@ -446,7 +450,8 @@ def _result(
     scaled = normal / (scale[:, :, None] * scale[:, None, :]) + 1e-7 * np.eye(q.shape[1])
     inverse = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
     variance = cost / freedom
-    sigma = np.sqrt(np.maximum(0.5 * (inverse[:, 0, 0] + inverse[:, 1, 1]) * variance, 0.0))
+    sigma2 = np.maximum(0.5 * (inverse[:, 0, 0] + inverse[:, 1, 1]) * variance, 0.0)
+    sigma = np.sqrt(sigma2 + _sampling_px2(q, win))
     amplitude = q[:, 6]
     residual = np.sqrt(variance) / np.maximum(np.abs(amplitude), 1e-9)
     finite = np.all(np.isfinite(q), axis=1) & np.isfinite(sigma)
@@ -460,6 +465,19 @@ def _result(
         parameters=q,
         converged=converged & finite & (freedom > _PARAMETERS),
     )
+
+
+def _sampling_px2(q: FloatArray, win: _Windows) -> FloatArray:
+    """Variance (N,) of a corner's place from the pixels' grid, which edges that are hardly blurred show.
+
+    What blur of standard deviation s leaves at the grid's frequency is exp(-2 pi^2 s^2). Along an edge that
+    crosses n rows or columns within the window it averages out as sin(pi n) / (pi n) does.
+    """
+    blur2 = np.maximum(0.5 * q[:, _WIDTH] ** 2 - _APERTURE_PX2, 0.0)
+    side = np.sqrt(win.weight.sum(axis=1))[:, None]
+    crossed = 0.5 * side * np.abs(np.sin(2.0 * q[:, 2:4]))
+    averaged = np.mean(1.0 / (1.0 + (np.pi * crossed) ** 2), axis=1)
+    return np.asarray((_SAMPLING_PX * np.exp(-2.0 * np.pi**2 * blur2)) ** 2 * averaged)
 
 
 # ----------------------------------------------------------------------
