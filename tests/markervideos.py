@@ -22,6 +22,7 @@ class Scene:
     ----------
     exposure : share of the frame's time in which light is gathered: the marker moves meanwhile.
     flicker : by how much the light changes.
+    shift_px : of the disc from where it else is.
     other : "none", "block" (a rectangle), "disc" (a smaller one), "way" (a rectangle that the marker passes).
     """
 
@@ -34,6 +35,7 @@ class Scene:
     noise: float = 3.0
     gamma: float = 1.6
     seed: int = 0
+    shift_px: tuple[float, float] = (0.0, 0.0)
 
     def centre_px(self, t_s: float | FloatArray) -> FloatArray:
         """Where the disc is: loops with up to 7 px between frames."""
@@ -41,7 +43,7 @@ class Scene:
         t = np.asarray(t_s)
         u = width * (0.5 + 0.27 * np.cos(2.1 * t) + 0.03 * np.sin(7.0 * t))
         v = height * (0.5 + 0.3 * np.sin(1.7 * t) + 0.02 * np.cos(9.0 * t))
-        return np.stack([u, v], axis=-1)
+        return np.stack([u, v], axis=-1) + self.shift_px
 
     def frames(self, count: int) -> Iterator[tuple[float, AnyArray]]:
         """Times of the middles of the exposures, and frames (H, W, 3) in BGR."""

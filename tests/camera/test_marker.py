@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -38,7 +39,7 @@ def ends(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
     return int(left.value.code or 0)
 
 
-@pytest.mark.parametrize(("codec", "name", "rmse_px"), [("MJPG", "m.avi", 0.1), ("mp4v", "m.mp4", 0.2)])
+@pytest.mark.parametrize(("codec", "name", "rmse_px"), [("MJPG", "m.avi", 0.06), ("mp4v", "m.mp4", 0.13)])
 def test_a_compressed_video(
     codec: str,
     name: str,
@@ -47,9 +48,10 @@ def test_a_compressed_video(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Light that changes, motion blur, noise, and an orange block: 0.1 px, 99 % of the frames, none wrong.
+    """Light that changes, motion blur, noise, and an orange block: 99 % of the frames, none wrong.
 
-    Where a codec throws most of the picture away, twice as much.
+    At OpenCV's default rate MPEG-4 throws away so much that a fit which knows all but the place is hardly
+    better: the next test.
     """
     scene, log = Scene(other="block"), tmp_path / "log.csv"
     assert ends(monkeypatch, written(scene, tmp_path / name, 150, codec), "-o", log) == 0
@@ -62,7 +64,33 @@ def test_a_compressed_video(
     assert np.sqrt((off**2).sum(axis=1).mean()) < rmse_px
     assert np.hypot(*off.T).max() < 0.5
     table = np.loadtxt(log, delimiter=",", skiprows=1)
-    assert 0.7 < (off / table[:, 3:]).std() < 1.4
+    # What a codec carries on over many frames is not in sigma, as the manual says.
+    assert 0.7 < (off / table[:, 3:]).std() < (1.4 if codec == "MJPG" else 1.7)
+
+
+@pytest.mark.slow
+def test_what_a_codec_leaves_bounds_the_centre(tmp_path: Path) -> None:
+    """The centre by least squares on frames that differ from the truth by the codec alone, and by a track."""
+    scene, count, step = Scene(other="block"), 60, 0.25
+    video = cv2.VideoCapture(str(written(scene, tmp_path / "m.mp4", count, "mp4v")))
+    known = [
+        [frame.astype(np.float64) for _, frame in moved.frames(count)]
+        for moved in (replace(scene, noise=0.0, shift_px=by) for by in ((0.0, 0.0), (step, 0.0), (0.0, step)))
+    ]
+    tracker, best, ours = Tracker(parse_colour("orange")), [], []
+    for k in range(count):
+        frame, centre = video.read()[1], scene.centre_px(k / scene.rate_hz)
+        u, v = centre.astype(int)
+        near = np.s_[v - 20 : v + 20, u - 20 : u + 20]
+        here, right, down = (one[k][near] for one in known)
+        J = np.stack([(right - here).ravel(), (down - here).ravel()], axis=1) / step
+        best.append(np.linalg.lstsq(J, (frame[near] - here).ravel(), rcond=None)[0])
+        one = tracker.follow(frame)
+        assert one is not None
+        ours.append(one.centre_px - centre)
+    bound, found = (float(np.sqrt((np.array(off) ** 2).sum(axis=1).mean())) for off in (best, ours))
+    print(f"RMSE: {found:.3f} px, of a fit that knows light, background and radius {bound:.3f} px")
+    assert found < 1.25 * bound
 
 
 def test_another_disc_is_told_and_not_followed() -> None:
