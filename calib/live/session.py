@@ -189,7 +189,7 @@ class Session:
             self.corners = _size_of(level.image)
             if self.corners is None:
                 return Seen(None, "no board", "Hold the whole board into the picture, with light on it.")
-        board = detect(level.image, *self.corners)
+        board = detect(level.image, *self.corners, quick=True)
         if board is None:
             return Seen(None, "no board", self._sought())
         scale = size_px[0] / level.image.shape[1]

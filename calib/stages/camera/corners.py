@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -265,6 +266,7 @@ def surroundings(grid: Refined) -> Surroundings:
 _COARSE_PIXELS = 120_000
 _LARGEST_PIXELS = 6_000_000
 _ENLARGE_BELOW_PIXELS = 700_000
+_QUICK_PIXELS = 400_000
 _ENLARGE_TWICE_BELOW_PIXELS = 90_000
 _OPENCV_PIXELS = 1_300_000
 _SEEN_SHARE = 0.8
@@ -345,8 +347,8 @@ def complete(lattice: Lattice) -> FloatArray | None:
     return np.where(seen[..., None], lattice.points, prediction.points)
 
 
-def lattice_stages(gray: GrayImage, columns: int, rows: int) -> list[Stage]:
-    """Stages that join saddle points of copies of the picture."""
+def lattice_stages(gray: GrayImage, columns: int, rows: int, quick: bool = False) -> list[Stage]:
+    """Stages that join saddle points of copies of the picture; where it must be `quick`, of no large ones."""
 
     def stage(zoom: float) -> Stage:
         def search() -> Found:
@@ -365,7 +367,11 @@ def lattice_stages(gray: GrayImage, columns: int, rows: int) -> list[Stage]:
 
         return Stage(f"saddles x{zoom:g}", search)
 
-    return [stage(zoom) for zoom in lattice_levels(gray)]
+    return [
+        stage(zoom)
+        for zoom in lattice_levels(gray)
+        if not (quick and zoom > 1.0 and zoom**2 * gray.size > _QUICK_PIXELS)
+    ]
 
 
 _Finder = Callable[[GrayImage, tuple[int, int]], FloatArray | None]
@@ -587,7 +593,7 @@ def _best_of(gray: GrayImage, grids: Sequence[FloatArray]) -> Refined | None:
     return best
 
 
-def detect(gray: GrayImage, columns: int, rows: int) -> Detection | None:
+def detect(gray: GrayImage, columns: int, rows: int, quick: bool = False) -> Detection | None:
     """Find a board of `columns` x `rows` inner corners, at any angle, to a small fraction of a pixel.
 
     The first stage whose grid is whole and passes the tests ends the search. Refinement starts each
@@ -597,6 +603,8 @@ def detect(gray: GrayImage, columns: int, rows: int) -> Detection | None:
     ----------
     gray : (H, W) of uint8.
     columns, rows : inner corners, each at least 3.
+    quick : for a camera that runs: no large copies and no other finders, which take ten times as long on
+        a frame without a board.
 
     Returns
     -------
@@ -614,7 +622,8 @@ def detect(gray: GrayImage, columns: int, rows: int) -> Detection | None:
     if not _checked(gray):
         return None
     fragments = False
-    for stages in (lattice_stages, fallback_stages):
+    joined = partial(lattice_stages, quick=quick)
+    for stages in (joined,) if quick else (joined, fallback_stages):
         for stage in stages(gray, columns, rows):
             found = stage.search()
             fragments |= found.fragments
