@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import yaml
@@ -12,10 +13,13 @@ import yaml
 from calib.core.errors import BadInputError
 from calib.core.files import sha256
 from calib.core.rig import Rig
+from calib.core.workers import Task
 from calib.core.writing import write_atomically
-from calib.runner.folder import Folder, LogFile, read_folder
-from calib.runner.graph import HIDDEN, Done, Planned, Runner, Step, opened
-from calib.runner.outputs import decide, publish, summary
+from calib.runner.decision import decide
+from calib.runner.folder import Folder, read_folder
+from calib.runner.graph import HIDDEN, Job, Runner, Step, opened
+from calib.runner.outputs import run_folder
+from calib.runner.processes import Here
 from calib.runner.work import DOCUMENT, FIGURES, MESSAGES, RIG, Work
 from calib.stages.estimator.section import Estimator
 from calib.twin.section import Twin, TwinTracker
@@ -28,29 +32,28 @@ CALLS: list[str] = []
 Act = Callable[[list[str], Path], int]
 
 
-class Inline:
+class Inline(Here):
     """Carries out a work at once; `codes` holds exit codes by its name, 0 for the others."""
 
     def __init__(
         self, codes: dict[str, int] | None = None, during: Callable[[str], None] | None = None
     ) -> None:
+        super().__init__()
         self.codes, self.during = codes or {}, during
-        self._ended: list[tuple[str, int]] = []
 
-    @property
-    def free(self) -> bool:
-        return not self._ended
+    def start(self, task: Task) -> None:
+        super().start(replace(task, function=self._done, arguments=(task.name, *task.arguments)))
 
-    def start(self, work: Work) -> None:
-        CALLS.append(work.name)
-        code = self.codes.get(work.name, 0)
+    def _done(self, name: str, work: Work) -> int:
+        CALLS.append(name)
+        code = self.codes.get(name, 0)
         if code in (0, 1):
             code = self._guarded(work, code)
         else:
-            (work.folder / MESSAGES).write_text(f"calib: {work.name} cannot\n")
+            (work.folder / MESSAGES).write_text(f"calib: {name} cannot\n")
         if self.during is not None:
-            self.during(work.name)
-        self._ended.append((work.name, code))
+            self.during(name)
+        return code
 
     def _guarded(self, work: Work, code: int) -> int:
         """As the command line ends a verb that cannot write."""
@@ -91,30 +94,27 @@ class Inline:
             figures.mkdir(exist_ok=True)
             write_atomically(figures / "some_figure.svg", "<svg xmlns='http://www.w3.org/2000/svg'/>")
         (work.folder / DOCUMENT).write_text(json.dumps({"schema": 1, "verb": work.verb}))
-        (work.folder / MESSAGES).write_text(f"said by {work.name}\n")
-
-    def finished(self) -> Iterator[tuple[str, int]]:
-        ended, self._ended = self._ended, []
-        yield from ended
+        (work.folder / MESSAGES).write_text(f"said by {work.verb}\n")
 
 
-def _pictures(folder: Folder) -> Planned | str:
-    return Planned(folder.pictures, folder.pictures) if folder.pictures else "no pictures"
+def _pictures(folder: Folder, job: Job) -> Job:
+    return replace(job, paths=folder.pictures, inputs=folder.pictures)
 
 
-def _nothing(_: Folder) -> Planned | str:
-    return Planned((), ())
+def _nothing(_: Folder, job: Job) -> Job:
+    return job
 
 
-def _log(log: LogFile) -> Planned | str:
-    return Planned((log.path,), (log.path,))
+def _log(_: Folder, job: Job) -> Job:
+    assert job.log is not None
+    return job.reading((job.log.path,), "")
 
 
 STEPS = (
     Step("first", "First", "first", _pictures, writes=("estimator",), flashed=True),
     Step("second", "Second", "second", _nothing, writes=("twin",), needs=("estimator",)),
     Step("lone", "Lone", "lone", _nothing),
-    Step("each", "Each", "each", None, _log, needs=("estimator",), output="states.csv"),
+    Step("each", "Each", "each", _log, each_log=True, needs=("estimator",), output="states.csv"),
     Step("firmware", "Firmware", "firmware", _nothing, needs=("estimator",),
           uses=("twin",), output="firmware", figures=False),
 )  # fmt: skip
@@ -133,14 +133,11 @@ def make_folder(root: Path) -> Path:
 
 def run_small(
     root: Path, out: Path, runs: Inline | None = None, follow_links: bool = False, fresh: bool = False
-) -> list[Done]:
+) -> Sequence[Job]:
     """A whole run with the small stages."""
     folder = read_folder(root, follow_links)
     with opened(out, root):
-        runner = Runner(folder, out, runs or Inline(), steps=STEPS, fresh=fresh)
-        ended = runner.run()
-        publish(runner, ended, summary(runner, ended, False))
-    return ended
+        return run_folder(Runner(folder, out, runs or Inline(), steps=STEPS, fresh=fresh), page=False).ended
 
 
 def exit_code(out: Path) -> int:

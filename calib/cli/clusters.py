@@ -13,7 +13,7 @@ from calib.cli.common import narrate
 from calib.core.errors import UsageError
 
 if TYPE_CHECKING:
-    from calib.runner.engine import Cluster
+    from calib.core.workers import Processes
     from calib.runner.fleet import Store
 
 OutOption = Annotated[
@@ -51,12 +51,14 @@ def opened_out(output: Path, verb: str, outputs: tuple[str, ...]) -> Iterator[St
 
 
 @contextmanager
-def processes(store: Store, scheduler: str | None, workers: int | None, retries: int) -> Iterator[Cluster]:
-    """The processes to work in, see `connected`; says what is to be said of them."""
+def processes(store: Store, scheduler: str | None, workers: int | None, retries: int) -> Iterator[Processes]:
+    """The processes to work in: this machine's own, or those of a scheduler."""
     from calib.core.workers import processors
-    from calib.runner.engine import connected
+    from calib.runner.processes import connected, local
 
-    with connected(scheduler, workers or processors(), store.scratch, retries) as cluster:
-        for sentence in cluster.remarks:
-            narrate(sentence)
-        yield cluster
+    with (
+        connected(scheduler, narrate)
+        if scheduler
+        else local(workers or processors(), retries, store.scratch) as made
+    ):
+        yield made

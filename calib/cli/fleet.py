@@ -75,8 +75,8 @@ def fleet(
     check_apart(output, known.rigs)
     with opened_out(output, "calib fleet", ("fleet.parquet", PAGE, TIMINGS)) as store:
         options = FleetOptions(pages, allowed=Allowed((*SCHEMES, *(allow_scheme or ())), allow_private))
-        with processes(store, scheduler, workers, retries) as cluster, progress_bar("rigs") as progress:
-            counts = run_fleet(store, cluster, known, options, retries, progress, narrate, limit_s)
+        with processes(store, scheduler, workers, retries) as pool, progress_bar("rigs") as progress:
+            counts = run_fleet(store, pool, known, options, progress, narrate, limit_s)
         summary = finish(store, known)
         write_fleet_page(output / PAGE, summary)
     if as_json:

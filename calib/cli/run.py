@@ -22,7 +22,7 @@ from calib.cli.common import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from calib.runner.graph import Done
+    from calib.runner.graph import Job
 
 
 def run(
@@ -82,13 +82,10 @@ def run(
         raise typer.Exit(decision.exit_code)
 
 
-def _tell(ended: Sequence[Done], files: Sequence[str], output: Path) -> None:
-    from calib.core.files import one_line, shown
+def _tell(ended: Sequence[Job], files: Sequence[str], output: Path) -> None:
+    from calib.core.files import shown
 
-    rows = []
-    for done in ended:
-        log = "" if done.job.log is None else f" of {one_line(done.job.log.path.stem)}"
-        rows.append([f"{done.job.step.title}{log}", done.status, "as before" if done.reused else ""])
+    rows = [[job.label, job.status, "as before" if job.reused else ""] for job in ended]
     for line in table(["stage", "", ""], rows):
         say(line)
     say(f"{shown(output)}: report.html and {len(files) - 1} more files")

@@ -54,8 +54,8 @@ def sweep(
     limit_s = parse_duration_s(timeout, "--timeout")
     known = read_sweep(spec)
     with opened_out(output, "calib sweep", ("sweep.parquet", SWEEP_PAGE, TIMINGS)) as store:
-        with processes(store, scheduler, workers, retries) as cluster, progress_bar("cases") as progress:
-            before = run_sweep(store, cluster, known, retries, progress, narrate, limit_s)
+        with processes(store, scheduler, workers, retries) as pool, progress_bar("cases") as progress:
+            before = run_sweep(store, pool, known, progress, limit_s)
         summary = summarise_sweep(store, known, before)
         write_sweep_page(output / SWEEP_PAGE, known, summary)
     if as_json:

@@ -2,15 +2,19 @@
 
 Forked workers see what the process holds without copying it, and are not held up by the interpreter's
 lock, as threads are. A process may fork safely only while it has one Python thread, so that elsewhere,
-and on systems where forking is not safe at all, threads do the work. A process of `concurrent.futures`
-that ends in the middle of its work, as after an error or Ctrl-C, now and then never ends; so each worker
-here has a pipe of its own, and no thread stands between.
+and on systems where forking is not safe at all, threads do the work.
+
+A process here is a loop at a pipe and does one task at a time, so that one which dies, or does not come to an
+end, is one task less and no more. A pool of `concurrent.futures` breaks as a whole when a process of it dies;
+one that ends in the middle of its work, as after Ctrl-C, now and then never ends; and its processes outlive a
+parent that is killed.
 """
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
+import math
 import multiprocessing
 import os
 import signal
@@ -19,14 +23,17 @@ import threading
 import time
 import traceback
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor, wait
-from multiprocessing import connection
-from multiprocessing.connection import Connection
+from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import wait as wait_for_futures
+from dataclasses import dataclass, field
+from functools import partial
+from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Generic, TypeVar, cast
+from typing import Any, Generic, Literal, Protocol, TypeVar
 
 import cv2
 import numpy.ma  # noqa: F401  for its loading
@@ -44,9 +51,6 @@ _LOOK_UP_S = 0.2
 _LAST_BREATH_S = 2.0
 _FEWEST_TO_FORK = 4
 """Starting processes for fewer items takes longer than they save."""
-
-_IN_HAND = 2
-"""Items that a worker holds, so that it need not wait for the next."""
 
 _PR_SET_PDEATHSIG = 1
 
@@ -71,26 +75,197 @@ def at_most(count: int) -> Iterator[None]:
         _most.pop()
 
 
-def _serve(shared: object, pipe: Connection, parent: int) -> None:
-    """What a worker process does: items in, results out, until told to end."""
+# ----------------------------------------------------------------------
+# Tasks, and the processes of this machine that carry them out.
+
+
+@dataclass(frozen=True)
+class Task:
+    """A call `function(*arguments)` under a name that is unique, with the time [s] that it has.
+
+    `function` is one of a module. A task may be begun more than once, so that it must not have effects that
+    count.
+    """
+
+    name: str
+    function: Callable[..., Any]
+    arguments: tuple[Any, ...]
+    limit_s: float = math.inf
+
+
+@dataclass(frozen=True)
+class Failure:
+    """In place of a task's result.
+
+    Attributes
+    ----------
+    how : its process "died", its time was "over", or it "raised" an exception. error : that exception.
+    """
+
+    how: Literal["died", "over", "raised"]
+    error: Exception | None = field(default=None, compare=False)
+
+
+class Processes(Protocol):
+    """What carries out tasks, some at a time."""
+
+    @property
+    def free(self) -> bool:
+        """Whether another task can be started."""
+
+    def start(self, task: Task) -> None:
+        """Start a task."""
+
+    def finished(self) -> Iterator[tuple[Task, Any]]:
+        """Wait until a task has ended; those that have, with results or a `Failure`. None if none is left."""
+
+
+def run_tasks(processes: Processes, tasks: Iterable[Task]) -> Iterator[tuple[Task, Any]]:
+    """Tasks with their results in the order in which they end; no more are in hand than can be under way."""
+    waiting = iter(tasks)
+    while True:
+        while processes.free and (task := next(waiting, None)) is not None:
+            processes.start(task)
+        ended = list(processes.finished())
+        if not ended:
+            return
+        yield from ended
+
+
+def guarded(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+    """What the function returns, or a `Failure`."""
+    try:
+        return function(*arguments)
+    except Exception as error:
+        error.add_note(traceback.format_exc())
+        return Failure("raised", error)
+
+
+def _serve(channel: Connection, parent: int, begin: Callable[[bool], None] | None, ahead: bool) -> None:
+    """Life of a process: calls in, results out, until the other end closes."""
     # Ctrl-C reaches all processes of a terminal; the first one answers for all.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    # A pipe that brothers and sisters hold open as well does not tell of the parent's end.
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL))
-    if os.getppid() != parent:
-        os._exit(1)
-    while (order := pipe.recv()) is not None:
-        ticket, work, item = order
-        try:
-            pipe.send((ticket, work(shared, item), None))
-        except Exception as error:
-            error.add_note(traceback.format_exc())
+    if sys.platform == "linux":
+        # In the middle of a task, too, and where brothers and sisters hold the pipe's other end open.
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL))
+        if os.getppid() != parent:
+            os._exit(1)
+    if begin is not None:
+        begin(ahead)
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            result = guarded(*channel.recv())
             try:
-                pipe.send((ticket, None, error))
-            except Exception:
-                # An error that cannot be pickled is told in words.
-                pipe.send((ticket, None, RuntimeError(repr(error))))
+                channel.send(result)
+            except OSError:
+                raise
+            except Exception as error:
+                # What cannot be pickled is told in words.
+                told = result.error if isinstance(result, Failure) else error
+                channel.send(Failure("raised", RuntimeError(repr(told))))
+
+
+class Pool:
+    """A few processes of this machine; use with `with`, whose end kills them.
+
+    Parameters
+    ----------
+    retries : how often a task is tried again after its process has died.
+    begin : a function that each process calls first, with whether it was started ahead of its first task.
+    forked : whether processes are forked, so that `begin` is handed on as it is. They cannot fork then.
+    """
+
+    def __init__(
+        self,
+        count: int,
+        retries: int = 0,
+        begin: Callable[[bool], None] | None = None,
+        forked: bool = False,
+    ) -> None:
+        self._count, self._retries, self._begin, self._forked = max(1, count), retries, begin, forked
+        self._idle: list[tuple[Connection, BaseProcess]] = []
+        self._busy: dict[Connection, tuple[BaseProcess, Task, float]] = {}
+        self._deaths: Counter[str] = Counter()
+
+    def __enter__(self) -> Pool:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        ours = self._idle + [(channel, busy[0]) for channel, busy in self._busy.items()]
+        # Whoever works still does so for nobody.
+        for _channel, process in ours:
+            process.kill()
+        for channel, process in ours:
+            process.join()
+            channel.close()
+        self._idle, self._busy = [], {}
+
+    @property
+    def free(self) -> bool:
+        """Whether another task can be started."""
+        return len(self._busy) < self._count
+
+    def start(self, task: Task) -> None:
+        """Hand a task to an idle process, or to a new one; with the first, another is made ready."""
+        first = not (self._idle or self._busy)
+        channel, process = self._idle.pop() if self._idle else self._made(ahead=False)
+        self._busy[channel] = process, task, time.monotonic() + task.limit_s
+        # That a process is gone shows when its answer is read.
+        with contextlib.suppress(OSError):
+            channel.send((task.function, task.arguments))
+        if first and self._count > 1 and not self._forked:
+            # Starting Python and its libraries takes longer than most tasks do.
+            self._idle.append(self._made(ahead=True))
+
+    def _made(self, ahead: bool) -> tuple[Connection, BaseProcess]:
+        context: Any = multiprocessing.get_context("fork" if self._forked else "spawn")
+        channel, theirs = context.Pipe()
+        words = (theirs, os.getpid(), self._begin, ahead)
+        process: BaseProcess = context.Process(target=_serve, args=words, daemon=self._forked)
+        with warnings.catch_warnings():
+            # Python 3.12 counts the idle threads of a BLAS library, which survive a fork.
+            warnings.filterwarnings("ignore", "This process .* is multi-threaded", DeprecationWarning)
+            process.start()
+        # Only the process holds this end now, so that its death closes the pipe.
+        theirs.close()
+        return channel, process
+
+    def finished(self) -> Iterator[tuple[Task, Any]]:
+        """Wait until a task has ended; those that have, with results or a `Failure`. None if none is left."""
+        ended: list[tuple[Task, Any]] = []
+        while self._busy and not ended:
+            # The wait is a short one, again and again, so that Ctrl-C is answered.
+            ready = wait(self._busy, timeout=_LOOK_UP_S)
+            for channel, (process, task, until) in list(self._busy.items()):
+                if channel not in ready and time.monotonic() < until:
+                    continue
+                del self._busy[channel]
+                result = _received(channel) if channel in ready else Failure("over")
+                how = result.how if isinstance(result, Failure) else "well"
+                if how in ("died", "over"):
+                    process.kill()
+                    process.join()
+                    channel.close()
+                else:
+                    self._idle.append((channel, process))
+                if how == "died" and self._deaths[task.name] < self._retries:
+                    self._deaths[task.name] += 1
+                    self.start(task)
+                else:
+                    ended.append((task, result))
+        yield from ended
+
+
+def _received(channel: Connection) -> Any:
+    try:
+        return channel.recv()
+    except (EOFError, OSError):
+        return Failure("died")
+
+
+# ----------------------------------------------------------------------
+# Many items in their order, by forked processes or by threads.
 
 
 def _may_fork(items: int) -> bool:
@@ -122,6 +297,17 @@ def _have_left() -> bool:
     return not _leaving
 
 
+_inherited: list[Any] = []
+
+
+def _inherit(shared: object, _: bool) -> None:
+    _inherited.append(shared)
+
+
+def _on_inherited(work: Callable[[Any, S], T], item: S) -> T:
+    return work(_inherited[0], item)
+
+
 class Workers(Generic[Shared]):
     """Calls `work(shared, item)` for many items at once.
 
@@ -139,8 +325,8 @@ class Workers(Generic[Shared]):
         self._shared = shared
         self._forks = not large and _may_fork(items)
         self._count = max(1, min(items, processors()))
-        self._processes: dict[Connection, BaseProcess] = {}
-        self._tickets = 0
+        self._pool = Pool(self._count, begin=partial(_inherit, shared), forked=True)
+        self._rounds = 0
 
     def __enter__(self) -> Workers[Shared]:
         self._threads = cv2.getNumThreads()
@@ -151,13 +337,7 @@ class Workers(Generic[Shared]):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         cv2.setNumThreads(self._threads)
-        for process in self._processes.values():
-            # Whoever works still does so for nobody.
-            process.kill()
-        for pipe, process in self._processes.items():
-            process.join()
-            pipe.close()
-        self._processes.clear()
+        self._pool.__exit__()
 
     def in_order(self, work: Callable[[Shared, S], T], items: Iterable[S]) -> Iterator[T]:
         """Results in the order of the items.
@@ -173,7 +353,7 @@ class Workers(Generic[Shared]):
             futures.reverse()
             while futures:
                 # Ctrl-C that comes just before a long wait is answered only at its end.
-                while not wait([futures[-1]], timeout=_LOOK_UP_S).done:
+                while not wait_for_futures([futures[-1]], timeout=_LOOK_UP_S).done:
                     pass
                 yield futures.pop().result()
         except KeyboardInterrupt:
@@ -185,56 +365,15 @@ class Workers(Generic[Shared]):
         pool.shutdown()
 
     def _by_processes(self, work: Callable[[Shared, S], T], items: list[S]) -> Iterator[T]:
-        self._start()
-        first = self._tickets
-        self._tickets += len(items)
-        waiting = iter(range(len(items)))
-        for _ in range(_IN_HAND):
-            for pipe in self._processes:
-                self._hand(pipe, first, waiting, work, items)
-        results: dict[int, T] = {}
-        for i in range(len(items)):
-            while i not in results:
-                for ready in connection.wait(self._processes, timeout=_LOOK_UP_S):
-                    pipe = cast("Connection", ready)
-                    ticket, result, error = self._answer(pipe)
-                    if ticket < first:
-                        # Left over from a round that nobody saw to its end.
-                        continue
-                    if error is not None:
-                        raise error
-                    results[ticket - first] = result
-                    self._hand(pipe, first, waiting, work, items)
-            yield results.pop(i)
-
-    def _start(self) -> None:
-        if self._processes:
-            return
-        fork = multiprocessing.get_context("fork")
-        with warnings.catch_warnings():
-            # Python 3.12 counts the idle threads of a BLAS library, which survive a fork.
-            warnings.filterwarnings("ignore", "This process .* is multi-threaded", DeprecationWarning)
-            for _ in range(self._count):
-                here, there = fork.Pipe()
-                process = fork.Process(target=_serve, args=(self._shared, there, os.getpid()), daemon=True)
-                process.start()
-                # Only the worker holds this end now, so that its death closes the pipe.
-                there.close()
-                self._processes[here] = process
-
-    def _hand(
-        self, pipe: Connection, first: int, waiting: Iterator[int], work: object, items: list[S]
-    ) -> None:
-        i = next(waiting, None)
-        if i is not None:
-            # That a worker is gone shows when its answer is read.
-            with contextlib.suppress(BrokenPipeError):
-                pipe.send((first + i, work, items[i]))
-
-    def _answer(self, pipe: Connection) -> tuple[int, Any, Exception | None]:
-        try:
-            answer: tuple[int, Any, Exception | None] = pipe.recv()
-        except (EOFError, ConnectionResetError) as gone:
-            self._processes[pipe].join()
-            raise MemoryError(f"a worker process ended with code {self._processes[pipe].exitcode}") from gone
-        return answer
+        self._rounds += 1
+        names = [f"{self._rounds} {i}" for i in range(len(items))]
+        tasks = (Task(name, _on_inherited, (work, item)) for name, item in zip(names, items, strict=True))
+        results, due = dict[str, T](), iter(names)
+        name = next(due, "")
+        for task, result in run_tasks(self._pool, tasks):
+            if isinstance(result, Failure):
+                raise result.error or MemoryError("a worker process has died")
+            results[task.name] = result
+            while name in results:
+                yield results.pop(name)
+                name = next(due, "")

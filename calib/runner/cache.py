@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import platform
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -133,6 +134,17 @@ def program_digest() -> str:
     sources = [path for path in files if path.parent.name != "__pycache__"]
     parts = [__version__, *(f"{path.relative_to(root).as_posix()} {digest_of(path)}" for path in sources)]
     return sha256("\n".join(parts).encode())
+
+
+@cache
+def program() -> str:
+    """What results follow from beside their inputs: this program and the libraries under it."""
+    import cv2
+    import numpy
+    import scipy
+
+    versions = (platform.python_version(), numpy.__version__, scipy.__version__, cv2.__version__)
+    return sha256(json.dumps([program_digest(), *versions]).encode())
 
 
 def key_of(command: tuple[str, ...], inputs: Mapping[str, str], sections: str) -> str:

@@ -10,7 +10,7 @@ import os
 import re
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import islice
@@ -21,11 +21,11 @@ import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import EXIT_INTERNAL, BadInputError
-from calib.core.files import sha256, shown
+from calib.core.files import one_line, sha256, shown
 from calib.core.words import unit_of
+from calib.core.workers import Failure, Processes, Task, run_tasks
 from calib.core.writing import check_folder, check_writable, make_folder, replacing, sweep, write_atomically
 from calib.runner.cache import held
-from calib.runner.engine import LIMIT_S, Broken, Cluster, Lost, Overdue, Task, run_tasks
 from calib.runner.folder import digest_of
 from calib.runner.task import (
     SAME,
@@ -37,86 +37,40 @@ from calib.runner.task import (
     calibrate_rig,
     from_json,
     is_url,
-    needed,
     serial_number,
     to_json,
     without_secrets,
 )
 
 # ----------------------------------------------------------------------
-# Outcomes as rows of a Parquet file, in blocks, and one column of it at a time.
+# Outcomes as rows of a table.
 #
 # Columns: name, serial, source, kind, verdict, code, sentence, reasons, `verdict.STAGE` for each stage,
 # `SECTION.NAME` and `SECTION.NAME.sigma` for each constant, and at last outlier_z and outlier_of, the
 # constant that stands out most against the fleet. A rig without a number has a null there. What each rig has
 # taken of time and memory stands in a file of its own, so that the same inputs give the same bytes here.
 
-_TEXTS = ("name", "serial", "source", "kind", "verdict", "sentence", "reasons")
+_FIRST = ("name", "serial", "source", "kind", "verdict", "code", "sentence", "reasons")
 _BLOCK = 512
-_MOST_COLUMNS = 4000
+_MOST_COLUMNS = 8000
 
 
-class Table:
-    """A Parquet file that is read a column at a time."""
+def table_of(outcomes: Iterable[Outcome]) -> Any:
+    """Outcomes as an Arrow table, a row for each."""
+    blocks, left = [], iter(outcomes)
+    while rows := [_row(one) for one in islice(left, _BLOCK)]:
+        blocks.append(arrow_table(rows))
+    import pyarrow as pa
 
-    def __init__(self, path: Path) -> None:
-        self._file = needed("pyarrow.parquet").ParquetFile(path)
-        self.rows = int(self._file.metadata.num_rows)
-        self.names = tuple(str(name) for name in self._file.schema_arrow.names)
-
-    def __enter__(self) -> Table:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._file.close()
-
-    def read(self, name: str) -> Any:
-        """A column as an Arrow array."""
-        return self._file.read(columns=[name]).column(0)
-
-    def blocks(self) -> Iterator[Any]:
-        """The rows in blocks."""
-        yield from self._file.iter_batches(_BLOCK)
-
-
-def column(table: Table, name: str) -> FloatArray:
-    """Numbers (n,) of a column, NaN for nulls and for a column that is not there."""
-    if name not in table.names:
-        return np.full(table.rows, np.nan)
-    return np.asarray(table.read(name).to_numpy(zero_copy_only=False), dtype=np.float64)
-
-
-def texts(table: Table, name: str) -> list[str]:
-    """Texts of a column, "" for nulls."""
-    return [value or "" for value in table.read(name).to_pylist()]
-
-
-def write_outcomes(path: Path, names: Sequence[str], outcome: Callable[[str], Outcome | None]) -> None:
-    """Write a row for each name; `outcome` is asked twice for each, for the columns and for the rows.
-
-    Raises `BadInputError` when the file cannot be written.
-    """
-    pa = needed("pyarrow")
-    stages: dict[str, None] = {}
-    values: dict[str, None] = {}
-    for name in names:
-        found = outcome(name)
-        if found is not None and len(values) < _MOST_COLUMNS:
-            stages |= dict.fromkeys(found.stages)
-            values |= dict.fromkeys(found.values)
-    fields = [pa.field(name, pa.string()) for name in _TEXTS]
-    fields.insert(5, pa.field("code", pa.int16()))
-    fields += [pa.field(f"verdict.{stage}", pa.string()) for stage in stages]
-    for value in values:
-        fields += [pa.field(value, pa.float64()), pa.field(f"{value}.sigma", pa.float64())]
-
-    def rows() -> Iterator[dict[str, Any]]:
-        for name in names:
-            found = outcome(name)
-            if found is not None:
-                yield _row(found)
-
-    write_table(path, pa.schema(fields), rows())
+    if not blocks:
+        return pa.table({name: pa.array([], pa.string()) for name in _FIRST})
+    whole = pa.concat_tables(blocks, promote_options="permissive")
+    verdicts = [name for name in whole.column_names if name.startswith("verdict.")]
+    constants = [name for name in whole.column_names if name not in (*_FIRST, *verdicts)]
+    whole = whole.select([*_FIRST, *verdicts, *constants[:_MOST_COLUMNS]])
+    kinds = [pa.int16() if name == "code" else pa.string() for name in (*_FIRST, *verdicts)]
+    kinds += [pa.float64()] * len(constants[:_MOST_COLUMNS])
+    return whole.cast(pa.schema(list(zip(whole.column_names, kinds, strict=True))))
 
 
 def _row(outcome: Outcome) -> dict[str, Any]:
@@ -136,46 +90,32 @@ def _row(outcome: Outcome) -> dict[str, Any]:
     return row
 
 
-def write_table(path: Path, schema: Any, rows: Iterable[dict[str, Any]]) -> None:
-    """Write rows in blocks; the file appears under its name when it is whole.
+def arrow_table(rows: Sequence[Mapping[str, Any]]) -> Any:
+    """Rows as an Arrow table, with nulls where a row has no such value."""
+    import pyarrow as pa
 
-    Raises `BadInputError` when it cannot be written.
-    """
-    pa = needed("pyarrow")
-
-    def blocks() -> Iterator[Any]:
-        left = iter(rows)
-        while block := list(islice(left, _BLOCK)):
-            yield pa.RecordBatch.from_pylist(block, schema=schema)
-
-    _write(path, schema, blocks())
+    names = dict.fromkeys(name for row in rows for name in row)
+    return pa.table({name: [row.get(name) for row in rows] for name in names})
 
 
-def with_columns(source: Path, path: Path, added: dict[str, Any]) -> None:
-    """Copy a table with columns added, each an Arrow array of as many rows, block by block."""
-    pa = needed("pyarrow")
-    with Table(source) as table:
-        schema = table._file.schema_arrow
-        for name, values in added.items():
-            schema = schema.append(pa.field(name, values.type))
-
-        def blocks() -> Iterator[Any]:
-            at = 0
-            for block in table.blocks():
-                parts = [values.slice(at, block.num_rows) for values in added.values()]
-                yield pa.RecordBatch.from_arrays([*block.columns, *parts], schema=schema)
-                at += block.num_rows
-
-        _write(path, schema, blocks())
+def column(table: Any, name: str) -> FloatArray:
+    """Numbers (n,) of a column, NaN for nulls and for a column that is not there."""
+    if name not in table.column_names:
+        return np.full(table.num_rows, np.nan)
+    return np.asarray(table[name].to_numpy(), dtype=np.float64)
 
 
-def _write(path: Path, schema: Any, blocks: Iterator[Any]) -> None:
-    with (
-        replacing(path) as stream,
-        needed("pyarrow.parquet").ParquetWriter(stream, schema, compression="zstd") as writer,
-    ):
-        for block in blocks:
-            writer.write_batch(block)
+def texts(table: Any, name: str) -> list[str]:
+    """Texts of a column, "" for nulls."""
+    return [value or "" for value in table[name].to_pylist()]
+
+
+def write_table(path: Path, table: Any) -> None:
+    """Write a table as Parquet. Raises `BadInputError` when it cannot be written."""
+    import pyarrow.parquet
+
+    with replacing(path) as stream:
+        pyarrow.parquet.write_table(table, stream, compression="zstd")
 
 
 # ----------------------------------------------------------------------
@@ -378,8 +318,6 @@ def drift_limit(rigs: int, constants: int) -> float:
 
 # ----------------------------------------------------------------------
 # A fleet in a bounded number of figures: how its rigs ended, how its constants are spread, whom to look at.
-#
-# One column is in memory at a time, and of the rigs one number each.
 
 _BINS = 36
 _REACH = 6.0
@@ -467,43 +405,40 @@ def judged_names(names: tuple[str, ...]) -> list[str]:
     ]
 
 
-def summarise(path: Path) -> tuple[FleetSummary, FloatArray, list[str | None]]:
-    """The summary of a Parquet file, with the largest |z| (n,) of each rig and the constant that it is of."""
-    with Table(path) as table:
-        names = texts(table, "name")
-        serials = texts(table, "serial")
-        numbers = np.array([_or_nan(serial_number(serial)) for serial in serials], dtype=np.float64)
-        wanted = judged_names(table.names)
-        values = {name: None for name in wanted if _varies(column(table, name))}
-        worst, of = np.full(table.rows, np.nan), np.full(table.rows, -1, dtype=np.int32)
-        limit = limit_of(table.rows, len(values)) if table.rows >= FEWEST else float("nan")
-        constants = []
-        for index, name in enumerate(values):
-            x, sigma = column(table, name), column(table, f"{name}.sigma")
-            one, z = _constant(name, x, sigma, numbers, names, limit, len(values))
-            constants.append(one)
-            size = np.abs(z)
-            larger = np.isfinite(size) & ~(size <= worst)
-            worst[larger], of[larger] = size[larger], index
-        listed = list(values)
-        which = [listed[i] if i >= 0 else None for i in of.tolist()]
-        verdicts = texts(table, "verdict")
-        stages = {
-            name.removeprefix("verdict."): dict(Counter(v for v in texts(table, name) if v))
-            for name in table.names
-            if name.startswith("verdict.")
-        }
-        looks, to_look_at = _looks(names, serials, verdicts, texts(table, "sentence"), worst, which, limit)
-        summary = FleetSummary(
-            table.rows,
-            dict(sorted(Counter(verdicts).items(), key=lambda pair: _ORDER.get(pair[0], 2))),
-            stages,
-            tuple(constants),
-            looks,
-            to_look_at,
-            int(np.isfinite(numbers).sum()),
-            limit,
-        )
+def summarise(table: Any) -> tuple[FleetSummary, FloatArray, list[str | None]]:
+    """The summary of a table, with the largest |z| (n,) of each rig and the constant that it is of."""
+    names, serials, verdicts = (texts(table, name) for name in ("name", "serial", "verdict"))
+    numbers = np.array([_or_nan(serial_number(serial)) for serial in serials], dtype=np.float64)
+    wanted = judged_names(tuple(table.column_names))
+    listed = [name for name in wanted if _varies(column(table, name))]
+    rigs = len(names)
+    worst, of = np.full(rigs, np.nan), np.full(rigs, -1, dtype=np.int32)
+    limit = limit_of(rigs, len(listed)) if rigs >= FEWEST else float("nan")
+    constants = []
+    for index, name in enumerate(listed):
+        x, sigma = column(table, name), column(table, f"{name}.sigma")
+        one, z = _constant(name, x, sigma, numbers, names, limit, len(listed))
+        constants.append(one)
+        size = np.abs(z)
+        larger = np.isfinite(size) & ~(size <= worst)
+        worst[larger], of[larger] = size[larger], index
+    which = [listed[i] if i >= 0 else None for i in of.tolist()]
+    stages = {
+        name.removeprefix("verdict."): dict(Counter(v for v in texts(table, name) if v))
+        for name in table.column_names
+        if name.startswith("verdict.")
+    }
+    looks, to_look_at = _looks(names, serials, verdicts, texts(table, "sentence"), worst, which, limit)
+    summary = FleetSummary(
+        rigs,
+        dict(sorted(Counter(verdicts).items(), key=lambda pair: _ORDER.get(pair[0], 2))),
+        stages,
+        tuple(constants),
+        looks,
+        to_look_at,
+        int(np.isfinite(numbers).sum()),
+        limit,
+    )
     return summary, worst, which
 
 
@@ -584,26 +519,19 @@ def _looks(
     which: list[str | None],
     limit: float,
 ) -> tuple[tuple[Look, ...], int]:
-    heap: list[tuple[Any, ...]] = []
-    total = 0
+    ranked = []
     for i, verdict in enumerate(verdicts):
-        z = float(worst[i]) if np.isfinite(worst[i]) else None
-        stands = z is not None and z > limit
-        if verdict == "ok" and not stands:
-            continue
-        total += 1
-        rank = min(_ORDER.get(verdict, 2), 2 if stands else 9)
-        heap.append((rank, -(z or 0.0), i))
-        if len(heap) > 4 * _MOST_LOOKS:
-            heap = heapq.nsmallest(_MOST_LOOKS, heap)
+        size = float(np.nan_to_num(worst[i]))
+        if verdict != "ok" or size > limit:
+            ranked.append((min(_ORDER.get(verdict, 2), 2 if size > limit else 9), -size, i))
     looks = []
-    for _, _, i in heapq.nsmallest(_MOST_LOOKS, heap):
+    for _, _, i in heapq.nsmallest(_MOST_LOOKS, ranked):
         z = float(worst[i]) if np.isfinite(worst[i]) else None
         why = [sentences[i]] if sentences[i] else []
         if z is not None and z > limit:
             why.append(f"{which[i]} is {z:.1f} standard deviations from the fleet's median")
         looks.append(Look(names[i], serials[i], verdicts[i], "; ".join(why), z))
-    return tuple(looks), total
+    return tuple(looks), len(ranked)
 
 
 # ----------------------------------------------------------------------
@@ -612,7 +540,7 @@ def _looks(
 #     rigs/NAME/               results of a rig, as a single run leaves them
 #     .fleet/outcomes/NAME.json    how it ended; written last, so that what it tells of is there
 #     .fleet/lock              one fleet at a time
-#     .fleet/scratch/          of a local cluster, gone at the end
+#     .fleet/scratch/          temporary files of this machine's processes, gone at the end
 #
 # All is written by one process, the one that was started by a person: workers need not see this folder.
 
@@ -671,10 +599,6 @@ class Store:
             write_atomically(place / name, data)
         write_atomically(self._file(outcome.name), to_json(outcome))
 
-    def result(self, name: str, file: str) -> Path:
-        """Path of one of a rig's results."""
-        return self.out / "rigs" / name / file
-
 
 def check_apart(out: Path, rigs: Iterable[RigSpec]) -> None:
     """Raise `BadInputError` where results would be written into a rig's folder, or over one."""
@@ -724,8 +648,11 @@ def opened_store(out: Path, verb: str, outputs: tuple[str, ...]) -> Iterator[tup
         write_atomically(told, json.dumps({"verb": verb}) + "\n")
         for folder in (out, hidden / "outcomes", hidden):
             sweep(folder)
-        yield Store(out), interrupted is not None
-        shutil.rmtree(hidden / "scratch", ignore_errors=True)
+        store = Store(out)
+        shutil.rmtree(store.scratch, ignore_errors=True)
+        make_folder(store.scratch)
+        yield store, interrupted is not None
+        shutil.rmtree(store.scratch, ignore_errors=True)
 
 
 def _verb(path: Path) -> str:
@@ -738,6 +665,8 @@ def _verb(path: Path) -> str:
 # A fleet from its manifest to its outcomes: what still holds is left alone, all else is done.
 
 Progress = Callable[[int, int], None]
+LIMIT_S = 3600.0
+"""Time that a rig has."""
 
 
 @dataclass
@@ -755,10 +684,9 @@ class Counts:
 
 def run_fleet(
     store: Store,
-    cluster: Cluster,
+    processes: Processes,
     manifest: Manifest,
     options: FleetOptions,
-    retries: int,
     progress: Progress = lambda done, total: None,
     tell: Callable[[str], None] = lambda _: None,
     limit_s: float = LIMIT_S,
@@ -768,43 +696,45 @@ def run_fleet(
     Raises `BadInputError` as `run_tasks` and `Store.keep`.
     """
     counts, total = Counts(), len(manifest.rigs)
-    scratch = "" if cluster.address else str(store.scratch)
-
-    def tasks() -> Iterator[Task]:
-        for spec in manifest.rigs:
-            yield Task(spec.name, (spec, options, store.known(spec.name), scratch))
-
-    def done(task: Task, result: Any) -> None:
-        answer = _answer(task.arguments[0], result)
-        if answer.outcome.status == SAME:
+    progress(0, total)
+    tasks = (
+        Task(spec.name, calibrate_rig, (spec, options, store.known(spec.name)), limit_s)
+        for spec in manifest.rigs
+    )
+    for task, result in run_tasks(processes, tasks):
+        answer = _answer(task, result)
+        outcome = answer.outcome
+        if outcome.status == SAME:
             counts.as_before += 1
         else:
             store.keep(answer)
-            counts.by_status[answer.outcome.status] += 1
-            if answer.outcome.status != "ok":
-                tell(f"{answer.outcome.name}: {answer.outcome.status} ({answer.outcome.sentence})")
+            counts.by_status[outcome.status] += 1
+            if outcome.status != "ok":
+                tell(f"{outcome.name}: {outcome.status} ({outcome.sentence})")
         progress(counts.done, total)
-
-    progress(0, total)
-    run_tasks(cluster, calibrate_rig, tasks(), done, retries, limit_s, tell)
     return counts
 
 
-def _answer(spec: RigSpec, result: Any) -> Answer:
+def _answer(task: Task, result: Any) -> Answer:
     if isinstance(result, Answer):
         return result
-    if isinstance(result, Lost):
-        status = "lost"
-        sentence = (
-            f"each of the {result.tries} processes that tried it died: out of memory, or a fault in a library"
-        )
-    elif isinstance(result, Overdue):
-        status, sentence = "lost", f"was not done after {result.limit_s:g} s, which is the --timeout of a rig"
-    else:
-        words = result.words if isinstance(result, Broken) else type(result).__name__
-        status, sentence = "broken", f"internal error: {words}"
+    status, sentence = "broken", f"internal error: {type(result).__name__}"
+    if isinstance(result, Failure):
+        status = "broken" if result.how == "raised" else "lost"
+        sentence = sentence_of(result, task, "rig")
+    spec = task.arguments[0]
     blank = Outcome(spec.name, spec.serial, without_secrets(spec.source), status, EXIT_INTERNAL, sentence)
     return Answer(blank, {})
+
+
+def sentence_of(failure: Failure, task: Task, what: str) -> str:
+    """Why a task, a rig or a case, has no result."""
+    if failure.how == "died":
+        return "each process that tried it died: out of memory, or a fault in a library"
+    if failure.how == "over":
+        return f"was not done after {task.limit_s:g} s, which is the --timeout of a {what}"
+    error = failure.error
+    return f"internal error: {type(error).__name__}: {one_line(' '.join(str(error).split()))[:200]}"
 
 
 TIMINGS = "timings.csv"
@@ -821,28 +751,22 @@ def finish(store: Store, manifest: Manifest) -> FleetSummary:
 
     Raises `BadInputError` when a file cannot be written.
     """
-    pa = needed("pyarrow")
-    between, final = store.out / HIDDEN / "rows.parquet", store.out / "fleet.parquet"
-    times: dict[str, tuple[float, float | None]] = {}
+    import pyarrow as pa
 
-    def timed(name: str) -> Outcome | None:
-        found = store.outcome(name)
-        if found is not None:
-            times[name] = found.seconds, found.peak_MB
-        return found
+    times: list[tuple[str, float, float | None]] = []
 
-    write_outcomes(between, [rig.name for rig in manifest.rigs], timed)
-    write_timings(store.out, "name,seconds,peak_MB", ((name, *two) for name, two in times.items()))
-    try:
-        summary, worst, which = summarise(between)
-        known = np.isfinite(worst)
-        added = {
-            "outlier_z": pa.array(worst, mask=~known),
-            "outlier_of": pa.array(which, type=pa.string()),
-            "stands_out": pa.array(known & (worst > summary.limit)),
-        }
-        with_columns(between, final, added)
-    finally:
-        with contextlib.suppress(OSError):
-            between.unlink()
+    def outcomes() -> Iterator[Outcome]:
+        for rig in manifest.rigs:
+            if (found := store.outcome(rig.name)) is not None:
+                times.append((found.name, found.seconds, found.peak_MB))
+                yield found
+
+    table = table_of(outcomes())
+    write_timings(store.out, "name,seconds,peak_MB", times)
+    summary, worst, which = summarise(table)
+    known = np.isfinite(worst)
+    table = table.append_column("outlier_z", pa.array(worst, mask=~known))
+    table = table.append_column("outlier_of", pa.array(which, type=pa.string()))
+    table = table.append_column("stands_out", pa.array(known & (worst > summary.limit)))
+    write_table(store.out / "fleet.parquet", table)
     return summary

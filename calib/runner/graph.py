@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
-import importlib
 import json
-import multiprocessing
 import os
-import signal
-import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
-from multiprocessing.connection import Connection, wait
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-from calib.core.errors import EXIT_DONE, EXIT_POOR, BadInputError
+from calib.core.errors import EXIT_DONE, EXIT_INTERNAL, EXIT_POOR, BadInputError
 from calib.core.files import inside, one_line, shown
 from calib.core.rig import SCHEMA, Rig
+from calib.core.workers import Failure, Processes, Task
 from calib.core.writing import check_folder, make_folder, sweep, write_atomically
 from calib.runner.cache import Result, held, key_of, load, remove, store
 from calib.runner.folder import Folder, LogFile, digest_of, folder_digests, with_beside
@@ -88,26 +82,14 @@ _PUMP = ("pwm1", "pwm2")
 
 
 @dataclass(frozen=True)
-class Planned:
-    """What a stage reads and its options, and all files that it depends on."""
-
-    paths: tuple[Path, ...]
-    inputs: tuple[Path, ...]
-    options: Mapping[str, Any] = field(default_factory=dict)
-
-
-Plan = Callable[[Folder], Planned | str]
-"""What a stage does with a folder, or why it has nothing to do."""
-
-
-@dataclass(frozen=True)
 class Step:
     """A stage in a run.
 
     Attributes
     ----------
     name : of its folder and anchor. title : its heading. verb : words of its stage.
-    plan : arguments and inputs for a folder; `plan_log` instead for a step that runs once for each log.
+    plan : a job with what it reads in a folder, or with the reason why it has nothing to do.
+    each_log : whether there is a job for each log. options : of the stage, beside what the plan adds.
     writes : sections of the rig's file. needs : sections without which it cannot run. uses : sections that
         it reads where they are.
     output : name of what it writes beside rig.yaml, "" for nothing. figures : whether it draws.
@@ -118,8 +100,9 @@ class Step:
     name: str
     title: str
     verb: str
-    plan: Plan | None = None
-    plan_log: Callable[[LogFile], Planned | str] | None = None
+    plan: Callable[[Folder, Job], Job]
+    each_log: bool = False
+    options: Mapping[str, Any] = field(default_factory=dict)
     writes: tuple[str, ...] = ()
     needs: tuple[str, ...] = ()
     uses: tuple[str, ...] = ()
@@ -131,24 +114,41 @@ class Step:
 
 @dataclass(frozen=True)
 class Job:
-    """A stage with its part of the folder: what to run, or why not.
+    """A step with its part of the folder, and how it ended.
 
     Attributes
     ----------
     name : unique, and safe as a path: that of the step, or step and log.
-    log : of a step that runs for each log.
-    planned : None where `reason` says why there is nothing to do.
+    log : of a step that has a job for each log.
+    paths, options : what the stage reads and its options. inputs : all files that it depends on.
+    status : "ok", "poor", "failed"; "blocked" by one that failed; "skipped" where the folder has nothing
+        for it; "" before the end.
+    reason : one sentence for all but "ok". result : None where nothing was run; reused : by an earlier run.
     """
 
     name: str
     step: Step
-    log: LogFile | None
-    planned: Planned | None
+    log: LogFile | None = None
+    paths: tuple[Path, ...] = ()
+    inputs: tuple[Path, ...] = ()
+    options: Mapping[str, Any] = field(default_factory=dict)
+    status: str = ""
     reason: str = ""
+    result: Result | None = None
+    reused: bool = False
 
+    @property
+    def label(self) -> str:
+        """The step's heading, and of which log."""
+        return self.step.title if self.log is None else f"{self.step.title} of {one_line(self.log.path.stem)}"
 
-def _given(paths: tuple[Path, ...], **options: Any) -> Planned:
-    return Planned(paths, with_beside(paths), options)
+    def skipped(self, reason: str) -> Job:
+        """This job, which has nothing to do."""
+        return replace(self, options={}, status="skipped", reason=reason)
+
+    def reading(self, logs: tuple[Path, ...], lacking: str) -> Job:
+        """This job with logs that it reads, or skipped where there are none."""
+        return replace(self, paths=logs, inputs=with_beside(logs)) if logs else self.skipped(lacking)
 
 
 def _logs(folder: Folder, kind: str, *columns: str) -> tuple[Path, ...]:
@@ -159,87 +159,76 @@ def _linked(folder: Folder, start: str) -> str:
     return next((sentence for sentence in folder.left_out if sentence.startswith(start)), "")
 
 
-def _intrinsics(folder: Folder) -> Planned | str:
+def _intrinsics(folder: Folder, job: Job) -> Job:
     if not folder.pictures:
-        return "no pictures in images/"
-    linked = _linked(folder, "images/board.yaml")
+        return job.skipped("no pictures in images/")
+    if linked := _linked(folder, "images/board.yaml"):
+        return job.skipped(linked)
     board = () if folder.board is None else (folder.board,)
-    return linked or Planned(folder.pictures, (*folder.pictures, *board))
+    return replace(job, paths=folder.pictures, inputs=(*folder.pictures, *board))
 
 
-def _extrinsics(folder: Folder) -> Planned | str:
+def _extrinsics(folder: Folder, job: Job) -> Job:
     if not folder.plane:
-        return "no pictures in images/plane/"
+        return job.skipped("no pictures in images/plane/")
     if linked := _linked(folder, "images/plane/"):
-        return linked
+        return job.skipped(linked)
     board = () if folder.plane_board is None else (folder.plane_board,)
-    return Planned((folder.root / "images" / "plane",), (*folder.plane, *board))
+    return replace(job, paths=(folder.root / "images" / "plane",), inputs=(*folder.plane, *board))
 
 
-def _static(folder: Folder) -> Planned | str:
-    logs = _logs(folder, "rest", *_IMU)
-    return _given(logs) if logs else "no logs of an IMU at rest, logs/static*.csv"
+def _static(folder: Folder, job: Job) -> Job:
+    return job.reading(_logs(folder, "rest", *_IMU), "no logs of an IMU at rest, logs/static*.csv")
 
 
-def _poses(folder: Folder) -> Planned | str:
+def _poses(folder: Folder, job: Job) -> Job:
     logs = _logs(folder, "poses", *_IMU)
-    return _given(logs[:1]) if logs else "no log of rests in different poses, logs/poses*.csv"
+    return job.reading(logs[:1], "no log of rests in different poses, logs/poses*.csv")
 
 
-def _moving(folder: Folder) -> Planned | str:
-    logs = _logs(folder, "motion", *_IMU)
-    return _given(logs) if logs else "no logs of an IMU in motion in logs/"
+def _moving(folder: Folder, job: Job) -> Job:
+    return job.reading(_logs(folder, "motion", *_IMU), "no logs of an IMU in motion in logs/")
 
 
-def _drift(folder: Folder) -> Planned | str:
+def _drift(folder: Folder, job: Job) -> Job:
     logs = (*_logs(folder, "rest", *_IMU), *_logs(folder, "motion", *_IMU)[:1])
-    # What is installed beside calib must not change the page.
-    return _given(logs, peers=False) if logs else "no logs of an IMU in logs/"
+    return job.reading(logs, "no logs of an IMU in logs/")
 
 
-def _lowpass(folder: Folder) -> Planned | str:
-    logs = _logs(folder, "motion", *_CAMERA)
-    if not logs:
-        return Planned((), ())
-    return Planned((), with_beside(logs[:1]), {"log": logs[0]})
+def _lowpass(folder: Folder, job: Job) -> Job:
+    logs = _logs(folder, "motion", *_CAMERA)[:1]
+    return replace(job, inputs=with_beside(logs), options={"log": logs[0]} if logs else {})
 
 
-def _both(folder: Folder) -> Planned | str:
+def _both(folder: Folder, job: Job) -> Job:
     logs = _logs(folder, "motion", *_IMU, *_CAMERA)
-    return _given(logs) if logs else "no logs of camera and IMU in motion in logs/"
+    return job.reading(logs, "no logs of camera and IMU in motion in logs/")
 
 
-def _identify(folder: Folder) -> Planned | str:
-    logs = _logs(folder, "motion", *_CAMERA, *_PUMP)
-    # A fit without each log in turn takes as many times as long, and is left to the verb.
-    return _given(logs, hold_back=False) if logs else "no logs with camera and PWM in logs/"
+def _driven(folder: Folder, job: Job) -> Job:
+    return job.reading(_logs(folder, "motion", *_CAMERA, *_PUMP), "no logs with camera and PWM in logs/")
 
 
-def _driven(folder: Folder) -> Planned | str:
-    logs = _logs(folder, "motion", *_CAMERA, *_PUMP)
-    return _given(logs) if logs else "no logs with camera and PWM in logs/"
+def _nothing(_: Folder, job: Job) -> Job:
+    return job
 
 
-def _nothing(_: Folder) -> Planned | str:
-    return Planned((), ())
-
-
-def _replay(log: LogFile) -> Planned | str:
-    if not (log.has(*_CAMERA) or log.has(*_IMU)):
-        return "the log has neither a camera nor an IMU"
-    return Planned((log.path,), with_beside([log.path]))
+def _replay(_: Folder, job: Job) -> Job:
+    log = job.log
+    usable = log is not None and (log.has(*_CAMERA) or log.has(*_IMU))
+    return job.reading((log.path,) if log and usable else (), "the log has neither a camera nor an IMU")
 
 
 _OPTICS = ("camera", "plane")
 
 
-def _step(verb: str, plan: Plan | None, name: str = "", needs: tuple[str, ...] = (), **beyond: Any) -> Step:
+def _step(verb: str, plan: Callable[[Folder, Job], Job], needs: tuple[str, ...] = (), **beyond: Any) -> Step:
     """The step of a stage; `needs` are what a run demands beyond it."""
     made = stage(verb)
     # What is written on request is not asked for.
     writes = () if made.on_request else made.writes
     return Step(
-        name or verb.replace(" ", "-"),
+        beyond.pop("name", verb.replace(" ", "-")),
         made.title,
         verb,
         plan,
@@ -259,13 +248,15 @@ STEPS: tuple[Step, ...] = (
     _step("imu static", _static, flashed=True, seconds=4.0),
     _step("imu intrinsics", _poses),
     _step("imu tune", _moving, flashed=True, seconds=4.0),
-    _step("imu drift", _drift, seconds=2.0),
+    # What is installed beside calib must not change the page.
+    _step("imu drift", _drift, options={"peers": False}, seconds=2.0),
     _step("lowpass", _lowpass, flashed=True, seconds=3.0),
     _step("align", _both, flashed=True, seconds=9.0),
-    _step("identify logs", _identify, "identify", _OPTICS, seconds=9.0),
-    _step("replay", None, needs=_OPTICS, plan_log=_replay, output="states.csv", seconds=2.0),
-    _step("control tune", _nothing, "control", flashed=True, seconds=3.0),
-    _step("validate", _driven, needs=_OPTICS, seconds=8.0),
+    # A fit without each log in turn takes as many times as long, and is left to the verb.
+    _step("identify logs", _driven, _OPTICS, name="identify", options={"hold_back": False}, seconds=9.0),
+    _step("replay", _replay, _OPTICS, each_log=True, output="states.csv", seconds=2.0),
+    _step("control tune", _nothing, name="control", flashed=True, seconds=3.0),
+    _step("validate", _driven, _OPTICS, seconds=8.0),
     _step("firmware", _nothing, output="firmware"),
 )
 """All steps, each after those whose sections it reads."""
@@ -284,146 +275,13 @@ def urgency(steps: tuple[Step, ...] = STEPS) -> dict[str, float]:
 def jobs_of(folder: Folder, steps: tuple[Step, ...] = STEPS) -> Iterator[Job]:
     """The work that a folder asks for, in the table's order."""
     for step in steps:
-        if step.plan_log is not None:
-            if not folder.logs:
-                yield Job(step.name, step, None, None, "no logs in logs/")
+        if not step.each_log:
+            yield step.plan(folder, Job(step.name, step, options=step.options))
+        elif not folder.logs:
+            yield Job(step.name, step).skipped("no logs in logs/")
+        else:
             for log in folder.logs:
-                yield _job(f"{step.name}-{log.slug}", step, log, step.plan_log(log))
-        elif step.plan is not None:
-            yield _job(step.name, step, None, step.plan(folder))
-
-
-def _job(name: str, step: Step, log: LogFile | None, planned: Planned | str) -> Job:
-    if isinstance(planned, str):
-        return Job(name, step, log, None, planned)
-    return Job(name, step, log, planned)
-
-
-# ----------------------------------------------------------------------
-# Processes in which verbs run, one at a time in each, as if they had been typed.
-#
-# A process is kept for many verbs: starting Python and its libraries takes longer than most verbs do. A
-# verb that brings its process down (out of memory, a fault in a library) fails alone.
-
-_PR_SET_PDEATHSIG = 1
-_LOOK_UP_S = 0.2
-_LOST = 70
-"""Exit code for a verb whose process has died."""
-_LIBRARIES = (
-    "calib.cli.main",
-    "calib.cli.app",
-    "calib.core.rig",
-    "scipy.optimize",
-    "scipy.signal",
-    "numba",
-    "calib.show.draw",
-)
-"""What most verbs need and takes long to load; the first of them sets up the others."""
-
-_Process = tuple[multiprocessing.process.BaseProcess, Connection]
-
-
-class Runs(Protocol):
-    """What carries out works: `start` while `free`, then names and exit codes of `finished` ones."""
-
-    @property
-    def free(self) -> bool:
-        """Whether another work can start."""
-
-    def start(self, work: Work) -> None:
-        """Start a work."""
-
-    def finished(self) -> Iterator[tuple[str, int]]:
-        """Wait until at least one has ended."""
-
-
-def _serve(channel: Connection, parent: int, ahead: bool) -> None:
-    """Life of a process: works in, exit codes out, until the other end closes.
-
-    One that is started `ahead` of its first work loads meanwhile what most of them need.
-    """
-    # Ctrl-C reaches all processes of a terminal; the first one answers for all.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL))
-        if os.getppid() != parent:
-            os._exit(1)
-    for name in _LIBRARIES if ahead else ():
-        # The verb that needs it says so.
-        with contextlib.suppress(ImportError):
-            importlib.import_module(name)
-    while True:
-        try:
-            work = channel.recv()
-        except EOFError:
-            return
-        code = perform(work)
-        try:
-            channel.send(code)
-        except OSError:
-            return
-
-
-class Pool:
-    """A few processes that carry out works; use with `with`."""
-
-    def __init__(self, count: int) -> None:
-        self._context = multiprocessing.get_context("spawn")
-        self._count = max(1, count)
-        self._idle: list[_Process] = []
-        self._busy: dict[str, _Process] = {}
-
-    def __enter__(self) -> Pool:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for process, channel in (*self._idle, *self._busy.values()):
-            channel.close()
-            process.kill()
-        for process, _channel in (*self._idle, *self._busy.values()):
-            process.join()
-
-    @property
-    def free(self) -> bool:
-        """Whether another work can start."""
-        return len(self._busy) < self._count
-
-    def start(self, work: Work) -> None:
-        """Hand a work to an idle process, or to a new one; with the first, another is made ready."""
-        first = not (self._idle or self._busy)
-        process, channel = self._idle.pop() if self._idle else self._made(ahead=False)
-        self._busy[work.name] = process, channel
-        with contextlib.suppress(OSError):
-            channel.send(work)
-        if first and self._count > 1:
-            self._idle.append(self._made(ahead=True))
-
-    def _made(self, ahead: bool) -> _Process:
-        channel, theirs = self._context.Pipe()
-        process = self._context.Process(target=_serve, args=(theirs, os.getpid(), ahead))
-        process.start()
-        theirs.close()
-        return process, channel
-
-    def finished(self) -> Iterator[tuple[str, int]]:
-        """Names and exit codes of works that have ended; waits for at least one."""
-        ready: list[object] = []
-        while not ready and self._busy:
-            # The wait is a short one, again and again, so that Ctrl-C is answered.
-            ready = list(wait([channel for _, channel in self._busy.values()], timeout=_LOOK_UP_S))
-        for name, (process, channel) in list(self._busy.items()):
-            if channel not in ready:
-                continue
-            del self._busy[name]
-            try:
-                code = int(channel.recv())
-                self._idle.append((process, channel))
-            except (EOFError, OSError):
-                process.kill()
-                process.join()
-                channel.close()
-                code = _LOST
-            yield name, code
+                yield step.plan(folder, Job(f"{step.name}-{log.slug}", step, log, options=step.options))
 
 
 # ----------------------------------------------------------------------
@@ -435,27 +293,6 @@ class Pool:
 
 HIDDEN = ".calib"
 _USABLE = (EXIT_DONE, EXIT_POOR)
-
-Tell = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class Done:
-    """How a job ended.
-
-    Attributes
-    ----------
-    status : "ok", "poor", "failed"; "blocked" by one that failed; "skipped" where the folder has nothing
-        for it.
-    reason : one sentence for all but "ok".
-    result : None where nothing was run.
-    """
-
-    job: Job
-    status: str
-    reason: str = ""
-    result: Result | None = None
-    reused: bool = False
 
 
 @contextmanager
@@ -508,126 +345,103 @@ class Runner:
 
     Parameters
     ----------
-    runs : what runs commands.
-    tell : gets a line for each stage that has ended; `progress` how many there are.
+    processes : what carries out the stages.
+    tell : gets a line for each job that has ended; `progress` how many there are.
     fresh : whether old results are left aside.
     """
 
     folder: Folder
     out: Path
-    runs: Runs
-    tell: Tell = lambda _: None
+    processes: Processes
+    tell: Callable[[str], None] = lambda _: None
     progress: Callable[[int, int], None] = lambda _done, _total: None
     steps: tuple[Step, ...] = STEPS
     fresh: bool = False
-    done: dict[str, Done] = field(default_factory=dict)
+    ended: dict[str, Job] = field(default_factory=dict)
     _base: Sections = field(default_factory=Sections)
     _sections: dict[str, Sections] = field(default_factory=dict)
     _digests: dict[Path, str] = field(default_factory=dict)
     _before: dict[Path, tuple[int, int, int]] = field(default_factory=dict)
     _began: dict[str, float] = field(default_factory=dict)
 
-    def run(self) -> list[Done]:
+    def run(self) -> list[Job]:
         """Run all jobs; returns how they ended, in the table's order."""
         jobs = list(jobs_of(self.folder, self.steps))
         self._before = {path: _stamp(path) for path in self.folder.files()}
         self._digests = folder_digests(self.folder)
         if self.folder.rig is not None:
-            told = sections_of(self.folder.rig)
-            learnt = {name for job in jobs if job.planned is not None for name in job.step.writes}
-            self._base = told.without(learnt)
+            learnt = {name for job in jobs if not job.status for name in job.step.writes}
+            self._base = sections_of(self.folder.rig).without(learnt)
         urgent = urgency(self.steps)
-        waiting = sorted(jobs, key=lambda job: -urgent[job.step.name])
-        running: dict[str, tuple[Job, str, Path]] = {}
+        waiting = sorted((job for job in jobs if not job.status), key=lambda job: -urgent[job.step.name])
+        for job in jobs:
+            if job.status:
+                self._end(job)
+        running: dict[str, tuple[Job, str]] = {}
         while waiting or running:
-            waiting = [job for job in waiting if not self._settled(job)]
-            for job in list(waiting):
-                if not self.runs.free:
-                    break
-                if self._ready(job, waiting, running):
-                    waiting.remove(job)
-                    started = self._start(job)
-                    if started is not None:
-                        running[job.name] = started
-            if running and (not self.runs.free or not self._any_ready(waiting, running)):
-                for name, code in self.runs.finished():
-                    job, key, work = running.pop(name)
-                    self._end(job, key, work, code)
-            self.progress(len(self.done), len(jobs))
-        return [self.done[job.name] for job in jobs]
+            first = next((job for job in waiting if self._ready(job, waiting, running)), None)
+            if first is not None and self.processes.free:
+                waiting.remove(first)
+                if key := self._start(first):
+                    running[first.name] = first, key
+            else:
+                for task, code in self.processes.finished():
+                    job, key = running.pop(task.name)
+                    self._end(self._stored(job, key, EXIT_INTERNAL if isinstance(code, Failure) else code))
+            self.progress(len(self.ended), len(jobs))
+        return [self.ended[job.name] for job in jobs]
 
     def sections(self) -> Sections:
         """All that is known at the end: what the person told and what the stages have learnt."""
         whole = self._base
         for step in self.steps:
             for name, part in self._sections.items():
-                if self.done[name].job.step is step:
+                if self.ended[name].step is step:
                     whole = whole.joined(part)
         return whole
 
-    def _any_ready(self, waiting: list[Job], running: dict[str, tuple[Job, str, Path]]) -> bool:
-        return any(self._ready(job, waiting, running) for job in waiting)
-
-    def _settled(self, job: Job) -> bool:
-        """Whether a job has ended without being run; it is then among `done`."""
-        if job.planned is None:
-            self._finish(Done(job, "skipped", job.reason))
-            return True
-        return False
-
-    def _ready(self, job: Job, waiting: list[Job], running: dict[str, tuple[Job, str, Path]]) -> bool:
+    @staticmethod
+    def _ready(job: Job, waiting: list[Job], running: Mapping[str, tuple[Job, str]]) -> bool:
         read = {*job.step.needs, *job.step.uses}
-        others = [*(other for other in waiting if other is not job), *(one for one, _, _ in running.values())]
+        others = [*(other for other in waiting if other is not job), *(one for one, _ in running.values())]
         return not any(read & set(other.step.writes) for other in others)
 
-    def _known(self, job: Job) -> Sections:
-        """The sections that a job may see."""
+    def _start(self, job: Job) -> str:
+        """Start a job and return its key; "" where it has ended at once: blocked, or with an old result."""
         whole = self.sections()
-        return whole.only({*self._base.values, *job.step.needs, *job.step.uses}).without(job.step.writes)
-
-    def _start(self, job: Job) -> tuple[Job, str, Path] | None:
-        """Start a job, or end it at once: blocked, or with the result that is there."""
-        assert job.planned is not None
-        known = self._known(job)
+        known = whole.only({*self._base.values, *job.step.needs, *job.step.uses}).without(job.step.writes)
         lacking = next((name for name in job.step.needs if name not in known.values), None)
         if lacking is not None:
-            self._finish(self._blocked(job, lacking))
-            return None
-        inputs = {self.folder.name_of(path): self._digests[path] for path in job.planned.inputs}
-        named = [self.folder.name_of(path) for path in job.planned.paths]
-        chosen = {**self._stated(job.planned), **job.planned.options}
+            self._end(self._blocked(job, lacking))
+            return ""
+        inputs = {self.folder.name_of(path): self._digests[path] for path in job.inputs}
+        named = [self.folder.name_of(path) for path in job.paths]
+        chosen = {**self._stated(job), **job.options}
         options = {name: self._said(value) for name, value in chosen.items()}
         key = key_of(
             (*job.step.verb.split(), *named, json.dumps(options, sort_keys=True)), inputs, known.canonical()
         )
         kept = None if self.fresh else load(self.out / HIDDEN / "stages" / job.name, key)
         if kept is not None and kept.code in _USABLE:
-            self._finish(self._judged(job, kept, reused=True))
-            return None
-        work = self.out / HIDDEN / "work" / job.name
+            self._end(self._judged(job, kept, reused=True))
+            return ""
+        work = self._work(job.name)
         remove(work)
         make_folder(work)
         write_atomically(work / "rig.yaml", known.text(self.folder.rig or self.out / "rig.yaml"))
         self._began[job.name] = time.monotonic()
         step = job.step
-        self.runs.start(
-            Work(
-                job.name,
-                step.verb,
-                self.folder.root,
-                work,
-                job.planned.paths,
-                chosen,
-                step.figures,
-                step.output,
-            )
-        )
-        return job, key, work
+        made = Work(step.verb, self.folder.root, work, job.paths, chosen, step.figures, step.output)
+        self.processes.start(Task(job.name, perform, (made,)))
+        return key
 
-    def _stated(self, planned: Planned) -> dict[str, Any]:
+    def _work(self, name: str) -> Path:
+        return self.out / HIDDEN / "work" / name
+
+    def _stated(self, job: Job) -> dict[str, Any]:
         """What a person states of logs, for a stage that reads some."""
         logs = {log.path for log in self.folder.logs}
-        stated = asdict(self.folder.options) if logs & set(planned.inputs) else {}
+        stated = asdict(self.folder.options) if logs & set(job.inputs) else {}
         return {name: value for name, value in stated.items() if value is not None}
 
     def _said(self, value: Any) -> Any:
@@ -636,52 +450,52 @@ class Runner:
             return value
         return self.folder.name_of(value) if value.is_relative_to(self.folder.root) else digest_of(value)
 
-    def _blocked(self, job: Job, section: str) -> Done:
-        for done in self.done.values():
-            if section in done.job.step.writes:
-                if done.status in ("failed", "blocked"):
-                    return Done(job, "blocked", f"needs {section}, and {done.job.step.title} has failed")
-                return Done(job, "skipped", f"needs {section}: {done.reason}")
-        return Done(job, "skipped", f"needs {section}, which the folder's rig.yaml has not")
+    def _blocked(self, job: Job, section: str) -> Job:
+        for other in self.ended.values():
+            if section in other.step.writes:
+                if other.status in ("failed", "blocked"):
+                    why = f"needs {section}, and {other.step.title} has failed"
+                    return replace(job, status="blocked", reason=why)
+                return replace(job, status="skipped", reason=f"needs {section}: {other.reason}")
+        why = f"needs {section}, which the folder's rig.yaml has not"
+        return replace(job, status="skipped", reason=why)
 
-    def _end(self, job: Job, key: str, work: Path, code: int) -> None:
-        assert job.planned is not None
-        changed = next((path for path in job.planned.inputs if _stamp(path) != self._before[path]), None)
+    def _stored(self, job: Job, key: str, code: int) -> Job:
+        """A job that has come to its end, its result kept."""
+        changed = next((path for path in job.inputs if _stamp(path) != self._before[path]), None)
         if changed is not None:
             name = one_line(self.folder.name_of(changed))
-            self._finish(Done(job, "failed", f"{name} changed while it was read; run it again"))
-            return
-        hidden = self.out / HIDDEN
-        result = store(work, hidden / "stages" / job.name, key, code, hidden / "work" / f"old-{job.name}")
-        self._finish(self._judged(job, result, reused=False))
+            return replace(job, status="failed", reason=f"{name} changed while it was read; run it again")
+        place, trash = self.out / HIDDEN / "stages" / job.name, self._work(f"old-{job.name}")
+        return self._judged(job, store(self._work(job.name), place, key, code, trash), reused=False)
 
-    def _judged(self, job: Job, result: Result, reused: bool) -> Done:
+    def _judged(self, job: Job, result: Result, reused: bool) -> Job:
+        job = replace(job, status="failed", result=result)
         if result.code not in _USABLE:
             said = result.messages()
             words = said[-1].removeprefix("calib: ") if said else f"ended with exit code {result.code}"
-            return Done(job, "failed", words, result)
+            return replace(job, reason=words)
         part = Sections()
         if job.step.writes:
             try:
                 part = sections_of(result.folder / "rig.yaml").only(job.step.writes)
             except BadInputError as error:
-                return Done(job, "failed", str(error), result)
+                return replace(job, reason=str(error))
             if not part.values:
-                return Done(job, "failed", f"has written no {' and no '.join(job.step.writes)}", result)
+                return replace(job, reason=f"has written no {' and no '.join(job.step.writes)}")
         self._sections[job.name] = part
         if result.code == EXIT_DONE:
-            return Done(job, "ok", "", result, reused)
-        return Done(job, "poor", _reason(job, part, result), result, reused)
+            return replace(job, status="ok", reused=reused)
+        return replace(job, status="poor", reason=_reason(job, part, result), reused=reused)
 
-    def _finish(self, done: Done) -> None:
-        self.done[done.job.name] = done
-        words = "not run" if done.status == "blocked" else done.status
-        of = "" if done.job.log is None else f" of {one_line(done.job.log.path.stem)}"
-        began = self._began.pop(done.job.name, None)
+    def _end(self, job: Job) -> None:
+        self.ended[job.name] = job
+        words = "not run" if job.status == "blocked" else job.status
+        began = self._began.pop(job.name, None)
         how = "" if began is None else f", {time.monotonic() - began:.1f} s"
-        how = ", as before" if done.reused else how
-        why = f" ({done.reason})" if done.reason else ""
-        self.tell(f"{done.job.step.title}{of}: {words}{how}{why}")
+        how = ", as before" if job.reused else how
+        why = f" ({job.reason})" if job.reason else ""
+        self.tell(f"{job.label}: {words}{how}{why}")
 
 
 def _reason(job: Job, part: Sections, result: Result) -> str:

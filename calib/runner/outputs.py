@@ -5,23 +5,24 @@ from __future__ import annotations
 import contextlib
 import json
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
-
-from calib.core.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_POOR, BadInputError
-from calib.core.files import one_line, read_text, shown
+from calib.core.errors import EXIT_DONE, BadInputError
+from calib.core.files import one_line, shown
 from calib.core.rig import Rig
 from calib.core.stage import NOTHING_STATED, LogOptions
 from calib.core.workers import processors
 from calib.core.writing import make_folder, replacing, write_atomically
 from calib.io.columns import read_columns_file
 from calib.runner.cache import key_of, load, remove, store
+from calib.runner.decision import Decision, decide
 from calib.runner.folder import Folder, digest_of, read_folder
-from calib.runner.graph import HIDDEN, Done, Job, Pool, Runner, opened
+from calib.runner.graph import HIDDEN, Job, Runner, opened
+from calib.runner.processes import local
+from calib.show.page import keep_pictures, write_page
 
 # ----------------------------------------------------------------------
 # What a run leaves in its folder: rig.yaml, states/, firmware/, and a summary for the page.
@@ -32,27 +33,24 @@ from calib.runner.graph import HIDDEN, Done, Job, Pool, Runner, opened
 _LIST = "outputs.json"
 
 
-def summary(runner: Runner, ended: Sequence[Done], simulated: bool) -> dict[str, Any]:
+def summary(runner: Runner, ended: Sequence[Job], simulated: bool) -> dict[str, Any]:
     """What the page tells of a run: nothing of time or place, so that the same inputs give the same."""
-    jobs = []
-    for done in ended:
-        job = done.job
-        planned = job.planned
-        jobs.append(
-            {
-                "name": job.name,
-                "stage": job.step.name,
-                "title": job.step.title,
-                "verb": job.step.verb,
-                "log": None if job.log is None else one_line(job.log.path.name),
-                "inputs": [] if planned is None else [_named(runner.folder, path) for path in planned.inputs],
-                "command": _command(runner.folder, job),
-                "writes": list(job.step.writes),
-                "flashed": job.step.flashed,
-                "status": done.status,
-                "reason": done.reason,
-            }
-        )
+    jobs = [
+        {
+            "name": job.name,
+            "stage": job.step.name,
+            "title": job.step.title,
+            "verb": job.step.verb,
+            "log": None if job.log is None else one_line(job.log.path.name),
+            "inputs": [one_line(runner.folder.name_of(path)) for path in job.inputs],
+            "command": _command(runner.folder, job),
+            "writes": list(job.step.writes),
+            "flashed": job.step.flashed,
+            "status": job.status,
+            "reason": job.reason,
+        }
+        for job in ended
+    ]
     return {
         "schema": 1,
         "simulated": simulated,
@@ -65,36 +63,30 @@ def summary(runner: Runner, ended: Sequence[Done], simulated: bool) -> dict[str,
 
 def _command(folder: Folder, job: Job) -> list[str]:
     """Words of the command as a person would type them in the folder."""
-    words: list[str] = []
-    if job.planned is not None:
-        words += [folder.name_of(path) for path in job.planned.paths]
-        for name, value in job.planned.options.items():
-            flag = name.replace("_", "-")
-            if isinstance(value, bool):
-                words.append(f"--{flag}" if value else f"--no-{flag}")
-            else:
-                words += [f"--{flag}", folder.name_of(value) if isinstance(value, Path) else str(value)]
+    words = [folder.name_of(path) for path in job.paths]
+    for name, value in job.options.items():
+        flag = name.replace("_", "-")
+        if isinstance(value, bool):
+            words.append(f"--{flag}" if value else f"--no-{flag}")
+        else:
+            words += [f"--{flag}", folder.name_of(value) if isinstance(value, Path) else str(value)]
     return ["calib", *job.step.verb.split(), *map(one_line, words)]
 
 
-def _named(folder: Folder, path: Path) -> str:
-    return one_line(folder.name_of(path))
-
-
-def publish(runner: Runner, ended: Sequence[Done], told: dict[str, Any]) -> list[str]:
+def publish(runner: Runner, ended: Sequence[Job], told: dict[str, Any]) -> list[str]:
     """Write all but the page; returns the names of the files relative to the output folder."""
     out = runner.out
     wanted: dict[str, Path] = {}
-    for done in ended:
-        if done.result is None or done.status not in ("ok", "poor"):
+    for job in ended:
+        if job.result is None or job.status not in ("ok", "poor"):
             continue
-        output = done.job.step.output
-        if done.job.log is not None and output in done.result.files:
-            wanted[f"states/{done.job.log.slug}{Path(output).suffix}"] = done.result.folder / output
+        output = job.step.output
+        if job.log is not None and output in job.result.files:
+            wanted[f"states/{job.log.slug}{Path(output).suffix}"] = job.result.folder / output
         elif output:
-            for name in done.result.files:
+            for name in job.result.files:
                 if name.startswith(f"{output}/"):
-                    wanted[name] = done.result.folder / name
+                    wanted[name] = job.result.folder / name
     if told["simulated"]:
         # What was calibrated lies where one sees it.
         root = runner.folder.root
@@ -167,192 +159,6 @@ def _copy(source: Path, target: Path) -> None:
 
 
 # ----------------------------------------------------------------------
-# run.json: what a run tells the page, read from a folder that may come from anywhere.
-
-_MOST_BYTES = 10_000_000
-Count = Annotated[int, Field(ge=0, strict=True)]
-Text = Annotated[str, Field(strict=True)]
-Flag = Annotated[bool, Field(strict=True)]
-
-
-class _Job(BaseModel):
-    model_config = ConfigDict(extra="ignore")
-
-    name: Text
-    stage: Text
-    title: Text
-    verb: Text
-    log: Text | None
-    inputs: list[Text]
-    command: list[Text]
-    writes: list[Text]
-    flashed: Flag
-    status: Literal["ok", "poor", "failed", "blocked", "skipped"]
-    reason: Text
-
-
-class _Summary(BaseModel):
-    model_config = ConfigDict(extra="ignore")
-
-    simulated: Flag
-    pictures: Count
-    logs: list[Text]
-    left_out: list[Text]
-    jobs: list[_Job]
-
-
-def read_summary(path: Path) -> dict[str, Any] | None:
-    """The summary that `outputs.publish` has written; None where there is none, or something else."""
-    with contextlib.suppress(BadInputError, ValueError, RecursionError, ValidationError):
-        return _Summary.model_validate(json.loads(read_text(path, _MOST_BYTES))).model_dump()
-    return None
-
-
-# ----------------------------------------------------------------------
-# Whether a calibration can be flashed, what is weak about it, and what to record next.
-#
-# The answer is one of
-#
-#     yes         every stage whose result the firmware uses is ok, and nothing else speaks against it; the
-#                 folder's pictures alone are the calibration of a camera
-#     with care   those are, but something beside them is poor or has failed
-#     not yet     a result that the firmware uses is poor or lacking
-#     no          such a stage has failed, or its numbers mean nothing, or there is no firmware
-
-_MEANINGLESS = ("unidentifiable", "inconsistent")
-_RECORD = {
-    "intrinsics": "15 to 25 pictures of a checkerboard into images/, with images/board.yaml",
-    "extrinsics": "a picture of the board lying in the plane of motion into images/plane/",
-    "imu-static": "the rig at rest for a minute or more, logs/static1.csv; hours show how the bias drifts",
-    "imu-tune": "the rig in motion, with the IMU at its full rate, as logs/NAME.csv",
-    "align": "camera and IMU in one log: a free swing, then slow motion to large angles",
-    "replay": "logs of camera and IMU as logs/NAME.csv",
-}
-"""What a stage wants that had nothing to work with."""
-_SHOWN = 4
-
-
-@dataclass(frozen=True)
-class Decision:
-    """The answer with its reasons, not yet escaped; `failed` when any stage has failed."""
-
-    answer: str
-    headline: str
-    weak: tuple[str, ...]
-    record: tuple[str, ...]
-    failed: bool = False
-
-    def as_json(self) -> dict[str, Any]:
-        """For the document."""
-        return {
-            "answer": self.answer,
-            "headline": self.headline,
-            "weak": list(self.weak),
-            "record_next": list(self.record),
-        }
-
-    @property
-    def exit_code(self) -> int:
-        """3 when a stage has failed, 0 when the answer is yes, else 1."""
-        if self.failed:
-            return EXIT_BAD_INPUT
-        return EXIT_DONE if self.answer == "yes" else EXIT_POOR
-
-
-def decide(told: Mapping[str, Any], sections: Mapping[str, Any]) -> Decision:
-    """The decision on a run: `told` is its summary, `sections` those of its rig.yaml."""
-    jobs: Sequence[Mapping[str, Any]] = told.get("jobs", ())
-    answer, headline = _answer(jobs, sections, camera_only=not told.get("logs"))
-    if told.get("simulated"):
-        headline = f"{headline}; the rig is a simulated one, so these numbers are for no real machine"
-    failed = any(job["status"] in ("failed", "blocked") for job in jobs)
-    return Decision(answer, headline, tuple(_weak(jobs, sections)), tuple(_record(jobs, sections)), failed)
-
-
-def _verdict(job: Mapping[str, Any], sections: Mapping[str, Any]) -> str:
-    for name in job.get("writes", ()):
-        section = sections.get(name)
-        if isinstance(section, dict) and section.get("verdict"):
-            return str(section["verdict"])
-    return ""
-
-
-def _answer(
-    jobs: Sequence[Mapping[str, Any]], sections: Mapping[str, Any], camera_only: bool
-) -> tuple[str, str]:
-    used = [job for job in jobs if job["flashed"]]
-    broken = [job for job in used if job["status"] in ("failed", "blocked")]
-    if broken:
-        return "no", f"{_titles(broken)} failed"
-    senseless = [job for job in used if _verdict(job, sections) in _MEANINGLESS]
-    if senseless:
-        return "no", f"the data do not support {_titles(senseless, plain=True)}"
-    made = [job for job in jobs if job["stage"] == "firmware"]
-    if not made or made[0]["status"] not in ("ok", "poor"):
-        why = made[0]["reason"] if made else "it was not asked for"
-        return "no", f"there is no firmware: {why}"
-    poor = [job for job in used if job["status"] == "poor"]
-    if poor:
-        return "not yet", f"{_titles(poor)} too weak"
-    # Pictures alone are the calibration of a camera; whoever has logs wants states from them.
-    optics = {name for name in ("camera", "plane") if name not in sections}
-    if camera_only and optics == {"plane"}:
-        return "yes", "the camera is calibrated; the header holds it alone, without a plane and logs"
-    lacking = [job for job in used if optics & set(job["writes"])]
-    if lacking:
-        return "not yet", f"{_titles(lacking)} not known"
-    if made[0]["status"] == "poor":
-        return "not yet", str(made[0]["reason"])
-    others = [job for job in jobs if job["status"] in ("poor", "failed", "blocked")]
-    if others:
-        return "with care", f"what the firmware uses is sound, but look at {_titles(others, plain=True)}"
-    return "yes", "every stage that had data passed its own quality gate"
-
-
-def _titles(jobs: Sequence[Mapping[str, Any]], plain: bool = False) -> str:
-    names = list(dict.fromkeys(f"“{job['title']}”" for job in jobs))
-    text = names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
-    if plain:
-        return text
-    return f"{text} {'is' if len(names) == 1 else 'are'}" if jobs[0]["status"] == "poor" else text
-
-
-def _weak(jobs: Sequence[Mapping[str, Any]], sections: Mapping[str, Any]) -> list[str]:
-    grouped: dict[tuple[str, str], list[str]] = {}
-    for job in jobs:
-        if job["status"] not in ("poor", "failed", "blocked"):
-            continue
-        reasons = [str(job["reason"])]
-        for name in job["writes"]:
-            section = sections.get(name)
-            if job["status"] == "poor" and isinstance(section, dict) and section.get("reasons"):
-                reasons = [str(reason) for reason in section["reasons"]]
-        for reason in reasons:
-            grouped.setdefault((str(job["title"]), reason), []).append(str(job["log"] or ""))
-    out = []
-    for (title, reason), logs in grouped.items():
-        names = [log for log in logs if log]
-        more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-        where = f" ({', '.join(names[:_SHOWN])}{more})" if names else ""
-        out.append(f"{title}{where}: {reason}")
-    return out
-
-
-def _record(jobs: Sequence[Mapping[str, Any]], sections: Mapping[str, Any]) -> list[str]:
-    out = []
-    for job in jobs:
-        wanted = _RECORD.get(str(job["stage"]))
-        if job["status"] == "skipped" and wanted and job["log"] is None:
-            out.append(f"{job['title']}: {wanted}")
-    for job in jobs:
-        for name in job["writes"]:
-            section = sections.get(name)
-            if isinstance(section, dict):
-                out += [f"{job['title']}: {advice}" for advice in section.get("advice") or ()]
-    return list(dict.fromkeys(out))
-
-
-# ----------------------------------------------------------------------
 # A whole rig: a folder in; its results, a page and the decision out.
 
 
@@ -363,13 +169,13 @@ class Calibrated:
     Attributes
     ----------
     out : its folder. decision : whether it can be flashed, and why not.
-    told : its summary. ended : how each step ended. files : what it has written, by name relative to `out`.
+    told : its summary. ended : its jobs. files : what it has written, by name relative to `out`.
     """
 
     out: Path
     decision: Decision
     told: dict[str, Any]
-    ended: Sequence[Done]
+    ended: Sequence[Job]
     files: tuple[str, ...]
 
     @property
@@ -403,14 +209,12 @@ def calibrate(
     ------
     BadInputError for a folder without anything to work on, and for an output folder that is not ours.
     """
-    from calib.show.page import keep_pictures, write_page
-
     out = Path(output)
     if stated.columns is not None:
         read_columns_file(stated.columns)
     root = None if folder is None else Path(folder)
     seen = None if root is None else read_folder(root, follow_links, stated)
-    with opened(out, root) as interrupted, Pool(jobs or processors()) as pool:
+    with opened(out, root) as interrupted, local(jobs or processors()) as pool:
         if interrupted is not None:
             narrate("the last run here was interrupted; going on where it stopped")
         if seen is None:
@@ -419,12 +223,19 @@ def calibrate(
         for sentence in seen.left_out:
             narrate(sentence)
         runner = Runner(seen, out, pool, narrate, progress, fresh=fresh)
-        ended = runner.run()
-        told = summary(runner, ended, root is None)
-        files = publish(runner, ended, told)
-        keep_pictures(seen.pictures, out / HIDDEN / "pictures")
+        return run_folder(runner, simulated=root is None)
+
+
+def run_folder(runner: Runner, simulated: bool = False, page: bool = True) -> Calibrated:
+    """Run the jobs of a folder and write all that is for a person, in an output folder that is open."""
+    out, ended = runner.out, runner.run()
+    told = summary(runner, ended, simulated)
+    files = publish(runner, ended, told)
+    if page:
+        keep_pictures(runner.folder.pictures, out / HIDDEN / "pictures")
         write_page(out / "rig.yaml")
-    return Calibrated(out, decide(told, runner.sections().values), told, ended, (*files, "report.html"))
+        files.append("report.html")
+    return Calibrated(out, decide(told, runner.sections().values), told, ended, tuple(files))
 
 
 def _simulated(output: Path) -> Folder:

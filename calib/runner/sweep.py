@@ -10,7 +10,7 @@ import math
 import re
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from itertools import islice
@@ -25,10 +25,20 @@ from calib.core.errors import BadInputError, CalibError
 from calib.core.files import one_line, read_yaml_mapping, sha256, shown
 from calib.core.rig import SCHEMA, Rig
 from calib.core.units import parse_duration_s
+from calib.core.workers import Failure, Processes, Task, run_tasks
 from calib.core.writing import write_atomically
-from calib.runner.engine import LIMIT_S, Broken, Cluster, Lost, Overdue, Task, run_tasks
-from calib.runner.fleet import HIDDEN, Store, Table, column, texts, write_table, write_timings
-from calib.runner.task import needed, program
+from calib.runner.cache import program
+from calib.runner.fleet import (
+    HIDDEN,
+    LIMIT_S,
+    Progress,
+    Store,
+    column,
+    sentence_of,
+    texts,
+    write_table,
+    write_timings,
+)
 from calib.stages.control.trial import control_model, run_controller
 from calib.stages.control.tuning import Tracking
 from calib.twin.rig import SimulatedRig, rig_from_file
@@ -380,13 +390,13 @@ class CaseResult:
     seconds: float
 
 
-def run_cases(base: Base, cases: tuple[Case, ...], seed: int, scratch: str = "") -> list[CaseResult]:
+def run_cases(base: Base, cases: tuple[Case, ...], seed: int) -> list[CaseResult]:
     """Run some cases one after the other; every failure is a result, none an exception."""
     out = []
     for case in cases:
         began, measures, sentence = time.perf_counter(), dict[str, float | None](), ""
         try:
-            measures = run_case(base, case, seed, scratch)
+            measures = run_case(base, case, seed)
         except CalibError as error:
             sentence = str(error)
         except Exception as error:
@@ -395,7 +405,7 @@ def run_cases(base: Base, cases: tuple[Case, ...], seed: int, scratch: str = "")
     return out
 
 
-def run_case(base: Base, case: Case, seed: int, scratch: str = "") -> dict[str, float | None]:
+def run_case(base: Base, case: Case, seed: int) -> dict[str, float | None]:
     """What is measured in one case, by name; None for what did not happen.
 
     Raises `BadInputError` for parameters that the plant, the controller or the filter cannot have.
@@ -413,7 +423,7 @@ def run_case(base: Base, case: Case, seed: int, scratch: str = "") -> dict[str, 
     run = run_scenario(plan, plant, noise, base.feedback, base.duration_s)
     if base.kind == "scenario":
         return {name: _or_none(value) for name, value in plan.figures(run).items()}
-    return _filtered(base, known, run, scratch)
+    return _filtered(base, known, run)
 
 
 def _changed(case: Case) -> tuple[dict[str, Any], dict[str, str]]:
@@ -478,12 +488,12 @@ def _of_tracking(figures: Tracking) -> dict[str, float | None]:
     return out
 
 
-def _filtered(base: Base, known: Rig, run: Any, scratch: str) -> dict[str, float | None]:
+def _filtered(base: Base, known: Rig, run: Any) -> dict[str, float | None]:
     from calib.io.logs import write_log
     from calib.stages.estimator.replay import replay_log
     from calib.twin.simulate import log_of
 
-    with tempfile.TemporaryDirectory(prefix="case-", dir=scratch or None) as place:
+    with tempfile.TemporaryDirectory(prefix="case-") as place:
         path = Path(place) / "log.csv"
         write_log(path, log_of(run, "log"))
         replayed = replay_log(path, known, _HERE, base.name, model=base.model)
@@ -505,8 +515,7 @@ def _or_none(value: float | None) -> float | None:
 BUNDLE = 8
 _MOST_SHOWN = 10
 _MOST_POINTS = 400
-
-Progress = Callable[[int, int], None]
+_BLOCK = 512
 
 
 @dataclass(frozen=True)
@@ -554,122 +563,82 @@ def _digest(spec: SweepSpec) -> str:
     return sha256(json.dumps([program(), asdict(spec)], sort_keys=True, default=str).encode())
 
 
-def _file(store: Store, bundle: int) -> Path:
-    return store.out / HIDDEN / "outcomes" / f"bundle{bundle:07d}.json"
+def _file(store: Store, cases: Sequence[Case]) -> Path:
+    name = f"cases{cases[0].number:07d}-{len(cases)}.json"
+    return store.out / HIDDEN / "outcomes" / name
 
 
-def _kept(store: Store, bundle: int, digest: str, final: bool = False) -> list[CaseResult] | None:
-    """Results of a bundle; with `final` only where none of them came of the processes that did the work."""
+def _kept(store: Store, cases: Sequence[Case], digest: str, final: bool = False) -> list[CaseResult] | None:
+    """Results of some cases; with `final` only where none of them came of the processes that did the work."""
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-        told = json.loads(_file(store, bundle).read_text(encoding="utf-8"))
+        told = json.loads(_file(store, cases).read_text(encoding="utf-8"))
         if told["digest"] == digest and not (final and told["lost"]):
             return [CaseResult(**one) for one in told["results"]]
     return None
 
 
-def _bundles(spec: SweepSpec) -> Iterator[tuple[int, tuple[Case, ...]]]:
-    every, number = cases(spec), 0
+def _results(store: Store, spec: SweepSpec) -> Iterator[tuple[Case, CaseResult | None]]:
+    """All cases with their results, where these are there."""
+    digest = _digest(spec)
+    for bundle in _bundles(spec):
+        together = {one.number: one for one in _kept(store, bundle, digest) or []}
+        for case in bundle:
+            alone = () if case.number in together else _kept(store, (case,), digest) or ()
+            yield case, together.get(case.number) or next(iter(alone), None)
+
+
+def _bundles(spec: SweepSpec) -> Iterator[tuple[Case, ...]]:
+    every = cases(spec)
     while bundle := tuple(islice(every, BUNDLE)):
-        yield number, bundle
-        number += 1
+        yield bundle
 
 
 def run_sweep(
     store: Store,
-    cluster: Cluster,
+    processes: Processes,
     spec: SweepSpec,
-    retries: int,
     progress: Progress = lambda done, total: None,
-    tell: Callable[[str], None] = lambda _: None,
     limit_s: float = LIMIT_S,
 ) -> int:
     """Run all bundles of cases that are not there, each case in `limit_s` seconds at most.
 
-    A bundle that is lost, or overdue, is done again case by case: one of them may be at fault, and the others
-    are not. Returns how many cases were there. Raises as `run_tasks`.
+    A bundle that is lost is done again case by case: one of them may be at fault, and the others are not.
+    Returns how many cases were there. Raises as `run_tasks`.
     """
-    digest, scratch = _digest(spec), "" if cluster.address else str(store.scratch)
-    before = done_now = 0
-    apart: list[tuple[int, tuple[Case, ...]]] = []
+    digest = _digest(spec)
+    before = done = 0
+    apart: list[Case] = []
 
     def task(some: tuple[Case, ...]) -> Task:
-        return Task(f"{some[0].number}-{len(some)}", (spec.base, some, spec.seed, scratch))
+        name = _file(store, some).stem
+        return Task(name, run_cases, (spec.base, some, spec.seed), len(some) * limit_s)
 
-    def tasks() -> Iterator[Task]:
+    def there(some: tuple[Case, ...]) -> bool:
         nonlocal before
-        for number, bundle in _bundles(spec):
-            if _kept(store, number, digest, final=True) is not None:
-                before += len(bundle)
+        if _kept(store, some, digest, final=True) is None:
+            return False
+        before += len(some)
+        return True
+
+    def run(tasks: Iterator[Task]) -> None:
+        nonlocal done
+        for task, result in run_tasks(processes, tasks):
+            some, lost = task.arguments[1], isinstance(result, Failure)
+            if lost and len(some) > 1:
+                apart.extend(some)
                 continue
-            yield task(bundle)
-
-    def keep(number: int, results: list[CaseResult], lost: bool) -> None:
-        nonlocal done_now
-        told = {"digest": digest, "lost": lost, "results": [asdict(one) for one in results]}
-        write_atomically(_file(store, number), json.dumps(told) + "\n")
-        done_now += len(results)
-        progress(before + done_now, spec.cases)
-
-    def done(task: Task, result: Any) -> None:
-        bundle, number = task.arguments[1], task.arguments[1][0].number // BUNDLE
-        if isinstance(result, Lost | Overdue) and len(bundle) > 1:
-            apart.append((number, bundle))
-        else:
-            keep(number, *_results(bundle, result))
-
-    def one_by_one(number: int, bundle: tuple[Case, ...]) -> None:
-        found: dict[int, CaseResult] = {}
-        lost = False
-
-        def one(task: Task, result: Any) -> None:
-            nonlocal lost
-            results, fault = _results(task.arguments[1], result)
-            found[results[0].number] = results[0]
-            lost = lost or fault
-
-        alone = (task((case,)) for case in bundle)
-        run_tasks(cluster, run_cases, alone, one, retries, limit_s, tell)
-        keep(number, [found[case.number] for case in bundle], lost)
+            if isinstance(result, Failure):
+                result = [CaseResult(some[0].number, {}, sentence_of(result, task, "case"), 0.0)]
+            told = {"digest": digest, "lost": lost, "results": [asdict(one) for one in result]}
+            write_atomically(_file(store, some), json.dumps(told) + "\n")
+            done += len(some)
+            progress(before + done, spec.cases)
 
     progress(0, spec.cases)
-    run_tasks(cluster, run_cases, tasks(), done, retries, BUNDLE * limit_s, tell)
-    for number, bundle in apart:
-        one_by_one(number, bundle)
+    run(task(bundle) for bundle in _bundles(spec) if not there(bundle))
+    run(task((case,)) for case in apart if not there((case,)))
     progress(spec.cases, spec.cases)
     return before
-
-
-def _results(some: tuple[Case, ...], result: Any) -> tuple[list[CaseResult], bool]:
-    """What came of some cases, and whether that was the processes' fault."""
-    if isinstance(result, Overdue):
-        words = f"was not done after {result.limit_s:g} s, which is the --timeout of a case"
-    elif isinstance(result, Lost):
-        words = "each process that tried it died"
-    elif isinstance(result, Broken):
-        words = result.words
-    else:
-        return result, False
-    return [CaseResult(case.number, {}, words, 0.0) for case in some], True
-
-
-def _rows(
-    store: Store, spec: SweepSpec, measures: tuple[str, ...], times: dict[int, float]
-) -> Iterator[dict[str, Any]]:
-    """Rows of the table; `times` takes what each case has taken."""
-    digest = _digest(spec)
-    for number, bundle in _bundles(spec):
-        results = {one.number: one for one in _kept(store, number, digest) or []}
-        for case in bundle:
-            one = results.get(case.number)
-            row: dict[str, Any] = {"case": case.number, "point": case.point, "draw": case.draw}
-            for name, value in case.values:
-                row[name] = value if _numeric(spec, name) else str(value)
-            found = {} if one is None else one.measures
-            row |= {name: found.get(name) for name in measures}
-            row["sentence"] = "was not run" if one is None else one_line(one.sentence)
-            if one is not None:
-                times[case.number] = one.seconds
-            yield row
 
 
 def _numeric(spec: SweepSpec, name: str) -> bool:
@@ -679,10 +648,9 @@ def _numeric(spec: SweepSpec, name: str) -> bool:
 
 def _measured(store: Store, spec: SweepSpec) -> tuple[str, ...]:
     """Names of all that was measured in any case; those asked for come first."""
-    digest, found = _digest(spec), dict[str, None]()
-    for number, _ in _bundles(spec):
-        for one in _kept(store, number, digest) or []:
-            found |= dict.fromkeys(one.measures)
+    found = dict.fromkeys(
+        name for _, one in _results(store, spec) if one is not None for name in one.measures
+    )
     unknown = next((name for name in spec.measures if found and name not in found), None)
     if unknown is not None:
         raise BadInputError(
@@ -691,35 +659,52 @@ def _measured(store: Store, spec: SweepSpec) -> tuple[str, ...]:
     return spec.measures or tuple(found)
 
 
+def _table(store: Store, spec: SweepSpec, measures: tuple[str, ...], times: list[tuple[int, float]]) -> Any:
+    """All cases as an Arrow table; `times` takes what each has taken."""
+    import pyarrow as pa
+
+    fields = [pa.field(name, pa.int64()) for name in ("case", "point", "draw")]
+    fields += [pa.field(name, pa.float64() if _numeric(spec, name) else pa.string()) for name in spec.names]
+    fields += [pa.field(name, pa.float64()) for name in measures]
+    schema = pa.schema([*fields, pa.field("sentence", pa.string())])
+
+    def rows() -> Iterator[dict[str, Any]]:
+        for case, one in _results(store, spec):
+            values = {name: value if _numeric(spec, name) else str(value) for name, value in case.values}
+            row = {"case": case.number, "point": case.point, "draw": case.draw, **values}
+            if one is None:
+                yield {**row, "sentence": "was not run"}
+            else:
+                times.append((case.number, one.seconds))
+                yield {**row, **one.measures, "sentence": one_line(one.sentence)}
+
+    left, batches = rows(), []
+    while block := list(islice(left, _BLOCK)):
+        batches.append(pa.RecordBatch.from_pylist(block, schema=schema))
+    return pa.Table.from_batches(batches, schema)
+
+
 def summarise_sweep(store: Store, spec: SweepSpec, as_before: int) -> SweepSummary:
     """Write sweep.parquet and the timings, and return the summary.
 
     Raises `BadInputError` for a measure that there is not.
     """
-    pa = needed("pyarrow")
-    measures = _measured(store, spec)
-    fields = [pa.field(name, pa.int64()) for name in ("case", "point", "draw")]
-    fields += [pa.field(name, pa.float64() if _numeric(spec, name) else pa.string()) for name in spec.names]
-    fields += [pa.field(name, pa.float64()) for name in measures]
-    fields.append(pa.field("sentence", pa.string()))
-    path = store.out / "sweep.parquet"
-    times: dict[int, float] = {}
-    write_table(path, pa.schema(fields), _rows(store, spec, measures, times))
-    write_timings(store.out, "case,seconds", times.items())
-    with Table(path) as table:
-        said = texts(table, "sentence")
-        failed = [sentence for sentence in said if sentence]
-        deciding = measures[0] if measures else ""
-        y = column(table, deciding) if deciding else np.full(table.rows, np.nan)
-        points = _points(table, spec, y, measures)
-        ranked = sorted((p for p in points if math.isfinite(p.loss)), key=lambda p: p.loss)
-        clouds = tuple((name, _cloud(column(table, name), y)) for name in spec.names if _numeric(spec, name))
+    measures, times = _measured(store, spec), list[tuple[int, float]]()
+    table = _table(store, spec, measures, times)
+    write_table(store.out / "sweep.parquet", table)
+    write_timings(store.out, "case,seconds", times)
+    failed = [sentence for sentence in texts(table, "sentence") if sentence]
+    deciding = measures[0] if measures else ""
+    y = column(table, deciding)
+    points = _points(table, spec, y, measures)
+    ranked = sorted((p for p in points if math.isfinite(p.loss)), key=lambda p: p.loss)
+    clouds = tuple((name, _cloud(column(table, name), y)) for name in spec.names if _numeric(spec, name))
     why = failed[0] if failed else ""
     best, worst = tuple(ranked[:_MOST_SHOWN]), tuple(reversed(ranked[_MOST_SHOWN:][-_MOST_SHOWN:]))
     return SweepSummary(spec.cases, len(failed), as_before, why, deciding, measures, best, worst, clouds)
 
 
-def _points(table: Table, spec: SweepSpec, y: FloatArray, measures: tuple[str, ...]) -> list[Point]:
+def _points(table: Any, spec: SweepSpec, y: FloatArray, measures: tuple[str, ...]) -> list[Point]:
     """Points of the grid; the draws themselves where there is no grid."""
     by_point = bool(spec.grid)
     group = column(table, "point" if by_point else "case").astype(np.int64)

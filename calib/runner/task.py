@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import importlib
 import io
 import ipaddress
 import json
 import math
-import platform
 import re
 import socket
 import tempfile
@@ -17,10 +15,11 @@ import time
 import urllib.parse
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from calib.core.constants import constants
 from calib.core.errors import (
     EXIT_BAD_INPUT,
     EXIT_DONE,
@@ -28,32 +27,17 @@ from calib.core.errors import (
     EXIT_POOR,
     BadInputError,
     CalibError,
-    pip_install,
 )
 from calib.core.files import PICTURES, one_line, read_text, read_yaml_mapping, sha256, shown
 from calib.core.stage import name_of_flag
 from calib.core.units import parse_corners, parse_square_m
 from calib.core.writing import make_folder
-from calib.runner.cache import key_of, program_digest
+from calib.runner.cache import key_of, program
 from calib.runner.folder import Folder, folder_digests, read_folder
-from calib.runner.graph import STEPS, Done, Planned, Runner, Step, opened
-from calib.runner.outputs import decide, publish, summary
-from calib.runner.work import Work, perform
+from calib.runner.graph import STEPS, Runner, opened, sections_of
+from calib.runner.outputs import Calibrated, run_folder
+from calib.runner.processes import Here, needed
 from calib.stages import stage
-
-# ----------------------------------------------------------------------
-# The packages of the extra `fleet`, loaded when they are first needed.
-
-
-def needed(name: str) -> Any:
-    """A module by its name. Raises `BadInputError` where it is not installed."""
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise BadInputError(
-            f"{name} cannot be loaded, which fleets and sweeps need ({error}): {pip_install('fleet')}"
-        ) from error
-
 
 # ----------------------------------------------------------------------
 # The manifest of a fleet: one row per rig, as CSV or YAML.
@@ -544,38 +528,6 @@ def _copied(system: Any, remote: str, target: Path, most: int, told: str) -> int
 CAMERA_STAGES = ("intrinsics", "extrinsics", "distortion")
 
 
-@dataclass(frozen=True)
-class Ended:
-    """How a rig's stages ended, and the results by name relative to `out`."""
-
-    code: int
-    stages: dict[str, str]
-    reasons: tuple[str, ...]
-    out: Path
-    files: tuple[str, ...]
-
-
-class _Here:
-    """Carries out each work at once, in this process."""
-
-    def __init__(self) -> None:
-        self._ended: list[tuple[str, int]] = []
-
-    @property
-    def free(self) -> bool:
-        """Whether another work can start."""
-        return not self._ended
-
-    def start(self, work: Work) -> None:
-        """Carry out a work to its end."""
-        self._ended.append((work.name, perform(work)))
-
-    def finished(self) -> Iterator[tuple[str, int]]:
-        """The work that was carried out."""
-        ended, self._ended = self._ended, []
-        yield from ended
-
-
 def rig_folder(root: Path) -> Folder:
     """What a rig's folder holds; pictures may lie in it directly where there is neither images/ nor logs/.
 
@@ -602,57 +554,24 @@ def kind_of(folder: Folder) -> str:
     return "run" if folder.logs else "camera"
 
 
-def _given(step: Step, folder: Folder, options: Mapping[str, str]) -> Step:
-    """A step with more options."""
-    planned = "" if step.plan is None else step.plan(folder)
-    if not options or not isinstance(planned, Planned):
-        return step
-    more = replace(planned, options={**planned.options, **options})
-    return replace(step, plan=lambda _: more)
-
-
-def _steps(folder: Folder, kind: str, options: Sequence[tuple[str, str]], figures: bool) -> tuple[Step, ...]:
-    kind_of_options = stage("intrinsics").options
-    given = {name_of_flag(kind_of_options, flag): value for flag, value in options}
-    wanted = [step for step in STEPS if kind == "run" or step.name in CAMERA_STAGES]
-    out = []
-    for step in wanted:
-        if step.name == "intrinsics":
-            step = _given(step, folder, given)
-        out.append(step if figures else replace(step, figures=False))
-    return tuple(out)
-
-
 def run_stages(
     folder: Folder, kind: str, options: Sequence[tuple[str, str]], out: Path, page: bool = False
-) -> Ended:
+) -> Calibrated:
     """Run a folder's stages into a new output folder. Raises `BadInputError` as `calib run` does."""
+    flags = stage("intrinsics").options
+    given = {name_of_flag(flags, flag): value for flag, value in options}
+    steps = [step for step in STEPS if kind == "run" or step.name in CAMERA_STAGES]
+    steps = [replace(step, options=given) if step.name == "intrinsics" else step for step in steps]
+    steps = [replace(step, figures=step.figures and page) for step in steps]
     with opened(out, folder.root):
-        runner = Runner(folder, out, _Here(), steps=_steps(folder, kind, options, page), fresh=True)
-        ended = runner.run()
-        told = summary(runner, ended, False)
-        files = publish(runner, ended, told)
-        if page:
-            from calib.runner.graph import HIDDEN
-            from calib.show.page import keep_pictures, write_page
-
-            keep_pictures(folder.pictures, out / HIDDEN / "pictures")
-            write_page(out / "rig.yaml")
-            files = [*files, "report.html"]
-    decision = decide(told, runner.sections().values)
-    code = decision.exit_code if kind == "run" else _camera_code(ended)
-    reasons = tuple(f"{done.job.step.title}: {done.reason}" for done in ended if done.status in _TELLING)
-    return Ended(code, {done.job.name: done.status for done in ended}, reasons, out, tuple(files))
+        return run_folder(Runner(folder, out, Here(), steps=tuple(steps), fresh=True), page=page)
 
 
-_TELLING = ("poor", "failed", "blocked")
-
-
-def _camera_code(ended: Sequence[Done]) -> int:
-    """As `calib run` would end, firmware apart: 3 when a stage has failed, 1 when one is poor."""
-    statuses = {done.status for done in ended}
-    if statuses & {"failed", "blocked"}:
-        return EXIT_BAD_INPUT
+def _code(done: Calibrated, kind: str) -> int:
+    """As `calib run` ends; of a camera firmware apart: 3 when a stage has failed, 1 when one is poor."""
+    statuses = {job.status for job in done.ended}
+    if kind == "run" or done.decision.failed:
+        return done.decision.exit_code
     return EXIT_POOR if "poor" in statuses or "ok" not in statuses else EXIT_DONE
 
 
@@ -663,6 +582,7 @@ def _camera_code(ended: Sequence[Done]) -> int:
 # elsewhere or later, gives the same bytes.
 
 _MOST_KEPT_BYTES = 30_000_000
+_TELLING = ("poor", "failed", "blocked")
 
 
 @dataclass(frozen=True)
@@ -689,29 +609,17 @@ class Answer:
     files: dict[str, bytes]
 
 
-@cache
-def program() -> str:
-    """What results follow from beside their inputs: this program and the libraries under it."""
-    import cv2
-    import numpy
-    import scipy
-
-    versions = (platform.python_version(), numpy.__version__, scipy.__version__, cv2.__version__)
-    return sha256(json.dumps([program_digest(), *versions]).encode())
-
-
-def calibrate_rig(spec: RigSpec, options: FleetOptions, known: str = "", scratch: str = "") -> Answer:
+def calibrate_rig(spec: RigSpec, options: FleetOptions, known: str = "") -> Answer:
     """Calibrate one rig; every failure is an outcome, none an exception. One at a time in a process.
 
     Parameters
     ----------
     known : key of an earlier result; where it still is the key, the rig is not calibrated again.
-    scratch : folder for what is fetched and made, removed afterwards; the system's own without.
     """
     blank = Outcome(spec.name, spec.serial, without_secrets(spec.source), "failed", EXIT_INTERNAL)
     with _measured() as spent:
         try:
-            with tempfile.TemporaryDirectory(prefix="rig-", dir=scratch or None) as place:
+            with tempfile.TemporaryDirectory(prefix="rig-") as place:
                 answer = _calibrated(spec, options, known, Path(place), blank)
         except CalibError as error:
             answer = _failed(blank, error.exit_code, str(error))
@@ -744,20 +652,21 @@ def _calibrated(spec: RigSpec, options: FleetOptions, known: str, place: Path, b
     cv2.setNumThreads(1)
     try:
         with at_most(1):
-            ended = run_stages(folder, kind, spec.options, place / "out", options.pages)
+            done = run_stages(folder, kind, spec.options, place / "out", options.pages)
     finally:
         cv2.setNumThreads(threads)
-    files = _kept(ended.out, ended.files, options.pages)
+    files, code = _kept(done.out, done.files, options.pages), _code(done, kind)
+    reasons = tuple(f"{job.step.title}: {job.reason}" for job in done.ended if job.status in _TELLING)
     outcome = replace(
         blank,
-        status=verdict_of(ended.code),
-        code=ended.code,
-        sentence=ended.reasons[0] if ended.reasons else "",
+        status=verdict_of(code),
+        code=code,
+        sentence=reasons[0] if reasons else "",
         key=key,
         kind=kind,
-        reasons=ended.reasons,
-        stages=ended.stages,
-        values=_values(ended.out / "rig.yaml"),
+        reasons=reasons,
+        stages={job.name: job.status for job in done.ended},
+        values=_values(done.out / "rig.yaml"),
         files={name: sha256(data) for name, data in files.items()},
     )
     return Answer(outcome, files)
@@ -776,9 +685,6 @@ def _kept(out: Path, names: tuple[str, ...], pages: bool) -> dict[str, bytes]:
 
 
 def _values(rig: Path) -> dict[str, tuple[float, float | None]]:
-    from calib.core.constants import constants
-    from calib.runner.graph import sections_of
-
     return {f"{one.section}.{one.name}": (one.value, one.sigma) for one in constants(sections_of(rig).values)}
 
 

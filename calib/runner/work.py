@@ -35,13 +35,12 @@ class Work:
 
     Attributes
     ----------
-    name : unique. verb : words of the stage. paths : what it reads, below `root`.
+    verb : words of the stage. paths : what it reads, below `root`.
     options : values by the names of the stage's options.
     folder : with the rig.yaml that the stage may see; takes what comes of it.
     figures : whether it draws. output : name of what it writes beside rig.yaml, "" for nothing.
     """
 
-    name: str
     verb: str
     root: Path
     folder: Path

@@ -22,8 +22,8 @@ from calib.core.rig import Rig
 from calib.core.words import BLANK, facts, number, unit_of
 from calib.core.writing import Kind, holds, make_folder, write_atomically
 from calib.runner.cache import Result, load
+from calib.runner.decision import decide, read_summary
 from calib.runner.graph import HIDDEN, STEPS
-from calib.runner.outputs import decide, read_summary
 from calib.show.charts import chart, library
 
 # ----------------------------------------------------------------------

@@ -27,9 +27,10 @@ from fleet_processes import COMMAND, done, workers
 from fleet_rigs import write_fleet, write_manifest
 
 from calib.core.files import sha256
+from calib.core.workers import Task, run_tasks
 from calib.io.logs import log_text
-from calib.runner.engine import Task, connected, run_tasks
 from calib.runner.fleet import opened_store
+from calib.runner.processes import local
 from calib.runner.task import Answer, FleetOptions, Outcome, RigSpec, calibrate_rig
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
@@ -152,16 +153,14 @@ def _resident_MB() -> float:
 
 
 def memory(place: Path) -> None:
-    """Resident memory of this process, which is the client and has the scheduler in it."""
-    with (
-        opened_store(place / "memory", "calib fleet", ()) as (store, _),
-        connected(None, 2, store.scratch, 2) as cluster,
-    ):
+    """Resident memory of this process, which hands out the tasks and keeps what comes of them."""
+    with opened_store(place / "memory", "calib fleet", ()) as (store, _), local(2) as pool:
         first = 0
         for total in (50, 100, 200, 2000):
-            tasks = (Task(f"rig{k}", (k,)) for k in range(first, total))
+            tasks = (Task(f"rig{k}", trivial, (k,)) for k in range(first, total))
             began = time.monotonic()
-            run_tasks(cluster, trivial, tasks, lambda _, answer: store.keep(answer))
+            for _, answer in run_tasks(pool, tasks):
+                store.keep(answer)
             rate = (total - first) / (time.monotonic() - began)
             first = total
             print(f"{total:5d} tasks: {_resident_MB():7.1f} MB resident, {rate:5.0f} tasks/s", flush=True)

@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fleet_clusters import in_threads
 from fleet_processes import COMMAND, all_gone, done, first_worker, started, until, workers
 from fleet_rigs import write_fleet, write_manifest
 
-from calib.runner import engine as cluster
+from calib.runner import processes
 from calib.runner.fleet import opened_store
+from calib.runner.processes import Here
 from calib.runner.sweep import read_sweep, run_sweep, summarise_sweep
 from calib.show.fleet import write_sweep_page
 
@@ -66,7 +66,7 @@ def test_what_cannot_be(calib: Callable[..., Any], tmp_path: Path, monkeypatch: 
     with opened_store(tmp_path / "taken", "calib fleet", ()):
         code, said = ended(manifest, "-o", tmp_path / "taken")
     assert code == 3 and "another calib fleet" in said and "is at work there" in said
-    monkeypatch.setattr(cluster, "_CONNECT_S", 0.5)
+    monkeypatch.setattr(processes, "_CONNECT_S", 0.5)
     with socket.socket() as silent:
         silent.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
@@ -203,9 +203,6 @@ def test_an_existing_scheduler_that_is_killed(
                 one.wait()
 
 
-pytest.importorskip("distributed")
-
-
 def test_what_is_no_sweep(calib: Callable[..., Any], tmp_path: Path) -> None:
     spec = tmp_path / "s.yaml"
     spec.write_text("base: {controller: pid, reference: jump}\n")
@@ -272,10 +269,9 @@ def test_killed_client_and_killed_worker_end_in_the_same(environment: dict[str, 
     assert all(path.stat().st_mtime_ns == when for path, when in kept.items())
     assert not (out / ".fleet" / "scratch").exists()
     # A sweep at one go in one process has the same results.
-    with in_threads(1) as cluster, opened_store(here, "calib sweep", ()) as (store, _):
-        store.scratch.mkdir()
+    with opened_store(here, "calib sweep", ()) as (store, _):
         known = read_sweep(spec)
-        assert run_sweep(store, cluster, known, 0) == 0
+        assert run_sweep(store, Here(), known) == 0
         write_sweep_page(here / "sweep.html", known, summarise_sweep(store, known, 0))
     same = [(folder / "sweep.parquet").read_bytes() for folder in (out, here)]
     assert same[0] == same[1]

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import shutil
-import socket
 import subprocess
 import sys
-import threading
-import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
-from http.client import HTTPException
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pyarrow.parquet
 import pytest
-from fleet_clusters import in_threads
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -23,11 +20,9 @@ from calib.core.errors import BadInputError
 from calib.core.files import sha256
 from calib.core.result import CovarianceTable
 from calib.core.rig import Provenance, Rig
-from calib.runner import engine as cluster
-from calib.runner import engine as worker
-from calib.runner import fleet as running
-from calib.runner.engine import Cluster, connected
-from calib.runner.fleet import Store, Table, column, finish, opened_store, run_fleet, texts
+from calib.core.workers import Failure, Task
+from calib.runner.fleet import Store, column, finish, opened_store, run_fleet, texts
+from calib.runner.processes import Here
 from calib.runner.task import (
     Answer,
     FleetOptions,
@@ -36,7 +31,6 @@ from calib.runner.task import (
     RigSpec,
     is_url,
     kind_of,
-    program,
     read_manifest,
     rig_folder,
     run_stages,
@@ -44,19 +38,8 @@ from calib.runner.task import (
 )
 from calib.stages.camera.section import Camera, Distortion
 
-pytest.importorskip("distributed")
-pytest.importorskip("pyarrow")
-pytestmark = pytest.mark.filterwarnings("default")
-"""What Dask warns of is not ours."""
 
-
-@pytest.fixture(scope="module")
-def here() -> Iterator[Cluster]:
-    with in_threads(1, program()) as cluster:
-        yield cluster
-
-
-def test_failures_are_rows_and_what_is_there_is_left_alone(here: Cluster, tmp_path: Path) -> None:
+def test_failures_are_rows_and_what_is_there_is_left_alone(tmp_path: Path) -> None:
     specs = []
     for k in range(5):
         images = tmp_path / f"rig{k}" / "images"
@@ -66,39 +49,36 @@ def test_failures_are_rows_and_what_is_there_is_left_alone(here: Cluster, tmp_pa
     specs.append(RigSpec("gone", str(tmp_path / "none")))
     manifest, said = Manifest(tuple(specs), ()), list[str]()
     with opened_store(tmp_path / "out", "calib fleet", ()) as (store, _):
-        store.scratch.mkdir()
-        first = run_fleet(store, here, manifest, FleetOptions(), 1, tell=said.append)
+        first = run_fleet(store, Here(), manifest, FleetOptions(), tell=said.append)
         assert first.by_status == {"failed": 6} and first.as_before == 0
         assert any(sentence.startswith("gone: failed (") for sentence in said) and len(said) == 6
         found = store.outcome("rig2")
         assert found is not None and found.serial == "2" and found.code == 3
         # Bad input is bad input again; a folder that was not there may be there now.
         (tmp_path / "rig1" / "images" / "a.png").write_bytes(b"another")
-        again = run_fleet(store, here, manifest, FleetOptions(), 1)
+        again = run_fleet(store, Here(), manifest, FleetOptions())
         assert again.as_before == 4 and again.by_status == {"failed": 2} and again.done == 6
-        assert not list(store.scratch.iterdir())
 
 
-def slow_calibrate(spec: RigSpec, options: FleetOptions, known: str, scratch: str) -> Answer:
-    """As `calibrate_rig` for a rig without anything in it; one never ends."""
-    if spec.name == "endless":
-        threading.Event().wait(5.0)
-    return Answer(Outcome(spec.name, spec.serial, spec.source, "ok", 0), {})
+class _Failing(Here):
+    """Tasks fail in the way that their name says."""
+
+    def finished(self) -> Iterator[tuple[Task, Any]]:
+        for task, _ in super().finished():
+            yield task, Failure(task.name, ValueError("why"))
 
 
-def test_a_rig_that_hangs_is_a_row(here: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(running, "calibrate_rig", slow_calibrate)
-    monkeypatch.setattr(worker, "_end_process", lambda seconds: None)
-    monkeypatch.setattr(worker, "_LEAVE_S", 0.01)
-    manifest = Manifest(tuple(RigSpec(name, "/x") for name in ("a", "endless", "b")), ())
+def test_a_rig_without_an_answer_is_a_row(tmp_path: Path) -> None:
+    manifest = Manifest(tuple(RigSpec(name, "/x") for name in ("died", "over", "raised")), ())
     with opened_store(tmp_path / "out", "calib fleet", ()) as (store, _):
-        store.scratch.mkdir()
-        counts = run_fleet(store, here, manifest, FleetOptions(), 1, limit_s=0.5)
-        found = store.outcome("endless")
-    worker._leaving.clear()
-    assert counts.by_status == {"ok": 2, "lost": 1}
-    assert found is not None and found.key == ""
-    assert found.sentence == "was not done after 0.5 s, which is the --timeout of a rig"
+        counts = run_fleet(store, _Failing(), manifest, FleetOptions(), limit_s=8.0)
+        found = {name: store.outcome(name) for name in ("died", "over", "raised")}
+    assert counts.by_status == {"lost": 2, "broken": 1}
+    assert {name: (one.key, one.sentence) for name, one in found.items() if one is not None} == {
+        "died": ("", "each process that tried it died: out of memory, or a fault in a library"),
+        "over": ("", "was not done after 8 s, which is the --timeout of a rig"),
+        "raised": ("", "internal error: ValueError: why"),
+    }
 
 
 def _csv(tmp_path: Path, text: str) -> Path:
@@ -160,54 +140,6 @@ def test_no_secret_is_kept() -> None:
     assert without_secrets("/data/a?b@c") == "/data/a?b@c"
 
 
-@pytest.mark.parametrize(
-    ("address", "said"),
-    [
-        ("tcp://127.0.0.1:{port}", "no scheduler answers there within 0.5 s"),
-        ("nonsense://x:1", "cannot be talked to|no scheduler answers"),
-    ],
-)
-def test_nobody_at_the_address(
-    address: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(cluster, "_CONNECT_S", 0.5)
-    with socket.socket() as taken:
-        # Bound but not listening: whoever connects is refused.
-        taken.bind(("127.0.0.1", 0))
-        where = address.format(port=taken.getsockname()[1])
-        with pytest.raises(BadInputError, match=said), connected(where, 1, tmp_path / "w", 1):
-            pass
-    assert not (tmp_path / "w").exists()
-
-
-def test_a_stranger_on_this_machine_cannot_enter_the_local_cluster(tmp_path: Path) -> None:
-    """Not without encryption, not with a certificate of his own; and no page tells of it."""
-    import psutil
-    from distributed import Client
-    from distributed.security import Security
-
-    def listening() -> set[int]:
-        here = psutil.Process()
-        sockets = [
-            one for process in (here, *here.children(recursive=True)) for one in process.net_connections()
-        ]
-        return {one.laddr.port for one in sockets if one.status == psutil.CONN_LISTEN}
-
-    before = listening()
-    with connected(None, 1, tmp_path / "w", 1) as ours:
-        address = ours.client.scheduler.address
-        assert address.startswith("tls://127.0.0.1:")
-        assert ours.client.submit(len, "abc").result(timeout=20) == 3
-        for port in listening() - before:
-            for page in ("", "status", "info/main/workers.html", "json/counts.json", "metrics", "health"):
-                with pytest.raises((OSError, HTTPException)):
-                    urllib.request.urlopen(f"http://127.0.0.1:{port}/{page}", timeout=2)
-        strangers = ((address.replace("tls", "tcp"), None), (address, Security.temporary()))
-        for where, security in strangers:
-            with pytest.raises((OSError, TimeoutError)):
-                Client(where, security=security, timeout=3, set_as_default=False)
-
-
 def _verbs(tmp_path: Path, *commands: tuple[str, ...]) -> bytes:
     rig = tmp_path / "single.yaml"
     for words in commands:
@@ -228,7 +160,7 @@ def test_the_bytes_are_those_of_single_verbs(tmp_path: Path, project_root: Path)
     folder = rig_folder(root)
     assert kind_of(folder) == "camera"
     ended = run_stages(folder, "camera", (("model", "radial2"),), tmp_path / "out")
-    assert ended.code == 0 and set(ended.stages.values()) == {"ok"} and ended.reasons == ()
+    assert {job.status for job in ended.ended} == {"ok"}
     images = str(root / "images")
     single = _verbs(
         tmp_path,
@@ -312,9 +244,8 @@ def test_who_stands_out_is_a_row_that_says_so(tmp_path: Path) -> None:
         summary = finish(store, manifest)
     assert summary.rigs == 31
     assert [look.name for look in summary.looks] == ["far"]
-    with Table(tmp_path / "fleet.parquet") as table:
-        assert table.rows == 31
-        of, out = texts(table, "outlier_of"), table.read("stands_out").to_pylist()
-        assert [name for name, one in zip(texts(table, "name"), out, strict=True) if one] == ["far"]
-        assert of[-1] in ("camera.fx_px", "camera.fy_px") and column(table, "outlier_z")[-1] > 5.0
-    assert not list((tmp_path / ".fleet").glob("*.parquet"))
+    table = pyarrow.parquet.read_table(tmp_path / "fleet.parquet")
+    assert table.num_rows == 31
+    of, out = texts(table, "outlier_of"), table["stands_out"].to_pylist()
+    assert [name for name, one in zip(texts(table, "name"), out, strict=True) if one] == ["far"]
+    assert of[-1] in ("camera.fx_px", "camera.fy_px") and column(table, "outlier_z")[-1] > 5.0

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -19,7 +17,7 @@ from calib.runner.fleet import (
     robust_z,
     spread_of,
     summarise,
-    write_outcomes,
+    table_of,
 )
 from calib.runner.task import Outcome
 
@@ -102,9 +100,6 @@ def test_a_fifth_of_bad_rigs_does_not_hide_itself() -> None:
     assert (np.abs(z[:20]) > limit).all() and not (np.abs(z[20:]) > limit).any()
 
 
-pytest.importorskip("pyarrow")
-
-
 def _fleet(count: int, seed: int = 0) -> dict[str, Outcome]:
     """Rigs of which the 7th stands out in cx, the 3rd has failed, the 5th is poor, and fx drifts."""
     rng = np.random.default_rng(seed)
@@ -127,18 +122,16 @@ def _fleet(count: int, seed: int = 0) -> dict[str, Outcome]:
     return out
 
 
-def _summary(tmp_path: Path, count: int) -> FleetSummary:
+def _summary(count: int) -> FleetSummary:
     known = _fleet(count)
-    path = tmp_path / f"{count}.parquet"
-    write_outcomes(path, list(known), known.get)
-    summary, worst, which = summarise(path)
+    summary, worst, which = summarise(table_of(known.values()))
     assert worst.shape == (count,) and len(which) == count
     assert which[6] == "camera.cx_px" and worst[6] > summary.limit and np.isnan(worst[2])
     return summary
 
 
-def test_outliers_drift_and_looks(tmp_path: Path) -> None:
-    found = _summary(tmp_path, 120)
+def test_outliers_drift_and_looks() -> None:
+    found = _summary(120)
     by_name = {one.name: one for one in found.constants}
     assert set(by_name) == {"camera.fx_px", "camera.cx_px"}
     assert found.verdicts == {"failed": 1, "poor": 1, "ok": 118}
@@ -153,7 +146,7 @@ def test_outliers_drift_and_looks(tmp_path: Path) -> None:
     assert found.numbered == 120
 
 
-def test_its_size_does_not_grow_with_the_fleet(tmp_path: Path) -> None:
+def test_its_size_does_not_grow_with_the_fleet() -> None:
     for count in (40, 2000):
-        found = _summary(tmp_path, count)
+        found = _summary(count)
         assert all(len(one.points) <= 240 and len(one.counts) == 36 for one in found.constants)

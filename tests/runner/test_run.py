@@ -12,6 +12,7 @@ import shutil
 import signal
 import sys
 import traceback
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,9 @@ from running_trials import CALLS, Inline, exit_code, make_folder, run_small
 
 from calib.core.errors import BadInputError
 from calib.core.rig import KINDS
+from calib.runner.decision import read_summary
 from calib.runner.folder import read_folder
-from calib.runner.graph import HIDDEN, STEPS, Done, opened
-from calib.runner.outputs import read_summary
+from calib.runner.graph import HIDDEN, STEPS, Job, opened
 from calib.show.page import keep_pictures, page_text, write_page
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="killing is POSIX's")
@@ -35,8 +36,8 @@ def _no_calls() -> None:
     CALLS.clear()
 
 
-def _status(ended: list[Done]) -> dict[str, str]:
-    return {done.job.name: done.status for done in ended}
+def _status(ended: Sequence[Job]) -> dict[str, str]:
+    return {job.name: job.status for job in ended}
 
 
 def _bytes(out: Path) -> dict[str, bytes]:
@@ -54,7 +55,7 @@ def test_second_run_reuses_all_and_gives_the_same_bytes(tmp_path: Path) -> None:
     CALLS.clear()
     ended = run_small(root, out)
     assert CALLS == []
-    assert all(done.reused for done in ended if done.status == "ok")
+    assert all(job.reused for job in ended if job.status == "ok")
     assert _bytes(out) == before
 
 
@@ -83,7 +84,7 @@ def test_a_failure_stops_only_what_needs_it(tmp_path: Path) -> None:
     assert status["first"] == "failed"
     assert status["lone"] == "ok"
     assert {status[name] for name in ("second", "each-one", "firmware")} == {"blocked"}
-    reasons = {done.job.name: done.reason for done in ended}
+    reasons = {job.name: job.reason for job in ended}
     assert reasons["first"] == "first cannot"
     assert "First has failed" in reasons["second"]
     assert exit_code(out) == 3
@@ -140,7 +141,7 @@ def test_an_input_that_changes_meanwhile_is_refused(tmp_path: Path) -> None:
                 stream.write("1,2,3\n")
 
     ended = run_small(root, out, Inline(during=during))
-    assert "changed while it was read" in next(d.reason for d in ended if d.job.name == "each-one")
+    assert "changed while it was read" in next(job.reason for job in ended if job.name == "each-one")
     assert not (out / "states" / "one.csv").exists()
     run_small(root, out)
     assert exit_code(out) == 0

@@ -19,8 +19,8 @@ from pages import EVIL, finished_run
 
 from calib.core.errors import BadInputError
 from calib.runner.cache import Result
-from calib.runner.fleet import FleetSummary, summarise, write_outcomes
-from calib.runner.outputs import decide
+from calib.runner.decision import decide
+from calib.runner.fleet import FleetSummary, summarise, table_of
 from calib.runner.task import Outcome
 from calib.show.charts import library
 from calib.show.fleet import PAGE, fleet_page_text, write_fleet_page
@@ -335,8 +335,7 @@ def test_the_policy_is_that_of_the_script() -> None:
 EVIL_FLEET = "</script><script>document.title='owned'</script><img src=x onerror=alert(1)>"
 
 
-def _summary(path: Path, count: int, constants: int = 6) -> FleetSummary:
-    pytest.importorskip("pyarrow")
+def _summary(count: int, constants: int = 6) -> FleetSummary:
     rng = np.random.default_rng(3)
     known = {}
     for k in range(1, count + 1):
@@ -348,12 +347,11 @@ def _summary(path: Path, count: int, constants: int = 6) -> FleetSummary:
             EVIL_FLEET if bad else "", stages={"intrinsics": "failed" if bad else "ok"},
             values={} if bad else values, seconds=1.0, peak_MB=90.0,
         )  # fmt: skip
-    write_outcomes(path, list(known), known.get)
-    return summarise(path)[0]
+    return summarise(table_of(known.values()))[0]
 
 
-def test_whole_harmless_and_told(tmp_path: Path) -> None:
-    found = _summary(tmp_path / "x.parquet", 60)
+def test_whole_harmless_and_told() -> None:
+    found = _summary(60)
     text = fleet_page_text(found)
     outline = _Outline()
     outline.feed(text)
@@ -369,21 +367,18 @@ def test_whole_harmless_and_told(tmp_path: Path) -> None:
     assert "1 of 60 rigs has no result" in text and "camera.fx_px drifts" in text
     # The worst first: the one without a result, then the one that stands out.
     assert text.index("rig3</td>") < text.index("rig7</td>")
-    assert fleet_page_text(found) == fleet_page_text(_summary(tmp_path / "y.parquet", 60))
+    assert fleet_page_text(found) == fleet_page_text(_summary(60))
 
 
-def test_a_page_does_not_grow_with_the_fleet(tmp_path: Path) -> None:
-    few, many = (
-        len(fleet_page_text(_summary(tmp_path / f"{rigs}.parquet", rigs, 2)).replace(library(), ""))
-        for rigs in (300, 3000)
-    )
+def test_a_page_does_not_grow_with_the_fleet() -> None:
+    few, many = (len(fleet_page_text(_summary(rigs, 2)).replace(library(), "")) for rigs in (300, 3000))
     assert many < 1.1 * few < 400_000
 
 
 def test_in_a_browser(tmp_path: Path) -> None:
     browser = browser_or_skip(tmp_path / "profile")
     try:
-        write_fleet_page(tmp_path / PAGE, _summary(tmp_path / "x.parquet", 60))
+        write_fleet_page(tmp_path / PAGE, _summary(60))
         browser.open(tmp_path / PAGE, 1100)
         assert browser.run("document.title") == "Fleet of 60 rigs"
         browser.run(_TO_EACH)

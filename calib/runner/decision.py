@@ -1,0 +1,200 @@
+"""Whether a calibration can be flashed, what is weak about it, and what to record next."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from calib.core.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_POOR, BadInputError
+from calib.core.files import read_text
+
+# ----------------------------------------------------------------------
+# run.json: what a run tells the page, read from a folder that may come from anywhere.
+
+_MOST_BYTES = 10_000_000
+Count = Annotated[int, Field(ge=0, strict=True)]
+Text = Annotated[str, Field(strict=True)]
+Flag = Annotated[bool, Field(strict=True)]
+
+
+class _Job(BaseModel):
+    model_config = ConfigDict(extra="ignore")
+
+    name: Text
+    stage: Text
+    title: Text
+    verb: Text
+    log: Text | None
+    inputs: list[Text]
+    command: list[Text]
+    writes: list[Text]
+    flashed: Flag
+    status: Literal["ok", "poor", "failed", "blocked", "skipped"]
+    reason: Text
+
+
+class _Summary(BaseModel):
+    model_config = ConfigDict(extra="ignore")
+
+    simulated: Flag
+    pictures: Count
+    logs: list[Text]
+    left_out: list[Text]
+    jobs: list[_Job]
+
+
+def read_summary(path: Path) -> dict[str, Any] | None:
+    """The summary that `outputs.publish` has written; None where there is none, or something else."""
+    with contextlib.suppress(BadInputError, ValueError, RecursionError, ValidationError):
+        return _Summary.model_validate(json.loads(read_text(path, _MOST_BYTES))).model_dump()
+    return None
+
+
+# ----------------------------------------------------------------------
+# Whether a calibration can be flashed, what is weak about it, and what to record next.
+#
+# The answer is one of
+#
+#     yes         every stage whose result the firmware uses is ok, and nothing else speaks against it; the
+#                 folder's pictures alone are the calibration of a camera
+#     with care   those are, but something beside them is poor or has failed
+#     not yet     a result that the firmware uses is poor or lacking
+#     no          such a stage has failed, or its numbers mean nothing, or there is no firmware
+
+_MEANINGLESS = ("unidentifiable", "inconsistent")
+_RECORD = {
+    "intrinsics": "15 to 25 pictures of a checkerboard into images/, with images/board.yaml",
+    "extrinsics": "a picture of the board lying in the plane of motion into images/plane/",
+    "imu-static": "the rig at rest for a minute or more, logs/static1.csv; hours show how the bias drifts",
+    "imu-tune": "the rig in motion, with the IMU at its full rate, as logs/NAME.csv",
+    "align": "camera and IMU in one log: a free swing, then slow motion to large angles",
+    "replay": "logs of camera and IMU as logs/NAME.csv",
+}
+"""What a stage wants that had nothing to work with."""
+_SHOWN = 4
+
+
+@dataclass(frozen=True)
+class Decision:
+    """The answer with its reasons, not yet escaped; `failed` when any stage has failed."""
+
+    answer: str
+    headline: str
+    weak: tuple[str, ...]
+    record: tuple[str, ...]
+    failed: bool = False
+
+    def as_json(self) -> dict[str, Any]:
+        """For the document."""
+        return {
+            "answer": self.answer,
+            "headline": self.headline,
+            "weak": list(self.weak),
+            "record_next": list(self.record),
+        }
+
+    @property
+    def exit_code(self) -> int:
+        """3 when a stage has failed, 0 when the answer is yes, else 1."""
+        if self.failed:
+            return EXIT_BAD_INPUT
+        return EXIT_DONE if self.answer == "yes" else EXIT_POOR
+
+
+def decide(told: Mapping[str, Any], sections: Mapping[str, Any]) -> Decision:
+    """The decision on a run: `told` is its summary, `sections` those of its rig.yaml."""
+    jobs: Sequence[Mapping[str, Any]] = told.get("jobs", ())
+    answer, headline = _answer(jobs, sections, camera_only=not told.get("logs"))
+    if told.get("simulated"):
+        headline = f"{headline}; the rig is a simulated one, so these numbers are for no real machine"
+    failed = any(job["status"] in ("failed", "blocked") for job in jobs)
+    return Decision(answer, headline, tuple(_weak(jobs, sections)), tuple(_record(jobs, sections)), failed)
+
+
+def _verdict(job: Mapping[str, Any], sections: Mapping[str, Any]) -> str:
+    for name in job.get("writes", ()):
+        section = sections.get(name)
+        if isinstance(section, dict) and section.get("verdict"):
+            return str(section["verdict"])
+    return ""
+
+
+def _answer(
+    jobs: Sequence[Mapping[str, Any]], sections: Mapping[str, Any], camera_only: bool
+) -> tuple[str, str]:
+    used = [job for job in jobs if job["flashed"]]
+    broken = [job for job in used if job["status"] in ("failed", "blocked")]
+    if broken:
+        return "no", f"{_titles(broken)} failed"
+    senseless = [job for job in used if _verdict(job, sections) in _MEANINGLESS]
+    if senseless:
+        return "no", f"the data do not support {_titles(senseless, plain=True)}"
+    made = [job for job in jobs if job["stage"] == "firmware"]
+    if not made or made[0]["status"] not in ("ok", "poor"):
+        why = made[0]["reason"] if made else "it was not asked for"
+        return "no", f"there is no firmware: {why}"
+    poor = [job for job in used if job["status"] == "poor"]
+    if poor:
+        return "not yet", f"{_titles(poor)} too weak"
+    # Pictures alone are the calibration of a camera; whoever has logs wants states from them.
+    optics = {name for name in ("camera", "plane") if name not in sections}
+    if camera_only and optics == {"plane"}:
+        return "yes", "the camera is calibrated; the header holds it alone, without a plane and logs"
+    lacking = [job for job in used if optics & set(job["writes"])]
+    if lacking:
+        return "not yet", f"{_titles(lacking)} not known"
+    if made[0]["status"] == "poor":
+        return "not yet", str(made[0]["reason"])
+    others = [job for job in jobs if job["status"] in ("poor", "failed", "blocked")]
+    if others:
+        return "with care", f"what the firmware uses is sound, but look at {_titles(others, plain=True)}"
+    return "yes", "every stage that had data passed its own quality gate"
+
+
+def _titles(jobs: Sequence[Mapping[str, Any]], plain: bool = False) -> str:
+    names = list(dict.fromkeys(f"“{job['title']}”" for job in jobs))
+    text = names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+    if plain:
+        return text
+    return f"{text} {'is' if len(names) == 1 else 'are'}" if jobs[0]["status"] == "poor" else text
+
+
+def _weak(jobs: Sequence[Mapping[str, Any]], sections: Mapping[str, Any]) -> list[str]:
+    grouped: dict[tuple[str, str], list[str]] = {}
+    for job in jobs:
+        if job["status"] not in ("poor", "failed", "blocked"):
+            continue
+        reasons = [str(job["reason"])]
+        for name in job["writes"]:
+            section = sections.get(name)
+            if job["status"] == "poor" and isinstance(section, dict) and section.get("reasons"):
+                reasons = [str(reason) for reason in section["reasons"]]
+        for reason in reasons:
+            grouped.setdefault((str(job["title"]), reason), []).append(str(job["log"] or ""))
+    out = []
+    for (title, reason), logs in grouped.items():
+        names = [log for log in logs if log]
+        more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+        where = f" ({', '.join(names[:_SHOWN])}{more})" if names else ""
+        out.append(f"{title}{where}: {reason}")
+    return out
+
+
+def _record(jobs: Sequence[Mapping[str, Any]], sections: Mapping[str, Any]) -> list[str]:
+    out = []
+    for job in jobs:
+        wanted = _RECORD.get(str(job["stage"]))
+        if job["status"] == "skipped" and wanted and job["log"] is None:
+            out.append(f"{job['title']}: {wanted}")
+    for job in jobs:
+        for name in job["writes"]:
+            section = sections.get(name)
+            if isinstance(section, dict):
+                out += [f"{job['title']}: {advice}" for advice in section.get("advice") or ()]
+    return list(dict.fromkeys(out))
