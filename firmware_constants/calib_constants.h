@@ -1,7 +1,7 @@
 /*
  * calib_constants.h - constants of one rig, written by calib 0.1.0. Do not edit.
  *
- * SHA-256 of the values: 7a1a5f07e1f1c62824758adcf85632ac29796bbd5b90fc20c3a5c1d4a2297ce6
+ * SHA-256 of the values: 6f0829bf63486d88a06f3103008784ac6b7255c69439477623bae33937ad7317
  * input camera/board.yaml: 2faa55cc9d27939d305dee84ddcd112fdaa4d3eec0edf39fb2588b871f258696
  * input camera/view01.png: a8a5d43cd237c318df2372ece67ce52fa2a09171cff9447bb68af2394a832c30
  * input camera/view02.png: 74159ff201b50cc6f7316fa06817c34155aa126f4f03cb7415b51f5489fcb730
@@ -53,7 +53,7 @@
 #define CALIB_TABLE_READ(address) (*(address))
 #endif
 
-#define CALIB_SCHEMA 4
+#define CALIB_SCHEMA 5
 #if defined(CALIB_EXPECT_SCHEMA)
 #if CALIB_EXPECT_SCHEMA != CALIB_SCHEMA
 #error "calib: this header has another schema than the code expects"
@@ -61,7 +61,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x7A1A5F07UL
+#define CALIB_ID 0x6F0829BFUL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 1 /* 0: a section that they come from is not ok */
@@ -293,13 +293,16 @@ static const float calib_ff_table_pwm[15] CALIB_IN_FLASH = {
 
 /*
  * Envelope, see calib_guard.h: the pumps stop where the actuator leaves it.
- * Defaults of the nominal actuator, not in rig.yaml: envelope.least_length_m, envelope.greatest_length_m, envelope.angle_rad, envelope.rate_mps, envelope.full_power_s, envelope.apart_m.
+ * Defaults of the nominal actuator, not in rig.yaml: envelope.least_length_m, envelope.greatest_length_m, envelope.angle_rad, envelope.rate_mps, envelope.full_power_s, envelope.apart_m, envelope.open_loop_s, envelope.open_loop_pwm.
  */
 #define CALIB_ENVELOPE_LEAST_M 0.0450000018f /* shortest length of a bellows, m */
 #define CALIB_ENVELOPE_GREATEST_M 0.115000002f /* longest length of a bellows, m */
 #define CALIB_ENVELOPE_ANGLE_RAD 1.5f /* greatest bending to each side, rad */
 #define CALIB_ENVELOPE_STEP_M 0.00833333377f /* greatest change of a length in a tick, m; 0.5 m/s */
 #define CALIB_ENVELOPE_FULL_TICKS 180 /* ticks that a pump may stay at its greatest command */
+#define CALIB_ENVELOPE_OPEN_TICKS 3600 /* ticks that a pump may be on in open loop */
+#define CALIB_ENVELOPE_OPEN_HIGH_PWM 255.0f /* greatest command in open loop: what holds the longest length by the pump's map, PWM */
+#define CALIB_ENVELOPE_OPEN_HIGH 255 /* the same as a whole number */
 #define CALIB_ENVELOPE_APART_M 0.0120000001f /* marker from where the angle puts it at most, m */
 
 #if defined(CALIB_EXPECT_TICK_RATE_MHZ)

@@ -25,6 +25,8 @@
  *   CALIB_FAULT_RATE         lengths that change faster than the envelope says   by calib_guard_clear
  *   CALIB_FAULT_FULL_POWER   a pump at its greatest command for longer than the  by calib_guard_clear
  *                            envelope says
+ *   CALIB_FAULT_LONG         in open loop a pump on for longer than the envelope  by calib_guard_clear
+ *                            says, less four times what it was off
  *   CALIB_FAULT_REFERENCE    a reference beyond the envelope, at once            with the next good one
  *   CALIB_FAULT_LATE, _HOST  told by the program: ticks too late, host silent    by themselves
  * What ends by itself does so after CALIB_GUARD_QUIET_TICKS without a cause, doubled with each of CALIB_GUARD_TRIES;
@@ -35,7 +37,9 @@
 
 #include "calib_pipeline.h"
 
-#if (!CALIB_RIG_OK || CALIB_SIMULATED) && defined(__AVR__) && !defined(CALIB_I_KNOW)
+/* Constants without a plane control nothing. */
+#if CALIB_HAS_PLANE && (!CALIB_RIG_OK || CALIB_SIMULATED) && (defined(__AVR__) || defined(ARDUINO)) && \
+    !defined(CALIB_I_KNOW)
 #error "calib: these constants are not ok or of a simulated rig, calib_constants.h says which; CALIB_I_KNOW 1 takes them"
 #endif
 
@@ -65,6 +69,10 @@ extern "C" {
 #define CALIB_FAULT_FULL_POWER 18
 #define CALIB_FAULT_SELFTEST 19
 #define CALIB_FAULT_WATCHDOG 20 /* of a program that keeps it over a reset */
+#define CALIB_FAULT_LONG 21
+
+/* A mode beside those of the pipeline: reference[] are commands that the program gives itself, PWM. */
+#define CALIB_MODE_OPEN 3
 
 #define CALIB_GUARD_QUIET_TICKS 30
 #define CALIB_GUARD_TRIES 5
@@ -88,6 +96,7 @@ typedef struct {
     float phi_rad;                        /* angle when the marker came to that pixel */
     float q_m[2];                         /* lengths four ticks ago */
     uint16_t full[2];                     /* ticks at full power, less those below it */
+    uint16_t on[2];                       /* ticks in open loop with a command, less four times those without */
     uint16_t quiet, sound;                /* ticks without a cause; ticks in RUN */
     uint8_t imu_bad, imu_same, camera_bad, frozen, apart, reach, rate;
     uint8_t state, fault, tries, known, needs_camera, turn, shown;
@@ -136,8 +145,8 @@ static inline void calib_guard_clear(calib_guard *guard) {
         guard->quiet = 0;
         guard->reach = 0;
         guard->rate = 0;
-        guard->full[0] = 0;
-        guard->full[1] = 0;
+        memset(guard->full, 0, sizeof guard->full);
+        memset(guard->on, 0, sizeof guard->on);
     }
 }
 
@@ -154,10 +163,17 @@ static inline uint8_t calib_guard_mode(calib_guard *guard, uint8_t wanted, const
         good = calib_within(reference[0], CALIB_ENVELOPE_ANGLE_RAD);
     } else if (wanted == CALIB_MODE_POSITION) {
         good = (uint8_t)(calib_guard_length(reference[0]) && calib_guard_length(reference[1]));
+    } else if (wanted == CALIB_MODE_OPEN) {
+        uint8_t i;
+        for (i = 0; i < 2; i++) {
+            good = (uint8_t)(good && !calib_negative(reference[i]) &&
+                             calib_within(reference[i], CALIB_ENVELOPE_OPEN_HIGH_PWM));
+        }
     } else {
         wanted = CALIB_MODE_OFF;
     }
-    guard->needs_camera = (uint8_t)(CALIB_FUSED || wanted == CALIB_MODE_POSITION);
+    guard->needs_camera =
+        (uint8_t)(wanted == CALIB_MODE_POSITION || (CALIB_FUSED && wanted != CALIB_MODE_OPEN));
     if (!good && guard->state != CALIB_BOOT) {
         calib_guard_fault(guard, CALIB_FAULT_REFERENCE);
     } else if (guard->fault == CALIB_FAULT_REFERENCE) {
@@ -239,6 +255,19 @@ static inline uint8_t calib_guard_camera(calib_guard *guard, const calib_state *
     return guard->apart >= CALIB_GUARD_APART ? CALIB_FAULT_APART : CALIB_FAULT_NONE;
 }
 
+/* Whether a pump has been on for too long in open loop, where nothing else knows how full a bellows is. */
+static inline uint8_t calib_guard_open(calib_guard *guard, const calib_outputs *out) {
+    uint8_t i;
+    for (i = 0; i < 2; i++) {
+        if (out->duty[i] == 0) {
+            guard->on[i] = guard->on[i] > 4 ? (uint16_t)(guard->on[i] - 4u) : 0;
+        } else if (++guard->on[i] >= CALIB_ENVELOPE_OPEN_TICKS) {
+            return CALIB_FAULT_LONG;
+        }
+    }
+    return CALIB_FAULT_NONE;
+}
+
 /* Whether the actuator is where and, every fourth tick, as fast as the envelope allows; lengths need the camera. */
 static inline uint8_t calib_guard_envelope(calib_guard *guard, const calib_outputs *out, uint8_t lengths) {
     uint8_t i, beyond = (uint8_t)!calib_within(out->phi_rad, CALIB_ENVELOPE_ANGLE_RAD), fast = 0;
@@ -279,6 +308,9 @@ static inline void calib_guard_tick(calib_guard *guard, const calib_state *state
     uint8_t envelope = calib_guard_envelope(guard, out, (uint8_t)(camera == CALIB_FAULT_NONE));
     if (imu) {
         fault = imu;
+    }
+    if (in->mode == CALIB_MODE_OPEN && !envelope) {
+        envelope = calib_guard_open(guard, out);
     }
     if (guard->state == CALIB_RUN) {
         if (!fault) {
@@ -332,7 +364,7 @@ static inline uint8_t calib_guard_try(uint8_t fault) {
     calib_state state;
     calib_inputs in;
     calib_outputs out;
-    uint8_t k;
+    uint8_t k, mode = CALIB_MODE_POSITION;
     memset(&state, 0, sizeof state);
     memset(&in, 0, sizeof in);
     memset(&out, 0, sizeof out);
@@ -379,12 +411,18 @@ static inline uint8_t calib_guard_try(uint8_t fault) {
         case CALIB_FAULT_RATE:
             out.q_m[1] = CALIB_ENVELOPE_LEAST_M + ((k & 4) ? 5.0f * CALIB_ENVELOPE_STEP_M : 0.0f);
             break;
+        case CALIB_FAULT_LONG:
+            mode = CALIB_MODE_OPEN;
+            in.reference[0] = 1.0f;
+            in.reference[1] = CALIB_ENVELOPE_OPEN_HIGH_PWM;
+            guard.on[1] = CALIB_ENVELOPE_OPEN_TICKS - 1;
+            break;
         default:
             guard.full[1] = CALIB_ENVELOPE_FULL_TICKS - 1;
             out.duty[1] = CALIB_PUMP_HIGH;
             break;
         }
-        in.mode = calib_guard_mode(&guard, CALIB_MODE_POSITION, in.reference);
+        in.mode = calib_guard_mode(&guard, mode, in.reference);
         calib_guard_tick(&guard, &state, &in, &out);
         if (!out.duty[0] && !out.duty[1]) {
             return guard.state == CALIB_FAULT && guard.fault == fault ? k : 255;
@@ -395,12 +433,13 @@ static inline uint8_t calib_guard_try(uint8_t fault) {
 
 /* 0 when every fault stops the pumps in its time, else the first that does not. */
 static inline uint8_t calib_guard_selftest(void) {
-    static const uint8_t faults[9] = {CALIB_FAULT_IMU_LOST,  CALIB_FAULT_IMU_FROZEN, CALIB_FAULT_CAMERA_LOST,
-                                      CALIB_FAULT_CAMERA_FROZEN, CALIB_FAULT_APART,  CALIB_FAULT_REFERENCE,
-                                      CALIB_FAULT_REACH,     CALIB_FAULT_RATE,       CALIB_FAULT_FULL_POWER};
-    static const uint8_t ticks[9] = {12, 13, 15, 8, 33, 1, 6, 12, 1};
+    static const uint8_t faults[10] = {CALIB_FAULT_IMU_LOST,  CALIB_FAULT_IMU_FROZEN, CALIB_FAULT_CAMERA_LOST,
+                                       CALIB_FAULT_CAMERA_FROZEN, CALIB_FAULT_APART,  CALIB_FAULT_REFERENCE,
+                                       CALIB_FAULT_REACH,     CALIB_FAULT_RATE,       CALIB_FAULT_FULL_POWER,
+                                       CALIB_FAULT_LONG};
+    static const uint8_t ticks[10] = {12, 13, 15, 8, 33, 1, 6, 12, 1, 1};
     uint8_t i, taken;
-    for (i = 0; i < 9; i++) {
+    for (i = 0; i < 10; i++) {
         taken = calib_guard_try(faults[i]);
         if (taken == 0 || taken > ticks[i]) {
             return faults[i];

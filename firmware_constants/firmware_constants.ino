@@ -1,29 +1,39 @@
 /*
- * calib_example - the pipeline on an ATmega328P: BNO055 and Pixy2 on I2C, two pumps on pins 9 and 10.
+ * calib_example - the pipeline on a board with the Arduino core: IMU on I2C, Pixy2, two pumps on pins 9 and 10.
  *
- * Keep this file in one folder with calib_constants.h, calib_pipeline.h, calib_guard.h and calib_selftest.h. Every
- * tick goes out on the serial port, 115200 baud, as a frame that `calib record` reads:
- *   A5 5A, length, payload, CRC-16 (0x1021 from 0xFFFF, over length and payload), all little-endian.
+ * Keep this file in one folder with the headers that `calib firmware` wrote beside it. It serves `calib record`:
+ * every tick goes out as a frame, or samples of the sensors at their own times while the computer drives the pumps in
+ * open loop within the envelope (frames: calib_link.h). With constants that have no plane it does the latter alone.
+ *
  * The pumps stay off until CALIB_EXAMPLE_MODE is set to something else than CALIB_MODE_OFF. With
- * CALIB_EXAMPLE_HEARTBEAT 1 they moreover stop where no byte came from the computer for half a second. The byte 'C'
- * clears a fault that stays.
+ * CALIB_EXAMPLE_HEARTBEAT 1 they moreover stop where no frame came from the computer for CALIB_LINK_SILENT_MS; in open
+ * loop they always do.
+ *
+ * Before including, or as flags: CALIB_IMU_MPU6050 1 for that IMU instead of the BNO055, CALIB_PIXY2_I2C 1 for the
+ * camera on I2C instead of SPI, CALIB_I2C_HZ.
  *
  * A loop that does not come round, as on a bus that hangs, is stopped by the watchdog: pumps off within 125 ms, then
  * a reset. A sensor that does not answer, or is not what it should be, is started anew, ever more seldom.
  */
 #define CALIB_PROGMEM 1
-#define CALIB_EXPECT_SCHEMA 4
+#define CALIB_EXPECT_SCHEMA 5
 #define CALIB_EXPECT_PUMP_HIGH 255
 
 #include <Arduino.h>
-#include <Wire.h>
 #if defined(__AVR__)
 #include <avr/interrupt.h>
 #include <avr/wdt.h>
 #endif
 
 #include "calib_guard.h"
+#include "calib_link.h"
 #include "calib_selftest.h"
+#if defined(CALIB_IMU_MPU6050)
+#include "calib_mpu6050.h"
+#else
+#include "calib_bno055.h"
+#endif
+#include "calib_pixy2.h"
 
 #ifndef CALIB_EXAMPLE_MODE
 #define CALIB_EXAMPLE_MODE CALIB_MODE_OFF
@@ -32,15 +42,18 @@
 #define CALIB_EXAMPLE_HEARTBEAT 0
 #endif
 
-static const uint8_t IMU_ADDRESS = 0x28, PIXY_ADDRESS = 0x54, PUMP_PINS[2] = {9, 10};
-static const uint32_t TICK_US = 1000000000UL / CALIB_TICK_RATE_MHZ;
+static const uint8_t PUMP_PINS[2] = {9, 10};
+static const uint32_t TICK_US = 1000000000UL / CALIB_TICK_RATE_MHZ, SAMPLE_US = 10000;
 
 static calib_state state;
 static calib_inputs in;
 static calib_outputs out;
 static calib_guard guard;
-static uint16_t sequence, silent;
-static uint32_t next_us;
+static calib_link link;
+static uint16_t ticks, samples;
+static uint32_t next_us, sample_us, imu_us;
+static uint8_t sampling, overruns;
+static float force[3], rate[3];
 
 /* Why the watchdog stopped the loop: kept over its reset and told in every frame, until the supply goes. */
 #define CHECK_OF(fault) ((uint16_t)(0xC5A0u ^ (uint16_t)((fault) * 257u)))
@@ -76,263 +89,220 @@ static void watched(void) {
     /* A time-out clears the interrupt; without it the pumps would stay on until the reset. */
     WDTCSR = (uint8_t)(WDTCSR | _BV(WDIE));
 }
+
+static void recall(void) {
+    if (kept_check != CHECK_OF(kept_fault)) {
+        kept_fault = CALIB_FAULT_NONE;
+    }
+}
+#elif defined(ARDUINO_ARCH_NRF52840) || defined(NRF52840_XXAA)
+/* Nano 33 BLE: its watchdog resets at once, which makes the pins inputs; the resistors to ground hold the pumps off. */
+#define REGISTER(at) (*(volatile uint32_t *)(at))
+static uint8_t kept_fault;
+static void watch(void) {
+    REGISTER(0x4001050CUL) = 1u;    /* also while the processor sleeps */
+    REGISTER(0x40010504UL) = 4095u; /* 125 ms at 32,768 Hz */
+    REGISTER(0x40010508UL) = 1u;
+    REGISTER(0x40010000UL) = 1u;
+}
+static void watched(void) {
+    REGISTER(0x40010600UL) = 0x6E524635UL;
+}
+static void recall(void) {
+    if (REGISTER(0x40000400UL) & 2u) {
+        kept_fault = CALIB_FAULT_WATCHDOG;
+        REGISTER(0x40000400UL) = 2u;
+    }
+}
 #else
+#if !defined(CALIB_NO_WATCHDOG)
+#error "calib: no watchdog is known for this board; write watch() and watched(), or CALIB_NO_WATCHDOG 1 does without"
+#endif
 static uint8_t kept_fault;
 static void watch(void) {}
 static void watched(void) {}
+static void recall(void) {}
 #endif
 
-/* Whether a slave holds the data line: nine clocks make it let go. */
-static void free_bus(void) {
-#if defined(__AVR__)
-    uint8_t i;
-    pinMode(SDA, INPUT_PULLUP);
-    pinMode(SCL, INPUT_PULLUP);
-    for (i = 0; i < 9 && digitalRead(SDA) == LOW; i++) {
-        pinMode(SCL, OUTPUT);
-        digitalWrite(SCL, LOW);
-        delayMicroseconds(5);
-        pinMode(SCL, INPUT_PULLUP);
-        delayMicroseconds(5);
-    }
-#endif
-}
-
-static void start_bus(void) {
-    free_bus();
-    Wire.begin();
-    Wire.setClock(400000);
-#if defined(WIRE_HAS_TIMEOUT)
-    Wire.setWireTimeout(3000, true);
-#endif
-}
-
-static bool imu_write(uint8_t place, uint8_t value) {
-    Wire.beginTransmission(IMU_ADDRESS);
-    Wire.write(place);
-    Wire.write(value);
-    return Wire.endTransmission() == 0;
-}
-
-static bool imu_bytes(uint8_t place, uint8_t count) {
-    Wire.beginTransmission(IMU_ADDRESS);
-    Wire.write(place);
-    return Wire.endTransmission(false) == 0 && Wire.requestFrom(IMU_ADDRESS, count) == count;
-}
-
-/* Two or more little-endian numbers from a register on; false when the bus failed. */
-static bool imu_read(uint8_t place, uint8_t count, int16_t *values) {
-    uint8_t i;
-    if (!imu_bytes(place, (uint8_t)(2 * count))) {
-        return false;
-    }
-    for (i = 0; i < count; i++) {
-        uint8_t low = (uint8_t)Wire.read(), high = (uint8_t)Wire.read();
-        values[i] = (int16_t)((uint16_t)low | (uint16_t)((uint16_t)high << 8));
-    }
-    return true;
-}
-
-static bool imu_says(uint8_t place, uint8_t value) {
-    return imu_bytes(place, 1) && (uint8_t)Wire.read() == value;
-}
-
-/* Steps of the IMU's start, with the ticks to wait after each; in the last one it measures. */
-#define IMU_MEASURES 4
 static uint8_t imu_step, imu_failed;
 static uint16_t imu_wait, imu_pause = 6, imu_checked;
 
-/* A step that failed begins the start anew after a pause, doubled each time up to ten seconds. */
+/* A step that failed begins the IMU's start anew after a pause, doubled each time up to ten seconds. */
 static void imu_again(void) {
     imu_step = 0;
     imu_wait = imu_pause;
     imu_pause = imu_pause < 300 ? (uint16_t)(2 * imu_pause) : 600;
 }
 
-static void start_imu(void) {
-    static const uint8_t waits[IMU_MEASURES] = {3, 3, 3, 3};
-    bool done = false;
-    if (imu_wait) {
-        imu_wait--;
-        return;
-    }
-    switch (imu_step) {
-    case 0: /* the right chip, out of its reset; to set the units: configuration mode */
-        done = imu_says(0x00, 0xA0) && imu_write(0x3D, 0x00);
-        break;
-    case 1: /* page 0, normal power */
-        done = imu_write(0x07, 0x00) && imu_write(0x3E, 0x00);
-        break;
-    case 2: /* m/s^2 and rad/s */
-        done = imu_write(0x3B, 0x02);
-        break;
-    default: /* accelerometer, magnetometer and gyroscope, no fusion */
-        done = imu_says(0x3B, 0x02) && imu_write(0x3D, 0x07);
-        break;
-    }
-    if (!done) {
-        imu_again();
-        return;
-    }
-    imu_wait = waits[imu_step];
-    imu_step++;
-    imu_failed = 0;
-    imu_checked = 0;
+static bool imu_measures(void) {
+    return imu_step >= CALIB_IMU_STEPS && imu_wait == 0;
 }
 
-static void read_imu(void) {
-    int16_t force[2], rate[3];
-    in.imu_read = 0;
-    if (imu_step < IMU_MEASURES || imu_wait) {
-        start_imu();
-        return;
-    }
-    /* Once a second: it may have restarted without a word. */
-    if (imu_checked++ == 60) {
-        imu_checked = 0;
-        if (!imu_says(0x3D, 0x07) || !imu_says(0x3B, 0x02)) {
+/* Once a tick: a step of the start, or a look at whether the IMU restarted without a word. */
+static void keep_imu(void) {
+    if (imu_wait) {
+        imu_wait--;
+    } else if (imu_step < CALIB_IMU_STEPS) {
+        if (!calib_imu_start(imu_step)) {
             imu_again();
             return;
         }
+        imu_wait = (uint16_t)(CALIB_IMU_WAIT_MS * (uint32_t)1000 / TICK_US);
+        imu_step++;
+        imu_failed = 0;
+        imu_checked = 0;
+    } else if (imu_checked++ == 60) {
+        imu_checked = 0;
         imu_pause = 6;
-    }
-    in.imu_read = imu_read(0x08, 2, force) && imu_read(0x14, 3, rate);
-    if (in.imu_read) {
-        in.ax_mps2 = (float)force[0] * 0.01f;
-        in.ay_mps2 = (float)force[1] * 0.01f;
-        in.gz_radps = (float)rate[2] * (1.0f / 900.0f);
-    }
-    imu_failed = in.imu_read ? 0 : (uint8_t)(imu_failed + 1u);
-    if (imu_failed >= CALIB_GUARD_SAME || guard.imu_same >= CALIB_GUARD_SAME) {
-        guard.imu_same = 0;
-        imu_again();
-    }
-}
-
-/* The largest block of signature 1, asked for in the tick before. */
-static void read_marker(void) {
-    static const uint8_t request[6] = {0xAE, 0xC1, 0x20, 0x02, 0x01, 0x01};
-    uint8_t reply[26], i, count, from = 0;
-    in.marker_seen = 0;
-    count = Wire.requestFrom(PIXY_ADDRESS, (uint8_t)sizeof reply);
-    for (i = 0; i < sizeof reply; i++) {
-        reply[i] = i < count ? (uint8_t)Wire.read() : 0;
-    }
-    /* The reply may begin behind what was left of an earlier one. */
-    while (from < sizeof reply - 20 && !(reply[from] == 0xAF && reply[from + 1] == 0xC1)) {
-        from++;
-    }
-    if (reply[from] == 0xAF && reply[from + 1] == 0xC1 && reply[from + 2] == 0x21 && reply[from + 3] >= 14) {
-        const uint8_t *at = reply + from;
-        uint16_t sum = 0;
-        for (i = 6; i < 20; i++) {
-            sum = (uint16_t)(sum + at[i]);
-        }
-        if (sum == (uint16_t)(at[4] | (uint16_t)((uint16_t)at[5] << 8))) {
-            in.u_px = (float)(uint16_t)(at[8] | (uint16_t)((uint16_t)at[9] << 8));
-            in.v_px = (float)(uint16_t)(at[10] | (uint16_t)((uint16_t)at[11] << 8));
-            in.marker_seen = 1;
+        if (!calib_imu_alive()) {
+            imu_again();
         }
     }
-    Wire.beginTransmission(PIXY_ADDRESS);
-    Wire.write(request, sizeof request);
-    Wire.endTransmission();
 }
 
-static uint16_t checksum;
-
-static void send_byte(uint8_t value) {
-    uint8_t bit;
-    checksum = (uint16_t)(checksum ^ (uint16_t)((uint16_t)value << 8));
-    for (bit = 0; bit < 8; bit++) {
-        checksum = (uint16_t)((checksum & 0x8000u) ? (uint16_t)(checksum << 1) ^ 0x1021u : checksum << 1);
+/* Six axes, and what the tick needs of them. At the end of the sensor's range it is a sample, but none to go by. */
+static bool read_imu(void) {
+    bool came;
+    imu_us = micros();
+    came = imu_measures() && calib_imu_read(force, rate);
+    in.imu_read = (uint8_t)(came && calib_within(force[0], CALIB_IMU_FULL_MPS2) &&
+                            calib_within(force[1], CALIB_IMU_FULL_MPS2) &&
+                            calib_within(rate[2], CALIB_IMU_FULL_RADPS));
+    if (came) {
+        in.ax_mps2 = force[0];
+        in.ay_mps2 = force[1];
+        in.gz_radps = rate[2];
     }
-    Serial.write(value);
-}
-
-static void send_word(uint32_t value, uint8_t bytes) {
-    while (bytes--) {
-        send_byte((uint8_t)value);
-        value >>= 8;
+    if (imu_measures()) {
+        imu_failed = came ? 0 : (uint8_t)(imu_failed + 1u);
+        if (imu_failed >= CALIB_GUARD_SAME || guard.imu_same >= CALIB_GUARD_SAME) {
+            guard.imu_same = 0;
+            imu_again();
+        }
     }
+    return came;
 }
 
-static void send_float(float value) {
-    send_word(calib_bits(value), 4);
+static void send_hello(void) {
+    calib_link_begin(&link, CALIB_LINK_HELLO, 16);
+    calib_link_word(&link, samples, 2);
+    calib_link_word(&link, CALIB_ID, 4);
+    calib_link_word(&link, CALIB_TICK_RATE_MHZ, 4);
+    calib_link_byte(&link, (uint8_t)CALIB_ENVELOPE_OPEN_HIGH);
+    calib_link_byte(&link, kept_fault);
+    calib_link_byte(&link, CALIB_IMU_KIND);
+    calib_link_byte(&link, CALIB_CAMERA_KIND);
+    calib_link_byte(&link, CALIB_HAS_PLANE);
+    calib_link_byte(&link, CALIB_EXAMPLE_MODE);
+    calib_link_end(&link);
 }
 
 static void send_tick(void) {
-    uint8_t i;
-    uint16_t sum;
-    Serial.write((uint8_t)0xA5);
-    Serial.write((uint8_t)0x5A);
-    checksum = 0xFFFF;
-    send_byte(83);
-    send_word(CALIB_ID, 4);
-    send_word(CALIB_TICK_RATE_MHZ, 4);
-    send_word(sequence++, 2);
-    send_byte((uint8_t)(in.marker_seen | (in.imu_read << 1)));
-    send_byte(in.mode);
-    send_float(in.u_px);
-    send_float(in.v_px);
-    send_float(in.ax_mps2);
-    send_float(in.ay_mps2);
-    send_float(in.gz_radps);
-    for (i = 0; i < 2; i++) {
-        send_float(in.reference[i]);
-    }
-    send_float(out.phi_rad);
-    for (i = 0; i < 2; i++) {
-        send_float(out.marker_m[i]);
-    }
-    for (i = 0; i < 2; i++) {
-        send_float(out.head_m[i]);
-    }
-    for (i = 0; i < 2; i++) {
-        send_float(out.q_m[i]);
-    }
-    for (i = 0; i < 2; i++) {
-        send_float(out.pwm[i]);
-    }
-    send_word(out.flags, 2);
-    send_byte(out.duty[0]);
-    send_byte(out.duty[1]);
-    send_byte(guard.state);
-    send_byte(guard.fault);
-    send_byte(kept_fault);
-    sum = checksum;
-    Serial.write((uint8_t)sum);
-    Serial.write((uint8_t)(sum >> 8));
+    calib_link_begin(&link, CALIB_LINK_TICK, 87);
+    calib_link_word(&link, imu_us, 4);
+    calib_link_word(&link, CALIB_ID, 4);
+    calib_link_word(&link, CALIB_TICK_RATE_MHZ, 4);
+    calib_link_word(&link, ticks++, 2);
+    calib_link_byte(&link, (uint8_t)(in.marker_seen | (in.imu_read << 1)));
+    calib_link_byte(&link, in.mode);
+    calib_link_floats(&link, &in.u_px, 1);
+    calib_link_floats(&link, &in.v_px, 1);
+    calib_link_floats(&link, &in.ax_mps2, 1);
+    calib_link_floats(&link, &in.ay_mps2, 1);
+    calib_link_floats(&link, &in.gz_radps, 1);
+    calib_link_floats(&link, in.reference, 2);
+    calib_link_floats(&link, &out.phi_rad, 1);
+    calib_link_floats(&link, out.marker_m, 2);
+    calib_link_floats(&link, out.head_m, 2);
+    calib_link_floats(&link, out.q_m, 2);
+    calib_link_floats(&link, out.pwm, 2);
+    calib_link_word(&link, out.flags, 2);
+    calib_link_byte(&link, out.duty[0]);
+    calib_link_byte(&link, out.duty[1]);
+    calib_link_byte(&link, guard.state);
+    calib_link_byte(&link, guard.fault);
+    calib_link_byte(&link, kept_fault);
+    calib_link_end(&link);
 }
 
-/* Bytes of the computer: each is a sign of life. */
+static void send_imu(void) {
+    calib_link_begin(&link, CALIB_LINK_IMU, 30);
+    calib_link_word(&link, samples++, 2);
+    calib_link_word(&link, imu_us, 4);
+    calib_link_floats(&link, force, 3);
+    calib_link_floats(&link, rate, 3);
+    calib_link_end(&link);
+}
+
+/* The picture, what the pumps got `after_us` later, and how the board is. */
+static void send_picture(uint32_t picture_us, uint32_t after_us) {
+    calib_link_begin(&link, CALIB_LINK_PICTURE, 23);
+    calib_link_word(&link, samples++, 2);
+    calib_link_word(&link, picture_us, 4);
+    calib_link_word(&link, after_us > 0xFFFFu ? 0xFFFFu : after_us, 2);
+    calib_link_byte(&link, in.marker_seen);
+    calib_link_floats(&link, &in.u_px, 1);
+    calib_link_floats(&link, &in.v_px, 1);
+    calib_link_byte(&link, out.duty[0]);
+    calib_link_byte(&link, out.duty[1]);
+    calib_link_byte(&link, guard.state);
+    calib_link_byte(&link, guard.fault);
+    calib_link_byte(&link, kept_fault);
+    calib_link_byte(&link, overruns);
+    calib_link_end(&link);
+}
+
 static void listen(void) {
-    if (silent < 0xFFFFu) {
-        silent++;
-    }
+    uint8_t i;
     while (Serial.available() > 0) {
-        if (Serial.read() == 'C') {
-            calib_guard_clear(&guard);
-        }
-        silent = 0;
+        calib_link_take(&link, (uint8_t)Serial.read(), millis());
     }
-    if (CALIB_EXAMPLE_HEARTBEAT && silent > CALIB_TICK_RATE_MHZ / 2000UL && guard.state == CALIB_RUN) {
+    if (link.clear) {
+        link.clear = 0;
+        calib_guard_clear(&guard);
+    }
+    if (calib_link_silent(&link, millis()) && guard.state == CALIB_RUN && (sampling || CALIB_EXAMPLE_HEARTBEAT)) {
         calib_guard_fault(&guard, CALIB_FAULT_HOST);
     }
+    if (link.samples != sampling) {
+        sampling = link.samples;
+        sample_us = micros();
+        overruns = 0;
+        for (i = 0; i < 2; i++) {
+            link.duty[i] = sampling ? link.duty[i] : 0;
+        }
+        send_hello();
+    }
+}
+
+/* Where the actuator shall go: from the computer in open loop, or here a reference of your own. */
+static uint8_t wanted_mode(void) {
+    if (sampling) {
+        in.reference[0] = (float)link.duty[0];
+        in.reference[1] = (float)link.duty[1];
+        return link.open ? CALIB_MODE_OPEN : CALIB_MODE_OFF;
+    }
+    if (CALIB_EXAMPLE_MODE == CALIB_MODE_ORIENTATION) {
+        in.reference[0] = 0.3f;
+    } else {
+        calib_reference_point(0.0f, CALIB_REST_LENGTH_M + 0.01f, in.reference);
+    }
+#if CALIB_HAS_PLANE
+    return CALIB_EXAMPLE_MODE;
+#else
+    return CALIB_MODE_OFF;
+#endif
 }
 
 void setup() {
     uint8_t i;
     for (i = 0; i < 2; i++) {
+        /* Before SPI: pin 10 is its SS, which it would pull up as an input. */
         digitalWrite(PUMP_PINS[i], LOW);
         pinMode(PUMP_PINS[i], OUTPUT);
     }
     calib_guard_start(&guard);
-#if defined(__AVR__)
-    if (kept_check != CHECK_OF(kept_fault)) {
-        kept_fault = CALIB_FAULT_NONE;
-    }
-#endif
+    recall();
     Serial.begin(115200);
     if (calib_selftest() != 0 || calib_guard_selftest() != 0) {
         /* It does not compute what it should: stay here with the pumps off. */
@@ -346,13 +316,28 @@ void setup() {
         }
     }
     watch();
-    start_bus();
+    calib_i2c_start();
+    calib_camera_start();
     calib_start(&state);
     calib_guard_ready(&guard, 1);
+    send_hello();
     next_us = micros();
 }
 
 void loop() {
+    static uint8_t fresh;
+    uint32_t began_us = micros(), picture_us;
+    if (sampling && (int32_t)(began_us - sample_us) >= 0) {
+        sample_us += SAMPLE_US;
+        if ((int32_t)(began_us - sample_us) >= 0) {
+            sample_us = began_us + SAMPLE_US;
+            overruns = overruns < 255 ? (uint8_t)(overruns + 1u) : 255;
+        }
+        if (read_imu()) {
+            send_imu();
+        }
+        fresh = in.imu_read;
+    }
     if ((int32_t)(micros() - next_us) < 0) {
         return;
     }
@@ -364,17 +349,30 @@ void loop() {
         next_us = micros();
     }
     listen();
-    read_imu();
-    read_marker();
-    if (CALIB_EXAMPLE_MODE == CALIB_MODE_ORIENTATION) {
-        in.reference[0] = 0.3f;
+    keep_imu();
+    if (sampling) {
+        in.imu_read = fresh;
+        fresh = 0;
     } else {
-        calib_reference_point(0.0f, CALIB_REST_LENGTH_M + 0.01f, in.reference);
+        read_imu();
     }
-    in.mode = calib_guard_mode(&guard, CALIB_EXAMPLE_MODE, in.reference);
+    picture_us = micros();
+    in.marker_seen = calib_camera_read(&in.u_px, &in.v_px);
+    in.mode = calib_guard_mode(&guard, wanted_mode(), in.reference);
     calib_tick(&state, &in, &out);
+    if (in.mode == CALIB_MODE_OPEN) {
+        out.duty[0] = link.duty[0];
+        out.duty[1] = link.duty[1];
+    }
     calib_guard_tick(&guard, &state, &in, &out);
     analogWrite(PUMP_PINS[0], out.duty[0]);
     analogWrite(PUMP_PINS[1], out.duty[1]);
-    send_tick();
+    if (!sampling) {
+        send_tick();
+        return;
+    }
+    send_picture(picture_us, micros() - picture_us);
+    if (++ticks % 60 == 0) {
+        send_hello();
+    }
 }

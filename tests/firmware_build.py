@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import re
 import shutil
 import struct
 import subprocess
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +20,7 @@ from firmware_rigs import header
 
 from calib.io.serial import Inputs
 from calib.stages.firmware.conformance import FusedReference, Reference, binary32
-from calib.stages.firmware.header import Header, verbatim
+from calib.stages.firmware.header import VERBATIM, Header, verbatim
 from calib.stages.firmware.vectors import TOLERANCE, selftest_text
 
 __all__ = [
@@ -32,6 +35,7 @@ __all__ = [
     "compare",
     "host",
     "hostile",
+    "link",
     "need",
     "pack",
     "run",
@@ -75,8 +79,8 @@ def need(tool: str) -> None:
 def write(folder: Path, header: Header) -> None:
     """The header's files, as `calib firmware` writes them."""
     (folder / "calib_constants.h").write_text(header.text)
-    (folder / "calib_pipeline.h").write_text(verbatim("calib_pipeline.h"))
-    (folder / "calib_guard.h").write_text(verbatim("calib_guard.h"))
+    for name in VERBATIM:
+        (folder / name).write_text(verbatim(name))
     (folder / "calib_selftest.h").write_text(selftest_text(header))
 
 
@@ -114,42 +118,71 @@ def avr(folder: Path, *flags: str) -> tuple[list[str], dict[str, int]]:
 
 @dataclass(frozen=True)
 class Built:
-    """The sketch with the Arduino core: the command that runs it, and its sizes in bytes."""
+    """The sketch with the Arduino core: the command that runs it, and its sizes in bytes.
+
+    Attributes
+    ----------
+    library : the simulated board for a caller of its own, see `Board`.
+    """
 
     command: list[str]
     flash: int
     ram: int
+    library: str
+
+    @property
+    def program(self) -> str:
+        """The sketch as a file of the linker's."""
+        return self.command[1]
 
 
-def sketch(folder: Path, mode: str, *flags: str) -> Built:
-    """The example sketch for the ATmega328P with the Arduino core, and the simulated rig around it."""
+_STANDARD = ARDUINO / "variants" / "standard"
+_LIBRARIES = [ARDUINO / "libraries" / name / "src" for name in ("Wire", "SPI")]
+_TARGET = ["-mmcu=atmega328p", "-Os", "-DF_CPU=16000000UL", "-DARDUINO=10819", "-DARDUINO_ARCH_AVR",
+           "-ffunction-sections", "-fdata-sections", "-fno-exceptions",
+           *(f"-I{path}" for path in (ARDUINO / "cores" / "arduino", _STANDARD, *_LIBRARIES)),
+           f"-I{ARDUINO / 'libraries' / 'Wire' / 'src' / 'utility'}"]  # fmt: skip
+
+
+@cache
+def _core() -> tuple[Path, ...]:
+    """The Arduino core compiled, and the simulated rig as program and library: once in a run of tests."""
     for tool in ("avr-gcc", "simavr", "gcc", "arduino"):
         need(tool)
-    write(folder, header())
-    source, made, rig = folder / "sketch.cpp", folder / "sketch.elf", folder / "rig"
-    source.write_text(verbatim("calib_example.ino"))
+    folder = Path(tempfile.mkdtemp(prefix="calib-core-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     core, wire = ARDUINO / "cores" / "arduino", ARDUINO / "libraries" / "Wire" / "src"
     names = ("main", "HardwareSerial", "HardwareSerial0", "Print", "Stream", "abi", "new")
-    cpp = [*(core / f"{name}.cpp" for name in names), wire / "Wire.cpp"]
+    cpp = [*(core / f"{name}.cpp" for name in names), wire / "Wire.cpp", _LIBRARIES[1] / "SPI.cpp"]
     plain = [*sorted(core.glob("wiring*.c")), core / "hooks.c", wire / "utility" / "twi.c"]
-    target = ["-mmcu=atmega328p", "-Os", "-DF_CPU=16000000UL", "-DARDUINO=10819", "-DARDUINO_ARCH_AVR"]
-    target += ["-ffunction-sections", "-fdata-sections", "-fno-exceptions", "-w"]
-    standard = ARDUINO / "variants" / "standard"
-    target += [f"-I{path}" for path in (folder, core, standard, wire, wire / "utility")]
     objects = []
     for path in (*cpp, *plain):
         objects.append(folder / f"{path.name}.o")
         tool = ["avr-gcc"] if path.suffix == ".c" else ["avr-g++", "-std=gnu++11", "-fno-threadsafe-statics"]
-        _compile([*tool, *target, "-c", path, "-o", objects[-1]])
-    ours = [*(flag for flag in target if flag != "-w"), "-std=gnu++11", "-Wall", "-Wextra", "-Werror"]
-    chosen = [f"-DCALIB_EXAMPLE_MODE=CALIB_MODE_{mode}", "-DCALIB_I_KNOW=1", *flags]
-    _compile(["avr-g++", *ours, *chosen, "-fno-threadsafe-statics", "-c", source, "-o", folder / "sketch.o"])
-    linked = ["-Wl,--gc-sections", "-o", made, folder / "sketch.o", *objects, "-lm"]
-    _compile(["avr-gcc", "-mmcu=atmega328p", "-Os", *linked])
+        _compile([*tool, *_TARGET, "-w", "-c", path, "-o", objects[-1]])
+    rig = folder / "rig"
     _compile(["gcc", "-O2", "-o", rig, NATIVE / "rig.c", "-lsimavr", "-lm"])
+    _compile(["gcc", "-O2", "-fPIC", "-shared", "-o", f"{rig}.so", NATIVE / "rig.c", "-lsimavr", "-lm"])
+    return rig, *objects
+
+
+def sketch(folder: Path, mode: str, *flags: str, made: Header | None = None) -> Built:
+    """The example sketch for the ATmega328P with the Arduino core, and the simulated rig around it."""
+    write(folder, made or header())
+    (folder / "sketch.cpp").write_text(verbatim("calib_example.ino"))
+    return link(folder, folder / "sketch.cpp", f"-DCALIB_EXAMPLE_MODE=CALIB_MODE_{mode}", *flags)
+
+
+def link(folder: Path, source: Path, *flags: str) -> Built:
+    """A sketch in a folder of headers, linked with the Arduino core."""
+    rig, *objects = _core()
+    made, unit = source.with_suffix(".elf"), source.with_suffix(".o")
+    ours = ["-std=gnu++11", "-Wall", "-Wextra", "-Werror", "-DCALIB_I_KNOW=1", f"-I{folder}", *flags]
+    _compile(["avr-g++", *_TARGET, *ours, "-fno-threadsafe-statics", "-x", "c++", "-c", source, "-o", unit])
+    _compile(["avr-gcc", *_TARGET[:2], "-Wl,--gc-sections", "-o", made, unit, *objects, "-lm"])
     sizes = subprocess.run(["avr-size", made], capture_output=True, text=True, check=True).stdout
     text, data, bss = map(int, sizes.splitlines()[1].split()[:3])
-    return Built([str(rig), str(made)], text + data, data + bss)
+    return Built([str(rig), str(made)], text + data, data + bss, f"{rig}.so")
 
 
 def pack(given: Inputs) -> bytes:

@@ -1,68 +1,249 @@
-"""`calib record`: what a board with the example sketch sends, as a log."""
+"""`calib record`: what a board with the example sketch sends, and what it is asked to do meanwhile."""
 
 from __future__ import annotations
 
+import sys
 import time
+from collections.abc import Callable
 from itertools import count
 from pathlib import Path
-from typing import Annotated, BinaryIO
+from typing import TYPE_CHECKING, Annotated, Any, BinaryIO
 
 import typer
 
 from calib.cli.common import JsonOption, document, narrate, say
 from calib.core.errors import BadInputError, UsageError, pip_install
 
+if TYPE_CHECKING:
+    from calib.io.experiments import Board
+
 _SILENT_S = 10.0
+_CUT_S = 0.5
+_ALL = "all"
+
+
+class _Port:
+    """A serial port of this computer, as `calib.io.experiments.Port`."""
+
+    def __init__(self, name: str, baud: int) -> None:
+        from calib.core.files import shown
+
+        try:
+            import serial
+        except ModuleNotFoundError as error:
+            raise UsageError(f"calib record needs pyserial: {pip_install('serial')}") from error
+        self.name, self.now_s = shown(name), time.monotonic
+        self._errors = (serial.SerialException, OSError)
+        try:
+            self.line = serial.Serial(name, baud, timeout=0.02, write_timeout=1.0)
+        except (*self._errors, ValueError) as error:
+            raise BadInputError(f"{self.name}: cannot be opened: {_reason(error)}") from error
+
+    def read(self) -> bytes:
+        try:
+            return bytes(self.line.read(max(1, self.line.in_waiting)))
+        except self._errors as error:
+            raise BadInputError(f"{self.name}: the board is gone: {_reason(error)}") from error
+
+    def write(self, data: bytes) -> None:
+        try:
+            self.line.write(data)
+        except self._errors as error:
+            raise BadInputError(f"{self.name}: the board is gone: {_reason(error)}") from error
 
 
 def record(
     port: Annotated[str, typer.Argument(help="Serial port, such as /dev/ttyUSB0 or COM3.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Log to write, .csv.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Log to write, .csv; the rig's folder with --do all.")
+    ],
+    do: Annotated[
+        str | None,
+        typer.Option(
+            help="What the rig shall do: static, swing, ellipse, steps, deflate, chirp or prbs, in open loop "
+            "within the envelope; or all that calib run wants, one after the other."
+        ),
+    ] = None,
+    level: Annotated[
+        int, typer.Option(min=10, max=100, help="Greatest command of --do, in % of what the envelope allows.")
+    ] = 100,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not wait for Enter before an experiment.")] = False,
     duration: Annotated[str | None, typer.Option(help="How long, such as 20s; else until Ctrl-C.")] = None,
     ticks: Annotated[int | None, typer.Option(min=1, help="Stop after this many ticks.")] = None,
     baud: Annotated[int, typer.Option(min=300, help="Speed of the port.")] = 115200,
     as_json: JsonOption = False,
 ) -> None:
-    """Record a board's ticks: camera, IMU and commands as a log, and what the board made of them.
+    """Record a board: its ticks and what it made of them, or samples of its sensors while it moves the rig.
 
-    Ticks are written as they come. A board that restarts begins another log beside the first.
+    The latter with --do. What comes is written as it comes. Without --do a board that restarts begins
+    another log beside the first.
     """
-    from calib.core.files import shown
     from calib.core.units import parse_duration_s
-    from calib.core.writing import appending, check_writable, writes_through
-    from calib.io.logs import LOG
-    from calib.io.serial import record as run
 
-    try:
-        import serial
-    except ModuleNotFoundError as error:
-        raise UsageError(f"calib record needs pyserial: {pip_install('serial')}") from error
     duration_s = None if duration is None else parse_duration_s(duration, "--duration")
+    if do is None:
+        _ticks(port, output, duration_s, ticks, baud, as_json)
+        return
+    from calib.io.experiments import EXPERIMENTS
+
+    if do not in (*EXPERIMENTS, _ALL):
+        raise UsageError(f"--do: found {do}, expected one of {', '.join((*EXPERIMENTS, _ALL))}")
+    if ticks is not None or (duration_s is not None and do == _ALL):
+        raise UsageError("--do: an experiment has its own length; --duration goes with a single one")
+    _experiments(port, output, do, 0.01 * level, duration_s, yes, baud, as_json)
+
+
+def _experiments(
+    port: str,
+    output: Path,
+    do: str,
+    level: float,
+    duration_s: float | None,
+    yes: bool,
+    baud: int,
+    as_json: bool,
+) -> None:
+    from dataclasses import replace
+
+    from calib.core.files import shown
+    from calib.core.writing import appending, check_writable, make_folder
+    from calib.io.experiments import PROGRAMME, Board, experiment, perform
+    from calib.io.logs import LOG
+
+    if do == _ALL:
+        logs = [(name, output / "logs" / f"{name}.csv") for name in PROGRAMME]
+        plans = [(name, path) for name, path in logs if not _complete(path, experiment(name).seconds)]
+        for name, path in logs:
+            if (name, path) not in plans:
+                narrate(f"{shown(path)}: is there, and is kept")
+        if plans:
+            make_folder(output / "logs")
+    else:
+        _must_be_new(output)
+        check_writable(output, LOG)
+        plans = [(do, output)]
+    results: list[dict[str, Any]] = []
+    if plans:
+        line = _Port(port, baud)
+        with line.line:
+            board = Board(line, line.name)
+            _greeted(board)
+            try:
+                for name, path in plans:
+                    plan = experiment(name)
+                    if duration_s is not None:
+                        plan = replace(plan, seconds=duration_s)
+                    which = f"{PROGRAMME.index(name) + 1} of {len(PROGRAMME)}: " if do == _ALL else ""
+                    narrate(f"{which}{name}, {plan.seconds:g} s; {plan.asks}")
+                    _ready(board, yes)
+                    with appending(path, LOG) as stream:
+                        done = perform(board, plan, level, _writer(stream), narrate)
+                    results.append({"log": shown(path), **vars(done)})
+                    if not as_json:
+                        say(f"{shown(path)}: {done.words}")
+                    if done.damaged:
+                        narrate(f"{done.damaged} frames came damaged")
+            finally:
+                board.close()
+    missing = [name for name in ("images", "images/plane") if do == _ALL and not (output / name).is_dir()]
+    if as_json:
+        document("record", {"record": {"logs": results, "missing": missing}})
+    elif do == _ALL:
+        say(f"all {len(PROGRAMME)} logs are in {shown(output / 'logs')}")
+        if missing:
+            say(f"missing: pictures of the board in {' and '.join(shown(output / name) for name in missing)}")
+        else:
+            say(f"next: calib run {shown(output)}")
+
+
+def _greeted(board: Board) -> None:
+    """Say what the board is."""
+    from calib.io.serial import FAULTS
+
+    hello = board.hello
+    imu = {1: "BNO055", 2: "MPU6050"}.get(hello.imu, f"IMU {hello.imu}")
+    camera = {1: "Pixy2 on SPI", 2: "Pixy2 on I2C"}.get(hello.camera, f"camera {hello.camera}")
+    narrate(
+        f"{board.name}: {imu}, {camera}, constants {hello.identity:08X}"
+        f"{'' if hello.has_plane else ' without a plane'}, commands up to {hello.open_high} PWM"
+    )
+    if hello.kept:
+        narrate(f"before its last reset: {FAULTS.get(hello.kept, hello.kept)}")
+
+
+def _ready(board: Board, yes: bool) -> None:
+    """Wait for the person; what came meanwhile is of no log."""
+    if yes:
+        return
+    if not sys.stdin.isatty():
+        raise UsageError("--do waits for Enter before each experiment, and no terminal is there; give --yes")
+    narrate("Enter begins, Ctrl-C ends")
+    sys.stdin.readline()
+    del board
+
+
+def _writer(stream: BinaryIO) -> Callable[[str], None]:
+    def write(text: str) -> None:
+        stream.write(text.encode())
+        stream.flush()
+
+    return write
+
+
+def _complete(path: Path, seconds: float) -> bool:
+    """Whether a log is there. Raises `BadInputError` for one that was cut."""
+    from calib.core.files import shown
+
+    if not path.is_file():
+        return False
+    try:
+        last = float(path.read_bytes().rstrip().rsplit(b"\n", 1)[-1].split(b",", 1)[0])
+    except ValueError:
+        last = 0.0
+    if last < seconds - _CUT_S:
+        raise BadInputError(
+            f"{shown(path)}: has {last:.1f} s, expected {seconds:g} s: a recording that was cut; "
+            "move it away, and run this again"
+        )
+    return True
+
+
+def _must_be_new(output: Path) -> None:
+    from calib.core.files import shown
+
     if output.is_file() and output.stat().st_size:
         raise BadInputError(
             f"{shown(output)}: is there, and a recording cannot be made again; give another name, or move it"
         )
+
+
+def _ticks(
+    port: str, output: Path, duration_s: float | None, ticks: int | None, baud: int, as_json: bool
+) -> None:
+    from calib.core.files import shown
+    from calib.core.writing import appending, check_writable, writes_through
+    from calib.io.logs import LOG
+    from calib.io.serial import ALIVE
+    from calib.io.serial import record as run
+
+    _must_be_new(output)
     check_writable(output, LOG)
-    try:
-        line = serial.Serial(port, baud, timeout=0.1)
-    except (serial.SerialException, OSError, ValueError) as error:
-        raise BadInputError(f"{shown(port)}: cannot be opened: {_reason(error)}") from error
-    began = time.monotonic()
+    line = _Port(port, baud)
+    began = said = time.monotonic()
     if duration_s is None and ticks is None:
         narrate("recording; Ctrl-C ends it")
 
-    def read() -> bytes:
-        try:
-            return bytes(line.read(max(1, line.in_waiting)))
-        except (serial.SerialException, OSError) as error:
-            raise BadInputError(f"{shown(port)}: the board is gone: {_reason(error)}") from error
-
     def more(so_far: int) -> bool:
-        passed = time.monotonic() - began
+        nonlocal said
+        now = time.monotonic()
+        passed = now - began
         if so_far == 0 and passed > _SILENT_S:
             raise BadInputError(
-                f"{shown(port)}: no frame within {_SILENT_S:g} s, expected the example sketch at {baud} baud"
+                f"{line.name}: no frame within {_SILENT_S:g} s, expected the example sketch at {baud} baud"
             )
+        if now - said > 0.1:
+            line.write(ALIVE)
+            said = now
         if ticks is not None and so_far >= ticks:
             return False
         return duration_s is None or passed < duration_s
@@ -81,13 +262,13 @@ def record(
         stream.flush()
 
     try:
-        with line:
-            result = run(read, more, write)
+        with line.line:
+            result = run(line.read, more, write)
     finally:
         for _, stream in logs:
             stream.close()
     if not result.runs:
-        raise BadInputError(f"{shown(port)}: no frame came, expected the example sketch at {baud} baud")
+        raise BadInputError(f"{line.name}: no frame came, expected the example sketch at {baud} baud")
     if result.opening:
         narrate(f"opening the port restarted the board; {result.opening} ticks from before are left out")
     told = {

@@ -7,24 +7,33 @@ import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from calib.core.errors import BadInputError
 from calib.core.files import check_readable, shown
 
 # ----------------------------------------------------------------------
-# Frames that the sketch sends: found in a stream of bytes, checked, and written as a log.
+# Frames between computer and board, see `calib_link.h`:
 #
-#     A5 5A | length | payload | CRC-16        (0x1021 from 0xFFFF over length and payload), little-endian
+#     A5 5A | version | kind | length | payload | CRC-16     (0x1021 from 0xFFFF, from version to payload)
 #
-# The payload holds the id of the header, the tick rate, a sequence number, what went into the tick and what
-# came out. After garbage the search goes on one byte behind the false start, so no whole frame is lost to
-# bytes that look like the beginning of one. The log has the columns that `calib.io.logs` knows and, beside
-# them, the board's own: everything that is needed to compute the tick again.
+# little-endian. A tick holds all that went into it and came out; samples of the IMU and pictures hold their
+# own times. Sketches of before sent ticks alone, with neither version nor kind. After garbage the search
+# goes on one byte behind the false start, so no whole frame is lost to bytes that look like the beginning
+# of one. A log of ticks has the columns that `calib.io.logs` knows and, beside them, the board's own:
+# everything that is needed to compute the tick again.
 
 _SYNC = b"\xa5\x5a"
-_PAYLOAD = struct.Struct("<IIHBB7f9fH5B")
-_UNGUARDED = struct.Struct("<IIHBB7f9fH")
-"""Of sketches before the guard."""
+VERSION = 2
+_HELLO, _TICK, _IMU, _PICTURE, _ALIVE, _SET, _CLEAR = 1, 2, 3, 4, 16, 17, 18
+_UNGUARDED, _UNTIMED = struct.Struct("<IIHBB7f9fH"), struct.Struct("<IIHBB7f9fH5B")
+"""Ticks of sketches before the guard, and before frames had a version: their length stands in its place."""
+_PAYLOADS = {
+    _HELLO: struct.Struct("<HII6B"),
+    _TICK: struct.Struct("<IIIHBB7f9fH5B"),
+    _IMU: struct.Struct("<HI6f"),
+    _PICTURE: struct.Struct("<HIHB2f6B"),
+}
 
 BOARD_COLUMNS = (
     "sequence", "rate_mhz", "calib_id", "marker_seen", "imu_read", "mode",
@@ -38,6 +47,12 @@ GUARD_COLUMNS = ("duty_1", "duty_2", "guard_state", "guard_fault", "kept_fault")
 """Those of the guard, which older logs lack."""
 
 _LOG_COLUMNS = ("t_s", "u_px", "v_px", "ax_mps2", "ay_mps2", "gz_radps", "pwm1", "pwm2")
+
+SAMPLE_COLUMNS = (
+    "t_s", "u_px", "v_px", "ax_mps2", "ay_mps2", "az_mps2", "gx_radps", "gy_radps", "gz_radps",
+    "pwm1", "pwm2", "sequence", "guard_state", "guard_fault", "overruns",
+)  # fmt: skip
+"""Columns of a log of samples: a row for each sample of the IMU, each picture and each command."""
 
 
 MODE_OFF, MODE_ORIENTATION, MODE_POSITION = 0, 1, 2
@@ -121,6 +136,7 @@ FAULTS = {
     18: "a pump was at full power for too long",
     19: "the self-test failed",
     20: "the watchdog stopped the loop",
+    21: "a pump was on for too long in open loop",
 }
 """What CALIB_FAULT_... of the guard mean."""
 
@@ -159,7 +175,8 @@ class Frame:
     Attributes
     ----------
     identity : CALIB_ID of its header. rate_mhz : ticks in 1000 s. sequence : counts up to 65535.
-    guard : None of sketches without one.
+    guard : None of sketches without one. t_us : time of the IMU's sample by the board's clock, which begins
+        anew after 2**32; None of sketches that did not tell it.
     """
 
     identity: int
@@ -168,6 +185,60 @@ class Frame:
     given: Inputs
     out: Outputs
     guard: Guard | None = None
+    t_us: int | None = None
+
+
+@dataclass(frozen=True)
+class Hello:
+    """What a board is.
+
+    Attributes
+    ----------
+    sequence : of the next sample; 0 at the board's start. open_high : greatest command in open loop, PWM.
+    kept : fault of the last reset. imu : 1 BNO055, 2 MPU6050. camera : 1 Pixy2 on SPI, 2 on I2C.
+    has_plane : whether it can control. mode : that the sketch was built for.
+    """
+
+    sequence: int
+    identity: int
+    rate_mhz: int
+    open_high: int
+    kept: int
+    imu: int
+    camera: int
+    has_plane: int
+    mode: int
+
+
+@dataclass(frozen=True)
+class ImuSample:
+    """A sample of the IMU: specific force [m/s^2] and rate [rad/s], three axes each, at a time."""
+
+    sequence: int
+    t_us: int
+    force: tuple[float, float, float]
+    rate: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What a picture showed at a time, and what the pumps got `after_us` later.
+
+    Attributes
+    ----------
+    overruns : samples of the IMU that were left out since recording began, as the loop came too late.
+    """
+
+    sequence: int
+    t_us: int
+    after_us: int
+    seen: bool
+    marker_px: tuple[float, float]
+    guard: Guard
+    overruns: int
+
+
+Message = Frame | Hello | ImuSample | Picture
 
 
 def checksum(data: bytes) -> int:
@@ -180,15 +251,61 @@ def checksum(data: bytes) -> int:
     return crc
 
 
-def encoded(frame: Frame) -> bytes:
-    """The frame as a board sends it."""
-    given, out = frame.given, frame.out
+def _framed(kind: int, payload: bytes) -> bytes:
+    body = bytes([VERSION, kind, len(payload)]) + payload
+    return _SYNC + body + struct.pack("<H", checksum(body))
+
+
+def encoded(frame: Message) -> bytes:
+    """The frame as a board sends it; a tick without a time as sketches of before did."""
+    if isinstance(frame, Hello):
+        return _framed(_HELLO, _PAYLOADS[_HELLO].pack(*vars(frame).values()))
+    if isinstance(frame, ImuSample):
+        return _framed(_IMU, _PAYLOADS[_IMU].pack(frame.sequence, frame.t_us, *frame.force, *frame.rate))
+    if isinstance(frame, Picture):
+        times = (frame.sequence, frame.t_us, frame.after_us, frame.seen)
+        rest = (*frame.marker_px, *frame.guard.numbers, frame.overruns)
+        return _framed(_PICTURE, _PAYLOADS[_PICTURE].pack(*times, *rest))
+    given, out, guard = frame.given, frame.out, frame.guard
     head = (frame.identity, frame.rate_mhz, frame.sequence, given.sensors, given.mode)
     numbers = (*head, *given.numbers, *out.numbers, out.flags)
-    guard = frame.guard
-    payload = _UNGUARDED.pack(*numbers) if guard is None else _PAYLOAD.pack(*numbers, *guard.numbers)
+    if guard is not None and frame.t_us is not None:
+        return _framed(_TICK, _PAYLOADS[_TICK].pack(frame.t_us, *numbers, *guard.numbers))
+    payload = _UNGUARDED.pack(*numbers) if guard is None else _UNTIMED.pack(*numbers, *guard.numbers)
     body = bytes([len(payload)]) + payload
     return _SYNC + body + struct.pack("<H", checksum(body))
+
+
+ALIVE = _framed(_ALIVE, b"")
+"""A sign of life for the board."""
+CLEAR = _framed(_CLEAR, b"")
+"""A person has looked: faults that stay end."""
+
+
+def setting(samples: bool, pumps: tuple[int, int] | None = None) -> bytes:
+    """What the board shall send, samples or ticks, and what its pumps get in open loop, None for nothing."""
+    first, second = pumps or (0, 0)
+    return _framed(_SET, bytes([samples, pumps is not None, first, second]))
+
+
+def _decoded(kind: int, payload: bytes) -> Message:
+    numbers = _PAYLOADS[kind].unpack(payload)
+    if kind == _TICK:
+        return _tick(numbers[1:], numbers[0])
+    if kind == _HELLO:
+        return Hello(*numbers)
+    if kind == _IMU:
+        sequence, t_us, *axes = numbers
+        return ImuSample(sequence, t_us, (axes[0], axes[1], axes[2]), (axes[3], axes[4], axes[5]))
+    sequence, t_us, after_us, seen, u, v, *guard, overruns = numbers
+    return Picture(sequence, t_us, after_us, bool(seen), (u, v), Guard.of(guard), overruns)
+
+
+def _tick(numbers: Sequence[Any], t_us: int | None) -> Frame:
+    identity, rate, sequence, sensors, mode, *rest = numbers
+    given, out = Inputs.of(rest[:7], sensors, mode), Outputs.of(rest[7:16], rest[16])
+    guard = Guard.of(rest[17:]) if len(rest) > 17 else None
+    return Frame(identity, rate, sequence, given, out, guard, t_us)
 
 
 class Decoder:
@@ -204,7 +321,7 @@ class Decoder:
         self.skipped = 0
         self.damaged = 0
 
-    def feed(self, data: bytes) -> Iterator[Frame]:
+    def feed(self, data: bytes) -> Iterator[Message]:
         """Take more of the stream; the frames that are complete now."""
         waiting = self._waiting
         waiting += data
@@ -212,34 +329,31 @@ class Decoder:
             start = waiting.find(_SYNC)
             if start < 0:
                 # The last byte may be the first of a mark.
-                drop = len(waiting) - (1 if waiting[-1:] == _SYNC[:1] else 0)
-                self.skipped += drop
-                del waiting[:drop]
+                self._skip(len(waiting) - (1 if waiting[-1:] == _SYNC[:1] else 0))
                 return
-            self.skipped += start
-            del waiting[:start]
-            if len(waiting) < 3:
+            self._skip(start)
+            if len(waiting) < 5:
                 return
-            length = waiting[2]
-            if length not in (_PAYLOAD.size, _UNGUARDED.size):
-                self.skipped += 1
-                del waiting[:1]
+            old = {one.size: one for one in (_UNGUARDED, _UNTIMED)}.get(waiting[2])
+            begin = 3 if old else 5
+            if old is None and not (waiting[2] == VERSION and waiting[3] in _PAYLOADS
+                                    and waiting[4] == _PAYLOADS[waiting[3]].size):  # fmt: skip
+                self._skip(1)
                 continue
-            end = 3 + length + 2
-            if len(waiting) < end:
+            end = begin + waiting[begin - 1]
+            if len(waiting) < end + 2:
                 return
-            body = bytes(waiting[2 : end - 2])
-            if checksum(body) != int.from_bytes(waiting[end - 2 : end], "little"):
+            body = bytes(waiting[2:end])
+            if checksum(body) != int.from_bytes(waiting[end : end + 2], "little"):
                 self.damaged += 1
-                self.skipped += 1
-                del waiting[:1]
+                self._skip(1)
                 continue
-            kind = _PAYLOAD if length == _PAYLOAD.size else _UNGUARDED
-            identity, rate, sequence, sensors, mode, *rest = kind.unpack(body[1:])
-            del waiting[:end]
-            given, out = Inputs.of(rest[:7], sensors, mode), Outputs.of(rest[7:16], rest[16])
-            guard = Guard.of(rest[17:]) if kind is _PAYLOAD else None
-            yield Frame(identity, rate, sequence, given, out, guard)
+            del waiting[: end + 2]
+            yield _tick(old.unpack(body[1:]), None) if old else _decoded(body[1], body[3:])
+
+    def _skip(self, count: int) -> None:
+        self.skipped += count
+        del self._waiting[:count]
 
 
 def csv_header() -> str:
@@ -247,25 +361,20 @@ def csv_header() -> str:
     return ",".join((*_LOG_COLUMNS, *BOARD_COLUMNS, *GUARD_COLUMNS)) + "\n"
 
 
-def csv_row(frame: Frame, tick: int) -> str:
-    """A line of the log.
+def text(value: float) -> str:
+    """A float as logs have it."""
+    return f"{value:.9g}"
 
-    Parameters
-    ----------
-    tick : number since the first frame, from the sequence numbers.
-    """
+
+def csv_row(frame: Frame, time_s: float) -> str:
+    """A line of a log of ticks, which begins with its time."""
     g = frame.given
-
-    def text(value: float) -> str:
-        return f"{value:.9g}"
-
     marker = [text(g.u_px), text(g.v_px)] if g.marker_seen else ["", ""]
     imu = [text(v) for v in (g.ax_mps2, g.ay_mps2, g.gz_radps)]
-    time = f"{1e3 * tick / frame.rate_mhz:.9g}" if frame.rate_mhz else "0"
     whole = [frame.sequence, frame.rate_mhz, frame.identity, int(g.marker_seen), int(g.imu_read), g.mode]
     board = [g.u_px, g.v_px, *g.reference, *frame.out.numbers[:7]]
     sensors = [*marker, *(imu if g.imu_read else ["", "", ""])]
-    cells = [time, *sensors, *map(text, frame.out.pwm), *map(str, whole), *map(text, board)]
+    cells = [text(time_s), *sensors, *map(text, frame.out.pwm), *map(str, whole), *map(text, board)]
     guard = [""] * len(GUARD_COLUMNS) if frame.guard is None else map(str, frame.guard.numbers)
     return ",".join([*cells, str(frame.out.flags), *guard]) + "\n"
 
@@ -298,7 +407,7 @@ _OPENING_S = 3.0
 
 @dataclass(frozen=True)
 class Run:
-    """What came from one start of a board: rows, and sequence numbers that never came."""
+    """What came from one start of a board: ticks or samples, and sequence numbers that never came."""
 
     ticks: int
     lost: int
@@ -320,6 +429,68 @@ class Recording:
     damaged: int
 
 
+class Rows:
+    """Lines of a log from what one start of a board sends: times from zero, losses counted.
+
+    Attributes
+    ----------
+    samples : whether it is a log of samples, None before anything came. count, lost : ticks or samples that
+        came, and that never came. time_s : of the last one.
+    """
+
+    def __init__(self) -> None:
+        self.samples: bool | None = None
+        self.count = self.lost = 0
+        self.time_s = 0.0
+        self._last: tuple[int, int | None] | None = None
+
+    def begins_anew(self, message: Message) -> bool:
+        """Whether the message is of another start of the board, or another kind of log, than those before."""
+        if self._last is None:
+            return False
+        sequence, t_us = self._last
+        if isinstance(message, Hello):
+            return message.sequence == 0 and sequence != 0xFFFF
+        back = t_us is not None and message.t_us is not None and (message.t_us - t_us) & 0xFFFFFFFF >= 1 << 31
+        again = isinstance(message, Frame) and message.sequence == 0 and sequence != 0xFFFF
+        return back or again or isinstance(message, Frame) == self.samples
+
+    def take(self, message: Message) -> str:
+        """Its lines, with the log's first line before them; empty for one that is none of a log."""
+        if isinstance(message, Hello):
+            return ""
+        begins = self._last is None
+        if self._last is None:
+            self.samples = not isinstance(message, Frame)
+        else:
+            sequence, t_us = self._last
+            step = (message.sequence - sequence) & 0xFFFF
+            self.lost += max(step - 1, 0)
+            if message.t_us is not None and t_us is not None:
+                self.time_s += 1e-6 * ((message.t_us - t_us) & 0xFFFFFFFF)
+            elif isinstance(message, Frame) and message.rate_mhz:
+                self.time_s += 1e3 * step / message.rate_mhz
+        self._last = (message.sequence, message.t_us)
+        self.count += 1
+        if isinstance(message, Frame):
+            return (csv_header() if begins else "") + csv_row(message, self.time_s)
+        return (",".join(SAMPLE_COLUMNS) + "\n" if begins else "") + _sample_rows(message, self.time_s)
+
+
+def _sample_rows(message: ImuSample | Picture, time_s: float) -> str:
+    """One line of a sample, two of a picture: what it showed, and what the pumps got then."""
+    if isinstance(message, ImuSample):
+        axes = map(text, (*message.force, *message.rate))
+        return f"{time_s:.6f},,,{','.join(axes)},,,{message.sequence},,,\n"
+    guard, after_s = message.guard, time_s + 1e-6 * message.after_us
+    marker = ",".join(map(text, message.marker_px)) if message.seen else ","
+    told = f"{guard.state},{guard.fault},{message.overruns}"
+    return (
+        f"{time_s:.6f},{marker},,,,,,,,,{message.sequence},,,\n"
+        f"{after_s:.6f},,,,,,,,,{guard.duty[0]},{guard.duty[1]},,{told}\n"
+    )
+
+
 def record(
     read: Callable[[], bytes], more: Callable[[int], bool], write: Callable[[int, str], None]
 ) -> Recording:
@@ -332,44 +503,36 @@ def record(
     write : appends text to the log of a run, counted from 0, as it comes; to the first after `_OPENING_S`.
     """
     decoder = Decoder()
-    lines, held = [csv_header()], True
+    rows, lines, held = Rows(), "", True
     runs: list[Run] = []
-    last: Frame | None = None
-    ticks = tick = lost = opening = 0
+    opening = 0
     try:
-        while more(ticks):
-            for frame in decoder.feed(read()):
-                if last is not None and frame.sequence == 0 and last.sequence != 0xFFFF:
+        while more(rows.count):
+            for message in decoder.feed(read()):
+                if rows.begins_anew(message):
                     if held:
-                        opening = ticks
+                        opening += rows.count
                     else:
-                        write(len(runs), "".join(lines))
-                        runs.append(Run(ticks, lost))
-                    lines, last, held = [csv_header()], None, False
-                    ticks = tick = lost = 0
-                if last is not None:
-                    step = (frame.sequence - last.sequence) & 0xFFFF
-                    lost += max(step - 1, 0)
-                    tick += step
-                lines.append(csv_row(frame, tick))
-                ticks += 1
-                last = frame
-                held = held and 1e3 * tick < _OPENING_S * frame.rate_mhz
-            if not held:
-                write(len(runs), "".join(lines))
-                lines.clear()
+                        write(len(runs), lines)
+                        runs.append(Run(rows.count, rows.lost))
+                    rows, lines, held = Rows(), "", False
+                lines += rows.take(message)
+                held = held and rows.time_s < _OPENING_S
+            if not held and lines:
+                write(len(runs), lines)
+                lines = ""
     except KeyboardInterrupt:
         # Stopping by hand is the usual end; what came so far is the log, and nothing may stop its writing.
         if hasattr(signal, "setitimer"):
             signal.setitimer(signal.ITIMER_REAL, 0.0)
     except BadInputError:
         # The board is gone; what it sent is not.
-        if ticks:
-            write(len(runs), "".join(lines))
+        if rows.count:
+            write(len(runs), lines)
         raise
-    if ticks:
-        write(len(runs), "".join(lines))
-        runs.append(Run(ticks, lost))
+    if rows.count:
+        write(len(runs), lines)
+        runs.append(Run(rows.count, rows.lost))
     return Recording(tuple(runs), opening, decoder.skipped, decoder.damaged)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import subprocess
 from dataclasses import replace
 from pathlib import Path
@@ -15,9 +16,8 @@ from firmware_plant import Loop
 from firmware_rigs import header, rig
 
 from calib.core.rig import Rig
-from calib.io.serial import MODE_ORIENTATION, MODE_POSITION, Decoder, Inputs
+from calib.io.serial import MODE_ORIENTATION, MODE_POSITION, Inputs
 from calib.stages.control.references import Ellipse
-from calib.stages.firmware.check import check_frames
 from calib.stages.firmware.conformance import Reference, reference_of
 from calib.stages.firmware.header import verbatim
 from calib.stages.firmware.vectors import binary32, coherent, directed, directed_fused
@@ -270,62 +270,22 @@ def test_the_loop_closed_by_the_processor_is_that_of_float64(
     assert np.ptp(expected[:, 0]) > 0.005
 
 
-def _sketch(folder: Path) -> Path:
-    write(folder, header())
-    path = folder / "sketch.ino"
-    path.write_text(verbatim("calib_example.ino"))
-    return path
-
-
-def test_it_compiles_for_the_board(tmp_path: Path) -> None:
-    need("avr-gcc")
-    flags = ["-mmcu=atmega328p", "-Os", "-DF_CPU=16000000UL", "-std=gnu++11", "-Wall", "-Wextra", "-Werror"]
-    call = [
-        "avr-g++",
-        *flags,
-        f"-I{NATIVE / 'arduino'}",
-        "-x",
-        "c++",
-        "-c",
-        _sketch(tmp_path),
-        "-o",
-        tmp_path / "o",
-    ]
+@pytest.mark.parametrize(
+    "flags",
+    [(), ("-DCALIB_IMU_MPU6050=1", "-DCALIB_PIXY2_I2C=1", "-DCALIB_FUSED=1")],
+    ids=["default", "others"],
+)
+def test_the_sketch_compiles_for_a_cortex_m4(tmp_path: Path, flags: tuple[str, ...]) -> None:
+    """A Nano 33 BLE, with a stub of the Arduino API."""
+    need("arm-none-eabi-g++")
+    write(tmp_path, header("fused"))
+    (tmp_path / "sketch.cpp").write_text(verbatim("calib_example.ino"))
+    target = ["-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "-Os", "-std=gnu++14"]
+    target += ["-DARDUINO=10819", "-DARDUINO_ARCH_NRF52840", "-DCALIB_I_KNOW=1", "-ffp-contract=off"]
+    call = ["arm-none-eabi-g++", *target, "-Wall", "-Wextra", "-Wdouble-promotion", "-Werror", *flags]
+    call += [f"-I{NATIVE / 'arduino'}", f"-I{tmp_path}", "-c", tmp_path / "sketch.cpp", "-o", tmp_path / "o"]
     done = subprocess.run([str(word) for word in call], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    sizes = subprocess.run(["avr-size", tmp_path / "o"], capture_output=True, text=True, check=True).stdout
-    text, data, bss = map(int, sizes.splitlines()[1].split()[:3])
-    print(f"sketch without the Arduino core: flash {text + data}, RAM {data + bss}")
-    assert data + bss <= 300
-
-
-@pytest.mark.parametrize("mode", ["OFF", "ORIENTATION", "POSITION"])
-def test_what_it_sends_is_what_python_computes(tmp_path: Path, mode: str) -> None:
-    need("g++")
-    flags = ["-std=c++11", "-O1", "-ffp-contract=off", f"-DCALIB_EXAMPLE_MODE=CALIB_MODE_{mode}"]
-    call = [
-        "g++",
-        *flags,
-        f"-I{NATIVE / 'arduino'}",
-        "-o",
-        tmp_path / "board",
-        "-x",
-        "c++",
-        _sketch(tmp_path),
-    ]
-    done = subprocess.run(
-        [str(word) for word in [*call, NATIVE / "board.cpp"]], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    stream = subprocess.run([tmp_path / "board", "300"], capture_output=True, check=True).stdout
-    decoder = Decoder()
-    frames = list(decoder.feed(stream))
-    assert (len(frames), decoder.skipped, decoder.damaged) == (300, 0, 0)
-    assert frames[10].rate_mhz == 60000
-    assert [not f.given.marker_seen for f in frames].count(True) == 6
-    # The IMU's start takes its time.
-    assert [k for k, f in enumerate(frames) if not f.given.imu_read] == [*range(16), *range(30, 40)]
-    result = check_frames(header(), frames, "board")
-    assert result.ticks == 300
-    assert result.verdict.ok
-    assert result.worst["q_m"] < 2e-7
+    symbols = subprocess.run(["arm-none-eabi-nm", tmp_path / "o"], capture_output=True, text=True, check=True)
+    # Nothing computes in double precision.
+    assert not re.search(r"__aeabi_[df]2|__aeabi_d", symbols.stdout), symbols.stdout

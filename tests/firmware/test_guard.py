@@ -14,6 +14,7 @@ from firmware_rigs import header
 
 from calib.io.serial import FAULTS as FAULT_WORDS
 from calib.io.serial import GUARD_FAULT, GUARD_RUN, Decoder, Frame
+from calib.stages.firmware.check import check_frames
 from calib.stages.firmware.header import verbatim
 from calib.twin.pictures import CAMERA, PLANE
 
@@ -50,6 +51,10 @@ def _marker(length_m: float) -> list[str]:
     return [f"{value:.2f}" for value in seen[:2] / seen[2]]
 
 
+def _frames(stream: bytes) -> list[Frame]:
+    return [message for message in Decoder().feed(stream) if isinstance(message, Frame)]
+
+
 def _run(
     board: Built, fault: str, at_ms: float = AT_MS, until_ms: float = UNTIL_MS, end_ms: float = END_MS
 ) -> Ended:
@@ -59,7 +64,7 @@ def _run(
     found = re.search(rb"result (\S+) (\S+) (\S+) (\d)", done.stderr)
     assert found is not None
     before, during, after = (float(value) for value in found.groups()[:3])
-    return Ended(before, during, after, found.group(4) == b"1", list(Decoder().feed(done.stdout)))
+    return Ended(before, during, after, found.group(4) == b"1", _frames(done.stdout))
 
 
 @pytest.fixture(scope="module")
@@ -98,6 +103,9 @@ def test_without_a_fault_it_starts_and_runs(board: Built) -> None:
     assert driven and max(map(max, driven)) > 50
     still = [f.guard.duty for f in ended.frames if f.guard is not None and f.guard.state != GUARD_RUN]
     assert len(still) > 30 and set(still) == {(0, 0)}
+    # And what was computed is what Python computes.
+    result = check_frames(header(), ended.frames, "board")
+    assert result.verdict.ok and result.ticks > 200 and result.worst["q_m"] < 2e-7
 
 
 @pytest.mark.parametrize("fault", ["bus_hang", "imu_nack", "imu_frozen", "marker_frozen", "beyond_reach"])

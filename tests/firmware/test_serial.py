@@ -143,7 +143,7 @@ def _frames_check(ticks: int = 120) -> list[Frame]:
 
 
 def _log(path: Path, frames: list[Frame]) -> Path:
-    path.write_text(csv_header() + "".join(csv_row(f, k) for k, f in enumerate(frames)))
+    path.write_text(csv_header() + "".join(csv_row(f, k / 60) for k, f in enumerate(frames)))
     return path
 
 
@@ -217,7 +217,7 @@ def _frames_log_serial(count: int = 300) -> list[Frame]:
 def test_frames_are_rows(ending: str, tmp_path: Path) -> None:
     frames, path, table = _frames_log_serial(), tmp_path / f"log{ending}", tmp_path / "log.csv"
     path.write_bytes(b"boot: hello\r\n\xa5" + b"".join(map(encoded, frames)) + encoded(frames[0])[:20])
-    table.write_text(csv_header() + "".join(csv_row(frame, k) for k, frame in enumerate(frames)))
+    table.write_text(csv_header() + "".join(csv_row(frame, k / 60) for k, frame in enumerate(frames)))
     log, same = read_log(path), read_log(table)
     assert log.columns.keys() == same.columns.keys() and log.t_s.tolist() == same.t_s.tolist()
     for name, values in log.columns.items():

@@ -96,7 +96,7 @@ class Reference:
 
     def __init__(self, values: Mapping[str, float], undistort: bool | None = None) -> None:
         self.c = {name.removeprefix("CALIB_"): value for name, value in values.items()}
-        self.undistort = bool(self.c["CAMERA_HAS_LENS"]) if undistort is None else undistort
+        self.undistort = bool(self.c.get("CAMERA_HAS_LENS", 0)) if undistort is None else undistort
         self.start()
 
     def start(self) -> None:
@@ -183,7 +183,7 @@ class Reference:
     def _marker(self, given: Inputs) -> tuple[int, bool]:
         c, m, flags = self.c, self.memory, MARKER_HELD
         u, v = given.u_px, given.v_px
-        inside = -0.5 <= u <= c["CAMERA_GREATEST_U_PX"]
+        inside = c["HAS_PLANE"] and -0.5 <= u <= c["CAMERA_GREATEST_U_PX"]
         if given.marker_seen and inside and -0.5 <= v <= c["CAMERA_GREATEST_V_PX"]:
             stem, least = ("PLANE_NORMALISED", "PLANE_LEAST_PER_M")
             if self.undistort:

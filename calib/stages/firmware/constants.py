@@ -330,8 +330,14 @@ def _plane_groups(plane: PlaneConstants) -> list[Group]:
     return groups
 
 
-def camera_groups(camera: CameraConstants) -> tuple[Group, ...]:
+def camera_groups(camera: CameraConstants | None) -> tuple[Group, ...]:
     """Camera, lens and plane as groups of the header."""
+    no_plane = Group(
+        ("No plane yet: the sketch records, and controls nothing.",),
+        (Whole("CALIB_HAS_PLANE", 0, "for #if"),),
+    )
+    if camera is None:
+        return (no_plane,)
     width, height = camera.image_size_px
     lens = camera.model == FISHEYE or any(
         value != 0.0 for name, value in camera.intrinsics.items() if not name.endswith("_px")
@@ -365,7 +371,7 @@ def camera_groups(camera: CameraConstants) -> tuple[Group, ...]:
         ),
     )
     if camera.plane is None:
-        return head, _lens_group(camera), Group(("No plane yet.",), (Whole("CALIB_HAS_PLANE", 0, "for #if"),))
+        return head, _lens_group(camera), no_plane
     return head, _lens_group(camera), *_plane_groups(camera.plane)
 
 
@@ -824,14 +830,29 @@ def control_groups(lookup: Lookup, rate_hz: float) -> tuple[Group, ...]:
     lengths = _pid_group(
         lookup, "position", "Control of both lengths, PD (4.5), (4.8).", ("M", "m"), _POSITION, rate_hz
     )
-    return pumps, angle, crossed, lengths, _feedforward_group(lookup, low), _envelope_group(lookup, rate_hz)
+    return (
+        pumps,
+        angle,
+        crossed,
+        lengths,
+        _feedforward_group(lookup, low),
+        _envelope_group(lookup, rate_hz, low, high),
+    )
 
 
 _SHORTEST_M, _LONGEST_M = 0.5 * LONGEST_ELONGATION_M, 1.25 * LONGEST_ELONGATION_M
 """By how much a bellows may be shorter and longer than at rest."""
 
 
-def _envelope_group(lookup: Lookup, rate_hz: float) -> Group:
+def _held_pwm(lookup: Lookup, length_m: float, low_pwm: float) -> float:
+    """The command that holds both bellows at a length, the greatest one where none does [PWM]."""
+    tuned = lookup.find("controller.feedforward")
+    first, table = _tuned_table(tuned, low_pwm) if isinstance(tuned, StaticMap) else _nominal_table()
+    reached = first + _TABLE_STEP_M * np.arange(len(table))
+    return float(np.interp(length_m, reached, table, right=PWM_MAX))
+
+
+def _envelope_group(lookup: Lookup, rate_hz: float, low: float, high: float) -> Group:
     """Limits of the guard, from the actuator's rest length and radius where a person states none."""
     plant, told = Plant(), Envelope()
     rest = lookup.number("actuator.rest_length_m", plant.rest_length_m)
@@ -848,7 +869,9 @@ def _envelope_group(lookup: Lookup, rate_hz: float) -> Group:
             f"{lookup.source}: envelope.least_length_m is {least:g}, expected less than the greatest, "
             f"{greatest:g}"
         )
-    ticks = min(max(round(full * rate_hz), 1), 65000)
+    open_s = lookup.number("envelope.open_loop_s", told.open_loop_s)
+    most = lookup.number("envelope.open_loop_pwm", _held_pwm(lookup, greatest, low), low, high)
+    ticks, open_ticks = (min(max(round(time * rate_hz), 1), 65000) for time in (full, open_s))
     return Group(
         ("Envelope, see calib_guard.h: the pumps stop where the actuator leaves it.",),
         (
@@ -861,6 +884,13 @@ def _envelope_group(lookup: Lookup, rate_hz: float) -> Group:
                 f"greatest change of a length in a tick, m; {rate:g} m/s",
             ),
             Whole("CALIB_ENVELOPE_FULL_TICKS", ticks, "ticks that a pump may stay at its greatest command"),
+            Whole("CALIB_ENVELOPE_OPEN_TICKS", open_ticks, "ticks that a pump may be on in open loop"),
+            Constant(
+                "CALIB_ENVELOPE_OPEN_HIGH_PWM",
+                math.floor(most),
+                "greatest command in open loop: what holds the longest length by the pump's map, PWM",
+            ),
+            Whole("CALIB_ENVELOPE_OPEN_HIGH", math.floor(most), "the same as a whole number"),
             Constant(
                 "CALIB_ENVELOPE_APART_M",
                 apart,

@@ -53,8 +53,12 @@ if TYPE_CHECKING:
     from calib.core.rig import Rig
     from calib.stages.camera.section import Camera
 
-SCHEMA = 4
+SCHEMA = 5
 """Raised when a constant changes its name, unit or meaning."""
+
+VERBATIM = ("calib_pipeline.h", "calib_guard.h", "calib_link.h", "calib_i2c.h", "calib_bno055.h",
+            "calib_mpu6050.h", "calib_pixy2.h")  # fmt: skip
+"""Files that are the same for every rig."""
 
 FLASHED = ("camera", "plane", "imu", "orientation_filter", "lowpass", "align", "controller")
 """Sections whose verdicts say whether the header can be flashed."""
@@ -71,13 +75,13 @@ class Header:
 
     Attributes
     ----------
-    camera : intrinsics, lens and plane.
+    camera : intrinsics, lens and plane, None for a rig without.
     groups : all constants in the order of the file.
     inputs : SHA-256 of each input by name.
     verdict : of the sections that the constants come from.
     """
 
-    camera: CameraConstants
+    camera: CameraConstants | None
     groups: tuple[Group, ...]
     inputs: Mapping[str, str]
     verdict: Verdict
@@ -106,7 +110,7 @@ class Header:
     @property
     def text(self) -> str:
         """calib_constants.h."""
-        plane = self.camera.plane
+        plane = self.camera.plane if self.camera else None
         return rendered(
             "calib_constants.h.j2",
             header=self,
@@ -129,7 +133,7 @@ class Header:
         return f"{folder.resolve().name or 'calib_example'}.ino"
 
     def write(self, folder: Path | str) -> list[Path]:
-        """Write the header and, where there is a plane, pipeline, self-test and sketch; the files written.
+        """Write the header with pipeline, self-test, drivers and sketch; the files written.
 
         A sketch that is there and says something else is left as it is: it is an example to be changed.
 
@@ -138,12 +142,9 @@ class Header:
         from calib.stages.firmware.vectors import selftest_text
 
         where = Path(folder)
-        texts = {"calib_constants.h": self.text}
-        if self.camera.plane is not None:
-            texts["calib_guard.h"] = verbatim("calib_guard.h")
-            texts["calib_pipeline.h"] = verbatim("calib_pipeline.h")
-            texts["calib_selftest.h"] = selftest_text(self)
-            texts[self.sketch(where)] = verbatim("calib_example.ino")
+        texts = {name: verbatim(name) for name in VERBATIM}
+        texts |= {"calib_constants.h": self.text, "calib_selftest.h": selftest_text(self)}
+        texts[self.sketch(where)] = verbatim("calib_example.ino")
         make_folder(where)
         written = []
         for name, text in texts.items():
@@ -196,11 +197,12 @@ def _undone(inverse: InverseLens) -> bool:
     )
 
 
-def _camera_constants(whole: Rig, source: str) -> CameraConstants:
+def _camera_constants(whole: Rig, source: str) -> CameraConstants | None:
     from calib.core.rig import Geometry
 
     section = whole.camera
-    assert section is not None
+    if section is None:
+        return None
     camera = section.optics
     inverse = _inverse(whole, section)
     named = dict(zip(COEFFICIENTS, camera.distortion.tolist(), strict=True))
@@ -232,7 +234,7 @@ def _camera_constants(whole: Rig, source: str) -> CameraConstants:
     return CameraConstants(camera.image_size_px, section.model, verdict, intrinsics, inverse, plane)
 
 
-def _judge(whole: Rig, camera: CameraConstants) -> Verdict:
+def _judge(whole: Rig, camera: CameraConstants | None) -> Verdict:
     """As bad as the worst of the sections that the constants come from, and as the lens is undone."""
     findings = []
     for name in FLASHED:
@@ -244,13 +246,15 @@ def _judge(whole: Rig, camera: CameraConstants) -> Verdict:
         if word != "ok":
             advice = _UNREAD if name in ("camera", "plane") else ""
             findings.append(Finding(word, f"{name} is {word}", advice))
-    inverse = camera.inverse
-    if not _undone(inverse):
+    inverse = camera.inverse if camera else None
+    if inverse is not None and not _undone(inverse):
         error = "without bound" if inverse.max_error_px is None else f"to {inverse.max_error_px:.3g} px only"
         text = f"the lens is undone {error}, over {inverse.covered:.0%} of the picture"
         findings.append(Finding("poor", text, _UNREAD))
-    if camera.plane is None:
-        findings.append(Finding("remark", "no plane yet, which the pipeline needs", "run calib extrinsics"))
+    if camera is None or camera.plane is None:
+        lacks, verb = ("camera", "intrinsics") if camera is None else ("plane", "extrinsics")
+        text = f"no {lacks} yet: the sketch records, and controls nothing"
+        findings.append(Finding("remark", text, f"run calib {verb}"))
     if _simulated(whole):
         text = "the rig is a simulated one: for a board its constants compile only with CALIB_I_KNOW"
         findings.append(Finding("remark", text))
@@ -264,7 +268,7 @@ def _simulated(whole: Rig) -> bool:
 
 
 def header_of(whole: Rig, source: str) -> Header:
-    """The header of a rig that has a camera.
+    """The header of a rig; one without a camera or plane makes a sketch that records.
 
     A lens that the firmware could not undo makes the camera's verdict in the header poor.
 
@@ -278,7 +282,8 @@ def header_of(whole: Rig, source: str) -> Header:
     lookup = Lookup(whole, source)
     rate_hz = tick_rate_hz(lookup)
     lookup.defaults()
-    motion = (*motion_groups(lookup), fused_group(lookup, rate_hz, camera.plane))
+    plane = camera.plane if camera else None
+    motion = (*motion_groups(lookup), fused_group(lookup, rate_hz, plane))
     verdict = _judge(whole, camera)
     groups = (
         trust_group(verdict.ok, _simulated(whole)),
@@ -291,7 +296,7 @@ def header_of(whole: Rig, source: str) -> Header:
         for section, named in whole.inputs.items()
         for name, digest in named.items()
         # Sections that name others as inputs; only files are inputs of the header.
-        if name not in ("camera", "plane") and (section != "plane" or camera.plane is not None)
+        if name not in ("camera", "plane") and (section != "plane" or plane is not None)
     }
     return Header(camera, groups, inputs, verdict)
 

@@ -120,9 +120,8 @@ firmware = Stage(
     _read,
     _solve,
     FirmwareOptions,
-    needs=("camera",),
-    uses=("plane", "lens", "imu", "imu_intrinsics", "orientation_filter", "lowpass", "align", "actuator",
-          "pump", "estimator", "controller"),
+    uses=("camera", "plane", "lens", "imu", "imu_intrinsics", "orientation_filter", "lowpass", "align",
+          "actuator", "pump", "estimator", "controller"),
     output=Output(
         "Folder to write into.", _write, default=Path("firmware_constants"), folder=True
     ),

@@ -43,7 +43,7 @@ def directed(constants: Mapping[str, float], ticks: int) -> list[Inputs]:
     ----------
     constants : of a header, by name.
     """
-    width, height = constants["CALIB_CAMERA_GREATEST_U_PX"], constants["CALIB_CAMERA_GREATEST_V_PX"]
+    width, height = (constants.get(f"CALIB_CAMERA_GREATEST_{axis}_PX", 0.0) for axis in "UV")
     mount, rest = constants["CALIB_IMU_MOUNT_ANGLE_RAD"], constants["CALIB_REST_LENGTH_M"]
     bias = constants["CALIB_IMU_GYRO_BIAS_RADPS"]
     made = []
@@ -93,7 +93,7 @@ def selftest_text(header: Header) -> str:
     return rendered(
         "calib_selftest.h.j2",
         header,
-        undistort=int(Reference(header.values).undistort),
+        undistort=int(header.values["CALIB_HAS_PLANE"] and Reference(header.values).undistort),
         rows=[_lines(vector) for vector in vectors(header)],
         fused_rows=[_lines(vector) for vector in fused],
         tolerance=TOLERANCE,

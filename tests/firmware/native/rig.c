@@ -1,6 +1,7 @@
 /*
- * The sketch with the real Arduino core on a simulated ATmega328P, around it a BNO055 and a Pixy2 on its bus, pumps
- * and an actuator that follows them, and one fault.
+ * The sketch with the real Arduino core on a simulated ATmega328P, around it a BNO055 or MPU6050 and a Pixy2 on I2C or
+ * SPI, pumps and an actuator that follows them, and one fault. As a library (`rig_open` and the rest) it takes what the
+ * sensors show from its caller, who has an actuator of its own.
  *
  *   rig SKETCH.elf FAULT AT_MS UNTIL_MS END_MS U0 V0 U1 V1 [MICROS_ADDRESS]
  *
@@ -10,6 +11,7 @@
  * whether they ran at the end; resets.
  */
 #include <math.h>
+#include <simavr/avr_spi.h>
 #include <simavr/avr_twi.h>
 #include <simavr/avr_uart.h>
 #include <simavr/sim_avr.h>
@@ -34,9 +36,14 @@ static const char *fault;
 static double at_ms, until_ms, u0, v0, u1, v1;
 static double length[2]; /* share of 40 mm by which each bellows is longer */
 static FILE *out;
+static unsigned char from_board[65536], to_board[4096];
+static size_t came, to_board_at, to_board_end;
 static unsigned addressed, index_, place, resets, wanted;
 static unsigned char written[8], reply[32];
-static unsigned mode_register, unit_register, noise = 1;
+static unsigned char registers[256];
+static unsigned noise = 1;
+static int of_caller, shown[9]; /* force, rate in the sensor's units; marker seen, u, v */
+static avr_irq_t *spi_in;
 
 static double now_ms(void) {
     return (double)avr->cycle / 16000.0;
@@ -70,45 +77,74 @@ static double angle(void) {
     return is("marker_frozen") ? turned + 0.6 * sin(0.003 * (now_ms() - at_ms)) : turned;
 }
 
-static void imu_reply(void) {
-    static unsigned char last[16];
+/* What the BNO055 would read: 0.01 m/s^2 and 1/900 rad/s. */
+static void axes(int *force, int *rate) {
+    static int kept[6];
     double phi = angle();
-    memset(reply, 0, sizeof reply);
-    if (place == 0x00) {
-        reply[0] = is("wrong_id") ? 0xA1 : 0xA0;
-    } else if (place == 0x3D) {
-        reply[0] = (unsigned char)mode_register;
-    } else if (place == 0x3B) {
-        reply[0] = (unsigned char)unit_register;
-    } else if (is("imu_zero") || mode_register != 7) {
+    int i, now[6] = {0};
+    if (of_caller) {
+        memcpy(force, shown, 3 * sizeof *force);
+        memcpy(rate, shown + 3, 3 * sizeof *rate);
         return;
-    } else if (place == 0x08) {
-        put(0, 981 * cos(phi) + rough());
-        put(2, 981 * sin(phi) + rough());
-        if (is("imu_saturated")) {
-            put(0, 32767);
-            put(2, -32768);
-        }
-    } else if (place == 0x14) {
-        put(4, rough() - (is("marker_frozen") ? 900 * 0.6 * 3 * cos(0.003 * (now_ms() - at_ms)) : 0));
-        if (is("imu_saturated")) {
-            put(4, 32767);
-        }
+    }
+    now[0] = (int)lrint(981 * cos(phi)) + rough();
+    now[1] = (int)lrint(981 * sin(phi)) + rough();
+    now[5] = (int)lrint(rough() - (is("marker_frozen") ? 900 * 0.6 * 3 * cos(0.003 * (now_ms() - at_ms)) : 0));
+    if (is("imu_saturated")) {
+        now[0] = 32767;
+        now[1] = -32768;
+        now[5] = 32767;
     }
     if (is("imu_garbage")) {
-        unsigned i;
         for (i = 0; i < 6; i++) {
-            reply[i] = (unsigned char)(rough() * 37);
+            now[i] = (rough() * 37 & 255) | (rough() * 37 & 255) << 8;
+            now[i] = (int16_t)now[i];
         }
     }
     /* Its readings stand still; its registers answer. */
-    if (place == 0x08 || place == 0x14) {
-        unsigned char *kept = last + (place == 0x14 ? 8 : 0);
-        if (is("imu_frozen")) {
-            memcpy(reply, kept, 8);
-        } else {
-            memcpy(kept, reply, 8);
+    if (!is("imu_frozen")) {
+        memcpy(kept, now, sizeof kept);
+    }
+    memcpy(force, kept, 3 * sizeof *force);
+    memcpy(rate, kept + 3, 3 * sizeof *rate);
+}
+
+static void imu_reply(void) {
+    int force[3], rate[3], i;
+    memset(reply, 0, sizeof reply);
+    if (place == 0x08) {
+        if (registers[0x3D] == 7 && !is("imu_zero")) {
+            axes(force, rate);
+            for (i = 0; i < 3; i++) {
+                put(2 * i, force[i]);
+                put(12 + 2 * i, rate[i]);
+            }
         }
+    } else {
+        reply[0] = place ? registers[place] : is("wrong_id") ? 0xA1 : 0xA0;
+        if (is("imu_zero") && place) {
+            reply[0] = 0;
+        }
+    }
+}
+
+/* The MPU6050: 1/8192 g and 1/16.384 deg/s, high bytes first. */
+static void mpu_reply(void) {
+    int force[3], rate[3], i;
+    memset(reply, 0, sizeof reply);
+    if (place == 0x3B) {
+        if (registers[0x6B] == 1) {
+            axes(force, rate);
+            for (i = 0; i < 3; i++) {
+                int f = (int)lrint(force[i] * 0.01 / 9.80665 * 8192), w = (int)lrint(rate[i] / 900.0 * 938.73);
+                reply[2 * i] = (unsigned char)(f >> 8 & 255);
+                reply[2 * i + 1] = (unsigned char)(f & 255);
+                reply[8 + 2 * i] = (unsigned char)(w >> 8 & 255);
+                reply[9 + 2 * i] = (unsigned char)(w & 255);
+            }
+        }
+    } else {
+        reply[0] = place == 0x75 ? 0x68 : registers[place];
     }
 }
 
@@ -118,6 +154,9 @@ static void pixy_reply(void) {
     unsigned char *r = reply + from;
     memset(reply, 0, sizeof reply);
     if (is("blob_lost") || (is("camera_slow") && fmod(now_ms(), 1000.0) > 20.0)) {
+        return;
+    }
+    if (of_caller && !shown[6]) {
         return;
     }
     if (is("beyond_reach")) {
@@ -142,6 +181,10 @@ static void pixy_reply(void) {
         put(from + 8, u0);
         put(from + 10, v0);
     }
+    if (of_caller) {
+        put(from + 8, shown[7]);
+        put(from + 10, shown[8]);
+    }
     for (i = 6; i < 20; i++) {
         total += r[i];
     }
@@ -149,7 +192,7 @@ static void pixy_reply(void) {
 }
 
 static int absent(unsigned slave) {
-    if (slave == 0x28) {
+    if (slave != 0x54) {
         return is("imu_nack") || (is("imu_slow") && fmod(now_ms(), 1000.0) > 20.0) ||
                (strcmp(fault, "deaf_start") == 0 && now_ms() < 400);
     }
@@ -168,11 +211,11 @@ static void on_bus(struct avr_irq_t *irq, uint32_t value, void *param) {
         unsigned slave = v.u.twi.addr >> 1;
         addressed = 0;
         index_ = 0;
-        if ((slave == 0x28 || slave == 0x54) && !absent(slave)) {
+        if ((slave == 0x28 || slave == 0x68 || slave == 0x54) && !absent(slave)) {
             addressed = slave;
             wanted = v.u.twi.addr;
             if (wanted & 1) {
-                (slave == 0x28 ? imu_reply : pixy_reply)();
+                (slave == 0x28 ? imu_reply : slave == 0x68 ? mpu_reply : pixy_reply)();
             }
             avr_raise_irq(bus_in, avr_twi_irq_msg(TWI_COND_ACK, (uint8_t)wanted, 1));
         }
@@ -185,12 +228,10 @@ static void on_bus(struct avr_irq_t *irq, uint32_t value, void *param) {
         if (index_ < sizeof written) {
             written[index_++] = v.u.twi.data;
         }
-        if (addressed == 0x28) {
+        if (addressed != 0x54) {
             place = written[0];
-            if (index_ == 2 && place == 0x3D) {
-                mode_register = written[1];
-            } else if (index_ == 2 && place == 0x3B) {
-                unit_register = written[1];
+            if (index_ == 2) {
+                registers[place] = place == 0x6B ? written[1] & 0x7F : written[1];
             }
         }
     }
@@ -200,14 +241,116 @@ static void on_bus(struct avr_irq_t *irq, uint32_t value, void *param) {
     }
 }
 
+/* The Pixy2 on SPI: each byte of the board's gets one of the answer to what was asked before. */
+static void on_spi(struct avr_irq_t *irq, uint32_t value, void *param) {
+    static unsigned char asked[2], answer[sizeof reply];
+    static unsigned sent = sizeof reply;
+    (void)irq;
+    (void)param;
+    asked[0] = asked[1];
+    asked[1] = (unsigned char)value;
+    avr_raise_irq(spi_in, sent < sizeof answer ? answer[sent] : 0);
+    sent++;
+    if (asked[0] == 0xAE && asked[1] == 0xC1) {
+        pixy_reply();
+        memcpy(answer, reply, sizeof answer);
+        if (is("pixy_nack")) {
+            memset(answer, 0, sizeof answer);
+        }
+        /* After the rest of the question, and a few bytes of which nothing is known. */
+        sent = (unsigned)-6;
+    }
+}
+
 static void on_serial(struct avr_irq_t *irq, uint32_t value, void *param) {
     (void)irq;
     (void)param;
-    fputc((int)(value & 255), out);
+    if (of_caller) {
+        if (came < sizeof from_board) {
+            from_board[came++] = (unsigned char)value;
+        }
+    } else {
+        fputc((int)(value & 255), out);
+    }
 }
 
-int main(int argc, char **argv) {
+static int opened(const char *path) {
     elf_firmware_t firmware;
+    uint32_t flags = 0;
+    memset(&firmware, 0, sizeof firmware);
+    if (elf_read_firmware(path, &firmware) != 0) {
+        return 3;
+    }
+    avr = avr_make_mcu_by_name("atmega328p");
+    avr_init(avr);
+    avr->frequency = 16000000;
+    avr->log = LOG_NONE;
+    avr_load_firmware(avr, &firmware);
+    bus_in = avr_io_getirq(avr, AVR_IOCTL_TWI_GETIRQ(0), TWI_IRQ_INPUT);
+    serial_in = avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_INPUT);
+    spi_in = avr_io_getirq(avr, AVR_IOCTL_SPI_GETIRQ(0), SPI_IRQ_INPUT);
+    avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_TWI_GETIRQ(0), TWI_IRQ_OUTPUT), on_bus, NULL);
+    avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_SPI_GETIRQ(0), SPI_IRQ_OUTPUT), on_spi, NULL);
+    avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_OUTPUT), on_serial, NULL);
+    /* Neither the simulator's own printing of the port, nor its waiting for one. */
+    avr_ioctl(avr, AVR_IOCTL_UART_SET_FLAGS('0'), &flags);
+    return 0;
+}
+
+/* ---- as a library ---- */
+
+int rig_open(const char *path) {
+    of_caller = 1;
+    fault = "none";
+    return opened(path);
+}
+
+/* Whole numbers: force (3), rate (3) as the BNO055 counts, whether the marker is seen, u, v. */
+void rig_show(const int *numbers) {
+    memcpy(shown, numbers, sizeof shown);
+}
+
+/* Bytes for the board's serial port, which takes them at its own speed. */
+void rig_give(const unsigned char *bytes, int count) {
+    while (count-- && to_board_end < sizeof to_board) {
+        to_board[to_board_end++] = *bytes++;
+    }
+}
+
+int rig_take(unsigned char *bytes) {
+    int count = (int)came;
+    memcpy(bytes, from_board, came);
+    came = 0;
+    return count;
+}
+
+void rig_reset(void) {
+    avr_reset(avr);
+}
+
+/* Let some microseconds pass; both commands, 256 times the second, or -1 when the processor stopped. */
+int rig_pass(double us) {
+    static double next;
+    avr_cycle_count_t end = avr->cycle + (avr_cycle_count_t)(16.0 * us);
+    while (avr->cycle < end) {
+        int state = avr_run(avr);
+        if (state == cpu_Done || state == cpu_Crashed) {
+            return -1;
+        }
+        if (to_board_at < to_board_end && (now_ms() >= next || now_ms() + 1.0 < next)) {
+            avr_raise_irq(serial_in, to_board[to_board_at++]);
+            next = now_ms() + 0.087;
+            if (to_board_at == to_board_end) {
+                to_board_at = to_board_end = 0;
+            }
+        }
+    }
+    return pump(0) + 256 * pump(1);
+}
+
+/* ---- as a program ---- */
+
+int main(int argc, char **argv) {
     double end_ms, next_ms = 0, on_before = 0, on_during = 0, off_since = -1, last_ms = 0;
     int was_on = 0, done = 0;
     if (argc < 10) {
@@ -225,23 +368,8 @@ int main(int argc, char **argv) {
     v0 = atof(argv[7]);
     u1 = atof(argv[8]);
     v1 = atof(argv[9]);
-    memset(&firmware, 0, sizeof firmware);
-    if (elf_read_firmware(argv[1], &firmware) != 0) {
+    if (opened(argv[1]) != 0) {
         return 3;
-    }
-    avr = avr_make_mcu_by_name("atmega328p");
-    avr_init(avr);
-    avr->frequency = 16000000;
-    avr->log = LOG_NONE;
-    avr_load_firmware(avr, &firmware);
-    bus_in = avr_io_getirq(avr, AVR_IOCTL_TWI_GETIRQ(0), TWI_IRQ_INPUT);
-    serial_in = avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_INPUT);
-    avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_TWI_GETIRQ(0), TWI_IRQ_OUTPUT), on_bus, NULL);
-    avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_OUTPUT), on_serial, NULL);
-    {
-        /* The simulator's own printing of the port, and its waiting for one. */
-        uint32_t flags = 0;
-        avr_ioctl(avr, AVR_IOCTL_UART_SET_FLAGS('0'), &flags);
     }
     while (now_ms() < end_ms) {
         avr_cycle_count_t before = avr->cycle;

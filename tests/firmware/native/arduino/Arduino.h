@@ -19,6 +19,7 @@ void analogWrite(uint8_t pin, int value);
 void delay(unsigned long ms);
 void delayMicroseconds(unsigned us);
 unsigned long micros(void);
+unsigned long millis(void);
 
 struct SerialPort {
     void begin(unsigned long baud);

@@ -1,0 +1,61 @@
+/*
+ * calib_i2c.h - registers of a chip on Wire, and a bus that comes back.
+ */
+#ifndef CALIB_I2C_H
+#define CALIB_I2C_H
+
+#include <Arduino.h>
+#include <Wire.h>
+
+#ifndef CALIB_I2C_HZ
+#define CALIB_I2C_HZ 400000
+#endif
+
+/* A slave that holds the data line lets it go after nine clocks. */
+static void calib_i2c_start(void) {
+#if defined(SDA) && defined(SCL)
+    uint8_t i;
+    pinMode(SDA, INPUT_PULLUP);
+    pinMode(SCL, INPUT_PULLUP);
+    for (i = 0; i < 9 && digitalRead(SDA) == LOW; i++) {
+        pinMode(SCL, OUTPUT);
+        digitalWrite(SCL, LOW);
+        delayMicroseconds(5);
+        pinMode(SCL, INPUT_PULLUP);
+        delayMicroseconds(5);
+    }
+#endif
+    Wire.begin();
+    Wire.setClock(CALIB_I2C_HZ);
+#if defined(WIRE_HAS_TIMEOUT)
+    Wire.setWireTimeout(3000, true);
+#endif
+}
+
+static bool calib_i2c_write(uint8_t address, uint8_t place, uint8_t value) {
+    Wire.beginTransmission(address);
+    Wire.write(place);
+    Wire.write(value);
+    return Wire.endTransmission() == 0;
+}
+
+/* Bytes from a register on; false when the bus failed. */
+static bool calib_i2c_read(uint8_t address, uint8_t place, uint8_t count, uint8_t *bytes) {
+    uint8_t i;
+    Wire.beginTransmission(address);
+    Wire.write(place);
+    if (Wire.endTransmission(false) != 0 || Wire.requestFrom(address, count) != count) {
+        return false;
+    }
+    for (i = 0; i < count; i++) {
+        bytes[i] = (uint8_t)Wire.read();
+    }
+    return true;
+}
+
+static bool calib_i2c_says(uint8_t address, uint8_t place, uint8_t value) {
+    uint8_t is;
+    return calib_i2c_read(address, place, 1, &is) && is == value;
+}
+
+#endif /* CALIB_I2C_H */

@@ -1,0 +1,182 @@
+"""A simulated board with the sketch, and around it the simulated rig with all errors of its sensors.
+
+The processor is simavr's, plant and sensors are the twin's. A `Board` is a serial port as
+`calib.io.experiments.Port` wants one, whose clock is the simulation's.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import pty
+import shutil
+import time
+import tty
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from firmware_build import Built
+
+from calib.stages.actuator.pump import static_force_N
+from calib.stages.actuator.simulate import derivative, rig_at_rest
+from calib.stages.actuator.simulate import run as run_kernel
+from calib.twin.rig import SimulatedRig
+from calib.twin.sensors import HeadMotion, draw_imu_noise, draw_tracker_noise, head_rows, measure, track
+from calib.twin.simulate import _Plant
+
+__all__ = ["Board", "serve"]
+
+_STEP_S = 1.0 / 1200.0
+_IMU_S, _FRAME_S = 0.01, 1.0 / 60.0
+_PULLED_RAD = 0.45
+
+
+class Board:
+    """The board and the rig, from the supply's coming on.
+
+    Attributes
+    ----------
+    duty : what drives the pumps. time_s : since the start. states : (n, 10) of the plant at the pictures.
+    """
+
+    def __init__(self, built: Built, seconds: float = 200.0, seed: int = 1) -> None:
+        # A library of its own, since the simulator lives in its variables.
+        library = Path(built.program).with_suffix(f".{id(self)}.so")
+        shutil.copy(built.library, library)
+        self._rig = ctypes.CDLL(str(library))
+        self._rig.rig_pass.argtypes = [ctypes.c_double]
+        assert self._rig.rig_open(built.program.encode()) == 0
+        self.rig = SimulatedRig()
+        self.plants = (_Plant(self.rig, self.rig.plant), _Plant(self.rig, self.rig.free_plant))
+        self.hoses_off = self.held = False
+        self.row = rig_at_rest(self.rig.plant, self.rig.pump).row.copy()
+        delay = round(self.rig.pump.delay_ticks * self.rig.pump.tick_s / _STEP_S)
+        self._waiting = deque([np.zeros(2)] * delay)
+        self._past = deque([self.row[:2].copy()], maxlen=round(self.rig.tracker.latency_s / _STEP_S) + 1)
+        self._imu = draw_imu_noise(self.rig.imu, seconds, seed)
+        frames = np.arange(int(seconds / _FRAME_S)) * _FRAME_S
+        self._tracker = draw_tracker_noise(self.rig.tracker, frames, seed)
+        self._shown = np.zeros(9, dtype=np.int32)
+        self._taken = np.zeros(1 << 16, dtype=np.uint8)
+        self._out = np.empty((1, 10))
+        self._steps = 0
+        self._release_s = np.inf
+        self.time_s = 0.0
+        self.duty = (0, 0)
+        self.states: list[np.ndarray] = []
+        self.cut = False
+        self._show_imu(0)
+        self._show_picture(0)
+
+    def _show_imu(self, k: int) -> None:
+        plant = self.plants[self.hoses_off]
+        rates = derivative(plant.c, self.row[:6], self.row[8], self.row[9])
+        ddq = np.zeros(2) if self.held else rates[2:4]
+        rows = head_rows(plant.c.r, self.row[None], ddq[None])
+        motion = HeadMotion(rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3:5], rows[:, 5:7])
+        force, rate = measure(self.rig.imu, self._imu, slice(k, k + 1), motion)
+        force[0, 2] += 0.02 * np.sin(k)  # no axis of a real sensor stands still
+        self._shown[:3], self._shown[3:6] = np.rint(100.0 * force[0]), np.rint(900.0 * rate[0])
+
+    def _show_picture(self, k: int) -> None:
+        q = self._past[0][None]
+        u, v = track(self.rig.view, self.rig.tracker, self._tracker, slice(k, k + 1), q, self.plants[0].c.r)[
+            0
+        ]
+        self._shown[6] = not np.isnan(u)
+        self._shown[7:] = (0, 0) if np.isnan(u) else (u, v)
+        self.states.append(self.row.copy())
+
+    def _step(self) -> None:
+        """The processor and the rig, a step further."""
+        both = self._rig.rig_pass(1e6 * _STEP_S)
+        assert both >= 0
+        self.duty = (both & 255, both >> 8)
+        self._waiting.append(np.array(self.duty, dtype=float))
+        arriving = self._waiting.popleft()
+        if self.hoses_off:
+            arriving = np.zeros(2)
+        if self.held and self.time_s >= self._release_s:
+            self.held = False
+        if not self.held:
+            plant = self.plants[self.hoses_off]
+            static = (static_force_N(self.rig.pump, arriving) * plant.strength)[None]
+            assert run_kernel(plant.c, plant.p, self.row, static, _STEP_S, 1, 1, self._out) < 0
+            self.row = self._out[0].copy()
+        self._past.append(self.row[:2].copy())
+        self._steps += 1
+        before, self.time_s = self.time_s, self._steps * _STEP_S
+        for period, show in ((_IMU_S, self._show_imu), (_FRAME_S, self._show_picture)):
+            k = int(self.time_s / period + 1e-9)
+            if k != int(before / period + 1e-9):
+                show(k)
+        self._rig.rig_show(ctypes.c_void_p(self._shown.ctypes.data))
+
+    def hear(self, words: str) -> None:
+        """What a person does who is told something."""
+        if "hoses" in words:
+            self.hoses_off = "hoses off" in words
+            self.row = rig_at_rest(self.plants[self.hoses_off].rig.plant, self.rig.pump).row.copy()
+        if words.startswith("pull"):
+            self.row = rig_at_rest(self.rig.free_plant, self.rig.pump, _PULLED_RAD).row.copy()
+            self.held, self._release_s = True, np.inf
+        if words == "let go":
+            self._release_s = self.time_s + 0.7
+
+    def run(self, seconds: float) -> None:
+        """Let time pass."""
+        end = self.time_s + seconds - 1e-9
+        while self.time_s < end:
+            self._step()
+
+    def read(self) -> bytes:
+        """What came in the next few milliseconds."""
+        self.run(6.0 * _STEP_S)
+        return self.everything()
+
+    def everything(self) -> bytes:
+        """All that came and was not read."""
+        count = self._rig.rig_take(ctypes.c_void_p(self._taken.ctypes.data))
+        return self._taken[:count].tobytes()
+
+    def write(self, data: bytes) -> None:
+        """Bytes for the board, unless the computer is cut off."""
+        if not self.cut:
+            self._rig.rig_give(data, len(data))
+
+    def reset(self) -> None:
+        """Press the board's button."""
+        self._rig.rig_reset()
+
+    def now_s(self) -> float:
+        """The simulation's time."""
+        return self.time_s
+
+
+def serve(board: Board, until: Callable[[], bool], name: Callable[[str], None]) -> None:
+    """Put the board behind a terminal of this machine, in its time or slower, until told to stop.
+
+    Parameters
+    ----------
+    name : takes the terminal's name, once it is there.
+    """
+    ours, theirs = pty.openpty()
+    for end in (ours, theirs):
+        tty.setraw(end)
+    os.set_blocking(ours, False)
+    name(os.ttyname(theirs))
+    began = time.monotonic() - board.time_s
+    try:
+        while not until():
+            with contextlib.suppress(BlockingIOError, OSError):
+                board.write(os.read(ours, 4096))
+            data = board.read()
+            with contextlib.suppress(BlockingIOError):
+                os.write(ours, data)
+            time.sleep(max(0.0, board.time_s - (time.monotonic() - began)))
+    finally:
+        os.close(ours)
+        os.close(theirs)
