@@ -19,7 +19,7 @@ def test_an_arm_is_identified_and_predicted(calib: Run, tmp_path: Path) -> None:
     assert "held trials, angle from the command" in ended.out
     assert "verdict: ok" in ended.out
     text = (tmp_path / "rig.yaml").read_text(encoding="utf-8")
-    assert set(yaml.safe_load(text)["arm"]["days"]) == {"a", "b"}
+    assert set(yaml.safe_load(text)["actuator"]["days"]) == {"a", "b"}
     assert str(tmp_path) not in text
     further = written(tmp_path, simulated("c_1", 9)).name
     ended = calib("validate", further, cwd=tmp_path)
@@ -38,7 +38,7 @@ def test_what_logs_without_commands_do_not_tell_is_named(calib: Run, tmp_path: P
         names.append(path.name)
     ended = calib("identify", *names, "--no-compare", cwd=tmp_path)
     assert ended.code == 0, ended.err
-    assert "leak_per_s: the prior's, these logs do not tell; it takes steps of the command" in ended.out
+    assert "valve, creep_s: the prior's, these logs do not tell; it takes steps of the command" in ended.out
     assert "held trials, angle from the pressure" in ended.out
     assert "angle from the command" not in ended.out
 

@@ -208,18 +208,20 @@ def _far(found: Identification) -> Iterator[Finding]:
 
 
 def _untold(found: Identification) -> Iterator[Finding]:
-    from calib.stages.arm.model import PARAMETERS
+    from calib.stages.arm.model import PARAMETERS, PARTS
 
-    mine = found.fit.assembly.names
-    untold = [
-        p for p, s in zip(PARAMETERS, found.fit.sigma.tolist(), strict=True) if s > _UNTOLD and p.name in mine
-    ]
+    vague = {p.name for p, s in zip(PARAMETERS, found.fit.sigma.tolist(), strict=True) if s > _UNTOLD}
+    untold: list[str] = []
+    takes: dict[str, None] = {}
+    for part in PARTS:
+        mine = [one for one in part.parameters if one.name in vague and part.name in found.fit.assembly.parts]
+        whole = len(mine) == len(part.parameters)
+        untold += [part.name] if whole else [one.name for one in mine]
+        takes |= dict.fromkeys(one.identified_by for one in (mine[:1] if whole else mine))
     if untold:
-        takes = dict.fromkeys(one.identified_by for one in untold)
         yield Finding(
             "remark",
-            f"{', '.join(one.name for one in untold)}: the prior's, these logs do not tell; it takes "
-            f"{', '.join(takes)}",
+            f"{', '.join(untold)}: the prior's, these logs do not tell; it takes {', '.join(takes)}",
         )
     if "load" not in found.fit.assembly.parts:
         yield Finding(
