@@ -20,8 +20,7 @@ from calib.stages.actuator.simulate import run as run_kernel
 from calib.stages.control.laws import LoopState
 from calib.stages.imu.mahony import Mahony, MahonySample, MahonyState, accelerometer_angle
 from calib.stages.imu.mahony import step as step_angle
-from calib.stages.lowpass.filters import LowPass, LowPassState, settled
-from calib.stages.lowpass.filters import step as step_lowpass
+from calib.stages.lowpass.filters import Design, design_lowpass
 from calib.twin.rig import SimulatedRig, workspace_homography
 from calib.twin.sensors import (
     ImuNoise,
@@ -77,7 +76,7 @@ class Firmware:
     bellows_radius_m, rest_length_m : of the actuator; the second until the first frame.
     marker_offset_m : d of (A.1).
     imu_rate_hz : rate that the angle filter counts on.
-    mahony, lowpass : filters.
+    mahony : filter of the angle. lowpass : (6,) section of first order.
     """
 
     to_plane: FloatArray
@@ -86,7 +85,7 @@ class Firmware:
     marker_offset_m: float
     imu_rate_hz: float
     mahony: Mahony = field(default_factory=Mahony)
-    lowpass: LowPass = field(default_factory=LowPass)
+    lowpass: FloatArray = field(default_factory=lambda: design_lowpass(Design()).exact[0])
 
 
 @dataclass(frozen=True)
@@ -97,13 +96,13 @@ class FirmwareState:
     ----------
     angle : of the MM filter.
     marker_m : last marker in the plane.
-    x, y : low-passed head.
+    x, y : head before the low-pass and behind it.
     """
 
     angle: MahonyState | None = None
     marker_m: tuple[float, float] | None = None
-    x: LowPassState | None = None
-    y: LowPassState | None = None
+    x: tuple[float, float] | None = None
+    y: tuple[float, float] | None = None
 
 
 def add_imu(
@@ -123,6 +122,14 @@ def _marker(firmware: Firmware, u: float, v: float) -> tuple[float, float]:
         float(s * (H[0, 0] * u + H[0, 1] * v + H[0, 2])),
         float(s * (H[1, 0] * u + H[1, 1] * v + H[1, 2])),
     )
+
+
+def _low_passed(firmware: Firmware, before: tuple[float, float] | None, x: float) -> tuple[float, float]:
+    """Input and output of the low-pass after one sample; the first one passes as it is."""
+    if before is None:
+        return x, x
+    b0, a1 = float(firmware.lowpass[0]), float(firmware.lowpass[4])
+    return x, b0 * (x + before[0]) - a1 * before[1]
 
 
 def _bellows(x: float, y: float, phi: float, bellows_radius_m: float) -> tuple[float, float]:
@@ -145,9 +152,8 @@ def add_frame(
         return state, Seen(phi, (firmware.rest_length_m + turned, firmware.rest_length_m - turned))
     x = marker[0] - firmware.marker_offset_m * math.sin(phi)
     y = marker[1] - firmware.marker_offset_m * math.cos(phi)
-    low_x = settled(x) if state.x is None else step_lowpass(firmware.lowpass, state.x, x)
-    low_y = settled(y) if state.y is None else step_lowpass(firmware.lowpass, state.y, y)
-    q = _bellows(low_x.y1, low_y.y1, phi, firmware.bellows_radius_m)
+    low_x, low_y = _low_passed(firmware, state.x, x), _low_passed(firmware, state.y, y)
+    q = _bellows(low_x[1], low_y[1], phi, firmware.bellows_radius_m)
     return FirmwareState(state.angle, marker, low_x, low_y), Seen(phi, q)
 
 

@@ -58,8 +58,7 @@ from calib.stages.firmware.vectors import (
 from calib.stages.imu.levelling import Levelling, level_log
 from calib.stages.imu.mahony import Mahony, MahonySample, MahonyState
 from calib.stages.imu.mahony import step as step_angle
-from calib.stages.lowpass.filters import LowPass, settled
-from calib.stages.lowpass.filters import step as step_lowpass
+from calib.stages.lowpass.filters import Design, design_lowpass, filter_signal
 from calib.stages.lowpass.section import LowPassSection
 from calib.twin.pictures import CAMERA, PLANE
 from calib.twin.rig import SimulatedRig
@@ -222,8 +221,6 @@ def test_signs_of_the_imus_axes(tmp_path: Path) -> None:
 @pytest.mark.parametrize("order", [2, 5, 8])
 def test_low_passes_of_every_order(tmp_path: Path, order: int) -> None:
     from calib.stages.firmware.header import header_of
-    from calib.stages.lowpass.filters import Design, design_lowpass
-
     section = rig("full").lowpass
     assert section is not None
     rows = design_lowpass(Design(3.0, 60.0, order)).sections.tolist()
@@ -465,7 +462,7 @@ def test_every_stage_is_the_projects_own(mode: int) -> None:
     constants = header().values
     reference = Reference(constants)
     angle: MahonyState | None = None
-    lowpass, x, y = LowPass(), None, None
+    lowpass, heads = design_lowpass(Design()).exact, []
     loop = LoopState()
     turning = OrientationControl(Pid(1000.0, 1000.0, 10.0, clamping=True), whole_pwm=False)
     stretching = PositionControl(Pid(15000.0, 0.0, 150.0), FeedForward(), whole_pwm=False)
@@ -481,9 +478,8 @@ def test_every_stage_is_the_projects_own(mode: int) -> None:
         # The polynomial undoes the lens to 0.01 px, 0.3 mm/px.
         assert np.abs(np.array(out.marker_m) - _true_marker(CAMERA, given.u_px, given.v_px)).max() < 5e-6
         head = head_from_marker(np.array(out.marker_m), np.array(out.phi_rad))
-        x = settled(head[0]) if x is None else step_lowpass(lowpass, x, head[0])
-        y = settled(head[1]) if y is None else step_lowpass(lowpass, y, head[1])
-        assert out.head_m == pytest.approx((x.y1, y.y1), abs=3e-7)
+        heads.append(head)
+        assert out.head_m == pytest.approx(filter_signal(lowpass, np.array(heads))[-1], abs=3e-7)
         q = inverse_series(np.array([*out.head_m, out.phi_rad]), 0.0126)
         assert out.q_m == pytest.approx(q, abs=1e-8)
         if mode == MODE_POSITION:

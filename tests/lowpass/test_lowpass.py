@@ -19,22 +19,18 @@ from calib.stages.actuator.kinematics import marker_from_head
 from calib.stages.lowpass.filters import (
     FAMILIES,
     Design,
-    LowPass,
     analogue_poles,
-    coefficients,
     dc_delay_s,
     design_lowpass,
     digital_poles,
     filter_signal,
-    fixed_point,
     frequency_response,
     group_delay_s,
     jitter_after,
     noise_gain,
     on_ticks,
-    settled,
+    rest_error_binary32,
     spectrum,
-    step,
     suggest,
 )
 from calib.stages.lowpass.stage import Inputs, positions_from_log, solve
@@ -63,15 +59,6 @@ def test_critical_poles_are_equal_and_lose_half_the_power(order: int) -> None:
     assert np.all(poles == poles[0])
     gain = np.prod(poles / (poles - 1j))
     assert abs(gain) ** 2 == pytest.approx(0.5, rel=1e-12)
-
-
-@pytest.mark.parametrize("order", [2, 5, 8])
-def test_the_bessel_delay_is_flat(order: int) -> None:
-    poles = analogue_poles("bessel", order)
-    w = np.linspace(0.0, 0.5, 6)
-    delay = np.sum(-poles.real / (poles.real**2 + (w[:, None] - poles.imag) ** 2), axis=1)
-    # An order n has n derivatives of the delay zero: order 2 to w^4, above to higher powers.
-    np.testing.assert_allclose(delay, delay[0], rtol=0.03 if order == 2 else 2e-3)
 
 
 CUTOFF = st.floats(1e-3, 0.499)
@@ -147,11 +134,10 @@ def test_response_and_delay_are_scipys(order: int, family: str) -> None:
 
 def test_filtering_is_the_firmwares_difference_equation() -> None:
     x = 0.3 + np.random.default_rng(1).normal(size=400)
-    state, out = settled(x[0]), [x[0]]
-    for value in x[1:].tolist():
-        state = step(LowPass(), state, value)
-        out.append(state.y1)
     exact = design_lowpass(Design()).exact
+    b0, a1, out = exact[0, 0], exact[0, 4], [x[0]]
+    for before, value in zip(x, x[1:], strict=False):
+        out.append(b0 * (before + value) - a1 * out[-1])
     np.testing.assert_allclose(filter_signal(exact, x), out, rtol=0.0, atol=1e-13)
     assert filter_signal(exact, x[:0]).shape == (0,)
     assert filter_signal(exact, x[:1]) == pytest.approx(x[:1])
@@ -165,48 +151,17 @@ def test_the_noise_gain_is_the_sum_of_squares(order: int, family: str) -> None:
     assert noise_gain(sections) == pytest.approx(float(np.sum(sosfilt(sections, impulse) ** 2)), rel=1e-9)
 
 
-@given(st.floats(0.01, 29.0))
-def test_the_coefficients_are_butterworths(cutoff_hz: float) -> None:
-    b, a = butter(1, cutoff_hz, fs=60.0)
-    b0, a1 = coefficients(LowPass(cutoff_hz, 60.0))
-    assert np.allclose([b0, b0], b, rtol=1e-12)
-    assert np.allclose([1.0, a1], a, rtol=1e-12)
-
-
-@pytest.mark.parametrize("family", FAMILIES)
-@pytest.mark.parametrize(
-    "order",
-    [
-        1,
-        3,
-        8,
-    ],
-)
-def test_what_was_seen_lies_within_the_bound(order: int, family: str) -> None:
-    found = fixed_point(design_lowpass(Design(1.0, 60.0, order, family)))
-    assert found.usable
-    assert found.stuck <= found.dead_band
-    assert found.cutoff_hz == pytest.approx(1.0, rel=0.01)
-
-
-@pytest.mark.parametrize("order", [1, 2])
-def test_the_bound_is_reached_by_a_loop_of_integers(order: int) -> None:
-    """An independent loop that starts at the edge of the dead band stays there, and beyond it does not."""
-    made = design_lowpass(Design(1.0, 60.0, order))
-    bound = fixed_point(made).dead_band
-    q = 15 if order == 1 else 14
-    a1, a2 = (round(float(v) * 2**q) for v in made.exact[0, 4:])
-    S = 2**q + a1 + a2
-    assert bound == pytest.approx(2**q / (2 * S))
-
-    def held(away: int) -> bool:
-        x, y1, y2 = 1000, 1000 + away, 1000 + away
-        return (S * x - a1 * y1 - a2 * y2 + 2 ** (q - 1)) // 2**q == y1
-
-    edge = math.ceil(bound) - 1
-    assert held(edge) and held(-edge)
-    assert not held(edge + 2)
-    assert edge == (5 if order == 1 else 49)
+@pytest.mark.parametrize(("cutoff_hz", "order"), [(1.0, 1), (0.1, 2), (0.03, 4), (0.03, 7)])
+def test_a_slow_filter_rests_where_its_input_is(cutoff_hz: float, order: int) -> None:
+    """The firmware's form, where the direct form of the same coefficients stays off by much more."""
+    made = design_lowpass(Design(cutoff_hz, 60.0, order))
+    # 0.01 mm at 0.11 m, beyond which it is called poor.
+    assert rest_error_binary32(made) < 9e-5
+    if order < 4:
+        return
+    y = sosfilt(made.sections.astype(np.float32), np.ones(40_000, dtype=np.float32))
+    assert y.dtype == np.float32
+    assert abs(float(y[-1]) - 1.0) > 1e-4
 
 
 FIRST = design_lowpass(Design()).sections

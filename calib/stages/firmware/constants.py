@@ -37,7 +37,7 @@ from calib.stages.firmware.literals import Constant, Group, Item, Macro, Table, 
 from calib.stages.firmware.section import Envelope
 from calib.stages.imu.levelling import Levelling, settled
 from calib.stages.imu.levelling import gains as gains_of
-from calib.stages.lowpass.filters import LowPass, coefficients
+from calib.stages.lowpass.filters import Design, design_lowpass
 
 if TYPE_CHECKING:
     from calib.core.rig import Rig
@@ -565,7 +565,7 @@ def _sections(lookup: Lookup, rate_hz: float) -> list[tuple[tuple[float, ...], t
     if lookup.rig.lowpass is None:
         lookup.number("lowpass.cutoff_hz", 1.0)
         # Rounded so that the gain at rest is one, as the sections of rig.yaml are.
-        a1 = float(np.float32(coefficients(LowPass(1.0, rate_hz))[1]))
+        a1 = float(np.float32(design_lowpass(Design(1.0, rate_hz)).exact[0, 4]))
         b0 = 0.5 * (1.0 + a1)
         return [((b0, b0, 0.0), (a1, 0.0))]
     sections = [(tuple(one.b), tuple(one.a[1:])) for one in lookup.rig.lowpass.sections]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -13,62 +12,6 @@ import numpy.typing as npt
 
 from calib.core.arrays import BoolArray, ComplexArray, FloatArray
 from calib.core.errors import BadInputError
-
-# ----------------------------------------------------------------------
-# The first-order low-pass of the camera's positions (2.2.2): 1 Hz at 60 Hz.
-#
-# The analogue filter 1 / (1 + s / w) becomes, by the bilinear transform with its cut-off kept
-# (K = tan(pi f / rate)),
-#
-#     y_k = b0 (x_k + x_(k-1)) - a1 y_(k-1),   b0 = K / (1 + K),   a1 = (K - 1) / (K + 1).
-#
-# b0 = 0.04979798 and a1 = -0.90040404 for 1 Hz at 60 Hz. The source does not print the order; with
-# this one slow motion arrives 1 / (2 pi f) = 0.159 s late.
-
-
-@dataclass(frozen=True)
-class LowPass:
-    """Cut-off and sampling rate [Hz].
-
-    Raises `BadInputError` for a cut-off outside (0, rate / 2).
-    """
-
-    cutoff_hz: float = 1.0
-    rate_hz: float = 60.0
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.cutoff_hz < 0.5 * self.rate_hz < math.inf:
-            raise BadInputError(
-                f"low-pass: found a cut-off of {self.cutoff_hz:g} Hz at {self.rate_hz:g} Hz, "
-                "expected one between zero and half the rate"
-            )
-
-
-@dataclass(frozen=True)
-class LowPassState:
-    """Input and output of the sample before."""
-
-    x1: float
-    y1: float
-
-
-@lru_cache(maxsize=64)
-def coefficients(parameters: LowPass) -> tuple[float, float]:
-    """b0 and a1."""
-    K = math.tan(math.pi * parameters.cutoff_hz / parameters.rate_hz)
-    return K / (1.0 + K), (K - 1.0) / (K + 1.0)
-
-
-def settled(value: float) -> LowPassState:
-    """State after `value` has been the input for ever, so that a log starts without a transient."""
-    return LowPassState(value, value)
-
-
-def step(parameters: LowPass, state: LowPassState, sample: float) -> LowPassState:
-    """State after one sample; its `y1` is the output."""
-    b0, a1 = coefficients(parameters)
-    return LowPassState(sample, b0 * (sample + state.x1) - a1 * state.y1)
-
 
 # ----------------------------------------------------------------------
 # Samples with time stamps as the firmware sees them: one value per tick.
@@ -248,28 +191,9 @@ def analogue_poles(family: str, order: int) -> ComplexArray:
         return np.asarray(np.exp(1j * angle))
     if family == "critical":
         return np.full(order, -1.0 / math.sqrt(math.expm1(math.log(2.0) / order)), dtype=np.complex128)
-    # Reverse Bessel polynomial: theta_n(s) = sum of (2n - k)! / (2^(n-k) k! (n-k)!) s^k.
-    rising = [
-        math.factorial(2 * order - k) // (2 ** (order - k) * math.factorial(k) * math.factorial(order - k))
-        for k in range(order + 1)
-    ]
-    poles = np.roots(np.array(rising[::-1], dtype=np.float64)).astype(np.complex128)
-    return np.asarray(poles / _half_power_frequency(poles), dtype=np.complex128)
+    from scipy.signal import besselap
 
-
-def _half_power_frequency(poles: ComplexArray) -> float:
-    """Frequency [rad/s] at which an all-pole filter of unit gain has half its power, by bisection."""
-
-    def power(w: float) -> float:
-        return float(np.prod(np.abs(poles) ** 2 / np.abs(1j * w - poles) ** 2))
-
-    low, high = 0.0, 2.0 * float(np.abs(poles).max())
-    for _ in range(200):
-        middle = 0.5 * (low + high)
-        if not low < middle < high:
-            break
-        low, high = (middle, high) if power(middle) > 0.5 else (low, middle)
-    return 0.5 * (low + high)
+    return np.asarray(besselap(order, norm="mag")[1], dtype=np.complex128)
 
 
 def digital_poles(sections: FloatArray) -> ComplexArray:
@@ -675,108 +599,44 @@ def quantisation_hz(pixels: FloatArray, step_px: float, rate_hz: float) -> Float
 
 
 # ----------------------------------------------------------------------
-# What sixteen-bit integers would do to a low-pass: its dead band and its cut-off.
+# How far from a constant input the filter comes to rest in binary32, in the forms that the firmware runs:
 #
-# A section in the direct form I with Q15 samples and coefficients of q fractional bits (15 for a single
-# pole, 14 for a pair because |a1| reaches 2) computes
+#     pair:    v3 = x - s2, v1 = A1 s1 + A2 v3, y = s2 + (A2 s1 + A3 v3), s1' = 2 v1 - s1, s2' = 2 y - s2,
+#              A3 = b0, A1 = b0 - a1 / 2, A2 = sqrt(A1 A3)
+#     single:  v = b0 (x - s), y = s + v, s' = y + v
 #
-#     y_k = floor( (B0 x_k + B1 x_(k-1) + B2 x_(k-2) - A1 y_(k-1) - A2 y_(k-2)) / 2^q + 1/2 ).
-#
-# Every value y with |S (x - y)| < 1/2, S = 1 + a1 + a2, is a fixed point for the constant input x: the
-# output
-# sticks up to 1 / (2 S) steps away from it (Jackson 1970). The lower the cut-off against the rate, the
-# smaller S and the wider this dead band; S itself is known to 2^-q only, which moves the cut-off.
-# The same is measured in binary32 by letting the filter come to rest in that arithmetic.
-
-IntMatrix = npt.NDArray[np.int64]
+# Both work on the difference of input and output, so that a slow filter rests within a step of binary32,
+# where the direct form of the same coefficients stays off by the step over 1 + a1 + a2 (Jackson 1970).
 
 _STARTS = 16
 _LONGEST = 20_000
 
 
-@dataclass(frozen=True)
-class FixedPoint:
-    """A filter in sixteen-bit integers.
-
-    Attributes
-    ----------
-    usable : whether the rounded filter is stable and passes anything at all.
-    cutoff_hz : its cut-off, NaN where it is not usable.
-    dead_band : bound on how far from a constant input the output may stick, in steps of the samples.
-    stuck : how far it did stick when it was run, in steps.
-    """
-
-    usable: bool
-    cutoff_hz: float
-    dead_band: float
-    stuck: float
-
-
-def _integers(section: FloatArray) -> tuple[list[int], int]:
-    """B0, B1, B2, A1, A2 with B0 + B1 + B2 = 2^q + A1 + A2, and q."""
-    pair = section[5] != 0.0
-    q = 14 if pair else 15
-    A1, A2 = (round(math.ldexp(float(a), q)) for a in section[4:])
-    total = (1 << q) + A1 + A2
-    side = round(total / 4) if pair else total // 2
-    return [side, total - 2 * side if pair else total - side, side if pair else 0, A1, A2], q
-
-
-def _come_to_rest(sections: list[tuple[list[int], int]], x: int, starts: IntMatrix, steps: int) -> IntMatrix:
-    """Distance (n,) from x at which the cascade ends, or the widest of a cycle, from each start (n,)."""
-    delay = [[starts.copy() for _ in range(4)] for _ in sections]
-    last = np.zeros((32, len(starts)), dtype=np.int64)
-    for k in range(steps):
-        value = np.full(len(starts), x, dtype=np.int64)
-        for ((B0, B1, B2, A1, A2), q), d in zip(sections, delay, strict=True):
-            total = B0 * value + B1 * d[0] + B2 * d[1] - A1 * d[2] - A2 * d[3]
-            out = np.clip((total + (1 << (q - 1))) >> q, -(1 << 15), (1 << 15) - 1)
-            d[1], d[0], d[3], d[2] = d[0], value, d[2], out
-            value = out
-        last[k % len(last)] = value
-        if k % len(last) == len(last) - 1 and np.all(last == last[0]):
-            break
-    return np.asarray(np.abs(last - x).max(axis=0))
-
-
-def fixed_point(filter_: Filter) -> FixedPoint:
-    """The filter in Q15: whether it can be, its cut-off, and its dead band."""
-    integers = [_integers(section) for section in filter_.exact]
-    values = np.array(
-        [[*(math.ldexp(b, -q) for b in c[:3]), 1.0, *(math.ldexp(a, -q) for a in c[3:])] for c, q in integers]
-    )
-    S = 1.0 + values[:, 4] + values[:, 5]
-    usable = bool(np.all(S > 0.0)) and float(np.abs(digital_poles(values)).max()) < 1.0
-    if not usable:
-        return FixedPoint(False, math.nan, math.inf, math.nan)
-    bound = float(np.sum(0.5 / S))
-    reach = min(4.0 * bound, 12_000.0)
-    starts = np.round(np.linspace(-reach, reach, _STARTS)).astype(np.int64)
-    stuck = _come_to_rest(integers, 11_003, 11_003 + starts, _steps(filter_))
-    return FixedPoint(True, cutoff_hz(values, filter_.design.rate_hz), bound, float(stuck.max()))
-
-
-def _steps(filter_: Filter) -> int:
-    slowest = float(np.abs(digital_poles(filter_.exact)).max())
-    return int(min(25.0 / max(1.0 - slowest, 1e-6) + 200, _LONGEST))
-
-
-def dead_band_binary32(filter_: Filter) -> float:
+def rest_error_binary32(filter_: Filter) -> float:
     """Largest distance from 1 at which the filter comes to rest in binary32, from starts around 1.
 
     Relative: at a position of 0.1 m the distance is a tenth of it in metres.
     """
-    sections = filter_.sections.astype(np.float32)
-    starts = np.linspace(0.0, 2.0, _STARTS)
-    s1, s2 = np.moveaxis(settled_state(filter_.sections, starts).astype(np.float32), 1, 0)
-    y = np.zeros(_STARTS, dtype=np.float32)
-    for _ in range(_steps(filter_)):
-        value = np.ones(_STARTS, dtype=np.float32)
-        for i, (b0, b1, b2, _, a1, a2) in enumerate(sections):
-            y = b0 * value + s1[i]
-            s1[i] = b1 * value - a1 * y + s2[i]
-            s2[i] = b2 * value - a2 * y
-            value = y
+    one, two = np.float32(1.0), np.float32(2.0)
+    starts = np.linspace(0.0, 2.0, _STARTS, dtype=np.float32)
+    y, state = starts, [[np.zeros_like(starts), starts] for _ in filter_.sections]
+    # The firmware's order: pairs first.
+    rows = filter_.sections[np.argsort(filter_.sections[:, 5] == 0.0, kind="stable")]
+    A1, A3 = rows[:, 0] - 0.5 * rows[:, 4], rows[:, 0]
+    forms = np.stack([A1, np.sqrt(A1 * A3), A3], axis=1).astype(np.float32)
+    slowest = float(np.abs(digital_poles(filter_.sections)).max())
+    for _ in range(int(min(25.0 / max(1.0 - slowest, 1e-6) + 200, _LONGEST))):
+        y = np.full_like(starts, one)
+        for (a1, a2, a3), a2_section, s in zip(forms, rows[:, 5], state, strict=True):
+            if a2_section == 0.0:
+                v = a3 * (y - s[1])
+                y = s[1] + v
+                s[1] = y + v
+                continue
+            v3 = y - s[1]
+            v1 = a1 * s[0] + a2 * v3
+            y = s[1] + (a2 * s[0] + a3 * v3)
+            s[0], s[1] = two * v1 - s[0], two * y - s[1]
     return float(np.abs(y.astype(np.float64) - 1.0).max())
 
 

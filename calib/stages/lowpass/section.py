@@ -60,7 +60,7 @@ class LowPass(Result):
     step : `rise_s` (10 % to 90 %), `settling_s` (2 %), `overshoot` (share).
     attenuation_db : gain at frequencies.
     noise_gain : variance of the output over that of a white input.
-    dead_band_mm : where the output may stick: bound in Q15 and what was seen there, and in float.
+    dead_band_mm : how far from a constant input the output rests in float, in the firmware's form.
     wanted_jitter : what was asked for, in the log's unit.
     """
 

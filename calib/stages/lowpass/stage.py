@@ -102,7 +102,7 @@ class Inputs:
     Attributes
     ----------
     filter : as asked for.
-    workspace_m : where the marker can be; the smallest power of two beyond it is full scale in Q15.
+    workspace_m : where the marker can be.
     positions : of the log to judge the filter on.
     suggest : of the log to choose the filter by, among `orders` and `families` (all where empty).
     wanted : jitter that the chosen filter may leave, in the positions' unit; None for that of `filter`.
@@ -255,9 +255,7 @@ def solve(inputs: Inputs) -> LowPass:
     gains = filters.decibels(filters.frequency_response(sections, np.array(f), rate))
     band = np.linspace(0.0, design.cutoff_hz, 201)
     largest = max(abs(value) for value in inputs.workspace_m)
-    step_mm = 1e3 * (2.0 ** math.ceil(math.log2(largest)) if largest > 0.0 else 1.0) / 32768.0
-    integer = filters.fixed_point(made)
-    float_mm = 1e3 * largest * filters.dead_band_binary32(made)
+    float_mm = 1e3 * largest * filters.rest_error_binary32(made)
     verdict = Verdict.of([*_of_rounding(made, rounded, float_mm), *_of_log(made, positions)])
     return LowPass(
         family=cast("Literal['butterworth', 'bessel', 'critical']", design.family),
@@ -273,12 +271,7 @@ def solve(inputs: Inputs) -> LowPass:
         step={"rise_s": answer.rise_s, "settling_s": answer.settling_s, "overshoot": answer.overshoot},
         attenuation_db={f"{c:.4g}Hz": gain for c, gain in zip(f, gains.tolist(), strict=True)},
         noise_gain=filters.noise_gain(sections),
-        dead_band_mm={
-            "q15_step": step_mm,
-            "q15": step_mm * integer.dead_band if integer.usable else None,
-            "q15_seen": step_mm * integer.stuck if integer.usable else None,
-            "float": float_mm,
-        },
+        dead_band_mm={"float": float_mm},
         wanted_jitter=wanted if wanted is None or _scale(positions) == 1.0 else 1e3 * wanted,
         log=None if positions is None else _log_section(made, positions),
         **judged(verdict),
