@@ -18,8 +18,7 @@ from calib.stages.actuator.pump import PumpCoefficients, delayed, pump_coefficie
 from calib.stages.actuator.simulate import STATE, RigState, check_start, largest_step_s
 from calib.stages.actuator.simulate import run as run_kernel
 from calib.stages.control.laws import LoopState
-from calib.stages.imu.mahony import Mahony, MahonySample, MahonyState, accelerometer_angle
-from calib.stages.imu.mahony import step as step_angle
+from calib.stages.imu.mahony import Mahony, MahonyState, advance
 from calib.stages.lowpass.filters import Design, design_lowpass
 from calib.twin.rig import SimulatedRig, workspace_homography
 from calib.twin.sensors import (
@@ -109,10 +108,14 @@ def add_imu(
     firmware: Firmware, state: FirmwareState, ax_mps2: float, ay_mps2: float, gz_radps: float
 ) -> FirmwareState:
     """State after one sample of the IMU; the first one sets the angle to the accelerometer's."""
-    if state.angle is None:
-        return replace(state, angle=MahonyState(accelerometer_angle(ax_mps2, ay_mps2), 0.0))
-    sample = MahonySample(ax_mps2, ay_mps2, gz_radps, 1.0 / firmware.imu_rate_hz)
-    return replace(state, angle=step_angle(firmware.mahony, state.angle, sample))
+    phi_acc, before, gains = math.atan2(ay_mps2, ax_mps2), state.angle, firmware.mahony
+    if before is None:
+        return replace(state, angle=MahonyState(phi_acc, 0.0))
+    dt_s = 1.0 / firmware.imu_rate_hz
+    phi, integral = advance(
+        before.phi_rad, before.integral_radps, phi_acc, -gz_radps, dt_s, gains.Kp, gains.Ki
+    )
+    return replace(state, angle=MahonyState(phi, integral))
 
 
 def _marker(firmware: Firmware, u: float, v: float) -> tuple[float, float]:

@@ -56,8 +56,7 @@ from calib.stages.firmware.vectors import (
     vectors,
 )
 from calib.stages.imu.levelling import Levelling, level_log
-from calib.stages.imu.mahony import Mahony, MahonySample, MahonyState
-from calib.stages.imu.mahony import step as step_angle
+from calib.stages.imu.mahony import advance
 from calib.stages.lowpass.filters import Design, design_lowpass, filter_signal
 from calib.stages.lowpass.section import LowPassSection
 from calib.twin.pictures import CAMERA, PLANE
@@ -221,6 +220,7 @@ def test_signs_of_the_imus_axes(tmp_path: Path) -> None:
 @pytest.mark.parametrize("order", [2, 5, 8])
 def test_low_passes_of_every_order(tmp_path: Path, order: int) -> None:
     from calib.stages.firmware.header import header_of
+
     section = rig("full").lowpass
     assert section is not None
     rows = design_lowpass(Design(3.0, 60.0, order)).sections.tolist()
@@ -461,20 +461,19 @@ def test_every_stage_is_the_projects_own(mode: int) -> None:
     """Stage by stage, each fed with what the reference had before it; binary32 constants cost 1e-6."""
     constants = header().values
     reference = Reference(constants)
-    angle: MahonyState | None = None
+    angle: tuple[float, float] | None = None
     lowpass, heads = design_lowpass(Design()).exact, []
     loop = LoopState()
     turning = OrientationControl(Pid(1000.0, 1000.0, 10.0, clamping=True), whole_pwm=False)
     stretching = PositionControl(Pid(15000.0, 0.0, 150.0), FeedForward(), whole_pwm=False)
     for given in _ticks(mode):
         out = reference.step(given)
+        phi_acc = math.atan2(given.ay_mps2, given.ax_mps2)
         if angle is None:
-            angle = MahonyState(math.atan2(given.ay_mps2, given.ax_mps2), 0.0)
+            angle = phi_acc, 0.0
         else:
-            angle = step_angle(
-                Mahony(), angle, MahonySample(given.ax_mps2, given.ay_mps2, given.gz_radps, 1.0 / 60.0)
-            )
-        assert out.phi_rad == pytest.approx(angle.phi_rad, abs=2e-6)
+            angle = advance(*angle, phi_acc, -given.gz_radps, 1.0 / 60.0, 3.0, 3.0)
+        assert out.phi_rad == pytest.approx(angle[0], abs=2e-6)
         # The polynomial undoes the lens to 0.01 px, 0.3 mm/px.
         assert np.abs(np.array(out.marker_m) - _true_marker(CAMERA, given.u_px, given.v_px)).max() < 5e-6
         head = head_from_marker(np.array(out.marker_m), np.array(out.phi_rad))

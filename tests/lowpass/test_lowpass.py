@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -136,7 +137,7 @@ def test_filtering_is_the_firmwares_difference_equation() -> None:
     x = 0.3 + np.random.default_rng(1).normal(size=400)
     exact = design_lowpass(Design()).exact
     b0, a1, out = exact[0, 0], exact[0, 4], [x[0]]
-    for before, value in zip(x, x[1:], strict=False):
+    for before, value in pairwise(x):
         out.append(b0 * (before + value) - a1 * out[-1])
     np.testing.assert_allclose(filter_signal(exact, x), out, rtol=0.0, atol=1e-13)
     assert filter_signal(exact, x[:0]).shape == (0,)

@@ -20,7 +20,7 @@ from calib.stages.actuator.pump import ElongationForce
 from calib.stages.camera.bundle import Calibration, calibrate
 from calib.stages.camera.lens import fit_inverse, pixel_grid
 from calib.stages.camera.model import View, distort, pack, undistort
-from calib.stages.imu.mahony import Mahony, MahonySample, MahonyState, accelerometer_angles, filter_log, step
+from calib.stages.imu.mahony import Mahony, accelerometer_angles, advance, filter_log
 from calib.stages.lowpass.filters import Design, dc_delay_s, design_lowpass, filter_signal, frequency_response
 from calib.twin.pictures import BOARD, CAMERA, PLANE, shots
 from calib.twin.rig import workspace_homography
@@ -93,11 +93,10 @@ def _largest_difference(dt_s: float) -> float:
 
     times = dt_s * np.arange(1, round(4.0 / dt_s) + 1)
     exact = solve_ivp(rates, (0.0, 4.0 + dt_s), [0.0, 0.0], t_eval=times, rtol=1e-10, atol=1e-12).y[0]
-    state, worst = MahonyState(), 0.0
+    found, integral, worst = 0.0, 0.0, 0.0
     for t, phi in zip(times.tolist(), exact.tolist(), strict=True):
-        phi_acc, w = motion(t)
-        state = step(gains, state, MahonySample(math.cos(phi_acc), math.sin(phi_acc), -w, dt_s))
-        worst = max(worst, abs(state.phi_rad - phi))
+        found, integral = advance(found, integral, *motion(t), dt_s, gains.Kp, gains.Ki)
+        worst = max(worst, abs(found - phi))
     return worst
 
 

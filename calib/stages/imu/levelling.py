@@ -194,8 +194,6 @@ def level_log(
     BadInputError for lengths that differ, time that goes back and values that are not finite.
     """
     t, phi_acc, w = checked(t_s, phi_acc_rad, rate_radps)
-    if not (np.isfinite(phi_acc).all() and np.isfinite(w).all() and (np.diff(t) >= 0.0).all()):
-        raise BadInputError("angle filter: expected finite readings and time that runs forward")
     state = MahonyState(float(phi_acc[0]), 0.0) if start is None else start
     phi, integral = np.empty(len(t)), np.empty(len(t))
     _run(

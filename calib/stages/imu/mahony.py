@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,32 +48,8 @@ class MahonyState:
     integral_radps: float = 0.0
 
 
-@dataclass(frozen=True)
-class MahonySample:
-    """Specific force in the plane [m/s^2], rate about z [rad/s], and time since the last sample [s]."""
-
-    ax_mps2: float
-    ay_mps2: float
-    gz_radps: float
-    dt_s: float
-
-
-def accelerometer_angle(ax_mps2: float, ay_mps2: float) -> float:
-    """phi_acc [rad] of (2.1), in (-pi, pi]; right only while the sensor does not accelerate."""
-    return math.atan2(ay_mps2, ax_mps2)
-
-
-def step(parameters: Mahony, state: MahonyState, sample: MahonySample) -> MahonyState:
-    """State after one sample (2.3)."""
-    phi_acc = accelerometer_angle(sample.ax_mps2, sample.ay_mps2)
-    e = math.remainder(phi_acc - state.phi_rad, 2.0 * math.pi)
-    integral = state.integral_radps + parameters.Ki * e * sample.dt_s
-    phi = state.phi_rad + (parameters.Kp * e + integral - sample.gz_radps) * sample.dt_s
-    return MahonyState(phi, integral)
-
-
 # ----------------------------------------------------------------------
-# The angle filter of `calib.stages.imu.mahony` over whole logs, compiled.
+# Over whole logs, compiled.
 #
 # A sample's step is the time since the sample before it, so that stamps need not be even, may repeat
 # (a step of zero leaves the state as it is) and may leave gaps. The filter is linear apart from the
@@ -123,44 +98,27 @@ def _run(
     integral: float,
     out_phi: FloatArray,
     out_integral: FloatArray,
-) -> int:
-    """Fills the outputs; returns the first sample whose time goes back, or -1."""
+) -> None:
     before = t[0]
     for k in range(len(t)):
-        dt = t[k] - before
-        if dt < 0.0:
-            return k
+        phi, integral = advance(phi, integral, phi_acc[k], w[k], t[k] - before, Kp, Ki)
         before = t[k]
-        phi, integral = advance(phi, integral, phi_acc[k], w[k], dt, Kp, Ki)
         out_phi[k] = phi
         out_integral[k] = integral
-    return -1
-
-
-@njit(cache=True, nogil=True)
-def _run_many(
-    t: FloatArray,
-    phi_acc: FloatArray,
-    w: FloatArray,
-    gains: FloatArray,
-    phi_0: float,
-    integral_0: float,
-    out_phi: FloatArray,
-) -> None:
-    unused = np.empty(len(t))
-    for j in range(len(gains)):
-        _run(t, phi_acc, w, gains[j, 0], gains[j, 1], phi_0, integral_0, out_phi[j], unused)
 
 
 def checked(
     t_s: FloatArray, phi_acc_rad: FloatArray, rate_radps: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Times, angles and rates (n,) of a log; raises `BadInputError` as `filter_log` says."""
     t, phi_acc, w = (np.ascontiguousarray(x, dtype=np.float64) for x in (t_s, phi_acc_rad, rate_radps))
     if t.ndim != 1 or t.shape != phi_acc.shape or t.shape != w.shape or len(t) == 0:
         raise BadInputError(
             f"angle filter: found times {t.shape}, angles {phi_acc.shape} and rates {w.shape}, "
             "expected as many of each and at least one"
         )
+    if not (np.isfinite(phi_acc).all() and np.isfinite(w).all() and (np.diff(t) >= 0.0).all()):
+        raise BadInputError("angle filter: expected finite readings and time that runs forward")
     return t, phi_acc, w
 
 
@@ -171,7 +129,7 @@ def filter_log(
     rate_radps: FloatArray,
     start: MahonyState | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Angle and integral after each sample of a log: `step`, from sample to sample.
+    """Angle and integral after each sample of a log; gains that are unstable at its steps may overflow.
 
     Parameters
     ----------
@@ -192,33 +150,5 @@ def filter_log(
     t, phi_acc, w = checked(t_s, phi_acc_rad, rate_radps)
     state = MahonyState(float(phi_acc[0]), 0.0) if start is None else start
     phi, integral = np.empty(len(t)), np.empty(len(t))
-    back = _run(
-        t, phi_acc, w, parameters.Kp, parameters.Ki, state.phi_rad, state.integral_radps, phi, integral
-    )
-    if back >= 0:
-        raise BadInputError(
-            f"angle filter: time goes back from {t[back - 1]:.6f} to {t[back]:.6f} s at sample {back}, "
-            "expected time to run forward"
-        )
-    # What is not finite stays in the state.
-    if not math.isfinite(phi[-1]):
-        raise BadInputError(
-            "angle filter: the result is not finite, expected finite readings and shorter gaps"
-        )
+    _run(t, phi_acc, w, parameters.Kp, parameters.Ki, state.phi_rad, state.integral_radps, phi, integral)
     return phi, integral
-
-
-def filter_many(
-    parameters: Sequence[Mahony],
-    t_s: FloatArray,
-    phi_acc_rad: FloatArray,
-    rate_radps: FloatArray,
-    start: MahonyState | None = None,
-) -> FloatArray:
-    """Angles (gains, n) of `filter_log` for each pair of gains; a pair that is unstable may overflow."""
-    t, phi_acc, w = checked(t_s, phi_acc_rad, rate_radps)
-    state = MahonyState(float(phi_acc[0]), 0.0) if start is None else start
-    gains = np.array([(p.Kp, p.Ki) for p in parameters], dtype=np.float64).reshape(-1, 2)
-    phi = np.empty((len(gains), len(t)))
-    _run_many(t, phi_acc, w, gains, state.phi_rad, state.integral_radps, phi)
-    return phi

@@ -35,7 +35,7 @@ from calib.stages.imu.intrinsics import Accelerometer, Intrinsics
 from calib.stages.imu.mahony import Mahony, wrapped
 from calib.stages.imu.section import OrientationFilter
 from calib.stages.imu.static import AxisNoise, Static, StaticLog
-from calib.stages.imu.tuning import Piece, Tuning, frontier, run_filter
+from calib.stages.imu.tuning import Piece, Tuning, run_filter
 
 # ----------------------------------------------------------------------
 # At rest: Allan deviation with what explains it, readings over time, drift by log.
@@ -394,7 +394,7 @@ def _in_motion(log: LogDrift) -> Figure:
 
 
 # ----------------------------------------------------------------------
-# A tuning: errors over the plane of gains, what gains cost, and the errors over time.
+# A tuning: errors over the plane of gains, and over time.
 
 _PAIRS = {"3/3": ("red", "squares"), "tuned": ("green", "points"), "riccati": ("orange", "diamonds")}
 
@@ -402,20 +402,15 @@ _PAIRS = {"3/3": ("red", "squares"), "tuned": ("green", "points"), "riccati": ("
 def tune_plots(result: Tuning, pieces: Sequence[Piece], section: OrientationFilter) -> dict[str, Figure]:
     """`tune_gains` and `tune_errors`."""
     return {
-        "tune_gains": _gains(result, 1.0 / section.rate_hz, section.verdict.word),
+        "tune_gains": _gains(result, section.verdict.word),
         "tune_errors": _tuning_errors(result, pieces, section.verdict.word),
     }
 
 
-def _gains(result: Tuning, dt_s: float, verdict: str) -> Figure:
-    """Error on the whole logs over Kp and Ki, and noise against settling, lag and the peak of a bias."""
-    note = (
-        "Left: error on the whole logs. Middle: each dot is a pair of gains, the line those that none beats "
-        "in noise and settling at once. Right: their lag, and the angle that a bias leaves at most."
-    )
-    f, s = frontier(result.noise, dt_s), result.surface
-    left: list[Mark] = []
-    above = "nothing to judge by"
+def _gains(result: Tuning, verdict: str) -> Figure:
+    """Error on the whole logs over Kp and Ki, and where the pairs that are compared lie."""
+    marks: list[Mark] = []
+    above, s = "nothing to judge by", result.surface
     if s is not None:
         Kp = np.repeat(s.Kp[:, None], len(s.damping), axis=1)
         Ki = Kp**2 / (4.0 * s.damping[None, :] ** 2)
@@ -423,34 +418,16 @@ def _gains(result: Tuning, dt_s: float, verdict: str) -> Figure:
         least = float(np.nanmin(error))
         levels = least * np.geomspace(1.0, 8.0, 13)
         error = np.clip(np.where(np.isfinite(error), error, np.inf), None, levels[-1])
-        left.append(Field(Kp, Ki, error, levels=levels, outlined=levels[1:2]))
+        marks.append(Field(Kp, Ki, error, levels=levels, outlined=levels[1:2]))
         above = f"Least {least:.3f} deg; line: 19 % more"
-    settles = np.isfinite(f.settling_s)
-    best = np.flatnonzero(f.best & settles)
-    best = best[np.argsort(f.noise_gain[best])]
-    middle: list[Mark] = [
-        Curve(f.noise_gain[settles], f.settling_s[settles], kind="points", colour="silver"),
-        Curve(f.noise_gain[best], f.settling_s[best], size=2.0),
-    ]
-    right: list[Mark] = [Curve(f.lag_s, f.bias_peak_s, kind="points", colour="silver")]
     for one in result.candidates:
         if isinstance(one.gains, Mahony):
             (hue, kind), gains = _PAIRS[one.name], one.gains
-            # The grid's nearest pair stands for it: the facts change slowly.
-            k = int(np.argmin(np.log(f.Kp / gains.Kp) ** 2 + np.log(f.Ki / max(gains.Ki, 1e-9)) ** 2))
-            for marks, x, y in (
-                (left, gains.Kp, max(gains.Ki, 1e-9)),
-                (middle, f.noise_gain[k], f.settling_s[k]),
-                (right, f.lag_s[k], f.bias_peak_s[k]),
-            ):
-                marks.append(Curve(np.array([x]), np.array([y]), one.name, kind, hue, 8.0))
-    panels = (
-        Plot("Kp (1/s)", "Ki (1/s\N{SUPERSCRIPT TWO})", left, above, log="xy"),
-        Plot("noise gain (variance)", "settling to 2 % (s)", middle, "Noise and settling", log="xy"),
-        Plot("lag of a step (s)", "peak per bias (s)", right, "Lag and bias", log="xy"),
-    )
+            at = np.array([gains.Kp]), np.array([max(gains.Ki, 1e-9)])
+            marks.append(Curve(*at, one.name, kind, hue, 8.0))
+    panel = Plot("Kp (1/s)", "Ki (1/s\N{SUPERSCRIPT TWO})", marks, above, log="xy")
     title = f"Gains of the angle filter: {result.recommended.name}"
-    return Figure(title, note, panels, 3.9, verdict, columns=3)
+    return Figure(title, "Error on the whole logs by pair of gains.", (panel,), 4.3, verdict)
 
 
 def _tuning_errors(result: Tuning, pieces: Sequence[Piece], verdict: str) -> Figure:

@@ -11,12 +11,12 @@ from numba import njit
 from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 from scipy.special import ndtri, stdtrit
 
-from calib.core.arrays import BoolArray, FloatArray, IntArray
+from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
 from calib.core.verdict import Finding, Severity
 from calib.stages.imu.levelling import Levelling, level_log
 from calib.stages.imu.levelling import system as levelling_system
-from calib.stages.imu.mahony import Mahony, MahonyState, advance, filter_log, wrapped
+from calib.stages.imu.mahony import Mahony, MahonyState, filter_log, wrapped
 
 AngleFilter = Mahony | Levelling
 """What can be asked for an angle."""
@@ -199,16 +199,6 @@ def gain_facts(gains: AngleFilter, dt_s: float) -> GainFacts:
         bias_settling_s=math.inf if only else _settled(toward[:, 1], dt_s),
         lag_s=float(half[0]) * dt_s if len(half) else math.inf,
     )
-
-
-def predicted_sigma(gains: Mahony, noise: Noise, dt_s: float) -> float:
-    """Standard deviation of the settled angle [rad] under these densities; infinite where none settles."""
-    A, B = _system(gains, dt_s)
-    if float(np.abs(np.linalg.eigvals(A)).max()) >= 1.0:
-        return math.inf
-    # With the bias' walk in I: the error of I is I + b.
-    Q = np.diag([noise.gyro**2 * dt_s, noise.walk**2 * dt_s]) + noise.accel**2 / dt_s * np.outer(B, B)
-    return math.sqrt(float(solve_discrete_lyapunov(A, Q)[0, 0]))
 
 
 def riccati(noise: Noise, dt_s: float) -> Mahony:
@@ -486,12 +476,13 @@ def _forward(
                 P[j, i] = P[i, j]
         log_likelihood -= 0.5 * (e * e / s + math.log(s))
         if keep:
-            xs[k] = x
-            Ps[k] = P
+            for i in range(m):
+                xs[k, i] = x[i]
+                for j in range(m):
+                    Ps[k, i, j] = P[i, j]
     return log_likelihood
 
 
-@njit(cache=True, nogil=True)
 def _backward(
     dt: FloatArray,
     turn: FloatArray,
@@ -503,25 +494,22 @@ def _backward(
     Ps: FloatArray,
 ) -> float:
     """Smooths the states in place; returns the mean variance of the first."""
-    m = 6
-    P_next, x_next = Ps[-1].copy(), xs[-1].copy()
-    total = P_next[0, 0]
-    F = np.eye(m)
-    for k in range(len(xs) - 2, -1, -1):
-        kept = math.exp(-dt[k + 1] / tau)
-        F[0, 1], F[0, 2], F[5, 5] = dt[k + 1], turn[k + 1], kept
-        ahead = F @ Ps[k]
-        P_minus = ahead @ F.T
-        P_minus[0, 0] += q * dt[k + 1]
-        P_minus[1, 1] += q_b * dt[k + 1]
-        P_minus[5, 5] += c * c * (1.0 - kept * kept)
-        G = np.linalg.solve(P_minus, ahead).T
-        x_next = xs[k] + G @ (x_next - F @ xs[k])
-        P_next = Ps[k] + G @ (P_next - P_minus) @ G.T
-        xs[k] = x_next
-        total += P_next[0, 0]
-    mean: float = total / len(xs)
-    return mean
+    steps = len(xs) - 1
+    F, Q = np.tile(np.eye(_STATES), (steps, 1, 1)), np.zeros((steps, _STATES, _STATES))
+    kept = np.exp(-dt[1:] / tau)
+    F[:, 0, 1], F[:, 0, 2], F[:, 5, 5] = dt[1:], turn[1:], kept
+    Q[:, 0, 0], Q[:, 1, 1], Q[:, 5, 5] = q * dt[1:], q_b * dt[1:], c * c * (1.0 - kept * kept)
+    ahead = F @ Ps[:-1]
+    P_minus = ahead @ F.transpose(0, 2, 1) + Q
+    G = np.linalg.solve(P_minus, ahead).transpose(0, 2, 1)
+    x_minus = (F @ xs[:-1, :, None])[..., 0]
+    P = Ps[-1]
+    total = float(P[0, 0])
+    for k in range(steps - 1, -1, -1):
+        xs[k] += G[k] @ (xs[k + 1] - x_minus[k])
+        P = Ps[k] + G[k] @ (P - P_minus[k]) @ G[k].T
+        total += float(P[0, 0])
+    return total / len(xs)
 
 
 @dataclass(frozen=True)
@@ -633,50 +621,6 @@ def smooth_log(
     return Smoothed(phi, math.sqrt(variance), math.sqrt(q), slow, -float(last[1]), -float(last[2]), last[3:5])
 
 
-# ----------------------------------------------------------------------
-# What pairs of gains cost: noise against lag, drift and settling, over the whole plane of gains.
-#
-# Every pair is named by Kp and its damping zeta, Ki = Kp^2 / (4 zeta^2). In continuous time the shapes of
-# all answers depend on zeta alone and their times on 1 / Kp:
-#
-#     bias of the rate -> angle      s / (s^2 + Kp s + Ki), a step of it peaks at
-#                                    exp(-zeta acos(zeta) / sqrt(1 - zeta^2)) / sqrt(Ki),
-#                                    with acosh and zeta^2 - 1 for zeta > 1
-#     accelerometer's angle -> angle (Kp s + Ki) / (s^2 + Kp s + Ki)
-#
-# Noise is that of the discrete filter, from its Lyapunov equation.
-
-_HIGHEST_KP = 20.0
-_LOWEST_KP = 0.02
-_LOWEST_DAMPING, _HIGHEST_DAMPING = 0.15, 10.0
-
-
-@dataclass(frozen=True)
-class Frontier:
-    """Facts of pairs of gains, each (n,).
-
-    Attributes
-    ----------
-    Kp, Ki, damping : the pairs.
-    noise_gain : variance of the angle over that of white noise on the accelerometer's angle.
-    lag_s : time to follow half of a step that the accelerometer alone sees.
-    bias_peak_s : largest angle after a bias appears, over the bias [rad per rad/s].
-    settling_s : time in which the slower pole takes an error to 2 %.
-    sigma_rad : predicted deviation under the log's densities.
-    best : pairs that no other beats in noise and settling at once.
-    """
-
-    Kp: FloatArray
-    Ki: FloatArray
-    damping: FloatArray
-    noise_gain: FloatArray
-    lag_s: FloatArray
-    bias_peak_s: FloatArray
-    settling_s: FloatArray
-    sigma_rad: FloatArray
-    best: BoolArray
-
-
 def damped(Kp: float, damping: float) -> Mahony:
     """The pair of this Kp and damping ratio."""
     return Mahony(Kp, Kp * Kp / (4.0 * damping * damping))
@@ -694,75 +638,6 @@ def gain_grid(dt_s: float, kp: int = 25, dampings: int = 17) -> tuple[FloatArray
     return (
         np.geomspace(min(_LOWEST_KP, 0.1 * highest), highest, kp),
         np.geomspace(_LOWEST_DAMPING, _HIGHEST_DAMPING, dampings),
-    )
-
-
-def _variance(A: FloatArray, Q: FloatArray) -> FloatArray:
-    """First element (n,) of P = A P A' + Q for pairs (n, 2, 2)."""
-    a, b, c, d = A[:, 0, 0], A[:, 0, 1], A[:, 1, 0], A[:, 1, 1]
-    one = np.ones_like(a)
-    # Unknowns P11, P12, P22.
-    M = np.stack(
-        [
-            np.stack([one - a * a, -2.0 * a * b, -b * b], axis=-1),
-            np.stack([-a * c, one - a * d - b * c, -b * d], axis=-1),
-            np.stack([-c * c, -2.0 * c * d, one - d * d], axis=-1),
-        ],
-        axis=-2,
-    )
-    right = np.stack([Q[:, 0, 0], Q[:, 0, 1], Q[:, 1, 1]], axis=-1)
-    return np.asarray(np.linalg.solve(M, right[..., None])[:, 0, 0])
-
-
-def _half_time(damping: float) -> float:
-    """Time times Kp after which a step is followed half way."""
-    Ki = 1.0 / (4.0 * damping * damping)
-    roots = np.roots([1.0, 1.0, Ki]).astype(np.complex128)
-    if abs(roots[0] - roots[1]) < 1e-6:
-        roots[0] *= 1.0 + 1e-5
-    # The error is 1 at first and falls with slope 1.
-    tau = np.linspace(0.0, 1.5, 3001)
-    s1, s2 = roots
-    error = ((-1.0 - s2) * np.exp(s1 * tau) - (-1.0 - s1) * np.exp(s2 * tau)) / (s1 - s2)
-    return float(np.interp(0.5, 1.0 - error.real, tau))
-
-
-def _bias_peak(damping: FloatArray) -> FloatArray:
-    """Peak times sqrt(Ki), of a step of the bias."""
-    z = np.where(np.abs(damping - 1.0) < 1e-6, 1.0 + 1e-6, damping)
-    root = np.sqrt(np.abs(1.0 - z * z))
-    angle = np.where(z < 1.0, np.arccos(np.minimum(z, 1.0)), np.arccosh(np.maximum(z, 1.0)))
-    return np.asarray(np.exp(-z * angle / root))
-
-
-def frontier(noise: Noise, dt_s: float, kp: int = 25, dampings: int = 17) -> Frontier:
-    """The facts of a grid of gains for a log's densities and step."""
-    K, Z = gain_grid(dt_s, kp, dampings)
-    Kp, damping = (x.ravel() for x in np.meshgrid(K, Z, indexing="ij"))
-    Ki = Kp**2 / (4.0 * damping**2)
-    whole = dt_s * (Kp + Ki * dt_s)
-    A = np.empty((len(Kp), 2, 2))
-    A[:, 0, 0], A[:, 0, 1], A[:, 1, 0], A[:, 1, 1] = 1.0 - whole, dt_s, -Ki * dt_s, 1.0
-    B = np.stack([whole, Ki * dt_s], axis=-1)
-    BB = B[:, :, None] * B[:, None, :]
-    own = np.diag([noise.gyro**2 * dt_s, noise.walk**2 * dt_s])
-    slowest = np.abs(np.linalg.eigvals(A)).max(axis=1)
-    settling = dt_s * math.log(0.02) / np.log(slowest)
-    noise_gain = _variance(A, BB)
-    order = np.lexsort((settling, noise_gain))
-    best = np.zeros(len(Kp), dtype=np.bool_)
-    least = np.minimum.accumulate(settling[order])
-    best[order] = np.concatenate([[True], least[1:] < least[:-1]])
-    return Frontier(
-        Kp=Kp,
-        Ki=Ki,
-        damping=damping,
-        noise_gain=noise_gain,
-        lag_s=np.repeat([[_half_time(z) for z in Z.tolist()]], len(K), axis=0).ravel() / Kp,
-        bias_peak_s=_bias_peak(damping) / np.sqrt(Ki),
-        settling_s=settling,
-        sigma_rad=np.sqrt(_variance(A, own + noise.accel**2 / dt_s * BB)),
-        best=best,
     )
 
 
@@ -785,6 +660,9 @@ def frontier(noise: Noise, dt_s: float, kp: int = 25, dampings: int = 17) -> Fro
 # and a pair that rings has fitted the log's start.
 
 THREE = Mahony(3.0, 3.0)
+_HIGHEST_KP = 20.0
+_LOWEST_KP = 0.02
+_LOWEST_DAMPING, _HIGHEST_DAMPING = 0.15, 10.0
 _ALIKE = 1.03
 _LEAST_JUDGED_S = 8.0
 _WORSE = 100.0
@@ -863,31 +741,6 @@ class Tuning:
         return next((p.gains for p in pairs if isinstance(p.gains, Mahony) and p.wins), THREE)
 
 
-@njit(cache=True, nogil=True)
-def _squares(
-    t: FloatArray,
-    phi_acc: FloatArray,
-    w: FloatArray,
-    target: FloatArray,
-    part: IntArray,
-    gains: FloatArray,
-    out: FloatArray,
-) -> None:
-    """Adds the sums of squared errors to out (gains, parts); NaN targets do not count."""
-    turn = 2.0 * math.pi
-    for j in range(len(gains)):
-        Kp, Ki = gains[j, 0], gains[j, 1]
-        phi, integral, before = phi_acc[0], 0.0, t[0]
-        for k in range(len(t)):
-            dt = t[k] - before
-            before = t[k]
-            phi, integral = advance(phi, integral, phi_acc[k], w[k], dt, Kp, Ki)
-            d = phi - target[k]
-            if d == d:
-                d -= turn * np.rint(d / turn)
-                out[j, part[k]] += d * d
-
-
 @dataclass(frozen=True)
 class _Judged:
     """Readings with the angle that they are judged by, NaN where they are not, and each sample's part."""
@@ -922,11 +775,7 @@ def _parted(pieces: Sequence[tuple[Piece, FloatArray]], dt_s: float) -> tuple[tu
 def _sums(judged: Sequence[_Judged], filters: Sequence[AngleFilter], parts: int) -> FloatArray:
     """Sums (filters, parts) of squared errors, infinite where they overflow."""
     out = np.zeros((len(filters), parts))
-    pairs = np.array([(g.Kp, g.Ki) for g in filters if isinstance(g, Mahony)])
     for one in judged:
-        if len(pairs):
-            _squares(one.t_s, one.phi_acc_rad, one.rate_radps, one.target, one.part, pairs, out)
-            continue
         for row, gains in zip(out, filters, strict=True):
             row += np.bincount(one.part, np.nan_to_num(one.errors(gains)) ** 2, parts)
     return np.where(np.isfinite(out), out, np.inf)
