@@ -9,9 +9,6 @@ import numpy as np
 from scipy.io import loadmat
 
 from calib.stages.imu.mahony import Mahony, MahonyState, accelerometer_angles, filter_log, wrapped
-from calib.stages.imu.tracks import in_plane, up_in_sensor
-
-__all__ = ["FILES", "PUBLISHED_DEG", "Trial", "filter_rmse_deg", "read_trial", "rmse_deg", "windows"]
 
 FILES = {
     "02": "02_undisturbed_slow_rotation_B.mat",
@@ -19,7 +16,6 @@ FILES = {
 }
 PUBLISHED_DEG = {
     "VQF": {"02": 0.429, "05": 0.353},
-    "VQF offline": {"02": 0.312, "05": 0.271},
     "imufusion": {"02": 0.666, "05": 0.553},
     "Mahony": {"02": 0.459, "05": 0.528},
     "Madgwick": {"02": 0.606, "05": 0.549},
@@ -31,7 +27,7 @@ _SHORTEST_S = 1.0
 
 @dataclass(frozen=True)
 class Trial:
-    """A recording: rates [rad/s], forces [m/s^2], true quaternions with gaps, and whether it moves."""
+    """A recording: rates [rad/s], forces [m/s^2], true up vectors with gaps, and whether it moves."""
 
     gyro: np.ndarray
     force: np.ndarray
@@ -42,8 +38,27 @@ class Trial:
     @property
     def true_phi(self) -> np.ndarray:
         """Angle of the true up vector in the plane."""
-        up = up_in_sensor(self.truth)
-        return np.arctan2(up[:, 1], up[:, 0])
+        return np.arctan2(self.truth[:, 1], self.truth[:, 0])
+
+    def inclination_deg(self, up: np.ndarray) -> float:
+        """RMS in motion of the angle between up vectors (n, 3) and the true ones.
+
+        It is BROAD's inclination error (Data 6(7):72, 2021, section 4), whose arc cosine loses digits.
+        """
+        up = up / np.linalg.norm(up, axis=1, keepdims=True)
+        apart = 2.0 * np.arcsin(np.clip(np.linalg.norm(up - self.truth, axis=1) / 2.0, 0.0, 1.0))
+        return float(np.degrees(np.sqrt(np.nanmean(apart[self.moving] ** 2))))
+
+
+def in_plane(up: np.ndarray, least: float = 0.5) -> np.ndarray:
+    """Where (n,) ux^2 + uy^2 is at least `least` of |u|^2: 0.5 is a tilt of the plane by up to 45 degrees."""
+    return up[:, 0] ** 2 + up[:, 1] ** 2 >= least * (up**2).sum(axis=1)
+
+
+def _up(q: np.ndarray) -> np.ndarray:
+    """The world's up vector (n, 3) in the axes of a sensor whose quaternions (n, 4) are w, x, y, z."""
+    w, x, y, z = q.T
+    return np.stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), w * w - x * x - y * y + z * z], axis=1)
 
 
 def read_trial(path: Path) -> Trial:
@@ -52,7 +67,7 @@ def read_trial(path: Path) -> Trial:
     return Trial(
         np.ascontiguousarray(m["imu_gyr"]),
         np.ascontiguousarray(m["imu_acc"]),
-        m["opt_quat"],
+        _up(m["opt_quat"]),
         m["movement"] == 1,
         1.0 / float(m["sampling_rate"]),
     )

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.stages.imu.intrinsics import PoseLog
+from calib.stages.imu.sampling import Readings
 
 AXES = ("gx", "gy", "gz", "ax", "ay", "az")
 G = 9.81
@@ -107,8 +107,8 @@ def motion(
 
 def pose_log(
     poses: list[Rotation], sensor: Sensor, seed: int = 0, counts: bool = False, **how: float
-) -> PoseLog:
+) -> Readings:
     """A log of this sensor."""
     t, w, f = motion(poses, **how)
     values = sensor.readings(w, f, np.random.default_rng(seed))
-    return PoseLog("log", AXES, t, values, "counts" if counts else "m/s2", "counts" if counts else "rad/s")
+    return Readings("log", AXES, t, values, counts="ag" if counts else "")

@@ -19,15 +19,8 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 from broad_trials import FILES, PUBLISHED_DEG, filter_rmse_deg, read_trial, rmse_deg, windows
 
-from calib.stages.imu.tracks import (
-    inclination_error,
-    missing,
-    planar_rate,
-    rms_in_motion,
-    run_peer,
-    up_in_sensor,
-    up_vector,
-)
+from calib.stages.imu.levelling import Levelling, level_three
+from calib.stages.imu.tracks import missing, planar_rate, run_peer
 
 
 def main() -> None:
@@ -46,13 +39,10 @@ def main() -> None:
         for peer, published in PUBLISHED_DEG.items():
             if missing(peer) or (peer in ("Mahony", "Madgwick") and not slow):
                 continue
-            q = run_peer(peer, one.gyro, one.force, one.period_s)
-            ups[peer] = up_in_sensor(q)
-            found = np.degrees(rms_in_motion(inclination_error(q, one.truth), one.moving))
-            print(f"  {peer:12} {found:.4f}  published {published[name]:.3f}")
-        up = up_vector(one.force, one.gyro, one.period_s)
-        apart = np.linalg.norm(up - up_in_sensor(one.truth), axis=1)
-        print(f"  up vector    {np.degrees(rms_in_motion(apart, one.moving)):.4f}")
+            ups[peer] = run_peer(peer, one.gyro, one.force, one.period_s)
+            print(f"  {peer:12} {one.inclination_deg(ups[peer]):.4f}  published {published[name]:.3f}")
+        up = level_three(Levelling(), one.period_s * np.arange(len(one.gyro)), one.force, one.gyro)
+        print(f"  levelling    {one.inclination_deg(up):.4f}")
         for least in (0.25, 0.5, 0.75):
             where = windows(one, up, least)
             length = sum(w.stop - w.start for w in where) * one.period_s

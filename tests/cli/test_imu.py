@@ -17,7 +17,7 @@ import pytest
 import typer
 import yaml
 from armlogs import Arm, swung, write
-from imu_poses import AXES, G, PoseLog, Sensor, pose_log, sphere_poses, tilts
+from imu_poses import AXES, G, Readings, Sensor, pose_log, sphere_poses, tilts
 from outside import outside
 
 from calib.cli.verbs import verb
@@ -187,7 +187,7 @@ HEAD_IMU_INTRINSICS = (
 )
 
 
-def _write_imu_intrinsics(path: Path, log: PoseLog) -> Path:
+def _write_imu_intrinsics(path: Path, log: Readings) -> Path:
     rows = np.column_stack([log.t_s, log.values]).tolist()
     path.write_text(
         HEAD_IMU_INTRINSICS + "".join(",".join(f"{cell:.9g}" for cell in row) + "\n" for row in rows)
@@ -222,7 +222,7 @@ def test_a_plane_with_its_short_protocol(tmp_path: Path, capsys: pytest.CaptureF
 def test_units_are_refused_and_then_converted_in_imu_intrinsics(tmp_path: Path) -> None:
     log = pose_log(sphere_poses(24), Sensor())
     scale = np.array([180.0 / np.pi] * 3 + [1.0 / 9.80665] * 3)
-    path = _write_imu_intrinsics(tmp_path / "log.csv", PoseLog("log", AXES, log.t_s, log.values * scale))
+    path = _write_imu_intrinsics(tmp_path / "log.csv", Readings("log", AXES, log.t_s, log.values * scale))
     rig = tmp_path / "rig.yaml"
     with pytest.raises(BadInputError, match="give --acc-unit g"):
         intrinsics(path, rig=rig)

@@ -15,17 +15,17 @@ from scipy.signal import lfilter
 from calib.solve.clock import Part
 from calib.stages.imu.drift import LogDrift, Measures, allan_at, analyse_drift, lag_s, slope_of
 from calib.stages.imu.mahony import Mahony, advance, filter_log
-from calib.stages.imu.tracks import DriftLog, Tuned, tracks_of
+from calib.stages.imu.sampling import Readings
+from calib.stages.imu.tracks import Tuned, tracks_of
 from calib.stages.imu.tuning import smooth_log
 
 AXES = ("gx", "gy", "gz", "ax", "ay", "az")
 PERIOD = 0.01
-NONE = np.zeros(0)
 
 
 def _log(
     phi: np.ndarray, rate: np.ndarray, bias: float = 0.006, seed: int = 0, tilt: float = 0.0
-) -> DriftLog:
+) -> Readings:
     """A sensor at the angle phi, out of the plane of gravity by `tilt`; no acceleration of its own."""
     rng = np.random.default_rng(seed)
     n = len(phi)
@@ -37,10 +37,10 @@ def _log(
     values += [0.0, 0.0, bias, 0.0, 0.0, 0.0]
     values[:, :3] += 2e-3 * rng.normal(size=(n, 3))
     values[:, 3:] += 0.02 * rng.normal(size=(n, 3))
-    return DriftLog("log.csv", AXES, t, values, NONE, NONE, NONE, NONE)
+    return Readings("log.csv", AXES, t, values)
 
 
-def _at_rest(n: int = 24000, bias: float = 0.006, seed: int = 0) -> DriftLog:
+def _at_rest(n: int = 24000, bias: float = 0.006, seed: int = 0) -> Readings:
     return _log(np.full(n, 0.2), np.zeros(n), bias, seed)
 
 
@@ -171,7 +171,7 @@ def test_lag_to_a_fraction_of_a_sample(lag: float) -> None:
 
 def _log_tracks(
     n: int = 2000, axes: tuple[str, ...] = AXES, bias: float = 0.01
-) -> tuple[DriftLog, Part, np.ndarray]:
+) -> tuple[Readings, Part, np.ndarray]:
     t = PERIOD * np.arange(n)
     phi, rate = 0.6 * np.sin(2.0 * t), 1.2 * np.cos(2.0 * t)
     whole = {
@@ -183,7 +183,7 @@ def _log_tracks(
         "az": 0.0 * t,
     }
     values = np.stack([whole[axis] for axis in axes], axis=1)
-    log = DriftLog("log.csv", axes, t, values, t, phi + 0.1, np.zeros(0), np.zeros(0))
+    log = Readings("log.csv", axes, t, values, t, phi + 0.1)
     places = np.arange(n)
     return log, Part(t, values, places, places), phi
 

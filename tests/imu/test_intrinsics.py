@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from imu_poses import AXES, G, PoseLog, Sensor, in_counts, motion, pose_log, sphere_poses, tilts
+from imu_poses import AXES, G, Readings, Sensor, in_counts, motion, pose_log, sphere_poses, tilts
 from outside import outside
 from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
@@ -81,7 +81,7 @@ def test_the_xsens_recording_of_imu_tk(shared_data: Path) -> None:
         with gzip.open(folder / name, "rt") as stream:
             tables.append(np.loadtxt(stream))
     values = np.hstack([table[:, 1:] for table in tables])
-    result = find_intrinsics(PoseLog("xsens", AXES, tables[1][:, 0], values, "counts", "counts"), 9.81744)
+    result = find_intrinsics(Readings("xsens", AXES, tables[1][:, 0], values, counts="ag"), 9.81744)
     accel, gyro = result.accel, result.gyro
     assert accel is not None
     assert gyro is not None
@@ -249,7 +249,7 @@ def test_reported_deviations_are_those_of_many_repetitions_in_gyroscope(
     errors, sigmas = [], []
     for seed in range(200):
         values = sensor.readings(w, f, np.random.default_rng(seed))
-        gyro = find_intrinsics(PoseLog("log", AXES, t, values), G).gyro
+        gyro = find_intrinsics(Readings("log", AXES, t, values), G).gyro
         assert gyro is not None
         errors.append(np.concatenate([gyro.scale, gyro.angles])[free] - truth)
         sigmas.append(np.concatenate([gyro.scale_sigma, gyro.angle_sigma])[free])
@@ -423,7 +423,7 @@ def test_several_turns_and_a_rate_that_changes() -> None:
     assert found[1] == pytest.approx(before[1], abs=1e-15)
 
 
-def _judge(log: PoseLog, gravity_mps2: float = G, planar: bool = False) -> Verdict:
+def _judge(log: Readings, gravity_mps2: float = G, planar: bool = False) -> Verdict:
     return judge_intrinsics(find_intrinsics(log, gravity_mps2, planar))
 
 
@@ -432,7 +432,7 @@ def _up(pose: Rotation) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def good() -> PoseLog:
+def good() -> Readings:
     return pose_log(sphere_poses(24), SENSOR)
 
 
@@ -461,7 +461,7 @@ def test_a_cap_of_the_sphere_is_unidentifiable() -> None:
 
 
 @pytest.mark.slow
-def test_axes_and_units_that_contradict_are_inconsistent(good: PoseLog) -> None:
+def test_axes_and_units_that_contradict_are_inconsistent(good: Readings) -> None:
     swapped = np.hstack([good.values[:, [1, 0, 2]] * [1, -1, 1], good.values[:, 3:]])
     found = _judge(replace(good, values=swapped))
     assert found.word == "inconsistent"
@@ -477,7 +477,7 @@ def test_axes_and_units_that_contradict_are_inconsistent(good: PoseLog) -> None:
     assert _judge(replace(good, values=other)).word == "inconsistent"
 
 
-def _section(log: PoseLog, planar: bool = False) -> ImuIntrinsics:
+def _section(log: Readings, planar: bool = False) -> ImuIntrinsics:
     section = solve_intrinsics(IntrinsicsInputs(log, G, planar))
     again = Rig.of(yaml.safe_load(Rig(imu_intrinsics=section).text()), "rig.yaml").imu_intrinsics
     assert again is not None and section_json(again) == section_json(section)

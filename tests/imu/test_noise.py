@@ -22,10 +22,10 @@ from calib.stages.imu.allan import (
     spaced,
 )
 from calib.stages.imu.formats import from_kalibr, to_kalibr
-from calib.stages.imu.sampling import regular_parts, rest_parts
+from calib.stages.imu.sampling import AXES, Readings, regular_parts, rest_parts
 from calib.stages.imu.section import Imu as ImuSection
 from calib.stages.imu.stage import solve_static
-from calib.stages.imu.static import AXES, RestLog, analyse_static, judge
+from calib.stages.imu.static import analyse_static, judge
 from calib.twin.sensors import HeadMotion, Imu, draw_imu_noise, measure
 
 IMU = Imu(gyro_scale=(0.0, 0.0, 0.0), accel_scale=(0.0, 0.0, 0.0), mount_angle_rad=0.0)
@@ -36,14 +36,14 @@ def _at_rest(n: int) -> HeadMotion:
     return HeadMotion(zero, zero, zero, np.zeros((n, 2)), np.zeros((n, 2)))
 
 
-def rest_log(imu: Imu, duration_s: float, seed: int, source: str = "log.csv") -> tuple[RestLog, np.ndarray]:
+def rest_log(imu: Imu, duration_s: float, seed: int, source: str = "log.csv") -> tuple[Readings, np.ndarray]:
     """Readings of the simulated sensor, and what its biases are at the end, without the white noise."""
     noise = draw_imu_noise(imu, duration_s, seed)
     force, rate = measure(imu, noise, slice(None), _at_rest(len(noise.taken_s)))
     silent = draw_imu_noise(replace(imu, gyro_noise=0.0, accel_noise=0.0), duration_s, seed)
     end = np.concatenate([silent.gyro[-1], silent.accel[-1] + [9.81, 0.0, 0.0]])
     values = np.concatenate([rate, force], axis=1)
-    return RestLog(source, AXES, noise.stamp_s, values, np.zeros(0), np.zeros(0)), end
+    return Readings(source, AXES, noise.stamp_s, values), end
 
 
 def test_the_simulated_sensor_is_recovered() -> None:
@@ -382,7 +382,7 @@ def _log(n: int = 6000, jitter_s: float = 4e-4, seed: int = 0) -> tuple[np.ndarr
 
 def test_rate_and_jitter() -> None:
     t, values = _log()
-    sampling, parts = regular_parts(t, values, GYRO)
+    sampling, parts = regular_parts(Readings("log", ("gz", "ax"), t, values))
     assert sampling.rate_hz == pytest.approx(100.0, rel=1e-5)
     assert sampling.jitter_s == pytest.approx(4e-4, rel=0.1)
     assert (sampling.gaps, sampling.repeated_rows, sampling.repeated_stamps) == ((), 0, 0)
@@ -395,7 +395,7 @@ def test_a_short_gap_is_filled_and_the_time_axis_kept() -> None:
     t, values = _log(jitter_s=1e-4)
     keep = np.ones(6000, dtype=bool)
     keep[3000:3002] = False
-    sampling, parts = regular_parts(t[keep], values[keep], GYRO)
+    sampling, parts = regular_parts(Readings("log", ("gz", "ax"), t[keep], values[keep]))
     (gap,) = sampling.gaps
     assert (gap.missing, gap.split) == (2, False)
     assert gap.at_s == pytest.approx(29.99, abs=1e-3)
@@ -409,7 +409,7 @@ def test_a_short_gap_is_filled_and_the_time_axis_kept() -> None:
 def test_a_long_gap_splits() -> None:
     t, values = _log()
     t[4000:] += 3600.0
-    sampling, parts = regular_parts(t, values, GYRO)
+    sampling, parts = regular_parts(Readings("log", ("gz", "ax"), t, values))
     assert [gap.split for gap in sampling.gaps] == [True]
     assert [len(part.values) for part in parts] == [4000, 2000]
     assert sampling.duration_s == pytest.approx(60.0, rel=1e-3)
@@ -423,7 +423,7 @@ def _result(axes: tuple[str, ...] = AXES, walk: float = 0.0, n: int = 12_000) ->
     values = 1e-3 * rng.normal(size=(n, len(axes))) + walk * np.cumsum(
         rng.normal(size=(n, len(axes))), axis=0
     )
-    return solve_static([RestLog("a.csv", axes, 0.01 * np.arange(n), values, np.zeros(0), np.zeros(0))])
+    return solve_static([Readings("a.csv", axes, 0.01 * np.arange(n), values)])
 
 
 def test_kalibr_gets_the_worst_axis_in_continuous_time() -> None:

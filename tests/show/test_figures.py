@@ -45,7 +45,8 @@ from calib.stages.camera.plots import plots as camera_plots
 from calib.stages.camera.verdict import Judgement
 from calib.stages.imu.intrinsics import find_intrinsics
 from calib.stages.imu.plots import intrinsics_plots, static_plots
-from calib.stages.imu.static import RestLog, analyse_static
+from calib.stages.imu.sampling import Readings
+from calib.stages.imu.static import analyse_static
 from calib.stages.lowpass.filters import Design, design_lowpass
 from calib.stages.lowpass.plots import plots as lowpass_plots
 from calib.stages.lowpass.stage import Inputs, Positions, positions_from_log
@@ -291,7 +292,7 @@ def _at_rest(axes: tuple[str, ...], stuck: bool = False) -> dict[str, Figure]:
     values = 1e-2 * np.random.default_rng(3).standard_normal((6000, len(axes))) + np.arange(len(axes))
     values[2000:2100, 0] += 0.5 * np.sin(0.1 * np.arange(100))
     values[:, -1] = 0.25 if stuck else values[:, -1]
-    log = RestLog("log.csv", axes, 0.01 * np.arange(6000), values, np.zeros(0), np.zeros(0))
+    log = Readings("log.csv", axes, 0.01 * np.arange(6000), values)
     return static_plots(analyse_static([log]), "poor")
 
 

@@ -17,9 +17,8 @@ from calib.core.arrays import BoolArray, FloatArray
 from calib.core.errors import BadInputError
 from calib.stages.imu.allan import allan_variance
 from calib.stages.imu.mahony import wrapped
-from calib.stages.imu.sampling import Sampling, regular_parts, rest_parts
-from calib.stages.imu.static import is_gyro
-from calib.stages.imu.tracks import DriftLog, Track, Tuned, mean_angle, on_grid, tracks_of
+from calib.stages.imu.sampling import Readings, Sampling, regular_parts, rest_parts
+from calib.stages.imu.tracks import Track, Tuned, mean_angle, on_grid, tracks_of
 
 # ----------------------------------------------------------------------
 # What is said of the error of an angle: its slope with an interval, its lag, its Allan deviation.
@@ -304,7 +303,7 @@ def _no_turns(error: FloatArray) -> FloatArray:
     return np.asarray(smooth - 2.0 * math.pi * np.rint(np.median(smooth) / (2.0 * math.pi)))
 
 
-def _upright(log: DriftLog) -> float:
+def _upright(log: Readings) -> float:
     if "az" not in log.axes:
         return math.nan
     ax, ay, az = (log.values[:, log.axes.index(axis)] for axis in ("ax", "ay", "az"))
@@ -372,7 +371,7 @@ def _measure(
 
 
 def analyse_drift(
-    log: DriftLog,
+    log: Readings,
     tuned: Tuned | None = None,
     peers: bool = True,
     told: Callable[[str], None] = lambda sentence: None,
@@ -389,11 +388,8 @@ def analyse_drift(
     ------
     BadInputError for a log without gz, ax and ay or with too few samples.
     """
-    for axis in ("gz", "ax", "ay"):
-        if axis not in log.axes:
-            raise BadInputError(f"{log.source}: has no readings of {axis}, expected gz, ax and ay")
-    gyro = is_gyro(log.axes)
-    sampling, every = regular_parts(log.t_s, log.values, gyro, log.source, log.repeated_rows)
+    log.places("gz", "ax", "ay")
+    sampling, every = regular_parts(log)
     period_s = sampling.period_s
     parts = tuple(part for part in every if len(part.values) * period_s >= _SHORTEST_S)
     if not parts:
@@ -401,7 +397,7 @@ def analyse_drift(
         raise BadInputError(
             f"{log.source}: is {longest:.3g} s long without a long gap, expected at least {_SHORTEST_S:g} s"
         )
-    _, motions = rest_parts(parts, period_s, gyro, sampling.step)
+    _, motions = rest_parts(parts, period_s, log.gyro, sampling.step)
     moving = []
     for part in parts:
         at = part.t_s + 0.5 * period_s

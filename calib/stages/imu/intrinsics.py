@@ -19,6 +19,7 @@ from calib.solve.clock import Part
 from calib.stages.imu.sampling import (
     MULTIPLES,
     Quiet,
+    Readings,
     Rest,
     Sampling,
     Spread,
@@ -28,7 +29,6 @@ from calib.stages.imu.sampling import (
     sampling_findings,
     spread,
 )
-from calib.stages.imu.static import is_gyro
 
 # ----------------------------------------------------------------------
 # Compiled integration of rates of rotation over many turns.
@@ -830,30 +830,6 @@ _KEPT = 0.9
 
 
 @dataclass(frozen=True)
-class PoseLog:
-    """Readings of a log with rests in many poses.
-
-    Attributes
-    ----------
-    source : name for messages.
-    axes : those of `calib.stages.imu.static.AXES` that it has.
-    t_s : (n,) time stamps that do not go back.
-    values : (n, axes) finite readings.
-    accel_unit, gyro_unit : "m/s2" or "counts", "rad/s" or "counts".
-    repeated_rows : that were written twice and are left out. findings : on the sensors.
-    """
-
-    source: str
-    axes: tuple[str, ...]
-    t_s: FloatArray
-    values: FloatArray
-    accel_unit: str = "m/s2"
-    gyro_unit: str = "rad/s"
-    repeated_rows: int = 0
-    findings: tuple[Finding, ...] = ()
-
-
-@dataclass(frozen=True)
 class Trial:
     """One threshold: how many rests and poses it gives, and their residual with lost freedom counted."""
 
@@ -881,7 +857,7 @@ class Intrinsics:
     has_gyro : whether the log has the gyroscope's axes that are needed.
     """
 
-    log: PoseLog
+    log: Readings
     gravity_mps2: float
     planar: bool
     asked: bool
@@ -918,14 +894,8 @@ def _in_plane(rests: Sequence[Rest], columns: list[int]) -> bool:
     return bool(np.abs(u[:, 2]).max() < _IN_PLANE and apart < _PLANE_SPREAD)
 
 
-def _columns(log: PoseLog, planar: bool) -> list[int]:
-    names = ("ax", "ay") if planar or "az" not in log.axes else ("ax", "ay", "az")
-    missing = [name for name in names if name not in log.axes]
-    if missing:
-        raise BadInputError(
-            f"{log.source}: has no {' and no '.join(missing)}, expected an accelerometer of at least x and y"
-        )
-    return [log.axes.index(name) for name in names]
+def _columns(log: Readings, planar: bool) -> list[int]:
+    return log.places("ax", "ay", *([] if planar or "az" not in log.axes else ["az"]))
 
 
 def _contest(
@@ -961,7 +931,7 @@ def _scatter(values: FloatArray) -> FloatArray:
 
 
 def _turns(
-    log: PoseLog,
+    log: Readings,
     parts: tuple[Part, ...],
     rests: tuple[Rest, ...],
     columns: list[int],
@@ -1011,7 +981,7 @@ def _turns(
     return turns, lost
 
 
-def find_intrinsics(log: PoseLog, gravity_mps2: float = 9.80665, planar: bool = False) -> Intrinsics:
+def find_intrinsics(log: Readings, gravity_mps2: float = 9.80665, planar: bool = False) -> Intrinsics:
     """Calibrate an accelerometer, and a gyroscope where the log has one.
 
     Parameters
@@ -1025,9 +995,8 @@ def find_intrinsics(log: PoseLog, gravity_mps2: float = 9.80665, planar: bool = 
     BadInputError for a log without the accelerometer's axes, shorter than a second, or never at rest.
     """
     columns = _columns(log, planar)
-    gyro_axes = is_gyro(log.axes)
-    sampling, parts = regular_parts(log.t_s, log.values, gyro_axes, log.source, log.repeated_rows)
-    si = log.accel_unit != "counts"
+    sampling, parts = regular_parts(log)
+    si = "a" not in log.counts
     s = spread(parts, columns, sampling.period_s)
     quiet = quiet_level(s, sampling.step[columns])
     asked, lean = planar, math.nan
@@ -1054,7 +1023,7 @@ def find_intrinsics(log: PoseLog, gravity_mps2: float = 9.80665, planar: bool = 
     if has_gyro and accel is not None and accel.span >= LEAST_SPAN:
         turns, lost = _turns(log, parts, rests, columns, quiet, sampling.period_s)
         if len(turns.first):
-            gyro_si = log.gyro_unit != "counts"
+            gyro_si = "g" not in log.counts
             gyro = fit_gyroscope(turns, accel, gyro_si)
             foreign = foreign_axes(turns, accel, gyro, gyro_si)
     return Intrinsics(
@@ -1141,7 +1110,7 @@ def _name(accel: Accelerometer, place: int) -> str:
 
 def _of_accelerometer(result: Intrinsics, accel: Accelerometer) -> Iterator[Finding]:
     d, g = len(accel.bias), result.gravity_mps2
-    if result.log.accel_unit == "m/s2" or accel.span >= LEAST_SPAN:
+    if "a" not in result.log.counts or accel.span >= LEAST_SPAN:
         yield from _sides(accel)
     if accel.span < LEAST_SPAN:
         mixed = np.flatnonzero(np.abs(accel.weakest) > 0.3).tolist()
@@ -1193,7 +1162,7 @@ def _of_accelerometer(result: Intrinsics, accel: Accelerometer) -> Iterator[Find
             f"{r[worst] / max(others, 1e-12):.0f} times what the others are",
             "look at that rest: something pushed the sensor, or it crept",
         )
-    if result.log.accel_unit == "m/s2":
+    if "a" not in result.log.counts:
         off = float(np.abs(accel.scale - 1.0).max())
         if off > _OFF_SCALE:
             yield Finding(
@@ -1244,7 +1213,7 @@ def _of_gyroscope(result: Intrinsics, gyro: Gyroscope) -> Iterator[Finding]:
         )
     used = np.isfinite(gyro.scale)
     off = gyro.scale[used][int(np.argmax(np.abs(gyro.scale[used] - 1.0)))]
-    if result.log.gyro_unit == "rad/s" and abs(off - 1.0) > _OFF_SCALE:
+    if "g" not in result.log.counts and abs(off - 1.0) > _OFF_SCALE:
         yield Finding(
             "inconsistent",
             f"a scale of the gyroscope comes out as {off:.3g}, so its readings are not in the unit that was "
@@ -1285,7 +1254,7 @@ def _of_gyroscope(result: Intrinsics, gyro: Gyroscope) -> Iterator[Finding]:
 
 def _of_log(result: Intrinsics) -> Iterator[Finding]:
     """Findings on how the log was sampled, and on its start."""
-    si = result.log.accel_unit == "m/s2" and result.log.gyro_unit == "rad/s"
+    si = not result.log.counts
     yield from sampling_findings(result.sampling, result.log.axes if si else ())
     if result.turns_lost:
         yield Finding("remark", f"{result.turns_lost} turn(s) not used: readings are missing in them")

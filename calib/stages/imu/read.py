@@ -25,17 +25,16 @@ from calib.io.logs import IMU, IN_PLANE, Log, Signals, log_of
 from calib.solve.clock import Part
 from calib.stages.actuator.kinematics import MARKER_OFFSET_M
 from calib.stages.camera.model import Camera, undistort
-from calib.stages.imu.intrinsics import PoseLog
-from calib.stages.imu.mahony import accelerometer_angles
 from calib.stages.imu.sampling import (
+    AXES,
     MOST_GYRO_RADPS,
+    Readings,
     Sampling,
     quiet_spread,
     regular_parts,
     sampling_findings,
 )
-from calib.stages.imu.static import AXES, RestLog, is_gyro
-from calib.stages.imu.tracks import DriftLog, on_grid, planar_rate, up_vector
+from calib.stages.imu.tracks import angle_of, on_grid, rate_of
 from calib.stages.imu.tuning import DATA_SHEET, SHORTEST_S, Noise, Piece, smooth_log
 
 _AXIS = dict(zip(IMU, AXES, strict=True))
@@ -68,17 +67,23 @@ def _angle(log: Log, name: str) -> tuple[FloatArray, FloatArray]:
     return log.t_s[rows], log.columns[name][rows] if len(rows) else np.zeros(0)
 
 
-def rest_log(log: Log) -> RestLog:
+def rest_log(log: Log) -> Readings:
     """The IMU's readings of a log at rest. Raises `BadInputError` for readings that never change."""
     signals = _readings(log)
     if signals.stuck == signals.names:
         raise BadInputError(
             f"{log.source}: no IMU reading ever changes ({', '.join(signals.names)}), expected noise"
         )
-    axes = tuple(_AXIS[name] for name in signals.names)
-    return RestLog(
-        log.source, axes, signals.stamps_s, signals.values, *_angle(log, "onchip_phi_rad"),
-        signals.repeated_rows, signals.findings,
+    return _of(log, signals)
+
+
+def _of(log: Log, signals: Signals, *findings: Finding) -> Readings:
+    """Signals of a log with the angles beside them."""
+    units = {_AXIS[name][0] for name in signals.names if log.unit(name) == "counts"}
+    return Readings(
+        log.source, tuple(_AXIS[name] for name in signals.names), signals.stamps_s, signals.values,
+        *_angle(log, "onchip_phi_rad"), *_angle(log, "true_phi_rad"),
+        signals.repeated_rows, (*findings, *signals.findings), "".join(sorted(units)),
     )  # fmt: skip
 
 
@@ -136,7 +141,7 @@ def lag_of(late_t_s: FloatArray, late_rad: FloatArray, t_s: FloatArray, phi_rad:
     return float(_LAGS_S[k] + (0.5 * 0.001 * (a - c) / bend if bend > 0.0 else 0.0))
 
 
-def drift_log(log: Log) -> DriftLog:
+def drift_log(log: Log) -> Readings:
     """The IMU's readings and the angles of a log in which it may move.
 
     Raises `BadInputError` for a log without gz, ax and ay, and where one of these never changes.
@@ -149,12 +154,7 @@ def drift_log(log: Log) -> DriftLog:
         )
         for name in signals.stuck
     )
-    kept = signals.without(*signals.stuck)
-    return DriftLog(
-        log.source, tuple(_AXIS[name] for name in kept.names), kept.stamps_s, kept.values,
-        *_angle(log, "onchip_phi_rad"), *_angle(log, "true_phi_rad"),
-        kept.repeated_rows, (*left_out, *kept.findings),
-    )  # fmt: skip
+    return _of(log, signals.without(*signals.stuck), *left_out)
 
 
 # ----------------------------------------------------------------------
@@ -232,7 +232,7 @@ def sensor_noise(rig: Rig, logs: Sequence[TuneLog]) -> tuple[Noise, str]:
     return DATA_SHEET, "a data sheet"
 
 
-def _wanted(log: Log, read: DriftLog, how: Reading) -> str:
+def _wanted(log: Log, read: Readings, how: Reading) -> str:
     """Which reference the log is judged by."""
     seen = len(log.sampled("u_px", "v_px")) >= _TUNELOGS_FEWEST
     has = {
@@ -267,23 +267,12 @@ def _camera_angle(log: Log, how: Reading) -> tuple[FloatArray, FloatArray]:
     return log.t_s[rows][known], phi[known]
 
 
-def _rate(part: Part, axes: tuple[str, ...], period_s: float, tilted: bool) -> FloatArray:
-    def column(name: str) -> FloatArray:
-        return part.values[:, axes.index(name)]
-
-    if not tilted:
-        return np.asarray(-column("gz"))
-    gyro = np.stack([column(f"g{x}") for x in "xyz"], axis=1)
-    force = np.stack([column(f"a{x}") for x in "xyz"], axis=1)
-    return planar_rate(gyro, up_vector(force, gyro, period_s))
-
-
-def _turns_in_plane(part: Part, axes: tuple[str, ...], period_s: float, quiet_radps: float) -> bool:
+def _turns_in_plane(part: Part, axes: tuple[str, ...], quiet_radps: float) -> bool:
     """Whether -gz is the up vector's rate, as far as six axes show it; True where there are fewer."""
     if len(axes) < 6:
         return True
-    plane = _rate(part, axes, period_s, tilted=False)
-    apart = float((_rate(part, axes, period_s, tilted=True) - plane).std())
+    plane = rate_of(part, axes, False)
+    apart = float((rate_of(part, axes, True) - plane).std())
     least = 3.0 * quiet_radps if quiet_radps < MOST_GYRO_RADPS else 0.0
     return apart <= max(_APART * float(plane.std()), least)
 
@@ -301,8 +290,7 @@ def _lag(
     if len(rate) * period_s < SHORTEST_S + period_s:
         return 0.0
     t = part.t_s
-    ax, ay = (np.ascontiguousarray(part.values[:, axes.index(name)]) for name in ("ax", "ay"))
-    own = smooth_log(t, accelerometer_angles(ax, ay), rate, DATA_SHEET.gyro, DATA_SHEET.walk)
+    own = smooth_log(t, angle_of(part, axes), rate, DATA_SHEET.gyro, DATA_SHEET.walk)
     # A rate that holds for the step before its sample is half a step ahead.
     return lag_of(seen[0], np.unwrap(seen[1]), t, own.phi_rad - 0.5 * period_s * rate)
 
@@ -322,7 +310,7 @@ def tune_log(log: Log, how: Reading) -> TuneLog:
         raise BadInputError(
             f"{log.source}: has no readings of {', '.join(lacking)}, expected all six axes for --rate up"
         )
-    sampling, parts = regular_parts(read.t_s, read.values, is_gyro(read.axes), log.source, read.repeated_rows)
+    sampling, parts = regular_parts(read)
     period = sampling.period_s
     said += [one.text for one in sampling_findings(sampling, read.axes, log.source)]
     kept = [part for part in parts if len(part.values) * period >= _SHORTEST_S]
@@ -344,17 +332,16 @@ def tune_log(log: Log, how: Reading) -> TuneLog:
         seen = _camera_angle(log, how)
     pieces = []
     references: tuple[FloatArray | None, ...] = (None,) * len(kept)
-    rates = [_rate(part, read.axes, period, how.tilted) for part in kept]
+    rates = [rate_of(part, read.axes, how.tilted) for part in kept]
     if seen is not None:
         if named != "truth":
             lag = _lag(seen, kept, rates, read.axes, period)
         references = on_grid(seen[0] - lag, seen[1], kept, period)
     for part, rate, reference in zip(kept, rates, references, strict=True):
-        ax, ay = (np.ascontiguousarray(part.values[:, read.axes.index(name)]) for name in ("ax", "ay"))
         t = part.t_s - part.t_s[0]
         known = reference is not None and int(np.isfinite(reference).sum()) >= _TUNELOGS_FEWEST
-        flat = how.tilted or _turns_in_plane(part, read.axes, period, quiet)
-        angles = accelerometer_angles(ax, ay)
+        flat = how.tilted or _turns_in_plane(part, read.axes, quiet)
+        angles = angle_of(part, read.axes)
         pieces.append(Piece(log.source, t, angles, rate, reference if known else None, flat))
     if not all(piece.in_plane for piece in pieces):
         said.append(
@@ -374,7 +361,7 @@ def tune_log(log: Log, how: Reading) -> TuneLog:
 _MOST_BYTES = 1 << 25
 
 
-def pose_log(log: Log, planar: bool = False) -> PoseLog:
+def pose_log(log: Log, planar: bool = False) -> Readings:
     """The IMU's readings of a log in many poses, counts as they are; `planar` keeps what lies in the plane.
 
     Raises `BadInputError` for a log without an accelerometer, and with an axis that never changes.
@@ -385,17 +372,7 @@ def pose_log(log: Log, planar: bool = False) -> PoseLog:
         signals = signals.without("gx_radps", "gy_radps", *({"az_mps2"} & set(signals.stuck)))
     hint = "" if planar else "; give --planar to do without az, gx and gy"
     signals.refuse_stuck(*signals.names, hint=hint)
-    raw = {name for name in signals.names if log.unit(name) == "counts"}
-    return PoseLog(
-        log.source,
-        tuple(_AXIS[name] for name in signals.names),
-        signals.stamps_s,
-        signals.values,
-        "counts" if raw & set(ACCEL) else "m/s2",
-        "counts" if raw & set(GYRO) else "rad/s",
-        signals.repeated_rows,
-        signals.findings,
-    )
+    return _of(log, signals)
 
 
 def _unpacked(path: Path) -> bytes:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -24,6 +24,53 @@ _G = 9.80665
 _GYRO_RANGES = tuple(math.radians(r) for r in (125.0, 250.0, 500.0, 1000.0, 2000.0, 4000.0))
 _ACCEL_RANGES = tuple(g * _G for g in (2.0, 4.0, 8.0, 16.0, 32.0))
 _AT_LIMIT_IN_A_ROW = 3
+
+
+AXES = ("gx", "gy", "gz", "ax", "ay", "az")
+"""Rates of rotation [rad/s] and specific forces [m/s^2] by name."""
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Readings of a log's IMU.
+
+    Attributes
+    ----------
+    source : name for messages.
+    axes : those of `AXES` that it has.
+    t_s : (n,) time stamps that do not go back.
+    values : (n, axes) finite readings, rad/s and m/s^2 unless `counts` says otherwise.
+    onchip_t_s, onchip_phi_rad : (k,) the chip's own angle, empty where it is not logged.
+    true_t_s, true_phi_rad : (m,) the true angle, likewise.
+    repeated_rows : that were written twice and are left out. findings : on the sensors.
+    counts : kinds of axes, "a" and "g", whose readings are in counts.
+    """
+
+    source: str
+    axes: tuple[str, ...]
+    t_s: FloatArray
+    values: FloatArray
+    onchip_t_s: FloatArray = field(default_factory=lambda: np.zeros(0))
+    onchip_phi_rad: FloatArray = field(default_factory=lambda: np.zeros(0))
+    true_t_s: FloatArray = field(default_factory=lambda: np.zeros(0))
+    true_phi_rad: FloatArray = field(default_factory=lambda: np.zeros(0))
+    repeated_rows: int = 0
+    findings: tuple[Finding, ...] = ()
+    counts: str = ""
+
+    @property
+    def gyro(self) -> BoolArray:
+        """Which of the axes are rates of rotation."""
+        return np.array([axis.startswith("g") for axis in self.axes])
+
+    def places(self, *axes: str) -> list[int]:
+        """Columns of these axes. Raises `BadInputError` where one is missing."""
+        lacking = [axis for axis in axes if axis not in self.axes]
+        if lacking:
+            raise BadInputError(
+                f"{self.source}: has no {' and no '.join(lacking)}, expected {', '.join(axes)}"
+            )
+        return [self.axes.index(axis) for axis in axes]
 
 
 @dataclass(frozen=True)
@@ -136,27 +183,19 @@ def _at_limit(values: FloatArray, gyro: bool) -> int:
     return count
 
 
-def regular_parts(
-    t_s: FloatArray, values: FloatArray, gyro: BoolArray, source: str = "log", repeated_rows: int = 0
-) -> tuple[Sampling, tuple[Part, ...]]:
+def regular_parts(log: Readings) -> tuple[Sampling, tuple[Part, ...]]:
     """Readings at even steps, in parts without long gaps, and how they were sampled.
-
-    Parameters
-    ----------
-    t_s : (n,) time stamps that do not go back.
-    values : (n, axes) finite readings.
-    gyro : (axes,) which axes are rates of rotation; the others are specific forces.
-    repeated_rows : that were written twice and left out before.
 
     Raises
     ------
     BadInputError for fewer than two samples, and for stamps that are all the same.
     """
+    t_s, values = log.t_s, log.values
     if len(t_s) < 2:
-        raise BadInputError(f"{source}: has {len(t_s)} IMU sample(s), expected a log at rest")
+        raise BadInputError(f"{log.source}: has {len(t_s)} IMU sample(s), expected a log at rest")
     axis = time_axis(t_s)
     if not axis.period_s > 0.0:
-        raise BadInputError(f"{source}: all {len(t_s)} IMU samples have the time {t_s[0]:g} s")
+        raise BadInputError(f"{log.source}: all {len(t_s)} IMU samples have the time {t_s[0]:g} s")
     parts = axis.parts(values)
     sampling = Sampling(
         samples=len(t_s),
@@ -165,12 +204,12 @@ def regular_parts(
         rate_hz=axis.rate_hz,
         jitter_s=axis.jitter_s,
         steady=axis.steady,
-        repeated_rows=repeated_rows,
+        repeated_rows=log.repeated_rows,
         repeated_stamps=axis.repeated,
         gaps=axis.gaps,
         step=np.array([_step(column) for column in values.T]),
         at_limit=np.array(
-            [_at_limit(column, bool(g)) for column, g in zip(values.T, gyro, strict=True)], dtype=np.int64
+            [_at_limit(column, bool(g)) for column, g in zip(values.T, log.gyro, strict=True)], dtype=np.int64
         ),
     )
     return sampling, parts

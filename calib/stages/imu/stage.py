@@ -20,8 +20,9 @@ if TYPE_CHECKING:
     from calib.core.words import Block
     from calib.core.writing import Kind
     from calib.stages.imu.drift import LogDrift, Measures
-    from calib.stages.imu.intrinsics import Gyroscope, Intrinsics, PoseLog
+    from calib.stages.imu.intrinsics import Gyroscope, Intrinsics
     from calib.stages.imu.read import TuneLog
+    from calib.stages.imu.sampling import Readings
     from calib.stages.imu.section import (
         AccelIntrinsics,
         Drift,
@@ -35,8 +36,8 @@ if TYPE_CHECKING:
         ImuLog,
         OrientationFilter,
     )
-    from calib.stages.imu.static import AxisNoise, RestLog, StaticLog
-    from calib.stages.imu.tracks import DriftLog, Tuned
+    from calib.stages.imu.static import AxisNoise, StaticLog
+    from calib.stages.imu.tracks import Tuned
     from calib.stages.imu.tuning import AngleFilter, Candidate, Noise, Tuning
 
 _SAME_RATE = 0.02
@@ -48,7 +49,7 @@ def _degrees(value: float) -> float | None:
     return finite_or_none(math.degrees(value))
 
 
-def _of_sensors(logs: Sequence[RestLog | DriftLog | TuneLog]) -> Iterator[Finding]:
+def _of_sensors(logs: Sequence[Readings | TuneLog]) -> Iterator[Finding]:
     """Findings on the sensors of logs, which are named."""
     for log in logs:
         for one in log.findings:
@@ -89,7 +90,7 @@ _SENSORS = (
 """First letter of a sensor's axes, and its keys: mean, then N, B and K, then the step."""
 
 
-def _read_static(files: Files, rig: Rig, options: LogOptions) -> list[RestLog]:
+def _read_static(files: Files, rig: Rig, options: LogOptions) -> list[Readings]:
     from calib.io.logs import read_log
     from calib.stages.imu.read import rest_log
 
@@ -99,7 +100,7 @@ def _read_static(files: Files, rig: Rig, options: LogOptions) -> list[RestLog]:
     return [replace(log, source=files.taken(path)) for path, log in read]
 
 
-def solve_static(logs: Sequence[RestLog]) -> Imu:
+def solve_static(logs: Sequence[Readings]) -> Imu:
     """Find bias, noise and drift, judge them, and assemble the section."""
     import numpy as np
 
@@ -248,7 +249,7 @@ class IntrinsicsOptions(LogOptions):
 class IntrinsicsInputs:
     """A log of rests in many poses, gravity there, and whether x, y and gz alone are calibrated."""
 
-    log: PoseLog
+    log: Readings
     gravity_mps2: float = 9.80665
     planar: bool = False
 
@@ -330,7 +331,7 @@ def _accelerometer(result: Intrinsics) -> AccelIntrinsics:
     from calib.stages.imu.intrinsics import ANGLES, LEAST_SPAN
     from calib.stages.imu.section import AccelIntrinsics, IntrinsicsSigma
 
-    unit: Literal["m/s2", "counts"] = "counts" if result.log.accel_unit == "counts" else "m/s2"
+    unit: Literal["m/s2", "counts"] = "counts" if "a" in result.log.counts else "m/s2"
     accel = result.accel
     if accel is None or accel.span < LEAST_SPAN:
         unknown = _three(np.full(3, math.nan))
@@ -366,7 +367,7 @@ def _gyroscope(result: Intrinsics, gyro: Gyroscope) -> GyroIntrinsics:
     angle_known = np.isfinite(gyro.angle_sigma) & (result.foreign is None)
     bias, names = gyro.bias, tuple(GYRO_ANGLES)
     return GyroIntrinsics(
-        unit="counts" if result.log.gyro_unit == "counts" else "rad/s",
+        unit="counts" if "g" in result.log.counts else "rad/s",
         bias=_three(np.where(used, bias.bias, math.nan)),
         scale=_three(np.where(known, gyro.scale, math.nan)),
         misalignment_rad=_named(names, np.where(angle_known, gyro.angles, math.nan)),
@@ -694,7 +695,7 @@ class DriftOptions(LogOptions):
 class DriftInputs:
     """Logs, their hashes, the rig's gains, and whether filters of others run."""
 
-    logs: Sequence[DriftLog]
+    logs: Sequence[Readings]
     hashes: dict[str, str]
     tuned: Tuned | None
     peers: bool

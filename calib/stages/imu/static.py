@@ -14,7 +14,7 @@ from calib.core.errors import BadInputError
 from calib.core.verdict import Finding, Severity, Verdict
 from calib.solve.clock import Part
 from calib.stages.imu.allan import LEAST_SAMPLES, Allan, analyse, model_variance
-from calib.stages.imu.sampling import Motion, Sampling, regular_parts, rest_parts, sampling_findings
+from calib.stages.imu.sampling import Motion, Readings, Sampling, regular_parts, rest_parts, sampling_findings
 
 # ----------------------------------------------------------------------
 # An inertial sensor at rest: bias, noise, drift of its angle, and whether the log was at rest at all.
@@ -41,36 +41,9 @@ from calib.stages.imu.sampling import Motion, Sampling, regular_parts, rest_part
 # differences of that log over as long, so that noise, flicker and a random walk, whatever their size, are
 # none; and it matters to an angle.
 
-AXES = ("gx", "gy", "gz", "ax", "ay", "az")
-"""Rates of rotation [rad/s] and specific forces [m/s^2] by name."""
-
 _SAME_RATE = 0.02
 _STRETCHES = 8
 _MEAN_FLICKER = 2.0 * math.log(2.0) / math.pi
-
-
-@dataclass(frozen=True)
-class RestLog:
-    """Readings of a log that claims to be at rest.
-
-    Attributes
-    ----------
-    source : name for messages.
-    axes : those of `AXES` that it has.
-    t_s : (n,) time stamps that do not go back.
-    values : (n, axes) finite readings, rad/s and m/s^2.
-    onchip_t_s, onchip_phi_rad : (k,) the chip's own angle, empty where it is not logged.
-    repeated_rows : that were written twice and are left out. findings : on the sensors.
-    """
-
-    source: str
-    axes: tuple[str, ...]
-    t_s: FloatArray
-    values: FloatArray
-    onchip_t_s: FloatArray
-    onchip_phi_rad: FloatArray
-    repeated_rows: int = 0
-    findings: tuple[Finding, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -153,11 +126,6 @@ class Static:
     noise: tuple[AxisNoise, ...]
 
 
-def is_gyro(axes: Sequence[str]) -> BoolArray:
-    """Which of the axes are rates of rotation."""
-    return np.array([axis.startswith("g") for axis in axes])
-
-
 def _slope(t_s: FloatArray, angle_rad: FloatArray) -> Drift | None:
     if len(t_s) < 4 * _STRETCHES or t_s[-1] <= t_s[0]:
         return None
@@ -172,10 +140,9 @@ def _slope(t_s: FloatArray, angle_rad: FloatArray) -> Drift | None:
     return Drift(slope, float(pieces.std(ddof=1) / math.sqrt(_STRETCHES)))
 
 
-def _rest_of(log: RestLog) -> StaticLog:
-    gyro = is_gyro(log.axes)
-    sampling, parts = regular_parts(log.t_s, log.values, gyro, log.source, log.repeated_rows)
-    still, motions = rest_parts(parts, sampling.period_s, gyro, sampling.step)
+def _rest_of(log: Readings) -> StaticLog:
+    sampling, parts = regular_parts(log)
+    still, motions = rest_parts(parts, sampling.period_s, log.gyro, sampling.step)
     samples = sum(len(part.values) for part in still)
     if max((len(part.values) for part in still), default=0) < LEAST_SAMPLES:
         if motions:
@@ -189,7 +156,7 @@ def _rest_of(log: RestLog) -> StaticLog:
     if not motions:
         onchip = _slope(log.onchip_t_s, log.onchip_phi_rad)
     rest_s = samples * sampling.period_s
-    steps = bias_steps(still, sampling.period_s, gyro)
+    steps = bias_steps(still, sampling.period_s, log.gyro)
     return StaticLog(log.source, sampling, still, motions, rest_s, mean, steps, None, onchip)
 
 
@@ -292,7 +259,7 @@ def _span_s(log: StaticLog, period_s: float) -> float:
     return float(last.t_s[-1] - log.parts[0].t_s[0]) + period_s
 
 
-def analyse_static(logs: Sequence[RestLog]) -> Static:
+def analyse_static(logs: Sequence[Readings]) -> Static:
     """Bias, noise and drift from logs at rest.
 
     Raises
