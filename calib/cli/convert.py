@@ -65,11 +65,11 @@ def convert(
     names = tuple(block.columns)
     rows, blank, truncated, wraps = 0, 0, False, 0
     with (
-        states_writer(output, ("t_s", *names), LOG) as writer,
+        states_writer(output, ("t_s", *names), LOG) as add,
         progress_bar(f"converting {log.name}") as progress,
     ):
         while True:
-            writer.add(np.column_stack([block.t_s, *(block.columns[name] for name in names)]))
+            add(np.column_stack([block.t_s, *(block.columns[name] for name in names)]))
             rows, blank, truncated = rows + len(block), blank + block.not_finite, block.truncated
             wraps += block.wraps
             progress(rows, 0)

@@ -206,7 +206,6 @@ class Figure:
     height_in : of the panels together, in inches at a width of `WIDTH_IN`.
     columns : in which the panels stand, row by row. mosaic : rows of letters, A for the first panel, where
         panels take several places, such as ("AB", "AC"). widths, heights : of columns and rows, relative.
-    coarse : of which there are many, as one for each log.
     """
 
     title: str
@@ -218,7 +217,13 @@ class Figure:
     mosaic: tuple[str, ...] = ()
     widths: tuple[float, ...] = ()
     heights: tuple[float, ...] = ()
-    coarse: bool = False
+
+    @property
+    def rows(self) -> tuple[str, ...]:
+        """A letter for each place of each row, A for the first panel, "." where there is none."""
+        names = "".join(chr(ord("A") + k) for k in range(len(self.panels)))
+        names += "." * (-len(names) % self.columns)
+        return self.mosaic or tuple(names[k : k + self.columns] for k in range(0, len(names), self.columns))
 
 
 def rectangle(left: float, top: float, width: float, height: float) -> FloatArray:

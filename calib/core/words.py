@@ -28,7 +28,9 @@ UNITS = {
     "_radps_per_sqrt_Hz": "rad/s/√Hz",
     "_mps3_per_sqrt_Hz": "m/s³/√Hz",
     "_mps2_per_sqrt_Hz": "m/s²/√Hz",
+    "_degps_per_sqrt_Hz": "°/s/√Hz",
     "_degps_per_sqrt_hz": "°/s/√Hz",
+    "_deg_per_sqrt_Hz": "°/√Hz",
     "_deg_per_sqrt_hz": "°/√Hz",
     "_rad_per_sqrt_s": "rad/√s",
     "_rad_per_sqrt_Hz": "rad/√Hz",
@@ -150,19 +152,25 @@ def facts(section: BaseModel) -> list[tuple[str, str]]:
         unit, scale, places = _shown(key, field)
         if isinstance(wanted, list):
             for item in wanted:
-                name = _AXES[item] if isinstance(item, int) else as_words(str(item))
+                name = _AXES[item] if isinstance(item, int) else as_words(str(item)).replace("max", "at most")
                 one = value[item] if isinstance(item, int) else _item(value, str(item))
                 own = unit or unit_of(str(item))
                 bars = _sigma(sigmas, key)
                 bar = bars[item] if isinstance(bars, list) and isinstance(item, int) else None
-                (text,) = _vector([one], [bar], scale, places)
-                out.append((f"{field.title} {name}", f"{text} {own}".strip()))
+                out.append((f"{field.title}, {name}", f"{_fact(one, bar, scale, places)} {own}".strip()))
         elif wanted and isinstance(value, bool | str):
             out.append((str(field.title), _word(value)))
         elif wanted:
-            (text,) = _vector([value], [_sigma(sigmas, key)], scale, places)
+            text = _fact(value, _sigma(sigmas, key), scale, places)
             out.append((str(field.title), f"{text} {unit}".strip()))
     return [(label, text) for label, text in out if not text.startswith(BLANK)]
+
+
+def _fact(value: Any, bar: Any, scale: float, places: int | None) -> str:
+    """A value with its deviation; to four digits where nothing says how many it has."""
+    if isinstance(value, float) and math.isfinite(value) and bar is None and places is None:
+        return f"{scale * value:{'.0f' if 1e3 <= abs(scale * value) < 1e7 else '.4g'}}"
+    return _vector([value], [bar], scale, places)[0]
 
 
 def _item(value: Any, name: str) -> Any:

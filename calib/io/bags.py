@@ -355,25 +355,6 @@ def _stamp(message: Any) -> int | None:
     return whole if 0 < whole < 2**63 else None
 
 
-@dataclass
-class _Sorter:
-    """Rows that wait for earlier ones."""
-
-    stamps: IntArray
-    values: FloatArray
-
-    def take(self, stamps: IntArray, values: FloatArray, last: bool) -> tuple[IntArray, FloatArray]:
-        """Add rows; those that nothing can precede any more, all at the end."""
-        stamps, values = np.concatenate([self.stamps, stamps]), np.concatenate([self.values, values])
-        order = np.argsort(stamps, kind="stable")
-        stamps, values = stamps[order], values[order]
-        ready = len(stamps)
-        if not last and ready:
-            ready = int(np.searchsorted(stamps, stamps[-1] - int(WINDOW_S * 1e9)))
-        self.stamps, self.values = stamps[ready:], values[ready:]
-        return stamps[:ready], values[:ready]
-
-
 def _merged(stamps: IntArray, values: FloatArray) -> tuple[IntArray, FloatArray]:
     """Rows of one stamp as one, where no column has two values; rows are sorted."""
     if len(stamps) < 2 or not np.any(stamps[1:] == stamps[:-1]):
@@ -420,7 +401,6 @@ def rows_from_messages(source: str, stream: Source, topics: TopicMap) -> Iterato
     Raises `BadInputError` for a message without an expected field.
     """
     columns = topics.columns
-    sorter = _Sorter(np.empty(0, dtype=np.int64), np.empty((0, len(columns))))
     start, first = None, 1
 
     def made(stamps: IntArray, values: FloatArray) -> Block:
@@ -435,14 +415,17 @@ def rows_from_messages(source: str, stream: Source, topics: TopicMap) -> Iterato
         named = {name: np.ascontiguousarray(values[:, k]) for k, name in enumerate(columns)}
         return Block({"t_s": t_s, **named}, lines, infinite)
 
+    stamps, values = np.empty(0, dtype=np.int64), np.empty((0, len(columns)))
     try:
-        waiting = (sorter.stamps, sorter.values)
-        for following in _chunks(source, stream, topics):
-            block = made(*sorter.take(*waiting, False))
-            if len(block.lines):
-                yield block
-            waiting = following
-        yield replace(made(*sorter.take(*waiting, True)), truncated=stream.truncated)
+        for more, others in _chunks(source, stream, topics):
+            # Rows that nothing can precede any more.
+            ready = int(np.searchsorted(stamps, stamps[-1] - int(WINDOW_S * 1e9))) if len(stamps) else 0
+            if ready:
+                yield made(stamps[:ready], values[:ready])
+            stamps, values = np.concatenate([stamps[ready:], more]), np.concatenate([values[ready:], others])
+            order = np.argsort(stamps, kind="stable")
+            stamps, values = stamps[order], values[order]
+        yield replace(made(stamps, values), truncated=stream.truncated)
     except OverflowError as error:
         raise BadInputError(f"{source}: has a time that is none: {error}") from error
 

@@ -120,29 +120,9 @@ def _sharpness(gray: GrayImage) -> float:
 
 
 def _of_video(path: Path) -> Iterator[GrayImage]:
-    check_readable(path)
-    video = cv2.VideoCapture(str(path), cv2.CAP_ANY)
-    try:
-        # As with pictures, the sensor's own pixels count, however the camera was held.
-        video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
-        if not video.isOpened():
-            raise BadInputError(f"{shown(path)}: is not a video that can be read")
-        while True:
-            there, frame = video.read()
-            if not there:
-                return
-            if frame.shape[0] * frame.shape[1] > _MOST_PIXELS:
-                raise BadInputError(
-                    f"{shown(path)}: its frames have more than {_MOST_PIXELS // 1_000_000} million pixels"
-                )
-            yield _gray(frame)
-    finally:
-        video.release()
-
-
-def _gray(frame: np.ndarray[Any, Any]) -> GrayImage:
-    gray = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-    return np.asarray(gray, dtype=np.uint8)
+    for frame in timed_frames(path)[1]:
+        gray = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+        yield np.asarray(gray, dtype=np.uint8)
 
 
 # ----------------------------------------------------------------------
@@ -203,7 +183,9 @@ def timed_frames(source: Path | int | str) -> tuple[Times, Iterator[np.ndarray[A
     video = cv2.VideoCapture()
     video.open(str(source) if isinstance(source, Path) else source)
     if not video.isOpened():
-        raise BadInputError(f"{name}: is not a video or a camera that can be opened")
+        what = "video that can be read" if isinstance(source, Path) else "camera that can be opened"
+        raise BadInputError(f"{name}: is not a {what}")
+    # As with pictures, the sensor's own pixels count, however the camera was held.
     video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
     times = Times(not isinstance(source, Path), float(video.get(cv2.CAP_PROP_FPS)))
 

@@ -50,7 +50,7 @@ from calib.io.columns import (
     settled,
     turning,
 )
-from calib.io.tables import open_text, parquet_blocks, text_blocks
+from calib.io.tables import GENERAL, TIME, open_text, parquet_blocks, table_bytes, text_blocks
 from calib.solve.clock import TimeAxis, time_axis
 
 _MOST_CELLS = 200_000_000
@@ -309,11 +309,9 @@ def log_text(log: Log) -> str:
 
     The columns come in the order of `COLUMNS`. The same log gives the same text.
     """
-    from calib.io.cells import GENERAL, TIME, table_bytes
-
     names = [name for name in COLUMNS if name in log.columns]
     values = np.column_stack([log.t_s, *(log.columns[name] for name in names)])
-    kinds = np.array([TIME] + [GENERAL] * len(names))
+    kinds = [TIME] + [GENERAL] * len(names)
     return ",".join(["t_s", *names]) + "\n" + table_bytes(values, kinds).decode()
 
 

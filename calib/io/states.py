@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import IO, Any, Protocol
+from typing import IO, Any
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError, pip_install
 from calib.core.files import shown
 from calib.core.writing import Kind, column_names, head, replacing
+from calib.io.tables import GENERAL, TIME, WHOLE, table_bytes
 
 # ----------------------------------------------------------------------
 # States as MCAP: JSON messages that Foxglove and PlotJuggler show without a plug-in.
@@ -25,6 +26,9 @@ from calib.core.writing import Kind, column_names, head, replacing
 # frame `world` of `calib.stages.actuator.kinematics` (x to the right, y along the straight actuator): a
 # turn by
 # -phi about z takes the head's frame at rest to the one now. Time is that of the log, from its zero.
+
+Add = Callable[[FloatArray], None]
+"""Adds rows (n, columns) to a file that is being written."""
 
 STATES_TOPIC, HEAD = "/states", "/head"
 
@@ -56,63 +60,50 @@ def _cell(value: float) -> str:
     return f"{value:.9g}" if math.isfinite(value) else "null"
 
 
-class McapStates:
-    """A states file in MCAP, chunk by chunk; the same rows give the same bytes.
+@contextmanager
+def _mcap(path: Path, stream: IO[bytes], names: tuple[str, ...]) -> Iterator[Add]:
+    """States in MCAP, chunk by chunk; the same rows give the same bytes.
 
     Raises `BadInputError` without the extra logs, and for a time before zero, which MCAP cannot tell.
     """
+    try:
+        writer: Any = importlib.import_module("mcap.writer").Writer(stream)
+    except ImportError as error:
+        raise BadInputError(f"{shown(path)}: writing MCAP needs mcap: {pip_install('logs')}") from error
+    pose_at = tuple(names.index(name) for name in ("x_m", "y_m", "phi_rad"))
+    writer.start(library="calib")
+    # A column that is not known in a row is null there.
+    listed: dict[str, Any] = {"timestamp": _TIME} | {name: {"type": ["number", "null"]} for name in names}
+    listed["t_s"] = _NUMBER
 
-    def __init__(self, stream: IO[bytes], names: tuple[str, ...], path: Path) -> None:
-        try:
-            writer: Any = importlib.import_module("mcap.writer")
-        except ImportError as error:
-            raise BadInputError(f"{shown(path)}: writing MCAP needs mcap: {pip_install('logs')}") from error
-        self._path, self._names = path, names
-        self._pose_at = tuple(names.index(name) for name in ("x_m", "y_m", "phi_rad"))
-        self._writer = writer.Writer(stream)
-        self._writer.start(library="calib")
-        # A column that is not known in a row is null there.
-        listed: dict[str, Any] = {"timestamp": _TIME} | {name: {"type": ["number", "null"]} for name in names}
-        listed["t_s"] = _NUMBER
-        described = {"title": "calib.States", "type": "object", "properties": listed}
-        self._states = self._channel(STATES_TOPIC, described)
-        self._head = self._channel(HEAD, _POSE)
+    def channel(topic: str, described: dict[str, Any]) -> int:
+        schema = writer.register_schema(described["title"], "jsonschema", json.dumps(described).encode())
+        return int(writer.register_channel(topic, "json", schema))
 
-    def _channel(self, topic: str, described: dict[str, Any]) -> int:
-        schema = self._writer.register_schema(
-            described["title"], "jsonschema", json.dumps(described).encode()
-        )
-        return int(self._writer.register_channel(topic, "json", schema))
+    states = channel(STATES_TOPIC, {"title": "calib.States", "type": "object", "properties": listed})
+    head = channel(HEAD, _POSE)
 
-    def add(self, values: FloatArray) -> None:
-        """Rows (n, columns)."""
-        names = self._names
+    def add(values: FloatArray) -> None:
         for row in values.tolist():
             stamp = round(row[0] * 1e9)
             if stamp < 0:
                 raise BadInputError(
-                    f"{shown(self._path)}: t_s is {row[0]:.6f}, expected no time before 0 in MCAP; "
+                    f"{shown(path)}: t_s is {row[0]:.6f}, expected no time before 0 in MCAP; "
                     "write .csv or .parquet"
                 )
             time = f'{{"timestamp":{{"sec":{stamp // 1_000_000_000},"nsec":{stamp % 1_000_000_000}}}'
             cells = ",".join(f'"{name}":{_cell(value)}' for name, value in zip(names, row, strict=True))
-            self._put(self._states, stamp, f"{time},{cells}}}")
-            x, y, phi = (row[k] for k in self._pose_at)
+            writer.add_message(states, stamp, f"{time},{cells}}}".encode(), stamp)
+            x, y, phi = (row[k] for k in pose_at)
             if math.isfinite(x + y + phi):
                 turn = f'"x":0,"y":0,"z":{math.sin(-0.5 * phi):.9g},"w":{math.cos(0.5 * phi):.9g}'
                 place = f'"x":{x:.9g},"y":{y:.9g},"z":0'
                 pose = f'{{"position":{{{place}}},"orientation":{{{turn}}}}}'
-                self._put(self._head, stamp, f'{time},"frame_id":"world","pose":{pose}}}')
+                text = f'{time},"frame_id":"world","pose":{pose}}}'
+                writer.add_message(head, stamp, text.encode(), stamp)
 
-    def _put(self, channel: int, stamp: int, text: str) -> None:
-        self._writer.add_message(channel, stamp, text.encode(), stamp)
-
-    def end(self) -> None:
-        """Write the last chunk and the index."""
-        self._writer.finish()
-
-    def abandon(self) -> None:
-        """Nothing is held."""
+    yield add
+    writer.finish()
 
 
 # ----------------------------------------------------------------------
@@ -144,122 +135,66 @@ STATES_FILE = Kind("states", ENDINGS, _holds_states)
 _GROUP_ROWS = 1 << 17
 
 
-class StatesFile(Protocol):
-    """A states file that is being written."""
-
-    def add(self, values: FloatArray) -> None:
-        """Rows (n, columns); NaN becomes a blank cell or a null."""
-        ...
-
-    def end(self) -> None:
-        """Write what is left."""
-        ...
-
-    def abandon(self) -> None:
-        """Let go of the stream; what was written is of no use."""
-        ...
-
-
 def is_whole(name: str) -> bool:
     """Whether a column holds whole numbers."""
     return name.startswith("gated") or name == "flags"
 
 
-class CsvStates:
+@contextmanager
+def _csv(stream: IO[bytes], names: tuple[str, ...]) -> Iterator[Add]:
     """Lines with time to the microsecond, counts without decimals, all else to nine digits."""
+    kinds = [WHOLE if is_whole(name) else TIME if name == "t_s" else GENERAL for name in names]
+    stream.write((",".join(names) + "\n").encode())
 
-    def __init__(self, stream: IO[bytes], names: tuple[str, ...]) -> None:
-        from calib.io.cells import GENERAL, TIME, WHOLE, table_bytes
+    def add(values: FloatArray) -> None:
+        stream.write(table_bytes(values, kinds))
 
-        kinds = [WHOLE if is_whole(name) else TIME if name == "t_s" else GENERAL for name in names]
-        self._stream, self._kinds, self._text = stream, np.array(kinds), table_bytes
-        stream.write((",".join(names) + "\n").encode())
-
-    def add(self, values: FloatArray) -> None:
-        """Rows (n, columns)."""
-        self._stream.write(self._text(values, self._kinds))
-
-    def end(self) -> None:
-        """Nothing waits."""
-
-    def abandon(self) -> None:
-        """Nothing is held."""
-
-
-class ParquetStates:
-    """Row groups of some hundred thousand rows; counts are integers, NaN is null."""
-
-    def __init__(self, stream: IO[bytes], names: tuple[str, ...]) -> None:
-        import pyarrow
-        from pyarrow import parquet
-
-        self._arrow: Any = pyarrow
-        kinds = {True: self._arrow.int64(), False: self._arrow.float64()}
-        self._schema = self._arrow.schema([(name, kinds[is_whole(name)]) for name in names])
-        # Values hardly repeat, so a dictionary saves nothing; their first bytes do, which this encoding puts
-        # side by side: with snappy smaller than plain zstd, and in less than half of its time.
-        split = {name: "BYTE_STREAM_SPLIT" for name in names if not is_whole(name)}
-        self._writer = parquet.ParquetWriter(
-            stream, self._schema, compression="snappy", use_dictionary=False, column_encoding=split
-        )
-        self._waiting: list[FloatArray] = []
-        self._rows = 0
-
-    def add(self, values: FloatArray) -> None:
-        """Rows (n, columns)."""
-        self._waiting.append(values)
-        self._rows += len(values)
-        if self._rows >= _GROUP_ROWS:
-            self._write()
-
-    def _write(self) -> None:
-        if not self._rows:
-            return
-        columns = np.concatenate(self._waiting).T.copy()
-        self._waiting, self._rows = [], 0
-        arrays = []
-        for field, column in zip(self._schema, columns, strict=True):
-            blank = np.isnan(column)
-            values = np.where(blank, 0.0, column).astype(np.int64) if is_whole(field.name) else column
-            arrays.append(self._arrow.array(values, mask=blank))
-        self._writer.write_table(self._arrow.Table.from_arrays(arrays, schema=self._schema))
-
-    def end(self) -> None:
-        """Write the last row group and the footer."""
-        self._write()
-        self._writer.close()
-
-    def abandon(self) -> None:
-        """Close while there is a stream to close on; later the package would complain."""
-        with contextlib.suppress(Exception):
-            self._writer.close()
-
-
-def _opened(path: Path, stream: IO[bytes], names: tuple[str, ...]) -> StatesFile:
-    ending = path.suffix.lower()
-    if ending == ".parquet":
-        return ParquetStates(stream, names)
-    if ending == ".mcap":
-        return McapStates(stream, names, path)
-    return CsvStates(stream, names)
-
-
-def _filled(states: StatesFile) -> Iterator[StatesFile]:
-    try:
-        yield states
-        states.end()
-    except BaseException:
-        states.abandon()
-        raise
+    yield add
 
 
 @contextmanager
-def states_writer(
-    path: Path, names: tuple[str, ...] = STATES, kind: Kind = STATES_FILE
-) -> Iterator[StatesFile]:
-    """Write a table block by block, as states or another `kind`; it appears under its name when it is whole.
+def _parquet(stream: IO[bytes], names: tuple[str, ...]) -> Iterator[Add]:
+    """Row groups of some hundred thousand rows; counts are integers, NaN is null."""
+    import pyarrow
+    from pyarrow import parquet
+
+    arrow: Any = pyarrow
+    schema = arrow.schema([(name, arrow.int64() if is_whole(name) else arrow.float64()) for name in names])
+    # Values hardly repeat, so a dictionary saves nothing; their first bytes do, which this encoding puts
+    # side by side: with snappy smaller than plain zstd, and in less than half of its time.
+    split = {name: "BYTE_STREAM_SPLIT" for name in names if not is_whole(name)}
+    waiting: list[FloatArray] = []
+
+    def write() -> None:
+        arrays = []
+        for name, column in zip(names, np.concatenate(waiting).T.copy(), strict=True):
+            blank = np.isnan(column)
+            values = np.where(blank, 0.0, column).astype(np.int64) if is_whole(name) else column
+            arrays.append(arrow.array(values, mask=blank))
+        writer.write_table(arrow.Table.from_arrays(arrays, schema=schema))
+        waiting.clear()
+
+    def add(values: FloatArray) -> None:
+        waiting.append(values)
+        if sum(map(len, waiting)) >= _GROUP_ROWS:
+            write()
+
+    options: Any = {"compression": "snappy", "use_dictionary": False, "column_encoding": split}
+    with parquet.ParquetWriter(stream, schema, **options) as writer:
+        yield add
+        if waiting:
+            write()
+
+
+@contextmanager
+def states_writer(path: Path, names: tuple[str, ...] = STATES, kind: Kind = STATES_FILE) -> Iterator[Add]:
+    """A function that adds rows (n, columns) to a table, as states or another `kind`; NaN is blank or null.
+
+    The table appears under its name when it is whole.
 
     Raises `BadInputError` where the place cannot be written, or the format needs the extra logs.
     """
-    with replacing(path, kind) as stream:
-        yield from _filled(_opened(path, stream, names))
+    formats: dict[str, Any] = {".parquet": _parquet, ".mcap": partial(_mcap, path)}
+    opened = formats.get(path.suffix.lower(), _csv)
+    with replacing(path, kind) as stream, opened(stream, names) as add:
+        yield add

@@ -1,7 +1,7 @@
 """Tables of logs: text and Parquet as blocks of numbers by column, see `calib.io.logs`.
 
 Text is parsed by pyarrow; a block that it declines is read line by line, which gives the same numbers, or a
-sentence with the number of the line.
+sentence with the number of the line. `table_bytes` writes such text.
 """
 
 from __future__ import annotations
@@ -314,6 +314,21 @@ def _blocks(text: _Text, stream: BinaryIO, data: bytes, line: int) -> Iterator[B
         yield Block(nothing, np.empty(0, dtype=np.int64), truncated=True)
     else:
         yield _parsed(text, rest + b"\n", line)[0]
+
+
+TIME, GENERAL, WHOLE = "%.6f", "%.9g", "%.0f"
+"""How a column is written: six decimals; nine significant digits, shortest; no decimals."""
+_ROWS_AT_ONCE = 4096
+
+
+def table_bytes(values: FloatArray, kinds: Sequence[str]) -> bytes:
+    """Rows (n, columns) as comma-separated lines, each column as its kind says; NaN is a blank cell."""
+    line, parts = ",".join(kinds) + "\n", []
+    for k in range(0, len(values), _ROWS_AT_ONCE):
+        rows = values[k : k + _ROWS_AT_ONCE]
+        text = line * len(rows) % tuple(rows.ravel().tolist())
+        parts.append(text.replace("nan", "").encode())
+    return b"".join(parts)
 
 
 class _Recoded(io.RawIOBase):

@@ -89,7 +89,6 @@ class Ghost:
     lines_px : lines of the board's lattice, each (n, 2).
     box_px : (4, 2) outer corners, in order around. normal : (3,) of the board, in the camera's frame.
     says : one sentence. away : edge in the picture that leans away, "" without tilt.
-    gain : share by which the uncertainty would fall; None before the first fits.
     """
 
     lines_px: tuple[FloatArray, ...]
@@ -97,7 +96,6 @@ class Ghost:
     normal: FloatArray
     says: str
     away: str
-    gain: float | None
 
 
 @dataclass(frozen=True)
@@ -105,7 +103,6 @@ class Progress:
     """What the pictures so far make of the camera, after each fit."""
 
     pictures: int
-    fx_px: float
     sigma_fx_px: float
     worst_sigma_px: float
 
@@ -278,14 +275,8 @@ class Session:
         worst = projection_sigma_px(some, fit.covariance, image_outline(some.camera))
         sigma = fit.covariance.sigma().get("fx_px", np.inf)
         known = worst[~np.isnan(worst)]
-        self.history.append(
-            Progress(
-                some.observations.views,
-                some.camera.fx_px,
-                float(sigma),
-                float(known.max()) if len(known) else np.inf,
-            )
-        )
+        largest = float(known.max()) if len(known) else np.inf
+        self.history.append(Progress(some.observations.views, float(sigma), largest))
 
     @property
     def enough(self) -> bool:
@@ -294,22 +285,17 @@ class Session:
         return gain is not None and gain < ENOUGH and self.fit is not None and self.fit.judgement.verdict.ok
 
     @property
-    def _next(self) -> Candidate | None:
-        """The best next picture; None before there is a fit."""
-        return None if self._plan is None else self._plan.best
-
-    @property
     def gain(self) -> float | None:
         """Share by which the best next picture would lower the uncertainty; None before there is a fit."""
-        return None if self._next is None else 1.0 - self._next.remaining
+        return None if self._plan is None else 1.0 - self._plan.best.remaining
 
     # ------------------------------------------------------------------
     # The next pose.
 
     def ghost(self) -> Ghost:
         """The pose to show next; before the first fits one of a few that make a start."""
-        best = self._next
-        if best is not None:
+        if self._plan is not None:
+            best = self._plan.best
             lean = (
                 f"tilted by {best.tilt_deg:.0f} degrees, its {best.away} edge away from the camera"
                 if best.away
@@ -317,7 +303,7 @@ class Session:
             )
             size = "over half of the picture" if best.span_share > 0.5 else "at a third of the picture"
             says = f"Next: the board {best.where}, {lean}, {size}."
-            return _drawn(self._grid_at(best), best.R_CT, says, best.away, 1.0 - best.remaining)
+            return _drawn(self._grid_at(best), best.R_CT, says, best.away)
         camera = self._nominal()
         away, (u, v), where = _START[len(self.views) % len(_START)]
         R = tilted(35.0, away)
@@ -327,7 +313,7 @@ class Session:
         ray = [(u - 0.5) * width / camera.fx_px, (v - 0.5) * height / camera.fx_px, 1.0]
         says = f"Hold the board {where}, tilted, its {away} edge away from the camera."
         grid = self._projected(camera, R, distance * np.array(ray), box)
-        return _drawn(grid, R, says, away, None)
+        return _drawn(grid, R, says, away)
 
     def _grid_at(self, pose: Candidate) -> FloatArray:
         """Corners (rows, columns, 2) of the board in a planned pose."""
@@ -372,8 +358,7 @@ class Session:
 
     def _as_good(self, grid: FloatArray) -> bool:
         """Whether this pose, though another one, gains nearly what the best would."""
-        pose = None if self._plan is None or self._waits else self._pose(grid)
-        if pose is None or self._plan is None:
+        if self._plan is None or self._waits or (pose := self._pose(grid)) is None:
             return False
         gain = 1.0 - self._plan.remaining(*pose)
         return gain > max(_GAIN_SHARE * (self.gain or 0.0), ENOUGH)
@@ -519,8 +504,8 @@ def _apart(a: FloatArray, b: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.sum((a - b) ** 2, axis=-1))))
 
 
-def _drawn(grid: FloatArray, R: FloatArray, says: str, away: str, gain: float | None) -> Ghost:
-    return Ghost((*grid, *grid.transpose(1, 0, 2)), _outer(grid), R[:, 2], says, away, gain)
+def _drawn(grid: FloatArray, R: FloatArray, says: str, away: str) -> Ghost:
+    return Ghost((*grid, *grid.transpose(1, 0, 2)), _outer(grid), R[:, 2], says, away)
 
 
 def _outer(grid: FloatArray) -> FloatArray:

@@ -127,21 +127,11 @@ def _text(array: FloatArray, kind: str) -> str:
 
 def _cells(figure: Figure) -> list[tuple[float, float, float, float]]:
     """Left, right, top and bottom of each panel as shares of the sheet."""
-    columns = len(figure.mosaic[0]) if figure.mosaic else figure.columns
-    rows = list(figure.mosaic)
-    if not rows:
-        letters = [chr(ord("A") + k) for k in range(len(figure.panels))]
-        letters += ["."] * (-len(letters) % columns)
-        rows = ["".join(letters[k : k + columns]) for k in range(0, len(letters), columns)]
-    wide = _edges(figure.widths or (1.0,) * columns)
-    high = _edges(figure.heights or (1.0,) * len(rows))
-    out = []
-    for k in range(len(figure.panels)):
-        letter = chr(ord("A") + k)
-        i = [row for row, words in enumerate(rows) if letter in words]
-        j = [column for words in rows for column, one in enumerate(words) if one == letter]
-        out.append((wide[min(j)], wide[max(j) + 1], high[min(i)], high[max(i) + 1]))
-    return out
+    letters = np.array([list(row) for row in figure.rows])
+    wide = _edges(figure.widths or (1.0,) * letters.shape[1])
+    high = _edges(figure.heights or (1.0,) * letters.shape[0])
+    places = [np.nonzero(letters == letter) for letter in np.unique(letters[letters != "."])]
+    return [(wide[j.min()], wide[j.max() + 1], high[i.min()], high[i.max() + 1]) for i, j in places]
 
 
 def _edges(sizes: Sequence[float]) -> list[float]:

@@ -99,7 +99,7 @@ def _over_picture(before: Camera, after: Camera) -> Figure:
         return picture(size, (Field(u, v, values, unit, unit, scale=scale, even=True),), word)
 
     length = np.linalg.norm(apart, axis=-1)
-    note = "Maps of the standard deviation of one coordinate above, of the difference below."
+    note = "Above are maps of the standard deviation of one coordinate, below of the difference."
     finite = length[np.isfinite(length)]
     if len(finite):
         note += f" A far point is seen up to {rounded(float(finite.max()), 'px', 2)} elsewhere"
@@ -151,7 +151,8 @@ def _on_plane(before: Rig, after: Rig, found: RigDiff) -> Figure:
     limits = (1e3 * x0, 1e3 * x1), (1e3 * y0, 1e3 * y1)
     blank = Plot("x (mm)", "y (mm)", (), "Difference, mm", *limits, grid="", equal=True, down=True)
     plane = found.plane
-    note = f"Up to {rounded(plane.largest_mm, 'mm', 2)}, {rounded(plane.mean_mm, 'mm', 2)} on average"
+    most, mean = rounded(plane.largest_mm, "mm", 2), rounded(plane.mean_mm, "mm", 2)
+    note = f"It is read up to {most} apart, {mean} on average"
     if plane.sigma_mm:
         note += (
             f"; the sigma of the difference is at most {rounded(plane.sigma_mm, 'mm', 2)}, so that this is "

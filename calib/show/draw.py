@@ -35,11 +35,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from matplotlib.textpath import text_to_path
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
-from PIL import Image
 
 from calib.core.arrays import FloatArray
-from calib.core.errors import BadInputError
-from calib.core.files import shown
 from calib.core.plot import (
     WIDTH_IN,
     Arrows,
@@ -60,7 +57,7 @@ from calib.core.plot import (
     round_down,
 )
 from calib.core.result import Result
-from calib.core.writing import Kind, begins, write_atomically
+from calib.core.writing import Kind, begins, make_folder, write_atomically
 
 HUES = {
     "ink": "#1d2730", "grey": "#66727d", "silver": "#b9c0c7", "shade": "#e9ecef", "blue": "#0072B2",
@@ -75,10 +72,8 @@ _RISING = LinearSegmentedColormap.from_list(
 """From light to dark with the value, never so dark that black lines drown in it."""
 
 _FONT = "DejaVu Sans"
-_DPI, _COARSE_DPI = 130, 90
-"""Figures of which there are many are coarser, so that a page has room for them."""
+_DPI = 130
 _LINE_IN, _TITLE_IN = 0.19, 0.235
-_COLOURS, _FEW, _NEARLY_WHITE = 128, 48, 252
 _TAG_IN = 2.15
 """Width that is kept free for the verdict."""
 _HALO = (patheffects.withStroke(linewidth=3.0, foreground="white"),)
@@ -122,9 +117,7 @@ def look() -> Iterator[None]:
 def draw(figure: Figure) -> Drawing:
     """A figure drawn by matplotlib: white, title and note above, panels below, labels under them."""
     with look():
-        dpi = _COARSE_DPI if figure.coarse else _DPI
-        # Letters take whole pixels, so that lines grow longer where those are large.
-        wide_in = (WIDTH_IN - 0.3) * (0.95 if figure.coarse else 1.0)
+        wide_in = WIDTH_IN - 0.3
         bad = figure.verdict != "ok"
         titles = _lines(plain(figure.title), 13, True, wide_in - bad * _TAG_IN)
         notes = _lines(plain(figure.note), 10, False, wide_in)
@@ -132,7 +125,7 @@ def draw(figure: Figure) -> Drawing:
         high_in = figure.height_in + head_in
         below = (0.008, 0.008, 0.984, 1.0 - head_in / high_in - 0.008)
         layout = ConstrainedLayoutEngine(rect=below, wspace=0.03, hspace=0.03)
-        drawing = Drawing(figsize=(WIDTH_IN, high_in), dpi=dpi, layout=layout, facecolor="white")
+        drawing = Drawing(figsize=(WIDTH_IN, high_in), dpi=_DPI, layout=layout, facecolor="white")
         left, top = 0.13 / WIDTH_IN, 1.0 - 0.12 / high_in
         drawing.text(left, top, "\n".join(titles), fontsize=13, weight="bold", va="top", linespacing=1.3)
         top -= (_TITLE_IN * len(titles) + 0.04) / high_in
@@ -170,23 +163,11 @@ FIGURE = Kind("a figure", (".png",), begins(b"\x89PNG"))
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Write a figure as PNG, atomically and without dates: the same figure gives the same bytes.
-
-    A palette of as few colours as are told apart makes it a quarter as large.
-    """
-    drawing = draw(figure)
-    canvas: Any = FigureCanvasAgg(drawing)
-    with look():
-        canvas.draw()
-    rows, columns = canvas.get_width_height()[::-1]
-    pixels = np.frombuffer(canvas.buffer_rgba(), dtype=np.uint8).reshape(rows, columns, 4)[:, :, :3]
-    few = Image.fromarray(pixels.copy()).quantize(
-        _FEW if figure.coarse else _COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE
-    )
-    palette = np.array(few.getpalette(), dtype=np.uint8).reshape(-1, 3)
-    few.putpalette(np.where(palette.min(axis=1, keepdims=True) >= _NEARLY_WHITE, 255, palette).tobytes())
+    """Write a figure as PNG, atomically and without dates: the same figure gives the same bytes."""
+    canvas: Any = FigureCanvasAgg(draw(figure))
     buffer = io.BytesIO()
-    few.save(buffer, format="png", compress_level=6)
+    with look():
+        canvas.print_png(buffer, metadata={"Software": None})
     write_atomically(path, buffer.getvalue(), FIGURE)
     return path
 
@@ -196,20 +177,8 @@ def write_figures(folder: Path, figures: Mapping[str, Figure]) -> list[Path]:
 
     Raises `BadInputError` where the folder or a file cannot be written.
     """
-    return [save(figure, figure_folder(folder) / f"{name}.png") for name, figure in figures.items()]
-
-
-def figure_folder(folder: Path) -> Path:
-    """The folder, made if it is not there. Raises `BadInputError` where that is impossible."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except FileExistsError as error:
-        raise BadInputError(f"{shown(folder)}: is a file, expected a folder for figures") from error
-    except OSError as error:
-        raise BadInputError(
-            f"{shown(folder)}: no folder for figures can be made here: {error.strerror or error}"
-        ) from error
-    return folder
+    make_folder(folder)
+    return [save(figure, folder / f"{name}.png") for name, figure in figures.items()]
 
 
 # ----------------------------------------------------------------------
@@ -218,16 +187,10 @@ def figure_folder(folder: Path) -> Path:
 
 def _places(drawing: Drawing, figure: Figure) -> list[Axes]:
     """Axes for each panel, in the figure's order."""
-    names = [chr(ord("A") + k) for k in range(len(figure.panels))]
-    filled = names + ["."] * (-len(names) % figure.columns)
-    rows = [list(row) for row in figure.mosaic] or [
-        filled[k : k + figure.columns] for k in range(0, len(filled), figure.columns)
-    ]
-    mosaic: Any = rows
     placed = drawing.subplot_mosaic(
-        mosaic, width_ratios=figure.widths or None, height_ratios=figure.heights or None
+        "\n".join(figure.rows), width_ratios=figure.widths or None, height_ratios=figure.heights or None
     )
-    return [placed[name] for name in names]
+    return [placed[name] for name in sorted(placed)]
 
 
 def _panel(axes: Axes, panel: Plot) -> None:

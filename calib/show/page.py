@@ -9,6 +9,7 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -18,9 +19,10 @@ from calib.core.constants import constants
 from calib.core.errors import BadInputError
 from calib.core.files import read_bytes, read_text, sha256
 from calib.core.plot import Figure
-from calib.core.rig import Rig
-from calib.core.words import BLANK, facts, number, unit_of
+from calib.core.rig import KINDS, Rig, kind_of
+from calib.core.words import BLANK, as_words, facts, number, unit_of
 from calib.core.writing import Kind, holds, make_folder, write_atomically
+from calib.io.columns import COLUMNS
 from calib.runner.cache import Result, load
 from calib.runner.decision import decide, read_summary
 from calib.runner.graph import HIDDEN, STEPS
@@ -54,6 +56,7 @@ def render(
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["plainly"] = plainly
     text = environment.get_template(template).render(
         style="".join(_resource(name) for name in style),
         script=words,
@@ -61,12 +64,33 @@ def render(
         script_hash="' '".join(f"sha256-{digest}" for digest in hashes),
         **values,
     )
-    # A file's name may hold halves of characters, which no page can.
+    # A file's name may hold halves of characters, which no page can show.
     return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 def _resource(name: str) -> str:
     return (resources.files("calib.show") / "templates" / name).read_text(encoding="utf-8")
+
+
+def plainly(sentence: str) -> str:
+    """A sentence with words in place of keys of rig.yaml, unless it says what to write into a file."""
+
+    def words(key: re.Match[str]) -> str:
+        return key[0] if key[0] in COLUMNS else _labels().get(key[0], as_words(key[0]))
+
+    return sentence if ".yaml" in sentence or "{" in sentence else _KEY.sub(words, sentence)
+
+
+@cache
+def _labels() -> dict[str, str]:
+    """What keys of the sections are called in a sentence."""
+    fields = [pair for name in KINDS for pair in kind_of(name).model_fields.items()]
+    titles = {key: field.title.partition(", ") for key, field in fields if field.title}
+    return {key: f"{head} ({rest})" if rest else head for key, (head, _, rest) in titles.items()}
+
+
+_KEY = re.compile(r"(?<![\w./-])[a-z][A-Za-z0-9]*(?:_[A-Za-z0-9]+)+(?![\w.:/-]*[\w:/])")
+"""No part of a path, of a file's name or of what stands before a colon."""
 
 
 def _as_script(value: Any) -> str:
@@ -239,17 +263,17 @@ def _table(path: tuple[str, ...], records: Sequence[Values]) -> list[Table]:
 def _tells(name: str, records: Sequence[Values]) -> bool:
     """Whether a column holds single values, and not only blanks."""
     values = [record.get(name) for record in records]
-    if any(isinstance(value, dict) or (isinstance(value, list) and len(value) > 3) for value in values):
+    lists = [value for value in values if isinstance(value, list)]
+    if any(isinstance(value, dict) for value in values) or any(
+        len(one) > 3 or any(isinstance(part, list) for part in one) for one in lists
+    ):
         return False
     return any(value not in (None, [], "") for value in values)
 
 
 def _head(name: str) -> str:
     unit = unit_of(name)
-    if not unit:
-        return name.replace("_", " ") or "name"
-    end = next(n for n in range(1, len(name)) if unit_of(name[n - 1 :]) == unit and unit_of(name[n:]) != unit)
-    return f"{name[: end - 1].replace('_', ' ')}, {unit}"
+    return f"{as_words(name)}, {unit}" if unit else as_words(name) or "name"
 
 
 def short(value: float) -> str:
@@ -267,7 +291,7 @@ def _cell(value: Any) -> Cell:
     if isinstance(value, int | float):
         return Cell(short(value), float(value))
     if isinstance(value, list):
-        return Cell("  ".join(_cell(part).text for part in value))
+        return Cell(", ".join(_cell(part).text for part in value))
     return Cell(str(value))
 
 

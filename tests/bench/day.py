@@ -29,10 +29,10 @@ import yaml
 
 from calib.core.arrays import FloatArray
 from calib.core.rig import Rig
-from calib.io.cells import GENERAL, TIME, table_bytes
 from calib.io.columns import COLUMNS, TRUE
 from calib.io.logs import Log, iter_log
 from calib.io.states import STATES, states_writer
+from calib.io.tables import GENERAL, TIME, table_bytes
 from calib.stages.estimator.consistency import Tally
 from calib.stages.estimator.kinematic import OUT
 from calib.stages.estimator.read import rows_of, truth_of
@@ -107,7 +107,7 @@ def make_log(path: Path, rows: int, imu_only: bool, truth: bool) -> None:
                 arrays = [arrow.array(column, from_pandas=True) for column in part.T.copy()]
                 writer.write_table(arrow.Table.from_arrays(arrays, schema=schema))
         return
-    kinds = np.array([TIME] + [GENERAL] * len(names))
+    kinds = [TIME] + [GENERAL] * len(names)
     with path.open("wb") as stream:
         stream.write((",".join(["t_s", *names]) + "\n").encode())
         for part in _parts(log, names, rows):
@@ -149,9 +149,9 @@ def _stages(
     columns = [OUT.index(name) for name in STATES]
 
     def write() -> None:
-        with states_writer(folder / f"part{ending}") as states:
+        with states_writer(folder / f"part{ending}") as add:
             for out in outs:
-                states.add(out[:, columns])
+                add(out[:, columns])
 
     show(f"write {ending}", n, write)
 

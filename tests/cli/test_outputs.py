@@ -176,10 +176,9 @@ def test_a_write_that_is_ended_leaves_nothing(environment, tmp_path: Path, how: 
         # Tests under nohup inherit a signal that is not heard.
         "signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"
         "from calib.io import states\n"
-        "add = states.CsvStates.add\n"
-        "def slow(self, values):\n"
-        "    add(self, values); print('writing', flush=True); time.sleep(60)\n"
-        "states.CsvStates.add = slow\n"
+        "def slow(values, kinds):\n"
+        "    print('writing', flush=True); time.sleep(60)\n"
+        "states.table_bytes = slow\n"
         "from calib.cli.main import main\n"
         "sys.argv = ['calib', 'convert', 'log.csv', '-o', 'out.csv']\n"
         "main()\n"

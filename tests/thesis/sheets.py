@@ -15,8 +15,8 @@ import numpy as np
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 
 from calib.core.plot import Arrows, Curve, Figure, Mark, Plot, Shape, Text, circle, every, rectangle
-from calib.core.writing import write_atomically
-from calib.show.draw import draw, figure_folder, look
+from calib.core.writing import make_folder, write_atomically
+from calib.show.draw import draw, look
 from thesis.book import Drawing
 from thesis.runs import Values
 
@@ -103,7 +103,7 @@ def write_figures(folder: Path, drawings: Sequence[Drawing]) -> list[Path]:
 
     Raises `BadInputError` where the folder or a file cannot be written.
     """
-    figure_folder(folder)
+    make_folder(folder)
     rows: list[dict[str, Any]] = []
     for one in drawings:
         plot, values = one.make()

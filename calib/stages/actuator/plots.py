@@ -56,8 +56,8 @@ def _motion(result: Identified) -> Figure:
     """Angle and length of each log, measured and simulated with the identified parameters."""
     tracks = list(result.solution.problem.tracks)[:_MOST_LOGS]
     note = (
-        "Points: from the logs. Lines: simulated with the identified parameters from the commands and the "
-        f"start alone. At most the first {_MOST_S:g} s of {_MOST_LOGS} logs."
+        "Points are from the logs. Lines are simulated with the identified parameters from the commands and "
+        f"the start alone. At most the first {_MOST_S:g} s of {_MOST_LOGS} logs are drawn."
     )
     panels = []
     for track, head in zip(tracks, simulated_heads(result.solution), strict=False):
@@ -83,8 +83,9 @@ def _measured(t: FloatArray, values: FloatArray) -> Curve:
 def _residuals(result: Identified) -> Figure:
     """Correlation of each log's residuals with themselves, and how they are distributed."""
     note = (
-        "Residuals over their standard deviation. Left: correlation with the rows after, white ones stay "
-        "within the grey band (95 %). Right: their distribution beside that of a normal one."
+        "Residuals are divided by their standard deviation. On the left is their correlation with the rows "
+        "after: white ones stay within the grey band (95 %). On the right is their distribution beside a "
+        "normal one."
     )
     at, rows, lags = 0, [], np.arange(1, _LAGS)
     marks: list[Mark] = []
@@ -111,7 +112,7 @@ def _residuals(result: Identified) -> Figure:
 def _parameters(result: Identified) -> Figure:
     """Relative deviation of each parameter now and after one more experiment."""
     names = list(result.solution.problem.names)
-    note = "Standard deviation over value. Bars: from these logs. Points: with one more experiment of 8 s."
+    note = "Bars are the standard deviation over the value from these logs, points with 8 s of one more test."
     sigma, values = result.uncertainty.sigma, result.solution.values
     now = np.array([100.0 * sigma[name] / max(abs(values[name]), 1e-12) for name in names])
     marks: list[Mark] = [Bars(np.arange(len(names)), now, 0.6, "ice", across=True)]
@@ -126,7 +127,7 @@ def _parameters(result: Identified) -> Figure:
 
 def _damping(result: Identified) -> Figure:
     """Swings with the peaks that the logarithmic decrement took."""
-    note = "Peaks that were used for the damping by the logarithmic decrement (3.39), (3.40)."
+    note = "These peaks were used for the damping by the logarithmic decrement (3.39), (3.40)."
     panels: list[Plot] = []
     for track in result.solution.problem.tracks:
         if track.name in result.decrements and len(panels) < _MOST_LOGS:
@@ -159,7 +160,7 @@ def stiffness_plots(
     panels = tuple(
         Plot("elongation (mm)", y, marks) for y, marks in (("force (N)", left), ("stiffness (N/m)", right))
     )
-    note = "Laws through zero; the thick one is used."
+    note = "The laws go through zero; the thick one is used."
     return {"identify_stiffness": Figure("Springs", note, panels, 3.5, columns=2)}
 
 
@@ -185,7 +186,7 @@ def _runs(result: PumpFound, verdict: str) -> Figure:
     """Each recording with both models, simulated from its PWM and its first fifth of a second."""
     records = result.records[:_MOST_RUNS]
     note = (
-        "Points: measured. Lines: simulated from the PWM and the first 0.2 s. In each title the RMS of "
+        "Points are measured, lines simulated from the PWM and the first 0.2 s. Each title has the RMS of "
         "linear lag / orifice flow, fitted without that file where there are several."
     )
     held = {model: {one.name: one.rms for one in result.held[model]} for model in result.fits}
@@ -209,7 +210,7 @@ def _runs(result: PumpFound, verdict: str) -> Figure:
 def _left_over(result: PumpFound, verdict: str) -> Figure:
     """Measured minus simulated over time, a panel for each model and a line for each recording."""
     note = (
-        "Measured minus simulated. Runs that leave the model are drawn in red: the PWM does not explain them."
+        "This is measured minus simulated. Runs that leave the model are red: the PWM does not explain them."
     )
     gone = {one.name for one in result.departs}
     errors = {
@@ -230,7 +231,7 @@ def _left_over(result: PumpFound, verdict: str) -> Figure:
 
 def _static(result: PumpFound, verdict: str) -> Figure:
     """Settled values over PWM with the fitted maps, and where the recordings settle."""
-    note = "Points: settled values; crosses: outliers. Lines: the fitted map. Squares: ends of recordings."
+    note = "Points are settled values, crosses outliers, lines the fitted map, squares ends of recordings."
     u = np.linspace(0.0, 255.0, 400)
     marks: list[Mark] = []
     for m, hue in zip(result.maps, _HUES * len(result.maps), strict=False):
@@ -276,9 +277,8 @@ def _validation(one: Comparison) -> Figure:
     ]
     parts += [f"{model} unknown, it ends before the log" for model in one.simulated if model not in known]
     note = (
-        "Points: from the log. Lines: simulated from commands and start alone. RMS of q1, q2 and phi: "
-        + "; ".join(parts)
-        + "."
+        "Points are from the log, lines are simulated from commands and start alone. RMS errors of q1, q2 "
+        "and phi are, model by model: " + "; ".join(parts) + "."
     )
     some = one.t_s <= _MOST_S
     t = one.t_s[some]
@@ -296,4 +296,4 @@ def _validation(one: Comparison) -> Figure:
         panels.append(Plot(x, y, left, "" if row else "Curves", limits))
         panels.append(Plot(x, "", right, "" if row else "Measured less simulated", limits))
     title = f"Model against log: {short(one.name, 50)}"
-    return Figure(title, note, panels, 6.6, columns=2, widths=(1.5, 1.0), coarse=True)
+    return Figure(title, note, panels, 6.6, columns=2, widths=(1.5, 1.0))

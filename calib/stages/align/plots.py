@@ -7,7 +7,8 @@ import math
 import numpy as np
 
 from calib.core.arrays import FloatArray
-from calib.core.plot import SIGMA, Band, Curve, Figure, Mark, Plot, Rule, every, number, short
+from calib.core.plot import SIGMA, Band, Curve, Figure, Mark, Plot, Rule, every, short
+from calib.core.words import number as with_sigma
 from calib.stages.align.solve import Alignment, Trace
 from calib.stages.estimator.sensors import SENSOR
 
@@ -31,16 +32,16 @@ def _residuals(fit: Alignment, log: int, verdict: str) -> Figure:
     """Residuals of one log with the sensors as assumed beforehand and as estimated."""
     title = f"Residuals: {short(fit.logs[log].name, 78)}"
     note = (
-        "Measured minus predicted by the fitted motion. Orange: with the time offset and the scales assumed "
-        "beforehand, without mount angle and biases. Blue: with those estimated. Red crosses: pictures taken "
-        "for something else. Points at the edge lie beyond it."
+        "This is what was measured less what the fitted motion predicts: in orange with the time offset and "
+        "the scales assumed beforehand, without mount angle and biases, in blue with those estimated. Red "
+        "crosses are pictures taken for something else. Points at the edge lie beyond it."
     )
     traces = [trace for trace in fit.traces if trace.log == log]
     panels = []
     for y, sensor, channel in _ROWS:
         x = "time (s)" if y == _ROWS[-1][0] else ""
         panels.append(_panel(traces, sensor, channel, x, y))
-    return Figure(title, note, panels, 7.4, verdict, coarse=True)
+    return Figure(title, note, panels, 7.4, verdict)
 
 
 def _panel(traces: list[Trace], sensor: str, channel: int, x: str, y: str) -> Plot:
@@ -77,9 +78,9 @@ def _correlation(fit: Alignment, verdict: str) -> Figure:
     offset, sigma = 1e3 * float(fit.sensor[at]), 1e3 * float(fit.sigma[at])
     title = "When the camera and the gyroscope see the same motion"
     note = (
-        "Rate of phi that pictures four frames apart show, against that of the gyroscope over the same time. "
-        f"The line is the time offset of the whole fit, the band its 2{SIGMA}; with one {SIGMA} it is "
-        f"{number(offset, 'ms', 4)} \N{PLUS-MINUS SIGN} {number(sigma, 'ms', 2)}."
+        "The rate of phi that pictures four frames apart show is compared with the gyroscope's over the same "
+        f"time. The line is the time offset of the whole fit, the band its 2{SIGMA}; with one {SIGMA} it is "
+        f"{with_sigma(offset, sigma)} \N{PLUS-MINUS SIGN} {with_sigma(sigma, sigma)} ms."
     )
     x, y = "pictures later than the gyroscope (ms)", "correlation"
     at_ms, value = 1e3 * fit.correlation.offset_s, fit.correlation.value

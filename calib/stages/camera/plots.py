@@ -152,9 +152,9 @@ def _errors(fit: Calibration, verdict: str) -> Figure:
     rms = np.sqrt(np.nansum(squared, axis=1) / np.maximum(count, 1))
     worst = int(np.argmax(rms))
     note = (
-        f"RMS {number(whole, 'px')} over {fit.observations.points} points in {views} view"
+        f"The RMS is {number(whole, 'px')} over {fit.observations.points} points in {views} view"
         f"{'' if views == 1 else 's'}, at worst {number(float(rms[worst]), 'px')} in "
-        f"{short(names[worst], 24)}. Rings: 1, 2 and 3 standard deviations of a coordinate "
+        f"{short(names[worst], 24)}. Rings are 1, 2 and 3 standard deviations of a coordinate "
         f"({number(fit.sigma_px, 'px')}); chance puts 39, 86 and 99 % inside."
     )
     if not count.any():
@@ -458,9 +458,10 @@ def _projection_sigma(fit: Calibration, sigma: Covariance, verdict: str) -> Figu
     values[values > math.hypot(*size)] = np.inf
     median = float(np.median(values[~np.isnan(values)])) if not np.isnan(values).all() else np.nan
     note = (
-        f"Standard deviation of where the camera puts a point {number(sigma.distance_m, 'm')} away, had the "
-        f"pictures been taken again; worst direction, median {number(median, 'px')}. Dashed: hull of the "
-        "corners seen; beyond it the camera extrapolates."
+        f"With pictures taken again, the camera would put a point {number(sigma.distance_m, 'm')} away "
+        "elsewhere by this standard deviation, in the worst direction; its median is "
+        f"{number(median, 'px')}. The dashed line is the hull of the corners seen; beyond it the camera "
+        "extrapolates."
     )
     outline = Shape(hull(fit.observations.pixels[fit.observations.present]), edge="red", kind="dashed")
     panel = picture(size, (Field(u, v, values, "px", "standard deviation (px)"), outline))
@@ -494,8 +495,8 @@ def _comparison(what: str, candidates: Sequence[Candidate], chosen: str, verdict
     marks.append(Curve(shown[:, 1], rows, "held back", "diamonds", "red", 6.5))
     names = tuple(f"{short(one.name, 20)}, {one.parameters} parameters" for one in candidates)
     note = (
-        "RMS over views that the model was fitted to and over views held back. The simplest model is taken "
-        f"that no richer one beats on views held back: {short(chosen, 20)}."
+        "The RMS is over views that the model was fitted to, and over views held back. The simplest model is "
+        f"taken that no richer one beats on views held back: {short(chosen, 20)}."
     )
     panel = Plot("RMS (px)", "", marks, x_limits=(low, limit), grid="x", names=names)
     title = f"Which {what} predicts views that it has not seen"
@@ -524,10 +525,10 @@ def _distortion(fit: Calibration, covariance: Covariance, verdict: str) -> Figur
         note = "This camera model has no distortion."
     else:
         note = (
-            f"Kind: {distortion_kind(camera)}; up to {number(float(length.max()), 'px')}, mean "
-            f"{number(float(length.mean()), 'px')} over the picture. Arrows lead from where a lens without "
-            "distortion shows a point to where this one does. Dashed: hull of the corners seen; shaded: none "
-            "seen."
+            f"The distortion ({distortion_kind(camera)}) moves points by up to "
+            f"{number(float(length.max()), 'px')}, by {number(float(length.mean()), 'px')} on average over "
+            "the picture. Arrows lead from where a lens without distortion shows a point to where this one "
+            "does. The dashed line is the hull of the corners seen; in the shaded part none was seen."
         )
     marks: tuple[Mark, ...] = ()
     if not camera.ideal and _finite(camera):
@@ -611,8 +612,9 @@ def _displacement(camera: Camera, report: DistortionReport) -> Figure:
     most, mean = number(report.max_px, "px"), number(report.mean_px, "px")
     region_most, region_mean = number(report.region_max_px, "px"), number(report.region_mean_px, "px")
     note = (
-        f"Kind: {report.kind}; it {report.effect}. Whole picture: up to {most}, mean {mean}. Region "
-        f"of interest (box): up to {region_most}, mean {region_mean}."
+        f"The distortion ({report.kind}) moves points by up to {most}, by {mean} on average over the "
+        f"picture, in the region of interest (box) by up to {region_most}, by {region_mean} on average; it "
+        f"{'matters' if report.effect == 'matters' else 'is ' + report.effect}."
     )
     if report.plane is not None:
         read, fitted = number(report.plane.max_mm, "mm"), number(report.plane.refitted_max_mm, "mm")
@@ -637,8 +639,9 @@ def _inverse(camera: Camera, inverse: InversePolynomial) -> Figure:
     size, count = camera.image_size_px, len(inverse.radial)
     most, asked = number(inverse.max_error_px, "px"), number(inverse.tolerance_px, "px", 1)
     note = (
-        f"{count} radial coefficient{'' if count == 1 else 's'}; largest error {most} where {asked} is asked "
-        f"for, over the {100 * inverse.covered:.0f} % of the picture that can be undone."
+        f"{count} radial coefficient{' undoes' if count == 1 else 's undo'} the lens; the largest error is "
+        f"{most} where {asked} is asked for, over the {100 * inverse.covered:.0f} % of the picture that can "
+        "be undone."
     )
     u, v, pixels = _grid_over(size, 121)
     error = inverse_error(camera, inverse, pixels.reshape(-1, 2))
@@ -708,8 +711,8 @@ def _plane_sigma(plane: Plane) -> Figure:
     worst = finite.get("All together", every)
     most = number(float(worst.max()) if len(worst) else np.inf, "mm")
     note = (
-        f"Standard deviation in mm of a marker's position, x and y together: up to {most} in the workspace. "
-        "Variances of the three parts add up. Hatched, if any: not in the picture."
+        f"The standard deviation of a marker's position, x and y together, is up to {most} in the workspace. "
+        "The variances of the three parts add up. What is hatched is not in the picture."
     )
     panels = []
     for name in parts:
@@ -747,8 +750,8 @@ def _plane_difference(camera: Camera, plane: Plane) -> Figure:
         free, fixed = number(plane.direct.rms_px, "px"), number(plane.rms_px, "px")
         note = (
             f"A homography fitted to the same corners without knowing the lens puts the marker up to {most} "
-            f"elsewhere, {mean} on average. Its RMS is {free}, with the lens it is {fixed}. Dots: corners of "
-            "the board."
+            f"elsewhere, {mean} on average. Its RMS is {free}, with the lens it is {fixed}. Dots are "
+            "the board's corners."
         )
         at, vectors = (grid[2::4, 2::4].reshape(-1, 2) for grid in (1e3 * points_m, moved_mm))
         times = _times(vectors, 3.6e3 * float(min(x[1] - x[0], y[1] - y[0])))
@@ -764,9 +767,9 @@ def _plane_picture(camera: Camera, plane: Plane) -> Figure:
     size = camera.image_size_px
     x0, y0, x1, y1 = (1e3 * value for value in plane.workspace_m)
     note = (
-        f"RMS {number(plane.rms_px, 'px')} in the picture, {number(plane.rms_mm, 'mm')} on the plane, over "
-        f"{plane.points} corners. Outlined: the workspace, x from {x0:g} to {x1:g} mm and y from {y0:g} to "
-        f"{y1:g} mm."
+        f"The RMS is {number(plane.rms_px, 'px')} in the picture, {number(plane.rms_mm, 'mm')} on the plane, "
+        f"over {plane.points} corners. The outline is the workspace, x from {x0:g} to {x1:g} mm and y from "
+        f"{y0:g} to {y1:g} mm."
     )
     times = _times(plane.residuals_px, 0.05 * max(size))
     marks = [*_outline(camera, plane), *_world_axes(camera, plane)]

@@ -227,7 +227,7 @@ class Lens(Result):
     That a lens matters is no defect: `effect` says it, and the verdict stays ok.
     """
 
-    kind: str = quantity(label="kind", fact=True)
+    kind: str = quantity(label="kind of distortion", fact=True)
     max_px: Number = quantity(label="distortion, at most", digits=3, fact=True)
     mean_px: Number = quantity(label="distortion, mean", digits=3)
     region_px: Annotated[list[Number], Field(min_length=4, max_length=4)]

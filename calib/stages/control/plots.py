@@ -64,7 +64,7 @@ def _commands(outcomes: Sequence[Outcome]) -> list[Plot]:
 
 def _angles(model: Model, reference: Reference, outcomes: Sequence[Outcome]) -> Figure:
     errors = (f"{one.controller} {number(one.figures.angle_rms_rad, 'rad')}" for one in outcomes)
-    note = f"Simulated. RMS of the angle: {', '.join(errors)}."
+    note = f"Simulated. The RMS error of the angle is {', '.join(errors)}."
     marks = [Curve(reference.t_s, reference.phi_rad, "reference", "dashed", "ink", 1.6)]
     for hue, one in zip(_HUES, outcomes, strict=False):
         phi = angle(one.run.states[:, :2], model.plant.bellows_radius_m)
@@ -76,7 +76,7 @@ def _angles(model: Model, reference: Reference, outcomes: Sequence[Outcome]) -> 
 
 def _lengths(reference: Reference, outcomes: Sequence[Outcome]) -> Figure:
     errors = (f"{one.controller} {number(one.figures.head_rms_mm, 'mm')}" for one in outcomes)
-    note = f"Simulated. RMS of the head's place: {', '.join(errors)}."
+    note = f"Simulated. The RMS error of the head's place is {', '.join(errors)}."
     t, q_mm = reference.t_s, 1e3 * reference.q_m
     lengths = [
         Curve(t, q_mm[:, i], f"reference of bellows {i + 1}", kind, "ink", 1.6)
@@ -106,9 +106,9 @@ def tune_plots(model: Model, section: Controller, orientation: Tuned, position: 
     turn, move, wanted = section.orientation, section.position, section.criterion
     note = (
         f"Every rest keeps a gain margin of {wanted.gain_margin:g} and a phase margin of "
-        f"{math.degrees(wanted.phase_margin_rad):.0f} deg. Angle: PID {turn.Kp_pwm_per_rad:g} / "
-        f"{turn.Ki_pwm_per_rad_s:g} / {turn.Kd_pwm_s_per_rad:g}. Lengths: PD {move.Kp_pwm_per_m:g} / "
-        f"{move.Kd_pwm_s_per_m:g}. Grey circles: distance 1 / Ms from -1."
+        f"{math.degrees(wanted.phase_margin_rad):.0f} deg. The angle has a PID of {turn.Kp_pwm_per_rad:g} / "
+        f"{turn.Ki_pwm_per_rad_s:g} / {turn.Kd_pwm_s_per_rad:g}. The lengths have a PD of "
+        f"{move.Kp_pwm_per_m:g} / {move.Kd_pwm_s_per_m:g}. Grey circles are 1 / Ms away from -1."
     )
     loops = (
         _loop(model, "angle", orientation_loop, orientation, wanted.sensitivity),

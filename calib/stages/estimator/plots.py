@@ -68,7 +68,7 @@ def _figure(title: str, note: str, result: Replayed, panels: Sequence[Plot]) -> 
     shared = [replace(one, x_limits=(float(t[0]), float(t[-1]))) for one in panels]
     shared[-1] = replace(shared[-1], x="time (s)")
     title = f"{title}: {short(result.source, 78)}"
-    return Figure(title, note, shared, 6.6, result.verdict.word, coarse=True)
+    return Figure(title, note, shared, 6.6, result.verdict.word)
 
 
 def _line(t: FloatArray, values: FloatArray, label: str, colour: str, size: float = 0.9) -> list[Mark]:
@@ -80,8 +80,8 @@ def _states(result: Replayed) -> Figure:
     """Lengths and angle over time with their bands, the baseline and the truth where it is known."""
     trace, t = result.evidence.trace, _named(result.evidence.trace, "t_s")
     note = (
-        f"Blue: estimate with its 2{SIGMA} band. Orange: the source's pipeline with its 1 Hz low-pass. "
-        "Black: truth, where the log knows it. Red marks: pictures that were gated out."
+        f"Blue is the estimate with its 2{SIGMA} band, orange the source's pipeline with its 1 Hz low-pass, "
+        "black the truth, where the log knows it. Red marks are pictures that were gated out."
     )
     gated = _named(trace, "gated_camera") == 1.0
     # NaN where there is no driven model.
@@ -89,7 +89,7 @@ def _states(result: Replayed) -> Figure:
     edges = np.flatnonzero(np.diff(np.concatenate([[False], kinematic, [False]]).astype(np.int8)))
     stretches = [Band("x", t[i], t[j - 1], colour="ochre") for i, j in edges.reshape(-1, 2)]
     if stretches:
-        note += " Shaded: the kinematic model speaks."
+        note += " Where it is shaded the kinematic model speaks."
     panels = []
     for k, (y, name, sigma, factor) in enumerate(_QUANTITIES):
         value, spread = factor * _named(trace, name), 2.0 * factor * _named(trace, sigma)
@@ -112,7 +112,7 @@ def _innovations(result: Replayed) -> Figure:
     trace, t = result.evidence.trace, _named(result.evidence.trace, "t_s")
     note = (
         f"An honest covariance keeps 95 % within the grey band of 2{SIGMA}, without a pattern. "
-        "Red: gated out and not used; marks at the edge lie beyond it."
+        "Red ones were gated out and not used; marks at the edge lie beyond it."
     )
     panels = []
     for y, names, gate in _SENSORS:
@@ -131,7 +131,7 @@ def _innovations(result: Replayed) -> Figure:
 def _errors(result: Replayed) -> Figure:
     """Errors against the truth with the 2-sigma band, the baseline's beside them."""
     trace, t = result.evidence.trace, _named(result.evidence.trace, "t_s")
-    note = f"Grey: 2{SIGMA} of the estimate. Blue: its error. Orange: the error of the source's pipeline."
+    note = f"Grey is 2{SIGMA} of the estimate, blue its error, orange the error of the source's pipeline."
     panels = []
     for k, (y, name, sigma, factor) in enumerate(_QUANTITIES):
         truth, spread = trace[:, _TRUTH + k], 2.0 * factor * every(_named(trace, sigma))

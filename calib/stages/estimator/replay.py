@@ -621,8 +621,8 @@ def _states_to(
 ) -> Iterator[Callable[[FloatArray], None]]:
     """Where states go: into a file, to a caller, or nowhere."""
     if output is not None:
-        with states_writer(output, columns) as file:
-            yield file.add
+        with states_writer(output, columns) as add:
+            yield add
     else:
         yield keep or (lambda rows: None)
 

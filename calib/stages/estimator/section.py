@@ -195,8 +195,8 @@ class Replayed(Result):
         """Write the states as .csv, .parquet or .mcap. Raises `BadInputError`."""
         from calib.io.states import states_writer
 
-        with states_writer(Path(path), self.columns) as file:
-            file.add(self.states)
+        with states_writer(Path(path), self.columns) as add:
+            add(self.states)
 
     def more_words(self) -> list[Block]:
         """Errors of this estimator and of others, side by side."""

@@ -76,9 +76,9 @@ def _y(axis: str) -> str:
 def _allan(result: Static, verdict: str) -> Figure:
     """Overlapping Allan deviation of each axis, its 1-sigma bounds, and the fitted N, B and K."""
     note = (
-        f"Grey: 1{SIGMA} bounds. White noise N falls with the root of the averaging time {_TAU}, bias "
-        "instability B is level, a random walk K of the bias rises. A line is drawn for what the logs show; "
-        "\N{LESS-THAN SIGN} is a bound of 95 % for what they are too short for."
+        f"Grey bands are 1{SIGMA} bounds. White noise N falls with the root of the averaging time {_TAU}, "
+        "bias instability B is level, a random walk K of the bias rises. A line is drawn for what the logs "
+        "show; \N{LESS-THAN SIGN} marks a bound of 95 % for what they are too short for."
     )
     mosaic = _by_axis(result.axes)
     panels = tuple(_deviation(noise) for noise in result.noise)
@@ -111,8 +111,8 @@ def _deviation(noise: AxisNoise) -> Plot:
 def _readings(axes: Sequence[str], log: StaticLog, verdict: str) -> Figure:
     """Readings of one log over time, means over a second, and where it moves."""
     moved = len(log.motions)
-    note = "Grey: readings, the extremes of each bin. Blue: means over a second. " + (
-        f"Red: {moved} stretch(es) taken for motion and left out." if moved else "No motion was found."
+    note = "Grey are the readings, as the extremes of each bin, blue their means over a second. " + (
+        "Red stretches were taken for motion and left out." if moved else "No motion was found."
     )
     period, zero = log.sampling.period_s, float(log.parts[0].t_s[0])
     bands = [Band("x", one.from_s - zero, one.to_s - zero, colour="peach") for one in log.motions]
@@ -134,8 +134,8 @@ def _readings(axes: Sequence[str], log: StaticLog, verdict: str) -> Figure:
 def _drift(result: Static, verdict: str) -> Figure:
     """Drift of the angle in each log, by the gyroscope and by the chip (Fig. 2.4)."""
     note = (
-        f"Slope of -gz integrated, and of the angle that the chip reports, with 2{SIGMA}. The line is the "
-        "mean of the logs, the band their standard deviation. A slope alone does not rank filters."
+        f"These are the slopes of -gz integrated and of the angle that the chip reports, with 2{SIGMA}. The "
+        "line is the mean of the logs, the band their standard deviation. A slope does not rank filters."
     )
     panels = []
     for title, drifts in (
@@ -214,10 +214,10 @@ def _disc(at: FloatArray, rings_deg: Sequence[float], centre: str, title: str) -
 
 def _residuals(result: Intrinsics, verdict: str) -> Figure:
     """What rests and turns are off by, and the threshold that was taken."""
-    note = f"Bars: 2{SIGMA} of a rest. "
+    note = f"Bars are 2{SIGMA} of a rest. "
     if result.accel is not None:
         rms = number(1e3 * result.accel.rms_mps2, _MMPS2)
-        note += f"The rests differ from g by {rms} (RMS). Red: the threshold taken, and the RMS of the turns."
+        note += f"The rests differ from g by {rms} (RMS). Red are the threshold taken and the turns' RMS."
     panels = (_rests(result), _thresholds(result), _turns(result))
     return Figure("Residuals of rests and turns", note, panels, 5.4, verdict, mosaic=("AA", "BC"))
 
@@ -294,8 +294,9 @@ def _angles(logs: Sequence[LogDrift]) -> Figure:
     """Angles since each log's start, a panel for each method and a line for each log (Fig. 2.4)."""
     names = list(dict.fromkeys(track.name for log in logs for track in log.tracks))
     note = (
-        "Angle since the start of each log, less the true angle where it has one. Each panel has its own "
-        "scale. A slope alone does not rank filters: the MM filter rejects a constant gyro bias entirely."
+        "This is the angle since the start of each log, less the true one where it has one. Each panel has "
+        "its own scale. A slope alone does not rank filters: the MM filter rejects a constant gyro bias "
+        "entirely."
     )
     panels = []
     for i, name in enumerate(names):
@@ -331,8 +332,8 @@ def _slopes(logs: Sequence[LogDrift]) -> Figure:
     """Slope of each method in each log with its interval."""
     names = list(dict.fromkeys(m.name for log in logs for m in log.measures))
     note = (
-        "Slope of the angle's error in each log, with 95 % intervals; logs from top to bottom. The scale is "
-        f"linear within {_PM}0.01 degrees/s and logarithmic beyond."
+        "These are the slopes of the angle's error in each log, with 95 % intervals, from the first log at "
+        f"the top to the last. The scale is linear within {_PM}0.01 degrees/s and logarithmic beyond."
     )
     marks: list[Mark] = [Rule("x", 0.0, "ink")]
     for j, (log, hue) in enumerate(zip(logs, _colours(logs), strict=True)):
@@ -362,10 +363,10 @@ def _liveliest(log: LogDrift) -> tuple[int, slice]:
 
 def _in_motion(log: LogDrift) -> Figure:
     """Angles of sensors and filters while the log moves most, and their errors (Fig. 2.6)."""
-    note = "The twelve seconds that move most. Below: error against the true angle, less its mean there."
+    note = "These twelve seconds move most. Below is the error against the true angle, less its mean there."
     truth = log.truth_rad
     if truth is None:
-        note = "The twelve seconds that move most. The log has no true angle. Below: difference from MM 3/3."
+        note = "These twelve seconds move most. The log has no true angle: below is what differs from MM 3/3."
     k, where = _liveliest(log)
     t = log.start_s[k] - log.start_s[0] + log.sampling.period_s * np.arange(where.start, where.stop)
     tracks = {track.name: np.degrees(track.phi_rad[k][where]) for track in log.tracks}
@@ -427,7 +428,7 @@ def _gains(result: Tuning, verdict: str) -> Figure:
             marks.append(Curve(*at, one.name, kind, hue, 8.0))
     panel = Plot("Kp (1/s)", "Ki (1/s\N{SUPERSCRIPT TWO})", marks, above, log="xy")
     title = f"Gains of the angle filter: {result.recommended.name}"
-    return Figure(title, "Error on the whole logs by pair of gains.", (panel,), 4.3, verdict)
+    return Figure(title, "The map is the error on the whole logs by pair of gains.", (panel,), 4.3, verdict)
 
 
 def _tuning_errors(result: Tuning, pieces: Sequence[Piece], verdict: str) -> Figure:
@@ -460,4 +461,4 @@ def _tuning_errors(result: Tuning, pieces: Sequence[Piece], verdict: str) -> Fig
         Plot("time (s)", "error (degrees)", below, x_limits=limits),
     )
     title = f"Errors over time: {short(piece.source, 70)}"
-    return Figure(title, f"Against {by}.", panels, 4.6, verdict)
+    return Figure(title, f"Errors are differences from {by}.", panels, 4.6, verdict)

@@ -48,11 +48,11 @@ def plots(filter_: Filter, section: LowPass, positions: Positions | None = None)
 def _response(filter_: Filter, section: LowPass, design: str) -> Figure:
     """Gain, group delay, step response and poles."""
     step, rate, cut = section.step, section.rate_hz, section.cutoff_hz
-    overshoot = f"overshoots by {step['overshoot']:.1%}" if step["overshoot"] else "no overshoot"
+    overshoot = f"it overshoots by {step['overshoot']:.1%}" if step["overshoot"] else "it does not overshoot"
     note = (
         f"Slow motion arrives {number(section.dc_delay_s, 's')} late. A step rises in "
         f"{number(step['rise_s'], 's')} and stays within 2 % after {number(step['settling_s'], 's')}; "
-        f"{overshoot}. Coefficients rounded to single precision."
+        f"{overshoot}. The coefficients are rounded to single precision."
     )
     f = np.geomspace(min(0.02 * cut, 1e-3 * rate), 0.4999 * rate, 800)
     x, limits, at_cut = "frequency (Hz)", (float(f[0]), 0.5 * rate), Rule("x", cut, "red", "dashed")
@@ -93,11 +93,11 @@ def _on_log(filter_: Filter, section: LowPass, positions: Positions, design: str
     log = section.log
     assert log is not None
     jitter = ", ".join(
-        f"{name} from {number(axis.jitter_before, log.unit)} to {number(axis.jitter_after, log.unit)}"
+        f"in {name} from {number(axis.jitter_before, log.unit)} to {number(axis.jitter_after, log.unit)}"
         for name, axis in log.axes.items()
     )
     note = (
-        f"{short(log.name, 60)}. Jitter (standard deviation): {jitter}. The filtered line is "
+        f"The jitter of {short(log.name, 60)} (standard deviation) goes {jitter}. The filtered line is "
         f"{number(section.dc_delay_s, 's')} late and starts without a transient."
     )
     piece = positions.ticks.longest
