@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from source_model import PolynomialForce
+
 from calib.stages.actuator.parameters import pumps_connected
-from calib.stages.actuator.pump import Orifice, PolynomialForce, Pump
+from calib.stages.actuator.pump import Orifice, Pump
 from calib.stages.control.laws import Model
 
 NOMINAL = Model(pumps_connected(), Pump())

@@ -369,6 +369,8 @@ class Orientation:
 
     def __post_init__(self) -> None:
         _one_of("controller", self.controller, _ORIENTATION)
+        if self.sign not in (1, -1):
+            raise BadInputError(f"sign of the orientation error: found {self.sign}, expected 1 or -1")
 
     def _law(self, rig: SimulatedRig, ticks: int) -> Law:
         pid = _tuned(rig, _ORIENTATION[self.controller], self.Kp, self.Ki, self.Kd)
@@ -457,7 +459,7 @@ class EllipseTrack:
     feedforward: bool = True
 
     def __post_init__(self) -> None:
-        Ellipse(chord=self.chord)
+        _one_of("chord", self.chord, ("exact", "thesis"))
 
     def _wanted(self, rig: SimulatedRig, t_s: FloatArray) -> FloatArray:
         return Ellipse(chord=self.chord).bellows_m(t_s, rig.plant.bellows_radius_m)

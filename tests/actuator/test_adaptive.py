@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from source_model import acceleration
 
 from adaptive import Method, simulate_adaptive, swing_adaptive
 from calib.core.arrays import FloatArray
-from calib.stages.actuator import dynamics as dyn
 from calib.stages.actuator.parameters import Plant, pumps_connected
 from calib.stages.actuator.pump import Pump, RateLimit, delayed, static_force_N
 from calib.stages.actuator.simulate import state_row
@@ -29,7 +29,7 @@ def test_reference_equations_give_the_same_swing() -> None:
     l1, l2, _ = plant.creep_rates
 
     def slope(_: float, y: FloatArray) -> FloatArray:
-        ddq = dyn.acceleration(plant, y[:2], y[2:4], y[4:], start[8:])
+        ddq = acceleration(plant, y[:2], y[2:4], y[4:], start[8:])
         return np.concatenate([y[2:4], ddq, -l1 * y[4:] + l2 * y[2:4]])
 
     y = solve_ivp(slope, (0.0, 0.3), start[:6], method="DOP853", t_eval=times, rtol=1e-10, atol=1e-12).y

@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import source_model as src
 import sympy
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -24,10 +25,9 @@ from calib.stages.actuator import kinematics as kin
 from calib.stages.actuator import simulate as kernel
 from calib.stages.actuator.dynamics import coefficients, rates
 from calib.stages.actuator.parameters import (
+    Creep,
     Plant,
-    StandardLinearSolid,
     Stiffness,
-    free_swing,
     pumps_connected,
 )
 from calib.stages.actuator.pump import Orifice, Pump, RateLimit, advance_pump, pump_coefficients
@@ -139,7 +139,7 @@ def test_head_projection_against_the_bellows_ends() -> None:
     r = plant.bellows_radius_m
 
     def ends(q: FloatArray) -> FloatArray:
-        H = kin.transform(kin.angle(q, r), kin.length(q))
+        H = src.transform(kin.angle(q, r), kin.length(q))
         return np.stack([(H @ np.array([side, 0.0, 1.0]))[:2] for side in (-r, r)])
 
     q = np.array([0.085, 0.06])
@@ -156,7 +156,7 @@ def test_hot_path_is_the_reference(plant: Plant) -> None:
     c = dyn.coefficients(plant)
     r = c.r
     for q, dq, z, force in zip(*random_motion(2, 60), strict=True):
-        expected = dyn.acceleration(plant, q, dq, z, force)
+        expected = src.acceleration(plant, q, dq, z, force)
         rate = derivative(c, np.concatenate([q, dq, z]), *force)
         assert rate[2:4] == pytest.approx(expected, rel=1e-10, abs=1e-9)
         assert rate[:2] == pytest.approx(dq)
@@ -173,18 +173,18 @@ def test_energies_belong_to_the_forces(plant: Plant) -> None:
     h = 1e-7
     for q, dq, z, force in zip(*random_motion(3, 20), strict=True):
         gradient = [
-            (dyn.potential_energy_J(plant, q + e) - dyn.potential_energy_J(plant, q - e)) / (2 * h)
+            (src.potential_energy_J(plant, q + e) - src.potential_energy_J(plant, q - e)) / (2 * h)
             for e in np.eye(2) * h
         ]
         assert dyn.resisting_forces(plant, q, np.zeros(2)) == pytest.approx(gradient, rel=1e-5, abs=1e-7)
         rate = derivative(dyn.coefficients(plant), np.concatenate([q, dq, z]), *force)
         ends = [
-            float(dyn.energy_J(plant, q + s * rate[:2], dq + s * rate[2:4], z + s * rate[4:]))
+            float(src.energy_J(plant, q + s * rate[:2], dq + s * rate[2:4], z + s * rate[4:]))
             for s in (-h, h)
         ]
-        power = force @ dq - float(dyn.dissipation_W(plant, q, dq, z))
+        power = force @ dq - float(src.dissipation_W(plant, q, dq, z))
         assert (ends[1] - ends[0]) / (2 * h) == pytest.approx(power, rel=1e-4, abs=1e-5)
-        assert dyn.dissipation_W(plant, q, dq, z) >= 0.0
+        assert src.dissipation_W(plant, q, dq, z) >= 0.0
 
 
 @pytest.mark.parametrize("plant", [Plant(), GRAVITY, PLANTS[5], PLANTS[6]])
@@ -206,7 +206,7 @@ PUMPED = pumps_connected()
 
 
 def energy(plant: Plant, motion: Motion) -> FloatArray:
-    return dyn.energy_J(plant, motion.q_m, motion.dq_mps, motion.z_N)
+    return src.energy_J(plant, motion.q_m, motion.dq_mps, motion.z_N)
 
 
 def extrema(values: FloatArray) -> FloatArray:
@@ -221,8 +221,8 @@ def random_commands(seed: int, blocks: int) -> FloatArray:
 
 def test_swing_has_the_nominal_damping_frequency_and_offset() -> None:
     """zeta 0.055 by (3.39) on deviations from equilibrium, 4.0 Hz, offset 41 -> 6 mrad after 1 s."""
-    motion = swing(free_swing(), state_row(free_swing(), 0.5), 3.0, 1e-3)
-    phi = kin.angle(motion.q_m, free_swing().bellows_radius_m)
+    motion = swing(Plant(), state_row(Plant(), 0.5), 3.0, 1e-3)
+    phi = kin.angle(motion.q_m, Plant().bellows_radius_m)
     peaks = extrema(phi)
     spans = np.abs(np.diff(peaks))
     # Two half swings at a time, so that the creeping offset drops out.
@@ -259,7 +259,7 @@ def test_deflation_to_five_percent(deflation: RateLimit | Orifice, time_s: float
 
 
 def test_free_swing_against_dop853() -> None:
-    plant = free_swing()
+    plant = Plant()
     fixed = swing(plant, state_row(plant, 0.5), 4.0, 1e-3)
     exact = swing_adaptive(plant, state_row(plant, 0.5), fixed.t_s, rtol=1e-12, atol=1e-14)
     assert np.abs(fixed.q_m - exact.q_m).max() < 1e-8
@@ -291,7 +291,7 @@ def test_energy_is_constant_without_damping(phi: float, gravity: tuple[float, fl
     plant = replace(UNDAMPED, gravity_mps2=gravity)
     motion = swing(plant, state_row(plant, phi, 0.07), 20.0, 1e-4, every=20)
     E = energy(plant, motion)
-    assert np.abs(E - E[0]).max() / np.ptp(dyn.potential_energy_J(plant, motion.q_m)) < 1e-8
+    assert np.abs(E - E[0]).max() / np.ptp(src.potential_energy_J(plant, motion.q_m)) < 1e-8
 
 
 @settings(max_examples=25, deadline=None)
@@ -309,7 +309,7 @@ def test_energy_never_rises(
 
     What a step may add is its own error at the corner of the stiffness law, k1 (dq h)^3 / 6.
     """
-    plant, h = Plant(damping_scale=damping, creep=StandardLinearSolid(branch, relaxation)), 2e-4
+    plant, h = Plant(damping_scale=damping, creep=Creep(1.0 / relaxation, branch, -1.0)), 2e-4
     motion = swing(plant, state_row(plant, phi, length), 1.0, h)
     E = energy(plant, motion)
     corner = 1092.9 * (np.abs(motion.dq_mps).max() * h) ** 3 / 6
@@ -456,7 +456,7 @@ def mixed(sets: int, seed: int) -> tuple[list[Plant], list[Pump]]:
                 stiffness_scale=rng.uniform(0.9, 1.1),
                 damping_scale=rng.uniform(3, 20),
                 bending_N_per_rad2=rng.uniform(0, 0.3),
-                creep=StandardLinearSolid(rng.uniform(5, 15), rng.uniform(0.2, 1.0)),
+                creep=Creep(rng.uniform(1, 5), rng.uniform(5, 15), -1.0),
                 gravity_mps2=(0.0, 9.81) if i % 5 == 3 else (0.0, 0.0),
                 force_projection="head" if i % 7 == 4 else "virtual_work",
             )

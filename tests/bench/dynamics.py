@@ -34,7 +34,7 @@ from _rows import Row, interleaved, print_rows
 from adaptive import simulate_adaptive, swing_adaptive
 from calib.core.arrays import FloatArray
 from calib.stages.actuator.dynamics import coefficients
-from calib.stages.actuator.parameters import Plant, Stiffness, free_swing, pumps_connected
+from calib.stages.actuator.parameters import Plant, Stiffness, pumps_connected
 from calib.stages.actuator.pump import Orifice, Pump, delayed, pump_coefficients, static_force_N
 from calib.stages.actuator.simulate import rig_at_rest, run, simulate, simulate_batch, state_row, swing
 
@@ -131,7 +131,7 @@ def usual(plant: Plant) -> Callable[[float, FloatArray], FloatArray]:
 
 def against_usual(repeats: int) -> tuple[float, float, float, float]:
     """Times real time of the usual way and of `swing` with the whole call, and both errors [m]."""
-    plant, duration = free_swing(), 4.0
+    plant, duration = Plant(), 4.0
     start = state_row(plant, 0.5)
     slope, times = usual(plant), np.linspace(0.0, duration, 401)
 
@@ -162,7 +162,7 @@ def jsrm_swings(duration: float) -> tuple[dict[str, Callable[[], object]], dict[
     expressions = Path(jsrm.__file__).parent / "symbolic_expressions" / "planar_pcs_ns-1.dill"
     factory = importlib.import_module("jsrm.systems.planar_pcs").factory
     _, _, matrices, _ = factory(expressions, np_.array([True, False, True]))
-    plant = free_swing()
+    plant = Plant()
     length, radius = plant.rest_length_m, plant.bellows_radius_m
     values: dict[str, object] = {
         "th0": 0.0, "l": [length], "r": [radius], "g": [0.0, 0.0], "E": [7.7e3], "G": [2.6e3],
@@ -202,7 +202,7 @@ def jsrm_swings(duration: float) -> tuple[dict[str, Callable[[], object]], dict[
 
 def rows(repeats: int = 5) -> list[Row]:
     """A swing of 20 s, each with steps and accuracy of its own."""
-    plant, duration, job = free_swing(), 20.0, "simulation, 20 s of free swing"
+    plant, duration, job = Plant(), 20.0, "simulation, 20 s of free swing"
     start, times = state_row(plant, 0.5), np.linspace(0.0, duration, 2001)
     slope = usual(plant)
 

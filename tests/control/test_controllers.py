@@ -11,11 +11,11 @@ from control_models import MODELS, NOMINAL, ORIFICE, UNLIKE
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import dlsim, dlti, lfilter
+from source_model import acceleration
 
-from calib.stages.actuator.dynamics import acceleration
 from calib.stages.actuator.parameters import pumps_connected
-from calib.stages.actuator.pump import pump_at_rest, static_force_N, step_pump
-from calib.stages.actuator.simulate import rig_at_rest, simulate
+from calib.stages.actuator.pump import static_force_N
+from calib.stages.actuator.simulate import rig_at_rest, simulate, tick
 from calib.stages.control.laws import (
     BackCalculation,
     BackState,
@@ -152,8 +152,8 @@ def test_values_of_the_text() -> None:
     assert feed_forward(LINE, math.nextafter(0.067, 0.0)) == 0.0
     assert feed_forward(LINE, 0.067) == 110.0
     assert feed_forward(LINE, 0.091) == pytest.approx(241.95, abs=0.01)
-    assert pytest.approx(0.09337, abs=1e-5) == LINE.saturates_at_m
-    assert feed_forward(LINE, LINE.saturates_at_m + 1e-6) == 255.0
+    assert feed_forward(LINE, 0.09336) < 255.0
+    assert feed_forward(LINE, 0.09338) == 255.0
     assert feed_forward(LINE, 1.0) == 255.0
 
 
@@ -211,10 +211,11 @@ commands = st.lists(st.tuples(st.floats(0, 255), st.floats(0, 255)), min_size=1,
 @pytest.mark.parametrize("model", [NOMINAL, ORIFICE])
 @given(pwm=commands)
 def test_it_follows_the_pumps_of_the_plant(model: Model, pwm: list[tuple[float, float]]) -> None:
-    mine, plant = pumps_at_rest(model), pump_at_rest(model.pump)
+    mine, plant = pumps_at_rest(model), rig_at_rest(model.plant, model.pump)
     for pair in pwm:
-        mine, plant = push(model, mine, pair), step_pump(model.pump, plant, pair)
-        assert mine.force_N == pytest.approx(plant.force_N, abs=1e-12)
+        mine, (plant, _) = push(model, mine, pair), tick(model.plant, model.pump, plant, pair)
+        # One step in a tick here, many there: where the valve of an orifice closes they differ.
+        assert mine.force_N == pytest.approx(plant.row[8:], abs=2e-5)
         assert mine.waiting_pwm == plant.waiting_pwm
 
 

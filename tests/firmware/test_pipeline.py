@@ -13,9 +13,9 @@ from armlogs import swung
 from firmware_build import LIMITS, compare, host, hostile, need, run, strew, write
 from firmware_plant import Loop
 from firmware_rigs import header, rig
+from source_model import head_from_marker, inverse_series
 
 from calib.io.serial import MODE_OFF, MODE_ORIENTATION, MODE_POSITION, Inputs
-from calib.stages.actuator.kinematics import head_from_marker, inverse_series
 from calib.stages.actuator.simulate import rig_at_rest
 from calib.stages.camera.model import Camera, undistort
 from calib.stages.control.laws import (

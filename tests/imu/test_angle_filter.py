@@ -17,8 +17,9 @@ from scipy.io import loadmat
 from scipy.linalg import solve_discrete_lyapunov
 from scipy.signal import freqz, lfilter
 from scipy.spatial.transform import Rotation
+from source_model import pose_from_configuration
 
-from calib.stages.actuator.kinematics import marker_from_head, pose_from_configuration
+from calib.stages.actuator.kinematics import marker_from_head
 from calib.stages.imu.levelling import Levelling, level_log, level_three, system
 from calib.stages.imu.mahony import (
     Mahony,

@@ -275,6 +275,11 @@ def _steady_lengths(from_pwm: float, count: int) -> tuple[FloatArray, FloatArray
     return pwm, _REST_M + 1e-3 * np.polyval(law.elongation_mm, law.supply_V * pwm / PWM_MAX)
 
 
+def _saturates_m(line: FeedForward) -> float:
+    """Length of a bellows from which the limit holds."""
+    return line.from_m + (line.limit_pwm - line.offset_pwm) / line.slope_pwm_per_m
+
+
 def ctl_ff() -> Values:
     line, (u, length) = FeedForward(), _steady_lengths(110.0, 300)
     inside = (length >= line.from_m) & (length <= 0.091)
@@ -284,7 +289,7 @@ def ctl_ff() -> Values:
         "rms_pwm": float(np.sqrt(np.mean(off**2))),
         "slope_pwm_per_m": float(np.polyfit(length[inside], u[inside], 1)[0]),
         "at_91mm_pwm": feed_forward(line, 0.091),
-        "saturates_mm": 1e3 * line.saturates_at_m,
+        "saturates_mm": 1e3 * _saturates_m(line),
     }
 
 
@@ -359,7 +364,7 @@ def figure_4_11() -> tuple[Plot, Values]:
         curve("(4.6)", 1e3 * q, output, colour=0),
         curve("steady lengths of (2.13), corrected", 1e3 * steady, pwm, "dashed", 1),
     )
-    values: Values = {"at_91mm_pwm": feed_forward(line, 0.091), "saturates_mm": 1e3 * line.saturates_at_m}
+    values: Values = {"at_91mm_pwm": feed_forward(line, 0.091), "saturates_mm": 1e3 * _saturates_m(line)}
     return Plot("wanted length of a bellows (mm)", "feed-forward (PWM)", curves), values
 
 

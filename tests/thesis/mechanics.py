@@ -12,10 +12,11 @@ from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
+from source_model import PRINTED_CREEP, PolynomialForce, kinetic_energy_J, pose_from_configuration, transform
 
 from calib.core.arrays import FloatArray
 from calib.core.plot import Band, Plot
-from calib.stages.actuator.dynamics import coriolis_matrix, kinetic_energy_J, linearised, mass_matrix
+from calib.stages.actuator.dynamics import coriolis_matrix, linearised, mass_matrix
 from calib.stages.actuator.identify import (
     Solution,
     StiffnessFit,
@@ -31,12 +32,10 @@ from calib.stages.actuator.kinematics import (
     forward_jacobian,
     inverse,
     inverse_coefficients,
-    pose_from_configuration,
-    transform,
 )
 from calib.stages.actuator.machine import Machine
-from calib.stages.actuator.parameters import PRINTED_CREEP, Plant, growth_rate_per_s
-from calib.stages.actuator.pump import PWM_MAX, ElongationForce, PolynomialForce, static_force_N
+from calib.stages.actuator.parameters import Plant, growth_rate_per_s
+from calib.stages.actuator.pump import PWM_MAX, ElongationForce, static_force_N
 from calib.stages.actuator.simulate import STATE
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import at_rest, elongation_mm, fall_time_s, tick_times

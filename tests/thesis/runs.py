@@ -12,9 +12,11 @@ from dataclasses import replace
 from functools import cache
 from typing import Any, TypeVar
 
+from source_model import PRINTED_CREEP, PolynomialForce
+
 from calib.core.arrays import BoolArray, FloatArray
-from calib.stages.actuator.parameters import PRINTED_CREEP, Creep, Plant, UnstablePlantWarning
-from calib.stages.actuator.pump import Orifice, PolynomialForce, RateLimit
+from calib.stages.actuator.parameters import Creep, Plant, UnstablePlantWarning
+from calib.stages.actuator.pump import Orifice, RateLimit
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import Figures, make_scenario, run_scenario
 from calib.twin.simulate import Run

@@ -12,10 +12,11 @@ from functools import cache
 import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.ndimage import median_filter
+from source_model import head_from_marker, transform
 
 from calib.core.arrays import FloatArray
 from calib.core.plot import Plot
-from calib.stages.actuator.kinematics import forward, head_from_marker, marker_from_head, transform
+from calib.stages.actuator.kinematics import forward, marker_from_head
 from calib.stages.actuator.pump import ElongationForce
 from calib.stages.camera.bundle import Calibration, calibrate
 from calib.stages.camera.lens import fit_inverse, pixel_grid

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from scipy.signal import butter, lfilter, lfilter_zi
 from scipy.spatial.transform import Rotation
+from source_model import inverse_series
 
 from calib.core.geometry import apply_homography
 from calib.stages.actuator.dynamics import coefficients
-from calib.stages.actuator.kinematics import forward, forward_jacobian, forward_jacobian_rate, inverse_series
-from calib.stages.actuator.parameters import free_swing
+from calib.stages.actuator.kinematics import forward, forward_jacobian, forward_jacobian_rate
+from calib.stages.actuator.parameters import Plant
 from calib.stages.actuator.simulate import state_row, swing
 from calib.stages.control.references import Ellipse
 from calib.twin.rig import nominal_view, workspace_homography
@@ -40,7 +41,7 @@ from calib.twin.simulate import Firmware, FirmwareState, add_frame, add_imu
 
 
 def test_the_motion_of_a_swing_is_that_of_its_path() -> None:
-    plant = free_swing()
+    plant = Plant()
     h = 1e-4
     fine = swing(plant, state_row(plant, 0.5, 0.07), 0.6, h)
     motion = head_motion(coefficients(plant), fine.states)
@@ -176,7 +177,7 @@ def test_its_axes_are_right_handed_and_x_points_to_the_base() -> None:
 
 
 def test_it_feels_the_acceleration_of_its_own_place_minus_gravity() -> None:
-    plant, h = free_swing(), 1e-4
+    plant, h = Plant(), 1e-4
     fine = swing(plant, state_row(plant, 0.5, 0.07), 0.6, h)
     motion = head_motion(coefficients(plant), fine.states)
     imu = replace(CLEAN_IMU_SENSOR, mount_angle_rad=0.1, lever_m=(0.004, 0.009), rate_hz=1.0 / h)
@@ -272,7 +273,7 @@ NODE_S = 1.0 / 300.0
 
 
 def test_a_swing_between_nodes_is_that_of_a_fine_simulation() -> None:
-    plant = free_swing()
+    plant = Plant()
     fine = swing(plant, state_row(plant, 0.5), 1.0, NODE_S / 16, every=1)
     between = states_between(NODE_S, fine.states[::16].copy(), fine.t_s)
     error = np.abs(between - fine.states)

@@ -42,7 +42,6 @@ from calib.stages.actuator.kinematics import (
     chord_ratio,
     chord_ratio_w,
     chord_slope,
-    forward,
     forward_jacobian,
     forward_jacobian_rate,
     inlined,
@@ -201,64 +200,6 @@ def resisting_forces(plant: Plant, q_m: FloatArray, dq_mps: FloatArray) -> Float
 def input_forces(plant: Plant, q_m: FloatArray, force_N: FloatArray) -> FloatArray:
     """tau (..., 2) [N] of the pumps' forces (..., 2) [N] (3.37)."""
     return np.asarray(np.einsum("...ri,...i->...r", force_map(plant, q_m), np.asarray(force_N)))
-
-
-def acceleration(
-    plant: Plant, q_m: FloatArray, dq_mps: FloatArray, z_N: FloatArray, force_N: FloatArray
-) -> FloatArray:
-    """ddq (..., 2) [m/s^2] from M, C, N and tau; every argument (..., 2)."""
-    q, dq = np.asarray(q_m, dtype=np.float64), np.asarray(dq_mps, dtype=np.float64)
-    swept = np.einsum("...rc,...c->...r", coriolis_matrix(plant, q, dq), dq)
-    driving = input_forces(plant, q, force_N) + plant.creep_rates[2] * np.asarray(z_N)
-    total = driving - swept - resisting_forces(plant, q, dq)
-    return np.asarray(np.linalg.solve(mass_matrix(plant, q), total[..., None])[..., 0])
-
-
-def kinetic_energy_J(plant: Plant, q_m: FloatArray, dq_mps: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Translational and rotational kinetic energy (...) [J] (3.21)."""
-    J = forward_jacobian(q_m, plant.bellows_radius_m)
-    rate = np.einsum("...xr,...r->...x", J, np.asarray(dq_mps, dtype=np.float64))
-    moving = 0.5 * plant.mass_kg * (rate[..., 0] ** 2 + rate[..., 1] ** 2)
-    return np.asarray(moving), np.asarray(0.5 * plant.inertia_kgm2 * rate[..., 2] ** 2)
-
-
-def potential_energy_J(plant: Plant, q_m: FloatArray) -> FloatArray:
-    """Springs, bending and gravity (...) [J] (3.42); M_bnd = 2 r_B k_bnd |phi|^3 / 3.
-
-    Only the forces by virtual work derive from it.
-    """
-    q = np.asarray(q_m, dtype=np.float64)
-    c = coefficients(plant)
-    eps = q - c.l0
-    stretch = np.maximum(eps, 0.0)
-    more = stretch**3 * (c.k1 / 3.0 + stretch * (c.k2 / 4.0 + stretch * c.k3 / 5.0))
-    springs = np.sum(0.5 * c.k0 * eps**2 + more, axis=-1)
-    phi = np.abs(angle(q, c.r))
-    weight = c.m * forward(q, c.r)[..., :2] @ np.array([c.gx, c.gy])
-    return np.asarray(springs + 2.0 / 3.0 * c.r * c.bending * phi**3 - weight)
-
-
-def creep_energy_J(plant: Plant, z_N: FloatArray) -> FloatArray:
-    """Energy (...) [J] that a creep element with lambda2 lambda3 < 0 holds at z (..., 2) [N], else 0."""
-    z = np.asarray(z_N, dtype=np.float64)
-    _, l2, l3 = plant.creep_rates
-    if l2 * l3 >= 0.0:
-        return np.zeros(z.shape[:-1])
-    return np.asarray(-0.5 * l3 * np.sum(z / l2 * z, axis=-1))
-
-
-def energy_J(plant: Plant, q_m: FloatArray, dq_mps: FloatArray, z_N: FloatArray) -> FloatArray:
-    """Whole energy (...) [J]: constant without damping and creep, never rising with passive ones."""
-    moving, turning = kinetic_energy_J(plant, q_m, dq_mps)
-    return moving + turning + potential_energy_J(plant, q_m) + creep_energy_J(plant, z_N)
-
-
-def dissipation_W(plant: Plant, q_m: FloatArray, dq_mps: FloatArray, z_N: FloatArray) -> FloatArray:
-    """Power (...) [W] that dampers and creep turn into heat, by virtual work."""
-    q, dq = np.asarray(q_m, dtype=np.float64), np.asarray(dq_mps, dtype=np.float64)
-    damped = _bellows_forces(plant, q, dq) - _bellows_forces(plant, q, np.zeros_like(dq))
-    crept = 2.0 * plant.creep_rates[0] * creep_energy_J(plant, z_N)
-    return np.asarray(np.sum(damped * dq, axis=-1) + crept)
 
 
 def linearised(plant: Plant, q_m: FloatArray) -> FloatArray:

@@ -99,7 +99,6 @@ def values_of(nominal: Machine) -> dict[str, float]:
     law = pump.deflation
     orifice = law if isinstance(law, Orifice) else Orifice()
     falling = law.falling_N_per_s if isinstance(law, RateLimit) else 0.4
-    assert isinstance(pump.static, ElongationForce)
     knots = np.polyval(pump.static.elongation_mm, KNOTS_V).tolist()
     return {
         "mass_kg": plant.mass_kg,
@@ -160,7 +159,6 @@ def made(nominal: Machine, values: Mapping[str, float], hoses: bool, tick_s: flo
         creep=Creep(v["lambda1_per_s"], v["lambda2_N_per_m"], v["lambda3"]),
     )
     static = nominal.pump.static
-    assert isinstance(static, ElongationForce)
     law = nominal.pump.deflation
     curve = static.elongation_mm
     if any(name in values for name in _ELONGATIONS):
@@ -355,7 +353,6 @@ _START_REACH = (0.3, 0.02, 30.0, 1.0, 2.0, 2.0, *(5.0,) * 4)
 _FREE_SIGMA = (3.0, 0.1, 0.2, 0.2)
 _PUMPED_SIGMA = (0.5, 0.02, 0.2, 0.2, *(0.5,) * 4)
 """Priors of the same, without those of angle and length: of free swings and of logs with pumps."""
-_PRIORS = ("offset_phi_rad", "offset_length_m")
 
 
 @dataclass(frozen=True)
@@ -386,10 +383,6 @@ class Layout:
         """The start of log k."""
         at = self.start + sum(self.starts[:k])
         return slice(at, at + self.starts[k])
-
-    @property
-    def nuisances(self) -> int:
-        return self.size - len(self.names)
 
 
 @dataclass(frozen=True)
@@ -1495,7 +1488,6 @@ _MOST_HELD = 1.5
 _MOST_RELATIVE = 0.25
 _STRONG = 0.95
 _FAR_ROWS = 0.05
-_BY_NATURE = ("lambda3",)
 _MOST_APART_S = 0.04
 _APART_SIGMA = 5.0
 

@@ -149,20 +149,6 @@ def length(q_m: FloatArray) -> FloatArray:
     return 0.5 * (q1 + q2)
 
 
-def configuration(q_m: FloatArray, bellows_radius_m: float) -> FloatArray:
-    """Curvature and length (..., 2) [1/m, m] of the bellows' lengths (..., 2) (3.3)."""
-    ell = length(q_m)
-    return np.stack([angle(q_m, bellows_radius_m) / ell, ell], axis=-1)
-
-
-def pose_from_configuration(k: FloatArray) -> FloatArray:
-    """Head (..., 3) [m, m, rad] of curvature and length (..., 2) (3.6), exact at zero curvature."""
-    kappa, ell = _parts(k, 2, "configuration")
-    phi = kappa * ell
-    chord = ell * chord_ratio(phi)
-    return np.stack([chord * np.sin(0.5 * phi), chord * np.cos(0.5 * phi), phi], axis=-1)
-
-
 def configuration_from_pose(pose: FloatArray) -> FloatArray:
     """Curvature and length (..., 2) [1/m, m] of the head (..., 3) (3.11).
 
@@ -193,34 +179,6 @@ def inverse(pose: FloatArray, bellows_radius_m: float) -> FloatArray:
     ell = configuration_from_pose(pose)[..., 1]
     half = bellows_radius_m * np.asarray(pose, dtype=np.float64)[..., 2]
     return np.stack([ell + half, ell - half], axis=-1)
-
-
-def transform(phi: FloatArray, length_m: FloatArray) -> FloatArray:
-    """Homogeneous transform H_bh (..., 3, 3) from the head's to the base frame (3.5), (3.6).
-
-    Parameters
-    ----------
-    phi : (...) bending angle [rad].
-    length_m : (...) length of the backbone [m].
-    """
-    phi, ell = np.broadcast_arrays(np.asarray(phi, dtype=np.float64), np.asarray(length_m, dtype=np.float64))
-    chord = ell * chord_ratio(phi)
-    H = np.zeros((*phi.shape, 3, 3))
-    H[..., 0, 0] = H[..., 1, 1] = np.cos(phi)
-    H[..., 0, 1] = np.sin(phi)
-    H[..., 1, 0] = -H[..., 0, 1]
-    H[..., 0, 2] = chord * np.sin(0.5 * phi)
-    H[..., 1, 2] = chord * np.cos(0.5 * phi)
-    H[..., 2, 2] = 1.0
-    return H
-
-
-def configuration_jacobian(q_m: FloatArray, bellows_radius_m: float) -> FloatArray:
-    """d(kappa, l) / d(q1, q2), shape (..., 2, 2), of (3.3)."""
-    q1, q2 = _parts(q_m, 2, "bellows")
-    scale = 2.0 / (bellows_radius_m * (q1 + q2) ** 2)
-    half = np.full_like(q1, 0.5)
-    return np.stack([np.stack([scale * q2, -scale * q1], axis=-1), np.stack([half, half], axis=-1)], axis=-2)
 
 
 def _arc_derivatives(phi: FloatArray) -> tuple[FloatArray, ...]:
@@ -266,30 +224,9 @@ def forward_jacobian_rate(q_m: FloatArray, dq_mps: FloatArray, bellows_radius_m:
     )
 
 
-def inverse_jacobian(pose: FloatArray, bellows_radius_m: float) -> FloatArray:
-    """d(q1, q2) / d(x, y, phi), shape (..., 2, 3), of `inverse`, away from the base, |phi| < 2 pi."""
-    x, y, phi = _parts(pose, 3, "pose")
-    S = chord_ratio(phi)
-    chord = np.hypot(x, y)
-    by_x, by_y = x / (chord * S), y / (chord * S)
-    by_phi = -chord * chord_slope(phi) / (S * S)
-    return np.stack(
-        [
-            np.stack([by_x, by_y, by_phi + bellows_radius_m], axis=-1),
-            np.stack([by_x, by_y, by_phi - bellows_radius_m], axis=-1),
-        ],
-        axis=-2,
-    )
-
-
 def _along_tangent(phi: FloatArray, distance_m: float) -> FloatArray:
     phi = np.asarray(phi, dtype=np.float64)
     return distance_m * np.stack([np.sin(phi), np.cos(phi)], axis=-1)
-
-
-def head_from_marker(marker_m: FloatArray, phi: FloatArray, offset_m: float = MARKER_OFFSET_M) -> FloatArray:
-    """Head (..., 2) [m] of the marker (..., 2) [m] and the angle phi (...) [rad] (A.1)."""
-    return np.asarray(marker_m, dtype=np.float64) - _along_tangent(phi, offset_m)
 
 
 def marker_from_head(head_m: FloatArray, phi: FloatArray, offset_m: float = MARKER_OFFSET_M) -> FloatArray:
@@ -319,14 +256,3 @@ def inverse_coefficients(order: int = INVERSE_ORDER) -> tuple[Fraction, ...]:
     for n in range(1, order // 2 + 1):
         c.append(-sum(((-1) ** k * c[n - k] / factorial(2 * k + 1) for k in range(1, n + 1)), Fraction(0)))
     return tuple(2 * value / 4**n for n, value in enumerate(c))
-
-
-def inverse_series(pose: FloatArray, bellows_radius_m: float) -> FloatArray:
-    """Bellows (..., 2) [m] of the head (..., 3) by (3.12) with the series for f, as the firmware does.
-
-    q1 = r_B phi + |(x, y)| f(phi) / 2 and q2 = -r_B phi + |(x, y)| f(phi) / 2.
-    """
-    x, y, phi = np.moveaxis(np.asarray(pose, dtype=np.float64), -1, 0)
-    f = np.polyval([float(c) for c in reversed(inverse_coefficients())], phi * phi)
-    ell = 0.5 * np.hypot(x, y) * f
-    return np.stack([ell + bellows_radius_m * phi, ell - bellows_radius_m * phi], axis=-1)

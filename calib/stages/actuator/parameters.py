@@ -32,8 +32,6 @@ DAMPING_SCALE_FREE = 3.3
 DAMPING_SCALE_PUMPS = 16.0
 """c_dmp with the pumps connected: the air in hoses and orifices damps as well."""
 
-FORCE_PROJECTIONS = ("virtual_work", "head")
-
 SUPPLY_V = 12.0
 """Of the pumps at PWM 255."""
 
@@ -41,27 +39,10 @@ LONGEST_ELONGATION_M = 0.04
 """Up to here a stiffness law has to stay positive; 12 V reach 0.0266 m."""
 
 _ELONGATIONS_M = np.linspace(0.0, LONGEST_ELONGATION_M, 81)
-_GRAVITY_LIMIT_MPS2 = 100.0
 
 
 class UnstablePlantWarning(UserWarning):
     """The parameters describe a plant that moves away from rest by itself."""
-
-
-def _finite(name: str, value: float) -> float:
-    if not math.isfinite(value):
-        raise BadInputError(f"{name}: found {value}, expected a finite number")
-    return value
-
-
-def _positive(name: str, value: float) -> None:
-    if not _finite(name, value) > 0.0:
-        raise BadInputError(f"{name}: found {value:g}, expected a positive number")
-
-
-def _not_negative(name: str, value: float) -> None:
-    if not _finite(name, value) >= 0.0:
-        raise BadInputError(f"{name}: found {value:g}, expected zero or more")
 
 
 @dataclass(frozen=True)
@@ -79,21 +60,12 @@ class Stiffness:
     coefficients: tuple[float, ...] = (47.7, 1092.9)
 
     def __post_init__(self) -> None:
-        if not 1 <= len(self.coefficients) <= 4:
-            raise BadInputError(f"stiffness: found {len(self.coefficients)} coefficients, expected 1 to 4")
-        for i, value in enumerate(self.coefficients):
-            _finite(f"stiffness k{i}", value)
         softest = float(np.polyval(self.coefficients[::-1], _ELONGATIONS_M).min())
         if softest <= 0.0:
             raise BadInputError(
                 f"stiffness: found {softest:g} N/m between 0 and {LONGEST_ELONGATION_M:g} m of elongation, "
                 "expected a positive law"
             )
-
-    @classmethod
-    def of_actuator(cls, *coefficients: float) -> Stiffness:
-        """The law of one bellows from that of the whole actuator: two in parallel, so half of it."""
-        return cls(tuple(0.5 * value for value in coefficients))
 
     @property
     def padded(self) -> tuple[float, float, float, float]:
@@ -112,12 +84,6 @@ class Stiffness:
         """dF/deps [N/m] at the elongation eps [m]."""
         stretch = max(eps, 0.0)
         return sum((n + 1) * value * stretch**n for n, value in enumerate(self.coefficients))
-
-    def energy(self, eps: float) -> float:
-        """Integral of F [J] from 0 to the elongation eps [m]."""
-        if eps < 0.0:
-            return 0.5 * self.coefficients[0] * eps * eps
-        return sum(value * eps ** (n + 2) / (n + 2) for n, value in enumerate(self.coefficients))
 
 
 @dataclass(frozen=True)
@@ -138,56 +104,10 @@ class Creep:
     lambda2_N_per_m: float = 10.0
     lambda3: float = -1.0
 
-    def __post_init__(self) -> None:
-        for name, value in zip(("lambda1", "lambda2", "lambda3"), self.rates, strict=True):
-            _finite(f"creep {name}", value)
-
     @property
     def rates(self) -> tuple[float, float, float]:
         """lambda1 [1/s], lambda2 [N/m], lambda3."""
         return self.lambda1_per_s, self.lambda2_N_per_m, self.lambda3
-
-    @property
-    def passive(self) -> bool:
-        """Whether the element can never give more energy than it took."""
-        coupling = self.lambda2_N_per_m * self.lambda3
-        return coupling == 0.0 or (coupling < 0.0 and self.lambda1_per_s >= 0.0)
-
-
-PRINTED_CREEP = (-0.1047, -14.98, -1.854)
-"""Table 3.2; its energy grows."""
-
-
-@dataclass(frozen=True)
-class StandardLinearSolid:
-    """The bellows' spring in parallel with a spring and a dashpot in series (Zener's solid).
-
-    The branch carries sigma with d sigma/dt = E dq/dt - sigma / T, which is (3.45) with lambda1 = 1 / T,
-    lambda2 = E, lambda3 = -1. Its energy sigma^2 / (2 E) can only be lost, so it is passive for every
-    E >= 0 and T > 0; anything else is refused. The nominal creep is this solid.
-
-    Attributes
-    ----------
-    branch_N_per_m : stiffness E of the branch.
-    relaxation_s : time T after which its force has fallen to 1/e.
-    """
-
-    branch_N_per_m: float = 10.0
-    relaxation_s: float = 1.0 / 3.0
-
-    def __post_init__(self) -> None:
-        _not_negative("stiffness of the creep branch", self.branch_N_per_m)
-        _positive("relaxation time of the creep branch", self.relaxation_s)
-
-    @property
-    def rates(self) -> tuple[float, float, float]:
-        """lambda1 [1/s], lambda2 [N/m], lambda3 of (3.45)."""
-        return 1.0 / self.relaxation_s, self.branch_N_per_m, -1.0
-
-    @property
-    def passive(self) -> bool:
-        """Always true."""
-        return True
 
 
 @dataclass(frozen=True)
@@ -200,7 +120,7 @@ class Plant:
     stiffness : law of one bellows; stiffness_scale is c_spr of (3.47), on the spring alone.
     damping_ratio, damping_scale : zeta of (3.41) and c_dmp of (3.48).
     bending_N_per_rad2 : k_bnd of (3.44) in newton.
-    creep : `Creep`, `StandardLinearSolid`, or None.
+    creep : `Creep` or None.
     gravity_mps2 : (x, y) in the world frame. Off by default, since l0 is the hanging rest length.
     force_projection : "virtual_work", or "head" for the projection of (3.30) - (3.37), which is the
         identity only at phi = 0 and whose springs have no potential.
@@ -218,29 +138,12 @@ class Plant:
     damping_ratio: float = 0.0513
     damping_scale: float = DAMPING_SCALE_FREE
     bending_N_per_rad2: float = 0.1695
-    creep: Creep | StandardLinearSolid | None = Creep()
+    creep: Creep | None = Creep()
     gravity_mps2: tuple[float, float] = (0.0, 0.0)
     force_projection: str = "virtual_work"
     allow_unstable: bool = False
 
     def __post_init__(self) -> None:
-        _positive("mass", self.mass_kg)
-        _not_negative("inertia", self.inertia_kgm2)
-        _positive("bellows radius", self.bellows_radius_m)
-        _positive("rest length", self.rest_length_m)
-        _positive("scale of the stiffness", self.stiffness_scale)
-        _not_negative("damping ratio", self.damping_ratio)
-        _not_negative("scale of the damping", self.damping_scale)
-        _not_negative("bending stiffness", self.bending_N_per_rad2)
-        if self.force_projection not in FORCE_PROJECTIONS:
-            names = " or ".join(FORCE_PROJECTIONS)
-            raise BadInputError(f"force projection: found {self.force_projection!r}, expected {names}")
-        for value in self.gravity_mps2:
-            if not abs(_finite("gravity", value)) <= _GRAVITY_LIMIT_MPS2:
-                raise BadInputError(f"gravity: found {value:g}, expected metres per second squared")
-        self._check_growth()
-
-    def _check_growth(self) -> None:
         growth = growth_rate_per_s(self)
         if growth <= 0.0:
             return
@@ -251,7 +154,7 @@ class Plant:
         )
         if not self.allow_unstable:
             raise BadInputError(f"{sentence}; expected lambda1 > 0 and lambda2 lambda3 < 0")
-        warnings.warn(sentence, UnstablePlantWarning, stacklevel=4)
+        warnings.warn(sentence, UnstablePlantWarning, stacklevel=3)
 
     @property
     def creep_rates(self) -> tuple[float, float, float]:
@@ -262,11 +165,6 @@ class Plant:
     def damping_Ns_per_sqrt_N_per_m(self) -> float:
         """2 c_dmp zeta sqrt(m / 2) of (3.48): times sqrt(k) it is a bellows' damping [N s/m]."""
         return 2.0 * self.damping_scale * self.damping_ratio * math.sqrt(0.5 * self.mass_kg)
-
-
-def free_swing() -> Plant:
-    """The nominal plant with the hoses off."""
-    return Plant()
 
 
 def pumps_connected() -> Plant:

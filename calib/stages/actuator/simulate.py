@@ -22,7 +22,6 @@ from calib.stages.actuator.pump import (
     PumpCoefficients,
     advance_pump,
     delayed,
-    pump_at_rest,
     pump_coefficients,
     static_force_N,
 )
@@ -340,8 +339,8 @@ def state_row(
 
 def rig_at_rest(plant: Plant, pump: Pump, phi_rad: float = 0.0, length_m: float | None = None) -> RigState:
     """The rig before the first command: pumps off, plant at rest at an angle and a length."""
-    off = pump_at_rest(pump)
-    return RigState(state_row(plant, phi_rad, length_m, off.force_N), off.waiting_pwm)
+    g1, g2 = static_force_N(pump, np.zeros(2)).tolist()
+    return RigState(state_row(plant, phi_rad, length_m, (g1, g2)), ((0.0, 0.0),) * pump.delay_ticks)
 
 
 def check_start(row: FloatArray) -> None:
@@ -394,8 +393,6 @@ def largest_step_s(plant: Plant, q_m: FloatArray | None = None) -> float:
 
 
 def _check_step(plant: Plant, step_s: float) -> None:
-    if not 0.0 < step_s < math.inf:
-        raise BadInputError(f"step: found {step_s:g} s, expected a positive time")
     largest = _largest_step_straight_s(plant)
     if step_s > largest:
         raise BadInputError(
@@ -416,13 +413,6 @@ def _run(
             f"beyond {LARGEST_ANGLE_RAD:g} rad; expected smaller forces, or steps below {h:.4g} s"
         )
     return out
-
-
-def _check_counts(substeps: int, every: int, ticks: int) -> None:
-    if substeps < 1 or every < 1:
-        raise BadInputError(f"steps: found {substeps} per tick, every {every}, expected 1 or more")
-    if ticks < 1:
-        raise BadInputError("pwm: found no rows, expected at least one tick")
 
 
 def simulate(
@@ -454,7 +444,6 @@ def simulate(
     check_start(begin.row)
     rows = delayed(pump, pwm, np.array(begin.waiting_pwm, dtype=np.float64).reshape(-1, 2))
     stride = substeps if every is None else every
-    _check_counts(substeps, stride, len(rows))
     h = pump.tick_s / substeps
     _check_step(plant, h)
     states = _run(plant, pump, begin.row, static_force_N(pump, rows), pump.tick_s, substeps, stride)
@@ -467,7 +456,6 @@ def tick(
 ) -> tuple[RigState, FloatArray]:
     """One tick of a closed loop: the state after it and the rows (substeps, 10) of all its steps."""
     queue = (*state.waiting_pwm, pwm)
-    _check_counts(substeps, 1, 1)
     _check_step(plant, pump.tick_s / substeps)
     force = static_force_N(pump, np.array(queue[:1]))
     rows = _run(plant, pump, state.row, force, pump.tick_s, substeps, 1)
@@ -482,7 +470,6 @@ def swing(plant: Plant, start: FloatArray, duration_s: float, step_s: float = 1e
     check_start(start)
     _check_step(plant, step_s)
     steps = round(duration_s / step_s)
-    _check_counts(1, every, steps // max(every, 1))
     static = np.tile(start[8:10], (steps, 1))
     held = np.concatenate([start[:6], start[8:10], start[8:10]])
     states = _run(plant, Pump(), held, static, step_s, 1, every)
@@ -594,29 +581,12 @@ def simulate_batch(
     states (sets, n, 10), one row at the end of each tick, and (sets,) the step in which a set left
     the model, -1 where it did not; the states of such a set are NaN. The step is not checked
     beforehand: an unstable one leaves the model.
-
-    Raises
-    ------
-    BadInputError for lists that do not match, ticks that differ and counts below one.
     """
-    if len(plants) != len(pumps) or not plants:
-        raise BadInputError(f"batch: found {len(plants)} plants and {len(pumps)} pumps, expected as many")
-    if len({pump.tick_s for pump in pumps}) > 1:
-        raise BadInputError("batch: found pumps with different ticks, expected the same for all")
-    if substeps < 1 or threads < 1 or len(pwm) < 1:
-        raise BadInputError(
-            f"batch: found {substeps} steps per tick, {threads} threads, {len(pwm)} rows, expected 1 or more"
-        )
-    rows = np.asarray(start, dtype=np.float64)
-    if rows.shape not in ((len(STATE),), (len(plants), len(STATE))):
-        raise BadInputError(
-            f"batch: found starts of shape {rows.shape}, expected {len(STATE)} numbers per set"
-        )
     task = _Task(
         plants,
         pumps,
         {pump: static_force_N(pump, delayed(pump, pwm)) for pump in set(pumps)},
-        np.ascontiguousarray(np.broadcast_to(rows, (len(plants), len(STATE)))),
+        np.ascontiguousarray(np.broadcast_to(start, (len(plants), len(STATE)))),
         substeps,
         np.empty((len(plants), len(pwm), len(STATE))),
         np.full(len(plants), -1, dtype=np.int64),

@@ -67,9 +67,6 @@ class Pid:
     clamping : compute outputs beyond the limits again with Ki = 0.
     low, high : limits that clamping goes by [PWM].
     tick_s : period.
-
-    Raises `BadInputError` for gains that are not finite, a period that is not positive, or limits in
-    the wrong order.
     """
 
     Kp: float
@@ -79,17 +76,6 @@ class Pid:
     low: float = PWM_MIN
     high: float = PWM_MAX
     tick_s: float = TICK_S
-
-    def __post_init__(self) -> None:
-        for name, gain in (("Kp", self.Kp), ("Ki", self.Ki), ("Kd", self.Kd)):
-            if not math.isfinite(gain):
-                raise BadInputError(f"{name}: found {gain}, expected a finite gain")
-        if not 0.0 < self.tick_s < math.inf:
-            raise BadInputError(f"tick of the controller: found {self.tick_s:g} s, expected a positive time")
-        if not self.low < self.high:
-            raise BadInputError(
-                f"limits of the controller: found {self.low:g} to {self.high:g}, expected low < high"
-            )
 
 
 @dataclass(frozen=True)
@@ -404,11 +390,7 @@ def pwm_for_force(model: Model, state: PumpEstimate, wanted_N: FloatArray, horiz
 
     While a force is wanted a command stays above the dead zone even where it gives none for a moment: the
     same force, without switching the motor off and on. A pump of which nothing is wanted is off.
-
-    Raises `BadInputError` for a horizon of less than a tick.
     """
-    if horizon_ticks < 1:
-        raise BadInputError(f"horizon: found {horizon_ticks} ticks, expected at least 1")
     T = horizon_ticks * model.tick_s
     F = np.array(state.force_N)
     # With an orifice the lag acts on the force itself.
@@ -448,9 +430,6 @@ class BackCalculation:
     Kp, Ki, Kd : as in `pid.Pid`.
     tracking_s : Tt.
     tick_s : period.
-
-    Raises `BadInputError` for gains that are not finite and times that are not positive or, for Tt,
-    shorter than a tick: the integral would overshoot the limit.
     """
 
     Kp: float
@@ -458,18 +437,6 @@ class BackCalculation:
     Kd: float = 0.0
     tracking_s: float = 4.0
     tick_s: float = TICK_S
-
-    def __post_init__(self) -> None:
-        for name, gain in (("Kp", self.Kp), ("Ki", self.Ki), ("Kd", self.Kd)):
-            if not math.isfinite(gain):
-                raise BadInputError(f"{name}: found {gain}, expected a finite gain")
-        if not 0.0 < self.tick_s < math.inf:
-            raise BadInputError(f"tick of the controller: found {self.tick_s:g} s, expected a positive time")
-        if not self.tick_s <= self.tracking_s < math.inf:
-            raise BadInputError(
-                f"back-calculation time: found {self.tracking_s:g} s, expected at least a tick "
-                f"({self.tick_s:.3g} s)"
-            )
 
 
 @dataclass(frozen=True)
@@ -504,8 +471,6 @@ class BackOrientation:
         fixed limits only.
     sign : of the error of bellows 1, as in `loop.OrientationControl`.
     whole_pwm : send whole numbers to the motors.
-
-    Raises `BadInputError` for another sign and a share that is negative.
     """
 
     control: BackCalculation
@@ -513,14 +478,6 @@ class BackOrientation:
     falling_share: float = 0.4
     sign: int = 1
     whole_pwm: bool = True
-
-    def __post_init__(self) -> None:
-        if self.sign not in (1, -1):
-            raise BadInputError(f"sign of the orientation error: found {self.sign}, expected 1 or -1")
-        if not self.falling_share >= 0.0:
-            raise BadInputError(
-                f"share of the falling rate: found {self.falling_share:g}, expected 0 or more"
-            )
 
 
 @dataclass(frozen=True)
@@ -540,14 +497,7 @@ def start_back_orientation(control: BackOrientation) -> BackOrientationState:
 def step_back_orientation(
     control: BackOrientation, state: BackOrientationState, phi_ref_rad: float, phi_rad: float
 ) -> tuple[BackOrientationState, tuple[float, float]]:
-    """One tick: the next state and the PWM values.
-
-    Raises `BadInputError` for a measurement that is not a number.
-    """
-    if not (math.isfinite(phi_ref_rad) and math.isfinite(phi_rad)):
-        raise BadInputError(
-            f"angle of the orientation controller: found {phi_ref_rad}, {phi_rad}, expected finite numbers"
-        )
+    """One tick: the next state and the PWM values."""
     model, error = control.model, control.sign * (phi_ref_rad - phi_rad)
     low = (model.low_pwm, model.low_pwm)
     if math.isfinite(control.falling_share):
@@ -585,26 +535,12 @@ class FeedForward:
     offset_pwm : value there [PWM].
     slope_pwm_per_m : increase with the length [PWM/m].
     limit_pwm : largest value [PWM].
-
-    Raises `BadInputError` for values that are not finite or a length that is not positive.
     """
 
     from_m: float = 0.067
     offset_pwm: float = 110.0
     slope_pwm_per_m: float = 5498.1
     limit_pwm: float = 255.0
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not math.isfinite(value):
-                raise BadInputError(f"feed-forward {name}: found {value}, expected a finite number")
-        if self.from_m <= 0.0:
-            raise BadInputError(f"feed-forward from_m: found {self.from_m:g} m, expected a positive length")
-
-    @property
-    def saturates_at_m(self) -> float:
-        """Length of a bellows from which the limit holds [m]."""
-        return self.from_m + (self.limit_pwm - self.offset_pwm) / self.slope_pwm_per_m
 
 
 def feed_forward(parameters: FeedForward, q_ref_m: float) -> float:
@@ -637,30 +573,12 @@ def feed_forward(parameters: FeedForward, q_ref_m: float) -> float:
 STATES = 9
 
 
-@dataclass(frozen=True)
-class ObserverNoise:
-    """What the gain is designed for.
-
-    Attributes
-    ----------
-    marker_m : standard deviation of the marker along each axis [m].
-    gyro_radps : of the mean of a tick's samples [rad/s].
-    force_N_per_sqrt_s : walk of d. bias_radps_per_sqrt_s : walk of b.
-    accel_mps2_per_sqrt_Hz : density of what pushes the head unseen.
-
-    Raises `BadInputError` for values that are not positive.
-    """
-
-    marker_m: float = 2.5e-4
-    gyro_radps: float = 0.003
-    force_N_per_sqrt_s: float = 0.03
-    bias_radps_per_sqrt_s: float = 3e-3
-    accel_mps2_per_sqrt_Hz: float = 0.05
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not 0.0 < value < math.inf:
-                raise BadInputError(f"observer {name}: found {value:g}, expected a positive number")
+_MARKER_M, _GYRO_RADPS = 2.5e-4, 0.003
+"""Standard deviations of the marker along each axis, and of the mean of a tick's rates."""
+_FORCE_N_PER_SQRT_S, _BIAS_RADPS_PER_SQRT_S, _ACCEL_MPS2_PER_SQRT_HZ = 0.03, 3e-3, 0.05
+"""Walks of d and b, and density of what pushes the head unseen."""
+_AT_M = 0.012
+"""Elongation at which the gain is designed, in the middle of the workspace."""
 
 
 @dataclass(frozen=True)
@@ -724,30 +642,24 @@ def marker_jacobian(q1: float, q2: float, r: float, offset_m: float) -> FloatArr
 
 
 def design_observer(
-    model: Model,
-    noise: ObserverNoise | None = None,
-    at_q_m: tuple[float, float] | None = None,
-    latency_s: float = 0.025,
-    marker_offset_m: float = MARKER_OFFSET_M,
+    model: Model, latency_s: float = 0.025, marker_offset_m: float = MARKER_OFFSET_M
 ) -> Observer:
-    """The observer whose gain is the stationary Kalman filter's at the lengths `at_q_m` [m].
+    """The observer whose gain is the stationary Kalman filter's in the middle of the workspace.
 
-    By default at 12 mm of elongation, in the middle of the workspace. Raises `BadInputError` where no
-    stationary filter exists.
+    Raises `BadInputError` where no stationary filter exists.
     """
     from scipy.linalg import LinAlgError, expm, solve_discrete_are
 
-    noise = noise or ObserverNoise()
     plant, h = model.plant, model.tick_s
-    q = np.full(2, plant.rest_length_m + 0.012) if at_q_m is None else np.array(at_q_m)
+    q = np.full(2, plant.rest_length_m + _AT_M)
     A = np.zeros((STATES, STATES))
     A[:6, :6] = linearised(plant, q)
     inverse = np.linalg.inv(mass_matrix(plant, q))
     A[2:4, 6:8] = inverse
     pushed = np.zeros(STATES)
-    pushed[2:4] = noise.accel_mps2_per_sqrt_Hz**2
-    pushed[6:8] = noise.force_N_per_sqrt_s**2
-    pushed[8] = noise.bias_radps_per_sqrt_s**2
+    pushed[2:4] = _ACCEL_MPS2_PER_SQRT_HZ**2
+    pushed[6:8] = _FORCE_N_PER_SQRT_S**2
+    pushed[8] = _BIAS_RADPS_PER_SQRT_S**2
     # Van Loan's block gives transition and noise of a tick together.
     block = expm(h * np.block([[-A, np.diag(pushed)], [np.zeros_like(A), A.T]]))
     Phi = block[STATES:, STATES:].T
@@ -758,8 +670,8 @@ def design_observer(
     H[2, 2], H[2, 3], H[2, 8] = 0.5 / r, -0.5 / r, 1.0
     to_q = np.linalg.inv(marker_jacobian(float(q[0]), float(q[1]), r, marker_offset_m))
     R = np.zeros((3, 3))
-    R[:2, :2] = noise.marker_m**2 * to_q @ to_q.T
-    R[2, 2] = noise.gyro_radps**2
+    R[:2, :2] = _MARKER_M**2 * to_q @ to_q.T
+    R[2, 2] = _GYRO_RADPS**2
     try:
         P = solve_discrete_are(Phi.T, H.T, 0.5 * (Q + Q.T), R)
     except (LinAlgError, ValueError) as error:
@@ -887,21 +799,12 @@ class ComputedTorque:
     horizon_ticks : time in which the pumps are asked to reach the wanted force.
     Kp_per_s2, Kd_per_s : gains on the lengths' errors.
     whole_pwm : send whole numbers to the motors.
-
-    Raises `BadInputError` for a horizon of less than a tick and for gains that are negative.
     """
 
     horizon_ticks: int = 6
     Kp_per_s2: float = 0.0
     Kd_per_s: float = 0.0
     whole_pwm: bool = True
-
-    def __post_init__(self) -> None:
-        if self.horizon_ticks < 1:
-            raise BadInputError(f"horizon: found {self.horizon_ticks} ticks, expected at least 1")
-        for name in ("Kp_per_s2", "Kd_per_s"):
-            if not 0.0 <= getattr(self, name) < math.inf:
-                raise BadInputError(f"{name}: found {getattr(self, name):g}, expected zero or more")
 
 
 @dataclass(frozen=True)
@@ -936,8 +839,6 @@ def wanted_motion(model: Model, q_m: FloatArray) -> WantedMotion:
     """The motion along lengths (n, 2) [m] at the ticks; derivatives by central differences."""
     h = model.tick_s
     q = np.asarray(q_m, dtype=np.float64)
-    if len(q) < 3:
-        raise BadInputError(f"reference: found {len(q)} ticks, expected at least 3")
     dq = np.gradient(q, h, axis=0)
     ddq = np.zeros_like(q)
     ddq[1:-1] = (q[2:] - 2.0 * q[1:-1] + q[:-2]) / h**2
@@ -1007,10 +908,6 @@ class OrientationControl:
     sign: int = 1
     whole_pwm: bool = True
 
-    def __post_init__(self) -> None:
-        if self.sign not in (1, -1):
-            raise BadInputError(f"sign of the orientation error: found {self.sign}, expected 1 or -1")
-
 
 @dataclass(frozen=True)
 class PositionControl:
@@ -1050,11 +947,6 @@ class Command:
     feedback: tuple[float, float]
 
 
-def _finite(what: str, *values: float) -> None:
-    if not all(map(math.isfinite, values)):
-        raise BadInputError(f"{what}: found {', '.join(map(str, values))}, expected finite numbers")
-
-
 def step_orientation(
     control: OrientationControl, state: LoopState, phi_ref_rad: float, phi_rad: float
 ) -> tuple[LoopState, Command]:
@@ -1063,10 +955,7 @@ def step_orientation(
     Parameters
     ----------
     phi_ref_rad, phi_rad : wanted and measured angle of the head [rad].
-
-    Raises `BadInputError` for a measurement that is not a number: a controller must not remember it.
     """
-    _finite("angle of the orientation controller", phi_ref_rad, phi_rad)
     error = control.sign * (phi_ref_rad - phi_rad)
     first, u1 = step(control.pid, state.first, error)
     second, u2 = step(control.pid, state.second, -error)
@@ -1082,10 +971,7 @@ def step_position(
     Parameters
     ----------
     q_ref_m, q_m : wanted and measured lengths of the bellows [m].
-
-    Raises `BadInputError` for a measurement that is not a number.
     """
-    _finite("lengths of the position controller", *q_ref_m, *q_m)
     first, u1 = step(control.pid, state.first, q_ref_m[0] - q_m[0])
     second, u2 = step(control.pid, state.second, q_ref_m[1] - q_m[1])
     extra1, extra2 = 0.0, 0.0

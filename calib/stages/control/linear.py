@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -289,29 +289,3 @@ def loop_margins(loop: System, omega: FloatArray | None = None) -> list[Margins]
     L = response(loop, w)
     stable = spectral_radius(closed_loop(loop)) < 1.0
     return [margins_of_response(w, break_at(L, i), stable) for i in range(len(loop.D))]
-
-
-def gain_to_instability(loop: System, channel: int = 0, most: float = 1e4) -> float:
-    """Gain margin by brute force: the factor on a channel at which an eigenvalue leaves the unit circle.
-
-    Bisection after the first of growing factors that is unstable; infinite when none up to `most` is.
-    """
-
-    def stable(factor: float) -> bool:
-        scale = np.ones(len(loop.D))
-        scale[channel] = factor
-        scaled = replace(loop, C=loop.C * scale[:, None], D=loop.D * scale[:, None])
-        return spectral_radius(closed_loop(scaled)) < 1.0
-
-    low = 1.0
-    if not stable(low):
-        return 1.0
-    high = low
-    while stable(high):
-        low, high = high, high * 1.05
-        if high > most:
-            return math.inf
-    for _ in range(50):
-        middle = math.sqrt(low * high)
-        low, high = (middle, high) if stable(middle) else (low, middle)
-    return low

@@ -31,14 +31,6 @@ from calib.stages.control.linear import bent_rest
 #   `chord="thesis"` keeps phi_ref = atan(x / y): the head then travels 7.5 mm to each side where 15 mm
 #   are drawn.
 
-CHORDS = ("exact", "thesis")
-
-
-def _finite(what: str, *values: float) -> None:
-    for value in values:
-        if not math.isfinite(value):
-            raise BadInputError(f"{what}: found {value}, expected finite numbers")
-
 
 @dataclass(frozen=True)
 class AngleSteps:
@@ -48,22 +40,10 @@ class AngleSteps:
     ----------
     angles_rad : values in turn [rad].
     at_s : times at which the second and later values begin [s], rising.
-
-    Raises `BadInputError` when the numbers do not fit together.
     """
 
     angles_rad: tuple[float, ...] = (0.7,)
     at_s: tuple[float, ...] = ()
-
-    def __post_init__(self) -> None:
-        _finite("set-point", *self.angles_rad, *self.at_s)
-        if len(self.angles_rad) != len(self.at_s) + 1:
-            raise BadInputError(
-                f"set-point: found {len(self.angles_rad)} angles and {len(self.at_s)} times, "
-                "expected one time between two angles"
-            )
-        if any(b <= a for a, b in zip(self.at_s, self.at_s[1:], strict=False)):
-            raise BadInputError("set-point: the times of the steps do not rise")
 
     def angle_rad(self, t_s: FloatArray) -> FloatArray:
         """phi_ref (...) [rad] at the times (...) [s]; a step counts from its own time on."""
@@ -86,9 +66,6 @@ class PolynomialElongation:
     c3_m_per_s3: float = -0.000368
     hold_s: float = 5.0
 
-    def __post_init__(self) -> None:
-        _finite("elongation set-point", self.c0_m, self.c2_m_per_s2, self.c3_m_per_s3, self.hold_s)
-
     def bellows_m(self, t_s: FloatArray) -> FloatArray:
         """q_ref (..., 2) [m] at the times (...) [s]."""
         t = np.clip(np.asarray(t_s, dtype=np.float64), 0.0, self.hold_s)
@@ -106,9 +83,6 @@ class Ellipse:
     centre_y_m : distance of the centre from the base, -y_offset [m].
     period_s : time of one turn [s].
     chord : "exact" or "thesis", see above.
-
-    Raises `BadInputError` for half axes, a centre or a period that are not positive, for an ellipse
-    around the base, and for another chord.
     """
 
     x_m: float = 0.015
@@ -116,20 +90,6 @@ class Ellipse:
     centre_y_m: float = 0.078
     period_s: float = 20.0
     chord: str = "exact"
-
-    def __post_init__(self) -> None:
-        _finite("ellipse", self.x_m, self.y_m, self.centre_y_m, self.period_s)
-        for name in ("x_m", "y_m", "centre_y_m", "period_s"):
-            if getattr(self, name) <= 0.0:
-                raise BadInputError(
-                    f"ellipse {name}: found {getattr(self, name):g}, expected a positive number"
-                )
-        if self.y_m >= self.centre_y_m:
-            raise BadInputError(
-                f"ellipse: a half axis of {self.y_m:g} m around {self.centre_y_m:g} m reaches the base"
-            )
-        if self.chord not in CHORDS:
-            raise BadInputError(f"chord: found {self.chord!r}, expected one of {', '.join(CHORDS)}")
 
     def pose(self, t_s: FloatArray) -> FloatArray:
         """x_ref, y_ref, phi_ref (..., 3) [m, m, rad] at the times (...) [s], y towards the head."""

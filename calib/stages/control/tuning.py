@@ -186,10 +186,7 @@ def _reason(model: Model, q: FloatArray, wanted: FloatArray, k: int, missing: Fl
 
 
 def follow(model: Model, q_m: FloatArray, tolerance_m: float = TOLERANCE_M) -> Following:
-    """How far the pumps can follow lengths (n, 2) [m] at the ticks.
-
-    Raises `BadInputError` for fewer than three ticks.
-    """
+    """How far the pumps can follow lengths (n, 2) [m] at the ticks, three at least."""
     wanted = wanted_motion(model, q_m).force_N
     given, h = _nearest(model, wanted), model.tick_s
     short = wanted - given
@@ -208,7 +205,7 @@ def follow(model: Model, q_m: FloatArray, tolerance_m: float = TOLERANCE_M) -> F
         given,
         max(float(rates.max()), 0.0),
         max(float(-rates.min()), 0.0),
-        approach_s(model, np.asarray(q_m)[0]),
+        math.inf if at == 0 else approach_s(model, np.asarray(q_m)[0]),
     )
 
 
