@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,13 @@ TRUE = FULL.without("creep").values(
 
 
 def simulated(
-    name: str, seed: int, day: str = "a", load_kg: float = 0.0, gain: float = 1.0, duration_s: float = 40.0
+    name: str,
+    seed: int,
+    day: str = "a",
+    load_kg: float = 0.0,
+    gain: float = 1.0,
+    duration_s: float = 40.0,
+    values: Mapping[str, float] = TRUE,
 ) -> Trial:
     """A trial of the true arm under a command that switches at random, with noise of a motion capture."""
     rng = np.random.default_rng(seed)
@@ -28,8 +35,8 @@ def simulated(
     command[-150:] = 7.0
     start = Trial(name, day, load_kg, STEP_S * np.arange(n), command, np.full(n, 5.0), np.full(n, 0.13),
                   np.full(n, 0.176 - 0.006 * (seed % 2)))  # fmt: skip
-    pressure = drive_run(start, TRUE)
-    angle, chord = segment_run(start, TRUE, pressure, gain)
+    pressure = drive_run(start, values)
+    angle, chord = segment_run(start, values, pressure, gain)
     return Trial(name, day, load_kg, start.t_s, command, pressure + rng.normal(0.0, 1.0, n),
                  angle + rng.normal(0.0, 1e-3, n), chord + rng.normal(0.0, 1e-4, n))  # fmt: skip
 

@@ -137,10 +137,10 @@ def _problem() -> Problem:
 def test_derivatives_are_those_of_the_residuals() -> None:
     problem = _problem()
     x = first_guess(problem, values_of(Machine()))
-    x[problem.layout.offset : problem.layout.start] += 1e-3
+    x[problem.unknowns.offset.start : problem.unknowns.starts[0].start] += 1e-3
     base, J = jacobian(problem, x)
     assert np.allclose(base, residuals(problem, x[None])[0], atol=1e-6)
-    steps = 1e-4 * problem.scales()
+    steps = 1e-4 * problem.unknowns.scale
     for k in range(len(x)):
         up, down = x.copy(), x.copy()
         up[k] += steps[k]
@@ -170,17 +170,18 @@ def test_a_log_in_motion_has_its_start_among_the_unknowns() -> None:
     tracks = [track("free", duration_s=1.5), _cut(track("prbs", duration_s=2.5), 1.0, moving)]
     free = _cut(track("free", duration_s=2.5), 0.5, Start(0.1, 0.065, -2.0))
     problem = Problem(Machine(), [*tracks, free], NAMES, {}, threads=1)
-    layout = problem.layout
-    assert layout.starts == (2, 10, 6)
-    assert layout.of_start(1) == slice(layout.start + 2, layout.start + 12)
+    unknowns = problem.unknowns
+    first = unknowns.starts[0].start
+    assert [at.start - first for at in unknowns.starts] == [0, 2, 12]
+    assert unknowns.size == first + 18
     x = first_guess(problem, values_of(Machine()))
     assert starts_of(problem, x)[1] == moving
     assert starts_of(problem, x)[2].dphi_radps == -2.0
-    x[layout.start :] += 1e-3 * problem.scales()[layout.start :]
+    x[first:] += 1e-3 * unknowns.scale[first:]
     base, J = jacobian(problem, x)
     assert np.allclose(base, residuals(problem, x[None])[0], atol=1e-6)
-    steps = 1e-3 * problem.scales()
-    for k in range(layout.start, layout.size):
+    steps = 1e-3 * unknowns.scale
+    for k in range(first, unknowns.size):
         up, down = x.copy(), x.copy()
         up[k] += steps[k]
         down[k] -= steps[k]

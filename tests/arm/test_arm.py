@@ -29,8 +29,8 @@ def trials() -> list[Trial]:
 def test_a_fit_predicts_trials_that_it_has_not_seen(trials: list[Trial]) -> None:
     made = fit(trials, FULL.without("creep", "load"), SCALE)
     unseen = errors_by(made.values, made.gains["b"], simulated("b_2", 7, "b", gain=1.1))
-    assert math.degrees(unseen.angle_rad) < 0.5
-    assert unseen.chord_m < 5e-4
+    assert math.degrees(unseen["angle_rad"]) < 0.5
+    assert unseen["chord_m"] < 5e-4
     assert abs(made.values["lag_s"] / TRUE["lag_s"] - 1.0) < 0.1
     assert abs(made.gains["b"] / made.gains["a"] - 1.1) < 0.03
 
@@ -63,7 +63,8 @@ def test_a_load_bends_an_upright_arm_further() -> None:
 
 
 def test_the_interval_of_one_more_trial_follows_from_the_errors_on_held_ones() -> None:
-    assert half_width([1.0, 1.0, 1.0]) == pytest.approx(3.18, abs=0.01)
+    assert half_width([1.0, 1.0, 1.0]) == pytest.approx(1.96, abs=0.01)
+    assert half_width([0.1, 0.1, 3.0]) > 3.0 * math.sqrt(3.0)
     assert math.isnan(half_width([1.0]))
 
 
@@ -90,16 +91,6 @@ def test_an_arm_is_a_kind_of_actuator_in_the_file() -> None:
         Rig.of(
             {"schema": 2, "actuator": section | {"verdict": "ok", "parts": ["segment", "chord"]}}, "rig.yaml"
         )
-
-
-def test_an_arm_of_an_earlier_model_is_kept_and_does_not_predict() -> None:
-    parts = ["valve", "segment", "quadratic", "chord"]
-    old = {"verdict": "ok", "parts": parts, "parameters": {"bends_rad_per_kpa2": -1e-6}}
-    rig = Rig.of({"schema": 2, "arm": old}, "rig.yaml")
-    assert rig.arm is not None
-    assert rig.arm.parameters == old["parameters"]
-    with pytest.raises(BadInputError, match=r"is of an earlier model.*run it again"):
-        _ = rig.arm.values
 
 
 # ----------------------------------------------------------------------
@@ -177,6 +168,6 @@ def test_held_trials_of_a_real_arm_are_predicted_better_than_by_arx(shared_data:
     assert 0.53 < frame.leans < 0.57
     trials = [trial_of(r, frame, r.name[:4], 0.2 if r.name == "1009_4" else 0.0) for r in recordings]
     found = identify(trials, compare=False)
-    for quantity in ("angle_rad", "chord_m", "by_pressure_rad"):
+    for quantity in ("angle_rad", "chord_m", "angle_by_pressure_rad"):
         mean, _ = gained(found, best_baseline(found, quantity), quantity)
         assert mean > 0.2, quantity

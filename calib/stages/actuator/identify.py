@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import astuple, dataclass, field, fields, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -27,8 +28,7 @@ from calib.stages.actuator.simulate import simulate_batch, state_row
 #
 # The static force of the pumps is either scaled for each bellows (`strength1`, `strength2`), or its map is
 # estimated: the steady elongations at 6, 8, 10 and 12 V, which are the cubic of (2.13), with the strength
-# of
-# the second pump against the first.
+# of the second pump against the first.
 
 KNOTS_V = (6.0, 8.0, 10.0, 12.0)
 """Voltages at which the static map is estimated (Fig. 2.11)."""
@@ -182,8 +182,8 @@ def made(nominal: Machine, values: Mapping[str, float], hoses: bool, tick_s: flo
 #
 # The rig is at rest before the first tick, bent and stretched as the start says, or in motion there, with
 # rates, creep and forces that are unknown too. Commands before it are zero, or of a start in motion the
-# first
-# one. Between ticks the states follow the cubic through values and rates at both ends (4e-5 rad at 4 Hz).
+# first one. Between ticks the states follow the cubic through values and rates at both ends (4e-5 rad
+# at 4 Hz).
 
 SUBSTEPS = 12
 """Steps per tick of 1/60 s: 1.4 ms, of fourth order."""
@@ -330,8 +330,7 @@ def heads_of(
 #     delay                          of the measured rows; for logs with commands one for all, since there
 #                                    it cannot be told from the pumps' dead time, else one for each log
 #     phi, length                    before each log's first tick; of a log that begins in motion also
-# rates,
-#                                    creep and forces there, bounded by wide priors about a first guess
+#                                    rates, creep and forces there, bounded by wide priors about a first guess
 #
 # The whitened residual of a row is r = W (measured - simulated(t - delay) - offset). Derivatives by
 # parameters and starts are central differences, which a batch of simulations gives at once; those by the
@@ -356,33 +355,34 @@ _PUMPED_SIGMA = (0.5, 0.02, 0.2, 0.2, *(0.5,) * 4)
 
 
 @dataclass(frozen=True)
-class Layout:
-    """Where the unknowns are: parameters, offsets, delays, starts."""
+class Unknowns:
+    """Where the unknowns are and what is known of them before: parameters, offsets, delays, starts.
 
-    names: tuple[str, ...]
+    Attributes
+    ----------
+    offset : of the camera's plane. delays : of each log. starts : of each log.
+    scale, low, high : (size,) typical changes and bounds.
+    mean, sigma : (size,) priors; an infinite deviation says nothing.
+    """
+
+    offset: slice
     delays: tuple[int, ...]
-    starts: tuple[int, ...]
-
-    @property
-    def offset(self) -> int:
-        return len(self.names)
-
-    @property
-    def delay(self) -> int:
-        return self.offset + 2
-
-    @property
-    def start(self) -> int:
-        return self.delay + max(self.delays) + 1
+    starts: tuple[slice, ...]
+    scale: FloatArray
+    low: FloatArray
+    high: FloatArray
+    mean: FloatArray
+    sigma: FloatArray
 
     @property
     def size(self) -> int:
-        return self.start + sum(self.starts)
+        return len(self.mean)
 
-    def of_start(self, k: int) -> slice:
-        """The start of log k."""
-        at = self.start + sum(self.starts[:k])
-        return slice(at, at + self.starts[k])
+    @property
+    def priors(self) -> IntArray:
+        """Unknowns that have one, those of the parameters last."""
+        some = np.flatnonzero(np.isfinite(self.sigma))
+        return np.concatenate([some[some >= self.offset.start], some[some < self.offset.start]])
 
 
 @dataclass(frozen=True)
@@ -412,51 +412,35 @@ class Problem:
         """Steps of a simulation in 1/60 s."""
         return _ROUGH_SUBSTEPS if self.rough else SUBSTEPS
 
-    @property
-    def priors(self) -> list[tuple[int, float, float]]:
-        """Index, mean and standard deviation of each unknown parameter that a person states."""
-        sigma = [self.stated.get(name, 0.0) for name in self.names]
-        if not any(sigma):
-            return []
-        mean = values_of(self.nominal)
-        return [(k, mean[name], s) for k, (name, s) in enumerate(zip(self.names, sigma, strict=True)) if s]
-
-    @property
-    def layout(self) -> Layout:
-        numbers, used, shared = [], 0, -1
-        for track in self.tracks:
-            if track.hoses:
-                if shared < 0:
-                    shared, used = used, used + 1
-                numbers.append(shared)
-            else:
-                numbers.append(used)
-                used += 1
-        return Layout(self.names, tuple(numbers), tuple(len(track.unknown) for track in self.tracks))
-
-    def scales(self) -> FloatArray:
-        """Typical changes of all unknowns."""
-        layout = self.layout
-        out = np.empty(layout.size)
-        out[: layout.offset] = [PARAMETERS[name].scale for name in self.names]
-        out[layout.offset : layout.delay] = _OFFSET_SIGMA
-        out[layout.delay : layout.start] = 0.01
-        for k, count in enumerate(layout.starts):
-            out[layout.of_start(k)] = _START_SCALE[:count]
-        return out
-
-    def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Least and greatest values of all unknowns."""
-        layout = self.layout
-        low, high = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)
-        low[: layout.offset] = [PARAMETERS[name].low for name in self.names]
-        high[: layout.offset] = [PARAMETERS[name].high for name in self.names]
-        low[layout.delay : layout.start], high[layout.delay : layout.start] = -0.5, 0.5
+    @cached_property
+    def unknowns(self) -> Unknowns:
+        """All unknowns. Logs with commands share a delay, swings have one each."""
+        nominal, inf = values_of(self.nominal), math.inf
+        rows = [
+            (spec.scale, spec.low, spec.high, nominal[name], self.stated.get(name) or inf)
+            for name, spec in ((name, PARAMETERS[name]) for name in self.names)
+        ]
+        rows += [(sigma, -inf, inf, 0.0, sigma) for sigma in _OFFSET_SIGMA]
+        delays: list[int] = []
         for k, track in enumerate(self.tracks):
-            at, count = layout.of_start(k), layout.starts[k]
-            begin, reach = np.array(astuple(track.start))[:count], np.array(_START_REACH)[:count]
-            low[at], high[at] = begin - reach, begin + reach
-        return low, high
+            before = [
+                at for at, one in zip(delays, self.tracks[:k], strict=True) if one.hoses and track.hoses
+            ]
+            delays.append(before[0] if before else len(rows))
+            if not before:
+                rows.append((0.01, -0.5, 0.5, self.delay_s, self.delay_sigma_s))
+        starts = []
+        for track in self.tracks:
+            at, moving = len(rows), track.moving is not None
+            sigma = (inf, inf, *(_PUMPED_SIGMA if track.hoses else _FREE_SIGMA))
+            of_start = zip(astuple(track.start), _START_SCALE, _START_REACH, sigma, strict=False)
+            rows += [
+                (scale, guess - reach, guess + reach, guess, deviation if moving else inf)
+                for _, (guess, scale, reach, deviation) in zip(track.unknown, of_start, strict=False)
+            ]
+            starts.append(slice(at, len(rows)))
+        count = len(self.names)
+        return Unknowns(slice(count, count + 2), tuple(delays), tuple(starts), *np.array(rows).T)
 
     def values(self, x: FloatArray) -> dict[str, float]:
         """Parameters by name of a vector of unknowns."""
@@ -465,40 +449,23 @@ class Problem:
 
 def first_guess(problem: Problem, values: Mapping[str, float]) -> FloatArray:
     """Unknowns with these parameters, offsets zero, usual delays, and starts as they were measured."""
-    layout = problem.layout
-    x = np.zeros(layout.size)
-    x[: layout.offset] = [values[name] for name in problem.names]
-    x[layout.delay : layout.start] = problem.delay_s
-    for k, track in enumerate(problem.tracks):
-        x[layout.of_start(k)] = astuple(track.start)[: layout.starts[k]]
+    x = problem.unknowns.mean.copy()
+    x[: len(problem.names)] = [values[name] for name in problem.names]
     return x
 
 
 def starts_of(problem: Problem, x: FloatArray) -> list[Start]:
     """Starts of all logs in a vector of unknowns."""
-    layout = problem.layout
-    return [Start(*x[layout.of_start(k)].tolist()) for k in range(len(problem.tracks))]
+    return [Start(*x[at].tolist()) for at in problem.unknowns.starts]
 
 
 def _whitened(track: Track, error: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("mij,...mj->...mi", track.whitening, error))
 
 
-def _start_sigma(track: Track) -> FloatArray:
-    return np.array(_PUMPED_SIGMA if track.hoses else _FREE_SIGMA)
-
-
 def _priors(problem: Problem, x: FloatArray) -> FloatArray:
-    layout = problem.layout
-    offsets = x[layout.offset : layout.delay] / np.array(_OFFSET_SIGMA)
-    delays = (x[layout.delay : layout.start] - problem.delay_s) / problem.delay_sigma_s
-    parts = [offsets, delays]
-    for k, track in enumerate(problem.tracks):
-        if track.moving is not None:
-            guess = np.array(astuple(track.moving))[2 : layout.starts[k]]
-            parts.append((x[layout.of_start(k)][2:] - guess) / _start_sigma(track))
-    parts.append(np.array([(x[k] - mean) / sigma for k, mean, sigma in problem.priors]))
-    return np.concatenate(parts)
+    u = problem.unknowns
+    return np.asarray((x[u.priors] - u.mean[u.priors]) / u.sigma[u.priors])
 
 
 def residuals(problem: Problem, xs: FloatArray) -> FloatArray:
@@ -506,12 +473,11 @@ def residuals(problem: Problem, xs: FloatArray) -> FloatArray:
 
     The rows are those of the logs in turn, angle and length of a picture side by side (before whitening).
     """
-    layout = problem.layout
-    parts = []
+    unknowns, parts = problem.unknowns, []
     values = [problem.values(x) for x in xs]
     for k, track in enumerate(problem.tracks):
         starts = [starts_of(problem, x)[k] for x in xs]
-        delay = layout.delay + layout.delays[k]
+        delay = unknowns.delays[k]
         # Candidates of one batch may differ in their delay; rates shift them to their own.
         middle = float(np.mean(xs[:, delay]))
         head, rate = heads_of(
@@ -519,7 +485,7 @@ def residuals(problem: Problem, xs: FloatArray) -> FloatArray:
         )
         if np.ptp(xs[:, delay]) > 0.0:
             head = head - rate * (xs[:, delay] - middle)[:, None, None]
-        error = track.head - head - xs[:, None, layout.offset : layout.delay]
+        error = track.head - head - xs[:, None, unknowns.offset]
         rows = _whitened(track, error).reshape(len(xs), -1)
         parts.append(np.where(np.isfinite(rows), rows, FAR))
     parts.append(np.stack([_priors(problem, x) for x in xs]))
@@ -528,11 +494,10 @@ def residuals(problem: Problem, xs: FloatArray) -> FloatArray:
 
 def jacobian(problem: Problem, x: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Residuals (rows,) and their derivatives (rows, size) at a vector of unknowns."""
-    layout, scales = problem.layout, problem.scales()
-    low, high = problem.bounds()
-    P = len(problem.names)
-    steps = _STEP * np.maximum(np.abs(x[:P]), scales[:P])
-    up, down = np.minimum(x[:P] + steps, high[:P]), np.maximum(x[:P] - steps, low[:P])
+    unknowns, P = problem.unknowns, len(problem.names)
+    steps = _STEP * np.maximum(np.abs(x[:P]), unknowns.scale[:P])
+    up = np.minimum(x[:P] + steps, unknowns.high[:P])
+    down = np.maximum(x[:P] - steps, unknowns.low[:P])
     start_steps = np.array(_START_STEP)
     if problem.rough:
         up, down = np.where(up - x[:P] >= x[:P] - down, up, down), x[:P]
@@ -551,44 +516,32 @@ def jacobian(problem: Problem, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         kind = track.hoses, track.tick_s
         if kind not in alike:
             alike[kind] = [made(problem.nominal, values, *kind) for values in moved]
-        count = layout.starts[k]
+        count = len(track.unknown)
         for name, step in zip(track.unknown, _START_STEP, strict=False):
             sets += [base] * len(sides)
             starts += [replace(begin, **{name: getattr(begin, name) + s * step}) for s in sides]
-        delay = layout.delay + layout.delays[k]
+        delay = unknowns.delays[k]
         pairs = [*alike[kind], *[alike[kind][0]] * (len(sets) - len(moved))]
         head, rate = heads_of(
             track, problem.nominal, sets, starts, float(x[delay]), problem.threads, pairs, problem.per_tick
         )
         W = track.whitening
-        J = np.zeros((len(track.t_s), 2, layout.size))
+        J = np.zeros((len(track.t_s), 2, unknowns.size))
         moved_to, moved_from = (head[1:], head[:1]) if problem.rough else (head[1::2], head[2::2])
         slope = (moved_to - moved_from) / width[: P + count, None, None]
         slope = -np.einsum("mij,smj->mis", W, slope)
         J[:, :, :P] = slope[:, :, :P]
-        J[:, :, layout.of_start(k)] = slope[:, :, P:]
-        J[:, :, layout.offset : layout.delay] = -W
+        J[:, :, unknowns.starts[k]] = slope[:, :, P:]
+        J[:, :, unknowns.offset] = -W
         J[:, :, delay] = _whitened(track, rate[0])
-        error = _whitened(track, track.head - head[0] - x[layout.offset : layout.delay])
+        error = _whitened(track, track.head - head[0] - x[unknowns.offset])
         good = np.isfinite(error).all() and np.isfinite(J).all()
-        blocks.append(J.reshape(-1, layout.size) if good else np.zeros((2 * len(track.t_s), layout.size)))
+        blocks.append(J.reshape(-1, unknowns.size) if good else np.zeros((2 * len(track.t_s), unknowns.size)))
         errors.append(np.where(np.isfinite(error), error, FAR).reshape(-1))
-    prior = np.zeros((2 + layout.start - layout.delay, layout.size))
-    for row, sigma in enumerate(_OFFSET_SIGMA):
-        prior[row, layout.offset + row] = 1.0 / sigma
-    for row in range(layout.start - layout.delay):
-        prior[2 + row, layout.delay + row] = 1.0 / problem.delay_sigma_s
-    priors = [prior]
-    for k, track in enumerate(problem.tracks):
-        if track.moving is not None:
-            rows = np.zeros((layout.starts[k] - 2, layout.size))
-            rows[:, layout.of_start(k)][:, 2:] = np.diag(1.0 / _start_sigma(track))
-            priors.append(rows)
-    stated = problem.priors
-    rows = np.zeros((len(stated), layout.size))
-    for row, (k, _, sigma) in enumerate(stated):
-        rows[row, k] = 1.0 / sigma
-    return np.concatenate([*errors, _priors(problem, x)]), np.vstack([*blocks, *priors, rows])
+    at = unknowns.priors
+    priors = np.zeros((len(at), unknowns.size))
+    priors[np.arange(len(at)), at] = 1.0 / unknowns.sigma[at]
+    return np.concatenate([*errors, _priors(problem, x)]), np.vstack([*blocks, priors])
 
 
 # ----------------------------------------------------------------------
@@ -667,8 +620,8 @@ def solve(
     """
     from scipy.optimize import least_squares
 
-    low, high = problem.bounds()
-    scales = problem.scales()
+    unknowns = problem.unknowns
+    low, high, scales = unknowns.low, unknowns.high, unknowns.scale
     begin = np.clip(x, low + 1e-9 * scales, high - 1e-9 * scales)
     seen: dict[bytes, tuple[FloatArray, FloatArray]] = {}
 
@@ -711,18 +664,22 @@ def solve(
     return end, float(_robust(residual)), residual, J
 
 
+def scaled_inverse(H: FloatArray, rcond: float = 1e-13) -> FloatArray:
+    """Pseudo-inverse of an information matrix (n, n) whose unknowns have units of their own."""
+    size = np.sqrt(np.maximum(np.diag(H), 1e-300))
+    return np.asarray(np.linalg.pinv(H / np.outer(size, size), rcond=rcond) / np.outer(size, size))
+
+
 def informative(problem: Problem, residual: FloatArray, J: FloatArray, x: FloatArray) -> FloatArray:
     """Information (P, P) about relative changes of the parameters, the other unknowns eliminated."""
     P = len(problem.names)
     # Relative changes of magnitudes, so that a product of a positive and a negative one is seen as such.
-    size = np.copysign(np.maximum(np.abs(x[:P]), 0.1 * problem.scales()[:P]), x[:P])
+    size = np.copysign(np.maximum(np.abs(x[:P]), 0.1 * problem.unknowns.scale[:P]), x[:P])
     w = weights(residual) if float(np.max(np.abs(residual), initial=0.0)) < FAR else np.ones(len(residual))
     A = J * np.sqrt(w)[:, None]
     A[:, :P] *= size
     H = A.T @ A
-    nuisance = H[P:, P:]
-    scale = np.sqrt(np.maximum(np.diag(nuisance), 1e-300))
-    inverse = np.linalg.pinv(nuisance / np.outer(scale, scale), rcond=1e-12) / np.outer(scale, scale)
+    inverse = scaled_inverse(H[P:, P:], 1e-12)
     return np.asarray(H[:P, :P] - H[:P, P:] @ inverse @ H[P:, :P])
 
 
@@ -797,10 +754,10 @@ def _spread(problem: Problem, values: Mapping[str, float], seed: int) -> FloatAr
     P = len(problem.names)
     apart = rng.uniform(-0.7, 0.7, (CANDIDATES - 1, P))
     out[1:, :P] *= np.exp(apart)
-    for k, mean, sigma in problem.priors:
-        out[1:, k] = mean + sigma * apart[:, k]
-    low, high = problem.bounds()
-    out[:, :P] = np.clip(out[:, :P], low[:P] * 1.001, high[:P] * 0.999)
+    u = problem.unknowns
+    stated = np.flatnonzero(np.isfinite(u.sigma[:P]))
+    out[1:, stated] = u.mean[stated] + u.sigma[stated] * apart[:, stated]
+    out[:, :P] = np.clip(out[:, :P], u.low[:P] * 1.001, u.high[:P] * 0.999)
     return out
 
 
@@ -968,11 +925,6 @@ def _spans(tracks: Sequence[Track]) -> list[slice]:
     return out
 
 
-def _inverse(H: FloatArray) -> FloatArray:
-    size = np.sqrt(np.maximum(np.diag(H), 1e-300))
-    return np.asarray(np.linalg.pinv(H / np.outer(size, size), rcond=1e-13) / np.outer(size, size))
-
-
 def uncertainty(solution: Solution) -> Uncertainty:
     """Covariance of the parameters, the larger of the white one and the sandwich."""
     problem, r, J = solution.problem, solution.residual, solution.J
@@ -984,7 +936,7 @@ def uncertainty(solution: Solution) -> Uncertainty:
     # The prior is known, the scale of the residuals is not.
     size = np.concatenate([np.full(rows, 1.0 / scale**2), np.ones(len(r) - rows)])
     H = (J * (w * size)[:, None]).T @ J
-    inverse = _inverse(H)
+    inverse = scaled_inverse(H)
     middle = (J[rows:]).T @ J[rows:]
     for track, span in zip(problem.tracks, spans, strict=True):
         g = (J[span] * (w * size * r)[span, None]).reshape(-1, 2, J.shape[1]).sum(axis=1)
@@ -1074,20 +1026,19 @@ def held_back(solution: Solution) -> list[HeldLog]:
 
 def _taken_over(solution: Solution, problem: Problem) -> FloatArray:
     """Unknowns of a problem of some of the logs, as the solution for all of them has them."""
-    whole, x = solution.problem.layout, solution.x
-    layout, out = problem.layout, np.zeros(problem.layout.size)
-    out[: layout.offset] = [solution.values[name] for name in problem.names]
-    out[layout.offset : layout.delay] = x[whole.offset : whole.delay]
+    whole, x = solution.problem.unknowns, solution.x
+    mine, out = problem.unknowns, np.zeros(problem.unknowns.size)
+    out[: len(problem.names)] = [solution.values[name] for name in problem.names]
+    out[mine.offset] = x[whole.offset]
     of_track = {id(track): k for k, track in enumerate(solution.problem.tracks)}
     for k, track in enumerate(problem.tracks):
         at = of_track[id(track)]
-        out[layout.of_start(k)] = x[whole.of_start(at)]
-        out[layout.delay + layout.delays[k]] = x[whole.delay + whole.delays[at]]
+        out[mine.starts[k]] = x[whole.starts[at]]
+        out[mine.delays[k]] = x[whole.delays[at]]
     return out
 
 
 def _told_by(name: str, kinds: set[bool]) -> bool:
-
     acts = PARAMETERS[name].acts
     return acts in ("all", "prior") or (acts == "pumps") in kinds
 
@@ -1096,10 +1047,9 @@ def _told_by(name: str, kinds: set[bool]) -> bool:
 # Damping by the logarithmic decrement (3.39), (3.40), from peaks that outliers do not make.
 #
 # Single readings that stand away from the cubic through their six neighbours are replaced by it. The
-# extremes
-# of what is left are found once the motion has come back by a fifth of its amplitude, so that noise makes
-# none, and each is the vertex of a parabola through the rows about it. The amplitude is that from peak to
-# peak, which does not see an offset that creeps; on the raw curve (3.39) yields about 0.004.
+# extremes of what is left are found once the motion has come back by a fifth of its amplitude, so that
+# noise makes none, and each is the vertex of a parabola through the rows about it. The amplitude is that from
+# peak to peak, which does not see an offset that creeps; on the raw curve (3.39) yields about 0.004.
 #
 #     delta = ln(x_i / x_(i+1)) over a period,   zeta = delta / sqrt(4 pi^2 + delta^2)
 #
@@ -1346,9 +1296,8 @@ def fit_stiffness(name: str, elongation_m: FloatArray, force_N: FloatArray) -> t
 # Which experiment to do next: the one that would shrink the worst standard deviation most.
 #
 # Experiments add their information: S_after = S_now + S_experiment, each with its own start, delay and
-# offsets
-# eliminated. That of an experiment that was not done yet is that of a simulated one on the identified rig,
-# with a picture at each tick and the noise of the logs at hand.
+# offsets eliminated. That of an experiment that was not done yet is that of a simulated one on the
+# identified rig, with a picture at each tick and the noise of the logs at hand.
 
 _DURATION_S = 8.0
 _TYPICAL = (0.004, 0.0004)
@@ -1424,7 +1373,7 @@ def _information(
     # The priors of what is stated are in the information so far.
     alone = replace(problem, tracks=[track], names=names + more, held=values, delay_s=0.0, stated={})
     x = first_guess(alone, values)
-    x[alone.layout.start :] = one.start.phi_rad, one.start.length_m
+    x[alone.unknowns.starts[0]] = one.start.phi_rad, one.start.length_m
     residual, J = jacobian(alone, x)
     S = informative(alone, np.zeros_like(residual), J, x)
     P = len(names)
@@ -1552,15 +1501,15 @@ def own_delays(solution: Solution) -> list[tuple[str, float, float]]:
     and a creep that are not there.
     """
     problem, r, J = solution.problem, solution.residual, solution.J
-    layout = problem.layout
-    shared = [k for k, at in enumerate(layout.delays) if layout.delays.count(at) > 1]
+    delays = problem.unknowns.delays
+    shared = [k for k, at in enumerate(delays) if delays.count(at) > 1]
     w = weights(r)
     WJ = J * w[:, None]
-    inverse = _inverse(WJ.T @ J)
+    inverse = scaled_inverse(WJ.T @ J)
     spans, out = _spans(problem.tracks), []
     for k in shared:
         column = np.zeros(len(r))
-        column[spans[k]] = J[spans[k], layout.delay + layout.delays[k]]
+        column[spans[k]] = J[spans[k], delays[k]]
         b = WJ.T @ column
         own = float(column @ (w * column) - b @ inverse @ b)
         if own < 1e-6 * float(column @ (w * column)) or own <= 0.0:
@@ -1606,7 +1555,7 @@ def judge(
     fixed = [name for name, sigma in solution.problem.stated.items() if not sigma]
     if fixed:
         out.append(Finding("remark", f"not estimated, for known states it: {', '.join(fixed)}"))
-    priors = [solution.problem.names[k] for k, _, _ in solution.problem.priors]
+    priors = [name for name in solution.problem.names if solution.problem.stated.get(name)]
     if priors:
         out.append(Finding("remark", f"known with a standard deviation, which went in: {', '.join(priors)}"))
     for name, value in solution.values.items():

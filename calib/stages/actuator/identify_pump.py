@@ -13,6 +13,7 @@ from scipy.special import chdtri
 
 from calib.core.arrays import BoolArray, FloatArray
 from calib.core.errors import BadInputError
+from calib.stages.actuator.identify import scaled_inverse
 from calib.stages.actuator.pump import PWM_MAX
 
 # ----------------------------------------------------------------------
@@ -422,11 +423,6 @@ def _slopes(
     return np.column_stack(columns)
 
 
-def _inverse(H: FloatArray) -> FloatArray:
-    size = np.sqrt(np.maximum(np.diag(H), 1e-300))
-    return np.asarray(np.linalg.pinv(H / np.outer(size, size), rcond=1e-12) / np.outer(size, size))
-
-
 def _by_chance(problem: _Problem, theta: FloatArray, free: list[int], extras: int) -> float:
     """How much a number of parameters that are not needed lowers the cost per sample, at most in 95 %."""
     base = problem.residual(theta)
@@ -446,7 +442,7 @@ def _covariance(problem: _Problem, theta: FloatArray, free: list[int]) -> FloatA
     H = (J * weight[:, None]).T @ J
     G = [J[s].T @ (weight[s] * base[s]) for s in _clusters(problem)]
     middle = sum((np.outer(g, g) for g in G), np.zeros_like(H)) * (len(G) / max(len(G) - 1, 1))
-    inverse = _inverse(H)
+    inverse = scaled_inverse(H, 1e-12)
     return np.asarray(inverse @ middle @ inverse)
 
 

@@ -33,6 +33,7 @@ from calib.stages.actuator.identify import (
     judge,
     prospects,
     rms_by_track,
+    scaled_inverse,
     starts_of,
     uncertainty,
     values_of,
@@ -105,14 +106,14 @@ _OF_TABLES = ("tick_s", "supply_V", "dead_zone_V")
 def simulated_heads(solution: Solution) -> list[FloatArray]:
     """Angle [rad] and length [m] (m, 2) of the identified rig at each log's poses, the offsets with them."""
     problem = solution.problem
-    layout, starts = problem.layout, starts_of(problem, solution.x)
+    unknowns, starts = problem.unknowns, starts_of(problem, solution.x)
     out = []
     for k, track in enumerate(problem.tracks):
-        delay = float(solution.x[layout.delay + layout.delays[k]])
+        delay = float(solution.x[unknowns.delays[k]])
         head, _ = heads_of(
             track, problem.nominal, [problem.values(solution.x)], [starts[k]], delay, problem.threads
         )
-        out.append(np.asarray(head[0] + solution.x[layout.offset : layout.delay]))
+        out.append(np.asarray(head[0] + solution.x[unknowns.offset]))
     return out
 
 
@@ -172,15 +173,11 @@ def identify_logs(
 def _delay(found: Identified) -> tuple[float, float] | None:
     """Dead time of the pumps [s] beyond that of the rig's file, and its deviation; None without pumps."""
     problem = found.solution.problem
-    layout = problem.layout
-    shared = [layout.delays[k] for k, track in enumerate(problem.tracks) if track.hoses]
+    shared = [at for at, track in zip(problem.unknowns.delays, problem.tracks, strict=True) if track.hoses]
     if not shared:
         return None
-    at = layout.delay + shared[0]
-    J = found.solution.J
-    H = J.T @ J / found.uncertainty.scale**2
-    size = np.sqrt(np.maximum(np.diag(H), 1e-300))
-    V = np.linalg.pinv(H / np.outer(size, size), rcond=1e-13) / np.outer(size, size)
+    at, J = shared[0], found.solution.J
+    V = scaled_inverse(J.T @ J / found.uncertainty.scale**2)
     return float(found.solution.x[at]) - problem.delay_s, float(math.sqrt(max(V[at, at], 0.0)))
 
 

@@ -95,8 +95,9 @@ class PumpParameters(Section):
     )
 
 
-def _checked(sigma: Deviations, kind: type[Section], values: dict[str, Any], needed: bool) -> Deviations:
-    """Deviations whose keys are those of a section; `needed` where a value has to stand beside each."""
+def _of_values(kind: type[Section], sigma: Deviations, info: ValidationInfo) -> Deviations:
+    """Deviations whose keys are those of a section; a statement has a value beside each."""
+    values, needed = info.data, issubclass(kind, Statement)
     keys = (*kind.model_fields, *(KNOTS if issubclass(kind, PumpParameters) else ()))
     for name, one in sigma.items():
         if name not in keys:
@@ -115,10 +116,7 @@ class KnownActuator(ActuatorParameters, Statement):
 
     sigma: Deviations = {}
 
-    @field_validator("sigma")
-    @classmethod
-    def _of_values(cls, sigma: Deviations, info: ValidationInfo) -> Deviations:
-        return _checked(sigma, cls, info.data, needed=True)
+    _checked = field_validator("sigma")(classmethod(_of_values))
 
 
 class KnownPump(PumpParameters, Statement):
@@ -126,10 +124,7 @@ class KnownPump(PumpParameters, Statement):
 
     sigma: Deviations = {}
 
-    @field_validator("sigma")
-    @classmethod
-    def _of_values(cls, sigma: Deviations, info: ValidationInfo) -> Deviations:
-        return _checked(sigma, cls, info.data, needed=True)
+    _checked = field_validator("sigma")(classmethod(_of_values))
 
 
 class Known(Statement):
@@ -150,10 +145,7 @@ class Actuator(ActuatorParameters, Result):
     sigma: Deviations = {}
     covariance: CovarianceTable | None = None
 
-    @field_validator("sigma")
-    @classmethod
-    def _of_values(cls, sigma: Deviations, info: ValidationInfo) -> Deviations:
-        return _checked(sigma, cls, info.data, needed=False)
+    _checked = field_validator("sigma")(classmethod(_of_values))
 
 
 class PumpModel(Section):
@@ -210,10 +202,7 @@ class PumpSection(PumpParameters, Result):
     covariance: CovarianceTable | None = None
     identified: PumpIdentified | None = None
 
-    @field_validator("sigma")
-    @classmethod
-    def _of_values(cls, sigma: Deviations, info: ValidationInfo) -> Deviations:
-        return _checked(sigma, cls, info.data, needed=False)
+    _checked = field_validator("sigma")(classmethod(_of_values))
 
 
 # ----------------------------------------------------------------------

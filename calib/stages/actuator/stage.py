@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
     from calib.stages.actuator.results import Identified
     from calib.stages.actuator.section import Actuator, PumpSection
     from calib.stages.actuator.validate import Comparison
-    from calib.stages.arm.identify import Held
+    from calib.stages.arm.identify import Errors
     from calib.stages.arm.model import Trial
 
     Sections = tuple[Actuator, PumpSection | None]
@@ -506,7 +505,7 @@ class Validated:
     """
 
     compared: tuple[Comparison, ...] = ()
-    held: Mapping[str, Held] | None = None
+    held: Mapping[str, Errors] | None = None
     verdict: Verdict = Verdict()
 
 
@@ -554,16 +553,7 @@ def _solve_validate(inputs: ValidateInputs) -> Validated:
 
 def _validate_document(outcome: Validated) -> dict[str, Any]:
     if outcome.held is not None:
-        arm = {
-            name: {
-                "angle_rad": one.angle_rad,
-                "chord_m": one.chord_m,
-                "angle_by_pressure_rad": one.by_pressure_rad,
-                "pressure_kpa": one.pressure_kpa,
-            }
-            for name, one in outcome.held.items()
-        }
-        return {"validate": {"arm": arm}}
+        return {"validate": {"arm": {name: dict(one) for name, one in outcome.held.items()}}}
     return {"validate": {"logs": [_log_json(one) for one in outcome.compared]}}
 
 
@@ -602,11 +592,13 @@ def _validate_words(outcome: Validated) -> list[Block]:
     from calib.core.words import Line, Table
 
     if outcome.held is not None:
-        scales = (math.degrees(1.0), 1e3, math.degrees(1.0), 1.0)
-        rows = []
-        for name, held in outcome.held.items():
-            values = (held.angle_rad, held.chord_m, held.by_pressure_rad, held.pressure_kpa)
-            rows.append((name, *(_cell(x * k, ".2f") for x, k in zip(values, scales, strict=True))))
+        from calib.stages.arm.identify import QUANTITIES
+
+        scales = {name: of.scale for name, of in QUANTITIES.items()} | {"pressure_kpa": 1.0}
+        rows = [
+            (name, *(_cell(scale * errors[of], ".2f") for of, scale in scales.items()))
+            for name, errors in outcome.held.items()
+        ]
         head = ("free run, RMS", "angle, °", "chord, mm", "angle by pressure, °", "pressure, kPa")
         return [Table(head, tuple(rows))]
     blocks: list[Block] = []

@@ -16,8 +16,9 @@ Baselines are trained on the same trials: linear ARX by least squares, run free,
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -41,8 +42,8 @@ from calib.stages.arm.model import (
 FULL = Assembly(tuple(part.name for part in PARTS if part.name != "lag"))
 WORTH = ("stiffening", "hysteresis", "creep", "settling", "load")
 """Parts whose worth is measured by leaving them out."""
-_SIGMA = (0.03, 0.027, 0.0045)
-"""Of pressure, angle and chord, of their scale: what assemblies of this kind leave."""
+_SIGMA = {"pressure_kpa": 0.03, "angle_rad": 0.027, "chord_m": 0.0045}
+"""Of their scale: what assemblies of this kind leave."""
 _ALIKE, _EVERY = 100, 5
 """Samples of one error, and of which one is looked at."""
 _STEP = 0.03
@@ -74,16 +75,25 @@ class Fit:
 
 
 @dataclass(frozen=True)
-class Held:
-    """Free-run errors on a trial that was not fitted, RMS; NaN where something was not logged.
+class Quantity:
+    """What is predicted: which column of a trial, from which other one, its words and scale in tables."""
 
-    `angle_rad`, `chord_m` from the command; `by_pressure_rad` from the measured pressure.
-    """
+    source: str
+    target: str
+    words: str
+    title: str
+    scale: float
 
-    angle_rad: float
-    chord_m: float
-    by_pressure_rad: float
-    pressure_kpa: float = math.nan
+
+QUANTITIES = {
+    "angle_rad": Quantity("command", "angle_rad", "angle", "angle from the command, deg", math.degrees(1.0)),
+    "chord_m": Quantity("command", "chord_m", "chord", "chord from the command, mm", 1e3),
+    "angle_by_pressure_rad": Quantity(
+        "pressure_kpa", "angle_rad", "angle by pressure", "angle from the pressure, deg", math.degrees(1.0)
+    ),
+}
+Errors = Mapping[str, float]
+"""RMS of a free run by quantity, that of the pressure [kPa] too; NaN where something was not logged."""
 
 
 @dataclass(frozen=True)
@@ -100,9 +110,35 @@ class Identification:
     trials: tuple[Trial, ...]
     fit: Fit
     sigma: Mapping[str, float]
-    held: Mapping[str, Held]
-    others: Mapping[str, Mapping[str, Held]]
+    held: Mapping[str, Errors]
+    others: Mapping[str, Mapping[str, Errors]]
     coverage: float
+
+
+def _bent(
+    trial: Trial, values: Mapping[str, float], gain: float, pressure_kpa: FloatArray
+) -> dict[str, FloatArray]:
+    if not (len(trial.angle_rad) and len(pressure_kpa)):
+        return {}
+    angle, chord = segment_run(trial, values, pressure_kpa, gain)
+    return {"angle_rad": angle - trial.angle_rad, "chord_m": chord - trial.chord_m}
+
+
+def by_pressure(trial: Trial, values: Mapping[str, float], gain: float) -> dict[str, FloatArray]:
+    """Simulated less measured values (n,) of the segment under the measured pressure."""
+    return _bent(trial, values, gain, trial.pressure_kpa)
+
+
+def by_command(trial: Trial, values: Mapping[str, float], gain: float) -> dict[str, FloatArray]:
+    """Simulated less measured values (n,) of drive and segment under the command."""
+    if not len(trial.command):
+        return {}
+    run = drive_run(trial, values)
+    off = {"pressure_kpa": run - trial.pressure_kpa} if len(trial.pressure_kpa) else {}
+    return off | _bent(trial, values, gain, run)
+
+
+_Model = Callable[[Trial, Mapping[str, float], float], dict[str, FloatArray]]
 
 
 class _Problem:
@@ -111,8 +147,8 @@ class _Problem:
     def __init__(self, trials: Sequence[Trial], assembly: Assembly, scale: Scale) -> None:
         self.trials, self.assembly, self.scale = trials, assembly, scale
         self.days = sorted({one.day for one in trials})
-        sizes = (scale.pressure_kpa, scale.angle_rad, scale.chord_m)
-        self.sizes = [s * x * math.sqrt(_ALIKE / _EVERY) for s, x in zip(_SIGMA, sizes, strict=True)]
+        alike = math.sqrt(_ALIKE / _EVERY)
+        self.sizes = {name: share * getattr(scale, name) * alike for name, share in _SIGMA.items()}
 
     def indices(self, drives: bool) -> IntArray:
         """Parameters of the drive, or of the segment and the days, where they are of the assembly."""
@@ -126,42 +162,18 @@ class _Problem:
         count = len(PARAMETERS)
         return {day: math.exp(DAY_SPREAD * x) for day, x in zip(self.days, z[count:].tolist(), strict=True)}
 
-    def _off(self, simulated: FloatArray, measured: FloatArray, kind: int) -> FloatArray:
-        return np.asarray((simulated - measured)[::_EVERY] / self.sizes[kind])
-
-    def by_pressure(self, z: FloatArray) -> list[FloatArray]:
-        """Errors of the segment under the measured pressure."""
-        values, gains, out = self.assembly.values(z[: len(PARAMETERS)], self.scale), self.gains(z), []
-        for one in self.trials:
-            if len(one.pressure_kpa) and len(one.angle_rad):
-                angle, chord = segment_run(one, values, one.pressure_kpa, gains[one.day])
-                out += [self._off(angle, one.angle_rad, 1), self._off(chord, one.chord_m, 2)]
-        return out
-
-    def by_command(self, z: FloatArray) -> list[FloatArray]:
-        """Errors of drive and segment under the command."""
-        values, gains, out = self.assembly.values(z[: len(PARAMETERS)], self.scale), self.gains(z), []
-        for one in self.trials:
-            if not len(one.command):
-                continue
-            pressure = drive_run(one, values)
-            if len(one.pressure_kpa):
-                out.append(self._off(pressure, one.pressure_kpa, 0))
-            if len(one.angle_rad):
-                angle, chord = segment_run(one, values, pressure, gains[one.day])
-                out += [self._off(angle, one.angle_rad, 1), self._off(chord, one.chord_m, 2)]
-        return out
-
-    def solve(
-        self, errors: Callable[[FloatArray], Iterable[FloatArray]], z: FloatArray, free: IntArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def solve(self, model: _Model, z: FloatArray, free: IntArray) -> tuple[FloatArray, FloatArray]:
         """z with its free entries where errors and deviations are least, and the posterior's deviations."""
 
         def residuals(x: FloatArray) -> FloatArray:
             full = z.copy()
             full[free] = x
-            rows = np.nan_to_num(np.concatenate([x, *errors(full)]), nan=1e3)
-            return np.asarray(np.clip(rows, -1e3, 1e3))
+            values = self.assembly.values(full[: len(PARAMETERS)], self.scale)
+            gains, rows = self.gains(full), [x]
+            for one in self.trials:
+                errors = model(one, values, gains[one.day])
+                rows += [error[::_EVERY] / self.sizes[name] for name, error in errors.items()]
+            return np.asarray(np.clip(np.nan_to_num(np.concatenate(rows), nan=1e3), -1e3, 1e3))
 
         def jacobian(x: FloatArray) -> FloatArray:
             steps = _STEP * np.eye(len(x))
@@ -186,40 +198,40 @@ def fit(trials: Sequence[Trial], assembly: Assembly, scale: Scale, start: Fit | 
     sigma = np.ones_like(z)
     together = not any(len(one.pressure_kpa) and len(one.angle_rad) for one in trials)
     if not together:
-        z, sigma = problem.solve(problem.by_pressure, z, segment)
+        z, sigma = problem.solve(by_pressure, z, segment)
     if any(len(one.command) for one in trials):
         free = np.concatenate([drive, segment]) if together else drive
-        z, by_command = problem.solve(problem.by_command, z, free)
-        sigma[free] = by_command[free]
+        z, by_drive = problem.solve(by_command, z, free)
+        sigma[free] = by_drive[free]
     return Fit(assembly, scale, z[:count], sigma[:count], problem.gains(z))
+
+
+_NONE = np.zeros(0)
 
 
 def _rms(error: FloatArray) -> float:
     return float(np.sqrt(np.mean(error**2))) if len(error) else math.nan
 
 
-def errors_of(made: Fit, trial: Trial) -> Held:
+def errors_by(values: Mapping[str, float], gain: float, trial: Trial) -> Errors:
+    """Free-run errors on a trial, of parameters by name and the gain of its day."""
+    off = by_command(trial, values, gain)
+    bent = by_pressure(trial, values, gain).get("angle_rad", _NONE)
+    names = ("angle_rad", "chord_m", "pressure_kpa")
+    return {name: _rms(off.get(name, _NONE)) for name in names} | {"angle_by_pressure_rad": _rms(bent)}
+
+
+def errors_of(made: Fit, trial: Trial) -> Errors:
     """Free-run errors of a fit on a trial."""
     return errors_by(made.values, made.gains.get(trial.day, 1.0), trial)
 
 
-def errors_by(values: Mapping[str, float], gain: float, trial: Trial) -> Held:
-    """Free-run errors on a trial, of parameters by name and the gain of its day."""
-    angle = chord = pressure = by_pressure = np.zeros(0)
-    if len(trial.command):
-        run = drive_run(trial, values)
-        if len(trial.angle_rad):
-            phi, length = segment_run(trial, values, run, gain)
-            angle, chord = phi - trial.angle_rad, length - trial.chord_m
-        if len(trial.pressure_kpa):
-            pressure = run - trial.pressure_kpa
-    if len(trial.pressure_kpa) and len(trial.angle_rad):
-        by_pressure = segment_run(trial, values, trial.pressure_kpa, gain)[0] - trial.angle_rad
-    return Held(_rms(angle), _rms(chord), _rms(by_pressure), _rms(pressure))
-
-
 # ----------------------------------------------------------------------
 # Baselines.
+
+
+_Pair = tuple[FloatArray, ...]
+_Error = Callable[[Sequence[_Pair], _Pair], float]
 
 
 def _thinned(values: FloatArray, step_s: float) -> FloatArray:
@@ -233,9 +245,7 @@ def _arx_rows(u: FloatArray, y: FloatArray, order: int) -> FloatArray:
     return np.column_stack([*past, np.ones(len(k))])
 
 
-def _arx_error(
-    train: Sequence[tuple[FloatArray, FloatArray]], test: tuple[FloatArray, FloatArray], order: int
-) -> float:
+def _arx_error(order: int, train: Sequence[_Pair], test: _Pair) -> float:
     """Free-run RMS of ARX, begun from the first measured values."""
     rows = np.concatenate([_arx_rows(u, y, order) for u, y in train])
     weights = np.linalg.lstsq(rows, np.concatenate([y[order:] for _, y in train]), rcond=None)[0]
@@ -251,7 +261,7 @@ def _arx_error(
     return _rms(out - y)
 
 
-def _lag_error(train: Sequence[tuple[FloatArray, FloatArray]], test: tuple[FloatArray, FloatArray]) -> float:
+def _lag_error(train: Sequence[_Pair], test: _Pair) -> float:
     """Free-run RMS of one linear lag, its time the best of a grid."""
 
     def lagged(u: FloatArray, lag_s: float) -> FloatArray:
@@ -270,44 +280,34 @@ def _lag_error(train: Sequence[tuple[FloatArray, FloatArray]], test: tuple[Float
     return _rms(np.stack([lagged(u, best[1]), np.ones(len(u))], axis=1) @ best[2] - y)
 
 
-_Error = Callable[[Sequence[tuple[FloatArray, FloatArray]], tuple[FloatArray, FloatArray]], float]
-
-
-def _by_baseline(error: _Error, train: Sequence[Trial], trial: Trial, step_s: float = STEP_S) -> Held:
-    def of(inputs: str, outputs: str) -> float:
+def _by_baseline(error: _Error, train: Sequence[Trial], trial: Trial, step_s: float = STEP_S) -> Errors:
+    out = {}
+    for name, one in QUANTITIES.items():
         pairs = [
-            (_thinned(getattr(one, inputs), step_s), _thinned(getattr(one, outputs), step_s))
-            for one in (*train, trial)
-            if len(getattr(one, inputs)) and len(getattr(one, outputs))
+            tuple(_thinned(getattr(of, column), step_s) for column in (one.source, one.target))
+            for of in (*train, trial)
+            if len(getattr(of, one.source)) and len(getattr(of, one.target))
         ]
-        used = len(getattr(trial, inputs)) and len(getattr(trial, outputs))
-        return error(pairs[:-1], pairs[-1]) if used and len(pairs) > 1 else math.nan
+        used = len(getattr(trial, one.source)) and len(getattr(trial, one.target)) and len(pairs) > 1
+        out[name] = error(pairs[:-1], pairs[-1]) if used else math.nan
+    return out
 
-    return Held(of("command", "angle_rad"), of("command", "chord_m"), of("pressure_kpa", "angle_rad"))
 
-
-def baselines(trials: Sequence[Trial]) -> dict[str, dict[str, Held]]:
+def baselines(trials: Sequence[Trial]) -> dict[str, dict[str, Errors]]:
     """Held errors of ARX and of a lag by name and trial.
 
     They are trained on the others of the same day where there are two at least, as they know no days.
     """
-    out: dict[str, dict[str, Held]] = {}
+    out: dict[str, dict[str, Errors]] = {}
     for trial in trials:
         others = [one for one in trials if one is not trial]
         same = [one for one in others if one.day == trial.day and one.load_kg == trial.load_kg]
         train = same if len(same) > 1 else others
         for step_s in _ARX_STEPS_S:
             for order in _ORDERS:
-
-                def arx(
-                    train: Sequence[tuple[FloatArray, FloatArray]],
-                    test: tuple[FloatArray, FloatArray],
-                    order: int = order,
-                ) -> float:
-                    return _arx_error(train, test, order)
-
                 name = f"ARX {order} at {1.0 / step_s:g} Hz"
-                out.setdefault(name, {})[trial.name] = _by_baseline(arx, train, trial, step_s)
+                errors = _by_baseline(partial(_arx_error, order), train, trial, step_s)
+                out.setdefault(name, {})[trial.name] = errors
         out.setdefault("a lag", {})[trial.name] = _by_baseline(_lag_error, train, trial)
     return out
 
@@ -345,22 +345,28 @@ def _deviations(made: Fit, held: Mapping[str, Fit]) -> dict[str, float]:
 
 
 def half_width(errors: Sequence[float]) -> float:
-    """Half the 95 % interval of a further trial's samples, from the RMS errors of held trials."""
-    found = [x for x in errors if math.isfinite(x)]
-    if len(found) < 2:
+    """Half the 95 % interval of a further trial's samples, from the RMS errors of held trials.
+
+    Degrees of freedom by how much the mean squares differ from trial to trial (Satterthwaite 1946): trials
+    that are all alike tell their deviation, a single bad one among good ones makes it uncertain.
+    """
+    squares = np.array([x * x for x in errors if math.isfinite(x)])
+    if len(squares) < 2:
         return math.nan
-    return float(stdtrit(len(found), 0.975)) * math.sqrt(sum(x * x for x in found) / len(found))
+    mean = float(squares.mean())
+    freedom = len(squares) * 2.0 * mean**2 / max(float(squares.var(ddof=1)), 1e-9 * mean**2)
+    return float(stdtrit(max(freedom, 1.0), 0.975)) * math.sqrt(mean)
 
 
-def _coverage(trials: Sequence[Trial], held: Mapping[str, Fit], errors: Mapping[str, Held]) -> float:
+def _coverage(trials: Sequence[Trial], held: Mapping[str, Fit], errors: Mapping[str, Errors]) -> float:
     inside = total = 0
     for one in trials:
-        wide = half_width([errors[other.name].angle_rad for other in trials if other is not one])
+        wide = half_width([errors[other.name]["angle_rad"] for other in trials if other is not one])
         if not (len(one.command) and len(one.angle_rad)) or math.isnan(wide):
             continue
         made = held[one.name]
-        angle, _ = segment_run(one, made.values, drive_run(one, made.values), made.gains.get(one.day, 1.0))
-        inside += int(np.sum(np.abs(angle - one.angle_rad) <= wide))
+        off = by_command(one, made.values, made.gains.get(one.day, 1.0))["angle_rad"]
+        inside += int(np.sum(np.abs(off) <= wide))
         total += len(one.angle_rad)
     return inside / total if total else math.nan
 
@@ -390,7 +396,7 @@ def identify(
     held = held_fits(trials, assembly, scale) if len(trials) > 1 else {}
     errors = {one.name: errors_of(held[one.name], one) for one in trials if one.name in held}
     progress(2, steps)
-    others: dict[str, Mapping[str, Held]] = {}
+    others: dict[str, Mapping[str, Errors]] = {}
     for k, (name, other) in enumerate(chosen.items()):
         fits = held_fits(trials, other, scale, held)
         others[name] = {one.name: errors_of(fits[one.name], one) for one in trials}
@@ -402,15 +408,14 @@ def identify(
 
 
 def best_baseline(found: Identification, quantity: str) -> str:
-    """Name of the ARX with the smallest mean error of a quantity of `Held`."""
+    """Name of the ARX with the smallest mean error of a quantity of `QUANTITIES`."""
     arx = [name for name in found.others if name.startswith("ARX")]
     return min(arx, key=lambda name: mean_of(found.others[name], quantity), default="")
 
 
-def mean_of(errors: Mapping[str, Held], quantity: str) -> float:
+def mean_of(errors: Mapping[str, Errors], quantity: str) -> float:
     """Mean over the trials that have it, NaN without one."""
-    values = [getattr(one, quantity) for one in errors.values()]
-    values = [x for x in values if math.isfinite(x)]
+    values = [one[quantity] for one in errors.values() if math.isfinite(one[quantity])]
     return sum(values) / len(values) if values else math.nan
 
 
@@ -419,10 +424,7 @@ def gained(found: Identification, baseline: str, quantity: str) -> tuple[float, 
 
     Both are shares of the baseline's mean; the half is NaN for fewer than two trials.
     """
-    pairs = [
-        (getattr(found.others[baseline][name], quantity), getattr(one, quantity))
-        for name, one in found.held.items()
-    ]
+    pairs = [(found.others[baseline][name][quantity], one[quantity]) for name, one in found.held.items()]
     less = np.array([a - b for a, b in pairs if math.isfinite(a) and math.isfinite(b)])
     mean = mean_of(found.others[baseline], quantity)
     if not len(less):

@@ -60,7 +60,7 @@ class Recording:
     turned : (n, 3) rotation vectors of the tip in the frame of the base [rad]. chord : (n, 3) from base to
         tip [m]. Both None for poses in the plane, or without motion capture.
     planar : (n, 2) angle [rad] and chord [m] in the plane, None without.
-    chamber : number of the driven chamber. findings : on the sensors.
+    findings : on the sensors.
     """
 
     name: str
@@ -71,27 +71,8 @@ class Recording:
     turned: FloatArray | None
     chord: FloatArray | None
     planar: FloatArray | None
-    chamber: int
     findings: tuple[Finding, ...]
     pwm: bool = False
-
-
-def _times(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Hamilton products of quaternions (n, 4), w first."""
-    w, x, y, z = a.T
-    p, q, r, s = b.T
-    return np.stack(
-        [w * p - x * q - y * r - z * s, w * q + x * p + y * s - z * r, w * r - x * s + y * p + z * q,
-         w * s + x * r - y * q + z * p], axis=1
-    )  # fmt: skip
-
-
-def _vector(q: FloatArray) -> FloatArray:
-    """Rotation vectors (n, 3) of unit quaternions (n, 4)."""
-    q = np.where(q[:, :1] < 0.0, -q, q)
-    size = np.linalg.norm(q[:, 1:], axis=1)
-    angle = 2.0 * np.arctan2(size, q[:, 0])
-    return np.asarray(q[:, 1:] * (angle / np.maximum(size, 1e-12))[:, None])
 
 
 def _poses(log: Log) -> tuple[FloatArray, FloatArray]:
@@ -99,6 +80,8 @@ def _poses(log: Log) -> tuple[FloatArray, FloatArray]:
 
     Raises `BadInputError` for quaternions that are none.
     """
+    from scipy.spatial.transform import Rotation
+
     read = {name: log.columns[name] for name in (*POSITION, *QUATERNION)}
     base, tip = (np.stack([read[f"{of}_q{k}"] for k in "wxyz"], axis=1) for of in ("base", "tip"))
     for of, q in (("base", base), ("tip", tip)):
@@ -109,8 +92,10 @@ def _poses(log: Log) -> tuple[FloatArray, FloatArray]:
                 f"{log.source}, line {log.lines[wrong[0]]}: the quaternion {of}_qw, ... has norm "
                 f"{norm[wrong[0]]:.4g}, expected 1"
             )
-    back = base * [1.0, -1.0, -1.0, -1.0]
-    turned = _vector(_times(back, tip))
+    seen = np.isfinite(base).all(axis=1) & np.isfinite(tip).all(axis=1)
+    turned = np.full((len(tip), 3), np.nan)
+    first, last = (Rotation.from_quat(q[seen][:, [1, 2, 3, 0]]) for q in (base, tip))
+    turned[seen] = (first.inv() * last).as_rotvec()
     apart = np.stack([read[f"tip_{k}_m"] - read[f"base_{k}_m"] for k in "xyz"], axis=1)
     return turned, apart
 
@@ -166,9 +151,7 @@ def recording_of(log: Log, name: str) -> Recording:
     pwm = command is None and driven < len(PWM) and PWM[driven] in log.columns
     if pwm:
         command = log.columns[PWM[driven]]
-    return Recording(
-        name, log.source, t, command, pressure, turned, chord, planar, driven + 1, tuple(findings), pwm
-    )
+    return Recording(name, log.source, t, command, pressure, turned, chord, planar, tuple(findings), pwm)
 
 
 def _jumps(log: Log, name: str, turned: FloatArray) -> list[Finding]:

@@ -6,7 +6,6 @@ from typing import Literal
 
 from pydantic import model_validator
 
-from calib.core.errors import BadInputError
 from calib.core.result import NotNegative, Number, Positive, Result, Row3, Section, Sigma, quantity
 from calib.stages.arm.model import PARAMETERS, PARTS, Assembly
 
@@ -54,8 +53,6 @@ class Arm(Result):
 
     @model_validator(mode="after")
     def _assembled(self) -> Arm:
-        if self.earlier:
-            return self
         known = [part.name for part in PARTS]
         needed = [part.name for part in PARTS if not part.off and not part.drives]
         if any(one not in known for one in self.parts) or any(one not in self.parts for one in needed):
@@ -71,25 +68,13 @@ class Arm(Result):
         return self
 
     @property
-    def earlier(self) -> bool:
-        """Whether its segment bends by the square of the pressure, as in an earlier version; it is kept."""
-        return "quadratic" in self.parts
-
-    @property
     def assembly(self) -> Assembly:
         """The parts that play a part."""
         return Assembly(tuple(self.parts))
 
     @property
     def values(self) -> dict[str, float]:
-        """All parameters, those of parts that are left out included.
-
-        Raises `BadInputError` for an arm of an earlier version.
-        """
-        if self.earlier:
-            raise BadInputError(
-                "arm: is of an earlier model, expected one of calib identify arm; run it again"
-            )
+        """All parameters, those of parts that are left out included."""
         return self.parameters | self.assembly.off
 
     def gain_of(self, day: str) -> float:

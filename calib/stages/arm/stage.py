@@ -15,7 +15,7 @@ from calib.core.verdict import Finding, Verdict
 if TYPE_CHECKING:
     from calib.core.rig import Rig
     from calib.core.words import Block
-    from calib.stages.arm.identify import Held, Identification
+    from calib.stages.arm.identify import Identification
     from calib.stages.arm.model import Trial
     from calib.stages.arm.read import Frame
     from calib.stages.arm.section import Arm
@@ -112,13 +112,9 @@ def _read(files: Files, rig: Rig, options: Options) -> Inputs:
     return Inputs(trials, frame, findings, options.compare, files.progress)
 
 
-def _known(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
 def _solve(inputs: Inputs) -> Arm:
-    from calib.core.result import judged
-    from calib.stages.arm.identify import half_width, identify, mean_of
+    from calib.core.result import finite_or_none, judged
+    from calib.stages.arm.identify import QUANTITIES, half_width, identify, mean_of
     from calib.stages.arm.section import Arm, HeldTrial
 
     with inputs.progress("identifying") as progress:
@@ -131,18 +127,14 @@ def _solve(inputs: Inputs) -> Arm:
         sigma={name: float(value) for name, value in found.sigma.items()},
         days={name: float(value) for name, value in made.gains.items()},
         bending_axis=None if axis is None else axis.tolist(),
-        chord_leans=_known(inputs.frame.leans),
-        angle_error_rad=_known(mean_of(found.held, "angle_rad")),
-        chord_error_m=_known(mean_of(found.held, "chord_m")),
-        by_pressure_error_rad=_known(mean_of(found.held, "by_pressure_rad")),
-        interval_rad=_known(half_width([one.angle_rad for one in found.held.values()])),
-        coverage=_known(found.coverage),
+        chord_leans=finite_or_none(inputs.frame.leans),
+        angle_error_rad=finite_or_none(mean_of(found.held, "angle_rad")),
+        chord_error_m=finite_or_none(mean_of(found.held, "chord_m")),
+        by_pressure_error_rad=finite_or_none(mean_of(found.held, "angle_by_pressure_rad")),
+        interval_rad=finite_or_none(half_width([one["angle_rad"] for one in found.held.values()])),
+        coverage=finite_or_none(found.coverage),
         held={
-            name: HeldTrial(
-                angle_rad=_known(one.angle_rad),
-                chord_m=_known(one.chord_m),
-                angle_by_pressure_rad=_known(one.by_pressure_rad),
-            )
+            name: HeldTrial(**{quantity: finite_or_none(one[quantity]) for quantity in QUANTITIES})
             for name, one in found.held.items()
         },
         **judged(Verdict.of((*inputs.findings, *judge(found)))),
@@ -151,7 +143,7 @@ def _solve(inputs: Inputs) -> Arm:
 
 def judge(found: Identification) -> Iterator[Finding]:
     """What the held trials, the baselines and the posterior say of an identification."""
-    from calib.stages.arm.identify import best_baseline, gained
+    from calib.stages.arm.identify import QUANTITIES, best_baseline, gained
 
     if not any(len(one.angle_rad) for one in found.trials):
         yield Finding("poor", "no log has a pose, so the valve alone is identified", "log base and tip")
@@ -162,46 +154,41 @@ def judge(found: Identification) -> Iterator[Finding]:
             f"{len(found.trials)} trials do not tell how trials differ, expected at least {_FEWEST}",
             "record more trials: other commands, another day",
         )
-    for quantity, words in (
-        ("angle_rad", "angle"),
-        ("chord_m", "chord"),
-        ("by_pressure_rad", "angle by pressure"),
-    ):
+    for quantity, one in QUANTITIES.items():
         name = best_baseline(found, quantity)
         mean, half = gained(found, name, quantity) if name else (math.nan, math.nan)
         if math.isnan(mean):
             continue
         text = (
-            f"{words}: error on held trials {100.0 * mean:.0f} +- {100.0 * half:.0f} % smaller than that of "
-            f"{name} (paired, 95 %)"
+            f"{one.words}: error on held trials {100.0 * mean:.0f} +- {100.0 * half:.0f} % smaller than "
+            f"that of {name} (paired, 95 %)"
         )
         yield Finding("remark" if mean > 0.0 else "poor", text)
     yield from _far(found)
     yield from _untold(found)
     values = found.fit.values
-    for one in found.trials:
-        if not len(one.angle_rad):
+    for trial in found.trials:
+        if not len(trial.angle_rad):
             continue
-        phi = float(one.angle_rad[0])
+        phi = float(trial.angle_rad[0])
         curve = values["chord_m"] + values["chord_m_per_rad"] * phi + values["chord_m_per_rad2"] * phi**2
-        short = curve - float(one.chord_m[0])
+        short = curve - float(trial.chord_m[0])
         if short > _SHORT * values["chord_m"]:
             yield Finding(
-                "remark", f"{one.name} starts {1e3 * short:.1f} mm too short: a vented start, it settles"
+                "remark", f"{trial.name} starts {1e3 * short:.1f} mm too short: a vented start, it settles"
             )
 
 
 def _far(found: Identification) -> Iterator[Finding]:
-    for name, one in found.held.items():
-        others = sorted(
-            x.angle_rad for n, x in found.held.items() if n != name and math.isfinite(x.angle_rad)
-        )
-        if len(others) < _FEWEST - 1 or one.angle_rad - others[len(others) // 2] < _LEAST_RAD:
+    errors = {name: one["angle_rad"] for name, one in found.held.items()}
+    for name, error in errors.items():
+        others = sorted(x for n, x in errors.items() if n != name and math.isfinite(x))
+        if len(others) < _FEWEST - 1 or error - others[len(others) // 2] < _LEAST_RAD:
             continue
-        if one.angle_rad > _FAR * others[len(others) // 2]:
+        if error > _FAR * others[len(others) // 2]:
             yield Finding(
                 "poor",
-                f"{name} is predicted to {math.degrees(one.angle_rad):.1f} deg from the others, which reach "
+                f"{name} is predicted to {math.degrees(error):.1f} deg from the others, which reach "
                 f"{math.degrees(others[len(others) // 2]):.1f} deg: it alone holds its day, load or range",
                 f"record another trial like {name}",
             )
@@ -234,7 +221,7 @@ def _untold(found: Identification) -> Iterator[Finding]:
 def _words(arm: Arm) -> list[Block]:
     """Parameters with what identifies them, and one table of errors on trials held back."""
     from calib.core.words import BLANK, Line, Table
-    from calib.stages.arm.identify import mean_of
+    from calib.stages.arm.identify import QUANTITIES, mean_of
     from calib.stages.arm.model import PARTS
 
     found: Identification = arm.evidence
@@ -251,34 +238,35 @@ def _words(arm: Arm) -> list[Block]:
         Line("gain of the day: " + ", ".join(f"{day} {gain:.3f}" for day, gain in arm.days.items())),
     ]
 
-    def cells(errors: dict[str, Held], quantity: str, scale: float) -> list[str]:
-        values = [getattr(one, quantity) * scale for one in errors.values()]
-        values.append(mean_of(errors, quantity) * scale)
-        return [BLANK if math.isnan(x) else f"{x:.2f}" for x in values]
+    def cell(error: float) -> str:
+        return BLANK if math.isnan(error) else f"{error:.2f}"
 
     models = {"assembly": found.held, **found.others} if found.held else {}
-    for quantity, scale, title in (
-        ("angle_rad", 180.0 / math.pi, "held trials, angle from the command, deg RMS"),
-        ("chord_m", 1e3, "held trials, chord from the command, mm RMS"),
-        ("by_pressure_rad", 180.0 / math.pi, "held trials, angle from the pressure, deg RMS"),
-    ):
-        if models and math.isfinite(mean_of(found.held, quantity)):
-            table = tuple((name, *cells(dict(errors), quantity, scale)) for name, errors in models.items())
-            blocks.append(Table(("model", *found.held, "mean"), table, title))
+    for name, of in QUANTITIES.items():
+        if models and math.isfinite(mean_of(found.held, name)):
+            table = [
+                (
+                    model,
+                    *(cell(of.scale * one[name]) for one in errors.values()),
+                    cell(of.scale * mean_of(errors, name)),
+                )
+                for model, errors in models.items()
+            ]
+            title = f"held trials, {of.title} RMS"
+            blocks.append(Table(("model", *found.held, "mean"), tuple(table), title))
     return blocks
 
 
 def _document(arm: Arm) -> dict[str, Any]:
+    from calib.core.result import finite_or_none
+    from calib.stages.arm.identify import QUANTITIES
+
     found: Identification = arm.evidence
     return {
         "models": {
             model: {
-                name: {
-                    "angle_rad": _known(one.angle_rad),
-                    "chord_m": _known(one.chord_m),
-                    "angle_by_pressure_rad": _known(one.by_pressure_rad),
-                }
-                for name, one in errors.items()
+                trial: {name: finite_or_none(one[name]) for name in QUANTITIES}
+                for trial, one in errors.items()
             }
             for model, errors in {"assembly": found.held, **found.others}.items()
         }
