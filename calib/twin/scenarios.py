@@ -18,9 +18,9 @@ from calib.stages.actuator.simulate import RigState, rig_at_rest
 from calib.stages.control.laws import (
     FeedForward,
     LoopState,
-    OrientationControl,
     Pid,
-    PositionControl,
+    feed_forward,
+    saturate,
     step_orientation,
     step_position,
 )
@@ -374,13 +374,12 @@ class Orientation:
 
     def _law(self, rig: SimulatedRig, ticks: int) -> Law:
         pid = _tuned(rig, _ORIENTATION[self.controller], self.Kp, self.Ki, self.Kd)
-        control = OrientationControl(pid, self.sign)
         steps = AngleSteps((self.reference_rad, self.jump_to_rad), (self.jump_at_s,))
         wanted = steps.angle_rad(tick_times(rig, ticks) + 1e-9).tolist()
 
         def law(k: int, memory: LoopState, seen: Seen) -> tuple[LoopState, Pair]:
-            memory, command = step_orientation(control, memory, wanted[k], seen.phi_rad)
-            return memory, command.pwm
+            memory, (u1, u2) = step_orientation(pid, memory, wanted[k], seen.phi_rad, self.sign)
+            return memory, (saturate(u1), saturate(u2))
 
         return law
 
@@ -398,12 +397,15 @@ class Orientation:
         return figures
 
 
-def _position_law(control: PositionControl, wanted_m: FloatArray) -> Law:
-    rows = wanted_m.tolist()
+def _position_law(pid: Pid, feed: bool, wanted_m: FloatArray) -> Law:
+    rows, line = wanted_m.tolist(), FeedForward()
 
     def law(k: int, memory: LoopState, seen: Seen) -> tuple[LoopState, Pair]:
-        memory, command = step_position(control, memory, (rows[k][0], rows[k][1]), seen.q_m)
-        return memory, command.pwm
+        q1, q2 = rows[k]
+        memory, (u1, u2) = step_position(pid, memory, (q1, q2), seen.q_m)
+        if feed:
+            u1, u2 = u1 + feed_forward(line, q1), u2 + feed_forward(line, q2)
+        return memory, (saturate(u1), saturate(u2))
 
     return law
 
@@ -432,10 +434,8 @@ class Elongation:
 
     def run(self, rig: SimulatedRig, ticks: int, seed: int, feedback: str) -> Run:
         pid, feed = _POSITION[self.controller]
-        control = PositionControl(
-            _tuned(rig, pid, self.Kp, self.Ki, self.Kd), FeedForward() if feed else None
-        )
-        law = _position_law(control, PolynomialElongation().bellows_m(tick_times(rig, ticks)))
+        pid = _tuned(rig, pid, self.Kp, self.Ki, self.Kd)
+        law = _position_law(pid, feed, PolynomialElongation().bellows_m(tick_times(rig, ticks)))
         start = rig_at_rest(rig.plant, rig.pump, length_m=or_none(self.start_m))
         return run_loop(rig, start, law, ticks, seed, feedback)
 
@@ -466,8 +466,7 @@ class EllipseTrack:
 
     def run(self, rig: SimulatedRig, ticks: int, seed: int, feedback: str) -> Run:
         pid = Pid(self.Kp, 0.0, self.Kd, tick_s=rig.pump.tick_s)
-        control = PositionControl(pid, FeedForward() if self.feedforward else None)
-        law = _position_law(control, self._wanted(rig, tick_times(rig, ticks)))
+        law = _position_law(pid, self.feedforward, self._wanted(rig, tick_times(rig, ticks)))
         return run_loop(rig, at_rest(rig), law, ticks, seed, feedback)
 
     def figures(self, run: Run) -> Figures:

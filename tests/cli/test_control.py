@@ -90,7 +90,11 @@ def test_the_plant_of_the_file_is_controlled(calib: Run, tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("verb", "text", "sentence"),
     [
-        ("run", "t_s,q1_m,q2_m\n0,0.07,0.07\n1,nan,0.07\n2,0.07,0.07\n", "ref.csv, line 3: q1_m is nan"),
+        (
+            "run",
+            "t_s,q1_m,q2_m\n0,0.07,0.07\n1,nan,0.07\n2,0.07,0.07\n",
+            "ref.csv, line 3: q1_m is blank or nan",
+        ),
         (
             "check",
             "t_s,q1_m,q2_m\n0,.07,.07\n1,.07,.07\n",

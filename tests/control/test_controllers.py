@@ -17,17 +17,14 @@ from calib.stages.actuator.parameters import pumps_connected
 from calib.stages.actuator.pump import static_force_N
 from calib.stages.actuator.simulate import rig_at_rest, simulate, tick
 from calib.stages.control.laws import (
-    BackCalculation,
     BackState,
     ComputedTorque,
     FeedForward,
-    LoopState,
     Model,
     Observer,
     ObserverState,
     Pid,
     PidState,
-    PositionControl,
     PumpEstimate,
     ahead,
     correct,
@@ -49,7 +46,6 @@ from calib.stages.control.laws import (
     static_stiffness,
     step,
     step_back,
-    step_position,
     wanted_motion,
 )
 from calib.stages.control.laws import computed_torque_step as step_of_computed_torque
@@ -103,46 +99,30 @@ errors = st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=60)
 def test_without_limits_it_is_the_incremental_form(
     errors: list[float], Kp: float, Ki: float, Kd: float
 ) -> None:
-    back, pid = BackCalculation(Kp, Ki, Kd), Pid(Kp, Ki, Kd)
+    pid = Pid(Kp, Ki, Kd)
     a, b = BackState(), PidState()
     for error in errors:
-        a, u = step_back(back, a, error, -math.inf, math.inf)
+        a, u = step_back(pid, 4.0, a, error, -math.inf, math.inf)
         b, v = step_pid(pid, b, error)
         assert u == pytest.approx(v, abs=1e-6 * (1.0 + abs(v)))
 
 
 @given(errors=errors, tracking_s=st.floats(0.02, 5.0))
 def test_commands_stay_within_their_limits(errors: list[float], tracking_s: float) -> None:
-    back, state = BackCalculation(1000.0, 1000.0, 10.0, tracking_s), BackState()
+    pid, state = Pid(1000.0, 1000.0, 10.0), BackState()
     for error in errors:
-        state, u = step_back(back, state, error, 10.0, 200.0)
+        state, u = step_back(pid, tracking_s, state, error, 10.0, 200.0)
         assert 10.0 <= u <= 200.0
 
 
 def test_a_constant_error_beyond_the_limit_settles_the_integral() -> None:
     """At rest Ki e = (v - u) / Tt: the integral stops a known way beyond the limit, it does not wind up."""
-    back, state = BackCalculation(100.0, 50.0, 0.0, 0.5), BackState()
+    pid, state = Pid(100.0, 50.0, 0.0), BackState()
     for _ in range(3000):
-        state, u = step_back(back, state, 3.0, 0.0, 255.0)
+        state, u = step_back(pid, 0.5, state, 3.0, 0.0, 255.0)
     v = 100.0 * 3.0 + state.integral + 0.5 / 60.0 * 50.0 * 3.0
     assert u == 255.0
     assert v - 255.0 == pytest.approx(0.5 * 50.0 * 3.0, rel=1e-9)
-
-
-def test_the_feed_forward_is_added_but_not_fed_back() -> None:
-    rng = np.random.default_rng(0)
-    reference, measured = 0.067 + 0.02 * rng.random((200, 2)), 0.065 + 0.02 * rng.random((200, 2))
-    pid = Pid(300.0, 50.0, 1.0)
-    control, bare = PositionControl(pid), PositionControl(pid, None)
-    with_line, without = LoopState(), LoopState()
-    for q_ref, q in zip(reference.tolist(), measured.tolist(), strict=True):
-        with_line, command = step_position(control, with_line, tuple(q_ref), tuple(q))
-        without, plain = step_position(bare, without, tuple(q_ref), tuple(q))
-        assert command.feedback == plain.feedback
-        for u, value, pwm in zip(command.feedback, q_ref, command.pwm, strict=True):
-            total = u + feed_forward(FeedForward(), value)
-            assert abs(pwm - min(max(total, 0.0), 255.0)) <= 0.5
-    assert with_line == without
 
 
 LINE = FeedForward()

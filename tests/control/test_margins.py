@@ -28,8 +28,8 @@ from calib.stages.control.linear import (
     series,
     spectral_radius,
 )
+from calib.stages.control.section import ControllerCriterion
 from calib.stages.control.tuning import (
-    Criterion,
     Tuned,
     holds,
     orientation_loop,
@@ -212,7 +212,7 @@ def test_breaking_one_channel_keeps_the_determinant(a: float, b: float, c: float
     assert (1.0 + break_at(L, 1)[0]) * (1.0 + a) == pytest.approx(whole)
 
 
-CRITERION = Criterion()
+CRITERION = ControllerCriterion(gain_margin=2.0, phase_margin_rad=math.pi / 3.0, sensitivity=2.0)
 
 
 @pytest.fixture(scope="module")
@@ -230,8 +230,8 @@ def _at_least(tuned: Tuned) -> None:
         m = point.margins
         assert m.stable
         # Gains are rounded to two digits.
-        assert m.gain > 0.98 * CRITERION.gain
-        assert m.phase_rad > 0.98 * CRITERION.phase_rad
+        assert m.gain > 0.98 * CRITERION.gain_margin
+        assert m.phase_rad > 0.98 * CRITERION.phase_margin_rad
         assert m.sensitivity < 1.02 * CRITERION.sensitivity
 
 

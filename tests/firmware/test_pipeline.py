@@ -21,9 +21,8 @@ from calib.stages.camera.model import Camera, undistort
 from calib.stages.control.laws import (
     FeedForward,
     LoopState,
-    OrientationControl,
     Pid,
-    PositionControl,
+    feed_forward,
     step_orientation,
     step_position,
 )
@@ -464,8 +463,7 @@ def test_every_stage_is_the_projects_own(mode: int) -> None:
     angle: tuple[float, float] | None = None
     lowpass, heads = design_lowpass(Design()).exact, []
     loop = LoopState()
-    turning = OrientationControl(Pid(1000.0, 1000.0, 10.0, clamping=True), whole_pwm=False)
-    stretching = PositionControl(Pid(15000.0, 0.0, 150.0), FeedForward(), whole_pwm=False)
+    turning, stretching = Pid(1000.0, 1000.0, 10.0, clamping=True), Pid(15000.0, 0.0, 150.0)
     for given in _ticks(mode):
         out = reference.step(given)
         phi_acc = math.atan2(given.ay_mps2, given.ax_mps2)
@@ -482,10 +480,11 @@ def test_every_stage_is_the_projects_own(mode: int) -> None:
         q = inverse_series(np.array([*out.head_m, out.phi_rad]), 0.0126)
         assert out.q_m == pytest.approx(q, abs=1e-8)
         if mode == MODE_POSITION:
-            loop, command = step_position(stretching, loop, given.reference, out.q_m)
+            loop, u = step_position(stretching, loop, given.reference, out.q_m)
+            u = np.add(u, [feed_forward(FeedForward(), q) for q in given.reference])
         else:
-            loop, command = step_orientation(turning, loop, given.reference[0], out.phi_rad)
-        assert out.pwm == pytest.approx(command.pwm, abs=1e-3)
+            loop, u = step_orientation(turning, loop, given.reference[0], out.phi_rad)
+        assert out.pwm == pytest.approx(np.clip(u, 0.0, 255.0), abs=1e-3)
 
 
 @pytest.mark.parametrize("kind", ["nominal", "full"])

@@ -22,11 +22,10 @@ from calib.stages.control.laws import (
     PWM_MIN,
     FeedForward,
     LoopState,
-    OrientationControl,
     Pid,
     PidState,
-    PositionControl,
     feed_forward,
+    saturate,
     step,
     step_orientation,
     step_position,
@@ -139,10 +138,10 @@ def _angle_reference(run: Run) -> Curve:
 
 def unsaturated(run: Run, pid: Pid) -> FloatArray:
     """Outputs (n, 2) [PWM] of the controllers before the limits, from what they got in a run."""
-    control, state, out = OrientationControl(pid), LoopState(), []
+    state, out = LoopState(), []
     for reference, phi in zip(_angle_reference(run).y.tolist(), seen(run)[:, 0].tolist(), strict=True):
-        state, command = step_orientation(control, state, reference, phi)
-        out.append(command.feedback)
+        state, u = step_orientation(pid, state, reference, phi)
+        out.append(u)
     return np.array(out)
 
 
@@ -457,12 +456,12 @@ def _ellipse_m() -> FloatArray:
 
 
 def _followed(reference_m: FloatArray, rig: RigMaker, feedback: str) -> Run:
-    control = PositionControl(Pid(10000.0, 0.0, 1000.0), FeedForward())
-    rows = reference_m.tolist()
+    pid, line, rows = Pid(10000.0, 0.0, 1000.0), FeedForward(), reference_m.tolist()
 
     def law(k: int, memory: LoopState, now: Seen) -> tuple[LoopState, tuple[float, float]]:
-        memory, command = step_position(control, memory, (rows[k][0], rows[k][1]), now.q_m)
-        return memory, command.pwm
+        q1, q2 = rows[k]
+        memory, (u1, u2) = step_position(pid, memory, (q1, q2), now.q_m)
+        return memory, (saturate(u1 + feed_forward(line, q1)), saturate(u2 + feed_forward(line, q2)))
 
     return simulate(rig(), at_rest(rig()), law, len(rows), 0, feedback)
 

@@ -422,24 +422,6 @@ def pwm_for_force(model: Model, state: PumpEstimate, wanted_N: FloatArray, horiz
 
 
 @dataclass(frozen=True)
-class BackCalculation:
-    """Gains of one channel.
-
-    Attributes
-    ----------
-    Kp, Ki, Kd : as in `pid.Pid`.
-    tracking_s : Tt.
-    tick_s : period.
-    """
-
-    Kp: float
-    Ki: float = 0.0
-    Kd: float = 0.0
-    tracking_s: float = 4.0
-    tick_s: float = TICK_S
-
-
-@dataclass(frozen=True)
 class BackState:
     """What one tick hands to the next: the integral [PWM] and the error of the tick before."""
 
@@ -448,14 +430,14 @@ class BackState:
 
 
 def step_back(
-    control: BackCalculation, state: BackState, error: float, low: float, high: float
+    pid: Pid, tracking_s: float, state: BackState, error: float, low: float, high: float
 ) -> tuple[BackState, float]:
-    """One tick. Returns the next state and the command within its limits [PWM]."""
-    h = control.tick_s
-    v = control.Kp * error + state.integral + 0.5 * h * control.Ki * error
-    v += control.Kd * (error - state.e1) / h
+    """One tick, with Tt = `tracking_s`. Returns the next state and the command within its limits [PWM]."""
+    h = pid.tick_s
+    v = pid.Kp * error + state.integral + 0.5 * h * pid.Ki * error
+    v += pid.Kd * (error - state.e1) / h
     u = min(max(v, low), high)
-    integral = state.integral + h * (control.Ki * error + (u - v) / control.tracking_s)
+    integral = state.integral + h * (pid.Ki * error + (u - v) / tracking_s)
     return BackState(integral, error), u
 
 
@@ -465,19 +447,18 @@ class BackOrientation:
 
     Attributes
     ----------
-    control : of both bellows.
+    pid : of both bellows. tracking_s : Tt.
     model : the identified rig; its pumps and limits.
     falling_share : share of the falling rate that a command may ask for; 1 for all of it, infinity for
         fixed limits only.
-    sign : of the error of bellows 1, as in `loop.OrientationControl`.
-    whole_pwm : send whole numbers to the motors.
+    sign : of the error of bellows 1.
     """
 
-    control: BackCalculation
+    pid: Pid
+    tracking_s: float
     model: Model
     falling_share: float = 0.4
     sign: int = 1
-    whole_pwm: bool = True
 
 
 @dataclass(frozen=True)
@@ -502,12 +483,10 @@ def step_back_orientation(
     low = (model.low_pwm, model.low_pwm)
     if math.isfinite(control.falling_share):
         low = least_pwm(model, ahead(model, state.pumps)[-1], control.falling_share)
-    first, u1 = step_back(control.control, state.first, error, low[0], model.high_pwm)
-    second, u2 = step_back(control.control, state.second, -error, low[1], model.high_pwm)
-    pwm = (
-        saturate(u1, control.whole_pwm, model.low_pwm, model.high_pwm),
-        saturate(u2, control.whole_pwm, model.low_pwm, model.high_pwm),
-    )
+    pid, Tt, high = control.pid, control.tracking_s, model.high_pwm
+    first, u1 = step_back(pid, Tt, state.first, error, low[0], high)
+    second, u2 = step_back(pid, Tt, state.second, -error, low[1], high)
+    pwm = (saturate(u1, True, model.low_pwm, high), saturate(u2, True, model.low_pwm, high))
     return BackOrientationState(push(model, state.pumps, pwm), first, second), pwm
 
 
@@ -798,13 +777,11 @@ class ComputedTorque:
     ----------
     horizon_ticks : time in which the pumps are asked to reach the wanted force.
     Kp_per_s2, Kd_per_s : gains on the lengths' errors.
-    whole_pwm : send whole numbers to the motors.
     """
 
     horizon_ticks: int = 6
     Kp_per_s2: float = 0.0
     Kd_per_s: float = 0.0
-    whole_pwm: bool = True
 
 
 @dataclass(frozen=True)
@@ -872,7 +849,7 @@ def computed_torque_step(
         | (force < lowest - 1e-3)
         | (force > largest_force_N(model))
     )
-    u1, u2 = (saturate(u, control.whole_pwm, model.low_pwm, model.high_pwm) for u in pwm.tolist())
+    u1, u2 = (saturate(u, True, model.low_pwm, model.high_pwm) for u in pwm.tolist())
     return TorqueCommand((u1, u2), (float(force[0]), float(force[1])), (bool(limited[0]), bool(limited[1])))
 
 
@@ -894,38 +871,6 @@ def computed_torque_step(
 
 
 @dataclass(frozen=True)
-class OrientationControl:
-    """Control of the head's angle alone.
-
-    Attributes
-    ----------
-    pid : the controller of both bellows.
-    sign : of the error of bellows 1 (4.1).
-    whole_pwm : send whole numbers to the motors, as the microcontroller does.
-    """
-
-    pid: Pid
-    sign: int = 1
-    whole_pwm: bool = True
-
-
-@dataclass(frozen=True)
-class PositionControl:
-    """Control of both bellows' lengths.
-
-    Attributes
-    ----------
-    pid : the controller of both bellows.
-    feedforward : None for feedback alone.
-    whole_pwm : send whole numbers to the motors, as the microcontroller does.
-    """
-
-    pid: Pid
-    feedforward: FeedForward | None = field(default_factory=FeedForward)
-    whole_pwm: bool = True
-
-
-@dataclass(frozen=True)
 class LoopState:
     """Memory of the two controllers, zeros at the start."""
 
@@ -933,50 +878,31 @@ class LoopState:
     second: PidState = field(default_factory=PidState)
 
 
-@dataclass(frozen=True)
-class Command:
-    """Result of a tick for bellows 1 and 2.
-
-    Attributes
-    ----------
-    pwm : what the motors get.
-    feedback : output of the feedback controllers before saturation.
-    """
-
-    pwm: tuple[float, float]
-    feedback: tuple[float, float]
-
-
 def step_orientation(
-    control: OrientationControl, state: LoopState, phi_ref_rad: float, phi_rad: float
-) -> tuple[LoopState, Command]:
-    """One tick of orientation control.
+    pid: Pid, state: LoopState, phi_ref_rad: float, phi_rad: float, sign: int = 1
+) -> tuple[LoopState, Pair]:
+    """One tick of orientation control: the next state, and the PWM values before saturation.
 
     Parameters
     ----------
+    pid : the controller of both bellows.
     phi_ref_rad, phi_rad : wanted and measured angle of the head [rad].
+    sign : of the error of bellows 1 (4.1).
     """
-    error = control.sign * (phi_ref_rad - phi_rad)
-    first, u1 = step(control.pid, state.first, error)
-    second, u2 = step(control.pid, state.second, -error)
-    pwm = (saturate(u1, control.whole_pwm), saturate(u2, control.whole_pwm))
-    return LoopState(first, second), Command(pwm, (u1, u2))
+    error = sign * (phi_ref_rad - phi_rad)
+    first, u1 = step(pid, state.first, error)
+    second, u2 = step(pid, state.second, -error)
+    return LoopState(first, second), (u1, u2)
 
 
-def step_position(
-    control: PositionControl, state: LoopState, q_ref_m: tuple[float, float], q_m: tuple[float, float]
-) -> tuple[LoopState, Command]:
-    """One tick of position control.
+def step_position(pid: Pid, state: LoopState, q_ref_m: Pair, q_m: Pair) -> tuple[LoopState, Pair]:
+    """One tick of position control: the next state, and the PWM values before feed-forward and saturation.
 
     Parameters
     ----------
+    pid : the controller of both bellows.
     q_ref_m, q_m : wanted and measured lengths of the bellows [m].
     """
-    first, u1 = step(control.pid, state.first, q_ref_m[0] - q_m[0])
-    second, u2 = step(control.pid, state.second, q_ref_m[1] - q_m[1])
-    extra1, extra2 = 0.0, 0.0
-    if control.feedforward is not None:
-        extra1 = feed_forward(control.feedforward, q_ref_m[0])
-        extra2 = feed_forward(control.feedforward, q_ref_m[1])
-    pwm = (saturate(u1 + extra1, control.whole_pwm), saturate(u2 + extra2, control.whole_pwm))
-    return LoopState(first, second), Command(pwm, (u1, u2))
+    first, u1 = step(pid, state.first, q_ref_m[0] - q_m[0])
+    second, u2 = step(pid, state.second, q_ref_m[1] - q_m[1])
+    return LoopState(first, second), (u1, u2)

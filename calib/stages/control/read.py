@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from pathlib import Path
 
@@ -11,11 +9,12 @@ import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
-from calib.core.files import read_text, shown
+from calib.core.files import shown
 from calib.core.rig import Rig
 from calib.core.writing import Kind, column_names, write_atomically
 from calib.io.logs import columns_of
 from calib.stages.actuator.kinematics import inverse
+from calib.stages.actuator.read import number, read_columns
 from calib.stages.control.laws import Model
 from calib.stages.control.references import (
     BUILT_IN,
@@ -44,51 +43,35 @@ _KINDS = (("q1_m", "q2_m"), ("true_q1_m", "true_q2_m"), ("x_m", "y_m"), ("phi_ra
 _FEWEST = 3
 
 
-def _cell(where: str, name: str, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        found = "an empty cell" if not text.strip() else f"{text.strip()[:40]!r}"
-        raise BadInputError(f"{where}: {name} is {found}, expected a number") from None
-    if not math.isfinite(value):
-        raise BadInputError(f"{where}: {name} is {value}, expected a finite number")
-    return value
-
-
 def _series(path: Path) -> tuple[tuple[str, ...], FloatArray, FloatArray]:
     """Names of the columns taken, times (n,) and values (n, len(names))."""
     source = shown(path)
-    rows = csv.reader(io.StringIO(read_text(path)))
-    try:
-        header = [name.strip() for name in next(rows, [])]
-        if "t_s" not in header:
-            raise BadInputError(f"{source}: has no column t_s, expected a reference with times")
-        names = next((kind for kind in _KINDS if all(name in header for name in kind)), None)
-        if names is None:
+    header, rows, lines = read_columns(path)
+    if "t_s" not in header:
+        raise BadInputError(f"{source}: has no column t_s, expected a reference with times")
+    names = next((kind for kind in _KINDS if all(name in header for name in kind)), None)
+    if names is None:
+        raise BadInputError(
+            f"{source}: has no reference in it, expected q1_m and q2_m, x_m and y_m, or phi_rad; of a "
+            "recorded log calib replay writes them"
+        )
+    times: list[float] = []
+    values: list[list[float]] = []
+    for row, line in zip(rows, lines, strict=True):
+        t, *cells = (number(row[header.index(name)], path, line, name) for name in ("t_s", *names))
+        for name, value in zip(("t_s", *names), (t, *cells), strict=True):
+            if not math.isfinite(value):
+                raise BadInputError(f"{source}, line {line}: {name} is blank or nan, expected a number")
+        if times and t < times[-1]:
             raise BadInputError(
-                f"{source}: has no reference in it, expected q1_m and q2_m, x_m and y_m, or phi_rad; of a "
-                "recorded log calib replay writes them"
+                f"{source}, line {line}: t_s is {t:g} after {times[-1]:g}, expected rising times"
             )
-        columns = [header.index("t_s"), *(header.index(name) for name in names)]
-        times: list[float] = []
-        values: list[list[float]] = []
-        for row in rows:
-            if not row or row[0].startswith("#"):
-                continue
-            where = f"{source}, line {rows.line_num}"
-            if len(row) <= max(columns):
-                raise BadInputError(f"{where}: has {len(row)} cells, expected {len(header)}")
-            t, *cells = (_cell(where, header[i], row[i]) for i in columns)
-            if times and t < times[-1]:
-                raise BadInputError(f"{where}: t_s is {t:g} after {times[-1]:g}, expected rising times")
-            if times and t == times[-1]:
-                # Loggers stamp samples that waited in a buffer alike; the last one is the newest.
-                values[-1] = cells
-                continue
-            times.append(t)
-            values.append(cells)
-    except csv.Error as error:
-        raise BadInputError(f"{source}, line {rows.line_num}: {error}") from error
+        if times and t == times[-1]:
+            # Loggers stamp samples that waited in a buffer alike; the last one is the newest.
+            values[-1] = cells
+            continue
+        times.append(t)
+        values.append(cells)
     return names, np.array(times), np.array(values)
 
 

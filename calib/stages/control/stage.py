@@ -24,9 +24,15 @@ if TYPE_CHECKING:
     from calib.core.writing import Kind
     from calib.stages.control.laws import Model, Pid
     from calib.stages.control.references import Reference
-    from calib.stages.control.section import AntiWindup, Controller, ControllerMargins, StaticMap
+    from calib.stages.control.section import (
+        AntiWindup,
+        Controller,
+        ControllerCriterion,
+        ControllerMargins,
+        StaticMap,
+    )
     from calib.stages.control.trial import Outcome
-    from calib.stages.control.tuning import Criterion, Following, Point, Tuned
+    from calib.stages.control.tuning import Following, Point, Tuned
     from calib.twin.rig import SimulatedRig
 
 _REFERENCE = (
@@ -409,7 +415,7 @@ class TuneInputs:
 
     machine: SimulatedRig
     model: Model
-    criterion: Criterion
+    criterion: ControllerCriterion
     progress: Progress
 
 
@@ -429,13 +435,19 @@ class ControllerEvidence:
 
 
 def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
+    from calib.stages.control.section import ControllerCriterion
     from calib.stages.control.trial import controlled
-    from calib.stages.control.tuning import Criterion
 
-    try:
-        criterion = Criterion(options.gain_margin, options.phase_margin_rad, options.sensitivity)
-    except BadInputError as error:
-        raise UsageError(str(error)) from error
+    gain, phase_rad, peak = options.gain_margin, options.phase_margin_rad, options.sensitivity
+    asked = (
+        ("gain margin", gain, 1.0, 100.0, ""),
+        ("phase margin", math.degrees(phase_rad), 0.0, 90.0, " deg"),
+        ("sensitivity", peak, 1.0, 100.0, ""),
+    )
+    for what, value, low, high, unit in asked:
+        if not low < value < high:
+            raise UsageError(f"{what}: found {value:g}{unit}, expected {low:g} to {high:g}{unit}")
+    criterion = ControllerCriterion(gain_margin=gain, phase_margin_rad=phase_rad, sensitivity=peak)
     machine, model = controlled(rig, options.pwm_limits)
     files.hashes.update(_hashes(rig))
     return TuneInputs(machine, model, criterion, files.progress)
@@ -458,7 +470,6 @@ def _solve_tune(inputs: TuneInputs) -> Controller:
         AntiWindup,
         ComputedTorqueGains,
         Controller,
-        ControllerCriterion,
         OrientationGains,
         PositionGains,
     )
@@ -478,11 +489,7 @@ def _solve_tune(inputs: TuneInputs) -> Controller:
         tick_s=model.tick_s,
         pwm_low=model.low_pwm,
         pwm_high=model.high_pwm,
-        criterion=ControllerCriterion(
-            gain_margin=criterion.gain,
-            phase_margin_rad=criterion.phase_rad,
-            sensitivity=criterion.sensitivity,
-        ),
+        criterion=criterion,
         orientation=OrientationGains(
             Kp_pwm_per_rad=turn.Kp,
             Ki_pwm_per_rad_s=turn.Ki,

@@ -26,18 +26,16 @@ from calib.core.errors import BadInputError
 from calib.core.rig import Rig
 from calib.stages.camera.model import undistort
 from calib.stages.control.laws import (
-    BackCalculation,
     BackOrientation,
     ComputedTorque,
     FeedForward,
     LoopState,
     Model,
-    OrientationControl,
     Pid,
-    PositionControl,
     computed_torque_step,
     correct,
     design_observer,
+    feed_forward,
     feed_forward_pwm,
     predict,
     saturate,
@@ -110,18 +108,18 @@ def controllers_for(reference: Reference, section: Controller | None) -> tuple[s
 
 
 def _orientation(model: Model, reference: Reference, pid: Pid) -> Law:
-    control = OrientationControl(replace(pid, low=model.low_pwm, high=model.high_pwm, tick_s=model.tick_s))
+    own = replace(pid, low=model.low_pwm, high=model.high_pwm, tick_s=model.tick_s)
     wanted = reference.phi_rad.tolist()
 
     def law(k: int, memory: LoopState, seen: Seen) -> tuple[LoopState, Pair]:
-        memory, command = step_orientation(control, memory, wanted[k], seen.phi_rad)
-        return memory, _limited(model, command.pwm)
+        memory, u = step_orientation(own, memory, wanted[k], seen.phi_rad)
+        return memory, _limited(model, u)
 
     return law
 
 
-def _limited(model: Model, pwm: Pair) -> Pair:
-    u1, u2 = (min(max(u, model.low_pwm), model.high_pwm) for u in pwm)
+def _limited(model: Model, u: Pair) -> Pair:
+    u1, u2 = (saturate(one, True, model.low_pwm, model.high_pwm) for one in u)
     return u1, u2
 
 
@@ -137,21 +135,17 @@ def _back(reference: Reference, back: BackOrientation) -> Law:
 
 
 def _position(model: Model, reference: Reference, pid: Pid, extra: str) -> Law:
-    control = PositionControl(
-        replace(pid, tick_s=model.tick_s), FeedForward() if extra == "line" else None, whole_pwm=False
-    )
-    rows = reference.q_m.tolist()
-    added = feed_forward_pwm(model, reference.q_m) if extra == "map" else np.zeros_like(reference.q_m)
+    own, rows = replace(pid, tick_s=model.tick_s), reference.q_m.tolist()
+    added = np.zeros_like(reference.q_m)
+    if extra == "map":
+        added = feed_forward_pwm(model, reference.q_m)
+    elif extra == "line":
+        line = FeedForward()
+        added = np.array([[feed_forward(line, q) for q in row] for row in rows])
 
     def law(k: int, memory: LoopState, seen: Seen) -> tuple[LoopState, Pair]:
-        memory, command = step_position(control, memory, (rows[k][0], rows[k][1]), seen.q_m)
-        if extra == "map":
-            # The map goes on top of what the controller would send, which is not yet limited.
-            u = command.feedback[0] + added[k, 0], command.feedback[1] + added[k, 1]
-        else:
-            u = command.pwm
-        u1, u2 = (saturate(value, True, model.low_pwm, model.high_pwm) for value in u)
-        return memory, (u1, u2)
+        memory, u = step_position(own, memory, (rows[k][0], rows[k][1]), seen.q_m)
+        return memory, _limited(model, (u[0] + added[k, 0], u[1] + added[k, 1]))
 
     return law
 
@@ -204,8 +198,8 @@ def _tuned(section: Controller | None) -> Controller:
 
 
 def _back_of(model: Model, pid: Pid, back_s: float, share: float | None, sign: int = 1) -> BackOrientation:
-    control = BackCalculation(pid.Kp, pid.Ki, pid.Kd, back_s, model.tick_s)
-    return BackOrientation(control, model, float("inf") if share is None else share, sign)
+    own = replace(pid, tick_s=model.tick_s)
+    return BackOrientation(own, back_s, model, float("inf") if share is None else share, sign)
 
 
 def _law(

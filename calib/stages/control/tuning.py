@@ -39,6 +39,7 @@ from calib.stages.control.linear import (
     spectral_radius,
 )
 from calib.stages.control.references import Reference
+from calib.stages.control.section import ControllerCriterion
 
 # ----------------------------------------------------------------------
 # What the pumps can follow: reachable lengths, rates of inflation and deflation, and references.
@@ -431,32 +432,6 @@ _BISECTIONS = 16
 
 
 @dataclass(frozen=True)
-class Criterion:
-    """Margins that every operating point has to have.
-
-    Attributes
-    ----------
-    gain, phase_rad, sensitivity : least gain margin, least phase margin, greatest Ms.
-
-    Raises `BadInputError` for margins that no loop can have or that are none.
-    """
-
-    gain: float = 2.0
-    phase_rad: float = math.pi / 3.0
-    sensitivity: float = 2.0
-
-    def __post_init__(self) -> None:
-        if not 1.0 < self.gain < 100.0:
-            raise BadInputError(f"gain margin: found {self.gain:g}, expected a factor above 1")
-        if not 0.0 < self.phase_rad < 0.5 * math.pi:
-            raise BadInputError(
-                f"phase margin: found {math.degrees(self.phase_rad):g} deg, expected 0 to 90 deg"
-            )
-        if not 1.0 < self.sensitivity < 100.0:
-            raise BadInputError(f"sensitivity: found {self.sensitivity:g}, expected more than 1")
-
-
-@dataclass(frozen=True)
 class Point:
     """Margins at an operating point, the least of its channels."""
 
@@ -511,13 +486,13 @@ def position_loop(model: Model, pid: Pid, q_m: tuple[float, float], sensing: boo
     return series(both, _position_rig(model, q_m, sensing))
 
 
-def holds(criterion: Criterion, margins: Margins) -> bool:
+def holds(criterion: ControllerCriterion, margins: Margins) -> bool:
     """Whether margins satisfy the criterion; stability is part of it."""
     return (
         margins.stable
-        and margins.gain >= criterion.gain
-        and margins.gain_down <= 1.0 / criterion.gain
-        and margins.phase_rad >= criterion.phase_rad
+        and margins.gain >= criterion.gain_margin
+        and margins.gain_down <= 1.0 / criterion.gain_margin
+        and margins.phase_rad >= criterion.phase_margin_rad
         and margins.sensitivity <= criterion.sensitivity
     )
 
@@ -542,7 +517,11 @@ def points_of(
 
 
 def _strongest(
-    criterion: Criterion, shape: ComplexArray, rigs: Sequence[ComplexArray], omega: FloatArray, most: float
+    criterion: ControllerCriterion,
+    shape: ComplexArray,
+    rigs: Sequence[ComplexArray],
+    omega: FloatArray,
+    most: float,
 ) -> float:
     """Largest factor on a controller's response (k,) that keeps the margins at rigs (k, n, n); 0 if none."""
 
@@ -573,7 +552,7 @@ def _tuning_rounded(value: float) -> float:
 
 def _searched(
     model: Model,
-    criterion: Criterion,
+    criterion: ControllerCriterion,
     rigs: Sequence[System],
     integrals_s: Sequence[float],
     most: float,
@@ -598,20 +577,23 @@ def _searched(
             if all(holds(_slack(criterion), one) for one in worst):
                 return pid
     raise BadInputError(
-        f"controller: no gains reach a gain margin of {criterion.gain:g} and a phase margin of "
-        f"{math.degrees(criterion.phase_rad):.3g} deg at every operating point, expected a lower demand"
+        f"controller: no gains reach a gain margin of {criterion.gain_margin:g} and a phase margin of "
+        f"{math.degrees(criterion.phase_margin_rad):.3g} deg at every operating point, expected a lower "
+        "demand"
     )
 
 
-def _slack(criterion: Criterion) -> Criterion:
+def _slack(criterion: ControllerCriterion) -> ControllerCriterion:
     """The criterion less what rounding the gains to two digits may cost."""
-    return Criterion(
-        1.0 + 0.98 * (criterion.gain - 1.0), 0.98 * criterion.phase_rad, 1.02 * criterion.sensitivity
+    return ControllerCriterion(
+        gain_margin=1.0 + 0.98 * (criterion.gain_margin - 1.0),
+        phase_margin_rad=0.98 * criterion.phase_margin_rad,
+        sensitivity=1.02 * criterion.sensitivity,
     )
 
 
 def tune_orientation(
-    model: Model, criterion: Criterion, at: Sequence[tuple[float, float]] | None = None
+    model: Model, criterion: ControllerCriterion, at: Sequence[tuple[float, float]] | None = None
 ) -> Tuned:
     """PID of the angle with the largest Ki [PWM/rad/s].
 
@@ -628,7 +610,7 @@ def tune_orientation(
 
 def tune_position(
     model: Model,
-    criterion: Criterion,
+    criterion: ControllerCriterion,
     at: Sequence[tuple[float, float]] | None = None,
     sensing: bool = True,
 ) -> Tuned:
