@@ -133,6 +133,13 @@ def number(value: float | None, sigma: float | None = None, places: int | None =
     return f"{value:.6g}" if places is None else f"{value:.{places}f}"
 
 
+def short(value: float) -> str:
+    """A value to four digits, whole numbers as they are."""
+    if isinstance(value, int) or (value == round(value) and abs(value) < 1e7):
+        return str(round(value))
+    return f"{value:.0f}" if 1e4 <= abs(value) < 1e7 else f"{value:.4g}"
+
+
 def described(result: BaseModel) -> list[Block]:
     """A result as tables and sentences: its quantities, its lists of parts, its verdict."""
     blocks = list(_parts(result))
@@ -169,7 +176,7 @@ def facts(section: BaseModel) -> list[tuple[str, str]]:
 def _fact(value: Any, bar: Any, scale: float, places: int | None) -> str:
     """A value with its deviation; to four digits where nothing says how many it has."""
     if isinstance(value, float) and math.isfinite(value) and bar is None and places is None:
-        return f"{scale * value:{'.0f' if 1e3 <= abs(scale * value) < 1e7 else '.4g'}}"
+        return short(scale * value)
     return _vector([value], [bar], scale, places)[0]
 
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
-from calib.core.files import shown
+from calib.core.files import read_bytes, shown
 from calib.core.stage import LogOptions
 from calib.core.units import plain_number
 from calib.io.columns import (
@@ -37,6 +37,7 @@ from calib.io.columns import (
 _BLOCK_BYTES = 1 << 20
 _LONGEST_LINE = 1 << 16
 _MAX_COLUMNS = 1000
+_MOST_RECODED = 1 << 27
 _MOST_BYTES, _MOST_GROWTH = 1 << 28, 200
 """What a Parquet file may unpack to: so many bytes, or so many times its own size where that is more."""
 
@@ -331,32 +332,19 @@ def table_bytes(values: FloatArray, kinds: Sequence[str]) -> bytes:
     return b"".join(parts)
 
 
-class _Recoded(io.RawIOBase):
-    """Bytes of a text in UTF-8 with the line ends of Unix."""
-
-    def __init__(self, stream: BinaryIO, encoding: str, to: str) -> None:
-        self._text = io.TextIOWrapper(stream, encoding, "replace")
-        self._to, self._rest = to, b""
-
-    def readable(self) -> bool:
-        return True
-
-    def readinto(self, room: Any) -> int:
-        self._rest = self._rest or self._text.read(1 << 16).encode(self._to)
-        size = min(len(room), len(self._rest))
-        room[:size], self._rest = self._rest[:size], self._rest[size:]
-        return size
-
-
 @contextmanager
 def open_text(path: Path) -> Iterator[BinaryIO]:
-    """A stream of a text file, of UTF-16 and of line ends without a line feed made UTF-8 with them."""
+    """A stream of a text file, of UTF-16 and of line ends without a line feed made UTF-8 with them.
+
+    Raises `BadInputError` for more than 128 MB of the latter.
+    """
     with path.open("rb") as stream:
         start = stream.peek()
-        if start.startswith((b"\xff\xfe", b"\xfe\xff")):
-            yield io.BufferedReader(_Recoded(stream, "utf-16", "utf-8"))
-        elif b"\r" in start and b"\n" not in start:
-            yield io.BufferedReader(_Recoded(stream, "latin-1", "latin-1"))
+        wide = start.startswith((b"\xff\xfe", b"\xfe\xff"))
+        if wide or (b"\r" in start and b"\n" not in start):
+            data = read_bytes(path, _MOST_RECODED)
+            data = data.decode("utf-16", "replace").encode() if wide else data
+            yield io.BytesIO(re.sub(rb"\r\n?", b"\n", data))
         else:
             yield stream
 

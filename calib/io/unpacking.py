@@ -69,7 +69,7 @@ def _decompressor(packing: str) -> Any:
 
 def unpacked(packing: str, data: bytes) -> bytes:
     """What is packed as "bz2", "lz4" or "zstd". Raises `ValueError` for more than `MOST_BYTES`."""
-    out: bytes = _decompressor(packing).decompress(data, MOST_BYTES + 1)
+    out = _at_most(packing, data)
     if len(out) > MOST_BYTES:
         raise ValueError(f"a part of it unpacks to more than {MOST_BYTES / 1e6:.0f} MB")
     return out

@@ -166,7 +166,8 @@ def _titles(jobs: Sequence[Mapping[str, Any]], plain: bool = False) -> str:
 
 
 def _weak(jobs: Sequence[Mapping[str, Any]], sections: Mapping[str, Any]) -> list[str]:
-    grouped: dict[tuple[str, str], list[str]] = {}
+    """Each reason once, after the stages and the logs that it is about."""
+    grouped: dict[str, tuple[list[str], list[str]]] = {}
     for job in jobs:
         if job["status"] not in ("poor", "failed", "blocked"):
             continue
@@ -176,14 +177,20 @@ def _weak(jobs: Sequence[Mapping[str, Any]], sections: Mapping[str, Any]) -> lis
             if job["status"] == "poor" and isinstance(section, dict) and section.get("reasons"):
                 reasons = [str(reason) for reason in section["reasons"]]
         for reason in reasons:
-            grouped.setdefault((str(job["title"]), reason), []).append(str(job["log"] or ""))
-    out = []
-    for (title, reason), logs in grouped.items():
-        names = [log for log in logs if log]
-        more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-        where = f" ({', '.join(names[:_SHOWN])}{more})" if names else ""
-        out.append(f"{title}{where}: {reason}")
-    return out
+            titles, logs = grouped.setdefault(reason, ([], []))
+            titles.append(str(job["title"]))
+            logs += [str(job["log"])] if job["log"] else []
+    return [
+        f"{_few(titles)}{f' ({_few(logs)})' if logs else ''}: {reason}"
+        for reason, (titles, logs) in grouped.items()
+    ]
+
+
+def _few(names: Sequence[str]) -> str:
+    """The first names, each once, and how many there are beside them."""
+    listed = list(dict.fromkeys(names))
+    more = f" and {len(listed) - _SHOWN} more" if len(listed) > _SHOWN else ""
+    return ", ".join(listed[:_SHOWN]) + more
 
 
 def _record(jobs: Sequence[Mapping[str, Any]], sections: Mapping[str, Any]) -> list[str]:

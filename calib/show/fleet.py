@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -81,19 +80,6 @@ STYLE, SCRIPT = ("page.css", "fleet.css"), ("common.js",)
 _MOST_DRAWN = 60
 _KIND = {"ok": "ok", "poor": "poor", "failed": "failed", "broken": "failed", "lost": "failed"}
 _STAGE_KIND = {"ok": "ok", "poor": "poor", "failed": "failed", "blocked": "blocked"}
-
-
-@dataclass(frozen=True)
-class _Card:
-    """A constant as the page shows it."""
-
-    name: str
-    unit: str
-    facts: tuple[tuple[str, str], ...]
-    figure: dict[str, str]
-    drifts: bool
-    out: tuple[tuple[str, str, str], ...]
-    more: int
 
 
 def write_fleet_page(path: Path, summary: FleetSummary) -> None:
@@ -177,16 +163,17 @@ def _facts(one: ConstantSummary) -> list[tuple[str, str]]:
     ]
 
 
-def _card(one: ConstantSummary) -> _Card:
-    return _Card(
-        one.name,
-        one.unit,
-        tuple(_facts(one)),
-        embedded(constant_figure(one)),
-        one.drifts,
-        tuple((name, number(value, one.spread.scale or None), f"{z:+.1f}") for name, value, z in one.out[:8]),
-        max(0, one.standing_out - 8),
-    )
+def _card(one: ConstantSummary) -> dict[str, Any]:
+    """A constant as the page shows it."""
+    out = [(name, number(value, one.spread.scale or None), f"{z:+.1f}") for name, value, z in one.out[:8]]
+    return {
+        "name": one.name,
+        "facts": _facts(one),
+        "figure": embedded(constant_figure(one)),
+        "drifts": one.drifts,
+        "out": out,
+        "more": max(0, one.standing_out - 8),
+    }
 
 
 def _row(one: ConstantSummary) -> Sequence[tuple[str, float | None]]:

@@ -20,7 +20,7 @@ from calib.core.errors import BadInputError
 from calib.core.files import read_bytes, read_text, sha256
 from calib.core.plot import Figure
 from calib.core.rig import KINDS, Rig, kind_of
-from calib.core.words import BLANK, as_words, facts, number, unit_of
+from calib.core.words import BLANK, as_words, facts, number, short, unit_of
 from calib.core.writing import Kind, holds, make_folder, write_atomically
 from calib.io.columns import COLUMNS
 from calib.runner.cache import Result, load
@@ -274,13 +274,6 @@ def _tells(name: str, records: Sequence[Values]) -> bool:
 def _head(name: str) -> str:
     unit = unit_of(name)
     return f"{as_words(name)}, {unit}" if unit else as_words(name) or "name"
-
-
-def short(value: float) -> str:
-    """A value to four digits, whole numbers as they are."""
-    if isinstance(value, int) or (value == round(value) and abs(value) < 1e7):
-        return str(round(value))
-    return f"{value:.0f}" if 1e4 <= abs(value) < 1e7 else f"{value:.4g}"
 
 
 def _cell(value: Any) -> Cell:

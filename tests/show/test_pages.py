@@ -333,6 +333,8 @@ def test_weak_points_are_grouped_by_reason() -> None:
     told["jobs"] += [_job("replay", "poor", log=f"{k}.csv", reason="the IMU is silent") for k in range(6)]
     (sentence,) = decide(told, SECTIONS).weak
     assert sentence == "Replay (0.csv, 1.csv, 2.csv, 3.csv and 2 more): the IMU is silent"
+    told["jobs"] += [_job(one, "failed", reason="swing.csv: is in g") for one in ("align", "identify")]
+    assert decide(told, SECTIONS).weak[1] == "Align, Identify: swing.csv: is in g"
 
 
 def test_the_policy_is_that_of_the_script() -> None:
