@@ -65,10 +65,6 @@ def _coherent(c: dict[str, float]) -> bool:
         return abs(a - b) <= 1e-4 * max(abs(a), abs(b)) + 1e-12
 
     ok = []
-    for stem, unit in (("ORIENTATION", "RAD"), ("POSITION", "M")):
-        KPDI, KD, half = (c[f"CALIB_{stem}_{n}_PWM_PER_{unit}"] for n in ("KPDI", "KD_PER_DT", "KI_HALF_DT"))
-        E0, E1, E2 = (c[f"CALIB_{stem}_E{i}_PWM_PER_{unit}"] for i in range(3))
-        ok += [near(E0, KPDI), near(E2, KD), near(E1, 2.0 * half - KPDI - KD)]
     fx, fy, skew = c["CALIB_CAMERA_FX_PX"], c["CALIB_CAMERA_FY_PX"], c["CALIB_CAMERA_SKEW_PX"]
     K = np.array([[fx, skew, c["CALIB_CAMERA_CX_PX"]], [0, fy, c["CALIB_CAMERA_CY_PX"]], [0, 0, 1]])
     inverse, normalised, raw = (
@@ -79,7 +75,7 @@ def _coherent(c: dict[str, float]) -> bool:
     del raw
     ok += [near(fx * c["CALIB_CAMERA_PER_FX"], 1.0), near(fy * c["CALIB_CAMERA_PER_FY"], 1.0)]
     rate = c["CALIB_TICK_RATE_HZ"]
-    ok += [near(rate * c["CALIB_TICK_PERIOD_S"], 1.0), near(1e3 * rate, c["CALIB_TICK_RATE_MHZ"])]
+    ok.append(near(1e3 * rate, c["CALIB_TICK_RATE_MHZ"]))
     pairs, single = int(c["CALIB_LOWPASS_PAIRS"]), int(c["CALIB_LOWPASS_SINGLES"])
     for i in range(1, pairs + single + 1):
         b = [c[f"CALIB_LOWPASS_{i}_B{j}"] for j in range(3)]
@@ -92,13 +88,8 @@ def _coherent(c: dict[str, float]) -> bool:
             # D = 1 / A1, g^2 = A3 / A1; a1 = 2 (g^2 - 1) / D, and g from A2.
             ok += [near(b[1], 2.0 * b[0]), near(b[2], b[0]), near(A3, b[0]), near(A2 * A2, A1 * A3)]
             ok.append(near(a1, 2.0 * (A3 - A1)))
-    at, offset, slope = c["CALIB_FF_FROM_M"], c["CALIB_FF_OFFSET_PWM"], c["CALIB_FF_SLOPE_PWM_PER_M"]
-    ok.append(near(c["CALIB_FF_MINUS_PWM"] + offset, slope * at))
     bias = c["CALIB_IMU_GYRO_BIAS_RADPS"] * c["CALIB_MM_DT_S"]
     ok += [near(bias, c["CALIB_MM_GYRO_BIAS_DT_RAD"]), near(c["CALIB_PUMP_HIGH"], c["CALIB_PUMP_HIGH_PWM"])]
-    ok.append(near(c["CALIB_PUMP_DEAD_ZONE_PWM"] * c["CALIB_PUMP_SUPPLY_V"], 255.0 * 4.7))
-    whole = c["CALIB_TIME_OFFSET_TICKS"] / rate + c["CALIB_TIME_OFFSET_REST_S"]
-    ok.append(abs(whole - (0.035 if c["CALIB_TIME_OFFSET_TICKS"] else 0.0)) < 1e-6)
     # The limits are whole numbers; a thousandth of 5 PWM is below what a command may be off by.
     ok.append(near(c["CALIB_PUMP_LOW_PWM"], round(c["CALIB_PUMP_LOW_PWM"])))
     # A thousandth of the series' last coefficient is 7e-8 m at the largest angle: checked against (3.14).
@@ -194,7 +185,7 @@ def test_a_constant_of_the_fused_estimator_that_is_off_is_seen(tmp_path: Path) -
         if not name.startswith("CALIB_FUSED_") or name in ("CALIB_FUSED_TICKS", "CALIB_HAS_FUSED"):
             continue
         whole = not literal.endswith("f")
-        changed = str(int(literal) + 1) if whole else float_literal(1.001 * constants[name], name)
+        changed = str(int(literal) + 1) if whole else float_literal(1.001 * constants[name])
         if not _coherent_fused({**constants, name: values({name: changed})[name]}):
             continue
         mutated = text.replace(f"#define {name} {literal} ", f"#define {name} {changed} ")
@@ -235,7 +226,7 @@ def test_a_constant_that_is_off_by_a_thousandth_is_seen(tmp_path: Path, kind: st
             continue
         if any(part in name for part in (*idle_here, "CALIB_FUSED_")):
             continue
-        changed = float_literal(1.001 * constants[name], name)
+        changed = float_literal(1.001 * constants[name])
         if not _coherent({**constants, name: values({name: changed})[name]}):
             continue
         if "[" in name:
@@ -249,7 +240,7 @@ def test_a_constant_that_is_off_by_a_thousandth_is_seen(tmp_path: Path, kind: st
         assert mutated != text, name
         if not seen(_build(tmp_path, mutated, undistort)):
             unseen.append(name)
-    line = ("CALIB_FF_FROM_M", "CALIB_FF_OFFSET_PWM", "CALIB_FF_SLOPE_PWM_PER_M", "CALIB_FF_LIMIT_PWM")
+    line = ("CALIB_FF_FROM_M", "CALIB_FF_SLOPE_PWM_PER_M", "CALIB_FF_LIMIT_PWM")
     table_names = ("calib_ff_table_pwm", "CALIB_FF_TABLE")
     idle = (*line, "CALIB_FF_MINUS_PWM") if constants["CALIB_FF_USE_TABLE"] else table_names
     assert not [name for name in unseen if not name.startswith(idle)]

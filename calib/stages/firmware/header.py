@@ -1,7 +1,7 @@
-"""calib_constants.h: every constant of rig.yaml that firmware needs, and the files around it.
+"""calib_constants.h and the files around it, and whether a rig's constants may be flashed.
 
-The text is a template's; here are the order of the groups, the provenance, and the guards' numbers. The
-same rig gives the same bytes: no time and no path goes in.
+The text is the template's, and what stands in it is read off it again: digest, values for Python, self-test.
+The same rig gives the same bytes: no time and no path goes in.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import jinja2
-import numpy as np
 
 from calib import __version__
 from calib.core.result import identity
@@ -25,36 +24,11 @@ from calib.core.writing import Kind, begins, make_folder, write_atomically
 from calib.stages.camera.lens import fit_inverse
 from calib.stages.camera.model import COEFFICIENTS, MODELS
 from calib.stages.camera.section import InverseLens
-from calib.stages.firmware.constants import (
-    CameraConstants,
-    Lookup,
-    PlaneConstants,
-    camera_groups,
-    control_groups,
-    fused_group,
-    motion_groups,
-    plane_constants,
-    put_right,
-    tick_rate_hz,
-    trust_group,
-)
-from calib.stages.firmware.literals import (
-    Constant,
-    Group,
-    Macro,
-    Table,
-    Whole,
-    comment_text,
-    literals,
-    values,
-)
+from calib.stages.firmware.constants import Lookup, constants, plane_constants
+from calib.stages.firmware.literals import comment_text, float_literal, literals, values
 
 if TYPE_CHECKING:
     from calib.core.rig import Rig
-    from calib.stages.camera.section import Camera
-
-SCHEMA = 5
-"""Raised when a constant changes its name, unit or meaning."""
 
 VERBATIM = ("calib_pipeline.h", "calib_guard.h", "calib_link.h", "calib_i2c.h", "calib_bno055.h",
             "calib_mpu6050.h", "calib_pixy2.h")  # fmt: skip
@@ -71,61 +45,30 @@ _INVERSE_SHARE = 0.9
 
 @dataclass(frozen=True)
 class Header:
-    """What goes into calib_constants.h, and the files around it.
+    """calib_constants.h, and the files around it.
 
     Attributes
     ----------
-    camera : intrinsics, lens and plane, None for a rig without.
-    groups : all constants in the order of the file.
-    inputs : SHA-256 of each input by name.
+    text : calib_constants.h.
+    literals : every number as it stands there, by name. digest : SHA-256 of them; its first eight digits are
+        CALIB_ID.
     verdict : of the sections that the constants come from.
     """
 
-    camera: CameraConstants | None
-    groups: tuple[Group, ...]
-    inputs: Mapping[str, str]
+    text: str
+    literals: Mapping[str, str]
+    digest: str
     verdict: Verdict
-
-    @cached_property
-    def literals(self) -> dict[str, str]:
-        """Every value as it stands in the file, by name. Raises `BadInputError` for what no float holds."""
-        return literals(self.groups)
 
     @cached_property
     def values(self) -> Mapping[str, float]:
         """Every value as a compiler reads it, by name."""
         return MappingProxyType(values(self.literals))
 
-    @cached_property
-    def digest(self) -> str:
-        """SHA-256 of schema and values; its first eight digits are CALIB_ID."""
-        canonical = "\n".join(f"{name} {literal}" for name, literal in self.literals.items())
-        return hashlib.sha256(f"{SCHEMA}\n{canonical}\n".encode()).hexdigest()
-
     @property
     def identity(self) -> int:
         """CALIB_ID."""
         return int(self.digest[:8], 16)
-
-    @property
-    def text(self) -> str:
-        """calib_constants.h."""
-        plane = self.camera.plane if self.camera else None
-        return rendered(
-            "calib_constants.h.j2",
-            header=self,
-            camera=self.camera,
-            plane_verdict=plane.verdict if plane else "",
-            digest=self.digest,
-            groups=[
-                {
-                    "notes": [*group.notes, *([group.defaults] if group.defaults else [])],
-                    "lines": _lines(group, self.literals),
-                }
-                for group in self.groups
-            ],
-            inputs=dict(sorted(self.inputs.items())),
-        )
 
     @staticmethod
     def sketch(folder: Path) -> str:
@@ -162,19 +105,19 @@ class Header:
 HEADER = Kind("a source of the firmware", (".h", ".ino"), begins(b"/*\n * calib_"))
 
 
-def rendered(template: str, header: Header, **more: Any) -> str:
-    """Text in C of a template; `comment` makes text safe inside a comment."""
+def rendered(template: str, **context: Any) -> str:
+    """Text in C of a template, floats as literals; `comment` makes text safe inside a comment."""
     made = jinja2.Environment(
         loader=jinja2.FunctionLoader(verbatim),
         undefined=jinja2.StrictUndefined,
+        finalize=lambda value: float_literal(value) if isinstance(value, float) else value,
         autoescape=False,
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
     made.filters["comment"] = comment_text
-    common = {"schema": SCHEMA, "version": __version__, "identity": f"{header.identity:08X}"}
-    return made.get_template(template).render(**common, **more)
+    return made.get_template(template).render(version=__version__, **context)
 
 
 def verbatim(name: str) -> str:
@@ -182,59 +125,21 @@ def verbatim(name: str) -> str:
     return resources.files("calib.stages.firmware").joinpath("templates", name).read_text("utf-8")
 
 
-def _inverse(whole: Rig, camera: Camera) -> InverseLens:
+def _inverse(rig: Rig) -> InverseLens | None:
     """The polynomial of the section lens where that is of this camera, else a new one."""
-    if whole.lens is not None and whole.inputs.get("lens", {}).get("camera") == identity(camera):
-        return whole.lens.inverse
-    return InverseLens.of(fit_inverse(camera.optics))
+    if rig.camera is None:
+        return None
+    if rig.lens is not None and rig.inputs.get("lens", {}).get("camera") == identity(rig.camera):
+        return rig.lens.inverse
+    return InverseLens.of(fit_inverse(rig.camera.optics))
 
 
 def _undone(inverse: InverseLens) -> bool:
-    return (
-        inverse.max_error_px is not None
-        and inverse.max_error_px <= _INVERSE_PX
-        and inverse.covered >= _INVERSE_SHARE
-    )
+    error = inverse.max_error_px
+    return error is not None and error <= _INVERSE_PX and inverse.covered >= _INVERSE_SHARE
 
 
-def _camera_constants(whole: Rig, source: str) -> CameraConstants | None:
-    from calib.core.rig import Geometry
-
-    section = whole.camera
-    if section is None:
-        return None
-    camera = section.optics
-    inverse = _inverse(whole, section)
-    named = dict(zip(COEFFICIENTS, camera.distortion.tolist(), strict=True))
-    intrinsics = {
-        "fx_px": section.fx_px,
-        "fy_px": section.fy_px,
-        "skew_px": section.skew_px,
-        "cx_px": section.cx_px,
-        "cy_px": section.cy_px,
-        **{name: named[name] for name in MODELS[section.model]},
-    }
-    plane: PlaneConstants | None = None
-    align = whole.align
-    known = whole.current_plane(source)
-    if known is not None:
-        x0, y0, x1, y1 = (whole.geometry or Geometry()).workspace_m
-        plane = plane_constants(
-            camera,
-            np.array(known.R_CW),
-            np.array(known.t_CW_m),
-            np.array(known.A_inverse),
-            (x0, y0, x1, y1),
-            known.verdict.word,
-        )
-        if align is not None:
-            x, y = align.plane_shift_m
-            plane = put_right(plane, (x, y), align.plane_stretch)
-    verdict = section.verdict.word if _undone(inverse) or not section.verdict.ok else "poor"
-    return CameraConstants(camera.image_size_px, section.model, verdict, intrinsics, inverse, plane)
-
-
-def _judge(whole: Rig, camera: CameraConstants | None) -> Verdict:
+def _judge(whole: Rig, inverse: InverseLens | None) -> Verdict:
     """As bad as the worst of the sections that the constants come from, and as the lens is undone."""
     findings = []
     for name in FLASHED:
@@ -246,13 +151,12 @@ def _judge(whole: Rig, camera: CameraConstants | None) -> Verdict:
         if word != "ok":
             advice = _UNREAD if name in ("camera", "plane") else ""
             findings.append(Finding(word, f"{name} is {word}", advice))
-    inverse = camera.inverse if camera else None
     if inverse is not None and not _undone(inverse):
         error = "without bound" if inverse.max_error_px is None else f"to {inverse.max_error_px:.3g} px only"
         text = f"the lens is undone {error}, over {inverse.covered:.0%} of the picture"
         findings.append(Finding("poor", text, _UNREAD))
-    if camera is None or camera.plane is None:
-        lacks, verb = ("camera", "intrinsics") if camera is None else ("plane", "extrinsics")
+    if whole.camera is None or whole.plane is None:
+        lacks, verb = ("camera", "intrinsics") if whole.camera is None else ("plane", "extrinsics")
         text = f"no {lacks} yet: the sketch records, and controls nothing"
         findings.append(Finding("remark", text, f"run calib {verb}"))
     if _simulated(whole):
@@ -267,7 +171,7 @@ def _simulated(whole: Rig) -> bool:
     return whole.twin is not None or any(one.simulated for one in optics)
 
 
-def header_of(whole: Rig, source: str) -> Header:
+def header_of(rig: Rig, source: str) -> Header:
     """The header of a rig; one without a camera or plane makes a sketch that records.
 
     A lens that the firmware could not undo makes the camera's verdict in the header poor.
@@ -278,41 +182,35 @@ def header_of(whole: Rig, source: str) -> Header:
 
     Raises `BadInputError` for values that the firmware cannot run with, by their key.
     """
-    camera = _camera_constants(whole, source)
-    lookup = Lookup(whole, source)
-    rate_hz = tick_rate_hz(lookup)
-    lookup.defaults()
-    plane = camera.plane if camera else None
-    motion = (*motion_groups(lookup), fused_group(lookup, rate_hz, plane))
-    verdict = _judge(whole, camera)
-    groups = (
-        trust_group(verdict.ok, _simulated(whole)),
-        *camera_groups(camera),
-        *motion,
-        *control_groups(lookup, rate_hz),
-    )
+    camera, inverse, plane = rig.camera, _inverse(rig), plane_constants(rig, source)
+    context = constants(Lookup(rig, source), plane)
+    if camera is not None and inverse is not None:
+        named = dict(zip(COEFFICIENTS, camera.optics.distortion.tolist(), strict=True))
+        context |= {
+            "lens": {name: named[name] for name in MODELS[camera.model]},
+            "has_lens": camera.optics.fisheye or any(named.values()),
+            "camera_verdict": camera.verdict.word if _undone(inverse) or not camera.verdict.ok else "poor",
+        }
     inputs = {
         f"{section}/{name}": digest
-        for section, named in whole.inputs.items()
-        for name, digest in named.items()
+        for section, names in rig.inputs.items()
+        for name, digest in names.items()
         # Sections that name others as inputs; only files are inputs of the header.
         if name not in ("camera", "plane") and (section != "plane" or plane is not None)
     }
-    return Header(camera, groups, inputs, verdict)
-
-
-def _lines(group: Group, literal: Mapping[str, str]) -> list[str]:
-    lines = []
-    for item in group.items:
-        note = comment_text(item.comment)
-        if isinstance(item, Constant | Whole):
-            lines.append(f"#define {item.name} {literal[item.name]} /* {note} */")
-        elif isinstance(item, Macro):
-            lines.append(f"#define {item.name} {item.body} /* {note} */")
-        elif isinstance(item, Table):
-            lines.append(f"/* {note} */")
-            entries = [literal[f"{item.name}[{i}]"] for i in range(len(item.values))]
-            lines.append(f"static const float {item.name}[{len(entries)}] CALIB_IN_FLASH = {{")
-            lines += [f"    {', '.join(entries[i : i + 6])}," for i in range(0, len(entries), 6)]
-            lines.append("};")
-    return lines
+    verdict = _judge(rig, inverse)
+    text = rendered(
+        "calib_constants.h.j2",
+        camera=camera,
+        inverse=inverse,
+        plane=plane,
+        rig_ok=verdict.ok,
+        simulated=_simulated(rig),
+        inputs=dict(sorted(inputs.items())),
+        **context,
+    )
+    found = literals(text)
+    canonical = "\n".join(f"{name} {literal}" for name, literal in found.items())
+    digest = hashlib.sha256(f"{canonical}\n".encode()).hexdigest()
+    text = text.replace("@SHA256@", digest).replace("@ID@", digest[:8].upper())
+    return Header(text, MappingProxyType(found), digest, verdict)

@@ -12,7 +12,6 @@ from calib.core.errors import BadInputError
 from calib.io.serial import MODE_OFF, MODE_ORIENTATION, MODE_POSITION, Inputs, Outputs
 from calib.stages.firmware.conformance import Reference, binary32, reference_of
 from calib.stages.firmware.header import Header, rendered
-from calib.stages.firmware.literals import float_literal
 
 # ----------------------------------------------------------------------
 # Golden vectors: a short run that drives every constant, with what the reference makes of it.
@@ -77,25 +76,22 @@ def vectors(header: Header, ticks: int = 48, fused: bool = False) -> list[Vector
     return [Vector(one, reference.step(one)) for one in given]
 
 
-def _lines(vector: Vector) -> list[str]:
+def _row(vector: Vector) -> list[list[float]]:
+    """Inputs, outputs and flags of a tick; zero where a value is too small for a normal float."""
     given, wanted = vector.given, vector.wanted
-
-    def row(*numbers: float) -> str:
-        # Zero where a value is too small for a normal float.
-        return ", ".join(float_literal(v if abs(v) > 1e-30 else 0.0, "calib_selftest_rows") for v in numbers)
-
-    return [row(*given.numbers, given.sensors, given.mode), row(*wanted.numbers), row(wanted.flags)]
+    rows = [[*given.numbers, given.sensors, given.mode], wanted.numbers, [wanted.flags]]
+    return [[float(v) if abs(v) > 1e-30 else 0.0 for v in row] for row in rows]
 
 
 def selftest_text(header: Header) -> str:
-    """calib_selftest.h of a header that has a plane."""
+    """calib_selftest.h of a header."""
     fused = vectors(header, FUSED_TICKS, fused=True) if header.values["CALIB_HAS_FUSED"] else []
     return rendered(
         "calib_selftest.h.j2",
-        header,
+        identity=f"{header.identity:08X}",
         undistort=int(header.values["CALIB_HAS_PLANE"] and Reference(header.values).undistort),
-        rows=[_lines(vector) for vector in vectors(header)],
-        fused_rows=[_lines(vector) for vector in fused],
+        rows=list(map(_row, vectors(header))),
+        fused_rows=list(map(_row, fused)),
         tolerance=TOLERANCE,
     )
 

@@ -44,7 +44,7 @@
 #include <string.h>
 
 #ifndef CALIB_EXPECT_SCHEMA
-#define CALIB_EXPECT_SCHEMA 5
+#define CALIB_EXPECT_SCHEMA 6
 #endif
 #include "calib_constants.h"
 
