@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 import subprocess
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import pytest
-from firmware_build import LIMITS, NATIVE, Process, Simulated, avr, compare, host, need, run, write
-from firmware_plant import Loop
+from firmware_build import LIMITS, NATIVE, Process, Simulated, avr, compare, host, need, pack, run, write
 from firmware_rigs import header, rig
 
 from calib.core.rig import Rig
 from calib.io.serial import MODE_ORIENTATION, MODE_POSITION, Inputs
+from calib.stages.actuator.simulate import rig_at_rest
+from calib.stages.control.laws import LoopState
 from calib.stages.control.references import Ellipse
 from calib.stages.firmware.conformance import Reference, reference_of
-from calib.stages.firmware.header import verbatim
+from calib.stages.firmware.header import header_of, verbatim
 from calib.stages.firmware.vectors import binary32, coherent, directed, directed_fused
 from calib.twin.rig import SimulatedRig
+from calib.twin.simulate import Seen, simulate
 
 TICK_CYCLES = 266_667
 STAGES = ("", "angle", "plane", "offset", "low-pass", "lengths", "control")
@@ -110,8 +113,6 @@ def _told(name: str, cycles: np.ndarray) -> int:
 
 def test_the_budget_of_the_thesis_tick(tmp_path: Path) -> None:
     """Angle filter, homography, low-pass, inverse kinematics, PD with feed-forward, in every tick."""
-    from calib.stages.firmware.header import header_of
-
     still = [(0.08, 0.085)] * 1200
     moving = [(0.015 * math.sin(0.02 * k), 0.078 - 0.01 * math.cos(0.02 * k)) for k in range(1200)]
     write(tmp_path, header())
@@ -163,8 +164,6 @@ def _with_integral(plain: Rig) -> Rig:
 
 def test_a_moving_reference_is_that_of_the_set_points(tmp_path: Path) -> None:
     """calib_reference_point against the exact inverse kinematics that the set-points use."""
-    from calib.stages.control.references import Ellipse
-
     ellipse, times = Ellipse(), np.linspace(0.0, 20.0, 400)
     wanted = ellipse.bellows_m(times, header().values["CALIB_BELLOWS_RADIUS_M"])
     pose = ellipse.pose(times)
@@ -185,58 +184,49 @@ def _with(tick: Inputs, q: np.ndarray) -> Inputs:
     return binary32(replace(tick, reference=(float(q[0]), float(q[1]))))
 
 
-class _Processor(Protocol):
-    def tick(self, numbers: np.ndarray, seen: bool, mode: int) -> np.ndarray: ...
+Processor = Callable[[Inputs], Sequence[float]]
+"""Commands of both pumps for a tick's readings."""
 
 
-class _Python:
-    """The reference, asked in the same way as a program."""
-
-    def __init__(self, kind: str, fused: bool) -> None:
-        self.reference = reference_of(header(kind).values, fused=fused)
-
-    def tick(self, numbers: np.ndarray, seen: bool, mode: int) -> np.ndarray:
-        u, v, ax, ay, gz, first, second = numbers.tolist()
-        given = Inputs(u, v, ax, ay, gz, (first, second), seen, True, mode)
-        return np.array(self.reference.step(binary32(given)).pwm)
-
-
-class _Host:
+def _host(process: Process) -> Processor:
     """A program on this machine, through its pipes."""
 
-    def __init__(self, command: list[str]) -> None:
-        self.process = Process(command)
+    def tick(given: Inputs) -> Sequence[float]:
+        process.send(given)
+        return process.receive().numbers[0, 7:].tolist()
 
-    def tick(self, numbers: np.ndarray, seen: bool, mode: int) -> np.ndarray:
-        u, v, ax, ay, gz, first, second = numbers.tolist()
-        self.process.send(Inputs(u, v, ax, ay, gz, (first, second), seen, True, mode))
-        return self.process.receive().numbers[0, 7:]
+    return tick
 
 
-class Avr:
+def _avr(command: list[str]) -> Processor:
     """The AVR in a simulator within this process."""
+    program = Simulated(command)
 
-    def __init__(self, command: list[str]) -> None:
-        self.program = Simulated(command)
-        self._floats = self.program.record[:28].view("<f4")
-        self._pwm = self.program.result[28:36].view("<f4")
+    def tick(given: Inputs) -> Sequence[float]:
+        program.record[:] = np.frombuffer(pack(given), dtype=np.uint8)
+        program.tick()
+        return program.result[28:36].view("<f4").tolist()
 
-    def tick(self, numbers: np.ndarray, seen: bool, mode: int) -> np.ndarray:
-        """Commands (2,) for the readings and reference (7,)."""
-        self._floats[:] = numbers
-        self.program.record[28:] = seen, 1, mode
-        self.program.tick()
-        return self._pwm.astype(np.float64)
+    return tick
 
 
-def closed(processor: _Processor, wanted: np.ndarray, mode: int) -> np.ndarray:
-    """Lengths (n + 1, 2) at the ticks of a loop that the processor closes; `wanted` (n, 2)."""
-    loop = Loop(SimulatedRig(), len(wanted))
-    for k, pair in enumerate(wanted):
-        seen = loop.look(k)
-        loop.record[5:] = pair
-        loop.move(k, processor.tick(loop.record, seen, mode))
-    return loop.lengths()
+def closed(processor: Processor, wanted: np.ndarray, mode: int) -> np.ndarray:
+    """Lengths (n, 2) at the ticks of a loop that the processor closes; `wanted` (n, 2)."""
+    record = Inputs(0.0, 0.0, 9.81, 0.0, 0.0, mode=mode)
+
+    def law(k: int, memory: LoopState, seen: Seen) -> tuple[LoopState, tuple[float, float]]:
+        nonlocal record
+        u, v = seen.marker_px
+        ax, ay, gz = seen.imu[-1] if seen.imu else (record.ax_mps2, record.ay_mps2, record.gz_radps)
+        there, (first, second) = not math.isnan(u), wanted[k].tolist()
+        if not there:
+            u, v = record.u_px, record.v_px
+        record = binary32(Inputs(u, v, ax, ay, gz, (first, second), there, True, mode))
+        low, high = processor(record)
+        return memory, (low, high)
+
+    machine = SimulatedRig()
+    return simulate(machine, rig_at_rest(machine.plant, machine.pump), law, len(wanted), seed=5).states[:, :2]
 
 
 def experiment(name: str) -> tuple[np.ndarray, int]:
@@ -258,11 +248,13 @@ def test_the_loop_closed_by_the_processor_is_that_of_float64(
     write(tmp_path, header(kind))
     switch = ["-DCALIB_FUSED=1"] if fused else []
     wanted, mode = experiment(name)
-    expected = closed(_Python(kind, fused), wanted, mode)
-    program = Avr(avr(tmp_path, *switch)[0]) if where == "avr" else _Host(host(tmp_path, *switch))
-    found = closed(program, wanted, mode)
-    if isinstance(program, _Host):
-        program.process.close()
+    reference = reference_of(header(kind).values, fused=fused)
+    expected = closed(lambda given: reference.step(given).pwm, wanted, mode)
+    if where == "avr":
+        found = closed(_avr(avr(tmp_path, *switch)[0]), wanted, mode)
+    else:
+        with contextlib.closing(Process(host(tmp_path, *switch))) as process:
+            found = closed(_host(process), wanted, mode)
     difference = np.abs(found - expected).max()
     print(f"{name} on {where}, {'fused' if fused else 'MM'}: lengths differ by {difference:.2g} m at most")
     assert difference < 1e-6

@@ -11,12 +11,10 @@ import numpy as np
 import pytest
 from armlogs import swung
 from firmware_build import LIMITS, compare, host, hostile, need, run, strew, write
-from firmware_plant import Loop
 from firmware_rigs import header, rig
 from source_model import head_from_marker, inverse_series
 
 from calib.io.serial import MODE_OFF, MODE_ORIENTATION, MODE_POSITION, Inputs
-from calib.stages.actuator.simulate import rig_at_rest
 from calib.stages.camera.model import Camera, undistort
 from calib.stages.control.laws import (
     FeedForward,
@@ -60,7 +58,6 @@ from calib.stages.lowpass.filters import Design, design_lowpass, filter_signal
 from calib.stages.lowpass.section import LowPassSection
 from calib.twin.pictures import CAMERA, PLANE
 from calib.twin.rig import SimulatedRig
-from calib.twin.simulate import simulate
 
 
 @pytest.fixture(scope="module", params=["nominal", "full", "levelling", "fisheye"])
@@ -76,7 +73,6 @@ def built(
 @cache
 def _logged(ticks: int, seed: int) -> list[Inputs]:
     """Ticks of two simulated experiments, each with the newest IMU sample."""
-    from calib.twin.rig import SimulatedRig
     from calib.twin.scenarios import make_scenario, run_scenario
 
     made: list[Inputs] = []
@@ -526,25 +522,3 @@ def test_the_estimator_follows_the_motion(kind: str) -> None:
     # A steady acceleration a leaves the length a / K_v behind; here 0.15 l0 (2 pi / ticks)^2.
     behind = 0.15 * constants["CALIB_REST_LENGTH_M"] * (2.0 * np.pi / (0.55 * PERIOD)) ** 2
     assert worst[1] < behind / constants["CALIB_FUSED_MOVING_RATE"]
-
-
-def test_states_and_readings_are_those_of_the_twin() -> None:
-    rig, ticks = SimulatedRig(), 400
-    k = np.arange(ticks)
-    pwm = np.stack([150.0 + 80.0 * np.sin(0.05 * k), 150.0 + 80.0 * np.cos(0.03 * k)], axis=1)
-    wanted = simulate(rig, rig_at_rest(rig.plant, rig.pump), pwm, ticks, seed=5)
-    loop = Loop(rig, ticks, seed=5)
-    newest = np.searchsorted(wanted.imu.taken_s, wanted.t_s + 1e-9, side="right") - 1
-    seen = 0
-    for i in range(ticks):
-        there = loop.look(i)
-        u, v, ax, ay, gz = loop.record[:5].tolist()
-        assert there == (not math.isnan(wanted.pixels[i, 0]))
-        if there:
-            assert (u, v) == tuple(wanted.pixels[i])
-            seen += 1
-        assert np.abs(np.array([ax, ay]) - wanted.accel_mps2[newest[i], :2]).max() < 1e-9
-        assert abs(gz - wanted.gyro_radps[newest[i], 2]) < 1e-9
-        loop.move(i, pwm[i])
-    assert seen > 380
-    assert np.abs(loop.nodes - wanted.trajectory.nodes).max() < 1e-12
