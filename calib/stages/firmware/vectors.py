@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -29,10 +30,11 @@ FUSED_TICKS = 72
 
 @dataclass(frozen=True)
 class Vector:
-    """One tick: what goes in and what has to come out."""
+    """One tick, or `times` of them that are alike: what goes in, and what has to come out of the last."""
 
     given: Inputs
     wanted: Outputs
+    times: int = 1
 
 
 def directed(constants: Mapping[str, float], ticks: int) -> list[Inputs]:
@@ -68,29 +70,78 @@ def directed(constants: Mapping[str, float], ticks: int) -> list[Inputs]:
     return made
 
 
-def vectors(header: Header, ticks: int = 48, fused: bool = False) -> list[Vector]:
-    """Golden vectors of a header that has a plane; `fused` for CALIB_FUSED 1."""
+def _limits(constants: Mapping[str, float], still: Inputs) -> list[tuple[Inputs, int]]:
+    """Ticks on either side of what is refused, with how often each comes: losses, NaN, readings beyond.
+
+    Parameters
+    ----------
+    still : a sound tick.
+    """
+    rest = constants["CALIB_REST_LENGTH_M"]
+    still = replace(still, gz_radps=0.0, mode=MODE_POSITION, reference=(1.1 * rest, 1.12 * rest))
+    hold, nan = int(constants["CALIB_HOLD_TICKS"]), math.nan
+    made: list[tuple[Inputs, int]] = []
+    for lost in (replace(still, marker_seen=False), replace(still, imu_read=False)):
+        made += [(still, 2), (lost, hold), (lost, 1), (still, 1)]
+    weak = {
+        f"a{axis}_mps2": 0.9 * constants["CALIB_IMU_ACCEL_WEAK_MPS2"]
+        + constants[f"CALIB_IMU_ACCEL_BIAS_{name}"]
+        for axis, name in (("x", "X_MPS2"), ("y", "Y_MPS2"))
+    }
+    edge = constants.get("CALIB_CAMERA_GREATEST_U_PX", 0.0), constants.get("CALIB_CAMERA_GREATEST_V_PX", 0.0)
+    changes: list[dict[str, Any]] = [
+        *({name: nan} for name in ("u_px", "v_px", "ax_mps2", "ay_mps2", "gz_radps")),
+        *({name: value} for name in ("u_px", "v_px") for value in (-0.51, -0.49)),
+        *(
+            {name: most + by}
+            for name, most in zip(("u_px", "v_px"), edge, strict=True)
+            for by in (0.01, -0.01)
+        ),
+        *({name: 158.0} for name in ("ax_mps2", "ay_mps2")),
+        *({"gz_radps": value} for value in (-35.1, 35.1)),
+        *({"reference": pair} for pair in ((nan, 0.08), (0.08, nan), (6.31, 0.08), (0.08, -6.31))),
+        weak,
+        {"mode": 7},
+    ]
+    for change in changes:
+        made += [(replace(still, **change), 1), (still, 1)]
+    # The head turns through both limits of its angle.
+    for rate, ticks in ((-20.0, 8), (20.0, 14)):
+        turns = replace(still, gz_radps=rate, reference=(0.3, 0.0), mode=MODE_ORIENTATION)
+        made.append((replace(turns, marker_seen=False), ticks))
+    return [(binary32(given), times) for given, times in made]
+
+
+def vectors(header: Header, ticks: int = 48, fused: bool = False, limits: bool = False) -> list[Vector]:
+    """Golden vectors of a header; `fused` for CALIB_FUSED 1, `limits` with all that a tick has to refuse."""
     constants = header.values
     reference = reference_of(constants, fused=fused)
-    given = directed_fused(constants, ticks, period=ticks) if fused else directed(constants, ticks)
-    return [Vector(one, reference.step(one)) for one in given]
+    run = directed_fused(constants, ticks, period=ticks) if fused else directed(constants, ticks)
+    given = [(one, 1) for one in run] + (_limits(constants, run[0]) if limits else [])
+    return [Vector(one, [reference.step(one) for _ in range(times)][-1], times) for one, times in given]
+
+
+_NAN = 3e38
+"""Stands for NaN in the rows."""
 
 
 def _row(vector: Vector) -> list[list[float]]:
     """Inputs, outputs and flags of a tick; zero where a value is too small for a normal float."""
     given, wanted = vector.given, vector.wanted
-    rows = [[*given.numbers, given.sensors, given.mode], wanted.numbers, [wanted.flags]]
+    inputs = [_NAN if math.isnan(value) else value for value in given.numbers]
+    sensors = given.sensors + 4 * (vector.times - 1)
+    rows = [[*inputs, sensors, given.mode], wanted.numbers, [wanted.flags]]
     return [[float(v) if abs(v) > 1e-30 else 0.0 for v in row] for row in rows]
 
 
 def selftest_text(header: Header) -> str:
     """calib_selftest.h of a header."""
-    fused = vectors(header, FUSED_TICKS, fused=True) if header.values["CALIB_HAS_FUSED"] else []
+    fused = vectors(header, FUSED_TICKS, fused=True, limits=True) if header.values["CALIB_HAS_FUSED"] else []
     return rendered(
         "calib_selftest.h.j2",
         identity=f"{header.identity:08X}",
         undistort=int(header.values["CALIB_HAS_PLANE"] and Reference(header.values).undistort),
-        rows=list(map(_row, vectors(header))),
+        rows=list(map(_row, vectors(header, limits=True))),
         fused_rows=list(map(_row, fused)),
         tolerance=TOLERANCE,
     )

@@ -2,7 +2,7 @@
  * One tick after the other, for a host (records on stdin and stdout) and for an AVR under a simulator that
  * fills `in` when GPIOR0 becomes 1 and fetches `out` when it becomes 2. CALIB_MOVING: the reference is a point
  * (x, y) that has to be turned into lengths in the same tick. CALIB_SELFTEST: the self-test instead of a tick.
- * CALIB_GUARDED: the guard before and after the tick, made to run in every one.
+ * CALIB_GUARDED: the guard before and after the tick, and with CALIB_MEASURE made to run in every one.
  */
 #ifdef __AVR__
 #include <avr/io.h>
@@ -39,7 +39,9 @@ static void one_tick(void) {
     }
 #endif
 #ifdef CALIB_GUARDED
+#ifdef CALIB_MEASURE
     guard.state = CALIB_RUN;
+#endif
     in.mode = calib_guard_mode(&guard, in.mode, in.reference);
 #endif
     calib_tick(&state, &in, &out);
@@ -65,6 +67,10 @@ int main(int argc, char **argv) {
     unsigned char bytes[31];
     (void)argv;
     calib_start(&state);
+#ifdef CALIB_GUARDED
+    calib_guard_start(&guard);
+    calib_guard_ready(&guard, 1);
+#endif
     while (fread(bytes, sizeof bytes, 1, stdin) == 1) {
         memcpy(&in, bytes, sizeof bytes);
         one_tick();

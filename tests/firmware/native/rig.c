@@ -3,7 +3,13 @@
  * SPI, pumps and an actuator that follows them, and one fault. As a library (`rig_open` and the rest) it takes what the
  * sensors show from its caller, who has an actuator of its own.
  *
- *   rig SKETCH.elf FAULT AT_MS UNTIL_MS END_MS U0 V0 U1 V1 [MICROS_ADDRESS]
+ *   rig SKETCH.elf FAULT AT_MS UNTIL_MS END_MS U0 V0 U1 V1
+ *   rig SKETCH.elf CLOCK@OVERFLOWS:MILLIS AT_MS STEP_MS COUNT U0 V0 U1 V1 FAULT...
+ *
+ * The second way has COUNT moments STEP_MS apart, in each of which the simulated board is continued once with each
+ * fault: for 700 ms, and from the first moment on to its end and 3 s longer. A line of stdout for each: the fault, the
+ * moment, milliseconds until both pumps were off for good, -1 for never, and whether they ran in the end. OVERFLOWS and
+ * MILLIS are places of the core's clock, which is set so that it begins anew in the middle of the moments.
  *
  * (U0, V0) and (U1, V1) show the marker of the straight actuator at its rest length and 40 mm longer. The serial
  * port's bytes go to stdout. On stderr one line: milliseconds with a pump on before the fault; of the fault's time
@@ -21,6 +27,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/wait.h>
 #include <unistd.h>
 
 #define TCCR1A 0x80
@@ -42,7 +49,7 @@ static unsigned addressed, index_, place, resets, wanted;
 static unsigned char written[8], reply[32];
 static unsigned char registers[256];
 static unsigned noise = 1;
-static int of_caller, shown[9]; /* force, rate in the sensor's units; marker seen, u, v */
+static int quiet, of_caller, shown[9]; /* force, rate in the sensor's units; marker seen, u, v */
 static avr_irq_t *spi_in;
 
 static double now_ms(void) {
@@ -90,6 +97,13 @@ static void axes(int *force, int *rate) {
     now[0] = (int)lrint(981 * cos(phi)) + rough();
     now[1] = (int)lrint(981 * sin(phi)) + rough();
     now[5] = (int)lrint(rough() - (is("marker_frozen") ? 900 * 0.6 * 3 * cos(0.003 * (now_ms() - at_ms)) : 0));
+    if (is("imu_tilted")) {
+        now[0] = (int)lrint(981 * cos(phi + 0.7)) + rough();
+        now[1] = (int)lrint(981 * sin(phi + 0.7)) + rough();
+    }
+    if (is("gyro_biased")) {
+        now[5] += 2700;
+    }
     if (is("imu_saturated")) {
         now[0] = 32767;
         now[1] = -32768;
@@ -153,7 +167,7 @@ static void pixy_reply(void) {
     unsigned i, from = is("pixy_shifted") ? 3 : 0, total = 0;
     unsigned char *r = reply + from;
     memset(reply, 0, sizeof reply);
-    if (is("blob_lost") || (is("camera_slow") && fmod(now_ms(), 1000.0) > 20.0)) {
+    if (is("blob_lost") || (is("camera_slow") && fmod(now_ms() - at_ms, 1000.0) < 980.0)) {
         return;
     }
     if (of_caller && !shown[6]) {
@@ -173,7 +187,7 @@ static void pixy_reply(void) {
     r[0] = 0xAF;
     r[1] = 0xC1;
     r[2] = is("pixy_error") ? 0x03 : 0x21;
-    r[3] = 14;
+    r[3] = is("many_blobs") ? 28 : 14;
     put(from + 6, 1);
     put(from + 8, u0 + (u1 - u0) * sum + (v1 - v0) / 0.04 * across + (is("blob_elsewhere") ? 90 : 0) + 0.5 * rough());
     put(from + 10, v0 + (v1 - v0) * sum - (u1 - u0) / 0.04 * across + 0.5 * rough());
@@ -189,11 +203,14 @@ static void pixy_reply(void) {
         total += r[i];
     }
     put(from + 4, (double)(total + (is("bad_checksum") ? 1 : 0)));
+    for (i = 0; is("pixy_garbage") && i < sizeof reply; i++) {
+        reply[i] = (unsigned char)(rough() * 37 & 255);
+    }
 }
 
 static int absent(unsigned slave) {
     if (slave != 0x54) {
-        return is("imu_nack") || (is("imu_slow") && fmod(now_ms(), 1000.0) > 20.0) ||
+        return is("imu_nack") || (is("imu_slow") && fmod(now_ms() - at_ms, 1000.0) < 980.0) ||
                (strcmp(fault, "deaf_start") == 0 && now_ms() < 400);
     }
     return is("pixy_nack");
@@ -269,7 +286,7 @@ static void on_serial(struct avr_irq_t *irq, uint32_t value, void *param) {
         if (came < sizeof from_board) {
             from_board[came++] = (unsigned char)value;
         }
-    } else {
+    } else if (!quiet) {
         fputc((int)(value & 255), out);
     }
 }
@@ -350,27 +367,14 @@ int rig_pass(double us) {
 
 /* ---- as a program ---- */
 
-int main(int argc, char **argv) {
-    double end_ms, next_ms = 0, on_before = 0, on_during = 0, off_since = -1, last_ms = 0;
-    int was_on = 0, done = 0;
-    if (argc < 10) {
-        return 2;
-    }
-    out = fdopen(dup(1), "wb");
-    if (out == NULL || dup2(2, 1) < 0) {
-        return 6;
-    }
-    fault = argv[2];
-    at_ms = atof(argv[3]);
-    until_ms = atof(argv[4]);
-    end_ms = atof(argv[5]);
-    u0 = atof(argv[6]);
-    v0 = atof(argv[7]);
-    u1 = atof(argv[8]);
-    v1 = atof(argv[9]);
-    if (opened(argv[1]) != 0) {
-        return 3;
-    }
+/* Milliseconds with a pump on before the fault and during it; since when both are off; whether one is on. */
+static double on_before, on_during, off_since;
+static int was_on;
+
+/* Let the board and its rig go on to a time; whether the processor stopped. */
+static int go_on(double end_ms) {
+    static double next_ms, last_ms;
+    static int done;
     while (now_ms() < end_ms) {
         avr_cycle_count_t before = avr->cycle;
         int state;
@@ -387,15 +391,26 @@ int main(int argc, char **argv) {
         }
         state = avr_run(avr);
         if (state == cpu_Done || state == cpu_Crashed) {
-            return 5;
+            return 1;
         }
         if (avr->cycle < before) {
             resets++;
         }
-        if (!done && strcmp(fault, "reset") == 0 && now_ms() >= at_ms) {
+        if (!done && now_ms() >= at_ms) {
+            if (strcmp(fault, "imu_brown_out") == 0 || strcmp(fault, "supply_reset") == 0) {
+                memset(registers, 0, sizeof registers);
+            }
+            if (strcmp(fault, "supply_reset") == 0) {
+                int i;
+                for (i = 0x100; i <= (int)avr->ramend; i++) {
+                    avr->data[i] = (unsigned char)(rough() * 37);
+                }
+            }
+            if (strcmp(fault, "supply_reset") == 0 || strcmp(fault, "reset") == 0) {
+                avr_reset(avr);
+                resets++;
+            }
             done = 1;
-            avr_reset(avr);
-            resets++;
         }
         if (now_ms() >= next_ms) {
             double step = now_ms() - last_ms;
@@ -422,8 +437,89 @@ int main(int argc, char **argv) {
             }
         }
     }
+    return 0;
+}
+
+static double off_after(void) {
+    return off_since < 0 ? -1 : off_since - at_ms;
+}
+
+static void set(unsigned place_, uint32_t value) {
+    unsigned i;
+    for (i = 0; i < 4; i++) {
+        avr->data[place_ + i] = (unsigned char)(value >> (8 * i));
+    }
+}
+
+/* Each fault at each moment, in processes that part there. */
+static int at_many_moments(const char *clock, double first_ms, double step_ms, int count, char **faults) {
+    unsigned overflows, millis_;
+    double middle_ms = first_ms + 0.5 * step_ms * count;
+    int k, i;
+    if (sscanf(clock, "CLOCK@%x:%x", &overflows, &millis_) != 2) {
+        return 2;
+    }
+    fault = "none";
+    at_ms = until_ms = 1e9;
+    if (go_on(50.0)) {
+        return 5;
+    }
+    set(overflows & 0xFFFFu, 0x400000u - (uint32_t)((middle_ms - 50.0) / 1.024));
+    set(millis_ & 0xFFFFu, 0u - (uint32_t)(middle_ms - 50.0));
+    for (k = 0; k < count; k++) {
+        if (go_on(first_ms + step_ms * k)) {
+            return 5;
+        }
+        if (k == 0) {
+            fprintf(out, "on_before %.1f\n", on_before);
+        }
+        fflush(out);
+        for (i = 0; faults[i] != NULL; i++) {
+            if (fork() == 0) {
+                fault = faults[i];
+                at_ms = now_ms();
+                until_ms = at_ms + 1500.0;
+                off_since = -1;
+                if (go_on(k ? at_ms + 700.0 : until_ms + 3000.0)) {
+                    _exit(5);
+                }
+                fprintf(out, "%s %.1f %.2f %d\n", fault, at_ms, off_after(), was_on);
+                fflush(out);
+                _exit(0);
+            }
+            wait(NULL);
+        }
+    }
+    return 0;
+}
+
+int main(int argc, char **argv) {
+    if (argc < 10) {
+        return 2;
+    }
+    out = fdopen(dup(1), "wb");
+    if (out == NULL || dup2(2, 1) < 0) {
+        return 6;
+    }
+    fault = argv[2];
+    u0 = atof(argv[6]);
+    v0 = atof(argv[7]);
+    u1 = atof(argv[8]);
+    v1 = atof(argv[9]);
+    off_since = -1;
+    if (opened(argv[1]) != 0) {
+        return 3;
+    }
+    if (argc > 10) {
+        quiet = 1;
+        return at_many_moments(argv[2], atof(argv[3]), atof(argv[4]), atoi(argv[5]), argv + 10);
+    }
+    at_ms = atof(argv[3]);
+    until_ms = atof(argv[4]);
+    if (go_on(atof(argv[5]))) {
+        return 5;
+    }
     fflush(out);
-    fprintf(stderr, "\nresult %.1f %.1f %.1f %d %u\n", on_before, on_during, off_since < 0 ? -1 : off_since - at_ms,
-            was_on, resets);
+    fprintf(stderr, "\nresult %.1f %.1f %.1f %d %u\n", on_before, on_during, off_after(), was_on, resets);
     return 0;
 }

@@ -24,6 +24,15 @@
  * input plane/plane01.png: <hash>
  * camera: radial2, verdict ok
  * plane: verdict ok
+ * Not in rig.yaml, so the nominal actuator's or a default:
+ *   actuator.bellows_radius_m, actuator.rest_length_m, controller.tick_s, align.rest_angle_rad,
+ *   imu.gyro_bias_radps.2, controller.pwm_low, controller.pwm_high, align.time_offset_s,
+ *   orientation_filter.Kp_per_s, orientation_filter.Ki_per_s2, align.marker_offset_m,
+ *   controller.orientation.Kp_pwm_per_rad, controller.orientation.Ki_pwm_per_rad_s,
+ *   controller.orientation.Kd_pwm_s_per_rad, controller.orientation.sign, controller.position.Kp_pwm_per_m,
+ *   controller.position.Ki_pwm_per_m_s, controller.position.Kd_pwm_s_per_m, envelope.least_length_m,
+ *   envelope.greatest_length_m, envelope.angle_rad, envelope.rate_mps, envelope.full_power_s,
+ *   envelope.open_loop_s, envelope.open_loop_pwm, envelope.apart_m
  *
  * Pixels: (0, 0) is the centre of the top-left pixel, u right, v down. World: metres, x right and y
  * down in the picture, z away from the camera. phi > 0 bends the head towards +x. Numbers in brackets are
@@ -53,7 +62,7 @@
 #define CALIB_TABLE_READ(address) (*(address))
 #endif
 
-#define CALIB_SCHEMA 4
+#define CALIB_SCHEMA 6
 #if defined(CALIB_EXPECT_SCHEMA)
 #if CALIB_EXPECT_SCHEMA != CALIB_SCHEMA
 #error "calib: this header has another schema than the code expects"
@@ -61,19 +70,16 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x7A1A5F07UL
+#define CALIB_ID 0x88CCB011UL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 1 /* 0: a section that they come from is not ok */
 #define CALIB_SIMULATED 1 /* 1: they come from a simulated rig or rendered pictures */
 
-/* Camera (2.5) and lens (B.1). */
+/* Camera (2.5) and lens (B.1), for programs of your own; the pipeline reads SKEW, CX, CY and P1, P2 of them. */
 #define CALIB_IMAGE_WIDTH_PX 316 /* columns */
 #define CALIB_IMAGE_HEIGHT_PX 208 /* rows */
 #define CALIB_CAMERA_OK 1 /* 0: the calibration failed its gate */
-#define CALIB_CAMERA_GREATEST_U_PX 315.5f /* greatest u inside the picture, px; the least is -0.5 */
-#define CALIB_CAMERA_GREATEST_V_PX 207.5f /* greatest v inside the picture, px; the least is -0.5 */
-#define CALIB_CAMERA_HAS_LENS 1 /* 0: no distortion, default of CALIB_UNDISTORT */
 #define CALIB_CAMERA_FX_PX 273.409576f /* focal length along u, px; sigma_mu of (2.5) */
 #define CALIB_CAMERA_FY_PX 272.603973f /* focal length along v, px; sigma_nu of (2.5) */
 #define CALIB_CAMERA_SKEW_PX 0.0f /* skew, px; gamma of (2.5) */
@@ -87,11 +93,14 @@
  * x = xd P, y = yd P with P = 1 + c1 r2 + c2 r2^2 + ..., r2 = xd^2 + yd^2.
  * Error at most 0.0012 px over 100 % of the picture.
  */
-#define CALIB_LENS_INVERSE_ORDER 5 /* number of coefficients c */
-#define CALIB_LENS_DECENTERING_STEPS 0 /* 0: no decentering */
+#define CALIB_CAMERA_GREATEST_U_PX 315.5f /* greatest u inside the picture, px; the least is -0.5 */
+#define CALIB_CAMERA_GREATEST_V_PX 207.5f /* greatest v inside the picture, px; the least is -0.5 */
+#define CALIB_CAMERA_HAS_LENS 1 /* 0: no distortion, default of CALIB_UNDISTORT */
 #define CALIB_CAMERA_HAS_SKEW 0 /* for #if */
 #define CALIB_CAMERA_PER_FX 0.00365751656f /* 1 / fx, 1/px */
 #define CALIB_CAMERA_PER_FY 0.00366832502f /* 1 / fy, 1/px */
+#define CALIB_LENS_INVERSE_ORDER 5 /* number of coefficients c */
+#define CALIB_LENS_DECENTERING_STEPS 0 /* 0: no decentering */
 #define CALIB_LENS_INVERSE_C1 0.217687204f /* coefficient of r2^1, dimensionless */
 #define CALIB_LENS_INVERSE_C2 -0.333740741f /* coefficient of r2^2, dimensionless */
 #define CALIB_LENS_INVERSE_C3 -1.56922758f /* coefficient of r2^3, dimensionless */
@@ -102,17 +111,20 @@
 /* Plane of the actuator, without the shift and stretch that align has found. */
 #define CALIB_HAS_PLANE 1 /* for #if */
 #define CALIB_PLANE_OK 1 /* 0: the plane failed its gate */
-#define CALIB_PLANE_INVERSE_11 0.00365899038f /* row 1, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
-#define CALIB_PLANE_INVERSE_12 -8.84281471e-05f /* row 1, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
-#define CALIB_PLANE_INVERSE_13 -0.59911108f /* row 1, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
-#define CALIB_PLANE_INVERSE_21 7.93001382e-05f /* row 2, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
-#define CALIB_PLANE_INVERSE_22 0.00362181547f /* row 2, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
-#define CALIB_PLANE_INVERSE_23 -0.160717785f /* row 2, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
-#define CALIB_PLANE_INVERSE_31 -0.000315899902f /* row 3, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
-#define CALIB_PLANE_INVERSE_32 -0.000872945704f /* row 3, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
-#define CALIB_PLANE_INVERSE_33 3.76397467f /* row 3, A^-1, undistorted px to m; (2.11), row 3 gives 1/s of (2.12) in 1/m */
+#define CALIB_PLANE_INVERSE_11 0.00365899038f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_12 -8.84281471e-05f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_13 -0.59911108f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_21 7.93001382e-05f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_22 0.00362181547f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_23 -0.160717785f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_31 -0.000315899902f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_32 -0.000872945704f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_33 3.76397467f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
 
-/* The same from normalised undistorted coordinates, for CALIB_UNDISTORT 1. */
+/*
+ * The same from normalised undistorted coordinates, for CALIB_UNDISTORT 1. Row 3 gives 1/s of (2.12) in 1/m, the
+ * reciprocal depth.
+ */
 #define CALIB_PLANE_NORMALISED_11 1.00040293f /* row 1, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_12 -0.0241058655f /* row 1, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_13 -0.02022909f /* row 1, A^-1 K, dimensionless to m */
@@ -140,21 +152,15 @@
 #define CALIB_PLANE_RAW_33 3.81185961f /* row 3, distorted px to m */
 #define CALIB_PLANE_RAW_LEAST_PER_M 0.35496065f /* 1/s below this: behind the horizon, 1/m */
 
-/*
- * The tick: one picture, one sample of the IMU, one command.
- * Defaults of the nominal actuator, not in rig.yaml: align.time_offset_s.
- */
+/* The tick: one picture, one sample of the IMU, one command. */
 #define CALIB_TICK_RATE_HZ 60.0f /* ticks per second, Hz */
 #define CALIB_TICK_RATE_MHZ 60000 /* the same in millihertz, for #if */
-#define CALIB_TICK_PERIOD_S 0.0166666675f /* dt, s */
-#define CALIB_HOLD_TICKS 60 /* a sensor that is silent for longer stops the pumps */
+#define CALIB_HOLD_TICKS 60 /* a sensor that is silent for longer, a second, stops the pumps */
 #define CALIB_TIME_OFFSET_TICKS 0 /* ticks by which a picture is later than the IMU, positive */
-#define CALIB_TIME_OFFSET_REST_S 0.0f /* what the whole ticks leave of that, s, unused */
 
 /*
  * IMU on the head, x from the head to the base at rest; phi = atan2(RATIO ay, ax) - mount (2.1),
  * dphi/dt = -gz. rig.yaml has no key for the signs of the axes, they are 1.
- * Defaults of the nominal actuator, not in rig.yaml: align.rest_angle_rad, imu.gyro_bias_radps.2.
  */
 #define CALIB_IMU_SIGN_AX 1 /* 1 or -1, by hand for an IMU that is not right-handed as mounted */
 #define CALIB_IMU_SIGN_AY 1 /* 1 or -1 */
@@ -162,7 +168,7 @@
 #define CALIB_IMU_ACCEL_BIAS_X_MPS2 0.0f /* subtracted from ax, m/s^2 */
 #define CALIB_IMU_ACCEL_BIAS_Y_MPS2 0.0f /* subtracted from ay, m/s^2 */
 #define CALIB_IMU_ACCEL_RATIO 1.0f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
-#define CALIB_IMU_GYRO_BIAS_RADPS 0.0f /* gz at rest, rad/s; sign as read */
+#define CALIB_IMU_GYRO_BIAS_RADPS 0.0f /* gz at rest, rad/s; sign as read; for programs of your own */
 #define CALIB_IMU_MOUNT_ANGLE_RAD 0.0f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
 #define CALIB_IMU_ACCEL_LIMIT_MPS2 157.0f /* readings beyond are lost, m/s^2 */
 #define CALIB_IMU_RATE_LIMIT_RADPS 35.0f /* readings beyond are lost, rad/s */
@@ -174,24 +180,21 @@
 /*
  * Angle filter (2.3), dt folded in. The integral is kept as an angle per tick, J = I dt:
  * J += KI_DT2 e, phi += KP_DT e + J - DT gz; J begins at GYRO_BIAS_DT.
- * Defaults of the nominal actuator, not in rig.yaml: orientation_filter.Kp_per_s, orientation_filter.Ki_per_s2.
  */
 #define CALIB_MM_KP_DT 0.0500000007f /* Kp dt, dimensionless; Kp = 3 1/s */
 #define CALIB_MM_KI_DT2 0.000833333354f /* Ki dt^2, dimensionless; Ki = 3 1/s^2 */
 #define CALIB_MM_DT_S 0.0166666675f /* dt of the rate over the gyroscope's scale, s; phi falls for gz > 0 */
 #define CALIB_MM_GYRO_BIAS_DT_RAD 0.0f /* bias times the same, rad */
-#define CALIB_MM_INTEGRAL_LIMIT_RAD 0.0166666675f /* |J| stays below, rad */
+#define CALIB_MM_INTEGRAL_LIMIT_RAD 0.0166666675f /* |J| stays below, rad; 1 rad/s */
 #define CALIB_PHI_LIMIT_RAD 1.58000004f /* |phi| stays below; range of the sine in the pipeline, rad */
 
-/*
- * Marker to head (A.1): x = X - d sin(phi), y = Y - d cos(phi).
- * Defaults of the nominal actuator, not in rig.yaml: align.marker_offset_m.
- */
+/* Marker to head (A.1): x = X - d sin(phi), y = Y - d cos(phi). */
 #define CALIB_MARKER_OFFSET_M 0.0149999997f /* d, m; positive beyond the head */
 
 /*
  * Low-pass of x and y. y_k = b0 x_k + b1 x_(k-1) + b2 x_(k-2) - a1 y_(k-1) - a2 y_(k-2): SciPy's
- * sign of a1, a2; CMSIS-DSP wants -a1, -a2. The pipeline runs forms exact at rest: SINGLE, PAIR.
+ * sign of a1, a2; CMSIS-DSP wants -a1, -a2. The pipeline runs forms exact at rest: SINGLE, PAIR. The sections
+ * themselves are for programs of your own, and for the self-test to be held against.
  */
 #define CALIB_LOWPASS_PAIRS 0 /* sections of order two */
 #define CALIB_LOWPASS_SINGLES 1 /* sections of order one */
@@ -205,7 +208,6 @@
 /*
  * Inverse kinematics (3.12) with the series (3.14): q1,2 = |(x, y)| f(phi) / 2 +- r_B phi,
  * f = F0 + F1 phi^2 + F2 phi^4 + F3 phi^6; bellows 1 is the longer one for phi > 0.
- * Defaults of the nominal actuator, not in rig.yaml: actuator.bellows_radius_m, actuator.rest_length_m.
  */
 #define CALIB_BELLOWS_RADIUS_M 0.0126f /* r_B, m */
 #define CALIB_REST_LENGTH_M 0.0649999976f /* l0, m; length until the first picture */
@@ -217,22 +219,15 @@
 /* Fused estimator: none. rig.yaml lacks align. */
 #define CALIB_HAS_FUSED 0 /* for #if; CALIB_FUSED 1 does not compile */
 
-/*
- * Pumps.
- * Defaults of the nominal actuator, not in rig.yaml: controller.tick_s, controller.pwm_low, controller.pwm_high, pump.supply_V, pump.dead_zone_V.
- */
+/* Pumps. */
 #define CALIB_PUMP_LOW_PWM 0.0f /* least command and limit of the clamping, PWM */
 #define CALIB_PUMP_HIGH_PWM 255.0f /* greatest command and limit of the clamping, PWM */
 #define CALIB_PUMP_HIGH 255 /* the same, for #if */
-#define CALIB_PUMP_DEAD_ZONE_PWM 99.875f /* no pressure below, PWM, for information */
-#define CALIB_PUMP_SUPPLY_V 12.0f /* at PWM 255, V, for information */
 
 /*
  * Control of the angle, PID (4.1), (4.4).
  * Kp = 1000, Ki = 1000, Kd = 10, error in rad. The pipeline sums (4.4) up:
- * u = KPDI e_k + (P - KD_PER_DT e_(k-1)), P += 2 KI_HALF_DT e_k; E0, E1, E2 are the factors of
- * e_k, e_(k-1), e_(k-2) in the incremental form u_k = u_(k-1) + ..., (4.4) and (D.9).
- * Defaults of the nominal actuator, not in rig.yaml: controller.orientation.Kp_pwm_per_rad, controller.orientation.Ki_pwm_per_rad_s, controller.orientation.Kd_pwm_s_per_rad.
+ * u = KPDI e_k + (P - KD_PER_DT e_(k-1)), P += 2 KI_HALF_DT e_k.
  */
 #define CALIB_ORIENTATION_KPDI_PWM_PER_RAD 1608.33337f /* Kp + Kd / dt + Ki dt / 2, PWM/rad */
 #define CALIB_ORIENTATION_KD_PER_DT_PWM_PER_RAD 600.0f /* Kd / dt, PWM/rad */
@@ -241,22 +236,14 @@
 #define CALIB_ORIENTATION_CLAMPING 1 /* 1: no integration beyond the limits (4.1.1) */
 #define CALIB_ORIENTATION_HAS_BACK 0 /* 1: back-calculation, P += BACK (limited - u) */
 #define CALIB_ORIENTATION_BACK 0.0f /* dt / time constant of the back-calculation, dimensionless */
-#define CALIB_ORIENTATION_E0_PWM_PER_RAD 1608.33337f /* Kp + Ki dt / 2 + Kd / dt, PWM/rad */
-#define CALIB_ORIENTATION_E1_PWM_PER_RAD -2191.66675f /* -Kp + Ki dt / 2 - 2 Kd / dt, PWM/rad */
-#define CALIB_ORIENTATION_E2_PWM_PER_RAD 600.0f /* Kd / dt, PWM/rad */
 
-/*
- * Which bellows a positive error of the angle drives (4.1).
- * Defaults of the nominal actuator, not in rig.yaml: controller.orientation.sign.
- */
+/* Which bellows a positive error of the angle drives (4.1). */
 #define CALIB_ORIENTATION_SIGN 1 /* 1: bellows 1; -1: the hoses are crossed */
 
 /*
  * Control of both lengths, PD (4.5), (4.8).
  * Kp = 15000, Ki = 0, Kd = 150, error in m. The pipeline sums (4.4) up:
- * u = KPDI e_k + (P - KD_PER_DT e_(k-1)), P += 2 KI_HALF_DT e_k; E0, E1, E2 are the factors of
- * e_k, e_(k-1), e_(k-2) in the incremental form u_k = u_(k-1) + ..., (4.4) and (D.9).
- * Defaults of the nominal actuator, not in rig.yaml: controller.position.Kp_pwm_per_m, controller.position.Ki_pwm_per_m_s, controller.position.Kd_pwm_s_per_m.
+ * u = KPDI e_k + (P - KD_PER_DT e_(k-1)), P += 2 KI_HALF_DT e_k.
  */
 #define CALIB_POSITION_KPDI_PWM_PER_M 24000.0f /* Kp + Kd / dt + Ki dt / 2, PWM/m */
 #define CALIB_POSITION_KD_PER_DT_PWM_PER_M 9000.0f /* Kd / dt, PWM/m */
@@ -265,20 +252,16 @@
 #define CALIB_POSITION_CLAMPING 0 /* 1: no integration beyond the limits (4.1.1) */
 #define CALIB_POSITION_HAS_BACK 0 /* 1: back-calculation, P += BACK (limited - u) */
 #define CALIB_POSITION_BACK 0.0f /* dt / time constant of the back-calculation, dimensionless */
-#define CALIB_POSITION_E0_PWM_PER_M 24000.0f /* Kp + Ki dt / 2 + Kd / dt, PWM/m */
-#define CALIB_POSITION_E1_PWM_PER_M -33000.0f /* -Kp + Ki dt / 2 - 2 Kd / dt, PWM/m */
-#define CALIB_POSITION_E2_PWM_PER_M 9000.0f /* Kd / dt, PWM/m */
 
 /*
- * Feed-forward: the line (4.6), 0 below FROM, else min(LIMIT, OFFSET + SLOPE (q_ref - FROM)), or
+ * Feed-forward: the line (4.6), 0 below FROM, else min(LIMIT, SLOPE q_ref - MINUS), or
  * the table of steady lengths: linear between entries, the last one beyond, 0 before the first.
  * Defaults, not in rig.yaml: the line (4.6), and the table of (2.13).
  */
 #define CALIB_FF_USE_TABLE 0 /* 0: the line, 1: the table */
-#define CALIB_FF_FROM_M 0.0670000017f /* shortest bellows that needs pressure, m */
-#define CALIB_FF_OFFSET_PWM 110.0f /* value there, PWM */
+#define CALIB_FF_FROM_M 0.0670000017f /* shortest bellows that needs pressure, m; 110 PWM there */
 #define CALIB_FF_SLOPE_PWM_PER_M 5498.1001f /* PWM/m */
-#define CALIB_FF_MINUS_PWM 258.372711f /* SLOPE FROM - OFFSET, PWM */
+#define CALIB_FF_MINUS_PWM 258.372711f /* SLOPE FROM less the value there, PWM */
 #define CALIB_FF_LIMIT_PWM 255.0f /* largest value, PWM */
 #define CALIB_FF_TABLE_FROM_M 0.0649999976f /* length of the first entry, m */
 #define CALIB_FF_TABLE_PER_STEP 500.0f /* entries per metre, 1/m */
@@ -290,15 +273,15 @@ static const float calib_ff_table_pwm[15] CALIB_IN_FLASH = {
     224.553818f, 240.382324f, 253.525574f,
 };
 
-/*
- * Envelope, see calib_guard.h: the pumps stop where the actuator leaves it.
- * Defaults of the nominal actuator, not in rig.yaml: envelope.least_length_m, envelope.greatest_length_m, envelope.angle_rad, envelope.rate_mps, envelope.full_power_s, envelope.apart_m.
- */
+/* Envelope, see calib_guard.h: the pumps stop where the actuator leaves it. */
 #define CALIB_ENVELOPE_LEAST_M 0.0450000018f /* shortest length of a bellows, m */
 #define CALIB_ENVELOPE_GREATEST_M 0.115000002f /* longest length of a bellows, m */
 #define CALIB_ENVELOPE_ANGLE_RAD 1.5f /* greatest bending to each side, rad */
 #define CALIB_ENVELOPE_STEP_M 0.00833333377f /* greatest change of a length in a tick, m; 0.5 m/s */
 #define CALIB_ENVELOPE_FULL_TICKS 180 /* ticks that a pump may stay at its greatest command */
+#define CALIB_ENVELOPE_OPEN_TICKS 3600 /* ticks that a pump may be on in open loop */
+#define CALIB_ENVELOPE_OPEN_HIGH_PWM 255.0f /* greatest command in open loop: what holds the longest length by the pump's map, PWM */
+#define CALIB_ENVELOPE_OPEN_HIGH 255 /* the same as a whole number */
 #define CALIB_ENVELOPE_APART_M 0.0120000001f /* marker from where the angle puts it at most, m */
 
 #if defined(CALIB_EXPECT_TICK_RATE_MHZ)

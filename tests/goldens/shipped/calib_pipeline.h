@@ -23,6 +23,7 @@
  *   CALIB_HOLD_TICKS, or never heard      pumps off, controllers cleared     CALIB_STALE
  *   reference NaN or absurd               pumps off, controllers cleared     CALIB_BAD_REFERENCE
  *   command beyond the limits             saturated, anti-windup             CALIB_SATURATED_1, _2
+ * With constants that have no plane no marker is ever seen.
  * A marker that comes back after CALIB_HOLD_TICKS starts the low-pass afresh. No output is ever NaN or infinite.
  * With CALIB_FUSED 1 moreover
  *   no marker                             angle by the IMU, the length's rate decays
@@ -43,18 +44,14 @@
 #include <string.h>
 
 #ifndef CALIB_EXPECT_SCHEMA
-#define CALIB_EXPECT_SCHEMA 4
+#define CALIB_EXPECT_SCHEMA 6
 #endif
 #include "calib_constants.h"
 
-#if !CALIB_HAS_PLANE
-#error "calib: calib_constants.h has no plane yet (calib extrinsics)"
-#endif
-
 #ifndef CALIB_UNDISTORT
-#define CALIB_UNDISTORT CALIB_CAMERA_HAS_LENS
+#define CALIB_UNDISTORT (CALIB_HAS_PLANE && CALIB_CAMERA_HAS_LENS)
 #endif
-#if !CALIB_UNDISTORT && !CALIB_HAS_RAW_PLANE
+#if CALIB_HAS_PLANE && !CALIB_UNDISTORT && !CALIB_HAS_RAW_PLANE
 #error "calib: no plane without undistortion, the camera does not see the workspace"
 #endif
 
@@ -438,9 +435,14 @@ static inline void calib_undistort(float u, float v, float *x, float *y) {
  * *afresh is set where the low-pass has to start again.
  */
 static inline uint16_t calib_marker(calib_state *state, const calib_inputs *in, uint8_t *afresh) {
-    float u = in->u_px, v = in->v_px, W;
     uint16_t flags = CALIB_MARKER_HELD;
+#if CALIB_HAS_PLANE
+    float u = in->u_px, v = in->v_px, W;
+#else
+    (void)in;
+#endif
     *afresh = 0;
+#if CALIB_HAS_PLANE
     /* A picture begins half a pixel before the centre of its first one. */
     if (in->marker_seen && calib_within(u, calib_negative(u) ? 0.5f : CALIB_CAMERA_GREATEST_U_PX) &&
         calib_within(v, calib_negative(v) ? 0.5f : CALIB_CAMERA_GREATEST_V_PX)) {
@@ -470,6 +472,7 @@ static inline uint16_t calib_marker(calib_state *state, const calib_inputs *in, 
             calib_count(state, CALIB_COUNT_HORIZON);
         }
     }
+#endif
     if (flags) {
         calib_count(state, CALIB_COUNT_MARKER);
         state->marker_age = calib_older(state->marker_age);

@@ -329,7 +329,7 @@ static inline void calib_guard_tick(calib_guard *guard, const calib_state *state
         guard->quiet++;
     }
     if (guard->state == CALIB_FAULT && guard->fault < CALIB_FAULT_STAYS && guard->fault != CALIB_FAULT_REFERENCE &&
-        guard->tries <= CALIB_GUARD_TRIES && guard->quiet >= ((uint16_t)(CALIB_GUARD_QUIET_TICKS << guard->tries))) {
+        guard->tries <= CALIB_GUARD_TRIES && guard->quiet >= ((uint16_t)((uint16_t)CALIB_GUARD_QUIET_TICKS << guard->tries))) {
         guard->state = CALIB_ARMED;
         guard->fault = CALIB_FAULT_NONE;
     }
@@ -339,18 +339,24 @@ static inline void calib_guard_tick(calib_guard *guard, const calib_state *state
     }
 }
 
-/* One tick of a sound rig for the self-test, k its number. */
+/*
+ * One tick of a sound rig for the self-test, k its number: bent, one axis of the IMU changes in each tick, and the
+ * marker is where the angle puts it (the tangent of half of it, by another series than above).
+ */
 static inline void calib_guard_sound(calib_state *state, calib_inputs *in, calib_outputs *out, uint8_t k) {
+    float phi = 0.5f * CALIB_ENVELOPE_ANGLE_RAD, h = 0.5f * phi, w = h * h;
     state->imu_age = 0;
     state->marker_age = 0;
     in->imu_read = 1;
-    in->ax_mps2 = 9.0f + 0.01f * (float)k;
+    in->ax_mps2 = 9.0f + 0.01f * (float)((k + 2) / 3);
+    in->ay_mps2 = 0.5f + 0.01f * (float)((k + 1) / 3);
+    in->gz_radps = 0.1f + 0.01f * (float)(k / 3);
     in->u_px = (float)k;
     in->reference[0] = CALIB_ENVELOPE_LEAST_M;
     in->reference[1] = CALIB_ENVELOPE_LEAST_M;
     out->flags = 0;
-    out->phi_rad = 0.0f;
-    out->marker_m[0] = 0.0f;
+    out->phi_rad = phi;
+    out->marker_m[0] = h * (1.0f + w * (0.333333343f + w * 0.13333334f)) * (CALIB_REST_LENGTH_M + CALIB_MARKER_OFFSET_M);
     out->marker_m[1] = CALIB_REST_LENGTH_M;
     out->q_m[0] = CALIB_ENVELOPE_LEAST_M;
     out->q_m[1] = CALIB_ENVELOPE_LEAST_M;
@@ -358,7 +364,30 @@ static inline void calib_guard_sound(calib_state *state, calib_inputs *in, calib
     out->duty[1] = 100;
 }
 
-/* Ticks until one fault stops pumps that run; 0 when they did not run before it, 255 when it never stopped them. */
+/* One tick of the guard. Whether a pump is on. */
+static inline uint8_t calib_guard_once(calib_guard *guard, const calib_state *state, calib_inputs *in, calib_outputs *out,
+                                       uint8_t mode) {
+    in->mode = calib_guard_mode(guard, mode, in->reference);
+    calib_guard_tick(guard, state, in, out);
+    return (uint8_t)(out->duty[0] || out->duty[1]);
+}
+
+/* Ticks of a sound rig until a pump is on, 255 for never. */
+static inline uint8_t calib_guard_until(calib_guard *guard, calib_state *state, calib_inputs *in, calib_outputs *out) {
+    uint8_t k;
+    for (k = 0; k < 140; k++) {
+        calib_guard_sound(state, in, out, k);
+        if (calib_guard_once(guard, state, in, out, CALIB_MODE_POSITION)) {
+            return k;
+        }
+    }
+    return 255;
+}
+
+/*
+ * Ticks until one fault stops pumps that run; 0 when they did not run before it or ran again other than they should,
+ * 255 when it never stopped them. CALIB_FAULT_NONE is a lost camera that nothing needs.
+ */
 static inline uint8_t calib_guard_try(uint8_t fault) {
     calib_guard guard;
     calib_state state;
@@ -369,18 +398,12 @@ static inline uint8_t calib_guard_try(uint8_t fault) {
     memset(&in, 0, sizeof in);
     memset(&out, 0, sizeof out);
     calib_guard_start(&guard);
-    for (k = 0; k < CALIB_GUARD_QUIET_TICKS + 2; k++) {
-        calib_guard_sound(&state, &in, &out, k);
-        if (k == 1) {
-            calib_guard_ready(&guard, 1);
-        }
-        in.mode = calib_guard_mode(&guard, CALIB_MODE_POSITION, in.reference);
-        calib_guard_tick(&guard, &state, &in, &out);
-        if (k < CALIB_GUARD_QUIET_TICKS && out.duty[0]) {
-            return 0;
-        }
+    calib_guard_sound(&state, &in, &out, 0);
+    if (calib_guard_once(&guard, &state, &in, &out, mode)) {
+        return 0;
     }
-    if (!out.duty[0] || guard.state != CALIB_RUN) {
+    calib_guard_ready(&guard, 1);
+    if (calib_guard_until(&guard, &state, &in, &out) + 1 != CALIB_GUARD_QUIET_TICKS || guard.state != CALIB_RUN) {
         return 0;
     }
     for (k = 1; k < 255; k++) {
@@ -391,16 +414,23 @@ static inline uint8_t calib_guard_try(uint8_t fault) {
             break;
         case CALIB_FAULT_IMU_FROZEN:
             in.ax_mps2 = 9.0f;
+            in.ay_mps2 = 0.5f;
+            in.gz_radps = 0.1f;
+            break;
+        case CALIB_FAULT_NONE:
+            mode = CALIB_MODE_ORIENTATION;
+            state.marker_age = 1;
             break;
         case CALIB_FAULT_CAMERA_LOST:
             state.marker_age = 1;
             break;
         case CALIB_FAULT_CAMERA_FROZEN:
-            in.u_px = 0.0f;
-            out.phi_rad = k > 1 ? 2.0f * CALIB_GUARD_FROZEN_RAD : 0.0f;
+            mode = CALIB_MODE_ORIENTATION;
+            in.u_px = -1.0f;
+            out.phi_rad = k > 1 ? out.phi_rad - 1.1f * CALIB_GUARD_FROZEN_RAD : out.phi_rad;
             break;
         case CALIB_FAULT_APART:
-            out.marker_m[0] = 2.0f * CALIB_ENVELOPE_APART_M;
+            out.marker_m[0] += 1.2f * CALIB_ENVELOPE_APART_M;
             break;
         case CALIB_FAULT_REFERENCE:
             in.reference[1] = 2.0f * CALIB_ENVELOPE_GREATEST_M;
@@ -422,27 +452,40 @@ static inline uint8_t calib_guard_try(uint8_t fault) {
             out.duty[1] = CALIB_PUMP_HIGH;
             break;
         }
-        in.mode = calib_guard_mode(&guard, mode, in.reference);
-        calib_guard_tick(&guard, &state, &in, &out);
-        if (!out.duty[0] && !out.duty[1]) {
-            return guard.state == CALIB_FAULT && guard.fault == fault ? k : 255;
+        if (calib_guard_once(&guard, &state, &in, &out, mode)) {
+            if (fault == CALIB_FAULT_NONE && k > 30) {
+                return 1;
+            }
+        } else if (guard.state != CALIB_FAULT || guard.fault != fault) {
+            return 255;
+        } else {
+            uint8_t again = calib_guard_until(&guard, &state, &in, &out);
+            if (fault < CALIB_FAULT_STAYS) {
+                return again == 255 || (fault != CALIB_FAULT_REFERENCE && again < 2 * CALIB_GUARD_QUIET_TICKS - 2) ? 0 : k;
+            }
+            if (again != 255) {
+                return 0;
+            }
+            calib_guard_clear(&guard);
+            return calib_guard_until(&guard, &state, &in, &out) == CALIB_GUARD_QUIET_TICKS ? k : 0;
         }
     }
     return 255;
 }
 
-/* 0 when every fault stops the pumps in its time, else the first that does not. */
+/* 0 when every fault stops the pumps in its time and no longer, else the number of the first that does not. */
 static inline uint8_t calib_guard_selftest(void) {
-    static const uint8_t faults[10] = {CALIB_FAULT_IMU_LOST,  CALIB_FAULT_IMU_FROZEN, CALIB_FAULT_CAMERA_LOST,
+    static const uint8_t faults[11] = {CALIB_FAULT_IMU_LOST,  CALIB_FAULT_IMU_FROZEN, CALIB_FAULT_CAMERA_LOST,
                                        CALIB_FAULT_CAMERA_FROZEN, CALIB_FAULT_APART,  CALIB_FAULT_REFERENCE,
                                        CALIB_FAULT_REACH,     CALIB_FAULT_RATE,       CALIB_FAULT_FULL_POWER,
-                                       CALIB_FAULT_LONG};
-    static const uint8_t ticks[10] = {12, 13, 15, 8, 33, 1, 6, 12, 1, 1};
+                                       CALIB_FAULT_LONG,      CALIB_FAULT_NONE};
+    static const uint8_t ticks[11] = {12, 13, 15, 8, 33, 1, 6, 12, 1, 1, 1};
     uint8_t i, taken;
-    for (i = 0; i < 10; i++) {
+    /* The fused estimator needs the camera in every mode. */
+    for (i = 0; i < (CALIB_FUSED ? 10 : 11); i++) {
         taken = calib_guard_try(faults[i]);
         if (taken == 0 || taken > ticks[i]) {
-            return faults[i];
+            return (uint8_t)(i + 1u);
         }
     }
     return 0;
