@@ -19,17 +19,31 @@ from calib.core.arrays import AnyArray, FloatArray
 from calib.core.files import one_line
 
 Colour = str | float
-"""A place, or ink, grey, silver, shade, blue, sky, ice, green, mint, orange, ochre, peach, red or purple."""
+"""A place, or the name of one of `HUES`."""
 KINDS = ("line", "dashed", "dotted", "points", "cloud", "crosses", "pluses", "squares", "diamonds", "marks")
 """How a curve is drawn: as a line, as markers, as dots of a pixel ("cloud") or as short strokes ("marks")."""
 
 Limits = tuple[float, float]
+
+HUES = {
+    "ink": ("#1d2730", "#e8ecef"), "grey": ("#66727d", "#a7b2bb"), "silver": ("#b9c0c7", "#6c7780"),
+    "shade": ("#e9ecef", "#2f3941"), "blue": ("#0072B2", "#4da9e0"), "sky": ("#56B4E9", "#8fd0f7"),
+    "ice": ("#e1eef7", "#20384a"), "green": ("#009E73", "#2fc79b"), "mint": ("#dff1ea", "#1c3d32"),
+    "orange": ("#E69F00", "#f0b429"), "ochre": ("#fdeccc", "#4a3a14"), "peach": ("#f6cfb2", "#6b4426"),
+    "red": ("#D55E00", "#ff8a4c"), "purple": ("#CC79A7", "#e19cc4"), "grid": ("#d3d8dd", "#36414a"),
+    "paper": ("#ffffff", "#1b2227"),
+}  # fmt: skip
+"""Each hue on a light and on a dark page: Okabe and Ito's, which colour-blind readers can tell apart."""
 
 SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 WIDTH_IN = 9.2
 """Width of every figure, in inches of its letters."""
 MOST_POINTS = 3000
 """More points of a curve than this cannot be told apart."""
+STEEP = 12.0
+"""From this ratio of largest to smallest value on, the levels of a map are spaced by factors."""
+_NEARLY_FLAT = 1e-3
+"""A map whose values differ by less than this share has no contours worth drawing."""
 
 
 @dataclass(frozen=True)
@@ -132,6 +146,22 @@ class Field:
     even: bool = False
     scale: Limits | None = None
 
+    @property
+    def known(self) -> FloatArray:
+        """The values, NaN where one is not finite."""
+        return np.where(np.isfinite(self.values), self.values, np.nan)
+
+    @property
+    def nothing(self) -> str:
+        """Why there are no contours to draw; empty where there are."""
+        finite = self.values[np.isfinite(self.values)]
+        if len(finite) == 0:
+            unbounded = np.isinf(self.values).any()
+            return "not bounded" if unbounded else "nothing to show: no value is known here"
+        if float(np.ptp(finite)) <= _NEARLY_FLAT * max(abs(float(finite.max())), 1e-12):
+            return f"{number(float(finite.mean()), self.unit)} everywhere"
+        return ""
+
 
 @dataclass(frozen=True)
 class Arrows:
@@ -142,6 +172,12 @@ class Arrows:
     times: float = 1.0
     unit: str = ""
     colour: Colour = "blue"
+
+    @property
+    def known(self) -> tuple[FloatArray, FloatArray]:
+        """Places and vectors (m, 2) of those that are finite."""
+        some = np.isfinite(self.at).all(axis=1) & np.isfinite(self.vectors).all(axis=1)
+        return self.at[some], self.vectors[some]
 
 
 @dataclass(frozen=True)

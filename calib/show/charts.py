@@ -22,6 +22,7 @@ import numpy as np
 from calib.core.arrays import AnyArray, FloatArray
 from calib.core.errors import DISTRIBUTION, BadInputError
 from calib.core.plot import (
+    STEEP,
     Arrows,
     Band,
     Bars,
@@ -36,7 +37,6 @@ from calib.core.plot import (
     Shape,
     Text,
     every,
-    number,
     thinned,
 )
 from calib.core.writing import make_folder, write_atomically
@@ -52,8 +52,6 @@ _SYMBOLS = {
     "points": "circle", "cloud": "square", "crosses": "x-thin-open", "pluses": "cross-thin-open",
     "squares": "square", "diamonds": "diamond", "marks": "line-ns-open",
 }  # fmt: skip
-_STEEP = 12.0
-"""From this ratio of largest to smallest value on, a map's colours are spaced by factors."""
 
 
 def library() -> str:
@@ -371,17 +369,12 @@ class _Panel:
         """A map coloured by its values; by their logarithms where they span decades."""
         step = max(1, math.ceil(math.sqrt(field.values.size / _MOST_CELLS)))
         x, y = (axis[..., ::step] if axis.ndim == 1 else axis[::step, ::step] for axis in (field.x, field.y))
-        values = np.where(np.isfinite(field.values), field.values, np.nan)[::step, ::step]
-        finite = values[np.isfinite(values)]
-        if len(finite) == 0:
-            unbounded = bool(np.isinf(field.values).any())
-            self._sentence("not bounded" if unbounded else "nothing to show: no value is known here")
+        values = field.known[::step, ::step]
+        if field.nothing or not np.isfinite(values).any():
+            self._sentence(field.nothing or "no value is known here")
             return
-        low, high = field.scale or (float(finite.min()), float(finite.max()))
-        if high - low <= 1e-3 * max(abs(high), 1e-12):
-            self._sentence(f"{number(float(finite.mean()), field.unit)} everywhere")
-            return
-        steep = low > 0.0 and high > _STEEP * low and not field.even
+        low, high = field.scale or (float(np.nanmin(values)), float(np.nanmax(values)))
+        steep = low > 0.0 and high > STEEP * low and not field.even
         shades = np.log10(values) if steep else values
         ends = (math.log10(low), math.log10(high)) if steep else (low, high)
         colours: dict[str, Any] = {"colorscale": "@rising", "showscale": bool(field.bar)}
@@ -412,8 +405,7 @@ class _Panel:
         self._traces.append(dots | self._xy(x[known], y[known]))
 
     def _arrows(self, arrows: Arrows) -> None:
-        known = np.isfinite(arrows.at).all(axis=1) & np.isfinite(arrows.vectors).all(axis=1)
-        at, along = arrows.at[known], arrows.vectors[known]
+        at, along = arrows.known
         if len(at) == 0:
             return
         ends = np.stack([at, at + arrows.times * along, np.full(at.shape, np.nan)], axis=1).reshape(-1, 2)

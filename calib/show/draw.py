@@ -36,8 +36,10 @@ from matplotlib.patches import Polygon
 from matplotlib.textpath import text_to_path
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
+from calib.core import plot
 from calib.core.arrays import FloatArray
 from calib.core.plot import (
+    STEEP,
     WIDTH_IN,
     Arrows,
     Band,
@@ -52,18 +54,13 @@ from calib.core.plot import (
     Rule,
     Shape,
     Text,
-    number,
     rectangle,
     round_down,
 )
 from calib.core.result import Result
 from calib.core.writing import Kind, begins, make_folder, write_atomically
 
-HUES = {
-    "ink": "#1d2730", "grey": "#66727d", "silver": "#b9c0c7", "shade": "#e9ecef", "blue": "#0072B2",
-    "sky": "#56B4E9", "ice": "#e1eef7", "green": "#009E73", "mint": "#dff1ea", "orange": "#E69F00",
-    "ochre": "#fdeccc", "peach": "#f6cfb2", "red": "#D55E00", "purple": "#CC79A7",
-}  # fmt: skip
+HUES = {name: light for name, (light, _) in plot.HUES.items()}
 _HATCHES: dict[object, tuple[str, str]] = {"ochre": ("//", HUES["orange"]), "shade": ("///", HUES["silver"])}
 _INK, _GREY = HUES["ink"], HUES["grey"]
 _RISING = LinearSegmentedColormap.from_list(
@@ -414,8 +411,7 @@ def _shape(axes: Axes, shape: Shape, z: float) -> None:
 
 def _arrows(axes: Axes, arrows: Arrows, z: float) -> None:
     """Arrows, and above the upper right corner, level with the title, one of a round length."""
-    known = np.isfinite(arrows.at).all(axis=1) & np.isfinite(arrows.vectors).all(axis=1)
-    at, vectors = arrows.at[known], arrows.vectors[known]
+    at, vectors = arrows.known
     if len(at) == 0:
         return
     drawn = axes.quiver(
@@ -438,34 +434,25 @@ def _arrows(axes: Axes, arrows: Arrows, z: float) -> None:
 # ----------------------------------------------------------------------
 # Maps.
 
-_NEARLY_FLAT = 1e-3
-"""A map whose values differ by less than this share has no contours worth drawing."""
-_STEEP = 12.0
-"""From this ratio of largest to smallest value on, levels are spaced by factors."""
-
 
 def _field(axes: Axes, field: Field) -> None:
     """Filled contours with their values on the lines, hatched where unknown; a sentence if there are none."""
-    known = np.where(np.isfinite(field.values), field.values, np.nan)
+    known = field.known
     finite = known[np.isfinite(known)]
     x, y = field.x, field.y
     if len(finite) < known.size:
         whole = rectangle(float(x.min()), float(y.min()), float(np.ptp(x)), float(np.ptp(y)))
         _shape(axes, Shape(whole, "shade", hatched=True), 0.4)
-    if len(finite) == 0:
-        unbounded = np.isinf(field.values).any()
-        _empty(axes, "not bounded" if unbounded else "nothing to show: no value is known here")
-        return
-    if float(np.ptp(finite)) <= _NEARLY_FLAT * max(abs(float(finite.max())), 1e-12):
+    if field.nothing:
         flat = np.where(np.isfinite(known), 0.25, np.nan)
         axes.pcolormesh(x, y, flat, cmap=_RISING, vmin=0.0, vmax=1.0, zorder=1.0)
-        _empty(axes, f"{number(float(finite.mean()), field.unit)} everywhere")
+        _empty(axes, field.nothing)
         return
     levels = contour_levels(finite, even=field.even) if field.levels is None else field.levels
     norm: Normalize = BoundaryNorm(levels, _RISING.N)
     if field.scale is not None:
         low, high = field.scale
-        norm = LogNorm(low, high) if 0.0 < low < high / _STEEP else Normalize(0.0, high)
+        norm = LogNorm(low, high) if 0.0 < low < high / STEEP else Normalize(0.0, high)
         levels = np.unique(np.maximum(levels, 0.5 * low)) if isinstance(norm, LogNorm) else levels
     filled = axes.contourf(x, y, known, levels=levels, cmap=_RISING, norm=norm, zorder=1.0)
     inside = levels[(levels > finite.min()) & (levels < finite.max())]
@@ -484,7 +471,7 @@ def contour_levels(values: FloatArray, *, even: bool = False) -> FloatArray:
     """Round levels that enclose all finite values: by 1-2-5 where these span decades, else evenly spaced."""
     finite = values[np.isfinite(values)]
     low, high = float(finite.min()), float(finite.max())
-    if low > 0.0 and high > _STEEP * low and not even:
+    if low > 0.0 and high > STEEP * low and not even:
         first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
         steps = ("1", "2", "5") if high / low < 3e3 else ("1",)
         # One decade more on both sides: logarithms of round numbers may be off by their last digit.

@@ -18,7 +18,7 @@ from calib import __version__
 from calib.core.constants import constants
 from calib.core.errors import BadInputError
 from calib.core.files import read_bytes, read_text, sha256
-from calib.core.plot import Figure
+from calib.core.plot import HUES, Figure
 from calib.core.rig import KINDS, Rig, kind_of
 from calib.core.words import BLANK, as_words, facts, number, short, unit_of
 from calib.core.writing import Kind, holds, make_folder, write_atomically
@@ -46,7 +46,9 @@ def render(
     """
     import jinja2
 
-    words = "".join(_resource(name) for name in (*script, *(("charts.js",) if charts else ())))
+    hues = {look: {name: pair[k] for name, pair in HUES.items()} for k, look in enumerate(("light", "dark"))}
+    drawn = f"const HUES = {json.dumps(hues)};\n{_resource('charts.js')}" if charts else ""
+    words = "".join(_resource(name) for name in script) + drawn
     drawing = library() if charts else ""
     hashes = [base64.b64encode(hashlib.sha256(one.encode()).digest()).decode() for one in (words, drawing)]
     environment = jinja2.Environment(

@@ -1,14 +1,6 @@
 "use strict";
 (() => {
-  // Colours on paper of either kind; places on the scale run from dark violet to green.
-  const HUES = {
-    light: { ink: "#1d2730", grey: "#66727d", silver: "#b9c0c7", shade: "#e9ecef", blue: "#0072B2", sky: "#56B4E9",
-      ice: "#e1eef7", green: "#009E73", mint: "#dff1ea", orange: "#E69F00", ochre: "#fdeccc", peach: "#f6cfb2",
-      red: "#D55E00", purple: "#CC79A7", grid: "#d3d8dd", paper: "#ffffff" },
-    dark: { ink: "#e8ecef", grey: "#a7b2bb", silver: "#6c7780", shade: "#2f3941", blue: "#4da9e0", sky: "#8fd0f7",
-      ice: "#20384a", green: "#2fc79b", mint: "#1c3d32", orange: "#f0b429", ochre: "#4a3a14", peach: "#6b4426",
-      red: "#ff8a4c", purple: "#e19cc4", grid: "#36414a", paper: "#1b2227" },
-  };
+  // HUES are those of calib.core.plot, on paper of either kind; places on the scale run from dark violet to green.
   const SCALE = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
   const RISING = { light: [[0, "#f6fafd"], [0.5, "#98c5e1"], [1, "#2173ad"]],
     dark: [[0, "#1f2f3a"], [0.5, "#2f6f9c"], [1, "#8fd0f7"]] };
