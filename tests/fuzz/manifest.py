@@ -34,7 +34,7 @@ def check(data: bytes, folder: Path) -> None:
             continue
         assert len({rig.name.casefold() for rig in manifest.rigs}) == len(manifest.rigs) > 0
         for rig in manifest.rigs:
-            place = store.result(rig.name, "rig.yaml").resolve()
+            place = (store.out / "rigs" / rig.name / "rig.yaml").resolve()
             assert place.parent.parent == (folder / "out" / "rigs").resolve(), rig.name
             assert is_url(rig.source) or Path(rig.source).is_absolute()
             assert (rig.name + rig.source + rig.serial).isprintable()

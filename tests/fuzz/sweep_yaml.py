@@ -6,7 +6,7 @@ import sys
 from itertools import islice
 from pathlib import Path
 
-MODULES = ("calib.runner.sweep", "calib.runner.sweep")
+MODULES = ("calib.runner.sweep",)
 
 WORDS = (
     b"base:", b"grid:", b"draws:", b"measure:", b"near:", b"controller:", b"scenario:", b"filter: fused",
@@ -35,7 +35,7 @@ def check(data: bytes, folder: Path) -> None:
     assert all(tuple(name for name, _ in case.values) == spec.names for case in first)
     if spec.base.duration_s is None or spec.base.duration_s > _LONGEST_S:
         return
-    (result,) = run_cases(spec.base, first[:1], spec.seed, str(folder))
+    (result,) = run_cases(spec.base, first[:1], spec.seed)
     assert bool(result.measures) != bool(result.sentence)
     assert "internal error" not in result.sentence, result.sentence
     assert result.sentence.isprintable() and len(result.sentence) < 2000, repr(result.sentence)
