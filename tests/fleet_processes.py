@@ -17,8 +17,8 @@ COMMAND = (sys.executable, "-c", "from calib.cli.main import main; main()")
 
 
 def done(out: Path) -> int:
-    """How many rigs, or bundles of cases, have ended."""
-    return len(list((out / ".fleet" / "outcomes").glob("*.json")))
+    """How many rigs or cases have ended."""
+    return len(list(out.glob(".*/outcomes/*.json")))
 
 
 def workers(parent: int) -> list[int]:

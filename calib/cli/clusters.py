@@ -14,7 +14,7 @@ from calib.core.errors import UsageError
 
 if TYPE_CHECKING:
     from calib.core.workers import Processes
-    from calib.runner.fleet import Store
+    from calib.runner.outcomes import Store
 
 OutOption = Annotated[
     Path, typer.Option("-o", "--output", help="Folder for the results; a later run goes on from it.")
@@ -42,7 +42,7 @@ def check_places(scheduler: str | None, workers: int | None) -> None:
 @contextmanager
 def opened_out(output: Path, verb: str, outputs: tuple[str, ...]) -> Iterator[Store]:
     """The output folder, see `opened_store`; says so where the last run there was interrupted."""
-    from calib.runner.fleet import opened_store
+    from calib.runner.outcomes import opened_store
 
     with opened_store(output, verb, outputs) as (store, interrupted):
         if interrupted:

@@ -20,7 +20,8 @@ from calib.cli.common import JsonOption, document, narrate, progress_bar, say, t
 from calib.core.errors import EXIT_POOR
 
 if TYPE_CHECKING:
-    from calib.runner.fleet import Counts, FleetSummary
+    from calib.runner.fleet import FleetSummary
+    from calib.runner.outcomes import Counts
 
 __all__ = ["fleet"]
 
@@ -61,7 +62,8 @@ def fleet(
     """
     from calib.core.files import shown
     from calib.core.units import parse_duration_s
-    from calib.runner.fleet import TIMINGS, check_apart, finish, run_fleet
+    from calib.runner.fleet import check_apart, finish, run_fleet
+    from calib.runner.outcomes import TIMINGS
     from calib.runner.task import SCHEMES, Allowed, FleetOptions, read_manifest, twice_told
     from calib.show.fleet import PAGE, write_fleet_page
 

@@ -46,7 +46,7 @@ def sweep(
     """
     from calib.core.files import shown
     from calib.core.units import parse_duration_s
-    from calib.runner.fleet import TIMINGS
+    from calib.runner.outcomes import TIMINGS
     from calib.runner.sweep import read_sweep, run_sweep, summarise_sweep
     from calib.show.fleet import SWEEP_PAGE, write_sweep_page
 
@@ -55,8 +55,8 @@ def sweep(
     known = read_sweep(spec)
     with opened_out(output, "calib sweep", ("sweep.parquet", SWEEP_PAGE, TIMINGS)) as store:
         with processes(store, scheduler, workers, retries) as pool, progress_bar("cases") as progress:
-            before = run_sweep(store, pool, known, progress, limit_s)
-        summary = summarise_sweep(store, known, before)
+            counts = run_sweep(store, pool, known, progress, limit_s)
+        summary = summarise_sweep(store, known, counts.as_before)
         write_sweep_page(output / SWEEP_PAGE, known, summary)
     if as_json:
         document("sweep", {"sweep": _as_json(summary)})

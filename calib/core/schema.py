@@ -27,6 +27,7 @@ _EXPECTED = {
     "float_type": "a number",
     "int_type": "a whole number",
     "int_from_float": "a whole number",
+    "invalid_key": "text as a key",
     "list_type": "a list",
     "model_attributes_type": "keys with values",
     "model_type": "keys with values",
@@ -72,8 +73,8 @@ def _refuse_endless(value: Any, source: Path | str, key: str) -> None:
     parts = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for name, part in parts:
         _refuse_endless(part, source, f"{key}.{name}" if key else str(name))
-    if isinstance(value, int | float) and math.isfinite(value) and abs(value) > _MOST:
-        raise BadInputError(f"{shown(source)}: {one_line(key)} is {value:g}, expected at most {_MOST:g}")
+    if isinstance(value, int | float) and _MOST < abs(value) < math.inf:
+        raise BadInputError(f"{shown(source)}: {one_line(key)} is {quoted(value)}, expected at most {_MOST:g}")
 
 
 def contradiction(text: str) -> PydanticCustomError:
@@ -179,8 +180,8 @@ def _kinds(part: Any, whole: dict[str, Any]) -> list[dict[str, Any]]:
         return [{}]
     if "$ref" in part:
         return _kinds(whole["$defs"][part["$ref"].rpartition("/")[2]], whole)
-    if "anyOf" in part:
-        return [kind for one in part["anyOf"] if one.get("type") != "null" for kind in _kinds(one, whole)]
+    if several := part.get("anyOf") or part.get("oneOf"):
+        return [kind for one in several if one.get("type") != "null" for kind in _kinds(one, whole)]
     return [part]
 
 

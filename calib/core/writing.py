@@ -226,8 +226,8 @@ def _through(path: Path) -> int | None:
 
 
 @contextlib.contextmanager
-def replacing(path: Path, kind: Kind | None = None) -> Iterator[BinaryIO]:
-    """A stream whose bytes become the file when all of them are there and on the disk.
+def replacing(path: Path, kind: Kind | None = None, durable: bool = True) -> Iterator[BinaryIO]:
+    """A stream whose bytes become the file when all of them are there and, if `durable`, on the disk.
 
     Raises `BadInputError` as `check_writable`, and when the disk is full or the place cannot be written; the
     old file then survives. `ReaderGoneError` for a pipe that nobody reads any more.
@@ -250,7 +250,8 @@ def replacing(path: Path, kind: Kind | None = None) -> Iterator[BinaryIO]:
         with _beside(target) as (stream, temporary):
             yield stream
             stream.flush()
-            os.fsync(stream.fileno())
+            if durable:
+                os.fsync(stream.fileno())
             _take_over(target, temporary)
             if os.name == "nt":
                 stream.close()
@@ -260,12 +261,18 @@ def replacing(path: Path, kind: Kind | None = None) -> Iterator[BinaryIO]:
         raise ReaderGoneError("") from error
     except OSError as error:
         raise BadInputError(f"{shown(path)}: cannot be written: {error.strerror or error}") from error
+    if durable:
+        settle(target.parent)
+
+
+def settle(folder: Path) -> None:
+    """Let the disk know of what was renamed in a folder."""
     with contextlib.suppress(OSError):
-        folder = os.open(target.parent, os.O_RDONLY)
+        descriptor = os.open(folder, os.O_RDONLY)
         try:
-            os.fsync(folder)
+            os.fsync(descriptor)
         finally:
-            os.close(folder)
+            os.close(descriptor)
 
 
 def appending(path: Path, kind: Kind | None = None) -> BinaryIO:
@@ -281,10 +288,10 @@ def appending(path: Path, kind: Kind | None = None) -> BinaryIO:
         raise BadInputError(f"{shown(path)}: cannot be written: {error.strerror or error}") from error
 
 
-def write_atomically(path: Path, data: bytes | str, kind: Kind | None = None) -> None:
+def write_atomically(path: Path, data: bytes | str, kind: Kind | None = None, durable: bool = True) -> None:
     """Replace a file as a whole. Raises as `replacing`."""
     raw = data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data
-    with replacing(path, kind) as stream:
+    with replacing(path, kind, durable) as stream:
         stream.write(raw)
 
 

@@ -7,7 +7,7 @@ import json
 import os
 import platform
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -17,7 +17,7 @@ from typing import Any
 from calib import __version__
 from calib.core.errors import BadInputError
 from calib.core.files import sha256, shown
-from calib.core.writing import try_lock, write_atomically
+from calib.core.writing import check_folder, make_folder, settle, sweep, try_lock, write_atomically
 from calib.runner.folder import digest_of
 
 # ----------------------------------------------------------------------
@@ -36,7 +36,41 @@ def _holder(path: Path) -> str:
 
 
 @contextmanager
-def held(path: Path, folder: Path, verb: str = "calib run") -> Iterator[int | None]:
+def opened(
+    out: Path, hidden: Path, verb: str, public: Sequence[str], kept: Sequence[str], scratch: str
+) -> Iterator[int | None]:
+    """Make and lock an output folder; yields the process whose run was interrupted there, or None.
+
+    Parameters
+    ----------
+    hidden : folder within it that is a verb's own; where that is, it has worked here before.
+    public : names in `out` of what it writes. kept : folders in `hidden`, scratch : one that is emptied.
+
+    Raises `BadInputError` when another run is at work there, for links that would lead a write out of it, and
+    for something of another origin.
+    """
+    check_folder(out)
+    ours = [out / name for name in public]
+    for path in (hidden, *(hidden / name for name in (*kept, scratch)), *ours):
+        if path.is_symlink():
+            raise BadInputError(f"{shown(path)}: is a symbolic link, expected a place in the output folder")
+    for path in ours:
+        if path.exists() and not hidden.exists():
+            raise BadInputError(
+                f"{shown(path)}: is there, and is not the work of {verb}; expected another output folder"
+            )
+    make_folder(hidden)
+    with held(hidden / "lock", out, verb) as interrupted:
+        remove(hidden / scratch)
+        for place in (out, hidden, *(hidden / name for name in kept)):
+            sweep(place)
+        for name in (*kept, scratch):
+            make_folder(hidden / name)
+        yield interrupted
+
+
+@contextmanager
+def held(path: Path, folder: Path, verb: str) -> Iterator[int | None]:
     """Hold the lock; yields the number of a process whose run was interrupted here, None without one.
 
     Raises `BadInputError` while another process holds it, and where the file cannot be made.
@@ -199,21 +233,11 @@ def store(work: Path, folder: Path, key: str, code: int, trash: Path) -> Result:
         if folder.exists():
             folder.rename(trash)
         work.rename(folder)
-        _settle(folder.parent)
+        settle(folder.parent)
     except OSError as error:
         raise BadInputError(f"{shown(folder)}: cannot be written: {error.strerror or error}") from error
     remove(trash)
     return Result(folder, key, code, files)
-
-
-def _settle(folder: Path) -> None:
-    """Let the disk know of what was renamed in a folder."""
-    with contextlib.suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
 
 
 def remove(folder: Path) -> None:

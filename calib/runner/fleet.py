@@ -1,83 +1,133 @@
-"""Many rigs: rows, spread, drift over serial numbers, outliers, results on the disk."""
+"""A fleet: rows of its rigs, spread and drift of their constants, who stands out."""
 
 from __future__ import annotations
 
-import contextlib
 import heapq
-import json
 import math
 import os
 import re
-import shutil
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
-from itertools import islice
-from pathlib import Path, PurePosixPath
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from calib.core.arrays import FloatArray
-from calib.core.errors import EXIT_INTERNAL, BadInputError
-from calib.core.files import one_line, sha256, shown
+from calib.core.errors import BadInputError
+from calib.core.files import shown
 from calib.core.words import unit_of
-from calib.core.workers import Failure, Processes, Task, run_tasks
-from calib.core.writing import check_folder, check_writable, make_folder, replacing, sweep, write_atomically
-from calib.runner.cache import held
-from calib.runner.folder import digest_of
+from calib.core.workers import Processes, Task
+from calib.runner.outcomes import (
+    LIMIT_S,
+    Counts,
+    Outcome,
+    Progress,
+    Store,
+    arrow_table,
+    column,
+    run_all,
+    texts,
+    typed,
+    write_table,
+    write_timings,
+)
 from calib.runner.task import (
-    SAME,
-    Answer,
     FleetOptions,
     Manifest,
-    Outcome,
     RigSpec,
     calibrate_rig,
-    from_json,
     is_url,
     serial_number,
-    to_json,
     without_secrets,
 )
 
 # ----------------------------------------------------------------------
-# Outcomes as rows of a table.
-#
+# A fleet from its manifest to its outcomes: what still holds is left alone, all else is done.
+
+
+def run_fleet(
+    store: Store,
+    processes: Processes,
+    manifest: Manifest,
+    options: FleetOptions,
+    progress: Progress = lambda done, total: None,
+    tell: Callable[[str], None] = lambda _: None,
+    limit_s: float = LIMIT_S,
+) -> Counts:
+    """Run all rigs whose results are not there, each in `limit_s` seconds at most. Raises as `run_all`."""
+    tasks = (
+        Task(spec.name, calibrate_rig, (spec, options, store.known(spec.name)), limit_s)
+        for spec in manifest.rigs
+    )
+    return run_all(store, processes, tasks, len(manifest.rigs), "rig", progress, tell)
+
+
+def check_apart(out: Path, rigs: Iterable[RigSpec]) -> None:
+    """Raise `BadInputError` where results would be written into a rig's folder, or over one."""
+    place = Path(os.path.realpath(out))
+    for rig in rigs:
+        if is_url(rig.source):
+            continue
+        source = Path(os.path.realpath(rig.source))
+        if place.is_relative_to(source):
+            raise BadInputError(f"{shown(out)}: lies in the folder of {rig.name}, expected another one")
+        if source.is_relative_to(place / "rigs") or source.is_relative_to(place / ".fleet"):
+            raise BadInputError(
+                f"{shown(rig.source)}: the folder of {rig.name} is where results are written, expected "
+                "another output folder"
+            )
+
+
+def finish(store: Store, manifest: Manifest) -> FleetSummary:
+    """Write fleet.parquet and the timings, and return the summary.
+
+    Raises `BadInputError` when a file cannot be written.
+    """
+    import pyarrow as pa
+
+    times: list[tuple[str, float, float | None]] = []
+
+    def kept() -> Iterator[tuple[RigSpec, Outcome]]:
+        for rig in manifest.rigs:
+            if (found := store.outcome(rig.name)) is not None:
+                times.append((found.name, found.seconds, found.peak_MB))
+                yield rig, found
+
+    table = table_of(kept())
+    write_timings(store.out, "name,seconds,peak_MB", times)
+    summary, worst, which = summarise(table)
+    known = np.isfinite(worst)
+    table = table.append_column("outlier_z", pa.array(worst, mask=~known))
+    table = table.append_column("outlier_of", pa.array(which, type=pa.string()))
+    table = table.append_column("stands_out", pa.array(known & (worst > summary.limit)))
+    write_table(store.out / "fleet.parquet", table)
+    return summary
+
+
 # Columns: name, serial, source, kind, verdict, code, sentence, reasons, `verdict.STAGE` for each stage,
 # `SECTION.NAME` and `SECTION.NAME.sigma` for each constant, and at last outlier_z and outlier_of, the
-# constant that stands out most against the fleet. A rig without a number has a null there. What each rig has
-# taken of time and memory stands in a file of its own, so that the same inputs give the same bytes here.
+# constant that stands out most against the fleet. A rig without a number has a null there.
 
 _FIRST = ("name", "serial", "source", "kind", "verdict", "code", "sentence", "reasons")
-_BLOCK = 512
 _MOST_COLUMNS = 8000
 
 
-def table_of(outcomes: Iterable[Outcome]) -> Any:
-    """Outcomes as an Arrow table, a row for each."""
-    blocks, left = [], iter(outcomes)
-    while rows := [_row(one) for one in islice(left, _BLOCK)]:
-        blocks.append(arrow_table(rows))
-    import pyarrow as pa
-
-    if not blocks:
-        return pa.table({name: pa.array([], pa.string()) for name in _FIRST})
-    whole = pa.concat_tables(blocks, promote_options="permissive")
+def table_of(rigs: Iterable[tuple[RigSpec, Outcome]]) -> Any:
+    """Rigs with their outcomes as an Arrow table, a row for each."""
+    whole = arrow_table((_row_of(rig, outcome) for rig, outcome in rigs), _FIRST)
     verdicts = [name for name in whole.column_names if name.startswith("verdict.")]
     constants = [name for name in whole.column_names if name not in (*_FIRST, *verdicts)]
-    whole = whole.select([*_FIRST, *verdicts, *constants[:_MOST_COLUMNS]])
-    kinds = [pa.int16() if name == "code" else pa.string() for name in (*_FIRST, *verdicts)]
-    kinds += [pa.float64()] * len(constants[:_MOST_COLUMNS])
-    return whole.cast(pa.schema(list(zip(whole.column_names, kinds, strict=True))))
+    kinds = dict.fromkeys([*_FIRST, *verdicts], "string") | {"code": "int16"}
+    return typed(whole, [*_FIRST, *verdicts, *constants[:_MOST_COLUMNS]], kinds)
 
 
-def _row(outcome: Outcome) -> dict[str, Any]:
+def _row_of(rig: RigSpec, outcome: Outcome) -> dict[str, Any]:
     row: dict[str, Any] = {
-        "name": outcome.name,
-        "serial": outcome.serial,
-        "source": outcome.source,
+        "name": rig.name,
+        "serial": rig.serial,
+        "source": without_secrets(rig.source),
         "kind": outcome.kind,
         "verdict": outcome.status,
         "code": outcome.code,
@@ -88,34 +138,6 @@ def _row(outcome: Outcome) -> dict[str, Any]:
     for name, (value, sigma) in outcome.values.items():
         row[name], row[f"{name}.sigma"] = value, sigma
     return row
-
-
-def arrow_table(rows: Sequence[Mapping[str, Any]]) -> Any:
-    """Rows as an Arrow table, with nulls where a row has no such value."""
-    import pyarrow as pa
-
-    names = dict.fromkeys(name for row in rows for name in row)
-    return pa.table({name: [row.get(name) for row in rows] for name in names})
-
-
-def column(table: Any, name: str) -> FloatArray:
-    """Numbers (n,) of a column, NaN for nulls and for a column that is not there."""
-    if name not in table.column_names:
-        return np.full(table.num_rows, np.nan)
-    return np.asarray(table[name].to_numpy(), dtype=np.float64)
-
-
-def texts(table: Any, name: str) -> list[str]:
-    """Texts of a column, "" for nulls."""
-    return [value or "" for value in table[name].to_pylist()]
-
-
-def write_table(path: Path, table: Any) -> None:
-    """Write a table as Parquet. Raises `BadInputError` when it cannot be written."""
-    import pyarrow.parquet
-
-    with replacing(path) as stream:
-        pyarrow.parquet.write_table(table, stream, compression="zstd")
 
 
 # ----------------------------------------------------------------------
@@ -532,241 +554,3 @@ def _looks(
             why.append(f"{which[i]} is {z:.1f} standard deviations from the fleet's median")
         looks.append(Look(names[i], serials[i], verdicts[i], "; ".join(why), z))
     return tuple(looks), len(ranked)
-
-
-# ----------------------------------------------------------------------
-# The output folder of a fleet: what is kept of each rig, and which of it still holds.
-#
-#     rigs/NAME/               results of a rig, as a single run leaves them
-#     .fleet/outcomes/NAME.json    how it ended; written last, so that what it tells of is there
-#     .fleet/lock              one fleet at a time
-#     .fleet/scratch/          temporary files of this machine's processes, gone at the end
-#
-# All is written by one process, the one that was started by a person: workers need not see this folder.
-
-HIDDEN = ".fleet"
-_MOST_BYTES = 5_000_000
-
-
-class Store:
-    """An output folder that is ours while it is open."""
-
-    def __init__(self, out: Path) -> None:
-        self.out = out
-        self.scratch = out / HIDDEN / "scratch"
-
-    def _file(self, name: str) -> Path:
-        return self.out / HIDDEN / "outcomes" / f"{name}.json"
-
-    def outcome(self, name: str) -> Outcome | None:
-        """How a rig has ended, None where that is not known."""
-        path = self._file(name)
-        with contextlib.suppress(OSError, ValueError):
-            if path.stat().st_size <= _MOST_BYTES:
-                found = from_json(path.read_text(encoding="utf-8"))
-                return found if found is not None and found.name == name else None
-        return None
-
-    def known(self, name: str) -> str:
-        """Key of a rig's result, "" where there is none or its files are not what they were."""
-        found = self.outcome(name)
-        if found is None or not found.key:
-            return ""
-        for file, digest in found.files.items():
-            path = self.out / "rigs" / name / file
-            try:
-                if path.is_symlink() or digest_of(path) != digest:
-                    return ""
-            except BadInputError:
-                return ""
-        return found.key
-
-    def keep(self, answer: Answer) -> None:
-        """Write a rig's results, then its outcome."""
-        outcome = answer.outcome
-        place = self.out / "rigs" / outcome.name
-        if place.is_symlink():
-            raise BadInputError(f"{shown(place)}: is a symbolic link, expected a place in the output folder")
-        with contextlib.suppress(OSError):
-            # What is about to be replaced must not count as a result any more.
-            self._file(outcome.name).unlink()
-        shutil.rmtree(place, ignore_errors=True)
-        for name, data in answer.files.items():
-            parts = PurePosixPath(name).parts
-            if len(parts) > 2 or ".." in parts or name.startswith("/") or sha256(data) != outcome.files[name]:
-                raise BadInputError(f"{outcome.name}: a worker has sent {name[:80]!r}, which is no result")
-            make_folder((place / name).parent)
-            write_atomically(place / name, data)
-        write_atomically(self._file(outcome.name), to_json(outcome))
-
-
-def check_apart(out: Path, rigs: Iterable[RigSpec]) -> None:
-    """Raise `BadInputError` where results would be written into a rig's folder, or over one."""
-    place = Path(os.path.realpath(out))
-    for rig in rigs:
-        if is_url(rig.source):
-            continue
-        source = Path(os.path.realpath(rig.source))
-        if place.is_relative_to(source):
-            raise BadInputError(f"{shown(out)}: lies in the folder of {rig.name}, expected another one")
-        if source.is_relative_to(place / "rigs") or source.is_relative_to(place / HIDDEN):
-            raise BadInputError(
-                f"{shown(rig.source)}: the folder of {rig.name} is where results are written, expected "
-                "another output folder"
-            )
-
-
-@contextmanager
-def opened_store(out: Path, verb: str, outputs: tuple[str, ...]) -> Iterator[tuple[Store, bool]]:
-    """Make and lock an output folder; yields it, and whether the last run there was interrupted.
-
-    Parameters
-    ----------
-    outputs : names of the files that will be written in it at the end.
-
-    Raises `BadInputError` when it cannot be written or another process is at work there.
-    """
-    check_folder(out)
-    hidden = out / HIDDEN
-    for path in (hidden, out / "rigs", hidden / "outcomes", hidden / "scratch"):
-        if path.is_symlink():
-            raise BadInputError(f"{shown(path)}: is a symbolic link, expected a place in the output folder")
-    for name in ("rigs", *outputs):
-        if (out / name).exists() and not hidden.exists():
-            raise BadInputError(
-                f"{shown(out / name)}: is there, and is not the work of {verb}; expected another output "
-                "folder"
-            )
-    make_folder(hidden / "outcomes")
-    for name in outputs:
-        check_writable(out / name)
-    with held(hidden / "lock", out, verb) as interrupted:
-        told = hidden / "verb.json"
-        before = _verb(told)
-        if before not in ("", verb):
-            raise BadInputError(f"{shown(out)}: holds the results of {before}, expected another folder")
-        write_atomically(told, json.dumps({"verb": verb}) + "\n")
-        for folder in (out, hidden / "outcomes", hidden):
-            sweep(folder)
-        store = Store(out)
-        shutil.rmtree(store.scratch, ignore_errors=True)
-        make_folder(store.scratch)
-        yield store, interrupted is not None
-        shutil.rmtree(store.scratch, ignore_errors=True)
-
-
-def _verb(path: Path) -> str:
-    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-        return str(json.loads(path.read_text(encoding="utf-8"))["verb"])
-    return ""
-
-
-# ----------------------------------------------------------------------
-# A fleet from its manifest to its outcomes: what still holds is left alone, all else is done.
-
-Progress = Callable[[int, int], None]
-LIMIT_S = 3600.0
-"""Time that a rig has."""
-
-
-@dataclass
-class Counts:
-    """How many rigs were done now, by how they ended, and how many were done before."""
-
-    by_status: Counter[str] = field(default_factory=Counter)
-    as_before: int = 0
-
-    @property
-    def done(self) -> int:
-        """All of them."""
-        return self.as_before + sum(self.by_status.values())
-
-
-def run_fleet(
-    store: Store,
-    processes: Processes,
-    manifest: Manifest,
-    options: FleetOptions,
-    progress: Progress = lambda done, total: None,
-    tell: Callable[[str], None] = lambda _: None,
-    limit_s: float = LIMIT_S,
-) -> Counts:
-    """Run all rigs whose results are not there, each in `limit_s` seconds at most.
-
-    Raises `BadInputError` as `run_tasks` and `Store.keep`.
-    """
-    counts, total = Counts(), len(manifest.rigs)
-    progress(0, total)
-    tasks = (
-        Task(spec.name, calibrate_rig, (spec, options, store.known(spec.name)), limit_s)
-        for spec in manifest.rigs
-    )
-    for task, result in run_tasks(processes, tasks):
-        answer = _answer(task, result)
-        outcome = answer.outcome
-        if outcome.status == SAME:
-            counts.as_before += 1
-        else:
-            store.keep(answer)
-            counts.by_status[outcome.status] += 1
-            if outcome.status != "ok":
-                tell(f"{outcome.name}: {outcome.status} ({outcome.sentence})")
-        progress(counts.done, total)
-    return counts
-
-
-def _answer(task: Task, result: Any) -> Answer:
-    if isinstance(result, Answer):
-        return result
-    status, sentence = "broken", f"internal error: {type(result).__name__}"
-    if isinstance(result, Failure):
-        status = "broken" if result.how == "raised" else "lost"
-        sentence = sentence_of(result, task, "rig")
-    spec = task.arguments[0]
-    blank = Outcome(spec.name, spec.serial, without_secrets(spec.source), status, EXIT_INTERNAL, sentence)
-    return Answer(blank, {})
-
-
-def sentence_of(failure: Failure, task: Task, what: str) -> str:
-    """Why a task, a rig or a case, has no result."""
-    if failure.how == "died":
-        return "each process that tried it died: out of memory, or a fault in a library"
-    if failure.how == "over":
-        return f"was not done after {task.limit_s:g} s, which is the --timeout of a {what}"
-    error = failure.error
-    return f"internal error: {type(error).__name__}: {one_line(' '.join(str(error).split()))[:200]}"
-
-
-TIMINGS = "timings.csv"
-
-
-def write_timings(out: Path, head: str, rows: Iterable[Sequence[Any]]) -> None:
-    """Write what each rig or case has taken, as CSV. Raises `BadInputError` when it cannot be written."""
-    lines = (",".join(map(str, row)) + "\n" for row in rows)
-    write_atomically(out / TIMINGS, f"{head}\n{''.join(lines)}")
-
-
-def finish(store: Store, manifest: Manifest) -> FleetSummary:
-    """Write fleet.parquet and the timings, and return the summary.
-
-    Raises `BadInputError` when a file cannot be written.
-    """
-    import pyarrow as pa
-
-    times: list[tuple[str, float, float | None]] = []
-
-    def outcomes() -> Iterator[Outcome]:
-        for rig in manifest.rigs:
-            if (found := store.outcome(rig.name)) is not None:
-                times.append((found.name, found.seconds, found.peak_MB))
-                yield found
-
-    table = table_of(outcomes())
-    write_timings(store.out, "name,seconds,peak_MB", times)
-    summary, worst, which = summarise(table)
-    known = np.isfinite(worst)
-    table = table.append_column("outlier_z", pa.array(worst, mask=~known))
-    table = table.append_column("outlier_of", pa.array(which, type=pa.string()))
-    table = table.append_column("stands_out", pa.array(known & (worst > summary.limit)))
-    write_table(store.out / "fleet.parquet", table)
-    return summary

@@ -15,8 +15,8 @@ from calib.core.errors import EXIT_DONE, EXIT_INTERNAL, EXIT_POOR, BadInputError
 from calib.core.files import inside, one_line, shown
 from calib.core.rig import SCHEMA, Rig
 from calib.core.workers import Failure, Processes, Task
-from calib.core.writing import check_folder, make_folder, sweep, write_atomically
-from calib.runner.cache import Result, held, key_of, load, remove, store
+from calib.core.writing import make_folder, write_atomically
+from calib.runner.cache import Result, key_of, load, opened, remove, store
 from calib.runner.folder import Folder, LogFile, digest_of, folder_digests, with_beside
 from calib.runner.work import Work, perform
 from calib.stages import stage
@@ -296,12 +296,8 @@ _USABLE = (EXIT_DONE, EXIT_POOR)
 
 
 @contextmanager
-def opened(out: Path, folder: Path | None) -> Iterator[int | None]:
-    """Make and lock the output folder; yields the process whose run was interrupted there, or None.
-
-    Raises `BadInputError` when another run is at work there, when it is the folder that is read, and for
-    links that would lead a write out of it.
-    """
+def opened_run(out: Path, folder: Path | None) -> Iterator[int | None]:
+    """Make and lock the output folder of a run, see `opened`; it must not be the folder that is read."""
     if folder is not None and (
         os.path.realpath(out) == os.path.realpath(folder)
         or any(inside(out, folder / name) for name in ("images", "logs"))
@@ -309,25 +305,8 @@ def opened(out: Path, folder: Path | None) -> Iterator[int | None]:
         raise BadInputError(
             f"{shown(out)}: lies in the folder that is read, expected another one for the results"
         )
-    check_folder(out)
-    hidden = out / HIDDEN
-    ours = [hidden / name for name in ("work", "stages", "pictures", "figures")]
-    public = [out / name for name in ("states", "firmware", "rig.yaml", "report.html")]
-    for path in (hidden, *ours, *public):
-        if path.is_symlink():
-            raise BadInputError(f"{shown(path)}: is a symbolic link, expected a place in the output folder")
-    for path in public:
-        if path.exists() and not hidden.exists():
-            raise BadInputError(
-                f"{shown(path)}: is there, and is not the work of calib run; expected another output folder"
-            )
-    make_folder(hidden)
-    with held(hidden / "lock", out) as interrupted:
-        remove(hidden / "work")
-        for place in (out, hidden, hidden / "pictures", hidden / "figures"):
-            sweep(place)
-        make_folder(hidden / "work")
-        make_folder(hidden / "stages")
+    public = ("states", "firmware", "rig.yaml", "report.html")
+    with opened(out, out / HIDDEN, "calib run", public, ("stages", "pictures"), "work") as interrupted:
         yield interrupted
 
 

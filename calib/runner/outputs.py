@@ -20,7 +20,7 @@ from calib.io.columns import read_columns_file
 from calib.runner.cache import key_of, load, remove, store
 from calib.runner.decision import Decision, decide
 from calib.runner.folder import Folder, digest_of, read_folder
-from calib.runner.graph import HIDDEN, Job, Runner, opened
+from calib.runner.graph import HIDDEN, Job, Runner, opened_run
 from calib.runner.processes import local
 from calib.show.page import keep_pictures, write_page
 
@@ -214,7 +214,7 @@ def calibrate(
         read_columns_file(stated.columns)
     root = None if folder is None else Path(folder)
     seen = None if root is None else read_folder(root, follow_links, stated)
-    with opened(out, root) as interrupted, local(jobs or processors()) as pool:
+    with opened_run(out, root) as interrupted, local(jobs or processors()) as pool:
         if interrupted is not None:
             narrate("the last run here was interrupted; going on where it stopped")
         if seen is None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import itertools
 import json
@@ -10,32 +9,39 @@ import math
 import re
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache
-from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError, CalibError
-from calib.core.files import one_line, read_yaml_mapping, sha256, shown
+from calib.core.files import one_line, read_text, read_yaml_mapping, sha256, shown
+from calib.core.result import Number, Pair, Section
 from calib.core.rig import SCHEMA, Rig
+from calib.core.schema import contradiction, quoted, validated
 from calib.core.units import parse_duration_s
-from calib.core.workers import Failure, Processes, Task, run_tasks
-from calib.core.writing import write_atomically
+from calib.core.workers import Processes, Task
 from calib.runner.cache import program
-from calib.runner.fleet import (
-    HIDDEN,
+from calib.runner.outcomes import (
     LIMIT_S,
+    SAME,
+    Answer,
+    Counts,
+    Outcome,
     Progress,
     Store,
+    arrow_table,
     column,
-    sentence_of,
+    internal_error,
+    run_all,
     texts,
+    typed,
     write_table,
     write_timings,
 )
@@ -57,87 +63,164 @@ from calib.twin.rig import SimulatedRig, rig_from_file
 #       actuator.mass_kg: {normal: [0.05, 0.002]}
 #     measure: [jump_overshoot_rad, angle_rms_rad]
 #     near: 0.0                               optional: what the first measure should be, else the least is
-# best
+#                                             best
 #
-# `base` names a controller with its reference, a scenario of `calib simulate`, or a filter (fused,
-# baseline)
-# with the scenario whose log it gets. A parameter is a key of rig.yaml, or `scenario.OPTION`. Cases are
-# told
+# `base` names a controller with its reference, a scenario of `calib simulate`, or a filter (fused, baseline)
+# with the scenario whose log it gets. A parameter is a key of rig.yaml, or `scenario.OPTION`. Cases are told
 # apart by a number; the seed of a case's noise is that of its draw, so that all grid points see the same
 # noise.
 
 _SECTIONS = (
     "actuator", "pump", "twin", "controller", "estimator", "align", "imu", "imu_intrinsics", "scenario",
 )  # fmt: skip
-_KEYS = ("base", "grid", "draws", "measure", "near")
-_KINDS = ("controller", "scenario", "filter")
-_BASE = (*_KINDS, "reference", "rig", "feedback", "duration", "model")
-_FILTERS = ("fused", "baseline")
 _GAINS = {"orientation": "tuned-pid", "position": "tuned-pd", "computed_torque": "torque"}
-_MODELS = ("auto", "kinematic", "driven")
-_MOST_CASES = 1_000_000
+_MOST_CASES = 200_000
 _LONGEST_S = 3600.0
 _KEY = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)+")
 
-Value = float | str | bool
+Value = Annotated[float, Field(allow_inf_nan=False, strict=True)] | str | bool
 
 
-@dataclass(frozen=True)
-class Base:
-    """What each case is.
+class Base(Section):
+    """What each case is: a controller with its reference, a scenario, or a filter of a scenario's log.
 
-    Attributes
-    ----------
-    kind : "controller", "scenario" or "filter".
-    name : of the controller or filter, or of the scenario.
-    other : the reference of a controller, the scenario of a filter.
-    rig : text of the rig.yaml that controllers and filters know, "" for the nominal rig.
-    feedback : "sensors" or "truth". duration_s : None for the usual one. model : of a filter.
+    `rig` is the file that controllers and filters know, and once that is read its text; "" for the nominal
+    rig.
     """
 
-    kind: str
-    name: str
-    other: str
-    rig: str
-    feedback: str
-    duration_s: float | None
-    model: str
+    controller: str = ""
+    reference: str = ""
+    scenario: str = ""
+    filter: Literal["fused", "baseline"] | None = None
+    rig: str = ""
+    feedback: Literal["sensors", "truth"] = "sensors"
+    duration: str | None = None
+    model: Literal["auto", "kinematic", "driven"] = "auto"
+
+    @property
+    def kind(self) -> str:
+        """What it is."""
+        return "filter" if self.filter else "controller" if self.controller else "scenario"
+
+    @property
+    def name(self) -> str:
+        """Name of the controller, scenario or filter."""
+        return self.filter or self.controller or self.scenario
+
+    @property
+    def other(self) -> str:
+        """The reference of a controller, the scenario of a filter."""
+        return self.scenario if self.filter else self.reference if self.controller else ""
+
+    @property
+    def duration_s(self) -> float | None:
+        """None for the usual one. Raises `UsageError`."""
+        return None if self.duration is None else parse_duration_s(self.duration, "base.duration")
 
 
-@dataclass(frozen=True)
-class SweepSpec:
-    """A sweep.
+class Range(Section):
+    """Evenly spaced values, or such whose logarithms are."""
 
-    Attributes
-    ----------
-    grid : values of each parameter of the grid. draws : distribution of each random parameter.
-    count, seed : of the draws; one draw without any.
-    measures : names of what is measured, the first one decides; empty for all there are.
-    near : what the deciding measure should be, None where the least is best.
-    """
+    start: Number = Field(alias="from")
+    to: Number
+    count: Annotated[int, Field(ge=1, le=10_000, strict=True)]
+    log: bool = False
+
+    @model_validator(mode="after")
+    def _positive(self) -> Range:
+        if self.log and not (self.start > 0.0 and self.to > 0.0):
+            raise contradiction("log goes with positive numbers only")
+        return self
+
+    def values(self) -> list[float]:
+        """All of them."""
+        spaced = np.geomspace if self.log else np.linspace
+        numbers: list[float] = spaced(self.start, self.to, self.count).tolist()
+        return numbers
+
+
+class Distribution(Section):
+    """Two numbers under the name of a distribution."""
+
+    uniform: Pair | None = None
+    normal: Pair | None = None
+    log_uniform: Pair | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> Distribution:
+        if len(self.model_fields_set) != 1:
+            raise contradiction("uniform, normal or log_uniform: expected one of them")
+        kind, (a, b) = self.chosen()
+        if kind == "normal" and b < 0.0:
+            raise contradiction(f"normal has the standard deviation {b:g}, expected none below zero")
+        if kind != "normal" and not a < b:
+            raise contradiction(f"{kind} goes from {a:g} to {b:g}, expected the smaller one first")
+        if kind == "log_uniform" and a <= 0.0:
+            raise contradiction(f"log_uniform begins at {a:g}, expected a positive number")
+        return self
+
+    def chosen(self) -> tuple[str, list[float]]:
+        """Name and numbers of the one that is given."""
+        kind = next(iter(self.model_fields_set))
+        return kind, getattr(self, kind) or [0.0, 0.0]
+
+    def drawn(self, rng: np.random.Generator) -> float:
+        """One value."""
+        kind, (a, b) = self.chosen()
+        if kind == "log_uniform":
+            return math.exp(rng.uniform(math.log(a), math.log(b)))
+        return float(rng.normal(a, b) if kind == "normal" else rng.uniform(a, b))
+
+
+Values = Annotated[
+    Annotated[Range, Tag("range")] | Annotated[list[Value], Field(min_length=1), Tag("list")],
+    Discriminator(lambda told: "range" if isinstance(told, dict | Range) else "list"),
+]
+
+
+class Draws(BaseModel):
+    """How many random plants there are for each point of the grid, and what is random of them."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, Distribution] = Field(init=False)
+
+    count: Annotated[int, Field(ge=1, strict=True)] = 1
+    seed: Annotated[int, Field(ge=0, strict=True)] = 0
+
+    @property
+    def parameters(self) -> dict[str, Distribution]:
+        """Distribution of each random parameter."""
+        return self.__pydantic_extra__ or {}
+
+
+class Sweep(Section):
+    """A sweep; of `measure` the first one decides, and none names all there are."""
 
     base: Base
-    grid: tuple[tuple[str, tuple[Value, ...]], ...]
-    draws: tuple[tuple[str, tuple[str, float, float]], ...]
-    count: int
-    seed: int
-    measures: tuple[str, ...]
-    near: float | None = None
+    grid: dict[str, Values] = Field(default={})
+    draws: Draws = Draws()
+    measure: list[str] = Field(default=[])
+    near: Number | None = None
+
+    @property
+    def axes(self) -> dict[str, list[Any]]:
+        """Values of each parameter of the grid."""
+        return {name: one.values() if isinstance(one, Range) else one for name, one in self.grid.items()}
 
     @property
     def points(self) -> int:
         """Combinations of the grid."""
-        return math.prod(len(values) for _, values in self.grid)
+        return math.prod(one.count if isinstance(one, Range) else len(one) for one in self.grid.values())
 
     @property
     def cases(self) -> int:
         """Points of the grid times draws."""
-        return self.points * self.count
+        return self.points * self.draws.count
 
     @property
     def names(self) -> tuple[str, ...]:
         """All parameters."""
-        return (*(name for name, _ in self.grid), *(name for name, _ in self.draws))
+        return (*self.grid, *self.draws.parameters)
 
 
 @dataclass(frozen=True)
@@ -147,262 +230,114 @@ class Case:
     number: int
     point: int
     draw: int
-    values: tuple[tuple[str, Value], ...]
+    values: tuple[tuple[str, Any], ...]
+
+    @property
+    def name(self) -> str:
+        """Name of the file that its outcome is kept in."""
+        return f"case{self.number:06d}"
 
 
-def cases(spec: SweepSpec) -> Iterator[Case]:
+def cases(spec: Sweep) -> Iterator[Case]:
     """All cases in their order: the draws of the first grid point, then those of the next."""
-    names = [name for name, _ in spec.grid]
-    for point, values in enumerate(itertools.product(*(values for _, values in spec.grid))):
-        for draw in range(spec.count):
-            drawn = _drawn(spec, draw)
-            yield Case(point * spec.count + draw, point, draw, (*zip(names, values, strict=True), *drawn))
+    axes, count = spec.axes, spec.draws.count
+    for point, values in enumerate(itertools.product(*axes.values())):
+        for draw in range(count):
+            rng = np.random.default_rng([spec.draws.seed, draw])
+            drawn = [(name, one.drawn(rng)) for name, one in spec.draws.parameters.items()]
+            yield Case(point * count + draw, point, draw, (*zip(axes, values, strict=True), *drawn))
 
 
-def _drawn(spec: SweepSpec, draw: int) -> list[tuple[str, Value]]:
-    rng = np.random.default_rng([spec.seed, draw])
-    out: list[tuple[str, Value]] = []
-    for name, (kind, a, b) in spec.draws:
-        if kind == "normal":
-            value = rng.normal(a, b)
-        elif kind == "log_uniform":
-            value = math.exp(rng.uniform(math.log(a), math.log(b)))
-        else:
-            value = rng.uniform(a, b)
-        out.append((name, float(value)))
-    return out
-
-
-def read_sweep(path: Path) -> SweepSpec:
+def read_sweep(path: Path) -> Sweep:
     """The sweep in a YAML file. Raises `BadInputError` for what is not one, with the key."""
-    whole, where = read_yaml_mapping(path), shown(path)
-    unknown = next((key for key in whole if key not in _KEYS), None)
-    if unknown is not None:
-        raise BadInputError(f"{where}: {one_line(unknown)} is not known here, expected {', '.join(_KEYS)}")
-    base = _base(where, _mapping(where, "base", whole.get("base")), path)
-    grid, points = list[tuple[str, tuple[Value, ...]]](), 1
-    for key, value in _mapping(where, "grid", whole.get("grid") or {}).items():
-        grid.append((key, _values(f"{where}: grid.{one_line(key)}", value)))
-        points *= len(grid[-1][1])
-        _check_cases(where, points)
-    drawn = dict(_mapping(where, "draws", whole.get("draws") or {}))
-    count, seed = drawn.pop("count", 1), drawn.pop("seed", 0)
-    for name, value, least in (("count", count, 1), ("seed", seed, 0)):
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise BadInputError(
-                f"{where}: draws.{name} is {_short(value)}, expected a whole number from {least}"
-            )
-    draws = tuple(
-        (key, _distribution(f"{where}: draws.{one_line(key)}", value)) for key, value in drawn.items()
-    )
-    for key in (*(key for key, _ in grid), *(key for key, _ in draws)):
-        _check_key(where, key, base)
-    twice = next((key for key, _ in grid if key in dict(draws)), None)
-    if twice is not None:
-        raise BadInputError(f"{where}: {twice} is in grid and in draws, expected it in one of them")
-    measures = whole.get("measure") or []
-    if not isinstance(measures, list) or not all(isinstance(name, str) for name in measures):
-        raise BadInputError(f"{where}: measure is no list of names")
-    near = None if whole.get("near") is None else _finite(f"{where}: near", whole["near"])
-    if near is not None and not measures:
-        raise BadInputError(f"{where}: near says what the first measure should be, and measure names none")
-    spec = SweepSpec(base, tuple(grid), draws, count, seed, tuple(measures), near)
-    if not spec.names and count == 1:
-        raise BadInputError(f"{where}: has neither grid nor draws, so there is nothing to sweep over")
-    _check_cases(where, spec.cases)
+    where = shown(path)
+    spec = validated(Sweep, read_yaml_mapping(path), path)
+    if spec.base.rig:
+        file = path.absolute().parent / spec.base.rig
+        if not file.is_file():
+            raise BadInputError(f"{where}: base.rig: {shown(file)} is not there")
+        Rig.load(file)
+        spec.base = spec.base.model_copy(update={"rig": read_text(file)})
+    for problem in _problems(spec):
+        raise BadInputError(f"{where}: {problem}")
     return spec
 
 
-def _check_cases(where: str, count: int) -> None:
-    if count > _MOST_CASES:
-        raise BadInputError(f"{where}: asks for {count} cases or more, expected no more than {_MOST_CASES}")
-
-
-def _mapping(where: str, key: str, value: Any) -> Mapping[str, Any]:
-    if not isinstance(value, dict):
-        found = "missing" if value is None else "no mapping"
-        raise BadInputError(f"{where}: {key} is {found}, expected keys with values")
-    wrong = [name for name in value if not isinstance(name, str)]
-    if wrong:
-        raise BadInputError(f"{where}: {key} has the key {one_line(repr(wrong[0]))[:60]}, expected text")
-    return value
-
-
-def _base(where: str, told: Mapping[str, Any], path: Path) -> Base:
-    unknown = next((key for key in told if key not in _BASE), None)
-    if unknown is not None:
-        raise BadInputError(f"{where}: base.{one_line(unknown)} is not known, expected {', '.join(_BASE)}")
-    wrong = next((key for key, value in told.items() if not isinstance(value, str)), None)
-    if wrong is not None:
-        raise BadInputError(f"{where}: base.{wrong} is {_short(told[wrong])}, expected text")
-    if "filter" in told:
-        kind, name, other = "filter", told["filter"], told.get("scenario", "")
-        _one_of(where, "base.filter", name, _FILTERS)
-    elif "controller" in told:
-        kind, name, other = "controller", told["controller"], told.get("reference", "")
-    elif "scenario" in told:
-        kind, name, other = "scenario", told["scenario"], ""
-    else:
-        raise BadInputError(f"{where}: base names none of {', '.join(_KINDS)}")
-    _check_names(where, kind, name, other)
-    feedback, model = told.get("feedback", "sensors"), told.get("model", "auto")
-    _one_of(where, "base.feedback", feedback, ("sensors", "truth"))
-    _one_of(where, "base.model", model, _MODELS)
-    try:
-        duration = parse_duration_s(told["duration"], "base.duration") if "duration" in told else None
-    except CalibError as error:
-        raise BadInputError(f"{where}: {error}") from error
-    if duration is not None and duration > _LONGEST_S:
-        raise BadInputError(f"{where}: base.duration is {_short(told['duration'])}, expected at most 1h")
-    return Base(kind, name, other, _rig_text(where, told.get("rig"), path), feedback, duration, model)
-
-
-def _check_names(where: str, kind: str, name: str, other: str) -> None:
+def _problems(spec: Sweep) -> Iterator[str]:
+    """What does not fit together, in sentences."""
     from calib.stages.control.references import BUILT_IN
     from calib.stages.control.trial import CONTROLLERS
     from calib.twin.scenarios import SCENARIOS
 
-    if kind == "controller":
-        _one_of(where, "base.controller", name, CONTROLLERS)
-        _one_of(where, "base.reference", other, BUILT_IN)
-    else:
-        _one_of(where, "base.scenario", other if kind == "filter" else name, tuple(SCENARIOS))
-
-
-def _rig_text(where: str, rig: str | None, path: Path) -> str:
-    if rig is None:
-        return ""
-    from calib.core.files import read_text
-
-    file = path.absolute().parent / rig
-    if not file.is_file():
-        raise BadInputError(f"{where}: base.rig: {shown(file)} is not there")
-    Rig.load(file)
-    return read_text(file)
-
-
-def _one_of(where: str, key: str, value: str, known: tuple[str, ...]) -> None:
-    if value not in known:
-        raise BadInputError(f"{where}: {key} is {_short(value)}, expected one of {', '.join(known)}")
-
-
-def _check_key(where: str, key: str, base: Base) -> None:
-    if not _KEY.fullmatch(key) or key.split(".")[0] not in _SECTIONS:
-        raise BadInputError(
-            f"{where}: {one_line(key)[:60]} is no parameter, expected SECTION.KEY with one of "
-            f"{', '.join(_SECTIONS)}"
-        )
-    if key.startswith("scenario.") and base.kind == "controller":
-        raise BadInputError(f"{where}: {key} needs a scenario, and base has a controller with a reference")
-    if key.startswith("controller."):
-        _check_gain(where, key, base)
-
-
-def _check_gain(where: str, key: str, base: Base) -> None:
-    """Refuse keys of the section `controller` that nothing would read."""
-    if base.kind != "controller":
-        raise BadInputError(f"{where}: {key} needs a controller, and base has a {base.kind}")
-    whose = _GAINS.get(key.split(".")[1], base.name)
-    if whose != base.name:
-        raise BadInputError(f"{where}: {key} belongs to the controller {whose}, and base has {base.name}")
-    if "controller" not in (yaml.safe_load(base.rig) or {}):
-        raise BadInputError(
-            f"{where}: {key} is in the section controller, which base.rig lacks; calib control tune writes it"
-        )
-
-
-def _finite(where: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(_float(value)):
-        raise BadInputError(f"{where} has {_short(value)} in it, expected a number")
-    return float(value)
-
-
-def _float(value: float) -> float:
-    """The number; infinity for a whole one that no float can hold."""
+    base = spec.base
+    wanted: dict[str, tuple[str, tuple[str, ...]]] = {"scenario": (base.scenario, tuple(SCENARIOS))}
+    if base.kind == "controller":
+        wanted = {"controller": (base.name, CONTROLLERS), "reference": (base.other, BUILT_IN)}
+    if not base.name:
+        yield "base names none of controller, scenario, filter"
+    for key, (name, names) in wanted.items():
+        if name not in names:
+            yield f"base.{key} is {quoted(name)}, expected one of {', '.join(names)}"
     try:
-        return float(value)
-    except OverflowError:
-        return math.inf
+        if (base.duration_s or 0.0) > _LONGEST_S:
+            yield f"base.duration is {quoted(base.duration)}, expected at most 1h"
+    except CalibError as error:
+        yield str(error)
+    for key in spec.names:
+        yield from _problems_of(key, base)
+    twice = next((key for key in spec.grid if key in spec.draws.parameters), None)
+    if twice is not None:
+        yield f"{twice} is in grid and in draws, expected it in one of them"
+    if spec.near is not None and not spec.measure:
+        yield "near says what the first measure should be, and measure names none"
+    if not spec.names and spec.cases == 1:
+        yield "has neither grid nor draws, so there is nothing to sweep over"
+    if spec.cases > _MOST_CASES:
+        yield f"asks for {spec.cases} cases, expected no more than {_MOST_CASES}"
 
 
-def _short(value: Any) -> str:
-    return one_line(repr(value))[:60]
-
-
-def _values(where: str, told: Any) -> tuple[Value, ...]:
-    if isinstance(told, dict):
-        if set(told) - {"from", "to", "count", "log"} or not {"from", "to", "count"} <= set(told):
-            raise BadInputError(f"{where} has {_short(list(told))}, expected from, to, count, log")
-        a, b, count = _finite(where, told["from"]), _finite(where, told["to"]), told["count"]
-        if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= 10_000:
-            raise BadInputError(f"{where}: count is {_short(count)}, expected a whole number from 1 to 10000")
-        if told.get("log"):
-            if not (a > 0.0 and b > 0.0):
-                raise BadInputError(f"{where} goes from {a:g} to {b:g}, expected positive numbers with log")
-            return tuple(np.geomspace(a, b, count).tolist())
-        return tuple(np.linspace(a, b, count).tolist())
-    if not isinstance(told, list) or not told:
-        raise BadInputError(f"{where} is no list of values and no range, expected for instance [1.0, 2.0]")
-    for value in told:
-        word = isinstance(value, str | bool)
-        if not word and not (isinstance(value, int | float) and math.isfinite(_float(value))):
-            raise BadInputError(f"{where} has {_short(value)} in it, expected numbers or words")
-    return tuple(float(v) if isinstance(v, int) and not isinstance(v, bool) else v for v in told)
-
-
-def _distribution(where: str, told: Any) -> tuple[str, float, float]:
-    kinds = ("uniform", "normal", "log_uniform")
-    if not isinstance(told, dict) or len(told) != 1 or next(iter(told)) not in kinds:
-        raise BadInputError(
-            f"{where} is no distribution, expected one of {', '.join(kinds)} with two numbers"
-        )
-    kind, numbers = next(iter(told.items()))
-    if not isinstance(numbers, list) or len(numbers) != 2:
-        raise BadInputError(f"{where}.{kind} is {_short(numbers)}, expected two numbers")
-    a, b = (_finite(f"{where}.{kind}", value) for value in numbers)
-    if kind == "normal" and b < 0.0:
-        raise BadInputError(f"{where}.normal has the standard deviation {b:g}, expected none below zero")
-    if kind != "normal" and not a < b:
-        raise BadInputError(f"{where}.{kind} goes from {a:g} to {b:g}, expected the smaller one first")
-    if kind == "log_uniform" and a <= 0.0:
-        raise BadInputError(f"{where}.log_uniform begins at {a:g}, expected a positive number")
-    return kind, a, b
+def _problems_of(key: str, base: Base) -> Iterator[str]:
+    """What is wrong with a parameter: nothing would read it."""
+    section, _, rest = key.partition(".")
+    if not _KEY.fullmatch(key) or section not in _SECTIONS:
+        listed = ", ".join(_SECTIONS)
+        yield f"{one_line(key)[:60]} is no parameter, expected SECTION.KEY with one of {listed}"
+    if section == "scenario" and base.kind == "controller":
+        yield f"{key} needs a scenario, and base has a controller with a reference"
+    if section == "controller" and base.kind != "controller":
+        yield f"{key} needs a controller, and base has a {base.kind}"
+    if section == "controller" and (whose := _GAINS.get(rest.split(".")[0], base.name)) != base.name:
+        yield f"{key} belongs to the controller {whose}, and base has {base.name}"
+    if section == "controller" and "controller" not in _parsed(base.rig):
+        yield f"{key} is in the section controller, which base.rig lacks; calib control tune writes it"
 
 
 # ----------------------------------------------------------------------
-# Cases of a sweep, as they go to a process: functions of the specification and their numbers alone.
+# A case, as it goes to a process: a function of the specification and its number alone.
 #
-# This module runs the twin on purpose: the plant is the base rig with a case's parameters, while
-# controllers
+# This module runs the twin on purpose: the plant is the base rig with a case's parameters, while controllers
 # and filters know the base rig, but for gains and noise that are parameters themselves.
 
 _PLANT = ("actuator", "pump", "twin")
 _HERE = Path("the sweep")
 
 
-@dataclass(frozen=True)
-class CaseResult:
-    """What was measured in a case; `sentence` says why nothing was."""
-
-    number: int
-    measures: dict[str, float | None]
-    sentence: str
-    seconds: float
-
-
-def run_cases(base: Base, cases: tuple[Case, ...], seed: int) -> list[CaseResult]:
-    """Run some cases one after the other; every failure is a result, none an exception."""
-    out = []
-    for case in cases:
-        began, measures, sentence = time.perf_counter(), dict[str, float | None](), ""
-        try:
-            measures = run_case(base, case, seed)
-        except CalibError as error:
-            sentence = str(error)
-        except Exception as error:
-            sentence = f"internal error: {type(error).__name__}: {' '.join(str(error).split())[:200]}"
-        out.append(CaseResult(case.number, measures, sentence, round(time.perf_counter() - began, 4)))
-    return out
+def measured(case: Case, base: Base, seed: int, key: str, known: str) -> Answer:
+    """Run a case; every failure is an outcome, none an exception. With a `known` key it is done already."""
+    if known == key:
+        return Answer(Outcome(name=case.name, status=SAME, key=key))
+    began, values, status, sentence = time.perf_counter(), dict[str, float | None](), "ok", ""
+    try:
+        values = run_case(base, case, seed)
+    except CalibError as error:
+        status, sentence = "failed", str(error)
+    except Exception as error:
+        status, sentence = "broken", internal_error(error)
+    spent = round(time.perf_counter() - began, 4)
+    numbers = {name: (value, None) for name, value in values.items()}
+    return Answer(
+        Outcome(name=case.name, status=status, sentence=sentence, key=key, values=numbers, seconds=spent)
+    )
 
 
 def run_case(base: Base, case: Case, seed: int) -> dict[str, float | None]:
@@ -419,7 +354,7 @@ def run_case(base: Base, case: Case, seed: int) -> dict[str, float | None]:
         return _controlled(base, known, plant, noise)
     from calib.twin.scenarios import make_scenario, run_scenario
 
-    plan = make_scenario(base.name if base.kind == "scenario" else base.other, options)
+    plan = make_scenario(base.scenario, options)
     run = run_scenario(plan, plant, noise, base.feedback, base.duration_s)
     if base.kind == "scenario":
         return {name: _or_none(value) for name, value in plan.figures(run).items()}
@@ -510,12 +445,10 @@ def _or_none(value: float | None) -> float | None:
 
 
 # ----------------------------------------------------------------------
-# A sweep from its specification to a table: cases in bundles, each bundle kept as soon as it is done.
+# A sweep from its specification to a table.
 
-BUNDLE = 8
 _MOST_SHOWN = 10
 _MOST_POINTS = 400
-_BLOCK = 512
 
 
 @dataclass(frozen=True)
@@ -559,140 +492,64 @@ class SweepSummary:
     clouds: tuple[tuple[str, tuple[tuple[float, float], ...]], ...]
 
 
-def _digest(spec: SweepSpec) -> str:
-    return sha256(json.dumps([program(), asdict(spec)], sort_keys=True, default=str).encode())
-
-
-def _file(store: Store, cases: Sequence[Case]) -> Path:
-    name = f"cases{cases[0].number:07d}-{len(cases)}.json"
-    return store.out / HIDDEN / "outcomes" / name
-
-
-def _kept(store: Store, cases: Sequence[Case], digest: str, final: bool = False) -> list[CaseResult] | None:
-    """Results of some cases; with `final` only where none of them came of the processes that did the work."""
-    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-        told = json.loads(_file(store, cases).read_text(encoding="utf-8"))
-        if told["digest"] == digest and not (final and told["lost"]):
-            return [CaseResult(**one) for one in told["results"]]
-    return None
-
-
-def _results(store: Store, spec: SweepSpec) -> Iterator[tuple[Case, CaseResult | None]]:
-    """All cases with their results, where these are there."""
-    digest = _digest(spec)
-    for bundle in _bundles(spec):
-        together = {one.number: one for one in _kept(store, bundle, digest) or []}
-        for case in bundle:
-            alone = () if case.number in together else _kept(store, (case,), digest) or ()
-            yield case, together.get(case.number) or next(iter(alone), None)
-
-
-def _bundles(spec: SweepSpec) -> Iterator[tuple[Case, ...]]:
-    every = cases(spec)
-    while bundle := tuple(islice(every, BUNDLE)):
-        yield bundle
-
-
 def run_sweep(
     store: Store,
     processes: Processes,
-    spec: SweepSpec,
+    spec: Sweep,
     progress: Progress = lambda done, total: None,
     limit_s: float = LIMIT_S,
-) -> int:
-    """Run all bundles of cases that are not there, each case in `limit_s` seconds at most.
+) -> Counts:
+    """Run all cases that are not there, each in `limit_s` seconds at most. Raises as `run_all`."""
+    base, seed = spec.base, spec.draws.seed
+    whole = [program(), base.model_dump(), seed]
 
-    A bundle that is lost is done again case by case: one of them may be at fault, and the others are not.
-    Returns how many cases were there. Raises as `run_tasks`.
-    """
-    digest = _digest(spec)
-    before = done = 0
-    apart: list[Case] = []
+    def task(case: Case) -> Task:
+        key = sha256(json.dumps([*whole, case.draw, case.values], sort_keys=True).encode())
+        return Task(case.name, measured, (case, base, seed, key, store.known(case.name)), limit_s)
 
-    def task(some: tuple[Case, ...]) -> Task:
-        name = _file(store, some).stem
-        return Task(name, run_cases, (spec.base, some, spec.seed), len(some) * limit_s)
-
-    def there(some: tuple[Case, ...]) -> bool:
-        nonlocal before
-        if _kept(store, some, digest, final=True) is None:
-            return False
-        before += len(some)
-        return True
-
-    def run(tasks: Iterator[Task]) -> None:
-        nonlocal done
-        for task, result in run_tasks(processes, tasks):
-            some, lost = task.arguments[1], isinstance(result, Failure)
-            if lost and len(some) > 1:
-                apart.extend(some)
-                continue
-            if isinstance(result, Failure):
-                result = [CaseResult(some[0].number, {}, sentence_of(result, task, "case"), 0.0)]
-            told = {"digest": digest, "lost": lost, "results": [asdict(one) for one in result]}
-            write_atomically(_file(store, some), json.dumps(told) + "\n")
-            done += len(some)
-            progress(before + done, spec.cases)
-
-    progress(0, spec.cases)
-    run(task(bundle) for bundle in _bundles(spec) if not there(bundle))
-    run(task((case,)) for case in apart if not there((case,)))
-    progress(spec.cases, spec.cases)
-    return before
+    return run_all(store, processes, map(task, cases(spec)), spec.cases, "case", progress)
 
 
-def _numeric(spec: SweepSpec, name: str) -> bool:
-    values = dict(spec.grid).get(name, (0.0,))
-    return all(isinstance(value, float) for value in values)
+def _numeric(spec: Sweep, name: str) -> bool:
+    return all(isinstance(value, float) for value in spec.axes.get(name, ()))
 
 
-def _measured(store: Store, spec: SweepSpec) -> tuple[str, ...]:
-    """Names of all that was measured in any case; those asked for come first."""
-    found = dict.fromkeys(
-        name for _, one in _results(store, spec) if one is not None for name in one.measures
-    )
-    unknown = next((name for name in spec.measures if found and name not in found), None)
+def _table(store: Store, spec: Sweep) -> tuple[Any, tuple[str, ...]]:
+    """All cases as an Arrow table, and the names of what was measured, the one that decides first."""
+    numbers, times = {name: _numeric(spec, name) for name in spec.names}, list[tuple[int, float]]()
+
+    def rows() -> Iterator[dict[str, Any]]:
+        for case in cases(spec):
+            row = {"case": case.number, "point": case.point, "draw": case.draw, "sentence": "was not run"}
+            row |= {name: value if numbers[name] else str(value) for name, value in case.values}
+            if (outcome := store.outcome(case.name)) is not None:
+                times.append((case.number, outcome.seconds))
+                row |= {name: value for name, (value, _) in outcome.values.items()}
+                row["sentence"] = outcome.sentence
+            yield row
+
+    whole = arrow_table(rows())
+    write_timings(store.out, "case,seconds", times)
+    first = ("case", "point", "draw", *spec.names)
+    found = [name for name in whole.column_names if name not in (*first, "sentence")]
+    unknown = next((name for name in spec.measure if found and name not in found), None)
     if unknown is not None:
         raise BadInputError(
             f"measure: {one_line(unknown)} was not measured, expected some of {', '.join(found)}"
         )
-    return spec.measures or tuple(found)
+    measures = tuple(name for name in spec.measure or found if name in found)
+    kinds = dict.fromkeys(first[:3], "int64") | {"sentence": "string"}
+    kinds |= {name: "string" for name, one in numbers.items() if not one}
+    return typed(whole, [*first, *measures, "sentence"], kinds), measures
 
 
-def _table(store: Store, spec: SweepSpec, measures: tuple[str, ...], times: list[tuple[int, float]]) -> Any:
-    """All cases as an Arrow table; `times` takes what each has taken."""
-    import pyarrow as pa
-
-    fields = [pa.field(name, pa.int64()) for name in ("case", "point", "draw")]
-    fields += [pa.field(name, pa.float64() if _numeric(spec, name) else pa.string()) for name in spec.names]
-    fields += [pa.field(name, pa.float64()) for name in measures]
-    schema = pa.schema([*fields, pa.field("sentence", pa.string())])
-
-    def rows() -> Iterator[dict[str, Any]]:
-        for case, one in _results(store, spec):
-            values = {name: value if _numeric(spec, name) else str(value) for name, value in case.values}
-            row = {"case": case.number, "point": case.point, "draw": case.draw, **values}
-            if one is None:
-                yield {**row, "sentence": "was not run"}
-            else:
-                times.append((case.number, one.seconds))
-                yield {**row, **one.measures, "sentence": one_line(one.sentence)}
-
-    left, batches = rows(), []
-    while block := list(islice(left, _BLOCK)):
-        batches.append(pa.RecordBatch.from_pylist(block, schema=schema))
-    return pa.Table.from_batches(batches, schema)
-
-
-def summarise_sweep(store: Store, spec: SweepSpec, as_before: int) -> SweepSummary:
+def summarise_sweep(store: Store, spec: Sweep, as_before: int) -> SweepSummary:
     """Write sweep.parquet and the timings, and return the summary.
 
     Raises `BadInputError` for a measure that there is not.
     """
-    measures, times = _measured(store, spec), list[tuple[int, float]]()
-    table = _table(store, spec, measures, times)
+    table, measures = _table(store, spec)
     write_table(store.out / "sweep.parquet", table)
-    write_timings(store.out, "case,seconds", times)
     failed = [sentence for sentence in texts(table, "sentence") if sentence]
     deciding = measures[0] if measures else ""
     y = column(table, deciding)
@@ -704,7 +561,7 @@ def summarise_sweep(store: Store, spec: SweepSpec, as_before: int) -> SweepSumma
     return SweepSummary(spec.cases, len(failed), as_before, why, deciding, measures, best, worst, clouds)
 
 
-def _points(table: Any, spec: SweepSpec, y: FloatArray, measures: tuple[str, ...]) -> list[Point]:
+def _points(table: Any, spec: Sweep, y: FloatArray, measures: tuple[str, ...]) -> list[Point]:
     """Points of the grid; the draws themselves where there is no grid."""
     by_point = bool(spec.grid)
     group = column(table, "point" if by_point else "case").astype(np.int64)
@@ -712,7 +569,7 @@ def _points(table: Any, spec: SweepSpec, y: FloatArray, measures: tuple[str, ...
     listed: dict[str, Any] = {
         name: column(table, name) if _numeric(spec, name) else texts(table, name) for name in spec.names
     }
-    shown = [name for name, _ in spec.grid] if by_point else list(spec.names)
+    shown = list(spec.grid) if by_point else list(spec.names)
     order = np.argsort(group, kind="stable")
     starts = np.flatnonzero(np.diff(group[order], prepend=-1))
     loss = y if spec.near is None else np.abs(y - spec.near)

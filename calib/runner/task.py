@@ -6,22 +6,19 @@ import contextlib
 import csv
 import io
 import ipaddress
-import json
-import math
 import re
 import socket
 import tempfile
 import time
 import urllib.parse
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from calib.core.constants import constants
 from calib.core.errors import (
-    EXIT_BAD_INPUT,
     EXIT_DONE,
     EXIT_INTERNAL,
     EXIT_POOR,
@@ -34,7 +31,8 @@ from calib.core.units import parse_corners, parse_square_m
 from calib.core.writing import make_folder
 from calib.runner.cache import key_of, program
 from calib.runner.folder import Folder, folder_digests, read_folder
-from calib.runner.graph import STEPS, Runner, opened, sections_of
+from calib.runner.graph import STEPS, Runner, opened_run, sections_of
+from calib.runner.outcomes import SAME, Answer, Outcome, internal_error
 from calib.runner.outputs import Calibrated, run_folder
 from calib.runner.processes import Here, needed
 from calib.stages import stage
@@ -277,86 +275,6 @@ def _check_option(where: str, key: str, value: str) -> None:
 
 
 # ----------------------------------------------------------------------
-# What became of one rig: a small record that is kept in a file of its own.
-
-SAME = "same"
-"""Status of a rig whose earlier result still holds; nothing else of its outcome means anything."""
-
-_MOST_TEXT = 2000
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """A rig's row.
-
-    Attributes
-    ----------
-    name, serial, source : of the manifest.
-    status : "ok", "poor", "failed" (bad input or a stage that failed), "broken" (a fault of the program),
-        "lost" (its time ran out, or every process that tried it died), or `SAME`.
-    code : exit code that a single run would have had.
-    sentence : why, in one sentence; "" for "ok".
-    key : of all that the result follows from, "" where that is not known.
-    kind : "run" for all stages, "camera" for those of a camera.
-    reasons : of stages that are not ok. stages : outcome of each stage by its name.
-    values : constants with their standard deviations, by "section.name".
-    seconds, peak_MB : spent on it, and the process's largest memory meanwhile.
-    files : SHA-256 of its results by name.
-    """
-
-    name: str
-    serial: str
-    source: str
-    status: str
-    code: int
-    sentence: str = ""
-    key: str = ""
-    kind: str = ""
-    reasons: tuple[str, ...] = ()
-    stages: dict[str, str] = field(default_factory=dict)
-    values: dict[str, tuple[float, float | None]] = field(default_factory=dict)
-    seconds: float = 0.0
-    peak_MB: float | None = None
-    files: dict[str, str] = field(default_factory=dict)
-
-
-def verdict_of(code: int) -> str:
-    """Status of a rig that came to an end by itself."""
-    names = {EXIT_DONE: "ok", EXIT_POOR: "poor", EXIT_BAD_INPUT: "failed", EXIT_INTERNAL: "broken"}
-    return names.get(code, "failed")
-
-
-def to_json(outcome: Outcome) -> str:
-    """Text of an outcome's file."""
-    told = asdict(outcome)
-    told["sentence"] = one_line(outcome.sentence)[:_MOST_TEXT]
-    told["reasons"] = [one_line(reason)[:_MOST_TEXT] for reason in outcome.reasons]
-    told["values"] = {
-        name: [value, sigma if sigma is not None and math.isfinite(sigma) else None]
-        for name, (value, sigma) in outcome.values.items()
-        if math.isfinite(value)
-    }
-    return json.dumps({"schema": 1, **told}, indent=1, sort_keys=True, allow_nan=False) + "\n"
-
-
-def from_json(text: str) -> Outcome | None:
-    """The outcome in a file's text, None for what is not one."""
-    try:
-        told: dict[str, Any] = json.loads(text)
-        if told.pop("schema") != 1:
-            return None
-        told["reasons"] = tuple(str(reason) for reason in told["reasons"])
-        told["values"] = {
-            str(name): (float(value), None if sigma is None else float(sigma))
-            for name, (value, sigma) in told["values"].items()
-        }
-        told["files"] = {str(name): str(digest) for name, digest in told["files"].items()}
-        return Outcome(**told)
-    except (ValueError, KeyError, TypeError, AttributeError):
-        return None
-
-
-# ----------------------------------------------------------------------
 # A rig folder as this process can read it: where it lies, or fetched from a URL into a folder of scratch.
 #
 # What a server calls its files is not trusted: a name that leads out of the folder is refused, only files
@@ -563,7 +481,7 @@ def run_stages(
     steps = [step for step in STEPS if kind == "run" or step.name in CAMERA_STAGES]
     steps = [replace(step, options=given) if step.name == "intrinsics" else step for step in steps]
     steps = [replace(step, figures=step.figures and page) for step in steps]
-    with opened(out, folder.root):
+    with opened_run(out, folder.root):
         return run_folder(Runner(folder, out, Here(), steps=tuple(steps), fresh=True), page=page)
 
 
@@ -583,6 +501,7 @@ def _code(done: Calibrated, kind: str) -> int:
 
 _MOST_KEPT_BYTES = 30_000_000
 _TELLING = ("poor", "failed", "blocked")
+_STATUS = {EXIT_DONE: "ok", EXIT_POOR: "poor", EXIT_INTERNAL: "broken"}
 
 
 @dataclass(frozen=True)
@@ -601,14 +520,6 @@ class FleetOptions:
     allowed: Allowed = Allowed()
 
 
-@dataclass(frozen=True)
-class Answer:
-    """An outcome with the results that belong to it."""
-
-    outcome: Outcome
-    files: dict[str, bytes]
-
-
 def calibrate_rig(spec: RigSpec, options: FleetOptions, known: str = "") -> Answer:
     """Calibrate one rig; every failure is an outcome, none an exception. One at a time in a process.
 
@@ -616,25 +527,26 @@ def calibrate_rig(spec: RigSpec, options: FleetOptions, known: str = "") -> Answ
     ----------
     known : key of an earlier result; where it still is the key, the rig is not calibrated again.
     """
-    blank = Outcome(spec.name, spec.serial, without_secrets(spec.source), "failed", EXIT_INTERNAL)
-    with _measured() as spent:
-        try:
-            with tempfile.TemporaryDirectory(prefix="rig-") as place:
-                answer = _calibrated(spec, options, known, Path(place), blank)
-        except CalibError as error:
-            answer = _failed(blank, error.exit_code, str(error))
-        except Exception as error:
-            words = " ".join(str(error).split())[:200]
-            answer = _failed(blank, EXIT_INTERNAL, f"internal error: {type(error).__name__}: {words}")
-    seconds, peak = spent
-    return Answer(replace(answer.outcome, seconds=round(seconds, 3), peak_MB=peak), answer.files)
+    with contextlib.suppress(OSError):
+        # 5 makes the kernel forget the largest memory so far (proc(5), clear_refs).
+        Path("/proc/self/clear_refs").write_text("5")
+    began = time.perf_counter()
+    try:
+        with tempfile.TemporaryDirectory(prefix="rig-") as place:
+            answer = _calibrated(spec, options, known, Path(place))
+    except CalibError as error:
+        answer = _failed(spec, error.exit_code, str(error))
+    except Exception as error:
+        answer = _failed(spec, EXIT_INTERNAL, internal_error(error))
+    spent = {"seconds": round(time.perf_counter() - began, 3), "peak_MB": peak_memory_MB()}
+    return replace(answer, outcome=answer.outcome.model_copy(update=spent))
 
 
-def _failed(blank: Outcome, code: int, sentence: str) -> Answer:
-    return Answer(replace(blank, status=verdict_of(code), code=code, sentence=sentence), {})
+def _failed(spec: RigSpec, code: int, sentence: str) -> Answer:
+    return Answer(Outcome(name=spec.name, status=_STATUS.get(code, "failed"), code=code, sentence=sentence))
 
 
-def _calibrated(spec: RigSpec, options: FleetOptions, known: str, place: Path, blank: Outcome) -> Answer:
+def _calibrated(spec: RigSpec, options: FleetOptions, known: str, place: Path) -> Answer:
     root = local_folder(spec.source, place / "fetched", options.attempts, options.most_bytes, options.allowed)
     folder = rig_folder(root)
     kind = kind_of(folder)
@@ -643,7 +555,7 @@ def _calibrated(spec: RigSpec, options: FleetOptions, known: str, place: Path, b
     command = ("fleet", kind, str(options.pages), program(), *chosen)
     key = key_of(command, inputs, "")
     if known == key:
-        return Answer(replace(blank, status=SAME, code=0, key=key), {})
+        return Answer(Outcome(name=spec.name, status=SAME, key=key))
     import cv2
 
     from calib.core.workers import at_most
@@ -657,9 +569,9 @@ def _calibrated(spec: RigSpec, options: FleetOptions, known: str, place: Path, b
         cv2.setNumThreads(threads)
     files, code = _kept(done.out, done.files, options.pages), _code(done, kind)
     reasons = tuple(f"{job.step.title}: {job.reason}" for job in done.ended if job.status in _TELLING)
-    outcome = replace(
-        blank,
-        status=verdict_of(code),
+    outcome = Outcome(
+        name=spec.name,
+        status=_STATUS.get(code, "failed"),
         code=code,
         sentence=reasons[0] if reasons else "",
         key=key,
@@ -686,19 +598,6 @@ def _kept(out: Path, names: tuple[str, ...], pages: bool) -> dict[str, bytes]:
 
 def _values(rig: Path) -> dict[str, tuple[float, float | None]]:
     return {f"{one.section}.{one.name}": (one.value, one.sigma) for one in constants(sections_of(rig).values)}
-
-
-@contextlib.contextmanager
-def _measured() -> Iterator[list[float]]:
-    """Seconds and largest memory in megabytes of what is done inside, in a list that is filled at the end."""
-    with contextlib.suppress(OSError):
-        # 5 makes the kernel forget the largest memory so far (proc(5), clear_refs).
-        Path("/proc/self/clear_refs").write_text("5")
-    began, spent = time.perf_counter(), list[float]()
-    try:
-        yield spent
-    finally:
-        spent += [time.perf_counter() - began, peak_memory_MB()]
 
 
 def peak_memory_MB() -> float:

@@ -14,7 +14,7 @@ from calib.core.plot import Bars, Curve, Figure, Mark, Plot, Rule
 from calib.core.words import BLANK, SIGMA, as_words, number, unit_of
 from calib.core.writing import write_atomically
 from calib.runner.fleet import ConstantSummary, Drift, FleetSummary
-from calib.runner.sweep import Point, SweepSpec, SweepSummary
+from calib.runner.sweep import Point, Sweep, SweepSummary
 from calib.show.page import PAGE as A_PAGE
 from calib.show.page import embedded, render
 
@@ -203,12 +203,12 @@ def _row(one: ConstantSummary) -> Sequence[tuple[str, float | None]]:
 SWEEP_PAGE = "sweep.html"
 
 
-def write_sweep_page(path: Path, spec: SweepSpec, summary: SweepSummary) -> None:
+def write_sweep_page(path: Path, spec: Sweep, summary: SweepSummary) -> None:
     """Write the page atomically. Raises `BadInputError` when it cannot be written."""
     write_atomically(path, sweep_page_text(spec, summary), A_PAGE)
 
 
-def sweep_page_text(spec: SweepSpec, summary: SweepSummary) -> str:
+def sweep_page_text(spec: Sweep, summary: SweepSummary) -> str:
     """The whole page."""
     base = spec.base
     what = f"{base.kind} {base.name}" + (f" on {base.other}" if base.other else "")
@@ -228,7 +228,7 @@ def sweep_page_text(spec: SweepSpec, summary: SweepSummary) -> str:
         feedback=base.feedback,
         aim="the least is best" if spec.near is None else f"the nearest to {spec.near:g} is best",
         points=spec.points,
-        draws=spec.count,
+        draws=spec.draws.count,
         tables=tables,
         clouds=[embedded(_cloud(name, summary.measure, points)) for name, points in summary.clouds if points],
     )

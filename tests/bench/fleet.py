@@ -29,9 +29,9 @@ from fleet_rigs import write_fleet, write_manifest
 from calib.core.files import sha256
 from calib.core.workers import Task, run_tasks
 from calib.io.logs import log_text
-from calib.runner.fleet import opened_store
+from calib.runner.outcomes import Answer, Outcome, opened_store
 from calib.runner.processes import local
-from calib.runner.task import Answer, FleetOptions, Outcome, RigSpec, calibrate_rig
+from calib.runner.task import FleetOptions, RigSpec, calibrate_rig
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.simulate import log_of
@@ -132,16 +132,8 @@ def trivial(number: int) -> Answer:
     """An answer as large as that of a rig."""
     text = f"rig: {number}\n" + "x" * 6000
     values = {f"camera.value{k}": (float(number + k), 0.1) for k in range(85)}
-    outcome = Outcome(
-        f"rig{number}",
-        str(number),
-        "",
-        "ok",
-        0,
-        key="k",
-        values=values,
-        files={"rig.yaml": sha256(text.encode())},
-    )
+    digest = sha256(text.encode())
+    outcome = Outcome(name=f"rig{number}", key="k", values=values, files={"rig.yaml": digest})
     return Answer(outcome, {"rig.yaml": text.encode()})
 
 

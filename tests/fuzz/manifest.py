@@ -19,10 +19,10 @@ WORDS = (
 def check(data: bytes, folder: Path) -> None:
     """Rigs with names that are folders of their own in an output folder, or a refusal."""
     from calib.core.errors import BadInputError
-    from calib.runner.fleet import Store
+    from calib.runner.outcomes import Store
     from calib.runner.task import OPTIONS, is_url, read_manifest, serial_number
 
-    store, refusals = Store(folder / "out"), list[BadInputError]()
+    store, refusals = Store(folder / "out", folder / "out" / ".fleet"), list[BadInputError]()
     for ending in ("csv", "yaml"):
         path = folder / f"manifest.{ending}"
         path.write_bytes(data)

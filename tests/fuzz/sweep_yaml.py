@@ -24,7 +24,7 @@ _LONGEST_S = 0.5
 
 def check(data: bytes, folder: Path) -> None:
     """Cases with parameters of their own, of which the first ends with measures or with a reason."""
-    from calib.runner.sweep import cases, read_sweep, run_cases
+    from calib.runner.sweep import cases, measured, read_sweep
 
     path = folder / "sweep.yaml"
     path.write_bytes(data)
@@ -35,8 +35,8 @@ def check(data: bytes, folder: Path) -> None:
     assert all(tuple(name for name, _ in case.values) == spec.names for case in first)
     if spec.base.duration_s is None or spec.base.duration_s > _LONGEST_S:
         return
-    (result,) = run_cases(spec.base, first[:1], spec.seed)
-    assert bool(result.measures) != bool(result.sentence)
+    result = measured(first[0], spec.base, spec.draws.seed, "key", "").outcome
+    assert bool(result.values) != bool(result.sentence)
     assert "internal error" not in result.sentence, result.sentence
     assert result.sentence.isprintable() and len(result.sentence) < 2000, repr(result.sentence)
 

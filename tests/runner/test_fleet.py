@@ -21,13 +21,12 @@ from calib.core.files import sha256
 from calib.core.result import CovarianceTable
 from calib.core.rig import Provenance, Rig
 from calib.core.workers import Failure, Task
-from calib.runner.fleet import Store, column, finish, opened_store, run_fleet, texts
+from calib.runner.fleet import finish, run_fleet
+from calib.runner.outcomes import Answer, Outcome, Store, column, opened_store, texts
 from calib.runner.processes import Here
 from calib.runner.task import (
-    Answer,
     FleetOptions,
     Manifest,
-    Outcome,
     RigSpec,
     is_url,
     kind_of,
@@ -53,7 +52,7 @@ def test_failures_are_rows_and_what_is_there_is_left_alone(tmp_path: Path) -> No
         assert first.by_status == {"failed": 6} and first.as_before == 0
         assert any(sentence.startswith("gone: failed (") for sentence in said) and len(said) == 6
         found = store.outcome("rig2")
-        assert found is not None and found.serial == "2" and found.code == 3
+        assert found is not None and found.code == 3
         # Bad input is bad input again; a folder that was not there may be there now.
         (tmp_path / "rig1" / "images" / "a.png").write_bytes(b"another")
         again = run_fleet(store, Here(), manifest, FleetOptions())
@@ -224,9 +223,13 @@ def _fleet(out: Path, rigs: dict[str, Rig]) -> Iterator[tuple[Store, Manifest]]:
             scratch.write_bytes(text)
             poor = not rig.camera.verdict.ok
             outcome = Outcome(
-                name, "", "", "poor" if poor else "ok", int(poor), key="k", values=_values(scratch),
+                name=name,
+                status="poor" if poor else "ok",
+                code=int(poor),
+                key="k",
+                values=_values(scratch),
                 files={"rig.yaml": sha256(text)},
-            )  # fmt: skip
+            )
             scratch.unlink()
             store.keep(Answer(outcome, {"rig.yaml": text}))
         yield store, Manifest(tuple(RigSpec(name, "/x") for name in rigs), ())

@@ -19,7 +19,8 @@ from calib.runner.fleet import (
     summarise,
     table_of,
 )
-from calib.runner.task import Outcome
+from calib.runner.outcomes import Outcome
+from calib.runner.task import RigSpec
 
 
 def _line(t: FloatArray, x: FloatArray, sigma: FloatArray) -> Drift:
@@ -100,10 +101,10 @@ def test_a_fifth_of_bad_rigs_does_not_hide_itself() -> None:
     assert (np.abs(z[:20]) > limit).all() and not (np.abs(z[20:]) > limit).any()
 
 
-def _fleet(count: int, seed: int = 0) -> dict[str, Outcome]:
+def _fleet(count: int, seed: int = 0) -> list[tuple[RigSpec, Outcome]]:
     """Rigs of which the 7th stands out in cx, the 3rd has failed, the 5th is poor, and fx drifts."""
     rng = np.random.default_rng(seed)
-    out = {}
+    out = []
     for k in range(1, count + 1):
         values = {
             "camera.fx_px": (273.0 + 0.02 * k + 0.3 * rng.standard_normal(), 0.2),
@@ -114,17 +115,21 @@ def _fleet(count: int, seed: int = 0) -> dict[str, Outcome]:
         }
         status, code = ("failed", 3) if k == 3 else ("poor", 1) if k == 5 else ("ok", 0)
         name = f"rig{k}"
-        out[name] = Outcome(
-            name, f"S{k:05d}", "/x", status, code, "" if status == "ok" else f"why {k}",
-            stages={"intrinsics": status}, values=values if status != "failed" else {}, seconds=float(k),
-            peak_MB=100.0 + k,
-        )  # fmt: skip
+        outcome = Outcome(
+            name=name,
+            status=status,
+            code=code,
+            sentence="" if status == "ok" else f"why {k}",
+            stages={"intrinsics": status},
+            values=values if status != "failed" else {},
+        )
+        out.append((RigSpec(name, "/x", f"S{k:05d}"), outcome))
     return out
 
 
 def _summary(count: int) -> FleetSummary:
     known = _fleet(count)
-    summary, worst, which = summarise(table_of(known.values()))
+    summary, worst, which = summarise(table_of(known))
     assert worst.shape == (count,) and len(which) == count
     assert which[6] == "camera.cx_px" and worst[6] > summary.limit and np.isnan(worst[2])
     return summary

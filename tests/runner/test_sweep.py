@@ -14,23 +14,14 @@ import pytest
 from calib.core.errors import BadInputError
 from calib.core.workers import Failure, Task
 from calib.runner import sweep as sweeping
-from calib.runner.fleet import Store, column, opened_store, texts
+from calib.runner.outcomes import column, opened_store, texts
 from calib.runner.processes import Here
-from calib.runner.sweep import (
-    Base,
-    Case,
-    CaseResult,
-    SweepSpec,
-    cases,
-    read_sweep,
-    run_sweep,
-    summarise_sweep,
-)
+from calib.runner.sweep import Base, Case, Sweep, cases, read_sweep, run_sweep, summarise_sweep
 
 _BASE = "base: {controller: pid, reference: jump}\n"
 
 
-def _read(tmp_path: Path, text: str) -> SweepSpec:
+def _read(tmp_path: Path, text: str) -> Sweep:
     path = tmp_path / "s.yaml"
     path.write_text(text)
     return read_sweep(path)
@@ -65,8 +56,8 @@ def test_grid_times_draws(tmp_path: Path) -> None:
         ("base: {scenario: swing, rig: none.yaml}\n", "none.yaml is not there"),
         (_BASE + "grid: {__class__.x: [1]}\n", "is no parameter"),
         ("base: {scenario: swing}\ngrid: {controller.pwm_high: [200]}\n", "needs a controller"),
-        (_BASE + f"grid: {{pump.lag_s: [{'9' * 390}]}}\n", "has 9{60} in it, expected numbers"),
-        ("base: {~: 1, scenario: swing, duration: {}}\n", "base has the key None"),
+        (_BASE + f"grid: {{pump.lag_s: [{'9' * 390}]}}\n", r"grid.pump.lag_s.0 is 9{57}..., expected at most 1e\+40"),
+        ("base: {~: 1, scenario: swing}\n", "base.None is None, expected text as a key"),
         (_BASE + "draws: {count: 0}\n", "draws.count is 0"),
         (_BASE + "grid: {pump.lag_s: [1]}\ndraws: {pump.lag_s: {normal: [1, 1]}}\n", "in grid and in draws"),
         (_BASE + "grid: {pump.lag_s: [1]}\nnear: 2\n", "measure names none"),
@@ -77,42 +68,33 @@ def test_what_is_no_sweep(tmp_path: Path, text: str, said: str) -> None:
         _read(tmp_path, text)
 
 
-SPEC = SweepSpec(
-    Base("scenario", "orientation", "", "", "truth", 1.0, "auto"),
-    (("scenario.Kp", (1.0, 2.0, 3.0)), ("scenario.controller", ("p", "pid"))),
-    (("actuator.mass_kg", ("uniform", 0.04, 0.06)),),
-    4,
-    0,
-    ("error",),
+SPEC = Sweep.model_validate(
+    {
+        "base": {"scenario": "orientation", "feedback": "truth", "duration": "1s"},
+        "grid": {"scenario.Kp": [1.0, 2.0, 3.0], "scenario.controller": ["p", "pid"]},
+        "draws": {"count": 4, "actuator.mass_kg": {"uniform": [0.04, 0.06]}},
+        "measure": ["error"],
+    }
 )
 
 
-def bowl(base: Base, cases: tuple[Case, ...], seed: int) -> list[CaseResult]:
+def bowl(base: Base, case: Case, seed: int) -> dict[str, float | None]:
     """An error that is least at Kp = 2 with pid; the third draw fails there."""
-    out = []
-    for case in cases:
-        values = dict(case.values)
-        kp, pid = float(values["scenario.Kp"]), values["scenario.controller"] == "pid"
-        error = (kp - 2.0) ** 2 + (0.0 if pid else 0.5) + 0.01 * case.draw
-        fails = case.draw == 3 and kp == 2.0 and pid
-        out.append(CaseResult(case.number, {} if fails else {"error": error, "other": kp}, "oh" * fails, 0.1))
-    return out
+    values = dict(case.values)
+    kp, pid = float(values["scenario.Kp"]), values["scenario.controller"] == "pid"
+    if case.draw == 3 and kp == 2.0 and pid:
+        raise BadInputError("oh")
+    return {"error": (kp - 2.0) ** 2 + (0.0 if pid else 0.5) + 0.01 * case.draw, "other": kp}
 
 
 @pytest.fixture(autouse=True)
-def _small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sweeping, "run_cases", bowl)
-    monkeypatch.setattr(sweeping, "BUNDLE", 5)
-
-
-def _opened(tmp_path: Path) -> Iterator[Store]:
-    with opened_store(tmp_path / "out", "calib sweep", ()) as (store, _):
-        yield store
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sweeping, "run_case", bowl)
 
 
 def test_best_worst_and_resumed(tmp_path: Path) -> None:
-    for store in _opened(tmp_path):
-        assert run_sweep(store, Here(), SPEC) == 0
+    with opened_store(tmp_path / "out", "calib sweep", ()) as (store, _):
+        assert run_sweep(store, Here(), SPEC).as_before == 0
         found = summarise_sweep(store, SPEC, 0)
         assert (found.cases, found.failed, found.why, found.measure) == (24, 1, "oh", "error")
         best = found.best[0]
@@ -127,24 +109,24 @@ def test_best_worst_and_resumed(tmp_path: Path) -> None:
         assert sum(bool(s) for s in texts(table, "sentence")) == 1
         masses = column(table, "actuator.mass_kg").reshape(6, 4)
         assert (masses == masses[0]).all()
-        # One bundle is lost, one is of another sweep: both are done again, and no others.
-        files = sorted((tmp_path / "out" / ".fleet" / "outcomes").glob("cases*-*.json"))
-        assert len(files) == 5
+        # One case is lost, one is damaged, one is of another sweep: they are done again, and no others.
+        files = sorted((tmp_path / "out" / ".sweep" / "outcomes").glob("case*.json"))
+        assert len(files) == 24
         files[0].unlink()
-        told = json.loads(files[2].read_text())
-        files[2].write_text(json.dumps({**told, "digest": "x"}))
-        assert run_sweep(store, Here(), SPEC) == 14
-        assert summarise_sweep(store, SPEC, 14).best == found.best
+        files[1].write_text(files[1].read_text()[:100])
+        files[2].write_text(json.dumps({**json.loads(files[2].read_text()), "key": "x"}))
+        assert run_sweep(store, Here(), SPEC).as_before == 21
+        assert summarise_sweep(store, SPEC, 21).best == found.best
 
 
 class Deadly(Here):
-    """As a process that dies, or hangs, of case 7, and takes the cases with it that are in the same task."""
+    """As a process that dies, or hangs, of case 7."""
 
     how = "died"
 
     def finished(self) -> Iterator[tuple[Task, Any]]:
         for task, result in super().finished():
-            yield task, Failure(self.how) if any(one.number == 7 for one in task.arguments[1]) else result
+            yield task, Failure(self.how) if task.arguments[0].number == 7 else result
 
 
 @pytest.mark.parametrize(
@@ -157,10 +139,10 @@ class Deadly(Here):
 def test_one_case_takes_no_others_with_it(tmp_path: Path, how: str, why: str) -> None:
     processes = Deadly()
     processes.how = how
-    for store in _opened(tmp_path):
+    with opened_store(tmp_path / "out", "calib sweep", ()) as (store, _):
         run_sweep(store, processes, SPEC, limit_s=0.2)
         found = summarise_sweep(store, SPEC, 0)
         assert (found.cases, found.failed, found.why) == (24, 2, why)
-        # It may live another time: its bundle is done again, and no others.
-        assert run_sweep(store, Here(), SPEC) == 19
-        assert summarise_sweep(store, SPEC, 19).failed == 1
+        # It may live another time.
+        assert run_sweep(store, Here(), SPEC).as_before == 23
+        assert summarise_sweep(store, SPEC, 23).failed == 1

@@ -21,7 +21,8 @@ from calib.core.errors import BadInputError
 from calib.runner.cache import Result
 from calib.runner.decision import decide
 from calib.runner.fleet import FleetSummary, summarise, table_of
-from calib.runner.task import Outcome
+from calib.runner.outcomes import Outcome
+from calib.runner.task import RigSpec
 from calib.show.charts import library
 from calib.show.fleet import PAGE, fleet_page_text, write_fleet_page
 from calib.show.page import (
@@ -361,17 +362,21 @@ EVIL_FLEET = "</script><script>document.title='owned'</script><img src=x onerror
 
 def _summary(count: int, constants: int = 6) -> FleetSummary:
     rng = np.random.default_rng(3)
-    known = {}
+    known = []
     for k in range(1, count + 1):
         values = {f"camera.c{i}_px": (100.0 + rng.standard_normal(), 0.1) for i in range(constants)}
         values["camera.fx_px"] = (273.0 + 0.05 * k + 0.2 * rng.standard_normal() + 40.0 * (k == 7), 0.1)
         bad = k == 3
-        known[f"rig{k}"] = Outcome(
-            f"rig{k}", EVIL_FLEET if k == 7 else f"S{k}", "/x", "failed" if bad else "ok", 3 if bad else 0,
-            EVIL_FLEET if bad else "", stages={"intrinsics": "failed" if bad else "ok"},
-            values={} if bad else values, seconds=1.0, peak_MB=90.0,
-        )  # fmt: skip
-    return summarise(table_of(known.values()))[0]
+        outcome = Outcome(
+            name=f"rig{k}",
+            status="failed" if bad else "ok",
+            code=3 if bad else 0,
+            sentence=EVIL_FLEET if bad else "",
+            stages={"intrinsics": "failed" if bad else "ok"},
+            values={} if bad else values,
+        )
+        known.append((RigSpec(f"rig{k}", "/x", EVIL_FLEET if k == 7 else f"S{k}"), outcome))
+    return summarise(table_of(known))[0]
 
 
 def test_whole_harmless_and_told() -> None:
