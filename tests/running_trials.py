@@ -7,6 +7,8 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import yaml
 
@@ -17,10 +19,10 @@ from calib.core.workers import Task
 from calib.core.writing import write_atomically
 from calib.runner.decision import decide
 from calib.runner.folder import Folder, read_folder
-from calib.runner.graph import HIDDEN, Job, Runner, Step, opened
+from calib.runner.graph import HIDDEN, Job, Runner, Step, opened_run
 from calib.runner.outputs import run_folder
 from calib.runner.processes import Here
-from calib.runner.work import DOCUMENT, FIGURES, MESSAGES, RIG, Work
+from calib.runner.work import DOCUMENT, FIGURES, MESSAGES, RIG
 from calib.stages.estimator.section import Estimator
 from calib.twin.section import Twin, TwinTracker
 
@@ -44,7 +46,9 @@ class Inline(Here):
     def start(self, task: Task) -> None:
         super().start(replace(task, function=self._done, arguments=(task.name, *task.arguments)))
 
-    def _done(self, name: str, work: Work) -> int:
+    def _done(self, name: str, *words: Any) -> int:
+        names = ("verb", "root", "folder", "paths", "options", "figures", "output")
+        work = SimpleNamespace(**dict(zip(names, words, strict=True)))
         CALLS.append(name)
         code = self.codes.get(name, 0)
         if code in (0, 1):
@@ -55,7 +59,7 @@ class Inline(Here):
             self.during(name)
         return code
 
-    def _guarded(self, work: Work, code: int) -> int:
+    def _guarded(self, work: SimpleNamespace, code: int) -> int:
         """As the command line ends a verb that cannot write."""
         try:
             self._work(work, code)
@@ -65,7 +69,7 @@ class Inline(Here):
                 (work.folder / MESSAGES).write_text(f"calib: {error}\n")
             return 3
 
-    def _work(self, work: Work, code: int) -> None:
+    def _work(self, work: SimpleNamespace, code: int) -> None:
         rig_path = work.folder / RIG
         rig = Rig.load(rig_path)
         inputs = list(work.paths)
@@ -136,7 +140,7 @@ def run_small(
 ) -> Sequence[Job]:
     """A whole run with the small stages."""
     folder = read_folder(root, follow_links)
-    with opened(out, root):
+    with opened_run(out, root):
         return run_folder(Runner(folder, out, runs or Inline(), steps=STEPS, fresh=fresh), page=False).ended
 
 

@@ -5,17 +5,17 @@ from __future__ import annotations
 import contextlib
 import functools
 import json
-import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Literal, ParamSpec, Protocol, TypeVar
+from typing import Annotated, Any, Literal, ParamSpec, TypeVar
 
 import typer
 
 from calib.core.errors import CalibError, ReaderGoneError
 from calib.core.files import one_line
+from calib.core.stage import ProgressCall, finite
 from calib.core.writing import stdout_is_taken
 
 # ----------------------------------------------------------------------
@@ -70,12 +70,6 @@ FiguresOption = Annotated[
 ]
 
 
-class ProgressCall(Protocol):
-    """Reports how much is done."""
-
-    def __call__(self, done: int, total: int) -> None: ...
-
-
 def narrate(message: str) -> None:
     """A line for the person who watches, on stderr; whether it arrives changes nothing."""
     with contextlib.suppress(OSError):
@@ -98,20 +92,23 @@ def emit(text: str) -> None:
         raise CalibError(f"standard output: cannot be written: {error.strerror or error}") from error
 
 
-def _finite(value: Any) -> Any:
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, dict):
-        return {str(key): _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return value
-
-
 def document(verb: str, sections: dict[str, Any]) -> None:
     """Print the JSON document of a verb; what is not finite becomes null."""
-    whole = {"schema": 1, "verb": verb, **sections}
-    emit(json.dumps(_finite(whole), indent=1, allow_nan=False, ensure_ascii=True) + "\n")
+    emit_json(finite({"schema": 1, "verb": verb, **sections}))
+
+
+def emit_json(whole: dict[str, Any]) -> None:
+    """Print a JSON document."""
+    emit(json.dumps(whole, indent=1, allow_nan=False, ensure_ascii=True) + "\n")
+
+
+def answer(as_json: bool, verb: str, told: dict[str, Any], *lines: str) -> None:
+    """Print what a verb has to say: its document, or lines."""
+    if as_json:
+        document(verb, told)
+        return
+    for line in lines:
+        say(line)
 
 
 @contextmanager
@@ -131,9 +128,6 @@ def progress_bar(label: str) -> Iterator[ProgressCall]:
 
 def table(head: list[str], rows: list[list[str]]) -> list[str]:
     """Lines of a table, the first column to the left and the others to the right."""
-    widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]
-    out = []
-    for row in [head, *rows]:
-        cells = [row[0].ljust(widths[0])] + [c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True)]
-        out.append("  " + "  ".join(cells).rstrip())
-    return out
+    from calib.core.words import Table, as_text
+
+    return as_text([Table(tuple(head), tuple(map(tuple, rows)))], sys.maxsize)

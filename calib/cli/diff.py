@@ -48,24 +48,7 @@ def diff(
         write_diff_page(output, one, other, (shown(before), shown(after)), found)
         narrate(f"page written to {shown(output)}")
     if as_json:
-        document(
-            "diff",
-            {
-                "changes": [{**asdict(c), "significant": c.significant} for c in found.changes],
-                "plane": None
-                if found.plane is None
-                else {**asdict(found.plane), "significant": found.plane.significant},
-                "verdicts": [
-                    dict(zip(("section", "before", "after"), v, strict=True)) for v in found.verdicts
-                ],
-                "only_before": list(found.only_before),
-                "only_after": list(found.only_after),
-                "others": {section: list(keys) for section, keys in found.others.items()},
-                "other_inputs": list(found.inputs),
-                "compared": found.compared,
-                "significant": found.significant,
-            },
-        )
+        document("diff", asdict(found))
         return
     _tell(found, every)
 
@@ -89,12 +72,12 @@ def _tell(found: RigDiff, every: bool) -> None:
         ("only before", [*found.only_before, *(f"{c.section}.{c.name}" for c in alone if c.after is None)]),
         ("only after", [*found.only_after, *(f"{c.section}.{c.name}" for c in alone if c.before is None)]),
         ("also different", [f"{section} ({', '.join(keys)})" for section, keys in found.others.items()]),
-        ("learnt from other inputs", found.inputs),
+        ("learnt from other inputs", found.other_inputs),
     ):
         if names:
             say(f"{words}: {', '.join(names)}")
-    for section, old, new in found.verdicts:
-        say(f"verdict of {section}: {old} before, {new} after")
+    for one in found.verdicts:
+        say("verdict of {section}: {before} before, {after} after".format(**one))
     plane = found.plane
     if plane is None:
         say("no plane in both: no difference in millimetres")

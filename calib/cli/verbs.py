@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import json
 from collections.abc import Callable
 from dataclasses import MISSING, fields
 from pathlib import Path
@@ -16,7 +15,7 @@ from calib.cli.common import (
     FiguresOption,
     JsonOption,
     RigOption,
-    emit,
+    emit_json,
     narrate,
     progress_bar,
     say,
@@ -106,15 +105,14 @@ def _several(hint: Any) -> Any:
 def _run(stage: Stage, files: Files, options: Any, figures: Path | None, as_json: bool) -> None:
     from calib.core.files import shown
     from calib.core.words import as_text, described
-    from calib.runner.work import carry_out, document_of
+    from calib.runner.work import carry_out
 
     outcome, after = carry_out(stage, files, options, files.rig_path, figures)
     sections = stage.sections(outcome)
     if figures is not None:
         narrate(f"figures in {shown(figures)}")
     if as_json:
-        whole = document_of(stage, outcome, files.written)
-        emit(json.dumps(whole, indent=1, allow_nan=False, ensure_ascii=True) + "\n")
+        emit_json(stage.as_json(outcome, files.written))
     else:
         blocks = [] if stage.words is None else list(stage.words(outcome))
         for one in stage.results(outcome):

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from calib.core.words import unit_of
+from calib.core.units import unit_of
 
 _LISTED = ("covariance", "provenance", "logs", "margins", "candidates", "observer_gain", "prior_sigma")
 """Parts that are no constants, or are shown in figures and tables of their own."""

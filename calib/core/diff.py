@@ -40,6 +40,7 @@ class Change:
     Attributes
     ----------
     sigmas : difference over the standard deviation of the difference, None where that is not known.
+    significant : whether that is much.
     """
 
     section: str
@@ -47,28 +48,23 @@ class Change:
     unit: str
     before: float | None
     after: float | None
-    sigma: float | None
-    sigmas: float | None
-
-    @property
-    def significant(self) -> bool | None:
-        """Whether the difference is significant, None where no standard deviation says so."""
-        return None if self.sigmas is None else self.sigmas >= SIGNIFICANT
+    sigma: float | None = None
+    sigmas: float | None = None
+    significant: bool | None = None
 
 
 @dataclass(frozen=True)
 class PlaneChange:
-    """Differences of position over the workspace: mean, largest, and their standard deviation, mm."""
+    """Differences of position over the workspace: mean, largest, and their standard deviation, mm.
+
+    `significant` says whether the largest is, None where no standard deviation does.
+    """
 
     mean_mm: float
     largest_mm: float
     at_m: tuple[float, float]
     sigma_mm: float | None
-
-    @property
-    def significant(self) -> bool | None:
-        """Whether the largest difference is significant, None where no standard deviation says so."""
-        return None if not self.sigma_mm else self.largest_mm >= SIGNIFICANT * self.sigma_mm
+    significant: bool | None
 
 
 @dataclass(frozen=True)
@@ -79,28 +75,23 @@ class RigDiff:
     ----------
     changes : constants that differ, by significance; those of one side only come last.
     plane : None where a side has no camera or plane.
-    verdicts : section, verdict before, verdict after, where they differ.
+    verdicts : "section", verdict "before" and "after", where they differ.
     only_before, only_after : sections of one side.
     others : keys by section that differ and hold no constants: choices, deviations, evidence.
-    inputs : sections learnt from other inputs.
+    other_inputs : sections learnt from other inputs.
     compared : how many constants both have.
+    significant : whether anything has changed by more than its standard deviation explains.
     """
 
     changes: tuple[Change, ...]
     plane: PlaneChange | None
-    verdicts: tuple[tuple[str, str, str], ...]
+    verdicts: tuple[dict[str, str], ...]
     only_before: tuple[str, ...]
     only_after: tuple[str, ...]
     others: dict[str, tuple[str, ...]]
-    inputs: tuple[str, ...]
+    other_inputs: tuple[str, ...]
     compared: int
-
-    @property
-    def significant(self) -> bool:
-        """Whether anything has changed by more than its standard deviation explains."""
-        return any(change.significant for change in self.changes) or bool(
-            self.plane is not None and self.plane.significant
-        )
+    significant: bool
 
 
 def compared(a: Sections, b: Sections, plane: PlaneChange | None) -> RigDiff:
@@ -112,9 +103,9 @@ def compared(a: Sections, b: Sections, plane: PlaneChange | None) -> RigDiff:
     differ = [change for change in changes if change is not None]
     differ.sort(key=lambda c: (c.before is None or c.after is None, -(c.sigmas or 0.0)))
     verdicts = [
-        (name, str(a[name].get("verdict", "-")), str(b[name].get("verdict", "-")))
-        for name in a
-        if name in b and a[name].get("verdict") != b[name].get("verdict")
+        {"section": name, "before": str(one.get("verdict", "-")), "after": str(b[name].get("verdict", "-"))}
+        for name, one in a.items()
+        if name in b and one.get("verdict") != b[name].get("verdict")
     ]
     return RigDiff(
         tuple(differ),
@@ -125,6 +116,7 @@ def compared(a: Sections, b: Sections, plane: PlaneChange | None) -> RigDiff:
         _others(a, b, {f"{section}.{name}" for section, name in left.keys() | right.keys()}),
         tuple(name for name, one in inputs[0].items() if name in inputs[1] and inputs[1][name] != one),
         len(left.keys() & right.keys()),
+        any(one.significant for one in (*differ, plane) if one is not None),
     )
 
 
@@ -172,17 +164,16 @@ def _change(before: Constant | None, after: Constant | None) -> Change | None:
     one = before or after
     assert one is not None
     if before is None or after is None:
-        return Change(
-            one.section, one.name, one.unit, before.value if before else None, after.value if after else None,
-            None, None,
-        )  # fmt: skip
+        old, new = (None if side is None else side.value for side in (before, after))
+        return Change(one.section, one.name, one.unit, old, new)
     difference = abs(after.value - before.value)
     if difference <= _SAME * max(abs(before.value), abs(after.value)):
         return None
     known = before.sigma is not None and after.sigma is not None
     sigma = math.hypot(before.sigma or 0.0, after.sigma or 0.0) if known else None
     sigmas = difference / sigma if sigma else None
-    return Change(one.section, one.name, one.unit, before.value, after.value, sigma, sigmas)
+    significant = None if sigmas is None else sigmas >= SIGNIFICANT
+    return Change(one.section, one.name, one.unit, before.value, after.value, sigma, sigmas, significant)
 
 
 def plane_change(
@@ -207,7 +198,9 @@ def plane_change(
     known = [bar for bar in sigmas_mm if bar is not None]
     sigma = math.hypot(*known) if len(known) == 2 else None
     at = (float(world[worst, 0]), float(world[worst, 1]))
-    return PlaneChange(float(np.nanmean(apart)), float(apart[worst]), at, sigma)
+    largest = float(apart[worst])
+    significant = largest >= SIGNIFICANT * sigma if sigma else None
+    return PlaneChange(float(np.nanmean(apart)), largest, at, sigma, significant)
 
 
 def grid_m(workspace_m: Sequence[float]) -> FloatArray:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -250,16 +250,43 @@ class Rig:
         ----------
         inputs : SHA-256 of each input by section and name, beside those that results carry.
         """
+        write_atomically(Path(path), self.file_text(path, inputs), SECTIONS)
+
+    def file_text(self, path: Path | str, inputs: Mapping[str, Mapping[str, str]] | None = None) -> str:
+        """What `save` writes."""
         merged = {**self.inputs, **(inputs or {})}
         ordered = {name: dict(sorted(merged[name].items())) for name in sorted(merged)}
         self.provenance, self.schema = Provenance(inputs=ordered), SCHEMA
         # What a program has set may be anything, and a file that cannot be read back helps nobody.
         Rig.of({"schema": SCHEMA, **self.values()}, path)
-        write_atomically(Path(path), self.text(), SECTIONS)
+        return self.text()
 
     def with_sections(self, sections: Mapping[str, Any]) -> Rig:
         """The same rig with other sections, by name."""
         return replace(self, **sections)
+
+    @property
+    def sections(self) -> dict[str, Any]:
+        """The sections that are there, by name, without the provenance."""
+        found = {name: getattr(self, name) for name in KINDS if name != "provenance"}
+        return {name: one for name, one in found.items() if one is not None}
+
+    def only(self, names: Iterable[str]) -> Rig:
+        """The sections of these names, and what they were learnt from."""
+        kept = {name: one for name, one in self.sections.items() if name in set(names)}
+        inputs = {name: one for name, one in self.provenance.inputs.items() if name in set(names)}
+        return Rig(**kept, provenance=Provenance(inputs=inputs))
+
+    def joined(self, other: Rig) -> Rig:
+        """The sections of both; the other's where both have one."""
+        inputs = {**self.provenance.inputs, **other.provenance.inputs}
+        return replace(self, **other.sections, provenance=Provenance(inputs=inputs))
+
+    @property
+    def simulated(self) -> bool:
+        """Whether constants come from a simulated rig or from rendered pictures."""
+        optics = (one for one in (self.camera, self.plane) if one is not None)
+        return self.twin is not None or any(one.simulated for one in optics)
 
     def diff(self, other: Rig) -> RigDiff:
         """What differs in a later calibration, in standard deviations and on the plane."""

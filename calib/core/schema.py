@@ -17,6 +17,7 @@ from pydantic_core import PydanticCustomError
 
 from calib.core.errors import BadInputError
 from calib.core.files import one_line, shown
+from calib.core.units import unit_of
 
 Kind = TypeVar("Kind", bound=BaseModel)
 
@@ -74,7 +75,9 @@ def _refuse_endless(value: Any, source: Path | str, key: str) -> None:
     for name, part in parts:
         _refuse_endless(part, source, f"{key}.{name}" if key else str(name))
     if isinstance(value, int | float) and _MOST < abs(value) < math.inf:
-        raise BadInputError(f"{shown(source)}: {one_line(key)} is {quoted(value)}, expected at most {_MOST:g}")
+        raise BadInputError(
+            f"{shown(source)}: {one_line(key)} is {quoted(value)}, expected at most {_MOST:g}"
+        )
 
 
 def contradiction(text: str) -> PydanticCustomError:
@@ -127,8 +130,6 @@ def _sentence(kind: type[BaseModel], error: ValidationError, under: str) -> str:
 
 def _unit(place: list[int | str]) -> str:
     """Unit at the end of the last key that has one."""
-    from calib.core.words import unit_of
-
     return next((unit for part in reversed(place) if (unit := unit_of(str(part)))), "")
 
 

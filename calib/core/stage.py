@@ -7,6 +7,7 @@ it imports what it works with inside of its functions.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, fields
@@ -317,9 +318,33 @@ class Stage:
         judged = self.results(outcome) or [outcome]
         return Verdict.of(finding for one in judged for finding in one.verdict.findings)
 
+    def as_json(self, outcome: Any, written: Sequence[str] = ()) -> dict[str, Any]:
+        """The JSON document of an outcome; what is not finite becomes null.
+
+        Parameters
+        ----------
+        written : names of the files that it was written to, which the document of a folder lists.
+        """
+        from calib.core.result import section_json
+
+        whole: dict[str, Any] = {"schema": 1, "verb": self.name}
+        whole |= {name: section_json(one) for name, one in self.sections(outcome).items()}
+        if written and self.output is not None and self.output.folder:
+            whole["files"] = list(written)
+        return {name: finite(value) for name, value in (whole | self.document(outcome)).items()}
+
     def writes_rig(self, options: Any) -> bool:
         """Whether sections of rig.yaml are written with these options."""
         return bool(self.writes) and (not self.on_request or bool(getattr(options, self.on_request)))
+
+
+def finite(value: Any) -> Any:
+    """Plain values for JSON: what is not finite becomes null."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Mapping):
+        return {str(key): finite(item) for key, item in value.items()}
+    return [finite(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 _VERBS = {"camera": "intrinsics", "plane": "extrinsics", "align": "align", "imu": "imu static"}

@@ -15,67 +15,13 @@ from typing import Any
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from calib.core.result import Result
+from calib.core.units import UNITS, unit_of
 from calib.core.verdict import Verdict
 
 BLANK = "\N{EN DASH}"
 """What stands for a value that is not there."""
 
 SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
-
-UNITS = {
-    "_radps2_per_sqrt_Hz": "rad/s²/√Hz",
-    "_radps_per_sqrt_Hz": "rad/s/√Hz",
-    "_mps3_per_sqrt_Hz": "m/s³/√Hz",
-    "_mps2_per_sqrt_Hz": "m/s²/√Hz",
-    "_degps_per_sqrt_Hz": "°/s/√Hz",
-    "_degps_per_sqrt_hz": "°/s/√Hz",
-    "_deg_per_sqrt_Hz": "°/√Hz",
-    "_deg_per_sqrt_hz": "°/√Hz",
-    "_rad_per_sqrt_s": "rad/√s",
-    "_rad_per_sqrt_Hz": "rad/√Hz",
-    "_m_per_sqrt_s": "m/√s",
-    "_pwm_per_rad_s": "PWM/(rad s)",
-    "_pwm_s_per_rad": "PWM s/rad",
-    "_pwm_per_m_s": "PWM/(m s)",
-    "_pwm_s_per_m": "PWM s/m",
-    "_pwm_per_rad": "PWM/rad",
-    "_pwm_per_m": "PWM/m",
-    "_N_per_rad2": "N/rad²",
-    "_N_per_m4": "N/m⁴",
-    "_N_per_m3": "N/m³",
-    "_N_per_m2": "N/m²",
-    "_N_per_m": "N/m",
-    "_N_per_s": "N/s",
-    "_Ns_per_m": "N s/m",
-    "_px_per_m": "px/m",
-    "_s2_per_N": "s²/N",
-    "_per_s2": "1/s²",
-    "_per_s": "1/s",
-    "_radps2": "rad/s²",
-    "_radps": "rad/s",
-    "_degps": "°/s",
-    "_mps2": "m/s²",
-    "_mps": "m/s",
-    "_kgm2": "kg m²",
-    "_kPa": "kPa",
-    "_kpa": "kPa",
-    "_ticks": "ticks",
-    "_rad": "rad",
-    "_deg": "°",
-    "_pwm": "PWM",
-    "_px": "px",
-    "_mm": "mm",
-    "_ms": "ms",
-    "_hz": "Hz",
-    "_Hz": "Hz",
-    "_db": "dB",
-    "_kg": "kg",
-    "_N": "N",
-    "_V": "V",
-    "_m": "m",
-    "_s": "s",
-}
 
 _SCALES = {
     ("m", "mm"): 1e3,
@@ -115,11 +61,6 @@ class Line:
 Block = Table | Line
 
 
-def unit_of(key: str) -> str:
-    """Unit at the end of a key, "" for a number without one."""
-    return next((unit for end, unit in UNITS.items() if key.endswith(end)), "")
-
-
 def number(value: float | None, sigma: float | None = None, places: int | None = None) -> str:
     """A value with the digits that its deviation leaves, else with `places`, else with six figures."""
     if value is None or not math.isfinite(value):
@@ -143,9 +84,10 @@ def short(value: float) -> str:
 def described(result: BaseModel) -> list[Block]:
     """A result as tables and sentences: its quantities, its lists of parts, its verdict."""
     blocks = list(_parts(result))
-    if isinstance(result, Result):
-        blocks += result.more_words()
-        blocks += of_verdict(result.verdict)
+    verdict = getattr(result, "verdict", None)
+    if isinstance(verdict, Verdict):
+        blocks += getattr(result, "more_words", tuple)()
+        blocks += of_verdict(verdict)
     return blocks
 
 
@@ -373,8 +315,8 @@ def listed(label: str, parts: Mapping[str, Any] | Sequence[Any]) -> Table:
     return Table(((label, *head) if named is parts else tuple(head)), tuple(rows), label)
 
 
-def as_text(blocks: Sequence[Block]) -> list[str]:
-    """Blocks as lines for a terminal."""
+def as_text(blocks: Sequence[Block], widest: int = _WIDEST) -> list[str]:
+    """Blocks as lines for a terminal, tables of more than `widest` characters in sheets."""
     out: list[str] = []
     for block in blocks:
         if isinstance(block, Line):
@@ -385,19 +327,19 @@ def as_text(blocks: Sequence[Block]) -> list[str]:
             out.append(f"{block.title}:")
         whole = [block.head, *block.rows]
         widths = [max(len(row[i]) for row in whole) for i in range(len(block.head))]
-        for columns in _in_sheets(widths):
+        for columns in _in_sheets(widths, widest):
             for row in whole:
                 cells = [row[0].ljust(widths[0]), *(row[i].rjust(widths[i]) for i in columns)]
                 out.append("  " + "  ".join(cells).rstrip())
     return out
 
 
-def _in_sheets(widths: Sequence[int]) -> list[list[int]]:
+def _in_sheets(widths: Sequence[int], widest: int) -> list[list[int]]:
     """Columns behind the first, in as many tables below each other as a line's width asks for."""
     sheets: list[list[int]] = [[]]
     used = widths[0]
     for i, width in enumerate(widths[1:], 1):
-        if sheets[-1] and used + 2 + width > _WIDEST:
+        if sheets[-1] and used + 2 + width > widest:
             sheets.append([])
             used = widths[0]
         sheets[-1].append(i)

@@ -17,7 +17,7 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.core.files import shown
-from calib.core.words import unit_of
+from calib.core.units import unit_of
 from calib.core.workers import Processes, Task
 from calib.runner.outcomes import (
     LIMIT_S,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -13,68 +13,21 @@ from typing import Any
 
 from calib.core.errors import EXIT_DONE, EXIT_INTERNAL, EXIT_POOR, BadInputError
 from calib.core.files import inside, one_line, shown
-from calib.core.rig import SCHEMA, Rig
+from calib.core.result import Result as StageResult
+from calib.core.rig import Rig
 from calib.core.workers import Failure, Processes, Task
-from calib.core.writing import make_folder, write_atomically
+from calib.core.writing import make_folder
 from calib.runner.cache import Result, key_of, load, opened, remove, store
 from calib.runner.folder import Folder, LogFile, digest_of, folder_digests, with_beside
-from calib.runner.work import Work, perform
+from calib.runner.work import perform
 from calib.stages import stage
-
-# ----------------------------------------------------------------------
-# Sections of the rig's file, handed from stage to stage.
-#
-# A stage gets a file of its own with the sections that its row names, and gives back those that it writes.
-# What a run knows in the end is put together from these parts in the order of the file, whatever the order
-# in which the stages came to an end.
-
-
-@dataclass
-class Sections:
-    """Sections by name as plain values, and the hashes of what each was learnt from."""
-
-    values: dict[str, Any] = field(default_factory=dict)
-    inputs: dict[str, dict[str, str]] = field(default_factory=dict)
-
-    def only(self, names: Iterable[str]) -> Sections:
-        """Those of these names."""
-        wanted = set(names)
-        return Sections(
-            {name: value for name, value in self.values.items() if name in wanted},
-            {name: value for name, value in self.inputs.items() if name in wanted},
-        )
-
-    def without(self, names: Iterable[str]) -> Sections:
-        """All but those of these names."""
-        return self.only(set(self.values) - set(names))
-
-    def joined(self, other: Sections) -> Sections:
-        """Both; the other's where both have one."""
-        return Sections({**self.values, **other.values}, {**self.inputs, **other.inputs})
-
-    def canonical(self) -> str:
-        """All of it as one line, the same for the same sections; quicker to make than the file's text."""
-        return json.dumps([self.values, self.inputs], sort_keys=True, ensure_ascii=True, default=str)
-
-    def text(self, source: Path) -> str:
-        """Text of a rig's file with these sections; `source` is named should they not be valid."""
-        inputs = {name: dict(sorted(self.inputs[name].items())) for name in sorted(self.inputs)}
-        return Rig.of({"schema": SCHEMA, **self.values, "provenance": {"inputs": inputs}}, source).text()
-
-
-def sections_of(path: Path) -> Sections:
-    """Sections of a rig's file. Raises `BadInputError` as `Rig.load` does."""
-    rig = Rig.load(path)
-    values = rig.values()
-    del values["provenance"]
-    return Sections(values, rig.provenance.inputs)
-
 
 # ----------------------------------------------------------------------
 # The steps of a run: each is a stage, what it does with a folder, and what a run asks beyond it.
 #
 # A step sees only the sections of the rig's file that its stage names (and what the person wrote into the
-# folder's own rig.yaml), so that what it does cannot depend on anything else.
+# folder's own rig.yaml), so that what it does cannot depend on anything else, and gives back those that it
+# writes. What a run knows in the end is put together from these in the table's order.
 
 _IMU = ("ax_mps2", "ay_mps2", "gz_radps")
 _CAMERA = ("u_px", "v_px")
@@ -337,8 +290,8 @@ class Runner:
     steps: tuple[Step, ...] = STEPS
     fresh: bool = False
     ended: dict[str, Job] = field(default_factory=dict)
-    _base: Sections = field(default_factory=Sections)
-    _sections: dict[str, Sections] = field(default_factory=dict)
+    _base: Rig = field(default_factory=Rig)
+    _learnt: dict[str, Rig] = field(default_factory=dict)
     _digests: dict[Path, str] = field(default_factory=dict)
     _before: dict[Path, tuple[int, int, int]] = field(default_factory=dict)
     _began: dict[str, float] = field(default_factory=dict)
@@ -350,7 +303,8 @@ class Runner:
         self._digests = folder_digests(self.folder)
         if self.folder.rig is not None:
             learnt = {name for job in jobs if not job.status for name in job.step.writes}
-            self._base = sections_of(self.folder.rig).without(learnt)
+            base = Rig.load(self.folder.rig)
+            self._base = base.only(set(base.sections) - learnt)
         urgent = urgency(self.steps)
         waiting = sorted((job for job in jobs if not job.status), key=lambda job: -urgent[job.step.name])
         for job in jobs:
@@ -370,11 +324,11 @@ class Runner:
             self.progress(len(self.ended), len(jobs))
         return [self.ended[job.name] for job in jobs]
 
-    def sections(self) -> Sections:
-        """All that is known at the end: what the person told and what the stages have learnt."""
+    def rig(self) -> Rig:
+        """All that is known: what the person told and what the stages have learnt."""
         whole = self._base
         for step in self.steps:
-            for name, part in self._sections.items():
+            for name, part in self._learnt.items():
                 if self.ended[name].step is step:
                     whole = whole.joined(part)
         return whole
@@ -387,9 +341,9 @@ class Runner:
 
     def _start(self, job: Job) -> str:
         """Start a job and return its key; "" where it has ended at once: blocked, or with an old result."""
-        whole = self.sections()
-        known = whole.only({*self._base.values, *job.step.needs, *job.step.uses}).without(job.step.writes)
-        lacking = next((name for name in job.step.needs if name not in known.values), None)
+        seen = {*self._base.sections, *job.step.needs, *job.step.uses} - {*job.step.writes}
+        known = self.rig().only(seen)
+        lacking = next((name for name in job.step.needs if name not in known.sections), None)
         if lacking is not None:
             self._end(self._blocked(job, lacking))
             return ""
@@ -397,9 +351,8 @@ class Runner:
         named = [self.folder.name_of(path) for path in job.paths]
         chosen = {**self._stated(job), **job.options}
         options = {name: self._said(value) for name, value in chosen.items()}
-        key = key_of(
-            (*job.step.verb.split(), *named, json.dumps(options, sort_keys=True)), inputs, known.canonical()
-        )
+        command = (*job.step.verb.split(), *named, json.dumps(options, sort_keys=True))
+        key = key_of(command, inputs, json.dumps(known.values(), sort_keys=True))
         kept = None if self.fresh else load(self.out / HIDDEN / "stages" / job.name, key)
         if kept is not None and kept.code in _USABLE:
             self._end(self._judged(job, kept, reused=True))
@@ -407,11 +360,11 @@ class Runner:
         work = self._work(job.name)
         remove(work)
         make_folder(work)
-        write_atomically(work / "rig.yaml", known.text(self.folder.rig or self.out / "rig.yaml"))
+        known.save(work / "rig.yaml")
         self._began[job.name] = time.monotonic()
         step = job.step
-        made = Work(step.verb, self.folder.root, work, job.paths, chosen, step.figures, step.output)
-        self.processes.start(Task(job.name, perform, (made,)))
+        words = (step.verb, self.folder.root, work, job.paths, chosen, step.figures, step.output)
+        self.processes.start(Task(job.name, perform, words))
         return key
 
     def _work(self, name: str) -> Path:
@@ -454,18 +407,18 @@ class Runner:
             said = result.messages()
             words = said[-1].removeprefix("calib: ") if said else f"ended with exit code {result.code}"
             return replace(job, reason=words)
-        part = Sections()
+        part = Rig()
         if job.step.writes:
             try:
-                part = sections_of(result.folder / "rig.yaml").only(job.step.writes)
+                part = Rig.load(result.folder / "rig.yaml").only(job.step.writes)
             except BadInputError as error:
                 return replace(job, reason=str(error))
-            if not part.values:
+            if not part.sections:
                 return replace(job, reason=f"has written no {' and no '.join(job.step.writes)}")
-        self._sections[job.name] = part
+        self._learnt[job.name] = part
         if result.code == EXIT_DONE:
             return replace(job, status="ok", reused=reused)
-        return replace(job, status="poor", reason=_reason(job, part, result), reused=reused)
+        return replace(job, status="poor", reason=_reason(part, result), reused=reused)
 
     def _end(self, job: Job) -> None:
         self.ended[job.name] = job
@@ -477,12 +430,11 @@ class Runner:
         self.tell(f"{job.label}: {words}{how}{why}")
 
 
-def _reason(job: Job, part: Sections, result: Result) -> str:
+def _reason(part: Rig, result: Result) -> str:
     """The first reason that a stage gives for a poor result."""
-    for name in job.step.writes:
-        reasons = part.values.get(name, {}).get("reasons")
-        if reasons:
-            return str(reasons[0])
+    for section in part.sections.values():
+        if isinstance(section, StageResult) and section.verdict.reasons:
+            return section.verdict.reasons[0]
     for value in result.document().values():
         logs = value.get("logs") if isinstance(value, dict) else None
         for log in logs if isinstance(logs, list) else []:

@@ -73,8 +73,11 @@ def _command(folder: Folder, job: Job) -> list[str]:
     return ["calib", *job.step.verb.split(), *map(one_line, words)]
 
 
-def publish(runner: Runner, ended: Sequence[Job], told: dict[str, Any]) -> list[str]:
-    """Write all but the page; returns the names of the files relative to the output folder."""
+def publish(runner: Runner, ended: Sequence[Job], told: dict[str, Any], rig: Rig, twin: bool) -> list[str]:
+    """Write all but the page; returns the names of the files relative to the output folder.
+
+    `twin` says that what was calibrated was made by the run itself, and is to be shown beside the results.
+    """
     out = runner.out
     wanted: dict[str, Path] = {}
     for job in ended:
@@ -87,7 +90,7 @@ def publish(runner: Runner, ended: Sequence[Job], told: dict[str, Any]) -> list[
             for name in job.result.files:
                 if name.startswith(f"{output}/"):
                     wanted[name] = job.result.folder / name
-    if told["simulated"]:
+    if twin:
         # What was calibrated lies where one sees it.
         root = runner.folder.root
         files = (path for path in root.rglob("*") if path.is_file())
@@ -105,7 +108,7 @@ def publish(runner: Runner, ended: Sequence[Job], told: dict[str, Any]) -> list[
             (out / folder).rmdir()
     # One that could not be removed is tried again by the next run.
     _list(out, sorted({*names, *left}))
-    _write(out / "rig.yaml", runner.sections().text(out / "rig.yaml"))
+    _write(out / "rig.yaml", rig.file_text(out / "rig.yaml"))
     _write(out / HIDDEN / "run.json", json.dumps(told, indent=1, ensure_ascii=True) + "\n")
     return ["rig.yaml", *names]
 
@@ -223,19 +226,20 @@ def calibrate(
         for sentence in seen.left_out:
             narrate(sentence)
         runner = Runner(seen, out, pool, narrate, progress, fresh=fresh)
-        return run_folder(runner, simulated=root is None)
+        return run_folder(runner, twin=root is None)
 
 
-def run_folder(runner: Runner, simulated: bool = False, page: bool = True) -> Calibrated:
+def run_folder(runner: Runner, twin: bool = False, page: bool = True) -> Calibrated:
     """Run the jobs of a folder and write all that is for a person, in an output folder that is open."""
     out, ended = runner.out, runner.run()
-    told = summary(runner, ended, simulated)
-    files = publish(runner, ended, told)
+    rig = runner.rig()
+    told = summary(runner, ended, twin or rig.simulated)
+    files = publish(runner, ended, told, rig, twin)
     if page:
         keep_pictures(runner.folder.pictures, out / HIDDEN / "pictures")
         write_page(out / "rig.yaml")
         files.append("report.html")
-    return Calibrated(out, decide(told, runner.sections().values), told, ended, tuple(files))
+    return Calibrated(out, decide(told, rig.values()), told, ended, tuple(files))
 
 
 def _simulated(output: Path) -> Folder:

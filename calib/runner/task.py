@@ -26,12 +26,13 @@ from calib.core.errors import (
     CalibError,
 )
 from calib.core.files import PICTURES, one_line, read_text, read_yaml_mapping, sha256, shown
+from calib.core.rig import Rig
 from calib.core.stage import name_of_flag
 from calib.core.units import parse_corners, parse_square_m
 from calib.core.writing import make_folder
 from calib.runner.cache import key_of, program
 from calib.runner.folder import Folder, folder_digests, read_folder
-from calib.runner.graph import STEPS, Runner, opened_run, sections_of
+from calib.runner.graph import STEPS, Runner, opened_run
 from calib.runner.outcomes import SAME, Answer, Outcome, internal_error
 from calib.runner.outputs import Calibrated, run_folder
 from calib.runner.processes import Here, needed
@@ -597,7 +598,7 @@ def _kept(out: Path, names: tuple[str, ...], pages: bool) -> dict[str, bytes]:
 
 
 def _values(rig: Path) -> dict[str, tuple[float, float | None]]:
-    return {f"{one.section}.{one.name}": (one.value, one.sigma) for one in constants(sections_of(rig).values)}
+    return {f"{one.section}.{one.name}": (one.value, one.sigma) for one in constants(Rig.load(rig).values())}
 
 
 def peak_memory_MB() -> float:

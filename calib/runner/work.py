@@ -1,53 +1,30 @@
 """One stage carried out: read, solved, written into the rig's file, drawn; for a verb, and for a run.
 
-A run hands `Work` to a process; what comes of it lies in the work's folder: rig.yaml with the sections, the
-stage's document, its messages, the charts of its figures and what it wrote beside them.
+In a run a process calls `perform`; what comes of it lies in a folder: rig.yaml with the sections, the stage's
+document, its messages, the charts of its figures and what it wrote beside them.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
-import math
 import os
 import traceback
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from calib.core.command import one_command
 from calib.core.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERNAL, EXIT_POOR, CalibError
 from calib.core.files import one_line, shown
-from calib.core.result import section_json
 from calib.core.rig import SECTIONS, Rig
 from calib.core.stage import Files, Stage, options_of
 from calib.core.writing import check_figures, check_folder, check_writable, write_atomically
 from calib.stages import stage
 
 DOCUMENT, MESSAGES, RIG, FIGURES = "document.json", "messages.txt", "rig.yaml", "figures"
-"""What a work leaves in its folder."""
-
-
-@dataclass(frozen=True)
-class Work:
-    """A stage to carry out.
-
-    Attributes
-    ----------
-    verb : words of the stage. paths : what it reads, below `root`.
-    options : values by the names of the stage's options.
-    folder : with the rig.yaml that the stage may see; takes what comes of it.
-    figures : whether it draws. output : name of what it writes beside rig.yaml, "" for nothing.
-    """
-
-    verb: str
-    root: Path
-    folder: Path
-    paths: tuple[Path, ...] = ()
-    options: Mapping[str, Any] = field(default_factory=dict)
-    figures: bool = True
-    output: str = ""
+"""What a stage leaves in its folder."""
 
 
 def carry_out(
@@ -94,53 +71,38 @@ def _carried_out(
     return outcome, rig
 
 
-def document_of(made: Stage, outcome: Any, written: Sequence[str] = ()) -> dict[str, Any]:
-    """The JSON document of an outcome; what is not finite becomes null.
+def perform(
+    verb: str,
+    root: Path,
+    folder: Path,
+    paths: tuple[Path, ...],
+    options: Mapping[str, Any],
+    figures: bool,
+    output: str,
+) -> int:
+    """Carry out a stage in this process; its exit code, as that of the verb would be.
 
     Parameters
     ----------
-    written : names of the files that it was written to, which the document of a folder lists.
+    verb : words of the stage. paths : what it reads, below `root`.
+    folder : with the rig.yaml that the stage may see; takes what comes of it.
+    options : values by the names of the stage's options.
+    figures : whether it draws. output : name of what it writes beside rig.yaml, "" for nothing.
     """
-    whole: dict[str, Any] = {"schema": 1, "verb": made.name}
-    whole |= {name: section_json(one) for name, one in made.sections(outcome).items()}
-    if written and made.output is not None and made.output.folder:
-        whole["files"] = list(written)
-    finite: dict[str, Any] = _finite(whole | made.document(outcome))
-    return finite
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, Mapping):
-        return {str(key): _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return value
-
-
-def perform(work: Work) -> int:
-    """Carry out a work in this process; its exit code, as that of the verb would be."""
     messages: list[str] = []
-    files = Files(
-        work.paths,
-        output=work.folder / work.output if work.output else None,
-        narrate=messages.append,
-        figures=work.figures,
-        keep=False,
-    )
-    made = stage(work.verb)
+    target = folder / output if output else None
+    files = Files(paths, output=target, narrate=messages.append, figures=figures, keep=False)
+    made = stage(verb)
     try:
-        options = options_of(made.options, work.options)
-        outcome, _ = carry_out(made, files, options, work.folder / RIG)
-        if work.figures and made.plots is not None:
+        outcome, _ = carry_out(made, files, options_of(made.options, options), folder / RIG)
+        if figures and made.plots is not None:
             from calib.show.charts import write_charts
 
-            write_charts(work.folder / FIGURES, made.plots(outcome))
-        told = document_of(made, outcome, files.written)
+            write_charts(folder / FIGURES, made.plots(outcome))
+        told = made.as_json(outcome, files.written)
         # Nothing in a result differs from run to run.
         told.pop("seconds", None)
-        write_atomically(work.folder / DOCUMENT, json.dumps(told, indent=1) + "\n")
+        write_atomically(folder / DOCUMENT, json.dumps(told, indent=1) + "\n")
         files.finish()
         code = EXIT_DONE if made.verdict(outcome).ok else EXIT_POOR
     except CalibError as error:
@@ -158,11 +120,11 @@ def perform(work: Work) -> int:
             traceback.print_exc()
         messages.append(f"calib: internal error: {type(error).__name__}: {error}; please report it")
         code = EXIT_INTERNAL
-    places = (f"{work.root}{os.sep}", f"{work.folder}{os.sep}")
+    places = (f"{root}{os.sep}", f"{folder}{os.sep}")
     with contextlib.suppress(OSError):
-        # Where a work puts what it writes is nobody's concern.
-        kept = [one for one in messages if str(work.folder) not in one or one.startswith("calib: ")]
-        write_atomically(work.folder / MESSAGES, "".join(f"{_nowhere(line, places)}\n" for line in kept))
+        # Where it is that a run writes is nobody's concern.
+        kept = [one for one in messages if str(folder) not in one or one.startswith("calib: ")]
+        write_atomically(folder / MESSAGES, "".join(f"{_nowhere(line, places)}\n" for line in kept))
     return code
 
 

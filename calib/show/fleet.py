@@ -11,7 +11,8 @@ import numpy as np
 
 from calib import __version__
 from calib.core.plot import Bars, Curve, Figure, Mark, Plot, Rule
-from calib.core.words import BLANK, SIGMA, as_words, number, unit_of
+from calib.core.units import unit_of
+from calib.core.words import BLANK, SIGMA, as_words, number
 from calib.core.writing import write_atomically
 from calib.runner.fleet import ConstantSummary, Drift, FleetSummary
 from calib.runner.sweep import Point, Sweep, SweepSummary

@@ -20,7 +20,9 @@ from calib.core.errors import BadInputError
 from calib.core.files import read_bytes, read_text, sha256
 from calib.core.plot import HUES, Figure
 from calib.core.rig import KINDS, Rig, kind_of
-from calib.core.words import BLANK, as_words, facts, number, short, unit_of
+from calib.core.units import unit_of
+from calib.core.verdict import Verdict
+from calib.core.words import BLANK, as_words, facts, number, short
 from calib.core.writing import Kind, holds, make_folder, write_atomically
 from calib.io.columns import COLUMNS
 from calib.runner.cache import Result, load
@@ -347,7 +349,7 @@ def page_text(rig: Path) -> str:
     sections = whole.values()
     provenance = sections.pop("provenance")
     hidden = rig.parent / HIDDEN
-    told = read_summary(hidden / "run.json") or _summary_of(sections)
+    told = read_summary(hidden / "run.json") or _summary_of(whole)
     budget = _Budget(MOST_BYTES - _ROOM_BYTES)
     views = _views(hidden, _Budget(_VIEWS_BYTES))
     budget.left -= sum(len(view["image"]) for view in views)
@@ -383,15 +385,15 @@ def page_text(rig: Path) -> str:
     )
 
 
-def _summary_of(sections: Mapping[str, Any]) -> dict[str, Any]:
+def _summary_of(rig: Rig) -> dict[str, Any]:
     """A summary for a rig.yaml that no run has made: each section is a stage."""
     jobs = []
     steps = [(name, step) for step in STEPS for name in step.writes]
     for name, step in steps:
-        values = sections.get(name)
-        if isinstance(values, dict):
-            poor = values.get("verdict", "ok") != "ok"
-            reasons = values.get("reasons") or [f"its verdict is {values.get('verdict')}"]
+        section = rig.sections.get(name)
+        if section is not None:
+            verdict = getattr(section, "verdict", Verdict())
+            reasons = verdict.reasons or [f"its verdict is {verdict.word}"]
             jobs.append(
                 {
                     "name": step.name,
@@ -402,11 +404,12 @@ def _summary_of(sections: Mapping[str, Any]) -> dict[str, Any]:
                     "inputs": [],
                     "writes": [name],
                     "flashed": step.flashed,
-                    "status": "poor" if poor else "ok",
-                    "reason": str(reasons[0]) if poor else "",
+                    "status": "ok" if verdict.ok else "poor",
+                    "reason": "" if verdict.ok else reasons[0],
                 }
             )
-    return {"simulated": False, "pictures": 0, "logs": [], "left_out": [], "jobs": jobs, "alone": True}
+    told = {"simulated": rig.simulated, "pictures": 0, "logs": [], "left_out": []}
+    return {**told, "jobs": jobs, "alone": True}
 
 
 def _views(hidden: Path, budget: _Budget) -> list[dict[str, Any]]:

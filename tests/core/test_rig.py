@@ -124,7 +124,7 @@ def test_difference_in_standard_deviations_of_both(tmp_path: Path) -> None:
     (change,) = found.changes
     assert change.name == "fx_px" and change.sigma == pytest.approx(0.05)
     assert change.sigmas == pytest.approx(4.0) and change.significant and found.significant
-    assert found.verdicts == (("camera", "ok", "poor"),)
+    assert found.verdicts == ({"section": "camera", "before": "ok", "after": "poor"},)
 
 
 def test_shift_of_the_plane_is_read_in_millimetres(tmp_path: Path) -> None:

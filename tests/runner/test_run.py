@@ -25,7 +25,7 @@ from calib.core.errors import BadInputError
 from calib.core.rig import KINDS
 from calib.runner.decision import read_summary
 from calib.runner.folder import read_folder
-from calib.runner.graph import HIDDEN, STEPS, Job, opened
+from calib.runner.graph import HIDDEN, STEPS, Job, opened_run
 from calib.show.page import keep_pictures, page_text, write_page
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="killing is POSIX's")
@@ -159,7 +159,7 @@ def test_links_in_the_output_folder_are_refused(tmp_path: Path) -> None:
 
 def test_the_folder_itself_is_no_output_folder(tmp_path: Path) -> None:
     root = make_folder(tmp_path / "rig")
-    with pytest.raises(BadInputError, match="folder that is read"), opened(root / "logs", root):
+    with pytest.raises(BadInputError, match="folder that is read"), opened_run(root / "logs", root):
         pass
 
 

@@ -56,7 +56,10 @@ def test_grid_times_draws(tmp_path: Path) -> None:
         ("base: {scenario: swing, rig: none.yaml}\n", "none.yaml is not there"),
         (_BASE + "grid: {__class__.x: [1]}\n", "is no parameter"),
         ("base: {scenario: swing}\ngrid: {controller.pwm_high: [200]}\n", "needs a controller"),
-        (_BASE + f"grid: {{pump.lag_s: [{'9' * 390}]}}\n", r"grid.pump.lag_s.0 is 9{57}..., expected at most 1e\+40"),
+        (
+            _BASE + f"grid: {{pump.lag_s: [{'9' * 390}]}}\n",
+            r"grid.pump.lag_s.0 is 9{57}..., expected at most 1e\+40",
+        ),
         ("base: {~: 1, scenario: swing}\n", "base.None is None, expected text as a key"),
         (_BASE + "draws: {count: 0}\n", "draws.count is 0"),
         (_BASE + "grid: {pump.lag_s: [1]}\ndraws: {pump.lag_s: {normal: [1, 1]}}\n", "in grid and in draws"),

@@ -47,9 +47,9 @@ from calib.stages.imu.intrinsics import find_intrinsics
 from calib.stages.imu.plots import intrinsics_plots, static_plots
 from calib.stages.imu.sampling import Readings
 from calib.stages.imu.static import analyse_static
-from calib.stages.lowpass.filters import Design, design_lowpass
+from calib.stages.lowpass.filters import Design, Positions, design_lowpass
 from calib.stages.lowpass.plots import plots as lowpass_plots
-from calib.stages.lowpass.stage import Inputs, Positions, positions_from_log
+from calib.stages.lowpass.stage import Inputs, positions_from_log
 from calib.stages.lowpass.stage import solve as solve_lowpass
 from synthetic import CAMERA, views_of
 

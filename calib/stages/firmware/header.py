@@ -159,16 +159,10 @@ def _judge(whole: Rig, inverse: InverseLens | None) -> Verdict:
         lacks, verb = ("camera", "intrinsics") if whole.camera is None else ("plane", "extrinsics")
         text = f"no {lacks} yet: the sketch records, and controls nothing"
         findings.append(Finding("remark", text, f"run calib {verb}"))
-    if _simulated(whole):
+    if whole.simulated:
         text = "the rig is a simulated one: for a board its constants compile only with CALIB_I_KNOW"
         findings.append(Finding("remark", text))
     return Verdict.of(findings)
-
-
-def _simulated(whole: Rig) -> bool:
-    """Whether constants come from a simulated rig or from rendered pictures."""
-    optics = (one for one in (whole.camera, whole.plane) if one is not None)
-    return whole.twin is not None or any(one.simulated for one in optics)
 
 
 def header_of(rig: Rig, source: str) -> Header:
@@ -205,7 +199,7 @@ def header_of(rig: Rig, source: str) -> Header:
         inverse=inverse,
         plane=plane,
         rig_ok=verdict.ok,
-        simulated=_simulated(rig),
+        simulated=rig.simulated,
         inputs=dict(sorted(inputs.items())),
         **context,
     )

@@ -772,3 +772,27 @@ def suggest(
     same = [one for one in tied if one.motion_lost <= least + _SAME_SHAPE]
     best = min(same, key=lambda one: (one.filter.design.order, one.delay_s))
     return Suggestion(best, tuple(candidates))
+
+
+@dataclass(frozen=True)
+class Positions:
+    """Where a log's camera saw the marker.
+
+    Attributes
+    ----------
+    source : name for messages.
+    unit : "m" on the plane where the rig has one, "px" otherwise.
+    names : of the two coordinates.
+    rate_hz : of the log.
+    ticks : the coordinates (n, 2).
+    pixels : the same in pixels, for the grid that they lie on.
+    spectra : of each coordinate, over the longest piece.
+    """
+
+    source: str
+    unit: str
+    names: tuple[str, str]
+    rate_hz: float
+    ticks: Ticks
+    pixels: Ticks
+    spectra: tuple[Spectrum, Spectrum]

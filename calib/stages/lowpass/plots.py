@@ -21,6 +21,7 @@ from calib.core.plot import (
 )
 from calib.stages.lowpass.filters import (
     Filter,
+    Positions,
     Spectrum,
     decibels,
     filter_signal,
@@ -29,7 +30,6 @@ from calib.stages.lowpass.filters import (
     step_response,
 )
 from calib.stages.lowpass.section import LowPass
-from calib.stages.lowpass.stage import Positions
 
 _WINDOW_S = 12.0
 """Length of a log that is drawn: its livelier part."""

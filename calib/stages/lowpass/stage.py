@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from calib.core.words import Block
     from calib.io.logs import Log
     from calib.stages.camera.model import Camera
-    from calib.stages.lowpass.filters import Filter, Spectrum, Suggestion, Ticks
+    from calib.stages.lowpass.filters import Filter, Positions, Suggestion
     from calib.stages.lowpass.section import LowPass, LowPassLog
 
 _RATE_OFF = 0.05
@@ -68,30 +68,6 @@ class Options(LogOptions):
         parse=parse_jitter,
     )
     log: Path | None = option(None, "Log to show the filter on. [default: that of --suggest]", metavar="LOG")
-
-
-@dataclass(frozen=True)
-class Positions:
-    """Where a log's camera saw the marker.
-
-    Attributes
-    ----------
-    source : name for messages.
-    unit : "m" on the plane where the rig has one, "px" otherwise.
-    names : of the two coordinates.
-    rate_hz : of the log.
-    ticks : the coordinates (n, 2).
-    pixels : the same in pixels, for the grid that they lie on.
-    spectra : of each coordinate, over the longest piece.
-    """
-
-    source: str
-    unit: str
-    names: tuple[str, str]
-    rate_hz: float
-    ticks: Ticks
-    pixels: Ticks
-    spectra: tuple[Spectrum, Spectrum]
 
 
 @dataclass(frozen=True)
@@ -142,7 +118,7 @@ def positions_from_log(
 
     from calib.core.geometry import apply_homography
     from calib.stages.camera.model import undistort
-    from calib.stages.lowpass.filters import on_ticks, spectrum
+    from calib.stages.lowpass.filters import Positions, on_ticks, spectrum
 
     signals = log.signals("u_px", "v_px")
     pixels = signals.values
