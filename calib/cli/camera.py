@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from calib.cli.common import (
     JsonOption,
     RigOption,
+    answer,
     document,
     emit,
     narrate,
@@ -170,57 +171,40 @@ def import_camera(
     as_json: JsonOption = False,
 ) -> None:
     """Read a camera from ROS camera_info, OpenCV FileStorage or Kalibr camchain, or an imu.yaml."""
-    if from_ == "kalibr-imu":
-        _import_imu(source, rig, as_json)
-        return
-    from calib.core.files import as_text, read_bytes, sha256, shown
+    from calib.core.files import read_bytes, sha256, shown
     from calib.core.result import section_json
     from calib.core.rig import SECTIONS, Rig
     from calib.core.writing import check_writable
-    from calib.stages.camera.formats import from_kalibr, from_opencv, from_ros
-    from calib.stages.camera.stage import imported_camera
 
     check_writable(rig, SECTIONS)
     before = Rig.load(rig, missing_ok=True)
-    data = read_bytes(source, _MAX_BYTES)
-    text = as_text(source, data)
+    data, where = read_bytes(source, _MAX_BYTES), shown(source)
     try:
-        camera = {"ros": from_ros, "opencv": from_opencv, "kalibr": from_kalibr}[from_](text)
+        name, section, words = _imported(from_, source, data)
     except BadInputError as error:
-        raise BadInputError(f"{shown(source)}: {error}") from error
-    section = imported_camera(camera, from_)
-    before.camera = section
-    before.save(rig, {"camera": {shown(source.name): sha256(data)}})
-    if as_json:
-        document("import", {"camera": section_json(section)})
-    else:
-        say(f"camera {camera.model}, {camera.image_size_px[0]}x{camera.image_size_px[1]} px")
-        say("it comes without error bars, so its verdict is poor until calib intrinsics has seen pictures")
-    narrate(f"camera written to {shown(rig)}")
-    for sentence in before.outdated():
+        raise BadInputError(str(error) if str(error).startswith(where) else f"{where}: {error}") from error
+    after = before.with_sections({name: section})
+    after.save(rig, {name: {shown(source.name): sha256(data)}})
+    answer(as_json, "import", {name: section_json(section)}, *words)
+    narrate(f"{name} written to {shown(rig)}")
+    for sentence in after.outdated():
         narrate(sentence)
 
 
-def _import_imu(source: Path, rig: Path, as_json: bool) -> None:
-    from calib.core.files import read_bytes, read_yaml_mapping, sha256, shown
-    from calib.core.result import section_json
-    from calib.core.rig import SECTIONS, Rig
-    from calib.core.writing import check_writable
-    from calib.stages.imu.formats import from_kalibr
+def _imported(from_: str, source: Path, data: bytes) -> tuple[str, Any, tuple[str, ...]]:
+    """Name and section of what a file holds, and sentences on it."""
+    from calib.core.files import as_text, read_yaml_mapping
+    from calib.stages.camera.formats import from_kalibr, from_opencv, from_ros
+    from calib.stages.camera.stage import imported_camera
+    from calib.stages.imu.formats import from_kalibr as imu_from_kalibr
 
-    check_writable(rig, SECTIONS)
-    before = Rig.load(rig, missing_ok=True)
-    digest = sha256(read_bytes(source, _MAX_BYTES))
-    try:
-        section = from_kalibr(read_yaml_mapping(source))
-    except BadInputError as error:
-        place = shown(source)
-        raise BadInputError(str(error) if str(error).startswith(place) else f"{place}: {error}") from error
-    before.imu = section
-    before.save(rig, {"imu": {shown(source.name): digest}})
-    if as_json:
-        document("import", {"imu": section_json(section)})
-    else:
-        say(f"IMU noise at {section.rate_hz:g} Hz")
-        say("it comes without biases and error bars, so its verdict is poor until calib imu static has run")
-    narrate(f"imu written to {shown(rig)}")
+    if from_ == "kalibr-imu":
+        imu = imu_from_kalibr(read_yaml_mapping(source))
+        lacks = (
+            "it comes without biases and error bars, so its verdict is poor until calib imu static has run"
+        )
+        return "imu", imu, (f"IMU noise at {imu.rate_hz:g} Hz", lacks)
+    camera = {"ros": from_ros, "opencv": from_opencv, "kalibr": from_kalibr}[from_](as_text(source, data))
+    width, height = camera.image_size_px
+    lacks = "it comes without error bars, so its verdict is poor until calib intrinsics has seen pictures"
+    return "camera", imported_camera(camera, from_), (f"camera {camera.model}, {width}x{height} px", lacks)

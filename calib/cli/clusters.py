@@ -33,32 +33,31 @@ RetriesOption = Annotated[
 ]
 
 
-def check_places(scheduler: str | None, workers: int | None) -> None:
-    """Raise `UsageError` where both are given."""
+@contextmanager
+def at_work(
+    output: Path,
+    verb: str,
+    outputs: tuple[str, ...],
+    scheduler: str | None,
+    workers: int | None,
+    retries: int,
+) -> Iterator[tuple[Store, Processes]]:
+    """The output folder, see `opened_store`, and the processes: this machine's own, or those of a scheduler.
+
+    Raises `UsageError` where both a scheduler and a number of workers are given.
+    """
+    from calib.core.workers import processors
+    from calib.runner.outcomes import opened_store
+    from calib.runner.processes import connected, local
+
     if scheduler is not None and workers is not None:
         raise UsageError("--workers: an existing cluster has its own workers, give --scheduler alone")
-
-
-@contextmanager
-def opened_out(output: Path, verb: str, outputs: tuple[str, ...]) -> Iterator[Store]:
-    """The output folder, see `opened_store`; says so where the last run there was interrupted."""
-    from calib.runner.outcomes import opened_store
-
     with opened_store(output, verb, outputs) as (store, interrupted):
         if interrupted:
             narrate("the last run here was interrupted; going on where it stopped")
-        yield store
-
-
-@contextmanager
-def processes(store: Store, scheduler: str | None, workers: int | None, retries: int) -> Iterator[Processes]:
-    """The processes to work in: this machine's own, or those of a scheduler."""
-    from calib.core.workers import processors
-    from calib.runner.processes import connected, local
-
-    with (
-        connected(scheduler, narrate)
-        if scheduler
-        else local(workers or processors(), retries, store.scratch) as made
-    ):
-        yield made
+        with (
+            connected(scheduler, narrate)
+            if scheduler
+            else local(workers or processors(), retries, store.scratch) as pool
+        ):
+            yield store, pool

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
@@ -13,10 +14,9 @@ from calib.cli.common import (
     GyroUnitOption,
     JsonOption,
     TopicsOption,
-    document,
+    answer,
     narrate,
     progress_bar,
-    say,
 )
 from calib.core.errors import BadInputError, UsageError
 
@@ -55,43 +55,37 @@ def convert(
     if save_columns is not None:
         check_writable(save_columns, COLUMNS_FILE)
     stream = iter_log(log, LogOptions(acc_unit, gyro_unit, columns, topics))
-    block = next(stream, None)
-    if block is None:
+    first = next(stream, None)
+    if first is None:
         raise BadInputError(f"{shown(log)}: has a header but no rows")
-    refuse_counts(block, tuple(block.columns))
-    read_as = block.map
+    refuse_counts(first, tuple(first.columns))
+    read_as = first.map
     if read_as is not None and read_as.narration:
         narrate(read_as.narration)
-    names = tuple(block.columns)
+    names = tuple(first.columns)
     rows, blank, truncated, wraps = 0, 0, False, 0
     with (
         states_writer(output, ("t_s", *names), LOG) as add,
         progress_bar(f"converting {log.name}") as progress,
     ):
-        while True:
+        for block in chain([first], stream):
             add(np.column_stack([block.t_s, *(block.columns[name] for name in names)]))
             rows, blank, truncated = rows + len(block), blank + block.not_finite, block.truncated
             wraps += block.wraps
             progress(rows, 0)
-            following = next(stream, None)
-            if following is None:
-                break
-            block = following
     if save_columns is not None and read_as is not None:
         write_atomically(save_columns, read_as.text(), COLUMNS_FILE)
     told = {
         "log": shown(output),
         "rows": rows,
         "columns": list(names),
-        "left_out": list(block.unknown),
+        "left_out": list(first.unknown),
         "not_finite": blank,
         "truncated": truncated,
     }
-    if as_json:
-        document("convert", {"convert": told})
-        return
-    say(f"{rows} rows written to {shown(output)}: t_s, {', '.join(names)}")
-    if block.unknown:
-        narrate(f"left out: {', '.join(block.unknown)}")
+    sentence = f"{rows} rows written to {shown(output)}: t_s, {', '.join(names)}"
+    answer(as_json, "convert", {"convert": told}, sentence)
+    if first.unknown:
+        narrate(f"left out: {', '.join(first.unknown)}")
     for sentence in passed_over(blank, truncated, wraps):
         narrate(sentence)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Annotated
 
 import typer
@@ -30,16 +31,7 @@ def doctor(
         document(
             "doctor",
             {
-                "checks": [
-                    {
-                        "name": c.name,
-                        "needed": c.needed,
-                        "good": c.good,
-                        "found": c.found,
-                        "what_for": c.what_for,
-                    }
-                    for c in checks
-                ],
+                "checks": [asdict(check) for check in checks],
                 "gate": [c.name for c in bad] or "passed",
             },
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,9 +13,7 @@ from calib.cli.clusters import (
     RetriesOption,
     SchedulerOption,
     WorkersOption,
-    check_places,
-    opened_out,
-    processes,
+    at_work,
 )
 from calib.cli.common import JsonOption, document, narrate, progress_bar, say, table
 from calib.core.errors import EXIT_POOR
@@ -67,7 +66,6 @@ def fleet(
     from calib.runner.task import SCHEMES, Allowed, FleetOptions, read_manifest, twice_told
     from calib.show.fleet import PAGE, write_fleet_page
 
-    check_places(scheduler, workers)
     limit_s = parse_duration_s(timeout, "--timeout")
     known = read_manifest(manifest)
     if known.ignored:
@@ -75,9 +73,10 @@ def fleet(
     for sentence in twice_told(known.rigs):
         narrate(f"{shown(manifest)}: {sentence}")
     check_apart(output, known.rigs)
-    with opened_out(output, "calib fleet", ("fleet.parquet", PAGE, TIMINGS)) as store:
+    outputs = ("fleet.parquet", PAGE, TIMINGS)
+    with at_work(output, "calib fleet", outputs, scheduler, workers, retries) as (store, pool):
         options = FleetOptions(pages, allowed=Allowed((*SCHEMES, *(allow_scheme or ())), allow_private))
-        with processes(store, scheduler, workers, retries) as pool, progress_bar("rigs") as progress:
+        with progress_bar("rigs") as progress:
             counts = run_fleet(store, pool, known, options, progress, narrate, limit_s)
         summary = finish(store, known)
         write_fleet_page(output / PAGE, summary)
@@ -112,10 +111,7 @@ def _as_json(summary: FleetSummary, counts: Counts) -> dict[str, Any]:
             }
             for one in summary.constants
         ],
-        "to_look_at": [
-            {"name": look.name, "serial": look.serial, "verdict": look.verdict, "z": look.z, "why": look.why}
-            for look in summary.looks
-        ],
+        "to_look_at": [asdict(look) for look in summary.looks],
     }
 
 

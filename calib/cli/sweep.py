@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,15 +13,13 @@ from calib.cli.clusters import (
     RetriesOption,
     SchedulerOption,
     WorkersOption,
-    check_places,
-    opened_out,
-    processes,
+    at_work,
 )
 from calib.cli.common import JsonOption, document, narrate, progress_bar, say, table
 from calib.core.errors import EXIT_POOR
 
 if TYPE_CHECKING:
-    from calib.runner.sweep import Point, SweepSummary
+    from calib.runner.sweep import SweepSummary
 
 __all__ = ["sweep"]
 
@@ -50,44 +49,22 @@ def sweep(
     from calib.runner.sweep import read_sweep, run_sweep, summarise_sweep
     from calib.show.fleet import SWEEP_PAGE, write_sweep_page
 
-    check_places(scheduler, workers)
     limit_s = parse_duration_s(timeout, "--timeout")
     known = read_sweep(spec)
-    with opened_out(output, "calib sweep", ("sweep.parquet", SWEEP_PAGE, TIMINGS)) as store:
-        with processes(store, scheduler, workers, retries) as pool, progress_bar("cases") as progress:
+    outputs = ("sweep.parquet", SWEEP_PAGE, TIMINGS)
+    with at_work(output, "calib sweep", outputs, scheduler, workers, retries) as (store, pool):
+        with progress_bar("cases") as progress:
             counts = run_sweep(store, pool, known, progress, limit_s)
         summary = summarise_sweep(store, known, counts.as_before)
         write_sweep_page(output / SWEEP_PAGE, known, summary)
     if as_json:
-        document("sweep", {"sweep": _as_json(summary)})
+        document("sweep", {"sweep": {**asdict(summary), "clouds": None}})
     else:
         _tell(summary)
         say(f"{shown(output)}: sweep.parquet and sweep.html")
     narrate("simulated: a model of a rig, not the rig")
     if summary.failed:
         raise typer.Exit(EXIT_POOR)
-
-
-def _as_json(summary: SweepSummary) -> dict[str, Any]:
-    def told(point: Point) -> dict[str, Any]:
-        return {
-            "point": point.number,
-            "parameters": dict(point.values),
-            "median": point.median,
-            "worst": point.worst,
-            "draws": point.draws,
-            "measures": dict(point.measures),
-        }
-
-    return {
-        "cases": summary.cases,
-        "failed": summary.failed,
-        "as_before": summary.as_before,
-        "why": summary.why,
-        "measure": summary.measure,
-        "best": [told(point) for point in summary.best],
-        "worst": [told(point) for point in summary.worst],
-    }
 
 
 def _tell(summary: SweepSummary) -> None:
@@ -100,12 +77,12 @@ def _tell(summary: SweepSummary) -> None:
     for title, points in (("best", summary.best[:5]), ("worst", summary.worst[:5])):
         if not points:
             continue
-        names = [name for name, _ in points[0].values]
+        names = list(points[0].parameters)
         head = [title, *names, f"{summary.measure}, median", "worst draw"]
         rows = [
             [
-                f"#{point.number}",
-                *(_text(value) for _, value in point.values),
+                f"#{point.point}",
+                *(_text(value) for value in point.parameters.values()),
                 f"{point.median:.4g}",
                 f"{point.worst:.4g}",
             ]

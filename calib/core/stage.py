@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args, get_origin, get_type_hints
 
 from calib.core.errors import EXIT_INTERNAL, BadInputError, CalibError, SomeFailedError, UsageError
 
@@ -204,6 +204,10 @@ def options_of(kind: type[Any], values: Mapping[str, Any]) -> Any:
             near = difflib.get_close_matches(name, known, 1)
             hint = f"; did you mean {near[0]}?" if near else f", expected one of {', '.join(known)}"
             raise UsageError(f"{name} is not an option{hint}")
+        choices = [part for one in (hints[name], *get_args(hints[name])) if get_origin(one) is Literal
+                   for part in get_args(one)]  # fmt: skip
+        if choices and value is not None and value not in choices:
+            raise UsageError(f"{name} is {value!r}, expected one of {', '.join(map(str, choices))}")
         parse = known[name].metadata.get("parse") or (Path if Path in get_args(hints[name]) else None)
         parsed[name] = parse(value) if parse is not None and isinstance(value, str) else value
     return kind(**parsed)

@@ -460,13 +460,13 @@ class Point:
     median : of the measure. worst : of its draws. loss : what points are ranked by, the less the better.
     """
 
-    number: int
-    values: tuple[tuple[str, Any], ...]
+    point: int
+    parameters: dict[str, Any]
     median: float
     worst: float
     loss: float
     draws: int
-    measures: tuple[tuple[str, float], ...]
+    measures: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -576,8 +576,8 @@ def _points(table: Any, spec: Sweep, y: FloatArray, measures: tuple[str, ...]) -
     out = []
     for first, rows in zip(starts.tolist(), np.split(order, starts[1:]), strict=True):
         i = int(order[first])
-        medians = tuple((name, _median(values[rows])) for name, values in others.items())
-        values = tuple((name, listed[name][i]) for name in shown)
+        medians = {name: _median(values[rows]) for name, values in others.items()}
+        values = {name: listed[name][i] for name in shown}
         known = rows[np.isfinite(loss[rows])]
         worst = float(y[known[np.argmax(loss[known])]]) if len(known) else math.nan
         out.append(

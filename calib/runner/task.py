@@ -27,8 +27,7 @@ from calib.core.errors import (
 )
 from calib.core.files import PICTURES, one_line, read_text, read_yaml_mapping, sha256, shown
 from calib.core.rig import Rig
-from calib.core.stage import name_of_flag
-from calib.core.units import parse_corners, parse_square_m
+from calib.core.stage import name_of_flag, options_of
 from calib.core.writing import make_folder
 from calib.runner.cache import key_of, program
 from calib.runner.folder import Folder, folder_digests, read_folder
@@ -51,11 +50,6 @@ from calib.stages import stage
 OPTIONS = ("corners", "square", "model", "loss", "board")
 """What may differ from rig to rig."""
 
-_CHOICES = {
-    "model": ("auto", "pinhole", "radial2", "radial3", "fisheye4", "brown5", "rational8"),
-    "loss": ("none", "huber", "cauchy"),
-    "board": ("rigid", "warp", "released", "auto"),
-}
 _COLUMNS = ("name", "path", "serial", *OPTIONS)
 _SIGNS = frozenset(" -_.+#=@()")
 _LONGEST = 80
@@ -244,9 +238,17 @@ def _rig(where: str, row: Mapping[str, Any], root: Path) -> RigSpec:
     for key in OPTIONS:
         value = _text(where, row, key)
         if value:
-            _check_option(f"{where}: {key} of {name}", key, value)
             options.append((key, value))
+    try:
+        options_of(stage("intrinsics").options, camera_options(options))
+    except CalibError as error:
+        raise BadInputError(f"{where}: {name}: {error}") from error
     return RigSpec(name, source, serial, tuple(options))
+
+
+def camera_options(options: Iterable[tuple[str, str]]) -> dict[str, str]:
+    """Options by the names that `intrinsics` has for them."""
+    return {name_of_flag(stage("intrinsics").options, flag): value for flag, value in options}
 
 
 def _problem_of_name(name: str) -> str:
@@ -261,18 +263,6 @@ def _problem_of_name(name: str) -> str:
         signs = "".join(sorted(_SIGNS)).strip()
         return f"has {one_line(wrong)!r} in it, expected letters, digits and {signs}"
     return ""
-
-
-def _check_option(where: str, key: str, value: str) -> None:
-    try:
-        if key == "corners":
-            parse_corners(value)
-        elif key == "square":
-            parse_square_m(value)
-    except CalibError as error:
-        raise BadInputError(f"{where}: {error}") from error
-    if key in _CHOICES and value not in _CHOICES[key]:
-        raise BadInputError(f"{where} is {one_line(value)!r}, expected one of {', '.join(_CHOICES[key])}")
 
 
 # ----------------------------------------------------------------------
@@ -477,8 +467,7 @@ def run_stages(
     folder: Folder, kind: str, options: Sequence[tuple[str, str]], out: Path, page: bool = False
 ) -> Calibrated:
     """Run a folder's stages into a new output folder. Raises `BadInputError` as `calib run` does."""
-    flags = stage("intrinsics").options
-    given = {name_of_flag(flags, flag): value for flag, value in options}
+    given = camera_options(options)
     steps = [step for step in STEPS if kind == "run" or step.name in CAMERA_STAGES]
     steps = [replace(step, options=given) if step.name == "intrinsics" else step for step in steps]
     steps = [replace(step, figures=step.figures and page) for step in steps]

@@ -237,14 +237,12 @@ def sweep_page_text(spec: Sweep, summary: SweepSummary) -> str:
 
 def _heads(summary: SweepSummary, points: tuple[Point, ...]) -> list[str]:
     others = [name for name in summary.measures if name != summary.measure]
-    names = [name for name, _ in points[0].values]
-    return ["point", *names, f"{summary.measure}, median", "worst draw", *others]
+    return ["point", *points[0].parameters, f"{summary.measure}, median", "worst draw", *others]
 
 
 def _sweep_page_row(point: Point) -> list[tuple[str, Any]]:
-    cells = [*(value for _, value in point.values), point.median, point.worst]
-    cells += [value for _, value in point.measures[1:]]
-    out: list[tuple[str, Any]] = [(f"#{point.number}", point.number)]
+    cells = [*point.parameters.values(), point.median, point.worst, *list(point.measures.values())[1:]]
+    out: list[tuple[str, Any]] = [(f"#{point.point}", point.point)]
     for cell in cells:
         if isinstance(cell, float):
             out.append((f"{cell:.4g}", cell) if cell == cell else ("", None))

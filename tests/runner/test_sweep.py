@@ -101,9 +101,9 @@ def test_best_worst_and_resumed(tmp_path: Path) -> None:
         found = summarise_sweep(store, SPEC, 0)
         assert (found.cases, found.failed, found.why, found.measure) == (24, 1, "oh", "error")
         best = found.best[0]
-        assert dict(best.values) == {"scenario.Kp": 2.0, "scenario.controller": "pid"}
+        assert best.parameters == {"scenario.Kp": 2.0, "scenario.controller": "pid"}
         assert (best.draws, best.median, best.worst) == (3, pytest.approx(0.01), pytest.approx(0.02))
-        assert dict(best.measures) == {"error": pytest.approx(0.01)}
+        assert best.measures == {"error": pytest.approx(0.01)}
         assert found.best[0].loss < found.best[-1].loss and not found.worst
         table = pyarrow.parquet.read_table(tmp_path / "out" / "sweep.parquet")
         assert table.num_rows == 24
