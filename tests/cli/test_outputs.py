@@ -33,6 +33,9 @@ def place(swing: bytes, rig: Path, project_root: Path) -> Path:
         shutil.copy(path, folder / "images")
     (folder / "photo.pdf").write_bytes(b"%PDF-1.4 a thesis")
     (folder / "table.csv").write_text("name,price\nbolt,3\n")
+    shutil.copy(folder / "rig.yaml", folder / "other.yaml")
+    (folder / "fleet.csv").write_text("name,path\na,.\n")
+    (folder / "sweep.yaml").write_text("base: {scenario: swing}\ngrid: {scenario.phi_rad: [0.1]}\n")
     return folder
 
 
@@ -66,6 +69,12 @@ REFUSED = {
     "run . -o images/out": "images/out: lies in the folder that is read",
     "run . -o logs": "logs: lies in the folder that is read",
     "run . -o taken": "taken/rig.yaml: is there, and is not the work of calib run",
+    "diff rig.yaml other.yaml -o other.yaml": "other.yaml: is an input of this command",
+    "track images/view01.png -o in.csv": "in.csv: is there, and is not a track that calib wrote",
+    "fleet fleet.csv -o .": ".: lies in the folder of a",
+    "sweep sweep.yaml -o sweep.yaml": "sweep.yaml: cannot be made a folder",
+    "simulate rig -o images": "images: is there already, expected a new or an empty folder",
+    "align in.csv --rig table.csv": "table.csv: ",
     "record /dev/null -o in.csv": "in.csv: is there, and a recording cannot be made again",
 }  # fmt: skip
 

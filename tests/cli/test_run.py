@@ -74,7 +74,7 @@ def test_whole_folder_killed_rerun_and_changed(folder: Path, tmp_path: Path) -> 
     assert (out / "firmware" / "calib_constants.h").stat().st_size > 1000
     assert (out / "states" / "swing.csv").read_text().startswith("t_s,")
     page = (out / "report.html").read_text()
-    assert "view17.png" in page and str(folder) not in page
+    assert "view17.png" in page and str(folder) not in page and "<strong>Simulated.</strong>" in page
     assert told["decision"]["answer"] in ("yes", "with care", "not yet", "no")
     # Killed on the way, with its processes, and run again: the same bytes, with one process at a time.
     process = subprocess.Popen(_words(folder, other, "--jobs", "2"), stderr=subprocess.DEVNULL)

@@ -57,6 +57,7 @@ def test_round_trip_and_same_bytes(tmp_path: Path) -> None:
         (("fx_px: 273.4", "fx_px: 273e0"), r"camera\.fx_px is '273e0', expected a number \(without quotes"),
         (("[316, 208]", "[316, 208.0]"), r"camera\.image_size_px\.1 is 208\.0, expected a whole number"),
         (("verdict: ok", "verdict: 1"), r"camera\.verdict is 1, expected 'ok'"),
+        (("fx_px: 273.4", f"fx_px: {'9' * 390}"), r"camera\.fx_px is 9+\.\.\., expected at most 1e\+40"),
     ],
 )
 def test_wrong_values_name_file_key_value_and_what_was_expected(
