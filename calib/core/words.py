@@ -97,20 +97,19 @@ def facts(section: BaseModel) -> list[tuple[str, str]]:
     out: list[tuple[str, str]] = []
     for key, field, value in _labelled(section):
         extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
-        wanted = extra.get("fact")
+        wanted, bars = extra.get("fact"), _sigma(sigmas, key)
         unit, scale, places = _shown(key, field)
         if isinstance(wanted, list):
             for item in wanted:
                 name = _AXES[item] if isinstance(item, int) else as_words(str(item)).replace("max", "at most")
                 one = value[item] if isinstance(item, int) else _item(value, str(item))
                 own = unit or unit_of(str(item))
-                bars = _sigma(sigmas, key)
                 bar = bars[item] if isinstance(bars, list) and isinstance(item, int) else None
                 out.append((f"{field.title}, {name}", f"{_fact(one, bar, scale, places)} {own}".strip()))
         elif wanted and isinstance(value, bool | str):
             out.append((str(field.title), _word(value)))
         elif wanted:
-            text = _fact(value, _sigma(sigmas, key), scale, places)
+            text = _fact(value, bars, scale, places)
             out.append((str(field.title), f"{text} {unit}".strip()))
     return [(label, text) for label, text in out if not text.startswith(BLANK)]
 
@@ -160,18 +159,18 @@ def _gathered(section: BaseModel, prefix: str) -> tuple[Rows, Rows, list[Block]]
     later: list[Block] = []
     sigmas, bounds = getattr(section, "sigma", None), getattr(section, "below", None)
     for key, field, value in _labelled(section):
-        label = f"{prefix}{field.title}"
+        label, bars = f"{prefix}{field.title}", _sigma(sigmas, key)
+        unit, scale, places = _shown(key, field)
+        parts = value.values() if isinstance(value, Mapping) else value if isinstance(value, list) else ()
+        first = next(iter(parts), None)
         if isinstance(value, BaseModel):
             inner = _gathered(value, f"{label} ")
-            scalars += inner[0]
+            scalars += [*inner[0], *_unlabelled(value, sigmas, f"{label} ")]
             vectors += inner[1]
             later += inner[2]
-            scalars += _unlabelled(value, sigmas, f"{label} ")
-        elif isinstance(value, Mapping) and value and isinstance(next(iter(value.values())), BaseModel):
+        elif isinstance(first, BaseModel):
             later.append(listed(label, value))
         elif isinstance(value, Mapping):
-            unit, scale, places = _shown(key, field)
-            bars = _sigma(sigmas, key)
             for name, one in value.items():
                 # A table of values may hold several units, each at the end of its name.
                 own = unit_of(name) or unit
@@ -179,32 +178,20 @@ def _gathered(section: BaseModel, prefix: str) -> tuple[Rows, Rows, list[Block]]
                 cell = one if isinstance(one, str) else number(_scaled(one, scale), wide, places)
                 bar = "" if wide is None else number(wide, wide)
                 scalars.append((_with_unit(f"{label} {as_words(name)}", own), cell, bar))
-        elif isinstance(value, list) and value and isinstance(value[0], BaseModel):
-            later.append(listed(label, value))
         elif isinstance(value, list) and all(isinstance(one, int) for one in value):
-            unit, _, _ = _shown(key, field)
             scalars.append((_with_unit(label, unit), " x ".join(str(one) for one in value), ""))
-        elif isinstance(value, str) and len(value) > _LONGEST:
-            later.append(Line(f"{label}: {value}"))
-        elif (
-            isinstance(value, list)
-            and len(value) in (2, 3)
-            and not any(isinstance(v, str | list) for v in value)
-        ):
-            unit, scale, places = _shown(key, field)
-            cells = _vector(value, _sigma(sigmas, key), scale, places, _sigma(bounds, key))
+        elif isinstance(value, list) and len(value) in (2, 3) and not isinstance(first, str | list):
+            cells = _vector(value, bars, scale, places, _sigma(bounds, key))
             vectors.append((_with_unit(label, unit), *cells))
         elif isinstance(value, list):
             scalars.append((label, ", ".join(str(one) for one in value), ""))
+        elif isinstance(value, str) and len(value) > _LONGEST:
+            later.append(Line(f"{label}: {value}"))
+        elif isinstance(value, bool | str):
+            scalars.append((label, _word(value), ""))
         else:
-            unit, scale, places = _shown(key, field)
-            sigma = _sigma(sigmas, key)
-            sigma = sigma if isinstance(sigma, int | float) else None
-            unbounded = isinstance(sigmas, Mapping) and key in sigmas and sigma is None
-            if isinstance(value, bool | str):
-                scalars.append((label, _word(value), ""))
-                continue
-            wide = _scaled(sigma, scale)
+            wide = _scaled(bars, scale) if isinstance(bars, int | float) else None
+            unbounded = isinstance(sigmas, Mapping) and key in sigmas and wide is None
             bar = "not bounded" if unbounded else "" if wide is None else number(wide, wide)
             scalars.append((_with_unit(label, unit), number(_scaled(value, scale), wide, places), bar))
     return scalars, vectors, later

@@ -34,6 +34,9 @@ _CAMERA = ("u_px", "v_px")
 _PUMP = ("pwm1", "pwm2")
 
 
+Plan = Callable[["Folder", "Job"], "Job"]
+
+
 @dataclass(frozen=True)
 class Step:
     """A stage in a run.
@@ -53,7 +56,7 @@ class Step:
     name: str
     title: str
     verb: str
-    plan: Callable[[Folder, Job], Job]
+    plan: Plan
     each_log: bool = False
     options: Mapping[str, Any] = field(default_factory=dict)
     writes: tuple[str, ...] = ()
@@ -130,17 +133,13 @@ def _extrinsics(folder: Folder, job: Job) -> Job:
     return replace(job, paths=(folder.root / "images" / "plane",), inputs=(*folder.plane, *board))
 
 
-def _static(folder: Folder, job: Job) -> Job:
-    return job.reading(_logs(folder, "rest", *_IMU), "no logs of an IMU at rest, logs/static*.csv")
+def _reading(kind: str, columns: tuple[str, ...], lacking: str, most: int | None = None) -> Plan:
+    """A plan that reads the logs of a kind with these columns, or the first few of them."""
 
+    def plan(folder: Folder, job: Job) -> Job:
+        return job.reading(_logs(folder, kind, *columns)[:most], lacking)
 
-def _poses(folder: Folder, job: Job) -> Job:
-    logs = _logs(folder, "poses", *_IMU)
-    return job.reading(logs[:1], "no log of rests in different poses, logs/poses*.csv")
-
-
-def _moving(folder: Folder, job: Job) -> Job:
-    return job.reading(_logs(folder, "motion", *_IMU), "no logs of an IMU in motion in logs/")
+    return plan
 
 
 def _drift(folder: Folder, job: Job) -> Job:
@@ -151,15 +150,6 @@ def _drift(folder: Folder, job: Job) -> Job:
 def _lowpass(folder: Folder, job: Job) -> Job:
     logs = _logs(folder, "motion", *_CAMERA)[:1]
     return replace(job, inputs=with_beside(logs), options={"log": logs[0]} if logs else {})
-
-
-def _both(folder: Folder, job: Job) -> Job:
-    logs = _logs(folder, "motion", *_IMU, *_CAMERA)
-    return job.reading(logs, "no logs of camera and IMU in motion in logs/")
-
-
-def _driven(folder: Folder, job: Job) -> Job:
-    return job.reading(_logs(folder, "motion", *_CAMERA, *_PUMP), "no logs with camera and PWM in logs/")
 
 
 def _nothing(_: Folder, job: Job) -> Job:
@@ -173,9 +163,14 @@ def _replay(_: Folder, job: Job) -> Job:
 
 
 _OPTICS = ("camera", "plane")
+_resting = _reading("rest", _IMU, "no logs of an IMU at rest, logs/static*.csv")
+_poses = _reading("poses", _IMU, "no log of rests in different poses, logs/poses*.csv", 1)
+_moving = _reading("motion", _IMU, "no logs of an IMU in motion in logs/")
+_both = _reading("motion", (*_IMU, *_CAMERA), "no logs of camera and IMU in motion in logs/")
+_driven = _reading("motion", (*_CAMERA, *_PUMP), "no logs with camera and PWM in logs/")
 
 
-def _step(verb: str, plan: Callable[[Folder, Job], Job], needs: tuple[str, ...] = (), **beyond: Any) -> Step:
+def _step(verb: str, plan: Plan, needs: tuple[str, ...] = (), **beyond: Any) -> Step:
     """The step of a stage; `needs` are what a run demands beyond it."""
     made = stage(verb)
     # What is written on request is not asked for.
@@ -198,7 +193,7 @@ STEPS: tuple[Step, ...] = (
     _step("intrinsics", _intrinsics, flashed=True, seconds=5.0),
     _step("extrinsics", _extrinsics, flashed=True, seconds=3.0),
     _step("distortion", _nothing),
-    _step("imu static", _static, flashed=True, seconds=4.0),
+    _step("imu static", _resting, flashed=True, seconds=4.0),
     _step("imu intrinsics", _poses),
     _step("imu tune", _moving, flashed=True, seconds=4.0),
     # What is installed beside calib must not change the page.

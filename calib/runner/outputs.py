@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.core.errors import EXIT_DONE, BadInputError
-from calib.core.files import one_line, shown
+from calib.core.files import one_line, sha256, shown
 from calib.core.rig import Rig
 from calib.core.stage import NOTHING_STATED, LogOptions
 from calib.core.workers import processors
@@ -142,12 +142,11 @@ def _list(out: Path, names: list[str]) -> None:
     _write(out / HIDDEN / _LIST, json.dumps(names, indent=1) + "\n")
 
 
-def _write(path: Path, text: str) -> None:
+def _write(target: Path, text: str) -> None:
     raw = text.encode("utf-8", "backslashreplace")
-    with contextlib.suppress(OSError):
-        if not path.is_symlink() and path.is_file() and path.read_bytes() == raw:
-            return
-    write_atomically(path, raw)
+    if not target.is_symlink() and target.is_file() and digest_of(target) == sha256(raw):
+        return
+    write_atomically(target, raw)
 
 
 def _copy(source: Path, target: Path) -> None:

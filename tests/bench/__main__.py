@@ -21,6 +21,7 @@ import monte_carlo
 import solver
 import startup
 import whole_process
+import whole_run
 from _rows import Row, print_rows
 
 
@@ -29,7 +30,7 @@ def main(full: bool) -> None:
     found: list[Row] = whole_process.rows()
     solved = solver.rows((20, 100, 400, 1000) if full else (20, 100, 400), full)
     found += solved
-    for job in (mahony, estimator, dynamics, monte_carlo, startup):
+    for job in (mahony, estimator, dynamics, monte_carlo, startup, whole_run):
         found += job.rows()
     print_rows(found)
     print(solver.growth(solved))

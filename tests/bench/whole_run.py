@@ -1,14 +1,15 @@
-"""How long `calib run` takes: 17 pictures and ten minutes of logs, again, and with one log changed.
+"""How long `calib run` takes: the simulated rig, ten minutes of its logs, and again with one log changed.
 
     python tests/bench/whole_run.py [FOLDER]
 
-Wall time and processor time of each run. Wall time means something on an idle machine only; over two
-processors it cannot fall below half of the processor time. The first run of all compiles what numba
-compiles and is not shown.
+Wall time and processor time of each run, and of the latter the ratio of what is wanted to what was found. Wall
+time means something on an idle machine only; over two processors it cannot fall below half of the processor
+time. The first run of all compiles what numba compiles, into a cache of its own.
 """
 
 from __future__ import annotations
 
+import os
 import resource
 import subprocess
 import sys
@@ -16,13 +17,20 @@ import tempfile
 import time
 from pathlib import Path
 
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = [str(HERE.parents[1]), str(HERE)]
+
+from _rows import Row, print_rows
+
 from calib.io.logs import log_text, read_log
 from calib.twin.folder import write_rig_folder
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.simulate import log_of
 
+CALIB = [sys.executable, "-c", "from calib.cli.main import main; main()"]
 WANTED_S = 600.0
+COLD_S, WARM_S, UNCHANGED_S = 26.0, 20.0, 1.0
 
 
 def _folder(root: Path) -> Path:
@@ -36,36 +44,31 @@ def _folder(root: Path) -> Path:
     return root
 
 
-def _timed(what: str, folder: Path, out: Path, *more: str) -> None:
-    words = [
-        sys.executable,
-        "-c",
-        "from calib.cli.main import main; main()",
-        "run",
-        str(folder),
-        "-o",
-        str(out),
-    ]
-    before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
-    done = subprocess.run([*words, *more], capture_output=True, text=True, check=False)
-    after, wall = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic() - began
-    spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    print(
-        f"{what:<32} {wall:7.1f} s wall {spent:7.1f} s of processors, exit code {done.returncode}", flush=True
-    )
-
-
-def main() -> None:
+def rows(folder: Path | None = None) -> list[Row]:
+    """A row for each run: a new rig of the twin, or a folder, cold, warm, unchanged and with a log changed."""
     with tempfile.TemporaryDirectory() as place:
         out = Path(place) / "out"
-        folder = Path(sys.argv[1]) if len(sys.argv) > 1 else _folder(Path(place) / "rig")
-        _timed("(first, with compiling)", folder, out)
-        _timed("everything again", folder, out, "--fresh")
-        _timed("nothing changed", folder, out)
-        log = sorted((folder / "logs").glob("*.csv"))[0]
+        os.environ["NUMBA_CACHE_DIR"] = f"{place}/compiled"
+        root = _folder(Path(place) / "rig") if folder is None else folder
+        found = [
+            _timed("calib run, compiling", COLD_S, root, out),
+            _timed("calib run, again", WARM_S, root, out, "--fresh"),
+            _timed("calib run, unchanged", UNCHANGED_S, root, out),
+        ]
+        log = sorted((root / "logs").glob("*.csv"))[0]
         log.write_text(log.read_text().rstrip("\n").rpartition("\n")[0] + "\n")
-        _timed(f"{log.name} one row shorter", folder, out)
+        return [*found, _timed(f"calib run, {log.name} shorter", None, root, out)]
+
+
+def _timed(what: str, wanted_s: float | None, folder: Path, out: Path, *more: str) -> Row:
+    words = [*CALIB, "run", str(folder), "-o", str(out), *more]
+    before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    after, wall = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic() - began
+    spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    note = f"processor time; {wall:.1f} s by the clock, exit code {done.returncode}"
+    return Row(what, "wanted", spent, wanted_s, 1.0, note=note)
 
 
 if __name__ == "__main__":
-    main()
+    print_rows(rows(Path(sys.argv[1]) if len(sys.argv) > 1 else None))
