@@ -62,7 +62,7 @@ _LIBRARIES = (
     "scipy.optimize",
     "scipy.signal",
     "numba",
-    "calib.show.draw",
+    "calib.show.charts",
 )
 """What most stages need and takes long to load; the first of them sets up the others."""
 
