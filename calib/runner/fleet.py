@@ -17,6 +17,7 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.core.files import shown
+from calib.core.plot import every
 from calib.core.units import unit_of
 from calib.core.workers import Processes, Task
 from calib.runner.outcomes import (
@@ -527,8 +528,7 @@ def _points(numbers: FloatArray, x: FloatArray) -> tuple[tuple[float, float], ..
     """Values over serial numbers; of many, evenly spaced ones in the order of their numbers."""
     known = np.flatnonzero(np.isfinite(numbers) & np.isfinite(x))
     known = known[np.argsort(numbers[known], kind="stable")]
-    if len(known) > _MOST_POINTS:
-        known = known[np.linspace(0, len(known) - 1, _MOST_POINTS).astype(np.int64)]
+    known = every(known, _MOST_POINTS)
     return tuple((float(numbers[i]), float(x[i])) for i in known)
 
 

@@ -18,7 +18,6 @@ import warnings
 from collections.abc import Callable, Iterator
 from concurrent import futures
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -214,7 +213,7 @@ def connected(address: str, tell: Callable[[str], None]) -> Iterator[Cluster]:
                 raise BadInputError(
                     f"{told}: the workers cannot run calib {__version__}: {_words(error)}; install it there"
                 ) from error
-            for sentence in remarks(found, survey()):
+            for sentence in remarks(found):
                 tell(sentence)
             if not address.startswith("tls://"):
                 tell(
@@ -238,36 +237,27 @@ def needed(name: str) -> Any:
         raise BadInputError(f"needs {name} ({error}): {pip_install('fleet')}") from error
 
 
-@dataclass(frozen=True)
-class Survey:
-    """What a worker says of itself."""
-
-    version: str
-    program: str
-    blas_threads: str
+def survey() -> tuple[str, str, str]:
+    """Version, program and threads of BLAS of this process; runs on each worker."""
+    return __version__, program(), os.environ.get("OPENBLAS_NUM_THREADS", "")
 
 
-def survey() -> Survey:
-    """What this process would work with; runs on each worker."""
-    return Survey(__version__, program(), os.environ.get("OPENBLAS_NUM_THREADS", ""))
-
-
-def remarks(found: dict[str, Survey], mine: Survey) -> Iterator[str]:
+def remarks(found: dict[str, tuple[str, str, str]]) -> Iterator[str]:
     """Sentences on the workers. Raises `BadInputError` for one with another program than this one."""
-    for address, one in sorted(found.items()):
-        if one.program != mine.program:
+    for address, (version, theirs, _) in sorted(found.items()):
+        if theirs != program():
             what = (
-                f"calib {one.version}, and this is {mine.version}"
-                if one.version != mine.version
+                f"calib {version}, and this is {__version__}"
+                if version != __version__
                 else "another source of calib, or another Python, NumPy, SciPy or OpenCV than is here"
             )
             raise BadInputError(
                 f"worker {one_line(address)}: has {what}; results would not be those of one program"
             )
-    loose = [address for address, one in found.items() if one.blas_threads != "1"]
+    loose = sum(threads != "1" for _, _, threads in found.values())
     if loose:
         yield (
-            f"{len(loose)} of {len(found)} workers were started without OPENBLAS_NUM_THREADS=1; the last "
+            f"{loose} of {len(found)} workers were started without OPENBLAS_NUM_THREADS=1; the last "
             "digits of their results may depend on that"
         )
 

@@ -22,6 +22,7 @@ from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_val
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError, CalibError
 from calib.core.files import one_line, read_text, read_yaml_mapping, sha256, shown
+from calib.core.plot import every
 from calib.core.result import Number, Pair, Section
 from calib.core.rig import SCHEMA, Rig
 from calib.core.schema import contradiction, quoted, validated
@@ -592,7 +593,5 @@ def _median(values: FloatArray) -> float:
 
 
 def _cloud(x: FloatArray, y: FloatArray) -> tuple[tuple[float, float], ...]:
-    known = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
-    if len(known) > _MOST_POINTS:
-        known = np.random.default_rng(0).choice(known, _MOST_POINTS, replace=False)
-    return tuple((float(x[i]), float(y[i])) for i in np.sort(known))
+    known = every(np.flatnonzero(np.isfinite(x) & np.isfinite(y)), _MOST_POINTS)
+    return tuple((float(x[i]), float(y[i])) for i in known)
