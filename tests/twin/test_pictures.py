@@ -23,12 +23,13 @@ from calib.twin.scene import (
     PrintedBoard,
     Sensor,
     board_coordinates,
+    clutter,
     corner_pixels,
     expose,
     pose_facing,
     render,
 )
-from calib.twin.sensors import clutter, gaussian_noise
+from calib.twin.sensors import gaussian_noise
 
 PRINTED = PrintedBoard(BOARD)
 

@@ -117,7 +117,11 @@ def vectors(header: Header, ticks: int = 48, fused: bool = False, limits: bool =
     constants = header.values
     reference = reference_of(constants, fused=fused)
     run = directed_fused(constants, ticks, period=ticks) if fused else directed(constants, ticks)
-    given = [(one, 1) for one in run] + (_limits(constants, run[0]) if limits else [])
+    given = [(one, 1) for one in run]
+    if limits:
+        silent = replace(run[0], marker_seen=False, imu_read=False)
+        weightless = binary32(replace(run[0], ax_mps2=0.1, ay_mps2=-0.1))
+        given = [(silent, 1), (weightless, 1), *given, *_limits(constants, run[0])]
     return [Vector(one, [reference.step(one) for _ in range(times)][-1], times) for one, times in given]
 
 
