@@ -24,7 +24,7 @@ from calib.stages.control.laws import (
     step_orientation,
     step_position,
 )
-from calib.stages.control.references import AngleSteps, Ellipse, PolynomialElongation
+from calib.stages.control.references import Ellipse, PolynomialElongation
 from calib.twin.rig import SimulatedRig, rig_from_file
 from calib.twin.sensors import stream, uniform
 from calib.twin.simulate import Law, Run, Seen, log_of
@@ -374,8 +374,8 @@ class Orientation:
 
     def _law(self, rig: SimulatedRig, ticks: int) -> Law:
         pid = _tuned(rig, _ORIENTATION[self.controller], self.Kp, self.Ki, self.Kd)
-        steps = AngleSteps((self.reference_rad, self.jump_to_rad), (self.jump_at_s,))
-        wanted = steps.angle_rad(tick_times(rig, ticks) + 1e-9).tolist()
+        early = tick_times(rig, ticks) + 1e-9 < self.jump_at_s
+        wanted = np.where(early, self.reference_rad, self.jump_to_rad).tolist()
 
         def law(k: int, memory: LoopState, seen: Seen) -> tuple[LoopState, Pair]:
             memory, (u1, u2) = step_orientation(pid, memory, wanted[k], seen.phi_rad, self.sign)

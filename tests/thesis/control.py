@@ -30,7 +30,7 @@ from calib.stages.control.laws import (
     step_orientation,
     step_position,
 )
-from calib.stages.control.references import AngleSteps, Ellipse, PolynomialElongation
+from calib.stages.control.references import Ellipse, PolynomialElongation
 from calib.twin.scenarios import StepResponse, at_rest, step_response
 from calib.twin.simulate import Run, Seen, simulate
 from thesis.plot import curve, curves_of
@@ -132,7 +132,7 @@ def _angle_run(controller: str, gain: int = 1000, seconds: float = 5.0, feedback
 
 
 def _angle_reference(run: Run) -> Curve:
-    reference = AngleSteps((_ANGLE_RAD, _JUMP_RAD), (_JUMP_S,)).angle_rad(run.t_s + 1e-9)
+    reference = np.where(run.t_s + 1e-9 < _JUMP_S, _ANGLE_RAD, _JUMP_RAD)
     return curve("reference", run.t_s, reference, "dotted", -1)
 
 

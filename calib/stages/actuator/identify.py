@@ -392,7 +392,7 @@ class Problem:
     Attributes
     ----------
     names : parameters that are estimated. held : values of others that differ from the nominal ones.
-    delay_s, delay_sigma_s : what is known of the rows' delay.
+    delay_s : what is known of the rows' delay.
     stated : standard deviations of nominal values that a person states; zero for those that are exact.
     rough : for a search: steps of twice the length, differences to one side.
     """
@@ -402,7 +402,6 @@ class Problem:
     names: tuple[str, ...]
     held: Mapping[str, float]
     delay_s: float = CAMERA_DELAY_S
-    delay_sigma_s: float = _DELAY_SIGMA_S
     threads: int = 2
     stated: Mapping[str, float] = field(default_factory=dict)
     rough: bool = False
@@ -428,7 +427,7 @@ class Problem:
             ]
             delays.append(before[0] if before else len(rows))
             if not before:
-                rows.append((0.01, -0.5, 0.5, self.delay_s, self.delay_sigma_s))
+                rows.append((0.01, -0.5, 0.5, self.delay_s, _DELAY_SIGMA_S))
         starts = []
         for track in self.tracks:
             at, moving = len(rows), track.moving is not None
@@ -746,9 +745,9 @@ def _moves(track: Track) -> bool:
     return bool(len(mean) and float(mean.max()) > _MOVES)
 
 
-def _spread(problem: Problem, values: Mapping[str, float], seed: int) -> FloatArray:
+def _spread(problem: Problem, values: Mapping[str, float]) -> FloatArray:
     """Candidates (`CANDIDATES`, size) about the nominal rig, itself the first."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     x = first_guess(problem, values)
     out = np.tile(x, (CANDIDATES, 1))
     P = len(problem.names)
@@ -766,9 +765,7 @@ def fit_tracks(
     tracks: Sequence[Track],
     static_map: bool = False,
     delay_s: float | None = None,
-    delay_sigma_s: float | None = None,
     threads: int = 2,
-    seed: int = 0,
     progress: Progress | None = None,
     stated: Mapping[str, float] | None = None,
 ) -> Solution:
@@ -778,7 +775,7 @@ def fit_tracks(
     ----------
     nominal : what is not estimated, and where the search starts.
     static_map : see `candidates`.
-    delay_s, delay_sigma_s : what is known of the delay of the measured rows.
+    delay_s : of the measured rows, as far as it is known.
     stated : standard deviations of the values in `nominal` that a person states; zero fixes a value.
 
     Raises
@@ -800,8 +797,6 @@ def fit_tracks(
     problem = Problem(nominal, tracks, names, {}, threads=threads, stated=stated or {})
     if delay_s is not None:
         problem = replace(problem, delay_s=delay_s)
-    if delay_sigma_s is not None:
-        problem = replace(problem, delay_sigma_s=max(delay_sigma_s, 1e-5))
     fixed: dict[str, str] = {}
     x = first_guess(problem, known)
     residual, J = jacobian(problem, x)
@@ -809,7 +804,7 @@ def fit_tracks(
     problem, x, J = _pruned(problem, x, np.zeros_like(residual), J, fixed)
     if not problem.names:
         raise _blind(fixed)
-    best, agreeing, refined = _search(problem, known, seed, progress)
+    best, agreeing, refined = _search(problem, known, progress)
     for _ in range(_ROUNDS):
         x, cost, residual, J = best
         smaller, x, J = _pruned(problem, x, residual, J, fixed)
@@ -826,10 +821,10 @@ def fit_tracks(
 
 
 def _search(
-    problem: Problem, known: Mapping[str, float], seed: int, progress: Progress | None
+    problem: Problem, known: Mapping[str, float], progress: Progress | None
 ) -> tuple[tuple[FloatArray, float, FloatArray, FloatArray], int, int]:
     """The best of several refined starts, how many agree with it, and of how many."""
-    spread, rough = _spread(problem, known, seed), replace(problem, rough=True)
+    spread, rough = _spread(problem, known), replace(problem, rough=True)
     order = np.argsort(_robust(residuals(rough, spread)), kind="stable")[:_REFINED].tolist()
     if 0 not in order:
         order.append(0)
@@ -1325,17 +1320,15 @@ class Prospect:
     worst_relative: float
 
 
-def EXPERIMENTS(
-    rest_length_m: float, tick_s: float, duration_s: float = _DURATION_S
-) -> tuple[Experiment, ...]:
+def _experiments(rest_length_m: float, tick_s: float) -> tuple[Experiment, ...]:
     """Static, swing, step, ellipse and elongation, open-loop stand-ins of the source's experiments."""
-    n = round(duration_s / tick_s)
+    n = round(_DURATION_S / tick_s)
     t = tick_s * np.arange(n, dtype=np.float64)
     off, straight = np.zeros((n, 2)), Start(0.0, rest_length_m)
-    step = np.where((t >= 0.5) & (t < 0.6 * duration_s), 225.0, 0.0)
-    turn = 2.0 * np.pi * t / (0.5 * duration_s)
+    step = np.where((t >= 0.5) & (t < 0.6 * _DURATION_S), 225.0, 0.0)
+    turn = 2.0 * np.pi * t / (0.5 * _DURATION_S)
     ellipse = np.stack([180.0 + 60.0 * np.sin(turn), 180.0 + 60.0 * np.cos(turn)], axis=1)
-    stairs = np.array([130.0, 175.0, 215.0, 250.0, 0.0])[np.minimum((5.0 * t / duration_s).astype(int), 4)]
+    stairs = np.array([130.0, 175.0, 215.0, 250.0, 0.0])[np.minimum((5.0 * t / _DURATION_S).astype(int), 4)]
     return (
         Experiment("static", "rest, pumps off", straight, True, off),
         Experiment("swing", "released from 0.5 rad, hoses off", Start(0.5, rest_length_m), False, off),
@@ -1405,7 +1398,7 @@ def prospects(solution: Solution, known: Uncertainty) -> tuple[Prospect, ...]:
     noise = np.where(np.isfinite(noise) & (noise > 0.0), noise, np.array(_TYPICAL))
     out = []
     rest = problem.nominal.plant.rest_length_m
-    for one in EXPERIMENTS(rest, problem.nominal.pump.tick_s):
+    for one in _experiments(rest, problem.nominal.pump.tick_s):
         gained = _information(problem, names, values, one, noise)
         if gained is None:
             continue

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -306,16 +306,7 @@ def identified_json(found: Identified) -> dict[str, Any]:
             }
             for track, rms, colour in zip(s.problem.tracks, found.rms, found.colours, strict=True)
         ],
-        "held_back": [
-            {
-                "name": h.name,
-                "fitted_phi_rad": h.fitted_phi_rad,
-                "held_phi_rad": h.held_phi_rad,
-                "fitted_length_m": h.fitted_length_m,
-                "held_length_m": h.held_length_m,
-            }
-            for h in found.held
-        ],
+        "held_back": [asdict(h) for h in found.held],
         "next": [
             {"name": p.name, "worst": p.worst, "worst_relative": p.worst_relative, "relative": p.relative}
             for p in found.prospects

@@ -153,7 +153,7 @@ def bent_rest(model: Model, phi_rad: float) -> FloatArray:
     return np.array([l + half, l - half])
 
 
-def rig_system(model: Model, q_m: FloatArray, extra_delay_ticks: int = 0) -> System:
+def rig_system(model: Model, q_m: FloatArray) -> System:
     """From PWM (2,) to lengths (2,) [m] about the rest at the lengths (2,) [m].
 
     Raises `BadInputError` for forces in the head's projection, for which no linear model is known here.
@@ -174,7 +174,7 @@ def rig_system(model: Model, q_m: FloatArray, extra_delay_ticks: int = 0) -> Sys
     held = expm(h * block)
     C = np.zeros((2, 8))
     C[0, 0] = C[1, 1] = 1.0
-    late = delay(model.pump.delay_ticks + extra_delay_ticks, h)
+    late = delay(model.pump.delay_ticks, h)
     return series(side_by_side(late, late), System(held[:8, :8], held[:8, 8:], C, np.zeros((2, 2)), h))
 
 
@@ -283,9 +283,9 @@ def break_at(L: ComplexArray, channel: int) -> ComplexArray:
     return np.asarray(own - (L[:, channel, None][:, :, others] @ rest)[:, 0, 0], dtype=np.complex128)
 
 
-def loop_margins(loop: System, omega: FloatArray | None = None) -> list[Margins]:
+def loop_margins(loop: System) -> list[Margins]:
     """Margins of each channel of a square loop, negative feedback."""
-    w = frequencies(loop.tick_s) if omega is None else omega
+    w = frequencies(loop.tick_s)
     L = response(loop, w)
     stable = spectral_radius(closed_loop(loop)) < 1.0
     return [margins_of_response(w, break_at(L, i), stable) for i in range(len(loop.D))]

@@ -33,25 +33,6 @@ from calib.stages.control.linear import bent_rest
 
 
 @dataclass(frozen=True)
-class AngleSteps:
-    """Piecewise constant angle of the head; with one value a constant, with two the jump of Fig. 4.7.
-
-    Attributes
-    ----------
-    angles_rad : values in turn [rad].
-    at_s : times at which the second and later values begin [s], rising.
-    """
-
-    angles_rad: tuple[float, ...] = (0.7,)
-    at_s: tuple[float, ...] = ()
-
-    def angle_rad(self, t_s: FloatArray) -> FloatArray:
-        """phi_ref (...) [rad] at the times (...) [s]; a step counts from its own time on."""
-        index = np.searchsorted(np.array(self.at_s), np.asarray(t_s, dtype=np.float64), side="right")
-        return np.asarray(np.array(self.angles_rad)[index])
-
-
-@dataclass(frozen=True)
 class PolynomialElongation:
     """Both bellows on q_ref = c0 + c2 t^2 + c3 t^3, held from `hold_s` on (4.7).
 
@@ -216,9 +197,8 @@ def built_in(model: Model, name: str, duration_s: float | None = None) -> Refere
         return from_lengths(model, name, Ellipse().bellows_m(t, model.plant.bellows_radius_m), 2.0)
     if name == "step":
         return replace(from_angles(model, name, np.full(len(t), _STEP_RAD)), from_rest=True)
-    steps = AngleSteps((_STEP_RAD, _JUMP_RAD), (_JUMP_AT_S,))
     jump_s = _JUMP_AT_S if t[-1] > _JUMP_AT_S else None
-    made = from_angles(model, name, steps.angle_rad(t + 1e-9))
+    made = from_angles(model, name, np.where(t + 1e-9 < _JUMP_AT_S, _STEP_RAD, _JUMP_RAD))
     return replace(made, from_rest=True, jump_s=jump_s)
 
 

@@ -253,7 +253,7 @@ def _least_times(model: Model, points: FloatArray) -> FloatArray:
     return np.asarray(np.max(np.maximum(up, down), axis=1))
 
 
-def slowed(model: Model, q_m: FloatArray, tolerance_m: float = TOLERANCE_M) -> tuple[FloatArray, Following]:
+def slowed(model: Model, q_m: FloatArray) -> tuple[FloatArray, Following]:
     """Lengths (m, 2) [m] at the ticks along the same path, slow enough for the pumps, and the proof.
 
     Jumps become the fastest way along the straight line between their ends. Lengths that lie outside of the
@@ -281,7 +281,7 @@ def slowed(model: Model, q_m: FloatArray, tolerance_m: float = TOLERANCE_M) -> t
         ticks = h * np.arange(max(count, 3))
         slow = np.stack([np.interp(ticks, t, points[:, i]) for i in range(2)], axis=1)
         slow = _rounded(slow, h, 1.0 + attempt * 0.5)
-        proof = follow(model, slow, tolerance_m)
+        proof = follow(model, slow)
         if proof.possible:
             return slow, proof
     raise BadInputError("reference: no speed was found at which the pumps follow it")
@@ -592,14 +592,12 @@ def _slack(criterion: ControllerCriterion) -> ControllerCriterion:
     )
 
 
-def tune_orientation(
-    model: Model, criterion: ControllerCriterion, at: Sequence[tuple[float, float]] | None = None
-) -> Tuned:
+def tune_orientation(model: Model, criterion: ControllerCriterion) -> Tuned:
     """PID of the angle with the largest Ki [PWM/rad/s].
 
     Raises `BadInputError` where no gains hold the margins.
     """
-    points = operating_angles(model) if at is None else tuple(at)
+    points = operating_angles(model)
     rigs = [_angle_rig(model, q, model.tick_s) for q in points]
     pid = _searched(
         model, criterion, rigs, _INTEGRAL_S.tolist(), 2e4, lambda p: p.Ki,
@@ -608,20 +606,15 @@ def tune_orientation(
     return Tuned(pid, points_of(lambda q: orientation_loop(model, pid, q), points))
 
 
-def tune_position(
-    model: Model,
-    criterion: ControllerCriterion,
-    at: Sequence[tuple[float, float]] | None = None,
-    sensing: bool = True,
-) -> Tuned:
-    """PD of the lengths with the largest Kp [PWM/m], `sensing` with the firmware's filters in the loop.
+def tune_position(model: Model, criterion: ControllerCriterion) -> Tuned:
+    """PD of the lengths with the largest Kp [PWM/m], the firmware's filters in the loop.
 
     Raises `BadInputError` where no gains hold the margins.
     """
-    points = operating_lengths(model) if at is None else tuple(at)
-    rigs = [_position_rig(model, q, sensing) for q in points]
+    points = operating_lengths(model)
+    rigs = [_position_rig(model, q, True) for q in points]
     pid = _searched(
         model, criterion, rigs, [math.inf], 4e5, lambda p: p.Kp,
         lambda p, i: series(side_by_side(pid_system(p), pid_system(p)), rigs[i]),
     )  # fmt: skip
-    return Tuned(pid, points_of(lambda q: position_loop(model, pid, q, sensing), points))
+    return Tuned(pid, points_of(lambda q: position_loop(model, pid, q), points))
