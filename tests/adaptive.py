@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 import numpy as np
+from open_loop import Motion
 from scipy.integrate import solve_ivp
 
 from calib.core.arrays import FloatArray
@@ -27,7 +28,7 @@ from calib.stages.actuator.pump import (
     pump_coefficients,
     static_force_N,
 )
-from calib.stages.actuator.simulate import Motion, RigState, check_start, derivative, rig_at_rest
+from calib.stages.actuator.simulate import RigState, check_start, derivative, rig_at_rest
 
 Method = Literal["RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA"]
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from open_loop import simulate
 
 from calib.core.rig import Rig
 from calib.io.logs import write_log
@@ -15,7 +16,7 @@ from calib.stages.actuator.identify_pump import PumpRecord, simulate_pump
 from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import Creep
 from calib.stages.actuator.pump import TICK_S, RateLimit
-from calib.stages.actuator.simulate import rig_at_rest, simulate
+from calib.stages.actuator.simulate import rig_at_rest
 from calib.stages.camera.section import Camera, Distortion, Plane
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario

@@ -16,6 +16,7 @@ import source_model as src
 import sympy
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from open_loop import Motion, simulate, swing, tick
 
 from adaptive import simulate_adaptive, swing_adaptive
 from calib.core.arrays import FloatArray
@@ -34,15 +35,11 @@ from calib.stages.actuator.pump import Orifice, Pump, RateLimit, advance_pump, p
 from calib.stages.actuator.simulate import (
     LANES,
     STATE,
-    Motion,
     derivative,
     largest_step_s,
     rig_at_rest,
-    simulate,
     simulate_batch,
     state_row,
-    swing,
-    tick,
 )
 
 BELLOWS = st.floats(0.045, 0.095)
@@ -344,7 +341,7 @@ def test_ticks_are_the_open_loop() -> None:
 )
 def test_largest_step_is_where_runge_kutta_turns(plant: Plant) -> None:
     """Just below it small motion dies down, just above it grows; both refused beyond."""
-    largest = largest_step_s(plant, np.array([0.065, 0.065]))
+    largest = largest_step_s(plant)
     A = dyn.linearised(plant, np.full(2, 0.065 + 0.0266))
     gains = []
     for factor in (0.99, 1.02):
@@ -429,12 +426,13 @@ def test_runs_where_no_folder_can_be_written() -> None:
     code = (
         "import numba.core.caching as caching\n"
         "caching.CacheImpl._locator_classes = []\n"
-        "from calib.stages.actuator.simulate import state_row, swing\n"
+        "from calib.stages.actuator.dynamics import coefficients\n"
         "from calib.stages.actuator.parameters import Plant\n"
-        "print(swing(Plant(), state_row(Plant(), 0.1), 0.01).q_m[-1].sum())"
+        "from calib.stages.actuator.simulate import derivative, state_row\n"
+        "print(derivative(coefficients(Plant()), state_row(Plant(), 0.1)[:6], 0.0, 0.0)[:2].sum())"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert float(done.stdout) == pytest.approx(0.13, rel=1e-3)
+    assert float(done.stdout) == 0.0
 
 
 def commands(seed: int, blocks: int) -> FloatArray:

@@ -30,13 +30,14 @@ from scipy.integrate import solve_ivp
 sys.path[:0] = [str(Path(__file__).resolve().parents[n]) for n in (2, 1, 0)]
 
 from _rows import Row, interleaved, print_rows
+from open_loop import simulate, swing
 
 from adaptive import simulate_adaptive, swing_adaptive
 from calib.core.arrays import FloatArray
 from calib.stages.actuator.dynamics import coefficients
 from calib.stages.actuator.parameters import Plant, Stiffness, pumps_connected
 from calib.stages.actuator.pump import Orifice, Pump, delayed, pump_coefficients, static_force_N
-from calib.stages.actuator.simulate import rig_at_rest, run, simulate, simulate_batch, state_row, swing
+from calib.stages.actuator.simulate import rig_at_rest, run, simulate_batch, state_row
 
 STEPS_PER_TICK = 17
 PUMP = Pump(tick_s=STEPS_PER_TICK * 1e-3)

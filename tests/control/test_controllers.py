@@ -10,12 +10,13 @@ import pytest
 from control_models import MODELS, NOMINAL, ORIFICE, UNLIKE
 from hypothesis import given
 from hypothesis import strategies as st
+from open_loop import simulate, tick
 from scipy.signal import dlsim, dlti, lfilter
 from source_model import acceleration
 
 from calib.stages.actuator.parameters import pumps_connected
 from calib.stages.actuator.pump import static_force_N
-from calib.stages.actuator.simulate import rig_at_rest, simulate, tick
+from calib.stages.actuator.simulate import rig_at_rest
 from calib.stages.control.laws import (
     BackState,
     ComputedTorque,

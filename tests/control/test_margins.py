@@ -10,9 +10,10 @@ import pytest
 from control_models import NOMINAL, ORIFICE
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from open_loop import simulate
 from scipy import signal
 
-from calib.stages.actuator.simulate import RigState, simulate
+from calib.stages.actuator.simulate import RigState
 from calib.stages.control.laws import Model, Pid, PidState, feed_forward_pwm, holding_force
 from calib.stages.control.laws import step as step_pid
 from calib.stages.control.linear import (

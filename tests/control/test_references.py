@@ -11,10 +11,10 @@ import pytest
 from control_models import MODELS, NOMINAL, ORIFICE
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from open_loop import simulate
 
 from calib.core.errors import BadInputError
 from calib.stages.actuator.kinematics import angle, forward
-from calib.stages.actuator.simulate import simulate
 from calib.stages.control.laws import Model, feed_forward_pwm
 from calib.stages.control.read import read_reference
 from calib.stages.control.references import (

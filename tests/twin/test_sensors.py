@@ -8,6 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from open_loop import swing
 from scipy.signal import butter, lfilter, lfilter_zi
 from scipy.spatial.transform import Rotation
 from source_model import inverse_series
@@ -16,7 +17,7 @@ from calib.core.geometry import apply_homography
 from calib.stages.actuator.dynamics import coefficients
 from calib.stages.actuator.kinematics import forward, forward_jacobian, forward_jacobian_rate
 from calib.stages.actuator.parameters import Plant
-from calib.stages.actuator.simulate import state_row, swing
+from calib.stages.actuator.simulate import state_row
 from calib.stages.control.references import Ellipse
 from calib.twin.rig import nominal_view, workspace_homography
 from calib.twin.sensors import (

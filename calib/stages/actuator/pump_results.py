@@ -180,7 +180,6 @@ def identify_pump(
 _MOST_SHARE = 0.05
 _FEWEST_RUNS = 3
 _MOST_VAGUE = 0.5
-_FREE = 1e5
 
 
 def unexplained(found: PumpFound) -> list[str]:

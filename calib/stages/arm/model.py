@@ -203,7 +203,6 @@ PARTS = (
 """In the order of the parameters."""
 
 PARAMETERS = tuple(one for part in PARTS for one in part.parameters)
-NAMES = tuple(one.name for one in PARAMETERS)
 DRIVES = {part.name: tuple(one.name for one in part.parameters) for part in PARTS if part.drives}
 """Parameters of the parts that make the pressure."""
 SEGMENT = tuple(one.name for part in PARTS if not part.drives for one in part.parameters)
