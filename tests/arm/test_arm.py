@@ -38,13 +38,19 @@ def test_a_fit_predicts_trials_that_it_has_not_seen(trials: list[Trial]) -> None
 def test_an_identification_beats_black_boxes_and_says_by_how_much(trials: list[Trial]) -> None:
     found = identify(trials, compare=False)
     assert set(found.held) == {"a_0", "a_1", "b_2", "b_3"}
-    name = best_baseline(found, "angle_rad")
-    mean, half = gained(found, name, "angle_rad")
+    mean, half = gained(found, best_baseline(found, "angle_rad"), "angle_rad")
     assert mean > 0.2
     assert half > 0.0
     assert found.coverage > 0.9
     assert found.sigma["lag_s"] > 0.0
     assert "load" not in found.fit.assembly.parts
+    # What a trial is for, it tells: a mass the compliance and the more the heavier, venting the settling.
+    left = found.prospects
+    name = "compliance_rad_per_Nm"
+    assert left["steps with 200 g"][name] < left["steps with 100 g"][name] < 0.9
+    assert left["open-loop steps"][name] == pytest.approx(1.0, abs=0.01)
+    assert left["a vented start"]["settling_s"] < left["rests of 10 s"]["settling_s"]
+    assert all(0.0 < share <= 1.0 + 1e-9 for one in left.values() for share in one.values())
 
 
 def test_a_part_that_is_off_plays_no_part() -> None:

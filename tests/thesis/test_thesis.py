@@ -18,7 +18,6 @@ from calib.stages.actuator.dynamics import coriolis_matrix, mass_matrix
 from calib.stages.actuator.kinematics import forward_jacobian
 from calib.stages.actuator.parameters import Plant
 from calib.stages.control.laws import FeedForward, PidState
-from calib.stages.imu.mahony import MahonyState
 from thesis import control, mechanics, sensing
 from thesis.book import (
     ALBUM,
@@ -163,7 +162,7 @@ WEAK_LENS = replace(sensing.CAMERA, distortion=np.array([-0.004, -0.001, 0, 0, 0
 @pytest.mark.parametrize(
     ("claim", "module", "name", "value"),
     [
-        ("imu.backward_difference", sensing, "step", lambda *_: MahonyState(1.0)),
+        ("imu.backward_difference", sensing, "advance", lambda *_: (1.0, 0.0)),
         ("cam.negligible", sensing, "CAMERA", WEAK_LENS),
         ("dyn.identity", mechanics, "forward_jacobian", lambda *a: 1.001 * forward_jacobian(*a)),
         ("dyn.mass", mechanics, "mass_matrix", lambda *a: -mass_matrix(*a)),

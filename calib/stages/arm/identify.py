@@ -58,15 +58,20 @@ class Fit:
 
     Attributes
     ----------
-    z, sigma : (parameters,) in deviations of the priors, and the posterior's deviations of these.
+    z : (parameters,) in deviations of the priors. covariance : (parameters, parameters) the posterior's.
     gains : of each day.
     """
 
     assembly: Assembly
     scale: Scale
     z: FloatArray
-    sigma: FloatArray
+    covariance: FloatArray
     gains: Mapping[str, float]
+
+    @property
+    def sigma(self) -> FloatArray:
+        """(parameters,) the posterior's deviations in those of the priors."""
+        return np.sqrt(np.diag(self.covariance))
 
     @property
     def values(self) -> dict[str, float]:
@@ -105,6 +110,7 @@ class Identification:
     fit, sigma : to all trials, and standard deviations by name that hold between trials.
     held : by trial. others : held errors of other assemblies and of baselines, by name and trial.
     coverage : share of the samples of left-out trials in the 95 % interval that the others' errors give.
+    prospects : by kind of trial, what it would leave of the parameters' deviations.
     """
 
     trials: tuple[Trial, ...]
@@ -113,6 +119,7 @@ class Identification:
     held: Mapping[str, Errors]
     others: Mapping[str, Mapping[str, Errors]]
     coverage: float
+    prospects: Mapping[str, Mapping[str, float]]
 
 
 def _bent(
@@ -162,29 +169,32 @@ class _Problem:
         count = len(PARAMETERS)
         return {day: math.exp(DAY_SPREAD * x) for day, x in zip(self.days, z[count:].tolist(), strict=True)}
 
+    def rows(self, model: _Model, z: FloatArray, free: IntArray, x: FloatArray) -> FloatArray:
+        """Deviations x of the free entries from their priors, and scaled errors."""
+        full = z.copy()
+        full[free] = x
+        values = self.assembly.values(full[: len(PARAMETERS)], self.scale)
+        gains, rows = self.gains(full), [x]
+        for one in self.trials:
+            errors = model(one, values, gains[one.day])
+            rows += [error[::_EVERY] / self.sizes[name] for name, error in errors.items()]
+        return np.asarray(np.clip(np.nan_to_num(np.concatenate(rows), nan=1e3), -1e3, 1e3))
+
+    def slopes(self, model: _Model, z: FloatArray, free: IntArray, x: FloatArray) -> FloatArray:
+        """Derivatives of `rows` by x."""
+        sides = [
+            self.rows(model, z, free, x + h) - self.rows(model, z, free, x - h)
+            for h in _STEP * np.eye(len(x))
+        ]
+        return np.stack(sides, axis=1) / (2.0 * _STEP)
+
     def solve(self, model: _Model, z: FloatArray, free: IntArray) -> tuple[FloatArray, FloatArray]:
-        """z with its free entries where errors and deviations are least, and the posterior's deviations."""
-
-        def residuals(x: FloatArray) -> FloatArray:
-            full = z.copy()
-            full[free] = x
-            values = self.assembly.values(full[: len(PARAMETERS)], self.scale)
-            gains, rows = self.gains(full), [x]
-            for one in self.trials:
-                errors = model(one, values, gains[one.day])
-                rows += [error[::_EVERY] / self.sizes[name] for name, error in errors.items()]
-            return np.asarray(np.clip(np.nan_to_num(np.concatenate(rows), nan=1e3), -1e3, 1e3))
-
-        def jacobian(x: FloatArray) -> FloatArray:
-            steps = _STEP * np.eye(len(x))
-            return np.stack([(residuals(x + h) - residuals(x - h)) / (2.0 * _STEP) for h in steps], axis=1)
-
-        found = least_squares(residuals, z[free], jac=jacobian, max_nfev=25, ftol=1e-3)
-        slopes = jacobian(found.x)
-        out, sigma = z.copy(), np.ones_like(z)
+        """z with its free entries where errors and deviations are least, and their covariance."""
+        rows, slopes = partial(self.rows, model, z, free), partial(self.slopes, model, z, free)
+        found = least_squares(rows, z[free], jac=slopes, max_nfev=25, ftol=1e-3)
+        J, out = slopes(found.x), z.copy()
         out[free] = found.x
-        sigma[free] = np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)))
-        return out, sigma
+        return out, np.asarray(np.linalg.inv(J.T @ J), dtype=np.float64)
 
 
 def fit(trials: Sequence[Trial], assembly: Assembly, scale: Scale, start: Fit | None = None) -> Fit:
@@ -195,15 +205,14 @@ def fit(trials: Sequence[Trial], assembly: Assembly, scale: Scale, start: Fit | 
         z[:count] = start.z
         z[count:] = [math.log(start.gains.get(day, 1.0)) / DAY_SPREAD for day in problem.days]
     segment, drive = problem.indices(False), problem.indices(True)
-    sigma = np.ones_like(z)
+    covariance = np.eye(len(z))
     together = not any(len(one.pressure_kpa) and len(one.angle_rad) for one in trials)
     if not together:
-        z, sigma = problem.solve(by_pressure, z, segment)
+        z, covariance[np.ix_(segment, segment)] = problem.solve(by_pressure, z, segment)
     if any(len(one.command) for one in trials):
         free = np.concatenate([drive, segment]) if together else drive
-        z, by_drive = problem.solve(by_command, z, free)
-        sigma[free] = by_drive[free]
-    return Fit(assembly, scale, z[:count], sigma[:count], problem.gains(z))
+        z, covariance[np.ix_(free, free)] = problem.solve(by_command, z, free)
+    return Fit(assembly, scale, z[:count], covariance[:count, :count], problem.gains(z))
 
 
 _NONE = np.zeros(0)
@@ -371,6 +380,66 @@ def _coverage(trials: Sequence[Trial], held: Mapping[str, Fit], errors: Mapping[
     return inside / total if total else math.nan
 
 
+# ----------------------------------------------------------------------
+# Which kind of trial to record next: what it would leave of the deviations, recorded twice.
+
+_PLANNED_S = 60.0
+_VENTED = 0.04
+"""By how much of its chord a vented arm starts too short."""
+
+
+def _plans(made: Fit) -> dict[str, Trial]:
+    """Kinds of trials, the commands as shares of the greatest, and masses at the tip."""
+    t = STEP_S * np.arange(round(_PLANNED_S / STEP_S), dtype=np.float64)
+    steps = np.random.default_rng(0).uniform(size=20)[(t // 3.0).astype(int)]
+    stairs = np.array([0.0, 0.25, 0.5, 0.75, 1.0, 0.75, 0.5, 0.25])[(t // 8.0).astype(int) % 8]
+    rests = np.where(t % 20.0 < 10.0, 0.0, 1.0)
+    kinds = {
+        "warm-up cycles": (np.where(t % 3.0 < 1.5, 1.0, 0.0), 0.0, 0.0),
+        "rests of 10 s": (rests, 0.0, 0.0),
+        "a vented start": (rests, 0.0, _VENTED),
+        "a slow staircase with holds": (stairs, 0.0, 0.0),
+        "open-loop steps": (steps, 0.0, 0.0),
+        "steps with 100 g": (steps, 0.1, 0.0),
+        "steps with 200 g": (steps, 0.2, 0.0),
+    }
+    rest = made.values["rest_rad"]
+    length = sum(made.values[name] * rest**k for k, name in enumerate(_CURVE))
+    return {
+        name: Trial(
+            name, "", load_kg, t, made.scale.command * share, np.zeros(len(t)), np.full(len(t), rest),
+            np.full(len(t), length * (1.0 - short)),
+        )
+        for name, (share, load_kg, short) in kinds.items()
+    }  # fmt: skip
+
+
+_CURVE = ("chord_m", "chord_m_per_rad", "chord_m_per_rad2")
+
+
+def prospects(made: Fit) -> dict[str, dict[str, float]]:
+    """What two more trials of a kind would leave of the posterior's deviations, by kind and parameter.
+
+    A load plays its part too, as no log without a known one tells its compliance. The trials are of another
+    day, whose gain has its prior.
+    """
+    parts = {*made.assembly.parts, "load"}
+    assembly = Assembly(tuple(part.name for part in PARTS if part.name in parts))
+    free = np.array([k for k, one in enumerate(PARAMETERS) if one.name in assembly.names])
+    now = made.covariance[np.ix_(free, free)]
+    known = np.eye(len(free) + 1)
+    known[:-1, :-1] = np.linalg.inv(now)
+    out = {}
+    for name, trial in _plans(made).items():
+        problem = _Problem([trial], assembly, made.scale)
+        z, some = np.append(made.z, 0.0), np.append(free, len(PARAMETERS))
+        J = problem.slopes(by_command, z, some, z[some])[len(some) :]
+        after = np.diag(np.linalg.inv(known + 2.0 * J.T @ J))[:-1]
+        left = np.sqrt(after / np.diag(now))
+        out[name] = {PARAMETERS[k].name: float(x) for k, x in zip(free, left, strict=True)}
+    return out
+
+
 def identify(
     trials: Sequence[Trial],
     compare: bool = True,
@@ -404,7 +473,8 @@ def identify(
     if len(trials) > 1:
         others |= baselines(trials)
     coverage = _coverage(trials, held, errors) if held else math.nan
-    return Identification(tuple(trials), made, _deviations(made, held), errors, others, coverage)
+    sigma = _deviations(made, held)
+    return Identification(tuple(trials), made, sigma, errors, others, coverage, prospects(made))
 
 
 def best_baseline(found: Identification, quantity: str) -> str:

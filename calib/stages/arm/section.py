@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from statistics import geometric_mean
 from typing import Literal
 
 from pydantic import model_validator
@@ -79,9 +80,4 @@ class Arm(Result):
 
     def gain_of(self, day: str) -> float:
         """A day's gain; of a day that was not seen the mean of those that were."""
-        if day in self.days or not self.days:
-            return self.days.get(day, 1.0)
-        product = 1.0
-        for one in self.days.values():
-            product *= one
-        return float(product ** (1.0 / len(self.days)))
+        return self.days.get(day) or (geometric_mean(self.days.values()) if self.days else 1.0)

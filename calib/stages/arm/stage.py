@@ -238,6 +238,12 @@ def _words(arm: Arm) -> list[Block]:
         Line("gain of the day: " + ", ".join(f"{day} {gain:.3f}" for day, gain in arm.days.items())),
     ]
 
+    ahead = []
+    for kind, left in found.prospects.items():
+        most = sorted(left, key=lambda name: left[name])[:3]
+        ahead.append((kind, ", ".join(f"{name} to {100.0 * left[name]:.0f} %" for name in most)))
+    blocks.append(Table(("one more trial, twice", "lowers deviations most"), tuple(ahead)))
+
     def cell(error: float) -> str:
         return BLANK if math.isnan(error) else f"{error:.2f}"
 
@@ -269,7 +275,8 @@ def _document(arm: Arm) -> dict[str, Any]:
                 for trial, one in errors.items()
             }
             for model, errors in {"assembly": found.held, **found.others}.items()
-        }
+        },
+        "next": {kind: dict(left) for kind, left in found.prospects.items()},
     }
 
 
