@@ -135,7 +135,7 @@ def _experiments(
                         plan = replace(plan, seconds=duration_s)
                     which = f"{PROGRAMME.index(name) + 1} of {len(PROGRAMME)}: " if do == _ALL else ""
                     narrate(f"{which}{name}, {plan.seconds:g} s; {plan.asks}")
-                    _ready(board, yes)
+                    _ready(yes)
                     with appending(path, LOG) as stream:
                         done = perform(board, plan, level, _writer(stream), narrate)
                     results.append({"log": shown(path), **vars(done)})
@@ -171,7 +171,7 @@ def _greeted(board: Board) -> None:
         narrate(f"before its last reset: {FAULTS.get(hello.kept, hello.kept)}")
 
 
-def _ready(board: Board, yes: bool) -> None:
+def _ready(yes: bool) -> None:
     """Wait for the person; what came meanwhile is of no log."""
     if yes:
         return
@@ -179,7 +179,6 @@ def _ready(board: Board, yes: bool) -> None:
         raise UsageError("--do waits for Enter before each experiment, and no terminal is there; give --yes")
     narrate("Enter begins, Ctrl-C ends")
     sys.stdin.readline()
-    del board
 
 
 def _writer(stream: BinaryIO) -> Callable[[str], None]:

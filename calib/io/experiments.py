@@ -47,11 +47,6 @@ _CHIRP_HZ = (0.05, 2.0)
 _CHIRP_S = 40.0
 
 
-def _off(t: float) -> Shares:
-    del t
-    return 0.0, 0.0
-
-
 def _steps(t: float) -> Shares:
     which, within = divmod(t, _STEP_ON_S + _STEP_OFF_S)
     return _LEVELS[int(which) % len(_LEVELS)] if within < _STEP_ON_S else (0.0, 0.0)

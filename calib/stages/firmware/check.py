@@ -101,16 +101,14 @@ def _differences(out: Outputs, wanted: Outputs) -> dict[str, float]:
     return {name: value if math.isfinite(value) else math.inf for name, value in found.items()}
 
 
-def check_frames(
-    header: Header, frames: Sequence[Frame], source: str, undistort: bool | None = None
-) -> Check:
+def check_frames(header: Header, frames: Sequence[Frame], source: str) -> Check:
     """Compare the ticks of a board with the reference.
 
     Parameters
     ----------
     source : the log's name for messages.
-    undistort : CALIB_UNDISTORT that the board was built with; by default the header's. CALIB_FUSED and
-        CALIB_RATE_IS_MEAN are told by the board's flags.
+
+    CALIB_UNDISTORT is the header's; CALIB_FUSED and CALIB_RATE_IS_MEAN are told by the board's flags.
 
     Raises `BadInputError` for a board with another header and for a log that does not begin at the start.
     """
@@ -128,7 +126,7 @@ def check_frames(
     by_fused, by_mean = bool(first.out.flags & BY_FUSED), bool(first.out.flags & BY_MEAN_RATE)
     if by_fused and not header.values["CALIB_HAS_FUSED"]:
         raise BadInputError(f"{source}: the board runs the fused estimator, for which rig.yaml has no gains")
-    reference = reference_of(header.values, undistort, by_fused, by_mean)
+    reference = reference_of(header.values, fused=by_fused, mean_rate=by_mean)
     worst = dict.fromkeys(TOLERANCE, 0.0)
     differ, bad, ticks, lost = 0, None, 0, None
     faults: dict[int, int] = {}
