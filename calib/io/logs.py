@@ -523,49 +523,36 @@ class Watch:
     """
 
     names: tuple[str, ...] = MEASURED
-    _there: dict[str, bool] = field(default_factory=dict)
-    _count: dict[str, int] = field(default_factory=dict)
-    _least: dict[str, float] = field(default_factory=dict)
-    _most: dict[str, float] = field(default_factory=dict)
+    _seen: dict[str, tuple[int, float, float]] = field(default_factory=dict)
     _mirrored: Finding | None = None
     _known: bool = False
 
     def add(self, log: Log) -> None:
         """Rows that follow."""
-        for name in self.names:
-            if name not in log.columns:
-                continue
-            self._there[name] = True
-            column = log.columns[name]
-            finite = column[np.isfinite(column)]
+        for name in set(self.names) & set(log.columns):
+            count, least, most = self._seen.get(name, (0, math.inf, -math.inf))
+            finite = log.columns[name][np.isfinite(log.columns[name])]
             if len(finite):
-                self._count[name] = self._count.get(name, 0) + len(finite)
-                self._least[name] = min(self._least.get(name, math.inf), float(finite.min()))
-                self._most[name] = max(self._most.get(name, -math.inf), float(finite.max()))
+                least, most = min(least, float(finite.min())), max(most, float(finite.max()))
+            self._seen[name] = count + len(finite), least, most
         if not self._known and all(name in log.columns and name in self.names for name in IN_PLANE):
             self._known, self._mirrored = _mirrored(log)
 
     def has(self, *names: str) -> bool:
         """Whether each of these columns has a reading."""
-        return all(self._count.get(name) for name in names)
+        return all(name in self._seen and self._seen[name][0] for name in names)
 
     def findings(self, stuck: bool = True) -> list[Finding]:
         """What is wrong about the sensors, with `stuck` those among them that never change."""
         out = []
-        for name in self.names:
-            if name in self._there and not self._count.get(name):
+        for name in (name for name in self.names if name in self._seen):
+            count, least, most = self._seen[name]
+            if not count:
                 severity: Severity = "poor" if name in _NEEDED else "remark"
                 out.append(Finding(severity, f"{name} has no reading in any row"))
-            elif stuck and (
-                name in IMU and self._count.get(name, 0) >= _FEWEST and self._least[name] == self._most[name]
-            ):
-                out.append(
-                    Finding(
-                        "inconsistent",
-                        f"{name} never changes, it is stuck at {self._least[name]:.6g}",
-                        "check the sensor and its wiring",
-                    )
-                )
+            elif stuck and name in IMU and count >= _FEWEST and least == most:
+                text = f"{name} never changes, it is stuck at {least:.6g}"
+                out.append(Finding("inconsistent", text, "check the sensor and its wiring"))
         return [*out, self._mirrored] if self._mirrored is not None else out
 
 

@@ -88,13 +88,11 @@ class Album:
 
     def names(self) -> list[str]:
         """Pictures that count, in the order in which they are read."""
-        return [path.name for path in list_pictures([self.images])] if holds_pictures(self.images) else []
+        return _names(self.images)
 
     def left_out(self) -> list[str]:
         """Pictures that were dropped."""
-        if not self.dropped.is_dir() or not holds_pictures(self.dropped):
-            return []
-        return [path.name for path in list_pictures([self.dropped])]
+        return _names(self.dropped)
 
     def new_name(self) -> str:
         """A name for the next picture, with a number that no picture here has."""
@@ -188,6 +186,11 @@ class Album:
         made = stage(verb)
         files = Files((pictures,), self.rig, figures=False, keep=False)
         return carry_out(made, files, options_of(made.options, {}), self.rig)[0]
+
+
+def _names(folder: Path) -> list[str]:
+    there = folder.is_dir() and holds_pictures(folder)
+    return [path.name for path in list_pictures([folder])] if there else []
 
 
 _NUMBER = re.compile(r"(\d{1,9})\.\w+$")

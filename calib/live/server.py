@@ -71,18 +71,19 @@ class _Tab:
     by_hand: bool = False
     taken_s: float | None = None
 
-    async def tell(self, message: dict[str, Any]) -> None:
-        """Send words; a page that has gone is no reason to fail."""
+    async def tell(self, message: dict[str, Any] | bytes) -> None:
+        """Send words or a frame; a page that has gone is no reason to fail."""
         with contextlib.suppress(WebSocketDisconnect, RuntimeError):
             async with self.sending:
-                await self.socket.send_text(json.dumps(message, allow_nan=False))
+                if isinstance(message, bytes):
+                    await self.socket.send_bytes(message)
+                else:
+                    await self.socket.send_text(json.dumps(message, allow_nan=False))
 
     async def show(self, jpeg: bytes) -> None:
         """Send a frame, unless the page is still busy with another."""
         if not self.sending.locked():
-            with contextlib.suppress(WebSocketDisconnect, RuntimeError):
-                async with self.sending:
-                    await self.socket.send_bytes(jpeg)
+            await self.tell(jpeg)
 
 
 class Live:
@@ -358,9 +359,11 @@ class Live:
 
     def _point(self, asked: dict[str, Any]) -> None:
         at = asked.get("at")
-        if not (isinstance(at, list) and len(at) == 2 and all(isinstance(x, int | float) for x in at)):
-            raise BadInputError("that is no place in the picture")
-        if not all(-1e5 < x < 1e5 for x in at):
+        if not (
+            isinstance(at, list)
+            and len(at) == 2
+            and all(isinstance(x, int | float) and abs(x) < 1e5 for x in at)
+        ):
             raise BadInputError("that is no place in the picture")
         if self.step == "plane":
             self._held(self.flat.choose, (at[0], at[1]))

@@ -57,6 +57,13 @@
   };
 
   const NARROW_PX = 560;
+  const LETTER_PX = 6.4;
+  const wrapped = (text, most) => text.split(" ").reduce((lines, word) => {
+    const longer = lines.length ? lines.at(-1) + " " + word : word;
+    if (lines.length && longer.length > most) lines.push(word);
+    else lines.splice(-1, 1, longer);
+    return lines;
+  }, []);
   const build = (chart, width) => {
     const look = dark() ? "dark" : "light";
     const hues = HUES[look];
@@ -66,10 +73,14 @@
     const traces = [];
     const legend = chart.panels.some((panel) => panel.traces.some((trace) => trace.name));
     const named = (panel) => Math.max(0, ...(panel.y.ticktext ?? []).map((text) => text.length));
-    const room = (panel) => Math.max(62, Math.min(6.3 * named(panel) + 16, 0.42 * width));
+    const room = (panel) => Math.max(70, Math.min(LETTER_PX * named(panel) + 16, (width < NARROW_PX ? 0.5 : 0.42) * width));
     const left0 = narrow ? chart.panels : chart.panels.filter((panel) => panel.cell[0] < 0.001);
-    const margin = { l: Math.max(...left0.map(room)), r: 14, t: 50, b: legend ? 84 : 46 };
-    const high = (narrow ? Math.max(chart.height, 250 * count) : chart.height) + (legend ? 64 : 24);
+    const l = Math.max(...left0.map(room));
+    const above = narrow ? chart.panels.slice(0, 1) : chart.panels.filter((panel) => panel.cell[2] < 0.001);
+    const lines = Math.max(1, ...above.map((panel) => wrapped(panel.title,
+      (narrow ? 1 : panel.cell[1] - panel.cell[0]) * (width - l - 14) / LETTER_PX).length));
+    const margin = { l, r: 14, t: 36 + 14 * lines, b: legend ? 84 : 46 };
+    const high = (narrow ? Math.max(chart.height, 250 * count) : chart.height) + 14 * (lines - 1) + (legend ? 64 : 24);
     const inner = { width: Math.max(width - margin.l - margin.r, 100), height: high - margin.t - margin.b };
     const layout = {
       height: high, width, margin, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
@@ -83,12 +94,14 @@
       const [left, right, top, bottom] = narrow ? [0, 1, k / count, (k + 1) / count] : panel.cell;
       const gap = (pixels, whole) => pixels / whole;
       const x = [left + (left > 0.001 ? gap(room(panel) + 4, inner.width) : 0), right - (right < 0.999 ? gap(12, inner.width) : 0)];
+      const title = wrapped(panel.title, ((x[1] - x[0]) * inner.width) / LETTER_PX);
       const y = [1 - bottom + (bottom < 0.999 ? gap(panel.x.title.text ? 50 : 24, inner.height) : 0),
-        1 - top - (top > 0.001 ? gap(24, inner.height) : 0)];
+        1 - top - (top > 0.001 ? gap(10 + 14 * Math.max(title.length, 1), inner.height) : 0)];
       const common = { gridcolor: hues.grid, zeroline: false, linecolor: hues.grey, showline: !panel.bare,
         ticks: panel.bare ? "" : "outside", tickcolor: hues.grey, automargin: false, visible: !panel.bare,
         exponentformat: "none" };
       layout["xaxis" + id] = { ...common, ...resolved(panel.x, chart, look), domain: x, anchor: "y" + id,
+        ...((x[1] - x[0]) * inner.width < 240 ? { nticks: 4, tickangle: 0 } : {}),
         showticklabels: panel.follows === null || panel.follows === undefined };
       layout["yaxis" + id] = { ...common, ...resolved(panel.y, chart, look), domain: y, anchor: "x" + id };
       if (panel.follows !== null) layout["xaxis" + id].matches = "x" + (panel.follows ? panel.follows + 1 : "");
@@ -105,7 +118,7 @@
           xref: own(note.xref), yref: own(note.yref) });
       }
       if (panel.title) {
-        layout.annotations.push({ text: panel.title, showarrow: false, xref: "x" + id + " domain", x: 0,
+        layout.annotations.push({ text: title.join("<br>"), align: "left", showarrow: false, xref: "x" + id + " domain", x: 0,
           xanchor: "left", yref: "y" + id + " domain", y: 1, yanchor: "bottom", font: { size: 12 } });
       }
       for (const trace of resolved(panel.traces, chart, look)) {
