@@ -1,4 +1,4 @@
-"""A command's wall seconds, peak memory of its largest process, exit code and output, as JSON.
+"""A command's wall and processor seconds, peak memory of its largest process, exit code and output, as JSON.
 
 Started anew for each measurement: what a child is said to take at its most is never less than its parent has.
 """
@@ -12,5 +12,10 @@ import time
 began = time.perf_counter()
 done = subprocess.run(sys.argv[1:], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, check=False)
 seconds = time.perf_counter() - began
-mib = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
-print(json.dumps({"seconds": seconds, "mib": mib, "code": done.returncode, "output": done.stdout}))
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+cpu_s, mib = used.ru_utime + used.ru_stime, used.ru_maxrss / 1024
+print(
+    json.dumps(
+        {"seconds": seconds, "cpu_s": cpu_s, "mib": mib, "code": done.returncode, "output": done.stdout}
+    )
+)

@@ -8,11 +8,11 @@ import sys
 import time
 import tracemalloc
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 
-__all__ = ["Process", "Row", "interleaved", "interleaved_processes", "peak_mib", "print_rows"]
+__all__ = ["Process", "Row", "interleaved", "interleaved_processes", "peak_mib", "print_rows", "run"]
 
 
 @dataclass(frozen=True)
@@ -43,9 +43,10 @@ class Row:
 
 @dataclass(frozen=True)
 class Process:
-    """A finished process: wall seconds, peak memory of its largest process, exit code and output."""
+    """A finished process: wall and processor seconds, peak memory of its largest, exit code and output."""
 
     seconds: float
+    cpu_s: float
     mib: float
     code: int
     output: str
@@ -62,7 +63,8 @@ def interleaved(calls: Mapping[str, Callable[[], object]], repeats: int) -> dict
     return {name: median(found) for name, found in times.items()}
 
 
-def _run(command: Sequence[str]) -> Process:
+def run(command: Sequence[str]) -> Process:
+    """Carry out a command and measure it."""
     measured = [sys.executable, "-S", str(Path(__file__).with_name("_measured.py")), *command]
     return Process(**json.loads(subprocess.run(measured, capture_output=True, check=True).stdout))
 
@@ -72,10 +74,9 @@ def interleaved_processes(commands: Mapping[str, Sequence[str]], repeats: int) -
     found: dict[str, list[Process]] = {name: [] for name in commands}
     for _ in range(1 + repeats):
         for name, command in commands.items():
-            found[name].append(_run(command))
+            found[name].append(run(command))
     return {
-        name: Process(median(p.seconds for p in runs[1:]), runs[-1].mib, runs[-1].code, runs[-1].output)
-        for name, runs in found.items()
+        name: replace(runs[-1], seconds=median(p.seconds for p in runs[1:])) for name, runs in found.items()
     }
 
 
