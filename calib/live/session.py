@@ -282,7 +282,7 @@ class Session:
     def enough(self) -> bool:
         """Whether the verdict is ok and the best next picture would change little."""
         gain = self.gain
-        return gain is not None and gain < ENOUGH and self.fit is not None and self.fit.judgement.verdict.ok
+        return gain is not None and gain < ENOUGH and self.fit is not None and self.fit.verdict.ok
 
     @property
     def gain(self) -> float | None:
@@ -398,7 +398,7 @@ class Session:
             some = fit.calibration
             rms = dict(zip(some.observations.names, some.view_rms_px.tolist(), strict=True))
             why = {one.name: one.why for one in fit.left_out}
-        verdict = None if fit is None else fit.judgement.verdict
+        verdict = None if fit is None else fit.verdict
         return {
             "corners": self.corners,
             "size": self._size(),

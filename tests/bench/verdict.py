@@ -30,7 +30,7 @@ def _verdict(views: list[View], size_px: tuple[int, int], model: str) -> tuple[s
     known = covariance(fit)
     began = time.process_time()
     found = judge(fit, known)
-    return found.verdict.word, time.process_time() - began
+    return found.word, time.process_time() - began
 
 
 def _row(name: str, tally: Counter[str]) -> None:

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from sets import Recipe, camera_of, take
 
+from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.core.geometry import apply_homography, fit_homography, map_jacobian
 from calib.core.verdict import Verdict
-from calib.stages.camera.bundle import calibrate, covariance
+from calib.stages.camera.bundle import calibrate, covariance, rotation_exp
 from calib.stages.camera.model import (
     Board,
     Camera,
@@ -28,7 +29,6 @@ from calib.stages.camera.plane import (
     position_sigma,
     settle_orientation,
     to_pixels,
-    to_world,
     workspace_grid,
     world_points_m,
 )
@@ -37,7 +37,6 @@ from calib.stages.camera.pose import (
     plane_map,
     pose_derivatives,
     projection_with_derivatives,
-    rotation,
 )
 
 THESIS = Camera(
@@ -59,6 +58,12 @@ FISHEYE = Camera(
 """150 degrees wide."""
 IDEAL = Camera("pinhole", (316, 208), 273.66, 270.0, 0.4, 157.5, 103.5)
 BOARD = Board(7, 5, 0.02)
+
+
+def rotation(w: FloatArray) -> FloatArray:
+    return rotation_exp(w[None])[0]
+
+
 R_TRUE = rotation(np.array([0.3, -0.2, 0.1]))
 T_TRUE = np.array([0.005, -0.055, 0.32])
 
@@ -88,7 +93,7 @@ def test_there_and_back_is_exact(camera: Camera) -> None:
     world = np.stack([x, y], axis=-1)
     pixels = to_pixels(plane, camera, world)
     assert pixels.shape == world.shape
-    assert np.abs(to_world(plane, camera, pixels) - world).max() < 1e-12
+    assert np.abs(plane_map(camera, plane.R_CW, plane.t_CW_m, pixels) - world).max() < 1e-12
 
 
 def test_the_homography_needs_the_intrinsics() -> None:
@@ -114,7 +119,7 @@ def test_the_plane_is_recovered_within_its_sigma() -> None:
             THESIS, None, [picture(THESIS, 0.2, seed=seed)], workspace_m=(0.01, 0.04, 0.03, 0.06)
         )
         sigma = plane.sigma.plane_mm[len(plane.sigma.points_m) // 2]
-        error = 1e3 * (to_world(plane, THESIS, pixel) - truth)
+        error = 1e3 * (plane_map(THESIS, plane.R_CW, plane.t_CW_m, pixel) - truth)
         inside.append(np.abs(error) < 1.96 * sigma)
         pose_inside.append(np.abs(plane.t_CW_m - T_TRUE) < 1.96 * np.sqrt(np.diag(plane.covariance)[3:]))
     # 300 draws: one standard error is 1.3 %.
@@ -156,7 +161,9 @@ def test_sigma_covers_the_truth_with_a_camera_that_was_calibrated_too() -> None:
         at = rng.uniform(box[:2], box[2:])
         sigma = position_sigma(fit.camera, known, fit_pose(fit.camera, world, pixels), at[None])
         seen = project(truth, at @ R[:, :2].T + t)
-        marker_z.append(1e3 * (to_world(plane, fit.camera, seen) - at) / sigma.calibration_mm[0])
+        marker_z.append(
+            1e3 * (plane_map(fit.camera, plane.R_CW, plane.t_CW_m, seen) - at) / sigma.calibration_mm[0]
+        )
     # 300 draws know a share of 95 % to 1.3 %.
     inside = np.mean(np.abs(pose_z) < 2.0, axis=0)
     assert np.all(inside > 0.91), inside
@@ -327,7 +334,7 @@ def test_the_pose_is_recovered_from_exact_pixels(camera: Camera, tilt: float, ro
     fit = fit_pose(camera, POINTS_POSE, project(camera, POINTS_POSE @ R[:, :2].T + T_TRUE_POSE))
     assert np.abs(fit.R_CW - R).max() < 1e-9
     assert np.abs(fit.t_CW_m - T_TRUE_POSE).max() < 1e-10
-    assert fit.termination != "iteration limit"
+    assert fit.termination == "converged"
     assert fit.other is None or fit.other[0] > 1e-6
     assert np.abs(plane_map(camera, fit.R_CW, fit.t_CW_m, pixels_of(camera))).max() < 1.0
 
@@ -485,19 +492,6 @@ def test_the_first_corner_given_overrules_the_rule() -> None:
 def test_an_axis_straight_up_or_down_is_not_guessed(roll_deg: float) -> None:
     with pytest.raises(BadInputError, match="first_corner_px"):
         settle_orientation(picture_placement(THESIS_PLACEMENT, 1.0, roll_deg), THESIS_PLACEMENT, 1.0)
-
-
-def test_mirrored_and_incomplete_grids_are_refused() -> None:
-    truth = picture_placement(THESIS_PLACEMENT, 0.0, 0.0)
-    mirrored = truth.reshape(5, 7, 2)[:, ::-1].reshape(-1, 2)
-    with pytest.raises(BadInputError, match=r"shot\.png: the grid of corners is mirrored"):
-        settle_orientation(mirrored, THESIS_PLACEMENT, 0.0, name="shot.png")
-    with pytest.raises(BadInputError, match="7x5 finite corners"):
-        settle_orientation(truth[:-1], THESIS_PLACEMENT, 0.0)
-    with pytest.raises(BadInputError, match="7x5 finite corners"):
-        settle_orientation(np.where(truth == truth[3], np.nan, truth), THESIS_PLACEMENT, 0.0)
-    with pytest.raises(BadInputError, match="shows no direction"):
-        settle_orientation(truth[:7], Board(7, 1, 0.02), 0.0)
 
 
 WORLD = world_points_m(BOARD, (-0.06, 0.02), 0.05)

@@ -12,8 +12,8 @@ from sets import SIZES, SPOILS, Recipe, camera_of, sheared, take
 
 from calib.core.arrays import FloatArray, GrayImage
 from calib.io.pictures import list_pictures, read_picture, usual_size
-from calib.stages.camera.bundle import calibrate, covariance
-from calib.stages.camera.checks import evidence, overdispersion, resolved
+from calib.stages.camera.bundle import calibrate, covariance, refitted
+from calib.stages.camera.checks import evidence, overdispersion
 from calib.stages.camera.corners import detect
 from calib.stages.camera.intrinsics import Choices, Intrinsics, calibrate_camera
 from calib.stages.camera.model import Board, Camera, View, pack
@@ -37,8 +37,8 @@ def _views_left(fit: Intrinsics) -> set[str]:
 def _faults(clean: Intrinsics, fit: Intrinsics, bad: Sequence[str], most: float = 1.0) -> list[str]:
     """What is not as it would be without the bad pictures."""
     faults = []
-    if fit.judgement.verdict.word != clean.judgement.verdict.word:
-        faults.append(f"{clean.judgement.verdict.word} became {fit.judgement.verdict.word}")
+    if fit.verdict.word != clean.verdict.word:
+        faults.append(f"{clean.verdict.word} became {fit.verdict.word}")
     if innocent := _views_left(fit) - set(bad) - _views_left(clean):
         faults.append(f"blames {sorted(innocent)}")
     before, after = clean.calibration, fit.calibration
@@ -61,13 +61,13 @@ def test_one_step_without_a_view_agrees_with_a_fit_without_it() -> None:
     fit = calibrate(pack(views), SIZE, "radial2")
     asked = agreement(fit, np.ones(12, dtype=np.bool_))
     for i in range(12):
-        without = resolved(fit, np.setdiff1d(np.arange(12), [i]))
+        without = refitted(fit, np.setdiff1d(np.arange(12), [i]))
         true = (without.block.intrinsics - fit.block.intrinsics)[fit.free]
         np.testing.assert_allclose(asked.shift[i] / asked.sigma, true / asked.sigma, atol=0.05, rtol=0.05)
     # The view that is left out and asked how it would move the others answers with the same step.
     rest = np.arange(12) != 3
     asked = agreement(fit, rest)
-    true = (fit.block.intrinsics - resolved(fit, np.flatnonzero(rest)).block.intrinsics)[fit.free]
+    true = (fit.block.intrinsics - refitted(fit, np.flatnonzero(rest)).block.intrinsics)[fit.free]
     assert np.argmax(asked.moved) == 3
     assert asked.chance[3] < 1e-6 < asked.chance[rest].min()
     assert asked.moved[3] == pytest.approx(np.max(np.abs(true) / asked.sigma), rel=0.1)
@@ -86,9 +86,9 @@ def test_a_bad_view_leaves(kind: str, count: int, seed: int) -> None:
     assert _faults(clean, fit, ["bad"], 1.0 if count > 6 else 3.0) == []
     kept = calibrate_camera([*views[1:], bad], SIZE, Choices("radial2", keep_all=True))
     assert kept.calibration.observations.views == count
-    assert kept.judgement.verdict.word == ("inconsistent" if "bad" in _views_left(fit) else "ok")
+    assert kept.verdict.word == ("inconsistent" if "bad" in _views_left(fit) else "ok")
     if "bad" in _views_left(fit):
-        assert kept.judgement.verdict.reasons[0].startswith("bad, used all the same: ")
+        assert kept.verdict.reasons[0].startswith("bad, used all the same: ")
 
 
 @pytest.mark.parametrize(
@@ -113,7 +113,7 @@ def test_more_than_a_fifth_leaving_is_a_finding() -> None:
     views = take(rng, camera, 12, recipe=Recipe(tilt_deg=(15.0, 40.0)))
     for i in range(3):
         views[i] = replace(views[i], pixels=sheared(views[i], camera, rng))
-    verdict = calibrate_camera(views, SIZE, Choices("radial2")).judgement.verdict
+    verdict = calibrate_camera(views, SIZE, Choices("radial2")).verdict
     assert verdict.word == "inconsistent"
     assert verdict.reasons[0].startswith(
         "3 of 12 pictures are left out for disagreeing with the others: v00, v01, v02"

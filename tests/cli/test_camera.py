@@ -254,7 +254,7 @@ def test_a_plane_of_another_camera_is_not_used(calib, rig, points, folder, tmp_p
 def test_the_shipped_camera(calib, rig) -> None:
     ended = calib("distortion", "--rig", rig)
     assert ended.code == 0
-    assert re.search(r"kind +mustache", ended.out)
+    assert re.search(r"kind of distortion +mustache", ended.out)
     assert re.search(r"effect +matters", ended.out)
     whole = yaml.safe_load(rig.read_text())
     assert whole["lens"]["inverse"]["max_error_px"] < 0.01

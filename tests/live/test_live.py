@@ -59,7 +59,7 @@ def test_from_the_first_frame_to_enough() -> None:
     poses = follow(live, Person(np.random.default_rng(0)))
     assert live.corners == (BOARD.columns, BOARD.rows)
     assert 8 <= len(poses) <= 25 and live.enough and live.gain is not None and live.gain < ENOUGH
-    assert live.fit is not None and live.fit.judgement.verdict.ok
+    assert live.fit is not None and live.fit.verdict.ok
     found, sigma = live.fit.calibration.camera, live.fit.covariance.sigma()
     for name in ("fx_px", "fy_px", "cx_px", "cy_px"):
         assert abs(getattr(found, name) - getattr(CAMERA, name)) < 4 * sigma[name], name

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -60,14 +61,19 @@ _TUNING = {"huber": 1.345, "cauchy": 2.385}
 """95 % efficiency on Gaussian residuals."""
 
 
+def cross_matrices(v: FloatArray) -> FloatArray:
+    """Matrices (N, 3, 3) with [v]x w = v x w."""
+    S = np.zeros((len(v), 3, 3))
+    S[:, 0, 1], S[:, 0, 2], S[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
+    return S - S.transpose(0, 2, 1)
+
+
 def rotation_exp(delta: FloatArray) -> FloatArray:
     """Rotation matrices (N, 3, 3) of rotation vectors (N, 3) (Rodrigues), smooth at zero."""
     angle = np.linalg.norm(delta, axis=1)
     a = np.sinc(angle / np.pi)
     b = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
-    S = np.zeros((len(delta), 3, 3))
-    S[:, 0, 1], S[:, 0, 2], S[:, 1, 2] = -delta[:, 2], delta[:, 1], -delta[:, 0]
-    S -= S.transpose(0, 2, 1)
+    S = cross_matrices(delta)
     return np.asarray(np.eye(3) + a[:, None, None] * S + b[:, None, None] * (S @ S))
 
 
@@ -144,14 +150,15 @@ def linearise(
 
     Views are taken a chunk at a time, so that a chunk's Jacobian stays in the processor's cache.
     """
-    G = len(free) + (0 if basis is None else len(basis))
+    G = len(free) + (0 if basis is None else basis.shape[-3])
     views, points = observations.views, observations.pixels.shape[1]
     products = np.empty((views, G + 7, G + 7))
     residuals = np.empty((views, 2, points))
     chunk = max(1, _CHUNK // ((G + 7) * points))
     for first in range(0, views, chunk):
         part = slice(first, first + chunk)
-        J = jacobian(block.part(part), observations.part(part), free, basis)
+        some = basis[part] if basis is not None and basis.ndim == 4 else basis
+        J = jacobian(block.part(part), observations.part(part), free, some)
         if J is None:
             return None
         residuals[part] = J[:, -1].reshape(-1, 2, points)
@@ -259,15 +266,6 @@ def _decrement(at: Linearised, G: int, step: tuple[FloatArray, FloatArray], free
 #
 # are two equations linear in B for each view. Five unknown ratios of B (skew included) need three
 # views, four (no skew) need two, and two (principal point held at the image's centre) need one.
-
-
-@dataclass(frozen=True)
-class InitialGuess:
-    """K (3, 3) and the pose of each view: rotations R_CT (N, 3, 3) and translations t_CT_m (N, 3)."""
-
-    K: FloatArray
-    R_CT: FloatArray
-    t_CT_m: FloatArray
 
 
 def _similarity(points: FloatArray, present: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -411,7 +409,7 @@ def _mismatch(K: FloatArray, H: FloatArray) -> float:
     return float(np.mean(((aa - bb) ** 2 + 4 * ab**2) / (aa + bb) ** 2))
 
 
-def initial_guess(observations: Observations, image_size_px: tuple[int, int], skew: bool) -> InitialGuess:
+def initial_guess(observations: Observations, image_size_px: tuple[int, int], skew: bool) -> Block:
     """Intrinsics without distortion and the poses of all views, as a start for the bundle adjustment.
 
     Zhang's closed form with as many unknowns as the views allow; where that has no plausible answer
@@ -438,7 +436,9 @@ def initial_guess(observations: Observations, image_size_px: tuple[int, int], sk
     if not skew:
         K[0, 1] = 0.0
     R_CT, t_CT_m = poses_from_homographies(K, H)
-    return InitialGuess(K, R_CT, t_CT_m)
+    intrinsics = np.zeros(len(INTRINSICS))
+    intrinsics[:5] = K[0, 0], K[1, 1], K[0, 2], K[1, 2], K[0, 1]
+    return Block(intrinsics, R_CT, t_CT_m, np.zeros(0))
 
 
 def _plausible(K: FloatArray, longest: float, centre: FloatArray) -> bool:
@@ -470,7 +470,7 @@ class Calibration:
     block : intrinsics, poses and deformation as the solver holds them.
     basis : (K, 3, M) of the target's deformation, or None.
     residuals_px : (N, M, 2) projected minus measured; NaN where there is no point.
-    weights : (N, M) of the robust loss, one without.
+    scale_px : of the robust loss.
     normal : (N, G + 6, G + 6) weighted normal matrix of each view at the solution.
     termination : "converged", "stalled", "iterations", "singular" or "behind the camera".
     evaluations : evaluations of the Jacobian.
@@ -483,7 +483,7 @@ class Calibration:
     basis: FloatArray | None
     observations: Observations
     residuals_px: FloatArray
-    weights: FloatArray
+    scale_px: float
     normal: FloatArray
     termination: str
     evaluations: int
@@ -499,6 +499,12 @@ class Calibration:
     def free_names(self) -> tuple[str, ...]:
         """Names of the estimated intrinsics."""
         return tuple(INTRINSICS[i] for i in self.free)
+
+    @property
+    def weights(self) -> FloatArray:
+        """Weights (N, M) of the robust loss, one without."""
+        residuals = np.nan_to_num(self.residuals_px.transpose(0, 2, 1))
+        return loss_weights(residuals, self.loss, self.scale_px)
 
     @property
     def squared_sum(self) -> float:
@@ -549,10 +555,7 @@ def starting_block(
     observations: Observations, image_size_px: tuple[int, int], skew: bool, free: IntArray | None = None
 ) -> Block:
     """Zhang's closed form as a start, with k1 and k2 by linear least squares where they are free."""
-    guess = initial_guess(observations, image_size_px, skew)
-    intrinsics = np.zeros(len(INTRINSICS))
-    intrinsics[:5] = guess.K[0, 0], guess.K[1, 1], guess.K[0, 2], guess.K[1, 2], guess.K[0, 1]
-    start = Block(intrinsics, guess.R_CT, guess.t_CT_m, np.zeros(0))
+    start = initial_guess(observations, image_size_px, skew)
     lens = np.array([INTRINSICS.index("k1"), INTRINSICS.index("k2")])
     if free is None or not np.isin(lens, free).all():
         return start
@@ -562,7 +565,7 @@ def starting_block(
     normal, gradient = at.normal[:, :2, :2].sum(axis=0), at.gradient[:, :2].sum(axis=0)
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     if np.linalg.cond(normal / scale / scale[:, None]) < _WELL_CONDITIONED:
-        intrinsics[lens] = -np.linalg.solve(normal, gradient)
+        start.intrinsics[lens] = -np.linalg.solve(normal, gradient)
     return start
 
 
@@ -680,13 +683,49 @@ def calibrate(
         basis=basis,
         observations=observations,
         residuals_px=np.where(observations.present[..., None], residuals.transpose(0, 2, 1), np.nan),
-        weights=loss_weights(residuals, loss, scale_px),
+        scale_px=scale_px,
         normal=normal,
         termination=found.reason,
         evaluations=evaluations,
         decrement=found.decrement,
         loss=loss,
     )
+
+
+def refitted(
+    calibration: Calibration,
+    index: IntArray | None = None,
+    *,
+    model: str | None = None,
+    start: Block | None = None,
+    **changes: Any,
+) -> Calibration:
+    """The calibration again from where it is, with what is held, board and loss alike but for the changes.
+
+    Parameters
+    ----------
+    index : of the views to go by; all by default. model : another lens model.
+    start : where to start, of the views to go by. changes : further arguments of `calibrate`.
+    """
+    camera, block, observations = calibration.camera, calibration.block, calibration.observations
+    if index is not None:
+        observations = observations.select(index)
+        block = replace(block, R_CT=block.R_CT[index], t_CT_m=block.t_CT_m[index])
+    same = {"basis": calibration.basis, "loss": calibration.loss, "fixed": held(calibration)}
+    return calibrate(
+        changes.pop("observations", observations),
+        camera.image_size_px,
+        model or camera.model,
+        skew="skew_px" in calibration.free_names,
+        start=block if start is None else start,
+        **(same | changes),
+    )
+
+
+def held(calibration: Calibration) -> tuple[str, ...]:
+    """Names of intrinsics that the model has and the calibration does not estimate."""
+    every = free_intrinsics(calibration.camera.model, True)
+    return tuple(INTRINSICS[i] for i in every if i not in calibration.free)
 
 
 def refit_poses(calibration: Calibration, observations: Observations) -> FloatArray:
@@ -766,13 +805,6 @@ class Covariance:
         return dict(zip(self.names, bounded.tolist(), strict=True))
 
 
-def _skew(v: FloatArray) -> FloatArray:
-    """Matrices (N, 3, 3) with [v]x w = v x w."""
-    S = np.zeros((len(v), 3, 3))
-    S[:, 0, 1], S[:, 0, 2], S[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
-    return S - S.transpose(0, 2, 1)
-
-
 def covariance(calibration: Calibration, variance_px2: float | None = None) -> Covariance:
     """Covariance of everything that was estimated.
 
@@ -808,7 +840,7 @@ def covariance(calibration: Calibration, variance_px2: float | None = None) -> C
     poses = V_inverse + E @ S_inverse @ E.transpose(0, 2, 1)
     motion = np.zeros((views, 6, 6))
     motion[:, :3, :3] = motion[:, 3:, 3:] = np.eye(3)
-    motion[:, 3:, :3] = -_skew(t)
+    motion[:, 3:, :3] = -cross_matrices(t)
     weighted = motion.transpose(0, 2, 1) @ V
     total = (weighted @ motion).sum(axis=0)
     # g = sum_i F_i dz_i with F_i = total^-1 G_i' V_i; dz_i = -E_i ds + its own noise.
@@ -868,31 +900,3 @@ def projection_sigma_px(
     mean = 0.5 * (cov[:, 0, 0] + cov[:, 1, 1])
     sigma[seen] = np.sqrt(mean + np.hypot(0.5 * (cov[:, 0, 0] - cov[:, 1, 1]), cov[:, 0, 1]))
     return sigma
-
-
-def residual_inflation(calibration: Calibration) -> float:
-    """Factor on all standard deviations for residuals that are not white within a view.
-
-    The sandwich estimate: the spread of the views' own scores about what white residuals would
-    give, over the intrinsics. One, never less, where residuals are white.
-    """
-    P = len(calibration.free)
-    G = P + len(calibration.block.deformation)
-    H = calibration.normal
-    block, obs = calibration.block, calibration.observations
-    J = jacobian(block, obs, calibration.free, calibration.basis)
-    if J is None or P == 0 or obs.views < 2:
-        return 1.0
-    V_inverse = np.linalg.inv(H[:, G:, G:])
-    E = V_inverse @ H[:, :G, G:].transpose(0, 2, 1)
-    root = np.sqrt(np.tile(calibration.weights, 2))
-    gradient = np.einsum("nqm,nm->nq", J[:, :-1] * root[:, None], J[:, -1] * root)
-    score = gradient[:, :G] - np.einsum("ngk,nk->ng", E.transpose(0, 2, 1), gradient[:, G:])
-    S = H[:, :G, :G].sum(axis=0) - np.einsum("ngk,nkh->gh", H[:, :G, G:], E)
-    meat = score.T @ score * obs.views / max(obs.views - G / 2.0, 1.0)
-    expected = calibration.sigma_px**2 * S
-    try:
-        ratio = np.trace(np.linalg.solve(expected, meat)) / G
-    except np.linalg.LinAlgError:
-        return 1.0
-    return float(np.sqrt(max(ratio, 1.0)))

@@ -8,13 +8,13 @@ import numpy as np
 
 from calib.core.errors import BadInputError
 from calib.stages.camera.bundle import calibrate, linearise
-from calib.stages.camera.checks import repeated_views
+from calib.stages.camera.checks import eliminated, repeated_views
 from calib.stages.camera.model import View, pack
 
-# A view's information about the intrinsics, with its own pose eliminated, is S_i = U_i - W_i V_i^-1 W_i'
-# (symbols of `bundle`), over the square of its residuals, so that a blurred or a smeared frame counts
-# less. Views are taken one by one, each the one that lowers the volume of the error ellipsoid most:
-# the largest log det(S + S_i), of each place of the board one.
+# A view's information about the intrinsics, with its own pose eliminated, is S_i (see `checks`), over the
+# square of its residuals, so that a blurred or a smeared frame counts less. Views are taken one by one, each
+# the one that lowers the volume of the error ellipsoid most: the largest log det(S + S_i), of each place of
+# the board one.
 
 MOST = 30
 _FEWEST = 20
@@ -37,12 +37,8 @@ def most_informative(views: Sequence[View], image_size_px: tuple[int, int], most
     at = linearise(fit.block, fit.observations, fit.free, None)
     if at is None or not np.all(np.isfinite(at.normal)):
         return every
-    G = len(fit.free)
-    U, W, V = at.normal[:, :G, :G], at.normal[:, :G, G:], at.normal[:, G:, G:]
-    rms = fit.view_rms_px
-    S = (U - W @ np.linalg.solve(V, W.transpose(0, 2, 1))) / np.maximum(rms, np.median(rms))[
-        :, None, None
-    ] ** 2
+    G, rms = len(fit.free), fit.view_rms_px
+    S = eliminated(at.normal, at.gradient)[0] / np.maximum(rms, np.median(rms))[:, None, None] ** 2
     scale = 1.0 / np.sqrt(np.maximum(np.einsum("nii->i", S), 1e-300))
     S = S * scale * scale[:, None]
     total = _LITTLE * np.eye(G)

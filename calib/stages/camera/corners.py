@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import cv2
 import numpy as np
 
-from calib.core.arrays import BoolArray, FloatArray, GrayImage
+from calib.core.arrays import AnyArray, BoolArray, FloatArray, GrayImage
 from calib.core.errors import BadInputError
 from calib.stages.camera.lattice import (
     Lattice,
@@ -269,6 +268,7 @@ _ENLARGE_BELOW_PIXELS = 700_000
 _QUICK_PIXELS = 400_000
 _ENLARGE_TWICE_BELOW_PIXELS = 90_000
 _OPENCV_PIXELS = 1_300_000
+"""Of a picture that OpenCV's finders can search quickly."""
 _SEEN_SHARE = 0.8
 """Least share of a grid's corners that must be seen; the others are looked for where they should be."""
 _MIN_SIDE_PX = 16
@@ -286,22 +286,6 @@ class Level:
     def to_picture(self, points: FloatArray) -> FloatArray:
         """Pixels of the picture from pixels of the copy."""
         return np.asarray((points + 0.5) / self.zoom - 0.5)
-
-
-@dataclass(frozen=True)
-class Found:
-    """What a stage saw: grids (r, c, 2) of the picture to try, and whether a broken grid is there."""
-
-    grids: list[FloatArray]
-    fragments: bool = False
-
-
-@dataclass(frozen=True)
-class Stage:
-    """One way of looking."""
-
-    name: str
-    search: Callable[[], Found]
 
 
 def resized(gray: GrayImage, zoom: float) -> Level:
@@ -347,79 +331,51 @@ def complete(lattice: Lattice) -> FloatArray | None:
     return np.where(seen[..., None], lattice.points, prediction.points)
 
 
-def lattice_stages(gray: GrayImage, columns: int, rows: int, quick: bool = False) -> list[Stage]:
-    """Stages that join saddle points of copies of the picture; where it must be `quick`, of no large ones."""
-
-    def stage(zoom: float) -> Stage:
-        def search() -> Found:
-            level = resized(gray, zoom)
-            grids, fragments = [], False
-            for lattice in find_lattices(find_saddles(level.image), least=max(4, columns * rows // 4)):
-                shape = lattice.points.shape[:2]
-                fits = sorted(shape) == sorted((rows, columns))
-                points = complete(lattice) if fits else None
-                if points is not None:
-                    grids.append(level.to_picture(points))
-                within = all(a <= b for a, b in zip(sorted(shape), sorted((rows, columns)), strict=True))
-                share = int(lattice.seen.sum()) / (columns * rows)
-                fragments |= points is None and within and share >= _FRAGMENT
-            return Found(grids, fragments)
-
-        return Stage(f"saddles x{zoom:g}", search)
-
-    return [
-        stage(zoom)
-        for zoom in lattice_levels(gray)
-        if not (quick and zoom > 1.0 and zoom**2 * gray.size > _QUICK_PIXELS)
-    ]
-
-
-_Finder = Callable[[GrayImage, tuple[int, int]], FloatArray | None]
-
-
-def _classic(image: GrayImage, size: tuple[int, int]) -> FloatArray | None:
-    found, corners = cv2.findChessboardCorners(
-        image, size, flags=cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-    )
-    return np.asarray(corners, dtype=np.float64) if found else None
-
-
-def _sector_based(image: GrayImage, size: tuple[int, int], flags: int = 0) -> FloatArray | None:
-    found, corners = cv2.findChessboardCornersSB(image, size, flags=flags)
-    return np.asarray(corners, dtype=np.float64) if found else None
-
-
-def _exhaustive(image: GrayImage, size: tuple[int, int]) -> FloatArray | None:
-    return _sector_based(
-        image, size, cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
-    )
-
-
-def fallback_stages(gray: GrayImage, columns: int, rows: int) -> list[Stage]:
-    """OpenCV's finders, on the picture or a copy of a size that they can do quickly."""
-    if min(gray.shape) < _MIN_SIDE_PX or min(columns, rows) < 3:
-        return []
+def _for_opencv(gray: GrayImage) -> Level:
     n = 1
     while gray.size / n**2 > _OPENCV_PIXELS:
         n += 1
-    plain = 1.0 / n
-    finders = (("classic", _classic), ("SB", _sector_based), ("SB exhaustive", _exhaustive))
+    return resized(gray, 1.0 / n)
 
-    def stage(name: str, finder: _Finder) -> Stage:
-        def search() -> Found:
-            level = resized(gray, plain)
-            try:
-                corners = finder(level.image, (columns, rows))
-            except cv2.error:
-                # Some pictures are too small for a finder's own filters.
-                return Found([])
-            if corners is None or corners.size != 2 * columns * rows:
-                return Found([])
-            return Found([level.to_picture(_not_mirrored(corners.reshape(rows, columns, 2)))])
 
-        return Stage(f"{name} x{plain:g}", search)
+_CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+_EXHAUSTIVE = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
+_FINDERS: dict[str, Callable[[GrayImage, tuple[int, int]], tuple[bool, AnyArray | None]]] = {
+    "classic": lambda image, size: cv2.findChessboardCorners(image, size, flags=_CLASSIC),
+    "SB": cv2.findChessboardCornersSB,
+    "SB exhaustive": lambda image, size: cv2.findChessboardCornersSB(image, size, flags=_EXHAUSTIVE),
+}
 
-    return [stage(name, finder) for name, finder in finders]
+
+def _candidates(
+    gray: GrayImage, columns: int, rows: int, quick: bool
+) -> Iterator[tuple[str, list[FloatArray]]]:
+    """Grids (r, c, 2) of the picture to try, and the name of the stage that saw them, stage by stage."""
+    fragments = False
+    for zoom in lattice_levels(gray):
+        if quick and zoom > 1.0 and zoom**2 * gray.size > _QUICK_PIXELS:
+            continue
+        level, grids = resized(gray, zoom), []
+        for lattice in find_lattices(find_saddles(level.image), least=max(4, columns * rows // 4)):
+            shape = sorted(lattice.points.shape[:2])
+            points = complete(lattice) if shape == sorted((rows, columns)) else None
+            if points is not None:
+                grids.append(level.to_picture(points))
+            elif all(a <= b for a, b in zip(shape, sorted((rows, columns)), strict=True)):
+                fragments |= int(lattice.seen.sum()) >= _FRAGMENT * columns * rows
+        yield f"saddles x{zoom:g}", grids
+    if quick or not fragments or min(gray.shape) < _MIN_SIDE_PX:
+        return
+    level = _for_opencv(gray)
+    for name, finder in _FINDERS.items():
+        try:
+            found, corners = finder(level.image, (columns, rows))
+        except cv2.error:
+            # Some pictures are too small for a finder's own filters.
+            continue
+        if found and corners is not None and corners.size == 2 * columns * rows:
+            grid = np.asarray(corners, dtype=np.float64).reshape(rows, columns, 2)
+            yield f"{name} x{level.zoom:g}", [level.to_picture(_not_mirrored(grid))]
 
 
 def _not_mirrored(grid: FloatArray) -> FloatArray:
@@ -438,7 +394,6 @@ _NARROW = 0.65
 _SIZE_MISFIT = 0.04
 """Largest misfit, in squares, of a board that nobody asked for."""
 _LATTICES = 3
-_SIZE_OPENCV_PIXELS = 1_300_000
 
 
 def _whole(gray: GrayImage, points: FloatArray) -> Refined | None:
@@ -487,10 +442,7 @@ def board_size(gray: GrayImage) -> tuple[int, int] | None:
 
 
 def _size_by_opencv(gray: GrayImage) -> tuple[int, int] | None:
-    n = 1
-    while gray.size / n**2 > _SIZE_OPENCV_PIXELS:
-        n += 1
-    level = resized(gray, 1.0 / n)
+    level = _for_opencv(gray)
     flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
     try:
         found, corners, meta = cv2.findChessboardCornersSBWithMeta(level.image, (3, 3), flags)
@@ -506,12 +458,6 @@ def _size_by_opencv(gray: GrayImage) -> tuple[int, int] | None:
         return None
     sides = sorted(grid.refined.shape, reverse=True)
     return int(sides[0]), int(sides[1])
-
-
-def board_sizes(pictures: Sequence[GrayImage]) -> tuple[int, int] | None:
-    """The size that most pictures show, the larger one in a tie; None when no picture shows a board."""
-    counts = Counter(size for size in map(board_size, pictures) if size is not None)
-    return max(counts, key=lambda size: (counts[size], size[0] * size[1], size), default=None)
 
 
 # ----------------------------------------------------------------------
@@ -621,17 +567,10 @@ def detect(gray: GrayImage, columns: int, rows: int, quick: bool = False) -> Det
         )
     if not _checked(gray):
         return None
-    fragments = False
-    joined = partial(lattice_stages, quick=quick)
-    for stages in (joined,) if quick else (joined, fallback_stages):
-        for stage in stages(gray, columns, rows):
-            found = stage.search()
-            fragments |= found.fragments
-            grid = _best_of(gray, found.grids)
-            if grid is not None:
-                return _ordered(grid, columns, rows, stage.name)
-        if not fragments:
-            break
+    for name, grids in _candidates(gray, columns, rows, quick):
+        grid = _best_of(gray, grids)
+        if grid is not None:
+            return _ordered(grid, columns, rows, name)
     return None
 
 
@@ -641,4 +580,6 @@ def find_size(gray: GrayImage | Sequence[GrayImage]) -> tuple[int, int] | None:
     Of several pictures the size that most of them show; of sizes shown equally often the larger.
     """
     pictures = [gray] if isinstance(gray, np.ndarray) else list(gray)
-    return board_sizes([picture for picture in pictures if _checked(picture)])
+    sizes = (board_size(picture) for picture in pictures if _checked(picture))
+    counts = Counter(size for size in sizes if size is not None)
+    return max(counts, key=lambda size: (counts[size], size[0] * size[1], size), default=None)

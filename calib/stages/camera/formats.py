@@ -150,41 +150,24 @@ def _loader() -> Any:
     return made
 
 
-class _Tree:
-    """Elements as nested values, with a bound on their depth."""
-
-    def __init__(self) -> None:
-        self.root: object = None
-        self._open: list[tuple[str, dict[str, str], dict[str, object], list[str]]] = []
-
-    def start(self, tag: str, attributes: dict[str, str]) -> None:
-        if len(self._open) >= _DEEPEST:
-            raise ValueError("too deep")
-        self._open.append((tag, attributes, {}, []))
-
-    def data(self, text: str) -> None:
-        if self._open:
-            self._open[-1][3].append(text)
-
-    def end(self, _: str) -> None:
-        tag, attributes, inner, texts = self._open.pop()
-        value: object = _leaf("".join(texts), attributes)
-        if inner:
-            value = {**inner, **({_TYPE: attributes[_TYPE]} if _TYPE in attributes else {})}
-        if not self._open:
-            self.root = (tag, value)
-        elif tag in self._open[-1][2]:
+def _element(element: ElementTree.Element, depth: int = 0) -> object:
+    """An element as nested values."""
+    kind = element.get(_TYPE)
+    if not len(element):
+        return _leaf(element.text or "", kind)
+    if depth >= _DEEPEST:
+        raise ValueError("too deep")
+    inner: dict[str, object] = {} if kind is None else {_TYPE: kind}
+    for child in element:
+        if child.tag in inner:
             raise ValueError("given twice")
-        else:
-            self._open[-1][2][tag] = value
-
-    def close(self) -> object:
-        return self.root
+        inner[child.tag] = _element(child, depth + 1)
+    return inner
 
 
-def _leaf(text: str, attributes: dict[str, str]) -> object:
+def _leaf(text: str, kind: str | None) -> object:
     """Text of an element: a number, a list of numbers, base64 or text."""
-    if attributes.get(_TYPE) == "binary":
+    if kind == "binary":
         return base64.b64decode("".join(text.split()), validate=True)
     words = text.split()
     if len(words) == 1 and re.fullmatch(r"[-+]?[0-9]{1,18}", words[0]):
@@ -198,10 +181,8 @@ def _xml(text: str) -> object:
     if "<!" in re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL):
         # Entities are the other way in which a small text becomes a large one.
         raise ValueError("has declarations")
-    parser = ElementTree.XMLParser(target=_Tree())
-    parser.feed(text)
-    tag, value = parser.close() or ("", None)
-    return value if tag == "opencv_storage" else None
+    root = ElementTree.fromstring(text)
+    return _element(root) if root.tag == "opencv_storage" else None
 
 
 # ----------------------------------------------------------------------
@@ -318,7 +299,7 @@ def from_opencv(text: str) -> Camera:
     fisheye = root.get("fisheye_model", 0)
     if fisheye not in (0, 1):
         raise BadInputError(f"fisheye_model is {_short(fisheye)}, expected 0 or 1")
-    width, height = (_storage_whole(root, key) for key in ("image_width", "image_height"))
+    width, height = (_whole(root, key) for key in ("image_width", "image_height"))
     K = _storage_matrix(root, "camera_matrix")
     coefficients = _storage_matrix(root, "distortion_coefficients").ravel()
     if K.shape != (3, 3):
@@ -401,7 +382,7 @@ def from_kalibr(text: str, entry: str = "cam0") -> Camera:
     if model != "none":
         coefficients = _numbers(camera.get("distortion_coeffs"), f"{entry}.distortion_coeffs", 4)
     size = camera.get("resolution")
-    if not (isinstance(size, list) and len(size) == 2 and all(_is_whole(value) for value in size)):
+    if not (isinstance(size, list) and len(size) == 2 and all(_count(value) for value in size)):
         raise BadInputError(
             f"{entry}.resolution is {_short(size)}, expected two whole numbers [width, height]"
         )
@@ -456,10 +437,6 @@ def _short(value: object) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _is_whole(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
-
-
 def _whole(document: Mapping[str, Any], key: str) -> int:
     value = document.get(key)
     if not isinstance(value, int) or isinstance(value, bool):
@@ -498,15 +475,6 @@ def _ros_matrix(document: Mapping[str, Any], key: str, shape: tuple[int, int] | 
     if shape is not None and (rows, cols) != shape:
         raise BadInputError(f"{key} is {rows}x{cols}, expected {shape[0]}x{shape[1]}")
     return np.array(data, dtype=np.float64).reshape(rows, cols)
-
-
-def _storage_whole(root: Mapping[str, Any], key: str) -> int:
-    value = root.get(key)
-    if value is None:
-        raise BadInputError(f"{key} is missing")
-    if not _is_whole(value):
-        raise BadInputError(f"{key} is not a whole number")
-    return int(value)
 
 
 def _storage_matrix(root: Mapping[str, Any], key: str) -> FloatArray:

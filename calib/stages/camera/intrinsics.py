@@ -5,13 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
-from calib.core.verdict import Finding
+from calib.core.verdict import Finding, Verdict
 from calib.core.workers import Workers
 from calib.solve.chance import tail_of_t
 from calib.stages.camera.bundle import (
@@ -22,15 +23,18 @@ from calib.stages.camera.bundle import (
     equidistant_start,
     projection_sigma_px,
     refit_poses,
-    residual_inflation,
+    refitted,
 )
 from calib.stages.camera.checks import (
     apart_px,
     best_of_starts,
+    evidence,
     image_outline,
     lens_shape,
+    overdispersion,
     repeated_views,
     screen,
+    seen_angles,
     skew_left_out,
 )
 from calib.stages.camera.model import (
@@ -45,7 +49,6 @@ from calib.stages.camera.model import (
 )
 from calib.stages.camera.triage import Triage, triage
 from calib.stages.camera.verdict import (
-    Judgement,
     judge,
     of_copies,
     of_leaving,
@@ -182,48 +185,28 @@ def _folds(views: int) -> list[IntArray]:
     return [np.arange(first, views, count, dtype=np.int64) for first in range(count)]
 
 
-@dataclass(frozen=True)
-class _Judges:
-    """What every fold has in common; `fits` are those to all views, which a fold starts from."""
-
-    fits: Sequence[Calibration]
-    folds: Sequence[IntArray]
-    fixed: tuple[str, ...]
-
-
-def _on_held_back(fits: Sequence[Calibration], fixed: tuple[str, ...]) -> FloatArray:
+def _on_held_back(fits: Sequence[Calibration]) -> FloatArray:
     """Mean squared residual vector (len(fits), N) of each view by a camera that has not seen it."""
     if not fits:
         return np.zeros((0, 0))
     views = fits[0].observations.views
     folds = _folds(views)
     squared = np.full((len(fits), views), np.nan)
-    jobs = [(i, k) for i in range(len(fits)) for k in range(len(folds))]
-    with Workers(_Judges(fits, folds, fixed), len(jobs)) as workers:
-        for (i, k), found in zip(jobs, workers.in_order(_on_fold, jobs), strict=True):
-            squared[i, folds[k]] = found
+    jobs = [(i, fold) for i in range(len(fits)) for fold in folds]
+    with Workers(fits, len(jobs)) as workers:
+        for (i, fold), found in zip(jobs, workers.in_order(_on_fold, jobs), strict=True):
+            squared[i, fold] = found
     return squared
 
 
 # As in the whole calibration, what is not finite is looked for; a thread does not inherit that.
 @np.errstate(all="ignore")
-def _on_fold(judges: _Judges, job: tuple[int, int]) -> FloatArray:
+def _on_fold(fits: Sequence[Calibration], job: tuple[int, IntArray]) -> FloatArray:
     """The same for the views of one fold, NaN where the others do not make a camera."""
-    whole, held = judges.fits[job[0]], judges.folds[job[1]]
+    whole, held = fits[job[0]], job[1]
     observations = whole.observations
     kept = np.setdiff1d(np.arange(observations.views, dtype=np.int64), held)
-    fit = calibrate(
-        observations.select(kept),
-        whole.camera.image_size_px,
-        whole.camera.model,
-        skew=LensModel.of(whole).skew,
-        fixed=judges.fixed,
-        basis=whole.basis,
-        loss=whole.loss,
-        start=replace(whole.block, R_CT=whole.block.R_CT[kept], t_CT_m=whole.block.t_CT_m[kept]),
-        max_iterations=_MAX_ITERATIONS,
-        tolerance=_ENOUGH,
-    )
+    fit = refitted(whole, kept, max_iterations=_MAX_ITERATIONS, tolerance=_ENOUGH)
     # A direction that a fold leaves flat makes "iterations" usual for rich models; its error counts.
     if fit.termination in ("behind the camera", "singular"):
         return np.full(len(held), np.nan)
@@ -238,7 +221,7 @@ def _soundness(fit: Calibration) -> int:
     """`Candidate.soundness` of a lens."""
     shape = lens_shape(fit)
     if not shape.one_to_one:
-        return int(shape.seen_slope > 0.0)
+        return int(not shape.folds_among_points)
     border = projection_sigma_px(fit, covariance(fit), image_outline(fit.camera))
     return _SOUND if np.all(border < _BORDER_SHARE * max(fit.camera.image_size_px)) else 2
 
@@ -288,7 +271,7 @@ def candidates_by_model(
     if FISHEYE in models and any(map(_wide, fits)):
         fit = fitted(FISHEYE, None)
         fits = sorted(fits if fit is None else [*fits, fit], key=lambda one: models.index(one.camera.model))
-    held = _on_held_back(fits, fixed)
+    held = _on_held_back(fits)
     return [
         (_candidate(str(LensModel.of(fit)), fit, held[i], _soundness(fit)), fit) for i, fit in enumerate(fits)
     ]
@@ -299,13 +282,8 @@ def _wide(fit: Calibration) -> bool:
 
     The rational model folds by noise alone.
     """
-    p1, p2, p3 = (
-        np.moveaxis(fit.observations.target_m @ fit.block.R_CT.transpose(0, 2, 1), 2, 0)
-        + (fit.block.t_CT_m.T[:, :, None])
-    )
-    theta = np.arctan2(np.hypot(p1, p2), p3)[fit.observations.present]
-    folds = fit.camera.model != "rational8" and lens_shape(fit).seen_slope <= 0.0
-    return bool(theta.max() > _WIDE) or folds
+    folds = fit.camera.model != "rational8" and lens_shape(fit).folds_among_points
+    return bool(seen_angles(fit).max() > _WIDE) or folds
 
 
 def _sturdier(fit: Calibration, simpler: Sequence[Calibration]) -> Calibration:
@@ -322,24 +300,12 @@ def _sturdier(fit: Calibration, simpler: Sequence[Calibration]) -> Calibration:
     if all(sound):
         return fit
     observations, size = fit.observations, fit.camera.image_size_px
-
-    def fitted(start: Block, fixed: tuple[str, ...] = ()) -> Calibration:
-        return calibrate(
-            observations,
-            size,
-            "rational8",
-            fixed=fixed,
-            loss=fit.loss,
-            start=start,
-            max_iterations=_MAX_ITERATIONS,
-            tolerance=_ENOUGH,
-        )
-
+    fitted = partial(refitted, fit, max_iterations=_MAX_ITERATIONS, tolerance=_ENOUGH)
     starts = [equidistant_start(observations, size, share * max(size)) for share in _EQUIDISTANT]
     starts = [start for start in starts if np.all(np.isfinite(start.t_CT_m))]
     if simpler:
-        starts.append(fitted(simpler[-1].block, ("k6",)).block)
-    fits = [fit, *(fitted(start) for start in starts)]
+        starts.append(fitted(start=simpler[-1].block, fixed=("k6",)).block)
+    fits = [fit, *(fitted(start=start) for start in starts)]
     fits = [one for one in fits if np.isfinite(one.rms_px)]
     least = min(one.rms_px for one in fits)
     return min(fits, key=lambda one: (one.rms_px > _SAME * least, not lens_shape(one).one_to_one, one.rms_px))
@@ -352,7 +318,7 @@ def candidates_by_board(
 
     Only for targets whose points are the same in every view; otherwise the rigid board alone.
     """
-    observations, size = rigid.observations, rigid.camera.image_size_px
+    observations = rigid.observations
     names: list[str] = []
     fits: list[Calibration] = []
     for kind in kinds:
@@ -365,22 +331,12 @@ def candidates_by_board(
             observations.views < 6 or 2 * observations.points < 2 * (shared + 6 * observations.views)
         ):
             continue
-        fit = rigid
-        if basis is not None:
-            fit = calibrate(
-                observations,
-                size,
-                rigid.camera.model,
-                skew=LensModel.of(rigid).skew,
-                basis=basis,
-                loss=rigid.loss,
-                start=rigid.block,
-            )
+        fit = rigid if basis is None else refitted(rigid, basis=basis, fixed=())
         if fit.termination in ("behind the camera", "singular"):
             continue
         names.append(kind)
         fits.append(fit)
-    held = _on_held_back(fits, ())
+    held = _on_held_back(fits)
     return [(_candidate(names[i], fit, held[i]), fit) for i, fit in enumerate(fits)]
 
 
@@ -450,8 +406,6 @@ _TRIAGES = 3
 _FAR_BETTER = 0.5
 """Squared error of a typical view over that by the chosen model."""
 _NO_PLANE = "shows points that no camera sees on a flat board: in another order, or of another board"
-_LOWER = 1.0 - 1e-6
-"""Cost of another start over that of the fit below which the fit is not the best one."""
 
 
 @dataclass(frozen=True)
@@ -480,7 +434,8 @@ class Intrinsics:
 
     Attributes
     ----------
-    calibration, covariance, judgement : the fit, its error bars by the scatter of the views, and the verdict.
+    calibration, covariance, verdict : the fit, its error bars by the scatter of the views, and whether to
+        trust it.
     models, boards : what was compared on views held back; empty where nothing was.
     board : the board model used.
     left_out : files, views and points that are not used, and why.
@@ -489,7 +444,7 @@ class Intrinsics:
 
     calibration: Calibration
     covariance: Covariance
-    judgement: Judgement
+    verdict: Verdict
     models: tuple[Candidate, ...]
     boards: tuple[Candidate, ...]
     board: str
@@ -636,15 +591,7 @@ def calibrate_camera(
     if choices.keep_all:
         fit = sorted_out.everything
     if choices.loss != "none":
-        fit = calibrate(
-            fit.observations,
-            image_size_px,
-            fit.camera.model,
-            skew=LensModel.of(fit).skew,
-            fixed=fixed,
-            loss=choices.loss,
-            start=fit.block,
-        )
+        fit = refitted(fit, loss=choices.loss)
     board = choices.board
     boards: tuple[Candidate, ...] = ()
     if board != "rigid":
@@ -655,15 +602,13 @@ def calibrate_camera(
     sigma = _by_the_views(fit)
     covered = time.perf_counter()
     findings += of_copies(copies)
-    judgement = _judged(fit, findings)
-    if judgement.numbers.get("lowest_start_cost_share", 1.0) < _LOWER:
-        better = best_of_starts(fit)
-        if better is not fit:
-            fit, sigma = better, _by_the_views(better)
-            judgement = _judged(fit, findings)
+    verdict = _judged(fit, findings)
+    if verdict.word == "unidentifiable" and (better := best_of_starts(fit)) is not fit:
+        fit, sigma = better, _by_the_views(better)
+        verdict = _judged(fit, findings)
     judged = time.perf_counter()
     seconds = {"solve": solved - began, "covariance": covered - solved, "judge": judged - covered}
-    return Intrinsics(fit, sigma, judgement, models, boards, board, tuple(not_used), seconds)
+    return Intrinsics(fit, sigma, verdict, models, boards, board, tuple(not_used), seconds)
 
 
 def without_copies(
@@ -751,10 +696,14 @@ def _by_the_views(fit: Calibration) -> Covariance:
     Blur, print and lens leave errors that are smooth over a view, so that views disagree by more than the
     noise of their corners would let them: two to three times as much on real pictures.
     """
-    return covariance(fit, (residual_inflation(fit) * fit.sigma_px) ** 2)
+    try:
+        inflation = overdispersion(evidence(fit, fit.basis))
+    except (np.linalg.LinAlgError, ValueError):
+        inflation = 1.0
+    return covariance(fit, (inflation * fit.sigma_px) ** 2)
 
 
-def _judged(fit: Calibration, findings: Sequence[Finding]) -> Judgement:
+def _judged(fit: Calibration, findings: Sequence[Finding]) -> Verdict:
     try:
         return judge(fit, covariance(fit), findings=findings)
     except (np.linalg.LinAlgError, ValueError, IndexError) as error:
@@ -787,13 +736,4 @@ def _with_board(rigid: Calibration, choices: Choices) -> tuple[Calibration, str,
         raise BadInputError(
             f"--board {choices.board} has more unknowns than {observations.views} views can fix"
         )
-    fit = calibrate(
-        observations,
-        rigid.camera.image_size_px,
-        rigid.camera.model,
-        skew=LensModel.of(rigid).skew,
-        basis=basis,
-        loss=choices.loss,
-        start=rigid.block,
-    )
-    return fit, choices.board, ()
+    return refitted(rigid, basis=basis, loss=choices.loss, fixed=()), choices.board, ()

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from calib.stages.camera.model import (
 )
 from calib.stages.camera.plane import visible, workspace_grid
 from calib.stages.camera.pose import projection_with_derivatives
+from calib.stages.camera.section import InverseLens, Lens
 
 # ----------------------------------------------------------------------
 # Undistortion that a microcontroller can afford: a polynomial fitted to the inverse of the lens model.
@@ -79,11 +81,6 @@ class InversePolynomial:
     max_error_px: float
     covered: float
     tolerance_px: float
-
-    @property
-    def good_enough(self) -> bool:
-        """Whether it reaches the tolerance everywhere in the picture."""
-        return self.covered == 1.0 and self.max_error_px <= self.tolerance_px
 
 
 def pixel_grid(
@@ -139,7 +136,7 @@ def exact_inverse(camera: Camera, pixels: FloatArray) -> tuple[FloatArray, BoolA
 def fit_inverse(camera: Camera, tolerance_px: float = 0.01) -> InversePolynomial:
     """The shortest inverse polynomial within `tolerance_px` of the exact inverse, else the best found.
 
-    Look at `good_enough`: where the lens model folds over inside the picture, or bends more than ten
+    Where the lens model folds over inside the picture, or bends more than ten
     coefficients can follow, the tolerance is not reached and `max_error_px` says by how much.
     """
     width, height = camera.image_size_px
@@ -179,10 +176,8 @@ def fit_inverse(camera: Camera, tolerance_px: float = 0.01) -> InversePolynomial
 def _minimax(camera: Camera, largest: float, count: int) -> tuple[float, ...]:
     """The c1, c2, ... with nearly the least largest error over undistorted radii up to `largest`."""
     r = np.linspace(0.0, largest, 40 * (count + 5))[1:]
-    radial = camera.distortion.copy()
-    radial[2:4] = 0.0
-    w = distort(r, np.zeros_like(r), radial, camera.fisheye)[0]
-    if count == 0 or not (radial.any() or camera.fisheye):
+    w = radial_curve(camera, r)
+    if count == 0 or np.array_equal(r, w):
         return ()
     rho = w * w
     top = float(rho.max())
@@ -237,60 +232,17 @@ class PlaneView:
     sigma_mm: float | None = None
 
 
-@dataclass(frozen=True)
-class PlaneCost:
-    """Errors of positions over the workspace when the lens is taken for ideal.
-
-    Attributes
-    ----------
-    max_mm, mean_mm : with the plane calibrated with the lens and read without it.
-    refitted_max_mm, refitted_mean_mm : with a homography fitted to the distorted pixels of the
-        workspace, the best that any map without a lens can do there.
-    """
-
-    max_mm: float
-    mean_mm: float
-    refitted_max_mm: float
-    refitted_mean_mm: float
-
-
-@dataclass(frozen=True)
-class DistortionReport:
-    """What distortion does and costs.
-
-    Attributes
-    ----------
-    kind : see `distortion_kind`.
-    max_px, mean_px : length of the displacement over the picture, as far as the lens shows it once.
-    region_px : box that `region_*` are taken over.
-    region_max_px, region_mean_px : the same over the region of interest.
-    monotonic : whether the lens model is one-to-one throughout the picture.
-    region_sigma_px : standard deviation of projection over the region at its least, from the
-        covariance of the intrinsics; None where that is not known.
-    plane : cost on the plane, None where no plane is known or none of it is seen.
-    inverse : polynomial that undoes the distortion.
-    effect, why : "negligible" or "matters", and why.
-    """
-
-    kind: str
-    max_px: float
-    mean_px: float
-    region_px: Region
-    region_max_px: float
-    region_mean_px: float
-    monotonic: bool
-    region_sigma_px: float | None
-    plane: PlaneCost | None
-    inverse: InversePolynomial
-    effect: Literal["negligible", "matters"]
-    why: str
+def radial_curve(camera: Camera, r: FloatArray) -> FloatArray:
+    """Distorted of undistorted normalised radii, any shape, the radial part of the model alone."""
+    radial = camera.distortion.copy()
+    radial[2:4] = 0.0
+    return distort(r, np.zeros_like(r), radial, camera.fisheye)[0]
 
 
 def displacement_field(camera: Camera, pixels: FloatArray) -> FloatArray:
     """Displacement mu_distorted - mu (..., 2) in pixels at pixels (..., 2) of the undistorted picture "
     "(B.1)."""
-    y = (pixels[..., 1] - camera.cy_px) / camera.fy_px
-    x = (pixels[..., 0] - camera.cx_px - camera.skew_px * y) / camera.fx_px
+    x, y = np.moveaxis(distorted_normalised(camera, pixels), -1, 0)
     xd, yd = distort(x, y, camera.distortion, camera.fisheye)
     return np.asarray(np.stack([xd - x, yd - y], axis=-1) @ camera.K[:2, :2].T)
 
@@ -328,9 +280,7 @@ def distortion_kind(camera: Camera) -> str:
         return "pincushion" if k1 + k2 > 0 else "barrel"
     # A pole itself has no value.
     r = np.linspace(0.0, min(corner_radius(camera), 0.999 * fold_radius(camera)[0]), 500)[1:]
-    radial = camera.distortion.copy()
-    radial[2:4] = 0.0
-    steps = np.diff(distort(r, np.zeros_like(r), radial, camera.fisheye)[0] / r)
+    steps = np.diff(radial_curve(camera, r) / r)
     rise, fall = float(steps[steps > 0].sum()), float(-steps[steps < 0].sum())
     seen_px = r[-1] * focal_px(camera)
     if max(rise, fall) * seen_px < 1e-9:
@@ -355,9 +305,7 @@ def projection_sigma_px(camera: Camera, covariance: FloatArray, pixels: FloatArr
     """
 
     def derivatives(at: FloatArray) -> tuple[FloatArray, FloatArray]:
-        y = (at[:, 1] - camera.cy_px) / camera.fy_px
-        x = (at[:, 0] - camera.cx_px - camera.skew_px * y) / camera.fx_px
-        rays = np.stack([x, y, np.ones_like(x)], axis=1)
+        rays = np.column_stack([distorted_normalised(camera, at), np.ones(len(at))])
         _, by_point, by_camera = projection_with_derivatives(camera, rays)
         return np.cross(rays[:, None, :], by_point), by_camera
 
@@ -400,8 +348,8 @@ def analyse_distortion(
     plane: PlaneView | None = None,
     region_px: Region | None = None,
     tolerance_px: float = 0.01,
-) -> DistortionReport:
-    """Displacement, kind, cost and inverse of a camera's distortion.
+) -> Lens:
+    """The section of a camera's distortion, its evidence the camera: displacement, kind, cost and inverse.
 
     Distortion is called negligible only where neglecting it costs less than the calibration's own
     standard deviation: on the plane in mm if the plane and its sigma are known, else at every pixel of
@@ -420,7 +368,7 @@ def analyse_distortion(
         When `region_px` is empty or not inside the picture.
     """
     width, height = camera.image_size_px
-    cost, around = (None, None) if plane is None else _on_plane(camera, plane)
+    cost, around = ({}, None) if plane is None else _on_plane(camera, plane)
     region = region_px or around or central_region(camera.image_size_px)
     if not (0 <= region[0] <= region[2] <= width - 1 and 0 <= region[1] <= region[3] <= height - 1):
         raise BadInputError(
@@ -435,20 +383,21 @@ def analyse_distortion(
     if camera_covariance is not None and np.all(np.isfinite(camera_covariance)):
         sigma = projection_sigma_px(camera, camera_covariance, at)
     effect, why = _judge(inside, sigma, plane, cost)
-    return DistortionReport(
+    return Lens(
         kind=distortion_kind(camera),
         max_px=float(whole.max()),
         mean_px=float(whole.mean()),
-        region_px=region,
+        region_px=[float(value) for value in region],
         region_max_px=float(inside.max()),
         region_mean_px=float(inside.mean()),
         monotonic=one_to_one_reach(camera) > 1.0,
         region_sigma_px=None if sigma is None else float(sigma.min()),
-        plane=cost,
-        inverse=fit_inverse(camera, tolerance_px),
+        **cost,
+        inverse=InverseLens.of(fit_inverse(camera, tolerance_px)),
         effect=effect,
-        why=why,
-    )
+        verdict="ok",
+        remarks=[why],
+    ).with_evidence(camera)
 
 
 def shown_once(camera: Camera, pixels: FloatArray) -> BoolArray:
@@ -467,12 +416,12 @@ def _once(camera: Camera, pixels: FloatArray) -> FloatArray:
     return pixels[kept] if kept.any() else pixels.reshape(-1, 2)
 
 
-def _on_plane(camera: Camera, plane: PlaneView) -> tuple[PlaneCost | None, Region | None]:
-    """Cost over the workspace, and the box around it in the picture."""
+def _on_plane(camera: Camera, plane: PlaneView) -> tuple[dict[str, Any], Region | None]:
+    """Cost over the workspace by the section's keys, and the box around it in the picture."""
     points = workspace_grid(plane.workspace_m, 21)
     points = points[visible(camera, plane.R_CW, plane.t_CW_m, points)]
     if len(points) < 4 or np.linalg.matrix_rank(points - points.mean(axis=0)) < 2:
-        return None, None
+        return {}, None
     H = np.column_stack([plane.R_CW[:, :2], plane.t_CW_m])
     pixels = project(camera, np.column_stack([points, np.ones(len(points))]) @ H.T)
     unaware = apply_homography(np.asarray(np.linalg.inv(camera.K @ H), dtype=np.float64), pixels)
@@ -483,24 +432,27 @@ def _on_plane(camera: Camera, plane: PlaneView) -> tuple[PlaneCost | None, Regio
     size = np.array(camera.image_size_px) - 1.0
     u0, v0 = np.maximum(pixels.min(axis=0), 0.0)
     u1, v1 = np.minimum(pixels.max(axis=0), size)
-    cost = PlaneCost(
-        float(error_mm.max()), float(error_mm.mean()), float(refitted_mm.max()), float(refitted_mm.mean())
-    )
+    cost = {
+        "plane_max_mm": float(error_mm.max()),
+        "plane_mean_mm": float(error_mm.mean()),
+        "refitted_max_mm": float(refitted_mm.max()),
+        "refitted_mean_mm": float(refitted_mm.mean()),
+    }
     return cost, (float(u0), float(v0), float(u1), float(v1))
 
 
 def _judge(
-    inside: FloatArray, sigma: FloatArray | None, plane: PlaneView | None, cost: PlaneCost | None
+    inside: FloatArray, sigma: FloatArray | None, plane: PlaneView | None, cost: Mapping[str, float]
 ) -> tuple[Literal["negligible", "matters"], str]:
     if inside.max() == 0.0:
         return (
             "negligible",
             "the camera's model has no distortion; whether the lens has none shows in the residuals",
         )
-    if cost is not None and plane is not None and plane.sigma_mm is not None:
-        small = cost.max_mm < plane.sigma_mm
+    if cost and plane is not None and plane.sigma_mm is not None:
+        small = cost["plane_max_mm"] < plane.sigma_mm
         reason = (
-            f"neglecting the lens costs up to {cost.max_mm:.3f} mm on the plane, "
+            f"neglecting the lens costs up to {cost['plane_max_mm']:.3f} mm on the plane, "
             f"{'less' if small else 'not less'} than the calibration's own sigma of {plane.sigma_mm:.3f} mm"
         )
     elif sigma is not None:
@@ -531,10 +483,8 @@ def ideal_pixels(camera: Camera, pixels: FloatArray) -> FloatArray:
 
 def radial_displacement(camera: Camera, radius_px: FloatArray) -> FloatArray:
     """Displacement along the radius at ideal radii, the radial part of the model alone, pixels."""
-    radial = camera.distortion.copy()
-    radial[2:4] = 0.0
     r = radius_px / focal_px(camera)
-    return np.asarray(focal_px(camera) * (distort(r, np.zeros_like(r), radial, camera.fisheye)[0] - r))
+    return np.asarray(focal_px(camera) * (radial_curve(camera, r) - r))
 
 
 def radial_sigma(camera: Camera, covariance: Covariance, radius_px: FloatArray) -> FloatArray:
@@ -556,11 +506,3 @@ def radial_sigma(camera: Camera, covariance: Covariance, radius_px: FloatArray) 
     J = np.array(rows).reshape(-1, len(radius_px))
     variance = np.einsum("pr,pq,qr->r", J, covariance.intrinsics, J)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
-
-
-def inverse_error(camera: Camera, inverse: InversePolynomial, pixels: FloatArray) -> FloatArray:
-    """Distance in pixels (n,) between both inverses, NaN where the lens model has none."""
-    exact, shown = exact_inverse(camera, pixels)
-    approximate = undistort_by_polynomial(inverse, distorted_normalised(camera, pixels))
-    error = np.linalg.norm((approximate - exact) @ camera.K[:2, :2].T, axis=1)
-    return np.asarray(np.where(shown, error, np.nan))

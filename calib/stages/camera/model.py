@@ -287,22 +287,6 @@ def distort(
     return xd, yd
 
 
-def _distort_jacobian(
-    x: FloatArray, y: FloatArray, distortion: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Derivatives of (xd, yd) with respect to (x, y): xx, xy, yx, yy."""
-    k1, k2, p1, p2, k3, k4, k5, k6 = distortion
-    r2 = x * x + y * y
-    numerator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-    radial = numerator / denominator
-    slope = (k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / denominator
-    cross = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
-    xx = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
-    yy = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
-    return xx, cross, cross, yy
-
-
 def project(camera: Camera, points_C: FloatArray) -> FloatArray:
     """Pixels of points in the camera's frame.
 
@@ -352,28 +336,26 @@ def undistort(camera: Camera, pixels: FloatArray, iterations: int = 30) -> Float
     if camera.fisheye:
         ahead = rays(camera, pixels)
         return np.where(ahead[..., 2:] > 0.0, ahead[..., :2] / np.maximum(ahead[..., 2:], 1e-300), np.nan)
-    yd = (pixels[..., 1] - camera.cy_px) / camera.fy_px
-    xd = (pixels[..., 0] - camera.cx_px - camera.skew_px * yd) / camera.fx_px
+    xd, yd = np.moveaxis(distorted_normalised(camera, pixels), -1, 0)
     x, y = xd.copy(), yd.copy()
     with np.errstate(all="ignore"):
+        now = _Ratios.of(x, y, 1.0, camera.distortion)
         for _ in range(iterations):
-            xd_now, yd_now = distort(x, y, camera.distortion)
-            ex, ey = xd - xd_now, yd - yd_now
-            xx, xy, yx, yy = _distort_jacobian(x, y, camera.distortion)
-            det = xx * yy - xy * yx
+            ex, ey = xd - now.xd, yd - now.yd
+            det = now.xd_x * now.yd_y - now.cross**2
             # A step longer than the radius would leap over the fold of a barrel distortion.
-            step_x, step_y = (yy * ex - xy * ey) / det, (xx * ey - yx * ex) / det
+            step_x, step_y = (now.yd_y * ex - now.cross * ey) / det, (now.xd_x * ey - now.cross * ex) / det
             limit = 0.5 * np.hypot(xd, yd) + 0.1
             scale = np.minimum(1.0, limit / np.maximum(np.hypot(step_x, step_y), 1e-300))
             x = x + scale * step_x
             y = y + scale * step_y
+            now = _Ratios.of(x, y, 1.0, camera.distortion)
             if not np.any(np.hypot(step_x, step_y) > 1e-14):
                 break
-        xd_now, yd_now = distort(x, y, camera.distortion)
-        solved = np.hypot(xd - xd_now, yd - yd_now) < 1e-10
-        xx, xy, yx, yy = _distort_jacobian(x, y, camera.distortion)
+        solved = np.hypot(xd - now.xd, yd - now.yd) < 1e-10
         # Both eigenvalues positive: beyond the fold the picture of the point's antipode has none.
-        solved &= (xx * yy - xy * yx > 0.0) & (xx + yy > 0.0) & (np.hypot(x, y) < fold_radius(camera)[0])
+        solved &= (now.xd_x * now.yd_y > now.cross**2) & (now.xd_x + now.yd_y > 0.0)
+        solved &= np.hypot(x, y) < fold_radius(camera)[0]
     return np.where(solved[..., None], np.stack([x, y], axis=-1), np.nan)
 
 
@@ -431,9 +413,8 @@ def corner_radius(camera: Camera) -> float:
     width, height = camera.image_size_px
     v = np.array([0.0, 0.0, height - 1.0, height - 1.0])
     u = np.array([0.0, width - 1.0, 0.0, width - 1.0])
-    y = (v - camera.cy_px) / camera.fy_px
-    x = (u - camera.cx_px - camera.skew_px * y) / camera.fx_px
-    return min(float(np.hypot(x, y).max()), ahead_radius(camera))
+    corners = distorted_normalised(camera, np.stack([u, v], axis=1))
+    return min(float(np.hypot(*corners.T).max()), ahead_radius(camera))
 
 
 def ahead_radius(camera: Camera) -> float:
@@ -560,7 +541,7 @@ class _Ratios:
 
     x: FloatArray
     y: FloatArray
-    inverse: FloatArray
+    inverse: FloatArray | float
     over: FloatArray | float
     radial: FloatArray
     xd: FloatArray
@@ -570,13 +551,9 @@ class _Ratios:
     yd_y: FloatArray
 
     @classmethod
-    def of(cls, p1: FloatArray, p2: FloatArray, p3: FloatArray, distortion: FloatArray) -> Self | None:
-        """None where a point is behind the camera."""
-        if p3.min() <= 0.0:
-            return None
+    def of(cls, x: FloatArray, y: FloatArray, inverse: FloatArray | float, distortion: FloatArray) -> Self:
+        """Of undistorted x and y, and 1 / p3."""
         k1, k2, t1, t2, k3, k4, k5, k6 = distortion
-        inverse = 1.0 / p3
-        x, y = p1 * inverse, p2 * inverse
         xx, yy, xy = x * x, y * y, x * y
         r2 = xx + yy
         numerator = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -613,28 +590,10 @@ class _Ratios:
             factor = -factor * self.radial
         return x * factor, y * factor
 
-    def by_point(
-        self,
-        side: int,
-        focal: tuple[float, float, float],
-        a1: FloatArray,
-        a2: FloatArray,
-        a3: FloatArray,
-    ) -> None:
-        """Writes du/dp (side 0) or dv/dp (side 1) with the focal lengths and skew."""
-        fx, fy, skew = focal
-        if side == 0:
-            np.multiply(self.xd_x, fx * self.inverse, out=a1)
-            np.multiply(self.cross, fx * self.inverse, out=a2)
-            if skew:
-                a1 += skew * self.inverse * self.cross
-                a2 += skew * self.inverse * self.yd_y
-        else:
-            np.multiply(self.cross, fy * self.inverse, out=a1)
-            np.multiply(self.yd_y, fy * self.inverse, out=a2)
-        np.multiply(self.x, a1, out=a3)
-        a3 += self.y * a2
-        np.negative(a3, out=a3)
+    def by_point(self) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, ...]]:
+        """Derivatives of xd and of yd by p1, p2 and p3."""
+        a, b, c = self.xd_x * self.inverse, self.cross * self.inverse, self.yd_y * self.inverse
+        return (a, b, -(self.x * a + self.y * b)), (b, c, -(self.x * b + self.y * c))
 
 
 @dataclass(frozen=True)
@@ -667,19 +626,9 @@ class _Angles:
         factor = np.zeros_like(self.theta) if power is None else self.theta**power
         return self.toward[0] * factor, self.toward[1] * factor
 
-    def by_point(
-        self,
-        side: int,
-        focal: tuple[float, float, float],
-        a1: FloatArray,
-        a2: FloatArray,
-        a3: FloatArray,
-    ) -> None:
-        """Writes du/dp (side 0) or dv/dp (side 1) with the focal lengths and skew."""
-        fx, fy, skew = focal
-        for row, a in enumerate((a1, a2, a3)):
-            by_x, by_y = self.by[0][row], self.by[1][row]
-            a[:] = fx * by_x + skew * by_y if side == 0 else fy * by_y
+    def by_point(self) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, ...]]:
+        """Derivatives of xd and of yd by p1, p2 and p3."""
+        return self.by
 
 
 def jacobian(
@@ -694,27 +643,29 @@ def jacobian(
     Parameters
     ----------
     free : indices into `INTRINSICS`.
-    basis : (K, 3, M) displacements of the target's points, or None for a rigid target.
+    basis : (K, 3, M) displacements of the target's points, or (N, K, 3, M) where views have points of their
+        own; None for a rigid target.
     """
     points = observations.pixels.shape[1]
     target = observations.target_m.transpose(0, 2, 1)
     if basis is not None:
-        target = target + np.tensordot(block.deformation, basis, axes=1)
+        target = target + np.tensordot(block.deformation, basis, axes=(0, basis.ndim - 3))
     # (n, 3, M) and (N, 3, 3): R X without the translation.
     rotated = block.R_CT @ target
     p1, p2, p3 = np.moveaxis(rotated + block.t_CT_m[:, :, None], 1, 0)
     if not observations.complete:
         p3 = np.where(observations.present, p3, 1.0)
-    lens: _Angles | _Ratios | None
+    lens: _Angles | _Ratios | None = None
     if block.fisheye:
         lens = _Angles.of(p1, p2, p3, block.intrinsics[5:])
-    else:
-        lens = _Ratios.of(p1, p2, p3, block.intrinsics[5:])
+    elif p3.min() > 0.0:
+        inverse = 1.0 / p3
+        lens = _Ratios.of(p1 * inverse, p2 * inverse, inverse, block.intrinsics[5:])
     if lens is None:
         return None
     fx, fy, cx, cy, skew = block.intrinsics[:5]
     xd, yd = lens.xd, lens.yd
-    shared = len(free) + (0 if basis is None else len(basis))
+    shared = len(free) + (0 if basis is None else basis.shape[-3])
     out = np.empty((observations.views, shared + 7, 2, points))
     for row, index in enumerate(free):
         u, v = out[:, row, 0], out[:, row, 1]
@@ -733,9 +684,13 @@ def jacobian(
             np.multiply(fy, dy, out=v)
     pose = out[:, shared : shared + 6]
     q1, q2, q3 = rotated[:, 0], rotated[:, 1], rotated[:, 2]
+    for row, (by_x, by_y) in enumerate(zip(*lens.by_point(), strict=True)):
+        np.multiply(fx, by_x, out=pose[:, 3 + row, 0])
+        if skew:
+            pose[:, 3 + row, 0] += skew * by_y
+        np.multiply(fy, by_y, out=pose[:, 3 + row, 1])
     for side in (0, 1):
         turn1, turn2, turn3, a1, a2, a3 = (pose[:, row, side] for row in range(6))
-        lens.by_point(side, (fx, fy, skew), a1, a2, a3)
         np.multiply(q2, a3, out=turn1)
         turn1 -= q3 * a2
         np.multiply(q3, a1, out=turn2)
@@ -744,7 +699,9 @@ def jacobian(
         turn3 -= q2 * a1
         if basis is not None:
             in_target = np.einsum("ncm,ncd->ndm", pose[:, 3:, side], block.R_CT)
-            out[:, len(free) : shared, side] = np.einsum("ndm,kdm->nkm", in_target, basis)
+            out[:, len(free) : shared, side] = np.einsum(
+                "ndm,kdm->nkm" if basis.ndim == 3 else "ndm,nkdm->nkm", in_target, basis
+            )
     residual_u, residual_v = out[:, shared + 6, 0], out[:, shared + 6, 1]
     residual_u[:] = fx * xd + skew * yd + cx - observations.pixels[..., 0]
     residual_v[:] = fy * yd + cy - observations.pixels[..., 1]

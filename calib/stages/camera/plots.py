@@ -42,12 +42,9 @@ from calib.stages.camera.bundle import Calibration, Covariance, projection_sigma
 from calib.stages.camera.checks import Means, cell_means, cell_of, hull
 from calib.stages.camera.intrinsics import Candidate, Intrinsics
 from calib.stages.camera.lens import (
-    DistortionReport,
-    InversePolynomial,
     displacement_field,
     distortion_kind,
     ideal_pixels,
-    inverse_error,
     pixel_grid,
     radial_displacement,
     radial_sigma,
@@ -55,13 +52,12 @@ from calib.stages.camera.lens import (
 )
 from calib.stages.camera.model import (
     Camera,
-    distorted_normalised,
     focal_px,
     fold_radius,
-    undistort,
     vector_from_camera,
 )
 from calib.stages.camera.plane import Plane, to_pixels, visible
+from calib.stages.camera.section import Lens
 
 Size = tuple[int, int]
 _RADIUS = "distance from the principal point (px)"
@@ -69,7 +65,7 @@ _RADIUS = "distance from the principal point (px)"
 
 def plots(result: Intrinsics) -> dict[str, Figure]:
     """Figures of a calibration: `camera_errors`, `camera_residuals`, ...; what was compared comes last."""
-    fit, sigma, verdict = result.calibration, result.covariance, result.judgement.verdict.word
+    fit, sigma, verdict = result.calibration, result.covariance, result.verdict.word
     figures = {
         "camera_errors": _errors(fit, verdict),
         "camera_residuals": _residuals(fit, verdict),
@@ -85,12 +81,9 @@ def plots(result: Intrinsics) -> dict[str, Figure]:
     return figures
 
 
-def lens_plots(camera: Camera, report: DistortionReport) -> dict[str, Figure]:
-    """`lens_displacement` and `lens_inverse`: a camera's distortion and how well it is undone."""
-    return {
-        "lens_displacement": _displacement(camera, report),
-        "lens_inverse": _inverse(camera, report.inverse),
-    }
+def lens_plots(lens: Lens) -> dict[str, Figure]:
+    """`lens_displacement`: a camera's distortion."""
+    return {"lens_displacement": _displacement(lens.evidence, lens)}
 
 
 def plane_plots(camera: Camera, plane: Plane) -> dict[str, Figure]:
@@ -251,30 +244,22 @@ def _mean(size: Size, means: Means) -> Plot:
 
 
 # ----------------------------------------------------------------------
-# Where the boards stood, and how they leaned.
-
-_ELEVATION, _AZIMUTH = math.radians(22.0), math.radians(-62.0)
-_RIGHT = np.array([-math.sin(_AZIMUTH), math.cos(_AZIMUTH), 0.0])
-_NEARER = math.cos(_ELEVATION) * np.array([math.cos(_AZIMUTH), math.sin(_AZIMUTH), math.tan(_ELEVATION)])
-_LOOK = np.stack([_RIGHT, np.cross(_NEARER, _RIGHT)])
-"""Places (right, forward, up) of the camera's frame to the sheet."""
-_FEW_BOARDS = 40
+# How the boards leaned.
 
 
 def _poses(fit: Calibration, verdict: str) -> Figure:
-    """Boards in the camera's frame, a histogram of their tilts, and the directions they lean to."""
+    """A histogram of the boards' tilts, and the directions they lean to."""
     R, t = fit.block.R_CT, fit.block.t_CT_m
     usable = np.flatnonzero(np.isfinite(R).all(axis=(1, 2)) & np.isfinite(t).all(axis=1))
     note = (
         "Boards that stand parallel to each other say the same about the camera. A good set leans to all "
-        "sides, by 20 to 50 degrees, and so fills the panel at the lower right."
+        "sides, by 20 to 50 degrees, and so fills the panel at the right."
     )
     normals = R[usable, :, 2]
     normals = normals * np.where(normals[:, 2:] < 0.0, -1.0, 1.0)
     colours = spaced(fit.observations.views)[usable]
-    panels = (_scene(fit, usable.tolist(), colours), *_tilts(normals, colours))
-    title = "Where the boards stood before the camera, and how they leaned"
-    return Figure(title, note, panels, 5.3, verdict, mosaic=("AB", "AC"), widths=(0.62, 0.38))
+    title = "How the boards leaned before the camera"
+    return Figure(title, note, _tilts(normals, colours), 4.0, verdict, columns=2)
 
 
 def _tilts(normals: FloatArray, colours: FloatArray) -> tuple[Plot, Plot]:
@@ -293,82 +278,6 @@ def _tilts(normals: FloatArray, colours: FloatArray) -> tuple[Plot, Plot]:
     x, y, limits = "normal, to the right (degrees)", "normal, down (degrees)", (-reach, reach)
     marks: tuple[Mark, ...] = (*rings, Rule("x", 0.0), Rule("y", 0.0), points)
     return views, Plot(x, y, marks, "Lean of each view", limits, limits, grid="", equal=True, down=True)
-
-
-def _upright(points_C: FloatArray) -> FloatArray:
-    """Camera axes (x right, y down, z forward) as (right, forward, up)."""
-    return np.asarray(points_C[..., [0, 2, 1]] * [1.0, 1.0, -1.0])
-
-
-def _rays(camera: Camera) -> FloatArray:
-    """Directions (4, 3) of the picture's corners, as an ideal lens has them where this one has none."""
-    width, height = camera.image_size_px
-    corners = rectangle(0.0, 0.0, width - 1.0, height - 1.0)
-    ideal = undistort(camera, corners)
-    return np.column_stack(
-        [np.where(np.isfinite(ideal), ideal, distorted_normalised(camera, corners)), np.ones(4)]
-    )
-
-
-def _scene(fit: Calibration, usable: list[int], colours: FloatArray) -> Plot:
-    """Outlines of the boards and the cone of sight, over a floor with lines at round lengths."""
-    observations, block, rays = fit.observations, fit.block, _rays(fit.camera)
-    if not usable or not np.isfinite(rays).all():
-        return Plot(empty="no poses: the fit failed", bare=True)
-    boards = []
-    for i in usable:
-        target = observations.target_m[0 if observations.same_target else i][observations.present[i]]
-        outline = hull(target[:, :2])
-        flat = np.column_stack([outline, np.zeros(len(outline))])
-        boards.append(_upright(flat @ block.R_CT[i].T + block.t_CT_m[i]))
-    depth = float(np.median([board[:, 1].mean() for board in boards]))
-    # A focal length that means nothing can open the cone to almost a half space.
-    cone = _upright(0.3 * depth * rays / max(1.0, float(np.abs(rays).max())))
-    marks: list[Shape | Text] = _floor(np.concatenate([*boards, cone, np.zeros((1, 3))]))
-    few = len(boards) <= _FEW_BOARDS
-    for k in np.argsort([float((board @ _NEARER).mean()) for board in boards], kind="stable"):
-        shade = float(colours[k])
-        marks.append(Shape(boards[k] @ _LOOK.T, shade, shade, opacity=0.28 if few else 0.08))
-    marks.append(Shape(cone @ _LOOK.T, "grey", opacity=0.15))
-    marks += [Shape(np.stack([np.zeros(3), corner]) @ _LOOK.T) for corner in cone]
-    drawn = [one.points if isinstance(one, Shape) else [[one.x, one.y]] for one in marks]
-    (left, below), (right, above) = (edge(np.concatenate(drawn), axis=0) for edge in (np.min, np.max))
-    return Plot(marks=marks, x_limits=(left, right), y_limits=(below, above), equal=True, bare=True)
-
-
-def _on_sheet(place: FloatArray, k: int, value: float) -> tuple[float, float]:
-    """Where a place (3,) is on the sheet with its coordinate k replaced."""
-    u, v = _LOOK @ np.where(np.arange(3) == k, value, place)
-    return float(u), float(v)
-
-
-def _floor(points: FloatArray) -> list[Shape | Text]:
-    """Lines on a floor under points (n, 3) at round lengths, and the numbers of all three axes beside it."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    widest = float((high - low).max())
-    room = np.maximum(0.25 * widest - (high - low), 0.0) / 2.0 + 0.03 * widest
-    low, high = low - room, high + room
-    step = round_down(0.3 * widest)
-    marks: list[Shape | Text] = []
-    # Each axis has its numbers at an edge that nothing stands in front of.
-    right = np.array([high[0], low[1], low[2]])
-    edges = (
-        (low, (0, -1, 0), "x, right (m)"),
-        (right, (1, 0, 0), "z, forward (m)"),
-        (low, (-1, 0, 0), "-y, up (m)"),
-    )
-    for k, (corner, outwards, name) in enumerate(edges):
-        out = np.array(outwards, dtype=np.float64)
-        for value in step * np.arange(math.ceil(low[k] / step), math.floor(high[k] / step) + 1):
-            far = corner - (high - low) * out if k < 2 else corner - 0.02 * widest * out
-            ends = np.array([_on_sheet(corner, k, value), _on_sheet(far, k, value)])
-            marks.append(Shape(ends, edge="silver"))
-            marks.append(Text(*_on_sheet(corner + 0.06 * widest * out, k, value), f"{value:g}", "grey"))
-        # The middle of the axis that leads away would be behind its own numbers.
-        middle = float(low[k] if k == 1 else 0.5 * (low + high)[k])
-        marks.append(Text(*_on_sheet(corner + 0.26 * widest * out, k, middle), name))
-    marks.append(Shape(np.array([_on_sheet(low, 2, low[2]), _on_sheet(low, 2, high[2])]), edge="silver"))
-    return marks
 
 
 # ----------------------------------------------------------------------
@@ -504,7 +413,7 @@ def _comparison(what: str, candidates: Sequence[Candidate], chosen: str, verdict
 
 
 # ----------------------------------------------------------------------
-# Lens distortion: where it moves what is seen (Fig. B.2), and how well it can be undone.
+# Lens distortion: where it moves what is seen (Fig. B.2).
 
 _SAMPLE = 40_000
 """Pixels over which the displacement is averaged."""
@@ -607,7 +516,7 @@ def _along_radius(
     return Plot(x, y, marks, title, (0.0, last), (bottom - 0.06 * span, top + 0.06 * span))
 
 
-def _displacement(camera: Camera, report: DistortionReport) -> Figure:
+def _displacement(camera: Camera, report: Lens) -> Figure:
     """The map of Fig. B.2 with the region of interest, and the radial curve."""
     most, mean = number(report.max_px, "px"), number(report.mean_px, "px")
     region_most, region_mean = number(report.region_max_px, "px"), number(report.region_mean_px, "px")
@@ -616,8 +525,8 @@ def _displacement(camera: Camera, report: DistortionReport) -> Figure:
         f"picture, in the region of interest (box) by up to {region_most}, by {region_mean} on average; it "
         f"{'matters' if report.effect == 'matters' else 'is ' + report.effect}."
     )
-    if report.plane is not None:
-        read, fitted = number(report.plane.max_mm, "mm"), number(report.plane.refitted_max_mm, "mm")
+    if report.plane_max_mm is not None and report.refitted_max_mm is not None:
+        read, fitted = number(report.plane_max_mm, "mm"), number(report.refitted_max_mm, "mm")
         note += (
             f" On the plane, reading without the lens costs up to {read}, with the best map that knows no "
             f"lens {fitted}."
@@ -632,31 +541,6 @@ def _displacement(camera: Camera, report: DistortionReport) -> Figure:
     right = replace(right, marks=marks, title=title)
     panels = (_map(camera, (Shape(box, edge="red"),)), right)
     return _lens_figure(camera, "What lens distortion does to the picture", note, panels)
-
-
-def _inverse(camera: Camera, inverse: InversePolynomial) -> Figure:
-    """Distance between the polynomial's answer and the exact one, over the picture and the radius."""
-    size, count = camera.image_size_px, len(inverse.radial)
-    most, asked = number(inverse.max_error_px, "px"), number(inverse.tolerance_px, "px", 1)
-    note = (
-        f"{count} radial coefficient{' undoes' if count == 1 else 's undo'} the lens; the largest error is "
-        f"{most} where {asked} is asked for, over the {100 * inverse.covered:.0f} % of the picture that can "
-        "be undone."
-    )
-    u, v, pixels = _grid_over(size, 121)
-    error = inverse_error(camera, inverse, pixels.reshape(-1, 2))
-    field = Field(u, v, error.reshape(pixels.shape[:2]), "px", "error (px)", outlined=np.array([]), even=True)
-    radius = np.linalg.norm(pixels.reshape(-1, 2) - [camera.cx_px, camera.cy_px], axis=1)
-    finite = error[np.isfinite(error)]
-    largest = float(finite.max()) if len(finite) else 0.0
-    marks: list[Mark] = [Curve(radius, error, kind="cloud")]
-    if inverse.tolerance_px <= 4.0 * largest or largest == 0.0:
-        marks.append(Rule("y", inverse.tolerance_px, "red", "dashed"))
-        largest = max(largest, inverse.tolerance_px)
-    limits = ((0.0, float(radius.max())), (0.0, 1.15 * largest))
-    right = Plot(_RADIUS, "error (px)", marks, "Error over the radius", *limits)
-    panels = (picture(size, (field,), "Error over the picture"), right)
-    return _lens_figure(camera, "How well the firmware's polynomial undoes the lens", note, panels)
 
 
 # ----------------------------------------------------------------------

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -29,7 +29,6 @@ from calib.stages.camera.model import Board, LeftOut, View
 from calib.stages.camera.targets import (
     DICTIONARIES,
     Layout,
-    Markers,
     detect_charuco,
     dictionary_named,
     find_markers,
@@ -252,32 +251,14 @@ class _Album:
         return again.gray
 
 
-def _detection(album: _Album, what: tuple[int, tuple[int, int]]) -> Detection | None:
-    i, corners = what
-    return detect(album.gray(i), *corners)
+_Job = tuple[Callable[..., Any], int | tuple[int, ...], tuple[Any, ...]]
+"""What is asked of one picture or of several, and further arguments."""
 
 
-def _markers(album: _Album, what: tuple[int, str]) -> Markers:
-    i, dictionary = what
-    return find_markers(album.gray(i), dictionary)
-
-
-def _charuco(album: _Album, what: tuple[int, Markers, Layout]) -> Detection | None:
-    i, markers, layout = what
-    return detect_charuco(album.gray(i), markers, layout)
-
-
-def _layout(album: _Album, what: tuple[tuple[int, ...], str | None]) -> Layout | None:
-    which, dictionary = what
-    return recognise([album.gray(i) for i in which], dictionary)
-
-
-def _other_target(album: _Album, which: tuple[int, ...]) -> str | None:
-    return name_of([album.gray(i) for i in which])
-
-
-def _size(album: _Album, i: int) -> tuple[int, int] | None:
-    return find_size(album.gray(i))
+def _look(album: _Album, job: _Job) -> Any:
+    ask, which, more = job
+    seen = album.gray(which) if isinstance(which, int) else [album.gray(i) for i in which]
+    return ask(seen, *more)
 
 
 @dataclass
@@ -311,7 +292,7 @@ class _Search:
             layout = self._layout(sample, None)
             if layout is not None:
                 return self._with_markers(corners, layout, layout.dictionary)
-            other_target = next(iter(self.workers.in_order(_other_target, [tuple(sample)])))
+            other_target = self._asked(name_of, sample)
             if other_target is not None:
                 raise BadInputError(f"{_names(pictures)}: {_shows(pictures)} {other_target}; {_READS}")
             wanted = wanted or self._common_size(range(count))
@@ -343,10 +324,14 @@ class _Search:
             layout=layout,
         )
 
+    def _asked(self, ask: Callable[..., Any], which: Sequence[int], *more: Any) -> Any:
+        """What several pictures together show."""
+        return next(iter(self.workers.in_order(_look, [(ask, tuple(which), more)])))
+
     def _layout(self, sample: Sequence[int], dictionary: str | None) -> Layout | None:
         """What board of markers the sample shows; of a stated dictionary, what any of the pictures does."""
         for which in (sample, range(len(self.pictures)) if dictionary else ()):
-            layout = next(iter(self.workers.in_order(_layout, [(tuple(which), dictionary)])))
+            layout: Layout | None = self._asked(recognise, which, dictionary)
             if layout is not None:
                 return layout
         return None
@@ -365,18 +350,14 @@ class _Search:
                 f"{_names(pictures)}: {_shows(pictures)} a grid of {layout.dictionary} markers, "
                 f"{layout.columns}x{layout.rows}; {_READS}"
             )
-        markers = list(self.workers.in_order(_markers, [(i, layout.dictionary) for i in every]))
+        jobs: list[_Job] = [(find_markers, i, (layout.dictionary,)) for i in every]
+        markers = list(self.workers.in_order(_look, jobs))
         kept = [in_place(one, layout)[0].ids for one in markers]
         layout = with_rows(layout, kept) or layout
         if corners is not None:
             layout = self._as_stated(corners, layout)
         board = Board(layout.columns - 1, layout.rows - 1, self.square_m)
-        found: dict[int, Detection | None] = {}
-        work = [(i, markers[i], layout) for i in every]
-        for i, detection in zip(every, self.workers.in_order(_charuco, work), strict=True):
-            found[i] = detection
-            self.done += 1
-            self.progress(self.done, len(pictures))
+        found = self._counted(every, [(detect_charuco, i, (markers[i], layout)) for i in every])
         if not any(found.values()):
             raise BadInputError(
                 f"{_names(pictures)}: no picture shows 3x3 corners of the ChArUco board "
@@ -396,9 +377,11 @@ class _Search:
         return replace(layout, rows=stated[1] + 1)
 
     def _detect(self, which: Sequence[int], corners: tuple[int, int]) -> dict[int, Detection | None]:
+        return self._counted(which, [(detect, i, corners) for i in which])
+
+    def _counted(self, which: Sequence[int], jobs: Sequence[_Job]) -> dict[int, Detection | None]:
         found: dict[int, Detection | None] = {}
-        detections = self.workers.in_order(_detection, [(i, corners) for i in which])
-        for i, detection in zip(which, detections, strict=True):
+        for i, detection in zip(which, self.workers.in_order(_look, jobs), strict=True):
             found[i] = detection
             self.done += 1
             self.progress(self.done, len(self.pictures))
@@ -410,7 +393,7 @@ class _Search:
         Seen upright and lying, a board counts the same.
         """
         new = [i for i in which if i not in self.sizes]
-        sizes = self.workers.in_order(_size, new)
+        sizes = self.workers.in_order(_look, [(find_size, i, ()) for i in new])
         self.sizes |= zip(new, sizes, strict=True)
         counts = Counter((max(s), min(s)) for i in which if (s := self.sizes[i]) is not None)
         most = max(counts, key=lambda s: (counts[s], s[0] * s[1]), default=None)

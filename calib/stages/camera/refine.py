@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import cv2
 import numpy as np
@@ -74,8 +73,16 @@ _EDGE_SLOPE = 2.0 / np.sqrt(np.pi)
 _Float32 = npt.NDArray[np.float32]
 
 
+class _Rows:
+    """Arrays of one row for each of N corners."""
+
+    def take(self, chosen: IntArray) -> Self:
+        """Those of some corners."""
+        return type(self)(*(value[chosen] for value in vars(self).values()))
+
+
 @dataclass(frozen=True)
-class Frames:
+class Frames(_Rows):
     """What the grid says of the surroundings of each of N corners.
 
     Attributes
@@ -90,13 +97,9 @@ class Frames:
     bends: FloatArray
     bend_sigmas: FloatArray
 
-    def take(self, chosen: IntArray) -> Frames:
-        """The frames of some corners."""
-        return Frames(self.along[chosen], self.across[chosen], self.bends[chosen], self.bend_sigmas[chosen])
-
 
 @dataclass(frozen=True)
-class LocalFit:
+class LocalFit(_Rows):
     """Fitted corners.
 
     Attributes
@@ -121,19 +124,9 @@ class LocalFit:
     parameters: FloatArray
     converged: BoolArray
 
-    def take(self, chosen: IntArray) -> LocalFit:
-        """The fits of some corners."""
-        return LocalFit(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
-
-
-def _joined(fits: Sequence[LocalFit]) -> LocalFit:
-    return LocalFit(
-        *(np.concatenate([getattr(fit, name) for fit in fits]) for name in LocalFit.__dataclass_fields__)
-    )
-
 
 @dataclass(frozen=True)
-class _Windows:
+class _Windows(_Rows):
     """Pixels around N corners, (N, M) each, with weights 0 or 1; x and y from `centre` (N, 2)."""
 
     centre: FloatArray
@@ -141,9 +134,6 @@ class _Windows:
     y: _Float32
     grey: _Float32
     weight: _Float32
-
-    def take(self, chosen: IntArray) -> _Windows:
-        return _Windows(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
 
 
 def _curvatures(curves: FloatArray, degree: int) -> FloatArray:
@@ -352,7 +342,11 @@ def fit_corners(
         before = None if warm is None else warm.take(some)
         win = _windows(part.image, points[some], frames.take(some), window, reach_px)
         fits.append(_fit_part(win, points[some], frames.take(some), iterations, window, before, part.halo_px))
-    return fits[0] if len(fits) == 1 else _joined(fits)
+    if len(fits) == 1:
+        return fits[0]
+    return LocalFit(
+        *(np.concatenate(rows) for rows in zip(*(vars(fit).values() for fit in fits), strict=True))
+    )
 
 
 def _fit_part(
@@ -718,8 +712,6 @@ not converge are."""
 _LEAST_PICTURE_PX = 8
 _NOISE_SAMPLE = 10_000
 
-_RefineFloat32 = npt.NDArray[np.float32]
-
 
 @dataclass(frozen=True)
 class Refined:
@@ -781,7 +773,7 @@ class Part:
     halo_px : r of a picture that was sharpened, 0 of others.
     """
 
-    image: _RefineFloat32
+    image: _Float32
     points: FloatArray
     k: int
     origin: FloatArray
@@ -803,7 +795,7 @@ class Part:
         return np.asarray((points - 0.5 * (self.k - 1) - self.origin) / self.k)
 
 
-def _noise(image: _RefineFloat32) -> float:
+def _noise(image: _Float32) -> float:
     """Standard deviation of the noise, from the median of a mask that is blind to edges (Immerkaer 1996).
 
     A sample of the pixels is enough for the median.
@@ -870,13 +862,11 @@ def _trusted(part: Part, fit: LocalFit) -> BoolArray:
 
 def _merged(fit: LocalFit, again: LocalFit, where: IntArray, use: BoolArray | None = None) -> LocalFit:
     """`fit` with the corners `where` (indices) replaced by those of `again` that are to be used."""
-    values = {}
     use = np.ones(len(where), dtype=np.bool_) if use is None else use
-    for name in LocalFit.__dataclass_fields__:
-        merged = getattr(fit, name).copy()
-        merged[where[use]] = getattr(again, name)[use]
-        values[name] = merged
-    return LocalFit(**values)
+    merged = {name: value.copy() for name, value in vars(fit).items()}
+    for name, value in vars(again).items():
+        merged[name][where[use]] = value[use]
+    return LocalFit(**merged)
 
 
 def _closer_looked(part: Part, fit: LocalFit, grid: FloatArray) -> LocalFit:

@@ -35,11 +35,6 @@ Metres = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False, strict=Tru
 Side = Annotated[int, Field(ge=1, le=100_000, strict=True)]
 
 
-_INTRINSICS = (
-    "fx_px", "fy_px", "skew_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"
-)  # fmt: skip
-
-
 class Distortion(Section):
     """Coefficients of `calib.stages.camera.model`; absent ones are zero."""
 
@@ -124,11 +119,13 @@ class Camera(Result):
     @field_validator("covariance")
     @classmethod
     def _of_intrinsics(cls, table: CovarianceTable | None) -> CovarianceTable | None:
+        from calib.stages.camera.model import INTRINSICS
+
         order = [] if table is None else table.order
-        wrong = next((name for name in order if name not in _INTRINSICS), None)
+        wrong = next((name for name in order if name not in INTRINSICS), None)
         if wrong is not None:
             raise contradiction(
-                f"order has {quoted(wrong)}, which is no intrinsic{nearest(wrong, _INTRINSICS)}"
+                f"order has {quoted(wrong)}, which is no intrinsic{nearest(wrong, INTRINSICS)}"
             )
         return table
 

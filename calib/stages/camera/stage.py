@@ -155,7 +155,7 @@ def _solve_intrinsics(inputs: IntrinsicsInputs) -> Camera:
         termination=fit.termination,
         rejected=[str(one) for one in result.left_out if one.kind in ("copy", "view", "points")],
         simulated=inputs.simulated,
-        **judged(result.judgement.verdict),
+        **judged(result.verdict),
     ).with_evidence(CameraEvidence(result, {"detect": inputs.detect_s, **result.seconds}))
 
 
@@ -506,14 +506,6 @@ class LensInputs:
     region_px: tuple[float, float, float, float] | None
 
 
-@dataclass(frozen=True)
-class LensEvidence:
-    """What a judgement of a lens was made from."""
-
-    camera: model.Camera
-    report: lens.DistortionReport
-
-
 def _read_lens(files: Files, rig: Rig, options: LensOptions) -> LensInputs:
     import numpy as np
 
@@ -538,31 +530,11 @@ def _read_lens(files: Files, rig: Rig, options: LensOptions) -> LensInputs:
 
 def _solve_lens(inputs: LensInputs) -> Lens:
     from calib.stages.camera.lens import analyse_distortion
-    from calib.stages.camera.section import InverseLens, Lens
 
-    optics = inputs.camera.optics
-    report = analyse_distortion(
-        optics, inputs.camera.intrinsic_covariance, plane=inputs.plane, region_px=inputs.region_px
+    camera = inputs.camera
+    return analyse_distortion(
+        camera.optics, camera.intrinsic_covariance, plane=inputs.plane, region_px=inputs.region_px
     )
-    cost = report.plane
-    return Lens(
-        kind=report.kind,
-        max_px=report.max_px,
-        mean_px=report.mean_px,
-        region_px=[float(value) for value in report.region_px],
-        region_max_px=report.region_max_px,
-        region_mean_px=report.region_mean_px,
-        region_sigma_px=report.region_sigma_px,
-        monotonic=report.monotonic,
-        plane_max_mm=None if cost is None else cost.max_mm,
-        plane_mean_mm=None if cost is None else cost.mean_mm,
-        refitted_max_mm=None if cost is None else cost.refitted_max_mm,
-        refitted_mean_mm=None if cost is None else cost.refitted_mean_mm,
-        inverse=InverseLens.of(report.inverse),
-        effect=report.effect,
-        verdict="ok",
-        remarks=[report.why],
-    ).with_evidence(LensEvidence(optics, report))
 
 
 def _lens_words(result: Lens) -> list[Block]:
@@ -580,7 +552,7 @@ def _lens_words(result: Lens) -> list[Block]:
 def _lens_plots(result: Lens) -> dict[str, Figure]:
     from calib.stages.camera.plots import lens_plots
 
-    return lens_plots(result.evidence.camera, result.evidence.report)
+    return lens_plots(result)
 
 
 distortion = Stage(

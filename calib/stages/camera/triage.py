@@ -35,8 +35,8 @@ import numpy as np
 
 from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.solve.chance import tail_of_f
-from calib.stages.camera.bundle import Calibration, joint_jacobian, minimise, poses_with_camera
-from calib.stages.camera.checks import evidence, resolved, scaled_inverse
+from calib.stages.camera.bundle import Calibration, joint_jacobian, minimise, poses_with_camera, refitted
+from calib.stages.camera.checks import evidence, points_C, scaled_inverse
 from calib.stages.camera.model import LeftOut, Observations, project
 from calib.stages.camera.verdict import listed
 
@@ -224,9 +224,7 @@ def agreement(calibration: Calibration, core: BoolArray | None = None) -> Agreem
 
 def _moved_px(calibration: Calibration, shift: FloatArray) -> FloatArray:
     """Farthest that changes (N, G) of the intrinsics move one of the directions that were seen, (N,)."""
-    block, observations = calibration.block, calibration.observations
-    points = observations.target_m @ block.R_CT.transpose(0, 2, 1) + block.t_CT_m[:, None]
-    used = points[observations.present]
+    used = points_C(calibration)
     some = used[:: max(1, len(used) // 300)]
     J = joint_jacobian(calibration, some)[:, :, : shift.shape[1]]
     return np.asarray(np.linalg.norm(np.einsum("mcg,ng->nmc", J, shift), axis=2).max(axis=1))
@@ -319,7 +317,7 @@ def _settled(calibration: Calibration, robust: bool) -> Triage:
         if new.sum() < min(_LEAST_VIEWS - 1, views):
             return Triage.of_all(calibration)
         kept, far = new, new_far
-        fit = resolved(replace(whole, observations=everything.without(far)), np.flatnonzero(kept))
+        fit = refitted(replace(whole, observations=everything.without(far)), np.flatnonzero(kept))
     left = [LeftOut(everything.names[i], reasons[int(i)], "view") for i in np.flatnonzero(~kept)]
     return Triage(fit, calibration, (*left, *_of_points(distance, everything, far)), scale_px)
 

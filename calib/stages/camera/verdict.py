@@ -3,37 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.core.verdict import Finding, Severity, Verdict
-from calib.stages.camera.bundle import Calibration, Covariance, covariance, projection_sigma_px
+from calib.stages.camera.bundle import (
+    Calibration,
+    Covariance,
+    covariance,
+    projection_sigma_px,
+    refitted,
+)
 from calib.stages.camera.checks import (
     ONE_TO_ONE_REACH,
     Coverage,
-    FocalInterval,
     Lens,
     Misfit,
     Screening,
     Split,
     Start,
     TargetShape,
-    best_change,
     best_next_view,
     best_split,
     conditioned,
     coverage,
     evidence,
-    focal_interval,
     image_outline,
     inside_hull,
     lens_shape,
     misfit,
     other_starts,
     overdispersion,
-    resolved,
     screen,
     straightened,
     target_shape,
@@ -79,9 +81,8 @@ class Limits:
     heavy_remark : share of the squared residuals that the worst percent of points may hold.
     repeated_remark : error that repeats at the same points over what independent errors leave.
     decrement : standard deviations that the solver may stop short of a minimum.
-    split_ratio, change_ratio : two cameras, in any order and one after the other: the statistic over
-        what chance reaches. One camera reaches 1.2 in a hundred sets, two that differ by three
-        percent 2 to 50.
+    split_ratio : two cameras: the statistic over what chance reaches. One camera reaches 1.2 in a hundred
+        sets, two that differ by three percent 2 to 50.
     split_sigma, split_least : largest difference of an intrinsic over its standard deviation, and
         the difference of focal length or principal point, as a share of the focal length or
         width, that matters.
@@ -125,7 +126,6 @@ class Limits:
     repeated_remark: float = 1.6
     decrement: float = 2.0
     split_ratio: float = 1.5
-    change_ratio: float = 1.3
     split_sigma: float = 4.0
     split_least: float = 0.007
     split_px: float = 0.3
@@ -205,7 +205,7 @@ def of_lens(found: Lens, calibration: Calibration, reach: float) -> list[Finding
     camera = calibration.camera
     width = max(camera.image_size_px)
     out = []
-    if found.seen_slope <= 0.0:
+    if found.folds_among_points:
         text = (
             "The distortion curve folds over among the points that were seen, so that two directions share "
             "a pixel: distortion has taken the place of something else."
@@ -234,53 +234,31 @@ def of_lens(found: Lens, calibration: Calibration, reach: float) -> list[Finding
     return out
 
 
-def of_focal(sigma_share: float, interval: FocalInterval | None, limits: Limits) -> list[Finding]:
-    """Standard deviation of the focal length, inflated, and its interval from the profile."""
-    out = []
-    if not sigma_share < limits.focal_remark:
-        known = f"{100 * sigma_share:.1f} %" if sigma_share < 2 else "no better than a factor of two"
-        text = (
-            f"The focal length is known to {known} (one standard deviation, residuals that are not white "
-            f"considered; up to {100 * limits.focal_poor:.0f} is good, {100 * limits.focal_free:.0f} means "
-            "that it is free)."
-        )
-        kind: Severity = "remark" if sigma_share < limits.focal_poor else "poor"
-        out.append(Finding(kind if sigma_share < limits.focal_free else "unidentifiable", text, MORE_TILT))
-    if interval is None:
-        return out
-    if interval.lower_cost:
-        text = "Moving the focal length lowers the cost: the solver had not found the minimum."
-        out.append(Finding("unidentifiable", text, MORE_TILT))
-    elif not interval.bounded:
-        text = (
-            f"The views fit a focal length of {_range(interval)} about as well as the "
-            f"{interval.fx_px:.0f} px found: its 95 % interval has no end."
-        )
-        out.append(Finding("unidentifiable", text, MORE_TILT))
-    elif interval.half_width_share > 2 * limits.focal_poor:
-        text = (
-            f"Focal lengths from {interval.low_px:.1f} to {interval.high_px:.1f} px fit the views about "
-            f"equally well (95 % interval; {200 * limits.focal_poor:.0f} % to either side is good)."
-        )
-        free = interval.half_width_share > 2 * limits.focal_free
-        out.append(Finding("unidentifiable" if free else "poor", text, MORE_TILT))
-    return out
+def _known(sigma_share: float) -> str:
+    return f"{100 * sigma_share:.1f} %" if sigma_share < 2 else "no better than a factor of two"
 
 
-def _range(interval: FocalInterval) -> str:
-    if interval.low_px > 0.0:
-        return f"any value above {interval.low_px:.0f} px"
-    return f"any value below {interval.high_px:.0f} px" if np.isfinite(interval.high_px) else "any value"
+def of_focal(sigma_share: float, limits: Limits) -> list[Finding]:
+    """Standard deviation of the focal length, inflated."""
+    if sigma_share < limits.focal_remark:
+        return []
+    text = (
+        f"The focal length is known to {_known(sigma_share)} (one standard deviation, residuals that are not "
+        f"white considered; up to {100 * limits.focal_poor:.0f} is good, {100 * limits.focal_free:.0f} means "
+        "that it is free)."
+    )
+    kind: Severity = "remark" if sigma_share < limits.focal_poor else "poor"
+    return [Finding(kind if sigma_share < limits.focal_free else "unidentifiable", text, MORE_TILT)]
 
 
 def of_denominator(sigma_share: float, limits: Limits) -> list[Finding]:
     """What the rational model's denominator costs the focal length when it is free as well."""
     if sigma_share < limits.focal_poor:
         return []
-    known = f"{100 * sigma_share:.1f} %" if sigma_share < 2 else "no better than a factor of two"
     text = (
         f"The coefficients k4, k5 and k6 are not determined; with them free the focal length is known to "
-        f"{known} (up to {100 * limits.focal_free:.0f} does not matter, as distortion makes up for it)."
+        f"{_known(sigma_share)} (up to {100 * limits.focal_free:.0f} does not matter, as distortion makes up "
+        "for it)."
     )
     return [
         Finding("remark" if sigma_share < limits.focal_free else "poor", text, "Use a simpler lens model.")
@@ -582,9 +560,9 @@ def _of_pattern(found: Misfit, limits: Limits) -> list[Finding]:
     return out
 
 
-def of_split(found: Split | None, in_order: bool, calibration: Calibration, limits: Limits) -> list[Finding]:
+def of_split(found: Split | None, calibration: Calibration, limits: Limits) -> list[Finding]:
     """One camera, or two."""
-    if found is None or found.ratio < (limits.change_ratio if in_order else limits.split_ratio):
+    if found is None or found.ratio < limits.split_ratio:
         return []
     shift = {name: abs(found.difference[name]) / max(found.sigma[name], 1e-300) for name in found.difference}
     camera, names = calibration.camera, calibration.observations.names
@@ -618,7 +596,7 @@ def of_split(found: Split | None, in_order: bool, calibration: Calibration, limi
             f"directions by {limits.split_px:g} px, which would matter."
         )
         return [Finding("remark", text)]
-    if in_order:
+    if found.in_order:
         what = "the lens was refocused or zoomed" if {"fx_px", "fy_px"} & set(telling) else "the lens moved"
         text = (
             f"From {names[int(second[0])]} on the camera differs from the one before {sure}: {what}, or the "
@@ -699,19 +677,11 @@ def _of_flatness(found: TargetShape, limits: Limits) -> list[Finding]:
 #
 # The worst finding decides. Remarks never do. All checks run without robust loss (points it rejects are
 # left out) and with the target rigid in the shape that was found for it.
-# Above 100 views the searches (other starts, profile, two cameras) run on an even sample of 100.
+# Above 100 views the searches (other starts, two cameras) run on an even sample of 100.
 
 _SAMPLE = 100
 _LEFT_OUT_WEIGHT = 0.5
 """Points that a robust loss weighs less are left out of the checks."""
-
-
-@dataclass(frozen=True)
-class Judgement:
-    """Verdict on a calibration, and what its sentences are made from, by name, as far as it is finite."""
-
-    verdict: Verdict
-    numbers: dict[str, float] = field(default_factory=dict)
 
 
 def judge(
@@ -719,7 +689,7 @@ def judge(
     found: Covariance | None = None,
     limits: Limits | None = None,
     findings: Sequence[Finding] = (),
-) -> Judgement:
+) -> Verdict:
     """Judge a calibration by its views alone.
 
     Parameters
@@ -729,25 +699,24 @@ def judge(
     """
     limits = Limits() if limits is None else limits
     observations = calibration.observations
-    numbers: dict[str, float] = {"views": observations.views}
     unusable = of_screening(screen(observations), observations.names)
     findings = [*findings, *unusable]
     if any(one.severity == "inconsistent" for one in unusable):
         # What else is wrong follows from the views that are none.
-        return _concluded(findings, None, numbers)
+        return _concluded(findings, None)
     if not np.all(np.isfinite(calibration.block.intrinsics)) or not np.all(np.isfinite(calibration.normal)):
         findings += of_solution(calibration, observations.views, limits)
         if not any(one.severity == "unidentifiable" for one in findings):
             findings.append(Finding("unidentifiable", "The solver found no camera that fits the views."))
-        return _concluded(findings, None, numbers)
+        return _concluded(findings, None)
     fit = _plain(calibration)
     findings += of_solution(calibration, fit.observations.views, limits)
     covered = coverage(fit)
     findings += of_coverage(covered, fit, limits)
     if fit.degrees_of_freedom <= 0 or fit.observations.views < 2 or not np.all(np.isfinite(fit.normal)):
-        return _concluded(findings, None, numbers)
-    left = misfit(fit, limits.view_bad, limits.point_factor, limits.point_floor_px)
-    findings += of_misfit(left, fit, limits)
+        return _concluded(findings, None)
+    found_misfit = misfit(fit, limits.view_bad, limits.point_factor, limits.point_floor_px)
+    findings += of_misfit(found_misfit, fit, limits)
     sturdy = conditioned(fit)
     if sturdy is not fit:
         share = _focal_share(fit, covariance(fit), 1.0)
@@ -756,21 +725,13 @@ def judge(
     least = 0.0
     if calibration.basis is not None:
         least = _focal_share(calibration, covariance(calibration) if found is None else found, 1.0)
-    findings += _uncertainty(sturdy, covered, least, limits, numbers)
-    findings += _contradictions(sturdy, limits, numbers)
+    findings += _uncertainty(sturdy, covered, least, limits)
+    findings += _contradictions(sturdy, limits)
     border = _border_sigma_px(fit, sturdy)
     if len(border):
         findings += of_border(border, max(fit.camera.image_size_px), limits)
-        numbers["border_sigma_px"] = float(border.max())
-    lens = lens_shape(fit)
-    findings += of_lens(lens, fit, covered.radius_share)
-    numbers.update(
-        rms_px=fit.rms_px,
-        worst_view_rms_px=float(left.view_rms_px.max()),
-        repeated_error=left.repeated,
-        lens_least_slope=lens.image_slope,
-    )
-    return _concluded(findings, sturdy, numbers)
+    findings += of_lens(lens_shape(fit), fit, covered.radius_share)
+    return _concluded(findings, sturdy)
 
 
 def _plain(calibration: Calibration) -> Calibration:
@@ -790,14 +751,7 @@ def _plain(calibration: Calibration) -> Calibration:
         )
     block = calibration.block
     start = replace(block, R_CT=block.R_CT[kept], t_CT_m=block.t_CT_m[kept], deformation=np.zeros(0))
-    bare = replace(
-        calibration,
-        observations=observations,
-        block=start,
-        basis=None,
-        loss="none",
-    )
-    return resolved(bare, np.arange(len(kept)))
+    return refitted(calibration, observations=observations, start=start, basis=None, loss="none")
 
 
 def _uncertainty(
@@ -805,9 +759,8 @@ def _uncertainty(
     covered: Coverage,
     least_share: float,
     limits: Limits,
-    numbers: dict[str, float],
 ) -> list[Finding]:
-    """Standard deviations, profile, starts."""
+    """Standard deviations and other starts."""
     known = covariance(fit)
     inflation = overdispersion(evidence(fit))
     share = max(_focal_share(fit, known, inflation), inflation * least_share)
@@ -818,32 +771,12 @@ def _uncertainty(
         spread = inflation * projection_sigma_px(fit, known, inside)
         bounded = spread[~np.isnan(spread)]
         projection = float(np.median(bounded)) if len(bounded) else np.inf
-    findings = []
-    interval = None
+    findings = of_focal(share, limits)
     if "fx_px" in known.names:
         some = _sampled(fit)
         own = covariance(some).sigma()["fx_px"]
-        interval = focal_interval(some, own, inflation)
-        ends = other_starts(some)
-        findings += of_starts(ends, some, own, inflation, limits)
-        lowest = min((end.cost for end in ends), default=np.inf)
-        numbers["lowest_start_cost_share"] = lowest / max(some.squared_sum, 1e-300)
-        numbers["fx_low_px"], numbers["fx_high_px"] = interval.low_px, interval.high_px
-    findings += of_focal(share, interval, limits)
-    findings += of_projection(projection, width, limits)
-    numbers.update(
-        sigma_inflation=inflation,
-        focal_sigma_share=share,
-        projection_sigma_px=projection,
-        tilt_spread_deg=covered.spread_deg,
-        weaker_tilt_spread_deg=covered.weaker_spread_deg,
-        tilt_median_deg=float(np.median(covered.tilts_deg)),
-        distance_ratio=float(covered.distances_m.max() / max(covered.distances_m.min(), 1e-12)),
-        area_share=covered.area_share,
-        cells_share=covered.cells_share,
-        radius_share=covered.radius_share,
-    )
-    return findings
+        findings += of_starts(other_starts(some), some, own, inflation, limits)
+    return findings + of_projection(projection, width, limits)
 
 
 def _border_sigma_px(fit: Calibration, sturdy: Calibration) -> FloatArray:
@@ -865,7 +798,7 @@ def _focal_share(fit: Calibration, known: Covariance, inflation: float) -> float
     return inflation * float(max(shares, default=0.0))
 
 
-def _contradictions(fit: Calibration, limits: Limits, numbers: dict[str, float]) -> list[Finding]:
+def _contradictions(fit: Calibration, limits: Limits) -> list[Finding]:
     """Two cameras, a refocused lens, a board that is not what it is said to be."""
     some = _sampled(fit)
     # The lens first: a target would bend to make up for a lens that the model cannot follow.
@@ -874,42 +807,21 @@ def _contradictions(fit: Calibration, limits: Limits, numbers: dict[str, float])
     shape = target_shape(wide)
     findings += of_target(shape, wide, limits)
     if shape is not None:
-        numbers.update(
-            board_aspect=1 + shape.aspect,
-            board_aspect_sigma=shape.aspect_sigma,
-            board_bow_m=shape.bow_m,
-            focal_share_per_half_percent_bow=shape.focal_per_bow,
-        )
         wide = straightened(wide, shape.displacement_m)
-    return findings + _two_cameras(wide, limits, numbers)
+    return findings + of_split(best_split(wide), wide, limits)
 
 
 def two_cameras(calibration: Calibration) -> list[Finding]:
     """Whether views come from two cameras, or from one that was refocused on the way."""
-    return _two_cameras(widened(_sampled(conditioned(calibration))), Limits(), {})
-
-
-def _two_cameras(wide: Calibration, limits: Limits, numbers: dict[str, float]) -> list[Finding]:
-    change, split = best_change(wide), best_split(wide)
-    if change is not None:
-        numbers["change_ratio"] = change.ratio
-    if split is not None:
-        numbers["split_ratio"] = split.ratio
-    late = of_split(change, True, wide, limits)
-    mixed = of_split(split, False, wide, limits)
-    # A split in order is found by both; what matters is told, and then what chance explains less.
-    if late and mixed and change is not None and split is not None:
-        if late[0].severity != mixed[0].severity:
-            return [one for one in late + mixed if one.severity != "remark"]
-        return mixed if split.ratio > change.ratio else late
-    return late + mixed
+    wide = widened(_sampled(conditioned(calibration)))
+    return of_split(best_split(wide), wide, Limits())
 
 
 def _sampled(fit: Calibration) -> Calibration:
     views = fit.observations.views
     if views <= _SAMPLE:
         return fit
-    return resolved(fit, np.unique(np.linspace(0, views - 1, _SAMPLE).astype(np.int64)))
+    return refitted(fit, np.unique(np.linspace(0, views - 1, _SAMPLE).astype(np.int64)))
 
 
 def _inside(covered: Coverage) -> FloatArray:
@@ -920,20 +832,18 @@ def _inside(covered: Coverage) -> FloatArray:
     return grid[inside_hull(grid, covered.hull_px)]
 
 
-def _concluded(findings: list[Finding], fit: Calibration | None, numbers: dict[str, float]) -> Judgement:
+def _concluded(findings: list[Finding], fit: Calibration | None) -> Verdict:
     if any(one.advice == _IN_CORNERS for one in findings):
         # Which says the same and more.
         findings = [replace(one, advice=_IN_CORNERS) if one.advice == _CORNERS else one for one in findings]
     verdict = Verdict.of(findings)
     # Where views contradict each other, more of them settle nothing.
     if fit is not None and verdict.word != "inconsistent":
-        verdict = Verdict.of(
-            [*findings, *(Finding("remark", "", text) for text in _next_picture(fit, verdict))]
-        )
-    return Judgement(verdict, {name: float(value) for name, value in numbers.items() if np.isfinite(value)})
+        return Verdict.of([*findings, *_next_picture(fit, verdict)])
+    return verdict
 
 
-def _next_picture(fit: Calibration, verdict: Verdict) -> list[str]:
+def _next_picture(fit: Calibration, verdict: Verdict) -> list[Finding]:
     width = max(fit.camera.image_size_px)
     if not 0.2 * width < min(fit.camera.fx_px, fit.camera.fy_px) < 50 * width:
         return []
@@ -957,7 +867,8 @@ def _next_picture(fit: Calibration, verdict: Verdict) -> list[str]:
         if not verdict.ok
         else "If you take another picture, the most useful"
     )
-    return [
+    text = (
         f"{word}: the board {best.where}, {lean}, {size}; "
         f"it would lower the uncertainty by about {gain:.0f} %."
-    ]
+    )
+    return [Finding("remark", "", text)]
