@@ -110,7 +110,7 @@ def simulate_adaptive(
     rtol: float = 1e-10,
     atol: float = 1e-12,
 ) -> Motion:
-    """As `integrate.simulate`, one row per tick, by `solve_ivp` from tick to tick.
+    """As `open_loop.simulate`, one row per tick, by `solve_ivp` from tick to tick.
 
     Parameters
     ----------

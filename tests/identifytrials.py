@@ -46,7 +46,7 @@ def track(
     seed: int = 0,
     delay_s: float = 0.025,
 ) -> Track:
-    """A track from `integrate.simulate` with steps of its own: "free", "steps" or "prbs"."""
+    """A track from `open_loop.simulate` with steps of its own: "free", "steps" or "prbs"."""
     nominal = Machine()
     n = round(duration_s / TICK_S)
     plant, pump = made(nominal, {**values_of(nominal), **(values or {})}, kind != "free", TICK_S)

@@ -356,7 +356,7 @@ def simulate(
 
     Parameters
     ----------
-    start : state and commands on their way, as `integrate.rig_at_rest` gives it.
+    start : state and commands on their way, as `rig_at_rest` gives it.
     drive : commands (ticks, 2), or the controller.
     seed : of everything random; the same seed gives the same run.
     feedback : "sensors" or "truth", what a controller gets.

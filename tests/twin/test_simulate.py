@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import open_loop
 import pytest
 
 from calib.core.errors import BadInputError, UsageError
 from calib.io.columns import MEASURED, TRUE
 from calib.io.logs import log_text
-from calib.stages.actuator import simulate as integrate
 from calib.stages.actuator.parameters import Plant, Stiffness
 from calib.stages.actuator.simulate import rig_at_rest
 from calib.stages.control.laws import LoopState, Pid, PidState, saturate, step
@@ -59,7 +59,7 @@ def _playing(pwm: np.ndarray, kept: list[Seen]) -> Law:
 def test_the_states_are_those_of_the_actuators_own_simulation() -> None:
     pwm = _commands(300)
     run = _run(pwm, 300)
-    own = integrate.simulate(RIG.plant, RIG.pump, pwm, substeps=20)
+    own = open_loop.simulate(RIG.plant, RIG.pump, pwm, substeps=20)
     assert np.allclose(run.states, own.states[:-1], rtol=0.0, atol=1e-12)
     assert np.allclose(run.trajectory.nodes[-1], own.states[-1], rtol=0.0, atol=1e-12)
     assert run.seen is None
