@@ -459,7 +459,13 @@ static inline uint8_t calib_guard_try(uint8_t fault) {
         } else if (guard.state != CALIB_FAULT || guard.fault != fault) {
             return 255;
         } else {
-            uint8_t again = calib_guard_until(&guard, &state, &in, &out);
+            uint8_t again;
+            /* To want nothing clears nothing but a bad reference. */
+            if (calib_guard_once(&guard, &state, &in, &out, CALIB_MODE_OFF) ||
+                (guard.state == CALIB_FAULT) != (fault != CALIB_FAULT_REFERENCE)) {
+                return 0;
+            }
+            again = calib_guard_until(&guard, &state, &in, &out);
             if (fault < CALIB_FAULT_STAYS) {
                 return again == 255 || (fault != CALIB_FAULT_REFERENCE && again < 2 * CALIB_GUARD_QUIET_TICKS - 2) ? 0 : k;
             }
@@ -473,18 +479,17 @@ static inline uint8_t calib_guard_try(uint8_t fault) {
     return 255;
 }
 
-/* 0 when every fault stops the pumps in its time and no longer, else the number of the first that does not. */
+/* 0 when every fault stops the pumps in its tick and no longer, else the number of the first that does not. */
 static inline uint8_t calib_guard_selftest(void) {
     static const uint8_t faults[11] = {CALIB_FAULT_IMU_LOST,  CALIB_FAULT_IMU_FROZEN, CALIB_FAULT_CAMERA_LOST,
                                        CALIB_FAULT_CAMERA_FROZEN, CALIB_FAULT_APART,  CALIB_FAULT_REFERENCE,
                                        CALIB_FAULT_REACH,     CALIB_FAULT_RATE,       CALIB_FAULT_FULL_POWER,
                                        CALIB_FAULT_LONG,      CALIB_FAULT_NONE};
-    static const uint8_t ticks[11] = {12, 13, 15, 8, 33, 1, 6, 12, 1, 1, 1};
-    uint8_t i, taken;
+    static const uint8_t ticks[11] = {12, 13, 15, 7, 31, 1, 6, 8, 1, 1, 1};
+    uint8_t i;
     /* The fused estimator needs the camera in every mode. */
     for (i = 0; i < (CALIB_FUSED ? 10 : 11); i++) {
-        taken = calib_guard_try(faults[i]);
-        if (taken == 0 || taken > ticks[i]) {
+        if (calib_guard_try(faults[i]) != ticks[i]) {
             return (uint8_t)(i + 1u);
         }
     }
