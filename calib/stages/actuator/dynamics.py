@@ -14,7 +14,7 @@ P[r, i] = t . d r_Bi / dq_r, which is [[1.25, 0.25], [-0.33, 0.67]] at 0.7 rad: 
 potential and the undamped energy drifts. It is kept as `force_projection="head"`.
 
 The functions of q above are the reference. The hot path, `rates`, uses (l, phi), in which the
-equations solve in closed form. With p = l S(phi) e(phi / 2), E = D / S (see `arc`) and the
+equations solve in closed form. With p = l S(phi) e(phi / 2), E = D / S (see `kinematics`) and the
 generalised forces Q_l, Q_phi, the acceleration of p along and across the chord is
 a_r = d2(lS)/dt2 - l S dphi^2 / 4 and a_t = l S ddphi / 2 + d(lS)/dt dphi, so
 

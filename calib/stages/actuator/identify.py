@@ -214,7 +214,7 @@ class Start:
     lag2_N: float = 0.0
 
     def row(self, plant: Plant) -> FloatArray:
-        """The row (10,) of `kernel.STATE`."""
+        """The row (10,) of `simulate.STATE`."""
         row = state_row(plant, self.phi_rad, self.length_m, (self.force1_N, self.force2_N))
         turning = plant.bellows_radius_m * self.dphi_radps
         row[2:4] = self.dlength_mps + turning, self.dlength_mps - turning
@@ -348,7 +348,7 @@ _STEP = 1e-4
 _START_STEP = (1e-4, 1e-5, 1e-3, *(1e-4,) * 7)
 _START_SCALE = (0.01, 0.001, 0.1, 0.005, 0.02, 0.02, *(0.05,) * 4)
 _START_REACH = (0.3, 0.02, 30.0, 1.0, 2.0, 2.0, *(5.0,) * 4)
-"""Steps, scales and bounds by `identify_tracks.COMPONENTS`."""
+"""Steps, scales and bounds by `COMPONENTS`."""
 _FREE_SIGMA = (3.0, 0.1, 0.2, 0.2)
 _PUMPED_SIGMA = (0.5, 0.02, 0.2, 0.2, *(0.5,) * 4)
 """Priors of the same, without those of angle and length: of free swings and of logs with pumps."""

@@ -241,15 +241,14 @@ def simulate_pump(
 # standard deviations are therefore those of a sandwich, H^-1 (sum g g^T) H^-1, with the gradient g summed
 # over whole recordings, or over stretches of a second where there are fewer than four recordings.
 #
-# A parameter that can be switched off (a limit, a leak, a hose) is taken only if the data ask for it, by two
-# measures. One that they do not ask for lowers the robust cost all the same, by lambda chi^2_1 / 2, where
-# lambda = g^2 / h with the variance g^2 of its gradient and its curvature h; lambda is 1 for white noise, and
-# much more for what a model misses, which is the same all along a recording. It is measured: fitted without a
-# recording, the parameters raise the cost of what is left out by lambda each, over all recordings together.
-# So k parameters have to lower the cost by more than lambda chi^2_k(0.95) / 2. And they have to lower it by
-# `_WORTH` for each extra: the start is read off noisy values, and taking up its error, an extra that the
-# truth
-# has not lowers the cost of a simulated pump by 2 %, not by chance.
+# A parameter that can be switched off (a limit, a leak, a hose) is taken only if the data ask for it, by
+# two measures. One that they do not ask for lowers the robust cost all the same, by lambda chi^2_1 / 2,
+# where lambda = g^2 / h with the variance g^2 of its gradient and its curvature h; lambda is 1 for white
+# noise, and much more for what a model misses, which is the same all along a recording. It is measured:
+# fitted without a recording, the parameters raise the cost of what is left out by lambda each, over all
+# recordings together. So k parameters have to lower the cost by more than lambda chi^2_k(0.95) / 2. And
+# they have to lower it by `_WORTH` for each extra: the start is read off noisy values, and taking up its
+# error, an extra that the truth has not lowers the cost of a simulated pump by 2 %, not by chance.
 
 _WORTH = 0.03
 _CONFIDENCE = 0.95
@@ -760,10 +759,10 @@ def jumps(records: Sequence[PumpRecord]) -> tuple[tuple[str, float, float], ...]
 #
 #     y(u) = Y (1 - exp(-(u - u0) / S)) / (1 - exp(-(255 - u0) / S)) for u > u0, else 0
 #
-# with the value Y at PWM 255, the dead zone u0 and the scale S of the saturation; the map has reached 95 %
-# of its end at u0 + 3 S at most. Least squares with soft L1 loss on the magnitudes; standard deviations
-# from
-# the scatter of the settled values about the map, those that lie far off counted as outliers and named.
+# with the value Y at PWM 255, the dead zone u0 and the scale S of the saturation; the map has reached 95
+# % of its end at u0 + 3 S at most. Least squares with soft L1 loss on the magnitudes; standard deviations
+# from the scatter of the settled values about the map, those that lie far off counted as outliers and
+# named.
 
 _FEWEST = 5
 _FAR = 4.0

@@ -129,7 +129,7 @@ class Pump:
 
 
 class PumpCoefficients(NamedTuple):
-    """What `advance` needs, derived from a `Pump`."""
+    """What `advance_pump` needs, derived from a `Pump`."""
 
     kind: int
     lag_s: float

@@ -233,12 +233,10 @@ def _record(
 #     phi(t) = m + exp(-zeta w t) (a cos w t + b sin w t),
 #
 # linear in m, a, b for each w and zeta of a grid, which is finer about the best of a coarse one. A swing
-# that
-# is let go has hardly any rate at its beginning; one that is cut out of a longer log has.
+# that is let go has hardly any rate at its beginning; one that is cut out of a longer log has.
 #
 # Pumps connected. A log whose head is away from the straight rest at its beginning is taken to be in
-# motion,
-# slowly: rates by straight lines, forces as they would hold the head.
+# motion, slowly: rates by straight lines, forces as they would hold the head.
 
 _FIRST_S = 1.0
 _SLOW_S = 0.25
@@ -318,10 +316,9 @@ def start_in_motion(
 # From a log and a rig.yaml to what an identification takes: commands by ticks, and the head's pose.
 #
 # The pose comes from the log's own pictures, marker by marker
-# (`calib.stages.estimator.sensors.invert_marker`), from
-# a states file of `calib replay`, or, for tests of the method, from the simulated rig's true columns. The
-# errors of pictures are independent of each other, those of filtered states are not and tell less than they
-# seem to.
+# (`calib.stages.estimator.sensors.invert_marker`), from a states file of `calib replay`, or, for tests of
+# the method, from the simulated rig's true columns. The errors of pictures are independent of each other,
+# those of filtered states are not and tell less than they seem to.
 
 LONGEST_S = 120.0
 _IDENTIFYING_SHORTEST_S = 1.0

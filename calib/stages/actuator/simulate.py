@@ -29,7 +29,7 @@ from calib.stages.actuator.pump import (
 # ----------------------------------------------------------------------
 # The compiled hot path: Runge-Kutta steps of the plant with its pumps, tick by tick.
 #
-# The mathematics is that of `dynamics.rates` and `pump.advance`, inlined. Forces are known ahead of the
+# The mathematics is that of `dynamics.rates` and `pump.advance_pump`, inlined. Forces are known ahead of the
 # mechanics, at the start, middle and end of each step, so the step is of fourth order.
 #
 # A state is the row
@@ -40,7 +40,7 @@ from calib.stages.actuator.pump import (
 # vector instructions: the same numbers at a quarter of the time for each.
 #
 # The functions are cached on disk beside this file. The cache notices a change of this file only, not
-# of the functions that it inlines: touch it after editing `dynamics`, `pump` or `arc`.
+# of the functions that it inlines: touch it after editing `dynamics`, `pump` or `kinematics`.
 
 STATE = (
     "q1_m",

@@ -285,8 +285,7 @@ def feed_forward_pwm(model: Model, q_ref_m: FloatArray) -> FloatArray:
 # The pumps as a controller follows them: no sensor sees the air, but what was commanded is known.
 #
 # The state is that of `calib.stages.actuator.pump`: output of the lag, force on the bellows, and commands
-# on their
-# way. It follows from the commands alone, rounding and saturation included.
+# on their way. It follows from the commands alone, rounding and saturation included.
 #
 # Reading the lag backwards. A static force g held for the time T takes the lag from x to g + (x - g) a,
 # a = exp(-T / tau), so that
@@ -410,15 +409,14 @@ def pwm_for_force(model: Model, state: PumpEstimate, wanted_N: FloatArray, horiz
 #     I_(k+1) = I_k + h (Ki e_k + (u_k - v_k) / Tt)
 #
 # Within the limits this is (4.4) exactly, the recursion of `calib.stages.control.laws`. Beyond them the
-# integral
-# follows the limited command with the time constant Tt instead of standing still, as it does in the
-# source's clamping (4.1.1).
+# integral follows the limited command with the time constant Tt instead of standing still, as it does in
+# the source's clamping (4.1.1).
 #
 # The limits are not 0 and 255 alone. A bellows deflates slowly while the pump's lag runs ahead of it: a
 # command of 0 empties the lag within 2 s, the force needs 5 s, and before the force can be held again the
 # lag has to come all the way back. That is what makes the angle overshoot after a jump down, clamping or
 # not. Here the command is never below the one that empties the bellows with a share of the rate that the
-# orifice allows (`pump_model.least_pwm`), and the integral follows that limit like the other.
+# orifice allows (`least_pwm`), and the integral follows that limit like the other.
 
 
 @dataclass(frozen=True)

@@ -60,8 +60,7 @@ from calib.stages.control.section import ControllerCriterion
 #     dt >= tau dF / (G - F)  rising,    dt >= -dF / R(F)  falling.
 #
 # `slowed` stretches the pieces that need it, rounds the corners that this leaves by a running mean, and
-# tries
-# again a little slower until `follow` agrees.
+# tries again a little slower until `follow` agrees.
 
 TOLERANCE_M = 2.5e-4
 """Lengths that may be missing: half of what a pixel of the rig's camera shows."""
