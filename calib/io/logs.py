@@ -364,6 +364,13 @@ _FEWEST = 20
 _TURNED_RAD = 0.05
 _AGREES, _CONTRADICTS = 0.3, 1.0
 _WINDOW = 20_000
+_CHECK_GYRO = "check the gyroscope and its wiring"
+_BIN_S, _BINS = 0.5, 10
+_UPRIGHT, _LEAST_MPS2 = 0.75, 3.0
+_FELT_RAD, _ANSWERED = 0.03, 0.1
+"""2 degrees, RMS: for half a second 0.03 g, of which a gyroscope that works shows more than a tenth."""
+_STUCK_S, _SHAKEN_RAD = 1.0, 0.1
+"""A reading that stays the same for so long while the accelerometer is shaken by 0.1 g."""
 
 
 @dataclass(frozen=True)
@@ -526,6 +533,7 @@ class Watch:
     _seen: dict[str, tuple[int, float, float]] = field(default_factory=dict)
     _mirrored: Finding | None = None
     _known: bool = False
+    _unmoved: Finding | None = None
 
     def add(self, log: Log) -> None:
         """Rows that follow."""
@@ -535,8 +543,10 @@ class Watch:
             if len(finite):
                 least, most = min(least, float(finite.min())), max(most, float(finite.max()))
             self._seen[name] = count + len(finite), least, most
-        if not self._known and all(name in log.columns and name in self.names for name in IN_PLANE):
-            self._known, self._mirrored = _mirrored(log)
+        if all(name in log.columns and name in self.names for name in IN_PLANE):
+            if not self._known:
+                self._known, self._mirrored = _mirrored(log)
+            self._unmoved = self._unmoved or _unmoved(log)
 
     def has(self, *names: str) -> bool:
         """Whether each of these columns has a reading."""
@@ -553,7 +563,66 @@ class Watch:
             elif stuck and name in IMU and count >= _FEWEST and least == most:
                 text = f"{name} never changes, it is stuck at {least:.6g}"
                 out.append(Finding("inconsistent", text, "check the sensor and its wiring"))
-        return [*out, self._mirrored] if self._mirrored is not None else out
+        # A reading that never changes is said as that.
+        _, least, most = self._seen.get("gz_radps", (0, 0.0, 0.0))
+        alive = least != most
+        return [*out, *(one for one in (self._mirrored, self._unmoved if alive else None) if one is not None)]
+
+
+def _unmoved(log: Log) -> Finding | None:
+    """Where the accelerometer moves and the gyroscope is stuck, or does not answer its turns.
+
+    For the latter both angles are averaged over half a second, in which a velocity of hands adds little, and
+    compared about their straight lines over five seconds, which take a bias out. Of a sensor that tilts
+    the angle turns about all three axes (`calib.stages.imu.tracks`); far out of the plane it is none.
+    """
+    tilts = "az_mps2" in log.columns
+    if tilts and not all(name in log.columns for name in IMU):
+        return None
+    rows = log.sampled(*(IMU if tilts else IN_PLANE))
+    if len(rows) < 2 * _FEWEST:
+        return None
+    t_s = np.maximum.accumulate(log.t_s[rows])
+    gz, ax, ay = (log.columns[name][rows] for name in IN_PLANE)
+    felt, rate, across = np.unwrap(np.arctan2(ay, ax)), -gz, ax * ax + ay * ay
+    upright = across > _LEAST_MPS2**2
+    if tilts:
+        gx, gy, az = (log.columns[name][rows] for name in ("gx_radps", "gy_radps", "az_mps2"))
+        rate = rate + az * (gx * ax + gy * ay) / np.maximum(across, 1e-9)
+        upright &= across > _UPRIGHT * (across + az * az)
+    turned = np.cumsum(rate * np.diff(t_s, prepend=t_s[0]))
+    edges = np.flatnonzero(np.diff(gz, prepend=np.nan, append=np.nan) != 0.0)
+    for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+        lasting = b - a >= _FEWEST and t_s[b - 1] - t_s[a] >= _STUCK_S and upright[a:b].mean() > 0.9
+        if lasting and float(felt[a:b].std()) > _SHAKEN_RAD:
+            return Finding(
+                "inconsistent",
+                f"gz_radps is stuck at {gz[a]:.6g} from {t_s[a]:.1f} to {t_s[b - 1]:.1f} s, where the "
+                "accelerometer moves",
+                _CHECK_GYRO,
+            )
+    starts = np.flatnonzero(np.diff(np.floor((t_s - t_s[0]) / _BIN_S), prepend=-1.0))
+    size = np.diff(np.append(starts, len(t_s)))
+    if len(starts) < _BINS:
+        return None
+    bins = np.stack([np.add.reduceat(x, starts) / size for x in (t_s, felt, turned, upright)])
+    windows = np.lib.stride_tricks.sliding_window_view(bins, _BINS, axis=1).transpose(1, 0, 2)
+    t, angles, flat = windows[:, 0], windows[:, 1:3], windows[:, 3].min(axis=1) > 0.9
+    flat &= t[:, -1] - t[:, 0] < 2.0 * _BINS * _BIN_S
+    k = t - t.mean(axis=1, keepdims=True)
+    angles = angles - angles.mean(axis=2, keepdims=True)
+    slope = np.einsum("wt,wat->wa", k, angles) / np.maximum((k * k).sum(axis=1), 1e-12)[:, None]
+    felt_rad, turned_rad = (angles - slope[:, :, None] * k[:, None, :]).std(axis=2).T
+    dead = np.flatnonzero(flat & (felt_rad > _FELT_RAD) & (turned_rad < _ANSWERED * felt_rad))
+    if len(dead) == 0:
+        return None
+    most = dead[np.argmax(felt_rad[dead])]
+    return Finding(
+        "inconsistent",
+        f"gz_radps does not turn from {t_s[starts[dead[0]]]:.1f} s on where the accelerometer's angle "
+        f"turns, by {math.degrees(felt_rad[most]):.2g} deg at about {t[most].mean():.0f} s",
+        _CHECK_GYRO,
+    )
 
 
 def _mirrored(log: Log) -> tuple[bool, Finding | None]:

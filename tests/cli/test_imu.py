@@ -321,6 +321,25 @@ def test_figures_are_drawn_in_imu_drift(calib: Run, logs_imu_drift: dict[str, Pa
     assert found == ["drift_angles.png", "drift_motion_3.png", "drift_slopes.png"]
 
 
+def test_a_gyroscope_that_sticks_is_no_ok(
+    calib: Run, logs_imu_drift: dict[str, Path], tmp_path: Path
+) -> None:
+    head, *rows = logs_imu_drift["moves"].read_text().splitlines()
+    gz = head.split(",").index("gz_radps")
+    for row, line in enumerate(rows):
+        cells = line.split(",")
+        if cells[gz] and float(cells[0]) > 8.0:
+            cells[gz] = "0.0125"
+            rows[row] = ",".join(cells)
+    log = tmp_path / "log.csv"
+    log.write_text("\n".join([head, *rows]) + "\n")
+    ended = calib("imu", "drift", log, "--no-peers", "--rig", tmp_path / "rig.yaml")
+    assert ended.code == 1
+    assert (
+        "log.csv: gz_radps is stuck at 0.0125 from 8.0 to 20.0 s, where the accelerometer moves" in ended.out
+    )
+
+
 def test_repeats_and_gaps_are_handled_and_reported(calib: Run, tmp_path: Path) -> None:
     t = 0.01 * np.arange(3000)
     t[2000:] += 3600.0

@@ -65,6 +65,40 @@ def test_a_watch_sees_what_is_stuck_or_absent(changes: dict[str, Any], severity:
     assert [(one.severity, one.text) for one in found] == ([(severity, words)] if words else [])
 
 
+def test_a_gyroscope_that_does_not_answer_is_named() -> None:
+    log = _log()
+    gz, t = log.columns["gz_radps"], log.t_s
+    noise = 0.003 * np.random.default_rng(1).normal(size=3000)
+    for spoilt, words in (
+        (np.where(t > 20.0, gz[2000], gz), "gz_radps is stuck at"),
+        (noise, "gz_radps does not turn from 0.0 s on"),
+        (np.where(t > 20.0, noise, gz), "gz_radps does not turn from 20.0 s on"),
+        (0.05 * gz, "gz_radps does not turn from 0.0 s on"),
+    ):
+        with pytest.raises(BadInputError, match=words):
+            _log(gz_radps=spoilt).signals(*IN_PLANE).refuse_mirrored()
+    # At rest a coarse gyroscope says the same for long, and on a table that shakes it says nothing.
+    rest = {"ax_mps2": G, "ay_mps2": 0.02 * np.random.default_rng(2).normal(size=3000)}
+    for still in (np.where(t > 20.0, 0.01, 0.0), noise):
+        assert _log(gz_radps=still, **rest).signals(*IN_PLANE).findings == ()
+    shaken = _log(gz_radps=noise, ax_mps2=G, ay_mps2=5.0 * np.sin(40.0 * t))
+    assert shaken.signals(*IN_PLANE).findings == ()
+    assert log.signals(*IN_PLANE).findings == ()
+
+
+def test_a_tilted_sensor_turns_without_gz() -> None:
+    """About x, with a third of gravity along z: the angle in the plane turns and gz does not."""
+    t, noise = 0.01 * np.arange(3000), 0.003 * np.random.default_rng(1).normal(size=(3, 3000))
+    turn, rate = 0.8 * np.sin(1.3 * t), 1.04 * np.cos(1.3 * t)
+    log = _log(
+        gx_radps=rate + noise[0], gy_radps=noise[1], gz_radps=noise[2],
+        ax_mps2=0.94 * G, ay_mps2=0.34 * G * np.sin(turn), az_mps2=0.34 * G * np.cos(turn),
+    )  # fmt: skip
+    assert log.signals(*IN_PLANE, "az_mps2").findings == ()
+    dead = Log(log.source, log.t_s, log.columns | {"gx_radps": noise[0]}, log.lines)
+    assert len(dead.signals(*IN_PLANE, "az_mps2").findings) == 1
+
+
 def test_axes_that_are_swapped_or_mirrored() -> None:
     right = _log()
     ax, ay, gz = (right.columns[name] for name in ("ax_mps2", "ay_mps2", "gz_radps"))
