@@ -257,3 +257,8 @@ def identity(section: BaseModel) -> str:
 def finite_or_none(value: float) -> float | None:
     """A standard deviation for the file: null where the data do not bound it."""
     return float(value) if math.isfinite(value) else None
+
+
+def degrees_or_none(value_rad: float) -> float | None:
+    """The same of an angle, in degrees."""
+    return finite_or_none(math.degrees(value_rad))

@@ -25,6 +25,7 @@ from calib.stages.imu.intrinsics import (
     ANGLES,
     GYRO_ANGLES,
     Accelerometer,
+    IntrinsicsInputs,
     Turns,
     _residual_and_jacobian,
     corrected,
@@ -35,12 +36,12 @@ from calib.stages.imu.intrinsics import (
     misfit,
     misfit_covariance,
     protocol,
+    solve_intrinsics,
     tangents,
     turn_directions,
 )
 from calib.stages.imu.sampling import Rest, find_rests, quiet_level, spread
 from calib.stages.imu.section import ImuIntrinsics
-from calib.stages.imu.stage import IntrinsicsInputs, solve_intrinsics
 
 SENSOR = Sensor()
 
@@ -402,7 +403,7 @@ def _turned(
     rates: np.ndarray, before: np.ndarray, starts: list[int], stops: list[int], h: float
 ) -> np.ndarray:
     out = np.empty((len(starts), 3))
-    turn_directions(rates, np.eye(3), np.array(starts), np.array(stops), before, h, out)
+    turn_directions(rates, np.array(starts), np.array(stops), before, h, out)
     return out
 
 

@@ -24,8 +24,7 @@ from calib.stages.imu.allan import (
 from calib.stages.imu.formats import from_kalibr, to_kalibr
 from calib.stages.imu.sampling import AXES, Readings, regular_parts, rest_parts
 from calib.stages.imu.section import Imu as ImuSection
-from calib.stages.imu.stage import solve_static
-from calib.stages.imu.static import analyse_static, judge
+from calib.stages.imu.static import analyse_static, judge, solve_static
 from calib.twin.sensors import HeadMotion, Imu, draw_imu_noise, measure
 
 IMU = Imu(gyro_scale=(0.0, 0.0, 0.0), accel_scale=(0.0, 0.0, 0.0), mount_angle_rad=0.0)
@@ -260,7 +259,7 @@ def test_the_covariance_of_variances_is_met(white: float, walk: float) -> None:
     theta = np.array([white**2, 0.0, walk**2])
     expected = np.einsum("ijpq,p,q->ij", covariance_forms(m, [n]), theta, theta)
     size = np.sqrt(np.diag(expected))
-    assert np.allclose(np.mean(found, axis=0), design(m) @ theta, rtol=0.03)
+    assert np.allclose(np.mean(found, axis=0), design(m.astype(float)) @ theta, rtol=0.03)
     assert np.allclose(
         np.cov(np.array(found).T) / np.outer(size, size), expected / np.outer(size, size), atol=0.1
     )

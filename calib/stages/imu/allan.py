@@ -14,13 +14,10 @@ from scipy.special import chdtrc, chdtri
 from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.core.errors import BadInputError
 
-# ----------------------------------------------------------------------
-# Compiled sums over long logs.
 
-
-# Additions may be taken in any order, so that several are done at once; nothing else is loosened.
+# Additions may be taken in any order, so that several are done at once.
 @njit(cache=True, nogil=True, fastmath={"reassoc", "nsz", "contract"})
-def sum_of_squared_differences(x: FloatArray, m: int) -> float:
+def _squares(x: FloatArray, m: int) -> float:
     """Sum of (x_(k+2m) - 2 x_(k+m) + x_k)^2 over x (n,), zero where n <= 2 m."""
     total = 0.0
     for k in range(len(x) - 2 * m):
@@ -67,14 +64,6 @@ _TAIL = 1.0
 """How far the sum goes beyond where white noise and random walk end, in the longer averaging time."""
 
 
-@dataclass(frozen=True)
-class _Lags:
-    """R_12 of the kinds (3, d) at lags `d` of averaging times scaled by `scale`."""
-
-    d: FloatArray
-    R: FloatArray
-
-
 def octaves(n: int, share: float = 0.25) -> IntArray:
     """Averaging factors 1, 2, 4, ... up to `share` of n samples."""
     count = math.floor(math.log2(max(share * n, 1.0))) + 1
@@ -116,15 +105,14 @@ def allan_variance(parts: Sequence[FloatArray], m: IntArray) -> FloatArray:
         np.cumsum(part - part.mean(), out=x[1:])
         for j, factor in enumerate(m.tolist()):
             if 2 * factor <= len(part):
-                total[j] += float(sum_of_squared_differences(x, factor))
+                total[j] += float(_squares(x, factor))
                 count[j] += len(x) - 2 * factor
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(total / (2.0 * count * m.astype(np.float64) ** 2))
 
 
-def design(m: IntArray) -> FloatArray:
-    """avar (len(m), 3) per unit of (N^2, B^2, K^2), all in periods of one sample."""
-    tau = m.astype(np.float64)
+def design(tau: FloatArray) -> FloatArray:
+    """avar (len(tau), 3) per unit of (N^2, B^2, K^2)."""
     return np.stack([1.0 / tau, np.full_like(tau, 2.0 * math.log(2.0) / math.pi), tau / 3.0], axis=1)
 
 
@@ -136,22 +124,22 @@ def _generalised(t: FloatArray) -> FloatArray:
 
 
 @lru_cache(maxsize=256)
-def _lags(m1: float, m2: float) -> _Lags:
-    """R_12 at whole lags; m1 <= m2."""
+def _lags(m1: float, m2: float) -> tuple[FloatArray, FloatArray]:
+    """Whole lags and R_12 (3, lags) of the kinds there; m1 <= m2, in steps of the sum over lags."""
     reach = _TAIL * m2
     d = np.arange(math.floor(-2.0 * m2 - reach), math.ceil(2.0 * m1 + reach) + 1, dtype=np.float64)
     R = np.zeros((3, len(d)))
     for a, ca in enumerate((1.0, -2.0, 1.0)):
         for b, cb in enumerate((1.0, -2.0, 1.0)):
             R += ca * cb * _generalised(d + b * m2 - a * m1)
-    return _Lags(d, R)
+    return d, R
 
 
 def _form(m1: int, m2: int, lengths: Sequence[int]) -> FloatArray:
     """Coefficients (3, 3) of the covariance of the variances at m1 <= m2."""
     scale = max(m1 / _FINE, 1.0)
-    lags = _lags(m1 / scale, m2 / scale)
-    d = lags.d * scale
+    d, R = _lags(m1 / scale, m2 / scale)
+    d = d * scale
     pairs, all1, all2 = np.zeros(len(d)), 0, 0
     for n in lengths:
         M1, M2 = n + 1 - 2 * m1, n + 1 - 2 * m2
@@ -161,7 +149,7 @@ def _form(m1: int, m2: int, lengths: Sequence[int]) -> FloatArray:
     if not (all1 and all2):
         return np.full((3, 3), np.nan)
     # R scales with the averaging times to the power 1, 2 and 3.
-    R = lags.R * (scale ** np.arange(1.0, 4.0))[:, None]
+    R = R * (scale ** np.arange(1.0, 4.0))[:, None]
     return np.asarray(scale * (R * pairs) @ R.T / (2.0 * all1 * all2 * float(m1) ** 2 * float(m2) ** 2))
 
 
@@ -189,7 +177,7 @@ def degrees_of_freedom(m: IntArray, lengths: Sequence[int], theta: FloatArray) -
     """Equivalent degrees of freedom (len(m),) under (N^2, B^2, K^2), at least one."""
     variance = np.einsum("jpq,p,q->j", covariance_forms(m, lengths, diagonal=True), theta, theta)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(np.maximum(2.0 * (design(m) @ theta) ** 2 / variance, 1.0))
+        return np.asarray(np.maximum(2.0 * (design(m.astype(np.float64)) @ theta) ** 2 / variance, 1.0))
 
 
 def bounds(
@@ -285,10 +273,7 @@ class _Fit:
 
 def model_variance(theta: FloatArray, tau_s: FloatArray) -> FloatArray:
     """Contributions (j, 3) of N, B and K to avar(tau)."""
-    return np.asarray(
-        np.stack([1.0 / tau_s, np.full_like(tau_s, 2.0 * math.log(2.0) / math.pi), tau_s / 3.0], axis=1)
-        * theta
-    )
+    return design(tau_s) * theta
 
 
 def _least_squares(
@@ -337,7 +322,7 @@ def _chance(variance: FloatArray, D: FloatArray, C: FloatArray, theta: FloatArra
 
 def _select(variance: FloatArray, m: IntArray, G: FloatArray) -> _Fit:
     """The fit with the terms that the variances support."""
-    D = design(m)
+    D = design(m.astype(np.float64))
     active = np.array([True, False, False])
     theta = np.array([float(variance[0] * m[0]), 0.0, 0.0])
     theta, covariance, C = _settle(variance, D, G, active, theta)
@@ -413,7 +398,7 @@ def analyse(parts: Sequence[FloatArray], period_s: float) -> Allan:
         if fit.chance > _WORST_CHANCE:
             break
         first, fit = skipped, _select(variance[skipped:], m_fit[skipped:], G[skipped:, skipped:])
-    used = (variance[first:], design(m_fit[first:]), G[first:, first:])
+    used = (variance[first:], design(m_fit[first:].astype(np.float64)), G[first:, first:])
     root = math.sqrt(period_s)
     units = (root, 1.0, 1.0 / root)
     terms = [_term(fit, k, *used, units[k]) for k in range(len(KINDS))]

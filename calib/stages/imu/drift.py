@@ -15,10 +15,23 @@ from scipy.special import stdtrit
 
 from calib.core.arrays import BoolArray, FloatArray
 from calib.core.errors import BadInputError
+from calib.core.result import degrees_or_none, finite_or_none, judged
+from calib.core.verdict import Verdict
 from calib.stages.imu.allan import allan_variance
-from calib.stages.imu.mahony import wrapped
-from calib.stages.imu.sampling import Readings, Sampling, regular_parts, rest_parts
+from calib.stages.imu.mahony import Mahony, wrapped
+from calib.stages.imu.sampling import (
+    Readings,
+    Sampling,
+    regular_parts,
+    rest_parts,
+    runs,
+    sampled,
+    sampling_findings,
+    sensor_findings,
+)
+from calib.stages.imu.section import Drift, DriftGains, DriftMethod, DriftOfLog, DriftSlopes
 from calib.stages.imu.tracks import Track, Tuned, mean_angle, on_grid, tracks_of
+from calib.stages.imu.tuning import parameters_of
 
 # ----------------------------------------------------------------------
 # What is said of the error of an angle: its slope with an interval, its lag, its Allan deviation.
@@ -286,12 +299,6 @@ class Spread:
     logs: int
 
 
-def _runs(flags: BoolArray) -> list[tuple[int, int]]:
-    """First and behind the last of each run of set flags."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int64), [0]])))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
-
-
 def _settled(start: int, stop: int, period_s: float) -> slice:
     skip = min(round(_SETTLE_S / period_s), int(_SETTLE_SHARE * (stop - start)))
     return slice(start + skip, stop)
@@ -356,7 +363,7 @@ def _measure(
             pieces = [
                 (e[a:b], t[a:b])
                 for e, t in zip(track.phi_rad, truth, strict=True)
-                for a, b in _runs(np.isfinite(e) & np.isfinite(t))
+                for a, b in runs(np.isfinite(e) & np.isfinite(t))
             ]
             lag = lag_s([e for e, _ in pieces], [t for _, t in pieces], period_s)
     return Measures(
@@ -413,7 +420,7 @@ def analyse_drift(
         stretches = [
             (k, _settled(a, b, period_s))
             for k, flags in enumerate(moving)
-            for a, b in _runs(~flags)
+            for a, b in runs(~flags)
             if (b - a) * period_s >= _SHORTEST_S
         ]
     tracks, skipped = tracks_of(log, parts, period_s, tuned, peers, told)
@@ -445,3 +452,87 @@ def spread_of(logs: Sequence[LogDrift]) -> tuple[Spread, ...]:
         spread = float(known.std(ddof=1)) if len(known) > 1 else math.nan
         out.append(Spread(name, float(known.mean()) if len(known) else math.nan, spread, len(known)))
     return tuple(out)
+
+
+# ----------------------------------------------------------------------
+# The section.
+
+_LEAST_UPRIGHT = 0.1
+_ABOUT = {
+    "truth": "error against true_phi_rad, without the first seconds",
+    "rest": "angle in the stretches at rest, without their first seconds; the offset is against the "
+    "accelerometer's mean angle",
+    "nothing": "the log never rests and has no true_phi_rad, so that it shows no drift",
+}
+
+
+@dataclass(frozen=True)
+class DriftInputs:
+    """Logs, their hashes, the rig's gains, and whether filters of others run."""
+
+    logs: Sequence[Readings]
+    hashes: dict[str, str]
+    tuned: Tuned | None
+    peers: bool
+    narrate: Callable[[str], None]
+
+
+def solve_drift(inputs: DriftInputs) -> Drift:
+    """Every way of getting the angle on every log, and how each drifts."""
+    tuned = inputs.tuned
+    logs = [analyse_drift(log, tuned, inputs.peers, inputs.narrate) for log in inputs.logs]
+    return Drift(
+        note=NOT_A_RANKING,
+        logs=[_drift_log(log) for log in logs],
+        methods={
+            one.name: DriftSlopes(
+                mean_degps=degrees_or_none(one.mean_radps),
+                spread_degps=degrees_or_none(one.spread_radps),
+                logs=one.logs,
+            )
+            for one in spread_of(logs)
+        },
+        provenance={"inputs": inputs.hashes},
+        tuned=None
+        if tuned is None
+        else DriftGains(
+            filter="mahony" if isinstance(tuned.gains, Mahony) else "levelling",
+            **parameters_of(tuned.gains),
+            rate_of_angle="up vector" if tuned.up_vector else "-gz",
+        ),
+        **judged(Verdict.of(sensor_findings(inputs.logs))),
+    ).with_evidence(logs)
+
+
+def _drift_log(log: LogDrift) -> DriftOfLog:
+    remarks = [finding.text for finding in sampling_findings(log.sampling, source=log.source)]
+    if log.upright < _LEAST_UPRIGHT:
+        tilt = math.degrees(math.acos(math.sqrt(log.upright)))
+        remarks.append(
+            f"{log.source}: gravity is {tilt:.0f} degrees out of the sensor's x-y plane, where the angle "
+            "atan2(ay, ax) is hardly defined; noise and drift of all methods are large for that reason"
+        )
+    return DriftOfLog(
+        name=log.source,
+        **sampled(log.sampling),
+        against=log.against,
+        about=_ABOUT[log.against],
+        judged_s=log.judged_s,
+        moving_s=log.moving_s,
+        methods={m.name: _method(m) for m in log.measures},
+        skipped=list(log.skipped),
+        remarks=remarks,
+    )
+
+
+def _method(m: Measures) -> DriftMethod:
+    return DriftMethod(
+        offset_deg=degrees_or_none(m.offset_rad),
+        slope_degps=degrees_or_none(m.slope.value),
+        sigma_degps=degrees_or_none(m.slope.sigma),
+        interval_degps=[degrees_or_none(m.slope.low), degrees_or_none(m.slope.high)],
+        allan_1s_deg=degrees_or_none(m.allan_1s_rad),
+        allan_100s_deg=degrees_or_none(m.allan_100s_rad),
+        rmse_deg=degrees_or_none(m.rmse_rad),
+        lag_ms=finite_or_none(1e3 * m.lag_s),
+    )

@@ -14,6 +14,7 @@ from scipy.special import fdtrc
 
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
+from calib.core.result import finite_or_none, judged
 from calib.core.verdict import Finding, Verdict
 from calib.solve.clock import Part
 from calib.stages.imu.sampling import (
@@ -29,79 +30,65 @@ from calib.stages.imu.sampling import (
     sampling_findings,
     spread,
 )
+from calib.stages.imu.section import (
+    AccelIntrinsics,
+    GyroIntrinsics,
+    GyroSigma,
+    ImuIntrinsics,
+    IntrinsicsSigma,
+)
 
 # ----------------------------------------------------------------------
-# Compiled integration of rates of rotation over many turns.
+# A direction fixed in the world, seen by a sensor that turns at w: dv/dt = v x w, by Runge and Kutta.
 
 
 @njit(cache=True, nogil=True)
-def _rate(q: FloatArray, w: FloatArray, out: FloatArray) -> None:
-    """dq/dt = q * (0, w) / 2."""
-    out[0] = 0.5 * (-q[1] * w[0] - q[2] * w[1] - q[3] * w[2])
-    out[1] = 0.5 * (q[0] * w[0] + q[2] * w[2] - q[3] * w[1])
-    out[2] = 0.5 * (q[0] * w[1] + q[3] * w[0] - q[1] * w[2])
-    out[3] = 0.5 * (q[0] * w[2] + q[1] * w[1] - q[2] * w[0])
+def _cross(v: FloatArray, w: FloatArray, out: FloatArray) -> None:
+    out[0] = v[1] * w[2] - v[2] * w[1]
+    out[1] = v[2] * w[0] - v[0] * w[2]
+    out[2] = v[0] * w[1] - v[1] * w[0]
 
 
 @njit(cache=True, nogil=True)
 def turn_directions(
-    rates: FloatArray,
-    M: FloatArray,
-    starts: IntArray,
-    stops: IntArray,
-    before: FloatArray,
-    period_s: float,
-    out: FloatArray,
+    rates: FloatArray, starts: IntArray, stops: IntArray, before: FloatArray, period_s: float, out: FloatArray
 ) -> None:
     """Directions that are fixed in the world, as the sensor sees them after each turn.
 
     Parameters
     ----------
-    rates : (n, 3); the rate of rotation is M rate, linear between readings.
+    rates : (n, 3) of rotation, linear between readings.
     starts, stops : (k,) first and last reading of each turn.
     before : (k, 3) vectors before the turns.
     out : (k, 3) vectors after them.
     """
-    w0, wm, w1 = np.zeros(3), np.zeros(3), np.zeros(3)
-    q, trial = np.zeros(4), np.zeros(4)
-    k1, k2, k3, k4 = np.zeros(4), np.zeros(4), np.zeros(4), np.zeros(4)
-    h = period_s
+    w, v, h = np.zeros(3), np.zeros(3), period_s
+    k1, k2, k3, k4 = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
     for turn in range(len(starts)):
-        q[0], q[1], q[2], q[3] = 1.0, 0.0, 0.0, 0.0
+        u = out[turn]
+        length = 0.0
         for i in range(3):
-            w1[i] = 0.0
-            for j in range(3):
-                w1[i] += M[i, j] * rates[starts[turn], j]
+            u[i] = before[turn, i]
+            length += u[i] * u[i]
         for row in range(starts[turn], stops[turn]):
             for i in range(3):
-                w0[i] = w1[i]
-                w1[i] = 0.0
-                for j in range(3):
-                    w1[i] += M[i, j] * rates[row + 1, j]
-                wm[i] = 0.5 * (w0[i] + w1[i])
-            _rate(q, w0, k1)
-            for i in range(4):
-                trial[i] = q[i] + 0.5 * h * k1[i]
-            _rate(trial, wm, k2)
-            for i in range(4):
-                trial[i] = q[i] + 0.5 * h * k2[i]
-            _rate(trial, wm, k3)
-            for i in range(4):
-                trial[i] = q[i] + h * k3[i]
-            _rate(trial, w1, k4)
+                w[i] = 0.5 * (rates[row, i] + rates[row + 1, i])
+            _cross(u, rates[row], k1)
+            for i in range(3):
+                v[i] = u[i] + 0.5 * h * k1[i]
+            _cross(v, w, k2)
+            for i in range(3):
+                v[i] = u[i] + 0.5 * h * k2[i]
+            _cross(v, w, k3)
+            for i in range(3):
+                v[i] = u[i] + h * k3[i]
+            _cross(v, rates[row + 1], k4)
             norm = 0.0
-            for i in range(4):
-                q[i] += h / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i])
-                norm += q[i] * q[i]
-            norm = norm**0.5
-            for i in range(4):
-                q[i] /= norm
-        # v_after = R(q)^T v_before, q turning vectors of the sensor after into those before.
-        s, x, y, z = q[0], q[1], q[2], q[3]
-        a, b, c = before[turn, 0], before[turn, 1], before[turn, 2]
-        out[turn, 0] = (1 - 2 * (y * y + z * z)) * a + 2 * (x * y + s * z) * b + 2 * (x * z - s * y) * c
-        out[turn, 1] = 2 * (x * y - s * z) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z + s * x) * c
-        out[turn, 2] = 2 * (x * z + s * y) * a + 2 * (y * z - s * x) * b + (1 - 2 * (x * x + y * y)) * c
+            for i in range(3):
+                u[i] += h / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i])
+                norm += u[i] * u[i]
+            for i in range(3):
+                u[i] *= (length / norm) ** 0.5 if norm > 0.0 else 1.0
 
 
 # ----------------------------------------------------------------------
@@ -278,17 +265,14 @@ def _deviations(p: FloatArray, x: FloatArray, variance: FloatArray) -> FloatArra
 
 def _tau(r: FloatArray, deviation: FloatArray, dof: int) -> float:
     """tau by which sum r^2 / (deviation^2 + tau^2) becomes dof; 0 where it is less without it."""
+    from scipy.optimize import brentq
 
     def excess(tau2: float) -> float:
         return float((r**2 / (deviation**2 + tau2)).sum()) - dof
 
     if dof <= 0 or excess(0.0) <= 0.0:
         return 0.0
-    low, high = 0.0, float((r**2).sum()) / dof
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if excess(middle) > 0.0 else (low, middle)
-    return math.sqrt(0.5 * (low + high))
+    return math.sqrt(float(brentq(excess, 0.0, float((r**2).sum()) / dof)))
 
 
 def _solve(p: FloatArray, free: IntArray, x: FloatArray, g: float, deviation: FloatArray) -> FloatArray:
@@ -476,15 +460,8 @@ def carried(turns: Turns, rates: FloatArray, M: FloatArray, vectors: FloatArray)
     `rates` (n, 3) are readings without their bias, M (3, 3) makes them rad/s.
     """
     out = np.empty((len(turns.first), 3))
-    turn_directions(
-        rates,
-        np.ascontiguousarray(M),
-        turns.first,
-        turns.last,
-        np.ascontiguousarray(vectors),
-        turns.period_s,
-        out,
-    )
+    w = np.ascontiguousarray(rates @ M.T)
+    turn_directions(w, turns.first, turns.last, np.ascontiguousarray(vectors), turns.period_s, out)
     return out
 
 
@@ -1302,3 +1279,105 @@ def _of_sensors(result: Intrinsics) -> Iterator[Finding]:
 def judge_intrinsics(result: Intrinsics) -> Verdict:
     """Verdict of a calibration of an IMU."""
     return Verdict.of([*_of_log(result), *_of_plane(result), *_of_sensors(result), *result.log.findings])
+
+
+# ----------------------------------------------------------------------
+# The section.
+
+
+@dataclass(frozen=True)
+class IntrinsicsInputs:
+    """A log of rests in many poses, gravity there, and whether x, y and gz alone are calibrated."""
+
+    log: Readings
+    gravity_mps2: float = 9.80665
+    planar: bool = False
+
+
+def solve_intrinsics(inputs: IntrinsicsInputs) -> ImuIntrinsics:
+    """Calibrate, judge, and assemble the section; what the log does not tell is null."""
+    result = find_intrinsics(inputs.log, inputs.gravity_mps2, inputs.planar)
+    return ImuIntrinsics(
+        gravity_mps2=result.gravity_mps2,
+        planar=result.planar,
+        rate_hz=result.sampling.rate_hz,
+        rests=len(result.rests),
+        poses=result.poses,
+        rest_s=sum(rest.duration_s for rest in result.rests),
+        degrees_of_freedom=None if result.accel is None else result.accel.dof,
+        initial_rest_s=result.quiet.initial_s,
+        threshold=result.multiple,
+        thresholds={f"{trial.multiple:g}": finite_or_none(trial.rms_mps2) for trial in result.trials},
+        accel=_accelerometer(result),
+        gyro=None if result.gyro is None else _gyroscope(result, result.gyro),
+        **judged(judge_intrinsics(result)),
+    ).with_evidence(result)
+
+
+def _three(values: FloatArray) -> list[float | None]:
+    """x, y, z with null for what is not finite or not there."""
+    out = [finite_or_none(value) for value in values.tolist()]
+    return out + [None] * (3 - len(out))
+
+
+def _named(names: Sequence[str], values: FloatArray) -> dict[str, float | None]:
+    pairs = zip(names, values.tolist(), strict=True)
+    return {name: finite_or_none(value) for name, value in pairs if not math.isnan(value)}
+
+
+def _padded(matrix: FloatArray) -> list[list[float]]:
+    """A matrix (r, c) as rows of three, zero where there is nothing."""
+    out = np.zeros((3, 3))
+    out[: matrix.shape[0], : matrix.shape[1]] = matrix
+    rows: list[list[float]] = out.tolist()
+    return rows
+
+
+def _accelerometer(result: Intrinsics) -> AccelIntrinsics:
+    unit: Literal["m/s2", "counts"] = "counts" if "a" in result.log.counts else "m/s2"
+    accel = result.accel
+    if accel is None or accel.span < LEAST_SPAN:
+        unknown = _three(np.full(3, math.nan))
+        sigma = IntrinsicsSigma(bias=unknown, scale=unknown)
+        return AccelIntrinsics(unit=unit, bias=unknown, scale=unknown, sigma=sigma)
+    d = len(accel.bias)
+    names = ANGLES[d] if accel.skewed else ()
+    k = len(names)
+    return AccelIntrinsics(
+        unit=unit,
+        bias=_three(accel.bias),
+        scale=_three(accel.scale),
+        misalignment_rad=_named(names, accel.angles[:k]),
+        sigma=IntrinsicsSigma(
+            bias=_three(accel.sigma[:d]),
+            scale=_three(accel.sigma[d : 2 * d]),
+            misalignment_rad=_named(names, accel.sigma[2 * d : 2 * d + k]),
+        ),
+        matrix=_padded(accel.matrix),
+        rms_mps2=accel.rms_mps2,
+        disagreement_mps2=accel.tau_mps2,
+    )
+
+
+def _gyroscope(result: Intrinsics, gyro: Gyroscope) -> GyroIntrinsics:
+    used = np.isfinite(gyro.scale)
+    known = np.isfinite(gyro.scale_sigma) & used & (result.foreign is None)
+    angle_known = np.isfinite(gyro.angle_sigma) & (result.foreign is None)
+    bias, names = gyro.bias, tuple(GYRO_ANGLES)
+    return GyroIntrinsics(
+        unit="counts" if "g" in result.log.counts else "rad/s",
+        bias=_three(np.where(used, bias.bias, math.nan)),
+        scale=_three(np.where(known, gyro.scale, math.nan)),
+        misalignment_rad=_named(names, np.where(angle_known, gyro.angles, math.nan)),
+        sigma=GyroSigma(
+            bias=_three(np.where(used, bias.sigma, math.nan)),
+            scale=_three(np.where(known, gyro.scale_sigma, math.nan)),
+            misalignment_rad=_named(names, np.where(angle_known, gyro.angle_sigma, math.nan)),
+            sensitivity=None if bias.sensitivity_sigma is None else _padded(bias.sensitivity_sigma),
+        ),
+        matrix=_padded(gyro.matrix) if known[used].all() else None,
+        start_bias=_three(np.where(used, gyro.initial_bias, math.nan)),
+        sensitivity=None if bias.sensitivity is None else _padded(bias.sensitivity),
+        rms_rad=gyro.rms_rad,
+        turns=len(gyro.turns_s),
+    )

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
-from itertools import pairwise
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -155,6 +155,12 @@ def sampling_findings(
         )
 
 
+def runs(flags: BoolArray) -> list[tuple[int, int]]:
+    """First and behind the last of each run of set flags."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int64), [0]])))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
 def _step(values: FloatArray) -> float:
     """Quantisation step: the least distance of readings, where all are whole multiples of it apart."""
     levels = np.unique(values)
@@ -176,10 +182,8 @@ def _at_limit(values: FloatArray, gyro: bool) -> int:
         ends = _GYRO_RANGES if gyro else _ACCEL_RANGES
         if not any(0.999 * end <= abs(extreme) <= 1.0005 * end for end in ends):
             continue
-        at = np.concatenate([[False], values == extreme, [False]]).astype(np.int64)
-        starts, stops = np.flatnonzero(np.diff(at) == 1), np.flatnonzero(np.diff(at) == -1)
-        runs = stops - starts
-        count += int(runs[runs >= _AT_LIMIT_IN_A_ROW].sum())
+        lengths = [stop - start for start, stop in runs(values == extreme)]
+        count += sum(length for length in lengths if length >= _AT_LIMIT_IN_A_ROW)
     return count
 
 
@@ -300,28 +304,17 @@ def rest_parts(
         change[shaken[:-1]] = 0.0
         excess[1:] = np.maximum(excess[1:], change)
         moving = (excess > 1.0).any(axis=1)
-        for start, stop, moves in _runs(moving):
+        moves = [(*run, True) for run in runs(moving)]
+        for start, stop, moved in sorted([*moves, *((*run, False) for run in runs(~moving))]):
             begin, end = start * size, stop * size if stop < len(w) else len(part.values)
-            if moves:
+            if moved:
                 axis = int(np.argmax(excess[start:stop].max(axis=0)))
                 motions.append(Motion(float(part.t_s[begin]), float(part.t_s[end - 1]) + period_s, axis))
             else:
                 inside = (part.places >= begin) & (part.places < end)
-                still.append(
-                    Part(
-                        part.t_s[begin:end],
-                        part.values[begin:end],
-                        part.rows[inside],
-                        part.places[inside] - begin,
-                    )
-                )
+                places = part.places[inside] - begin
+                still.append(Part(part.t_s[begin:end], part.values[begin:end], part.rows[inside], places))
     return tuple(still), tuple(motions)
-
-
-def _runs(flags: BoolArray) -> list[tuple[int, int, bool]]:
-    """First, behind the last, and value of each run of equal flags."""
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(flags)) + 1, [len(flags)]]).tolist()
-    return [(a, b, bool(flags[a])) for a, b in pairwise(edges)]
 
 
 # ----------------------------------------------------------------------
@@ -462,9 +455,7 @@ def find_rests(parts: tuple[Part, ...], columns: list[int], s: Spread, threshold
     least = max(_RESTS_FEWEST, round(_LEAST_REST_S / s.period_s))
     rests = []
     for number, (part, zeta) in enumerate(zip(parts, s.zeta, strict=True)):
-        still = np.concatenate([[False], zeta <= threshold, [False]]).astype(np.int64)
-        starts, stops = np.flatnonzero(np.diff(still) == 1), np.flatnonzero(np.diff(still) == -1)
-        for start, stop in zip(starts.tolist(), stops.tolist(), strict=True):
+        for start, stop in runs(zeta <= threshold):
             if stop - start < least:
                 continue
             values = part.values[start:stop][:, columns]
@@ -481,3 +472,24 @@ def find_rests(parts: tuple[Part, ...], columns: list[int], s: Spread, threshold
                 )
             )
     return tuple(rests)
+
+
+def sampled(s: Sampling) -> dict[str, Any]:
+    """Keys that say how a log was sampled."""
+    return {
+        "duration_s": s.duration_s,
+        "rate_hz": s.rate_hz,
+        "jitter_s": s.jitter_s,
+        "missing": s.missing,
+        "gaps": sum(not gap.split for gap in s.gaps),
+        "splits": sum(gap.split for gap in s.gaps),
+        "repeated_rows": s.repeated_rows,
+        "repeated_stamps": s.repeated_stamps,
+    }
+
+
+def sensor_findings(logs: Sequence[Any]) -> Iterator[Finding]:
+    """Findings on the sensors of logs, which are named."""
+    for log in logs:
+        for one in log.findings:
+            yield replace(one, text=f"{log.source}: {one.text}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,10 +11,21 @@ from scipy.special import stdtrit
 
 from calib.core.arrays import BoolArray, FloatArray
 from calib.core.errors import BadInputError
+from calib.core.result import degrees_or_none, finite_or_none, judged
 from calib.core.verdict import Finding, Severity, Verdict
 from calib.solve.clock import Part
 from calib.stages.imu.allan import LEAST_SAMPLES, Allan, analyse, model_variance
-from calib.stages.imu.sampling import Motion, Readings, Sampling, regular_parts, rest_parts, sampling_findings
+from calib.stages.imu.sampling import (
+    Motion,
+    Readings,
+    Sampling,
+    regular_parts,
+    rest_parts,
+    sampled,
+    sampling_findings,
+    sensor_findings,
+)
+from calib.stages.imu.section import Imu, ImuLog
 
 # ----------------------------------------------------------------------
 # An inertial sensor at rest: bias, noise, drift of its angle, and whether the log was at rest at all.
@@ -441,4 +452,97 @@ def judge(result: Static) -> Verdict:
             *(finding for noise in result.noise for finding in _of_axis(noise)),
             *_of_length(result),
         ]
+    )
+
+
+# ----------------------------------------------------------------------
+# The section.
+
+_SENSORS = (
+    (
+        "g",
+        "gyro_bias_radps",
+        ("gyro_noise_radps_per_sqrt_Hz", "gyro_instability_radps", "gyro_walk_radps2_per_sqrt_Hz"),
+        "gyro_step_radps",
+    ),
+    (
+        "a",
+        "accel_mean_mps2",
+        ("accel_noise_mps2_per_sqrt_Hz", "accel_instability_mps2", "accel_walk_mps3_per_sqrt_Hz"),
+        "accel_step_mps2",
+    ),
+)
+"""First letter of a sensor's axes, and its keys: mean, then N, B and K, then the step."""
+
+
+def solve_static(logs: Sequence[Readings]) -> Imu:
+    """Find bias, noise and drift, judge them, and assemble the section."""
+
+    result = analyse_static(logs)
+    every = [np.where(np.isnan(log.sampling.step), math.inf, log.sampling.step) for log in result.logs]
+    steps = dict(zip(result.axes, np.nanmin(every, axis=0).tolist(), strict=True))
+    noise = {one.axis: one for one in result.noise}
+
+    def triple(kind: str, value: Callable[[AxisNoise], float]) -> list[float | None]:
+        axes = [noise.get(kind + letter) for letter in "xyz"]
+        return [None if one is None else finite_or_none(value(one)) for one in axes]
+
+    def term(index: int, name: str) -> Callable[[AxisNoise], float]:
+        def value(one: AxisNoise) -> float:
+            allan = one.allan
+            return math.nan if allan is None else float(getattr((allan.N, allan.B, allan.K)[index], name))
+
+        return value
+
+    values: dict[str, list[float | None]] = {}
+    sigma: dict[str, list[float | None]] = {}
+    below: dict[str, list[float | None]] = {}
+    for kind, mean, densities, step in _SENSORS:
+        values[mean] = triple(kind, lambda one: one.bias)
+        sigma[mean] = triple(kind, lambda one: one.sigma)
+        for index, key in enumerate(densities):
+            values[key] = triple(kind, term(index, "value"))
+            sigma[key] = triple(kind, term(index, "sigma"))
+            below[key] = triple(kind, term(index, "below"))
+        values[step] = [finite_or_none(steps.get(kind + letter, math.nan)) for letter in "xyz"]
+    drift = {
+        name: [math.degrees(one.slope_radps) for one in slopes if one is not None]
+        for name, slopes in (
+            ("gyro", [log.gyro for log in result.logs]),
+            ("onchip", [log.onchip for log in result.logs]),
+        )
+    }
+    return Imu.model_validate(
+        {
+            "rate_hz": result.rate_hz,
+            **values,
+            "sigma": {key: row for key, row in sigma.items() if row != [None] * 3},
+            "below": {key: row for key, row in below.items() if row != [None] * 3},
+            "drift": {
+                name: {
+                    "mean_degps": float(np.mean(slopes)),
+                    "spread_degps": float(np.std(slopes, ddof=1)) if len(slopes) > 1 else None,
+                    "logs": len(slopes),
+                }
+                for name, slopes in drift.items()
+                if slopes
+            },
+            "logs": [_rest_log(log) for log in result.logs],
+            **judged(Verdict.of([*judge(result).findings, *sensor_findings(logs)])),
+        }
+    ).with_evidence(result)
+
+
+def _rest_log(log: StaticLog) -> ImuLog:
+    gyro, onchip = log.gyro, log.onchip
+    return ImuLog(
+        name=log.source,
+        rest_s=log.rest_s,
+        samples=log.sampling.samples,
+        **sampled(log.sampling),
+        moves_s=[[motion.from_s, motion.to_s] for motion in log.motions],
+        gyro_degps=None if gyro is None else degrees_or_none(gyro.slope_radps),
+        gyro_sigma_degps=None if gyro is None else degrees_or_none(gyro.sigma_radps),
+        onchip_degps=None if onchip is None else degrees_or_none(onchip.slope_radps),
+        onchip_sigma_degps=None if onchip is None else degrees_or_none(onchip.sigma_radps),
     )

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numba import njit
@@ -13,10 +14,16 @@ from scipy.special import ndtri, stdtrit
 
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
-from calib.core.verdict import Finding, Severity
+from calib.core.result import degrees_or_none, finite_or_none, judged
+from calib.core.verdict import Finding, Severity, Verdict
 from calib.stages.imu.levelling import Levelling, level_log
 from calib.stages.imu.levelling import system as levelling_system
 from calib.stages.imu.mahony import Mahony, MahonyState, filter_log, wrapped
+from calib.stages.imu.sampling import sensor_findings
+from calib.stages.imu.section import FilterCandidate, FilterLog, OrientationFilter
+
+if TYPE_CHECKING:
+    from calib.stages.imu.read import TuneLog
 
 AngleFilter = Mahony | Levelling
 """What can be asked for an angle."""
@@ -94,37 +101,6 @@ DATA_SHEET = Noise(math.radians(0.01), 1e-4, 0.01)
 """Gyroscope N and bias walk K of consumer sensors; the accelerometer's is only a stand-in at rest."""
 
 
-@dataclass(frozen=True)
-class GainFacts:
-    """What a pair of gains does at a step dt.
-
-    Attributes
-    ----------
-    poles : discrete; stable inside of the unit circle.
-    bandwidth_hz : where the accelerometer's part has fallen by 3 dB.
-    noise_gain : variance of the angle over that of white noise on phi_acc.
-    bias_gain_s : angle left by a constant bias of the rate [rad per rad/s].
-    bias_peak_s : largest angle on the way after the bias appears.
-    settling_s : time after which an error of the start stays below 2 % of it.
-    bias_settling_s : the same of the bias' estimate.
-    lag_s : time after which a step that the accelerometer alone sees is followed half way.
-    """
-
-    poles: tuple[complex, ...]
-    bandwidth_hz: float
-    noise_gain: float
-    bias_gain_s: float
-    bias_peak_s: float
-    settling_s: float
-    bias_settling_s: float
-    lag_s: float
-
-    @property
-    def stable(self) -> bool:
-        """Whether all errors die out; a pole on the unit circle is the integral that is not used."""
-        return max(abs(p) for p in self.poles) < 1.0
-
-
 def _system(gains: AngleFilter, dt: float) -> tuple[FloatArray, FloatArray]:
     """A (m, m) and B (m,) of the settled filter; the state begins with the angle and the integral."""
     if isinstance(gains, Levelling):
@@ -160,10 +136,11 @@ def _powers(A: FloatArray, x: FloatArray, steps: int) -> FloatArray:
     return out[:, :steps].T
 
 
-def gain_facts(gains: AngleFilter, dt_s: float) -> GainFacts:
-    """Poles, bandwidth, noise, rejection of a bias and settling of a filter with its settled gains.
+def gain_facts(gains: AngleFilter, dt_s: float) -> dict[str, Any]:
+    """Poles, bandwidth, noise, rejection of a bias and settling, by the keys of `FilterCandidate`.
 
-    Raises `BadInputError` for a step that is not positive and for gains that are unstable with it.
+    Of the filter with its settled gains; times are None where nothing settles. Raises
+    `BadInputError` for a step that is not positive and for gains that are unstable with it.
     """
     if not 0.0 < dt_s < math.inf:
         raise BadInputError(f"step: found {dt_s:g} s, expected more than zero")
@@ -189,16 +166,16 @@ def gain_facts(gains: AngleFilter, dt_s: float) -> GainFacts:
         left = 0.0
     follow = np.cumsum(_powers(A, B, steps)[:, 0])
     half = np.flatnonzero(follow >= 0.5)
-    return GainFacts(
-        poles=tuple(complex(pole) for pole in poles),
-        bandwidth_hz=_bandwidth_hz(A, B, dt_s),
-        noise_gain=noise,
-        bias_gain_s=left,
-        bias_peak_s=float(np.abs(biased).max()),
-        settling_s=_settled(start, dt_s),
-        bias_settling_s=math.inf if only else _settled(toward[:, 1], dt_s),
-        lag_s=float(half[0]) * dt_s if len(half) else math.inf,
-    )
+    return {
+        "poles": [[float(pole.real), float(pole.imag)] for pole in poles],
+        "bandwidth_hz": _bandwidth_hz(A, B, dt_s),
+        "noise_gain": noise,
+        "bias_gain_s": left,
+        "bias_peak_s": float(np.abs(biased).max()),
+        "settling_s": finite_or_none(_settled(start, dt_s)),
+        "bias_settling_s": None if only else finite_or_none(_settled(toward[:, 1], dt_s)),
+        "lag_s": float(half[0]) * dt_s if len(half) else None,
+    }
 
 
 def riccati(noise: Noise, dt_s: float) -> Mahony:
@@ -1113,3 +1090,143 @@ def contradictions(pieces: Sequence[Piece], result: Tuning) -> list[Finding]:
                 "more than that of the other logs, as if the sensor were mounted otherwise",
             )
     return list(out.values())
+
+
+# ----------------------------------------------------------------------
+# The section.
+
+_TILTED = 3.0
+_RINGS = 0.5
+
+
+@dataclass(frozen=True)
+class TuneInputs:
+    """Logs of one rate, densities of the sensor and where they are from, whether the up vector is used."""
+
+    logs: Sequence[TuneLog]
+    noise: Noise
+    densities_from: str
+    tilted: bool = False
+
+
+def solve_tune(inputs: TuneInputs) -> OrientationFilter:
+    """Tune, judge on what was held back, and assemble the section."""
+
+    logs = inputs.logs
+    pieces = [piece for log in logs for piece in log.pieces]
+    result = tune(pieces, inputs.noise)
+    dt_s = float(np.median([log.sampling.period_s for log in logs]))
+    chosen, mahony = result.recommended, result.mahony
+    levelling = next((one.gains for one in result.candidates if isinstance(one.gains, Levelling)), None)
+    held_out = [[one.Kp, one.Ki] for one in result.held_out]
+    sigma: dict[str, float | None] = {}
+    if held_out and chosen.name == "tuned":
+        # The jackknife's deviation.
+        spread = np.std(np.array(held_out), axis=0) * math.sqrt(len(held_out) - 1)
+        sigma = dict(zip(("Kp_per_s", "Ki_per_s2"), spread.tolist(), strict=True))
+    by: Literal["reference", "smoothed", "default"] = "default"
+    if chosen.name != "3/3":
+        by = "reference" if result.judge == "reference" else "smoothed"
+    severity: Literal["poor", "remark"] = "poor" if result.judge == "none" else "remark"
+    findings = [Finding(severity, text) for text in result.reasons]
+    findings += [one for one in sensor_findings(logs) if one.severity != "remark"]
+    firsts = np.cumsum([0, *(len(log.pieces) for log in logs)]).tolist()
+    return OrientationFilter(
+        filter="levelling" if chosen.gains is levelling else "mahony",
+        Kp_per_s=mahony.Kp,
+        Ki_per_s2=mahony.Ki,
+        tau_s=None if levelling is None else levelling.tau_s,
+        velocity_mps=None if levelling is None else levelling.velocity_mps,
+        rate_hz=1.0 / dt_s,
+        recommended=chosen.name,
+        recommended_by=by,
+        rate_of_angle="up vector" if inputs.tilted else "-gz",
+        sigma=sigma,
+        held_out=held_out,
+        candidates={one.name: _candidate(one, dt_s) for one in result.candidates},
+        densities={
+            "gyro_radps_per_sqrt_Hz": result.noise.gyro,
+            "walk_radps2_per_sqrt_Hz": result.noise.walk,
+            "angle_rad_per_sqrt_Hz": result.noise.accel,
+        },
+        densities_from=inputs.densities_from,
+        judged_s=result.judged_s,
+        block_s=finite_or_none(result.block_s),
+        logs=[_filter_log(log, result, k) for log, k in zip(logs, firsts, strict=False)],
+        **judged(Verdict.of([*findings, *_of_tuning(result, logs, inputs.tilted)])),
+    ).with_evidence((result, pieces))
+
+
+def parameters_of(gains: AngleFilter) -> dict[str, Any]:
+    """The parameters of a filter by their keys."""
+    if isinstance(gains, Mahony):
+        return {"Kp_per_s": gains.Kp, "Ki_per_s2": gains.Ki}
+    return {"tau_s": gains.tau_s, "velocity_mps": gains.velocity_mps}
+
+
+def _candidate(one: Candidate, dt_s: float) -> FilterCandidate:
+    def interval(low: float, high: float) -> list[float] | None:
+        return [math.degrees(low), math.degrees(high)] if math.isfinite(low) else None
+
+    return FilterCandidate(
+        **(parameters_of(one.gains) | gain_facts(one.gains, dt_s)),
+        rmse_deg=degrees_or_none(one.rmse_rad),
+        interval_deg=interval(one.low_rad, one.high_rad),
+        less_than_3_3_deg=degrees_or_none(one.less_rad),
+        less_interval_deg=interval(one.less_low_rad, one.less_high_rad),
+        confidence=finite_or_none(one.confidence),
+        whole_rmse_deg=degrees_or_none(one.whole_rad),
+    )
+
+
+def _filter_log(log: TuneLog, result: Tuning, first: int) -> FilterLog:
+    """A log whose first piece is the tuning's piece of this number."""
+    s, own = log.sampling, result.smoothed[first]
+    return FilterLog(
+        name=log.source,
+        duration_s=s.duration_s,
+        samples=s.samples,
+        missing=s.missing,
+        pieces=len(log.pieces),
+        repeated_rows=s.repeated_rows,
+        repeated_stamps=s.repeated_stamps,
+        reference=log.reference or None,
+        reference_offset_deg=math.degrees(result.offset_rad[first]) if log.reference else None,
+        reference_lag_s=log.lag_s if log.reference else None,
+        rate_error_degps_per_sqrt_Hz=None if own is None else math.degrees(own.gyro_noise),
+        angle_error_deg_per_sqrt_Hz=None if own is None else math.degrees(own.accel_noise),
+        smoothed_sigma_deg=None if own is None else math.degrees(own.sigma_rad),
+        bias_degps=None if own is None else math.degrees(own.bias_radps),
+    )
+
+
+def _of_tuning(result: Tuning, logs: Sequence[TuneLog], tilted: bool) -> Iterator[Finding]:
+    """What is to be known of the gains, and of the logs that they are from."""
+    pieces = [piece for log in logs for piece in log.pieces]
+    yield from contradictions(pieces, result)
+    gains, base = result.recommended.gains, result.candidates[0]
+    if isinstance(gains, Mahony) and gains.Kp < 2.0 * _RINGS * math.sqrt(gains.Ki):
+        yield Finding(
+            "remark",
+            f"The pair is damped by {gains.Kp / (2.0 * math.sqrt(gains.Ki)):.2f} only and rings: it serves a "
+            "start from an unknown bias; a bias that is subtracted before allows a calmer one.",
+        )
+    for one in result.candidates[1:]:
+        if one.name == "riccati" and one.whole_rad > 1.5 * base.whole_rad:
+            yield Finding(
+                "remark",
+                "The settled Kalman filter, riccati, takes longer than these logs to learn the bias.",
+            )
+    worst = max((s.gyro_noise for s in result.smoothed if s is not None), default=0.0)
+    if worst > _TILTED * result.noise.gyro and not tilted:
+        yield Finding(
+            "remark",
+            f"-gz errs by {math.degrees(worst):.2g} deg/s/sqrt(Hz) as the angle's rate, the sensor by "
+            f"{math.degrees(result.noise.gyro):.2g}: it may be tilted out of the plane or its scale be off; "
+            "with all six axes --rate up takes the tilt out.",
+        )
+    if result.judge == "smoothed":
+        yield Finding("remark", "Without a reference the logs are judged by their own smoothed angle.")
+    for log in logs:
+        if log.lag_s:
+            yield Finding("remark", f"{log.source}: {log.reference} came {1e3 * log.lag_s:.1f} ms late.")
