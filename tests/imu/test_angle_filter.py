@@ -587,7 +587,8 @@ def test_keeps_three_three_where_the_truth_is_three_three() -> None:
 
 @pytest.mark.slow
 def test_whatever_is_recommended_on_real_recordings_is_better(shared_data: Path) -> None:
-    judged = won = 0
+    """After the first five seconds, which the tuning leaves out. It says 95 %: of 24 one may be wrong."""
+    ratios = []
     for name in ("02_undisturbed_slow_rotation_B", "05_undisturbed_slow_rotation_with_breaks_B"):
         data = loadmat(outside(shared_data / "broad" / f"{name}.mat"))
         fs = float(data["sampling_rate"].squeeze())
@@ -607,15 +608,16 @@ def test_whatever_is_recommended_on_real_recordings_is_better(shared_data: Path)
                 acc, rate = np.arctan2(force[a:b, 1], force[a:b, 0]), planar_rate(gyro[a:b], felt[a:b])
                 blind = tune([Piece(name, t, acc, rate)], DATA_SHEET)
                 seeing = tune([Piece(name, t, acc, rate, phi)], DATA_SHEET)
-                errors = [
-                    _error(run_filter(gains, t, acc, rate), phi, seeing.offset_rad[0])
+                late = t >= 5.0
+                three, *errors = (
+                    _error(run_filter(gains, t, acc, rate)[late], phi[late], seeing.offset_rad[0])
                     for gains in (THREE, blind.recommended.gains, seeing.recommended.gains)
-                ]
-                assert max(errors[1:]) <= errors[0] + 1e-9
-                judged += 1
-                won += errors[1] < 0.95 * errors[0]
-    assert judged >= 10
-    assert won >= 3
+                )
+                ratios += [error / three for error in errors]
+    assert len(ratios) >= 20
+    assert sum(ratio > 1.0 + 1e-9 for ratio in ratios) <= 1
+    assert max(ratios) < 1.1
+    assert sum(ratio < 0.8 for ratio in ratios) >= 8
 
 
 def _markers(phi: np.ndarray, length: np.ndarray) -> np.ndarray:

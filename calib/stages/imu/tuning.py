@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 from numba import njit
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 AngleFilter = Mahony | Levelling
 """What can be asked for an angle."""
+
+F = TypeVar("F", Mahony, Levelling)
 
 
 def run_filter(
@@ -247,14 +249,14 @@ class Candidate:
 
     name: str
     gains: AngleFilter
-    rmse_rad: float
-    low_rad: float
-    high_rad: float
-    less_rad: float
-    less_low_rad: float
-    less_high_rad: float
-    confidence: float
-    whole_rad: float
+    rmse_rad: float = math.nan
+    low_rad: float = math.nan
+    high_rad: float = math.nan
+    less_rad: float = math.nan
+    less_low_rad: float = math.nan
+    less_high_rad: float = math.nan
+    confidence: float = math.nan
+    whole_rad: float = math.nan
 
     @property
     def wins(self) -> bool:
@@ -720,31 +722,25 @@ class Tuning:
 
 @dataclass(frozen=True)
 class _Judged:
-    """Readings with the angle that they are judged by, NaN where they are not, and each sample's part."""
+    """A piece with the angle that it is judged by, NaN where it is not, and each sample's part."""
 
-    t_s: FloatArray
-    phi_acc_rad: FloatArray
-    rate_radps: FloatArray
+    piece: Piece
     target: FloatArray
     part: IntArray
 
     def errors(self, gains: AngleFilter) -> FloatArray:
         """Errors (n,) of a filter that runs from the first sample on."""
-        return wrapped(run_filter(gains, self.t_s, self.phi_acc_rad, self.rate_radps) - self.target)
+        one = self.piece
+        return wrapped(run_filter(gains, one.t_s, one.phi_acc_rad, one.rate_radps) - self.target)
 
 
 def _parted(pieces: Sequence[tuple[Piece, FloatArray]], dt_s: float) -> tuple[tuple[_Judged, ...], int]:
-    """Logs in parts that are judged for as long as each other, and how many parts there are."""
+    """Pieces in parts that are judged for as long as each other, and how many parts there are."""
     out, count = [], 0
     for piece, target in pieces:
         known = np.cumsum(np.isfinite(target))
         parts = int(np.clip(known[-1] * dt_s / _PART_S, 2, _MOST_PARTS))
-        part = count + np.minimum(parts * known // (known[-1] + 1), parts - 1)
-        t, phi_acc, w, known_angle = (
-            np.ascontiguousarray(x, dtype=np.float64)
-            for x in (piece.t_s, piece.phi_acc_rad, piece.rate_radps, target)
-        )
-        out.append(_Judged(t, phi_acc, w, known_angle, part))
+        out.append(_Judged(piece, target, count + np.minimum(parts * known // (known[-1] + 1), parts - 1)))
         count += parts
     return tuple(out), count
 
@@ -764,6 +760,18 @@ def _pick(gains: Sequence[Mahony], errors: FloatArray) -> Mahony:
     rank = {k: min(round(gains[k].Kp / (2.0 * math.sqrt(gains[k].Ki)), 3), 1.0) for k in near}
     most = max(rank.values())
     return gains[min((k for k in near if rank[k] == most), key=lambda k: float(errors[k]))]
+
+
+def _least(filters: Sequence[Levelling], errors: FloatArray) -> Levelling:
+    return filters[int(np.argmin(errors))]
+
+
+def _best(
+    tried: Sequence[F], sums: FloatArray, pick: Callable[[Sequence[F], FloatArray], F]
+) -> tuple[F, tuple[F, ...]]:
+    """The filter that is picked by all parts, and those by all but each."""
+    whole = sums.sum(axis=1)
+    return pick(tried, whole), tuple(pick(tried, whole - own) for own in sums.T)
 
 
 def _search(judged: Sequence[_Judged], dt_s: float, parts: int) -> tuple[Mahony, tuple[Mahony, ...], Surface]:
@@ -789,18 +797,7 @@ def _search(judged: Sequence[_Judged], dt_s: float, parts: int) -> tuple[Mahony,
         ]
         tried += more
         sums = np.concatenate([sums, _sums(judged, more, parts)])
-    whole = sums.sum(axis=1)
-    return _pick(tried, whole), tuple(_pick(tried, whole - own) for own in sums.T), surface
-
-
-def _search_levelling(
-    judged: Sequence[_Judged], dt_s: float, parts: int
-) -> tuple[Levelling, tuple[Levelling, ...]]:
-    """Best levelling filter for these logs, and those without each part."""
-    tried = [Levelling(tau, v) for tau in _TAU_S if tau >= 2.0 * dt_s for v in _VELOCITY_MPS]
-    sums = _sums(judged, tried, parts)
-    whole = sums.sum(axis=1)
-    return tried[int(np.argmin(whole))], tuple(tried[int(np.argmin(whole - own))] for own in sums.T)
+    return *_best(tried, sums, _pick), surface
 
 
 def _crossed(judged: Sequence[_Judged], filters: Sequence[AngleFilter]) -> list[FloatArray]:
@@ -883,61 +880,38 @@ def tune(pieces: Sequence[Piece], sensor: Noise) -> Tuning:
             late = piece.t_s - piece.t_s[0] >= min(_SETTLE_S, _SETTLE_SHARE * span_s)
             with_target.append((piece, np.where(late, target, np.nan)))
     judged_s = sum(float(np.isfinite(target).sum()) for _, target in with_target) * dt_s
-    settled = riccati(noise, dt_s)
+    settled, surface, block_s = riccati(noise, dt_s), None, math.nan
+    held_out: tuple[Mahony, ...] = ()
+    why: tuple[str, ...]
     if judged_s < _LEAST_JUDGED_S:
-        reasons.append(
+        judge = "none"
+        candidates: tuple[Candidate, ...] = (Candidate("3/3", THREE), Candidate("riccati", settled))
+        recommended, why = candidates[0], (
             f"There are {judged_s:.3g} s to judge gains by, expected at least {_LEAST_JUDGED_S:g} s: "
-            "3/3 is kept."
-        )
-        nan = math.nan
-        unknown = tuple(
-            Candidate(name, gains, nan, nan, nan, nan, nan, nan, nan, nan)
-            for name, gains in (("3/3", THREE), ("riccati", settled))
-        )
-        return Tuning(
-            judge="none",
-            candidates=unknown,
-            recommended=unknown[0],
-            reasons=tuple(reasons),
-            held_out=(),
-            surface=None,
-            smoothed=smoothed,
-            noise=noise,
-            offset_rad=tuple(offsets),
-            judged_s=judged_s,
-            block_s=nan,
-        )
-    judged, parts = _parted(with_target, dt_s)
-    tuned, held_out, surface = _search(judged, dt_s, parts)
-    levelling, levelling_held_out = _search_levelling(judged, dt_s, parts)
+            "3/3 is kept.",
+        )  # fmt: skip
+    else:
+        judged, parts = _parted(with_target, dt_s)
+        tuned, held_out, surface = _search(judged, dt_s, parts)
+        tried = [Levelling(tau, v) for tau in _TAU_S if tau >= 2.0 * dt_s for v in _VELOCITY_MPS]
+        levelling, levelling_held_out = _best(tried, _sums(judged, tried, parts), _least)
 
-    def row(name: str, gains: AngleFilter, held_out: Sequence[AngleFilter] = ()) -> Row:
-        errors = [one.errors(gains) for one in judged]
-        return Row(name, gains, _crossed(judged, held_out) if held_out else errors, rms(errors))
+        def row(name: str, gains: AngleFilter, held_out: Sequence[AngleFilter] = ()) -> Row:
+            errors = [one.errors(gains) for one in judged]
+            return Row(name, gains, _crossed(judged, held_out) if held_out else errors, rms(errors))
 
-    candidates, block_s = compared(
-        [
+        rows = [
             row("3/3", THREE),
             row("tuned", tuned, held_out),
             row("riccati", settled),
             row("levelling", levelling, levelling_held_out),
-        ],
-        dt_s,
-    )
-    recommended, why = _recommended(candidates, judge)
+        ]
+        candidates, block_s = compared(rows, dt_s)
+        recommended, why = _recommended(candidates, judge)
     return Tuning(
-        judge,
-        candidates,
-        recommended,
-        (*reasons, *why),
-        held_out,
-        surface,
-        smoothed,
-        noise,
-        tuple(offsets),
-        judged_s,
-        block_s,
-    )
+        judge, candidates, recommended, (*reasons, *why), held_out, surface, smoothed, noise, tuple(offsets),
+        judged_s, block_s,
+    )  # fmt: skip
 
 
 def _recommended(candidates: Sequence[Candidate], judge: str) -> tuple[Candidate, tuple[str, ...]]:
