@@ -13,7 +13,7 @@ from armlogs import swung
 from scipy.signal import lfilter
 
 from calib.solve.clock import Part
-from calib.stages.imu.drift import LogDrift, Measures, allan_at, analyse_drift, lag_s, slope_of
+from calib.stages.imu.drift import allan_at, analyse_drift, lag_s, slope_of
 from calib.stages.imu.mahony import Mahony, advance, filter_log
 from calib.stages.imu.sampling import Readings
 from calib.stages.imu.tracks import Tuned, tracks_of
@@ -44,34 +44,31 @@ def _at_rest(n: int = 24000, bias: float = 0.006, seed: int = 0) -> Readings:
     return _log(np.full(n, 0.2), np.zeros(n), bias, seed)
 
 
-def _by_name(result: LogDrift) -> dict[str, Measures]:
-    return {m.name: m for m in result.measures}
-
-
 def test_a_log_at_rest() -> None:
     log = _at_rest()
     chip = 0.2 + 0.3 + np.radians(0.145) * log.t_s
     result = analyse_drift(replace(log, onchip_t_s=log.t_s, onchip_phi_rad=chip), peers=False)
-    found = _by_name(result)
+    found = result.measures
+    on_chip, accel, gyro = (found[x] for x in ("on the chip", "accelerometer alone", "gyroscope alone"))
     assert (result.against, result.moving_s) == ("rest", 0.0)
     assert result.judged_s == pytest.approx(235.0, abs=0.1)
-    assert np.degrees(found["on the chip"].slope.value) == pytest.approx(0.145, rel=1e-6)
+    assert on_chip.slope_degps == pytest.approx(0.145, rel=1e-6)
     middle = 0.5 * (5.0 + 240.0)
-    assert found["on the chip"].offset_rad == pytest.approx(0.3 + np.radians(0.145) * middle, abs=1e-3)
-    gyro = found["gyroscope alone"].slope
-    assert gyro.low < -0.006 < gyro.high
+    assert math.radians(on_chip.offset_deg) == pytest.approx(0.3 + np.radians(0.145) * middle, abs=1e-3)
+    low, high = gyro.interval_degps
+    assert low < math.degrees(-0.006) < high
     # The filter takes the bias out whole: what is left is the accelerometer's.
     for name in ("accelerometer alone", "MM 3/3", "MM 3/3 with up vector"):
-        slope = found[name].slope
-        assert slope.low < 0.0 < slope.high
-        assert abs(slope.value) < 1e-6
-        assert abs(found[name].offset_rad) < 1e-4
+        low, high = found[name].interval_degps
+        assert low < 0.0 < high
+        assert abs(found[name].slope_degps) < math.degrees(1e-6)
+        assert abs(found[name].offset_deg) < math.degrees(1e-4)
     # A ramp b t has the Allan deviation b tau / sqrt(2).
-    assert found["on the chip"].allan_1s_rad == pytest.approx(np.radians(0.145) / np.sqrt(2.0), rel=1e-6)
-    assert found["gyroscope alone"].allan_100s_rad == pytest.approx(0.6 / np.sqrt(2.0), rel=0.02)
+    assert math.radians(on_chip.allan_1s_deg) == pytest.approx(np.radians(0.145) / np.sqrt(2.0), rel=1e-6)
+    assert math.radians(gyro.allan_100s_deg) == pytest.approx(0.6 / np.sqrt(2.0), rel=0.02)
     # White noise of the accelerometer falls with the root of the averaging time.
-    assert found["accelerometer alone"].allan_1s_rad == pytest.approx(0.02 / 9.81 / 10.0, rel=0.1)
-    assert all(np.isnan(m.rmse_rad) and np.isnan(m.lag_s) for m in result.measures)
+    assert math.radians(accel.allan_1s_deg) == pytest.approx(0.02 / 9.81 / 10.0, rel=0.1)
+    assert all(m.rmse_deg is None and m.lag_ms is None for m in found.values())
 
 
 def test_a_log_in_motion_with_truth() -> None:
@@ -81,20 +78,21 @@ def test_a_log_in_motion_with_truth() -> None:
     late = 0.1 + 0.5 * np.sin(3.0 * (t - 0.03))
     log = replace(log, true_t_s=t, true_phi_rad=phi - 0.05, onchip_t_s=t, onchip_phi_rad=late)
     result = analyse_drift(log, peers=False)
-    found = _by_name(result)
+    found = result.measures
+    on_chip, accel, gyro = (found[x] for x in ("on the chip", "accelerometer alone", "gyroscope alone"))
     assert result.against == "truth"
     assert result.moving_s == pytest.approx(60.0, abs=0.5)
-    assert found["on the chip"].lag_s == pytest.approx(0.03, abs=5e-4)
+    assert 1e-3 * on_chip.lag_ms == pytest.approx(0.03, abs=5e-4)
     # The constant mount offset is in the offset, not in the RMSE.
-    assert found["on the chip"].offset_rad == pytest.approx(0.15, abs=2e-3)
-    assert found["on the chip"].rmse_rad == pytest.approx(
+    assert math.radians(on_chip.offset_deg) == pytest.approx(0.15, abs=2e-3)
+    assert math.radians(on_chip.rmse_deg) == pytest.approx(
         0.5 * 2.0 * np.sin(0.5 * 3.0 * 0.03) / np.sqrt(2.0), rel=0.02
     )
-    assert found["accelerometer alone"].rmse_rad == pytest.approx(0.02 / 9.81, rel=0.05)
-    assert found["accelerometer alone"].offset_rad == pytest.approx(0.05, abs=1e-3)
-    assert found["gyroscope alone"].slope.value == pytest.approx(-0.006, rel=0.05)
+    assert math.radians(accel.rmse_deg) == pytest.approx(0.02 / 9.81, rel=0.05)
+    assert math.radians(accel.offset_deg) == pytest.approx(0.05, abs=1e-3)
+    assert math.radians(gyro.slope_degps) == pytest.approx(-0.006, rel=0.05)
     # Summing the rate of a step's end is half a step ahead.
-    assert found["gyroscope alone"].lag_s == pytest.approx(-0.5 * PERIOD, abs=5e-4)
+    assert 1e-3 * gyro.lag_ms == pytest.approx(-0.5 * PERIOD, abs=5e-4)
 
 
 Noise = Callable[[np.random.Generator, int], np.ndarray]

@@ -245,19 +245,6 @@ _SHORTEST_S = 2.0
 
 
 @dataclass(frozen=True)
-class Measures:
-    """What is said of one method on one log [rad, s]; NaN where the log does not show it."""
-
-    name: str
-    offset_rad: float
-    slope: Slope
-    allan_1s_rad: float
-    allan_100s_rad: float
-    rmse_rad: float
-    lag_s: float
-
-
-@dataclass(frozen=True)
 class LogDrift:
     """One log.
 
@@ -271,7 +258,7 @@ class LogDrift:
     start_s : time of each part's first sample.
     moving : where (n_i,) each part moves.
     truth_rad : the true angle in each part, NaN outside of its samples; None without.
-    tracks, measures : by method, in the same order.
+    tracks : of each method. measures : what is said of it, by its name, in the same order.
     skipped : sentences about methods that were left out.
     """
 
@@ -285,18 +272,8 @@ class LogDrift:
     moving: tuple[BoolArray, ...]
     truth_rad: tuple[FloatArray, ...] | None
     tracks: tuple[Track, ...]
-    measures: tuple[Measures, ...]
+    measures: dict[str, DriftMethod]
     skipped: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Spread:
-    """Slopes [rad/s] of one method over several logs: mean, standard deviation from log to log, number."""
-
-    name: str
-    mean_radps: float
-    spread_radps: float
-    logs: int
 
 
 def _settled(start: int, stop: int, period_s: float) -> slice:
@@ -324,7 +301,7 @@ def _measure(
     stretches: Sequence[tuple[int, slice]],
     moving: Sequence[BoolArray],
     period_s: float,
-) -> Measures:
+) -> DriftMethod:
     errors, offsets = [], []
     for k, where in stretches:
         angle = track.phi_rad[k][where]
@@ -366,14 +343,16 @@ def _measure(
                 for a, b in runs(np.isfinite(e) & np.isfinite(t))
             ]
             lag = lag_s([e for e, _ in pieces], [t for _, t in pieces], period_s)
-    return Measures(
-        track.name,
-        offset,
-        slope_of(errors, period_s),
-        allan_at(errors, period_s, 1.0),
-        allan_at(errors, period_s, 100.0),
-        rmse,
-        lag,
+    slope = slope_of(errors, period_s)
+    return DriftMethod(
+        offset_deg=degrees_or_none(offset),
+        slope_degps=degrees_or_none(slope.value),
+        sigma_degps=degrees_or_none(slope.sigma),
+        interval_degps=[degrees_or_none(slope.low), degrees_or_none(slope.high)],
+        allan_1s_deg=degrees_or_none(allan_at(errors, period_s, 1.0)),
+        allan_100s_deg=degrees_or_none(allan_at(errors, period_s, 100.0)),
+        rmse_deg=degrees_or_none(rmse),
+        lag_ms=finite_or_none(1e3 * lag),
     )
 
 
@@ -425,7 +404,7 @@ def analyse_drift(
         ]
     tracks, skipped = tracks_of(log, parts, period_s, tuned, peers, told)
     phi_acc = next(track.phi_rad for track in tracks if track.name == "accelerometer alone")
-    measures = [_measure(track, truth, phi_acc, stretches, moving, period_s) for track in tracks]
+    measures = {one.name: _measure(one, truth, phi_acc, stretches, moving, period_s) for one in tracks}
     return LogDrift(
         log.source,
         sampling,
@@ -437,21 +416,23 @@ def analyse_drift(
         tuple(moving),
         truth,
         tuple(tracks),
-        tuple(measures),
+        measures,
         tuple(skipped),
     )
 
 
-def spread_of(logs: Sequence[LogDrift]) -> tuple[Spread, ...]:
+def spread_of(logs: Sequence[LogDrift]) -> dict[str, DriftSlopes]:
     """Mean and spread of the slopes of each method over the logs that show one (Fig. 2.4)."""
-    names = list(dict.fromkeys(measures.name for log in logs for measures in log.measures))
-    out = []
-    for name in names:
-        slopes = [m.slope.value for log in logs for m in log.measures if m.name == name]
-        known = np.array([slope for slope in slopes if math.isfinite(slope)])
-        spread = float(known.std(ddof=1)) if len(known) > 1 else math.nan
-        out.append(Spread(name, float(known.mean()) if len(known) else math.nan, spread, len(known)))
-    return tuple(out)
+    out = {}
+    for name in dict.fromkeys(name for log in logs for name in log.measures):
+        slopes = [log.measures[name].slope_degps for log in logs if name in log.measures]
+        known = np.array([slope for slope in slopes if slope is not None])
+        out[name] = DriftSlopes(
+            mean_degps=float(known.mean()) if len(known) else None,
+            spread_degps=float(known.std(ddof=1)) if len(known) > 1 else None,
+            logs=len(known),
+        )
+    return out
 
 
 # ----------------------------------------------------------------------
@@ -484,14 +465,7 @@ def solve_drift(inputs: DriftInputs) -> Drift:
     return Drift(
         note=NOT_A_RANKING,
         logs=[_drift_log(log) for log in logs],
-        methods={
-            one.name: DriftSlopes(
-                mean_degps=degrees_or_none(one.mean_radps),
-                spread_degps=degrees_or_none(one.spread_radps),
-                logs=one.logs,
-            )
-            for one in spread_of(logs)
-        },
+        methods=spread_of(logs),
         provenance={"inputs": inputs.hashes},
         tuned=None
         if tuned is None
@@ -519,20 +493,7 @@ def _drift_log(log: LogDrift) -> DriftOfLog:
         about=_ABOUT[log.against],
         judged_s=log.judged_s,
         moving_s=log.moving_s,
-        methods={m.name: _method(m) for m in log.measures},
+        methods=log.measures,
         skipped=list(log.skipped),
         remarks=remarks,
-    )
-
-
-def _method(m: Measures) -> DriftMethod:
-    return DriftMethod(
-        offset_deg=degrees_or_none(m.offset_rad),
-        slope_degps=degrees_or_none(m.slope.value),
-        sigma_degps=degrees_or_none(m.slope.sigma),
-        interval_degps=[degrees_or_none(m.slope.low), degrees_or_none(m.slope.high)],
-        allan_1s_deg=degrees_or_none(m.allan_1s_rad),
-        allan_100s_deg=degrees_or_none(m.allan_100s_rad),
-        rmse_deg=degrees_or_none(m.rmse_rad),
-        lag_ms=finite_or_none(1e3 * m.lag_s),
     )

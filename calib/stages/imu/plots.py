@@ -280,7 +280,7 @@ _PM = "\N{PLUS-MINUS SIGN}"
 def drift_plots(logs: Sequence[LogDrift]) -> dict[str, Figure]:
     """`drift_angles`, `drift_slopes` where there are any, and `drift_motion_1`, ... for logs that move."""
     figures = {"drift_angles": _angles(logs)}
-    if any(np.isfinite(m.slope.value) for log in logs for m in log.measures):
+    if any(m.slope_degps is not None for log in logs for m in log.measures.values()):
         figures["drift_slopes"] = _slopes(logs)
     moving = {f"drift_motion_{i}": log for i, log in enumerate(logs, start=1) if log.moving_s > 0.0}
     return figures | {name: _in_motion(log) for name, log in moving.items()}
@@ -330,17 +330,18 @@ def _change(log: LogDrift, name: str, colour: Colour, logs: int) -> list[Curve]:
 
 def _slopes(logs: Sequence[LogDrift]) -> Figure:
     """Slope of each method in each log with its interval."""
-    names = list(dict.fromkeys(m.name for log in logs for m in log.measures))
+    names = list(dict.fromkeys(name for log in logs for name in log.measures))
     note = (
         "These are the slopes of the angle's error in each log, with 95 % intervals, from the first log at "
         f"the top to the last. The scale is linear within {_PM}0.01 degrees/s and logarithmic beyond."
     )
     marks: list[Mark] = [Rule("x", 0.0, "ink")]
     for j, (log, hue) in enumerate(zip(logs, _colours(logs), strict=True)):
-        have = [m for m in log.measures if np.isfinite(m.slope.value)]
-        at = np.array([names.index(m.name) for m in have]) + 0.6 * ((j + 0.5) / len(logs) - 0.5)
-        value = np.degrees([m.slope.value for m in have])
-        half = np.nan_to_num(np.degrees([m.slope.high - m.slope.low for m in have]) / 2.0)
+        have = {name: m for name, m in log.measures.items() if m.slope_degps is not None}
+        at = np.array([names.index(name) for name in have]) + 0.6 * ((j + 0.5) / len(logs) - 0.5)
+        value = np.array([m.slope_degps for m in have.values()])
+        ends = np.array([m.interval_degps for m in have.values()], dtype=np.float64)
+        half = np.nan_to_num(0.5 * np.ptp(ends, axis=1))
         marks.append(Curve(value, at, kind="points", colour=hue, spread=half, across=True))
     x = "slope (degrees/s)"
     panel = Plot(x, "", marks, log="x", linear_within=0.01, grid="x", names=tuple(names))
