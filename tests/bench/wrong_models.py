@@ -4,8 +4,9 @@
 
 Rigs as those of `driven.py`, and then: `orifice`, pumps that deflate by another law; `hysteresis`, pumps that
 follow their commands with a play of 8 % of the range; `quarter`, plant and pumps up to 25 % off. The error is
-the mean over q1 and q2 in millimetres after two seconds, averaged over seeds; `limit` is the kinematic target
-and a fifth. `share` is that of the rows in which the driven model spoke.
+the mean over q1 and q2 in millimetres after two seconds, beside it that of phi in degrees and NEES (2
+expected), averaged over seeds; `limit` is the kinematic target and a fifth. `share` is that of the rows in
+which the driven model spoke.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from calib.twin.scenarios import at_rest, make_scenario, run_scenario
 from calib.twin.simulate import log_of, simulate
 
 LIMIT = {"ellipse": 1.2 * 0.15, "step": 1.2 * 0.20, "elongation": 1.2 * 0.14}
+ESTIMATORS = ("kinematic", "driven", "handover", "smoothed")
 RANGE_PWM, PLAY = 255.0, 0.08
 
 
@@ -64,36 +66,32 @@ def main() -> None:
     """Print the table."""
     first = int(sys.argv[1]) if len(sys.argv) > 1 else 1
     count = int(sys.argv[2]) if len(sys.argv) > 2 else 4
-    print(
-        f"{'':24s}{'kinematic':>10s}{'driven':>10s}{'handover':>10s}{'smoothed':>10s}{'limit':>10s}{'share':>8s}"
-    )
+    print(f"{'':24s}" + "".join(f"{name:>23s}" for name in (*ESTIMATORS, "limit share")))
+    print(f"{'':24s}" + f"{'mm   deg   NEES':>23s}" * len(ESTIMATORS))
     for kind in ("as known", "orifice", "hysteresis", "quarter"):
         for name, limit in LIMIT.items():
             if kind == "hysteresis" and name == "elongation":
                 continue
-            found = []
+            found, shares = [], []
             for seed in range(first, first + count):
                 rig, log = made(kind, name, seed)
                 setup, rows, pwm = setup_for(rig, seed), rows_from(log), commands_of(log)
                 driven, kinematic, weight = Handover(setup, Drive()).run_each(rows, pwm)
                 both = blended(driven, kinematic, weight)
+                smoothed = smooth_both(setup, Drive(), rows, pwm, driven, kinematic)
                 errors = []
-                for out in (
-                    kinematic,
-                    driven,
-                    both,
-                    smooth_both(setup, Drive(), rows, pwm, driven, kinematic),
-                ):
+                for out in (kinematic, driven, both, smoothed):
                     tally = Tally(setup.bellows_radius_m)
                     tally.add(out, truth(log))
-                    errors.append(tally.rmse()["mean_q_mm"])
-                found.append([*errors, limit, float((weight[log.t_s > 2.0] > 0.5).mean())])
-            *cells, share = np.mean(found, axis=0)
-            missed = "  MISSED" if cells[2] > limit else ""
-            print(
-                f"{kind:12s}{name:12s}" + "".join(f"{c:10.3f}" for c in cells) + f"{share:8.2f}{missed}",
-                flush=True,
-            )
+                    rmse = tally.rmse()
+                    errors.append((rmse["mean_q_mm"], rmse["phi_deg"], rmse["nees"]))
+                found.append(errors)
+                shares.append(float((weight[log.t_s > 2.0] > 0.5).mean()))
+            means = np.mean(found, axis=0)
+            cells = [f"{mm:.3f} {degrees:.3f} {nees:6.1f}" for mm, degrees, nees in means]
+            cells.append(f"{limit:.3f} {np.mean(shares):.2f}")
+            missed = "  MISSED" if means[ESTIMATORS.index("handover"), 0] > limit else ""
+            print(f"{kind:12s}{name:12s}" + "".join(f"{c:>23s}" for c in cells) + missed, flush=True)
 
 
 if __name__ == "__main__":
