@@ -895,7 +895,7 @@ _LEAST = 3
 _LEAST_IN_ALL = 8
 """Of fewer any three may differ from the rest by what is odd about each."""
 _IN_ORDER = 0.9
-"""Statistic of a split in order over that of any from which on it is taken."""
+"""Statistic of a split in order over that of any, each over its chance, from which on it is taken."""
 _ODD_VIEWS = 6
 """Views without each of which the finding has to stand."""
 _PRIOR = {"fx_px": 0.3, "fy_px": 0.3, "cx_px": 0.15, "cy_px": 0.15, "skew_px": 0.05}
@@ -1055,18 +1055,18 @@ def _replicates(problem: _Problem, rng: np.random.Generator) -> list[_Problem]:
     return made
 
 
-def _reach(statistics: list[float]) -> float:
-    return float(np.mean(statistics) + _QUANTILE * np.std(statistics, ddof=1))
+def _reach(statistics: list[FloatArray]) -> FloatArray:
+    return np.asarray(np.mean(statistics, axis=0) + _QUANTILE * np.std(statistics, axis=0, ddof=1))
 
 
-def _sturdy(problem: _Problem, search: Callable[[_Problem], float]) -> float:
+def _sturdy(problem: _Problem, search: Callable[[_Problem], FloatArray]) -> FloatArray:
     """Least of what a search finds without one of the oddest views, or without the two oddest of ten or more.
 
     A bad picture or two, each with a camera of its own, must not make innocent views a second camera.
     """
     odd = np.argsort(-_statistic(problem, np.eye(len(problem.b), dtype=np.bool_))[1])[:_ODD_VIEWS]
-    least = min(search(_without(problem, odd[k : k + 1])) for k in range(len(odd)))
-    return least if len(problem.b) < 10 else min(least, search(_without(problem, odd[:2])))
+    without = [odd[k : k + 1] for k in range(len(odd))] + ([odd[:2]] if len(problem.b) >= 10 else [])
+    return np.asarray(np.min([search(_without(problem, some)) for some in without], axis=0))
 
 
 def _described(
@@ -1133,22 +1133,26 @@ def best_split(calibration: Calibration, seed: int = 0) -> Split | None:
     rng = np.random.default_rng(seed)
     problem, scale = _problem(evidence(calibration), calibration)
 
-    def search(made: _Problem, starts: int, least: int) -> tuple[BoolArray, FloatArray]:
-        """Divisions (T, N), the searched ones first, and their statistics."""
+    def search(made: _Problem, starts: int, least: int) -> tuple[list[BoolArray], FloatArray]:
+        """The best division of any, and the best in order, and their statistics (2,)."""
         views = len(made.b)
         at = np.unique(np.linspace(least, views - least, 60).astype(np.int64))
-        ends = _reassigned(made, _beginnings(made, rng)[:starts], least)
-        every = np.concatenate([ends, np.arange(views) >= at[:, None]])
-        return every, _statistic(made, every)[0]
+        kinds = _reassigned(made, _beginnings(made, rng)[:starts], least), np.arange(views) >= at[:, None]
+        found = [_statistic(made, kind)[0] for kind in kinds]
+        best = [kind[int(np.argmax(one))] for kind, one in zip(kinds, found, strict=True)]
+        return best, np.array([one.max() for one in found])
 
     divisions, statistics = search(problem, _STARTS, _LEAST)
-    chance = _reach([float(search(made, 6, _LEAST)[1].max()) for made in _replicates(problem, rng)])
-    statistic = min(float(statistics.max()), _sturdy(problem, lambda one: float(search(one, 6, 2)[1].max())))
-    best = divisions[int(np.argmax(statistics))]
-    ordered = divisions[_STARTS + int(np.argmax(statistics[_STARTS:]))]
-    if statistics[_STARTS:].max() > _IN_ORDER * statistics.max():
-        best = ordered
-    elif best.sum() > len(best) / 2:
+    chances = _reach([search(made, 6, _LEAST)[1] for made in _replicates(problem, rng)])
+    statistics = np.minimum(statistics, _sturdy(problem, lambda one: search(one, 6, 2)[1]))
+    # Of few divisions less is reached by chance.
+    ordered = bool(statistics[1] / chances[1] > _IN_ORDER * statistics[0] / chances[0])
+    best, statistic, chance = (
+        divisions[ordered],
+        float(statistics[int(ordered)]),
+        float(chances[int(ordered)]),
+    )
+    if not ordered and best.sum() > len(best) / 2:
         best = ~best
     return _described(problem, scale, calibration, best, statistic, chance)
 

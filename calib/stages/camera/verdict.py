@@ -81,8 +81,9 @@ class Limits:
     heavy_remark : share of the squared residuals that the worst percent of points may hold.
     repeated_remark : error that repeats at the same points over what independent errors leave.
     decrement : standard deviations that the solver may stop short of a minimum.
-    split_ratio : two cameras: the statistic over what chance reaches. One camera reaches 1.2 in a hundred
-        sets, two that differ by three percent 2 to 50.
+    split_ratio, change_ratio : two cameras, in any order and one after the other: the statistic over
+        what chance reaches. One camera reaches 1.2 in a hundred sets, two that differ by three
+        percent 2 to 50.
     split_sigma, split_least : largest difference of an intrinsic over its standard deviation, and
         the difference of focal length or principal point, as a share of the focal length or
         width, that matters.
@@ -126,6 +127,7 @@ class Limits:
     repeated_remark: float = 1.6
     decrement: float = 2.0
     split_ratio: float = 1.5
+    change_ratio: float = 1.3
     split_sigma: float = 4.0
     split_least: float = 0.007
     split_px: float = 0.3
@@ -562,7 +564,7 @@ def _of_pattern(found: Misfit, limits: Limits) -> list[Finding]:
 
 def of_split(found: Split | None, calibration: Calibration, limits: Limits) -> list[Finding]:
     """One camera, or two."""
-    if found is None or found.ratio < limits.split_ratio:
+    if found is None or found.ratio < (limits.change_ratio if found.in_order else limits.split_ratio):
         return []
     shift = {name: abs(found.difference[name]) / max(found.sigma[name], 1e-300) for name in found.difference}
     camera, names = calibration.camera, calibration.observations.names
