@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
-import importlib.util
 import os
 import platform
 import re
@@ -12,11 +11,11 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from calib.core.errors import pip_install
+from calib.core.errors import DISTRIBUTION, pip_install
 
 _LEAST_PYTHON = (3, 11)
 _PATIENCE_S = 20.0
@@ -33,32 +32,24 @@ class Check:
     what_for: str
 
 
-_LIBRARIES = (
-    ("numpy", "numpy", (2, 0)),
-    ("scipy", "scipy", (1, 13)),
-    ("opencv-python-headless", "cv2", (5, 0)),
-    ("filterpy", "filterpy", (2, 0)),
-    ("matplotlib", "matplotlib", (3, 9)),
-    ("numba", "numba", (0, 60)),
-    ("pyarrow", "pyarrow", (15, 0)),
-    ("typer", "typer", (0, 20)),
-    ("pydantic", "pydantic", (2, 8)),
-    ("pyyaml", "yaml", (6, 0)),
-    ("jinja2", "jinja2", (3, 1)),
-    ("markdown-it-py", "markdown_it", (3, 0)),
-)
-"""Distribution, module and least version of what every installation has."""
+_MODULES = {
+    "opencv-python-headless": "cv2",
+    "pyyaml": "yaml",
+    "markdown-it-py": "markdown_it",
+    "pyserial": "serial",
+    "pillow-heif": "pillow_heif",
+}
+"""Modules whose names are not those of their distributions."""
 
-_EXTRAS = (
-    ("mcap", "mcap", f"logs and states in MCAP: {pip_install('logs')}"),
-    ("rosbags", "rosbags", f"logs in ROS bags: {pip_install('logs')}"),
-    ("uvicorn", "uvicorn", f"calib live: {pip_install('live')}"),
-    ("starlette", "starlette", f"calib live: {pip_install('live')}"),
-    ("pyserial", "serial", f"calib record: {pip_install('serial')}"),
-    ("ahrs", "ahrs", f"filters of others in calib imu drift: {pip_install('peers')}"),
-    ("imufusion", "imufusion", f"filters of others in calib imu drift: {pip_install('peers')}"),
-    ("vqf", "vqf", f"filters of others in calib imu drift: {pip_install('peers')}"),
-)
+_EXTRAS = {
+    "logs": "logs and states in MCAP, logs in ROS bags",
+    "pictures": "pictures in HEIF",
+    "serial": "calib record",
+    "fleet": "calib fleet on a cluster and from URLs",
+    "live": "calib live",
+    "peers": "filters of others in calib imu drift",
+}
+_REQUIREMENT = re.compile(r"([\w.-]+)(?:\[\w+\])?([^;]*)(?:; *extra *== *['\"](\w+)['\"])?")
 
 _TOOLS = (
     (("avr-gcc",), "compiling the firmware for the ATmega328P"),
@@ -70,15 +61,16 @@ _TOOLS = (
 
 def examine(quick: bool = False) -> list[Check]:
     """Look at everything; the trial, which takes a few seconds, is left out of a quick look."""
+    libraries = list(_libraries())
     checks = [
         _python(),
-        *(_library(*one) for one in _LIBRARIES),
+        *(one for one in libraries if one.needed),
         _tried("folder for temporary files", _folder),
     ]
     if not quick:
         checks.append(_tried("compiled code", _compiled))
         checks.append(_tried("camera chain", _camera))
-    checks += [_extra(*one) for one in _EXTRAS]
+    checks += [one for one in libraries if not one.needed]
     checks += [_tool(names, what_for) for names, what_for in _TOOLS]
     return checks
 
@@ -93,29 +85,31 @@ def _numbers(version: str) -> tuple[int, ...]:
     return tuple(int(part) for part in re.findall(r"\d+", version)[:2])
 
 
-def _library(name: str, module: str, least: tuple[int, int]) -> Check:
-    words = f"at least {'.'.join(map(str, least))}"
+def _libraries() -> Iterator[Check]:
+    """What the installed distribution says that it needs, and its extras."""
     try:
+        stated = importlib.metadata.requires(DISTRIBUTION) or []
+    except importlib.metadata.PackageNotFoundError:
+        yield Check(DISTRIBUTION, False, False, "-", "telling which libraries are needed")
+        return
+    for found in map(_REQUIREMENT.match, stated):
+        if found is not None and (found[3] is None or found[3] in _EXTRAS):
+            yield _library(found[1], found[2].strip(), found[3])
+
+
+def _library(name: str, bounds: str, extra: str | None) -> Check:
+    words = bounds if extra is None else f"{_EXTRAS[extra]}: {pip_install(extra)}"
+    try:
+        importlib.import_module(_MODULES.get(name, name))
         version = importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
-        version = ""
-    try:
-        importlib.import_module(module)
+        # A module of another distribution (a system's own OpenCV) has no version here, and may do.
+        return Check(name, extra is None, True, "of unknown version", words)
     except Exception as error:
-        return Check(name, True, False, f"cannot be imported: {type(error).__name__}", words)
-    # A module of another distribution (a system's own OpenCV) has no version here, and may do.
-    return Check(
-        name, True, not version or _numbers(version) >= least, version or "of unknown version", words
-    )
-
-
-def _extra(name: str, module: str, what_for: str) -> Check:
-    if importlib.util.find_spec(module) is None:
-        return Check(name, False, False, "-", what_for)
-    try:
-        return Check(name, False, True, importlib.metadata.version(name), what_for)
-    except importlib.metadata.PackageNotFoundError:
-        return Check(name, False, True, "of unknown version", what_for)
+        return Check(name, extra is None, False, f"cannot be imported: {type(error).__name__}", words)
+    least = re.search(r">= *([\d.]+)", bounds)
+    good = least is None or _numbers(version) >= _numbers(least[1])
+    return Check(name, extra is None, good, version, words)
 
 
 def _tool(names: tuple[str, ...], what_for: str) -> Check:
