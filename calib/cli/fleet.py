@@ -20,7 +20,6 @@ from calib.core.errors import EXIT_POOR
 
 if TYPE_CHECKING:
     from calib.runner.fleet import FleetSummary
-    from calib.runner.outcomes import Counts
 
 __all__ = ["fleet"]
 
@@ -81,19 +80,19 @@ def fleet(
         summary = finish(store, known)
         write_fleet_page(output / PAGE, summary)
     if as_json:
-        document("fleet", {"fleet": _as_json(summary, counts)})
+        document("fleet", {"fleet": _as_json(summary, counts["same"])})
     else:
-        _tell(summary, counts, output)
+        _tell(summary, counts["same"], output)
     narrate(f"page written to {output / PAGE}")
     if any(verdict != "ok" for verdict in summary.verdicts):
         raise typer.Exit(EXIT_POOR)
 
 
-def _as_json(summary: FleetSummary, counts: Counts) -> dict[str, Any]:
+def _as_json(summary: FleetSummary, as_before: int) -> dict[str, Any]:
     return {
         "rigs": summary.rigs,
         "verdicts": summary.verdicts,
-        "as_before": counts.as_before,
+        "as_before": as_before,
         "stages": summary.stages,
         "constants": [
             {
@@ -118,11 +117,11 @@ def _as_json(summary: FleetSummary, counts: Counts) -> dict[str, Any]:
 _MOST_TOLD = 20
 
 
-def _tell(summary: FleetSummary, counts: Counts, output: Path) -> None:
+def _tell(summary: FleetSummary, as_before: int, output: Path) -> None:
     from calib.core.files import shown
 
     words = ", ".join(f"{count} {verdict}" for verdict, count in summary.verdicts.items())
-    say(f"{summary.rigs} rigs: {words}" + (f"; {counts.as_before} as before" if counts.as_before else ""))
+    say(f"{summary.rigs} rigs: {words}" + (f"; {as_before} as before" if as_before else ""))
     rows = []
     for one in summary.constants:
         if one.standing_out or one.drifts:

@@ -55,7 +55,7 @@ def sweep(
     with at_work(output, "calib sweep", outputs, scheduler, workers, retries) as (store, pool):
         with progress_bar("cases") as progress:
             counts = run_sweep(store, pool, known, progress, limit_s)
-        summary = summarise_sweep(store, known, counts.as_before)
+        summary = summarise_sweep(store, known, counts["same"])
         write_sweep_page(output / SWEEP_PAGE, known, summary)
     if as_json:
         document("sweep", {"sweep": {**asdict(summary), "clouds": None}})

@@ -22,7 +22,6 @@ from calib.core.units import unit_of
 from calib.core.workers import Processes, Task
 from calib.runner.outcomes import (
     LIMIT_S,
-    Counts,
     Outcome,
     Progress,
     Store,
@@ -56,7 +55,7 @@ def run_fleet(
     progress: Progress = lambda done, total: None,
     tell: Callable[[str], None] = lambda _: None,
     limit_s: float = LIMIT_S,
-) -> Counts:
+) -> Counter[str]:
     """Run all rigs whose results are not there, each in `limit_s` seconds at most. Raises as `run_all`."""
     tasks = (
         Task(spec.name, calibrate_rig, (spec, options, store.known(spec.name)), limit_s)

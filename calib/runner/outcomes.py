@@ -160,19 +160,6 @@ def opened_store(out: Path, verb: str, outputs: tuple[str, ...]) -> Iterator[tup
 # All tasks: what still holds is left alone, all else is done.
 
 
-@dataclass
-class Counts:
-    """How many tasks were done now, by how they ended, and how many were done before."""
-
-    by_status: Counter[str] = field(default_factory=Counter)
-    as_before: int = 0
-
-    @property
-    def done(self) -> int:
-        """All of them."""
-        return self.as_before + sum(self.by_status.values())
-
-
 def run_all(
     store: Store,
     processes: Processes,
@@ -181,24 +168,24 @@ def run_all(
     what: str,
     progress: Progress = lambda done, total: None,
     tell: Callable[[str], None] = lambda _: None,
-) -> Counts:
-    """Run tasks that give an `Answer` and keep what comes of them; `what` a task is, for sentences.
+) -> Counter[str]:
+    """Run tasks that give an `Answer` and keep what comes of them; how many have ended with each status.
+
+    `what` a task is, for sentences. A status of `SAME` was done before.
 
     Raises `BadInputError` as `run_tasks` and `Store.keep`.
     """
-    counts = Counts()
+    counts = Counter[str]()
     progress(0, total)
     for task, result in run_tasks(processes, tasks):
         answer = Answer(_lost(task, result, what)) if isinstance(result, Failure) else result
         outcome = answer.outcome
-        if outcome.status == SAME:
-            counts.as_before += 1
-        else:
+        counts[outcome.status] += 1
+        if outcome.status != SAME:
             store.keep(answer)
-            counts.by_status[outcome.status] += 1
-            if outcome.status != "ok":
-                tell(f"{outcome.name}: {outcome.status} ({outcome.sentence})")
-        progress(counts.done, total)
+        if outcome.status not in (SAME, "ok"):
+            tell(f"{outcome.name}: {outcome.status} ({outcome.sentence})")
+        progress(counts.total(), total)
     return counts
 
 

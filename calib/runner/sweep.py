@@ -9,6 +9,7 @@ import math
 import re
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache
@@ -33,7 +34,6 @@ from calib.runner.outcomes import (
     LIMIT_S,
     SAME,
     Answer,
-    Counts,
     Outcome,
     Progress,
     Store,
@@ -358,7 +358,7 @@ def run_case(base: Base, case: Case, seed: int) -> dict[str, float | None]:
     plan = make_scenario(base.scenario, options)
     run = run_scenario(plan, plant, noise, base.feedback, base.duration_s)
     if base.kind == "scenario":
-        return {name: _or_none(value) for name, value in plan.figures(run).items()}
+        return dict(plan.figures(run))
     return _filtered(base, known, run)
 
 
@@ -418,9 +418,9 @@ def _of_tracking(figures: Tracking) -> dict[str, float | None]:
     out: dict[str, float | None] = {}
     for name, value in asdict(figures).items():
         if isinstance(value, tuple):
-            out |= {f"{name}_{i}": _or_none(part) for i, part in enumerate(value, start=1)}
+            out |= {f"{name}_{i}": part for i, part in enumerate(value, start=1)}
         else:
-            out[name] = _or_none(value)
+            out[name] = value
     return out
 
 
@@ -433,16 +433,12 @@ def _filtered(base: Base, known: Rig, run: Any) -> dict[str, float | None]:
         path = Path(place) / "log.csv"
         write_log(path, log_of(run, "log"))
         replayed = replay_log(path, known, _HERE, base.name, model=base.model)
-    out = {name: _or_none(value) for name, value in replayed.rmse.items()}
+    out: dict[str, float | None] = dict(replayed.rmse)
     for other, errors in replayed.compared.items():
-        out |= {f"{other}_{name}": _or_none(value) for name, value in errors.items()}
+        out |= {f"{other}_{name}": value for name, value in errors.items()}
     for sensor, check in replayed.sensors.items():
-        out[f"nis_{sensor}"] = _or_none(check.nis)
+        out[f"nis_{sensor}"] = check.nis
     return out
-
-
-def _or_none(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else float(value)
 
 
 # ----------------------------------------------------------------------
@@ -499,7 +495,7 @@ def run_sweep(
     spec: Sweep,
     progress: Progress = lambda done, total: None,
     limit_s: float = LIMIT_S,
-) -> Counts:
+) -> Counter[str]:
     """Run all cases that are not there, each in `limit_s` seconds at most. Raises as `run_all`."""
     base, seed = spec.base, spec.draws.seed
     whole = [program(), base.model_dump(), seed]

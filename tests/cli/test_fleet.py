@@ -271,7 +271,7 @@ def test_killed_client_and_killed_worker_end_in_the_same(environment: dict[str, 
     # A sweep at one go in one process has the same results.
     with opened_store(here, "calib sweep", ()) as (store, _):
         known = read_sweep(spec)
-        assert run_sweep(store, Here(), known).as_before == 0
+        assert run_sweep(store, Here(), known)["same"] == 0
         write_sweep_page(here / "sweep.html", known, summarise_sweep(store, known, 0))
     same = [(folder / "sweep.parquet").read_bytes() for folder in (out, here)]
     assert same[0] == same[1]

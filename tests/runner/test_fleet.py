@@ -49,14 +49,14 @@ def test_failures_are_rows_and_what_is_there_is_left_alone(tmp_path: Path) -> No
     manifest, said = Manifest(tuple(specs), ()), list[str]()
     with opened_store(tmp_path / "out", "calib fleet", ()) as (store, _):
         first = run_fleet(store, Here(), manifest, FleetOptions(), tell=said.append)
-        assert first.by_status == {"failed": 6} and first.as_before == 0
+        assert first == {"failed": 6}
         assert any(sentence.startswith("gone: failed (") for sentence in said) and len(said) == 6
         found = store.outcome("rig2")
         assert found is not None and found.code == 3
         # Bad input is bad input again; a folder that was not there may be there now.
         (tmp_path / "rig1" / "images" / "a.png").write_bytes(b"another")
         again = run_fleet(store, Here(), manifest, FleetOptions())
-        assert again.as_before == 4 and again.by_status == {"failed": 2} and again.done == 6
+        assert again == {"same": 4, "failed": 2}
 
 
 class _Failing(Here):
@@ -72,7 +72,7 @@ def test_a_rig_without_an_answer_is_a_row(tmp_path: Path) -> None:
     with opened_store(tmp_path / "out", "calib fleet", ()) as (store, _):
         counts = run_fleet(store, _Failing(), manifest, FleetOptions(), limit_s=8.0)
         found = {name: store.outcome(name) for name in ("died", "over", "raised")}
-    assert counts.by_status == {"lost": 2, "broken": 1}
+    assert counts == {"lost": 2, "broken": 1}
     assert {name: (one.key, one.sentence) for name, one in found.items() if one is not None} == {
         "died": ("", "each process that tried it died: out of memory, or a fault in a library"),
         "over": ("", "was not done after 8 s, which is the --timeout of a rig"),

@@ -97,7 +97,7 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_best_worst_and_resumed(tmp_path: Path) -> None:
     with opened_store(tmp_path / "out", "calib sweep", ()) as (store, _):
-        assert run_sweep(store, Here(), SPEC).as_before == 0
+        assert run_sweep(store, Here(), SPEC)["same"] == 0
         found = summarise_sweep(store, SPEC, 0)
         assert (found.cases, found.failed, found.why, found.measure) == (24, 1, "oh", "error")
         best = found.best[0]
@@ -118,7 +118,7 @@ def test_best_worst_and_resumed(tmp_path: Path) -> None:
         files[0].unlink()
         files[1].write_text(files[1].read_text()[:100])
         files[2].write_text(json.dumps({**json.loads(files[2].read_text()), "key": "x"}))
-        assert run_sweep(store, Here(), SPEC).as_before == 21
+        assert run_sweep(store, Here(), SPEC)["same"] == 21
         assert summarise_sweep(store, SPEC, 21).best == found.best
 
 
@@ -147,5 +147,5 @@ def test_one_case_takes_no_others_with_it(tmp_path: Path, how: str, why: str) ->
         found = summarise_sweep(store, SPEC, 0)
         assert (found.cases, found.failed, found.why) == (24, 2, why)
         # It may live another time.
-        assert run_sweep(store, Here(), SPEC).as_before == 23
+        assert run_sweep(store, Here(), SPEC)["same"] == 23
         assert summarise_sweep(store, SPEC, 23).failed == 1
