@@ -22,8 +22,8 @@ from calib.core.errors import (
     EXIT_DONE,
     EXIT_INTERNAL,
     EXIT_READER_GONE,
-    CalibError,
     UsageError,
+    end_of,
 )
 from calib.core.files import one_line
 
@@ -86,26 +86,18 @@ def _run(debug: bool, interrupts: Interrupts) -> int:
             interrupts.settle()
             return _ended(_INTERRUPTED, code)
         return code
-    except CalibError as error:
-        return _ended(str(error), error.exit_code)
     except KeyboardInterrupt:
         interrupts.settle()
         return _ended(_INTERRUPTED, _EXIT_INTERRUPTED)
-    except MemoryError:
-        return _ended("out of memory; the input is larger than this machine can hold", EXIT_BAD_INPUT)
-    except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        return _ended(f"{where}{error.strerror or error}", EXIT_BAD_INPUT)
     except Exception as error:
-        if interrupts.came:
+        code, sentence = end_of(error)
+        if code == EXIT_INTERNAL and interrupts.came:
             # A library that drops the interruption goes on with what it has not done.
             interrupts.settle()
             return _ended(_INTERRUPTED, _EXIT_INTERRUPTED)
-        if debug:
+        if code == EXIT_INTERNAL and debug:
             traceback.print_exc()
-        return _ended(
-            f"internal error: {_described(error)}; please report it (CALIB_DEBUG=1 shows more)", EXIT_INTERNAL
-        )
+        return _ended(sentence, code)
     return EXIT_DONE
 
 
@@ -114,19 +106,6 @@ def _ended(message: str, code: int) -> int:
         with contextlib.suppress(OSError):
             sys.stderr.write(f"calib: {one_line(' '.join(message.split()))}\n")
     return code
-
-
-def _described(error: BaseException) -> str:
-    """Kind and words of an exception, and where in this package it came from."""
-    where = ""
-    trace = error.__traceback__
-    while trace is not None:
-        module = str(trace.tb_frame.f_globals.get("__name__", ""))
-        if module.startswith("calib."):
-            where = f" ({module}, line {trace.tb_lineno})"
-        trace = trace.tb_next
-    words = " ".join(str(error).split())[:200]
-    return f"{type(error).__name__}{': ' if words else ''}{words}{where}"
 
 
 def _prepare_streams(debug: bool) -> None:

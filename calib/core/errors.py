@@ -58,3 +58,23 @@ class ReaderGoneError(CalibError):
     """Nobody reads stdout any more, as when `head` has seen enough; there is no one to tell."""
 
     exit_code = EXIT_READER_GONE
+
+
+def end_of(error: BaseException) -> tuple[int, str]:
+    """Exit code and sentence of an error that ends a command, with the place of a fault in this package."""
+    if isinstance(error, CalibError):
+        return error.exit_code, str(error)
+    if isinstance(error, MemoryError):
+        return EXIT_BAD_INPUT, "out of memory; the input is larger than this machine can hold"
+    if isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename else ""
+        return EXIT_BAD_INPUT, f"{where}{error.strerror or error}"
+    where, trace = "", error.__traceback__
+    while trace is not None:
+        module = str(trace.tb_frame.f_globals.get("__name__", ""))
+        if module.startswith("calib."):
+            where = f" ({module}, line {trace.tb_lineno})"
+        trace = trace.tb_next
+    words = " ".join(str(error).split())[:200]
+    what = f"{type(error).__name__}{': ' if words else ''}{words}{where}"
+    return EXIT_INTERNAL, f"internal error: {what}; please report it (CALIB_DEBUG=1 shows more)"

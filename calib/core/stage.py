@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args, get_origin, get_type_hints
 
-from calib.core.errors import EXIT_INTERNAL, BadInputError, CalibError, SomeFailedError, UsageError
+from calib.core.errors import BadInputError, CalibError, SomeFailedError, UsageError, end_of
 
 if TYPE_CHECKING:
     from calib.core.plot import Figure
@@ -81,8 +81,8 @@ class Files:
         except (ArithmeticError, ValueError) as error:
             from calib.core.files import shown
 
-            words = f"{shown(path)}: internal error: {type(error).__name__}: {error}; please report it"
-            self._fails(path, error, words, EXIT_INTERNAL)
+            code, sentence = end_of(error)
+            self._fails(path, error, f"{shown(path)}: {sentence}", code)
 
     def _fails(self, path: Path, error: Exception, words: str, exit_code: int) -> None:
         if len(self.paths) < 2:

@@ -28,7 +28,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict
 
 from calib.core.arrays import FloatArray
-from calib.core.errors import EXIT_DONE, EXIT_INTERNAL, BadInputError
+from calib.core.errors import EXIT_DONE, EXIT_INTERNAL, BadInputError, end_of
 from calib.core.files import one_line, sha256, shown
 from calib.core.workers import Failure, Processes, Task, run_tasks
 from calib.core.writing import check_writable, make_folder, replacing, write_atomically
@@ -193,14 +193,9 @@ def _lost(task: Task, failure: Failure, what: str) -> Outcome:
     sentence = {
         "died": "each process that tried it died: out of memory, or a fault in a library",
         "over": f"was not done after {task.limit_s:g} s, which is the --timeout of a {what}",
-    }.get(failure.how) or internal_error(failure.error)
+    }.get(failure.how) or end_of(failure.error or RuntimeError())[1]
     status = "broken" if failure.how == "raised" else "lost"
     return Outcome(name=task.name, status=status, code=EXIT_INTERNAL, sentence=sentence)
-
-
-def internal_error(error: Exception | None) -> str:
-    """A fault of the program as a sentence."""
-    return f"internal error: {type(error).__name__}: {' '.join(str(error).split())[:200]}"
 
 
 # ----------------------------------------------------------------------

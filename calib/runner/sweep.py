@@ -21,7 +21,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 
 from calib.core.arrays import FloatArray
-from calib.core.errors import BadInputError, CalibError
+from calib.core.errors import EXIT_INTERNAL, BadInputError, CalibError, end_of
 from calib.core.files import one_line, read_text, read_yaml_mapping, sha256, shown
 from calib.core.plot import every
 from calib.core.result import Number, Pair, Section
@@ -39,7 +39,6 @@ from calib.runner.outcomes import (
     Store,
     arrow_table,
     column,
-    internal_error,
     run_all,
     texts,
     typed,
@@ -330,10 +329,9 @@ def measured(case: Case, base: Base, seed: int, key: str, known: str) -> Answer:
     began, values, status, sentence = time.perf_counter(), dict[str, float | None](), "ok", ""
     try:
         values = run_case(base, case, seed)
-    except CalibError as error:
-        status, sentence = "failed", str(error)
     except Exception as error:
-        status, sentence = "broken", internal_error(error)
+        code, sentence = end_of(error)
+        status = "broken" if code == EXIT_INTERNAL else "failed"
     spent = round(time.perf_counter() - began, 4)
     numbers = {name: (value, None) for name, value in values.items()}
     return Answer(

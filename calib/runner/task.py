@@ -24,6 +24,7 @@ from calib.core.errors import (
     EXIT_POOR,
     BadInputError,
     CalibError,
+    end_of,
 )
 from calib.core.files import PICTURES, one_line, read_text, read_yaml_mapping, sha256, shown
 from calib.core.rig import Rig
@@ -32,7 +33,7 @@ from calib.core.writing import make_folder
 from calib.runner.cache import key_of, program
 from calib.runner.folder import Folder, folder_digests, read_folder
 from calib.runner.graph import STEPS, Runner, opened_run
-from calib.runner.outcomes import SAME, Answer, Outcome, internal_error
+from calib.runner.outcomes import SAME, Answer, Outcome
 from calib.runner.outputs import Calibrated, run_folder
 from calib.runner.processes import Here, needed
 from calib.stages import stage
@@ -524,16 +525,13 @@ def calibrate_rig(spec: RigSpec, options: FleetOptions, known: str = "") -> Answ
     try:
         with tempfile.TemporaryDirectory(prefix="rig-") as place:
             answer = _calibrated(spec, options, known, Path(place))
-    except CalibError as error:
-        answer = _failed(spec, error.exit_code, str(error))
     except Exception as error:
-        answer = _failed(spec, EXIT_INTERNAL, internal_error(error))
+        code, sentence = end_of(error)
+        answer = Answer(
+            Outcome(name=spec.name, status=_STATUS.get(code, "failed"), code=code, sentence=sentence)
+        )
     spent = {"seconds": round(time.perf_counter() - began, 3), "peak_MB": peak_memory_MB()}
     return replace(answer, outcome=answer.outcome.model_copy(update=spent))
-
-
-def _failed(spec: RigSpec, code: int, sentence: str) -> Answer:
-    return Answer(Outcome(name=spec.name, status=_STATUS.get(code, "failed"), code=code, sentence=sentence))
 
 
 def _calibrated(spec: RigSpec, options: FleetOptions, known: str, place: Path) -> Answer:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.core.command import one_command
-from calib.core.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERNAL, EXIT_POOR, CalibError
+from calib.core.errors import EXIT_DONE, EXIT_INTERNAL, EXIT_POOR, end_of
 from calib.core.files import one_line, shown
 from calib.core.rig import SECTIONS, Rig
 from calib.core.stage import Files, Stage, options_of
@@ -105,21 +105,11 @@ def perform(
         write_atomically(folder / DOCUMENT, json.dumps(told, indent=1) + "\n")
         files.finish()
         code = EXIT_DONE if made.verdict(outcome).ok else EXIT_POOR
-    except CalibError as error:
-        messages.append(f"calib: {error}")
-        code = error.exit_code
-    except MemoryError:
-        messages.append("calib: out of memory; the input is larger than this machine can hold")
-        code = EXIT_BAD_INPUT
-    except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        messages.append(f"calib: {where}{error.strerror or error}")
-        code = EXIT_BAD_INPUT
     except Exception as error:
-        if os.environ.get("CALIB_DEBUG") == "1":
+        code, sentence = end_of(error)
+        if code == EXIT_INTERNAL and os.environ.get("CALIB_DEBUG") == "1":
             traceback.print_exc()
-        messages.append(f"calib: internal error: {type(error).__name__}: {error}; please report it")
-        code = EXIT_INTERNAL
+        messages.append(f"calib: {sentence}")
     places = (f"{root}{os.sep}", f"{folder}{os.sep}")
     with contextlib.suppress(OSError):
         # Where it is that a run writes is nobody's concern.

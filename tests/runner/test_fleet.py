@@ -76,7 +76,7 @@ def test_a_rig_without_an_answer_is_a_row(tmp_path: Path) -> None:
     assert {name: (one.key, one.sentence) for name, one in found.items() if one is not None} == {
         "died": ("", "each process that tried it died: out of memory, or a fault in a library"),
         "over": ("", "was not done after 8 s, which is the --timeout of a rig"),
-        "raised": ("", "internal error: ValueError: why"),
+        "raised": ("", "internal error: ValueError: why; please report it (CALIB_DEBUG=1 shows more)"),
     }
 
 
