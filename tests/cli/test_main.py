@@ -65,7 +65,7 @@ def test_help_of_each_verb_explains_every_argument(calib, verb: str) -> None:
         (("intrinsics", "a", "--square", "20px"), "--square: '20px' has the unit 'px'"),
         (("intrinsics", "a", "--square", "20m"), "--square: '20m' is not between 0.01 mm and 10 m"),
         (("intrinsics", "a", "--image-size", "0x9"), "--image-size: '0x9' is not a picture's size"),
-        (("distortion", "--region", "5,5,1,nan"), "--region: '5,5,1,nan' is not a box"),
+        (("distortion", "--region", "5,5,1,nan"), "--region: '5,5,1,nan' is not four finite numbers"),
     ],
 )
 def test_usage_ends_with_two(calib, words: tuple[str, ...], says: str) -> None:
