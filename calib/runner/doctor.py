@@ -34,6 +34,7 @@ class Check:
 
 _MODULES = {
     "opencv-python-headless": "cv2",
+    "pillow": "PIL",
     "pyyaml": "yaml",
     "markdown-it-py": "markdown_it",
     "pyserial": "serial",

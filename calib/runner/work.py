@@ -52,7 +52,9 @@ def _carried_out(
             check_writable(files.output, None if output.kind is None else output.kind())
     if figures is not None:
         check_figures(figures)
-    rig = Rig.load(rig_path, missing_ok=True)
+    # A name that a person has mistyped is no empty rig for a stage that only reads it.
+    may_begin = made.writes_rig(options) or (rig_path.name == RIG and rig_path.parent.is_dir())
+    rig = Rig.load(rig_path, missing_ok=may_begin)
     outcome = made.run(files, rig, options)
     sections = made.sections(outcome)
     if sections:

@@ -111,9 +111,9 @@ def test_cost_on_the_plane() -> None:
     assert 0 <= u0 < u1 <= 315
     assert 0 <= v0 < v1 <= 207
     nothing = analyse_distortion(lens(), plane=PLANE)
-    assert nothing.plane is not None
-    assert nothing.plane.max_mm < 1e-9
-    assert nothing.plane.refitted_max_mm < 1e-6
+    assert nothing.plane_max_mm is not None
+    assert nothing.plane_max_mm < 1e-9
+    assert nothing.refitted_max_mm < 1e-6
 
 
 def test_projection_sigma_against_draws_with_the_best_rotation_taken_off() -> None:

@@ -94,6 +94,14 @@ def test_a_rig_without_a_plane(calib, rig) -> None:
     assert "CALIB_PLANE_INVERSE" not in text
 
 
+@pytest.mark.parametrize("name", ["rigg.yaml", "my_rgi/rig.yaml"])
+def test_a_rig_whose_name_is_mistyped_is_no_bare_board(calib, tmp_path, name: str) -> None:
+    ended = calib("firmware", "--rig", tmp_path / name, "-o", tmp_path / "out")
+    assert ended.code == 3
+    assert ended.sentence == f"{tmp_path / name}: cannot be read: there is no such file"
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_number_that_no_float_holds(calib, rig) -> None:
     text = rig.read_text()
     text = text[: text.index("\nplane:")]
