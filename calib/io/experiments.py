@@ -78,7 +78,7 @@ def _chirp(t: float) -> Shares:
 def _prbs(t: float) -> Shares:
     """Each pump jumps at random between two values, the same ones in each recording."""
     drawn = random.Random(int(2.0 * t))
-    return tuple(drawn.choice((_DEAD, 0.9)) for _ in range(2))  # type: ignore[return-value]
+    return drawn.choice((_DEAD, 0.9)), drawn.choice((_DEAD, 0.9))
 
 
 @dataclass(frozen=True)
