@@ -17,7 +17,7 @@ import importlib
 from types import SimpleNamespace
 from typing import Any
 
-__version__ = "0.1.0"
+from calib.core import __version__ as __version__
 
 _PLACES = {
     "Rig": "calib.core.rig:Rig",

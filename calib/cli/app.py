@@ -6,7 +6,6 @@ import sys
 
 import typer
 
-from calib import __version__
 from calib.cli.camera import board, export_camera, import_camera
 from calib.cli.common import telling
 from calib.cli.convert import convert
@@ -22,6 +21,7 @@ from calib.cli.simulate import simulate
 from calib.cli.sweep import sweep
 from calib.cli.track import track
 from calib.cli.verbs import OneByDefault, group, verb
+from calib.core import __version__
 from calib.stages import stage
 
 app = typer.Typer(

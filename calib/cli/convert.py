@@ -42,7 +42,7 @@ def convert(
 
     from calib.core.command import note_inputs
     from calib.core.files import shown
-    from calib.core.stage import LogOptions
+    from calib.core.options import LogOptions
     from calib.core.writing import check_writable, write_atomically, writes_through
     from calib.io.columns import COLUMNS_FILE
     from calib.io.logs import LOG, beside, iter_log, passed_over, refuse_counts

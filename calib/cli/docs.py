@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from calib import __version__
 from calib.cli.common import JsonOption, document, emit, narrate, say
+from calib.core import __version__
 from calib.core.errors import BadInputError, UsageError
 from calib.core.writing import Kind, holds
 

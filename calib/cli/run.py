@@ -54,7 +54,7 @@ def run(
     alone are the calibration of a camera. Exits 0 when the firmware can be flashed, 1 when it cannot or
     something is weak, 3 when a stage has failed.
     """
-    from calib.core.stage import LogOptions
+    from calib.core.options import LogOptions
     from calib.runner.outputs import calibrate
 
     stated = LogOptions(acc_unit, gyro_unit, None if columns is None else columns.absolute())

@@ -22,7 +22,8 @@ from calib.cli.common import (
     telling,
 )
 from calib.core.errors import EXIT_POOR
-from calib.core.stage import Files, Stage, options_of
+from calib.core.options import options_of
+from calib.core.stage import Files, Stage
 from calib.stages import STAGES, stage
 
 

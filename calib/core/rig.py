@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import yaml
 from pydantic import BaseModel, Field, field_validator
 
-from calib import __version__
+from calib.core import __version__
 from calib.core.errors import BadInputError
 from calib.core.files import one_line, read_yaml_mapping, shown
 from calib.core.result import Result, Section, identity, section_json
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from calib.core.diff import RigDiff
     from calib.stages.actuator.machine import Machine
     from calib.stages.actuator.parameters import Plant
-    from calib.stages.actuator.section import Actuator, Known, PumpSection
+    from calib.stages.actuator.section import Actuator, Known, PumpSection, Standing
     from calib.stages.align.section import Align
     from calib.stages.arm.section import Arm
     from calib.stages.camera.section import Camera, Lens, Plane
@@ -202,9 +202,9 @@ class Rig:
     def _check(self, source: Path | str) -> None:
         """Refuse values of actuator and pumps that no rig can have together."""
         from calib.stages.actuator.parameters import SUPPLY_V
-        from calib.stages.actuator.section import plant_from, standing
+        from calib.stages.actuator.section import plant_from
 
-        parts = standing(self)
+        parts = self.standing
         try:
             plant_from({key: value for key, (value, _) in parts["actuator"].items()})
         except BadInputError as error:
@@ -310,22 +310,29 @@ class Rig:
         return x0, y0, x1, y1
 
     @property
+    def standing(self) -> dict[str, Standing]:
+        """What is in force of the sections `actuator` and `pump`: value and standard deviation by key."""
+        from calib.stages.actuator.section import Known, in_force
+
+        known = self.known or Known()
+        return {"actuator": in_force(self.actuator, known.actuator), "pump": in_force(self.pump, known.pump)}
+
+    @property
     def plant(self) -> Plant:
         """The plant: nominal values, over them what was estimated, over it what is known.
 
         Raises `BadInputError` for values that no plant can have together.
         """
-        from calib.stages.actuator.section import plant_from, standing
+        from calib.stages.actuator.section import plant_from
 
-        return plant_from({key: value for key, (value, _) in standing(self)["actuator"].items()})
+        return plant_from({key: value for key, (value, _) in self.standing["actuator"].items()})
 
     @property
     def machine(self) -> Machine:
         """The plant with its pumps, by the same rule."""
         from calib.stages.actuator.machine import machine_from
-        from calib.stages.actuator.section import standing
 
-        values = standing(self)
+        values = self.standing
         return machine_from(*({k: v for k, (v, _) in values[name].items()} for name in ("actuator", "pump")))
 
     def current_plane(self, source: Path | str) -> Plane | None:

@@ -38,7 +38,7 @@ import numpy as np
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
 from calib.core.files import one_line, read_yaml_mapping, shown
-from calib.core.stage import LogOptions
+from calib.core.options import LogOptions
 from calib.core.writing import Kind, head
 
 MEASURED = (

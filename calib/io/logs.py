@@ -31,7 +31,7 @@ import numpy as np
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
 from calib.core.files import check_readable, is_bag, shown
-from calib.core.stage import NOTHING_STATED, LogOptions
+from calib.core.options import NOTHING_STATED, LogOptions
 from calib.core.verdict import Finding, Severity
 from calib.core.writing import Kind, column_names, write_atomically
 from calib.io.columns import (

@@ -22,7 +22,7 @@ import numpy as np
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
 from calib.core.files import read_bytes, shown
-from calib.core.stage import LogOptions
+from calib.core.options import LogOptions
 from calib.core.units import plain_number
 from calib.io.columns import (
     Block,

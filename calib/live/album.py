@@ -179,7 +179,7 @@ class Album:
         return camera
 
     def _carried_out(self, verb: str, pictures: Path) -> Any:
-        from calib.core.stage import options_of
+        from calib.core.options import options_of
         from calib.runner.work import carry_out
         from calib.stages import stage
 

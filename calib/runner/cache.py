@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from calib import __version__
+from calib.core import __version__
 from calib.core.errors import BadInputError
 from calib.core.files import sha256, shown
 from calib.core.writing import check_folder, make_folder, settle, sweep, try_lock, write_atomically

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from calib.core.errors import BadInputError
 from calib.core.files import PICTURES, file_sha256, inside, one_line, shown, slug
-from calib.core.stage import NOTHING_STATED, LogOptions
+from calib.core.options import NOTHING_STATED, LogOptions
 
 _LOGS = (".csv", ".tsv", ".parquet", ".mcap", ".bag", ".db3")
 

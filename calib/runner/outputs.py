@@ -12,8 +12,8 @@ from typing import Any
 
 from calib.core.errors import EXIT_DONE, BadInputError
 from calib.core.files import one_line, sha256, shown
+from calib.core.options import NOTHING_STATED, LogOptions
 from calib.core.rig import Rig
-from calib.core.stage import NOTHING_STATED, LogOptions
 from calib.core.workers import processors
 from calib.core.writing import make_folder, replacing, write_atomically
 from calib.io.columns import read_columns_file

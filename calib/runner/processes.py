@@ -22,7 +22,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from calib import __version__
+from calib.core import __version__
 from calib.core.errors import BadInputError, pip_install
 from calib.core.files import one_line
 from calib.core.workers import Failure, Pool, Task, guarded

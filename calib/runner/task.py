@@ -27,8 +27,8 @@ from calib.core.errors import (
     end_of,
 )
 from calib.core.files import PICTURES, one_line, read_text, read_yaml_mapping, sha256, shown
+from calib.core.options import name_of_flag, options_of
 from calib.core.rig import Rig
-from calib.core.stage import name_of_flag, options_of
 from calib.core.writing import make_folder
 from calib.runner.cache import key_of, program
 from calib.runner.folder import Folder, folder_digests, read_folder

@@ -18,8 +18,9 @@ from typing import Any
 from calib.core.command import one_command
 from calib.core.errors import EXIT_DONE, EXIT_INTERNAL, EXIT_POOR, end_of
 from calib.core.files import one_line, shown
+from calib.core.options import options_of
 from calib.core.rig import SECTIONS, Rig
-from calib.core.stage import Files, Stage, options_of
+from calib.core.stage import Files, Stage
 from calib.core.writing import check_figures, check_folder, check_writable, write_atomically
 from calib.stages import stage
 

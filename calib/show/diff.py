@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calib import __version__
+from calib.core import __version__
 from calib.core.arrays import FloatArray
 from calib.core.diff import SIGNIFICANT, Change, RigDiff, grid_m
 from calib.core.plot import Arrows, Field, Figure, Plot, magnified

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from calib import __version__
+from calib.core import __version__
 from calib.core.plot import Bars, Curve, Figure, Mark, Plot, Rule
 from calib.core.units import unit_of
 from calib.core.words import BLANK, SIGMA, as_words, number

@@ -14,7 +14,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from calib import __version__
+from calib.core import __version__
 from calib.core.constants import constants
 from calib.core.errors import BadInputError
 from calib.core.files import read_bytes, read_text, sha256

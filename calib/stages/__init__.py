@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 from calib.core.command import one_command
 from calib.core.errors import BadInputError
-from calib.core.stage import Files, Stage, options_of
+from calib.core.options import options_of
+from calib.core.stage import Files, Stage
 
 if TYPE_CHECKING:
     from calib.core.rig import Rig

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from calib.core.errors import BadInputError
-from calib.core.stage import LogOptions
+from calib.core.options import LogOptions
 from calib.io import unpacking as log_unpacking
 from calib.io.bags import WINDOW_S, Field, Topic, TopicMap, reader_of, rows_from_messages, topic_map
 from calib.io.logs import read_log

@@ -10,7 +10,7 @@ import pytest
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
-from calib.core.stage import LogOptions
+from calib.core.options import LogOptions
 from calib.io.columns import COLUMNS, known_name
 from calib.io.logs import Log, read_log, write_log
 

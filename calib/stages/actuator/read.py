@@ -13,8 +13,8 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.core.files import read_text, shown
+from calib.core.options import NOTHING_STATED, LogOptions
 from calib.core.rig import Rig
-from calib.core.stage import NOTHING_STATED, LogOptions
 from calib.core.units import plain_number
 from calib.io.logs import Log, check_time, read_log
 from calib.stages.actuator.identify import Start, Track, without_outliers

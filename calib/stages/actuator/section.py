@@ -19,7 +19,6 @@ from calib.core.result import CovarianceTable, NotNegative, Number, Result, Sect
 from calib.core.schema import nearest, validated
 
 if TYPE_CHECKING:
-    from calib.core.rig import Rig
     from calib.stages.actuator.parameters import Plant
 
 Acceleration = Annotated[float, Field(ge=-100.0, le=100.0, allow_inf_nan=False, strict=True)]
@@ -295,12 +294,6 @@ def in_force(
 
 Standing = Mapping[str, tuple[Any, Any]]
 """Values in force and their standard deviations by key."""
-
-
-def standing(rig: Rig) -> dict[str, Standing]:
-    """What is in force of the sections `actuator` and `pump`."""
-    known = rig.known or Known()
-    return {"actuator": in_force(rig.actuator, known.actuator), "pump": in_force(rig.pump, known.pump)}
 
 
 _VALUES = frozenset({*ActuatorParameters.model_fields, *PumpParameters.model_fields})

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from calib.core.errors import BadInputError, UsageError
-from calib.core.stage import Files, LogOptions, Stage, option
+from calib.core.options import LogOptions, option
+from calib.core.stage import Files, Stage
 from calib.core.verdict import Verdict
 
 if TYPE_CHECKING:

@@ -26,8 +26,8 @@ from pathlib import Path
 import numpy as np
 
 from calib.core.arrays import FloatArray
+from calib.core.options import NOTHING_STATED, LogOptions
 from calib.core.rig import Rig
-from calib.core.stage import NOTHING_STATED, LogOptions
 from calib.stages.actuator.identify import Start, Track, heads_of, without_outliers
 from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import Creep, Plant

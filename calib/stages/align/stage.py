@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from calib.core.errors import BadInputError
-from calib.core.stage import Files, LogOptions, Stage, option
+from calib.core.options import LogOptions, option
+from calib.core.stage import Files, Stage
 from calib.core.units import parse_length_m
 
 if TYPE_CHECKING:

@@ -9,7 +9,8 @@ from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any
 
 from calib.core.errors import UsageError
-from calib.core.stage import Files, LogOptions, Progress, Stage, option
+from calib.core.options import LogOptions, option
+from calib.core.stage import Files, Progress, Stage
 from calib.core.verdict import Finding, Verdict
 
 if TYPE_CHECKING:

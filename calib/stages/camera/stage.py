@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from calib.core.errors import BadInputError
-from calib.core.stage import Files, NoOptions, Stage, option
+from calib.core.options import NoOptions, option
+from calib.core.stage import Files, Stage
 from calib.core.units import parse_corners, parse_image_size, parse_region_px, parse_square_m
 
 if TYPE_CHECKING:

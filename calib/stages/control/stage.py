@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from calib.core.errors import BadInputError, UsageError
-from calib.core.stage import Files, Output, Stage, option
+from calib.core.options import option
+from calib.core.stage import Files, Output, Stage
 from calib.core.units import parse_angle_rad, parse_duration_s, parse_pwm_limits
 from calib.core.verdict import Finding, Verdict
 

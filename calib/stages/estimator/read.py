@@ -12,12 +12,12 @@ import numpy as np
 from calib.core.arrays import BoolArray, FloatArray
 from calib.core.errors import BadInputError
 from calib.core.files import shown
+from calib.core.options import LogOptions
 from calib.core.result import CovarianceTable
 from calib.core.rig import Geometry, Rig
-from calib.core.stage import LogOptions
 from calib.io.logs import Log, iter_log, refuse_counts
 from calib.solve.clock import time_axis
-from calib.stages.actuator.section import Standing, standing
+from calib.stages.actuator.section import Standing
 from calib.stages.align.section import SENSORS_OF, Align
 from calib.stages.estimator.baseline import BaselineSetup, undistorting_nothing
 from calib.stages.estimator.driven import PARAMETER, Drive
@@ -449,7 +449,7 @@ def _driving_covariance(
 
 def drive_from_rig(rig: Rig) -> Drive:
     """Plant and pumps with their deviations; what the rig lacks is nominal."""
-    machine, nominal, sections = rig.machine, Drive(), standing(rig)
+    machine, nominal, sections = rig.machine, Drive(), rig.standing
     table = None if rig.actuator is None else rig.actuator.covariance
     sigma = dict(zip(PARAMETER, nominal.sigma, strict=True))
     for name, (section, key) in _SIGMA.items():

@@ -24,9 +24,10 @@ from calib.core.arrays import FloatArray
 from calib.core.compilation import on_compiling
 from calib.core.errors import BadInputError
 from calib.core.files import shown
+from calib.core.options import NOTHING_STATED, LogOptions
 from calib.core.result import finite_or_none, judged
 from calib.core.rig import Rig
-from calib.core.stage import NOTHING_STATED, LogOptions, ProgressCall
+from calib.core.stage import ProgressCall
 from calib.core.verdict import Finding, Verdict
 from calib.io.logs import Log, Watch, passed_over
 from calib.io.states import STATES, states_writer

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from calib.core.errors import BadInputError, UsageError
-from calib.core.stage import Files, LogOptions, Output, Stage, option
+from calib.core.options import LogOptions, option
+from calib.core.stage import Files, Output, Stage
 
 if TYPE_CHECKING:
     from calib.core.plot import Figure

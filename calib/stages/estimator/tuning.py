@@ -11,9 +11,10 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.core.files import shown
+from calib.core.options import NOTHING_STATED, LogOptions
 from calib.core.result import judged
 from calib.core.rig import Rig
-from calib.core.stage import NOTHING_STATED, LogOptions, ProgressCall
+from calib.core.stage import ProgressCall
 from calib.core.verdict import Finding, Verdict
 from calib.stages.estimator.constant_gain import MOST_DELAY_TICKS, design, tick_noise
 from calib.stages.estimator.driven import Drive

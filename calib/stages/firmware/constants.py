@@ -18,7 +18,6 @@ from calib.core.geometry import fit_homography
 from calib.stages.actuator.kinematics import MARKER_OFFSET_M, inverse_coefficients
 from calib.stages.actuator.parameters import LONGEST_ELONGATION_M, Plant
 from calib.stages.actuator.pump import PWM_MAX, ElongationForce
-from calib.stages.actuator.section import standing
 from calib.stages.camera.model import project
 from calib.stages.control.laws import PWM_MIN, FeedForward, Pid
 from calib.stages.control.section import OrientationGains, StaticMap
@@ -58,7 +57,7 @@ class Lookup:
 
     def __init__(self, rig: Rig, source: str) -> None:
         self.rig, self.source = rig, source
-        self._standing = standing(rig)
+        self._standing = rig.standing
         self.missing: dict[str, None] = {}
 
     def find(self, key: str) -> Any:

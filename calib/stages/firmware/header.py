@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import jinja2
 
-from calib import __version__
+from calib.core import __version__
 from calib.core.result import identity
 from calib.core.verdict import Finding, Verdict
 from calib.core.writing import Kind, begins, make_folder, write_atomically

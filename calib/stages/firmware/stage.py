@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from calib.core.errors import BadInputError
-from calib.core.stage import Files, Output, Stage, option
+from calib.core.options import option
+from calib.core.stage import Files, Output, Stage
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -17,8 +17,8 @@ from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.core.files import as_text, read_bytes, shown
 from calib.core.geometry import apply_homography
+from calib.core.options import LogOptions
 from calib.core.rig import Rig
-from calib.core.stage import LogOptions
 from calib.core.verdict import Finding
 from calib.io.columns import ACCEL, GYRO
 from calib.io.logs import IMU, IN_PLANE, Log, Signals, log_of
@@ -29,13 +29,12 @@ from calib.stages.imu.sampling import (
     AXES,
     MOST_GYRO_RADPS,
     Readings,
-    Sampling,
     quiet_spread,
     regular_parts,
     sampling_findings,
 )
 from calib.stages.imu.tracks import angle_of, on_grid, rate_of
-from calib.stages.imu.tuning import DATA_SHEET, SHORTEST_S, Noise, Piece, smooth_log
+from calib.stages.imu.tuning import DATA_SHEET, SHORTEST_S, Noise, Piece, TuneLog, smooth_log
 
 _AXIS = dict(zip(IMU, AXES, strict=True))
 """Axes by column."""
@@ -183,28 +182,6 @@ class Reading:
     reference: str = "auto"
     camera: Camera | None = None
     A_inverse: FloatArray | None = None
-
-
-@dataclass(frozen=True)
-class TuneLog:
-    """A log on an even grid.
-
-    Attributes
-    ----------
-    pieces : without gaps of more than a second.
-    reference : "truth", "camera", "onchip" or "" for none, and by how much it came late.
-    quiet_radps : standard deviation of gz in the quiet windows.
-    said : what is to be known about the log. findings : on its sensors.
-    """
-
-    source: str
-    sampling: Sampling
-    pieces: tuple[Piece, ...]
-    reference: str
-    lag_s: float
-    quiet_radps: float
-    said: tuple[str, ...]
-    findings: tuple[Finding, ...] = ()
 
 
 def sensor_noise(rig: Rig, logs: Sequence[TuneLog]) -> tuple[Noise, str]:

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from calib.core.errors import BadInputError, UsageError
-from calib.core.stage import Files, LogOptions, Output, Stage, option
+from calib.core.options import LogOptions, option
+from calib.core.stage import Files, Output, Stage
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     from calib.core.writing import Kind
     from calib.stages.imu.drift import DriftInputs
     from calib.stages.imu.intrinsics import IntrinsicsInputs
-    from calib.stages.imu.read import TuneLog
     from calib.stages.imu.sampling import Readings
     from calib.stages.imu.section import (
         Drift,
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
         ImuIntrinsics,
         OrientationFilter,
     )
-    from calib.stages.imu.tuning import AngleFilter, TuneInputs
+    from calib.stages.imu.tuning import AngleFilter, TuneInputs, TuneLog
 
 _SAME_RATE = 0.02
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numba import njit
@@ -19,11 +19,8 @@ from calib.core.verdict import Finding, Severity, Verdict
 from calib.stages.imu.levelling import Levelling, level_log
 from calib.stages.imu.levelling import system as levelling_system
 from calib.stages.imu.mahony import Mahony, MahonyState, filter_log, wrapped
-from calib.stages.imu.sampling import sensor_findings
+from calib.stages.imu.sampling import Sampling, sensor_findings
 from calib.stages.imu.section import FilterCandidate, FilterLog, OrientationFilter
-
-if TYPE_CHECKING:
-    from calib.stages.imu.read import TuneLog
 
 AngleFilter = Mahony | Levelling
 """What can be asked for an angle."""
@@ -1071,6 +1068,28 @@ def contradictions(pieces: Sequence[Piece], result: Tuning) -> list[Finding]:
 
 _TILTED = 3.0
 _RINGS = 0.5
+
+
+@dataclass(frozen=True)
+class TuneLog:
+    """A log on an even grid.
+
+    Attributes
+    ----------
+    pieces : without gaps of more than a second.
+    reference : "truth", "camera", "onchip" or "" for none, and by how much it came late.
+    quiet_radps : standard deviation of gz in the quiet windows.
+    said : what is to be known about the log. findings : on its sensors.
+    """
+
+    source: str
+    sampling: Sampling
+    pieces: tuple[Piece, ...]
+    reference: str
+    lag_s: float
+    quiet_radps: float
+    said: tuple[str, ...]
+    findings: tuple[Finding, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast
 
 from calib.core.errors import BadInputError, UsageError
-from calib.core.stage import Files, LogOptions, Stage, option
+from calib.core.options import LogOptions, option
+from calib.core.stage import Files, Stage
 from calib.core.units import parse_frequency_hz, parse_jitter
 from calib.core.verdict import Finding, Verdict
 
