@@ -14,24 +14,70 @@ import shutil
 import time
 import tty
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from firmware_build import Built
+from scipy.signal import butter, sosfilt, sosfilt_zi
 
 from calib.stages.actuator.pump import static_force_N
 from calib.stages.actuator.simulate import derivative, rig_at_rest
 from calib.stages.actuator.simulate import run as run_kernel
 from calib.twin.rig import SimulatedRig
-from calib.twin.sensors import HeadMotion, draw_imu_noise, draw_tracker_noise, head_rows, measure, track
+from calib.twin.sensors import (
+    HeadMotion,
+    _read,
+    draw_imu_noise,
+    draw_tracker_noise,
+    head_rows,
+    measure,
+    track,
+)
 from calib.twin.simulate import _Plant
 
 __all__ = ["Board", "serve"]
 
 _STEP_S = 1.0 / 1200.0
-_IMU_S, _FRAME_S = 0.01, 1.0 / 60.0
+_FRAME_S = 1.0 / 60.0
+_FELT_HZ = 400.0
+_ACCEL_HZ = {code: (7.8125 * 2**code, 15.625 * 2**code) for code in range(8)}
+_GYRO_HZ = {0: (523, 2000), 1: (230, 2000), 2: (116, 1000), 3: (47, 400),
+            4: (23, 200), 5: (12, 100), 6: (64, 200), 7: (32, 100)}  # fmt: skip
+"""Bandwidths by their codes as in the BNO055's data sheet, 3.5.2, with the rates of the BMI055 inside it."""
 _PULLED_RAD = 0.45
+
+
+class _Sensor:
+    """One sensor of the BNO055: a low-pass of order two, and registers that change at a rate of its own.
+
+    Parameters
+    ----------
+    table : bandwidth and rate [Hz] by the code in its configuration. clock : its oscillator by the board's.
+    """
+
+    def __init__(self, table: Mapping[int, tuple[float, float]], clock: float) -> None:
+        self._table, self._clock = table, clock
+        self._code = -1
+        self._count = -1
+        self.value = np.zeros(3)
+
+    def feel(self, code: int, felt: np.ndarray) -> None:
+        """Take readings (1, 3) `_FELT_HZ` times a second."""
+        if code != self._code:
+            self._code = code
+            bandwidth, self._rate_hz = self._table[code]
+            self._sos = butter(2, min(bandwidth, 0.45 * _FELT_HZ), fs=_FELT_HZ, output="sos")
+            self._memory = sosfilt_zi(self._sos)[:, :, None] * felt
+        passed, self._memory = sosfilt(self._sos, felt, axis=0, zi=self._memory)
+        self.value = passed[0]
+
+    def due(self, time_s: float) -> bool:
+        """Whether the registers take the value now."""
+        count = int(time_s * self._rate_hz * self._clock)
+        new, self._count = count != self._count, count
+        return new
 
 
 class Board:
@@ -56,7 +102,10 @@ class Board:
         delay = round(self.rig.pump.delay_ticks * self.rig.pump.tick_s / _STEP_S)
         self._waiting = deque([np.zeros(2)] * delay)
         self._past = deque([self.row[:2].copy()], maxlen=round(self.rig.tracker.latency_s / _STEP_S) + 1)
-        self._imu = draw_imu_noise(self.rig.imu, seconds, seed)
+        self._imu = draw_imu_noise(replace(self.rig.imu, rate_hz=_FELT_HZ), seconds, seed)
+        # Its oscillator is as good as such are.
+        clock = 1.0 + 0.01 * (seed % 5 - 2)
+        self._chip = _Sensor(_ACCEL_HZ, clock), _Sensor(_GYRO_HZ, clock)
         frames = np.arange(int(seconds / _FRAME_S)) * _FRAME_S
         self._tracker = draw_tracker_noise(self.rig.tracker, frames, seed)
         self._shown = np.zeros(9, dtype=np.int32)
@@ -68,18 +117,36 @@ class Board:
         self.duty = (0, 0)
         self.states: list[np.ndarray] = []
         self.cut = False
-        self._show_imu(0)
+        self._sense(0)
+        self._show_imu()
         self._show_picture(0)
 
-    def _show_imu(self, k: int) -> None:
+    def _sense(self, k: int) -> None:
+        """What both sensors of the BNO055 feel, through the low-pass of each."""
         plant = self.plants[self.hoses_off]
         rates = derivative(plant.c, self.row[:6], self.row[8], self.row[9])
         ddq = np.zeros(2) if self.held else rates[2:4]
         rows = head_rows(plant.c.r, self.row[None], ddq[None])
         motion = HeadMotion(rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3:5], rows[:, 5:7])
-        force, rate = measure(self.rig.imu, self._imu, slice(k, k + 1), motion)
-        force[0, 2] += 0.02 * np.sin(k)  # no axis of a real sensor stands still
-        self._shown[:3], self._shown[3:6] = np.rint(100.0 * force[0]), np.rint(900.0 * rate[0])
+        exact = replace(self.rig.imu, accel_step_mps2=0.0, gyro_step_radps=0.0)
+        both = int(self._rig.rig_bandwidths())
+        codes = (both >> 2 & 7, both >> 11 & 7)
+        for one, code, felt in zip(
+            self._chip, codes, measure(exact, self._imu, slice(k, k + 1), motion), strict=True
+        ):
+            one.feel(code, felt)
+
+    def _show_imu(self) -> None:
+        """New values in the registers, where it is time."""
+        imu, (force, rate) = self.rig.imu, self._chip
+        if force.due(self.time_s):
+            self._shown[:3] = np.rint(
+                100.0 * _read(force.value, (0.0,) * 3, 0.0, imu.accel_step_mps2, imu.accel_range_mps2)
+            )
+        if rate.due(self.time_s):
+            self._shown[3:6] = np.rint(
+                900.0 * _read(rate.value, (0.0,) * 3, 0.0, imu.gyro_step_radps, imu.gyro_range_radps)
+            )
 
     def _show_picture(self, k: int) -> None:
         q = self._past[0][None]
@@ -109,10 +176,11 @@ class Board:
         self._past.append(self.row[:2].copy())
         self._steps += 1
         before, self.time_s = self.time_s, self._steps * _STEP_S
-        for period, show in ((_IMU_S, self._show_imu), (_FRAME_S, self._show_picture)):
+        for period, show in ((1.0 / _FELT_HZ, self._sense), (_FRAME_S, self._show_picture)):
             k = int(self.time_s / period + 1e-9)
             if k != int(before / period + 1e-9):
                 show(k)
+        self._show_imu()
         self._rig.rig_show(ctypes.c_void_p(self._shown.ctypes.data))
 
     def hear(self, words: str) -> None:

@@ -77,6 +77,20 @@ def test_steps_of_the_pumps_are_recorded_with_the_boards_own_times(bare: Built, 
     assert simulated.duty == (0, 0)
 
 
+@pytest.mark.parametrize("seed", [2, 3])
+def test_no_sample_of_the_imu_comes_twice(bare: Built, tmp_path: Path, seed: int) -> None:
+    """Whatever the sensor's clock is: it starts with 100 new rates a second, as many as are read."""
+    simulated = SimulatedBoard(bare, seed=seed)
+    _do(simulated, replace(EXPERIMENTS["static"], seconds=4.0), tmp_path / "log.csv")
+    columns = read_log(tmp_path / "log.csv").columns
+    rates = np.column_stack([columns[name] for name in ("gx_radps", "gy_radps", "gz_radps")])
+    rates = rates[~np.isnan(rates[:, 0])]
+    # Rounded to whole units, two readings in a hundred agree by chance.
+    twice = float((np.diff(rates, axis=0) == 0.0).all(axis=1).mean())
+    print(f"{twice:.1%} of {len(rates)} rates are those of the sample before")
+    assert twice < 0.04
+
+
 def test_a_rest_without_commands_leaves_the_pumps_off(bare: Built, tmp_path: Path) -> None:
     simulated, drives = SimulatedBoard(bare), []
     plan = replace(EXPERIMENTS["static"], seconds=1.0)

@@ -47,7 +47,7 @@ static unsigned char from_board[65536], to_board[4096];
 static size_t came, to_board_at, to_board_end;
 static unsigned addressed, index_, place, resets, wanted;
 static unsigned char written[8], reply[32];
-static unsigned char registers[256];
+static unsigned char registers[256], second[8]; /* `second`: of the BNO055, places 0x08 to 0x0F of page 1 */
 static unsigned noise = 1;
 static int quiet, of_caller, shown[9]; /* force, rate in the sensor's units; marker seen, u, v */
 static avr_irq_t *spi_in;
@@ -126,8 +126,10 @@ static void axes(int *force, int *rate) {
 static void imu_reply(void) {
     int force[3], rate[3], i;
     memset(reply, 0, sizeof reply);
-    if (place == 0x08) {
-        if (registers[0x3D] == 7 && !is("imu_zero")) {
+    if (registers[0x07] == 1 && place >= 0x08) {
+        reply[0] = place < 0x10 ? second[place - 8] : 0;
+    } else if (place == 0x08) {
+        if (registers[0x3D] == 5 && !is("imu_zero")) {
             axes(force, rate);
             for (i = 0; i < 3; i++) {
                 put(2 * i, force[i]);
@@ -247,7 +249,12 @@ static void on_bus(struct avr_irq_t *irq, uint32_t value, void *param) {
         }
         if (addressed != 0x54) {
             place = written[0];
-            if (index_ == 2) {
+            if (index_ == 2 && addressed == 0x28 && registers[0x07] == 1 && place >= 0x08) {
+                /* Only in the configuration mode. */
+                if (place < 0x10 && registers[0x3D] == 0) {
+                    second[place - 8] = written[1];
+                }
+            } else if (index_ == 2) {
                 registers[place] = place == 0x6B ? written[1] & 0x7F : written[1];
             }
         }
@@ -291,10 +298,19 @@ static void on_serial(struct avr_irq_t *irq, uint32_t value, void *param) {
     }
 }
 
+/* What stands in the BNO055 after its reset: 62.5 Hz, 32 Hz. */
+static void restart_imu(void) {
+    memset(registers, 0, sizeof registers);
+    memset(second, 0, sizeof second);
+    second[0] = 0x0D;
+    second[2] = 0x38;
+}
+
 static int opened(const char *path) {
     elf_firmware_t firmware;
     uint32_t flags = 0;
     memset(&firmware, 0, sizeof firmware);
+    restart_imu();
     if (elf_read_firmware(path, &firmware) != 0) {
         return 3;
     }
@@ -325,6 +341,11 @@ int rig_open(const char *path) {
 /* Whole numbers: force (3), rate (3) as the BNO055 counts, whether the marker is seen, u, v. */
 void rig_show(const int *numbers) {
     memcpy(shown, numbers, sizeof shown);
+}
+
+/* ACC_CONFIG and, 256 times, GYR_CONFIG_0 of the BNO055. */
+int rig_bandwidths(void) {
+    return second[0] + 256 * second[2];
 }
 
 /* Bytes for the board's serial port, which takes them at its own speed. */
@@ -398,7 +419,7 @@ static int go_on(double end_ms) {
         }
         if (!done && now_ms() >= at_ms) {
             if (strcmp(fault, "imu_brown_out") == 0 || strcmp(fault, "supply_reset") == 0) {
-                memset(registers, 0, sizeof registers);
+                restart_imu();
             }
             if (strcmp(fault, "supply_reset") == 0) {
                 int i;

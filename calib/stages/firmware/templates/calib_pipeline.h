@@ -154,6 +154,7 @@ typedef struct {
     float integral_rad;                   /* J of (2.3), from the gyroscope's known bias on */
 #if CALIB_LEVELLING
     float sum_rad, before_radps;          /* S, and gz of the tick before */
+    float rest_rad[2];                    /* what rounding left of phi and J, see calib_carried */
     uint16_t ticks;                       /* taken so far, up to the last change of the gains */
     uint8_t step;                         /* entry of the tables of gains */
 #endif
@@ -337,9 +338,24 @@ static inline uint8_t calib_sampled(const calib_inputs *in) {
 #endif
 
 #if !CALIB_FUSED
+#if CALIB_LEVELLING
+/*
+ * A sum of small changes, with what rounding leaves of each kept for the next (Kahan 1965): the filter remembers for
+ * half a minute, over which the roundings of 2000 ticks would add up to 4e-6 rad.
+ */
+static inline float calib_carried(float sum, float change, float *rest) {
+    float all = change + *rest, now = sum + all;
+    *rest = all - (now - sum);
+    return now;
+}
+#endif
+
 /* Angle filter: (2.3), or levelling. Returns flags. */
 static inline uint16_t calib_angle(calib_state *state, const calib_inputs *in) {
     float ax, ay, gz, e = 0.0f, phi = state->phi_rad;
+#if CALIB_LEVELLING
+    float turned = 0.0f;
+#endif
     uint16_t flags = 0;
     if (!calib_sampled(in)) {
         return calib_imu_lost(state);
@@ -349,7 +365,8 @@ static inline uint16_t calib_angle(calib_state *state, const calib_inputs *in) {
     gz = CALIB_GZ(in);
 #if CALIB_LEVELLING
     if (state->imu_age != CALIB_NEVER) {
-        phi += state->integral_rad - (0.5f * CALIB_MM_DT_S) * (gz + state->before_radps);
+        turned = state->integral_rad - (0.5f * CALIB_MM_DT_S) * (gz + state->before_radps);
+        phi += turned;
     }
     state->before_radps = gz;
 #endif
@@ -373,9 +390,10 @@ static inline uint16_t calib_angle(calib_state *state, const calib_inputs *in) {
 #if CALIB_LEVELLING
         uint8_t i = state->step;
         float S = state->sum_rad + e;
-        phi += CALIB_TABLE_READ(&calib_levelling_angle[i]) * S;
-        state->integral_rad = calib_clip(state->integral_rad + CALIB_TABLE_READ(&calib_levelling_bias[i]) * S,
-                                         CALIB_MM_INTEGRAL_LIMIT_RAD);
+        float J = calib_carried(state->integral_rad, CALIB_TABLE_READ(&calib_levelling_bias[i]) * S, &state->rest_rad[1]);
+        state->integral_rad = calib_clip(J, CALIB_MM_INTEGRAL_LIMIT_RAD);
+        turned += CALIB_TABLE_READ(&calib_levelling_angle[i]) * S;
+        phi = calib_carried(state->phi_rad, turned, &state->rest_rad[0]);
         state->sum_rad = S - CALIB_TABLE_READ(&calib_levelling_sum[i]) * S;
         if (i < CALIB_LEVELLING_STEPS - 1u) {
             state->ticks = (uint16_t)(state->ticks + 1u);
