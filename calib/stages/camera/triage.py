@@ -116,11 +116,18 @@ class _Disagreement:
     S_core: FloatArray
     d: FloatArray
     score: FloatArray
+    freedom: IntArray
     ratio: FloatArray
-    chance: FloatArray
     variance: FloatArray
     typical: float
     phi2: float
+
+    def chance(self, core: BoolArray) -> FloatArray:
+        """Probability (N,) of so large a T_i by chance."""
+        # The median of few views is uncertain; about a third of their components fix it.
+        second = max(float(self.freedom[core].sum()) / 3, 2.0)
+        found = tail_of_f(np.maximum(self.freedom, 1), second, self.ratio)
+        return np.where(self.freedom > 0, found, 1.0)
 
 
 def _disagreement(
@@ -149,11 +156,7 @@ def _disagreement(
     phi2 = max(float(np.median(white[core])) / _MEDIAN_CHI2, 1.0)
     r2 = np.clip(variance / typical, 1.0, _ODD_NOISE**2)[:, None]
     T = np.where(counts, y2 / (told * (r2 + told)), 0.0).sum(axis=1) / (typical * phi2)
-    # The median of few views is uncertain; about a third of their components fix it.
-    second = max(float(freedom[core].sum()) / 3, 2.0)
-    chance = tail_of_f(np.maximum(freedom, 1), second, T / np.maximum(freedom, 1))
-    chance = np.where(freedom > 0, chance, 1.0)
-    return _Disagreement(S_core, d, score, T / np.maximum(freedom, 1), chance, variance, typical, phi2)
+    return _Disagreement(S_core, d, score, freedom, T / np.maximum(freedom, 1), variance, typical, phi2)
 
 
 def _first_core(S: FloatArray, b: FloatArray, cost: FloatArray, measured: IntArray) -> BoolArray:
@@ -212,7 +215,7 @@ def agreement(calibration: Calibration, core: BoolArray | None = None) -> Agreem
         shift=shift * unit,
         moved=np.max(np.abs(shift) / np.maximum(sigma, 1e-300), axis=1, initial=0.0),
         moved_px=_moved_px(calibration, shift * unit),
-        chance=one.chance,
+        chance=one.chance(core),
         noise_px=noise,
         noise=noise / np.sqrt(one.typical),
         rms_px=rms,
