@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
-import os
 import re
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -136,29 +133,25 @@ def test_units_are_refused_and_then_converted(tmp_path: Path) -> None:
     assert section.gyro_bias_radps[2] == pytest.approx(0.006, abs=2e-4)
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
+@pytest.mark.parametrize("verb_", ["static", "intrinsics", "drift"])
+def test_bad_input_is_one_sentence(calib: Run, tmp_path: Path, verb_: str) -> None:
+    refused = [
         ("t_s,u_px\n0,1\n1,2\n", "log.csv: has no IMU"),
-        (HEAD + "0,0,0,0,0,0,9.8\n", "log.csv: has 1 IMU sample"),
-        (
-            HEAD + ZEROS,
-            "log.csv: all IMU readings are zero",
-        ),
+        (HEAD + ZEROS, "log.csv: all IMU readings are zero"),
         (HEAD + BLANKS, "hold no number"),
         (HEAD + "1,0,0,0,9,1,1\n0,0.1,0,0,9,1,1\n", "log.csv, line 3: t_s goes back"),
-    ],
-)
-def test_bad_input_is_one_sentence(tmp_path: Path, text: str, words: str) -> None:
-    (tmp_path / "log.csv").write_text(text)
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])}
-    command = [sys.executable, "-c", "from calib.cli.main import main; main()", "imu", "static", "log.csv"]
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 3
-    assert done.stdout == ""
-    assert words in done.stderr
-    assert len(done.stderr.splitlines()) == 1
-    assert not (tmp_path / "rig.yaml").exists()
+    ]
+    if verb_ == "static":
+        refused.append((HEAD + "0,0,0,0,0,0,9.8\n", "log.csv: has 1 IMU sample"))
+    if verb_ == "drift":
+        refused.append((HEAD + "0,0,0,0,9.8,0,0\n0.01,0,0,0.01,9.81,0.1,0\n", "log.csv: is 0.02 s long"))
+    for text, words in refused:
+        (tmp_path / "log.csv").write_text(text)
+        ended = calib("imu", verb_, "log.csv", cwd=tmp_path)
+        assert (ended.code, ended.out) == (3, "")
+        assert words in ended.sentence
+        assert len(ended.err.splitlines()) == 1
+        assert not (tmp_path / "rig.yaml").exists()
 
 
 @pytest.mark.slow
@@ -233,34 +226,6 @@ def test_units_are_refused_and_then_converted_in_imu_intrinsics(tmp_path: Path) 
     section = Rig.load(rig).imu_intrinsics
     assert section is not None
     assert section.accel.scale == pytest.approx([1.012, 0.991, 1.006], abs=3e-4)
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("t_s,u_px\n0,1\n1,2\n", "log.csv: has no IMU"),
-        (
-            HEAD_IMU_INTRINSICS + ZEROS,
-            "log.csv: all IMU readings are zero",
-        ),
-        (
-            HEAD_IMU_INTRINSICS + BLANKS,
-            "hold no number",
-        ),
-        (HEAD_IMU_INTRINSICS + "1,0,0,0,9,1,1\n0,0.1,0,0,9,1,1\n", "log.csv, line 3: t_s goes back"),
-    ],
-)
-def test_bad_input_is_one_sentence_in_imu_intrinsics(tmp_path: Path, text: str, words: str) -> None:
-    (tmp_path / "log.csv").write_text(text)
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])}
-    program = "from calib.cli.main import main; main()"
-    command = [sys.executable, "-c", program, "imu", "intrinsics", "log.csv"]
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 3
-    assert done.stdout == ""
-    assert words in done.stderr
-    assert len(done.stderr.splitlines()) == 1
-    assert not (tmp_path / "rig.yaml").exists()
 
 
 def test_the_recording_of_imu_tk_with_figures(
@@ -371,30 +336,6 @@ def test_units_are_named_and_converted(calib: Run, tmp_path: Path) -> None:
 
 
 _STUCK = HEAD + "".join(f"{i / 100},0,0,{i % 7 / 1000},9.8,0.2,{i % 5 / 10}\n" for i in range(500))
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("t_s,u_px\n0,1\n1,2\n", "log.csv: has no IMU"),
-        (
-            HEAD + ZEROS,
-            "log.csv: all IMU readings are zero",
-        ),
-        (
-            HEAD + BLANKS,
-            "gz_radps, ax_mps2 and ay_mps2 hold no number",
-        ),
-        (HEAD + "0,0,0,0,9.8,0,0\n0.01,0,0,0.01,9.81,0.1,0\n", "log.csv: is 0.02 s long"),
-    ],
-)
-def test_bad_input_is_one_sentence_in_imu_drift(calib: Run, tmp_path: Path, text: str, words: str) -> None:
-    (tmp_path / "log.csv").write_text(text)
-    ended = calib("imu", "drift", "log.csv", cwd=tmp_path)
-    assert ended.code == 3
-    assert ended.out == ""
-    assert words in ended.sentence
-    assert not (tmp_path / "rig.yaml").exists()
 
 
 def test_without_a_reference_and_with_figures(calib: Run, tmp_path: Path) -> None:

@@ -87,7 +87,15 @@ def _judged(log: Log) -> tuple[str, float]:
     return Verdict.of(findings).word, float(np.sqrt(np.mean(away**2, axis=0)).max())
 
 
-@pytest.mark.parametrize("scenario", ["static", "swing", "step", "elongation"])
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        "static",
+        "swing",
+        pytest.param("step", marks=pytest.mark.slow),
+        pytest.param("elongation", marks=pytest.mark.slow),
+    ],
+)
 def test_no_verdict_is_ok_where_a_column_is_not_what_it_says(scenario: str) -> None:
     _, log = driven_log(scenario)
     _, other = driven_log("ellipse")

@@ -7,19 +7,22 @@ the rigs' working folders there to look at. The exit code is 1 when something di
 moves code leaves the goldens as they are; a commit that changes what a user sees refreshes them.
 `tests/goldens/test_goldens.py` runs the same comparison under pytest.
 
-Everything is driven through `python -m calib` in processes of their own, and nothing of `calib` is
-imported, so that modules can move without a change here. The words of a command are part of its
-golden: exit code, stdout, stderr, and the files that it wrote. Text must be equal, spaces included.
-Numbers are equal to 1e-9 of their size on x86-64 (`RELATIVE`, `FLOOR`); where processors differ by more than
-that, a rule in `LOOSE` says so and why. Times taken, the program's version, hashes and folders are
-replaced by marks before anything is stored. Of a states file every 50th row is kept, of a page its
+Everything is driven through `python -m calib` in processes of their own, forked from one that has loaded the
+libraries, and nothing of `calib` is imported, so that modules can move without a change here. The words of
+a command are part of its golden: exit code, stdout, stderr, and the files that it wrote. Text must be
+equal, spaces included. Numbers are equal to 1e-9 of their size on x86-64 (`RELATIVE`, `FLOOR`); where
+processors differ by more than that, a rule in `LOOSE` says so and why. Times taken, the program's version,
+hashes and folders are replaced by marks before anything is stored. Of a states file every 50th row is kept,
+of a page its
 visible text.
 """
 
 from __future__ import annotations
 
 import argparse
+import atexit
 import difflib
+import functools
 import html.parser
 import json
 import math
@@ -88,24 +91,15 @@ class Rig:
 
         Without a name nothing is kept of it but that it must not fail: it prepares.
         """
-        done = subprocess.run(
-            [sys.executable, "-m", "calib", *words],
-            cwd=self.folder,
-            check=False,
-            env=_environment(),
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            timeout=600,
-        )
+        code, *outputs = _Forks.shared().run(words, self.folder)
         if not name:
-            if done.returncode:
-                raise RuntimeError(f"calib {' '.join(words)}: exit code {done.returncode}\n{done.stderr}")
+            if code:
+                raise RuntimeError(f"calib {' '.join(words)}: exit code {code}\n{outputs[1]}")
             return
-        stdout, stderr = (self._marked(text, took) for text in (done.stdout, done.stderr))
+        stdout, stderr = (self._marked(text, took) for text in outputs)
         if "--json" in words:
             stdout = as_json(stdout)
-        parts = [f"$ calib {' '.join(words)}", f"exit {done.returncode}", "--- stdout", stdout.rstrip("\n")]
+        parts = [f"$ calib {' '.join(words)}", f"exit {code}", "--- stdout", stdout.rstrip("\n")]
         parts += ["--- stderr", stderr.rstrip("\n")]
         self._add(f"{name}.txt", "\n".join(parts) + "\n")
 
@@ -175,6 +169,63 @@ def _version() -> str:
     )
     assert found is not None
     return found[1]
+
+
+class _Forks:
+    """A process that has loaded the libraries, which takes longer than most commands, and forks each."""
+
+    SCRIPT = """
+import json, os, runpy, sys
+import cv2, jinja2, numba, numpy, pydantic, scipy.linalg, scipy.optimize, scipy.signal, typer, yaml
+for line in iter(sys.stdin.readline, ""):
+    words, folder, *streams = json.loads(line)
+    child = os.fork()
+    if child == 0:
+        os.chdir(folder)
+        for number, name in enumerate((os.devnull, *streams)):
+            os.dup2(os.open(name, os.O_RDWR | os.O_CREAT | os.O_TRUNC), number)
+        sys.argv, code = ["calib", *words], 0
+        try:
+            runpy.run_module("calib", run_name="__main__")
+        except SystemExit as ended:
+            code = ended.code
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code or 0)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+"""
+
+    def __init__(self) -> None:
+        self._streams = [Path(tempfile.mkstemp()[1]) for _ in range(2)]
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", self.SCRIPT],
+            env=_environment(),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        atexit.register(self._end)
+
+    @staticmethod
+    @functools.cache
+    def shared() -> _Forks:
+        """The one of this process."""
+        return _Forks()
+
+    def run(self, words: tuple[str, ...], folder: Path) -> tuple[int, str, str]:
+        """Exit code, stdout and stderr of a command in a folder."""
+        assert self._process.stdin is not None and self._process.stdout is not None
+        print(
+            json.dumps([words, str(folder), *map(str, self._streams)]), file=self._process.stdin, flush=True
+        )
+        code = int(self._process.stdout.readline())
+        out, err = (path.read_text(encoding="utf-8") for path in self._streams)
+        return code, out, err
+
+    def _end(self) -> None:
+        self._process.communicate()
+        for path in self._streams:
+            path.unlink()
 
 
 # --- normal forms -------------------------------------------------------------------------------------------
