@@ -121,7 +121,7 @@ def _run(stage: Stage, files: Files, options: Any, figures: Path | None, as_json
         for line in as_text(blocks):
             say(line)
     for name in sections:
-        narrate(f"{name} written to {shown(files.rig_path)}")
+        narrate(f"{after.name_in_file(name)} written to {shown(files.rig_path)}")
     for sentence in () if stage.remarks is None else stage.remarks(after):
         narrate(sentence)
     files.finish()

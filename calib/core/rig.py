@@ -222,10 +222,9 @@ class Rig:
         return {name: section_json(one) for name, one in sections.items() if one is not None}
 
     def text(self) -> str:
-        """The file's text, the same for the same rig; an arm is its actuator unless there is another."""
+        """The file's text, the same for the same rig."""
         sections = self.values()
-        if "actuator" not in sections:
-            sections = {"actuator" if name == "arm" else name: one for name, one in sections.items()}
+        sections = {self.name_in_file(name): one for name, one in sections.items()}
         return yaml.safe_dump(
             {"schema": SCHEMA, **sections},
             sort_keys=False,
@@ -233,6 +232,10 @@ class Rig:
             width=110,
             allow_unicode=True,
         )
+
+    def name_in_file(self, section: str) -> str:
+        """What the file calls a section: an arm is its actuator unless there is another."""
+        return "actuator" if section == "arm" and self.actuator is None else section
 
     @property
     def inputs(self) -> dict[str, Mapping[str, str]]:

@@ -9,7 +9,6 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -19,12 +18,11 @@ from calib.core.constants import constants
 from calib.core.errors import BadInputError
 from calib.core.files import read_bytes, read_text, sha256
 from calib.core.plot import HUES, Figure
-from calib.core.rig import KINDS, Rig, kind_of
+from calib.core.rig import Rig
 from calib.core.units import unit_of
 from calib.core.verdict import Verdict
 from calib.core.words import BLANK, as_words, facts, number, short
 from calib.core.writing import Kind, holds, make_folder, write_atomically
-from calib.io.columns import COLUMNS
 from calib.runner.cache import Result, load
 from calib.runner.decision import decide, read_summary
 from calib.runner.graph import HIDDEN, STEPS
@@ -60,7 +58,6 @@ def render(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["plainly"] = plainly
     text = environment.get_template(template).render(
         style="".join(_resource(name) for name in style),
         script=words,
@@ -74,27 +71,6 @@ def render(
 
 def _resource(name: str) -> str:
     return (resources.files("calib.show") / "templates" / name).read_text(encoding="utf-8")
-
-
-def plainly(sentence: str) -> str:
-    """A sentence with words in place of keys of rig.yaml, unless it says what to write into a file."""
-
-    def words(key: re.Match[str]) -> str:
-        return key[0] if key[0] in COLUMNS else _labels().get(key[0], as_words(key[0]))
-
-    return sentence if ".yaml" in sentence or "{" in sentence else _KEY.sub(words, sentence)
-
-
-@cache
-def _labels() -> dict[str, str]:
-    """What keys of the sections are called in a sentence."""
-    fields = [pair for name in KINDS for pair in kind_of(name).model_fields.items()]
-    titles = {key: field.title.partition(", ") for key, field in fields if field.title}
-    return {key: f"{head} ({rest})" if rest else head for key, (head, _, rest) in titles.items()}
-
-
-_KEY = re.compile(r"(?<![\w./-])[a-z][A-Za-z0-9]*(?:_[A-Za-z0-9]+)+(?![\w.:/-]*[\w:/])")
-"""No part of a path, of a file's name or of what stands before a colon."""
 
 
 def _as_script(value: Any) -> str:

@@ -55,7 +55,7 @@ def test_swings_without_noise_give_the_truth() -> None:
     found = fit_tracks(Machine(), tracks, threads=1)
     for name, value in TRUTH.items():
         assert found.values[name] == pytest.approx(value, rel=0.01), name
-    assert found.fixed == {"lambda3": "lambda2 and lambda3 enter only as a product; kept at -1"}
+    assert found.fixed == {"lambda3": "creep lambda2 and creep lambda3 enter only as a product; kept at -1"}
     assert found.agreeing >= 1
 
 

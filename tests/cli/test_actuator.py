@@ -59,7 +59,7 @@ def test_swings_fill_the_section(calib: Run, rig: Path, swings: list[Path], tmp_
     assert ended.code in (0, 1)
     for words in (
         "stiffness_scale",
-        "lambda2 and lambda3 enter only as a product",
+        "creep lambda2 and creep lambda3 enter only as a product",
         "held phi",
         "zeta by peaks",
     ):
@@ -103,8 +103,8 @@ def test_what_is_known_is_kept_and_said(calib: Run, rig: Path, swings: list[Path
     rig.write_text(rig.read_text() + yaml.safe_dump({"known": {"actuator": known}}))
     ended = calib("identify", *swings, "--rig", rig, "--no-hold-back")
     assert ended.code in (0, 1)
-    assert "not estimated, for known states it: stiffness_scale" in ended.out
-    assert "known with a standard deviation, which went in: mass_kg" in ended.out
+    assert "not estimated, for known states it: stiffness (of the nominal)" in ended.out
+    assert "known with a standard deviation, which went in: mass" in ended.out
     after = yaml.safe_load(rig.read_text())
     assert after["known"]["actuator"] == known
     assert "stiffness_scale" not in after["actuator"]
@@ -149,7 +149,7 @@ def test_a_log_at_rest_names_what_it_cannot_tell(calib: Run, rig: Path, tmp_path
     still = log_file(tmp_path / "static.csv", SimulatedRig(), "static", 0, 4.0)
     ended = calib("identify", still, "--rig", rig)
     assert ended.code == 3
-    for words in ("cannot tell any parameter", "stiffness_scale", "bending_N_per_rad2", "lambda1_per_s"):
+    for words in ("cannot tell any parameter", "stiffness (of the nominal)", "bending", "creep lambda1"):
         assert words in ended.sentence
 
 

@@ -31,7 +31,6 @@ from calib.show.page import (
     _chosen,
     _resource,
     page_text,
-    plainly,
     render,
     write_page,
 )
@@ -253,27 +252,6 @@ def _drawn(root: Path, logs: int) -> list[Result | None]:
             files[name] = ""
         made.append(Result(folder, "", 0, files))
     return made
-
-
-@pytest.mark.parametrize(
-    ("sentence", "words"),
-    [
-        ("falling_N_per_s is not identifiable", "deflation is not identifiable"),
-        (
-            "damping_scale_pumps_connected is known to 28 % only",
-            "damping (pumps connected) is known to 28 % only",
-        ),
-        ("it leaves some_new_key_m as the least known.", "it leaves some new key as the least known."),
-        ("swing_1.csv: u_px has no reading in any row", "swing_1.csv: u_px has no reading in any row"),
-        (
-            "add to logs/columns.yaml the line gz_radps: x_y",
-            "add to logs/columns.yaml the line gz_radps: x_y",
-        ),
-        ("known to 0.3 mm (geometry.marker_offset_m)", "known to 0.3 mm (geometry.marker_offset_m)"),
-    ],
-)
-def test_sentences_have_words_for_keys(sentence: str, words: str) -> None:
-    assert plainly(sentence) == words
 
 
 @pytest.mark.parametrize("logs", [4, 40, 130])

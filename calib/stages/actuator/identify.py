@@ -16,7 +16,7 @@ from calib.core.verdict import Finding, Verdict
 from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import Creep, Plant
 from calib.stages.actuator.pump import ElongationForce, Orifice, Pump, RateLimit
-from calib.stages.actuator.section import CREEP
+from calib.stages.actuator.section import CREEP, label_of
 from calib.stages.actuator.simulate import simulate_batch, state_row
 
 # ----------------------------------------------------------------------
@@ -682,11 +682,6 @@ def informative(problem: Problem, residual: FloatArray, J: FloatArray, x: FloatA
     return np.asarray(H[:P, :P] - H[:P, P:] @ inverse @ H[P:, :P])
 
 
-def _words(name: str) -> str:
-    symbol = PARAMETERS[name].symbol
-    return symbol if name.startswith(symbol) else f"{name} ({symbol})"
-
-
 def _left_out(problem: Problem, S: FloatArray, held: Mapping[str, float]) -> tuple[str, str] | None:
     """A parameter that the logs cannot tell, and the sentence about it."""
     names = problem.names
@@ -701,7 +696,7 @@ def _left_out(problem: Problem, S: FloatArray, held: Mapping[str, float]) -> tup
                 how = "a product" if cosine[i, j] > 0.0 else "a ratio"
                 if not 0.99 < size[i] / size[j] < 1.01:
                     how = "one combination"
-                sentence = f"{_words(names[i])} and {_words(names[j])} enter only as {how}"
+                sentence = f"{label_of(names[i])} and {label_of(names[j])} enter only as {how}"
                 return names[j], f"{sentence}; kept at {held[names[j]]:.4g}"
     sigma = np.sqrt(np.maximum(np.diag(np.linalg.pinv(cosine, rcond=1e-10)), 0.0)) / size
     worst = int(np.argmax(sigma))
@@ -730,7 +725,7 @@ def _pruned(
 
 
 def _blind(fixed: Mapping[str, str]) -> BadInputError:
-    names = ", ".join(name for name in fixed if name != "lambda3")
+    names = ", ".join(label_of(name) for name in fixed if name != "lambda3")
     return BadInputError(
         f"identify: these logs cannot tell any parameter ({names}); expected logs in which the rig moves"
     )
@@ -1440,7 +1435,7 @@ def _bounds(solution: Solution) -> list[str]:
         spec = PARAMETERS[name]
         near = 1e-3 * spec.scale
         if value - spec.low < near or spec.high - value < near:
-            out.append(f"{name} lies at its bound {value:.4g} {spec.unit}".rstrip())
+            out.append(f"{label_of(name)} lies at its bound {value:.4g} {spec.unit}".rstrip())
     return out
 
 
@@ -1461,7 +1456,7 @@ def _of_fit(solution: Solution, known: Uncertainty, colours: Sequence[Colour]) -
     worst = max(known.inflation, key=lambda n: known.inflation[n])
     if known.inflation[worst] > _MOST_INFLATION:
         poor(
-            f"the residuals are so coloured that the deviation of {worst} had to be raised "
+            f"the residuals are so coloured that the deviation of {label_of(worst)} had to be raised "
             f"{known.inflation[worst]:.1f} times"
         )
     for colour in colours:
@@ -1474,7 +1469,7 @@ def _of_fit(solution: Solution, known: Uncertainty, colours: Sequence[Colour]) -
             poor(f"{colour.name}: {100.0 * colour.share_far:.0f} % of the poses are far off")
     names = solution.problem.names
     close = [
-        f"{names[i]} and {names[j]} {float(known.correlation[i, j]):+.2f}"
+        f"{label_of(names[i])} and {label_of(names[j])} {float(known.correlation[i, j]):+.2f}"
         for i in range(len(names))
         for j in range(i + 1, len(names))
         if abs(float(known.correlation[i, j])) > _STRONG
@@ -1544,17 +1539,18 @@ def judge(
         if "enter only" in why:
             out.append(Finding("remark", why))
         else:
-            out.append(Finding("unidentifiable", f"{name} is not identifiable from these logs: {why}"))
-    fixed = [name for name, sigma in solution.problem.stated.items() if not sigma]
+            text = f"{label_of(name)} is not identifiable from these logs: {why}"
+            out.append(Finding("unidentifiable", text))
+    fixed = [label_of(name) for name, sigma in solution.problem.stated.items() if not sigma]
     if fixed:
         out.append(Finding("remark", f"not estimated, for known states it: {', '.join(fixed)}"))
-    priors = [name for name in solution.problem.names if solution.problem.stated.get(name)]
+    priors = [label_of(name) for name in solution.problem.names if solution.problem.stated.get(name)]
     if priors:
         out.append(Finding("remark", f"known with a standard deviation, which went in: {', '.join(priors)}"))
     for name, value in solution.values.items():
         relative = known.sigma[name] / max(abs(value), 1e-12)
         if relative > _MOST_RELATIVE:
-            out.append(Finding("poor", f"{name} is known to {100.0 * relative:.0f} % only"))
+            out.append(Finding("poor", f"{label_of(name)} is known to {100.0 * relative:.0f} % only"))
     out += [*_of_fit(solution, known, colours), *_apart(solution, known)]
     for log in held:
         if log.held_phi_rad > _MOST_HELD * log.fitted_phi_rad + 1e-4:
@@ -1568,8 +1564,8 @@ def judge(
     if next_ones:
         best = next_ones[0]
         advice = (
-            f"next experiment: {best.name} ({best.what}); it would leave {best.worst} as the least known, "
-            f"to {100.0 * best.worst_relative:.2g} %"
+            f"next experiment: {best.name} ({best.what}); it would leave {label_of(best.worst)} as the least "
+            f"known, to {100.0 * best.worst_relative:.2g} %"
         )
         out.append(Finding("remark", "", advice))
     return Verdict.of(out)

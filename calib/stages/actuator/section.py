@@ -296,6 +296,17 @@ Standing = Mapping[str, tuple[Any, Any]]
 """Values in force and their standard deviations by key."""
 
 
+def label_of(parameter: str) -> str:
+    """Words for a parameter of an identification in a sentence, as "damping (hoses off)"."""
+    for kind in (ActuatorParameters, PumpParameters):
+        if parameter in kind.model_fields:
+            label, _, which = str(kind.model_fields[parameter].title).partition(", ")
+            return f"{label} ({which})" if which else label
+    if parameter in KNOTS:
+        return f"elongation at {parameter.split('_')[1].removesuffix('V')} V"
+    return f"strength of pump {parameter[-1]}"
+
+
 _VALUES = frozenset({*ActuatorParameters.model_fields, *PumpParameters.model_fields})
 _PLAIN = ("mass_kg", "inertia_kgm2", "bellows_radius_m", "rest_length_m", "stiffness_scale", "damping_ratio",
           "bending_N_per_rad2", "force_projection")  # fmt: skip

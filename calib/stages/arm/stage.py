@@ -12,6 +12,7 @@ from calib.core.errors import UsageError
 from calib.core.options import LogOptions, option
 from calib.core.stage import Files, Progress, Stage
 from calib.core.verdict import Finding, Verdict
+from calib.core.words import as_words
 
 if TYPE_CHECKING:
     from calib.core.rig import Rig
@@ -204,7 +205,7 @@ def _untold(found: Identification) -> Iterator[Finding]:
     for part in PARTS:
         mine = [one for one in part.parameters if one.name in vague and part.name in found.fit.assembly.parts]
         whole = len(mine) == len(part.parameters)
-        untold += [part.name] if whole else [one.name for one in mine]
+        untold += [part.name] if whole else [as_words(one.name) for one in mine]
         takes |= dict.fromkeys(one.identified_by for one in (mine[:1] if whole else mine))
     if untold:
         yield Finding(
