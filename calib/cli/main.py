@@ -16,7 +16,6 @@ import warnings
 from typing import NoReturn, TextIO
 
 from calib.cli.interrupts import Interrupts
-from calib.core.compiled import choose_folder
 from calib.core.errors import (
     EXIT_BAD_INPUT,
     EXIT_DONE,
@@ -32,7 +31,6 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")
 # No plugin of pydantic is wanted, and the search for them loads every installed package's metadata.
 os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
-choose_folder()
 
 _EXIT_INTERRUPTED = 130
 _INTERRUPTED = "interrupted; files that were there before are unchanged or whole"

@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from calib.core.arrays import BoolArray, FloatArray
+from calib.core.compilation import kernel
 from calib.stages.actuator.dynamics import Coefficients
 from calib.stages.actuator.kinematics import (
     MARKER_OFFSET_M,
@@ -65,7 +65,7 @@ MOTION = ("phi_rad", "dphi_radps", "ddphi_radps2", "x_m", "y_m", "ax_mps2", "ay_
 """Columns of `head_rows`, in the world frame."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def states_between(node_s: float, nodes: FloatArray, t_s: FloatArray) -> FloatArray:
     """States (m, 10) at the times (m,) from nodes (n, 10); see `sensors.Trajectory`."""
     last = len(nodes) - 1
@@ -79,7 +79,8 @@ def states_between(node_s: float, nodes: FloatArray, t_s: FloatArray) -> FloatAr
         i = int(place)
         s = place - i
         if i >= last or s == 0.0:
-            out[row] = nodes[min(i, last)]
+            for k in range(nodes.shape[1]):
+                out[row, k] = nodes[min(i, last), k]
             continue
         a, b = nodes[i], nodes[i + 1]
         for k in range(4, nodes.shape[1]):
@@ -93,7 +94,7 @@ def states_between(node_s: float, nodes: FloatArray, t_s: FloatArray) -> FloatAr
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def head_rows(r: float, states: FloatArray, ddq: FloatArray) -> FloatArray:
     """Motion (m, 7) of the head, see `MOTION`, from states (m, 10) and accelerations (m, 2) [m/s^2]."""
     out = np.empty((len(states), 7))

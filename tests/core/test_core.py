@@ -1,4 +1,4 @@
-"""Files written whole or not at all, bounded YAML, quantities with units, and errors as a user sees them."""
+"""Files written whole or not at all, bounded YAML, quantities with units, errors as seen, compilation."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import errno
 import math
 import os
 import pickle
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -290,3 +292,43 @@ def test_an_error_goes_between_processes() -> None:
     error = pickle.loads(pickle.dumps(BadInputError("a\nb")))
     assert isinstance(error, BadInputError)
     assert str(error) == r"a\nb"
+
+
+# ----------------------------------------------------------------------
+# What numba compiles.
+
+
+def test_of_two_processes_that_need_a_function_one_compiles_it(tmp_path: Path) -> None:
+    (tmp_path / "compiled_once.py").write_text(
+        "from calib.core.compilation import kernel, on_compiling\n"
+        "@kernel()\n"
+        "def total(values):\n"
+        "    found = 0.0\n"
+        "    for value in values:\n"
+        "        found += value\n"
+        "    return found\n"
+    )
+    program = (
+        "import numpy as np, compiled_once as c\n"
+        "input()\n"
+        "with c.on_compiling(lambda: print('compiled')):\n"
+        "    assert c.total(np.ones(3)) == 3.0\n"
+    )
+    both = [
+        subprocess.Popen(
+            [sys.executable, "-c", program],
+            cwd=tmp_path,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        for _ in range(2)
+    ]
+    for one in both:
+        assert one.stdin is not None
+        one.stdin.write("\n")
+        one.stdin.flush()
+    told = [one.communicate(timeout=120)[0] for one in both]
+    assert [one.returncode for one in both] == [0, 0]
+    assert sorted(told) == ["", "compiled\n"]
+    assert not list(tmp_path.rglob("*.lock"))

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field, replace
 from itertools import combinations, pairwise
 
 import numpy as np
-from numba import njit
 from scipy.special import chdtri
 
 from calib.core.arrays import BoolArray, FloatArray
+from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
 from calib.stages.actuator.identify import scaled_inverse
 from calib.stages.actuator.pump import PWM_MAX
@@ -124,7 +124,7 @@ class Shape:
 _STRAIGHT = Shape()
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _risen(p: float, g: float, lag_s: float, limit: float, for_s: float) -> float:
     """Pressure of the lag after some time under one command."""
     steep_s = max((g - p) / limit - lag_s, 0.0)
@@ -133,7 +133,7 @@ def _risen(p: float, g: float, lag_s: float, limit: float, for_s: float) -> floa
     return g + (p + limit * steep_s - g) * math.exp(-(for_s - steep_s) / lag_s)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _lag(t: FloatArray, s: FloatArray, p: float, z: float, theta: FloatArray, out: FloatArray) -> None:
     p += z
     begin, i = t[0], 0
@@ -148,7 +148,7 @@ def _lag(t: FloatArray, s: FloatArray, p: float, z: float, theta: FloatArray, ou
         begin = end
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _flow(theta: FloatArray, g: float, p: float, z: float, hose: float) -> float:
     a, b = theta[2], theta[3]
     drop = g - p
@@ -156,7 +156,7 @@ def _flow(theta: FloatArray, g: float, p: float, z: float, hose: float) -> float
     return float(w - p / theta[4] - hose * (p - z))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _orifice(t: FloatArray, s: FloatArray, p: float, z: float, theta: FloatArray, out: FloatArray) -> None:
     z += p
     begin, i, hose, fills = t[0], 0, 0.0, 0.0

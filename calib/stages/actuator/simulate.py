@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TypeVar, cast
 
 import numpy as np
-from numba import njit
 
 from calib.core.arrays import FloatArray, IntArray
+from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
 from calib.stages.actuator.dynamics import Coefficients, coefficients, linearised, rates
 from calib.stages.actuator.kinematics import LARGEST_ANGLE_RAD, inlined
@@ -62,18 +61,6 @@ LANE_COEFFICIENTS = 18
 """Rows of the coefficients of `run_lanes`: 13 of the plant, decay, and 4 of the pump."""
 
 
-Function = TypeVar("Function", bound=Callable[..., object])
-
-
-def _compiled(function: Function) -> Function:
-    """Compile at the first call; keep the result on disk where some folder can be written."""
-    try:
-        kept = njit(cache=True, nogil=True, error_model="numpy")(function)
-    except RuntimeError:
-        kept = njit(nogil=True, error_model="numpy")(function)
-    return cast(Function, kept)
-
-
 @inlined
 def _step(
     c: Coefficients,
@@ -104,7 +91,7 @@ def _step(
     )
 
 
-@_compiled
+@kernel()
 def run(
     c: Coefficients,
     pump: PumpCoefficients,
@@ -157,7 +144,7 @@ def run(
     return -1
 
 
-@_compiled
+@kernel()
 def derivative(c: Coefficients, y: FloatArray, F1: float, F2: float) -> FloatArray:
     """Rate (6,) of the mechanical state (q1, q2, dq1, dq2, z1, z2) under the forces F1, F2 [N]."""
     r = c.r
@@ -179,7 +166,7 @@ def derivative(c: Coefficients, y: FloatArray, F1: float, F2: float) -> FloatArr
     return out
 
 
-@_compiled
+@kernel()
 def run_lanes(
     kind: int,
     table: FloatArray,

@@ -114,7 +114,8 @@ def states_of(span: IntArray, basis: FloatArray, c: FloatArray, sensor: FloatArr
                 phi += basis[n, d, j] * c[span[n] + j, 0]
                 length += basis[n, d, j] * c[span[n] + j, 1]
             states[n, 2 * d], states[n, 2 * d + 1] = phi, length
-        states[n, 6:] = sensor
+        for k in range(len(sensor)):
+            states[n, 6 + k] = sensor[k]
         states[n, 13] = 0.0
     return states
 

@@ -37,9 +37,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from calib.core.arrays import FloatArray
+from calib.core.compilation import kernel
 
 STEP_S = 0.02
 """Of the free run; a tenth of the fastest lag that pressures and motion capture at 90 Hz show."""
@@ -234,7 +234,7 @@ class Trial:
     pwm: bool = False
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _nozzle(ratio):  # type: ignore[no-untyped-def]
     """psi of ISO 6358 at a ratio of absolute pressures."""
     if ratio >= 1.0:
@@ -243,7 +243,7 @@ def _nozzle(ratio):  # type: ignore[no-untyped-def]
     return math.sqrt(1.0 - beyond * beyond)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _valve(command, start_kpa, q, step_s):  # type: ignore[no-untyped-def]
     rate, drains, overlap, opening, supply, exhaust, source, line, ratio, leak = q
     out = np.empty(len(command))
@@ -276,7 +276,7 @@ def _valve(command, start_kpa, q, step_s):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _lag(command, start_kpa, q, step_s):  # type: ignore[no-untyped-def]
     level, rises_s, falls_s = q
     out = np.empty(len(command))
@@ -288,7 +288,7 @@ def _lag(command, start_kpa, q, step_s):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _segment(pressure, angle, chord, q, gain, moment, step_s):  # type: ignore[no-untyped-def]
     rest, linear, fill, lag, stiffens, stop, reach, creep, creep_s, vented, settling_s, sooner = q[:12]
     compliance, c0, c1, c2 = q[12:]

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 from scipy.special import chdtrc, chdtri
 
 from calib.core.arrays import BoolArray, FloatArray, IntArray
+from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
 
 
 # Additions may be taken in any order, so that several are done at once.
-@njit(cache=True, nogil=True, fastmath={"reassoc", "nsz", "contract"})
+@kernel(reordered=True)
 def _squares(x: FloatArray, m: int) -> float:
     """Sum of (x_(k+2m) - 2 x_(k+m) + x_k)^2 over x (n,), zero where n <= 2 m."""
     total = 0.0

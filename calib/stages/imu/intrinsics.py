@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numba import njit
 from scipy.special import fdtrc
 
 from calib.core.arrays import FloatArray, IntArray
+from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
 from calib.core.result import finite_or_none, judged
 from calib.core.verdict import Finding, Verdict
@@ -42,14 +42,14 @@ from calib.stages.imu.section import (
 # A direction fixed in the world, seen by a sensor that turns at w: dv/dt = v x w, by Runge and Kutta.
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _cross(v: FloatArray, w: FloatArray, out: FloatArray) -> None:
     out[0] = v[1] * w[2] - v[2] * w[1]
     out[1] = v[2] * w[0] - v[0] * w[2]
     out[2] = v[0] * w[1] - v[1] * w[0]
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def turn_directions(
     rates: FloatArray, starts: IntArray, stops: IntArray, before: FloatArray, period_s: float, out: FloatArray
 ) -> None:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 
 from calib.core.arrays import FloatArray
+from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
 from calib.stages.imu.mahony import MahonyState, checked
 
@@ -84,7 +84,7 @@ class Levelling:
         return (self.velocity_mps / _G) ** 2, self.angle_rad**2, self.bias_radps**2
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _gains(P: FloatArray, dt: float, r: float, q: float, q_b: float, K: FloatArray) -> None:
     """Propagates P (vv, ve, vb, ee, eb, bb) over a step and an update; fills K of V, angle and bias."""
     vv, ve, vb, ee, eb, bb = P[0], P[1], P[2], P[3], P[4], P[5]
@@ -101,7 +101,7 @@ def _gains(P: FloatArray, dt: float, r: float, q: float, q_b: float, K: FloatArr
     P[3], P[4], P[5] = ee - ve * K[1], eb - ve * K[2], bb - vb * K[2]
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _run(
     t: FloatArray,
     phi_acc: FloatArray,
@@ -130,7 +130,7 @@ def _run(
         out_integral[k] = integral
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _table(densities: tuple[float, float, float], P: FloatArray, dt: float, out: FloatArray) -> None:
     for k in range(len(out)):
         _gains(P, dt, densities[0], densities[1], densities[2], out[k])
@@ -222,7 +222,7 @@ _TURNED_G = 0.015
 """Rest: readings this near to their means, and a mean force that has moved by no more since rest began."""
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _turned(x: FloatArray, w: FloatArray, dt: float) -> None:
     """x <- x + (x x w) dt to the second order: a vector at rest in the world, seen by a sensor that turns."""
     a, b, c = dt * w[0], dt * w[1], dt * w[2]
@@ -232,7 +232,7 @@ def _turned(x: FloatArray, w: FloatArray, dt: float) -> None:
     x[2] += d2 + 0.5 * (d0 * b - d1 * a)
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _run_three(
     t: FloatArray,
     force: FloatArray,
@@ -241,37 +241,45 @@ def _run_three(
     P: FloatArray,
     out: FloatArray,
 ) -> None:
+    # Element by element: numba compiles 3 s longer for whole arrays and np.cross.
     r, q, q_b = densities
-    K = np.zeros(3)
+    K, w = np.zeros(3), np.zeros(3)
     u, V, b = force[0].copy(), np.zeros(3), np.zeros(3)
     mean_w, mean_f, at_rest = gyro[0].copy(), force[0].copy(), force[0].copy()
     still = 0.0
-    out[0] = u
+    for i in range(3):
+        out[0, i] = u[i]
     for k in range(1, len(t)):
         dt = t[k] - t[k - 1]
         if dt > 0.0:
-            w = 0.5 * (gyro[k - 1] + gyro[k]) - b
+            for i in range(3):
+                w[i] = 0.5 * (gyro[k - 1, i] + gyro[k, i]) - b[i]
             _turned(u, w, dt)
             _turned(V, w, dt)
-            V += dt * (force[k] - u)
+            for i in range(3):
+                V[i] += dt * (force[k, i] - u[i])
             _gains(P, dt, r, q, q_b, K)
-            b += K[2] * np.cross(u, V)
-            u += K[1] * V
-            V -= K[0] * V
+            b[0] += K[2] * (u[1] * V[2] - u[2] * V[1])
+            b[1] += K[2] * (u[2] * V[0] - u[0] * V[2])
+            b[2] += K[2] * (u[0] * V[1] - u[1] * V[0])
             share = min(dt / min(t[k] - t[0] + dt, _MEAN_S), 1.0)
-            mean_w += share * (gyro[k] - mean_w)
-            mean_f += share * (force[k] - mean_f)
-            quiet = (
-                np.abs(gyro[k] - mean_w).max() < _QUIET_RADPS
-                and np.abs(force[k] - mean_f).max() < _QUIET_G
-                and (still < _REST_S / 2 or np.abs(mean_f - at_rest).max() < _TURNED_G)
-            )
-            still = still + dt if quiet else 0.0
-            if still < _REST_S / 2:
-                at_rest[:] = mean_f
-            if still >= _REST_S:
-                b += min(dt / (2.0 * _MEAN_S), 1.0) * (mean_w - b)
-        out[k] = u
+            quiet, stays = True, True
+            for i in range(3):
+                u[i] += K[1] * V[i]
+                V[i] -= K[0] * V[i]
+                mean_w[i] += share * (gyro[k, i] - mean_w[i])
+                mean_f[i] += share * (force[k, i] - mean_f[i])
+                quiet = quiet and abs(gyro[k, i] - mean_w[i]) < _QUIET_RADPS
+                quiet = quiet and abs(force[k, i] - mean_f[i]) < _QUIET_G
+                stays = stays and abs(mean_f[i] - at_rest[i]) < _TURNED_G
+            still = still + dt if quiet and (stays or still < _REST_S / 2) else 0.0
+            for i in range(3):
+                if still < _REST_S / 2:
+                    at_rest[i] = mean_f[i]
+                if still >= _REST_S:
+                    b[i] += min(dt / (2.0 * _MEAN_S), 1.0) * (mean_w[i] - b[i])
+        for i in range(3):
+            out[k, i] = u[i]
 
 
 def level_three(

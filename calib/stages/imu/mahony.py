@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from calib.core.arrays import FloatArray
+from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
 
 # ----------------------------------------------------------------------
@@ -75,7 +75,7 @@ def wrapped(angle_rad: FloatArray) -> FloatArray:
 
 
 # A product and a sum may be rounded once; nothing else is loosened.
-@njit(cache=True, nogil=True)
+@kernel()
 def advance(
     phi: float, integral: float, phi_acc: float, w: float, dt: float, Kp: float, Ki: float
 ) -> tuple[float, float]:
@@ -87,7 +87,7 @@ def advance(
     return phi + (dt * (Kp + Ki * dt) * e + turned), integral + Ki * dt * e
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _run(
     t: FloatArray,
     phi_acc: FloatArray,

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
 import numpy as np
-from numba import njit
 from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 from scipy.special import ndtri, stdtrit
 
 from calib.core.arrays import FloatArray, IntArray
+from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
 from calib.core.result import degrees_or_none, finite_or_none, judged
 from calib.core.verdict import Finding, Severity, Verdict
@@ -396,7 +396,7 @@ class Smoothed:
     lever_m: FloatArray
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _forward(
     z: FloatArray,
     X: FloatArray,
@@ -517,7 +517,7 @@ def _blocks(
     return _Blocks(tb, db, X, dt, np.diff(th, prepend=th[0]))
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _likelihoods(
     z: FloatArray,
     X: FloatArray,
