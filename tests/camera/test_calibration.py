@@ -459,7 +459,7 @@ def test_the_chosen_lens_is_nearly_the_best_for_real_pictures(name: str, shared_
 
 
 @pytest.mark.parametrize("skew_px", [0.0, 1.0])
-@pytest.mark.parametrize("roll_deg", [5.0, 180.0])
+@pytest.mark.parametrize("roll_deg", [5.0, pytest.param(180.0, marks=pytest.mark.slow)])
 def test_a_skew_is_chosen_where_the_views_show_one(skew_px: float, roll_deg: float) -> None:
     camera = replace(camera_of(), skew_px=skew_px)
     views = take(np.random.default_rng(2), camera, 14, recipe=Recipe(roll_deg=roll_deg))

@@ -29,7 +29,12 @@ def _pictures(drawing: Drawing, count: int, blur_px: float) -> tuple[list[np.nda
     return pictures, [inner_corners(drawing, *p) for p in poses]
 
 
-@pytest.mark.parametrize("name", BOARDS)
+_OTHERS = ("before OpenCV 4.6", "thin margins")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(one, marks=[pytest.mark.slow] if one in _OTHERS else []) for one in BOARDS]
+)
 def test_corners_against_truth_and_opencv(name: str) -> None:
     """Boards cut by the border: more corners than OpenCV finds, each at most half as far off."""
     drawing, blur_px = BOARDS[name]
@@ -60,6 +65,7 @@ def test_a_charuco_board_is_no_plain_board() -> None:
         assert detect(gray, drawing.columns - 1, drawing.rows - 1) is None
 
 
+@pytest.mark.slow
 def test_nothing_has_markers_that_has_none(project_root: Path) -> None:
     rng = np.random.default_rng(0)
     views = [read_picture(path).gray for path in list_pictures([project_root / "images"])[:2]]

@@ -74,7 +74,7 @@ def test_one_step_without_a_view_agrees_with_a_fit_without_it() -> None:
 
 
 @pytest.mark.parametrize("kind", SPOILS)
-@pytest.mark.parametrize(("count", "seed"), [(14, 3), (6, 8)])
+@pytest.mark.parametrize(("count", "seed"), [pytest.param(14, 3, marks=pytest.mark.slow), (6, 8)])
 def test_a_bad_view_leaves(kind: str, count: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     camera = camera_of()

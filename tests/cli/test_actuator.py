@@ -153,6 +153,7 @@ def test_a_log_at_rest_names_what_it_cannot_tell(calib: Run, rig: Path, tmp_path
         assert words in ended.sentence
 
 
+@pytest.mark.slow
 def test_a_pump_and_both_its_models(calib: Run, tables: list[Path], tmp_path: Path) -> None:
     rig = tmp_path / "rig.yaml"
     ended = calib(

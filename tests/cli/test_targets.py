@@ -12,6 +12,8 @@ import pytest
 import yaml
 from boards import CAMERA, charuco, pose, render
 
+from .conftest import Ended
+
 BOARD = charuco(8, 6, cv2.aruco.DICT_4X4_50, 0.75)
 
 
@@ -24,9 +26,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_partial_views_make_a_camera(calib, folder, tmp_path) -> None:
-    rig = tmp_path / "rig.yaml"
-    ended = calib("intrinsics", folder, "--rig", rig, "--model", "radial2")
+@pytest.fixture(scope="module")
+def made(calib, folder: Path) -> tuple[Ended, Path]:
+    """How the calibration of these pictures ended, and its rig.yaml."""
+    rig = folder / "rig.yaml"
+    return calib("intrinsics", folder, "--rig", rig, "--model", "radial2"), rig
+
+
+def test_partial_views_make_a_camera(calib, folder, made, tmp_path) -> None:
+    ended, rig = made
     assert "found a ChArUco board with 7x5 inner corners and markers of 4X4_50" in ended.err
     assert ended.code == 0, ended.out
     camera = yaml.safe_load(rig.read_text())["camera"]
@@ -34,7 +42,9 @@ def test_partial_views_make_a_camera(calib, folder, tmp_path) -> None:
     for name in ("fx_px", "fy_px", "cx_px", "cy_px"):
         assert abs(camera[name] - getattr(CAMERA, name)) < 3 * camera["sigma"][name]
     few = _few(folder, tmp_path)
-    named = calib("intrinsics", few, "--rig", rig, "--corners", "5x7", "--dictionary", "dict_4x4_250")
+    named = calib(
+        "intrinsics", few, "--rig", tmp_path / "rig.yaml", "--corners", "5x7", "--dictionary", "dict_4x4_250"
+    )
     assert named.code in (0, 1) and "inner corners and markers of 4X4_50" in named.err
 
 
@@ -63,10 +73,10 @@ def test_what_the_pictures_do_not_show(calib, folder, tmp_path, words, code, say
     assert not rig.exists()
 
 
-def test_a_plane_by_a_board_that_lies_any_way(calib, tmp_path) -> None:
+def test_a_plane_by_a_board_that_lies_any_way(calib, made, tmp_path) -> None:
     """The world's axes follow the markers, where a plain board's picture could be read from either end."""
     square_m = 0.02
-    rig, plane = tmp_path / "rig.yaml", tmp_path / "plane"
+    rig, plane = Path(shutil.copy(made[1], tmp_path)), tmp_path / "plane"
     plane.mkdir()
     text = (
         "corners: [7, 5]\nsquare_m: 0.02\nfirst_corner_m: [0.02, 0.02]\nangle_rad: 0.0\ndictionary: 4X4_50\n"
@@ -75,11 +85,6 @@ def test_a_plane_by_a_board_that_lies_any_way(calib, tmp_path) -> None:
     R = cv2.Rodrigues(np.array([0.2, 0.1, 0.0]))[0] @ cv2.Rodrigues(np.array([0.0, 0.0, 2.5]))[0]
     t = np.array([0.3, -0.2, 8.0]) - R @ np.array([4.0, 3.0, 0.0])
     cv2.imwrite(str(plane / "plane.png"), render(BOARD, R, t))
-    images = tmp_path / "images"
-    images.mkdir()
-    for seed in range(8):
-        cv2.imwrite(str(images / f"{seed}.png"), render(BOARD, *pose(BOARD, seed, 0.8, 0.1), seed=seed))
-    assert calib("intrinsics", images, "--rig", rig, "--model", "radial2").code in (0, 1)
     ended = calib("extrinsics", plane, "--rig", rig)
     assert ended.code in (0, 1), ended.err
     section = yaml.safe_load(rig.read_text())["plane"]

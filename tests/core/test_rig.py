@@ -313,7 +313,7 @@ CONSISTENT: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("name", [name for name in KINDS if name != "provenance"])
-@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.filter_too_much])
+@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.filter_too_much])
 @given(data=st.data())
 def test_every_section_comes_back_from_the_file_as_it_was(name: str, data: st.DataObject) -> None:
     kind = kind_of(name)

@@ -126,22 +126,48 @@ def test_the_tutorial_prints_what_it_shows(tmp_path: Path, monkeypatch: pytest.M
         names: dict[str, Path] = {}
         exec(compile(block, "tutorial.md", "exec"), names)
         names["zoomed"].rename(tmp_path / "zoomed")
-    environment = {**os.environ, "PYTHON": sys.executable, "PYTHONPATH": str(ROOT)}
     compared = 0
     for line, block in blocks(text, "console"):
-        lines = block.splitlines()
-        commands = [row.removeprefix("$ ") for row in lines if row.startswith("$ ")]
-        expected = [row for row in lines if not row.startswith("$ ")]
-        printed = ""
-        for command in commands:
-            done = subprocess.run(
-                ["bash", "-c", SHELL + command], env=environment, capture_output=True, text=True, check=False
-            )
-            assert done.returncode in (0, 1), f"line {line}: {command}: {done.stderr}"
-            printed += done.stdout
-        compare(expected, printed.splitlines(), f"tutorial.md, line {line}")
-        compared += len(expected)
+        compared += shows_what_is_printed(block, f"tutorial.md, line {line}")
     assert compared > 50
+
+
+def shows_what_is_printed(block: str, where: str, folder: Path | None = None) -> int:
+    """Run the commands of a block and compare; how many lines it shows."""
+    environment = {**os.environ, "PYTHON": sys.executable, "PYTHONPATH": str(ROOT)}
+    lines = block.splitlines()
+    expected = [row for row in lines if not row.startswith("$ ")]
+    printed = ""
+    for command in (row.removeprefix("$ ") for row in lines if row.startswith("$ ")):
+        done = subprocess.run(
+            ["bash", "-c", SHELL + command],
+            env=environment, capture_output=True, text=True, check=False, cwd=folder,
+        )  # fmt: skip
+        assert done.returncode in (0, 1), f"{where}: {command}: {done.stderr}"
+        printed += done.stdout or done.stderr
+    compare(expected, printed.splitlines(), where)
+    return len(expected)
+
+
+_OTHER_FILES = ("live", "imu intrinsics", "identify arm", "identify pump", "identify stiffness", "record",
+                "track", "firmware --check", "fleet", "sweep", "doctor")  # fmt: skip
+"""Verbs whose blocks in the reference show recordings, a board, or what is installed."""
+
+
+@pytest.mark.slow
+def test_the_reference_prints_what_it_shows(tmp_path: Path) -> None:
+    """Each block of output.md on the folder that its first command makes."""
+    text, stale, compared = (MANUAL / "reference" / "output.md").read_text(encoding="utf-8"), [], 0
+    for line, block in blocks(text, "console"):
+        if block.startswith(tuple(f"$ calib {verb}" for verb in _OTHER_FILES)):
+            continue
+        folder = tmp_path / "twin" if (tmp_path / "twin").exists() else tmp_path
+        try:
+            compared += shows_what_is_printed(block, f"output.md, line {line}", folder)
+        except AssertionError as error:
+            stale.append(str(error))
+    assert not stale, "\n".join(stale)
+    assert compared > 200
 
 
 def compare(expected: list[str], printed: list[str], where: str) -> None:

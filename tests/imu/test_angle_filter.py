@@ -548,7 +548,7 @@ def _spoilt(piece: Piece, way: str) -> Piece:
     }[way]
 
 
-@pytest.mark.parametrize("reference", [True, False])
+@pytest.mark.parametrize("reference", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_no_gains_are_ok_from_a_log_that_contradicts_itself(reference: bool) -> None:
     ways = ("gz sign", "gz double", "gz late", "gz of another log", "ax for ay", "ay late", "ay double")
     for way in ways:
