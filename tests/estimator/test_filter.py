@@ -298,7 +298,9 @@ def test_compiled_smoother_equals_matrices() -> None:
     levels, _ = setup.process.arrays()
     expected_x, expected_P = reference.extended_smoothed(setup, events, x, P)
     deviation = np.sqrt(np.diagonal(P, axis1=1, axis2=2)) + 1e-12
-    smoother.backward(events.t_s, np.tile(levels[0], (len(x), 1)), trace, x, P, True)
+    smoother.backward(
+        events.t_s, np.tile(levels[0], (len(x), 1)), trace, np.ones(len(x), dtype=np.bool_), x, P, True
+    )
     np.testing.assert_allclose(x / deviation, expected_x / deviation, rtol=0, atol=1e-5)
     np.testing.assert_allclose(P[:, :2, :2], expected_P[:, :2, :2], rtol=1e-4, atol=1e-14)
 

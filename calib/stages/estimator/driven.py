@@ -14,15 +14,22 @@ from calib.stages.actuator.kinematics import chord_decay_w, chord_ratio_w
 from calib.stages.actuator.parameters import DAMPING_SCALE_FREE, Plant, pumps_connected
 from calib.stages.actuator.pump import Pump, PumpCoefficients, advance_pump, pump_coefficients, static_force_N
 from calib.stages.estimator.kinematic import (
+    COUNT,
     FASTEST_MPS,
+    NEWEST,
     OUT,
     Filter,
     Rows,
     Setup,
     advance,
     begin_row,
+    count_first,
     even_times,
+    finish_row,
+    make_room,
     new_clock,
+    settle_event,
+    write_columns,
 )
 from calib.stages.estimator.sensors import (
     SENSOR,
@@ -35,7 +42,7 @@ from calib.stages.estimator.sensors import (
     marker,
     update_terms,
 )
-from calib.stages.estimator.smoother import events_of, smooth
+from calib.stages.estimator.smoother import events_of, look_back, smooth, undo_readings
 
 # ----------------------------------------------------------------------
 # The driven process: the actuator's dynamics with the commands of its pumps as input.
@@ -712,28 +719,19 @@ _HELD_N = (0.4, 0.05)
 _LET_GO_RADPS = 0.3
 """What the head's rate is off by where it is let go at a time that one sample of the gyroscope tells."""
 _LAST, _REJECTED, _FIRST, _REJECTED_IMU, _BEGUN = range(5)
-_NEWEST, _COUNT, _STARTED, _PENDING, _SWITCH, _HOSES = range(6)
+_STARTED, _PENDING, _SWITCH, _HOSES = range(2, 6)
 _SWITCHES = 128
 SILENT_S = 0.1
 """A row so long after the last reading carries the state on with it."""
 
 
 @compiled()
-def write_row(x: FloatArray, P: FloatArray, dt: float, radius: float, out: FloatArray) -> None:
+def write_row(x: FloatArray, P: FloatArray, dt: float, radius: float, out: FloatArray, row: int) -> None:
     """Mean and deviations a very short time dt after the state into columns 1 to 12."""
-    phi, length = x[0] + dt * x[2], x[1] + dt * x[3]
     pp = P[0, 0] + dt * (2.0 * P[0, 2] + dt * P[2, 2])
     ll = P[1, 1] + dt * (2.0 * P[1, 3] + dt * P[3, 3])
     pl = P[0, 1] + dt * (P[0, 3] + P[1, 2] + dt * P[2, 3])
-    r = radius
-    out[1], out[2] = length + r * phi, length - r * phi
-    out[3], out[4] = x[3] + r * x[2], x[3] - r * x[2]
-    out[5], out[6] = phi, length
-    out[7], out[8] = head_position(phi, length)
-    out[9] = x[INVOLVED]
-    out[10] = math.sqrt(max(ll + r * r * pp + 2.0 * r * pl, 1e-18))
-    out[11] = math.sqrt(max(ll + r * r * pp - 2.0 * r * pl, 1e-18))
-    out[12] = math.sqrt(max(pp, 1e-18))
+    finish_row(x[0] + dt * x[2], x[1] + dt * x[3], x[2], x[3], x[INVOLVED], pp, ll, pl, radius, out, row)
 
 
 @compiled()
@@ -858,8 +856,8 @@ def run_driven(
         stamp = t[row]
         flags = 0
         if begin_row(stamp, real[_LAST], camera_clock, imu_clock, out, row):
-            newest = whole[_NEWEST]
-            whole[_COUNT], whole[_STARTED], whole[_PENDING] = 0, 0, 0
+            newest = whole[NEWEST]
+            whole[COUNT], whole[_STARTED], whole[_PENDING] = 0, 0, 0
             for k in range(len(switch_t)):
                 switch_t[k] = -math.inf
                 switch_g[k, 0] = switch_g[whole[_SWITCH], 0]
@@ -880,8 +878,8 @@ def run_driven(
         for turn in range(4):
             if turn == 3:
                 # Without readings the state itself goes on, one picture behind.
-                newest = whole[_NEWEST]
-                if whole[_COUNT] == 0 or not stamp - ring_t[newest] > delay + SILENT_S:
+                newest = whole[NEWEST]
+                if whole[COUNT] == 0 or not stamp - ring_t[newest] > delay + SILENT_S:
                     continue
                 kind, when = 0, stamp - delay
             elif turn == 0:
@@ -905,28 +903,14 @@ def run_driven(
                 z[0], z[1], z[2], z[3] = readings[row, 2], readings[row, 3], readings[row, 4], imu_clock[3]
                 if math.isnan(z[2]) and (math.isnan(z[0]) or math.isnan(z[1])):
                     continue
-            newest = whole[_NEWEST]
-            if whole[_COUNT] == 0:
-                ring_t[newest], ring_kind[newest] = when, 0
-                whole[_COUNT] = 1
-            back = 0
-            while back < whole[_COUNT] - 1 and ring_t[(newest - back) % size] > when:
-                back += 1
-            if ring_t[(newest - back) % size] > when:
-                if whole[_COUNT] == size:
-                    flags |= 16
-                    continue
-                when = ring_t[(newest - back) % size]
-            for i in range(back):
-                to, since = (newest + 1 - i) % size, (newest - i) % size
-                ring_t[to], ring_kind[to] = ring_t[since], ring_kind[since]
-                for k in range(4):
-                    ring_z[to, k] = ring_z[since, k]
-                ring_let_go[to] = ring_let_go[since]
-                for k in range(3):
-                    ring_gated[to, k] = ring_gated[since, k]
+            newest = whole[NEWEST]
+            count_first(ring_t, ring_kind, whole, when)
+            back = make_room(ring_t, ring_z, ring_kind, ring_gated, ring_let_go, whole, kind, when)
+            if back < 0:
+                flags |= 16
+                continue
             own = (newest + 1 - back) % size
-            ring_t[own], ring_kind[own], ring_let_go[own] = when, kind, math.nan
+            when, ring_let_go[own] = ring_t[own], math.nan
             if back > 0 and ring_let_go[(own + 1) % size] < when:
                 ring_let_go[own], ring_let_go[(own + 1) % size] = ring_let_go[(own + 1) % size], math.nan
             for k in range(4):
@@ -977,7 +961,7 @@ def run_driven(
                 if trial == 0 and back == 0 and kind == IMU and when > real[_BEGUN] + SETTLING_S:
                     # The sample before contradicts, too; since the one before that the head was let go.
                     suspect, since = 0, 0
-                    for i in range(1, whole[_COUNT] - 1 if contradicted(ring_z[own], ring_gated[own]) else 1):
+                    for i in range(1, whole[COUNT] - 1 if contradicted(ring_z[own], ring_gated[own]) else 1):
                         now = (own - i) % size
                         if ring_kind[now] != IMU:
                             continue
@@ -1001,16 +985,10 @@ def run_driven(
                         ring_let_go[(own - i) % size] = math.nan
                 else:
                     break
-            whole[_NEWEST] = (newest + 1) % size
-            whole[_COUNT] = min(whole[_COUNT] + 1, size)
             if kind == HOSES or kind == 0:
-                continue
-            likelihood = out[row, 24]
-            for k in range(12):
-                if not math.isnan(report[k]):
-                    out[row, 13 + k] = report[k]
-            if not math.isnan(likelihood):
-                out[row, 24] += likelihood
+                for k in range(12):
+                    report[k] = math.nan
+            settle_event(whole, size, report, out, row)
             for k in range(3):
                 at = _REJECTED if k == 0 else _REJECTED_IMU
                 if report[8 + k] == 1.0:
@@ -1019,8 +997,8 @@ def run_driven(
                     real[at] *= 0.7
             if real[_REJECTED] > _LOCKED_OUT or real[_REJECTED_IMU] > 2.0 * _LOCKED_OUT:
                 whole[_PENDING], real[_REJECTED], real[_REJECTED_IMU] = 1, 0.0, 0.0
-        here = whole[_NEWEST]
-        ahead = stamp - ring_t[here] if whole[_COUNT] > 0 else 0.0
+        here = whole[NEWEST]
+        ahead = stamp - ring_t[here] if whole[COUNT] > 0 else 0.0
         if whole[_STARTED] == 0:
             flags |= 64
         if ahead > 1e-3 and whole[_STARTED] == 1:
@@ -1031,10 +1009,10 @@ def run_driven(
             )  # fmt: skip
             if not sound(spare_x, spare_P, radius):
                 copy_state(spare_x, spare_P, x0, P0)
-            write_row(spare_x, spare_P, 0.0, radius, out[row])
+            write_row(spare_x, spare_P, 0.0, radius, out, row)
         else:
             back_s = min(max(ahead, -max(delay, 1e-3)), 1e-3)
-            write_row(ring_x[here], ring_P[here], back_s, radius, out[row])
+            write_row(ring_x[here], ring_P[here], back_s, radius, out, row)
         out[row, 25] = flags
 
 
@@ -1109,23 +1087,33 @@ assert SIZE == 19
 WINDOW, OVERLAP = 6000, 3000
 LONGEST_GAP_S = 2.0
 _SMOOTHER_BEFORE_S, _SMOOTHER_LOCKED_OUT = 0.03, 5.5
-_SMOOTHER_STARTED, _SMOOTHER_PENDING, _SMOOTHER_HOSES = range(3)
+_SMOOTHER_BEGUN, _SMOOTHER_STARTED, _SMOOTHER_PENDING, _SMOOTHER_HOSES = range(2, 6)
+"""Marks of the forward pass, after the numbers of pictures and of IMU readings that were rejected."""
 _SHOWN = np.array([0, 1, 2, 3, INVOLVED])
 """States that the output needs: the motion and the gyroscope's bias."""
+
+
+@compiled()
+def _copy_marked(
+    to_x: FloatArray, to_P: FloatArray, to_marks: FloatArray, x: FloatArray, P: FloatArray, marks: FloatArray
+) -> None:
+    copy_state(to_x, to_P, x, P)
+    for i in range(len(marks)):
+        to_marks[i] = marks[i]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _forward(
     t: FloatArray, before_s: float, first_s: float, kinds: IntArray, readings: FloatArray, x: FloatArray,
-    P: FloatArray, whole: IntArray, rejected: FloatArray, switch_t: FloatArray, switch_g: FloatArray,
+    P: FloatArray, marks: FloatArray, switch_t: FloatArray, switch_g: FloatArray,
     x0: FloatArray, P0: FloatArray, plant: FloatArray, walk: FloatArray, view: FloatArray,
     constants: FloatArray, noise: FloatArray, kept_x: FloatArray, kept_P: FloatArray, trace: FloatArray,
     F: FloatArray, chained: BoolArray, alive: BoolArray, keep: int, hoses_sigma: float, radius: float,
 ) -> None:  # fmt: skip
     """The filter over events, keeping what is shown; state and counters after the event `keep` are left."""
     work, report, gated = np.zeros(WORK), np.empty(12), np.zeros(3)
-    own_x, own_P, counters, marks = x.copy(), P.copy(), rejected.copy(), whole.copy()
-    good_x, good_P, good_counters, good_marks = x.copy(), P.copy(), rejected.copy(), whole.copy()
+    own_x, own_P, own_marks = x.copy(), P.copy(), marks.copy()
+    good_x, good_P, good_marks = x.copy(), P.copy(), marks.copy()
     # The last sample that does not contradict, the next one, whether a release between is tried, and refused.
     good, suspect, trial, agrees, let_go_s = -1, -1, 0, False, math.nan
     last, k = 0, 0
@@ -1136,47 +1124,47 @@ def _forward(
         while last > 0 and switch_t[last] > t[k]:
             last -= 1
         kind, z = kinds[k], readings[k]
-        F[k] = 0.0
         chained[k] = False
-        trace[k, :, TRACE - 1] = 0.0
+        for i in range(3):
+            trace[k, i, TRACE - 1] = 0.0
         if t[k] - begin > LONGEST_GAP_S:
-            whole[_SMOOTHER_STARTED], whole[_SMOOTHER_PENDING] = 0, 0
-            rejected[:2] = 0.0
-        if whole[_SMOOTHER_STARTED] == 1:
+            marks[_SMOOTHER_STARTED], marks[_SMOOTHER_PENDING] = 0, 0
+            marks[0], marks[1] = 0.0, 0.0
+        if marks[_SMOOTHER_STARTED] == 1:
             now_s = let_go_s if trial == 1 and begin <= let_go_s < t[k] else math.nan
             _stand(F[k])
             pass_on(x, P, begin, t[k], now_s, x0, P0, plant, walk, switch_t, switch_g, last, F[k], work)
             chained[k] = True
         if kind == HOSES:
-            whole[_SMOOTHER_HOSES] = 1
-        waits = whole[_SMOOTHER_STARTED] == 0 or whole[_SMOOTHER_PENDING] == 1
+            marks[_SMOOTHER_HOSES] = 1
+        waits = marks[_SMOOTHER_STARTED] == 0 or marks[_SMOOTHER_PENDING] == 1
         if waits and kind == CAMERA and t[k] > first_s + _SMOOTHER_BEFORE_S and begin_again(
-            x, P, x0, P0, view, z[0], z[1], not math.isnan(rejected[2]), whole[_SMOOTHER_HOSES] == 1,
-            switch_g[last, 0], switch_g[last, 1],
+            x, P, x0, P0, view, z[0], z[1], not math.isnan(marks[_SMOOTHER_BEGUN]),
+            marks[_SMOOTHER_HOSES] == 1, switch_g[last, 0], switch_g[last, 1],
         ):  # fmt: skip
-            whole[_SMOOTHER_STARTED], whole[_SMOOTHER_PENDING] = 1, 0
+            marks[_SMOOTHER_STARTED], marks[_SMOOTHER_PENDING] = 1, 0
             chained[k] = False
-            rejected[2] = t[k]
-            if whole[_SMOOTHER_HOSES] == 1:
+            marks[_SMOOTHER_BEGUN] = t[k]
+            if marks[_SMOOTHER_HOSES] == 1:
                 x[13], P[13, 13] = 0.0, hoses_sigma * hoses_sigma
-        if kind == IMU and t[k] < rejected[2] + SETTLING_S:
+        if kind == IMU and t[k] < marks[_SMOOTHER_BEGUN] + SETTLING_S:
             z[0], z[1] = math.nan, math.nan
-        if whole[_SMOOTHER_STARTED] == 1 and kind != 0:
+        if marks[_SMOOTHER_STARTED] == 1.0 and kind != 0:
             driven_event(x, P, kind, z, plant, view, constants, noise, work, False, report, gated, trace[k])
             for i in range(3):
                 if report[8 + i] == 1.0:
-                    rejected[min(i, 1)] += 1.0
+                    marks[min(i, 1)] += 1.0
                 elif report[8 + i] == 0.0:
-                    rejected[min(i, 1)] *= 0.7
+                    marks[min(i, 1)] *= 0.7
             if not sound(x, P, radius):
-                x[:], P[:] = x0, P0
+                copy_state(x, P, x0, P0)
                 chained[k] = False
-                whole[_SMOOTHER_PENDING] = 1
-            elif rejected[0] > _SMOOTHER_LOCKED_OUT or rejected[1] > 2.0 * _SMOOTHER_LOCKED_OUT:
-                whole[_SMOOTHER_PENDING] = 1
-                rejected[:2] = 0.0
+                marks[_SMOOTHER_PENDING] = 1
+            elif marks[0] > _SMOOTHER_LOCKED_OUT or marks[1] > 2.0 * _SMOOTHER_LOCKED_OUT:
+                marks[_SMOOTHER_PENDING] = 1
+                marks[0], marks[1] = 0.0, 0.0
             if kind == IMU:
-                bad = contradicted(z, gated) and t[k] > rejected[2] + SETTLING_S
+                bad = contradicted(z, gated) and t[k] > marks[_SMOOTHER_BEGUN] + SETTLING_S
                 before = trial
                 if trial == 1:
                     if k == suspect:
@@ -1192,18 +1180,45 @@ def _forward(
                     suspect = k
                 if trial > before:
                     k = good + 1
-                    x[:], P[:], rejected[:], whole[:] = good_x, good_P, good_counters, good_marks
+                    _copy_marked(x, P, marks, good_x, good_P, good_marks)
                     continue
                 if k != suspect or before == 2:
                     good, suspect = k, -1
-                    good_x[:], good_P[:], good_counters[:], good_marks[:] = x, P, rejected, whole
+                    _copy_marked(good_x, good_P, good_marks, x, P, marks)
         for i in range(len(_SHOWN)):
-            kept_x[k, i], kept_P[k, i] = x[_SHOWN[i]], P[_SHOWN[i]]
-        alive[k] = whole[_SMOOTHER_STARTED] == 1
+            kept_x[k, i] = x[_SHOWN[i]]
+            for j in range(len(x)):
+                kept_P[k, i, j] = P[_SHOWN[i], j]
+        alive[k] = marks[_SMOOTHER_STARTED] == 1
         if k == keep:
-            own_x[:], own_P[:], counters[:], marks[:] = x, P, rejected, whole
+            _copy_marked(own_x, own_P, own_marks, x, P, marks)
         k += 1
-    x[:], P[:], rejected[:], whole[:] = own_x, own_P, counters, marks
+    _copy_marked(x, P, marks, own_x, own_P, own_marks)
+
+
+@compiled()
+def _undo_step(y: FloatArray, Y: FloatArray, F: FloatArray, FY: FloatArray) -> None:
+    """F' y and F' Y F for the transition F (12, 23) of a step, in place; FY (24, 36) is scratch."""
+    n, moved = y.shape[0], FY[INVOLVED]
+    for i in range(INVOLVED):
+        moved[i] = y[i] if i >= DYNAMIC else 0.0
+        for j in range(n):
+            FY[i, j] = Y[i, j] if i >= DYNAMIC else 0.0
+        for m in range(DYNAMIC):
+            slope = F[m, i]
+            moved[i] += slope * y[m]
+            for j in range(n):
+                FY[i, j] += slope * Y[m, j]
+    for i in range(INVOLVED):
+        y[i] = moved[i]
+        for j in range(n):
+            Y[i, j] = FY[i, j] if j >= DYNAMIC else 0.0
+        for m in range(DYNAMIC):
+            slope = FY[i, m]
+            for j in range(INVOLVED):
+                Y[i, j] += slope * F[m, j]
+        for j in range(INVOLVED, n):
+            Y[j, i] = Y[i, j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -1215,52 +1230,19 @@ def _backward(
 
     `rows` tells at which events (>= 0) states are wanted.
     """
-    shown, n = kept_P.shape[1], kept_P.shape[2]
-    y, Y, Yk = np.zeros(n), np.zeros((n, n)), np.empty(n)
+    n = kept_P.shape[2]
+    y, Y, part, FY = np.zeros(n), np.zeros((n, n)), np.empty(n), np.empty((INVOLVED + 1, n))
     for k in range(len(t) - 1, -1, -1):
         if rows[k] >= 0:
-            P = kept_P[k]
-            kept_x[k] += P @ y
-            P[:, :shown] -= P @ Y @ P.T
-        for reading in range(2, -1, -1):
-            H, gain, weight = (
-                trace[k, reading, :n],
-                trace[k, reading, n : 2 * n],
-                trace[k, reading, 2 * n + 1],
-            )
-            if weight == 0.0:
-                continue
-            change = trace[k, reading, 2 * n] - gain @ y
-            for i in range(n):
-                y[i] += H[i] * change
-            Yk[:] = Y @ gain
-            weight += gain @ Yk
-            for i in range(n):
-                half = 0.5 * weight * H[i] - Yk[i]
-                for j in range(n):
-                    Y[i, j] += half * H[j] + H[i] * (0.5 * weight * H[j] - Yk[j])
+            look_back(kept_x[k], kept_P[k], y, Y, part, True)
+        undo_readings(trace[k], y, Y, part, True)
         if not chained[k]:
-            y[:], Y[:] = 0.0, 0.0
+            for i in range(n):
+                y[i] = 0.0
+                for j in range(n):
+                    Y[i, j] = 0.0
         elif k and t[k] > t[k - 1]:
-            moved = F[k].T @ y[:DYNAMIC]
-            moved[DYNAMIC:] += y[DYNAMIC:INVOLVED]
-            y[:INVOLVED] = moved
-            FY = F[k].T @ Y[:DYNAMIC]
-            FY[DYNAMIC:] += Y[DYNAMIC:INVOLVED]
-            Y[:INVOLVED, :INVOLVED] = np.ascontiguousarray(FY[:, :DYNAMIC]) @ F[k]
-            Y[:INVOLVED, DYNAMIC:INVOLVED] += FY[:, DYNAMIC:INVOLVED]
-            Y[:INVOLVED, INVOLVED:] = FY[:, INVOLVED:]
-            Y[INVOLVED:, :INVOLVED] = FY[:, INVOLVED:].T
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _write(kept_x: FloatArray, kept_P: FloatArray, rows: IntArray, radius: float, out: FloatArray) -> None:
-    x, P = np.zeros(INVOLVED + 1), np.zeros((4, 4))
-    for k in range(len(rows)):
-        if rows[k] >= 0:
-            x[:4], x[INVOLVED] = kept_x[k, :4], kept_x[k, 4]
-            P[:] = kept_P[k, :4, :4]
-            write_row(x, P, 0.0, radius, out[rows[k]])
+            _undo_step(y, Y, F[k], FY)
 
 
 def _timeline(
@@ -1313,7 +1295,7 @@ def smooth_driven(setup: Setup, drive: Drive, rows: Rows, pwm: FloatArray, outpu
     x, P = drive.start(setup)
     x0, P0 = x.copy(), P.copy()
     constants = np.array([setup.gravity_mps2, setup.lever_across_m])
-    whole, rejected = np.zeros(3, dtype=np.int64), np.array([0.0, 0.0, np.nan])
+    marks = np.array([0.0, 0.0, np.nan, 0.0, 0.0, 0.0])
     plant, walk, noise = drive.numbers(), drive.walk(setup), drive.noise(setup)
     out = outputs.copy()
     out[:, 1:13] = np.nan
@@ -1328,14 +1310,15 @@ def smooth_driven(setup: Setup, drive: Drive, rows: Rows, pwm: FloatArray, outpu
         trace, F = np.empty((count, 3, TRACE)), np.empty((count, DYNAMIC, INVOLVED))
         chained, alive = np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
         _forward(
-            t[part], before, first, kinds[part], readings[part], x, P, whole, rejected, switch_t, switch_g,
+            t[part], before, first, kinds[part], readings[part], x, P, marks, switch_t, switch_g,
             x0, P0, plant, walk, setup.view, constants, noise, kept_x, kept_P, trace, F, chained,
             alive, end - begin - 1, drive.sigma[1], setup.bellows_radius_m,
         )  # fmt: skip
         wanted = np.where(alive & (kinds[part] == 0), at[part], -1)
         wanted[end - begin :] = -1
         _backward(t[part], F, trace, chained, wanted, kept_x, kept_P)
-        _write(kept_x, kept_P, wanted, setup.bellows_radius_m, out)
+        some = np.nonzero(wanted >= 0)[0]
+        write_columns(kept_x[some], kept_P[some], shown - 1, wanted[some], setup.bellows_radius_m, out)
         before = float(t[end - 1])
         begin = end
     return out

@@ -1133,7 +1133,7 @@ def begin_row(
 
 
 @compiled()
-def _finish(
+def finish_row(
     phi: float, length: float, dphi: float, dl: float, bias: float, pp: float, ll: float, pl: float, r: float,
     out: FloatArray, row: int,
 ) -> None:  # fmt: skip
@@ -1193,29 +1193,25 @@ def write_bank(
         pp += w * (var_p + phi_m * phi_m)
         ll += w * (var_l + length_m * length_m)
         pl += w * (cross + phi_m * length_m)
-    _finish(
+    finish_row(
         phi_0 + phi, length_0 + length, dphi, dl, bias, pp - phi * phi, ll - length * length,
         pl - phi * length, radius, out, row,
     )  # fmt: skip
 
 
 @compiled()
-def write_columns(x: FloatArray, P: FloatArray, rows: IntArray, radius: float, out: FloatArray) -> None:
-    """States (k, n) and covariances (k, n, n) into columns 1 to 12 of these rows (k,) of `out`."""
+def write_columns(
+    x: FloatArray, P: FloatArray, bias: int, rows: IntArray, radius: float, out: FloatArray
+) -> None:
+    """States (k, n) and covariances (k, n, n) into columns 1 to 12 of these rows (k,) of `out`.
+
+    `bias` is the place of the gyroscope's bias in a state.
+    """
     for k in range(len(rows)):
-        _finish(
-            x[k, 0],
-            x[k, 1],
-            x[k, 2],
-            x[k, 3],
-            x[k, 6],
-            P[k, 0, 0],
-            P[k, 1, 1],
-            P[k, 0, 1],
-            radius,
-            out,
+        finish_row(
+            x[k, 0], x[k, 1], x[k, 2], x[k, 3], x[k, bias], P[k, 0, 0], P[k, 1, 1], P[k, 0, 1], radius, out,
             rows[k],
-        )
+        )  # fmt: skip
 
 
 # ----------------------------------------------------------------------
@@ -1231,6 +1227,9 @@ def write_columns(x: FloatArray, P: FloatArray, rows: IntArray, radius: float, o
 # after half a second of rejected pictures, at a jump of the time, or from a state that no rig has; an
 # angle or length that no sensor sees, which the prior then holds.
 
+NEWEST, COUNT = 0, 1
+"""Where a filter's integers tell the place of the newest of the last events, and how many there are."""
+
 FASTEST_MPS = 1.0
 """No rig's bellows change their lengths faster: a swing from 0.7 rad reaches a quarter of it."""
 _SILENT_S = 0.5
@@ -1238,7 +1237,7 @@ _LOCKED_OUT_S = 0.5
 _KNOWN_M = 0.05
 """A length with a larger deviation than this is as good as unknown."""
 _LAST, _CAMERA_SEEN, _IMU_SEEN, _REJECTED_SINCE, _GYRO_REJECTED_SINCE = range(5)
-_NEWEST, _COUNT, _CAMERA_STARTED, _PENDING = range(4)
+_CAMERA_STARTED, _PENDING = 2, 3
 _PHI, _LENGTH = 0, 1
 
 
@@ -1326,6 +1325,57 @@ def _mend(
 
 
 @compiled()
+def count_first(ring_t: FloatArray, ring_kind: IntArray, whole: IntArray, when: float) -> None:
+    """Let the ring of events begin where it is empty."""
+    if whole[COUNT] == 0:
+        ring_t[whole[NEWEST]], ring_kind[whole[NEWEST]] = when, 0
+        whole[COUNT] = 1
+
+
+@compiled()
+def make_room(
+    ring_t: FloatArray, ring_z: FloatArray, ring_kind: IntArray, ring_gated: FloatArray,
+    ring_let_go: FloatArray, whole: IntArray, kind: int, when: float,
+) -> int:  # fmt: skip
+    """Put an event among the last ones, by its time; how many are after it, -1 where it is older than all.
+
+    Its readings are the caller's to write. What is only known to be older than the oldest of a ring that is
+    not full goes right after that one. `ring_let_go` may be empty.
+    """
+    size, newest, back = ring_t.shape[0], whole[NEWEST], 0
+    while back < whole[COUNT] - 1 and ring_t[(newest - back) % size] > when:
+        back += 1
+    if ring_t[(newest - back) % size] > when:
+        if whole[COUNT] == size:
+            return -1
+        when = ring_t[(newest - back) % size]
+    for i in range(back):
+        to, since = (newest + 1 - i) % size, (newest - i) % size
+        ring_t[to], ring_kind[to] = ring_t[since], ring_kind[since]
+        for k in range(ring_z.shape[1]):
+            ring_z[to, k] = ring_z[since, k]
+        for k in range(3):
+            ring_gated[to, k] = ring_gated[since, k]
+        if ring_let_go.shape[0]:
+            ring_let_go[to] = ring_let_go[since]
+    own = (newest + 1 - back) % size
+    ring_t[own], ring_kind[own] = when, kind
+    return int(back)
+
+
+@compiled()
+def settle_event(whole: IntArray, size: int, report: FloatArray, out: FloatArray, row: int) -> None:
+    """The ring has one event more; what it says of itself goes into its row."""
+    whole[NEWEST] = (whole[NEWEST] + 1) % size
+    whole[COUNT] = min(whole[COUNT] + 1, size)
+    if not math.isnan(out[row, 24]) and not math.isnan(report[11]):
+        report[11] += out[row, 24]
+    for k in range(12):
+        if not math.isnan(report[k]):
+            out[row, 13 + k] = report[k]
+
+
+@compiled()
 def run_filter(
     t: FloatArray, readings: FloatArray, kinds: IntArray,
     bank: FloatArray, weights: FloatArray, ring_t: FloatArray, ring_z: FloatArray,
@@ -1334,7 +1384,7 @@ def run_filter(
     switch_hz: float, levels: FloatArray, walk: FloatArray, view: FloatArray, constants: FloatArray,
     noise: FloatArray, head: FloatArray, head_sigma: FloatArray, radius: float, delay: float,
     sensor: FloatArray, told: FloatArray, report: FloatArray, spare: FloatArray, untraced: FloatArray,
-    out: FloatArray,
+    never: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
     """Rows (n,), (n, 5), (n,) through the ring of the last events; writes `out` (n, len(OUT)).
 
@@ -1346,9 +1396,9 @@ def run_filter(
         stamp = t[row]
         flags = 0
         if begin_row(stamp, real[_LAST], camera_clock, imu_clock, out, row):
-            newest = whole[_NEWEST]
+            newest = whole[NEWEST]
             _reset_head(bank, weights, newest, head, head_sigma)
-            whole[_COUNT], whole[_CAMERA_STARTED], whole[_PENDING] = 0, 0, 0
+            whole[COUNT], whole[_CAMERA_STARTED], whole[_PENDING] = 0, 0, 0
             real[_CAMERA_SEEN], real[_IMU_SEEN] = stamp, stamp
             real[_REJECTED_SINCE], real[_GYRO_REJECTED_SINCE] = math.nan, math.nan
             flags |= 32
@@ -1370,31 +1420,19 @@ def run_filter(
                 if math.isnan(z2) and (math.isnan(z0) or math.isnan(z1)):
                     continue
                 real[_IMU_SEEN] = stamp
-            newest = whole[_NEWEST]
-            if whole[_COUNT] == 0:
-                ring_t[newest], ring_kind[newest] = when, 0
-                whole[_COUNT] = 1
+            newest = whole[NEWEST]
+            if whole[COUNT] == 0:
+                count_first(ring_t, ring_kind, whole, when)
                 if kind == IMU and not math.isnan(z0) and math.hypot(z0, z1) > 1.0:
                     at = newest * count * RECORD + STATE
                     tilt = math.atan2(z1, z0) - bank[at + 9]
                     tilt = min(max(math.atan2(math.sin(tilt), math.cos(tilt)), -1.5), 1.5)
                     _place_head(bank, newest, count, tilt, bank[at + 1])
-            # Back to the last event before this one.
-            back = 0
-            while back < whole[_COUNT] - 1 and ring_t[(newest - back) % size] > when:
-                back += 1
-            if ring_t[(newest - back) % size] > when:
-                if whole[_COUNT] == size:
-                    flags |= 16
-                    continue
-                when = ring_t[(newest - back) % size]
-            for i in range(back):
-                to, since = (newest + 1 - i) % size, (newest - i) % size
-                ring_t[to], ring_kind[to] = ring_t[since], ring_kind[since]
-                for k in range(3):
-                    ring_z[to, k], ring_gated[to, k] = ring_z[since, k], ring_gated[since, k]
+            back = make_room(ring_t, ring_z, ring_kind, ring_gated, never, whole, kind, when)
+            if back < 0:
+                flags |= 16
+                continue
             own = (newest + 1 - back) % size
-            ring_t[own], ring_kind[own] = when, kind
             ring_z[own, 0], ring_z[own, 1], ring_z[own, 2] = z0, z1, z2
             begin_camera = kind == CAMERA and (whole[_CAMERA_STARTED] == 0 or whole[_PENDING] == 1)
             for i in range(back + 1):
@@ -1421,14 +1459,7 @@ def run_filter(
                     report if i == 0 else spare, ring_gated, untraced,
                 )  # fmt: skip
                 flags |= _mend(bank, now, count, head, head_sigma, radius)
-            whole[_NEWEST] = (newest + 1) % size
-            whole[_COUNT] = min(whole[_COUNT] + 1, size)
-            likelihood = out[row, 24]
-            for k in range(12):
-                if not math.isnan(report[k]):
-                    out[row, 13 + k] = report[k]
-            if not math.isnan(likelihood):
-                out[row, 24] += likelihood
+            settle_event(whole, size, report, out, row)
             if kind == CAMERA:
                 if report[8] == 0.0:
                     real[_REJECTED_SINCE] = math.nan
@@ -1443,7 +1474,7 @@ def run_filter(
                 if math.isnan(real[_GYRO_REJECTED_SINCE]):
                     real[_GYRO_REJECTED_SINCE] = stamp
                 elif stamp - real[_GYRO_REJECTED_SINCE] > _LOCKED_OUT_S:
-                    here = whole[_NEWEST]
+                    here = whole[NEWEST]
                     at = here * count * RECORD + STATE
                     phi, length = bank[at], bank[at + 1]
                     _reset_head(bank, weights, here, head, head_sigma)
@@ -1454,9 +1485,9 @@ def run_filter(
             flags |= 2
         if stamp - real[_IMU_SEEN] > _SILENT_S:
             flags |= 4
-        here = whole[_NEWEST]
-        ahead = stamp - ring_t[here] if whole[_COUNT] > 0 else 0.0
-        if whole[_COUNT] == 0:
+        here = whole[NEWEST]
+        ahead = stamp - ring_t[here] if whole[COUNT] > 0 else 0.0
+        if whole[COUNT] == 0:
             flags |= 64
         far = abs(ahead) > 0.02
         if not far:
@@ -1513,7 +1544,7 @@ class Filter:
         self._w[:, :count] = 1.0 / count
         self._scratch = (
             np.empty(SIZE - 6), np.zeros((count, TOLD)), np.empty(len(REPORT)), np.empty(len(REPORT)),
-            np.empty((0, 3, TRACE)),
+            np.empty((0, 3, TRACE)), np.empty(0),
         )  # fmt: skip
         self._t, self._z, self._gated = np.zeros(size), np.zeros((size, 3)), np.zeros((size, 3))
         self._kind, self._whole = np.zeros(size, dtype=np.int64), np.zeros(4, dtype=np.int64)

@@ -32,7 +32,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from calib.core.arrays import FloatArray, IntArray
+from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.stages.estimator.kinematic import (
     CONSIDERED,
     FASTEST_MPS,
@@ -57,7 +57,7 @@ from calib.stages.estimator.kinematic import (
     starting_state,
     write_columns,
 )
-from calib.stages.estimator.sensors import SIZE
+from calib.stages.estimator.sensors import SIZE, compiled
 
 WINDOW, OVERLAP = 12_000, 3_000
 _KEPT = 7
@@ -205,70 +205,85 @@ def _undo_step(y: FloatArray, level: FloatArray, h: float) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def backward(
-    t: FloatArray, level: FloatArray, trace: FloatArray, kept_x: FloatArray, kept_P: FloatArray, spread: bool
+def look_back(
+    x: FloatArray, P: FloatArray, y: FloatArray, Y: FloatArray, part: FloatArray, spread: bool
 ) -> None:
+    """x + P y and P - P Y P of the first a states, in place; P (a, n), of which the first a columns change.
+
+    `part` (n,) is scratch; `spread` tells whether the covariance is wanted.
+    """
+    rows, n = P.shape
+    for i in range(rows):
+        for j in range(n):
+            x[i] += P[i, j] * y[j]
+    if not spread:
+        return
+    off = np.zeros((rows, rows))
+    for i in range(rows):
+        for j in range(n):
+            part[j] = 0.0
+        for m in range(n):
+            for j in range(n):
+                part[j] += P[i, m] * Y[m, j]
+        for j in range(i + 1):
+            for m in range(n):
+                off[i, j] += part[m] * P[j, m]
+    for i in range(rows):
+        for j in range(i + 1):
+            P[i, j] -= off[i, j]
+            P[j, i] = P[i, j]
+
+
+@compiled()
+def undo_readings(trace: FloatArray, y: FloatArray, Y: FloatArray, Yk: FloatArray, spread: bool) -> None:
+    """Take y and Y from after an event's readings (3, 2 n + 2) to before them; Yk (n,) is scratch."""
+    n = y.shape[0]
+    for reading in range(2, -1, -1):
+        weight = trace[reading, 2 * n + 1]
+        if weight == 0.0:
+            continue
+        change = trace[reading, 2 * n]
+        for i in range(n):
+            change -= trace[reading, n + i] * y[i]
+        for i in range(n):
+            y[i] += trace[reading, i] * change
+            Yk[i] = 0.0
+        if not spread:
+            continue
+        for i in range(n):
+            gain = trace[reading, n + i]
+            for j in range(n):
+                Yk[j] += gain * Y[i, j]
+        for i in range(n):
+            weight += trace[reading, n + i] * Yk[i]
+        for i in range(n):
+            H = trace[reading, i]
+            half = 0.5 * weight * H - Yk[i]
+            for j in range(n):
+                Y[i, j] += half * trace[reading, j] + H * (0.5 * weight * trace[reading, j] - Yk[j])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def backward(
+    t: FloatArray, level: FloatArray, trace: FloatArray, wanted: BoolArray, kept_x: FloatArray,
+    kept_P: FloatArray, spread: bool,
+) -> None:  # fmt: skip
     """Bryson and Frazier over what `forward` has kept of one level, in place.
 
     Parameters
     ----------
-    level : (n, 8). trace : (n, 3, `TRACE`). kept_x, kept_P : (n, a) and (n, a, 19); of kept_P the first a
-        columns become the smoothed covariance. What is considered stays as it was in kept_x and kept_P.
+    level : (n, 8). trace : (n, 3, `TRACE`). wanted : (n,) events whose states are.
+    kept_x, kept_P : (n, a) and (n, a, 19); of kept_P the first a columns become the smoothed covariance.
     spread : whether the covariance is wanted; the states do without it.
     """
-    rows, n = kept_P.shape[1], kept_P.shape[2]
-    y, Y, Yk, part = np.zeros(n), np.zeros((n, n)), np.empty(n), np.empty((rows, n))
+    n = kept_P.shape[2]
+    y, Y, part = np.zeros(n), np.zeros((n, n)), np.empty(n)
     for k in range(len(t) - 1, -1, -1):
         # What follows the event tells of the state after its readings.
-        for i in range(rows):
-            if i == 11 or i == 12 or 14 <= i <= 16:
-                continue
-            for j in range(n):
-                kept_x[k, i] += kept_P[k, i, j] * y[j]
-        for i in range(rows if spread else 0):
-            for j in range(n):
-                part[i, j] = 0.0
-            for m in range(n):
-                for j in range(n):
-                    part[i, j] += kept_P[k, i, m] * Y[m, j]
-        for i in range(rows if spread else 0):
-            for j in range(i + 1):
-                off = 0.0
-                for m in range(n):
-                    off += part[i, m] * kept_P[k, j, m]
-                Yk[j] = off
-            for j in range(i + 1):
-                part[i, j] = Yk[j]
-        for i in range(rows if spread else 0):
-            for j in range(i + 1):
-                kept_P[k, i, j] -= part[i, j]
-                kept_P[k, j, i] = kept_P[k, i, j]
-        for reading in range(2, -1, -1):
-            weight = trace[k, reading, 2 * n + 1]
-            if weight == 0.0:
-                continue
-            H, gain = trace[k, reading, :n], trace[k, reading, n : 2 * n]
-            known = 0.0
-            for i in range(n):
-                known += gain[i] * y[i]
-                Yk[i] = 0.0
-            change = trace[k, reading, 2 * n] - known
-            for i in range(n):
-                y[i] += H[i] * change
-            if not spread:
-                continue
-            for i in range(n):
-                for j in range(n):
-                    Yk[j] += gain[i] * Y[i, j]
-            for i in range(n):
-                weight += gain[i] * Yk[i]
-            for i in range(n):
-                half = 0.5 * weight * H[i] - Yk[i]
-                for j in range(n):
-                    Y[i, j] += half * H[j] + H[i] * (0.5 * weight * H[j] - Yk[j])
-        if k == 0:
-            continue
-        dt = t[k] - t[k - 1]
+        if wanted[k]:
+            look_back(kept_x[k], kept_P[k], y, Y, part, spread)
+        undo_readings(trace[k], y, Y, part, spread)
+        dt = t[k] - t[k - 1] if k else 0.0
         if not dt > 0.0:
             continue
         parts = max(math.ceil(dt / LARGEST_STEP_S - 1e-9), 1)
@@ -283,10 +298,10 @@ def backward(
                     Y[j, i] = Y[i, j]
             for j in range(6):
                 for i in range(6):
-                    Yk[i] = Y[i, j]
-                _undo_step(Yk, level[k], dt / parts)
+                    part[i] = Y[i, j]
+                _undo_step(part, level[k], dt / parts)
                 for i in range(6):
-                    Y[i, j] = Yk[i]
+                    Y[i, j] = part[i]
 
 
 def _given(x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -369,14 +384,17 @@ def smooth(setup: Setup, rows: Rows, outputs: FloatArray) -> FloatArray:
                         kept_x[at], kept_P[at],
                     )  # fmt: skip
                 since = float(events.t_s[end - 1])
-            backward(events.t_s[begin:stop], mixed[begin:stop], trace, kept_x, kept_P, number == 0)
+            backward(
+                events.t_s[begin:stop], mixed[begin:stop], trace, events.kinds[begin:stop] == 0, kept_x,
+                kept_P, number == 0,
+            )  # fmt: skip
             if number == 0:
                 mean, covariance = kept_x[shown], kept_P[shown, :, :_KEPT]
             else:
                 away = kept_x[shown] - mean
                 covariance = covariance + away[:, :, None] * away[:, None, :]
         write_columns(
-            mean, np.ascontiguousarray(covariance), events.rows[own][shown], setup.bellows_radius_m, out,
+            mean, np.ascontiguousarray(covariance), 6, events.rows[own][shown], setup.bellows_radius_m, out,
         )  # fmt: skip
         before = float(events.t_s[end - 1])
         begin = end
