@@ -234,7 +234,14 @@ def surroundings(grid: Refined) -> Surroundings:
     least = _CONTINUES * float(np.median(np.abs(grid.amplitude)))
     along, across = np.gradient(local, axis=1), np.gradient(local, axis=0)
     half_step, unlike = looks_like_corners(image, local, along, across)
-    chosen = np.flatnonzero((inside & (parity * half_step > 0.5 * least) & (unlike < 1.0)).ravel())
+    likely = inside & (parity * half_step > 0.5 * least) & (unlike < 1.0)
+    lines = (np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1])
+    count = [int(inside[line].sum()) for line in lines]
+    needed = [max(2, 0.5 * n) for n in count]
+    for line, n in zip(lines, needed, strict=True):
+        # So few make no row, whatever they are.
+        likely[line] &= likely[line].sum() >= n
+    chosen = np.flatnonzero(likely.ravel())
     found: BoolArray = np.zeros(rows * columns, dtype=np.bool_)
     if len(chosen):
         frames = frames_of(local).take(chosen)
@@ -246,10 +253,8 @@ def surroundings(grid: Refined) -> Surroundings:
         alike = misshape(fit, part.noise) < max(_WORST_RESIDUAL, 1.5 * float(np.median(grid.residual)))
         found[chosen] = fit.converged & near & strong & alike
     hit = found.reshape(rows, columns)
-    lines = (np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1])
-    count = [int(inside[line].sum()) for line in lines]
     hits = [int(hit[line].sum()) for line in lines]
-    top, bottom, left, right = (n >= 2 and h >= max(2, 0.5 * n) for h, n in zip(hits, count, strict=True))
+    top, bottom, left, right = (h >= n for h, n in zip(hits, needed, strict=True))
     above, below, before, after = (n >= 2 for n in count)
     return Surroundings((top, bottom, left, right), (above, below, before, after))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import NamedTuple, Self
 
 import cv2
@@ -564,15 +565,21 @@ def _strength(board: FloatArray, pixels: FloatArray, used: BoolArray, lens: Lens
     return float(np.clip(-b / (2.0 * a), _LAMBDAS[k - 1], _LAMBDAS[k + 1])) if a > 0 else float(_LAMBDAS[k])
 
 
-def _basis(board: FloatArray, degree: int, columns: int, rows: int) -> FloatArray:
-    x, y = board.T
+@lru_cache(maxsize=16)
+def _bases(columns: int, rows: int) -> tuple[FloatArray, tuple[FloatArray, ...]]:
+    """Corners (N, 2) of a board in [-1, 1], and the polynomials (N, P) over it of each degree."""
+    j, i = np.mgrid[0:rows, 0:columns]
+    x, y = (2.0 * i / max(columns - 1, 1) - 1.0).ravel(), (2.0 * j / max(rows - 1, 1) - 1.0).ravel()
     terms = [
-        x**p * y**q
-        for p in range(degree + 1)
-        for q in range(degree + 1 - p)
-        if p < max(columns - 1, 2) and q < max(rows - 1, 2)
+        [
+            x**p * y**q
+            for p in range(degree + 1)
+            for q in range(degree + 1 - p)
+            if p < max(columns - 1, 2) and q < max(rows - 1, 2)
+        ]
+        for degree in _DEGREES
     ]
-    return np.stack(terms, axis=1)
+    return np.stack([x, y], axis=1), tuple(np.stack(some, axis=1) for some in terms)
 
 
 def _median(values: FloatArray) -> float:
@@ -598,9 +605,7 @@ def predict(points: FloatArray, known: BoolArray, lens: Lens | None = None) -> P
     lens : where the picture's centre is; without it lambda is 0.
     """
     rows, columns = known.shape
-    j, i = np.mgrid[0:rows, 0:columns]
-    grid = np.stack([2.0 * i / max(columns - 1, 1) - 1.0, 2.0 * j / max(rows - 1, 1) - 1.0], axis=2)
-    board, used = grid.reshape(-1, 2), known.ravel()
+    (board, bases), used = _bases(columns, rows), known.ravel()
     if int(used.sum()) < 6:
         return None
     pixels = np.where(used[:, None], points.reshape(-1, 2), 0.0)
@@ -612,9 +617,8 @@ def predict(points: FloatArray, known: BoolArray, lens: Lens | None = None) -> P
     fit = _Fit(board, pixels, used, lens, strength, (rows, columns))
     weights, plane = fit.homography()
     best: Prediction | None = None
-    for degree in _DEGREES:
-        basis = _basis(board, degree, columns, rows)
-        if degree > 1 and used.sum() < _FREEDOM * basis.shape[1]:
+    for basis in bases:
+        if best is not None and used.sum() < _FREEDOM * basis.shape[1]:
             break
         candidate = fit.with_basis(basis, weights, plane)
         if best is None or candidate.spread_px < best.spread_px:
@@ -686,9 +690,12 @@ _LEAST_WIDTH_PX = 0.9
 """Width of an edge below which its place depends on where it falls between the pixels."""
 _FIRST_ITERATIONS = 4
 _FIRST_REACH_PX = 8
-_HALOS_PX = (0.8, 1.6, 3.0)
+_HALOS_PX = (1.6, 0.8, 3.0)
 _HALO_CORNERS = 16
 """Corners that are tried with halos; a picture has one halo, and these tell it."""
+_HALO_SIGN = 0.95
+"""Misshape with the first halo over that without from which on none of the others helps. It was below in all
+39 pictures of five sets whose halo is taken, and above in 81 of 94 others."""
 _HALO_MISSHAPE = 0.05
 """Typical misshape from which on halos are tried."""
 _HALO_GAIN = 0.8
@@ -974,12 +981,14 @@ def _sharpened(part: Part, first: LocalFit) -> tuple[Part, LocalFit]:
         )
 
     some = np.linspace(0, len(every) - 1, min(_HALO_CORNERS, len(every))).astype(np.int64)
-    best, least = 0.0, _HALO_GAIN * float(np.median(misshape(first.take(some), part.noise)))
+    plain = float(np.median(misshape(first.take(some), part.noise)))
+    left: dict[float, float] = {}
     for halo_px in _HALOS_PX:
-        left = float(np.median(misshape(with_halo(halo_px, some)[1], part.noise)))
-        if left < least:
-            best, least = halo_px, left
-    return with_halo(best, np.arange(len(every))) if best else (part, first)
+        left[halo_px] = float(np.median(misshape(with_halo(halo_px, some)[1], part.noise)))
+        if min(left.values()) > _HALO_SIGN * plain:
+            return part, first
+    best = min(sorted(left), key=lambda halo_px: left[halo_px])
+    return with_halo(best, np.arange(len(every))) if left[best] < _HALO_GAIN * plain else (part, first)
 
 
 def refine(gray: GrayImage, points: FloatArray) -> Refined | None:
