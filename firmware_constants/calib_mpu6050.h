@@ -1,5 +1,5 @@
 /*
- * calib_mpu6050.h - MPU6050 on I2C, +-4 g, +-2000 deg/s, 44 Hz, 100 samples/s; interface as in calib_bno055.h.
+ * calib_mpu6050.h - MPU6050 on I2C, +-4 g, +-2000 deg/s, 44 Hz, a new value each ms; interface as in calib_bno055.h.
  */
 #ifndef CALIB_IMU_H
 #define CALIB_IMU_H
@@ -22,7 +22,7 @@ static bool calib_imu_start(uint8_t step) {
     case 1: /* awake, on the gyroscope's clock */
         return calib_i2c_write(CALIB_IMU_ADDRESS, 0x6B, 0x01);
     case 2: /* filter, rate, ranges */
-        return calib_i2c_write(CALIB_IMU_ADDRESS, 0x1A, 0x03) && calib_i2c_write(CALIB_IMU_ADDRESS, 0x19, 9) &&
+        return calib_i2c_write(CALIB_IMU_ADDRESS, 0x1A, 0x03) && calib_i2c_write(CALIB_IMU_ADDRESS, 0x19, 0) &&
                calib_i2c_write(CALIB_IMU_ADDRESS, 0x1B, 0x18) && calib_i2c_write(CALIB_IMU_ADDRESS, 0x1C, 0x08);
     default:
         return calib_i2c_says(CALIB_IMU_ADDRESS, 0x1C, 0x08) && calib_i2c_says(CALIB_IMU_ADDRESS, 0x1B, 0x18);

@@ -9,7 +9,7 @@
 
 #include "calib_pipeline.h"
 
-#if CALIB_ID != 0x88CCB011UL
+#if CALIB_ID != 0x5FD32D50UL
 #error "calib: calib_selftest.h is of another rig than calib_constants.h"
 #endif
 #if CALIB_UNDISTORT != 1

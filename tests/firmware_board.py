@@ -16,6 +16,7 @@ import tty
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +40,7 @@ from calib.twin.simulate import _Plant
 
 __all__ = ["Board", "serve"]
 
+_NUMBERS = count()
 _STEP_S = 1.0 / 1200.0
 _FRAME_S = 1.0 / 60.0
 _FELT_HZ = 400.0
@@ -90,7 +92,7 @@ class Board:
 
     def __init__(self, built: Built, seconds: float = 200.0, seed: int = 1) -> None:
         # A library of its own, since the simulator lives in its variables.
-        library = Path(built.program).with_suffix(f".{id(self)}.so")
+        library = Path(built.program).with_suffix(f".{next(_NUMBERS)}.so")
         shutil.copy(built.library, library)
         self._rig = ctypes.CDLL(str(library))
         self._rig.rig_pass.argtypes = [ctypes.c_double]

@@ -21,7 +21,7 @@ from firmware_rigs import header
 from calib.io.serial import Inputs
 from calib.stages.firmware.conformance import FusedReference, Reference, binary32
 from calib.stages.firmware.header import VERBATIM, Header, verbatim
-from calib.stages.firmware.vectors import TOLERANCE, selftest_text
+from calib.stages.firmware.vectors import TOLERANCE
 
 __all__ = [
     "HOSTILE",
@@ -81,7 +81,7 @@ def write(folder: Path, header: Header) -> None:
     (folder / "calib_constants.h").write_text(header.text)
     for name in VERBATIM:
         (folder / name).write_text(verbatim(name))
-    (folder / "calib_selftest.h").write_text(selftest_text(header))
+    (folder / "calib_selftest.h").write_text(header.selftest)
 
 
 def _compile(command: Sequence[str | Path]) -> None:

@@ -183,7 +183,7 @@ serial = pytest.importorskip("serial")
 
 def _stream(header: Header, ticks: int = 90) -> bytes:
     identity, out = header.identity, b"\x00\xa5\x5a\x4ehalf a frame"
-    for k, vector in enumerate(vectors(header, ticks)):
+    for k, vector in enumerate(vectors(header.values, ticks)):
         w = vector.wanted
         frame = Frame(identity, 60000, k, vector.given, w)
         out += encoded(frame)

@@ -109,7 +109,7 @@ def test_what_does_not_fit_does_not_compile(tmp_path: Path, line: str, message: 
     done = _compiled(tmp_path, "gcc", "-std=c99", f'{line}\n#include "calib_constants.h"\n')
     assert done.returncode != 0
     assert message in done.stderr
-    fits = "#define CALIB_EXPECT_SCHEMA 6\n#define CALIB_EXPECT_TICK_RATE_MHZ 60000\n"
+    fits = "#define CALIB_EXPECT_SCHEMA 7\n#define CALIB_EXPECT_TICK_RATE_MHZ 60000\n"
     fits += "#define CALIB_EXPECT_PUMP_HIGH 255\n"
     done = _compiled(tmp_path, "gcc", "-std=c99", f'{fits}#include "calib_pipeline.h"\n')
     assert done.returncode == 0, done.stderr
@@ -340,6 +340,23 @@ def test_the_tuned_table_balances_the_springs() -> None:
 def _with(section: str, **changes: object) -> Rig:
     whole = rig("fused")
     return whole.with_sections({section: getattr(whole, section).model_copy(update=changes)})
+
+
+@pytest.mark.parametrize(("offset_s", "ticks"), [(0.0255, 1.53), (0.0, 0.0), (0.1, 6.0), (-0.008, 0.0)])
+def test_the_delay_of_the_pictures_is_honoured_to_parts_of_a_tick(offset_s: float, ticks: float) -> None:
+    made = header_of(_with("align", time_offset_s=offset_s), "rig.yaml")
+    c = made.values
+    assert c["CALIB_TIME_OFFSET_TICKS"] - c["CALIB_TIME_OFFSET_PART"] == pytest.approx(ticks, abs=1e-6)
+    assert c["CALIB_FUSED_DELAY_TICKS"] == pytest.approx(ticks, abs=1e-6)
+    assert ("8.0 ms earlier than the IMU's" in str(made.verdict.remarks)) == (offset_s < 0.0)
+
+
+def test_pictures_from_before_or_long_after_the_sample_are_refused() -> None:
+    for offset_s in (-0.02, 0.15):
+        with pytest.raises(
+            BadInputError, match=r"align\.time_offset_s is .* expected pictures that are -1 to 8"
+        ):
+            header_of(_with("align", time_offset_s=offset_s), "rig.yaml")
 
 
 @pytest.mark.parametrize("alpha", [0.0, 0.05, -1.2, 2.5])

@@ -471,7 +471,7 @@ def test_every_stage_is_the_projects_own(mode: int) -> None:
 @pytest.mark.parametrize("kind", ["nominal", "full"])
 def test_they_reach_every_branch_but_the_angles_limit(kind: str) -> None:
     seen = 0
-    for vector in vectors(header(kind)):
+    for vector in vectors(header(kind).values):
         seen |= vector.wanted.flags
     for flag in (MARKER_HELD, IMU_HELD, BAD_REFERENCE, *SATURATED):
         assert seen & flag, hex(flag)
@@ -483,7 +483,7 @@ def test_they_reach_every_branch_but_the_angles_limit(kind: str) -> None:
 @pytest.mark.parametrize("kind", ["fused", "full"])
 def test_they_reach_every_branch(kind: str) -> None:
     seen, resting = 0, 0
-    for vector in vectors(header(kind), FUSED_TICKS, fused=True):
+    for vector in vectors(header(kind).values, FUSED_TICKS, fused=True):
         seen |= vector.wanted.flags
         resting += not vector.wanted.flags & (MOVING | MARKER_HELD)
     for flag in (MARKER_HELD, IMU_HELD, ACCEL_WEAK, REJECTED, MOVING, BAD_REFERENCE, *SATURATED):

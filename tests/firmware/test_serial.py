@@ -72,7 +72,7 @@ def test_every_whole_frame_is_found_between_garbage(garbage: list[bytes], portio
 
 
 def _frames(count: int, first: int = 0) -> list[Frame]:
-    vector = vectors(header(), 2)[0]
+    vector = vectors(header().values, 2)[0]
     w = vector.wanted
     one = Frame(1, 60000, 0, vector.given, w)
     return [replace(one, sequence=(first + k) & 0xFFFF) for k in range(count)]
@@ -136,7 +136,7 @@ def test_ticks_are_written_as_they_come() -> None:
 def _frames_check(ticks: int = 120) -> list[Frame]:
     identity = header().identity
     made = []
-    for k, vector in enumerate(vectors(header(), ticks)):
+    for k, vector in enumerate(vectors(header().values, ticks)):
         w = vector.wanted
         made.append(Frame(identity, 60000, k, vector.given, w))
     return made
@@ -162,7 +162,7 @@ def test_a_good_board_passes(tmp_path: Path) -> None:
 def test_a_board_with_the_fused_estimator_is_known_by_its_flags(tmp_path: Path) -> None:
     identity = header("fused").identity
     frames = []
-    for k, vector in enumerate(vectors(header("fused"), 120, fused=True)):
+    for k, vector in enumerate(vectors(header("fused").values, 120, fused=True)):
         w = vector.wanted
         frames.append(Frame(identity, 60000, k, vector.given, w))
     result = check_frames(header("fused"), read_frames(_log(tmp_path / "log.csv", frames)), "log.csv")

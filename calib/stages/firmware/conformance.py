@@ -14,15 +14,12 @@ from calib.io.serial import MODE_OFF, MODE_ORIENTATION, MODE_POSITION, Inputs, O
 # What the firmware has to compute, in float64: the reference that C, AVR and boards are held against.
 #
 # It takes the constants of a header as a compiler reads them, rounded to binary32, and inputs in the same
-# precision, so that what differs is the firmware's own rounding and its polynomials alone. Those it does
-# not
-# share: angle, sine and cosine are the library's here. The order of decisions is that of
-# `calib_pipeline.h`.
+# precision, so that what differs is the firmware's own rounding and its polynomials alone. Those it does not
+# share: angle, sine and cosine are the library's here. The order of decisions is that of `calib_pipeline.h`.
 #
 # Decisions on computed values (integration left out or not) can fall either way when the value lies within
-# rounding of the limit. `step` therefore takes what the firmware decided, and reports how far its own
-# value was
-# from the limit where it would have decided otherwise.
+# rounding of the limit. `step` therefore takes what the firmware decided, and reports how far its own value
+# was from the limit where it would have decided otherwise.
 
 MARKER_HELD, HORIZON, IMU_HELD, ACCEL_WEAK = 0x1, 0x2, 0x4, 0x8
 ANGLE_LIMIT, STALE, BAD_REFERENCE = 0x10, 0x20, 0x40
@@ -204,6 +201,11 @@ class Reference:
         m.marker_age = 0
         return 0, afresh
 
+    def _then(self) -> float:
+        """The angle when the picture was exposed."""
+        line = [*self.memory.past, self.memory.phi]
+        return line[0] + (self.c["TIME_OFFSET_PART"] * (line[1] - line[0]) if len(line) > 1 else 0.0)
+
     def _lowpass(self, axis: int, x: float, afresh: bool) -> float:
         """Direct form on the difference equation's own coefficients, unlike the firmware's forms."""
         c, memory = self.c, self.memory
@@ -319,7 +321,7 @@ class Reference:
             head, turned = (0.0, c["REST_LENGTH_M"]), c["BELLOWS_RADIUS_M"] * phi
             q = (c["REST_LENGTH_M"] + turned, c["REST_LENGTH_M"] - turned)
         else:
-            then = m.past[0] if m.past else phi
+            then = self._then()
             d = c["MARKER_OFFSET_M"]
             x, y = m.marker[0] - d * math.sin(then), m.marker[1] - d * math.cos(then)
             head = (self._lowpass(0, x, afresh), self._lowpass(1, y, afresh))
@@ -346,21 +348,16 @@ class Reference:
 # The tick with the fused estimator in float64, what CALIB_FUSED 1 is held against.
 #
 # As `calib.stages.firmware.conformance`: the header's constants, exact functions, the order of decisions of
-# `calib_pipeline.h`. Rest or motion, and a picture left out or not, are taken from the firmware's flags
-# where
+# `calib_pipeline.h`. Rest or motion, and a picture left out or not, are taken from the firmware's flags where
 # they are given, with the distance of the reference's own value from the limit where it would have decided
 # otherwise.
 
 
 @dataclass
 class _Fused:
-    """What the estimator remembers; `past` are the last ticks' angles, the oldest first.
-
-    `chord` is that of the time of the picture.
-    """
+    """What the estimator remembers beside the angles; `chord` is that of the time of the picture."""
 
     length: float
-    past: list[float]
     bias: float = 0.0
     half: float = 0.0
     rate: float = 0.0
@@ -397,7 +394,7 @@ class FusedReference(Reference):
     def start(self) -> None:
         """Forget everything, as calib_start."""
         super().start()
-        self.fused = _Fused(self.c["REST_LENGTH_M"], [0.0] * int(self.c["FUSED_TICKS"]))
+        self.fused = _Fused(self.c["REST_LENGTH_M"])
 
     def _turn(self, given: Inputs) -> tuple[int, bool, float, float]:
         """Flags, whether the IMU's sample is used, and gravity along and across the head."""
@@ -419,7 +416,7 @@ class FusedReference(Reference):
                 sampled = False
             else:
                 m.phi = clip(math.atan2(B, A), c["PHI_LIMIT_RAD"])
-                f.past = [m.phi] * len(f.past)
+                m.past = [m.phi] * len(m.past)
             f.half = half
         if sampled:
             m.imu_age = 0
@@ -481,8 +478,7 @@ class FusedReference(Reference):
         flags |= BY_FUSED | (BY_MEAN_RATE if self.mean_rate else 0)
         seen, afresh = self._marker(given)
         flags |= seen
-        line = [*f.past, m.phi]
-        then = line[0] + (c["FUSED_PART"] * (line[1] - line[0]) if f.past else 0.0)
+        then = self._then()
         correction = 0.0
         if sampled and not flags & ACCEL_WEAK:
             whole = c["FUSED_ACCEL_GAIN"]
@@ -503,8 +499,8 @@ class FusedReference(Reference):
         if abs(m.phi) > limit:
             m.phi = clip(m.phi, limit)
             flags |= ANGLE_LIMIT
-        if f.past:
-            f.past = [*(clip(angle + correction, limit) for angle in f.past[1:]), m.phi]
+        if m.past:
+            m.past = [*(clip(angle + correction, limit) for angle in m.past[1:]), m.phi]
         turned = c["BELLOWS_RADIUS_M"] * m.phi
         head = (f.chord * math.sin(0.5 * then), f.chord * math.cos(0.5 * then))
         return flags, head, (f.length + turned, f.length - turned), undecided

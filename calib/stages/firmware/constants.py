@@ -209,19 +209,22 @@ def plane_constants(rig: Rig, source: str) -> PlaneConstants | None:
 #
 #     D = 2 / (2 b0 - a1),  g = sqrt(b0 D);   A1 = 1 / D,  A2 = g / D,  A3 = b0.
 
-_LONGEST_OFFSET_TICKS = 8
+MOST_EARLY_TICKS = 1.0
+"""Pictures that are earlier than the IMU by less count as of its time."""
+
+_WHOLE = 1e-6
 _LEVELLING_STEPS = 17
 
 
-def _offset_ticks(lookup: Lookup, rate_hz: float) -> int:
-    offset_s = lookup.number("align.time_offset_s", 0.0)
-    ticks = round(offset_s * rate_hz)
-    if not 0 <= ticks <= _LONGEST_OFFSET_TICKS:
+def _delay_ticks(lookup: Lookup, rate_hz: float) -> float:
+    """Ticks from the exposure of a picture to the tick that reads it; 0 for pictures that seem early."""
+    delay = lookup.number("align.time_offset_s", 0.0) * rate_hz
+    if not -MOST_EARLY_TICKS <= delay <= MOST_DELAY_TICKS:
         raise BadInputError(
-            f"{lookup.source}: align.time_offset_s is {offset_s:g} s, {ticks} ticks; "
-            f"expected 0 to {_LONGEST_OFFSET_TICKS} ticks, by which the pictures are late"
+            f"{lookup.source}: align.time_offset_s is {delay / rate_hz:g} s, {delay:.3g} ticks; "
+            f"expected pictures that are {-MOST_EARLY_TICKS:g} to {MOST_DELAY_TICKS} ticks late"
         )
-    return ticks
+    return max(delay, 0.0)
 
 
 def _imu(lookup: Lookup, rate_hz: float) -> dict[str, Any]:
@@ -407,10 +410,9 @@ def _envelope(
 #
 #     A = k ( f_x cos alpha + f_y sin alpha),   B = k (-f_x sin alpha + f_y cos alpha),
 #
-# so that K_a e_a = B cos(phi_D) - A sin(phi_D) - K_a (phi - phi_D). A picture's age of D ticks is
-# `TICKS` = ceil(D) remembered angles less the share `PART` = TICKS - D of a tick.
+# so that K_a e_a = B cos(phi_D) - A sin(phi_D) - K_a (phi - phi_D). D is the age
+# of a picture in ticks.
 
-_WHOLE = 1e-6
 _WEAK_MPS2 = 1.0
 _GRAVITY_MPS2 = 9.81
 
@@ -432,19 +434,13 @@ def _designed(lookup: Lookup, rate_hz: float, delay: float, plane: PlaneConstant
     return design(noise, rate_hz, delay / rate_hz, lever)
 
 
-def _delay_ticks(lookup: Lookup, rate_hz: float) -> float:
-    delay = lookup.number("align.time_offset_s", 0.0) * rate_hz
-    # As far as the whole ticks of the other filters reach.
-    if not -0.5 <= delay <= MOST_DELAY_TICKS + 0.5:
-        raise BadInputError(
-            f"{lookup.source}: align.time_offset_s is {delay / rate_hz:g} s, {delay:.3g} ticks; "
-            f"expected pictures that are 0 to {MOST_DELAY_TICKS} ticks late"
-        )
-    return min(max(delay, 0.0), float(MOST_DELAY_TICKS))
-
-
 def _fused(
-    lookup: Lookup, rate_hz: float, plane: PlaneConstants | None, imu: dict[str, Any], rest: float
+    lookup: Lookup,
+    rate_hz: float,
+    delay: float,
+    plane: PlaneConstants | None,
+    imu: dict[str, Any],
+    rest: float,
 ) -> dict[str, Any]:
     """Those of the estimator, or what rig.yaml lacks for it.
 
@@ -455,7 +451,6 @@ def _fused(
         return {
             "lacks": " and ".join([*["plane"] * (plane is None), *["align"] * (lookup.rig.align is None)])
         }
-    delay = _delay_ticks(lookup, rate_hz)
     tuned = lookup.find("estimator.constant_gain")
     if isinstance(tuned, EstimatorGain) and abs(tuned.rate_hz / rate_hz - 1.0) <= 1e-6:
         gain, source = Gains(**tuned.model_dump()), "Gains of estimator.constant_gain."
@@ -463,14 +458,12 @@ def _fused(
         gain, source = _designed(lookup, rate_hz, delay, plane, rest), "Gains for the noise in align."
         if tuned is not None:
             source += " Those of estimator.constant_gain are for another tick."
-    k, ticks = gain.accel_phi / _GRAVITY_MPS2, math.ceil(delay - _WHOLE)
+    k = gain.accel_phi / _GRAVITY_MPS2
     ca, sa = k * math.cos(imu["mount"]), k * math.sin(imu["mount"])
     rows = np.array([[ca, sa], [-sa, ca]]) / imu["scales"]
     return {
         "lacks": "",
         "source": source,
-        "ticks": ticks,
-        "part": max(ticks - delay, 0.0),
         "delay": delay,
         "accel": np.column_stack([rows, rows @ imu["bias"]]),
         "gain": gain,
@@ -501,9 +494,12 @@ def constants(lookup: Lookup, plane: PlaneConstants | None) -> dict[str, Any]:
         )
     imu, pwm = _imu(lookup, rate_hz), _limits(lookup)
     feed = _feed(lookup, pwm[0])
+    delay = _delay_ticks(lookup, rate_hz)
+    ticks = math.ceil(delay - _WHOLE)
     return {
         "rate_hz": rate_hz,
-        "offset_ticks": _offset_ticks(lookup, rate_hz),
+        "offset_ticks": ticks,
+        "offset_part": max(ticks - delay, 0.0),
         "imu": imu,
         "levelling": _levelling(lookup, rate_hz),
         "mahony": {
@@ -515,7 +511,7 @@ def constants(lookup: Lookup, plane: PlaneConstants | None) -> dict[str, Any]:
         "bellows_radius_m": radius,
         "rest_length_m": rest,
         "series": [float(c) for c in inverse_coefficients()],
-        "fused": _fused(lookup, rate_hz, plane, imu, rest),
+        "fused": _fused(lookup, rate_hz, delay, plane, imu, rest),
         "pwm": pwm,
         "orientation": _pid(lookup, "orientation", "rad", _ORIENTATION, rate_hz),
         "orientation_sign": round(lookup.number("controller.orientation.sign", 1)),

@@ -26,6 +26,7 @@ from calib.stages.camera.model import COEFFICIENTS, MODELS
 from calib.stages.camera.section import InverseLens
 from calib.stages.firmware.constants import Lookup, constants, plane_constants
 from calib.stages.firmware.literals import comment_text, float_literal, literals, values
+from calib.stages.firmware.vectors import selftest_rows
 
 if TYPE_CHECKING:
     from calib.core.rig import Rig
@@ -70,6 +71,12 @@ class Header:
         """CALIB_ID."""
         return int(self.digest[:8], 16)
 
+    @property
+    def selftest(self) -> str:
+        """calib_selftest.h."""
+        identity = f"{self.identity:08X}"
+        return rendered("calib_selftest.h.j2", identity=identity, **selftest_rows(self.values))
+
     @staticmethod
     def sketch(folder: Path) -> str:
         """Name of the sketch in a folder: the Arduino IDE wants it to bear the folder's."""
@@ -82,11 +89,9 @@ class Header:
 
         Raises `BadInputError` where the folder cannot be written.
         """
-        from calib.stages.firmware.vectors import selftest_text
-
         where = Path(folder)
         texts = {name: verbatim(name) for name in VERBATIM}
-        texts |= {"calib_constants.h": self.text, "calib_selftest.h": selftest_text(self)}
+        texts |= {"calib_constants.h": self.text, "calib_selftest.h": self.selftest}
         texts[self.sketch(where)] = verbatim("calib_example.ino")
         make_folder(where)
         written = []
@@ -159,6 +164,10 @@ def _judge(whole: Rig, inverse: InverseLens | None) -> Verdict:
         lacks, verb = ("camera", "intrinsics") if whole.camera is None else ("plane", "extrinsics")
         text = f"no {lacks} yet: the sketch records, and controls nothing"
         findings.append(Finding("remark", text, f"run calib {verb}"))
+    if whole.align is not None and whole.align.time_offset_s < 0.0:
+        early_ms = -1e3 * whole.align.time_offset_s
+        text = f"pictures are {early_ms:.1f} ms earlier than the IMU's samples, and count as of their time"
+        findings.append(Finding("remark", text))
     if whole.simulated:
         text = "the rig is a simulated one: for a board its constants compile only with CALIB_I_KNOW"
         findings.append(Finding("remark", text))

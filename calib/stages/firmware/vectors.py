@@ -12,7 +12,6 @@ import numpy as np
 from calib.core.errors import BadInputError
 from calib.io.serial import MODE_OFF, MODE_ORIENTATION, MODE_POSITION, Inputs, Outputs
 from calib.stages.firmware.conformance import Reference, binary32, reference_of
-from calib.stages.firmware.header import Header, rendered
 
 # ----------------------------------------------------------------------
 # Golden vectors: a short run that drives every constant, with what the reference makes of it.
@@ -112,9 +111,15 @@ def _limits(constants: Mapping[str, float], still: Inputs) -> list[tuple[Inputs,
     return [(binary32(given), times) for given, times in made]
 
 
-def vectors(header: Header, ticks: int = 48, fused: bool = False, limits: bool = False) -> list[Vector]:
-    """Golden vectors of a header; `fused` for CALIB_FUSED 1, `limits` with all that a tick has to refuse."""
-    constants = header.values
+def vectors(
+    constants: Mapping[str, float], ticks: int = 48, fused: bool = False, limits: bool = False
+) -> list[Vector]:
+    """Golden vectors for the constants of a header, by name.
+
+    Parameters
+    ----------
+    fused : for CALIB_FUSED 1. limits : with all that a tick has to refuse.
+    """
     reference = reference_of(constants, fused=fused)
     run = directed_fused(constants, ticks, period=ticks) if fused else directed(constants, ticks)
     given = [(one, 1) for one in run]
@@ -138,28 +143,24 @@ def _row(vector: Vector) -> list[list[float]]:
     return [[float(v) if abs(v) > 1e-30 else 0.0 for v in row] for row in rows]
 
 
-def selftest_text(header: Header) -> str:
-    """calib_selftest.h of a header."""
-    fused = vectors(header, FUSED_TICKS, fused=True, limits=True) if header.values["CALIB_HAS_FUSED"] else []
-    return rendered(
-        "calib_selftest.h.j2",
-        identity=f"{header.identity:08X}",
-        undistort=int(header.values["CALIB_HAS_PLANE"] and Reference(header.values).undistort),
-        rows=list(map(_row, vectors(header, limits=True))),
-        fused_rows=list(map(_row, fused)),
-        tolerance=TOLERANCE,
-    )
+def selftest_rows(constants: Mapping[str, float]) -> dict[str, Any]:
+    """What calib_selftest.h is made of: rows of numbers for CALIB_FUSED 0 and 1, and CALIB_UNDISTORT."""
+    fused = vectors(constants, FUSED_TICKS, fused=True, limits=True) if constants["CALIB_HAS_FUSED"] else []
+    return {
+        "undistort": int(constants["CALIB_HAS_PLANE"] and Reference(constants).undistort),
+        "rows": list(map(_row, vectors(constants, limits=True))),
+        "fused_rows": list(map(_row, fused)),
+        "tolerance": TOLERANCE,
+    }
 
 
 # ----------------------------------------------------------------------
 # A run that drives the fused estimator: readings of one motion, so that the pictures fit the angle.
 #
 # Every `PERIOD` ticks the head swings through +-1.2 rad while its length changes, creeps by less than what
-# the
-# estimator counts as a motion, and rests. The marker is where the head was CALIB_FUSED_DELAY_TICKS earlier.
-# Pictures of something else, one by one and enough of them in a row for a new start, lost markers, lost
-# samples
-# of the IMU, free fall and refused references are among the ticks.
+# the estimator counts as a motion, and rests. The marker is where the head was CALIB_FUSED_DELAY_TICKS
+# earlier. Pictures of something else, one by one and enough of them in a row for a new start, lost markers,
+# lost samples of the IMU, free fall and refused references are among the ticks.
 
 PERIOD = 240
 _SWING = 0.55

@@ -16,7 +16,7 @@
  * a reset. A sensor that does not answer, or is not what it should be, is started anew, ever more seldom.
  */
 #define CALIB_PROGMEM 1
-#define CALIB_EXPECT_SCHEMA 6
+#define CALIB_EXPECT_SCHEMA 7
 #define CALIB_EXPECT_PUMP_HIGH 255
 
 #include <Arduino.h>
