@@ -12,9 +12,11 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import json
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -111,6 +113,20 @@ class Provenance(Section):
 
     version: str = __version__
     inputs: dict[str, dict[str, str]] = {}
+
+
+@lru_cache(maxsize=64)
+def _section_text(name: str, document: str) -> str:
+    """The lines of a section in the file. A run writes most sections two dozen times."""
+    return str(
+        yaml.safe_dump(
+            {name: json.loads(document)},
+            sort_keys=False,
+            default_flow_style=None,
+            width=110,
+            allow_unicode=True,
+        )
+    )
 
 
 @dataclass
@@ -223,15 +239,10 @@ class Rig:
 
     def text(self) -> str:
         """The file's text, the same for the same rig."""
-        sections = self.values()
-        sections = {self.name_in_file(name): one for name, one in sections.items()}
-        return yaml.safe_dump(
-            {"schema": SCHEMA, **sections},
-            sort_keys=False,
-            default_flow_style=None,
-            width=110,
-            allow_unicode=True,
+        sections = (
+            _section_text(self.name_in_file(name), json.dumps(one)) for name, one in self.values().items()
         )
+        return "".join([f"schema: {SCHEMA}\n", *sections])
 
     def name_in_file(self, section: str) -> str:
         """What the file calls a section: an arm is its actuator unless there is another."""

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -447,9 +447,14 @@ def simulate_batch(
         np.full(len(plants), -1, dtype=np.int64),
     )
     blocks, alone = _blocks(plants, pumps)
+    jobs = [partial(_block, task, block) for block in blocks] + [
+        partial(_one, task, index) for index in alone
+    ]
+    if len(jobs) == 1:
+        # As in most of a search: a thread would cost a tenth of the work.
+        jobs[0]()
+        return task.states, task.stopped
     with ThreadPoolExecutor(max_workers=threads) as pool:
-        side_by_side = [pool.submit(_block, task, block) for block in blocks]
-        single = [pool.submit(_one, task, index) for index in alone]
-        for job in (*side_by_side, *single):
+        for job in [pool.submit(job) for job in jobs]:
             job.result()
     return task.states, task.stopped
