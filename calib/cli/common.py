@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Literal, ParamSpec, TypeVar
+from typing import Annotated, Any, ParamSpec, TypeVar
 
 import typer
 
@@ -47,24 +47,6 @@ def telling(verb: Callable[Parameters, Returned]) -> Callable[Parameters, Return
 
 RigOption = Annotated[Path, typer.Option("--rig", help="The rig's file.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of words.")]
-AccUnitOption = Annotated[
-    Literal["m/s2", "g", "mg", "counts"] | None,
-    typer.Option("--acc-unit", help="Unit of ax, ay, az in the logs; else as names or readings say."),
-]
-GyroUnitOption = Annotated[
-    Literal["rad/s", "deg/s", "mdeg/s", "counts"] | None,
-    typer.Option("--gyro-unit", help="Unit of gx, gy, gz in the logs; else as names or readings say."),
-]
-ColumnsOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--columns", help="What the logs' columns are; else columns.yaml or NAME.columns.yaml beside them."
-    ),
-]
-TopicsOption = Annotated[
-    Path | None,
-    typer.Option("--topics", help="Which topic of a bag is which column; else NAME.topics.yaml beside it."),
-]
 FiguresOption = Annotated[
     Path | None, typer.Option("--figures", help="Folder to draw figures into, made if needed.")
 ]

@@ -9,25 +9,21 @@ from typing import Annotated
 import typer
 
 from calib.cli.common import (
-    AccUnitOption,
-    ColumnsOption,
-    GyroUnitOption,
     JsonOption,
-    TopicsOption,
     answer,
     narrate,
     progress_bar,
 )
+from calib.cli.verbs import of_logs
 from calib.core.errors import BadInputError, UsageError
+from calib.core.options import NOTHING_STATED, LogOptions
 
 
+@of_logs
 def convert(
     log: Annotated[Path, typer.Argument(help="Log: .csv, .parquet, .mcap, .bag, .db3 or a ROS 2 folder.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Log to write, .csv or .parquet.")],
-    acc_unit: AccUnitOption = None,
-    gyro_unit: GyroUnitOption = None,
-    columns: ColumnsOption = None,
-    topics: TopicsOption = None,
+    stated: LogOptions = NOTHING_STATED,
     save_columns: Annotated[
         Path | None,
         typer.Option("--save-columns", help="Write what the columns were read as, as a columns.yaml."),
@@ -42,7 +38,6 @@ def convert(
 
     from calib.core.command import note_inputs
     from calib.core.files import shown
-    from calib.core.options import LogOptions
     from calib.core.writing import check_writable, write_atomically, writes_through
     from calib.io.columns import COLUMNS_FILE
     from calib.io.logs import LOG, beside, iter_log, passed_over, refuse_counts
@@ -50,11 +45,11 @@ def convert(
 
     if output.suffix.lower() not in (".csv", ".parquet") and not writes_through(output):
         raise UsageError(f"{shown(output)}: expected a name that ends in .csv or .parquet")
-    note_inputs([log, *beside(log), *(path for path in (columns, topics) if path is not None)])
+    note_inputs([log, *beside(log), *(path for path in (stated.columns, stated.topics) if path is not None)])
     check_writable(output, LOG)
     if save_columns is not None:
         check_writable(save_columns, COLUMNS_FILE)
-    stream = iter_log(log, LogOptions(acc_unit, gyro_unit, columns, topics))
+    stream = iter_log(log, stated)
     first = next(stream, None)
     if first is None:
         raise BadInputError(f"{shown(log)}: has a header but no rows")

@@ -8,9 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from calib.cli.common import (
-    AccUnitOption,
-    ColumnsOption,
-    GyroUnitOption,
     JsonOption,
     document,
     narrate,
@@ -18,6 +15,8 @@ from calib.cli.common import (
     say,
     table,
 )
+from calib.cli.verbs import of_logs
+from calib.core.options import NOTHING_STATED, LogOptions
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,6 +24,7 @@ if TYPE_CHECKING:
     from calib.runner.graph import Job
 
 
+@of_logs
 def run(
     folder: Annotated[
         Path | None,
@@ -40,9 +40,7 @@ def run(
     follow_links: Annotated[
         bool, typer.Option("--follow-links", help="Take files that are links out of the folder as well.")
     ] = False,
-    acc_unit: AccUnitOption = None,
-    gyro_unit: GyroUnitOption = None,
-    columns: ColumnsOption = None,
+    stated: LogOptions = NOTHING_STATED,
     jobs: Annotated[
         int | None, typer.Option(min=1, max=64, help="Stages at a time. [default: one per processor]")
     ] = None,
@@ -54,10 +52,8 @@ def run(
     alone are the calibration of a camera. Exits 0 when the firmware can be flashed, 1 when it cannot or
     something is weak, 3 when a stage has failed.
     """
-    from calib.core.options import LogOptions
     from calib.runner.outputs import calibrate
 
-    stated = LogOptions(acc_unit, gyro_unit, None if columns is None else columns.absolute())
     with progress_bar("calibrating") as progress:
         done = calibrate(
             folder,

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
@@ -22,7 +23,7 @@ from calib.cli.common import (
     telling,
 )
 from calib.core.errors import EXIT_POOR
-from calib.core.options import options_of
+from calib.core.options import LogOptions, options_of
 from calib.core.stage import Files, Stage
 from calib.stages import STAGES, stage
 
@@ -51,10 +52,7 @@ def verb(stage: Stage) -> Callable[..., None]:
 
     command.__name__ = stage.name.split()[-1]
     command.__doc__ = stage.summary
-    parameters = _parameters(stage)
-    # What typer and help() read.
-    command.__annotations__ = {one.name: one.annotation for one in parameters}
-    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # no function has it before
+    _declare(command, _parameters(stage))
     return command
 
 
@@ -68,18 +66,7 @@ def _parameters(stage: Stage) -> list[inspect.Parameter]:
             shape, default = shape | None, None
         argument = typer.Argument(help=stage.sources, metavar=stage.metavar or None, show_default=False)
         out.append(inspect.Parameter("sources", kind, default=default, annotation=Annotated[shape, argument]))
-    hints = get_type_hints(stage.options)
-    for one in fields(stage.options):
-        meta, default = one.metadata, None if one.default is MISSING else one.default
-        # What has a parser is typed with its unit, and has its default in the help's words.
-        shape = str | None if meta["parse"] is not None else _several(hints[one.name])
-        name = "--" + (meta["flag"] or one.name.replace("_", "-"))
-        if hints[one.name] == bool | None:
-            # Left open it is neither.
-            name += f"/--no-{name.removeprefix('--')}"
-        switch = typer.Option(name, help=meta["words"], metavar=meta["metavar"] or None, min=meta["least"])
-        default = None if meta["parse"] is not None else default
-        out.append(inspect.Parameter(one.name, kind, default=default, annotation=Annotated[shape, switch]))
+    out += _switches(stage.options)
     if stage.output is not None:
         made = stage.output
         switch = typer.Option(*made.flags, help=made.words, metavar=made.metavar or None)
@@ -92,6 +79,48 @@ def _parameters(stage: Stage) -> list[inspect.Parameter]:
     out.append(inspect.Parameter("rig", kind, default=Path("rig.yaml"), annotation=RigOption))
     out.append(inspect.Parameter("as_json", kind, default=False, annotation=JsonOption))
     return out
+
+
+def _switches(options: type[Any]) -> Iterator[inspect.Parameter]:
+    """The options of a class on the command line."""
+    hints = get_type_hints(options)
+    for one in fields(options):
+        meta, default = one.metadata, None if one.default is MISSING else one.default
+        # What has a parser is typed with its unit, and has its default in the help's words.
+        shape: Any = str | None if meta["parse"] is not None else _several(hints[one.name])
+        name = "--" + (meta["flag"] or one.name.replace("_", "-"))
+        if hints[one.name] == bool | None:
+            # Left open it is neither.
+            name += f"/--no-{name.removeprefix('--')}"
+        switch = typer.Option(name, help=meta["words"], metavar=meta["metavar"] or None, min=meta["least"])
+        default = None if meta["parse"] is not None else default
+        kind = inspect.Parameter.KEYWORD_ONLY
+        yield inspect.Parameter(one.name, kind, default=default, annotation=Annotated[shape, switch])
+
+
+def of_logs(function: Callable[..., None]) -> Callable[..., None]:
+    """A verb that takes what a person states of logs as options of its own, and gets it as `stated`."""
+
+    @functools.wraps(function)
+    def command(*paths: Any, **values: Any) -> None:
+        stated = {one.name: values.pop(one.name, None) for one in fields(LogOptions)}
+        function(*paths, stated=LogOptions(**stated), **values)
+
+    hints, parameters = get_type_hints(function, include_extras=True), list[inspect.Parameter]()
+    for one in inspect.signature(function).parameters.values():
+        if one.name == "stated":
+            parameters += _switches(LogOptions)
+        else:
+            own = one.replace(annotation=hints[one.name], kind=inspect.Parameter.KEYWORD_ONLY)
+            parameters.append(own)
+    _declare(command, parameters)
+    return command
+
+
+def _declare(command: Callable[..., None], parameters: Sequence[inspect.Parameter]) -> None:
+    """What typer and help() read."""
+    command.__annotations__ = {one.name: one.annotation for one in parameters}
+    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # no function has it before
 
 
 def _several(hint: Any) -> Any:

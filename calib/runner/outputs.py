@@ -6,7 +6,7 @@ import contextlib
 import json
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -212,6 +212,10 @@ def calibrate(
     BadInputError for a folder without anything to work on, and for an output folder that is not ours.
     """
     out = Path(output)
+    files: dict[str, Any] = {
+        name: value.absolute() for name, value in asdict(stated).items() if isinstance(value, Path)
+    }
+    stated = replace(stated, **files)
     if stated.columns is not None:
         read_columns_file(stated.columns)
     root = None if folder is None else Path(folder)

@@ -12,7 +12,6 @@ from calib.core.errors import UsageError
 from calib.core.options import LogOptions, option
 from calib.core.stage import Files, Progress, Stage
 from calib.core.verdict import Finding, Verdict
-from calib.core.words import as_words
 
 if TYPE_CHECKING:
     from calib.core.rig import Rig
@@ -197,6 +196,7 @@ def _far(found: Identification) -> Iterator[Finding]:
 
 
 def _untold(found: Identification) -> Iterator[Finding]:
+    from calib.core.words import as_words
     from calib.stages.arm.model import PARAMETERS, PARTS
 
     vague = {p.name for p, s in zip(PARAMETERS, found.fit.sigma.tolist(), strict=True) if s > _UNTOLD}
