@@ -246,13 +246,15 @@ def _class_of(kind: type[BaseModel], title: str) -> type[BaseModel]:
 
 def meanings(kind: type[BaseModel]) -> dict[str, str]:
     """What labels, the docstring's list of attributes and the text behind single fields say of each key."""
-    out = {name: field.title for name, field in kind.model_fields.items() if field.title}
-    for one in reversed(kind.__mro__[: kind.__mro__.index(BaseModel)]):
+    parts = getattr(kind, "model_fields", {})
+    out = {name: field.title for name, field in parts.items() if field.title}
+    for one in reversed(kind.__mro__[: kind.__mro__.index(BaseModel if parts else object)]):
         listed = (inspect.getdoc(one) or "").partition("Attributes\n----------\n")[2]
         entries = re.split(r"(?:^|(?<=[.,] )|\n)((?:[\w*]+, )*[\w*]+) : ", listed)
         for names, text in zip(entries[1::2], entries[2::2], strict=True):
             for name in names.split(", "):
-                out.update(dict.fromkeys(fnmatch.filter(one.model_fields, name), _plain(text).rstrip(",")))
+                keys = fnmatch.filter(getattr(one, "model_fields", one.__annotations__), name)
+                out.update(dict.fromkeys(keys, _plain(text).rstrip(",")))
         named: list[ast.AnnAssign] = []
         (tree,) = ast.parse(textwrap.dedent(inspect.getsource(one))).body
         assert isinstance(tree, ast.ClassDef)

@@ -24,7 +24,7 @@ from calib.runner.outputs import run_folder
 from calib.runner.processes import Here
 from calib.runner.work import DOCUMENT, FIGURES, MESSAGES, RIG
 from calib.stages.estimator.section import Estimator
-from calib.twin.section import Twin, TwinTracker
+from calib.twin.section import Tracker, Twin
 
 __all__ = ["CALLS", "STEPS", "Inline", "make_folder", "run_small"]
 
@@ -85,7 +85,7 @@ class Inline(Here):
             rig.save(rig_path, {"estimator": {path.name: digest for path in inputs}})
         elif work.verb == "second":
             assert rig.estimator is not None
-            rig.twin = Twin(tracker=TwinTracker(jitter_px=2.0 * rig.estimator.jitter_px))
+            rig.twin = Twin(tracker=Tracker(jitter_px=2.0 * rig.estimator.jitter_px))
             rig.save(rig_path, {"twin": {}})
         output = work.folder / work.output if work.output else None
         if output is not None and output.suffix:

@@ -23,6 +23,7 @@ Kind = TypeVar("Kind", bound=BaseModel)
 
 _EXPECTED = {
     "bool_type": "true or false",
+    "dataclass_type": "keys with values",
     "dict_type": "keys with values",
     "finite_number": "a finite number",
     "float_type": "a number",
@@ -33,6 +34,7 @@ _EXPECTED = {
     "model_attributes_type": "keys with values",
     "model_type": "keys with values",
     "string_type": "text",
+    "tuple_type": "a list",
 }
 """What pydantic's kinds of error ask for, in words."""
 
@@ -106,7 +108,7 @@ def _sentence(kind: type[BaseModel], error: ValidationError, under: str) -> str:
         return f"{key}.{first['msg']}"
     if how == "missing":
         return f"{key} is missing"
-    if how == "extra_forbidden":
+    if how in ("extra_forbidden", "unexpected_keyword_argument"):
         return f"{key} is not a key that is known here{nearest(str(place[-1]), around.get('properties', {}))}"
     message = first["msg"]
     expected = message[0].lower() + message[1:]

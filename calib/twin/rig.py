@@ -8,19 +8,18 @@ changes it: `camera` and `plane` as calibrated, `known`, `actuator` and `pump` a
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
-from calib.core.result import Section
 from calib.stages.actuator.parameters import DAMPING_SCALE_FREE, Plant, pumps_connected
 from calib.stages.actuator.pump import Pump
 from calib.stages.camera.model import project
 from calib.twin.pictures import CAMERA, PLANE
-from calib.twin.section import Twin
-from calib.twin.sensors import Imu, Tracker, View
+from calib.twin.section import Imu, Tracker, Twin
+from calib.twin.sensors import View
 
 if TYPE_CHECKING:
     from calib.core.rig import Rig
@@ -94,16 +93,6 @@ def rig_from_file(rig: Rig) -> SimulatedRig:
         machine.pump,
         machine.strength,
         view,
-        replace(made.tracker, **_frozen(twin.tracker)),
-        replace(made.imu, **_frozen(twin.imu)),
+        twin.tracker,
+        twin.imu,
     )
-
-
-def _frozen(section: Section | None) -> dict[str, Any]:
-    """Values that a section has, lists as tuples."""
-    values = {} if section is None else section.model_dump(exclude_none=True)
-    return {key: _tuple(value) if isinstance(value, list) else value for key, value in values.items()}
-
-
-def _tuple(values: list[Any]) -> tuple[Any, ...]:
-    return tuple(_tuple(value) if isinstance(value, list) else value for value in values)

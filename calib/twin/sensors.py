@@ -11,7 +11,6 @@ from calib.core.arrays import BoolArray, FloatArray
 from calib.core.compilation import kernel
 from calib.stages.actuator.dynamics import Coefficients
 from calib.stages.actuator.kinematics import (
-    MARKER_OFFSET_M,
     chord_decay_w,
     chord_ratio_w,
     forward,
@@ -19,6 +18,7 @@ from calib.stages.actuator.kinematics import (
 )
 from calib.stages.actuator.simulate import derivative
 from calib.stages.camera.model import Camera, project
+from calib.twin.section import Imu, Tracker
 
 # ----------------------------------------------------------------------
 # Random numbers that are the same on every machine.
@@ -230,33 +230,6 @@ class View:
 
 
 @dataclass(frozen=True)
-class Tracker:
-    """Errors of the tracker.
-
-    Attributes
-    ----------
-    marker_offset_m : d of (A.1).
-    latency_s : time from the exposure to the tick that reads the result.
-    jitter_px : standard deviation of the found position along each axis, before rounding.
-    grid_px : the position is a multiple of this; zero leaves it as it is.
-    outliers : probability that a frame shows another thing, `outlier_px` (least, most) away.
-    dropouts : probability that nothing is found in a frame.
-    blackouts_s : pairs (start, duration) without any frame.
-    stamp_jitter_s : standard deviation of the time stamps.
-    """
-
-    marker_offset_m: float = MARKER_OFFSET_M
-    latency_s: float = 0.025
-    jitter_px: float = 0.3
-    grid_px: float = 1.0
-    outliers: float = 0.003
-    outlier_px: tuple[float, float] = (5.0, 20.0)
-    dropouts: float = 0.004
-    blackouts_s: tuple[tuple[float, float], ...] = ()
-    stamp_jitter_s: float = 2e-4
-
-
-@dataclass(frozen=True)
 class TrackerNoise:
     """Everything random about the n frames of a log.
 
@@ -351,54 +324,8 @@ def track(
 
 _SENSOR_PURPOSE = 2
 _DEG = math.pi / 180.0
-_G = 9.81
 
-Triple = tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class Imu:
-    """Place and errors of the sensor.
-
-    Attributes
-    ----------
-    rate_hz : samples per second.
-    mount_angle_rad : what it reads at rest at phi = 0.
-    lever_m : its place c in the head's frame, across and along the tangent [m].
-    gravity_mps2 : g in the world frame.
-    gyro_scale, accel_scale : scale errors per axis.
-    gyro_bias_radps, accel_bias_mps2 : biases at the start.
-    gyro_noise, accel_noise : densities of the white noise [rad/s/sqrt(Hz), m/s^2/sqrt(Hz)].
-    gyro_walk, accel_walk : densities of the biases' walk [rad/s^2/sqrt(Hz), m/s^3/sqrt(Hz)].
-    gyro_step_radps, accel_step_mps2 : quantisation; zero for none.
-    gyro_range_radps, accel_range_mps2 : largest reading.
-    stamp_jitter_s, duplicated_stamps : deviation of the time stamps, share that repeat the last one.
-    onchip : whether the fusion on the chip is logged too.
-    onchip_drift_radps, onchip_spread : mean of its drift over many logs, and the deviation of a log's
-        drift from it as a share of it (Fig. 2.4).
-    """
-
-    rate_hz: float = 100.0
-    mount_angle_rad: float = 0.02
-    lever_m: tuple[float, float] = (0.0, 0.006)
-    gravity_mps2: tuple[float, float] = (0.0, _G)
-    gyro_scale: Triple = (0.004, -0.003, 0.006)
-    accel_scale: Triple = (0.003, -0.002, 0.004)
-    gyro_bias_radps: Triple = (0.004, -0.003, 0.006)
-    accel_bias_mps2: Triple = (0.05, -0.04, 0.07)
-    gyro_noise: float = 0.014 * _DEG
-    accel_noise: float = 150e-6 * _G
-    gyro_walk: float = 1e-5
-    accel_walk: float = 1e-4
-    gyro_step_radps: float = 0.0305 * _DEG
-    accel_step_mps2: float = 0.01916
-    gyro_range_radps: float = 2000.0 * _DEG
-    accel_range_mps2: float = 4.0 * _G
-    stamp_jitter_s: float = 4e-4
-    duplicated_stamps: float = 0.002
-    onchip: bool = False
-    onchip_drift_radps: float = 0.145 * _DEG
-    onchip_spread: float = 0.4
+Triple = tuple[float, ...]
 
 
 @dataclass(frozen=True)
