@@ -87,6 +87,23 @@ def test_the_plant_of_the_file_is_controlled(calib: Run, tmp_path: Path) -> None
     assert rise() > 1.3 * nominal
 
 
+def test_controllers_meet_another_plant(calib: Run, tmp_path: Path) -> None:
+    (tmp_path / "weak.yaml").write_text("known: {pump: {strength: [0.85, 0.85]}}\n")
+    (tmp_path / "slow.yaml").write_text("known: {pump: {tick_s: 0.02}}\n")
+    words = ("control", "run", "ellipse", "--controller", "torque", "--json", "--duration", "3s")
+    own, other = (calib(*words, *more, cwd=tmp_path) for more in ((), ("--plant", "weak.yaml")))
+    assert own.code == other.code == 0, other.err
+    own_run, other_run = json.loads(own.out)["control"], json.loads(other.out)["control"]
+    assert "plant" not in own_run and other_run["plant"] == "weak.yaml"
+    errors = [told["runs"][0]["head_rms_mm"] for told in (own_run, other_run)]
+    # A sixth of the force is missing, and the law learns it from the errors alone.
+    assert errors[1] > 2.0 * errors[0]
+    # What can be followed is told of the model, which is the same.
+    assert own_run["fastest_rise_N_per_s"] == other_run["fastest_rise_N_per_s"]
+    ended = calib(*words, "--plant", "slow.yaml", cwd=tmp_path)
+    assert ended.code == 3 and "--plant: found pumps with a tick of 20 ms, expected the 16.67 ms" in ended.err
+
+
 @pytest.mark.parametrize(
     ("verb", "text", "sentence"),
     [

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from calib.core.errors import BadInputError, UsageError
+from calib.core.files import one_line
 from calib.core.options import option
 from calib.core.stage import Files, Output, Stage
 from calib.core.units import parse_angle_rad, parse_duration_s, parse_pwm_limits
@@ -45,15 +46,19 @@ _DURATION = "Length of a reference by name, such as 30s."
 
 
 def _wanted(
-    files: Files, rig: Rig, duration_s: float | None, limits: tuple[float, float] | None
+    files: Files,
+    rig: Rig,
+    duration_s: float | None,
+    limits: tuple[float, float] | None,
+    plant: Path | None = None,
 ) -> tuple[SimulatedRig, Model, Reference]:
     """The machine, what controllers know of it, and the reference that was named."""
-    from calib.core.rig import Geometry
+    from calib.core.rig import Geometry, Rig
     from calib.stages.control.read import wanted_reference
     from calib.stages.control.references import check_workspace
     from calib.stages.control.trial import controlled
 
-    machine, model = controlled(rig, limits)
+    machine, model = controlled(rig, limits, None if plant is None else Rig.load(plant))
     wanted = wanted_reference(str(files.paths[0]), model, duration_s, rig, files.rig_path)
     x0, y0, x1, y1 = (rig.geometry or Geometry()).workspace_m
     check_workspace(model, wanted, (x0, y0, x1, y1))
@@ -82,6 +87,9 @@ class RunOptions:
         None, _DURATION, flag="duration", parse=partial(parse_duration_s, what="--duration")
     )
     pwm_limits: tuple[float, float] | None = option(None, _LIMITS, parse=parse_pwm_limits)
+    plant: Path | None = option(
+        None, "Another rig's file, whose actuator and pumps are driven; controllers know those of --rig."
+    )
 
 
 @dataclass(frozen=True)
@@ -103,7 +111,8 @@ class Runs:
 
     Attributes
     ----------
-    follow : how far the pumps can follow it, whatever the controller.
+    follow : how far the pumps of the model can follow it, whatever the controller.
+    plant : name of the file of the plant, where it is not the model's.
     """
 
     model: Model
@@ -112,6 +121,7 @@ class Runs:
     outcomes: Sequence[Outcome]
     feedback: str
     seed: int
+    plant: str | None = None
 
     @property
     def verdict(self) -> Verdict:
@@ -128,7 +138,7 @@ def _read_run(files: Files, rig: Rig, options: RunOptions) -> RunInputs:
     for name in options.controllers or ():
         if name not in CONTROLLERS:
             raise UsageError(f"--controller: {name!r} is not one of {', '.join(CONTROLLERS)}")
-    machine, model, wanted = _wanted(files, rig, options.duration_s, options.pwm_limits)
+    machine, model, wanted = _wanted(files, rig, options.duration_s, options.pwm_limits, options.plant)
     names = options.controllers or controllers_for(wanted, rig.controller)
     files.narrate("simulated: a model of a rig, not the rig")
     return RunInputs(machine, model, wanted, names, rig.controller, options, files.progress)
@@ -149,7 +159,8 @@ def _solve_run(inputs: RunInputs) -> Runs:
                 )
             )
     found = follow(model, wanted.path_m(model.plant.rest_length_m))
-    return Runs(model, wanted, found, outcomes, options.feedback, options.seed)
+    plant = None if options.plant is None else options.plant.name
+    return Runs(model, wanted, found, outcomes, options.feedback, options.seed, plant)
 
 
 def _followed(reference: Reference, found: Following) -> dict[str, Any]:
@@ -173,7 +184,10 @@ def _run_document(runs: Runs) -> dict[str, Any]:
         limited = {} if one.limited is None else {"limited": one.limited}
         rows.append({"controller": one.controller, **asdict(one.figures), **limited})
     followed = _followed(runs.reference, runs.follow)
-    return {"control": {"feedback": runs.feedback, "seed": runs.seed, **followed, "runs": rows}}
+    told = {"feedback": runs.feedback, "seed": runs.seed}
+    if runs.plant is not None:
+        told["plant"] = runs.plant
+    return {"control": {**told, **followed, "runs": rows}}
 
 
 def _run_words(runs: Runs) -> list[Block]:
@@ -200,6 +214,7 @@ def _run_words(runs: Runs) -> list[Block]:
         rows.append((one.controller, *row[: len(head)], saturated, f"{f.changes_pwm:.1f}"))
     rate_hz = 1.0 / runs.model.tick_s
     first = f"{reference.name}: {reference.duration_s:g} s at {rate_hz:g} Hz, feedback from {runs.feedback}"
+    first += "" if runs.plant is None else f", on the plant of {one_line(runs.plant)}"
     table = Table(("", *head, "saturated", "PWM steps"), tuple(rows))
     return [Line(first), table, *(Line(text) for text in runs.verdict.remarks)]
 
@@ -215,7 +230,8 @@ run = Stage(
     "Controllers tried",
     """Run controllers along a reference on the simulated rig, from rest, and compare their errors.
 
-    The plant is that of the sections actuator and pump, the nominal one without.
+    The plant is that of the sections actuator and pump, the nominal one without. No rig is its model: with
+    --plant controllers are tried on another one, with another load, say, or of another day.
     """,
     _read_run,
     _solve_run,

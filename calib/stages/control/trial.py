@@ -87,10 +87,26 @@ class Outcome:
     limited: float | None
 
 
-def controlled(rig: Rig, limits: Pair | None) -> tuple[SimulatedRig, Model]:
-    """A simulated machine with the parameters of a rig, and what controllers know of it."""
+def controlled(rig: Rig, limits: Pair | None, other: Rig | None = None) -> tuple[SimulatedRig, Model]:
+    """A simulated machine with the parameters of a rig, and what controllers know of it.
+
+    Parameters
+    ----------
+    other : a rig whose actuator and pumps the machine has in place of those that controllers know.
+
+    Raises `BadInputError` for another rig whose pumps have another tick.
+    """
     machine = rig_from_file(rig)
-    return machine, control_model(machine, rig.controller, limits)
+    model = control_model(machine, rig.controller, limits)
+    if other is not None:
+        own = other.machine
+        if own.pump.tick_s != machine.pump.tick_s:
+            raise BadInputError(
+                f"--plant: found pumps with a tick of {1e3 * own.pump.tick_s:.4g} ms, expected the "
+                f"{1e3 * machine.pump.tick_s:.4g} ms of the rig that controllers know"
+            )
+        machine = replace(machine, plant=own.plant, pump=own.pump, pump_strength=own.strength)
+    return machine, model
 
 
 def control_model(rig: SimulatedRig, section: Controller | None = None, limits: Pair | None = None) -> Model:
