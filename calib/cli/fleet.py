@@ -62,7 +62,7 @@ def fleet(
     from calib.core.units import parse_duration_s
     from calib.runner.fleet import check_apart, finish, run_fleet
     from calib.runner.outcomes import TIMINGS
-    from calib.runner.task import SCHEMES, Allowed, FleetOptions, read_manifest, twice_told
+    from calib.runner.rigs import SCHEMES, Allowed, FleetOptions, read_manifest, twice_told
     from calib.show.fleet import PAGE, write_fleet_page
 
     limit_s = parse_duration_s(timeout, "--timeout")

@@ -9,8 +9,8 @@ A colour is the name of a hue, or a place from 0 to 1 on a scale for things in a
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -260,6 +260,11 @@ class Figure:
         names = "".join(chr(ord("A") + k) for k in range(len(self.panels)))
         names += "." * (-len(names) % self.columns)
         return self.mosaic or tuple(names[k : k + self.columns] for k in range(0, len(names), self.columns))
+
+
+def judged(figures: Mapping[str, Figure], verdict: str) -> dict[str, Figure]:
+    """Figures by their names, each with the verdict on what it shows."""
+    return {name: replace(figure, verdict=verdict) for name, figure in figures.items()}
 
 
 def rectangle(left: float, top: float, width: float, height: float) -> FloatArray:

@@ -33,7 +33,7 @@ from calib.runner.outcomes import (
     write_table,
     write_timings,
 )
-from calib.runner.task import (
+from calib.runner.rigs import (
     FleetOptions,
     Manifest,
     RigSpec,

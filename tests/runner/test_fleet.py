@@ -24,7 +24,7 @@ from calib.core.workers import Failure, Task
 from calib.runner.fleet import finish, run_fleet
 from calib.runner.outcomes import Answer, Outcome, Store, column, opened_store, texts
 from calib.runner.processes import Here
-from calib.runner.task import (
+from calib.runner.rigs import (
     FleetOptions,
     Manifest,
     RigSpec,
@@ -126,7 +126,7 @@ def test_what_is_no_manifest_is_told_with_its_line(tmp_path: Path, text: str, sa
 
 @given(st.text(max_size=12))
 def test_a_name_that_is_taken_is_a_safe_folder(name: str) -> None:
-    from calib.runner.task import _problem_of_name
+    from calib.runner.rigs import _problem_of_name
 
     if _problem_of_name(name) == "":
         path = Path("root") / name
@@ -213,7 +213,7 @@ def _rig(rng: np.random.Generator, name: str, fx_px: float | None = None, verdic
 
 @contextmanager
 def _fleet(out: Path, rigs: dict[str, Rig]) -> Iterator[tuple[Store, Manifest]]:
-    from calib.runner.task import _values
+    from calib.runner.rigs import _values
 
     with opened_store(out, "calib fleet", ()) as (store, _):
         for name, rig in rigs.items():

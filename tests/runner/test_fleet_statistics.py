@@ -20,7 +20,7 @@ from calib.runner.fleet import (
     table_of,
 )
 from calib.runner.outcomes import Outcome
-from calib.runner.task import RigSpec
+from calib.runner.rigs import RigSpec
 
 
 def _line(t: FloatArray, x: FloatArray, sigma: FloatArray) -> Drift:

@@ -20,6 +20,7 @@ from calib.core.plot import (
     Text,
     every,
     histogram,
+    judged,
     number,
     short,
 )
@@ -49,7 +50,8 @@ def plots(result: Identified) -> dict[str, Figure]:
         "identify_residuals": _residuals(result),
         "identify_parameters": _parameters(result),
     }
-    return figures | ({"identify_damping": _damping(result)} if result.decrements else {})
+    figures |= {"identify_damping": _damping(result)} if result.decrements else {}
+    return judged(figures, result.verdict.word)
 
 
 def _motion(result: Identified) -> Figure:
@@ -72,8 +74,8 @@ def _motion(result: Identified) -> Figure:
             panels.append(
                 Plot("time (s)", y, marks, "" if column else short(track.name, 40), y_limits=limits)
             )
-    high, verdict = 2.0 * len(tracks) + 0.3, result.verdict.word
-    return Figure("Simulated against measured", note, panels, high, verdict, columns=2)
+    high = 2.0 * len(tracks) + 0.3
+    return Figure("Simulated against measured", note, panels, high, columns=2)
 
 
 def _measured(t: FloatArray, values: FloatArray) -> Curve:
@@ -106,7 +108,7 @@ def _residuals(result: Identified) -> Figure:
         Plot("lag (rows)", "correlation", (Band("y", -white, white), *marks)),
         Plot("residual / deviation", "density", (replace(bars, colour="silver"), normal)),
     )
-    return Figure("Residuals", note, panels, 3.5, result.verdict.word, columns=2)
+    return Figure("Residuals", note, panels, 3.5, columns=2)
 
 
 def _parameters(result: Identified) -> Figure:
@@ -141,7 +143,7 @@ def _damping(result: Identified) -> Figure:
             title = f"{short(track.name, 30)}: zeta {d.zeta:.4f} +- {d.sigma:.1g}{fitted}"
             panels.append(Plot("time (s)", "angle (rad)", marks, title, y_limits=(-top, top)))
     whole = panels or (Plot(empty="no free swing with enough peaks"),)
-    return Figure("Damping by peaks", note, whole, 2.1 * len(whole), result.verdict.word)
+    return Figure("Damping by peaks", note, whole, 2.1 * len(whole))
 
 
 def stiffness_plots(
@@ -175,14 +177,14 @@ def pump_plots(result: PumpFound, verdict: str) -> dict[str, Figure]:
     """`pump_runs` and `pump_residuals` of recordings, and `pump_static`."""
     figures = {}
     if result.records:
-        figures["pump_runs"] = _runs(result, verdict)
-        figures["pump_residuals"] = _left_over(result, verdict)
+        figures["pump_runs"] = _runs(result)
+        figures["pump_residuals"] = _left_over(result)
     if result.maps or result.groups:
-        figures["pump_static"] = _static(result, verdict)
-    return figures
+        figures["pump_static"] = _static(result)
+    return judged(figures, verdict)
 
 
-def _runs(result: PumpFound, verdict: str) -> Figure:
+def _runs(result: PumpFound) -> Figure:
     """Each recording with both models, simulated from its PWM and its first fifth of a second."""
     records = result.records[:_MOST_RUNS]
     note = (
@@ -204,10 +206,10 @@ def _runs(result: PumpFound, verdict: str) -> Figure:
         x, y = "time (s)" if i + 3 >= len(records) else "", "" if i % 3 else result.unit
         panels.append(Plot(x, y, marks, title, (0.0, longest)))
     title, high = "The pump's models against the recordings", 2.1 * -(-len(records) // 3) + 0.3
-    return Figure(title, note, panels, high, verdict, columns=3)
+    return Figure(title, note, panels, high, columns=3)
 
 
-def _left_over(result: PumpFound, verdict: str) -> Figure:
+def _left_over(result: PumpFound) -> Figure:
     """Measured minus simulated over time, a panel for each model and a line for each recording."""
     note = (
         "This is measured minus simulated. Runs that leave the model are red: the PWM does not explain them."
@@ -226,10 +228,10 @@ def _left_over(result: PumpFound, verdict: str) -> Figure:
         )
         y = "" if panels else f"error ({result.unit})"
         panels.append(Plot("time (s)", y, marks, model, y_limits=(-most, most)))
-    return Figure("What is left over", note, panels, 3.0, verdict, columns=len(panels))
+    return Figure("What is left over", note, panels, 3.0, columns=len(panels))
 
 
-def _static(result: PumpFound, verdict: str) -> Figure:
+def _static(result: PumpFound) -> Figure:
     """Settled values over PWM with the fitted maps, and where the recordings settle."""
     note = "Points are settled values, crosses outliers, lines the fitted map, squares ends of recordings."
     u = np.linspace(0.0, 255.0, 400)
@@ -243,7 +245,7 @@ def _static(result: PumpFound, verdict: str) -> Figure:
         at, value = np.array(group.pwm[1:2]), np.array([group.value])
         marks.append(Curve(at, value, kind="squares", colour="red", size=5.0))
         marks.append(Text(at[0] - 3.0, value[0], f"{len(group.names)} runs", align="right"))
-    return Figure("Static map", note, (Plot("PWM", result.unit, marks),), 3.6, verdict)
+    return Figure("Static map", note, (Plot("PWM", result.unit, marks),), 3.6)
 
 
 # ----------------------------------------------------------------------

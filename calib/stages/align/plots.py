@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from calib.core.arrays import FloatArray
-from calib.core.plot import SIGMA, Band, Curve, Figure, Mark, Plot, Rule, every, short
+from calib.core.plot import SIGMA, Band, Curve, Figure, Mark, Plot, Rule, every, judged, short
 from calib.core.words import number as with_sigma
 from calib.stages.align.solve import Alignment, Trace
 from calib.stages.estimator.sensors import SENSOR
@@ -22,13 +22,13 @@ _ROWS = (
 
 def plots(fit: Alignment, verdict: str = "ok") -> dict[str, Figure]:
     """`align_correlation` and, for each log, `align_residuals_1`, ..."""
-    figures = {"align_correlation": _correlation(fit, verdict)}
+    figures = {"align_correlation": _correlation(fit)}
     for k in range(len(fit.logs)):
-        figures[f"align_residuals_{k + 1}"] = _residuals(fit, k, verdict)
-    return figures
+        figures[f"align_residuals_{k + 1}"] = _residuals(fit, k)
+    return judged(figures, verdict)
 
 
-def _residuals(fit: Alignment, log: int, verdict: str) -> Figure:
+def _residuals(fit: Alignment, log: int) -> Figure:
     """Residuals of one log with the sensors as assumed beforehand and as estimated."""
     title = f"Residuals: {short(fit.logs[log].name, 78)}"
     note = (
@@ -41,7 +41,7 @@ def _residuals(fit: Alignment, log: int, verdict: str) -> Figure:
     for y, sensor, channel in _ROWS:
         x = "time (s)" if y == _ROWS[-1][0] else ""
         panels.append(_panel(traces, sensor, channel, x, y))
-    return Figure(title, note, panels, 7.4, verdict)
+    return Figure(title, note, panels, 7.4)
 
 
 def _panel(traces: list[Trace], sensor: str, channel: int, x: str, y: str) -> Plot:
@@ -72,7 +72,7 @@ def _cloud(t: FloatArray, values: FloatArray, limit: float, label: str) -> Curve
     return Curve(every(t[known]), shown, label, "cloud", "orange" if label == "before" else "blue")
 
 
-def _correlation(fit: Alignment, verdict: str) -> Figure:
+def _correlation(fit: Alignment) -> Figure:
     """Correlation of the camera's rate with the gyroscope's over the time offset, and what was estimated."""
     at = SENSOR.index("time_offset_s")
     offset, sigma = 1e3 * float(fit.sensor[at]), 1e3 * float(fit.sigma[at])
@@ -85,7 +85,7 @@ def _correlation(fit: Alignment, verdict: str) -> Figure:
     x, y = "pictures later than the gyroscope (ms)", "correlation"
     at_ms, value = 1e3 * fit.correlation.offset_s, fit.correlation.value
     if not np.isfinite(value).any():
-        return Figure(title, note, (Plot(x, y, empty="too few pictures"),), 3.4, verdict)
+        return Figure(title, note, (Plot(x, y, empty="too few pictures"),), 3.4)
     low, high = float(at_ms[0]), float(at_ms[-1])
     marks = (
         Band("x", max(offset - 2.0 * sigma, low), min(offset + 2.0 * sigma, high)),
@@ -95,4 +95,4 @@ def _correlation(fit: Alignment, verdict: str) -> Figure:
     )
     above = "" if math.isfinite(sigma) and sigma <= 10.0 else "the logs do not show the time offset"
     y_limits = (min(-0.1, 1.1 * float(np.nanmin(value))), max(0.1, 1.1 * float(np.nanmax(value))))
-    return Figure(title, note, (Plot(x, y, marks, above, (low, high), y_limits),), 3.4, verdict)
+    return Figure(title, note, (Plot(x, y, marks, above, (low, high), y_limits),), 3.4)

@@ -31,6 +31,7 @@ from calib.core.plot import (
     circle,
     ellipse,
     histogram,
+    judged,
     magnified,
     number,
     rectangle,
@@ -65,20 +66,20 @@ _RADIUS = "distance from the principal point (px)"
 
 def plots(result: Intrinsics) -> dict[str, Figure]:
     """Figures of a calibration: `camera_errors`, `camera_residuals`, ...; what was compared comes last."""
-    fit, sigma, verdict = result.calibration, result.covariance, result.verdict.word
+    fit, sigma = result.calibration, result.covariance
     figures = {
-        "camera_errors": _errors(fit, verdict),
-        "camera_residuals": _residuals(fit, verdict),
-        "camera_coverage": _coverage(fit, sigma, verdict),
-        "camera_poses": _poses(fit, verdict),
-        "camera_sigma": _projection_sigma(fit, sigma, verdict),
-        "camera_distortion": _distortion(fit, sigma, verdict),
+        "camera_errors": _errors(fit),
+        "camera_residuals": _residuals(fit),
+        "camera_coverage": _coverage(fit, sigma),
+        "camera_poses": _poses(fit),
+        "camera_sigma": _projection_sigma(fit, sigma),
+        "camera_distortion": _distortion(fit, sigma),
     }
     if result.models:
-        figures["camera_models"] = _comparison("lens model", result.models, fit.camera.model, verdict)
+        figures["camera_models"] = _comparison("lens model", result.models, fit.camera.model)
     if result.boards:
-        figures["camera_boards"] = _comparison("board model", result.boards, result.board, verdict)
-    return figures
+        figures["camera_boards"] = _comparison("board model", result.boards, result.board)
+    return judged(figures, result.verdict.word)
 
 
 def lens_plots(lens: Lens) -> dict[str, Figure]:
@@ -88,11 +89,12 @@ def lens_plots(lens: Lens) -> dict[str, Figure]:
 
 def plane_plots(camera: Camera, plane: Plane) -> dict[str, Figure]:
     """`plane_picture`, `plane_sigma` and `plane_difference`."""
-    return {
+    figures = {
         "plane_picture": _plane_picture(camera, plane),
         "plane_sigma": _plane_sigma(plane),
         "plane_difference": _plane_difference(camera, plane),
     }
+    return judged(figures, plane.verdict.word)
 
 
 # ----------------------------------------------------------------------
@@ -137,7 +139,7 @@ def _points(fit: Calibration) -> tuple[IntArray, ...]:
     return np.nonzero(np.isfinite(fit.residuals_px).all(axis=2).T)
 
 
-def _errors(fit: Calibration, verdict: str) -> Figure:
+def _errors(fit: Calibration) -> Figure:
     """RMS of each view as bars, and all residuals as a cloud in the same colours."""
     names, views, whole = fit.observations.names, fit.observations.views, fit.rms_px
     squared = np.sum(fit.residuals_px**2, axis=2)
@@ -163,7 +165,7 @@ def _errors(fit: Calibration, verdict: str) -> Figure:
         left = Plot("view, in the order given", y, (bars, Rule("y", whole, "ink", "dashed")), title, grid="y")
         high = 4.6
     title = "How far the corners lie from where the fitted camera puts them"
-    return Figure(title, note, (left, _cloud(fit)), high, verdict, columns=2, widths=(1.12, 1.0))
+    return Figure(title, note, (left, _cloud(fit)), high, columns=2, widths=(1.12, 1.0))
 
 
 def _cloud(fit: Calibration) -> Plot:
@@ -190,7 +192,7 @@ def _cloud(fit: Calibration) -> Plot:
     return Plot(x, y, marks, title, (-limit, limit), (-limit, limit), equal=True, down=True)
 
 
-def _residuals(fit: Calibration, verdict: str) -> Figure:
+def _residuals(fit: Calibration) -> Figure:
     """Residual vectors where they are in the picture, and their mean over cells against chance."""
     size = fit.camera.image_size_px
     point, view = _points(fit)
@@ -210,7 +212,7 @@ def _residuals(fit: Calibration, verdict: str) -> Figure:
     if nothing:
         panels = (picture(size, (), empty=nothing),) * 2
     title = "Where the residuals point, over the picture"
-    return Figure(title, note, panels, panel_height_in(0.5, size), verdict, columns=2)
+    return Figure(title, note, panels, panel_height_in(0.5, size), columns=2)
 
 
 def _each(size: Size, at: FloatArray, vectors: FloatArray) -> Plot:
@@ -247,7 +249,7 @@ def _mean(size: Size, means: Means) -> Plot:
 # How the boards leaned.
 
 
-def _poses(fit: Calibration, verdict: str) -> Figure:
+def _poses(fit: Calibration) -> Figure:
     """A histogram of the boards' tilts, and the directions they lean to."""
     R, t = fit.block.R_CT, fit.block.t_CT_m
     usable = np.flatnonzero(np.isfinite(R).all(axis=(1, 2)) & np.isfinite(t).all(axis=1))
@@ -259,7 +261,7 @@ def _poses(fit: Calibration, verdict: str) -> Figure:
     normals = normals * np.where(normals[:, 2:] < 0.0, -1.0, 1.0)
     colours = spaced(fit.observations.views)[usable]
     title = "How the boards leaned before the camera"
-    return Figure(title, note, _tilts(normals, colours), 4.0, verdict, columns=2)
+    return Figure(title, note, _tilts(normals, colours), 4.0, columns=2)
 
 
 def _tilts(normals: FloatArray, colours: FloatArray) -> tuple[Plot, Plot]:
@@ -287,7 +289,7 @@ _COLUMNS, _ROWS = 6, 5
 """Cells of the picture in which points are looked for, as in `calib.stages.camera.checks`."""
 
 
-def _coverage(fit: Calibration, sigma: Covariance, verdict: str) -> Figure:
+def _coverage(fit: Calibration, sigma: Covariance) -> Figure:
     """All points over the picture with empty cells shaded, the principal point, and points by radius."""
     camera, size = fit.camera, fit.camera.image_size_px
     pixels = fit.observations.pixels[fit.observations.present]
@@ -313,7 +315,7 @@ def _coverage(fit: Calibration, sigma: Covariance, verdict: str) -> Figure:
     frame = picture(size, (*marks, *rings[:1]), title)
     title, high = f"Which parts of the picture the {len(pixels)} corners cover", panel_height_in(0.62, size)
     panels = (frame, principal, _radii(size, centre, pixels))
-    return Figure(title, note, panels, max(high, 4.3), verdict, mosaic=("AB", "AC"), widths=(1.75, 1.0))
+    return Figure(title, note, panels, max(high, 4.3), mosaic=("AB", "AC"), widths=(1.75, 1.0))
 
 
 def _principal_point(camera: Camera, sigma: Covariance) -> tuple[tuple[Shape, ...], Plot]:
@@ -358,7 +360,7 @@ def _radii(size: Size, centre: FloatArray, pixels: FloatArray) -> Plot:
     return Plot(_RADIUS, "points", marks, title, (0.0, last), grid="")
 
 
-def _projection_sigma(fit: Calibration, sigma: Covariance, verdict: str) -> Figure:
+def _projection_sigma(fit: Calibration, sigma: Covariance) -> Figure:
     """Standard deviation of projection over the picture, with the hull of what was seen."""
     size = fit.camera.image_size_px
     u, v, pixels = _grid_over(size, 97)
@@ -375,10 +377,10 @@ def _projection_sigma(fit: Calibration, sigma: Covariance, verdict: str) -> Figu
     outline = Shape(hull(fit.observations.pixels[fit.observations.present]), edge="red", kind="dashed")
     panel = picture(size, (Field(u, v, values, "px", "standard deviation (px)"), outline))
     title = "How uncertain the camera's projection is, over the picture"
-    return Figure(title, note, (panel,), panel_height_in(0.8, size), verdict)
+    return Figure(title, note, (panel,), panel_height_in(0.8, size))
 
 
-def _comparison(what: str, candidates: Sequence[Candidate], chosen: str, verdict: str) -> Figure:
+def _comparison(what: str, candidates: Sequence[Candidate], chosen: str) -> Figure:
     """Fitted and held-back RMS of each model, drawn and in figures, the chosen one marked."""
     rms = np.array([[c.fitted_rms_px, c.held_back_rms_px] for c in candidates])
     # A model far off would press the others together; its line ends at the limit.
@@ -409,7 +411,7 @@ def _comparison(what: str, candidates: Sequence[Candidate], chosen: str, verdict
     )
     panel = Plot("RMS (px)", "", marks, x_limits=(low, limit), grid="x", names=names)
     title = f"Which {what} predicts views that it has not seen"
-    return Figure(title, note, (panel,), 0.42 * len(candidates) + 1.3, verdict)
+    return Figure(title, note, (panel,), 0.42 * len(candidates) + 1.3)
 
 
 # ----------------------------------------------------------------------
@@ -423,7 +425,7 @@ def _finite(camera: Camera) -> bool:
     return bool(np.isfinite(vector_from_camera(camera)).all())
 
 
-def _distortion(fit: Calibration, covariance: Covariance, verdict: str) -> Figure:
+def _distortion(fit: Calibration, covariance: Covariance) -> Figure:
     """Displacement by a calibrated lens over the picture, and along the radius with its uncertainty."""
     camera, pixels = fit.camera, fit.observations.pixels[fit.observations.present]
     field = displacement_field(camera, pixel_grid(camera.image_size_px, most=_SAMPLE))
@@ -444,14 +446,12 @@ def _distortion(fit: Calibration, covariance: Covariance, verdict: str) -> Figur
         outline = ideal_pixels(camera, hull(pixels))
         marks = (Shape(outline[np.isfinite(outline).all(axis=1)], kind="dashed"),)
     panels = (_map(camera, marks), _along_radius(camera, covariance, pixels))
-    return _lens_figure(camera, "How far lens distortion moves what is seen", note, panels, verdict)
+    return _lens_figure(camera, "How far lens distortion moves what is seen", note, panels)
 
 
-def _lens_figure(
-    camera: Camera, title: str, note: str, panels: tuple[Plot, Plot], verdict: str = "ok"
-) -> Figure:
+def _lens_figure(camera: Camera, title: str, note: str, panels: tuple[Plot, Plot]) -> Figure:
     high = max(panel_height_in(0.6, camera.image_size_px), 3.9)
-    return Figure(title, note, panels, high, verdict, columns=2, widths=(1.55, 1.0))
+    return Figure(title, note, panels, high, columns=2, widths=(1.55, 1.0))
 
 
 def _map(camera: Camera, marks: tuple[Mark, ...]) -> Plot:
@@ -608,7 +608,7 @@ def _plane_sigma(plane: Plane) -> Figure:
         field = Field(*_grid(plane, lengths[name]), "mm", even=True, scale=scale)
         panels.append(_workspace(plane, (field,), f"{name}: {most}"))
     title, high = "How well a marker's position is known over the workspace", _plane_height_in(plane, 0.46)
-    return Figure(title, note, panels, 2.0 * high, plane.verdict.word, columns=2)
+    return Figure(title, note, panels, 2.0 * high, columns=2)
 
 
 def _plane_difference(camera: Camera, plane: Plane) -> Figure:
@@ -643,7 +643,7 @@ def _plane_difference(camera: Camera, plane: Plane) -> Figure:
         above = f"Arrows drawn {times:g} times"
     panel = _workspace(plane, marks, above)
     title = "What it costs to leave the lens out, over the workspace"
-    return Figure(title, note, (panel,), _plane_height_in(plane, 0.8), plane.verdict.word)
+    return Figure(title, note, (panel,), _plane_height_in(plane, 0.8))
 
 
 def _plane_picture(camera: Camera, plane: Plane) -> Figure:
@@ -669,7 +669,7 @@ def _plane_picture(camera: Camera, plane: Plane) -> Figure:
         marks.append(Arrows(at, plane.residuals_px[part], times, "" if k else "px", colour))
     panel = picture(size, marks, f"Residuals drawn {times:g} times")
     title = "The plane in the picture: corners, their residuals, and the workspace"
-    return Figure(title, note, (panel,), panel_height_in(0.88, size), plane.verdict.word)
+    return Figure(title, note, (panel,), panel_height_in(0.88, size))
 
 
 def _pixels(camera: Camera, plane: Plane, world_m: FloatArray) -> FloatArray:

@@ -24,6 +24,7 @@ from calib.core.plot import (
     Text,
     circle,
     every,
+    judged,
     number,
     short,
     spaced,
@@ -55,10 +56,10 @@ _TAU = "\N{GREEK SMALL LETTER TAU}"
 
 def static_plots(result: Static, verdict: str = "ok") -> dict[str, Figure]:
     """`imu_allan`, `imu_drift`, and `imu_static_1`, ... for each log."""
-    figures = {"imu_allan": _allan(result, verdict), "imu_drift": _drift(result, verdict)}
+    figures = {"imu_allan": _allan(result), "imu_drift": _drift(result)}
     for i, log in enumerate(result.logs, start=1):
-        figures[f"imu_static_{i}"] = _readings(result.axes, log, verdict)
-    return figures
+        figures[f"imu_static_{i}"] = _readings(result.axes, log)
+    return judged(figures, verdict)
 
 
 def _by_axis(axes: Sequence[str]) -> tuple[str, ...]:
@@ -73,7 +74,7 @@ def _y(axis: str) -> str:
     return _NAMES[axis[0]] if axis[1] == "x" else ""
 
 
-def _allan(result: Static, verdict: str) -> Figure:
+def _allan(result: Static) -> Figure:
     """Overlapping Allan deviation of each axis, its 1-sigma bounds, and the fitted N, B and K."""
     note = (
         f"Grey bands are 1{SIGMA} bounds. White noise N falls with the root of the averaging time {_TAU}, "
@@ -82,7 +83,7 @@ def _allan(result: Static, verdict: str) -> Figure:
     )
     mosaic = _by_axis(result.axes)
     panels = tuple(_deviation(noise) for noise in result.noise)
-    return Figure("Allan deviation at rest", note, panels, 2.75 * len(mosaic) + 0.25, verdict, mosaic=mosaic)
+    return Figure("Allan deviation at rest", note, panels, 2.75 * len(mosaic) + 0.25, mosaic=mosaic)
 
 
 def _deviation(noise: AxisNoise) -> Plot:
@@ -108,7 +109,7 @@ def _deviation(noise: AxisNoise) -> Plot:
     return Plot(x, y, marks, noise.axis, y_limits=limits, log="xy", corner="\n".join(words))
 
 
-def _readings(axes: Sequence[str], log: StaticLog, verdict: str) -> Figure:
+def _readings(axes: Sequence[str], log: StaticLog) -> Figure:
     """Readings of one log over time, means over a second, and where it moves."""
     moved = len(log.motions)
     note = "Grey are the readings, as the extremes of each bin, blue their means over a second. " + (
@@ -128,10 +129,10 @@ def _readings(axes: Sequence[str], log: StaticLog, verdict: str) -> Figure:
             marks.append(Curve(middle, means, size=1.0))
         panels.append(Plot("time (s)", _y(axis), marks, axis))
     title, mosaic = f"Readings at rest: {short(log.source, 70)}", _by_axis(axes)
-    return Figure(title, note, panels, 2.2 * len(mosaic), verdict, mosaic=mosaic)
+    return Figure(title, note, panels, 2.2 * len(mosaic), mosaic=mosaic)
 
 
-def _drift(result: Static, verdict: str) -> Figure:
+def _drift(result: Static) -> Figure:
     """Drift of the angle in each log, by the gyroscope and by the chip (Fig. 2.4)."""
     note = (
         f"These are the slopes of -gz integrated and of the angle that the chip reports, with 2{SIGMA}. The "
@@ -158,7 +159,7 @@ def _drift(result: Static, verdict: str) -> Figure:
         )
         limits = (0.4, len(drifts) + 0.6)
         panels.append(Plot("log", "slope (degrees/s)", marks, title, limits, whole="x", grid="y"))
-    return Figure("Drift of the angle, log by log", note, panels, 3.4, verdict, columns=2)
+    return Figure("Drift of the angle, log by log", note, panels, 3.4, columns=2)
 
 
 # ----------------------------------------------------------------------
@@ -170,10 +171,10 @@ _DEGREE = "\N{DEGREE SIGN}"
 
 def intrinsics_plots(result: Intrinsics, verdict: str = "ok") -> dict[str, Figure]:
     """`imu_poses` and `imu_residuals`."""
-    return {"imu_poses": _poses(result, verdict), "imu_residuals": _residuals(result, verdict)}
+    return judged({"imu_poses": _poses(result), "imu_residuals": _residuals(result)}, verdict)
 
 
-def _poses(result: Intrinsics, verdict: str) -> Figure:
+def _poses(result: Intrinsics) -> Figure:
     """Which way was up in each rest, in the sensor's frame."""
     note = (
         f"Each point is a rest: the direction in the sensor's frame that was up. {len(result.rests)} rests "
@@ -188,7 +189,7 @@ def _poses(result: Intrinsics, verdict: str) -> Figure:
         panels = (_disc(result.accel.directions, (90.0,), "", "In the plane of x and y"),)
     else:
         panels = tuple(_half(result.accel, sign) for sign in (1.0, -1.0))
-    return Figure("Poses of the IMU", note, panels, 4.3, verdict, columns=len(panels))
+    return Figure("Poses of the IMU", note, panels, 4.3, columns=len(panels))
 
 
 def _half(accel: Accelerometer, sign: float) -> Plot:
@@ -212,14 +213,14 @@ def _disc(at: FloatArray, rings_deg: Sequence[float], centre: str, title: str) -
     return Plot("", "", marks, title, (-1.25, 1.25), (-1.25, 1.25), equal=True, bare=True)
 
 
-def _residuals(result: Intrinsics, verdict: str) -> Figure:
+def _residuals(result: Intrinsics) -> Figure:
     """What rests and turns are off by, and the threshold that was taken."""
     note = f"Bars are 2{SIGMA} of a rest. "
     if result.accel is not None:
         rms = number(1e3 * result.accel.rms_mps2, _MMPS2)
         note += f"The rests differ from g by {rms} (RMS). Red are the threshold taken and the turns' RMS."
     panels = (_rests(result), _thresholds(result), _turns(result))
-    return Figure("Residuals of rests and turns", note, panels, 5.4, verdict, mosaic=("AA", "BC"))
+    return Figure("Residuals of rests and turns", note, panels, 5.4, mosaic=("AA", "BC"))
 
 
 def _rests(result: Intrinsics) -> Plot:
@@ -403,13 +404,11 @@ _PAIRS = {"3/3": ("red", "squares"), "tuned": ("green", "points"), "riccati": ("
 
 def tune_plots(result: Tuning, pieces: Sequence[Piece], section: OrientationFilter) -> dict[str, Figure]:
     """`tune_gains` and `tune_errors`."""
-    return {
-        "tune_gains": _gains(result, section.verdict.word),
-        "tune_errors": _tuning_errors(result, pieces, section.verdict.word),
-    }
+    figures = {"tune_gains": _gains(result), "tune_errors": _tuning_errors(result, pieces)}
+    return judged(figures, section.verdict.word)
 
 
-def _gains(result: Tuning, verdict: str) -> Figure:
+def _gains(result: Tuning) -> Figure:
     """Error on the whole logs over Kp and Ki, and where the pairs that are compared lie."""
     marks: list[Mark] = []
     above, s = "nothing to judge by", result.surface
@@ -429,10 +428,10 @@ def _gains(result: Tuning, verdict: str) -> Figure:
             marks.append(Curve(*at, one.name, kind, hue, 8.0))
     panel = Plot("Kp (1/s)", "Ki (1/s\N{SUPERSCRIPT TWO})", marks, above, log="xy")
     title = f"Gains of the angle filter: {result.recommended.name}"
-    return Figure(title, "The map is the error on the whole logs by pair of gains.", (panel,), 4.3, verdict)
+    return Figure(title, "The map is the error on the whole logs by pair of gains.", (panel,), 4.3)
 
 
-def _tuning_errors(result: Tuning, pieces: Sequence[Piece], verdict: str) -> Figure:
+def _tuning_errors(result: Tuning, pieces: Sequence[Piece]) -> Figure:
     """Angle of the longest piece, and the errors of 3/3 and of the tuned filters."""
     k = int(np.argmax([len(piece.t_s) for piece in pieces]))
     piece, own = pieces[k], result.smoothed[k]
@@ -462,4 +461,4 @@ def _tuning_errors(result: Tuning, pieces: Sequence[Piece], verdict: str) -> Fig
         Plot("time (s)", "error (degrees)", below, x_limits=limits),
     )
     title = f"Errors over time: {short(piece.source, 70)}"
-    return Figure(title, f"Errors are differences from {by}.", panels, 4.6, verdict)
+    return Figure(title, f"Errors are differences from {by}.", panels, 4.6)

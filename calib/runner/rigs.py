@@ -1,4 +1,4 @@
-"""One rig of a fleet: its row of the manifest, its files fetched, its run, its outcome."""
+"""Rigs of a fleet: their rows of the manifest, their files fetched, their runs, their outcomes."""
 
 from __future__ import annotations
 
