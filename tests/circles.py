@@ -5,21 +5,15 @@ from __future__ import annotations
 from graphlib import CycleError, TopologicalSorter
 from typing import Any
 
-from importlinter import Contract, ContractCheck, fields, output
-from importlinter.application import contract_utils
+from importlinter import Contract, ContractCheck, output
 
 
 class NoCircles(Contract):
     """All modules can be put in an order in which each imports earlier ones only."""
 
-    ignore_imports = fields.SetField(subfield=fields.ImportExpressionField(), required=False)
-
     def check(self, graph: Any, verbose: bool) -> ContractCheck:
         """Look for one circle."""
         del verbose
-        contract_utils.remove_ignored_imports(
-            graph, self.ignore_imports or (), contract_utils.AlertLevel.WARN
-        )
         imported = {one: graph.find_modules_directly_imported_by(one) for one in sorted(graph.modules)}
         try:
             TopologicalSorter(imported).prepare()

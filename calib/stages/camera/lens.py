@@ -11,6 +11,7 @@ import numpy as np
 from calib.core.arrays import AnyArray, BoolArray, FloatArray
 from calib.core.errors import BadInputError
 from calib.core.geometry import apply_homography, fit_homography
+from calib.core.result import finite_or_none
 from calib.stages.camera.bundle import Covariance, rotation_exp
 from calib.stages.camera.model import (
     INTRINSICS,
@@ -291,6 +292,16 @@ def distortion_kind(camera: Camera) -> str:
     return "pincushion" if rise > fall else "barrel"
 
 
+def inverse_section(fit: InversePolynomial) -> InverseLens:
+    """What of a fit the file holds."""
+    return InverseLens(
+        radial=list(fit.radial),
+        decentering_steps=fit.decentering_steps,
+        max_error_px=finite_or_none(fit.max_error_px),
+        covered=fit.covered,
+    )
+
+
 def projection_sigma_px(camera: Camera, covariance: FloatArray, pixels: FloatArray) -> FloatArray:
     """Standard deviation (N,) of where a far point is projected, root mean square of the two axes.
 
@@ -393,7 +404,7 @@ def analyse_distortion(
         monotonic=one_to_one_reach(camera) > 1.0,
         region_sigma_px=None if sigma is None else float(sigma.min()),
         **cost,
-        inverse=InverseLens.of(fit_inverse(camera, tolerance_px)),
+        inverse=inverse_section(fit_inverse(camera, tolerance_px)),
         effect=effect,
         verdict="ok",
         remarks=[why],

@@ -15,7 +15,6 @@ from calib.core.result import (
     Result,
     Section,
     Sigma,
-    finite_or_none,
     quantity,
 )
 from calib.core.schema import contradiction, nearest, quoted
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
 
     from calib.core.arrays import FloatArray
     from calib.stages.camera import model as optics
-    from calib.stages.camera.lens import InversePolynomial
 
 Model = Annotated[str, Field(pattern="^(pinhole|radial2|radial3|fisheye4|brown5|rational8)$")]
 Focal = Annotated[float, Field(ge=1e-3, le=1e7, allow_inf_nan=False, strict=True)]
@@ -206,16 +204,6 @@ class InverseLens(Section):
     decentering_steps: Count
     max_error_px: NotNegative | None
     covered: Number = Field(ge=0, le=1)
-
-    @staticmethod
-    def of(fit: InversePolynomial) -> InverseLens:
-        """What of a fit the file holds."""
-        return InverseLens(
-            radial=list(fit.radial),
-            decentering_steps=fit.decentering_steps,
-            max_error_px=finite_or_none(fit.max_error_px),
-            covered=fit.covered,
-        )
 
 
 class Lens(Result):
