@@ -13,8 +13,6 @@ from calib.cli.common import JsonOption, document, narrate, say, table
 if TYPE_CHECKING:
     from calib.core.diff import Change, RigDiff
 
-__all__ = ["diff"]
-
 
 def diff(
     before: Annotated[Path, typer.Argument(help="rig.yaml of one calibration.")],

@@ -10,8 +10,6 @@ import typer
 from calib.cli.common import JsonOption, document, say, table
 from calib.core.errors import EXIT_POOR
 
-__all__ = ["doctor"]
-
 
 def doctor(
     quick: Annotated[

@@ -21,8 +21,6 @@ from calib.core.errors import EXIT_POOR
 if TYPE_CHECKING:
     from calib.runner.fleet import FleetSummary
 
-__all__ = ["fleet"]
-
 
 def fleet(
     manifest: Annotated[

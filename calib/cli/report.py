@@ -9,8 +9,6 @@ import typer
 
 from calib.cli.common import JsonOption, document, narrate, say
 
-__all__ = ["report"]
-
 
 def report(
     rig: Annotated[

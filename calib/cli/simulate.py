@@ -10,8 +10,6 @@ import typer
 from calib.cli.common import JsonOption, document, narrate, progress_bar, say
 from calib.core.errors import UsageError
 
-__all__ = ["simulate"]
-
 
 def _options(settings: list[str]) -> dict[str, str]:
     options = {}

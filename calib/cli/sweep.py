@@ -21,8 +21,6 @@ from calib.core.errors import EXIT_POOR
 if TYPE_CHECKING:
     from calib.runner.sweep import SweepSummary
 
-__all__ = ["sweep"]
-
 
 def sweep(
     spec: Annotated[Path, typer.Argument(help="YAML with base, grid, draws and measure.")],
