@@ -49,6 +49,53 @@ def apply_homography(H: FloatArray, points: FloatArray) -> FloatArray:
     return np.asarray(mapped[..., :2] / depth)
 
 
+def _similarities(points: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Centre (n, 2) and scale (n,) that bring each weighted set of points to zero mean and unit spread."""
+    total = np.maximum(weights.sum(axis=1), 1e-300)
+    centre = (points * weights[..., None]).sum(axis=1) / total[:, None]
+    spread = (((points - centre[:, None]) ** 2).sum(axis=2) * weights).sum(axis=1) / total
+    return centre, 1.0 / np.sqrt(np.maximum(spread, 1e-300))
+
+
+def linear_homographies(points: FloatArray, pixels: FloatArray, weights: FloatArray) -> FloatArray:
+    """Homographies (N, 3, 3) from points (N, M, 2) of a plane to pixels (N, M, 2), by linear least squares.
+
+    Hartley's normalisation makes h33 of the normalised homography the depth of the points' centroid, never
+    zero for a plane that was seen, so the eight other entries follow from normal equations.
+
+    Parameters
+    ----------
+    weights : (N, M) of the points' squared errors, zero for points that do not count.
+    """
+    N = len(pixels)
+    points = np.broadcast_to(points, pixels.shape)
+    weights = np.broadcast_to(weights, pixels.shape[:2])
+    centre_t, scale_t = _similarities(points, weights)
+    centre_p, scale_p = _similarities(pixels, weights)
+    x, y = np.moveaxis((points - centre_t[:, None]) * scale_t[:, None, None], 2, 0)
+    u, v = np.moveaxis((pixels - centre_p[:, None]) * scale_p[:, None, None], 2, 0)
+    design = np.zeros((N, 9, 2, x.shape[1]))
+    for row, value in enumerate((x, y, np.ones_like(x))):
+        design[:, row, 0] = value
+        design[:, row + 3, 1] = value
+    design[:, 6, 0], design[:, 6, 1] = -u * x, -v * x
+    design[:, 7, 0], design[:, 7, 1] = -u * y, -v * y
+    design[:, 8, 0], design[:, 8, 1] = u, v
+    normal = (design * weights[:, None, None]).reshape(N, 9, -1) @ design.reshape(N, 9, -1).transpose(0, 2, 1)
+    ridge = 1e-15 * np.trace(normal[:, :8, :8], axis1=1, axis2=2)
+    h = np.ones((N, 9))
+    h[:, :8] = np.linalg.solve(normal[:, :8, :8] + ridge[:, None, None] * np.eye(8), normal[:, :8, 8:])[
+        ..., 0
+    ]
+    to_pixels, from_points = np.zeros((N, 3, 3)), np.zeros((N, 3, 3))
+    to_pixels[:, 0, 0] = to_pixels[:, 1, 1] = 1.0 / scale_p
+    to_pixels[:, :2, 2] = centre_p
+    from_points[:, 0, 0] = from_points[:, 1, 1] = scale_t
+    from_points[:, :2, 2] = -centre_t * scale_t[:, None]
+    to_pixels[:, 2, 2] = from_points[:, 2, 2] = 1.0
+    return to_pixels @ h.reshape(N, 3, 3) @ from_points
+
+
 def map_jacobian(H: FloatArray, points: FloatArray) -> FloatArray:
     """Derivative of the mapped points by the points, (..., 2, 2)."""
     mapped = points @ H[:, :2].T + H[:, 2]

@@ -12,8 +12,8 @@ import threading
 import warnings
 import zlib
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -40,15 +40,22 @@ _HEIF_BYTES = 1_000_000
 
 def declared_pixels(data: bytes) -> int | None:
     """Width times height by a picture's header; None where there is no header of a known kind."""
+    width, height = declared_size(data)
+    return width * height or None
+
+
+def declared_size(data: bytes) -> tuple[int, int]:
+    """Width and height by a picture's header; zeros where there is no header of a known kind."""
     if data[4:8] == b"ftyp":
         # The largest of the sizes in the file's properties: tiles are smaller than the whole.
-        sizes = re.findall(rb"ispe.{4}(.{4})(.{4})", data[:_HEIF_BYTES], re.DOTALL)
-        return max((int.from_bytes(w) * int.from_bytes(h) for w, h in sizes), default=0) or None
+        found = re.findall(rb"ispe.{4}(.{4})(.{4})", data[:_HEIF_BYTES], re.DOTALL)
+        sizes = [(int.from_bytes(w), int.from_bytes(h)) for w, h in found]
+        return max(sizes, key=lambda size: size[0] * size[1], default=(0, 0))
     if data[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
         try:
-            return _tiff_pixels(data) or None
+            return _tiff_size(data)
         except (struct.error, OverflowError, KeyError):
-            return None
+            return 0, 0
     from PIL import Image
 
     try:
@@ -56,15 +63,15 @@ def declared_pixels(data: bytes) -> int | None:
             warnings.catch_warnings(action="ignore"),
             Image.open(io.BytesIO(data), formats=_BY_PILLOW) as image,
         ):
-            return image.width * image.height or None
+            return image.width, image.height
     except Image.DecompressionBombError:
-        return _MAX_PIXELS + 1
+        return _MAX_PIXELS + 1, 1
     except Exception:
         # Damaged bytes make its readers raise nearly anything.
-        return None
+        return 0, 0
 
 
-def _tiff_pixels(data: bytes) -> int:
+def _tiff_size(data: bytes) -> tuple[int, int]:
     """Of the first picture of a file."""
     order = "<" if data.startswith(b"II") else ">"
     big = data[2:4] in (b"+\0", b"\0+")
@@ -79,7 +86,7 @@ def _tiff_pixels(data: bytes) -> int:
             # A tag given twice counts with its larger value.
             value = struct.unpack_from(order + _TIFF_KINDS[kind], data, value_at)[0]
             found[tag] = max(value, found.get(tag, 0))
-    return int(found[_TIFF_WIDTH] * found[_TIFF_HEIGHT])
+    return int(found[_TIFF_WIDTH]), int(found[_TIFF_HEIGHT])
 
 
 # ----------------------------------------------------------------------
@@ -111,7 +118,7 @@ class Picture:
     ----------
     name : of the file, control characters escaped.
     sha256 : of the file.
-    gray : (height, width) grey values.
+    gray : (height, width) grey values; (0, 0) of a picture whose header alone was read.
     size_px : width and height.
     """
 
@@ -119,10 +126,6 @@ class Picture:
     sha256: str
     gray: GrayImage
     size_px: tuple[int, int]
-
-    def without_pixels(self) -> Picture:
-        """The same without its grey values, which take the memory."""
-        return replace(self, gray=np.empty((0, 0), dtype=np.uint8))
 
 
 def _natural(path: Path) -> tuple[object, ...]:
@@ -192,13 +195,21 @@ def _incomplete(data: bytes) -> str | None:
     return None
 
 
-def read_picture(path: Path) -> Picture:
+def read_picture(path: Path, wanted: Callable[[int], bool] = lambda pixels: True) -> Picture:
     """Decode one file to 8-bit grey values.
 
     Colour is averaged as OpenCV does, an alpha channel is dropped, and deeper pictures are scaled so
     that their brightest 0.1 % are white. Raises `BadInputError` for what is not a whole picture.
+
+    Parameters
+    ----------
+    wanted : whether to decode a picture of so many pixels, by its header.
     """
     data = read_bytes(path)
+    size_px = declared_size(data)
+    pixels = size_px[0] * size_px[1]
+    if 0 < pixels <= _MAX_PIXELS and not wanted(pixels):
+        return Picture(shown(path.name), sha256(data), np.empty((0, 0), dtype=np.uint8), size_px)
     return decoded_picture(data, shown(path), shown(path.name), sha256(data))
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from calib.core.arrays import FloatArray, IntArray
+from calib.core.geometry import linear_homographies
 from calib.stages.camera.model import (
     FISHEYE,
     INTRINSICS,
@@ -268,54 +269,10 @@ def _decrement(at: Linearised, G: int, step: tuple[FloatArray, FloatArray], free
 # views, four (no skew) need two, and two (principal point held at the image's centre) need one.
 
 
-def _similarity(points: FloatArray, present: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Centre (n, 2) and scale (n,) that bring each set of points to zero mean and unit spread."""
-    count = present.sum(axis=1)
-    centre = (points * present[..., None]).sum(axis=1) / count[:, None]
-    spread = (((points - centre[:, None]) ** 2).sum(axis=2) * present).sum(axis=1) / count
-    return centre, 1.0 / np.sqrt(np.maximum(spread, 1e-300))
-
-
 def homographies(observations: Observations) -> FloatArray:
-    """Homography from the target's plane (metres) to pixels for each view, shape (N, 3, 3).
-
-    Hartley's normalisation makes h33 of the normalised homography the depth of the target's
-    centroid, never zero for a target that was seen, so the eight other entries follow from normal
-    equations.
-    """
+    """Homography from the target's plane (metres) to pixels for each view, shape (N, 3, 3)."""
     present = observations.present.astype(np.float64)
-    views = observations.views
-    target = np.broadcast_to(observations.target_m[..., :2], observations.pixels.shape)
-    centre_t, scale_t = _similarity(target, present)
-    centre_p, scale_p = _similarity(observations.pixels, present)
-    x, y = np.moveaxis((target - centre_t[:, None]) * scale_t[:, None, None], 2, 0)
-    u, v = np.moveaxis((observations.pixels - centre_p[:, None]) * scale_p[:, None, None], 2, 0)
-    one = np.ones_like(x)
-    design = np.zeros((views, 9, 2, x.shape[1]))
-    for row, value in enumerate((x, y, one)):
-        design[:, row, 0] = value
-        design[:, row + 3, 1] = value
-    design[:, 6, 0], design[:, 6, 1] = -u * x, -v * x
-    design[:, 7, 0], design[:, 7, 1] = -u * y, -v * y
-    design[:, 8, 0], design[:, 8, 1] = u, v
-    if not observations.complete:
-        design *= present[:, None, None]
-    rows = design.reshape(views, 9, -1)
-    normal = rows @ rows.transpose(0, 2, 1)
-    ridge = 1e-15 * np.trace(normal[:, :8, :8], axis1=1, axis2=2)
-    left = normal[:, :8, :8] + ridge[:, None, None] * np.eye(8)
-    h = np.ones((views, 9))
-    h[:, :8] = np.linalg.solve(left, normal[:, :8, 8:])[..., 0]
-    H = h.reshape(views, 3, 3)
-    to_pixels = np.zeros((views, 3, 3))
-    to_pixels[:, 0, 0] = to_pixels[:, 1, 1] = 1.0 / scale_p
-    to_pixels[:, :2, 2] = centre_p
-    to_pixels[:, 2, 2] = 1.0
-    from_target = np.zeros((views, 3, 3))
-    from_target[:, 0, 0] = from_target[:, 1, 1] = scale_t
-    from_target[:, :2, 2] = -centre_t * scale_t[:, None]
-    from_target[:, 2, 2] = 1.0
-    return to_pixels @ H @ from_target
+    return linear_homographies(observations.target_m[..., :2], observations.pixels, present)
 
 
 def _constraint(H: FloatArray, i: int, j: int) -> FloatArray:

@@ -639,7 +639,6 @@ class TargetShape:
     bow_m : largest departure from flatness between the target's middle and its border.
     bow_significance : square root of the Wald statistic of the three bows, over its degrees of freedom.
     size_m : longer side of the target.
-    rms_drop : share by which the RMS would fall with all five deformations.
     focal_shift : share by which fx would move.
     focal_per_bow : share by which fx moves for a bow of half a percent of the target's size.
     values, sigma : (5,) in the order of `DEFORMATIONS`; slopes, and metres for bows and twist.
@@ -651,7 +650,6 @@ class TargetShape:
     bow_m: float
     bow_significance: float
     size_m: float
-    rms_drop: float
     focal_shift: float
     focal_per_bow: float
     values: FloatArray
@@ -704,7 +702,6 @@ def target_shape(calibration: Calibration) -> TargetShape | None:
         bow_m=float(np.ptp(np.tensordot(bows, basis[..., 2:, 2, :], axes=(0, basis.ndim - 3)))),
         bow_significance=float(np.sqrt(wald / 3)),
         size_m=2 * half,
-        rms_drop=1.0 - float(np.sqrt(left / max(calibration.squared_sum, 1e-300))),
         focal_shift=float(step[fx_at] / fx) if fx_at >= 0 else 0.0,
         focal_per_bow=float(np.abs(row[2:4]).max() * 0.01 * half / fx),
         values=step[P:],

@@ -345,17 +345,16 @@ def _for_opencv(gray: GrayImage) -> Level:
 
 _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 _EXHAUSTIVE = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
-_FINDERS: dict[str, Callable[[GrayImage, tuple[int, int]], tuple[bool, AnyArray | None]]] = {
-    "classic": lambda image, size: cv2.findChessboardCorners(image, size, flags=_CLASSIC),
-    "SB": cv2.findChessboardCornersSB,
-    "SB exhaustive": lambda image, size: cv2.findChessboardCornersSB(image, size, flags=_EXHAUSTIVE),
-}
+_FINDERS: tuple[Callable[[GrayImage, tuple[int, int]], tuple[bool, AnyArray | None]], ...] = (
+    lambda image, size: cv2.findChessboardCorners(image, size, flags=_CLASSIC),
+    cv2.findChessboardCornersSB,
+    lambda image, size: cv2.findChessboardCornersSB(image, size, flags=_EXHAUSTIVE),
+)
+"""The classic finder, the one by sectors, and the same with an exhaustive search."""
 
 
-def _candidates(
-    gray: GrayImage, columns: int, rows: int, quick: bool
-) -> Iterator[tuple[str, list[FloatArray]]]:
-    """Grids (r, c, 2) of the picture to try, and the name of the stage that saw them, stage by stage."""
+def _candidates(gray: GrayImage, columns: int, rows: int, quick: bool) -> Iterator[list[FloatArray]]:
+    """Grids (r, c, 2) of the picture to try, stage by stage."""
     fragments = False
     for zoom in lattice_levels(gray):
         if quick and zoom > 1.0 and zoom**2 * gray.size > _QUICK_PIXELS:
@@ -368,11 +367,11 @@ def _candidates(
                 grids.append(level.to_picture(points))
             elif all(a <= b for a, b in zip(shape, sorted((rows, columns)), strict=True)):
                 fragments |= int(lattice.seen.sum()) >= _FRAGMENT * columns * rows
-        yield f"saddles x{zoom:g}", grids
+        yield grids
     if quick or not fragments or min(gray.shape) < _MIN_SIDE_PX:
         return
     level = _for_opencv(gray)
-    for name, finder in _FINDERS.items():
+    for finder in _FINDERS:
         try:
             found, corners = finder(level.image, (columns, rows))
         except cv2.error:
@@ -380,7 +379,7 @@ def _candidates(
             continue
         if found and corners is not None and corners.size == 2 * columns * rows:
             grid = np.asarray(corners, dtype=np.float64).reshape(rows, columns, 2)
-            yield f"{name} x{level.zoom:g}", [level.to_picture(_not_mirrored(grid))]
+            yield [level.to_picture(_not_mirrored(grid))]
 
 
 def _not_mirrored(grid: FloatArray) -> FloatArray:
@@ -485,11 +484,9 @@ class Detection:
     ----------
     pixels : (rows * columns, 2), (0, 0) at the centre of the top-left pixel, u right, v down.
     columns, rows : inner corners.
-    detector : name of the stage that found the board.
     sigma_px : (rows * columns,) standard deviation of one coordinate of a corner, from its own fit.
     refined : (rows * columns,) False where the corner itself could not be measured: `pixels` then has
         its place between the others and must not be taken for a measurement.
-    square_px : median side of the squares.
     contrast : median half step from dark to bright, grey levels.
     misfit_px : typical distance of a corner from where the others, by a smooth fit, place it.
     """
@@ -497,10 +494,8 @@ class Detection:
     pixels: FloatArray
     columns: int
     rows: int
-    detector: str
     sigma_px: FloatArray
     refined: BoolArray
-    square_px: float
     contrast: float
     misfit_px: float
 
@@ -515,7 +510,7 @@ def _checked(gray: GrayImage) -> bool:
     return min(gray.shape) >= 8 and int(gray.max()) - int(gray.min()) >= _LEAST_RANGE
 
 
-def _ordered(grid: Refined, columns: int, rows: int, detector: str) -> Detection | None:
+def _ordered(grid: Refined, columns: int, rows: int) -> Detection | None:
     turn = canonical_turn(grid.points, grid.amplitude, columns, rows)
     if turn is None:
         return None
@@ -523,10 +518,8 @@ def _ordered(grid: Refined, columns: int, rows: int, detector: str) -> Detection
         pixels=np.ascontiguousarray(np.rot90(grid.points, turn)).reshape(-1, 2),
         columns=columns,
         rows=rows,
-        detector=detector,
         sigma_px=np.rot90(grid.sigma_px, turn).ravel(),
         refined=np.rot90(grid.refined, turn).ravel(),
-        square_px=square_px(grid.points),
         contrast=float(np.median(np.abs(grid.amplitude))),
         misfit_px=grid.misfit_px,
     )
@@ -572,10 +565,10 @@ def detect(gray: GrayImage, columns: int, rows: int, quick: bool = False) -> Det
         )
     if not _checked(gray):
         return None
-    for name, grids in _candidates(gray, columns, rows, quick):
+    for grids in _candidates(gray, columns, rows, quick):
         grid = _best_of(gray, grids)
         if grid is not None:
-            return _ordered(grid, columns, rows, name)
+            return _ordered(grid, columns, rows)
     return None
 
 

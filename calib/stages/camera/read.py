@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import threading
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -52,8 +53,8 @@ Angle = Annotated[float, Field(ge=-6.2832, le=6.2832, allow_inf_nan=False, stric
 BOARD_FILE = "board.yaml"
 _SIZE_SAMPLE = 5
 """Pictures that are asked for the size of an unknown board."""
-_KEPT_PIXELS = 250_000_000
-"""Pixels that are kept in memory; further pictures are read twice."""
+_KEPT_PIXELS = 40_000_000
+"""Pixels that are kept in memory; further pictures are decoded where they are looked into."""
 
 
 class BoardFile(BaseModel):
@@ -134,7 +135,6 @@ class BoardSearch:
     board : the board that was looked for, or found.
     image_size_px : width and height of all pictures.
     views : one for each picture with the board; the names are the files'.
-    detections : as `views`.
     left_out : pictures that are not used: unreadable, of another size, or without the board.
     hashes : SHA-256 of every picture that could be read by name.
     layout : of the markers of a ChArUco board, which say which way it lies; None for a plain board.
@@ -143,7 +143,6 @@ class BoardSearch:
     board: Board
     image_size_px: tuple[int, int]
     views: tuple[View, ...]
-    detections: tuple[Detection, ...]
     left_out: tuple[LeftOut, ...]
     hashes: dict[str, str]
     layout: Layout | None = None
@@ -191,17 +190,18 @@ def find_boards(
         )
     with Workers(_Album(list(usable), list(usable.values())), len(usable)) as workers:
         search = _Search(workers, list(usable.values()), size_px, square_m, progress).run(corners, dictionary)
-    boardless = {one.name: one for one in search.left_out}
+    without = {one.name: one for one in search.left_out}
+    damaged = {one.name for one in search.left_out if one.kind == "unreadable"}
     left_out = [
         _not_read(path, one) if isinstance(one, BadInputError)
         else _of_another_size(one, size_px, len(usable)) if path not in usable
-        else boardless.get(one.name)
+        else without.get(one.name)
         for path, one in read.items()
     ]  # fmt: skip
     return replace(
         search,
         left_out=tuple(one for one in left_out if one is not None),
-        hashes={one.name: one.sha256 for one in pictures.values()},
+        hashes={one.name: one.sha256 for one in pictures.values() if one.name not in damaged},
     )
 
 
@@ -217,20 +217,29 @@ def _of_another_size(picture: Picture, size_px: tuple[int, int], others: int) ->
 
 
 def _read(paths: Sequence[Path]) -> list[Picture | BadInputError]:
-    """All pictures, or why they cannot be read; the pixels only of as many as memory surely has room for."""
-    kept, pictures = 0, list[Picture | BadInputError]()
-    with Workers(None, len(paths), large=True) as workers:
-        for picture in workers.in_order(_picture, paths):
-            if isinstance(picture, Picture):
-                kept += picture.gray.size
-                picture = picture if kept <= _KEPT_PIXELS else picture.without_pixels()
-            pictures.append(picture)
-    return pictures
+    """All pictures, or why they cannot be read; the pixels of some only, which take the memory."""
+    with Workers(_Room(_KEPT_PIXELS), len(paths), large=True) as workers:
+        return list(workers.in_order(_picture, paths))
 
 
-def _picture(_: None, path: Path) -> Picture | BadInputError:
+@dataclass
+class _Room:
+    """For pixels in memory."""
+
+    pixels: int
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def take(self, pixels: int) -> bool:
+        """Whether there is room for so many, which is then taken."""
+        with self.lock:
+            fits = pixels <= self.pixels
+            self.pixels -= pixels if fits else 0
+        return fits
+
+
+def _picture(room: _Room, path: Path) -> Picture | BadInputError:
     try:
-        return read_picture(path)
+        return read_picture(path, room.take)
     except BadInputError as error:
         return error
 
@@ -242,12 +251,19 @@ class _Album:
     paths: Sequence[Path]
     pictures: Sequence[Picture]
 
-    def gray(self, i: int) -> GrayImage:
-        if self.pictures[i].gray.size:
-            return self.pictures[i].gray
-        again = read_picture(self.paths[i])
-        if again.sha256 != self.pictures[i].sha256:
-            raise BadInputError(f"{self.pictures[i].name}: has changed since the work began")
+    def gray(self, i: int) -> GrayImage | LeftOut:
+        """Grey levels, or why a picture cannot be decoded."""
+        one = self.pictures[i]
+        if one.gray.size:
+            return one.gray
+        try:
+            again = read_picture(self.paths[i])
+        except BadInputError as error:
+            return _not_read(self.paths[i], error)
+        if again.sha256 != one.sha256:
+            raise BadInputError(f"{one.name}: has changed since the work began")
+        if again.size_px != one.size_px:
+            return LeftOut(one.name, "has another size than its header says", "unreadable")
         return again.gray
 
 
@@ -256,9 +272,12 @@ _Job = tuple[Callable[..., Any], int | tuple[int, ...], tuple[Any, ...]]
 
 
 def _look(album: _Album, job: _Job) -> Any:
+    """What is seen, or why the picture cannot be decoded; of several those are looked into that can be."""
     ask, which, more = job
-    seen = album.gray(which) if isinstance(which, int) else [album.gray(i) for i in which]
-    return ask(seen, *more)
+    if isinstance(which, int):
+        gray = album.gray(which)
+        return gray if isinstance(gray, LeftOut) else ask(gray, *more)
+    return ask([gray for gray in map(album.gray, which) if not isinstance(gray, LeftOut)], *more)
 
 
 @dataclass
@@ -272,6 +291,7 @@ class _Search:
     progress: Callable[[int, int], None]
     done: int = 0
     sizes: dict[int, tuple[int, int] | None] = field(default_factory=dict)
+    damaged: dict[int, LeftOut] = field(default_factory=dict)
 
     def run(self, corners: tuple[int, int] | None, dictionary: str | None) -> BoardSearch:
         pictures, count = self.pictures, len(self.pictures)
@@ -314,15 +334,21 @@ class _Search:
             board=board,
             image_size_px=self.size_px,
             views=tuple(View(p.name, target, d.pixels, d.refined) for p, d in seen),
-            detections=tuple(detection for _, detection in seen),
             left_out=tuple(
-                LeftOut(picture.name, why, "no board")
+                self.damaged.get(i, LeftOut(picture.name, why, "no board"))
                 for i, picture in enumerate(self.pictures)
                 if found[i] is None
             ),
             hashes={},
             layout=layout,
         )
+
+    def _each(self, jobs: Sequence[_Job], which: Sequence[int]) -> Iterator[Any]:
+        """What each picture shows, None of one that cannot be decoded."""
+        for i, seen in zip(which, self.workers.in_order(_look, jobs), strict=True):
+            if isinstance(seen, LeftOut):
+                self.damaged[i] = seen
+            yield None if isinstance(seen, LeftOut) else seen
 
     def _asked(self, ask: Callable[..., Any], which: Sequence[int], *more: Any) -> Any:
         """What several pictures together show."""
@@ -350,14 +376,16 @@ class _Search:
                 f"{_names(pictures)}: {_shows(pictures)} a grid of {layout.dictionary} markers, "
                 f"{layout.columns}x{layout.rows}; {_READS}"
             )
-        jobs: list[_Job] = [(find_markers, i, (layout.dictionary,)) for i in every]
-        markers = list(self.workers.in_order(_look, jobs))
-        kept = [in_place(one, layout)[0].ids for one in markers]
+        seen = self._each([(find_markers, i, (layout.dictionary,)) for i in every], every)
+        markers = {i: one for i, one in zip(every, seen, strict=True) if one is not None}
+        kept = [in_place(one, layout)[0].ids for one in markers.values()]
         layout = with_rows(layout, kept) or layout
         if corners is not None:
             layout = self._as_stated(corners, layout)
         board = Board(layout.columns - 1, layout.rows - 1, self.square_m)
-        found = self._counted(every, [(detect_charuco, i, (markers[i], layout)) for i in every])
+        found = dict.fromkeys(every) | self._counted(
+            list(markers), [(detect_charuco, i, (one, layout)) for i, one in markers.items()]
+        )
         if not any(found.values()):
             raise BadInputError(
                 f"{_names(pictures)}: no picture shows 3x3 corners of the ChArUco board "
@@ -381,7 +409,7 @@ class _Search:
 
     def _counted(self, which: Sequence[int], jobs: Sequence[_Job]) -> dict[int, Detection | None]:
         found: dict[int, Detection | None] = {}
-        for i, detection in zip(which, self.workers.in_order(_look, jobs), strict=True):
+        for i, detection in zip(which, self._each(jobs, which), strict=True):
             found[i] = detection
             self.done += 1
             self.progress(self.done, len(self.pictures))
@@ -393,8 +421,7 @@ class _Search:
         Seen upright and lying, a board counts the same.
         """
         new = [i for i in which if i not in self.sizes]
-        sizes = self.workers.in_order(_look, [(find_size, i, ()) for i in new])
-        self.sizes |= zip(new, sizes, strict=True)
+        self.sizes |= zip(new, self._each([(find_size, i, ()) for i in new], new), strict=True)
         counts = Counter((max(s), min(s)) for i in which if (s := self.sizes[i]) is not None)
         most = max(counts, key=lambda s: (counts[s], s[0] * s[1]), default=None)
         return None if most is None or counts[most] < share * len(which) else most

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calib.core.arrays import BoolArray, FloatArray, GrayImage, IntArray
+from calib.core.geometry import linear_homographies
 from calib.stages.camera.lattice import extrapolated
 
 # ----------------------------------------------------------------------
@@ -530,22 +531,11 @@ class Prediction:
 
 
 def _homographies(board: FloatArray, targets: FloatArray, weights: FloatArray) -> FloatArray:
-    """Weighted direct linear transforms of board (N, 2) in [-1, 1] to L targets (L, N, 2), mapped."""
-    total = weights.sum()
-    centre = (weights[:, None] * targets).sum(axis=1, keepdims=True) / total
-    square = np.sum((targets - centre) ** 2, axis=2)
-    scale = np.sqrt((weights * square).sum(axis=1) / total)[:, None, None] + 1e-12
-    x = (targets - centre) / scale
-    X = np.column_stack([board, np.ones(len(board))])
-    rows = np.zeros((len(targets), 2, len(X), 9))
-    root = np.sqrt(weights)[:, None]
-    rows[:, 0, :, :3], rows[:, 1, :, 3:6] = root * X, root * X
-    rows[:, 0, :, 6:], rows[:, 1, :, 6:] = -root * x[..., :1] * X, -root * x[..., 1:] * X
-    system = rows.reshape(len(targets), -1, 9)
-    H = np.linalg.eigh(system.transpose(0, 2, 1) @ system)[1][:, :, 0].reshape(-1, 3, 3)
-    mapped = X @ H.transpose(0, 2, 1)
+    """Board (N, 2) mapped by the homographies to L targets (L, N, 2) with weights (N,)."""
+    H = linear_homographies(board[None], targets, weights[None])
+    mapped = np.column_stack([board, np.ones(len(board))]) @ H.transpose(0, 2, 1)
     depth = np.where(np.abs(mapped[..., 2:]) < 1e-9, 1e-9, mapped[..., 2:])
-    return np.asarray(mapped[..., :2] / depth * scale + centre)
+    return np.asarray(mapped[..., :2] / depth)
 
 
 def _strength(board: FloatArray, pixels: FloatArray, used: BoolArray, lens: Lens) -> float:

@@ -366,10 +366,8 @@ def _ordered(
         pixels=pixels.reshape(-1, 2),
         columns=columns,
         rows=rows,
-        detector="charuco",
         sigma_px=sigma.ravel(),
         refined=measured.ravel(),
-        square_px=square_px(grid.points),
         contrast=float(np.median(np.abs(grid.amplitude))),
         misfit_px=grid.misfit_px,
     )
