@@ -155,7 +155,7 @@ def _judge(whole: Rig, inverse: InverseLens | None) -> Verdict:
         word = section.verdict.word
         if word != "ok":
             advice = _UNREAD if name in ("camera", "plane") else ""
-            findings.append(Finding(word, f"{name} is {word}", advice))
+            findings.append(Finding(word, f"{name.replace('_', ' ')} is {word}", advice))
     if inverse is not None and not _undone(inverse):
         error = "without bound" if inverse.max_error_px is None else f"to {inverse.max_error_px:.3g} px only"
         text = f"the lens is undone {error}, over {inverse.covered:.0%} of the picture"
