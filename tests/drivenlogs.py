@@ -89,3 +89,42 @@ def held_log(seed: int, held_s: float) -> tuple[SimulatedRig, Rows, FloatArray, 
         np.concatenate([pwm, commands_of(log)]),
         np.concatenate([np.tile(true[0], (len(t), 1)), true]),
     )
+
+
+def hostile(seed: int, rows: Rows, pwm: FloatArray) -> tuple[Rows, FloatArray]:
+    """A short piece of a log (120 to 300 rows) on which up to four things go wrong at random."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(120, 301))
+    at = int(rng.integers(0, max(len(rows) - n, 1)))
+    t, z, kinds = (part[at : at + n].copy() for part in (rows.t_s, rows.readings, rows.kinds))
+    pwm = pwm[at : at + n].copy()
+    n = len(t)
+    for fault in rng.choice(8, int(rng.integers(1, 5)), replace=False):
+        begin, end = np.sort(rng.integers(0, n + 1, 2))
+        some = slice(begin, end)
+        if fault == 0:
+            t[begin:] += 10.0
+        elif fault <= 2:
+            z[some, slice(0, 2) if fault == 1 else slice(2, 5)] = np.nan
+        elif fault == 3:
+            wild = np.column_stack([rng.uniform(-50.0, 400.0, (n, 2)), 60.0 * rng.standard_normal((n, 3))])
+            z = np.where((rng.random((n, 5)) < 0.05) & np.isfinite(z), wild, z)
+        elif fault == 4:
+            z[some, 2:] = np.clip(z[some, 2:], -2.0, 2.0)
+        elif fault == 5:
+            pwm[some] = np.nan
+        elif fault == 6:
+            pwm[some] = np.where(np.isfinite(pwm[some]), rng.choice([0.0, 255.0], 2), np.nan)
+        elif end > begin:
+            z[some] = np.where(np.isfinite(z[some]), z[begin], np.nan)
+    seen, felt = np.isfinite(z[:, :2]).all(axis=1), np.isfinite(z[:, 2:]).any(axis=1)
+    return Rows(t, z, np.where(seen, kinds & 1, 0) + np.where(felt, kinds & 2, 0)), pwm
+
+
+def unsound(out: FloatArray) -> str:
+    """What no rig does in rows of `OUT`: nothing, "NaN" or "1.23 m/s"."""
+    started = np.isfinite(out[:, 5])
+    if not np.isfinite(out[started, 1:13]).all() or not (out[started, 10:13] > 0.0).all():
+        return "NaN"
+    fastest = float(np.abs(out[started, 3:5]).max(initial=0.0))
+    return f"{fastest:.2f} m/s" if fastest > 1.0 else ""

@@ -67,7 +67,7 @@ def beside_filterpy() -> tuple[float, float, float]:
     levels, walk = setup.process.arrays()
     gated, constants = np.zeros((count, 3)), np.array([9.81, 0.0])
     kept_x, kept_P = np.empty((count, 19)), np.empty((count, 19, 19))
-    nothing = (np.empty((0, 3, TRACE)), np.empty((0, 19)), np.empty((0, 19, 19)))
+    nothing = (np.empty((1, 0, TRACE)), np.empty((0, 19)), np.empty((0, 19, 19)))
 
     def recursion(*kept: np.ndarray) -> None:
         x, P, w = starting_state(setup, rows)
@@ -79,7 +79,7 @@ def beside_filterpy() -> tuple[float, float, float]:
     def alone() -> None:
         recursion(*nothing)
 
-    recursion(np.empty((0, 3, TRACE)), kept_x, kept_P)
+    recursion(np.empty((1, 0, TRACE)), kept_x, kept_P)
     alone()
     few = 600
     some = Events(events.t_s[:few], events.kinds[:few], events.readings[:few], events.rows[:few])

@@ -240,6 +240,20 @@ def test_a_log_becomes_states_with_their_deviations(
     assert 1e3 * np.sqrt(np.mean(error[late] ** 2)) == pytest.approx(told["rmse"]["q1_mm"], rel=1e-3)
 
 
+def test_the_equations_can_be_checked_on_filterpy(
+    calib: Run, aligned: Path, log_file: Callable[..., Path], tmp_path: Path
+) -> None:
+    path, states = log_file("ellipse", change=lambda log: _first(log, 400)), tmp_path / "states.csv"
+    ended = calib("replay", path, "--rig", aligned, "--estimator", "filterpy", "-o", states, "--json")
+    assert ended.code == 0
+    told = json.loads(ended.out)["replay"]["logs"][0]
+    (remark,) = [one for one in told["remarks"] if "compiled filter" in one]
+    assert float(remark.split(" at most ")[1].split()[0]) <= 1e-9
+    assert len(read_states(states)["t_s"]) == 400 and told["rmse"]["mean_q_mm"] < 0.4
+    refused = calib("replay", path, "--rig", aligned, "--estimator", "filterpy", "--smooth")
+    assert refused.code == 2 and "--estimator filterpy: cannot be smoothed" in refused.err
+
+
 def test_several_logs_go_to_a_folder_with_figures(
     calib: Run, aligned: Path, log_file: Callable[..., Path], tmp_path: Path
 ) -> None:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drivenlogs import commands_of, driven_log, held_log, varied_drive
-from estimatorlogs import rows_from, setup_for, simulated, truth
+from drivenlogs import commands_of, driven_log, held_log, hostile, unsound, varied_drive
+from estimatorlogs import SCENARIOS, rows_from, setup_for, simulated, truth
 from identifytrials import rig_file
 
 from calib.core.arrays import BoolArray, FloatArray
@@ -683,3 +683,16 @@ def test_a_log_with_commands_tunes_the_driven_model_too(
     assert found.driven.walk_disturbance_N_per_sqrt_s > 0.0
     assert {"driven_disturbance", "driven_rates", "driven_forces"} <= set(found.sigma)
     assert tuned_section([tmp_path / "quiet.csv"], rig, path).driven is None
+
+
+@pytest.mark.parametrize("seed", [*range(15), 130, 1300, 1500])
+def test_hostile_logs_break_nothing(seed: int) -> None:
+    """Of more logs, `python tests/bench/hostile.py`; the last three had smoothed rates of up to 13 m/s."""
+    name = list(SCENARIOS)[seed % len(SCENARIOS)]
+    rig, log = simulated(name, 1)
+    setup, drive = setup_for(rig, 1), Drive()
+    rows, pwm = hostile(seed, rows_from(log), commands_of(log))
+    driven, kinematic, weight = Handover(setup, drive).run_each(rows, pwm)
+    for out in (driven, kinematic, blended(driven, kinematic, weight)):
+        assert unsound(out) == ""
+    assert unsound(smooth_both(setup, drive, rows, pwm, driven, kinematic)) == ""

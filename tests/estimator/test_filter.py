@@ -26,34 +26,28 @@ from calib.stages.camera.model import Camera
 from calib.stages.estimator import reference, sensors, smoother
 from calib.stages.estimator.baseline import Baseline, BaselineSetup
 from calib.stages.estimator.consistency import Tally, chi_square_band, nees
+from calib.stages.estimator.event import CAMERA, IMU, REPORT, camera_terms, imu_terms
 from calib.stages.estimator.kinematic import (
-    CAMERA,
     CONSIDERED,
     FLAGS,
-    IMU,
     OUT,
-    REPORT,
-    TOLD,
     TRACE,
+    WORK,
     Filter,
     Kinematic,
     Rows,
     Setup,
+    bank_event,
     even_times,
-    event,
-    get,
-    new_bank,
     new_clock,
-    put,
     starting_state,
 )
 from calib.stages.estimator.noise import jitter_px, log_likelihood, tune
 from calib.stages.estimator.read import READINGS, Periods, setup_from_rig
-from calib.stages.estimator.reference import camera_terms, imu_terms
 from calib.stages.estimator.replay import consistent, sampled
 from calib.stages.estimator.section import SensorCheck
 from calib.stages.estimator.sensors import SENSOR, SIZE, truncated, update_terms
-from calib.stages.estimator.smoother import Events, banked, events_of, forward
+from calib.stages.estimator.smoother import Events, OneLevel, banked, events_of, forward, one_level
 from calib.twin.rig import SimulatedRig, nominal_view, workspace_homography
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.sensors import HeadMotion, Imu, ImuNoise, Tracker, marker_pixels, measure
@@ -130,18 +124,17 @@ def test_late_pictures_end_in_the_state_of_the_right_order() -> None:
     x, P, w = starting_state(setup, rows)
     levels, walk = setup.process.arrays()
     weights, gated = np.empty((len(events.t_s), len(levels))), np.zeros((len(events.t_s), 3))
-    bank, turned = banked(x, P, w)
+    bank_x, bank_P, turned = banked(x, P, w)
     forward(
-        events.t_s, float(events.t_s[0]), events.kinds, events.readings, bank, turned,
+        events.t_s, float(events.t_s[0]), events.kinds, events.readings, bank_x, bank_P, turned,
         setup.process.switch_hz, levels[None], walk, setup.view, np.array([9.81, 0.0]), setup.noise, False,
         gated, weights,
-        np.empty((0, 3, TRACE)), np.empty((0, SIZE)), np.empty((0, SIZE, SIZE)),
+        np.empty((1, 0, TRACE)), np.empty((0, SIZE)), np.empty((0, SIZE, SIZE)),
     )  # fmt: skip
     assert np.nansum(out[:, OUT.index("gated_camera")]) == gated[events.kinds == CAMERA, 0].sum()
     got_x, got_P, got_w = late.state
     deviation = np.sqrt(np.diagonal(got_P[0]))
-    ordered_x, _ = get(bank, 0, len(levels))
-    np.testing.assert_allclose((got_w @ got_x - turned[0, :-1] @ ordered_x) / deviation, 0.0, atol=0.02)
+    np.testing.assert_allclose((got_w @ got_x - turned[0, :-1] @ bank_x[0]) / deviation, 0.0, atol=0.02)
 
 
 def test_a_blackout_is_survived_and_its_uncertainty_told() -> None:
@@ -246,26 +239,12 @@ def test_small_disorder_and_repeated_rows_do_little() -> None:
     assert 1e3 * np.sqrt(np.mean((out[late, 1] - true[twice][late, 0]) ** 2)) < 0.35
 
 
-def compiled(
-    setup: Setup, rows: Rows, seconds: float
-) -> tuple[Events, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Events of the first seconds, what was gated, states and covariances after each event, and the trace."""
+def compiled(setup: Setup, rows: Rows, seconds: float) -> tuple[Events, OneLevel]:
+    """Events of the first seconds and what the filter makes of them."""
     events = smoother.events_of(setup, rows, outputs=False)
     keep = events.t_s < rows.t_s[0] + seconds
     events = Events(events.t_s[keep], events.kinds[keep], events.readings[keep], events.rows[keep])
-    levels, walk = setup.process.arrays()
-    n, constants, begin = len(events.t_s), np.array([9.81, 0.0]), float(events.t_s[0])
-    gated, trace, kept_x, kept_P = (
-        np.zeros((n, 3)), np.empty((n, 3, TRACE)), np.empty((n, 19)), np.empty((n, 19, 19)),
-    )  # fmt: skip
-    for again in (False, True):
-        x, P, w = starting_state(setup, rows)
-        smoother.forward(
-            events.t_s, begin, events.kinds, events.readings, *smoother.banked(x, P, w), 0.0,
-            levels[None], walk, setup.view, constants, setup.noise, again, gated, np.empty((n, 1)), trace,
-            kept_x, kept_P,
-        )  # fmt: skip
-    return events, gated, kept_x, kept_P, trace
+    return events, one_level(setup, rows, events)
 
 
 def prepared(name: str, level: int = 2) -> tuple[Setup, Rows]:
@@ -276,12 +255,12 @@ def prepared(name: str, level: int = 2) -> tuple[Setup, Rows]:
 @pytest.mark.parametrize("name", sorted(SCENARIOS))
 def test_compiled_filter_equals_filterpy(name: str) -> None:
     setup, rows = prepared(name, 3 if name == "swing" else 2)
-    events, gated, x, P, _ = compiled(setup, rows, 4.0)
-    got_x, got_P = reference.extended(setup, rows, events, gated)
-    deviation = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
-    np.testing.assert_allclose(x / deviation, got_x / deviation, rtol=0, atol=1e-9)
+    events, ours = compiled(setup, rows, 4.0)
+    got_x, got_P = reference.extended(setup, rows, events, ours.gated)
+    deviation = np.sqrt(np.diagonal(ours.P, axis1=1, axis2=2))
+    np.testing.assert_allclose(ours.x / deviation, got_x / deviation, rtol=0, atol=1e-10)
     scale = deviation[:, :, None] * deviation[:, None, :]
-    np.testing.assert_allclose(P / scale, got_P / scale, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(ours.P / scale, got_P / scale, rtol=0, atol=1e-9)
 
 
 def test_compiled_smoother_equals_matrices() -> None:
@@ -294,7 +273,8 @@ def test_compiled_smoother_equals_matrices() -> None:
         start=replace(setup.start, sensor_sigma=sigma),
         process=replace(setup.process, sensor_walk=tuple(walks)),
     )
-    events, _, x, P, trace = compiled(setup, rows, 2.0)
+    events, ours = compiled(setup, rows, 2.0)
+    x, P, trace = ours.x, ours.P, ours.trace
     levels, _ = setup.process.arrays()
     expected_x, expected_P = reference.extended_smoothed(setup, events, x, P)
     deviation = np.sqrt(np.diagonal(P, axis1=1, axis2=2)) + 1e-12
@@ -307,8 +287,9 @@ def test_compiled_smoother_equals_matrices() -> None:
 
 def test_unscented_filter_agrees_within_its_deviation() -> None:
     setup, rows = prepared("ellipse")
-    events, gated, x, P, _ = compiled(setup, rows, 3.0)
-    got_x, _ = reference.unscented(setup, rows, events, gated)
+    events, ours = compiled(setup, rows, 3.0)
+    x, P = ours.x, ours.P
+    got_x, _ = reference.unscented(setup, rows, events, ours.gated)
     late = events.t_s > rows.t_s[0] + 1.0
     deviation = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
     away = (x - got_x)[late, :2] / deviation[late, :2]
@@ -322,18 +303,16 @@ def _one_event(
     process = Kinematic(Kinematic().levels[:levels])
     setup = setup or setup_for(rig, 0, process)
     x, P, w = starting_state(setup, rows_from(log))
-    bank, weights = new_bank(2, levels), np.zeros((2, levels + 1))
-    put(bank, 0, x, P)
-    weights[0, :levels] = w
+    bank_x, bank_P, weights = banked(x, P, w)
     level, walk = process.arrays()
     report = np.empty(len(REPORT))
-    event(
-        bank, weights, 0, 1, kind, np.array([z]), 0, 0.0, 0.3, level[None], 0, walk, setup.view,
-        np.array([9.81, 0.0]), setup.noise, np.zeros((levels, TOLD)), False, report, np.zeros((1, 3)),
-        np.empty((0, 3, TRACE)),
+    bank_event(
+        bank_x, bank_P, weights, 0, 1, kind, np.array(z), 0.0, 0.3, level, walk, setup.view,
+        np.array([9.81, 0.0]), setup.noise, np.empty((levels, *WORK)), np.zeros((levels, 7)), False, report,
+        np.zeros(3), np.empty((0, TRACE)),
     )  # fmt: skip
-    np.testing.assert_array_equal(get(bank, 0, levels)[0], x)
-    after = get(bank, 1, levels)
+    np.testing.assert_array_equal(bank_x[0], x)
+    after = bank_x[1], bank_P[1]
     np.testing.assert_array_equal(after[1], np.swapaxes(after[1], 1, 2))
     return dict(zip(REPORT, report.tolist(), strict=True)), (x, P), after
 
@@ -353,8 +332,8 @@ def test_an_event_is_joseph_s_form_reading_by_reading_but_for_what_is_considered
     H, out, held = np.zeros((3, SIZE)), np.empty(SIZE), list(CONSIDERED)
     before, x, P = x[0], x[0].copy(), P[0].copy()
     if kind == CAMERA:
-        camera_terms(setup.view, noise, before, P, H, out)
-        order, R = [0, 1], out[2:4] + noise[0] ** 2
+        camera_terms(setup.view, noise, noise[6] ** 2, before, P, H, out)
+        order, R = [0, 1], out[3:5].copy()
     else:
         imu_terms(np.array([9.81, 0.0]), noise, before, P, H, out)
         order, R = [2, 0, 1], out[3:6].copy()

@@ -42,7 +42,7 @@ def correlation_band(count: int) -> float:
 
 
 def nees(out: FloatArray, q_m: FloatArray, phi_rad: FloatArray, bellows_radius_m: float) -> FloatArray:
-    """NEES (n,) of (q1, q2, phi), two degrees of freedom, of rows of `setup.OUT` against the truth.
+    """NEES (n,) of (q1, q2, phi), two degrees of freedom, of rows of `kinematic.OUT` against the truth.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ class Tally:
     squares: FloatArray = field(default_factory=lambda: np.zeros(8))
 
     def add(self, out: FloatArray, truth: FloatArray | None = None) -> None:
-        """Rows of `setup.OUT`, and (n, 3) true q1, q2, phi, NaN where not known."""
+        """Rows of `kinematic.OUT`, and (n, 3) true q1, q2, phi, NaN where not known."""
         if len(out) == 0:
             return
         if self.rows == 0:

@@ -13,6 +13,18 @@ from calib.stages.actuator.dynamics import Coefficients, coefficients, rates
 from calib.stages.actuator.kinematics import chord_decay_w, chord_ratio_w
 from calib.stages.actuator.parameters import DAMPING_SCALE_FREE, Plant, pumps_connected
 from calib.stages.actuator.pump import Pump, PumpCoefficients, advance_pump, pump_coefficients, static_force_N
+from calib.stages.estimator.event import (
+    CAMERA,
+    IMU,
+    TELLING,
+    absorb,
+    camera_terms,
+    chi_squares,
+    judge,
+    leave,
+    tell,
+    update,
+)
 from calib.stages.estimator.kinematic import (
     COUNT,
     FASTEST_MPS,
@@ -23,6 +35,7 @@ from calib.stages.estimator.kinematic import (
     Setup,
     advance,
     begin_row,
+    copy_state,
     count_first,
     even_times,
     finish_row,
@@ -39,8 +52,6 @@ from calib.stages.estimator.sensors import (
     gyroscope,
     head_position,
     invert_marker,
-    marker,
-    update_terms,
 )
 from calib.stages.estimator.smoother import events_of, look_back, smooth, undo_readings
 
@@ -266,7 +277,7 @@ def carry(P: FloatArray, F: FloatArray, noise: FloatArray, dt: float, FP: FloatA
 # What the driven filter knows beforehand: plant, pumps, and how far from the truth they may be.
 
 SIGMA = (0.08, 0.1, 0.1, 0.06, 0.06, 0.06, 0.08, 5e-4, 0.08, 0.1, 0.1)
-"""Deviations of `driven_model.PARAMETER` from nominal: by what two rigs that were made alike differ."""
+"""Deviations of `PARAMETER` from nominal: by what two rigs that were made alike differ."""
 
 
 @dataclass(frozen=True)
@@ -277,7 +288,7 @@ class Drive:
     ----------
     plant, pump, strength : nominal, with the hoses on; factors on the pumps' static forces.
     free_damping_scale : c_dmp with the hoses off. Until the first command nobody knows which it is.
-    sigma : (11,) deviations of `driven_model.PARAMETER`.
+    sigma : (11,) deviations of `PARAMETER`.
     covariance : (11, 11) of the same where they are not independent; its diagonal is `sigma` squared.
     sigma_force_N, sigma_disturbance_N, sigma_creep_N : of the state before the first reading.
     sigma_turning_radps : of dphi; a free swing is fast.
@@ -307,11 +318,11 @@ class Drive:
     covariance: FloatArray | None = None
 
     def numbers(self) -> FloatArray:
-        """The (22,) vector of `driven_model.PLANT`."""
+        """The (22,) vector of `PLANT`."""
         return np.array([*coefficients(self.plant), *pump_coefficients(self.pump)], dtype=np.float64)
 
     def noise(self, setup: Setup) -> FloatArray:
-        """The (11,) of `kernel.NOISE` for the driven filter."""
+        """The (11,) of `event.NOISE` for the driven filter."""
         noise = setup.noise.copy()
         if self.imu_noise is not None:
             noise[2:5] = self.imu_noise
@@ -363,12 +374,12 @@ def commands(drive: Drive, pwm: FloatArray) -> FloatArray:
 # ----------------------------------------------------------------------
 # One event of the driven filter: a picture, an IMU sample, or the certainty that the hoses are on.
 #
-# The process is `driven_model`, the readings are those of `kernel`: pixels rounded as `rounding` has it,
-# linearised once per event, taken one after the other, gated by the chi-square of their sensor. The head's
-# accelerations, which the accelerometer feels, are what the dynamics say of the state, so their gradients
-# reach forces and parameters. What `kernel.CONSIDERED` names of the geometry is considered and not learnt.
+# Readings are those of `event`. The head's accelerations, which the accelerometer feels, are what the
+# dynamics say of the state, so their gradients reach forces and parameters. What `kinematic.CONSIDERED` names
+# of the geometry is considered and not learnt.
 
-CAMERA, IMU, HOSES = 1, 2, 4
+HOSES = 4
+"""A kind of event beside those of `event`."""
 
 LONGEST_S = 0.02
 """Longer steps are taken in parts."""
@@ -380,9 +391,8 @@ WORK = (25 + DYNAMIC, SIZE_D)
 TRACE = 2 * SIZE_D + 2
 """Length of what a reading leaves; the last number is 0 where there was none."""
 
-_TELLING = 9.0
-_MARGIN_PX2 = 0.25
 _SWING_RADPS = 25.0
+_ALONE = np.ones(1)
 _MOST_DAMPED = 1.1
 """Limit of `log_damping`, three times the damping that is known: a head that is held is not in honey."""
 _KNOWN_MPS = 3e-3
@@ -392,15 +402,6 @@ SETTLING_S = 0.3
 _MOST_SEGMENTS = 12
 _SHIFT = INVOLVED - 6
 """The sensors' quantities stand this much further on than in `sensors`."""
-
-
-@compiled()
-def copy_state(to_x: FloatArray, to_P: FloatArray, x: FloatArray, P: FloatArray) -> None:
-    """Copy a state and its covariance."""
-    for i in range(x.shape[0]):
-        to_x[i] = x[i]
-        for j in range(x.shape[0]):
-            to_P[i, j] = P[i, j]
 
 
 @compiled()
@@ -415,61 +416,12 @@ def _consider(x: FloatArray, P: FloatArray, learnt: FloatArray) -> None:
     for k in range(x.shape[0]):
         learnt[k] = 1.0
     learnt[28], learnt[29], learnt[31], learnt[32], learnt[33] = 0.0, 0.0, 0.0, 0.0, 0.0
-    if x[2] * x[2] > _TELLING * P[2, 2] or x[3] * x[3] > _TELLING * P[3, 3]:
+    if x[2] * x[2] > TELLING * P[2, 2] or x[3] * x[3] > TELLING * P[3, 3]:
         return
     learnt[13], learnt[20], learnt[21], learnt[22] = 0.0, 0.0, 0.0, 0.0
     pumped = x[8] + x[9]
-    if pumped * pumped < _TELLING * (P[10, 10] + P[11, 11]):
+    if pumped * pumped < TELLING * (P[10, 10] + P[11, 11]):
         learnt[12], learnt[14], learnt[15], learnt[16], learnt[17], learnt[18] = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-
-
-@compiled()
-def _update(
-    x: FloatArray, P: FloatArray, innovation: float, S: float, p: FloatArray, learnt: FloatArray
-) -> None:
-    """Update in place by an innovation with variance S; p = P H' is used up. `learnt` as of `_consider`."""
-    n = x.shape[0]
-    root = 1.0 / math.sqrt(S)
-    for j in range(n):
-        p[j] *= root
-    move = innovation * root
-    for i in range(n):
-        gain = p[i]
-        if learnt[i] == 0.0:
-            for j in range(n):
-                P[i, j] -= gain * learnt[j] * p[j]
-            continue
-        x[i] += gain * move
-        for j in range(n):
-            P[i, j] -= gain * p[j]
-
-
-@compiled()
-def _leave(trace: FloatArray, row: int, H: FloatArray, p: FloatArray, innovation: float, S: float) -> None:
-    """Write what a reading did: gradient, gain, innovation / S and 1 / S; p as `_update` leaves it."""
-    if trace.shape[0] == 0:
-        return
-    n, root = H.shape[0], 1.0 / math.sqrt(S)
-    for j in range(n):
-        trace[row, j], trace[row, n + j] = H[j], p[j] * root
-    trace[row, 2 * n], trace[row, 2 * n + 1] = innovation / S, 1.0 / S
-
-
-@compiled()
-def _project(P: FloatArray, H: FloatArray, p: FloatArray) -> float:
-    """p = P H' and H P H'."""
-    n = H.shape[0]
-    for j in range(n):
-        p[j] = 0.0
-    for k in range(n):
-        slope = H[k]
-        if slope != 0.0:
-            for j in range(n):
-                p[j] += slope * P[k, j]
-    total = 0.0
-    for k in range(n):
-        total += H[k] * p[k]
-    return total
 
 
 @compiled()
@@ -546,16 +498,12 @@ def measure(
     state[0], state[1], state[2], state[3], state[4], state[5] = x[0], x[1], x[2], x[3], 0.0, 0.0
     for k in range(6, SIZE):
         state[k] = x[k + _SHIFT]
-    h0, h1 = work[1, :SIZE], work[7, :SIZE]
+    h = work[6:8, :SIZE]
+    h0, h1 = h[0], h[1]
     if kind == CAMERA:
-        out[0], out[1] = marker(view, state, h0, h1)
+        camera_terms(view, noise, stamp, state, P, h, out)
         _spread_out(h0, H[0])
         _spread_out(h1, H[1])
-        for k in range(2):
-            speed = H[k, 0] * x[2] + H[k, 1] * x[3]
-            out[3 + k] = noise[0] * noise[0] + speed * speed * stamp
-            if speed * speed < _TELLING * (H[k, 0] ** 2 * P[2, 2] + H[k, 1] ** 2 * P[3, 3]):
-                H[k, 30] = 0.0
         return
     by_phi, by_length = work[8], work[9]
     state[4], state[5] = accelerations(plant, x, by_phi, by_length)
@@ -568,31 +516,15 @@ def measure(
     turning = constants[0] * constants[0] * x[2] * x[2] + _SWING_RADPS * _SWING_RADPS * moved
     scale = noise[5] * noise[5] * moved + stamp * turning
     for k in range(2):
-        h = h0 if k == 0 else h1
-        _spread_out(h, H[k])
+        _spread_out(h[k], H[k])
         for i in range(INVOLVED):
-            H[k, i] += h[4] * by_phi[i] + h[5] * by_length[i]
+            H[k, i] += h[k, 4] * by_phi[i] + h[k, 5] * by_length[i]
         out[3 + k] = noise[2 + k] * noise[2 + k] + scale
     out[2] = gyroscope(state, h0)
     _spread_out(h0, H[2])
-    if x[2] * x[2] < _TELLING * P[2, 2]:
+    if x[2] * x[2] < TELLING * P[2, 2]:
         H[2, 27] = 0.0
     out[5] = noise[4] * noise[4] + state[4] * state[4] * stamp
-
-
-@compiled()
-def _chi_square(
-    P: FloatArray, H: FloatArray, p: FloatArray, first: int, e: FloatArray, r: FloatArray, more: float
-) -> tuple[float, float, float]:
-    """Chi-square of two readings together, and the deviations of both."""
-    a = _project(P, H[first], p) + r[first] + more
-    b = 0.0
-    for k in range(H.shape[1]):
-        b += H[first + 1, k] * p[k]
-    c = _project(P, H[first + 1], p) + r[first + 1] + more
-    e0, e1 = e[first], e[first + 1]
-    total = (c * e0 * e0 - 2.0 * b * e0 * e1 + a * e1 * e1) / (a * c - b * b)
-    return total, math.sqrt(a), math.sqrt(c)
 
 
 @compiled()
@@ -607,8 +539,8 @@ def driven_event(
     ----------
     kind, z : `CAMERA`, `IMU` or `HOSES` and (4,) its readings, NaN where missing, and the variance of its
         time [s^2]; of `HOSES` the deviation that the damping then has.
-    plant : (22,). view, constants, noise : as in `kernel.event`.
-    work : scratch of the shape `WORK`. report : (12,) of `kernel.REPORT`, written to.
+    plant : (22,). view, constants, noise : as in `kinematic.bank_event`.
+    work : scratch of the shape `WORK`. report : (12,) of `event.REPORT`, written to.
     again : whether the event is done once more; then `gated` (3,) holds.
     trace : (3, `TRACE`) what each reading did, for the smoother; (0, `TRACE`) for nothing.
     """
@@ -628,62 +560,16 @@ def driven_event(
         H[0, 13] = 1.0
         y, S = -x[13], P[13, 13] + z[0] * z[0]
         learnt[13] = 1.0
-        _update(x, P, y, S, p, learnt)
-        _leave(trace, 0, H[0], p, y, S)
-    elif kind == CAMERA:
+        update(x, P, y, S, p, learnt)
+        leave(trace, 0, H[0], p, y, S)
+    else:
         measure(kind, x, P, plant, view, constants, noise, stamp, H, out, work)
-        e[0], e[1] = z[0] - out[0], z[1] - out[1]
-        grid = noise[1] * noise[1] / 12.0
+        told = work[11:12]
+        chi_squares(kind, P, H, z, out, noise, e, work[12:15], told[0])
         if not again:
-            gate, _, _ = _chi_square(P, H, p, 0, e, out[3:6], grid + _MARGIN_PX2)
-            report[0], s0, s1 = _chi_square(P, H, p, 0, e, out[3:6], grid)
-            report[3], report[4] = e[0] / s0, e[1] / s1
-            gated[0] = 0.0 if gate < noise[8] else 1.0
-            report[8] = gated[0]
-        if gated[0] == 0.0:
-            x0 = work[1]
-            for k in range(x.shape[0]):
-                x0[k] = x[k]
-            for k in range(2):
-                spread = _project(P, H[k], p)
-                moved = 0.0
-                for i in range(x.shape[0]):
-                    moved += H[k, i] * (x[i] - x0[i])
-                y, S, log_z = update_terms(e[k] - moved, spread, out[3 + k], noise[1])
-                log_l += log_z
-                _update(x, P, y, S, p, learnt)
-                _leave(trace, k, H[k], p, y, S)
-    elif kind == IMU:
-        measure(kind, x, P, plant, view, constants, noise, stamp, H, out, work)
-        for k in range(3):
-            e[k] = z[k] - out[k]
-        if not again:
-            gated[1], gated[2] = 1.0, 1.0
-            known = P[3, 3] < _KNOWN_MPS * _KNOWN_MPS
-            if known and not (math.isnan(z[0]) or math.isnan(z[1])):
-                report[1], s0, s1 = _chi_square(P, H, p, 0, e, out[3:6], 0.0)
-                report[5], report[6] = e[0] / s0, e[1] / s1
-                gated[1] = 0.0 if report[1] < noise[9] else 1.0
-                report[9] = gated[1]
-            if not math.isnan(z[2]):
-                S = _project(P, H[2], p) + out[5]
-                report[2], report[7] = e[2] * e[2] / S, e[2] / math.sqrt(S)
-                gated[2] = 0.0 if report[2] < noise[10] else 1.0
-                report[10] = gated[2]
-        x0 = work[1]
-        for k in range(x.shape[0]):
-            x0[k] = x[k]
-        for order in range(3):
-            k = 2 if order == 0 else order - 1
-            if gated[2 if k == 2 else 1] != 0.0:
-                continue
-            S = _project(P, H[k], p) + out[3 + k]
-            y = e[k]
-            for i in range(x.shape[0]):
-                y -= H[k, i] * (x[i] - x0[i])
-            log_l -= 0.5 * (y * y / S + math.log(2.0 * math.pi * S))
-            _update(x, P, y, S, p, learnt)
-            _leave(trace, order, H[k], p, y, S)
+            judge(kind, z, told, noise, P[3, 3] < _KNOWN_MPS * _KNOWN_MPS, gated, report)
+            tell(kind, _ALONE, told, report)
+        log_l = absorb(kind, x, P, H, e, out, noise, gated, learnt, work[12:15], trace)
     x[13] = min(x[13], _MOST_DAMPED)
     report[11] = log_l
 
@@ -694,10 +580,9 @@ assert SIZE_D == 36
 # ----------------------------------------------------------------------
 # The driven filter, row by row: the dynamics with the commands as input, readings as they arrive.
 #
-# As in `filter` a picture belongs to its exposure, before IMU samples that have been used already; the last
-# events are kept with the state before the reading of each, the picture is put among them and those after
-# it
-# are done again. A command acts `delay_s` after the tick that gave it, so it is known in time.
+# As in `kinematic` a picture belongs to its exposure, before IMU samples that have been used already; the
+# last events are kept, the picture is put among them and those after it are done again. A command acts
+# `delay_s` after the tick that gave it, so it is known in time.
 #
 # The first command that is not zero says that the hoses are on (`HOSES`); until then the damping may be that
 # of either. When most readings are rejected for a tenth of a second, time jumps, or the state leaves the
@@ -1232,10 +1117,12 @@ def _backward(
     """
     n = kept_P.shape[2]
     y, Y, part, FY = np.zeros(n), np.zeros((n, n)), np.empty(n), np.empty((INVOLVED + 1, n))
+    # A literal would be a type of its own, and its functions compiled for it.
+    spread = n > 0
     for k in range(len(t) - 1, -1, -1):
         if rows[k] >= 0:
-            look_back(kept_x[k], kept_P[k], y, Y, part, True)
-        undo_readings(trace[k], y, Y, part, True)
+            look_back(kept_x[k], kept_P[k], y, Y, part, spread)
+        undo_readings(trace[k], y, Y, part, spread)
         if not chained[k]:
             for i in range(n):
                 y[i] = 0.0
@@ -1321,6 +1208,8 @@ def smooth_driven(setup: Setup, drive: Drive, rows: Rows, pwm: FloatArray, outpu
         write_columns(kept_x[some], kept_P[some], shown - 1, wanted[some], setup.bellows_radius_m, out)
         before = float(t[end - 1])
         begin = end
+    # As in `smooth`: readings that lie carry it away, and there the kinematic model speaks.
+    out[~(np.abs(out[:, 3:5]) < FASTEST_MPS).all(axis=1), 1:13] = np.nan
     return out
 
 

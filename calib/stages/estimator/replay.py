@@ -41,7 +41,8 @@ from calib.stages.estimator.driven import (
     smooth_both,
     smooth_driven,
 )
-from calib.stages.estimator.kinematic import FLAGS, NOISE, OUT, Filter, Rows, Setup, Start, starting_state
+from calib.stages.estimator.event import NOISE
+from calib.stages.estimator.kinematic import FLAGS, OUT, Filter, Rows, Setup, Start, starting_state
 from calib.stages.estimator.noise import jitter_px
 from calib.stages.estimator.read import (
     READINGS,
@@ -276,6 +277,8 @@ class Estimate:
 
 _SMOOTHED_ROWS = 1_000_000
 """The smoother keeps 1.6 kB for each row with the kinematic model alone."""
+_FILTERPY_ROWS = 100_000
+"""Filterpy's filter keeps 13 kB for each row and takes two minutes for so many."""
 
 
 def joined(parts: list[Rows]) -> Rows:
@@ -311,6 +314,20 @@ class Smoothed:
     sensor: FloatArray
 
 
+def filterpy_log(log: OpenLog, stream: Iterable[Log]) -> tuple[FloatArray, FloatArray, list[Finding]]:
+    """Rows of `OUT` by filterpy's extended filter, the truth (n, 3), and how far ours is away."""
+    from calib.stages.estimator.reference import replayed
+
+    parts, truths = [], []
+    for block in stream:
+        parts.append(rows_of(block, log.periods.ticks))
+        truth = truth_of(block)
+        truths.append(np.full((len(block), 3), np.nan) if truth is None else truth)
+    out, apart = replayed(log.setup, joined(parts))
+    text = f"the compiled filter with the same one level of noise is at most {apart:.0e} sigma away"
+    return out, np.concatenate(truths), [Finding("remark", text)]
+
+
 def smooth_log(setup: Setup, ticks: bool, stream: Iterable[Log], drive: Drive | None = None) -> Smoothed:
     """A log filtered block by block and smoothed as a whole; with a `drive` both models are weighed."""
     parts, outs, truths, pwm, driven, kinematic = [], [], [], [], [], []
@@ -337,16 +354,16 @@ def smooth_log(setup: Setup, ticks: bool, stream: Iterable[Log], drive: Drive | 
     return Smoothed(filtered, out, np.concatenate(truths), sensor)
 
 
-def _watched(stream: Iterator[Log], watch: Watch) -> Iterator[Log]:
+def _watched(stream: Iterator[Log], watch: Watch, most: int, option: str) -> Iterator[Log]:
     """The blocks of a log that may be held in memory as a whole, with a watch over its sensors."""
     rows = 0
     for log in stream:
         watch.add(log)
         rows += len(log)
-        if rows > _SMOOTHED_ROWS:
+        if rows > most:
             raise BadInputError(
-                f"{log.source}: has more than {_SMOOTHED_ROWS} rows, which smoothing would hold in memory; "
-                "leave --smooth out or cut the log"
+                f"{log.source}: has more than {most} rows, which {option} would hold in memory; "
+                f"leave {option} out or cut the log"
             )
         yield log
 
@@ -568,7 +585,7 @@ def replay_log(
 
     Parameters
     ----------
-    estimator : "fused", or "baseline" for the low-pass pipeline that it replaces.
+    estimator : "fused", "baseline" for the low-pass pipeline that it replaces, or "filterpy".
     model : one of `MODELS`: driven by the commands or kinematic, "auto" both where the log has commands,
         camera and IMU, each speaking where it is the better.
     smoothed : look at the whole log, forward and backward.
@@ -582,7 +599,7 @@ def replay_log(
     with _compiling_both(smoothed) if driven else contextlib.nullcontext():
         compile_filters(False, smoothed)
         log = opened(path, rig, rig_path, options)
-    fused = estimator == "fused"
+    fused = estimator != "baseline"
     if not fused and not log.both:
         raise BadInputError(f"{shown(path)}: the baseline needs camera and IMU, and the log lacks one")
     drive = drive_for(log, rig, model)
@@ -591,11 +608,19 @@ def replay_log(
     columns = STATES if fused else BASELINE
     kept: list[FloatArray] = []
     compared: dict[str, Errors] = {}
+    sensor: FloatArray | None = None
+    findings: list[Finding] = []
     with _states_to(output, columns, kept.append if keep else None) as write:
-        if smoothed:
-            whole = smooth_log(log.setup, log.periods.ticks, _watched(log.stream, sums.watch), drive)
+        if estimator == "filterpy":
+            stream = _watched(log.stream, sums.watch, _FILTERPY_ROWS, "--estimator filterpy")
+            out, truth, findings = filterpy_log(log, stream)
+            sums.add(out, truth)
+            write(out[:, _COLUMNS])
+        elif smoothed:
+            stream = _watched(log.stream, sums.watch, _SMOOTHED_ROWS, "--smooth")
+            whole = smooth_log(log.setup, log.periods.ticks, stream, drive)
             sums.add(whole.out, whole.truth)
-            sensor: FloatArray | None = whole.sensor
+            sensor = whole.sensor
             filtered = Tally(radius_m)
             filtered.add(whole.filtered, whole.truth)
             if filtered.scored:
@@ -613,7 +638,7 @@ def replay_log(
     states = np.concatenate(kept) if kept else None
     trace = sums.trace.values if sums.trace is not None else np.zeros((0, 0))
     name = estimator if not smoothed else "smoothed"
-    return _replayed(log, name, sums, compared, sensor).with_evidence(Held(trace, columns, states))
+    return _replayed(log, name, sums, compared, sensor, findings).with_evidence(Held(trace, columns, states))
 
 
 @contextmanager
@@ -667,16 +692,16 @@ def _lengths_and_angle(tally: Tally) -> Errors:
 
 
 def _replayed(
-    log: OpenLog, estimator: str, sums: Sums, compared: dict[str, Errors], sensor: FloatArray | None
-) -> Replayed:
+    log: OpenLog, estimator: str, sums: Sums, compared: dict[str, Errors], sensor: FloatArray | None,
+    findings: list[Finding],
+) -> Replayed:  # fmt: skip
     """Judge, and put together what is shown."""
     tally, own = sums.fused, estimator != "baseline"
     checks = {name: check for name in SENSORS if (check := tally.check(name)) is not None}
     flags = {name: tally.flags[bit] for name, bit in FLAGS.items() if tally.flags.get(bit)}
     share = sums.driven / sums.weighed if own and sums.weighed else None
-    findings: list[Finding] = []
     if own:
-        findings += [*sampled(sums.watch), *consistent(checks, flags, max(tally.rows, 1))]
+        findings = [*findings, *sampled(sums.watch), *consistent(checks, flags, max(tally.rows, 1))]
         if sensor is not None:
             findings += contradicting(log.setup, sensor, tally.end_s - tally.start_s)
     if share is not None and share < 0.99:

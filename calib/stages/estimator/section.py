@@ -143,7 +143,7 @@ class Replayed(Result):
 
     Attributes
     ----------
-    source, rows, duration_s : of the log. estimator : "fused", "smoothed" or "baseline".
+    source, rows, duration_s : of the log. estimator : "fused", "smoothed", "baseline" or "filterpy".
     driven_share : of the rows, in which the driven model speaks; null where there is none.
     rmse, compared : errors against the truth, of this estimator and of others.
     sensors : consistency by sensor. flags : rows by flag. jitter_px : of the tracker, that was used.

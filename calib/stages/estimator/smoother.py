@@ -4,7 +4,7 @@
    weights; these are smoothed backwards (Kim 1994, eq. 2.20),
        w_k|N(i) = w_k|k(i) sum_j pi_ij w_k+1|N(j) / w_k+1|k(j).
 2. One filter with the process noise that these weights mix runs forward, given what is only considered
-   (`kernel.CONSIDERED`). Readings that the bank has gated stay out.
+   (`kinematic.CONSIDERED`). Readings that the bank has gated stay out.
 3. Bryson and Frazier (1963) backwards: each scalar reading, with k = P H' / S and L = I - k H, turns
        y into L' y + H' innovation / S,   Y into L' Y L + H' H / S,
    each step from one event to the next turns them into F' y and F' Y F, and
@@ -39,21 +39,16 @@ from calib.stages.estimator.kinematic import (
     FLAGS,
     LARGEST_STEP_S,
     OUT,
-    RECORD,
-    STATE,
-    TOLD,
     TRACE,
-    WIDTH,
+    WORK,
     Rows,
     Setup,
     axis_transition,
-    copy_level,
+    bank_event,
+    copy_state,
     even_times,
-    event,
     mixes,
-    new_bank,
     new_clock,
-    put,
     starting_state,
     write_columns,
 )
@@ -103,44 +98,44 @@ def events_of(setup: Setup, rows: Rows, outputs: bool = True) -> Events:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def forward(
-    t: FloatArray, before_s: float, kinds: IntArray, readings: FloatArray, bank: FloatArray,
-    weights: FloatArray, switch_hz: float, levels: FloatArray, walk: FloatArray, view: FloatArray,
-    constants: FloatArray, noise: FloatArray, again: bool, gated: FloatArray, kept_weights: FloatArray,
-    trace: FloatArray, kept_x: FloatArray, kept_P: FloatArray,
+    t: FloatArray, before_s: float, kinds: IntArray, readings: FloatArray, bank_x: FloatArray,
+    bank_P: FloatArray, weights: FloatArray, switch_hz: float, levels: FloatArray, walk: FloatArray,
+    view: FloatArray, constants: FloatArray, noise: FloatArray, again: bool, gated: FloatArray,
+    kept_weights: FloatArray, trace: FloatArray, kept_x: FloatArray, kept_P: FloatArray,
 ) -> float:  # fmt: skip
     """A bank over all events; its log likelihood.
 
     Parameters
     ----------
-    before_s : time of the first slot of `bank` and `weights`, which becomes that after the last event.
+    before_s : time of the first slot of bank and weights, which becomes that after the last event.
     levels : (1, M, 8), or (n, M, 8) with levels of their own for each event.
     again : whether `gated` (n, 3) holds; else it is written to.
-    kept_weights : (n, M) written to. trace : (n, 3, `TRACE`) or (0, 3, `TRACE`), of the last level.
+    kept_weights : (n, M) written to.
+    trace : (n, 3, `TRACE`), of the last level, or (1, 0, `TRACE`) for nothing.
     kept_x, kept_P : (n, a) and (n, a, 19), the last level's first states after each event; or none (0, ...).
     """
     count = weights.shape[1] - 1
-    told, report = np.zeros((count, TOLD)), np.empty(12)
+    told, report, work = np.zeros((count, 7)), np.empty(12), np.empty((count, WORK[0], WORK[1]))
     size, rows, total = kept_P.shape[2], kept_x.shape[1], 0.0
     for k in range(len(t)):
         dt = t[k] - (t[k - 1] if k else before_s)
         old = k % 2 if count > 1 else 0
         new = 1 - old if count > 1 else 0
-        event(
-            bank, weights, old, new, kinds[k], readings, k, dt, switch_hz, levels,
-            k if levels.shape[0] > 1 else 0, walk, view, constants, noise, told, again, report, gated, trace,
+        bank_event(
+            bank_x, bank_P, weights, old, new, kinds[k], readings[k], dt, switch_hz,
+            levels[k if levels.shape[0] > 1 else 0], walk, view, constants, noise, work, told, again, report,
+            gated[k], trace[k if trace.shape[0] > 1 else 0],
         )  # fmt: skip
         for m in range(count):
             kept_weights[k, m] = weights[new, m]
-        if kept_x.shape[0]:
-            o = (new * count + count - 1) * RECORD
-            for i in range(rows):
-                kept_x[k, i] = bank[o + STATE + i]
-                for j in range(size):
-                    kept_P[k, i, j] = bank[o + WIDTH * (j if i > 5 >= j else i) + (i if i > 5 >= j else j)]
+        for i in range(rows if kept_x.shape[0] else 0):
+            kept_x[k, i] = bank_x[new, count - 1, i]
+            for j in range(size):
+                kept_P[k, i, j] = bank_P[new, count - 1, i, j]
         total += report[11]
     if count > 1 and len(t) % 2:
         for m in range(count):
-            copy_level(bank, (count + m) * RECORD, m * RECORD)
+            copy_state(bank_x[0, m], bank_P[0, m], bank_x[1, m], bank_P[1, m])
             weights[0, m] = weights[1, m]
         weights[0, count] = weights[1, count]
     return total
@@ -176,7 +171,7 @@ def _smooth_weights(t: FloatArray, kinds: IntArray, switch_hz: float, weights: F
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def transition(level: FloatArray, dt: float, F: FloatArray) -> None:
-    """F (n, n) of `model.predict` over dt [s]."""
+    """F (n, n) of `kinematic.predict` over dt [s]."""
     n = F.shape[0]
     F[:] = 0.0
     for i in range(n):
@@ -325,12 +320,33 @@ def _given(x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
     return states, left
 
 
-def banked(x: FloatArray, P: FloatArray, w: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Memory of a bank that starts from states (M, 19), covariances and weights, and its weights."""
-    bank, weights = new_bank(2, len(w)), np.zeros((2, len(w) + 1))
-    put(bank, 0, x, P)
-    weights[0, : len(w)] = w
-    return bank, weights
+def banked(x: FloatArray, P: FloatArray, w: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """A bank that starts from states (M, 19), covariances and weights, and its weights: two slots of each."""
+    return np.stack([x, x]), np.stack([P, P]), np.tile(np.append(w, 0.0), (2, 1))
+
+
+@dataclass(frozen=True)
+class OneLevel:
+    """One level of process noise over events: what it gated (n, 3), states (n, 19), covariances, trace."""
+
+    gated: FloatArray
+    x: FloatArray
+    P: FloatArray
+    trace: FloatArray
+
+
+def one_level(setup: Setup, rows: Rows, events: Events) -> OneLevel:
+    """The compiled filter with the first level of `setup` alone, everything kept: 4 kB an event."""
+    levels, walk = setup.process.arrays()
+    x, P, _ = starting_state(setup, rows)
+    n, begin = len(events.t_s), float(events.t_s[0])
+    kept = OneLevel(np.zeros((n, 3)), np.empty((n, SIZE)), np.empty((n, SIZE, SIZE)), np.empty((n, 3, TRACE)))
+    forward(
+        events.t_s, begin, events.kinds, events.readings, *banked(x[:1], P[:1], np.ones(1)), 0.0,
+        levels[None, :1], walk, setup.view, np.array([setup.gravity_mps2, setup.lever_across_m]), setup.noise,
+        False, kept.gated, np.empty((n, 1)), kept.trace, kept.x, kept.P,
+    )  # fmt: skip
+    return kept
 
 
 def smooth(setup: Setup, rows: Rows, outputs: FloatArray) -> FloatArray:
@@ -353,7 +369,7 @@ def smooth(setup: Setup, rows: Rows, outputs: FloatArray) -> FloatArray:
     steady = walk.copy()
     steady[[k - 6 for k in CONSIDERED]] = 0.0
     known = (setup.view, np.array([setup.gravity_mps2, setup.lever_across_m]), setup.noise)
-    none = (np.empty((0, 3, TRACE)), np.empty((0, _KEPT)), np.empty((0, _KEPT, SIZE)))
+    none = (np.empty((1, 0, TRACE)), np.empty((0, _KEPT)), np.empty((0, _KEPT, SIZE)))
     forward(
         events.t_s, float(events.t_s[0]), events.kinds, events.readings, *banked(x, P, w),
         setup.process.switch_hz, levels[None], walk, *known, False, gated, weights, *none,
@@ -375,7 +391,7 @@ def smooth(setup: Setup, rows: Rows, outputs: FloatArray) -> FloatArray:
             for part in (own, beyond):
                 if part is beyond:
                     # The next window begins with the state at `end`; what is beyond only looks back.
-                    state = (state[0].copy(), state[1].copy())
+                    state = (state[0].copy(), state[1].copy(), state[2].copy())
                 at = slice(part.start - begin, part.stop - begin)
                 if part.start < part.stop:
                     forward(

@@ -27,8 +27,10 @@ class ReplayOptions(LogOptions):
     states_format: Literal["csv", "parquet", "mcap"] = option(
         "csv", "Of the states of several logs.", flag="format"
     )
-    estimator: Literal["fused", "baseline"] = option(
-        "fused", "The fused filter, or the low-pass pipeline that it replaces."
+    estimator: Literal["fused", "baseline", "filterpy"] = option(
+        "fused",
+        "The fused filter, the low-pass pipeline that it replaces, or the extended filter of the filterpy "
+        "library, to check the equations.",
     )
     model: Literal["auto", "kinematic", "driven"] = option(
         "auto",
@@ -52,8 +54,8 @@ def _read(files: Files, rig: Rig, options: ReplayOptions) -> ReplayInputs:
     from calib.core.writing import check_folder, check_writable, make_folder
     from calib.io.states import STATES_FILE
 
-    if options.estimator == "baseline" and (options.smooth or options.tune):
-        raise UsageError("--estimator baseline: cannot be smoothed or tuned")
+    if options.estimator != "fused" and (options.smooth or options.tune):
+        raise UsageError(f"--estimator {options.estimator}: cannot be smoothed or tuned")
     outputs: list[Path | None] = [files.output] * len(files.paths)
     if files.output is not None and len(files.paths) > 1:
         check_folder(files.output)
