@@ -141,7 +141,7 @@ def kept(fault: str, off_ms: list[float], again: bool) -> bool:
 
 
 def test_without_a_fault_it_starts_and_runs(board: Built) -> None:
-    ended = _run(board, "none", 3000.0, 3000.0, 4000.0)
+    ended = _run(board, "none", 3500.0, 3500.0, 4500.0)
     assert ended.runs and ended.on_before_ms > 500.0
     assert not ended.faults
     # Frames say what drove the pumps, which stood still until the sensors had been sound.

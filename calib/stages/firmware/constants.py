@@ -388,7 +388,7 @@ def _envelope(
     held = float(np.interp(greatest, reached, feed["pwm"], right=PWM_MAX))
 
     def ticks(name: str) -> int:
-        return min(max(round(limit(name) * rate_hz), 1), 65000)
+        return min(max(round(limit(name) * rate_hz), 2), 65000)
 
     return {
         "least_length_m": least,

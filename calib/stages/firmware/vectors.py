@@ -27,13 +27,20 @@ FUSED_TICKS = 72
 """Golden vectors of the fused estimator: pictures until it runs, a swing, a new start, rest."""
 
 
+_SHAKEN_RAD = (1.96, 2.75)
+
+
 @dataclass(frozen=True)
 class Vector:
-    """One tick, or `times` of them that are alike: what goes in, and what has to come out of the last."""
+    """One tick, or `times` of them that are alike: what goes in, and what has to come out of the last.
+
+    `counts` are the counters after it, in the order of `conformance.COUNTERS`.
+    """
 
     given: Inputs
     wanted: Outputs
-    times: int = 1
+    times: int
+    counts: tuple[int, ...]
 
 
 def directed(constants: Mapping[str, float], ticks: int) -> list[Inputs]:
@@ -51,6 +58,8 @@ def directed(constants: Mapping[str, float], ticks: int) -> list[Inputs]:
         share = k / max(ticks - 1, 1)
         turn = 2.0 * math.pi * share
         phi = 1.3 * math.sin(3.0 * turn + 1.2)
+        # Now and then the specific force is shaken to where the head never is.
+        felt = math.copysign(_SHAKEN_RAD[k // 11 % 2], -phi) if k % 11 == 7 else phi
         mode = (MODE_POSITION, MODE_ORIENTATION)[(4 * k // ticks) % 2]
         sweep = rest * (0.98 + 0.45 * abs(math.sin(2.0 * turn)))
         reference = (
@@ -59,14 +68,17 @@ def directed(constants: Mapping[str, float], ticks: int) -> list[Inputs]:
         given = Inputs(
             u_px=0.5 * width * (1.0 + 0.8 * math.cos(2.0 * turn)),
             v_px=0.5 * height * (1.0 + 0.8 * math.sin(3.0 * turn)),
-            ax_mps2=9.81 * math.cos(phi + mount) + 0.8 * math.sin(11.0 * turn),
-            ay_mps2=9.81 * math.sin(phi + mount) + 0.8 * math.cos(13.0 * turn),
+            ax_mps2=9.81 * math.cos(felt + mount) + 0.8 * math.sin(11.0 * turn),
+            ay_mps2=9.81 * math.sin(felt + mount) + 0.8 * math.cos(13.0 * turn),
             gz_radps=bias + 2.5 * math.sin(7.0 * turn),
             reference=reference,
             mode=mode,
         )
         made.append(binary32(spoilt(given, k)))
     return made
+
+
+_TO_LIMIT = 30
 
 
 def _limits(constants: Mapping[str, float], still: Inputs) -> list[tuple[Inputs, int]]:
@@ -91,23 +103,37 @@ def _limits(constants: Mapping[str, float], still: Inputs) -> list[tuple[Inputs,
     changes: list[dict[str, Any]] = [
         *({name: nan} for name in ("u_px", "v_px", "ax_mps2", "ay_mps2", "gz_radps")),
         *({name: value} for name in ("u_px", "v_px") for value in (-0.51, -0.49)),
-        *(
-            {name: most + by}
-            for name, most in zip(("u_px", "v_px"), edge, strict=True)
-            for by in (0.01, -0.01)
-        ),
+        {"u_px": edge[0] + 0.01},
+        {"v_px": edge[1] + 0.01},
+        {"u_px": edge[0] - 0.01, "v_px": edge[1] - 0.01},
         *({name: 158.0} for name in ("ax_mps2", "ay_mps2")),
         *({"gz_radps": value} for value in (-35.1, 35.1)),
         *({"reference": pair} for pair in ((nan, 0.08), (0.08, nan), (6.31, 0.08), (0.08, -6.31))),
         weak,
         {"mode": 7},
     ]
-    for change in changes:
-        made += [(replace(still, **change), 1), (still, 1)]
+    for k, change in enumerate(changes):
+        made += [(replace(still, **change), 1), *[(still, 1)] * (k % 3 == 2)]
+    # At rest, and then a little beside: told from a motion.
+    steady = replace(still, gz_radps=constants["CALIB_IMU_GYRO_BIAS_RADPS"], mode=MODE_OFF)
+    made += [(steady, 150), (replace(steady, v_px=still.v_px + 0.5), 3)]
+    half = constants["CALIB_ORIENTATION_KI_HALF_DT_PWM_PER_RAD"]
+    if half > 0.0 and constants["CALIB_ORIENTATION_CLAMPING"]:
+        # The integral comes to the limit within `_TO_LIMIT` ticks, and is left out from there.
+        proportional = constants["CALIB_ORIENTATION_KPDI_PWM_PER_RAD"] - half
+        proportional -= constants["CALIB_ORIENTATION_KD_PER_DT_PWM_PER_RAD"]
+        e = constants["CALIB_PUMP_HIGH_PWM"] / (proportional + 2 * _TO_LIMIT * half)
+        bias = (constants[f"CALIB_IMU_ACCEL_BIAS_{axis}_MPS2"] for axis in "XY")
+        ax, ay = (value - by for value, by in zip((still.ax_mps2, still.ay_mps2), bias, strict=True))
+        phi = math.atan2(constants["CALIB_IMU_ACCEL_RATIO"] * ay, ax) - constants["CALIB_IMU_MOUNT_ANGLE_RAD"]
+        wanted = replace(steady, reference=(phi + e, 0.0), mode=MODE_ORIENTATION)
+        made.append((wanted, _TO_LIMIT + 10))
     # The head turns through both limits of its angle.
     for rate, ticks in ((-20.0, 8), (20.0, 14)):
         turns = replace(still, gz_radps=rate, reference=(0.3, 0.0), mode=MODE_ORIENTATION)
         made.append((replace(turns, marker_seen=False), ticks))
+    # From there it is nearer to the accelerometer's angle the other way round.
+    made.append((replace(still, ax_mps2=-9.07, ay_mps2=3.74, gz_radps=-20.0), 1))
     return [(binary32(given), times) for given, times in made]
 
 
@@ -127,7 +153,11 @@ def vectors(
         silent = replace(run[0], marker_seen=False, imu_read=False)
         weightless = binary32(replace(run[0], ax_mps2=0.1, ay_mps2=-0.1))
         given = [(silent, 1), (weightless, 1), *given, *_limits(constants, run[0])]
-    return [Vector(one, [reference.step(one) for _ in range(times)][-1], times) for one, times in given]
+    made = []
+    for one, times in given:
+        out = [reference.step(one) for _ in range(times)][-1]
+        made.append(Vector(one, out, times, tuple(reference.count.values())))
+    return made
 
 
 _NAN = 3e38
@@ -146,10 +176,13 @@ def _row(vector: Vector) -> list[list[float]]:
 def selftest_rows(constants: Mapping[str, float]) -> dict[str, Any]:
     """What calib_selftest.h is made of: rows of numbers for CALIB_FUSED 0 and 1, and CALIB_UNDISTORT."""
     fused = vectors(constants, FUSED_TICKS, fused=True, limits=True) if constants["CALIB_HAS_FUSED"] else []
+    plain = vectors(constants, limits=True)
     return {
         "undistort": int(constants["CALIB_HAS_PLANE"] and Reference(constants).undistort),
-        "rows": list(map(_row, vectors(constants, limits=True))),
+        "rows": list(map(_row, plain)),
         "fused_rows": list(map(_row, fused)),
+        "counts": plain[-1].counts,
+        "fused_counts": fused[-1].counts if fused else plain[-1].counts,
         "tolerance": TOLERANCE,
     }
 

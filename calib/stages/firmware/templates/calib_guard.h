@@ -340,18 +340,18 @@ static inline void calib_guard_tick(calib_guard *guard, const calib_state *state
 }
 
 /*
- * One tick of a sound rig for the self-test, k its number: bent, one axis of the IMU changes in each tick, and the
- * marker is where the angle puts it (the tangent of half of it, by another series than above).
+ * One tick of a sound rig for the self-test, k its number: bent, one axis of the IMU changes in each tick, the pixel in
+ * each sixteenth, and the marker is where the angle puts it (the tangent of half of it, by another series than above).
  */
 static inline void calib_guard_sound(calib_state *state, calib_inputs *in, calib_outputs *out, uint8_t k) {
-    float phi = 0.5f * CALIB_ENVELOPE_ANGLE_RAD, h = 0.5f * phi, w = h * h;
+    float phi = 0.8f * CALIB_ENVELOPE_ANGLE_RAD, h = 0.5f * phi, w = h * h;
     state->imu_age = 0;
     state->marker_age = 0;
     in->imu_read = 1;
     in->ax_mps2 = 9.0f + 0.01f * (float)((k + 2) / 3);
     in->ay_mps2 = 0.5f + 0.01f * (float)((k + 1) / 3);
     in->gz_radps = 0.1f + 0.01f * (float)(k / 3);
-    in->u_px = (float)k;
+    in->u_px = (float)((k >> 4) + 1);
     in->reference[0] = CALIB_ENVELOPE_LEAST_M;
     in->reference[1] = CALIB_ENVELOPE_LEAST_M;
     out->flags = 0;
@@ -385,10 +385,12 @@ static inline uint8_t calib_guard_until(calib_guard *guard, calib_state *state, 
 }
 
 /*
- * Ticks until one fault stops pumps that run; 0 when they did not run before it or ran again other than they should,
- * 255 when it never stopped them. CALIB_FAULT_NONE is a lost camera that nothing needs.
+ * Ticks until one fault stops pumps that run, and 256 times those until they run again, after calib_guard_clear where
+ * that is needed; 0 when they did not run before it or ran again without, 255 when it never stopped them. CALIB_FAULT_NONE is a lost camera that nothing needs.
+ *
+ * Of most faults there are two kinds: of the first bellows or the second, in each tick or in each second one.
  */
-static inline uint8_t calib_guard_try(uint8_t fault) {
+static inline uint16_t calib_guard_try(uint8_t fault, uint8_t kind) {
     calib_guard guard;
     calib_state state;
     calib_inputs in;
@@ -410,7 +412,7 @@ static inline uint8_t calib_guard_try(uint8_t fault) {
         calib_guard_sound(&state, &in, &out, k);
         switch (fault) {
         case CALIB_FAULT_IMU_LOST:
-            state.imu_age = 1;
+            state.imu_age = (uint16_t)(k & 1u || !kind);
             break;
         case CALIB_FAULT_IMU_FROZEN:
             in.ax_mps2 = 9.0f;
@@ -422,7 +424,7 @@ static inline uint8_t calib_guard_try(uint8_t fault) {
             state.marker_age = 1;
             break;
         case CALIB_FAULT_CAMERA_LOST:
-            state.marker_age = 1;
+            state.marker_age = (uint16_t)(k & 1u || !kind);
             break;
         case CALIB_FAULT_CAMERA_FROZEN:
             mode = CALIB_MODE_ORIENTATION;
@@ -430,26 +432,31 @@ static inline uint8_t calib_guard_try(uint8_t fault) {
             out.phi_rad = k > 1 ? out.phi_rad - 1.1f * CALIB_GUARD_FROZEN_RAD : out.phi_rad;
             break;
         case CALIB_FAULT_APART:
-            out.marker_m[0] += 1.2f * CALIB_ENVELOPE_APART_M;
+            out.marker_m[0] += kind ? -1.2f * CALIB_ENVELOPE_APART_M : 1.2f * CALIB_ENVELOPE_APART_M;
             break;
         case CALIB_FAULT_REFERENCE:
-            in.reference[1] = 2.0f * CALIB_ENVELOPE_GREATEST_M;
+            if (kind > 1) {
+                mode = CALIB_MODE_ORIENTATION;
+                in.reference[0] = 1.1f * CALIB_ENVELOPE_ANGLE_RAD;
+            } else {
+                in.reference[kind] = 2.0f * CALIB_ENVELOPE_GREATEST_M;
+            }
             break;
         case CALIB_FAULT_REACH:
-            out.q_m[1] = 2.0f * CALIB_ENVELOPE_GREATEST_M;
+            out.q_m[kind] = 2.0f * CALIB_ENVELOPE_GREATEST_M;
             break;
         case CALIB_FAULT_RATE:
-            out.q_m[1] = CALIB_ENVELOPE_LEAST_M + ((k & 4) ? 5.0f * CALIB_ENVELOPE_STEP_M : 0.0f);
+            out.q_m[kind] = CALIB_ENVELOPE_LEAST_M + ((k & 4) ? 5.0f * CALIB_ENVELOPE_STEP_M : 0.0f);
             break;
         case CALIB_FAULT_LONG:
             mode = CALIB_MODE_OPEN;
             in.reference[0] = 1.0f;
             in.reference[1] = CALIB_ENVELOPE_OPEN_HIGH_PWM;
-            guard.on[1] = CALIB_ENVELOPE_OPEN_TICKS - 1;
+            guard.on[kind] = CALIB_ENVELOPE_OPEN_TICKS - 1;
             break;
         default:
-            guard.full[1] = CALIB_ENVELOPE_FULL_TICKS - 1;
-            out.duty[1] = CALIB_PUMP_HIGH;
+            guard.full[kind] = (uint16_t)(guard.full[kind] + (k > 1 ? 0 : CALIB_ENVELOPE_FULL_TICKS - 2));
+            out.duty[kind] = (uint8_t)CALIB_PUMP_HIGH_PWM;
             break;
         }
         if (calib_guard_once(&guard, &state, &in, &out, mode)) {
@@ -466,14 +473,14 @@ static inline uint8_t calib_guard_try(uint8_t fault) {
                 return 0;
             }
             again = calib_guard_until(&guard, &state, &in, &out);
-            if (fault < CALIB_FAULT_STAYS) {
-                return again == 255 || (fault != CALIB_FAULT_REFERENCE && again < 2 * CALIB_GUARD_QUIET_TICKS - 2) ? 0 : k;
+            if (fault >= CALIB_FAULT_STAYS) {
+                if (again != 255) {
+                    return 0;
+                }
+                calib_guard_clear(&guard);
+                again = calib_guard_until(&guard, &state, &in, &out);
             }
-            if (again != 255) {
-                return 0;
-            }
-            calib_guard_clear(&guard);
-            return calib_guard_until(&guard, &state, &in, &out) == CALIB_GUARD_QUIET_TICKS ? k : 0;
+            return (uint16_t)(k + 256u * again);
         }
     }
     return 255;
@@ -481,15 +488,21 @@ static inline uint8_t calib_guard_try(uint8_t fault) {
 
 /* 0 when every fault stops the pumps in its tick and no longer, else the number of the first that does not. */
 static inline uint8_t calib_guard_selftest(void) {
-    static const uint8_t faults[11] = {CALIB_FAULT_IMU_LOST,  CALIB_FAULT_IMU_FROZEN, CALIB_FAULT_CAMERA_LOST,
-                                       CALIB_FAULT_CAMERA_FROZEN, CALIB_FAULT_APART,  CALIB_FAULT_REFERENCE,
-                                       CALIB_FAULT_REACH,     CALIB_FAULT_RATE,       CALIB_FAULT_FULL_POWER,
-                                       CALIB_FAULT_LONG,      CALIB_FAULT_NONE};
-    static const uint8_t ticks[11] = {12, 13, 15, 7, 31, 1, 6, 8, 1, 1, 1};
+    /* Fault, kind, tick, ticks until it is over. The last is not of the fused estimator, which always needs the camera. */
+    static const uint8_t tries[20][4] = {
+        {CALIB_FAULT_IMU_LOST, 0, 12, 107},     {CALIB_FAULT_IMU_LOST, 1, 31, 107},
+        {CALIB_FAULT_IMU_FROZEN, 0, 13, 61},    {CALIB_FAULT_CAMERA_LOST, 0, 15, 119},
+        {CALIB_FAULT_CAMERA_LOST, 1, 39, 119},  {CALIB_FAULT_CAMERA_FROZEN, 0, 7, 60},
+        {CALIB_FAULT_APART, 0, 31, 62},         {CALIB_FAULT_APART, 1, 31, 62},
+        {CALIB_FAULT_REFERENCE, 0, 1, 28},      {CALIB_FAULT_REFERENCE, 1, 1, 28},
+        {CALIB_FAULT_REFERENCE, 2, 1, 28},      {CALIB_FAULT_REACH, 0, 6, 30},
+        {CALIB_FAULT_REACH, 1, 6, 30},          {CALIB_FAULT_RATE, 0, 8, 30},
+        {CALIB_FAULT_RATE, 1, 8, 30},           {CALIB_FAULT_FULL_POWER, 0, 2, 30},
+        {CALIB_FAULT_FULL_POWER, 1, 2, 30},     {CALIB_FAULT_LONG, 0, 1, 30},
+        {CALIB_FAULT_LONG, 1, 1, 30},           {CALIB_FAULT_NONE, 0, 1, 0}};
     uint8_t i;
-    /* The fused estimator needs the camera in every mode. */
-    for (i = 0; i < (CALIB_FUSED ? 10 : 11); i++) {
-        if (calib_guard_try(faults[i]) != ticks[i]) {
+    for (i = 0; i < (CALIB_FUSED ? 19 : 20); i++) {
+        if (calib_guard_try(tries[i][0], tries[i][1]) != tries[i][2] + 256u * tries[i][3]) {
             return (uint8_t)(i + 1u);
         }
     }
