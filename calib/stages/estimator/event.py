@@ -251,9 +251,11 @@ def absorb(
         for after in range(order + 1, count):
             other, by_learnt, by_held = after - 1 if count == 3 else after, 0.0, 0.0
             for i in range(n):
-                by = H[other, i] * p[k, i]
-                by_learnt += learnt[i] * by
-                by_held += (1.0 - learnt[i]) * by
+                # Most of a gradient is zero.
+                if H[other, i] != 0.0:
+                    by = H[other, i] * p[k, i]
+                    by_learnt += learnt[i] * by
+                    by_held += (1.0 - learnt[i]) * by
             for i in range(n):
                 p[other, i] -= p[k, i] * (by_learnt + learnt[i] * by_held)
             e[other] -= by_learnt * move
