@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numba import njit
 from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
 
 from calib.core.arrays import BoolArray, FloatArray
+from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
 from calib.core.result import finite_or_none
 from calib.core.rig import Geometry
@@ -53,7 +53,7 @@ HUBER = 4.0
 _JITTERS_PX = np.exp(np.linspace(math.log(0.03), math.log(3.0), 47))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def pixel_terms(
     off: FloatArray, jitter: float, grid: float, share: float, area: float, pull: FloatArray,
     weight: FloatArray, good: FloatArray,

@@ -15,9 +15,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from calib.core.arrays import FloatArray, IntArray
+from calib.core.compilation import kernel
 from calib.stages.estimator.sensors import SIZE, accelerometer, gyroscope, marker
 
 _DEGREE = 5
@@ -77,7 +77,7 @@ class Rows:
     by: FloatArray
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _basis(
     M: FloatArray, start: float, h: float, count: int, t_s: FloatArray, span: IntArray, basis: FloatArray
 ) -> None:
@@ -103,7 +103,7 @@ def basis_rows(knots: Knots, t_s: FloatArray) -> tuple[IntArray, FloatArray]:
     return span, basis
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def states_of(span: IntArray, basis: FloatArray, c: FloatArray, sensor: FloatArray) -> FloatArray:
     """States (n, 19) of coefficients c (count, 2) and `SENSOR` (13,), its time offset already taken."""
     states = np.empty((len(span), SIZE))
@@ -120,13 +120,13 @@ def states_of(span: IntArray, basis: FloatArray, c: FloatArray, sensor: FloatArr
     return states
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _seen(view: FloatArray, states: FloatArray, out: FloatArray, by: FloatArray) -> None:
     for n in range(len(states)):
         out[n, 0], out[n, 1] = marker(view, states[n], by[n, 0], by[n, 1])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _felt(gravity: float, across: float, states: FloatArray, out: FloatArray, by: FloatArray) -> None:
     for n in range(len(states)):
         out[n, 0], out[n, 1] = accelerometer(gravity, across, states[n], by[n, 0], by[n, 1])
@@ -153,14 +153,14 @@ def imu_rows(
     return Rows(span, basis, out, by)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _row(basis: FloatArray, by: FloatArray, J: FloatArray) -> None:
     for j in range(basis.shape[1]):
         J[2 * j] = by[0] * basis[0, j] + by[2] * basis[1, j] + by[4] * basis[2, j]
         J[2 * j + 1] = by[1] * basis[0, j] + by[3] * basis[1, j] + by[5] * basis[2, j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def normal_sums(
     span: IntArray, basis: FloatArray, by: FloatArray, weight: FloatArray, A: FloatArray, B: FloatArray,
     C: FloatArray,
@@ -190,7 +190,7 @@ def normal_sums(
                         C[k - 6, m - 6] += w * g[k] * g[m]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def gathered(
     span: IntArray, basis: FloatArray, by: FloatArray, pull: FloatArray, to_c: FloatArray, to_s: FloatArray
 ) -> None:

@@ -17,9 +17,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from calib.core.arrays import FloatArray, IntArray
+from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
 from calib.core.geometry import fit_homography
 from calib.stages.actuator.kinematics import inverse_coefficients
@@ -87,7 +87,7 @@ def undistorting_nothing(
     return np.asarray(np.linalg.inv(H), dtype=np.float64)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _run(
     t: FloatArray, readings: FloatArray, kinds: IntArray, numbers: FloatArray, to_plane: FloatArray,
     series: FloatArray, memory: FloatArray, out: FloatArray,

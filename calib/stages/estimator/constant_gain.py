@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from calib.core.arrays import BoolArray, FloatArray, IntArray
+from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
 from calib.stages.actuator.kinematics import chord_ratio_w
 from calib.stages.camera.model import FISHEYE, Camera, undistort
@@ -300,7 +300,7 @@ def run_gains(gains: Gains, setup: Setup, ticks: Ticks, mean_rate: bool = False)
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _run(n: FloatArray, places: FloatArray, accel: FloatArray, rate: FloatArray, out: FloatArray) -> None:
     T, delay, lever, K_c, K_a, K_b = 1.0 / n[0], n[1], n[2], n[3], n[4], n[5]
     K_m, K_v, K_r, K_d, K_s, s_0, v_0, gate = n[6], n[7], n[8], n[9], n[10], n[11], n[12], n[13]

@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba import njit
 
 from calib.core.arrays import BoolArray, FloatArray, IntArray
+from calib.core.compilation import kernel
 from calib.stages.actuator.dynamics import Coefficients, coefficients, rates
 from calib.stages.actuator.kinematics import chord_decay_w, chord_ratio_w
 from calib.stages.actuator.parameters import DAMPING_SCALE_FREE, Plant, pumps_connected
@@ -48,7 +48,6 @@ from calib.stages.estimator.sensors import (
     SENSOR,
     SIZE,
     accelerometer,
-    compiled,
     gyroscope,
     head_position,
     invert_marker,
@@ -104,12 +103,12 @@ _NUDGE = np.array([1e-6, 1e-7, 1e-5, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1
                    1e-5, 1e-5, 1e-5, 1e-5, 1e-5, 1e-5, 1e-5, 1e-7, 1e-5, 1e-5, 1e-5])  # fmt: skip
 
 
-@compiled()
+@kernel(arrays=False)
 def _factor(deviation: float) -> float:
     return max(1.0 + deviation, 0.1)
 
 
-@compiled()
+@kernel(arrays=False)
 def _coefficients(plant: FloatArray, x: FloatArray) -> Coefficients:
     scale = _factor(x[12])
     return Coefficients(
@@ -121,7 +120,7 @@ def _coefficients(plant: FloatArray, x: FloatArray) -> Coefficients:
     )  # fmt: skip
 
 
-@compiled()
+@kernel(arrays=False)
 def longest_step_s(plant: FloatArray, x: FloatArray) -> float:
     """Longest Runge-Kutta step [s] from a state (23,) or more: `STEP_S`, less where it is stiff.
 
@@ -145,7 +144,7 @@ def longest_step_s(plant: FloatArray, x: FloatArray) -> float:
     return max(STEP_RATE / rate, LEAST_STEP_S) if rate * STEP_S > STEP_RATE else STEP_S
 
 
-@compiled()
+@kernel(arrays=False)
 def flow(
     plant: FloatArray, x: FloatArray, segments: FloatArray, count: int, longest_s: float, out: FloatArray
 ) -> None:
@@ -197,7 +196,7 @@ def flow(
     out[6], out[7], out[8], out[9], out[10], out[11] = x1, x2, f1, f2, d1, d2
 
 
-@compiled()
+@kernel(arrays=False)
 def jacobian(
     plant: FloatArray, x: FloatArray, segments: FloatArray, count: int, out: FloatArray, F: FloatArray
 ) -> None:
@@ -217,14 +216,14 @@ def jacobian(
             F[i, k] = (moved[i] - out[i]) / step
 
 
-@compiled()
+@kernel(arrays=False)
 def _accelerate(plant: FloatArray, x: FloatArray) -> tuple[float, float]:
     c = _coefficients(plant, x)
     ddl, ddphi, _, _ = rates(c, x[1], x[0], x[3], x[2], x[4], x[5], x[8] + x[10], x[9] + x[11])
     return ddphi, ddl
 
 
-@compiled()
+@kernel(arrays=False)
 def accelerations(
     plant: FloatArray, x: FloatArray, by_phi: FloatArray, by_length: FloatArray
 ) -> tuple[float, float]:
@@ -242,7 +241,7 @@ def accelerations(
     return ddphi, ddl
 
 
-@compiled()
+@kernel(arrays=False)
 def carry(P: FloatArray, F: FloatArray, noise: FloatArray, dt: float, FP: FloatArray) -> None:
     """P = [F 0; 0 1] P [F 0; 0 1]' + noise dt, in place.
 
@@ -404,7 +403,7 @@ _SHIFT = INVOLVED - 6
 """The sensors' quantities stand this much further on than in `sensors`."""
 
 
-@compiled()
+@kernel(arrays=False)
 def _consider(x: FloatArray, P: FloatArray, learnt: FloatArray) -> None:
     """Which entries of a state (36,) readings change: 1, and 0 for what is considered and not learnt.
 
@@ -424,7 +423,7 @@ def _consider(x: FloatArray, P: FloatArray, learnt: FloatArray) -> None:
         learnt[12], learnt[14], learnt[15], learnt[16], learnt[17], learnt[18] = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
 
 
-@compiled()
+@kernel(arrays=False)
 def cut(
     begin: float, end: float, switch_t: FloatArray, switch_g: FloatArray, last: int, segments: FloatArray
 ) -> int:
@@ -455,7 +454,7 @@ def cut(
         back -= 1
 
 
-@compiled()
+@kernel(arrays=False)
 def predict_driven(
     x: FloatArray, P: FloatArray, begin: float, end: float, plant: FloatArray, walk: FloatArray,
     switch_t: FloatArray, switch_g: FloatArray, last: int, F: FloatArray, work: FloatArray,
@@ -474,7 +473,7 @@ def predict_driven(
             x[i] = moved[i]
 
 
-@compiled()
+@kernel(arrays=False)
 def _spread_out(h: FloatArray, H: FloatArray) -> None:
     """A gradient (19,) by head and sensors as one by the driven state; accelerations are left out."""
     for k in range(4, INVOLVED):
@@ -485,7 +484,7 @@ def _spread_out(h: FloatArray, H: FloatArray) -> None:
         H[k + _SHIFT] = h[k]
 
 
-@compiled()
+@kernel(arrays=False)
 def measure(
     kind: int, x: FloatArray, P: FloatArray, plant: FloatArray, view: FloatArray, constants: FloatArray,
     noise: FloatArray, stamp: float, H: FloatArray, out: FloatArray, work: FloatArray,
@@ -527,7 +526,7 @@ def measure(
     out[5] = noise[4] * noise[4] + state[4] * state[4] * stamp
 
 
-@compiled()
+@kernel(arrays=False)
 def driven_event(
     x: FloatArray, P: FloatArray, kind: int, z: FloatArray, plant: FloatArray, view: FloatArray,
     constants: FloatArray, noise: FloatArray, work: FloatArray, again: bool, report: FloatArray,
@@ -610,7 +609,7 @@ SILENT_S = 0.1
 """A row so long after the last reading carries the state on with it."""
 
 
-@compiled()
+@kernel(arrays=False)
 def write_row(x: FloatArray, P: FloatArray, dt: float, radius: float, out: FloatArray, row: int) -> None:
     """Mean and deviations a very short time dt after the state into columns 1 to 12."""
     pp = P[0, 0] + dt * (2.0 * P[0, 2] + dt * P[2, 2])
@@ -619,7 +618,7 @@ def write_row(x: FloatArray, P: FloatArray, dt: float, radius: float, out: Float
     finish_row(x[0] + dt * x[2], x[1] + dt * x[3], x[2], x[3], x[INVOLVED], pp, ll, pl, radius, out, row)
 
 
-@compiled()
+@kernel(arrays=False)
 def begin_again(
     x: FloatArray, P: FloatArray, x0: FloatArray, P0: FloatArray, view: FloatArray, u: float, v: float,
     again: bool, driven: bool, g1: float, g2: float,
@@ -645,13 +644,13 @@ def begin_again(
     return True
 
 
-@compiled()
+@kernel(arrays=False)
 def contradicted(z: FloatArray, gated: FloatArray) -> bool:
     """Whether a sample's gyroscope contradicts a state and its accelerometer does not support it."""
     return bool(not math.isnan(z[2]) and gated[1] == 1.0 and gated[2] == 1.0)
 
 
-@compiled()
+@kernel(arrays=False)
 def let_go_time(
     x: FloatArray, g_z: float, begin: float, end: float, plant: FloatArray, work: FloatArray
 ) -> float:
@@ -665,7 +664,7 @@ def let_go_time(
     return float(end - min(since, end - begin))
 
 
-@compiled()
+@kernel(arrays=False)
 def pass_on(
     x: FloatArray, P: FloatArray, begin: float, end: float, let_go_s: float, x0: FloatArray, P0: FloatArray,
     plant: FloatArray, walk: FloatArray, switch_t: FloatArray, switch_g: FloatArray, last: int,
@@ -701,7 +700,7 @@ def pass_on(
             F[i, j] = row[j]
 
 
-@compiled()
+@kernel(arrays=False)
 def _stand(F: FloatArray) -> None:
     """The transition (12, 23) of no time."""
     for i in range(DYNAMIC):
@@ -709,7 +708,7 @@ def _stand(F: FloatArray) -> None:
             F[i, j] = 1.0 if i == j else 0.0
 
 
-@compiled()
+@kernel(arrays=False)
 def sound(x: FloatArray, P: FloatArray, radius: float) -> bool:
     """Whether a state is one that a rig can have."""
     good = abs(x[0]) < 3.0 and 1e-3 < x[1] < 1.0 and abs(x[3]) + radius * abs(x[2]) < FASTEST_MPS
@@ -719,7 +718,7 @@ def sound(x: FloatArray, P: FloatArray, radius: float) -> bool:
     return bool(good)
 
 
-@compiled()
+@kernel(arrays=False)
 def run_driven(
     t: FloatArray, readings: FloatArray, kinds: IntArray, forces: FloatArray, driven: FloatArray,
     ring_x: FloatArray, ring_P: FloatArray, ring_t: FloatArray, ring_z: FloatArray, ring_kind: IntArray,
@@ -978,7 +977,7 @@ _SHOWN = np.array([0, 1, 2, 3, INVOLVED])
 """States that the output needs: the motion and the gyroscope's bias."""
 
 
-@compiled()
+@kernel(arrays=False)
 def _copy_marked(
     to_x: FloatArray, to_P: FloatArray, to_marks: FloatArray, x: FloatArray, P: FloatArray, marks: FloatArray
 ) -> None:
@@ -987,7 +986,7 @@ def _copy_marked(
         to_marks[i] = marks[i]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _forward(
     t: FloatArray, before_s: float, first_s: float, kinds: IntArray, readings: FloatArray, x: FloatArray,
     P: FloatArray, marks: FloatArray, switch_t: FloatArray, switch_g: FloatArray,
@@ -1081,7 +1080,7 @@ def _forward(
     _copy_marked(x, P, marks, own_x, own_P, own_marks)
 
 
-@compiled()
+@kernel(arrays=False)
 def _undo_step(y: FloatArray, Y: FloatArray, F: FloatArray, FY: FloatArray) -> None:
     """F' y and F' Y F for the transition F (12, 23) of a step, in place; FY (24, 36) is scratch."""
     n, moved = y.shape[0], FY[INVOLVED]
@@ -1106,7 +1105,7 @@ def _undo_step(y: FloatArray, Y: FloatArray, F: FloatArray, FY: FloatArray) -> N
             Y[j, i] = Y[i, j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _backward(
     t: FloatArray, F: FloatArray, trace: FloatArray, chained: BoolArray, rows: IntArray, kept_x: FloatArray,
     kept_P: FloatArray,
@@ -1253,7 +1252,7 @@ def new_handover() -> FloatArray:
     return memory
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _distrust(memory: FloatArray) -> float:
     """What the driven filter's innovations in memory cost it."""
     cost = 0.0
@@ -1271,7 +1270,7 @@ def _distrust(memory: FloatArray) -> float:
     return cost
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def weigh(
     driven: FloatArray, kinematic: FloatArray, memory: FloatArray, begin: float, weight: FloatArray
 ) -> None:
@@ -1311,7 +1310,7 @@ def weigh(
         weight[row] = 1.0 / (1.0 + math.exp(min(max(-(s - OFFSET) / SOFT, -40.0), 40.0)))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _positions(out: FloatArray) -> None:
     for k in range(len(out)):
         out[k, 7], out[k, 8] = head_position(out[k, 5], out[k, 6])

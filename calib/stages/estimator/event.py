@@ -19,7 +19,8 @@ from __future__ import annotations
 import math
 
 from calib.core.arrays import FloatArray
-from calib.stages.estimator.sensors import accelerometer, compiled, gyroscope, marker, update_terms
+from calib.core.compilation import kernel
+from calib.stages.estimator.sensors import accelerometer, gyroscope, marker, update_terms
 
 CAMERA, IMU = 1, 2
 """Kinds of events; a picture has the readings (u, v), a sample (a_x, a_y, g_z), NaN where missing."""
@@ -47,7 +48,7 @@ _MARGIN_PX2 = 0.25
 """Added to the variance for gating: half a pixel of motion that no level expects is no outlier."""
 
 
-@compiled()
+@kernel(arrays=False)
 def camera_terms(
     view: FloatArray, noise: FloatArray, stamp: float, x: FloatArray, P: FloatArray, H: FloatArray,
     out: FloatArray,
@@ -67,7 +68,7 @@ def camera_terms(
             H[k, 13] = 0.0
 
 
-@compiled()
+@kernel(arrays=False)
 def imu_terms(
     constants: FloatArray, noise: FloatArray, x: FloatArray, P: FloatArray, H: FloatArray, out: FloatArray
 ) -> None:
@@ -92,7 +93,7 @@ def imu_terms(
     out[5] = noise[4] * noise[4] + (x[4] * noise[7]) ** 2
 
 
-@compiled()
+@kernel(arrays=False)
 def project(P: FloatArray, H: FloatArray, p: FloatArray) -> float:
     """p = P H' and H P H'."""
     n = H.shape[0]
@@ -109,7 +110,7 @@ def project(P: FloatArray, H: FloatArray, p: FloatArray) -> float:
     return total
 
 
-@compiled()
+@kernel(arrays=False)
 def update(
     x: FloatArray, P: FloatArray, innovation: float, S: float, p: FloatArray, learnt: FloatArray
 ) -> None:
@@ -133,7 +134,7 @@ def update(
             P[i, j] -= gain * p[j]
 
 
-@compiled()
+@kernel(arrays=False)
 def leave(trace: FloatArray, row: int, H: FloatArray, p: FloatArray, innovation: float, S: float) -> None:
     """Write what a reading did for the smoother: H (n), P H' / S (n), y / S and 1 / S; p as of `update`.
 
@@ -147,7 +148,7 @@ def leave(trace: FloatArray, row: int, H: FloatArray, p: FloatArray, innovation:
     trace[row, 2 * n], trace[row, 2 * n + 1] = innovation / S, 1.0 / S
 
 
-@compiled()
+@kernel(arrays=False)
 def chi_squares(
     kind: int, P: FloatArray, H: FloatArray, z: FloatArray, out: FloatArray, noise: FloatArray, e: FloatArray,
     p: FloatArray, told: FloatArray,
@@ -173,7 +174,7 @@ def chi_squares(
     told[E_GYRO], told[GYRO] = e[2] / math.sqrt(S), e[2] * e[2] / S
 
 
-@compiled()
+@kernel(arrays=False)
 def judge(
     kind: int, z: FloatArray, told: FloatArray, noise: FloatArray, accel: bool, gated: FloatArray,
     report: FloatArray,
@@ -201,7 +202,7 @@ def judge(
         report[10] = gated[2]
 
 
-@compiled()
+@kernel(arrays=False)
 def tell(kind: int, weights: FloatArray, told: FloatArray, report: FloatArray) -> None:
     """Innovations of a judged event in the report, those of each level weighed as after the event."""
     pair, gyro, e0, e1, e2 = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -218,7 +219,7 @@ def tell(kind: int, weights: FloatArray, told: FloatArray, report: FloatArray) -
         report[2], report[7] = gyro, e2
 
 
-@compiled()
+@kernel(arrays=False)
 def absorb(
     kind: int, x: FloatArray, P: FloatArray, H: FloatArray, e: FloatArray, out: FloatArray,
     noise: FloatArray, gated: FloatArray, learnt: FloatArray, p: FloatArray, trace: FloatArray,

@@ -7,9 +7,9 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba import njit
 
 from calib.core.arrays import FloatArray, IntArray
+from calib.core.compilation import kernel
 from calib.stages.estimator.event import (
     CAMERA,
     IMU,
@@ -23,7 +23,7 @@ from calib.stages.estimator.event import (
     tell,
     update,
 )
-from calib.stages.estimator.sensors import SIZE, compiled, head_position, invert_marker
+from calib.stages.estimator.sensors import SIZE, head_position, invert_marker
 
 # ----------------------------------------------------------------------
 # The kinematic process: how the head moves when nothing is known of what drives it.
@@ -125,7 +125,7 @@ class Kinematic:
         return np.array([level.numbers() for level in self.levels]), np.array(self.sensor_walk) ** 2
 
 
-@compiled(inlined=True)
+@kernel(arrays=False, inlined=True)
 def axis_transition(c: float, b: float, h: float) -> tuple[float, float, float, float, float]:
     """Entries f01, f02, f11, f12, f22 of the transition of (p, v, a) over h [s]; c = 1/T_a, b = 1/T_v."""
     h2, h3 = 0.5 * h * h, h * h * h / 6.0
@@ -138,7 +138,7 @@ def axis_transition(c: float, b: float, h: float) -> tuple[float, float, float, 
     )
 
 
-@compiled(inlined=True)
+@kernel(arrays=False, inlined=True)
 def axis_noise(q: float, walk: float, h: float) -> tuple[float, float, float, float, float, float]:
     """Entries pp, pv, pa, vv, va, aa of the noise over h [s] for the densities q of w_a, walk of w_p."""
     h2 = h * h
@@ -161,7 +161,7 @@ _NEGLIGIBLE = 1e-6
 """A share of a mixture that is left out."""
 
 
-@compiled()
+@kernel(arrays=False)
 def copy_state(to_x: FloatArray, to_P: FloatArray, x: FloatArray, P: FloatArray) -> None:
     """Copy a state and its covariance."""
     n = x.shape[0]
@@ -171,7 +171,7 @@ def copy_state(to_x: FloatArray, to_P: FloatArray, x: FloatArray, P: FloatArray)
             to_P[i, j] = P[i, j]
 
 
-@compiled()
+@kernel(arrays=False)
 def _step(x: FloatArray, P: FloatArray, level: FloatArray, walk: FloatArray, h: float) -> None:
     n = x.shape[0]
     for axis in range(2):
@@ -206,7 +206,7 @@ def _step(x: FloatArray, P: FloatArray, level: FloatArray, walk: FloatArray, h: 
         P[i, i] += walk[i - 6] * h
 
 
-@compiled()
+@kernel(arrays=False)
 def predict(x: FloatArray, P: FloatArray, level: FloatArray, walk: FloatArray, dt: float) -> None:
     """Carry a state (19,) and its covariance on by dt >= 0 [s], in place.
 
@@ -221,7 +221,7 @@ def predict(x: FloatArray, P: FloatArray, level: FloatArray, walk: FloatArray, d
         _step(x, P, level, walk, dt / parts)
 
 
-@compiled()
+@kernel(arrays=False)
 def mix(bank_x: FloatArray, bank_P: FloatArray, weights: FloatArray, old: int, new: int, turn: float) -> None:
     """Let the levels start from their mixtures.
 
@@ -265,7 +265,7 @@ def mix(bank_x: FloatArray, bank_P: FloatArray, weights: FloatArray, old: int, n
                     P[r, m] += part / left * (other_P[r, m] + apart * (other[m] - x[m]))
 
 
-@compiled()
+@kernel(arrays=False)
 def settle_weights(weights: FloatArray, slot: int, log_likelihood: FloatArray, place: int) -> float:
     """Weights of a slot after an event, in place; returns the log likelihood of the event.
 
@@ -325,14 +325,14 @@ def new_clock(period_s: float) -> FloatArray:
     return clock
 
 
-@compiled()
+@kernel(arrays=False)
 def restart(clock: FloatArray) -> None:
     """Forget the time, but neither the nominal period nor the jitter."""
     clock[0] = 0.0
     clock[7] = 0.0
 
 
-@compiled()
+@kernel(arrays=False)
 def advance(clock: FloatArray, stamp: float) -> float:
     """Time of the sample that came with this stamp [s]."""
     nominal = clock[8]
@@ -384,7 +384,7 @@ def advance(clock: FloatArray, stamp: float) -> float:
     return float(clock[1])
 
 
-@compiled()
+@kernel(arrays=False)
 def advance_again(clock: FloatArray, stamp: float) -> float:
     """Start from this stamp with the period as it was."""
     clock[0], clock[1], clock[7] = 1.0, stamp, 0.0
@@ -392,7 +392,7 @@ def advance_again(clock: FloatArray, stamp: float) -> float:
     return stamp
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def even_times(clock: FloatArray, stamps: FloatArray) -> FloatArray:
     """Times (n,) of samples with these stamps (n,) [s], each from the stamps up to its own."""
     out = np.empty(len(stamps))
@@ -424,13 +424,13 @@ TRACE = 2 * SIZE + 2
 """What a reading leaves for the smoother, see `event.leave`."""
 
 
-@compiled()
+@kernel(arrays=False)
 def mixes(kind: int, since: float) -> bool:
     """Whether the levels are mixed before an event of this kind, so long after they last were [s]."""
     return bool(kind == CAMERA or (kind != 0 and since > MIXED_S))
 
 
-@compiled()
+@kernel(arrays=False)
 def bank_event(
     bank_x: FloatArray, bank_P: FloatArray, weights: FloatArray, old: int, new: int, kind: int, z: FloatArray,
     dt: float, switch_hz: float, levels: FloatArray, walk: FloatArray, view: FloatArray,
@@ -591,7 +591,7 @@ class Rows:
 _JUMP_S = (-0.1, 2.0)
 
 
-@compiled()
+@kernel(arrays=False)
 def begin_row(
     stamp: float, last: float, camera_clock: FloatArray, imu_clock: FloatArray, out: FloatArray, row: int
 ) -> bool:
@@ -607,7 +607,7 @@ def begin_row(
     return bool(jumps)
 
 
-@compiled()
+@kernel(arrays=False)
 def finish_row(
     phi: float, length: float, dphi: float, dl: float, bias: float, pp: float, ll: float, pl: float, r: float,
     out: FloatArray, row: int,
@@ -623,7 +623,7 @@ def finish_row(
     out[row, 12] = math.sqrt(max(pp, 1e-18))
 
 
-@compiled()
+@kernel(arrays=False)
 def write_bank(
     bank_x: FloatArray, bank_P: FloatArray, weights: FloatArray, slot: int, dt: float, levels: FloatArray,
     radius: float, out: FloatArray, row: int,
@@ -671,7 +671,7 @@ def write_bank(
     )  # fmt: skip
 
 
-@compiled()
+@kernel(arrays=False)
 def write_columns(
     x: FloatArray, P: FloatArray, bias: int, rows: IntArray, radius: float, out: FloatArray
 ) -> None:
@@ -714,7 +714,7 @@ _PHI, _LENGTH = 0, 1
 _ALL = np.ones(SIZE)
 
 
-@compiled()
+@kernel(arrays=False)
 def _clear(P: FloatArray, i: int, variance: float) -> None:
     """Make a state independent of all others."""
     for j in range(P.shape[0]):
@@ -723,7 +723,7 @@ def _clear(P: FloatArray, i: int, variance: float) -> None:
     P[i, i] = variance
 
 
-@compiled()
+@kernel(arrays=False)
 def _reset_head(
     bank_x: FloatArray, bank_P: FloatArray, weights: FloatArray, slot: int, head: FloatArray,
     sigma: FloatArray,
@@ -737,13 +737,13 @@ def _reset_head(
         weights[slot, m] = 1.0 / count
 
 
-@compiled()
+@kernel(arrays=False)
 def _place_head(bank_x: FloatArray, slot: int, phi: float, length: float) -> None:
     for m in range(bank_x.shape[1]):
         bank_x[slot, m, 0], bank_x[slot, m, 1] = phi, length
 
 
-@compiled()
+@kernel(arrays=False)
 def _hold(x: FloatArray, P: FloatArray, k: int, middle: float, sigma: float, p: FloatArray) -> None:
     """Use the prior of one quantity of the head as a reading; p (19,) is scratch."""
     for j in range(p.shape[0]):
@@ -751,7 +751,7 @@ def _hold(x: FloatArray, P: FloatArray, k: int, middle: float, sigma: float, p: 
     update(x, P, middle - x[k], P[k, k] + sigma * sigma, p, _ALL)
 
 
-@compiled()
+@kernel(arrays=False)
 def _mend(
     bank_x: FloatArray, bank_P: FloatArray, slot: int, head: FloatArray, head_sigma: FloatArray,
     radius: float, p: FloatArray,
@@ -784,7 +784,7 @@ def _mend(
     return flags
 
 
-@compiled()
+@kernel(arrays=False)
 def count_first(ring_t: FloatArray, ring_kind: IntArray, whole: IntArray, when: float) -> None:
     """Let the ring of events begin where it is empty."""
     if whole[COUNT] == 0:
@@ -792,7 +792,7 @@ def count_first(ring_t: FloatArray, ring_kind: IntArray, whole: IntArray, when: 
         whole[COUNT] = 1
 
 
-@compiled()
+@kernel(arrays=False)
 def make_room(
     ring_t: FloatArray, ring_z: FloatArray, ring_kind: IntArray, ring_gated: FloatArray,
     ring_let_go: FloatArray, whole: IntArray, kind: int, when: float,
@@ -823,7 +823,7 @@ def make_room(
     return int(back)
 
 
-@compiled()
+@kernel(arrays=False)
 def settle_event(whole: IntArray, size: int, report: FloatArray, out: FloatArray, row: int) -> None:
     """The ring has one event more; what it says of itself goes into its row."""
     whole[NEWEST] = (whole[NEWEST] + 1) % size
@@ -835,7 +835,7 @@ def settle_event(whole: IntArray, size: int, report: FloatArray, out: FloatArray
             out[row, 13 + k] = report[k]
 
 
-@compiled()
+@kernel(arrays=False)
 def run_filter(
     t: FloatArray, readings: FloatArray, kinds: IntArray,
     bank_x: FloatArray, bank_P: FloatArray, weights: FloatArray, ring_t: FloatArray, ring_z: FloatArray,

@@ -3,42 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from fractions import Fraction
-from typing import Any, ParamSpec, TypeVar, cast
 
 import numpy as np
-from numba import njit
 
 from calib.core.arrays import FloatArray
+from calib.core.compilation import kernel
 from calib.stages.actuator.kinematics import chord_decay_w, chord_ratio_w
 from calib.stages.camera.model import Camera
-
-# ----------------------------------------------------------------------
-# The decorator of functions that are called for every event of a log.
-
-Parameters = ParamSpec("Parameters")
-Returned = TypeVar("Returned")
-
-
-def compiled(
-    inlined: bool = False,
-) -> Callable[[Callable[Parameters, Returned]], Callable[Parameters, Returned]]:
-    """Compile a function that makes no arrays, without counting references to those it gets.
-
-    Counting them for a dozen arrays in each call took a third of a filter's time. Numba keeps the option
-    `_nrt` for itself; without it all works the same, only slower. A product and a sum stay two roundings:
-    where they may be one, the last digits depend on the order in which functions happen to be compiled.
-
-    Parameters
-    ----------
-    inlined : whether it becomes part of its caller. A call passes seven numbers for each array.
-    """
-    options: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False}
-    if inlined:
-        options["forceinline"] = True
-    return cast("Callable[[Callable[Parameters, Returned]], Callable[Parameters, Returned]]", njit(**options))
-
 
 # ----------------------------------------------------------------------
 # Whole pixels: what a rounded reading says of the place that was rounded.
@@ -59,7 +31,7 @@ _NORM = 1.0 / math.sqrt(2.0 * math.pi)
 _FAR = 6.0
 
 
-@compiled()
+@kernel(arrays=False)
 def truncated(a: float, b: float) -> tuple[float, float, float]:
     """Log of the probability of [a, b], mean and variance within it, of a standard normal number.
 
@@ -99,7 +71,7 @@ def truncated(a: float, b: float) -> tuple[float, float, float]:
     return log_z, -mean if flip else mean, variance
 
 
-@compiled()
+@kernel(arrays=False)
 def update_terms(innovation: float, spread: float, jitter: float, grid: float) -> tuple[float, float, float]:
     """Equivalent Gaussian reading of a rounded one: innovation, its whole variance S, log likelihood.
 
@@ -218,14 +190,14 @@ def sensor_values(values: dict[str, float]) -> FloatArray:
     return np.array([values.get(name, 0.0) for name in SENSOR], dtype=np.float64)
 
 
-@compiled()
+@kernel(arrays=False)
 def head_position(phi: float, length: float) -> tuple[float, float]:
     """Head (x, y) [m] of angle and length (3.6)."""
     rho = length * chord_ratio_w(phi * phi)
     return rho * math.sin(0.5 * phi), rho * math.cos(0.5 * phi)
 
 
-@compiled()
+@kernel(arrays=False)
 def _fisheye_pixel(
     view: FloatArray, p1: float, p2: float, p3: float
 ) -> tuple[float, float, float, float, float, float]:
@@ -252,7 +224,7 @@ def _fisheye_pixel(
     )
 
 
-@compiled()
+@kernel(arrays=False)
 def _pixel(view: FloatArray, X: float, Y: float) -> tuple[float, float, float, float, float, float]:
     """Distorted pixel of a place in the plane and its derivatives: u, v, u_X, u_Y, v_X, v_Y.
 
@@ -294,7 +266,7 @@ def _pixel(view: FloatArray, X: float, Y: float) -> tuple[float, float, float, f
     )
 
 
-@compiled()
+@kernel(arrays=False)
 def marker_terms(
     view: FloatArray, phi: float, length: float, dphi: float, dl: float, ddphi: float, ddl: float,
     d: float, late: float, shift_x: float, shift_y: float, stretch: float,
@@ -335,7 +307,7 @@ def marker_terms(
     )  # fmt: skip
 
 
-@compiled()
+@kernel(arrays=False)
 def marker(view: FloatArray, state: FloatArray, by_u: FloatArray, by_v: FloatArray) -> tuple[float, float]:
     """Distorted pixel (u, v) of the marker; NaN behind the camera.
 
@@ -367,7 +339,7 @@ def marker(view: FloatArray, state: FloatArray, by_u: FloatArray, by_v: FloatArr
     return found[0], found[1]
 
 
-@compiled()
+@kernel(arrays=False)
 def accelerometer_terms(
     gravity: float, across: float, phi: float, length: float, dphi: float, dl: float, ddphi: float,
     ddl: float, alpha: float, lever: float,
@@ -421,7 +393,7 @@ def accelerometer_terms(
     )  # fmt: skip
 
 
-@compiled()
+@kernel(arrays=False)
 def accelerometer(
     gravity: float, across: float, state: FloatArray, by_x: FloatArray, by_y: FloatArray
 ) -> tuple[float, float]:
@@ -449,7 +421,7 @@ def accelerometer(
     return grow_x * found[0] + state[7], grow_y * found[1] + state[8]
 
 
-@compiled()
+@kernel(arrays=False)
 def gyroscope(state: FloatArray, by_z: FloatArray) -> float:
     """Rotation rate g_z [rad/s] of a state (19,); the gradient (19,) is written to."""
     for k in range(by_z.shape[0]):
@@ -458,7 +430,7 @@ def gyroscope(state: FloatArray, by_z: FloatArray) -> float:
     return float(-(1.0 + state[10]) * state[2] + state[6])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def marker_rows(view: FloatArray, states: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Pixels (n, 2) of the states (n, 19) and their gradients (n, 2, 19)."""
     pixels, by = np.empty((len(states), 2)), np.empty((len(states), 2, states.shape[1]))
@@ -467,7 +439,7 @@ def marker_rows(view: FloatArray, states: FloatArray) -> tuple[FloatArray, Float
     return pixels, by
 
 
-@compiled()
+@kernel(arrays=False)
 def invert_marker(
     view: FloatArray, sensor: FloatArray, u: float, v: float, phi: float, length: float
 ) -> tuple[float, float, bool]:

@@ -30,9 +30,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from calib.core.arrays import BoolArray, FloatArray, IntArray
+from calib.core.compilation import kernel
 from calib.stages.estimator.kinematic import (
     CONSIDERED,
     FASTEST_MPS,
@@ -52,7 +52,7 @@ from calib.stages.estimator.kinematic import (
     starting_state,
     write_columns,
 )
-from calib.stages.estimator.sensors import SIZE, compiled
+from calib.stages.estimator.sensors import SIZE
 
 WINDOW, OVERLAP = 12_000, 3_000
 _KEPT = 7
@@ -96,7 +96,7 @@ def events_of(setup: Setup, rows: Rows, outputs: bool = True) -> Events:
     return Events(t[order], kinds[order], readings[order], np.concatenate([camera, imu, every])[order])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def forward(
     t: FloatArray, before_s: float, kinds: IntArray, readings: FloatArray, bank_x: FloatArray,
     bank_P: FloatArray, weights: FloatArray, switch_hz: float, levels: FloatArray, walk: FloatArray,
@@ -141,7 +141,7 @@ def forward(
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _smooth_weights(t: FloatArray, kinds: IntArray, switch_hz: float, weights: FloatArray) -> None:
     """Kim's backward pass over the weights (n, M), in place."""
     n, count = weights.shape
@@ -169,7 +169,7 @@ def _smooth_weights(t: FloatArray, kinds: IntArray, switch_hz: float, weights: F
             weights[k, i] /= total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def transition(level: FloatArray, dt: float, F: FloatArray) -> None:
     """F (n, n) of `kinematic.predict` over dt [s]."""
     n = F.shape[0]
@@ -189,7 +189,7 @@ def transition(level: FloatArray, dt: float, F: FloatArray) -> None:
                 F[a, j] = f22 * F[a, j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _undo_step(y: FloatArray, level: FloatArray, h: float) -> None:
     """F' y for a step of h, in place."""
     for axis in range(2):
@@ -199,7 +199,7 @@ def _undo_step(y: FloatArray, level: FloatArray, h: float) -> None:
         y[axis + 4] = f02 * p + f12 * v + f22 * a
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def look_back(
     x: FloatArray, P: FloatArray, y: FloatArray, Y: FloatArray, part: FloatArray, spread: bool
 ) -> None:
@@ -229,7 +229,7 @@ def look_back(
             P[j, i] = P[i, j]
 
 
-@compiled()
+@kernel(arrays=False)
 def undo_readings(trace: FloatArray, y: FloatArray, Y: FloatArray, Yk: FloatArray, spread: bool) -> None:
     """Take y and Y from after an event's readings (3, 2 n + 2) to before them; Yk (n,) is scratch."""
     n = y.shape[0]
@@ -258,7 +258,7 @@ def undo_readings(trace: FloatArray, y: FloatArray, Y: FloatArray, Yk: FloatArra
                 Y[i, j] += half * trace[reading, j] + H * (0.5 * weight * trace[reading, j] - Yk[j])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def backward(
     t: FloatArray, level: FloatArray, trace: FloatArray, wanted: BoolArray, kept_x: FloatArray,
     kept_P: FloatArray, spread: bool,
