@@ -62,7 +62,7 @@
 #define CALIB_TABLE_READ(address) (*(address))
 #endif
 
-#define CALIB_SCHEMA 6
+#define CALIB_SCHEMA 7
 #if defined(CALIB_EXPECT_SCHEMA)
 #if CALIB_EXPECT_SCHEMA != CALIB_SCHEMA
 #error "calib: this header has another schema than the code expects"
@@ -70,7 +70,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x88CCB011UL
+#define CALIB_ID 0x5FD32D50UL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 1 /* 0: a section that they come from is not ok */
@@ -156,7 +156,8 @@
 #define CALIB_TICK_RATE_HZ 60.0f /* ticks per second, Hz */
 #define CALIB_TICK_RATE_MHZ 60000 /* the same in millihertz, for #if */
 #define CALIB_HOLD_TICKS 60 /* a sensor that is silent for longer, a second, stops the pumps */
-#define CALIB_TIME_OFFSET_TICKS 0 /* ticks by which a picture is later than the IMU, positive */
+#define CALIB_TIME_OFFSET_TICKS 0 /* ceil(D), angles that are remembered; D ticks by which a picture is later than the IMU */
+#define CALIB_TIME_OFFSET_PART 0.0f /* ceil(D) - D, share of a tick */
 
 /*
  * IMU on the head, x from the head to the base at rest; phi = atan2(RATIO ay, ax) - mount (2.1),

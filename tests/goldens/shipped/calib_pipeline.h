@@ -44,7 +44,7 @@
 #include <string.h>
 
 #ifndef CALIB_EXPECT_SCHEMA
-#define CALIB_EXPECT_SCHEMA 6
+#define CALIB_EXPECT_SCHEMA 7
 #endif
 #include "calib_constants.h"
 
@@ -146,21 +146,19 @@ typedef struct {
 #if CALIB_FUSED
     float bias_rad, half_rad;             /* what the gyroscope turns too little in a tick; T / 2 times its rate */
     float length_m, rate_m, slow_m;       /* length, its change in a tick, mean residual */
-#if CALIB_FUSED_TICKS > 0
-    float past_rad[CALIB_FUSED_TICKS];    /* angles of the last ticks, the oldest first */
-#endif
     uint8_t boost, moving, rejected;
 #else
     float integral_rad;                   /* J of (2.3), from the gyroscope's known bias on */
 #if CALIB_LEVELLING
     float sum_rad, before_radps;          /* S, and gz of the tick before */
+    float rest_rad[2];                    /* what rounding left of phi and J, see calib_carried */
     uint16_t ticks;                       /* taken so far, up to the last change of the gains */
     uint8_t step;                         /* entry of the tables of gains */
 #endif
     float lowpass[2][CALIB_LOWPASS_STATES];
-#if CALIB_TIME_OFFSET_TICKS > 0
-    float past_rad[CALIB_TIME_OFFSET_TICKS];
 #endif
+#if CALIB_TIME_OFFSET_TICKS > 0
+    float past_rad[CALIB_TIME_OFFSET_TICKS]; /* angles of the last ticks, the oldest first */
 #endif
     calib_channel channel[2];
     uint16_t marker_age, imu_age;         /* ticks since the last good one, from CALIB_NEVER */
@@ -253,16 +251,16 @@ static inline float calib_cos_half(float w) {
 }
 #else
 /*
- * d sin(phi) and d cos(phi) for |phi| <= CALIB_PHI_LIMIT_RAD, to 1e-6 d; w is phi squared. The compiler multiplies
- * the coefficients by d.
+ * d sin(phi) and d cos(phi) for |phi| <= CALIB_PHI_LIMIT_RAD, to 1e-6 d and 7e-6 d; w is phi squared. The compiler
+ * multiplies the coefficients by d.
  */
 static inline float calib_sin(float d, float phi, float w) {
     return phi * (d + w * (d * -0.166655675f + w * (d * 0.00831080042f + w * (d * -0.000184432589f))));
 }
 
 static inline float calib_cos(float d, float w) {
-    return d + w * (d * -0.499999225f +
-                    w * (d * 0.0416636802f + w * (d * -0.00138534617f + w * (d * 2.31359791e-05f))));
+    return d * 0.999992967f +
+           w * (d * -0.499909371f + w * (d * 0.0414836332f + w * (d * -0.00126988115f)));
 }
 
 /* Half of f of (3.14): length of the backbone by that of the chord. */
@@ -336,10 +334,39 @@ static inline uint8_t calib_sampled(const calib_inputs *in) {
 #define CALIB_GZ(in) ((in)->gz_radps)
 #endif
 
+/* The angle at the time of the picture, for all that is of the picture; phi is that of this tick. */
+static inline float calib_then(const calib_state *state, float phi) {
+    (void)state;
+    (void)phi;
+#if CALIB_TIME_OFFSET_TICKS > 1
+    /* Two products, as a difference of two angles that are nearly alike takes longer on an AVR. */
+    return (1.0f - CALIB_TIME_OFFSET_PART) * state->past_rad[0] + CALIB_TIME_OFFSET_PART * state->past_rad[1];
+#elif CALIB_TIME_OFFSET_TICKS > 0
+    return (1.0f - CALIB_TIME_OFFSET_PART) * state->past_rad[0] + CALIB_TIME_OFFSET_PART * phi;
+#else
+    return phi;
+#endif
+}
+
 #if !CALIB_FUSED
+#if CALIB_LEVELLING
+/*
+ * A sum of small changes, with what rounding leaves of each kept for the next (Kahan 1965): the filter remembers for
+ * half a minute, over which the roundings of 2000 ticks would add up to 4e-6 rad.
+ */
+static inline float calib_carried(float sum, float change, float *rest) {
+    float all = change + *rest, now = sum + all;
+    *rest = all - (now - sum);
+    return now;
+}
+#endif
+
 /* Angle filter: (2.3), or levelling. Returns flags. */
 static inline uint16_t calib_angle(calib_state *state, const calib_inputs *in) {
     float ax, ay, gz, e = 0.0f, phi = state->phi_rad;
+#if CALIB_LEVELLING
+    float turned = 0.0f;
+#endif
     uint16_t flags = 0;
     if (!calib_sampled(in)) {
         return calib_imu_lost(state);
@@ -349,7 +376,8 @@ static inline uint16_t calib_angle(calib_state *state, const calib_inputs *in) {
     gz = CALIB_GZ(in);
 #if CALIB_LEVELLING
     if (state->imu_age != CALIB_NEVER) {
-        phi += state->integral_rad - (0.5f * CALIB_MM_DT_S) * (gz + state->before_radps);
+        turned = state->integral_rad - (0.5f * CALIB_MM_DT_S) * (gz + state->before_radps);
+        phi += turned;
     }
     state->before_radps = gz;
 #endif
@@ -373,9 +401,10 @@ static inline uint16_t calib_angle(calib_state *state, const calib_inputs *in) {
 #if CALIB_LEVELLING
         uint8_t i = state->step;
         float S = state->sum_rad + e;
-        phi += CALIB_TABLE_READ(&calib_levelling_angle[i]) * S;
-        state->integral_rad = calib_clip(state->integral_rad + CALIB_TABLE_READ(&calib_levelling_bias[i]) * S,
-                                         CALIB_MM_INTEGRAL_LIMIT_RAD);
+        float J = calib_carried(state->integral_rad, CALIB_TABLE_READ(&calib_levelling_bias[i]) * S, &state->rest_rad[1]);
+        state->integral_rad = calib_clip(J, CALIB_MM_INTEGRAL_LIMIT_RAD);
+        turned += CALIB_TABLE_READ(&calib_levelling_angle[i]) * S;
+        phi = calib_carried(state->phi_rad, turned, &state->rest_rad[0]);
         state->sum_rad = S - CALIB_TABLE_READ(&calib_levelling_sum[i]) * S;
         if (i < CALIB_LEVELLING_STEPS - 1u) {
             state->ticks = (uint16_t)(state->ticks + 1u);
@@ -547,15 +576,15 @@ static inline void calib_lowpass_settle(float *s, float x) {
 }
 #else
 /*
- * The fused estimator. A picture tells where the head was when it was exposed, CALIB_FUSED_TICKS less
- * CALIB_FUSED_PART ticks ago; with h half the angle of then, the marker's place across the chord tells that angle's
- * error, its place along the chord the length, without root or arc tangent. Returns flags.
+ * The fused estimator. A picture tells where the head was when it was exposed; with h half the angle of then, see
+ * calib_then, the marker's place across the chord tells that angle's error, its place along the chord the length,
+ * without root or arc tangent. Returns flags.
  */
 static inline uint16_t calib_fuse(calib_state *state, const calib_inputs *in, calib_outputs *out) {
     float phi = state->phi_rad, A = 0.0f, B = 0.0f, half, then, h, w, s, sh, ch, chord, c = 0.0f;
     uint16_t flags = 0, age = state->marker_age;
     uint8_t sampled = calib_sampled(in), afresh;
-#if CALIB_FUSED_TICKS > 0
+#if CALIB_TIME_OFFSET_TICKS > 0
     uint8_t i;
 #endif
     if (sampled) {
@@ -578,8 +607,8 @@ static inline uint16_t calib_fuse(calib_state *state, const calib_inputs *in, ca
         } else {
             /* Nothing is known of the angle: the accelerometer's. */
             phi = calib_clip(calib_atan2(B, A), CALIB_PHI_LIMIT_RAD);
-#if CALIB_FUSED_TICKS > 0
-            for (i = 0; i < CALIB_FUSED_TICKS; i++) {
+#if CALIB_TIME_OFFSET_TICKS > 0
+            for (i = 0; i < CALIB_TIME_OFFSET_TICKS; i++) {
                 state->past_rad[i] = phi;
             }
 #endif
@@ -594,13 +623,7 @@ static inline uint16_t calib_fuse(calib_state *state, const calib_inputs *in, ca
     CALIB_STAGE(2);
     flags = (uint16_t)(flags | calib_marker(state, in, &afresh));
     CALIB_STAGE(3);
-#if CALIB_FUSED_TICKS > 1
-    then = state->past_rad[0] + CALIB_FUSED_PART * (state->past_rad[1] - state->past_rad[0]);
-#elif CALIB_FUSED_TICKS > 0
-    then = state->past_rad[0] + CALIB_FUSED_PART * (phi - state->past_rad[0]);
-#else
-    then = phi;
-#endif
+    then = calib_then(state, phi);
     h = 0.5f * then;
     w = h * h;
     s = calib_sinc_half(w);
@@ -674,11 +697,11 @@ static inline uint16_t calib_fuse(calib_state *state, const calib_inputs *in, ca
         phi = calib_clip(phi, CALIB_PHI_LIMIT_RAD);
         flags = (uint16_t)(flags | CALIB_ANGLE_LIMIT);
     }
-#if CALIB_FUSED_TICKS > 0
-    for (i = 0; i + 1 < CALIB_FUSED_TICKS; i++) {
+#if CALIB_TIME_OFFSET_TICKS > 0
+    for (i = 0; i + 1 < CALIB_TIME_OFFSET_TICKS; i++) {
         state->past_rad[i] = calib_clip(state->past_rad[i + 1] + c, CALIB_PHI_LIMIT_RAD);
     }
-    state->past_rad[CALIB_FUSED_TICKS - 1] = phi;
+    state->past_rad[CALIB_TIME_OFFSET_TICKS - 1] = phi;
 #endif
     state->phi_rad = phi;
     CALIB_STAGE(5);
@@ -892,18 +915,10 @@ static inline void calib_tick(calib_state *state, const calib_inputs *in, calib_
 
     CALIB_STAGE(3);
     if (state->marker_age != CALIB_NEVER) {
-        float x, y;
-#if CALIB_TIME_OFFSET_TICKS > 0
-        /* The angle at the time of the picture, for all that is of the picture. */
-        float then = state->past_rad[0];
+        float x, y, then = calib_then(state, phi);
         w = then * then;
         x = state->marker_m[0] - calib_sin(CALIB_MARKER_OFFSET_M, then, w);
         y = state->marker_m[1] - calib_cos(CALIB_MARKER_OFFSET_M, w);
-#else
-        w = phi * phi;
-        x = state->marker_m[0] - calib_sin(CALIB_MARKER_OFFSET_M, phi, w);
-        y = state->marker_m[1] - calib_cos(CALIB_MARKER_OFFSET_M, w);
-#endif
         CALIB_STAGE(4);
         if (afresh) {
             calib_lowpass_settle(state->lowpass[0], x);

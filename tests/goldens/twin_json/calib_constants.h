@@ -71,7 +71,7 @@
 #define CALIB_TABLE_READ(address) (*(address))
 #endif
 
-#define CALIB_SCHEMA 6
+#define CALIB_SCHEMA 7
 #if defined(CALIB_EXPECT_SCHEMA)
 #if CALIB_EXPECT_SCHEMA != CALIB_SCHEMA
 #error "calib: this header has another schema than the code expects"
@@ -79,7 +79,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0xA2159CBDUL
+#define CALIB_ID 0x88C53133UL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok */
@@ -165,7 +165,8 @@
 #define CALIB_TICK_RATE_HZ 60.0f /* ticks per second, Hz */
 #define CALIB_TICK_RATE_MHZ 60000 /* the same in millihertz, for #if */
 #define CALIB_HOLD_TICKS 60 /* a sensor that is silent for longer, a second, stops the pumps */
-#define CALIB_TIME_OFFSET_TICKS 2 /* ticks by which a picture is later than the IMU, positive */
+#define CALIB_TIME_OFFSET_TICKS 2 /* ceil(D), angles that are remembered; D ticks by which a picture is later than the IMU */
+#define CALIB_TIME_OFFSET_PART 0.494395316f /* ceil(D) - D, share of a tick */
 
 /*
  * IMU on the head, x from the head to the base at rest; phi = atan2(RATIO ay, ax) - mount (2.1),
@@ -233,8 +234,6 @@
  * Gains for the noise in align.
  */
 #define CALIB_HAS_FUSED 1 /* for #if */
-#define CALIB_FUSED_TICKS 2 /* angles that are remembered, ceil(D) */
-#define CALIB_FUSED_PART 0.494395316f /* ceil(D) - D, share of a tick */
 #define CALIB_FUSED_DELAY_TICKS 1.50560474f /* D, ticks from the exposure of a picture to its tick */
 #define CALIB_FUSED_ACCEL_11 0.000253955834f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
 #define CALIB_FUSED_ACCEL_12 5.89604679e-06f /* row 1, of ay, rad per m/s^2 */
