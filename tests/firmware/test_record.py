@@ -105,7 +105,7 @@ def test_a_computer_that_is_cut_off_stops_the_pumps(bare: Built, tmp_path: Path,
     simulated = SimulatedBoard(bare)
 
     def unplug() -> None:
-        if simulated.time_s > 2.3 + 1e-3 * after_ms:
+        if simulated.time_s > 2.8 + 1e-3 * after_ms:
             simulated.cut = True
             raise ConnectionError
 
@@ -153,7 +153,7 @@ def test_a_board_that_restarts_ends_the_recording(bare: Built, tmp_path: Path) -
 
     def reset() -> None:
         nonlocal done
-        if simulated.time_s > 3.0 and not done:
+        if simulated.time_s > 3.5 and not done:
             done = True
             simulated.reset()
 
