@@ -10,7 +10,6 @@ from calib.core.arrays import FloatArray
 from calib.stages.actuator.dynamics import (
     coefficients,
     coriolis_matrix,
-    input_forces,
     mass_matrix,
     resisting_forces,
 )
@@ -106,7 +105,7 @@ def acceleration(
     """ddq (..., 2) [m/s^2] from M, C, N and tau; every argument (..., 2)."""
     q, dq = np.asarray(q_m, dtype=np.float64), np.asarray(dq_mps, dtype=np.float64)
     swept = np.einsum("...rc,...c->...r", coriolis_matrix(plant, q, dq), dq)
-    driving = input_forces(plant, q, force_N) + plant.creep_rates[2] * np.asarray(z_N)
+    driving = np.asarray(force_N) + plant.creep_rates[2] * np.asarray(z_N)
     total = driving - swept - resisting_forces(plant, q, dq)
     return np.asarray(np.linalg.solve(mass_matrix(plant, q), total[..., None])[..., 0])
 

@@ -48,8 +48,7 @@ PLANTS = [
     Plant(),
     pumps_connected(),
     GRAVITY,
-    Plant(force_projection="head"),
-    Plant(force_projection="head", gravity_mps2=(-2.0, 9.81), creep=None),
+    Plant(gravity_mps2=(-2.0, 9.81), creep=None),
     Plant(stiffness=Stiffness((40.0, 500.0, -2e4, 3e5)), stiffness_scale=0.9102),
     Plant(stiffness=Stiffness((55.0,)), inertia_kgm2=0.0, bending_N_per_rad2=0.0),
 ]
@@ -130,23 +129,6 @@ def test_coriolis_matrix_of_335() -> None:
         assert dq @ swept == pytest.approx(0.5 * dq @ rate @ dq, rel=1e-5, abs=1e-10)
 
 
-def test_head_projection_against_the_bellows_ends() -> None:
-    """P[r, i] = t . d r_Bi / dq_r with r_Bi from the homogeneous transform (3.32)."""
-    plant, h = Plant(force_projection="head"), 1e-6
-    r = plant.bellows_radius_m
-
-    def ends(q: FloatArray) -> FloatArray:
-        H = src.transform(kin.angle(q, r), kin.length(q))
-        return np.stack([(H @ np.array([side, 0.0, 1.0]))[:2] for side in (-r, r)])
-
-    q = np.array([0.085, 0.06])
-    phi = float(kin.angle(q, r))
-    tangent = np.array([np.sin(phi), np.cos(phi)])
-    for row, step in enumerate(np.eye(2) * h):
-        moved = (ends(q + step) - ends(q - step)) / (2 * h)
-        assert dyn.force_map(plant, q)[row] == pytest.approx(moved @ tangent, abs=1e-8)
-
-
 @pytest.mark.parametrize("plant", PLANTS)
 def test_hot_path_is_the_reference(plant: Plant) -> None:
     """The closed form in (l, phi), compiled and in Python, against M, C, N and tau."""
@@ -164,7 +146,7 @@ def test_hot_path_is_the_reference(plant: Plant) -> None:
         assert [ddl + r * ddphi, ddl - r * ddphi] == pytest.approx(expected, rel=1e-10, abs=1e-9)
 
 
-@pytest.mark.parametrize("plant", [Plant(), GRAVITY, PLANTS[5]])
+@pytest.mark.parametrize("plant", [Plant(), GRAVITY, PLANTS[4]])
 def test_energies_belong_to_the_forces(plant: Plant) -> None:
     """N at rest is the gradient of U, and dE/dt = F dq - dissipation along any motion."""
     h = 1e-7
@@ -184,7 +166,7 @@ def test_energies_belong_to_the_forces(plant: Plant) -> None:
         assert src.dissipation_W(plant, q, dq, z) >= 0.0
 
 
-@pytest.mark.parametrize("plant", [Plant(), GRAVITY, PLANTS[5], PLANTS[6]])
+@pytest.mark.parametrize("plant", [Plant(), GRAVITY, PLANTS[4], PLANTS[5]])
 @pytest.mark.parametrize("q", [(0.07, 0.07), (0.085, 0.066), (0.06, 0.08)])
 def test_linearised_plant_against_differences(plant: Plant, q: tuple[float, float]) -> None:
     """About a rest that the pumps hold."""
@@ -390,9 +372,7 @@ def python_run(plant: Plant, pump: Pump, start: FloatArray, g: FloatArray, subst
 
 
 @pytest.mark.parametrize("deflation", [RateLimit(), Orifice()])
-@pytest.mark.parametrize(
-    "plant", [pumps_connected(), Plant(gravity_mps2=(0.5, 9.81), force_projection="head")]
-)
+@pytest.mark.parametrize("plant", [pumps_connected(), Plant(gravity_mps2=(0.5, 9.81))])
 def test_compiled_is_the_python_text(plant: Plant, deflation: RateLimit | Orifice) -> None:
     pump = Pump(deflation=deflation)
     g = np.array([[1.5, 0.2]] * 5 + [[0.0, 1.0]] * 5)
@@ -440,7 +420,7 @@ def commands(seed: int, blocks: int) -> FloatArray:
 
 
 def mixed(sets: int, seed: int) -> tuple[list[Plant], list[Pump]]:
-    """Every parameter differs; some plants have gravity or the head's projection, some pumps an orifice."""
+    """Every parameter differs; some plants have gravity, some pumps an orifice."""
     rng = np.random.default_rng(seed)
     plants, pumps = [], []
     for i in range(sets):
@@ -456,7 +436,6 @@ def mixed(sets: int, seed: int) -> tuple[list[Plant], list[Pump]]:
                 bending_N_per_rad2=rng.uniform(0, 0.3),
                 creep=Creep(rng.uniform(1, 5), rng.uniform(5, 15), -1.0),
                 gravity_mps2=(0.0, 9.81) if i % 5 == 3 else (0.0, 0.0),
-                force_projection="head" if i % 7 == 4 else "virtual_work",
             )
         )
         deflation = Orifice(rng.uniform(0.8, 1.2)) if i % 3 == 0 else RateLimit(rng.uniform(0.3, 0.5))

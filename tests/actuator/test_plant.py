@@ -44,7 +44,6 @@ def test_nominal_values() -> None:
     assert plant.bending_N_per_rad2 == 0.1695
     assert plant.creep_rates == (3.0, 10.0, -1.0)
     assert plant.gravity_mps2 == (0.0, 0.0)
-    assert plant.force_projection == "virtual_work"
 
 
 @pytest.mark.parametrize("law", [Stiffness(), Stiffness((60.0,)), Stiffness((40.0, 500.0, -2e4, 3e5))])

@@ -205,7 +205,7 @@ def test_a_value_in_force_is_known_or_estimated_or_nominal() -> None:
             "actuator": {
                 "mass_kg": 0.03, "bending_N_per_rad2": 0.25, "stiffness_scale": 1.1, "k0_N_per_m": 80.0,
                 "damping_scale_free_swing": 3.0, "damping_scale_pumps_connected": 12.0, "lambda1_per_s": 2.0,
-                "gravity_mps2": [0, 9.81], "force_projection": "head", "verdict": "poor",
+                "gravity_mps2": [0, 9.81], "verdict": "poor",
             },
             "pump": {
                 "lag_s": 0.5, "delay_ticks": 3, "deflation": "orifice", "laminar_s": 0.9, "verdict": "ok",
@@ -221,7 +221,7 @@ def test_a_value_in_force_is_known_or_estimated_or_nominal() -> None:
     assert plant.inertia_kgm2 == nominal.inertia_kgm2
     assert plant.stiffness.padded == (80.0, 1092.9, 0.0, 0.0)
     assert plant.creep_rates == (2.0, *nominal.creep_rates[1:])
-    assert (plant.gravity_mps2, plant.force_projection) == ((0.0, 9.81), "head")
+    assert plant.gravity_mps2 == (0.0, 9.81)
     machine = rig.machine
     assert machine.plant == plant and machine.free_plant.damping_scale == 3.0
     assert (machine.pump.lag_s, machine.pump.delay_ticks, machine.strength) == (0.5, 3, (1.0, 0.9))

@@ -4,14 +4,13 @@
 
     M = m Jp' Jp + J / (4 r_B^2) [[1, -1], [-1, 1]]                                            (3.34)
     C = m Jp' dJp/dt                                                                           (3.35)
-    N = dM_bnd/dq - m Jp' g + P (F_spring + F_damper)                                          (3.43)
-    tau = P F_act                                                                              (3.37)
+    N = dM_bnd/dq - m Jp' g + F_spring + F_damper                                              (3.43)
+    tau = F_act                                                                                (3.37)
 
-Jp is the position part of `kinematics.forward_jacobian`; its rate satisfies (3.23). P maps the
-bellows' forces to generalised forces. By virtual work it is the identity, since the bellows' lengths
-are the coordinates. The source projects the forces in the head's frame,
-P[r, i] = t . d r_Bi / dq_r, which is [[1.25, 0.25], [-0.33, 0.67]] at 0.7 rad: such springs have no
-potential and the undamped energy drifts. It is kept as `force_projection="head"`.
+Jp is the position part of `kinematics.forward_jacobian`; its rate satisfies (3.23). By virtual work the
+bellows' forces are the generalised forces, since the bellows' lengths are the coordinates. The source
+projects them in the head's frame by P[r, i] = t . d r_Bi / dq_r, which is [[1.25, 0.25], [-0.33, 0.67]]
+at 0.7 rad: such springs have no potential and the undamped energy drifts.
 
 The functions of q above are the reference. The hot path, `rates`, uses (l, phi), in which the
 equations solve in closed form. With p = l S(phi) e(phi / 2), E = D / S (see `kinematics`) and the
@@ -70,7 +69,6 @@ class Coefficients(NamedTuple):
     lambda3: float
     gx: float
     gy: float
-    head: int
     gravity: int
 
 
@@ -93,7 +91,6 @@ def coefficients(plant: Plant) -> Coefficients:
         *plant.creep_rates,
         gx,
         gy,
-        int(plant.force_projection == "head"),
         int(gx != 0.0 or gy != 0.0),
     )
 
@@ -129,12 +126,9 @@ def rates(
     # Brackets and reciprocals keep what does not wait for the springs out of the chain that does.
     pulling = (f1 + f2) + c.lambda3 * z_sum
     turning = r * ((f1 - f2) + (c.lambda3 * z_difference - 2.0 * c.bending * phi * abs(phi)))
-    if c.head or c.gravity:
+    if c.gravity:
         sine, cosine = math.sin(0.5 * phi), math.cos(0.5 * phi)
         slope = -phi * E * S
-        if c.head:
-            pulling += (f1 + f2) * (S * cosine - 1.0)
-            turning += (f1 + f2) * l * (slope * cosine + 0.5 * S * sine)
         pulling += c.m * S * (c.gx * sine + c.gy * cosine)
         turning += c.m * l * (slope * (c.gx * sine + c.gy * cosine) + 0.5 * S * (c.gx * cosine - c.gy * sine))
     phiE = phi * E
@@ -164,20 +158,6 @@ def coriolis_matrix(plant: Plant, q_m: FloatArray, dq_mps: FloatArray) -> FloatA
     return np.asarray(plant.mass_kg * np.swapaxes(Jp, -1, -2) @ rate)
 
 
-def force_map(plant: Plant, q_m: FloatArray) -> FloatArray:
-    """P (..., 2, 2): generalised forces of the bellows' forces; the identity by virtual work.
-
-    With the head's projection P[r, i] = t . d r_Bi / dq_r, r_Bi = p -+ r_B (cos phi, -sin phi).
-    """
-    q = np.asarray(q_m, dtype=np.float64)
-    if plant.force_projection == "virtual_work":
-        return np.broadcast_to(np.eye(2), (*q.shape[:-1], 2, 2)).copy()
-    phi = angle(q, plant.bellows_radius_m)
-    tangent = np.stack([np.sin(phi), np.cos(phi)], axis=-1)
-    along = np.einsum("...x,...xr->...r", tangent, forward_jacobian(q, plant.bellows_radius_m)[..., :2, :])
-    return np.asarray(along[..., :, None] + 0.5 * _TURN)
-
-
 def _bellows_forces(plant: Plant, q: FloatArray, dq: FloatArray) -> FloatArray:
     c = coefficients(plant)
     eps = q - c.l0
@@ -193,19 +173,13 @@ def resisting_forces(plant: Plant, q_m: FloatArray, dq_mps: FloatArray) -> Float
     bent = plant.bending_N_per_rad2 * phi * np.abs(phi)
     Jp = forward_jacobian(q, plant.bellows_radius_m)[..., :2, :]
     weight = plant.mass_kg * np.einsum("...xr,x->...r", Jp, np.array(plant.gravity_mps2))
-    pulls = np.einsum("...ri,...i->...r", force_map(plant, q), _bellows_forces(plant, q, dq))
-    return np.asarray(np.stack([bent, -bent], axis=-1) - weight + pulls)
-
-
-def input_forces(plant: Plant, q_m: FloatArray, force_N: FloatArray) -> FloatArray:
-    """tau (..., 2) [N] of the pumps' forces (..., 2) [N] (3.37)."""
-    return np.asarray(np.einsum("...ri,...i->...r", force_map(plant, q_m), np.asarray(force_N)))
+    return np.asarray(np.stack([bent, -bent], axis=-1) - weight + _bellows_forces(plant, q, dq))
 
 
 def linearised(plant: Plant, q_m: FloatArray) -> FloatArray:
     """A (6, 6) of d(q, dq, z)/dt = A (dq, ddq, dz) for small motion about a rest at q (2,).
 
-    The pumps' forces hold the plant there. Forces by virtual work.
+    The pumps' forces hold the plant there.
     """
     q = np.asarray(q_m, dtype=np.float64)
     c = coefficients(plant)

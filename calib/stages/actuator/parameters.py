@@ -122,8 +122,6 @@ class Plant:
     bending_N_per_rad2 : k_bnd of (3.44) in newton.
     creep : `Creep` or None.
     gravity_mps2 : (x, y) in the world frame. Off by default, since l0 is the hanging rest length.
-    force_projection : "virtual_work", or "head" for the projection of (3.30) - (3.37), which is the
-        identity only at phi = 0 and whose springs have no potential.
     allow_unstable : warn instead of refusing parameters that grow by themselves.
 
     Raises `BadInputError` for values that no plant can have.
@@ -140,7 +138,6 @@ class Plant:
     bending_N_per_rad2: float = 0.1695
     creep: Creep | None = Creep()
     gravity_mps2: tuple[float, float] = (0.0, 0.0)
-    force_projection: str = "virtual_work"
     allow_unstable: bool = False
 
     def __post_init__(self) -> None:

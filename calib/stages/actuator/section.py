@@ -66,7 +66,6 @@ class ActuatorParameters(Section):
     lambda2_N_per_m: Number | None = quantity(None, label="creep lambda2", ge=-1e5, le=1e5)
     lambda3: Number | None = quantity(None, label="creep lambda3", ge=-1e3, le=1e3)
     gravity_mps2: Annotated[list[Acceleration], Field(min_length=2, max_length=2)] | None = None
-    force_projection: Literal["virtual_work", "head"] | None = None
 
 
 class PumpParameters(Section):
@@ -309,7 +308,7 @@ def label_of(parameter: str) -> str:
 
 _VALUES = frozenset({*ActuatorParameters.model_fields, *PumpParameters.model_fields})
 _PLAIN = ("mass_kg", "inertia_kgm2", "bellows_radius_m", "rest_length_m", "stiffness_scale", "damping_ratio",
-          "bending_N_per_rad2", "force_projection")  # fmt: skip
+          "bending_N_per_rad2")  # fmt: skip
 
 
 def plant_from(values: Mapping[str, Any]) -> Plant:

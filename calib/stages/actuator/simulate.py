@@ -176,7 +176,7 @@ def run_lanes(
     substeps: int,
     out: FloatArray,
 ) -> None:
-    """As `run` for `LANES` sets with virtual work, without gravity, and pumps of one kind.
+    """As `run` for `LANES` sets without gravity, and pumps of one kind.
 
     Lane i of row k of a flat array is at k LANES + i: offsets that are known when compiling are what
     lets the loop over the lanes become vector instructions.
@@ -209,7 +209,6 @@ def run_lanes(
                     table[12 * LANES + i],
                     0.0,
                     0.0,
-                    0,
                     0,
                 )
                 decay = table[13 * LANES + i]
@@ -335,9 +334,8 @@ def largest_step_s(plant: Plant) -> float:
 # Many parameter sets under the same commands, as an identification needs them.
 #
 # Sets are taken `LANES` at a time through `run_lanes`, and the blocks are shared among threads, since the
-# kernel releases the interpreter. Plants with gravity or with the head's projection need the sine of the
-# angle, which has no vector instruction, and go one by one through `run`. Either way a set gives the same
-# numbers.
+# kernel releases the interpreter. Plants with gravity need the sine of the angle, which has no vector
+# instruction, and go one by one through `run`. Either way a set gives the same numbers.
 
 
 @dataclass(frozen=True)
@@ -406,7 +404,7 @@ def _blocks(plants: Sequence[Plant], pumps: Sequence[Pump]) -> tuple[list[list[i
     alone = []
     for i, (plant, pump) in enumerate(zip(plants, pumps, strict=True)):
         c = coefficients(plant)
-        if c.head or c.gravity:
+        if c.gravity:
             alone.append(i)
         else:
             alike.setdefault(pump_coefficients(pump).kind, []).append(i)

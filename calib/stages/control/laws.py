@@ -16,7 +16,6 @@ from calib.stages.actuator.dynamics import (
     Coefficients,
     coefficients,
     coriolis_matrix,
-    force_map,
     linearised,
     mass_matrix,
     resisting_forces,
@@ -225,16 +224,10 @@ def pwm_of_force(model: Model, force_N: FloatArray) -> FloatArray:
     return np.asarray(np.where(wanted <= force[0], model.low_pwm, found))
 
 
-def _forces(plant: Plant, q: FloatArray, generalised: FloatArray) -> FloatArray:
-    if plant.force_projection == "virtual_work":
-        return generalised
-    return np.asarray(np.linalg.solve(force_map(plant, q), generalised[..., None])[..., 0])
-
-
 def holding_force(plant: Plant, q_m: FloatArray) -> FloatArray:
     """Forces (..., 2) [N] that hold the bellows at the lengths (..., 2) [m] after all creep."""
     q = np.asarray(q_m, dtype=np.float64)
-    return _forces(plant, q, resisting_forces(plant, q, np.zeros_like(q)))
+    return resisting_forces(plant, q, np.zeros_like(q))
 
 
 def moving_force(
@@ -245,7 +238,7 @@ def moving_force(
     inertia = np.einsum("...rc,...c->...r", mass_matrix(plant, q), np.asarray(ddq_mps2))
     swept = np.einsum("...rc,...c->...r", coriolis_matrix(plant, q, dq), dq)
     crept = plant.creep_rates[2] * np.asarray(z_N)
-    return _forces(plant, q, np.asarray(inertia + swept + resisting_forces(plant, q, dq) - crept))
+    return np.asarray(inertia + swept + resisting_forces(plant, q, dq) - crept)
 
 
 def creep_along(plant: Plant, tick_s: float, dq_mps: FloatArray) -> FloatArray:
@@ -271,7 +264,7 @@ def creep_along(plant: Plant, tick_s: float, dq_mps: FloatArray) -> FloatArray:
 
 
 def static_stiffness(plant: Plant, q_m: FloatArray) -> FloatArray:
-    """dF/dq (2, 2) [N/m] of `holding_force` at the lengths (2,), forces by virtual work."""
+    """dF/dq (2, 2) [N/m] of `holding_force` at the lengths (2,)."""
     A = linearised(plant, q_m)
     return np.asarray(-mass_matrix(plant, q_m) @ A[2:4, :2])
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.core.arrays import ComplexArray, FloatArray
 from calib.core.errors import BadInputError
-from calib.stages.actuator.dynamics import input_forces, linearised, mass_matrix
+from calib.stages.actuator.dynamics import linearised, mass_matrix
 from calib.stages.control.laws import Model, Pid, force_of_pwm, holding_force, pwm_of_force
 
 # ----------------------------------------------------------------------
@@ -154,19 +154,14 @@ def bent_rest(model: Model, phi_rad: float) -> FloatArray:
 
 
 def rig_system(model: Model, q_m: FloatArray) -> System:
-    """From PWM (2,) to lengths (2,) [m] about the rest at the lengths (2,) [m].
-
-    Raises `BadInputError` for forces in the head's projection, for which no linear model is known here.
-    """
+    """From PWM (2,) to lengths (2,) [m] about the rest at the lengths (2,) [m]."""
     from scipy.linalg import expm
 
     plant, h = model.plant, model.tick_s
-    if plant.force_projection != "virtual_work":
-        raise BadInputError("margins: force_projection is 'head', expected 'virtual_work'")
     q = np.asarray(q_m, dtype=np.float64)
     A, B = np.zeros((8, 8)), np.zeros((8, 2))
     A[:6, :6] = linearised(plant, q)
-    A[2:4, 6:] = np.linalg.solve(mass_matrix(plant, q), input_forces(plant, np.tile(q, (2, 1)), np.eye(2)).T)
+    A[2:4, 6:] = np.linalg.inv(mass_matrix(plant, q))
     A[6:, 6:] = -np.eye(2) / model.pump.lag_s
     B[6:] = np.diag(pump_slope(model, q)) / model.pump.lag_s
     block = np.zeros((10, 10))

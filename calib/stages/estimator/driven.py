@@ -91,7 +91,7 @@ INVOLVED = DYNAMIC + len(PARAMETER)
 
 PLANT = (
     "m", "J", "r", "l0", "k0", "k1", "k2", "k3", "damping", "bending", "lambda1", "lambda2", "lambda3",
-    "gx", "gy", "head", "gravity", "kind", "lag_s", "falling", "laminar", "turbulent",
+    "gx", "gy", "gravity", "kind", "lag_s", "falling", "laminar", "turbulent",
 )  # fmt: skip
 """Nominal values, those of `Coefficients` and then of `PumpCoefficients`, as the vector `plant`."""
 
@@ -116,7 +116,7 @@ def _coefficients(plant: FloatArray, x: FloatArray) -> Coefficients:
         plant[4] * scale, plant[5] * scale, plant[6] * scale, plant[7] * scale,
         plant[8] * math.exp(x[13]) / math.sqrt(scale), plant[9] * _factor(x[14]),
         plant[10] * _factor(x[22]), plant[11] * _factor(x[21]), plant[12],
-        plant[13], plant[14], int(plant[15]), int(plant[16]),
+        plant[13], plant[14], int(plant[15]),
     )  # fmt: skip
 
 
@@ -152,16 +152,16 @@ def flow(
 
     Parameters
     ----------
-    plant : (22,) of `PLANT`.
+    plant : (21,) of `PLANT`.
     x : (23,) or more, of `DRIVEN`.
     segments : (count, 3) or more rows: duration [s] and the nominal static forces of both pumps [N].
     longest_s : step. States that are compared have to take the same steps.
     """
     c = _coefficients(plant, x)
-    lag_s, deflation = plant[18] * _factor(x[17]), _factor(x[18])
+    lag_s, deflation = plant[17] * _factor(x[17]), _factor(x[18])
     # An orifice that passes more empties sooner.
     pump = PumpCoefficients(
-        int(plant[17]), lag_s, plant[19] * deflation, plant[20] / deflation, plant[21] / deflation
+        int(plant[16]), lag_s, plant[18] * deflation, plant[19] / deflation, plant[20] / deflation
     )
     y0, y1, y2, y3, y4, y5 = x[1], x[0], x[3], x[2], x[4], x[5]
     x1, x2, f1, f2, d1, d2 = x[6], x[7], x[8], x[9], x[10], x[11]
@@ -317,7 +317,7 @@ class Drive:
     covariance: FloatArray | None = None
 
     def numbers(self) -> FloatArray:
-        """The (22,) vector of `PLANT`."""
+        """The (21,) vector of `PLANT`."""
         return np.array([*coefficients(self.plant), *pump_coefficients(self.pump)], dtype=np.float64)
 
     def noise(self, setup: Setup) -> FloatArray:
@@ -538,7 +538,7 @@ def driven_event(
     ----------
     kind, z : `CAMERA`, `IMU` or `HOSES` and (4,) its readings, NaN where missing, and the variance of its
         time [s^2]; of `HOSES` the deviation that the damping then has.
-    plant : (22,). view, constants, noise : as in `kinematic.bank_event`.
+    plant : (21,). view, constants, noise : as in `kinematic.bank_event`.
     work : scratch of the shape `WORK`. report : (12,) of `event.REPORT`, written to.
     again : whether the event is done once more; then `gated` (3,) holds.
     trace : (3, `TRACE`) what each reading did, for the smoother; (0, `TRACE`) for nothing.
