@@ -341,7 +341,7 @@ static inline void calib_guard_tick(calib_guard *guard, const calib_state *state
 
 /*
  * One tick of a sound rig for the self-test, k its number: bent, one axis of the IMU changes in each tick, the pixel in
- * each sixteenth, and the marker is where the angle puts it (the tangent of half of it, by another series than above).
+ * each sixteenth, and the marker is where the angle puts it (the series of above, in half the angle).
  */
 static inline void calib_guard_sound(calib_state *state, calib_inputs *in, calib_outputs *out, uint8_t k) {
     float phi = 0.8f * CALIB_ENVELOPE_ANGLE_RAD, h = 0.5f * phi, w = h * h;
@@ -356,7 +356,7 @@ static inline void calib_guard_sound(calib_state *state, calib_inputs *in, calib
     in->reference[1] = CALIB_ENVELOPE_LEAST_M;
     out->flags = 0;
     out->phi_rad = phi;
-    out->marker_m[0] = h * (1.0f + w * (0.333333343f + w * 0.13333334f)) * (CALIB_REST_LENGTH_M + CALIB_MARKER_OFFSET_M);
+    out->marker_m[0] = h * (1.0f + w * 0.333333343f) * (CALIB_REST_LENGTH_M + CALIB_MARKER_OFFSET_M);
     out->marker_m[1] = CALIB_REST_LENGTH_M;
     out->q_m[0] = CALIB_ENVELOPE_LEAST_M;
     out->q_m[1] = CALIB_ENVELOPE_LEAST_M;
@@ -408,6 +408,10 @@ static inline uint16_t calib_guard_try(uint8_t fault, uint8_t kind) {
     if (calib_guard_until(&guard, &state, &in, &out) + 1 != CALIB_GUARD_QUIET_TICKS || guard.state != CALIB_RUN) {
         return 0;
     }
+    /* A mode that nobody knows is none. */
+    if (calib_guard_once(&guard, &state, &in, &out, CALIB_MODE_OPEN + 1) || guard.state != CALIB_ARMED) {
+        return 0;
+    }
     for (k = 1; k < 255; k++) {
         calib_guard_sound(&state, &in, &out, k);
         switch (fault) {
@@ -429,13 +433,17 @@ static inline uint16_t calib_guard_try(uint8_t fault, uint8_t kind) {
         case CALIB_FAULT_CAMERA_FROZEN:
             mode = CALIB_MODE_ORIENTATION;
             in.u_px = -1.0f;
-            out.phi_rad = k > 1 ? out.phi_rad - 1.1f * CALIB_GUARD_FROZEN_RAD : out.phi_rad;
+            /* Just within CALIB_GUARD_FROZEN_RAD once, then just beyond. */
+            out.phi_rad -= k > 2 ? 0.2525f : k > 1 ? 0.2475f : 0.0f;
             break;
         case CALIB_FAULT_APART:
-            out.marker_m[0] += kind ? -1.2f * CALIB_ENVELOPE_APART_M : 1.2f * CALIB_ENVELOPE_APART_M;
+            out.marker_m[0] += kind ? -1.004f * CALIB_ENVELOPE_APART_M : 1.004f * CALIB_ENVELOPE_APART_M;
             break;
         case CALIB_FAULT_REFERENCE:
-            if (kind > 1) {
+            if (kind > 2) {
+                mode = CALIB_MODE_OPEN;
+                in.reference[1] = -1.0f;
+            } else if (kind > 1) {
                 mode = CALIB_MODE_ORIENTATION;
                 in.reference[0] = 1.1f * CALIB_ENVELOPE_ANGLE_RAD;
             } else {
@@ -455,8 +463,12 @@ static inline uint16_t calib_guard_try(uint8_t fault, uint8_t kind) {
             guard.on[kind] = CALIB_ENVELOPE_OPEN_TICKS - 1;
             break;
         default:
-            guard.full[kind] = (uint16_t)(guard.full[kind] + (k > 1 ? 0 : CALIB_ENVELOPE_FULL_TICKS - 2));
-            out.duty[kind] = (uint8_t)CALIB_PUMP_HIGH_PWM;
+            /* One tick below full power, which takes one off, then at it. */
+            if (k == 1) {
+                guard.full[kind] = CALIB_ENVELOPE_FULL_TICKS - 2;
+            } else {
+                out.duty[kind] = (uint8_t)CALIB_PUMP_HIGH_PWM;
+            }
             break;
         }
         if (calib_guard_once(&guard, &state, &in, &out, mode)) {
@@ -489,19 +501,20 @@ static inline uint16_t calib_guard_try(uint8_t fault, uint8_t kind) {
 /* 0 when every fault stops the pumps in its tick and no longer, else the number of the first that does not. */
 static inline uint8_t calib_guard_selftest(void) {
     /* Fault, kind, tick, ticks until it is over. The last is not of the fused estimator, which always needs the camera. */
-    static const uint8_t tries[20][4] = {
+    static const uint8_t tries[21][4] = {
         {CALIB_FAULT_IMU_LOST, 0, 12, 107},     {CALIB_FAULT_IMU_LOST, 1, 31, 107},
         {CALIB_FAULT_IMU_FROZEN, 0, 13, 61},    {CALIB_FAULT_CAMERA_LOST, 0, 15, 119},
-        {CALIB_FAULT_CAMERA_LOST, 1, 39, 119},  {CALIB_FAULT_CAMERA_FROZEN, 0, 7, 60},
-        {CALIB_FAULT_APART, 0, 31, 62},         {CALIB_FAULT_APART, 1, 31, 62},
+        {CALIB_FAULT_CAMERA_LOST, 1, 39, 119},  {CALIB_FAULT_CAMERA_FROZEN, 0, 8, 60},
+        {CALIB_FAULT_APART, 0, 30, 62},         {CALIB_FAULT_APART, 1, 30, 62},
         {CALIB_FAULT_REFERENCE, 0, 1, 28},      {CALIB_FAULT_REFERENCE, 1, 1, 28},
-        {CALIB_FAULT_REFERENCE, 2, 1, 28},      {CALIB_FAULT_REACH, 0, 6, 30},
-        {CALIB_FAULT_REACH, 1, 6, 30},          {CALIB_FAULT_RATE, 0, 8, 30},
-        {CALIB_FAULT_RATE, 1, 8, 30},           {CALIB_FAULT_FULL_POWER, 0, 2, 30},
-        {CALIB_FAULT_FULL_POWER, 1, 2, 30},     {CALIB_FAULT_LONG, 0, 1, 30},
-        {CALIB_FAULT_LONG, 1, 1, 30},           {CALIB_FAULT_NONE, 0, 1, 0}};
+        {CALIB_FAULT_REFERENCE, 2, 1, 28},      {CALIB_FAULT_REFERENCE, 3, 1, 28},
+        {CALIB_FAULT_REACH, 0, 6, 30},          {CALIB_FAULT_REACH, 1, 6, 30},
+        {CALIB_FAULT_RATE, 0, 11, 30},          {CALIB_FAULT_RATE, 1, 11, 30},
+        {CALIB_FAULT_FULL_POWER, 0, 4, 30},     {CALIB_FAULT_FULL_POWER, 1, 4, 30},
+        {CALIB_FAULT_LONG, 0, 1, 30},           {CALIB_FAULT_LONG, 1, 1, 30},
+        {CALIB_FAULT_NONE, 0, 1, 0}};
     uint8_t i;
-    for (i = 0; i < (CALIB_FUSED ? 19 : 20); i++) {
+    for (i = 0; i < (CALIB_FUSED ? 20 : 21); i++) {
         if (calib_guard_try(tries[i][0], tries[i][1]) != tries[i][2] + 256u * tries[i][3]) {
             return (uint8_t)(i + 1u);
         }

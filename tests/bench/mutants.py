@@ -4,7 +4,8 @@
 
 Each mutant changes one operator, number or condition, or leaves out one assignment or call, in
 calib_pipeline.h, calib_guard.h or a constant that they read. It is caught where `calib_selftest` or
-`calib_guard_selftest` fails, for a rig with every section, with CALIB_FUSED 0 or 1, or for the nominal one.
+`calib_guard_selftest` fails, for a rig with every section, with CALIB_FUSED 0 or 1, for the nominal one, or
+for one with the levelling filter.
 Of the others each that changes what a program gives by more than the self-test's tolerances, in runs with
 sound, lost, frozen, absurd and hostile sensors, is observable, and printed. COUNT is 200 by default. The
 exit code is 1 when one of these was not caught.
@@ -31,7 +32,7 @@ from firmware_rigs import header
 from calib.io.serial import MODE_OFF, MODE_ORIENTATION, MODE_POSITION, Inputs
 from calib.stages.firmware.vectors import binary32, coherent, directed
 
-BUILDS = (("full", 0), ("full", 1), ("nominal", 0))
+BUILDS = (("full", 0), ("full", 1), ("nominal", 0), ("levelling", 0))
 SWAPS = {"<=": "<", ">=": ">", "<": "<=", ">": ">=", "==": "!=", "!=": "==", "&&": "||", "||": "&&",
          "+": "-", "-": "+", "*": "/", "+=": "-=", "-=": "+=", "++": "--", "--": "++"}  # fmt: skip
 _OPERATOR = re.compile(r"(?<= )(<=|>=|<|>|==|!=|&&|\|\||\+=|-=|\+|-|\*)(?= )|(?<=\w)(\+\+|--)(?=;)")

@@ -12,7 +12,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from firmware_build import LIMITS, NATIVE, Process, Simulated, avr, compare, host, need, pack, run, write
+from firmware_build import (
+    LIMITS,
+    NATIVE,
+    Process,
+    Simulated,
+    avr,
+    compare,
+    host,
+    need,
+    pack,
+    run,
+    sketch,
+    write,
+)
 from firmware_rigs import header, rig
 
 from calib.core.rig import Rig
@@ -20,7 +33,7 @@ from calib.io.serial import MODE_ORIENTATION, MODE_POSITION, Inputs
 from calib.stages.actuator.simulate import rig_at_rest
 from calib.stages.control.laws import LoopState
 from calib.stages.control.references import Ellipse
-from calib.stages.firmware.conformance import Reference, reference_of
+from calib.stages.firmware.conformance import reference_of
 from calib.stages.firmware.header import header_of, verbatim
 from calib.stages.firmware.vectors import binary32, coherent, directed, directed_fused
 from calib.twin.rig import SimulatedRig
@@ -167,15 +180,12 @@ def test_a_moving_reference_is_that_of_the_set_points(tmp_path: Path) -> None:
     ellipse, times = Ellipse(), np.linspace(0.0, 20.0, 400)
     wanted = ellipse.bellows_m(times, header().values["CALIB_BELLOWS_RADIUS_M"])
     pose = ellipse.pose(times)
-    reference = Reference(header().values)
-    found = np.array([reference.reference_point(x, y) for x, y, _ in pose.tolist()])
-    assert np.abs(found - wanted).max() < 1e-9
     write(tmp_path, header())
     command, _ = avr(tmp_path, "-DCALIB_UNDISTORT=1", "-DCALIB_MOVING")
     ticks = _thesis_ticks([(float(x), float(y)) for x, y in pose[:, :2]])
     moved = run(command, ticks)
     again = run(
-        avr(tmp_path, "-DCALIB_UNDISTORT=1")[0], [_with(t, q) for t, q in zip(ticks, found, strict=True)]
+        avr(tmp_path, "-DCALIB_UNDISTORT=1")[0], [_with(t, q) for t, q in zip(ticks, wanted, strict=True)]
     )
     assert np.abs(moved.numbers - again.numbers)[:, 7:].max() < 0.01
 
@@ -260,6 +270,21 @@ def test_the_loop_closed_by_the_processor_is_that_of_float64(
     assert difference < 1e-6
     # The loop did something.
     assert np.ptp(expected[:, 0]) > 0.005
+
+
+@pytest.mark.parametrize(
+    ("kind", "flags", "most"),
+    [
+        ("full", (), 30_720),
+        ("fused", ("-DCALIB_FUSED=1",), 30_720),
+        ("full", ("-DCALIB_FUSED=1",), 32_256),
+    ],
+)
+def test_the_sketch_fits(tmp_path: Path, kind: str, flags: tuple[str, ...], most: int) -> None:
+    """What an ATmega328P has with the bootloader of old Nanos, and with that of an Uno."""
+    built = sketch(tmp_path, "POSITION", *flags, made=header(kind))
+    print(f"{kind} {' '.join(flags)}: {built.flash} bytes of {most}")
+    assert built.flash <= most
 
 
 @pytest.mark.parametrize(

@@ -229,15 +229,6 @@ class Reference:
         length, turned = 0.5 * math.hypot(x, y) * f, c["BELLOWS_RADIUS_M"] * phi
         return length + turned, length - turned
 
-    def reference_point(self, x: float, y: float) -> tuple[float, float]:
-        """Lengths that bring the head to (x, y) exactly, as calib_reference_point; beyond 45 degrees none."""
-        if not (0.0 < y <= REFERENCE_LIMIT and abs(x) <= y):
-            return 2.0 * REFERENCE_LIMIT, 2.0 * REFERENCE_LIMIT
-        half = math.atan2(x, y)
-        length = math.hypot(x, y) * (half / math.sin(half) if half else 1.0)
-        turned = 2.0 * self.c["BELLOWS_RADIUS_M"] * half
-        return length + turned, length - turned
-
     def feed_forward(self, q_ref_m: float) -> float:
         """(4.6), or the table."""
         c = self.c

@@ -103,9 +103,6 @@ class Header:
             written.append(path)
         return written
 
-    def __str__(self) -> str:
-        return self.text
-
 
 HEADER = Kind("a source of the firmware", (".h", ".ino"), begins(b"/*\n * calib_"))
 

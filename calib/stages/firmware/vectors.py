@@ -11,7 +11,7 @@ import numpy as np
 
 from calib.core.errors import BadInputError
 from calib.io.serial import MODE_OFF, MODE_ORIENTATION, MODE_POSITION, Inputs, Outputs
-from calib.stages.firmware.conformance import Reference, binary32, reference_of
+from calib.stages.firmware.conformance import MARKER_HELD, Reference, binary32, reference_of
 
 # ----------------------------------------------------------------------
 # Golden vectors: a short run that drives every constant, with what the reference makes of it.
@@ -137,6 +137,22 @@ def _limits(constants: Mapping[str, float], still: Inputs) -> list[tuple[Inputs,
     return [(binary32(given), times) for given, times in made]
 
 
+def _bent(constants: Mapping[str, float], run: list[Inputs]) -> list[tuple[Inputs, int]]:
+    """The run's most bent tick for long, which adds up what the accelerometer's biases leave, and then the
+    marker farther out by less than the gate, whose mean residual is a motion.
+    """
+    bent = max(run, key=lambda one: abs(one.ay_mps2))
+    still = binary32(replace(bent, gz_radps=constants["CALIB_IMU_GYRO_BIAS_RADPS"], mode=MODE_OFF))
+    reference = Reference(constants)
+    seen = reference.step(still)
+    if seen.flags & MARKER_HELD:
+        return [(still, 150)]
+    out = 1.0 + 0.8 * constants["CALIB_FUSED_GATE_M"] / math.hypot(*seen.marker_m)
+    X, Y = seen.marker_m
+    u, v = pixel_of(reference, out * X, out * Y, (still.u_px, still.v_px))
+    return [(still, 150), (binary32(replace(still, u_px=u, v_px=v)), 3)]
+
+
 def vectors(
     constants: Mapping[str, float], ticks: int = 48, fused: bool = False, limits: bool = False
 ) -> list[Vector]:
@@ -153,6 +169,8 @@ def vectors(
         silent = replace(run[0], marker_seen=False, imu_read=False)
         weightless = binary32(replace(run[0], ax_mps2=0.1, ay_mps2=-0.1))
         given = [(silent, 1), (weightless, 1), *given, *_limits(constants, run[0])]
+        if fused:
+            given += _bent(constants, coherent(constants, ticks, period=ticks))
     made = []
     for one, times in given:
         out = [reference.step(one) for _ in range(times)][-1]
