@@ -290,9 +290,8 @@ def test_the_response_is_that_of_changed_readings() -> None:
     problem, _ = _problem(noisy=True)
     fit = solve(problem, MEAN, NOISE)
     stretch = problem.stretches[0]
-    change = np.zeros_like(stretch.readings)
-    change[:, 2] = 1e-4
-    predicted = response(problem, fit, [np.zeros_like(stretch.pixels)], [change])
+    change = np.array([0.0, 0.0, 1e-4])
+    predicted = response(problem, fit, 0, change)
     moved = replace(stretch, readings=stretch.readings - change, start=fit.coefficients[0])
     again = solve(replace(problem, stretches=(moved,)), fit.sensor, fit.noise)
     assert predicted[0] == pytest.approx(-1e-4, rel=0.02)

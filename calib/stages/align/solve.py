@@ -24,6 +24,7 @@ from calib.stages.align.spline import (
     Rows,
     basis_rows,
     camera_rows,
+    chunks,
     gathered,
     imu_rows,
     normal_sums,
@@ -51,6 +52,8 @@ HUBER = 4.0
 """Knee of the loss of an IMU's reading, in deviations."""
 
 _JITTERS_PX = np.exp(np.linspace(math.log(0.03), math.log(3.0), 47))
+_COARSE = 4
+"""Of the jitters every fourth is tried first, then those beside the best."""
 
 
 @kernel()
@@ -99,11 +102,19 @@ def pixel_terms(
 def best_jitter_px(off: FloatArray, grid: float, share: float, area: float) -> float:
     """Jitter that makes pictures off by (n, 2) [px] most likely."""
     pull, weight, good = np.empty(off.shape), np.empty(off.shape), np.empty(len(off))
-    losses = np.array([pixel_terms(off, s, grid, share, area, pull, weight, good) for s in _JITTERS_PX])
-    k = int(np.argmin(losses))
-    if not 0 < k < len(losses) - 1:
+
+    def loss(k: int) -> float:
+        return pixel_terms(off, float(_JITTERS_PX[k]), grid, share, area, pull, weight, good)
+
+    last = len(_JITTERS_PX) - 1
+    coarse = min(range(0, last + 1, _COARSE), key=loss)
+    near = range(max(coarse - _COARSE, 0), min(coarse + _COARSE, last) + 1)
+    losses = [loss(k) for k in near]
+    at = int(np.argmin(losses))
+    k = near[at]
+    if not 0 < k < last:
         return float(_JITTERS_PX[k])
-    a, b, c = losses[k - 1 : k + 2]
+    a, b, c = losses[at - 1 : at + 2]
     step = math.log(_JITTERS_PX[1] / _JITTERS_PX[0])
     return float(_JITTERS_PX[k] * math.exp(0.5 * step * (a - c) / (a - 2.0 * b + c)))
 
@@ -204,104 +215,127 @@ class Arrow:
 
     def solve(self, to_c: list[FloatArray], to_s: FloatArray) -> tuple[list[FloatArray], FloatArray]:
         """Steps of all coefficients and of s for a right-hand side."""
-        inner = [cho_solve_banded((f, True), g) for f, g in zip(self.factors, to_c, strict=True)]
         right = to_s.copy()
         for X, g in zip(self.X, to_c, strict=True):
             right -= X.T @ g
         ds = np.asarray(cho_solve(self.S, right))
-        return [u - X @ ds for u, X in zip(inner, self.X, strict=True)], ds
+        steps = []
+        for factor, X, g in zip(self.factors, self.X, to_c, strict=True):
+            step = cho_solve_banded((factor, True), g, check_finite=False)
+            step -= X @ ds
+            steps.append(step)
+        return steps, ds
 
     def size(self, ds: FloatArray) -> float:
         """The largest of a step (13,) in deviations."""
         return float(np.max(np.abs(ds) / np.sqrt(np.diag(cho_solve(self.S, np.eye(len(ds)))))))
 
 
+def _pictures(
+    problem: Problem, stretch: Stretch, c: FloatArray, sensor: FloatArray
+) -> Iterator[tuple[FloatArray, Rows]]:
+    """Pixels (k, 2) seen minus predicted with their rows, a chunk at a time."""
+    for part in chunks(len(stretch.camera_s)):
+        rows = camera_rows(problem.view, stretch.knots, c, sensor, stretch.camera_s[part])
+        yield stretch.pixels[part] - rows.predicted, rows
+
+
+def _readings(
+    problem: Problem, stretch: Stretch, c: FloatArray, sensor: FloatArray
+) -> Iterator[tuple[FloatArray, Rows]]:
+    """Readings (k, 3) of the IMU minus predicted with their rows, a chunk at a time."""
+    for part in chunks(len(stretch.imu_s)):
+        rows = imu_rows(problem.gravity_mps2, problem.across_m, stretch.knots, c, sensor, stretch.imu_s[part])
+        yield stretch.readings[part] - rows.predicted, rows
+
+
 def pictures_off(problem: Problem, stretch: Stretch, c: FloatArray, sensor: FloatArray) -> FloatArray:
     """Pixels (n, 2) seen minus predicted."""
-    rows = camera_rows(problem.view, stretch.knots, c, sensor, stretch.camera_s)
-    return np.asarray(stretch.pixels - rows.predicted)
+    return np.concatenate([off for off, _ in _pictures(problem, stretch, c, sensor)])
 
 
 def readings_off(problem: Problem, stretch: Stretch, c: FloatArray, sensor: FloatArray) -> FloatArray:
     """Readings (m, 3) of the IMU minus predicted, NaN where one is missing."""
-    rows = imu_rows(problem.gravity_mps2, problem.across_m, stretch.knots, c, sensor, stretch.imu_s)
-    return np.asarray(stretch.readings - rows.predicted)
+    return np.concatenate([off for off, _ in _readings(problem, stretch, c, sensor)])
 
 
-def _loose_rows(stretch: Stretch) -> Rows:
-    """Accelerations of phi and l in the middle of each span."""
-    knots = stretch.knots
-    middles = knots.middles
-    span, basis = basis_rows(knots, middles)
-    by = np.zeros((len(middles), 2, SIZE))
-    by[:, 0, 4], by[:, 1, 5] = 1.0, 1.0
-    return Rows(span, basis, np.zeros((len(middles), 2)), by)
+def _picture_terms(
+    problem: Problem, noise: Noise, off: FloatArray
+) -> tuple[float, FloatArray, FloatArray, FloatArray]:
+    """Loss, pull, weight and probability of pictures off by (k, 2) [px], as `pixel_terms` has them."""
+    room = np.empty_like(off), np.empty_like(off), np.empty(len(off))
+    return pixel_terms(off, noise.jitter_px, problem.grid_px, noise.share, problem.area_px2, *room), *room
 
 
-class Work:
-    """The problem at a point: loss, and the normal equations."""
+def _accelerations(stretch: Stretch) -> Iterator[Rows]:
+    """Accelerations of phi and l in the middle of each span, a chunk at a time."""
+    middles = stretch.knots.middles
+    for part in chunks(len(middles)):
+        span, basis = basis_rows(stretch.knots, middles[part])
+        by = np.zeros((len(span), 2, SIZE))
+        by[:, 0, 4], by[:, 1, 5] = 1.0, 1.0
+        yield Rows(span, basis, np.zeros((len(span), 2)), by)
 
-    def __init__(self, problem: Problem) -> None:
-        self.problem = problem
-        self.loose = [_loose_rows(stretch) for stretch in problem.stretches]
 
-    def prior(self, i: int, c: FloatArray) -> tuple[float, FloatArray]:
-        """Loss of a stretch's accelerations and anchor, and its pull on the accelerations (n, 2)."""
-        stretch, rows = self.problem.stretches[i], self.loose[i]
-        at = rows.span[:, None] + np.arange(6)
-        bends = np.einsum("nj,nja->na", rows.basis[:, 2], c[at])
-        z, away = bends / stretch.loose, (c - stretch.start) / _ANCHOR
-        return 0.5 * float((z * z).sum() + (away * away).sum()), -z / stretch.loose
+def _prior(stretch: Stretch, c: FloatArray) -> tuple[float, FloatArray]:
+    """Loss of a stretch's accelerations and anchor, and its pull on the accelerations (spans, 2)."""
+    bends = [
+        np.einsum("nj,nja->na", rows.basis[:, 2], c[rows.span[:, None] + np.arange(6)])
+        for rows in _accelerations(stretch)
+    ]
+    z, away = np.concatenate(bends) / stretch.loose, (c - stretch.start) / _ANCHOR
+    return 0.5 * float((z * z).sum() + (away * away).sum()), -z / stretch.loose
 
-    def loss(self, cs: list[FloatArray], s: FloatArray, noise: Noise) -> float:
-        """Minus the logarithm of the posterior."""
-        p = self.problem
-        total = 0.5 * float((((s - p.mean) / p.sigma) ** 2).sum())
-        for i, (stretch, c) in enumerate(zip(p.stretches, cs, strict=True)):
-            off = pictures_off(p, stretch, c, s)
-            room = np.empty_like(off), np.empty_like(off), np.empty(len(off))
-            total += pixel_terms(off, noise.jitter_px, p.grid_px, noise.share, p.area_px2, *room)
-            total += imu_terms(readings_off(p, stretch, c, s), noise.imu)[0]
-            total += self.prior(i, c)[0]
-        return total
 
-    def normal(
-        self, cs: list[FloatArray], s: FloatArray, noise: Noise
-    ) -> tuple[Arrow, list[FloatArray], FloatArray, list[FloatArray]]:
-        """Factors, right-hand sides, and the probability of each picture to show the marker."""
-        p = self.problem
-        C = np.diag(1.0 / p.sigma**2)
-        to_s = (p.mean - s) / p.sigma**2
-        factors: list[FloatArray] = []
-        Xs: list[FloatArray] = []
-        Bs: list[FloatArray] = []
-        to_cs: list[FloatArray] = []
-        goods: list[FloatArray] = []
-        for i, (stretch, c) in enumerate(zip(p.stretches, cs, strict=True)):
-            n = 2 * stretch.knots.count
-            A, B, to_c = np.zeros((BAND, n)), np.zeros((n, len(SENSOR))), np.zeros(n)
-            rows = camera_rows(p.view, stretch.knots, c, s, stretch.camera_s)
-            off = stretch.pixels - rows.predicted
-            pull, weight, good = np.empty_like(off), np.empty_like(off), np.empty(len(off))
-            pixel_terms(off, noise.jitter_px, p.grid_px, noise.share, p.area_px2, pull, weight, good)
-            by = np.where(good[:, None, None] > 0.0, rows.by, 0.0)
-            normal_sums(rows.span, rows.basis, by, weight, A, B, C)
-            gathered(rows.span, rows.basis, by, pull, to_c, to_s)
-            rows = imu_rows(p.gravity_mps2, p.across_m, stretch.knots, c, s, stretch.imu_s)
-            _, pull, weight = imu_terms(stretch.readings - rows.predicted, noise.imu)
+def _loss(problem: Problem, cs: list[FloatArray], s: FloatArray, noise: Noise) -> float:
+    """Minus the logarithm of the posterior."""
+    total = 0.5 * float((((s - problem.mean) / problem.sigma) ** 2).sum())
+    for stretch, c in zip(problem.stretches, cs, strict=True):
+        total += sum(_picture_terms(problem, noise, off)[0] for off, _ in _pictures(problem, stretch, c, s))
+        total += sum(imu_terms(off, noise.imu)[0] for off, _ in _readings(problem, stretch, c, s))
+        total += _prior(stretch, c)[0]
+    return total
+
+
+def _normal(
+    problem: Problem, cs: list[FloatArray], s: FloatArray, noise: Noise
+) -> tuple[Arrow, list[FloatArray], FloatArray, list[FloatArray]]:
+    """Factors, right-hand sides, and the probability of each picture to show the marker.
+
+    A turns into its factor where it is, and B goes once X is there: an hour at 100 Hz has 35 MB of each.
+    """
+    C, taken = np.diag(1.0 / problem.sigma**2), np.zeros((len(s), len(s)))
+    to_s = (problem.mean - s) / problem.sigma**2
+    factors: list[FloatArray] = []
+    Xs: list[FloatArray] = []
+    to_cs: list[FloatArray] = []
+    goods: list[FloatArray] = []
+    for stretch, c in zip(problem.stretches, cs, strict=True):
+        A, B, to_c = np.zeros((c.size, BAND)).T, np.zeros((c.size, len(s))), np.zeros(c.size)
+        good = []
+        for off, rows in _pictures(problem, stretch, c, s):
+            _, pull, weight, likely = _picture_terms(problem, noise, off)
             normal_sums(rows.span, rows.basis, rows.by, weight, A, B, C)
             gathered(rows.span, rows.basis, rows.by, pull, to_c, to_s)
-            rows = self.loose[i]
-            normal_sums(rows.span, rows.basis, rows.by, 1.0 / stretch.loose**2, A, B, C)
-            gathered(rows.span, rows.basis, rows.by, self.prior(i, c)[1], to_c, to_s)
-            A[0] += np.tile(1.0 / _ANCHOR**2, stretch.knots.count)
-            to_c += ((stretch.start - c) / _ANCHOR**2).ravel()
-            factor = np.asarray(cholesky_banded(A, lower=True, check_finite=False))
-            X = np.asarray(cho_solve_banded((factor, True), B, check_finite=False))
-            for found, value in zip((factors, Xs, Bs, to_cs, goods), (factor, X, B, to_c, good), strict=True):
-                found.append(value)
-        S = C - sum((B.T @ X for B, X in zip(Bs, Xs, strict=True)), np.zeros_like(C))
-        return Arrow(factors, Xs, cho_factor(0.5 * (S + S.T))), to_cs, to_s, goods
+            good.append(likely)
+        for off, rows in _readings(problem, stretch, c, s):
+            _, pull, weight = imu_terms(off, noise.imu)
+            normal_sums(rows.span, rows.basis, rows.by, weight, A, B, C)
+            gathered(rows.span, rows.basis, rows.by, pull, to_c, to_s)
+        weight, pull = 1.0 / stretch.loose**2, _prior(stretch, c)[1]
+        for part, rows in zip(chunks(len(pull)), _accelerations(stretch), strict=True):
+            normal_sums(rows.span, rows.basis, rows.by, weight[part], A, B, C)
+            gathered(rows.span, rows.basis, rows.by, pull[part], to_c, to_s)
+        A[0] += np.tile(1.0 / _ANCHOR**2, len(c))
+        to_c += ((stretch.start - c) / _ANCHOR**2).ravel()
+        factors.append(cholesky_banded(A, lower=True, overwrite_ab=True, check_finite=False))
+        Xs.append(np.asarray(cho_solve_banded((factors[-1], True), B, check_finite=False)))
+        taken += B.T @ Xs[-1]
+        to_cs.append(to_c)
+        goods.append(np.concatenate(good))
+        del B
+    S = C - taken
+    return Arrow(factors, Xs, cho_factor(0.5 * (S + S.T))), to_cs, to_s, goods
 
 
 # ----------------------------------------------------------------------
@@ -410,7 +444,7 @@ def _cuts(log: AlignLog) -> list[float]:
 def _own_angle(view: FloatArray, sensor: FloatArray, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
     phi, length = np.full(len(pixels), np.nan), np.full(len(pixels), np.nan)
     at = (0.0, 0.07)
-    for n, (u, v) in enumerate(pixels.tolist()):
+    for n, (u, v) in enumerate(pixels):
         for guess in (at, (0.0, 0.07)):
             angle, arc, found = invert_marker(view, sensor, u, v, *guess)
             if found:
@@ -455,11 +489,12 @@ def pieces_of(
         if len(cuts) > 2:
             said.append(f"{log.source}: split at {len(cuts) - 2} gap(s) of more than {SPLIT_S:g} s")
         for begin, end in pairwise(cuts):
-            seen = (log.camera_s > begin) & (log.camera_s < end)
-            felt = (log.imu_s > begin) & (log.imu_s < end)
-            if seen.sum() < _LEAST_PICTURES or felt.sum() < _START_LEAST_SAMPLES:
+            # Parts of what was read, not copies of it.
+            seen, felt = (slice(*np.searchsorted(t, (begin, end))) for t in (log.camera_s, log.imu_s))
+            camera_s, imu_s = log.camera_s[seen], log.imu_s[felt]
+            if len(camera_s) < _LEAST_PICTURES or len(imu_s) < _START_LEAST_SAMPLES:
                 continue
-            camera, imu = time_axis(log.camera_s[seen]), time_axis(log.imu_s[felt])
+            camera, imu = time_axis(camera_s), time_axis(imu_s)
             if min(camera.t_s[-1], imu.t_s[-1]) - max(camera.t_s[0], imu.t_s[0]) < SHORTEST_S:
                 continue
             pixels, readings = log.pixels[seen], log.readings[felt]
@@ -539,20 +574,21 @@ def _spline(
 ) -> FloatArray:
     """Coefficients (count,) by least squares: lists of (times, values, derivative, deviation)."""
     n = 2 * knots.count
-    A, B, C = np.zeros((BAND, n)), np.zeros((n, SIZE - 6)), np.zeros((SIZE - 6, SIZE - 6))
+    A, B, C = np.zeros((n, BAND)).T, np.zeros((n, SIZE - 6)), np.zeros((SIZE - 6, SIZE - 6))
     to_c, to_s = np.zeros(n), np.zeros(SIZE - 6)
     middles = knots.middles
     for at, value, derivative, sigma in [*values, (middles, np.zeros(len(middles)), 2, loose)]:
-        span, basis = basis_rows(knots, at)
-        by = np.zeros((len(at), 1, SIZE))
-        by[:, 0, 2 * derivative] = 1.0
-        weight = np.full((len(at), 1), 1.0 / sigma**2)
-        normal_sums(span, basis, by, weight, A, B, C)
-        gathered(span, basis, by, weight * value[:, None], to_c, to_s)
+        for part in chunks(len(at)):
+            span, basis = basis_rows(knots, at[part])
+            by = np.zeros((len(span), 1, SIZE))
+            by[:, 0, 2 * derivative] = 1.0
+            weight = np.full((len(span), 1), 1.0 / sigma**2)
+            normal_sums(span, basis, by, weight, A, B, C)
+            gathered(span, basis, by, weight * value[part, None], to_c, to_s)
     A[0, 1::2] = 1.0
     A[0, ::2] += 1e-3
-    factor = cholesky_banded(A, lower=True)
-    return np.asarray(cho_solve_banded((factor, True), to_c))[::2]
+    factor = cholesky_banded(A, lower=True, overwrite_ab=True)
+    return np.asarray(cho_solve_banded((factor, True), to_c))[::2].copy()
 
 
 def _local_size(t: FloatArray, values: FloatArray, at: FloatArray) -> FloatArray:
@@ -650,10 +686,11 @@ def _mount(stretches: Sequence[Stretch]) -> float:
     """What atan2(a_y, a_x) reads beyond phi, in the median."""
     offs = []
     for stretch in stretches:
-        span, basis = basis_rows(stretch.knots, stretch.imu_s)
-        phi = np.einsum("nj,nj->n", basis[:, 0], stretch.start[span[:, None] + np.arange(6), 0])
-        off = np.arctan2(stretch.readings[:, 1], stretch.readings[:, 0]) - phi
-        offs.append(off[np.isfinite(off)])
+        for part in chunks(len(stretch.imu_s)):
+            span, basis = basis_rows(stretch.knots, stretch.imu_s[part])
+            phi = np.einsum("nj,nj->n", basis[:, 0], stretch.start[span[:, None] + np.arange(6), 0])
+            off = np.arctan2(stretch.readings[part, 1], stretch.readings[part, 0]) - phi
+            offs.append(off[np.isfinite(off)])
     whole = np.concatenate(offs)
     if len(whole) == 0:
         return 0.0
@@ -661,9 +698,7 @@ def _mount(stretches: Sequence[Stretch]) -> float:
     return middle + float(np.median((whole - middle + math.pi) % (2.0 * math.pi) - math.pi))
 
 
-def check_accelerometer(
-    stretches: Sequence[Stretch], source: str, sensor: FloatArray, gravity_mps2: float, across_m: float
-) -> None:
+def check_accelerometer(problem: Problem, source: str, sensor: FloatArray) -> None:
     """Refuse an accelerometer whose axes are mirrored, which no mount angle explains.
 
     With p = x + i y of the predicted specific force and r of the readings, the least sum of |r - e^(ia) p|^2
@@ -675,14 +710,15 @@ def check_accelerometer(
     sensor : (13,) of `SENSOR` with the mount angle 0.
     """
     power, straight, mirrored = 0.0, 0j, 0j
-    for stretch in stretches:
-        rows = imu_rows(gravity_mps2, across_m, stretch.knots, stretch.start, sensor, stretch.imu_s)
-        p, r = (values[:, 0] + 1j * values[:, 1] for values in (rows.predicted, stretch.readings))
-        p, r = p[np.isfinite(r)], r[np.isfinite(r)]
-        power += float((np.abs(p) ** 2 + np.abs(r) ** 2).sum())
-        straight, mirrored = straight + complex(r @ p.conj()), mirrored + complex(r @ p)
-    off, off_mirrored = power - 2.0 * abs(straight), power - 2.0 * abs(mirrored)
-    if off > _MISFIT * power and off_mirrored < 0.5 * off:
+    for stretch in problem.stretches:
+        for off, rows in _readings(problem, stretch, stretch.start, sensor):
+            known = np.isfinite(off[:, 0] + off[:, 1])
+            p, e = (values[known, 0] + 1j * values[known, 1] for values in (rows.predicted, off))
+            r = p + e
+            power += float((np.abs(p) ** 2 + np.abs(r) ** 2).sum())
+            straight, mirrored = straight + complex(r @ p.conj()), mirrored + complex(r @ p)
+    miss, miss_mirrored = power - 2.0 * abs(straight), power - 2.0 * abs(mirrored)
+    if miss > _MISFIT * power and miss_mirrored < 0.5 * miss:
         raise BadInputError(
             f"{source}: ax_mps2 and ay_mps2 turn the other way round than the camera sees, so they are "
             "swapped or one has the wrong sign, expected a right-handed IMU, its x axis from the head to the "
@@ -753,29 +789,32 @@ class Fit:
     arrow: Arrow
 
 
-def _imu_noise(work: Work, arrow: Arrow, cs: list[FloatArray], s: FloatArray, noise: Noise) -> FloatArray:
+def _imu_noise(
+    problem: Problem, arrow: Arrow, cs: list[FloatArray], s: FloatArray, noise: Noise
+) -> FloatArray:
     """Deviations (3,) of the IMU's readings by their residuals and degrees of freedom."""
-    p, rng = work.problem, np.random.default_rng(0)
+    rng, both = np.random.default_rng(0), np.array([-1, 1], dtype=np.int8)
+    signs = [
+        [rng.choice(both, len(stretch.imu_s)) for stretch in problem.stretches] for _ in range(3 * _PROBES)
+    ]
+    to_cs, to_s = [[np.zeros(c.size) for c in cs] for _ in signs], np.zeros((len(signs), len(s)))
     squares, count, taken = np.zeros(3), np.zeros(3), np.zeros(3)
-    all_rows = []
-    for stretch, c in zip(p.stretches, cs, strict=True):
-        rows = imu_rows(p.gravity_mps2, p.across_m, stretch.knots, c, s, stretch.imu_s)
-        off = stretch.readings - rows.predicted
-        _, pull, weight = imu_terms(off, noise.imu)
-        squares += np.nansum(np.where(np.isfinite(off), pull * off, 0.0), axis=0)
-        count += (weight > 0.0).sum(axis=0)
-        all_rows.append((rows, np.sqrt(weight)))
-    for channel in range(3):
-        for _ in range(_PROBES):
-            to_cs, to_s = [], np.zeros(len(SENSOR))
-            for (rows, root), c in zip(all_rows, cs, strict=True):
-                signs = np.zeros_like(root)
-                signs[:, channel] = root[:, channel] * rng.choice(np.array([-1.0, 1.0]), len(root))
-                to_c = np.zeros(c.size)
-                gathered(rows.span, rows.basis, rows.by, signs, to_c, to_s)
-                to_cs.append(to_c)
-            dcs, ds = arrow.solve(to_cs, to_s)
-            taken[channel] += sum(float(a @ b) for a, b in zip(dcs, to_cs, strict=True)) + float(ds @ to_s)
+    for i, (stretch, c) in enumerate(zip(problem.stretches, cs, strict=True)):
+        done = 0
+        for off, rows in _readings(problem, stretch, c, s):
+            _, pull, weight = imu_terms(off, noise.imu)
+            squares += np.where(np.isfinite(off), pull * off, 0.0).sum(axis=0)
+            count += (weight > 0.0).sum(axis=0)
+            root = np.sqrt(weight)
+            for probe in range(len(signs)):
+                channel, signed = probe // _PROBES, np.zeros_like(root)
+                signed[:, channel] = root[:, channel] * signs[probe][i][done : done + len(off)]
+                gathered(rows.span, rows.basis, rows.by, signed, to_cs[probe][i], to_s[probe])
+            done += len(off)
+    for probe in range(len(signs)):
+        dcs, ds = arrow.solve(to_cs[probe], to_s[probe])
+        own = sum(float(a @ b) for a, b in zip(dcs, to_cs[probe], strict=True))
+        taken[probe // _PROBES] += own + float(ds @ to_s[probe])
     left = np.maximum(count - taken / _PROBES, 1.0)
     found = noise.imu * np.sqrt(squares / left)
     # Without readings of an axis its deviation plays no part.
@@ -783,14 +822,13 @@ def _imu_noise(work: Work, arrow: Arrow, cs: list[FloatArray], s: FloatArray, no
 
 
 def _renewed(
-    work: Work, arrow: Arrow, cs: list[FloatArray], s: FloatArray, noise: Noise, goods: list[FloatArray]
+    problem: Problem, arrow: Arrow, cs: list[FloatArray], s: FloatArray, noise: Noise, goods: list[FloatArray]
 ) -> Noise:
-    p = work.problem
-    offs = [pictures_off(p, stretch, c, s) for stretch, c in zip(p.stretches, cs, strict=True)]
     good = np.concatenate(goods)
     share = float(np.clip(1.0 - good.mean() if len(good) else 0.0, 1e-3, 0.5))
-    jitter = best_jitter_px(np.concatenate(offs), p.grid_px, share, p.area_px2)
-    return Noise(jitter, share, _imu_noise(work, arrow, cs, s, noise))
+    offs = [pictures_off(problem, stretch, c, s) for stretch, c in zip(problem.stretches, cs, strict=True)]
+    jitter = best_jitter_px(np.concatenate(offs), problem.grid_px, share, problem.area_px2)
+    return Noise(jitter, share, _imu_noise(problem, arrow, cs, s, noise))
 
 
 def solve(problem: Problem, sensor: FloatArray, noise: Noise) -> Fit:
@@ -798,19 +836,20 @@ def solve(problem: Problem, sensor: FloatArray, noise: Noise) -> Fit:
 
     The noise is renewed after each step that is small or of which it was the third with the same noise.
     """
-    work = Work(problem)
     cs, s = [stretch.start.copy() for stretch in problem.stretches], sensor.copy()
     same, converged, steps = 0, False, 0
-    loss = work.loss(cs, s, noise)
-    arrow, to_cs, to_s, goods = work.normal(cs, s, noise)
+    loss = _loss(problem, cs, s, noise)
+    arrow, to_cs, to_s, goods = _normal(problem, cs, s, noise)
     while steps < _MOST_STEPS and not converged:
         steps += 1
         dcs, ds = arrow.solve(to_cs, to_s)
         size = arrow.size(ds)
         share = 1.0
+        # The next factors take the place of these in memory.
+        del arrow
         for _ in range(_HALVINGS):
             moved = [c + share * dc.reshape(c.shape) for c, dc in zip(cs, dcs, strict=True)]
-            trial = work.loss(moved, s + share * ds, noise)
+            trial = _loss(problem, moved, s + share * ds, noise)
             if trial <= loss + 1e-9 * abs(loss):
                 cs, s, loss = moved, s + share * ds, trial
                 break
@@ -819,44 +858,29 @@ def solve(problem: Problem, sensor: FloatArray, noise: Noise) -> Fit:
             size = 0.0
         same += 1
         small = size < _SMALL_STEP
-        arrow, to_cs, to_s, goods = work.normal(cs, s, noise)
+        arrow, to_cs, to_s, goods = _normal(problem, cs, s, noise)
         if small or same >= 3:
-            found = _renewed(work, arrow, cs, s, noise, goods)
+            found = _renewed(problem, arrow, cs, s, noise, goods)
             change = np.abs(np.log(found.imu / noise.imu)).max()
             change = max(float(change), abs(np.log(found.jitter_px / noise.jitter_px)))
             noise, same = found, 0
-            arrow, to_cs, to_s, goods = work.normal(cs, s, noise)
+            del arrow
+            arrow, to_cs, to_s, goods = _normal(problem, cs, s, noise)
             converged = small and change < _SMALL_CHANGE
-            loss = work.loss(cs, s, noise)
+            loss = _loss(problem, cs, s, noise)
     covariance = np.asarray(cho_solve(arrow.S, np.eye(len(s))))
     covariance = 0.5 * (covariance + covariance.T)
     return Fit(s, covariance, cs, noise, goods, loss, steps, converged, arrow)
 
 
-def response(
-    problem: Problem, fit: Fit, pictures: list[FloatArray], readings: list[FloatArray]
-) -> FloatArray:
-    """Change (13,) of the sensors' quantities when predictions change by so much.
-
-    Parameters
-    ----------
-    pictures, readings : for each stretch (n, 2) [px] and (m, 3), the change of what is predicted.
-    """
-    to_cs, to_s = [], np.zeros(len(SENSOR))
-    for i, (stretch, c) in enumerate(zip(problem.stretches, fit.coefficients, strict=True)):
-        to_c = np.zeros(c.size)
-        rows = camera_rows(problem.view, stretch.knots, c, fit.sensor, stretch.camera_s)
-        off = stretch.pixels - rows.predicted
-        pull, weight, good = np.empty_like(off), np.empty_like(off), np.empty(len(off))
-        n = fit.noise
-        pixel_terms(off, n.jitter_px, problem.grid_px, n.share, problem.area_px2, pull, weight, good)
-        by = np.where(good[:, None, None] > 0.0, rows.by, 0.0)
-        gathered(rows.span, rows.basis, by, -weight * pictures[i], to_c, to_s)
-        rows = imu_rows(problem.gravity_mps2, problem.across_m, stretch.knots, c, fit.sensor, stretch.imu_s)
-        _, _, weight = imu_terms(stretch.readings - rows.predicted, n.imu)
-        gathered(rows.span, rows.basis, rows.by, -weight * readings[i], to_c, to_s)
-        to_cs.append(to_c)
-    return fit.arrow.solve(to_cs, to_s)[1]
+def response(problem: Problem, fit: Fit, i: int, change: FloatArray) -> FloatArray:
+    """Change (13,) of the sensors' quantities when predictions of stretch i's IMU change by so much (3,)."""
+    stretch, c = problem.stretches[i], fit.coefficients[i]
+    to_c, to_s = np.zeros(c.size), np.zeros(len(SENSOR))
+    for off, rows in _readings(problem, stretch, c, fit.sensor):
+        _, _, weight = imu_terms(off, fit.noise.imu)
+        gathered(rows.span, rows.basis, rows.by, -weight * change, to_c, to_s)
+    return np.asarray(cho_solve(fit.arrow.S, to_s - fit.arrow.X[i].T @ to_c))
 
 
 # ----------------------------------------------------------------------
@@ -981,13 +1005,11 @@ def rest_angle(sensor: FloatArray, gravity_mps2: float = GRAVITY_MPS2) -> tuple[
 def _walked(settings: Settings, problem: Problem, fit: Fit) -> FloatArray:
     """Covariance (13, 13) from biases that differ from stretch to stretch."""
     total = np.zeros((len(SENSOR), len(SENSOR)))
-    nothing = [np.zeros_like(stretch.pixels) for stretch in problem.stretches]
+    walks = np.diag([settings.accel_walk, settings.accel_walk, settings.gyro_walk])
     for i, stretch in enumerate(problem.stretches):
         duration = float(stretch.imu_s[-1] - stretch.imu_s[0])
-        for channel, walk in enumerate((settings.accel_walk, settings.accel_walk, settings.gyro_walk)):
-            change = [np.zeros_like(other.readings) for other in problem.stretches]
-            change[i][:, channel] = walk * math.sqrt(duration / 3.0)
-            moved = response(problem, fit, nothing, change)
+        for walk in walks:
+            moved = response(problem, fit, i, walk * math.sqrt(duration / 3.0))
             total += np.outer(moved, moved)
     return total
 
@@ -1063,15 +1085,13 @@ def align(logs: Sequence[AlignLog], settings: Settings) -> Alignment:
         )
     mean = settings.mean.copy()
     mean[_MOUNT] = 0.0
-    if first.moves:
-        check_accelerometer(
-            first.stretches, logs[pieces[0].log].source, mean, settings.gravity_mps2, settings.across_m
-        )
-    mean[_MOUNT] = first.mount_angle_rad
     problem = Problem(
         settings.view, settings.gravity_mps2, settings.across_m, settings.grid_px, _OUTLIER_AREA_PX2,
         first.stretches, mean, settings.sigma,
     )  # fmt: skip
+    if first.moves:
+        check_accelerometer(problem, logs[pieces[0].log].source, mean)
+    mean[_MOUNT] = first.mount_angle_rad
     sensor = mean.copy()
     sensor[_OFFSET] = first.time_offset_s
     fit = solve(problem, sensor, _FIRST_NOISE)

@@ -12,6 +12,7 @@ touches twelve numbers that lie side by side, which makes the normal equations b
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,9 +62,19 @@ class Knots:
         return Knots(start_s, span_s, spans + _DEGREE)
 
 
+CHUNK = 8192
+"""Measurements of which gradients are held at one time: 600 bytes each."""
+
+
+def chunks(count: int) -> Iterator[slice]:
+    """Parts of so many measurements; one empty part of none."""
+    for first in range(0, max(count, 1), CHUNK):
+        yield slice(first, min(first + CHUNK, count))
+
+
 @dataclass(frozen=True)
 class Rows:
-    """Measurements of one kind in a stretch, linearised.
+    """Measurements of one kind in a stretch or a part of it, linearised.
 
     Attributes
     ----------
