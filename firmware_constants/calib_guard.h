@@ -425,6 +425,7 @@ static inline uint16_t calib_guard_try(uint8_t fault, uint8_t kind) {
             break;
         case CALIB_FAULT_NONE:
             mode = CALIB_MODE_ORIENTATION;
+            in.reference[0] = 0.0f;
             state.marker_age = 1;
             break;
         case CALIB_FAULT_CAMERA_LOST:
@@ -432,9 +433,10 @@ static inline uint16_t calib_guard_try(uint8_t fault, uint8_t kind) {
             break;
         case CALIB_FAULT_CAMERA_FROZEN:
             mode = CALIB_MODE_ORIENTATION;
+            in.reference[0] = 0.0f;
             in.u_px = -1.0f;
-            /* Just within CALIB_GUARD_FROZEN_RAD once, then just beyond. */
-            out.phi_rad -= k > 2 ? 0.2525f : k > 1 ? 0.2475f : 0.0f;
+            /* As it was once, then just beyond CALIB_GUARD_FROZEN_RAD: no longer than a narrow envelope bears. */
+            out.phi_rad -= k > 2 ? 0.2525f : 0.0f;
             break;
         case CALIB_FAULT_APART:
             out.marker_m[0] += kind ? -1.004f * CALIB_ENVELOPE_APART_M : 1.004f * CALIB_ENVELOPE_APART_M;

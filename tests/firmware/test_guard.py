@@ -13,10 +13,11 @@ import pytest
 from firmware_build import Built, need, sketch, warnings, write
 from firmware_rigs import header
 
+from calib.core.rig import Rig
 from calib.io.serial import FAULTS as FAULT_WORDS
 from calib.io.serial import GUARD_FAULT, GUARD_RUN, Decoder, Frame
 from calib.stages.firmware.check import check_frames
-from calib.stages.firmware.header import verbatim
+from calib.stages.firmware.header import header_of, verbatim
 from calib.twin.pictures import CAMERA, PLANE
 
 IMU_LOST, IMU_FROZEN, CAMERA_LOST, CAMERA_FROZEN, APART, REFERENCE = range(1, 7)
@@ -223,6 +224,25 @@ def test_every_fault_is_tried_by_the_self_test_in_all_builds(tmp_path: Path) -> 
             done = subprocess.run(list(map(str, call)), capture_output=True, text=True, check=False)
             assert done.returncode == 0, done.stderr
             assert subprocess.run([made], check=False).returncode == 0
+
+
+@pytest.mark.parametrize(
+    "envelope",
+    [
+        {"angle_rad": 0.01, "apart_m": 0.0005, "rate_mps": 0.01, "full_power_s": 0.01, "open_loop_s": 0.01},
+        {"angle_rad": 0.08},
+        {"angle_rad": 1.5, "apart_m": 0.5, "rate_mps": 10.0, "full_power_s": 600.0, "open_loop_s": 600.0},
+    ],
+)
+def test_the_self_test_passes_in_any_envelope(tmp_path: Path, envelope: dict[str, float]) -> None:
+    need("gcc")
+    write(tmp_path, header_of(Rig.of({"envelope": envelope}, "rig.yaml"), "rig.yaml"))
+    (tmp_path / "guard.c").write_text(
+        '#include "calib_guard.h"\nint main(void) { return calib_guard_selftest(); }\n'
+    )
+    made = tmp_path / "guard"
+    subprocess.run(["gcc", f"-I{tmp_path}", tmp_path / "guard.c", "-lm", "-o", made], check=True)
+    assert subprocess.run([tmp_path / "guard"], check=False).returncode == 0
 
 
 def test_a_log_knows_every_fault_of_the_guard() -> None:
