@@ -350,6 +350,8 @@ static inline uint16_t calib_selftest(void) {
         in.imu_read = (sensors >> 1) & 1u;
         in.mode = (uint8_t)CALIB_TABLE_READ(at + 8);
         do {
+            /* A tick writes all outputs, whatever was there. */
+            memset(&out, 0xFF, sizeof out);
             calib_tick(&state, &in, &out);
             sensors = (uint16_t)(sensors - 4u);
         } while (sensors < 0x8000u);
