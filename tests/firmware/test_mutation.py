@@ -38,7 +38,8 @@ def _stimulus(constants: dict[str, float]) -> list[Inputs]:
     for factor in (1.0005, 0.9995):
         weak = factor * constants["CALIB_IMU_ACCEL_WEAK_MPS2"]
         ticks.append(binary32(replace(base, ax_mps2=weak + bias[0], ay_mps2=bias[1])))
-        ticks.append(binary32(replace(base, reference=(factor * constants["CALIB_FF_FROM_M"], 0.08))))
+        # On the side whose length is near, where the feedback leaves room for it.
+        ticks.append(binary32(replace(base, reference=(0.08, factor * constants["CALIB_FF_FROM_M"]))))
         ticks.append(binary32(replace(base, reference=(factor * constants["CALIB_FF_TABLE_FROM_M"], 0.08))))
     # The wanted lengths past both ends of the feed-forward, slowly, near the measured ones.
     for k in range(600):
