@@ -264,13 +264,14 @@ class _Panel:
         x, y, spread = np.asarray(curve.x), np.asarray(curve.y), curve.spread
         line = curve.kind in _DASHES
         trace: dict[str, Any] = {"type": "scatter", "name": _words(curve.label)}
-        hue = curve.colour if isinstance(curve.colour, np.ndarray) else None
+        hue, shade = (
+            (curve.colour, "@blue") if isinstance(curve.colour, np.ndarray) else (None, _colour(curve.colour))
+        )
         if line:
             if bool(np.all(x[1:] >= x[:-1])) and spread is None:
                 x, y = thinned(x, y, MOST_POINTS)
             elif spread is None:
                 x, y = every(x, MOST_POINTS), every(y, MOST_POINTS)
-            shade = "@blue" if isinstance(curve.colour, np.ndarray) else _colour(curve.colour)
             trace |= {"mode": "lines"}
             trace["line"] = {"color": shade, "width": curve.size or 1.4, "dash": _DASHES[curve.kind]}
         else:
@@ -280,7 +281,7 @@ class _Panel:
             size = 1.3 * (curve.size or (2.0 if curve.kind == "cloud" else 4.0))
             marker: dict[str, Any] = {"symbol": _SYMBOLS[curve.kind], "size": size}
             if hue is None:
-                marker["color"] = _colour(curve.colour)  # type: ignore[arg-type]
+                marker["color"] = shade
             else:
                 marker |= {"color": self._arrays(hue), "colorscale": "Viridis", "cmin": 0.0, "cmax": 1.16}
             if curve.kind in ("crosses", "pluses", "marks"):
