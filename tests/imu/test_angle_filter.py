@@ -171,13 +171,14 @@ def test_a_levelled_bias_is_known_as_well_as_the_filter_says() -> None:
     rng = np.random.default_rng(1)
     # Slow enough for accelerations that stay below g.
     level = replace(LEVEL, velocity_mps=0.002)
-    r, q, _ = level.densities
-    t = DT * np.arange(1001)
+    _, q, _ = level.densities
+    t, kept = DT * np.arange(1001), math.exp(-DT / 0.3)
     errors = []
     for _ in range(200):
         bias = level.bias_radps * rng.normal()
-        # An acceleration whose sum is a velocity, begun at the first step, and a rate that walks.
-        v = math.sqrt(r / DT) * np.append([0.0, 0.0], rng.normal(size=1000))
+        # An acceleration whose sum is a velocity that lasts for 0.3 s, and a rate that walks.
+        fresh = level.velocity_mps / 9.80665 * math.sqrt(1.0 - kept * kept) * rng.normal(size=1000)
+        v = np.append([0.0, 0.0], lfilter([1.0], [1.0, -kept], fresh))
         acc = np.diff(v) / DT
         w = bias + math.sqrt(q / DT) * rng.normal(size=1001)
         start = MahonyState(level.angle_rad * rng.normal())
@@ -233,6 +234,18 @@ def test_untuned_levelling_beats_the_best_gains_of_the_published_filter() -> Non
         ratios.append(errors[-1] / errors[:-1].min())
     assert np.median(ratios) < 0.8
     assert max(ratios) < 1.2
+
+
+def test_an_acceleration_that_is_held_turns_the_angle_by_half_of_its_direction() -> None:
+    """0.3 g for 3 s, which points 17 degrees away."""
+    t = DT * np.arange(6000)
+    pushed = 0.3 * ((t > 30.0) & (t <= 33.0))
+    force = 9.80665 * np.stack([np.ones(6000), pushed, np.zeros(6000)], axis=1)
+    up = level_three(Levelling(), t, force, np.zeros((6000, 3)))
+    phi = level_log(Levelling(), t, np.arctan2(force[:, 1], force[:, 0]), np.zeros(6000))[0]
+    for angle in (np.arctan2(up[:, 1], up[:, 0]), phi):
+        assert np.degrees(np.abs(angle).max()) < 7.5
+        assert np.degrees(np.abs(angle[t > 45.0]).max()) < 0.1
 
 
 NOISE_GAINS = Noise(math.radians(0.1), 1e-3, math.radians(0.1))

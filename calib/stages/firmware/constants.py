@@ -201,7 +201,7 @@ def plane_constants(rig: Rig, source: str) -> PlaneConstants | None:
 # gains stand in a table for the ticks at which they change, the last for ever.
 #
 #     phi += J - dt (gz + gz of the tick before) / 2,   S += e
-#     phi += A S,   J += B S,   S -= C S
+#     |S| <= D,   phi += A S,   J += B S,   S -= C S
 #
 # A section of the low-pass of order one, b0 (1 + z^-1) / (1 + a1 z^-1), runs in the trapezoidal form
 # v = b0 (x - s), y = s + v, s' = y + v: one product, and y = x exactly at rest. A section of order two runs
@@ -256,15 +256,13 @@ def _levelling(lookup: Lookup, rate_hz: float) -> dict[str, Any] | None:
     edges = np.unique(np.round(np.geomspace(1.0, last, _LEVELLING_STEPS))).astype(int)
     gains = gains_of(filter_, dt, last)
     rows = [gains[a - 1 : b - 1].mean(axis=0) for a, b in pairwise(edges.tolist())]
-    sums, angle, bias = (np.array([*rows, settled(filter_, dt)]) * [1.0, dt, dt * dt]).T.tolist()
-    until = [*map(float, edges[1:] - 1), 0.0]
+    table = np.array([*rows, settled(filter_, dt)]) * [1.0, dt, dt * dt, 1.0 / dt]
+    names = ("sum", "angle", "bias", "most")
     return {
         "tau_s": tau_s,
         "velocity_mps": velocity,
-        "until": until,
-        "angle": angle,
-        "bias": bias,
-        "sum": sums,
+        "until": [*map(float, edges[1:] - 1), 0.0],
+        **dict(zip(names, table.T.tolist(), strict=True)),
     }
 
 
