@@ -17,16 +17,15 @@ from calib.core.verdict import Verdict
 from calib.stages.camera import intrinsics
 from calib.stages.camera.bundle import Calibration, calibrate, covariance, minimise
 from calib.stages.camera.checks import (
+    FAULTS,
     Candidate,
-    Misfit,
     best_next_view,
     best_split,
     evidence,
-    misfit,
     overdispersion,
-    screen,
     straightened,
     target_shape,
+    view_faults,
     widened,
 )
 from calib.stages.camera.corners import detect
@@ -361,10 +360,10 @@ def test_degenerate_views_leave_and_are_refused_alone() -> None:
     few = View("few", good[0].target_m[:3], good[0].pixels[:3])
     found = calibrate_camera([line, *good, few], (640, 480), Choices("radial2"))
     assert [str(one) for one in found.left_out] == [
-        "line: all its points lie on one line on the target",
-        "few: has 3 points, expected at least 4",
+        "line: shows only points on one line",
+        "few: shows fewer than four points",
     ]
-    with pytest.raises(BadInputError, match="view few: has 3 points"):
+    with pytest.raises(BadInputError, match="view few: shows fewer than four points"):
         calibrate_camera([few], (640, 480))
     corners = [View(v.name, v.target_m[[0, 8, 45, 53]], v.pixels[[0, 8, 45, 53]]) for v in good[:2]]
     with pytest.raises(BadInputError, match="cannot fix"):
@@ -414,8 +413,8 @@ def _views(count: int = 12, seed: int = 0) -> list[View]:
     return take(np.random.default_rng(seed), camera_of(), count)
 
 
-def _misfit(views: list[View]) -> Misfit:
-    return misfit(calibrate(pack(views), (640, 480), "radial2"), 5.0, 8.0, 0.5)
+def _told(views: list[View]) -> Verdict:
+    return judge(calibrate(pack(views), (640, 480), "radial2"))
 
 
 def test_what_is_no_view_of_a_plane_is_named() -> None:
@@ -427,11 +426,8 @@ def test_what_is_no_view_of_a_plane_is_named() -> None:
     views[4] = View("line", views[4].target_m[:7], views[4].pixels[:7])
     views[5] = View("few", views[5].target_m[:3], views[5].pixels[:3])
     views[6] = replace(views[6], pixels=views[6].pixels[:, :1] * [1.0, 0.3] + 5.0)
-    found = screen(pack(views))
-    np.testing.assert_array_equal(np.flatnonzero(found.not_a_plane), [1, 3])
-    np.testing.assert_array_equal(np.flatnonzero(found.on_a_line), [4, 6])
-    np.testing.assert_array_equal(np.flatnonzero(found.few), [5])
-    np.testing.assert_array_equal(np.flatnonzero(found.unusable), [1, 3, 4, 5, 6])
+    few, line, off_plane = FAULTS
+    assert view_faults(pack(views)) == ["", off_plane, "", off_plane, line, few, line, ""]
 
 
 def test_a_bad_view_and_bad_points_are_found() -> None:
@@ -439,10 +435,10 @@ def test_a_bad_view_and_bad_points_are_found() -> None:
     rng = np.random.default_rng(2)
     views[2] = replace(views[2], pixels=views[2].pixels + rng.normal(0, 2.0, (35, 2)))
     views[7].pixels[4] += [3.0, -2.0]
-    found = _misfit(views)
-    np.testing.assert_array_equal(np.flatnonzero(found.bad_views), [2])
-    np.testing.assert_array_equal(np.argwhere(found.bad_points), [[7, 4]])
-    assert found.heavy_share > 0.1
+    found = _told(views)
+    assert any(one.startswith("v02 (") and "does not fit the other views" in one for one in found.reasons)
+    assert any("1 point lies" in one and "in v07 (" in one for one in found.remarks)
+    assert any("The worst percent of the points holds" in one for one in found.remarks)
 
 
 def test_errors_printed_on_the_board_repeat() -> None:
@@ -450,10 +446,10 @@ def test_errors_printed_on_the_board_repeat() -> None:
     views = _views(20)
     printed = views[0].target_m + rng.normal(0, 1e-4, (35, 2))
     wrong = [replace(v, target_m=printed) for v in views]
-    assert _misfit(wrong).repeated > 2.0
+    assert any("repeat at the same corners" in one for one in _told(wrong).remarks)
     # Points that differ from view to view have nothing that could repeat.
     ragged = [View(v.name, v.target_m[i % 3 :], v.pixels[i % 3 :]) for i, v in enumerate(views)]
-    assert _misfit(ragged).repeated == 1.0
+    assert not any("repeat at the same corners" in one for one in _told(ragged).remarks)
 
 
 NOTHING = np.zeros(0, dtype=np.int64)

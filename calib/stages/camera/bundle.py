@@ -88,6 +88,11 @@ class Minimum:
     evaluations: int
     decrement: float
 
+    @property
+    def cost(self) -> float:
+        """Value of the loss, infinite behind the camera."""
+        return np.inf if self.at is None else self.at.cost
+
 
 def _moved(block: Block, free: IntArray, shared: FloatArray, poses: FloatArray) -> Block:
     intrinsics = block.intrinsics.copy()
@@ -570,10 +575,9 @@ def _fisheye_start(observations: Observations, image_size_px: tuple[int, int], f
     starts = [equidistant_start(observations, image_size_px, share * size, FISHEYE) for share in _WIDE_STARTS]
     starts = [start for start in starts if np.all(np.isfinite(start.t_CT_m))]
     tried = [minimise(start, observations, free, max_iterations=_TRIED_ITERATIONS) for start in starts]
-    ends = [one for one in tried if one.at is not None]
-    if not ends:
+    if not any(np.isfinite(one.cost) for one in tried):
         return replace(starting_block(observations, image_size_px, skew=False), fisheye=True)
-    return min(ends, key=lambda one: np.inf if one.at is None else one.at.cost).block
+    return min(tried, key=lambda one: one.cost).block
 
 
 def calibrate(

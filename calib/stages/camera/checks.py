@@ -1,4 +1,4 @@
-"""What the views of a calibration say about it: coverage, misfit, evidence, other minima, two cameras."""
+"""What the views of a calibration say: repeats, evidence, other minima, two cameras, what to take next."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.stages.camera.bundle import (
     Calibration,
+    Minimum,
     held,
     homographies,
     joint_jacobian,
@@ -38,11 +39,7 @@ from calib.stages.camera.model import (
 )
 
 # ----------------------------------------------------------------------
-# How varied the views of a calibration are: tilts, distances, image covered, pictures taken twice.
-#
-# Two views whose boards are parallel say the same about the camera (Zhang 2000, section 4.3), so what
-# counts is not how far a board leans from the picture's plane but how far the boards' normals differ
-# among themselves; a board that never leans in any view is the worst case of that.
+# Where views show the board, which of them show it where others do, and how far the lens is one-to-one.
 
 _DIRECTIONS = 72
 ONE_TO_ONE_REACH = 1.05
@@ -51,33 +48,6 @@ _MAX_PAIRED = 2000
 """Views above which repeats are sought among the first ones only."""
 _SAME_PX, _SAME_SHARE = 0.3, 0.004
 """Motion of a board that is none, and as a share of the picture's width the most that noise may pass for."""
-
-
-@dataclass(frozen=True)
-class Coverage:
-    """Diversity of the views.
-
-    Attributes
-    ----------
-    mirrored : (N,) views that show the target's back: its points are listed mirrored.
-    tilts_deg : (N,) angle between the board's normal and the optical axis.
-    spread_deg : largest angle between the normals of two views.
-    area_share : area of the hull of all points over the image's area.
-    view_share : median over views of the hull of one view over the image's area.
-    radius_share : largest distance of a point from the principal point over that of the image's
-        farthest corner.
-    outside_share : share of points more than one pixel outside the image.
-    hull_px : (H, 2) hull of all points.
-    """
-
-    mirrored: BoolArray
-    tilts_deg: FloatArray
-    spread_deg: float
-    area_share: float
-    view_share: float
-    radius_share: float
-    outside_share: float
-    hull_px: FloatArray
 
 
 @dataclass(frozen=True)
@@ -109,7 +79,9 @@ def hull(points: FloatArray) -> FloatArray:
     return np.asarray(points[extreme[kept]] if len(kept) else points[extreme[:1]])
 
 
-def _area(corners: FloatArray) -> float:
+def hull_area(points: FloatArray) -> float:
+    """Area of the hull of points (n, 2)."""
+    corners = hull(points)
     x, y = corners[:, 0], corners[:, 1]
     return float(0.5 * abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)))
 
@@ -131,33 +103,6 @@ def target_box(calibration: Calibration) -> FloatArray:
     return np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
 
 
-def coverage(calibration: Calibration) -> Coverage:
-    """Diversity of the views of a calibration and the part of the image that they cover."""
-    observations, camera, block = calibration.observations, calibration.camera, calibration.block
-    width, height = camera.image_size_px
-    pixels = observations.pixels[observations.present]
-    outline = hull(pixels)
-    areas = [_area(hull(p[on])) for p, on in zip(observations.pixels, observations.present, strict=True)]
-    normals = block.R_CT[:, :, 2]
-    # A mirrored list of points turns the board's back to the camera; its plane leans the same way.
-    normals = normals * np.where(normals[:, 2:] < 0.0, -1.0, 1.0)
-    centre = np.array([camera.cx_px, camera.cy_px])
-    corner = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], dtype=np.float64)
-    outside = (pixels < -1.0) | (pixels > np.array([width, height], dtype=np.float64))
-    return Coverage(
-        mirrored=block.R_CT[:, 2, 2] < 0.0,
-        tilts_deg=np.degrees(np.arccos(np.clip(normals[:, 2], 0.0, 1.0))),
-        spread_deg=_widest_angle_deg(normals),
-        area_share=_area(outline) / (width * height),
-        view_share=float(np.median(areas)) / (width * height),
-        radius_share=float(
-            np.linalg.norm(pixels - centre, axis=1).max() / np.linalg.norm(corner - centre, axis=1).max()
-        ),
-        outside_share=float(outside.any(axis=1).mean()),
-        hull_px=outline,
-    )
-
-
 def cell_of(
     pixels: FloatArray, image_size_px: tuple[int, int], columns: int, rows: int
 ) -> tuple[IntArray, IntArray]:
@@ -165,12 +110,6 @@ def cell_of(
     column = np.clip((pixels[:, 0] + 0.5) / image_size_px[0] * columns, 0, columns - 1).astype(np.int64)
     row = np.clip((pixels[:, 1] + 0.5) / image_size_px[1] * rows, 0, rows - 1).astype(np.int64)
     return column, row
-
-
-def _widest_angle_deg(normals: FloatArray) -> float:
-    """Largest angle between two normals, exact for few views and to a degree for many."""
-    some = normals[:: max(1, len(normals) // _MAX_PAIRED)]
-    return float(np.degrees(np.arccos(np.clip((some @ some.T).min(), -1.0, 1.0))))
 
 
 def repeated_views(observations: Observations, width_px: int) -> IntArray:
@@ -311,38 +250,22 @@ def cell_means(fit: Calibration, at: FloatArray, vectors: FloatArray, weights: F
 
 
 # ----------------------------------------------------------------------
-# Views and points that do not fit: told from the correspondences alone, and from the residuals.
+# Views that cannot be views of the plane, told from the correspondences alone.
 #
 # A plane seen through a lens follows a homography up to distortion, a smooth bulge of at most a tenth of
 # the board's extent in the picture. Points in another order, from another board or on one line do not, and
-# one such view can keep a whole calibration from finding a camera. After the fit the residuals tell views
-# and points that are far worse than the others, and errors that repeat from view to view.
+# one such view can keep a whole calibration from finding a camera.
 
+FAULTS = (
+    "fewer than four points",
+    "only points on one line",
+    "points that no camera sees on a flat board: listed in another order, or from another board",
+)
+"""What a view may show that is no view of the plane."""
 _FLAT = 2e-3
 """Smaller over larger extent of a set of points below which they lie on a line."""
 _OFF_PLANE = 0.2
 """Departure from a homography over the extent in the picture; 100 degrees of barrel make 0.1."""
-
-
-@dataclass(frozen=True)
-class Screening:
-    """What is wrong with each view, all (N,).
-
-    Attributes
-    ----------
-    few : fewer than four points.
-    on_a_line : the target's points, or their pixels, lie on one line.
-    not_a_plane : no homography explains the pixels.
-    """
-
-    few: BoolArray
-    on_a_line: BoolArray
-    not_a_plane: BoolArray
-
-    @property
-    def unusable(self) -> BoolArray:
-        """Views with any of these, (N,)."""
-        return self.few | self.on_a_line | self.not_a_plane
 
 
 def _flatness(points: FloatArray, present: BoolArray) -> tuple[FloatArray, FloatArray]:
@@ -355,14 +278,14 @@ def _flatness(points: FloatArray, present: BoolArray) -> tuple[FloatArray, Float
     return values[:, 0] / np.maximum(values[:, 1], 1e-300), values[:, 1]
 
 
-def screen(observations: Observations) -> Screening:
-    """Look for views that cannot be views of the plane."""
+def view_faults(observations: Observations) -> list[str]:
+    """Of each view the one of `FAULTS` that it has, or ""."""
     present, pixels = observations.present, observations.pixels
     target = np.broadcast_to(observations.target_m, (*present.shape, 3))
     few = present.sum(axis=1) < 4
-    extent = _flatness(pixels, present)[1]
-    line = (_flatness(target[..., :2], present)[0] < _FLAT) | (_flatness(pixels, present)[0] < _FLAT)
-    departure = np.zeros(observations.views)
+    flatness, extent = _flatness(pixels, present)
+    line = (_flatness(target[..., :2], present)[0] < _FLAT) | (flatness < _FLAT)
+    off_plane = np.zeros(observations.views, dtype=np.bool_)
     usable = np.flatnonzero(~few & ~line)
     if len(usable):
         chosen = observations.select(usable)
@@ -372,94 +295,8 @@ def screen(observations: Observations) -> Screening:
         depth = np.where(np.abs(mapped[..., 2:]) > 1e-12, mapped[..., 2:], 1e-12)
         off = np.where(chosen.present, ((mapped[..., :2] / depth - chosen.pixels) ** 2).sum(axis=2), 0.0)
         rms = np.sqrt(off.sum(axis=1) / chosen.present.sum(axis=1))
-        departure[usable] = rms / np.maximum(extent[usable], 1e-300)
-    return Screening(few, line & ~few, departure > _OFF_PLANE)
-
-
-@dataclass(frozen=True)
-class Misfit:
-    """What the residuals show.
-
-    Attributes
-    ----------
-    view_rms_px : (N,).
-    typical_px : median of `view_rms_px`.
-    bad_views : (N,) views whose RMS is far above the others'.
-    bad_points : (N, M) points outside of bad views whose residual is far above the others'.
-    points : how many points there are outside of bad views.
-    heavy_share : share of squared residuals that the worst percent of points holds; 0.05 when normal.
-    repeated : root mean square over the target's points of the mean residual over views, in the
-        target's frame, over what it would be if the views' errors were independent.
-    """
-
-    view_rms_px: FloatArray
-    typical_px: float
-    bad_views: BoolArray
-    bad_points: BoolArray
-    points: int
-    heavy_share: float
-    repeated: float
-
-
-def misfit(calibration: Calibration, view_factor: float, point_factor: float, floor_px: float) -> Misfit:
-    """Judge the residuals of a calibration.
-
-    Parameters
-    ----------
-    view_factor : a view is bad above this many times the median RMS of the views ...
-    point_factor : a point above this many times its view's and the median view's RMS ...
-    floor_px : ... and above this many pixels.
-    """
-    residuals, present = calibration.residuals_px, calibration.observations.present
-    squared = np.where(present, (residuals**2).sum(axis=2), 0.0)
-    per_view = np.sqrt(squared.sum(axis=1) / np.maximum(present.sum(axis=1), 1))
-    # A bad view drags the camera and raises its neighbours' residuals, so the lower half is the measure.
-    typical = float(np.median(per_view))
-    quiet = float(np.median(np.sort(per_view)[: (len(per_view) + 1) // 2]))
-    bad_views = per_view > max(view_factor * quiet, floor_px)
-    fine = present & ~bad_views[:, None]
-    distance = np.sqrt(squared)
-    median = _median_distance(distance, fine)
-    bad_points = fine & (distance > np.maximum(point_factor * median[:, None], floor_px))
-    ordered = np.sort(squared[fine])
-    worst = max(1, len(ordered) // 100)
-    return Misfit(
-        view_rms_px=per_view,
-        typical_px=typical,
-        bad_views=bad_views,
-        bad_points=bad_points,
-        points=int(fine.sum()),
-        heavy_share=float(ordered[-worst:].sum() / max(ordered.sum(), 1e-300)) if len(ordered) else 0.0,
-        repeated=_repeated(calibration),
-    )
-
-
-def _median_distance(distance: FloatArray, fine: BoolArray) -> FloatArray:
-    """Median residual of each view, and not below that of all, (N,)."""
-    hidden = np.where(fine, distance, np.nan)
-    everything = float(np.median(distance[fine])) if fine.any() else 0.0
-    own = np.full(len(distance), everything)
-    some = fine.any(axis=1)
-    own[some] = np.nanmedian(hidden[some], axis=1)
-    return np.asarray(np.maximum(own, everything))
-
-
-def _repeated(calibration: Calibration) -> float:
-    """Mean residual of each target point over views, in the target's axes; one when independent."""
-    observations = calibration.observations
-    if not observations.same_target or observations.views < 4:
-        return 1.0
-    block = calibration.block
-    # Directions of the target's axes in the picture, turned back, lengths left out.
-    axes = block.R_CT[:, :2, :2]
-    U, _, Vt = np.linalg.svd(axes)
-    turned = np.einsum("nmi,nij->nmj", np.nan_to_num(calibration.residuals_px), U @ Vt)
-    count = np.maximum(observations.present.sum(axis=0), 1)
-    mean = turned.sum(axis=0) / count[:, None]
-    spread = float((turned**2).sum() / max(2 * observations.points, 1))
-    if spread <= 0.0:
-        return 1.0
-    return float(np.sqrt((mean**2 * count[:, None]).mean() / spread))
+        off_plane[usable] = rms > _OFF_PLANE * np.maximum(extent[usable], 1e-300)
+    return list(np.select([few, line, off_plane], FAULTS, ""))
 
 
 # ----------------------------------------------------------------------
@@ -731,24 +568,6 @@ _NEARLY = 1.02
 """Cost of five coefficients over that of the rational model below which they do."""
 
 
-@dataclass(frozen=True)
-class Start:
-    """Where one start ended.
-
-    Attributes
-    ----------
-    focal_px : focal length that it began with.
-    block : where it ended.
-    cost : sum of squared residuals there, pixels squared.
-    termination : as `Calibration.termination`.
-    """
-
-    focal_px: float
-    block: Block
-    cost: float
-    termination: str
-
-
 def conditioned(calibration: Calibration) -> Calibration:
     """The same views without the freedom of the rational model's denominator; other models as they are.
 
@@ -772,10 +591,11 @@ def conditioned(calibration: Calibration) -> Calibration:
     return replace(calibration, free=calibration.free[kept], normal=normal)
 
 
-def other_starts(calibration: Calibration, seed: int = 0) -> list[Start]:
-    """Minima reached from focal lengths of 0.4 to 4 image widths and principal points about the centre.
+def other_starts(calibration: Calibration, seed: int = 0) -> list[tuple[float, Minimum]]:
+    """Focal lengths of starts, and where they ended.
 
-    A fisheye lens starts from 0.2 to 0.8.
+    They go from 0.4 to 4 image widths, of a fisheye lens from 0.2 to 0.8, with principal points about the
+    centre.
     """
     rng = np.random.default_rng(seed)
     observations, camera = calibration.observations, calibration.camera
@@ -805,7 +625,7 @@ def other_starts(calibration: Calibration, seed: int = 0) -> list[Start]:
         start = Block(guess, R_CT, t_CT_m, np.zeros(0), camera.fisheye)
         found = minimise(start, observations, free, max_iterations=_MAX_ITERATIONS)
         if found.at is not None:
-            ends.append(Start(focal, found.block, found.at.cost, found.reason))
+            ends.append((focal, found))
     return ends
 
 
@@ -827,7 +647,7 @@ def best_of_starts(calibration: Calibration) -> Calibration:
     ends = other_starts(some)
     if not ends:
         return calibration
-    best = min(ends, key=lambda end: end.cost)
+    best = min((end for _, end in ends), key=lambda end: end.cost)
     if best.cost > _cost(some) - chance:
         return calibration
     camera, start = calibration.camera, best.block

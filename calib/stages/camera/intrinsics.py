@@ -26,6 +26,7 @@ from calib.stages.camera.bundle import (
     refitted,
 )
 from calib.stages.camera.checks import (
+    FAULTS,
     apart_px,
     best_of_starts,
     evidence,
@@ -34,9 +35,9 @@ from calib.stages.camera.checks import (
     overdispersion,
     repeated_views,
     scaled_inverse,
-    screen,
     seen_angles,
     skew_left_out,
+    view_faults,
 )
 from calib.stages.camera.model import (
     FISHEYE,
@@ -52,8 +53,8 @@ from calib.stages.camera.triage import Triage, triage
 from calib.stages.camera.verdict import (
     judge,
     of_copies,
+    of_faults,
     of_leaving,
-    of_screening,
     scale_of,
     two_cameras,
 )
@@ -426,7 +427,6 @@ _TRIAGES = 3
 """Times that a model is chosen; bad views can make the first choice wrong."""
 _FAR_BETTER = 0.5
 """Squared error of a typical view over that by the chosen model."""
-_NO_PLANE = "shows points that no camera sees on a flat board: in another order, or of another board"
 
 
 @dataclass(frozen=True)
@@ -473,41 +473,36 @@ class Intrinsics:
     seconds: dict[str, float]
 
 
-def _usable(views: Sequence[View], choices: Choices) -> tuple[list[View], list[LeftOut]]:
+def _usable(views: Sequence[View], choices: Choices) -> tuple[Observations, list[LeftOut]]:
     """Views that can be views of a plane, and the others.
 
-    Raises `BadInputError` where no answer could follow from what is left.
+    Where all show points that no camera sees on a plane, they are used. Raises `BadInputError` where no
+    answer could follow from what is left.
     """
     if not views:
         raise BadInputError("there are no views to calibrate from")
-    left_out = [LeftOut(view.name, why, "view") for view in views if (why := _unusable(view))]
-    names = {one.name for one in left_out}
-    usable = [view for view in views if view.name not in names]
-    if not usable:
+    everything = pack(views)
+    faults = view_faults(everything)
+    for allowed in ("", FAULTS[-1]):
+        kept = [i for i, fault in enumerate(faults) if fault in ("", allowed)]
+        if kept:
+            break
+    left_out = [
+        LeftOut(views[i].name, f"shows {why}", "view") for i, why in enumerate(faults) if i not in kept
+    ]
+    if not kept:
         raise BadInputError(f"view {left_out[0]}")
-    if choices.skew and len(usable) < 3:
-        raise BadInputError(f"a camera with skew needs at least 3 views, found {len(usable)}")
-    total = sum(len(view.counted()[1]) for view in usable)
+    if choices.skew and len(kept) < 3:
+        raise BadInputError(f"a camera with skew needs at least 3 views, found {len(kept)}")
+    usable = everything.select(kept)
     if choices.model != "auto":
-        unknown = len(free_intrinsics(choices.model, bool(choices.skew))) + 6 * len(usable)
-        if 2 * total <= unknown:
+        unknown = len(free_intrinsics(choices.model, bool(choices.skew))) + 6 * len(kept)
+        if 2 * usable.points <= unknown:
             raise BadInputError(
-                f"{len(usable)} views with {total} points cannot fix the {unknown} unknowns of the model "
-                f"{choices.model}"
+                f"{len(kept)} views with {usable.points} points cannot fix the {unknown} unknowns of the "
+                f"model {choices.model}"
             )
     return usable, left_out
-
-
-def _unusable(view: View) -> str:
-    """Why a view tells nothing, "" where it may."""
-    target_m, pixels = view.counted()
-    if len(pixels) < 4:
-        return f"has {len(pixels)} points, expected at least 4"
-    for points, where in ((target_m, "on the target"), (pixels, "in the picture")):
-        spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-        if spread[1] <= 1e-6 * spread[0]:
-            return f"all its points lie on one line {where}"
-    return ""
 
 
 def _chosen_model(
@@ -579,21 +574,14 @@ def calibrate_camera(
     left_out : files that were left out before; the verdict considers how many.
     """
     began = time.perf_counter()
-    usable, unusable = _usable(views, choices)
-    everything = pack(usable)
-    screening = screen(everything)
-    if not screening.unusable.all():
-        unusable += [
-            LeftOut(everything.names[i], _NO_PLANE, "view") for i in np.flatnonzero(screening.unusable)
-        ]
-        everything = everything.select(np.flatnonzero(~screening.unusable))
+    everything, unusable = _usable(views, choices)
     everything, copies = without_copies(everything, image_size_px)
     unusable += copies
     fixed = ("cx_px", "cy_px") if everything.views == 1 else ()
     sorted_out, models = _sorted_out(everything, image_size_px, choices, fixed)
     leaving = [*left_out, *unusable, *sorted_out.left_out]
     agree = sorted_out.calibration.observations.views
-    findings = of_leaving(leaving, agree, choices.keep_all, _moved_px(sorted_out))
+    findings = list(of_leaving(leaving, agree, choices.keep_all, _moved_px(sorted_out)))
     if sorted_out.left_out:
         several = two_cameras(sorted_out.everything)
         if any(one.severity == "inconsistent" for one in findings):
@@ -606,7 +594,7 @@ def calibrate_camera(
                 calibrate(everything, image_size_px, lens.model, skew=lens.skew, fixed=fixed, start=first)
             )
             leaving = [*left_out, *unusable]
-            findings = of_leaving(leaving, everything.views, choices.keep_all)
+            findings = list(of_leaving(leaving, everything.views, choices.keep_all))
     not_used = [*left_out, *unusable] if choices.keep_all else leaving
     fit = sorted_out.calibration
     if choices.keep_all:
@@ -726,7 +714,7 @@ def _by_the_views(fit: Calibration) -> Covariance:
 
 def _judged(fit: Calibration, findings: Sequence[Finding]) -> Verdict:
     try:
-        return judge(fit, covariance(fit), findings=findings)
+        return judge(fit, covariance(fit), findings)
     except (np.linalg.LinAlgError, ValueError, IndexError) as error:
         # Points that no camera sees on a flat board leave the checks without a linear system to solve.
         if fit.rms_px < _HOPELESS * max(fit.camera.image_size_px):
@@ -736,8 +724,8 @@ def _judged(fit: Calibration, findings: Sequence[Finding]) -> Verdict:
 
 def _no_camera(observations: Observations, what: str) -> BadInputError:
     """The error for views that no camera fits, with those named that are no views of a flat target."""
-    found = of_screening(screen(observations), observations.names)
-    why = found[0].text if found else "Expected views of one flat target, each point with its own pixel."
+    found = next(of_faults(observations), None)
+    why = found.text if found else "Expected views of one flat target, each point with its own pixel."
     return BadInputError(f"no camera fits these views: {what}. {why}")
 
 
