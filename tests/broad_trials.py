@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from scipy.io import loadmat
+from scipy.spatial.transform import Rotation
 
 from calib.stages.imu.mahony import Mahony, MahonyState, accelerometer_angles, filter_log, wrapped
 
@@ -71,6 +73,51 @@ def read_trial(path: Path) -> Trial:
         m["movement"] == 1,
         1.0 / float(m["sampling_rate"]),
     )
+
+
+def averaged(one: Trial, every: int) -> Trial:
+    """Means over `every` samples, and the truth in their middle."""
+    n = len(one.gyro) // every * every
+    gyro, force = (x[:n].reshape(-1, every, 3).mean(axis=1) for x in (one.gyro, one.force))
+    middles = slice(every // 2, n, every)
+    return Trial(gyro, force, one.truth[middles], one.moving[middles], every * one.period_s)
+
+
+def varied(one: Trial) -> Iterator[tuple[str, Trial]]:
+    """The recording as others might have made it, by name."""
+    rng, quarter = np.random.default_rng(0), Rotation.random(random_state=1).as_matrix()
+    moving = np.flatnonzero(one.moving)
+    late = slice(int(moving[len(moving) // 2]), None)
+    biased = replace(one, gyro=one.gyro + np.radians([3.0, -3.0, 3.0]))
+    begun = Trial(one.gyro[late], one.force[late], one.truth[late], one.moving[late], one.period_s)
+    noise = rng.normal(size=(2, *one.gyro.shape))
+    pushed, up = one.force.copy(), np.nan_to_num(one.truth[late][: round(3.0 / one.period_s)])
+    across = np.cross(up, [0.0, 0.0, 1.0])
+    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
+    pushed[late.start : late.start + len(up)] += 0.3 * 9.81 * across
+    yield "as it is", one
+    yield "means at 57 Hz", averaged(one, 5)
+    yield "bias of 3 deg/s", biased
+    yield "the same at 57 Hz", averaged(biased, 5)
+    yield "from the middle of the motion", begun
+    yield "the same, bias of 1 deg/s", replace(begun, gyro=begun.gyro + np.radians([1.0, -1.0, 1.0]))
+    yield (
+        "sensor turned",
+        replace(one, gyro=one.gyro @ quarter.T, force=one.force @ quarter.T, truth=one.truth @ quarter.T),
+    )
+    yield "noisy", replace(one, gyro=one.gyro + 0.02 * noise[0], force=one.force + 0.3 * noise[1])
+    yield "rate 1 % too large", replace(one, gyro=1.01 * one.gyro)
+    yield "0.3 g held for 3 s", replace(one, force=pushed)
+
+
+def late_deg(one: Trial, up: np.ndarray) -> float:
+    """Inclination's RMS in motion after 5 s, least over the shift of the truth's clock, which is late."""
+    t = one.period_s * np.arange(len(up))
+    after, found = replace(one, moving=one.moving & (t > 5.0)), []
+    for shift in np.arange(-0.02, 0.021, 0.002).tolist():
+        at = np.stack([np.interp(t, t + shift, up[:, i]) for i in range(3)], axis=1)
+        found.append(after.inclination_deg(at))
+    return min(found)
 
 
 def windows(one: Trial, up: np.ndarray, least: float) -> list[slice]:

@@ -13,7 +13,7 @@ from armlogs import swung
 from scipy.signal import lfilter
 
 from calib.solve.clock import Part
-from calib.stages.imu.drift import allan_at, analyse_drift, lag_s, slope_of
+from calib.stages.imu.drift import _drift_log, allan_at, analyse_drift, lag_s, slope_of
 from calib.stages.imu.mahony import Mahony, advance, filter_log
 from calib.stages.imu.sampling import Readings
 from calib.stages.imu.tracks import Tuned, tracks_of
@@ -93,6 +93,18 @@ def test_a_log_in_motion_with_truth() -> None:
     assert math.radians(gyro.slope_degps) == pytest.approx(-0.006, rel=0.05)
     # Summing the rate of a step's end is half a step ahead.
     assert 1e-3 * gyro.lag_ms == pytest.approx(-0.5 * PERIOD, abs=5e-4)
+
+
+def test_a_truth_that_comes_late_is_moved() -> None:
+    t = PERIOD * np.arange(6000)
+    phi, rate = 0.5 * np.sin(3.0 * t), 1.5 * np.cos(3.0 * t)
+    log = replace(_log(phi, rate), true_t_s=t + 0.0148, true_phi_rad=phi)
+    result = analyse_drift(log, peers=False)
+    assert result.truth_late_s == pytest.approx(0.0148, abs=5e-4)
+    accel = result.measures["accelerometer alone"]
+    assert math.radians(accel.rmse_deg) == pytest.approx(0.02 / 9.81, rel=0.1)
+    assert abs(accel.lag_ms) < 0.5
+    assert "14.8 ms later" in _drift_log(result).remarks[0]
 
 
 Noise = Callable[[np.random.Generator, int], np.ndarray]

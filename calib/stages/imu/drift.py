@@ -57,7 +57,8 @@ from calib.stages.imu.tuning import parameters_of
 #
 # **Lag.** Both angles are freed from what is slower than some seconds, the estimate is moved against the
 # truth by whole samples, and a parabola through the highest correlation and its neighbours gives the
-# fraction. Drift and offsets so play no part.
+# fraction. Drift and offsets so play no part. An instrument's truth may itself come late: by how much the
+# rate integrated, which is half a step ahead, leads it says so, and the truth is moved by that first.
 
 _BLOCKS = 128
 _FEWEST_BLOCKS = 8
@@ -67,6 +68,9 @@ _SUPPORT = 1.0
 _SLOW_S = 4.0
 _FARTHEST_S = 0.5
 _LEAST_CORRELATION = 0.5
+_SURE_CORRELATION = 0.9
+_LEAST_LATE = 0.2
+"""Steps by which a truth has to be late to be moved: below, the parabola's fraction is in doubt."""
 
 
 @dataclass(frozen=True)
@@ -179,6 +183,7 @@ def lag_s(
     truth: Sequence[FloatArray],
     period_s: float,
     farthest_s: float = _FARTHEST_S,
+    least: float = _LEAST_CORRELATION,
 ) -> float:
     """How much later [s] the estimate comes than the truth; negative where it is ahead.
 
@@ -186,6 +191,7 @@ def lag_s(
     ----------
     estimate, truth : pairs of stretches (n_i,) at one period.
     farthest_s : lags that are tried, on both sides.
+    least : correlation below which the two hardly resemble each other.
 
     Returns
     -------
@@ -208,7 +214,7 @@ def lag_s(
         return math.nan
     c = both / np.sqrt(own * theirs)
     i = int(np.argmax(c))
-    if i in (0, len(c) - 1) or c[i] < _LEAST_CORRELATION:
+    if i in (0, len(c) - 1) or c[i] < least:
         return math.nan
     bend = c[i - 1] - 2.0 * c[i] + c[i + 1]
     fraction = 0.5 * (c[i - 1] - c[i + 1]) / bend if bend < 0.0 else 0.0
@@ -258,6 +264,7 @@ class LogDrift:
     start_s : time of each part's first sample.
     moving : where (n_i,) each part moves.
     truth_rad : the true angle in each part, NaN outside of its samples; None without.
+    truth_late_s : by which it was moved.
     tracks : of each method. measures : what is said of it, by its name, in the same order.
     skipped : sentences about methods that were left out.
     """
@@ -271,6 +278,7 @@ class LogDrift:
     start_s: tuple[float, ...]
     moving: tuple[BoolArray, ...]
     truth_rad: tuple[FloatArray, ...] | None
+    truth_late_s: float
     tracks: tuple[Track, ...]
     measures: dict[str, DriftMethod]
     skipped: tuple[str, ...]
@@ -292,6 +300,18 @@ def _upright(log: Readings) -> float:
         return math.nan
     ax, ay, az = (log.values[:, log.axes.index(axis)] for axis in ("ax", "ay", "az"))
     return float(np.median((ax**2 + ay**2) / np.maximum(ax**2 + ay**2 + az**2, 1e-12)))
+
+
+def _both_known(
+    estimate: Sequence[FloatArray], truth: Sequence[FloatArray]
+) -> tuple[list[FloatArray], list[FloatArray]]:
+    """The stretches of two angles in which both are known."""
+    where = [
+        (e, t, a, b)
+        for e, t in zip(estimate, truth, strict=True)
+        for a, b in runs(np.isfinite(e) & np.isfinite(t))
+    ]
+    return [e[a:b] for e, _, a, b in where], [t[a:b] for _, t, a, b in where]
 
 
 def _measure(
@@ -337,12 +357,7 @@ def _measure(
                 ]
             )
             rmse = float(flat.std())
-            pieces = [
-                (e[a:b], t[a:b])
-                for e, t in zip(track.phi_rad, truth, strict=True)
-                for a, b in runs(np.isfinite(e) & np.isfinite(t))
-            ]
-            lag = lag_s([e for e, _ in pieces], [t for _, t in pieces], period_s)
+            lag = lag_s(*_both_known(track.phi_rad, truth), period_s)
     slope = slope_of(errors, period_s)
     return DriftMethod(
         offset_deg=degrees_or_none(offset),
@@ -391,9 +406,17 @@ def analyse_drift(
         for motion in motions:
             flags[np.searchsorted(at, motion.from_s) : np.searchsorted(at, motion.to_s)] = True
         moving.append(flags)
-    truth = None
+    tracks, skipped = tracks_of(log, parts, period_s, tuned, peers, told)
+    by_name = {track.name: track.phi_rad for track in tracks}
+    truth, late_s = None, 0.0
     if len(log.true_t_s) >= 2:
         truth = on_grid(log.true_t_s, log.true_phi_rad, parts, period_s)
+        turned = _both_known(by_name["gyroscope alone"], truth)
+        late_s = -0.5 * period_s - lag_s(*turned, period_s, least=_SURE_CORRELATION)
+        if abs(late_s) > _LEAST_LATE * period_s:
+            truth = on_grid(log.true_t_s - late_s, log.true_phi_rad, parts, period_s)
+        else:
+            late_s = 0.0
         stretches = [(k, _settled(0, len(part.values), period_s)) for k, part in enumerate(parts)]
     else:
         stretches = [
@@ -402,8 +425,7 @@ def analyse_drift(
             for a, b in runs(~flags)
             if (b - a) * period_s >= _SHORTEST_S
         ]
-    tracks, skipped = tracks_of(log, parts, period_s, tuned, peers, told)
-    phi_acc = next(track.phi_rad for track in tracks if track.name == "accelerometer alone")
+    phi_acc = by_name["accelerometer alone"]
     measures = {one.name: _measure(one, truth, phi_acc, stretches, moving, period_s) for one in tracks}
     return LogDrift(
         log.source,
@@ -415,6 +437,7 @@ def analyse_drift(
         tuple(float(part.t_s[0]) for part in parts),
         tuple(moving),
         truth,
+        late_s,
         tuple(tracks),
         measures,
         tuple(skipped),
@@ -480,6 +503,11 @@ def solve_drift(inputs: DriftInputs) -> Drift:
 
 def _drift_log(log: LogDrift) -> DriftOfLog:
     remarks = [finding.text for finding in sampling_findings(log.sampling, source=log.source)]
+    if log.truth_late_s:
+        remarks.append(
+            f"{log.source}: true_phi_rad comes {1e3 * log.truth_late_s:.1f} ms later than the gyroscope "
+            "turns; it is moved by that, and lags are against the gyroscope"
+        )
     if log.upright < _LEAST_UPRIGHT:
         tilt = math.degrees(math.acos(math.sqrt(log.upright)))
         remarks.append(
