@@ -42,7 +42,7 @@ def varied_drive(seed: int, share: float = 0.08) -> SimulatedRig:
         plant=plant,
         pump=pump,
         free_damping_scale=nominal.free_damping_scale * f[7],
-        pump_strength=(float(strength[0]), float(strength[1])),
+        strength=(float(strength[0]), float(strength[1])),
     )
 
 

@@ -72,7 +72,7 @@ def varied(seed: int) -> SimulatedRig:
         rig,
         imu=imu,
         plant=plant,
-        pump_strength=(float(strength[0]), float(strength[1])),
+        strength=(float(strength[0]), float(strength[1])),
         tracker=replace(rig.tracker, latency_s=float(rng.uniform(0.01, 0.04))),
     )
 

@@ -97,7 +97,7 @@ def varied(seed: int) -> tuple[SimulatedRig, dict[str, float]]:
             plant=plant,
             free_damping_scale=truth["damping_scale_free_swing"],
             pump=pump,
-            pump_strength=strength,
+            strength=strength,
             tracker=replace(rig.tracker, latency_s=float(rng.uniform(0.015, 0.035))),
         ),
         truth,

@@ -360,15 +360,13 @@ def run_case(base: Base, case: Case, seed: int) -> dict[str, float | None]:
     return _filtered(base, known, run)
 
 
-def _changed(case: Case) -> tuple[dict[str, Any], dict[str, str]]:
-    """Changes to rig.yaml by their paths, and options of the scenario as they would be typed."""
-    from calib.twin.scenarios import as_typed
-
-    changed, options = dict[str, Any](), dict[str, str]()
+def _changed(case: Case) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Changes to rig.yaml by their paths, and options of the scenario."""
+    changed, options = dict[str, Any](), dict[str, Any]()
     for key, value in case.values:
         section, _, rest = key.partition(".")
         if section == "scenario":
-            options[rest] = as_typed(value)
+            options[rest] = value
         else:
             changed[key] = value
     return changed, options

@@ -13,10 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calib.core.arrays import FloatArray
-from calib.core.errors import BadInputError
-from calib.stages.actuator.parameters import DAMPING_SCALE_FREE, Plant, pumps_connected
-from calib.stages.actuator.pump import Pump
-from calib.stages.camera.model import project
+from calib.stages.actuator.machine import Machine
 from calib.twin.pictures import CAMERA, PLANE
 from calib.twin.section import Imu, Tracker, Twin
 from calib.twin.sensors import View
@@ -31,29 +28,12 @@ def nominal_view() -> View:
 
 
 @dataclass(frozen=True)
-class SimulatedRig:
-    """All that is true of a rig.
+class SimulatedRig(Machine):
+    """All that is true of a rig: of its actuator and pumps, and of its sensors `view`, `tracker`, `imu`."""
 
-    Attributes
-    ----------
-    plant : with the pumps connected.
-    free_damping_scale : c_dmp with the hoses off, for a free swing.
-    pump, pump_strength : both pumps, and factors on their static forces.
-    view, tracker, imu : the sensors.
-    """
-
-    plant: Plant = field(default_factory=pumps_connected)
-    free_damping_scale: float = DAMPING_SCALE_FREE
-    pump: Pump = field(default_factory=Pump)
-    pump_strength: tuple[float, float] = (1.0, 1.0)
     view: View = field(default_factory=nominal_view)
     tracker: Tracker = field(default_factory=Tracker)
     imu: Imu = field(default_factory=Imu)
-
-    @property
-    def free_plant(self) -> Plant:
-        """The plant with the hoses off."""
-        return replace(self.plant, damping_scale=self.free_damping_scale)
 
 
 def workspace_homography(view: View) -> FloatArray:
@@ -64,18 +44,12 @@ def workspace_homography(view: View) -> FloatArray:
 
     Raises `BadInputError` where the camera does not see the workspace.
     """
-    from calib.core.geometry import fit_homography
+    from calib.stages.estimator.baseline import undistorting_nothing
+    from calib.stages.estimator.sensors import view_coefficients
 
-    x, y = np.meshgrid(np.linspace(-0.06, 0.06, 9), np.linspace(0.05, 0.11, 7))
-    world = np.stack([x.ravel(), y.ravel()], axis=1)
-    points = world @ view.R_CW[:, :2].T + view.t_CW_m
-    width, height = view.camera.image_size_px
-    pixels = project(view.camera, np.where(points[:, 2:] > 0.0, points, 1.0))
-    inside = (pixels >= -0.5) & (pixels <= np.array([width - 0.5, height - 0.5]))
-    seen = inside.all(axis=1) & (points[:, 2] > 0.0)
-    if seen.sum() < 12:
-        raise BadInputError("plane: the camera does not see the actuator's workspace")
-    return fit_homography(world[seen], pixels[seen], np.arange(int(seen.sum()))).H
+    numbers = view_coefficients(view.camera, view.R_CW, view.t_CW_m)
+    to_plane = undistorting_nothing(numbers, (-0.06, 0.05, 0.06, 0.11), view.camera.image_size_px)
+    return np.asarray(np.linalg.inv(to_plane))
 
 
 def rig_from_file(rig: Rig) -> SimulatedRig:

@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields, replace
-from typing import Any, Protocol
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import BeforeValidator, Field, model_validator
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError, UsageError
+from calib.core.result import Section
 from calib.core.rig import Rig
+from calib.core.schema import contradiction, validated
 from calib.core.units import parse_duration_s
 from calib.io.logs import Log
 from calib.stages.actuator.simulate import RigState, rig_at_rest
-from calib.stages.control.laws import (
-    FeedForward,
-    LoopState,
-    Pid,
-    feed_forward,
-    saturate,
-    step_orientation,
-    step_position,
-)
+from calib.stages.control.laws import Channels, FeedForward, Pid, feed_forward, saturate
 from calib.stages.control.references import Ellipse, PolynomialElongation
 from calib.twin.rig import SimulatedRig, rig_from_file
 from calib.twin.sensors import stream, uniform
@@ -120,29 +115,40 @@ def fall_time_s(tick_s: float, values: FloatArray, share: float = 0.05) -> float
 
 
 # ----------------------------------------------------------------------
-# What the scenarios have in common: their interface, and small helpers.
-
-UNSET = float("nan")
-"""Default of a number that then follows from something else."""
+# What the scenarios have in common: how they are run, and small helpers.
 
 Figures = dict[str, float | None]
 """Figures of a run by name; None for what did not happen."""
 
+Plain = Annotated[float, Field(allow_inf_nan=False)]
+"""A number, or its text as it is typed."""
+Numbers = Annotated[
+    tuple[Plain, ...], BeforeValidator(lambda given: given.split(",") if isinstance(given, str) else given)
+]
+"""Numbers, or their text with commas between them."""
 
-class Scenario(Protocol):
+
+class Scenario(Section):
     """An experiment: its length unless told otherwise, how it is run, and figures of the result."""
 
-    @property
-    def duration_s(self) -> float: ...
+    duration_s: Plain = 10.0
 
-    def run(self, rig: SimulatedRig, ticks: int, seed: int, feedback: str) -> Run: ...
+    def start(self, rig: SimulatedRig) -> RigState:
+        """The state before the first tick."""
+        return at_rest(rig)
 
-    def figures(self, run: Run) -> Figures: ...
+    def drive(self, rig: SimulatedRig, ticks: int) -> FloatArray | Law:
+        """Commands (ticks, 2), or the controller."""
+        del rig
+        return np.zeros((ticks, 2))
 
+    def run(self, rig: SimulatedRig, ticks: int, seed: int, feedback: str) -> Run:
+        """The simulated run. Raises `BadInputError` as `calib.twin.simulate.simulate`."""
+        return run_loop(rig, self.start(rig), self.drive(rig, ticks), ticks, seed, feedback)
 
-def or_none(value: float) -> float | None:
-    """A number, or None for `UNSET`."""
-    return None if value != value else value
+    def figures(self, run: Run) -> Figures:
+        """By which the source describes the experiment."""
+        return _span(run)
 
 
 def at_rest(rig: SimulatedRig) -> RigState:
@@ -160,6 +166,11 @@ def elongation_mm(run: Run) -> FloatArray:
     return np.asarray(1e3 * (run.states[:, :2].mean(axis=1) - run.plant.rest_length_m))
 
 
+def _span(run: Run) -> Figures:
+    q = run.states[:, :2]
+    return {"shortest_bellows_mm": float(1e3 * q.min()), "longest_bellows_mm": float(1e3 * q.max())}
+
+
 # ----------------------------------------------------------------------
 # Experiments without a controller: rest, swing, steps, deflation, and signals for identification.
 
@@ -173,16 +184,15 @@ def _pwm(rig: SimulatedRig, volt: float) -> float:
     return min(max(255.0 * volt / supply, 0.0), 255.0)
 
 
-@dataclass(frozen=True)
-class Static:
+class Static(Scenario):
     """At rest, pumps off, for the noise and drift of the sensors (Fig. 2.4)."""
 
-    duration_s: float = 60.0
+    duration_s: Plain = 60.0
     onchip: bool = True
 
     def run(self, rig: SimulatedRig, ticks: int, seed: int, feedback: str) -> Run:
         rig = replace(rig, imu=replace(rig.imu, onchip=self.onchip or rig.imu.onchip))
-        return run_loop(rig, at_rest(rig), np.zeros((ticks, 2)), ticks, seed, feedback)
+        return super().run(rig, ticks, seed, feedback)
 
     def figures(self, run: Run) -> Figures:
         if not run.rig.imu.onchip or len(run.onchip_rad) < 2:
@@ -191,16 +201,15 @@ class Static:
         return {"onchip_drift_degps": float(np.degrees(slope))}
 
 
-@dataclass(frozen=True)
-class SwingRelease:
+class SwingRelease(Scenario):
     """Released from an angle with the hoses off (3.3)."""
 
-    duration_s: float = 5.0
-    phi_rad: float = 0.5
-    length_m: float = UNSET
+    duration_s: Plain = 5.0
+    phi_rad: Plain = 0.5
+    length_m: Plain | None = None
 
     def run(self, rig: SimulatedRig, ticks: int, seed: int, feedback: str) -> Run:
-        start = rig_at_rest(rig.free_plant, rig.pump, self.phi_rad, or_none(self.length_m))
+        start = rig_at_rest(rig.free_plant, rig.pump, self.phi_rad, self.length_m)
         return run_loop(rig, start, np.zeros((ticks, 2)), ticks, seed, feedback, rig.free_plant)
 
     def figures(self, run: Run) -> Figures:
@@ -219,21 +228,20 @@ class SwingRelease:
         return figures
 
 
-@dataclass(frozen=True)
-class Steps:
+class Steps(Scenario):
     """Both motors at 6, 8, 10 and 12 V in turn, with time to deflate after each (Fig. 2.12)."""
 
-    duration_s: float = 56.0
-    volts: tuple[float, ...] = (6.0, 8.0, 10.0, 12.0)
-    on_s: float = 6.0
-    off_s: float = 8.0
+    duration_s: Plain = 56.0
+    volts: Numbers = (6.0, 8.0, 10.0, 12.0)
+    on_s: Plain = 6.0
+    off_s: Plain = 8.0
 
-    def run(self, rig: SimulatedRig, ticks: int, seed: int, feedback: str) -> Run:
+    def drive(self, rig: SimulatedRig, ticks: int) -> FloatArray:
         pwm, t = np.zeros((ticks, 2)), tick_times(rig, ticks)
         for i, volt in enumerate(self.volts):
             begin = i * (self.on_s + self.off_s)
             pwm[(t >= begin) & (t < begin + self.on_s)] = _pwm(rig, volt)
-        return run_loop(rig, at_rest(rig), pwm, ticks, seed, feedback)
+        return pwm
 
     def figures(self, run: Run) -> Figures:
         mm, figures = elongation_mm(run), Figures()
@@ -244,18 +252,16 @@ class Steps:
         return figures
 
 
-@dataclass(frozen=True)
-class Deflate:
+class Deflate(Scenario):
     """Both motors at a voltage, then off (Fig. 3.24)."""
 
-    duration_s: float = 14.0
-    volt: float = 12.0
-    off_at_s: float = 5.0
+    duration_s: Plain = 14.0
+    volt: Plain = 12.0
+    off_at_s: Plain = 5.0
 
-    def run(self, rig: SimulatedRig, ticks: int, seed: int, feedback: str) -> Run:
-        on = tick_times(rig, ticks) < self.off_at_s - 1e-9
-        pwm = np.where(on, _pwm(rig, self.volt), 0.0)
-        return run_loop(rig, at_rest(rig), np.stack([pwm, pwm], axis=1), ticks, seed, feedback)
+    def drive(self, rig: SimulatedRig, ticks: int) -> FloatArray:
+        pwm = np.where(tick_times(rig, ticks) < self.off_at_s - 1e-9, _pwm(rig, self.volt), 0.0)
+        return np.stack([pwm, pwm], axis=1)
 
     def figures(self, run: Run) -> Figures:
         mm, off = elongation_mm(run), round(self.off_at_s / run.tick_s)
@@ -264,61 +270,43 @@ class Deflate:
         return {"inflated_mm": float(mm[off]), "deflation_s": fall_time_s(run.tick_s, mm[off:])}
 
 
-@dataclass(frozen=True)
-class Chirp:
+class Chirp(Scenario):
     """Both motors swept through frequencies, the second a quarter of a turn behind, for identification."""
 
-    duration_s: float = 40.0
-    middle_pwm: float = 170.0
-    amplitude_pwm: float = 70.0
-    from_hz: float = 0.05
-    to_hz: float = 2.0
+    duration_s: Plain = 40.0
+    middle_pwm: Plain = 170.0
+    amplitude_pwm: Plain = 70.0
+    from_hz: Annotated[Plain, Field(gt=0.0)] = 0.05
+    to_hz: Plain = 2.0
 
-    def __post_init__(self) -> None:
-        if not 0.0 < self.from_hz <= self.to_hz:
-            raise BadInputError(
-                f"chirp: found {self.from_hz:g} to {self.to_hz:g} Hz, expected rising frequencies"
-            )
+    @model_validator(mode="after")
+    def _rising(self) -> Chirp:
+        if self.to_hz < self.from_hz:
+            raise contradiction(f"to_hz is {self.to_hz:g}, expected at least from_hz, {self.from_hz:g}")
+        return self
 
-    def run(self, rig: SimulatedRig, ticks: int, seed: int, feedback: str) -> Run:
+    def drive(self, rig: SimulatedRig, ticks: int) -> FloatArray:
         t, growth = tick_times(rig, ticks), np.log(self.to_hz / self.from_hz)
         span = ticks * rig.pump.tick_s
         cycles = self.from_hz * (t if growth == 0.0 else span / growth * np.expm1(growth * t / span))
         phase = 2.0 * np.pi * cycles
         waves = np.stack([np.sin(phase), np.cos(phase)], axis=1)
-        pwm = np.clip(np.floor(self.middle_pwm + self.amplitude_pwm * waves + 0.5), 0.0, 255.0)
-        return run_loop(rig, at_rest(rig), pwm, ticks, seed, feedback)
-
-    def figures(self, run: Run) -> Figures:
-        return _span(run)
+        return np.clip(np.floor(self.middle_pwm + self.amplitude_pwm * waves + 0.5), 0.0, 255.0)
 
 
-@dataclass(frozen=True)
-class Prbs:
+class Prbs(Scenario):
     """Each motor jumps at random between two values, at random times, for identification."""
 
-    duration_s: float = 40.0
-    low_pwm: float = 105.0
-    high_pwm: float = 235.0
-    hold_s: float = 0.5
-
-    def __post_init__(self) -> None:
-        if not self.hold_s > 0.0:
-            raise BadInputError(f"prbs hold_s: found {self.hold_s:g} s, expected a positive time")
+    duration_s: Plain = 40.0
+    low_pwm: Plain = 105.0
+    high_pwm: Plain = 235.0
+    hold_s: Annotated[Plain, Field(gt=0.0)] = 0.5
 
     def run(self, rig: SimulatedRig, ticks: int, seed: int, feedback: str) -> Run:
         hold = max(round(self.hold_s / rig.pump.tick_s), 1)
         bits = uniform(stream(seed, _PRBS), 2 * (ticks // hold + 1)).reshape(-1, 2) < 0.5
         pwm = np.repeat(np.where(bits, self.low_pwm, self.high_pwm), hold, axis=0)[:ticks]
         return run_loop(rig, at_rest(rig), np.clip(pwm, 0.0, 255.0), ticks, seed, feedback)
-
-    def figures(self, run: Run) -> Figures:
-        return _span(run)
-
-
-def _span(run: Run) -> Figures:
-    q = run.states[:, :2]
-    return {"shortest_bellows_mm": float(1e3 * q.min()), "longest_bellows_mm": float(1e3 * q.max())}
 
 
 # ----------------------------------------------------------------------
@@ -338,53 +326,62 @@ _POSITION: dict[str, tuple[Pid, bool]] = {
 }
 
 
-def _one_of(what: str, value: str, known: Iterable[str]) -> None:
-    if value not in known:
-        raise BadInputError(f"{what}: found {value!r}, expected one of {', '.join(known)}")
+def _limited(pid: Pid, u1: float, u2: float) -> Pair:
+    return saturate(u1, low=pid.low, high=pid.high), saturate(u2, low=pid.low, high=pid.high)
 
 
-def _tuned(rig: SimulatedRig, pid: Pid, Kp: float, Ki: float, Kd: float) -> Pid:
-    """The controller with the gains that were given in place of its own, at the rig's tick."""
-    own = ((Kp, pid.Kp), (Ki, pid.Ki), (Kd, pid.Kd))
-    P, I, D = (default if or_none(given) is None else given for given, default in own)  # noqa: E741  the field's letters
-    return replace(pid, Kp=P, Ki=I, Kd=D, tick_s=rig.pump.tick_s)
+def angle_law(pid: Pid, wanted_rad: FloatArray, sign: int = 1) -> Law:
+    """Control of the angle (4.1) along (n,) [rad]."""
+    wanted, channels = wanted_rad.tolist(), Channels(pid)
+
+    def law(k: int, seen: Seen) -> Pair:
+        error = sign * (wanted[k] - seen.phi_rad)
+        return _limited(pid, *channels.step(error, -error))
+
+    return law
 
 
-@dataclass(frozen=True)
-class Orientation:
+def length_law(pid: Pid, wanted_m: FloatArray, added_pwm: FloatArray) -> Law:
+    """Control of the lengths (4.5) along (n, 2) [m], with a feed-forward (n, 2)."""
+    wanted, added, channels = wanted_m.tolist(), added_pwm.tolist(), Channels(pid)
+
+    def law(k: int, seen: Seen) -> Pair:
+        u1, u2 = channels.step(wanted[k][0] - seen.q_m[0], wanted[k][1] - seen.q_m[1])
+        return _limited(pid, u1 + added[k][0], u2 + added[k][1])
+
+    return law
+
+
+class _Controlled(Scenario):
+    """A scenario with gains that stand in place of its controller's own."""
+
+    Kp: Plain | None = None
+    Ki: Plain | None = None
+    Kd: Plain | None = None
+
+    def _tuned(self, rig: SimulatedRig, pid: Pid) -> Pid:
+        """The controller at the rig's tick."""
+        given = {name: getattr(self, name) for name in ("Kp", "Ki", "Kd")}
+        own = {name: value for name, value in given.items() if value is not None}
+        return replace(pid, **own, tick_s=rig.pump.tick_s)
+
+
+class Orientation(_Controlled):
     """The angle alone, with P, PID or PID with clamping (4.1 - 4.4); a jump at 5 s (Fig. 4.7).
 
     `controller` is p, pid or clamping with the gains of Figs. 4.2 and 4.4, which Kp, Ki, Kd replace.
     """
 
-    duration_s: float = 10.0
-    controller: str = "pid"
-    Kp: float = UNSET
-    Ki: float = UNSET
-    Kd: float = UNSET
-    reference_rad: float = 0.7
-    jump_to_rad: float = 0.3
-    jump_at_s: float = 5.0
-    sign: int = 1
+    controller: Literal["p", "pid", "clamping"] = "pid"
+    reference_rad: Plain = 0.7
+    jump_to_rad: Plain = 0.3
+    jump_at_s: Plain = 5.0
+    sign: Annotated[Literal[1, -1], BeforeValidator(int)] = 1
 
-    def __post_init__(self) -> None:
-        _one_of("controller", self.controller, _ORIENTATION)
-        if self.sign not in (1, -1):
-            raise BadInputError(f"sign of the orientation error: found {self.sign}, expected 1 or -1")
-
-    def _law(self, rig: SimulatedRig, ticks: int) -> Law:
-        pid = _tuned(rig, _ORIENTATION[self.controller], self.Kp, self.Ki, self.Kd)
+    def drive(self, rig: SimulatedRig, ticks: int) -> Law:
         early = tick_times(rig, ticks) + 1e-9 < self.jump_at_s
-        wanted = np.where(early, self.reference_rad, self.jump_to_rad).tolist()
-
-        def law(k: int, memory: LoopState, seen: Seen) -> tuple[LoopState, Pair]:
-            memory, (u1, u2) = step_orientation(pid, memory, wanted[k], seen.phi_rad, self.sign)
-            return memory, (saturate(u1), saturate(u2))
-
-        return law
-
-    def run(self, rig: SimulatedRig, ticks: int, seed: int, feedback: str) -> Run:
-        return run_loop(rig, at_rest(rig), self._law(rig, ticks), ticks, seed, feedback)
+        wanted = np.where(early, self.reference_rad, self.jump_to_rad)
+        return angle_law(self._tuned(rig, _ORIENTATION[self.controller]), wanted, self.sign)
 
     def figures(self, run: Run) -> Figures:
         jump = max(min(round(self.jump_at_s / run.tick_s), len(run.pwm)), 1)
@@ -397,47 +394,31 @@ class Orientation:
         return figures
 
 
-def _position_law(pid: Pid, feed: bool, wanted_m: FloatArray) -> Law:
-    rows, line = wanted_m.tolist(), FeedForward()
-
-    def law(k: int, memory: LoopState, seen: Seen) -> tuple[LoopState, Pair]:
-        q1, q2 = rows[k]
-        memory, (u1, u2) = step_position(pid, memory, (q1, q2), seen.q_m)
-        if feed:
-            u1, u2 = u1 + feed_forward(line, q1), u2 + feed_forward(line, q2)
-        return memory, (saturate(u1), saturate(u2))
-
-    return law
+def _line(wanted_m: FloatArray, feed: bool) -> FloatArray:
+    return feed_forward(FeedForward(), wanted_m) if feed else np.zeros_like(wanted_m)
 
 
 def _errors_mm(run: Run, wanted_m: FloatArray) -> FloatArray:
     return np.asarray(1e3 * (wanted_m - run.states[:, :2]))
 
 
-@dataclass(frozen=True)
-class Elongation:
+class Elongation(_Controlled):
     """Both bellows along (4.7), held after 5 s (Fig. 4.12).
 
     `controller` is pd+ff, pd or pid with the gains of Fig. 4.12, which Kp, Ki, Kd replace.
     `start_m` is the length at the start, by default the rest length; the source's run began at 68.1 mm.
     """
 
-    duration_s: float = 10.0
-    controller: str = "pd+ff"
-    Kp: float = UNSET
-    Ki: float = UNSET
-    Kd: float = UNSET
-    start_m: float = UNSET
+    controller: Literal["pd+ff", "pd", "pid"] = "pd+ff"
+    start_m: Plain | None = None
 
-    def __post_init__(self) -> None:
-        _one_of("controller", self.controller, _POSITION)
+    def start(self, rig: SimulatedRig) -> RigState:
+        return rig_at_rest(rig.plant, rig.pump, length_m=self.start_m)
 
-    def run(self, rig: SimulatedRig, ticks: int, seed: int, feedback: str) -> Run:
+    def drive(self, rig: SimulatedRig, ticks: int) -> Law:
         pid, feed = _POSITION[self.controller]
-        pid = _tuned(rig, pid, self.Kp, self.Ki, self.Kd)
-        law = _position_law(pid, feed, PolynomialElongation().bellows_m(tick_times(rig, ticks)))
-        start = rig_at_rest(rig.plant, rig.pump, length_m=or_none(self.start_m))
-        return run_loop(rig, start, law, ticks, seed, feedback)
+        wanted = PolynomialElongation().bellows_m(tick_times(rig, ticks))
+        return length_law(self._tuned(rig, pid), wanted, _line(wanted, feed))
 
     def figures(self, run: Run) -> Figures:
         error = _errors_mm(run, PolynomialElongation().bellows_m(run.t_s))
@@ -448,26 +429,22 @@ class Elongation:
         return figures
 
 
-@dataclass(frozen=True)
-class EllipseTrack:
+class EllipseTrack(Scenario):
     """The head around the ellipse (4.9) with PD and feed-forward (Figs. 4.14 - 4.18)."""
 
-    duration_s: float = 20.0
-    chord: str = "exact"
-    Kp: float = 10000.0
-    Kd: float = 1000.0
+    duration_s: Plain = 20.0
+    chord: Literal["exact", "thesis"] = "exact"
+    Kp: Plain = 10000.0
+    Kd: Plain = 1000.0
     feedforward: bool = True
-
-    def __post_init__(self) -> None:
-        _one_of("chord", self.chord, ("exact", "thesis"))
 
     def _wanted(self, rig: SimulatedRig, t_s: FloatArray) -> FloatArray:
         return Ellipse(chord=self.chord).bellows_m(t_s, rig.plant.bellows_radius_m)
 
-    def run(self, rig: SimulatedRig, ticks: int, seed: int, feedback: str) -> Run:
+    def drive(self, rig: SimulatedRig, ticks: int) -> Law:
+        wanted = self._wanted(rig, tick_times(rig, ticks))
         pid = Pid(self.Kp, 0.0, self.Kd, tick_s=rig.pump.tick_s)
-        law = _position_law(pid, self.feedforward, self._wanted(rig, tick_times(rig, ticks)))
-        return run_loop(rig, at_rest(rig), law, ticks, seed, feedback)
+        return length_law(pid, wanted, _line(wanted, self.feedforward))
 
     def figures(self, run: Run) -> Figures:
         error = _errors_mm(run, self._wanted(run.rig, run.t_s))[run.t_s >= 2.0]
@@ -497,10 +474,10 @@ class EllipseTrack:
 #
 # What the model does not reproduce: the wobble of the ellipse at 4 - 5 s and its poor second half
 # (Figs. 4.14 - 4.18), the overshoot that the source's own simulation has after deflation (Fig. 3.24), an
-# anti-windup without overshoot (Fig. 4.7), and, while both pumps are alike (see `pump_strength`), the
+# anti-windup without overshoot (Fig. 4.7), and, while both pumps are alike (see `strength`), the
 # different lengths of the two bellows in Figs. 4.12 and 4.13.
 
-SCENARIOS: dict[str, type[Any]] = {
+SCENARIOS: dict[str, type[Scenario]] = {
     "static": Static,
     "swing": SwingRelease,
     "steps": Steps,
@@ -514,49 +491,17 @@ SCENARIOS: dict[str, type[Any]] = {
 """What `make_scenario` knows; `rig`, a folder with all of them, is in `calib.twin.folder`."""
 
 
-def _finite(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
-        raise ValueError(text)
-    return value
+def make_scenario(name: str, options: Mapping[str, object] | None = None) -> Scenario:
+    """A scenario by name, with options as values or as they are typed, such as `{"Kp": "500"}`.
 
-
-def _value(name: str, text: str, default: object) -> object:
-    """An option's text as a value of the default's kind."""
-    try:
-        if isinstance(default, bool):
-            return {"true": True, "yes": True, "false": False, "no": False}[text.strip().lower()]
-        if isinstance(default, tuple):
-            return tuple(_finite(part) for part in text.split(","))
-        if isinstance(default, int):
-            return int(text)
-        if isinstance(default, float):
-            return _finite(text)
-    except (KeyError, ValueError):
-        kinds = {bool: "true or false", tuple: "numbers separated by commas", int: "a whole number"}
-        kind = kinds.get(type(default), "a number")
-        raise UsageError(f"{name}: {text!r} is not {kind}") from None
-    return text
-
-
-def make_scenario(name: str, options: Mapping[str, str] | None = None) -> Scenario:
-    """A scenario by name, with options as they are typed, such as `{"Kp": "500"}`.
-
-    Raises `UsageError` for a name, an option or a value that is not known, `BadInputError` for one
-    that the scenario cannot run with.
+    Raises `UsageError` for a name, an option or a value that the scenario cannot have.
     """
     if name not in SCENARIOS:
         raise UsageError(f"SCENARIO: {name!r} is not one of {', '.join([*SCENARIOS, 'rig'])}")
-    kind = SCENARIOS[name]
-    defaults = {f.name: f.default for f in fields(kind)}
-    values = {}
-    for key, text in (options or {}).items():
-        if key not in defaults or key == "duration_s":
-            known = ", ".join(k for k in defaults if k != "duration_s")
-            raise UsageError(f"{key}: is no option of the scenario {name}, expected one of {known}")
-        values[key] = _value(key, text, defaults[key])
-    scenario: Scenario = kind(**values)
-    return scenario
+    try:
+        return validated(SCENARIOS[name], dict(options or {}), "scenario", name)
+    except BadInputError as error:
+        raise UsageError(str(error)) from error
 
 
 def run_scenario(
@@ -598,15 +543,6 @@ def simulate(
     Raises `UsageError`, `BadInputError` as `make_scenario` and `run_scenario`.
     """
     machine = SimulatedRig() if rig is None else rig_from_file(rig)
-    plan = make_scenario(scenario, {name: as_typed(value) for name, value in settings.items()})
+    plan = make_scenario(scenario, settings)
     duration_s = parse_duration_s(duration, "duration") if isinstance(duration, str) else duration
     return log_of(run_scenario(plan, machine, seed, feedback, duration_s), scenario)
-
-
-def as_typed(value: object) -> str:
-    """A setting as it is typed, such as "500" for 500.0."""
-    if isinstance(value, list | tuple):
-        return ",".join(as_typed(one) for one in value)
-    if isinstance(value, bool):
-        return str(value).lower()
-    return repr(int(value)) if isinstance(value, float) and value == math.floor(value) else str(value)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,14 +12,13 @@ from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
 from calib.io.logs import Log
 from calib.stages.actuator.dynamics import Coefficients, coefficients
-from calib.stages.actuator.kinematics import forward, inverse_coefficients
+from calib.stages.actuator.kinematics import forward
 from calib.stages.actuator.parameters import Plant
 from calib.stages.actuator.pump import PumpCoefficients, delayed, pump_coefficients, static_force_N
 from calib.stages.actuator.simulate import STATE, RigState, check_start, largest_step_s
 from calib.stages.actuator.simulate import run as run_kernel
-from calib.stages.control.laws import LoopState
-from calib.stages.imu.mahony import Mahony, MahonyState, advance
-from calib.stages.lowpass.filters import Design, design_lowpass
+from calib.stages.estimator.baseline import Baseline, BaselineSetup
+from calib.stages.estimator.kinematic import Rows
 from calib.twin.rig import SimulatedRig, workspace_homography
 from calib.twin.sensors import (
     ImuNoise,
@@ -34,21 +33,17 @@ from calib.twin.sensors import (
 )
 
 # ----------------------------------------------------------------------
-# What the thesis's firmware makes of its sensors, tick by tick: the measurement that closes the loop.
+# The simulated rig at work: plant, pumps, sensors and controller, tick by tick, and the log of it.
 #
-#     IMU, 100 Hz    ->  MM filter 3/3                                                  phi      (2.3)
-#     camera, 60 Hz  ->  homography without undistortion  ->  marker                           (2.11),
-# (2.12)
-#                    ->  head by the marker's offset and phi                                   (A.1)
-#                    ->  first-order low-pass, 1 Hz at 60 Hz                            x, y
-#     x, y, phi      ->  series of the inverse kinematics                               q1, q2   (3.12),
-# (3.14)
+# At tick k the controller gets what it sees at that moment, its command starts its way to the pumps,
+# and the plant moves on to tick k + 1. What it sees is either the truth or what the firmware has made
+# of the sensors' readings by then (`calib.stages.estimator.baseline`): the IMU samples up to the tick,
+# and the camera's picture that was exposed one latency earlier. Latency, bias, mount angle and lens are not
+# corrected there, so that a loop closed over these values errs as the real one does. Without a controller
+# the commands are known beforehand and all ticks are run at once.
 #
-# Time stamps are not used: the firmware counts samples. Where the camera found nothing the last marker
-# is held. Latency, bias, mount angle and lens are not corrected either, so that a loop closed over
-# these values errs as the real one does.
-
-_F_SERIES = tuple(float(c) for c in inverse_coefficients())
+# The log has one row per tick, with the marker and the commands given in that tick, and one per IMU
+# sample in between. Its true_* columns are the state at the row's own time stamp.
 
 
 @dataclass(frozen=True)
@@ -65,113 +60,6 @@ class Seen:
     imu: tuple[tuple[float, float, float], ...] = ()
 
 
-@dataclass(frozen=True)
-class Firmware:
-    """Constants of the firmware.
-
-    Attributes
-    ----------
-    to_plane : (3, 3) pixels to metres, A^-1 of (2.11).
-    bellows_radius_m, rest_length_m : of the actuator; the second until the first frame.
-    marker_offset_m : d of (A.1).
-    imu_rate_hz : rate that the angle filter counts on.
-    mahony : filter of the angle. lowpass : (6,) section of first order.
-    """
-
-    to_plane: FloatArray
-    bellows_radius_m: float
-    rest_length_m: float
-    marker_offset_m: float
-    imu_rate_hz: float
-    mahony: Mahony = field(default_factory=Mahony)
-    lowpass: FloatArray = field(default_factory=lambda: design_lowpass(Design()).exact[0])
-
-
-@dataclass(frozen=True)
-class FirmwareState:
-    """Memory of the firmware; None before the first sample of each sensor.
-
-    Attributes
-    ----------
-    angle : of the MM filter.
-    marker_m : last marker in the plane.
-    x, y : head before the low-pass and behind it.
-    """
-
-    angle: MahonyState | None = None
-    marker_m: tuple[float, float] | None = None
-    x: tuple[float, float] | None = None
-    y: tuple[float, float] | None = None
-
-
-def add_imu(
-    firmware: Firmware, state: FirmwareState, ax_mps2: float, ay_mps2: float, gz_radps: float
-) -> FirmwareState:
-    """State after one sample of the IMU; the first one sets the angle to the accelerometer's."""
-    phi_acc, before, gains = math.atan2(ay_mps2, ax_mps2), state.angle, firmware.mahony
-    if before is None:
-        return replace(state, angle=MahonyState(phi_acc, 0.0))
-    dt_s = 1.0 / firmware.imu_rate_hz
-    phi, integral = advance(
-        before.phi_rad, before.integral_radps, phi_acc, -gz_radps, dt_s, gains.Kp, gains.Ki
-    )
-    return replace(state, angle=MahonyState(phi, integral))
-
-
-def _marker(firmware: Firmware, u: float, v: float) -> tuple[float, float]:
-    H = firmware.to_plane
-    s = 1.0 / (H[2, 0] * u + H[2, 1] * v + H[2, 2])
-    return (
-        float(s * (H[0, 0] * u + H[0, 1] * v + H[0, 2])),
-        float(s * (H[1, 0] * u + H[1, 1] * v + H[1, 2])),
-    )
-
-
-def _low_passed(firmware: Firmware, before: tuple[float, float] | None, x: float) -> tuple[float, float]:
-    """Input and output of the low-pass after one sample; the first one passes as it is."""
-    if before is None:
-        return x, x
-    b0, a1 = float(firmware.lowpass[0]), float(firmware.lowpass[4])
-    return x, b0 * (x + before[0]) - a1 * before[1]
-
-
-def _bellows(x: float, y: float, phi: float, bellows_radius_m: float) -> tuple[float, float]:
-    """q1, q2 [m] by (3.12) with the series (3.14) in place of f."""
-    w, f = phi * phi, 0.0
-    for coefficient in reversed(_F_SERIES):
-        f = f * w + coefficient
-    length = 0.5 * math.hypot(x, y) * f
-    return length + bellows_radius_m * phi, length - bellows_radius_m * phi
-
-
-def add_frame(
-    firmware: Firmware, state: FirmwareState, u_px: float, v_px: float
-) -> tuple[FirmwareState, Seen]:
-    """State after a tick's frame, NaN where the camera found nothing, and what the controller gets."""
-    phi = 0.0 if state.angle is None else state.angle.phi_rad
-    marker = state.marker_m if math.isnan(u_px) else _marker(firmware, u_px, v_px)
-    if marker is None:
-        turned = firmware.bellows_radius_m * phi
-        return state, Seen(phi, (firmware.rest_length_m + turned, firmware.rest_length_m - turned))
-    x = marker[0] - firmware.marker_offset_m * math.sin(phi)
-    y = marker[1] - firmware.marker_offset_m * math.cos(phi)
-    low_x, low_y = _low_passed(firmware, state.x, x), _low_passed(firmware, state.y, y)
-    q = _bellows(low_x[1], low_y[1], phi, firmware.bellows_radius_m)
-    return FirmwareState(state.angle, marker, low_x, low_y), Seen(phi, q)
-
-
-# ----------------------------------------------------------------------
-# The simulated rig at work: plant, pumps, sensors and controller, tick by tick, and the log of it.
-#
-# At tick k the controller gets what it sees at that moment, its command starts its way to the pumps,
-# and the plant moves on to tick k + 1. What it sees is either the truth or what the firmware has made
-# of the sensors' readings by then (`calib.twin.simulate`): the IMU samples up to the tick, and the camera's
-# picture that was exposed one latency earlier. Without a controller the commands are known beforehand
-# and all ticks are run at once.
-#
-# The log has one row per tick, with the marker and the commands given in that tick, and one per IMU
-# sample in between. Its true_* columns are the state at the row's own time stamp.
-
 FEEDBACKS = ("sensors", "truth")
 
 LONGEST_S = 7200.0
@@ -182,8 +70,8 @@ _NODES_PER_TICK = 5
 """Steps of 0.83 ms; at 60 Hz nodes 1/300 s apart, so that 100 Hz samples fall on nodes."""
 
 Pair = tuple[float, float]
-Law = Callable[[int, LoopState, Seen], tuple[LoopState, Pair]]
-"""A controller: tick, its memory and what it sees in; memory and PWM values out."""
+Law = Callable[[int, Seen], Pair]
+"""A controller, called at one tick after the other: tick and what it sees in, PWM values out."""
 
 
 @dataclass(frozen=True)
@@ -239,7 +127,7 @@ class _Plant:
         self.tick_s = rig.pump.tick_s
         self.c: Coefficients = coefficients(plant)
         self.p: PumpCoefficients = pump_coefficients(rig.pump)
-        self.strength = np.array(rig.pump_strength)
+        self.strength = np.array(rig.strength)
         step, largest = self.tick_s / _SUBSTEPS, largest_step_s(plant)
         if step > largest:
             raise BadInputError(
@@ -290,30 +178,30 @@ class _Eyes:
     """The firmware at work: from the readings up to a tick to what the controller sees."""
 
     def __init__(self, rig: SimulatedRig, sensors: _Sensors) -> None:
-        self.firmware = Firmware(
-            np.asarray(np.linalg.inv(workspace_homography(rig.view)), dtype=np.float64),
-            rig.plant.bellows_radius_m,
-            rig.plant.rest_length_m,
-            rig.tracker.marker_offset_m,
-            rig.imu.rate_hz,
+        to_plane = np.asarray(np.linalg.inv(workspace_homography(rig.view)), dtype=np.float64)
+        plant, offset_m = rig.plant, rig.tracker.marker_offset_m
+        self.firmware = Baseline(
+            BaselineSetup(to_plane, plant.bellows_radius_m, plant.rest_length_m, offset_m, rig.imu.rate_hz)
         )
         self.sensors = sensors
-        self.state = FirmwareState()
 
     def look(self, k: int, past: Trajectory) -> Seen:
         sensors = self.sensors
         samples = slice(int(sensors.due[k - 1]) if k else 0, int(sensors.due[k]))
-        readings: list[tuple[float, float, float]] = []
-        if samples.stop > samples.start:
+        count = samples.stop - samples.start
+        if count:
             sensors.take_samples(past, samples)
-            force, rate = sensors.accel[samples].tolist(), sensors.gyro[samples].tolist()
-            readings = [(ax, ay, gz) for (ax, ay, _), (_, _, gz) in zip(force, rate, strict=True)]
-            for ax, ay, gz in readings:
-                self.state = add_imu(self.firmware, self.state, ax, ay, gz)
         sensors.take_frames(past, slice(k, k + 1))
+        # The samples since the last tick, then its picture.
+        readings = np.full((count + 1, 5), np.nan)
+        readings[:-1, 2:4], readings[:-1, 4] = sensors.accel[samples, :2], sensors.gyro[samples, 2]
+        readings[-1, :2] = sensors.pixels[k]
+        kinds = np.full(count + 1, 2)
+        kinds[-1] = 1
+        _, q1, q2, phi, *_ = self.firmware.run(Rows(np.zeros(count + 1), readings, kinds))[-1].tolist()
         u, v = sensors.pixels[k].tolist()
-        self.state, seen = add_frame(self.firmware, self.state, u, v)
-        return replace(seen, marker_px=(u, v), imu=tuple(readings))
+        imu = tuple((ax, ay, gz) for ax, ay, gz in readings[:-1, 2:].tolist())
+        return Seen(phi, (q1, q2), (u, v), imu)
 
 
 def _truth(row: FloatArray, bellows_radius_m: float) -> Seen:
@@ -327,15 +215,14 @@ def _close_loop(
     """Fill the nodes; returns the commands (n, 2) and what the controller saw (n, 3)."""
     per, node_s = _NODES_PER_TICK, plant.tick_s / _NODES_PER_TICK
     pwm, seen = np.empty((ticks, 2)), np.empty((ticks, 3))
-    memory, waiting = LoopState(), list(start.waiting_pwm)
+    waiting = list(start.waiting_pwm)
     for k in range(ticks):
         here = per * k
         if eyes is None:
             view = _truth(nodes[here], plant.c.r)
         else:
             view = eyes.look(k, Trajectory(node_s, nodes[: here + 1]))
-        memory, command = law(k, memory, view)
-        pwm[k] = command
+        pwm[k] = command = law(k, view)
         seen[k] = view.phi_rad, *view.q_m
         waiting.append(command)
         arriving = np.array([waiting.pop(0)])

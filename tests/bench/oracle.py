@@ -63,7 +63,7 @@ def told_plant(rig: SimulatedRig, drive: Drive) -> Drive:
         drive,
         plant=rig.plant,
         pump=rig.pump,
-        strength=rig.pump_strength,
+        strength=rig.strength,
         free_damping_scale=rig.free_damping_scale,
         sigma=tuple(NOTHING * value for value in drive.sigma),
     )

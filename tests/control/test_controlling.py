@@ -60,7 +60,7 @@ def test_computed_torque_on_the_ellipse_with_sensors(seed: int) -> None:
 def test_computed_torque_on_a_rig_that_is_not_the_model() -> None:
     """Pumps 10 % weaker and 5 % stronger, a stiffer plant: the observer's force makes up for it."""
     plant = replace(RIG.plant, stiffness_scale=1.1, bending_N_per_rad2=0.2)
-    other = replace(RIG, plant=plant, pump_strength=(0.95, 1.1))
+    other = replace(RIG, plant=plant, strength=(0.95, 1.1))
     reference = built_in(MODEL, "ellipse")
     line = _run("pd+ff", reference, rig=other).figures
     found = _run("torque", reference, rig=other).figures
@@ -112,15 +112,14 @@ def test_the_same_seed_the_same_run() -> None:
 
 def test_a_controller_may_read_the_sensors_themselves() -> None:
     """The samples of each tick once, in order, and the marker as the tracker reports it."""
-    from calib.stages.control.laws import LoopState
     from calib.twin.scenarios import at_rest
     from calib.twin.simulate import Seen, simulate
 
     read: list[Seen] = []
 
-    def law(k: int, memory: LoopState, seen: Seen) -> tuple[LoopState, tuple[float, float]]:
+    def law(k: int, seen: Seen) -> tuple[float, float]:
         read.append(seen)
-        return memory, (0.0, 0.0)
+        return 0.0, 0.0
 
     run = simulate(RIG, at_rest(RIG), law, 60, 1, "sensors")
     rows = [row for seen in read for row in seen.imu]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import re
@@ -239,9 +238,7 @@ def test_the_reference_names_every_column_section_and_scenario() -> None:
     options = {name: re.findall(r"`(\w+)`", cell) for name, cell in rows}
     assert options.pop("rig") == []
     for name, kind in SCENARIOS.items():
-        assert options.pop(name) == [
-            field.name for field in dataclasses.fields(kind) if field.name != "duration_s"
-        ], name
+        assert options.pop(name) == [field for field in kind.model_fields if field != "duration_s"], name
     assert not options
 
 

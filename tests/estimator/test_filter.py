@@ -24,7 +24,6 @@ from calib.io.logs import Watch
 from calib.stages.actuator.kinematics import forward as forward_of_sensors
 from calib.stages.camera.model import Camera
 from calib.stages.estimator import reference, sensors, smoother
-from calib.stages.estimator.baseline import Baseline, BaselineSetup
 from calib.stages.estimator.consistency import Tally, chi_square_band, nees
 from calib.stages.estimator.event import CAMERA, IMU, REPORT, camera_terms, imu_terms
 from calib.stages.estimator.kinematic import (
@@ -48,10 +47,10 @@ from calib.stages.estimator.replay import consistent, sampled
 from calib.stages.estimator.section import SensorCheck
 from calib.stages.estimator.sensors import SENSOR, SIZE, truncated, update_terms
 from calib.stages.estimator.smoother import Events, OneLevel, banked, events_of, forward, one_level
-from calib.twin.rig import SimulatedRig, nominal_view, workspace_homography
+from calib.twin.rig import SimulatedRig, nominal_view
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.sensors import HeadMotion, Imu, ImuNoise, Tracker, marker_pixels, measure
-from calib.twin.simulate import Firmware, FirmwareState, add_frame, add_imu, log_of
+from calib.twin.simulate import log_of
 
 TARGET_MM = {"static": 0.08, "swing": 0.22, "ellipse": 0.19, "step": 0.22, "elongation": 0.18}
 TARGET_DEG = {"swing": 0.06}
@@ -639,22 +638,6 @@ def test_no_function_may_round_as_its_compilation_happens_to_be(package: ModuleT
         found += [one for one in vars(module).values() if isinstance(one, Dispatcher)]
     assert len(found) > 5
     assert not [one.__name__ for one in found if one.targetoptions.get("fastmath")]
-
-
-def test_it_is_the_firmware_of_the_simulated_rig() -> None:
-    rig, log = simulated("ellipse", 1)
-    to_plane = np.linalg.inv(workspace_homography(rig.view))
-    rows = rows_from(log)
-    made = Baseline(BaselineSetup(to_plane, rig.plant.bellows_radius_m, rig.plant.rest_length_m)).run(rows)
-    firmware = Firmware(to_plane, rig.plant.bellows_radius_m, rig.plant.rest_length_m, 0.015, 100.0)
-    state = FirmwareState()
-    for i in range(600):
-        u, v, ax, ay, gz = rows.readings[i].tolist()
-        if rows.kinds[i] == 2:
-            state = add_imu(firmware, state, ax, ay, gz)
-            continue
-        state, seen = add_frame(firmware, state, u, v)
-        assert np.allclose(made[i, 1:4], [*seen.q_m, seen.phi_rad], rtol=0, atol=1e-12)
 
 
 GOOD = {"degrees": 2, "readings": 900, "gated": 2, "nis": 2.1, "inside": 0.95, "correlation": 0.02}

@@ -31,7 +31,6 @@ from firmware_rigs import header, rig
 from calib.core.rig import Rig
 from calib.io.serial import MODE_ORIENTATION, MODE_POSITION, Inputs
 from calib.stages.actuator.simulate import rig_at_rest
-from calib.stages.control.laws import LoopState
 from calib.stages.control.references import Ellipse
 from calib.stages.firmware.conformance import reference_of
 from calib.stages.firmware.header import header_of, verbatim
@@ -228,7 +227,7 @@ def closed(processor: Processor, wanted: np.ndarray, mode: int) -> np.ndarray:
     """Lengths (n, 2) at the ticks of a loop that the processor closes; `wanted` (n, 2)."""
     record = Inputs(0.0, 0.0, 9.81, 0.0, 0.0, mode=mode)
 
-    def law(k: int, memory: LoopState, seen: Seen) -> tuple[LoopState, tuple[float, float]]:
+    def law(k: int, seen: Seen) -> tuple[float, float]:
         nonlocal record
         u, v = seen.marker_px
         ax, ay, gz = seen.imu[-1] if seen.imu else (record.ax_mps2, record.ay_mps2, record.gz_radps)
@@ -237,7 +236,7 @@ def closed(processor: Processor, wanted: np.ndarray, mode: int) -> np.ndarray:
             u, v = record.u_px, record.v_px
         record = binary32(Inputs(u, v, ax, ay, gz, (first, second), there, True, mode))
         low, high = processor(record)
-        return memory, (low, high)
+        return low, high
 
     machine = SimulatedRig()
     return simulate(machine, rig_at_rest(machine.plant, machine.pump), law, len(wanted), seed=5).states[:, :2]

@@ -18,12 +18,10 @@ from source_model import head_from_marker, inverse_series
 from calib.io.serial import MODE_OFF, MODE_ORIENTATION, MODE_POSITION, Inputs
 from calib.stages.camera.model import Camera, undistort
 from calib.stages.control.laws import (
+    Channels,
     FeedForward,
-    LoopState,
     Pid,
     feed_forward,
-    step_orientation,
-    step_position,
 )
 from calib.stages.estimator.constant_gain import Gains, Ticks, run_gains
 from calib.stages.estimator.kinematic import Setup, Start
@@ -443,8 +441,9 @@ def test_every_stage_is_the_projects_own(mode: int) -> None:
     reference = Reference(constants)
     angle: tuple[float, float] | None = None
     lowpass, heads = design_lowpass(Design()).exact, []
-    loop = LoopState()
-    turning, stretching = Pid(1000.0, 1000.0, 10.0, clamping=True), Pid(15000.0, 0.0, 150.0)
+    turning, stretching = (
+        Channels(one) for one in (Pid(1000.0, 1000.0, 10.0, clamping=True), Pid(15000.0, 0.0, 150.0))
+    )
     for given in _ticks(mode):
         out = reference.step(given)
         phi_acc = math.atan2(given.ay_mps2, given.ax_mps2)
@@ -461,10 +460,11 @@ def test_every_stage_is_the_projects_own(mode: int) -> None:
         q = inverse_series(np.array([*out.head_m, out.phi_rad]), 0.0126)
         assert out.q_m == pytest.approx(q, abs=1e-8)
         if mode == MODE_POSITION:
-            loop, u = step_position(stretching, loop, given.reference, out.q_m)
-            u = np.add(u, [feed_forward(FeedForward(), q) for q in given.reference])
+            u = stretching.step(*(r - q for r, q in zip(given.reference, out.q_m, strict=True)))
+            u = np.add(u, feed_forward(FeedForward(), given.reference))
         else:
-            loop, u = step_orientation(turning, loop, given.reference[0], out.phi_rad)
+            error = given.reference[0] - out.phi_rad
+            u = turning.step(error, -error)
         assert out.pwm == pytest.approx(np.clip(u, 0.0, 255.0), abs=1e-3)
 
 

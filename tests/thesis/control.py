@@ -20,19 +20,16 @@ from calib.stages.actuator.kinematics import forward, inverse
 from calib.stages.actuator.pump import PWM_MAX, ElongationForce
 from calib.stages.control.laws import (
     PWM_MIN,
+    Channels,
     FeedForward,
-    LoopState,
     Pid,
     PidState,
     feed_forward,
-    saturate,
     step,
-    step_orientation,
-    step_position,
 )
 from calib.stages.control.references import Ellipse, PolynomialElongation
-from calib.twin.scenarios import StepResponse, at_rest, step_response
-from calib.twin.simulate import Run, Seen, simulate
+from calib.twin.scenarios import StepResponse, at_rest, length_law, step_response
+from calib.twin.simulate import Run, simulate
 from thesis.plot import curve, curves_of
 from thesis.runs import (
     RigMaker,
@@ -138,10 +135,9 @@ def _angle_reference(run: Run) -> Curve:
 
 def unsaturated(run: Run, pid: Pid) -> FloatArray:
     """Outputs (n, 2) [PWM] of the controllers before the limits, from what they got in a run."""
-    state, out = LoopState(), []
+    channels, out = Channels(pid), []
     for reference, phi in zip(_angle_reference(run).y.tolist(), seen(run)[:, 0].tolist(), strict=True):
-        state, u = step_orientation(pid, state, reference, phi)
-        out.append(u)
+        out.append(channels.step(reference - phi, phi - reference))
     return np.array(out)
 
 
@@ -282,12 +278,12 @@ def _saturates_m(line: FeedForward) -> float:
 def ctl_ff() -> Values:
     line, (u, length) = FeedForward(), _steady_lengths(110.0, 300)
     inside = (length >= line.from_m) & (length <= 0.091)
-    off = np.array([feed_forward(line, q) for q in length[inside].tolist()]) - u[inside]
+    off = feed_forward(line, length[inside]) - u[inside]
     return {
         "worst_pwm": float(np.abs(off).max()),
         "rms_pwm": float(np.sqrt(np.mean(off**2))),
         "slope_pwm_per_m": float(np.polyfit(length[inside], u[inside], 1)[0]),
-        "at_91mm_pwm": feed_forward(line, 0.091),
+        "at_91mm_pwm": float(feed_forward(line, 0.091)),
         "saturates_mm": 1e3 * _saturates_m(line),
     }
 
@@ -358,12 +354,15 @@ def _true_length_mm(run: Run) -> FloatArray:
 def figure_4_11() -> tuple[Plot, Values]:
     line, (pwm, steady) = FeedForward(), _steady_lengths(100.0, 120)
     q = np.concatenate([np.linspace(0.062, line.from_m - 1e-9, 40), np.linspace(line.from_m, 0.097, 160)])
-    output = np.array([feed_forward(line, value) for value in q.tolist()])
+    output = feed_forward(line, q)
     curves = (
         curve("(4.6)", 1e3 * q, output, colour=0),
         curve("steady lengths of (2.13), corrected", 1e3 * steady, pwm, "dashed", 1),
     )
-    values: Values = {"at_91mm_pwm": feed_forward(line, 0.091), "saturates_mm": 1e3 * _saturates_m(line)}
+    values: Values = {
+        "at_91mm_pwm": float(feed_forward(line, 0.091)),
+        "saturates_mm": 1e3 * _saturates_m(line),
+    }
     return Plot("wanted length of a bellows (mm)", "feed-forward (PWM)", curves), values
 
 
@@ -456,14 +455,9 @@ def _ellipse_m() -> FloatArray:
 
 
 def _followed(reference_m: FloatArray, rig: RigMaker, feedback: str) -> Run:
-    pid, line, rows = Pid(10000.0, 0.0, 1000.0), FeedForward(), reference_m.tolist()
-
-    def law(k: int, memory: LoopState, now: Seen) -> tuple[LoopState, tuple[float, float]]:
-        q1, q2 = rows[k]
-        memory, (u1, u2) = step_position(pid, memory, (q1, q2), now.q_m)
-        return memory, (saturate(u1 + feed_forward(line, q1)), saturate(u2 + feed_forward(line, q2)))
-
-    return simulate(rig(), at_rest(rig()), law, len(rows), 0, feedback)
+    pid = Pid(10000.0, 0.0, 1000.0)
+    law = length_law(pid, reference_m, feed_forward(FeedForward(), reference_m))
+    return simulate(rig(), at_rest(rig()), law, len(reference_m), 0, feedback)
 
 
 @once
@@ -556,7 +550,7 @@ def figure_4_10() -> tuple[None, Values]:
     k = round(7.0 / run.tick_s)
     errors = reference - _recorded_m()
     u = 10000.0 * errors[k] + 1000.0 * (errors[k] - errors[k - 1]) / run.tick_s
-    extra = np.array([feed_forward(FeedForward(), q) for q in reference[k].tolist()])
+    extra = feed_forward(FeedForward(), reference[k])
     pairs = {
         "ref_mm": 1e3 * reference[k], "error_mm": 1e3 * errors[k], "seen_mm": 1e3 * _recorded_m()[k],
         "feedback_pwm": u, "ff_pwm": extra, "total_pwm": u + extra, "sent_pwm": run.pwm[k],

@@ -120,12 +120,12 @@ def other_rig() -> SimulatedRig:
     rig = with_plant(
         stiffness_scale=0.93, bending_N_per_rad2=0.21, creep=Creep(3.6, 12.0, -1.0), damping_scale=17.5
     )
-    return replace(rig, free_damping_scale=3.0, pump_strength=(1.0, 0.96))
+    return replace(rig, free_damping_scale=3.0, strength=(1.0, 0.96))
 
 
 def unlike_rig() -> SimulatedRig:
     """The nominal rig with pumps that are not alike, as the source's two bellows differ."""
-    return replace(nominal(), pump_strength=(1.02, 0.97))
+    return replace(nominal(), strength=(1.02, 0.97))
 
 
 def leaking_rig() -> SimulatedRig:

@@ -19,6 +19,8 @@ from calib.stages.actuator.kinematics import forward, forward_jacobian, forward_
 from calib.stages.actuator.parameters import Plant
 from calib.stages.actuator.simulate import state_row
 from calib.stages.control.references import Ellipse
+from calib.stages.estimator.baseline import Baseline, BaselineSetup
+from calib.stages.estimator.kinematic import Rows
 from calib.twin.rig import nominal_view, workspace_homography
 from calib.twin.sensors import (
     MOTION,
@@ -38,7 +40,6 @@ from calib.twin.sensors import (
     stream,
     track,
 )
-from calib.twin.simulate import Firmware, FirmwareState, add_frame, add_imu
 
 
 def test_the_motion_of_a_swing_is_that_of_its_path() -> None:
@@ -309,19 +310,14 @@ def test_accelerations_are_those_of_the_jacobian_and_its_rate(bend: float) -> No
 
 RADIUS_M_FEEDBACK, D_M = 0.0126, 0.015
 H = workspace_homography(nominal_view())
-FIRMWARE = Firmware(np.linalg.inv(H), RADIUS_M_FEEDBACK, 0.065, D_M, 100.0)
 
 
 def _frames(pixels: np.ndarray, phi: np.ndarray) -> np.ndarray:
-    """phi, q1, q2 at each tick for an angle filter that is told the angle."""
-    state, out = FirmwareState(), []
-    for (u, v), angle in zip(pixels.tolist(), phi.tolist(), strict=True):
-        # A fresh angle filter starts at the accelerometer's angle.
-        state = FirmwareState(None, state.marker_m, state.x, state.y)
-        state = add_imu(FIRMWARE, state, 9.81 * math.cos(angle), 9.81 * math.sin(angle), 0.0)
-        state, seen = add_frame(FIRMWARE, state, u, v)
-        out.append([seen.phi_rad, *seen.q_m])
-    return np.array(out)
+    """phi, q1, q2 at each tick for an angle filter that takes the accelerometer's angle at once."""
+    setup = BaselineSetup(np.linalg.inv(H), RADIUS_M_FEEDBACK, 0.065, D_M, 100.0, Kp=100.0, Ki=0.0)
+    felt = 9.81 * np.stack([np.cos(phi), np.sin(phi), 0.0 * phi], axis=1)
+    rows = Rows(np.zeros(len(phi)), np.column_stack([pixels, felt]), np.full(len(phi), 3))
+    return Baseline(setup).run(rows)[:, [3, 1, 2]]
 
 
 def test_it_is_homography_offset_lowpass_and_series() -> None:

@@ -13,7 +13,7 @@ from calib.io.columns import MEASURED, TRUE
 from calib.io.logs import log_text
 from calib.stages.actuator.parameters import Plant, Stiffness
 from calib.stages.actuator.simulate import rig_at_rest
-from calib.stages.control.laws import LoopState, Pid, PidState, saturate, step
+from calib.stages.control.laws import Channels, Pid, PidState, saturate
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import SCENARIOS, Figures, make_scenario, run_scenario
 from calib.twin.sensors import Imu, Tracker, marker_pixels
@@ -49,9 +49,9 @@ def _run(drive: np.ndarray | Law, ticks: int, rig: SimulatedRig = RIG, **options
 def _playing(pwm: np.ndarray, kept: list[Seen]) -> Law:
     """A controller that plays commands and keeps what it sees."""
 
-    def law(k: int, memory: LoopState, seen: Seen) -> tuple[LoopState, tuple[float, float]]:
+    def law(k: int, seen: Seen) -> tuple[float, float]:
         kept.append(seen)
-        return memory, (float(pwm[k, 0]), float(pwm[k, 1]))
+        return float(pwm[k, 0]), float(pwm[k, 1])
 
     return law
 
@@ -196,14 +196,14 @@ def test_clamping_halves_the_overshoot_of_a_jump_and_slows_the_first_rise() -> N
 
 
 def test_with_the_saturated_output_remembered_clamping_never_reaches() -> None:
-    pid = Pid(1000.0, 1000.0, 10.0, clamping=True)
+    channels = Channels(Pid(1000.0, 1000.0, 10.0, clamping=True))
 
-    def law(k: int, memory: LoopState, seen: Seen) -> tuple[LoopState, tuple[float, float]]:
+    def law(k: int, seen: Seen) -> tuple[float, float]:
         error = 0.7 - seen.phi_rad
-        first, u1 = step(pid, memory.first, error)
-        second, u2 = step(pid, memory.second, -error)
-        u1, u2 = saturate(u1), saturate(u2)
-        return LoopState(PidState(u1, first.e1, first.e2), PidState(u2, second.e1, second.e2)), (u1, u2)
+        u1, u2 = map(saturate, channels.step(error, -error))
+        channels.first = PidState(u1, channels.first.e1, channels.first.e2)
+        channels.second = PidState(u2, channels.second.e1, channels.second.e2)
+        return u1, u2
 
     run = simulate(RIG, rig_at_rest(RIG.plant, RIG.pump), law, 300, 0, "truth")
     assert run.phi_rad.max() < 0.7
@@ -253,8 +253,12 @@ def test_every_scenario_gives_a_log_of_the_length_asked_for(name: str) -> None:
     ("name", "options", "words"),
     [
         ("wobble", {}, "SCENARIO: 'wobble' is not one of static, swing, .*, prbs, rig"),
-        ("orientation", {"Kp": "nan"}, "Kp: 'nan' is not a number"),
-        ("steps", {"volts": "6;8"}, "volts: '6;8' is not numbers separated by commas"),
+        ("orientation", {"Kp": "nan"}, "orientation.Kp is 'nan', expected a finite number"),
+        ("orientation", {"controler": "p"}, "orientation.controler is not a key .*; did you mean controller"),
+        ("orientation", {"controller": "lqr"}, "controller is 'lqr', expected 'p', 'pid' or 'clamping'"),
+        ("steps", {"volts": "6;8"}, "steps.volts.0 is '6;8', expected a valid number"),
+        ("prbs", {"hold_s": "0"}, "prbs.hold_s is '0', expected greater than 0"),
+        ("chirp", {"from_hz": "2.5"}, "chirp.to_hz is 2, expected at least from_hz, 2.5"),
     ],
 )
 def test_words_that_are_not_known(name: str, options: dict[str, str], words: str) -> None:
@@ -265,10 +269,8 @@ def test_words_that_are_not_known(name: str, options: dict[str, str], words: str
 @pytest.mark.parametrize(
     ("name", "options", "words"),
     [
-        ("orientation", {"controller": "lqr"}, "controller: found 'lqr', expected one of p, pid, clamping"),
         ("swing", {"length_m": "-0.065"}, "expected positive lengths"),
         ("elongation", {"start_m": "-0.01"}, "expected positive lengths"),
-        ("prbs", {"hold_s": "0"}, "prbs hold_s: found 0 s"),
     ],
 )
 def test_numbers_that_no_experiment_can_have(name: str, options: dict[str, str], words: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from typing import NamedTuple
@@ -432,11 +432,10 @@ def step_back(
     return BackState(integral, error), u
 
 
-@dataclass(frozen=True)
 class BackOrientation:
-    """Control of the head's angle with back-calculation.
+    """Control of the head's angle with back-calculation, with the memory of both channels and of the pumps.
 
-    Attributes
+    Parameters
     ----------
     pid : of both bellows. tracking_s : Tt.
     model : the identified rig; its pumps and limits.
@@ -445,40 +444,25 @@ class BackOrientation:
     sign : of the error of bellows 1.
     """
 
-    pid: Pid
-    tracking_s: float
-    model: Model
-    falling_share: float = 0.4
-    sign: int = 1
+    def __init__(
+        self, pid: Pid, tracking_s: float, model: Model, falling_share: float = 0.4, sign: int = 1
+    ) -> None:
+        self.pid, self.tracking_s, self.model = pid, tracking_s, model
+        self.falling_share, self.sign = falling_share, sign
+        self.pumps = pumps_at_rest(model)
+        self.first = self.second = BackState()
 
-
-@dataclass(frozen=True)
-class BackOrientationState:
-    """Memory of both channels, and the pumps as they follow from the commands."""
-
-    pumps: PumpEstimate
-    first: BackState = field(default_factory=BackState)
-    second: BackState = field(default_factory=BackState)
-
-
-def start_back_orientation(control: BackOrientation) -> BackOrientationState:
-    """Zeros, pumps off."""
-    return BackOrientationState(pumps_at_rest(control.model))
-
-
-def step_back_orientation(
-    control: BackOrientation, state: BackOrientationState, phi_ref_rad: float, phi_rad: float
-) -> tuple[BackOrientationState, tuple[float, float]]:
-    """One tick: the next state and the PWM values."""
-    model, error = control.model, control.sign * (phi_ref_rad - phi_rad)
-    low = (model.low_pwm, model.low_pwm)
-    if math.isfinite(control.falling_share):
-        low = least_pwm(model, ahead(model, state.pumps)[-1], control.falling_share)
-    pid, Tt, high = control.pid, control.tracking_s, model.high_pwm
-    first, u1 = step_back(pid, Tt, state.first, error, low[0], high)
-    second, u2 = step_back(pid, Tt, state.second, -error, low[1], high)
-    pwm = (saturate(u1, True, model.low_pwm, high), saturate(u2, True, model.low_pwm, high))
-    return BackOrientationState(push(model, state.pumps, pwm), first, second), pwm
+    def step(self, phi_ref_rad: float, phi_rad: float) -> Pair:
+        """PWM values of one tick."""
+        model, error = self.model, self.sign * (phi_ref_rad - phi_rad)
+        low, high = (model.low_pwm, model.low_pwm), model.high_pwm
+        if math.isfinite(self.falling_share):
+            low = least_pwm(model, ahead(model, self.pumps)[-1], self.falling_share)
+        self.first, u1 = step_back(self.pid, self.tracking_s, self.first, error, low[0], high)
+        self.second, u2 = step_back(self.pid, self.tracking_s, self.second, -error, low[1], high)
+        pwm = (saturate(u1, True, model.low_pwm, high), saturate(u2, True, model.low_pwm, high))
+        self.pumps = push(model, self.pumps, pwm)
+        return pwm
 
 
 # ----------------------------------------------------------------------
@@ -513,14 +497,11 @@ class FeedForward:
     limit_pwm: float = 255.0
 
 
-def feed_forward(parameters: FeedForward, q_ref_m: float) -> float:
-    """u_ff [PWM] of the wanted length of one bellows [m] (4.6)."""
-    if q_ref_m < parameters.from_m:
-        return 0.0
-    return min(
-        parameters.limit_pwm,
-        parameters.slope_pwm_per_m * (q_ref_m - parameters.from_m) + parameters.offset_pwm,
-    )
+def feed_forward(parameters: FeedForward, q_ref_m: FloatArray) -> FloatArray:
+    """u_ff (...) [PWM] of wanted lengths (...) [m] (4.6)."""
+    q = np.asarray(q_ref_m, dtype=np.float64)
+    line = parameters.slope_pwm_per_m * (q - parameters.from_m) + parameters.offset_pwm
+    return np.where(q < parameters.from_m, 0.0, np.minimum(line, parameters.limit_pwm))
 
 
 # ----------------------------------------------------------------------
@@ -861,39 +842,15 @@ def computed_torque_step(
 # fed back.
 
 
-@dataclass(frozen=True)
-class LoopState:
-    """Memory of the two controllers, zeros at the start."""
+class Channels:
+    """The controllers of both bellows with their memory, zeros at the start."""
 
-    first: PidState = field(default_factory=PidState)
-    second: PidState = field(default_factory=PidState)
+    def __init__(self, pid: Pid) -> None:
+        self.pid = pid
+        self.first = self.second = PidState()
 
-
-def step_orientation(
-    pid: Pid, state: LoopState, phi_ref_rad: float, phi_rad: float, sign: int = 1
-) -> tuple[LoopState, Pair]:
-    """One tick of orientation control: the next state, and the PWM values before saturation.
-
-    Parameters
-    ----------
-    pid : the controller of both bellows.
-    phi_ref_rad, phi_rad : wanted and measured angle of the head [rad].
-    sign : of the error of bellows 1 (4.1).
-    """
-    error = sign * (phi_ref_rad - phi_rad)
-    first, u1 = step(pid, state.first, error)
-    second, u2 = step(pid, state.second, -error)
-    return LoopState(first, second), (u1, u2)
-
-
-def step_position(pid: Pid, state: LoopState, q_ref_m: Pair, q_m: Pair) -> tuple[LoopState, Pair]:
-    """One tick of position control: the next state, and the PWM values before feed-forward and saturation.
-
-    Parameters
-    ----------
-    pid : the controller of both bellows.
-    q_ref_m, q_m : wanted and measured lengths of the bellows [m].
-    """
-    first, u1 = step(pid, state.first, q_ref_m[0] - q_m[0])
-    second, u2 = step(pid, state.second, q_ref_m[1] - q_m[1])
-    return LoopState(first, second), (u1, u2)
+    def step(self, error_1: float, error_2: float) -> Pair:
+        """PWM values of one tick before feed-forward and saturation."""
+        self.first, u1 = step(self.pid, self.first, error_1)
+        self.second, u2 = step(self.pid, self.second, error_2)
+        return u1, u2

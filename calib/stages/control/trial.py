@@ -29,7 +29,6 @@ from calib.stages.control.laws import (
     BackOrientation,
     ComputedTorque,
     FeedForward,
-    LoopState,
     Model,
     Pid,
     computed_torque_step,
@@ -38,19 +37,14 @@ from calib.stages.control.laws import (
     feed_forward,
     feed_forward_pwm,
     predict,
-    saturate,
-    start_back_orientation,
     start_observer,
-    step_back_orientation,
-    step_orientation,
-    step_position,
     wanted_motion,
 )
 from calib.stages.control.references import Reference, built_in
 from calib.stages.control.section import Controller
 from calib.stages.control.tuning import Tracking, tracking
 from calib.twin.rig import SimulatedRig, rig_from_file
-from calib.twin.scenarios import at_rest
+from calib.twin.scenarios import angle_law, at_rest, length_law
 from calib.twin.simulate import Law, Run, Seen, simulate
 
 Pair = tuple[float, float]
@@ -105,7 +99,7 @@ def controlled(rig: Rig, limits: Pair | None, other: Rig | None = None) -> tuple
                 f"--plant: found pumps with a tick of {1e3 * own.pump.tick_s:.4g} ms, expected the "
                 f"{1e3 * machine.pump.tick_s:.4g} ms of the rig that controllers know"
             )
-        machine = replace(machine, plant=own.plant, pump=own.pump, pump_strength=own.strength)
+        machine = replace(machine, plant=own.plant, pump=own.pump, strength=own.strength)
     return machine, model
 
 
@@ -114,7 +108,7 @@ def control_model(rig: SimulatedRig, section: Controller | None = None, limits: 
     low, high = (0.0, 255.0) if section is None else (section.pwm_low, section.pwm_high)
     if limits is not None:
         low, high = limits
-    return Model(rig.plant, rig.pump, rig.pump_strength, low, high)
+    return Model(rig.plant, rig.pump, rig.strength, low, high)
 
 
 def controllers_for(reference: Reference, section: Controller | None) -> tuple[str, ...]:
@@ -123,47 +117,26 @@ def controllers_for(reference: Reference, section: Controller | None) -> tuple[s
     return tuple(name for name in names if section is not None or not name.startswith("tuned"))
 
 
+def _with_limits(model: Model, pid: Pid) -> Pid:
+    return replace(pid, low=model.low_pwm, high=model.high_pwm, tick_s=model.tick_s)
+
+
 def _orientation(model: Model, reference: Reference, pid: Pid) -> Law:
-    own = replace(pid, low=model.low_pwm, high=model.high_pwm, tick_s=model.tick_s)
-    wanted = reference.phi_rad.tolist()
-
-    def law(k: int, memory: LoopState, seen: Seen) -> tuple[LoopState, Pair]:
-        memory, u = step_orientation(own, memory, wanted[k], seen.phi_rad)
-        return memory, _limited(model, u)
-
-    return law
-
-
-def _limited(model: Model, u: Pair) -> Pair:
-    u1, u2 = (saturate(one, True, model.low_pwm, model.high_pwm) for one in u)
-    return u1, u2
+    return angle_law(_with_limits(model, pid), reference.phi_rad)
 
 
 def _back(reference: Reference, back: BackOrientation) -> Law:
-    state = [start_back_orientation(back)]
     wanted = reference.phi_rad.tolist()
-
-    def law(k: int, memory: LoopState, seen: Seen) -> tuple[LoopState, Pair]:
-        state[0], pwm = step_back_orientation(back, state[0], wanted[k], seen.phi_rad)
-        return memory, pwm
-
-    return law
+    return lambda k, seen: back.step(wanted[k], seen.phi_rad)
 
 
 def _position(model: Model, reference: Reference, pid: Pid, extra: str) -> Law:
-    own, rows = replace(pid, tick_s=model.tick_s), reference.q_m.tolist()
     added = np.zeros_like(reference.q_m)
     if extra == "map":
         added = feed_forward_pwm(model, reference.q_m)
     elif extra == "line":
-        line = FeedForward()
-        added = np.array([[feed_forward(line, q) for q in row] for row in rows])
-
-    def law(k: int, memory: LoopState, seen: Seen) -> tuple[LoopState, Pair]:
-        memory, u = step_position(own, memory, (rows[k][0], rows[k][1]), seen.q_m)
-        return memory, _limited(model, (u[0] + added[k, 0], u[1] + added[k, 1]))
-
-    return law
+        added = feed_forward(FeedForward(), reference.q_m)
+    return length_law(_with_limits(model, pid), reference.q_m, added)
 
 
 class _Torque:
@@ -192,7 +165,7 @@ class _Torque:
         p = self.to_plane @ np.array([ray[0], ray[1], 1.0])
         return float(p[0] / p[2]), float(p[1] / p[2])
 
-    def __call__(self, k: int, memory: LoopState, seen: Seen) -> tuple[LoopState, Pair]:
+    def __call__(self, k: int, seen: Seen) -> Pair:
         if self.sensors:
             rate = -sum(row[2] for row in seen.imu) / len(seen.imu) if seen.imu else float("nan")
             self.state = correct(self.observer, self.state, self._marker(seen), rate)
@@ -204,7 +177,7 @@ class _Torque:
         command = computed_torque_step(self.control, self.observer, self.state, self.wanted, k)
         self.limited += any(command.limited)
         self.state = predict(self.observer, self.state, command.pwm)
-        return memory, command.pwm
+        return command.pwm
 
 
 def _tuned(section: Controller | None) -> Controller:
