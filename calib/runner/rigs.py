@@ -15,7 +15,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, ConfigDict
 
 from calib.core.constants import constants
 from calib.core.errors import (
@@ -28,7 +30,9 @@ from calib.core.errors import (
 )
 from calib.core.files import PICTURES, one_line, read_text, read_yaml_mapping, sha256, shown
 from calib.core.options import name_of_flag, options_of
+from calib.core.result import Section
 from calib.core.rig import Rig
+from calib.core.schema import validated
 from calib.core.writing import make_folder
 from calib.runner.cache import key_of, program
 from calib.runner.folder import Folder, folder_digests, read_folder
@@ -48,14 +52,63 @@ from calib.stages import stage
 # A CSV has these as its header. A YAML file has a list `rigs` of such mappings, and perhaps `options` that
 # hold for all. Relative paths start at the manifest's folder.
 
-OPTIONS = ("corners", "square", "model", "loss", "board")
-"""What may differ from rig to rig."""
-
-_COLUMNS = ("name", "path", "serial", *OPTIONS)
 _SIGNS = frozenset(" -_.+#=@()")
 _LONGEST = 80
 _MOST_BYTES = 200_000_000
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
+
+
+def _named(name: str) -> str:
+    signs = "".join(sorted(_SIGNS)).strip()
+    if not name or len(name.encode()) > _LONGEST:
+        raise ValueError(f"expected a name of 1 to {_LONGEST} bytes for the rig's results")
+    if name[0] in ".- " or name[-1] in ". ":
+        raise ValueError("expected a name without a dot or dash in front, and without a dot at the end")
+    if not all(c.isalnum() or c in _SIGNS for c in name):
+        raise ValueError(f"expected a name of letters, digits and {signs}")
+    return name
+
+
+def _found(source: str) -> str:
+    if not source or not source.isprintable():
+        raise ValueError("expected the rig's folder, or the URL of one")
+    if "::" in source and "://" in source:
+        raise ValueError("expected a plain URL, not several in a chain")
+    return source
+
+
+def _numbered(serial: str) -> str:
+    if len(serial) > _LONGEST or not serial.isprintable():
+        raise ValueError("expected a short text")
+    return serial
+
+
+class _Options(Section):
+    """What may differ from rig to rig."""
+
+    model_config = ConfigDict(coerce_numbers_to_str=True, str_strip_whitespace=True)
+
+    corners: str = ""
+    square: str = ""
+    model: str = ""
+    loss: str = ""
+    board: str = ""
+
+
+class _Row(_Options):
+    model_config = ConfigDict(extra="ignore")
+
+    name: Annotated[str, AfterValidator(_named)]
+    path: Annotated[str, AfterValidator(_found)]
+    serial: Annotated[str, AfterValidator(_numbered)] = ""
+
+
+class _Listed(Section):
+    rigs: list[dict[str, Any]]
+    options: _Options = _Options()
+
+
+OPTIONS = tuple(_Options.model_fields)
 
 
 @dataclass(frozen=True)
@@ -174,96 +227,34 @@ def _from_csv(path: Path) -> tuple[Iterator[tuple[str, Mapping[str, Any]]], tupl
         except csv.Error as error:
             raise BadInputError(f"{shown(path)}, line {reader.line_num}: is not CSV: {error}") from error
 
-    return rows(), tuple(one_line(name) for name in head if name and name not in _COLUMNS)
+    return rows(), tuple(one_line(name) for name in head if name and _strange(name))
 
 
 def _from_yaml(path: Path) -> tuple[Iterator[tuple[str, Mapping[str, Any]]], tuple[str, ...]]:
-    whole = read_yaml_mapping(path)
-    unknown = next((key for key in whole if key not in ("rigs", "options")), None)
-    if unknown is not None:
-        raise BadInputError(
-            f"{shown(path)}: {one_line(unknown)} is not a key that is known here, expected rigs and options"
-        )
-    listed, common = whole.get("rigs"), whole.get("options") or {}
-    if not isinstance(listed, list):
-        raise BadInputError(f"{shown(path)}: has no list rigs, expected one entry for each rig")
-    if not isinstance(common, dict):
-        raise BadInputError(f"{shown(path)}: options is no mapping, expected for instance model: radial2")
-    strange = next((key for key in common if key not in OPTIONS), None)
-    if strange is not None:
-        raise BadInputError(
-            f"{shown(path)}: options.{one_line(str(strange))} is not one of {', '.join(OPTIONS)}"
-        )
-    ignored: dict[str, None] = {}
-
-    def rows() -> Iterator[tuple[str, Mapping[str, Any]]]:
-        for number, entry in enumerate(listed, start=1):
-            where = f"rig {number}"
-            if not isinstance(entry, dict):
-                raise BadInputError(f"{shown(path)}, {where}: is no mapping, expected name and path")
-            yield where, {**common, **entry}
-
-    for entry in listed:
-        if isinstance(entry, dict):
-            ignored |= dict.fromkeys(one_line(str(key)) for key in entry if key not in _COLUMNS)
-    return rows(), tuple(ignored)
+    whole = validated(_Listed, read_yaml_mapping(path), path)
+    common = whole.options.model_dump(exclude_unset=True)
+    rows = ((f"rig {number}", {**common, **entry}) for number, entry in enumerate(whole.rigs, start=1))
+    return rows, tuple(dict.fromkeys(one_line(key) for entry in whole.rigs for key in entry if _strange(key)))
 
 
-def _text(where: str, row: Mapping[str, Any], key: str) -> str:
-    value = row.get(key)
-    if value is None:
-        return ""
-    if isinstance(value, bool) or not isinstance(value, str | int | float):
-        raise BadInputError(f"{where}: {key} is {one_line(repr(value))[:60]}, expected text")
-    return str(value).strip(" \t")
+def _strange(column: str) -> bool:
+    return column not in _Row.model_fields
 
 
 def _rig(where: str, row: Mapping[str, Any], root: Path) -> RigSpec:
-    name = _text(where, row, "name")
-    problem = _problem_of_name(name)
-    if problem:
-        raise BadInputError(f"{where}: the name {one_line(repr(name))[:60]} {problem}")
-    source = _text(where, row, "path")
-    if not source:
-        raise BadInputError(f"{where}: {name} has no path, expected the rig's folder")
-    if not source.isprintable():
-        raise BadInputError(f"{where}: the path of {name} has control characters in it")
-    if "::" in source and "://" in source:
-        raise BadInputError(f"{where}: the URL of {name} chains several with '::', expected a plain one")
-    if not is_url(source):
-        source = str(root / source)
-    serial = _text(where, row, "serial")
-    if len(serial) > _LONGEST or not serial.isprintable():
-        raise BadInputError(f"{where}: the serial of {name} is no short text")
-    options = []
-    for key in OPTIONS:
-        value = _text(where, row, key)
-        if value:
-            options.append((key, value))
+    told = validated(_Row, {key: value for key, value in row.items() if value is not None}, where)
+    options = tuple((key, value) for key in OPTIONS if (value := getattr(told, key)))
     try:
         options_of(stage("intrinsics").options, camera_options(options))
     except CalibError as error:
-        raise BadInputError(f"{where}: {name}: {error}") from error
-    return RigSpec(name, source, serial, tuple(options))
+        raise BadInputError(f"{where}: {told.name}: {error}") from error
+    source = told.path if is_url(told.path) else str(root / told.path)
+    return RigSpec(told.name, source, told.serial, options)
 
 
 def camera_options(options: Iterable[tuple[str, str]]) -> dict[str, str]:
     """Options by the names that `intrinsics` has for them."""
     return {name_of_flag(stage("intrinsics").options, flag): value for flag, value in options}
-
-
-def _problem_of_name(name: str) -> str:
-    if not name:
-        return "is empty, expected a name for the rig's results"
-    if len(name.encode()) > _LONGEST:
-        return f"is longer than {_LONGEST} bytes"
-    if name[0] in ".- " or name[-1] in ". ":
-        return "begins with a dot or a dash, or ends with a dot"
-    wrong = next((c for c in name if not (c.isalnum() or c in _SIGNS)), None)
-    if wrong is not None:
-        signs = "".join(sorted(_SIGNS)).strip()
-        return f"has {one_line(wrong)!r} in it, expected letters, digits and {signs}"
-    return ""
 
 
 # ----------------------------------------------------------------------

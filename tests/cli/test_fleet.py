@@ -37,7 +37,7 @@ def _manifest(tmp_path: Path, rows: str) -> Path:
     [
         ("", "names no rigs"),
         ("a,x\na,y\n", "the name 'a' is that of line 2"),
-        ("../a,x\n", "line 2: the name '../a' begins with a dot"),
+        ("../a,x\n", "line 2: name is '../a', expected a name without a dot"),
     ],
 )
 def test_a_manifest_that_is_none(calib: Callable[..., Any], tmp_path: Path, rows: str, said: str) -> None:
