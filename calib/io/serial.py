@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import struct
+from binascii import crc_hqx
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -243,36 +244,11 @@ Message = Frame | Hello | ImuSample | Picture
 
 def checksum(data: bytes) -> int:
     """CRC-16 with the polynomial 0x1021 from 0xFFFF."""
-    crc = 0xFFFF
-    for byte in data:
-        crc ^= byte << 8
-        for _ in range(8):
-            crc = ((crc << 1) ^ 0x1021 if crc & 0x8000 else crc << 1) & 0xFFFF
-    return crc
+    return crc_hqx(data, 0xFFFF)
 
 
 def _framed(kind: int, payload: bytes) -> bytes:
     body = bytes([VERSION, kind, len(payload)]) + payload
-    return _SYNC + body + struct.pack("<H", checksum(body))
-
-
-def encoded(frame: Message) -> bytes:
-    """The frame as a board sends it; a tick without a time as sketches of before did."""
-    if isinstance(frame, Hello):
-        return _framed(_HELLO, _PAYLOADS[_HELLO].pack(*vars(frame).values()))
-    if isinstance(frame, ImuSample):
-        return _framed(_IMU, _PAYLOADS[_IMU].pack(frame.sequence, frame.t_us, *frame.force, *frame.rate))
-    if isinstance(frame, Picture):
-        times = (frame.sequence, frame.t_us, frame.after_us, frame.seen)
-        rest = (*frame.marker_px, *frame.guard.numbers, frame.overruns)
-        return _framed(_PICTURE, _PAYLOADS[_PICTURE].pack(*times, *rest))
-    given, out, guard = frame.given, frame.out, frame.guard
-    head = (frame.identity, frame.rate_mhz, frame.sequence, given.sensors, given.mode)
-    numbers = (*head, *given.numbers, *out.numbers, out.flags)
-    if guard is not None and frame.t_us is not None:
-        return _framed(_TICK, _PAYLOADS[_TICK].pack(frame.t_us, *numbers, *guard.numbers))
-    payload = _UNGUARDED.pack(*numbers) if guard is None else _UNTIMED.pack(*numbers, *guard.numbers)
-    body = bytes([len(payload)]) + payload
     return _SYNC + body + struct.pack("<H", checksum(body))
 
 

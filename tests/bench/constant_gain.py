@@ -21,9 +21,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import numpy as np
 from drivenlogs import driven_log
 from estimatorlogs import SCENARIOS, rows_from, setup_for, truth
+from ticks import run_gains, ticks_of
 
 from calib.stages.estimator.baseline import Baseline, BaselineSetup, undistorting_nothing
-from calib.stages.estimator.constant_gain import design, run_gains, tick_noise, ticks_of
+from calib.stages.estimator.constant_gain import design, tick_noise
 from calib.stages.estimator.kinematic import Filter
 
 NAMES = ("source", "full filter", "newest", "mean")

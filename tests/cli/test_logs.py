@@ -16,13 +16,14 @@ import pytest
 from bags import readings, write_bag
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from sentframes import encoded
 
 from calib.core.files import hash_of
 from calib.core.result import identity
 from calib.core.rig import Rig
 from calib.io.columns import MEASURED
 from calib.io.logs import Log, read_log, write_log
-from calib.io.serial import Frame, encoded
+from calib.io.serial import Frame
 from calib.stages.firmware.header import Header, header_of
 from calib.stages.firmware.vectors import vectors
 

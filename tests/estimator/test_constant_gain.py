@@ -7,17 +7,15 @@ import math
 import numpy as np
 import pytest
 from estimatorlogs import rows_from, setup_for, simulated, truth
+from ticks import Ticks, run_gains, ticks_of
 
 from calib.stages.estimator.baseline import Baseline, BaselineSetup, undistorting_nothing
 from calib.stages.estimator.constant_gain import (
     MOST_DELAY_TICKS,
     Gains,
     TickNoise,
-    Ticks,
     design,
-    run_gains,
     tick_noise,
-    ticks_of,
 )
 from calib.stages.estimator.kinematic import Setup
 from calib.stages.estimator.sensors import head_position

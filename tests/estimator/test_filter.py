@@ -11,6 +11,7 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
+import peers
 import pytest
 from estimatorlogs import SCENARIOS, rows_from, setup_for, simulated, truth, truth_of_sensors
 from numba.core.dispatcher import Dispatcher
@@ -275,7 +276,7 @@ def test_compiled_smoother_equals_matrices() -> None:
     events, ours = compiled(setup, rows, 2.0)
     x, P, trace = ours.x, ours.P, ours.trace
     levels, _ = setup.process.arrays()
-    expected_x, expected_P = reference.extended_smoothed(setup, events, x, P)
+    expected_x, expected_P = peers.extended_smoothed(setup, events, x, P)
     deviation = np.sqrt(np.diagonal(P, axis1=1, axis2=2)) + 1e-12
     smoother.backward(
         events.t_s, np.tile(levels[0], (len(x), 1)), trace, np.ones(len(x), dtype=np.bool_), x, P, True
@@ -288,7 +289,7 @@ def test_unscented_filter_agrees_within_its_deviation() -> None:
     setup, rows = prepared("ellipse")
     events, ours = compiled(setup, rows, 3.0)
     x, P = ours.x, ours.P
-    got_x, _ = reference.unscented(setup, rows, events, ours.gated)
+    got_x, _ = peers.unscented(setup, rows, events, ours.gated)
     late = events.t_s > rows.t_s[0] + 1.0
     deviation = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
     away = (x - got_x)[late, :2] / deviation[late, :2]

@@ -14,6 +14,7 @@ from armlogs import swung
 from firmware_build import LIMITS, compare, host, hostile, need, run, strew, write
 from firmware_rigs import header, rig
 from source_model import head_from_marker, inverse_series
+from ticks import Ticks, run_gains
 
 from calib.io.serial import MODE_OFF, MODE_ORIENTATION, MODE_POSITION, Inputs
 from calib.stages.camera.model import Camera, undistort
@@ -23,7 +24,7 @@ from calib.stages.control.laws import (
     Pid,
     feed_forward,
 )
-from calib.stages.estimator.constant_gain import Gains, Ticks, run_gains
+from calib.stages.estimator.constant_gain import Gains
 from calib.stages.estimator.kinematic import Setup, Start
 from calib.stages.firmware.conformance import (
     ACCEL_WEAK,

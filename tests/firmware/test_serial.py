@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import binascii
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import pytest
 from firmware_rigs import header
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sentframes import encoded
 
 from calib.core.errors import BadInputError
 from calib.io.logs import read_log
@@ -21,10 +21,8 @@ from calib.io.serial import (
     Outputs,
     Recording,
     Run,
-    checksum,
     csv_header,
     csv_row,
-    encoded,
     record,
 )
 from calib.stages.firmware.check import check_frames, read_frames
@@ -43,11 +41,6 @@ def frame(sequence: int, value: float = 0.25, **more: object) -> Frame:
         binary32(inputs),
         Outputs(value, (0.5, 1.0), (0.25, 2.0), (0.0625, 4.0), (1.0, 255.0), 3),
     )
-
-
-@given(st.binary(max_size=64))
-def test_the_checksum_is_the_one_of_the_standard_library(data: bytes) -> None:
-    assert checksum(data) == binascii.crc_hqx(data, 0xFFFF)
 
 
 @given(st.integers(0, 65535), floats)

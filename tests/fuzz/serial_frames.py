@@ -32,9 +32,11 @@ def check(data: bytes, folder: Path) -> None:
 
 
 def _check(data: bytes, folder: Path) -> None:
+    from sentframes import encoded
+
     from calib.core.errors import BadInputError
     from calib.io.logs import read_log
-    from calib.io.serial import Decoder, encoded, record
+    from calib.io.serial import Decoder, record
     from calib.stages.firmware.check import read_frames
 
     whole = Decoder()

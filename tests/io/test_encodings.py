@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from sentframes import encoded
 
 from calib.cli.camera import import_camera
 from calib.core.errors import BadInputError
 from calib.core.rig import Rig
 from calib.io.logs import log_text, read_log
-from calib.io.serial import encoded, frame_from_row, record
+from calib.io.serial import frame_from_row, record
 from calib.stages.actuator.read import read_pump_table
 from calib.stages.camera.read import read_board_file, read_table, read_vnl
 from calib.stages.control.read import _series

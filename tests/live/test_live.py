@@ -24,13 +24,14 @@ import pytest
 from chromium import browser_or_skip
 from liveboards import BOARD, CAMERA, Person, follow, random_poses, write_y4m
 from markervideos import Scene
+from sentframes import encoded
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from calib.cli.main import main
 from calib.core.errors import BadInputError
 from calib.io.logs import read_log
-from calib.io.serial import Frame, Inputs, Outputs, encoded
+from calib.io.serial import Frame, Inputs, Outputs
 from calib.live.album import Album
 from calib.live.server import MOST_BYTES, Live
 from calib.live.session import ENOUGH, Seen, Session, edge_blur_px

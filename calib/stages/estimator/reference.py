@@ -2,10 +2,7 @@
 
 Readings leave `kinematic.CONSIDERED` alone in both. `extended` runs filterpy's ExtendedKalmanFilter over the
 events of a log: predict with F and Q of `model`, then each scalar reading in turn, a rounded pixel as its
-equivalent Gaussian reading. It agrees with the compiled filter to rounding. `unscented` is filterpy's
-UnscentedKalmanFilter with the same noise, whole readings at once and rounding as variance g^2 / 12: not the
-same estimator, but one without a Jacobian. `extended_smoothed` adds Rauch, Tung and Striebel with matrices
-inverted by numpy.
+equivalent Gaussian reading. It agrees with the compiled filter to rounding.
 """
 
 from __future__ import annotations
@@ -49,11 +46,12 @@ def process_noise(level: FloatArray, walk: FloatArray, dt: float) -> FloatArray:
     return Q
 
 
-def _constants(setup: Setup) -> FloatArray:
+def constants(setup: Setup) -> FloatArray:
+    """Gravity and lever as `event.imu_terms` takes them."""
     return np.array([setup.gravity_mps2, setup.lever_across_m])
 
 
-def _scalar_readings(
+def scalar_readings(
     setup: Setup, kind: int, z: FloatArray, x: FloatArray, P: FloatArray
 ) -> list[tuple[float, float, FloatArray, float, bool]]:
     """Each reading of an event: value, prediction, gradient, variance of its noise, whether rounded."""
@@ -62,7 +60,7 @@ def _scalar_readings(
     if kind == CAMERA:
         camera_terms(setup.view, noise, noise[6] ** 2, x, P, H, out)
         return [(z[k], out[k], H[k].copy(), out[3 + k], True) for k in range(2)]
-    imu_terms(_constants(setup), noise, x, P, H, out)
+    imu_terms(constants(setup), noise, x, P, H, out)
     return [(z[k], out[k], H[k].copy(), out[3 + k], False) for k in (2, 0, 1) if not math.isnan(z[k])]
 
 
@@ -90,7 +88,7 @@ def extended(setup: Setup, rows: Rows, events: Events, gated: FloatArray) -> tup
         kind = int(events.kinds[k])
         if kind:
             before = ekf.x.copy()
-            readings = _scalar_readings(setup, kind, events.readings[k], before, ekf.P)
+            readings = scalar_readings(setup, kind, events.readings[k], before, ekf.P)
             for place, (z, predicted, H, variance, rounded) in enumerate(readings):
                 sensor = (
                     0 if kind == CAMERA else 2 if place == 0 and not math.isnan(events.readings[k, 2]) else 1
@@ -132,78 +130,3 @@ def replayed(setup: Setup, rows: Rows) -> tuple[FloatArray, float]:
     sigma = np.sqrt(np.diagonal(ours.P, axis1=1, axis2=2))
     apart = np.abs((x - ours.x) / sigma).max()
     return out, float(max(apart, np.abs((P - ours.P) / (sigma[:, :, None] * sigma[:, None, :])).max()))
-
-
-def extended_smoothed(
-    setup: Setup, events: Events, x: FloatArray, P: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Rauch, Tung and Striebel over the states of `extended` where what is considered has no variance.
-
-    Inverts the predicted covariance of all that has one.
-    """
-    levels, walk = setup.process.arrays()
-    x, P = x.copy(), P.copy()
-    F, free = np.empty((SIZE, SIZE)), [i for i in range(SIZE) if i not in CONSIDERED]
-    block = np.ix_(free, free)
-    for k in range(len(x) - 2, -1, -1):
-        dt = float(events.t_s[k + 1] - events.t_s[k])
-        transition(levels[0], dt, F)
-        before, f = P[k][block], F[block]
-        ahead = f @ before @ f.T + process_noise(levels[0], walk, dt)[block]
-        scale = 1.0 / np.sqrt(np.diag(ahead))
-        gain = (before @ f.T * scale) @ np.linalg.inv(ahead * scale[:, None] * scale) * scale
-        x[k, free] += gain @ (x[k + 1] - F @ x[k])[free]
-        P[k][block] += gain @ (P[k + 1][block] - ahead) @ gain.T
-    return x, P
-
-
-def unscented(setup: Setup, rows: Rows, events: Events, gated: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """States (n, 19) and covariances after each event, by filterpy's UKF (Julier's sigma points)."""
-    from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
-
-    levels, walk = setup.process.arrays()
-    start_x, start_P, _ = starting_state(setup, rows)
-    points = MerweScaledSigmaPoints(SIZE, alpha=0.5, beta=2.0, kappa=0.0)
-    F = np.eye(SIZE)
-
-    def carry(x: FloatArray, _: float) -> FloatArray:
-        return np.asarray(F @ x)
-
-    def nothing(x: FloatArray) -> FloatArray:
-        return x[:1]
-
-    ukf: Any = UnscentedKalmanFilter(SIZE, 1, 1.0, hx=nothing, fx=carry, points=points)
-    ukf.x, ukf.P = start_x[0].copy(), start_P[0].copy()
-    n = len(events.t_s)
-    x, P = np.empty((n, SIZE)), np.empty((n, SIZE, SIZE))
-    for k in range(n):
-        dt = float(events.t_s[k] - events.t_s[k - 1]) if k else 0.0
-        transition(levels[0], dt, F)
-        ukf.Q = process_noise(levels[0], walk, dt)
-        ukf.predict()
-        kind = int(events.kinds[k])
-        # filterpy keeps the points of the process; readings need those of the predicted covariance.
-        ukf.sigmas_f = points.sigma_points(ukf.x, ukf.P)
-        if kind and not gated[k, 0 if kind == CAMERA else 1]:
-            z = events.readings[k, : 2 if kind == CAMERA else 3]
-            base = _scalar_readings(setup, kind, events.readings[k], ukf.x, ukf.P)
-            order = [0, 1] if kind == CAMERA else [2, 0, 1]
-            R = np.zeros(len(order))
-            for place, reading in zip(order, base, strict=True):
-                R[place] = reading[3] + (setup.noise[1] ** 2 / 12.0 if kind == CAMERA else 0.0)
-
-            def read(state: FloatArray, kind: int = kind) -> FloatArray:
-                H, out, none = np.empty((3, SIZE)), np.empty(SIZE), np.zeros((SIZE, SIZE))
-                if kind == CAMERA:
-                    camera_terms(setup.view, setup.noise, setup.noise[6] ** 2, state, none, H, out)
-                    return out[:2].copy()
-                imu_terms(_constants(setup), setup.noise, state, none, H, out)
-                return out[:3].copy()
-
-            held = list(CONSIDERED)
-            kept_x, kept_P = ukf.x[held].copy(), ukf.P[np.ix_(held, held)].copy()
-            ukf._dim_z = len(z)
-            ukf.update(z, R=np.diag(R), hx=read)
-            ukf.x[held], ukf.P[np.ix_(held, held)] = kept_x, kept_P
-        x[k], P[k] = ukf.x, ukf.P
-    return x, P
