@@ -48,6 +48,7 @@ from calib.stages.estimator.sensors import (
     SENSOR,
     SIZE,
     accelerometer,
+    decay_slope_w,
     gyroscope,
     head_position,
     invert_marker,
@@ -69,8 +70,8 @@ from calib.stages.estimator.smoother import events_of, look_back, smooth, undo_r
 # springs are uncertain, so is what is stiff. At equal steps an L-stable Rosenbrock method of third order
 # (ROS34PW2) errs five to forty times as much. A command acts as the static force that it settles at,
 # constant between the times at which commands take effect; a step of the filter is cut there (`cut`). The
-# Jacobian is by forward differences of the same steps, over the 23 columns that the motion depends on; those
-# of the sensors are those of the identity.
+# Jacobian is that of the same steps, over the 23 columns that the motion depends on; those of the sensors are
+# those of the identity.
 
 MOVING = (
     "phi_rad", "length_m", "dphi_radps", "dlength_mps", "z_sum_N", "z_difference_N",
@@ -85,6 +86,7 @@ PARAMETER = (
 
 DRIVEN = (*MOVING, *PARAMETER, *SENSOR)
 
+SIZE_D = len(DRIVEN)
 DYNAMIC = len(MOVING)
 INVOLVED = DYNAMIC + len(PARAMETER)
 """Entries that move, and entries that the motion depends on."""
@@ -98,9 +100,6 @@ PLANT = (
 STEP_S, STEP_RATE, LEAST_STEP_S = 0.0035, 1.5, 5e-5
 """Longest Runge-Kutta step, the most that it may be times the stiffest rate, and the shortest step, for 30
 times the damping of a rig with its hoses on. From 2.78 on a step makes what it should damp grow."""
-
-_NUDGE = np.array([1e-6, 1e-7, 1e-5, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6,
-                   1e-5, 1e-5, 1e-5, 1e-5, 1e-5, 1e-5, 1e-5, 1e-7, 1e-5, 1e-5, 1e-5])  # fmt: skip
 
 
 @kernel(arrays=False)
@@ -145,130 +144,336 @@ def longest_step_s(plant: FloatArray, x: FloatArray) -> float:
 
 
 @kernel(arrays=False)
-def flow(
-    plant: FloatArray, x: FloatArray, segments: FloatArray, count: int, longest_s: float, out: FloatArray
-) -> None:
-    """State of the moving part (12,) after the segments.
+def _per_factor(deviation: float) -> float:
+    """Derivative of the logarithm of `_factor`."""
+    return 1.0 / (1.0 + deviation) if 1.0 + deviation > 0.1 else 0.0
+
+
+@kernel(arrays=False)
+def _pump(plant: FloatArray, lag: float, deflation: float) -> PumpCoefficients:
+    # An orifice that passes more empties sooner.
+    return PumpCoefficients(
+        int(plant[16]), plant[17] * lag, plant[18] * deflation, plant[19] / deflation, plant[20] / deflation
+    )
+
+
+_FELT = (12, 13, 14, 19, 20)
+"""Parameters on which accelerations depend: stiffness, damping, bending, rest length, mass."""
+
+
+@kernel(arrays=False)
+def _motion(
+    c: Coefficients, x: FloatArray, phi: float, length: float, dphi: float, dl: float, z_sum: float,
+    z_difference: float, F1: float, F2: float, by: FloatArray,
+) -> tuple[float, float, float, float]:  # fmt: skip
+    """ddphi, ddl and the rates of both creep forces, as `rates` has them.
+
+    Parameters
+    ----------
+    c, x : coefficients, and the state (23,) or more whose parameters made them.
+    by : (26,) derivatives of ddphi and then of ddl, written to: by phi, l, dphi, dl, z_sum, z_difference, F1,
+        F2 and the parameters `_FELT`.
+    """
+    ddl, ddphi, dz_sum, dz_difference = rates(c, length, phi, dl, dphi, z_sum, z_difference, F1, F2)
+    w, r = phi * phi, c.r
+    S, D = chord_ratio_w(w), chord_decay_w(w)
+    E = D / S
+    g, E_phi = phi * E, phi * (E * E - decay_slope_w(w) / S)
+    g_phi, moved = E + phi * E_phi, length * g
+    # Sums and differences over the bellows of force by length and by rate, of springs' and dampers' forces.
+    stiff = stiff_apart = damped = damped_apart = spring = spring_apart = damper = damper_apart = 0.0
+    for side in (-1.0, 1.0):
+        eps, rate = length + side * r * phi - c.l0, dl + side * r * dphi
+        stretch = max(eps, 0.0)
+        k = c.k0 + stretch * (c.k1 + stretch * (c.k2 + stretch * c.k3))
+        k_q = c.k1 + stretch * (2.0 * c.k2 + stretch * 3.0 * c.k3) if eps > 0.0 else 0.0
+        resistance = c.damping * math.sqrt(k)
+        by_q = k + k_q * (eps + 0.5 * resistance * rate / k)
+        stiff, stiff_apart = stiff + by_q, stiff_apart + side * by_q
+        damped, damped_apart = damped + resistance, damped_apart + side * resistance
+        spring, spring_apart = spring + k * eps, spring_apart + side * k * eps
+        damper, damper_apart = damper + resistance * rate, damper_apart + side * resistance * rate
+    pulling = F1 + F2 + c.lambda3 * z_sum - spring - damper
+    weight, weight_phi, weight_phi2 = 0.0, 0.0, 0.0
+    if c.gravity:
+        sine, cosine = math.sin(0.5 * phi), math.cos(0.5 * phi)
+        along, across = c.m * (c.gx * sine + c.gy * cosine), c.m * (c.gx * cosine - c.gy * sine)
+        weight, weight_phi = S * along, S * (0.5 * across - g * along)
+        weight_phi2 = (2.0 * D - 0.5 * S) * along - g * S * across
+        pulling += weight
+    a, spun = 0.25 * c.m * length * S * S, dl - moved * dphi
+    by_l, by_phi = 1.0 / (c.m * S * S), 1.0 / (a * length + c.J)
+    for k in range(13):
+        P = T = N = L = 0.0
+        if k == 0:
+            P = weight_phi - r * stiff_apart
+            T = length * weight_phi2 - r * (r * stiff + 4.0 * c.bending * abs(phi))
+            N = length * g_phi * (pulling + 2.0 * a * dphi * dphi)
+            N += 2.0 * a * g * (2.0 * dphi * spun + length * ddphi)
+            L = 2.0 * g * by_l * pulling - 2.0 * length * dphi * dphi * E_phi
+            L += g_phi * (2.0 * dl * dphi + length * ddphi)
+        elif k == 1:
+            P, T = -stiff, weight_phi - r * stiff_apart
+            N = pulling * g - 2.0 * a * (dphi * spun / length - g * dphi * dphi + ddphi)
+            L = dphi * dphi * (0.5 - 2.0 * E) + g * ddphi
+        elif k == 2:
+            P, T = -r * damped_apart, -r * r * damped
+            N, L = -2.0 * a * (spun - moved * dphi), 2.0 * length * dphi * (0.5 - 2.0 * E) + 2.0 * g * dl
+        elif k == 3:
+            P, T, N, L = -damped, -r * damped_apart, -2.0 * a * dphi, 2.0 * g * dphi
+        elif k == 4:
+            P = c.lambda3
+        elif k == 5:
+            T = r * c.lambda3
+        elif k == 6:
+            P, T = 1.0, r
+        elif k == 7:
+            P, T = 1.0, -r
+        elif k == 8:
+            per = _per_factor(x[12])
+            P, T = -spring * per, -r * spring_apart * per
+        elif k == 9:
+            P, T = -damper, -r * damper_apart
+        elif k == 10:
+            T = -2.0 * r * c.bending * phi * abs(phi) * _per_factor(x[14])
+        elif k == 11:
+            P, T = stiff, r * stiff_apart
+        else:
+            per = _per_factor(x[20])
+            P, T, N = weight * per, length * weight_phi * per, -a * (2.0 * dphi * spun + length * ddphi) * per
+            L = -by_l * pulling * per
+        by[k] = by_phi * (T + moved * P + N)
+        by[13 + k] = by_l * P + L + moved * by[k]
+    return ddphi, ddl, dz_sum, dz_difference
+
+
+# Sensitivities are rows of `_L` numbers in one flat array, at distances that the compiler sees: it takes
+# several columns at a time. Rows 0 to 11 are those of the moving part; then come those of its first six
+# entries at a stage of Runge and Kutta and of their change in a step, of both forces at a stage, in the
+# middle of a step and at its end, and what parameters do by themselves to the last four of the six.
+_L = INVOLVED + 1
+_A, _SUM, _FORCE, _MIDDLE, _END, _OWN = 12 * _L, 18 * _L, 24 * _L, 26 * _L, 28 * _L, 30 * _L
+_BY = 34 * _L
+FLOW = _BY + 26 + 12
+"""Length of the scratch of `jacobian`: rows, derivatives of `_motion`, a stage's state and its change."""
+
+_NUDGES = (1e-6, 1e-6, 1e-5, 1e-5, 1e-5)
+"""Steps of the differences by which pumps are differentiated: by lag, force, strength, time and deflation."""
+
+
+@kernel(arrays=False)
+def _pump_rows(
+    plant: FloatArray, x: FloatArray, y: FloatArray, side: int, to: float, h: float, w: FloatArray
+) -> tuple[float, float]:
+    """Advance a pump's lag by h [s] and give its force after h / 2 and h, all with their sensitivities.
+
+    Parameters
+    ----------
+    x : as in `jacobian`. y : (12,) of `MOVING`. to : nominal static force [N].
+    """
+    lag, force, strength = y[6 + side], y[8 + side], _factor(x[15 + side])
+    pump = _pump(plant, _factor(x[17]), _factor(x[18]))
+    own, middle, end = advance_pump(pump, lag, force, strength * to, math.exp(-0.5 * h / pump.lag_s), h)
+    y[6 + side] = own
+    lag_row, force_row = (6 + side) * _L, (8 + side) * _L
+    middle_row, end_row = _MIDDLE + side * _L, _END + side * _L
+    for n in range(5):
+        step = _NUDGES[n]
+        other = _pump(plant, _factor(x[17] + step * (n == 3)), _factor(x[18] + step * (n == 4)))
+        a, b, c = advance_pump(
+            other, lag + step * (n == 0), force + step * (n == 1),
+            _factor(x[15 + side] + step * (n == 2)) * to, math.exp(-0.5 * h / other.lag_s), h,
+        )  # fmt: skip
+        by_own, by_middle, by_end = (a - own) / step, (b - middle) / step, (c - end) / step
+        if n < 2:
+            since = force_row if n else lag_row
+            for k in range(_L):
+                w[middle_row + k] = by_middle * w[since + k] + (w[middle_row + k] if n else 0.0)
+                w[end_row + k] = by_end * w[since + k] + (w[end_row + k] if n else 0.0)
+            if n == 0:
+                fading = by_own
+        else:
+            k = 15 + side if n == 2 else 14 + n
+            w[middle_row + k] += by_middle
+            w[end_row + k] += by_end
+            w[_BY + n] = by_own
+    for k in range(_L):
+        w[lag_row + k] *= fading
+    for n in range(2, 5):
+        w[lag_row + (15 + side if n == 2 else 14 + n)] += w[_BY + n]
+    return middle, end
+
+
+@kernel(arrays=False)
+def _stage_rows(c: Coefficients, by: FloatArray, weight: float, g: float, w: FloatArray) -> None:
+    """Add a stage's rates of the sensitivities with this weight, and go by g times them to the next one."""
+    p0, p1, p2, p3, p4, p5, p6, p7 = by[0], by[1], by[2], by[3], by[4], by[5], by[6], by[7]
+    q0, q1, q2, q3, q4, q5, q6, q7 = by[13], by[14], by[15], by[16], by[17], by[18], by[19], by[20]
+    by_dl, by_dphi, fading = 2.0 * c.lambda2, 2.0 * c.r * c.lambda2, c.lambda1
+    for k in range(_L):
+        phi, length, dphi, dl = w[_A + k], w[_A + _L + k], w[_A + 2 * _L + k], w[_A + 3 * _L + k]
+        z1, z2, F1, F2 = w[_A + 4 * _L + k], w[_A + 5 * _L + k], w[_FORCE + k], w[_FORCE + _L + k]
+        ddphi = p0 * phi + p1 * length + p2 * dphi + p3 * dl + p4 * z1 + p5 * z2 + p6 * F1 + p7 * F2
+        ddl = q0 * phi + q1 * length + q2 * dphi + q3 * dl + q4 * z1 + q5 * z2 + q6 * F1 + q7 * F2
+        ddphi, ddl = ddphi + w[_OWN + k], ddl + w[_OWN + _L + k]
+        dz_sum = by_dl * dl - fading * z1 + w[_OWN + 2 * _L + k]
+        dz_difference = by_dphi * dphi - fading * z2 + w[_OWN + 3 * _L + k]
+        w[_SUM + k] += weight * dphi
+        w[_SUM + _L + k] += weight * dl
+        w[_SUM + 2 * _L + k] += weight * ddphi
+        w[_SUM + 3 * _L + k] += weight * ddl
+        w[_SUM + 4 * _L + k] += weight * dz_sum
+        w[_SUM + 5 * _L + k] += weight * dz_difference
+        w[_A + k] = w[k] + g * dphi
+        w[_A + _L + k] = w[_L + k] + g * dl
+        w[_A + 2 * _L + k] = w[2 * _L + k] + g * ddphi
+        w[_A + 3 * _L + k] = w[3 * _L + k] + g * ddl
+        w[_A + 4 * _L + k] = w[4 * _L + k] + g * dz_sum
+        w[_A + 5 * _L + k] = w[5 * _L + k] + g * dz_difference
+
+
+@kernel(arrays=False)
+def jacobian(
+    plant: FloatArray, x: FloatArray, segments: FloatArray, count: int, longest_s: float, out: FloatArray,
+    F: FloatArray, w: FloatArray,
+) -> None:  # fmt: skip
+    """State of the moving part (12,) after the segments into out, and its derivative F (12, 23).
 
     Parameters
     ----------
     plant : (21,) of `PLANT`.
     x : (23,) or more, of `DRIVEN`.
     segments : (count, 3) or more rows: duration [s] and the nominal static forces of both pumps [N].
-    longest_s : step. States that are compared have to take the same steps.
+    longest_s : step. w : (`FLOW`,) scratch.
     """
     c = _coefficients(plant, x)
-    lag_s, deflation = plant[17] * _factor(x[17]), _factor(x[18])
-    # An orifice that passes more empties sooner.
-    pump = PumpCoefficients(
-        int(plant[16]), lag_s, plant[18] * deflation, plant[19] / deflation, plant[20] / deflation
-    )
-    y0, y1, y2, y3, y4, y5 = x[1], x[0], x[3], x[2], x[4], x[5]
-    x1, x2, f1, f2, d1, d2 = x[6], x[7], x[8], x[9], x[10], x[11]
-    strength1, strength2 = _factor(x[15]), _factor(x[16])
-    for k in range(count):
-        parts = max(math.ceil(segments[k, 0] / longest_s - 1e-9), 1)
-        h = segments[k, 0] / parts
-        decay = math.exp(-0.5 * h / lag_s)
-        g1, g2 = strength1 * segments[k, 1], strength2 * segments[k, 2]
+    creep_stiffness, creep_rate = _per_factor(x[21]) * c.lambda2, _per_factor(x[22]) * c.lambda1
+    by, a, s = w[_BY : _BY + 26], w[_BY + 26 : _BY + 32], w[_BY + 32 : _BY + 38]
+    for k in range(_BY):
+        w[k] = 0.0
+    for i in range(DYNAMIC):
+        out[i], w[i * _L + i] = x[i], 1.0
+    for segment in range(count):
+        parts = max(math.ceil(segments[segment, 0] / longest_s - 1e-9), 1)
+        h = segments[segment, 0] / parts
         for _ in range(parts):
-            x1, middle1, end1 = advance_pump(pump, x1, f1, g1, decay, h)
-            x2, middle2, end2 = advance_pump(pump, x2, f2, g2, decay, h)
-            a0, a1, a2, a3, a4, a5 = y0, y1, y2, y3, y4, y5
-            s0 = s1 = s2 = s3 = s4 = s5 = 0.0
-            F1, F2 = f1 + d1, f2 + d2
-            # The four stages in a loop: compiling `rates` once takes a quarter of the time.
+            middle1, end1 = _pump_rows(plant, x, out, 0, segments[segment, 1], h, w)
+            middle2, end2 = _pump_rows(plant, x, out, 1, segments[segment, 2], h, w)
+            for i in range(6):
+                a[i], s[i] = out[i], 0.0
+            for k in range(6 * _L):
+                w[_A + k], w[_SUM + k] = w[k], 0.0
+            F1, F2 = out[8], out[9]
+            for k in range(2 * _L):
+                w[_FORCE + k] = w[8 * _L + k] + w[10 * _L + k]
             for stage in range(4):
                 if stage == 1:
-                    F1, F2 = middle1 + d1, middle2 + d2
+                    F1, F2 = middle1, middle2
+                    for k in range(2 * _L):
+                        w[_FORCE + k] = w[_MIDDLE + k] + w[10 * _L + k]
                 elif stage == 3:
-                    F1, F2 = end1 + d1, end2 + d2
-                r2, r3, r4, r5 = rates(c, a0, a1, a2, a3, a4, a5, F1, F2)
-                w = h / 6.0 if stage == 0 or stage == 3 else h / 3.0
-                s0, s1, s2, s3 = s0 + w * a2, s1 + w * a3, s2 + w * r2, s3 + w * r3
-                s4, s5 = s4 + w * r4, s5 + w * r5
+                    F1, F2 = end1, end2
+                    for k in range(2 * _L):
+                        w[_FORCE + k] = w[_END + k] + w[10 * _L + k]
+                dphi, dl, z1, z2 = a[2], a[3], a[4], a[5]
+                ddphi, ddl, dz1, dz2 = _motion(
+                    c, x, a[0], a[1], dphi, dl, z1, z2, F1 + out[10], F2 + out[11], by
+                )
+                for n in range(5):
+                    w[_OWN + _FELT[n]], w[_OWN + _L + _FELT[n]] = by[8 + n], by[21 + n]
+                w[_OWN + 2 * _L + 21], w[_OWN + 2 * _L + 22] = 2.0 * creep_stiffness * dl, -creep_rate * z1
+                w[_OWN + 3 * _L + 21] = 2.0 * c.r * creep_stiffness * dphi
+                w[_OWN + 3 * _L + 22] = -creep_rate * z2
+                weight = h / 6.0 if stage == 0 or stage == 3 else h / 3.0
                 g = h if stage == 2 else 0.5 * h
-                a0, a1, a2, a3 = y0 + g * a2, y1 + g * a3, y2 + g * r2, y3 + g * r3
-                a4, a5 = y4 + g * r4, y5 + g * r5
-            y0, y1, y2, y3, y4, y5 = y0 + s0, y1 + s1, y2 + s2, y3 + s3, y4 + s4, y5 + s5
-            f1, f2 = end1, end2
-    out[0], out[1], out[2], out[3], out[4], out[5] = y1, y0, y3, y2, y4, y5
-    out[6], out[7], out[8], out[9], out[10], out[11] = x1, x2, f1, f2, d1, d2
-
-
-@kernel(arrays=False)
-def jacobian(
-    plant: FloatArray, x: FloatArray, segments: FloatArray, count: int, out: FloatArray, F: FloatArray
-) -> None:
-    """`flow` into out[:12], and its derivative F (12, 23).
-
-    Twelve more entries of out are scratch; x is nudged on the way and then as before.
-    """
-    longest_s = longest_step_s(plant, x)
-    flow(plant, x, segments, count, longest_s, out)
-    moved = out[DYNAMIC:]
-    for k in range(INVOLVED):
-        step, own = _NUDGE[k], x[k]
-        x[k] = own + step
-        flow(plant, x, segments, count, longest_s, moved)
-        x[k] = own
-        for i in range(DYNAMIC):
-            F[i, k] = (moved[i] - out[i]) / step
-
-
-@kernel(arrays=False)
-def _accelerate(plant: FloatArray, x: FloatArray) -> tuple[float, float]:
-    c = _coefficients(plant, x)
-    ddl, ddphi, _, _ = rates(c, x[1], x[0], x[3], x[2], x[4], x[5], x[8] + x[10], x[9] + x[11])
-    return ddphi, ddl
+                _stage_rows(c, by, weight, g, w)
+                s[0], s[1], s[2] = s[0] + weight * dphi, s[1] + weight * dl, s[2] + weight * ddphi
+                s[3], s[4], s[5] = s[3] + weight * ddl, s[4] + weight * dz1, s[5] + weight * dz2
+                a[0], a[1], a[2] = out[0] + g * dphi, out[1] + g * dl, out[2] + g * ddphi
+                a[3], a[4], a[5] = out[3] + g * ddl, out[4] + g * dz1, out[5] + g * dz2
+            for i in range(6):
+                out[i] += s[i]
+            for k in range(6 * _L):
+                w[k] += w[_SUM + k]
+            out[8], out[9] = end1, end2
+            for k in range(2 * _L):
+                w[8 * _L + k] = w[_END + k]
+    for i in range(DYNAMIC):
+        for k in range(INVOLVED):
+            F[i, k] = w[i * _L + k]
 
 
 @kernel(arrays=False)
 def accelerations(
-    plant: FloatArray, x: FloatArray, by_phi: FloatArray, by_length: FloatArray
+    plant: FloatArray, x: FloatArray, by_phi: FloatArray, by_length: FloatArray, by: FloatArray
 ) -> tuple[float, float]:
-    """ddphi [rad/s^2], ddl [m/s^2] of a state and their gradients (23,), written to; x stays."""
-    ddphi, ddl = _accelerate(plant, x)
-    for k in range(INVOLVED):
-        by_phi[k], by_length[k] = 0.0, 0.0
-        if k == 6 or k == 7 or 15 <= k <= 18 or k >= 21:
-            continue
-        own = x[k]
-        x[k] = own + _NUDGE[k]
-        a, b = _accelerate(plant, x)
-        x[k] = own
-        by_phi[k], by_length[k] = (a - ddphi) / _NUDGE[k], (b - ddl) / _NUDGE[k]
+    """ddphi [rad/s^2], ddl [m/s^2] of a state and their gradients (23,), written to; by (26,) is scratch."""
+    F1, F2 = x[8] + x[10], x[9] + x[11]
+    ddphi, ddl, _, _ = _motion(
+        _coefficients(plant, x), x, x[0], x[1], x[2], x[3], x[4], x[5], F1, F2, by
+    )  # fmt: skip
+    for i in range(2):
+        to, at = by_phi if i == 0 else by_length, 13 * i
+        for k in range(INVOLVED):
+            to[k] = by[at + k] if k < 6 else 0.0
+        to[8], to[9], to[10], to[11] = by[at + 6], by[at + 7], by[at + 6], by[at + 7]
+        for n in range(5):
+            to[_FELT[n]] = by[at + 8 + n]
     return ddphi, ddl
 
 
+_DENSE, _WIDTH, _TURNED = 6, 8, DYNAMIC * SIZE_D
+"""Rows of F that are full, those of head and creep, and how wide each row of their transpose is."""
+CARRY = _TURNED + INVOLVED * _WIDTH
+"""Length of the scratch of `carry`."""
+
+
 @kernel(arrays=False)
-def carry(P: FloatArray, F: FloatArray, noise: FloatArray, dt: float, FP: FloatArray) -> None:
+def carry(P: FloatArray, F: FloatArray, noise: FloatArray, dt: float, w: FloatArray) -> None:
     """P = [F 0; 0 1] P [F 0; 0 1]' + noise dt, in place.
 
     Parameters
     ----------
-    P : (36, 36). F : (12, 23). noise : (36,) squared densities. FP : (12, 36) scratch.
+    P : (36, 36). F : (12, 23). noise : (36,) squared densities. w : (`CARRY`,) scratch, for F P and F'.
     """
-    n = P.shape[0]
-    for i in range(DYNAMIC):
-        for j in range(n):
-            FP[i, j] = 0.0
+    # Flat arrays with sizes that are known: the compiler takes several columns at a time.
+    flat = P.reshape(-1)
+    for i in range(_DENSE):
+        for k in range(INVOLVED):
+            w[_TURNED + k * _WIDTH + i] = F[i, k]
+        for j in range(SIZE_D):
+            total = 0.0
+            for k in range(INVOLVED):
+                total += F[i, k] * flat[k * SIZE_D + j]
+            w[i * SIZE_D + j] = total
+    for i in range(_DENSE, DYNAMIC):
+        for j in range(SIZE_D):
+            w[i * SIZE_D + j] = 0.0
         for k in range(INVOLVED):
             slope = F[i, k]
             if slope != 0.0:
-                for j in range(n):
-                    FP[i, j] += slope * P[k, j]
+                for j in range(SIZE_D):
+                    w[i * SIZE_D + j] += slope * flat[k * SIZE_D + j]
     for i in range(DYNAMIC):
-        for j in range(i + 1):
+        for j in range(_WIDTH):
             total = 0.0
             for k in range(INVOLVED):
-                total += FP[i, k] * F[j, k]
-            P[i, j] = total
-            P[j, i] = total
-        for j in range(DYNAMIC, n):
-            P[i, j] = FP[i, j]
-            P[j, i] = FP[i, j]
-    for i in range(n):
+                total += w[i * SIZE_D + k] * w[_TURNED + k * _WIDTH + j]
+            flat[i * SIZE_D + j] = total
+    for i in range(_DENSE, DYNAMIC):
+        for j in range(_DENSE, i + 1):
+            P[i, j] = 0.0
+        for k in range(INVOLVED):
+            slope = F[i, k]
+            if slope != 0.0:
+                for j in range(_DENSE, i + 1):
+                    P[i, j] += slope * w[j * SIZE_D + k]
+    for i in range(DYNAMIC):
+        for j in range(i):
+            P[j, i] = P[i, j]
+        for j in range(DYNAMIC, SIZE_D):
+            P[i, j] = P[j, i] = w[i * SIZE_D + j]
+    for i in range(SIZE_D):
         P[i, i] += noise[i] * dt
 
 
@@ -383,8 +588,7 @@ HOSES = 4
 LONGEST_S = 0.02
 """Longer steps are taken in parts."""
 
-SIZE_D = len(DRIVEN)
-WORK = (25 + DYNAMIC, SIZE_D)
+WORK = (26 + DYNAMIC + max(FLOW, CARRY) // SIZE_D, SIZE_D)
 """Shape of the scratch: p, x0, gradients, terms, segments, accelerations, F P, what is learnt, and F."""
 
 TRACE = 2 * SIZE_D + 2
@@ -465,10 +669,11 @@ def predict_driven(
     parts = max(math.ceil((end - begin) / LONGEST_S - 1e-9), 1)
     h = (end - begin) / parts
     segments, moved = work[8:12].reshape(-1)[: 3 * _MOST_SEGMENTS].reshape(_MOST_SEGMENTS, 3), work[6]
+    flow = work[37:].reshape(-1)
     for k in range(parts):
         count = cut(begin + k * h, begin + (k + 1) * h, switch_t, switch_g, last, segments)
-        jacobian(plant, x, segments, count, moved, F)
-        carry(P, F, walk, h, work[12:])
+        jacobian(plant, x, segments, count, longest_step_s(plant, x), moved, F, flow)
+        carry(P, F, walk, h, flow)
         for i in range(DYNAMIC):
             x[i] = moved[i]
 
@@ -505,7 +710,7 @@ def measure(
         _spread_out(h1, H[1])
         return
     by_phi, by_length = work[8], work[9]
-    state[4], state[5] = accelerations(plant, x, by_phi, by_length)
+    state[4], state[5] = accelerations(plant, x, by_phi, by_length, work[1])
     out[0], out[1] = accelerometer(constants[0], constants[1], state, h0, h1)
     tilt = x[0] + x[26]
     moved_x = out[0] - x[24] - constants[0] * math.cos(tilt)
@@ -657,7 +862,7 @@ def let_go_time(
     """When, between two times, a head of this state was let go that turns at the end as a sample says."""
     own1, own2 = x[10], x[11]
     x[10], x[11] = 0.0, 0.0
-    ddphi, _ = accelerations(plant, x, work[8], work[9])
+    ddphi, _ = accelerations(plant, x, work[8], work[9], work[1])
     x[10], x[11] = own1, own2
     turned = (x[23] - g_z) / (1.0 + x[27]) - x[2]
     since = turned / ddphi if ddphi * turned > 0.0 else 0.0

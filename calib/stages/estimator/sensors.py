@@ -169,6 +169,15 @@ def _slope_series(terms: int = 13) -> tuple[float, ...]:
 _E_SERIES = _slope_series()
 
 
+@kernel(arrays=False, inlined=True)
+def decay_slope_w(w: float) -> float:
+    """-2 dD/dw as a function of w = phi^2, so that dD/dphi is -phi times it."""
+    E = _E_SERIES[0]
+    for coefficient in _E_SERIES[1:]:
+        E = E * w + coefficient
+    return E
+
+
 def view_coefficients(
     camera: Camera, R_CW: FloatArray, t_CW_m: FloatArray, middle_m: tuple[float, float] = (0.0, 0.08)
 ) -> FloatArray:
@@ -355,9 +364,7 @@ def accelerometer_terms(
     """
     w = phi * phi
     S, D = chord_ratio_w(w), chord_decay_w(w)
-    E = _E_SERIES[0]
-    for coefficient in _E_SERIES[1:]:
-        E = E * w + coefficient
+    E = decay_slope_w(w)
     S1, S2 = -phi * D, 2.0 * D - 0.25 * S
     S3 = -2.0 * phi * E - 0.25 * S1
     sh, ch = 0.5 * phi * S, S - w * D
