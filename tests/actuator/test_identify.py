@@ -379,12 +379,12 @@ def test_truth_is_recovered_beside_outliers(sign: float) -> None:
     y = sign * (20.0 * Shape(95.0, 30.0).of(U) + 0.2 * rng.standard_normal(len(U)))
     y[10] += sign * 6.0
     found = fit_static_map("table", U, y)
-    assert found.end == pytest.approx(sign * 20.0, abs=3.5 * found.sigma["end"])
-    assert found.shape.dead_pwm == pytest.approx(95.0, abs=3.5 * found.sigma["dead_pwm"])
-    assert found.shape.scale_pwm == pytest.approx(30.0, abs=3.5 * found.sigma["scale_pwm"])
-    assert U[10] in found.outliers
-    assert found.scatter == pytest.approx(0.2, rel=0.5)
-    assert abs(found.of(np.array([found.saturates_pwm]))[0]) == pytest.approx(0.95 * abs(found.end))
+    assert found.fit.end == pytest.approx(sign * 20.0, abs=3.5 * found.fit.sigma["end"])
+    assert found.shape.dead_pwm == pytest.approx(95.0, abs=3.5 * found.fit.sigma["dead_pwm"])
+    assert found.shape.scale_pwm == pytest.approx(30.0, abs=3.5 * found.fit.sigma["scale_pwm"])
+    assert U[10] in found.fit.outliers_pwm
+    assert found.fit.scatter == pytest.approx(0.2, rel=0.5)
+    assert abs(found.of(np.array([found.fit.saturates_pwm]))[0]) == pytest.approx(0.95 * abs(found.fit.end))
 
 
 EPS = np.linspace(0.002, 0.027, 12)

@@ -15,19 +15,25 @@ from calib.stages.actuator.identify_pump import (
     LAG,
     MODELS,
     ORIFICE,
+    PumpFound,
     PumpRecord,
+    PumpTable,
+    Settled,
     Shape,
     _by_chance,
     _Problem,
     _solve,
     cross_validate,
     fit_pump,
+    identify_pump,
+    judge_pump,
+    pump_section,
     simulate_pump,
+    unexplained,
     with_run_sigma,
 )
 from calib.stages.actuator.pump import Orifice
-from calib.stages.actuator.pump_results import PumpFound, identify_pump, judge_pump, pump_section, unexplained
-from calib.stages.actuator.read import PumpTable, Settled, read_pump_table
+from calib.stages.actuator.read import read_pump_table
 
 
 @pytest.mark.parametrize(
@@ -227,7 +233,7 @@ def test_what_the_pwm_does_not_explain_makes_it_poor(found: PumpFound) -> None:
     assert "while the PWM stood still" in said[1]
     assert judge_pump(odd)[0] == "poor"
     assert odd.main_group is not None
-    assert odd.held_rms(LAG, odd.main_group.names) < odd.held_rms(LAG)
+    assert odd.held_rms(LAG, odd.main_group.files) < odd.held_rms(LAG)
 
 
 def _write(path: Path, head: str, rows: np.ndarray) -> Path:

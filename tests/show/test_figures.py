@@ -25,9 +25,9 @@ from calib.io.logs import Log, read_log, write_log
 from calib.show.charts import chart
 from calib.show.draw import draw, plain, write_figures
 from calib.stages import function, stage
-from calib.stages.actuator.identify_pump import Group, fit_static_map
+from calib.stages.actuator.identify_pump import PumpFound, fit_static_map
 from calib.stages.actuator.plots import pump_plots
-from calib.stages.actuator.pump_results import PumpFound
+from calib.stages.actuator.section import SettledRuns
 from calib.stages.camera.bundle import Calibration, calibrate, covariance, rotation_exp
 from calib.stages.camera.checks import cell_means
 from calib.stages.camera.intrinsics import Intrinsics
@@ -287,7 +287,10 @@ def _settled() -> dict[str, Figure]:
     pwm = np.linspace(0.0, 255.0, 18)
     value = 26.0 * np.clip(pwm - 40.0, 0.0, None) / 215.0
     value[9] += 8.0
-    groups = (Group(12.0, 0.2, (120.0, 180.0), ("a", "b")), Group(24.0, 0.2, (240.0, 240.0), ("c",)))
+    groups = (
+        SettledRuns(value=12.0, spread=0.2, pwm=[120.0, 180.0], files=["a", "b"]),
+        SettledRuns(value=24.0, spread=0.2, pwm=[240.0, 240.0], files=["c"]),
+    )
     maps = (fit_static_map("settled.csv", pwm, value),)
     return pump_plots(PumpFound("kPa", (), {}, {}, {}, {}, maps, groups, (), (), ()), "ok")
 

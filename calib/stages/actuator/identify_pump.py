@@ -1,4 +1,4 @@
-"""Models of a pump with its chamber, fitted to recordings."""
+"""A pump from tables: models of it with its chamber, compared and judged, and the section `pump`."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations, pairwise
+from typing import Any
 
 import numpy as np
 from scipy.special import chdtri
@@ -13,8 +14,19 @@ from scipy.special import chdtri
 from calib.core.arrays import BoolArray, FloatArray
 from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
-from calib.stages.actuator.identify import scaled_inverse
-from calib.stages.actuator.pump import PWM_MAX
+from calib.core.result import finite_or_none, section_json
+from calib.core.rig import Rig
+from calib.stages.actuator.identify import Progress, scaled_inverse
+from calib.stages.actuator.parameters import SUPPLY_V
+from calib.stages.actuator.pump import PWM_MAX, TICK_S
+from calib.stages.actuator.section import (
+    KnownPump,
+    PumpIdentified,
+    PumpModel,
+    PumpSection,
+    SettledRuns,
+    StaticMapSection,
+)
 
 # ----------------------------------------------------------------------
 # Two models of a pump with its chamber, from PWM to the pressure (or force) that a sensor sees.
@@ -100,6 +112,25 @@ class PumpRecord:
             raise BadInputError(f"{self.name}: found {len(self.t_s)} rows, expected at least 10")
         if not np.all(np.diff(self.t_s) > 0.0):
             raise BadInputError(f"{self.name}: found time that stands still or runs backward")
+
+
+@dataclass(frozen=True)
+class Settled:
+    """Settled values (n,) at PWM values (n,), of one mode."""
+
+    name: str
+    pwm: FloatArray
+    value: FloatArray
+
+
+@dataclass(frozen=True)
+class PumpTable:
+    """What a table holds: a recording over time, or settled values by mode; and sentences about it."""
+
+    unit: str
+    record: PumpRecord | None
+    settled: tuple[Settled, ...]
+    said: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -647,22 +678,6 @@ _JUMP_S = 0.1
 
 
 @dataclass(frozen=True)
-class Group:
-    """Runs that settle at the same value under nearly the same PWM.
-
-    Attributes
-    ----------
-    value, spread : mean and standard deviation of the settled values.
-    pwm : least and greatest PWM while settled. names : of the runs.
-    """
-
-    value: float
-    spread: float
-    pwm: tuple[float, float]
-    names: tuple[str, ...]
-
-
-@dataclass(frozen=True)
 class Departure:
     """Where a run leaves the model: time from its start [s], error there after, and whether PWM had moved."""
 
@@ -672,7 +687,7 @@ class Departure:
     pwm_moved: bool
 
 
-def settled_groups(records: Sequence[PumpRecord]) -> tuple[Group, ...]:
+def settled_groups(records: Sequence[PumpRecord]) -> tuple[SettledRuns, ...]:
     """Groups of runs by the value of their last second, for runs near full PWM then.
 
     Two groups are apart by more than a twentieth of the largest value.
@@ -692,11 +707,11 @@ def settled_groups(records: Sequence[PumpRecord]) -> tuple[Group, ...]:
         else:
             groups.append([end])
     return tuple(
-        Group(
-            float(np.mean([e[0] for e in group])),
-            float(np.std([e[0] for e in group])),
-            (min(e[2] for e in group), max(e[3] for e in group)),
-            tuple(e[1] for e in group),
+        SettledRuns(
+            value=float(np.mean([e[0] for e in group])),
+            spread=float(np.std([e[0] for e in group])),
+            pwm=[min(e[2] for e in group), max(e[3] for e in group)],
+            files=[e[1] for e in group],
         )
         for group in groups
     )
@@ -770,29 +785,21 @@ _FAR = 4.0
 
 @dataclass(frozen=True)
 class StaticMap:
-    """A fitted static map.
-
-    Attributes
-    ----------
-    name : of the table or the part of it. end : Y with its sign. shape : dead zone and scale.
-    sigma : of end, dead_pwm, scale_pwm. saturates_pwm : where 95 % of the end are reached.
-    scatter : robust standard deviation of the settled values about the map.
-    pwm, value : (n,) what was fitted. outliers : (m,) PWM values that lie more than four scatters off.
-    """
+    """A fitted static map, of settled values (n,) at PWM values (n,) of a table or a part of it."""
 
     name: str
-    end: float
-    shape: Shape
-    sigma: dict[str, float]
-    saturates_pwm: float
-    scatter: float
+    fit: StaticMapSection
     pwm: FloatArray
     value: FloatArray
-    outliers: tuple[float, ...]
+
+    @property
+    def shape(self) -> Shape:
+        """Dead zone and saturation."""
+        return Shape(self.fit.dead_pwm, self.fit.scale_pwm)
 
     def of(self, pwm: FloatArray) -> FloatArray:
         """Settled value of PWM values (n,)."""
-        return np.asarray(self.end * self.shape.of(pwm))
+        return np.asarray(self.fit.end * self.shape.of(pwm))
 
 
 def fit_static_map(name: str, pwm: FloatArray, value: FloatArray) -> StaticMap:
@@ -843,14 +850,307 @@ def fit_static_map(name: str, pwm: FloatArray, value: FloatArray) -> StaticMap:
         for k, s in zip(inside, spread.tolist(), strict=True):
             sigma[("end", "dead_pwm", "scale_pwm")[k]] = s
     reach = -scale * math.log1p(0.95 * math.expm1(-(PWM_MAX - dead) / scale))
-    return StaticMap(
-        name,
-        sign * end,
-        Shape(dead, scale),
-        sigma,
-        dead + reach,
-        scatter * 0.02 * top,
-        u,
-        y,
-        tuple(sorted(u[far].tolist())),
+    fit = StaticMapSection(
+        end=sign * end,
+        dead_pwm=dead,
+        scale_pwm=scale,
+        saturates_pwm=dead + reach,
+        scatter=scatter * 0.02 * top,
+        sigma={key: finite_or_none(one) for key, one in sigma.items()},
+        outliers_pwm=sorted(u[far].tolist()),
     )
+    return StaticMap(name, fit, u, y)
+
+
+# ----------------------------------------------------------------------
+# Both models on recordings, and the static maps of settled values.
+
+
+@dataclass(frozen=True)
+class PumpFound:
+    """Everything that `calib identify pump` has found.
+
+    Attributes
+    ----------
+    unit : of the values. records : recordings over time.
+    fits, held : by model. asked : errors on recordings that were kept out on purpose, by model.
+    between : standard deviation of where a run settles about the fit, by model.
+    maps : static maps. groups, departs, leaps : what is not explained.
+    """
+
+    unit: str
+    records: tuple[PumpRecord, ...]
+    fits: dict[str, PumpFit]
+    held: dict[str, list[Held]]
+    asked: dict[str, list[Held]]
+    between: dict[str, float]
+    maps: tuple[StaticMap, ...]
+    groups: tuple[SettledRuns, ...]
+    departs: tuple[Departure, ...]
+    leaps: tuple[tuple[str, float, float], ...]
+    said: tuple[str, ...]
+
+    @property
+    def main_group(self) -> SettledRuns | None:
+        """The largest group of runs, None where all settle alike or too few do."""
+        if len(self.groups) < 2:
+            return None
+        return max(self.groups, key=lambda g: len(g.files))
+
+    def held_rms(self, model: str, names: Sequence[str] | None = None) -> float | None:
+        """RMS over recordings that were not fitted, each counting alike; None without any."""
+        some = [h.rms for h in self.held[model] if names is None or h.name in names]
+        return float(np.sqrt(np.mean(np.square(some)))) if some else None
+
+    def settles(self, model: str) -> tuple[float, float, int, int] | None:
+        """Level, half its 95 % interval for a further run, and how many of the held runs end inside that
+        which the others give, of how many; None where fewer than three were held.
+
+        Three deviations hold 95 % of any distribution with one peak (Vysochanskij and Petunin 1980).
+        """
+        ends = [h.settles for h in self.held[model] if math.isfinite(h.settles)]
+        if len(ends) < _FEWEST_RUNS or "level" not in self.fits[model].sigma:
+            return None
+        inside = sum(
+            abs(end)
+            <= 3.0 * math.hypot(*(other for j, other in enumerate(ends) if j != k)) / math.sqrt(len(ends) - 1)
+            for k, end in enumerate(ends)
+        )
+        fit = self.fits[model]
+        return fit.values["level"], 3.0 * fit.sigma["level"], inside, len(ends)
+
+    @property
+    def better(self) -> str | None:
+        """The model with the smaller error on recordings not fitted; None without recordings."""
+        if not self.fits:
+            return None
+        return min(self.fits, key=lambda m: self.held_rms(m) or self.fits[m].rms)
+
+
+def _chosen_shape(records: Sequence[PumpRecord], maps: Sequence[StaticMap]) -> Shape:
+    """The static map's shape that lets the plain lag fit best: a straight line, or one of the tables'."""
+    rising = [m for m in maps if m.fit.end * float(np.median([r.value[-1] for r in records])) > 0.0]
+    shapes = [Shape(), *(m.shape for m in rising)]
+    if len(shapes) == 1:
+        return shapes[0]
+    # Judged by the model that a drop of the PWM can tell anything about.
+    costs = [fit_pump(records, LAG, shape).cost for shape in shapes]
+    return shapes[int(np.argmin(costs))]
+
+
+def identify_pump(
+    tables: Sequence[PumpTable], kept_out: Sequence[PumpTable] = (), progress: Progress | None = None
+) -> PumpFound:
+    """Dead time, lag, static map and flow of a pump, both models compared on recordings not fitted.
+
+    Parameters
+    ----------
+    kept_out : tables that are predicted and not fitted.
+
+    Raises
+    ------
+    BadInputError for tables of different units, and where nothing changes in any.
+    """
+    units = {table.unit for table in (*tables, *kept_out)}
+    if len(units) != 1:
+        raise BadInputError(f"pump: found tables in {' and '.join(sorted(units))}, expected one unit")
+    said = [sentence for table in tables for sentence in table.said]
+    records = []
+    for table in tables:
+        record = table.record
+        if record is None:
+            continue
+        if not np.ptp(record.pwm) and float(np.ptp(record.value)) < 1e-9:
+            said.append(f"{record.name}: neither PWM nor value ever changes; left out")
+            continue
+        records.append(record)
+    settled = [part for table in tables for part in table.settled]
+    maps = [fit_static_map(part.name, part.pwm, part.value) for part in settled]
+    if not records and not maps:
+        raise BadInputError("pump: neither PWM nor value ever changes in these tables, expected steps")
+    fits: dict[str, PumpFit] = {}
+    held: dict[str, list[Held]] = {}
+    asked: dict[str, list[Held]] = {}
+    between: dict[str, float] = {}
+    if records:
+        shape = _chosen_shape(records, maps)
+        for done, model in enumerate(MODELS):
+            if progress is not None:
+                progress(done, len(MODELS))
+            fits[model] = fit_pump(records, model, shape)
+            held[model] = cross_validate(fits[model], records)
+            fits[model], between[model] = with_run_sigma(fits[model], held[model])
+            outside = [table.record for table in kept_out if table.record is not None]
+            asked[model] = [held_by(fits[model], r) for r in outside]
+    return PumpFound(
+        units.pop(),
+        tuple(records),
+        fits,
+        held,
+        asked,
+        between,
+        tuple(maps),
+        settled_groups(records) if records else (),
+        departures(fits[ORIFICE], records) if records else (),
+        jumps(records),
+        tuple(said),
+    )
+
+
+# ----------------------------------------------------------------------
+# What was found of a pump, judged and as the section `pump` of rig.yaml.
+
+_MOST_SHARE = 0.05
+_FEWEST_RUNS = 3
+_MOST_VAGUE = 0.5
+
+
+def unexplained(found: PumpFound) -> list[str]:
+    """Sentences on what no function of the PWM explains."""
+    out, unit = [], found.unit
+    main = found.main_group
+    if main is not None:
+        parts = [
+            f"{len(g.files)} at {g.value:.1f} {unit} ({', '.join(g.files)}; "
+            f"PWM {g.pwm[0]:.0f} .. {g.pwm[1]:.0f})"
+            for g in found.groups
+        ]
+        out.append(f"runs near full PWM settle apart: {'; '.join(parts)}; PWM does not say which")
+    for d in found.departs:
+        moved = "after the PWM had moved" if d.pwm_moved else "while the PWM stood still"
+        out.append(
+            f"{d.name} leaves the model {d.at_s:.2f} s after its start, {moved}, by {d.error:+.2f} {unit}"
+        )
+    for name, size, before in found.leaps:
+        out.append(
+            f"{name} begins with a jump of {size:.1f} {unit} within 0.1 s from {before:.2f} {unit}, as if "
+            "the chamber had been under pressure behind a closed valve"
+        )
+    for m in found.maps:
+        if m.fit.outliers_pwm:
+            values = ", ".join(f"{u:g}" for u in m.fit.outliers_pwm)
+            out.append(
+                f"{m.name}: the settled values at PWM {values} lie off the map by more than four scatters"
+            )
+    return out
+
+
+def judge_pump(found: PumpFound) -> tuple[str, list[str], list[str]]:
+    """Verdict, reasons and remarks."""
+    reasons, remarks = unexplained(found), list(dict.fromkeys(found.said))
+    if not found.fits:
+        remarks.append(
+            "settled values alone: neither dead time nor lag can be told, expected a recording over time"
+        )
+        return "unidentifiable" if not found.maps else "poor" if reasons else "ok", reasons, remarks
+    better = found.better
+    assert better is not None
+    fit = found.fits[better]
+    span = max(float(r.value.max() - r.value.min()) for r in found.records)
+    rms = found.held_rms(better)
+    if rms is None:
+        remarks.append("one recording alone: no error on recordings not fitted")
+    elif rms > _MOST_SHARE * span:
+        reasons.append(
+            f"on recordings not fitted the {better} is off by {rms:.2f} {found.unit} (RMS), "
+            f"{100.0 * rms / span:.0f} % of the range"
+        )
+    for name, sigma in fit.sigma.items():
+        value = abs(fit.values[name])
+        if (
+            name not in ("laminar_s", "turbulent_s2", "hose_per_s", "chamber_s")
+            and sigma > _MOST_VAGUE * value
+        ):
+            reasons.append(
+                f"{name} of the {better} is known to {100.0 * sigma / max(value, 1e-12):.0f} % only"
+            )
+    settles = found.settles(better)
+    if settles is not None:
+        level, half, inside, count = settles
+        remarks.append(
+            f"a further run settles at {level:.1f} +- {half:.1f} {found.unit} at full PWM (95 %); "
+            f"of {count} runs that were held back {inside} end inside what the others give"
+        )
+    if found.fits[LAG].shape.dead_pwm == 0.0:
+        remarks.append(
+            "dead zone and shape of the static map are not told by these recordings; it is taken as a "
+            "straight line through zero (settled values at several PWM tell it)"
+        )
+    return "poor" if reasons else "ok", reasons, remarks
+
+
+def _unit(parameter: Parameter, unit: str) -> str:
+    if parameter.name == "rising_limit_per_s":
+        return f"{unit}/s"
+    return {"y": unit, "1/y": f"s^2/{unit}"}.get(parameter.unit, parameter.unit)
+
+
+def parameter_rows(fit: PumpFit, unit: str) -> list[tuple[str, float, float | None, str, str]]:
+    """Name, value, standard deviation, unit and remark of each parameter."""
+    rows = []
+    for parameter in MODELS[fit.model]:
+        value = fit.values[parameter.name]
+        rows.append(
+            (
+                parameter.name,
+                value,
+                fit.sigma.get(parameter.name),
+                _unit(parameter, unit),
+                fit.fixed.get(parameter.name, ""),
+            )
+        )
+    return rows
+
+
+def _model(found: PumpFound, name: str) -> PumpModel:
+    fit, main = found.fits[name], found.main_group
+    held = found.held[name]
+    return PumpModel(
+        parameters={n: v for n, v in fit.values.items() if n in fit.sigma},
+        sigma={n: finite_or_none(s) for n, s in fit.sigma.items()},
+        fixed=fit.fixed,
+        fitted_rms=fit.rms,
+        held_rms=found.held_rms(name),
+        level_between_runs=finite_or_none(found.between[name]),
+        held_rms_in_main_group=None if main is None else found.held_rms(name, main.files),
+        held_by_file={h.name: h.rms for h in held},
+        ahead_by_file={h.name: finite_or_none(h.ahead) for h in held},
+    )
+
+
+def pump_section(found: PumpFound, rig: Rig) -> PumpSection:
+    """The section, with lag and dead time of the linear model where a recording tells them.
+
+    Levels in kPa are no forces: they stay under `identified`. What logs have told of forces stays.
+    """
+    verdict, reasons, remarks = judge_pump(found)
+    before: dict[str, Any] = {} if rig.pump is None else section_json(rig.pump)
+    stated = rig.known.pump if rig.known is not None and rig.known.pump is not None else KnownPump()
+    update: dict[str, Any] = {"verdict": verdict, "reasons": reasons, "remarks": remarks, "advice": []}
+    sigma: dict[str, Any] = before.get("sigma", {})
+    if found.fits:
+        lag = found.fits[LAG]
+        tick_s = stated.tick_s or before.get("tick_s", TICK_S)
+        update |= {
+            "lag_s": lag.values["lag_s"],
+            "delay_ticks": round(lag.values["dead_time_s"] / tick_s),
+        }
+        sigma |= {"lag_s": lag.sigma["lag_s"], "delay_ticks": lag.sigma["dead_time_s"] / tick_s}
+        dead = lag.shape.dead_pwm
+        if dead > 0.0:
+            of = [m for m in found.maps if m.shape == lag.shape]
+            supply = stated.supply_V or before.get("supply_V", SUPPLY_V)
+            update["dead_zone_V"] = supply * dead / PWM_MAX
+            wide = of[0].fit.sigma["dead_pwm"] if of else None
+            sigma["dead_zone_V"] = None if wide is None else supply * wide / PWM_MAX
+    identified = PumpIdentified.model_validate(
+        {
+            "unit": found.unit,
+            "models": {name: _model(found, name) for name in found.fits},
+            "better": found.better,
+            "static": {m.name: m.fit for m in found.maps},
+            "groups": found.groups,
+            "unexplained": unexplained(found),
+        }
+    )
+    return PumpSection.model_validate(before | update | {"sigma": sigma, "identified": identified})

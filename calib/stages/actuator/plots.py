@@ -25,8 +25,7 @@ from calib.core.plot import (
     short,
 )
 from calib.stages.actuator.identify import PARAMETERS, StiffnessFit
-from calib.stages.actuator.identify_pump import LAG, ORIFICE, simulate_pump
-from calib.stages.actuator.pump_results import PumpFound
+from calib.stages.actuator.identify_pump import LAG, ORIFICE, PumpFound, simulate_pump
 from calib.stages.actuator.results import Identified, simulated_heads
 from calib.stages.actuator.validate import IMPROVED, NOMINAL, ORIGINAL, QUANTITIES, Comparison
 
@@ -237,14 +236,14 @@ def _static(result: PumpFound) -> Figure:
     u = np.linspace(0.0, 255.0, 400)
     marks: list[Mark] = []
     for m, hue in zip(result.maps, _HUES * len(result.maps), strict=False):
-        far = np.isin(m.pwm, m.outliers)
+        far = np.isin(m.pwm, m.fit.outliers_pwm)
         marks.append(Curve(m.pwm[~far], m.value[~far], kind="points", colour=hue))
         marks.append(Curve(m.pwm[far], m.value[far], kind="crosses", colour=hue, size=5.0))
         marks.append(Curve(u, m.of(u), short(m.name, 50), colour=hue))
     for group in result.groups:
         at, value = np.array(group.pwm[1:2]), np.array([group.value])
         marks.append(Curve(at, value, kind="squares", colour="red", size=5.0))
-        marks.append(Text(at[0] - 3.0, value[0], f"{len(group.names)} runs", align="right"))
+        marks.append(Text(at[0] - 3.0, value[0], f"{len(group.files)} runs", align="right"))
     return Figure("Static map", note, (Plot("PWM", result.unit, marks),), 3.6)
 
 

@@ -18,7 +18,7 @@ from calib.core.rig import Rig
 from calib.core.units import plain_number
 from calib.io.logs import Log, check_time, read_log
 from calib.stages.actuator.identify import Start, Track, without_outliers
-from calib.stages.actuator.identify_pump import PumpRecord
+from calib.stages.actuator.identify_pump import PumpRecord, PumpTable, Settled
 from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import Plant
 from calib.stages.actuator.pump import TICK_S
@@ -47,25 +47,6 @@ _MOST_BAD = 0.05
 _FEWEST = 20
 _SHORTEST_S = 0.5
 _JUMP = 20.0
-
-
-@dataclass(frozen=True)
-class Settled:
-    """Settled values (n,) at PWM values (n,), of one mode."""
-
-    name: str
-    pwm: FloatArray
-    value: FloatArray
-
-
-@dataclass(frozen=True)
-class PumpTable:
-    """What a table holds: a recording over time, or settled values by mode; and sentences about it."""
-
-    unit: str
-    record: PumpRecord | None
-    settled: tuple[Settled, ...]
-    said: tuple[str, ...]
 
 
 def read_columns(path: Path) -> tuple[list[str], list[list[str]], list[int]]:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field, ValidationInfo, field_validator
 
 from calib.core.files import one_line
-from calib.core.result import CovarianceTable, NotNegative, Number, Result, Section, Statement, quantity
+from calib.core.result import CovarianceTable, NotNegative, Number, Pair, Result, Section, Statement, quantity
 from calib.core.schema import nearest, validated
 
 if TYPE_CHECKING:
@@ -177,19 +177,28 @@ class StaticMapSection(Section):
     outliers_pwm: list[Number] = []
 
 
+class SettledRuns(Section):
+    """Runs that settle alike under nearly the same PWM: mean and deviation, least and greatest PWM."""
+
+    value: Number
+    spread: NotNegative
+    pwm: Pair
+    files: list[str]
+
+
 class PumpIdentified(Section):
     """What `calib identify pump` finds, in the unit of its tables.
 
     Attributes
     ----------
-    models : by name. groups : settled values, with the PWM and the recordings that settle there.
+    models : by name. groups : of runs that settle apart.
     """
 
     unit: Literal["kPa", "N"]
     models: dict[str, PumpModel] = {}
     better: str | None = None
     static: dict[str, StaticMapSection] = {}
-    groups: list[dict[str, Number | list[str] | list[Number]]] = []
+    groups: list[SettledRuns] = []
     unexplained: list[str] = []
 
 

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from calib.core.stage import Progress
     from calib.core.words import Block, Table
     from calib.stages.actuator.identify import Start, StiffnessFit
+    from calib.stages.actuator.identify_pump import PumpFound, PumpTable
     from calib.stages.actuator.machine import Machine
-    from calib.stages.actuator.pump_results import PumpFound
-    from calib.stages.actuator.read import PumpTable, TrackSource
+    from calib.stages.actuator.read import TrackSource
     from calib.stages.actuator.results import Identified
     from calib.stages.actuator.section import Actuator, PumpSection
     from calib.stages.actuator.validate import Comparison
@@ -263,7 +263,7 @@ def _read_pump(files: Files, rig: Rig, options: PumpOptions) -> PumpInputs:
 
 
 def _solve_pump(inputs: PumpInputs) -> PumpSection:
-    from calib.stages.actuator.pump_results import identify_pump, pump_section
+    from calib.stages.actuator.identify_pump import identify_pump, pump_section
 
     with inputs.progress("identifying") as progress:
         found = identify_pump(inputs.tables, inputs.kept_out, progress)
@@ -282,7 +282,7 @@ def _pump_document(section: PumpSection) -> dict[str, Any]:
 def _pump_words(section: PumpSection) -> list[Block]:
     """Parameters, errors on tables that were not fitted, and static maps."""
     from calib.core.words import Line, Table
-    from calib.stages.actuator.pump_results import parameter_rows
+    from calib.stages.actuator.identify_pump import parameter_rows
 
     found: PumpFound = section.evidence
     unit, models = found.unit, list(found.fits)
@@ -303,7 +303,7 @@ def _pump_words(section: PumpSection) -> list[Block]:
             errors.append((record.name, *cells, *(_cell(None if one is None else one.ahead) for one in row)))
         blank, main = ("",) * len(models), found.main_group
         if main is not None:
-            ends = (_cell(found.held_rms(model, main.names)) for model in models)
+            ends = (_cell(found.held_rms(model, main.files)) for model in models)
             errors.append((f"all that settle near {main.value:.1f} {unit}", *ends, *blank))
         errors.append(("all", *(_cell(found.held_rms(model)) for model in models), *blank))
         blocks.append(Table((f"RMS on files not fitted, {unit}", *columns), tuple(errors)))
@@ -319,11 +319,11 @@ def _pump_words(section: PumpSection) -> list[Block]:
     maps = [
         (
             one.name,
-            f"{one.end:.4g} ± {_cell(one.sigma['end'], '.2g')}",
-            f"{one.shape.dead_pwm:.1f} ± {_cell(one.sigma['dead_pwm'], '.2g')}",
-            f"{one.shape.scale_pwm:.1f} ± {_cell(one.sigma['scale_pwm'], '.2g')}",
-            f"{one.saturates_pwm:.0f}",
-            _cell(one.scatter),
+            f"{one.fit.end:.4g} ± {_cell(one.fit.sigma['end'], '.2g')}",
+            f"{one.fit.dead_pwm:.1f} ± {_cell(one.fit.sigma['dead_pwm'], '.2g')}",
+            f"{one.fit.scale_pwm:.1f} ± {_cell(one.fit.sigma['scale_pwm'], '.2g')}",
+            f"{one.fit.saturates_pwm:.0f}",
+            _cell(one.fit.scatter),
         )
         for one in found.maps
     ]
