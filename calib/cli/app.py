@@ -12,13 +12,12 @@ from calib.cli.convert import convert
 from calib.cli.diff import diff
 from calib.cli.docs import docs
 from calib.cli.doctor import doctor
-from calib.cli.fleet import fleet
+from calib.cli.fleet import fleet, sweep
 from calib.cli.live import live
 from calib.cli.record import record
 from calib.cli.report import report
 from calib.cli.run import run
 from calib.cli.simulate import simulate
-from calib.cli.sweep import sweep
 from calib.cli.track import track
 from calib.cli.verbs import OneByDefault, group, verb
 from calib.core import __version__

@@ -1,25 +1,76 @@
-"""`calib fleet`: many rigs from a manifest; a table, a page, and each rig's own results out."""
+"""`calib fleet` and `calib sweep`: many rigs, or many cases of a simulated one, on many processes."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from calib.cli.clusters import (
-    OutOption,
-    RetriesOption,
-    SchedulerOption,
-    WorkersOption,
-    at_work,
-)
 from calib.cli.common import JsonOption, document, narrate, progress_bar, say, table
-from calib.core.errors import EXIT_POOR
+from calib.core.errors import EXIT_POOR, UsageError
 
 if TYPE_CHECKING:
+    from calib.core.workers import Processes
     from calib.runner.fleet import FleetSummary
+    from calib.runner.outcomes import Store
+    from calib.runner.sweep import SweepSummary
+
+# ----------------------------------------------------------------------
+# What both share: their options, and the processes themselves.
+
+OutOption = Annotated[
+    Path, typer.Option("-o", "--output", help="Folder for the results; a later run goes on from it.")
+]
+SchedulerOption = Annotated[
+    str | None,
+    typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler to work on, as tls://host:8786."),
+]
+WorkersOption = Annotated[
+    int | None,
+    typer.Option("--workers", min=1, max=512, help="Processes on this machine. [default: one per processor]"),
+]
+RetriesOption = Annotated[
+    int,
+    typer.Option("--retries", min=0, max=10, help="How often a task is tried again after its process died."),
+]
+
+
+@contextmanager
+def at_work(
+    output: Path,
+    verb: str,
+    outputs: tuple[str, ...],
+    scheduler: str | None,
+    workers: int | None,
+    retries: int,
+) -> Iterator[tuple[Store, Processes]]:
+    """The output folder, see `opened_store`, and the processes: this machine's own, or those of a scheduler.
+
+    Raises `UsageError` where both a scheduler and a number of workers are given.
+    """
+    from calib.core.workers import processors
+    from calib.runner.outcomes import opened_store
+    from calib.runner.processes import connected, local
+
+    if scheduler is not None and workers is not None:
+        raise UsageError("--workers: an existing cluster has its own workers, give --scheduler alone")
+    with opened_store(output, verb, outputs) as (store, interrupted):
+        if interrupted:
+            narrate("the last run here was interrupted; going on where it stopped")
+        with (
+            connected(scheduler, narrate)
+            if scheduler
+            else local(workers or processors(), retries, store.scratch) as pool
+        ):
+            yield store, pool
+
+
+# ----------------------------------------------------------------------
+# `calib fleet`: many rigs from a manifest; a table, a page, and each rig's own results out.
 
 
 def fleet(
@@ -58,9 +109,17 @@ def fleet(
     """
     from calib.core.files import shown
     from calib.core.units import parse_duration_s
-    from calib.runner.fleet import check_apart, finish, run_fleet
+    from calib.runner.fleet import (
+        SCHEMES,
+        Allowed,
+        FleetOptions,
+        check_apart,
+        finish,
+        read_manifest,
+        run_fleet,
+        twice_told,
+    )
     from calib.runner.outcomes import TIMINGS
-    from calib.runner.rigs import SCHEMES, Allowed, FleetOptions, read_manifest, twice_told
     from calib.show.fleet import PAGE, write_fleet_page
 
     limit_s = parse_duration_s(timeout, "--timeout")
@@ -80,7 +139,7 @@ def fleet(
     if as_json:
         document("fleet", {"fleet": _as_json(summary, counts["same"])})
     else:
-        _tell(summary, counts["same"], output)
+        _tell_fleet(summary, counts["same"], output)
     narrate(f"page written to {output / PAGE}")
     if any(verdict != "ok" for verdict in summary.verdicts):
         raise typer.Exit(EXIT_POOR)
@@ -115,7 +174,7 @@ def _as_json(summary: FleetSummary, as_before: int) -> dict[str, Any]:
 _MOST_TOLD = 20
 
 
-def _tell(summary: FleetSummary, as_before: int, output: Path) -> None:
+def _tell_fleet(summary: FleetSummary, as_before: int, output: Path) -> None:
     from calib.core.files import shown
 
     words = ", ".join(f"{count} {verdict}" for verdict, count in summary.verdicts.items())
@@ -141,3 +200,79 @@ def _tell(summary: FleetSummary, as_before: int, output: Path) -> None:
     if summary.to_look_at > _MOST_TOLD:
         say(f"... and {summary.to_look_at - _MOST_TOLD} more, in the page")
     say(f"{shown(output)}: fleet.parquet, fleet.html and a folder for each rig in rigs/")
+
+
+# ----------------------------------------------------------------------
+# `calib sweep`: controllers, scenarios and filters over plants and gains; a table and a page out.
+
+
+def sweep(
+    spec: Annotated[Path, typer.Argument(help="YAML with base, grid, draws and measure.")],
+    output: OutOption,
+    scheduler: SchedulerOption = None,
+    workers: WorkersOption = None,
+    retries: RetriesOption = 2,
+    timeout: Annotated[
+        str,
+        typer.Option(
+            "--timeout", metavar="TIME", help="The most time that a case gets; one that needs more is a row."
+        ),
+    ] = "10min",
+    as_json: JsonOption = False,
+) -> None:
+    """Run a controller, a scenario or a filter on the simulated rig over many plants and settings.
+
+    The first measure decides; the least of it is best, or what is near the value that was asked for. A case
+    that fails is a row. Exits 1 when one has failed.
+    """
+    from calib.core.files import shown
+    from calib.core.units import parse_duration_s
+    from calib.runner.outcomes import TIMINGS
+    from calib.runner.sweep import read_sweep, run_sweep, summarise_sweep
+    from calib.show.fleet import SWEEP_PAGE, write_sweep_page
+
+    limit_s = parse_duration_s(timeout, "--timeout")
+    known = read_sweep(spec)
+    outputs = ("sweep.parquet", SWEEP_PAGE, TIMINGS)
+    with at_work(output, "calib sweep", outputs, scheduler, workers, retries) as (store, pool):
+        with progress_bar("cases") as progress:
+            counts = run_sweep(store, pool, known, progress, limit_s)
+        summary = summarise_sweep(store, known, counts["same"])
+        write_sweep_page(output / SWEEP_PAGE, known, summary)
+    if as_json:
+        document("sweep", {"sweep": {**asdict(summary), "clouds": None}})
+    else:
+        _tell_sweep(summary)
+        say(f"{shown(output)}: sweep.parquet and sweep.html")
+    narrate("simulated: a model of a rig, not the rig")
+    if summary.failed:
+        raise typer.Exit(EXIT_POOR)
+
+
+def _tell_sweep(summary: SweepSummary) -> None:
+    parts = [f"{summary.cases} cases"]
+    if summary.as_before:
+        parts.append(f"{summary.as_before} as before")
+    if summary.failed:
+        parts.append(f"{summary.failed} failed, the first: {summary.why}")
+    say("; ".join(parts))
+    for title, points in (("best", summary.best[:5]), ("worst", summary.worst[:5])):
+        if not points:
+            continue
+        names = list(points[0].parameters)
+        head = [title, *names, f"{summary.measure}, median", "worst draw"]
+        rows = [
+            [
+                f"#{point.point}",
+                *(_text(value) for value in point.parameters.values()),
+                f"{point.median:.4g}",
+                f"{point.worst:.4g}",
+            ]
+            for point in points
+        ]
+        for line in table(head, rows):
+            say(line)
+
+
+def _text(value: Any) -> str:
+    return f"{value:.5g}" if isinstance(value, float) else str(value)

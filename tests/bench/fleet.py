@@ -29,9 +29,9 @@ from fleet_rigs import write_fleet, write_manifest
 from calib.core.files import sha256
 from calib.core.workers import Task, run_tasks
 from calib.io.logs import log_text
+from calib.runner.fleet import FleetOptions, RigSpec, calibrate_rig
 from calib.runner.outcomes import Answer, Outcome, opened_store
 from calib.runner.processes import local
-from calib.runner.rigs import FleetOptions, RigSpec, calibrate_rig
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.simulate import log_of

@@ -223,7 +223,7 @@ def test_a_write_that_is_ended_leaves_nothing(environment, tmp_path: Path, how: 
 
 def test_there_is_one_way_to_write(project_root: Path) -> None:
     """All files of the package but those of a process's own are written by `calib.core.writing`."""
-    own = {"core/writing.py", "core/compilation.py", "runner/doctor.py", "runner/cache.py", "runner/rigs.py"}
+    own = {"core/writing.py", "core/compilation.py", "runner/doctor.py", "runner/cache.py", "runner/fleet.py"}
     means = re.compile(
         r"write_(bytes|text)\(|copyfile\(|mkstemp\(|open\([^)]*['\"][wax]b?['\"]|savefig\(|imwrite\("
     )

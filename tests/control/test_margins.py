@@ -14,27 +14,24 @@ from open_loop import simulate
 from scipy import signal
 
 from calib.stages.actuator.simulate import RigState
-from calib.stages.control.laws import Model, Pid, PidState, feed_forward_pwm, holding_force
+from calib.stages.control.laws import Model, Pid, PidState, bent_rest, feed_forward_pwm, holding_force
 from calib.stages.control.laws import step as step_pid
-from calib.stages.control.linear import (
+from calib.stages.control.section import ControllerCriterion
+from calib.stages.control.tuning import (
     System,
-    bent_rest,
+    Tuned,
     break_at,
     closed_loop,
     delay,
+    holds,
     loop_margins,
+    orientation_loop,
     pid_system,
+    position_loop,
     response,
     rig_system,
     series,
     spectral_radius,
-)
-from calib.stages.control.section import ControllerCriterion
-from calib.stages.control.tuning import (
-    Tuned,
-    holds,
-    orientation_loop,
-    position_loop,
     tune_orientation,
     tune_position,
 )

@@ -6,7 +6,7 @@ import random
 import sys
 from pathlib import Path
 
-MODULES = ("calib.io.bags", "calib.io.unpacking", "calib.io.bags", "calib.io.bags")
+MODULES = ("calib.io.bags", "calib.io.bags", "calib.io.bags", "calib.io.bags")
 
 MOST_BYTES = 12_000
 

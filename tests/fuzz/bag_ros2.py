@@ -9,7 +9,7 @@ import tempfile
 from pathlib import Path
 from unittest import mock
 
-MODULES = ("calib.io.bags", "calib.io.unpacking", "calib.io.bags", "calib.io.bags")
+MODULES = ("calib.io.bags", "calib.io.bags", "calib.io.bags", "calib.io.bags")
 
 MOST_BYTES = 40_000
 

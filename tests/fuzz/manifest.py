@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-MODULES = ("calib.runner.rigs",)
+MODULES = ("calib.runner.fleet",)
 
 WORDS = (
     b"name,path,serial", b"name", b"path", b"serial", b"corners", b"square", b"model", b"loss", b"board",
@@ -19,8 +19,8 @@ WORDS = (
 def check(data: bytes, folder: Path) -> None:
     """Rigs with names that are folders of their own in an output folder, or a refusal."""
     from calib.core.errors import BadInputError
+    from calib.runner.fleet import OPTIONS, is_url, read_manifest, serial_number
     from calib.runner.outcomes import Store
-    from calib.runner.rigs import OPTIONS, is_url, read_manifest, serial_number
 
     store, refusals = Store(folder / "out", folder / "out" / ".fleet"), list[BadInputError]()
     for ending in ("csv", "yaml"):

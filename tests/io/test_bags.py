@@ -14,10 +14,19 @@ from hypothesis import strategies as st
 
 from calib.core.errors import BadInputError
 from calib.core.options import LogOptions
-from calib.io import unpacking as log_unpacking
-from calib.io.bags import WINDOW_S, Field, Topic, TopicMap, reader_of, rows_from_messages, topic_map
+from calib.io import bags as log_unpacking
+from calib.io.bags import (
+    WINDOW_S,
+    BoundedFile,
+    BoundedPath,
+    Field,
+    Topic,
+    TopicMap,
+    reader_of,
+    rows_from_messages,
+    topic_map,
+)
 from calib.io.logs import read_log
-from calib.io.unpacking import BoundedFile, BoundedPath
 
 COLUMNS = {
     "imu": ("ax_mps2", "ay_mps2", "az_mps2", "gx_radps", "gy_radps", "gz_radps"),
@@ -178,7 +187,7 @@ def test_a_chunk_that_unpacks_to_too_much_is_refused(
     (tmp_path / "topics.yaml").write_text("topics:\n  /imu: {gz_radps: gz_radps}\n")
     if index:
         assert len(read_log(path)) == 2000
-    monkeypatch.setattr("calib.io.unpacking.MOST_BYTES", 100_000)
+    monkeypatch.setattr("calib.io.bags.MOST_BYTES", 100_000)
     said = _refused(path)
     assert "a chunk unpacks to" in said or "exceeds" in said
 

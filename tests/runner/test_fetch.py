@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from calib.core.errors import BadInputError
-from calib.runner import rigs as fetch
-from calib.runner.rigs import Allowed, local_folder
+from calib.runner import fleet as fetch
+from calib.runner.fleet import Allowed, local_folder
 
 fsspec = pytest.importorskip("fsspec")
 

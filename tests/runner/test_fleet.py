@@ -22,20 +22,21 @@ from calib.core.files import sha256
 from calib.core.result import CovarianceTable
 from calib.core.rig import Provenance, Rig
 from calib.core.workers import Failure, Task
-from calib.runner.fleet import finish, run_fleet
-from calib.runner.outcomes import Answer, Outcome, Store, column, opened_store, texts
-from calib.runner.processes import Here
-from calib.runner.rigs import (
+from calib.runner.fleet import (
     FleetOptions,
     Manifest,
     RigSpec,
+    finish,
     is_url,
     kind_of,
     read_manifest,
     rig_folder,
+    run_fleet,
     run_stages,
     without_secrets,
 )
+from calib.runner.outcomes import Answer, Outcome, Store, column, opened_store, texts
+from calib.runner.processes import Here
 from calib.stages.camera.section import Camera, Distortion
 
 
@@ -127,7 +128,7 @@ def test_what_is_no_manifest_is_told_with_its_line(tmp_path: Path, text: str, sa
 
 @given(st.text(max_size=12))
 def test_a_name_that_is_taken_is_a_safe_folder(name: str) -> None:
-    from calib.runner.rigs import _named
+    from calib.runner.fleet import _named
 
     with contextlib.suppress(ValueError):
         path = Path("root") / _named(name)
@@ -214,7 +215,7 @@ def _rig(rng: np.random.Generator, name: str, fx_px: float | None = None, verdic
 
 @contextmanager
 def _fleet(out: Path, rigs: dict[str, Rig]) -> Iterator[tuple[Store, Manifest]]:
-    from calib.runner.rigs import _values
+    from calib.runner.fleet import _values
 
     with opened_store(out, "calib fleet", ()) as (store, _):
         for name, rig in rigs.items():

@@ -11,6 +11,7 @@ from calib.core.arrays import FloatArray
 from calib.runner.fleet import (
     Drift,
     FleetSummary,
+    RigSpec,
     drift_limit,
     drift_of,
     limit_of,
@@ -20,7 +21,6 @@ from calib.runner.fleet import (
     table_of,
 )
 from calib.runner.outcomes import Outcome
-from calib.runner.rigs import RigSpec
 
 
 def _line(t: FloatArray, x: FloatArray, sigma: FloatArray) -> Drift:

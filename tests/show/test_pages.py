@@ -20,9 +20,8 @@ from pages import EVIL, finished_run
 from calib.core.errors import BadInputError
 from calib.runner.cache import Result
 from calib.runner.decision import decide
-from calib.runner.fleet import FleetSummary, summarise, table_of
+from calib.runner.fleet import FleetSummary, RigSpec, summarise, table_of
 from calib.runner.outcomes import Outcome
-from calib.runner.rigs import RigSpec
 from calib.show.charts import library
 from calib.show.fleet import PAGE, fleet_page_text, write_fleet_page
 from calib.show.page import (

@@ -263,6 +263,29 @@ def creep_along(plant: Plant, tick_s: float, dq_mps: FloatArray) -> FloatArray:
     return z
 
 
+def bent_rest(model: Model, phi_rad: float) -> FloatArray:
+    """Lengths (2,) [m] at rest at an angle [rad] with one pump alone.
+
+    Raises `BadInputError` for an angle at which no length satisfies this.
+    """
+    from scipy.optimize import brentq
+
+    plant = model.plant
+    half, idle = plant.bellows_radius_m * phi_rad, 1 if phi_rad >= 0.0 else 0
+
+    def rest(l: float) -> float:  # noqa: E741  the source's symbol
+        return float(holding_force(plant, np.array([l + half, l - half]))[idle])
+
+    low, high = max(abs(half) * 1.001, 0.2 * plant.rest_length_m), 3.0 * plant.rest_length_m
+    if not (low < high and rest(low) < 0.0 < rest(high)):
+        raise BadInputError(
+            f"angle: found {phi_rad:g} rad, at which no length is at rest with one pump, expected a "
+            "smaller one"
+        )
+    l = float(brentq(rest, low, high, xtol=1e-12))  # noqa: E741  the source's symbol
+    return np.array([l + half, l - half])
+
+
 def static_stiffness(plant: Plant, q_m: FloatArray) -> FloatArray:
     """dF/dq (2, 2) [N/m] of `holding_force` at the lengths (2,)."""
     A = linearised(plant, q_m)

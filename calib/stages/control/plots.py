@@ -24,17 +24,20 @@ from calib.core.plot import (
 )
 from calib.stages.actuator.kinematics import angle, forward, length
 from calib.stages.control.laws import Model, holding_force, largest_force_N
-from calib.stages.control.linear import System, break_at, frequencies, response
 from calib.stages.control.references import Reference
 from calib.stages.control.section import Controller
 from calib.stages.control.trial import Outcome
 from calib.stages.control.tuning import (
     Following,
+    System,
     Tuned,
+    break_at,
+    frequencies,
     largest_angle,
     longest_m,
     orientation_loop,
     position_loop,
+    response,
 )
 
 _HUES = ("blue", "orange", "green", "red", "purple", "sky")

@@ -10,8 +10,7 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.stages.actuator.kinematics import angle, forward, inverse, marker_from_head
-from calib.stages.control.laws import Model
-from calib.stages.control.linear import bent_rest
+from calib.stages.control.laws import Model, bent_rest
 
 # ----------------------------------------------------------------------
 # Set-points: constant angle and jump (4.1), polynomial elongation (4.7), ellipse (4.9).
@@ -89,7 +88,7 @@ class Ellipse:
 # References at the controller's ticks: the set-points of chapter 4, and series of lengths or angles.
 #
 # A reference always has both lengths and angle. One that was given as an angle alone gets the lengths at
-# which one pump bends the actuator to it and the other idles (`linear.bent_rest`).
+# which one pump bends the actuator to it and the other idles (`laws.bent_rest`).
 
 BUILT_IN = ("elongation", "step", "jump", "ellipse")
 """(4.7) held after 5 s, 0.7 rad from rest, 0.7 then 0.3 rad at 5 s, (4.9)."""
