@@ -51,6 +51,8 @@ _UNEVEN = 0.25
 _LATE = 0.05
 """Stamps of a short stretch that may be off by more than half a period."""
 _WINDOW = 11
+_PASSES = 6
+"""Looks, at most, at whether gaps are in their places."""
 _LAG, _LONG_LAG = 8, 64
 _CLOSE, _BURSTS = 0.25, 0.25
 """Steps below this share of the mean one are within a burst; where so many steps are, bursts are the rule."""
@@ -140,8 +142,9 @@ class TimeAxis:
             t, places, held = self.t_s[first:last], self.places[first:last], values[first:last]
             known, wanted, times = places.astype(np.float64), np.arange(int(places[-1]) + 1.0), t
             if not even and t[-1] > t[0]:
-                known, times = t, np.linspace(t[0], t[-1], max(round((t[-1] - t[0]) / self.period_s), 1) + 1)
-                places, wanted = np.rint((t - t[0]) / (times[1] - times[0])).astype(np.int64), times
+                span, count = t[-1] - t[0], max(round((t[-1] - t[0]) / self.period_s), 1)
+                known, times = t, np.linspace(t[0], t[-1], count + 1)
+                places, wanted = np.rint((t - t[0]) / span * count).astype(np.int64), times
             if not even or len(wanted) != len(known):
                 times = np.interp(wanted, known, t)
                 held = np.stack([np.interp(wanted, known, column) for column in held.T], axis=1)
@@ -198,10 +201,16 @@ def _steady(t: FloatArray) -> tuple[FloatArray, IntArray, float] | None:
     origin, period, _ = _line(k, t[anchors])
     if not period > 0.0:
         return None
-    even = origin + period * k
-    off = (t[anchors] - even - _wander(even, t[anchors] - even)) / period
-    k = _with_gaps_in_place(k - anchors, np.where(np.abs(off) > 0.5 * size, np.rint(off), 0.0)) + anchors
-    origin, period, _ = _line(k, t[anchors])
+    for _ in range(_PASSES):
+        even = origin + period * k
+        wander = _wander(even, t[anchors] - even)
+        off = (t[anchors] - even - wander) / period
+        # Gaps in their wrong places bend the line, so that the next look sees more of them.
+        held, k = k, _with_gaps_in_place(k - anchors, np.where(np.abs(off) > 0.5 * size, np.rint(off), 0.0))
+        k += anchors
+        if np.array_equal(k, held):
+            break
+        origin, period, _ = _line(k, t[anchors])
     even = origin + period * k
     wander = _wander(even, t[anchors] - even)
     # Samples of a burst come before its last; what is missing is missing before the burst.
@@ -230,7 +239,8 @@ def _anchors(t: FloatArray) -> IntArray:
     everyone = np.arange(len(t))
     if len(t) < 2 * _LONG_LAG:
         return everyone
-    mean = float(np.median(t[_LONG_LAG:] - t[:-_LONG_LAG])) / _LONG_LAG
+    # A low quantile, so that gaps within a short stretch do not make all its steps look close.
+    mean = float(np.quantile(t[_LONG_LAG:] - t[:-_LONG_LAG], 0.1)) / _LONG_LAG
     close = np.diff(t) < _CLOSE * mean
     lasts = np.flatnonzero(np.append(~close, True))
     return lasts if close.mean() >= _BURSTS and len(lasts) >= _FIRST else everyone

@@ -146,6 +146,34 @@ def test_missing_samples_are_counted(share: float) -> None:
     assert np.abs(part.values[:, 0] - part.t_s).max() < 1e-4
 
 
+@pytest.mark.parametrize("seed", [73, 178, 250, 289, 974, 1497])
+def test_gaps_of_a_clock_that_bends_come_to_their_places(seed: int) -> None:
+    """Many single samples are missing; gaps found some samples late hide what the clock wanders."""
+    rng = np.random.default_rng(seed)
+    taken = 0.05 * np.arange(1700)
+    taken = taken + 0.3 * np.sin(taken / 60.0)
+    keep = rng.random(1700) > 0.1
+    keep[[0, -1]] = True
+    stamps = np.maximum.accumulate(taken[keep] + 0.005 * rng.standard_normal(keep.sum()))
+    axis = time_axis(stamps)
+    assert np.array_equal(axis.places, np.flatnonzero(keep))
+    _held(axis, stamps, 2.0 * float(np.abs(stamps - taken[keep]).max()))
+
+
+def test_a_gap_within_a_short_stretch_makes_no_bursts() -> None:
+    """Steps are far from even, so that stamps stay; of most pairs 64 samples apart one is beyond the gap."""
+    taken = np.cumsum(0.001 * np.random.default_rng(106).uniform(0.4, 1.9, 149))
+    taken[75:] += 0.3
+    assert np.abs(time_axis(taken).t_s - taken).max() <= 0.001
+
+
+def test_equal_stamps_at_the_clock_s_last_digit() -> None:
+    stamps = np.full(39, 1.7e9)
+    stamps[-1] += 2e-5
+    axis = time_axis(stamps)
+    _held(axis, stamps, 0.0)
+
+
 def test_a_clock_that_wanders_is_followed() -> None:
     taken = 0.01 * np.arange(12000)
     wander = 3e-3 * np.sin(2.0 * np.pi * taken / 90.0)
