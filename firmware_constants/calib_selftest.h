@@ -9,7 +9,7 @@
 
 #include "calib_pipeline.h"
 
-#if CALIB_ID != 0x5FD32D50UL
+#if CALIB_ID != 0x3B75FBD0UL
 #error "calib: calib_selftest.h is of another rig than calib_constants.h"
 #endif
 #if CALIB_UNDISTORT != 1

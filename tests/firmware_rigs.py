@@ -125,11 +125,11 @@ def _estimator(delay_s: float) -> dict[str, Any]:
     return {"jitter_px": 0.3, "constant_gain": _gain(delay_s), "verdict": "ok"}
 
 
-def _lowpass() -> dict[str, Any]:
-    made = design_lowpass(Design(2.0, 60.0, 3))
+def _lowpass(family: str = "butterworth") -> dict[str, Any]:
+    made = design_lowpass(Design(2.0, 60.0, 3, family))
     rows = made.sections.tolist()
     return {
-        "family": "butterworth",
+        "family": family,
         "order": 3,
         "cutoff_hz": 2.0,
         "rate_hz": 60.0,
@@ -147,15 +147,15 @@ def _lowpass() -> dict[str, Any]:
 def rig(kind: str = "nominal") -> Rig:
     """A rig with camera and plane; "full" with every section, "levelling" the same with that angle filter.
 
-    "fisheye" has a lens of 110 degrees. "fused" has what that estimator needs, "twin" the same with
-    the sensors of the nominal simulated rig.
+    "fisheye" has a lens of 110 degrees, and an elliptic low-pass. "fused" has what that estimator needs,
+    "twin" the same with the sensors of the nominal simulated rig.
     """
     camera = _camera()
     sections: dict[str, Any] = {"camera": camera, "plane": _plane(camera)}
     if kind == "fisheye":
         lens = {"k1": 0.03, "k2": -0.01, "k3": 0.004, "k4": -0.001}
         camera = _camera(model="fisheye4", distortion=lens, fx_px=164.0, fy_px=164.5)
-        sections = {"camera": camera, "plane": _plane(camera)}
+        sections = {"camera": camera, "plane": _plane(camera), "lowpass": _lowpass("elliptic")}
     if kind == "fused":
         sections |= {"align": {**_align(), "time_offset_s": 0.025}, "estimator": _estimator(0.025)}
     if kind == "twin":

@@ -12,15 +12,28 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
-from scipy.signal import bessel, butter, group_delay, sos2tf, sosfilt, sosfreqz
+from scipy.signal import (
+    bessel,
+    butter,
+    cheb1ap,
+    cheb2ap,
+    cheby1,
+    cheby2,
+    ellip,
+    ellipap,
+    group_delay,
+    sos2tf,
+    sosfilt,
+    sosfreqz,
+)
 
 from calib.core.errors import BadInputError
 from calib.io.logs import read_log, write_log
 from calib.stages.actuator.kinematics import marker_from_head
 from calib.stages.lowpass.filters import (
     FAMILIES,
+    RIPPLED,
     Design,
-    analogue_poles,
     dc_delay_s,
     design_lowpass,
     digital_poles,
@@ -30,6 +43,7 @@ from calib.stages.lowpass.filters import (
     jitter_after,
     noise_gain,
     on_ticks,
+    prototype,
     rest_error_binary32,
     spectrum,
     suggest,
@@ -56,17 +70,38 @@ def test_the_response_is_scipys(order: int, family: str, scipys: object) -> None
 
 @pytest.mark.parametrize("order", [1, 2, 5, 8])
 def test_critical_poles_are_equal_and_lose_half_the_power(order: int) -> None:
-    poles = analogue_poles("critical", order)
+    _, poles = prototype("critical", order)
     assert np.all(poles == poles[0])
     gain = np.prod(poles / (poles - 1j))
     assert abs(gain) ** 2 == pytest.approx(0.5, rel=1e-12)
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 5, 8])
+@pytest.mark.parametrize(
+    ("family", "analogue", "scipys", "ripples"),
+    [
+        ("chebyshev1", cheb1ap, cheby1, (0.5,)),
+        ("chebyshev2", cheb2ap, cheby2, (40.0,)),
+        ("elliptic", ellipap, ellip, (0.5, 40.0)),
+    ],
+)
+def test_rippled_responses_are_scipys_but_for_what_names_the_cutoff(
+    order: int, family: str, analogue: object, scipys: object, ripples: tuple[float, ...]
+) -> None:
+    """SciPy names the end of the ripples; the gain at rest is 1 here."""
+    cut = abs(np.atleast_1d(analogue(order, *ripples)[1])[0] / prototype(family, order)[1][0])
+    end_hz = 60.0 / np.pi * np.arctan(np.tan(np.pi * 1.3 / 60.0) / cut)
+    expected = scipys(order, *ripples, end_hz, fs=60.0, output="sos")
+    _, theirs = sosfreqz(expected, FREQUENCIES, fs=60.0)
+    _, H = sosfreqz(design_lowpass(Design(1.3, 60.0, order, family)).exact, FREQUENCIES, fs=60.0)
+    np.testing.assert_allclose(np.abs(H), np.abs(theirs / theirs[0]), rtol=1e-6, atol=1e-12)
 
 
 CUTOFF = st.floats(1e-3, 0.499)
 
 
 @settings(max_examples=150, deadline=None)
-@given(CUTOFF, st.integers(1, 8), st.sampled_from(FAMILIES))
+@given(CUTOFF, st.integers(1, 8), st.sampled_from(FAMILIES + RIPPLED))
 def test_the_gain_at_rest_is_exactly_one_in_binary32(part: float, order: int, family: str) -> None:
     try:
         made = design_lowpass(Design(part * 60.0, 60.0, order, family))
@@ -77,14 +112,14 @@ def test_the_gain_at_rest_is_exactly_one_in_binary32(part: float, order: int, fa
         assert np.array_equal(section.astype(np.float32).astype(np.float64), section)
         b, a = [Fraction(v) for v in section[:3]], [Fraction(v) for v in section[3:]]
         assert sum(b) == sum(a) > 0
-        # Both zeros at z = -1.
-        assert b[0] - b[1] + b[2] == 0
-        assert 2 * (b[0] - b[2]) in (0, 2 * b[1])
+        # Zeros on the unit circle, both at z = -1 where the family has none.
+        assert b[2] in (0, b[0])
+        assert family in RIPPLED or b[0] - b[1] + b[2] == 0
     assert made.stable
     assert made.pole_radius < 1.0
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", FAMILIES + RIPPLED)
 @pytest.mark.parametrize("order", [1, 2, 3, 8])
 def test_rounding_moves_the_cutoff_little_and_poles_are_those_of_the_sections(
     order: int, family: str
@@ -101,7 +136,7 @@ def test_rounding_moves_the_cutoff_little_and_poles_are_those_of_the_sections(
 
 
 F = np.array([0.0, 0.05, 0.5, 1.0, 2.0, 7.0, 25.0])
-EVERY = [(order, family) for order in (1, 2, 5) for family in FAMILIES]
+EVERY = [(order, family) for order in (1, 2, 5) for family in FAMILIES + RIPPLED]
 
 
 def _sections(order: int = 1, family: str = "butterworth", cutoff: float = 1.0) -> np.ndarray:

@@ -37,7 +37,7 @@ from calib.stages.estimator.section import EstimatorGain
 from calib.stages.firmware.section import Envelope
 from calib.stages.imu.levelling import Levelling, settled
 from calib.stages.imu.levelling import gains as gains_of
-from calib.stages.lowpass.filters import Design, design_lowpass
+from calib.stages.lowpass.filters import Design, design_lowpass, state_variable_gains
 
 if TYPE_CHECKING:
     from calib.core.rig import Rig
@@ -205,9 +205,7 @@ def plane_constants(rig: Rig, source: str) -> PlaneConstants | None:
 #
 # A section of the low-pass of order one, b0 (1 + z^-1) / (1 + a1 z^-1), runs in the trapezoidal form
 # v = b0 (x - s), y = s + v, s' = y + v: one product, and y = x exactly at rest. A section of order two runs
-# as a state-variable filter with three gains derived from b0, a1, a2 (Simper 2013), at rest as exact:
-#
-#     D = 2 / (2 b0 - a1),  g = sqrt(b0 D);   A1 = 1 / D,  A2 = g / D,  A3 = b0.
+# as a state-variable filter whose gains `calib.stages.lowpass.filters` derives, at rest as exact.
 
 MOST_EARLY_TICKS = 1.0
 """Pictures that are earlier than the IMU by less count as of its time."""
@@ -281,13 +279,11 @@ def _lowpass(lookup: Lookup) -> list[dict[str, Any]]:
     for index, (b, a) in enumerate(sorted(sections, key=lambda section: section[1][1] == 0.0), start=1):
         pair: list[float] = []
         if a[1] != 0.0:
-            if not (2.0 * b[0] - a[0] > 0.0 and b[0] > 0.0):
-                raise BadInputError(
-                    f"{lookup.source}: lowpass.sections.{index - 1} is no low-pass of bilinear form"
-                )
-            D = 2.0 / (2.0 * b[0] - a[0])
-            pair = [1.0 / D, math.sqrt(b[0] * D) / D, b[0]]
-        made.append({"index": index, "b": b, "a": a, "pair": pair})
+            if b[0] != b[2]:
+                where = f"{lookup.source}: lowpass.sections.{index - 1}.b"
+                raise BadInputError(f"{where} is {b}, expected its last as its first, as calib lowpass does")
+            pair = state_variable_gains(a[0], a[1], b[0])
+        made.append({"index": index, "b": b, "a": a, "pair": pair, "zeros": any(pair[3:])})
     return made
 
 

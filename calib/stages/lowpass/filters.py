@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -117,13 +117,17 @@ def _phase(t_s: FloatArray, rate_hz: float) -> FloatArray:
 #
 # a single one g (1 + z^-1) / (1 + a1 z^-1) with g = (1 + a1) / 2. First a1 and a2 are rounded, on a grid
 # on which g is a binary32, too; then g follows from them. So H(1) is 1 and not nearly 1, the zeros stay
-# at -1, and a position at rest is reported where it is.
+# at -1, and a position at rest is reported where it is. A pair of zeros +-j w of the prototype lies at
+# 1 + c z^-1 + z^-2 with 2 + c = 4 K^2 w^2 / (1 + K^2 w^2), which takes the place of 4 in g.
 #
 # Families: Butterworth (flattest gain), Bessel (flattest delay, Thomson 1949), and critical: n equal real
-# poles -1 / sqrt(2^(1/n) - 1), which never overshoot.
+# poles -1 / sqrt(2^(1/n) - 1), which never overshoot. Chebyshev's and the elliptic filters fall faster behind
+# the cut-off and delay more: ripples of 0.5 dB below it (I, elliptic), 40 dB above it (II, elliptic).
 
 FAMILIES = ("butterworth", "bessel", "critical")
+RIPPLED = ("chebyshev1", "chebyshev2", "elliptic")
 LARGEST_ORDER = 8
+_RIPPLE_DB, _STOP_DB = 0.5, 40.0
 
 _FINEST, _COARSEST = 30, 22
 """Grids 2^-k that a1 and a2 are rounded to; on the coarsest g is a binary32 for every stable section."""
@@ -150,9 +154,9 @@ class Design:
             )
         if not 1 <= self.order <= LARGEST_ORDER:
             raise BadInputError(f"low-pass: the order is {self.order}, expected 1 to {LARGEST_ORDER}")
-        if self.family not in FAMILIES:
+        if self.family not in FAMILIES + RIPPLED:
             raise BadInputError(
-                f"low-pass: the family is {self.family!r}, expected one of {', '.join(FAMILIES)}"
+                f"low-pass: the family is {self.family!r}, expected one of {', '.join(FAMILIES + RIPPLED)}"
             )
 
 
@@ -184,16 +188,33 @@ class Filter:
         return float(np.abs(digital_poles(self.sections)).max())
 
 
-def analogue_poles(family: str, order: int) -> ComplexArray:
-    """Poles (order,) of the prototype with |H| = 1 / sqrt(2) at 1 rad/s."""
+def prototype(family: str, order: int) -> tuple[FloatArray, ComplexArray]:
+    """Zeros w (order // 2,) at +-j w, infinite for none, and poles (order,), with |H(j)| = 1 / sqrt(2)."""
+    far = np.full(order // 2, np.inf)
     if family == "butterworth":
         angle = np.pi * (2.0 * np.arange(order) + order + 1.0) / (2.0 * order)
-        return np.asarray(np.exp(1j * angle))
+        return far, np.asarray(np.exp(1j * angle))
     if family == "critical":
-        return np.full(order, -1.0 / math.sqrt(math.expm1(math.log(2.0) / order)), dtype=np.complex128)
-    from scipy.signal import besselap
+        return far, np.full(order, -1.0 / math.sqrt(math.expm1(math.log(2.0) / order)), dtype=np.complex128)
+    from scipy.optimize import brentq
+    from scipy.signal import besselap, cheb1ap, cheb2ap, ellipap
 
-    return np.asarray(besselap(order, norm="mag")[1], dtype=np.complex128)
+    if family == "bessel":
+        return far, np.asarray(besselap(order, norm="mag")[1], dtype=np.complex128)
+    designs: dict[str, Callable[[], Any]] = {
+        "chebyshev1": lambda: cheb1ap(order, _RIPPLE_DB),
+        "chebyshev2": lambda: cheb2ap(order, _STOP_DB),
+        "elliptic": lambda: ellipap(order, _RIPPLE_DB, _STOP_DB),
+    }
+    zeros, poles, _ = designs[family]()
+    w: FloatArray = np.sort(np.imag(zeros)[np.imag(zeros) > 0.0])
+
+    def above_half(at: float) -> float:
+        return float(np.prod(1.0 - (at / w) ** 2) / np.abs(np.prod(1.0 - 1j * at / poles))) ** 2 - 0.5
+
+    # The gain falls from the ripples' end at 1, or from 0, to the first zero.
+    cut = float(brentq(above_half, 0.0 if family == "chebyshev2" else 1.0, w[0] if len(w) else 1e3))
+    return (w / cut if len(w) else far), np.atleast_1d(poles / cut).astype(np.complex128)
 
 
 def digital_poles(sections: FloatArray) -> ComplexArray:
@@ -205,10 +226,10 @@ def digital_poles(sections: FloatArray) -> ComplexArray:
     return np.concatenate(found)
 
 
-def _denominators(design: Design) -> list[tuple[float, float | None]]:
-    """a1 and a2 of each section, a2 None for a single pole; slow poles first."""
+def _placed(design: Design) -> list[tuple[float, float | None, float]]:
+    """a1, a2 and 2 + c of each section, a2 None for a single pole; slow poles first."""
     K = math.tan(math.pi * design.cutoff_hz / design.rate_hz)
-    poles = analogue_poles(design.family, design.order)
+    zeros, poles = prototype(design.family, design.order)
     upper = poles[poles.imag > 1e-9]
     real = poles[np.abs(poles.imag) <= 1e-9].real
     pairs = [
@@ -220,24 +241,30 @@ def _denominators(design: Design) -> list[tuple[float, float | None]]:
         (-(single[i] + single[i + 1]), single[i] * single[i + 1])
         for i in range(len(single) % 2, len(single), 2)
     ]
-    first: list[tuple[float, float | None]] = [(-single[0], None)] if len(single) % 2 else []
-    return first + pairs
+    across = (4.0 / (1.0 + (K * zeros) ** -2.0)).tolist()
+    first: list[tuple[float, float | None, float]] = [(-single[0], None, 4.0)] if len(single) % 2 else []
+    return first + [(*pair, one) for pair, one in zip(pairs, across, strict=True)]
 
 
-def _section(a1: float, a2: float | None) -> list[float]:
+def _section(a1: float, a2: float | None, across: float, places: int | None = None) -> list[float]:
+    """b0, b1, b2, 1, a1, a2; with `places` a1 and a2 are rounded, and b0 where it does not follow."""
+    if places is not None:
+        a1, a2 = _on_grid(a1, places), None if a2 is None else _on_grid(a2, places)
     if a2 is None:
         g = 0.5 * (1.0 + a1)
         return [g, g, 0.0, 1.0, a1, 0.0]
-    g = 0.25 * (1.0 + a1 + a2)
-    return [g, 2.0 * g, g, 1.0, a1, a2]
+    g = (1.0 + a1 + a2) / across
+    if places is not None and across != 4.0:
+        g = _on_grid(g, places)
+    return [g, 1.0 + a1 + a2 - 2.0 * g, g, 1.0, a1, a2]
 
 
-def _rounded_section(a1: float, a2: float | None) -> list[float]:
+def _rounded_section(a1: float, a2: float | None, across: float) -> list[float]:
     """The section whose every coefficient is a binary32; sums of multiples of 2^-30 are exact here."""
     section: list[float] = []
     for places in range(_FINEST, _COARSEST - 1, -1):
-        section = _section(_on_grid(a1, places), None if a2 is None else _on_grid(a2, places))
-        if float(np.float32(section[0])) == section[0]:
+        section = _section(a1, a2, across, places)
+        if all(float(np.float32(b)) == b for b in section[:2]):
             break
     return section
 
@@ -251,11 +278,11 @@ def design_lowpass(design: Design) -> Filter:
 
     Raises `BadInputError` where no rounded filter is stable: the cut-off is too low for the rate.
     """
-    denominators = _denominators(design)
+    placed = _placed(design)
     out = Filter(
         design,
-        np.array([_section(a1, a2) for a1, a2 in denominators]),
-        np.array([_rounded_section(a1, a2) for a1, a2 in denominators]),
+        np.array([_section(*one) for one in placed]),
+        np.array([_rounded_section(*one) for one in placed]),
     )
     if not out.stable:
         raise BadInputError(
@@ -269,13 +296,11 @@ def design_lowpass(design: Design) -> Filter:
 # ----------------------------------------------------------------------
 # What a low-pass does to a signal: gain, delay, step response, noise, and filtering itself.
 #
-# All sections (k, 6) have a gain of 1 at zero frequency and their zeros at z = -1, as those of
-# `calib.stages.lowpass.filters`. A numerator (1 + z^-1)^n then delays every frequency by n / 2 samples,
-# and with
-# D(z) = 1 + a1 z^-1 + a2 z^-2 the group delay of a section is
+# All sections (k, 6) have a gain of 1 at zero frequency and a numerator of order n that reads the same from
+# both ends, which delays every frequency by n / 2 samples. With D(z) = 1 + a1 z^-1 + a2 z^-2 the group delay
+# of a section is
 #
-#     tau = n / 2 - Re[ (a1 z^-1 + 2 a2 z^-2) / D(z) ],   n / 2 - (a1 + 2 a2) / (1 + a1 + a2) at zero
-# frequency.
+#     tau = n / 2 - Re[ (a1 z^-1 + 2 a2 z^-2) / D(z) ],   n / 2 - (a1 + 2 a2) / (1 + a1 + a2) at 0 Hz.
 #
 # Signals are filtered in the transposed direct form II,
 #
@@ -601,8 +626,9 @@ def quantisation_hz(pixels: FloatArray, step_px: float, rate_hz: float) -> Float
 # ----------------------------------------------------------------------
 # How far from a constant input the filter comes to rest in binary32, in the forms that the firmware runs:
 #
-#     pair:    v3 = x - s2, v1 = A1 s1 + A2 v3, y = s2 + (A2 s1 + A3 v3), s1' = 2 v1 - s1, s2' = 2 y - s2,
-#              A3 = b0, A1 = b0 - a1 / 2, A2 = sqrt(A1 A3)
+#     pair:    v3 = x - s2, v1 = A1 s1 + A2 v3, v2 = s2 + (A2 s1 + A3 v3), s1' = 2 v1 - s1, s2' = 2 v2 - s2,
+#              y = v2 + Z (v1 - s1), A3 = (1 + a1 + a2) / 4, A1 = A3 - a1 / 2, A2 = sqrt(A1 A3),
+#              Z = (b0 - A3) / A2 for zeros that are not at z = -1
 #     single:  v = b0 (x - s), y = s + v, s' = y + v
 #
 # Both work on the difference of input and output, so that a slow filter rests within a step of binary32,
@@ -610,6 +636,14 @@ def quantisation_hz(pixels: FloatArray, step_px: float, rate_hz: float) -> Float
 
 _STARTS = 16
 _LONGEST = 20_000
+
+
+def state_variable_gains(a1: float, a2: float, b0: float) -> list[float]:
+    """A1, A2, A3 and Z of a pair (Simper 2013)."""
+    A3 = 0.25 * (1.0 + a1 + a2)
+    A1 = A3 - 0.5 * a1
+    A2 = math.sqrt(A1 * A3)
+    return [A1, A2, A3, (b0 - A3) / A2]
 
 
 def rest_error_binary32(filter_: Filter) -> float:
@@ -622,21 +656,25 @@ def rest_error_binary32(filter_: Filter) -> float:
     y, state = starts, [[np.zeros_like(starts), starts] for _ in filter_.sections]
     # The firmware's order: pairs first.
     rows = filter_.sections[np.argsort(filter_.sections[:, 5] == 0.0, kind="stable")]
-    A1, A3 = rows[:, 0] - 0.5 * rows[:, 4], rows[:, 0]
-    forms = np.stack([A1, np.sqrt(A1 * A3), A3], axis=1).astype(np.float32)
+    forms = [
+        [np.float32(x) for x in (state_variable_gains(a1, a2, b0) if a2 != 0.0 else [b0])]
+        for b0, _, _, _, a1, a2 in rows.tolist()
+    ]
     slowest = float(np.abs(digital_poles(filter_.sections)).max())
     for _ in range(int(min(25.0 / max(1.0 - slowest, 1e-6) + 200, _LONGEST))):
         y = np.full_like(starts, one)
-        for (a1, a2, a3), a2_section, s in zip(forms, rows[:, 5], state, strict=True):
-            if a2_section == 0.0:
-                v = a3 * (y - s[1])
+        for form, s in zip(forms, state, strict=True):
+            if len(form) == 1:
+                v = form[0] * (y - s[1])
                 y = s[1] + v
                 s[1] = y + v
                 continue
+            A1, A2, A3, Z = form
             v3 = y - s[1]
-            v1 = a1 * s[0] + a2 * v3
-            y = s[1] + (a2 * s[0] + a3 * v3)
-            s[0], s[1] = two * v1 - s[0], two * y - s[1]
+            v1 = A1 * s[0] + A2 * v3
+            v2 = s[1] + (A2 * s[0] + A3 * v3)
+            y = np.asarray(v2 + Z * (v1 - s[0]))
+            s[0], s[1] = two * v1 - s[0], two * v2 - s[1]
     return float(np.abs(y.astype(np.float64) - 1.0).max())
 
 

@@ -9,6 +9,8 @@ from pydantic import Field, model_validator
 from calib.core.result import Count, NotNegative, Number, Positive, Result, Row3, Section, quantity
 from calib.core.schema import contradiction
 
+Family = Literal["butterworth", "bessel", "critical", "chebyshev1", "chebyshev2", "elliptic"]
+
 
 class LowPassSection(Section):
     """b0 b1 b2 and 1 a1 a2 of a second-order section; values that binary32 holds exactly."""
@@ -64,7 +66,7 @@ class LowPass(Result):
     wanted_jitter : what was asked for, in the log's unit.
     """
 
-    family: Literal["butterworth", "bessel", "critical"] = quantity(label="family", fact=True)
+    family: Family = quantity(label="family", fact=True)
     order: Annotated[int, Field(ge=1, le=8, strict=True)] = quantity(label="order", fact=True)
     cutoff_hz: Positive = quantity(label="cut-off", fact=True, le=1e6)
     rate_hz: Positive = quantity(label="rate", le=1e6)

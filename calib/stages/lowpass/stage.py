@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from calib.io.logs import Log
     from calib.stages.camera.model import Camera
     from calib.stages.lowpass.filters import Filter, Positions, Suggestion
-    from calib.stages.lowpass.section import LowPass, LowPassLog
+    from calib.stages.lowpass.section import Family, LowPass, LowPassLog
 
 _RATE_OFF = 0.05
 _CUTOFF_OFF = 0.01
@@ -55,8 +55,8 @@ class Options(LogOptions):
         parse=partial(parse_frequency_hz, what="--rate"),
     )
     order: int | None = option(None, "1 to 8. [default: 1; with --suggest the one of least delay]")
-    family: Literal["butterworth", "bessel", "critical"] | None = option(
-        None, "Of the filter. [default: butterworth; with --suggest the best]"
+    family: Literal["butterworth", "bessel", "critical", "chebyshev1", "chebyshev2", "elliptic"] | None = (
+        option(None, "Of the filter. [default: butterworth; with --suggest the best of the first three]")
     )
     suggest: Path | None = option(
         None, "Choose the filter of least delay from this log's own spectrum.", metavar="LOG"
@@ -234,7 +234,7 @@ def solve(inputs: Inputs) -> LowPass:
     float_mm = 1e3 * largest * filters.rest_error_binary32(made)
     verdict = Verdict.of([*_of_rounding(made, rounded, float_mm), *_of_log(made, positions)])
     return LowPass(
-        family=cast("Literal['butterworth', 'bessel', 'critical']", design.family),
+        family=cast("Family", design.family),
         order=design.order,
         cutoff_hz=design.cutoff_hz,
         rate_hz=rate,

@@ -519,8 +519,11 @@ static inline float calib_lowpass(float *s, float x) {
     {
         float v3 = x - s[1], v1 = CALIB_LOWPASS_PAIR1_A1 * s[0] + CALIB_LOWPASS_PAIR1_A2 * v3;
         x = s[1] + (CALIB_LOWPASS_PAIR1_A2 * s[0] + CALIB_LOWPASS_PAIR1_A3 * v3);
-        s[0] = 2.0f * v1 - s[0];
         s[1] = 2.0f * x - s[1];
+#if CALIB_LOWPASS_ZEROS
+        x += CALIB_LOWPASS_PAIR1_Z * (v1 - s[0]);
+#endif
+        s[0] = 2.0f * v1 - s[0];
         s += 2;
     }
 #endif
@@ -528,8 +531,11 @@ static inline float calib_lowpass(float *s, float x) {
     {
         float v3 = x - s[1], v1 = CALIB_LOWPASS_PAIR2_A1 * s[0] + CALIB_LOWPASS_PAIR2_A2 * v3;
         x = s[1] + (CALIB_LOWPASS_PAIR2_A2 * s[0] + CALIB_LOWPASS_PAIR2_A3 * v3);
-        s[0] = 2.0f * v1 - s[0];
         s[1] = 2.0f * x - s[1];
+#if CALIB_LOWPASS_ZEROS
+        x += CALIB_LOWPASS_PAIR2_Z * (v1 - s[0]);
+#endif
+        s[0] = 2.0f * v1 - s[0];
         s += 2;
     }
 #endif
@@ -537,8 +543,11 @@ static inline float calib_lowpass(float *s, float x) {
     {
         float v3 = x - s[1], v1 = CALIB_LOWPASS_PAIR3_A1 * s[0] + CALIB_LOWPASS_PAIR3_A2 * v3;
         x = s[1] + (CALIB_LOWPASS_PAIR3_A2 * s[0] + CALIB_LOWPASS_PAIR3_A3 * v3);
-        s[0] = 2.0f * v1 - s[0];
         s[1] = 2.0f * x - s[1];
+#if CALIB_LOWPASS_ZEROS
+        x += CALIB_LOWPASS_PAIR3_Z * (v1 - s[0]);
+#endif
+        s[0] = 2.0f * v1 - s[0];
         s += 2;
     }
 #endif
@@ -546,8 +555,11 @@ static inline float calib_lowpass(float *s, float x) {
     {
         float v3 = x - s[1], v1 = CALIB_LOWPASS_PAIR4_A1 * s[0] + CALIB_LOWPASS_PAIR4_A2 * v3;
         x = s[1] + (CALIB_LOWPASS_PAIR4_A2 * s[0] + CALIB_LOWPASS_PAIR4_A3 * v3);
-        s[0] = 2.0f * v1 - s[0];
         s[1] = 2.0f * x - s[1];
+#if CALIB_LOWPASS_ZEROS
+        x += CALIB_LOWPASS_PAIR4_Z * (v1 - s[0]);
+#endif
+        s[0] = 2.0f * v1 - s[0];
         s += 2;
     }
 #endif
