@@ -12,7 +12,7 @@ import threading
 import warnings
 import zlib
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -195,7 +195,7 @@ def _incomplete(data: bytes) -> str | None:
     return None
 
 
-def read_picture(path: Path, wanted: Callable[[int], bool] = lambda pixels: True) -> Picture:
+def read_picture(path: Path, pixels: bool = True) -> Picture:
     """Decode one file to 8-bit grey values.
 
     Colour is averaged as OpenCV does, an alpha channel is dropped, and deeper pictures are scaled so
@@ -203,13 +203,14 @@ def read_picture(path: Path, wanted: Callable[[int], bool] = lambda pixels: True
 
     Parameters
     ----------
-    wanted : whether to decode a picture of so many pixels, by its header.
+    pixels : whether to decode them; without them the header tells the size, where it can.
     """
     data = read_bytes(path)
-    size_px = declared_size(data)
-    pixels = size_px[0] * size_px[1]
-    if 0 < pixels <= _MAX_PIXELS and not wanted(pixels):
-        return Picture(shown(path.name), sha256(data), np.empty((0, 0), dtype=np.uint8), size_px)
+    if not pixels:
+        width, height = declared_size(data)
+        if 0 < width * height <= _MAX_PIXELS:
+            nothing = np.empty((0, 0), dtype=np.uint8)
+            return Picture(shown(path.name), sha256(data), nothing, (width, height))
     return decoded_picture(data, shown(path), shown(path.name), sha256(data))
 
 

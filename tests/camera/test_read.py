@@ -156,16 +156,12 @@ def test_views_come_in_the_order_of_the_pictures(shipped: list[Path]) -> None:
     assert list(found.hashes) == [path.name for path in paths]
 
 
-@pytest.mark.parametrize("kept_pixels", [0, 40_000_000])
-def test_damaged_pictures_are_named_wherever_they_are_decoded(
-    shipped: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept_pixels: int
-) -> None:
+def test_damaged_pictures_are_named(shipped: list[Path], tmp_path: Path) -> None:
     copies = [Path(shutil.copy(path, tmp_path)) for path in shipped[:6]]
     whole = copies[1].read_bytes()
     # Its header and its end are there, and nonsense between them.
     copies[1].write_bytes(whole[:2000] + b"x" * (len(whole) - 2100) + whole[-100:])
     copies[3].write_bytes(b"")
-    monkeypatch.setattr(boards, "_KEPT_PIXELS", kept_pixels)
     for corners in ((7, 5), None):
         found = find_boards(copies, corners, 0.02)
         assert [view.name for view in found.views] == [copies[i].name for i in (0, 2, 4, 5)]
@@ -173,13 +169,15 @@ def test_damaged_pictures_are_named_wherever_they_are_decoded(
             (copies[i].name, "unreadable") for i in (1, 3)
         ]
         assert list(found.hashes) == [copies[i].name for i in (0, 2, 4, 5)]
+    for corners, dictionary in (((7, 5), None), (None, None), (None, "4X4_50")):
+        with pytest.raises(BadInputError, match=rf"{copies[1].name}: is a damaged PNG"):
+            find_boards([copies[1]], corners, 0.02, dictionary=dictionary)
 
 
 def test_a_picture_that_changes_meanwhile(
     shipped: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     copies = [Path(shutil.copy(path, tmp_path)) for path in shipped[:2]]
-    monkeypatch.setattr(boards, "_KEPT_PIXELS", 0)
 
     def change(done: int, total: int) -> None:
         shutil.copy(shipped[5], copies[1])

@@ -90,8 +90,8 @@ def test_what_is_no_picture_of_the_board_among_good_ones(calib, pictures, gray, 
     why = {one["file"]: one["why"] for one in json.loads(ended.out)["not_used"]}
     assert all(says in why[name] for name, (_, says) in DAMAGED.items())
     assert why["poster.png"] == "shows no board with 7x5 inner corners that can be read"
-    assert why["small.png"] == "is 316x207 px; 9 others are 316x208 px"
-    assert why["upright.png"] == "is 208x316 px, as if turned by a quarter; 9 others are 316x208 px"
+    assert why["small.png"] == "is 316x207 px; 15 others are 316x208 px"
+    assert why["upright.png"] == "is 208x316 px, as if turned by a quarter; 15 others are 316x208 px"
     assert why["notes.txt"].startswith("is no picture (png")
     assert why["gone.png"].startswith("cannot be read: No such file")
     assert len(why) == len(DAMAGED) + 5

@@ -190,20 +190,31 @@ def _folds(views: int) -> list[IntArray]:
 def _on_held_back(fits: Sequence[Calibration]) -> FloatArray:
     """Mean squared residual vector (len(fits), N) of each view by a camera that has not seen it.
 
-    What each view says about the camera (`checks.evidence`) tells it without another fit. Not so for the
-    rational model, whose numerator and denominator move far together at next to no cost, and a robust loss.
+    What each view says about the camera (`checks.evidence`) tells it without another fit. Not so for a robust
+    loss, and the rational model, whose numerator and denominator move far together at next to no cost; it is
+    fitted again where it has a chance: where it shows the views that it was fitted to better than the best of
+    the others shows those held back.
     """
     if not fits:
         return np.zeros((0, 0))
     folds = _folds(fits[0].observations.views)
-    bent = [fit.camera.model == "rational8" or fit.loss != "none" for fit in fits]
-    squared = np.array(
-        [
-            np.full(len(fit.normal), np.nan) if b else _by_evidence(fit, folds)
-            for fit, b in zip(fits, bent, strict=True)
-        ]
+    squared = np.array([_by_evidence(fit, folds) for fit in fits])
+    gain_px2 = (_GAIN_PX * scale_of(fits[0].camera)) ** 2
+    least = min(
+        (
+            float(np.median(s))
+            for s, fit in zip(squared, fits, strict=True)
+            if fit.camera.model != "rational8"
+        ),
+        default=np.inf,
     )
-    jobs = [(i, fold) for i in np.flatnonzero(bent).tolist() for fold in folds]
+    bent = [
+        i
+        for i, fit in enumerate(fits)
+        if fit.loss != "none"
+        or (fit.camera.model == "rational8" and np.median(fit.view_rms_px**2) < least - gain_px2)
+    ]
+    jobs = [(i, fold) for i in bent for fold in folds]
     with Workers(fits, len(jobs)) as workers:
         for (i, fold), found in zip(jobs, workers.in_order(_on_fold, jobs), strict=True):
             squared[i, fold] = found

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import math
-import threading
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -53,8 +52,6 @@ Angle = Annotated[float, Field(ge=-6.2832, le=6.2832, allow_inf_nan=False, stric
 BOARD_FILE = "board.yaml"
 _SIZE_SAMPLE = 5
 """Pictures that are asked for the size of an unknown board."""
-_KEPT_PIXELS = 40_000_000
-"""Pixels that are kept in memory; further pictures are decoded where they are looked into."""
 
 
 class BoardFile(BaseModel):
@@ -176,7 +173,7 @@ def find_boards(
     BadInputError : no picture that can be read, none of the size, or no board in any; when another board
         is there the message says which.
     """
-    read = dict(zip(paths, _read(paths), strict=True)) | {Path(one.name): one for one in frames}
+    read = {path: _headed(path) for path in paths} | {Path(one.name): one for one in frames}
     pictures = {path: one for path, one in read.items() if isinstance(one, Picture)}
     if not pictures:
         raise next(one for one in read.values() if isinstance(one, BadInputError))
@@ -189,7 +186,13 @@ def find_boards(
             f"{_names(which)}: {_is_or_are(which)} {width}x{height} px, expected {size_px[0]}x{size_px[1]} px"
         )
     with Workers(_Album(list(usable), list(usable.values())), len(usable)) as workers:
-        search = _Search(workers, list(usable.values()), size_px, square_m, progress).run(corners, dictionary)
+        looking = _Search(workers, list(usable.values()), size_px, square_m, progress)
+        try:
+            search = looking.run(corners, dictionary)
+        except BadInputError as error:
+            if len(looking.damaged) < len(usable):
+                raise
+            raise BadInputError(f"{shown(next(iter(usable)))}: {looking.damaged[0].why}") from error
     without = {one.name: one for one in search.left_out}
     damaged = {one.name for one in search.left_out if one.kind == "unreadable"}
     left_out = [
@@ -216,37 +219,17 @@ def _of_another_size(picture: Picture, size_px: tuple[int, int], others: int) ->
     return LeftOut(picture.name, why, "size")
 
 
-def _read(paths: Sequence[Path]) -> list[Picture | BadInputError]:
-    """All pictures, or why they cannot be read; the pixels of some only, which take the memory."""
-    with Workers(_Room(_KEPT_PIXELS), len(paths), large=True) as workers:
-        return list(workers.in_order(_picture, paths))
-
-
-@dataclass
-class _Room:
-    """For pixels in memory."""
-
-    pixels: int
-    lock: threading.Lock = field(default_factory=threading.Lock)
-
-    def take(self, pixels: int) -> bool:
-        """Whether there is room for so many, which is then taken."""
-        with self.lock:
-            fits = pixels <= self.pixels
-            self.pixels -= pixels if fits else 0
-        return fits
-
-
-def _picture(room: _Room, path: Path) -> Picture | BadInputError:
+def _headed(path: Path) -> Picture | BadInputError:
+    """A picture without its pixels, or why it cannot be read."""
     try:
-        return read_picture(path, room.take)
+        return read_picture(path, pixels=False)
     except BadInputError as error:
         return error
 
 
 @dataclass(frozen=True)
 class _Album:
-    """Pictures that workers look into, and where to find those that are not in memory."""
+    """Pictures that workers decode and look into; frames of recordings have their pixels."""
 
     paths: Sequence[Path]
     pictures: Sequence[Picture]
@@ -274,10 +257,11 @@ _Job = tuple[Callable[..., Any], int | tuple[int, ...], tuple[Any, ...]]
 def _look(album: _Album, job: _Job) -> Any:
     """What is seen, or why the picture cannot be decoded; of several those are looked into that can be."""
     ask, which, more = job
-    if isinstance(which, int):
-        gray = album.gray(which)
-        return gray if isinstance(gray, LeftOut) else ask(gray, *more)
-    return ask([gray for gray in map(album.gray, which) if not isinstance(gray, LeftOut)], *more)
+    grays = [album.gray(i) for i in ([which] if isinstance(which, int) else which)]
+    whole = [gray for gray in grays if not isinstance(gray, LeftOut)]
+    if not whole:
+        return grays[0]
+    return ask(whole[0] if isinstance(which, int) else whole, *more)
 
 
 @dataclass
@@ -351,12 +335,17 @@ class _Search:
             yield None if isinstance(seen, LeftOut) else seen
 
     def _asked(self, ask: Callable[..., Any], which: Sequence[int], *more: Any) -> Any:
-        """What several pictures together show."""
-        return next(iter(self.workers.in_order(_look, [(ask, tuple(which), more)])))
+        """What several pictures together show, None of such that cannot be decoded."""
+        seen = next(iter(self.workers.in_order(_look, [(ask, tuple(which), more)])))
+        if isinstance(seen, LeftOut):
+            self.damaged |= dict.fromkeys(which, seen)
+            return None
+        return seen
 
     def _layout(self, sample: Sequence[int], dictionary: str | None) -> Layout | None:
         """What board of markers the sample shows; of a stated dictionary, what any of the pictures does."""
-        for which in (sample, range(len(self.pictures)) if dictionary else ()):
+        every = range(len(self.pictures))
+        for which in (sample, every) if dictionary else (sample,):
             layout: Layout | None = self._asked(recognise, which, dictionary)
             if layout is not None:
                 return layout

@@ -523,11 +523,14 @@ class Prediction:
     points : (rows, columns, 2) pixels, each from all corners but itself.
     spread_px : typical distance of a corner from its prediction, robust.
     limit_px : (rows, columns) distance beyond which a corner disagrees with the others.
+    strength, degree : lambda, and which of the degrees.
     """
 
     points: FloatArray
     spread_px: float
     limit_px: FloatArray
+    strength: float
+    degree: int
 
 
 def _homographies(board: FloatArray, targets: FloatArray, weights: FloatArray) -> FloatArray:
@@ -585,7 +588,9 @@ def _weights(error: FloatArray, used: BoolArray, least: float) -> FloatArray:
     return used / (1.0 + (error / scale) ** 2) ** 2
 
 
-def predict(points: FloatArray, known: BoolArray, lens: Lens | None = None) -> Prediction | None:
+def predict(
+    points: FloatArray, known: BoolArray, lens: Lens | None = None, like: Prediction | None = None
+) -> Prediction | None:
     """Predict every corner of a grid from the others.
 
     Parameters
@@ -593,6 +598,7 @@ def predict(points: FloatArray, known: BoolArray, lens: Lens | None = None) -> P
     points : (rows, columns, 2) pixels.
     known : (rows, columns) which points to go by; at least six, or None is returned.
     lens : where the picture's centre is; without it lambda is 0.
+    like : an earlier prediction of the same corners, whose lambda is taken, and its degree or the next.
     """
     rows, columns = known.shape
     (board, bases), used = _bases(columns, rows), known.ravel()
@@ -603,14 +609,15 @@ def predict(points: FloatArray, known: BoolArray, lens: Lens | None = None) -> P
     if lens is None:
         lens = Lens(np.mean(pixels[used], axis=0), float(np.ptp(pixels[used])) + 1.0)
     else:
-        strength = _strength(board, pixels, used, lens)
+        strength = _strength(board, pixels, used, lens) if like is None else like.strength
     fit = _Fit(board, pixels, used, lens, strength, (rows, columns))
     weights, plane = fit.homography()
     best: Prediction | None = None
-    for basis in bases:
-        if best is not None and used.sum() < _FREEDOM * basis.shape[1]:
+    degrees = range(len(bases)) if like is None else range(like.degree, min(like.degree + 2, len(bases)))
+    for degree in degrees:
+        if best is not None and used.sum() < _FREEDOM * bases[degree].shape[1]:
             break
-        candidate = fit.with_basis(basis, weights, plane)
+        candidate = fit.with_basis(bases[degree], degree, weights, plane)
         if best is None or candidate.spread_px < best.spread_px:
             best = candidate
     return best
@@ -642,8 +649,10 @@ class _Fit:
             plane = _homographies(self.board, target, weights)[0]
         return weights, plane
 
-    def with_basis(self, basis: FloatArray, weights: FloatArray, plane: FloatArray) -> Prediction:
-        """Fit the displacement from the homography by `basis` (N, P), robustly."""
+    def with_basis(
+        self, basis: FloatArray, degree: int, weights: FloatArray, plane: FloatArray
+    ) -> Prediction:
+        """Fit the displacement from the homography by `basis` (N, P) of this degree, robustly."""
         target = self.lens.straightened(self.pixels, self.strength)
         for _ in range(_ROUNDS):
             weighted = basis * weights[:, None]
@@ -660,7 +669,8 @@ class _Fit:
         spread = _median((apart / (1.0 - leverage))[self.used])
         # A prediction is as uncertain as the corners, and as its leverage makes it.
         limit = _LIMIT * max(spread, _LEAST_SPREAD_PX) * np.sqrt(1.0 + np.minimum(power, 8.0))
-        return Prediction(points.reshape(*self.shape, 2), spread, limit.reshape(self.shape))
+        grid = points.reshape(*self.shape, 2)
+        return Prediction(grid, spread, limit.reshape(self.shape), self.strength, degree)
 
 
 # ----------------------------------------------------------------------
@@ -893,8 +903,10 @@ class _Check:
     grid: FloatArray
 
 
-def _checked(part: Part, fit: LocalFit, good: BoolArray) -> tuple[_Check, Prediction] | None:
-    prediction = predict(fit.points.reshape(*part.shape, 2), good.reshape(part.shape), part.lens)
+def _checked(
+    part: Part, fit: LocalFit, good: BoolArray, like: Prediction | None
+) -> tuple[_Check, Prediction] | None:
+    prediction = predict(fit.points.reshape(*part.shape, 2), good.reshape(part.shape), part.lens, like)
     if prediction is None:
         return None
     placed = prediction.points.reshape(-1, 2)
@@ -906,11 +918,13 @@ def _checked(part: Part, fit: LocalFit, good: BoolArray) -> tuple[_Check, Predic
     return _Check(placed, away, bound, far, grid), prediction
 
 
-def _rescued(part: Part, fit: LocalFit) -> tuple[LocalFit, BoolArray, Prediction] | None:
+def _rescued(
+    part: Part, fit: LocalFit, like: Prediction | None
+) -> tuple[LocalFit, BoolArray, Prediction] | None:
     """Fit again, from where the others place them, the corners that failed or disagree with the others."""
     good = _trusted(part, fit)
     for window in _RESCUE_WINDOWS:
-        checked = _checked(part, fit, good)
+        checked = _checked(part, fit, good, like)
         if checked is None:
             return None
         check, prediction = checked
@@ -923,7 +937,7 @@ def _rescued(part: Part, fit: LocalFit) -> tuple[LocalFit, BoolArray, Prediction
         use = _trusted(part, trial)[doubtful] & (~good[doubtful] | (near < 0.7 * check.away[doubtful]))
         fit = _merged(fit, again, doubtful, use)
         good[doubtful[use]] = True
-    checked = _checked(part, fit, good)
+    checked = _checked(part, fit, good, like)
     if checked is None:
         return None
     check = checked[0]
@@ -932,7 +946,7 @@ def _rescued(part: Part, fit: LocalFit) -> tuple[LocalFit, BoolArray, Prediction
     beside = extrapolated(fit.points.reshape(*part.shape, 2))[1:-1, 1:-1].reshape(-1, 2)
     nearest = np.fmin(check.away, np.linalg.norm(fit.points - beside, axis=1))
     good &= np.where(clean, nearest < check.far, check.away < check.bound)
-    last = predict(fit.points.reshape(*part.shape, 2), good.reshape(part.shape), part.lens)
+    last = predict(fit.points.reshape(*part.shape, 2), good.reshape(part.shape), part.lens, like)
     return None if last is None else (fit, good, last)
 
 
@@ -1021,7 +1035,8 @@ def refine(gray: GrayImage, points: FloatArray) -> Refined | None:
         if len(unsteady) == 0:
             break
     fit = _closer_looked(part, fit, moved)
-    rescued = _rescued(part, fit)
+    # What disturbs corners disturbs the choice of lambda and degree.
+    rescued = _rescued(part, fit, rough if stays.all() else None)
     if rescued is None:
         return None
     fit, good, prediction = rescued
