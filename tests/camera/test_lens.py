@@ -210,9 +210,9 @@ def test_a_hundredth_of_a_pixel_everywhere(name: str) -> None:
     """Checked against the lens model itself: distorting the answer again gives the pixel back."""
     camera = CAMERAS[name]
     inverse = fit_inverse(camera)
-    assert inverse.covered == 1.0 and inverse.max_error_px <= inverse.tolerance_px
+    assert inverse.covered == 1.0 and inverse.max_error_px <= 0.01
     pixels = pixel_grid(camera.image_size_px, most=50_000).reshape(-1, 2)
-    x = undistort_by_polynomial(inverse, distorted_normalised(camera, pixels))
+    x = undistort_by_polynomial(camera, inverse, distorted_normalised(camera, pixels))
     again = project(camera, np.column_stack([x, np.ones(len(x))]))
     # Distorting magnifies a distance at most by the steepest slope of the lens model, below 3 here.
     assert np.linalg.norm(again - pixels, axis=1).max() < 3 * 0.01
@@ -234,7 +234,9 @@ def test_single_precision_is_enough() -> None:
     for camera in (THESIS, CAMERAS["brown5 with skew"], CAMERAS["12 megapixels"]):
         inverse = fit_inverse(camera)
         pixels = pixel_grid(camera.image_size_px, most=20_000).reshape(-1, 2)
-        single = undistort_by_polynomial(inverse, distorted_normalised(camera, pixels.astype(np.float32)))
+        single = undistort_by_polynomial(
+            camera, inverse, distorted_normalised(camera, pixels.astype(np.float32))
+        )
         assert single.dtype == np.float32
         error_px = np.linalg.norm((single - undistort(camera, pixels)) @ camera.K[:2, :2].T, axis=1)
         assert error_px.max() <= 0.01

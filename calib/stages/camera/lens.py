@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -59,31 +59,6 @@ _MOST_PIXELS = 200_000
 """Larger pictures are checked on a grid of about this many pixels, their borders included."""
 
 
-@dataclass(frozen=True)
-class InversePolynomial:
-    """An inverse of the lens model, see the module.
-
-    Attributes
-    ----------
-    radial : c1, c2, ...
-    p1, p2 : decentering coefficients of the camera.
-    decentering_steps : how often the decentering is taken off.
-    max_error_px : largest distance between this and the exact inverse over the picture, in undistorted
-        pixels, computed in single precision as a microcontroller does.
-    covered : share of the picture that the lens model can show at all, of a fisheye lens up to 75 degrees
-        from the axis; the error is over this share.
-    tolerance_px : what was asked for.
-    """
-
-    radial: tuple[float, ...]
-    p1: float
-    p2: float
-    decentering_steps: int
-    max_error_px: float
-    covered: float
-    tolerance_px: float
-
-
 def pixel_grid(
     image_size_px: tuple[int, int],
     region_px: tuple[float, float, float, float] | None = None,
@@ -102,10 +77,10 @@ def pixel_grid(
     return np.stack(np.meshgrid(u, v), axis=-1)
 
 
-def undistort_by_polynomial(inverse: InversePolynomial, distorted: AnyArray) -> AnyArray:
+def undistort_by_polynomial(camera: Camera, inverse: InverseLens, distorted: AnyArray) -> AnyArray:
     """Normalised undistorted coordinates (..., 2) of distorted ones, in the precision of the input."""
     kind = distorted.dtype.type
-    p1, p2, two = kind(inverse.p1), kind(inverse.p2), kind(2)
+    p1, p2, two = kind(camera.distortion[2]), kind(camera.distortion[3]), kind(2)
     xd, yd = distorted[..., 0], distorted[..., 1]
     x, y = _times_radial(inverse.radial, xd, yd)
     for _ in range(inverse.decentering_steps):
@@ -116,7 +91,7 @@ def undistort_by_polynomial(inverse: InversePolynomial, distorted: AnyArray) -> 
     return np.stack([x, y], axis=-1)
 
 
-def _times_radial(radial: tuple[float, ...], x: AnyArray, y: AnyArray) -> tuple[AnyArray, AnyArray]:
+def _times_radial(radial: Sequence[float], x: AnyArray, y: AnyArray) -> tuple[AnyArray, AnyArray]:
     rho = x * x + y * y
     P = np.zeros_like(rho)
     for coefficient in (*reversed(radial), 1.0):
@@ -134,52 +109,55 @@ def exact_inverse(camera: Camera, pixels: FloatArray) -> tuple[FloatArray, BoolA
     return ideal, np.asarray(np.isfinite(ideal).all(axis=1) & (np.hypot(*ideal.T) < most))
 
 
-def fit_inverse(camera: Camera, tolerance_px: float = 0.01) -> InversePolynomial:
+def fit_inverse(camera: Camera, tolerance_px: float = 0.01) -> InverseLens:
     """The shortest inverse polynomial within `tolerance_px` of the exact inverse, else the best found.
 
     Where the lens model folds over inside the picture, or bends more than ten
-    coefficients can follow, the tolerance is not reached and `max_error_px` says by how much.
+    coefficients can follow, the tolerance is not reached and `max_error_px` says by how much: the largest
+    distance from the exact inverse over the share of the picture that is `covered`, in undistorted pixels,
+    computed in single precision as a microcontroller does. It is None where nothing is.
     """
     width, height = camera.image_size_px
     pixels = pixel_grid(camera.image_size_px, (-0.5, -0.5, width - 0.5, height - 0.5)).reshape(-1, 2)
     ideal, seen = exact_inverse(camera, pixels)
-    p1, p2 = float(camera.distortion[2]), float(camera.distortion[3])
-    covered = float(np.mean(seen))
-    best = InversePolynomial((), p1, p2, 0, np.inf, covered, tolerance_px)
+    best, least = (
+        InverseLens(radial=[], decentering_steps=0, max_error_px=None, covered=float(np.mean(seen))),
+        np.inf,
+    )
     if not seen.any():
         return best
     ideal = ideal[seen]
     distorted = distorted_normalised(camera, pixels[seen].astype(np.float32))
 
-    def checked(radial: tuple[float, ...], steps: int) -> InversePolynomial:
-        trial = replace(best, radial=radial, decentering_steps=steps)
-        error = (undistort_by_polynomial(trial, distorted) - ideal) @ camera.K[:2, :2].T
-        return replace(trial, max_error_px=float(np.sqrt(np.max(np.sum(error**2, axis=1)))))
+    def checked(radial: list[float], steps: int) -> tuple[InverseLens, float]:
+        trial = best.model_copy(update={"radial": radial, "decentering_steps": steps})
+        off = (undistort_by_polynomial(camera, trial, distorted) - ideal) @ camera.K[:2, :2].T
+        error = float(np.sqrt(np.max(np.sum(off**2, axis=1))))
+        return trial.model_copy(update={"max_error_px": finite_or_none(error)}), error
 
-    most = _MOST_STEPS if p1 or p2 else 0
+    most = _MOST_STEPS if np.any(camera.distortion[2:4]) else 0
     largest = float(np.sqrt(np.max(np.sum(ideal**2, axis=1))))
     with np.errstate(over="ignore", invalid="ignore"):
         for count in range(_MOST_COEFFICIENTS + 1):
-            trial = checked(_minimax(camera, largest, count), most)
-            if trial.max_error_px < best.max_error_px:
-                best = trial
-            if best.max_error_px <= tolerance_px:
+            trial, error = checked(_minimax(camera, largest, count), most)
+            if error < least:
+                best, least = trial, error
+            if least <= tolerance_px:
                 break
         # Fewer steps where they do, and never more than help.
-        goal = max(tolerance_px, 1.02 * best.max_error_px)
         for steps in range(most):
-            trial = checked(best.radial, steps)
-            if trial.max_error_px <= goal:
+            trial, error = checked(best.radial, steps)
+            if error <= max(tolerance_px, 1.02 * least):
                 return trial
     return best
 
 
-def _minimax(camera: Camera, largest: float, count: int) -> tuple[float, ...]:
+def _minimax(camera: Camera, largest: float, count: int) -> list[float]:
     """The c1, c2, ... with nearly the least largest error over undistorted radii up to `largest`."""
     r = np.linspace(0.0, largest, 40 * (count + 5))[1:]
     w = radial_curve(camera, r)
     if count == 0 or np.array_equal(r, w):
-        return ()
+        return []
     rho = w * w
     top = float(rho.max())
     powers = (rho[:, None] / top) ** np.arange(1, count + 1) * w[:, None]
@@ -196,7 +174,7 @@ def _minimax(camera: Camera, largest: float, count: int) -> tuple[float, ...]:
             break
         weight = weight * error
         weight = weight / weight.sum()
-    return tuple(float(c) for c in best / top ** np.arange(1.0, count + 1))
+    return [float(c) for c in best / top ** np.arange(1.0, count + 1)]
 
 
 # ----------------------------------------------------------------------
@@ -290,16 +268,6 @@ def distortion_kind(camera: Camera) -> str:
     if min(rise, fall) * seen_px > _TURN_PX:
         return "mustache"
     return "pincushion" if rise > fall else "barrel"
-
-
-def inverse_section(fit: InversePolynomial) -> InverseLens:
-    """What of a fit the file holds."""
-    return InverseLens(
-        radial=list(fit.radial),
-        decentering_steps=fit.decentering_steps,
-        max_error_px=finite_or_none(fit.max_error_px),
-        covered=fit.covered,
-    )
 
 
 def projection_sigma_px(camera: Camera, covariance: FloatArray, pixels: FloatArray) -> FloatArray:
@@ -404,7 +372,7 @@ def analyse_distortion(
         monotonic=one_to_one_reach(camera) > 1.0,
         region_sigma_px=None if sigma is None else float(sigma.min()),
         **cost,
-        inverse=inverse_section(fit_inverse(camera, tolerance_px)),
+        inverse=fit_inverse(camera, tolerance_px),
         effect=effect,
         verdict="ok",
         remarks=[why],

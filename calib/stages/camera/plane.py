@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -240,170 +240,155 @@ def _own_pose(camera: Camera, view: View) -> Pose | None:
         return None
 
 
-def judge(
+def _findings(
     camera: Camera,
-    views: Sequence[View],
     pose: Pose,
+    corners: tuple[FloatArray, FloatArray],
     comparison: Comparison,
     sigma: PositionSigma,
     workspace_m: tuple[float, float, float, float],
     camera_rms_px: float | None,
-) -> Verdict:
-    """What speaks against a plane, and notes that do not."""
-    world_m = np.concatenate([view.target_m for view in views])
-    pixels = np.concatenate([view.pixels for view in views])
-    moved = _moved(comparison)
-    lost, flat = _shape(pose, world_m, pixels)
-    poor = flat + _fit(camera, pose, world_m, pixels, camera_rms_px)
-    poor += _horizon(camera, pose)
-    poor += _precision(camera, pose, sigma, workspace_m)
-    notes: list[str] = []
-    out_of_sight = float(np.mean(~np.isfinite(sigma.plane_mm[:, 0])))
-    if out_of_sight == 1.0:
-        poor.append("no part of the workspace is in the picture")
-    elif out_of_sight > _MOSTLY_UNSEEN:
-        poor.append(
-            f"{100 * out_of_sight:.0f} % of the workspace is outside the picture; move the camera, or say in "
-            "the rig's file where the marker can be (geometry.workspace_m)"
+) -> Iterator[Finding]:
+    """What speaks against a plane, and notes that do not.
+
+    Parameters
+    ----------
+    corners : (M, 2) of all pictures, on the plane and in the picture.
+    """
+    world_m, pixels = corners
+    if comparison.probability <= _MOVED_PROBABILITY and comparison.moved_px >= _MOVED_PX:
+        text = (
+            f"the pictures contradict each other: {comparison.moved_name} is {comparison.moved_px:.2f} px "
+            "away from the common pose; the camera or the board moved in between"
         )
-    elif out_of_sight > 0.0:
-        notes.append(
-            f"{100 * out_of_sight:.0f} % of the workspace is outside the picture; sigma is given for the rest"
-        )
+        yield Finding("inconsistent", text)
+    yield from _of_direction(pose, world_m, pixels)
+    yield from _of_residuals(camera, pose, world_m, pixels, camera_rms_px)
+    yield from _of_horizon(camera, pose)
+    yield from _of_precision(camera, pose, sigma, workspace_m)
+    unseen = float(np.mean(~np.isfinite(sigma.plane_mm[:, 0])))
+    share = f"{100 * unseen:.0f} % of the workspace is outside the picture"
+    if unseen == 1.0:
+        yield Finding("poor", "no part of the workspace is in the picture")
+    elif unseen > _MOSTLY_UNSEEN:
+        where = "move the camera, or say in the rig's file where the marker can be (geometry.workspace_m)"
+        yield Finding("poor", f"{share}; {where}")
+    elif unseen > 0.0:
+        yield Finding("remark", f"{share}; sigma is given for the rest")
     if sigma.intrinsics_mm is None:
-        notes.append("the uncertainty of the intrinsics is not known and not part of the sigma")
+        text = "the uncertainty of the intrinsics is not known and not part of the sigma"
+        yield Finding("remark", text)
     freedom = 2 * len(np.unique(np.round(world_m, 9), axis=0)) - 6
     if freedom < _FEW_FREEDOMS:
-        notes.append(f"the sigma rests on {freedom} degrees of freedom only and is rough")
-    return Verdict.of(
-        [
-            *(Finding("inconsistent", text) for text in moved),
-            *(Finding("unidentifiable", text) for text in lost),
-            *(Finding("poor", text) for text in poor),
-            *(Finding("remark", text) for text in notes),
-        ]
-    )
+        yield Finding("remark", f"the sigma rests on {freedom} degrees of freedom only and is rough")
 
 
-def _moved(comparison: Comparison) -> list[str]:
-    if comparison.probability > _MOVED_PROBABILITY or comparison.moved_px < _MOVED_PX:
-        return []
-    return [
-        f"the pictures contradict each other: {comparison.moved_name} is {comparison.moved_px:.2f} px away "
-        "from the "
-        "common pose; the camera or the board moved in between"
-    ]
-
-
-def _shape(pose: Pose, world_m: FloatArray, pixels: FloatArray) -> tuple[list[str], list[str]]:
-    """Reasons why the plane's direction cannot be known, and why it is known badly."""
+def _of_direction(pose: Pose, world_m: FloatArray, pixels: FloatArray) -> Iterator[Finding]:
+    """Whether the plane's direction can be known, and well."""
     at = pose.R_CW[:, :2] @ world_m.mean(axis=0) + pose.t_CW_m
     elevation = float(np.degrees(np.arcsin(min(1.0, pose.R_CW[:, 2] @ at / np.linalg.norm(at)))))
     width = float(np.linalg.svd(pixels - pixels.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(pixels)))
     if elevation < _ELEVATION_LOST_DEG or width < _SPREAD_LOST_PX:
-        return [
+        text = (
             f"the plane is seen edge-on or from too far: the line of sight meets it at {elevation:.1f} "
-            "degrees and its "
-            f"corners spread over {width:.1f} px only"
-        ], []
-    if elevation < _ELEVATION_POOR_DEG:
-        return [], [
+            f"degrees and its corners spread over {width:.1f} px only"
+        )
+        yield Finding("unidentifiable", text)
+    elif elevation < _ELEVATION_POOR_DEG:
+        text = (
             f"the plane is seen nearly edge-on, at {elevation:.1f} degrees; {_ELEVATION_POOR_DEG:.0f} or "
             "more are needed"
-        ]
-    return [], []
-
-
-def _fit(
-    camera: Camera, pose: Pose, world_m: FloatArray, pixels: FloatArray, camera_rms_px: float | None
-) -> list[str]:
-    """Reasons that lie in the residuals."""
-    reasons = []
-    rms = float(np.sqrt(np.mean(np.sum(pose.residuals_px**2, axis=1))))
-    if pose.termination == "iterations":
-        reasons.append("the fit of the pose did not converge")
-    if rms > _RMS_LIMIT_PX:
-        reasons.append(
-            f"the corners miss their places by {rms:.2f} px RMS (limit {_RMS_LIMIT_PX:g}): wrong square, "
-            "wrong order of "
-            "corners, or another camera's intrinsics"
         )
+        yield Finding("poor", text)
+
+
+def _of_residuals(
+    camera: Camera, pose: Pose, world_m: FloatArray, pixels: FloatArray, camera_rms_px: float | None
+) -> Iterator[Finding]:
+    rms = pose.rms_px
+    if pose.termination == "iterations":
+        yield Finding("poor", "the fit of the pose did not converge")
+    if rms > _RMS_LIMIT_PX:
+        text = (
+            f"the corners miss their places by {rms:.2f} px RMS (limit {_RMS_LIMIT_PX:g}): wrong square, "
+            "wrong order of corners, or another camera's intrinsics"
+        )
+        yield Finding("poor", text)
     elif camera_rms_px is not None and rms > max(_RMS_FACTOR * camera_rms_px, _RMS_NOTICED_PX):
-        reasons.append(
+        text = (
             f"the RMS of {rms:.2f} px is more than {_RMS_FACTOR:g} times the camera's own "
             f"{camera_rms_px:.2f} px"
         )
+        yield Finding("poor", text)
     ideal = undistort(camera, pixels)
     usable = np.isfinite(ideal).all(axis=1)
     if not usable.all():
-        reasons.append(f"{int((~usable).sum())} corners lie where the camera's lens model folds over")
+        text = f"{int((~usable).sum())} corners lie where the camera's lens model folds over"
+        yield Finding("poor", text)
     elif len(pixels) >= _HOMOGRAPHY_POINTS and rms > _RMS_NOTICED_PX:
         free = fit_homography(world_m, ideal)
         seen = project(camera, np.column_stack([world_m, np.ones(len(world_m))]) @ free.H.T)
         free_rms = float(np.sqrt(np.mean(np.sum((seen - pixels) ** 2, axis=1))))
         if rms > _HOMOGRAPHY_FACTOR * free_rms:
-            reasons.append(
+            text = (
                 f"a free homography fits to {free_rms:.2f} px where the pose fits to {rms:.2f} px: the "
-                "intrinsics or the "
-                "proportions of the board are not the real ones"
+                "intrinsics or the proportions of the board are not the real ones"
             )
-    return reasons
+            yield Finding("poor", text)
 
 
-def _horizon(camera: Camera, pose: Pose) -> list[str]:
+def _of_horizon(camera: Camera, pose: Pose) -> Iterator[Finding]:
     """The denominator of (2.12) must not cross zero within the picture.
 
     In that of a fisheye lens it does for any plane that is tilted; what is beyond has no place on the plane.
     """
     if camera.fisheye:
-        return []
+        return
     width, height = camera.image_size_px
     u, v = np.meshgrid(np.linspace(0, width - 1, 41), np.linspace(0, height - 1, 31))
     ideal = undistort(camera, np.stack([u.ravel(), v.ravel()], axis=1))
     ideal = ideal[np.isfinite(ideal).all(axis=1)]
     last = np.linalg.inv(np.column_stack([pose.R_CW[:, :2], pose.t_CW_m]))[2]
     beyond = float(np.mean(ideal @ last[:2] + last[2] <= 0.0)) if len(ideal) else 0.0
-    if beyond == 0.0:
-        return []
-    return [
-        f"the plane's horizon crosses the picture: {100 * beyond:.0f} % of the pixels show nothing of the "
-        "plane"
-    ]
+    if beyond > 0.0:
+        text = (
+            f"the plane's horizon crosses the picture: {100 * beyond:.0f} % of the pixels show nothing of "
+            "the plane"
+        )
+        yield Finding("poor", text)
 
 
-def _precision(
+def _of_precision(
     camera: Camera, pose: Pose, sigma: PositionSigma, workspace_m: tuple[float, float, float, float]
-) -> list[str]:
-    """Reasons that lie in how well the pose is known over the workspace."""
+) -> Iterator[Finding]:
+    """How well the pose is known over the workspace."""
     seen = visible(camera, pose.R_CW, pose.t_CW_m, sigma.points_m)
-    if not seen.any():
-        return []
-    if np.any(np.isinf(sigma.calibration_mm[seen])):
-        return ["the intrinsics themselves are not known: their covariance is infinite"]
-    if not np.all(np.isfinite(sigma.calibration_mm[seen])):
-        return []
-    reasons = []
+    calibration_mm = sigma.calibration_mm[seen]
+    if np.any(np.isinf(calibration_mm)):
+        text = "the intrinsics themselves are not known: their covariance is infinite"
+        yield Finding("poor", text)
+    if not seen.any() or not np.all(np.isfinite(calibration_mm)):
+        return
     diagonal_mm = 1e3 * float(np.hypot(workspace_m[2] - workspace_m[0], workspace_m[3] - workspace_m[1]))
     worst_mm = float(np.hypot(*sigma.plane_mm[seen].T).max())
     if worst_mm > _SIGMA_SHARE * diagonal_mm:
-        reasons.append(
+        text = (
             f"the corners do not fix the plane over the workspace: sigma reaches {worst_mm:.1f} mm of "
             f"{diagonal_mm:.0f} mm"
         )
+        yield Finding("poor", text)
     if pose.other is not None:
         cost, R, t = pose.other
         points = sigma.points_m[seen]
         pixels = project(camera, points @ pose.R_CW[:, :2].T + pose.t_CW_m)
         apart = 1e3 * np.linalg.norm(plane_map(camera, R, t, pixels) - points, axis=1)
         likely = cost - pose.cost_px2 < 9.0 * pose.sigma_px**2
-        calibration_mm = float(np.hypot(*sigma.calibration_mm[seen].T).max())
-        if likely and np.nanmax(apart) > 3.0 * calibration_mm:
-            reasons.append(
+        if likely and np.nanmax(apart) > 3.0 * float(np.hypot(*calibration_mm.T).max()):
+            text = (
                 "the plane tilted the other way fits as well and puts the marker up to "
-                f"{np.nanmax(apart):.1f} mm elsewhere; "
-                "look at it more obliquely or from nearer"
+                f"{np.nanmax(apart):.1f} mm elsewhere; look at it more obliquely or from nearer"
             )
-    return reasons
+            yield Finding("poor", text)
 
 
 # ----------------------------------------------------------------------
@@ -423,21 +408,16 @@ def _precision(
 
 
 @dataclass(frozen=True)
-class Plane:
-    """A calibrated plane.
+class Plane(Pose):
+    """A calibrated plane: a pose whose covariance holds what it takes over from the intrinsics as well.
 
     Attributes
     ----------
-    R_CW, t_CW_m : (3, 3) and (3,), world to camera.
     A : (3, 3), homography (2.9) from metres to ideal pixels; s is the depth in metres.
-    covariance : (6, 6) of (rotation vector on the left, t), rad and m: from the noise of the corners and
-        from the intrinsics, where their covariance is known.
-    rms_px : reprojection error over all corners.
     rms_mm : distance on the plane between where corners are and where they are read.
-    points : corners used, over all pictures.
     pictures : fit of each picture.
-    corners_m, corners_px, residuals_px : (M, 2) of all pictures in turn: places on the plane, where the
-        pictures show them, and projected minus measured.
+    corners_m, corners_px : (M, 2) of all pictures in turn: places on the plane, and where the pictures show
+        them.
     workspace_m : box (x0, y0, x1, y1) over which the uncertainty is reported.
     sigma : standard deviations of a marker's position over the workspace.
     direct : homography from metres to distorted pixels, fitted without intrinsics.
@@ -445,17 +425,11 @@ class Plane:
     verdict : whether to trust it.
     """
 
-    R_CW: FloatArray
-    t_CW_m: FloatArray
     A: FloatArray
-    covariance: FloatArray
-    rms_px: float
     rms_mm: float
-    points: int
     pictures: tuple[PictureFit, ...]
     corners_m: FloatArray
     corners_px: FloatArray
-    residuals_px: FloatArray
     workspace_m: tuple[float, float, float, float]
     sigma: PositionSigma
     direct: Homography
@@ -515,21 +489,18 @@ def calibrate_plane(
         box = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
     sigma = position_sigma(camera, camera_covariance, pose, workspace_grid(box))
     direct = fit_homography(world_m, pixels, groups)
-    verdict = judge(camera, views, pose, comparison, sigma, box, camera_rms_px)
+    findings = _findings(camera, pose, (world_m, pixels), comparison, sigma, box, camera_rms_px)
+    verdict = Verdict.of(findings)
 
     read_m = plane_map(camera, pose.R_CW, pose.t_CW_m, pixels)
+    whole = replace(pose, covariance=_pose_covariance(pose, camera_covariance))
     return Plane(
-        R_CW=pose.R_CW,
-        t_CW_m=pose.t_CW_m,
+        **vars(whole),
         A=camera.K @ np.column_stack([pose.R_CW[:, :2], pose.t_CW_m]),
-        covariance=_pose_covariance(pose, camera_covariance),
-        rms_px=float(np.sqrt(np.mean(np.sum(pose.residuals_px**2, axis=1)))),
         rms_mm=1e3 * float(np.sqrt(np.nanmean(np.sum((read_m - world_m) ** 2, axis=1)))),
-        points=len(world_m),
         pictures=pictures,
         corners_m=world_m,
         corners_px=pixels,
-        residuals_px=pose.residuals_px,
         workspace_m=box,
         sigma=sigma,
         direct=direct,

@@ -652,8 +652,8 @@ def _plane_picture(camera: Camera, plane: Plane) -> Figure:
     x0, y0, x1, y1 = (1e3 * value for value in plane.workspace_m)
     note = (
         f"The RMS is {number(plane.rms_px, 'px')} in the picture, {number(plane.rms_mm, 'mm')} on the plane, "
-        f"over {plane.points} corners. The outline is the workspace, x from {x0:g} to {x1:g} mm and y from "
-        f"{y0:g} to {y1:g} mm."
+        f"over {len(plane.corners_m)} corners. The outline is the workspace, x from {x0:g} to {x1:g} mm "
+        f"and y from {y0:g} to {y1:g} mm."
     )
     times = _times(plane.residuals_px, 0.05 * max(size))
     marks = [*_outline(camera, plane), *_world_axes(camera, plane)]

@@ -66,6 +66,11 @@ class Pose:
         """Sum of squared residuals."""
         return float(np.sum(self.residuals_px**2))
 
+    @property
+    def rms_px(self) -> float:
+        """Root mean square length of the residuals."""
+        return float(np.sqrt(self.cost_px2 / len(self.residuals_px)))
+
 
 def _block(camera: Camera, R: FloatArray, t_m: FloatArray) -> Block:
     return Block(vector_from_camera(camera), R[None], t_m[None], np.zeros(0), camera.fisheye)

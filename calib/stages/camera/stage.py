@@ -430,7 +430,7 @@ def _solve_plane(inputs: PlaneInputs) -> Plane:
         },
         without_intrinsics=without,
         pictures=len(fit.pictures),
-        points=fit.points,
+        points=len(fit.corners_m),
         orientation=" ".join(inputs.orientation),
         simulated=inputs.simulated,
         **judged(Verdict.of(findings)),

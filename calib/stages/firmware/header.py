@@ -21,7 +21,7 @@ from calib.core import __version__
 from calib.core.result import identity
 from calib.core.verdict import Finding, Verdict
 from calib.core.writing import Kind, begins, make_folder, write_atomically
-from calib.stages.camera.lens import fit_inverse, inverse_section
+from calib.stages.camera.lens import fit_inverse
 from calib.stages.camera.model import COEFFICIENTS, MODELS
 from calib.stages.camera.section import InverseLens
 from calib.stages.firmware.constants import Lookup, constants, plane_constants
@@ -133,7 +133,7 @@ def _inverse(rig: Rig) -> InverseLens | None:
         return None
     if rig.lens is not None and rig.inputs.get("lens", {}).get("camera") == identity(rig.camera):
         return rig.lens.inverse
-    return inverse_section(fit_inverse(rig.camera.optics))
+    return fit_inverse(rig.camera.optics)
 
 
 def _undone(inverse: InverseLens) -> bool:
