@@ -23,7 +23,7 @@ from calib.core.verdict import Verdict
 from calib.solve.clock import Part
 from calib.stages.imu.intrinsics import (
     ANGLES,
-    GYRO_ANGLES,
+    PLACES,
     Accelerometer,
     IntrinsicsInputs,
     Turns,
@@ -115,7 +115,7 @@ def _rests(
     n, d = up.shape
     p = _truth(sensor, d)
     size = sensor.accel_scale[:d].mean()
-    A = misalignment(p[2 * d :], d) / p[d : 2 * d]
+    A = misalignment(ANGLES[d], p[2 * d :], d) / p[d : 2 * d]
     force = (G + beyond * rng.normal(size=n))[:, None] * up
     counts = np.full(n, 300) if counts is None else counts
     x = force @ np.linalg.inv(A).T + p[:d]
@@ -203,7 +203,7 @@ def test_scale_and_misalignment_are_recovered(counts: bool) -> None:
     assert gyro.bias.sensitivity is None
     assert gyro.initial_bias == pytest.approx(quiet.gyro_bias, rel=1e-3)
     T = gyro.matrix * gyro.scale
-    for (i, j, sign), angle in zip(GYRO_ANGLES.values(), gyro.angles, strict=True):
+    for (i, j, sign), angle in zip(PLACES.values(), gyro.angles, strict=True):
         assert T[i, j] == pytest.approx(sign * angle)
 
 

@@ -17,6 +17,7 @@ from calib.core.errors import BadInputError
 from calib.core.result import finite_or_none, judged
 from calib.core.verdict import Finding, Verdict
 from calib.solve.clock import Part
+from calib.stages.imu.levelling import turned
 from calib.stages.imu.sampling import (
     MULTIPLES,
     Quiet,
@@ -39,14 +40,7 @@ from calib.stages.imu.section import (
 )
 
 # ----------------------------------------------------------------------
-# A direction fixed in the world, seen by a sensor that turns at w: dv/dt = v x w, by Runge and Kutta.
-
-
-@kernel()
-def _cross(v: FloatArray, w: FloatArray, out: FloatArray) -> None:
-    out[0] = v[1] * w[2] - v[2] * w[1]
-    out[1] = v[2] * w[0] - v[0] * w[2]
-    out[2] = v[0] * w[1] - v[1] * w[0]
+# A direction fixed in the world, seen by a sensor that turns at w: dv/dt = v x w, step by step.
 
 
 @kernel()
@@ -62,33 +56,14 @@ def turn_directions(
     before : (k, 3) vectors before the turns.
     out : (k, 3) vectors after them.
     """
-    w, v, h = np.zeros(3), np.zeros(3), period_s
-    k1, k2, k3, k4 = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
+    w = np.zeros(3)
     for turn in range(len(starts)):
-        u = out[turn]
-        length = 0.0
         for i in range(3):
-            u[i] = before[turn, i]
-            length += u[i] * u[i]
+            out[turn, i] = before[turn, i]
         for row in range(starts[turn], stops[turn]):
             for i in range(3):
                 w[i] = 0.5 * (rates[row, i] + rates[row + 1, i])
-            _cross(u, rates[row], k1)
-            for i in range(3):
-                v[i] = u[i] + 0.5 * h * k1[i]
-            _cross(v, w, k2)
-            for i in range(3):
-                v[i] = u[i] + 0.5 * h * k2[i]
-            _cross(v, w, k3)
-            for i in range(3):
-                v[i] = u[i] + h * k3[i]
-            _cross(v, rates[row + 1], k4)
-            norm = 0.0
-            for i in range(3):
-                u[i] += h / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i])
-                norm += u[i] * u[i]
-            for i in range(3):
-                u[i] *= (length / norm) ** 0.5 if norm > 0.0 else 1.0
+            turned(out[turn], w, period_s)
 
 
 # ----------------------------------------------------------------------
@@ -119,13 +94,22 @@ def turn_directions(
 # of rests is divided. Poses all over the sphere make the smallest 0.26, on the circle 0.35. Misalignments
 # that the poses do not tell, as when each axis just points up and down, are left at zero.
 
+PLACES = {
+    "yz": (0, 1, -1.0),
+    "zy": (0, 2, 1.0),
+    "xz": (1, 0, 1.0),
+    "zx": (1, 2, -1.0),
+    "xy": (2, 0, -1.0),
+    "yx": (2, 1, 1.0),
+}
+"""Row, column and sign of each misalignment in T; a gyroscope has all of them."""
+
 ANGLES = {2: ("yz",), 3: ("yz", "zy", "zx")}
-"""Names of the misalignments by the number of axes, in the order of the parameters."""
+"""Those of an accelerometer by the number of its axes, in the order of the parameters."""
 
 LEAST_SPAN = 0.02
 """Smallest singular value below which parameters are not told apart."""
 
-_PLACES = {"yz": (0, 1, -1.0), "zy": (0, 2, 1.0), "zx": (1, 2, -1.0)}
 _ROUNDS = 6
 
 
@@ -175,14 +159,15 @@ class Accelerometer:
     @property
     def matrix(self) -> FloatArray:
         """A (d, d) of a = A (x - b)."""
-        return misalignment(self.angles, len(self.bias)) / self.scale
+        d = len(self.bias)
+        return misalignment(ANGLES[d], self.angles, d) / self.scale
 
 
-def misalignment(angles: FloatArray, d: int) -> FloatArray:
-    """T (d, d) of the misalignments as `ANGLES[d]`."""
+def misalignment(names: Sequence[str], angles: FloatArray, d: int) -> FloatArray:
+    """T (d, d) of misalignments with these names."""
     T = np.eye(d)
-    for name, angle in zip(ANGLES[d], angles, strict=True):
-        i, j, sign = _PLACES[name]
+    for name, angle in zip(names, angles, strict=True):
+        i, j, sign = PLACES[name]
         T[i, j] = sign * angle
     return T
 
@@ -195,7 +180,7 @@ def corrected(parameters: FloatArray, readings: FloatArray) -> FloatArray:
 def _corrected(p: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """a (n, d) and its parts: T (d, d) and the scaled y (n, d)."""
     d = x.shape[1]
-    T = misalignment(p[2 * d :], d)
+    T = misalignment(ANGLES[d], p[2 * d :], d)
     y = (x - p[:d]) / p[d : 2 * d]
     return y @ T.T, T, y
 
@@ -211,7 +196,7 @@ def _residual_and_jacobian(p: FloatArray, x: FloatArray, g: float) -> tuple[Floa
     J[:, :d] = -along / p[d : 2 * d]
     J[:, d : 2 * d] = -along * y / p[d : 2 * d]
     for k, name in enumerate(ANGLES[d]):
-        i, j, sign = _PLACES[name]
+        i, j, sign = PLACES[name]
         J[:, 2 * d + k] = sign * u[:, i] * y[:, j]
     return length - g, J
 
@@ -559,16 +544,6 @@ def misfit_covariance(
 # The turns are weighted by their covariance, and the measured scale of the residuals goes into the standard
 # deviations.
 
-GYRO_ANGLES = {
-    "yz": (0, 1, -1.0),
-    "zy": (0, 2, 1.0),
-    "xz": (1, 0, 1.0),
-    "zx": (1, 2, -1.0),
-    "xy": (2, 0, -1.0),
-    "yx": (2, 1, 1.0),
-}
-"""Row, column and sign of each misalignment in T."""
-
 _FASTEST_RADPS, _SLOWEST_RADPS = 50.0, 0.2
 _FINE, _COARSE = 1.05, 1.3
 _FOLLOWS_POSE = 1e-4
@@ -605,7 +580,7 @@ class Gyroscope:
     bias : what it reads at rest.
     initial_bias : (3,) mean reading of the rest at the start.
     scale, scale_sigma : (3,) per rad/s; NaN for axes that were not fitted.
-    angles, angle_sigma : (6,) rad as `GYRO_ANGLES`; NaN where not fitted.
+    angles, angle_sigma : (6,) rad as `PLACES`; NaN where not fitted.
     residual_rad : (k, c) direction predicted less direction found after each turn, c = 1 in a plane.
     rms_rad : of their lengths.
     turns_s : (k,) lengths of the turns.
@@ -632,10 +607,7 @@ class Gyroscope:
 
 
 def _matrix(p: FloatArray) -> FloatArray:
-    T = np.eye(3)
-    for (i, j, sign), angle in zip(GYRO_ANGLES.values(), p[3:], strict=True):
-        T[i, j] = sign * angle
-    return np.asarray(T / p[:3])
+    return misalignment(tuple(PLACES), p[3:], 3) / p[:3]
 
 
 def fit_bias(turns: Turns, accel: Accelerometer) -> Bias:
@@ -674,16 +646,6 @@ def _rates(turns: Turns, accel: Accelerometer, bias: Bias) -> FloatArray:
     return np.ascontiguousarray(out)
 
 
-def _signed_permutations() -> list[FloatArray]:
-    out = []
-    for order in itertools.permutations(range(3)):
-        for signs in itertools.product((1.0, -1.0), repeat=3):
-            P = np.zeros((3, 3))
-            P[np.arange(3), order] = signs
-            out.append(P)
-    return out
-
-
 def _scales(rates: FloatArray, si: bool, step: float) -> list[float]:
     """Scales to try: 1, or all by which the fastest turn is one that a hand or a rig makes."""
     if si:
@@ -707,7 +669,10 @@ def foreign_axes(turns: Turns, accel: Accelerometer, found: Gyroscope, si: bool)
         return None
     rates, across = _rates(turns, accel, found.bias), tangents(turns, accel)
     best, least = None, 0.5 * found.rms_rad
-    for P in _signed_permutations():
+    for order, signs in itertools.product(
+        itertools.permutations(range(3)), itertools.product((1.0, -1.0), repeat=3)
+    ):
+        P = np.diag(signs) @ np.eye(3)[list(order)]
         for scale in _scales(rates, si, _COARSE if not si else _FINE):
             now = _rms(turns, accel, rates, P / scale, across)
             if now < least:
@@ -1076,39 +1041,47 @@ def _sides(accel: Accelerometer) -> Iterator[Finding]:
                 )
 
 
-def _name(accel: Accelerometer, place: int) -> str:
-    d = len(accel.bias)
-    if place < d:
-        return f"bias of {'xyz'[place]}"
-    if place < 2 * d:
-        return f"scale of {'xyz'[place - d]}"
-    return f"misalignment {ANGLES[d][place - 2 * d]}"
+def _names(d: int) -> list[str]:
+    """The accelerometer's parameters in words, in their order."""
+    words = [f"{what} of {axis}" for what in ("bias", "scale") for axis in "xyz"[:d]]
+    return words + [f"misalignment {name}" for name in ANGLES[d]]
+
+
+def _loose(
+    sensor: str, names: Sequence[str], sigma: FloatArray, limits: FloatArray, planar: bool
+) -> Iterator[Finding]:
+    """Findings on parameters that are known less well than their limits: g, shares and rad."""
+    for name, one, limit in zip(names, sigma.tolist(), limits.tolist(), strict=True):
+        if limit < one < math.inf:
+            kind = name.split()[0]
+            shown = f"{one:.2%}" if kind == "scale" else f"{one:.2g} {'g' if kind == 'bias' else 'rad'}"
+            yield Finding(
+                "unidentifiable" if one > _USELESS * limit else "poor",
+                f"{sensor}, {name}: known to {shown} only",
+                protocol(planar),
+            )
+
+
+def _off_scale(scale: FloatArray, what: str, so: str, advice: str) -> Iterator[Finding]:
+    off = float(scale[int(np.argmax(np.abs(scale - 1.0)))])
+    if abs(off - 1.0) > _OFF_SCALE:
+        yield Finding("inconsistent", f"{what} comes out as {off:.3g}, so {so}", advice)
 
 
 def _of_accelerometer(result: Intrinsics, accel: Accelerometer) -> Iterator[Finding]:
-    d, g = len(accel.bias), result.gravity_mps2
-    if "a" not in result.log.counts or accel.span >= LEAST_SPAN:
+    d, g, counts = len(accel.bias), result.gravity_mps2, "a" in result.log.counts
+    told, names = accel.span >= LEAST_SPAN, _names(len(accel.bias))
+    if told or not counts:
         yield from _sides(accel)
-    if accel.span < LEAST_SPAN:
-        mixed = np.flatnonzero(np.abs(accel.weakest) > 0.3).tolist()
-        words = [_name(accel, place) for place in mixed]
-        names = " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
-        yield Finding("unidentifiable", f"the poses do not tell {names} apart", protocol(result.planar))
+    if not told:
+        *words, last = (names[place] for place in np.flatnonzero(np.abs(accel.weakest) > 0.3).tolist())
+        mixed = f"{', '.join(words)} and {last}" if words else last
+        yield Finding("unidentifiable", f"the poses do not tell {mixed} apart", protocol(result.planar))
         return
-    size = np.concatenate([g * accel.scale, accel.scale, np.ones(len(accel.angles))])
-    limit = np.repeat([LIMITS["bias_g"], LIMITS["scale"], LIMITS["angle_rad"]], [d, d, len(accel.angles)])
-    relative = accel.sigma / size / limit
-    for place in range(len(relative) if accel.skewed else 2 * d):
-        if relative[place] > 1.0:
-            value = accel.sigma[place] / size[place]
-            shown = (
-                f"{value:.2g} g" if place < d else f"{value:.2g} rad" if place >= 2 * d else f"{value:.2%}"
-            )
-            yield Finding(
-                "unidentifiable" if relative[place] > _USELESS else "poor",
-                f"accelerometer, {_name(accel, place)}: known to {shown} only",
-                protocol(result.planar),
-            )
+    k = len(accel.angles)
+    size = np.concatenate([g * accel.scale, accel.scale, np.ones(k)])
+    limits = np.repeat([LIMITS["bias_g"], LIMITS["scale"], LIMITS["angle_rad"]], [d, d, k])
+    yield from _loose("accelerometer", names, accel.sigma / size, limits, result.planar)
     if not accel.skewed:
         yield Finding(
             "remark",
@@ -1139,30 +1112,23 @@ def _of_accelerometer(result: Intrinsics, accel: Accelerometer) -> Iterator[Find
             f"{r[worst] / max(others, 1e-12):.0f} times what the others are",
             "look at that rest: something pushed the sensor, or it crept",
         )
-    if "a" not in result.log.counts:
-        off = float(np.abs(accel.scale - 1.0).max())
-        if off > _OFF_SCALE:
-            yield Finding(
-                "inconsistent",
-                f"a scale comes out as {accel.scale[int(np.argmax(np.abs(accel.scale - 1.0)))]:.3g}, so the "
-                "readings are not in the unit that was named, or gravity is another",
-                "check --acc-unit and --gravity",
-            )
-    if accel.skewed and float(np.abs(accel.angles).max(initial=0.0)) > _OFF_ANGLE_RAD:
+    if not counts:
+        so = "the readings are not in the unit that was named, or gravity is another"
+        yield from _off_scale(accel.scale, "a scale", so, "check --acc-unit and --gravity")
+    skew = float(np.abs(accel.angles).max(initial=0.0))
+    if accel.skewed and skew > _OFF_ANGLE_RAD:
         yield Finding(
-            "inconsistent",
-            f"two axes come out {math.degrees(float(np.abs(accel.angles).max())):.0f} degrees from a right "
-            "angle",
+            "inconsistent", f"two axes come out {math.degrees(skew):.0f} degrees from a right angle"
         )
 
 
 def _swapped(P: FloatArray) -> str:
     """Which column measures which axis, for P with w = P x."""
-    words = []
-    for column in range(3):
-        row = int(np.argmax(np.abs(P[:, column])))
-        words.append(f"g{'xyz'[column]} measures {'-' if P[row, column] < 0 else ''}{'xyz'[row]}")
-    return ", ".join(words)
+    rows = np.argmax(np.abs(P), axis=0).tolist()
+    return ", ".join(
+        f"g{'xyz'[column]} measures {'-' if P[row, column] < 0 else ''}{'xyz'[row]}"
+        for column, row in enumerate(rows)
+    )
 
 
 def _of_gyroscope(result: Intrinsics, gyro: Gyroscope) -> Iterator[Finding]:
@@ -1174,29 +1140,21 @@ def _of_gyroscope(result: Intrinsics, gyro: Gyroscope) -> Iterator[Finding]:
             "put the gyroscope's columns into the accelerometer's order and signs",
         )
         return
+    missed = f"the turns miss gravity's direction by {math.degrees(gyro.rms_rad):.2g} degrees"
     if gyro.rms_rad > _WRONG_TURNS_RAD:
         yield Finding(
             "inconsistent",
-            f"the turns miss gravity's direction by {math.degrees(gyro.rms_rad):.0f} degrees: the rates are "
-            "not in the unit that was named, or gyroscope and accelerometer do not belong together",
+            f"{missed}: the rates are not in the unit that was named, or gyroscope and accelerometer do not "
+            "belong together",
             "check --gyro-unit and the signs of the gyroscope",
         )
         return
     if gyro.rms_rad > _ROUGH_TURNS_RAD:
-        yield Finding(
-            "poor",
-            f"the turns miss gravity's direction by {math.degrees(gyro.rms_rad):.2g} degrees",
-            "turn more slowly, in a second or two, and log at 100 Hz or more",
-        )
+        yield Finding("poor", missed, "turn more slowly, in a second or two, and log at 100 Hz or more")
     used = np.isfinite(gyro.scale)
-    off = gyro.scale[used][int(np.argmax(np.abs(gyro.scale[used] - 1.0)))]
-    if "g" not in result.log.counts and abs(off - 1.0) > _OFF_SCALE:
-        yield Finding(
-            "inconsistent",
-            f"a scale of the gyroscope comes out as {off:.3g}, so its readings are not in the unit that was "
-            "named",
-            "check --gyro-unit",
-        )
+    if "g" not in result.log.counts:
+        so = "its readings are not in the unit that was named"
+        yield from _off_scale(gyro.scale[used], "a scale of the gyroscope", so, "check --gyro-unit")
     for k in np.flatnonzero(used).tolist():
         travel = float(gyro.travel_rad[k])
         if travel < _LEAST_TRAVEL_RAD:
@@ -1205,23 +1163,15 @@ def _of_gyroscope(result: Intrinsics, gyro: Gyroscope) -> Iterator[Finding]:
                 f"hardly a turn about the {'xyz'[k]} axis: {math.degrees(travel):.0f} degrees",
                 f"turn by 90 degrees or more about the {'xyz'[k]} axis between rests",
             )
-    names = [f"scale of g{axis}" for axis in "xyz"] + [f"misalignment {name}" for name in GYRO_ANGLES]
+    names = [f"scale of g{axis}" for axis in "xyz"] + [f"misalignment {name}" for name in PLACES]
     sigma = np.concatenate([gyro.scale_sigma / np.abs(gyro.scale), gyro.angle_sigma])
-    unknown = [name for name, one in zip(names, sigma.tolist(), strict=True) if one == math.inf]
-    if unknown:
+    if unknown := int(np.isinf(sigma).sum()):
         yield Finding(
             "unidentifiable",
-            f"{len(gyro.turns_s)} turn(s) do not tell the gyroscope's {len(unknown)} parameters",
+            f"{len(gyro.turns_s)} turn(s) do not tell the gyroscope's {unknown} parameters",
             protocol(result.planar),
         )
-    for name, one in zip(names, sigma.tolist(), strict=True):
-        if LIMITS["gyro"] < one < math.inf:
-            shown = f"{one:.2%}" if name.startswith("scale") else f"{one:.2g} rad"
-            yield Finding(
-                "unidentifiable" if one > _USELESS * LIMITS["gyro"] else "poor",
-                f"gyroscope, {name}: known to {shown} only",
-                protocol(result.planar),
-            )
+    yield from _loose("gyroscope", names, sigma, np.full(9, LIMITS["gyro"]), result.planar)
     if gyro.bias.sensitivity is not None:
         yield Finding(
             "remark",
@@ -1229,10 +1179,9 @@ def _of_gyroscope(result: Intrinsics, gyro: Gyroscope) -> Iterator[Finding]:
         )
 
 
-def _of_log(result: Intrinsics) -> Iterator[Finding]:
-    """Findings on how the log was sampled, and on its start."""
-    si = not result.log.counts
-    yield from sampling_findings(result.sampling, result.log.axes if si else ())
+def _findings(result: Intrinsics) -> Iterator[Finding]:
+    log, accel, planar = result.log, result.accel, result.planar
+    yield from sampling_findings(result.sampling, () if log.counts else log.axes)
     if result.turns_lost:
         yield Finding("remark", f"{result.turns_lost} turn(s) not used: readings are missing in them")
     if result.quiet.initial_s == 0.0 and result.has_gyro:
@@ -1241,44 +1190,36 @@ def _of_log(result: Intrinsics) -> Iterator[Finding]:
             "the log does not begin at rest; the gyroscope's bias is that of its longest rest",
             "let the sensor lie still for 30 s at the start",
         )
-
-
-def _of_plane(result: Intrinsics) -> Iterator[Finding]:
-    """Findings on a calibration of x, y and gz alone."""
-    if not result.planar:
-        return
-    if not result.asked:
+    if planar and not result.asked:
         yield Finding("remark", "all poses lie in the plane of x and y: ax, ay and gz alone are calibrated")
-    lean = "" if math.isnan(result.lean_rad) else (
-        f"; by az it leans by {math.degrees(result.lean_rad):.1f} degrees at most, which would make the "
-        f"scales {1.0 - math.cos(result.lean_rad):.2g} too small"
-    )  # fmt: skip
-    yield Finding("remark", "the plane is taken to stand upright" + lean)
-
-
-def _of_sensors(result: Intrinsics) -> Iterator[Finding]:
-    """Findings on the accelerometer and on the gyroscope, or on why there is none."""
-    if result.accel is None:
+    if planar:
+        lean = "" if math.isnan(result.lean_rad) else (
+            f"; by az it leans by {math.degrees(result.lean_rad):.1f} degrees at most, which would make the "
+            f"scales {1.0 - math.cos(result.lean_rad):.2g} too small"
+        )  # fmt: skip
+        yield Finding("remark", "the plane is taken to stand upright" + lean)
+    if accel is None:
         yield Finding(
             "unidentifiable",
             f"{len(result.rests)} rest(s) in {result.poses} pose(s) are fewer than the "
-            f"{4 if result.planar else 6} that bias and scale need",
-            protocol(result.planar),
+            f"{4 if planar else 6} that bias and scale need",
+            protocol(planar),
         )
     else:
-        yield from _of_accelerometer(result, result.accel)
+        yield from _of_accelerometer(result, accel)
     if result.gyro is not None:
         yield from _of_gyroscope(result, result.gyro)
     elif not result.has_gyro:
-        needed = "gz" if result.planar else "gx, gy and gz"
+        needed = "gz" if planar else "gx, gy and gz"
         yield Finding("remark", f"without {needed} the gyroscope is not calibrated")
-    elif result.accel is not None and result.accel.span >= LEAST_SPAN:
+    elif accel is not None and accel.span >= LEAST_SPAN:
         yield Finding("unidentifiable", "no turn between two rests is there to calibrate the gyroscope by")
+    yield from log.findings
 
 
 def judge_intrinsics(result: Intrinsics) -> Verdict:
     """Verdict of a calibration of an IMU."""
-    return Verdict.of([*_of_log(result), *_of_plane(result), *_of_sensors(result), *result.log.findings])
+    return Verdict.of(list(_findings(result)))
 
 
 # ----------------------------------------------------------------------
@@ -1363,7 +1304,7 @@ def _gyroscope(result: Intrinsics, gyro: Gyroscope) -> GyroIntrinsics:
     used = np.isfinite(gyro.scale)
     known = np.isfinite(gyro.scale_sigma) & used & (result.foreign is None)
     angle_known = np.isfinite(gyro.angle_sigma) & (result.foreign is None)
-    bias, names = gyro.bias, tuple(GYRO_ANGLES)
+    bias, names = gyro.bias, tuple(PLACES)
     return GyroIntrinsics(
         unit="counts" if "g" in result.log.counts else "rad/s",
         bias=_three(np.where(used, bias.bias, math.nan)),
