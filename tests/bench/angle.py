@@ -17,9 +17,9 @@ sys.path[:0] = [str(Path(__file__).resolve().parents[2])]
 import calib
 from calib.io.logs import Log
 from calib.stages.imu.levelling import Levelling
-from calib.stages.imu.mahony import wrapped
+from calib.stages.imu.mahony import filter_log, wrapped
 from calib.stages.imu.read import drift_log
-from calib.stages.imu.tuning import DATA_SHEET, THREE, AngleFilter, Piece, damped, run_filter, tune
+from calib.stages.imu.tuning import DATA_SHEET, THREE, AngleFilter, Piece, damped, tune
 
 GRID = [damped(Kp, z) for Kp in np.geomspace(0.02, 20.0, 28) for z in np.geomspace(0.15, 10.0, 25)]
 TUNED_ON, JUDGED_ON = ("chirp", "ellipse", "orientation"), ("prbs", "ellipse", "orientation", "swing")
@@ -44,7 +44,7 @@ def piece(log: Log) -> tuple[Piece, np.ndarray]:
 def error_deg(gains: AngleFilter, one: Piece, truth: np.ndarray) -> float:
     """Standard deviation after the start: 5 s, or a second of a short log."""
     late = one.t_s > min(5.0, 0.25 * one.t_s[-1])
-    off = wrapped(run_filter(gains, one.t_s, one.phi_acc_rad, one.rate_radps) - truth)[late]
+    off = wrapped(filter_log(gains, one.t_s, one.phi_acc_rad, one.rate_radps)[0] - truth)[late]
     return float(np.degrees(off.std()))
 
 

@@ -52,8 +52,8 @@ from calib.stages.firmware.vectors import (
     directed_fused,
     vectors,
 )
-from calib.stages.imu.levelling import Levelling, level_log
-from calib.stages.imu.mahony import advance
+from calib.stages.imu.levelling import Levelling
+from calib.stages.imu.mahony import advance, filter_log
 from calib.stages.lowpass.filters import Design, design_lowpass, filter_signal
 from calib.stages.lowpass.section import LowPassSection
 from calib.twin.pictures import CAMERA, PLANE
@@ -429,7 +429,7 @@ def test_the_levelling_filter_is_the_projects_own(seed: int) -> None:
         reference.step(Inputs(100.0, 100.0, ax, ay, gz, (0.078, 0.078), True, True, MODE_POSITION)).phi_rad
         for ax, ay, gz in readings
     ]
-    wanted = level_log(Levelling(1.5, 0.05), arm.t_s, arm.phi_acc, -arm.gz)[0]
+    wanted = filter_log(Levelling(1.5, 0.05), arm.t_s, arm.phi_acc, -arm.gz)[0]
     error, late = np.degrees(np.array(phi) - wanted), arm.t_s > 5.0
     assert np.abs(error).max() < 0.2
     assert error[late].std() < 0.05 * np.degrees((wanted - arm.phi)[late].std())

@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 from source_model import pose_from_configuration
 
 from calib.stages.actuator.kinematics import marker_from_head
-from calib.stages.imu.levelling import Levelling, level_log, level_three, system
+from calib.stages.imu.levelling import Levelling, level_three, system
 from calib.stages.imu.mahony import (
     Mahony,
     MahonyState,
@@ -50,7 +50,6 @@ from calib.stages.imu.tuning import (
     gain_facts,
     riccati,
     rms,
-    run_filter,
     tune,
 )
 
@@ -157,7 +156,7 @@ def test_levelling_is_the_kalman_filter_of_velocity_angle_and_bias() -> None:
     t = np.concatenate([[0.0], np.cumsum(rng.uniform(0.005, 0.02, 299))])
     acc, w = 0.02 * rng.normal(size=300), 0.1 * rng.normal(size=300)
     start = MahonyState(0.1, 0.02)
-    phi, integral = level_log(LEVEL, t, acc, w, start)
+    phi, integral = filter_log(LEVEL, t, acc, w, start)
     _, angle, bias, _ = _dense(t, acc, w, start)
     np.testing.assert_allclose(phi, angle, atol=1e-12)
     np.testing.assert_allclose(integral, bias, atol=1e-12)
@@ -192,7 +191,7 @@ def test_a_levelled_bias_is_known_as_well_as_the_filter_says() -> None:
         acc = np.diff(v) / DT
         w = bias + math.sqrt(q / DT) * rng.normal(size=1001)
         start = MahonyState(level.angle_rad * rng.normal())
-        found = level_log(level, t, acc, w, start)[1][-1]
+        found = filter_log(level, t, acc, w, start)[1][-1]
         errors.append(found + bias)
     sigma = _dense(t, np.zeros(1001), np.zeros(1001), MahonyState(), level)[3][-1]
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(sigma, rel=0.15)
@@ -205,7 +204,7 @@ def test_levelling_in_three_axes_is_that_of_the_plane_in_the_plane() -> None:
     force = np.stack([arm.ax, arm.ay, np.zeros(n)], axis=1)
     gyro = np.stack([np.zeros(n), np.zeros(n), arm.gz], axis=1)
     up = level_three(LEVEL, arm.t_s, force, gyro)
-    plane = level_log(LEVEL, arm.t_s, arm.phi_acc, -arm.gz)[0]
+    plane = filter_log(LEVEL, arm.t_s, arm.phi_acc, -arm.gz)[0]
     # One takes the force, the other its direction: they differ by the force along gravity.
     error = wrapped(np.arctan2(up[:, 1], up[:, 0]) - plane)
     assert np.abs(error).max() < math.radians(0.1)
@@ -239,7 +238,7 @@ def test_untuned_levelling_beats_the_best_gains_of_the_published_filter() -> Non
     for seed in range(12):
         arm = swung(seed, rate_hz=60.0, duration_s=60.0, rest_s=-5.0)
         run = (arm.t_s, arm.phi_acc, -arm.gz)
-        many = np.vstack([_filtered(GRID, *run), level_log(Levelling(), *run)[0]])
+        many = np.vstack([_filtered(GRID, *run), filter_log(Levelling(), *run)[0]])
         errors = np.std(wrapped(many - arm.phi)[:, arm.t_s > 5.0], axis=1)
         ratios.append(errors[-1] / errors[:-1].min())
     assert np.median(ratios) < 0.8
@@ -252,7 +251,7 @@ def test_an_acceleration_that_is_held_turns_the_angle_by_half_of_its_direction()
     pushed = 0.3 * ((t > 30.0) & (t <= 33.0))
     force = 9.80665 * np.stack([np.ones(6000), pushed, np.zeros(6000)], axis=1)
     up = level_three(Levelling(), t, force, np.zeros((6000, 3)))
-    phi = level_log(Levelling(), t, np.arctan2(force[:, 1], force[:, 0]), np.zeros(6000))[0]
+    phi = filter_log(Levelling(), t, np.arctan2(force[:, 1], force[:, 0]), np.zeros(6000))[0]
     for angle in (np.arctan2(up[:, 1], up[:, 0]), phi):
         assert np.degrees(np.abs(angle).max()) < 7.5
         assert np.degrees(np.abs(angle[t > 45.0]).max()) < 0.1
@@ -531,7 +530,7 @@ def test_near_the_best_of_all_constant_gains(seed: int, reference: bool) -> None
     found = tune([piece], DATA_SHEET)
     run = (piece.t_s, piece.phi_acc_rad, piece.rate_radps)
     best = _error(_filtered(GRID, *run), truth, offset).min()
-    ours = _error(run_filter(found.recommended.gains, *run), truth, offset)
+    ours = _error(filter_log(found.recommended.gains, *run)[0], truth, offset)
     three = _error(filter_log(THREE, *run)[0], truth, offset)
     assert found.judge == ("reference" if reference else "smoothed")
     assert found.recommended.name == "levelling"
@@ -617,7 +616,7 @@ def test_whatever_is_recommended_on_real_recordings_is_better(shared_data: Path)
                 seeing = tune([Piece(name, t, acc, rate, phi)], DATA_SHEET)
                 late = t >= 5.0
                 three, *errors = (
-                    _error(run_filter(gains, t, acc, rate)[late], phi[late], seeing.offset_rad[0])
+                    _error(filter_log(gains, t, acc, rate)[0][late], phi[late], seeing.offset_rad[0])
                     for gains in (THREE, blind.recommended.gains, seeing.recommended.gains)
                 )
                 ratios += [error / three for error in errors]

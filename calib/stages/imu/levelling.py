@@ -11,7 +11,6 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
-from calib.stages.imu.mahony import MahonyState, checked
 
 # ----------------------------------------------------------------------
 # What an accelerometer shows of the angle is right on the average only: its errors are the sensor's own
@@ -89,6 +88,12 @@ class Levelling:
         """Variances of V, the angle's error and the bias at the first sample."""
         return (self.velocity_mps / _G) ** 2, self.angle_rad**2, self.bias_radps**2
 
+    def fill(
+        self, t: FloatArray, phi_acc: FloatArray, w: FloatArray, phi: FloatArray, integral: FloatArray
+    ) -> None:
+        """As `Mahony.fill` of `calib.stages.imu.mahony`."""
+        _run(t, phi_acc, w, self.densities, _covariance(self), phi, integral)
+
 
 @kernel()
 def _gains(P: FloatArray, dt: float, r: float, q: float, q_b: float, K: FloatArray) -> None:
@@ -115,12 +120,11 @@ def _run(
     w: FloatArray,
     densities: tuple[float, float, float],
     P: FloatArray,
-    phi: float,
-    integral: float,
     out_phi: FloatArray,
     out_integral: FloatArray,
 ) -> None:
     r, q, q_b = densities
+    phi, integral = out_phi[0], out_integral[0]
     K = np.zeros(4)
     V = 0.0
     for k in range(len(t)):
@@ -178,44 +182,6 @@ def system(parameters: Levelling, dt_s: float) -> tuple[FloatArray, FloatArray]:
     feed = np.array([K1, K2, 1.0 - K0])
     ahead = np.array([[1.0, dt_s, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
     return ahead + np.outer(feed, [-dt_s, -dt_s * dt_s, 1.0]), dt_s * feed
-
-
-def level_log(
-    parameters: Levelling,
-    t_s: FloatArray,
-    phi_acc_rad: FloatArray,
-    rate_radps: FloatArray,
-    start: MahonyState | None = None,
-) -> tuple[FloatArray, FloatArray]:
-    """Angle and integral after each sample of a log; the rate is taken as straight between samples.
-
-    Parameters
-    ----------
-    t_s, phi_acc_rad, rate_radps, start : as of `calib.stages.imu.mahony.filter_log`.
-
-    Returns
-    -------
-    phi_rad (n,), not wrapped, and integral_radps (n,), which goes to minus the bias of the rate.
-
-    Raises
-    ------
-    BadInputError for lengths that differ, time that goes back and values that are not finite.
-    """
-    t, phi_acc, w = checked(t_s, phi_acc_rad, rate_radps)
-    state = MahonyState(float(phi_acc[0]), 0.0) if start is None else start
-    phi, integral = np.empty(len(t)), np.empty(len(t))
-    _run(
-        t,
-        phi_acc,
-        w,
-        parameters.densities,
-        _covariance(parameters),
-        state.phi_rad,
-        state.integral_radps,
-        phi,
-        integral,
-    )
-    return phi, integral
 
 
 # ----------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -38,6 +39,21 @@ class Mahony:
         for name, gain in (("Kp", self.Kp), ("Ki", self.Ki)):
             if not 0.0 <= gain < math.inf:
                 raise BadInputError(f"{name} of the angle filter: found {gain:g}, expected zero or more")
+
+    def fill(
+        self, t: FloatArray, phi_acc: FloatArray, w: FloatArray, phi: FloatArray, integral: FloatArray
+    ) -> None:
+        """Angle and integral after each sample; the first of both are those before the first sample."""
+        _run(t, phi_acc, w, self.Kp, self.Ki, phi, integral)
+
+
+class Filter(Protocol):
+    """What gives an angle: `Mahony` and `calib.stages.imu.levelling.Levelling`."""
+
+    def fill(
+        self, t: FloatArray, phi_acc: FloatArray, w: FloatArray, phi: FloatArray, integral: FloatArray
+    ) -> None:
+        """As `Mahony.fill`."""
 
 
 @dataclass(frozen=True)
@@ -94,12 +110,10 @@ def _run(
     w: FloatArray,
     Kp: float,
     Ki: float,
-    phi: float,
-    integral: float,
     out_phi: FloatArray,
     out_integral: FloatArray,
 ) -> None:
-    before = t[0]
+    before, phi, integral = t[0], out_phi[0], out_integral[0]
     for k in range(len(t)):
         phi, integral = advance(phi, integral, phi_acc[k], w[k], t[k] - before, Kp, Ki)
         before = t[k]
@@ -107,23 +121,8 @@ def _run(
         out_integral[k] = integral
 
 
-def checked(
-    t_s: FloatArray, phi_acc_rad: FloatArray, rate_radps: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Times, angles and rates (n,) of a log; raises `BadInputError` as `filter_log` says."""
-    t, phi_acc, w = (np.ascontiguousarray(x, dtype=np.float64) for x in (t_s, phi_acc_rad, rate_radps))
-    if t.ndim != 1 or t.shape != phi_acc.shape or t.shape != w.shape or len(t) == 0:
-        raise BadInputError(
-            f"angle filter: found times {t.shape}, angles {phi_acc.shape} and rates {w.shape}, "
-            "expected as many of each and at least one"
-        )
-    if not (np.isfinite(phi_acc).all() and np.isfinite(w).all() and (np.diff(t) >= 0.0).all()):
-        raise BadInputError("angle filter: expected finite readings and time that runs forward")
-    return t, phi_acc, w
-
-
 def filter_log(
-    parameters: Mahony,
+    parameters: Filter,
     t_s: FloatArray,
     phi_acc_rad: FloatArray,
     rate_radps: FloatArray,
@@ -133,6 +132,7 @@ def filter_log(
 
     Parameters
     ----------
+    parameters : of either filter. The levelling filter takes the rate as straight between samples.
     t_s : (n,) time stamps that do not go back.
     phi_acc_rad : (n,) accelerometer's angles (2.1), wrapped or not.
     rate_radps : (n,) rate of phi, which is -gz of a sensor in the plane.
@@ -141,14 +141,22 @@ def filter_log(
 
     Returns
     -------
-    phi_rad (n,), not wrapped, and integral_radps (n,).
+    phi_rad (n,), not wrapped, and integral_radps (n,), which goes to minus the bias of the rate.
 
     Raises
     ------
     BadInputError for lengths that differ, time that goes back and values that are not finite.
     """
-    t, phi_acc, w = checked(t_s, phi_acc_rad, rate_radps)
+    t, phi_acc, w = (np.ascontiguousarray(x, dtype=np.float64) for x in (t_s, phi_acc_rad, rate_radps))
+    if t.ndim != 1 or t.shape != phi_acc.shape or t.shape != w.shape or len(t) == 0:
+        raise BadInputError(
+            f"angle filter: found times {t.shape}, angles {phi_acc.shape} and rates {w.shape}, "
+            "expected as many of each and at least one"
+        )
+    if not (np.isfinite(phi_acc).all() and np.isfinite(w).all() and (np.diff(t) >= 0.0).all()):
+        raise BadInputError("angle filter: expected finite readings and time that runs forward")
     state = MahonyState(float(phi_acc[0]), 0.0) if start is None else start
     phi, integral = np.empty(len(t)), np.empty(len(t))
-    _run(t, phi_acc, w, parameters.Kp, parameters.Ki, state.phi_rad, state.integral_radps, phi, integral)
+    phi[0], integral[0] = state.phi_rad, state.integral_radps
+    parameters.fill(t, phi_acc, w, phi, integral)
     return phi, integral

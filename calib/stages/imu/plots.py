@@ -33,10 +33,10 @@ from calib.core.plot import (
 from calib.stages.imu.allan import model_variance
 from calib.stages.imu.drift import LogDrift
 from calib.stages.imu.intrinsics import Accelerometer, Intrinsics
-from calib.stages.imu.mahony import Mahony, wrapped
+from calib.stages.imu.mahony import Mahony, filter_log, wrapped
 from calib.stages.imu.section import OrientationFilter
 from calib.stages.imu.static import AxisNoise, Static, StaticLog
-from calib.stages.imu.tuning import Piece, Tuning, run_filter
+from calib.stages.imu.tuning import Piece, Tuning
 
 # ----------------------------------------------------------------------
 # At rest: Allan deviation with what explains it, readings over time, drift by log.
@@ -451,7 +451,8 @@ def _tuning_errors(result: Tuning, pieces: Sequence[Piece]) -> Figure:
     for one in result.candidates:
         if one.name == "riccati":
             continue
-        error = np.degrees(wrapped(run_filter(one.gains, t, piece.phi_acc_rad, piece.rate_radps) - target))
+        phi = filter_log(one.gains, t, piece.phi_acc_rad, piece.rate_radps)[0]
+        error = np.degrees(wrapped(phi - target))
         if np.isfinite(error).any():
             hue = _PAIRS[one.name][0] if one.name in _PAIRS else "purple"
             below.append(Curve(*thinned(t, error), one.name, colour=hue, size=1.0))

@@ -16,9 +16,9 @@ from calib.core.arrays import FloatArray
 from calib.core.errors import pip_install
 from calib.solve.clock import Part
 from calib.stages.imu.levelling import Levelling, level_three
-from calib.stages.imu.mahony import Mahony, MahonyState, accelerometer_angles
+from calib.stages.imu.mahony import Mahony, MahonyState, accelerometer_angles, filter_log
 from calib.stages.imu.sampling import AXES, Readings
-from calib.stages.imu.tuning import AngleFilter, run_filter
+from calib.stages.imu.tuning import AngleFilter
 
 # ----------------------------------------------------------------------
 # The rate of the angle in the plane of a sensor that is not exactly in plane.
@@ -245,7 +245,7 @@ def tracks_of(
     def filtered(gains: AngleFilter, tilted: bool = False) -> Callable[[Part], FloatArray]:
         def angle(part: Part) -> FloatArray:
             rate, acc = rate_of(part, axes, tilted), phi_acc[id(part)]
-            return run_filter(gains, part.t_s, acc, rate, MahonyState(_start(acc, rate, period_s)))
+            return filter_log(gains, part.t_s, acc, rate, MahonyState(_start(acc, rate, period_s)))[0]
 
         return angle
 

@@ -16,9 +16,9 @@ from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
 from calib.core.result import degrees_or_none, finite_or_none, judged
 from calib.core.verdict import Finding, Severity, Verdict
-from calib.stages.imu.levelling import Levelling, level_log
+from calib.stages.imu.levelling import Levelling
 from calib.stages.imu.levelling import system as levelling_system
-from calib.stages.imu.mahony import Mahony, MahonyState, filter_log, wrapped
+from calib.stages.imu.mahony import Mahony, filter_log, wrapped
 from calib.stages.imu.sampling import Sampling, sensor_findings
 from calib.stages.imu.section import FilterCandidate, FilterLog, OrientationFilter
 
@@ -26,19 +26,6 @@ AngleFilter = Mahony | Levelling
 """What can be asked for an angle."""
 
 F = TypeVar("F", Mahony, Levelling)
-
-
-def run_filter(
-    gains: AngleFilter,
-    t_s: FloatArray,
-    phi_acc_rad: FloatArray,
-    rate_radps: FloatArray,
-    start: MahonyState | None = None,
-) -> FloatArray:
-    """Angle (n,) of either filter over a log, see `calib.stages.imu.mahony.filter_log`."""
-    if isinstance(gains, Levelling):
-        return level_log(gains, t_s, phi_acc_rad, rate_radps, start)[0]
-    return filter_log(gains, t_s, phi_acc_rad, rate_radps, start)[0]
 
 
 def words_of(gains: AngleFilter) -> str:
@@ -728,7 +715,7 @@ class _Judged:
     def errors(self, gains: AngleFilter) -> FloatArray:
         """Errors (n,) of a filter that runs from the first sample on."""
         one = self.piece
-        return wrapped(run_filter(gains, one.t_s, one.phi_acc_rad, one.rate_radps) - self.target)
+        return wrapped(filter_log(gains, one.t_s, one.phi_acc_rad, one.rate_radps)[0] - self.target)
 
 
 def _parted(pieces: Sequence[tuple[Piece, FloatArray]], dt_s: float) -> tuple[tuple[_Judged, ...], int]:
