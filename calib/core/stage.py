@@ -7,6 +7,7 @@ it imports what it works with inside of its functions.
 
 from __future__ import annotations
 
+import importlib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -34,6 +35,15 @@ class ProgressCall(Protocol):
 
 Progress = Callable[[str], AbstractContextManager[ProgressCall]]
 """Opens a bar with a label, which is advanced by what it yields."""
+
+
+def later(module: str, name: str) -> Callable[[Any], Any]:
+    """A function of a module that is loaded as the function is called."""
+
+    def call(given: Any) -> Any:
+        return getattr(importlib.import_module(module), name)(given)
+
+    return call
 
 
 @contextmanager

@@ -41,10 +41,10 @@ from calib.stages.camera.model import Camera, View, pack, project
 from calib.stages.camera.plane import Plane, calibrate_plane
 from calib.stages.camera.plots import lens_plots, picture, plane_plots
 from calib.stages.camera.plots import plots as camera_plots
-from calib.stages.imu.intrinsics import find_intrinsics
+from calib.stages.imu.intrinsics import IntrinsicsInputs, solve_intrinsics
 from calib.stages.imu.plots import intrinsics_plots, static_plots
 from calib.stages.imu.sampling import Readings
-from calib.stages.imu.static import analyse_static
+from calib.stages.imu.static import solve_static
 from calib.stages.lowpass.filters import Design, Positions, design_lowpass
 from calib.stages.lowpass.plots import plots as lowpass_plots
 from calib.stages.lowpass.stage import Inputs, positions_from_log
@@ -275,11 +275,11 @@ def _at_rest(axes: tuple[str, ...], stuck: bool = False) -> dict[str, Figure]:
     values[2000:2100, 0] += 0.5 * np.sin(0.1 * np.arange(100))
     values[:, -1] = 0.25 if stuck else values[:, -1]
     log = Readings("log.csv", axes, 0.01 * np.arange(6000), values)
-    return static_plots(analyse_static([log]), "poor")
+    return static_plots(solve_static([log]))
 
 
 def _posed(poses: list[Rotation], planar: bool = False) -> dict[str, Figure]:
-    return intrinsics_plots(find_intrinsics(pose_log(poses, Sensor()), G, planar))
+    return intrinsics_plots(solve_intrinsics(IntrinsicsInputs(pose_log(poses, Sensor()), G, planar)))
 
 
 def _settled() -> dict[str, Figure]:

@@ -34,7 +34,7 @@ from calib.stages.imu.allan import model_variance
 from calib.stages.imu.drift import LogDrift
 from calib.stages.imu.intrinsics import Accelerometer, Intrinsics
 from calib.stages.imu.mahony import Mahony, filter_log, wrapped
-from calib.stages.imu.section import OrientationFilter
+from calib.stages.imu.section import Drift, Imu, ImuIntrinsics, OrientationFilter
 from calib.stages.imu.static import AxisNoise, Static, StaticLog
 from calib.stages.imu.tuning import Piece, Tuning
 
@@ -54,12 +54,13 @@ _NAMES = {"g": f"rate ({_UNITS['g'][1]})", "a": f"specific force ({_UNITS['a'][1
 _TAU = "\N{GREEK SMALL LETTER TAU}"
 
 
-def static_plots(result: Static, verdict: str = "ok") -> dict[str, Figure]:
+def static_plots(imu: Imu) -> dict[str, Figure]:
     """`imu_allan`, `imu_drift`, and `imu_static_1`, ... for each log."""
+    result: Static = imu.evidence
     figures = {"imu_allan": _allan(result), "imu_drift": _drift(result)}
     for i, log in enumerate(result.logs, start=1):
         figures[f"imu_static_{i}"] = _readings(result.axes, log)
-    return judged(figures, verdict)
+    return judged(figures, imu.verdict.word)
 
 
 def _by_axis(axes: Sequence[str]) -> tuple[str, ...]:
@@ -169,9 +170,10 @@ _MMPS2 = "mm/s\N{SUPERSCRIPT TWO}"
 _DEGREE = "\N{DEGREE SIGN}"
 
 
-def intrinsics_plots(result: Intrinsics, verdict: str = "ok") -> dict[str, Figure]:
+def intrinsics_plots(section: ImuIntrinsics) -> dict[str, Figure]:
     """`imu_poses` and `imu_residuals`."""
-    return judged({"imu_poses": _poses(result), "imu_residuals": _residuals(result)}, verdict)
+    result: Intrinsics = section.evidence
+    return judged({"imu_poses": _poses(result), "imu_residuals": _residuals(result)}, section.verdict.word)
 
 
 def _poses(result: Intrinsics) -> Figure:
@@ -278,8 +280,9 @@ _MOST_IN_LEGEND = 8
 _PM = "\N{PLUS-MINUS SIGN}"
 
 
-def drift_plots(logs: Sequence[LogDrift]) -> dict[str, Figure]:
+def drift_plots(drift: Drift) -> dict[str, Figure]:
     """`drift_angles`, `drift_slopes` where there are any, and `drift_motion_1`, ... for logs that move."""
+    logs: Sequence[LogDrift] = drift.evidence
     figures = {"drift_angles": _angles(logs)}
     if any(m.slope_degps is not None for log in logs for m in log.measures.values()):
         figures["drift_slopes"] = _slopes(logs)
@@ -402,8 +405,9 @@ def _in_motion(log: LogDrift) -> Figure:
 _PAIRS = {"3/3": ("red", "squares"), "tuned": ("green", "points"), "riccati": ("orange", "diamonds")}
 
 
-def tune_plots(result: Tuning, pieces: Sequence[Piece], section: OrientationFilter) -> dict[str, Figure]:
+def tune_plots(section: OrientationFilter) -> dict[str, Figure]:
     """`tune_gains` and `tune_errors`."""
+    result, pieces = section.evidence
     figures = {"tune_gains": _gains(result), "tune_errors": _tuning_errors(result, pieces)}
     return judged(figures, section.verdict.word)
 

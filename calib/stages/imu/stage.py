@@ -8,12 +8,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from calib.core.errors import BadInputError, UsageError
 from calib.core.options import LogOptions, option
-from calib.core.stage import Files, Output, Stage
+from calib.core.stage import Files, Output, Stage, later
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from calib.core.plot import Figure
     from calib.core.rig import Rig
     from calib.core.words import Block
     from calib.core.writing import Kind
@@ -23,7 +20,6 @@ if TYPE_CHECKING:
     from calib.stages.imu.section import (
         Drift,
         Imu,
-        ImuIntrinsics,
         OrientationFilter,
     )
     from calib.stages.imu.tuning import AngleFilter, TuneInputs, TuneLog
@@ -45,12 +41,6 @@ def _read_static(files: Files, rig: Rig, options: LogOptions) -> list[Readings]:
     return [replace(log, source=files.taken(path)) for path, log in read]
 
 
-def _static_solved(inputs: Sequence[Readings]) -> Imu:
-    from calib.stages.imu.static import solve_static
-
-    return solve_static(inputs)
-
-
 def _imu_yaml() -> Kind:
     from calib.stages.imu.formats import IMU_YAML
 
@@ -64,12 +54,6 @@ def _write_kalibr(files: Files, imu: Imu) -> list[Path]:
     assert files.output is not None
     write_atomically(files.output, to_kalibr(imu), IMU_YAML)
     return [files.output]
-
-
-def _static_plots(imu: Imu) -> dict[str, Figure]:
-    from calib.stages.imu.plots import static_plots
-
-    return static_plots(imu.evidence, imu.verdict.word)
 
 
 def _static_words(imu: Imu) -> list[Block]:
@@ -90,14 +74,14 @@ static = Stage(
     Writes the section imu of the rig's file. Exits 1 when the verdict is not ok.
     """,
     _read_static,
-    _static_solved,
+    later("calib.stages.imu.static", "solve_static"),
     LogOptions,
     sources="Logs of the rig at rest.",
     metavar="LOG...",
     writes=("imu",),
     output=Output("Kalibr's imu.yaml to write as well.", _write_kalibr, ("--imu-yaml",), kind=_imu_yaml),
     words=_static_words,
-    plots=_static_plots,
+    plots=later("calib.stages.imu.plots", "static_plots"),
 )
 
 
@@ -138,18 +122,6 @@ def _read_intrinsics(files: Files, rig: Rig, options: IntrinsicsOptions) -> Intr
     return IntrinsicsInputs(log, options.gravity, options.planar)
 
 
-def _intrinsics_solved(inputs: IntrinsicsInputs) -> ImuIntrinsics:
-    from calib.stages.imu.intrinsics import solve_intrinsics
-
-    return solve_intrinsics(inputs)
-
-
-def _intrinsics_plots(result: ImuIntrinsics) -> dict[str, Figure]:
-    from calib.stages.imu.plots import intrinsics_plots
-
-    return intrinsics_plots(result.evidence, result.verdict.word)
-
-
 intrinsics = Stage(
     "imu intrinsics",
     "IMU in poses",
@@ -161,7 +133,7 @@ intrinsics = Stage(
     when the verdict is not ok.
     """,
     _read_intrinsics,
-    _intrinsics_solved,
+    later("calib.stages.imu.intrinsics", "solve_intrinsics"),
     IntrinsicsOptions,
     sources="Log of rests in many poses, turns between.",
     several=False,
@@ -169,7 +141,7 @@ intrinsics = Stage(
     metavar="LOG",
     writes=("imu_intrinsics",),
     uses=("imu",),
-    plots=_intrinsics_plots,
+    plots=later("calib.stages.imu.plots", "intrinsics_plots"),
 )
 
 
@@ -226,19 +198,6 @@ def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
     return TuneInputs(logs, *sensor_noise(rig, logs), how.tilted)
 
 
-def _tune_solved(inputs: TuneInputs) -> OrientationFilter:
-    from calib.stages.imu.tuning import solve_tune
-
-    return solve_tune(inputs)
-
-
-def _tune_plots(section: OrientationFilter) -> dict[str, Figure]:
-    from calib.stages.imu.plots import tune_plots
-
-    result, pieces = section.evidence
-    return tune_plots(result, pieces, section)
-
-
 def _tune_words(section: OrientationFilter) -> list[Block]:
     from calib.core.words import Line
 
@@ -258,14 +217,14 @@ tune = Stage(
     orientation_filter. Exits 1 when the logs do not allow a judgement.
     """,
     _read_tune,
-    _tune_solved,
+    later("calib.stages.imu.tuning", "solve_tune"),
     TuneOptions,
     sources="Logs of the rig in motion.",
     metavar="LOG...",
     writes=("orientation_filter",),
     uses=("imu", "imu_intrinsics", "camera", "plane"),
     words=_tune_words,
-    plots=_tune_plots,
+    plots=later("calib.stages.imu.plots", "tune_plots"),
 )
 
 
@@ -305,12 +264,6 @@ def _read_drift(files: Files, rig: Rig, options: DriftOptions) -> DriftInputs:
     return DriftInputs(logs, dict(files.hashes), tuned, options.peers, files.narrate)
 
 
-def _drift_solved(inputs: DriftInputs) -> Drift:
-    from calib.stages.imu.drift import solve_drift
-
-    return solve_drift(inputs)
-
-
 def _drift_document(result: Drift) -> dict[str, Any]:
     from calib.core.result import section_json
 
@@ -334,12 +287,6 @@ def _drift_words(result: Drift) -> list[Block]:
     return [*blocks, Line(_INTERVALS), Line(f"note: {result.note}"), *described(result)]
 
 
-def _drift_plots(result: Drift) -> dict[str, Figure]:
-    from calib.stages.imu.plots import drift_plots
-
-    return drift_plots(result.evidence)
-
-
 drift = Stage(
     "imu drift",
     "Drift of the angle",
@@ -348,12 +295,12 @@ drift = Stage(
     Tuned gains are read from the rig's file, to which nothing is written.
     """,
     _read_drift,
-    _drift_solved,
+    later("calib.stages.imu.drift", "solve_drift"),
     DriftOptions,
     sources="Logs of the rig, at rest or in motion.",
     metavar="LOG...",
     uses=("imu", "imu_intrinsics", "orientation_filter"),
     document=_drift_document,
     words=_drift_words,
-    plots=_drift_plots,
+    plots=later("calib.stages.imu.plots", "drift_plots"),
 )
