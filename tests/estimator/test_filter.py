@@ -38,6 +38,7 @@ from calib.stages.estimator.kinematic import (
     Rows,
     Setup,
     bank_event,
+    banked,
     even_times,
     new_clock,
     starting_state,
@@ -47,7 +48,7 @@ from calib.stages.estimator.read import READINGS, Periods, setup_from_rig
 from calib.stages.estimator.replay import consistent, sampled
 from calib.stages.estimator.section import SensorCheck
 from calib.stages.estimator.sensors import SENSOR, SIZE, truncated, update_terms
-from calib.stages.estimator.smoother import Events, OneLevel, banked, events_of, forward, one_level
+from calib.stages.estimator.smoother import Events, OneLevel, events_of, forward, one_level
 from calib.twin.rig import SimulatedRig, nominal_view
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.sensors import HeadMotion, Imu, ImuNoise, Tracker, marker_pixels, measure
@@ -134,7 +135,9 @@ def test_late_pictures_end_in_the_state_of_the_right_order() -> None:
     assert np.nansum(out[:, OUT.index("gated_camera")]) == gated[events.kinds == CAMERA, 0].sum()
     got_x, got_P, got_w = late.state
     deviation = np.sqrt(np.diagonal(got_P[0]))
-    np.testing.assert_allclose((got_w @ got_x - turned[0, :-1] @ bank_x[0]) / deviation, 0.0, atol=0.02)
+    np.testing.assert_allclose(
+        (got_w @ got_x - turned[0, :-1] @ bank_x[0, :, :SIZE]) / deviation, 0.0, atol=0.02
+    )
 
 
 def test_a_blackout_is_survived_and_its_uncertainty_told() -> None:
@@ -308,11 +311,11 @@ def _one_event(
     report = np.empty(len(REPORT))
     bank_event(
         bank_x, bank_P, weights, 0, 1, kind, np.array(z), 0.0, 0.3, level, walk, setup.view,
-        np.array([9.81, 0.0]), setup.noise, np.empty((levels, *WORK)), np.zeros((levels, 7)), False, report,
+        np.array([9.81, 0.0]), setup.noise, np.zeros((levels, *WORK)), np.zeros((levels, 7)), False, report,
         np.zeros(3), np.empty((0, TRACE)),
     )  # fmt: skip
-    np.testing.assert_array_equal(bank_x[0], x)
-    after = bank_x[1], bank_P[1]
+    np.testing.assert_array_equal(bank_x[0, :, :SIZE], x)
+    after = bank_x[1, :, :SIZE], bank_P[1, ..., :SIZE]
     np.testing.assert_array_equal(after[1], np.swapaxes(after[1], 1, 2))
     return dict(zip(REPORT, report.tolist(), strict=True)), (x, P), after
 

@@ -273,17 +273,17 @@ def _pump_rows(
     """
     lag, force, strength = y[6 + side], y[8 + side], _factor(x[15 + side])
     pump = _pump(plant, _factor(x[17]), _factor(x[18]))
-    own, middle, end = advance_pump(pump, lag, force, strength * to, math.exp(-0.5 * h / pump.lag_s), h)
+    decay = math.exp(-0.5 * h / pump.lag_s)
+    own, middle, end = advance_pump(pump, lag, force, strength * to, decay, h)
     y[6 + side] = own
     lag_row, force_row = (6 + side) * _L, (8 + side) * _L
     middle_row, end_row = _MIDDLE + side * _L, _END + side * _L
     for n in range(5):
         step = _NUDGES[n]
         other = _pump(plant, _factor(x[17] + step * (n == 3)), _factor(x[18] + step * (n == 4)))
-        a, b, c = advance_pump(
-            other, lag + step * (n == 0), force + step * (n == 1),
-            _factor(x[15 + side] + step * (n == 2)) * to, math.exp(-0.5 * h / other.lag_s), h,
-        )  # fmt: skip
+        settled = _factor(x[15 + side] + step * (n == 2)) * to
+        fades = math.exp(-0.5 * h / other.lag_s) if n == 3 else decay
+        a, b, c = advance_pump(other, lag + step * (n == 0), force + step * (n == 1), settled, fades, h)
         by_own, by_middle, by_end = (a - own) / step, (b - middle) / step, (c - end) / step
         if n < 2:
             since = force_row if n else lag_row
@@ -422,8 +422,8 @@ def accelerations(
     return ddphi, ddl
 
 
-_DENSE, _WIDTH, _TURNED = 6, 8, DYNAMIC * SIZE_D
-"""Rows of F that are full, those of head and creep, and how wide each row of their transpose is."""
+_DENSE, _WIDTH, _TURNED = 6, 24, DYNAMIC * SIZE_D
+"""Rows of F that are full, those of head and creep; how wide the rows of F' are: shorter loops are slower."""
 CARRY = _TURNED + INVOLVED * _WIDTH
 """Length of the scratch of `carry`."""
 
@@ -438,9 +438,10 @@ def carry(P: FloatArray, F: FloatArray, noise: FloatArray, dt: float, w: FloatAr
     """
     # Flat arrays with sizes that are known: the compiler takes several columns at a time.
     flat = P.reshape(-1)
-    for i in range(_DENSE):
+    for i in range(DYNAMIC):
         for k in range(INVOLVED):
             w[_TURNED + k * _WIDTH + i] = F[i, k]
+    for i in range(_DENSE):
         for j in range(SIZE_D):
             total = 0.0
             for k in range(INVOLVED):
@@ -455,19 +456,12 @@ def carry(P: FloatArray, F: FloatArray, noise: FloatArray, dt: float, w: FloatAr
                 for j in range(SIZE_D):
                     w[i * SIZE_D + j] += slope * flat[k * SIZE_D + j]
     for i in range(DYNAMIC):
+        # What is beyond the twelfth is written over.
         for j in range(_WIDTH):
             total = 0.0
             for k in range(INVOLVED):
                 total += w[i * SIZE_D + k] * w[_TURNED + k * _WIDTH + j]
             flat[i * SIZE_D + j] = total
-    for i in range(_DENSE, DYNAMIC):
-        for j in range(_DENSE, i + 1):
-            P[i, j] = 0.0
-        for k in range(INVOLVED):
-            slope = F[i, k]
-            if slope != 0.0:
-                for j in range(_DENSE, i + 1):
-                    P[i, j] += slope * w[j * SIZE_D + k]
     for i in range(DYNAMIC):
         for j in range(i):
             P[j, i] = P[i, j]
@@ -769,11 +763,13 @@ def driven_event(
     else:
         measure(kind, x, P, plant, view, constants, noise, stamp, H, out, work)
         told = work[11:12]
-        chi_squares(kind, P, H, z, out, noise, e, work[12:15], told[0])
+        chi_squares(kind, P, H, z, out, noise, e, work[12:15], work[15:18], told[0], int(SIZE_D))
         if not again:
             judge(kind, z, told, noise, P[3, 3] < _KNOWN_MPS * _KNOWN_MPS, gated, report)
             tell(kind, _ALONE, told, report)
-        log_l = absorb(kind, x, P, H, e, out, noise, gated, learnt, work[12:15], trace)
+        log_l = absorb(
+            kind, x, P, H, e, out, noise, gated, learnt, work[12:15], work[15:18], trace, int(SIZE_D)
+        )
     x[13] = min(x[13], _MOST_DAMPED)
     report[11] = log_l
 

@@ -93,20 +93,39 @@ def imu_terms(
     out[5] = noise[4] * noise[4] + (x[4] * noise[7]) ** 2
 
 
-@kernel(arrays=False)
-def project(P: FloatArray, H: FloatArray, p: FloatArray) -> float:
-    """p = P H' and H P H'."""
-    n = H.shape[0]
-    for j in range(n):
-        p[j] = 0.0
+@kernel(arrays=False, inlined=True)
+def project(P: FloatArray, H: FloatArray, p: FloatArray, at: FloatArray, n: int) -> float:
+    """p = P H' and H P H'.
+
+    Parameters
+    ----------
+    at : (n,) gets the places at which H is not zero and last of all their number, at most n - 4.
+    n : length of the state, a constant of the caller's: loops whose length is known take half the time.
+    """
+    count = 0
     for k in range(n):
-        slope = H[k]
-        if slope != 0.0:
-            for j in range(n):
-                p[j] += slope * P[k, j]
+        if H[k] != 0.0:
+            at[count] = k
+            count += 1
+        p[k] = 0.0
+    at[count], at[count + 1], at[count + 2], at[n - 1] = 0.0, 0.0, 0.0, count
+    # Four rows at a time; what stands after the last one counts nothing.
+    for first in range(0, count, 4):
+        a, b, c, d = int(at[first]), int(at[first + 1]), int(at[first + 2]), int(at[first + 3])
+        ha, hb = H[a], H[b] if first + 1 < count else 0.0
+        hc, hd = H[c] if first + 2 < count else 0.0, H[d] if first + 3 < count else 0.0
+        for j in range(n):
+            p[j] = p[j] + ha * P[a, j] + hb * P[b, j] + hc * P[c, j] + hd * P[d, j]
+    return dot(H, p, at, n)
+
+
+@kernel(arrays=False, inlined=True)
+def dot(H: FloatArray, p: FloatArray, at: FloatArray, n: int) -> float:
+    """H p over the places at which H is not zero."""
     total = 0.0
-    for k in range(n):
-        total += H[k] * p[k]
+    for k in range(int(at[n - 1])):
+        i = int(at[k])
+        total += H[i] * p[i]
     return total
 
 
@@ -118,7 +137,7 @@ def update(
 
     `learnt` is 1 for the entries of a state that readings change, 0 for those that are considered.
     """
-    n = x.shape[0]
+    n = P.shape[0]
     root = 1.0 / math.sqrt(S)
     for j in range(n):
         p[j] *= root
@@ -142,25 +161,25 @@ def leave(trace: FloatArray, row: int, H: FloatArray, p: FloatArray, innovation:
     """
     if trace.shape[0] == 0:
         return
-    n, root = H.shape[0], 1.0 / math.sqrt(S)
+    n, root = trace.shape[1] // 2 - 1, 1.0 / math.sqrt(S)
     for j in range(n):
         trace[row, j], trace[row, n + j] = H[j], p[j] * root
     trace[row, 2 * n], trace[row, 2 * n + 1] = innovation / S, 1.0 / S
 
 
-@kernel(arrays=False)
+@kernel(arrays=False, inlined=True)
 def chi_squares(
     kind: int, P: FloatArray, H: FloatArray, z: FloatArray, out: FloatArray, noise: FloatArray, e: FloatArray,
-    p: FloatArray, told: FloatArray,
+    p: FloatArray, at: FloatArray, told: FloatArray, n: int,
 ) -> None:  # fmt: skip
-    """Innovations e (3,), p (3, n) = P H', out[6:9] = H P H', and what the event is worth into told (7,)."""
-    for k in range(3):
-        e[k] = z[k] - out[k]
+    """Innovations e (3,), p (3, n) = P H', out[6:9] = H P H', and what the event is worth into told (7,).
+
+    at : (3, n), and n, as in `project`.
+    """
     for k in range(2 if kind == CAMERA else 3):
-        out[6 + k] = project(P, H[k], p[k])
-    b = 0.0
-    for k in range(H.shape[1]):
-        b += H[1, k] * p[0, k]
+        e[k] = z[k] - out[k]
+        out[6 + k] = project(P, H[k], p[k], at[k], n)
+    b = dot(H[1], p[0], at[1], n)
     grid = noise[1] * noise[1] / 12.0 if kind == CAMERA else 0.0
     a, c = out[6] + out[3] + grid, out[7] + out[4] + grid
     told[E_FIRST], told[E_SECOND] = e[0] / math.sqrt(a), e[1] / math.sqrt(c)
@@ -219,20 +238,25 @@ def tell(kind: int, weights: FloatArray, told: FloatArray, report: FloatArray) -
         report[2], report[7] = gyro, e2
 
 
-@kernel(arrays=False)
+@kernel(arrays=False, inlined=True)
 def absorb(
     kind: int, x: FloatArray, P: FloatArray, H: FloatArray, e: FloatArray, out: FloatArray,
-    noise: FloatArray, gated: FloatArray, learnt: FloatArray, p: FloatArray, trace: FloatArray,
+    noise: FloatArray, gated: FloatArray, learnt: FloatArray, p: FloatArray, at: FloatArray,
+    trace: FloatArray, n: int,
 ) -> float:  # fmt: skip
     """Update by the readings that are not gated, one after the other; their log likelihood.
 
-    Of a sample the gyroscope comes first: it is the most exact. e, out and p are of `chi_squares`, used up.
+    Of a sample the gyroscope comes first: it is the most exact. e, out, p and `at` are of `chi_squares`, used
+    up.
     """
-    n, log_l, count = x.shape[0], 0.0, 2 if kind == CAMERA else 3
-    for order in range(3):
+    log_l, count = 0.0, 2 if kind == CAMERA else 3
+    if kind == CAMERA:
+        for i in range(n):
+            p[2, i] = 0.0
+    for order in range(count):
         # (0, 1) of a picture, (2, 0, 1) of a sample.
         k = order if count == 2 else (order + 2) % 3
-        if order >= count or gated[0 if kind == CAMERA else 2 if k == 2 else 1] != 0.0:
+        if gated[0 if kind == CAMERA else 2 if k == 2 else 1] != 0.0:
             for i in range(n):
                 p[k, i] = 0.0
             continue
@@ -251,23 +275,21 @@ def absorb(
         leave(trace, order, H[k], p[k], y, S)
         for after in range(order + 1, count):
             other, by_learnt, by_held = after - 1 if count == 3 else after, 0.0, 0.0
-            for i in range(n):
-                # Most of a gradient is zero.
-                if H[other, i] != 0.0:
-                    by = H[other, i] * p[k, i]
-                    by_learnt += learnt[i] * by
-                    by_held += (1.0 - learnt[i]) * by
+            for q in range(int(at[other, n - 1])):
+                i = int(at[other, q])
+                by = H[other, i] * p[k, i]
+                by_learnt += learnt[i] * by
+                by_held += (1.0 - learnt[i]) * by
             for i in range(n):
                 p[other, i] -= p[k, i] * (by_learnt + learnt[i] * by_held)
             e[other] -= by_learnt * move
             out[6 + other] -= by_learnt * (by_learnt + 2.0 * by_held)
-    p0, p1, p2 = p[0], p[1], p[2]
-    for i in range(n):
-        a, b, c = p0[i], p1[i], p2[i]
+    for i in range(P.shape[0]):
+        a, b, c = p[0, i], p[1, i], p[2, i]
         if learnt[i] == 0.0:
             for j in range(n):
-                P[i, j] -= learnt[j] * (a * p0[j] + b * p1[j] + c * p2[j])
-            continue
-        for j in range(n):
-            P[i, j] -= a * p0[j] + b * p1[j] + c * p2[j]
+                P[i, j] -= learnt[j] * (a * p[0, j] + b * p[1, j] + c * p[2, j])
+        else:
+            for j in range(n):
+                P[i, j] -= a * p[0, j] + b * p[1, j] + c * p[2, j]
     return log_l

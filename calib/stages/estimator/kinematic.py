@@ -154,33 +154,44 @@ def axis_noise(q: float, walk: float, h: float) -> tuple[float, float, float, fl
 
 
 # ----------------------------------------------------------------------
-# The bank: states (slots, M, 19) and covariances (slots, M, 19, 19) of its M levels, carried on and mixed. A
-# slot holds the levels of one moment.
+# The bank: states (slots, M, 24) and covariances (slots, M, 19, 24) of its M levels, carried on and mixed. A
+# slot holds the levels of one moment. Of the 24 places of a row 19 are used and the rest are zero: whole
+# registers take half the time.
+
+WIDTH = 24
 
 _NEGLIGIBLE = 1e-6
 """A share of a mixture that is left out."""
 
 
+def banked(
+    x: FloatArray, P: FloatArray, w: FloatArray, slots: int = 2
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """A bank whose slots all hold states (M, 19), covariances and weights, and its weights (slots, M + 1)."""
+    wide_x, wide_P = np.zeros((slots, len(x), WIDTH)), np.zeros((slots, len(x), SIZE, WIDTH))
+    wide_x[:, :, :SIZE], wide_P[..., :SIZE] = x, P
+    return wide_x, wide_P, np.tile(np.append(w, 0.0), (slots, 1))
+
+
 @kernel(arrays=False)
 def copy_state(to_x: FloatArray, to_P: FloatArray, x: FloatArray, P: FloatArray) -> None:
     """Copy a state and its covariance."""
-    n = x.shape[0]
-    for i in range(n):
+    for i in range(x.shape[0]):
         to_x[i] = x[i]
-        for j in range(n):
-            to_P[i, j] = P[i, j]
+    to_flat, flat = to_P.reshape(-1), P.reshape(-1)
+    for i in range(flat.shape[0]):
+        to_flat[i] = flat[i]
 
 
 @kernel(arrays=False)
 def _step(x: FloatArray, P: FloatArray, level: FloatArray, walk: FloatArray, h: float) -> None:
-    n = x.shape[0]
     for axis in range(2):
         c, b, q, w = level[4 * axis], level[4 * axis + 1], level[4 * axis + 2], level[4 * axis + 3]
         f01, f02, f11, f12, f22 = axis_transition(c, b, h)
         p, v, a = axis, axis + 2, axis + 4
         x[p] += f01 * x[v] + f02 * x[a]
         x[v], x[a] = f11 * x[v] + f12 * x[a], f22 * x[a]
-        for j in range(n):
+        for j in range(WIDTH):
             by_v, by_a = P[v, j], P[a, j]
             P[p, j] += f01 * by_v + f02 * by_a
             P[v, j] = f11 * by_v + f12 * by_a
@@ -200,9 +211,9 @@ def _step(x: FloatArray, P: FloatArray, level: FloatArray, walk: FloatArray, h: 
     for i in range(6):
         for j in range(i + 1, 6):
             P[i, j] = P[j, i]
-        for j in range(6, n):
+        for j in range(6, SIZE):
             P[j, i] = P[i, j]
-    for i in range(6, n):
+    for i in range(6, SIZE):
         P[i, i] += walk[i - 6] * h
 
 
@@ -225,44 +236,47 @@ def predict(x: FloatArray, P: FloatArray, level: FloatArray, walk: FloatArray, d
 def mix(bank_x: FloatArray, bank_P: FloatArray, weights: FloatArray, old: int, new: int, turn: float) -> None:
     """Let the levels start from their mixtures.
 
+    As any level turns into each other one alike, a mixture is that of a level itself and of all together.
+
     Parameters
     ----------
     weights : (slots, M + 1) of the levels in each slot; `old` is read, `new` written.
     turn : probability of turning into each one of the others.
     """
-    count, n = bank_x.shape[1], bank_x.shape[2]
+    count, whole = bank_x.shape[1], 0.0
     stay = 1.0 - (count - 1) * turn
-    for j in range(count):
-        total, largest, of = 0.0, 0.0, 0
-        for i in range(count):
-            part = weights[old, i] * (stay if i == j else turn)
-            total += part
-            if part > largest:
-                largest, of = part, i
-        weights[new, j] = total
-        x, P = bank_x[new, j], bank_P[new, j]
-        if largest > (1.0 - _NEGLIGIBLE) * total:
-            copy_state(x, P, bank_x[old, of], bank_P[old, of])
+    for i in range(count):
+        whole += weights[old, i]
+    # All together stand in the last level, which is the last to be written.
+    all_x, all_P = bank_x[new, count - 1], bank_P[new, count - 1]
+    for j in range(WIDTH):
+        all_x[j] = 0.0
+    for i in range(count):
+        x, part = bank_x[old, i], weights[old, i] / whole
+        for j in range(WIDTH):
+            all_x[j] += part * x[j]
+    for i in range(count):
+        x, P, part = bank_x[old, i], bank_P[old, i], weights[old, i] / whole
+        for r in range(SIZE):
+            apart, keep = x[r] - all_x[r], 1.0 if i > 0 else 0.0
+            for j in range(WIDTH):
+                all_P[r, j] = keep * all_P[r, j] + part * (P[r, j] + apart * (x[j] - all_x[j]))
+    for m in range(count):
+        own = (stay - turn) * weights[old, m]
+        total = own + turn * whole
+        weights[new, m] = total
+        x, P, to_x, to_P = bank_x[old, m], bank_P[old, m], bank_x[new, m], bank_P[new, m]
+        part = turn * whole / total
+        if part < _NEGLIGIBLE:
+            copy_state(to_x, to_P, x, P)
             continue
-        left = 1.0
-        for i in range(count):
-            part = weights[old, i] * (stay if i == j else turn) / total
-            left -= part if part < _NEGLIGIBLE else 0.0
-        for i in range(n):
-            x[i] = 0.0
-            for m in range(n):
-                P[i, m] = 0.0
-        for i in range(count):
-            part = weights[old, i] * (stay if i == j else turn) / total
-            for r in range(n if part >= _NEGLIGIBLE else 0):
-                x[r] += part / left * bank_x[old, i, r]
-        for i in range(count):
-            part = weights[old, i] * (stay if i == j else turn) / total
-            other, other_P = bank_x[old, i], bank_P[old, i]
-            for r in range(n if part >= _NEGLIGIBLE else 0):
-                apart = other[r] - x[r]
-                for m in range(n):
-                    P[r, m] += part / left * (other_P[r, m] + apart * (other[m] - x[m]))
+        own /= total
+        for r in range(SIZE):
+            apart = own * part * (x[r] - all_x[r])
+            for j in range(WIDTH):
+                to_P[r, j] = own * P[r, j] + (part * all_P[r, j] + apart * (x[j] - all_x[j]))
+        for r in range(SIZE):
+            to_x[r] = own * x[r] + part * all_x[r]
 
 
 @kernel(arrays=False)
@@ -412,13 +426,13 @@ def even_times(clock: FloatArray, stamps: FloatArray) -> FloatArray:
 CONSIDERED = (11, 12, 14, 15, 16)
 """Entries of the state that readings do not change."""
 
-_LEARNT = np.array([0.0 if k in CONSIDERED else 1.0 for k in range(SIZE)])
+_LEARNT = np.array([0.0 if k in CONSIDERED else 1.0 for k in range(WIDTH)])
 
 MIXED_S = 0.015
 """The levels are mixed at each picture, without pictures after so long: their turns take seconds."""
 
-WORK = (8, SIZE)
-"""Scratch of each level: gradients (3), predictions with variances, innovations, P H' (3)."""
+WORK = (11, WIDTH)
+"""Scratch of each level: gradients (3), predictions with variances, innovations, P H' (3), places (3)."""
 
 TRACE = 2 * SIZE + 2
 """What a reading leaves for the smoother, see `event.leave`."""
@@ -476,7 +490,9 @@ def bank_event(
         elif kind == IMU:
             imu_terms(constants, noise, x, P, work[m], out)
         if kind != 0:
-            chi_squares(kind, P, work[m], z, out, noise, work[m, 4], work[m, 5:8], told[m])
+            chi_squares(
+                kind, P, work[m], z, out, noise, work[m, 4], work[m, 5:8], work[m, 8:], told[m], int(WIDTH)
+            )  # fmt: skip
     if kind == 0:
         return
     if not again:
@@ -484,7 +500,7 @@ def bank_event(
     for m in range(count):
         told[m, LOG_LIKELIHOOD] = absorb(
             kind, bank_x[new, m], bank_P[new, m], work[m], work[m, 4], work[m, 3], noise, gated, _LEARNT,
-            work[m, 5:8], trace,
+            work[m, 5:8], work[m, 8:], trace, int(WIDTH),
         )  # fmt: skip
     report[11] = told[0, LOG_LIKELIHOOD]
     if count > 1:
@@ -711,15 +727,14 @@ _KNOWN_M = 0.05
 _LAST, _CAMERA_SEEN, _IMU_SEEN, _REJECTED_SINCE, _GYRO_REJECTED_SINCE = range(5)
 _CAMERA_STARTED, _PENDING = 2, 3
 _PHI, _LENGTH = 0, 1
-_ALL = np.ones(SIZE)
+_ALL = np.ones(WIDTH)
 
 
 @kernel(arrays=False)
 def _clear(P: FloatArray, i: int, variance: float) -> None:
     """Make a state independent of all others."""
     for j in range(P.shape[0]):
-        P[i, j] = 0.0
-        P[j, i] = 0.0
+        P[i, j], P[j, i] = 0.0, 0.0
     P[i, i] = variance
 
 
@@ -767,14 +782,14 @@ def _mend(
             _hold(x, P, int(_LENGTH), head[1], head_sigma[1], p)
             flags |= 8
         bad = not (abs(x[0]) < 3.0 and 1e-3 < x[1] < 1.0)
-        for i in range(x.shape[0]):
+        for i in range(SIZE):
             bad = bad or not (abs(x[i]) < 1e6 and P[i, i] > 0.0)
         # Faster than a rig: where it is stays, as unsure as the prior, and its motion is not known.
         fast = not abs(x[3]) + radius * abs(x[2]) < FASTEST_MPS
         if not (bad or fast):
             continue
         flags |= 1
-        for i in range(x.shape[0] if bad else 6):
+        for i in range(SIZE if bad else 6):
             if i < 6 and (bad or i >= 2):
                 x[i] = head[i]
             elif not abs(x[i]) < 1e6:
@@ -997,9 +1012,7 @@ class Filter:
         size = min(max(16, math.ceil(2.0 * (delay + 0.02) / period) + 8), 512)
         count = len(levels)
         # One slot more than the ring has, for what is only looked ahead.
-        self._x, self._P = np.zeros((size + 1, count, SIZE)), np.zeros((size + 1, count, SIZE, SIZE))
-        self._w = np.zeros((size + 1, count + 1))
-        self._w[:, :count] = 1.0 / count
+        self._x, self._P, self._w = banked(*starting_state(setup), size + 1)
         self._scratch = (
             np.empty((count, *WORK)), np.zeros((count, 7)), np.empty(len(REPORT)), np.empty(len(REPORT)),
             np.empty((0, TRACE)), np.empty(0),
@@ -1009,7 +1022,6 @@ class Filter:
         self._real = np.full(5, np.nan)
         self._camera_clock = new_clock(setup.camera_period_s)
         self._imu_clock = new_clock(setup.imu_period_s)
-        self._x[0], self._P[0], _ = starting_state(setup)
 
     def run(self, rows: Rows) -> FloatArray:
         """Estimates (n, len(OUT)) at the rows' stamps; call again with the rows that follow."""
@@ -1039,7 +1051,8 @@ class Filter:
     def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """State (M, 19), covariance (M, 19, 19) and weights (M,) after the last event."""
         here, count = int(self._whole[0]), len(self._levels)
-        return self._x[here].copy(), self._P[here].copy(), self._w[here, :count].copy()
+        x, P = self._x[here, :, :SIZE], self._P[here, :, :, :SIZE]
+        return x.copy(), P.copy(), self._w[here, :count].copy()
 
 
 assert CLOCK_SIZE == 10

@@ -45,6 +45,7 @@ from calib.stages.estimator.kinematic import (
     Setup,
     axis_transition,
     bank_event,
+    banked,
     copy_state,
     even_times,
     mixes,
@@ -115,7 +116,7 @@ def forward(
     kept_x, kept_P : (n, a) and (n, a, 19), the last level's first states after each event; or none (0, ...).
     """
     count = weights.shape[1] - 1
-    told, report, work = np.zeros((count, 7)), np.empty(12), np.empty((count, WORK[0], WORK[1]))
+    told, report, work = np.zeros((count, 7)), np.empty(12), np.zeros((count, WORK[0], WORK[1]))
     size, rows, total = kept_P.shape[2], kept_x.shape[1], 0.0
     for k in range(len(t)):
         dt = t[k] - (t[k - 1] if k else before_s)
@@ -318,11 +319,6 @@ def _given(x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
     left = np.zeros((SIZE, SIZE))
     left[np.ix_(free, free)] = P[np.ix_(free, free)] - follow @ follow.T
     return states, left
-
-
-def banked(x: FloatArray, P: FloatArray, w: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """A bank that starts from states (M, 19), covariances and weights, and its weights: two slots of each."""
-    return np.stack([x, x]), np.stack([P, P]), np.tile(np.append(w, 0.0), (2, 1))
 
 
 @dataclass(frozen=True)
