@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -30,6 +31,7 @@ from scipy.signal import (
 from calib.core.errors import BadInputError
 from calib.io.logs import read_log, write_log
 from calib.stages.actuator.kinematics import marker_from_head
+from calib.stages.camera.pose import plane_map
 from calib.stages.lowpass.filters import (
     FAMILIES,
     RIPPLED,
@@ -320,17 +322,16 @@ def test_a_long_gap_splits_and_a_short_one_does_not() -> None:
 WORKSPACE = (-0.06, 0.04, 0.06, 0.11)
 
 
-def _plane(rig: SimulatedRig) -> np.ndarray:
-    view = rig.view
-    return np.linalg.inv(view.camera.K @ np.column_stack([view.R_CW[:, :2], view.t_CW_m]))
-
-
 def test_positions_are_the_markers_on_the_plane(tmp_path: Path) -> None:
     rig = SimulatedRig()
     run = run_scenario(make_scenario("ellipse"), rig, 2, "sensors", 8.0)
     log = log_of(run)
     write_log(tmp_path / "log.csv", log)
-    seen = positions_from_log(read_log(tmp_path / "log.csv"), 60.0, rig.view.camera, _plane(rig))
+    seen = positions_from_log(
+        read_log(tmp_path / "log.csv"),
+        60.0,
+        partial(plane_map, rig.view.camera, rig.view.R_CW, rig.view.t_CW_m),
+    )
     assert (seen.unit, seen.names) == ("m", ("x", "y"))
     piece = seen.ticks.longest
     truth = {name: log.columns[f"true_{name}"] for name in ("x_m", "y_m", "phi_rad")}

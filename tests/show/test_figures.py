@@ -250,7 +250,7 @@ def _positions(folder: Path, still: bool = False, n: int = 3000) -> Positions:
     u = np.round(150 + 30 * np.sin(0.4 * t) * (t > 20) + 0.4 * noise[0])
     v = np.round(90 + 0.4 * noise[1])
     write_log(folder / "log.csv", Log("log.csv", t, {"u_px": u, "v_px": v}, np.arange(n)))
-    return positions_from_log(read_log(folder / "log.csv"), 60.0, None, None)
+    return positions_from_log(read_log(folder / "log.csv"), 60.0)
 
 
 def _lens(camera: Camera) -> dict[str, Figure]:

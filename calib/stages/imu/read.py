@@ -7,7 +7,7 @@ import io
 import math
 import zlib
 from array import array
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +16,6 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.core.files import as_text, read_bytes, shown
-from calib.core.geometry import apply_homography
 from calib.core.options import LogOptions
 from calib.core.rig import Rig
 from calib.core.verdict import Finding
@@ -24,7 +23,6 @@ from calib.io.columns import ACCEL, GYRO
 from calib.io.logs import IMU, IN_PLANE, Log, Signals, log_of
 from calib.solve.clock import Part
 from calib.stages.actuator.kinematics import MARKER_OFFSET_M
-from calib.stages.camera.model import Camera, undistort
 from calib.stages.imu.sampling import (
     AXES,
     MOST_GYRO_RADPS,
@@ -107,20 +105,6 @@ def angle_from_marker(marker_m: FloatArray, offset_m: float = MARKER_OFFSET_M) -
     return np.asarray(2.0 * np.arctan2(x, y + offset_m))
 
 
-def angle_from_pixels(
-    camera: Camera, A_inverse: FloatArray, pixels: FloatArray, offset_m: float = MARKER_OFFSET_M
-) -> FloatArray:
-    """Bending angle phi (n,) [rad] of the marker in distorted pixels (n, 2), NaN beyond the horizon.
-
-    Parameters
-    ----------
-    A_inverse : (3, 3) from ideal pixels to metres (2.12).
-    """
-    rays = undistort(camera, pixels)
-    ideal = np.column_stack([rays, np.ones(len(rays))]) @ camera.K[:2].T
-    return angle_from_marker(apply_homography(A_inverse, ideal), offset_m)
-
-
 def lag_of(late_t_s: FloatArray, late_rad: FloatArray, t_s: FloatArray, phi_rad: FloatArray) -> float:
     """By how much [s] one angle (m,) is later than another (n,), from -20 to 120 ms; 0 for standing still.
 
@@ -175,13 +159,12 @@ class Reading:
     ----------
     tilted : take the rate from the up vector (`calib.stages.imu.tracks`) and not -gz.
     reference : one of `REFERENCES`; auto takes the camera where the log has it.
-    camera, A_inverse : of the rig, None where it has no plane.
+    on_plane : from pixels (n, 2) to metres (n, 2) in the rig's plane, None where it has none.
     """
 
     tilted: bool = False
     reference: str = "auto"
-    camera: Camera | None = None
-    A_inverse: FloatArray | None = None
+    on_plane: Callable[[FloatArray], FloatArray] | None = None
 
 
 def sensor_noise(rig: Rig, logs: Sequence[TuneLog]) -> tuple[Noise, str]:
@@ -214,7 +197,7 @@ def _wanted(log: Log, read: Readings, how: Reading) -> str:
     seen = len(log.sampled("u_px", "v_px")) >= _TUNELOGS_FEWEST
     has = {
         "truth": len(read.true_t_s) >= _TUNELOGS_FEWEST,
-        "camera": seen and how.A_inverse is not None,
+        "camera": seen and how.on_plane is not None,
         "onchip": len(read.onchip_t_s) >= _TUNELOGS_FEWEST,
     }
     if how.reference == "auto":
@@ -233,11 +216,10 @@ def _wanted(log: Log, read: Readings, how: Reading) -> str:
 
 
 def _camera_angle(log: Log, how: Reading) -> tuple[FloatArray, FloatArray]:
-    assert how.camera is not None
-    assert how.A_inverse is not None
+    assert how.on_plane is not None
     rows = log.sampled("u_px", "v_px")
     pixels = np.stack([log.columns["u_px"][rows], log.columns["v_px"][rows]], axis=1)
-    phi = angle_from_pixels(how.camera, how.A_inverse, pixels)
+    phi = angle_from_marker(how.on_plane(pixels))
     known = np.isfinite(phi)
     if int(known.sum()) < _TUNELOGS_FEWEST:
         raise BadInputError(f"{log.source}: the marker is not on the rig's plane, expected this rig's camera")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -164,7 +165,6 @@ class TuneOptions(LogOptions):
 
 
 def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
-    import numpy as np
 
     from calib.core.files import shown
     from calib.core.result import identity
@@ -177,7 +177,7 @@ def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
     if options.reference in ("auto", "camera"):
         plane = rig.current_plane(files.rig_path)
     if camera is not None and plane is not None:
-        how = replace(how, camera=camera.optics, A_inverse=np.array(plane.A_inverse))
+        how = replace(how, on_plane=partial(plane.to_world, camera=camera))
     logs: list[TuneLog] = []
     for path in files.paths:
         log = tune_log(read_log(path, options, files.remarks), how)

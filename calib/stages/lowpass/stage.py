@@ -14,14 +14,13 @@ from calib.core.units import parse_frequency_hz, parse_jitter
 from calib.core.verdict import Finding, Verdict
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from calib.core.arrays import FloatArray
     from calib.core.plot import Figure
     from calib.core.rig import Rig
     from calib.core.words import Block
     from calib.io.logs import Log
-    from calib.stages.camera.model import Camera
     from calib.stages.lowpass.filters import Filter, Positions, Suggestion
     from calib.stages.lowpass.section import Family, LowPass, LowPassLog
 
@@ -103,31 +102,27 @@ class Evidence:
 
 
 def positions_from_log(
-    log: Log, rate_hz: float | None, camera: Camera | None, A_inverse: FloatArray | None
+    log: Log, rate_hz: float, on_plane: Callable[[FloatArray], FloatArray] | None = None
 ) -> Positions:
     """The marker in a log, one position per tick.
 
     Parameters
     ----------
-    rate_hz : of the filter; None takes the log's own.
-    camera, A_inverse : of the rig; without both the positions stay in pixels.
+    rate_hz : of the filter.
+    on_plane : from pixels (n, 2) to metres (n, 2) in the rig's plane; without, positions stay in pixels.
 
     Raises `BadInputError` for a log without camera, with too few samples, whose time runs backwards,
     whose marker lies beyond the plane's horizon, or of another rate.
     """
     import numpy as np
 
-    from calib.core.geometry import apply_homography
-    from calib.stages.camera.model import undistort
     from calib.stages.lowpass.filters import Positions, on_ticks, spectrum
 
     signals = log.signals("u_px", "v_px")
     pixels = signals.values
     values, unit, names = pixels, "px", ("u", "v")
-    if camera is not None and A_inverse is not None:
-        rays = undistort(camera, pixels)
-        ideal = np.column_stack([rays, np.ones(len(rays))]) @ camera.K[:2].T
-        values, unit, names = apply_homography(A_inverse, ideal), "m", ("x", "y")
+    if on_plane is not None:
+        values, unit, names = on_plane(pixels), "m", ("x", "y")
         lost = np.nonzero(np.isnan(values).any(axis=1))[0]
         if len(lost):
             u, v = pixels[lost[0]]
@@ -139,21 +134,19 @@ def positions_from_log(
         if not signals.axis.period_s > 0.0:
             raise BadInputError("has no two pictures of the marker at different times, expected a series")
         own = signals.axis.rate_hz
-        rate = own if rate_hz is None else rate_hz
-        if abs(own / rate - 1.0) > _RATE_OFF:
+        if abs(own / rate_hz - 1.0) > _RATE_OFF:
             raise BadInputError(
-                f"has {own:.4g} camera samples/s, expected the {rate:g} Hz that the filter is designed for"
+                f"has {own:.4g} camera samples/s, expected the {rate_hz:g} Hz that the filter is designed for"
             )
-        ticks = on_ticks(signals.t_s, values, rate)
+        ticks = on_ticks(signals.t_s, values, rate_hz)
         piece = ticks.longest.values
-        spectra = (spectrum(piece[:, 0], rate), spectrum(piece[:, 1], rate))
+        spectra = (spectrum(piece[:, 0], rate_hz), spectrum(piece[:, 1], rate_hz))
     except BadInputError as error:
         raise BadInputError(f"{log.source}: {error}") from error
-    return Positions(log.source, unit, names, own, ticks, on_ticks(signals.t_s, pixels, rate), spectra)
+    return Positions(log.source, unit, names, own, ticks, on_ticks(signals.t_s, pixels, rate_hz), spectra)
 
 
 def _read(files: Files, rig: Rig, options: Options) -> Inputs:
-    import numpy as np
 
     from calib.core.result import identity
     from calib.core.rig import Geometry
@@ -171,15 +164,15 @@ def _read(files: Files, rig: Rig, options: Options) -> Inputs:
     except BadInputError as error:
         raise UsageError(str(error)) from error
     plane, camera = rig.current_plane(files.rig_path), rig.camera
-    optics = A_inverse = None
+    on_plane = None
     if plane is not None and camera is not None and (options.log or options.suggest):
-        optics, A_inverse = camera.optics, np.array(plane.A_inverse)
+        on_plane = partial(plane.to_world, camera=camera)
         files.hashes |= {"camera": identity(camera), "plane": identity(plane)}
 
     def positions(path: Path | None) -> Positions | None:
         if path is None:
             return None
-        read = positions_from_log(read_log(path, options, files.remarks), options.rate_hz, optics, A_inverse)
+        read = positions_from_log(read_log(path, options, files.remarks), options.rate_hz, on_plane)
         files.taken(path)
         return read
 
