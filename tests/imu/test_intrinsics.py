@@ -349,7 +349,6 @@ def _turns(poses: list, d: int, rng: np.random.Generator | None, noise: tuple[fl
         np.array([rest.stop - 1 for rest in rests[:-1]]),
         np.array([rest.start for rest in rests[1:]]),
         k,
-        k + 1,
         rests,
         np.stack([gyro[rest.start : rest.stop].mean(axis=0) for rest in rests]),
         scatter,

@@ -209,35 +209,17 @@ def _units(p: FloatArray, d: int, g: float) -> FloatArray:
     return out
 
 
-def _start(x: FloatArray, g: float) -> FloatArray:
-    """Bias and scale of the axis-aligned ellipsoid through the means; a sphere where that is none."""
+def _starts(x: FloatArray, g: float, si: bool) -> list[FloatArray]:
+    """Bias and scale of the sphere through the means, after bias 0 and scale 1 where that is a start."""
     d = x.shape[1]
     middle, size = x.mean(axis=0), max(float(np.ptp(x, axis=0).max()), 1e-12)
     z = (x - middle) / size
-    k = ANGLES[d]
-    p = np.zeros(2 * d + len(k))
-    if len(x) >= 2 * d:
-        q = np.linalg.lstsq(np.hstack([z**2, z]), np.ones(len(x)), rcond=1e-9)[0]
-        if np.all(q[:d] > 0.0):
-            centre = -0.5 * q[d:] / q[:d]
-            radius = np.sqrt((1.0 + (q[:d] * centre**2).sum()) / q[:d])
-            if radius.max() < 3.0 * radius.min():
-                p[:d], p[d : 2 * d] = middle + size * centre, size * radius / g
-                return p
+    p, plain = np.zeros((2, 2 * d + len(ANGLES[d])))
     q = np.linalg.lstsq(np.hstack([2.0 * z, np.ones((len(x), 1))]), (z**2).sum(axis=1), rcond=1e-6)[0]
     p[:d] = middle + size * q[:d]
     p[d : 2 * d] = size * math.sqrt(max(float(q[d] + q[:d] @ q[:d]), 1e-6)) / g
-    return p
-
-
-def _starts(x: FloatArray, g: float, si: bool) -> list[FloatArray]:
-    d = x.shape[1]
-    starts = [_start(x, g)]
-    if si:
-        p = np.zeros_like(starts[0])
-        p[d : 2 * d] = 1.0
-        starts.insert(0, p)
-    return starts
+    plain[d : 2 * d] = 1.0
+    return [plain, p] if si else [p]
 
 
 def _deviations(p: FloatArray, x: FloatArray, variance: FloatArray) -> FloatArray:
@@ -402,7 +384,7 @@ class Turns:
     gyro : (n, 3) readings, (0, 0, z) in a plane.
     accel : (n, d) readings.
     first, last : (k,) last reading of the rest before and first of the rest after.
-    before, after : (k,) numbers of these rests, both rising.
+    before : (k,) numbers of the rests before, rising; those after follow them.
     rests : all of them.
     gyro_mean, gyro_scatter : (m, 3) mean over each rest, and long-run variance of a reading.
     initial : number of the rest that the bias is taken from.
@@ -413,12 +395,16 @@ class Turns:
     first: IntArray
     last: IntArray
     before: IntArray
-    after: IntArray
     rests: Sequence[Rest]
     gyro_mean: FloatArray
     gyro_scatter: FloatArray
     initial: int
     period_s: float
+
+    @property
+    def after(self) -> IntArray:
+        """(k,) numbers of the rests after."""
+        return self.before + 1
 
     @property
     def duration_s(self) -> FloatArray:
@@ -867,11 +853,6 @@ def _contest(
     return tuple(one[0] for one in tried), trial, rests, accel
 
 
-def _scatter(values: FloatArray) -> FloatArray:
-    """Variance (3,) of a reading by differences, which a slow drift does not enter."""
-    return np.asarray((np.diff(values, axis=0) ** 2).mean(axis=0) / 2.0)
-
-
 def _turns(
     log: Readings,
     parts: tuple[Part, ...],
@@ -881,46 +862,34 @@ def _turns(
     period_s: float,
 ) -> tuple[Turns, int]:
     """Turns between rests, and how many could not be used."""
-    names = ("gx", "gy", "gz") if len(columns) == 3 else ("", "", "gz")
-    gyros, offsets = [], np.concatenate([[0], np.cumsum([len(part.values) for part in parts])])
-    for part in parts:
-        gyro = np.zeros((len(part.values), 3))
-        for k, name in enumerate(names):
-            if name:
-                gyro[:, k] = part.values[:, log.axes.index(name)]
-        gyros.append(gyro)
-    first, last, before, after, lost = [], [], [], [], 0
+    names = ("gx", "gy", "gz") if len(columns) == 3 else ("gz",)
+    values = np.concatenate([part.values for part in parts])
+    gyro = np.zeros((len(values), 3))
+    gyro[:, 3 - len(names) :] = values[:, log.places(*names)]
+    offsets = np.cumsum([0, *(len(part.values) for part in parts)]).tolist()
     longest = max(2, round(_LONGEST_FILLED_S / period_s))
-    for i in range(len(rests) - 1):
-        a, b = rests[i], rests[i + 1]
-        if a.part != b.part:
-            lost += 1
-            continue
+    spans = []
+    for i, (a, b) in enumerate(itertools.pairwise(rests)):
         places = parts[a.part].places
         inside = places[(places >= a.stop - 1) & (places <= b.start)]
-        if len(inside) < 2 or int(np.diff(inside).max()) > longest:
-            lost += 1
-            continue
-        first.append(int(offsets[a.part]) + a.stop - 1)
-        last.append(int(offsets[a.part]) + b.start)
-        before.append(i)
-        after.append(i + 1)
-    held = [gyros[rest.part][rest.start : rest.stop] for rest in rests]
-    initial = 0 if quiet.initial_s > 0.0 else int(np.argmax([rest.duration_s for rest in rests]))
+        if a.part == b.part and len(inside) >= 2 and int(np.diff(inside).max()) <= longest:
+            spans.append((offsets[a.part] + a.stop - 1, offsets[a.part] + b.start, i))
+    first, last, before = np.array(spans, dtype=np.int64).reshape(-1, 3).T.copy()
+    held = [gyro[offsets[rest.part] + rest.start : offsets[rest.part] + rest.stop] for rest in rests]
     turns = Turns(
-        gyro=np.ascontiguousarray(np.concatenate(gyros)),
-        accel=np.concatenate([part.values[:, columns] for part in parts]),
-        first=np.array(first, dtype=np.int64),
-        last=np.array(last, dtype=np.int64),
-        before=np.array(before, dtype=np.int64),
-        after=np.array(after, dtype=np.int64),
+        gyro=gyro,
+        accel=values[:, columns],
+        first=first,
+        last=last,
+        before=before,
         rests=rests,
-        gyro_mean=np.stack([values.mean(axis=0) for values in held]),
-        gyro_scatter=np.stack([_scatter(values) for values in held]),
-        initial=initial,
+        gyro_mean=np.stack([one.mean(axis=0) for one in held]),
+        # By differences, which a slow drift does not enter.
+        gyro_scatter=np.stack([0.5 * (np.diff(one, axis=0) ** 2).mean(axis=0) for one in held]),
+        initial=0 if quiet.initial_s > 0.0 else int(np.argmax([rest.duration_s for rest in rests])),
         period_s=period_s,
     )
-    return turns, lost
+    return turns, len(rests) - 1 - len(spans)
 
 
 def find_intrinsics(log: Readings, gravity_mps2: float = 9.80665, planar: bool = False) -> Intrinsics:
