@@ -346,17 +346,11 @@ def _measure(
             late = _settled(0, len(t), period_s)
             error = (e - t)[late]
             off.append(error[np.isfinite(error) & m[late]])
-        off = [_no_turns(error) for error in off if len(error)]
+        off = [error for error in off if len(error)]
         if off:
             # Parts may be whole turns apart.
             middle = float(np.median(off[0]))
-            flat = np.concatenate(
-                [
-                    error - 2.0 * math.pi * np.rint((np.median(error) - middle) / (2.0 * math.pi))
-                    for error in off
-                ]
-            )
-            rmse = float(flat.std())
+            rmse = float(np.concatenate([_no_turns(error - middle) for error in off]).std())
             lag = lag_s(*_both_known(track.phi_rad, truth), period_s)
     slope = slope_of(errors, period_s)
     return DriftMethod(
