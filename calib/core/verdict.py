@@ -19,6 +19,7 @@ Severity = Literal["remark", "poor", "inconsistent", "unidentifiable"]
 
 WORDS: tuple[Word, ...] = ("ok", "poor", "inconsistent", "unidentifiable")
 """From good to bad."""
+POOR = WORDS[1:]
 
 _RANK = {"remark": 0, "ok": 0, "poor": 1, "inconsistent": 2, "unidentifiable": 3}
 

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from calib.core.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_POOR, BadInputError
 from calib.core.files import read_text
+from calib.core.verdict import POOR, Word
 
 # ----------------------------------------------------------------------
 # run.json: what a run tells the page, read from a folder that may come from anywhere.
@@ -35,7 +36,7 @@ class _Job(BaseModel):
     command: list[Text]
     writes: list[Text]
     flashed: Flag
-    status: Literal["ok", "poor", "failed", "blocked", "skipped"]
+    status: Word | Literal["failed", "blocked", "skipped"]
     reason: Text
 
 
@@ -68,6 +69,7 @@ def read_summary(path: Path) -> dict[str, Any] | None:
 #     no          such a stage has failed, or its numbers mean nothing, or there is no firmware
 
 _MEANINGLESS = ("unidentifiable", "inconsistent")
+_FINE = ("ok", "skipped")
 _RECORD = {
     "intrinsics": "15 to 25 pictures of a checkerboard into images/, with images/board.yaml",
     "extrinsics": "a picture of the board lying in the plane of motion into images/plane/",
@@ -117,14 +119,6 @@ def decide(told: Mapping[str, Any], sections: Mapping[str, Any]) -> Decision:
     return Decision(answer, headline, tuple(_weak(jobs, sections)), tuple(_record(jobs, sections)), failed)
 
 
-def _verdict(job: Mapping[str, Any], sections: Mapping[str, Any]) -> str:
-    for name in job.get("writes", ()):
-        section = sections.get(name)
-        if isinstance(section, dict) and section.get("verdict"):
-            return str(section["verdict"])
-    return ""
-
-
 def _answer(
     jobs: Sequence[Mapping[str, Any]], sections: Mapping[str, Any], camera_only: bool
 ) -> tuple[str, str]:
@@ -132,7 +126,7 @@ def _answer(
     broken = [job for job in used if job["status"] in ("failed", "blocked")]
     if broken:
         return "no", f"{_titles(broken)} failed"
-    senseless = [job for job in used if _verdict(job, sections) in _MEANINGLESS]
+    senseless = [job for job in used if job["status"] in _MEANINGLESS]
     if senseless:
         return "no", f"the data do not support {_titles(senseless, plain=True)}"
     made = [job for job in jobs if job["stage"] == "firmware"]
@@ -151,7 +145,7 @@ def _answer(
         return "not yet", f"{_titles(lacking)} not known"
     if made[0]["status"] == "poor":
         return "not yet", str(made[0]["reason"])
-    others = [job for job in jobs if job["status"] in ("poor", "failed", "blocked")]
+    others = [job for job in jobs if job["status"] not in _FINE]
     if others:
         return "with care", f"what the firmware uses is sound, but look at {_titles(others, plain=True)}"
     return "yes", "every stage that had data passed its own quality gate"
@@ -169,12 +163,12 @@ def _weak(jobs: Sequence[Mapping[str, Any]], sections: Mapping[str, Any]) -> lis
     """Each reason once, after the stages and the logs that it is about."""
     grouped: dict[str, tuple[list[str], list[str]]] = {}
     for job in jobs:
-        if job["status"] not in ("poor", "failed", "blocked"):
+        if job["status"] in _FINE:
             continue
         reasons = [str(job["reason"])]
         for name in job["writes"]:
             section = sections.get(name)
-            if job["status"] == "poor" and isinstance(section, dict) and section.get("reasons"):
+            if job["status"] in POOR and isinstance(section, dict) and section.get("reasons"):
                 reasons = [str(reason) for reason in section["reasons"]]
         for reason in reasons:
             titles, logs = grouped.setdefault(reason, ([], []))

@@ -488,7 +488,7 @@ def _code(done: Calibrated, kind: str) -> int:
     statuses = {job.status for job in done.ended}
     if kind == "run" or done.decision.failed:
         return done.decision.exit_code
-    return EXIT_POOR if "poor" in statuses or "ok" not in statuses else EXIT_DONE
+    return EXIT_DONE if "ok" in statuses <= {"ok", "skipped"} else EXIT_POOR
 
 
 # ----------------------------------------------------------------------
@@ -498,7 +498,6 @@ def _code(done: Calibrated, kind: str) -> int:
 # elsewhere or later, gives the same bytes.
 
 _MOST_KEPT_BYTES = 30_000_000
-_TELLING = ("poor", "failed", "blocked")
 _STATUS = {EXIT_DONE: "ok", EXIT_POOR: "poor", EXIT_INTERNAL: "broken"}
 
 
@@ -563,7 +562,9 @@ def _calibrated(spec: RigSpec, options: FleetOptions, known: str, place: Path) -
     finally:
         cv2.setNumThreads(threads)
     files, code = _kept(done.out, done.files, options.pages), _code(done, kind)
-    reasons = tuple(f"{job.step.title}: {job.reason}" for job in done.ended if job.status in _TELLING)
+    reasons = tuple(
+        f"{job.step.title}: {job.reason}" for job in done.ended if job.status not in ("ok", "skipped")
+    )
     outcome = Outcome(
         name=spec.name,
         status=_STATUS.get(code, "failed"),

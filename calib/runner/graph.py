@@ -15,6 +15,7 @@ from calib.core.errors import EXIT_DONE, EXIT_INTERNAL, EXIT_POOR, BadInputError
 from calib.core.files import inside, one_line, shown
 from calib.core.result import Result as StageResult
 from calib.core.rig import Rig
+from calib.core.verdict import worst
 from calib.core.workers import Failure, Processes, Task
 from calib.core.writing import make_folder
 from calib.runner.cache import Result, key_of, load, opened, remove, store
@@ -77,8 +78,8 @@ class Job:
     name : unique, and safe as a path: that of the step, or step and log.
     log : of a step that has a job for each log.
     paths, options : what the stage reads and its options. inputs : all files that it depends on.
-    status : "ok", "poor", "failed"; "blocked" by one that failed; "skipped" where the folder has nothing
-        for it; "" before the end.
+    status : the word of its verdict, or "failed"; "blocked" by one that failed; "skipped" where the folder
+        has nothing for it; "" before the end.
     reason : one sentence for all but "ok". result : None where nothing was run; reused : by an earlier run.
     """
 
@@ -413,7 +414,8 @@ class Runner:
         self._learnt[job.name] = part
         if result.code == EXIT_DONE:
             return replace(job, status="ok", reused=reused)
-        return replace(job, status="poor", reason=_reason(part, result), reused=reused)
+        found = (one.verdict.word for one in part.sections.values() if isinstance(one, StageResult))
+        return replace(job, status=worst(("poor", *found)), reason=_reason(part, result), reused=reused)
 
     def _end(self, job: Job) -> None:
         self.ended[job.name] = job

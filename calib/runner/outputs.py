@@ -81,7 +81,7 @@ def publish(runner: Runner, ended: Sequence[Job], told: dict[str, Any], rig: Rig
     out = runner.out
     wanted: dict[str, Path] = {}
     for job in ended:
-        if job.result is None or job.status not in ("ok", "poor"):
+        if job.result is None or job.status == "failed":
             continue
         output = job.step.output
         if job.log is not None and output in job.result.files:

@@ -12,6 +12,7 @@ import numpy as np
 from calib.core import __version__
 from calib.core.plot import Bars, Curve, Figure, Mark, Plot, Rule
 from calib.core.units import unit_of
+from calib.core.verdict import POOR
 from calib.core.words import BLANK, SIGMA, as_words, number
 from calib.core.writing import write_atomically
 from calib.runner.fleet import ConstantSummary, Drift, FleetSummary
@@ -80,7 +81,7 @@ PAGE = "fleet.html"
 STYLE, SCRIPT = ("page.css", "fleet.css"), ("common.js",)
 _MOST_DRAWN = 60
 _KIND = {"ok": "ok", "poor": "poor", "failed": "failed", "broken": "failed", "lost": "failed"}
-_STAGE_KIND = {"ok": "ok", "poor": "poor", "failed": "failed", "blocked": "blocked"}
+_STAGE_KIND: dict[str, str] = {**_KIND, **dict.fromkeys(POOR, "poor"), "blocked": "blocked"}
 
 
 def write_fleet_page(path: Path, summary: FleetSummary) -> None:

@@ -20,7 +20,7 @@ from calib.core.files import read_bytes, read_text, sha256
 from calib.core.plot import HUES, Figure
 from calib.core.rig import Rig
 from calib.core.units import unit_of
-from calib.core.verdict import Verdict
+from calib.core.verdict import POOR, WORDS, Verdict
 from calib.core.words import BLANK, as_words, facts, number, short
 from calib.core.writing import Kind, holds, make_folder, write_atomically
 from calib.runner.cache import Result, load
@@ -286,13 +286,8 @@ _ROOM_BYTES = 450_000
 """What is kept for words, tables and numbers."""
 _MOST_COUNTED = 3
 """Figures of one kind for each log that a stage shows, so that there is room for the states of all logs."""
-_STATUS = {
-    "ok": "ok",
-    "poor": "poor",
-    "failed": "failed",
-    "blocked": "not run",
-    "skipped": "no data",
-}
+_STATUS = {"blocked": "not run", "skipped": "no data"}
+_ORDER = ("failed", "blocked", *reversed(WORDS), "skipped")
 
 
 @dataclass
@@ -380,7 +375,7 @@ def _summary_of(rig: Rig) -> dict[str, Any]:
                     "inputs": [],
                     "writes": [name],
                     "flashed": step.flashed,
-                    "status": "ok" if verdict.ok else "poor",
+                    "status": verdict.word,
                     "reason": "" if verdict.ok else reasons[0],
                 }
             )
@@ -459,14 +454,14 @@ def _stage(
                 "command": _command(job),
             }
         )
-    status = _worst([job["status"] for job in jobs])
+    status = min((job["status"] for job in jobs), key=_ORDER.index)
     document = parts[0]["document"] if len(parts) == 1 else {}
     return {
         "name": name,
         "title": jobs[0]["title"],
         "status": _STATUS.get(status, status),
-        "kind": status,
-        "facts": _facts(jobs, rig, document) if status in ("ok", "poor") else [],
+        "kind": "poor" if status in POOR else status,
+        "facts": _facts(jobs, rig, document) if status in WORDS else [],
         "reasons": list(section.get("reasons") or ()),
         "remarks": [*(section.get("remarks") or ()), *(section.get("advice") or ())],
         "parts": parts,
@@ -502,11 +497,6 @@ def _merged(sections: list[Any]) -> dict[str, Any]:
             else:
                 whole.setdefault(key, value)
     return whole
-
-
-def _worst(statuses: list[str]) -> str:
-    order = ("failed", "blocked", "poor", "ok", "skipped")
-    return min(statuses, key=order.index)
 
 
 def _chosen(results: list[Result | None], budget: _Budget) -> dict[Path, str]:

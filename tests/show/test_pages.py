@@ -288,6 +288,7 @@ SECTIONS = {"camera": {"verdict": "ok"}, "plane": {"verdict": "ok"}}
         ({}, "yes"),
         ({"replay": "poor"}, "with care"),
         ({"imu_static": "poor"}, "not yet"),
+        ({"imu_static": "unidentifiable"}, "no"),
         ({"firmware": "poor"}, "not yet"),
         ({"extrinsics": "blocked"}, "no"),
         ({"firmware": "skipped"}, "no"),
