@@ -18,7 +18,7 @@ from calib.core.schema import contradiction, validated
 from calib.core.units import parse_duration_s
 from calib.io.logs import Log
 from calib.stages.actuator.simulate import RigState, rig_at_rest
-from calib.stages.control.laws import Channels, FeedForward, Pid, feed_forward, saturate
+from calib.stages.control.laws import Channel, FeedForward, Pid, feed_forward, saturate
 from calib.stages.control.references import Ellipse, PolynomialElongation
 from calib.twin.rig import SimulatedRig, rig_from_file
 from calib.twin.sensors import stream, uniform
@@ -326,27 +326,39 @@ _POSITION: dict[str, tuple[Pid, bool]] = {
 }
 
 
+# Control of angle and of lengths (Fig. 4.1, 4.6, 4.10): one error and one PID controller for each
+# bellows, the feed-forward where there is one, and the limits:
+#
+#     orientation   e = (s, -s)(phi_ref - phi)            (4.1), s = +1 or -1
+#     position      e = q_ref - q,  u + u_ff(q_ref)       (4.5), (4.6), (4.8)
+#
+# The text under (4.1) says that bellows 2 has to extend when phi < phi_ref; the formula drives bellows
+# 1, which agrees with phi = (q1 - q2) / (2 r_B) of (3.3). `sign` is +1 for the formula, -1 for a rig
+# whose hoses are crossed. Feed-forward and saturated values are not fed back.
+
+
 def _limited(pid: Pid, u1: float, u2: float) -> Pair:
     return saturate(u1, low=pid.low, high=pid.high), saturate(u2, low=pid.low, high=pid.high)
 
 
 def angle_law(pid: Pid, wanted_rad: FloatArray, sign: int = 1) -> Law:
     """Control of the angle (4.1) along (n,) [rad]."""
-    wanted, channels = wanted_rad.tolist(), Channels(pid)
+    wanted, first, second = wanted_rad.tolist(), Channel(pid), Channel(pid)
 
     def law(k: int, seen: Seen) -> Pair:
         error = sign * (wanted[k] - seen.phi_rad)
-        return _limited(pid, *channels.step(error, -error))
+        return _limited(pid, first.step(error), second.step(-error))
 
     return law
 
 
 def length_law(pid: Pid, wanted_m: FloatArray, added_pwm: FloatArray) -> Law:
     """Control of the lengths (4.5) along (n, 2) [m], with a feed-forward (n, 2)."""
-    wanted, added, channels = wanted_m.tolist(), added_pwm.tolist(), Channels(pid)
+    wanted, added = wanted_m.tolist(), added_pwm.tolist()
+    first, second = Channel(pid), Channel(pid)
 
     def law(k: int, seen: Seen) -> Pair:
-        u1, u2 = channels.step(wanted[k][0] - seen.q_m[0], wanted[k][1] - seen.q_m[1])
+        u1, u2 = first.step(wanted[k][0] - seen.q_m[0]), second.step(wanted[k][1] - seen.q_m[1])
         return _limited(pid, u1 + added[k][0], u2 + added[k][1])
 
     return law

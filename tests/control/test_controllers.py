@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from control_models import MODELS, NOMINAL, ORIFICE, UNLIKE
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from open_loop import simulate, tick
 from scipy.signal import dlsim, dlti, lfilter
@@ -18,17 +19,15 @@ from calib.stages.actuator.parameters import pumps_connected
 from calib.stages.actuator.pump import static_force_N
 from calib.stages.actuator.simulate import rig_at_rest
 from calib.stages.control.laws import (
-    BackState,
+    Channel,
     ComputedTorque,
     FeedForward,
     Model,
     Observer,
-    ObserverState,
     Pid,
-    PidState,
     PumpEstimate,
     ahead,
-    correct,
+    computed_torque_step,
     design_observer,
     feed_forward,
     feed_forward_pwm,
@@ -38,29 +37,20 @@ from calib.stages.control.laws import (
     marker_jacobian,
     marker_of,
     moving_force,
-    predict,
     pumps_at_rest,
     push,
     pwm_for_force,
     pwm_of_force,
-    start_observer,
     static_stiffness,
-    step,
     step_back,
     wanted_motion,
 )
-from calib.stages.control.laws import computed_torque_step as step_of_computed_torque
-from calib.stages.control.laws import step as step_pid
 from calib.stages.control.references import Ellipse
 
 
-def _outputs(pid: Pid, errors: list[float], state: PidState | None = None) -> np.ndarray:
-    state = PidState() if state is None else state
-    out = []
-    for error in errors:
-        state, u = step(pid, state, error)
-        out.append(u)
-    return np.array(out)
+def _outputs(pid: Pid, errors: list[float]) -> np.ndarray:
+    channel = Channel(pid)
+    return np.array([channel.step(error) for error in errors])
 
 
 def test_it_is_the_transfer_function_of_the_appendix() -> None:
@@ -80,49 +70,40 @@ def test_it_is_the_transfer_function_of_the_appendix() -> None:
     assert np.allclose(ours, lfilter(b, [1.0, -1.0], e), rtol=1e-10, atol=1e-8)
 
 
-@given(st.floats(-500.0, 500.0), st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))
-def test_clamping_drops_the_integral_where_the_output_is_out_of_range(
-    u: float, e0: float, e1: float, e2: float
-) -> None:
-    pid, state = Pid(1000.0, 1000.0, 10.0, clamping=True), PidState(u, e1, e2)
-    with_integral = step(replace(pid, clamping=False), state, e0)[1]
-    without = step(replace(pid, clamping=False, Ki=0.0), state, e0)[1]
-    after, got = step(pid, state, e0)
-    assert got == (with_integral if 0.0 <= with_integral <= 255.0 else without)
-    # What is remembered is the output itself, however far beyond the limits.
-    assert after == PidState(got, e0, e1)
+@given(st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=60))
+def test_clamping_drops_the_integral_where_the_output_is_out_of_range(errors: list[float]) -> None:
+    """Against the incremental form of (4.4), which remembers the output, however far beyond the limits."""
+    pid = Pid(1000.0, 1000.0, 10.0, clamping=True)
+    channel, u, e1, e2 = Channel(pid), 0.0, 0.0, 0.0
+
+    def moved(Ki: float, e0: float) -> float:
+        a, b = 0.5 * Ki * pid.tick_s, pid.Kd / pid.tick_s
+        return u + (pid.Kp + a + b) * e0 + (a - pid.Kp - 2.0 * b) * e1 + b * e2
+
+    for e0 in errors:
+        whole = moved(pid.Ki, e0)
+        assume(min(abs(whole), abs(whole - 255.0)) > 1e-6)
+        u = whole if 0.0 <= whole <= 255.0 else moved(0.0, e0)
+        e1, e2 = e0, e1
+        assert channel.step(e0) == pytest.approx(u, abs=1e-8)
 
 
 errors = st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=60)
 
 
-@given(errors=errors, Kp=st.floats(0, 2000), Ki=st.floats(0, 2000), Kd=st.floats(0, 50))
-def test_without_limits_it_is_the_incremental_form(
-    errors: list[float], Kp: float, Ki: float, Kd: float
-) -> None:
-    pid = Pid(Kp, Ki, Kd)
-    a, b = BackState(), PidState()
-    for error in errors:
-        a, u = step_back(pid, 4.0, a, error, -math.inf, math.inf)
-        b, v = step_pid(pid, b, error)
-        assert u == pytest.approx(v, abs=1e-6 * (1.0 + abs(v)))
-
-
 @given(errors=errors, tracking_s=st.floats(0.02, 5.0))
 def test_commands_stay_within_their_limits(errors: list[float], tracking_s: float) -> None:
-    pid, state = Pid(1000.0, 1000.0, 10.0), BackState()
+    channel = Channel(Pid(1000.0, 1000.0, 10.0))
     for error in errors:
-        state, u = step_back(pid, tracking_s, state, error, 10.0, 200.0)
-        assert 10.0 <= u <= 200.0
+        assert 10.0 <= step_back(channel, error, 10.0, 200.0, tracking_s) <= 200.0
 
 
 def test_a_constant_error_beyond_the_limit_settles_the_integral() -> None:
     """At rest Ki e = (v - u) / Tt: the integral stops a known way beyond the limit, it does not wind up."""
-    pid, state = Pid(100.0, 50.0, 0.0), BackState()
+    channel = Channel(Pid(100.0, 50.0, 0.0))
     for _ in range(3000):
-        state, u = step_back(pid, 0.5, state, 3.0, 0.0, 255.0)
-    v = 100.0 * 3.0 + state.integral + 0.5 / 60.0 * 50.0 * 3.0
-    assert u == 255.0
+        assert step_back(channel, 3.0, 0.0, 255.0, 0.5) == 255.0
+    v = channel.step(3.0)
     assert v - 255.0 == pytest.approx(0.5 * 50.0 * 3.0, rel=1e-9)
 
 
@@ -235,10 +216,9 @@ R = NOMINAL.plant.bellows_radius_m
 
 @given(q1=st.floats(0.05, 0.1), q2=st.floats(0.05, 0.1))
 def test_its_jacobian_by_differences(q1: float, q2: float) -> None:
-    eps, J = 1e-6, marker_jacobian(q1, q2, R, 0.015)
-    by1 = np.subtract(marker_of(q1 + eps, q2, R, 0.015), marker_of(q1 - eps, q2, R, 0.015)) / (2 * eps)
-    by2 = np.subtract(marker_of(q1, q2 + eps, R, 0.015), marker_of(q1, q2 - eps, R, 0.015)) / (2 * eps)
-    assert np.stack([by1, by2], axis=1) == pytest.approx(J, abs=1e-6)
+    eps, q = 1e-6, np.array([q1, q2])
+    sides = [marker_of(q + e, R, 0.015) - marker_of(q - e, R, 0.015) for e in eps * np.eye(2)]
+    assert np.stack(sides, axis=1) / (2 * eps) == pytest.approx(marker_jacobian(q, R, 0.015), abs=1e-6)
 
 
 def _commands(ticks: int) -> np.ndarray:
@@ -251,36 +231,34 @@ def test_without_readings_it_is_the_simulation(model: Model) -> None:
     pwm = _commands(300)
     truth = simulate(model.plant, model.pump, pwm, rig_at_rest(model.plant, model.pump))
     observer = design_observer(model)
-    state = start_observer(observer)
     for k, row in enumerate(pwm.tolist()):
         # Forces go in straight lines between ticks here, along curves there.
-        assert state.y[:2] == pytest.approx(truth.q_m[k], abs=3e-5)
-        state = predict(observer, state, (row[0], row[1]))
+        assert observer.y[:2] == pytest.approx(truth.q_m[k], abs=3e-5)
+        observer.predict((row[0], row[1]))
 
 
 def _follow(
-    observer: Observer, pwm: np.ndarray, truth: np.ndarray, noise_m: float, bias: float, push: float = 0.0
-) -> list[ObserverState]:
-    """Estimates along a simulated motion, the marker two ticks late."""
-    rng = np.random.default_rng(11)
-    state, out = start_observer(observer), []
+    pwm: np.ndarray, truth: np.ndarray, noise_m: float, bias: float, push: float = 0.0
+) -> list[Observer]:
+    """Observers tick by tick along a simulated motion, the marker two ticks late."""
+    rng, out = np.random.default_rng(11), []
+    observer = design_observer(NOMINAL, latency_s=2.0 / 60.0)
     for k, row in enumerate(pwm.tolist()):
         q, dq = truth[max(k - 2, 0), :2], truth[k, 2:4]
-        marker = np.array(marker_of(q[0], q[1], R, observer.marker_offset_m)) + noise_m * rng.normal(size=2)
+        marker = marker_of(q, R, observer.marker_offset_m) + noise_m * rng.normal(size=2)
         if k % 50 == 49:
             marker += push
         rate = (dq[0] - dq[1]) / (2 * R) + bias + 0.003 * rng.normal()
-        state = correct(observer, state, (float(marker[0]), float(marker[1])), rate)
-        out.append(state)
-        state = predict(observer, state, (row[0], row[1]))
+        observer.correct((float(marker[0]), float(marker[1])), rate)
+        out.append(copy(observer))
+        observer.predict((row[0], row[1]))
     return out
 
 
 def test_it_finds_the_bias_and_is_better_than_its_readings() -> None:
     pwm = _commands(900)
     truth = simulate(NOMINAL.plant, NOMINAL.pump, pwm).states
-    observer = design_observer(NOMINAL, latency_s=2.0 / 60.0)
-    found = _follow(observer, pwm, truth, 2.5e-4, 0.03)
+    found = _follow(pwm, truth, 2.5e-4, 0.03)
     error = np.array([s.y[:2] for s in found])[300:] - truth[300:900, :2]
     # The marker alone gives lengths to 2.5e-4 / sqrt(2) straight, and more than that bent.
     assert float(np.sqrt(np.mean(error**2))) < 2e-4
@@ -302,23 +280,23 @@ def test_an_unknown_force_is_found() -> None:
     forces[:2] = 0.0
     assert run(coefficients(weak.plant), pump_coefficients(weak.pump), row, forces, 1 / 60, 17, 17, out) < 0
     truth = np.vstack([row, out])
-    found = _follow(design_observer(NOMINAL, latency_s=2.0 / 60.0), pwm, truth, 1e-5, 0.0)
+    found = _follow(pwm, truth, 1e-5, 0.0)
     assert found[-1].d_N == pytest.approx([-0.1 * static, 0.0], abs=0.01)
 
 
 def test_outliers_are_not_believed_and_a_lost_estimate_comes_back() -> None:
     pwm = _commands(600)
     truth = simulate(NOMINAL.plant, NOMINAL.pump, pwm).states
-    observer = design_observer(NOMINAL, latency_s=2.0 / 60.0)
-    clean = np.array([s.y[:2] for s in _follow(observer, pwm, truth, 1e-4, 0.0)])
-    dirty = np.array([s.y[:2] for s in _follow(observer, pwm, truth, 1e-4, 0.0, push=0.02)])
+    clean = np.array([s.y[:2] for s in _follow(pwm, truth, 1e-4, 0.0)])
+    dirty = np.array([s.y[:2] for s in _follow(pwm, truth, 1e-4, 0.0, push=0.02)])
     assert np.abs(clean - dirty).max() < 2e-4
-    state = start_observer(observer)
-    away = marker_of(0.08, 0.08, R, 0.015)
+    observer = design_observer(NOMINAL, latency_s=2.0 / 60.0)
+    x, y = marker_of(np.array([0.08, 0.08]), R, 0.015).tolist()
     for _ in range(10):
-        state = correct(observer, state, away, math.nan)
-        assert state.y[0] == pytest.approx(0.065)
-    assert correct(observer, state, away, math.nan).y[0] > 0.066
+        observer.correct((x, y), math.nan)
+        assert observer.y[0] == pytest.approx(0.065)
+    observer.correct((x, y), math.nan)
+    assert observer.y[0] > 0.066
 
 
 def _ellipse(model: Model, ticks: int) -> np.ndarray:
@@ -328,11 +306,11 @@ def _ellipse(model: Model, ticks: int) -> np.ndarray:
 def _commands_computed_torque(model: Model, q: np.ndarray, control: ComputedTorque) -> np.ndarray:
     """Commands when the model is the truth: the observer needs no readings."""
     observer, wanted = design_observer(model), wanted_motion(model, q)
-    state, out = start_observer(observer), []
+    out = []
     for k in range(len(q)):
-        command = step_of_computed_torque(control, observer, state, wanted, k)
-        out.append(command.pwm)
-        state = predict(observer, state, command.pwm)
+        pwm, _ = computed_torque_step(control, observer, wanted, k)
+        out.append(pwm)
+        observer.predict(pwm)
     return np.array(out)
 
 

@@ -14,8 +14,7 @@ from open_loop import simulate
 from scipy import signal
 
 from calib.stages.actuator.simulate import RigState
-from calib.stages.control.laws import Model, Pid, PidState, bent_rest, feed_forward_pwm, holding_force
-from calib.stages.control.laws import step as step_pid
+from calib.stages.control.laws import Channel, Model, Pid, bent_rest, feed_forward_pwm, holding_force
 from calib.stages.control.section import ControllerCriterion
 from calib.stages.control.tuning import (
     System,
@@ -51,10 +50,8 @@ def _through(system: System, u: np.ndarray) -> np.ndarray:
 def test_the_controller_as_a_system_is_its_recursion(gains: tuple[float, float, float]) -> None:
     pid = Pid(*gains)
     errors = np.random.default_rng(3).normal(size=200)
-    state, expected = PidState(), []
-    for e in errors.tolist():
-        state, u = step_pid(pid, state, e)
-        expected.append(u)
+    channel = Channel(pid)
+    expected = [channel.step(e) for e in errors.tolist()]
     system = pid_system(pid)
     assert len(system.A) == (gains[1] != 0) + (gains[2] != 0)
     assert _through(system, errors[:, None])[:, 0] == pytest.approx(np.array(expected), rel=1e-9, abs=1e-6)

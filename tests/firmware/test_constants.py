@@ -24,7 +24,7 @@ from calib.core.rig import Rig
 from calib.stages.actuator.parameters import Stiffness
 from calib.stages.actuator.pump import ElongationForce
 from calib.stages.camera.model import project, undistort
-from calib.stages.control.laws import Pid, PidState, step
+from calib.stages.control.laws import Channel, Pid
 from calib.stages.estimator.constant_gain import design, tick_noise
 from calib.stages.estimator.kinematic import Setup, Start
 from calib.stages.estimator.sensors import sensor_values, view_coefficients
@@ -302,13 +302,11 @@ def _summed(c: dict[str, float], errors: np.ndarray, clamping: bool) -> np.ndarr
 
 
 @pytest.mark.parametrize("clamping", [False, True])
-def test_the_summed_form_is_the_incremental_one(clamping: bool) -> None:
+def test_the_pipelines_form_is_the_librarys(clamping: bool) -> None:
     """Random errors that cross both limits, against `calib.stages.control.laws`."""
     errors = 0.15 * np.cumsum(np.random.default_rng(1).normal(0.0, 0.3, 400))
-    pid, state, wanted = Pid(1000.0, 1000.0, 10.0, clamping=clamping), PidState(), []
-    for e in errors.tolist():
-        state, u = step(pid, state, e)
-        wanted.append(u)
+    channel = Channel(Pid(1000.0, 1000.0, 10.0, clamping=clamping))
+    wanted = [channel.step(e) for e in errors.tolist()]
     found = _summed(header().values, errors, clamping)
     assert np.abs(found - wanted).max() < 1e-6 * np.abs(wanted).max() + 1e-3
 

@@ -19,7 +19,7 @@ from ticks import Ticks, run_gains
 from calib.io.serial import MODE_OFF, MODE_ORIENTATION, MODE_POSITION, Inputs
 from calib.stages.camera.model import Camera, undistort
 from calib.stages.control.laws import (
-    Channels,
+    Channel,
     FeedForward,
     Pid,
     feed_forward,
@@ -443,7 +443,8 @@ def test_every_stage_is_the_projects_own(mode: int) -> None:
     angle: tuple[float, float] | None = None
     lowpass, heads = design_lowpass(Design()).exact, []
     turning, stretching = (
-        Channels(one) for one in (Pid(1000.0, 1000.0, 10.0, clamping=True), Pid(15000.0, 0.0, 150.0))
+        (Channel(pid), Channel(pid))
+        for pid in (Pid(1000.0, 1000.0, 10.0, clamping=True), Pid(15000.0, 0.0, 150.0))
     )
     for given in _ticks(mode):
         out = reference.step(given)
@@ -461,11 +462,12 @@ def test_every_stage_is_the_projects_own(mode: int) -> None:
         q = inverse_series(np.array([*out.head_m, out.phi_rad]), 0.0126)
         assert out.q_m == pytest.approx(q, abs=1e-8)
         if mode == MODE_POSITION:
-            u = stretching.step(*(r - q for r, q in zip(given.reference, out.q_m, strict=True)))
+            errors = np.subtract(given.reference, out.q_m).tolist()
+            u = [channel.step(e) for channel, e in zip(stretching, errors, strict=True)]
             u = np.add(u, feed_forward(FeedForward(), given.reference))
         else:
             error = given.reference[0] - out.phi_rad
-            u = turning.step(error, -error)
+            u = [turning[0].step(error), turning[1].step(-error)]
         assert out.pwm == pytest.approx(np.clip(u, 0.0, 255.0), abs=1e-3)
 
 

@@ -20,12 +20,10 @@ from calib.stages.actuator.kinematics import forward, inverse
 from calib.stages.actuator.pump import PWM_MAX, ElongationForce
 from calib.stages.control.laws import (
     PWM_MIN,
-    Channels,
+    Channel,
     FeedForward,
     Pid,
-    PidState,
     feed_forward,
-    step,
 )
 from calib.stages.control.references import Ellipse, PolynomialElongation
 from calib.twin.scenarios import StepResponse, at_rest, length_law, step_response
@@ -76,11 +74,9 @@ def ctl_pid_discrete() -> Values:
     # Proportional, trapezoidal integral and backward difference, each on its own (D.6).
     sums = _PID.Kp * errors + _PID.Ki * h * np.cumsum(0.5 * (errors + before))
     sums += _PID.Kd / h * (errors - before)
-    state, worst = PidState(), 0.0
-    for error, u in zip(errors.tolist(), sums.tolist(), strict=True):
-        state, ours = step(_PID, state, error)
-        worst = max(worst, abs(ours - u))
-    return {"error_pwm": worst}
+    channel = Channel(_PID)
+    ours = np.array([channel.step(error) for error in errors.tolist()])
+    return {"error_pwm": float(np.abs(ours - sums).max())}
 
 
 def ctl_pid_peak() -> Values:
@@ -135,10 +131,9 @@ def _angle_reference(run: Run) -> Curve:
 
 def unsaturated(run: Run, pid: Pid) -> FloatArray:
     """Outputs (n, 2) [PWM] of the controllers before the limits, from what they got in a run."""
-    channels, out = Channels(pid), []
-    for reference, phi in zip(_angle_reference(run).y.tolist(), seen(run)[:, 0].tolist(), strict=True):
-        out.append(channels.step(reference - phi, phi - reference))
-    return np.array(out)
+    errors = (_angle_reference(run).y - seen(run)[:, 0]).tolist()
+    first, second = Channel(pid), Channel(pid)
+    return np.array([(first.step(error), second.step(-error)) for error in errors])
 
 
 def _response(run: Run, phi: FloatArray) -> StepResponse:

@@ -17,7 +17,7 @@ from calib.core.plot import KINDS as CURVES
 from calib.stages.actuator.dynamics import coriolis_matrix, mass_matrix
 from calib.stages.actuator.kinematics import forward_jacobian
 from calib.stages.actuator.parameters import Plant
-from calib.stages.control.laws import FeedForward, PidState
+from calib.stages.control.laws import Channel, FeedForward
 from thesis import control, mechanics, sensing
 from thesis.book import (
     ALBUM,
@@ -170,7 +170,7 @@ WEAK_LENS = replace(sensing.CAMERA, distortion=np.array([-0.004, -0.001, 0, 0, 0
         ("fit.lambda", mechanics, "printed_plant", Plant),
         ("fit.k_bnd", mechanics, "PRINTED_K_BND", 0.16949),
         ("pump.poly", mechanics, "_PRINTED_MM", (-0.1493, 3.756, -25.87, 54.13)),
-        ("ctl.pid_discrete", control, "PidState", lambda: PidState(0.0, 0.7, 0.7)),
+        ("ctl.pid_discrete", control, "Channel", lambda pid: Channel(replace(pid, Ki=0.99 * pid.Ki))),
         ("ctl.ff", control, "FeedForward", lambda: FeedForward(slope_pwm_per_m=3000.0)),
     ],
 )

@@ -13,7 +13,7 @@ from calib.io.columns import MEASURED, TRUE
 from calib.io.logs import log_text
 from calib.stages.actuator.parameters import Plant, Stiffness
 from calib.stages.actuator.simulate import rig_at_rest
-from calib.stages.control.laws import Channels, Pid, PidState, saturate
+from calib.stages.control.laws import Channel, Pid, saturate
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import SCENARIOS, Figures, make_scenario, run_scenario
 from calib.twin.sensors import Imu, Tracker, marker_pixels
@@ -196,14 +196,17 @@ def test_clamping_halves_the_overshoot_of_a_jump_and_slows_the_first_rise() -> N
 
 
 def test_with_the_saturated_output_remembered_clamping_never_reaches() -> None:
-    channels = Channels(Pid(1000.0, 1000.0, 10.0, clamping=True))
+    pid = Pid(1000.0, 1000.0, 10.0, clamping=True)
+    channels = Channel(pid), Channel(pid)
+
+    def saturated(channel: Channel, error: float) -> float:
+        u = channel.step(error)
+        channel.sum += saturate(u) - u
+        return saturate(u)
 
     def law(k: int, seen: Seen) -> tuple[float, float]:
         error = 0.7 - seen.phi_rad
-        u1, u2 = map(saturate, channels.step(error, -error))
-        channels.first = PidState(u1, channels.first.e1, channels.first.e2)
-        channels.second = PidState(u2, channels.second.e1, channels.second.e2)
-        return u1, u2
+        return saturated(channels[0], error), saturated(channels[1], -error)
 
     run = simulate(RIG, rig_at_rest(RIG.plant, RIG.pump), law, 300, 0, "truth")
     assert run.phi_rad.max() < 0.7

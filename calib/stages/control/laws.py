@@ -6,27 +6,31 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.stages.actuator.dynamics import (
-    Coefficients,
     coefficients,
     coriolis_matrix,
     linearised,
     mass_matrix,
     resisting_forces,
 )
-from calib.stages.actuator.kinematics import MARKER_OFFSET_M, chord_decay_w, chord_ratio_w
+from calib.stages.actuator.kinematics import (
+    MARKER_OFFSET_M,
+    angle,
+    forward,
+    forward_jacobian,
+    marker_from_head,
+)
 from calib.stages.actuator.parameters import Plant
 from calib.stages.actuator.pump import PWM_MAX, Orifice, Pump, advance_pump, pump_coefficients, static_force_N
 from calib.stages.actuator.simulate import derivative, largest_step_s
 
 # ----------------------------------------------------------------------
-# The discrete PID controller in its incremental form, with integrator clamping (4.4, D.1 - D.9).
+# The discrete PID controller with integrator clamping (4.4, D.1 - D.9).
 #
 # The backward difference for the derivative and the trapezoidal rule for the integral give
 #
@@ -37,15 +41,17 @@ from calib.stages.actuator.simulate import derivative, largest_step_s
 #
 #     u_k = Kp e_k + Ki h (e_0 + ... + e_(k-1) + e_k / 2) + Kd (e_k - e_(k-1)) / h,  e_(-1) = 0.
 #
+# That is how it is computed here: sums of products instead of differences of outputs.
+#
 # Three points that the source leaves open, and that decide whether the loop works:
 #
 # - History. It starts from zeros. Filling it with e_0 leaves out the first step of the proportional
 #   term, and with Ki = 0 the output is then wrong by -Kp e_0 for ever.
-# - Memory. u_(k-1) is the output of this recursion before saturation. With the saturated value stored,
+# - Memory. u_(k-1) is the output before saturation. With the saturated value stored,
 #   the recursion forgets what lay beyond the limits: 0.7 rad is then never reached within 5 s. Nor may
 #   a feed-forward term be in it, since it would be added again at every tick.
 # - Clamping. When u_k lies outside the limits it is computed again with Ki = 0 and the same history
-#   (4.1.1), and that value is both the output and the next u_(k-1).
+#   (4.1.1), and that value is both the output and the next u_(k-1): the tick adds nothing to the sum.
 #
 # A controller here has one channel; `calib.stages.control.laws` runs one for each bellows.
 
@@ -77,46 +83,27 @@ class Pid:
     tick_s: float = TICK_S
 
 
-@dataclass(frozen=True)
-class PidState:
-    """What one tick hands to the next; zeros at the start.
+class Channel:
+    """A controller of one bellows with its memory, zeros at the start.
 
     Attributes
     ----------
-    u : output of the tick before, not saturated [PWM].
-    e1, e2 : errors of the tick before and the one before that.
+    sum : integral [PWM] up to the tick before. e1 : error of that tick.
     """
 
-    u: float = 0.0
-    e1: float = 0.0
-    e2: float = 0.0
+    def __init__(self, pid: Pid) -> None:
+        self.pid, self.sum, self.e1 = pid, 0.0, 0.0
 
-
-def _increment(Kp: float, Ki: float, Kd: float, h: float, error: float, state: PidState) -> float:
-    """u_k - u_(k-1) of (4.4)."""
-    integral, derivative = 0.5 * Ki * h, Kd / h
-    return (
-        (Kp + integral + derivative) * error
-        + (integral - Kp - 2.0 * derivative) * state.e1
-        + derivative * state.e2
-    )
-
-
-def step(pid: Pid, state: PidState, error: float) -> tuple[PidState, float]:
-    """One tick of (4.4), and of (4.8) for Ki = 0.
-
-    Parameters
-    ----------
-    error : e_k, set-point minus measured value.
-
-    Returns
-    -------
-    The next state, and u_k before saturation [PWM].
-    """
-    u = state.u + _increment(pid.Kp, pid.Ki, pid.Kd, pid.tick_s, error, state)
-    if pid.clamping and not pid.low <= u <= pid.high:
-        u = state.u + _increment(pid.Kp, 0.0, pid.Kd, pid.tick_s, error, state)
-    return PidState(u, error, state.e1), u
+    def step(self, error: float) -> float:
+        """u_k [PWM] of (4.4) before saturation, for the error e_k, set-point minus measured value."""
+        pid = self.pid
+        u = pid.Kp * error + pid.Kd * (error - self.e1) / pid.tick_s + self.sum
+        more = 0.5 * pid.tick_s * pid.Ki * (error + self.e1)
+        self.e1 = error
+        if pid.clamping and not pid.low <= u + more <= pid.high:
+            return u
+        self.sum += more
+        return u + more
 
 
 def saturate(u: float, whole: bool = True, low: float = PWM_MIN, high: float = PWM_MAX) -> float:
@@ -424,7 +411,7 @@ def pwm_for_force(model: Model, state: PumpEstimate, wanted_N: FloatArray, horiz
 #     v_k = Kp e_k + I_k + Ki h e_k / 2 + Kd (e_k - e_(k-1)) / h,    u_k = limit(v_k)
 #     I_(k+1) = I_k + h (Ki e_k + (u_k - v_k) / Tt)
 #
-# Within the limits this is (4.4) exactly, the recursion of `calib.stages.control.laws`. Beyond them the
+# Within the limits this is (4.4), and so computed, with the sum I_k - Ki h e_(k-1) / 2. Beyond them the
 # integral follows the limited command with the time constant Tt instead of standing still, as it does in
 # the source's clamping (4.1.1).
 #
@@ -435,24 +422,12 @@ def pwm_for_force(model: Model, state: PumpEstimate, wanted_N: FloatArray, horiz
 # orifice allows (`least_pwm`), and the integral follows that limit like the other.
 
 
-@dataclass(frozen=True)
-class BackState:
-    """What one tick hands to the next: the integral [PWM] and the error of the tick before."""
-
-    integral: float = 0.0
-    e1: float = 0.0
-
-
-def step_back(
-    pid: Pid, tracking_s: float, state: BackState, error: float, low: float, high: float
-) -> tuple[BackState, float]:
-    """One tick, with Tt = `tracking_s`. Returns the next state and the command within its limits [PWM]."""
-    h = pid.tick_s
-    v = pid.Kp * error + state.integral + 0.5 * h * pid.Ki * error
-    v += pid.Kd * (error - state.e1) / h
+def step_back(channel: Channel, error: float, low: float, high: float, tracking_s: float) -> float:
+    """One tick, with Tt = `tracking_s`. Returns the command within its limits [PWM]."""
+    v = channel.step(error)
     u = min(max(v, low), high)
-    integral = state.integral + h * (pid.Ki * error + (u - v) / tracking_s)
-    return BackState(integral, error), u
+    channel.sum += channel.pid.tick_s * (u - v) / tracking_s
+    return u
 
 
 class BackOrientation:
@@ -470,10 +445,10 @@ class BackOrientation:
     def __init__(
         self, pid: Pid, tracking_s: float, model: Model, falling_share: float = 0.4, sign: int = 1
     ) -> None:
-        self.pid, self.tracking_s, self.model = pid, tracking_s, model
+        self.tracking_s, self.model = tracking_s, model
         self.falling_share, self.sign = falling_share, sign
         self.pumps = pumps_at_rest(model)
-        self.first = self.second = BackState()
+        self.channels = Channel(pid), Channel(pid)
 
     def step(self, phi_ref_rad: float, phi_rad: float) -> Pair:
         """PWM values of one tick."""
@@ -481,8 +456,10 @@ class BackOrientation:
         low, high = (model.low_pwm, model.low_pwm), model.high_pwm
         if math.isfinite(self.falling_share):
             low = least_pwm(model, ahead(model, self.pumps)[-1], self.falling_share)
-        self.first, u1 = step_back(self.pid, self.tracking_s, self.first, error, low[0], high)
-        self.second, u2 = step_back(self.pid, self.tracking_s, self.second, -error, low[1], high)
+        u1, u2 = (
+            step_back(channel, e, least, high, self.tracking_s)
+            for channel, e, least in zip(self.channels, (error, -error), low, strict=True)
+        )
         pwm = (saturate(u1, True, model.low_pwm, high), saturate(u2, True, model.low_pwm, high))
         self.pumps = push(model, self.pumps, pwm)
         return pwm
@@ -551,68 +528,104 @@ _MARKER_M, _GYRO_RADPS = 2.5e-4, 0.003
 """Standard deviations of the marker along each axis, and of the mean of a tick's rates."""
 _FORCE_N_PER_SQRT_S, _BIAS_RADPS_PER_SQRT_S, _ACCEL_MPS2_PER_SQRT_HZ = 0.03, 3e-3, 0.05
 """Walks of d and b, and density of what pushes the head unseen."""
+_GATE_M = 4e-3
+"""Largest innovation of a marker that is believed."""
 _AT_M = 0.012
 """Elongation at which the gain is designed, in the middle of the workspace."""
 
 
-@dataclass(frozen=True)
 class Observer:
-    """An observer with its gain.
+    """An observer with its memory, straight at rest with the pumps off at the start.
 
     Attributes
     ----------
     model : the identified rig.
     gain : (9, 3) L, columns q1, q2 [m] and the gyroscope [rad/s].
-    latency_s : from the exposure to the tick that reads the marker.
-    marker_offset_m, gate_m : offset of (A.1), and the largest innovation that is believed.
-    """
-
-    model: Model
-    gain: FloatArray
-    latency_s: float = 0.025
-    marker_offset_m: float = MARKER_OFFSET_M
-    gate_m: float = 4e-3
-
-
-class ObserverState(NamedTuple):
-    """Estimate at a tick.
-
-    Attributes
-    ----------
+    latency_s : from the exposure to the tick that reads the marker. marker_offset_m : of (A.1).
     y : (6,) q, dq, z. d_N : (2,). bias_radps : b.
-    pumps : state of the pumps.
-    past_q : lengths at this tick and those before, the newest first.
-    refused : markers in a row that were not believed.
+    pumps : their state.
     """
 
-    y: FloatArray
-    d_N: FloatArray
-    bias_radps: float
-    pumps: PumpEstimate
-    past_q: tuple[FloatArray, ...]
-    refused: int = 0
+    def __init__(self, model: Model, gain: FloatArray, latency_s: float, marker_offset_m: float) -> None:
+        self.model, self.gain = model, gain
+        self.latency_s, self.marker_offset_m = latency_s, marker_offset_m
+        self.y = np.array([model.plant.rest_length_m] * 2 + [0.0] * 4)
+        self.d_N, self.bias_radps, self.pumps = np.zeros(2), 0.0, pumps_at_rest(model)
+        # Lengths at this tick and those before, the newest first.
+        self._past_q = np.tile(self.y[:2], (2 + math.ceil(latency_s / model.tick_s), 1))
+        self._refused = 0
+
+    def _advanced(self, y: FloatArray, before: PumpEstimate, after: PumpEstimate) -> FloatArray:
+        """Plant (6,) after a tick in which the pumps' forces go in a straight line."""
+        c, tick_s = coefficients(self.model.plant), self.model.tick_s
+        steps = max(4, math.ceil(1.5 * tick_s / largest_step_s(self.model.plant)))
+        h, d = tick_s / steps, self.d_N
+        start, end = np.array(before.force_N) + d, np.array(after.force_N) + d
+        for i in range(steps):
+            a, b = start + (end - start) * (i / steps), start + (end - start) * ((i + 1) / steps)
+            m = 0.5 * (a + b)
+            k1 = derivative(c, y, a[0], a[1])
+            k2 = derivative(c, y + 0.5 * h * k1, m[0], m[1])
+            k3 = derivative(c, y + 0.5 * h * k2, m[0], m[1])
+            k4 = derivative(c, y + h * k3, b[0], b[1])
+            y = y + h / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)
+        return y
+
+    def predict(self, pwm: Pair) -> None:
+        """Go on to the next tick after a command, without new readings."""
+        pumps = push(self.model, self.pumps, pwm)
+        self.y, self.pumps = self._advanced(self.y, self.pumps, pumps), pumps
+        self._past_q = np.vstack([self.y[:2], self._past_q[:-1]])
+
+    def look_ahead(self) -> tuple[FloatArray, PumpEstimate]:
+        """Plant (6,) and pumps at the tick at which the next command arrives."""
+        y, pumps = self.y, ahead(self.model, self.pumps)
+        for before, after in pairwise(pumps):
+            y = self._advanced(y, before, after)
+        return y, pumps[-1]
+
+    def _exposed(self) -> FloatArray:
+        late = self.latency_s / self.model.tick_s
+        i = min(int(late), len(self._past_q) - 2)
+        return np.asarray((1.0 - (late - i)) * self._past_q[i] + (late - i) * self._past_q[i + 1])
+
+    def correct(self, marker_m: Pair, minus_gz_radps: float) -> None:
+        """Take a tick's readings.
+
+        Parameters
+        ----------
+        marker_m : in the plane [m], NaN where nothing was found.
+        minus_gz_radps : mean of the tick's samples, NaN without.
+        """
+        r, offset, innovation = self.model.plant.bellows_radius_m, self.marker_offset_m, np.zeros(3)
+        if not math.isnan(marker_m[0] + marker_m[1]):
+            q = self._exposed()
+            away = np.array(marker_m) - marker_of(q, r, offset)
+            # Ten in a row are no outliers: the estimate itself is off.
+            if float(np.hypot(*away)) <= _GATE_M or self._refused >= 10:
+                innovation[:2] = np.linalg.solve(marker_jacobian(q, r, offset), away)
+                self._refused = 0
+            else:
+                self._refused += 1
+        if not math.isnan(minus_gz_radps):
+            dphi = 0.5 * float(self.y[2] - self.y[3]) / r
+            innovation[2] = minus_gz_radps - dphi - self.bias_radps
+        step = self.gain @ innovation
+        self.y, self.d_N = self.y + step[:6], self.d_N + step[6:8]
+        self.bias_radps += float(step[8])
+        self._past_q = self._past_q + step[:2]
 
 
-def marker_of(q1: float, q2: float, r: float, offset_m: float) -> tuple[float, float]:
-    """The marker (x, y) [m] of the lengths [m] (3.6), (A.1)."""
-    phi, l = (q1 - q2) / (2.0 * r), 0.5 * (q1 + q2)  # noqa: E741  the source's symbol
-    chord = l * chord_ratio_w(phi * phi)
-    return (
-        chord * math.sin(0.5 * phi) + offset_m * math.sin(phi),
-        chord * math.cos(0.5 * phi) + offset_m * math.cos(phi),
-    )
+def marker_of(q_m: FloatArray, bellows_radius_m: float, offset_m: float) -> FloatArray:
+    """The marker (2,) [m] of the lengths (2,) [m] (3.6), (A.1)."""
+    head = forward(q_m, bellows_radius_m)
+    return marker_from_head(head[:2], head[2], offset_m)
 
 
-def marker_jacobian(q1: float, q2: float, r: float, offset_m: float) -> FloatArray:
+def marker_jacobian(q_m: FloatArray, bellows_radius_m: float, offset_m: float) -> FloatArray:
     """d(x, y) / d(q1, q2), shape (2, 2), of `marker_of`."""
-    phi, l = (q1 - q2) / (2.0 * r), 0.5 * (q1 + q2)  # noqa: E741  the source's symbol
-    S, S1 = chord_ratio_w(phi * phi), -phi * chord_decay_w(phi * phi)
-    s, c = math.sin(0.5 * phi), math.cos(0.5 * phi)
-    x_l, y_l = S * s, S * c
-    x_phi = l * (S1 * s + 0.5 * S * c) + offset_m * math.cos(phi)
-    y_phi = l * (S1 * c - 0.5 * S * s) - offset_m * math.sin(phi)
-    a, b = 0.5 / r * x_phi, 0.5 / r * y_phi
-    return np.array([[0.5 * x_l + a, 0.5 * x_l - a], [0.5 * y_l + b, 0.5 * y_l - b]])
+    phi, J = float(angle(q_m, bellows_radius_m)), forward_jacobian(q_m, bellows_radius_m)
+    return np.asarray(J[:2] + offset_m * np.outer([math.cos(phi), -math.sin(phi)], J[2]))
 
 
 def design_observer(
@@ -642,7 +655,7 @@ def design_observer(
     H = np.zeros((3, STATES))
     H[0, 0] = H[1, 1] = 1.0
     H[2, 2], H[2, 3], H[2, 8] = 0.5 / r, -0.5 / r, 1.0
-    to_q = np.linalg.inv(marker_jacobian(float(q[0]), float(q[1]), r, marker_offset_m))
+    to_q = np.linalg.inv(marker_jacobian(q, r, marker_offset_m))
     R = np.zeros((3, 3))
     R[:2, :2] = _MARKER_M**2 * to_q @ to_q.T
     R[2, 2] = _GYRO_RADPS**2
@@ -652,97 +665,6 @@ def design_observer(
         raise BadInputError(f"observer: has no stationary gain for this plant ({error})") from error
     L = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
     return Observer(model, np.asarray(L), latency_s, marker_offset_m)
-
-
-def start_observer(observer: Observer) -> ObserverState:
-    """Straight at rest with the pumps off."""
-    rest = observer.model.plant.rest_length_m
-    y = np.array([rest, rest, 0.0, 0.0, 0.0, 0.0])
-    kept = 2 + math.ceil(observer.latency_s / observer.model.tick_s)
-    return ObserverState(y, np.zeros(2), 0.0, pumps_at_rest(observer.model), (y[:2],) * kept)
-
-
-def _substeps(model: Model) -> int:
-    return max(4, math.ceil(1.5 * model.tick_s / largest_step_s(model.plant)))
-
-
-def _advance(
-    c: Coefficients, y: FloatArray, start: FloatArray, end: FloatArray, tick_s: float, steps: int
-) -> FloatArray:
-    """Plant after a tick in which the forces go in a straight line from `start` to `end`."""
-    h = tick_s / steps
-    for i in range(steps):
-        a, b = start + (end - start) * (i / steps), start + (end - start) * ((i + 1) / steps)
-        m = 0.5 * (a + b)
-        k1 = derivative(c, y, a[0], a[1])
-        k2 = derivative(c, y + 0.5 * h * k1, m[0], m[1])
-        k3 = derivative(c, y + 0.5 * h * k2, m[0], m[1])
-        k4 = derivative(c, y + h * k3, b[0], b[1])
-        y = y + h / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)
-    return y
-
-
-def predict(observer: Observer, state: ObserverState, pwm: tuple[float, float]) -> ObserverState:
-    """State at the next tick after a command, without new readings."""
-    model = observer.model
-    pumps = push(model, state.pumps, pwm)
-    start, end = np.array(state.pumps.force_N) + state.d_N, np.array(pumps.force_N) + state.d_N
-    y = _advance(coefficients(model.plant), state.y, start, end, model.tick_s, _substeps(model))
-    return state._replace(y=y, pumps=pumps, past_q=(y[:2], *state.past_q[:-1]))
-
-
-def look_ahead(observer: Observer, state: ObserverState) -> tuple[FloatArray, PumpEstimate]:
-    """Plant (6,) and pumps at the tick at which the next command arrives."""
-    model = observer.model
-    c, steps, y = coefficients(model.plant), _substeps(model), state.y
-    pumps = ahead(model, state.pumps)
-    for a, b in pairwise(pumps):
-        forces = np.array(a.force_N) + state.d_N, np.array(b.force_N) + state.d_N
-        y = _advance(c, y, *forces, model.tick_s, steps)
-    return y, pumps[-1]
-
-
-def _exposed(observer: Observer, state: ObserverState) -> FloatArray:
-    late = observer.latency_s / observer.model.tick_s
-    i = min(int(late), len(state.past_q) - 2)
-    part = late - i
-    return np.asarray((1.0 - part) * state.past_q[i] + part * state.past_q[i + 1])
-
-
-def correct(
-    observer: Observer,
-    state: ObserverState,
-    marker_m: tuple[float, float],
-    minus_gz_radps: float,
-) -> ObserverState:
-    """State with a tick's readings.
-
-    Parameters
-    ----------
-    marker_m : in the plane [m], NaN where nothing was found.
-    minus_gz_radps : mean of the tick's samples, NaN without.
-    """
-    plant, innovation = observer.model.plant, np.zeros(3)
-    r, offset, refused = plant.bellows_radius_m, observer.marker_offset_m, state.refused
-    if not math.isnan(marker_m[0] + marker_m[1]):
-        q1, q2 = _exposed(observer, state).tolist()
-        x_m, y_m = marker_of(q1, q2, r, offset)
-        away = np.array([marker_m[0] - x_m, marker_m[1] - y_m])
-        # Ten in a row are no outliers: the estimate itself is off.
-        if float(np.hypot(*away)) <= observer.gate_m or refused >= 10:
-            innovation[:2] = np.linalg.solve(marker_jacobian(q1, q2, r, offset), away)
-            refused = 0
-        else:
-            refused += 1
-    if not math.isnan(minus_gz_radps):
-        dphi = 0.5 * float(state.y[2] - state.y[3]) / r
-        innovation[2] = minus_gz_radps - dphi - state.bias_radps
-    step = observer.gain @ innovation
-    y = state.y + step[:6]
-    moved = tuple(q + step[:2] for q in state.past_q)
-    return ObserverState(
-        y, state.d_N + step[6:8], state.bias_radps + float(step[8]), state.pumps, moved, refused
-    )
 
 
 # ----------------------------------------------------------------------
@@ -761,7 +683,7 @@ def correct(
 # measurements' disagreement with the model under the *limited* commands.
 #
 # `calib.stages.control.laws` then turns F* into a command. Where F* asks for more than the pumps can do
-# the nearest that they can is commanded; `limited` tells.
+# the nearest that they can is commanded, which is told.
 
 
 @dataclass(frozen=True)
@@ -798,15 +720,6 @@ class WantedMotion:
         return min(k, len(self.q_m) - 1)
 
 
-@dataclass(frozen=True)
-class TorqueCommand:
-    """Result of a tick: what the motors get, and whether the pumps can do what was wanted of them."""
-
-    pwm: tuple[float, float]
-    wanted_N: tuple[float, float]
-    limited: tuple[bool, bool]
-
-
 def wanted_motion(model: Model, q_m: FloatArray) -> WantedMotion:
     """The motion along lengths (n, 2) [m] at the ticks; derivatives by central differences."""
     h = model.tick_s
@@ -819,11 +732,14 @@ def wanted_motion(model: Model, q_m: FloatArray) -> WantedMotion:
 
 
 def computed_torque_step(
-    control: ComputedTorque, observer: Observer, state: ObserverState, wanted: WantedMotion, k: int
-) -> TorqueCommand:
-    """The command of the tick k, from the estimate with the readings of that tick."""
+    control: ComputedTorque, observer: Observer, wanted: WantedMotion, k: int
+) -> tuple[Pair, bool]:
+    """The command of the tick k, from the estimate with the readings of that tick.
+
+    The second is whether the pumps cannot do what is wanted of them.
+    """
     model = observer.model
-    y, pumps = look_ahead(observer, state)
+    y, pumps = observer.look_ahead()
     arrives = wanted.at(k + model.pump.delay_ticks)
     then = wanted.at(k + model.pump.delay_ticks + control.horizon_ticks)
     crept = model.plant.creep_rates[2] * (y[4:6] - wanted.z_N[arrives])
@@ -831,7 +747,7 @@ def computed_torque_step(
     T, lag = control.horizon_ticks * model.tick_s, model.pump.lag_s
     lead = lag * -math.expm1(-T / lag) / T
     ramp = wanted.force_N[then] - wanted.force_N[arrives]
-    force = wanted.force_N[arrives] + lead * ramp - crept - state.d_N
+    force = wanted.force_N[arrives] + lead * ramp - crept - observer.d_N
     if control.Kp_per_s2 or control.Kd_per_s:
         v = control.Kp_per_s2 * (wanted.q_m[arrives] - y[:2])
         v = v + control.Kd_per_s * (wanted.dq_mps[arrives] - y[2:4])
@@ -845,35 +761,4 @@ def computed_torque_step(
         | (force > largest_force_N(model))
     )
     u1, u2 = (saturate(u, True, model.low_pwm, model.high_pwm) for u in pwm.tolist())
-    return TorqueCommand((u1, u2), (float(force[0]), float(force[1])), (bool(limited[0]), bool(limited[1])))
-
-
-# ----------------------------------------------------------------------
-# One tick of the two control schemes: orientation (Fig. 4.1, 4.6) and position (Fig. 4.10).
-#
-# Each scheme turns a reference and a measurement into one error per bellows, runs one PID controller
-# for each, adds the feed-forward where there is one, and saturates:
-#
-#     orientation   e = (s, -s)(phi_ref - phi)            (4.1), s = +1 or -1
-#     position      e = q_ref - q,  u + u_ff(q_ref)       (4.5), (4.6), (4.8)
-#
-# The text under (4.1) says that bellows 2 has to extend when phi < phi_ref; the formula drives bellows
-# 1, which agrees with phi = (q1 - q2) / (2 r_B) of (3.3). `sign` is +1 for the formula, -1 for a rig
-# whose hoses are crossed.
-#
-# The loop has no memory but that of the controllers: the feed-forward and the saturated values are not
-# fed back.
-
-
-class Channels:
-    """The controllers of both bellows with their memory, zeros at the start."""
-
-    def __init__(self, pid: Pid) -> None:
-        self.pid = pid
-        self.first = self.second = PidState()
-
-    def step(self, error_1: float, error_2: float) -> Pair:
-        """PWM values of one tick before feed-forward and saturation."""
-        self.first, u1 = step(self.pid, self.first, error_1)
-        self.second, u2 = step(self.pid, self.second, error_2)
-        return u1, u2
+    return (u1, u2), bool(limited.any())

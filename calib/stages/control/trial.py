@@ -32,12 +32,9 @@ from calib.stages.control.laws import (
     Model,
     Pid,
     computed_torque_step,
-    correct,
     design_observer,
     feed_forward,
     feed_forward_pwm,
-    predict,
-    start_observer,
     wanted_motion,
 )
 from calib.stages.control.references import Reference, built_in
@@ -148,7 +145,6 @@ class _Torque:
         tracker = rig.tracker
         latency = tracker.latency_s if sensors else 0.0
         self.observer = design_observer(model, latency_s=latency, marker_offset_m=tracker.marker_offset_m)
-        self.state = start_observer(self.observer)
         self.wanted = wanted_motion(model, reference.q_m)
         self.control, self.sensors = control, sensors
         view = rig.view
@@ -168,16 +164,14 @@ class _Torque:
     def __call__(self, k: int, seen: Seen) -> Pair:
         if self.sensors:
             rate = -sum(row[2] for row in seen.imu) / len(seen.imu) if seen.imu else float("nan")
-            self.state = correct(self.observer, self.state, self._marker(seen), rate)
+            self.observer.correct(self._marker(seen), rate)
         else:
-            y = self.state.y.copy()
-            y[:2] = seen.q_m
-            self.state = self.state._replace(y=y)
-        self.estimates.append(self.state.y[:2].copy())
-        command = computed_torque_step(self.control, self.observer, self.state, self.wanted, k)
-        self.limited += any(command.limited)
-        self.state = predict(self.observer, self.state, command.pwm)
-        return command.pwm
+            self.observer.y[:2] = seen.q_m
+        self.estimates.append(self.observer.y[:2].copy())
+        pwm, limited = computed_torque_step(self.control, self.observer, self.wanted, k)
+        self.limited += limited
+        self.observer.predict(pwm)
+        return pwm
 
 
 def _tuned(section: Controller | None) -> Controller:
