@@ -58,6 +58,17 @@ class LogOptions:
     )
 
 
+@dataclass(frozen=True)
+class PoseOptions(LogOptions):
+    """Where the pose comes from."""
+
+    states: tuple[Path, ...] | None = option(
+        None, "States of calib replay to use instead of the pictures, for the logs in turn."
+    )
+    truth: bool = option(False, "Take the true columns of a simulated log, to test the method.")
+    no_pwm: bool = option(False, "Logs without commands are swings with the hoses off.")
+
+
 NOTHING_STATED = LogOptions()
 
 

@@ -10,6 +10,8 @@ import pytest
 from identifytrials import SIGMA, log_file, rig_file, track, varied
 
 from calib.core.errors import BadInputError
+from calib.core.options import PoseOptions
+from calib.core.stage import Files
 from calib.io.logs import Log, read_log, write_log
 from calib.stages.actuator.identify import (
     Problem,
@@ -36,7 +38,7 @@ from calib.stages.actuator.identify import (
 from calib.stages.actuator.identify_pump import Shape, fit_static_map
 from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import Plant
-from calib.stages.actuator.read import TrackSource, let_go, read_track, start_in_motion
+from calib.stages.actuator.read import let_go, read_track, start_in_motion
 from calib.stages.actuator.section import Known, KnownActuator, KnownPump
 from calib.stages.actuator.validate import IMPROVED, ORIGINAL, begun_track, compare, models_of
 from calib.twin.rig import SimulatedRig
@@ -285,7 +287,7 @@ def test_recovery_on_twenty_rigs(tmp_path: Path) -> None:
         tracks = []
         for k, phi in enumerate(("0.5", "-0.4", "0.6")):
             path = log_file(tmp_path / f"{k}.csv", rig, "swing", 10 * seed + k, 8.0, phi_rad=phi)
-            tracks.append(read_track(path, known, rig_yaml, Machine()).track)
+            tracks.append(read_track(Files((path,), rig_yaml), path, known, Machine(), PoseOptions()))
         found = fit_tracks(Machine(), tracks)
         sigma = uncertainty(found).sigma
         assert set(found.fixed) == {"lambda3"}
@@ -306,7 +308,7 @@ def test_recovery_with_the_pumps_connected(tmp_path: Path) -> None:
         tracks = []
         for k, (kind, duration_s) in enumerate((("prbs", 15.0), ("deflate", 12.0))):
             path = log_file(tmp_path / f"{kind}.csv", rig, kind, 10 * seed + k, duration_s)
-            tracks.append(read_track(path, known, rig_yaml, Machine()).track)
+            tracks.append(read_track(Files((path,), rig_yaml), path, known, Machine(), PoseOptions()))
         found = fit_tracks(Machine(), tracks)
         sigma = uncertainty(found).sigma
         assert {"lag_s", "strength1", "strength2", "falling_N_per_s"} <= set(found.values)
@@ -424,9 +426,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def _read(folder: Path, name: str, **options: object) -> TrackSource:
-    rig = rig_file(folder / "rig.yaml")
-    return read_track(folder / name, rig, folder / "rig.yaml", Machine(), **options)
+def _read(folder: Path, name: str, truth: bool = False, states: Path | None = None) -> Track:
+    rig, path = rig_file(folder / "rig.yaml"), folder / name
+    files = Files((path,), folder / "rig.yaml")
+    return read_track(files, path, rig, Machine(), PoseOptions(truth=truth), states)
 
 
 def _changed(folder: Path, name: str, **columns: np.ndarray | None) -> Path:
@@ -445,10 +448,10 @@ def _changed(folder: Path, name: str, **columns: np.ndarray | None) -> Path:
 def test_pictures_give_the_true_pose_with_the_noise_that_is_said(folder: Path) -> None:
     seen, true = _read(folder, "prbs.csv"), _read(folder, "prbs.csv", truth=True)
     assert (seen.source, true.source) == ("pictures", "truth")
-    at = seen.track.t_s - 0.025
+    at = seen.t_s - 0.025
     inside = at > 0.1
-    truth = np.stack([np.interp(at, true.track.t_s, true.track.head[:, k]) for k in range(2)], axis=1)
-    z = np.einsum("mij,mj->mi", seen.track.whitening, seen.track.head - truth)[inside]
+    truth = np.stack([np.interp(at, true.t_s, true.head[:, k]) for k in range(2)], axis=1)
+    z = np.einsum("mij,mj->mi", seen.whitening, seen.head - truth)[inside]
     assert 0.7 < 1.4826 * np.median(np.abs(z)) < 1.5
     assert seen.delay_s == pytest.approx(0.025)
 
@@ -463,8 +466,8 @@ def test_a_swing_that_is_held_first_begins_where_it_is_let_go(folder: Path) -> N
     path = folder / "held.csv"
     write_log(path, Log("held", t, columns, np.arange(len(t), dtype=np.int64)))
     source = _read(folder, "held.csv")
-    assert any("let go at" in sentence for sentence in source.said)
-    assert source.track.t_s[-1] == pytest.approx(4.0, abs=0.15)
+    assert source.begin_s == pytest.approx(1.0, abs=0.05)
+    assert source.t_s[-1] == pytest.approx(4.0, abs=0.15)
 
 
 @pytest.mark.parametrize("gyro", [True, False])
@@ -511,9 +514,9 @@ def test_states_stand_in_for_pictures(folder: Path) -> None:
     states.write_text("\n".join(["t_s,phi_rad,length_m,sigma_phi_rad", *lines]) + "\n")
     path = _changed(folder, "swing.csv", u_px=None, v_px=None)
     source = _read(folder, path.name)
-    assert (source.source, source.delay_s, source.states) == ("states", 0.0, states)
+    assert (source.source, source.delay_s) == ("states", 0.0)
     given = _read(folder, "swing.csv", states=states)
-    assert np.allclose(given.track.head, source.track.head)
+    assert np.allclose(given.head, source.head)
     states.unlink()
     with pytest.raises(BadInputError, match="has no marker"):
         _read(folder, path.name)
@@ -552,7 +555,7 @@ def test_pumps_that_are_on_already_are_seen_by_the_pose() -> None:
 
 def test_the_true_model_leaves_the_noise_and_another_one_more() -> None:
     values = {"stiffness_scale": 1.3, "bending_N_per_rad2": 0.25}
-    source = TrackSource(track("prbs", values, noise=0.0), "truth", 0.025, ())
+    source = replace(track("prbs", values, noise=0.0), delay_s=0.025)
     nominal = Machine()
     plant = replace(nominal.plant, stiffness_scale=1.3, bending_N_per_rad2=0.25)
     found = compare(source, {ORIGINAL: nominal, IMPROVED: replace(nominal, plant=plant)})
@@ -570,8 +573,7 @@ def test_one_wrong_picture_does_not_decide() -> None:
     head = seen.head.copy()
     head[100] += (1.0, 0.02)
     clean, wrong = (
-        compare(TrackSource(replace(seen, head=h), "pictures", 0.025, ()), {ORIGINAL: Machine()})
-        for h in (seen.head, head)
+        compare(replace(seen, head=h, delay_s=0.025), {ORIGINAL: Machine()}) for h in (seen.head, head)
     )
     assert wrong.replaced == clean.replaced + 1
     assert wrong.errors[ORIGINAL]["q1"].norm == pytest.approx(clean.errors[ORIGINAL]["q1"].norm, rel=0.02)
@@ -588,12 +590,13 @@ def test_a_log_with_its_true_parameters(tmp_path: Path) -> None:
     stated = Known(actuator=KnownActuator(**actuator, lambda3=-1.0), pump=KnownPump(**pump))
     known = rig_file(path, known=stated)
     log = log_file(tmp_path / "log.csv", rig, "prbs", 1, 6.0)
-    track, start = begun_track(log, known, path, truth=True)
+    files = Files((log,), path)
+    track, start = begun_track(files, log, known, PoseOptions(truth=True))
     found = compare(track, models_of(known), start)
     assert found.how == "truth" and found.hoses
     assert found.errors[IMPROVED]["q1"].rms < 1e-5 and found.errors[IMPROVED]["phi"].rms < 1e-3
     assert found.improvement_percent("q1") > 99.0
-    track, start = begun_track(log, known, path)
+    track, start = begun_track(files, log, known, PoseOptions())
     seen = compare(track, models_of(known), start)
     assert seen.how == "pictures"
     # The marker's place comes in whole pixels of a third of a millimetre and more.

@@ -237,6 +237,8 @@ class Track:
     t_s : (m,) times of the measured rows. head : (m, 2) angle [rad] and length [m].
     whitening : (m, 2, 2) turns errors of `head` into numbers of deviation one.
     moving : a guess of the start where the log begins in motion, None where it begins at rest.
+    source : where the pose comes from: "pictures", "states" or "truth". delay_s : what is known of its delay.
+    begin_s : time of the log at which the track begins.
     """
 
     name: str
@@ -247,6 +249,9 @@ class Track:
     head: FloatArray
     whitening: FloatArray
     moving: Start | None = None
+    source: str = ""
+    delay_s: float = 0.0
+    begin_s: float = 0.0
 
     def __post_init__(self) -> None:
         m = len(self.t_s)

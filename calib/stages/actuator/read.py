@@ -5,15 +5,17 @@ from __future__ import annotations
 import csv
 import io
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.core.files import read_text, shown
-from calib.core.options import NOTHING_STATED, LogOptions
+from calib.core.options import PoseOptions
 from calib.core.rig import Rig
 from calib.core.units import plain_number
 from calib.io.logs import Log, check_time, read_log
@@ -25,6 +27,9 @@ from calib.stages.actuator.pump import TICK_S
 from calib.stages.control.laws import holding_force
 from calib.stages.estimator.read import periods, setup_from_rig
 from calib.stages.estimator.sensors import SIZE, invert_marker, marker
+
+if TYPE_CHECKING:
+    from calib.core.stage import Files
 
 # ----------------------------------------------------------------------
 # Tables of a pump's recordings: time, PWM, and pressure or force, in columns of whatever name.
@@ -49,8 +54,45 @@ _SHORTEST_S = 0.5
 _JUMP = 20.0
 
 
-def read_columns(path: Path) -> tuple[list[str], list[list[str]], list[int]]:
-    """Header, rows of cells, and the number of each row's line in a CSV.
+@dataclass(frozen=True)
+class Cells:
+    """A small CSV: its header, rows of cells, and the number of each row's line."""
+
+    path: Path
+    header: list[str]
+    rows: list[list[str]]
+    lines: list[int]
+
+    def column(self, wanted: str | None, known: Sequence[str], what: str) -> int:
+        """Index of a column, the one asked for or the first known name. Raises `BadInputError`."""
+        low, names = [name.lower() for name in self.header], ", ".join(self.header)[:120]
+        if wanted is not None and wanted.lower() not in low:
+            raise BadInputError(f"{shown(self.path)}: has no column {wanted}, found {names}")
+        name = next((name for name in (known if wanted is None else (wanted.lower(),)) if name in low), None)
+        if name is None:
+            raise BadInputError(
+                f"{shown(self.path)}: has no {what}, found columns {names}; expected for instance {known[0]}"
+            )
+        return low.index(name)
+
+    def numbers(self, *columns: int) -> FloatArray:
+        """Values (rows, columns), NaN for what is blank or not finite. Raises `BadInputError` for words."""
+        rows = zip(self.rows, self.lines, strict=True)
+        return np.array([[self._number(row[k], line, k) for k in columns] for row, line in rows])
+
+    def _number(self, cell: str, line: int, column: int) -> float:
+        word = cell.strip()
+        value = plain_number(word) if word else math.nan
+        if value is None:
+            raise BadInputError(
+                f"{shown(self.path)}, line {line}: {self.header[column]} is {shown(word[:40])!r}, expected a "
+                "number"
+            )
+        return value if math.isfinite(value) else math.nan
+
+
+def read_cells(path: Path) -> Cells:
+    """The cells of a CSV.
 
     Raises `BadInputError` for a file without header or rows and for a row of another length.
     """
@@ -79,34 +121,7 @@ def read_columns(path: Path) -> tuple[list[str], list[list[str]], list[int]]:
         raise BadInputError(f"{shown(path)}: is empty, expected a header and rows")
     if not rows:
         raise BadInputError(f"{shown(path)}: has a header but no rows")
-    return header, rows, lines
-
-
-def find_column(path: Path, header: list[str], wanted: str | None, known: tuple[str, ...], what: str) -> int:
-    """Index of a column, the one asked for or the first known name."""
-    low = [name.lower() for name in header]
-    if wanted is not None:
-        if wanted.lower() not in low:
-            raise BadInputError(f"{shown(path)}: has no column {wanted}, found {', '.join(header)[:120]}")
-        return low.index(wanted.lower())
-    for name in known:
-        if name in low:
-            return low.index(name)
-    raise BadInputError(
-        f"{shown(path)}: has no {what}, found columns {', '.join(header)[:120]}; "
-        f"expected for instance {known[0]}"
-    )
-
-
-def number(cell: str, path: Path, line: int, name: str) -> float:
-    """A cell as a number, NaN where it is blank or says nan. Raises `BadInputError` for other words."""
-    word = cell.strip()
-    if not word:
-        return math.nan
-    value = plain_number(word)
-    if value is None:
-        raise BadInputError(f"{shown(path)}, line {line}: {name} is {shown(word[:40])!r}, expected a number")
-    return value if math.isfinite(value) else math.nan
+    return Cells(path, header, rows, lines)
 
 
 def read_pump_table(
@@ -127,17 +142,12 @@ def read_pump_table(
     BadInputError for missing columns, text for a number, PWM outside 0 .. 255, time that runs back or
     jumps, and tables that are too short.
     """
-    header, rows, lines = read_columns(path)
-    what = "pressure or force"
-    at = [
-        find_column(path, header, wanted, known, name)
-        for wanted, known, name in ((time, _TIME, "time"), (pwm, _PWM, "PWM"), (value, _VALUE, what))
-    ]
-    table = np.array(
-        [[number(row[k], path, line, header[k]) for k in at] for row, line in zip(rows, lines, strict=True)]
-    )
+    cells, what = read_cells(path), "pressure or force"
+    header, rows, lines = cells.header, cells.rows, cells.lines
+    at = [cells.column(*one) for one in ((time, _TIME, "time"), (pwm, _PWM, "PWM"), (value, _VALUE, what))]
+    table = cells.numbers(*at)
     said = []
-    good = np.isfinite(table).all(axis=1)
+    good = np.asarray(np.isfinite(table).all(axis=1))
     if not good.all():
         bad = int((~good).sum())
         if bad > max(_MOST_BAD * len(table), 1.0) or bad == len(table):
@@ -265,6 +275,14 @@ def swing_at_beginning(t_s: FloatArray, phi_rad: FloatArray) -> tuple[float, flo
     return best[1:]
 
 
+def held_by_pumps(start: Start, plant: Plant) -> Start:
+    """The start with pumps that just hold the head."""
+    turned = plant.bellows_radius_m * start.phi_rad
+    q = np.array([start.length_m + turned, start.length_m - turned])
+    F1, F2 = np.maximum(holding_force(plant, q), 0.0).tolist()
+    return replace(start, force1_N=F1, force2_N=F2, lag1_N=F1, lag2_N=F2)
+
+
 def start_in_motion(
     t_s: FloatArray, head: FloatArray, hoses: bool, plant: Plant, rest_noise_rad: float
 ) -> Start | None:
@@ -284,9 +302,7 @@ def start_in_motion(
             return None
         some = t_s <= max(_SLOW_S, float(t_s[4]))
         rates = np.polyfit(t_s[some], head[some], 1)[0].tolist()
-        turned = plant.bellows_radius_m * phi
-        F = np.maximum(holding_force(plant, np.array([length + turned, length - turned])), 0.0).tolist()
-        return Start(phi, length, rates[0], rates[1], 0.0, 0.0, *F, *F)
+        return held_by_pumps(Start(phi, length, *rates), plant)
     at_0, rate, sigma, fastest = swing_at_beginning(t_s, head[:, 0])
     if abs(rate) < max(_SHARE * fastest, _SURE * sigma, _LEAST_RADPS):
         return None
@@ -317,27 +333,10 @@ _GRAVITY_MPS2 = 9.81
 Head = tuple[FloatArray, FloatArray, FloatArray]
 
 
-@dataclass(frozen=True)
-class TrackSource:
-    """A track, how its pose was found, what is known of its delay, and sentences about it.
-
-    `begin_s` is the time of the log at which the track begins.
-    """
-
-    track: Track
-    source: str
-    delay_s: float
-    said: tuple[str, ...]
-    states: Path | None = None
-    begin_s: float = 0.0
-
-
 def states_beside(path: Path) -> Path | None:
     """The states file that `calib replay` writes for a log, where it lies beside it."""
-    for name in (f"{path.stem}_states.csv", f"{path.stem}.states.csv"):
-        if path.with_name(name).is_file():
-            return path.with_name(name)
-    return None
+    beside = (path.with_name(f"{path.stem}{end}") for end in ("_states.csv", ".states.csv"))
+    return next((one for one in beside if one.is_file()), None)
 
 
 def _from_pictures(log: Log, rig: Rig, rig_path: Path) -> tuple[Head, float]:
@@ -379,20 +378,13 @@ def _from_pictures(log: Log, rig: Rig, rig_path: Path) -> tuple[Head, float]:
 
 
 def _from_states(path: Path) -> Head:
-    header, rows, lines = read_columns(path)
+    cells, of_lengths = read_cells(path), ("sigma_q1_m", "sigma_q2_m")
     names = ("t_s", "phi_rad", "length_m", "sigma_phi_rad")
-    at = [find_column(path, header, name, (name,), name) for name in names]
-    table = np.array(
-        [[number(row[k], path, line, header[k]) for k in at] for row, line in zip(rows, lines, strict=True)]
-    )
-    low = [name.lower() for name in header]
+    table = cells.numbers(*(cells.column(name, (), name) for name in names))
     spread = np.full(len(table), _LENGTH_SIGMA_M)
-    if "sigma_q1_m" in low and "sigma_q2_m" in low:
-        both = [
-            [number(row[low.index(n)], path, line, n) for n in ("sigma_q1_m", "sigma_q2_m")]
-            for row, line in zip(rows, lines, strict=True)
-        ]
-        spread = np.sqrt(np.mean(np.array(both) ** 2, axis=1))
+    if {*of_lengths} <= {name.lower() for name in cells.header}:
+        both = cells.numbers(*(cells.column(name, (), name) for name in of_lengths))
+        spread = np.sqrt(np.mean(both**2, axis=1))
     good = np.isfinite(table).all(axis=1) & np.isfinite(spread) & (spread > 0.0) & (table[:, 3] > 0.0)
     # States come at every row of camera and IMU; more than one per tick says the same again.
     table, spread = table[good], spread[good]
@@ -501,45 +493,39 @@ def release_s(log: Log, t_s: FloatArray, phi: FloatArray, noise_rad: float) -> f
 
 
 def read_track(
-    path: Path,
-    rig: Rig,
-    rig_path: Path,
-    nominal: Machine,
-    states: Path | None = None,
-    truth: bool = False,
-    no_pwm: bool = False,
-    options: LogOptions = NOTHING_STATED,
-) -> TrackSource:
+    files: Files, path: Path, rig: Rig, nominal: Machine, options: PoseOptions, states: Path | None = None
+) -> Track:
     """A log as a track.
 
     Parameters
     ----------
+    files : notes what is read, and gets sentences about it.
     nominal : the machine as it is known; its radius makes an angle of true lengths, its springs hold the head
         at the start of a log that begins in motion.
+    options : where the pose comes from, and what a person states of the log.
     states : states file to take the pose from; without pictures one beside the log is looked for.
-    truth : take the true columns.
-    no_pwm : logs without commands are swings with the hoses off.
-    options : what a person states of the log.
 
     Raises
     ------
     BadInputError for a log that is too short, jumps in time, has no commands or commands out of range,
     no marker, or a rig without camera or plane where the pictures are needed.
     """
-    log = read_log(path, options)
-    said = log.remarks()
+    said = files.remarks
+    log = read_log(path, options, said)
     _check_clock(log)
-    begin, tick_s, pwm = _commands(log, no_pwm)
+    begin, tick_s, pwm = _commands(log, options.no_pwm)
     delay_s = 0.0
-    if states is None and not truth and not len(log.sampled("u_px", "v_px")):
+    if states is None and not options.truth and not len(log.sampled("u_px", "v_px")):
         states = states_beside(path)
-    if truth:
+    files.taken(path)
+    if options.truth:
         (t, head, W), how = _from_truth(log, nominal.plant.bellows_radius_m), "truth"
     elif states is not None:
         (t, head, W), how = _from_states(states), "states"
+        files.taken(states)
         said.append(f"{log.source}: takes the pose from {shown(states)}")
     else:
-        (t, head, W), delay_s = _from_pictures(log, rig, rig_path)
+        (t, head, W), delay_s = _from_pictures(log, rig, files.rig_path)
         how = "pictures"
     hoses = bool(pwm.any())
     spread = np.linalg.inv(W[:20])
@@ -573,8 +559,7 @@ def read_track(
         # The first pictures show the head before the first tick.
         late = t >= delay_s + _LATE_S
         t, head, W = t[late], head[late], W[late]
-    track = Track(shown(path.name), tick_s, pwm, hoses, t, head, W, moving)
-    return TrackSource(track, how, delay_s, tuple(said), states, begin)
+    return Track(shown(path.name), tick_s, pwm, hoses, t, head, W, moving, how, delay_s, begin)
 
 
 _LENGTHS = {"elongation_mm": 1e-3, "displacement_mm": 1e-3, "elongation_m": 1.0, "displacement_m": 1.0}
@@ -586,16 +571,12 @@ def read_displacements(path: Path) -> tuple[FloatArray, FloatArray]:
 
     Columns are any of elongation or displacement in mm or m, and force_N, force_mN, mass_g or mass_kg.
     """
-    header, rows, lines = read_columns(path)
-    x = find_column(path, header, None, tuple(_LENGTHS), "elongation")
-    y = find_column(path, header, None, tuple(_LOADS), "force")
-    table = np.array(
-        [
-            [number(row[k], path, line, header[k]) for k in (x, y)]
-            for row, line in zip(rows, lines, strict=True)
-        ]
-    )
+    cells = read_cells(path)
+    x, y = cells.column(None, tuple(_LENGTHS), "elongation"), cells.column(None, tuple(_LOADS), "force")
+    table = cells.numbers(x, y)
     bad = np.nonzero(~np.isfinite(table).all(axis=1))[0]
     if len(bad):
-        raise BadInputError(f"{shown(path)}, line {lines[int(bad[0])]}: has a blank or nan, expected numbers")
-    return table[:, 0] * _LENGTHS[header[x].lower()], table[:, 1] * _LOADS[header[y].lower()]
+        line = cells.lines[int(bad[0])]
+        raise BadInputError(f"{shown(path)}, line {line}: has a blank or nan, expected numbers")
+    scales = (_LENGTHS[cells.header[x].lower()], _LOADS[cells.header[y].lower()])
+    return table[:, 0] * scales[0], table[:, 1] * scales[1]

@@ -23,6 +23,7 @@ from calib.stages.actuator.identify import (
     Prospect,
     Solution,
     StiffnessFit,
+    Track,
     Uncertainty,
     colour_of,
     decrement,
@@ -41,7 +42,6 @@ from calib.stages.actuator.identify import (
 from calib.stages.actuator.identify_pump import LAG
 from calib.stages.actuator.machine import Machine, machine_from
 from calib.stages.actuator.parameters import Stiffness
-from calib.stages.actuator.read import TrackSource
 from calib.stages.actuator.section import CREEP, KNOTS, LAW, Actuator, Known, PumpSection, in_force
 
 
@@ -56,7 +56,6 @@ class Identified:
     held: tuple[HeldLog, ...]
     prospects: tuple[Prospect, ...]
     decrements: Mapping[str, tuple[Decrement, float | None]]
-    sources: Mapping[str, str]
     verdict: Verdict
 
 
@@ -138,7 +137,7 @@ def _decrements(solution: Solution) -> dict[str, tuple[Decrement, float | None]]
 
 def identify_logs(
     nominal: Machine,
-    sources: Sequence[TrackSource],
+    tracks: Sequence[Track],
     static_map: bool = False,
     hold_back: bool = True,
     progress: Progress | None = None,
@@ -150,8 +149,7 @@ def identify_logs(
 
     Raises `BadInputError` where the logs can tell nothing.
     """
-    delay_s = float(np.median([source.delay_s for source in sources]))
-    tracks = [source.track for source in sources]
+    delay_s = float(np.median([track.delay_s for track in tracks]))
     solution = fit_tracks(nominal, tracks, static_map, delay_s, progress=progress, stated=stated)
     known = uncertainty(solution)
     colours = colour_of(solution)
@@ -165,7 +163,6 @@ def identify_logs(
         tuple(held),
         ahead,
         _decrements(solution),
-        {source.track.name: source.source for source in sources},
         judge(solution, known, colours, held, ahead),
     )
 
@@ -296,7 +293,7 @@ def identified_json(found: Identified) -> dict[str, Any]:
             {
                 "name": track.name,
                 "poses": len(track.t_s),
-                "source": found.sources.get(track.name, ""),
+                "source": track.source,
                 "hoses": track.hoses,
                 "phi_rms_rad": rms[0],
                 "length_rms_m": rms[1],

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from calib.core.errors import BadInputError, UsageError
-from calib.core.options import LogOptions, option
+from calib.core.options import PoseOptions, option
 from calib.core.stage import Files, Stage
 from calib.core.verdict import Verdict
 
@@ -18,10 +18,9 @@ if TYPE_CHECKING:
     from calib.core.rig import Rig
     from calib.core.stage import Progress
     from calib.core.words import Block, Table
-    from calib.stages.actuator.identify import Start, StiffnessFit
+    from calib.stages.actuator.identify import Start, StiffnessFit, Track
     from calib.stages.actuator.identify_pump import PumpFound, PumpTable
     from calib.stages.actuator.machine import Machine
-    from calib.stages.actuator.read import TrackSource
     from calib.stages.actuator.results import Identified
     from calib.stages.actuator.section import Actuator, PumpSection
     from calib.stages.actuator.validate import Comparison
@@ -29,17 +28,6 @@ if TYPE_CHECKING:
     from calib.stages.arm.model import Trial
 
     Sections = tuple[Actuator, PumpSection | None]
-
-
-@dataclass(frozen=True)
-class PoseOptions(LogOptions):
-    """Where the pose comes from."""
-
-    states: tuple[Path, ...] | None = option(
-        None, "States of calib replay to use instead of the pictures, for the logs in turn."
-    )
-    truth: bool = option(False, "Take the true columns of a simulated log, to test the method.")
-    no_pwm: bool = option(False, "Logs without commands are swings with the hoses off.")
 
 
 @dataclass(frozen=True)
@@ -75,7 +63,7 @@ class LogsInputs:
     rig : holds what logs do not tell.
     """
 
-    tracks: Sequence[TrackSource]
+    tracks: Sequence[Track]
     nominal: Machine
     stated: Mapping[str, float]
     rig: Rig
@@ -88,14 +76,10 @@ def _read(files: Files, rig: Rig, options: LogsOptions) -> LogsInputs:
     from calib.stages.actuator.results import beginning
 
     nominal, stated = beginning(rig)
-    tracks = []
-    for path, given in _with_states(files, options):
-        track = read_track(path, rig, files.rig_path, nominal, given, options.truth, options.no_pwm, options)
-        files.taken(path)
-        if track.states is not None:
-            files.taken(track.states)
-        files.remarks += track.said
-        tracks.append(track)
+    tracks = [
+        read_track(files, path, rig, nominal, options, states)
+        for path, states in _with_states(files, options)
+    ]
     return LogsInputs(tracks, nominal, stated, rig, options, files.progress)
 
 
@@ -372,28 +356,21 @@ class StiffnessOptions:
 
 @dataclass(frozen=True)
 class Springs:
-    """Elongations [m] with forces [N], the laws that were fitted to them, and which of these is used."""
+    """A table's elongations [m] and forces [N], and the rig with what it holds of the actuator.
 
-    name: str
-    elongation_m: FloatArray
-    force_N: FloatArray
-    fits: Sequence[StiffnessFit]
-    used: int
-    per: str
-
-
-@dataclass(frozen=True)
-class StiffnessInputs:
-    """A table's elongations [m] and forces [N], and the rig with what it holds of the actuator."""
+    `fits` are the laws that were fitted to them, `used` which of these is used.
+    """
 
     name: str
     elongation_m: FloatArray
     force_N: FloatArray
     per: str
     rig: Rig
+    fits: Sequence[StiffnessFit] = ()
+    used: int = 0
 
 
-def _read_stiffness(files: Files, rig: Rig, options: StiffnessOptions) -> StiffnessInputs:
+def _read_stiffness(files: Files, rig: Rig, options: StiffnessOptions) -> Springs:
     from calib.core.files import shown
     from calib.stages.actuator.read import read_displacements
 
@@ -402,17 +379,16 @@ def _read_stiffness(files: Files, rig: Rig, options: StiffnessOptions) -> Stiffn
     # The section keeps what logs have told of the other parameters.
     files.hashes |= rig.provenance.inputs.get("actuator", {})
     files.taken(path)
-    return StiffnessInputs(shown(path), elongation_m, force_N, options.per, rig)
+    return Springs(shown(path), elongation_m, force_N, options.per, rig)
 
 
-def _solve_stiffness(inputs: StiffnessInputs) -> Actuator:
+def _solve_stiffness(inputs: Springs) -> Actuator:
     from calib.stages.actuator.identify import fit_stiffness
     from calib.stages.actuator.results import stiffness_section
 
     fits, best = fit_stiffness(inputs.name, inputs.elongation_m, inputs.force_N)
-    found = Springs(inputs.name, inputs.elongation_m, inputs.force_N, fits, best, inputs.per)
     section = stiffness_section(fits[best], inputs.per == "actuator", inputs.rig)
-    return section.with_evidence(found)
+    return section.with_evidence(replace(inputs, fits=fits, used=best))
 
 
 def _stiffness_document(section: Actuator) -> dict[str, Any]:
@@ -491,7 +467,7 @@ class ValidateOptions(PoseOptions):
 class ValidateInputs:
     """Tracks of the actuator with the estimator's starts, or trials of an arm, and the rig."""
 
-    tracks: Sequence[tuple[TrackSource, Start | None]]
+    tracks: Sequence[tuple[Track, Start | None]]
     trials: Sequence[Trial]
     rig: Rig
 
@@ -525,11 +501,7 @@ def _read_validate(files: Files, rig: Rig, options: ValidateOptions) -> Validate
 
         arm_options = Options(columns=options.columns, load=options.load, day=options.day)
         return ValidateInputs((), held_trials(files, rig.arm, arm_options), rig)
-    tracks = []
-    for path, states in logs:
-        track, start = begun_track(path, rig, files.rig_path, states, options.truth, options.no_pwm, options)
-        files.remarks += track.said
-        tracks.append((track, start))
+    tracks = [begun_track(files, path, rig, options, states) for path, states in logs]
     if IMPROVED not in models_of(rig):
         files.remarks.append(
             f"{shown(files.rig_path)} has no section known, actuator or pump: the improved model has "

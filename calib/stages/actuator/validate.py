@@ -22,17 +22,20 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from calib.core.arrays import FloatArray
-from calib.core.options import NOTHING_STATED, LogOptions
+from calib.core.options import LogOptions, PoseOptions
 from calib.core.rig import Rig
 from calib.stages.actuator.identify import Start, Track, heads_of, without_outliers
 from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import Creep, Plant
-from calib.stages.actuator.read import TrackSource, read_track
-from calib.stages.control.laws import holding_force
+from calib.stages.actuator.read import held_by_pumps, read_track
+
+if TYPE_CHECKING:
+    from calib.core.stage import Files
 
 ORIGINAL, NOMINAL, IMPROVED = "original", "nominal", "improved"
 _SECONDS = 2.0
@@ -111,7 +114,7 @@ def _cleaned(track: Track) -> tuple[Track, int]:
 
 
 def estimated_start(
-    path: Path, rig: Rig, rig_path: Path, begin_s: float, options: LogOptions = NOTHING_STATED
+    path: Path, rig: Rig, rig_path: Path, begin_s: float, options: LogOptions
 ) -> Start | None:
     """Angle, length and their rates at a time of a log [s] by the estimator; None where it lacks a sensor.
 
@@ -139,15 +142,10 @@ def _begun(track: Track, start: Start, nominal: Machine) -> Track:
     """The track begun as a start says: with its rates and forces where it is in motion, else at rest."""
     if track.moving is None:
         return track
-    if not track.hoses:
-        return replace(track, moving=start)
-    turned = nominal.plant.bellows_radius_m * start.phi_rad
-    q = np.array([start.length_m + turned, start.length_m - turned])
-    F1, F2 = np.maximum(holding_force(nominal.plant, q), 0.0).tolist()
-    return replace(track, moving=replace(start, force1_N=F1, force2_N=F2, lag1_N=F1, lag2_N=F2))
+    return replace(track, moving=held_by_pumps(start, nominal.plant) if track.hoses else start)
 
 
-def compare(source: TrackSource, models: Mapping[str, Machine], start: Start | None = None) -> Comparison:
+def compare(track: Track, models: Mapping[str, Machine], start: Start | None = None) -> Comparison:
     """A log against models by name, each simulated from the log's start.
 
     Parameters
@@ -155,7 +153,7 @@ def compare(source: TrackSource, models: Mapping[str, Machine], start: Start | N
     models : of which the last gives the radius that measured angles and lengths become bellows with.
     start : the estimator's, the track's own without.
     """
-    track, replaced = _cleaned(source.track)
+    track, replaced = _cleaned(track)
     begin = track.start if start is None else start
     if track.moving is None:
         begin = Start(begin.phi_rad, begin.length_m)
@@ -164,13 +162,13 @@ def compare(source: TrackSource, models: Mapping[str, Machine], start: Start | N
     for name, nominal in models.items():
         begun = _begun(track, begin, nominal)
         at = begin if begun.moving is None else begun.moving
-        head, _ = heads_of(begun, nominal, [{}], [at], source.delay_s, threads=1)
+        head, _ = heads_of(begun, nominal, [{}], [at], track.delay_s, threads=1)
         simulated[name] = _columns(head[0], nominal.plant.bellows_radius_m)
     errors = {name: errors_of(measured, curves) for name, curves in simulated.items()}
     return Comparison(
         track.name,
-        source.source,
-        source.source if start is None else "estimator",
+        track.source,
+        track.source if start is None else "estimator",
         track.hoses,
         replaced,
         track.t_s,
@@ -193,26 +191,10 @@ def models_of(rig: Rig) -> dict[str, Machine]:
 
 
 def begun_track(
-    path: Path,
-    rig: Rig,
-    rig_path: Path,
-    states: Path | None = None,
-    truth: bool = False,
-    no_pwm: bool = False,
-    options: LogOptions = NOTHING_STATED,
-) -> tuple[TrackSource, Start | None]:
-    """A log's track, and the estimator's start where its pose comes from pictures.
-
-    Parameters
-    ----------
-    states, truth, no_pwm, options : as in `calib.stages.actuator.read.read_track`.
-
-    Raises
-    ------
-    BadInputError as `read_track`.
-    """
-    machine = list(models_of(rig).values())[-1]
-    source = read_track(path, rig, rig_path, machine, states, truth, no_pwm, options)
-    if source.source != "pictures":
-        return source, None
-    return source, estimated_start(path, rig, rig_path, source.begin_s, options)
+    files: Files, path: Path, rig: Rig, options: PoseOptions, states: Path | None = None
+) -> tuple[Track, Start | None]:
+    """A log's track, and the estimator's start where its pose comes from pictures; both as `read_track`."""
+    track = read_track(files, path, rig, list(models_of(rig).values())[-1], options, states)
+    if track.source != "pictures":
+        return track, None
+    return track, estimated_start(path, rig, files.rig_path, track.begin_s, options)

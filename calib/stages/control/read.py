@@ -14,7 +14,7 @@ from calib.core.rig import Rig
 from calib.core.writing import Kind, column_names, write_atomically
 from calib.io.logs import columns_of
 from calib.stages.actuator.kinematics import inverse
-from calib.stages.actuator.read import number, read_columns
+from calib.stages.actuator.read import read_cells
 from calib.stages.control.laws import Model
 from calib.stages.control.references import (
     BUILT_IN,
@@ -46,7 +46,8 @@ _FEWEST = 3
 def _series(path: Path) -> tuple[tuple[str, ...], FloatArray, FloatArray]:
     """Names of the columns taken, times (n,) and values (n, len(names))."""
     source = shown(path)
-    header, rows, lines = read_columns(path)
+    cells = read_cells(path)
+    header = cells.header
     if "t_s" not in header:
         raise BadInputError(f"{source}: has no column t_s, expected a reference with times")
     names = next((kind for kind in _KINDS if all(name in header for name in kind)), None)
@@ -55,24 +56,21 @@ def _series(path: Path) -> tuple[tuple[str, ...], FloatArray, FloatArray]:
             f"{source}: has no reference in it, expected q1_m and q2_m, x_m and y_m, or phi_rad; of a "
             "recorded log calib replay writes them"
         )
-    times: list[float] = []
-    values: list[list[float]] = []
-    for row, line in zip(rows, lines, strict=True):
-        t, *cells = (number(row[header.index(name)], path, line, name) for name in ("t_s", *names))
-        for name, value in zip(("t_s", *names), (t, *cells), strict=True):
-            if not math.isfinite(value):
-                raise BadInputError(f"{source}, line {line}: {name} is blank or nan, expected a number")
-        if times and t < times[-1]:
-            raise BadInputError(
-                f"{source}, line {line}: t_s is {t:g} after {times[-1]:g}, expected rising times"
-            )
-        if times and t == times[-1]:
-            # Loggers stamp samples that waited in a buffer alike; the last one is the newest.
-            values[-1] = cells
-            continue
-        times.append(t)
-        values.append(cells)
-    return names, np.array(times), np.array(values)
+    at = [header.index(name) for name in ("t_s", *names)]
+    table = cells.numbers(*at)
+    for row, k in np.argwhere(~np.isfinite(table)).tolist():
+        raise BadInputError(
+            f"{source}, line {cells.lines[row]}: {header[at[k]]} is blank or nan, expected a number"
+        )
+    t = table[:, 0]
+    for row in (np.nonzero(np.diff(t) < 0.0)[0] + 1).tolist():
+        raise BadInputError(
+            f"{source}, line {cells.lines[row]}: t_s is {t[row]:g} after {t[row - 1]:g}, expected rising "
+            "times"
+        )
+    # Loggers stamp samples that waited in a buffer alike; the last one is the newest.
+    newest = np.append(np.diff(t) > 0.0, True)
+    return names, t[newest], table[newest, 1:]
 
 
 def read_reference(path: Path, model: Model) -> Reference:
