@@ -195,9 +195,9 @@ class Static(Scenario):
         return super().run(rig, ticks, seed, feedback)
 
     def figures(self, run: Run) -> Figures:
-        if not run.rig.imu.onchip or len(run.onchip_rad) < 2:
+        if not run.rig.imu.onchip or len(run.sensors.onchip_rad) < 2:
             return {}
-        slope = np.polyfit(run.imu.taken_s, run.onchip_rad, 1)[0]
+        slope = np.polyfit(run.sensors.imu.taken_s, run.sensors.onchip_rad, 1)[0]
         return {"onchip_drift_degps": float(np.degrees(slope))}
 
 

@@ -21,8 +21,6 @@ from calib.stages.estimator.baseline import Baseline, BaselineSetup
 from calib.stages.estimator.kinematic import Rows
 from calib.twin.rig import SimulatedRig, workspace_homography
 from calib.twin.sensors import (
-    ImuNoise,
-    TrackerNoise,
     Trajectory,
     draw_imu_noise,
     draw_tracker_noise,
@@ -86,8 +84,7 @@ class Run:
     pwm : (n, 2) commands given at the ticks.
     tick_s : period of the ticks.
     seen : (n, 3) angle and lengths that the controller got at each tick, None in open loop.
-    tracker, pixels : noise of the frames and the reported pixels (n, 2), NaN where nothing was found.
-    imu, accel_mps2, gyro_radps, onchip_rad : noise of the samples and readings (m, 3), (m, 3), (m,).
+    sensors : what camera and IMU have read.
     """
 
     rig: SimulatedRig
@@ -96,12 +93,7 @@ class Run:
     pwm: FloatArray
     tick_s: float
     seen: FloatArray | None
-    tracker: TrackerNoise
-    pixels: FloatArray
-    imu: ImuNoise
-    accel_mps2: FloatArray
-    gyro_radps: FloatArray
-    onchip_rad: FloatArray
+    sensors: Sensors
 
     @property
     def t_s(self) -> FloatArray:
@@ -148,8 +140,14 @@ class _Plant:
             )
 
 
-class _Sensors:
-    """Readings of one run, taken in any number of portions."""
+class Sensors:
+    """Readings of one run, taken in any number of portions.
+
+    Attributes
+    ----------
+    tracker, pixels : noise of the frames and the reported pixels (n, 2), NaN where nothing was found.
+    imu, accel_mps2, gyro_radps, onchip_rad : noise of the samples and readings (m, 3), (m, 3), (m,).
+    """
 
     def __init__(self, rig: SimulatedRig, plant: _Plant, ticks: int, seed: int) -> None:
         self.rig, self.c = rig, plant.c
@@ -158,8 +156,8 @@ class _Sensors:
         self.imu = draw_imu_noise(rig.imu, ticks * plant.tick_s, seed)
         samples = len(self.imu.taken_s)
         self.pixels = np.full((ticks, 2), np.nan)
-        self.accel, self.gyro = np.zeros((samples, 3)), np.zeros((samples, 3))
-        self.onchip = np.zeros(samples)
+        self.accel_mps2, self.gyro_radps = np.zeros((samples, 3)), np.zeros((samples, 3))
+        self.onchip_rad = np.zeros(samples)
         self.due: IntArray = np.searchsorted(self.imu.taken_s, times + 1e-9, side="right")
 
     def take_frames(self, trajectory: Trajectory, frames: slice) -> None:
@@ -169,15 +167,16 @@ class _Sensors:
 
     def take_samples(self, trajectory: Trajectory, samples: slice) -> None:
         motion = head_motion(self.c, trajectory.at(self.imu.taken_s[samples]))
-        self.accel[samples], self.gyro[samples] = measure(self.rig.imu, self.imu, samples, motion)
+        readings = measure(self.rig.imu, self.imu, samples, motion)
+        self.accel_mps2[samples], self.gyro_radps[samples] = readings
         if self.rig.imu.onchip:
-            self.onchip[samples] = onchip_angle_rad(self.rig.imu, self.imu, samples, motion)
+            self.onchip_rad[samples] = onchip_angle_rad(self.rig.imu, self.imu, samples, motion)
 
 
 class _Eyes:
     """The firmware at work: from the readings up to a tick to what the controller sees."""
 
-    def __init__(self, rig: SimulatedRig, sensors: _Sensors) -> None:
+    def __init__(self, rig: SimulatedRig, sensors: Sensors) -> None:
         to_plane = np.asarray(np.linalg.inv(workspace_homography(rig.view)), dtype=np.float64)
         plant, offset_m = rig.plant, rig.tracker.marker_offset_m
         self.firmware = Baseline(
@@ -194,7 +193,7 @@ class _Eyes:
         sensors.take_frames(past, slice(k, k + 1))
         # The samples since the last tick, then its picture.
         readings = np.full((count + 1, 5), np.nan)
-        readings[:-1, 2:4], readings[:-1, 4] = sensors.accel[samples, :2], sensors.gyro[samples, 2]
+        readings[:-1, 2:4], readings[:-1, 4] = sensors.accel_mps2[samples, :2], sensors.gyro_radps[samples, 2]
         readings[-1, :2] = sensors.pixels[k]
         kinds = np.full(count + 1, 2)
         kinds[-1] = 1
@@ -264,7 +263,7 @@ def simulate(
     check_start(start.row)
     body = rig.plant if plant is None else plant
     moving = _Plant(rig, body)
-    sensors = _Sensors(rig, moving, ticks, seed)
+    sensors = Sensors(rig, moving, ticks, seed)
     nodes = np.empty((ticks * _NODES_PER_TICK + 1, len(STATE)))
     nodes[0] = start.row
     whole = Trajectory(tick_s / _NODES_PER_TICK, nodes)
@@ -282,26 +281,14 @@ def simulate(
     else:
         # The samples after the last tick, which no controller saw.
         sensors.take_samples(whole, slice(int(sensors.due[-1]), len(sensors.imu.taken_s)))
-    return Run(
-        rig,
-        body,
-        whole,
-        pwm,
-        tick_s,
-        seen,
-        sensors.tracker,
-        sensors.pixels,
-        sensors.imu,
-        sensors.accel,
-        sensors.gyro,
-        sensors.onchip,
-    )
+    return Run(rig, body, whole, pwm, tick_s, seen, sensors)
 
 
 def log_of(run: Run, source: str = "simulated") -> Log:
     """The log of a run: ticks and IMU samples merged by their time stamps, with the truth."""
-    ticks, samples = len(run.pwm), len(run.imu.stamp_s)
-    t = np.concatenate([run.tracker.stamp_s, run.imu.stamp_s])
+    sensors = run.sensors
+    ticks, samples = len(run.pwm), len(sensors.imu.stamp_s)
+    t = np.concatenate([sensors.tracker.stamp_s, sensors.imu.stamp_s])
     order = np.argsort(t, kind="stable")
     columns: dict[str, FloatArray] = {}
 
@@ -311,15 +298,15 @@ def log_of(run: Run, source: str = "simulated") -> Log:
     def at_samples(name: str, values: FloatArray) -> None:
         columns[name] = np.concatenate([np.full(ticks, np.nan), values])[order]
 
-    at_ticks("u_px", run.pixels[:, 0])
-    at_ticks("v_px", run.pixels[:, 1])
+    at_ticks("u_px", sensors.pixels[:, 0])
+    at_ticks("v_px", sensors.pixels[:, 1])
     for axis, name in enumerate("xyz"):
-        at_samples(f"a{name}_mps2", run.accel_mps2[:, axis])
-        at_samples(f"g{name}_radps", run.gyro_radps[:, axis])
+        at_samples(f"a{name}_mps2", sensors.accel_mps2[:, axis])
+        at_samples(f"g{name}_radps", sensors.gyro_radps[:, axis])
     at_ticks("pwm1", run.pwm[:, 0])
     at_ticks("pwm2", run.pwm[:, 1])
     if run.rig.imu.onchip:
-        at_samples("onchip_phi_rad", run.onchip_rad)
+        at_samples("onchip_phi_rad", sensors.onchip_rad)
     t = t[order]
     q = run.trajectory.at(t)[:, :2]
     pose = forward(q, run.plant.bellows_radius_m)

@@ -123,10 +123,10 @@ def test_a_controller_may_read_the_sensors_themselves() -> None:
 
     run = simulate(RIG, at_rest(RIG), law, 60, 1, "sensors")
     rows = [row for seen in read for row in seen.imu]
-    assert np.array_equal(np.array(rows)[:, 2], run.gyro_radps[: len(rows), 2])
-    assert np.array_equal(np.array(rows)[:, :2], run.accel_mps2[: len(rows), :2])
+    assert np.array_equal(np.array(rows)[:, 2], run.sensors.gyro_radps[: len(rows), 2])
+    assert np.array_equal(np.array(rows)[:, :2], run.sensors.accel_mps2[: len(rows), :2])
     assert 98 <= len(rows) <= 100
-    assert np.array_equal(np.array([seen.marker_px for seen in read]), run.pixels, equal_nan=True)
+    assert np.array_equal(np.array([seen.marker_px for seen in read]), run.sensors.pixels, equal_nan=True)
 
 
 R, H = NOMINAL.plant.bellows_radius_m, NOMINAL.tick_s

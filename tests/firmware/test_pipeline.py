@@ -79,9 +79,12 @@ def _logged(ticks: int, seed: int) -> list[Inputs]:
     for name, mode in (("ellipse", MODE_POSITION), ("orientation", MODE_ORIENTATION)):
         plan = make_scenario(name, {})
         record = run_scenario(plan, SimulatedRig(), seed, "sensors", 0.5 * ticks / 60.0)
-        newest = np.clip(np.searchsorted(record.imu.taken_s, record.t_s, side="right") - 1, 0, None)
-        for k, (u, v) in enumerate(record.pixels.tolist()):
-            (ax, ay, _), gz = record.accel_mps2[newest[k]].tolist(), float(record.gyro_radps[newest[k], 2])
+        newest = np.clip(np.searchsorted(record.sensors.imu.taken_s, record.t_s, side="right") - 1, 0, None)
+        for k, (u, v) in enumerate(record.sensors.pixels.tolist()):
+            (ax, ay, _), gz = (
+                record.sensors.accel_mps2[newest[k]].tolist(),
+                float(record.sensors.gyro_radps[newest[k], 2]),
+            )
             turn = 0.3 * math.sin(0.01 * k)
             reference = (
                 (0.078 + 0.0126 * turn, 0.078 - 0.0126 * turn) if mode == MODE_POSITION else (2.0 * turn, 0.0)

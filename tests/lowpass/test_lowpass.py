@@ -241,8 +241,8 @@ def test_the_simulated_rigs_jitter_is_found_in_motion(name: str) -> None:
     log = log_of(run)
     rows = log.sampled("u_px", "v_px")
     seen = np.stack([log.columns["u_px"][rows], log.columns["v_px"][rows]], axis=1)
-    q = run.trajectory.at(run.tracker.exposed_s)[:, :2]
-    noise = run.pixels - marker_pixels(rig.view, rig.tracker, q, run.plant.bellows_radius_m)
+    q = run.trajectory.at(run.sensors.tracker.exposed_s)[:, :2]
+    noise = run.sensors.pixels - marker_pixels(rig.view, rig.tracker, q, run.plant.bellows_radius_m)
     for axis in (0, 1):
         one = noise[:, axis][~np.isnan(noise[:, axis])]
         calm = np.where(np.abs(one) < 3.0, one, 0.0)

@@ -670,7 +670,10 @@ def figure_3_16() -> tuple[Plot, Values]:
     volts, runs = _bent_runs()
     rows = []
     for run in runs:
-        acc, t = np.arctan2(run.accel_mps2[:, 1], run.accel_mps2[:, 0]), run.imu.taken_s
+        acc, t = (
+            np.arctan2(run.sensors.accel_mps2[:, 1], run.sensors.accel_mps2[:, 0]),
+            run.sensors.imu.taken_s,
+        )
         rows.append([acc[(t >= begin) & (t < begin + 1.0)].mean() for begin in (5.0, 6.0, 7.0)])
     seen, true = np.array(rows), np.array([run.phi_rad[-1] for run in runs])
     mean, spread = seen.mean(axis=1), T_OF_TWO * seen.std(axis=1, ddof=1) / math.sqrt(3)

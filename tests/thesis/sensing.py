@@ -46,15 +46,15 @@ def imu_onchip_drift() -> Values:
 
 
 def _filtered(run: Run, gains: Mahony) -> FloatArray:
-    phi_acc = accelerometer_angles(run.accel_mps2[:, 0], run.accel_mps2[:, 1])
-    return filter_log(gains, run.imu.taken_s, phi_acc, -run.gyro_radps[:, 2])[0]
+    phi_acc = accelerometer_angles(run.sensors.accel_mps2[:, 0], run.sensors.accel_mps2[:, 1])
+    return filter_log(gains, run.sensors.imu.taken_s, phi_acc, -run.sensors.gyro_radps[:, 2])[0]
 
 
 def _motion_error_mrad(Kp: float, Ki: float) -> float:
     """Deviation of the filter's error while the simulated rig moves, its mean taken off."""
     run = tried("prbs", 20.0)
-    error = _filtered(run, Mahony(Kp, Ki)) - angles_rad(run, run.imu.taken_s)
-    return float(1e3 * np.std(error[run.imu.taken_s > _SETTLED_S]))
+    error = _filtered(run, Mahony(Kp, Ki)) - angles_rad(run, run.sensors.imu.taken_s)
+    return float(1e3 * np.std(error[run.sensors.imu.taken_s > _SETTLED_S]))
 
 
 def imu_mm_gains() -> Values:
@@ -67,8 +67,8 @@ def imu_mm_gains() -> Values:
 def imu_mm_drift() -> Values:
     slopes = []
     for run in (tried("static", 60.0, seed=seed) for seed in _LOGS):
-        late = run.imu.taken_s > _SETTLED_S
-        slopes.append(np.polyfit(run.imu.taken_s[late], _filtered(run, Mahony())[late], 1)[0])
+        late = run.sensors.imu.taken_s > _SETTLED_S
+        slopes.append(np.polyfit(run.sensors.imu.taken_s[late], _filtered(run, Mahony())[late], 1)[0])
     degps = np.degrees(slopes)
     return {"mean_degps": float(degps.mean()), "largest_degps": float(np.abs(degps).max())}
 
@@ -110,7 +110,7 @@ def figure_2_4() -> tuple[Plot, Values]:
     curves = []
     for seed in _LOGS:
         run = tried("static", 60.0, seed=seed)
-        t, phi = run.imu.taken_s[::20], np.degrees(run.onchip_rad[::20])
+        t, phi = run.sensors.imu.taken_s[::20], np.degrees(run.sensors.onchip_rad[::20])
         curves.append(curve(f"log {seed + 1}", t, phi - phi[0], colour=seed))
     slopes = [figure("onchip_drift_degps", "static", 60.0, seed=seed) for seed in _LOGS]
     values: Values = {
@@ -121,8 +121,8 @@ def figure_2_4() -> tuple[Plot, Values]:
 
 def figure_2_6() -> tuple[Plot, Values]:
     run = tried("prbs", 20.0)
-    t, gyro = run.imu.taken_s, -run.gyro_radps[:, 2]
-    acc = accelerometer_angles(run.accel_mps2[:, 0], run.accel_mps2[:, 1])
+    t, gyro = run.sensors.imu.taken_s, -run.sensors.gyro_radps[:, 2]
+    acc = accelerometer_angles(run.sensors.accel_mps2[:, 0], run.sensors.accel_mps2[:, 1])
     turned = acc[0] + np.concatenate([[0.0], np.cumsum(0.5 * (gyro[1:] + gyro[:-1]) * np.diff(t))])
     kept, truth = _filtered(run, Mahony()), angles_rad(run, t)
     curves = (
@@ -280,7 +280,7 @@ def lp_cutoff() -> Values:
 def _marker_m(run: Run) -> FloatArray:
     """Marker (n, 2) [m] in the plane as the firmware maps its pixels, held where none was found."""
     H = np.linalg.inv(workspace_homography(run.rig.view))
-    rows = np.column_stack([run.pixels, np.ones(len(run.pixels))]) @ H.T
+    rows = np.column_stack([run.sensors.pixels, np.ones(len(run.sensors.pixels))]) @ H.T
     plane = rows[:, :2] / rows[:, 2:]
     at = np.maximum.accumulate(np.where(np.isfinite(plane[:, 0]), np.arange(len(plane)), 0))
     return np.asarray(plane[at])

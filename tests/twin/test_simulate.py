@@ -73,9 +73,9 @@ def test_a_loop_that_plays_commands_is_the_open_loop(feedback: str) -> None:
     # The kernel works in (l, phi): handing (q1, q2) over at each tick costs a rounding.
     assert np.allclose(closed.trajectory.nodes, opened.trajectory.nodes, rtol=0.0, atol=1e-12)
     # Sensing in portions or at once, the readings are the same.
-    assert np.array_equal(closed.pixels, opened.pixels, equal_nan=True)
-    assert np.array_equal(closed.accel_mps2, opened.accel_mps2)
-    assert np.array_equal(closed.gyro_radps, opened.gyro_radps)
+    assert np.array_equal(closed.sensors.pixels, opened.sensors.pixels, equal_nan=True)
+    assert np.array_equal(closed.sensors.accel_mps2, opened.sensors.accel_mps2)
+    assert np.array_equal(closed.sensors.gyro_radps, opened.sensors.gyro_radps)
     assert len(kept) == 200
 
 
@@ -103,10 +103,10 @@ def test_frames_show_the_past_and_samples_the_present() -> None:
     run = _run(pwm, 240, late)
     exposed = run.trajectory.at(run.t_s - 0.03)[:, :2]
     expected = marker_pixels(late.view, late.tracker, exposed, RIG.plant.bellows_radius_m)
-    assert np.array_equal(run.pixels, expected)
-    dphi = run.trajectory.at(run.imu.taken_s)
+    assert np.array_equal(run.sensors.pixels, expected)
+    dphi = run.trajectory.at(run.sensors.imu.taken_s)
     rate = (dphi[:, 2] - dphi[:, 3]) / (2.0 * RIG.plant.bellows_radius_m)
-    assert np.abs(run.gyro_radps[:, 2] / 1.006 + rate).max() < 0.02
+    assert np.abs(run.sensors.gyro_radps[:, 2] / 1.006 + rate).max() < 0.02
 
 
 def test_the_log_has_rows_of_ticks_and_of_samples_in_the_order_of_time() -> None:
