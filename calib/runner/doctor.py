@@ -164,22 +164,15 @@ def _compiled() -> str:
 
 
 def _camera() -> str:
-    """Calibrate a camera whose truth is known, without pictures."""
-    import numpy as np
-
+    """Calibrate the camera of the simulated rig from corners that are exact."""
     from calib.stages.camera.bundle import calibrate
-    from calib.stages.camera.model import Board, Camera, View, pack, project
+    from calib.stages.camera.model import View, pack
+    from calib.twin.pictures import BOARD, shots
+    from calib.twin.pictures import CAMERA as truth
+    from calib.twin.scene import PrintedBoard, corner_pixels
 
-    truth = Camera("radial2", (640, 480), 600.0, 598.0, 0.0, 320.0, 241.0)
-    target_m = Board(7, 5, 0.02).points_m()
-    target = np.column_stack([target_m, np.zeros(len(target_m))])
-    views = []
-    for k in range(8):
-        a, b = 0.5 * np.sin(0.8 * k), 0.5 * np.cos(0.8 * k)
-        R_x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
-        R_y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
-        points_C = (target - target.mean(axis=0)) @ (R_x @ R_y).T + [0.01 * (k % 3 - 1), 0.0, 0.3]
-        views.append(View(f"view {k}", target_m, project(truth, points_C)))
+    printed = PrintedBoard(BOARD)
+    views = [View(one.path, BOARD.points_m(), corner_pixels(truth, printed, one.pose)) for one in shots()]
     found = calibrate(pack(views), truth.image_size_px, "radial2")
     wrong = abs(found.camera.fx_px - truth.fx_px)
     if not wrong < 1e-3:

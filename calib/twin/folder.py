@@ -6,16 +6,14 @@
     logs/*.csv                                rig in motion
     truth.json                                all that is true of the rig, for scoring only
 
-With the nominal camera and plane the pictures are the shipped ones. For another camera the same views
-are taken so that the board fills the same part of the picture.
+With the nominal camera and plane the pictures are the shipped ones.
 """
 
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -27,20 +25,16 @@ from calib.core.writing import write_atomically
 from calib.io.logs import log_text
 from calib.twin.pictures import (
     BOARD,
-    CAMERA,
     PLANE,
-    VIEWS,
     Plane,
     Shot,
     plane_shot,
-    png_bytes,
     shots,
-    write_board_files,
     write_pictures,
 )
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
-from calib.twin.scene import PrintedBoard, corner_pixels, pose_facing, render
+from calib.twin.scene import PrintedBoard, corner_pixels
 from calib.twin.sensors import View
 from calib.twin.simulate import log_of
 
@@ -64,51 +58,16 @@ LOGS: dict[str, tuple[str, dict[str, str]]] = {
 Progress = Callable[[int, int], None]
 
 
-def _is_nominal(view: View) -> bool:
-    ours, theirs = view.camera, CAMERA
-    return bool(
-        ours.fisheye == theirs.fisheye
-        and ours.image_size_px == theirs.image_size_px
-        and np.array_equal(ours.K, theirs.K)
-        and np.array_equal(ours.distortion, theirs.distortion)
-        and np.array_equal(view.R_CW, PLANE.R_CW)
-        and np.array_equal(view.t_CW_m, PLANE.t_m)
-    )
-
-
 def _views(view: View) -> list[Shot]:
-    """The shipped views taken by another camera, and its picture of the plane."""
-    camera, printed = view.camera, PrintedBoard(BOARD)
-    width, height = camera.image_size_px
-    wide, high = width / CAMERA.image_size_px[0], height / CAMERA.image_size_px[1]
-    farther = min(camera.fx_px / (CAMERA.fx_px * wide), camera.fy_px / (CAMERA.fy_px * high))
-    taken = []
-    for shot, (u, v, depth_m, *degrees) in zip(shots(), VIEWS, strict=True):
-        tilt, azimuth, roll = (math.radians(value) for value in degrees)
-        pose = pose_facing(camera, printed, (u * wide, v * high), depth_m * farther, tilt, azimuth, roll)
-        taken.append(replace(shot, pose=pose))
-    lying = Plane(view.R_CW, view.t_CW_m, PLANE.first_corner_m, PLANE.angle_rad)
-    pose = lying.board_pose
-    corners = corner_pixels(camera, printed, pose)
-    inside = (corners > 1.0) & (corners < np.array([width - 2.0, height - 2.0]))
-    facing = float(pose.R_CB[:, 2] @ pose.t_m) > 0.0
+    """The shipped views taken by a camera, and its picture of the plane."""
+    camera = view.camera
+    lying = plane_shot(Plane(view.R_CW, view.t_CW_m, PLANE.first_corner_m, PLANE.angle_rad))
+    corners = corner_pixels(camera, PrintedBoard(BOARD), lying.pose)
+    inside = (corners > 1.0) & (corners < np.array(camera.image_size_px) - 2.0)
+    facing = float(lying.pose.R_CB[:, 2] @ lying.pose.t_m) > 0.0
     if not facing or not bool(np.all(inside)):
         raise BadInputError("plane: the camera does not see a whole board lying in the actuator's plane")
-    return [*taken, replace(plane_shot(), pose=pose)]
-
-
-def _write_pictures(view: View, folder: Path) -> None:
-    if _is_nominal(view):
-        write_pictures(folder)
-        return
-    views = _views(view)
-    (folder / "plane").mkdir(parents=True, exist_ok=True)
-    for shot in views:
-        picture = render(
-            view.camera, PrintedBoard(BOARD), shot.pose, light=shot.light, sensor=shot.sensor, seed=shot.seed
-        )
-        write_atomically(folder / shot.path, png_bytes(picture))
-    write_board_files(folder)
+    return [*shots(camera), lying]
 
 
 def _plain(value: Any) -> Any:
@@ -137,7 +96,7 @@ def write_rig_folder(
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise BadInputError(f"{shown(folder)}: is there already, expected a new or an empty folder")
         (folder / "logs").mkdir(parents=True, exist_ok=True)
-        _write_pictures(rig.view, folder / "images")
+        write_pictures(folder / "images", rig.view.camera, _views(rig.view))
     except OSError as error:
         raise BadInputError(f"{shown(folder)}: cannot be written: {error.strerror or error}") from error
     written = []

@@ -14,6 +14,7 @@ import math
 import struct
 import sys
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -119,20 +120,23 @@ def _light(index: int) -> Light:
     )
 
 
-def shots() -> list[Shot]:
-    """The seventeen views, in order."""
+def shots(camera: Camera = CAMERA) -> list[Shot]:
+    """The seventeen views, in order; before another camera the board fills the same part of the picture."""
+    wide, high = (own / ours for own, ours in zip(camera.image_size_px, CAMERA.image_size_px, strict=True))
+    farther = min(camera.fx_px / (CAMERA.fx_px * wide), camera.fy_px / (CAMERA.fy_px * high))
     taken = []
     for index, (u, v, depth_m, *degrees) in enumerate(VIEWS, start=1):
         tilt, azimuth, roll = (math.radians(value) for value in degrees)
-        pose = pose_facing(CAMERA, PrintedBoard(BOARD), (u, v), depth_m, tilt, azimuth, roll)
+        at, printed = (u * wide, v * high), PrintedBoard(BOARD)
+        pose = pose_facing(camera, printed, at, depth_m * farther, tilt, azimuth, roll)
         sensor = Sensor(blur_px=0.62 + 0.04 * (index % 5), noise_grey=2.0, gamma=1.5)
         taken.append(Shot(f"view{index:02d}.png", pose, _light(index), sensor, seed=1000 + 10 * index))
     return taken
 
 
-def plane_shot() -> Shot:
+def plane_shot(plane: Plane = PLANE) -> Shot:
     """The board lying in the actuator's plane."""
-    return Shot("plane/plane01.png", PLANE.board_pose, _light(0), Sensor(blur_px=0.7, gamma=1.5), seed=2000)
+    return Shot("plane/plane01.png", plane.board_pose, _light(0), Sensor(blur_px=0.7, gamma=1.5), seed=2000)
 
 
 def png_bytes(image: GrayImage) -> bytes:
@@ -197,28 +201,19 @@ def truth() -> dict[str, Any]:
     }
 
 
-def write_pictures(folder: Path) -> list[Path]:
-    """Write pictures and board.yaml files under `folder` and return their paths."""
+def write_pictures(folder: Path, camera: Camera, taken: Sequence[Shot]) -> None:
+    """Write pictures and the board.yaml files of a folder and of its folder `plane`."""
     (folder / "plane").mkdir(parents=True, exist_ok=True)
-    written = []
-    for shot in [*shots(), plane_shot()]:
+    for shot in taken:
         image = render(
-            CAMERA, PrintedBoard(BOARD), shot.pose, light=shot.light, sensor=shot.sensor, seed=shot.seed
+            camera, PrintedBoard(BOARD), shot.pose, light=shot.light, sensor=shot.sensor, seed=shot.seed
         )
-        written.append(folder / shot.path)
-        write_atomically(written[-1], png_bytes(image))
-    return [*written, *write_board_files(folder)]
-
-
-def write_board_files(folder: Path) -> list[Path]:
-    """Write the board.yaml of a folder of pictures and of its folder `plane`; their paths."""
+        write_atomically(folder / shot.path, png_bytes(image))
     board = f"corners: [{BOARD.columns}, {BOARD.rows}]\nsquare_m: {BOARD.square_m:.3f}\nsimulated: true\n"
     x, y = PLANE.first_corner_m
     place = f"first_corner_m: [{x:.3f}, {y:.3f}]\nangle_rad: {PLANE.angle_rad:.2f}\n"
-    written = [folder / "board.yaml", folder / "plane" / "board.yaml"]
-    for path, text in zip(written, (board, board + place), strict=True):
-        write_atomically(path, text)
-    return written
+    write_atomically(folder / "board.yaml", board)
+    write_atomically(folder / "plane" / "board.yaml", board + place)
 
 
 def main(arguments: list[str]) -> int:
@@ -226,7 +221,7 @@ def main(arguments: list[str]) -> int:
     try:
         if len(arguments) not in (1, 2) or arguments[0].startswith("-"):
             raise UsageError("usage: python -m calib.twin.pictures FOLDER [TRUTH.json]")
-        write_pictures(Path(arguments[0]))
+        write_pictures(Path(arguments[0]), CAMERA, [*shots(), plane_shot()])
         if len(arguments) == 2:
             text = json.dumps(truth(), indent=1) + "\n"
             write_atomically(Path(arguments[1]), text)
