@@ -21,6 +21,7 @@ sys.path.insert(0, str(ROOT / "tests"))
 
 import cv2
 import numpy as np
+from scipy.special import erf
 
 from calib.core.arrays import FloatArray, GrayImage
 from calib.io.pictures import list_pictures, read_picture
@@ -94,6 +95,8 @@ def _turned(corners: FloatArray, truth: FloatArray) -> FloatArray:
 
 TRUTH = {(316, 208): 6, (640, 480): 6, (1280, 960): 4, (4000, 3000): 1}
 """Sizes of rendered pictures and how many of each kind."""
+_NOISE = 2.0
+"""Grey levels."""
 
 
 def _rendered(
@@ -115,18 +118,48 @@ def _rendered(
         azimuth_rad=rng.uniform(0, 2 * np.pi),
         roll_rad=rng.uniform(-0.05, 0.05) if along_pixels else rng.uniform(-0.5, 0.5),
     )
-    gray = render(camera, printed, pose, sensor=Sensor(blur_px=blur_px, noise_grey=2.0), seed=seed)
+    gray = render(camera, printed, pose, sensor=Sensor(blur_px=blur_px, noise_grey=_NOISE), seed=seed)
     return gray, corner_pixels(camera, printed, pose)
 
 
+def _bound_px(truth: FloatArray, contrast: float, blur_px: float) -> float:
+    """Least RMSE per coordinate, px, that an unbiased estimate of single corners (54, 2) can have.
+
+    Cramer and Rao's, from all pixels nearer to a corner than to the next ones, of place, directions of the
+    edges, blur, tones and slope of the light, against the noise and the rounding to whole grey levels.
+    """
+    grid = truth.reshape(6, 9, 2)
+    steps = zip(*(np.gradient(grid, axis=axis).reshape(-1, 2) for axis in (1, 0)), strict=True)
+    v, u = np.mgrid[-40:41, -40:41]
+    variances = []
+    for (u0, v0), (along, across) in zip(truth % 1.0, steps, strict=True):
+        share = np.linalg.solve(np.column_stack([along, across]), np.stack([u.ravel() - u0, v.ravel() - v0]))
+        at = np.abs(share).max(axis=0) < 0.5
+        x, y = u.ravel()[at], v.ravel()[at]
+
+        def shown(q: FloatArray, x: FloatArray = x, y: FloatArray = y) -> FloatArray:
+            dx, dy = x - q[0], y - q[1]
+            edges = (
+                (dy * np.cos(q[2]) - dx * np.sin(q[2])) / q[4],
+                (dx * np.sin(q[3]) - dy * np.cos(q[3])) / q[4],
+            )
+            return (1 + q[7] * dx + q[8] * dy) * (q[5] + q[6] * erf(edges[0]) * erf(edges[1]))
+
+        directions = np.arctan2(along[1], along[0]), np.arctan2(across[1], across[0])
+        q = np.array([u0, v0, *directions, np.sqrt(2 * (blur_px**2 + 1 / 12)), 128.0, contrast, 0.0, 0.0])
+        J = [(shown(q + e) - shown(q - e)) / 2e-4 for e in 1e-4 * np.eye(9)]
+        variances.append(np.diag(np.linalg.inv(np.array(J) @ np.array(J).T))[:2] * (_NOISE**2 + 1 / 12))
+    return float(np.sqrt(np.mean(variances)))
+
+
 def _on_truth() -> None:
-    """Corner RMSE by size, blur and direction, beside the classic finder's and the fits' own sigma."""
-    print("\nrendered, RMSE per coordinate, px; z: over the sigma that calib gives, which is near the bound")
-    print(f"{'':34}{'calib':>8}{'classic':>9}{'ratio':>7}{'z':>6}{'boards':>8}")
+    """Corner RMSE by size, blur and direction, beside the classic finder's and the bound."""
+    print("\nrendered, RMSE per coordinate, px; bound: Cramer and Rao's; z: over the sigma that calib gives")
+    print(f"{'':34}{'calib':>8}{'classic':>9}{'ratio':>7}{'bound':>8}{'over it':>9}{'z':>6}{'boards':>8}")
     for size_px, count in TRUTH.items():
         for blur_px in (0.3, 0.7, 1.5, 3.0):
             for along_pixels in (False, True):
-                squares, theirs, sigmas, boards = [], [], [], 0
+                squares, theirs, sigmas, bounds, boards = [], [], [], [], 0
                 for seed in range(count):
                     gray, truth = _rendered(size_px, blur_px, along_pixels, seed)
                     detection, classic = detect(gray, 9, 6), _classic(gray, 9, 6)
@@ -136,15 +169,16 @@ def _on_truth() -> None:
                     on = detection.refined
                     squares.append(np.mean((_turned(detection.pixels, truth) - truth)[on] ** 2))
                     sigmas.append(np.mean(detection.sigma_px[on] ** 2))
+                    bounds.append(_bound_px(truth, detection.contrast, blur_px) ** 2)
                     if classic is not None:
                         theirs.append(np.mean((_turned(classic, truth) - truth) ** 2))
-                ours, sigma = np.sqrt(np.mean(squares)), np.sqrt(np.mean(sigmas))
+                ours, sigma, bound = (np.sqrt(np.mean(some)) for some in (squares, sigmas, bounds))
                 peer = np.sqrt(np.mean(theirs)) if theirs else np.nan
                 what = f"{size_px[0]}x{size_px[1]}, blur {blur_px}" + (
                     ", along pixels" if along_pixels else ""
                 )
-                numbers = f"{ours:8.4f}{peer:9.4f}{ours / peer:7.2f}{ours / sigma:6.2f}{boards:5d}/{count}"
-                print(f"{what:34}{numbers}", flush=True)
+                numbers = f"{ours:8.4f}{peer:9.4f}{ours / peer:7.2f}{bound:8.4f}{ours / bound:9.2f}"
+                print(f"{what:34}{numbers}{ours / sigma:6.2f}{boards:5d}/{count}", flush=True)
 
 
 def main(folders: list[str]) -> None:

@@ -3,8 +3,10 @@
 python tests/bench/verdict.py [sets of each kind, default 20]
 
 Good sets are taken with the lens named; the lens is chosen by views held back. In brackets of how many sets
-views have left. With the rational model stated half of its good sets are `poor`: noise alone puts a pole of
-its coefficients into the picture, which cannot be undistorted beyond.
+views have left. A set that is bad by some of its views may end ok without them: the last column tells, of the
+bad sets that are ok, how many of fx, fy, cx and cy lie within two standard deviations of the truth. With the
+rational model stated half of its good sets are `poor`: noise alone puts a pole of its coefficients into the
+picture, which cannot be undistorted beyond.
 """
 
 from __future__ import annotations
@@ -24,37 +26,41 @@ from sets import BAD, camera_of, good_set, take
 from calib.core.errors import BadInputError
 from calib.core.verdict import WORDS
 from calib.stages.camera.intrinsics import calibrate_camera
-from calib.stages.camera.model import MODELS, View
+from calib.stages.camera.model import INTRINSICS, MODELS, Camera, View, vector_from_camera
 
 
-def _verdict(views: list[View], size_px: tuple[int, int]) -> tuple[str, bool]:
-    """The word, and whether views left."""
+def _verdict(views: list[View], camera: Camera) -> tuple[str, bool, list[bool]]:
+    """The word, whether views left, and which of fx, fy, cx and cy are right."""
     try:
-        found = calibrate_camera(views, size_px)
+        found = calibrate_camera(views, camera.image_size_px)
     except BadInputError:
-        return "refused", False
-    return found.verdict.word, any(one.kind == "view" for one in found.left_out)
+        return "refused", False, []
+    off = np.abs(found.calibration.block.intrinsics - vector_from_camera(camera))
+    right = [bool(off[INTRINSICS.index(name)] < 2.0 * s) for name, s in found.covariance.sigma().items()]
+    return found.verdict.word, any(one.kind == "view" for one in found.left_out), right[:4]
 
 
-def _row(name: str, found: list[tuple[str, bool]]) -> None:
-    words, left = Counter(word for word, _ in found), Counter(word for word, some in found if some)
+def _row(name: str, found: list[tuple[str, bool, list[bool]]], bad: bool = False) -> None:
+    words, left = Counter(one[0] for one in found), Counter(one[0] for one in found if one[1])
     cells = [f"{words[w] or '.'}" + (f" ({left[w]})" if left[w] else "") for w in (*WORDS, "refused")]
+    right = [value for word, _, values in found if bad and word == "ok" for value in values]
+    cells.append(f"{sum(right)} of {len(right)}" if right else "")
     print(f"{name:42s}" + "".join(f"{cell:>16}" for cell in cells), flush=True)
 
 
 def main(count: int) -> None:
     """Print the tables."""
-    print(" " * 42 + "".join(f"{word:>16}" for word in (*WORDS, "refused")))
+    print(" " * 42 + "".join(f"{word:>16}" for word in (*WORDS, "refused", "ok and right")))
     for model in MODELS:
         sets = [good_set(2000 + seed, model) for seed in range(count)]
-        _row(f"good, {model}", [_verdict(views, camera.image_size_px) for views, camera in sets])
+        _row(f"good, {model}", [_verdict(*one) for one in sets])
     for name, (make, _) in BAD.items():
         sets = [make(np.random.default_rng([seed, 4242])) for seed in range(count)]
-        _row(name, [_verdict(views, camera.image_size_px) for views, camera in sets])
+        _row(name, [_verdict(*one) for one in sets], bad=True)
     rng = np.random.default_rng(0)
     for views in (10, 17, 25, 50, 100, 200, 400, 1000):
         shots, began = take(rng, camera_of(), views), time.process_time()
-        _verdict(shots, (640, 480))
+        calibrate_camera(shots, (640, 480))
         seconds = time.process_time() - began
         print(f"{views:5d} views of 35 points: {1e3 * seconds:6.0f} ms of one processor")
 

@@ -953,16 +953,19 @@ def _rescued(
 def _begun(gray: GrayImage, points: FloatArray) -> tuple[Part, LocalFit] | None:
     """The part of the picture around a grid and a first fit of its corners.
 
-    Blocks become smaller until the edges in the part are blurred.
+    Blocks are as large as the edges' blur allows, and no larger than a window needs to hold its share of a
+    square.
     """
     part = part_around(gray, points)
+    largest = max(1, int(np.ceil(WINDOW * square_px(points) / REACH_PX)))
     while part is not None:
         start = part.points
         first = fit_corners(part, start.reshape(-1, 2), frames_of(start), _FIRST_ITERATIONS, _FIRST_REACH_PX)
-        width = float(np.median(first.width_px))
-        if part.k == 1 or width >= _LEAST_WIDTH_PX:
+        k = min(largest, max(1, int(part.k * float(np.median(first.width_px)) / _LEAST_WIDTH_PX)))
+        if k == part.k:
             return _sharpened(part, first)
-        part = part_around(gray, points, min(part.k - 1, max(1, int(part.k * width))))
+        # The next time blocks can only become smaller.
+        largest, part = k, part_around(gray, points, k)
     return None
 
 
