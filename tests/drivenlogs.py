@@ -70,7 +70,7 @@ def held_log(seed: int, held_s: float) -> tuple[SimulatedRig, Rows, FloatArray, 
     state[0], state[1], state[13] = true[0, 2], true[0, :2].mean(), 0.0
     view = rig.view
     seen = marker(view_coefficients(view.camera, view.R_CW, view.t_CW_m), state, *spare)
-    felt = (*accelerometer(9.81, 0.0, state, *spare), state[6])
+    felt = (*accelerometer(state, *spare), state[6])
     camera_s, imu_s = np.arange(0.0, held_s, 1.0 / 60.0), np.arange(0.0003, held_s, 1.0 / rig.imu.rate_hz)
     readings = np.full((len(camera_s) + len(imu_s), 5), np.nan)
     readings[: len(camera_s), :2] = np.round(seen + rng.normal(0.0, NOISE[0], (len(camera_s), 2)))

@@ -13,7 +13,7 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.stages.estimator.event import CAMERA, camera_terms, imu_terms
 from calib.stages.estimator.kinematic import CONSIDERED, Rows, Setup, starting_state
-from calib.stages.estimator.reference import constants, process_noise, scalar_readings
+from calib.stages.estimator.reference import process_noise, scalar_readings
 from calib.stages.estimator.sensors import SIZE
 from calib.stages.estimator.smoother import Events, transition
 
@@ -81,7 +81,7 @@ def unscented(setup: Setup, rows: Rows, events: Events, gated: FloatArray) -> tu
                 if kind == CAMERA:
                     camera_terms(setup.view, setup.noise, setup.noise[6] ** 2, state, none, H, out)
                     return out[:2].copy()
-                imu_terms(constants(setup), setup.noise, state, none, H, out)
+                imu_terms(setup.noise, state, none, H, out)
                 return out[:3].copy()
 
             held = list(CONSIDERED)

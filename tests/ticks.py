@@ -17,6 +17,7 @@ from calib.stages.actuator.kinematics import chord_ratio_w
 from calib.stages.camera.model import FISHEYE, Camera, undistort
 from calib.stages.estimator.constant_gain import ALONE, BOOST, BOOST_TICKS, MOVING_TICKS, PATIENCE, Gains
 from calib.stages.estimator.kinematic import Rows, Setup
+from calib.stages.estimator.sensors import GRAVITY_MPS2
 
 GAINED = ("phi_rad", "length_m", "bias_rad", "rate_m")
 """Columns of what `run_gains` gives; bias and rate are per tick."""
@@ -107,7 +108,7 @@ def run_gains(gains: Gains, setup: Setup, ticks: Ticks, mean_rate: bool = False)
         [
             g.rate_hz, g.delay_ticks, g.lever_m, g.camera_phi, g.accel_phi, g.bias, g.moving_length,
             g.moving_rate, g.rest_length, g.rate_decay, g.slow, g.moving_m, g.still_m, g.gate_m,
-            setup.start.sensor[6], setup.start.head[1], setup.gravity_mps2, float(mean_rate),
+            setup.start.sensor[6], setup.start.head[1], GRAVITY_MPS2, float(mean_rate),
         ]
     )  # fmt: skip
     out = np.empty((len(ticks.t_s), len(GAINED)))

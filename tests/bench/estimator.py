@@ -65,7 +65,7 @@ def beside_filterpy() -> tuple[float, float, float]:
     events = smoother.events_of(setup, rows, outputs=False)
     count = len(events.t_s)
     levels, walk = setup.process.arrays()
-    gated, constants = np.zeros((count, 3)), np.array([9.81, 0.0])
+    gated = np.zeros((count, 3))
     kept_x, kept_P = np.empty((count, 19)), np.empty((count, 19, 19))
     nothing = (np.empty((1, 0, TRACE)), np.empty((0, 19)), np.empty((0, 19, 19)))
 
@@ -73,7 +73,7 @@ def beside_filterpy() -> tuple[float, float, float]:
         x, P, w = starting_state(setup, rows)
         smoother.forward(
             events.t_s, float(events.t_s[0]), events.kinds, events.readings, *smoother.banked(x, P, w), 0.0,
-            levels[None], walk, setup.view, constants, setup.noise, True, gated, np.empty((count, 1)), *kept,
+            levels[None], walk, setup.view, setup.noise, True, gated, np.empty((count, 1)), *kept,
         )  # fmt: skip
 
     def alone() -> None:

@@ -134,7 +134,7 @@ def drawn(seed: int, off_mm: float = 0.0, wrong: str | None = None) -> Simulated
 def _log(
     rig: SimulatedRig, kind: str, options: dict[str, str], seed: int, span: float | None, play: bool
 ) -> str:
-    run = run_scenario(make_scenario(kind, **options), rig, seed, "sensors", span)
+    run = run_scenario(make_scenario(kind, options), rig, seed, "sensors", span)
     if play:
         told = run.pwm
         run = simulate(rig, at_rest(rig), played(told, PLAY * RANGE_PWM), len(told), seed)

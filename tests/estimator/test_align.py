@@ -217,14 +217,14 @@ def _problem(
     camera_s = np.arange(4, int(60 * duration_s)) / 60.0
     imu_s = np.arange(int(100 * duration_s)) / 100.0
     pixels = camera_rows(NUMBERS, knots, c, TRUTH, camera_s).predicted
-    readings = imu_rows(9.81, 0.0, knots, c, TRUTH, imu_s).predicted
+    readings = imu_rows(knots, c, TRUTH, imu_s).predicted
     if noisy:
         pixels = pixels + 0.3 * rng.standard_normal(pixels.shape)
         readings = readings + NOISE.imu * rng.standard_normal(readings.shape)
     begin = c + np.array([0.02, 0.001]) * rng.standard_normal(c.shape)
     loose = np.full((knots.count - 5, 2), 1e3)
     stretch = Stretch(0, camera_s, pixels, imu_s, readings, knots, begin, loose)
-    return Problem(NUMBERS, 9.81, 0.0, 0.0, 1256.0, (stretch,), MEAN, SIGMA), c
+    return Problem(NUMBERS, 0.0, 1256.0, (stretch,), MEAN, SIGMA), c
 
 
 def test_exact_readings_give_the_truth_back() -> None:
@@ -233,7 +233,7 @@ def test_exact_readings_give_the_truth_back() -> None:
     fit = solve(loose, MEAN, NOISE)
     stretch = loose.stretches[0]
     assert np.abs(pictures_off(loose, stretch, fit.coefficients[0], fit.sensor)).max() < 1e-3
-    assert np.abs(readings_off(loose, stretch, fit.coefficients[0], fit.sensor)).max() < 1e-3
+    assert np.abs(readings_off(stretch, fit.coefficients[0], fit.sensor)).max() < 1e-3
     # What the motion shows well is exact; scale, d and stretch together have a direction of their own.
     assert fit.sensor[7] == pytest.approx(TRUTH[7], abs=2e-6)
     assert fit.sensor[0] == pytest.approx(TRUTH[0], abs=2e-6)
@@ -270,7 +270,7 @@ def test_the_covariance_is_the_inverse_of_the_whole_matrix() -> None:
     def off(values: FloatArray) -> FloatArray:
         moved, sensor = values[: c.size].reshape(c.shape), values[c.size :]
         seen = pictures_off(problem, stretch, moved, sensor) / fit.noise.jitter_px
-        felt = readings_off(problem, stretch, moved, sensor) / fit.noise.imu
+        felt = readings_off(stretch, moved, sensor) / fit.noise.imu
         anchor = (moved - stretch.start) / np.array([3.0, 0.1])
         return np.concatenate([seen.ravel(), felt.ravel(), anchor.ravel(), (sensor - MEAN) / SIGMA])
 
@@ -326,7 +326,7 @@ def test_gradients_by_coefficients_and_sensors_against_differences() -> None:
     def predicted(values: np.ndarray) -> np.ndarray:
         coefficients, s = values[: c.size].reshape(c.shape), values[c.size :]
         seen = camera_rows(numbers, knots, coefficients, s, t).predicted
-        felt = imu_rows(9.81, 0.001, knots, coefficients, s, t).predicted
+        felt = imu_rows(knots, coefficients, s, t).predicted
         return np.concatenate([seen.ravel(), felt.ravel()])
 
     at = np.concatenate([c.ravel(), sensor])
@@ -334,7 +334,7 @@ def test_gradients_by_coefficients_and_sensors_against_differences() -> None:
     to_c, to_s = np.zeros(c.size), np.zeros(13)
     rows = camera_rows(numbers, knots, c, sensor, t)
     gathered(rows.span, rows.basis, rows.by, weights[:14].reshape(7, 2), to_c, to_s)
-    rows = imu_rows(9.81, 0.001, knots, c, sensor, t)
+    rows = imu_rows(knots, c, sensor, t)
     gathered(rows.span, rows.basis, rows.by, weights[14:].reshape(7, 3), to_c, to_s)
     found = np.concatenate([to_c, to_s])
     for k in range(len(at)):

@@ -337,9 +337,6 @@ def test_a_bias_of_the_innovations_takes_the_word_away_and_it_comes_back() -> No
     np.testing.assert_array_equal(halves, weight)
 
 
-CONSTANTS = np.array([9.81, 0.0])
-
-
 def some(seed: int = 0) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """State, covariance, plant, view and noise."""
     setup, drive = setup_for(varied_drive(1)), Drive()
@@ -356,14 +353,14 @@ def test_gradients_agree_with_differences(kind: int) -> None:
     x, P, plant, view, noise = some()
     n, count = len(DRIVEN), 2 if kind == CAMERA else 3
     H, spare, out, work = np.zeros((3, n)), np.zeros((3, n)), np.zeros(n), np.zeros(WORK)
-    measure(kind, x, P, plant, view, CONSTANTS, noise, 0.0, H, out, work)
+    measure(kind, x, P, plant, view, noise, 0.0, H, out, work)
     for k in range(n):
         h = 1e-7 if DRIVEN[k].endswith("_m") else 1e-5
         above, below = np.zeros(n), np.zeros(n)
         for sign, to in ((1.0, above), (-1.0, below)):
             near = x.copy()
             near[k] += sign * h
-            measure(kind, near, P, plant, view, CONSTANTS, noise, 0.0, spare, to, work)
+            measure(kind, near, P, plant, view, noise, 0.0, spare, to, work)
         slope = (above[:count] - below[:count]) / (2.0 * h)
         np.testing.assert_allclose(H[:count, k], slope, rtol=2e-3, atol=2e-3)
 
@@ -374,11 +371,9 @@ def test_what_is_considered_stays_and_the_rest_learns(kind: int) -> None:
     before_x, before_P = x.copy(), P.copy()
     n = len(DRIVEN)
     out, H, work, report, gated = np.zeros(n), np.zeros((3, n)), np.zeros(WORK), np.empty(12), np.zeros(4)
-    measure(kind, x, P, plant, view, CONSTANTS, noise, 0.0, H, out, work)
+    measure(kind, x, P, plant, view, noise, 0.0, H, out, work)
     z = np.array([out[0] + 0.5, out[1] - 0.4, out[2] + 0.002, 0.0])
-    driven_event(
-        x, P, kind, z, plant, view, CONSTANTS, noise, work, False, report, gated, np.empty((0, TRACE))
-    )
+    driven_event(x, P, kind, z, plant, view, noise, work, False, report, gated, np.empty((0, TRACE)))
     held = [28, 29, 31, 32, 33]
     np.testing.assert_array_equal(x[held], before_x[held])
     np.testing.assert_array_equal(P[np.ix_(held, held)], before_P[np.ix_(held, held)])

@@ -128,7 +128,7 @@ def test_late_pictures_end_in_the_state_of_the_right_order() -> None:
     bank_x, bank_P, turned = banked(x, P, w)
     forward(
         events.t_s, float(events.t_s[0]), events.kinds, events.readings, bank_x, bank_P, turned,
-        setup.process.switch_hz, levels[None], walk, setup.view, np.array([9.81, 0.0]), setup.noise, False,
+        setup.process.switch_hz, levels[None], walk, setup.view, setup.noise, False,
         gated, weights,
         np.empty((1, 0, TRACE)), np.empty((0, SIZE)), np.empty((0, SIZE, SIZE)),
     )  # fmt: skip
@@ -311,7 +311,7 @@ def _one_event(
     report = np.empty(len(REPORT))
     bank_event(
         bank_x, bank_P, weights, 0, 1, kind, np.array(z), 0.0, 0.3, level, walk, setup.view,
-        np.array([9.81, 0.0]), setup.noise, np.zeros((levels, *WORK)), np.zeros((levels, 7)), False, report,
+        setup.noise, np.zeros((levels, *WORK)), np.zeros((levels, 7)), False, report,
         np.zeros(3), np.empty((0, TRACE)),
     )  # fmt: skip
     np.testing.assert_array_equal(bank_x[0, :, :SIZE], x)
@@ -338,7 +338,7 @@ def test_an_event_is_joseph_s_form_reading_by_reading_but_for_what_is_considered
         camera_terms(setup.view, noise, noise[6] ** 2, before, P, H, out)
         order, R = [0, 1], out[3:5].copy()
     else:
-        imu_terms(np.array([9.81, 0.0]), noise, before, P, H, out)
+        imu_terms(noise, before, P, H, out)
         order, R = [2, 0, 1], out[3:6].copy()
     for k in order:
         S = H[k] @ P @ H[k] + R[k]
@@ -558,7 +558,7 @@ def readings(state: FloatArray, camera: Camera | None = None) -> tuple[FloatArra
     """All five readings (5,) and their gradients (5, 19)."""
     by = np.empty((5, 19))
     u, v = sensors.marker(view(camera), state, by[0], by[1])
-    ax, ay = sensors.accelerometer(9.81, 0.002, state, by[2], by[3])
+    ax, ay = sensors.accelerometer(state, by[2], by[3])
     return np.array([u, v, ax, ay, sensors.gyroscope(state, by[4])]), by
 
 
@@ -601,7 +601,7 @@ def test_accelerometer_and_gyroscope_agree_with_the_simulated_imu() -> None:
     rows[:, 11] = 0.006
     rows[:, 6:9] = 0.01, 0.05, -0.04
     imu = replace(
-        Imu(), mount_angle_rad=0.05, lever_m=(0.002, 0.006), gyro_scale=(0.0, 0.0, -0.01),
+        Imu(), mount_angle_rad=0.05, lever_m=(0.0, 0.006), gyro_scale=(0.0, 0.0, -0.01),
         accel_scale=(0.004, -0.003, 0.0), gyro_step_radps=0.0, accel_step_mps2=0.0,
         accel_range_mps2=1e6, gyro_range_radps=1e6,
     )  # fmt: skip

@@ -190,14 +190,12 @@ class Problem:
 
     Attributes
     ----------
-    view : (25,) of `sensors.view_coefficients`. gravity_mps2, across_m : g and c_n.
+    view : (25,) of `sensors.view_coefficients`.
     grid_px : step of the pixels, 0 for none. area_px2 : over which outliers lie.
     mean, sigma : (13,) prior of `SENSOR`.
     """
 
     view: FloatArray
-    gravity_mps2: float
-    across_m: float
     grid_px: float
     area_px2: float
     stretches: tuple[Stretch, ...]
@@ -240,12 +238,10 @@ def _pictures(
         yield stretch.pixels[part] - rows.predicted, rows
 
 
-def _readings(
-    problem: Problem, stretch: Stretch, c: FloatArray, sensor: FloatArray
-) -> Iterator[tuple[FloatArray, Rows]]:
+def _readings(stretch: Stretch, c: FloatArray, sensor: FloatArray) -> Iterator[tuple[FloatArray, Rows]]:
     """Readings (k, 3) of the IMU minus predicted with their rows, a chunk at a time."""
     for part in chunks(len(stretch.imu_s)):
-        rows = imu_rows(problem.gravity_mps2, problem.across_m, stretch.knots, c, sensor, stretch.imu_s[part])
+        rows = imu_rows(stretch.knots, c, sensor, stretch.imu_s[part])
         yield stretch.readings[part] - rows.predicted, rows
 
 
@@ -254,9 +250,9 @@ def pictures_off(problem: Problem, stretch: Stretch, c: FloatArray, sensor: Floa
     return np.concatenate([off for off, _ in _pictures(problem, stretch, c, sensor)])
 
 
-def readings_off(problem: Problem, stretch: Stretch, c: FloatArray, sensor: FloatArray) -> FloatArray:
+def readings_off(stretch: Stretch, c: FloatArray, sensor: FloatArray) -> FloatArray:
     """Readings (m, 3) of the IMU minus predicted, NaN where one is missing."""
-    return np.concatenate([off for off, _ in _readings(problem, stretch, c, sensor)])
+    return np.concatenate([off for off, _ in _readings(stretch, c, sensor)])
 
 
 def _picture_terms(
@@ -292,7 +288,7 @@ def _loss(problem: Problem, cs: list[FloatArray], s: FloatArray, noise: Noise) -
     total = 0.5 * float((((s - problem.mean) / problem.sigma) ** 2).sum())
     for stretch, c in zip(problem.stretches, cs, strict=True):
         total += sum(_picture_terms(problem, noise, off)[0] for off, _ in _pictures(problem, stretch, c, s))
-        total += sum(imu_terms(off, noise.imu)[0] for off, _ in _readings(problem, stretch, c, s))
+        total += sum(imu_terms(off, noise.imu)[0] for off, _ in _readings(stretch, c, s))
         total += _prior(stretch, c)[0]
     return total
 
@@ -318,7 +314,7 @@ def _normal(
             normal_sums(rows.span, rows.basis, rows.by, weight, A, B, C)
             gathered(rows.span, rows.basis, rows.by, pull, to_c, to_s)
             good.append(likely)
-        for off, rows in _readings(problem, stretch, c, s):
+        for off, rows in _readings(stretch, c, s):
             _, pull, weight = imu_terms(off, noise.imu)
             normal_sums(rows.span, rows.basis, rows.by, weight, A, B, C)
             gathered(rows.span, rows.basis, rows.by, pull, to_c, to_s)
@@ -711,7 +707,7 @@ def check_accelerometer(problem: Problem, source: str, sensor: FloatArray) -> No
     """
     power, straight, mirrored = 0.0, 0j, 0j
     for stretch in problem.stretches:
-        for off, rows in _readings(problem, stretch, stretch.start, sensor):
+        for off, rows in _readings(stretch, stretch.start, sensor):
             known = np.isfinite(off[:, 0] + off[:, 1])
             p, e = (values[known, 0] + 1j * values[known, 1] for values in (rows.predicted, off))
             r = p + e
@@ -801,7 +797,7 @@ def _imu_noise(
     squares, count, taken = np.zeros(3), np.zeros(3), np.zeros(3)
     for i, (stretch, c) in enumerate(zip(problem.stretches, cs, strict=True)):
         done = 0
-        for off, rows in _readings(problem, stretch, c, s):
+        for off, rows in _readings(stretch, c, s):
             _, pull, weight = imu_terms(off, noise.imu)
             squares += np.where(np.isfinite(off), pull * off, 0.0).sum(axis=0)
             count += (weight > 0.0).sum(axis=0)
@@ -877,7 +873,7 @@ def response(problem: Problem, fit: Fit, i: int, change: FloatArray) -> FloatArr
     """Change (13,) of the sensors' quantities when predictions of stretch i's IMU change by so much (3,)."""
     stretch, c = problem.stretches[i], fit.coefficients[i]
     to_c, to_s = np.zeros(c.size), np.zeros(len(SENSOR))
-    for off, rows in _readings(problem, stretch, c, fit.sensor):
+    for off, rows in _readings(stretch, c, fit.sensor):
         _, _, weight = imu_terms(off, fit.noise.imu)
         gathered(rows.span, rows.basis, rows.by, -weight * change, to_c, to_s)
     return np.asarray(cho_solve(fit.arrow.S, to_s - fit.arrow.X[i].T @ to_c))
@@ -926,8 +922,6 @@ class Settings:
     mean: FloatArray
     sigma: FloatArray
     grid_px: float = 1.0
-    gravity_mps2: float = GRAVITY_MPS2
-    across_m: float = 0.0
     gyro_walk: float = 1e-5
     accel_walk: float = 1e-4
 
@@ -987,18 +981,18 @@ class Alignment:
         return np.sqrt(np.diag(self.covariance))
 
 
-def rest_angle(sensor: FloatArray, gravity_mps2: float = GRAVITY_MPS2) -> tuple[float, FloatArray]:
+def rest_angle(sensor: FloatArray) -> tuple[float, FloatArray]:
     """Angle that the accelerometer reads at phi = 0 at rest, and its gradient (13,)."""
     alpha = sensor[_MOUNT]
     ca, sa = math.cos(alpha), math.sin(alpha)
-    x = (1.0 + sensor[_SX]) * gravity_mps2 * ca + sensor[_AX]
-    y = (1.0 + sensor[_SY]) * gravity_mps2 * sa + sensor[_AY]
+    x = (1.0 + sensor[_SX]) * GRAVITY_MPS2 * ca + sensor[_AX]
+    y = (1.0 + sensor[_SY]) * GRAVITY_MPS2 * sa + sensor[_AY]
     square = x * x + y * y
     by_x, by_y = -y / square, x / square
     gradient = np.zeros(len(SENSOR))
     gradient[_AX], gradient[_AY] = by_x, by_y
-    gradient[_SX], gradient[_SY] = by_x * gravity_mps2 * ca, by_y * gravity_mps2 * sa
-    gradient[_MOUNT] = gravity_mps2 * (by_y * (1.0 + sensor[_SY]) * ca - by_x * (1.0 + sensor[_SX]) * sa)
+    gradient[_SX], gradient[_SY] = by_x * GRAVITY_MPS2 * ca, by_y * GRAVITY_MPS2 * sa
+    gradient[_MOUNT] = GRAVITY_MPS2 * (by_y * (1.0 + sensor[_SY]) * ca - by_x * (1.0 + sensor[_SX]) * sa)
     return math.atan2(y, x), gradient
 
 
@@ -1027,7 +1021,7 @@ def _traces(problem: Problem, first: FloatArray, fit: Fit) -> tuple[Trace, ...]:
                 stretch.log, stretch.camera_s, good,
                 pictures_off(problem, stretch, c, first), pictures_off(problem, stretch, c, fit.sensor),
                 stretch.imu_s,
-                readings_off(problem, stretch, c, first), readings_off(problem, stretch, c, fit.sensor),
+                readings_off(stretch, c, first), readings_off(stretch, c, fit.sensor),
             )
         )  # fmt: skip
     return tuple(out)
@@ -1086,7 +1080,7 @@ def align(logs: Sequence[AlignLog], settings: Settings) -> Alignment:
     mean = settings.mean.copy()
     mean[_MOUNT] = 0.0
     problem = Problem(
-        settings.view, settings.gravity_mps2, settings.across_m, settings.grid_px, _OUTLIER_AREA_PX2,
+        settings.view, settings.grid_px, _OUTLIER_AREA_PX2,
         first.stretches, mean, settings.sigma,
     )  # fmt: skip
     if first.moves:
@@ -1096,7 +1090,7 @@ def align(logs: Sequence[AlignLog], settings: Settings) -> Alignment:
     sensor[_OFFSET] = first.time_offset_s
     fit = solve(problem, sensor, _FIRST_NOISE)
     covariance = fit.covariance + _walked(settings, problem, fit)
-    angle, gradient = rest_angle(fit.sensor, settings.gravity_mps2)
+    angle, gradient = rest_angle(fit.sensor)
     # Before: the sensors as they were assumed to be.
     before = mean.copy()
     before[_MOUNT] = 0.0

@@ -138,9 +138,9 @@ def _seen(view: FloatArray, states: FloatArray, out: FloatArray, by: FloatArray)
 
 
 @kernel()
-def _felt(gravity: float, across: float, states: FloatArray, out: FloatArray, by: FloatArray) -> None:
+def _felt(states: FloatArray, out: FloatArray, by: FloatArray) -> None:
     for n in range(len(states)):
-        out[n, 0], out[n, 1] = accelerometer(gravity, across, states[n], by[n, 0], by[n, 1])
+        out[n, 0], out[n, 1] = accelerometer(states[n], by[n, 0], by[n, 1])
         out[n, 2] = gyroscope(states[n], by[n, 2])
 
 
@@ -153,14 +153,12 @@ def camera_rows(view: FloatArray, knots: Knots, c: FloatArray, sensor: FloatArra
     return Rows(span, basis, out, by)
 
 
-def imu_rows(
-    gravity: float, across: float, knots: Knots, c: FloatArray, sensor: FloatArray, t_s: FloatArray
-) -> Rows:
+def imu_rows(knots: Knots, c: FloatArray, sensor: FloatArray, t_s: FloatArray) -> Rows:
     """Readings a_x, a_y, g_z at the times (n,)."""
     span, basis = basis_rows(knots, t_s)
     states = states_of(span, basis, c, sensor)
     out, by = np.empty((len(t_s), 3)), np.empty((len(t_s), 3, SIZE))
-    _felt(gravity, across, states, out, by)
+    _felt(states, out, by)
     return Rows(span, basis, out, by)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.stages.estimator.kinematic import Setup
-from calib.stages.estimator.sensors import marker
+from calib.stages.estimator.sensors import GRAVITY_MPS2, marker
 
 # ----------------------------------------------------------------------
 # Gains of the fused estimator of `calib.stages.estimator.constant_gain`: what it runs with, and how they
@@ -197,5 +197,5 @@ def tick_noise(setup: Setup) -> TickNoise:
         float(camera[0]),
         float(camera[1]),
         float(setup.noise[4]),
-        math.hypot(float(setup.noise[3]), SHAKING_RADPS2 * reach) / setup.gravity_mps2,
+        math.hypot(float(setup.noise[3]), SHAKING_RADPS2 * reach) / GRAVITY_MPS2,
     )

@@ -45,6 +45,7 @@ from calib.stages.estimator.kinematic import (
     write_columns,
 )
 from calib.stages.estimator.sensors import (
+    GRAVITY_MPS2,
     SENSOR,
     SIZE,
     accelerometer,
@@ -685,8 +686,8 @@ def _spread_out(h: FloatArray, H: FloatArray) -> None:
 
 @kernel(arrays=False)
 def measure(
-    kind: int, x: FloatArray, P: FloatArray, plant: FloatArray, view: FloatArray, constants: FloatArray,
-    noise: FloatArray, stamp: float, H: FloatArray, out: FloatArray, work: FloatArray,
+    kind: int, x: FloatArray, P: FloatArray, plant: FloatArray, view: FloatArray, noise: FloatArray,
+    stamp: float, H: FloatArray, out: FloatArray, work: FloatArray,
 ) -> None:  # fmt: skip
     """Predicted readings out[0:3] and variances of their noise out[3:6]; H (3, 36) gets the gradients.
 
@@ -705,13 +706,13 @@ def measure(
         return
     by_phi, by_length = work[8], work[9]
     state[4], state[5] = accelerations(plant, x, by_phi, by_length, work[1])
-    out[0], out[1] = accelerometer(constants[0], constants[1], state, h0, h1)
+    out[0], out[1] = accelerometer(state, h0, h1)
     tilt = x[0] + x[26]
-    moved_x = out[0] - x[24] - constants[0] * math.cos(tilt)
-    moved_y = out[1] - x[25] - constants[0] * math.sin(tilt)
+    moved_x = out[0] - x[24] - GRAVITY_MPS2 * math.cos(tilt)
+    moved_y = out[1] - x[25] - GRAVITY_MPS2 * math.sin(tilt)
     moved = moved_x * moved_x + moved_y * moved_y
     # Of a swing at _SWING_RADPS the acceleration changes by so much in a second.
-    turning = constants[0] * constants[0] * x[2] * x[2] + _SWING_RADPS * _SWING_RADPS * moved
+    turning = GRAVITY_MPS2 * GRAVITY_MPS2 * x[2] * x[2] + _SWING_RADPS * _SWING_RADPS * moved
     scale = noise[5] * noise[5] * moved + stamp * turning
     for k in range(2):
         _spread_out(h[k], H[k])
@@ -728,7 +729,7 @@ def measure(
 @kernel(arrays=False)
 def driven_event(
     x: FloatArray, P: FloatArray, kind: int, z: FloatArray, plant: FloatArray, view: FloatArray,
-    constants: FloatArray, noise: FloatArray, work: FloatArray, again: bool, report: FloatArray,
+    noise: FloatArray, work: FloatArray, again: bool, report: FloatArray,
     gated: FloatArray, trace: FloatArray,
 ) -> None:  # fmt: skip
     """Update a predicted state by an event, in place.
@@ -737,7 +738,7 @@ def driven_event(
     ----------
     kind, z : `CAMERA`, `IMU` or `HOSES` and (4,) its readings, NaN where missing, and the variance of its
         time [s^2]; of `HOSES` the deviation that the damping then has.
-    plant : (21,). view, constants, noise : as in `kinematic.bank_event`.
+    plant : (21,). view, noise : as in `kinematic.bank_event`.
     work : scratch of the shape `WORK`. report : (12,) of `event.REPORT`, written to.
     again : whether the event is done once more; then `gated` (3,) holds.
     trace : (3, `TRACE`) what each reading did, for the smoother; (0, `TRACE`) for nothing.
@@ -761,7 +762,7 @@ def driven_event(
         update(x, P, y, S, p, learnt)
         leave(trace, 0, H[0], p, y, S)
     else:
-        measure(kind, x, P, plant, view, constants, noise, stamp, H, out, work)
+        measure(kind, x, P, plant, view, noise, stamp, H, out, work)
         told = work[11:12]
         chi_squares(kind, P, H, z, out, noise, e, work[12:15], work[15:18], told[0], int(SIZE_D))
         if not again:
@@ -926,7 +927,7 @@ def run_driven(
     ring_gated: FloatArray, ring_let_go: FloatArray, switch_t: FloatArray, switch_g: FloatArray,
     whole: IntArray, real: FloatArray,
     camera_clock: FloatArray, imu_clock: FloatArray, x0: FloatArray, P0: FloatArray, plant: FloatArray,
-    walk: FloatArray, view: FloatArray, constants: FloatArray, noise: FloatArray, radius: float,
+    walk: FloatArray, view: FloatArray, noise: FloatArray, radius: float,
     delay: float, action: float, hoses_sigma: float, z: FloatArray, report: FloatArray, spare: FloatArray,
     spare_x: FloatArray, spare_P: FloatArray, F: FloatArray, work: FloatArray, untraced: FloatArray,
     out: FloatArray,
@@ -1035,7 +1036,7 @@ def run_driven(
                             ring_gated[now, k] = 1.0
                         continue
                     driven_event(
-                        x, P, ring_kind[now], ring_z[now], plant, view, constants, noise, work,
+                        x, P, ring_kind[now], ring_z[now], plant, view, noise, work,
                         now != own and trial == 0, report if now == own else spare, ring_gated[now],
                         untraced,
                     )  # fmt: skip
@@ -1136,7 +1137,7 @@ class DrivenFilter:
             self._z, self._kind, self._gated, self._let_go, self._switch_t, self._switch_g, self._whole,
             self._real,
             self._camera_clock, self._imu_clock, *self._start, self._numbers, self._walk, setup.view,
-            np.array([setup.gravity_mps2, setup.lever_across_m]), self._noise, setup.bellows_radius_m,
+            self._noise, setup.bellows_radius_m,
             self._delay, drive.pump.delay_ticks * drive.pump.tick_s, drive.sigma[1], *self._scratch, out,
         )  # fmt: skip
         return out
@@ -1192,7 +1193,7 @@ def _forward(
     t: FloatArray, before_s: float, first_s: float, kinds: IntArray, readings: FloatArray, x: FloatArray,
     P: FloatArray, marks: FloatArray, switch_t: FloatArray, switch_g: FloatArray,
     x0: FloatArray, P0: FloatArray, plant: FloatArray, walk: FloatArray, view: FloatArray,
-    constants: FloatArray, noise: FloatArray, kept_x: FloatArray, kept_P: FloatArray, trace: FloatArray,
+    noise: FloatArray, kept_x: FloatArray, kept_P: FloatArray, trace: FloatArray,
     F: FloatArray, chained: BoolArray, alive: BoolArray, keep: int, hoses_sigma: float, radius: float,
 ) -> None:  # fmt: skip
     """The filter over events, keeping what is shown; state and counters after the event `keep` are left."""
@@ -1235,7 +1236,7 @@ def _forward(
         if kind == IMU and t[k] < marks[_SMOOTHER_BEGUN] + SETTLING_S:
             z[0], z[1] = math.nan, math.nan
         if marks[_SMOOTHER_STARTED] == 1.0 and kind != 0:
-            driven_event(x, P, kind, z, plant, view, constants, noise, work, False, report, gated, trace[k])
+            driven_event(x, P, kind, z, plant, view, noise, work, False, report, gated, trace[k])
             for i in range(3):
                 if report[8 + i] == 1.0:
                     marks[min(i, 1)] += 1.0
@@ -1381,7 +1382,6 @@ def smooth_driven(setup: Setup, drive: Drive, rows: Rows, pwm: FloatArray, outpu
     t, kinds, readings, at, switch_t, switch_g = _timeline(setup, drive, rows, pwm)
     x, P = drive.start(setup)
     x0, P0 = x.copy(), P.copy()
-    constants = np.array([setup.gravity_mps2, setup.lever_across_m])
     marks = np.array([0.0, 0.0, np.nan, 0.0, 0.0, 0.0])
     plant, walk, noise = drive.numbers(), drive.walk(setup), drive.noise(setup)
     out = outputs.copy()
@@ -1398,7 +1398,7 @@ def smooth_driven(setup: Setup, drive: Drive, rows: Rows, pwm: FloatArray, outpu
         chained, alive = np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
         _forward(
             t[part], before, first, kinds[part], readings[part], x, P, marks, switch_t, switch_g,
-            x0, P0, plant, walk, setup.view, constants, noise, kept_x, kept_P, trace, F, chained,
+            x0, P0, plant, walk, setup.view, noise, kept_x, kept_P, trace, F, chained,
             alive, end - begin - 1, drive.sigma[1], setup.bellows_radius_m,
         )  # fmt: skip
         wanted = np.where(alive & (kinds[part] == 0), at[part], -1)

@@ -20,7 +20,7 @@ import math
 
 from calib.core.arrays import FloatArray
 from calib.core.compilation import kernel
-from calib.stages.estimator.sensors import accelerometer, gyroscope, marker, update_terms
+from calib.stages.estimator.sensors import GRAVITY_MPS2, accelerometer, gyroscope, marker, update_terms
 
 CAMERA, IMU = 1, 2
 """Kinds of events; a picture has the readings (u, v), a sample (a_x, a_y, g_z), NaN where missing."""
@@ -69,22 +69,20 @@ def camera_terms(
 
 
 @kernel(arrays=False)
-def imu_terms(
-    constants: FloatArray, noise: FloatArray, x: FloatArray, P: FloatArray, H: FloatArray, out: FloatArray
-) -> None:
+def imu_terms(noise: FloatArray, x: FloatArray, P: FloatArray, H: FloatArray, out: FloatArray) -> None:
     """Predicted a_x, a_y, g_z and variances of their noise, for a state (19,) that holds its accelerations.
 
     Length and lever act on the accelerometer through ddphi, which is estimated from the same readings; errors
     in what multiplies them would pass for knowledge and pull the length by a millimetre at rest. So they go
     into the noise. For the same reason the gyroscope's scale is learnt only from rates that tell.
     """
-    out[0], out[1] = accelerometer(constants[0], constants[1], x, H[0], H[1])
+    out[0], out[1] = accelerometer(x, H[0], H[1])
     out[2] = gyroscope(x, H[2])
     if x[2] * x[2] < TELLING * P[2, 2]:
         H[2, 10] = 0.0
     tilt = x[0] + x[9]
-    moved_x = out[0] - x[7] - constants[0] * math.cos(tilt)
-    moved_y = out[1] - x[8] - constants[0] * math.sin(tilt)
+    moved_x = out[0] - x[7] - GRAVITY_MPS2 * math.cos(tilt)
+    moved_y = out[1] - x[8] - GRAVITY_MPS2 * math.sin(tilt)
     scale = noise[5] * noise[5] * (moved_x * moved_x + moved_y * moved_y)
     for k in range(2):
         unknown = H[k, 1] * H[k, 1] * P[1, 1] + H[k, 11] * H[k, 11] * P[11, 11]

@@ -448,7 +448,7 @@ def mixes(kind: int, since: float) -> bool:
 def bank_event(
     bank_x: FloatArray, bank_P: FloatArray, weights: FloatArray, old: int, new: int, kind: int, z: FloatArray,
     dt: float, switch_hz: float, levels: FloatArray, walk: FloatArray, view: FloatArray,
-    constants: FloatArray, noise: FloatArray, work: FloatArray, told: FloatArray, again: bool,
+    noise: FloatArray, work: FloatArray, told: FloatArray, again: bool,
     report: FloatArray, gated: FloatArray, trace: FloatArray,
 ) -> None:  # fmt: skip
     """Carry the bank on to an event and update it.
@@ -459,7 +459,7 @@ def bank_event(
     weights : (slots, M + 1) weights of the levels, and the time since they were last mixed [s].
     kind, z, dt : `CAMERA`, `IMU` or 0 for none; (3,) readings; time since the event before [s].
     switch_hz, levels, walk : of `Kinematic`, (M, 8) levels.
-    view, constants, noise : camera (25,), gravity and lever across (2,), `NOISE` (11,).
+    view, noise : camera (25,), `NOISE` (11,).
     work, told : (M, *`WORK`) and (M, 7) scratch.
     again : whether the event is done once more; then `gated` (3,) holds.
     report : (12,) of `REPORT`, written to.
@@ -488,7 +488,7 @@ def bank_event(
         if kind == CAMERA:
             camera_terms(view, noise, stamp, x, P, work[m], out)
         elif kind == IMU:
-            imu_terms(constants, noise, x, P, work[m], out)
+            imu_terms(noise, x, P, work[m], out)
         if kind != 0:
             chi_squares(
                 kind, P, work[m], z, out, noise, work[m, 4], work[m, 5:8], work[m, 8:], told[m], int(WIDTH)
@@ -566,7 +566,6 @@ class Setup:
     noise : (11,) of `event.NOISE`.
     start : prior. `sensor[7]`, the time offset, is the delay of the pictures.
     bellows_radius_m : r_B.
-    gravity_mps2, lever_across_m : g and the IMU's place across the tangent.
     process : bank of levels.
     camera_period_s, imu_period_s : nominal; NaN takes the stamps as they are.
     """
@@ -575,8 +574,6 @@ class Setup:
     noise: FloatArray
     start: Start
     bellows_radius_m: float
-    gravity_mps2: float = 9.81
-    lever_across_m: float = 0.0
     process: Kinematic = field(default_factory=Kinematic)
     camera_period_s: float = math.nan
     imu_period_s: float = math.nan
@@ -856,8 +853,8 @@ def run_filter(
     bank_x: FloatArray, bank_P: FloatArray, weights: FloatArray, ring_t: FloatArray, ring_z: FloatArray,
     ring_kind: IntArray, ring_gated: FloatArray, whole: IntArray, real: FloatArray,
     camera_clock: FloatArray, imu_clock: FloatArray,
-    switch_hz: float, levels: FloatArray, walk: FloatArray, view: FloatArray, constants: FloatArray,
-    noise: FloatArray, head: FloatArray, head_sigma: FloatArray, radius: float, delay: float,
+    switch_hz: float, levels: FloatArray, walk: FloatArray, view: FloatArray, noise: FloatArray,
+    head: FloatArray, head_sigma: FloatArray, radius: float, delay: float,
     work: FloatArray, told: FloatArray, report: FloatArray, spare: FloatArray, untraced: FloatArray,
     never: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
@@ -928,7 +925,7 @@ def run_filter(
                         whole[_CAMERA_STARTED], whole[_PENDING] = 1, 0
                 bank_event(
                     bank_x, bank_P, weights, before, now, ring_kind[now], ring_z[now],
-                    ring_t[now] - ring_t[before], switch_hz, levels, walk, view, constants, noise, work, told,
+                    ring_t[now] - ring_t[before], switch_hz, levels, walk, view, noise, work, told,
                     i > 0, report if i == 0 else spare, ring_gated[now], untraced,
                 )  # fmt: skip
                 flags |= _mend(bank_x, bank_P, now, head, head_sigma, radius, p)
@@ -1031,7 +1028,7 @@ class Filter:
             rows.t_s, rows.readings, rows.kinds, self._x, self._P, self._w, self._t, self._z, self._kind,
             self._gated, self._whole, self._real, self._camera_clock, self._imu_clock,
             setup.process.switch_hz, self._levels, self._walk, setup.view,
-            np.array([setup.gravity_mps2, setup.lever_across_m]), setup.noise, setup.start.head,
+            setup.noise, setup.start.head,
             setup.start.head_sigma, setup.bellows_radius_m, self._delay, *self._scratch, out,
         )  # fmt: skip
         return out

@@ -46,11 +46,6 @@ def process_noise(level: FloatArray, walk: FloatArray, dt: float) -> FloatArray:
     return Q
 
 
-def constants(setup: Setup) -> FloatArray:
-    """Gravity and lever as `event.imu_terms` takes them."""
-    return np.array([setup.gravity_mps2, setup.lever_across_m])
-
-
 def scalar_readings(
     setup: Setup, kind: int, z: FloatArray, x: FloatArray, P: FloatArray
 ) -> list[tuple[float, float, FloatArray, float, bool]]:
@@ -60,7 +55,7 @@ def scalar_readings(
     if kind == CAMERA:
         camera_terms(setup.view, noise, noise[6] ** 2, x, P, H, out)
         return [(z[k], out[k], H[k].copy(), out[3 + k], True) for k in range(2)]
-    imu_terms(constants(setup), noise, x, P, H, out)
+    imu_terms(noise, x, P, H, out)
     return [(z[k], out[k], H[k].copy(), out[3 + k], False) for k in (2, 0, 1) if not math.isnan(z[k])]
 
 

@@ -115,9 +115,9 @@ def update_terms(innovation: float, spread: float, jitter: float, grid: float) -
 #     r = rho'' - rho dphi^2 / 4,   x = rho ddphi / 2 + rho' dphi
 #
 # along and across the chord the head accelerates by A_t = r cos h + x sin h along its tangent and by
-# A_n = -r sin h + x cos h across it. At the lever (c_n, c_t) across and along the tangent, with gravity g,
+# A_n = -r sin h + x cos h across it. At the lever c along the tangent, with gravity g,
 #
-#     f_x = g cos phi - (A_t - ddphi c_n - dphi^2 c_t),   f_y = g sin phi + A_n + ddphi c_t - dphi^2 c_n
+#     f_x = g cos phi - A_t + dphi^2 c,   f_y = g sin phi + A_n + ddphi c
 #
 # is the specific force a - g in the IMU's axes, x towards the base. Mounted at the angle alpha it reads
 #
@@ -350,8 +350,7 @@ def marker(view: FloatArray, state: FloatArray, by_u: FloatArray, by_v: FloatArr
 
 @kernel(arrays=False)
 def accelerometer_terms(
-    gravity: float, across: float, phi: float, length: float, dphi: float, dl: float, ddphi: float,
-    ddl: float, alpha: float, lever: float,
+    phi: float, length: float, dphi: float, dl: float, ddphi: float, ddl: float, alpha: float, lever: float
 ) -> tuple[float, ...]:  # fmt: skip
     """Specific force of the mounted IMU without biases and scales, that at rest, and pairs of derivatives.
 
@@ -359,9 +358,9 @@ def accelerometer_terms(
 
     Parameters
     ----------
-    gravity, across : g [m/s^2] and the lever c_n across the tangent [m].
     phi .. ddl : motion of the head. alpha, lever : mount angle and the lever along the tangent.
     """
+    gravity = GRAVITY_MPS2
     w = phi * phi
     S, D = chord_ratio_w(w), chord_decay_w(w)
     E = decay_slope_w(w)
@@ -380,15 +379,15 @@ def accelerometer_terms(
     r_dl, x_dl = 2.0 * S1 * dphi, S * dphi
     r_ddphi, x_ddphi = length * S1, 0.5 * rho
     A_t, A_n = r * ch + x * sh, x * ch - r * sh
-    f_x = gravity * c - A_t + ddphi * across + spin2 * lever
-    f_y = gravity * s + A_n + ddphi * lever - spin2 * across
+    f_x = gravity * c - A_t + spin2 * lever
+    f_y = gravity * s + A_n + ddphi * lever
     x0 = -gravity * s - (r_phi * ch + x_phi * sh + 0.5 * A_n)
     y0 = gravity * c + (x_phi * ch - r_phi * sh - 0.5 * A_t)
     x1, y1 = -(r_l * ch + x_l * sh), x_l * ch - r_l * sh
     x2 = -(r_dphi * ch + x_dphi * sh) + 2.0 * dphi * lever
-    y2 = x_dphi * ch - r_dphi * sh - 2.0 * dphi * across
+    y2 = x_dphi * ch - r_dphi * sh
     x3, y3 = -(r_dl * ch + x_dl * sh), x_dl * ch - r_dl * sh
-    x4, y4 = across - (r_ddphi * ch + x_ddphi * sh), lever + x_ddphi * ch - r_ddphi * sh
+    x4, y4 = -(r_ddphi * ch + x_ddphi * sh), lever + x_ddphi * ch - r_ddphi * sh
     x5, y5 = -S * ch, -S * sh
     ca, sa = math.cos(alpha), math.sin(alpha)
     return (
@@ -401,19 +400,16 @@ def accelerometer_terms(
 
 
 @kernel(arrays=False)
-def accelerometer(
-    gravity: float, across: float, state: FloatArray, by_x: FloatArray, by_y: FloatArray
-) -> tuple[float, float]:
+def accelerometer(state: FloatArray, by_x: FloatArray, by_y: FloatArray) -> tuple[float, float]:
     """Specific force (a_x, a_y) [m/s^2] that the mounted IMU reads.
 
     Parameters
     ----------
-    gravity, across : g [m/s^2] and the lever c_n across the tangent [m].
     state : (19,) of `HEAD` and `SENSOR`.
     by_x, by_y : (19,) gradients, written to.
     """
     found = accelerometer_terms(
-        gravity, across, state[0], state[1], state[2], state[3], state[4], state[5], state[9], state[11]
+        state[0], state[1], state[2], state[3], state[4], state[5], state[9], state[11]
     )
     grow_x, grow_y = 1.0 + state[17], 1.0 + state[18]
     for k in range(by_x.shape[0]):

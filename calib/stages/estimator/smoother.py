@@ -101,7 +101,7 @@ def events_of(setup: Setup, rows: Rows, outputs: bool = True) -> Events:
 def forward(
     t: FloatArray, before_s: float, kinds: IntArray, readings: FloatArray, bank_x: FloatArray,
     bank_P: FloatArray, weights: FloatArray, switch_hz: float, levels: FloatArray, walk: FloatArray,
-    view: FloatArray, constants: FloatArray, noise: FloatArray, again: bool, gated: FloatArray,
+    view: FloatArray, noise: FloatArray, again: bool, gated: FloatArray,
     kept_weights: FloatArray, trace: FloatArray, kept_x: FloatArray, kept_P: FloatArray,
 ) -> float:  # fmt: skip
     """A bank over all events; its log likelihood.
@@ -124,7 +124,7 @@ def forward(
         new = 1 - old if count > 1 else 0
         bank_event(
             bank_x, bank_P, weights, old, new, kinds[k], readings[k], dt, switch_hz,
-            levels[k if levels.shape[0] > 1 else 0], walk, view, constants, noise, work, told, again, report,
+            levels[k if levels.shape[0] > 1 else 0], walk, view, noise, work, told, again, report,
             gated[k], trace[k if trace.shape[0] > 1 else 0],
         )  # fmt: skip
         for m in range(count):
@@ -339,7 +339,7 @@ def one_level(setup: Setup, rows: Rows, events: Events) -> OneLevel:
     kept = OneLevel(np.zeros((n, 3)), np.empty((n, SIZE)), np.empty((n, SIZE, SIZE)), np.empty((n, 3, TRACE)))
     forward(
         events.t_s, begin, events.kinds, events.readings, *banked(x[:1], P[:1], np.ones(1)), 0.0,
-        levels[None, :1], walk, setup.view, np.array([setup.gravity_mps2, setup.lever_across_m]), setup.noise,
+        levels[None, :1], walk, setup.view, setup.noise,
         False, kept.gated, np.empty((n, 1)), kept.trace, kept.x, kept.P,
     )  # fmt: skip
     return kept
@@ -364,7 +364,7 @@ def smooth(setup: Setup, rows: Rows, outputs: FloatArray) -> FloatArray:
     states, left = _given(x[0], P[0])
     steady = walk.copy()
     steady[[k - 6 for k in CONSIDERED]] = 0.0
-    known = (setup.view, np.array([setup.gravity_mps2, setup.lever_across_m]), setup.noise)
+    known = (setup.view, setup.noise)
     none = (np.empty((1, 0, TRACE)), np.empty((0, _KEPT)), np.empty((0, _KEPT, SIZE)))
     forward(
         events.t_s, float(events.t_s[0]), events.kinds, events.readings, *banked(x, P, w),
