@@ -48,8 +48,8 @@ WINDOW = 0.45
 REACH_PX = 12
 _LEAST_REACH_PX = 2.5
 _ITERATIONS = 16
-_STEP_PX = 1e-3
-_STEP_SIGMA = 0.05
+_STEP_PX = 3e-3
+_STEP_SIGMA = 0.1
 _WHITE = np.float32(255.0)
 _NOISE, _LEAST_NOISE = 0.04, 1.0
 _LEAST_BEND_SIGMA = 1e-6
@@ -523,14 +523,11 @@ class Prediction:
     points : (rows, columns, 2) pixels, each from all corners but itself.
     spread_px : typical distance of a corner from its prediction, robust.
     limit_px : (rows, columns) distance beyond which a corner disagrees with the others.
-    strength, degree : lambda, and which of the degrees.
     """
 
     points: FloatArray
     spread_px: float
     limit_px: FloatArray
-    strength: float
-    degree: int
 
 
 def _homographies(board: FloatArray, targets: FloatArray, weights: FloatArray) -> FloatArray:
@@ -588,9 +585,7 @@ def _weights(error: FloatArray, used: BoolArray, least: float) -> FloatArray:
     return used / (1.0 + (error / scale) ** 2) ** 2
 
 
-def predict(
-    points: FloatArray, known: BoolArray, lens: Lens | None = None, like: Prediction | None = None
-) -> Prediction | None:
+def predict(points: FloatArray, known: BoolArray, lens: Lens | None = None) -> Prediction | None:
     """Predict every corner of a grid from the others.
 
     Parameters
@@ -598,7 +593,6 @@ def predict(
     points : (rows, columns, 2) pixels.
     known : (rows, columns) which points to go by; at least six, or None is returned.
     lens : where the picture's centre is; without it lambda is 0.
-    like : an earlier prediction of the same corners, whose lambda is taken, and its degree or the next.
     """
     rows, columns = known.shape
     (board, bases), used = _bases(columns, rows), known.ravel()
@@ -609,15 +603,14 @@ def predict(
     if lens is None:
         lens = Lens(np.mean(pixels[used], axis=0), float(np.ptp(pixels[used])) + 1.0)
     else:
-        strength = _strength(board, pixels, used, lens) if like is None else like.strength
+        strength = _strength(board, pixels, used, lens)
     fit = _Fit(board, pixels, used, lens, strength, (rows, columns))
     weights, plane = fit.homography()
     best: Prediction | None = None
-    degrees = range(len(bases)) if like is None else range(like.degree, min(like.degree + 2, len(bases)))
-    for degree in degrees:
-        if best is not None and used.sum() < _FREEDOM * bases[degree].shape[1]:
+    for basis in bases:
+        if best is not None and used.sum() < _FREEDOM * basis.shape[1]:
             break
-        candidate = fit.with_basis(bases[degree], degree, weights, plane)
+        candidate = fit.with_basis(basis, weights, plane)
         if best is None or candidate.spread_px < best.spread_px:
             best = candidate
     return best
@@ -649,10 +642,8 @@ class _Fit:
             plane = _homographies(self.board, target, weights)[0]
         return weights, plane
 
-    def with_basis(
-        self, basis: FloatArray, degree: int, weights: FloatArray, plane: FloatArray
-    ) -> Prediction:
-        """Fit the displacement from the homography by `basis` (N, P) of this degree, robustly."""
+    def with_basis(self, basis: FloatArray, weights: FloatArray, plane: FloatArray) -> Prediction:
+        """Fit the displacement from the homography by `basis` (N, P), robustly."""
         target = self.lens.straightened(self.pixels, self.strength)
         for _ in range(_ROUNDS):
             weighted = basis * weights[:, None]
@@ -669,8 +660,7 @@ class _Fit:
         spread = _median((apart / (1.0 - leverage))[self.used])
         # A prediction is as uncertain as the corners, and as its leverage makes it.
         limit = _LIMIT * max(spread, _LEAST_SPREAD_PX) * np.sqrt(1.0 + np.minimum(power, 8.0))
-        grid = points.reshape(*self.shape, 2)
-        return Prediction(grid, spread, limit.reshape(self.shape), self.strength, degree)
+        return Prediction(points.reshape(*self.shape, 2), spread, limit.reshape(self.shape))
 
 
 # ----------------------------------------------------------------------
@@ -689,7 +679,9 @@ _SQUARE_PX = 40.0
 _LEAST_WIDTH_PX = 0.9
 """Width of an edge below which its place depends on where it falls between the pixels."""
 _FIRST_ITERATIONS = 4
-_FIRST_REACH_PX = 8
+_FIRST_REACH_PX = 6
+_EVEN = 0.02
+"""Third differences of a grid in squares, of which a smooth one has less."""
 _HALOS_PX = (1.6, 0.8, 3.0)
 _HALO_CORNERS = 16
 """Corners that are tried with halos; a picture has one halo, and these tell it."""
@@ -758,6 +750,14 @@ def square_px(points: FloatArray) -> float:
     along = np.linalg.norm(np.diff(points, axis=1), axis=-1)
     across = np.linalg.norm(np.diff(points, axis=0), axis=-1)
     return float(np.median(np.concatenate([along.ravel(), across.ravel()])))
+
+
+def _unevenness(points: FloatArray) -> float:
+    """Largest third difference of a grid (rows, columns, 2), in squares; infinite below 4 x 4."""
+    if min(points.shape[:2]) < 4:
+        return float("inf")
+    third = [np.abs(np.diff(points, 3, axis=axis)).max() for axis in (0, 1)]
+    return float(max(third)) / square_px(points)
 
 
 def _sides_px(points: FloatArray) -> FloatArray:
@@ -903,10 +903,8 @@ class _Check:
     grid: FloatArray
 
 
-def _checked(
-    part: Part, fit: LocalFit, good: BoolArray, like: Prediction | None
-) -> tuple[_Check, Prediction] | None:
-    prediction = predict(fit.points.reshape(*part.shape, 2), good.reshape(part.shape), part.lens, like)
+def _checked(part: Part, fit: LocalFit, good: BoolArray) -> tuple[_Check, Prediction] | None:
+    prediction = predict(fit.points.reshape(*part.shape, 2), good.reshape(part.shape), part.lens)
     if prediction is None:
         return None
     placed = prediction.points.reshape(-1, 2)
@@ -918,13 +916,11 @@ def _checked(
     return _Check(placed, away, bound, far, grid), prediction
 
 
-def _rescued(
-    part: Part, fit: LocalFit, like: Prediction | None
-) -> tuple[LocalFit, BoolArray, Prediction] | None:
+def _rescued(part: Part, fit: LocalFit) -> tuple[LocalFit, BoolArray, Prediction] | None:
     """Fit again, from where the others place them, the corners that failed or disagree with the others."""
     good = _trusted(part, fit)
     for window in _RESCUE_WINDOWS:
-        checked = _checked(part, fit, good, like)
+        checked = _checked(part, fit, good)
         if checked is None:
             return None
         check, prediction = checked
@@ -937,7 +933,7 @@ def _rescued(
         use = _trusted(part, trial)[doubtful] & (~good[doubtful] | (near < 0.7 * check.away[doubtful]))
         fit = _merged(fit, again, doubtful, use)
         good[doubtful[use]] = True
-    checked = _checked(part, fit, good, like)
+    checked = _checked(part, fit, good)
     if checked is None:
         return None
     check = checked[0]
@@ -946,7 +942,7 @@ def _rescued(
     beside = extrapolated(fit.points.reshape(*part.shape, 2))[1:-1, 1:-1].reshape(-1, 2)
     nearest = np.fmin(check.away, np.linalg.norm(fit.points - beside, axis=1))
     good &= np.where(clean, nearest < check.far, check.away < check.bound)
-    last = predict(fit.points.reshape(*part.shape, 2), good.reshape(part.shape), part.lens, like)
+    last = predict(fit.points.reshape(*part.shape, 2), good.reshape(part.shape), part.lens)
     return None if last is None else (fit, good, last)
 
 
@@ -1015,14 +1011,15 @@ def refine(gray: GrayImage, points: FloatArray) -> Refined | None:
         return None
     part, first = begun
     shape, start = part.shape, part.points
-    # A misplaced corner would spoil the curvatures of its row and column.
-    sound = _sound(part, first)
-    rough = predict(first.points.reshape(start.shape), sound.reshape(shape), part.lens)
-    if rough is None:
-        return None
-    away = np.linalg.norm(first.points - rough.points.reshape(-1, 2), axis=1)
-    stays = sound & (away < rough.limit_px.ravel())
-    moved = np.where(stays[:, None], first.points, rough.points.reshape(-1, 2)).reshape(start.shape)
+    sound, moved = _sound(part, first), first.points.reshape(start.shape)
+    if not sound.all() or _unevenness(moved) > _EVEN:
+        # A misplaced corner would spoil the curvatures of its row and column.
+        rough = predict(moved, sound.reshape(shape), part.lens)
+        if rough is None:
+            return None
+        away = np.linalg.norm(moved - rough.points, axis=2)
+        stays = sound.reshape(shape) & (away < rough.limit_px)
+        moved = np.where(stays[..., None], moved, rough.points)
     fit, unsteady = first, np.arange(len(first.points))
     for _ in range(_PASSES):
         again = fit_corners(
@@ -1038,8 +1035,7 @@ def refine(gray: GrayImage, points: FloatArray) -> Refined | None:
         if len(unsteady) == 0:
             break
     fit = _closer_looked(part, fit, moved)
-    # What disturbs corners disturbs the choice of lambda and degree.
-    rescued = _rescued(part, fit, rough if stays.all() else None)
+    rescued = _rescued(part, fit)
     if rescued is None:
         return None
     fit, good, prediction = rescued
