@@ -807,6 +807,7 @@ _LET_GO_RADPS = 0.3
 _LAST, _REJECTED, _FIRST, _REJECTED_IMU, _BEGUN = range(5)
 _STARTED, _PENDING, _SWITCH, _HOSES = range(2, 6)
 _SWITCHES = 128
+_LET_GO = OUT.index("let_go_s")
 SILENT_S = 0.1
 """A row so long after the last reading carries the state on with it."""
 
@@ -1005,7 +1006,7 @@ def run_driven(
             begin = (kind == CAMERA and (whole[_STARTED] == 0 or whole[_PENDING] == 1)
                      and when > real[_FIRST] + _BEFORE_S)  # fmt: skip
             # Done again where two samples say that the head was let go, and once more where it was not.
-            first, trial, suspect = back, 0, 0
+            first, trial, suspect, let_go_s = back, 0, 0, math.nan
             while True:
                 for i in range(first + 1):
                     now = (newest + 1 - first + i) % size
@@ -1059,17 +1060,21 @@ def run_driven(
                     if since == 0 or ring_z[(own - suspect) % size, 2] == ring_z[own, 2]:
                         break
                     trial, first, before, now = 1, since - 1, (own - since) % size, (own - suspect) % size
-                    at = let_go_time(ring_x[before], ring_z[now, 2], ring_t[before], ring_t[now], plant, work)
+                    let_go_s = let_go_time(
+                        ring_x[before], ring_z[now, 2], ring_t[before], ring_t[now], plant, work
+                    )
                     for i in range(suspect, since):
                         now = (own - i) % size
-                        if ring_t[(now - 1) % size] <= at:
-                            ring_let_go[now] = at
+                        if ring_t[(now - 1) % size] <= let_go_s:
+                            ring_let_go[now] = let_go_s
                             break
                 elif trial == 1 and ring_gated[(own - suspect) % size, 2] + ring_gated[own, 2] > 0.0:
                     trial = 2
                     for i in range(first + 1):
                         ring_let_go[(own - i) % size] = math.nan
                 else:
+                    if trial == 1:
+                        out[row, _LET_GO] = let_go_s
                     break
             if kind == HOSES or kind == 0:
                 for k in range(12):
@@ -1194,16 +1199,17 @@ def _forward(
     P: FloatArray, marks: FloatArray, switch_t: FloatArray, switch_g: FloatArray,
     x0: FloatArray, P0: FloatArray, plant: FloatArray, walk: FloatArray, view: FloatArray,
     noise: FloatArray, kept_x: FloatArray, kept_P: FloatArray, trace: FloatArray,
-    F: FloatArray, chained: BoolArray, alive: BoolArray, keep: int, hoses_sigma: float, radius: float,
+    F: FloatArray, chained: BoolArray, alive: BoolArray, let_go_s: FloatArray, keep: int,
+    hoses_sigma: float, radius: float,
 ) -> None:  # fmt: skip
-    """The filter over events, keeping what is shown; state and counters after the event `keep` are left."""
+    """The filter over events, keeping what is shown; state and counters after the event `keep` are left.
+
+    `let_go_s` (n,) has the time of a release in the event whose step it is in.
+    """
     work, report, gated = np.zeros(WORK), np.empty(12), np.zeros(3)
     own_x, own_P, own_marks = x.copy(), P.copy(), marks.copy()
-    good_x, good_P, good_marks = x.copy(), P.copy(), marks.copy()
-    # The last sample that does not contradict, the next one, whether a release between is tried, and refused.
-    good, suspect, trial, agrees, let_go_s = -1, -1, 0, False, math.nan
-    last, k = 0, 0
-    while k < len(t):
+    last = 0
+    for k in range(len(t)):
         begin = t[k - 1] if k else before_s
         while last < len(switch_t) - 1 and switch_t[last + 1] <= t[k]:
             last += 1
@@ -1217,9 +1223,8 @@ def _forward(
             marks[_SMOOTHER_STARTED], marks[_SMOOTHER_PENDING] = 0, 0
             marks[0], marks[1] = 0.0, 0.0
         if marks[_SMOOTHER_STARTED] == 1:
-            now_s = let_go_s if trial == 1 and begin <= let_go_s < t[k] else math.nan
             _stand(F[k])
-            pass_on(x, P, begin, t[k], now_s, x0, P0, plant, walk, switch_t, switch_g, last, F[k], work)
+            pass_on(x, P, begin, t[k], let_go_s[k], x0, P0, plant, walk, switch_t, switch_g, last, F[k], work)
             chained[k] = True
         if kind == HOSES:
             marks[_SMOOTHER_HOSES] = 1
@@ -1249,28 +1254,6 @@ def _forward(
             elif marks[0] > _SMOOTHER_LOCKED_OUT or marks[1] > 2.0 * _SMOOTHER_LOCKED_OUT:
                 marks[_SMOOTHER_PENDING] = 1
                 marks[0], marks[1] = 0.0, 0.0
-            if kind == IMU:
-                bad = contradicted(z, gated) and t[k] > marks[_SMOOTHER_BEGUN] + SETTLING_S
-                before = trial
-                if trial == 1:
-                    if k == suspect:
-                        agrees = gated[2] == 0.0
-                    else:
-                        trial = 0 if agrees and gated[2] == 0.0 else 2
-                elif trial == 2:
-                    trial = 0
-                elif bad and suspect >= 0 and readings[suspect, 2] != z[2]:
-                    trial = 1
-                    let_go_s = let_go_time(good_x, readings[suspect, 2], t[good], t[suspect], plant, work)
-                elif bad and suspect < 0 and good >= 0:
-                    suspect = k
-                if trial > before:
-                    k = good + 1
-                    _copy_marked(x, P, marks, good_x, good_P, good_marks)
-                    continue
-                if k != suspect or before == 2:
-                    good, suspect = k, -1
-                    _copy_marked(good_x, good_P, good_marks, x, P, marks)
         for i in range(len(_SHOWN)):
             kept_x[k, i] = x[_SHOWN[i]]
             for j in range(len(x)):
@@ -1278,7 +1261,6 @@ def _forward(
         alive[k] = marks[_SMOOTHER_STARTED] == 1
         if k == keep:
             _copy_marked(own_x, own_P, own_marks, x, P, marks)
-        k += 1
     _copy_marked(x, P, marks, own_x, own_P, own_marks)
 
 
@@ -1377,7 +1359,8 @@ def smooth_driven(setup: Setup, drive: Drive, rows: Rows, pwm: FloatArray, outpu
     Parameters
     ----------
     pwm : (n, 2) commands, NaN in rows without.
-    outputs : (n, len(OUT)) of the driven filter; what it says of innovations and flags is kept.
+    outputs : (n, len(OUT)) of the driven filter; what it says of innovations and flags is kept, and where it
+        says that the head was let go, it was.
     """
     t, kinds, readings, at, switch_t, switch_g = _timeline(setup, drive, rows, pwm)
     x, P = drive.start(setup)
@@ -1387,6 +1370,8 @@ def smooth_driven(setup: Setup, drive: Drive, rows: Rows, pwm: FloatArray, outpu
     out = outputs.copy()
     out[:, 1:13] = np.nan
     n, size, shown = len(t), len(DRIVEN), len(_SHOWN)
+    let_go_s, told = np.full(n + 1, np.nan), outputs[np.isfinite(outputs[:, _LET_GO]), _LET_GO]
+    let_go_s[np.searchsorted(t, told, side="right")] = told
     begin, before = 0, float(t[0]) if n else 0.0
     first = float(rows.t_s[0]) - max(float(setup.start.sensor[7]), 0.0) if n else 0.0
     while begin < n:
@@ -1399,7 +1384,7 @@ def smooth_driven(setup: Setup, drive: Drive, rows: Rows, pwm: FloatArray, outpu
         _forward(
             t[part], before, first, kinds[part], readings[part], x, P, marks, switch_t, switch_g,
             x0, P0, plant, walk, setup.view, noise, kept_x, kept_P, trace, F, chained,
-            alive, end - begin - 1, drive.sigma[1], setup.bellows_radius_m,
+            alive, let_go_s[part], end - begin - 1, drive.sigma[1], setup.bellows_radius_m,
         )  # fmt: skip
         wanted = np.where(alive & (kinds[part] == 0), at[part], -1)
         wanted[end - begin :] = -1

@@ -521,14 +521,14 @@ FLAGS = {
     "time_jump": 32,
     "not_started": 64,
 }
+"""Bits of the column `flags`."""
 
 OUT = (
     "t_s", "q1_m", "q2_m", "dq1_mps", "dq2_mps", "phi_rad", "length_m", "x_m", "y_m", "gyro_bias_radps",
     "sigma_q1_m", "sigma_q2_m", "sigma_phi_rad", *REPORT, "flags", "swing_weight", "rest_weight",
-    "driven_weight",
+    "driven_weight", "let_go_s",
 )  # fmt: skip
-"""Columns of the output."""
-"""Bits of the column `flags`."""
+"""Columns of the output; the last is the time at which somebody let go of the head, in the row that told."""
 
 
 @dataclass(frozen=True)
