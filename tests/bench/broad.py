@@ -3,7 +3,8 @@
 First the inclination's RMSE in motion of filters by others beside what was published, which shows that
 the evaluation is right; then the angle in the plane, in windows where the sensor's plane is near gravity;
 then VQF and the levelling filter on the recordings as others might have made them, after 5 s and with the
-truth's clock shifted by what suits each best.
+truth's clock shifted by what suits each best. Last the recording of the folder imufusion, which has no
+truth: the largest angle to the mean force as the sensor comes to rest, once after circles.
 Recordings lie in the folder broad of CALIB_SHARED_DATA.
 """
 
@@ -74,6 +75,28 @@ def main() -> None:
             t = other.period_s * np.arange(len(other.gyro))
             own = level_three(Levelling(), t, other.force, other.gyro)
             print(f"    {words:38} {late_deg(other, peer_up):7.3f} {late_deg(other, own):7.3f}")
+    table = np.genfromtxt(folder.parent / "imufusion" / "sensor_data.csv", delimiter=",", skip_header=1)
+    t = np.arange(table[0, 0], table[-1, 0], 0.01)
+    gx, gy, gz, *accel = (np.interp(t, table[:, 0], column) for column in table.T[1:7])
+    gyro, force = np.radians(np.stack([gx, gy, gz], axis=1)), 9.80665 * np.stack(accel, axis=1)
+    found = {"levelling": level_three(Levelling(), t, force, gyro)}
+    found |= {peer: run_peer(peer, gyro, force, 0.01) for peer in ("VQF", "imufusion") if not missing(peer)}
+    for name, up in found.items():
+        print(
+            f"imufusion's recording, as it comes to rest: {name:12} {settling_deg(force, gyro, up):.2f} deg"
+        )
+
+
+def settling_deg(force: np.ndarray, gyro: np.ndarray, up: np.ndarray) -> float:
+    """Largest angle [deg] of up to the mean force in half seconds at rest that follow motion, at 100 Hz."""
+    n, size = len(up) // 50, 50
+    f, w = (x[: n * size].reshape(n, size, 3) for x in (force, gyro))
+    still = (w.std(axis=1).max(axis=1) < 0.01) & (f.std(axis=1).max(axis=1) < 0.1)
+    still &= np.abs(w.mean(axis=1)).max(axis=1) < 0.02
+    first = np.flatnonzero(still[1:] & ~still[:-1]) + 1
+    mean, u = f[first].mean(axis=1), up[first * size + 5]
+    across = np.linalg.norm(np.cross(mean, u), axis=1)
+    return float(np.degrees(np.arctan2(across, (mean * u).sum(axis=1))).max())
 
 
 if __name__ == "__main__":

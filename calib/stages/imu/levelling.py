@@ -38,15 +38,15 @@ from calib.core.errors import BadInputError
 # A bias about the vertical does not show in this; at rest the mean rate shows it.
 #
 # An acceleration that is held moves V beyond what a velocity and the angle's error allow. |V| is held to
-# five of its standard deviations, that of V and that of the velocity together, so that 0.3 g for 3 s turns
-# the angle by 7 degrees and not by 15. A velocity of 0.1 m/s is allowed to any sensor: a filter that was
+# three of its standard deviations, that of V and that of the velocity together, so that 0.3 g for 3 s turns
+# the angle by 4 degrees and not by 15. A velocity of 0.1 m/s is allowed to any sensor: a filter that was
 # tuned on calm logs shall come back from a wrong angle as soon as it can.
 
 _G = 9.80665
 _TURN = 2.0 * math.pi
 _LASTING_S = 0.3
 """Time for which a velocity lasts: its density is 2 sigma^2 times this."""
-_MOST_SIGMAS, _ANY_MPS = 5.0, 0.1
+_MOST_SIGMAS, _ANY_MPS = 3.0, 0.1
 
 
 @dataclass(frozen=True)
