@@ -1,31 +1,25 @@
 """The pictures shipped in `images/`: seventeen views of the thesis's board and one in the actuator's plane.
 
-    python -m calib.twin.pictures images/ [tests/truth/pictures.json]
-
-writes them, byte for byte the same everywhere, and with a second argument also the truth about them.
-The camera is a stand-in for the thesis's Pixy2: its picture size and distortion coefficients are
-printed there (2.2.2, B), its intrinsics are not, so a field of view of 60 degrees is assumed.
+`calib simulate rig` writes them, byte for byte the same everywhere. The camera is a stand-in for the
+thesis's Pixy2: its picture size and distortion coefficients are printed there (2.2.2, B), its intrinsics are
+not, so a field of view of 60 degrees is assumed.
 """
 
 from __future__ import annotations
 
-import json
 import math
 import struct
-import sys
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from calib.core.arrays import FloatArray, GrayImage
-from calib.core.errors import CalibError, UsageError
 from calib.core.writing import write_atomically
 from calib.stages.camera.model import Board, Camera
-from calib.twin.scene import Light, Pose, PrintedBoard, Sensor, corner_pixels, pose_facing, render, rotation
+from calib.twin.scene import Light, Pose, PrintedBoard, Sensor, pose_facing, render, rotation
 
 CAMERA = Camera(
     model="radial2",
@@ -162,45 +156,6 @@ def png_bytes(image: GrayImage) -> bytes:
     )
 
 
-def _rounded(values: FloatArray, digits: int) -> Any:
-    return (np.round(values, digits) + 0.0).tolist()
-
-
-def _view_truth(shot: Shot) -> dict[str, Any]:
-    pixels = corner_pixels(CAMERA, PrintedBoard(BOARD), shot.pose)
-    return {
-        "R_CB": _rounded(shot.pose.R_CB, 12),
-        "t_m": _rounded(shot.pose.t_m, 12),
-        "corners_px": _rounded(pixels, 6),
-    }
-
-
-def truth() -> dict[str, Any]:
-    """What is true of the shipped pictures: camera, board, pose and corners of each view, and the plane."""
-    camera = {
-        "model": CAMERA.model,
-        "image_size_px": list(CAMERA.image_size_px),
-        "fx_px": CAMERA.fx_px,
-        "fy_px": CAMERA.fy_px,
-        "skew_px": CAMERA.skew_px,
-        "cx_px": CAMERA.cx_px,
-        "cy_px": CAMERA.cy_px,
-        "distortion": CAMERA.distortion.tolist(),
-    }
-    lying = {
-        "R_CW": _rounded(PLANE.R_CW, 12),
-        "t_m": _rounded(PLANE.t_m, 12),
-        "first_corner_m": list(PLANE.first_corner_m),
-        "angle_rad": PLANE.angle_rad,
-    }
-    return {
-        "board": {"corners": [BOARD.columns, BOARD.rows], "square_m": BOARD.square_m},
-        "camera": camera,
-        "views": {shot.path: _view_truth(shot) for shot in shots()},
-        "plane": {**lying, "views": {plane_shot().path: _view_truth(plane_shot())}},
-    }
-
-
 def write_pictures(folder: Path, camera: Camera, taken: Sequence[Shot]) -> None:
     """Write pictures and the board.yaml files of a folder and of its folder `plane`."""
     (folder / "plane").mkdir(parents=True, exist_ok=True)
@@ -214,22 +169,3 @@ def write_pictures(folder: Path, camera: Camera, taken: Sequence[Shot]) -> None:
     place = f"first_corner_m: [{x:.3f}, {y:.3f}]\nangle_rad: {PLANE.angle_rad:.2f}\n"
     write_atomically(folder / "board.yaml", board)
     write_atomically(folder / "plane" / "board.yaml", board + place)
-
-
-def main(arguments: list[str]) -> int:
-    """Write the pictures into the first argument and the truth, if asked for, into the second."""
-    try:
-        if len(arguments) not in (1, 2) or arguments[0].startswith("-"):
-            raise UsageError("usage: python -m calib.twin.pictures FOLDER [TRUTH.json]")
-        write_pictures(Path(arguments[0]), CAMERA, [*shots(), plane_shot()])
-        if len(arguments) == 2:
-            text = json.dumps(truth(), indent=1) + "\n"
-            write_atomically(Path(arguments[1]), text)
-    except CalibError as error:
-        sys.stderr.write(f"{error}\n")
-        return error.exit_code
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

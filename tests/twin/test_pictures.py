@@ -14,9 +14,10 @@ from scipy import stats
 from scipy.ndimage import map_coordinates, spline_filter
 from scipy.optimize import least_squares
 from scipy.special import erf
+from shipped_pictures import write
 
 from calib.stages.camera.model import Board, Camera, project, undistort
-from calib.twin.pictures import BOARD, CAMERA, main, plane_shot, shots
+from calib.twin.pictures import BOARD, CAMERA, plane_shot, shots
 from calib.twin.scene import (
     Light,
     Pose,
@@ -55,7 +56,7 @@ def _found(picture: np.ndarray, near: np.ndarray) -> np.ndarray:
 
 
 def test_one_command_gives_the_shipped_bytes(images: Path, known: dict[str, Any], tmp_path: Path) -> None:
-    assert main([str(tmp_path / "images"), str(tmp_path / "truth.json")]) == 0
+    write(tmp_path / "images", tmp_path / "truth.json")
     made = sorted(path.relative_to(tmp_path / "images") for path in (tmp_path / "images").rglob("*.*"))
     shipped = sorted(path.relative_to(images) for path in images.rglob("*.*"))
     assert made == shipped
