@@ -105,15 +105,11 @@ def as_text(path: Path, data: bytes) -> str:
 
 def sha256(data: bytes) -> str:
     """SHA-256 in hexadecimal."""
-    import hashlib
-
     return hashlib.sha256(data).hexdigest()
 
 
 def file_sha256(path: Path) -> str:
     """SHA-256 of a file of any size in hexadecimal, or a `BadInputError` that says why not."""
-    import hashlib
-
     _size(path)
     try:
         with path.open("rb") as stream:

@@ -409,9 +409,9 @@ def column_map(
         known = known_name(name)
         if known is not None:
             found.setdefault(known[0], []).append((name, known[1]))
-    for pair in (("u_px", "v_px"),):
-        if not all(name in found or name in stated for name in pair):
-            found = {k: v for k, v in found.items() if k not in pair or k in names}
+    pair = ("u_px", "v_px")
+    if not all(name in found or name in stated for name in pair):
+        found = {k: v for k, v in found.items() if k not in pair or k in names}
     sources: dict[str, Source] = {}
     for column in ("t_s", *COLUMNS):
         if column in stated:

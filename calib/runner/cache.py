@@ -16,9 +16,8 @@ from typing import Any
 
 from calib.core import __version__
 from calib.core.errors import BadInputError
-from calib.core.files import sha256, shown
+from calib.core.files import file_sha256, sha256, shown
 from calib.core.writing import check_folder, make_folder, settle, sweep, try_lock, write_atomically
-from calib.runner.folder import digest_of
 
 # ----------------------------------------------------------------------
 # One run at a time in an output folder.
@@ -166,7 +165,7 @@ def program_digest() -> str:
     root = Path(__file__).resolve().parent.parent
     files = (path for path in sorted(root.rglob("*")) if path.is_file())
     sources = [path for path in files if path.parent.name != "__pycache__"]
-    parts = [__version__, *(f"{path.relative_to(root).as_posix()} {digest_of(path)}" for path in sources)]
+    parts = [__version__, *(f"{path.relative_to(root).as_posix()} {file_sha256(path)}" for path in sources)]
     return sha256("\n".join(parts).encode())
 
 
@@ -215,7 +214,7 @@ def load(folder: Path, key: str | None = None) -> Result | None:
         return None
     for name, digest in result.files.items():
         path = folder / name
-        if not path.is_file() or path.is_symlink() or digest_of(path) != digest:
+        if not path.is_file() or path.is_symlink() or file_sha256(path) != digest:
             return None
     return result
 
@@ -225,7 +224,7 @@ def store(work: Path, folder: Path, key: str, code: int, trash: Path) -> Result:
     files = {}
     for path in sorted(work.rglob("*")):
         if path.is_file() and not path.is_symlink():
-            files[path.relative_to(work).as_posix()] = digest_of(path)
+            files[path.relative_to(work).as_posix()] = file_sha256(path)
     told: dict[str, Any] = {"schema": 1, "key": key, "code": code, "files": files}
     told["sha256"] = _digest(told)
     write_atomically(work / _RESULT, json.dumps(told, indent=1, sort_keys=True) + "\n")

@@ -153,11 +153,6 @@ def with_beside(logs: Iterable[Path]) -> tuple[Path, ...]:
     return tuple(dict.fromkeys(part for path in logs for part in (path, *beside(path))))
 
 
-def digest_of(path: Path) -> str:
-    """SHA-256 of a file of any size. Raises `BadInputError` for one that cannot be read."""
-    return file_sha256(path)
-
-
 def folder_digests(folder: Folder) -> dict[Path, str]:
     """SHA-256 of every file that is read."""
-    return {path: digest_of(path) for path in folder.files()}
+    return {path: file_sha256(path) for path in folder.files()}

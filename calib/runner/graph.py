@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from calib.core.errors import EXIT_DONE, EXIT_INTERNAL, EXIT_POOR, BadInputError
-from calib.core.files import inside, one_line, shown
+from calib.core.files import file_sha256, inside, one_line, shown
 from calib.core.result import Result as StageResult
 from calib.core.rig import Rig
 from calib.core.verdict import worst
 from calib.core.workers import Failure, Processes, Task
 from calib.core.writing import make_folder
 from calib.runner.cache import Result, key_of, load, opened, remove, store
-from calib.runner.folder import Folder, LogFile, digest_of, folder_digests, with_beside
+from calib.runner.folder import Folder, LogFile, folder_digests, with_beside
 from calib.runner.work import perform
 from calib.stages import stage
 
@@ -376,7 +376,7 @@ class Runner:
         """An option's value, the same wherever the folder lies; of a file elsewhere what it holds."""
         if not isinstance(value, Path):
             return value
-        return self.folder.name_of(value) if value.is_relative_to(self.folder.root) else digest_of(value)
+        return self.folder.name_of(value) if value.is_relative_to(self.folder.root) else file_sha256(value)
 
     def _blocked(self, job: Job, section: str) -> Job:
         for other in self.ended.values():

@@ -29,11 +29,10 @@ from pydantic import AfterValidator, BaseModel, ConfigDict
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import EXIT_DONE, EXIT_INTERNAL, BadInputError, end_of
-from calib.core.files import one_line, sha256, shown
+from calib.core.files import file_sha256, one_line, sha256, shown
 from calib.core.workers import Failure, Processes, Task, run_tasks
 from calib.core.writing import check_writable, make_folder, replacing, write_atomically
 from calib.runner.cache import opened
-from calib.runner.folder import digest_of
 
 Progress = Callable[[int, int], None]
 LIMIT_S = 3600.0
@@ -112,7 +111,7 @@ class Store:
         for file, digest in found.files.items():
             path = self.out / "rigs" / name / file
             try:
-                if path.is_symlink() or digest_of(path) != digest:
+                if path.is_symlink() or file_sha256(path) != digest:
                     return ""
             except BadInputError:
                 return ""

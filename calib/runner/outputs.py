@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.core.errors import EXIT_DONE, BadInputError
-from calib.core.files import one_line, sha256, shown
+from calib.core.files import file_sha256, one_line, sha256, shown
 from calib.core.options import NOTHING_STATED, LogOptions
 from calib.core.rig import Rig
 from calib.core.workers import processors
@@ -19,7 +19,7 @@ from calib.core.writing import make_folder, replacing, write_atomically
 from calib.io.columns import read_columns_file
 from calib.runner.cache import key_of, load, remove, store
 from calib.runner.decision import Decision, decide
-from calib.runner.folder import Folder, digest_of, read_folder
+from calib.runner.folder import Folder, read_folder
 from calib.runner.graph import HIDDEN, Job, Runner, opened_run
 from calib.runner.processes import local
 from calib.show.page import keep_pictures, write_page
@@ -144,7 +144,7 @@ def _list(out: Path, names: list[str]) -> None:
 
 def _write(target: Path, text: str) -> None:
     raw = text.encode("utf-8", "backslashreplace")
-    if not target.is_symlink() and target.is_file() and digest_of(target) == sha256(raw):
+    if not target.is_symlink() and target.is_file() and file_sha256(target) == sha256(raw):
         return
     write_atomically(target, raw)
 
@@ -154,7 +154,7 @@ def _copy(source: Path, target: Path) -> None:
     make_folder(target.parent)
     if target.is_symlink() or (target.exists() and not target.is_file()):
         raise BadInputError(f"{shown(target)}: is no file of a run, and was not replaced")
-    if target.is_file() and digest_of(target) == digest_of(source):
+    if target.is_file() and file_sha256(target) == file_sha256(source):
         return
     with replacing(target) as stream, source.open("rb") as whole:
         shutil.copyfileobj(whole, stream)

@@ -30,8 +30,7 @@ from calib.stages.estimator.kinematic import Setup, Start
 from calib.stages.estimator.sensors import sensor_values, view_coefficients
 from calib.stages.firmware.conformance import Reference
 from calib.stages.firmware.constants import MIDDLE_M, PlaneConstants, plane_constants
-from calib.stages.firmware.header import VERBATIM, header_of, verbatim
-from calib.stages.firmware.literals import comment_text, float_literal, literals
+from calib.stages.firmware.header import VERBATIM, comment_text, float_literal, header_of, literals, verbatim
 from calib.twin.pictures import CAMERA, PLANE
 
 HOSTILE = {"*/ int x; /*": "1", "??/\n#error": "2", 'quote".png': "3", "ünï\u202e.png": "4", "\\": "5"}

@@ -14,7 +14,7 @@ from firmware_rigs import header, rig
 
 from calib.io.serial import MODE_ORIENTATION, MODE_POSITION, Inputs
 from calib.stages.firmware.conformance import FusedReference, Reference
-from calib.stages.firmware.literals import float_literal, values
+from calib.stages.firmware.header import float_literal, values
 from calib.stages.firmware.vectors import binary32, coherent, directed, directed_fused, pixel_of
 
 # Not reached by any marker inside the picture; test_pipeline.py has a plane whose horizon is.

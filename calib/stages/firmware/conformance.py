@@ -87,7 +87,7 @@ class Reference:
 
     Parameters
     ----------
-    values : constants by their names in the header, see `literals.values`.
+    values : constants by their names in the header, see `header.values`.
     undistort : CALIB_UNDISTORT; by default 1 where the camera has a lens.
     """
 
