@@ -260,7 +260,7 @@ def _lens(camera: Camera) -> dict[str, Figure]:
 
 def _low_pass(cutoff: float, order: int, family: str, folder: Path, still: bool = False) -> dict[str, Figure]:
     made, seen = design_lowpass(Design(cutoff, 60.0, order, family)), _positions(folder, still)
-    return lowpass_plots(made, solve_lowpass(Inputs(made, WORKSPACE, seen)), seen)
+    return lowpass_plots(solve_lowpass(Inputs(made, WORKSPACE, seen)))
 
 
 def _control(verb: str, *sources: str, **options: Any) -> dict[str, Figure]:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -73,19 +73,13 @@ _LEAST_LATE = 0.2
 """Steps by which a truth has to be late to be moved: below, the parabola's fraction is in doubt."""
 
 
-@dataclass(frozen=True)
-class Slope:
-    """Slope [rad/s], its standard deviation and its 95 % interval; NaN where it cannot be told.
+class Slope(NamedTuple):
+    """Slope [rad/s], its standard deviation and its 95 % interval; NaN where it cannot be told."""
 
-    `rho` is the coefficient from block to block that the deviation rests on, `block_s` their length.
-    """
-
-    value: float
-    sigma: float
-    low: float
-    high: float
-    rho: float
-    block_s: float
+    value: float = math.nan
+    sigma: float = math.nan
+    low: float = math.nan
+    high: float = math.nan
 
 
 def _line(stretches: Sequence[FloatArray]) -> float:
@@ -143,25 +137,22 @@ def slope_of(stretches: Sequence[FloatArray], period_s: float) -> Slope:
 
     NaN without two samples in a stretch; without an interval where they give too few blocks.
     """
-    nan = math.nan
     long = [y for y in stretches if len(y) >= 2]
     if not long:
-        return Slope(nan, nan, nan, nan, nan, nan)
+        return Slope()
     value = _line(long) / period_s
     size = max(sum(len(y) for y in long) // _BLOCKS, 1)
     means = [y[: len(y) // size * size].reshape(-1, size).mean(axis=1) for y in long if len(y) >= 2 * size]
     free = sum(len(mean) for mean in means) - len(means) - 1
     if free < _FEWEST_BLOCKS:
-        return Slope(value, nan, nan, nan, nan, nan)
+        return Slope(value)
     means = [mean - mean.mean() for mean in means]
     pairs = [(rho, share) for rho in _RHO for share in (_SHARE if rho > 0.0 else _SHARE[:1])]
-    judged = [(*_judged(means, size, rho, share), rho) for rho, share in pairs]
-    most = max(likely for likely, _, _ in judged)
-    variance, rho = max((v, rho) for likely, v, rho in judged if likely >= most - _SUPPORT)
-    block_s = size * period_s
-    sigma = math.sqrt(variance) / block_s
+    judged = [_judged(means, size, rho, share) for rho, share in pairs]
+    most = max(likely for likely, _ in judged)
+    sigma = math.sqrt(max(v for likely, v in judged if likely >= most - _SUPPORT)) / (size * period_s)
     half = float(stdtrit(free, 0.975)) * sigma
-    return Slope(value, sigma, value - half, value + half, rho, block_s)
+    return Slope(value, sigma, value - half, value + half)
 
 
 def allan_at(stretches: Sequence[FloatArray], period_s: float, tau_s: float) -> float:

@@ -36,8 +36,9 @@ _WINDOW_S = 12.0
 _LOWEST_DB = -80.0
 
 
-def plots(filter_: Filter, section: LowPass, positions: Positions | None = None) -> dict[str, Figure]:
+def plots(section: LowPass) -> dict[str, Figure]:
     """`lowpass_response`, and with the log's positions `lowpass_log`."""
+    filter_, positions = section.evidence.filter, section.evidence.positions
     design = f"{section.family}, order {section.order}, {section.cutoff_hz:g} Hz at {section.rate_hz:g} Hz"
     figures = {"lowpass_response": _response(filter_, section, design)}
     if positions is not None:

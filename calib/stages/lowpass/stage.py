@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal, cast
 
 from calib.core.errors import BadInputError, UsageError
 from calib.core.options import LogOptions, option
-from calib.core.stage import Files, Stage
+from calib.core.stage import Files, Stage, later
 from calib.core.units import parse_frequency_hz, parse_jitter
 from calib.core.verdict import Finding, Verdict
 
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from calib.core.arrays import FloatArray
-    from calib.core.plot import Figure
     from calib.core.rig import Rig
     from calib.core.words import Block
     from calib.io.logs import Log
@@ -362,13 +361,6 @@ def _words(result: LowPass) -> list[Block]:
     return [Table(head, rows, title)]
 
 
-def _plots(result: LowPass) -> dict[str, Figure]:
-    from calib.stages.lowpass.plots import plots
-
-    evidence: Evidence = result.evidence
-    return plots(evidence.filter, result, evidence.positions)
-
-
 lowpass = Stage(
     "lowpass",
     "Low-pass",
@@ -383,5 +375,5 @@ lowpass = Stage(
     writes=("lowpass",),
     uses=("camera", "plane"),
     words=_words,
-    plots=_plots,
+    plots=later("calib.stages.lowpass.plots", "plots"),
 )
