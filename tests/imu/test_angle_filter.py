@@ -29,6 +29,7 @@ from scipy.signal import freqz, lfilter
 from scipy.spatial.transform import Rotation
 from source_model import pose_from_configuration
 
+from calib import simulate
 from calib.stages.actuator.kinematics import marker_from_head
 from calib.stages.imu.levelling import Levelling, level_three, system
 from calib.stages.imu.mahony import (
@@ -37,7 +38,8 @@ from calib.stages.imu.mahony import (
     filter_log,
     wrapped,
 )
-from calib.stages.imu.read import angle_from_marker, lag_of
+from calib.stages.imu.read import angle_from_marker, drift_log, lag_of
+from calib.stages.imu.sampling import AXES
 from calib.stages.imu.tracks import PEERS, missing, planar_rate, run_peer
 from calib.stages.imu.tuning import (
     DATA_SHEET,
@@ -255,6 +257,24 @@ def test_an_acceleration_that_is_held_turns_the_angle_by_a_quarter_of_its_direct
     for angle in (np.arctan2(up[:, 1], up[:, 0]), phi):
         assert np.degrees(np.abs(angle).max()) < 4.5
         assert np.degrees(np.abs(angle[t > 45.0]).max()) < 0.1
+
+
+@pytest.mark.parametrize("rest_s", [-5.0, 15.0])
+def test_a_swing_at_the_start_or_later_leaves_an_angle_in_three_axes(rest_s: float) -> None:
+    """The head is let go from far out, and turns by up to 10 rad/s."""
+    log = drift_log(simulate("swing", seed=1))
+    values = log.values[:, [log.axes.index(axis) for axis in AXES]]
+    phi = np.interp(log.t_s, log.true_t_s, log.true_phi_rad)
+    back = values[::-1] * [-1.0, -1.0, -1.0, 1.0, 1.0, 1.0]
+    still = np.tile(values[-100:], (max(round(rest_s), 0), 1))
+    if rest_s > 0.0:
+        # At rest, then the swing backwards, then forwards.
+        values = np.concatenate([still, back, values])
+        phi = np.concatenate([np.full(len(still), phi[-1]), phi[::-1], phi])
+    t = DT * np.arange(len(values))
+    up = level_three(Levelling(), t, values[:, 3:], values[:, :3])
+    error = wrapped(np.arctan2(up[:, 1], up[:, 0]) - phi)[t > max(rest_s, 1.2)]
+    assert np.degrees(error.std()) < 0.8
 
 
 NOISE_GAINS = Noise(math.radians(0.1), 1e-3, math.radians(0.1))

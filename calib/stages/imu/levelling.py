@@ -35,7 +35,8 @@ from calib.core.errors import BadInputError
 #
 #     u' = u x (w - b) + K1 V,   V' = V x (w - b) + (a / g - u) - K0 V,   b' = K2 u x V.
 #
-# A bias about the vertical does not show in this; at rest the mean rate shows it.
+# A bias about the vertical does not show in this; at rest the mean rate shows it. A log that begins in a
+# swing begins with forces of any size and direction, so that V is not held (below) in its first seconds.
 #
 # An acceleration that is held moves V beyond what a velocity and the angle's error allow. |V| is held to
 # three of its standard deviations, that of V and that of the velocity together, so that 0.3 g for 3 s turns
@@ -190,6 +191,7 @@ def system(parameters: Levelling, dt_s: float) -> tuple[FloatArray, FloatArray]:
 
 _MEAN_S = 0.5
 _REST_S = 2.0
+_START_S = 10.0
 _QUIET_RADPS = 0.02
 _QUIET_G = 0.05
 _TURNED_G = 0.015
@@ -235,7 +237,9 @@ def _run_three(
             for i in range(3):
                 V[i] += dt * (force[k, i] - u[i])
             _gains(P, dt, r, q, q_b, K)
-            part = K[3] / max(K[3], math.sqrt(V[0] * V[0] + V[1] * V[1] + V[2] * V[2]))
+            part = 1.0
+            if t[k] - t[0] > _START_S:
+                part = K[3] / max(K[3], math.sqrt(V[0] * V[0] + V[1] * V[1] + V[2] * V[2]))
             for i in range(3):
                 V[i] *= part
             b[0] += K[2] * (u[1] * V[2] - u[2] * V[1])
