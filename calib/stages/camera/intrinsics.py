@@ -74,6 +74,8 @@ BOARDS = ("rigid", "warp", "released")
 
 _FOLDS = 6
 _MAX_ITERATIONS = 40
+_MANY = 40
+"""Views from which on evidence tells the rational model's error on views held back to about a percent."""
 _ENOUGH = 1e-2
 """Of a standard deviation: far more than a comparison of held-back views needs."""
 _CHANCE = 0.023
@@ -191,28 +193,23 @@ def _on_held_back(fits: Sequence[Calibration]) -> FloatArray:
     """Mean squared residual vector (len(fits), N) of each view by a camera that has not seen it.
 
     What each view says about the camera (`checks.evidence`) tells it without another fit. Not so for a robust
-    loss, and the rational model, whose numerator and denominator move far together at next to no cost; it is
-    fitted again where it has a chance: where it shows the views that it was fitted to better than the best of
-    the others shows those held back.
+    loss, and the rational model, whose numerator and denominator move far together at next to no cost. Of
+    many views that one is fitted to parts only where it has a chance: where it shows the views that it was
+    fitted to better than the best of the others shows those held back.
     """
     if not fits:
         return np.zeros((0, 0))
-    folds = _folds(fits[0].observations.views)
+    views = fits[0].observations.views
+    folds = _folds(views)
     squared = np.array([_by_evidence(fit, folds) for fit in fits])
     gain_px2 = (_GAIN_PX * scale_of(fits[0].camera)) ** 2
-    least = min(
-        (
-            float(np.median(s))
-            for s, fit in zip(squared, fits, strict=True)
-            if fit.camera.model != "rational8"
-        ),
-        default=np.inf,
-    )
+    rational = np.array([fit.camera.model == "rational8" for fit in fits])
+    goal = np.median(squared[~rational], axis=1).min(initial=np.inf) - gain_px2
     bent = [
         i
         for i, fit in enumerate(fits)
         if fit.loss != "none"
-        or (fit.camera.model == "rational8" and np.median(fit.view_rms_px**2) < least - gain_px2)
+        or (rational[i] and (views < _MANY or not np.median(fit.view_rms_px**2) >= goal))
     ]
     jobs = [(i, fold) for i in bent for fold in folds]
     with Workers(fits, len(jobs)) as workers:
