@@ -62,15 +62,17 @@ def grid_px(readings: FloatArray) -> float:
     return 1.0 if len(seen) and bool(np.all(seen == np.rint(seen))) else 0.0
 
 
+_GATES = [OUT.index(f"gated_{name}") for name in ("camera", "accel", "gyro")]
+
+
+def _of(out: FloatArray) -> float:
+    """Log likelihood of an output; a gated sensor counts as a reading at the edge: gating wins nothing."""
+    return float(np.nansum(out[:, OUT.index("log_likelihood")]) - GATED * np.nansum(out[:, _GATES]))
+
+
 def log_likelihood(setup: Setup, logs: Sequence[Rows]) -> float:
-    """Of all logs; a gated sensor counts as a reading at the edge, so that gating wins nothing."""
-    total = 0.0
-    gates = [OUT.index(f"gated_{name}") for name in ("camera", "accel", "gyro")]
-    for rows in logs:
-        out = Filter(setup).run(rows)
-        total += float(np.nansum(out[:, OUT.index("log_likelihood")]))
-        total -= GATED * float(np.nansum(out[:, gates]))
-    return total
+    """Of all logs by the kinematic filter."""
+    return sum(_of(Filter(setup).run(rows)) for rows in logs)
 
 
 def best(values: FloatArray, likelihood: Callable[[float], float]) -> tuple[Estimate, float]:
@@ -206,14 +208,8 @@ def scaled(drive: Drive, walk: str, factor: float) -> Drive:
 
 
 def driven_likelihood(setup: Setup, drive: Drive, logs: Sequence[Log]) -> float:
-    """Of all logs; a gated sensor counts as a reading at the edge, as in `noise.log_likelihood`."""
-    total = 0.0
-    gates = [OUT.index(f"gated_{name}") for name in ("camera", "accel", "gyro")]
-    for rows, pwm in logs:
-        out = DrivenFilter(setup, drive).run(rows, pwm)
-        total += float(np.nansum(out[:, OUT.index("log_likelihood")]))
-        total -= GATED * float(np.nansum(out[:, gates]))
-    return total
+    """Of all logs by the driven filter."""
+    return sum(_of(DrivenFilter(setup, drive).run(rows, pwm)) for rows, pwm in logs)
 
 
 def tune_driven(

@@ -201,7 +201,8 @@ class OpenLog:
 
 
 def opened(path: Path, rig: Rig, rig_path: Path, options: LogOptions = NOTHING_STATED) -> OpenLog:
-    """A log with its set-up; the tracker's jitter comes from its beginning where the rig has no estimator.
+    """A log with its set-up; the tracker's jitter comes from its beginning where neither estimator nor
+    alignment says it.
 
     Raises `BadInputError` for a log or a rig that cannot be used.
     """
@@ -211,7 +212,8 @@ def opened(path: Path, rig: Rig, rig_path: Path, options: LogOptions = NOTHING_S
     setup, remarks = setup_from_rig(rig, rig_path, found)
     if first.map is not None and first.map.narration:
         remarks.append(first.map.narration)
-    if rig.estimator is None and found.camera:
+    stated = rig.estimator is not None or (rig.align is not None and rig.align.jitter_px > 0.0)
+    if found.camera and not stated:
         rows = rows_of(first, found.ticks)
         part = Rows(rows.t_s[:_JITTER_ROWS], rows.readings[:_JITTER_ROWS], rows.kinds[:_JITTER_ROWS])
         noise = setup.noise.copy()
