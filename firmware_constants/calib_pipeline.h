@@ -400,7 +400,7 @@ static inline uint16_t calib_angle(calib_state *state, const calib_inputs *in) {
     } else {
 #if CALIB_LEVELLING
         uint8_t i = state->step;
-        float S = calib_clip(state->sum_rad + e, CALIB_TABLE_READ(&calib_levelling_most[i]));
+        float S = state->sum_rad + e;
         float J = calib_carried(state->integral_rad, CALIB_TABLE_READ(&calib_levelling_bias[i]) * S, &state->rest_rad[1]);
         state->integral_rad = calib_clip(J, CALIB_MM_INTEGRAL_LIMIT_RAD);
         turned += CALIB_TABLE_READ(&calib_levelling_angle[i]) * S;

@@ -58,7 +58,7 @@ def test_the_same_values_as_in_float64(tmp_path: Path, kind: str, undistort: int
     assert (worst <= LIMITS).all(), worst
     assert undecided <= 0.01
     assert sizes["flash"] <= 8192
-    tables = 5 * 17 * 4 * (kind == "levelling" and not progmem)
+    tables = 4 * 17 * 4 * (kind == "levelling" and not progmem)
     assert sizes["ram"] + found.stack <= 300 + 60 * (kind != "nominal") + tables + 20 * (kind == "levelling")
 
 

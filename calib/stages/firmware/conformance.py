@@ -140,8 +140,7 @@ class Reference:
         if m.imu_age == _NEVER:
             m.phi = e
         elif levelling:
-            i = m.step
-            S = clip(m.level + e, c[f"calib_levelling_most[{i}]"])
+            i, S = m.step, m.level + e
             m.phi += c[f"calib_levelling_angle[{i}]"] * S
             m.integral = clip(m.integral + c[f"calib_levelling_bias[{i}]"] * S, c["MM_INTEGRAL_LIMIT_RAD"])
             m.level = S - c[f"calib_levelling_sum[{i}]"] * S

@@ -201,7 +201,7 @@ def plane_constants(rig: Rig, source: str) -> PlaneConstants | None:
 # gains stand in a table for the ticks at which they change, the last for ever.
 #
 #     phi += J - dt (gz + gz of the tick before) / 2,   S += e
-#     |S| <= D,   phi += A S,   J += B S,   S -= C S
+#     phi += A S,   J += B S,   S -= C S
 #
 # A section of the low-pass of order one, b0 (1 + z^-1) / (1 + a1 z^-1), runs in the trapezoidal form
 # v = b0 (x - s), y = s + v, s' = y + v: one product, and y = x exactly at rest. A section of order two runs
@@ -254,8 +254,8 @@ def _levelling(lookup: Lookup, rate_hz: float) -> dict[str, Any] | None:
     edges = np.unique(np.round(np.geomspace(1.0, last, _LEVELLING_STEPS))).astype(int)
     gains = gains_of(filter_, dt, last)
     rows = [gains[a - 1 : b - 1].mean(axis=0) for a, b in pairwise(edges.tolist())]
-    table = np.array([*rows, settled(filter_, dt)]) * [1.0, dt, dt * dt, 1.0 / dt]
-    names = ("sum", "angle", "bias", "most")
+    table = np.array([*rows, settled(filter_, dt)]) * [1.0, dt, dt * dt]
+    names = ("sum", "angle", "bias")
     return {
         "tau_s": tau_s,
         "velocity_mps": velocity,
