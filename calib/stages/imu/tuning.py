@@ -28,13 +28,6 @@ AngleFilter = Mahony | Levelling
 F = TypeVar("F", Mahony, Levelling)
 
 
-def words_of(gains: AngleFilter) -> str:
-    """The filter's parameters in words."""
-    if isinstance(gains, Levelling):
-        return f"time constant {gains.tau_s:g} s, velocity {gains.velocity_mps:g} m/s"
-    return f"gains Kp {gains.Kp:g}, Ki {gains.Ki:g}"
-
-
 # ----------------------------------------------------------------------
 # The angle filter as a linear system, and gains from noise.
 #
@@ -135,9 +128,7 @@ def gain_facts(gains: AngleFilter, dt_s: float) -> dict[str, Any]:
     size = float(np.abs(poles[np.abs(poles - 1.0) > 1e-12]).max(initial=0.0))
     only = isinstance(gains, Mahony) and gains.Ki == 0.0
     if size >= 1.0 or (isinstance(gains, Mahony) and gains.Kp == 0.0):
-        raise BadInputError(
-            f"{words_of(gains)} at steps of {dt_s:g} s: are not stable, expected 0 < Kp < {2.0 / dt_s:g}"
-        )
+        raise BadInputError(f"{gains} is not stable at steps of {dt_s:g} s, expected 0 < Kp < {2.0 / dt_s:g}")
     steps = min(math.ceil(math.log(1e-3) / math.log(size)) + 2, _LONGEST_STEPS)
     unit = np.eye(len(B))
     start = _powers(A, unit[0], steps)[:, 0]
