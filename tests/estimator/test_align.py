@@ -224,7 +224,7 @@ def _problem(
     begin = c + np.array([0.02, 0.001]) * rng.standard_normal(c.shape)
     loose = np.full((knots.count - 5, 2), 1e3)
     stretch = Stretch(0, camera_s, pixels, imu_s, readings, knots, begin, loose)
-    return Problem(NUMBERS, 0.0, 1256.0, (stretch,), MEAN, SIGMA), c
+    return Problem(NUMBERS, 0.0, (stretch,), MEAN, SIGMA), c
 
 
 def test_exact_readings_give_the_truth_back() -> None:

@@ -51,6 +51,8 @@ from calib.stages.estimator.sensors import GRAVITY_MPS2, SENSOR, SIZE, invert_ma
 HUBER = 4.0
 """Knee of the loss of an IMU's reading, in deviations."""
 
+_OUTLIER_AREA_PX2 = 1256.0
+"""The area a over which pictures of something else lie: a circle of 20 px."""
 _JITTERS_PX = np.exp(np.linspace(math.log(0.03), math.log(3.0), 47))
 _COARSE = 4
 """Of the jitters every fourth is tried first, then those beside the best."""
@@ -191,13 +193,12 @@ class Problem:
     Attributes
     ----------
     view : (25,) of `sensors.view_coefficients`.
-    grid_px : step of the pixels, 0 for none. area_px2 : over which outliers lie.
+    grid_px : step of the pixels, 0 for none.
     mean, sigma : (13,) prior of `SENSOR`.
     """
 
     view: FloatArray
     grid_px: float
-    area_px2: float
     stretches: tuple[Stretch, ...]
     mean: FloatArray
     sigma: FloatArray
@@ -260,7 +261,7 @@ def _picture_terms(
 ) -> tuple[float, FloatArray, FloatArray, FloatArray]:
     """Loss, pull, weight and probability of pictures off by (k, 2) [px], as `pixel_terms` has them."""
     room = np.empty_like(off), np.empty_like(off), np.empty(len(off))
-    return pixel_terms(off, noise.jitter_px, problem.grid_px, noise.share, problem.area_px2, *room), *room
+    return pixel_terms(off, noise.jitter_px, problem.grid_px, noise.share, _OUTLIER_AREA_PX2, *room), *room
 
 
 def _accelerations(stretch: Stretch) -> Iterator[Rows]:
@@ -823,7 +824,7 @@ def _renewed(
     good = np.concatenate(goods)
     share = float(np.clip(1.0 - good.mean() if len(good) else 0.0, 1e-3, 0.5))
     offs = [pictures_off(problem, stretch, c, s) for stretch, c in zip(problem.stretches, cs, strict=True)]
-    jitter = best_jitter_px(np.concatenate(offs), problem.grid_px, share, problem.area_px2)
+    jitter = best_jitter_px(np.concatenate(offs), problem.grid_px, share, _OUTLIER_AREA_PX2)
     return Noise(jitter, share, _imu_noise(problem, arrow, cs, s, noise))
 
 
@@ -896,7 +897,6 @@ def response(problem: Problem, fit: Fit, i: int, change: FloatArray) -> FloatArr
 #
 # what the accelerometer reads at phi = 0; it comes with its own deviation.
 
-_OUTLIER_AREA_PX2 = 1256.0
 _FIRST_NOISE = Noise(1.0, 0.05, np.array([0.2, 0.2, 0.01]))
 _GYRO, _AX, _AY, _MOUNT, _OFFSET = (
     SENSOR.index(name)
@@ -1080,7 +1080,7 @@ def align(logs: Sequence[AlignLog], settings: Settings) -> Alignment:
     mean = settings.mean.copy()
     mean[_MOUNT] = 0.0
     problem = Problem(
-        settings.view, settings.grid_px, _OUTLIER_AREA_PX2,
+        settings.view, settings.grid_px,
         first.stretches, mean, settings.sigma,
     )  # fmt: skip
     if first.moves:

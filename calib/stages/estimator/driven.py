@@ -1177,7 +1177,6 @@ assert SIZE == 19
 
 WINDOW, OVERLAP = 6000, 3000
 LONGEST_GAP_S = 2.0
-_SMOOTHER_BEFORE_S, _SMOOTHER_LOCKED_OUT = 0.03, 5.5
 _SMOOTHER_BEGUN, _SMOOTHER_STARTED, _SMOOTHER_PENDING, _SMOOTHER_HOSES = range(2, 6)
 """Marks of the forward pass, after the numbers of pictures and of IMU readings that were rejected."""
 _SHOWN = np.array([0, 1, 2, 3, INVOLVED])
@@ -1229,7 +1228,7 @@ def _forward(
         if kind == HOSES:
             marks[_SMOOTHER_HOSES] = 1
         waits = marks[_SMOOTHER_STARTED] == 0 or marks[_SMOOTHER_PENDING] == 1
-        if waits and kind == CAMERA and t[k] > first_s + _SMOOTHER_BEFORE_S and begin_again(
+        if waits and kind == CAMERA and t[k] > first_s + _BEFORE_S and begin_again(
             x, P, x0, P0, view, z[0], z[1], not math.isnan(marks[_SMOOTHER_BEGUN]),
             marks[_SMOOTHER_HOSES] == 1, switch_g[last, 0], switch_g[last, 1],
         ):  # fmt: skip
@@ -1251,7 +1250,7 @@ def _forward(
                 copy_state(x, P, x0, P0)
                 chained[k] = False
                 marks[_SMOOTHER_PENDING] = 1
-            elif marks[0] > _SMOOTHER_LOCKED_OUT or marks[1] > 2.0 * _SMOOTHER_LOCKED_OUT:
+            elif marks[0] > _LOCKED_OUT or marks[1] > 2.0 * _LOCKED_OUT:
                 marks[_SMOOTHER_PENDING] = 1
                 marks[0], marks[1] = 0.0, 0.0
         for i in range(len(_SHOWN)):
