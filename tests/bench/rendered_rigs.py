@@ -102,7 +102,7 @@ def drawn(seed: int, off_mm: float = 0.0, wrong: str | None = None) -> Simulated
     elif wrong == "heavier":
         rig = replace(rig, plant=replace(rig.plant, mass_kg=1.25 * rig.plant.mass_kg))
     elif wrong == "weaker":
-        rig = replace(rig, pump_strength=(0.85 * rig.pump_strength[0], 0.85 * rig.pump_strength[1]))
+        rig = replace(rig, strength=(0.85 * rig.strength[0], 0.85 * rig.strength[1]))
     rng = np.random.default_rng(9000 + seed)
     louder = float(rng.uniform(0.8, 1.25))
     imu = replace(
