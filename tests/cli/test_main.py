@@ -204,7 +204,7 @@ def test_an_interruption_while_boards_are_searched(environment, tmp_path) -> Non
         "import sys, time, numpy as np, calib.stages.camera.read\n"
         "from calib.io.pictures import Picture\n"
         "import calib.stages.camera.read as read\n"
-        "read.read_picture = lambda p, *_: Picture(p.name, '', np.zeros((9, 9), np.uint8), (9, 9))\n"
+        "read.read_picture = lambda p, *_, **__: Picture(p.name, '', np.zeros((9, 9), np.uint8), (9, 9))\n"
         "def slow(*_):\n    sys.stdout.write('searching\\n'); sys.stdout.flush(); time.sleep(30)\n"
         "calib.stages.camera.read.detect = slow\n"
         "from calib.cli.main import main\n"
