@@ -796,8 +796,7 @@ def limit_of(rigs: int, constants: int) -> float:
 # ----------------------------------------------------------------------
 # Whether a constant drifts over the serial numbers of a fleet: a robust straight line with its sigma.
 #
-# x_i = a + b t_i + noise, with Huber's estimate: residuals beyond 1.345 standard deviations count as such
-# of
+# x_i = a + b t_i + noise, with Huber's estimate: residuals beyond 1.345 standard deviations count as such of
 # that size, so that rigs that stand out do not turn the line. With the residuals r_i over their own scales
 # c_i = sqrt(tau^2 + sigma_i^2), psi Huber's function and psi' its derivative, the covariance of (a, b) is
 #

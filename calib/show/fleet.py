@@ -73,8 +73,7 @@ def _with_sigma(drift: Drift) -> str:
 # ----------------------------------------------------------------------
 # The page of a fleet: one HTML file that needs no network, from its summary.
 #
-# Whatever the number of rigs, the page holds so many bins, points and names and no more. Names and
-# sentences
+# Whatever the number of rigs, the page holds so many bins, points and names and no more. Names and sentences
 # are escaped, and a policy in the page lets no script run but its own.
 
 PAGE = "fleet.html"

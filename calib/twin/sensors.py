@@ -53,9 +53,8 @@ def gaussian_noise(bits: np.random.PCG64, shape: tuple[int, int]) -> FloatArray:
 #
 # Sensors in a closed loop look at one or two states per tick, where calls cost more than numbers.
 #
-# With rho = l S(phi), h = phi / 2 and S of `calib.stages.actuator.kinematics` the head is at rho (sin h,
-# cos h), and its
-# acceleration along and across that direction is
+# With rho = l S(phi), h = phi / 2 and S of `calib.stages.actuator.kinematics` the head is at rho (sin h, cos
+# h), and its acceleration along and across that direction is
 #
 #     a_r = rho'' - rho dphi^2 / 4,   a_t = rho ddphi / 2 + rho' dphi,
 #     rho' = dl S + l S' dphi,   rho'' = ddl S + 2 dl S' dphi + l (S'' dphi^2 + S' ddphi),
@@ -126,9 +125,8 @@ def head_rows(r: float, states: FloatArray, ddq: FloatArray) -> FloatArray:
 # from the truth in a swing with nodes 1/300 s apart). Creep and forces change slowly and are
 # interpolated linearly. Accelerations come from the equations of motion in the interpolated state.
 #
-# `calib.twin.sensors` and `calib.twin.sensors` make measurements of it. Every random number of a
-# log is drawn before the simulation from streams of its own, so that closing the loop over the sensors
-# or not does not change the noise.
+# Tracker and IMU measure it. Every random number of a log is drawn before the simulation from streams of its
+# own, so that closing the loop over the sensors or not does not change the noise.
 
 
 def stream(seed: int, *purpose: int) -> np.random.PCG64:

@@ -117,9 +117,8 @@ def chord_curvature(phi: FloatArray) -> FloatArray:
 #     (x, y) = l S(phi) (sin(phi / 2), cos(phi / 2))                                  (3.6), (3.10)
 #     l = |(x, y)| / S(phi)                                                           (3.11), (3.12)
 #
-# with S of `calib.stages.actuator.kinematics`. World: x to the right, y along the straight actuator
-# towards the head, phi > 0 bends the head towards +x and bellows 1, at -r_B in the head's frame, is then
-# longer.
+# with S as above. World: x to the right, y along the straight actuator towards the head, phi > 0 bends the
+# head towards +x and bellows 1, at -r_B in the head's frame, is then longer.
 #
 # The rotation in (3.6) is printed the other way round: the arc's tangent at the head is
 # (sin phi, cos phi), as (A.1) has it, so the block is [[cos, sin], [-sin, cos]].

@@ -746,8 +746,7 @@ def start(pieces: Sequence[Piece], logs: Sequence[AlignLog], usual_offset_s: flo
 # ----------------------------------------------------------------------
 # Batch least squares for what the sensors are, over splines for how the head moved.
 #
-# The normal equations are those of `align_problem`. Camera, accelerometer and gyroscope read the same
-# motion
+# The normal equations are those of `align_problem`. Camera, accelerometer and gyroscope read the same motion
 # with errors of known size, so that the fit, which makes the motion and the sensors' quantities most likely
 # together, is a total least squares: right on the average while the motion is left free (Van Huffel and
 # Vandewalle 1991).

@@ -719,10 +719,9 @@ def refit_poses(calibration: Calibration, observations: Observations) -> FloatAr
 # ----------------------------------------------------------------------
 # Standard deviations of a calibration: intrinsics, poses, and projection over the image.
 #
-# With the normal matrix H of `calib.stages.camera.bundle` and the residuals' variance sigma^2, the
-# covariance of
-# all parameters is sigma^2 H^-1. Its block of the intrinsics is the inverse of the Schur complement S,
-# and for view i
+# With the normal matrix H of the adjustment and the residuals' variance sigma^2, the covariance of all
+# parameters is sigma^2 H^-1. Its block of the intrinsics is the inverse of the Schur complement S, and for
+# view i
 #
 #     cov(z_i) = V_i^-1 + E_i S^-1 E_i',   cov(s, z_i) = -S^-1 E_i',   E_i = V_i^-1 W_i'.
 #

@@ -684,7 +684,7 @@ def _cost(calibration: Calibration) -> float:
 # A set mixed from two cameras can fit one at a low RMS, because every view's pose bends to the
 # camera's will. Splitting the views always lowers the cost, also where there is one camera, so the fall
 # has to be compared with what it would be by chance. With the quadratic evidence of each view
-# (`calib.stages.camera.checks`) a split costs next to nothing:
+# (above) a split costs next to nothing:
 #
 # 1. views are reassigned between two cameras until stable, from several starts (k-means with each
 #    view's own metric); and, for a lens that was moved on the way, all splits in order are tried, of which
@@ -977,11 +977,10 @@ def best_split(calibration: Calibration, seed: int = 0) -> Split | None:
 # ----------------------------------------------------------------------
 # Which picture to take next: the one that takes most of the uncertainty away.
 #
-# A candidate view adds its information S_c (its pose eliminated, `calib.stages.camera.checks`) to the sum
-# S of
-# the views taken. What is left is measured by tr(R (S + S_c)^-1), where R is the mean information
-# of reference views that fill the whole picture: the expected squared error, in pixels, of explaining a
-# new view anywhere in the picture with this camera (optimal design, criterion V).
+# A candidate view adds its information S_c (its pose eliminated, as above) to the sum S of the views taken.
+# What is left is measured by tr(R (S + S_c)^-1), where R is the mean information of reference views that fill
+# the whole picture: the expected squared error, in pixels, of explaining a new view anywhere in the picture
+# with this camera (optimal design, criterion V).
 
 _EDGES = {0: "right", 90: "bottom", 180: "left", 270: "top"}
 _PLACES = (0.22, 0.5, 0.78)

@@ -476,7 +476,7 @@ def one_to_one_reach(camera: Camera) -> float:
 # Residuals of all views and their Jacobian, for the bundle adjustment.
 #
 # For the point X of the target, p = R X + t in the camera's frame, x = p1 / p3, y = p2 / p3, distorted
-# and projected as in `calib.stages.camera.model`. With a = du/dp (3,) the derivatives are, for a rotation
+# and projected as above. With a = du/dp (3,) the derivatives are, for a rotation
 # exp(delta) R on the left,
 #
 #     du/d(delta) = (R X) x a,   du/dt = a,   du/dw_k = a . R B_k
@@ -487,8 +487,7 @@ def one_to_one_reach(camera: Camera) -> float:
 #     d(p_i m)/dp_j = m [i = j] + p_i p_j (theta_d' p3 / d^2 - m) / rho^2
 #     d(p_i m)/dp3  = -p_i theta_d' / d^2
 #
-# All arrays are kept with the
-# point last, so that each line of code runs over all views and points at once.
+# All arrays are kept with the point last, so that each line of code runs over all views and points at once.
 
 INTRINSICS = ("fx_px", "fy_px", "cx_px", "cy_px", "skew_px", *COEFFICIENTS)
 """Order of the vector of intrinsics."""

@@ -53,7 +53,7 @@ from calib.stages.actuator.simulate import derivative, largest_step_s
 # - Clamping. When u_k lies outside the limits it is computed again with Ki = 0 and the same history
 #   (4.1.1), and that value is both the output and the next u_(k-1): the tick adds nothing to the sum.
 #
-# A controller here has one channel; `calib.stages.control.laws` runs one for each bellows.
+# A controller has one channel for each bellows.
 
 PWM_MIN = 0.0
 """Limits of what the microcontroller can put out, 0 V to 12 V, with `PWM_MAX`."""
@@ -476,7 +476,7 @@ class BackOrientation:
 # pumps ends, reaches 242 at 91 mm and saturates at 93.4 mm.
 #
 # Its value is added to the output of the feedback controller before saturation and is no part of that
-# controller's memory (see `calib.stages.control.laws`).
+# controller's memory.
 
 
 @dataclass(frozen=True)
@@ -682,7 +682,7 @@ def design_observer(
 # zero by d^, which takes the place of an integrator and needs no anti-windup: it is driven by the
 # measurements' disagreement with the model under the *limited* commands.
 #
-# `calib.stages.control.laws` then turns F* into a command. Where F* asks for more than the pumps can do
+# `pwm_for_force` then turns F* into a command. Where F* asks for more than the pumps can do
 # the nearest that they can is commanded, which is told.
 
 

@@ -13,12 +13,10 @@ from calib.stages.estimator.kinematic import Setup
 from calib.stages.estimator.sensors import GRAVITY_MPS2, marker
 
 # ----------------------------------------------------------------------
-# Gains of the fused estimator of `calib.stages.estimator.constant_gain`: what it runs with, and how they
-# are found.
+# Gains of the fused estimator: what it runs with, and how they are found.
 #
-# K_c, K_a, K_b are those of the stationary filter of (phi, b), which the gyroscope's turn carries from
-# tick to
-# tick, K_m, K_v of (l, v), and K_r of l alone. With P of the discrete algebraic Riccati equation they are
+# K_c, K_a, K_b are those of the stationary filter of (phi, b), which the gyroscope's turn carries from tick
+# to tick, K_m, K_v of (l, v), and K_r of l alone. With P of the discrete algebraic Riccati equation they are
 # K = P H' (H P H' + R)^-1 (Anderson and Moore 1979, 4.4). A picture that is D ticks late shows l - D v. The
 # densities of the process noise were found by a random search for the least errors on simulated rigs whose
 # parameters vary.
@@ -146,15 +144,12 @@ def design(noise: TickNoise, rate_hz: float, delay_s: float, lever_m: float) -> 
 # ----------------------------------------------------------------------
 # The fused estimator with constant gains as the firmware runs it, on one picture and one IMU sample a tick.
 #
-# A camera that sees whole pixels tells the angle to half a degree, the gyroscope its change to a
-# thousandth of
-# that, and the accelerometer's angle is wrong while the head accelerates. So the gyroscope carries the
-# angle,
-# and pictures and accelerometer pull it, slowly. A picture belongs to the time of its exposure, D ticks
-# ago:
-# the angle of then is remembered, the residual taken there and added now. With (X, Y) the marker, d its
-# offset,
-# phi_D the angle D ticks ago and h = phi_D / 2, constant curvature (3.6), (A.1) gives to first order
+# A camera that sees whole pixels tells the angle to half a degree, the gyroscope its change to a thousandth
+# of that, and the accelerometer's angle is wrong while the head accelerates. So the gyroscope carries the
+# angle, and pictures and accelerometer pull it, slowly. A picture belongs to the time of its exposure, D
+# ticks ago: the angle of then is remembered, the residual taken there and added now. With (X, Y) the marker,
+# d its offset, phi_D the angle D ticks ago and h = phi_D / 2, constant curvature (3.6), (A.1) gives to first
+# order
 #
 #     X cos h - Y sin h - d sin h = (rho / 2 + d cos h) (angle - phi_D)        across the chord
 #     X sin h + Y cos h - d cos h = l S(phi_D) - d sin h (angle - phi_D)        along it
@@ -171,17 +166,12 @@ def design(noise: TickNoise, rate_hz: float, delay_s: float, lever_m: float) -> 
 # that
 #     l += K_m e_l, v += K_v e_l moving,      else l += K_r e_l, v *= K_d
 #
-# The gains are those of `calib.stages.estimator.constant_gain`. One cannot serve a length at rest and in
-# motion; the mean
-# residual s tells which it is.
+# One gain cannot serve a length at rest and in motion; the mean residual s tells which it is.
 #
-# A picture with |across| or |e_l| beyond `gate_m` is left out; after `PATIENCE` of them in a row the next
-# one
-# starts afresh. Then, and at the beginning, the length is that of the picture, and for `BOOST_TICKS`
-# pictures
+# A picture with |across| or |e_l| beyond `gate_m` is left out; after `PATIENCE` of them in a row the next one
+# starts afresh. Then, and at the beginning, the length is that of the picture, and for `BOOST_TICKS` pictures
 # angle and length go by `BOOST` of their residual. Without a picture v *= K_d, and without a sample of the
-# IMU
-# the angle stands but for `ALONE` of the pictures' residual.
+# IMU the angle stands but for `ALONE` of the pictures' residual.
 
 
 def tick_noise(setup: Setup) -> TickNoise:

@@ -59,12 +59,11 @@ from calib.stages.estimator.smoother import events_of, look_back, smooth, undo_r
 # ----------------------------------------------------------------------
 # The driven process: the actuator's dynamics with the commands of its pumps as input.
 #
-# A state is the row `DRIVEN` of 36 numbers. The first twelve move: angle, length and their rates, creep as
-# z1 + z2 and z1 - z2, and for each bellows the output of the pump's lag, its force, and a slow disturbance
-# that
-# is added to it. Then come what is not known exactly of plant and pumps (`PARAMETER`), as relative
-# deviations from the nominal value (of the damping its logarithm, of the rest length metres), and the
-# sensors of `sensors.SENSOR`.
+# A state is the row `DRIVEN` of 36 numbers. The first twelve move: angle, length and their rates, creep as z1
+# + z2 and z1 - z2, and for each bellows the output of the pump's lag, its force, and a slow disturbance that
+# is added to it. Then come what is not known exactly of plant and pumps (`PARAMETER`), as relative deviations
+# from the nominal value (of the damping its logarithm, of the rest length metres), and the sensors of
+# `sensors.SENSOR`.
 #
 # The motion is that of `calib.stages.actuator.dynamics.rates` and
 # `calib.stages.actuator.pump.advance_pump`, in Runge-Kutta steps of at most `longest_step_s`: as damping and
@@ -1400,19 +1399,17 @@ def smooth_driven(setup: Setup, drive: Drive, rows: Rows, pwm: FloatArray, outpu
 # ----------------------------------------------------------------------
 # Which of two models speaks: the driven one while it explains the pictures, else the kinematic one.
 #
-# Both filters predict every picture. With s the sum over pictures of the log likelihood of the driven
-# filter
+# Both filters predict every picture. With s the sum over pictures of the log likelihood of the driven filter
 # minus that of the kinematic one, each term cut to +-`CUT` and forgotten over `MEMORY_S`, the driven one's
 # weight is
 #
 #     w = 1 / (1 + exp(-(s - OFFSET) / SOFT)).
 #
-# Pictures are compared since they alone see the length. Likelihoods only compare two predictions, though,
-# and a wrong model of the plant may still predict better than one that knows nothing. So the driven filter
-# must agree with itself as well: over what is in memory the mean of each sensor's innovations, which a
-# wrong
-# force moves first, and their mean square are chi-square, and what they exceed that by is taken from s. A
-# restart or a reading that only the driven filter rejects counts against it too.
+# Pictures are compared since they alone see the length. Likelihoods only compare two predictions, though, and
+# a wrong model of the plant may still predict better than one that knows nothing. So the driven filter must
+# agree with itself as well: over what is in memory the mean of each sensor's innovations, which a wrong force
+# moves first, and their mean square are chi-square, and what they exceed that by is taken from s. A restart
+# or a reading that only the driven filter rejects counts against it too.
 #
 # Means are mixed by the weight, and what they differ by is added to the covariance.
 

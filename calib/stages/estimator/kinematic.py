@@ -313,10 +313,9 @@ def settle_weights(weights: FloatArray, slot: int, log_likelihood: FloatArray, p
 # ----------------------------------------------------------------------
 # Time stamps made even: a causal clock for each sensor that samples at a steady rate.
 #
-# A sensor's k-th sample was taken at o + k T; its stamp has jitter, waits in buffers and is sometimes that
-# of
-# the sample before. A Kalman filter on (time of this sample, period) with a period that wanders a little is
-# a line fitted with forgetting: its gains fall as in a fit of a line and end at about one in a hundred.
+# A sensor's k-th sample was taken at o + k T; its stamp has jitter, waits in buffers and is sometimes that of
+# the sample before. A Kalman filter on (time of this sample, period) with a period that wanders a little is a
+# line fitted with forgetting: its gains fall as in a fit of a line and end at about one in a hundred.
 #
 # A stamp that comes a number of periods late says that samples are missing, and they are counted. One
 # that is off by less, or early, is not believed; the sample gets the time that was due. When ten in
@@ -707,10 +706,9 @@ def write_columns(
 # those after it are done again. So each row's output rests on all that had arrived by then, and on nothing
 # else. Time stamps go through the clocks first.
 #
-# What goes wrong is said in `flags`: a picture or a sample that was gated; a sensor that is silent; a
-# restart
-# after half a second of rejected pictures, at a jump of the time, or from a state that no rig has; an
-# angle or length that no sensor sees, which the prior then holds.
+# What goes wrong is said in `flags`: a picture or a sample that was gated; a sensor that is silent; a restart
+# after half a second of rejected pictures, at a jump of the time, or from a state that no rig has; an angle
+# or length that no sensor sees, which the prior then holds.
 
 NEWEST, COUNT = 0, 1
 """Where a filter's integers tell the place of the newest of the last events, and how many there are."""

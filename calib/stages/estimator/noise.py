@@ -15,12 +15,11 @@ from calib.stages.estimator.kinematic import OUT, Filter, Kinematic, Level, Rows
 # ----------------------------------------------------------------------
 # Noise that a log itself tells: the tracker's jitter, and levels of process noise.
 #
-# The likelihood of a log is the product of what its filter expected of each reading. It is maximised
-# over the logarithm of one number at a time: a grid, then the parabola through the best three
-# values, whose curvature gives the standard deviation. Pooled over logs of rest and motion it would drive
-# the process noise to what the most frequent regime needs, so each level of the bank is tuned by logs in
-# which
-# it speaks, weighted by nothing else: the bank's own likelihood does that.
+# The likelihood of a log is the product of what its filter expected of each reading. It is maximised over the
+# logarithm of one number at a time: a grid, then the parabola through the best three values, whose curvature
+# gives the standard deviation. Pooled over logs of rest and motion it would drive the process noise to what
+# the most frequent regime needs, so each level of the bank is tuned by logs in which it speaks, weighted by
+# nothing else: the bank's own likelihood does that.
 
 _JITTERS_PX = np.array([0.05, 0.1, 0.15, 0.22, 0.3, 0.42, 0.6, 0.85, 1.2, 2.0])
 _FACTORS = np.array([0.5, 1.0, 2.0])
@@ -163,13 +162,11 @@ def tune(setup: Setup, logs: Sequence[Rows], progress: Callable[[int, int], None
 # ----------------------------------------------------------------------
 # Process noise of the driven filter from logs, by maximum likelihood of its innovations.
 #
-# What the model of plant and pumps lacks is in three random walks: of the disturbance forces, of the
-# rates, and
-# of lag, forces and creep. Each is scaled by the factor at which a log is most likely, one after the other.
-# A log in which little happens needs no noise and would, pooled with others, drive it to nothing; so logs
-# are
-# asked one by one, and the one that needs most has its way. No factor is less than a half: that nothing
-# disturbs a plant, a log cannot show.
+# What the model of plant and pumps lacks is in three random walks: of the disturbance forces, of the rates,
+# and of lag, forces and creep. Each is scaled by the factor at which a log is most likely, one after the
+# other. A log in which little happens needs no noise and would, pooled with others, drive it to nothing; so
+# logs are asked one by one, and the one that needs most has its way. No factor is less than a half: that
+# nothing disturbs a plant, a log cannot show.
 
 WALKS = ("disturbance", "rates", "forces")
 _DRIVEN_NOISE_FACTORS = np.array([0.5, 1.0, 2.0, 4.0, 8.0, 16.0])

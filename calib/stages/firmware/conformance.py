@@ -338,7 +338,7 @@ class Reference:
 # ----------------------------------------------------------------------
 # The tick with the fused estimator in float64, what CALIB_FUSED 1 is held against.
 #
-# As `calib.stages.firmware.conformance`: the header's constants, exact functions, the order of decisions of
+# As above: the header's constants, exact functions, the order of decisions of
 # `calib_pipeline.h`. Rest or motion, and a picture left out or not, are taken from the firmware's flags where
 # they are given, with the distance of the reference's own value from the limit where it would have decided
 # otherwise.

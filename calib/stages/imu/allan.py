@@ -192,10 +192,9 @@ def bounds(
 # ----------------------------------------------------------------------
 # White noise N, bias instability B and random walk K fitted to Allan variances.
 #
-# The squares theta = (N^2, B^2, K^2) enter the variances linearly (`calib.stages.imu.allan`), with a
-# covariance
-# that depends on theta itself. So weighted least squares are repeated with the covariance of the last
-# estimate, over averaging times in octaves up to a quarter of the log. What has to be explained:
+# The squares theta = (N^2, B^2, K^2) enter the variances linearly, with a covariance that depends on theta
+# itself. So weighted least squares are repeated with the covariance of the last estimate, over averaging
+# times in octaves up to a quarter of the log. What has to be explained:
 #
 # - which terms there are. White noise is always there. B and K are added one at a time, the one with the
 #   larger z = theta / sigma first, and only where z exceeds `LEAST_Z` with the covariance that holds

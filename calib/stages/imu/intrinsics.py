@@ -84,10 +84,8 @@ def turn_directions(
 #     1 / w = u^T A C A^T u / n + tau^2,   A = T diag(1/s),  u = a / |a|,
 #
 # where tau is what the rests disagree by beyond their noise (a bias that moves, a table that gives way),
-# chosen so that the weighted residuals have the size that their degrees of freedom ask for. So neither a
-# long
-# rest counts for more than it is worth, nor a short one for less. Standard deviations follow from the
-# normal
+# chosen so that the weighted residuals have the size that their degrees of freedom ask for. So neither a long
+# rest counts for more than it is worth, nor a short one for less. Standard deviations follow from the normal
 # equations times the measured scale of the residuals.
 #
 # What can be told is judged by the singular values of dr/dp, in units of g, by which the root of the number
@@ -519,9 +517,8 @@ def misfit_covariance(
 #
 # with readings x, bias b, scale s (counts per rad/s, or about 1) and six small angles [rad] to the axes of
 # the accelerometer's frame (Tedaldi, Pretto and Menegatti, ICRA 2014, eqs. 7 - 11; names as in imu_tk).
-# Integrated from rest to rest they carry gravity's direction along (`calib.stages.imu.intrinsics`). A turn
-# about gravity
-# itself shows nothing; many others together show all. In a plane the scale of z alone is left.
+# Integrated from rest to rest they carry gravity's direction along. A turn about gravity itself shows
+# nothing; many others together show all. In a plane the scale of z alone is left.
 #
 # The bias is that of the rest at the start, as in the paper. Where the readings at rest follow the pose
 # beyond doubt (F test), b and the sensitivity S to the specific force a are fitted to all rests instead: an
@@ -966,8 +963,7 @@ def find_intrinsics(log: Readings, gravity_mps2: float = 9.80665, planar: bool =
 # - poor: known less well than `LIMITS`, or poses missing on one side;
 # - ok otherwise.
 #
-# A scale and a bias of an axis are told apart by rests with the axis up and with it down. A side lacks
-# where
+# A scale and a bias of an axis are told apart by rests with the axis up and with it down. A side lacks where
 # no rest has the axis within 60 degrees of it.
 
 LIMITS = {"scale": 0.005, "bias_g": 0.005, "angle_rad": math.radians(0.5), "gyro": 0.01}

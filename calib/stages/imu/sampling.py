@@ -325,8 +325,7 @@ def rest_parts(
 #     zeta = sqrt(var_x^2 + var_y^2 + var_z^2),
 #
 # is below a multiple of what it is while the sensor lies still at the start of the log (Tedaldi, Pretto and
-# Menegatti, ICRA 2014, eq. 12). Which multiple is right depends on the sensor and on the table; whoever
-# fits
+# Menegatti, ICRA 2014, eq. 12). Which multiple is right depends on the sensor and on the table; whoever fits
 # a model to the rests tries those of `MULTIPLES` and keeps the one with the least residual.
 #
 # Where the log does not begin at rest, its quietest windows are the measure instead.

@@ -191,14 +191,12 @@ def riccati(noise: Noise, dt_s: float) -> Mahony:
 # in their difference.
 #
 # With m runs, about ten, the spread of the draws is too small and not well known. Runs about their common
-# mean
-# lose a share 1 / m of the variance, and a variance from overlapping runs has 1.5 m degrees of freedom
+# mean lose a share 1 / m of the variance, and a variance from overlapping runs has 1.5 m degrees of freedom
 # (Kuensch, Annals of Statistics 17, 1989). So deviations from the estimate are widened by
 #
 #     sqrt(m / (m - 1)) t(1.5 m) / z,   t and z the 97.5 % points of Student's and the normal distribution,
 #
-# and intervals of an error, which is a scale, are those of its logarithm, turned about the estimate: an
-# error
+# and intervals of an error, which is a scale, are those of its logarithm, turned about the estimate: an error
 # that was found too small was found with too small a spread.
 
 CONFIDENCE = 0.95
@@ -329,11 +327,11 @@ def compared(rows: Sequence[Row], dt_s: float) -> tuple[tuple[Candidate, ...], f
 #     X1 = (alpha cos phi + w^2 sin phi) / g,   X2 = (alpha sin phi - w^2 cos phi) / g,   alpha = dgz/dt,
 #
 # white noises n, n_b of the gyroscope, and of the accelerometer white noise v and accelerations c that last
-# for a time tau. A Kalman filter forwards and the
-# smoother of Rauch, Tung and Striebel backwards give phi = theta + delta. How much of c and v there is
-# depends on the motion, and a rate that is not quite that of the angle adds to n: densities, tau and the
-# size of c are those that make the log most likely, from means over half a second. What the accelerometer
-# feels stays bounded and what the gyroscope gathers does not, by which the two are told apart.
+# for a time tau. A Kalman filter forwards and the smoother of Rauch, Tung and Striebel backwards give phi =
+# theta + delta. How much of c and v there is depends on the motion, and a rate that is not quite that of the
+# angle adds to n: densities, tau and the size of c are those that make the log most likely, from means over
+# half a second. What the accelerometer feels stays bounded and what the gyroscope gathers does not, by which
+# the two are told apart.
 
 _G = 9.80665
 BLOCK_S = 0.05

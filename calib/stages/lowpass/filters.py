@@ -17,11 +17,10 @@ from calib.core.errors import BadInputError
 # Samples with time stamps as the firmware sees them: one value per tick.
 #
 # The firmware counts ticks and does not look at clocks: a tick uses the newest sample, and where the camera
-# found nothing the last one is held. So samples are put on a uniform grid: a sample belongs to the tick
-# that is
-# nearest to its time stamp (jitter below half a tick changes nothing), of several in one tick the
-# last counts, and a tick without a sample holds the one before. After a gap longer than `LONGEST_HOLD_S`
-# a new piece begins, filtered from rest, because what was held so long is no position any more.
+# found nothing the last one is held. So samples are put on a uniform grid: a sample belongs to the tick that
+# is nearest to its time stamp (jitter below half a tick changes nothing), of several in one tick the last
+# counts, and a tick without a sample holds the one before. After a gap longer than `LONGEST_HOLD_S` a new
+# piece begins, filtered from rest, because what was held so long is no position any more.
 
 LONGEST_HOLD_S = 1.0
 
@@ -443,13 +442,12 @@ def noise_gain(sections: FloatArray) -> float:
 # ----------------------------------------------------------------------
 # Motion and jitter of a logged position, told apart by their spectrum.
 #
-# Motion of a heavy thing is slow, quantisation and tracking errors are spread over all frequencies. So
-# the power density (Welch 1967) falls from the motion to a floor. Outliers are no jitter: samples beyond
-# six
+# Motion of a heavy thing is slow, quantisation and tracking errors are spread over all frequencies. So the
+# power density (Welch 1967) falls from the motion to a floor. Outliers are no jitter: samples beyond six
 # standard deviations from the median of five (Hampel 1974) are replaced by it first. Of the segments'
-# densities the mean holds motion however short it was, and the median P counts disturbances little.
-# The motion ends at the last frequency f_m of the lower half of the band at which the mean is above six
-# times its own floor. The jitter has the density
+# densities the mean holds motion however short it was, and the median P counts disturbances little. The
+# motion ends at the last frequency f_m of the lower half of the band at which the mean is above six times its
+# own floor. The jitter has the density
 #
 #     N(f) = F below f_m (motion hides it there),   N(f) = P(f) above,
 #
@@ -681,13 +679,12 @@ def rest_error_binary32(filter_: Filter) -> float:
 # ----------------------------------------------------------------------
 # The low-pass of least delay that leaves no more than a wanted jitter.
 #
-# For every family and order the jitter behind the filter rises with the cut-off, so the highest cut-off
-# that
+# For every family and order the jitter behind the filter rises with the cut-off, so the highest cut-off that
 # keeps it is found by bisection; of these filters the one with the least delay at zero frequency is
-# suggested. In white jitter a filter of first order and every one with a single pair of poles have
-# the same product of delay and noise bandwidth, 1/4, which sampling and a log's scatter part by some
-# percent. So delays within 7 % count as equal: of those the one wins that changes the shape of the log's
-# motion least (`calib.stages.lowpass.filters.motion_lost`), and without motion the one of lowest order.
+# suggested. In white jitter a filter of first order and every one with a single pair of poles have the same
+# product of delay and noise bandwidth, 1/4, which sampling and a log's scatter part by some percent. So
+# delays within 7 % count as equal: of those the one wins that changes the shape of the log's motion least
+# (`motion_lost`), and without motion the one of lowest order.
 
 _TIE = 0.07
 _LOWEST = 1e-4
