@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import stat
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, cast
 
@@ -26,6 +28,22 @@ _LONGEST_WAIT_S = 300.0
 _LOOK_AGAIN_S = 0.02
 
 
+_PACKAGE = Path(__file__).parents[1]
+_IMPORTS = re.compile(r"^from calib\.([\w.]+) import", re.MULTILINE)
+
+
+@cache
+def _sources(path: Path) -> frozenset[Path]:
+    """A file and the modules of calib that it is made from, which it imports, and they, and so on."""
+    found, new = {path}, [path]
+    while new:
+        names = _IMPORTS.findall(new.pop().read_text(encoding="utf-8"))
+        modules = {_PACKAGE.joinpath(*name.split(".")).with_suffix(".py") for name in names}
+        new += [module for module in modules - found if module.is_file()]
+        found |= modules
+    return frozenset(one for one in found if one.is_file())
+
+
 class _CompiledOnce:
     """Numba's cache of one function on disk; of processes that miss it at one time the first compiles.
 
@@ -37,6 +55,12 @@ class _CompiledOnce:
         # Numba tells no types of it.
         make: Any = FunctionCache
         self._kept = make(function)
+        # What is compiled holds the functions that it calls and the constants of other files. Numba looks at
+        # its own file alone: after one of the others had changed, an old caller wrote beyond an array.
+        with contextlib.suppress(OSError):
+            own = Path(self._kept._py_func.__code__.co_filename)
+            stats = [one.stat() for one in sorted(_sources(own))]
+            self._kept._cache_file._source_stamp = tuple((one.st_mtime, one.st_size) for one in stats)
         self._path = Path(self._kept.cache_path) / f"{self._kept._impl.filename_base}.lock"
         self._lock: int | None = None
 

@@ -26,6 +26,7 @@ from calib.stages.actuator.kinematics import forward as forward_of_sensors
 from calib.stages.camera.model import Camera
 from calib.stages.estimator import reference, sensors, smoother
 from calib.stages.estimator.consistency import Tally, chi_square_band, nees
+from calib.stages.estimator.driven import driven_event
 from calib.stages.estimator.event import CAMERA, IMU, REPORT, camera_terms, imu_terms
 from calib.stages.estimator.kinematic import (
     CONSIDERED,
@@ -642,6 +643,15 @@ def test_no_function_may_round_as_its_compilation_happens_to_be(package: ModuleT
         found += [one for one in vars(module).values() if isinstance(one, Dispatcher)]
     assert len(found) > 5
     assert not [one.__name__ for one in found if one.targetoptions.get("fastmath")]
+
+
+def test_what_is_compiled_belongs_to_all_files_that_it_is_made_from() -> None:
+    """Numba itself asks after a function's own file alone, and keeps what others were when it compiled it."""
+    kept = driven_event._cache._kept
+    package = Path(calib.__file__).parent
+    for name in ("estimator/driven.py", "estimator/event.py", "actuator/pump.py", "camera/model.py"):
+        now = (package / "stages" / name).stat()
+        assert (now.st_mtime, now.st_size) in kept._cache_file._source_stamp
 
 
 GOOD = {"degrees": 2, "readings": 900, "gated": 2, "nis": 2.1, "inside": 0.95, "correlation": 0.02}
