@@ -70,7 +70,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x5FD32D50UL
+#define CALIB_ID 0x34E43B39UL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 1 /* 0: a section that they come from is not ok */
@@ -80,13 +80,13 @@
 #define CALIB_IMAGE_WIDTH_PX 316 /* columns */
 #define CALIB_IMAGE_HEIGHT_PX 208 /* rows */
 #define CALIB_CAMERA_OK 1 /* 0: the calibration failed its gate */
-#define CALIB_CAMERA_FX_PX 273.409576f /* focal length along u, px; sigma_mu of (2.5) */
-#define CALIB_CAMERA_FY_PX 272.603973f /* focal length along v, px; sigma_nu of (2.5) */
+#define CALIB_CAMERA_FX_PX 273.40802f /* focal length along u, px; sigma_mu of (2.5) */
+#define CALIB_CAMERA_FY_PX 272.60257f /* focal length along v, px; sigma_nu of (2.5) */
 #define CALIB_CAMERA_SKEW_PX 0.0f /* skew, px; gamma of (2.5) */
-#define CALIB_CAMERA_CX_PX 160.670029f /* principal point, px from the centre of the left column; mu_0 of (2.5) */
-#define CALIB_CAMERA_CY_PX 101.869591f /* principal point, px from the centre of the top row; nu_0 of (2.5) */
-#define CALIB_CAMERA_K1 -0.220018521f /* lens, dimensionless, OpenCV's order and signs */
-#define CALIB_CAMERA_K2 0.549357474f /* lens, dimensionless, OpenCV's order and signs */
+#define CALIB_CAMERA_CX_PX 160.670135f /* principal point, px from the centre of the left column; mu_0 of (2.5) */
+#define CALIB_CAMERA_CY_PX 101.869415f /* principal point, px from the centre of the top row; nu_0 of (2.5) */
+#define CALIB_CAMERA_K1 -0.219997272f /* lens, dimensionless, OpenCV's order and signs */
+#define CALIB_CAMERA_K2 0.549296975f /* lens, dimensionless, OpenCV's order and signs */
 
 /*
  * Inverse lens, normalised coordinates: yd = (v - cy) / fy, xd = (u - cx - skew yd) / fx, then
@@ -97,60 +97,60 @@
 #define CALIB_CAMERA_GREATEST_V_PX 207.5f /* greatest v inside the picture, px; the least is -0.5 */
 #define CALIB_CAMERA_HAS_LENS 1 /* 0: no distortion, default of CALIB_UNDISTORT */
 #define CALIB_CAMERA_HAS_SKEW 0 /* for #if */
-#define CALIB_CAMERA_PER_FX 0.00365751656f /* 1 / fx, 1/px */
-#define CALIB_CAMERA_PER_FY 0.00366832502f /* 1 / fy, 1/px */
+#define CALIB_CAMERA_PER_FX 0.00365753705f /* 1 / fx, 1/px */
+#define CALIB_CAMERA_PER_FY 0.00366834388f /* 1 / fy, 1/px */
 #define CALIB_LENS_INVERSE_ORDER 5 /* number of coefficients c */
 #define CALIB_LENS_DECENTERING_STEPS 0 /* 0: no decentering */
-#define CALIB_LENS_INVERSE_C1 0.217687204f /* coefficient of r2^1, dimensionless */
-#define CALIB_LENS_INVERSE_C2 -0.333740741f /* coefficient of r2^2, dimensionless */
-#define CALIB_LENS_INVERSE_C3 -1.56922758f /* coefficient of r2^3, dimensionless */
-#define CALIB_LENS_INVERSE_C4 3.4366281f /* coefficient of r2^4, dimensionless */
-#define CALIB_LENS_INVERSE_C5 -2.06394625f /* coefficient of r2^5, dimensionless */
+#define CALIB_LENS_INVERSE_C1 0.217666402f /* coefficient of r2^1, dimensionless */
+#define CALIB_LENS_INVERSE_C2 -0.33372438f /* coefficient of r2^2, dimensionless */
+#define CALIB_LENS_INVERSE_C3 -1.56887734f /* coefficient of r2^3, dimensionless */
+#define CALIB_LENS_INVERSE_C4 3.43578029f /* coefficient of r2^4, dimensionless */
+#define CALIB_LENS_INVERSE_C5 -2.06336069f /* coefficient of r2^5, dimensionless */
 #define CALIB_LENS_INVERSE_P(r2) (1.0f + (r2) * (CALIB_LENS_INVERSE_C1 + (r2) * (CALIB_LENS_INVERSE_C2 + (r2) * (CALIB_LENS_INVERSE_C3 + (r2) * (CALIB_LENS_INVERSE_C4 + (r2) * (CALIB_LENS_INVERSE_C5)))))) /* P by Horner's scheme */
 
 /* Plane of the actuator, without the shift and stretch that align has found. */
 #define CALIB_HAS_PLANE 1 /* for #if */
 #define CALIB_PLANE_OK 1 /* 0: the plane failed its gate */
-#define CALIB_PLANE_INVERSE_11 0.00365899038f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_12 -8.84281471e-05f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_13 -0.59911108f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_21 7.93001382e-05f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_22 0.00362181547f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_23 -0.160717785f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_31 -0.000315899902f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_32 -0.000872945704f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_33 3.76397467f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_11 0.00365901133f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_12 -8.84286346e-05f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_13 -0.599114299f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_21 7.92978244e-05f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_22 0.00362183806f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_23 -0.160718814f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_31 -0.000315939047f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_32 -0.000872857461f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_33 3.7639873f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
 
 /*
  * The same from normalised undistorted coordinates, for CALIB_UNDISTORT 1. Row 3 gives 1/s of (2.12) in 1/m, the
  * reciprocal depth.
  */
-#define CALIB_PLANE_NORMALISED_11 1.00040293f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_12 -0.0241058655f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_13 -0.02022909f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_21 0.0216814149f /* row 2, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_22 0.987321317f /* row 2, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_23 0.220976233f /* row 2, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_31 -0.0863700584f /* row 3, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_32 -0.237968475f /* row 3, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_33 3.62429237f /* row 3, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_LEAST_PER_M 0.356375515f /* 1/s below this: behind the horizon, 1/m */
+#define CALIB_PLANE_NORMALISED_11 1.00040305f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_12 -0.0241058748f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_13 -0.0202286392f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_21 0.0216806624f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_22 0.98732245f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_23 0.220976502f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_31 -0.0863802731f /* row 3, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_32 -0.237943202f /* row 3, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_33 3.62430787f /* row 3, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_LEAST_PER_M 0.356377214f /* 1/s below this: behind the horizon, 1/m */
 
 /*
  * The same from pixels as the camera reports them, fitted over the workspace, for
  * CALIB_UNDISTORT 0. Neglecting the lens costs up to 0.278 mm there.
  */
 #define CALIB_HAS_RAW_PLANE 1 /* 0: the workspace is not in sight */
-#define CALIB_PLANE_RAW_11 0.00369097712f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_12 -8.82029635e-05f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_13 -0.6043787f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_21 7.21787583e-05f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_22 0.00363199529f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_23 -0.160419032f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_31 -0.000436221308f /* row 3, distorted px to m */
-#define CALIB_PLANE_RAW_32 -0.0011149213f /* row 3, distorted px to m */
-#define CALIB_PLANE_RAW_33 3.81185961f /* row 3, distorted px to m */
-#define CALIB_PLANE_RAW_LEAST_PER_M 0.35496065f /* 1/s below this: behind the horizon, 1/m */
+#define CALIB_PLANE_RAW_11 0.00369099551f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_12 -8.82034801e-05f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_13 -0.604381502f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_21 7.21772885e-05f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_22 0.00363201671f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_23 -0.160420105f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_31 -0.000436246803f /* row 3, distorted px to m */
+#define CALIB_PLANE_RAW_32 -0.00111481769f /* row 3, distorted px to m */
+#define CALIB_PLANE_RAW_33 3.81186843f /* row 3, distorted px to m */
+#define CALIB_PLANE_RAW_LEAST_PER_M 0.354962438f /* 1/s below this: behind the horizon, 1/m */
 
 /* The tick: one picture, one sample of the IMU, one command. */
 #define CALIB_TICK_RATE_HZ 60.0f /* ticks per second, Hz */
@@ -199,6 +199,7 @@
  */
 #define CALIB_LOWPASS_PAIRS 0 /* sections of order two */
 #define CALIB_LOWPASS_SINGLES 1 /* sections of order one */
+#define CALIB_LOWPASS_ZEROS 0 /* 1: sections with zeros elsewhere than at z = -1, for #if */
 #define CALIB_LOWPASS_1_B0 0.049797982f /* b0, dimensionless */
 #define CALIB_LOWPASS_1_B1 0.049797982f /* b1, dimensionless */
 #define CALIB_LOWPASS_1_B2 0.0f /* b2, dimensionless */

@@ -400,7 +400,7 @@ static inline uint16_t calib_angle(calib_state *state, const calib_inputs *in) {
     } else {
 #if CALIB_LEVELLING
         uint8_t i = state->step;
-        float S = calib_clip(state->sum_rad + e, CALIB_TABLE_READ(&calib_levelling_most[i]));
+        float S = state->sum_rad + e;
         float J = calib_carried(state->integral_rad, CALIB_TABLE_READ(&calib_levelling_bias[i]) * S, &state->rest_rad[1]);
         state->integral_rad = calib_clip(J, CALIB_MM_INTEGRAL_LIMIT_RAD);
         turned += CALIB_TABLE_READ(&calib_levelling_angle[i]) * S;
@@ -519,8 +519,11 @@ static inline float calib_lowpass(float *s, float x) {
     {
         float v3 = x - s[1], v1 = CALIB_LOWPASS_PAIR1_A1 * s[0] + CALIB_LOWPASS_PAIR1_A2 * v3;
         x = s[1] + (CALIB_LOWPASS_PAIR1_A2 * s[0] + CALIB_LOWPASS_PAIR1_A3 * v3);
-        s[0] = 2.0f * v1 - s[0];
         s[1] = 2.0f * x - s[1];
+#if CALIB_LOWPASS_ZEROS
+        x += CALIB_LOWPASS_PAIR1_Z * (v1 - s[0]);
+#endif
+        s[0] = 2.0f * v1 - s[0];
         s += 2;
     }
 #endif
@@ -528,8 +531,11 @@ static inline float calib_lowpass(float *s, float x) {
     {
         float v3 = x - s[1], v1 = CALIB_LOWPASS_PAIR2_A1 * s[0] + CALIB_LOWPASS_PAIR2_A2 * v3;
         x = s[1] + (CALIB_LOWPASS_PAIR2_A2 * s[0] + CALIB_LOWPASS_PAIR2_A3 * v3);
-        s[0] = 2.0f * v1 - s[0];
         s[1] = 2.0f * x - s[1];
+#if CALIB_LOWPASS_ZEROS
+        x += CALIB_LOWPASS_PAIR2_Z * (v1 - s[0]);
+#endif
+        s[0] = 2.0f * v1 - s[0];
         s += 2;
     }
 #endif
@@ -537,8 +543,11 @@ static inline float calib_lowpass(float *s, float x) {
     {
         float v3 = x - s[1], v1 = CALIB_LOWPASS_PAIR3_A1 * s[0] + CALIB_LOWPASS_PAIR3_A2 * v3;
         x = s[1] + (CALIB_LOWPASS_PAIR3_A2 * s[0] + CALIB_LOWPASS_PAIR3_A3 * v3);
-        s[0] = 2.0f * v1 - s[0];
         s[1] = 2.0f * x - s[1];
+#if CALIB_LOWPASS_ZEROS
+        x += CALIB_LOWPASS_PAIR3_Z * (v1 - s[0]);
+#endif
+        s[0] = 2.0f * v1 - s[0];
         s += 2;
     }
 #endif
@@ -546,8 +555,11 @@ static inline float calib_lowpass(float *s, float x) {
     {
         float v3 = x - s[1], v1 = CALIB_LOWPASS_PAIR4_A1 * s[0] + CALIB_LOWPASS_PAIR4_A2 * v3;
         x = s[1] + (CALIB_LOWPASS_PAIR4_A2 * s[0] + CALIB_LOWPASS_PAIR4_A3 * v3);
-        s[0] = 2.0f * v1 - s[0];
         s[1] = 2.0f * x - s[1];
+#if CALIB_LOWPASS_ZEROS
+        x += CALIB_LOWPASS_PAIR4_Z * (v1 - s[0]);
+#endif
+        s[0] = 2.0f * v1 - s[0];
         s += 2;
     }
 #endif

@@ -82,7 +82,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x37055C78UL
+#define CALIB_ID 0x191EDA47UL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 1 /* 0: a section that they come from is not ok */
@@ -92,13 +92,13 @@
 #define CALIB_IMAGE_WIDTH_PX 316 /* columns */
 #define CALIB_IMAGE_HEIGHT_PX 208 /* rows */
 #define CALIB_CAMERA_OK 1 /* 0: the calibration failed its gate */
-#define CALIB_CAMERA_FX_PX 273.409576f /* focal length along u, px; sigma_mu of (2.5) */
-#define CALIB_CAMERA_FY_PX 272.603973f /* focal length along v, px; sigma_nu of (2.5) */
+#define CALIB_CAMERA_FX_PX 273.40802f /* focal length along u, px; sigma_mu of (2.5) */
+#define CALIB_CAMERA_FY_PX 272.60257f /* focal length along v, px; sigma_nu of (2.5) */
 #define CALIB_CAMERA_SKEW_PX 0.0f /* skew, px; gamma of (2.5) */
-#define CALIB_CAMERA_CX_PX 160.670029f /* principal point, px from the centre of the left column; mu_0 of (2.5) */
-#define CALIB_CAMERA_CY_PX 101.869591f /* principal point, px from the centre of the top row; nu_0 of (2.5) */
-#define CALIB_CAMERA_K1 -0.220018521f /* lens, dimensionless, OpenCV's order and signs */
-#define CALIB_CAMERA_K2 0.549357474f /* lens, dimensionless, OpenCV's order and signs */
+#define CALIB_CAMERA_CX_PX 160.670135f /* principal point, px from the centre of the left column; mu_0 of (2.5) */
+#define CALIB_CAMERA_CY_PX 101.869415f /* principal point, px from the centre of the top row; nu_0 of (2.5) */
+#define CALIB_CAMERA_K1 -0.219997272f /* lens, dimensionless, OpenCV's order and signs */
+#define CALIB_CAMERA_K2 0.549296975f /* lens, dimensionless, OpenCV's order and signs */
 
 /*
  * Inverse lens, normalised coordinates: yd = (v - cy) / fy, xd = (u - cx - skew yd) / fx, then
@@ -109,67 +109,67 @@
 #define CALIB_CAMERA_GREATEST_V_PX 207.5f /* greatest v inside the picture, px; the least is -0.5 */
 #define CALIB_CAMERA_HAS_LENS 1 /* 0: no distortion, default of CALIB_UNDISTORT */
 #define CALIB_CAMERA_HAS_SKEW 0 /* for #if */
-#define CALIB_CAMERA_PER_FX 0.00365751656f /* 1 / fx, 1/px */
-#define CALIB_CAMERA_PER_FY 0.00366832502f /* 1 / fy, 1/px */
+#define CALIB_CAMERA_PER_FX 0.00365753705f /* 1 / fx, 1/px */
+#define CALIB_CAMERA_PER_FY 0.00366834388f /* 1 / fy, 1/px */
 #define CALIB_LENS_INVERSE_ORDER 5 /* number of coefficients c */
 #define CALIB_LENS_DECENTERING_STEPS 0 /* 0: no decentering */
-#define CALIB_LENS_INVERSE_C1 0.217687204f /* coefficient of r2^1, dimensionless */
-#define CALIB_LENS_INVERSE_C2 -0.333740741f /* coefficient of r2^2, dimensionless */
-#define CALIB_LENS_INVERSE_C3 -1.56922758f /* coefficient of r2^3, dimensionless */
-#define CALIB_LENS_INVERSE_C4 3.4366281f /* coefficient of r2^4, dimensionless */
-#define CALIB_LENS_INVERSE_C5 -2.06394625f /* coefficient of r2^5, dimensionless */
+#define CALIB_LENS_INVERSE_C1 0.217666402f /* coefficient of r2^1, dimensionless */
+#define CALIB_LENS_INVERSE_C2 -0.33372438f /* coefficient of r2^2, dimensionless */
+#define CALIB_LENS_INVERSE_C3 -1.56887734f /* coefficient of r2^3, dimensionless */
+#define CALIB_LENS_INVERSE_C4 3.43578029f /* coefficient of r2^4, dimensionless */
+#define CALIB_LENS_INVERSE_C5 -2.06336069f /* coefficient of r2^5, dimensionless */
 #define CALIB_LENS_INVERSE_P(r2) (1.0f + (r2) * (CALIB_LENS_INVERSE_C1 + (r2) * (CALIB_LENS_INVERSE_C2 + (r2) * (CALIB_LENS_INVERSE_C3 + (r2) * (CALIB_LENS_INVERSE_C4 + (r2) * (CALIB_LENS_INVERSE_C5)))))) /* P by Horner's scheme */
 
 /* Plane of the actuator, without the shift and stretch that align has found. */
 #define CALIB_HAS_PLANE 1 /* for #if */
 #define CALIB_PLANE_OK 1 /* 0: the plane failed its gate */
-#define CALIB_PLANE_INVERSE_11 0.00365902064f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_12 -8.84294495e-05f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_13 -0.599113643f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_21 7.93010113e-05f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_22 0.0036218462f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_23 -0.16072166f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_31 -0.000315899902f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_32 -0.000872945704f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_33 3.76397467f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_11 0.00365904137f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_12 -8.84299297e-05f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_13 -0.599116862f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_21 7.92986975e-05f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_22 0.00362186879f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_23 -0.160722673f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_31 -0.000315939047f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_32 -0.000872857461f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_33 3.7639873f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
 
 /*
  * The same from normalised undistorted coordinates, for CALIB_UNDISTORT 1. Row 3 gives 1/s of (2.12) in 1/m, the
  * reciprocal depth.
  */
 #define CALIB_PLANE_NORMALISED_11 1.00041127f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_12 -0.0241062194f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_13 -0.0202269237f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_21 0.0216816533f /* row 2, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_22 0.987329662f /* row 2, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_23 0.220975623f /* row 2, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_31 -0.0863700584f /* row 3, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_32 -0.237968475f /* row 3, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_33 3.62429237f /* row 3, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_LEAST_PER_M 0.356375515f /* 1/s below this: behind the horizon, 1/m */
+#define CALIB_PLANE_NORMALISED_12 -0.0241062287f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_13 -0.0202264711f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_21 0.0216809008f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_22 0.987330794f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_23 0.220975906f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_31 -0.0863802731f /* row 3, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_32 -0.237943202f /* row 3, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_33 3.62430787f /* row 3, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_LEAST_PER_M 0.356377214f /* 1/s below this: behind the horizon, 1/m */
 
 /*
  * The same from pixels as the camera reports them, fitted over the workspace, for
  * CALIB_UNDISTORT 0. Neglecting the lens costs up to 0.278 mm there.
  */
 #define CALIB_HAS_RAW_PLANE 1 /* 0: the workspace is not in sight */
-#define CALIB_PLANE_RAW_11 0.00369100762f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_12 -8.82044187e-05f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_13 -0.604381263f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_21 7.21796532e-05f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_22 0.00363202626f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_23 -0.160422936f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_31 -0.000436221308f /* row 3, distorted px to m */
-#define CALIB_PLANE_RAW_32 -0.0011149213f /* row 3, distorted px to m */
-#define CALIB_PLANE_RAW_33 3.81185961f /* row 3, distorted px to m */
-#define CALIB_PLANE_RAW_LEAST_PER_M 0.35496065f /* 1/s below this: behind the horizon, 1/m */
+#define CALIB_PLANE_RAW_11 0.00369102578f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_12 -8.8204928e-05f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_13 -0.604384065f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_21 7.21781835e-05f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_22 0.00363204768f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_23 -0.160423994f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_31 -0.000436246803f /* row 3, distorted px to m */
+#define CALIB_PLANE_RAW_32 -0.00111481769f /* row 3, distorted px to m */
+#define CALIB_PLANE_RAW_33 3.81186843f /* row 3, distorted px to m */
+#define CALIB_PLANE_RAW_LEAST_PER_M 0.354962438f /* 1/s below this: behind the horizon, 1/m */
 
 /* The tick: one picture, one sample of the IMU, one command. */
 #define CALIB_TICK_RATE_HZ 60.0f /* ticks per second, Hz */
 #define CALIB_TICK_RATE_MHZ 60000 /* the same in millihertz, for #if */
 #define CALIB_HOLD_TICKS 60 /* a sensor that is silent for longer, a second, stops the pumps */
 #define CALIB_TIME_OFFSET_TICKS 2 /* ceil(D), angles that are remembered; D ticks by which a picture is later than the IMU */
-#define CALIB_TIME_OFFSET_PART 0.485961884f /* ceil(D) - D, share of a tick */
+#define CALIB_TIME_OFFSET_PART 0.485961765f /* ceil(D) - D, share of a tick */
 
 /*
  * IMU on the head, x from the head to the base at rest; phi = atan2(RATIO ay, ax) - mount (2.1),
@@ -178,11 +178,11 @@
 #define CALIB_IMU_SIGN_AX 1 /* 1 or -1, by hand for an IMU that is not right-handed as mounted */
 #define CALIB_IMU_SIGN_AY 1 /* 1 or -1 */
 #define CALIB_IMU_SIGN_GZ 1 /* 1 or -1 */
-#define CALIB_IMU_ACCEL_BIAS_X_MPS2 0.0608038008f /* subtracted from ax, m/s^2 */
-#define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.03439226f /* subtracted from ay, m/s^2 */
-#define CALIB_IMU_ACCEL_RATIO 1.00344145f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
+#define CALIB_IMU_ACCEL_BIAS_X_MPS2 0.0608182885f /* subtracted from ax, m/s^2 */
+#define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.0343927927f /* subtracted from ay, m/s^2 */
+#define CALIB_IMU_ACCEL_RATIO 1.00344086f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
 #define CALIB_IMU_GYRO_BIAS_RADPS 0.00599755347f /* gz at rest, rad/s; sign as read; for programs of your own */
-#define CALIB_IMU_MOUNT_ANGLE_RAD 0.0188652258f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
+#define CALIB_IMU_MOUNT_ANGLE_RAD 0.0188642778f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
 #define CALIB_IMU_ACCEL_LIMIT_MPS2 157.0f /* readings beyond are lost, m/s^2 */
 #define CALIB_IMU_RATE_LIMIT_RADPS 35.0f /* readings beyond are lost, rad/s */
 #define CALIB_IMU_ACCEL_WEAK_MPS2 1.0f /* |ax| and |ay| below say nothing of phi, m/s^2 */
@@ -196,13 +196,13 @@
  */
 #define CALIB_MM_KP_DT 0.0500000007f /* Kp dt, dimensionless; Kp = 3 1/s */
 #define CALIB_MM_KI_DT2 0.000833333354f /* Ki dt^2, dimensionless; Ki = 3 1/s^2 */
-#define CALIB_MM_DT_S 0.0165402498f /* dt of the rate over the gyroscope's scale, s; phi falls for gz > 0 */
-#define CALIB_MM_GYRO_BIAS_DT_RAD 9.92010318e-05f /* bias times the same, rad */
+#define CALIB_MM_DT_S 0.0165402628f /* dt of the rate over the gyroscope's scale, s; phi falls for gz > 0 */
+#define CALIB_MM_GYRO_BIAS_DT_RAD 9.92011119e-05f /* bias times the same, rad */
 #define CALIB_MM_INTEGRAL_LIMIT_RAD 0.0166666675f /* |J| stays below, rad; 1 rad/s */
 #define CALIB_PHI_LIMIT_RAD 1.58000004f /* |phi| stays below; range of the sine in the pipeline, rad */
 
 /* Marker to head (A.1): x = X - d sin(phi), y = Y - d cos(phi). */
-#define CALIB_MARKER_OFFSET_M 0.0149997948f /* d, m; positive beyond the head */
+#define CALIB_MARKER_OFFSET_M 0.0149997957f /* d, m; positive beyond the head */
 
 /*
  * Low-pass of x and y. y_k = b0 x_k + b1 x_(k-1) + b2 x_(k-2) - a1 y_(k-1) - a2 y_(k-2): SciPy's
@@ -211,6 +211,7 @@
  */
 #define CALIB_LOWPASS_PAIRS 0 /* sections of order two */
 #define CALIB_LOWPASS_SINGLES 1 /* sections of order one */
+#define CALIB_LOWPASS_ZEROS 0 /* 1: sections with zeros elsewhere than at z = -1, for #if */
 #define CALIB_LOWPASS_1_B0 0.049797982f /* b0, dimensionless */
 #define CALIB_LOWPASS_1_B1 0.049797982f /* b1, dimensionless */
 #define CALIB_LOWPASS_1_B2 0.0f /* b2, dimensionless */
@@ -237,27 +238,27 @@
  * Gains for the noise in align.
  */
 #define CALIB_HAS_FUSED 1 /* for #if */
-#define CALIB_FUSED_DELAY_TICKS 1.51403809f /* D, ticks from the exposure of a picture to its tick */
-#define CALIB_FUSED_ACCEL_11 0.000255363208f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_12 4.83463737e-06f /* row 1, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_1 1.53607798e-05f /* row 1, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_21 -4.81805637e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_22 0.000256242027f /* row 2, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_2 -9.10569906e-06f /* row 2, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_GAIN 0.00251037162f /* K_a, share of the accelerometer's residual */
-#define CALIB_FUSED_ACCEL_WEAK 0.000255899242f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
-#define CALIB_FUSED_HALF_DT_S 0.0082701249f /* dt / 2 over the gyroscope's scale, s */
-#define CALIB_FUSED_HALF_BIAS_RAD 4.96005159e-05f /* bias times the same, rad */
-#define CALIB_FUSED_PHI_PER_M 0.373812675f /* K_c / lever, rad/m */
+#define CALIB_FUSED_DELAY_TICKS 1.51403821f /* D, ticks from the exposure of a picture to its tick */
+#define CALIB_FUSED_ACCEL_11 0.000255363761f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_12 4.83440181e-06f /* row 1, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_1 1.53645178e-05f /* row 1, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_21 -4.81782445e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_22 0.000256242405f /* row 2, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_2 -9.1059037e-06f /* row 2, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_GAIN 0.00251037301f /* K_a, share of the accelerometer's residual */
+#define CALIB_FUSED_ACCEL_WEAK 0.000255899387f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
+#define CALIB_FUSED_HALF_DT_S 0.00827013142f /* dt / 2 over the gyroscope's scale, s */
+#define CALIB_FUSED_HALF_BIAS_RAD 4.96005559e-05f /* bias times the same, rad */
+#define CALIB_FUSED_PHI_PER_M 0.373812348f /* K_c / lever, rad/m */
 #define CALIB_FUSED_ALONE_PHI_PER_M 5.26318073f /* the same without the IMU, rad/m */
 #define CALIB_FUSED_BOOST_PHI_PER_M 10.5263615f /* the same after a start, rad/m */
-#define CALIB_FUSED_BIAS 0.00252496218f /* K_b, share of the correction */
-#define CALIB_FUSED_MOVING_LENGTH 0.18807292f /* K_m, dimensionless */
-#define CALIB_FUSED_MOVING_RATE 0.00686666975f /* K_v, per tick */
-#define CALIB_FUSED_REST_LENGTH 0.00904550683f /* K_r, dimensionless */
+#define CALIB_FUSED_BIAS 0.00252496195f /* K_b, share of the correction */
+#define CALIB_FUSED_MOVING_LENGTH 0.188073009f /* K_m, dimensionless */
+#define CALIB_FUSED_MOVING_RATE 0.00686667347f /* K_v, per tick */
+#define CALIB_FUSED_REST_LENGTH 0.00904551242f /* K_r, dimensionless */
 #define CALIB_FUSED_RATE_DECAY 0.935506999f /* K_d, per tick, at rest and without a picture */
 #define CALIB_FUSED_SLOW 0.0989248976f /* K_s, dimensionless */
-#define CALIB_FUSED_MOVING_M 0.000369467569f /* s_0, mean residual of a length that moves, m */
+#define CALIB_FUSED_MOVING_M 0.000369467336f /* s_0, mean residual of a length that moves, m */
 #define CALIB_FUSED_STILL_M 7.33333354e-06f /* v_0, m per tick */
 #define CALIB_FUSED_GATE_M 0.00499999989f /* residuals beyond are left out, m */
 #define CALIB_FUSED_BOOST 0.5f /* share of the length's residual after a start */
@@ -315,9 +316,9 @@
 #define CALIB_FF_TABLE_SIZE 15 /* entries */
 /* PWM that holds a bellows at FROM + 0.002 m times the index */
 static const float calib_ff_table_pwm[15] CALIB_IN_FLASH = {
-    99.75f, 128.243576f, 139.740921f, 149.177795f, 157.614838f, 165.5289f,
-    173.172775f, 180.704987f, 188.29158f, 196.099335f, 204.340256f, 213.385071f,
-    224.052353f, 241.444031f, 253.5f,
+    99.75f, 128.243622f, 139.740982f, 149.177872f, 157.614944f, 165.529007f,
+    173.172897f, 180.705124f, 188.291733f, 196.099518f, 204.340469f, 213.38533f,
+    224.052719f, 241.445145f, 253.5f,
 };
 
 /* Envelope, see calib_guard.h: the pumps stop where the actuator leaves it. */
