@@ -88,7 +88,7 @@ def test_a_bad_view_leaves(kind: str, count: int, seed: int) -> None:
     assert kept.calibration.observations.views == count
     assert kept.verdict.word == ("inconsistent" if "bad" in _views_left(fit) else "ok")
     if "bad" in _views_left(fit):
-        assert kept.verdict.reasons[0].startswith("bad, used all the same: ")
+        assert kept.verdict.reasons[0].startswith("bad does not agree with the others: ")
 
 
 @pytest.mark.parametrize(

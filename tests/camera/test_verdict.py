@@ -405,6 +405,10 @@ def test_a_view_in_disorder_leaves(seed: int) -> None:
     assert found.verdict.word == "ok"
     assert [one.name for one in found.left_out] == ["view05"]
     assert "shows points that no camera sees on a flat board" in found.left_out[0].why
+    # It cannot be used, whoever wants all.
+    kept = calibrate_camera(views, (640, 480), Choices(keep_all=True))
+    assert kept.left_out == found.left_out
+    assert kept.verdict.reasons[0].startswith("view05 does not agree with the others: shows points")
     (alone,) = judge(calibrate(pack(views), (640, 480), "radial2")).reasons
     assert alone.startswith("view05 shows points that no camera sees on a flat board")
 

@@ -377,14 +377,14 @@ def of_leaving(
 
     Parameters
     ----------
-    used : views that agree. kept : whether the others are used all the same.
+    used : views that agree. kept : whether the others are to stay, as far as they can be used.
     moved_px : by how much those that disagree move directions, over `scale_of` the camera.
     """
     views = [one for one in left_out if one.kind == "view"]
     if kept:
         advice = "Leave it out: calibrate without --keep-all."
         for one in views:
-            yield Finding("inconsistent", f"{one.name}, used all the same: {one.why}.", advice)
+            yield Finding("inconsistent", f"{one.name} does not agree with the others: {one.why}.", advice)
         return
     kinds: tuple[tuple[list[LeftOut], str, Severity], ...] = (
         (views, "left out for disagreeing with the others", "inconsistent"),
