@@ -27,7 +27,7 @@ from whole_process import CALIB
 from calib.stages.camera.model import Board, Camera
 from calib.twin.scene import PrintedBoard, Sensor, pose_facing, render
 
-RECORDINGS = Path(os.environ.get("CALIB_SHARED_DATA", HERE.parents[2].parent / "shared" / "data"))
+RECORDINGS = Path(os.environ.get("CALIB_SHARED_DATA", HERE.parents[2] / "shared" / "data"))
 JOBS = {str(RECORDINGS / "opencv_left"): 3.0, "100x1280x960": 2.0, "20x4000x3000": 1.0}
 """Wanted ratios of time; of memory 2 at 12 MP."""
 
