@@ -22,13 +22,16 @@ from calib.core.units import unit_of
 Kind = TypeVar("Kind", bound=BaseModel)
 
 _EXPECTED = {
+    "bool_parsing": "true or false",
     "bool_type": "true or false",
     "dataclass_type": "keys with values",
     "dict_type": "keys with values",
     "finite_number": "a finite number",
+    "float_parsing": "a number",
     "float_type": "a number",
     "int_type": "a whole number",
     "int_from_float": "a whole number",
+    "int_parsing": "a whole number",
     "invalid_key": "text as a key",
     "list_type": "a list",
     "model_attributes_type": "keys with values",
@@ -87,10 +90,17 @@ def contradiction(text: str) -> PydanticCustomError:
     return PydanticCustomError("contradiction", "{text}", {"text": text})
 
 
+_MOST_NAMES = 8
+"""Names that a sentence tells at most."""
+
+
 def nearest(name: str, names: Iterable[str]) -> str:
-    """The end of a sentence that asks for the most alike of some names; empty where none is."""
-    alike = difflib.get_close_matches(name, list(names), 1)
-    return f"; did you mean {alike[0]}?" if alike else ""
+    """The end of a sentence that asks for the most alike of some names, or else tells a few of them."""
+    known = list(names)
+    alike = difflib.get_close_matches(name, known, 1)
+    if alike:
+        return f"; did you mean {alike[0]}?"
+    return f"; expected one of {', '.join(known)}" if 0 < len(known) <= _MOST_NAMES else ""
 
 
 def quoted(value: Any) -> str:

@@ -259,7 +259,7 @@ def test_every_scenario_gives_a_log_of_the_length_asked_for(name: str) -> None:
         ("orientation", {"Kp": "nan"}, "orientation.Kp is 'nan', expected a finite number"),
         ("orientation", {"controler": "p"}, "orientation.controler is not a key .*; did you mean controller"),
         ("orientation", {"controller": "lqr"}, "controller is 'lqr', expected 'p', 'pid' or 'clamping'"),
-        ("steps", {"volts": "6;8"}, "steps.volts.0 is '6;8', expected a valid number"),
+        ("steps", {"volts": "6;8"}, "steps.volts.0 is '6;8', expected a number"),
         ("prbs", {"hold_s": "0"}, "prbs.hold_s is '0', expected greater than 0"),
         ("chirp", {"from_hz": "2.5"}, "chirp.to_hz is 2, expected at least from_hz, 2.5"),
     ],
