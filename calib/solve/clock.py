@@ -51,7 +51,7 @@ _UNEVEN = 0.25
 _LATE = 0.05
 """Stamps of a short stretch that may be off by more than half a period."""
 _WINDOW = 11
-_PASSES = 6
+_LOOKS = 7
 """Looks, at most, at whether gaps are in their places."""
 _LAG, _LONG_LAG = 8, 64
 _CLOSE, _BURSTS = 0.25, 0.25
@@ -201,18 +201,17 @@ def _steady(t: FloatArray) -> tuple[FloatArray, IntArray, float] | None:
     origin, period, _ = _line(k, t[anchors])
     if not period > 0.0:
         return None
-    for _ in range(_PASSES):
+    for look in range(_LOOKS):
         even = origin + period * k
         wander = _wander(even, t[anchors] - even)
         off = (t[anchors] - even - wander) / period
-        # Gaps in their wrong places bend the line, so that the next look sees more of them.
-        held, k = k, _with_gaps_in_place(k - anchors, np.where(np.abs(off) > 0.5 * size, np.rint(off), 0.0))
-        k += anchors
-        if np.array_equal(k, held):
+        off = np.where(np.abs(off) > 0.5 * size, np.rint(off), 0.0)
+        moved = _with_gaps_in_place(k - anchors, off) + anchors
+        if look == _LOOKS - 1 or np.array_equal(moved, k):
             break
+        # Gaps in their wrong places bend the line, so that the next look sees more of them.
+        k = moved
         origin, period, _ = _line(k, t[anchors])
-    even = origin + period * k
-    wander = _wander(even, t[anchors] - even)
     # Samples of a burst come before its last; what is missing is missing before the burst.
     places = i + np.repeat(k - anchors, np.diff(anchors, prepend=-1)).astype(np.int64)
     times = np.maximum.accumulate(origin + period * places + np.interp(places, k, wander))
