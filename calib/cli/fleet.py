@@ -39,6 +39,12 @@ RetriesOption = Annotated[
 ]
 
 
+def _timeout(one: str) -> Any:
+    """The option of the most time that one rig or case gets."""
+    words = f"The most time that a {one} gets; one that needs more is a row."
+    return typer.Option("--timeout", metavar="TIME", help=words)
+
+
 @contextmanager
 def at_work(
     output: Path,
@@ -82,12 +88,7 @@ def fleet(
     scheduler: SchedulerOption = None,
     workers: WorkersOption = None,
     retries: RetriesOption = 2,
-    timeout: Annotated[
-        str,
-        typer.Option(
-            "--timeout", metavar="TIME", help="The most time that a rig gets; one that needs more is a row."
-        ),
-    ] = "1h",
+    timeout: Annotated[str, _timeout("rig")] = "1h",
     allow_scheme: Annotated[
         list[str] | None,
         typer.Option(
@@ -212,12 +213,7 @@ def sweep(
     scheduler: SchedulerOption = None,
     workers: WorkersOption = None,
     retries: RetriesOption = 2,
-    timeout: Annotated[
-        str,
-        typer.Option(
-            "--timeout", metavar="TIME", help="The most time that a case gets; one that needs more is a row."
-        ),
-    ] = "10min",
+    timeout: Annotated[str, _timeout("case")] = "10min",
     as_json: JsonOption = False,
 ) -> None:
     """Run a controller, a scenario or a filter on the simulated rig over many plants and settings.
