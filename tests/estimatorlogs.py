@@ -131,6 +131,7 @@ def setup_for(
         process=process or Kinematic(),
         camera_period_s=1.0 / 60.0,
         imu_period_s=1.0 / rig.imu.rate_hz,
+        command_period_s=rig.pump.tick_s,
     )
 
 

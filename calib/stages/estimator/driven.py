@@ -597,6 +597,8 @@ _KNOWN_MPS = 3e-3
 SETTLING_S = 0.3
 """For so long after a start it is left out too: it is not linear in what is not known yet."""
 _MOST_SEGMENTS = 12
+LONGEST_GAP_S = 2.0
+"""A longer silence cuts a log."""
 _SHIFT = INVOLVED - 6
 """The sensors' quantities stand this much further on than in `sensors`."""
 
@@ -622,6 +624,39 @@ def _consider(x: FloatArray, P: FloatArray, learnt: FloatArray) -> None:
 
 
 @kernel(arrays=False)
+def give(
+    switch_t: FloatArray, switch_g: FloatArray, last: int, when: float, force1: float, force2: float,
+    period: float, lag_s: float,
+) -> int:  # fmt: skip
+    """Let a command take effect after the newest in the ring; returns its place, where all before it holds.
+
+    Where commands are missing between the two, as of rows that were dropped, any of those may have been the
+    first with the new force. In the mean it rises evenly, and from n missing ones T apart on the force that
+    the lag has taken up is uncertain by (difference T / lag) sqrt(n (n + 2) / 12), here as a walk.
+
+    Parameters
+    ----------
+    switch_t, switch_g : as in `cut`. when, force1, force2 : its time [s] and static forces [N].
+    period : T [s] of commands, NaN where each holds until the next. lag_s : of the pumps.
+    """
+    size, step = switch_t.shape[0], when - switch_t[last]
+    missing = math.floor(step / period + 0.5) - 1.0 if period > 0.0 and step < LONGEST_GAP_S else 0.0
+    if missing > 0.0:
+        between = (last + 1) % size
+        switch_t[between] = switch_t[last] + period
+        for k in range(2):
+            force = force1 if k == 0 else force2
+            change = (force - switch_g[last, k]) / lag_s
+            switch_g[between, k] = 0.5 * (force + switch_g[last, k])
+            switch_g[between, 2 + k] = change * change * period * (missing + 2.0) / 12.0
+        last = between
+    to = (last + 1) % size
+    switch_t[to] = max(when, switch_t[last])
+    switch_g[to, 0], switch_g[to, 1], switch_g[to, 2], switch_g[to, 3] = force1, force2, 0.0, 0.0
+    return int(to)
+
+
+@kernel(arrays=False)
 def cut(
     begin: float, end: float, switch_t: FloatArray, switch_g: FloatArray, last: int, segments: FloatArray
 ) -> int:
@@ -629,7 +664,9 @@ def cut(
 
     Parameters
     ----------
-    switch_t, switch_g : ring of the times at which commands take effect and of their static forces.
+    switch_t, switch_g : ring of the times at which commands take effect, and of their static forces with the
+        squared densities of the walks of both pumps' lags from then on.
+    segments : (`_MOST_SEGMENTS`, 5) durations, and what `switch_g` has.
     last : place of the newest. Before the oldest one the oldest holds.
     """
     size = switch_t.shape[0]
@@ -644,7 +681,8 @@ def cut(
             stop = min(end, max(switch_t[(last - back + 1) % size], now))
         if stop > now or stop == end:
             segments[count, 0] = stop - now
-            segments[count, 1], segments[count, 2] = switch_g[at, 0], switch_g[at, 1]
+            for k in range(4):
+                segments[count, 1 + k] = switch_g[at, k]
             count += 1
             now = stop
         if stop == end or back == 0:
@@ -662,12 +700,15 @@ def predict_driven(
         return
     parts = max(math.ceil((end - begin) / LONGEST_S - 1e-9), 1)
     h = (end - begin) / parts
-    segments, moved = work[8:12].reshape(-1)[: 3 * _MOST_SEGMENTS].reshape(_MOST_SEGMENTS, 3), work[6]
+    segments, moved = work[8:12].reshape(-1)[: 5 * _MOST_SEGMENTS].reshape(_MOST_SEGMENTS, 5), work[6]
     flow = work[37:].reshape(-1)
     for k in range(parts):
         count = cut(begin + k * h, begin + (k + 1) * h, switch_t, switch_g, last, segments)
         jacobian(plant, x, segments, count, longest_step_s(plant, x), moved, F, flow)
         carry(P, F, walk, h, flow)
+        for i in range(count):
+            P[6, 6] += segments[i, 3] * segments[i, 0]
+            P[7, 7] += segments[i, 4] * segments[i, 0]
         for i in range(DYNAMIC):
             x[i] = moved[i]
 
@@ -928,14 +969,14 @@ def run_driven(
     whole: IntArray, real: FloatArray,
     camera_clock: FloatArray, imu_clock: FloatArray, x0: FloatArray, P0: FloatArray, plant: FloatArray,
     walk: FloatArray, view: FloatArray, noise: FloatArray, radius: float,
-    delay: float, action: float, hoses_sigma: float, z: FloatArray, report: FloatArray, spare: FloatArray,
-    spare_x: FloatArray, spare_P: FloatArray, F: FloatArray, work: FloatArray, untraced: FloatArray,
-    out: FloatArray,
+    delay: float, action: float, period: float, hoses_sigma: float, z: FloatArray, report: FloatArray,
+    spare: FloatArray, spare_x: FloatArray, spare_P: FloatArray, F: FloatArray, work: FloatArray,
+    untraced: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
     """Rows (n,), (n, 5), (n,), (n, 2), (n,) through the ring of the last events; writes `out`.
 
-    `driven` says whether a row's command drives the pumps, `action` how long after it it acts [s]. What is
-    from `z` (4,) on is scratch.
+    `driven` says whether a row's command drives the pumps, `action` how long after it it acts [s]; `period`
+    as in `give`. What is from `z` (4,) on is scratch.
     """
     size = ring_x.shape[0]
     for row in range(len(t)):
@@ -946,8 +987,8 @@ def run_driven(
             whole[COUNT], whole[_STARTED], whole[_PENDING] = 0, 0, 0
             for k in range(len(switch_t)):
                 switch_t[k] = -math.inf
-                switch_g[k, 0] = switch_g[whole[_SWITCH], 0]
-                switch_g[k, 1] = switch_g[whole[_SWITCH], 1]
+                for i in range(2):
+                    switch_g[k, i], switch_g[k, 2 + i] = switch_g[whole[_SWITCH], i], 0.0
             real[_REJECTED], real[_REJECTED_IMU], real[_FIRST] = 0.0, 0.0, stamp
             flags |= 32
         elif math.isnan(real[_LAST]):
@@ -957,10 +998,10 @@ def run_driven(
         if kinds[row] & 1:
             tick = advance(camera_clock, stamp)
         if not math.isnan(forces[row, 0]):
-            to = (whole[_SWITCH] + 1) % len(switch_t)
-            switch_t[to] = max(tick + action, switch_t[whole[_SWITCH]])
-            switch_g[to, 0], switch_g[to, 1] = forces[row, 0], forces[row, 1]
-            whole[_SWITCH] = to
+            whole[_SWITCH] = give(
+                switch_t, switch_g, whole[_SWITCH], tick + action, forces[row, 0], forces[row, 1], period,
+                plant[17],
+            )  # fmt: skip
         for turn in range(4):
             if turn == 3:
                 # Without readings the state itself goes on, one picture behind.
@@ -1120,7 +1161,7 @@ class DrivenFilter:
         self._let_go = np.full(size, np.nan)
         self._kind, self._whole = np.zeros(size, dtype=np.int64), np.zeros(6, dtype=np.int64)
         self._real = np.full(5, np.nan)
-        self._switch_t, self._switch_g = np.full(_SWITCHES, -np.inf), np.zeros((_SWITCHES, 2))
+        self._switch_t, self._switch_g = np.full(_SWITCHES, -np.inf), np.zeros((_SWITCHES, 4))
         self._camera_clock = new_clock(setup.camera_period_s)
         self._imu_clock = new_clock(setup.imu_period_s)
         self._start = drive.start(setup)
@@ -1142,7 +1183,8 @@ class DrivenFilter:
             self._real,
             self._camera_clock, self._imu_clock, *self._start, self._numbers, self._walk, setup.view,
             self._noise, setup.bellows_radius_m,
-            self._delay, drive.pump.delay_ticks * drive.pump.tick_s, drive.sigma[1], *self._scratch, out,
+            self._delay, drive.pump.delay_ticks * drive.pump.tick_s, setup.command_period_s, drive.sigma[1],
+            *self._scratch, out,
         )  # fmt: skip
         return out
 
@@ -1175,7 +1217,6 @@ assert SIZE == 19
 # of what was before. The backward pass begins anew every `WINDOW` events, from events `OVERLAP` further on.
 
 WINDOW, OVERLAP = 6000, 3000
-LONGEST_GAP_S = 2.0
 _SMOOTHER_BEGUN, _SMOOTHER_STARTED, _SMOOTHER_PENDING, _SMOOTHER_HOSES = range(2, 6)
 """Marks of the forward pass, after the numbers of pictures and of IMU readings that were rejected."""
 _SHOWN = np.array([0, 1, 2, 3, INVOLVED])
@@ -1313,6 +1354,17 @@ def _backward(
             _undo_step(y, Y, F[k], FY)
 
 
+@kernel()
+def _switches(
+    t: FloatArray, forces: FloatArray, period: float, lag_s: float
+) -> tuple[FloatArray, FloatArray]:
+    """All that `give` makes of commands with static forces (n, 2) that take effect at the times t (n,)."""
+    switch_t, switch_g, last = np.full(2 * len(t) + 1, -np.inf), np.zeros((2 * len(t) + 1, 4)), 0
+    for k in range(len(t)):
+        last = give(switch_t, switch_g, last, t[k], forces[k, 0], forces[k, 1], period, lag_s)
+    return switch_t[: last + 1], switch_g[: last + 1]
+
+
 def _timeline(
     setup: Setup, drive: Drive, rows: Rows, pwm: FloatArray
 ) -> tuple[FloatArray, IntArray, FloatArray, IntArray, FloatArray, FloatArray]:
@@ -1324,8 +1376,9 @@ def _timeline(
     ticks[camera] = even_times(new_clock(setup.camera_period_s), rows.t_s[camera])
     given = np.isfinite(forces[:, 0])
     action = drive.pump.delay_ticks * drive.pump.tick_s
-    switch_t = np.concatenate([[-np.inf], np.maximum.accumulate(ticks[given] + action)])
-    switch_g = np.concatenate([np.zeros((1, 2)), forces[given]])
+    switch_t, switch_g = _switches(
+        ticks[given] + action, forces[given], setup.command_period_s, drive.pump.lag_s
+    )
     t, kinds, at = events.t_s, events.kinds, events.rows
     readings = np.full((len(t), 4), 0.0)
     readings[:, :3] = events.readings

@@ -567,6 +567,7 @@ class Setup:
     bellows_radius_m : r_B.
     process : bank of levels.
     camera_period_s, imu_period_s : nominal; NaN takes the stamps as they are.
+    command_period_s : of the commands; NaN where each holds until the next, however long.
     """
 
     view: FloatArray
@@ -576,6 +577,7 @@ class Setup:
     process: Kinematic = field(default_factory=Kinematic)
     camera_period_s: float = math.nan
     imu_period_s: float = math.nan
+    command_period_s: float = math.nan
 
 
 @dataclass(frozen=True)

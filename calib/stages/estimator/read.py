@@ -71,6 +71,7 @@ class Periods:
     grid_px : 1 for whole pixels, 0 for others.
     ticks : whether rows with commands and without IMU are ticks of the camera's clock.
     camera, imu : samples.
+    command_s : distance of commands [s], NaN where they are not as steady as a loop's.
     """
 
     camera_s: float
@@ -81,6 +82,7 @@ class Periods:
     imu: int
     camera_even: bool = True
     imu_even: bool = True
+    command_s: float = math.nan
 
 
 def _column(log: Log, name: str) -> FloatArray:
@@ -102,6 +104,10 @@ def _readings(log: Log) -> FloatArray:
     return np.where(np.isfinite(values), values, np.nan)
 
 
+_STEADY = 0.7
+"""Share of steps near the usual one from which on commands are a loop's, and longer ones have lost some."""
+
+
 def periods(log: Log) -> Periods:
     """Rates and pixel grid from the first block of a log."""
     readings = _readings(log)
@@ -112,9 +118,12 @@ def periods(log: Log) -> Periods:
     camera = seen | ticks if use else seen
     # Time that goes back starts the filter again, and says nothing of the period.
     first, second = (time_axis(np.maximum.accumulate(log.t_s[rows])) for rows in (camera, imu))
+    steps = np.diff(log.t_s[np.isfinite(_column(log, "pwm1"))])
+    usual = float(np.median(steps)) if len(steps) else math.nan
+    steady = bool(np.mean(np.abs(steps / usual - 1.0) < 0.5) > _STEADY) if usual > 0.0 else False
     return Periods(
         first.period_s, second.period_s, grid_px(readings), use, int(seen.sum()), int(imu.sum()),
-        first.steady, second.steady,
+        first.steady, second.steady, usual if steady else math.nan,
     )  # fmt: skip
 
 
@@ -353,6 +362,7 @@ def setup_from_rig(rig: Rig, path: Path, found: Periods) -> tuple[Setup, list[st
         view, _noise(rig, found), start, plant.bellows_radius_m, process=_process(rig),
         camera_period_s=found.camera_s if found.camera_even else math.nan,
         imu_period_s=found.imu_s if found.imu_even else math.nan,
+        command_period_s=found.command_s,
     )  # fmt: skip
     return setup, said
 
