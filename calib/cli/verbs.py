@@ -134,7 +134,7 @@ def _several(hint: Any) -> Any:
 
 def _run(stage: Stage, files: Files, options: Any, figures: Path | None, as_json: bool) -> None:
     from calib.core.files import shown
-    from calib.core.words import as_text, described
+    from calib.core.words import as_text
     from calib.runner.work import carry_out
 
     outcome, after = carry_out(stage, files, options, files.rig_path, figures)
@@ -144,10 +144,7 @@ def _run(stage: Stage, files: Files, options: Any, figures: Path | None, as_json
     if as_json:
         emit_json(stage.as_json(outcome, files.written))
     else:
-        blocks = [] if stage.words is None else list(stage.words(outcome))
-        for one in stage.results(outcome):
-            blocks += described(one)
-        for line in as_text(blocks):
+        for line in as_text(stage.blocks(outcome)):
             say(line)
     for name in sections:
         narrate(f"{after.name_in_file(name)} written to {shown(files.rig_path)}")

@@ -260,6 +260,13 @@ class Stage:
             whole["files"] = list(written)
         return {name: finite(value) for name, value in (whole | self.document(outcome)).items()}
 
+    def blocks(self, outcome: Any) -> list[Block]:
+        """An outcome in words, for the terminal and the page."""
+        from calib.core.words import described
+
+        told = [] if self.words is None else list(self.words(outcome))
+        return [*told, *(block for one in self.results(outcome) for block in described(one))]
+
     def writes_rig(self, options: Any) -> bool:
         """Whether sections of rig.yaml are written with these options."""
         return bool(self.writes) and (not self.on_request or bool(getattr(options, self.on_request)))

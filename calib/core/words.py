@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pydantic import BaseModel
+from pydantic import BaseModel, TypeAdapter
 from pydantic.fields import FieldInfo
 
 from calib.core.units import UNITS, unit_of
@@ -59,6 +59,8 @@ class Line:
 
 
 Block = Table | Line
+BLOCKS = TypeAdapter(list[Block])
+"""Blocks as JSON, there and back."""
 
 
 def number(value: float | None, sigma: float | None = None, places: int | None = None) -> str:

@@ -17,6 +17,7 @@ from typing import Any
 from calib.core import __version__
 from calib.core.errors import BadInputError
 from calib.core.files import file_sha256, sha256, shown
+from calib.core.words import BLOCKS, Block
 from calib.core.writing import check_folder, make_folder, settle, sweep, try_lock, write_atomically
 
 # ----------------------------------------------------------------------
@@ -111,7 +112,7 @@ def _tell(descriptor: int, text: str) -> None:
 #
 #     result.json    key, exit code, SHA-256 of every other file, and of all this
 #     rig.yaml       the rig's file after the stage: what it saw, and what it has written
-#     document.json  what the verb said with --json    messages.txt  what it said on stderr
+#     document.json  what the verb said with --json, words.json without, messages.txt on stderr
 #     figures/       and what it wrote with -o
 #
 # The key is the SHA-256 of all that the result follows from: the program, the command, the inputs' hashes
@@ -138,20 +139,28 @@ class Result:
 
     def document(self) -> dict[str, Any]:
         """What the verb said with --json; empty where it said nothing that can be read."""
-        path = self.folder / "document.json"
-        with contextlib.suppress(OSError, ValueError, RecursionError):
-            if path.name in self.files and path.stat().st_size <= _MOST_BYTES:
-                found = json.loads(path.read_text(encoding="utf-8"))
-                return found if isinstance(found, dict) else {}
+        with contextlib.suppress(ValueError, RecursionError):
+            found = json.loads(self._text("document.json"))
+            return found if isinstance(found, dict) else {}
         return {}
+
+    def words(self) -> list[Block]:
+        """The same as a person reads it."""
+        with contextlib.suppress(ValueError):
+            return BLOCKS.validate_json(self._text("words.json"))
+        return []
 
     def messages(self) -> list[str]:
         """What the verb said on stderr."""
+        return [line for line in self._text("messages.txt").splitlines() if line.strip()]
+
+    def _text(self, name: str) -> str:
+        """What a file of it holds, nothing where there is none that can be read."""
+        path = self.folder / name
         with contextlib.suppress(OSError):
-            if "messages.txt" in self.files:
-                text = (self.folder / "messages.txt").read_text(encoding="utf-8", errors="replace")
-                return [line for line in text.splitlines() if line.strip()]
-        return []
+            if name in self.files and path.stat().st_size <= _MOST_BYTES:
+                return path.read_text(encoding="utf-8", errors="replace")
+        return ""
 
     def figures(self) -> list[Path]:
         """The charts of the figures, in the order of their names."""

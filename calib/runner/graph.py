@@ -16,6 +16,7 @@ from calib.core.files import file_sha256, inside, one_line, shown
 from calib.core.result import Result as StageResult
 from calib.core.rig import Rig
 from calib.core.verdict import worst
+from calib.core.words import Line
 from calib.core.workers import Failure, Processes, Task
 from calib.core.writing import make_folder
 from calib.runner.cache import Result, key_of, load, opened, remove, store
@@ -428,16 +429,9 @@ class Runner:
 
 
 def _reason(part: Rig, result: Result) -> str:
-    """The first reason that a stage gives for a poor result."""
+    """The first reason of a section that is poor, or all of a stage that writes none."""
     for section in part.sections.values():
         if isinstance(section, StageResult) and section.verdict.reasons:
             return section.verdict.reasons[0]
-    for value in result.document().values():
-        logs = value.get("logs") if isinstance(value, dict) else None
-        for log in logs if isinstance(logs, list) else []:
-            if isinstance(log, dict) and log.get("reasons"):
-                return str(log["reasons"][0])
-    gate, said = result.document().get("gate"), result.messages()
-    if isinstance(gate, list):
-        return ", ".join(str(one) for one in gate)
-    return said[-1] if said else "fails its quality gate"
+    given = [one.text for one in result.words() if isinstance(one, Line) and one.kind == "reason"]
+    return ", ".join(given) or next(reversed(result.messages()), "fails its quality gate")

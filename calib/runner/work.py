@@ -1,7 +1,7 @@
 """One stage carried out: read, solved, written into the rig's file, drawn; for a verb, and for a run.
 
 In a run a process calls `perform`; what comes of it lies in a folder: rig.yaml with the sections, the stage's
-document, its messages, the charts of its figures and what it wrote beside them.
+document and words, its messages, the charts of its figures and what it wrote beside them.
 """
 
 from __future__ import annotations
@@ -21,10 +21,12 @@ from calib.core.files import one_line, shown
 from calib.core.options import options_of
 from calib.core.rig import SECTIONS, Rig
 from calib.core.stage import Files, Stage
+from calib.core.words import BLOCKS
 from calib.core.writing import check_figures, check_folder, check_writable, write_atomically
 from calib.stages import stage
 
-DOCUMENT, MESSAGES, RIG, FIGURES = "document.json", "messages.txt", "rig.yaml", "figures"
+DOCUMENT, WORDS, MESSAGES = "document.json", "words.json", "messages.txt"
+RIG, FIGURES = "rig.yaml", "figures"
 """What a stage leaves in its folder."""
 
 
@@ -106,6 +108,7 @@ def perform(
         # Nothing in a result differs from run to run.
         told.pop("seconds", None)
         write_atomically(folder / DOCUMENT, json.dumps(told, indent=1) + "\n")
+        write_atomically(folder / WORDS, BLOCKS.dump_json(made.blocks(outcome)))
         files.finish()
         code = EXIT_DONE if made.verdict(outcome).ok else EXIT_POOR
     except Exception as error:

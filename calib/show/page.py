@@ -8,7 +8,7 @@ import hashlib
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -19,9 +19,8 @@ from calib.core.errors import BadInputError
 from calib.core.files import read_bytes, read_text, sha256
 from calib.core.plot import HUES, Figure
 from calib.core.rig import Rig
-from calib.core.units import unit_of
 from calib.core.verdict import POOR, WORDS, Verdict
-from calib.core.words import BLANK, as_words, facts, number, short
+from calib.core.words import Block, Table, facts, number
 from calib.core.writing import Kind, holds, make_folder, write_atomically
 from calib.runner.cache import Result, load
 from calib.runner.decision import decide, read_summary
@@ -58,6 +57,7 @@ def render(
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["value"] = _value
     text = environment.get_template(template).render(
         style="".join(_resource(name) for name in style),
         script=words,
@@ -162,110 +162,6 @@ def kept_picture(name: str, folder: Path) -> Embedded | None:
         if data.startswith(b"\xff\xd8") and own == sha256(data).encode():
             return Embedded(name, int(width), int(height), data)
     return None
-
-
-# ----------------------------------------------------------------------
-# What the page says of each stage: a few figures at its head, and tables of what the verb told.
-#
-# A stage without words of its own gets tables of whatever lists its document has, so that the page of a
-# later verb is not empty.
-
-Values = Mapping[str, Any]
-Fact = tuple[str, str]
-
-_ROWS = 200
-_DEEP = 4
-
-
-@dataclass(frozen=True)
-class Cell:
-    """A cell: what is shown, and the number by which it is sorted (None for text)."""
-
-    text: str
-    number: float | None = None
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table with a title; every row has as many cells as there are heads."""
-
-    title: str
-    heads: tuple[str, ...]
-    rows: tuple[tuple[Cell, ...], ...]
-
-
-def tables(document: Values) -> list[Table]:
-    """A table for each list or mapping of records in a verb's document, in its order."""
-    out: list[Table] = []
-    _search(document, (), out)
-    return out
-
-
-def _search(value: Any, path: tuple[str, ...], out: list[Table]) -> None:
-    if len(path) > _DEEP:
-        return
-    if isinstance(value, dict):
-        if len(path) > 1 and len(value) > 1 and all(isinstance(part, dict) for part in value.values()):
-            out += _table(path, [{"": name, **part} for name, part in value.items()])
-            return
-        for name, part in value.items():
-            if name not in ("sigma", "covariance", "schema", "verb", "per_view"):
-                _search(part, (*path, str(name)), out)
-    elif isinstance(value, list) and value and all(isinstance(part, dict) for part in value):
-        out += (
-            _table((*path[:-1], "models"), _compared(value)) if "models" in value[0] else _table(path, value)
-        )
-
-
-def _compared(logs: Sequence[Values]) -> list[Values]:
-    """A record for each log and model of `calib validate`, the errors of each quantity beside each other."""
-    out: list[Values] = []
-    for log in logs:
-        models = log.get("models")
-        for model, quantities in (models if isinstance(models, dict) else {}).items():
-            row: dict[str, Any] = {"log": log.get("log"), "model": model}
-            for name, errors in (quantities if isinstance(quantities, dict) else {}).items():
-                for key, value in (errors if isinstance(errors, dict) else {}).items():
-                    row[f"{name} {key}"] = value
-            out.append(row)
-    return out
-
-
-def _table(path: tuple[str, ...], records: Sequence[Values]) -> list[Table]:
-    heads = [name for name in dict.fromkeys(k for r in records for k in r) if _tells(name, records)]
-    if not heads:
-        return []
-    title = " ".join(path[-2:]).replace("_", " ")
-    rows = tuple(tuple(_cell(record.get(name)) for name in heads) for record in records[:_ROWS])
-    return [Table(title, tuple(_head(name) for name in heads), rows)]
-
-
-def _tells(name: str, records: Sequence[Values]) -> bool:
-    """Whether a column holds single values, and not only blanks."""
-    values = [record.get(name) for record in records]
-    lists = [value for value in values if isinstance(value, list)]
-    if any(isinstance(value, dict) for value in values) or any(
-        len(one) > 3 or any(isinstance(part, list) for part in one) for one in lists
-    ):
-        return False
-    return any(value not in (None, [], "") for value in values)
-
-
-def _head(name: str) -> str:
-    unit = unit_of(name)
-    return f"{as_words(name)}, {unit}" if unit else as_words(name) or "name"
-
-
-def _cell(value: Any) -> Cell:
-    if value is None or value == []:
-        return Cell(BLANK)
-    if isinstance(value, bool):
-        return Cell("yes" if value else "no")
-    if isinstance(value, int | float):
-        return Cell(short(value), float(value))
-    if isinstance(value, list):
-        return Cell(", ".join(_cell(part).text for part in value))
-    return Cell(str(value))
 
 
 # ----------------------------------------------------------------------
@@ -448,6 +344,7 @@ def _stage(
                 "job": job,
                 "status": _STATUS.get(job["status"], job["status"]),
                 "document": document,
+                "blocks": _blocks(result, bool(job["writes"]) and bool(section)),
                 "figures": figures,
                 "dropped": dropped,
                 "messages": [] if result is None else result.messages(),
@@ -465,13 +362,13 @@ def _stage(
         "reasons": list(section.get("reasons") or ()),
         "remarks": [*(section.get("remarks") or ()), *(section.get("advice") or ())],
         "parts": parts,
-        "tables": _replay_tables(parts) if len(parts) > 1 or name == "replay" else tables(document),
+        "tables": _over_all(parts) if len(parts) > 1 else [],
         "several": len(parts) > 1,
         "flashed": bool(jobs[0]["flashed"]),
     }
 
 
-def _facts(jobs: list[dict[str, Any]], rig: Rig, document: Mapping[str, Any]) -> list[Fact]:
+def _facts(jobs: list[dict[str, Any]], rig: Rig, document: Mapping[str, Any]) -> list[tuple[str, str]]:
     """The few values at the head of a stage: those of its sections, or what the firmware's verb counts."""
     out = [
         fact
@@ -558,23 +455,33 @@ def _command(job: Mapping[str, Any]) -> str:
     return " ".join(words)
 
 
-def _replay_tables(parts: list[dict[str, Any]]) -> list[Table]:
-    """One table over all logs of a stage that runs for each."""
-    records = []
+_KINDS = ("", "remark", "reason", "advice")
+_ROWS = 200
+
+
+def _blocks(result: Result | None, judged: bool) -> list[Block]:
+    """What a stage said in words, but for a verdict that the page has from its sections already."""
+    kinds = _KINDS[:1] if judged else _KINDS
+    told = [] if result is None else result.words()
+    return [
+        replace(one, rows=one.rows[:_ROWS]) if isinstance(one, Table) else one
+        for one in told
+        if isinstance(one, Table) or one.kind in kinds
+    ]
+
+
+def _over_all(parts: list[dict[str, Any]]) -> list[Table]:
+    """Tables of one kind of all logs as one, with the log in front."""
+    rows: dict[tuple[str, tuple[str, ...]], list[tuple[str, ...]]] = {}
     for part in parts:
-        logs = (part["document"].get("replay") or {}).get("logs") or []
-        for log in logs:
-            other = (log.get("compared") or {}).get("baseline") or {}
-            error = log.get("rmse") or {}
-            row = {
-                "log": part["job"]["log"],
-                "verdict": log.get("verdict"),
-                "duration_s": log.get("duration_s"),
-            }
-            row |= {"mean q error_mm": error.get("mean_q_mm"), "baseline_mm": other.get("mean_q_mm")}
-            row |= {"phi error_deg": error.get("phi_deg"), "baseline phi_deg": other.get("phi_deg")}
-            row |= {"NEES (2)": error.get("nees")}
-            for sensor, check in (log.get("sensors") or {}).items():
-                row[f"NIS {sensor} ({check.get('degrees')})"] = check.get("nis")
-            records.append(row)
-    return tables({"": {"logs": records}}) if records else []
+        for one in part["blocks"]:
+            if isinstance(one, Table) and len(one.head) > 2:
+                log = str(part["job"]["log"])
+                rows.setdefault((one.title, one.head), []).extend((log, *row) for row in one.rows)
+    return [Table(("log", *head), tuple(some), title) for (title, head), some in rows.items()]
+
+
+def _value(cell: str) -> float | None:
+    """The number by which a cell is sorted, None for a text."""
+    found = re.match(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?(?= ±|$)", cell)
+    return float(found[0]) if found else None
