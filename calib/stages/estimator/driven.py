@@ -493,6 +493,8 @@ class Drive:
     walk_disturbance : density of the disturbances' walk [N/sqrt(s)].
     walk_rates : densities of the walk of dphi and dl [rad/s, m/s per sqrt(s)].
     walk_forces : density of the walk of lag, force and creep [N/sqrt(s)].
+    walk_switching : what the density of the disturbances' walk has beside, as a share of the rate of the
+        pump's force [sqrt(s)]: a law that is not quite the pump's errs while the force changes.
     walk_parameters : of all parameters, as a share of `SIGMA` per sqrt(s). Known ones walk as well: they
         stand for a model that is not the actuator, and a smoother spreads what they learn over the log.
     imu_noise : deviations of a_x, a_y [m/s^2] and g_z [rad/s] for this filter, which knows the head's
@@ -511,6 +513,7 @@ class Drive:
     walk_disturbance: float = 2.5e-4
     walk_rates: tuple[float, float] = (2e-3, 1e-4)
     walk_forces: float = 1e-4
+    walk_switching: float = 0.0
     walk_parameters: float = 3.5e-3
     imu_noise: tuple[float, float, float] | None = None
     covariance: FloatArray | None = None
@@ -527,13 +530,13 @@ class Drive:
         return noise
 
     def walk(self, setup: Setup) -> FloatArray:
-        """Squared densities (36,) of the walk of the state."""
+        """Squared densities (36,) of the walk of the state, and of `walk_switching`."""
         moving = np.zeros(DYNAMIC)
         moving[2:4] = self.walk_rates
         moving[4:10] = self.walk_forces
         moving[10:12] = self.walk_disturbance
         parameters = self.walk_parameters * np.array(SIGMA)
-        return np.concatenate([moving, parameters, setup.process.sensor_walk]) ** 2
+        return np.concatenate([moving, parameters, setup.process.sensor_walk, [self.walk_switching]]) ** 2
 
     def start(self, setup: Setup) -> tuple[FloatArray, FloatArray]:
         """State (36,) and covariance (36, 36) before the first reading."""
@@ -709,6 +712,9 @@ def predict_driven(
         for i in range(count):
             P[6, 6] += segments[i, 3] * segments[i, 0]
             P[7, 7] += segments[i, 4] * segments[i, 0]
+        for i in range(2):
+            change = moved[8 + i] - x[8 + i]
+            P[10 + i, 10 + i] += walk[SIZE_D] * change * change / h
         for i in range(DYNAMIC):
             x[i] = moved[i]
 
