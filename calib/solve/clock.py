@@ -5,10 +5,11 @@ missing, and a sample that waited in a buffer bears the stamp of the one before 
 from the stamps, in this order.
 
 Places k. The samples missing before the i-th one, k - i, can only grow, and are the running median of
-round((t_i - o) / T) - i. Chunk by chunk is counted on from the line through those just before it, so that
-the count is held to the stamps: one late stamp adds no sample, however many there are. Where samples come in
-bursts, as from a buffer that is read now and then, the count goes by bursts, of which the last sample is
-the freshest.
+round((t_i - o) / T) - i. Chunk by chunk is counted on from the line through those just before it, so that the
+count is held to the stamps: one late stamp adds no sample, however many there are. Chunks are as long as the
+line foretells the next one to a quarter of a period, and shorter where the clock bends. Where samples come in
+bursts, as from a buffer that is read now and then, the count goes by bursts, of which the last sample is the
+freshest.
 
 Wander w. Deviations of the stamps from the line are averaged over blocks of W samples. Jitter asks for long
 blocks and a clock that wanders, or a loop whose delays add up, for short ones; W is where the means of
@@ -207,6 +208,8 @@ def _steady(t: FloatArray) -> tuple[FloatArray, IntArray, float] | None:
         off = (t[anchors] - even - wander) / period
         off = np.where(np.abs(off) > 0.5 * size, np.rint(off), 0.0)
         moved = _with_gaps_in_place(k - anchors, off) + anchors
+        if size == 1.0:
+            moved = _without_steps(moved, (t - origin) / period - moved)
         if look == _LOOKS - 1 or np.array_equal(moved, k):
             break
         # Gaps in their wrong places bend the line, so that the next look sees more of them.
@@ -220,7 +223,8 @@ def _steady(t: FloatArray) -> tuple[FloatArray, IntArray, float] | None:
     # A late stamp stands alone; where neighbours are off as well, or the samples are few, the line is wrong.
     if _running_median(far.astype(np.float64)).any() or (len(t) < _RECENT and far.mean() > _LATE):
         return None
-    if len(t) < 2 * _FIRST and off.max() > _UNEVEN:
+    # Of few stamps that are their own times none tells a late one from a wrong line.
+    if len(t) < 2 * _FIRST and off.max() > (_UNEVEN if np.median(off) > 1e-6 else 1e-3):
         return None
     return times, places - places[0], period
 
@@ -288,21 +292,28 @@ def _counted(t: FloatArray, i: IntArray, period: float, uneven: float) -> FloatA
     Each chunk is counted on from the line through those before it.
     """
     k = np.zeros(len(t))
-    origin, nominal, done = float(t[0] - period * i[0]), period, 0
+    origin, nominal, done, chunk = float(t[0] - period * i[0]), period, 0, _FIRST
     while done < len(t):
-        end = min(done + min(max(done, _FIRST), _CHUNK), len(t))
+        end = min(done + chunk, len(t))
         since = max(done - _WINDOW, 0)
         counted = _on_line(t[since:end], i[since:end], origin, period)
         # Numbers that are known stay; those after them go on rising.
         k[done:end] = counted[done - since :]
         if done:
             k[done:end] += max(k[done - 1] + i[done] - i[done - 1] - k[done], 0.0)
-        recent = slice(max(end - _RECENT, 0), end)
+        off = t[done:end] - origin - period * k[done:end]
+        if chunk > _FIRST and abs(float(np.median(off[-_WINDOW:]))) > uneven * period:
+            # The clock bends: it is looked less far ahead, from a line that reaches less far back.
+            chunk //= 2
+            recent = slice(max(done - 2 * chunk, 0), done)
+            origin, period, _ = _line(k[recent], t[recent])
+            continue
+        recent = slice(max(end - 2 * chunk, 0), end)
         origin, period, spread = _line(k[recent], t[recent])
         if not 0.5 * nominal < period < 2.0 * nominal or spread > uneven * period:
             return None
         # The last ones are looked at once more, with those that follow.
-        done = end if end == len(t) else end - _WINDOW
+        done, chunk = end if end == len(t) else end - _WINDOW, min(2 * chunk, _CHUNK)
     return k
 
 
@@ -319,16 +330,40 @@ def _with_gaps_in_place(missing: FloatArray, off: FloatArray) -> FloatArray:
     return missing[1:-1]
 
 
+def _without_steps(k: FloatArray, off: FloatArray) -> FloatArray:
+    """Numbers k (n,) of samples, where stamps, `off` (n,) samples late, step by a whole one and stay there.
+
+    Where its jitter is small, what a clock wanders is followed closely enough to hide such steps.
+    """
+    spread = 1.4826 * float(np.median(np.abs(off - _running_median(off))))
+    if len(k) < 2 * _WINDOW or _FAR * spread > 0.5:
+        return k
+    medians = np.median(np.lib.stride_tricks.sliding_window_view(off, _WINDOW), axis=1)
+    step = medians[_WINDOW:] - medians[:-_WINDOW]
+    here = np.diff(off)[_WINDOW - 1 :][: len(step)]
+    k, last = k.copy(), 0
+    for i in np.flatnonzero((np.abs(step) > 0.5) & (step * here > 0.5 * np.abs(step))).tolist():
+        # Another one within the window is seen better once this one is away.
+        whole, at = float(np.rint(here[i])), i + _WINDOW
+        if at - last >= _WINDOW and k[at] + whole > k[at - 1]:
+            k[at:] += whole
+            last = at
+    return k
+
+
 def _wander(even: FloatArray, off: FloatArray) -> FloatArray:
     """What the clock is off its line (n,), from the deviations (n,) of the stamps at the times `even`.
 
     Zero where the blocks' means differ by no more than jitter makes them.
     """
-    middle, lag = _running_median(off), max(min(_LONG_LAG, len(off) // 2), 1)
-    spread = 1.4826 * float(np.median(np.abs(off - middle)))
+    lag = max(min(_LONG_LAG, len(off) // 2), 1)
+    ahead = off[lag:] - off[:-lag]
+    slope = float(np.median(ahead))
     # At its ends the running median lags behind a slope.
-    slope = float(np.median(np.abs(off[lag:] - off[:-lag]))) / lag
-    most = _FAR * spread + _WINDOW * slope
+    trend = slope / lag * np.arange(len(off))
+    middle = trend + _running_median(off - trend)
+    spread = 1.4826 * float(np.median(np.abs(off - middle)))
+    most = _FAR * spread + _WINDOW / lag * float(np.median(np.abs(ahead - slope)))
     off = np.clip(off, middle - most, middle + most)
     best, least, by, jitter, wanders = 1, math.inf, off, 0.0, False
     for size in _BLOCKS:

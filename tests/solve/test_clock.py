@@ -146,15 +146,19 @@ def test_missing_samples_are_counted(share: float) -> None:
     assert np.abs(part.values[:, 0] - part.t_s).max() < 1e-4
 
 
-@pytest.mark.parametrize("seed", [73, 178, 250, 289, 974, 1497])
-def test_gaps_of_a_clock_that_bends_come_to_their_places(seed: int) -> None:
+@pytest.mark.parametrize(
+    ("missing", "jitter_s", "seed"),
+    [(0.1, 0.005, seed) for seed in (73, 178, 250, 289, 974, 1497)]
+    + [(0.4, 0.0005, seed) for seed in range(8)],
+)
+def test_gaps_of_a_clock_that_bends_come_to_their_places(missing: float, jitter_s: float, seed: int) -> None:
     """Many single samples are missing; gaps found some samples late hide what the clock wanders."""
     rng = np.random.default_rng(seed)
     taken = 0.05 * np.arange(1700)
     taken = taken + 0.3 * np.sin(taken / 60.0)
-    keep = rng.random(1700) > 0.1
+    keep = rng.random(1700) > missing
     keep[[0, -1]] = True
-    stamps = np.maximum.accumulate(taken[keep] + 0.005 * rng.standard_normal(keep.sum()))
+    stamps = np.maximum.accumulate(taken[keep] + jitter_s * rng.standard_normal(keep.sum()))
     axis = time_axis(stamps)
     assert np.array_equal(axis.places, np.flatnonzero(keep))
     _held(axis, stamps, 2.0 * float(np.abs(stamps - taken[keep]).max()))
