@@ -258,6 +258,23 @@ def test_an_acceleration_that_is_held_turns_the_angle_by_a_quarter_of_its_direct
     assert angle[t > 45.0].max() < 0.1
 
 
+@pytest.mark.parametrize(("rate_hz", "angle_rad"), [(1.0, 0.6), (2.0, 0.3), (0.3, 1.0)])
+def test_a_log_that_begins_in_a_fast_swing_has_no_lasting_error(rate_hz: float, angle_rad: float) -> None:
+    """Velocities of 0.6 to 1.1 m/s where 0.1 m/s was foreseen, with a bias of 0.6 deg/s."""
+    t, lever_m = DT * np.arange(6000), 0.3
+    phi = angle_rad * np.sin(2.0 * np.pi * rate_hz * t)
+    rate, turning = np.gradient(phi, t), np.gradient(np.gradient(phi, t), t)
+    ax = 9.80665 * np.cos(phi) + lever_m * rate**2
+    ay = 9.80665 * np.sin(phi) + lever_m * turning
+    zero = np.zeros(6000)
+    up = level_three(
+        Levelling(), t, np.stack([ax, ay, zero], axis=1), np.stack([zero, zero, -rate - 0.01], axis=1)
+    )
+    error = np.degrees(np.arctan2(up[:, 1], up[:, 0]) - phi)[t > 20.0]
+    assert abs(error.mean()) < 0.1
+    assert error.std() < 0.7
+
+
 def test_an_angle_that_is_far_off_comes_back_in_the_plane() -> None:
     """As after a board has lost its sensor for a while."""
     t = np.arange(7200) / 60.0
