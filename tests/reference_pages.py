@@ -26,7 +26,7 @@ from typing import Any
 import typer
 from pydantic import BaseModel
 
-from calib.cli.app import app
+from calib.cli.app import command_line
 from calib.core.rig import KINDS, kind_of
 
 MANUAL = Path(__file__).resolve().parent.parent / "calib" / "docs"
@@ -60,6 +60,7 @@ def pages() -> dict[str, str]:
 
 def verbs() -> Iterator[tuple[str, Callable[..., Any]]]:
     """Words and function of each verb, in the order of --help."""
+    app = command_line()
     for command in app.registered_commands:
         if command.callback is not None and command.name is not None:
             yield f"calib {command.name}", command.callback

@@ -2,35 +2,71 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import typer
+from typer.core import TyperGroup
 
-from calib.cli.camera import board, export_camera, import_camera
 from calib.cli.common import telling
-from calib.cli.convert import convert
-from calib.cli.diff import diff
-from calib.cli.docs import docs
-from calib.cli.doctor import doctor
-from calib.cli.fleet import fleet, sweep
-from calib.cli.live import live
-from calib.cli.record import record
-from calib.cli.report import report
-from calib.cli.run import run
-from calib.cli.simulate import simulate
-from calib.cli.track import track
 from calib.cli.verbs import OneByDefault, group, verb
 from calib.core import __version__
-from calib.stages import stage
+from calib.stages import STAGES, stage
 
-app = typer.Typer(
-    name="calib",
-    help="Calibrate a cheap camera and an IMU on a machine, down to the constants in its firmware.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
+_VERBS = (
+    "run intrinsics live extrinsics distortion lowpass imu align replay identify control validate firmware "
+    "fleet sweep record track convert board simulate export import report diff doctor docs"
+).split()
+"""In the order of --help."""
+_GROUPS = {
+    "imu": "Understand an IMU: its bias, its noise, its drift.",
+    "identify": "Identify the actuator from LOG..., a pump from tables, springs from weights; all with error "
+    "bars.",
+    "control": "Try controllers on the identified model before the hardware.",
+}
+_ELSEWHERE = {
+    "sweep": "fleet.sweep",
+    "board": "camera.board",
+    "export": "camera.export_camera",
+    "import": "camera.import_camera",
+}
+"""Module and function of verbs that have no module of their name."""
+_COMPILE = ("run", "align", "replay", "validate", "fleet", "sweep", "simulate")
+"""Verbs whose first use compiles functions; those of groups say so by themselves."""
+
+
+def command_line(words: Sequence[str] = ()) -> typer.Typer:
+    """The command with all its verbs, or with the one that a line of words begins with.
+
+    To import and declare them all takes as long as to calibrate a camera from a few pictures.
+    """
+    made = typer.Typer(
+        name="calib",
+        help="Calibrate a cheap camera and an IMU on a machine, down to the constants in its firmware.",
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+    made.callback()(_options)
+    for name in words[:1] if words and words[0] in _VERBS else _VERBS:
+        if name in _GROUPS:
+            kind = OneByDefault if name == "identify" else TyperGroup
+            made.add_typer(group(name, _GROUPS[name], kind), name=name)
+        else:
+            made.command(name)(_verb(name))
+    return made
+
+
+def _verb(name: str) -> Callable[..., Any]:
+    if name in STAGES:
+        function = verb(stage(name))
+    else:
+        module, _, own = _ELSEWHERE.get(name, f"{name}.{name}").partition(".")
+        function = getattr(importlib.import_module(f"calib.cli.{module}"), own)
+    return telling(function) if name in _COMPILE else function
 
 
 def _show_version(value: bool) -> None:
@@ -39,47 +75,9 @@ def _show_version(value: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
 def _options(
     version: bool = typer.Option(
         False, "--version", help="Show the version and leave.", callback=_show_version, is_eager=True
     ),
 ) -> None:
     pass
-
-
-app.command("run")(telling(run))
-app.command("intrinsics")(verb(stage("intrinsics")))
-app.command("live")(live)
-app.command("extrinsics")(verb(stage("extrinsics")))
-app.command("distortion")(verb(stage("distortion")))
-app.command("lowpass")(verb(stage("lowpass")))
-app.add_typer(group("imu", "Understand an IMU: its bias, its noise, its drift."), name="imu")
-app.command("align")(telling(verb(stage("align"))))
-app.command("replay")(telling(verb(stage("replay"))))
-app.add_typer(
-    group(
-        "identify",
-        "Identify the actuator from LOG..., a pump from tables, springs from weights; all with error bars.",
-        OneByDefault,
-    ),
-    name="identify",
-)
-app.add_typer(
-    group("control", "Try controllers on the identified model before the hardware."), name="control"
-)
-app.command("validate")(telling(verb(stage("validate"))))
-app.command("firmware")(verb(stage("firmware")))
-app.command("fleet")(telling(fleet))
-app.command("sweep")(telling(sweep))
-app.command("record")(record)
-app.command("track")(track)
-app.command("convert")(convert)
-app.command("board")(board)
-app.command("simulate")(telling(simulate))
-app.command("export")(export_camera)
-app.command("import")(import_camera)
-app.command("report")(report)
-app.command("diff")(diff)
-app.command("doctor")(doctor)
-app.command("docs")(docs)

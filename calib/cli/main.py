@@ -73,14 +73,14 @@ def _still_working() -> bool:
 
 def _run(debug: bool, interrupts: Interrupts) -> int:
     try:
-        from calib.cli.app import app
+        from calib.cli.app import command_line
         from calib.core.command import one_command
 
         empty = next((word for word in sys.argv[1:] if not word or re.fullmatch(r"--[a-z-]+=", word)), None)
         if empty is not None:
             raise UsageError(f"an argument is empty: {empty!r}")
         with one_command():
-            app(prog_name="calib")
+            command_line(sys.argv[1:])(prog_name="calib")
     except SystemExit as leaving:
         code = leaving.code if isinstance(leaving.code, int) else EXIT_DONE
         if code == _EXIT_INTERRUPTED:

@@ -264,7 +264,7 @@ def test_an_interruption_is_answered_within_two_seconds(environment, tmp_path, b
     script = (
         f"import sys, time\nimport calib.cli.main as cli\n"
         f"def run(*_):\n    exec({body!r}, {{'time': time}})\n"
-        "import calib.cli.app as verbs\nverbs.app = lambda **_: run()\n"
+        "import calib.cli.app as verbs\nverbs.command_line = lambda _: lambda **_: run()\n"
         "sys.argv = ['calib', 'doctor']\ncli.main()\n"
     )
     started = subprocess.Popen(

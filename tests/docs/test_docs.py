@@ -21,7 +21,7 @@ from reference_pages import pages as generated_pages
 from reference_pages import verbs
 from typer.main import get_command
 
-from calib.cli.app import app
+from calib.cli.app import command_line
 from calib.cli.docs import MANUAL, docs, manual, page_of, slug, write_manual
 from calib.core.errors import DISTRIBUTION, UsageError, pip_install
 from calib.core.rig import KINDS
@@ -287,7 +287,7 @@ def quoted_commands() -> Iterator[tuple[str, str]]:
 
 
 def test_quoted_commands_have_existing_verbs_and_options() -> None:
-    wrong, count, whole = [], 0, get_command(app)
+    wrong, count, whole = [], 0, get_command(command_line())
     for page, line in quoted_commands():
         words = shlex.split(line.replace("...", ""))[1:]
         command = whole
