@@ -15,10 +15,34 @@ from calib.cli.verbs import OneByDefault, group, verb
 from calib.core import __version__
 from calib.stages import STAGES, stage
 
-_VERBS = (
-    "run intrinsics live extrinsics distortion lowpass imu align replay identify control validate firmware "
-    "fleet sweep record track convert board simulate export import report diff doctor docs"
-).split()
+_VERBS = [
+    "run",
+    "intrinsics",
+    "live",
+    "extrinsics",
+    "distortion",
+    "lowpass",
+    "imu",
+    "align",
+    "replay",
+    "identify",
+    "control",
+    "validate",
+    "firmware",
+    "fleet",
+    "sweep",
+    "record",
+    "track",
+    "convert",
+    "board",
+    "simulate",
+    "export",
+    "import",
+    "report",
+    "diff",
+    "doctor",
+    "docs",
+]
 """In the order of --help."""
 _GROUPS = {
     "imu": "Understand an IMU: its bias, its noise, its drift.",

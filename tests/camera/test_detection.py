@@ -106,6 +106,7 @@ VARIANTS: dict[str, Callable[[GrayImage], GrayImage]] = {
     "JPEG 10": _jpeg,
     "bright": _gamma(0.4),
     "dark": _gamma(2.5),
+    "overexposed": lambda gray: np.clip(1.6 * gray + 40, 0, 255).astype(np.uint8),
     "blurred": lambda gray: np.asarray(cv2.GaussianBlur(gray, (0, 0), 2.0)),
     "median": lambda gray: np.asarray(cv2.medianBlur(gray, 5)),
     "half": lambda gray: np.asarray(cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)),
@@ -120,6 +121,7 @@ VARIANTS: dict[str, Callable[[GrayImage], GrayImage]] = {
         ("gloworm_qvga", (8, 6), "sharpened 1 px"),
         ("gloworm_qvga", (8, 6), "sharpened 3 px"),
         ("opencv_left", (9, 6), "two tones"),
+        ("opencv_left", (9, 6), "overexposed"),
     ],
 )
 def test_sharpened_boards_are_found(
@@ -252,6 +254,15 @@ def test_hard_pictures_are_found_and_honest(what: str, sensor: dict[str, float])
     assert detection.refined.mean() > 0.9
     # Sigma from the fits themselves covers the error.
     assert error < 4 * np.median(detection.sigma_px) + 0.01
+
+
+def test_boards_whose_white_is_clipped_are_found() -> None:
+    """Most of the light squares' brightness is missing, and the fit's amplitude goes on beyond white."""
+    for seed in range(4):
+        gray, truth = _picture(VGA, Board(9, 6, 0.02), seed)
+        clipped = np.clip(2.5 * gray + 40, 0, 255).astype(np.uint8)
+        assert np.mean(clipped == 255) > 0.7
+        assert np.sqrt(np.mean(_error(detect(clipped, 9, 6), truth) ** 2)) < 0.05
 
 
 def test_the_same_on_any_number_of_threads() -> None:

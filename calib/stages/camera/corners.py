@@ -129,12 +129,11 @@ def _turns_alike(points: FloatArray) -> bool:
 def _squares_are_plain(grid: Refined) -> bool:
     """Whether the squares between the corners alternate and are of one tone each."""
     p = grid.part.from_picture(grid.points)
-    smooth = grid.part.image
-    if square_px(p) > _SMOOTHED_PX:
-        smooth = np.asarray(cv2.blur(smooth, (3, 3)))
     corners = np.stack([p[:-1, :-1], p[:-1, 1:], p[1:, :-1], p[1:, 1:]])
     middle = corners.mean(axis=0)
-    quarters = sample(smooth, 0.5 * (corners + middle))
+    beside = [-1, 0, 1] if square_px(p) > _SMOOTHED_PX else [0]
+    around = np.stack(np.meshgrid(beside, beside), axis=-1).reshape(-1, 1, 1, 1, 2)
+    quarters = sample(grid.part.image, 0.5 * (corners + middle) + around).mean(axis=0)
     tone = quarters.mean(axis=0)
     i, j = np.indices(tone.shape)
     bright = grid.sign * (1 - 2 * ((i + j) % 2)) > 0

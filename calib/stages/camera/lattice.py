@@ -59,9 +59,11 @@ class Saddles:
     weak: FloatArray
 
 
-def sample(image: _Float32, points: FloatArray) -> FloatArray:
+def sample(image: _Float32 | GrayImage, points: FloatArray) -> FloatArray:
     """Bilinear grey levels at (..., 2) points; beyond the border the border's values go on."""
     flat = np.nan_to_num(points.reshape(-1, 2), nan=0.0, posinf=0.0, neginf=0.0).astype(np.float32)
+    if image.dtype == np.uint8:
+        return _between_pixels(np.asarray(image), flat).reshape(points.shape[:-1])
     values = np.empty(len(flat))
     for start in range(0, len(flat), _REMAP_ROWS):
         part = flat[start : start + _REMAP_ROWS]
@@ -70,6 +72,18 @@ def sample(image: _Float32, points: FloatArray) -> FloatArray:
             image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )[:, 0]
     return values.reshape(points.shape[:-1])
+
+
+def _between_pixels(image: GrayImage, points: _Float32) -> FloatArray:
+    """The same of whole grey levels at a few points (n, 2), which OpenCV would round."""
+    height, width = image.shape
+    u, v = np.clip(points, 0, [width - 1, height - 1]).astype(np.float64).T
+    u0, v0 = u.astype(np.intp), v.astype(np.intp)
+    u1, v1 = np.minimum(u0 + 1, width - 1), np.minimum(v0 + 1, height - 1)
+    right, down = u - u0, v - v0
+    above = image[v0, u0] * (1.0 - right) + image[v0, u1] * right
+    below = image[v1, u0] * (1.0 - right) + image[v1, u1] * right
+    return np.asarray(above * (1.0 - down) + below * down)
 
 
 def _extrema(smooth: _Float32) -> FloatArray:
@@ -365,7 +379,7 @@ def _axes(points: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def looks_like_corners(
-    smooth: npt.NDArray[np.float32], points: FloatArray, along: FloatArray, across: FloatArray
+    smooth: _Float32 | GrayImage, points: FloatArray, along: FloatArray, across: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Contrast of the four squares around each of (..., 2) points, and how far it misses a corner's symmetry.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -453,7 +454,13 @@ def fold_radius(camera: Camera) -> tuple[float, float]:
     if camera.fisheye:
         theta, theta_d = fold_angle(camera)
         return float(np.tan(theta)) if theta < 0.5 * np.pi else np.inf, theta_d
-    k1, k2, _, _, k3, k4, k5, k6 = camera.distortion
+    return _fold_of_ratio(*camera.distortion.tolist())
+
+
+@lru_cache(maxsize=64)
+def _fold_of_ratio(*distortion: float) -> tuple[float, float]:
+    """The same of k1, k2, p1 ... k6; asked of one camera again and again."""
+    k1, k2, _, _, k3, k4, k5, k6 = distortion
     N, D = np.polynomial.Polynomial([1, k1, k2, k3]), np.polynomial.Polynomial([1, k4, k5, k6])
     rho = np.polynomial.Polynomial([0, 1])
 

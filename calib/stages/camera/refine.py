@@ -183,7 +183,9 @@ def frames_of(points: FloatArray) -> Frames:
     return Frames(along.reshape(-1, 2), across.reshape(-1, 2), bends, sigmas)
 
 
-def _windows(image: _Float32, points: FloatArray, frames: Frames, window: float, most_px: int) -> _Windows:
+def _windows(
+    image: _Float32 | GrayImage, points: FloatArray, frames: Frames, window: float, most_px: int
+) -> _Windows:
     height, width = image.shape
     centre = np.rint(points)
     extent = window * (np.abs(frames.along) + np.abs(frames.across))
@@ -209,7 +211,7 @@ def _windows(image: _Float32, points: FloatArray, frames: Frames, window: float,
         centre,
         dx[packed].astype(np.float32),
         dy[packed].astype(np.float32),
-        image[v, u],
+        image[v, u].astype(np.float32, copy=False),
         weight.astype(np.float32),
     )
 
@@ -683,8 +685,8 @@ _FIRST_REACH_PX = 6
 _EVEN = 0.02
 """Third differences of a grid in squares, of which a smooth one has less."""
 _HALOS_PX = (1.6, 0.8, 3.0)
-_HALO_CORNERS = 16
-"""Corners that are tried with halos; a picture has one halo, and these tell it."""
+_FEW_CORNERS = 16
+"""Corners that tell a picture's halo, and the width of its edges."""
 _HALO_SIGN = 0.95
 """Misshape with the first halo over that without from which on none of the others helps. It was below in all
 39 pictures of five sets whose halo is taken, and above in 81 of 94 others."""
@@ -710,6 +712,7 @@ _STEADY_PX = 0.1
 not converge are."""
 _LEAST_PICTURE_PX = 8
 _NOISE_SAMPLE = 10_000
+_STRIP_PIXELS = 65_536
 
 
 @dataclass(frozen=True)
@@ -720,9 +723,9 @@ class Refined:
     ----------
     points : pixels.
     sigma_px : standard deviation of one coordinate of a corner, from the residuals of its fit.
-    amplitude : half the step from dark to bright, positive where the square between growing column
-        and growing row is bright, grey levels.
-    residual : RMS of the fit over |amplitude|, without the share of the noise.
+    amplitude : half the step from dark to bright that the picture shows, positive where the square between
+        growing column and growing row is bright, grey levels.
+    residual : RMS of the fit over the amplitude without clipping, and without the share of the noise.
     narrow : whether a corner had to be fitted with a smaller window than usual.
     refined : False where a corner could not be measured and its predicted place is given.
     misfit_px : typical distance of a corner from where the others place it.
@@ -772,7 +775,7 @@ class Part:
 
     Attributes
     ----------
-    image : grey levels.
+    image : grey levels; of k = 1 the picture's own, not copied.
     points : the grid in it, (rows, columns, 2) of its pixels.
     k, origin : a pixel (x, y) of the part is at k (x, y) + (k - 1) / 2 + origin in the picture.
     lens : the centre and half diagonal of the picture, in pixels of the part.
@@ -780,7 +783,7 @@ class Part:
     halo_px : r of a picture that was sharpened, 0 of others.
     """
 
-    image: _Float32
+    image: _Float32 | GrayImage
     points: FloatArray
     k: int
     origin: FloatArray
@@ -802,15 +805,18 @@ class Part:
         return np.asarray((points - 0.5 * (self.k - 1) - self.origin) / self.k)
 
 
-def _noise(image: _Float32) -> float:
+def _noise(image: _Float32 | GrayImage) -> float:
     """Standard deviation of the noise, from the median of a mask that is blind to edges (Immerkaer 1996).
 
     A sample of the pixels is enough for the median.
     """
     step = max(1, int(np.sqrt(image.size / _NOISE_SAMPLE)))
     height, width = image.shape
-    at = [[image[j : height - 2 + j : step, i : width - 2 + i : step] for i in range(3)] for j in range(3)]
     # [1 -2 1] down of [1 -2 1] across.
+    at = [
+        [image[j : height - 2 + j : step, i : width - 2 + i : step].astype(np.float32) for i in range(3)]
+        for j in range(3)
+    ]
     across = [left - 2.0 * middle + right for left, middle, right in at]
     return float(np.median(np.abs(across[0] - 2.0 * across[1] + across[2]))) / (6.0 * 0.6745)
 
@@ -830,9 +836,8 @@ def part_around(gray: GrayImage, points: FloatArray, k: int | None = None) -> Pa
     columns, rows = (min(int(high[0]), width) - u0) // k, (min(int(high[1]), height) - v0) // k
     if min(columns, rows) < _LEAST_PICTURE_PX:
         return None
-    image = gray[v0 : v0 + rows * k, u0 : u0 + columns * k].astype(np.float32)
-    if k > 1:
-        image = np.asarray(cv2.resize(image, (columns, rows), interpolation=cv2.INTER_AREA))
+    cut = gray[v0 : v0 + rows * k, u0 : u0 + columns * k]
+    image = _averaged(cut, k) if k > 1 else cut
     origin = np.array([u0, v0], dtype=np.float64)
     shift = origin + 0.5 * (k - 1)
     lens = Lens(
@@ -841,11 +846,30 @@ def part_around(gray: GrayImage, points: FloatArray, k: int | None = None) -> Pa
     return Part(image, (points - shift) / k, k, origin, lens, _noise(image))
 
 
+def _averaged(gray: GrayImage, k: int) -> _Float32:
+    """Means of blocks of k x k pixels, a few rows at a time, so that no large copy is made."""
+    rows, columns = gray.shape[0] // k, gray.shape[1] // k
+    out = np.empty((rows, columns), dtype=np.float32)
+    some = max(1, _STRIP_PIXELS // gray[:k].size)
+    for first in range(0, rows, some):
+        strip = gray[first * k : (first + some) * k].astype(np.float32)
+        size = (columns, len(strip) // k)
+        out[first : first + some] = cv2.resize(strip, size, interpolation=cv2.INTER_AREA)
+    return out
+
+
 def _colours(fit: LocalFit, shape: tuple[int, int]) -> FloatArray:
     """Amplitude (N,), positive where a corner has the colours that most corners give it."""
     j, i = np.indices(shape)
     signed = fit.amplitude * (1.0 - 2.0 * ((i + j) % 2)).ravel()
     return signed * (1.0 if np.sum(np.sign(signed)) >= 0 else -1.0)
+
+
+def _shown(fit: LocalFit) -> FloatArray:
+    """Amplitudes (N,) of fits as a sensor shows them that is full at white: the fit's own go on beyond."""
+    b, a = fit.parameters[:, 5], fit.parameters[:, 6]
+    clipped = 0.5 * (np.clip(b + a, 0.0, _WHITE) - np.clip(b - a, 0.0, _WHITE))
+    return np.where((b + np.abs(a) > _WHITE) | (b < np.abs(a)), clipped, a)
 
 
 def misshape(fit: LocalFit, noise: float) -> FloatArray:
@@ -955,14 +979,35 @@ def _begun(gray: GrayImage, points: FloatArray) -> tuple[Part, LocalFit] | None:
     part = part_around(gray, points)
     largest = max(1, int(np.ceil(WINDOW * square_px(points) / REACH_PX)))
     while part is not None:
-        start = part.points
-        first = fit_corners(part, start.reshape(-1, 2), frames_of(start), _FIRST_ITERATIONS, _FIRST_REACH_PX)
-        k = min(largest, max(1, int(part.k * float(np.median(first.width_px)) / _LEAST_WIDTH_PX)))
+        every = np.arange(points[..., 0].size)
+        # Of blocks that may be too large a few corners tell.
+        some = every if part.k == 1 else _spread(len(every))
+        first = _first_fit(part, some)
+        k = min(largest, max(1, int(part.k * _blocks(float(np.median(first.width_px))))))
         if k == part.k:
-            return _sharpened(part, first)
+            return _sharpened(part, first if len(some) == len(every) else _first_fit(part, every))
         # The next time blocks can only become smaller.
         largest, part = k, part_around(gray, points, k)
     return None
+
+
+def _spread(count: int) -> IntArray:
+    """A few of so many corners."""
+    return np.linspace(0, count - 1, min(_FEW_CORNERS, count)).astype(np.int64)
+
+
+def _first_fit(part: Part, some: IntArray) -> LocalFit:
+    frames = frames_of(part.points).take(some)
+    return fit_corners(part, part.points.reshape(-1, 2)[some], frames, _FIRST_ITERATIONS, _FIRST_REACH_PX)
+
+
+def _blocks(width_px: float) -> float:
+    """How many times as large blocks may be for edges of this width to have `_LEAST_WIDTH_PX`.
+
+    Of a sharp edge most of the width is the pixel's aperture, which smaller blocks have as well.
+    """
+    least, sharp = _LEAST_WIDTH_PX**2, 2.0 * _APERTURE_PX2
+    return min(width_px / _LEAST_WIDTH_PX, float(np.sqrt(max(width_px**2 - sharp, 0.0) / (least - sharp))))
 
 
 def _sharpened(part: Part, first: LocalFit) -> tuple[Part, LocalFit]:
@@ -983,7 +1028,7 @@ def _sharpened(part: Part, first: LocalFit) -> tuple[Part, LocalFit]:
             warm=first.take(chosen),
         )
 
-    some = np.linspace(0, len(every) - 1, min(_HALO_CORNERS, len(every))).astype(np.int64)
+    some = _spread(len(every))
     plain = float(np.median(misshape(first.take(some), part.noise)))
     left: dict[float, float] = {}
     for halo_px in _HALOS_PX:
@@ -1045,7 +1090,7 @@ def refine(gray: GrayImage, points: FloatArray) -> Refined | None:
     return Refined(
         points=part.to_picture(found),
         sigma_px=part.k * np.where(good, fit.sigma_px, unknown).reshape(shape),
-        amplitude=fit.amplitude.reshape(shape),
+        amplitude=_shown(fit).reshape(shape),
         residual=misshape(fit, part.noise).reshape(shape),
         narrow=(fit.window < WINDOW).reshape(shape),
         refined=good.reshape(shape),
