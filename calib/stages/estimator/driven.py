@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -967,29 +968,234 @@ def sound(x: FloatArray, P: FloatArray, radius: float) -> bool:
     return bool(good)
 
 
+class Ring(NamedTuple):
+    """The last events, the newest at `whole[NEWEST]`: states after them, and what they were.
+
+    Attributes
+    ----------
+    x, P : (size, 36), (size, 36, 36). t : (size,) times [s]. z : (size, 4) as in `driven_event`.
+    kind, gated : (size,), (size, 3) as in `driven_event`. let_go : (size,) time before it at which the head
+        was let go, NaN for none.
+    """
+
+    x: FloatArray
+    P: FloatArray
+    t: FloatArray
+    z: FloatArray
+    kind: IntArray
+    gated: FloatArray
+    let_go: FloatArray
+
+
+class Memory(NamedTuple):
+    """What the filter remembers beside the ring.
+
+    Attributes
+    ----------
+    whole : (6,) `NEWEST`, `COUNT`, and from `_STARTED` on. real : (5,) from `_LAST` on.
+    switch_t, switch_g : ring of commands as in `cut`, the newest at `whole[_SWITCH]`.
+    camera_clock, imu_clock : of `kinematic.new_clock`.
+    """
+
+    whole: IntArray
+    real: FloatArray
+    switch_t: FloatArray
+    switch_g: FloatArray
+    camera_clock: FloatArray
+    imu_clock: FloatArray
+
+
+class Model(NamedTuple):
+    """What does not change: start (36,), (36, 36), plant (21,), walk, the camera's view, noise, and numbers.
+
+    Attributes
+    ----------
+    delay : of pictures [s]. action : how long after its tick a command acts [s]. period : as in `give`.
+    hoses_sigma : deviation of the logarithm of the damping once the hoses are on. radius : of a bellows [m].
+    """
+
+    x0: FloatArray
+    P0: FloatArray
+    plant: FloatArray
+    walk: FloatArray
+    camera: FloatArray
+    noise: FloatArray
+    radius: float
+    delay: float
+    action: float
+    period: float
+    hoses_sigma: float
+
+
+class Room(NamedTuple):
+    """Scratch: a reading (4,), two reports (12,), a state, the transition of `predict_driven`, and `WORK`."""
+
+    z: FloatArray
+    report: FloatArray
+    spare: FloatArray
+    x: FloatArray
+    P: FloatArray
+    F: FloatArray
+    work: FloatArray
+    untraced: FloatArray
+
+
+@kernel(arrays=False)
+def _due(
+    turn: int, stamp: float, tick: float, readings: FloatArray, kinds: int, driven: float, ring: Ring,
+    memory: Memory, model: Model, z: FloatArray,
+) -> tuple[int, float]:  # fmt: skip
+    """Kind and time of the event that a row brings in a turn, with its reading in z; -1 for none.
+
+    In turn come the hoses, of which the first command tells, a picture, a sample of the IMU, and, a while
+    after the last reading, the state itself, one picture behind.
+    """
+    whole = memory.whole
+    if turn == 0:
+        # Its own event, so that it is done again with those around it.
+        if whole[_HOSES] == 1 or not driven > 0.0:
+            return -1, 0.0
+        whole[_HOSES] = 1
+        z[0], z[1], z[2], z[3] = model.hoses_sigma, math.nan, math.nan, 0.0
+        return HOSES, tick
+    if turn == 1:
+        if not kinds & 1 or math.isnan(readings[0]) or math.isnan(readings[1]):
+            return -1, 0.0
+        z[0], z[1], z[2], z[3] = readings[0], readings[1], math.nan, memory.camera_clock[3]
+        return CAMERA, tick - model.delay
+    if turn == 2:
+        if not kinds & 2:
+            return -1, 0.0
+        when = advance(memory.imu_clock, stamp)
+        z[0], z[1], z[2], z[3] = readings[2], readings[3], readings[4], memory.imu_clock[3]
+        if math.isnan(z[2]) and (math.isnan(z[0]) or math.isnan(z[1])):
+            return -1, 0.0
+        return IMU, when
+    if whole[COUNT] == 0 or not stamp - ring.t[whole[NEWEST]] > model.delay + SILENT_S:
+        return -1, 0.0
+    return 0, stamp - model.delay
+
+
+@kernel(arrays=False)
+def _do_again(
+    own: int, first: int, begin: bool, afresh: bool, ring: Ring, memory: Memory, model: Model, room: Room
+) -> int:
+    """Do the last events again, from `first` before the newest on; returns flags.
+
+    Parameters
+    ----------
+    own : place of the event that is new, which `begin` says the filter may begin at.
+    afresh : whether those that were done before are gated anew.
+    """
+    x0, P0, plant, whole, real = model.x0, model.P0, model.plant, memory.whole, memory.real
+    switch_t, switch_g = memory.switch_t, memory.switch_g
+    size, flags = ring.t.shape[0], 0
+    for i in range(first + 1):
+        now = (whole[NEWEST] + 1 - first + i) % size
+        before = (now - 1) % size
+        x, P, z, gated = ring.x[now], ring.P[now], ring.z[now], ring.gated[now]
+        copy_state(x, P, ring.x[before], ring.P[before])
+        if whole[_STARTED] == 1:
+            pass_on(
+                x, P, ring.t[before], ring.t[now], ring.let_go[now], x0, P0, plant, model.walk, switch_t,
+                switch_g, whole[_SWITCH], room.F, room.work,
+            )  # fmt: skip
+        if now == own and begin and begin_again(
+            x, P, x0, P0, model.camera, z[0], z[1], not math.isnan(real[_BEGUN]), whole[_HOSES] == 1,
+            switch_g[whole[_SWITCH], 0], switch_g[whole[_SWITCH], 1],
+        ):  # fmt: skip
+            if whole[_STARTED] == 1:
+                flags |= 1
+            whole[_STARTED], whole[_PENDING] = 1, 0
+            real[_BEGUN] = ring.t[now]
+            if whole[_HOSES] == 1:
+                x[13], P[13, 13] = 0.0, model.hoses_sigma * model.hoses_sigma
+        if ring.kind[now] == IMU and ring.t[now] < real[_BEGUN] + SETTLING_S:
+            z[0], z[1], gated[1] = math.nan, math.nan, 1.0
+        if (whole[_STARTED] == 0 and ring.kind[now] != HOSES) or ring.kind[now] == 0:
+            for k in range(12 if now == own else 0):
+                room.report[k] = math.nan
+            for k in range(3):
+                gated[k] = 1.0
+            continue
+        driven_event(
+            x, P, ring.kind[now], z, plant, model.camera, model.noise, room.work, not (afresh or now == own),
+            room.report if now == own else room.spare, gated, room.untraced,
+        )  # fmt: skip
+        if not sound(x, P, model.radius):
+            copy_state(x, P, x0, P0)
+            whole[_PENDING] = 1
+            flags |= 1
+    return flags
+
+
+@kernel(arrays=False)
+def _suspects(own: int, ring: Ring, count: int) -> tuple[int, int]:
+    """How far back the first of two samples is that contradict the model, and the last one before them.
+
+    The second of the two is `own`; 0, 0 where there are no two, or their rates are the same.
+    """
+    size, suspect = ring.t.shape[0], 0
+    if not contradicted(ring.z[own], ring.gated[own]):
+        return 0, 0
+    for i in range(1, count - 1):
+        now = (own - i) % size
+        if ring.kind[now] != IMU:
+            continue
+        if suspect > 0:
+            return (0, 0) if ring.z[(own - suspect) % size, 2] == ring.z[own, 2] else (suspect, i)
+        if not contradicted(ring.z[now], ring.gated[now]):
+            return 0, 0
+        suspect = i
+    return 0, 0
+
+
+@kernel(arrays=False)
+def _taken(
+    own: int, back: int, begin: bool, ring: Ring, memory: Memory, model: Model, room: Room
+) -> tuple[int, float]:
+    """Do a new event and the `back` ones after it; flags, and when the head was let go, NaN if it was not.
+
+    They are done again where two samples say that the head was let go, and once more where it was not.
+    """
+    flags, size = _do_again(own, back, begin, False, ring, memory, model, room), ring.t.shape[0]
+    settled = ring.t[own] > memory.real[_BEGUN] + SETTLING_S
+    if back > 0 or ring.kind[own] != IMU or not settled:
+        return flags, math.nan
+    suspect, since = _suspects(own, ring, memory.whole[COUNT])
+    if since == 0:
+        return flags, math.nan
+    before, first = (own - since) % size, (own - suspect) % size
+    let_go_s = let_go_time(
+        ring.x[before], ring.z[first, 2], ring.t[before], ring.t[first], model.plant, room.work
+    )
+    for i in range(suspect, since):
+        now = (own - i) % size
+        if ring.t[(now - 1) % size] <= let_go_s:
+            ring.let_go[now] = let_go_s
+            break
+    flags |= _do_again(own, since - 1, False, True, ring, memory, model, room)
+    if not ring.gated[first, 2] + ring.gated[own, 2] > 0.0:
+        return flags, let_go_s
+    for i in range(since):
+        ring.let_go[(own - i) % size] = math.nan
+    return flags | _do_again(own, since - 1, False, True, ring, memory, model, room), math.nan
+
+
 @kernel(arrays=False)
 def run_driven(
     t: FloatArray, readings: FloatArray, kinds: IntArray, forces: FloatArray, driven: FloatArray,
-    ring_x: FloatArray, ring_P: FloatArray, ring_t: FloatArray, ring_z: FloatArray, ring_kind: IntArray,
-    ring_gated: FloatArray, ring_let_go: FloatArray, switch_t: FloatArray, switch_g: FloatArray,
-    whole: IntArray, real: FloatArray,
-    camera_clock: FloatArray, imu_clock: FloatArray, x0: FloatArray, P0: FloatArray, plant: FloatArray,
-    walk: FloatArray, view: FloatArray, noise: FloatArray, radius: float,
-    delay: float, action: float, period: float, hoses_sigma: float, z: FloatArray, report: FloatArray,
-    spare: FloatArray, spare_x: FloatArray, spare_P: FloatArray, F: FloatArray, work: FloatArray,
-    untraced: FloatArray, out: FloatArray,
+    ring: Ring, memory: Memory, model: Model, room: Room, out: FloatArray,
 ) -> None:  # fmt: skip
     """Rows (n,), (n, 5), (n,), (n, 2), (n,) through the ring of the last events; writes `out`.
 
-    `driven` says whether a row's command drives the pumps, `action` how long after it it acts [s]; `period`
-    as in `give`. What is from `z` (4,) on is scratch.
+    `driven` says whether a row's command drives the pumps.
     """
-    size = ring_x.shape[0]
+    whole, real, size = memory.whole, memory.real, ring.t.shape[0]
+    switch_t, switch_g = memory.switch_t, memory.switch_g
     for row in range(len(t)):
-        stamp = t[row]
-        flags = 0
-        if begin_row(stamp, real[_LAST], camera_clock, imu_clock, out, row):
-            newest = whole[NEWEST]
+        stamp, flags = t[row], 0
+        if begin_row(stamp, real[_LAST], memory.camera_clock, memory.imu_clock, out, row):
             whole[COUNT], whole[_STARTED], whole[_PENDING] = 0, 0, 0
             for k in range(len(switch_t)):
                 switch_t[k] = -math.inf
@@ -1000,128 +1206,39 @@ def run_driven(
         elif math.isnan(real[_LAST]):
             real[_REJECTED], real[_REJECTED_IMU], real[_FIRST] = 0.0, 0.0, stamp
         real[_LAST] = stamp
-        tick = stamp
-        if kinds[row] & 1:
-            tick = advance(camera_clock, stamp)
+        tick = advance(memory.camera_clock, stamp) if kinds[row] & 1 else stamp
         if not math.isnan(forces[row, 0]):
             whole[_SWITCH] = give(
-                switch_t, switch_g, whole[_SWITCH], tick + action, forces[row, 0], forces[row, 1], period,
-                plant[17],
+                switch_t, switch_g, whole[_SWITCH], tick + model.action, forces[row, 0], forces[row, 1],
+                model.period, model.plant[17],
             )  # fmt: skip
         for turn in range(4):
-            if turn == 3:
-                # Without readings the state itself goes on, one picture behind.
-                newest = whole[NEWEST]
-                if whole[COUNT] == 0 or not stamp - ring_t[newest] > delay + SILENT_S:
-                    continue
-                kind, when = 0, stamp - delay
-            elif turn == 0:
-                # Its own event, so that it is done again with those around it.
-                if whole[_HOSES] == 1 or not driven[row] > 0.0:
-                    continue
-                whole[_HOSES] = 1
-                kind, when = HOSES, tick
-                z[0], z[1], z[2], z[3] = hoses_sigma, math.nan, math.nan, 0.0
-            elif turn == 1:
-                if not kinds[row] & 1:
-                    continue
-                kind, when = CAMERA, tick - delay
-                z[0], z[1], z[2], z[3] = readings[row, 0], readings[row, 1], math.nan, camera_clock[3]
-                if math.isnan(z[0]) or math.isnan(z[1]):
-                    continue
-            else:
-                if not kinds[row] & 2:
-                    continue
-                kind, when = IMU, advance(imu_clock, stamp)
-                z[0], z[1], z[2], z[3] = readings[row, 2], readings[row, 3], readings[row, 4], imu_clock[3]
-                if math.isnan(z[2]) and (math.isnan(z[0]) or math.isnan(z[1])):
-                    continue
+            kind, when = _due(
+                turn, stamp, tick, readings[row], kinds[row], driven[row], ring, memory, model, room.z
+            )
+            if kind < 0:
+                continue
             newest = whole[NEWEST]
-            count_first(ring_t, ring_kind, whole, when)
-            back = make_room(ring_t, ring_z, ring_kind, ring_gated, ring_let_go, whole, kind, when)
+            count_first(ring.t, ring.kind, whole, when)
+            back = make_room(ring.t, ring.z, ring.kind, ring.gated, ring.let_go, whole, kind, when)
             if back < 0:
                 flags |= 16
                 continue
             own = (newest + 1 - back) % size
-            when, ring_let_go[own] = ring_t[own], math.nan
-            if back > 0 and ring_let_go[(own + 1) % size] < when:
-                ring_let_go[own], ring_let_go[(own + 1) % size] = ring_let_go[(own + 1) % size], math.nan
+            when, ring.let_go[own] = ring.t[own], math.nan
+            after = (own + 1) % size
+            if back > 0 and ring.let_go[after] < when:
+                ring.let_go[own], ring.let_go[after] = ring.let_go[after], math.nan
             for k in range(4):
-                ring_z[own, k] = z[k]
+                ring.z[own, k] = room.z[k]
             # Who holds the head until the log begins is not in the model.
             begin = (kind == CAMERA and (whole[_STARTED] == 0 or whole[_PENDING] == 1)
                      and when > real[_FIRST] + _BEFORE_S)  # fmt: skip
-            # Done again where two samples say that the head was let go, and once more where it was not.
-            first, trial, suspect, let_go_s = back, 0, 0, math.nan
-            while True:
-                for i in range(first + 1):
-                    now = (newest + 1 - first + i) % size
-                    before = (now - 1) % size
-                    x, P = ring_x[now], ring_P[now]
-                    copy_state(x, P, ring_x[before], ring_P[before])
-                    if whole[_STARTED] == 1:
-                        pass_on(
-                            x, P, ring_t[before], ring_t[now], ring_let_go[now], x0, P0, plant, walk,
-                            switch_t, switch_g, whole[_SWITCH], F, work,
-                        )  # fmt: skip
-                    if now == own and begin and begin_again(
-                        x, P, x0, P0, view, z[0], z[1], not math.isnan(real[_BEGUN]), whole[_HOSES] == 1,
-                        switch_g[whole[_SWITCH], 0], switch_g[whole[_SWITCH], 1],
-                    ):  # fmt: skip
-                        if whole[_STARTED] == 1:
-                            flags |= 1
-                        whole[_STARTED], whole[_PENDING] = 1, 0
-                        real[_BEGUN] = ring_t[now]
-                        if whole[_HOSES] == 1:
-                            x[13], P[13, 13] = 0.0, hoses_sigma * hoses_sigma
-                    if ring_kind[now] == IMU and ring_t[now] < real[_BEGUN] + SETTLING_S:
-                        ring_z[now, 0], ring_z[now, 1], ring_gated[now, 1] = math.nan, math.nan, 1.0
-                    if (whole[_STARTED] == 0 and ring_kind[now] != HOSES) or ring_kind[now] == 0:
-                        for k in range(12 if now == own else 0):
-                            report[k] = math.nan
-                        for k in range(3):
-                            ring_gated[now, k] = 1.0
-                        continue
-                    driven_event(
-                        x, P, ring_kind[now], ring_z[now], plant, view, noise, work,
-                        now != own and trial == 0, report if now == own else spare, ring_gated[now],
-                        untraced,
-                    )  # fmt: skip
-                    if not sound(x, P, radius):
-                        copy_state(x, P, x0, P0)
-                        whole[_PENDING] = 1
-                        flags |= 1
-                if trial == 0 and back == 0 and kind == IMU and when > real[_BEGUN] + SETTLING_S:
-                    # The sample before contradicts, too; since the one before that the head was let go.
-                    suspect, since = 0, 0
-                    for i in range(1, whole[COUNT] - 1 if contradicted(ring_z[own], ring_gated[own]) else 1):
-                        now = (own - i) % size
-                        if ring_kind[now] != IMU:
-                            continue
-                        if suspect > 0:
-                            since = i
-                        if suspect > 0 or not contradicted(ring_z[now], ring_gated[now]):
-                            break
-                        suspect = i
-                    if since == 0 or ring_z[(own - suspect) % size, 2] == ring_z[own, 2]:
-                        break
-                    trial, first, before, now = 1, since - 1, (own - since) % size, (own - suspect) % size
-                    let_go_s = let_go_time(
-                        ring_x[before], ring_z[now, 2], ring_t[before], ring_t[now], plant, work
-                    )
-                    for i in range(suspect, since):
-                        now = (own - i) % size
-                        if ring_t[(now - 1) % size] <= let_go_s:
-                            ring_let_go[now] = let_go_s
-                            break
-                elif trial == 1 and ring_gated[(own - suspect) % size, 2] + ring_gated[own, 2] > 0.0:
-                    trial = 2
-                    for i in range(first + 1):
-                        ring_let_go[(own - i) % size] = math.nan
-                else:
-                    if trial == 1:
-                        out[row, _LET_GO] = let_go_s
-                    break
+            found, let_go_s = _taken(own, back, begin, ring, memory, model, room)
+            flags |= found
+            if not math.isnan(let_go_s):
+                out[row, _LET_GO] = let_go_s
+            report = room.report
             if kind == HOSES or kind == 0:
                 for k in range(12):
                     report[k] = math.nan
@@ -1135,21 +1252,21 @@ def run_driven(
             if real[_REJECTED] > _LOCKED_OUT or real[_REJECTED_IMU] > 2.0 * _LOCKED_OUT:
                 whole[_PENDING], real[_REJECTED], real[_REJECTED_IMU] = 1, 0.0, 0.0
         here = whole[NEWEST]
-        ahead = stamp - ring_t[here] if whole[COUNT] > 0 else 0.0
+        ahead = stamp - ring.t[here] if whole[COUNT] > 0 else 0.0
         if whole[_STARTED] == 0:
             flags |= 64
         if ahead > 1e-3 and whole[_STARTED] == 1:
-            copy_state(spare_x, spare_P, ring_x[here], ring_P[here])
+            copy_state(room.x, room.P, ring.x[here], ring.P[here])
             predict_driven(
-                spare_x, spare_P, ring_t[here], stamp, plant, walk, switch_t, switch_g, whole[_SWITCH], F,
-                work,
+                room.x, room.P, ring.t[here], stamp, model.plant, model.walk, switch_t, switch_g,
+                whole[_SWITCH], room.F, room.work,
             )  # fmt: skip
-            if not sound(spare_x, spare_P, radius):
-                copy_state(spare_x, spare_P, x0, P0)
-            write_row(spare_x, spare_P, 0.0, radius, out, row)
+            if not sound(room.x, room.P, model.radius):
+                copy_state(room.x, room.P, model.x0, model.P0)
+            write_row(room.x, room.P, 0.0, model.radius, out, row)
         else:
-            back_s = min(max(ahead, -max(delay, 1e-3)), 1e-3)
-            write_row(ring_x[here], ring_P[here], back_s, radius, out, row)
+            back_s = min(max(ahead, -max(model.delay, 1e-3)), 1e-3)
+            write_row(ring.x[here], ring.P[here], back_s, model.radius, out, row)
         out[row, 25] = flags
 
 
@@ -1158,47 +1275,44 @@ class DrivenFilter:
 
     def __init__(self, setup: Setup, drive: Drive) -> None:
         self.setup, self.drive = setup, drive
-        self._delay = max(float(setup.start.sensor[7]), 0.0)
-        period = setup.imu_period_s if setup.imu_period_s > 0.0 else 0.002
-        size = min(max(16, math.ceil(2.0 * (self._delay + 0.02) / period) + 8), 512)
-        n = len(DRIVEN)
-        self._x, self._P = np.zeros((size, n)), np.zeros((size, n, n))
-        self._t, self._z, self._gated = np.zeros(size), np.zeros((size, 4)), np.zeros((size, 3))
-        self._let_go = np.full(size, np.nan)
-        self._kind, self._whole = np.zeros(size, dtype=np.int64), np.zeros(6, dtype=np.int64)
-        self._real = np.full(5, np.nan)
-        self._switch_t, self._switch_g = np.full(_SWITCHES, -np.inf), np.zeros((_SWITCHES, 4))
-        self._camera_clock = new_clock(setup.camera_period_s)
-        self._imu_clock = new_clock(setup.imu_period_s)
-        self._start = drive.start(setup)
-        self._x[0], self._P[0] = self._start
-        self._numbers, self._walk, self._noise = drive.numbers(), drive.walk(setup), drive.noise(setup)
-        self._scratch = (
+        delay = max(float(setup.start.sensor[7]), 0.0)
+        imu_s = setup.imu_period_s if setup.imu_period_s > 0.0 else 0.002
+        size, n = min(max(16, math.ceil(2.0 * (delay + 0.02) / imu_s) + 8), 512), len(DRIVEN)
+        self._ring = Ring(
+            np.zeros((size, n)), np.zeros((size, n, n)), np.zeros(size), np.zeros((size, 4)),
+            np.zeros(size, dtype=np.int64), np.zeros((size, 3)), np.full(size, np.nan),
+        )  # fmt: skip
+        self._memory = Memory(
+            np.zeros(6, dtype=np.int64), np.full(5, np.nan), np.full(_SWITCHES, -np.inf),
+            np.zeros((_SWITCHES, 4)), new_clock(setup.camera_period_s), new_clock(setup.imu_period_s),
+        )  # fmt: skip
+        start = drive.start(setup)
+        self._ring.x[0], self._ring.P[0] = start
+        self._model = Model(
+            *start, drive.numbers(), drive.walk(setup), setup.view, drive.noise(setup),
+            setup.bellows_radius_m, delay, drive.pump.delay_ticks * drive.pump.tick_s,
+            setup.command_period_s, drive.sigma[1],
+        )  # fmt: skip
+        self._room = Room(
             np.empty(4), np.empty(12), np.empty(12), np.empty(n), np.empty((n, n)),
             np.zeros((DYNAMIC, INVOLVED)), np.zeros(WORK), np.empty((0, TRACE)),
         )  # fmt: skip
 
     def run(self, rows: Rows, pwm: FloatArray) -> FloatArray:
         """Estimates (n, len(OUT)) of rows with commands (n, 2); call again with the rows that follow."""
-        setup, drive = self.setup, self.drive
         out = np.empty((len(rows), len(OUT)))
         driven = np.asarray(np.nan_to_num(pwm).max(axis=1, initial=0.0), dtype=np.float64)
         run_driven(
-            rows.t_s, rows.readings, rows.kinds, commands(drive, pwm), driven, self._x, self._P, self._t,
-            self._z, self._kind, self._gated, self._let_go, self._switch_t, self._switch_g, self._whole,
-            self._real,
-            self._camera_clock, self._imu_clock, *self._start, self._numbers, self._walk, setup.view,
-            self._noise, setup.bellows_radius_m,
-            self._delay, drive.pump.delay_ticks * drive.pump.tick_s, setup.command_period_s, drive.sigma[1],
-            *self._scratch, out,
+            rows.t_s, rows.readings, rows.kinds, commands(self.drive, pwm), driven, self._ring,
+            self._memory, self._model, self._room, out,
         )  # fmt: skip
         return out
 
     @property
     def state(self) -> tuple[FloatArray, FloatArray]:
         """State (36,) and covariance (36, 36) after the last event."""
-        here = int(self._whole[0])
-        return self._x[here].copy(), self._P[here].copy()
+        here = int(self._memory.whole[NEWEST])
+        return self._ring.x[here].copy(), self._ring.P[here].copy()
 
 
 assert SIZE == 19
