@@ -82,9 +82,12 @@ def varied(seed: int) -> tuple[SimulatedRig, dict[str, float]]:
         "strength1": strength[0],
         "strength2": strength[1],
     }
+    late_s = float(rng.uniform(0.015, 0.035))
+    truth["rest_length_m"] = 0.065 + 5e-4 * float(rng.standard_normal())
     rig = SimulatedRig()
     plant = replace(
         rig.plant,
+        rest_length_m=truth["rest_length_m"],
         stiffness_scale=truth["stiffness_scale"],
         damping_scale=truth["damping_scale_pumps_connected"],
         bending_N_per_rad2=truth["bending_N_per_rad2"],
@@ -98,7 +101,7 @@ def varied(seed: int) -> tuple[SimulatedRig, dict[str, float]]:
             free_damping_scale=truth["damping_scale_free_swing"],
             pump=pump,
             strength=strength,
-            tracker=replace(rig.tracker, latency_s=float(rng.uniform(0.015, 0.035))),
+            tracker=replace(rig.tracker, latency_s=late_s),
         ),
         truth,
     )

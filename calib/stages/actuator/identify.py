@@ -39,7 +39,8 @@ class Spec:
     """One parameter: unit, bounds, the size of a typical change, and what it acts on.
 
     `acts` is "all", "free" (swings with the hoses off) or "pumps"; "prior" for one that no log can tell, so
-    that it is among the unknowns only with a prior. `symbol` is the source's.
+    that it is among the unknowns only with a prior. `symbol` is the source's. `sigma` is that of two rigs
+    which were made alike, the prior of what logs tell in part and nobody states.
     """
 
     unit: str
@@ -48,10 +49,12 @@ class Spec:
     scale: float
     acts: str
     symbol: str
+    sigma: float = math.inf
 
 
 PARAMETERS: dict[str, Spec] = {
     "mass_kg": Spec("kg", 1e-4, 10.0, 0.002, "prior", "m"),
+    "rest_length_m": Spec("m", 5e-3, 1.0, 1e-3, "all", "l_0", 5e-4),
     "stiffness_scale": Spec("", 0.05, 20.0, 0.2, "all", "c_spr"),
     "damping_scale_free_swing": Spec("", 0.01, 200.0, 1.0, "free", "c_dmp"),
     "damping_scale_pumps_connected": Spec("", 0.01, 500.0, 5.0, "pumps", "c_dmp"),
@@ -102,6 +105,7 @@ def values_of(nominal: Machine) -> dict[str, float]:
     knots = np.polyval(pump.static.elongation_mm, KNOTS_V).tolist()
     return {
         "mass_kg": plant.mass_kg,
+        "rest_length_m": plant.rest_length_m,
         "stiffness_scale": plant.stiffness_scale,
         "damping_scale_free_swing": nominal.free_damping_scale,
         "damping_scale_pumps_connected": plant.damping_scale,
@@ -153,6 +157,7 @@ def made(nominal: Machine, values: Mapping[str, float], hoses: bool, tick_s: flo
     plant = replace(
         plant,
         mass_kg=v["mass_kg"],
+        rest_length_m=v["rest_length_m"],
         stiffness_scale=v["stiffness_scale"],
         damping_scale=v["damping_scale_pumps_connected" if hoses else "damping_scale_free_swing"],
         bending_N_per_rad2=v["bending_N_per_rad2"],
@@ -421,7 +426,7 @@ class Problem:
         """All unknowns. Logs with commands share a delay, swings have one each."""
         nominal, inf = values_of(self.nominal), math.inf
         rows = [
-            (spec.scale, spec.low, spec.high, nominal[name], self.stated.get(name) or inf)
+            (spec.scale, spec.low, spec.high, nominal[name], self.stated.get(name) or spec.sigma)
             for name, spec in ((name, PARAMETERS[name]) for name in self.names)
         ]
         rows += [(sigma, -inf, inf, 0.0, sigma) for sigma in _OFFSET_SIGMA]
@@ -559,13 +564,16 @@ def jacobian(problem: Problem, x: FloatArray) -> tuple[FloatArray, FloatArray]:
 # that is unknown eliminated (S, the Schur complement). In relative changes of the parameters:
 #
 # - two whose effects are the same up to a factor enter only as a product or ratio; the second is fixed;
-# - one whose relative standard deviation would be above `VAGUE` is fixed at its nominal value.
+# - one whose relative standard deviation would be above `VAGUE` is fixed at its nominal value. Where that is
+#   more than `_CONTRARY` deviations away the logs tell at least that it is small, as a creep that the rig
+#   does not have, and it is fixed where they have it: all others would make up for another value.
 #
 # Both are looked at where the search starts and again at the solution.
 
 CANDIDATES = 32
 VAGUE = 0.5
 _SAME = 0.99995
+_CONTRARY = 4.0
 _SOFT = 2.0
 _REFINED = 3
 _ROUNDS = 4
@@ -687,13 +695,15 @@ def informative(problem: Problem, residual: FloatArray, J: FloatArray, x: FloatA
     return np.asarray(H[:P, :P] - H[:P, P:] @ inverse @ H[P:, :P])
 
 
-def _left_out(problem: Problem, S: FloatArray, held: Mapping[str, float]) -> tuple[str, str] | None:
-    """A parameter that the logs cannot tell, and the sentence about it."""
+def _left_out(
+    problem: Problem, S: FloatArray, held: Mapping[str, float], x: FloatArray
+) -> tuple[str, str, float] | None:
+    """A parameter that the logs cannot tell, why, and the value that it keeps, mostly the held one."""
     names = problem.names
     size = np.sqrt(np.maximum(np.diag(S), 0.0))
     for k, name in enumerate(names):
         if size[k] < 1e-6 * max(float(size.max(initial=0.0)), 1e-300) or size[k] < 1.0 / VAGUE / 10.0:
-            return name, f"the logs do not depend on it; kept at {held[name]:.4g}"
+            return name, "the logs do not depend on it", held[name]
     cosine = S / np.outer(size, size)
     for i in range(len(names)):
         for j in range(i + 1, len(names)):
@@ -702,14 +712,17 @@ def _left_out(problem: Problem, S: FloatArray, held: Mapping[str, float]) -> tup
                 if not 0.99 < size[i] / size[j] < 1.01:
                     how = "one combination"
                 sentence = f"{label_of(names[i])} and {label_of(names[j])} enter only as {how}"
-                return names[j], f"{sentence}; kept at {held[names[j]]:.4g}"
+                return names[j], sentence, held[names[j]]
     sigma = np.sqrt(np.maximum(np.diag(np.linalg.pinv(cosine, rcond=1e-10)), 0.0)) / size
     worst = int(np.argmax(sigma))
-    if sigma[worst] > VAGUE:
-        return names[worst], (
-            f"the logs tell it to {100.0 * sigma[worst]:.0f} % only; kept at {held[names[worst]]:.4g}"
-        )
-    return None
+    if not sigma[worst] > VAGUE:
+        return None
+    name, value = names[worst], float(x[worst])
+    away = abs(held[name] - value) / (sigma[worst] * max(abs(value), 0.1 * PARAMETERS[name].scale))
+    sentence = f"the logs tell it to {100.0 * sigma[worst]:.0f} % only"
+    if away > _CONTRARY:
+        return name, f"{sentence}, and that it is not {held[name]:.4g}", value
+    return name, sentence, held[name]
 
 
 def _pruned(
@@ -718,14 +731,19 @@ def _pruned(
     """The problem without what cannot be told, its unknowns and derivatives."""
     known = {**values_of(problem.nominal), **problem.held}
     while problem.names:
-        found = _left_out(problem, informative(problem, residual, J, x), known)
+        found = _left_out(problem, informative(problem, residual, J, x), known, x)
         if found is None:
             break
-        name, sentence = found
+        name, sentence, value = found
         k = problem.names.index(name)
-        fixed[name] = sentence
-        problem = replace(problem, names=tuple(n for n in problem.names if n != name))
+        fixed[name] = f"{sentence}; kept at {value:.4g}"
+        held = problem.held if value == known[name] else {**problem.held, name: value}
+        problem = replace(problem, names=tuple(n for n in problem.names if n != name), held=held)
+        moves = abs(value - x[k]) > 1e-2 * PARAMETERS[name].scale
         x, J = np.delete(x, k), np.delete(J, k, axis=1)
+        if moves:
+            # The others have to follow before more is said of them.
+            break
     return problem, x, J
 
 
@@ -1363,8 +1381,9 @@ def _information(
     more = tuple(name for name in mine if name not in names and name != "lambda3")
     if any(name.startswith("elongation") for name in names):
         more = tuple(name for name in more if name != "strength1")
-    # The priors of what is stated are in the information so far.
-    alone = replace(problem, tracks=[track], names=names + more, held=values, delay_s=0.0, stated={})
+    # Priors are in the information so far.
+    flat = dict.fromkeys(PARAMETERS, math.inf)
+    alone = replace(problem, tracks=[track], names=names + more, held=values, delay_s=0.0, stated=flat)
     x = first_guess(alone, values)
     x[alone.unknowns.starts[0]] = one.start.phi_rad, one.start.length_m
     residual, J = jacobian(alone, x)

@@ -339,7 +339,7 @@ def states_beside(path: Path) -> Path | None:
     return next((one for one in beside if one.is_file()), None)
 
 
-def _from_pictures(log: Log, rig: Rig, rig_path: Path) -> tuple[Head, float]:
+def _from_pictures(log: Log, rig: Rig, rig_path: Path, rest: float) -> tuple[Head, float]:
     if not len(log.sampled("u_px", "v_px")):
         raise BadInputError(
             f"{log.source}: has no marker, expected u_px and v_px, or the states of calib replay beside it"
@@ -352,7 +352,6 @@ def _from_pictures(log: Log, rig: Rig, rig_path: Path) -> tuple[Head, float]:
     state, by_u, by_v = np.zeros(SIZE), np.empty(SIZE), np.empty(SIZE)
     state[6:] = sensor
     state[13] = 0.0
-    rest = float(setup.start.head[1])
     sigma = math.sqrt(float(setup.noise[0]) ** 2 + float(setup.noise[1]) ** 2 / 12.0)
     guess = (0.0, rest)
     t, heads, whitening = [], [], []
@@ -525,7 +524,7 @@ def read_track(
         files.taken(states)
         said.append(f"{log.source}: takes the pose from {shown(states)}")
     else:
-        (t, head, W), delay_s = _from_pictures(log, rig, files.rig_path)
+        (t, head, W), delay_s = _from_pictures(log, rig, files.rig_path, nominal.plant.rest_length_m)
         how = "pictures"
     hoses = bool(pwm.any())
     spread = np.linalg.inv(W[:20])

@@ -196,9 +196,10 @@ def sections_from(found: Identified, rig: Rig) -> tuple[Actuator, PumpSection | 
     kept += [] if False in kinds else ["damping_scale_free_swing"]
     kept += [] if True in kinds else ["damping_scale_pumps_connected"]
     section, sigma = _kept(rig.actuator, kept)
-    if {"lambda1_per_s", "lambda2_N_per_m"} & set(names):
+    if {"lambda1_per_s", "lambda2_N_per_m"} & {*names, *problem.held}:
         # The creep makes sense only whole.
         section |= dict(zip(CREEP, problem.nominal.plant.creep_rates, strict=True))
+    section |= {name: value for name, value in problem.held.items() if name in Actuator.model_fields}
     mine = [name for name in names if name in Actuator.model_fields]
     section |= {name: values[name] for name in mine}
     sigma |= _sigma_of(uncertainty, mine)
@@ -223,6 +224,7 @@ def _pump(found: Identified, rig: Rig, judgement: dict[str, Any]) -> PumpSection
     nominal = problem.nominal
     mine = [name for name in problem.names if name in PumpSection.model_fields]
     section, sigma = _by_tables(rig)
+    section |= {name: value for name, value in problem.held.items() if name in PumpSection.model_fields}
     section |= {name: values[name] for name in mine}
     sigma |= _sigma_of(uncertainty, mine)
     strengths = [n for n in ("strength1", "strength2") if n in values]

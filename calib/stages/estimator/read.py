@@ -388,7 +388,7 @@ def baseline_setup(setup: Setup, rig: Rig, path: Path, found: Periods) -> Baseli
 
 _LEAST_SHARE, _APART = 0.01, 0.003
 """Identified values are not taken to be nearer the truth than the first, nor what they tell together than
-the second: an identification keeps mass and rest length as they are, and its model is not the actuator."""
+the second: an identification keeps the mass as it is, and its model is not the actuator."""
 
 _WALK_IDENTIFIED, _SWITCHING = 1e-3, 0.01
 """Walks beside parameters that were identified: errors of the model itself, which deviations of parameters
