@@ -18,7 +18,7 @@ from calib.stages.camera.corners import detect
 from calib.stages.camera.intrinsics import Choices, Intrinsics, calibrate_camera
 from calib.stages.camera.model import Board, Camera, View, pack
 from calib.stages.camera.pose import fit_pose
-from calib.stages.camera.triage import agreement, triage
+from calib.stages.camera.triage import agreement, triage, turned_views
 from calib.twin.scene import Pose, PrintedBoard, render
 
 SIZE = (640, 480)
@@ -105,6 +105,51 @@ def test_two_bad_views_leave(kinds: tuple[str, str]) -> None:
     ]
     fit = calibrate_camera([*views[2:], *bad], SIZE, Choices("radial2"))
     assert _faults(clean, fit, ["bad0", "bad1"]) == []
+
+
+def _turned(view: View, how: str) -> View:
+    """The view as found in the picture after it was turned or mirrored, where corners have another order."""
+    last = np.array(SIZE) - 1.0
+    sides = {"turned by half a turn": [True, True], "mirrored left to right": [True, False]}[how]
+    pixels = np.where(sides, last - view.pixels, view.pixels)
+    # A board of 7 x 5 is not mirrored when it is found: its rows then run the other way.
+    order = np.arange(35).reshape(5, 7)[:, :: 1 if all(sides) else -1].ravel()
+    return replace(view, pixels=pixels[order])
+
+
+@pytest.mark.parametrize("how", ["turned by half a turn", "mirrored left to right"])
+@pytest.mark.parametrize(("count", "bad"), [(13, 4), (13, 1), (30, 14)])
+def test_turned_pictures_are_named(how: str, count: int, bad: int) -> None:
+    """The centre is off by 12 px: all are named and no other, and what is left is the camera without them."""
+    rng = np.random.default_rng(5)
+    camera = camera_of(off_centre_px=(12.0, 8.0))
+    views = take(rng, camera, count, recipe=Recipe(tilt_deg=(15.0, 40.0)))
+    clean = calibrate_camera(views[bad:], SIZE, Choices("radial2"))
+    fit = calibrate_camera([*(_turned(one, how) for one in views[:bad]), *views[bad:]], SIZE, Choices())
+    named = {one.name: one.why for one in fit.left_out if one.kind == "view"}
+    assert set(named) - _views_left(clean) == {one.name for one in views[:bad]}
+    assert all(f"if it was {how}" in named[one.name] for one in views[:bad])
+    assert fit.calibration.camera.cx_px == pytest.approx(camera.cx_px, abs=1.0)
+    assert fit.verdict.word == ("inconsistent" if bad > 0.2 * count else clean.verdict.word)
+
+
+@pytest.mark.parametrize("off_centre_px", [(4.0, -3.0), (0.0, 0.0), (25.0, 10.0)])
+def test_views_as_taken_are_not_turned(off_centre_px: tuple[float, float]) -> None:
+    for seed in range(8):
+        camera = camera_of(off_centre_px=off_centre_px)
+        views = take(np.random.default_rng(seed), camera, (5, 13)[seed % 2])
+        assert turned_views(calibrate(pack(views), SIZE, "radial2")) == []
+
+
+@pytest.mark.parametrize("kind", SPOILS)
+def test_beside_a_bad_view_no_other_looks_turned(kind: str) -> None:
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        camera = camera_of()
+        views = take(rng, camera, (8, 14)[seed % 2], recipe=Recipe(tilt_deg=(15.0, 40.0)))
+        bad = replace(views[0], name="bad", pixels=SPOILS[kind](views[0], camera, rng))
+        found = turned_views(calibrate(pack([bad, *views[1:]]), SIZE, "radial2"))
+        assert {one.name for one in found} <= {"bad"}
 
 
 def test_more_than_a_fifth_leaving_is_a_finding() -> None:

@@ -49,7 +49,7 @@ from calib.stages.camera.model import (
     free_intrinsics,
     pack,
 )
-from calib.stages.camera.triage import Triage, triage
+from calib.stages.camera.triage import Triage, triage, turned_views
 from calib.stages.camera.verdict import (
     judge,
     of_copies,
@@ -587,9 +587,17 @@ def calibrate_camera(
     unusable += copies
     fixed = ("cx_px", "cy_px") if everything.views == 1 else ()
     sorted_out, models = _sorted_out(everything, image_size_px, choices, fixed)
-    leaving = [*left_out, *unusable, *sorted_out.left_out]
+    of_all = sorted_out.everything
+    turned = turned_views(of_all)
+    by_name = {one.name for one in turned}
+    if turned and not choices.keep_all:
+        everything = everything.select(np.flatnonzero(~np.isin(everything.names, list(by_name))))
+        sorted_out, models = _sorted_out(everything, image_size_px, choices, fixed)
+    odd = [*turned, *(one for one in sorted_out.left_out if one.name not in by_name)]
+    leaving = [*left_out, *unusable, *odd]
     agree = sorted_out.calibration.observations.views
-    findings = list(of_leaving(leaving, agree, choices.keep_all, _moved_px(sorted_out)))
+    moved_px = _moved_px(replace(sorted_out, everything=of_all))
+    findings = list(of_leaving(leaving, agree, choices.keep_all, moved_px))
     if sorted_out.left_out:
         several = two_cameras(sorted_out.everything)
         if any(one.severity == "inconsistent" for one in findings):
@@ -601,7 +609,7 @@ def calibrate_camera(
             sorted_out = Triage.of_all(
                 calibrate(everything, image_size_px, lens.model, skew=lens.skew, fixed=fixed, start=first)
             )
-            leaving = [*left_out, *unusable]
+            leaving = [*left_out, *unusable, *turned]
             findings = list(of_leaving(leaving, everything.views, choices.keep_all))
     not_used = [*left_out, *unusable] if choices.keep_all else leaving
     fit = sorted_out.calibration

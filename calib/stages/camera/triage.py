@@ -36,7 +36,7 @@ import numpy as np
 from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.solve.chance import tail_of_f
 from calib.stages.camera.bundle import Calibration, joint_jacobian, minimise, poses_with_camera, refitted
-from calib.stages.camera.checks import evidence, points_C, scaled_inverse
+from calib.stages.camera.checks import apart_px, evidence, overdispersion, points_C, scaled_inverse
 from calib.stages.camera.model import LeftOut, Observations, project
 from calib.stages.camera.verdict import listed
 
@@ -231,6 +231,149 @@ def _moved_px(calibration: Calibration, shift: FloatArray) -> FloatArray:
     some = used[:: max(1, len(used) // 300)]
     J = joint_jacobian(calibration, some)[:, :, : shift.shape[1]]
     return np.asarray(np.linalg.norm(np.einsum("mcg,ng->nmc", J, shift), axis=2).max(axis=1))
+
+
+# ----------------------------------------------------------------------
+# Views that were turned or mirrored after the camera took them.
+#
+# A picture that is turned by half a turn is as large as before, and a board in it is found. It is a view by
+# the camera rho(theta) whose principal point is mirrored at the picture's middle and whose p1 and p2 have
+# the other sign. With rho(theta_0 + d) = theta_0 + F d + g, F = diag(+-1), such a view costs c_i(F d + g).
+# Which views these are and the camera that all share follow in turn from each other, from several starts.
+
+_TURNS = {
+    "turned by half a turn": ("cx_px", "cy_px", "p1", "p2"),
+    "mirrored left to right": ("cx_px", "skew_px", "p2"),
+    "mirrored top to bottom": ("cy_px", "skew_px", "p1"),
+}
+"""Intrinsics that change: the centre to the other side of the picture's middle, the others their sign."""
+_LEAST_TURNED = 8
+"""Views below which none can be told to be turned."""
+_TURN_SIGMAS = 4.0
+"""Standard deviations, the views' overdispersion included, by which a view is turned: in three sets as taken
+the most is 2.6, where views are turned 5 to 55."""
+_TURN_ALSO = 2.0
+"""The same for a view beside one that is."""
+_TURN_EXCESS = 0.25
+"""Disagreement of a turned view with the others over that of the view as it is, at most."""
+_TURN_PX = 0.3
+"""Change of directions by the turn below which it does not matter; pixels at up to 1000 pixels' width."""
+_TURN_STARTS, _TURN_STEPS = 8, 10
+
+
+def turned_views(calibration: Calibration) -> list[LeftOut]:
+    """Views that agree with the others once they are turned or mirrored, a minority.
+
+    Parameters
+    ----------
+    calibration : of all views, the target rigid, without robust loss.
+    """
+    N, width = calibration.observations.views, max(calibration.camera.image_size_px)
+    if N < _LEAST_TURNED or not len(calibration.free):
+        return []
+    try:
+        found = evidence(calibration)
+    except ValueError:
+        return []
+    best: tuple[float, str, BoolArray, FloatArray] | None = None
+    for how, names in _TURNS.items():
+        flip, offset = _reflection(calibration, names)
+        S = np.stack([found.S, flip[:, None] * found.S * flip])
+        b = np.stack([found.b, flip * (found.b + found.S @ offset)])
+        cost = found.cost + 2 * found.b @ offset + np.einsum("g,ngh,h->n", offset, found.S, offset)
+        turned, d, total = _parted(S, b, np.stack([found.cost, cost]))
+        if not turned.any():
+            continue
+        there = np.stack([found.cost, cost]) + 2 * b @ d + np.einsum("g,sngh,h->sn", d, S, d)
+        of = turned.astype(np.int64), np.arange(N)
+        sigma_px = np.sqrt(max(total, 0.0) / max(calibration.degrees_of_freedom, 1))
+        at_d = replace(found, S=S[of], b=b[of] + S[of] @ d, sigma_px=float(sigma_px))
+        least = found.cost - np.einsum("ng,ngh,nh->n", found.b, scaled_inverse(found.S), found.b)
+        least_gain = (_TURN_SIGMAS * overdispersion(at_d) * sigma_px) ** 2
+        # Where they explain it alike a picture was turned: that happens more often.
+        if best is not None and total > best[0] - least_gain:
+            continue
+        by = there[0] - there[1]
+        clear = turned & (by > least_gain)
+        clear &= there[1] - least < _TURN_EXCESS * (there[0] - least)
+        if clear.any():
+            agree, odd = _agree_turned(S, b, np.stack([found.cost, cost]), found.measured, turned)
+            clear &= agree & odd
+            # Where one was turned others may have been that say less.
+            if clear.any():
+                clear |= turned & agree & (by > least_gain * (_TURN_ALSO / _TURN_SIGMAS) ** 2)
+        best = total, how, clear, (flip - 1.0) * d + offset
+    if best is None or not best[2].any():
+        return []
+    _, how, which, difference = best
+    moved_px = apart_px(calibration, difference)
+    if moved_px < _TURN_PX * max(1.0, width / 1000):
+        return []
+    why = (
+        f"agrees with the camera of the {N - int(which.sum())} others if it was {how} after it was taken, "
+        f"and not as it is, where directions are off by {moved_px:.2g} px"
+    )
+    return [LeftOut(calibration.observations.names[i], why, "view") for i in np.flatnonzero(which)]
+
+
+def _agree_turned(
+    S: FloatArray, b: FloatArray, cost: FloatArray, measured: IntArray, turned: BoolArray
+) -> tuple[BoolArray, BoolArray]:
+    """Which views (N,) agree with those that agree best when these are turned, and which are odd as they are.
+
+    Another view that is odd may make some look turned.
+    """
+    unit = 1.0 / np.sqrt(np.maximum(np.diag(S[0].sum(axis=0)), 1e-300))
+    S, b = S * unit[:, None] * unit, b * unit
+    of = turned.astype(np.int64), np.arange(len(turned))
+    core = _first_core(S[of], b[of], cost[of], measured)
+    agree = _disagreement(S[of], b[of], cost[of], measured, core).chance(core) > _CHANCE
+    odd = np.zeros(len(turned), dtype=np.bool_)
+    for i in np.flatnonzero(agree & turned):
+        as_is = turned & (of[1] != i)
+        others = core & (of[1] != i)
+        now = as_is.astype(np.int64), of[1]
+        odd[i] = _disagreement(S[now], b[now], cost[now], measured, others).chance(others)[i] < _CHANCE
+    return agree, odd
+
+
+def _reflection(calibration: Calibration, names: tuple[str, ...]) -> tuple[FloatArray, FloatArray]:
+    """F (G,) and g (G,) of the free intrinsics when these change."""
+    changes = np.isin(calibration.free_names, names)
+    middle = dict(zip(("cx_px", "cy_px"), calibration.camera.image_size_px, strict=True))
+    full = np.array([middle.get(name, 1) - 1.0 for name in calibration.free_names])
+    now = calibration.block.intrinsics[calibration.free]
+    return np.where(changes, -1.0, 1.0), np.where(changes, full - 2.0 * now, 0.0)
+
+
+def _parted(S: FloatArray, b: FloatArray, cost: FloatArray) -> tuple[BoolArray, FloatArray, float]:
+    """Which views (N,) are turned, the step d (G,) to the camera that all then share, and their cost.
+
+    Parameters
+    ----------
+    S, b, cost : (2, N, ...) of the views as they are and turned.
+    """
+    N, G = b.shape[1:]
+    unit = 1.0 / np.sqrt(np.maximum(np.diag(S[0].sum(axis=0)), 1e-300))
+    S, b = S * unit[:, None] * unit, b * unit
+    every = np.arange(N)
+    weak = 1e-3 * S[0].sum(axis=0) / N + 1e-9 * np.eye(G)
+    seeds = np.unique(np.linspace(0, N - 1, _TURN_STARTS).astype(np.int64))
+    best, least = (np.zeros(N, dtype=np.bool_), np.zeros(G)), np.inf
+    for start in (None, *seeds):
+        d = np.zeros(G) if start is None else -np.linalg.solve(S[0, start] + weak, b[0, start])
+        turned = np.zeros(N, dtype=np.bool_)
+        for step in range(_TURN_STEPS):
+            there = cost + 2 * b @ d + np.einsum("g,sngh,h->sn", d, S, d)
+            before, turned = turned, there[1] < there[0]
+            if step and np.array_equal(turned, before):
+                break
+            of = turned.astype(np.int64), every
+            d = -scaled_inverse(S[of].sum(axis=0)) @ b[of].sum(axis=0)
+        total = float(cost[of].sum() + b[of].sum(axis=0) @ d)
+        if 2 * turned.sum() <= N and total < least:
+            best, least = (turned, d), total
+    return best[0], best[1] * unit, least
 
 
 # ----------------------------------------------------------------------
