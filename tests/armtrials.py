@@ -35,8 +35,9 @@ def simulated(
     command[-150:] = 7.0
     start = Trial(name, day, load_kg, STEP_S * np.arange(n), command, np.full(n, 5.0), np.full(n, 0.13),
                   np.full(n, 0.176 - 0.006 * (seed % 2)))  # fmt: skip
+    values = dict(values) | {"bends_rad_per_kpa": gain * values["bends_rad_per_kpa"]}
     pressure = drive_run(start, values)
-    angle, chord = segment_run(start, values, pressure, gain)
+    angle, chord = segment_run(start, values, pressure)
     return Trial(name, day, load_kg, start.t_s, command, pressure + rng.normal(0.0, 1.0, n),
                  angle + rng.normal(0.0, 1e-3, n), chord + rng.normal(0.0, 1e-4, n))  # fmt: skip
 

@@ -518,7 +518,7 @@ def _solve_validate(inputs: ValidateInputs) -> Validated:
 
         arm = inputs.rig.arm
         assert arm is not None
-        held = {one.name: errors_by(arm.values, arm.gain_of(one.day), one) for one in inputs.trials}
+        held = {one.name: errors_by(arm.values_on(one.day), one) for one in inputs.trials}
         return Validated(held=held)
     models = models_of(inputs.rig)
     return Validated(tuple(compare(track, models, start) for track, start in inputs.tracks))

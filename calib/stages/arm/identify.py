@@ -3,9 +3,9 @@
 Least squares over whole free runs with the parameters' priors, in two steps: the segment from the measured
 pressure, then the drive from the command with the segment as it is, so that what a valve's model misses does
 not bend the arm's. Without a measured pressure all is fitted from the command at once. Errors of a free run
-stay alike for seconds, so a sample counts as 1/`_ALIKE` of a reading. What differs from day to day is a gain
-with a prior of its own. Standard deviations are the larger of the posterior's and of the jackknife's over
-trials, as trials differ by more than their samples tell.
+stay alike for seconds, so a sample counts as 1/`_ALIKE` of a reading. Days differ by factors with priors of
+their own. Standard deviations are the larger of the posterior's and of the jackknife's over trials, as trials
+differ by more than their samples tell.
 
 A trial is held back from all: fits to the others begin at the priors, or where another fit to the same others
 has ended.
@@ -26,17 +26,19 @@ from scipy.special import stdtrit
 
 from calib.core.arrays import FloatArray, IntArray
 from calib.stages.arm.model import (
-    DAY_SPREAD,
+    DAILY,
     DRIVES,
     PARAMETERS,
     PARTS,
     STEP_S,
     Assembly,
+    Days,
     Scale,
     Trial,
     drive_run,
     scale_of,
     segment_run,
+    values_on,
 )
 
 FULL = Assembly(tuple(part.name for part in PARTS if part.name != "lag"))
@@ -44,8 +46,9 @@ WORTH = ("stiffening", "hysteresis", "creep", "settling", "load")
 """Parts whose worth is measured by leaving them out."""
 _SIGMA = {"pressure_kpa": 0.03, "angle_rad": 0.027, "chord_m": 0.0045}
 """Of their scale: what assemblies of this kind leave."""
-_ALIKE, _EVERY = 100, 5
-"""Samples of one error, and of which one is looked at."""
+_ALIKE, _EVERY = 300, 5
+"""Samples of one error, and of which one is looked at. Errors on held trials of a real arm have an integral
+time of 2 to 7 s about their mean over the trial, and of 4 to 37 s with it."""
 _STEP = 0.03
 """Of the differences, in deviations of the priors; smaller ones see the valve's ports open and close."""
 _ORDERS, _ARX_STEPS_S = (8, 15), (0.1, 0.2)
@@ -59,14 +62,14 @@ class Fit:
     Attributes
     ----------
     z : (parameters,) in deviations of the priors. covariance : (parameters, parameters) the posterior's.
-    gains : of each day.
+    days : factors of each day.
     """
 
     assembly: Assembly
     scale: Scale
     z: FloatArray
     covariance: FloatArray
-    gains: Mapping[str, float]
+    days: Days
 
     @property
     def sigma(self) -> FloatArray:
@@ -122,61 +125,61 @@ class Identification:
     prospects: Mapping[str, Mapping[str, float]]
 
 
-def _bent(
-    trial: Trial, values: Mapping[str, float], gain: float, pressure_kpa: FloatArray
-) -> dict[str, FloatArray]:
+def _bent(trial: Trial, values: Mapping[str, float], pressure_kpa: FloatArray) -> dict[str, FloatArray]:
     if not (len(trial.angle_rad) and len(pressure_kpa)):
         return {}
-    angle, chord = segment_run(trial, values, pressure_kpa, gain)
+    angle, chord = segment_run(trial, values, pressure_kpa)
     return {"angle_rad": angle - trial.angle_rad, "chord_m": chord - trial.chord_m}
 
 
-def by_pressure(trial: Trial, values: Mapping[str, float], gain: float) -> dict[str, FloatArray]:
+def by_pressure(trial: Trial, values: Mapping[str, float]) -> dict[str, FloatArray]:
     """Simulated less measured values (n,) of the segment under the measured pressure."""
-    return _bent(trial, values, gain, trial.pressure_kpa)
+    return _bent(trial, values, trial.pressure_kpa)
 
 
-def by_command(trial: Trial, values: Mapping[str, float], gain: float) -> dict[str, FloatArray]:
+def by_command(trial: Trial, values: Mapping[str, float]) -> dict[str, FloatArray]:
     """Simulated less measured values (n,) of drive and segment under the command."""
     if not len(trial.command):
         return {}
     run = drive_run(trial, values)
     off = {"pressure_kpa": run - trial.pressure_kpa} if len(trial.pressure_kpa) else {}
-    return off | _bent(trial, values, gain, run)
+    return off | _bent(trial, values, run)
 
 
-_Model = Callable[[Trial, Mapping[str, float], float], dict[str, FloatArray]]
+_Model = Callable[[Trial, Mapping[str, float]], dict[str, FloatArray]]
 
 
 class _Problem:
-    """Squared errors of trials as functions of z: parameters in deviations of their priors, then days."""
+    """Squared errors of trials as functions of z: parameters in deviations of their priors, then factors."""
 
     def __init__(self, trials: Sequence[Trial], assembly: Assembly, scale: Scale) -> None:
         self.trials, self.assembly, self.scale = trials, assembly, scale
-        self.days = sorted({one.day for one in trials})
+        days = sorted({one.day for one in trials})
+        self.daily = [(day, name) for day in days for name in DAILY if name in assembly.names]
         alike = math.sqrt(_ALIKE / _EVERY)
         self.sizes = {name: share * getattr(scale, name) * alike for name, share in _SIGMA.items()}
 
     def indices(self, drives: bool) -> IntArray:
-        """Parameters of the drive, or of the segment and the days, where they are of the assembly."""
+        """Parameters of the drive, or of the segment, and factors of these, where the assembly has them."""
         mine = set(self.assembly.names)
         of = [name for names in DRIVES.values() for name in names]
-        days = [] if drives else range(len(PARAMETERS), len(PARAMETERS) + len(self.days))
-        chosen = [k for k, p in enumerate(PARAMETERS) if p.name in mine and (p.name in of) == drives]
-        return np.array([*chosen, *days])
+        names = [p.name for p in PARAMETERS] + [name for _, name in self.daily]
+        return np.array([k for k, name in enumerate(names) if name in mine and (name in of) == drives])
 
-    def gains(self, z: FloatArray) -> dict[str, float]:
-        count = len(PARAMETERS)
-        return {day: math.exp(DAY_SPREAD * x) for day, x in zip(self.days, z[count:].tolist(), strict=True)}
+    def days(self, z: FloatArray) -> dict[str, dict[str, float]]:
+        out: dict[str, dict[str, float]] = {one.day: {} for one in self.trials}
+        for (day, name), x in zip(self.daily, z[len(PARAMETERS) :].tolist(), strict=True):
+            out[day][name] = math.exp(DAILY[name] * x)
+        return out
 
     def rows(self, model: _Model, z: FloatArray, free: IntArray, x: FloatArray) -> FloatArray:
         """Deviations x of the free entries from their priors, and scaled errors."""
         full = z.copy()
         full[free] = x
         values = self.assembly.values(full[: len(PARAMETERS)], self.scale)
-        gains, rows = self.gains(full), [x]
+        days, rows = self.days(full), [x]
         for one in self.trials:
-            errors = model(one, values, gains[one.day])
+            errors = model(one, values_on(one.day, values, days))
             rows += [error[::_EVERY] / self.sizes[name] for name, error in errors.items()]
         return np.asarray(np.clip(np.nan_to_num(np.concatenate(rows), nan=1e3), -1e3, 1e3))
 
@@ -200,10 +203,12 @@ class _Problem:
 def fit(trials: Sequence[Trial], assembly: Assembly, scale: Scale, start: Fit | None = None) -> Fit:
     """The assembly with the smallest squared errors and deviations from its priors."""
     problem, count = _Problem(trials, assembly, scale), len(PARAMETERS)
-    z = np.zeros(count + len(problem.days))
+    z = np.zeros(count + len(problem.daily))
     if start is not None:
         z[:count] = start.z
-        z[count:] = [math.log(start.gains.get(day, 1.0)) / DAY_SPREAD for day in problem.days]
+        z[count:] = [
+            math.log(start.days.get(day, {}).get(name, 1.0)) / DAILY[name] for day, name in problem.daily
+        ]
     segment, drive = problem.indices(False), problem.indices(True)
     covariance = np.eye(len(z))
     together = not any(len(one.pressure_kpa) and len(one.angle_rad) for one in trials)
@@ -212,7 +217,7 @@ def fit(trials: Sequence[Trial], assembly: Assembly, scale: Scale, start: Fit | 
     if any(len(one.command) for one in trials):
         free = np.concatenate([drive, segment]) if together else drive
         z, covariance[np.ix_(free, free)] = problem.solve(by_command, z, free)
-    return Fit(assembly, scale, z[:count], covariance[:count, :count], problem.gains(z))
+    return Fit(assembly, scale, z[:count], covariance[:count, :count], problem.days(z))
 
 
 _NONE = np.zeros(0)
@@ -222,17 +227,17 @@ def _rms(error: FloatArray) -> float:
     return float(np.sqrt(np.mean(error**2))) if len(error) else math.nan
 
 
-def errors_by(values: Mapping[str, float], gain: float, trial: Trial) -> Errors:
-    """Free-run errors on a trial, of parameters by name and the gain of its day."""
-    off = by_command(trial, values, gain)
-    bent = by_pressure(trial, values, gain).get("angle_rad", _NONE)
+def errors_by(values: Mapping[str, float], trial: Trial) -> Errors:
+    """Free-run errors on a trial, of parameters by name on its day."""
+    off = by_command(trial, values)
+    bent = by_pressure(trial, values).get("angle_rad", _NONE)
     names = ("angle_rad", "chord_m", "pressure_kpa")
     return {name: _rms(off.get(name, _NONE)) for name in names} | {"angle_by_pressure_rad": _rms(bent)}
 
 
 def errors_of(made: Fit, trial: Trial) -> Errors:
     """Free-run errors of a fit on a trial."""
-    return errors_by(made.values, made.gains.get(trial.day, 1.0), trial)
+    return errors_by(values_on(trial.day, made.values, made.days), trial)
 
 
 # ----------------------------------------------------------------------
@@ -374,7 +379,7 @@ def _coverage(trials: Sequence[Trial], held: Mapping[str, Fit], errors: Mapping[
         if not (len(one.command) and len(one.angle_rad)) or math.isnan(wide):
             continue
         made = held[one.name]
-        off = by_command(one, made.values, made.gains.get(one.day, 1.0))["angle_rad"]
+        off = by_command(one, values_on(one.day, made.values, made.days))["angle_rad"]
         inside += int(np.sum(np.abs(off) <= wide))
         total += len(one.angle_rad)
     return inside / total if total else math.nan
@@ -421,20 +426,21 @@ def prospects(made: Fit) -> dict[str, dict[str, float]]:
     """What two more trials of a kind would leave of the posterior's deviations, by kind and parameter.
 
     A load plays its part too, as no log without a known one tells its compliance. The trials are of another
-    day, whose gain has its prior.
+    day, whose factors have their priors.
     """
     parts = {*made.assembly.parts, "load"}
     assembly = Assembly(tuple(part.name for part in PARTS if part.name in parts))
     free = np.array([k for k, one in enumerate(PARAMETERS) if one.name in assembly.names])
     now = made.covariance[np.ix_(free, free)]
-    known = np.eye(len(free) + 1)
-    known[:-1, :-1] = np.linalg.inv(now)
     out = {}
     for name, trial in _plans(made).items():
         problem = _Problem([trial], assembly, made.scale)
-        z, some = np.append(made.z, 0.0), np.append(free, len(PARAMETERS))
+        z = np.append(made.z, np.zeros(len(problem.daily)))
+        some = np.append(free, np.arange(len(made.z), len(z)))
+        known = np.eye(len(some))
+        known[: len(free), : len(free)] = np.linalg.inv(now)
         J = problem.slopes(by_command, z, some, z[some])[len(some) :]
-        after = np.diag(np.linalg.inv(known + 2.0 * J.T @ J))[:-1]
+        after = np.diag(np.linalg.inv(known + 2.0 * J.T @ J))[: len(free)]
         left = np.sqrt(after / np.diag(now))
         out[name] = {PARAMETERS[k].name: float(x) for k, x in zip(free, left, strict=True)}
     return out

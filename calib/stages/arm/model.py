@@ -1,10 +1,11 @@
 """A bending arm, assembled from parts that drive, bend and resist, and its free run.
 
-Valve: the pilot x [kPa] integrates the command u against the outlet's pressure p, and drains D times as fast
-as it fills. Within the overlap d neither port is open; supply and exhaust open over w as x leaves it. The
-outlet's line feeds the chamber, p_c. Flows are those of nozzles (ISO 6358, critical ratio .3, absolute
-pressures, P_0 of the air):
+Valve: the pilot x [kPa] integrates the command u, smoothed by the input, against the outlet's pressure p, and
+drains D times as fast as it fills. Within the overlap d neither port is open; supply and exhaust open over w
+as x leaves it. The outlet's line feeds the chamber, p_c. Flows are those of nozzles (ISO 6358, critical ratio
+.3, absolute pressures, P_0 of the air):
 
+    du/dt   = (command - u) / t_u
     dx/dt   = r (u - p), D times that for u < p,  |x - p| <= d + w
     dp/dt   = S o(x - p) (p_s + P_0) psi((p + P_0) / (p_s + P_0)) - E o(p - x) (p + P_0) psi(P_0 / (p + P_0))
               - l p - k (p - p_c),   o(e) = max(e - d, 0) / w
@@ -21,11 +22,14 @@ at most the hysteresis' range; c creeps after the angle; s is by how much the ch
 as of an arm that was vented:
 
     dp_f/dt = (p - p_f) / t_f
-    tau dphi/dt = phi_0 + (g a p_f + C M(phi) - h w / r) / (1 + b p_f) + q c + v s - phi
+    tau dphi/dt = phi_0 + (a p_f + C M(phi) - h w / r) / (1 + b p_f) + q c + v s - phi
     dw = dphi,  |w| <= r;   dc/dt = (phi - phi_0 - c) / tau_c;   ds/dt = -s exp(e p_f) / tau_s
 
-g is the gain of the day. M = m g l sin(.55 phi) is the moment of a load at the tip of an upright arm of
+M = m g l sin(.55 phi) is the moment of a load at the tip of an upright arm of
 length l, whose chord leans by about .55 of the angle. Chord: L = c_0 + c_1 phi + c_2 phi^2 - s.
+
+What differs from day to day is a factor of a, and of D: an arm is refitted, its rubber rests, and so do the
+valve's springs.
 
 Area, stiffness and lever arm are one number, a, without a known load; with one, C separates the stiffness.
 """
@@ -121,10 +125,11 @@ PARTS = (
             Parameter("opening_kpa", "kPa", 0.03, 0.7, True, _P, identified_by="commands that change sign"),
             Parameter("supply_per_s", "1/s", 1.2, 0.4, True, identified_by="steps up"),
             Parameter("exhaust_per_s", "1/s", 1.5, 0.4, True, identified_by="steps down"),
-            Parameter("supply_kpa", "kPa", 1.08, 0.07, True, _P, identified_by="long steps up"),
+            Parameter("supply_kpa", "kPa", 1.0, 0.12, True, _P, identified_by="long steps up"),
             Parameter("line_per_s", "1/s", 4.0, 0.6, True, identified_by=_STEPS),
             Parameter("line_to_chamber", "", 0.7, 0.6, True, identified_by=_STEPS),
             Parameter("leak_per_s", "1/s", 0.3, 0.5, True, identified_by="holds"),
+            Parameter("input_s", "s", 0.03, 0.7, True, identified_by="commands that switch fast"),
         ),
         {},
         drives=True,
@@ -206,8 +211,10 @@ PARAMETERS = tuple(one for part in PARTS for one in part.parameters)
 DRIVES = {part.name: tuple(one.name for one in part.parameters) for part in PARTS if part.drives}
 """Parameters of the parts that make the pressure."""
 SEGMENT = tuple(one.name for part in PARTS if not part.drives for one in part.parameters)
-DAY_SPREAD = 0.15
-"""Standard deviation of the logarithm of a day's gain: an arm is refitted, its hoses and its rubber rest."""
+DAILY = {"pilot_drains": 0.1, "bends_rad_per_kpa": 0.15}
+"""Parameters that differ from day to day, and standard deviations of the logarithms of a day's factors."""
+Days = Mapping[str, Mapping[str, float]]
+"""Factors of parameters by day."""
 
 
 @dataclass(frozen=True)
@@ -216,7 +223,7 @@ class Trial:
 
     Attributes
     ----------
-    name, day : of the log; trials of one day share a gain. load_kg : at the tip.
+    name, day : of the log; trials of one day share its factors. load_kg : at the tip.
     t_s : (n,). command : (n,) kPa, or PWM, means over the steps; empty where it was not logged.
     pressure_kpa : (n,) of the driven chamber, empty where it was not logged.
     angle_rad, chord_m : (n,) of the tip, empty without motion capture.
@@ -245,17 +252,19 @@ def _nozzle(ratio):  # type: ignore[no-untyped-def]
 
 @kernel()
 def _valve(command, start_kpa, q, step_s):  # type: ignore[no-untyped-def]
-    rate, drains, overlap, opening, supply, exhaust, source, line, ratio, leak = q
+    rate, drains, overlap, opening, supply, exhaust, source, line, ratio, leak, input_s = q
     out = np.empty(len(command))
     outlet = chamber = start_kpa
     ahead = overlap
     step_s /= _FINER
     flow = step_s * line
     held = 1.0 + ratio * flow
+    smooth, follows = command[0], 1.0 - math.exp(-step_s / input_s)
     for k in range(len(command)):
         out[k] = outlet
         for _ in range(_FINER):
-            error = command[k] - outlet
+            smooth += follows * (command[k] - smooth)
+            error = smooth - outlet
             ahead += step_s * rate * error * (drains if error < 0.0 else 1.0)
             ahead = min(max(ahead, -overlap - opening), overlap + opening)
             # Implicit in the pressures, as ports and line are fast: flows over the drops that drive them.
@@ -289,7 +298,7 @@ def _lag(command, start_kpa, q, step_s):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _segment(pressure, angle, chord, q, gain, moment, step_s):  # type: ignore[no-untyped-def]
+def _segment(pressure, angle, chord, q, moment, step_s):  # type: ignore[no-untyped-def]
     rest, linear, fill, lag, stiffens, stop, reach, creep, creep_s, vented, settling_s, sooner = q[:12]
     compliance, c0, c1, c2 = q[12:]
     out = np.empty((len(pressure), 2))
@@ -301,9 +310,7 @@ def _segment(pressure, angle, chord, q, gain, moment, step_s):  # type: ignore[n
         out[k, 0] = angle
         out[k, 1] = c0 + c1 * angle + c2 * angle * angle - short
         inside += fills * (pressure[k] - inside)
-        bends = (
-            gain * linear * inside + compliance * moment * math.sin(_LEANS * angle) - stop * elastic / reach
-        )
+        bends = linear * inside + compliance * moment * math.sin(_LEANS * angle) - stop * elastic / reach
         aim = rest + bends / max(1.0 + stiffens * inside, 0.1)
         change = follows * (aim + creep * crept + vented * short - angle)
         angle += change
@@ -311,6 +318,15 @@ def _segment(pressure, angle, chord, q, gain, moment, step_s):  # type: ignore[n
         crept += step_s / creep_s * (angle - rest - crept)
         short -= step_s / settling_s * short * math.exp(min(sooner * inside, 5.0))
     return out
+
+
+def values_on(day: str, values: Mapping[str, float], days: Days) -> dict[str, float]:
+    """Parameters on a day; on one that was not seen their factors are the means of those that were."""
+    seen = [days[day]] if day in days else list(days.values())
+    logs = {name: [math.log(one.get(name, 1.0)) for one in seen] for name in DAILY if seen}
+    return dict(values) | {
+        name: values[name] * math.exp(sum(of) / len(of)) for name, of in logs.items() if name in values
+    }
 
 
 def drive_run(trial: Trial, values: Mapping[str, float]) -> FloatArray:
@@ -325,17 +341,12 @@ def drive_run(trial: Trial, values: Mapping[str, float]) -> FloatArray:
 
 
 def segment_run(
-    trial: Trial, values: Mapping[str, float], pressure_kpa: FloatArray, gain: float = 1.0
+    trial: Trial, values: Mapping[str, float], pressure_kpa: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Angle [rad] and chord [m], each (n,), that follow from a pressure (n,) and from the first pose alone.
-
-    Parameters
-    ----------
-    values : parameters by name. gain : of the day.
-    """
+    """Angle [rad] and chord [m], each (n,), that follow from a pressure (n,) and from the first pose."""
     q = np.array([values[name] for name in SEGMENT])
     moment = trial.load_kg * _GRAVITY_MPS2 * values["chord_m"]
-    out = _segment(pressure_kpa, trial.angle_rad[0], trial.chord_m[0], q, gain, moment, STEP_S)
+    out = _segment(pressure_kpa, trial.angle_rad[0], trial.chord_m[0], q, moment, STEP_S)
     return out[:, 0], out[:, 1]
 
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from statistics import geometric_mean
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import model_validator
 
 from calib.core.result import NotNegative, Number, Positive, Result, Row3, Section, Sigma, quantity
-from calib.stages.arm.model import PARAMETERS, PARTS, Assembly
+from calib.stages.arm.model import DAILY, PARAMETERS, PARTS, Assembly, values_on
+
+_AT_ONCE_S = 1e-4
+"""Input of a valve in files of earlier versions, which knew none."""
 
 
 class HeldTrial(Section):
@@ -25,7 +27,8 @@ class Arm(Result):
     Attributes
     ----------
     parts : that play a part. parameters : by name.
-    days : gain of each day, see `calib.stages.arm.model`.
+    days : factors of parameters on each day, see `calib.stages.arm.model`; in files of earlier versions the
+        factor of bends_rad_per_kpa alone.
     bending_axis : in the frame of the base; absent for poses in the plane.
     interval_rad : half the 95 % interval of the angle of a further trial, from the errors on held trials.
     coverage : share of the samples of held trials inside the interval that the others' errors give.
@@ -36,7 +39,7 @@ class Arm(Result):
     parts: list[str]
     parameters: dict[str, Number]
     sigma: Sigma = {}
-    days: dict[str, Positive] = {}
+    days: dict[str, dict[str, Positive]] = {}
     bending_axis: Row3 | None = None
     chord_leans: NotNegative | None = quantity(None, label="chord's turn, of the tip's", digits=2)
     angle_error_rad: NotNegative | None = quantity(
@@ -52,6 +55,20 @@ class Arm(Result):
     coverage: NotNegative | None = quantity(None, label="held samples inside", show="%", digits=0)
     held: dict[str, HeldTrial] = {}
 
+    @model_validator(mode="before")
+    @classmethod
+    def _earlier(cls, section: Any) -> Any:
+        if not isinstance(section, dict) or not isinstance(section.get("days", {}), dict):
+            return section
+        days = {
+            day: one if isinstance(one, dict) else {"bends_rad_per_kpa": one}
+            for day, one in section.get("days", {}).items()
+        }
+        out, parameters = section | {"days": days}, section.get("parameters")
+        if isinstance(parameters, dict) and "leak_per_s" in parameters:
+            out["parameters"] = {"input_s": _AT_ONCE_S} | parameters
+        return out
+
     @model_validator(mode="after")
     def _assembled(self) -> Arm:
         known = [part.name for part in PARTS]
@@ -63,6 +80,9 @@ class Arm(Result):
             raise ValueError(f"expected one part of {' and '.join(drives)}")
         if set(self.parameters) != set(self.assembly.names):
             raise ValueError("expected the parameters of its parts, all of them")
+        strange = {name for day in self.days.values() for name in day} - set(DAILY)
+        if strange:
+            raise ValueError(f"expected factors of {' and '.join(DAILY)}, not of {min(strange)}")
         wrong = [p.name for p in PARAMETERS if p.positive and self.parameters.get(p.name, 1.0) <= 0.0]
         if wrong:
             raise ValueError(f"expected {wrong[0]} above 0")
@@ -73,11 +93,6 @@ class Arm(Result):
         """The parts that play a part."""
         return Assembly(tuple(self.parts))
 
-    @property
-    def values(self) -> dict[str, float]:
-        """All parameters, those of parts that are left out included."""
-        return self.parameters | self.assembly.off
-
-    def gain_of(self, day: str) -> float:
-        """A day's gain; of a day that was not seen the mean of those that were."""
-        return self.days.get(day) or (geometric_mean(self.days.values()) if self.days else 1.0)
+    def values_on(self, day: str) -> dict[str, float]:
+        """All parameters on a day, those of parts that are left out included."""
+        return values_on(day, self.parameters | self.assembly.off, self.days)

@@ -126,7 +126,7 @@ def _solve(inputs: Inputs) -> Arm:
         parts=list(made.assembly.parts),
         parameters={name: float(made.values[name]) for name in made.assembly.names},
         sigma={name: float(value) for name, value in found.sigma.items()},
-        days={name: float(value) for name, value in made.gains.items()},
+        days={day: dict(factors) for day, factors in made.days.items()},
         bending_axis=None if axis is None else axis.tolist(),
         chord_leans=finite_or_none(inputs.frame.leans),
         angle_error_rad=finite_or_none(mean_of(found.held, "angle_rad")),
@@ -237,7 +237,10 @@ def _words(arm: Arm) -> list[Block]:
     blocks: list[Block] = [
         Table(("part", "parameter", "value", "sigma", "unit", "identified by"), tuple(rows)),
         Line("sigma holds between trials: the larger of the posterior's and of the jackknife's over trials"),
-        Line("gain of the day: " + ", ".join(f"{day} {gain:.3f}" for day, gain in arm.days.items())),
+        *(
+            Line(f"{day}: " + ", ".join(f"{name} times {factor:.3f}" for name, factor in factors.items()))
+            for day, factors in arm.days.items()
+        ),
     ]
 
     ahead = []
@@ -292,7 +295,7 @@ def held_trials(files: Files, arm: Arm, options: Options) -> Sequence[Trial]:
     trials, _, findings = read_trials(files, options, Frame(None if axis is None else np.array(axis)))
     files.remarks += [one.text for one in findings]
     files.remarks += [
-        f"{one.name}: day {one.day} is not in the rig, its gain is the mean"
+        f"{one.name}: day {one.day} is not in the rig, its factors are the means"
         for one in trials
         if one.day not in arm.days
     ]
