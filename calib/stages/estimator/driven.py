@@ -31,6 +31,7 @@ from calib.stages.estimator.kinematic import (
     FASTEST_MPS,
     NEWEST,
     OUT,
+    Events,
     Filter,
     Rows,
     Setup,
@@ -42,6 +43,7 @@ from calib.stages.estimator.kinematic import (
     finish_row,
     make_room,
     new_clock,
+    no_events,
     settle_event,
     write_columns,
 )
@@ -968,35 +970,19 @@ def sound(x: FloatArray, P: FloatArray, radius: float) -> bool:
     return bool(good)
 
 
-class Ring(NamedTuple):
-    """The last events, the newest at `whole[NEWEST]`: states after them, and what they were.
-
-    Attributes
-    ----------
-    x, P : (size, 36), (size, 36, 36). t : (size,) times [s]. z : (size, 4) as in `driven_event`.
-    kind, gated : (size,), (size, 3) as in `driven_event`. let_go : (size,) time before it at which the head
-        was let go, NaN for none.
-    """
-
-    x: FloatArray
-    P: FloatArray
-    t: FloatArray
-    z: FloatArray
-    kind: IntArray
-    gated: FloatArray
-    let_go: FloatArray
-
-
 class Memory(NamedTuple):
-    """What the filter remembers beside the ring.
+    """What the filter remembers beside the last events.
 
     Attributes
     ----------
-    whole : (6,) `NEWEST`, `COUNT`, and from `_STARTED` on. real : (5,) from `_LAST` on.
+    x, P : (size, 36), (size, 36, 36) states after the last events.
+    whole, real : (6,) `NEWEST`, `COUNT`, and from `_STARTED` on; (5,) from `_LAST` on.
     switch_t, switch_g : ring of commands as in `cut`, the newest at `whole[_SWITCH]`.
     camera_clock, imu_clock : of `kinematic.new_clock`.
     """
 
+    x: FloatArray
+    P: FloatArray
     whole: IntArray
     real: FloatArray
     switch_t: FloatArray
@@ -1042,7 +1028,7 @@ class Room(NamedTuple):
 
 @kernel(arrays=False)
 def _due(
-    turn: int, stamp: float, tick: float, readings: FloatArray, kinds: int, driven: float, ring: Ring,
+    turn: int, stamp: float, tick: float, readings: FloatArray, kinds: int, driven: float, events: Events,
     memory: Memory, model: Model, z: FloatArray,
 ) -> tuple[int, float]:  # fmt: skip
     """Kind and time of the event that a row brings in a turn, with its reading in z; -1 for none.
@@ -1071,14 +1057,14 @@ def _due(
         if math.isnan(z[2]) and (math.isnan(z[0]) or math.isnan(z[1])):
             return -1, 0.0
         return IMU, when
-    if whole[COUNT] == 0 or not stamp - ring.t[whole[NEWEST]] > model.delay + SILENT_S:
+    if whole[COUNT] == 0 or not stamp - events.t[whole[NEWEST]] > model.delay + SILENT_S:
         return -1, 0.0
     return 0, stamp - model.delay
 
 
 @kernel(arrays=False)
 def _do_again(
-    own: int, first: int, begin: bool, afresh: bool, ring: Ring, memory: Memory, model: Model, room: Room
+    own: int, first: int, begin: bool, afresh: bool, events: Events, memory: Memory, model: Model, room: Room
 ) -> int:
     """Do the last events again, from `first` before the newest on; returns flags.
 
@@ -1089,16 +1075,16 @@ def _do_again(
     """
     x0, P0, plant, whole, real = model.x0, model.P0, model.plant, memory.whole, memory.real
     switch_t, switch_g = memory.switch_t, memory.switch_g
-    size, flags = ring.t.shape[0], 0
+    size, flags = events.t.shape[0], 0
     for i in range(first + 1):
         now = (whole[NEWEST] + 1 - first + i) % size
         before = (now - 1) % size
-        x, P, z, gated = ring.x[now], ring.P[now], ring.z[now], ring.gated[now]
-        copy_state(x, P, ring.x[before], ring.P[before])
+        x, P, z, gated = memory.x[now], memory.P[now], events.z[now], events.gated[now]
+        copy_state(x, P, memory.x[before], memory.P[before])
         if whole[_STARTED] == 1:
             pass_on(
-                x, P, ring.t[before], ring.t[now], ring.let_go[now], x0, P0, plant, model.walk, switch_t,
-                switch_g, whole[_SWITCH], room.F, room.work,
+                x, P, events.t[before], events.t[now], events.let_go[now], x0, P0, plant, model.walk,
+                switch_t, switch_g, whole[_SWITCH], room.F, room.work,
             )  # fmt: skip
         if now == own and begin and begin_again(
             x, P, x0, P0, model.camera, z[0], z[1], not math.isnan(real[_BEGUN]), whole[_HOSES] == 1,
@@ -1107,20 +1093,20 @@ def _do_again(
             if whole[_STARTED] == 1:
                 flags |= 1
             whole[_STARTED], whole[_PENDING] = 1, 0
-            real[_BEGUN] = ring.t[now]
+            real[_BEGUN] = events.t[now]
             if whole[_HOSES] == 1:
                 x[13], P[13, 13] = 0.0, model.hoses_sigma * model.hoses_sigma
-        if ring.kind[now] == IMU and ring.t[now] < real[_BEGUN] + SETTLING_S:
+        if events.kind[now] == IMU and events.t[now] < real[_BEGUN] + SETTLING_S:
             z[0], z[1], gated[1] = math.nan, math.nan, 1.0
-        if (whole[_STARTED] == 0 and ring.kind[now] != HOSES) or ring.kind[now] == 0:
+        if (whole[_STARTED] == 0 and events.kind[now] != HOSES) or events.kind[now] == 0:
             for k in range(12 if now == own else 0):
                 room.report[k] = math.nan
             for k in range(3):
                 gated[k] = 1.0
             continue
         driven_event(
-            x, P, ring.kind[now], z, plant, model.camera, model.noise, room.work, not (afresh or now == own),
-            room.report if now == own else room.spare, gated, room.untraced,
+            x, P, events.kind[now], z, plant, model.camera, model.noise, room.work,
+            not (afresh or now == own), room.report if now == own else room.spare, gated, room.untraced,
         )  # fmt: skip
         if not sound(x, P, model.radius):
             copy_state(x, P, x0, P0)
@@ -1130,21 +1116,21 @@ def _do_again(
 
 
 @kernel(arrays=False)
-def _suspects(own: int, ring: Ring, count: int) -> tuple[int, int]:
+def _suspects(own: int, events: Events, count: int) -> tuple[int, int]:
     """How far back the first of two samples is that contradict the model, and the last one before them.
 
     The second of the two is `own`; 0, 0 where there are no two, or their rates are the same.
     """
-    size, suspect = ring.t.shape[0], 0
-    if not contradicted(ring.z[own], ring.gated[own]):
+    size, suspect = events.t.shape[0], 0
+    if not contradicted(events.z[own], events.gated[own]):
         return 0, 0
     for i in range(1, count - 1):
         now = (own - i) % size
-        if ring.kind[now] != IMU:
+        if events.kind[now] != IMU:
             continue
         if suspect > 0:
-            return (0, 0) if ring.z[(own - suspect) % size, 2] == ring.z[own, 2] else (suspect, i)
-        if not contradicted(ring.z[now], ring.gated[now]):
+            return (0, 0) if events.z[(own - suspect) % size, 2] == events.z[own, 2] else (suspect, i)
+        if not contradicted(events.z[now], events.gated[now]):
             return 0, 0
         suspect = i
     return 0, 0
@@ -1152,46 +1138,46 @@ def _suspects(own: int, ring: Ring, count: int) -> tuple[int, int]:
 
 @kernel(arrays=False)
 def _taken(
-    own: int, back: int, begin: bool, ring: Ring, memory: Memory, model: Model, room: Room
+    own: int, back: int, begin: bool, events: Events, memory: Memory, model: Model, room: Room
 ) -> tuple[int, float]:
     """Do a new event and the `back` ones after it; flags, and when the head was let go, NaN if it was not.
 
     They are done again where two samples say that the head was let go, and once more where it was not.
     """
-    flags, size = _do_again(own, back, begin, False, ring, memory, model, room), ring.t.shape[0]
-    settled = ring.t[own] > memory.real[_BEGUN] + SETTLING_S
-    if back > 0 or ring.kind[own] != IMU or not settled:
+    flags, size = _do_again(own, back, begin, False, events, memory, model, room), events.t.shape[0]
+    settled = events.t[own] > memory.real[_BEGUN] + SETTLING_S
+    if back > 0 or events.kind[own] != IMU or not settled:
         return flags, math.nan
-    suspect, since = _suspects(own, ring, memory.whole[COUNT])
+    suspect, since = _suspects(own, events, memory.whole[COUNT])
     if since == 0:
         return flags, math.nan
     before, first = (own - since) % size, (own - suspect) % size
     let_go_s = let_go_time(
-        ring.x[before], ring.z[first, 2], ring.t[before], ring.t[first], model.plant, room.work
+        memory.x[before], events.z[first, 2], events.t[before], events.t[first], model.plant, room.work
     )
     for i in range(suspect, since):
         now = (own - i) % size
-        if ring.t[(now - 1) % size] <= let_go_s:
-            ring.let_go[now] = let_go_s
+        if events.t[(now - 1) % size] <= let_go_s:
+            events.let_go[now] = let_go_s
             break
-    flags |= _do_again(own, since - 1, False, True, ring, memory, model, room)
-    if not ring.gated[first, 2] + ring.gated[own, 2] > 0.0:
+    flags |= _do_again(own, since - 1, False, True, events, memory, model, room)
+    if not events.gated[first, 2] + events.gated[own, 2] > 0.0:
         return flags, let_go_s
     for i in range(since):
-        ring.let_go[(own - i) % size] = math.nan
-    return flags | _do_again(own, since - 1, False, True, ring, memory, model, room), math.nan
+        events.let_go[(own - i) % size] = math.nan
+    return flags | _do_again(own, since - 1, False, True, events, memory, model, room), math.nan
 
 
 @kernel(arrays=False)
 def run_driven(
     t: FloatArray, readings: FloatArray, kinds: IntArray, forces: FloatArray, driven: FloatArray,
-    ring: Ring, memory: Memory, model: Model, room: Room, out: FloatArray,
+    events: Events, memory: Memory, model: Model, room: Room, out: FloatArray,
 ) -> None:  # fmt: skip
     """Rows (n,), (n, 5), (n,), (n, 2), (n,) through the ring of the last events; writes `out`.
 
     `driven` says whether a row's command drives the pumps.
     """
-    whole, real, size = memory.whole, memory.real, ring.t.shape[0]
+    whole, real, size = memory.whole, memory.real, events.t.shape[0]
     switch_t, switch_g = memory.switch_t, memory.switch_g
     for row in range(len(t)):
         stamp, flags = t[row], 0
@@ -1214,27 +1200,27 @@ def run_driven(
             )  # fmt: skip
         for turn in range(4):
             kind, when = _due(
-                turn, stamp, tick, readings[row], kinds[row], driven[row], ring, memory, model, room.z
+                turn, stamp, tick, readings[row], kinds[row], driven[row], events, memory, model, room.z
             )
             if kind < 0:
                 continue
             newest = whole[NEWEST]
-            count_first(ring.t, ring.kind, whole, when)
-            back = make_room(ring.t, ring.z, ring.kind, ring.gated, ring.let_go, whole, kind, when)
+            count_first(events, whole, when)
+            back = make_room(events, whole, kind, when)
             if back < 0:
                 flags |= 16
                 continue
             own = (newest + 1 - back) % size
-            when, ring.let_go[own] = ring.t[own], math.nan
+            when, events.let_go[own] = events.t[own], math.nan
             after = (own + 1) % size
-            if back > 0 and ring.let_go[after] < when:
-                ring.let_go[own], ring.let_go[after] = ring.let_go[after], math.nan
+            if back > 0 and events.let_go[after] < when:
+                events.let_go[own], events.let_go[after] = events.let_go[after], math.nan
             for k in range(4):
-                ring.z[own, k] = room.z[k]
+                events.z[own, k] = room.z[k]
             # Who holds the head until the log begins is not in the model.
             begin = (kind == CAMERA and (whole[_STARTED] == 0 or whole[_PENDING] == 1)
                      and when > real[_FIRST] + _BEFORE_S)  # fmt: skip
-            found, let_go_s = _taken(own, back, begin, ring, memory, model, room)
+            found, let_go_s = _taken(own, back, begin, events, memory, model, room)
             flags |= found
             if not math.isnan(let_go_s):
                 out[row, _LET_GO] = let_go_s
@@ -1252,13 +1238,13 @@ def run_driven(
             if real[_REJECTED] > _LOCKED_OUT or real[_REJECTED_IMU] > 2.0 * _LOCKED_OUT:
                 whole[_PENDING], real[_REJECTED], real[_REJECTED_IMU] = 1, 0.0, 0.0
         here = whole[NEWEST]
-        ahead = stamp - ring.t[here] if whole[COUNT] > 0 else 0.0
+        ahead = stamp - events.t[here] if whole[COUNT] > 0 else 0.0
         if whole[_STARTED] == 0:
             flags |= 64
         if ahead > 1e-3 and whole[_STARTED] == 1:
-            copy_state(room.x, room.P, ring.x[here], ring.P[here])
+            copy_state(room.x, room.P, memory.x[here], memory.P[here])
             predict_driven(
-                room.x, room.P, ring.t[here], stamp, model.plant, model.walk, switch_t, switch_g,
+                room.x, room.P, events.t[here], stamp, model.plant, model.walk, switch_t, switch_g,
                 whole[_SWITCH], room.F, room.work,
             )  # fmt: skip
             if not sound(room.x, room.P, model.radius):
@@ -1266,7 +1252,7 @@ def run_driven(
             write_row(room.x, room.P, 0.0, model.radius, out, row)
         else:
             back_s = min(max(ahead, -max(model.delay, 1e-3)), 1e-3)
-            write_row(ring.x[here], ring.P[here], back_s, model.radius, out, row)
+            write_row(memory.x[here], memory.P[here], back_s, model.radius, out, row)
         out[row, 25] = flags
 
 
@@ -1278,16 +1264,14 @@ class DrivenFilter:
         delay = max(float(setup.start.sensor[7]), 0.0)
         imu_s = setup.imu_period_s if setup.imu_period_s > 0.0 else 0.002
         size, n = min(max(16, math.ceil(2.0 * (delay + 0.02) / imu_s) + 8), 512), len(DRIVEN)
-        self._ring = Ring(
-            np.zeros((size, n)), np.zeros((size, n, n)), np.zeros(size), np.zeros((size, 4)),
-            np.zeros(size, dtype=np.int64), np.zeros((size, 3)), np.full(size, np.nan),
-        )  # fmt: skip
+        self._events = no_events(size, 4, np.full(size, np.nan))
         self._memory = Memory(
-            np.zeros(6, dtype=np.int64), np.full(5, np.nan), np.full(_SWITCHES, -np.inf),
-            np.zeros((_SWITCHES, 4)), new_clock(setup.camera_period_s), new_clock(setup.imu_period_s),
+            np.zeros((size, n)), np.zeros((size, n, n)), np.zeros(6, dtype=np.int64), np.full(5, np.nan),
+            np.full(_SWITCHES, -np.inf), np.zeros((_SWITCHES, 4)), new_clock(setup.camera_period_s),
+            new_clock(setup.imu_period_s),
         )  # fmt: skip
         start = drive.start(setup)
-        self._ring.x[0], self._ring.P[0] = start
+        self._memory.x[0], self._memory.P[0] = start
         self._model = Model(
             *start, drive.numbers(), drive.walk(setup), setup.view, drive.noise(setup),
             setup.bellows_radius_m, delay, drive.pump.delay_ticks * drive.pump.tick_s,
@@ -1303,7 +1287,7 @@ class DrivenFilter:
         out = np.empty((len(rows), len(OUT)))
         driven = np.asarray(np.nan_to_num(pwm).max(axis=1, initial=0.0), dtype=np.float64)
         run_driven(
-            rows.t_s, rows.readings, rows.kinds, commands(self.drive, pwm), driven, self._ring,
+            rows.t_s, rows.readings, rows.kinds, commands(self.drive, pwm), driven, self._events,
             self._memory, self._model, self._room, out,
         )  # fmt: skip
         return out
@@ -1312,7 +1296,7 @@ class DrivenFilter:
     def state(self) -> tuple[FloatArray, FloatArray]:
         """State (36,) and covariance (36, 36) after the last event."""
         here = int(self._memory.whole[NEWEST])
-        return self._ring.x[here].copy(), self._ring.P[here].copy()
+        return self._memory.x[here].copy(), self._memory.P[here].copy()
 
 
 assert SIZE == 19

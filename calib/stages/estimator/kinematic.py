@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -637,18 +638,25 @@ def finish_row(
     out[row, 12] = math.sqrt(max(pp, 1e-18))
 
 
+class Bank(NamedTuple):
+    """States (slots, M, 19), covariances and weights (slots, M + 1) of the levels, as in `bank_event`."""
+
+    x: FloatArray
+    P: FloatArray
+    weights: FloatArray
+
+
 @kernel(arrays=False)
 def write_bank(
-    bank_x: FloatArray, bank_P: FloatArray, weights: FloatArray, slot: int, dt: float, levels: FloatArray,
-    radius: float, out: FloatArray, row: int,
-) -> None:  # fmt: skip
+    bank: Bank, slot: int, dt: float, levels: FloatArray, radius: float, out: FloatArray, row: int
+) -> None:
     """Means and deviations of the bank a short time dt after its last event into columns 1 to 12."""
-    count = weights.shape[1] - 1
+    count = bank.weights.shape[1] - 1
     phi = length = dphi = dl = bias = pp = ll = pl = 0.0
     # Second moments about the first level: what cancels is no more than the levels are apart.
     phi_0 = length_0 = 0.0
     for m in range(count):
-        x, P = bank_x[slot, m], bank_P[slot, m]
+        x, P = bank.x[slot, m], bank.P[slot, m]
         a01, a02, a11, a12, _ = axis_transition(levels[m, 0], levels[m, 1], dt)
         b01, b02, b11, b12, _ = axis_transition(levels[m, 4], levels[m, 5], dt)
         phi_m = x[0] + a01 * x[2] + a02 * x[4]
@@ -670,7 +678,7 @@ def write_bank(
         if dt > 0.0:
             var_p += axis_noise(levels[m, 2], levels[m, 3], dt)[0]
             var_l += axis_noise(levels[m, 6], levels[m, 7], dt)[0]
-        w = weights[slot, m]
+        w = bank.weights[slot, m]
         phi += w * phi_m
         length += w * length_m
         dphi += w * (a11 * x[2] + a12 * x[4])
@@ -736,23 +744,20 @@ def _clear(P: FloatArray, i: int, variance: float) -> None:
 
 
 @kernel(arrays=False)
-def _reset_head(
-    bank_x: FloatArray, bank_P: FloatArray, weights: FloatArray, slot: int, head: FloatArray,
-    sigma: FloatArray,
-) -> None:  # fmt: skip
+def _reset_head(bank: Bank, slot: int, head: FloatArray, sigma: FloatArray) -> None:
     """Forget the head's motion; what is known of the sensors stays."""
-    count = bank_x.shape[1]
+    count = bank.x.shape[1]
     for m in range(count):
         for i in range(6):
-            bank_x[slot, m, i] = head[i]
-            _clear(bank_P[slot, m], i, sigma[i] * sigma[i])
-        weights[slot, m] = 1.0 / count
+            bank.x[slot, m, i] = head[i]
+            _clear(bank.P[slot, m], i, sigma[i] * sigma[i])
+        bank.weights[slot, m] = 1.0 / count
 
 
 @kernel(arrays=False)
-def _place_head(bank_x: FloatArray, slot: int, phi: float, length: float) -> None:
-    for m in range(bank_x.shape[1]):
-        bank_x[slot, m, 0], bank_x[slot, m, 1] = phi, length
+def _place_head(bank: Bank, slot: int, phi: float, length: float) -> None:
+    for m in range(bank.x.shape[1]):
+        bank.x[slot, m, 0], bank.x[slot, m, 1] = phi, length
 
 
 @kernel(arrays=False)
@@ -765,13 +770,12 @@ def _hold(x: FloatArray, P: FloatArray, k: int, middle: float, sigma: float, p: 
 
 @kernel(arrays=False)
 def _mend(
-    bank_x: FloatArray, bank_P: FloatArray, slot: int, head: FloatArray, head_sigma: FloatArray,
-    radius: float, p: FloatArray,
-) -> int:  # fmt: skip
+    bank: Bank, slot: int, head: FloatArray, head_sigma: FloatArray, radius: float, p: FloatArray
+) -> int:
     """Whether the state is still one that a rig can have, and what is done where it is not: flags."""
     flags = 0
-    for m in range(bank_x.shape[1]):
-        x, P = bank_x[slot, m], bank_P[slot, m]
+    for m in range(bank.x.shape[1]):
+        x, P = bank.x[slot, m], bank.P[slot, m]
         if P[0, 0] > 1.0:
             _hold(x, P, int(_PHI), head[0], 0.7, p)
             flags |= 8
@@ -796,42 +800,67 @@ def _mend(
     return flags
 
 
+class Events(NamedTuple):
+    """The last events, in a ring.
+
+    Attributes
+    ----------
+    t : (size,) times [s]. z : (size, k) readings. kind : (size,). gated : (size, 3) as in `bank_event`.
+    let_go : (size,) time before it at which the head was let go, NaN for none; or empty.
+    """
+
+    t: FloatArray
+    z: FloatArray
+    kind: IntArray
+    gated: FloatArray
+    let_go: FloatArray
+
+
+def no_events(size: int, readings: int, let_go: FloatArray) -> Events:
+    """A ring of this size without events."""
+    return Events(
+        np.zeros(size),
+        np.zeros((size, readings)),
+        np.zeros(size, dtype=np.int64),
+        np.zeros((size, 3)),
+        let_go,
+    )
+
+
 @kernel(arrays=False)
-def count_first(ring_t: FloatArray, ring_kind: IntArray, whole: IntArray, when: float) -> None:
+def count_first(events: Events, whole: IntArray, when: float) -> None:
     """Let the ring of events begin where it is empty."""
     if whole[COUNT] == 0:
-        ring_t[whole[NEWEST]], ring_kind[whole[NEWEST]] = when, 0
+        events.t[whole[NEWEST]], events.kind[whole[NEWEST]] = when, 0
         whole[COUNT] = 1
 
 
 @kernel(arrays=False)
-def make_room(
-    ring_t: FloatArray, ring_z: FloatArray, ring_kind: IntArray, ring_gated: FloatArray,
-    ring_let_go: FloatArray, whole: IntArray, kind: int, when: float,
-) -> int:  # fmt: skip
+def make_room(events: Events, whole: IntArray, kind: int, when: float) -> int:
     """Put an event among the last ones, by its time; how many are after it, -1 where it is older than all.
 
     Its readings are the caller's to write. What is only known to be older than the oldest of a ring that is
-    not full goes right after that one. `ring_let_go` may be empty.
+    not full goes right after that one.
     """
-    size, newest, back = ring_t.shape[0], whole[NEWEST], 0
-    while back < whole[COUNT] - 1 and ring_t[(newest - back) % size] > when:
+    t, z, kinds, gated, let_go = events.t, events.z, events.kind, events.gated, events.let_go
+    size, newest, back = t.shape[0], whole[NEWEST], 0
+    while back < whole[COUNT] - 1 and t[(newest - back) % size] > when:
         back += 1
-    if ring_t[(newest - back) % size] > when:
+    if t[(newest - back) % size] > when:
         if whole[COUNT] == size:
             return -1
-        when = ring_t[(newest - back) % size]
+        when = t[(newest - back) % size]
     for i in range(back):
         to, since = (newest + 1 - i) % size, (newest - i) % size
-        ring_t[to], ring_kind[to] = ring_t[since], ring_kind[since]
-        for k in range(ring_z.shape[1]):
-            ring_z[to, k] = ring_z[since, k]
+        t[to], kinds[to] = t[since], kinds[since]
+        for k in range(z.shape[1]):
+            z[to, k] = z[since, k]
         for k in range(3):
-            ring_gated[to, k] = ring_gated[since, k]
-        if ring_let_go.shape[0]:
-            ring_let_go[to] = ring_let_go[since]
+            gated[to, k] = gated[since, k]
+        if let_go.shape[0]:
+            let_go[to] = let_go[since]
     own = (newest + 1 - back) % size
-    ring_t[own], ring_kind[own] = when, kind
+    t[own], kinds[own] = when, kind
     return int(back)
 
 
@@ -847,30 +876,114 @@ def settle_event(whole: IntArray, size: int, report: FloatArray, out: FloatArray
             out[row, 13 + k] = report[k]
 
 
+class _Memory(NamedTuple):
+    """What the filter remembers beside bank and events: (4,) from `NEWEST`, (5,) from `_LAST` on, clocks."""
+
+    whole: IntArray
+    real: FloatArray
+    camera_clock: FloatArray
+    imu_clock: FloatArray
+
+
+class _Model(NamedTuple):
+    """What does not change, as in `bank_event` and `Start`; radius of a bellows, delay of pictures [s]."""
+
+    switch_hz: float
+    levels: FloatArray
+    walk: FloatArray
+    camera: FloatArray
+    noise: FloatArray
+    head: FloatArray
+    head_sigma: FloatArray
+    radius: float
+    delay: float
+
+
+class _Room(NamedTuple):
+    """Scratch: that of `bank_event`, a second report, and a trace of no rows."""
+
+    work: FloatArray
+    told: FloatArray
+    report: FloatArray
+    spare: FloatArray
+    untraced: FloatArray
+
+
+@kernel(arrays=False)
+def _begin_at(u: float, v: float, bank: Bank, slot: int, memory: _Memory, model: _Model) -> int:
+    """Begin at a picture where it shows a head that a rig can have; flags."""
+    x, rest, flags = bank.x[slot, 0], model.head[1], 0
+    phi, length, found = 0.0, 0.0, False
+    for attempt in range(2):
+        if not found:
+            angle = x[0] if attempt == 0 else 0.0
+            phi, length, found = invert_marker(model.camera, x[6:], u, v, angle, rest)
+    if found and 0.2 * rest < length < 3.0 * rest:
+        if memory.whole[_CAMERA_STARTED] == 1:
+            flags = 1
+        _reset_head(bank, slot, model.head, model.head_sigma)
+        _place_head(bank, slot, phi, length)
+        memory.whole[_CAMERA_STARTED], memory.whole[_PENDING] = 1, 0
+    return flags
+
+
+@kernel(arrays=False)
+def _after_rejections(
+    kind: int, stamp: float, report: FloatArray, bank: Bank, memory: _Memory, model: _Model
+) -> int:
+    """What follows from a sensor that has been rejected for `_LOCKED_OUT_S`; flags."""
+    real = memory.real
+    since, gate = (_REJECTED_SINCE, 8) if kind == CAMERA else (_GYRO_REJECTED_SINCE, 10)
+    if report[gate] == 0.0:
+        real[since] = math.nan
+    elif report[gate] == 1.0 and math.isnan(real[since]):
+        real[since] = stamp
+    elif report[gate] == 1.0 and stamp - real[since] > _LOCKED_OUT_S:
+        real[since] = math.nan
+        if kind == CAMERA:
+            memory.whole[_PENDING] = 1
+            return 0
+        here = memory.whole[NEWEST]
+        phi, length = bank.x[here, 0, 0], bank.x[here, 0, 1]
+        _reset_head(bank, here, model.head, model.head_sigma)
+        _place_head(bank, here, phi, length)
+        return 1
+    return 0
+
+
+@kernel(arrays=False)
+def _write_ahead(
+    ahead: float, bank: Bank, memory: _Memory, model: _Model, room: _Room, out: FloatArray, row: int
+) -> int:
+    """The bank so long after its last event into a row; flags. The last slot of the bank is scratch."""
+    here, slot, levels = memory.whole[NEWEST], bank.x.shape[0] - 1, model.levels
+    if abs(ahead) <= 0.02:
+        write_bank(bank, here, ahead, levels, model.radius, out, row)
+        if max(abs(out[row, 3]), abs(out[row, 4])) < FASTEST_MPS:
+            return 0
+    for m in range(levels.shape[0]):
+        bank.weights[slot, m] = bank.weights[here, m]
+        x, P = bank.x[slot, m], bank.P[slot, m]
+        copy_state(x, P, bank.x[here, m], bank.P[here, m])
+        predict(x, P, levels[m], model.walk, ahead)
+    flags = _mend(bank, slot, model.head, model.head_sigma, model.radius, room.work[0, 5])
+    write_bank(bank, slot, 0.0, levels, model.radius, out, row)
+    return int(flags)
+
+
 @kernel(arrays=False)
 def run_filter(
-    t: FloatArray, readings: FloatArray, kinds: IntArray,
-    bank_x: FloatArray, bank_P: FloatArray, weights: FloatArray, ring_t: FloatArray, ring_z: FloatArray,
-    ring_kind: IntArray, ring_gated: FloatArray, whole: IntArray, real: FloatArray,
-    camera_clock: FloatArray, imu_clock: FloatArray,
-    switch_hz: float, levels: FloatArray, walk: FloatArray, view: FloatArray, noise: FloatArray,
-    head: FloatArray, head_sigma: FloatArray, radius: float, delay: float,
-    work: FloatArray, told: FloatArray, report: FloatArray, spare: FloatArray, untraced: FloatArray,
-    never: FloatArray, out: FloatArray,
+    t: FloatArray, readings: FloatArray, kinds: IntArray, bank: Bank, events: Events, memory: _Memory,
+    model: _Model, room: _Room, out: FloatArray,
 ) -> None:  # fmt: skip
-    """Rows (n,), (n, 5), (n,) through the ring of the last events; writes `out` (n, len(OUT)).
-
-    The last slot of bank and weights is scratch; so are the arrays from `work` on.
-    """
-    size, count = ring_t.shape[0], told.shape[0]
-    p = work[0, 5]
+    """Rows (n,), (n, 5), (n,) through the ring of the last events; writes `out` (n, len(OUT))."""
+    whole, real, size, count = memory.whole, memory.real, events.t.shape[0], model.levels.shape[0]
+    head, head_sigma, report = model.head, model.head_sigma, room.report
     z0 = z1 = z2 = 0.0
     for row in range(len(t)):
-        stamp = t[row]
-        flags = 0
-        if begin_row(stamp, real[_LAST], camera_clock, imu_clock, out, row):
-            newest = whole[NEWEST]
-            _reset_head(bank_x, bank_P, weights, newest, head, head_sigma)
+        stamp, flags = t[row], 0
+        if begin_row(stamp, real[_LAST], memory.camera_clock, memory.imu_clock, out, row):
+            _reset_head(bank, whole[NEWEST], head, head_sigma)
             whole[COUNT], whole[_CAMERA_STARTED], whole[_PENDING] = 0, 0, 0
             real[_CAMERA_SEEN], real[_IMU_SEEN] = stamp, stamp
             real[_REJECTED_SINCE], real[_GYRO_REJECTED_SINCE] = math.nan, math.nan
@@ -882,98 +995,57 @@ def run_filter(
             if not kinds[row] & kind:
                 continue
             if kind == CAMERA:
-                when = advance(camera_clock, stamp) - delay
+                when = advance(memory.camera_clock, stamp) - model.delay
                 z0, z1, z2 = readings[row, 0], readings[row, 1], math.nan
                 if math.isnan(z0) or math.isnan(z1):
                     continue
                 real[_CAMERA_SEEN] = stamp
             else:
-                when = advance(imu_clock, stamp)
+                when = advance(memory.imu_clock, stamp)
                 z0, z1, z2 = readings[row, 2], readings[row, 3], readings[row, 4]
                 if math.isnan(z2) and (math.isnan(z0) or math.isnan(z1)):
                     continue
                 real[_IMU_SEEN] = stamp
             newest = whole[NEWEST]
             if whole[COUNT] == 0:
-                count_first(ring_t, ring_kind, whole, when)
+                count_first(events, whole, when)
                 if kind == IMU and not math.isnan(z0) and math.hypot(z0, z1) > 1.0:
-                    tilt = math.atan2(z1, z0) - bank_x[newest, 0, 9]
+                    tilt = math.atan2(z1, z0) - bank.x[newest, 0, 9]
                     tilt = min(max(math.atan2(math.sin(tilt), math.cos(tilt)), -1.5), 1.5)
-                    _place_head(bank_x, newest, tilt, bank_x[newest, 0, 1])
-            back = make_room(ring_t, ring_z, ring_kind, ring_gated, never, whole, kind, when)
+                    _place_head(bank, newest, tilt, bank.x[newest, 0, 1])
+            back = make_room(events, whole, kind, when)
             if back < 0:
                 flags |= 16
                 continue
             own = (newest + 1 - back) % size
-            ring_z[own, 0], ring_z[own, 1], ring_z[own, 2] = z0, z1, z2
-            begin_camera = kind == CAMERA and (whole[_CAMERA_STARTED] == 0 or whole[_PENDING] == 1)
+            events.z[own, 0], events.z[own, 1], events.z[own, 2] = z0, z1, z2
+            if kind == CAMERA and (whole[_CAMERA_STARTED] == 0 or whole[_PENDING] == 1):
+                flags |= _begin_at(z0, z1, bank, (own - 1) % size, memory, model)
             for i in range(back + 1):
-                now = (newest + 1 - back + i) % size
+                now = (own + i) % size
                 before = (now - 1) % size
-                if i == 0 and begin_camera:
-                    x = bank_x[before, 0]
-                    phi, length, found = 0.0, 0.0, False
-                    for attempt in range(2):
-                        if not found:
-                            angle = x[0] if attempt == 0 else 0.0
-                            phi, length, found = invert_marker(view, x[6:], z0, z1, angle, head[1])
-                    if found and 0.2 * head[1] < length < 3.0 * head[1]:
-                        if whole[_CAMERA_STARTED] == 1:
-                            flags |= 1
-                        _reset_head(bank_x, bank_P, weights, before, head, head_sigma)
-                        _place_head(bank_x, before, phi, length)
-                        whole[_CAMERA_STARTED], whole[_PENDING] = 1, 0
                 bank_event(
-                    bank_x, bank_P, weights, before, now, ring_kind[now], ring_z[now],
-                    ring_t[now] - ring_t[before], switch_hz, levels, walk, view, noise, work, told,
-                    i > 0, report if i == 0 else spare, ring_gated[now], untraced,
+                    bank.x, bank.P, bank.weights, before, now, events.kind[now], events.z[now],
+                    events.t[now] - events.t[before], model.switch_hz, model.levels, model.walk,
+                    model.camera, model.noise, room.work, room.told, i > 0, report if i == 0 else room.spare,
+                    events.gated[now], room.untraced,
                 )  # fmt: skip
-                flags |= _mend(bank_x, bank_P, now, head, head_sigma, radius, p)
+                flags |= _mend(bank, now, head, head_sigma, model.radius, room.work[0, 5])
             settle_event(whole, size, report, out, row)
-            if kind == CAMERA:
-                if report[8] == 0.0:
-                    real[_REJECTED_SINCE] = math.nan
-                elif math.isnan(real[_REJECTED_SINCE]):
-                    real[_REJECTED_SINCE] = stamp
-                elif stamp - real[_REJECTED_SINCE] > _LOCKED_OUT_S:
-                    whole[_PENDING] = 1
-                    real[_REJECTED_SINCE] = math.nan
-            elif report[10] == 0.0:
-                real[_GYRO_REJECTED_SINCE] = math.nan
-            elif report[10] == 1.0:
-                if math.isnan(real[_GYRO_REJECTED_SINCE]):
-                    real[_GYRO_REJECTED_SINCE] = stamp
-                elif stamp - real[_GYRO_REJECTED_SINCE] > _LOCKED_OUT_S:
-                    here = whole[NEWEST]
-                    phi, length = bank_x[here, 0, 0], bank_x[here, 0, 1]
-                    _reset_head(bank_x, bank_P, weights, here, head, head_sigma)
-                    _place_head(bank_x, here, phi, length)
-                    real[_GYRO_REJECTED_SINCE] = math.nan
-                    flags |= 1
+            flags |= _after_rejections(kind, stamp, report, bank, memory, model)
         if stamp - real[_CAMERA_SEEN] > _SILENT_S:
             flags |= 2
         if stamp - real[_IMU_SEEN] > _SILENT_S:
             flags |= 4
         here = whole[NEWEST]
-        ahead = stamp - ring_t[here] if whole[COUNT] > 0 else 0.0
+        ahead = stamp - events.t[here] if whole[COUNT] > 0 else 0.0
         if whole[COUNT] == 0:
             flags |= 64
-        far = abs(ahead) > 0.02
-        if not far:
-            write_bank(bank_x, bank_P, weights, here, ahead, levels, radius, out, row)
-            far = not max(abs(out[row, 3]), abs(out[row, 4])) < FASTEST_MPS
-        if far:
-            for m in range(count):
-                weights[size, m] = weights[here, m]
-                x, P = bank_x[size, m], bank_P[size, m]
-                copy_state(x, P, bank_x[here, m], bank_P[here, m])
-                predict(x, P, levels[m], walk, ahead)
-            flags |= _mend(bank_x, bank_P, size, head, head_sigma, radius, p)
-            write_bank(bank_x, bank_P, weights, size, 0.0, levels, radius, out, row)
+        flags |= _write_ahead(ahead, bank, memory, model, room, out, row)
         if max(out[row, 10], out[row, 11]) > _KNOWN_M:
             flags |= 8
         out[row, 25] = flags
-        out[row, 26], out[row, 27] = weights[here, count - 1], weights[here, 0]
+        out[row, 26], out[row, 27] = bank.weights[here, count - 1], bank.weights[here, 0]
 
 
 def starting_state(setup: Setup, rows: Rows | None = None) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -1002,34 +1074,31 @@ class Filter:
     def __init__(self, setup: Setup) -> None:
         self.setup = setup
         levels, walk = setup.process.arrays()
-        self._levels, self._walk = levels, walk
-        delay = max(float(setup.start.sensor[7]), 0.0)
-        self._delay = delay
+        start, delay = setup.start, max(float(setup.start.sensor[7]), 0.0)
         period = setup.imu_period_s if setup.imu_period_s > 0.0 else 0.002
         size = min(max(16, math.ceil(2.0 * (delay + 0.02) / period) + 8), 512)
-        count = len(levels)
         # One slot more than the ring has, for what is only looked ahead.
-        self._x, self._P, self._w = banked(*starting_state(setup), size + 1)
-        self._scratch = (
-            np.empty((count, *WORK)), np.zeros((count, 7)), np.empty(len(REPORT)), np.empty(len(REPORT)),
-            np.empty((0, TRACE)), np.empty(0),
+        self._bank = Bank(*banked(*starting_state(setup), size + 1))
+        self._events = no_events(size, 3, np.empty(0))
+        self._memory = _Memory(
+            np.zeros(4, dtype=np.int64), np.full(5, np.nan), new_clock(setup.camera_period_s),
+            new_clock(setup.imu_period_s),
         )  # fmt: skip
-        self._t, self._z, self._gated = np.zeros(size), np.zeros((size, 3)), np.zeros((size, 3))
-        self._kind, self._whole = np.zeros(size, dtype=np.int64), np.zeros(4, dtype=np.int64)
-        self._real = np.full(5, np.nan)
-        self._camera_clock = new_clock(setup.camera_period_s)
-        self._imu_clock = new_clock(setup.imu_period_s)
+        self._model = _Model(
+            setup.process.switch_hz, levels, walk, setup.view, setup.noise, start.head, start.head_sigma,
+            setup.bellows_radius_m, delay,
+        )  # fmt: skip
+        self._room = _Room(
+            np.empty((len(levels), *WORK)), np.zeros((len(levels), 7)), np.empty(len(REPORT)),
+            np.empty(len(REPORT)), np.empty((0, TRACE)),
+        )  # fmt: skip
 
     def run(self, rows: Rows) -> FloatArray:
         """Estimates (n, len(OUT)) at the rows' stamps; call again with the rows that follow."""
-        setup = self.setup
         out = np.empty((len(rows), len(OUT)))
         run_filter(
-            rows.t_s, rows.readings, rows.kinds, self._x, self._P, self._w, self._t, self._z, self._kind,
-            self._gated, self._whole, self._real, self._camera_clock, self._imu_clock,
-            setup.process.switch_hz, self._levels, self._walk, setup.view,
-            setup.noise, setup.start.head,
-            setup.start.head_sigma, setup.bellows_radius_m, self._delay, *self._scratch, out,
+            rows.t_s, rows.readings, rows.kinds, self._bank, self._events, self._memory, self._model,
+            self._room, out,
         )  # fmt: skip
         return out
 
@@ -1047,9 +1116,9 @@ class Filter:
     @property
     def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """State (M, 19), covariance (M, 19, 19) and weights (M,) after the last event."""
-        here, count = int(self._whole[0]), len(self._levels)
-        x, P = self._x[here, :, :SIZE], self._P[here, :, :, :SIZE]
-        return x.copy(), P.copy(), self._w[here, :count].copy()
+        here, count = int(self._memory.whole[NEWEST]), len(self._model.levels)
+        x, P = self._bank.x[here, :, :SIZE], self._bank.P[here, :, :, :SIZE]
+        return x.copy(), P.copy(), self._bank.weights[here, :count].copy()
 
 
 assert CLOCK_SIZE == 10
