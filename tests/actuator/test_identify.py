@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +38,7 @@ from calib.stages.actuator.identify import (
 from calib.stages.actuator.identify_pump import Shape, fit_static_map
 from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import Plant
+from calib.stages.actuator.pump import Orifice, RateLimit
 from calib.stages.actuator.read import let_go, read_track, start_in_motion
 from calib.stages.actuator.section import Known, KnownActuator, KnownPump
 from calib.stages.actuator.validate import IMPROVED, ORIGINAL, begun_track, compare, models_of
@@ -338,6 +339,23 @@ def test_recovery_with_the_pumps_connected(tmp_path: Path) -> None:
         z += np.linalg.solve(L, [value - truth[name] for name, value in found.values.items()]).tolist()
     assert np.mean(np.abs(z) < 1.96) >= 0.9
     assert np.abs(z).max() < 3.0
+
+
+@pytest.mark.parametrize("law", [RateLimit(0.35), Orifice(0.9, 1.3)])
+def test_the_law_of_deflation_is_found(law: RateLimit | Orifice, tmp_path: Path) -> None:
+    rig_yaml = tmp_path / "rig.yaml"
+    known = rig_file(rig_yaml)
+    rig, _ = varied(1)
+    rig = replace(rig, pump=replace(rig.pump, deflation=law))
+    path = log_file(tmp_path / "deflate.csv", rig, "deflate", 1, 12.0)
+    tracks = [read_track(Files((path,), rig_yaml), path, known, Machine(), PoseOptions())]
+    found = fit_tracks(Machine(), tracks, either_law=True)
+    assert type(found.problem.nominal.pump.deflation) is type(law)
+    assert bool(found.law) is isinstance(law, Orifice)
+    sigma = uncertainty(found).sigma
+    for name in {*asdict(law)} & {*found.values}:
+        assert abs(found.values[name] - asdict(law)[name]) < 3.5 * sigma[name], name
+    assert {*asdict(law)} & {*found.values}
 
 
 @pytest.mark.parametrize("kind", ["free", "prbs"])

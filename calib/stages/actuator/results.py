@@ -142,15 +142,18 @@ def identify_logs(
     hold_back: bool = True,
     progress: Progress | None = None,
     stated: Mapping[str, float] | None = None,
+    either_law: bool = False,
 ) -> Identified:
     """Parameters of the actuator and the pumps from logs, with all that says what they are worth.
 
-    `nominal` and `stated` are those of `beginning`.
+    `nominal` and `stated` are those of `beginning`, `either_law` as for `fit_tracks`.
 
     Raises `BadInputError` where the logs can tell nothing.
     """
     delay_s = float(np.median([track.delay_s for track in tracks]))
-    solution = fit_tracks(nominal, tracks, static_map, delay_s, progress=progress, stated=stated)
+    solution = fit_tracks(
+        nominal, tracks, static_map, delay_s, progress=progress, stated=stated, either_law=either_law
+    )
     known = uncertainty(solution)
     colours = colour_of(solution)
     held = held_back(solution) if hold_back else []
@@ -227,6 +230,8 @@ def _pump(found: Identified, rig: Rig, judgement: dict[str, Any]) -> PumpSection
     section |= {name: value for name, value in problem.held.items() if name in PumpSection.model_fields}
     section |= {name: values[name] for name in mine}
     sigma |= _sigma_of(uncertainty, mine)
+    if "laminar_s" in values:
+        section["deflation"] = "orifice"
     strengths = [n for n in ("strength1", "strength2") if n in values]
     if strengths:
         pair = [values.get("strength1", nominal.strength[0]), values.get("strength2", nominal.strength[1])]

@@ -86,11 +86,12 @@ def _read(files: Files, rig: Rig, options: LogsOptions) -> LogsInputs:
 def _solve(inputs: LogsInputs) -> Sections:
     from calib.stages.actuator.results import identify_logs, sections_from
 
-    options = inputs.options
+    options, known = inputs.options, inputs.rig.known
     with inputs.progress("identifying") as progress:
         found = identify_logs(
-            inputs.nominal, inputs.tracks, options.static_map, options.hold_back, progress, inputs.stated
-        )
+            inputs.nominal, inputs.tracks, options.static_map, options.hold_back, progress, inputs.stated,
+            either_law=known is None or known.pump is None or known.pump.deflation is None,
+        )  # fmt: skip
     return sections_from(found, inputs.rig)
 
 
