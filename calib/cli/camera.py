@@ -4,23 +4,16 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
-from calib.cli.common import (
-    JsonOption,
-    RigOption,
-    answer,
-    document,
-    emit,
-    narrate,
-    say,
-)
+from calib.cli.common import JsonOption, RigOption, answer, document, emit, narrate, say
+from calib.core.command import note_inputs
 from calib.core.errors import BadInputError, UsageError
-
-if TYPE_CHECKING:
-    from calib.core.writing import Kind
+from calib.core.files import as_text, one_line, read_bytes, read_yaml_mapping, sha256, shown
+from calib.core.units import parse_corners, parse_square_m
+from calib.core.writing import Kind, check_writable, write_atomically
 
 # ----------------------------------------------------------------------
 # `calib board`: a checkerboard or ChArUco board to print, at exact scale.
@@ -46,8 +39,6 @@ def board(
     Half a turn changes the default board, so that every picture shows which corner is the first. A board
     whose columns and rows of corners are both even or both odd looks the same from either end.
     """
-    from calib.core.units import parse_corners, parse_square_m
-    from calib.core.writing import write_atomically
     from calib.show.boardsheet import BOARD_PDF, board_pdf
     from calib.stages.camera.model import Board
     from calib.stages.camera.read import known_dictionary
@@ -106,9 +97,6 @@ def export_camera(
     as_json: JsonOption = False,
 ) -> None:
     """Write the camera as ROS camera_info, OpenCV FileStorage or Kalibr camchain, the IMU as imu.yaml."""
-    from calib.core.command import note_inputs
-    from calib.core.files import shown
-    from calib.core.writing import check_writable, write_atomically
 
     kind = _kind_of(to)
     if output is not None:
@@ -135,7 +123,6 @@ def _kind_of(to: str) -> Kind:
 
 
 def _camera_text(to: str, rig: Path, name: str) -> tuple[str, str]:
-    from calib.core.files import shown
     from calib.core.rig import Rig
     from calib.stages.camera.formats import to_kalibr, to_opencv, to_ros
 
@@ -152,7 +139,6 @@ def _camera_text(to: str, rig: Path, name: str) -> tuple[str, str]:
 
 
 def _imu_text(rig: Path, topic: str | None) -> tuple[str, str]:
-    from calib.core.files import one_line, shown
     from calib.core.rig import Rig
     from calib.stages.imu.formats import to_kalibr
 
@@ -171,10 +157,8 @@ def import_camera(
     as_json: JsonOption = False,
 ) -> None:
     """Read a camera from ROS camera_info, OpenCV FileStorage or Kalibr camchain, or an imu.yaml."""
-    from calib.core.files import read_bytes, sha256, shown
     from calib.core.result import section_json
     from calib.core.rig import SECTIONS, Rig
-    from calib.core.writing import check_writable
 
     check_writable(rig, SECTIONS)
     before = Rig.load(rig, missing_ok=True)
@@ -193,7 +177,6 @@ def import_camera(
 
 def _imported(from_: str, source: Path, data: bytes) -> tuple[str, Any, tuple[str, ...]]:
     """Name and section of what a file holds, and sentences on it."""
-    from calib.core.files import as_text, read_yaml_mapping
     from calib.stages.camera.formats import from_kalibr, from_opencv, from_ros
     from calib.stages.camera.stage import imported_camera
     from calib.stages.imu.formats import from_kalibr as imu_from_kalibr

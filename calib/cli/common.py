@@ -16,6 +16,7 @@ import typer
 from calib.core.errors import CalibError, ReaderGoneError
 from calib.core.files import one_line
 from calib.core.stage import ProgressCall, finite
+from calib.core.words import Table, as_text
 from calib.core.writing import stdout_is_taken
 
 # ----------------------------------------------------------------------
@@ -110,6 +111,5 @@ def progress_bar(label: str) -> Iterator[ProgressCall]:
 
 def table(head: list[str], rows: list[list[str]]) -> list[str]:
     """Lines of a table, the first column to the left and the others to the right."""
-    from calib.core.words import Table, as_text
 
     return as_text([Table(tuple(head), tuple(map(tuple, rows)))], sys.maxsize)

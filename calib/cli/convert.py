@@ -8,15 +8,13 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.common import (
-    JsonOption,
-    answer,
-    narrate,
-    progress_bar,
-)
+from calib.cli.common import JsonOption, answer, narrate, progress_bar
 from calib.cli.verbs import of_logs
+from calib.core.command import note_inputs
 from calib.core.errors import BadInputError, UsageError
+from calib.core.files import shown
 from calib.core.options import NOTHING_STATED, LogOptions
+from calib.core.writing import check_writable, write_atomically, writes_through
 
 
 @of_logs
@@ -36,9 +34,6 @@ def convert(
     """
     import numpy as np
 
-    from calib.core.command import note_inputs
-    from calib.core.files import shown
-    from calib.core.writing import check_writable, write_atomically, writes_through
     from calib.io.columns import COLUMNS_FILE
     from calib.io.logs import LOG, beside, iter_log, passed_over, refuse_counts
     from calib.io.states import states_writer

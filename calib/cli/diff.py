@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from calib.cli.common import JsonOption, document, narrate, say, table
+from calib.core.words import number
 
 if TYPE_CHECKING:
     from calib.core.diff import Change, RigDiff
@@ -91,7 +92,6 @@ def _tell(found: RigDiff, every: bool) -> None:
 
 
 def _row(change: Change) -> list[str]:
-    from calib.core.words import number
 
     assert change.before is not None and change.after is not None
     return [

@@ -12,6 +12,8 @@ import typer
 
 from calib.cli.common import JsonOption, document, narrate, progress_bar, say, table
 from calib.core.errors import EXIT_POOR, UsageError
+from calib.core.files import shown
+from calib.core.units import parse_duration_s
 
 if TYPE_CHECKING:
     from calib.core.workers import Processes
@@ -108,8 +110,6 @@ def fleet(
     A rig that fails is a row and does not end the run; rigs whose results are there are not done again.
     Exits 1 when a rig is not ok.
     """
-    from calib.core.files import shown
-    from calib.core.units import parse_duration_s
     from calib.runner.fleet import (
         SCHEMES,
         Allowed,
@@ -176,7 +176,6 @@ _MOST_TOLD = 20
 
 
 def _tell_fleet(summary: FleetSummary, as_before: int, output: Path) -> None:
-    from calib.core.files import shown
 
     words = ", ".join(f"{count} {verdict}" for verdict, count in summary.verdicts.items())
     say(f"{summary.rigs} rigs: {words}" + (f"; {as_before} as before" if as_before else ""))
@@ -221,8 +220,6 @@ def sweep(
     The first measure decides; the least of it is best, or what is near the value that was asked for. A case
     that fails is a row. Exits 1 when one has failed.
     """
-    from calib.core.files import shown
-    from calib.core.units import parse_duration_s
     from calib.runner.outcomes import TIMINGS
     from calib.runner.sweep import read_sweep, run_sweep, summarise_sweep
     from calib.show.fleet import SWEEP_PAGE, write_sweep_page

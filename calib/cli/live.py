@@ -11,6 +11,9 @@ import typer
 from calib.cli.common import JsonOption, document, narrate, say
 from calib.cli.interrupts import Interrupts
 from calib.core.errors import EXIT_POOR, BadInputError, UsageError, pip_install
+from calib.core.files import shown
+from calib.core.units import parse_corners, parse_square_m
+from calib.core.words import as_text, described
 
 
 def live(
@@ -55,10 +58,7 @@ def live(
     rig.yaml is what calib intrinsics makes of them. Done, or Ctrl-C, ends it. Exits 1 when the verdict is
     not ok.
     """
-    from calib.core.files import shown
     from calib.core.result import section_json
-    from calib.core.units import parse_corners, parse_square_m
-    from calib.core.words import as_text, described
     from calib.live.album import Album
     from calib.live.session import Session
     from calib.live.sources import source_of

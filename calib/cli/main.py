@@ -17,14 +17,7 @@ import warnings
 from typing import NoReturn, TextIO
 
 from calib.cli.interrupts import Interrupts
-from calib.core.errors import (
-    EXIT_BAD_INPUT,
-    EXIT_DONE,
-    EXIT_INTERNAL,
-    EXIT_READER_GONE,
-    UsageError,
-    end_of,
-)
+from calib.core.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERNAL, EXIT_READER_GONE, UsageError, end_of
 from calib.core.files import one_line
 
 # Small matrices gain nothing from BLAS threads, and sums then do not depend on their number.

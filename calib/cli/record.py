@@ -13,6 +13,9 @@ import typer
 
 from calib.cli.common import JsonOption, document, narrate, say
 from calib.core.errors import BadInputError, UsageError, pip_install
+from calib.core.files import shown
+from calib.core.units import parse_duration_s
+from calib.core.writing import appending, check_writable, make_folder, writes_through
 
 if TYPE_CHECKING:
     from calib.io.experiments import Board
@@ -26,7 +29,6 @@ class _Port:
     """A serial port of this computer, as `calib.io.experiments.Port`."""
 
     def __init__(self, name: str, baud: int) -> None:
-        from calib.core.files import shown
 
         try:
             import serial
@@ -78,7 +80,6 @@ def record(
     The latter with --do. What comes is written as it comes. Without --do a board that restarts begins
     another log beside the first.
     """
-    from calib.core.units import parse_duration_s
 
     duration_s = None if duration is None else parse_duration_s(duration, "--duration")
     if do is None:
@@ -105,8 +106,6 @@ def _experiments(
 ) -> None:
     from dataclasses import replace
 
-    from calib.core.files import shown
-    from calib.core.writing import appending, check_writable, make_folder
     from calib.io.experiments import PROGRAMME, Board, experiment, perform
     from calib.io.logs import LOG
 
@@ -191,7 +190,6 @@ def _writer(stream: BinaryIO) -> Callable[[str], None]:
 
 def _complete(path: Path, seconds: float) -> bool:
     """Whether a log is there. Raises `BadInputError` for one that was cut."""
-    from calib.core.files import shown
 
     if not path.is_file():
         return False
@@ -208,7 +206,6 @@ def _complete(path: Path, seconds: float) -> bool:
 
 
 def _must_be_new(output: Path) -> None:
-    from calib.core.files import shown
 
     if output.is_file() and output.stat().st_size:
         raise BadInputError(
@@ -219,8 +216,6 @@ def _must_be_new(output: Path) -> None:
 def _ticks(
     port: str, output: Path, duration_s: float | None, ticks: int | None, baud: int, as_json: bool
 ) -> None:
-    from calib.core.files import shown
-    from calib.core.writing import appending, check_writable, writes_through
     from calib.io.logs import LOG
     from calib.io.serial import ALIVE
     from calib.io.serial import record as run

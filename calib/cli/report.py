@@ -8,6 +8,9 @@ from typing import Annotated
 import typer
 
 from calib.cli.common import JsonOption, document, narrate, say
+from calib.core.command import note_inputs
+from calib.core.files import shown
+from calib.core.writing import check_writable
 
 
 def report(
@@ -21,9 +24,6 @@ def report(
     as_json: JsonOption = False,
 ) -> None:
     """Write the page of a calibration again: one HTML file that needs no network."""
-    from calib.core.command import note_inputs
-    from calib.core.files import shown
-    from calib.core.writing import check_writable
     from calib.show.page import PAGE, write_page
 
     target = rig.parent / "report.html" if output is None else output

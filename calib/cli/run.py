@@ -7,15 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calib.cli.common import (
-    JsonOption,
-    document,
-    narrate,
-    progress_bar,
-    say,
-    table,
-)
+from calib.cli.common import JsonOption, document, narrate, progress_bar, say, table
 from calib.cli.verbs import of_logs
+from calib.core.files import shown
 from calib.core.options import NOTHING_STATED, LogOptions
 
 if TYPE_CHECKING:
@@ -79,7 +73,6 @@ def run(
 
 
 def _tell(ended: Sequence[Job], files: Sequence[str], output: Path) -> None:
-    from calib.core.files import shown
 
     rows = [[job.label, job.status, "as before" if job.reused else ""] for job in ended]
     for line in table(["stage", "", ""], rows):

@@ -9,6 +9,9 @@ import typer
 
 from calib.cli.common import JsonOption, document, narrate, progress_bar, say
 from calib.core.errors import UsageError
+from calib.core.files import shown
+from calib.core.units import parse_duration_s
+from calib.core.writing import check_writable
 
 
 def _options(settings: list[str]) -> dict[str, str]:
@@ -47,9 +50,6 @@ def simulate(
     as_json: JsonOption = False,
 ) -> None:
     """Simulate an experiment and write its log, with the truth in columns of its own."""
-    from calib.core.files import shown
-    from calib.core.units import parse_duration_s
-    from calib.core.writing import check_writable
     from calib.io.logs import SIMULATED, write_log
     from calib.twin.rig import SimulatedRig, rig_from_file
     from calib.twin.scenarios import make_scenario, run_scenario

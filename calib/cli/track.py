@@ -10,6 +10,9 @@ import typer
 from calib.cli.common import JsonOption, RigOption, document, narrate, progress_bar, say
 from calib.cli.interrupts import Interrupts
 from calib.core.errors import EXIT_POOR, BadInputError, UsageError
+from calib.core.files import shown
+from calib.core.units import parse_duration_s, parse_length_m, parse_pixel
+from calib.core.writing import Kind, check_writable, column_names, write_atomically
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -63,9 +66,6 @@ def track(
     A frame in which the marker is not seen, or not told apart from another disc, has no row. Exits 1 when
     fewer than 90 of 100 frames have one.
     """
-    from calib.core.files import shown
-    from calib.core.units import parse_duration_s, parse_length_m, parse_pixel
-    from calib.core.writing import Kind, check_writable, column_names, write_atomically
     from calib.io.frames import timed_frames
     from calib.stages.camera.marker import (
         TRACK_COLUMNS,
@@ -163,7 +163,6 @@ def _why(tracker: Tracker | None, stated: bool) -> str:
 
 def _to_disc(diameter_m: float, rig: Path) -> Callable[[FloatArray], FloatArray]:
     """Maps the ellipse's centre to that of the disc in the plane of the rig."""
-    from calib.core.files import shown
     from calib.core.rig import Rig
     from calib.stages.camera.marker import disc_centre
 

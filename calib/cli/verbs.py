@@ -23,8 +23,10 @@ from calib.cli.common import (
     telling,
 )
 from calib.core.errors import EXIT_POOR
+from calib.core.files import shown
 from calib.core.options import LogOptions, options_of
 from calib.core.stage import Files, Stage
+from calib.core.words import as_text
 from calib.stages import STAGES, stage
 
 
@@ -133,8 +135,6 @@ def _several(hint: Any) -> Any:
 
 
 def _run(stage: Stage, files: Files, options: Any, figures: Path | None, as_json: bool) -> None:
-    from calib.core.files import shown
-    from calib.core.words import as_text
     from calib.runner.work import carry_out
 
     outcome, after = carry_out(stage, files, options, files.rig_path, figures)

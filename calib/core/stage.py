@@ -16,14 +16,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from calib.core.errors import BadInputError, CalibError, SomeFailedError, end_of
+from calib.core.files import hash_of, shown
 from calib.core.options import NoOptions
+from calib.core.verdict import Verdict
+from calib.core.words import Block, described
 
 if TYPE_CHECKING:
     from calib.core.plot import Figure
     from calib.core.result import Result
     from calib.core.rig import Rig
-    from calib.core.verdict import Verdict
-    from calib.core.words import Block
     from calib.core.writing import Kind
 
 
@@ -90,8 +91,6 @@ class Files:
         except CalibError as error:
             self._fails(path, error, str(error), error.exit_code)
         except (ArithmeticError, ValueError) as error:
-            from calib.core.files import shown
-
             code, sentence = end_of(error)
             self._fails(path, error, f"{shown(path)}: {sentence}", code)
 
@@ -104,8 +103,6 @@ class Files:
     def finish(self) -> None:
         """End the work, whose outcome has been told. Raises `SomeFailedError` where files have failed."""
         if self.failed:
-            from calib.core.files import shown
-
             names = ", ".join(shown(path.name) for path in self.failed)
             raise SomeFailedError(
                 f"{len(self.failed)} of {len(self.paths)} files failed: {names}", max(self.failed.values())
@@ -113,7 +110,6 @@ class Files:
 
     def taken(self, path: Path) -> str:
         """Note that a file is an input; its name without folders, the same wherever the folder lies."""
-        from calib.core.files import hash_of, shown
 
         name = shown(path.name)
         if name in self.hashes:
@@ -203,8 +199,6 @@ class Stage:
         """
         from pydantic import ValidationError
 
-        from calib.core.files import shown
-
         for name in self.needs:
             if getattr(rig, name) is None:
                 raise BadInputError(
@@ -240,7 +234,6 @@ class Stage:
 
     def verdict(self, outcome: Any) -> Verdict:
         """All findings on an outcome."""
-        from calib.core.verdict import Verdict
 
         judged = self.results(outcome) or [outcome]
         return Verdict.of(finding for one in judged for finding in one.verdict.findings)
@@ -262,7 +255,6 @@ class Stage:
 
     def blocks(self, outcome: Any) -> list[Block]:
         """An outcome in words, for the terminal and the page."""
-        from calib.core.words import described
 
         told = [] if self.words is None else list(self.words(outcome))
         return [*told, *(block for one in self.results(outcome) for block in described(one))]

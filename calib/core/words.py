@@ -10,13 +10,14 @@ import html
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
-
-from pydantic import BaseModel, TypeAdapter
-from pydantic.fields import FieldInfo
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 from calib.core.units import UNITS, unit_of
 from calib.core.verdict import Verdict
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+    from pydantic.fields import FieldInfo
 
 BLANK = "\N{EN DASH}"
 """What stands for a value that is not there."""
@@ -59,8 +60,6 @@ class Line:
 
 
 Block = Table | Line
-BLOCKS = TypeAdapter(list[Block])
-"""Blocks as JSON, there and back."""
 
 
 def number(value: float | None, sigma: float | None = None, places: int | None = None) -> str:
@@ -140,6 +139,11 @@ def of_verdict(verdict: Verdict) -> list[Line]:
 Rows = list[tuple[str, ...]]
 
 
+def _is_part(value: Any) -> TypeGuard[BaseModel]:
+    """Whether a value is a section or a part of one; pydantic itself takes long to load."""
+    return hasattr(type(value), "model_fields")
+
+
 def _parts(section: BaseModel) -> Iterator[Block]:
     """Numbers in a table, x y z in another, then lists and long texts."""
     scalars, vectors, later = _gathered(section, "")
@@ -165,12 +169,12 @@ def _gathered(section: BaseModel, prefix: str) -> tuple[Rows, Rows, list[Block]]
         unit, scale, places = _shown(key, field)
         parts = value.values() if isinstance(value, Mapping) else value if isinstance(value, list) else ()
         first = next(iter(parts), None)
-        if isinstance(value, BaseModel):
+        if _is_part(value):
             inner = _gathered(value, f"{label} ")
             scalars += [*inner[0], *_unlabelled(value, sigmas, f"{label} ")]
             vectors += inner[1]
             later += inner[2]
-        elif isinstance(first, BaseModel):
+        elif _is_part(first):
             later.append(listed(label, value))
         elif isinstance(value, Mapping):
             for name, one in value.items():
@@ -283,7 +287,7 @@ def listed(label: str, parts: Mapping[str, Any] | Sequence[Any]) -> Table:
         key
         for one in named.values()
         for key, _, value in _labelled(one)
-        if not isinstance(value, BaseModel | Mapping)
+        if not (_is_part(value) or isinstance(value, Mapping))
     }
     columns: dict[str, FieldInfo] = {}
     for one in named.values():

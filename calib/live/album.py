@@ -12,9 +12,11 @@ import yaml
 
 from calib.core.errors import BadInputError
 from calib.core.files import shown
+from calib.core.options import options_of
 from calib.core.stage import Files
 from calib.core.writing import RIG_FILE, Kind, begins, make_folder, move, write_atomically
 from calib.io.pictures import holds_pictures, list_pictures
+from calib.stages import stage
 from calib.stages.camera.model import View
 from calib.stages.camera.read import BOARD_FILE, BoardFile, Told, read_board_file, read_views
 
@@ -179,9 +181,7 @@ class Album:
         return camera
 
     def _carried_out(self, verb: str, pictures: Path) -> Any:
-        from calib.core.options import options_of
         from calib.runner.work import carry_out
-        from calib.stages import stage
 
         made = stage(verb)
         files = Files((pictures,), self.rig, figures=False, keep=False)

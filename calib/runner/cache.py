@@ -14,10 +14,12 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from pydantic import TypeAdapter
+
 from calib.core import __version__
 from calib.core.errors import BadInputError
 from calib.core.files import file_sha256, sha256, shown
-from calib.core.words import BLOCKS, Block
+from calib.core.words import Block
 from calib.core.writing import check_folder, make_folder, settle, sweep, try_lock, write_atomically
 
 # ----------------------------------------------------------------------
@@ -119,6 +121,8 @@ def _tell(descriptor: int, text: str) -> None:
 # and the sections of the rig's file that the stage saw.
 
 _RESULT = "result.json"
+BLOCKS = TypeAdapter(list[Block])
+"""What a verb says in words, as JSON there and back."""
 _MOST_BYTES = 50_000_000
 
 

@@ -21,8 +21,8 @@ from calib.core.files import one_line, shown
 from calib.core.options import options_of
 from calib.core.rig import SECTIONS, Rig
 from calib.core.stage import Files, Stage
-from calib.core.words import BLOCKS
 from calib.core.writing import check_figures, check_folder, check_writable, write_atomically
+from calib.runner.cache import BLOCKS
 from calib.stages import stage
 
 DOCUMENT, WORDS, MESSAGES = "document.json", "words.json", "messages.txt"

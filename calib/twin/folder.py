@@ -23,15 +23,7 @@ from calib.core.errors import BadInputError
 from calib.core.files import shown
 from calib.core.writing import write_atomically
 from calib.io.logs import log_text
-from calib.twin.pictures import (
-    BOARD,
-    PLANE,
-    Plane,
-    Shot,
-    plane_shot,
-    shots,
-    write_pictures,
-)
+from calib.twin.pictures import BOARD, PLANE, Plane, Shot, plane_shot, shots, write_pictures
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.scene import PrintedBoard, corner_pixels

@@ -10,12 +10,7 @@ import numpy as np
 from calib.core.arrays import BoolArray, FloatArray
 from calib.core.compilation import kernel
 from calib.stages.actuator.dynamics import Coefficients
-from calib.stages.actuator.kinematics import (
-    chord_decay_w,
-    chord_ratio_w,
-    forward,
-    marker_from_head,
-)
+from calib.stages.actuator.kinematics import chord_decay_w, chord_ratio_w, forward, marker_from_head
 from calib.stages.actuator.simulate import derivative
 from calib.stages.camera.model import Camera, project
 from calib.twin.section import Imu, Tracker

@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -292,7 +293,8 @@ def _settled() -> dict[str, Figure]:
         SettledRuns(value=24.0, spread=0.2, pwm=[240.0, 240.0], files=["c"]),
     )
     maps = (fit_static_map("settled.csv", pwm, value),)
-    return pump_plots(PumpFound("kPa", (), {}, {}, {}, {}, maps, groups, (), (), ()), "ok")
+    found = PumpFound("kPa", (), {}, {}, {}, {}, maps, groups, (), (), ())
+    return pump_plots(SimpleNamespace(evidence=found, verdict=Verdict()))
 
 
 CASES: dict[str, Callable[[Path], dict[str, Figure]]] = {

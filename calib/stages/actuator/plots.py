@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -24,9 +23,11 @@ from calib.core.plot import (
     number,
     short,
 )
-from calib.stages.actuator.identify import PARAMETERS, StiffnessFit
+from calib.stages.actuator.identify import PARAMETERS
 from calib.stages.actuator.identify_pump import LAG, ORIFICE, PumpFound, simulate_pump
 from calib.stages.actuator.results import Identified, simulated_heads
+from calib.stages.actuator.section import Actuator, PumpSection
+from calib.stages.actuator.stage import Springs, Validated
 from calib.stages.actuator.validate import IMPROVED, NOMINAL, ORIGINAL, QUANTITIES, Comparison
 
 _HUES = ("blue", "green", "orange", "grey")
@@ -42,8 +43,13 @@ _PROSPECTS = (
 )  # fmt: skip
 
 
-def plots(result: Identified) -> dict[str, Figure]:
-    """`identify_motion`, `_residuals`, `_parameters` and, where a log is a free swing, `_damping`."""
+def plots(outcome: tuple[Actuator, PumpSection | None] | Actuator | PumpSection) -> dict[str, Figure]:
+    """`identify_motion`, `_residuals`, `_parameters` and, where a log is a free swing, `_damping`.
+
+    Each section of an identification has them all.
+    """
+    one = outcome[0] if isinstance(outcome, tuple) else outcome
+    result: Identified = one.evidence
     figures = {
         "identify_motion": _motion(result),
         "identify_residuals": _residuals(result),
@@ -145,17 +151,17 @@ def _damping(result: Identified) -> Figure:
     return Figure("Damping by peaks", note, whole, 2.1 * len(whole))
 
 
-def stiffness_plots(
-    elongation_m: FloatArray, force_N: FloatArray, fits: Sequence[StiffnessFit], best: int
-) -> dict[str, Figure]:
+def stiffness_plots(section: Actuator) -> dict[str, Figure]:
     """`identify_stiffness`: force (Fig. 3.9) and stiffness (Fig. 3.10) over elongation."""
+    found: Springs = section.evidence
+    elongation_m, force_N = found.elongation_m, found.force_N
     x = np.linspace(0.0, 1.05 * float(np.max(np.abs(elongation_m))), 200)[1:]
     some = np.abs(elongation_m) > 1e-9
     eps, stiffness = 1e3 * elongation_m, force_N[some] / elongation_m[some]
     left: list[Mark] = [Curve(eps, force_N, "measured", "points", "ink")]
     right: list[Mark] = [Curve(eps[some], stiffness, "measured", "points", "ink")]
-    for k, (fit, hue) in enumerate(zip(fits, ("orange", "blue", "green"), strict=False)):
-        name, size = f"order {fit.order}", 2.0 if k == best else 0.9
+    for k, (fit, hue) in enumerate(zip(found.fits, ("orange", "blue", "green"), strict=False)):
+        name, size = f"order {fit.order}", 2.0 if k == found.used else 0.9
         left.append(Curve(1e3 * x, fit.force_N(x), name, "line", hue, size))
         right.append(Curve(1e3 * x, fit.force_N(x) / x, name, "line", hue, size))
     panels = tuple(
@@ -172,15 +178,16 @@ _MODELS = {LAG: "orange", ORIFICE: "blue"}
 _MOST_RUNS = 12
 
 
-def pump_plots(result: PumpFound, verdict: str) -> dict[str, Figure]:
+def pump_plots(section: PumpSection) -> dict[str, Figure]:
     """`pump_runs` and `pump_residuals` of recordings, and `pump_static`."""
+    result: PumpFound = section.evidence
     figures = {}
     if result.records:
         figures["pump_runs"] = _runs(result)
         figures["pump_residuals"] = _left_over(result)
     if result.maps or result.groups:
         figures["pump_static"] = _static(result)
-    return judged(figures, verdict)
+    return judged(figures, section.verdict.word)
 
 
 def _runs(result: PumpFound) -> Figure:
@@ -258,8 +265,9 @@ _SCALES = {
 }
 
 
-def validate_plots(compared: Sequence[Comparison]) -> dict[str, Figure]:
+def validate_plots(outcome: Validated) -> dict[str, Figure]:
     """`validate_model`, or `validate_model_1`, ... of several logs."""
+    compared = outcome.compared
     several = len(compared) > 1
     return {
         f"validate_model_{k}" if several else "validate_model": _validation(one)

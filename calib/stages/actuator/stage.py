@@ -8,16 +8,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from calib.core.errors import BadInputError, UsageError
+from calib.core.files import shown
 from calib.core.options import PoseOptions, option
-from calib.core.stage import Files, Stage
+from calib.core.stage import Files, Stage, later
 from calib.core.verdict import Verdict
+from calib.core.words import BLANK, Block, Line, Table
+from calib.stages import expanded
 
 if TYPE_CHECKING:
     from calib.core.arrays import FloatArray
-    from calib.core.plot import Figure
     from calib.core.rig import Rig
     from calib.core.stage import Progress
-    from calib.core.words import Block, Table
     from calib.stages.actuator.identify import Start, StiffnessFit, Track
     from calib.stages.actuator.identify_pump import PumpFound, PumpTable
     from calib.stages.actuator.machine import Machine
@@ -42,7 +43,6 @@ class LogsOptions(PoseOptions):
 
 def _with_states(files: Files, options: PoseOptions) -> list[tuple[Path, Path | None]]:
     """Logs with their states. Raises `UsageError` where these are not one for each, or not to be used."""
-    from calib.stages import expanded
 
     states = expanded(options.states)
     if not states:
@@ -95,24 +95,17 @@ def _solve(inputs: LogsInputs) -> Sections:
     return sections_from(found, inputs.rig)
 
 
-def _evidence(outcome: Sections | Actuator | PumpSection) -> Identified:
-    one = outcome[0] if isinstance(outcome, tuple) else outcome
-    found: Identified = one.evidence
-    return found
-
-
 def _document(sections: Sections) -> dict[str, Any]:
     from calib.stages.actuator.results import identified_json
 
-    return {"identify": identified_json(_evidence(sections))}
+    return {"identify": identified_json(sections[0].evidence)}
 
 
 def _words(sections: Sections) -> list[Block]:
     """What the logs tell of each parameter, how the parameters hang together, and how well each log fits."""
-    from calib.core.words import BLANK, Line, Table
     from calib.stages.actuator.identify import PARAMETERS
 
-    found = _evidence(sections)
+    found: Identified = sections[0].evidence
     solution, known = found.solution, found.uncertainty
     rows = [
         (
@@ -166,13 +159,6 @@ def _words(sections: Sections) -> list[Block]:
     return blocks
 
 
-def _plots(outcome: Sections | Actuator | PumpSection) -> dict[str, Figure]:
-    """Figures of an identification; each of its sections has them all."""
-    from calib.stages.actuator.plots import plots
-
-    return plots(_evidence(outcome))
-
-
 logs = Stage(
     "identify logs",
     "Model of the actuator",
@@ -200,12 +186,11 @@ logs = Stage(
     ),
     document=_document,
     words=_words,
-    plots=_plots,
+    plots=later("calib.stages.actuator.plots", "plots"),
 )
 
 
 def _cell(value: float | None, form: str = ".3g") -> str:
-    from calib.core.words import BLANK
 
     return BLANK if value is None or value != value else f"{value:{form}}"
 
@@ -236,7 +221,6 @@ class PumpInputs:
 
 
 def _read_pump(files: Files, rig: Rig, options: PumpOptions) -> PumpInputs:
-    from calib.stages import expanded
     from calib.stages.actuator.read import read_pump_table
 
     columns = (options.time, options.pwm, options.value, options.unit)
@@ -266,7 +250,6 @@ def _pump_document(section: PumpSection) -> dict[str, Any]:
 
 def _pump_words(section: PumpSection) -> list[Block]:
     """Parameters, errors on tables that were not fitted, and static maps."""
-    from calib.core.words import Line, Table
     from calib.stages.actuator.identify_pump import parameter_rows
 
     found: PumpFound = section.evidence
@@ -318,12 +301,6 @@ def _pump_words(section: PumpSection) -> list[Block]:
     return blocks
 
 
-def _pump_plots(section: PumpSection) -> dict[str, Figure]:
-    from calib.stages.actuator.plots import pump_plots
-
-    return pump_plots(section.evidence, section.verdict.word)
-
-
 pump = Stage(
     "identify pump",
     "Pump",
@@ -340,7 +317,7 @@ pump = Stage(
     uses=("known", "pump"),
     document=_pump_document,
     words=_pump_words,
-    plots=_pump_plots,
+    plots=later("calib.stages.actuator.plots", "pump_plots"),
 )
 
 
@@ -372,7 +349,6 @@ class Springs:
 
 
 def _read_stiffness(files: Files, rig: Rig, options: StiffnessOptions) -> Springs:
-    from calib.core.files import shown
     from calib.stages.actuator.read import read_displacements
 
     (path,) = files.paths
@@ -410,7 +386,6 @@ def _stiffness_document(section: Actuator) -> dict[str, Any]:
 
 
 def _stiffness_words(section: Actuator) -> list[Block]:
-    from calib.core.words import BLANK, Table
 
     found: Springs = section.evidence
     rows = []
@@ -422,13 +397,6 @@ def _stiffness_words(section: Actuator) -> list[Block]:
         rows.append((f"order {fit.order}{used}", *terms, f"{fit.left_out_rms_N:.3g}"))
     head = (f"of the {found.per}", "k0, N/m", "k1, N/m²", "k2, N/m³", "left out, N")
     return [Table(head, tuple(rows))]
-
-
-def _stiffness_plots(section: Actuator) -> dict[str, Figure]:
-    from calib.stages.actuator.plots import stiffness_plots
-
-    found: Springs = section.evidence
-    return stiffness_plots(found.elongation_m, found.force_N, list(found.fits), found.used)
 
 
 stiffness = Stage(
@@ -448,7 +416,7 @@ stiffness = Stage(
     uses=("actuator",),
     document=_stiffness_document,
     words=_stiffness_words,
-    plots=_stiffness_plots,
+    plots=later("calib.stages.actuator.plots", "stiffness_plots"),
 )
 
 
@@ -488,7 +456,6 @@ class Validated:
 
 
 def _read_validate(files: Files, rig: Rig, options: ValidateOptions) -> ValidateInputs:
-    from calib.core.files import shown
     from calib.io.columns import is_arm_log
     from calib.io.logs import columns_of
     from calib.stages.actuator.validate import IMPROVED, begun_track, models_of
@@ -563,7 +530,6 @@ def _log_json(one: Comparison) -> dict[str, Any]:
 
 
 def _validate_words(outcome: Validated) -> list[Block]:
-    from calib.core.words import Line, Table
 
     if outcome.held is not None:
         from calib.stages.arm.identify import QUANTITIES
@@ -592,7 +558,6 @@ def _validate_words(outcome: Validated) -> list[Block]:
 
 
 def _errors(one: Comparison) -> Table:
-    from calib.core.words import Table
     from calib.stages.actuator.validate import ORIGINAL, QUANTITIES
 
     rows = []
@@ -604,12 +569,6 @@ def _errors(one: Comparison) -> Table:
             cells = (_cell(scale * error.norm), _cell(scale * error.rms), _cell(error.fit_percent, ".1f"))
             rows.append((f"{quantity}, {unit}, {model}", *cells, _cell(gained, ".1f")))
     return Table(("error of", "L2 norm", "RMS", "fit, %", "smaller by, %"), tuple(rows))
-
-
-def _validate_plots(outcome: Validated) -> dict[str, Figure]:
-    from calib.stages.actuator.plots import validate_plots
-
-    return validate_plots(outcome.compared)
 
 
 validate = Stage(
@@ -630,5 +589,5 @@ validate = Stage(
     uses=(*logs.uses, "arm"),
     document=_validate_document,
     words=_validate_words,
-    plots=_validate_plots,
+    plots=later("calib.stages.actuator.plots", "validate_plots"),
 )

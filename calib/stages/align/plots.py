@@ -9,6 +9,7 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.core.plot import SIGMA, Band, Curve, Figure, Mark, Plot, Rule, every, judged, short
 from calib.core.words import number as with_sigma
+from calib.stages.align.section import Align
 from calib.stages.align.solve import Alignment, Trace
 from calib.stages.estimator.sensors import SENSOR
 
@@ -20,12 +21,13 @@ _ROWS = (
 )
 
 
-def plots(fit: Alignment, verdict: str = "ok") -> dict[str, Figure]:
+def plots(section: Align) -> dict[str, Figure]:
     """`align_correlation` and, for each log, `align_residuals_1`, ..."""
+    fit: Alignment = section.evidence
     figures = {"align_correlation": _correlation(fit)}
     for k in range(len(fit.logs)):
         figures[f"align_residuals_{k + 1}"] = _residuals(fit, k)
-    return judged(figures, verdict)
+    return judged(figures, section.verdict.word)
 
 
 def _residuals(fit: Alignment, log: int) -> Figure:

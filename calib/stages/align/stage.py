@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 from calib.core.errors import BadInputError
 from calib.core.options import LogOptions, option
-from calib.core.stage import Files, Stage
+from calib.core.stage import Files, Stage, later
 from calib.core.units import parse_length_m
+from calib.core.verdict import Verdict
 
 if TYPE_CHECKING:
-    from calib.core.plot import Figure
     from calib.core.rig import Geometry, Rig
     from calib.stages.align.section import Align
     from calib.stages.align.solve import AlignLog, Settings
@@ -66,7 +66,6 @@ def _solve(inputs: AlignInputs) -> Align:
     import numpy as np
 
     from calib.core.result import CovarianceTable, finite_or_none, judged
-    from calib.core.verdict import Verdict
     from calib.stages.align.section import SENSORS_OF, Align
     from calib.stages.align.solve import align as fit
     from calib.stages.align.solve import judge, with_drawn_marker
@@ -99,12 +98,6 @@ def _solve(inputs: AlignInputs) -> Align:
     ).with_evidence(found)
 
 
-def _plots(result: Align) -> dict[str, Figure]:
-    from calib.stages.align.plots import plots
-
-    return plots(result.evidence, result.verdict.word)
-
-
 align = Stage(
     "align",
     "Camera and IMU together",
@@ -121,5 +114,5 @@ align = Stage(
     writes=("align",),
     needs=("camera", "plane"),
     uses=("geometry", "imu", "imu_intrinsics"),
-    plots=_plots,
+    plots=later("calib.stages.align.plots", "plots"),
 )

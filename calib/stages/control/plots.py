@@ -26,9 +26,9 @@ from calib.stages.actuator.kinematics import angle, forward, length
 from calib.stages.control.laws import Model, holding_force, largest_force_N
 from calib.stages.control.references import Reference
 from calib.stages.control.section import Controller
+from calib.stages.control.stage import Checked, ControllerEvidence, Runs
 from calib.stages.control.trial import Outcome
 from calib.stages.control.tuning import (
-    Following,
     System,
     Tuned,
     break_at,
@@ -43,11 +43,11 @@ from calib.stages.control.tuning import (
 _HUES = ("blue", "orange", "green", "red", "purple", "sky")
 
 
-def run_plots(model: Model, reference: Reference, outcomes: Sequence[Outcome]) -> dict[str, Figure]:
+def run_plots(runs: Runs) -> dict[str, Figure]:
     """`control_run`: at most the last six runs of controllers."""
-    shown = list(outcomes)[-len(_HUES) :]
+    reference, shown = runs.reference, list(runs.outcomes)[-len(_HUES) :]
     angles = reference.kind == "angle"
-    return {"control_run": _angles(model, reference, shown) if angles else _lengths(reference, shown)}
+    return {"control_run": _angles(runs.model, reference, shown) if angles else _lengths(reference, shown)}
 
 
 def _over_time(y: str, marks: Sequence[Mark], title: str, limits: Limits | None = None) -> Plot:
@@ -104,8 +104,9 @@ def _lengths(reference: Reference, outcomes: Sequence[Outcome]) -> Figure:
     return Figure(title, note, panels, 8.6, mosaic=("AA", "BC", "DE"), heights=(1.3, 1.0, 0.9))
 
 
-def tune_plots(model: Model, section: Controller, orientation: Tuned, position: Tuned) -> dict[str, Figure]:
+def tune_plots(section: Controller) -> dict[str, Figure]:
     """`control_margins`: the tuned loops at their operating points."""
+    fit: ControllerEvidence = section.evidence
     turn, move, wanted = section.orientation, section.position, section.criterion
     note = (
         f"Every rest keeps a gain margin of {wanted.gain_margin:g} and a phase margin of "
@@ -114,8 +115,8 @@ def tune_plots(model: Model, section: Controller, orientation: Tuned, position: 
         f"{move.Kp_pwm_per_m:g} / {move.Kd_pwm_s_per_m:g}. Grey circles are 1 / Ms away from -1."
     )
     loops = (
-        _loop(model, "angle", orientation_loop, orientation, wanted.sensitivity),
-        _loop(model, "lengths", position_loop, position, wanted.sensitivity),
+        _loop(fit.model, "angle", orientation_loop, fit.orientation, wanted.sensitivity),
+        _loop(fit.model, "lengths", position_loop, fit.position, wanted.sensitivity),
     )
     panels = tuple(panel for row in zip(*loops, strict=True) for panel in row)
     title = "Open loops on the model: gain, phase and distance from -1"
@@ -147,10 +148,9 @@ def _loop(
     return replace(gains, legend="lower left", legend_title=legend), phases, around
 
 
-def check_plots(
-    model: Model, reference: Reference, following: Following, slower: Reference | None = None
-) -> dict[str, Figure]:
+def check_plots(checked: Checked) -> dict[str, Figure]:
     """`control_check`: what the pumps reach, and how far they follow a reference."""
+    model, reference, following, slower = checked.model, checked.reference, checked.follow, checked.slower
     note = "The pumps can follow it."
     if not following.possible:
         note = f"The pumps cannot follow it from {following.at_s:.2f} s on: {following.reason}."

@@ -11,20 +11,19 @@ from typing import TYPE_CHECKING, Any, Literal
 from calib.core.errors import BadInputError, UsageError
 from calib.core.files import one_line
 from calib.core.options import option
-from calib.core.stage import Files, Output, Stage
+from calib.core.stage import Files, Output, Stage, later
 from calib.core.units import parse_angle_rad, parse_duration_s, parse_pwm_limits
 from calib.core.verdict import Finding, Verdict
+from calib.core.words import BLANK, Block, Line, Table, of_verdict
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from calib.core.arrays import FloatArray
-    from calib.core.plot import Figure
     from calib.core.rig import Rig
     from calib.core.stage import Progress
-    from calib.core.words import Block
     from calib.core.writing import Kind
-    from calib.stages.control.laws import Model, Pid
+    from calib.stages.control.laws import Model
     from calib.stages.control.references import Reference
     from calib.stages.control.section import (
         AntiWindup,
@@ -191,7 +190,6 @@ def _run_document(runs: Runs) -> dict[str, Any]:
 
 
 def _run_words(runs: Runs) -> list[Block]:
-    from calib.core.words import BLANK, Line, Table
 
     def cell(value: float | None, digits: int) -> str:
         return BLANK if value is None or math.isnan(value) else f"{value:.{digits}f}"
@@ -219,12 +217,6 @@ def _run_words(runs: Runs) -> list[Block]:
     return [Line(first), table, *(Line(text) for text in runs.verdict.remarks)]
 
 
-def _run_plots(runs: Runs) -> dict[str, Figure]:
-    from calib.stages.control.plots import run_plots
-
-    return run_plots(runs.model, runs.reference, runs.outcomes)
-
-
 run = Stage(
     "control run",
     "Controllers tried",
@@ -242,7 +234,7 @@ run = Stage(
     uses=("camera", "plane", "actuator", "pump", "controller", "twin"),
     document=_run_document,
     words=_run_words,
-    plots=_run_plots,
+    plots=later("calib.stages.control.plots", "run_plots"),
 )
 
 
@@ -337,7 +329,6 @@ def _check_document(checked: Checked) -> dict[str, Any]:
 
 
 def _check_words(checked: Checked) -> list[Block]:
-    from calib.core.words import Line, of_verdict
     from calib.stages.control.tuning import largest_angle, longest_m
 
     found, reference = checked.follow, checked.reference
@@ -357,12 +348,6 @@ def _check_words(checked: Checked) -> list[Block]:
         ),
         *of_verdict(checked.verdict),
     ]
-
-
-def _check_plots(checked: Checked) -> dict[str, Figure]:
-    from calib.stages.control.plots import check_plots
-
-    return check_plots(checked.model, checked.reference, checked.follow, checked.slower)
 
 
 def _reference_kind() -> Kind:
@@ -403,7 +388,7 @@ check = Stage(
     ),
     document=_check_document,
     words=_check_words,
-    plots=_check_plots,
+    plots=later("calib.stages.control.plots", "check_plots"),
 )
 
 
@@ -438,17 +423,11 @@ class TuneInputs:
 
 @dataclass(frozen=True)
 class ControllerEvidence:
-    """What gains were chosen from.
-
-    Attributes
-    ----------
-    source : margins that the source's gains have at the same points, by their names.
-    """
+    """What gains were chosen from."""
 
     model: Model
     orientation: Tuned
     position: Tuned
-    source: dict[str, list[ControllerMargins]]
 
 
 def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
@@ -529,7 +508,7 @@ def _solve_tune(inputs: TuneInputs) -> Controller:
         margins=[*_margins("orientation", orientation.points), *_margins("position", position.points)],
         anti_windup=anti_windup,
         **judged(_judge(anti_windup["clamping"], anti_windup["back_calculation"], model.tick_s)),
-    ).with_evidence(ControllerEvidence(model, orientation, position, _source(model, orientation, position)))
+    ).with_evidence(ControllerEvidence(model, orientation, position))
 
 
 def _judge(clamped: AntiWindup, back: AntiWindup, tick_s: float) -> Verdict:
@@ -565,24 +544,6 @@ def _margins(loop: Literal["orientation", "position"], points: Sequence[Point]) 
     ]
 
 
-def _source(model: Model, orientation: Tuned, position: Tuned) -> dict[str, list[ControllerMargins]]:
-    """Margins that the source's gains have at the same points."""
-    from calib.stages.control.laws import Pid
-    from calib.stages.control.tuning import orientation_loop, points_of, position_loop
-
-    h = model.tick_s
-    turn, slow, fast = (
-        Pid(*gains, tick_s=h) for gains in ((1e3, 1e3, 10.0), (1.5e4, 0.0, 150.0), (1e4, 0.0, 1e3))
-    )
-    bent, straight = ([point.q_m for point in tuned.points] for tuned in (orientation, position))
-
-    def both(pid: Pid) -> list[ControllerMargins]:
-        return _margins("position", points_of(partial(position_loop, model, pid), straight))
-
-    angle = _margins("orientation", points_of(partial(orientation_loop, model, turn), bent))
-    return {"PID 1000/1000/10": angle, "PD 15000/150": both(slow), "PD 10000/1000": both(fast)}
-
-
 _MAP_ROWS = 41
 
 
@@ -608,26 +569,6 @@ def _static_map(model: Model) -> StaticMap:
     )
 
 
-def _tune_document(section: Controller) -> dict[str, Any]:
-    from calib.core.result import section_json
-
-    source = section.evidence.source
-    return {"source_margins": {name: [section_json(row) for row in rows] for name, rows in source.items()}}
-
-
-def _tune_words(section: Controller) -> list[Block]:
-    from calib.core.words import listed
-
-    return [listed(f"margins of the source's {name}", rows) for name, rows in section.evidence.source.items()]
-
-
-def _tune_plots(section: Controller) -> dict[str, Figure]:
-    from calib.stages.control.plots import tune_plots
-
-    fit: ControllerEvidence = section.evidence
-    return tune_plots(fit.model, section, fit.orientation, fit.position)
-
-
 tune = Stage(
     "control tune",
     "Controllers",
@@ -640,7 +581,5 @@ tune = Stage(
     TuneOptions,
     writes=("controller",),
     uses=("camera", "plane", "actuator", "pump", "twin"),
-    document=_tune_document,
-    words=_tune_words,
-    plots=_tune_plots,
+    plots=later("calib.stages.control.plots", "tune_plots"),
 )

@@ -7,14 +7,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from calib.core.errors import BadInputError
+from calib.core.files import shown
 from calib.core.options import option
 from calib.core.stage import Files, Output, Stage
+from calib.core.words import Block, Line, Table, of_verdict
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from calib.core.rig import Rig
-    from calib.core.words import Block
     from calib.io.serial import Frame
     from calib.stages.firmware.check import Check
     from calib.stages.firmware.header import Header
@@ -40,7 +41,6 @@ class FirmwareInputs:
 
 
 def _read(files: Files, rig: Rig, options: FirmwareOptions) -> FirmwareInputs:
-    from calib.core.files import shown
 
     source = shown(files.rig_path)
     if options.check is None:
@@ -62,7 +62,6 @@ def _solve(inputs: FirmwareInputs) -> Header | Check:
 
 
 def _write(files: Files, outcome: Header | Check) -> list[Path]:
-    from calib.core.files import shown
     from calib.stages.firmware.header import Header
 
     if files.output is None or not isinstance(outcome, Header):
@@ -99,7 +98,6 @@ def _document(outcome: Header | Check) -> dict[str, Any]:
 
 
 def _words(outcome: Header | Check) -> list[Block]:
-    from calib.core.words import Line, Table, of_verdict
     from calib.stages.firmware.header import Header
     from calib.stages.firmware.vectors import TOLERANCE
 

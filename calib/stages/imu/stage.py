@@ -8,21 +8,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from calib.core.errors import BadInputError, UsageError
+from calib.core.files import shown
 from calib.core.options import LogOptions, option
 from calib.core.stage import Files, Output, Stage, later
+from calib.core.words import Block, Line, described, listed
+from calib.core.writing import Kind, write_atomically
 
 if TYPE_CHECKING:
     from calib.core.rig import Rig
-    from calib.core.words import Block
-    from calib.core.writing import Kind
     from calib.stages.imu.drift import DriftInputs
     from calib.stages.imu.intrinsics import IntrinsicsInputs
     from calib.stages.imu.sampling import Readings
-    from calib.stages.imu.section import (
-        Drift,
-        Imu,
-        OrientationFilter,
-    )
+    from calib.stages.imu.section import Drift, Imu, OrientationFilter
     from calib.stages.imu.tuning import AngleFilter, TuneInputs, TuneLog
 
 _SAME_RATE = 0.02
@@ -49,7 +46,6 @@ def _imu_yaml() -> Kind:
 
 
 def _write_kalibr(files: Files, imu: Imu) -> list[Path]:
-    from calib.core.writing import write_atomically
     from calib.stages.imu.formats import IMU_YAML, to_kalibr
 
     assert files.output is not None
@@ -58,7 +54,6 @@ def _write_kalibr(files: Files, imu: Imu) -> list[Path]:
 
 
 def _static_words(imu: Imu) -> list[Block]:
-    from calib.core.words import Line
 
     del imu
     return [
@@ -166,7 +161,6 @@ class TuneOptions(LogOptions):
 
 def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
 
-    from calib.core.files import shown
     from calib.core.result import identity
     from calib.io.logs import read_log
     from calib.stages.imu.read import Reading, sensor_noise, tune_log
@@ -199,7 +193,6 @@ def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
 
 
 def _tune_words(section: OrientationFilter) -> list[Block]:
-    from calib.core.words import Line
 
     del section
     return [
@@ -272,7 +265,6 @@ def _drift_document(result: Drift) -> dict[str, Any]:
 
 def _drift_words(result: Drift) -> list[Block]:
     """A table of the methods for each log, then the slopes over all."""
-    from calib.core.words import Line, described, listed
 
     blocks: list[Block] = []
     for log in result.logs:

@@ -12,13 +12,13 @@ from calib.core.options import LogOptions, option
 from calib.core.stage import Files, Stage, later
 from calib.core.units import parse_frequency_hz, parse_jitter
 from calib.core.verdict import Finding, Verdict
+from calib.core.words import Block, Table
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from calib.core.arrays import FloatArray
     from calib.core.rig import Rig
-    from calib.core.words import Block
     from calib.io.logs import Log
     from calib.stages.lowpass.filters import Filter, Positions, Suggestion
     from calib.stages.lowpass.section import Family, LowPass, LowPassLog
@@ -339,7 +339,6 @@ def _of_log(made: Filter, positions: Positions | None) -> Iterator[Finding]:
 
 def _words(result: LowPass) -> list[Block]:
     """The filters that a log leaves to choose from."""
-    from calib.core.words import Table
 
     evidence: Evidence = result.evidence
     choice = evidence.choice
