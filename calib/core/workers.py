@@ -315,15 +315,14 @@ class Workers(Generic[Shared]):
     ----------
     shared : what all calls have in common; forked workers see it as it is when they start.
     items : how many items there are about to be.
-    large : whether results are large; then threads do the work, which need not send them.
 
     `work` has to be a function of a module, and items and results have to be picklable. OpenCV's own
     threads are off meanwhile: they would only get in the way.
     """
 
-    def __init__(self, shared: Shared, items: int, large: bool = False) -> None:
+    def __init__(self, shared: Shared, items: int) -> None:
         self._shared = shared
-        self._forks = not large and _may_fork(items)
+        self._forks = _may_fork(items)
         self._count = max(1, min(items, processors()))
         self._pool = Pool(self._count, begin=partial(_inherit, shared), forked=True)
         self._rounds = 0

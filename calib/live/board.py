@@ -18,16 +18,17 @@ from pathlib import Path
 from typing import Any
 
 from calib.core.errors import BadInputError
+from calib.io.experiments import EXPERIMENTS
 from calib.live.album import Album
 
 PROGRAMME = {
-    "static": ("60s", "Nothing moves, and nothing touches the rig."),
-    "swing": ("5s", "Take the hoses off, pull the head aside by 20 to 30 degrees, start, and let go."),
-    "ellipse": ("20s", "Slow motion to large angles both ways."),
-    "steps": ("20s", "Commands in steps, and the hoses on."),
-    "deflate": ("20s", "Commands up, then off, and the hoses on."),
+    "static": "Nothing moves, and nothing touches the rig.",
+    "swing": "Take the hoses off, pull the head aside by 20 to 30 degrees, start, and let go.",
+    "ellipse": "Slow motion to large angles both ways.",
+    "steps": "Commands in steps, and the hoses on.",
+    "deflate": "Commands up, then off, and the hoses on.",
 }
-"""Names of recordings, how long they take, and what is to be done."""
+"""What is to be done for each recording; how long it takes is in `calib.io.experiments`."""
 SERIES = {
     "marker (px)": ("u_px", "v_px"),
     "angle (rad)": ("board_phi_rad",),
@@ -71,7 +72,15 @@ class Board:
             self.path, self.last = self.album.new_log(name), ""
             self._heads, self._read = [], 0
             self._rows.clear()
-        words = ["record", self.port, "-o", str(self.path), "--duration", PROGRAMME[name][0], "--json"]
+        words = [
+            "record",
+            self.port,
+            "-o",
+            str(self.path),
+            "--duration",
+            f"{EXPERIMENTS[name].seconds:g}s",
+            "--json",
+        ]
         self._process = subprocess.Popen(
             [sys.executable, "-m", "calib", *words],
             stdin=subprocess.DEVNULL,
@@ -153,7 +162,9 @@ class Board:
         ]
         return {
             "port": self.port,
-            "programme": [[name, *what] for name, what in PROGRAMME.items()],
+            "programme": [
+                [name, f"{EXPERIMENTS[name].seconds:g}s", what] for name, what in PROGRAMME.items()
+            ],
             "recording": self.path.name if self.path is not None and self.at_work else None,
             "seconds": None if end is None else round(end, 1),
             "last": self.last,

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import csv
 import heapq
-import io
 import ipaddress
 import math
 import os
@@ -27,7 +25,7 @@ from pydantic import AfterValidator, ConfigDict
 from calib.core.arrays import FloatArray
 from calib.core.constants import constants
 from calib.core.errors import EXIT_DONE, EXIT_INTERNAL, EXIT_POOR, BadInputError, CalibError, end_of
-from calib.core.files import PICTURES, one_line, read_text, read_yaml_mapping, sha256, shown
+from calib.core.files import PICTURES, one_line, read_yaml_mapping, sha256, shown
 from calib.core.options import name_of_flag, options_of
 from calib.core.plot import every
 from calib.core.result import Section
@@ -36,6 +34,7 @@ from calib.core.schema import validated
 from calib.core.units import unit_of
 from calib.core.workers import Processes, Task
 from calib.core.writing import make_folder
+from calib.io.tables import read_cells
 from calib.runner.cache import key_of, program
 from calib.runner.folder import Folder, folder_digests, read_folder
 from calib.runner.graph import STEPS, Runner, opened_run
@@ -70,7 +69,6 @@ from calib.stages import stage
 
 _SIGNS = frozenset(" -_.+#=@()")
 _LONGEST = 80
-_MOST_BYTES = 200_000_000
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
 
 
@@ -213,37 +211,18 @@ def twice_told(rigs: Iterable[RigSpec]) -> tuple[str, ...]:
 
 
 def _from_csv(path: Path) -> tuple[Iterator[tuple[str, Mapping[str, Any]]], tuple[str, ...]]:
-    text = read_text(path, _MOST_BYTES)
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-    try:
-        head = [name.strip() for name in next(reader, [])]
-    except csv.Error as error:
-        raise BadInputError(f"{shown(path)}, line 1: is not CSV: {error}") from error
-    if not any(head):
-        raise BadInputError(f"{shown(path)}: is empty, expected a header with name and path")
+    cells = read_cells(path, comments=False)
+    head = cells.header
     for name in ("name", "path"):
         if name not in head:
             found = one_line(", ".join(head))[:80]
-            raise BadInputError(f"{shown(path)}, line 1: has no column {name}, found {found}")
+            raise BadInputError(f"{shown(path)}: has no column {name}, found {found}")
     twice = next((name for name in head if name and head.count(name) > 1), None)
     if twice is not None:
-        raise BadInputError(f"{shown(path)}, line 1: has the column {one_line(twice)!r} twice")
-
-    def rows() -> Iterator[tuple[str, Mapping[str, Any]]]:
-        try:
-            for cells in reader:
-                if not any(cell.strip() for cell in cells):
-                    continue
-                where = f"line {reader.line_num}"
-                if len(cells) != len(head):
-                    raise BadInputError(
-                        f"{shown(path)}, {where}: has {len(cells)} cells, the header {len(head)}"
-                    )
-                yield where, dict(zip(head, cells, strict=True))
-        except csv.Error as error:
-            raise BadInputError(f"{shown(path)}, line {reader.line_num}: is not CSV: {error}") from error
-
-    return rows(), tuple(one_line(name) for name in head if name and _strange(name))
+        raise BadInputError(f"{shown(path)}: has the column {one_line(twice)!r} twice")
+    rows = zip(cells.lines, cells.rows, strict=True)
+    named = ((f"line {line}", dict(zip(head, row, strict=True))) for line, row in rows)
+    return named, tuple(one_line(name) for name in head if name and _strange(name))
 
 
 def _from_yaml(path: Path) -> tuple[Iterator[tuple[str, Mapping[str, Any]]], tuple[str, ...]]:
@@ -445,27 +424,6 @@ def _copied(system: Any, remote: str, target: Path, most: int, told: str) -> int
 CAMERA_STAGES = ("intrinsics", "extrinsics", "distortion")
 
 
-def rig_folder(root: Path) -> Folder:
-    """What a rig's folder holds; pictures may lie in it directly where there is neither images/ nor logs/.
-
-    Raises `BadInputError` for a folder with nothing to work on.
-    """
-    if (root / "images").is_dir() or (root / "logs").is_dir():
-        return read_folder(root)
-    root = root.absolute()
-    try:
-        found = sorted(path for path in root.iterdir() if path.suffix.lower() in PICTURES and path.is_file())
-    except OSError as error:
-        raise BadInputError(f"{shown(root)}: cannot be listed: {error.strerror or error}") from error
-    pictures = tuple(path for path in found if not path.is_symlink() and not path.name.startswith("."))
-    if not pictures:
-        raise BadInputError(f"{shown(root)}: holds no images/, no logs/ and no pictures")
-    board, rig = root / "board.yaml", root / "rig.yaml"
-    return Folder(
-        root, pictures, board if board.is_file() else None, (), None, (), rig if rig.is_file() else None, ()
-    )
-
-
 def kind_of(folder: Folder) -> str:
     """ "camera" for a folder that holds only pictures, "run" for one with logs."""
     return "run" if folder.logs else "camera"
@@ -542,7 +500,7 @@ def calibrate_rig(spec: RigSpec, options: FleetOptions, known: str = "") -> Answ
 
 def _calibrated(spec: RigSpec, options: FleetOptions, known: str, place: Path) -> Answer:
     root = local_folder(spec.source, place / "fetched", options.attempts, options.most_bytes, options.allowed)
-    folder = rig_folder(root)
+    folder = read_folder(root)
     kind = kind_of(folder)
     inputs = {folder.name_of(path): digest for path, digest in folder_digests(folder).items()}
     chosen = [word for pair in spec.options for word in pair]

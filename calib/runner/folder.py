@@ -103,7 +103,9 @@ def read_folder(root: Path, follow_links: bool = False, options: LogOptions = NO
             return False
         return True
 
-    pictures, board = _pictures(root / "images", taken)
+    # Pictures alone may lie in the folder itself.
+    flat = not any((root / name).is_dir() for name in ("images", "logs"))
+    pictures, board = _pictures(root if flat else root / "images", taken)
     plane, plane_board = _pictures(root / "images" / "plane", taken)
     logs: list[LogFile] = []
     for path in _listed(root / "logs", _LOGS):

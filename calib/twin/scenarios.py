@@ -17,6 +17,7 @@ from calib.core.rig import Rig
 from calib.core.schema import contradiction, validated
 from calib.core.units import parse_duration_s
 from calib.io.logs import Log
+from calib.stages.actuator.identify import decrement
 from calib.stages.actuator.simulate import RigState, rig_at_rest
 from calib.stages.control.laws import Channel, FeedForward, Pid, feed_forward, saturate
 from calib.stages.control.references import Ellipse, PolynomialElongation
@@ -30,53 +31,6 @@ from calib.twin.simulate import simulate as run_loop
 #
 # All take evenly sampled truth. Where a curve crosses a level between two samples the crossing is found
 # on the straight line between them.
-
-
-@dataclass(frozen=True)
-class Swing:
-    """A decaying oscillation.
-
-    Attributes
-    ----------
-    damping_ratio : zeta by (3.39), (3.40) on peak-to-peak amplitudes, mean over the first half periods.
-    frequency_hz : mean over the same.
-    offset_at_s, offset_rad : middle of the oscillation at every extreme but the first and last.
-    """
-
-    damping_ratio: float
-    frequency_hz: float
-    offset_at_s: FloatArray
-    offset_rad: FloatArray
-
-
-def swing_decay(t_s: FloatArray, phi_rad: FloatArray, half_periods: int = 8) -> Swing:
-    """Decay of a swing that is released at the first sample, from its first half periods.
-
-    Peak-to-peak amplitudes do not see an offset that decays slowly; on the raw curve (3.39) yields
-    about 0.004. The offset at an extreme is (a + 2 b + c) / 4 of it and its neighbours.
-
-    Raises `BadInputError` when there are fewer than three extremes.
-    """
-    inner = phi_rad[1:-1]
-    rising, falling = inner > phi_rad[:-2], inner < phi_rad[:-2]
-    turn = np.nonzero((rising & (inner >= phi_rad[2:])) | (falling & (inner <= phi_rad[2:])))[0] + 1
-    if len(turn) < 2:
-        raise BadInputError(f"swing: found {len(turn) + 1} extremes, expected at least 3")
-    # The parabola through three samples has its extreme between them.
-    a, b, c = phi_rad[turn - 1], phi_rad[turn], phi_rad[turn + 1]
-    bend = a - 2.0 * b + c
-    shift = 0.5 * (a - c) / np.where(bend == 0.0, 1.0, bend)
-    at = np.concatenate([[t_s[0]], t_s[turn] + float(t_s[1] - t_s[0]) * shift])
-    value = np.concatenate([[phi_rad[0]], b - 0.25 * (a - c) * shift])
-    used = min(half_periods, len(turn))
-    swings = np.abs(np.diff(value[: used + 1]))
-    delta = 2.0 * float(np.mean(np.log(swings[:-1] / swings[1:])))
-    return Swing(
-        delta / math.hypot(delta, 2.0 * math.pi),
-        0.5 * used / float(at[used] - at[0]),
-        at[1:-1],
-        0.25 * (value[:-2] + 2.0 * value[1:-1] + value[2:]),
-    )
 
 
 @dataclass(frozen=True)
@@ -216,15 +170,17 @@ class SwingRelease(Scenario):
         t = run.trajectory.node_s * np.arange(len(run.trajectory.nodes), dtype=np.float64)
         q = run.trajectory.nodes
         try:
-            swing = swing_decay(t, (q[:, 0] - q[:, 1]) / (2.0 * run.plant.bellows_radius_m))
+            swing = decrement(t, (q[:, 0] - q[:, 1]) / (2.0 * run.plant.bellows_radius_m))
         except BadInputError:
             return {}
-        figures: Figures = {"damping_ratio": swing.damping_ratio, "frequency_hz": swing.frequency_hz}
+        figures: Figures = {"damping_ratio": swing.zeta, "frequency_hz": swing.frequency_hz}
+        # The middle of the oscillation at every extreme but the first and the last.
+        peak, middle_s = swing.peak, swing.peak_at_s[1:-1]
+        middle_rad = 0.25 * (peak[:-2] + 2.0 * peak[1:-1] + peak[2:])
         # One and four periods after the release; the first extreme still has the release in it.
         for name, at_s in (("offset_after_a_period_rad", 0.25), ("offset_after_1s_rad", 1.0)):
-            if swing.offset_at_s[-1] >= at_s:
-                nearest = int(np.argmin(np.abs(swing.offset_at_s - at_s)))
-                figures[name] = float(swing.offset_rad[nearest])
+            if middle_s[-1] >= at_s:
+                figures[name] = float(middle_rad[np.argmin(np.abs(middle_s - at_s))])
         return figures
 
 

@@ -35,7 +35,7 @@ def _manifest(tmp_path: Path, rows: str) -> Path:
 @pytest.mark.parametrize(
     ("rows", "said"),
     [
-        ("", "names no rigs"),
+        ("", "has a header but no rows"),
         ("a,x\na,y\n", "the name 'a' is that of line 2"),
         ("../a,x\n", "line 2: name is '../a', expected a name without a dot"),
     ],

@@ -30,11 +30,11 @@ from calib.runner.fleet import (
     is_url,
     kind_of,
     read_manifest,
-    rig_folder,
     run_fleet,
     run_stages,
     without_secrets,
 )
+from calib.runner.folder import read_folder
 from calib.runner.outcomes import Answer, Outcome, Store, column, opened_store, texts
 from calib.runner.processes import Here
 from calib.stages.camera.section import Camera, Distortion
@@ -111,7 +111,7 @@ def test_csv_and_yaml_say_the_same(tmp_path: Path) -> None:
     ("text", "said"),
     [
         ("", "is empty"),
-        ("name,folder\na,b\n", "line 1: has no column path"),
+        ("name,folder\na,b\n", "m.csv: has no column path, found name, folder"),
         ("name,path\n../a,b\n", "line 2: name is '../a', expected a name without a dot"),
         ("name,path\na\\b,b\n", "expected a name of letters"),
         ("name,path\na,\n", "line 2: path is '', expected the rig's folder"),
@@ -158,7 +158,7 @@ def _verbs(tmp_path: Path, *commands: tuple[str, ...]) -> bytes:
 def test_the_bytes_are_those_of_single_verbs(tmp_path: Path, project_root: Path) -> None:
     root = tmp_path / "rig"
     shutil.copytree(project_root / "images", root / "images")
-    folder = rig_folder(root)
+    folder = read_folder(root)
     assert kind_of(folder) == "camera"
     ended = run_stages(folder, "camera", (("model", "radial2"),), tmp_path / "out")
     assert {job.status for job in ended.ended} == {"ok"}
@@ -174,18 +174,18 @@ def test_the_bytes_are_those_of_single_verbs(tmp_path: Path, project_root: Path)
 
 def test_what_a_rig_folder_holds(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
-    with pytest.raises(BadInputError, match="holds no images/, no logs/ and no pictures"):
-        rig_folder(tmp_path / "empty")
+    with pytest.raises(BadInputError, match="holds no pictures in images/ and no logs in logs/"):
+        read_folder(tmp_path / "empty")
     logs = tmp_path / "with" / "logs"
     logs.mkdir(parents=True)
     (logs / "a.csv").write_text("t_s\n")
-    assert kind_of(rig_folder(tmp_path / "with")) == "run"
+    assert kind_of(read_folder(tmp_path / "with")) == "run"
     flat = tmp_path / "flat"
     flat.mkdir()
     (tmp_path / "secret.png").write_bytes(b"x")
     (flat / "a.png").write_bytes(b"x")
     (flat / "b.png").symlink_to(tmp_path / "secret.png")
-    assert [path.name for path in rig_folder(flat).pictures] == ["a.png"]
+    assert [path.name for path in read_folder(flat).pictures] == ["a.png"]
 
 
 _ORDER = ["fx_px", "fy_px", "k1"]

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,11 +11,11 @@ import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
-from calib.core.files import read_text, shown
+from calib.core.files import shown
 from calib.core.options import PoseOptions
 from calib.core.rig import Rig
-from calib.core.units import plain_number
 from calib.io.logs import Log, check_time, read_log
+from calib.io.tables import read_cells
 from calib.stages.actuator.identify import Start, Track, without_outliers
 from calib.stages.actuator.identify_pump import PumpRecord, PumpTable, Settled
 from calib.stages.actuator.machine import Machine
@@ -52,76 +49,6 @@ _MOST_BAD = 0.05
 _FEWEST = 20
 _SHORTEST_S = 0.5
 _JUMP = 20.0
-
-
-@dataclass(frozen=True)
-class Cells:
-    """A small CSV: its header, rows of cells, and the number of each row's line."""
-
-    path: Path
-    header: list[str]
-    rows: list[list[str]]
-    lines: list[int]
-
-    def column(self, wanted: str | None, known: Sequence[str], what: str) -> int:
-        """Index of a column, the one asked for or the first known name. Raises `BadInputError`."""
-        low, names = [name.lower() for name in self.header], ", ".join(self.header)[:120]
-        if wanted is not None and wanted.lower() not in low:
-            raise BadInputError(f"{shown(self.path)}: has no column {wanted}, found {names}")
-        name = next((name for name in (known if wanted is None else (wanted.lower(),)) if name in low), None)
-        if name is None:
-            raise BadInputError(
-                f"{shown(self.path)}: has no {what}, found columns {names}; expected for instance {known[0]}"
-            )
-        return low.index(name)
-
-    def numbers(self, *columns: int) -> FloatArray:
-        """Values (rows, columns), NaN for what is blank or not finite. Raises `BadInputError` for words."""
-        rows = zip(self.rows, self.lines, strict=True)
-        return np.array([[self._number(row[k], line, k) for k in columns] for row, line in rows])
-
-    def _number(self, cell: str, line: int, column: int) -> float:
-        word = cell.strip()
-        value = plain_number(word) if word else math.nan
-        if value is None:
-            raise BadInputError(
-                f"{shown(self.path)}, line {line}: {self.header[column]} is {shown(word[:40])!r}, expected a "
-                "number"
-            )
-        return value if math.isfinite(value) else math.nan
-
-
-def read_cells(path: Path) -> Cells:
-    """The cells of a CSV.
-
-    Raises `BadInputError` for a file without header or rows and for a row of another length.
-    """
-    header: list[str] = []
-    rows: list[list[str]] = []
-    lines: list[int] = []
-    reader = csv.reader(io.StringIO(read_text(path)))
-    try:
-        for cells in reader:
-            if not cells or not any(cell.strip() for cell in cells) or cells[0].lstrip().startswith("#"):
-                continue
-            if not header:
-                header = [cell.strip() for cell in cells]
-                continue
-            if len(cells) != len(header):
-                raise BadInputError(
-                    f"{shown(path)}, line {reader.line_num}: has {len(cells)} cells, expected {len(header)}"
-                )
-            rows.append(cells)
-            lines.append(reader.line_num)
-    except csv.Error as error:
-        raise BadInputError(
-            f"{shown(path)}, line {reader.line_num}: is not comma-separated: {error}"
-        ) from error
-    if not header:
-        raise BadInputError(f"{shown(path)}: is empty, expected a header and rows")
-    if not rows:
-        raise BadInputError(f"{shown(path)}: has a header but no rows")
-    return Cells(path, header, rows, lines)
 
 
 def read_pump_table(

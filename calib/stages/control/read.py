@@ -13,8 +13,8 @@ from calib.core.files import shown
 from calib.core.rig import Rig
 from calib.core.writing import Kind, column_names, write_atomically
 from calib.io.logs import columns_of
+from calib.io.tables import read_cells
 from calib.stages.actuator.kinematics import inverse
-from calib.stages.actuator.read import read_cells
 from calib.stages.control.laws import Model
 from calib.stages.control.references import (
     BUILT_IN,
