@@ -11,7 +11,8 @@ import numpy as np
 from PIL import Image
 
 from calib.core.plot import Arrows, Band, Bars, Curve, Field, Figure, Plot, Ribbon, Rule, Shape, Text
-from calib.runner.cache import store
+from calib.core.words import Block, Line, Table
+from calib.runner.cache import BLOCKS, store
 from calib.show.charts import chart
 from calib.show.page import keep_pictures
 
@@ -88,11 +89,14 @@ def _job(name: str, stage: str, title: str, status: str, **more: Any) -> dict[st
     return {"name": name, "stage": stage, "title": title, "status": status, **common, **more}
 
 
-def _result(out: Path, name: str, document: dict[str, Any], figures: dict[str, bytes], said: str) -> None:
+def _result(
+    out: Path, name: str, document: dict[str, Any], words: list[Block], figures: dict[str, bytes], said: str
+) -> None:
     work, stages = out / ".calib" / "work" / name, out / ".calib" / "stages"
     (work / "figures").mkdir(parents=True)
     stages.mkdir(exist_ok=True)
     (work / "document.json").write_text(json.dumps(document))
+    (work / "words.json").write_bytes(BLOCKS.dump_json(words))
     (work / "messages.txt").write_text(said)
     for figure, data in figures.items():
         (work / "figures" / figure).write_bytes(data)
@@ -119,25 +123,18 @@ def finished_run(root: Path) -> Path:
         }
         for k, name in enumerate(names)
     ]
-    document = {"models": [{"name": "radial2", "fitted_rms_px": 0.01}, {"name": EVIL, "fitted_rms_px": 0.2}]}
+    words: list[Block] = [
+        Table(("model", EVIL), (("radial2", "0.01"), (EVIL, "0.2 ± 0.1")), EVIL),
+        Line(EVIL),
+        Line(EVIL, EVIL),
+        Line("said elsewhere", "reason"),
+    ]
     figures = {"camera_errors.json": _chart("Errors"), "camera_sigma.json": _chart(EVIL)}
-    _result(out, "intrinsics", {**document, "per_view": seen}, figures, f"found {EVIL}\n")
+    _result(out, "intrinsics", {"per_view": seen}, words, figures, f"found {EVIL}\n")
     for log in ("one", "two"):
-        check = {"degrees": 2, "nis": 2.0}
-        told = {
-            "source": log,
-            "verdict": "ok",
-            "duration_s": 9.0,
-            "rmse": {"mean_q_mm": 0.2},
-            "sensors": {"camera": check},
-        }
-        _result(
-            out,
-            f"replay-{log}",
-            {"replay": {"logs": [told]}},
-            {f"replay_{log}_states.json": _chart(f"States of {log}")},
-            "",
-        )
+        charts = {f"replay_{log}_states.json": _chart(f"States of {log}")}
+        sensors = Table(("sensor", "NIS", "gated"), (("camera", "2.0", "0"),))
+        _result(out, f"replay-{log}", {}, [sensors, Line(f"{log} is weak", "reason")], charts, "")
     jobs = [
         _job("intrinsics", "intrinsics", "Camera", "ok", writes=["camera"], flashed=True, inputs=names),
         _job("align", "align", "Together", "failed", reason=f"log {EVIL} is empty", flashed=True),

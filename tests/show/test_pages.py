@@ -15,6 +15,7 @@ import jinja2
 import numpy as np
 import pytest
 from chromium import Browser, browser_or_skip
+from markupsafe import escape
 from pages import EVIL, finished_run
 
 from calib.core.errors import BadInputError
@@ -251,6 +252,18 @@ def _drawn(root: Path, logs: int) -> list[Result | None]:
             files[name] = ""
         made.append(Result(folder, "", 0, files))
     return made
+
+
+def test_the_page_has_the_words_of_each_stage_and_of_several_logs_one_table(tmp_path: Path) -> None:
+    text = page_text(finished_run(tmp_path))
+    assert EVIL not in text and text.count(str(escape(EVIL))) > 6
+    # A section tells its own reasons; a stage without one has them among its words.
+    assert "said elsewhere" not in text and "one is weak" in text and "two is weak" in text
+    whole = text[text.index("States over all logs") :]
+    one_table = whole[: whole.index("</table>")]
+    rows = re.findall(r'<tr><td(?: class="long")?>(.+?)</td><td>camera</td>', one_table)
+    assert rows == ["one.csv", str(escape(EVIL))]
+    assert 'data-value="0.2">0.2 ± 0.1</td>' in text
 
 
 @pytest.mark.parametrize("logs", [4, 40, 130])
