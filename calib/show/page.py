@@ -220,7 +220,7 @@ def page_text(rig: Path) -> str:
     budget = _Budget(MOST_BYTES - _ROOM_BYTES)
     views = _views(hidden, _Budget(_VIEWS_BYTES))
     budget.left -= sum(len(view["image"]) for view in views)
-    stages = _stages(told, sections, whole, hidden, budget)
+    stages = _stages(told, whole, hidden, budget)
     return render(
         "page.html.j2",
         ("page.css",),
@@ -304,9 +304,7 @@ def _views(hidden: Path, budget: _Budget) -> list[dict[str, Any]]:
     return sorted(out, key=lambda one: order[one["name"]])
 
 
-def _stages(
-    told: Mapping[str, Any], sections: Mapping[str, Any], rig: Rig, hidden: Path, budget: _Budget
-) -> list[dict[str, Any]]:
+def _stages(told: Mapping[str, Any], rig: Rig, hidden: Path, budget: _Budget) -> list[dict[str, Any]]:
     """A part of the page for each stage, with all its jobs; figures first of stages that run once."""
     grouped: dict[str, list[dict[str, Any]]] = {}
     for job in told["jobs"]:
@@ -315,20 +313,24 @@ def _stages(
     for several in (False, True):
         for name, jobs in grouped.items():
             if (len(jobs) > 1) == several:
-                made[name] = _stage(name, jobs, sections, rig, hidden, budget)
+                made[name] = _stage(name, jobs, rig, hidden, budget)
     return [made[name] for name in grouped]
 
 
 def _stage(
     name: str,
     jobs: list[dict[str, Any]],
-    sections: Mapping[str, Any],
     rig: Rig,
     hidden: Path,
     budget: _Budget,
 ) -> dict[str, Any]:
-    section = _merged([sections.get(n) for job in jobs for n in job["writes"]])
-    logs = [str(log.get("name")) for log in section.get("logs") or () if isinstance(log, dict)]
+    names = dict.fromkeys(str(name) for job in jobs for name in job["writes"])
+    sections = [rig.sections[name] for name in names if name in rig.sections]
+    verdict = Verdict.of(
+        finding for one in sections for finding in getattr(one, "verdict", Verdict()).findings
+    )
+    listed = (one.logs for one in sections if isinstance(getattr(one, "logs", None), list))
+    logs = [str(getattr(log, "name", log)) for log in next(listed, [])]
     ran = [job["status"] not in ("skipped", "blocked") for job in jobs]
     results = [
         load(hidden / "stages" / str(job["name"])) if one else None
@@ -344,7 +346,7 @@ def _stage(
                 "job": job,
                 "status": _STATUS.get(job["status"], job["status"]),
                 "document": document,
-                "blocks": _blocks(result, bool(job["writes"]) and bool(section)),
+                "blocks": _blocks(result, bool(job["writes"]) and bool(sections)),
                 "figures": figures,
                 "dropped": dropped,
                 "messages": [] if result is None else result.messages(),
@@ -358,9 +360,9 @@ def _stage(
         "title": jobs[0]["title"],
         "status": _STATUS.get(status, status),
         "kind": "poor" if status in POOR else status,
-        "facts": _facts(jobs, rig, document) if status in WORDS else [],
-        "reasons": list(section.get("reasons") or ()),
-        "remarks": [*(section.get("remarks") or ()), *(section.get("advice") or ())],
+        "facts": _facts(sections, document) if status in WORDS else [],
+        "reasons": verdict.reasons,
+        "remarks": [*verdict.remarks, *verdict.advice],
         "parts": parts,
         "tables": _over_all(parts) if len(parts) > 1 else [],
         "several": len(parts) > 1,
@@ -368,32 +370,13 @@ def _stage(
     }
 
 
-def _facts(jobs: list[dict[str, Any]], rig: Rig, document: Mapping[str, Any]) -> list[tuple[str, str]]:
+def _facts(sections: Sequence[Any], document: Mapping[str, Any]) -> list[tuple[str, str]]:
     """The few values at the head of a stage: those of its sections, or what the firmware's verb counts."""
-    out = [
-        fact
-        for name in dict.fromkeys(name for job in jobs for name in job["writes"])
-        if (section := getattr(rig, name, None)) is not None
-        for fact in facts(section)
-    ]
+    out = [fact for section in sections for fact in facts(section)]
     if "constants" in document and "files" in document:
         out.append(("constants", str(document["constants"])))
         out.append(("files", ", ".join(str(name) for name in document["files"] or ())))
     return out
-
-
-def _merged(sections: list[Any]) -> dict[str, Any]:
-    """The sections of a stage as one; reasons and the like of all of them."""
-    whole: dict[str, Any] = {}
-    for section in sections:
-        for key, value in (section if isinstance(section, dict) else {}).items():
-            if isinstance(value, list) and key in ("reasons", "remarks", "advice"):
-                whole[key] = [*whole.get(key, ()), *value]
-            elif isinstance(value, dict) and key == "sigma":
-                whole[key] = {**whole.get(key, {}), **value}
-            else:
-                whole.setdefault(key, value)
-    return whole
 
 
 def _chosen(results: list[Result | None], budget: _Budget) -> dict[Path, str]:
