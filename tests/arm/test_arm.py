@@ -96,9 +96,7 @@ def test_an_arm_is_a_kind_of_actuator_in_the_file() -> None:
     assert old is not None
     assert old.values_on("a")["bends_rad_per_kpa"] == pytest.approx(1.1)
     assert old.values_on("another")["bends_rad_per_kpa"] == pytest.approx(1.1)
-    with pytest.raises(
-        BadInputError, match="expected factors of pilot_drains and bends_rad_per_kpa, not of lag_s"
-    ):
+    with pytest.raises(BadInputError, match=r"expected factors of .*bends_rad_per_kpa, not of lag_s"):
         Rig.of({"arm": section | {"verdict": "ok", "days": {"a": {"lag_s": 1.1}}}}, "rig.yaml")
     with pytest.raises(BadInputError, match="actuator is a pressure_arm and there is an arm"):
         Rig.of({"actuator": section, "arm": section}, "rig.yaml")

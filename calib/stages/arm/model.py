@@ -28,8 +28,8 @@ as of an arm that was vented:
 M = m g l sin(.55 phi) is the moment of a load at the tip of an upright arm of
 length l, whose chord leans by about .55 of the angle. Chord: L = c_0 + c_1 phi + c_2 phi^2 - s.
 
-What differs from day to day is a factor of a, and of D: an arm is refitted, its rubber rests, and so do the
-valve's springs.
+What differs from day to day is a factor of a, and of D or G: an arm is refitted, its rubber rests, and so do
+the valve's springs.
 
 Area, stiffness and lever arm are one number, a, without a known load; with one, C separates the stiffness.
 """
@@ -211,7 +211,7 @@ PARAMETERS = tuple(one for part in PARTS for one in part.parameters)
 DRIVES = {part.name: tuple(one.name for one in part.parameters) for part in PARTS if part.drives}
 """Parameters of the parts that make the pressure."""
 SEGMENT = tuple(one.name for part in PARTS if not part.drives for one in part.parameters)
-DAILY = {"pilot_drains": 0.1, "bends_rad_per_kpa": 0.15}
+DAILY = {"pilot_drains": 0.1, "kpa_per_command": 0.1, "bends_rad_per_kpa": 0.15}
 """Parameters that differ from day to day, and standard deviations of the logarithms of a day's factors."""
 Days = Mapping[str, Mapping[str, float]]
 """Factors of parameters by day."""

@@ -82,7 +82,7 @@ class Arm(Result):
             raise ValueError("expected the parameters of its parts, all of them")
         strange = {name for day in self.days.values() for name in day} - set(DAILY)
         if strange:
-            raise ValueError(f"expected factors of {' and '.join(DAILY)}, not of {min(strange)}")
+            raise ValueError(f"expected factors of {', '.join(DAILY)}, not of {min(strange)}")
         wrong = [p.name for p in PARAMETERS if p.positive and self.parameters.get(p.name, 1.0) <= 0.0]
         if wrong:
             raise ValueError(f"expected {wrong[0]} above 0")

@@ -200,12 +200,12 @@ def _untold(found: Identification) -> Iterator[Finding]:
     from calib.stages.arm.model import PARAMETERS, PARTS
 
     vague = {p.name for p, s in zip(PARAMETERS, found.fit.sigma.tolist(), strict=True) if s > _UNTOLD}
-    untold: list[str] = []
+    untold: dict[str, None] = {}
     takes: dict[str, None] = {}
     for part in PARTS:
         mine = [one for one in part.parameters if one.name in vague and part.name in found.fit.assembly.parts]
         whole = len(mine) == len(part.parameters)
-        untold += [part.name] if whole else [as_words(one.name) for one in mine]
+        untold |= dict.fromkeys([part.name] if whole else [as_words(one.name) for one in mine])
         takes |= dict.fromkeys(one.identified_by for one in (mine[:1] if whole else mine))
     if untold:
         yield Finding(
