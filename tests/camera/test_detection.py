@@ -256,6 +256,16 @@ def test_hard_pictures_are_found_and_honest(what: str, sensor: dict[str, float])
     assert error < 4 * np.median(detection.sigma_px) + 0.01
 
 
+@pytest.mark.parametrize("frame", ["014", "016", "020", "028"])
+def test_interlaced_and_sharpened_boards_are_found(shared_data: Path, frame: str) -> None:
+    """Squares of 16 px whose edges are jagged by a pixel; OpenCV's classic finder finds three of them."""
+    gray = read_picture(shared_data / "sks_charuco_left" / f"Frame_{frame}.jpg").gray
+    found = detect(gray, 13, 8)
+    assert found is not None
+    assert found.refined.all()
+    assert found.misfit_px < 0.2
+
+
 def test_boards_whose_white_is_clipped_are_found() -> None:
     """Most of the light squares' brightness is missing, and the fit's amplitude goes on beyond white."""
     for seed in range(4):

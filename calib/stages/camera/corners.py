@@ -92,11 +92,11 @@ _MISFIT = 0.08
 _MEDIAN_RESIDUAL = 0.25
 _CLOSE_MISFIT = 0.03
 """Misfit, in squares, below which a grid is close: its corners may have another shape."""
-_NEAR, _NEAR_PX = 0.06, 0.9
+_NEAR, _NEAR_PX = 0.06, 1.2
 """How far from a corner the squares are looked at, in squares, and at least in pixels."""
 _NEAR_STEP = 0.7
-"""Least step there over the step between the squares' middles. Sharpened boards have .78 and more, spots
-that touch .62 and less."""
+"""Least step there over the step between the squares' middles. Sharpened boards, interlaced or not, have .78
+and more, spots that touch .68 and less."""
 _LEAST_AMPLITUDE = 2.5
 """Grey levels."""
 _CONTINUES = 0.4
