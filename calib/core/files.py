@@ -31,6 +31,12 @@ def one_line(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
+def quoted(value: Any) -> str:
+    """A value of a file as a sentence shows it."""
+    text = one_line(repr(value))
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
 def shown(path: Path | str) -> str:
     """A path as an error message shows it, see `one_line`."""
     return one_line(str(path))

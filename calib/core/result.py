@@ -25,8 +25,8 @@ from pydantic import (
 )
 
 from calib.core.errors import BadInputError
-from calib.core.files import sha256
-from calib.core.schema import contradiction, quoted
+from calib.core.files import quoted, sha256
+from calib.core.schema import contradiction
 from calib.core.verdict import Verdict, Word
 
 if TYPE_CHECKING:

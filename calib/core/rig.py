@@ -25,9 +25,9 @@ from pydantic import BaseModel, Field, field_validator
 
 from calib.core import __version__
 from calib.core.errors import BadInputError
-from calib.core.files import one_line, read_yaml_mapping, shown
+from calib.core.files import one_line, quoted, read_yaml_mapping, shown
 from calib.core.result import Result, Section, identity, section_json
-from calib.core.schema import nearest, quoted, validated
+from calib.core.schema import nearest, validated
 from calib.core.writing import Kind, head, write_atomically
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import PydanticCustomError
 
 from calib.core.errors import BadInputError
-from calib.core.files import one_line, shown
+from calib.core.files import one_line, quoted, shown
 from calib.core.units import unit_of
 
 Kind = TypeVar("Kind", bound=BaseModel)
@@ -101,12 +101,6 @@ def nearest(name: str, names: Iterable[str]) -> str:
     if alike:
         return f"; did you mean {alike[0]}?"
     return f"; expected one of {', '.join(known)}" if 0 < len(known) <= _MOST_NAMES else ""
-
-
-def quoted(value: Any) -> str:
-    """A value of a file as a sentence shows it."""
-    text = one_line(repr(value))
-    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def _sentence(kind: type[BaseModel], error: ValidationError, under: str) -> str:

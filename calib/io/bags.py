@@ -23,7 +23,7 @@ import numpy as np
 
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError, CalibError, pip_install
-from calib.core.files import check_readable, one_line, read_yaml_mapping, shown
+from calib.core.files import check_readable, one_line, quoted, read_yaml_mapping, shown
 from calib.io.columns import COLUMNS, Block
 
 # ----------------------------------------------------------------------
@@ -175,16 +175,16 @@ def _from_file(place: Path, bag: Path, topics: Sequence[Topic]) -> TopicMap:
             raise BadInputError(f"{source}: {one_line(key)[:60]} is not known, expected time or topics")
     time = document.get("time", "stamp")
     if time not in ("stamp", "received"):
-        raise BadInputError(f"{source}: time is {_short(time)}, expected stamp or received")
+        raise BadInputError(f"{source}: time is {quoted(time)}, expected stamp or received")
     listed = document.get("topics")
     if not isinstance(listed, dict) or not listed:
-        raise BadInputError(f"{source}: topics is {_short(listed)}, expected topics with their columns")
+        raise BadInputError(f"{source}: topics is {quoted(listed)}, expected topics with their columns")
     there = {topic.name: topic for topic in topics}
     found = {}
     for name, wanted in listed.items():
         if name not in there:
             raise BadInputError(
-                f"{source}: the topic {_short(name)} is not in {shown(bag)}, which has {_listed(topics)}"
+                f"{source}: the topic {quoted(name)} is not in {shown(bag)}, which has {_listed(topics)}"
             )
         found[name] = _wanted(f"{source}: topics.{one_line(name)[:80]}", wanted, there[name])
     return _checked(TopicMap(source, found, time == "stamp"))
@@ -194,7 +194,7 @@ def _wanted(where: str, wanted: Any, topic: Topic) -> tuple[Field, ...]:
     """The fields that one entry of the file asks for."""
     if isinstance(wanted, str):
         if wanted not in _PRESETS:
-            raise BadInputError(f"{where} is {_short(wanted)}, expected {', '.join(_PRESETS)} or columns")
+            raise BadInputError(f"{where} is {quoted(wanted)}, expected {', '.join(_PRESETS)} or columns")
         columns = _preset(wanted, topic)
         if columns is None:
             raise BadInputError(
@@ -202,12 +202,12 @@ def _wanted(where: str, wanted: Any, topic: Topic) -> tuple[Field, ...]:
             )
         return _fields(columns)
     if not isinstance(wanted, dict) or not wanted:
-        raise BadInputError(f"{where} is {_short(wanted)}, expected {', '.join(_PRESETS)} or columns")
+        raise BadInputError(f"{where} is {quoted(wanted)}, expected {', '.join(_PRESETS)} or columns")
     fields = []
     for column, path in wanted.items():
         if column not in COLUMNS:
             raise BadInputError(
-                f"{where}: {_short(column)} is no column, expected one of {', '.join(COLUMNS)}"
+                f"{where}: {quoted(column)} is no column, expected one of {', '.join(COLUMNS)}"
             )
         entry: dict[str, Any] = (
             path if isinstance(path, dict) and set(path) <= {"field", "factor"} else {"field": path}
@@ -215,16 +215,12 @@ def _wanted(where: str, wanted: Any, topic: Topic) -> tuple[Field, ...]:
         path, factor = entry.get("field"), entry.get("factor", 1.0)
         if not isinstance(path, str) or not all(_STEP.fullmatch(step) for step in path.split(".")):
             raise BadInputError(
-                f"{where}.{column} is {_short(path)}, expected a field such as point.x or data[0]"
+                f"{where}.{column} is {quoted(path)}, expected a field such as point.x or data[0]"
             )
         if isinstance(factor, bool) or not isinstance(factor, int | float) or not math.isfinite(factor):
-            raise BadInputError(f"{where}.{column}: the factor is {_short(factor)}, expected a number")
+            raise BadInputError(f"{where}.{column}: the factor is {quoted(factor)}, expected a number")
         fields.append(Field(column, path, float(factor)))
     return tuple(fields)
-
-
-def _short(value: Any) -> str:
-    return one_line(repr(value))[:60]
 
 
 def _checked(found: TopicMap) -> TopicMap:
@@ -280,7 +276,7 @@ def reader_of(source: str, topic: str, field: Field) -> Callable[[Any], float]:
                 raise TypeError
             return float(value) * factor
         except (TypeError, ValueError, OverflowError):
-            raise BadInputError(f"{where} is {_short(value)}, expected a number") from None
+            raise BadInputError(f"{where} is {quoted(value)}, expected a number") from None
 
     return read
 
@@ -291,10 +287,10 @@ def _named(value: Any, step: str | int) -> str:
         try:
             return f"{len(value)} elements there"
         except TypeError:
-            return f"{_short(value)} there"
+            return f"{quoted(value)} there"
     names = list(value) if isinstance(value, dict) else list(getattr(value, "__dataclass_fields__", ()))
     names = [one_line(str(name))[:40] for name in names if not str(name).startswith("__")]
-    return ", ".join(names[:_SHOWN]) if names else f"{_short(value)} there"
+    return ", ".join(names[:_SHOWN]) if names else f"{quoted(value)} there"
 
 
 # ----------------------------------------------------------------------

@@ -37,7 +37,7 @@ import numpy as np
 
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
-from calib.core.files import one_line, read_yaml_mapping, shown
+from calib.core.files import one_line, quoted, read_yaml_mapping, shown
 from calib.core.options import LogOptions
 from calib.core.writing import Kind, head
 
@@ -280,19 +280,19 @@ def read_columns_file(path: Path) -> ColumnsFile:
             raise BadInputError(f"{where}: {one_line(key)[:60]} is not known{hint}")
     names = document.get("names", [])
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise BadInputError(f"{where}: names is {_short(names)}, expected a list of columns")
+        raise BadInputError(f"{where}: names is {quoted(names)}, expected a list of columns")
     units = document.get("units", {})
     if not isinstance(units, dict):
-        raise BadInputError(f"{where}: units is {_short(units)}, expected for instance {{accel: g}}")
+        raise BadInputError(f"{where}: units is {quoted(units)}, expected for instance {{accel: g}}")
     for kind, unit in units.items():
         if kind not in UNITS or not isinstance(unit, str) or unit not in UNITS[kind]:
             expected = ", ".join(UNITS.get(kind, UNITS))
-            raise BadInputError(f"{where}: units.{_word(kind)} is {_short(unit)}, expected one of {expected}")
+            raise BadInputError(f"{where}: units.{_word(kind)} is {quoted(unit)}, expected one of {expected}")
     marks = {}
     for key, known in (("separator", (",", ";", "\t")), ("decimal", (".", ","))):
         marks[key] = document.get(key, "")
         if marks[key] and marks[key] not in known:
-            raise BadInputError(f"{where}: {key} is {_short(marks[key])}, expected one of {known}")
+            raise BadInputError(f"{where}: {key} is {quoted(marks[key])}, expected one of {known}")
     columns = [key for key in document if key not in _RESERVED]
     sources = {key: _source(f"{where}: {key}", key, document[key]) for key in columns}
     return ColumnsFile(path, sources, units, tuple(names), marks["separator"], marks["decimal"])
@@ -302,27 +302,23 @@ def _source(where: str, column: str, entry: Any) -> Source:
     entry = {"column": entry} if isinstance(entry, str | int) else entry
     keys = ("column", "unit", "factor", "offset")
     if not isinstance(entry, dict) or any(key not in keys for key in entry):
-        raise BadInputError(f"{where} is {_short(entry)}, expected a column's name or {', '.join(keys)}")
+        raise BadInputError(f"{where} is {quoted(entry)}, expected a column's name or {', '.join(keys)}")
     named = entry.get("column", column)
     if isinstance(named, bool) or not isinstance(named, str | int):
-        raise BadInputError(f"{where}.column is {_short(named)}, expected a name or a number from 1")
+        raise BadInputError(f"{where}.column is {quoted(named)}, expected a name or a number from 1")
     kind = kind_of(column)
     unit = entry.get("unit", "")
     if unit and (not kind or unit not in UNITS[kind]):
         known = ", ".join(UNITS.get(kind, ()))
-        raise BadInputError(f"{where}.unit is {_short(unit)}, expected one of {known}")
+        raise BadInputError(f"{where}.unit is {quoted(unit)}, expected one of {known}")
     numbers = [entry.get("factor", 1.0), entry.get("offset", 0.0)]
     for key, value in zip(keys[2:], numbers, strict=True):
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise BadInputError(f"{where}.{key} is {_short(value)}, expected a number")
+            raise BadInputError(f"{where}.{key} is {quoted(value)}, expected a number")
     if unit == "counts" and "factor" in entry:
         # A factor makes SI of counts.
         unit = next(iter(UNITS[kind]))
     return Source(str(named), unit, "file" if unit else "", float(numbers[0]), float(numbers[1]))
-
-
-def _short(value: Any) -> str:
-    return one_line(repr(value))[:60]
 
 
 def _word(value: Any) -> str:

@@ -22,11 +22,11 @@ from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_val
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import EXIT_INTERNAL, BadInputError, CalibError, end_of
-from calib.core.files import one_line, read_text, read_yaml_mapping, sha256, shown
+from calib.core.files import one_line, quoted, read_text, read_yaml_mapping, sha256, shown
 from calib.core.plot import every
 from calib.core.result import Number, Pair, Section
 from calib.core.rig import SCHEMA, Rig
-from calib.core.schema import contradiction, quoted, validated
+from calib.core.schema import contradiction, validated
 from calib.core.units import parse_duration_s
 from calib.core.workers import Processes, Task
 from calib.runner.cache import program

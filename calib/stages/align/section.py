@@ -6,8 +6,9 @@ from typing import Annotated
 
 from pydantic import Field, field_validator
 
+from calib.core.files import quoted
 from calib.core.result import Count, CovarianceTable, NotNegative, Result, Section, quantity
-from calib.core.schema import contradiction, nearest, quoted
+from calib.core.schema import contradiction, nearest
 
 Angle = Annotated[float, Field(ge=-7.0, le=7.0, allow_inf_nan=False, strict=True)]
 Seconds = Annotated[float, Field(ge=-10.0, le=10.0, allow_inf_nan=False, strict=True)]

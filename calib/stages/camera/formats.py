@@ -19,6 +19,7 @@ import yaml
 from calib.core.arrays import FloatArray
 from calib.core.bounded_yaml import YamlProblem, load
 from calib.core.errors import BadInputError
+from calib.core.files import quoted
 from calib.core.writing import Kind, holds
 from calib.stages.camera.model import COEFFICIENTS, FISHEYE, MODELS, Camera
 
@@ -257,7 +258,7 @@ def from_ros(text: str) -> Camera:
     lengths = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
     if not isinstance(model, str) or model not in lengths:
         raise BadInputError(
-            f"distortion_model is {_short(model)}, expected plumb_bob, rational_polynomial or equidistant; "
+            f"distortion_model is {quoted(model)}, expected plumb_bob, rational_polynomial or equidistant; "
             "no other can be expressed"
         )
     coefficients = _ros_matrix(document, "distortion_coefficients", None)
@@ -298,7 +299,7 @@ def from_opencv(text: str) -> Camera:
     root = read_storage(text)
     fisheye = root.get("fisheye_model", 0)
     if fisheye not in (0, 1):
-        raise BadInputError(f"fisheye_model is {_short(fisheye)}, expected 0 or 1")
+        raise BadInputError(f"fisheye_model is {quoted(fisheye)}, expected 0 or 1")
     width, height = (_whole(root, key) for key in ("image_width", "image_height"))
     K = _storage_matrix(root, "camera_matrix")
     coefficients = _storage_matrix(root, "distortion_coefficients").ravel()
@@ -367,14 +368,14 @@ def from_kalibr(text: str, entry: str = "cam0") -> Camera:
     camera = document[entry]
     if camera.get("camera_model") != "pinhole":
         raise BadInputError(
-            f"{entry}.camera_model is {_short(camera.get('camera_model'))}, expected pinhole; no other can "
+            f"{entry}.camera_model is {quoted(camera.get('camera_model'))}, expected pinhole; no other can "
             "be "
             "expressed"
         )
     model = camera.get("distortion_model")
     if model not in ("radtan", "equidistant", "none"):
         raise BadInputError(
-            f"{entry}.distortion_model is {_short(model)}, expected radtan, equidistant or none; no other "
+            f"{entry}.distortion_model is {quoted(model)}, expected radtan, equidistant or none; no other "
             "can be expressed"
         )
     fx, fy, cx, cy = _numbers(camera.get("intrinsics"), f"{entry}.intrinsics", 4)
@@ -384,7 +385,7 @@ def from_kalibr(text: str, entry: str = "cam0") -> Camera:
     size = camera.get("resolution")
     if not (isinstance(size, list) and len(size) == 2 and all(_count(value) for value in size)):
         raise BadInputError(
-            f"{entry}.resolution is {_short(size)}, expected two whole numbers [width, height]"
+            f"{entry}.resolution is {quoted(size)}, expected two whole numbers [width, height]"
         )
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     key = f"{entry}.intrinsics"
@@ -432,16 +433,11 @@ def _mapping(text: str) -> Mapping[str, Any]:
     return document
 
 
-def _short(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
 def _whole(document: Mapping[str, Any], key: str) -> int:
     value = document.get(key)
     if not isinstance(value, int) or isinstance(value, bool):
         raise BadInputError(
-            f"{key} is missing" if value is None else f"{key} is {_short(value)}, expected a whole number"
+            f"{key} is missing" if value is None else f"{key} is {quoted(value)}, expected a whole number"
         )
     return value
 
@@ -450,7 +446,7 @@ def _numbers(values: object, key: str, count: int | None) -> list[float]:
     """A list of finite numbers. YAML 1.1 reads 1e-05 as text, and yaml-cpp writes it like that."""
     if not isinstance(values, Sequence) or isinstance(values, str):
         raise BadInputError(
-            f"{key} is missing" if values is None else f"{key} is {_short(values)}, expected a list"
+            f"{key} is missing" if values is None else f"{key} is {quoted(values)}, expected a list"
         )
     if count is not None and len(values) != count:
         raise BadInputError(f"{key} has {len(values)} numbers, expected {count}")
@@ -461,7 +457,7 @@ def _numbers(values: object, key: str, count: int | None) -> list[float]:
         except (TypeError, ValueError, OverflowError):
             number = math.nan
         if not math.isfinite(number):
-            raise BadInputError(f"{key} contains {_short(value)}, expected finite numbers")
+            raise BadInputError(f"{key} contains {quoted(value)}, expected finite numbers")
         numbers.append(number)
     return numbers
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
+from calib.core.files import quoted
 from calib.core.result import (
     Count,
     CovarianceTable,
@@ -17,7 +18,7 @@ from calib.core.result import (
     Sigma,
     quantity,
 )
-from calib.core.schema import contradiction, nearest, quoted
+from calib.core.schema import contradiction, nearest
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

@@ -143,7 +143,6 @@ def drift_log(log: Log) -> Readings:
 # ----------------------------------------------------------------------
 # Logs as `calib.stages.imu.tuning` takes them: angles and rates on an even grid, and what to judge them by.
 
-REFERENCES = ("auto", "truth", "camera", "onchip", "none")
 _TUNELOGS_FEWEST = 20
 _SHORTEST_S = 1.0
 """Pieces of less are passed over."""
@@ -158,7 +157,7 @@ class Reading:
     Attributes
     ----------
     tilted : take the rate from the up vector (`calib.stages.imu.tracks`) and not -gz.
-    reference : one of `REFERENCES`; auto takes the camera where the log has it.
+    reference : auto, truth, camera, onchip or none; auto takes the camera where the log has it.
     on_plane : from pixels (n, 2) to metres (n, 2) in the rig's plane, None where it has none.
     """
 
