@@ -278,6 +278,25 @@ def test_a_log_held_back_is_predicted_as_well_as_fitted(solution: Solution) -> N
     assert held_back(alone) == []
 
 
+@pytest.mark.parametrize("other", [{}, {"stiffness_scale": 1.05}, {"lag_s": 0.8}])
+def test_a_log_of_another_plant_is_contradicted_and_one_that_tells_more_is_not(
+    other: dict[str, float],
+) -> None:
+    """Steps of both pumps alike move the length, so that they leave the angle of a prbs open by 5 mrad."""
+    names = ("stiffness_scale", "damping_scale_pumps_connected", "lag_s", "falling_N_per_s")
+    problem = Problem(Machine(), [track("prbs"), track("steps", other, seed=1)], names, {}, threads=1)
+    x, cost, residual, J = solve(problem, first_guess(problem, values_of(Machine())))
+    found = Solution(problem, x, residual, J, cost, {}, 1, 1)
+    held = held_back(found)
+    verdict = judge(found, uncertainty(found), colour_of(found), held, [])
+    contradicted = [one.text for one in verdict.findings if "the other logs contradict" in one.text]
+    assert bool(contradicted) is bool(other)
+    assert all((log.chance < 1e-6) is bool(other) for log in held)
+    if not other:
+        blamed = replace(held[0], held_phi_rad=3.0 * held[0].fitted_phi_rad)
+        assert judge(found, uncertainty(found), colour_of(found), [blamed], []).word == "ok"
+
+
 @pytest.mark.parametrize("late_s", [0.0, 0.2])
 def test_pictures_late_in_one_log_alone_are_named(late_s: float) -> None:
     names = ("stiffness_scale", "damping_scale_pumps_connected", "lag_s")

@@ -962,13 +962,18 @@ class Colour:
 
 @dataclass(frozen=True)
 class HeldLog:
-    """RMS of angle [rad] and length [m] on a log, fitted and held back."""
+    """RMS of angle [rad] and length [m] on a log, fitted and held back.
+
+    `chance` is the probability that the other logs fit this much worse with the parameters of all logs than
+    with their own, where one model makes them all.
+    """
 
     name: str
     fitted_phi_rad: float
     fitted_length_m: float
     held_phi_rad: float
     held_length_m: float
+    chance: float
 
 
 def _spans(tracks: Sequence[Track]) -> list[slice]:
@@ -1059,22 +1064,27 @@ def held_back(solution: Solution) -> list[HeldLog]:
     Of the log that is held back only its start, delay and the camera's offset are estimated. A log that
     alone tells a parameter keeps the others from telling it; that one stays as it was found.
     """
+    from scipy.special import chdtrc
+
     problem = solution.problem
     if len(problem.tracks) < 2:
         return []
     inside = rms_by_track(problem, solution.residual)
     found = {**problem.held, **solution.values}
-    out = []
+    known, out = uncertainty(solution), []
+    raised = known.scale * max(known.inflation.values(), default=1.0)
     for k, track in enumerate(problem.tracks):
         others = [t for i, t in enumerate(problem.tracks) if i != k]
         kinds = {t.hoses for t in others}
         names = tuple(name for name in problem.names if _told_by(name, kinds))
         less = replace(problem, tracks=others, names=names, held=found)
-        x, _, _, _ = solve(less, _taken_over(solution, less), 15)
+        start = _taken_over(solution, less)
+        x, cost, _, _ = solve(less, start, 15)
+        worse = 2.0 * (float(_robust(jacobian(less, start)[0])) - cost) / raised**2
         alone = replace(problem, tracks=[track], names=(), held={**found, **less.values(x)})
         _, _, residual, _ = solve(alone, _taken_over(solution, alone), 15)
         (phi, length) = rms_by_track(alone, residual)[0]
-        out.append(HeldLog(track.name, *inside[k], phi, length))
+        out.append(HeldLog(track.name, *inside[k], phi, length, float(chdtrc(len(names), max(worse, 0.0)))))
     return out
 
 
@@ -1486,7 +1496,7 @@ def _relative(S: FloatArray, names: Sequence[str]) -> dict[str, float]:
 
 _MOST_SCALE = 2.5
 _MOST_INFLATION = 4.0
-_MOST_HELD = 1.5
+_MOST_HELD, _LEAST_CHANCE = 1.5, 0.01
 _MOST_RELATIVE = 0.25
 _STRONG = 0.95
 _FAR_ROWS = 0.05
@@ -1618,10 +1628,11 @@ def judge(
             out.append(Finding("poor", f"{label_of(name)} is known to {100.0 * relative:.0f} % only"))
     out += [*_of_fit(solution, known, colours), *_apart(solution, known)]
     for log in held:
-        if log.held_phi_rad > _MOST_HELD * log.fitted_phi_rad + 1e-4:
+        # A log that alone tells a parameter is predicted badly by the others, who say nothing against it.
+        if log.held_phi_rad > _MOST_HELD * log.fitted_phi_rad + 1e-4 and log.chance < _LEAST_CHANCE:
             text = (
                 f"{log.name}: held back, its angle is predicted to {1e3 * log.held_phi_rad:.3g} mrad, "
-                f"fitted to {1e3 * log.fitted_phi_rad:.3g} mrad"
+                f"fitted to {1e3 * log.fitted_phi_rad:.3g} mrad, by parameters that the other logs contradict"
             )
             out.append(Finding("poor", text))
     if solution.law:
