@@ -104,12 +104,13 @@ def _document(sections: Sections) -> dict[str, Any]:
 def _words(sections: Sections) -> list[Block]:
     """What the logs tell of each parameter, how the parameters hang together, and how well each log fits."""
     from calib.stages.actuator.identify import PARAMETERS
+    from calib.stages.actuator.section import label_of
 
     found: Identified = sections[0].evidence
     solution, known = found.solution, found.uncertainty
     rows = [
         (
-            name,
+            label_of(name),
             f"{value:.5g}",
             f"{known.sigma[name]:.2g}",
             PARAMETERS[name].unit or BLANK,
@@ -124,9 +125,12 @@ def _words(sections: Sections) -> list[Block]:
     ]
     names = solution.problem.names
     if len(names) > 1:
-        matrix = [(n, *(f"{c:+.2f}" for c in row)) for n, row in zip(names, known.correlation, strict=True)]
+        matrix = [
+            (label_of(n), *(f"{c:+.2f}" for c in row))
+            for n, row in zip(names, known.correlation, strict=True)
+        ]
         blocks.append(Table(("correlation", *(PARAMETERS[n].symbol for n in names)), tuple(matrix)))
-    blocks += [Line(f"fixed: {name}: {why}") for name, why in solution.fixed.items()]
+    blocks += [Line(f"fixed: {label_of(name)}: {why}") for name, why in solution.fixed.items()]
     held = {one.name: one for one in found.held}
     fits = []
     for track, (phi, length), colour in zip(solution.problem.tracks, found.rms, found.colours, strict=True):
@@ -154,7 +158,9 @@ def _words(sections: Sections) -> list[Block]:
         columns = ("damping of", "zeta by peaks", "sigma", "of the fit", "f, Hz", "outliers")
         blocks.append(Table(columns, tuple(peaks)))
     if found.prospects:
-        after = [(one.name, one.worst, f"{100.0 * one.worst_relative:.2g} %") for one in found.prospects]
+        after = [
+            (one.name, label_of(one.worst), f"{100.0 * one.worst_relative:.2g} %") for one in found.prospects
+        ]
         blocks.append(Table(("after one more", "least known", "relative sigma"), tuple(after)))
     return blocks
 
