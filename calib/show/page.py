@@ -57,7 +57,7 @@ def render(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["value"] = _value
+    environment.filters["numeric"] = _numeric
     text = environment.get_template(template).render(
         style="".join(_resource(name) for name in style),
         script=words,
@@ -235,7 +235,6 @@ def page_text(rig: Path) -> str:
             {
                 "section": c.section,
                 "name": c.name,
-                "value": c.value,
                 "text": number(c.value, c.sigma),
                 "unit": c.unit,
                 "sigma": c.sigma,
@@ -464,7 +463,6 @@ def _over_all(parts: list[dict[str, Any]]) -> list[Table]:
     return [Table(("log", *head), tuple(some), title) for (title, head), some in rows.items()]
 
 
-def _value(cell: str) -> float | None:
-    """The number by which a cell is sorted, None for a text."""
-    found = re.match(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?(?= ±|$)", cell)
-    return float(found[0]) if found else None
+def _numeric(cell: str) -> bool:
+    """Whether a cell is a number, or one with its deviation, and is sorted by it."""
+    return bool(re.match(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?( ±|$)", cell))
