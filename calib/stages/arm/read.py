@@ -218,8 +218,8 @@ def frame_findings(frame: Frame) -> list[Finding]:
     said = [
         Finding(
             "remark",
-            f"bends about ({x:.2f}, {y:.2f}, {z:.2f}) of the base, straight it points along "
-            f"({u:.2f}, {v:.2f}, {w:.2f}); the chord turns by {frame.leans:.2f} of the tip's angle",
+            f"bends about ({x:z.2f}, {y:z.2f}, {z:z.2f}) of the base, straight it points along "
+            f"({u:z.2f}, {v:z.2f}, {w:z.2f}); the chord turns by {frame.leans:.2f} of the tip's angle",
         )
     ]
     if math.radians(frame.planar_deg) > _TILTED_RAD:
