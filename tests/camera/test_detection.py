@@ -402,6 +402,38 @@ def _circles(rng: np.random.Generator) -> np.ndarray:
     return _seen(target, rng)
 
 
+def _spots(radius: float, square_px: float, blur_px: float, dark: bool, shape: str = "disc") -> np.ndarray:
+    """Discs of a radius in squares, or squares, where a board of 10 x 7 corners has its dark squares."""
+    fine = 8
+    pitch = square_px * fine
+    target = np.full((round(11 * pitch), round(14 * pitch)), 220, dtype=np.uint8)
+    for i, j in np.argwhere(np.indices((11, 8)).sum(axis=0) % 2 == 0):
+        centre = np.array([i + 2, j + 2]) * pitch
+        if shape == "disc":
+            cv2.circle(target, centre.astype(int).tolist(), int(radius * pitch), 30, -1)
+        else:
+            low, high = (np.rint(centre + side * pitch / 2).astype(int) for side in (-1, 1))
+            target[low[1] : high[1], low[0] : high[0]] = 30
+    height, width = target.shape
+    turn = cv2.getRotationMatrix2D((width / 2, height / 2), 7, 1)
+    turned = cv2.warpAffine(target, turn, (width, height), borderValue=220)
+    small = cv2.resize(turned, None, fx=1 / fine, fy=1 / fine, interpolation=cv2.INTER_AREA)
+    blurred = cv2.GaussianBlur(small, (0, 0), blur_px)
+    noisy = blurred + np.random.default_rng(0).normal(0, 1.5, blurred.shape)
+    picture = np.clip(noisy, 0, 255).astype(np.uint8)
+    return picture if dark else 255 - picture
+
+
+@pytest.mark.parametrize("square_px", [8, 11])
+@pytest.mark.parametrize("blur_px", [0.5, 1.0])
+def test_grids_of_round_spots_are_no_boards(square_px: float, blur_px: float) -> None:
+    """Spots that nearly touch look like corners of a board; what tells them is that their edges bulge."""
+    for dark in (True, False):
+        assert detect(_spots(0.5, square_px, blur_px, dark, "square"), 10, 7) is not None
+        for radius in (0.5, 0.56, 0.6):
+            assert detect(_spots(radius, square_px, blur_px, dark), 10, 7) is None, (radius, dark)
+
+
 def _markers(rng: np.random.Generator) -> np.ndarray:
     kinds = (cv2.aruco.DICT_4X4_50, cv2.aruco.DICT_6X6_250, cv2.aruco.DICT_APRILTAG_36h11)
     dictionary = cv2.aruco.getPredefinedDictionary(kinds[int(rng.integers(len(kinds)))])

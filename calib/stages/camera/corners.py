@@ -97,6 +97,14 @@ _NEAR, _NEAR_PX = 0.06, 1.2
 _NEAR_STEP = 0.7
 """Least step there over the step between the squares' middles. Sharpened boards, interlaced or not, have .78
 and more, spots that touch .68 and less."""
+_BULGE = 0.036
+"""Largest bulge of edges between corners, in squares, towards the same colour everywhere. Photographed
+boards, sharpened or in two tones too, have .022 and less, drawn ones of 5 px .029; drawn spots .046 and more,
+and .029 where they are filtered besides."""
+_ACROSS = 0.3
+"""How far across an edge its place is looked for, in squares."""
+_SHARP, _SHARP_AT = 0.6, 0.15
+"""Least share of the step from dark to bright within so many squares of an edge: blur makes squares round."""
 _LEAST_AMPLITUDE = 2.5
 """Grey levels."""
 _CONTINUES = 0.4
@@ -167,6 +175,34 @@ def _squares_meet(grid: Refined) -> bool:
     return step(near) > _NEAR_STEP * step(0.5)
 
 
+def _edges_bulge(grid: Refined) -> bool:
+    """Whether the edges between corners bulge, all towards dark or all towards bright, as those of spots do.
+
+    A lens bends neighbouring edges of a line alike, which is towards dark for one and towards bright for the
+    next; an exposure shifts an edge by as much at its quarters as in its middle.
+    """
+    local, image = grid.part.from_picture(grid.points), grid.part.image
+    bulges = []
+    for p in (local, local.transpose(1, 0, 2)):
+        along, across = np.diff(p, axis=1), np.gradient(p, axis=0)
+        across = 0.5 * (across[:, :-1] + across[:, 1:])
+        middles = p[:, :-1] + 0.5 * along
+        aside = np.array([-0.5, -_SHARP_AT, _SHARP_AT, 0.5])[:, None, None, None] * across
+        far, near, near_too, far_too = sample(image, middles + aside)
+        step = np.maximum(np.abs(far_too - far), 1.0)
+        if np.median(np.abs(near_too - near) / step) < _SHARP:
+            return False
+        # The share of bright across an edge says where the edge is: at the quarters and in the middle.
+        way = np.array([-0.25, 0.0, 0.25])[:, None, None, None, None] * along
+        aside = np.linspace(-_ACROSS, _ACROSS, 19)[1::2, None, None, None] * across
+        tones = (sample(image, middles + way + aside) - 0.5 * (far + far_too)) / step
+        # A sharpened edge is darker and brighter than its squares.
+        first, middle, last = np.clip(tones, -0.5, 0.5).mean(axis=1)
+        bulge = 2.0 * _ACROSS * (middle - 0.5 * (first + last))
+        bulges.append(float(np.median(bulge)))
+    return min(bulges) > _BULGE or max(bulges) < -_BULGE
+
+
 def fault_of(gray: GrayImage, grid: Refined) -> str | None:
     """What speaks against a grid being a checkerboard, in a few words; None when nothing does."""
     height, width = gray.shape
@@ -187,6 +223,8 @@ def fault_of(gray: GrayImage, grid: Refined) -> str | None:
         return "a folded grid"
     if min(shape) >= 2 and not _squares_are_plain(grid):
         return "squares that are not plain"
+    if min(shape) >= 2 and _edges_bulge(grid):
+        return "round spots"
     return None
 
 
