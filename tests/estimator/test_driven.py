@@ -575,6 +575,20 @@ def test_what_was_identified_together_starts_together() -> None:
     assert np.all(np.linalg.eigvalsh(P) > 0.0)
 
 
+def test_smoothed_angles_of_a_swing_are_as_sure_as_they_say_from_its_beginning() -> None:
+    """The first times of a log are uncertain; taken as exact they belie the gyroscope in a fast swing."""
+    squares = []
+    for seed in (1, 2, 12, 22):
+        rig, log = driven_log("swing", seed)
+        setup, rows, pwm = setup_for(rig, seed), rows_from(log), commands_of(log)
+        filtered = DrivenFilter(setup, Drive()).run(rows, pwm)
+        smoothed = driven_smoother.smooth_driven(setup, Drive(), rows, pwm, filtered)
+        early = (rows.t_s > 0.2) & (rows.t_s < 1.0)
+        z = (smoothed[early, 5] - truth(log)[early, 2]) / smoothed[early, 12]
+        squares.append(np.mean(z**2))
+    assert np.mean(squares) < 1.5
+
+
 @pytest.mark.parametrize("name", ["elongation", "step"])
 def test_smoothing_lessens_the_error(name: str) -> None:
     figures = []
@@ -678,6 +692,15 @@ def test_what_was_identified_together_stays_together() -> None:
     bending = PARAMETER.index("bending")
     assert np.count_nonzero(drive.covariance[bending]) == 1
     assert drive.sigma[bending] == Drive().sigma[bending]
+
+
+def test_what_each_value_has_for_itself_is_a_share_of_it_and_no_length() -> None:
+    told = {"stiffness_scale": 0.022, "rest_length_m": 3e-4}
+    values = np.outer([*told.values()], [*told.values()]) * [[1.0, 0.3], [0.3, 1.0]]
+    table = {"order": list(told), "values": values.tolist()}
+    section = {"verdict": "ok", "stiffness_scale": 1.1, "rest_length_m": 0.0652}
+    rig = Rig.of({"schema": 2, "actuator": {**section, "sigma": told, "covariance": table}}, "rig.yaml")
+    assert drive_from_rig(rig).sigma[PARAMETER.index("rest_length_m")] == pytest.approx(3e-4)
 
 
 def test_a_log_with_commands_tunes_the_driven_model_too(

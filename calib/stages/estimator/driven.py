@@ -1477,15 +1477,13 @@ def _timeline(
     forces = commands(drive, pwm)
     ticks = rows.t_s.copy()
     camera = np.nonzero(rows.kinds & 1)[0]
-    ticks[camera] = even_times(new_clock(setup.camera_period_s), rows.t_s[camera])
+    ticks[camera] = even_times(new_clock(setup.camera_period_s), rows.t_s[camera])[0]
     given = np.isfinite(forces[:, 0])
     action = drive.pump.delay_ticks * drive.pump.tick_s
     switch_t, switch_g = _switches(
         ticks[given] + action, forces[given], setup.command_period_s, drive.pump.lag_s
     )
-    t, kinds, at = events.t_s, events.kinds, events.rows
-    readings = np.full((len(t), 4), 0.0)
-    readings[:, :3] = events.readings
+    t, kinds, at, readings = events.t_s, events.kinds, events.rows, events.readings
     extra_t, extra_kind = [np.zeros(0)], [np.zeros(0, dtype=np.int64)]
     driven = np.nonzero(np.nan_to_num(pwm).max(axis=1, initial=0.0) > 0.0)[0]
     if len(driven):

@@ -407,12 +407,13 @@ def advance_again(clock: FloatArray, stamp: float) -> float:
 
 
 @kernel()
-def even_times(clock: FloatArray, stamps: FloatArray) -> FloatArray:
-    """Times (n,) of samples with these stamps (n,) [s], each from the stamps up to its own."""
-    out = np.empty(len(stamps))
+def even_times(clock: FloatArray, stamps: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Times (n,) and their variances of samples with these stamps (n,) [s], from the stamps up to each."""
+    out, variance = np.empty(len(stamps)), np.empty(len(stamps))
     for i in range(len(stamps)):
         out[i] = advance(clock, stamps[i])
-    return out
+        variance[i] = clock[3]
+    return out, variance
 
 
 # ----------------------------------------------------------------------

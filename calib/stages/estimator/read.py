@@ -458,7 +458,8 @@ def _driving_covariance(
     correlation = 0.5 * (together + together.T) / np.outer(spread, spread)
     deviations = np.array([sigma[name] for name in names])
     out[np.ix_(places, places)] = correlation * np.outer(deviations, deviations)
-    out[places, places] += _APART**2
+    shares = [place for place in places if PARAMETER[place] != "rest_length_m"]
+    out[shares, shares] += _APART**2
     return np.asarray(out)
 
 

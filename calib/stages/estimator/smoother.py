@@ -66,7 +66,8 @@ class Events:
 
     Attributes
     ----------
-    t_s : (n,). kinds : (n,) 0 for a row of the output, else of `kernel`. readings : (n, 3).
+    t_s : (n,). kinds : (n,) 0 for a row of the output, else of `kernel`. readings : (n, 4), the last one the
+        variance of the time [s^2].
     rows : (n,) the row of the log.
     """
 
@@ -82,17 +83,18 @@ def events_of(setup: Setup, rows: Rows, outputs: bool = True) -> Events:
     Stamps run through the clocks, which do not look ahead.
     """
     camera, imu = np.nonzero(rows.kinds & 1)[0], np.nonzero(rows.kinds & 2)[0]
-    exposed = even_times(new_clock(setup.camera_period_s), rows.t_s[camera])
+    exposed, camera_s2 = even_times(new_clock(setup.camera_period_s), rows.t_s[camera])
     exposed = exposed - max(float(setup.start.sensor[7]), 0.0)
-    taken = even_times(new_clock(setup.imu_period_s), rows.t_s[imu])
+    taken, imu_s2 = even_times(new_clock(setup.imu_period_s), rows.t_s[imu])
     seen = np.isfinite(rows.readings[camera, :2]).all(axis=1)
     camera, exposed = camera[seen], exposed[seen]
-    pixels = np.full((len(camera), 3), np.nan)
-    pixels[:, :2] = rows.readings[camera, :2]
+    pixels = np.full((len(camera), 4), np.nan)
+    pixels[:, :2], pixels[:, 3] = rows.readings[camera, :2], camera_s2[seen]
+    samples = np.column_stack([rows.readings[imu, 2:], imu_s2])
     every = np.arange(len(rows)) if outputs else np.zeros(0, dtype=np.int64)
     t = np.concatenate([exposed, taken, rows.t_s[every]])
     kinds = np.repeat([1, 2, 0], [len(camera), len(imu), len(every)])
-    readings = np.concatenate([pixels, rows.readings[imu, 2:], np.full((len(every), 3), np.nan)])
+    readings = np.concatenate([pixels, samples, np.full((len(every), 4), np.nan)])
     order = np.argsort(t, kind="stable")
     return Events(t[order], kinds[order], readings[order], np.concatenate([camera, imu, every])[order])
 
