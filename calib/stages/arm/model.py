@@ -242,7 +242,7 @@ class Trial:
 
 
 @kernel()
-def _nozzle(ratio):  # type: ignore[no-untyped-def]
+def _nozzle(ratio: float) -> float:
     """psi of ISO 6358 at a ratio of absolute pressures."""
     if ratio >= 1.0:
         return 0.0
@@ -251,7 +251,7 @@ def _nozzle(ratio):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _valve(command, start_kpa, q, step_s):  # type: ignore[no-untyped-def]
+def _valve(command: FloatArray, start_kpa: float, q: FloatArray, step_s: float) -> FloatArray:
     rate, drains, overlap, opening, supply, exhaust, source, line, ratio, leak, input_s = q
     out = np.empty(len(command))
     outlet = chamber = start_kpa
@@ -286,7 +286,7 @@ def _valve(command, start_kpa, q, step_s):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _lag(command, start_kpa, q, step_s):  # type: ignore[no-untyped-def]
+def _lag(command: FloatArray, start_kpa: float, q: FloatArray, step_s: float) -> FloatArray:
     level, rises_s, falls_s = q
     out = np.empty(len(command))
     pressure = start_kpa
@@ -298,7 +298,9 @@ def _lag(command, start_kpa, q, step_s):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _segment(pressure, angle, chord, q, moment, step_s):  # type: ignore[no-untyped-def]
+def _segment(
+    pressure: FloatArray, angle: float, chord: float, q: FloatArray, moment: float, step_s: float
+) -> FloatArray:
     rest, linear, fill, lag, stiffens, stop, reach, creep, creep_s, vented, settling_s, sooner = q[:12]
     compliance, c0, c1, c2 = q[12:]
     out = np.empty((len(pressure), 2))

@@ -287,5 +287,6 @@ def tracks_of(
             )
         else:
             told(f"{log.source}: running {name}")
+            # mypy takes the type of a lambda's default from nowhere.
             add(name, lambda part, name=name: _turning(run_peer(name, *three(part, axes), period_s)))  # type: ignore[misc]
     return found, skipped
