@@ -6,6 +6,7 @@ import os
 import socket
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,16 @@ def _listening() -> list[Any]:
     return [one for process in ours for one in process.net_connections() if one.status == "LISTEN"]
 
 
+def _workers() -> list[psutil.Process]:
+    found = []
+    for child in psutil.Process().children():
+        # One that ends meanwhile is none.
+        with suppress(psutil.NoSuchProcess):
+            if "spawn_main" in "".join(child.cmdline()):
+                found.append(child)
+    return found
+
+
 def test_one_task_takes_no_other_with_it(tmp_path: Path) -> None:
     """One dies once, one each time, one raises, and one holds the interpreter beyond its time."""
     before = _listening()
@@ -43,7 +54,7 @@ def test_one_task_takes_no_other_with_it(tmp_path: Path) -> None:
             Task("last", pool_tasks.scratch, ()),
         )
         assert _listening() == before, "a port is a door for all users of the machine"
-        children = psutil.Process().children()
+        workers = _workers()
     assert found == {
         "first": str(tmp_path),
         "dies": Failure("died"),
@@ -53,7 +64,7 @@ def test_one_task_takes_no_other_with_it(tmp_path: Path) -> None:
         "last": str(tmp_path),
     }
     assert isinstance(found["raises"].error, ValueError) and "in fail" in found["raises"].error.__notes__[0]
-    assert not any(child.is_running() for child in children if "spawn_main" in "".join(child.cmdline()))
+    assert not any(worker.is_running() for worker in workers)
 
 
 _PARENT = """
