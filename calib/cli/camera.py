@@ -97,7 +97,6 @@ def export_camera(
     as_json: JsonOption = False,
 ) -> None:
     """Write the camera as ROS camera_info, OpenCV FileStorage or Kalibr camchain, the IMU as imu.yaml."""
-
     kind = _kind_of(to)
     if output is not None:
         note_inputs([rig])

@@ -111,5 +111,4 @@ def progress_bar(label: str) -> Iterator[ProgressCall]:
 
 def table(head: list[str], rows: list[list[str]]) -> list[str]:
     """Lines of a table, the first column to the left and the others to the right."""
-
     return as_text([Table(tuple(head), tuple(map(tuple, rows)))], sys.maxsize)

@@ -92,7 +92,6 @@ def _tell(found: RigDiff, every: bool) -> None:
 
 
 def _row(change: Change) -> list[str]:
-
     assert change.before is not None and change.after is not None
     return [
         f"{change.section}.{change.name}",

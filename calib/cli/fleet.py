@@ -176,7 +176,6 @@ _MOST_TOLD = 20
 
 
 def _tell_fleet(summary: FleetSummary, as_before: int, output: Path) -> None:
-
     words = ", ".join(f"{count} {verdict}" for verdict, count in summary.verdicts.items())
     say(f"{summary.rigs} rigs: {words}" + (f"; {as_before} as before" if as_before else ""))
     rows = []

@@ -29,7 +29,6 @@ class _Port:
     """A serial port of this computer, as `calib.io.experiments.Port`."""
 
     def __init__(self, name: str, baud: int) -> None:
-
         try:
             import serial
         except ModuleNotFoundError as error:
@@ -80,7 +79,6 @@ def record(
     The latter with --do. What comes is written as it comes. Without --do a board that restarts begins
     another log beside the first.
     """
-
     duration_s = None if duration is None else parse_duration_s(duration, "--duration")
     if do is None:
         _ticks(port, output, duration_s, ticks, baud, as_json)
@@ -190,7 +188,6 @@ def _writer(stream: BinaryIO) -> Callable[[str], None]:
 
 def _complete(path: Path, seconds: float) -> bool:
     """Whether a log is there. Raises `BadInputError` for one that was cut."""
-
     if not path.is_file():
         return False
     try:
@@ -206,7 +203,6 @@ def _complete(path: Path, seconds: float) -> bool:
 
 
 def _must_be_new(output: Path) -> None:
-
     if output.is_file() and output.stat().st_size:
         raise BadInputError(
             f"{shown(output)}: is there, and a recording cannot be made again; give another name, or move it"

@@ -73,7 +73,6 @@ def run(
 
 
 def _tell(ended: Sequence[Job], files: Sequence[str], output: Path) -> None:
-
     rows = [[job.label, job.status, "as before" if job.reused else ""] for job in ended]
     for line in table(["stage", "", ""], rows):
         say(line)

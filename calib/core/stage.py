@@ -110,7 +110,6 @@ class Files:
 
     def taken(self, path: Path) -> str:
         """Note that a file is an input; its name without folders, the same wherever the folder lies."""
-
         name = shown(path.name)
         if name in self.hashes:
             name = f"{name} ({len(self.hashes) + 1})"
@@ -234,7 +233,6 @@ class Stage:
 
     def verdict(self, outcome: Any) -> Verdict:
         """All findings on an outcome."""
-
         judged = self.results(outcome) or [outcome]
         return Verdict.of(finding for one in judged for finding in one.verdict.findings)
 
@@ -255,7 +253,6 @@ class Stage:
 
     def blocks(self, outcome: Any) -> list[Block]:
         """An outcome in words, for the terminal and the page."""
-
         told = [] if self.words is None else list(self.words(outcome))
         return [*told, *(block for one in self.results(outcome) for block in described(one))]
 

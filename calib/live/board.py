@@ -29,6 +29,12 @@ PROGRAMME = {
     "deflate": "Commands up, then off, and the hoses on.",
 }
 """What is to be done for each recording; how long it takes is in `calib.io.experiments`."""
+
+
+def _duration(name: str) -> str:
+    return f"{EXPERIMENTS[name].seconds:g}s"
+
+
 SERIES = {
     "marker (px)": ("u_px", "v_px"),
     "angle (rad)": ("board_phi_rad",),
@@ -72,15 +78,7 @@ class Board:
             self.path, self.last = self.album.new_log(name), ""
             self._heads, self._read = [], 0
             self._rows.clear()
-        words = [
-            "record",
-            self.port,
-            "-o",
-            str(self.path),
-            "--duration",
-            f"{EXPERIMENTS[name].seconds:g}s",
-            "--json",
-        ]
+        words = ["record", self.port, "-o", str(self.path), "--duration", _duration(name), "--json"]
         self._process = subprocess.Popen(
             [sys.executable, "-m", "calib", *words],
             stdin=subprocess.DEVNULL,
@@ -162,9 +160,7 @@ class Board:
         ]
         return {
             "port": self.port,
-            "programme": [
-                [name, f"{EXPERIMENTS[name].seconds:g}s", what] for name, what in PROGRAMME.items()
-            ],
+            "programme": [[name, _duration(name), what] for name, what in PROGRAMME.items()],
             "recording": self.path.name if self.path is not None and self.at_work else None,
             "seconds": None if end is None else round(end, 1),
             "last": self.last,

@@ -301,8 +301,9 @@ def _counted(t: FloatArray, i: IntArray, period: float, uneven: float) -> FloatA
         k[done:end] = counted[done - since :]
         if done:
             k[done:end] += max(k[done - 1] + i[done] - i[done - 1] - k[done], 0.0)
-        off = t[done:end] - origin - period * k[done:end]
-        if chunk > _FIRST and abs(float(np.median(off[-_WINDOW:]))) > uneven * period:
+        last = slice(max(end - _WINDOW, done), end)
+        off = t[last] - origin - period * k[last]
+        if chunk > _FIRST and abs(float(np.median(off))) > uneven * period:
             # The clock bends: it is looked less far ahead, from a line that reaches less far back.
             chunk //= 2
             recent = slice(max(done - 2 * chunk, 0), done)
@@ -335,10 +336,11 @@ def _without_steps(k: FloatArray, off: FloatArray) -> FloatArray:
 
     Where its jitter is small, what a clock wanders is followed closely enough to hide such steps.
     """
-    spread = 1.4826 * float(np.median(np.abs(off - _running_median(off))))
+    middle, half = _running_median(off), _WINDOW // 2
+    spread = 1.4826 * float(np.median(np.abs(off - middle)))
     if len(k) < 2 * _WINDOW or _FAR * spread > 0.5:
         return k
-    medians = np.median(np.lib.stride_tricks.sliding_window_view(off, _WINDOW), axis=1)
+    medians = middle[half:-half]
     step = medians[_WINDOW:] - medians[:-_WINDOW]
     here = np.diff(off)[_WINDOW - 1 :][: len(step)]
     k, last = k.copy(), 0

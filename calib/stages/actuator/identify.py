@@ -1080,7 +1080,7 @@ def held_back(solution: Solution) -> list[HeldLog]:
         less = replace(problem, tracks=others, names=names, held=found)
         start = _taken_over(solution, less)
         x, cost, _, _ = solve(less, start, 15)
-        worse = 2.0 * (float(_robust(jacobian(less, start)[0])) - cost) / raised**2
+        worse = 2.0 * (float(_robust(residuals(less, start[None]))[0]) - cost) / raised**2
         alone = replace(problem, tracks=[track], names=(), held={**found, **less.values(x)})
         _, _, residual, _ = solve(alone, _taken_over(solution, alone), 15)
         (phi, length) = rms_by_track(alone, residual)[0]

@@ -43,7 +43,6 @@ class LogsOptions(PoseOptions):
 
 def _with_states(files: Files, options: PoseOptions) -> list[tuple[Path, Path | None]]:
     """Logs with their states. Raises `UsageError` where these are not one for each, or not to be used."""
-
     states = expanded(options.states)
     if not states:
         return [(path, None) for path in files.paths]
@@ -197,7 +196,6 @@ logs = Stage(
 
 
 def _cell(value: float | None, form: str = ".3g") -> str:
-
     return BLANK if value is None or value != value else f"{value:{form}}"
 
 
@@ -392,7 +390,6 @@ def _stiffness_document(section: Actuator) -> dict[str, Any]:
 
 
 def _stiffness_words(section: Actuator) -> list[Block]:
-
     found: Springs = section.evidence
     rows = []
     for k, fit in enumerate(found.fits):
@@ -536,7 +533,6 @@ def _log_json(one: Comparison) -> dict[str, Any]:
 
 
 def _validate_words(outcome: Validated) -> list[Block]:
-
     if outcome.held is not None:
         from calib.stages.arm.identify import QUANTITIES
 

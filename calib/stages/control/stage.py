@@ -190,7 +190,6 @@ def _run_document(runs: Runs) -> dict[str, Any]:
 
 
 def _run_words(runs: Runs) -> list[Block]:
-
     def cell(value: float | None, digits: int) -> str:
         return BLANK if value is None or math.isnan(value) else f"{value:.{digits}f}"
 

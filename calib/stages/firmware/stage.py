@@ -41,7 +41,6 @@ class FirmwareInputs:
 
 
 def _read(files: Files, rig: Rig, options: FirmwareOptions) -> FirmwareInputs:
-
     source = shown(files.rig_path)
     if options.check is None:
         return FirmwareInputs(rig, source)

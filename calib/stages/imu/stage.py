@@ -54,7 +54,6 @@ def _write_kalibr(files: Files, imu: Imu) -> list[Path]:
 
 
 def _static_words(imu: Imu) -> list[Block]:
-
     del imu
     return [
         Line("± is one standard deviation, < a 95 % bound where the logs are too short for an estimate"),
@@ -160,7 +159,6 @@ class TuneOptions(LogOptions):
 
 
 def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
-
     from calib.core.result import identity
     from calib.io.logs import read_log
     from calib.stages.imu.read import Reading, sensor_noise, tune_log
@@ -193,7 +191,6 @@ def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
 
 
 def _tune_words(section: OrientationFilter) -> list[Block]:
-
     del section
     return [
         Line("noise: variance of the angle over that of the accelerometer's; peak: angle per rate's bias"),
@@ -265,7 +262,6 @@ def _drift_document(result: Drift) -> dict[str, Any]:
 
 def _drift_words(result: Drift) -> list[Block]:
     """A table of the methods for each log, then the slopes over all."""
-
     blocks: list[Block] = []
     for log in result.logs:
         blocks.append(

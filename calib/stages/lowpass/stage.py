@@ -146,7 +146,6 @@ def positions_from_log(
 
 
 def _read(files: Files, rig: Rig, options: Options) -> Inputs:
-
     from calib.core.result import identity
     from calib.core.rig import Geometry
     from calib.io.logs import read_log
@@ -339,7 +338,6 @@ def _of_log(made: Filter, positions: Positions | None) -> Iterator[Finding]:
 
 def _words(result: LowPass) -> list[Block]:
     """The filters that a log leaves to choose from."""
-
     evidence: Evidence = result.evidence
     choice = evidence.choice
     if choice is None:
