@@ -17,6 +17,7 @@ from typing import Any, ParamSpec, TypeVar, cast
 from numba import njit
 from numba.core import config, event
 from numba.core.caching import FunctionCache
+from numba.core.types import unliteral
 
 from calib.core.writing import try_lock
 
@@ -158,6 +159,10 @@ def kernel(
 
     def compiled(function: Callable[_Parameters, _Returned]) -> Callable[_Parameters, _Returned]:
         made = njit(**options)(function)
+        template = made.get_call_template
+        # A constant in a call is a value like any other: numba would compile the function anew for each.
+        plain: Callable[[Any], Any] = unliteral
+        made.get_call_template = lambda types, named: template([plain(one) for one in types], named)
         # What `cache=True` does, with our own cache; there is none where no folder can be written.
         with contextlib.suppress(RuntimeError):
             made._cache = _CompiledOnce(function)

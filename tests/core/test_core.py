@@ -332,3 +332,19 @@ def test_of_two_processes_that_need_a_function_one_compiles_it(tmp_path: Path) -
     assert [one.returncode for one in both] == [0, 0]
     assert sorted(told) == ["", "compiled\n"]
     assert not list(tmp_path.rglob("*.lock"))
+
+
+def test_constants_in_calls_are_compiled_once() -> None:
+    program = (
+        "from calib.core.compilation import kernel\n"
+        "@kernel(arrays=False)\n"
+        "def scaled(value, twice):\n"
+        "    return 2.0 * value if twice else value\n"
+        "@kernel(arrays=False)\n"
+        "def both(value):\n"
+        "    return scaled(value, True) + scaled(value, False) + scaled(value, value > 0.0)\n"
+        "assert both(1.0) == 5.0\n"
+        "print(len(scaled.signatures))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "1\n"
