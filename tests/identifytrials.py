@@ -85,8 +85,10 @@ def varied(seed: int) -> tuple[SimulatedRig, dict[str, float]]:
     late_s = float(rng.uniform(0.015, 0.035))
     truth["rest_length_m"] = 0.065 + 5e-4 * float(rng.standard_normal())
     rig = SimulatedRig()
+    truth["inertia_kgm2"] = rig.plant.inertia_kgm2 * float(rng.uniform(0.92, 1.08))
     plant = replace(
         rig.plant,
+        inertia_kgm2=truth["inertia_kgm2"],
         rest_length_m=truth["rest_length_m"],
         stiffness_scale=truth["stiffness_scale"],
         damping_scale=truth["damping_scale_pumps_connected"],

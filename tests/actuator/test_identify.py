@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from calib.core.options import PoseOptions
 from calib.core.stage import Files
 from calib.io.logs import Log, read_log, write_log
 from calib.stages.actuator.identify import (
+    PARAMETERS,
     Problem,
     Solution,
     Start,
@@ -117,9 +119,10 @@ def test_what_a_person_states_is_fixed_or_a_prior() -> None:
     assert table.sigma["mass_kg"] == pytest.approx(0.05 * 0.0166, rel=0.05)
     turning = 0.25 * nominal.plant.mass_kg * nominal.plant.rest_length_m**2
     share = turning / (turning + nominal.plant.inertia_kgm2)
-    assert table.sigma["stiffness_scale"] == pytest.approx(0.05 * 1.15 * share, rel=0.1)
+    doubted = math.hypot(0.05 * share, PARAMETERS["inertia_kgm2"].share * (1.0 - share))
+    assert table.sigma["stiffness_scale"] == pytest.approx(1.15 * doubted, rel=0.05)
     both = [doubt.problem.names.index(name) for name in ("mass_kg", "stiffness_scale")]
-    assert table.correlation[both[0], both[1]] > 0.95
+    assert table.correlation[both[0], both[1]] == pytest.approx(0.05 * share / doubted, abs=0.02)
 
 
 NAMES = (
@@ -237,9 +240,9 @@ def test_coloured_residuals_raise_the_deviations(solution: Solution) -> None:
 
 
 def test_deviations_are_those_of_repeated_logs() -> None:
-    """Of one rig: by what two rigs differ in their length at rest does not scatter from log to log."""
+    """Of one rig: by what two rigs differ in length at rest and inertia does not scatter from log to log."""
     tracks = [track("free", phi_rad=phi, seed=k) for k, phi in enumerate((0.5, -0.4))]
-    solution = fit_tracks(Machine(), tracks, threads=1, stated={"rest_length_m": 0.0})
+    solution = fit_tracks(Machine(), tracks, threads=1, stated={"rest_length_m": 0.0, "inertia_kgm2": 0.0})
     found = []
     for seed in range(12):
         tracks = [track("free", phi_rad=phi, seed=50 + 2 * seed + k) for k, phi in enumerate((0.5, -0.4))]
@@ -360,11 +363,14 @@ def test_recovery_with_the_pumps_connected(tmp_path: Path) -> None:
     assert np.abs(z).max() < 3.0
 
 
-@pytest.mark.parametrize("law", [RateLimit(0.35), Orifice(0.9, 1.3)])
-def test_the_law_of_deflation_is_found(law: RateLimit | Orifice, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("law", "seed"), [(RateLimit(0.35), 1), (Orifice(0.9, 1.3), 1), (Orifice(0.9, 1.3), 3)]
+)
+def test_the_law_of_deflation_is_found(law: RateLimit | Orifice, seed: int, tmp_path: Path) -> None:
+    """Seed 3 from the limited rate alone: springs of .26, turbulence of 4.2 +- .5."""
     rig_yaml = tmp_path / "rig.yaml"
     known = rig_file(rig_yaml)
-    rig, _ = varied(1)
+    rig, _ = varied(seed)
     rig = replace(rig, pump=replace(rig.pump, deflation=law))
     path = log_file(tmp_path / "deflate.csv", rig, "deflate", 1, 12.0)
     tracks = [read_track(Files((path,), rig_yaml), path, known, Machine(), PoseOptions())]

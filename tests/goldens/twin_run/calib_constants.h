@@ -81,7 +81,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x71E8CBB9UL
+#define CALIB_ID 0x02AEA8D4UL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 1 /* 0: a section that they come from is not ok */
@@ -223,7 +223,7 @@
  * f = F0 + F1 phi^2 + F2 phi^4 + F3 phi^6; bellows 1 is the longer one for phi > 0.
  */
 #define CALIB_BELLOWS_RADIUS_M 0.0126f /* r_B, m */
-#define CALIB_REST_LENGTH_M 0.0649773329f /* l0, m; length until the first picture */
+#define CALIB_REST_LENGTH_M 0.0649772957f /* l0, m; length until the first picture */
 #define CALIB_INVERSE_F0_PER_RAD0 2.0f /* coefficient of phi^0 (3.14), 1/rad^0 */
 #define CALIB_INVERSE_F1_PER_RAD2 0.0833333358f /* coefficient of phi^2 (3.14), 1/rad^2 */
 #define CALIB_INVERSE_F2_PER_RAD4 0.00243055564f /* coefficient of phi^4 (3.14), 1/rad^4 */
@@ -238,20 +238,20 @@
  */
 #define CALIB_HAS_FUSED 1 /* for #if */
 #define CALIB_FUSED_DELAY_TICKS 1.51403821f /* D, ticks from the exposure of a picture to its tick */
-#define CALIB_FUSED_ACCEL_11 0.000255561579f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_12 4.83814665e-06f /* row 1, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_1 1.53764213e-05f /* row 1, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_21 -4.82155656e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_22 0.000256440922f /* row 2, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_2 -9.11295865e-06f /* row 2, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_GAIN 0.00251231785f /* K_a, share of the accelerometer's residual */
-#define CALIB_FUSED_ACCEL_WEAK 0.000256097643f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
+#define CALIB_FUSED_ACCEL_11 0.000255561928f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_12 4.83815302e-06f /* row 1, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_1 1.53764413e-05f /* row 1, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_21 -4.82156292e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_22 0.000256441272f /* row 2, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_2 -9.11297047e-06f /* row 2, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_GAIN 0.00251232111f /* K_a, share of the accelerometer's residual */
+#define CALIB_FUSED_ACCEL_WEAK 0.000256097963f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
 #define CALIB_FUSED_HALF_DT_S 0.00827013142f /* dt / 2 over the gyroscope's scale, s */
 #define CALIB_FUSED_HALF_BIAS_RAD 4.96005559e-05f /* bias times the same, rad */
-#define CALIB_FUSED_PHI_PER_M 0.37379837f /* K_c / lever, rad/m */
-#define CALIB_FUSED_ALONE_PHI_PER_M 5.26443672f /* the same without the IMU, rad/m */
-#define CALIB_FUSED_BOOST_PHI_PER_M 10.5288734f /* the same after a start, rad/m */
-#define CALIB_FUSED_BIAS 0.0025249098f /* K_b, share of the correction */
+#define CALIB_FUSED_PHI_PER_M 0.373798341f /* K_c / lever, rad/m */
+#define CALIB_FUSED_ALONE_PHI_PER_M 5.26443863f /* the same without the IMU, rad/m */
+#define CALIB_FUSED_BOOST_PHI_PER_M 10.5288773f /* the same after a start, rad/m */
+#define CALIB_FUSED_BIAS 0.00252490956f /* K_b, share of the correction */
 #define CALIB_FUSED_MOVING_LENGTH 0.188074499f /* K_m, dimensionless */
 #define CALIB_FUSED_MOVING_RATE 0.00686674193f /* K_v, per tick */
 #define CALIB_FUSED_REST_LENGTH 0.0090456102f /* K_r, dimensionless */
@@ -310,19 +310,19 @@
 #define CALIB_FF_SLOPE_PWM_PER_M 5498.1001f /* PWM/m */
 #define CALIB_FF_MINUS_PWM 258.372711f /* SLOPE FROM less the value there, PWM */
 #define CALIB_FF_LIMIT_PWM 255.0f /* largest value, PWM */
-#define CALIB_FF_TABLE_FROM_M 0.0649773329f /* length of the first entry, m */
+#define CALIB_FF_TABLE_FROM_M 0.0649772957f /* length of the first entry, m */
 #define CALIB_FF_TABLE_PER_STEP 500.0f /* entries per metre, 1/m */
 #define CALIB_FF_TABLE_SIZE 15 /* entries */
 /* PWM that holds a bellows at FROM + 0.002 m times the index */
 static const float calib_ff_table_pwm[15] CALIB_IN_FLASH = {
-    99.75f, 128.243576f, 139.740936f, 149.177795f, 157.614853f, 165.528915f,
-    173.172791f, 180.705002f, 188.291595f, 196.099365f, 204.340286f, 213.385101f,
-    224.052399f, 241.444183f, 253.5f,
+    99.75f, 128.243576f, 139.740936f, 149.177811f, 157.614853f, 165.528931f,
+    173.172806f, 180.705017f, 188.291595f, 196.099365f, 204.340302f, 213.385117f,
+    224.052429f, 241.444244f, 253.5f,
 };
 
 /* Envelope, see calib_guard.h: the pumps stop where the actuator leaves it. */
-#define CALIB_ENVELOPE_LEAST_M 0.0449773334f /* shortest length of a bellows, m */
-#define CALIB_ENVELOPE_GREATEST_M 0.114977337f /* longest length of a bellows, m */
+#define CALIB_ENVELOPE_LEAST_M 0.0449772961f /* shortest length of a bellows, m */
+#define CALIB_ENVELOPE_GREATEST_M 0.114977293f /* longest length of a bellows, m */
 #define CALIB_ENVELOPE_ANGLE_RAD 1.5f /* greatest bending to each side, rad */
 #define CALIB_ENVELOPE_STEP_M 0.00833333377f /* greatest change of a length in a tick, m; 0.5 m/s */
 #define CALIB_ENVELOPE_FULL_TICKS 180 /* ticks that a pump may stay at its greatest command */
