@@ -6,14 +6,14 @@
     logs/*.csv                                rig in motion
     truth.json                                all that is true of the rig, for scoring only
 
-With the nominal camera and plane the pictures are the shipped ones.
+With the nominal camera and plane, and the seed 0, the pictures are the shipped ones.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,9 @@ from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.scene import PrintedBoard, corner_pixels
 from calib.twin.sensors import View
 from calib.twin.simulate import log_of
+
+_PICTURES_SEEDS = 10_000
+"""From one seed to the next, for the pictures' noise; those of one folder lie below it."""
 
 LOGS: dict[str, tuple[str, dict[str, str]]] = {
     "static1": ("static", {}),
@@ -88,7 +91,8 @@ def write_rig_folder(
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise BadInputError(f"{shown(folder)}: is there already, expected a new or an empty folder")
         (folder / "logs").mkdir(parents=True, exist_ok=True)
-        write_pictures(folder / "images", rig.view.camera, _views(rig.view))
+        taken = [replace(shot, seed=shot.seed + _PICTURES_SEEDS * seed) for shot in _views(rig.view)]
+        write_pictures(folder / "images", rig.view.camera, taken)
     except OSError as error:
         raise BadInputError(f"{shown(folder)}: cannot be written: {error.strerror or error}") from error
     written = []

@@ -98,6 +98,13 @@ def test_the_folder_holds_pictures_plane_and_logs(tmp_path: Path, project_root: 
     again = tmp_path / "again"
     write_rig_folder(again, RIG)
     assert _hashes(again) == _hashes(tmp_path / "rig")
+    write_rig_folder(tmp_path / "other", RIG, seed=1)
+    both = [
+        {path: one for path, one in _hashes(tmp_path / name).items() if path.endswith((".png", ".csv"))}
+        for name in ("rig", "other")
+    ]
+    assert both[0].keys() == both[1].keys()
+    assert not set(both[0].values()) & set(both[1].values())
 
 
 @pytest.mark.slow
