@@ -239,6 +239,20 @@ def test_coloured_residuals_raise_the_deviations(solution: Solution) -> None:
     assert not any(colour.white for colour in colour_of(again))
 
 
+def test_residuals_that_last_for_seconds_count_as_few(
+    solution: Solution, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As where the pumps have a play, which the model does not know."""
+    slow = [np.sin(0.6 * np.pi * one.t_s)[:, None] * np.ones(2) for one in solution.problem.tracks]
+    priors = np.zeros(len(solution.problem.unknowns.priors))
+    lasting = replace(solution, residual=np.concatenate([*(one.ravel() for one in slow), priors]))
+    raised = uncertainty(lasting).inflation
+    monkeypatch.setattr("calib.stages.actuator.identify._LONGEST_S", 0.0)
+    briefly = uncertainty(lasting).inflation
+    assert all(raised[name] >= briefly[name] for name in raised)
+    assert max(raised[name] / briefly[name] for name in raised) > 1.3
+
+
 def test_deviations_are_those_of_repeated_logs() -> None:
     """Of one rig: by what two rigs differ in length at rest and inertia does not scatter from log to log."""
     tracks = [track("free", phi_rad=phi, seed=k) for k, phi in enumerate((0.5, -0.4))]

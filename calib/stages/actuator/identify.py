@@ -992,11 +992,14 @@ def _alike(cost: float) -> float:
 #
 #     H^-1 (sum_k w_k sum_i g_i g_(i+k)^T) H^-1,   g_i the gradient of row i, w_k = 1 - |k| / (L + 1)
 #
-# (Newey and West) holds, with the lags L of a third of a second. It scatters itself, so of it and the white
-# one the larger variance is taken for each parameter; their ratio says how far colour has inflated it.
+# (Newey and West) holds, with lags L of a third of a second or, where residuals stay alike for longer, up to
+# the first at which they do not. It scatters itself, so of it and the white one the larger variance is taken
+# for each parameter; their ratio says how far colour has inflated it.
 
-_SPAN_S = 0.35
+_SPAN_S, _LONGEST_S = 0.35, 10.0
 _LAGS = 20
+_BAND = 1.96
+"""Of the correlation of white residuals, over the root of their number."""
 
 
 @dataclass(frozen=True)
@@ -1061,6 +1064,15 @@ def _spans(tracks: Sequence[Track]) -> list[slice]:
     return out
 
 
+def _autocorrelation(residual: FloatArray, lags: int) -> FloatArray:
+    """Of a log's residuals (rows,), of angle and length (lags, 2) from lag 1 on; far ones are cut."""
+    r = residual.reshape(-1, 2)
+    z = np.clip(r / np.maximum(1.4826 * np.median(np.abs(r), axis=0), 1e-9), -3.0, 3.0)
+    z = z - z.mean(axis=0)
+    power = np.maximum(np.sum(z * z, axis=0), 1e-12)
+    return np.array([np.sum(z[k:] * z[:-k], axis=0) / power for k in range(1, lags + 1)]).reshape(-1, 2)
+
+
 def uncertainty(solution: Solution) -> Uncertainty:
     """Covariance of the parameters, the larger of the white one and the sandwich."""
     problem, r, J = solution.problem, solution.residual, solution.J
@@ -1077,11 +1089,15 @@ def uncertainty(solution: Solution) -> Uncertainty:
     for track, span in zip(problem.tracks, spans, strict=True):
         g = (J[span] * (w * size * r)[span, None]).reshape(-1, 2, J.shape[1]).sum(axis=1)
         period = float(np.median(np.diff(track.t_s))) if len(track.t_s) > 1 else track.tick_s
-        lags = min(max(round(_SPAN_S / max(period, 1e-4)), 1), len(g) // 4)
-        middle = middle + g.T @ g
-        for k in range(1, lags + 1):
-            cross = g[:-k].T @ g[k:]
-            middle = middle + (1.0 - k / (lags + 1.0)) * (cross + cross.T)
+        rows_of_s = 1.0 / max(period, 1e-4)
+        c = _autocorrelation(r[span], min(round(_LONGEST_S * rows_of_s), len(g) // 4))
+        apart = np.flatnonzero((c < _BAND / math.sqrt(len(g))).all(axis=1))
+        alike = int(apart[0]) if len(apart) else len(c)
+        over = 1 + min(max(round(_SPAN_S * rows_of_s), alike, 1), len(g) // 4)
+        # Sums over all windows of a length have Bartlett's weights of the lags below it.
+        total = np.cumsum(np.pad(g, ((over, over - 1), (0, 0))), axis=0)
+        windows = total[over:] - total[:-over]
+        middle = middle + windows.T @ windows / over
     # With far rows weighted down, the mean of w r^2 stands for the scale of the others.
     sandwich = (inverse @ middle @ inverse)[:P, :P]
     spread = float(np.mean((w * r**2)[:rows])) / scale**2
@@ -1105,17 +1121,12 @@ def colour_of(solution: Solution) -> tuple[Colour, ...]:
     for track, span in zip(solution.problem.tracks, _spans(solution.problem.tracks), strict=True):
         r = solution.residual[span].reshape(-1, 2)
         far = float(np.mean((w[span].reshape(-1, 2) < 1.0 / 3.0).any(axis=1)))
-        size = np.maximum(1.4826 * np.median(np.abs(r), axis=0), 1e-9)
-        z = np.clip(r / size, -3.0, 3.0)
-        z = z - z.mean(axis=0)
-        power = np.maximum(np.sum(z * z, axis=0), 1e-12)
-        lags = min(_LAGS, max(len(z) - 2, 1))
-        c = np.stack([np.sum(z[k:] * z[:-k], axis=0) / power for k in range(1, lags + 1)])
+        c = _autocorrelation(r, min(_LAGS, max(len(r) - 2, 1)))
         out.append(
             Colour(
                 track.name,
                 (float(c[0, 0]), float(c[0, 1])),
-                float(np.mean(np.abs(c) > 1.96 / math.sqrt(len(z)))),
+                float(np.mean(np.abs(c) > _BAND / math.sqrt(len(r)))),
                 far,
             )
         )
@@ -1528,11 +1539,11 @@ def prospects(solution: Solution, known: Uncertainty) -> tuple[Prospect, ...]:
     """All experiments, the most useful first.
 
     Judged are the parameters that were estimated and those that could not be told for want of excitation,
-    lambda3 apart, which no experiment tells from lambda2.
+    lambda3 apart, which no experiment tells from lambda2, and a creep that is not there.
     """
     problem = solution.problem
     values = {**values_of(problem.nominal), **problem.held, **solution.values}
-    vague = [n for n in solution.fixed if n != "lambda3" and n in PARAMETERS]
+    vague = [n for n, why in solution.fixed.items() if n != "lambda3" and NO_CREEP not in why]
     order = list(PARAMETERS)
     names = tuple(sorted([*problem.names, *vague], key=order.index))
     now = np.zeros((len(names), len(names)))
@@ -1574,7 +1585,7 @@ def _relative(S: FloatArray, names: Sequence[str]) -> dict[str, float]:
 #   worse than fitted), a parameter lies at a bound, or an important one is vague.
 
 _MOST_SCALE = 2.5
-_MOST_INFLATION = 4.0
+_MOST_INFLATION = 8.0
 _MOST_HELD, _LEAST_CHANCE = 1.5, 0.01
 _MOST_RELATIVE = 0.25
 _STRONG = 0.95
