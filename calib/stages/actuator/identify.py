@@ -940,16 +940,18 @@ def _without_creep(solution: Solution) -> Solution:
     fixed = {name: why for name, why in solution.fixed.items() if "enter only" in why}
     names = {*problem.names, *solution.fixed} - {*CREEP} - {*fixed}
 
-    def found(stiffness: float, why: str) -> Solution:
+    def found(stiffness: float, why: dict[str, str]) -> Solution:
         held = {spring: stiffness}
         other = replace(problem, names=tuple(name for name in PARAMETERS if name in names), held=held)
-        said = fixed | {spring: f"{label_of(spring)}: {why}; kept at {stiffness:.4g}"}
         # Swings lock to springs that are off by a turn, and a creep that runs away takes the springs along.
         starts = known, {**known, **solution.values}
-        return min((_again(solution, other, values, said) for values in starts), key=lambda one: one.cost)
+        found = (_again(solution, other, values, fixed | why) for values in starts)
+        return min(found, key=lambda one: one.cost)
 
-    usual = found(known[spring], "the logs do not tell it from other damping")
-    none = found(PARAMETERS[spring].low, f"the logs show {NO_CREEP}")
+    damping = "the logs do not tell it from damping; kept at"
+    usual = found(known[spring], {name: f"{damping} {known[name]:.4g}" for name in (rate, spring)})
+    least = PARAMETERS[spring].low
+    none = found(least, {spring: f"the logs show {NO_CREEP}; kept at {least:g}"})
     scale = 1.4826 * float(np.median(np.abs(none.residual)))
     contradicted = usual.cost - none.cost > 0.5 * (_CONTRARY * scale) ** 2
     plainer = none if contradicted else usual
@@ -1699,8 +1701,10 @@ def judge(
     """Judge an identification from what was computed of it."""
     out = []
     for name, why in solution.fixed.items():
-        if "enter only" in why or NO_CREEP in why:
+        if "enter only" in why:
             out.append(Finding("remark", why))
+        elif NO_CREEP in why:
+            out.append(Finding("remark", f"{label_of(name)}: {why}"))
         else:
             text = f"{label_of(name)} is not identifiable from these logs: {why}"
             out.append(Finding("unidentifiable", text))
