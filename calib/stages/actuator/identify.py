@@ -7,11 +7,10 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import astuple, dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
-from calib.core.arrays import FloatArray, IntArray
+from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.core.errors import BadInputError
 from calib.core.verdict import Finding, Verdict
 from calib.stages.actuator.machine import Machine
@@ -643,18 +642,21 @@ def weights(problem: Problem, residual: FloatArray) -> FloatArray:
     return np.asarray(out)
 
 
-def _loss(problem: Problem) -> Callable[[FloatArray], FloatArray]:
-    """That cost as `scipy.optimize.least_squares` takes it: of (r / `_SOFT`)^2, with two derivatives."""
-    told = len(problem.unknowns.priors)
+def _compressed(problem: Problem, residual: FloatArray, J: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Residuals (size + 1,) and derivatives (size + 1, size) of the same robust cost and slope.
 
-    def loss(z: FloatArray) -> FloatArray:
-        root = np.sqrt(1.0 + z)
-        out = np.stack([2.0 * (root - 1.0), 1.0 / root, -0.5 / root**3])
-        priors = slice(len(z) - told, None)
-        out[0, priors], out[1, priors], out[2, priors] = z[priors], 1.0, 0.0
-        return out
-
-    return loss
+    A row r of the cost rho(r) counts as one of the size (2 rho)^(1/2). All that a search needs are the
+    products of such columns, and their root holds them in few rows.
+    """
+    w = weights(problem, residual)
+    # Of rho = s^2 ((1 + (r/s)^2)^(1/2) - 1) that root is r (2 w / (1 + w))^(1/2), w the weight.
+    size = np.sqrt(2.0 * w / (1.0 + w))
+    A = np.column_stack([J * (w / size)[:, None], size * residual])
+    G = A.T @ A
+    scale = np.sqrt(np.maximum(np.diag(G), 1e-300))
+    power, V = np.linalg.eigh(G / np.outer(scale, scale))
+    root = np.sqrt(np.maximum(power, 0.0))[:, None] * V.T * scale
+    return root[:, -1], root[:, :-1]
 
 
 class _Enough(Exception):
@@ -672,30 +674,30 @@ def solve(
 
     unknowns = problem.unknowns
     low, high, scales = unknowns.low, unknowns.high, unknowns.scale
-    # SciPy's stubs know a loss by a type that they do not export.
-    loss: Any = _loss(problem)
     begin = np.clip(x, low + 1e-9 * scales, high - 1e-9 * scales)
-    seen: dict[bytes, tuple[FloatArray, FloatArray]] = {}
+    seen: dict[bytes, tuple[FloatArray, ...]] = {}
+    precision = 1e-5 if problem.rough else 1e-8
 
-    def both(at: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def all_of(at: FloatArray) -> tuple[FloatArray, ...]:
         key = at.tobytes()
         if key not in seen:
             seen.clear()
-            seen[key] = jacobian(problem, at)
+            residual, J = jacobian(problem, at)
+            seen[key] = residual, J, *_compressed(problem, residual, J)
         return seen[key]
 
     end = begin
 
     def rows(at: FloatArray) -> FloatArray:
         nonlocal end
-        residual = both(at)[0]
+        residual, _, few, _ = all_of(at)
         if _robust(problem, residual) < enough:
             end = at
             raise _Enough
-        return residual
+        return few
 
     def slopes(at: FloatArray) -> FloatArray:
-        return both(at)[1]
+        return all_of(at)[3]
 
     with suppress(_Enough):
         end = least_squares(
@@ -704,15 +706,13 @@ def solve(
             jac=slopes,
             bounds=(low, high),
             x_scale=scales,
-            loss=loss,
-            f_scale=_SOFT,
             max_nfev=most,
-            xtol=1e-8,
-            ftol=1e-8,
+            xtol=precision,
+            ftol=precision,
             gtol=1e-10,
         ).x
     end = np.array(end, dtype=np.float64)
-    residual, J = both(end)
+    residual, J, _, _ = all_of(end)
     return end, float(_robust(problem, residual)), residual, J
 
 
@@ -906,7 +906,11 @@ def _by_the_better_law(solution: Solution) -> Solution:
         problem, nominal=nominal, names=tuple(name for name in PARAMETERS if name in names), held={}
     )
     known = values_of(nominal)
-    best = _again(solution, other, {**known, **problem.held, **solution.values}, fixed)
+    near = {**known, **problem.held, **solution.values}
+    rough = replace(other, rough=True)
+    if not solve(rough, _moved(solution, rough, near), 25)[1] < solution.cost:
+        return solution
+    best = _again(solution, other, near, fixed)
     if not best.cost < _BETTER * solution.cost:
         return solution
     # The wrong law may have bent the forces so far that no way leads back.
@@ -920,10 +924,17 @@ def _again(
     solution: Solution, problem: Problem, values: Mapping[str, float], fixed: Mapping[str, str]
 ) -> Solution:
     """The minimum of another problem with the same logs, from values and the solution's starts and delays."""
-    x, why = first_guess(problem, values), dict(fixed)
-    x[len(problem.names) :] = solution.x[len(solution.problem.names) :]
-    told, (x, cost, residual, J) = _all_told(problem, solve(problem, x, 40), why)
+    why = dict(fixed)
+    minimum = solve(problem, _moved(solution, problem, values), 40)
+    told, (x, cost, residual, J) = _all_told(problem, minimum, why)
     return Solution(told, x, residual, J, cost, why, solution.agreeing, solution.starts, solution.law)
+
+
+def _moved(solution: Solution, problem: Problem, values: Mapping[str, float]) -> FloatArray:
+    """Unknowns of another problem with the same logs: these parameters, the rest from the solution."""
+    x = first_guess(problem, values)
+    x[len(problem.names) :] = solution.x[len(solution.problem.names) :]
+    return x
 
 
 def _without_creep(solution: Solution) -> Solution:
@@ -1163,32 +1174,97 @@ def held_back(solution: Solution) -> list[HeldLog]:
     found = {**problem.held, **solution.values}
     known, out = uncertainty(solution), []
     raised = known.scale * max(known.inflation.values(), default=1.0)
-    for k, track in enumerate(problem.tracks):
-        others = [t for i, t in enumerate(problem.tracks) if i != k]
-        kinds = {t.hoses for t in others}
-        names = tuple(name for name in problem.names if _told_by(name, kinds))
-        less = replace(problem, tracks=others, names=names, held=found)
-        start = _taken_over(solution, less)
-        x, cost, _, _ = solve(less, start, 15)
-        worse = 2.0 * (float(_robust(less, residuals(less, start[None]))[0]) - cost) / raised**2
-        alone = replace(problem, tracks=[track], names=(), held={**found, **less.values(x)})
-        _, _, residual, _ = solve(alone, _taken_over(solution, alone), 15)
+    for k, (x, told, gain) in enumerate(_without_each(solution)):
+        track = problem.tracks[k]
+        alone = replace(problem, tracks=[track], names=(), held={**found, **problem.values(x)})
+        _, _, residual, _ = solve(alone, x[_places(problem, alone)], 15)
         (phi, length) = rms_by_track(alone, residual)[0]
-        out.append(HeldLog(track.name, *inside[k], phi, length, float(chdtrc(len(names), max(worse, 0.0)))))
+        worse = max(2.0 * gain / raised**2, 0.0)
+        out.append(HeldLog(track.name, *inside[k], phi, length, float(chdtrc(told, worse))))
     return out
 
 
-def _taken_over(solution: Solution, problem: Problem) -> FloatArray:
-    """Unknowns of a problem of some of the logs, as the solution for all of them has them."""
-    whole, x = solution.problem.unknowns, solution.x
-    mine, out = problem.unknowns, np.zeros(problem.unknowns.size)
-    out[: len(problem.names)] = [solution.values[name] for name in problem.names]
-    out[mine.offset] = x[whole.offset]
-    of_track = {id(track): k for k, track in enumerate(solution.problem.tracks)}
-    for k, track in enumerate(problem.tracks):
+_CHORDS = 12
+_STILL = 1e-2
+"""Robust cost: a step that would gain less is not taken."""
+
+
+def _without_each(solution: Solution) -> list[tuple[FloatArray, int, float]]:
+    """For each log the fit to all others: all unknowns, how many parameters it tells, cost that it gains.
+
+    It lies near the fit to all logs, so the derivatives there serve (a chord method), and one batch of
+    simulations moves the fits of all logs at once. One that does not come to rest is sought by itself.
+    """
+    problem, tracks, J = solution.problem, solution.problem.tracks, solution.J
+    u, priors, count = problem.unknowns, problem.unknowns.priors, len(solution.problem.tracks)
+    free, kept = np.ones((count, u.size), dtype=bool), np.ones((count, len(J)), dtype=bool)
+    for k, span in enumerate(_spans(tracks)):
+        kinds = {track.hoses for i, track in enumerate(tracks) if i != k}
+        free[k, : len(problem.names)] = [_told_by(name, kinds) for name in problem.names]
+        free[k, u.starts[k]] = False
+        free[k, u.delays[k]] = u.delays.count(u.delays[k]) > 1
+        kept[k, span], kept[k, len(J) - len(priors) :] = False, free[k, priors]
+    weighted = J * weights(problem, solution.residual)[:, None]
+    whole = weighted.T @ J
+    curved = [whole - weighted[~rows].T @ J[~rows] for rows in kept]
+    xs, residual = np.tile(solution.x, (count, 1)), np.tile(solution.residual, (count, 1))
+    first = _robust(problem, residual * kept)
+    cost = first.copy()
+    going = np.ones(count, dtype=bool)
+    rested = ~going
+    for _ in range(_CHORDS):
+        to = xs.copy()
+        for k in np.flatnonzero(going):
+            slope = J.T @ (weights(problem, residual[k]) * residual[k] * kept[k])
+            step, gain = _step_within(curved[k], slope, free[k], u.low - xs[k], u.high - xs[k])
+            to[k] += step
+            rested[k] = gain < _STILL
+        going &= ~rested
+        at = np.flatnonzero(going)
+        if not len(at):
+            break
+        found = residuals(problem, to[at])
+        after = _robust(problem, found * kept[at])
+        going[at] = after < cost[at]
+        better = at[going[at]]
+        xs[better], residual[better], cost[better] = to[better], found[going[at]], after[going[at]]
+    for k in np.flatnonzero(~rested):
+        others = [track for i, track in enumerate(tracks) if i != k]
+        names = tuple(name for name, told in zip(problem.names, free[k], strict=False) if told)
+        less = replace(problem, tracks=others, names=names, held={**problem.held, **solution.values})
+        places = _places(problem, less)
+        first[k] = _robust(less, residuals(less, solution.x[places][None]))[0]
+        xs[k, places], cost[k], _, _ = solve(less, xs[k, places], 15)
+    told = free[:, : len(problem.names)].sum(axis=1).tolist()
+    return list(zip(xs, told, (first - cost).tolist(), strict=True))
+
+
+def _step_within(
+    H: FloatArray, slope: FloatArray, free: BoolArray, low: FloatArray, high: FloatArray
+) -> tuple[FloatArray, float]:
+    """The step to the minimum of a quadratic cost over what is free and stays within bounds, and its gain."""
+    free = free.copy()
+    while True:
+        at = np.flatnonzero(free)
+        step = np.zeros(len(slope))
+        step[at] = -scaled_inverse(H[np.ix_(at, at)]) @ slope[at]
+        outside = (step < low) | (step > high)
+        if not outside.any():
+            return step, float(-0.5 * slope @ step)
+        free &= ~outside
+
+
+def _places(problem: Problem, part: Problem) -> IntArray:
+    """Where the unknowns of a problem with some of the logs are among those of the one with all."""
+    whole, mine = problem.unknowns, part.unknowns
+    out = np.empty(mine.size, dtype=np.int64)
+    out[: len(part.names)] = [problem.names.index(name) for name in part.names]
+    out[mine.offset] = range(whole.offset.start, whole.offset.stop)
+    of_track = {id(track): k for k, track in enumerate(problem.tracks)}
+    for k, track in enumerate(part.tracks):
         at = of_track[id(track)]
-        out[mine.starts[k]] = x[whole.starts[at]]
-        out[mine.delays[k]] = x[whole.delays[at]]
+        out[mine.starts[k]] = range(whole.starts[at].start, whole.starts[at].stop)
+        out[mine.delays[k]] = whole.delays[at]
     return out
 
 
