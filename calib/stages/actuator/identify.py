@@ -1214,7 +1214,7 @@ def _without_each(solution: Solution) -> list[tuple[FloatArray, int, float]]:
     rested = ~going
     for _ in range(_CHORDS):
         to = xs.copy()
-        for k in np.flatnonzero(going):
+        for k in np.flatnonzero(going).tolist():
             slope = J.T @ (weights(problem, residual[k]) * residual[k] * kept[k])
             step, gain = _step_within(curved[k], slope, free[k], u.low - xs[k], u.high - xs[k])
             to[k] += step
@@ -1228,7 +1228,7 @@ def _without_each(solution: Solution) -> list[tuple[FloatArray, int, float]]:
         going[at] = after < cost[at]
         better = at[going[at]]
         xs[better], residual[better], cost[better] = to[better], found[going[at]], after[going[at]]
-    for k in np.flatnonzero(~rested):
+    for k in np.flatnonzero(~rested).tolist():
         others = [track for i, track in enumerate(tracks) if i != k]
         names = tuple(name for name, told in zip(problem.names, free[k], strict=False) if told)
         less = replace(problem, tracks=others, names=names, held={**problem.held, **solution.values})
