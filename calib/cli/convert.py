@@ -34,8 +34,8 @@ def convert(
     """
     import numpy as np
 
-    from calib.io.columns import COLUMNS_FILE
-    from calib.io.logs import LOG, beside, iter_log, passed_over, refuse_counts
+    from calib.io.columns import COLUMNS_FILE, Passed
+    from calib.io.logs import LOG, beside, iter_log, refuse_counts
     from calib.io.states import states_writer
 
     if output.suffix.lower() not in (".csv", ".parquet") and not writes_through(output):
@@ -44,7 +44,7 @@ def convert(
     check_writable(output, LOG)
     if save_columns is not None:
         check_writable(save_columns, COLUMNS_FILE)
-    stream = iter_log(log, stated)
+    stream = iter_log(log, stated, as_it_is=True)
     first = next(stream, None)
     if first is None:
         raise BadInputError(f"{shown(log)}: has a header but no rows")
@@ -53,15 +53,14 @@ def convert(
     if read_as is not None and read_as.narration:
         narrate(read_as.narration)
     names = tuple(first.columns)
-    rows, blank, truncated, wraps = 0, 0, False, 0
+    rows, passed = 0, Passed()
     with (
         states_writer(output, ("t_s", *names), LOG) as add,
         progress_bar(f"converting {log.name}") as progress,
     ):
         for block in chain([first], stream):
             add(np.column_stack([block.t_s, *(block.columns[name] for name in names)]))
-            rows, blank, truncated = rows + len(block), blank + block.not_finite, block.truncated
-            wraps += block.wraps
+            rows, passed = rows + len(block), passed + block.passed
             progress(rows, 0)
     if save_columns is not None and read_as is not None:
         write_atomically(save_columns, read_as.text(), COLUMNS_FILE)
@@ -70,12 +69,12 @@ def convert(
         "rows": rows,
         "columns": list(names),
         "left_out": list(first.unknown),
-        "not_finite": blank,
-        "truncated": truncated,
+        "not_finite": passed.not_finite,
+        "truncated": passed.truncated,
     }
     sentence = f"{rows} rows written to {shown(output)}: t_s, {', '.join(names)}"
     answer(as_json, "convert", {"convert": told}, sentence)
     if first.unknown:
         narrate(f"left out: {', '.join(first.unknown)}")
-    for sentence in passed_over(blank, truncated, wraps):
+    for sentence in passed.sentences:
         narrate(sentence)

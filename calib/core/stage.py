@@ -213,7 +213,8 @@ class Stage:
             first = error.errors()[0]
             key = ".".join(str(part) for part in first["loc"])
             raise BadInputError(
-                f"no useful answer follows from this input: {key} came out as {first['input']!r:.40}"
+                f"{', '.join(shown(path) for path in files.paths[:3])}: no useful answer follows, {key} came "
+                f"out as {first['input']!r:.40}"
             ) from error
         for result in self.results(outcome):
             result.made_by(self.name, files.hashes)

@@ -24,7 +24,7 @@ import numpy as np
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError, CalibError, pip_install
 from calib.core.files import check_readable, one_line, quoted, read_yaml_mapping, shown
-from calib.io.columns import COLUMNS, Block
+from calib.io.columns import COLUMNS, Block, Passed
 
 # ----------------------------------------------------------------------
 # Which field of which topic of a bag is which column of a log.
@@ -403,7 +403,7 @@ def rows_from_messages(source: str, stream: Source, topics: TopicMap) -> Iterato
         lines = np.arange(first, first + len(stamps), dtype=np.int64)
         first += len(stamps)
         named = {name: np.ascontiguousarray(values[:, k]) for k, name in enumerate(columns)}
-        return Block({"t_s": t_s, **named}, lines, infinite)
+        return Block({"t_s": t_s, **named}, lines, Passed(infinite))
 
     stamps, values = np.empty(0, dtype=np.int64), np.empty((0, len(columns)))
     try:
@@ -415,7 +415,8 @@ def rows_from_messages(source: str, stream: Source, topics: TopicMap) -> Iterato
             stamps, values = np.concatenate([stamps[ready:], more]), np.concatenate([values[ready:], others])
             order = np.argsort(stamps, kind="stable")
             stamps, values = stamps[order], values[order]
-        yield replace(made(stamps, values), truncated=stream.truncated)
+        last = made(stamps, values)
+        yield replace(last, passed=last.passed + Passed(truncated=stream.truncated))
     except OverflowError as error:
         raise BadInputError(f"{source}: has a time that is none: {error}") from error
 

@@ -213,21 +213,63 @@ def _column(word: str, unit: str) -> tuple[str, str] | None:
 
 
 @dataclass(frozen=True)
+class Passed:
+    """What of a log's cells and rows was not taken as it stands.
+
+    Attributes
+    ----------
+    not_finite : cells that said nan or inf; in Parquet nan is a blank.
+    beyond : cells that hold more than any sensor gives. first : the first of them, in words.
+    truncated : whether the last line was cut short and left out.
+    wraps : how often the counter that is the time began again.
+    """
+
+    not_finite: int = 0
+    beyond: int = 0
+    first: str = ""
+    truncated: bool = False
+    wraps: int = 0
+
+    def __add__(self, later: Passed) -> Passed:
+        return Passed(
+            self.not_finite + later.not_finite,
+            self.beyond + later.beyond,
+            self.first or later.first,
+            self.truncated or later.truncated,
+            self.wraps + later.wraps,
+        )
+
+    @property
+    def sentences(self) -> list[str]:
+        """One for each kind that there is."""
+        beyond = f"{self.beyond} cells hold more than any sensor gives ({self.first}) and count as blank"
+        return [
+            *([f"{self.not_finite} cells say nan or inf and count as blank"] if self.not_finite else []),
+            *([beyond] if self.beyond else []),
+            *(["the last line is cut short and left out"] if self.truncated else []),
+            *(
+                [f"the time is a counter that begins again {self.wraps} times, and is counted on"]
+                if self.wraps
+                else []
+            ),
+        ]
+
+
+ALL_TAKEN = Passed()
+
+
+@dataclass(frozen=True)
 class Block:
     """Cells of some rows as they are in the file, by column, `t_s` among them; NaN where one is blank.
 
     Attributes
     ----------
     lines : (n,) number of each row's line, or of the row in a table without lines.
-    not_finite : cells that said nan or inf. truncated : whether a last line was cut short and left out.
-    wraps : how often the counter that is the time began again.
     """
 
     cells: Mapping[str, FloatArray]
     lines: IntArray
-    not_finite: int = 0
-    truncated: bool = False
-    wraps: int = 0
+    passed: Passed = ALL_TAKEN
 
 
 @dataclass(frozen=True)
@@ -471,7 +513,9 @@ def settled(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMap:
     BadInputError for a unit that the readings contradict, and for one that nobody states and that they do not
     tell either: with the line for columns.yaml.
     """
-    cells = {name: values[:_MOST_EVIDENCE] for name, values in cells.items()}
+    # Rows out of order are for whoever reads the log to refuse, and no sign of another unit.
+    order = np.argsort(cells["t_s"][:_MOST_EVIDENCE], kind="stable")
+    cells = {name: values[order] for name, values in cells.items()}
     # Damaged files hold any number.
     with np.errstate(all="ignore"):
         for step in (_with_time, _with_accel, _with_gyro):
@@ -626,6 +670,9 @@ def turning(t_s: FloatArray, force: FloatArray, rates: FloatArray, factors: Sequ
     t_s : (n,) times. force : (n, 2 or 3) in any unit. rates : (n,) -gz, or (n, 3) about x, y and z.
     factors : to try on the rates.
     """
+    # A row that is written twice counts once.
+    new = np.diff(t_s, prepend=-np.inf) > 0.0
+    t_s, force, rates = t_s[new], force[new], rates[new]
     phi = np.unwrap(np.arctan2(force[:, 1], force[:, 0]))
     z = -rates if rates.ndim == 1 else rates[:, 2]
     angle = np.concatenate([[0.0], np.cumsum(-z[1:] * np.diff(t_s))])
@@ -741,7 +788,9 @@ def _implausible(
     values: FloatArray,
 ) -> str:
     """Why rates (n, axes) cannot be in a unit of this many rad/s; empty where they can."""
-    largest = scale * float(np.abs(values).max())
+    # A few wild readings are a fault, not a unit.
+    few = 2 + len(values) // 1000
+    largest = scale * float(np.partition(np.abs(values).ravel(), -1 - few)[-1 - few])
     if largest > _FASTEST_RADPS:
         return f"reaches {largest:.4g} rad/s"
     accel = _of(columns, ACCEL)

@@ -7,7 +7,7 @@ commas, semicolons or tabs; where not by commas, numbers may have a decimal comm
 UTF-16, its lines end as on any system. Times may be dates, as `2024-05-01T12:00:00.25Z`. Other columns are
 kept out of the way: they are named in `Log.unknown` and not read. Blank lines and lines that begin with # are
 passed over; without a header the last of these, or columns.yaml, names the columns. A cell that says nan or
-inf counts as blank; how many there were is in `Log.not_finite`. A last line that is cut short, as in a log
+inf counts as blank; how many there were is in `Log.passed`. A last line that is cut short, as in a log
 that is still being written, is left out. Where the time is a counter of 16 or 32 bits that begins again, as
 millis() does after 49.7 days and micros() after 71.6 minutes, it is counted on.
 
@@ -36,6 +36,7 @@ from calib.core.verdict import Finding, Severity
 from calib.core.writing import Kind, column_names, write_atomically
 from calib.io.columns import (
     ACCEL,
+    ALL_TAKEN,
     COLUMNS,
     GYRO,
     MEASURED,
@@ -43,6 +44,7 @@ from calib.io.columns import (
     UNITS,
     Block,
     ColumnMap,
+    Passed,
     column_map,
     find_columns,
     kind_of,
@@ -60,15 +62,6 @@ _WRAPS_WITHIN = 20.0
 """Usual steps from the last time before a counter begins again to the first one after."""
 
 
-def passed_over(not_finite: int, truncated: bool, wraps: int) -> list[str]:
-    """Sentences on cells that are not finite, on a last line cut short, on a time that begins again."""
-    return [
-        *([f"{not_finite} cells say nan or inf and count as blank"] if not_finite else []),
-        *(["the last line is cut short and left out"] if truncated else []),
-        *([f"the time is a counter that begins again {wraps} times, and is counted on"] if wraps else []),
-    ]
-
-
 @dataclass(frozen=True)
 class Log:
     """Rows of a log in SI.
@@ -81,9 +74,7 @@ class Log:
     lines : (n,) number of each row's line in the file, or of the row in a table without lines.
     map : where the columns come from; None for a log that was not read from a file.
     unknown : names of the columns that were not read.
-    not_finite : cells that said nan or inf; in Parquet nan is a blank.
-    truncated : whether the last line was cut short and left out.
-    wraps : how often the counter that is the time began again.
+    passed : what was not taken as it stands.
     """
 
     source: str
@@ -92,9 +83,7 @@ class Log:
     lines: IntArray
     map: ColumnMap | None = None
     unknown: tuple[str, ...] = ()
-    not_finite: int = 0
-    truncated: bool = False
-    wraps: int = 0
+    passed: Passed = ALL_TAKEN
 
     def __len__(self) -> int:
         return len(self.t_s)
@@ -128,10 +117,9 @@ class Log:
         return signals_of(self, names, tuple(optional), counts, partly)
 
     def remarks(self) -> list[str]:
-        """Sentences on what the columns were read as, on cells that are not finite, on a cut last line."""
+        """Sentences on what the columns were read as, and on what was not taken as it stands."""
         read_as = self.map.narration if self.map is not None else ""
-        passed = passed_over(self.not_finite, self.truncated, self.wraps)
-        return [*([read_as] if read_as else []), *(f"{self.source}: {one}" for one in passed)]
+        return [*([read_as] if read_as else []), *(f"{self.source}: {one}" for one in self.passed.sentences)]
 
 
 def _logs(columns: ColumnMap, blocks: Iterator[Block]) -> Iterator[Log]:
@@ -145,10 +133,24 @@ def _logs(columns: ColumnMap, blocks: Iterator[Block]) -> Iterator[Log]:
     for block in chain([first], blocks):
         named = {n: known.sources[n].si(kind_of(n), v) for n, v in block.cells.items() if n != "t_s"}
         t_s = known.sources["t_s"].si("time", block.cells["t_s"])
-        yield Log(
-            known.source, t_s, named, block.lines, known, unknown, block.not_finite, block.truncated,
-            block.wraps,
-        )  # fmt: skip
+        yield Log(known.source, t_s, named, block.lines, known, unknown, block.passed)
+
+
+_MOST = {"accel": 4000.0, "gyro": 140.0, "pixel": 1e5}
+"""Twice what the widest cheap accelerometers and gyroscopes read (200 g, 4000 deg/s), and any picture."""
+
+
+def _within(log: Log) -> Log:
+    """The log with blanks for cells that no sensor can have given."""
+    columns, passed = dict(log.columns), log.passed
+    for name, values in log.columns.items():
+        far = np.flatnonzero(np.abs(values) > _MOST.get(kind_of(name), math.inf))
+        if len(far) and log.unit(name) != "counts":
+            first = f"{name} is {values[far[0]]:.6g} in line {log.lines[far[0]]}"
+            passed += Passed(beyond=len(far), first=first)
+            columns[name] = values.copy()
+            columns[name][far] = np.nan
+    return log if passed == log.passed else replace(log, columns=columns, passed=passed)
 
 
 def _counted_on(blocks: Iterator[Block]) -> Iterator[Block]:
@@ -163,7 +165,8 @@ def _counted_on(blocks: Iterator[Block]) -> Iterator[Block]:
             again = steps < -0.5 * size
             ahead = laps + size * np.cumsum(again)
             laps = int(ahead[-1]) if len(t) else laps
-            block = replace(block, cells={**block.cells, "t_s": t + ahead}, wraps=int(again.sum()))
+            passed = block.passed + Passed(wraps=int(again.sum()))
+            block = replace(block, cells={**block.cells, "t_s": t + ahead}, passed=passed)
         yield block
 
 
@@ -221,13 +224,14 @@ def log_of(source: str, path: Path, cells: Mapping[str, FloatArray], options: Lo
     columns = _stated(source, path, tuple(cells), options)
     lines = np.arange(1, len(cells["t_s"]) + 1, dtype=np.int64)
     (log,) = _logs(columns, iter([Block(cells, lines)]))
-    return log
+    return _within(log)
 
 
-def iter_log(path: Path, options: LogOptions = NOTHING_STATED) -> Iterator[Log]:
+def iter_log(path: Path, options: LogOptions = NOTHING_STATED, as_it_is: bool = False) -> Iterator[Log]:
     """Blocks of a log in turn, each a `Log` of some ten thousand rows at most.
 
     Text, Parquet, a bag (see `calib.io.bags`), or what a board with the sketch sent (`calib.io.serial`).
+    Cells that hold more than any sensor gives count as blank, unless it is wanted `as_it_is`.
 
     Raises
     ------
@@ -238,16 +242,18 @@ def iter_log(path: Path, options: LogOptions = NOTHING_STATED) -> Iterator[Log]:
     """
     from calib.io.serial import STREAMS, stream_text
 
-    if not (is_bag(path) and path.is_dir()):
+    bag, ending = is_bag(path), path.suffix.lower()
+    if not (bag and path.is_dir()):
         check_readable(path)
-    if is_bag(path):
-        return _iter_bag(path, options)
-    if options.topics is not None:
+    if not bag and options.topics is not None:
         raise BadInputError(f"{shown(path)}: has columns, expected a bag where topics are given")
-    ending = path.suffix.lower()
-    if ending in STREAMS:
-        return iter_rows(io.BytesIO(stream_text(path).encode()), shown(path))
-    return _logs(*parquet_blocks(path, options)) if ending == ".parquet" else _iter_csv(path, options)
+    if bag:
+        blocks = _iter_bag(path, options)
+    elif ending in STREAMS:
+        blocks = iter_rows(io.BytesIO(stream_text(path).encode()), shown(path))
+    else:
+        blocks = _logs(*parquet_blocks(path, options)) if ending == ".parquet" else _iter_csv(path, options)
+    return blocks if as_it_is else map(_within, blocks)
 
 
 def columns_of(path: Path, options: LogOptions = NOTHING_STATED) -> tuple[str, ...] | None:
@@ -295,9 +301,7 @@ def read_log(path: Path, options: LogOptions = NOTHING_STATED, remarks: list[str
         t_s=np.concatenate([block.t_s for block in blocks]),
         columns={name: np.concatenate([block.columns[name] for block in blocks]) for name in first.columns},
         lines=np.concatenate([block.lines for block in blocks]),
-        not_finite=sum(block.not_finite for block in blocks),
-        truncated=blocks[-1].truncated,
-        wraps=sum(block.wraps for block in blocks),
+        passed=sum((block.passed for block in blocks), ALL_TAKEN),
     )
     if remarks is not None:
         remarks += log.remarks()
@@ -365,6 +369,9 @@ _TURNED_RAD = 0.05
 _AGREES, _CONTRADICTS = 0.3, 1.0
 _WINDOW = 20_000
 _CHECK_GYRO = "check the gyroscope and its wiring"
+_CHECK_IMU = "check the IMU's wiring and the bus that reads it"
+_HELD_S, _HELD_CHANCE = 1.0, 1e-12
+"""Readings of a whole IMU that are the same for so long, and how likely that is by their steps alone."""
 _BIN_S, _BINS = 0.5, 10
 _UPRIGHT, _LEAST_MPS2 = 0.75, 3.0
 _FELT_RAD, _ANSWERED = 0.03, 0.1
@@ -499,6 +506,8 @@ def signals_of(
     if len(rows) == 0:
         raise BadInputError(f"{log.source}: no row has all of {', '.join(wanted)}, expected them together")
     check_time(log)
+    held = [np.arange(a, b) for a, b in _held(log)] if set(wanted) & set(IMU) else []
+    rows = np.setdiff1d(rows, np.concatenate(held)) if held else rows
     values = np.stack([log.columns[name][rows] for name in wanted], axis=1)
     stamps = log.t_s[rows]
     same = np.all((values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1])), axis=1)
@@ -534,6 +543,7 @@ class Watch:
     _mirrored: Finding | None = None
     _known: bool = False
     _unmoved: Finding | None = None
+    _held: Finding | None = None
 
     def add(self, log: Log) -> None:
         """Rows that follow."""
@@ -547,6 +557,8 @@ class Watch:
             if not self._known:
                 self._known, self._mirrored = _mirrored(log)
             self._unmoved = self._unmoved or _unmoved(log)
+        if set(self.names) & set(IMU):
+            self._held = self._held or _all_held(log)
 
     def has(self, *names: str) -> bool:
         """Whether each of these columns has a reading."""
@@ -566,7 +578,43 @@ class Watch:
         # A reading that never changes is said as that.
         _, least, most = self._seen.get("gz_radps", (0, 0.0, 0.0))
         alive = least != most
-        return [*out, *(one for one in (self._mirrored, self._unmoved if alive else None) if one is not None)]
+        more = self._held, self._mirrored, self._unmoved if alive else None
+        return [*out, *(one for one in more if one is not None)]
+
+
+def _held(log: Log) -> list[tuple[int, int]]:
+    """Rows, from and to, in which the whole IMU repeats one reading for longer than chance and steps explain.
+
+    Of an IMU with at least one axis of each sensor and three in all; the first of equal readings is not among
+    them. A log that never changes has no such rows.
+    """
+    names = [name for name in IMU if name in log.columns]
+    rows = log.sampled(*names)
+    if len(names) < 3 or not set(names) & set(ACCEL) or not set(names) & set(GYRO) or len(rows) < _FEWEST:
+        return []
+    values = np.stack([log.columns[name][rows] for name in names])
+    same = (values[:, 1:] == values[:, :-1]).all(axis=0)
+    same_share = float(same.mean())
+    if not 0.0 < same_share < 1.0:
+        return []
+    least = max(math.log(_HELD_CHANCE) / math.log(same_share), _FEWEST)
+    edges = np.flatnonzero(np.diff(same.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
+    return [
+        (int(rows[a + 1]), int(rows[b]) + 1)
+        for a, b in edges.tolist()
+        if b - a >= least and log.t_s[rows[b]] - log.t_s[rows[a]] >= _HELD_S
+    ]
+
+
+def _all_held(log: Log) -> Finding | None:
+    """That the whole IMU stops answering, where it does."""
+    held = _held(log)
+    if not held:
+        return None
+    (a, b), more = held[0], len(held) - 1
+    text = f"all readings of the IMU stay the same from {log.t_s[a]:.1f} to {log.t_s[b - 1]:.1f} s"
+    text += f" and {more} more time{'s' * (more > 1)}" if more else ""
+    return Finding("poor", f"{text}; they tell nothing", _CHECK_IMU)
 
 
 def _unmoved(log: Log) -> Finding | None:

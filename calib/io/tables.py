@@ -28,6 +28,7 @@ from calib.io.columns import (
     Block,
     ColumnMap,
     ColumnsFile,
+    Passed,
     column_map,
     find_columns,
     known_name,
@@ -163,7 +164,7 @@ def _by_pyarrow(text: _Text, data: bytes, lines: IntArray) -> Block | None:
         odd += int(np.count_nonzero(np.isnan(values))) - column.null_count + int(np.count_nonzero(infinite))
         values[infinite] = np.nan
         cells[name] = values
-    return Block(cells, lines, odd)
+    return Block(cells, lines, Passed(odd))
 
 
 def _floats(column: Any) -> FloatArray:
@@ -196,7 +197,7 @@ def _by_lines(text: _Text, data: bytes, lines: IntArray) -> Block:
     infinite = np.isinf(values)
     values[infinite] = np.nan
     cells_of = {name: np.ascontiguousarray(values[:, k]) for k, name in enumerate(text.slots)}
-    return Block(cells_of, lines, int(infinite.sum()))
+    return Block(cells_of, lines, Passed(int(infinite.sum())))
 
 
 def _separator(line: str) -> str:
@@ -312,7 +313,7 @@ def _blocks(text: _Text, stream: BinaryIO, data: bytes, line: int) -> Iterator[B
     # The last line without its end: a row, or the beginning of one.
     if rest.count(text.separator.encode()) < len(text.columns.names) - 1:
         nothing = {name: np.empty(0) for name in text.slots}
-        yield Block(nothing, np.empty(0, dtype=np.int64), truncated=True)
+        yield Block(nothing, np.empty(0, dtype=np.int64), Passed(truncated=True))
     else:
         yield _parsed(text, rest + b"\n", line)[0]
 
@@ -410,7 +411,7 @@ def _parquet_blocks(file: Any, columns: ColumnMap) -> Iterator[Block]:
                 infinite = np.isinf(values)
                 values[infinite] = np.nan
                 cells[name], odd = values, odd + int(infinite.sum())
-            block = Block(cells, np.arange(first, first + len(batch), dtype=np.int64), odd)
+            block = Block(cells, np.arange(first, first + len(batch), dtype=np.int64), Passed(odd))
             first += len(batch)
             yield _timed(columns.source, block)
 

@@ -162,7 +162,7 @@ def test_points_that_belong_to_no_camera(calib, table_text, tmp_path, model: str
     file.write_text("view,x_m,y_m,u_px,v_px\n" + "\n".join(lines))
     ended = calib("intrinsics", file, *SIZE, "--model", model, "--rig", rig)
     if ended.code == 3:
-        assert ended.sentence.startswith(("no camera fits these views", "no useful answer follows"))
+        assert "no camera fits these views" in ended.sentence or "no useful answer" in ended.sentence
         assert not rig.exists()
     else:
         assert ended.code == 1

@@ -39,7 +39,7 @@ COLUMNS = {
 def test_every_format_gives_the_same_log(form: str, tmp_path: Path) -> None:
     messages = readings(np.random.default_rng(0))
     log = read_log(write_bag(tmp_path, form, messages))
-    assert len(log) == 160 and log.unknown == () and not log.truncated and log.not_finite == 0
+    assert len(log) == 160 and log.unknown == () and not log.passed.truncated and log.passed.not_finite == 0
     assert np.all(np.diff(log.t_s) > 0.0) and log.t_s[0] == 0.0
     for kind, columns in COLUMNS.items():
         rows = log.sampled(*columns)
@@ -57,7 +57,7 @@ def test_every_format_gives_the_same_log(form: str, tmp_path: Path) -> None:
         st.tuples(
             st.sampled_from(["imu", "marker", "pwm"]),
             st.integers(0, 400_000_000),
-            st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=6, max_size=6),
+            st.lists(st.floats(-140.0, 140.0), min_size=6, max_size=6),
         ),
         min_size=1,
         max_size=12,
@@ -128,7 +128,7 @@ def test_nan_in_a_message_is_a_blank_cell(tmp_path: Path) -> None:
     ]
     log = read_log(write_bag(tmp_path, "mcap", messages))
     assert log.sampled("u_px").tolist() == [] and log.columns["v_px"].tolist() == [2.0, 3.0]
-    assert log.not_finite == 1
+    assert log.passed.not_finite == 1
 
 
 def test_an_mcap_that_is_still_written_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
@@ -136,7 +136,7 @@ def test_an_mcap_that_is_still_written_is_read_as_far_as_it_goes(tmp_path: Path)
     whole = read_log(path)
     path.write_bytes(path.read_bytes()[: path.stat().st_size * 3 // 5])
     part = read_log(path)
-    assert part.truncated and 0 < len(part) < len(whole)
+    assert part.passed.truncated and 0 < len(part) < len(whole)
     assert np.array_equal(part.t_s, whole.t_s[: len(part)])
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from calib.core.arrays import FloatArray
+from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
 from calib.io.logs import IN_PLANE, Log, Watch
 
@@ -146,3 +149,59 @@ def test_time_that_goes_back_and_axes_that_are_stuck() -> None:
     log.t_s[10] = 0.0
     with pytest.raises(BadInputError, match=r"log.csv, line 12: t_s goes back from 0.090000 to 0.000000"):
         log.signals("gz_radps")
+
+
+@pytest.fixture
+def written(tmp_path: Path) -> Callable[[IntArray], Path]:
+    """Writes these rows of a log of a gyroscope and an accelerometer at rest."""
+    rng = np.random.default_rng(2)
+    t = 0.01 * np.arange(3000)
+    readings = rng.normal(size=(3000, 3)) * (0.002, 0.015, 0.015) + (0.004, G, 0.1)
+
+    def write(rows: IntArray, readings: FloatArray = readings) -> Path:
+        path = tmp_path / "log.csv"
+        lines = [f"{t[k]:.6f},{','.join(f'{x:.6f}' for x in readings[k])}" for k in rows]
+        path.write_text("\n".join([",".join(("t_s", *IN_PLANE)), *lines]) + "\n")
+        return path
+
+    return write
+
+
+def test_rows_twice_or_out_of_order_say_nothing_of_units(written: Callable[[IntArray], Path]) -> None:
+    twice = Log.load(written(np.repeat(np.arange(3000), 2))).signals(*IN_PLANE)
+    assert (len(twice), twice.repeated_rows, twice.findings) == (3000, 3000, ())
+    for rows in (np.arange(3000)[::-1], np.roll(np.arange(3000), 700).reshape(-1, 50)[::-1].ravel()):
+        with pytest.raises(BadInputError, match=r"log\.csv, line \d+: t_s goes back from"):
+            Log.load(written(rows)).signals(*IN_PLANE)
+
+
+@pytest.mark.parametrize("name", IN_PLANE)
+def test_wild_cells_count_as_blank(written: Any, name: str) -> None:
+    readings = np.loadtxt(written(np.arange(3000)), delimiter=",", skiprows=1)[:, 1:]
+    readings[[700, 1400, 2100], IN_PLANE.index(name)] = 1e6, -1e7, 1e300
+    log = Log.load(written(np.arange(3000), readings))
+    assert (log.passed.beyond, log.passed.first) == (3, f"{name} is 1e+06 in line 702")
+    assert np.isnan(log.columns[name]).sum() == 3 and np.nanmax(np.abs(log.columns[name])) < 12.0
+    assert any("3 cells hold more than any sensor gives" in one for one in log.remarks())
+
+
+@pytest.mark.parametrize("every", [1, 8])
+@pytest.mark.parametrize(("begin", "end"), [(0, 2000), (900, 1200), (1000, 3000)])
+def test_an_imu_that_stops_answering(begin: int, end: int, every: int) -> None:
+    # A board may read a sensor more often than that has something new to tell.
+    held = np.arange(3000) // every * every
+    held[begin:end] = held[begin]
+    log = _log(az_mps2=0.02 * np.random.default_rng(3).normal(size=3000))
+    log = replace(log, columns={name: values[held] for name, values in log.columns.items()})
+    signals = log.signals(*IN_PLANE)
+    gone = np.setdiff1d(np.arange(3000), signals.rows)
+    assert abs(gone[0] - begin - 1) < every and abs(gone[-1] + 1 - end) < every
+    (finding,) = (one for one in signals.findings if "all readings of the IMU stay the same" in one.text)
+    assert finding.severity == "poor" and f"to {log.t_s[gone[-1]]:.1f} s" in finding.text
+
+
+def test_an_imu_with_coarse_steps_has_not_stopped() -> None:
+    log = _log(az_mps2=0.0)
+    coarse = {name: np.rint(values / 0.05) * 0.05 for name, values in log.columns.items()}
+    signals = replace(log, columns=coarse).signals(*IN_PLANE)
+    assert len(signals) == 3000 and not any("stay the same" in one.text for one in signals.findings)

@@ -29,7 +29,8 @@ from calib.core.result import finite_or_none, judged
 from calib.core.rig import Rig
 from calib.core.stage import ProgressCall
 from calib.core.verdict import Finding, Verdict
-from calib.io.logs import Log, Watch, passed_over
+from calib.io.columns import Passed
+from calib.io.logs import Log, Watch
 from calib.io.states import STATES, states_writer
 from calib.stages.estimator.baseline import BASELINE, Baseline
 from calib.stages.estimator.consistency import SENSORS, Tally
@@ -224,11 +225,11 @@ def opened(path: Path, rig: Rig, rig_path: Path, options: LogOptions = NOTHING_S
 
 def _noted(stream: Iterator[Log], remarks: list[str]) -> Iterator[Log]:
     """The blocks, and at their end sentences on what was passed over in them."""
-    cells, truncated, wraps = 0, False, 0
+    passed = Passed()
     for log in stream:
-        cells, truncated, wraps = cells + log.not_finite, log.truncated, wraps + log.wraps
+        passed += log.passed
         yield log
-    remarks.extend(passed_over(cells, truncated, wraps))
+    remarks.extend(passed.sentences)
 
 
 def drive_for(log: OpenLog, rig: Rig, model: str) -> Drive | None:
