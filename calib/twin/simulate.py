@@ -14,7 +14,7 @@ from calib.io.logs import Log
 from calib.stages.actuator.dynamics import Coefficients, coefficients
 from calib.stages.actuator.kinematics import forward
 from calib.stages.actuator.parameters import Plant
-from calib.stages.actuator.pump import PumpCoefficients, delayed, pump_coefficients, static_force_N
+from calib.stages.actuator.pump import PumpCoefficients, delayed, pump_coefficients, settling_force_N
 from calib.stages.actuator.simulate import STATE, RigState, check_start, largest_step_s
 from calib.stages.actuator.simulate import run as run_kernel
 from calib.stages.estimator.baseline import Baseline, BaselineSetup
@@ -119,7 +119,7 @@ class _Plant:
         self.tick_s = rig.pump.tick_s
         self.c: Coefficients = coefficients(plant)
         self.p: PumpCoefficients = pump_coefficients(rig.pump)
-        self.strength = np.array(rig.strength)
+        self.held = np.zeros((2, 2))
         step, largest = self.tick_s / _SUBSTEPS, largest_step_s(plant)
         if step > largest:
             raise BadInputError(
@@ -129,7 +129,7 @@ class _Plant:
 
     def advance(self, row: FloatArray, arriving_pwm: FloatArray, at_s: float, out: FloatArray) -> None:
         """Write the nodes (5 n, 10) of the n ticks in which the commands (n, 2) act."""
-        static = static_force_N(self.rig.pump, arriving_pwm) * self.strength
+        static = settling_force_N(self.rig.pump, arriving_pwm, self.rig.strength, self.held)
         every = _SUBSTEPS // _NODES_PER_TICK
         stopped = run_kernel(self.c, self.p, row, static, self.tick_s, _SUBSTEPS, every, out)
         if stopped >= 0:

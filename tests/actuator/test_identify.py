@@ -397,6 +397,25 @@ def test_the_law_of_deflation_is_found(law: RateLimit | Orifice, seed: int, tmp_
     assert {*asdict(law)} & {*found.values}
 
 
+@pytest.mark.parametrize("play", [{}, {"play_pwm": 18.0}, {"play_N": 0.14}])
+def test_a_play_is_found_where_there_is_one(play: dict[str, float], tmp_path: Path) -> None:
+    rig_yaml = tmp_path / "rig.yaml"
+    known = rig_file(rig_yaml)
+    rig, truth = varied(5)
+    rig = replace(rig, pump=replace(rig.pump, **play))
+    kinds = {"ellipse": 16.0, "orientation": 16.0, "swing": 8.0}
+    paths = [log_file(tmp_path / f"{kind}.csv", rig, kind, 1, span_s) for kind, span_s in kinds.items()]
+    tracks = [read_track(Files((p,), rig_yaml), p, known, Machine(), PoseOptions()) for p in paths]
+    found = fit_tracks(Machine(), tracks)
+    sigma = uncertainty(found).sigma
+    assert {"play_pwm", "play_N"} & {*found.values} == {*play}
+    assert ("of the misfit" in found.law) is bool(play)
+    for name, width in play.items():
+        assert abs(found.values[name] - width) < 3.5 * sigma[name] < 0.2 * width
+    for name in {*truth} & {*found.values}:
+        assert abs(found.values[name] - truth[name]) < 3.5 * sigma[name], name
+
+
 @pytest.mark.parametrize("kind", ["free", "prbs"])
 def test_interpolated_heads_agree_with_fine_steps(kind: str) -> None:
     one = track(kind, noise=0.0)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from source_model import PRINTED_CREEP, PolynomialForce
@@ -29,6 +29,7 @@ from calib.stages.actuator.pump import (
     RateLimit,
     advance_pump,
     pump_coefficients,
+    settling_force_N,
     static_force_N,
 )
 from calib.stages.control.laws import Model, PumpEstimate, pumps_at_rest, push
@@ -96,6 +97,41 @@ def ticks(pump: Pump, pwm: list[float], state: PumpEstimate | None = None) -> Fl
         force.append(state.force_N[0])
         assert state.force_N[1] == 0.0
     return np.array(force)
+
+
+@settings(deadline=None)
+@given(
+    st.lists(st.tuples(st.floats(0.0, 255.0), st.floats(0.0, 255.0)), min_size=1, max_size=40),
+    st.floats(0.5, 60.0),
+    st.floats(0.01, 0.5),
+    st.integers(0, 40),
+)
+def test_a_play_stays_within_its_width_and_does_not_know_time(
+    rows: list[tuple[float, float]], play_pwm: float, play_N: float, cut: int
+) -> None:
+    pwm = np.array(rows)
+    forces = settling_force_N(Pump(play_N=play_N), pwm, (1.1, 0.9))
+    plain = settling_force_N(Pump(), pwm, (1.1, 0.9))
+    assert np.array_equal(plain, static_force_N(Pump(), pwm) * (1.1, 0.9))
+    assert np.abs(forces - plain).max() <= 0.5 * play_N + 1e-12
+    both = Pump(play_pwm=play_pwm, play_N=play_N)
+    whole = settling_force_N(both, pwm)
+    assert np.all(whole >= 0.0)
+    # A command that stays, and one in parts, change nothing.
+    assert np.array_equal(settling_force_N(both, np.repeat(pwm, 3, axis=0))[::3], whole)
+    held = np.zeros((2, 2))
+    parts = [settling_force_N(both, part, held=held) for part in (pwm[:cut], pwm[cut:])]
+    assert np.array_equal(np.concatenate(parts), whole)
+
+
+def test_a_play_loops_by_its_width_and_a_pump_that_is_off_gives_none() -> None:
+    up = np.arange(120.0, 241.0)
+    pwm = np.concatenate([up, up[::-1], [0.0]])[:, None] * np.ones(2)
+    held = np.zeros((2, 2))
+    force = settling_force_N(Pump(play_pwm=20.0), pwm, held=held)
+    assert np.allclose(force[20:121], static_force_N(Pump(), pwm[20:121] - 10.0))
+    assert np.allclose(force[141:241], static_force_N(Pump(), pwm[141:241] + 10.0))
+    assert force[-1].tolist() == [0.0, 0.0] and held[0].tolist() == [10.0, 10.0]
 
 
 @pytest.mark.parametrize(("volt", "elongation_mm"), [(6, 1.88), (8, 11.11), (10, 21.73), (12, 26.56)])

@@ -135,7 +135,7 @@ def _log(
     rig: SimulatedRig, kind: str, options: dict[str, str], seed: int, span: float | None, play: bool
 ) -> str:
     run = run_scenario(make_scenario(kind, options), rig, seed, "sensors", span)
-    if play:
+    if play and run.pwm.any():
         told = run.pwm
         run = simulate(rig, at_rest(rig), played(told, PLAY * RANGE_PWM), len(told), seed)
         run = replace(run, pwm=told)
@@ -152,13 +152,11 @@ def make(folder: Path, seed: int, off_mm: float, wrong: str | None, pictures: Pa
         write_rig_folder(folder, rig, seed)
     if wrong:
         for k, name in enumerate((*RESTS, *ALIGNED)):
-            play = wrong == "hysteresis" and LOGS[name][0] in ("ellipse", "orientation")
-            text = _log(rig, *LOGS[name], 1000 * seed + k, None, play)
+            text = _log(rig, *LOGS[name], 1000 * seed + k, None, wrong == "hysteresis")
             (folder / "logs" / f"{name}.csv").write_text(text)
     (folder / "replayed").mkdir()
     for k, (name, (kind, span)) in enumerate(REPLAYED.items()):
-        play = wrong == "hysteresis" and name in ("ellipse", "step")
-        text = _log(rig, kind, {}, 100_000 + 100 * seed + k, span, play)
+        text = _log(rig, kind, {}, 100_000 + 100 * seed + k, span, wrong == "hysteresis")
         (folder / "replayed" / f"{name}.csv").write_text(text)
 
 
@@ -238,7 +236,7 @@ def _off(rig: Rig, true: SimulatedRig) -> dict[str, dict[str, tuple[float, float
                 out["align"][name] = (float(v) - sensors[name], float(one))
     # What the model takes for the mass, over what it is.
     share = (actuator.mass_kg or rig.machine.plant.mass_kg) / true.plant.mass_kg
-    truths: dict[str, Any] = values_of(true)
+    truths: dict[str, Any] = values_of(true) | {"play_pwm": PLAY * RANGE_PWM}
     truths["strength"] = [truths["strength1"], truths["strength2"]]
     for name, section in (("actuator", actuator), ("pump", pump)):
         out[name] = {}

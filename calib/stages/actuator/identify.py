@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import astuple, dataclass, field, fields, replace
 from functools import cached_property
@@ -72,12 +72,20 @@ PARAMETERS: dict[str, Spec] = {
     "falling_N_per_s": Spec("N/s", 0.01, 50.0, 0.1, "pumps", "R"),
     "laminar_s": Spec("s", 0.01, 50.0, 0.3, "pumps", "a"),
     "turbulent_s2_per_N": Spec("s^2/N", 0.0, 200.0, 0.3, "pumps", "b"),
+    "play_pwm": Spec("PWM", 0.0, 120.0, 5.0, "pumps", "w"),
+    "play_N": Spec("N", 0.0, 5.0, 0.05, "pumps", "w_F"),
     "elongation_6V_mm": Spec("mm", 0.0, 60.0, 2.0, "pumps", "eps(6 V)"),
     "elongation_8V_mm": Spec("mm", 0.0, 60.0, 2.0, "pumps", "eps(8 V)"),
     "elongation_10V_mm": Spec("mm", 0.0, 60.0, 2.0, "pumps", "eps(10 V)"),
     "elongation_12V_mm": Spec("mm", 0.0, 60.0, 2.0, "pumps", "eps(12 V)"),
 }
 """All parameters in the order of tables."""
+
+_PLAYS = {
+    "play_pwm": (4.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0),
+    "play_N": (0.03, 0.06, 0.09, 0.12, 0.18, 0.25, 0.35, 0.5),
+}
+"""Plays of the pumps, and widths from which they are sought."""
 
 _ELONGATIONS = tuple(f"elongation_{volt:g}V_mm" for volt in KNOTS_V)
 
@@ -124,6 +132,8 @@ def values_of(nominal: Machine) -> dict[str, float]:
         "falling_N_per_s": falling,
         "laminar_s": orifice.laminar_s,
         "turbulent_s2_per_N": orifice.turbulent_s2_per_N,
+        "play_pwm": pump.play_pwm,
+        "play_N": pump.play_N,
         **dict(zip(_ELONGATIONS, knots, strict=True)),
     }
 
@@ -146,6 +156,8 @@ def candidates(
     orifice = isinstance(nominal.pump.deflation, Orifice)
     left_out = {"falling_N_per_s"} if orifice else {"laminar_s", "turbulent_s2_per_N"}
     left_out |= {"strength1"} if static_map else set(_ELONGATIONS)
+    # A play is looked for where a rig without one leaves the logs unexplained.
+    left_out |= {name for name in _PLAYS if not getattr(nominal.pump, name) > 0.0}
     return tuple(name for name in names if name not in left_out)
 
 
@@ -182,7 +194,16 @@ def made(nominal: Machine, values: Mapping[str, float], hoses: bool, tick_s: flo
     force = StrengthForce(
         curve, static.stiffness, static.supply_V, static.dead_zone_V, (v["strength1"], v["strength2"])
     )
-    return plant, replace(nominal.pump, static=force, deflation=deflation, lag_s=v["lag_s"], tick_s=tick_s)
+    pump = replace(
+        nominal.pump,
+        static=force,
+        deflation=deflation,
+        lag_s=v["lag_s"],
+        play_pwm=v["play_pwm"],
+        play_N=v["play_N"],
+        tick_s=tick_s,
+    )
+    return plant, pump
 
 
 # ----------------------------------------------------------------------
@@ -609,7 +630,7 @@ class Solution:
     residual, J : whitened residuals and their derivatives there. cost : robust cost.
     fixed : sentences by parameter for what was left out.
     agreeing, starts : how many of the refined starts came to the same minimum.
-    law : what is to be said of the law of deflation, where it is not the nominal one.
+    law : what is to be said of the pumps' model, where it is not the nominal one.
     """
 
     problem: Problem
@@ -871,7 +892,8 @@ def fit_tracks(
         raise _blind(fixed)
     x, cost, residual, J = best
     found = Solution(problem, x, residual, J, cost, fixed, agreeing, refined)
-    return _without_creep(_by_the_better_law(found) if either_law else found)
+    found = _by_the_better_law(found) if either_law and not _explained(found) else found
+    return _without_creep(found if _explained(found) else _with_play(found))
 
 
 _Minimum = tuple[FloatArray, float, FloatArray, FloatArray]
@@ -892,6 +914,55 @@ def _all_told(problem: Problem, best: _Minimum, fixed: dict[str, str]) -> tuple[
     return problem, best
 
 
+def _explained(solution: Solution) -> bool:
+    """Whether the residuals of all logs with pumps are white: nothing is left for another model of them."""
+    return all(
+        colour.white
+        for colour, track in zip(colour_of(solution), solution.problem.tracks, strict=True)
+        if track.hoses
+    )
+
+
+def _reopened(solution: Solution) -> tuple[set[str], dict[str, str]]:
+    """Names to estimate by another model, and sentences on those that stay fixed.
+
+    What could not be told by the wrong model may be by the right one.
+    """
+    fixed = {name: why for name, why in solution.fixed.items() if "enter only" in why}
+    return {*solution.problem.names, *solution.fixed} - {*fixed}, fixed
+
+
+def _ordered(names: Iterable[str]) -> tuple[str, ...]:
+    return tuple(name for name in PARAMETERS if name in names)
+
+
+def _with_play(solution: Solution) -> Solution:
+    """The solution, or that with a play of the pumps where it explains the logs far better."""
+    problem = solution.problem
+    if {*_PLAYS} & {*problem.names, *problem.stated}:
+        return solution
+    names, fixed = _reopened(solution)
+    known = values_of(problem.nominal)
+    # Without a play others have made up for it: creep, and a lag that grew.
+    bases = known, {**known, **problem.held, **solution.values}
+    tried = []
+    for name, widths in _PLAYS.items():
+        rough = replace(problem, names=_ordered(names | {name}), held={}, rough=True)
+        values = [{**base, name: width} for base in bases for width in widths]
+        starts = np.array([_moved(solution, rough, one) for one in values])
+        best = int(np.argmin(_robust(rough, residuals(rough, starts))))
+        tried.append((solve(rough, starts[best], 25)[1], name, values[best]))
+    cost, name, begin = min(tried, key=lambda one: one[0])
+    if not cost < _BETTER * solution.cost:
+        return solution
+    found = _again(solution, replace(problem, names=_ordered(names | {name}), held={}), begin, fixed)
+    if not found.cost < _BETTER * solution.cost or name not in found.values:
+        return solution
+    width = f"{label_of(name)} of {found.values[name]:.3g} {PARAMETERS[name].unit}"
+    law = f"a {width} leaves {100.0 * found.cost / solution.cost:.0f} % of the misfit"
+    return replace(found, law="; ".join(one for one in (solution.law, law) if one))
+
+
 def _by_the_better_law(solution: Solution) -> Solution:
     """The solution with a limited rate, or that with an orifice where it explains the logs far better."""
     problem = solution.problem
@@ -899,12 +970,8 @@ def _by_the_better_law(solution: Solution) -> Solution:
     if not limited <= {*problem.names} or (limited | orifice) & {*problem.stated}:
         return solution
     nominal = replace(problem.nominal, pump=replace(problem.nominal.pump, deflation=Orifice()))
-    # What could not be told by the wrong law may be by the right one.
-    fixed = {name: why for name, why in solution.fixed.items() if "enter only" in why}
-    names = ({*problem.names, *solution.fixed} - limited - {*fixed}) | orifice
-    other = replace(
-        problem, nominal=nominal, names=tuple(name for name in PARAMETERS if name in names), held={}
-    )
+    names, fixed = _reopened(solution)
+    other = replace(problem, nominal=nominal, names=_ordered((names - limited) | orifice), held={})
     known = values_of(nominal)
     near = {**known, **problem.held, **solution.values}
     rough = replace(other, rough=True)
@@ -948,12 +1015,12 @@ def _without_creep(solution: Solution) -> Solution:
     if not doubtful or {*CREEP} & {*problem.stated}:
         return solution
     known = values_of(problem.nominal)
-    fixed = {name: why for name, why in solution.fixed.items() if "enter only" in why}
-    names = {*problem.names, *solution.fixed} - {*CREEP} - {*fixed}
+    names, fixed = _reopened(solution)
+    names -= {*CREEP}
 
     def found(stiffness: float, why: dict[str, str]) -> Solution:
         held = {spring: stiffness}
-        other = replace(problem, names=tuple(name for name in PARAMETERS if name in names), held=held)
+        other = replace(problem, names=_ordered(names), held=held)
         # Swings lock to springs that are off by a turn, and a creep that runs away takes the springs along.
         starts = known, {**known, **solution.values}
         found = (_again(solution, other, values, fixed | why) for values in starts)
@@ -1184,8 +1251,8 @@ def held_back(solution: Solution) -> list[HeldLog]:
     return out
 
 
-_CHORDS = 12
-_STILL = 1e-2
+_CHORDS = 20
+_STILL = 1e-4
 """Robust cost: a step that would gain less is not taken."""
 
 

@@ -62,4 +62,6 @@ def _pump(values: Mapping[str, Any], plant: Plant) -> Pump:
         if orifice
         else RateLimit(**given("falling_N_per_s"))
     )
-    return Pump(ElongationForce(**static), deflation, **given("lag_s", "delay_ticks", "tick_s"))
+    return Pump(
+        ElongationForce(**static), deflation, **given("lag_s", "delay_ticks", "tick_s", "play_pwm", "play_N")
+    )

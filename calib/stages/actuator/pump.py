@@ -5,6 +5,10 @@ Order of (2.13), (3.49) and Fig. 3.22, corrected:
     transport delay in ticks -> saturation to 0 .. 255 -> static force g(u), zero in the dead zone
     -> first-order lag of 0.7 s -> limit on the falling rate.
 
+Play. What follows a command late after each turn acts as a play of the width w: it stays as it is until the
+command is w / 2 away. One may lie before the static force, as of valves (a pump that is off gives none), one
+behind it, as of rubber whose hysteresis leaves a rest. The source's actuator has neither.
+
 Static force. `ElongationForce` turns (2.13) into a force with the spring law: F = k(eps) eps, so
 that the steady elongation is the measured one. The printed 3.376 in (2.13) gives negative lengths;
 3.756 gives 26.56 mm at 12 V, as the text says. `PolynomialForce` is (3.49), which is in
@@ -44,6 +48,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calib.core.arrays import FloatArray
+from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
 from calib.stages.actuator.kinematics import inlined
 from calib.stages.actuator.parameters import SUPPLY_V, Stiffness
@@ -119,6 +124,7 @@ class Pump:
     lag_s : time constant of the rise.
     delay_ticks : ticks from a command to its effect.
     tick_s : period of the commands.
+    play_pwm, play_N : widths of the plays before and behind the static force.
     """
 
     static: ElongationForce = ElongationForce()
@@ -126,6 +132,8 @@ class Pump:
     lag_s: float = 0.7
     delay_ticks: int = 2
     tick_s: float = TICK_S
+    play_pwm: float = 0.0
+    play_N: float = 0.0
 
 
 class PumpCoefficients(NamedTuple):
@@ -164,6 +172,37 @@ def delayed(pump: Pump, pwm: FloatArray, before: FloatArray | None = None) -> Fl
     """
     lead = np.zeros((pump.delay_ticks, 2)) if before is None else before
     return np.concatenate([lead, pwm])[: len(pwm)]
+
+
+@kernel()
+def _follow(half: float, values: FloatArray, held: FloatArray, out: FloatArray) -> None:
+    for k in range(len(values)):
+        for i in range(values.shape[1]):
+            held[i] = min(max(held[i], values[k, i] - half), values[k, i] + half)
+            out[k, i] = held[i]
+
+
+def _behind_play(width: float, values: FloatArray, held: FloatArray) -> FloatArray:
+    out = np.empty(values.shape)
+    _follow(0.5 * width, np.ascontiguousarray(values, dtype=np.float64), held, out)
+    return out
+
+
+def settling_force_N(
+    pump: Pump, pwm: FloatArray, strength: Sequence[float] = (1.0, 1.0), held: FloatArray | None = None
+) -> FloatArray:
+    """Forces (n, 2) [N] that commands (n, 2), one after the other, settle at behind the plays.
+
+    Parameters
+    ----------
+    strength : factors on the static forces.
+    held : (2, 2), by default zeros: what followed the commands and the forces before, and then at the end.
+    """
+    held = np.zeros((2, 2)) if held is None else held
+    if pump.play_pwm > 0.0:
+        pwm = np.where(pwm > 0.0, _behind_play(pump.play_pwm, pwm, held[0]), 0.0)
+    force = static_force_N(pump, pwm) * np.asarray(strength)
+    return _behind_play(pump.play_N, force, held[1]) if pump.play_N > 0.0 else force
 
 
 @inlined

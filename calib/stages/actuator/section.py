@@ -88,6 +88,8 @@ class PumpParameters(Section):
     falling_N_per_s: Number | None = quantity(None, label="deflation", fact=True, ge=1e-3, le=1e3)
     laminar_s: Number | None = quantity(None, label="deflation, laminar", ge=1e-3, le=60.0)
     turbulent_s2_per_N: Number | None = quantity(None, label="deflation, turbulent", ge=0.0, le=1e3)
+    play_pwm: Number | None = quantity(None, label="play of the commands", ge=0.0, le=255.0)
+    play_N: Number | None = quantity(None, label="play of the forces", ge=0.0, le=1e3)
     strength: Annotated[list[Factor], Field(min_length=2, max_length=2)] | None = quantity(
         None, label="strength of the pumps"
     )

@@ -22,6 +22,7 @@ from calib.stages.actuator.pump import (
     advance_pump,
     delayed,
     pump_coefficients,
+    settling_force_N,
     static_force_N,
 )
 
@@ -438,7 +439,7 @@ def simulate_batch(
     task = _Task(
         plants,
         pumps,
-        {pump: static_force_N(pump, delayed(pump, pwm)) for pump in set(pumps)},
+        {pump: settling_force_N(pump, delayed(pump, pwm)) for pump in set(pumps)},
         np.ascontiguousarray(np.broadcast_to(start, (len(plants), len(STATE)))),
         substeps,
         np.empty((len(plants), len(pwm), len(STATE))),

@@ -13,7 +13,13 @@ from calib.core.compilation import kernel
 from calib.stages.actuator.dynamics import Coefficients, coefficients, rates
 from calib.stages.actuator.kinematics import chord_decay_w, chord_ratio_w
 from calib.stages.actuator.parameters import DAMPING_SCALE_FREE, Plant, pumps_connected
-from calib.stages.actuator.pump import Pump, PumpCoefficients, advance_pump, pump_coefficients, static_force_N
+from calib.stages.actuator.pump import (
+    Pump,
+    PumpCoefficients,
+    advance_pump,
+    pump_coefficients,
+    settling_force_N,
+)
 from calib.stages.estimator.event import (
     CAMERA,
     IMU,
@@ -567,11 +573,14 @@ class Drive:
         return x, P
 
 
-def commands(drive: Drive, pwm: FloatArray) -> FloatArray:
-    """Static forces (n, 2) [N] that commands (n, 2) settle at with nominal pumps; NaN without a command."""
+def commands(drive: Drive, pwm: FloatArray, held: FloatArray | None = None) -> FloatArray:
+    """Static forces (n, 2) [N] that commands (n, 2) settle at with nominal pumps; NaN without a command.
+
+    `held` is that of `settling_force_N`.
+    """
     known = np.isfinite(pwm).all(axis=1)
     out = np.full(pwm.shape, np.nan)
-    out[known] = static_force_N(drive.pump, pwm[known]) * np.array(drive.strength)
+    out[known] = settling_force_N(drive.pump, pwm[known], drive.strength, held)
     return out
 
 
@@ -1263,6 +1272,7 @@ class DrivenFilter:
         self.setup, self.drive = setup, drive
         delay = max(float(setup.start.sensor[7]), 0.0)
         imu_s = setup.imu_period_s if setup.imu_period_s > 0.0 else 0.002
+        self._held = np.zeros((2, 2))
         size, n = min(max(16, math.ceil(2.0 * (delay + 0.02) / imu_s) + 8), 512), len(DRIVEN)
         self._events = no_events(size, 4, np.full(size, np.nan))
         self._memory = Memory(
@@ -1286,9 +1296,10 @@ class DrivenFilter:
         """Estimates (n, len(OUT)) of rows with commands (n, 2); call again with the rows that follow."""
         out = np.empty((len(rows), len(OUT)))
         driven = np.asarray(np.nan_to_num(pwm).max(axis=1, initial=0.0), dtype=np.float64)
+        forces = commands(self.drive, pwm, self._held)
         run_driven(
-            rows.t_s, rows.readings, rows.kinds, commands(self.drive, pwm), driven, self._events,
-            self._memory, self._model, self._room, out,
+            rows.t_s, rows.readings, rows.kinds, forces, driven, self._events, self._memory, self._model,
+            self._room, out,
         )  # fmt: skip
         return out
 

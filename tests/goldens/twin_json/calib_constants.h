@@ -79,7 +79,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x2782C936UL
+#define CALIB_ID 0x468B42B0UL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok */
@@ -221,7 +221,7 @@
  * f = F0 + F1 phi^2 + F2 phi^4 + F3 phi^6; bellows 1 is the longer one for phi > 0.
  */
 #define CALIB_BELLOWS_RADIUS_M 0.0126f /* r_B, m */
-#define CALIB_REST_LENGTH_M 0.0651527047f /* l0, m; length until the first picture */
+#define CALIB_REST_LENGTH_M 0.0651526973f /* l0, m; length until the first picture */
 #define CALIB_INVERSE_F0_PER_RAD0 2.0f /* coefficient of phi^0 (3.14), 1/rad^0 */
 #define CALIB_INVERSE_F1_PER_RAD2 0.0833333358f /* coefficient of phi^2 (3.14), 1/rad^2 */
 #define CALIB_INVERSE_F2_PER_RAD4 0.00243055564f /* coefficient of phi^4 (3.14), 1/rad^4 */
@@ -238,8 +238,8 @@
 #define CALIB_FUSED_DELAY_TICKS 1.50560474f /* D, ticks from the exposure of a picture to its tick */
 #define CALIB_FUSED_ACCEL_11 0.000252634665f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
 #define CALIB_FUSED_ACCEL_12 5.86510805e-06f /* row 1, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_1 -4.0070986e-06f /* row 1, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_21 -5.76584807e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_1 -4.00709905e-06f /* row 1, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_21 -5.76584853e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
 #define CALIB_FUSED_ACCEL_22 0.000256983796f /* row 2, of ay, rad per m/s^2 */
 #define CALIB_FUSED_ACCEL_2 -1.74283832e-05f /* row 2, of the biases, subtracted, rad */
 #define CALIB_FUSED_ACCEL_GAIN 0.00250281161f /* K_a, share of the accelerometer's residual */
@@ -308,14 +308,14 @@
 #define CALIB_FF_SLOPE_PWM_PER_M 5498.1001f /* PWM/m */
 #define CALIB_FF_MINUS_PWM 258.372711f /* SLOPE FROM less the value there, PWM */
 #define CALIB_FF_LIMIT_PWM 255.0f /* largest value, PWM */
-#define CALIB_FF_TABLE_FROM_M 0.0651527047f /* length of the first entry, m */
+#define CALIB_FF_TABLE_FROM_M 0.0651526973f /* length of the first entry, m */
 #define CALIB_FF_TABLE_PER_STEP 500.0f /* entries per metre, 1/m */
 #define CALIB_FF_TABLE_SIZE 15 /* entries */
 /* PWM that holds a bellows at FROM + 0.002 m times the index */
 static const float calib_ff_table_pwm[15] CALIB_IN_FLASH = {
-    99.75f, 128.214767f, 139.69957f, 149.12529f, 157.553146f, 165.458649f,
-    173.091187f, 180.613693f, 188.186951f, 195.979126f, 204.200455f, 213.209503f,
-    223.813583f, 240.717316f, 253.5f,
+    99.75f, 128.214752f, 139.699554f, 149.125275f, 157.553131f, 165.458618f,
+    173.091156f, 180.613663f, 188.18692f, 195.979095f, 204.200409f, 213.209442f,
+    223.813522f, 240.717102f, 253.5f,
 };
 
 /* Envelope, see calib_guard.h: the pumps stop where the actuator leaves it. */

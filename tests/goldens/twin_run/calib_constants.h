@@ -81,7 +81,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x02AEA8D4UL
+#define CALIB_ID 0xE68BCDA5UL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 1 /* 0: a section that they come from is not ok */
@@ -239,13 +239,13 @@
 #define CALIB_HAS_FUSED 1 /* for #if */
 #define CALIB_FUSED_DELAY_TICKS 1.51403821f /* D, ticks from the exposure of a picture to its tick */
 #define CALIB_FUSED_ACCEL_11 0.000255561928f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_12 4.83815302e-06f /* row 1, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_12 4.83815347e-06f /* row 1, of ay, rad per m/s^2 */
 #define CALIB_FUSED_ACCEL_1 1.53764413e-05f /* row 1, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_21 -4.82156292e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_21 -4.82156338e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
 #define CALIB_FUSED_ACCEL_22 0.000256441272f /* row 2, of ay, rad per m/s^2 */
 #define CALIB_FUSED_ACCEL_2 -9.11297047e-06f /* row 2, of the biases, subtracted, rad */
 #define CALIB_FUSED_ACCEL_GAIN 0.00251232111f /* K_a, share of the accelerometer's residual */
-#define CALIB_FUSED_ACCEL_WEAK 0.000256097963f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
+#define CALIB_FUSED_ACCEL_WEAK 0.000256097992f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
 #define CALIB_FUSED_HALF_DT_S 0.00827013142f /* dt / 2 over the gyroscope's scale, s */
 #define CALIB_FUSED_HALF_BIAS_RAD 4.96005559e-05f /* bias times the same, rad */
 #define CALIB_FUSED_PHI_PER_M 0.373798341f /* K_c / lever, rad/m */
@@ -315,9 +315,9 @@
 #define CALIB_FF_TABLE_SIZE 15 /* entries */
 /* PWM that holds a bellows at FROM + 0.002 m times the index */
 static const float calib_ff_table_pwm[15] CALIB_IN_FLASH = {
-    99.75f, 128.243576f, 139.740936f, 149.177811f, 157.614853f, 165.528931f,
-    173.172806f, 180.705017f, 188.291595f, 196.099365f, 204.340302f, 213.385117f,
-    224.052429f, 241.444244f, 253.5f,
+    99.75f, 128.243591f, 139.740952f, 149.177826f, 157.614883f, 165.528961f,
+    173.172836f, 180.705048f, 188.291641f, 196.099411f, 204.340347f, 213.385193f,
+    224.052521f, 241.444534f, 253.5f,
 };
 
 /* Envelope, see calib_guard.h: the pumps stop where the actuator leaves it. */

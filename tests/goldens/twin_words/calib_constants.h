@@ -79,7 +79,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x93C5A7BCUL
+#define CALIB_ID 0xCA2E4C54UL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok */
@@ -238,12 +238,12 @@
 #define CALIB_FUSED_DELAY_TICKS 1.48945153f /* D, ticks from the exposure of a picture to its tick */
 #define CALIB_FUSED_ACCEL_11 0.000250908924f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
 #define CALIB_FUSED_ACCEL_12 5.82468783e-06f /* row 1, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_1 -3.82994358e-06f /* row 1, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_21 -5.72820409e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_22 0.000255135121f /* row 2, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_2 -1.73300941e-05f /* row 2, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_GAIN 0.00248554233f /* K_a, share of the accelerometer's residual */
-#define CALIB_FUSED_ACCEL_WEAK 0.000253368227f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
+#define CALIB_FUSED_ACCEL_1 -3.82994403e-06f /* row 1, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_21 -5.72820454e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_22 0.00025513515f /* row 2, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_2 -1.73300959e-05f /* row 2, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_GAIN 0.00248554256f /* K_a, share of the accelerometer's residual */
+#define CALIB_FUSED_ACCEL_WEAK 0.000253368256f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
 #define CALIB_FUSED_HALF_DT_S 0.00819364097f /* dt / 2 over the gyroscope's scale, s */
 #define CALIB_FUSED_HALF_BIAS_RAD 4.92096187e-05f /* bias times the same, rad */
 #define CALIB_FUSED_PHI_PER_M 0.376751512f /* K_c / lever, rad/m */
@@ -313,9 +313,9 @@
 #define CALIB_FF_TABLE_SIZE 15 /* entries */
 /* PWM that holds a bellows at FROM + 0.002 m times the index */
 static const float calib_ff_table_pwm[15] CALIB_IN_FLASH = {
-    99.75f, 128.273636f, 139.784088f, 149.232574f, 157.679214f, 165.602219f,
-    173.257904f, 180.800247f, 188.400726f, 196.224762f, 204.48613f, 213.568253f,
-    224.301483f, 242.202301f, 253.5f,
+    99.75f, 128.273636f, 139.784073f, 149.232574f, 157.679214f, 165.602219f,
+    173.257904f, 180.800247f, 188.400726f, 196.224747f, 204.48613f, 213.568253f,
+    224.301483f, 242.202255f, 253.5f,
 };
 
 /* Envelope, see calib_guard.h: the pumps stop where the actuator leaves it. */
