@@ -1252,6 +1252,8 @@ def held_back(solution: Solution) -> list[HeldLog]:
 
 
 _CHORDS = 20
+_NEAR = 0.05
+"""Relative change of a parameter within which the derivatives of the fit to all logs serve."""
 _STILL = 1e-4
 """Robust cost: a step that would gain less is not taken."""
 
@@ -1260,7 +1262,7 @@ def _without_each(solution: Solution) -> list[tuple[FloatArray, int, float]]:
     """For each log the fit to all others: all unknowns, how many parameters it tells, cost that it gains.
 
     It lies near the fit to all logs, so the derivatives there serve (a chord method), and one batch of
-    simulations moves the fits of all logs at once. One that does not come to rest is sought by itself.
+    simulations moves the fits of all logs at once. One that does not come to rest nearby is sought by itself.
     """
     problem, tracks, J = solution.problem, solution.problem.tracks, solution.J
     u, priors, count = problem.unknowns, problem.unknowns.priors, len(solution.problem.tracks)
@@ -1295,7 +1297,9 @@ def _without_each(solution: Solution) -> list[tuple[FloatArray, int, float]]:
         going[at] = after < cost[at]
         better = at[going[at]]
         xs[better], residual[better], cost[better] = to[better], found[going[at]], after[going[at]]
-    for k in np.flatnonzero(~rested).tolist():
+    size = np.maximum(np.abs(solution.x), u.scale)[: len(problem.names)]
+    near = (np.abs(xs - solution.x)[:, : len(problem.names)] < _NEAR * size).all(axis=1)
+    for k in np.flatnonzero(~(rested & near)).tolist():
         others = [track for i, track in enumerate(tracks) if i != k]
         names = tuple(name for name, told in zip(problem.names, free[k], strict=False) if told)
         less = replace(problem, tracks=others, names=names, held={**problem.held, **solution.values})
