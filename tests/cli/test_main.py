@@ -192,7 +192,7 @@ def test_an_interruption_leaves_the_old_file_or_the_new_one(
         assert "Traceback" not in err
     else:
         # Done before, or killed; or the interpreter itself was still starting on a busy machine.
-        assert started.returncode in (0, -how)
+        assert started.returncode in (0, -how) or "Failed to import the site module" in err
     after = rig.read_text()
     assert after.encode() == before or (after.startswith("schema:") and "\nprovenance:\n" in after)
     assert [path.name for path in rig.parent.iterdir()] == ["rig.yaml"]
