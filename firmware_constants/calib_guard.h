@@ -435,8 +435,9 @@ static inline uint16_t calib_guard_try(uint8_t fault, uint8_t kind) {
             mode = CALIB_MODE_ORIENTATION;
             in.reference[0] = 0.0f;
             in.u_px = -1.0f;
-            /* As it was once, then just beyond CALIB_GUARD_FROZEN_RAD: no longer than a narrow envelope bears. */
-            out.phi_rad -= k > 2 ? 0.2525f : 0.0f;
+            in.v_px = 7.0f;
+            /* As it was once or never, then just beyond CALIB_GUARD_FROZEN_RAD: no longer than a narrow envelope bears. */
+            out.phi_rad -= k + kind > 2 ? 0.2525f : 0.0f;
             break;
         case CALIB_FAULT_APART:
             out.marker_m[0] += kind ? -1.004f * CALIB_ENVELOPE_APART_M : 1.004f * CALIB_ENVELOPE_APART_M;
@@ -503,10 +504,11 @@ static inline uint16_t calib_guard_try(uint8_t fault, uint8_t kind) {
 /* 0 when every fault stops the pumps in its tick and no longer, else the number of the first that does not. */
 static inline uint8_t calib_guard_selftest(void) {
     /* Fault, kind, tick, ticks until it is over. The last is not of the fused estimator, which always needs the camera. */
-    static const uint8_t tries[21][4] = {
+    static const uint8_t tries[22][4] = {
         {CALIB_FAULT_IMU_LOST, 0, 12, 107},     {CALIB_FAULT_IMU_LOST, 1, 31, 107},
         {CALIB_FAULT_IMU_FROZEN, 0, 13, 61},    {CALIB_FAULT_CAMERA_LOST, 0, 15, 119},
         {CALIB_FAULT_CAMERA_LOST, 1, 39, 119},  {CALIB_FAULT_CAMERA_FROZEN, 0, 8, 60},
+        {CALIB_FAULT_CAMERA_FROZEN, 1, 7, 60},
         {CALIB_FAULT_APART, 0, 30, 62},         {CALIB_FAULT_APART, 1, 30, 62},
         {CALIB_FAULT_REFERENCE, 0, 1, 28},      {CALIB_FAULT_REFERENCE, 1, 1, 28},
         {CALIB_FAULT_REFERENCE, 2, 1, 28},      {CALIB_FAULT_REFERENCE, 3, 1, 28},
@@ -516,7 +518,7 @@ static inline uint8_t calib_guard_selftest(void) {
         {CALIB_FAULT_LONG, 0, 1, 30},           {CALIB_FAULT_LONG, 1, 1, 30},
         {CALIB_FAULT_NONE, 0, 1, 0}};
     uint8_t i;
-    for (i = 0; i < (CALIB_FUSED ? 20 : 21); i++) {
+    for (i = 0; i < (CALIB_FUSED ? 21 : 22); i++) {
         if (calib_guard_try(tries[i][0], tries[i][1]) != tries[i][2] + 256u * tries[i][3]) {
             return (uint8_t)(i + 1u);
         }

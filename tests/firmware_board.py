@@ -23,7 +23,7 @@ import numpy as np
 from firmware_build import Built
 from scipy.signal import butter, sosfilt, sosfilt_zi
 
-from calib.stages.actuator.pump import static_force_N
+from calib.stages.actuator.pump import settling_force_N
 from calib.stages.actuator.simulate import derivative, rig_at_rest
 from calib.stages.actuator.simulate import run as run_kernel
 from calib.twin.rig import SimulatedRig
@@ -172,7 +172,7 @@ class Board:
             self.held = False
         if not self.held:
             plant = self.plants[self.hoses_off]
-            static = (static_force_N(self.rig.pump, arriving) * plant.strength)[None]
+            static = settling_force_N(self.rig.pump, arriving[None], self.rig.strength, plant.held)
             assert run_kernel(plant.c, plant.p, self.row, static, _STEP_S, 1, 1, self._out) < 0
             self.row = self._out[0].copy()
         self._past.append(self.row[:2].copy())

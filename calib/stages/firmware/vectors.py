@@ -164,11 +164,17 @@ def vectors(
     """
     reference = reference_of(constants, fused=fused)
     run = directed_fused(constants, ticks, period=ticks) if fused else directed(constants, ticks)
+    still = run[0]
+    # What is known first is that the head is bent, and turns.
+    bent = max(
+        range(ticks), key=lambda k: abs(run[k].ay_mps2) if run[k].marker_seen and run[k].imu_read else 0.0
+    )
+    run = [*run[bent:], *run[:bent]]
     given = [(one, 1) for one in run]
     if limits:
-        silent = replace(run[0], marker_seen=False, imu_read=False)
-        weightless = binary32(replace(run[0], ax_mps2=0.1, ay_mps2=-0.1))
-        given = [(silent, 1), (weightless, 1), *given, *_limits(constants, run[0])]
+        silent = replace(still, marker_seen=False, imu_read=False)
+        weightless = binary32(replace(silent, imu_read=True, ax_mps2=0.1, ay_mps2=-0.1))
+        given = [(silent, 1), (weightless, 1), *given, *_limits(constants, still)]
         if fused:
             given += _bent(constants, coherent(constants, ticks, period=ticks))
     made = []
