@@ -211,10 +211,12 @@ class Stage:
         except ValidationError as error:
             # A fit to nonsense can end anywhere.
             first = error.errors()[0]
-            key = ".".join(str(part) for part in first["loc"])
+            key, value = ".".join(str(part) for part in first["loc"]), first["input"]
+            told = f", {key} came out as {value:.6g}" if isinstance(value, int | float) else ""
+            names = ", ".join(shown(path) for path in files.paths)
+            which = "; one of them may be of another rig or spoilt: leave them out in turn"
             raise BadInputError(
-                f"{', '.join(shown(path) for path in files.paths[:3])}: no useful answer follows, {key} came "
-                f"out as {first['input']!r:.40}"
+                f"{names}: no useful answer follows{told}{which if len(files.paths) > 1 else ''}"
             ) from error
         for result in self.results(outcome):
             result.made_by(self.name, files.hashes)

@@ -789,7 +789,7 @@ def _implausible(
 ) -> str:
     """Why rates (n, axes) cannot be in a unit of this many rad/s; empty where they can."""
     # A few wild readings are a fault, not a unit.
-    few = 2 + len(values) // 1000
+    few = min(max(8, values.size // 100), values.size - 1)
     largest = scale * float(np.partition(np.abs(values).ravel(), -1 - few)[-1 - few])
     if largest > _FASTEST_RADPS:
         return f"reaches {largest:.4g} rad/s"
@@ -797,6 +797,7 @@ def _implausible(
     if "gz_radps" not in names or "ax_mps2" not in accel or "ay_mps2" not in accel:
         return ""
     every = _together(cells, columns, ["t_s", *accel, *names])
+    every = every[(scale * np.abs(every[:, 1 + len(accel) :]) <= _FASTEST_RADPS).all(axis=1)]
     if len(every) < 2 * _CALM_WINDOW:
         return ""
     t = every[:, 0] * UNITS["time"][columns.sources["t_s"].unit]

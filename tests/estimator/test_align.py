@@ -119,6 +119,20 @@ def test_outliers_dropouts_and_a_blackout_do_little() -> None:
     assert sum(log.outliers for log in found.logs) > 10
 
 
+def test_a_few_wild_readings_of_the_imu_do_little() -> None:
+    trial = known(SimulatedRig())
+    logs = []
+    for k, (kind, settings) in enumerate(MOTIONS[:2]):
+        log = align_log(twin_log(trial.rig, kind, settings, 30 + k))
+        readings, rng = log.readings.copy(), np.random.default_rng(k)
+        for axis, wild in enumerate((100.0, -60.0, 30.0)):
+            readings[rng.choice(len(readings), 5, replace=False), axis] = wild
+        logs.append(replace(log, readings=readings))
+    found = align(logs, prior_settings(trial.view))
+    assert np.abs(scores(trial, found)).max() < 3.5
+    assert np.all(found.noise.imu < 2.0 * np.array([0.016, 0.016, 0.0025]))
+
+
 def test_the_angle_at_rest_and_its_gradient() -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):

@@ -462,11 +462,24 @@ def _like_neighbours(phi: FloatArray) -> BoolArray:
     return np.asarray(np.isfinite(phi) & (np.abs(off) <= limit))
 
 
+_SPIKE = 20.0
+
+
+def _without_spikes(rates: FloatArray) -> FloatArray:
+    """Rates (n,) with the median of three in place of single ones that stand out, for a first guess."""
+    middle = rates.copy()
+    middle[1:-1] = np.median([rates[:-2], rates[1:-1], rates[2:]], axis=0)
+    off = np.abs(rates - middle)
+    # Half of the readings are their own median.
+    usual = float(np.median(off[off > 0.0])) if off.any() else 0.0
+    return np.where(off > _SPIKE * usual, middle, rates)
+
+
 def _integrated(t: FloatArray, gz: FloatArray) -> FloatArray:
     known = np.isfinite(gz)
     if known.sum() < 2:
         return np.zeros(len(t))
-    rate = -np.interp(t, t[known], gz[known])
+    rate = -np.interp(t, t[known], _without_spikes(gz[known]))
     steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(t)
     return np.asarray(np.concatenate([[0.0], np.cumsum(steps)]))
 
@@ -670,7 +683,7 @@ def _stretch(piece: Piece, offset_s: float) -> Stretch | None:
     knots = Knots.over(first - _MARGIN_S, last + _MARGIN_S, span)
     t = exposed[use]
     known = np.isfinite(piece.readings[:, 2])
-    rates = (piece.imu.t_s[known], -piece.readings[known, 2], 1, 0.02)
+    rates = (piece.imu.t_s[known], -_without_spikes(piece.readings[known, 2]), 1, 0.02)
     phi = _spline(knots, [(t, piece.phi[use], 0, _PHI_SIGMA), rates], 300.0)
     length = _spline(knots, [(t, piece.length[use], 0, 1.5e-3)], 0.5)
     return Stretch(
@@ -799,7 +812,8 @@ def _imu_noise(
         done = 0
         for off, rows in _readings(stretch, c, s):
             _, pull, weight = imu_terms(off, noise.imu)
-            squares += np.where(np.isfinite(off), pull * off, 0.0).sum(axis=0)
+            # Beyond `HUBER` deviations a reading counts as one there: a few wild ones are no noise.
+            squares += ((pull * noise.imu) ** 2).sum(axis=0)
             count += (weight > 0.0).sum(axis=0)
             root = np.sqrt(weight)
             for probe in range(len(signs)):

@@ -79,7 +79,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x468B42B0UL
+#define CALIB_ID 0x1673B71DUL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok */
@@ -120,12 +120,12 @@
 /* Plane of the actuator, without the shift and stretch that align has found. */
 #define CALIB_HAS_PLANE 1 /* for #if */
 #define CALIB_PLANE_OK 1 /* 0: the plane failed its gate */
-#define CALIB_PLANE_INVERSE_11 0.00365914311f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_12 -8.84316614e-05f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_13 -0.599136591f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_21 7.93016152e-05f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_22 0.00362197123f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_23 -0.160735682f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_11 0.00365914684f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_12 -8.84317196e-05f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_13 -0.599137306f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_21 7.93017171e-05f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_22 0.00362197496f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_23 -0.160736144f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_31 -0.000315939047f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_32 -0.000872857461f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_33 3.7639873f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
@@ -134,12 +134,12 @@
  * The same from normalised undistorted coordinates, for CALIB_UNDISTORT 1. Row 3 gives 1/s of (2.12) in 1/m, the
  * reciprocal depth.
  */
-#define CALIB_PLANE_NORMALISED_11 1.00043917f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_12 -0.0241067f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_13 -0.0202300325f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_21 0.021681698f /* row 2, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_22 0.987358689f /* row 2, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_23 0.220973805f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_11 1.00044012f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_12 -0.0241067167f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_13 -0.0202301797f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_21 0.0216817278f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_22 0.987359703f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_23 0.22097373f /* row 2, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_31 -0.0863802731f /* row 3, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_32 -0.237943202f /* row 3, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_33 3.62430787f /* row 3, A^-1 K, dimensionless to m */
@@ -150,12 +150,12 @@
  * CALIB_UNDISTORT 0. Neglecting the lens costs up to 0.278 mm there.
  */
 #define CALIB_HAS_RAW_PLANE 1 /* 0: the workspace is not in sight */
-#define CALIB_PLANE_RAW_11 0.00369112869f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_12 -8.8206456e-05f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_13 -0.604403973f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_21 7.21811739e-05f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_22 0.00363215082f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_23 -0.160437107f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_11 0.00369113241f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_12 -8.82065069e-05f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_13 -0.604404747f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_21 7.2181283e-05f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_22 0.00363215478f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_23 -0.160437569f /* row 2, distorted px to m */
 #define CALIB_PLANE_RAW_31 -0.000436246803f /* row 3, distorted px to m */
 #define CALIB_PLANE_RAW_32 -0.00111481769f /* row 3, distorted px to m */
 #define CALIB_PLANE_RAW_33 3.81186843f /* row 3, distorted px to m */
@@ -166,7 +166,7 @@
 #define CALIB_TICK_RATE_MHZ 60000 /* the same in millihertz, for #if */
 #define CALIB_HOLD_TICKS 60 /* a sensor that is silent for longer, a second, stops the pumps */
 #define CALIB_TIME_OFFSET_TICKS 2 /* ceil(D), angles that are remembered; D ticks by which a picture is later than the IMU */
-#define CALIB_TIME_OFFSET_PART 0.494395286f /* ceil(D) - D, share of a tick */
+#define CALIB_TIME_OFFSET_PART 0.494403481f /* ceil(D) - D, share of a tick */
 
 /*
  * IMU on the head, x from the head to the base at rest; phi = atan2(RATIO ay, ax) - mount (2.1),
@@ -175,11 +175,11 @@
 #define CALIB_IMU_SIGN_AX 1 /* 1 or -1, by hand for an IMU that is not right-handed as mounted */
 #define CALIB_IMU_SIGN_AY 1 /* 1 or -1 */
 #define CALIB_IMU_SIGN_GZ 1 /* 1 or -1 */
-#define CALIB_IMU_ACCEL_BIAS_X_MPS2 -0.0142793311f /* subtracted from ax, m/s^2 */
-#define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.0681393743f /* subtracted from ay, m/s^2 */
-#define CALIB_IMU_ACCEL_RATIO 1.01721513f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
-#define CALIB_IMU_GYRO_BIAS_RADPS 0.00578942103f /* gz at rest, rad/s; sign as read; for programs of your own */
-#define CALIB_IMU_MOUNT_ANGLE_RAD 0.02281891f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
+#define CALIB_IMU_ACCEL_BIAS_X_MPS2 -0.0143916393f /* subtracted from ax, m/s^2 */
+#define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.0679094493f /* subtracted from ay, m/s^2 */
+#define CALIB_IMU_ACCEL_RATIO 1.01723242f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
+#define CALIB_IMU_GYRO_BIAS_RADPS 0.00578957796f /* gz at rest, rad/s; sign as read; for programs of your own */
+#define CALIB_IMU_MOUNT_ANGLE_RAD 0.0227956865f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
 #define CALIB_IMU_ACCEL_LIMIT_MPS2 157.0f /* readings beyond are lost, m/s^2 */
 #define CALIB_IMU_RATE_LIMIT_RADPS 35.0f /* readings beyond are lost, rad/s */
 #define CALIB_IMU_ACCEL_WEAK_MPS2 1.0f /* |ax| and |ay| below say nothing of phi, m/s^2 */
@@ -193,13 +193,13 @@
  */
 #define CALIB_MM_KP_DT 0.0500000007f /* Kp dt, dimensionless; Kp = 3 1/s */
 #define CALIB_MM_KI_DT2 0.000833333354f /* Ki dt^2, dimensionless; Ki = 3 1/s^2 */
-#define CALIB_MM_DT_S 0.0163863152f /* dt of the rate over the gyroscope's scale, s; phi falls for gz > 0 */
-#define CALIB_MM_GYRO_BIAS_DT_RAD 9.4867275e-05f /* bias times the same, rad */
+#define CALIB_MM_DT_S 0.0163866486f /* dt of the rate over the gyroscope's scale, s; phi falls for gz > 0 */
+#define CALIB_MM_GYRO_BIAS_DT_RAD 9.48717861e-05f /* bias times the same, rad */
 #define CALIB_MM_INTEGRAL_LIMIT_RAD 0.0166666675f /* |J| stays below, rad; 1 rad/s */
 #define CALIB_PHI_LIMIT_RAD 1.58000004f /* |phi| stays below; range of the sine in the pipeline, rad */
 
 /* Marker to head (A.1): x = X - d sin(phi), y = Y - d cos(phi). */
-#define CALIB_MARKER_OFFSET_M 0.0145762656f /* d, m; positive beyond the head */
+#define CALIB_MARKER_OFFSET_M 0.0145755773f /* d, m; positive beyond the head */
 
 /*
  * Low-pass of x and y. y_k = b0 x_k + b1 x_(k-1) + b2 x_(k-2) - a1 y_(k-1) - a2 y_(k-2): SciPy's
@@ -221,7 +221,7 @@
  * f = F0 + F1 phi^2 + F2 phi^4 + F3 phi^6; bellows 1 is the longer one for phi > 0.
  */
 #define CALIB_BELLOWS_RADIUS_M 0.0126f /* r_B, m */
-#define CALIB_REST_LENGTH_M 0.0651526973f /* l0, m; length until the first picture */
+#define CALIB_REST_LENGTH_M 0.0651530474f /* l0, m; length until the first picture */
 #define CALIB_INVERSE_F0_PER_RAD0 2.0f /* coefficient of phi^0 (3.14), 1/rad^0 */
 #define CALIB_INVERSE_F1_PER_RAD2 0.0833333358f /* coefficient of phi^2 (3.14), 1/rad^2 */
 #define CALIB_INVERSE_F2_PER_RAD4 0.00243055564f /* coefficient of phi^4 (3.14), 1/rad^4 */
@@ -235,27 +235,27 @@
  * Gains for the noise in align.
  */
 #define CALIB_HAS_FUSED 1 /* for #if */
-#define CALIB_FUSED_DELAY_TICKS 1.50560474f /* D, ticks from the exposure of a picture to its tick */
-#define CALIB_FUSED_ACCEL_11 0.000252634665f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_12 5.86510805e-06f /* row 1, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_1 -4.00709905e-06f /* row 1, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_21 -5.76584853e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_22 0.000256983796f /* row 2, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_2 -1.74283832e-05f /* row 2, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_GAIN 0.00250281161f /* K_a, share of the accelerometer's residual */
-#define CALIB_FUSED_ACCEL_WEAK 0.000255128602f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
-#define CALIB_FUSED_HALF_DT_S 0.00819315761f /* dt / 2 over the gyroscope's scale, s */
-#define CALIB_FUSED_HALF_BIAS_RAD 4.74336375e-05f /* bias times the same, rad */
-#define CALIB_FUSED_PHI_PER_M 0.374506444f /* K_c / lever, rad/m */
-#define CALIB_FUSED_ALONE_PHI_PER_M 5.30193281f /* the same without the IMU, rad/m */
-#define CALIB_FUSED_BOOST_PHI_PER_M 10.6038656f /* the same after a start, rad/m */
-#define CALIB_FUSED_BIAS 0.00251953467f /* K_b, share of the correction */
-#define CALIB_FUSED_MOVING_LENGTH 0.187992707f /* K_m, dimensionless */
-#define CALIB_FUSED_MOVING_RATE 0.00686585112f /* K_v, per tick */
-#define CALIB_FUSED_REST_LENGTH 0.00904431846f /* K_r, dimensionless */
+#define CALIB_FUSED_DELAY_TICKS 1.50559652f /* D, ticks from the exposure of a picture to its tick */
+#define CALIB_FUSED_ACCEL_11 0.000252841361f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_12 5.8640303e-06f /* row 1, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_1 -4.03702461e-06f /* row 1, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_21 -5.76469074e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_22 0.000257198408f /* row 2, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_2 -1.73832395e-05f /* row 2, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_GAIN 0.00250488776f /* K_a, share of the accelerometer's residual */
+#define CALIB_FUSED_ACCEL_WEAK 0.000255340245f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
+#define CALIB_FUSED_HALF_DT_S 0.00819332432f /* dt / 2 over the gyroscope's scale, s */
+#define CALIB_FUSED_HALF_BIAS_RAD 4.74358931e-05f /* bias times the same, rad */
+#define CALIB_FUSED_PHI_PER_M 0.374407858f /* K_c / lever, rad/m */
+#define CALIB_FUSED_ALONE_PHI_PER_M 5.30199051f /* the same without the IMU, rad/m */
+#define CALIB_FUSED_BOOST_PHI_PER_M 10.603981f /* the same after a start, rad/m */
+#define CALIB_FUSED_BIAS 0.00251949113f /* K_b, share of the correction */
+#define CALIB_FUSED_MOVING_LENGTH 0.187963128f /* K_m, dimensionless */
+#define CALIB_FUSED_MOVING_RATE 0.0068645007f /* K_v, per tick */
+#define CALIB_FUSED_REST_LENGTH 0.00904239714f /* K_r, dimensionless */
 #define CALIB_FUSED_RATE_DECAY 0.935506999f /* K_d, per tick, at rest and without a picture */
 #define CALIB_FUSED_SLOW 0.0989248976f /* K_s, dimensionless */
-#define CALIB_FUSED_MOVING_M 0.000369516376f /* s_0, mean residual of a length that moves, m */
+#define CALIB_FUSED_MOVING_M 0.000369595218f /* s_0, mean residual of a length that moves, m */
 #define CALIB_FUSED_STILL_M 7.33333354e-06f /* v_0, m per tick */
 #define CALIB_FUSED_GATE_M 0.00499999989f /* residuals beyond are left out, m */
 #define CALIB_FUSED_BOOST 0.5f /* share of the length's residual after a start */
@@ -308,19 +308,19 @@
 #define CALIB_FF_SLOPE_PWM_PER_M 5498.1001f /* PWM/m */
 #define CALIB_FF_MINUS_PWM 258.372711f /* SLOPE FROM less the value there, PWM */
 #define CALIB_FF_LIMIT_PWM 255.0f /* largest value, PWM */
-#define CALIB_FF_TABLE_FROM_M 0.0651526973f /* length of the first entry, m */
+#define CALIB_FF_TABLE_FROM_M 0.0651530474f /* length of the first entry, m */
 #define CALIB_FF_TABLE_PER_STEP 500.0f /* entries per metre, 1/m */
 #define CALIB_FF_TABLE_SIZE 15 /* entries */
 /* PWM that holds a bellows at FROM + 0.002 m times the index */
 static const float calib_ff_table_pwm[15] CALIB_IN_FLASH = {
-    99.75f, 128.214752f, 139.699554f, 149.125275f, 157.553131f, 165.458618f,
-    173.091156f, 180.613663f, 188.18692f, 195.979095f, 204.200409f, 213.209442f,
-    223.813522f, 240.717102f, 253.5f,
+    99.75f, 128.214828f, 139.699646f, 149.125397f, 157.553268f, 165.458786f,
+    173.091354f, 180.613876f, 188.187164f, 195.97937f, 204.200729f, 213.209854f,
+    223.814072f, 240.718781f, 253.5f,
 };
 
 /* Envelope, see calib_guard.h: the pumps stop where the actuator leaves it. */
-#define CALIB_ENVELOPE_LEAST_M 0.0451527014f /* shortest length of a bellows, m */
-#define CALIB_ENVELOPE_GREATEST_M 0.115152702f /* longest length of a bellows, m */
+#define CALIB_ENVELOPE_LEAST_M 0.0451530516f /* shortest length of a bellows, m */
+#define CALIB_ENVELOPE_GREATEST_M 0.115153052f /* longest length of a bellows, m */
 #define CALIB_ENVELOPE_ANGLE_RAD 1.5f /* greatest bending to each side, rad */
 #define CALIB_ENVELOPE_STEP_M 0.00833333377f /* greatest change of a length in a tick, m; 0.5 m/s */
 #define CALIB_ENVELOPE_FULL_TICKS 180 /* ticks that a pump may stay at its greatest command */

@@ -79,7 +79,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0xCA2E4C54UL
+#define CALIB_ID 0x4820B85DUL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok */
@@ -120,12 +120,12 @@
 /* Plane of the actuator, without the shift and stretch that align has found. */
 #define CALIB_HAS_PLANE 1 /* for #if */
 #define CALIB_PLANE_OK 1 /* 0: the plane failed its gate */
-#define CALIB_PLANE_INVERSE_11 0.00365915219f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_12 -8.84328547e-05f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_13 -0.599133968f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_21 7.93018771e-05f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_22 0.00362198055f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_23 -0.160736859f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_11 0.00365915406f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_12 -8.84328838e-05f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_13 -0.599134326f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_21 7.93019353e-05f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_22 0.00362198264f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_23 -0.160737112f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_31 -0.000315939047f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_32 -0.000872857461f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_33 3.7639873f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
@@ -134,12 +134,12 @@
  * The same from normalised undistorted coordinates, for CALIB_UNDISTORT 1. Row 3 gives 1/s of (2.12) in 1/m, the
  * reciprocal depth.
  */
-#define CALIB_PLANE_NORMALISED_11 1.00044155f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_12 -0.0241070259f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_13 -0.0202260725f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_21 0.0216817707f /* row 2, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_22 0.987361252f /* row 2, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_23 0.220973626f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_11 1.00044215f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_12 -0.0241070334f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_13 -0.0202261657f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_21 0.0216817856f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_22 0.987361848f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_23 0.220973596f /* row 2, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_31 -0.0863802731f /* row 3, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_32 -0.237943202f /* row 3, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_33 3.62430787f /* row 3, A^-1 K, dimensionless to m */
@@ -150,12 +150,12 @@
  * CALIB_UNDISTORT 0. Neglecting the lens costs up to 0.278 mm there.
  */
 #define CALIB_HAS_RAW_PLANE 1 /* 0: the workspace is not in sight */
-#define CALIB_PLANE_RAW_11 0.00369113754f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_12 -8.82079185e-05f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_13 -0.60440129f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_21 7.21814504e-05f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_22 0.00363216037f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_23 -0.160438284f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_11 0.0036911394f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_12 -8.82079403e-05f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_13 -0.604401708f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_21 7.21815013e-05f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_22 0.00363216246f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_23 -0.160438538f /* row 2, distorted px to m */
 #define CALIB_PLANE_RAW_31 -0.000436246803f /* row 3, distorted px to m */
 #define CALIB_PLANE_RAW_32 -0.00111481769f /* row 3, distorted px to m */
 #define CALIB_PLANE_RAW_33 3.81186843f /* row 3, distorted px to m */
@@ -166,7 +166,7 @@
 #define CALIB_TICK_RATE_MHZ 60000 /* the same in millihertz, for #if */
 #define CALIB_HOLD_TICKS 60 /* a sensor that is silent for longer, a second, stops the pumps */
 #define CALIB_TIME_OFFSET_TICKS 2 /* ceil(D), angles that are remembered; D ticks by which a picture is later than the IMU */
-#define CALIB_TIME_OFFSET_PART 0.510548472f /* ceil(D) - D, share of a tick */
+#define CALIB_TIME_OFFSET_PART 0.510547459f /* ceil(D) - D, share of a tick */
 
 /*
  * IMU on the head, x from the head to the base at rest; phi = atan2(RATIO ay, ax) - mount (2.1),
@@ -175,11 +175,11 @@
 #define CALIB_IMU_SIGN_AX 1 /* 1 or -1, by hand for an IMU that is not right-handed as mounted */
 #define CALIB_IMU_SIGN_AY 1 /* 1 or -1 */
 #define CALIB_IMU_SIGN_GZ 1 /* 1 or -1 */
-#define CALIB_IMU_ACCEL_BIAS_X_MPS2 -0.01368031f /* subtracted from ax, m/s^2 */
-#define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.0682323053f /* subtracted from ay, m/s^2 */
-#define CALIB_IMU_ACCEL_RATIO 1.01684368f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
-#define CALIB_IMU_GYRO_BIAS_RADPS 0.0060058306f /* gz at rest, rad/s; sign as read; for programs of your own */
-#define CALIB_IMU_MOUNT_ANGLE_RAD 0.0228258502f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
+#define CALIB_IMU_ACCEL_BIAS_X_MPS2 -0.0137136048f /* subtracted from ax, m/s^2 */
+#define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.0679590479f /* subtracted from ay, m/s^2 */
+#define CALIB_IMU_ACCEL_RATIO 1.01683724f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
+#define CALIB_IMU_GYRO_BIAS_RADPS 0.00600619894f /* gz at rest, rad/s; sign as read; for programs of your own */
+#define CALIB_IMU_MOUNT_ANGLE_RAD 0.0227973536f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
 #define CALIB_IMU_ACCEL_LIMIT_MPS2 157.0f /* readings beyond are lost, m/s^2 */
 #define CALIB_IMU_RATE_LIMIT_RADPS 35.0f /* readings beyond are lost, rad/s */
 #define CALIB_IMU_ACCEL_WEAK_MPS2 1.0f /* |ax| and |ay| below say nothing of phi, m/s^2 */
@@ -193,13 +193,13 @@
  */
 #define CALIB_MM_KP_DT 0.0500000007f /* Kp dt, dimensionless; Kp = 3 1/s */
 #define CALIB_MM_KI_DT2 0.000833333354f /* Ki dt^2, dimensionless; Ki = 3 1/s^2 */
-#define CALIB_MM_DT_S 0.0163872819f /* dt of the rate over the gyroscope's scale, s; phi falls for gz > 0 */
-#define CALIB_MM_GYRO_BIAS_DT_RAD 9.84192375e-05f /* bias times the same, rad */
+#define CALIB_MM_DT_S 0.0163875557f /* dt of the rate over the gyroscope's scale, s; phi falls for gz > 0 */
+#define CALIB_MM_GYRO_BIAS_DT_RAD 9.84269209e-05f /* bias times the same, rad */
 #define CALIB_MM_INTEGRAL_LIMIT_RAD 0.0166666675f /* |J| stays below, rad; 1 rad/s */
 #define CALIB_PHI_LIMIT_RAD 1.58000004f /* |phi| stays below; range of the sine in the pipeline, rad */
 
 /* Marker to head (A.1): x = X - d sin(phi), y = Y - d cos(phi). */
-#define CALIB_MARKER_OFFSET_M 0.014589237f /* d, m; positive beyond the head */
+#define CALIB_MARKER_OFFSET_M 0.0145904562f /* d, m; positive beyond the head */
 
 /*
  * Low-pass of x and y. y_k = b0 x_k + b1 x_(k-1) + b2 x_(k-2) - a1 y_(k-1) - a2 y_(k-2): SciPy's
@@ -221,7 +221,7 @@
  * f = F0 + F1 phi^2 + F2 phi^4 + F3 phi^6; bellows 1 is the longer one for phi > 0.
  */
 #define CALIB_BELLOWS_RADIUS_M 0.0126f /* r_B, m */
-#define CALIB_REST_LENGTH_M 0.0651829019f /* l0, m; length until the first picture */
+#define CALIB_REST_LENGTH_M 0.0651823059f /* l0, m; length until the first picture */
 #define CALIB_INVERSE_F0_PER_RAD0 2.0f /* coefficient of phi^0 (3.14), 1/rad^0 */
 #define CALIB_INVERSE_F1_PER_RAD2 0.0833333358f /* coefficient of phi^2 (3.14), 1/rad^2 */
 #define CALIB_INVERSE_F2_PER_RAD4 0.00243055564f /* coefficient of phi^4 (3.14), 1/rad^4 */
@@ -235,27 +235,27 @@
  * Gains for the noise in align.
  */
 #define CALIB_HAS_FUSED 1 /* for #if */
-#define CALIB_FUSED_DELAY_TICKS 1.48945153f /* D, ticks from the exposure of a picture to its tick */
-#define CALIB_FUSED_ACCEL_11 0.000250908924f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_12 5.82468783e-06f /* row 1, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_1 -3.82994403e-06f /* row 1, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_21 -5.72820454e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_22 0.00025513515f /* row 2, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_2 -1.73300959e-05f /* row 2, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_GAIN 0.00248554256f /* K_a, share of the accelerometer's residual */
-#define CALIB_FUSED_ACCEL_WEAK 0.000253368256f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
-#define CALIB_FUSED_HALF_DT_S 0.00819364097f /* dt / 2 over the gyroscope's scale, s */
-#define CALIB_FUSED_HALF_BIAS_RAD 4.92096187e-05f /* bias times the same, rad */
-#define CALIB_FUSED_PHI_PER_M 0.376751512f /* K_c / lever, rad/m */
-#define CALIB_FUSED_ALONE_PHI_PER_M 5.29877806f /* the same without the IMU, rad/m */
-#define CALIB_FUSED_BOOST_PHI_PER_M 10.5975561f /* the same after a start, rad/m */
-#define CALIB_FUSED_BIAS 0.0025255261f /* K_b, share of the correction */
-#define CALIB_FUSED_MOVING_LENGTH 0.188922077f /* K_m, dimensionless */
-#define CALIB_FUSED_MOVING_RATE 0.0069138743f /* K_v, per tick */
-#define CALIB_FUSED_REST_LENGTH 0.00911263376f /* K_r, dimensionless */
+#define CALIB_FUSED_DELAY_TICKS 1.48945248f /* D, ticks from the exposure of a picture to its tick */
+#define CALIB_FUSED_ACCEL_11 0.000251091988f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_12 5.82162193e-06f /* row 1, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_1 -3.83900806e-06f /* row 1, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_21 -5.72522458e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_22 0.000255319697f /* row 2, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_2 -1.72727705e-05f /* row 2, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_GAIN 0.00248736376f /* K_a, share of the accelerometer's residual */
+#define CALIB_FUSED_ACCEL_WEAK 0.00025355391f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
+#define CALIB_FUSED_HALF_DT_S 0.00819377787f /* dt / 2 over the gyroscope's scale, s */
+#define CALIB_FUSED_HALF_BIAS_RAD 4.92134604e-05f /* bias times the same, rad */
+#define CALIB_FUSED_PHI_PER_M 0.376656383f /* K_c / lever, rad/m */
+#define CALIB_FUSED_ALONE_PHI_PER_M 5.29867506f /* the same without the IMU, rad/m */
+#define CALIB_FUSED_BOOST_PHI_PER_M 10.5973501f /* the same after a start, rad/m */
+#define CALIB_FUSED_BIAS 0.00252549001f /* K_b, share of the correction */
+#define CALIB_FUSED_MOVING_LENGTH 0.188893035f /* K_m, dimensionless */
+#define CALIB_FUSED_MOVING_RATE 0.00691254344f /* K_v, per tick */
+#define CALIB_FUSED_REST_LENGTH 0.00911073852f /* K_r, dimensionless */
 #define CALIB_FUSED_RATE_DECAY 0.935506999f /* K_d, per tick, at rest and without a picture */
 #define CALIB_FUSED_SLOW 0.0989248976f /* K_s, dimensionless */
-#define CALIB_FUSED_MOVING_M 0.000366733526f /* s_0, mean residual of a length that moves, m */
+#define CALIB_FUSED_MOVING_M 0.000366810185f /* s_0, mean residual of a length that moves, m */
 #define CALIB_FUSED_STILL_M 7.33333354e-06f /* v_0, m per tick */
 #define CALIB_FUSED_GATE_M 0.00499999989f /* residuals beyond are left out, m */
 #define CALIB_FUSED_BOOST 0.5f /* share of the length's residual after a start */
@@ -308,19 +308,19 @@
 #define CALIB_FF_SLOPE_PWM_PER_M 5498.1001f /* PWM/m */
 #define CALIB_FF_MINUS_PWM 258.372711f /* SLOPE FROM less the value there, PWM */
 #define CALIB_FF_LIMIT_PWM 255.0f /* largest value, PWM */
-#define CALIB_FF_TABLE_FROM_M 0.0651829019f /* length of the first entry, m */
+#define CALIB_FF_TABLE_FROM_M 0.0651823059f /* length of the first entry, m */
 #define CALIB_FF_TABLE_PER_STEP 500.0f /* entries per metre, 1/m */
 #define CALIB_FF_TABLE_SIZE 15 /* entries */
 /* PWM that holds a bellows at FROM + 0.002 m times the index */
 static const float calib_ff_table_pwm[15] CALIB_IN_FLASH = {
-    99.75f, 128.273636f, 139.784073f, 149.232574f, 157.679214f, 165.602219f,
-    173.257904f, 180.800247f, 188.400726f, 196.224747f, 204.48613f, 213.568253f,
-    224.301483f, 242.202255f, 253.5f,
+    99.75f, 128.273651f, 139.784119f, 149.232635f, 157.679276f, 165.602295f,
+    173.257996f, 180.800339f, 188.400833f, 196.224884f, 204.486282f, 213.568436f,
+    224.301727f, 242.203018f, 253.5f,
 };
 
 /* Envelope, see calib_guard.h: the pumps stop where the actuator leaves it. */
-#define CALIB_ENVELOPE_LEAST_M 0.0451829024f /* shortest length of a bellows, m */
-#define CALIB_ENVELOPE_GREATEST_M 0.115182899f /* longest length of a bellows, m */
+#define CALIB_ENVELOPE_LEAST_M 0.0451823026f /* shortest length of a bellows, m */
+#define CALIB_ENVELOPE_GREATEST_M 0.115182303f /* longest length of a bellows, m */
 #define CALIB_ENVELOPE_ANGLE_RAD 1.5f /* greatest bending to each side, rad */
 #define CALIB_ENVELOPE_STEP_M 0.00833333377f /* greatest change of a length in a tick, m; 0.5 m/s */
 #define CALIB_ENVELOPE_FULL_TICKS 180 /* ticks that a pump may stay at its greatest command */
