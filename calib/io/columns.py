@@ -790,9 +790,9 @@ def _implausible(
     """Why rates (n, axes) cannot be in a unit of this many rad/s; empty where they can."""
     # A few wild readings are a fault, not a unit.
     few = min(max(8, values.size // 100), values.size - 1)
-    largest = scale * float(np.partition(np.abs(values).ravel(), -1 - few)[-1 - few])
-    if largest > _FASTEST_RADPS:
-        return f"reaches {largest:.4g} rad/s"
+    sizes = scale * np.sort(np.abs(values).ravel())
+    if sizes[-1 - few] > _FASTEST_RADPS:
+        return f"reaches {sizes[-1]:.4g} rad/s"
     accel = _of(columns, ACCEL)
     if "gz_radps" not in names or "ax_mps2" not in accel or "ay_mps2" not in accel:
         return ""

@@ -506,8 +506,10 @@ def signals_of(
     if len(rows) == 0:
         raise BadInputError(f"{log.source}: no row has all of {', '.join(wanted)}, expected them together")
     check_time(log)
-    held = [np.arange(a, b) for a, b in _held(log)] if set(wanted) & set(IMU) else []
-    rows = np.setdiff1d(rows, np.concatenate(held)) if held else rows
+    watch = Watch(tuple(name for name in (*names, *optional) if name in IMU))
+    watch.add(log)
+    for a, b in watch.held:
+        rows = rows[(rows < a) | (rows >= b)]
     values = np.stack([log.columns[name][rows] for name in wanted], axis=1)
     stamps = log.t_s[rows]
     same = np.all((values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1])), axis=1)
@@ -515,8 +517,6 @@ def signals_of(
     if twice.any():
         kept = np.concatenate([[True], ~twice])
         rows, stamps, values = rows[kept], stamps[kept], values[kept]
-    watch = Watch(tuple(name for name in (*names, *optional) if name in IMU))
-    watch.add(log)
     findings = tuple(watch.findings(stuck=False))
     return Signals(log.source, wanted, stamps, values, rows, log.lines[rows], int(twice.sum()), findings)
 
@@ -536,14 +536,16 @@ class Watch:
     Attributes
     ----------
     names : columns that are used, and so ought to have readings.
+    held : rows of the last block, from and to, in which the whole IMU repeats one reading.
     """
 
     names: tuple[str, ...] = MEASURED
+    held: list[tuple[int, int]] = field(default_factory=list)
     _seen: dict[str, tuple[int, float, float]] = field(default_factory=dict)
     _mirrored: Finding | None = None
     _known: bool = False
     _unmoved: Finding | None = None
-    _held: Finding | None = None
+    _stopped: Finding | None = None
 
     def add(self, log: Log) -> None:
         """Rows that follow."""
@@ -557,8 +559,8 @@ class Watch:
             if not self._known:
                 self._known, self._mirrored = _mirrored(log)
             self._unmoved = self._unmoved or _unmoved(log)
-        if set(self.names) & set(IMU):
-            self._held = self._held or _all_held(log)
+        self.held = _held(log) if set(self.names) & set(IMU) else []
+        self._stopped = self._stopped or _stopped(log, self.held)
 
     def has(self, *names: str) -> bool:
         """Whether each of these columns has a reading."""
@@ -578,7 +580,7 @@ class Watch:
         # A reading that never changes is said as that.
         _, least, most = self._seen.get("gz_radps", (0, 0.0, 0.0))
         alive = least != most
-        more = self._held, self._mirrored, self._unmoved if alive else None
+        more = self._stopped, self._mirrored, self._unmoved if alive else None
         return [*out, *(one for one in more if one is not None)]
 
 
@@ -606,9 +608,8 @@ def _held(log: Log) -> list[tuple[int, int]]:
     ]
 
 
-def _all_held(log: Log) -> Finding | None:
+def _stopped(log: Log, held: Sequence[tuple[int, int]]) -> Finding | None:
     """That the whole IMU stops answering, where it does."""
-    held = _held(log)
     if not held:
         return None
     (a, b), more = held[0], len(held) - 1

@@ -213,7 +213,7 @@ def misaligned(folder: Path, rig: SimulatedRig) -> tuple[float, float]:
     return 1e3 * abs(late), float(np.degrees(abs(turned)))
 
 
-def _off(rig: Rig, true: SimulatedRig) -> dict[str, dict[str, tuple[float, float]]]:
+def _off(rig: Rig, true: SimulatedRig, wrong: str | None) -> dict[str, dict[str, tuple[float, float]]]:
     """By section and key the error of what was calibrated and its deviation."""
     camera, plane, align, actuator, pump = rig.camera, rig.plane, rig.align, rig.actuator, rig.pump
     assert camera and plane and align and actuator and pump
@@ -236,7 +236,8 @@ def _off(rig: Rig, true: SimulatedRig) -> dict[str, dict[str, tuple[float, float
                 out["align"][name] = (float(v) - sensors[name], float(one))
     # What the model takes for the mass, over what it is.
     share = (actuator.mass_kg or rig.machine.plant.mass_kg) / true.plant.mass_kg
-    truths: dict[str, Any] = values_of(true) | {"play_pwm": PLAY * RANGE_PWM}
+    truths: dict[str, Any] = values_of(true)
+    truths["play_pwm"] = PLAY * RANGE_PWM if wrong == "hysteresis" else 0.0
     truths["strength"] = [truths["strength1"], truths["strength2"]]
     for name, section in (("actuator", actuator), ("pump", pump)):
         out[name] = {}
@@ -306,7 +307,7 @@ def main() -> None:
                 said = calibrate(folder, given.undrawn)
             true = drawn(seed, given.off, given.wrong)
             off.append(misaligned(folder, true))
-            rigs.append(_off(Rig.load(folder / "identified.yaml"), true))
+            rigs.append(_off(Rig.load(folder / "identified.yaml"), true, given.wrong))
             for way, (file, how) in WAYS.items():
                 path = folder / file
                 rig = Rig.load(path)

@@ -112,7 +112,7 @@ def _backwards(t: FloatArray) -> FloatArray:
         (lambda log: (log, {"ax_mps2": None, "ay_mps2": None, "gz_radps": None}), "has no gyroscope"),
         (lambda log: (_times(log, _backwards), {}), "t_s goes back"),
         (lambda log: (_first(log, 4), {}), "has no stretch of 1 s"),
-        (lambda log: (log, {"gz_radps": 57.2958 * log.columns["gz_radps"]}), "the gyroscope reaches"),
+        (lambda log: (log, {"gz_radps": 57.2958 * log.columns["gz_radps"]}), "the gyroscope reaches 584"),
         (lambda log: (log, {"gz_radps": -log.columns["gz_radps"]}), "the other way round"),
         (
             lambda log: (log, {"ax_mps2": log.columns["ay_mps2"], "ay_mps2": log.columns["ax_mps2"]}),

@@ -892,8 +892,10 @@ def fit_tracks(
         raise _blind(fixed)
     x, cost, residual, J = best
     found = Solution(problem, x, residual, J, cost, fixed, agreeing, refined)
-    found = _by_the_better_law(found) if either_law and not _explained(found) else found
-    return _without_creep(found if _explained(found) else _with_play(found))
+    if not _explained(found):
+        first, found = found, _by_the_better_law(found) if either_law else found
+        found = _with_play(found) if found is first or not _explained(found) else found
+    return _without_creep(found)
 
 
 _Minimum = tuple[FloatArray, float, FloatArray, FloatArray]

@@ -463,6 +463,7 @@ def _like_neighbours(phi: FloatArray) -> BoolArray:
 
 
 _SPIKE = 20.0
+"""How far a single rate stands out, over what rates usually are from the median of three."""
 
 
 def _without_spikes(rates: FloatArray) -> FloatArray:
