@@ -17,7 +17,7 @@ from calib.stages.estimator.consistency import SENSORS, Tally
 from calib.stages.estimator.driven import Drive
 from calib.stages.estimator.kinematic import FLAGS, OUT
 from calib.stages.estimator.read import READINGS
-from calib.stages.estimator.replay import Estimate, consistent, contradicting, sampled
+from calib.stages.estimator.replay import Estimate, consistent, contradicting, sampled, untimely
 
 _LAST_PIXEL = {"u_px": 315.0, "v_px": 207.0}
 _UNIT = {"u_px": 0.5, "v_px": 0.5, "ax_mps2": 1 / 9.81, "ay_mps2": 1 / 9.81, "gz_radps": 57.3}
@@ -110,3 +110,38 @@ def test_no_verdict_is_ok_where_a_column_is_not_what_it_says(scenario: str) -> N
             believed.append(f"{name} {way}: {away:.1f}")
     assert not believed
     assert seen >= 20
+
+
+def _delayed(log: Log, names: tuple[str, ...], samples: int) -> Log:
+    """The log with columns whose readings come so many samples later."""
+    columns = dict(log.columns)
+    for name in names:
+        rows = log.sampled(name)
+        columns[name] = columns[name].copy()
+        columns[name][rows[samples:]] = log.columns[name][rows[:-samples]]
+    return replace(log, columns=columns)
+
+
+@pytest.mark.parametrize("scenario", ["swing", "ellipse", "step"])
+@pytest.mark.parametrize(
+    ("late", "samples", "told"),
+    [
+        (("ay_mps2",), 1, "ay_mps2 comes 10 ms after"),
+        (("ay_mps2",), 5, "ay_mps2 comes 50 ms after"),
+        (("gz_radps",), 1, "gz_radps comes 10 ms after"),
+        (("ax_mps2", "ay_mps2", "gz_radps"), 5, "the IMU comes"),
+    ],
+)
+def test_a_late_column_is_named(scenario: str, late: tuple[str, ...], samples: int, told: str) -> None:
+    _, log = driven_log(scenario)
+    setup = setup_for(varied_drive(0))
+    assert not list(untimely(setup, rows_from(log)))
+    (finding,) = untimely(setup, rows_from(_delayed(log, late, samples)))
+    assert finding.severity == "inconsistent"
+    assert told in finding.text
+
+
+def test_delays_are_not_looked_for_in_a_log_at_rest() -> None:
+    _, log = driven_log("static")
+    late = _delayed(log, ("gz_radps",), 5)
+    assert not list(untimely(setup_for(varied_drive(0)), rows_from(late)))
