@@ -31,6 +31,7 @@ from calib.stages.actuator.identify import (
     judge,
     own_delays,
     prospects,
+    pump_delay,
     residuals,
     solve,
     starts_of,
@@ -312,6 +313,31 @@ def test_a_log_of_another_plant_is_contradicted_and_one_that_tells_more_is_not(
     if not other:
         blamed = replace(held[0], held_phi_rad=3.0 * held[0].fitted_phi_rad)
         assert judge(found, uncertainty(found), colour_of(found), [blamed], []).word == "ok"
+
+
+@pytest.mark.parametrize("ticks", [0, 1, 5, -5])
+def test_commands_of_one_pump_that_come_late_are_named(ticks: int) -> None:
+    names = ("stiffness_scale", "damping_scale_pumps_connected", "lag_s", "falling_N_per_s")
+    tracks = []
+    for one in (track("prbs"), track("steps", seed=1)):
+        pwm, pump = one.pwm.copy(), int(ticks < 0)
+        at = np.maximum(np.arange(len(pwm)) - abs(ticks), 0)
+        pwm[:, pump] = one.pwm[at, pump]
+        tracks.append(replace(one, pwm=pwm))
+    problem = Problem(Machine(), tracks, names, {}, threads=1)
+    x, cost, residual, J = solve(problem, first_guess(problem, values_of(Machine())))
+    found = Solution(problem, x, residual, J, cost, {}, 1, 1)
+    delay = pump_delay(found)
+    assert delay is not None
+    late_s, sigma = delay
+    named = [one.text for one in judge(found, uncertainty(found), colour_of(found), [], []).findings]
+    named = [text for text in named if " as the rig answers them" in text]
+    if ticks:
+        assert late_s == pytest.approx(ticks / 60.0, rel=0.3)
+        assert named[0].startswith("pwm1" if ticks > 0 else "pwm2")
+    else:
+        assert abs(late_s) < 4.0 * sigma
+        assert not named
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.2])

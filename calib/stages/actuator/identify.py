@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import astuple, dataclass, field, fields, replace
 from functools import cached_property
@@ -1742,6 +1742,7 @@ _MOST_RELATIVE = 0.25
 _STRONG = 0.95
 _FAR_ROWS = 0.05
 _MOST_APART_S = 0.04
+_PUMPS_APART_S = 0.01
 _APART_SIGMA = 5.0
 
 
@@ -1795,49 +1796,90 @@ def _of_fit(solution: Solution, known: Uncertainty, colours: Sequence[Colour]) -
     return out
 
 
+def _one_more(solution: Solution, columns: Iterable[FloatArray]) -> Iterator[tuple[float, float] | None]:
+    """What one unknown more would be and its deviation, for derivatives (rows,) of the residuals by it.
+
+    One step of Gauss and Newton in which all other unknowns follow. None where they can make up for it.
+    """
+    r, J = solution.residual, solution.J
+    w = weights(solution.problem, r)
+    WJ = J * w[:, None]
+    inverse = scaled_inverse(WJ.T @ J)
+    for column in columns:
+        b, whole = WJ.T @ column, float(column @ (w * column))
+        own = whole - float(b @ inverse @ b)
+        slope = float(column @ (w * r) - b @ inverse @ (WJ.T @ r))
+        yield (-slope / own, 1.0 / math.sqrt(own)) if own > 1e-6 * whole and own > 0.0 else None
+
+
 def own_delays(solution: Solution) -> list[tuple[str, float, float]]:
     """By how much each log's rows come later than those of the others [s], and the deviation of that.
 
-    One step of Gauss and Newton with a delay of the log's own among the unknowns; only for logs that share
-    one. Columns that are late in one log alone are otherwise taken for a delay between, and for a damping
-    and a creep that are not there.
+    Only of logs that share a delay. Columns that are late in one log alone are otherwise taken for a delay
+    between, and for a damping and a creep that are not there.
     """
-    problem, r, J = solution.problem, solution.residual, solution.J
-    delays = problem.unknowns.delays
+    problem, J = solution.problem, solution.J
+    delays, spans = problem.unknowns.delays, _spans(problem.tracks)
     shared = [k for k, at in enumerate(delays) if delays.count(at) > 1]
-    w = weights(problem, r)
-    WJ = J * w[:, None]
-    inverse = scaled_inverse(WJ.T @ J)
-    spans, out = _spans(problem.tracks), []
+    columns = []
     for k in shared:
-        column = np.zeros(len(r))
+        column = np.zeros(len(J))
         column[spans[k]] = J[spans[k], delays[k]]
-        b = WJ.T @ column
-        own = float(column @ (w * column) - b @ inverse @ b)
-        if own < 1e-6 * float(column @ (w * column)) or own <= 0.0:
-            continue
-        slope = float(column @ (w * r) - b @ inverse @ (WJ.T @ r))
-        out.append((problem.tracks[k].name, -slope / own, 1.0 / math.sqrt(own)))
-    return out
+        columns.append(column)
+    found = zip(shared, _one_more(solution, columns), strict=True)
+    return [(problem.tracks[k].name, *one) for k, one in found if one is not None]
+
+
+def pump_delay(solution: Solution) -> tuple[float, float] | None:
+    """By how much the commands of pump 1 come later than those of pump 2 [s], and the deviation of that.
+
+    None without pumps. A column that is late is otherwise taken for a damping that is not there.
+    """
+    problem, x = solution.problem, solution.x
+    column = np.zeros(len(solution.residual))
+    starts, values = starts_of(problem, x), problem.values(x)
+    for k, (track, span) in enumerate(zip(problem.tracks, _spans(problem.tracks), strict=True)):
+        if track.hoses:
+            n, ends = len(track.pwm), []
+            for shift in (1, -1):
+                pwm = track.pwm.copy()
+                pwm[:, 0] = track.pwm[np.clip(np.arange(n) + shift, 0, n - 1), 0]
+                head, _ = heads_of(
+                    replace(track, pwm=pwm), problem.nominal, [values], [starts[k]],
+                    float(x[problem.unknowns.delays[k]]), problem.threads,
+                )  # fmt: skip
+                ends.append(head[0])
+            slope = (ends[0] - ends[1]) / (2.0 * track.tick_s)
+            column[span] = -_whitened(track, slope).reshape(-1)
+    return next(iter(_one_more(solution, [column]))) if np.isfinite(column).all() and column.any() else None
 
 
 def _apart(solution: Solution, known: Uncertainty) -> list[Finding]:
-    """The log whose rows come most clearly at another time than those of the others."""
+    """The log whose rows come most clearly at another time than those of the others, and a pump that does."""
     raised = known.scale * max(known.inflation.values(), default=1.0)
     far = [
         (abs(late) / sigma, name, late)
         for name, late, sigma in own_delays(solution)
         if abs(late) > max(_MOST_APART_S, _APART_SIGMA * raised * sigma)
     ]
-    if not far:
-        return []
-    _, name, late = max(far)
-    when = "later" if late > 0.0 else "earlier"
-    text = (
-        f"{name}: its pictures come {1e3 * abs(late):.0f} ms {when} after its commands than those of the "
-        "other logs"
-    )
-    return [Finding("inconsistent", text, "compare the clocks of camera and commands, log by log")]
+    out = []
+    if far:
+        _, name, late = max(far)
+        when = "later" if late > 0.0 else "earlier"
+        text = (
+            f"{name}: its pictures come {1e3 * abs(late):.0f} ms {when} after its commands than those of the "
+            "other logs"
+        )
+        out.append(Finding("inconsistent", text, "compare the clocks of camera and commands, log by log"))
+    late, sigma = pump_delay(solution) or (0.0, 1.0)
+    if abs(late) > max(_PUMPS_APART_S, _APART_SIGMA * raised * sigma):
+        one, other = ("pwm1", "pwm2") if late > 0.0 else ("pwm2", "pwm1")
+        text = (
+            f"{one} comes about {1e3 * abs(late):.0f} ms after {other}, as the rig answers them; the model "
+            "has one dead time and one lag for both pumps, so damping and lag are not the rig's"
+        )
+        out.append(Finding("inconsistent", text, "check the times of both columns, and hoses and valves"))
+    return out
 
 
 def judge(
