@@ -324,6 +324,14 @@ class Rig:
         return x0, y0, x1, y1
 
     @property
+    def picture_px(self) -> tuple[int, int] | None:
+        """Width and height of the camera's pictures, in which a log's marker lies; None without a camera."""
+        if self.camera is None:
+            return None
+        width, height = self.camera.image_size_px
+        return width, height
+
+    @property
     def standing(self) -> dict[str, Standing]:
         """What is in force of the sections `actuator` and `pump`: value and standard deviation by key."""
         from calib.stages.actuator.section import Known, in_force

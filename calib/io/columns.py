@@ -220,6 +220,7 @@ class Passed:
     ----------
     not_finite : cells that said nan or inf; in Parquet nan is a blank.
     beyond : cells that hold more than any sensor gives. first : the first of them, in words.
+    outside : pictures that put the marker outside of them.
     truncated : whether the last line was cut short and left out.
     wraps : how often the counter that is the time began again.
     """
@@ -229,6 +230,7 @@ class Passed:
     first: str = ""
     truncated: bool = False
     wraps: int = 0
+    outside: int = 0
 
     def __add__(self, later: Passed) -> Passed:
         return Passed(
@@ -237,15 +239,18 @@ class Passed:
             self.first or later.first,
             self.truncated or later.truncated,
             self.wraps + later.wraps,
+            self.outside + later.outside,
         )
 
     @property
     def sentences(self) -> list[str]:
         """One for each kind that there is."""
         beyond = f"{self.beyond} cells hold more than any sensor gives ({self.first}) and count as blank"
+        outside = f"{self.outside} pictures put the marker outside the picture and count as blank"
         return [
             *([f"{self.not_finite} cells say nan or inf and count as blank"] if self.not_finite else []),
             *([beyond] if self.beyond else []),
+            *([outside] if self.outside else []),
             *(["the last line is cut short and left out"] if self.truncated else []),
             *(
                 [f"the time is a counter that begins again {self.wraps} times, and is counted on"]

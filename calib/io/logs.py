@@ -138,6 +138,33 @@ def _logs(columns: ColumnMap, blocks: Iterator[Block]) -> Iterator[Log]:
 
 _MOST = {"accel": 4000.0, "gyro": 140.0, "pixel": 1e5}
 """Twice what the widest cheap accelerometers and gyroscopes read (200 g, 4000 deg/s), and any picture."""
+_MARKER = ("u_px", "v_px")
+_MOST_OUTSIDE, _SENTINELS = 0.05, 2
+
+
+def _in_picture(log: Log, size_px: tuple[int, int]) -> Log:
+    """The log with blanks for markers outside of pictures of this width and height.
+
+    Raises `BadInputError` where there are many, unless they hold the same few numbers, as those of a tracker
+    that says so that it has lost the marker.
+    """
+    rows = log.sampled(*_MARKER)
+    at = np.stack([log.columns[name][rows] for name in _MARKER], axis=1) if len(rows) else np.zeros((0, 2))
+    outside = ~((at >= -0.5) & (at <= np.array(size_px) - 0.5)).all(axis=1)
+    if not outside.any():
+        return log
+    if outside.mean() > _MOST_OUTSIDE and len(np.unique(at[outside], axis=0)) > _SENTINELS:
+        (u, v), line = at[outside][0], log.lines[rows[outside][0]]
+        raise BadInputError(
+            f"{log.source}, line {line}: the marker is at ({u:g}, {v:g}) px, outside the picture of "
+            f"{size_px[0]}x{size_px[1]} px that the camera was calibrated with, as {int(outside.sum())} of "
+            f"{len(rows)} times; check resolution, order and signs of u_px and v_px"
+        )
+    columns = dict(log.columns)
+    for name in _MARKER:
+        columns[name] = columns[name].copy()
+        columns[name][rows[outside]] = np.nan
+    return replace(log, columns=columns, passed=log.passed + Passed(outside=int(outside.sum())))
 
 
 def _within(log: Log) -> Log:
@@ -227,18 +254,25 @@ def log_of(source: str, path: Path, cells: Mapping[str, FloatArray], options: Lo
     return _within(log)
 
 
-def iter_log(path: Path, options: LogOptions = NOTHING_STATED, as_it_is: bool = False) -> Iterator[Log]:
+def iter_log(
+    path: Path,
+    options: LogOptions = NOTHING_STATED,
+    as_it_is: bool = False,
+    picture_px: tuple[int, int] | None = None,
+) -> Iterator[Log]:
     """Blocks of a log in turn, each a `Log` of some ten thousand rows at most.
 
     Text, Parquet, a bag (see `calib.io.bags`), or what a board with the sketch sent (`calib.io.serial`).
-    Cells that hold more than any sensor gives count as blank, unless it is wanted `as_it_is`.
+    Cells that hold more than any sensor gives count as blank, unless it is wanted `as_it_is`, and so do
+    markers outside of the camera's pictures, where their size is known.
 
     Raises
     ------
     BadInputError
         For a pipe or a device, which may never end; for a file that cannot be read, has no time, a row
         without time or with too few cells, or a cell that is no number, with the number of the line; for
-        units that are not known or contradict the readings; for a Parquet file that unpacks to too much.
+        units that are not known or contradict the readings; for pictures of another size; for a Parquet
+        file that unpacks to too much.
     """
     from calib.io.serial import STREAMS, stream_text
 
@@ -253,7 +287,9 @@ def iter_log(path: Path, options: LogOptions = NOTHING_STATED, as_it_is: bool = 
         blocks = iter_rows(io.BytesIO(stream_text(path).encode()), shown(path))
     else:
         blocks = _logs(*parquet_blocks(path, options)) if ending == ".parquet" else _iter_csv(path, options)
-    return blocks if as_it_is else map(_within, blocks)
+    if as_it_is:
+        return blocks
+    return (_within(log) if picture_px is None else _in_picture(_within(log), picture_px) for log in blocks)
 
 
 def columns_of(path: Path, options: LogOptions = NOTHING_STATED) -> tuple[str, ...] | None:
@@ -279,13 +315,18 @@ def beside(path: Path) -> list[Path]:
     return [one for one in found if one is not None]
 
 
-def read_log(path: Path, options: LogOptions = NOTHING_STATED, remarks: list[str] | None = None) -> Log:
+def read_log(
+    path: Path,
+    options: LogOptions = NOTHING_STATED,
+    remarks: list[str] | None = None,
+    picture_px: tuple[int, int] | None = None,
+) -> Log:
     """A whole log, of at most 200 million cells that are read; sentences on it are added to `remarks`.
 
     Raises `BadInputError` as `iter_log`, and for a log without rows or with more cells.
     """
     blocks, cells = list[Log](), 0
-    for block in iter_log(path, options):
+    for block in iter_log(path, options, picture_px=picture_px):
         blocks.append(block)
         cells += len(block) * (2 + len(block.columns))
         if cells > _MOST_CELLS:

@@ -12,7 +12,7 @@ import pytest
 
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
-from calib.io.logs import IN_PLANE, Log, Watch
+from calib.io.logs import IN_PLANE, Log, Watch, read_log
 
 G = 9.80665
 
@@ -183,6 +183,38 @@ def test_wild_cells_count_as_blank(written: Any, name: str) -> None:
     assert (log.passed.beyond, log.passed.first) == (3, f"{name} is 1e+06 in line 702")
     assert np.isnan(log.columns[name]).sum() == 3 and np.nanmax(np.abs(log.columns[name])) < 12.0
     assert any("3 cells hold more than any sensor gives" in one for one in log.remarks())
+
+
+def _pictures(folder: Path, u: FloatArray, v: FloatArray) -> Path:
+    path = folder / "seen.csv"
+    t = np.arange(len(u)) / 60.0
+    np.savetxt(path, np.stack([t, u, v], axis=1), "%.6f", ",", header="t_s,u_px,v_px", comments="")
+    return path
+
+
+@pytest.mark.parametrize(("factor", "sign"), [(2.0, 1.0), (1.0, -1.0)])
+def test_pictures_of_another_camera_are_refused(tmp_path: Path, factor: float, sign: float) -> None:
+    turn = np.linspace(0.0, 9.0, 600)
+    path = _pictures(
+        tmp_path, sign * factor * (160.0 + 80.0 * np.sin(turn)), factor * (100 + 50 * np.cos(turn))
+    )
+    assert len(read_log(path).sampled("u_px", "v_px")) == 600
+    with pytest.raises(
+        BadInputError, match=r"seen\.csv, line 2: the marker is at .* outside the picture of 316x208"
+    ):
+        read_log(path, picture_px=(316, 208))
+
+
+@pytest.mark.parametrize(("lost", "count"), [((-1.0, -1.0), 300), ((400.0, 10.0), 3), ((100.0, 208.0), 1)])
+def test_markers_outside_the_picture_count_as_blank(
+    tmp_path: Path, lost: tuple[float, float], count: int
+) -> None:
+    at = np.full((600, 2), [-0.4, 207.4])
+    at[100 : 100 + count] = lost
+    remarks: list[str] = []
+    log = read_log(_pictures(tmp_path, *at.T), remarks=remarks, picture_px=(316, 208))
+    assert len(log.sampled("u_px", "v_px")) == 600 - count
+    assert f"{count} pictures put the marker outside the picture" in remarks[-1]
 
 
 @pytest.mark.parametrize("every", [1, 8])

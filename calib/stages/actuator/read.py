@@ -437,7 +437,7 @@ def read_track(
     no marker, or a rig without camera or plane where the pictures are needed.
     """
     said = files.remarks
-    log = read_log(path, options, said)
+    log = read_log(path, options, said, rig.picture_px)
     _check_clock(log)
     begin, tick_s, pwm = _commands(log, options.no_pwm)
     delay_s = 0.0

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.core.arrays import BoolArray
 from calib.core.errors import BadInputError
 from calib.core.rig import Geometry, Rig
 from calib.io.logs import Log
@@ -40,7 +39,7 @@ _ABOUT_G = (4.0, 25.0)
 _ACCEL = ("ax_mps2", "ay_mps2")
 
 
-def align_log(log: Log, image_size_px: tuple[int, int]) -> tuple[AlignLog | None, list[str]]:
+def align_log(log: Log) -> tuple[AlignLog | None, list[str]]:
     """Pictures and IMU samples of a log, and sentences on what was passed over.
 
     None where the log has no picture or no gyroscope, of which a sentence says so.
@@ -49,19 +48,9 @@ def align_log(log: Log, image_size_px: tuple[int, int]) -> tuple[AlignLog | None
     """
     remarks: list[str] = []
     camera = log.signals("u_px", "v_px") if len(log.sampled("u_px", "v_px")) else None
-    inside: BoolArray = np.zeros(0, dtype=np.bool_)
-    if camera is not None:
-        width, height = image_size_px
-        at = camera.values
-        inside = np.all((at >= -0.5) & (at <= np.array([width, height]) - 0.5), axis=1)
-        if not inside.all():
-            remarks.append(
-                f"{log.source}: {int((~inside).sum())} pictures put the marker outside the image; they count "
-                "as blank"
-            )
     if not len(log.sampled("gz_radps")):
         return None, [*remarks, f"{log.source}: has no gyroscope (gz_radps), which an alignment needs"]
-    if camera is None or not inside.any():
+    if camera is None:
         lacking = f"{log.source}: has no picture of the marker (u_px, v_px), which an alignment needs"
         return None, [*remarks, lacking]
     imu = log.signals("gz_radps", optional=_ACCEL, partly=True)
@@ -81,8 +70,7 @@ def align_log(log: Log, image_size_px: tuple[int, int]) -> tuple[AlignLog | None
                 f"{log.source}: ax_mps2 and ay_mps2 are {norm:.4g} together, expected about 9.81 m/s^2: an "
                 "IMU whose x and y axes lie in the plane"
             )
-    pictures = camera.stamps_s[inside], camera.values[inside]
-    return AlignLog(log.source, *pictures, imu.stamps_s, readings), remarks
+    return AlignLog(log.source, camera.stamps_s, camera.values, imu.stamps_s, readings), remarks
 
 
 def _prior(rig: Rig) -> dict[str, tuple[float, float]]:

@@ -46,11 +46,9 @@ def _read(files: Files, rig: Rig, options: AlignOptions) -> AlignInputs:
     from calib.stages.align.read import align_log, settings_from_rig
 
     rig.current_plane(files.rig_path)
-    assert rig.camera is not None
-    width, height = rig.camera.image_size_px
     logs: list[AlignLog] = []
     for path in files.paths:
-        log, remarks = align_log(read_log(path, options, files.remarks), (width, height))
+        log, remarks = align_log(read_log(path, options, files.remarks, rig.picture_px))
         files.remarks += remarks
         if log is not None:
             logs.append(replace(log, source=files.taken(path)))

@@ -142,13 +142,13 @@ def truth_of(log: Log) -> FloatArray | None:
     return np.stack([log.columns[name] for name in _TRUTH], axis=1)
 
 
-def blocks(path: Path, options: LogOptions) -> Iterator[Log]:
-    """Blocks with rows of a log; `options` as for `iter_log`.
+def blocks(path: Path, options: LogOptions, picture_px: tuple[int, int] | None) -> Iterator[Log]:
+    """Blocks with rows of a log; `options` and `picture_px` as for `iter_log`.
 
     Raises `BadInputError` for one without rows, camera and IMU.
     """
     rows, known = 0, False
-    for block in iter_log(path, options):
+    for block in iter_log(path, options, picture_px=picture_px):
         if not known and not any(name in block.columns for name in READINGS):
             raise BadInputError(
                 f"{shown(path)}: has neither camera nor IMU, expected columns as u_px, v_px or gz_radps"

@@ -209,7 +209,7 @@ def opened(path: Path, rig: Rig, rig_path: Path, options: LogOptions = NOTHING_S
 
     Raises `BadInputError` for a log or a rig that cannot be used.
     """
-    stream = blocks(path, options)
+    stream = blocks(path, options, rig.picture_px)
     first = next(stream)
     found = periods(first)
     setup, remarks = setup_from_rig(rig, rig_path, found)

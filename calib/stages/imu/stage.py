@@ -172,7 +172,7 @@ def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
         how = replace(how, on_plane=partial(plane.to_world, camera=camera))
     logs: list[TuneLog] = []
     for path in files.paths:
-        log = tune_log(read_log(path, options, files.remarks), how)
+        log = tune_log(read_log(path, options, files.remarks, rig.picture_px), how)
         files.remarks += log.said
         name = files.taken(path)
         # What is written to the rig's file does not depend on the folder.

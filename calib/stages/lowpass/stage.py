@@ -170,7 +170,9 @@ def _read(files: Files, rig: Rig, options: Options) -> Inputs:
     def positions(path: Path | None) -> Positions | None:
         if path is None:
             return None
-        read = positions_from_log(read_log(path, options, files.remarks), options.rate_hz, on_plane)
+        read = positions_from_log(
+            read_log(path, options, files.remarks, rig.picture_px), options.rate_hz, on_plane
+        )
         files.taken(path)
         return read
 
