@@ -123,7 +123,7 @@ def _backwards(t: FloatArray) -> FloatArray:
             lambda log: (log, {"gz_radps": 0.0 * log.columns["gz_radps"]}),
             "gz_radps never changes, it is stuck at 0",
         ),
-        (lambda log: (log, {"u_px": log.columns["u_px"] + 4000.0}), "has no picture of the marker"),
+        (lambda log: (log, {"u_px": log.columns["u_px"] + 4000.0}), "px, outside the picture of 316x208"),
     ],
 )
 def test_bad_logs_end_in_a_sentence(

@@ -466,19 +466,20 @@ def test_the_drawing_is_one_more_reading_of_the_marker(log: Log, apart: float) -
     found = align([align_log(log)], settings_from_rig(_rig_file(), Path("rig.yaml"), []))
     at = SENSOR.index("marker_offset_m")
     drawn = float(found.sensor[at] + apart * found.sigma[at])
-    told, remark = with_drawn_marker(found, Geometry(marker_offset_m=drawn, marker_offset_sigma_m=1e-4))
+    told, finding = with_drawn_marker(found, Geometry(marker_offset_m=drawn, marker_offset_sigma_m=1e-4))
     mean, covariance = _mixture(found, drawn, 1e-4, 0.02)
     assert np.all(np.abs(told.sensor - mean) < 1e-5 * found.sigma)
     np.testing.assert_allclose(told.covariance, covariance, atol=1e-6 * found.sigma.max() ** 2, rtol=1e-4)
     np.testing.assert_array_equal(told.covariance, told.covariance.T)
     assert np.linalg.eigvalsh(told.covariance / np.outer(found.sigma, found.sigma)).min() > 0.0
-    assert ("contradict" in remark.text) == (abs(apart) > 5.0)
+    assert ("contradict" in finding.text) == (abs(apart) > 5.0)
+    assert (finding.severity == "inconsistent") == (abs(apart) > 5.0)
     if abs(apart) < 1.0:
         assert told.sigma[at] < 2e-4 < found.sigma[at]
         # What was one number with the marker is known with it.
         assert told.sigma[SENSOR.index("imu_lever_m")] < 0.7 * found.sigma[SENSOR.index("imu_lever_m")]
         assert told.rest_angle_sigma <= found.rest_angle_sigma
-        assert "as drawn" in remark.text and "measure it" not in remark.text
+        assert "as drawn" in finding.text and "measure it" not in finding.text
 
 
 def test_sigma_grows_where_the_marker_is_not_where_it_was_drawn() -> None:

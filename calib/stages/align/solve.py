@@ -1299,12 +1299,12 @@ def judge(found: Alignment) -> Verdict:
 
 _DOUBT = {True: 0.02, False: 0.1}
 """Probability that the marker is not where its drawing says: with one written down, and without."""
-_ELSEWHERE_M = 3e-3
+_ELSEWHERE_M, _CONTRARY_M = 3e-3, 5e-4
 _MARKER = SENSOR.index("marker_offset_m")
 
 
 def with_drawn_marker(found: Alignment, geometry: Geometry) -> tuple[Alignment, Finding]:
-    """An alignment with what the rig's drawing says of the marker's offset d, and a remark on that.
+    """An alignment with what the rig's drawing says of the marker's offset d, and a finding on that.
 
     Along the straight actuator d and the length are one number. Logs part them only by the angle between
     chord and tangent, to some tenths of a millimetre, since the scales of gyroscope and accelerometer take
@@ -1341,6 +1341,12 @@ def with_drawn_marker(found: Alignment, geometry: Geometry) -> tuple[Alignment, 
     )
     if weight[0] < 0.5:
         both += "; drawing and logs contradict each other, and the logs are believed"
+        if abs(away) > _CONTRARY_M:
+            advice = (
+                "measure d again; where it is as drawn, camera or plane have moved since they were "
+                "calibrated, or a column of the logs is scaled"
+            )
+            return mixed, Finding("inconsistent" if written else "poor", both, advice)
     elif not written:
         both += "; lengths err as much as it does, so measure it and write it down: nobody has for this rig"
     return mixed, Finding("remark", both)

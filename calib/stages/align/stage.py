@@ -72,8 +72,8 @@ def _solve(inputs: AlignInputs) -> Align:
     found = fit(inputs.logs, inputs.settings)
     verdict = judge(found)
     if inputs.drawn is not None:
-        found, remark = with_drawn_marker(found, inputs.drawn)
-        verdict = Verdict.of([*verdict.findings, remark])
+        found, drawn = with_drawn_marker(found, inputs.drawn)
+        verdict = Verdict.of([*verdict.findings, drawn])
 
     def by_key(values: Mapping[str, Any]) -> dict[str, Any]:
         listed = {key: [values[name] for name in names] for key, names in SENSORS_OF.items()}
