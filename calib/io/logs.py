@@ -28,7 +28,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from calib.core.arrays import FloatArray, IntArray
+from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.core.errors import BadInputError
 from calib.core.files import check_readable, is_bag, shown
 from calib.core.options import NOTHING_STATED, LogOptions
@@ -411,8 +411,9 @@ _AGREES, _CONTRADICTS = 0.3, 1.0
 _WINDOW = 20_000
 _CHECK_GYRO = "check the gyroscope and its wiring"
 _CHECK_IMU = "check the IMU's wiring and the bus that reads it"
-_HELD_S, _HELD_CHANCE = 1.0, 1e-12
-"""Readings of a whole IMU that are the same for so long, and how likely that is by their steps alone."""
+_HELD_S, _HELD_CHANCE, _OTHERS_REPEAT = 1.0, 1e-12, 0.5
+"""Readings of a whole IMU that are the same for so long, and how likely that is by their steps alone; of one
+axis, and the most that other axes of the sensor repeat theirs meanwhile."""
 _BIN_S, _BINS = 0.5, 10
 _UPRIGHT, _LEAST_MPS2 = 0.75, 3.0
 _FELT_RAD, _ANSWERED = 0.03, 0.1
@@ -587,6 +588,7 @@ class Watch:
     _known: bool = False
     _unmoved: Finding | None = None
     _stopped: Finding | None = None
+    _stuck: Finding | None = None
 
     def add(self, log: Log) -> None:
         """Rows that follow."""
@@ -596,6 +598,7 @@ class Watch:
             if len(finite):
                 least, most = min(least, float(finite.min())), max(most, float(finite.max()))
             self._seen[name] = count + len(finite), least, most
+        self._stuck = self._stuck or _frozen(log, self.names)
         if all(name in log.columns and name in self.names for name in IN_PLANE):
             if not self._known:
                 self._known, self._mirrored = _mirrored(log)
@@ -621,7 +624,11 @@ class Watch:
         # A reading that never changes is said as that.
         _, least, most = self._seen.get("gz_radps", (0, 0.0, 0.0))
         alive = least != most
-        more = self._stopped, self._mirrored, self._unmoved if alive else None
+        more = (
+            self._stopped,
+            self._stuck or self._mirrored,
+            self._unmoved if alive and not self._stuck else None,
+        )
         return [*out, *(one for one in more if one is not None)]
 
 
@@ -635,18 +642,42 @@ def _held(log: Log) -> list[tuple[int, int]]:
     rows = log.sampled(*names)
     if len(names) < 3 or not set(names) & set(ACCEL) or not set(names) & set(GYRO) or len(rows) < _FEWEST:
         return []
+    same = np.logical_and.reduce(_repeats(log, names, rows))
+    return [(int(rows[a + 1]), int(rows[b]) + 1) for a, b in _lasting(same, log.t_s[rows])]
+
+
+def _repeats(log: Log, names: Sequence[str], rows: IntArray) -> BoolArray:
+    """Whether each of these columns repeats its reading in a row, (names, rows - 1)."""
     values = np.stack([log.columns[name][rows] for name in names])
-    same = (values[:, 1:] == values[:, :-1]).all(axis=0)
-    same_share = float(same.mean())
-    if not 0.0 < same_share < 1.0:
+    return np.asarray(values[:, 1:] == values[:, :-1])
+
+
+def _lasting(same: BoolArray, t_s: FloatArray) -> list[tuple[int, int]]:
+    """Runs of repetitions, from and to, longer than chance and steps explain; none where all are."""
+    share = float(same.mean())
+    if not 0.0 < share < 1.0:
         return []
-    least = max(math.log(_HELD_CHANCE) / math.log(same_share), _FEWEST)
+    least = max(math.log(_HELD_CHANCE) / math.log(share), _FEWEST)
     edges = np.flatnonzero(np.diff(same.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
-    return [
-        (int(rows[a + 1]), int(rows[b]) + 1)
-        for a, b in edges.tolist()
-        if b - a >= least and log.t_s[rows[b]] - log.t_s[rows[a]] >= _HELD_S
-    ]
+    return [(a, b) for a, b in edges.tolist() if b - a >= least and t_s[b] - t_s[a] >= _HELD_S]
+
+
+def _frozen(log: Log, names: Sequence[str]) -> Finding | None:
+    """The first of these columns that repeats one reading while other axes of its sensor go on changing."""
+    for sensor in (GYRO, ACCEL):
+        axes = [name for name in sensor if name in log.columns]
+        rows = log.sampled(*axes)
+        if len(axes) < 2 or len(rows) < _FEWEST:
+            continue
+        same = _repeats(log, axes, rows)
+        for k, name in enumerate(axes):
+            others = np.delete(same, k, axis=0)
+            for a, b in _lasting(same[k], log.t_s[rows]) if name in names else ():
+                if others[:, a:b].mean() < _OTHERS_REPEAT:
+                    value, stamps = log.columns[name][rows[a]], log.t_s[rows]
+                    text = f"{name} is stuck at {value:.6g} from {stamps[a]:.1f} to {stamps[b]:.1f} s"
+                    return Finding("inconsistent", f"{text}, where the others go on changing", _CHECK_IMU)
+    return None
 
 
 def _stopped(log: Log, held: Sequence[tuple[int, int]]) -> Finding | None:

@@ -232,6 +232,32 @@ def test_an_imu_that_stops_answering(begin: int, end: int, every: int) -> None:
     assert finding.severity == "poor" and f"to {log.t_s[gone[-1]]:.1f} s" in finding.text
 
 
+@pytest.mark.parametrize("name", ["gz_radps", "ax_mps2", "ay_mps2"])
+@pytest.mark.parametrize(("begin", "end"), [(0, 1500), (1500, 3000), (1000, 1150)])
+def test_an_axis_that_is_stuck_while_the_others_go_on(name: str, begin: int, end: int) -> None:
+    rng = np.random.default_rng(5)
+    log = _log(az_mps2=0.02 * rng.normal(size=3000), gx_radps=0.003 * rng.normal(size=3000))
+    assert not log.signals(*IN_PLANE).findings
+    column = log.columns[name].copy()
+    column[begin:end] = column[begin]
+    stuck = replace(log, columns={**log.columns, name: column})
+    (finding,) = stuck.signals(*IN_PLANE).findings
+    assert finding.severity == "inconsistent"
+    assert finding.text.startswith(f"{name} is stuck at {column[begin]:.6g} from {log.t_s[begin]:.1f} to")
+    others = [one for one in IN_PLANE if one != name]
+    assert not any("is stuck" in one.text for one in stuck.signals(*others).findings)
+
+
+@pytest.mark.parametrize("step", [0.01, 0.05, 0.3])
+def test_an_axis_that_rests_within_its_step_is_not_stuck(step: float) -> None:
+    """A coarse sensor repeats itself at rest, in all its axes alike, and changes in motion."""
+    rng = np.random.default_rng(6)
+    log = _log(az_mps2=0.02 * rng.normal(size=3000), gx_radps=0.003 * rng.normal(size=3000))
+    moving = np.arange(3000) > 1000
+    coarse = {name: np.rint(np.where(moving, v, 0.1 * v) / step) * step for name, v in log.columns.items()}
+    assert not any("is stuck" in one.text for one in replace(log, columns=coarse).signals(*IN_PLANE).findings)
+
+
 def test_an_imu_with_coarse_steps_has_not_stopped() -> None:
     log = _log(az_mps2=0.0)
     coarse = {name: np.rint(values / 0.05) * 0.05 for name, values in log.columns.items()}

@@ -781,7 +781,11 @@ def _replayed(
     flags = {name: tally.flags[bit] for name, bit in FLAGS.items() if tally.flags.get(bit)}
     share = sums.driven / sums.weighed if own and sums.weighed else None
     if own:
-        findings = [*findings, *sampled(sums.watch), *consistent(checks, flags, max(tally.rows, 1))]
+        seen = list(sampled(sums.watch))
+        if any(one.severity == "inconsistent" for one in seen):
+            # A sensor that is stuck or mirrored seems late, too.
+            findings = [one for one in findings if one.severity == "remark"]
+        findings = [*seen, *findings, *consistent(checks, flags, max(tally.rows, 1))]
         if sensor is not None:
             findings += contradicting(log.setup, sensor, tally.end_s - tally.start_s)
     if share is not None and share < 0.99:
