@@ -608,6 +608,20 @@ def test_no_gains_are_ok_from_a_log_that_contradicts_itself(reference: bool) -> 
         assert found[0].severity in ("poor", "inconsistent")
 
 
+@pytest.mark.parametrize("factor", [0.5, 0.85, 1.2, 2.0, -1.0])
+def test_a_reference_that_turns_too_far_is_named(factor: float) -> None:
+    """As a camera's does whose picture is mirrored, stretched, or of another plane."""
+    piece = _piece(3, True)
+    assert piece.reference_rad is not None
+    pieces = [
+        replace(piece, reference_rad=factor * piece.reference_rad),
+        replace(_piece(1, True), source="good.csv"),
+    ]
+    (found,) = contradictions(pieces, tune(pieces, DATA_SHEET))
+    assert found.severity == "inconsistent"
+    assert found.text.startswith("arm.csv:") and "contradict each other" in found.text
+
+
 @pytest.mark.parametrize("reference", [True, False])
 @pytest.mark.parametrize("lever_m", [0.05, 0.2])
 def test_a_sound_log_does_not_contradict_itself(reference: bool, lever_m: float) -> None:

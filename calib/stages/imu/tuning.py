@@ -922,6 +922,8 @@ _LATE_S = 0.01 * np.arange(-30, 31)
 _MOST_RATE_ERROR = math.radians(1.5)
 _TIMES_THE_SENSOR = 10.0
 _MOST_TURNED_RAD = math.radians(5.0)
+_MEAN_S, _FEWEST_MEANS = 2.0, 5
+_TURNED_SLOWLY_RAD = math.radians(3.0)
 
 
 def _level(t_s: FloatArray, values: FloatArray) -> FloatArray:
@@ -967,6 +969,27 @@ def _against(t_s: FloatArray, rate_radps: FloatArray, seen_rad: FloatArray) -> s
     return ""
 
 
+def _slowly(t_s: FloatArray, own_rad: FloatArray, seen_rad: FloatArray) -> str:
+    """How means over spans of a reference contradict those of the IMU's own angle; empty where they do not.
+
+    Slow turns are the accelerometer's own, and the rate has no say in them.
+    """
+    known = np.isfinite(seen_rad)
+    span = ((t_s - t_s[0]) / _MEAN_S).astype(np.int64)[known]
+    count = np.bincount(span)
+    full = count > 0.5 * max(float(count.max(initial=0)), 1.0)
+    if int(full.sum()) < _FEWEST_MEANS:
+        return ""
+    own, seen = (np.bincount(span, x[known])[full] / count[full] for x in (own_rad, seen_rad))
+    own, seen = own - own.mean(), seen - seen.mean()
+    if max(float(own.std()), float(seen.std())) < _TURNED_SLOWLY_RAD:
+        return ""
+    scale = float(own @ seen) / max(float(own @ own), 1e-12)
+    if abs(scale - 1.0) <= _MOST_SCALE or abs(scale - 1.0) * float(own.std()) <= _TURNS_RAD:
+        return ""
+    return f"the angle turns {scale:.3g} times as far as the accelerometer says"
+
+
 def _late(t_s: FloatArray, phi_acc_rad: FloatArray, rate_radps: FloatArray) -> float:
     """By how much the accelerometer's angle comes later than the rate's [s]; 0 where that is not clear.
 
@@ -1006,6 +1029,10 @@ def contradictions(pieces: Sequence[Piece], result: Tuning) -> list[Finding]:
             what = _against(piece.t_s, piece.rate_radps, piece.reference_rad)
             if what:
                 found(piece.source, f"rate and reference contradict each other: {what}")
+            elif piece.in_plane and own is not None:
+                what = _slowly(piece.t_s, own.phi_rad, piece.reference_rad)
+                if what:
+                    found(piece.source, f"accelerometer and reference contradict each other: {what}")
         if piece.in_plane and own is not None:
             late = _late(piece.t_s, piece.phi_acc_rad, piece.rate_radps)
             if abs(late) > _MOST_LATE_S:
