@@ -676,7 +676,7 @@ def _frozen(log: Log, names: Sequence[str]) -> Finding | None:
                 if others[:, a:b].mean() < _OTHERS_REPEAT:
                     value, stamps = log.columns[name][rows[a]], log.t_s[rows]
                     text = f"{name} is stuck at {value:.6g} from {stamps[a]:.1f} to {stamps[b]:.1f} s"
-                    return Finding("inconsistent", f"{text}, where the others go on changing", _CHECK_IMU)
+                    return Finding("inconsistent", f"{text}, while other axes go on changing", _CHECK_IMU)
     return None
 
 

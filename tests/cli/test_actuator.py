@@ -133,7 +133,12 @@ def test_logs_that_cannot_be_used_end_in_a_sentence(
             row[where["u_px"]] = "nan"
         return row
 
+    def share(row: list[str], where: dict[str, int]) -> list[str]:
+        row[where["pwm1"]] = "0.9" if row[where["pwm1"]] else ""
+        return row
+
     for change, words in (
+        (share, "pwm1 and pwm2 are 0.9 at most, expected 0 to 255"),
         (late, "the clock jumps"),
         (short, "expected at least 40"),
         (mute, "has no commands"),

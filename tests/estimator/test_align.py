@@ -403,6 +403,18 @@ def test_a_gyroscope_in_other_units_is_refused(swing: AlignLog, factor: float, w
         start(pieces, [wrong], 0.025)
 
 
+def test_the_log_whose_picture_is_mirrored_is_named(swing: AlignLog) -> None:
+    """Of a quick swing half a period late looks turned round, too: the offset of all logs says nothing."""
+    ellipse = align_log(twin_log(RIG, "ellipse", {}, 3))
+    mirrored = replace(
+        ellipse, source="mirrored.csv", pixels=np.array([315.0, 0.0]) - ellipse.pixels * [1, -1]
+    )
+    for logs in ([swing, mirrored], [mirrored, swing]):
+        pieces, _ = pieces_of(logs, NUMBERS, MEAN_ALIGN_START)
+        with pytest.raises(BadInputError, match=r"^mirrored\.csv: .* the other way round"):
+            start(pieces, logs, 0.025)
+
+
 SIZE_ALIGNING = RIG.view.camera.image_size_px
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import allantools
@@ -189,6 +190,15 @@ def test_a_scale_that_no_accelerometer_has_is_poor(scale: float, word: str) -> N
     judged = judge(analyse_static([replace(log, values=scaled)]))
     assert judged.word == word
     assert any("times gravity" in text for text in judged.reasons) == (word == "poor")
+
+
+@pytest.mark.parametrize(("factor", "word"), [(1.0, "ok"), (0.15, "ok"), (math.pi / 180.0, "poor")])
+def test_a_rate_that_was_taken_for_degrees_is_poor(factor: float, word: str) -> None:
+    log, _ = rest_log(Imu(), 120.0, 1)
+    scaled = log.values * np.where([axis.startswith("g") for axis in AXES], factor, 1.0)
+    judged = judge(analyse_static([replace(log, values=scaled)]))
+    assert judged.word == word
+    assert any("less than any small gyroscope" in text for text in judged.reasons) == (word == "poor")
 
 
 def test_noise_and_a_walk_are_no_steps() -> None:

@@ -363,6 +363,11 @@ def _commands(log: Log, no_pwm: bool) -> tuple[float, float, FloatArray]:
         raise BadInputError(
             f"{log.source}, line {commands.lines[k]}: pwm is {pwm[k].tolist()}, expected 0 to 255"
         )
+    if 0.0 < float(pwm.max()) <= 1.0:
+        raise BadInputError(
+            f"{log.source}: pwm1 and pwm2 are {float(pwm.max()):.3g} at most, expected 0 to 255; where they "
+            "are shares of the full duty, columns.yaml takes them: `pwm1: {column: pwm1, factor: 255}`"
+        )
     tick_s = commands.axis.period_s if len(t) > 2 else TICK_S
     # A nominal rate that the stamps only scatter about is exact.
     tick_s = TICK_S if abs(tick_s / TICK_S - 1.0) < 0.01 else tick_s

@@ -526,22 +526,26 @@ def _use(piece: Piece, offset_s: float) -> BoolArray:
     return np.asarray(inside & piece.fine)
 
 
-def _factor_at(pieces: Sequence[Piece], offset_s: float) -> tuple[float, float, float]:
-    """Factor a at this offset, sum of squares with it, and without the gyroscope."""
-    cross, own, total = 0.0, 0.0, 0.0
-    for piece in pieces:
-        use = _use(piece, offset_s)
-        if use.sum() < _LEAST_PICTURES:
-            continue
+def _moments(piece: Piece, offset_s: float) -> FloatArray:
+    """Sums (3,) of theta phi, theta^2 and phi^2 at this offset, each about its straight line."""
+    sums = np.zeros(3)
+    use = _use(piece, offset_s)
+    if use.sum() >= _LEAST_PICTURES:
         t = piece.camera.t_s[use]
         theta = np.interp(t - offset_s, piece.imu.t_s, piece.theta)
         line = np.stack([np.ones(len(t)), t - t.mean()], axis=1)
         norms = (line * line).sum(axis=0)
         theta = theta - line @ (line.T @ theta / norms)
         phi = piece.phi[use] - line @ (line.T @ piece.phi[use] / norms)
-        cross, own, total = cross + float(theta @ phi), own + float(theta @ theta), total + float(phi @ phi)
-    factor = cross / own if own > 0.0 else 0.0
-    return factor, total - factor * cross, total
+        sums[:] = theta @ phi, theta @ theta, phi @ phi
+    return sums
+
+
+def _factors(sums: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Factors a (n,) of the camera's angle by the rate's, and squares left, of moments (n, 3)."""
+    cross, own, total = sums.T
+    factor = np.divide(cross, own, out=np.zeros(len(sums)), where=own > 0.0)
+    return factor, total - factor * cross
 
 
 def correlation(pieces: Sequence[Piece]) -> Correlation:
@@ -565,19 +569,26 @@ def correlation(pieces: Sequence[Piece]) -> Correlation:
     return Correlation(_OFFSETS_S.copy(), np.array(values))
 
 
-def _check_gyro(pieces: Sequence[Piece], logs: Sequence[AlignLog], factor: float, share: float) -> None:
-    if share < 0.5:
-        return
-    if _TIMES_IN_DEGREES[0] < abs(factor) < _TIMES_IN_DEGREES[1]:
-        raise BadInputError(
-            f"{logs[pieces[0].log].source}: gz_radps turns {1.0 / abs(factor):.3g} times as fast as the "
-            "camera sees, so it is in deg/s, expected rad/s"
-        )
-    if factor < -0.3:
-        raise BadInputError(
-            f"{logs[pieces[0].log].source}: gz_radps turns the other way round than the camera sees, "
-            "expected minus the rate of phi (a right-handed IMU, its x axis from the head to the base)"
-        )
+def _check_gyro(log: AlignLog, sums: FloatArray) -> None:
+    """Raise `BadInputError` for a log whose motion tells a gyroscope of another unit or sign.
+
+    `sums` are its moments at all offsets. At that of all logs a swing may be half a period late, and turn the
+    other way round.
+    """
+    factors, left = _factors(sums)
+    k = int(np.argmin(left))
+    factor, total = float(factors[k]), float(sums[k, 2])
+    if left[k] < 0.5 * total and total - left[k] > _WORTH * _PHI_SIGMA**2:
+        if _TIMES_IN_DEGREES[0] < abs(factor) < _TIMES_IN_DEGREES[1]:
+            raise BadInputError(
+                f"{log.source}: gz_radps turns {1.0 / abs(factor):.3g} times as fast as the camera sees, so "
+                "it is in deg/s, expected rad/s"
+            )
+        if factor < -0.3:
+            raise BadInputError(
+                f"{log.source}: gz_radps turns the other way round than the camera sees, expected minus the "
+                "rate of phi (a right-handed IMU, its x axis from the head to the base)"
+            )
 
 
 def _spline(
@@ -742,19 +753,21 @@ def start(pieces: Sequence[Piece], logs: Sequence[AlignLog], usual_offset_s: flo
 
     Raises `BadInputError` for a gyroscope in other units or with another sign.
     """
-    found = [_factor_at(pieces, float(offset)) for offset in _OFFSETS_S]
-    squares = np.array([entry[1] for entry in found])
+    sums = np.zeros((len(logs), len(_OFFSETS_S), 3))
+    for piece in pieces:
+        sums[piece.log] += [_moments(piece, offset) for offset in _OFFSETS_S.tolist()]
+    for log, own in zip(logs, sums, strict=True):
+        _check_gyro(log, own)
+    factors, squares = _factors(sums.sum(axis=0))
     usual = int(np.argmin(np.abs(_OFFSETS_S - usual_offset_s)))
     best = int(np.argmin(squares))
     moves = bool((squares.max() - squares[best]) / _PHI_SIGMA**2 > _WORTH)
     at = best if moves else usual
-    factor, left, total = found[at]
-    _check_gyro(pieces, logs, factor, 1.0 - left / total if total > 0.0 else 0.0)
     offset = float(_OFFSETS_S[at])
     made = [_stretch(piece, offset) for piece in pieces]
     stretches = tuple(stretch for stretch in made if stretch is not None)
     mount = _mount(stretches) if stretches else 0.0
-    return Started(stretches, offset, mount, factor, moves)
+    return Started(stretches, offset, mount, float(factors[at]), moves)
 
 
 # ----------------------------------------------------------------------

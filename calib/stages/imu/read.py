@@ -245,12 +245,12 @@ def _lag(
     """By how much a reference is later than the longest part's own smoothed angle [s]."""
     k = max(range(len(parts)), key=lambda i: len(parts[i].values))
     part, rate = parts[k], rates[k]
-    if len(rate) * period_s < SHORTEST_S + period_s:
-        return 0.0
     t = part.t_s
-    own = smooth_log(t, angle_of(part, axes), rate, DATA_SHEET.gyro, DATA_SHEET.walk)
+    own = period_s * np.cumsum(rate)
+    if len(rate) * period_s >= SHORTEST_S + period_s:
+        own = smooth_log(t, angle_of(part, axes), rate, DATA_SHEET.gyro, DATA_SHEET.walk).phi_rad
     # A rate that holds for the step before its sample is half a step ahead.
-    return lag_of(seen[0], np.unwrap(seen[1]), t, own.phi_rad - 0.5 * period_s * rate)
+    return lag_of(seen[0], np.unwrap(seen[1]), t, own - 0.5 * period_s * rate)
 
 
 def tune_log(log: Log, how: Reading) -> TuneLog:

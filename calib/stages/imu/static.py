@@ -382,6 +382,10 @@ def _of_steps(log: StaticLog, noise: Sequence[AxisNoise]) -> Iterator[Finding]:
         yield Finding("remark", f"{log.source}: {len(log.steps) - _SHOWN_MOTIONS} more steps of a mean")
 
 
+_LEAST_GYRO_NOISE = 1e-5
+"""A quarter of what the best micromachined gyroscopes have, in rad/s/sqrt(Hz)."""
+
+
 def _of_axis(noise: AxisNoise) -> Iterator[Finding]:
     """Findings on how well an axis' noise is known."""
     axis, allan = noise.axis, noise.allan
@@ -394,6 +398,13 @@ def _of_axis(noise: AxisNoise) -> Iterator[Finding]:
     if not N.sigma <= _MOST_SIGMA_OF_N * N.value:
         share = N.sigma / N.value if N.value > 0.0 else math.inf
         yield Finding("poor", f"{axis}: the white noise is known to {share:.0%} only; the log is too short")
+    if axis.startswith("g") and N.value < _LEAST_GYRO_NOISE:
+        yield Finding(
+            "poor",
+            f"{axis}: its noise of {math.degrees(N.value):.2g} deg/s/sqrt(Hz) is less than any small "
+            f"gyroscope has ({math.degrees(4.0 * _LEAST_GYRO_NOISE):.2g})",
+            "look whether its unit is rad/s where deg/s is stated, or a filter hides its noise",
+        )
     if allan.chance < _LEAST_CHANCE:
         off, tau_s = _colour(allan)
         text = f"{axis}: its noise is coloured, at {tau_s:.2g} s the deviation is {off:.2g} times what white "
