@@ -415,6 +415,20 @@ def test_the_log_whose_picture_is_mirrored_is_named(swing: AlignLog) -> None:
             start(pieces, logs, 0.025)
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_swing_that_hardly_dies_down_is_not_turned_round(sign: float) -> None:
+    """Half a period late it looks nearly the same; the sign of the only log there is tells."""
+    rig = replace(RIG, plant=replace(RIG.plant, damping_scale=0.02 * RIG.plant.damping_scale))
+    log = align_log(twin_log(rig, "swing", {"phi_rad": "-0.4"}, 3))
+    log = replace(log, readings=log.readings * np.array([1.0, 1.0, sign]))
+    pieces, _ = pieces_of([log], NUMBERS, MEAN_ALIGN_START)
+    if sign > 0.0:
+        assert start(pieces, [log], 0.025).time_offset_s == pytest.approx(0.025, abs=0.004)
+    else:
+        with pytest.raises(BadInputError, match="the other way round"):
+            start(pieces, [log], 0.025)
+
+
 SIZE_ALIGNING = RIG.view.camera.image_size_px
 
 

@@ -572,23 +572,27 @@ def correlation(pieces: Sequence[Piece]) -> Correlation:
 def _check_gyro(log: AlignLog, sums: FloatArray) -> None:
     """Raise `BadInputError` for a log whose motion tells a gyroscope of another unit or sign.
 
-    `sums` are its moments at all offsets. At that of all logs a swing may be half a period late, and turn the
-    other way round.
+    `sums` (n, 3) are its moments at some offsets. Half a period late a swing turns the other way round: it
+    counts as turned where no offset of the other sign explains it half as well.
     """
     factors, left = _factors(sums)
-    k = int(np.argmin(left))
-    factor, total = float(factors[k]), float(sums[k, 2])
-    if left[k] < 0.5 * total and total - left[k] > _WORTH * _PHI_SIGMA**2:
-        if _TIMES_IN_DEGREES[0] < abs(factor) < _TIMES_IN_DEGREES[1]:
-            raise BadInputError(
-                f"{log.source}: gz_radps turns {1.0 / abs(factor):.3g} times as fast as the camera sees, so "
-                "it is in deg/s, expected rad/s"
-            )
-        if factor < -0.3:
-            raise BadInputError(
-                f"{log.source}: gz_radps turns the other way round than the camera sees, expected minus the "
-                "rate of phi (a right-handed IMU, its x axis from the head to the base)"
-            )
+    total = float(sums[:, 2].max())
+    least = {sign: float(np.min(left[sign * factors > 0.0], initial=total)) for sign in (1.0, -1.0)}
+    turned = least[-1.0] < 0.5 * least[1.0]
+    best = least[-1.0 if turned else 1.0]
+    if best > 0.5 * total or total - best < _WORTH * _PHI_SIGMA**2:
+        return
+    factor = float(factors[np.argmin(np.abs(left - best))])
+    if _TIMES_IN_DEGREES[0] < abs(factor) < _TIMES_IN_DEGREES[1]:
+        raise BadInputError(
+            f"{log.source}: gz_radps turns {1.0 / abs(factor):.3g} times as fast as the camera sees, so it "
+            "is in deg/s, expected rad/s"
+        )
+    if factor < -0.3:
+        raise BadInputError(
+            f"{log.source}: gz_radps turns the other way round than the camera sees, expected minus the rate "
+            "of phi (a right-handed IMU, its x axis from the head to the base)"
+        )
 
 
 def _spline(
@@ -763,6 +767,8 @@ def start(pieces: Sequence[Piece], logs: Sequence[AlignLog], usual_offset_s: flo
     best = int(np.argmin(squares))
     moves = bool((squares.max() - squares[best]) / _PHI_SIGMA**2 > _WORTH)
     at = best if moves else usual
+    most = logs[int(np.argmax(sums[:, at, 2]))]
+    _check_gyro(most, sums.sum(axis=0)[at : at + 1])
     offset = float(_OFFSETS_S[at])
     made = [_stretch(piece, offset) for piece in pieces]
     stretches = tuple(stretch for stretch in made if stretch is not None)
