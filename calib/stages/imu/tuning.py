@@ -928,16 +928,19 @@ _TURNED_SLOWLY_RAD = math.radians(3.0)
 
 def _level(t_s: FloatArray, values: FloatArray) -> FloatArray:
     """Angles (n,) less a straight line in each span, NaN where they are or where a span has too few."""
-    out = np.full(len(values), np.nan)
+    known = np.isfinite(values)
     span = ((t_s - t_s[0]) / _SPAN_S).astype(np.int64)
-    edges = np.flatnonzero(np.diff(span, prepend=-1, append=span[-1] + 1))
-    for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        known = np.isfinite(values[a:b])
-        if int(known.sum()) < 20:
-            continue
-        t, y = t_s[a:b] - t_s[a], values[a:b]
-        line = np.polynomial.Polynomial.fit(t[known], y[known], 1)
-        out[a:b] = y - line(t)
+    of, most = span[known], int(span[-1]) + 1
+    count = np.bincount(of, minlength=most)
+
+    def mean(x: FloatArray) -> FloatArray:
+        return np.asarray(np.bincount(of, x, most) / np.maximum(count, 1))
+
+    t, y = t_s[known], values[known]
+    t, y = t - mean(t)[of], y - mean(y)[of]
+    slope = mean(t * y) / np.maximum(mean(t * t), 1e-300)
+    out = np.full(len(values), np.nan)
+    out[known] = np.where(count[of] >= 20, y - slope[of] * t, np.nan)
     return out
 
 
