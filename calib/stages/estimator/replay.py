@@ -570,6 +570,7 @@ def contradicting(setup: Setup, sensor: FloatArray, duration_s: float) -> Iterat
 _SEARCHED_ROWS = 2000
 _SHIFTS, _LATEST = (-4, -1, 1, 4), 50
 _TURNING_RADPS = 0.05
+_REPEATING = 0.08
 _GAIN = 60.0
 """Of the logarithm of the likelihood, over no delay and over the opposite one: in 180 moving logs of nine
 plants a delay that was none gained 20 at most, one sample's of one column gains 100 to 500."""
@@ -687,7 +688,7 @@ def replay_log(
     kept: list[FloatArray] = []
     compared: dict[str, Errors] = {}
     sensor: FloatArray | None = None
-    findings = list(untimely(log.setup, rows_of(log.first, log.periods.ticks))) if fused else []
+    findings: list[Finding] = []
     with _states_to(output, columns, kept.append if keep else None) as write:
         if estimator == "filterpy":
             stream = _watched(log.stream, sums.watch, _FILTERPY_ROWS, "--estimator filterpy")
@@ -781,10 +782,12 @@ def _replayed(
     share = sums.driven / sums.weighed if own and sums.weighed else None
     if own:
         seen = list(sampled(sums.watch))
-        if any(one.severity == "inconsistent" for one in seen):
-            # A sensor that is stuck or mirrored seems late, too.
-            findings = [one for one in findings if one.severity == "remark"]
-        findings = [*seen, *findings, *consistent(checks, flags, max(tally.rows, 1))]
+        findings = [*seen, *findings]
+        # A sensor that is stuck or mirrored seems late, too; innovations that are white hide no delay.
+        repeats = any((check.correlation or 0.0) > _REPEATING for check in checks.values())
+        if repeats and all(one.severity != "inconsistent" for one in seen):
+            findings += untimely(log.setup, rows_of(log.first, log.periods.ticks))
+        findings += consistent(checks, flags, max(tally.rows, 1))
         if sensor is not None:
             findings += contradicting(log.setup, sensor, tally.end_s - tally.start_s)
     if share is not None and share < 0.99:
