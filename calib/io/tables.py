@@ -104,13 +104,16 @@ def _split(where: str, line: str, separator: str) -> list[str]:
 _NO_ZONE = re.compile(rb"\A[^\n]*?\d\d:\d\d:\d\d(?:\.\d+)?(?![\d.Z+-])")
 _PASSED_OVER = re.compile(rb"(?:^|\n)[ \t\r]*(?:[#\n]|$)")
 """A blank line or a comment."""
+_BEGINS = (b"#", b"\n\n", b"\n\r", b"\n ", b"\n\t")
+"""One of these is in text with such a line, unless it is the first; to look for them takes a tenth."""
 
 
 def _parsed(text: _Text, data: bytes, first_line: int) -> tuple[Block, int]:
     """Rows of whole lines, and the number of the next line."""
     count = data.count(b"\n")
     lines = np.arange(first_line, first_line + count, dtype=np.int64)
-    if _PASSED_OVER.search(data, 0, len(data) - 1):
+    suspect = data[:1].isspace() or any(one in data for one in _BEGINS)
+    if suspect and _PASSED_OVER.search(data, 0, len(data) - 1):
         every = data.split(b"\n")[:-1]
         rows = [n for n, line in enumerate(every) if line.strip() and not line.lstrip().startswith(b"#")]
         data, lines = b"".join(every[n] + b"\n" for n in rows), lines[rows]
