@@ -141,6 +141,19 @@ def test_views_as_taken_are_not_turned(off_centre_px: tuple[float, float]) -> No
         assert turned_views(calibrate(pack(views), SIZE, "radial2")) == []
 
 
+@pytest.mark.parametrize("bow", [0.005, 0.01])
+def test_pictures_of_a_bent_board_are_not_turned(bow: float) -> None:
+    """The bow pulls the centre to one side or the other with the tilt, as turning a picture would."""
+    suspected = 0
+    for seed in range(4):
+        views = take(np.random.default_rng(seed), camera_of(), 14, recipe=Recipe(bow_m=bow * 0.2))
+        suspected += bool(turned_views(calibrate(pack(views), SIZE, "radial2")))
+        rigid = calibrate_camera(views, SIZE, Choices("radial2"))
+        assert not any("if it was" in one.why for one in rigid.left_out)
+        assert any("not flat" in text for text in (*rigid.verdict.reasons, *rigid.verdict.remarks))
+    assert suspected
+
+
 @pytest.mark.parametrize("kind", SPOILS)
 def test_beside_a_bad_view_no_other_looks_turned(kind: str) -> None:
     for seed in range(4):

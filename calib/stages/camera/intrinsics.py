@@ -589,6 +589,8 @@ def calibrate_camera(
     sorted_out, models = _sorted_out(everything, image_size_px, choices, fixed)
     of_all = sorted_out.everything
     turned = turned_views(of_all)
+    if turned and _bent(of_all, turned):
+        turned = []
     by_name = {one.name for one in turned}
     if turned and not choices.keep_all:
         everything = everything.select(np.flatnonzero(~np.isin(everything.names, list(by_name))))
@@ -658,6 +660,18 @@ def without_copies(
         if own[k] != i
     ]
     return observations.select(sorted(own.values())), copies
+
+
+def _bent(fit: Calibration, turned: Sequence[LeftOut]) -> bool:
+    """Whether a board that is not flat explains all views better than a flat one those that are not turned.
+
+    A bow moves the principal point of a view with the sign of its tilt, as turning a picture does.
+    """
+    if not fit.observations.same_target:
+        return False
+    others = np.flatnonzero(~np.isin(fit.observations.names, [one.name for one in turned]))
+    warped = refitted(fit, basis=board_basis(fit.observations.target_m[0], "warp"))
+    return warped.rms_px < refitted(fit, others).rms_px
 
 
 def _moved_px(found: Triage) -> float:
