@@ -570,6 +570,15 @@ def test_squares_that_are_not_square_are_noticed() -> None:
     assert any("proportions of the board" in reason for reason in plane.verdict.reasons)
 
 
+def test_a_picture_that_was_undistorted_before_is_told() -> None:
+    """As OpenCV's undistort leaves it: the same matrix, no distortion."""
+    straight = replace(THESIS, model="pinhole", distortion=np.zeros(8))
+    views = [picture_plane_checks("a", *pose_at(0.2, 0.16), 0.03, straight)]
+    plane = calibrate_plane(THESIS, COVARIANCE, views, camera_rms_px=0.14)
+    assert plane.verdict.word == "poor"
+    assert any("undistorted before" in reason for reason in plane.verdict.reasons)
+
+
 def test_two_tilts_that_fit_alike_are_told() -> None:
     far = Camera("pinhole", (640, 480), 900.0, 900.0, 0.0, 319.5, 239.5)
     R, t = pose_at(0.6, 2.8)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -139,6 +140,7 @@ _MOSTLY_UNSEEN = 0.5
 _RMS_LIMIT_PX = 1.0
 """A board that is found to 0.1 px and still misses by this much does not fit its description."""
 _RMS_FACTOR, _RMS_NOTICED_PX = 3.0, 0.3
+_STRAIGHT_PX = 0.03
 """Against the camera's own RMS: this many times as large, and large enough to matter."""
 _HOMOGRAPHY_FACTOR, _HOMOGRAPHY_POINTS = 2.0, 10
 """A homography that is free to bend to the pixels must not fit this much better than the pose."""
@@ -308,7 +310,22 @@ def _of_residuals(
     rms = pose.rms_px
     if pose.termination == "iterations":
         yield Finding("poor", "the fit of the pose did not converge")
-    if rms > _RMS_LIMIT_PX:
+    ideal = undistort(camera, pixels)
+    usable = bool(np.isfinite(ideal).all())
+    free_rms = plain_rms = math.nan
+    if usable and len(pixels) >= _HOMOGRAPHY_POINTS and rms > _STRAIGHT_PX:
+        free = fit_homography(world_m, ideal)
+        seen = project(camera, np.column_stack([world_m, np.ones(len(world_m))]) @ free.H.T)
+        free_rms = float(np.sqrt(np.mean(np.sum((seen - pixels) ** 2, axis=1))))
+        plain_rms = fit_homography(world_m, pixels).rms_px
+    if _HOMOGRAPHY_FACTOR * plain_rms < min(free_rms, rms):
+        yield Finding(
+            "poor",
+            f"without any distortion the corners fit to {plain_rms:.2g} px, with the camera's to {rms:.2g} "
+            "px: the picture was undistorted before, or is another camera's",
+            "give the picture as it was taken",
+        )
+    elif rms > _RMS_LIMIT_PX:
         text = (
             f"the corners miss their places by {rms:.2f} px RMS (limit {_RMS_LIMIT_PX:g}): wrong square, "
             "wrong order of corners, or another camera's intrinsics"
@@ -320,21 +337,15 @@ def _of_residuals(
             f"{camera_rms_px:.2f} px"
         )
         yield Finding("poor", text)
-    ideal = undistort(camera, pixels)
-    usable = np.isfinite(ideal).all(axis=1)
-    if not usable.all():
-        text = f"{int((~usable).sum())} corners lie where the camera's lens model folds over"
+    if not usable:
+        folded = int((~np.isfinite(ideal).all(axis=1)).sum())
+        yield Finding("poor", f"{folded} corners lie where the camera's lens model folds over")
+    elif rms > _RMS_NOTICED_PX and rms > _HOMOGRAPHY_FACTOR * free_rms:
+        text = (
+            f"a free homography fits to {free_rms:.2f} px where the pose fits to {rms:.2f} px: the "
+            "intrinsics or the proportions of the board are not the real ones"
+        )
         yield Finding("poor", text)
-    elif len(pixels) >= _HOMOGRAPHY_POINTS and rms > _RMS_NOTICED_PX:
-        free = fit_homography(world_m, ideal)
-        seen = project(camera, np.column_stack([world_m, np.ones(len(world_m))]) @ free.H.T)
-        free_rms = float(np.sqrt(np.mean(np.sum((seen - pixels) ** 2, axis=1))))
-        if rms > _HOMOGRAPHY_FACTOR * free_rms:
-            text = (
-                f"a free homography fits to {free_rms:.2f} px where the pose fits to {rms:.2f} px: the "
-                "intrinsics or the proportions of the board are not the real ones"
-            )
-            yield Finding("poor", text)
 
 
 def _of_horizon(camera: Camera, pose: Pose) -> Iterator[Finding]:
