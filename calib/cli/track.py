@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,10 +16,11 @@ from calib.core.units import parse_duration_s, parse_length_m, parse_pixel
 from calib.core.writing import Kind, check_writable, column_names, write_atomically
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Sequence
 
-    from calib.core.arrays import FloatArray
+    from calib.core.arrays import AnyArray, FloatArray
     from calib.stages.camera.marker import Disc, Tracker
+    from calib.stages.camera.section import Camera, Plane
 
 _GATE = 0.9
 """Share of the frames that must show the marker."""
@@ -83,7 +85,7 @@ def track(
     wanted = None if colour is None else parse_colour(colour)
     if pixy and diameter is not None:
         raise UsageError("--diameter: does not go with --pixy, which tells the middle of the blob's box")
-    centre = None if diameter is None else _to_disc(parse_length_m(diameter, "--diameter"), rig)
+    disc = None if diameter is None else _DiscOnPlane.of(rig, parse_length_m(diameter, "--diameter"))
     where = int(source) if source.isdecimal() else source if "://" in source else Path(source)
     check_writable(output, kind)
     times, frames = timed_frames(where)
@@ -102,6 +104,8 @@ def track(
                     times.stamps_s.pop()
                     break
                 if tracker is None:
+                    if disc is not None:
+                        disc.refuse_frame(frame, source)
                     learnt: Colour | None = wanted
                     if learnt is None:
                         learnt = parse_colour("orange") if start is None else colour_at(frame, start)
@@ -125,7 +129,9 @@ def track(
     seen = sum(one is not None for one in found)
     if tracker is None or not seen:
         raise BadInputError(f"{shown(source)}: {_why(tracker, start is not None)}")
-    rows = track_rows(times.settled_s(), found, pixy, centre)
+    if disc is not None:
+        disc.refuse_size([one for one in found if one is not None])
+    rows = track_rows(times.settled_s(), found, pixy, None if disc is None else disc.centre)
     write_atomically(output, f"{','.join(TRACK_COLUMNS)}\n{track_text(rows, pixy)}", kind)
     told: dict[str, Any] = {
         "frames": len(found),
@@ -161,22 +167,65 @@ def _why(tracker: Tracker | None, stated: bool) -> str:
     )
 
 
-def _to_disc(diameter_m: float, rig: Path) -> Callable[[FloatArray], FloatArray]:
-    """Maps the ellipse's centre to that of the disc in the plane of the rig."""
-    from calib.core.rig import Rig
-    from calib.stages.camera.marker import disc_centre
+@dataclass(frozen=True)
+class _DiscOnPlane:
+    """A disc of a diameter in the plane of the rig."""
 
-    known = Rig.load(rig, missing_ok=True)
-    camera, plane = known.camera, known.plane
-    if camera is None or plane is None:
-        missing = "camera" if camera is None else "plane"
-        verb = "intrinsics" if camera is None else "extrinsics"
-        raise BadInputError(
-            f"{shown(rig)}: has no {missing} yet, which --diameter needs; run calib {verb} first"
+    diameter_m: float
+    camera: Camera
+    plane: Plane
+
+    @staticmethod
+    def of(path: Path, diameter_m: float) -> _DiscOnPlane:
+        """Of the rig's camera and plane. Raises `BadInputError` where there are none."""
+        from calib.core.rig import Rig
+
+        known = Rig.load(path, missing_ok=True)
+        camera, plane = known.camera, known.current_plane(path)
+        if camera is None or plane is None:
+            missing = "camera" if camera is None else "plane"
+            verb = "intrinsics" if camera is None else "extrinsics"
+            raise BadInputError(
+                f"{shown(path)}: has no {missing} yet, which --diameter needs; run calib {verb} first"
+            )
+        return _DiscOnPlane(diameter_m, camera, plane)
+
+    def refuse_frame(self, frame: AnyArray, source: str) -> None:
+        """Raise `BadInputError` for pictures of another size than the camera's."""
+        size, known = frame.shape[1::-1], tuple(self.camera.image_size_px)
+        if size != known:
+            raise BadInputError(
+                f"{shown(source)}: is {size[0]}x{size[1]} px, expected {known[0]}x{known[1]} px, for which "
+                "the rig's camera holds; leave --diameter out, or calibrate the camera at this size"
+            )
+
+    def refuse_size(self, found: Sequence[Disc]) -> None:
+        """Raise `BadInputError` where discs of this diameter would look much larger or smaller."""
+        import numpy as np
+
+        middle = sorted(found, key=lambda one: one.radius_px)[len(found) // 2]
+        place = self.plane.to_world(middle.centre_px[None], self.camera)
+        ends = place + 1e-3 * np.eye(2)
+        px_per_mm = np.hypot(*(self.plane.to_pixels(ends, self.camera) - middle.centre_px).T)
+        seen, expected = middle.radius_px, 0.5e3 * self.diameter_m * float(np.sqrt(px_per_mm.prod()))
+        if not (1.0 / _TIMES_SEEN < expected / seen < _TIMES_SEEN or abs(expected - seen) < _SEEN_PX):
+            raise BadInputError(
+                f"--diameter: the disc is seen {2.0 * seen:.0f} px wide, one of {1e3 * self.diameter_m:g} mm "
+                f"on the rig's plane would be {2.0 * expected:.0f} px; expected about "
+                f"{1e3 * self.diameter_m * seen / expected:.0f} mm"
+            )
+
+    def centre(self, ellipse_px: FloatArray) -> FloatArray:
+        """The disc's centre from that of the ellipse."""
+        from calib.stages.camera.marker import disc_centre
+
+        return disc_centre(
+            ellipse_px,
+            0.5 * self.diameter_m,
+            lambda pixels: self.plane.to_world(pixels, self.camera),
+            lambda places: self.plane.to_pixels(places, self.camera),
         )
-    return lambda centre: disc_centre(
-        centre,
-        0.5 * diameter_m,
-        lambda pixels: plane.to_world(pixels, camera),
-        lambda places: plane.to_pixels(places, camera),
-    )
+
+
+_TIMES_SEEN, _SEEN_PX = 1.5, 2.0
+"""A threshold of colour and a blur take or add a pixel or two of a disc's edge."""

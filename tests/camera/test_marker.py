@@ -11,14 +11,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from identifytrials import rig_file
 from markervideos import Scene
 
 from calib.cli.main import main
+from calib.cli.track import _DiscOnPlane
 from calib.core.arrays import AnyArray, FloatArray
-from calib.core.errors import UsageError
+from calib.core.errors import BadInputError, UsageError
 from calib.io.frames import Times
 from calib.io.logs import read_log
-from calib.stages.camera.marker import Tracker, colour_at, disc_centre, discs, parse_colour
+from calib.stages.camera.marker import Disc, Tracker, colour_at, disc_centre, discs, parse_colour
 from calib.stages.camera.model import project
 from calib.twin.pictures import CAMERA
 from calib.twin.scene import rotation
@@ -188,6 +190,24 @@ def test_colours() -> None:
     patch[...] = (0, 102, 255)
     learnt = colour_at(patch, (10, 10))
     assert learnt is not None and learnt.hue_deg == pytest.approx(24) and colour_at(patch, (30, 3)) is None
+
+
+@pytest.mark.parametrize(("diameter_m", "fits"), [(0.012, True), (0.016, True), (0.12, False), (16.0, False)])
+def test_a_disc_of_another_size_is_refused(tmp_path: Path, diameter_m: float, fits: bool) -> None:
+    rig_file(tmp_path / "rig.yaml")
+    disc = _DiscOnPlane.of(tmp_path / "rig.yaml", diameter_m)
+    # Ends of a disc of 14 mm in the middle of the plane.
+    place = np.array([[0.0, 0.08], [0.007, 0.08], [0.0, 0.087]])
+    middle, *ends = disc.plane.to_pixels(place, disc.camera)
+    axes = np.array([np.hypot(*(end - middle)) for end in ends])
+    seen = Disc(middle, 0.05, axes, (0, 0, 1, 1), 0.0)
+    if fits:
+        disc.refuse_size([seen])
+    else:
+        with pytest.raises(BadInputError, match="expected about 14 mm"):
+            disc.refuse_size([seen])
+    with pytest.raises(BadInputError, match="is 640x480 px, expected 316x208 px"):
+        disc.refuse_frame(np.zeros((480, 640, 3), dtype=np.uint8), "m.avi")
 
 
 def test_what_the_command_refuses(
