@@ -369,22 +369,32 @@ class Rig:
             )
         return self.plane
 
+    def identities(self, *names: str) -> dict[str, str]:
+        """SHA-256 of these sections, of those that there are, to note what was computed from them."""
+        found = {name: getattr(self, name) for name in names}
+        return {name: identity(section) for name, section in found.items() if section is not None}
+
     def outdated(self) -> list[str]:
         """Sentences for sections that were computed from others than the rig now has."""
-        now = {
-            name: identity(section)
-            for name, section in (("camera", self.camera), ("plane", self.plane))
-            if section is not None
-        }
+        known = {name: self.inputs.get(name, {}) for name in _AGAIN if getattr(self, name) is not None}
+        now = self.identities(*(name for name in KINDS if any(name in inputs for inputs in known.values())))
         sentences = []
-        for name, verb in (("plane", "extrinsics"), ("lens", "distortion")):
-            known = self.inputs.get(name, {})
-            changed = [other for other in now if other in known and known[other] != now[other]]
-            if getattr(self, name) is not None and changed:
-                sentences.append(
-                    f"{name} in the file is of an earlier {' and '.join(changed)}; run calib {verb} again"
-                )
+        for name, inputs in known.items():
+            verb = _AGAIN[name]
+            changed = [
+                other.replace("_", " ") for other in now if inputs.get(other, now[other]) != now[other]
+            ]
+            if changed:
+                what = f"{name.replace('_', ' ')} in the file is of an earlier {' and '.join(changed)}"
+                sentences.append(f"{what}; run calib {verb} again")
         return sentences
+
+
+_AGAIN = {
+    "plane": "extrinsics", "lens": "distortion", "lowpass": "lowpass", "orientation_filter": "imu tune",
+    "align": "align", "actuator": "identify", "pump": "identify", "controller": "control tune",
+}  # fmt: skip
+"""Verb that computes a section which follows from others."""
 
 
 def kind_of(name: str) -> type[BaseModel]:

@@ -367,3 +367,22 @@ def test_every_number_is_finite(name: str) -> None:
 def test_what_is_no_covariance_is_refused(values: list[list[float]]) -> None:
     with pytest.raises(ValidationError):
         CovarianceTable(order=["a", "b"], values=values)
+
+
+def test_sections_that_follow_from_an_earlier_one_are_told(tmp_path: Path, project_root: Path) -> None:
+    """Once the plane is another one all that saw through it is of the earlier one."""
+    path = tmp_path / "rig.yaml"
+    path.write_text((project_root / "tests/goldens/twin_run/rig.yaml").read_text(encoding="utf-8"))
+    rig = Rig.load(path)
+    through = rig.identities("camera", "plane", "align")
+    inputs = dict.fromkeys(("lens", "lowpass", "orientation_filter", "actuator", "pump"), through)
+    of_align = rig.identities("camera", "plane")
+    rig.save(path, {**inputs, "align": of_align, "plane": rig.identities("camera"), "controller": {}})
+    rig = Rig.load(path)
+    assert rig.outdated() == []
+    assert rig.plane is not None
+    rig.plane.t_CW_m[2] += 1e-3
+    told = rig.outdated()
+    for name, verb in (("align", "align"), ("actuator", "identify"), ("lens", "distortion")):
+        assert f"{name} in the file is of an earlier plane; run calib {verb} again" in told
+    assert not any(one.startswith(("plane", "imu", "camera")) for one in told)

@@ -75,6 +75,7 @@ def _read(files: Files, rig: Rig, options: LogsOptions) -> LogsInputs:
     from calib.stages.actuator.results import beginning
 
     nominal, stated = beginning(rig)
+    files.hashes |= rig.identities("camera", "plane", "align")
     tracks = [
         read_track(files, path, rig, nominal, options, states)
         for path, states in _with_states(files, options)

@@ -323,7 +323,6 @@ class PlaneEvidence:
 
 def _read_plane(files: Files, rig: Rig, options: NoOptions) -> PlaneInputs:
     from calib.core.files import shown
-    from calib.core.result import identity
     from calib.core.rig import Geometry
     from calib.io.pictures import list_pictures
     from calib.stages.camera.model import View
@@ -369,7 +368,7 @@ def _read_plane(files: Files, rig: Rig, options: NoOptions) -> PlaneInputs:
         views.append(View(view.name, world_m[kept], placed.pixels[kept]))
         orientation.append(f"{view.name}: {placed.how}")
     x0, y0, x1, y1 = (rig.geometry or Geometry()).workspace_m
-    files.hashes.update({**search.hashes, **board_hash, "camera": identity(rig.camera)})
+    files.hashes |= {**search.hashes, **board_hash, **rig.identities("camera")}
     return PlaneInputs(
         rig.camera, views, (x0, y0, x1, y1), tuple(orientation), search.left_out, stated.simulated
     )
@@ -510,16 +509,14 @@ class LensInputs:
 def _read_lens(files: Files, rig: Rig, options: LensOptions) -> LensInputs:
     import numpy as np
 
-    from calib.core.result import identity
     from calib.core.rig import Geometry
     from calib.stages.camera.lens import PlaneView
 
     assert rig.camera is not None
-    files.hashes["camera"] = identity(rig.camera)
+    files.hashes |= rig.identities("camera", "plane")
     view = None
     current = rig.current_plane(files.rig_path)
     if current is not None:
-        files.hashes["plane"] = identity(current)
         x0, y0, x1, y1 = (rig.geometry or Geometry()).workspace_m
         sigma_mm = current.sigma_marker_mm.get("calibration_max")
         view = PlaneView(np.array(current.R_CW), np.array(current.t_CW_m), (x0, y0, x1, y1), sigma_mm)

@@ -444,16 +444,8 @@ def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
             raise UsageError(f"{what}: found {value:g}{unit}, expected {low:g} to {high:g}{unit}")
     criterion = ControllerCriterion(gain_margin=gain, phase_margin_rad=phase_rad, sensitivity=peak)
     machine, model = controlled(rig, options.pwm_limits)
-    files.hashes.update(_hashes(rig))
+    files.hashes |= rig.identities("known", "actuator", "pump")
     return TuneInputs(machine, model, criterion, files.progress)
-
-
-def _hashes(rig: Rig) -> dict[str, str]:
-    """SHA-256 of the sections that the gains follow from, where the file has them."""
-    from calib.core.result import identity
-
-    sections = {"known": rig.known, "actuator": rig.actuator, "pump": rig.pump}
-    return {name: identity(one) for name, one in sections.items() if one is not None}
 
 
 def _solve_tune(inputs: TuneInputs) -> Controller:

@@ -159,7 +159,6 @@ class TuneOptions(LogOptions):
 
 
 def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
-    from calib.core.result import identity
     from calib.io.logs import read_log
     from calib.stages.imu.read import Reading, sensor_noise, tune_log
     from calib.stages.imu.tuning import TuneInputs
@@ -183,10 +182,9 @@ def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
                 f"{shown(path)}: is sampled at {log.sampling.rate_hz:.4g} Hz, expected {first:.4g} Hz as in "
                 f"{logs[0].source}"
             )
-    if rig.imu is not None:
-        files.hashes["imu"] = identity(rig.imu)
-    if camera is not None and plane is not None and any(log.reference == "camera" for log in logs):
-        files.hashes |= {"camera": identity(camera), "plane": identity(plane)}
+    files.hashes |= rig.identities("imu")
+    if any(log.reference == "camera" for log in logs):
+        files.hashes |= rig.identities("camera", "plane")
     return TuneInputs(logs, *sensor_noise(rig, logs), how.tilted)
 
 

@@ -146,7 +146,6 @@ def positions_from_log(
 
 
 def _read(files: Files, rig: Rig, options: Options) -> Inputs:
-    from calib.core.result import identity
     from calib.core.rig import Geometry
     from calib.io.logs import read_log
     from calib.stages.lowpass.filters import Design, design_lowpass
@@ -165,7 +164,7 @@ def _read(files: Files, rig: Rig, options: Options) -> Inputs:
     on_plane = None
     if plane is not None and camera is not None and (options.log or options.suggest):
         on_plane = partial(plane.to_world, camera=camera)
-        files.hashes |= {"camera": identity(camera), "plane": identity(plane)}
+        files.hashes |= rig.identities("camera", "plane")
 
     def positions(path: Path | None) -> Positions | None:
         if path is None:

@@ -2,6 +2,7 @@
  * calib_constants.h - constants of one rig, written by calib <version>. Do not edit.
  *
  * SHA-256 of the values: <hash>
+ * input actuator/align: <hash>
  * input actuator/steps.csv: <hash>
  * input actuator/swing.csv: <hash>
  * input align/ellipse.csv: <hash>
@@ -34,6 +35,7 @@
  * input orientation_filter/swing.csv: <hash>
  * input plane/board.yaml: <hash>
  * input plane/plane01.png: <hash>
+ * input pump/align: <hash>
  * input pump/steps.csv: <hash>
  * input pump/swing.csv: <hash>
  * camera: radial2, verdict ok

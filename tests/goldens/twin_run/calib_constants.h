@@ -2,6 +2,7 @@
  * calib_constants.h - constants of one rig, written by calib <version>. Do not edit.
  *
  * SHA-256 of the values: <hash>
+ * input actuator/align: <hash>
  * input actuator/ellipse.csv: <hash>
  * input actuator/steps.csv: <hash>
  * input actuator/swing1.csv: <hash>
@@ -36,6 +37,7 @@
  * input orientation_filter/swing1.csv: <hash>
  * input plane/board.yaml: <hash>
  * input plane/plane01.png: <hash>
+ * input pump/align: <hash>
  * input pump/ellipse.csv: <hash>
  * input pump/steps.csv: <hash>
  * input pump/swing1.csv: <hash>
