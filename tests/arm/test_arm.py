@@ -147,6 +147,31 @@ def test_frozen_channels_and_jumps_are_findings() -> None:
     assert any("line 702: motion capture jumps by 2." in text for text in texts)
 
 
+def test_units_that_no_arm_has_are_told() -> None:
+    trial = simulated("a", 1)
+    columns = columns_of(trial)
+    lengths = {name: 1e3 * columns[name] for name in columns if name.endswith("_m")}
+    with pytest.raises(BadInputError, match="m apart, expected at most 3; columns"):
+        recording_of(_log(columns | lengths, trial), "a")
+    for factor, words in ((1e3, "columns.yaml takes Pa"), (0.01, "kPa at most, as bar would")):
+        pressures = {name: factor * columns[name] for name in columns if name.endswith("_kpa")}
+        try:
+            said = [one.text for one in recording_of(_log(columns | pressures, trial), "a").findings]
+        except BadInputError as error:
+            said = [str(error)]
+        assert any(words in text for text in said)
+
+
+def test_quaternions_in_another_order_are_told() -> None:
+    trial = simulated("a", 1)
+    columns = columns_of(trial)
+    for of in ("base", "tip"):
+        w, x, y, z = (columns[f"{of}_q{k}"] for k in "wxyz")
+        columns |= {f"{of}_q{k}": q for k, q in zip("wxyz", (x, y, z, w), strict=True)}
+    found = frame_findings(frame_of([recording_of(_log(columns, trial), "a")]))
+    assert any("order of the quaternions" in one.advice for one in found)
+
+
 def test_what_is_no_single_driven_arm_is_refused() -> None:
     trial = simulated("a", 1)
     both = columns_of(trial) | {"p_cmd2_kpa": trial.command}

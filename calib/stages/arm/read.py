@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,6 +27,9 @@ _JUMP_RAD = math.radians(0.7)
 """Between neighbours at 90 Hz: no arm of this kind turns as fast as 60 deg/s."""
 _TILTED_RAD = math.radians(5.0)
 _LEAST_TURN_RAD = math.radians(2.0)
+_NO_PLANE_RAD = math.radians(45.0)
+_LONGEST_M, _MOST_KPA, _LEAST_KPA = 3.0, 2000.0, 5.0
+"""No soft arm is so long or takes so much; hardly one bends by so little."""
 
 
 @dataclass(frozen=True)
@@ -151,7 +154,35 @@ def recording_of(log: Log, name: str) -> Recording:
     pwm = command is None and driven < len(PWM) and PWM[driven] in log.columns
     if pwm:
         command = log.columns[PWM[driven]]
-    return Recording(name, log.source, t, command, pressure, turned, chord, planar, tuple(findings), pwm)
+    made = Recording(name, log.source, t, command, pressure, turned, chord, planar, tuple(findings), pwm)
+    return replace(made, findings=(*findings, *_in_units(made)))
+
+
+def _in_units(recording: Recording) -> list[Finding]:
+    """What speaks of units other than metres and kPa. Raises `BadInputError` where no arm is so."""
+    source, poses = recording.source, recording.chord
+    chord = None if poses is None else np.linalg.norm(poses, axis=1)
+    chord = chord if recording.planar is None else recording.planar[:, 1]
+    if chord is not None and np.nanmedian(chord) > _LONGEST_M:
+        raise BadInputError(
+            f"{source}: base and tip are {float(np.nanmedian(chord)):.4g} m apart, expected at most "
+            f"{_LONGEST_M:g}; columns.yaml takes millimetres, each column with factor: 0.001"
+        )
+    if recording.pwm:
+        return []
+    read = [
+        one for one in (recording.command, recording.pressure) if one is not None and np.isfinite(one).any()
+    ]
+    most = max((float(np.nanmax(np.abs(one))) for one in read), default=math.nan)
+    if most > _MOST_KPA:
+        raise BadInputError(
+            f"{source}: pressures reach {most:.4g} kPa, expected at most {_MOST_KPA:g}; columns.yaml takes "
+            "Pa, each column with factor: 0.001"
+        )
+    if 0.0 < most < _LEAST_KPA:
+        text = f"{recording.name}: pressures reach {most:.3g} kPa at most, as bar would"
+        return [Finding("poor", text, "look for their unit; columns.yaml takes bar with factor: 100")]
+    return []
 
 
 def _jumps(log: Log, name: str, turned: FloatArray) -> list[Finding]:
@@ -222,7 +253,15 @@ def frame_findings(frame: Frame) -> list[Finding]:
             f"({u:z.2f}, {v:z.2f}, {w:z.2f}); the chord turns by {frame.leans:.2f} of the tip's angle",
         )
     ]
-    if math.radians(frame.planar_deg) > _TILTED_RAD:
+    if math.radians(frame.planar_deg) > _NO_PLANE_RAD:
+        said.append(
+            Finding(
+                "inconsistent",
+                f"the axis of bending stands {frame.planar_deg:.0f} deg off the normal of the tip's path",
+                "look at the order of the quaternions, w first, and at the axes of base and tip",
+            )
+        )
+    elif math.radians(frame.planar_deg) > _TILTED_RAD:
         said.append(
             Finding(
                 "remark",

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any
 
-from calib.core.errors import UsageError
+from calib.core.errors import BadInputError, UsageError
 from calib.core.options import LogOptions, option
 from calib.core.stage import Files, Progress, Stage
 from calib.core.verdict import Finding, Verdict
@@ -99,6 +99,13 @@ def read_trials(
     for path in files.paths:
         recordings.append(recording_of(read_log(path, options, files.remarks), path.stem))
         files.taken(path)
+    seen: dict[str, str] = {}
+    for name, digest in files.hashes.items():
+        if digest in seen:
+            raise BadInputError(
+                f"{name}: is the same recording as {seen[digest]}, expected another trial; leave one out"
+            )
+        seen[digest] = name
     found = frame_of(recordings) if frame is None else frame
     trials = tuple(trial_of(one, found, days[one.name], loads.get(one.name, 0.0)) for one in recordings)
     loaded = ", ".join(f"{name} {kg:g} kg" for name, kg in loads.items()) or "none"
@@ -168,6 +175,12 @@ def judge(found: Identification) -> Iterator[Finding]:
     yield from _far(found)
     yield from _untold(found)
     values = found.fit.values
+    if values.get("compliance_rad_per_Nm", 0.0) < 0.0:
+        yield Finding(
+            "remark",
+            "a load straightens the arm, as it does one that hangs: its compliance is below zero",
+            "where the arm stands upright look whether --load names the trials with the mass at the tip",
+        )
     for trial in found.trials:
         if not len(trial.angle_rad):
             continue
