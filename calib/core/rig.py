@@ -367,6 +367,12 @@ class Rig:
                 f"{shown(source)}: plane was calibrated with another camera than the one in camera; "
                 "run calib extrinsics again"
             )
+        off_px = self.plane.off_px(self.camera, (self.geometry or Geometry()).workspace_m)
+        if not off_px < _MOST_OFF_PX:
+            raise BadInputError(
+                f"{shown(source)}: plane.A_px_per_m is {off_px:.3g} px off from what camera, R_CW and t_CW_m "
+                "give; run calib extrinsics again"
+            )
         return self.plane
 
     def identities(self, *names: str) -> dict[str, str]:
@@ -390,6 +396,7 @@ class Rig:
         return sentences
 
 
+_MOST_OFF_PX = 0.01
 _AGAIN = {
     "plane": "extrinsics", "lens": "distortion", "lowpass": "lowpass", "orientation_filter": "imu tune",
     "align": "align", "actuator": "identify", "pump": "identify", "controller": "control tune",

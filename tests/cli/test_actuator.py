@@ -68,7 +68,9 @@ def test_swings_fill_the_section(calib: Run, rig: Path, swings: list[Path], tmp_
     for name, truth in (("stiffness_scale", 1.0), ("damping_scale_free_swing", 3.3), ("lambda1_per_s", 3.0)):
         assert abs(section[name] - truth) < 4.0 * section["sigma"][name]
     assert set(yaml.safe_load(rig.read_text())["provenance"]["inputs"]["actuator"]) == {
-        p.name for p in swings
+        *(p.name for p in swings),
+        "camera",
+        "plane",
     }
     assert (tmp_path / "figures" / "identify_motion.png").exists()
     # The simulation takes the file as it is.
@@ -79,7 +81,7 @@ def test_the_function_returns_both_sections(rig: Path, swings: list[Path]) -> No
     actuator, pump = python.identify(str(swings[0].parent / "swing*.csv"), Rig.load(rig), hold_back=False)
     assert pump is None
     assert abs(actuator.stiffness_scale - 1.0) < 4.0 * actuator.sigma["stiffness_scale"]
-    assert set(actuator.inputs) == {path.name for path in swings}
+    assert set(actuator.inputs) == {*(path.name for path in swings), "camera", "plane"}
     assert {"motion", "residuals", "parameters"} <= set(python.plots(actuator))
 
 

@@ -58,7 +58,7 @@ def test_a_rig_is_aligned(calib: Run, logs: dict[str, Log], rig: Path, tmp_path:
     offset = section.sigma["time_offset_s"]
     assert isinstance(offset, float)
     assert abs(section.time_offset_s - 0.025) < 4.0 * offset
-    assert set(Rig.load(rig).provenance.inputs["align"]) == {"swing.csv", "ellipse.csv"}
+    assert set(Rig.load(rig).provenance.inputs["align"]) == {"swing.csv", "ellipse.csv", "camera", "plane"}
     assert {path.name for path in figures.iterdir()} == {
         "align_correlation.png", "align_residuals_1.png", "align_residuals_2.png",
     }  # fmt: skip

@@ -386,3 +386,17 @@ def test_sections_that_follow_from_an_earlier_one_are_told(tmp_path: Path, proje
     for name, verb in (("align", "align"), ("actuator", "identify"), ("lens", "distortion")):
         assert f"{name} in the file is of an earlier plane; run calib {verb} again" in told
     assert not any(one.startswith(("plane", "imu", "camera")) for one in told)
+
+
+@pytest.mark.parametrize("key", ["fx_px", "t_CW_m"])
+def test_a_plane_that_its_own_pose_does_not_give_is_refused(project_root: Path, key: str) -> None:
+    rig = Rig.load(project_root / "tests/goldens/shipped/rig.yaml")
+    rig.provenance.inputs.clear()
+    assert rig.camera is not None and rig.plane is not None
+    assert rig.current_plane("rig.yaml") is rig.plane
+    if key == "fx_px":
+        rig.camera.fx_px *= 1.01
+    else:
+        rig.plane.t_CW_m[0] += 1e-3
+    with pytest.raises(BadInputError, match=r"rig\.yaml: plane\.A_px_per_m is .* px off from what camera"):
+        rig.current_plane("rig.yaml")

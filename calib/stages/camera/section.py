@@ -21,6 +21,8 @@ from calib.core.result import (
 from calib.core.schema import contradiction, nearest
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import ArrayLike
 
     from calib.core.arrays import FloatArray
@@ -170,6 +172,16 @@ class Plane(Result):
         if not np.allclose(A_inverse @ A, np.eye(3), atol=1e-6):
             raise contradiction("A_inverse is not the inverse of A_px_per_m")
         return self
+
+    def off_px(self, camera: Camera, workspace_m: Sequence[float]) -> float:
+        """By how much A_px_per_m and K [r1 r2 t] differ at the corners x0, y0, x1, y1 of a workspace."""
+        import numpy as np
+
+        x0, y0, x1, y1 = workspace_m
+        corners = np.array([[x0, y0, 1.0], [x1, y0, 1.0], [x0, y1, 1.0], [x1, y1, 1.0]])
+        of_pose = camera.optics.K @ np.column_stack([np.array(self.R_CW)[:, :2], self.t_CW_m])
+        one, other = corners @ np.array(self.A_px_per_m).T, corners @ of_pose.T
+        return float(np.abs(one[:, :2] / one[:, 2:] - other[:, :2] / other[:, 2:]).max())
 
     def to_pixels(self, world_m: ArrayLike, camera: Camera) -> FloatArray:
         """Pixels (n, 2), lens and all, at which the camera sees places on the plane (n, 2) in metres."""
