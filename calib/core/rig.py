@@ -380,9 +380,10 @@ class Rig:
         found = {name: getattr(self, name) for name in names}
         return {name: identity(section) for name, section in found.items() if section is not None}
 
-    def outdated(self) -> list[str]:
-        """Sentences for sections that were computed from others than the rig now has."""
-        known = {name: self.inputs.get(name, {}) for name in _AGAIN if getattr(self, name) is not None}
+    def outdated(self, *but: str) -> list[str]:
+        """Sentences for sections, all but these, that were computed from others than the rig now has."""
+        there = [name for name in _AGAIN if name not in but and getattr(self, name) is not None]
+        known = {name: self.inputs.get(name, {}) for name in there}
         now = self.identities(*(name for name in KINDS if any(name in inputs for inputs in known.values())))
         sentences = []
         for name, inputs in known.items():

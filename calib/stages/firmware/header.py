@@ -215,7 +215,8 @@ def _judge(whole: Rig, inverse: InverseLens | None) -> Verdict:
         if word != "ok":
             advice = _UNREAD if name in ("camera", "plane") else ""
             findings.append(Finding(word, f"{name.replace('_', ' ')} is {word}", advice))
-    findings += [Finding("poor", sentence) for sentence in whole.outdated()]
+    # A lens of another camera is not taken, but undone anew.
+    findings += [Finding("poor", sentence) for sentence in whole.outdated("lens")]
     if inverse is not None and not _undone(inverse):
         error = "without bound" if inverse.max_error_px is None else f"to {inverse.max_error_px:.3g} px only"
         text = f"the lens is undone {error}, over {inverse.covered:.0%} of the picture"
