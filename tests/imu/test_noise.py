@@ -183,22 +183,22 @@ def test_a_step_beyond_the_deviation_of_the_bias_makes_it_poor(axis: int, size: 
     assert any(advice in text for text in judged.advice)
 
 
-@pytest.mark.parametrize(("scale", "word"), [(0.8, "poor"), (0.95, "ok"), (1.05, "ok"), (1.4, "poor")])
-def test_a_scale_that_no_accelerometer_has_is_poor(scale: float, word: str) -> None:
+@pytest.mark.parametrize(
+    ("sensor", "factor", "word", "told"),
+    [
+        *(("a", factor, "poor", "times gravity") for factor in (0.8, 1.4)),
+        *(("a", factor, "ok", "times gravity") for factor in (0.95, 1.05)),
+        ("g", math.pi / 180.0, "poor", "less than any small gyroscope"),
+        *(("g", factor, "ok", "less than any small gyroscope") for factor in (1.0, 0.15)),
+    ],
+)
+def test_a_scale_that_no_sensor_has_is_poor(sensor: str, factor: float, word: str, told: str) -> None:
+    """Gravity tells an accelerometer's; a rate that was taken for degrees is too quiet."""
     log, _ = rest_log(Imu(), 120.0, 1)
-    scaled = log.values * np.where([axis.startswith("a") for axis in AXES], scale, 1.0)
+    scaled = log.values * np.where([axis.startswith(sensor) for axis in AXES], factor, 1.0)
     judged = judge(analyse_static([replace(log, values=scaled)]))
     assert judged.word == word
-    assert any("times gravity" in text for text in judged.reasons) == (word == "poor")
-
-
-@pytest.mark.parametrize(("factor", "word"), [(1.0, "ok"), (0.15, "ok"), (math.pi / 180.0, "poor")])
-def test_a_rate_that_was_taken_for_degrees_is_poor(factor: float, word: str) -> None:
-    log, _ = rest_log(Imu(), 120.0, 1)
-    scaled = log.values * np.where([axis.startswith("g") for axis in AXES], factor, 1.0)
-    judged = judge(analyse_static([replace(log, values=scaled)]))
-    assert judged.word == word
-    assert any("less than any small gyroscope" in text for text in judged.reasons) == (word == "poor")
+    assert any(told in text for text in judged.reasons) == (word == "poor")
 
 
 def test_noise_and_a_walk_are_no_steps() -> None:

@@ -337,7 +337,7 @@ def setup_from_rig(rig: Rig, path: Path, found: Periods) -> tuple[Setup, list[st
     Raises `BadInputError` without a camera or a plane where the log has pictures.
     """
     source = shown(path)
-    said = [one for one in rig.outdated() if one.startswith(("align", "actuator", "pump"))]
+    said: list[str] = []
     workspace = (rig.geometry or Geometry()).workspace_m
     view = np.zeros(25)
     if found.camera:

@@ -213,6 +213,7 @@ def opened(path: Path, rig: Rig, rig_path: Path, options: LogOptions = NOTHING_S
     first = next(stream)
     found = periods(first)
     setup, remarks = setup_from_rig(rig, rig_path, found)
+    remarks += rig.outdated("plane", "lens", "lowpass", "orientation_filter", "controller")
     if first.map is not None and first.map.narration:
         remarks.append(first.map.narration)
     stated = rig.estimator is not None or (rig.align is not None and rig.align.jitter_px > 0.0)
@@ -572,8 +573,9 @@ _SHIFTS, _LATEST = (-4, -1, 1, 4), 50
 _TURNING_RADPS = 0.05
 _REPEATING = 0.08
 _GAIN = 60.0
-"""Of the logarithm of the likelihood, over no delay and over the opposite one: in 180 moving logs of nine
-plants a delay that was none gained 20 at most, one sample's of one column gains 100 to 500."""
+"""Of the logarithm of the likelihood, over no delay and over the opposite one: in 176 moving logs of 16 rigs
+of six kinds, wrong models among them, a delay that was none gained 7 at most, in those of the demo 12; one
+sample's of one column gains 100 to 500."""
 _TOGETHER = {
     ("ay_mps2",): "ay_mps2 comes {} the other readings",
     ("gz_radps",): "gz_radps comes {} the other readings",
