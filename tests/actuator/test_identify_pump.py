@@ -231,7 +231,7 @@ def test_what_the_pwm_does_not_explain_makes_it_poor(found: PumpFound) -> None:
     assert "settle apart: 3 at 25.0 kPa" in said[0]
     assert "odd leaves the model" in said[1]
     assert "while the PWM stood still" in said[1]
-    assert judge_pump(odd)[0] == "poor"
+    assert judge_pump(odd).word == "poor"
     assert odd.main_group is not None
     assert odd.held_rms(LAG, odd.main_group.files) < odd.held_rms(LAG)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations, pairwise
 from typing import Any
@@ -14,8 +14,9 @@ from scipy.special import chdtri
 from calib.core.arrays import BoolArray, FloatArray
 from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
-from calib.core.result import finite_or_none, section_json
+from calib.core.result import finite_or_none, judged, section_json
 from calib.core.rig import Rig
+from calib.core.verdict import Finding, Verdict
 from calib.stages.actuator.identify import Progress, scaled_inverse
 from calib.stages.actuator.parameters import SUPPLY_V
 from calib.stages.actuator.pump import PWM_MAX, TICK_S
@@ -68,7 +69,8 @@ _PRIOR = 0.15
 class Parameter:
     """One number of a model: unit, where a search starts, its bounds, and the value that switches it off.
 
-    A unit of "y" is that of the measured values, and `start` and bounds are then multiples of their range.
+    A unit of "y" is that of the measured values, and `start` and bounds are then multiples of their range, as
+    those of "y/s" are.
     """
 
     name: str
@@ -84,12 +86,12 @@ MODELS: dict[str, tuple[Parameter, ...]] = {
     LAG: (
         *_COMMON,
         Parameter("lag_s", "s", 0.6, 0.005, 30.0),
-        Parameter("rising_limit_per_s", "y", 0.5, 0.05, 200.0, _FREE),
+        Parameter("rising_limit_per_s", "y/s", 0.5, 0.05, 200.0, _FREE),
     ),
     ORIFICE: (
         *_COMMON,
         Parameter("laminar_s", "s", 0.2, 1e-3, 30.0, 0.0),
-        Parameter("turbulent_s2", "1/y", 0.2, 1e-5, 100.0),
+        Parameter("turbulent_s2", "s^2/y", 0.2, 1e-5, 100.0),
         Parameter("leak_s", "s", 10.0, 0.02, 1000.0, _FREE),
         Parameter("hose_per_s", "1/s", 50.0, 0.1, 100.0, 0.0),
         Parameter("chamber_s", "s", 0.05, 0.01, 3.0, 1.0),
@@ -291,7 +293,6 @@ _MOST, _FARTHEST = 100, 1.0
 _STANDS, _NEAR = 1e-9, 1e-3
 """Steps, as parts of each parameter, below which a search has ended, or is near enough to be compared."""
 _DEAD_S = 0.05
-_PUMP_FREE = 1e6
 
 
 @dataclass(frozen=True)
@@ -322,6 +323,10 @@ class PumpFit:
         """All parameters by name."""
         return dict(zip([p.name for p in MODELS[self.model]], self.theta.tolist(), strict=True))
 
+    def run(self, record: PumpRecord, start_s: float = _START_S) -> FloatArray:
+        """Values (n,) of `simulate_pump`."""
+        return simulate_pump(self.model, self.theta, record, self.shape, start_s)
+
 
 @dataclass(frozen=True)
 class Held:
@@ -348,7 +353,7 @@ class _Problem:
 
     @property
     def unit(self) -> dict[str, float]:
-        return {"y": self.span, "1/y": 1.0 / self.span}
+        return {"y": self.span, "y/s": self.span, "s^2/y": 1.0 / self.span}
 
     def nominal(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Starts and bounds, in SI and in the unit of the values."""
@@ -480,8 +485,7 @@ def _check(records: Sequence[PumpRecord]) -> float:
     if not records:
         raise BadInputError("pump: found no recording with values over time, expected at least one")
     span = float(max(np.ptp(r.value) for r in records))
-    quiet = [r.name for r in records if not np.ptp(r.pwm) and np.ptp(r.value) < 0.02 * max(span, 1e-12)]
-    if len(quiet) == len(records) or span <= 0.0:
+    if span <= 0.0:
         names = ", ".join(r.name for r in records)
         raise BadInputError(f"{names}: neither PWM nor the measured value ever changes, expected steps")
     return span
@@ -579,7 +583,7 @@ def _search(
             more = {
                 c: v
                 for c, v in scores.items()
-                if group in c and all(_within(names, g, free) for g in c if g != group)
+                if group in c and all(names.index(g[0]) in free for g in c if g != group)
             }
             with_it = min(more, key=lambda c: more[c])
             gain = max(1.0 - more[with_it] / cost, 0.0)
@@ -590,39 +594,28 @@ def _search(
     return best, cost, free
 
 
-def _within(names: list[str], group: tuple[str, ...], free: list[int]) -> bool:
-    return names.index(group[0]) in free
-
-
 def _vague(problem: _Problem, theta: FloatArray, free: list[int], off: FloatArray) -> bool:
     """Whether a parameter that infinity switches off cannot be told from infinity."""
     sigma = np.sqrt(np.maximum(np.diag(_covariance(problem, theta, free)), 0.0))
     return any(
-        off[k] == _PUMP_FREE and not s <= 0.7 * abs(theta[k])
-        for k, s in zip(free, sigma.tolist(), strict=True)
+        off[k] == _FREE and not s <= 0.7 * abs(theta[k]) for k, s in zip(free, sigma.tolist(), strict=True)
     )
 
 
-def rms_of(fit: PumpFit, record: PumpRecord) -> float:
-    """RMS of the free run on a recording."""
-    error = simulate_pump(fit.model, fit.theta, record, fit.shape) - record.value
-    return float(np.sqrt(np.mean(error**2)))
-
-
-def rms_ahead(fit: PumpFit, record: PumpRecord, ahead_s: float = _AHEAD_S) -> float:
-    """RMS of predictions a time ahead of a measured value, begun anew ten times in it."""
+def rms_ahead(fit: PumpFit, record: PumpRecord) -> float:
+    """RMS of predictions `_AHEAD_S` ahead of a measured value, begun anew ten times in it."""
     t = record.t_s
     begin, errors = float(t[0]), []
-    while begin + ahead_s < float(t[-1]):
+    while begin + _AHEAD_S < float(t[-1]):
         # A tenth of a second before the beginning gives the start, as with a whole recording.
-        rows = np.nonzero((t >= begin - 0.1) & (t <= begin + ahead_s))[0]
+        rows = np.nonzero((t >= begin - 0.1) & (t <= begin + _AHEAD_S))[0]
         if len(rows) >= 10:
             part = PumpRecord(record.name, t[rows], record.pwm[rows], record.value[rows])
             known = float(begin - t[rows[0]]) if begin > float(t[0]) else 0.04
-            told = simulate_pump(fit.model, fit.theta, part, fit.shape, known)
-            late = t[rows] >= begin + 0.9 * ahead_s
+            told = fit.run(part, known)
+            late = t[rows] >= begin + 0.9 * _AHEAD_S
             errors.append((told - part.value)[late])
-        begin += 0.1 * ahead_s
+        begin += 0.1 * _AHEAD_S
     return float(np.sqrt(np.mean(np.concatenate(errors) ** 2))) if errors else math.nan
 
 
@@ -640,10 +633,9 @@ def cross_validate(fit: PumpFit, records: Sequence[PumpRecord]) -> list[Held]:
 
 def held_by(fit: PumpFit, record: PumpRecord) -> Held:
     """Errors of a fit on a recording that it has not seen."""
-    late = _near_full(record)
-    off = record.value - simulate_pump(fit.model, fit.theta, record, fit.shape)
+    late, off = _near_full(record), record.value - fit.run(record)
     settles = float(np.mean(off[late])) if late is not None else math.nan
-    return Held(record.name, rms_of(fit, record), rms_ahead(fit, record), settles)
+    return Held(record.name, float(np.sqrt(np.mean(off**2))), rms_ahead(fit, record), settles)
 
 
 def _near_full(record: PumpRecord) -> BoolArray | None:
@@ -721,7 +713,7 @@ def departures(fit: PumpFit, records: Sequence[PumpRecord]) -> tuple[Departure, 
     """Runs whose error grows beyond a twentieth of their range and stays there, and when it began."""
     out = []
     for record in records:
-        error = record.value - simulate_pump(fit.model, fit.theta, record, fit.shape)
+        error = record.value - fit.run(record)
         limit = _APART * float(np.ptp(record.value))
         large = np.abs(error) > limit
         # The last stretch of large errors, up to the end of the run.
@@ -1003,6 +995,8 @@ def identify_pump(
 _MOST_SHARE = 0.05
 _FEWEST_RUNS = 3
 _MOST_VAGUE = 0.5
+_PASSAGE = ("laminar_s", "turbulent_s2", "hose_per_s", "chamber_s")
+"""What may be vague: parts of the passage make up for each other."""
 
 
 def unexplained(found: PumpFound) -> list[str]:
@@ -1035,71 +1029,51 @@ def unexplained(found: PumpFound) -> list[str]:
     return out
 
 
-def judge_pump(found: PumpFound) -> tuple[str, list[str], list[str]]:
-    """Verdict, reasons and remarks."""
-    reasons, remarks = unexplained(found), list(dict.fromkeys(found.said))
-    if not found.fits:
-        remarks.append(
-            "settled values alone: neither dead time nor lag can be told, expected a recording over time"
-        )
-        return "unidentifiable" if not found.maps else "poor" if reasons else "ok", reasons, remarks
+def judge_pump(found: PumpFound) -> Verdict:
+    """What nothing explains, how recordings that were not fitted are met, and what is hardly known."""
+    remarks = [Finding("remark", text) for text in found.said]
+    return Verdict.of([*(Finding("poor", text) for text in unexplained(found)), *remarks, *_of_better(found)])
+
+
+def _of_better(found: PumpFound) -> Iterator[Finding]:
+    """Findings on the better model; without a recording there is none."""
     better = found.better
-    assert better is not None
+    if better is None:
+        yield Finding(
+            "remark",
+            "settled values alone: neither dead time nor lag can be told, expected a recording over time",
+        )
+        return
     fit = found.fits[better]
-    span = max(float(r.value.max() - r.value.min()) for r in found.records)
+    span = max(float(np.ptp(r.value)) for r in found.records)
     rms = found.held_rms(better)
     if rms is None:
-        remarks.append("one recording alone: no error on recordings not fitted")
+        yield Finding("remark", "one recording alone: no error on recordings not fitted")
     elif rms > _MOST_SHARE * span:
-        reasons.append(
+        yield Finding(
+            "poor",
             f"on recordings not fitted the {better} is off by {rms:.2f} {found.unit} (RMS), "
-            f"{100.0 * rms / span:.0f} % of the range"
+            f"{100.0 * rms / span:.0f} % of the range",
         )
     for name, sigma in fit.sigma.items():
         value = abs(fit.values[name])
-        if (
-            name not in ("laminar_s", "turbulent_s2", "hose_per_s", "chamber_s")
-            and sigma > _MOST_VAGUE * value
-        ):
-            reasons.append(
-                f"{name} of the {better} is known to {100.0 * sigma / max(value, 1e-12):.0f} % only"
-            )
+        if name not in _PASSAGE and sigma > _MOST_VAGUE * value:
+            share = f"{100.0 * sigma / max(value, 1e-12):.0f} %"
+            yield Finding("poor", f"{name} of the {better} is known to {share} only")
     settles = found.settles(better)
     if settles is not None:
         level, half, inside, count = settles
-        remarks.append(
+        yield Finding(
+            "remark",
             f"a further run settles at {level:.1f} +- {half:.1f} {found.unit} at full PWM (95 %); "
-            f"of {count} runs that were held back {inside} end inside what the others give"
+            f"of {count} runs that were held back {inside} end inside what the others give",
         )
-    if found.fits[LAG].shape.dead_pwm == 0.0:
-        remarks.append(
+    if fit.shape.dead_pwm == 0.0:
+        yield Finding(
+            "remark",
             "dead zone and shape of the static map are not told by these recordings; it is taken as a "
-            "straight line through zero (settled values at several PWM tell it)"
+            "straight line through zero (settled values at several PWM tell it)",
         )
-    return "poor" if reasons else "ok", reasons, remarks
-
-
-def _unit(parameter: Parameter, unit: str) -> str:
-    if parameter.name == "rising_limit_per_s":
-        return f"{unit}/s"
-    return {"y": unit, "1/y": f"s^2/{unit}"}.get(parameter.unit, parameter.unit)
-
-
-def parameter_rows(fit: PumpFit, unit: str) -> list[tuple[str, float, float | None, str, str]]:
-    """Name, value, standard deviation, unit and remark of each parameter."""
-    rows = []
-    for parameter in MODELS[fit.model]:
-        value = fit.values[parameter.name]
-        rows.append(
-            (
-                parameter.name,
-                value,
-                fit.sigma.get(parameter.name),
-                _unit(parameter, unit),
-                fit.fixed.get(parameter.name, ""),
-            )
-        )
-    return rows
 
 
 def _model(found: PumpFound, name: str) -> PumpModel:
@@ -1123,10 +1097,9 @@ def pump_section(found: PumpFound, rig: Rig) -> PumpSection:
 
     Levels in kPa are no forces: they stay under `identified`. What logs have told of forces stays.
     """
-    verdict, reasons, remarks = judge_pump(found)
     before: dict[str, Any] = {} if rig.pump is None else section_json(rig.pump)
     stated = rig.known.pump if rig.known is not None and rig.known.pump is not None else KnownPump()
-    update: dict[str, Any] = {"verdict": verdict, "reasons": reasons, "remarks": remarks, "advice": []}
+    update = judged(judge_pump(found))
     sigma: dict[str, Any] = before.get("sigma", {})
     if found.fits:
         lag = found.fits[LAG]

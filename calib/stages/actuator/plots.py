@@ -24,7 +24,7 @@ from calib.core.plot import (
     short,
 )
 from calib.stages.actuator.identify import PARAMETERS
-from calib.stages.actuator.identify_pump import LAG, ORIFICE, PumpFound, simulate_pump
+from calib.stages.actuator.identify_pump import LAG, ORIFICE, PumpFound
 from calib.stages.actuator.results import Identified, simulated_heads
 from calib.stages.actuator.section import Actuator, PumpSection
 from calib.stages.actuator.stage import Springs, Validated
@@ -204,7 +204,7 @@ def _runs(result: PumpFound) -> Figure:
         t, errors = record.t_s - record.t_s[0], []
         marks = [Curve(t, record.value, "measured", "points", "grey", 2.5)]
         for model, fit in result.fits.items():
-            simulated = simulate_pump(model, fit.theta, record, fit.shape)
+            simulated = fit.run(record)
             marks.append(Curve(t, simulated, model, "line", _MODELS[model], 1.1))
             rms = float(np.sqrt(np.mean((simulated - record.value) ** 2)))
             errors.append(f"{held[model].get(record.name, rms):.2f}")
@@ -222,8 +222,7 @@ def _left_over(result: PumpFound) -> Figure:
     )
     gone = {one.name for one in result.departs}
     errors = {
-        model: [one.value - simulate_pump(model, fit.theta, one, fit.shape) for one in result.records]
-        for model, fit in result.fits.items()
+        model: [one.value - fit.run(one) for one in result.records] for model, fit in result.fits.items()
     }
     most = 1.05 * max(float(np.abs(error).max()) for of_model in errors.values() for error in of_model) or 1.0
     panels: list[Plot] = []

@@ -255,16 +255,17 @@ def _pump_document(section: PumpSection) -> dict[str, Any]:
 
 def _pump_words(section: PumpSection) -> list[Block]:
     """Parameters, errors on tables that were not fitted, and static maps."""
-    from calib.stages.actuator.identify_pump import parameter_rows
+    from calib.stages.actuator.identify_pump import MODELS
 
     found: PumpFound = section.evidence
     unit, models = found.unit, list(found.fits)
     blocks: list[Block] = []
     for model, fit in found.fits.items():
-        rows = [
-            (name, "off" if sigma is None else _cell(value, ".4g"), _cell(sigma, ".2g"), of)
-            for name, value, sigma, of, _ in parameter_rows(fit, unit)
-        ]
+        rows = []
+        for one in MODELS[model]:
+            sigma = fit.sigma.get(one.name)
+            value = "off" if sigma is None else _cell(fit.values[one.name], ".4g")
+            rows.append((one.name, value, _cell(sigma, ".2g"), one.unit.replace("y", unit)))
         blocks.append(Table((model, "value", "sigma", "unit"), tuple(rows)))
     columns = (*models, *(f"{model}, 0.5 s ahead" for model in models))
     if models:
