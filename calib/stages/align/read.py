@@ -13,24 +13,10 @@ from calib.core.rig import Geometry, Rig
 from calib.io.logs import Log
 from calib.stages.align.solve import AlignLog, Settings
 from calib.stages.estimator.noise import grid_px
-from calib.stages.estimator.sensors import sensor_values, view_coefficients
+from calib.stages.estimator.sensors import QUANTITIES, sensor_values, view_coefficients
 
-PRIOR: dict[str, tuple[float, float]] = {
-    "gyro_bias_radps": (0.0, 0.1),
-    "accel_bias_x_mps2": (0.0, 0.3),
-    "accel_bias_y_mps2": (0.0, 0.3),
-    "mount_angle_rad": (0.0, 0.5),
-    "gyro_scale": (0.0, 0.02),
-    "imu_lever_m": (0.006, 0.02),
-    "marker_offset_m": (0.015, 0.003),
-    "time_offset_s": (0.025, 0.05),
-    "shift_x_m": (0.0, 2e-4),
-    "shift_y_m": (0.0, 2e-4),
-    "stretch": (0.0, 1e-3),
-    "accel_scale_x": (0.0, 0.01),
-    "accel_scale_y": (0.0, 0.01),
-}
-"""Value and deviation of what is known before: data sheets, a ruler, and a printed board's scale."""
+PRIOR = {name: (one.usual, one.unaligned) for name, one in QUANTITIES.items()}
+"""Value and deviation of what is known before."""
 
 _LEAST_SHIFT_M = 1e-5
 _LEAST_BIAS_MPS2 = 0.02

@@ -29,7 +29,7 @@ from calib.stages.align.spline import (
     imu_rows,
     normal_sums,
 )
-from calib.stages.estimator.sensors import GRAVITY_MPS2, SENSOR, SIZE, invert_marker, truncated
+from calib.stages.estimator.sensors import GRAVITY_MPS2, QUANTITIES, SENSOR, SIZE, invert_marker, truncated
 
 # ----------------------------------------------------------------------
 # How well readings fit: whole pixels with outliers, and readings of the IMU.
@@ -931,10 +931,10 @@ def response(problem: Problem, fit: Fit, i: int, change: FloatArray) -> FloatArr
 # what the accelerometer reads at phi = 0; it comes with its own deviation.
 
 _FIRST_NOISE = Noise(1.0, 0.05, np.array([0.2, 0.2, 0.01]))
-_GYRO, _AX, _AY, _MOUNT, _OFFSET = (
+_AX, _AY, _MOUNT, _OFFSET, _MARKER = (
     SENSOR.index(name)
     for name in (
-        "gyro_bias_radps", "accel_bias_x_mps2", "accel_bias_y_mps2", "mount_angle_rad", "time_offset_s",
+        "accel_bias_x_mps2", "accel_bias_y_mps2", "mount_angle_rad", "time_offset_s", "marker_offset_m",
     )
 )  # fmt: skip
 _SX, _SY = SENSOR.index("accel_scale_x"), SENSOR.index("accel_scale_y")
@@ -986,7 +986,6 @@ class Alignment:
     Attributes
     ----------
     sensor, covariance : (13,) and (13, 13) of `SENSOR`; mean, prior : (13,) prior and its deviations.
-    rest_angle_rad, rest_angle_sigma : what the accelerometer reads at phi = 0 at rest.
     noise, converged, steps : of the fit. moves : the first guess could see the offset. factor : of the
         gyroscope against the camera.
     left_out : sentences on gaps and logs that were not used.
@@ -996,8 +995,6 @@ class Alignment:
     covariance: FloatArray
     mean: FloatArray
     prior: FloatArray
-    rest_angle_rad: float
-    rest_angle_sigma: float
     noise: Noise
     converged: bool
     steps: int
@@ -1012,6 +1009,17 @@ class Alignment:
     def sigma(self) -> FloatArray:
         """Standard deviations (13,)."""
         return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def rest_angle_rad(self) -> float:
+        """What the accelerometer reads at phi = 0 at rest."""
+        return rest_angle(self.sensor)[0]
+
+    @property
+    def rest_angle_sigma(self) -> float:
+        """Standard deviation of that."""
+        gradient = rest_angle(self.sensor)[1]
+        return math.sqrt(float(gradient @ self.covariance @ gradient))
 
 
 def rest_angle(sensor: FloatArray) -> tuple[float, FloatArray]:
@@ -1123,7 +1131,6 @@ def align(logs: Sequence[AlignLog], settings: Settings) -> Alignment:
     sensor[_OFFSET] = first.time_offset_s
     fit = solve(problem, sensor, _FIRST_NOISE)
     covariance = fit.covariance + _walked(settings, problem, fit)
-    angle, gradient = rest_angle(fit.sensor)
     # Before: the sensors as they were assumed to be.
     before = mean.copy()
     before[_MOUNT] = 0.0
@@ -1132,8 +1139,7 @@ def align(logs: Sequence[AlignLog], settings: Settings) -> Alignment:
         _check(number, log, pieces, first.stretches, fit, traces) for number, log in enumerate(logs)
     )
     return Alignment(
-        fit.sensor, covariance, mean, settings.sigma, angle,
-        math.sqrt(float(gradient @ covariance @ gradient)), fit.noise, fit.converged, fit.steps, first.moves,
+        fit.sensor, covariance, mean, settings.sigma, fit.noise, fit.converged, fit.steps, first.moves,
         first.factor, checks, traces, correlation(pieces), tuple(said),
     )  # fmt: skip
 
@@ -1144,22 +1150,6 @@ def align(logs: Sequence[AlignLog], settings: Settings) -> Alignment:
 # What has to be known is the time offset and the angle read at rest. Of the others a combination is
 # often known much better than each alone: with the correlation r of two quantities, a part sqrt(1 - r^2) of
 # their deviations is left once the other is known.
-
-NAMES = {
-    "gyro_bias_radps": "the gyroscope's bias",
-    "accel_bias_x_mps2": "the accelerometer's bias along x",
-    "accel_bias_y_mps2": "the accelerometer's bias along y",
-    "mount_angle_rad": "the mount angle",
-    "gyro_scale": "the gyroscope's scale",
-    "imu_lever_m": "the IMU's place along the head",
-    "marker_offset_m": "the marker's offset d",
-    "time_offset_s": "the time offset",
-    "shift_x_m": "the plane's shift along x",
-    "shift_y_m": "the plane's shift along y",
-    "stretch": "the plane's stretch",
-    "accel_scale_x": "the accelerometer's scale along x",
-    "accel_scale_y": "the accelerometer's scale along y",
-}
 
 _OFFSET_S = (1e-3, 1e-2)
 _REST_RAD = math.radians(0.1)
@@ -1238,7 +1228,7 @@ def _contradicted(found: Alignment) -> Iterator[Finding]:
 
 def _known(found: Alignment) -> Iterator[Finding]:
     sigma = found.sigma
-    offset = float(sigma[SENSOR.index("time_offset_s")])
+    offset = float(sigma[_OFFSET])
     if offset > _OFFSET_S[0]:
         turned = max((log.turned_rad for log in found.logs), default=0.0)
         why = ""
@@ -1259,7 +1249,7 @@ def _known(found: Alignment) -> Iterator[Finding]:
     for k, name in enumerate(SENSOR):
         away = abs(found.sensor[k] - found.mean[k]) / found.prior[k]
         if away > _BEYOND_PRIOR:
-            text = f"{NAMES[name]} came out as {found.sensor[k]:.3g}, which is not to be expected"
+            text = f"{QUANTITIES[name].words} came out as {found.sensor[k]:.3g}, which is not to be expected"
             yield Finding("poor", text)
 
 
@@ -1280,28 +1270,27 @@ def _groups(tied: BoolArray) -> list[list[int]]:
 def _separable(found: Alignment) -> Iterator[Finding]:
     sigma = found.sigma
     R = found.covariance / sigma / sigma[:, None]
-    mount, bias = SENSOR.index("mount_angle_rad"), SENSOR.index("accel_bias_y_mps2")
     unlearnt = [k for k in range(len(SENSOR)) if sigma[k] > _NOTHING_LEARNT * found.prior[k]]
-    if sigma[mount] > 2.0 * found.rest_angle_sigma or R[mount, bias] < -_INSEPARABLE:
+    if sigma[_MOUNT] > 2.0 * found.rest_angle_sigma or R[_MOUNT, _AY] < -_INSEPARABLE:
         yield Finding(
             "remark",
             "the mount angle and the accelerometer's bias along y are nearly one number "
-            f"(correlation {R[mount, bias]:.3f}): together, as the angle read at rest at phi = 0, they are "
+            f"(correlation {R[_MOUNT, _AY]:.3f}): together, as the angle read at rest at phi = 0, they are "
             f"{math.degrees(found.rest_angle_rad):.3f} +- {math.degrees(found.rest_angle_sigma):.3f} deg, "
-            f"the mount angle alone {math.degrees(found.sensor[mount]):.2f} +- "
-            f"{math.degrees(sigma[mount]):.2f} deg",
-            _TILT if sigma[mount] > _REST_RAD else "",
+            f"the mount angle alone {math.degrees(found.sensor[_MOUNT]):.2f} +- "
+            f"{math.degrees(sigma[_MOUNT]):.2f} deg",
+            _TILT if sigma[_MOUNT] > _REST_RAD else "",
         )
     for group in _groups(np.abs(R) > _INSEPARABLE):
-        if set(group) != {mount, bias}:
-            words = [NAMES[SENSOR[k]] for k in group]
+        if set(group) != {_MOUNT, _AY}:
+            words = [QUANTITIES[SENSOR[k]].words for k in group]
             yield Finding(
                 "remark",
                 f"hardly told apart from each other: {', '.join(words[:-1])} and {words[-1]}; what they do "
                 "together is known much better than each, see the covariance",
             )
     if unlearnt:
-        names = ", ".join(NAMES[SENSOR[k]] for k in unlearnt)
+        names = ", ".join(QUANTITIES[SENSOR[k]].words for k in unlearnt)
         yield Finding("remark", f"the logs say next to nothing of {names}: as assumed beforehand")
 
 
@@ -1319,7 +1308,6 @@ def judge(found: Alignment) -> Verdict:
 _DOUBT = {True: 0.02, False: 0.1}
 """Probability that the marker is not where its drawing says: with one written down, and without."""
 _ELSEWHERE_M, _CONTRARY_M = 3e-3, 5e-4
-_MARKER = SENSOR.index("marker_offset_m")
 
 
 def with_drawn_marker(found: Alignment, geometry: Geometry) -> tuple[Alignment, Finding]:
@@ -1345,14 +1333,7 @@ def with_drawn_marker(found: Alignment, geometry: Geometry) -> tuple[Alignment, 
     spread = float(weight @ (1.0 / sums) - weight @ (pulls - pull) ** 2)
     sensor = found.sensor + by * pull
     covariance = found.covariance - spread * np.outer(by, by)
-    angle, gradient = rest_angle(sensor)
-    mixed = replace(
-        found,
-        sensor=sensor,
-        covariance=covariance,
-        rest_angle_rad=angle,
-        rest_angle_sigma=math.sqrt(float(gradient @ covariance @ gradient)),
-    )
+    mixed = replace(found, sensor=sensor, covariance=covariance)
     both = (
         f"the marker's offset d: {_mm(drawn, sigma)} as drawn (geometry.marker_offset_m), "
         f"{_mm(value, math.sqrt(float(by[_MARKER])))} by the logs alone, "

@@ -24,7 +24,7 @@ from calib.stages.estimator.event import (
     tell,
     update,
 )
-from calib.stages.estimator.sensors import SIZE, head_position, invert_marker
+from calib.stages.estimator.sensors import QUANTITIES, SIZE, head_position, invert_marker
 
 # ----------------------------------------------------------------------
 # The kinematic process: how the head moves when nothing is known of what drives it.
@@ -101,25 +101,7 @@ class Kinematic:
 
     levels: tuple[Level, ...] = LEVELS
     switch_hz: float = 0.1
-    sensor_walk: tuple[float, ...] = (
-        2e-5,
-        3e-3,
-        1e-3,
-        1e-6,
-        1e-6,
-        1e-7,
-        1e-7,
-        1e-7,
-        1e-8,
-        1e-8,
-        1e-6,
-        1e-6,
-        1e-6,
-    )
-    names: tuple[str, ...] = field(init=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "names", tuple(level.name for level in self.levels))
+    sensor_walk: tuple[float, ...] = tuple(one.walk for one in QUANTITIES.values())
 
     def arrays(self) -> tuple[FloatArray, FloatArray]:
         """Levels (M, 8) and squared walks (13,) for the compiled functions."""

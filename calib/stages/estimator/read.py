@@ -23,7 +23,7 @@ from calib.stages.estimator.baseline import BaselineSetup, undistorting_nothing
 from calib.stages.estimator.driven import PARAMETER, Drive
 from calib.stages.estimator.kinematic import LEVELS, Kinematic, Level, Rows, Setup, Start
 from calib.stages.estimator.noise import grid_px
-from calib.stages.estimator.sensors import SENSOR, sensor_values, view_coefficients
+from calib.stages.estimator.sensors import QUANTITIES, SENSOR, sensor_values, view_coefficients
 
 # ----------------------------------------------------------------------
 # From a log and a rig.yaml to the estimator's rows and its set-up.
@@ -35,23 +35,6 @@ from calib.stages.estimator.sensors import SENSOR, sensor_values, view_coefficie
 READINGS = ("u_px", "v_px", "ax_mps2", "ay_mps2", "gz_radps")
 """Columns of `kinematic.Rows.readings`."""
 _TRUTH = ("true_q1_m", "true_q2_m", "true_phi_rad")
-
-DEFAULTS: dict[str, tuple[float, float]] = {
-    "gyro_bias_radps": (0.0, 0.02),
-    "accel_bias_x_mps2": (0.0, 0.1),
-    "accel_bias_y_mps2": (0.0, 0.1),
-    "mount_angle_rad": (0.0, 0.05),
-    "gyro_scale": (0.0, 0.01),
-    "imu_lever_m": (0.006, 0.001),
-    "marker_offset_m": (0.015, 3e-4),
-    "time_offset_s": (0.025, 0.01),
-    "shift_x_m": (0.0, 2e-4),
-    "shift_y_m": (0.0, 2e-4),
-    "stretch": (0.0, 1e-3),
-    "accel_scale_x": (0.0, 0.003),
-    "accel_scale_y": (0.0, 0.003),
-}
-"""Value and standard deviation of what no section of the rig's file says."""
 
 _NOISE = {
     "jitter_px": 0.3, "grid_px": 1.0, "accel_x_mps2": 0.0158, "accel_y_mps2": 0.0158, "gyro_radps": 0.0026,
@@ -165,7 +148,7 @@ def blocks(path: Path, options: LogOptions, picture_px: tuple[int, int] | None) 
 
 def _from_align(rig: Rig) -> tuple[dict[str, tuple[float, float]], FloatArray | None, list[str]]:
     """Values and deviations of the sensors, their covariance, and sentences for what is only assumed."""
-    values, said = dict(DEFAULTS), []
+    values, said = {name: (one.usual, one.assumed) for name, one in QUANTITIES.items()}, list[str]()
     plane = rig.plane
     if plane is not None and plane.sigma_marker_mm.get("calibration_max") is not None:
         shift = 1e-3 * float(plane.sigma_marker_mm["calibration_max"] or 0.0) / math.sqrt(2.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
+from typing import NamedTuple
 
 import numpy as np
 
@@ -133,21 +134,41 @@ def update_terms(innovation: float, spread: float, jitter: float, grid: float) -
 HEAD = ("phi_rad", "length_m", "dphi_radps", "dlength_mps", "ddphi_radps2", "ddlength_mps2")
 """Motion of the head: entries 0 to 5 of a state and of a gradient."""
 
-SENSOR = (
-    "gyro_bias_radps",
-    "accel_bias_x_mps2",
-    "accel_bias_y_mps2",
-    "mount_angle_rad",
-    "gyro_scale",
-    "imu_lever_m",
-    "marker_offset_m",
-    "time_offset_s",
-    "shift_x_m",
-    "shift_y_m",
-    "stretch",
-    "accel_scale_x",
-    "accel_scale_y",
-)
+
+class Quantity(NamedTuple):
+    """A quantity of the sensors, and what is known of it before any log.
+
+    Attributes
+    ----------
+    words : for sentences.
+    usual : its value, by data sheets, a ruler, and a printed board's scale.
+    unaligned, assumed : deviation of that before an alignment, and of an estimator whose rig has none.
+    walk : density of its slow random walk, unit per sqrt(s).
+    """
+
+    words: str
+    usual: float
+    unaligned: float
+    assumed: float
+    walk: float
+
+
+QUANTITIES = {
+    "gyro_bias_radps": Quantity("the gyroscope's bias", 0.0, 0.1, 0.02, 2e-5),
+    "accel_bias_x_mps2": Quantity("the accelerometer's bias along x", 0.0, 0.3, 0.1, 3e-3),
+    "accel_bias_y_mps2": Quantity("the accelerometer's bias along y", 0.0, 0.3, 0.1, 1e-3),
+    "mount_angle_rad": Quantity("the mount angle", 0.0, 0.5, 0.05, 1e-6),
+    "gyro_scale": Quantity("the gyroscope's scale", 0.0, 0.02, 0.01, 1e-6),
+    "imu_lever_m": Quantity("the IMU's place along the head", 0.006, 0.02, 0.001, 1e-7),
+    "marker_offset_m": Quantity("the marker's offset d", 0.015, 0.003, 3e-4, 1e-7),
+    "time_offset_s": Quantity("the time offset", 0.025, 0.05, 0.01, 1e-7),
+    "shift_x_m": Quantity("the plane's shift along x", 0.0, 2e-4, 2e-4, 1e-8),
+    "shift_y_m": Quantity("the plane's shift along y", 0.0, 2e-4, 2e-4, 1e-8),
+    "stretch": Quantity("the plane's stretch", 0.0, 1e-3, 1e-3, 1e-6),
+    "accel_scale_x": Quantity("the accelerometer's scale along x", 0.0, 0.01, 0.003, 1e-6),
+    "accel_scale_y": Quantity("the accelerometer's scale along y", 0.0, 0.01, 0.003, 1e-6),
+}
+SENSOR = tuple(QUANTITIES)
 """What the sensors are: entries 6 to 18. The lever is that along the tangent."""
 
 SIZE = len(HEAD) + len(SENSOR)
