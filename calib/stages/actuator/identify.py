@@ -13,6 +13,7 @@ import numpy as np
 from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.core.errors import BadInputError
 from calib.core.verdict import Finding, Verdict
+from calib.solve.groups import tied_groups
 from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import Creep, Plant
 from calib.stages.actuator.pump import ElongationForce, Orifice, Pump, RateLimit
@@ -1785,9 +1786,7 @@ def _of_fit(solution: Solution, known: Uncertainty, colours: Sequence[Colour]) -
         if colour.share_far > _FAR_ROWS:
             poor(f"{colour.name}: {100.0 * colour.share_far:.0f} % of the poses are far off")
     labels = [label_of(name) for name in solution.problem.names]
-    close = np.abs(known.correlation) > _STRONG
-    reached = np.linalg.matrix_power(close.astype(np.float64), len(labels)) > 0.0
-    groups = sorted({tuple(np.flatnonzero(row).tolist()) for row in reached if np.count_nonzero(row) > 1})
+    groups = tied_groups(known.correlation, _STRONG)
     if groups:
         texts = "; ".join(", ".join(labels[k] for k in group) for group in groups)
         remark(f"hardly told apart, with correlations beyond {_STRONG:g}: {texts}")

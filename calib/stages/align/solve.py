@@ -17,6 +17,7 @@ from calib.core.result import finite_or_none
 from calib.core.rig import Geometry
 from calib.core.verdict import Finding, Verdict
 from calib.solve.clock import TimeAxis, time_axis
+from calib.solve.groups import tied_groups
 from calib.stages.align.section import LogCheck
 from calib.stages.align.spline import (
     BAND,
@@ -1253,20 +1254,6 @@ def _known(found: Alignment) -> Iterator[Finding]:
             yield Finding("poor", text)
 
 
-def _groups(tied: BoolArray) -> list[list[int]]:
-    """Groups of two or more quantities that are tied to each other, directly or by others."""
-    left, groups = set(range(len(tied))), []
-    while left:
-        group, new = set(), {min(left)}
-        while new:
-            group |= new
-            new = {k for i in new for k in np.flatnonzero(tied[i]).tolist()} - group
-        left -= group
-        if len(group) > 1:
-            groups.append(sorted(group))
-    return groups
-
-
 def _separable(found: Alignment) -> Iterator[Finding]:
     sigma = found.sigma
     R = found.covariance / sigma / sigma[:, None]
@@ -1281,7 +1268,7 @@ def _separable(found: Alignment) -> Iterator[Finding]:
             f"{math.degrees(sigma[_MOUNT]):.2f} deg",
             _TILT if sigma[_MOUNT] > _REST_RAD else "",
         )
-    for group in _groups(np.abs(R) > _INSEPARABLE):
+    for group in tied_groups(R, _INSEPARABLE):
         if set(group) != {_MOUNT, _AY}:
             words = [QUANTITIES[SENSOR[k]].words for k in group]
             yield Finding(
