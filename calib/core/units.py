@@ -7,6 +7,9 @@ import re
 
 from calib.core.errors import UsageError
 
+GRAVITY_MPS2 = 9.80665
+"""Standard gravity, by which accelerations in g are read."""
+
 UNITS = {
     "_radps2_per_sqrt_Hz": "rad/s²/√Hz",
     "_radps_per_sqrt_Hz": "rad/s/√Hz",

@@ -39,6 +39,7 @@ from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
 from calib.core.files import one_line, quoted, read_yaml_mapping, shown
 from calib.core.options import LogOptions
+from calib.core.units import GRAVITY_MPS2
 from calib.core.writing import Kind, head
 
 MEASURED = (
@@ -75,7 +76,6 @@ COLUMNS = (*MEASURED, *COMMANDED, *PRESSURES, *POSE, *TRUE)
 ACCEL = ("ax_mps2", "ay_mps2", "az_mps2")
 GYRO = ("gx_radps", "gy_radps", "gz_radps")
 
-GRAVITY_MPS2 = 9.80665
 _DEGREE = math.pi / 180.0
 
 UNITS: dict[str, dict[str, float]] = {

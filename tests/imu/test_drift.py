@@ -200,7 +200,7 @@ def _log_tracks(
 
 def test_the_sensors_alone_and_the_filter() -> None:
     log, part, phi = _log_tracks()
-    found, skipped = tracks_of(log, [part], PERIOD, Tuned(Mahony(1.0, 0.25)), peers=False)
+    found, skipped = tracks_of(log, [part], PERIOD, Tuned(Mahony(1.0, 0.25)), False, print)
     angles = {track.name: track.phi_rad[0] for track in found}
     assert list(angles) == [
         "on the chip",

@@ -44,6 +44,7 @@ import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.core.compilation import kernel
+from calib.core.units import GRAVITY_MPS2
 
 STEP_S = 0.02
 """Of the free run; a tenth of the fastest lag that pressures and motion capture at 90 Hz show."""
@@ -52,7 +53,6 @@ _FINER = 4
 _AIR_KPA = 101.3
 _CRITICAL = 0.3
 _LEANS = 0.55
-_GRAVITY_MPS2 = 9.80665
 
 
 @dataclass(frozen=True)
@@ -347,7 +347,7 @@ def segment_run(
 ) -> tuple[FloatArray, FloatArray]:
     """Angle [rad] and chord [m], each (n,), that follow from a pressure (n,) and from the first pose."""
     q = np.array([values[name] for name in SEGMENT])
-    moment = trial.load_kg * _GRAVITY_MPS2 * values["chord_m"]
+    moment = trial.load_kg * GRAVITY_MPS2 * values["chord_m"]
     out = _segment(pressure_kpa, trial.angle_rad[0], trial.chord_m[0], q, moment, STEP_S)
     return out[:, 0], out[:, 1]
 

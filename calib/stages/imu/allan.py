@@ -55,8 +55,8 @@ def _squares(x: FloatArray, m: int) -> float:
 KINDS = ("N", "B", "K")
 """White noise, bias instability, random walk: the order of the squared coefficients everywhere."""
 
-ONE_SIGMA = 0.6826894921370859
-
+_ONE_SIGMA_TAIL = 0.15865525393145705
+"""Chance of more than one standard deviation of a normal distribution, on one side."""
 _FINE = 8
 _FARTHEST = 1024
 """Averaging times farther apart than this factor are taken as uncorrelated."""
@@ -64,17 +64,16 @@ _TAIL = 1.0
 """How far the sum goes beyond where white noise and random walk end, in the longer averaging time."""
 
 
-def octaves(n: int, share: float = 0.25) -> IntArray:
-    """Averaging factors 1, 2, 4, ... up to `share` of n samples."""
-    count = math.floor(math.log2(max(share * n, 1.0))) + 1
+def octaves(n: int) -> IntArray:
+    """Averaging factors 1, 2, 4, ... up to a quarter of n samples."""
+    count = math.floor(math.log2(max(0.25 * n, 1.0))) + 1
     return np.asarray(2 ** np.arange(count), dtype=np.int64)
 
 
-def spaced(n: int, per_decade: int = 12, share: float = 1.0 / 3.0) -> IntArray:
-    """Averaging factors at even distances on a logarithmic scale, up to `share` of n samples."""
-    most = max(share * n, 1.0)
-    steps = np.arange(int(per_decade * math.log10(most)) + 1)
-    return np.unique(np.floor(10.0 ** (steps / per_decade) + 1e-9).astype(np.int64))
+def spaced(n: int) -> IntArray:
+    """Averaging factors, twelve in a decade, up to a third of n samples."""
+    steps = np.arange(int(12 * math.log10(max(n / 3.0, 1.0))) + 1)
+    return np.unique(np.floor(10.0 ** (steps / 12) + 1e-9).astype(np.int64))
 
 
 def allan_variance(parts: Sequence[FloatArray], m: IntArray) -> FloatArray:
@@ -180,12 +179,9 @@ def degrees_of_freedom(m: IntArray, lengths: Sequence[int], theta: FloatArray) -
         return np.asarray(np.maximum(2.0 * (design(m.astype(np.float64)) @ theta) ** 2 / variance, 1.0))
 
 
-def bounds(
-    variance: FloatArray, freedom: FloatArray, confidence: float = ONE_SIGMA
-) -> tuple[FloatArray, FloatArray]:
-    """Lower and upper bound of the deviation, by the chi-square distribution of its square."""
-    tail = 0.5 * (1.0 - confidence)
-    upper, lower = chdtri(freedom, 1.0 - tail), chdtri(freedom, tail)
+def bounds(variance: FloatArray, freedom: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """1-sigma bounds of the deviation, by the chi-square distribution of its square."""
+    upper, lower = chdtri(freedom, 1.0 - _ONE_SIGMA_TAIL), chdtri(freedom, _ONE_SIGMA_TAIL)
     return np.sqrt(variance * freedom / lower), np.sqrt(variance * freedom / upper)
 
 
@@ -201,13 +197,10 @@ def bounds(
 #   without the term. Otherwise the log is too short to support it, and it gets an upper bound;
 # - where the fit begins. Filters in the sensor and coarse steps change the variance at the shortest times.
 #   While the fit is worse than chance would have it once in ten thousand, the shortest time is left out.
-#
-# Intervals are those of log theta, which keeps them positive.
 
 LEAST_Z = 3.0
 LEAST_SAMPLES = 64
 _ONE_SIDED_95 = 1.6448536269514722
-_TWO_SIDED_95 = 1.959963984540054
 _WORST_CHANCE = 1e-4
 _FEWEST = 4
 _SHORTEST_S = 1.0
@@ -221,15 +214,13 @@ class Term:
     Attributes
     ----------
     supported : whether the log shows it.
-    value, sigma, low, high : estimate, standard deviation and 95 % interval; NaN where not supported.
+    value, sigma : estimate and standard deviation, NaN where not supported.
     below : 95 % upper bound where not supported, otherwise NaN.
     """
 
     supported: bool
     value: float
     sigma: float
-    low: float
-    high: float
     below: float
 
 
@@ -239,8 +230,7 @@ class Allan:
 
     Attributes
     ----------
-    tau_s, deviation, low, high, freedom : (j,) averaging times, deviation, 1-sigma bounds, degrees of
-        freedom.
+    tau_s, deviation, low, high : (j,) averaging times, deviation, 1-sigma bounds.
     N, B, K : coefficients in unit/sqrt(Hz), unit, unit sqrt(Hz); 1/sqrt(Hz) is sqrt(s).
     theta : (3,) squares of the supported ones, zero for the others.
     walk_within : K^2 that the log cannot exclude, one sigma above its estimate, or K^2 if supported.
@@ -252,7 +242,6 @@ class Allan:
     deviation: FloatArray
     low: FloatArray
     high: FloatArray
-    freedom: FloatArray
     N: Term
     B: Term
     K: Term
@@ -342,15 +331,13 @@ def _select(variance: FloatArray, m: IntArray, G: FloatArray) -> _Fit:
 
 
 def _term(fit: _Fit, k: int, variance: FloatArray, D: FloatArray, G: FloatArray, unit: float) -> Term:
-    square, nan = float(fit.theta[k]), math.nan
+    square = float(fit.theta[k])
     if fit.active[k] and square > 0.0:
-        spread = math.sqrt(float(fit.covariance[k, k]))
         value = math.sqrt(square)
-        sigma, factor = 0.5 * spread / value, math.exp(0.5 * _TWO_SIDED_95 * spread / square)
-        value *= unit
-        return Term(True, value, unit * sigma, value / factor, value * factor, nan)
+        sigma = 0.5 * math.sqrt(float(fit.covariance[k, k])) / value
+        return Term(True, unit * value, unit * sigma, math.nan)
     below = _unsupported(fit, k, variance, D, G, _ONE_SIDED_95)
-    return Term(False, nan, nan, nan, nan, unit * math.sqrt(below))
+    return Term(False, math.nan, math.nan, unit * math.sqrt(below))
 
 
 def _unsupported(
@@ -405,17 +392,13 @@ def analyse(parts: Sequence[FloatArray], period_s: float) -> Allan:
     if not terms[2].supported:
         walk = _unsupported(fit, 2, *used, 1.0)
     everywhere = allan_variance(parts, m_all)
-    freedom = degrees_of_freedom(m_all, lengths, fit.theta)
-    low, high = bounds(everywhere, freedom)
+    low, high = bounds(everywhere, degrees_of_freedom(m_all, lengths, fit.theta))
     return Allan(
         tau_s=period_s * m_all.astype(np.float64),
         deviation=np.sqrt(everywhere),
         low=low,
         high=high,
-        freedom=freedom,
-        N=terms[0],
-        B=terms[1],
-        K=terms[2],
+        **dict(zip(KINDS, terms, strict=True)),
         theta=fit.theta * np.array(units) ** 2,
         walk_within=walk / period_s,
         fit_s=(period_s * float(m_fit[first]), period_s * float(m_fit[-1])),

@@ -18,10 +18,11 @@ from calib.core.errors import BadInputError
 from calib.core.result import degrees_or_none, finite_or_none, judged
 from calib.core.verdict import Verdict
 from calib.stages.imu.allan import allan_variance
-from calib.stages.imu.mahony import Mahony, wrapped
+from calib.stages.imu.mahony import Mahony, mean_angle, wrapped
 from calib.stages.imu.sampling import (
     Readings,
     Sampling,
+    blocks,
     regular_parts,
     rest_parts,
     runs,
@@ -30,7 +31,7 @@ from calib.stages.imu.sampling import (
     sensor_findings,
 )
 from calib.stages.imu.section import Drift, DriftGains, DriftMethod, DriftOfLog, DriftSlopes
-from calib.stages.imu.tracks import Track, Tuned, mean_angle, on_grid, tracks_of
+from calib.stages.imu.tracks import Track, Tuned, on_grid, tracks_of
 from calib.stages.imu.tuning import parameters_of
 
 # ----------------------------------------------------------------------
@@ -142,7 +143,7 @@ def slope_of(stretches: Sequence[FloatArray], period_s: float) -> Slope:
         return Slope()
     value = _line(long) / period_s
     size = max(sum(len(y) for y in long) // _BLOCKS, 1)
-    means = [y[: len(y) // size * size].reshape(-1, size).mean(axis=1) for y in long if len(y) >= 2 * size]
+    means = [blocks(y, size).mean(axis=1) for y in long if len(y) >= 2 * size]
     free = sum(len(mean) for mean in means) - len(means) - 1
     if free < _FEWEST_BLOCKS:
         return Slope(value)
@@ -253,7 +254,6 @@ class LogDrift:
     upright : median share of gravity that is in the sensor's plane, squared; NaN without az. Where it is
         small the plane is nearly level, and the angle hardly defined.
     start_s : time of each part's first sample.
-    moving : where (n_i,) each part moves.
     truth_rad : the true angle in each part, NaN outside of its samples; None without.
     truth_late_s : by which it was moved.
     tracks : of each method. measures : what is said of it, by its name, in the same order.
@@ -267,7 +267,6 @@ class LogDrift:
     moving_s: float
     upright: float
     start_s: tuple[float, ...]
-    moving: tuple[BoolArray, ...]
     truth_rad: tuple[FloatArray, ...] | None
     truth_late_s: float
     tracks: tuple[Track, ...]
@@ -420,7 +419,6 @@ def analyse_drift(
         period_s * sum(int(flags.sum()) for flags in moving),
         _upright(log),
         tuple(float(part.t_s[0]) for part in parts),
-        tuple(moving),
         truth,
         late_s,
         tuple(tracks),

@@ -170,6 +170,11 @@ def misalignment(names: Sequence[str], angles: FloatArray, d: int) -> FloatArray
     return T
 
 
+def _unit(vectors: FloatArray) -> FloatArray:
+    """Directions (n, d) of vectors (n, d)."""
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1), 1e-300)[:, None])
+
+
 def corrected(parameters: FloatArray, readings: FloatArray) -> FloatArray:
     """Specific forces (n, d) of readings (n, d) [m/s^2], by parameters as `Accelerometer.parameters`."""
     return _corrected(parameters, readings)[0]
@@ -224,8 +229,7 @@ def _deviations(p: FloatArray, x: FloatArray, variance: FloatArray) -> FloatArra
     """Standard deviation (n,) of |a| from the noise of the readings' means, whose variance is (n, d)."""
     d = x.shape[1]
     a, T, _ = _corrected(p, x)
-    u = a / np.maximum(np.linalg.norm(a, axis=1), 1e-300)[:, None]
-    return np.asarray(np.sqrt((((u @ T) / p[d : 2 * d]) ** 2 * variance).sum(axis=1)))
+    return np.asarray(np.sqrt((((_unit(a) @ T) / p[d : 2 * d]) ** 2 * variance).sum(axis=1)))
 
 
 def _tau(r: FloatArray, deviation: FloatArray, dof: int) -> float:
@@ -339,8 +343,6 @@ def fit_accelerometer(rests: Sequence[Rest], gravity_mps2: float, si: bool) -> A
         W = J[:, free] * units / deviation[:, None]
         covariance[np.ix_(free, free)] = np.outer(units, units) * np.linalg.inv(W.T @ W) * scale2
         sigma[free] = np.sqrt(np.diag(covariance)[free])
-    a = _corrected(p, x)[0]
-    u = a / np.maximum(np.linalg.norm(a, axis=1), 1e-300)[:, None]
     across = np.sqrt((variance / p[d : 2 * d] ** 2).mean(axis=1) + tau**2) / g
     return Accelerometer(
         bias=p[:d],
@@ -348,7 +350,7 @@ def fit_accelerometer(rests: Sequence[Rest], gravity_mps2: float, si: bool) -> A
         angles=p[2 * d :],
         sigma=sigma,
         covariance=covariance,
-        directions=u,
+        directions=_unit(corrected(p, x)),
         direction_sigma=across,
         residual_mps2=r,
         deviation_mps2=deviation * math.sqrt(scale2),
@@ -418,9 +420,7 @@ def rest_forces(turns: Turns, parameters: FloatArray) -> FloatArray:
 def _directions(turns: Turns, parameters: FloatArray) -> FloatArray:
     """Unit vectors (m, 3) at rest; z is zero in a plane."""
     f = rest_forces(turns, parameters)
-    out = np.zeros((len(f), 3))
-    out[:, : f.shape[1]] = f / np.linalg.norm(f, axis=1)[:, None]
-    return out
+    return np.pad(_unit(f), ((0, 0), (0, 3 - f.shape[1])))
 
 
 def carried(turns: Turns, rates: FloatArray, M: FloatArray, vectors: FloatArray) -> FloatArray:
@@ -568,7 +568,6 @@ class Gyroscope:
     rms_rad : of their lengths.
     turns_s : (k,) lengths of the turns.
     travel_rad : (3,) root mean square of the angle turned about each axis.
-    span : smallest singular value of the residuals' derivative by relative parameters over sqrt(k).
     """
 
     bias: Bias
@@ -581,7 +580,6 @@ class Gyroscope:
     rms_rad: float
     turns_s: FloatArray
     travel_rad: FloatArray
-    span: float
 
     @property
     def matrix(self) -> FloatArray:
@@ -732,7 +730,6 @@ def fit_gyroscope(turns: Turns, accel: Accelerometer, si: bool) -> Gyroscope:
         rms_rad=float(np.sqrt((residual**2).sum() / k)),
         turns_s=turns.duration_s,
         travel_rad=np.sqrt((angle**2).mean(axis=0)),
-        span=span,
     )
 
 
@@ -756,10 +753,9 @@ _KEPT = 0.9
 
 @dataclass(frozen=True)
 class Trial:
-    """One threshold: how many rests and poses it gives, and their residual with lost freedom counted."""
+    """One threshold: how many poses it shows, and the rests' residual with lost freedom counted."""
 
     multiple: float
-    rests: int
     poses: int
     rms_mps2: float
 
@@ -813,8 +809,7 @@ def _in_plane(rests: Sequence[Rest], columns: list[int]) -> bool:
     """Whether the rests lie in the plane of x and y, and turn in it."""
     if len(columns) != 3 or len(rests) < 3:
         return False
-    means = np.stack([rest.mean for rest in rests])
-    u = means / np.maximum(np.linalg.norm(means, axis=1), 1e-300)[:, None]
+    u = _unit(np.stack([rest.mean for rest in rests]))
     apart = float((u @ u.T).min())
     return bool(np.abs(u[:, 2]).max() < _IN_PLANE and apart < _PLANE_SPREAD)
 
@@ -839,11 +834,10 @@ def _contest(
             if accel.dof > 0:
                 rms = accel.rms_mps2 * math.sqrt(len(rests) / accel.dof)
         elif rests and si:
-            means = np.stack([rest.mean for rest in rests])
-            poses = count_poses(means / np.maximum(np.linalg.norm(means, axis=1), 1e-300)[:, None])
+            poses = count_poses(_unit(np.stack([rest.mean for rest in rests])))
         else:
             poses = min(len(rests), 1)
-        tried.append((Trial(multiple, len(rests), poses, rms), rests, accel))
+        tried.append((Trial(multiple, poses, rms), rests, accel))
     most = max(trial.poses for trial, _, _ in tried)
     able = [one for one in tried if one[0].poses >= _KEPT * most]
     trial, rests, accel = min(able, key=lambda one: (one[0].rms_mps2, one[0].multiple))
@@ -889,7 +883,7 @@ def _turns(
     return turns, len(rests) - 1 - len(spans)
 
 
-def find_intrinsics(log: Readings, gravity_mps2: float = 9.80665, planar: bool = False) -> Intrinsics:
+def find_intrinsics(log: Readings, gravity_mps2: float, planar: bool = False) -> Intrinsics:
     """Calibrate an accelerometer, and a gyroscope where the log has one.
 
     Parameters
@@ -905,16 +899,18 @@ def find_intrinsics(log: Readings, gravity_mps2: float = 9.80665, planar: bool =
     columns = _columns(log, planar)
     sampling, parts = regular_parts(log)
     si = "a" not in log.counts
-    s = spread(parts, columns, sampling.period_s)
-    quiet = quiet_level(s, sampling.step[columns])
     asked, lean = planar, math.nan
+
+    def still(columns: list[int]) -> tuple[Spread, Quiet]:
+        s = spread(parts, columns, sampling.period_s)
+        return s, quiet_level(s, sampling.step[columns])
+
+    s, quiet = still(columns)
     if si and not planar and len(columns) == 3:
         planar = _in_plane(find_rests(parts, columns, s, 6.0 * quiet.zeta), columns)
     if planar or len(columns) == 2:
-        planar = True
-        columns = _columns(log, True)
-        s = spread(parts, columns, sampling.period_s)
-        quiet = quiet_level(s, sampling.step[columns])
+        planar, columns = True, _columns(log, True)
+        s, quiet = still(columns)
     trials, won, rests, accel = _contest(parts, columns, s, quiet, gravity_mps2, si)
     if not rests:
         raise BadInputError(
@@ -1184,7 +1180,7 @@ def _findings(result: Intrinsics) -> Iterator[Finding]:
 
 def judge_intrinsics(result: Intrinsics) -> Verdict:
     """Verdict of a calibration of an IMU."""
-    return Verdict.of(list(_findings(result)))
+    return Verdict.of(_findings(result))
 
 
 # ----------------------------------------------------------------------
@@ -1196,7 +1192,7 @@ class IntrinsicsInputs:
     """A log of rests in many poses, gravity there, and whether x, y and gz alone are calibrated."""
 
     log: Readings
-    gravity_mps2: float = 9.80665
+    gravity_mps2: float
     planar: bool = False
 
 
@@ -1243,7 +1239,7 @@ def _accelerometer(result: Intrinsics) -> AccelIntrinsics:
     unit: Literal["m/s2", "counts"] = "counts" if "a" in result.log.counts else "m/s2"
     accel = result.accel
     if accel is None or accel.span < LEAST_SPAN:
-        unknown = _three(np.full(3, math.nan))
+        unknown: list[float | None] = [None] * 3
         sigma = IntrinsicsSigma(bias=unknown, scale=unknown)
         return AccelIntrinsics(unit=unit, bias=unknown, scale=unknown, sigma=sigma)
     d = len(accel.bias)

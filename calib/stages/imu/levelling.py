@@ -11,6 +11,7 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
+from calib.core.units import GRAVITY_MPS2
 
 # ----------------------------------------------------------------------
 # What an accelerometer shows of the angle is right on the average only: its errors are the sensor's own
@@ -45,7 +46,6 @@ from calib.core.errors import BadInputError
 # in the plane, which a board runs, does without: an angle that is 40 degrees off after the sensor was lost
 # would take half a minute to come back.
 
-_G = 9.80665
 _TURN = 2.0 * math.pi
 _LASTING_S = 0.3
 """Time for which a velocity lasts: its density is 2 sigma^2 times this."""
@@ -84,14 +84,14 @@ class Levelling:
     @property
     def densities(self) -> tuple[float, float, float]:
         """r [rad^2 s^3], q [rad^2/s] and q_b [rad^2/s^3]."""
-        r = 2.0 * (self.velocity_mps / _G) ** 2 * _LASTING_S
+        r = 2.0 * (self.velocity_mps / GRAVITY_MPS2) ** 2 * _LASTING_S
         q = r * (math.sqrt(2.0) / self.tau_s) ** 4
         return r, q, q / self.bias_tau_s**2
 
     @property
     def start(self) -> tuple[float, float, float]:
         """Variances of V, the angle's error and the bias at the first sample."""
-        return (self.velocity_mps / _G) ** 2, self.angle_rad**2, self.bias_radps**2
+        return (self.velocity_mps / GRAVITY_MPS2) ** 2, self.angle_rad**2, self.bias_radps**2
 
     def fill(
         self, t: FloatArray, phi_acc: FloatArray, w: FloatArray, phi: FloatArray, integral: FloatArray
@@ -113,7 +113,7 @@ def _gains(P: FloatArray, dt: float, r: float, q: float, q_b: float, K: FloatArr
     vb += dt * eb
     s = vv + r / dt
     K[0], K[1], K[2] = vv / s, ve / s, vb / s
-    K[3] = _MOST_SIGMAS * math.sqrt(vv + max(r / (2.0 * _LASTING_S), (_ANY_MPS / _G) ** 2))
+    K[3] = _MOST_SIGMAS * math.sqrt(vv + max(r / (2.0 * _LASTING_S), (_ANY_MPS / GRAVITY_MPS2) ** 2))
     P[0], P[1], P[2] = vv - vv * K[0], ve - vv * K[1], vb - vv * K[2]
     P[3], P[4], P[5] = ee - ve * K[1], eb - ve * K[2], bb - vb * K[2]
 
@@ -293,5 +293,5 @@ def level_three(
     if not (np.isfinite(force).all() and np.isfinite(gyro).all() and (np.diff(t) >= 0.0).all()):
         raise BadInputError("levelling filter: expected finite readings and time that runs forward")
     out = np.empty_like(force)
-    _run_three(t, force / _G, gyro, parameters.densities, _covariance(parameters), out)
+    _run_three(t, force / GRAVITY_MPS2, gyro, parameters.densities, _covariance(parameters), out)
     return out

@@ -90,6 +90,11 @@ def wrapped(angle_rad: FloatArray) -> FloatArray:
     return angle_rad - _TURN * np.rint(angle_rad / _TURN)
 
 
+def mean_angle(angles: FloatArray) -> float:
+    """Direction of the mean of unit vectors at the angles (n,) [rad]."""
+    return math.atan2(float(np.sin(angles).mean()), float(np.cos(angles).mean()))
+
+
 # A product and a sum may be rounded once; nothing else is loosened.
 @kernel()
 def advance(

@@ -34,6 +34,7 @@ from calib.stages.imu.allan import model_variance
 from calib.stages.imu.drift import LogDrift
 from calib.stages.imu.intrinsics import Accelerometer, Intrinsics
 from calib.stages.imu.mahony import Mahony, filter_log, wrapped
+from calib.stages.imu.sampling import blocks
 from calib.stages.imu.section import Drift, Imu, ImuIntrinsics, OrientationFilter
 from calib.stages.imu.static import AxisNoise, Static, StaticLog
 from calib.stages.imu.tuning import Piece, Tuning
@@ -124,9 +125,8 @@ def _readings(axes: Sequence[str], log: StaticLog) -> Figure:
         marks: list[Mark] = list(bands)
         for part in log.parts:
             marks.append(Curve(*thinned(part.t_s - zero, part.values[:, k]), colour="silver", size=0.5))
-            count = len(part.values) // size
-            means = part.values[: count * size, k].reshape(count, size).mean(axis=1)
-            middle = part.t_s[0] - zero + period * size * (np.arange(count) + 0.5)
+            means = blocks(part.values[:, k], size).mean(axis=1)
+            middle = part.t_s[0] - zero + period * size * (np.arange(len(means)) + 0.5)
             marks.append(Curve(middle, means, size=1.0))
         panels.append(Plot("time (s)", _y(axis), marks, axis))
     title, mosaic = f"Readings at rest: {short(log.source, 70)}", _by_axis(axes)

@@ -99,10 +99,10 @@ _LAGS_S = np.arange(-0.02, 0.1201, 0.001)
 _FEWEST = 30
 
 
-def angle_from_marker(marker_m: FloatArray, offset_m: float = MARKER_OFFSET_M) -> FloatArray:
+def angle_from_marker(marker_m: FloatArray) -> FloatArray:
     """Bending angle phi (n,) [rad] of marker positions (n, 2) in the plane [m]."""
-    x, y = np.moveaxis(np.asarray(marker_m, dtype=np.float64), -1, 0)
-    return np.asarray(2.0 * np.arctan2(x, y + offset_m))
+    x, y = marker_m.T
+    return np.asarray(2.0 * np.arctan2(x, y + MARKER_OFFSET_M))
 
 
 def lag_of(late_t_s: FloatArray, late_rad: FloatArray, t_s: FloatArray, phi_rad: FloatArray) -> float:
@@ -161,8 +161,8 @@ class Reading:
     on_plane : from pixels (n, 2) to metres (n, 2) in the rig's plane, None where it has none.
     """
 
-    tilted: bool = False
-    reference: str = "auto"
+    tilted: bool
+    reference: str
     on_plane: Callable[[FloatArray], FloatArray] | None = None
 
 
@@ -191,38 +191,33 @@ def sensor_noise(rig: Rig, logs: Sequence[TuneLog]) -> tuple[Noise, str]:
     return DATA_SHEET, "a data sheet"
 
 
-def _wanted(log: Log, read: Readings, how: Reading) -> str:
-    """Which reference the log is judged by."""
-    seen = len(log.sampled("u_px", "v_px")) >= _TUNELOGS_FEWEST
-    has = {
-        "truth": len(read.true_t_s) >= _TUNELOGS_FEWEST,
-        "camera": seen and how.on_plane is not None,
-        "onchip": len(read.onchip_t_s) >= _TUNELOGS_FEWEST,
-    }
-    if how.reference == "auto":
+def _reference(log: Log, read: Readings, how: Reading) -> tuple[str, FloatArray, FloatArray]:
+    """Which reference the log is judged by, "" for none, its times (k,) and its angle (k,)."""
+    rows, name, none = log.sampled("u_px", "v_px"), how.reference, np.zeros(0)
+    seen = len(rows) >= _TUNELOGS_FEWEST
+    if name == "auto":
         # A truth is for scores: gains that were chosen by it say nothing of a rig that has none.
-        return "camera" if has["camera"] else ""
-    if how.reference == "none":
-        return ""
-    if not has[how.reference]:
-        lacks = {
-            "truth": "no column true_phi_rad",
-            "camera": "no columns u_px and v_px" if not seen else "a camera, but the rig's file has no plane",
-            "onchip": "no column onchip_phi_rad",
-        }[how.reference]
-        raise BadInputError(f"{log.source}: has {lacks}, expected one for --reference {how.reference}")
-    return how.reference
-
-
-def _camera_angle(log: Log, how: Reading) -> tuple[FloatArray, FloatArray]:
-    assert how.on_plane is not None
-    rows = log.sampled("u_px", "v_px")
-    pixels = np.stack([log.columns["u_px"][rows], log.columns["v_px"][rows]], axis=1)
-    phi = angle_from_marker(how.on_plane(pixels))
-    known = np.isfinite(phi)
-    if int(known.sum()) < _TUNELOGS_FEWEST:
-        raise BadInputError(f"{log.source}: the marker is not on the rig's plane, expected this rig's camera")
-    return log.t_s[rows][known], phi[known]
+        name = "camera" if seen and how.on_plane is not None else "none"
+    if name == "none":
+        return "", none, none
+    camera = "a camera, but the rig's file has no plane" if seen else "no columns u_px and v_px"
+    times, phi, lacks = {
+        "truth": (read.true_t_s, read.true_phi_rad, "no column true_phi_rad"),
+        "onchip": (read.onchip_t_s, read.onchip_phi_rad, "no column onchip_phi_rad"),
+        "camera": (none, none, camera),
+    }[name]
+    if name == "camera" and seen and how.on_plane is not None:
+        pixels = np.stack([log.columns["u_px"][rows], log.columns["v_px"][rows]], axis=1)
+        phi = angle_from_marker(how.on_plane(pixels))
+        known = np.isfinite(phi)
+        if int(known.sum()) < _TUNELOGS_FEWEST:
+            raise BadInputError(
+                f"{log.source}: the marker is not on the rig's plane, expected this rig's camera"
+            )
+        times, phi = log.t_s[rows][known], phi[known]
+    if len(times) < _TUNELOGS_FEWEST:
+        raise BadInputError(f"{log.source}: has {lacks}, expected one for --reference {name}")
+    return name, times, phi
 
 
 def _turns_in_plane(part: Part, axes: tuple[str, ...], quiet_radps: float) -> bool:
@@ -236,7 +231,8 @@ def _turns_in_plane(part: Part, axes: tuple[str, ...], quiet_radps: float) -> bo
 
 
 def _lag(
-    seen: tuple[FloatArray, FloatArray],
+    late_t_s: FloatArray,
+    late_rad: FloatArray,
     parts: Sequence[Part],
     rates: Sequence[FloatArray],
     axes: tuple[str, ...],
@@ -250,7 +246,7 @@ def _lag(
     if len(rate) * period_s >= SHORTEST_S + period_s:
         own = smooth_log(t, angle_of(part, axes), rate, DATA_SHEET.gyro, DATA_SHEET.walk).phi_rad
     # A rate that holds for the step before its sample is half a step ahead.
-    return lag_of(seen[0], np.unwrap(seen[1]), t, own - 0.5 * period_s * rate)
+    return lag_of(late_t_s, np.unwrap(late_rad), t, own - 0.5 * period_s * rate)
 
 
 def tune_log(log: Log, how: Reading) -> TuneLog:
@@ -263,8 +259,7 @@ def tune_log(log: Log, how: Reading) -> TuneLog:
     """
     read = drift_log(log)
     said = [f"{log.source}: {one.text}" for one in read.findings if one.severity == "remark"]
-    lacking = [f"{k}{x}" for k in "ga" for x in "xyz" if f"{k}{x}" not in read.axes]
-    if how.tilted and lacking:
+    if how.tilted and (lacking := read.lacks()):
         raise BadInputError(
             f"{log.source}: has no readings of {', '.join(lacking)}, expected all six axes for --rate up"
         )
@@ -279,22 +274,14 @@ def tune_log(log: Log, how: Reading) -> TuneLog:
         )
     gz = read.axes.index("gz")
     quiet = float(quiet_spread(tuple(kept), period)[gz])
-    named = _wanted(log, read, how)
-    lag = 0.0
-    seen: tuple[FloatArray, FloatArray] | None = None
-    if named == "truth":
-        seen = (read.true_t_s, read.true_phi_rad)
-    elif named == "onchip":
-        seen = (read.onchip_t_s, read.onchip_phi_rad)
-    elif named == "camera":
-        seen = _camera_angle(log, how)
-    pieces = []
+    named, late_t_s, phi = _reference(log, read, how)
+    lag, pieces = 0.0, []
     references: tuple[FloatArray | None, ...] = (None,) * len(kept)
     rates = [rate_of(part, read.axes, how.tilted) for part in kept]
-    if seen is not None:
+    if named:
         if named != "truth":
-            lag = _lag(seen, kept, rates, read.axes, period)
-        references = on_grid(seen[0] - lag, seen[1], kept, period)
+            lag = _lag(late_t_s, phi, kept, rates, read.axes, period)
+        references = on_grid(late_t_s - lag, phi, kept, period)
     for part, rate, reference in zip(kept, rates, references, strict=True):
         t = part.t_s - part.t_s[0]
         known = reference is not None and int(np.isfinite(reference).sum()) >= _TUNELOGS_FEWEST

@@ -11,6 +11,7 @@ import numpy as np
 
 from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.core.errors import BadInputError
+from calib.core.units import GRAVITY_MPS2
 from calib.core.verdict import Finding
 from calib.solve.clock import Gap, Part, time_axis
 
@@ -20,9 +21,8 @@ from calib.solve.clock import Gap, Part, time_axis
 # When the samples were taken says `calib.solve.clock`. Rows that repeat both stamp and readings are one
 # sample written twice, and are dropped before (`calib.io.logs`).
 
-_G = 9.80665
 _GYRO_RANGES = tuple(math.radians(r) for r in (125.0, 250.0, 500.0, 1000.0, 2000.0, 4000.0))
-_ACCEL_RANGES = tuple(g * _G for g in (2.0, 4.0, 8.0, 16.0, 32.0))
+_ACCEL_RANGES = tuple(g * GRAVITY_MPS2 for g in (2.0, 4.0, 8.0, 16.0, 32.0))
 _AT_LIMIT_IN_A_ROW = 3
 
 
@@ -63,10 +63,13 @@ class Readings:
         """Which of the axes are rates of rotation."""
         return np.array([axis.startswith("g") for axis in self.axes])
 
+    def lacks(self, *axes: str) -> list[str]:
+        """Those of the axes that it has not, of all six without a name."""
+        return [axis for axis in axes or AXES if axis not in self.axes]
+
     def places(self, *axes: str) -> list[int]:
         """Columns of these axes. Raises `BadInputError` where one is missing."""
-        lacking = [axis for axis in axes if axis not in self.axes]
-        if lacking:
+        if lacking := self.lacks(*axes):
             raise BadInputError(
                 f"{self.source}: has no {' and no '.join(lacking)}, expected {', '.join(axes)}"
             )
@@ -219,6 +222,18 @@ def regular_parts(log: Readings) -> tuple[Sampling, tuple[Part, ...]]:
     return sampling, parts
 
 
+_SAME_RATE = 0.02
+
+
+def check_rate(sampling: Sampling, source: str, first: Sampling, first_source: str) -> None:
+    """Raise `BadInputError` for a log that is not sampled at the rate of the first one."""
+    if abs(sampling.rate_hz / first.rate_hz - 1.0) > _SAME_RATE:
+        raise BadInputError(
+            f"{source}: is sampled at {sampling.rate_hz:.4g} Hz, expected {first.rate_hz:.4g} Hz as in "
+            f"{first_source}"
+        )
+
+
 # ----------------------------------------------------------------------
 # Motion in a log that claims to be at rest.
 #
@@ -253,16 +268,15 @@ def _window(period_s: float) -> int:
     return max(_FEWEST, round(_WINDOW_S / period_s))
 
 
-def _windows(part: Part, size: int) -> FloatArray:
-    """Readings (w, size, axes) of whole windows; the rest of the part belongs to the last."""
-    count = len(part.values) // size
-    return part.values[: count * size].reshape(count, size, -1)
+def blocks(values: FloatArray, size: int) -> FloatArray:
+    """Values (n, ...) in whole blocks (n // size, size, ...); what is left at the end is left out."""
+    return values[: len(values) // size * size].reshape(-1, size, *values.shape[1:])
 
 
 def quiet_spread(parts: tuple[Part, ...], period_s: float) -> FloatArray:
     """Standard deviation (axes,) within the quiet windows; zeros where there is no whole window."""
     size = _window(period_s)
-    spreads = [_windows(part, size).std(axis=1) for part in parts if len(part.values) >= size]
+    spreads = [blocks(part.values, size).std(axis=1) for part in parts if len(part.values) >= size]
     if not spreads:
         return np.zeros(parts[0].values.shape[1])
     return np.asarray(np.quantile(np.concatenate(spreads), 0.25, axis=0))
@@ -283,7 +297,7 @@ def rest_parts(
     coarse = np.nan_to_num(step)
     most = np.where(gyro, MOST_GYRO_RADPS, MOST_ACCEL_MPS2)
     quiet = np.maximum(quiet_spread(parts, period_s), 0.3 * coarse)
-    means = [_windows(part, size).mean(axis=1) for part in parts if len(part.values) >= 2 * size]
+    means = [blocks(part.values, size).mean(axis=1) for part in parts if len(part.values) >= 2 * size]
     steps = [np.abs(np.diff(mean, axis=0)) for mean in means]
     jump = np.zeros(len(gyro))
     if steps:
@@ -296,7 +310,8 @@ def rest_parts(
         if len(part.values) < size:
             still.append(part)
             continue
-        w = _windows(part, size)
+        # The rest of the part belongs to the last window.
+        w = blocks(part.values, size)
         excess = w.std(axis=1) / np.minimum(TIMES_SPREAD * quiet + 1e-12, most)
         change = np.abs(np.diff(w.mean(axis=1), axis=0)) / (TIMES_MEAN * jump)
         # Coming to rest is no motion of the window that follows.
@@ -342,10 +357,9 @@ _BATCH_S = 0.25
 
 @dataclass(frozen=True)
 class Spread:
-    """zeta about each reading of each part, and the window's length in samples."""
+    """zeta about each reading of each part, at an even period."""
 
     zeta: tuple[FloatArray, ...]
-    window: int
     period_s: float
 
 
@@ -416,7 +430,7 @@ def spread(parts: tuple[Part, ...], columns: list[int], period_s: float) -> Spre
             zeta[half : half + len(inner)] = inner
             zeta[:half], zeta[half + len(inner) :] = inner[0], inner[-1]
         out.append(zeta)
-    return Spread(tuple(out), size, period_s)
+    return Spread(tuple(out), period_s)
 
 
 def quiet_level(s: Spread, step: FloatArray) -> Quiet:
@@ -441,10 +455,9 @@ def quiet_level(s: Spread, step: FloatArray) -> Quiet:
 def _scatter(values: FloatArray, period_s: float) -> FloatArray:
     """Long-run variance (d,): that of means over a batch times its length, which counts correlation."""
     size = max(1, round(_BATCH_S / period_s))
-    count = len(values) // size
-    if count < 3:
+    means = blocks(values, size).mean(axis=1)
+    if len(means) < 3:
         return np.asarray(values.var(axis=0, ddof=1))
-    means = values[: count * size].reshape(count, size, -1).mean(axis=1)
     # Differences of neighbours, as a drift over the rest is no noise of its mean.
     return np.asarray(size * (np.diff(means, axis=0) ** 2).mean(axis=0) / 2.0)
 
@@ -458,18 +471,9 @@ def find_rests(parts: tuple[Part, ...], columns: list[int], s: Spread, threshold
             if stop - start < least:
                 continue
             values = part.values[start:stop][:, columns]
-            at = part.t_s[[start, stop - 1]] + np.array([0.0, s.period_s])
-            rests.append(
-                Rest(
-                    number,
-                    start,
-                    stop,
-                    float(at[0]),
-                    float(at[1]),
-                    values.mean(axis=0),
-                    _scatter(values, s.period_s),
-                )
-            )
+            from_s, to_s = float(part.t_s[start]), float(part.t_s[stop - 1]) + s.period_s
+            scatter = _scatter(values, s.period_s)
+            rests.append(Rest(number, start, stop, from_s, to_s, values.mean(axis=0), scatter))
     return tuple(rests)
 
 

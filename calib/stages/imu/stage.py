@@ -7,22 +7,32 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from calib.core.errors import BadInputError, UsageError
+from calib.core.errors import UsageError
 from calib.core.files import shown
 from calib.core.options import LogOptions, option
 from calib.core.stage import Files, Output, Stage, later
+from calib.core.units import GRAVITY_MPS2
 from calib.core.words import Block, Line, described, listed
 from calib.core.writing import Kind, write_atomically
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from calib.core.rig import Rig
+    from calib.io.logs import Log
     from calib.stages.imu.drift import DriftInputs
     from calib.stages.imu.intrinsics import IntrinsicsInputs
     from calib.stages.imu.sampling import Readings
     from calib.stages.imu.section import Drift, Imu, OrientationFilter
     from calib.stages.imu.tuning import AngleFilter, TuneInputs, TuneLog
 
-_SAME_RATE = 0.02
+
+def _readings(files: Files, options: LogOptions, read: Callable[[Log], Readings]) -> list[Readings]:
+    """Readings of each log, by the name that is written, which does not depend on the folder."""
+    from calib.io.logs import read_log
+
+    logs = [(path, read(read_log(path, options, files.remarks))) for path in files.paths]
+    return [replace(log, source=files.taken(path)) for path, log in logs]
 
 
 # ----------------------------------------------------------------------
@@ -30,13 +40,10 @@ _SAME_RATE = 0.02
 
 
 def _read_static(files: Files, rig: Rig, options: LogOptions) -> list[Readings]:
-    from calib.io.logs import read_log
     from calib.stages.imu.read import rest_log
 
     del rig
-    # What is written to the rig's file does not depend on the folder.
-    read = [(path, rest_log(read_log(path, options, files.remarks))) for path in files.paths]
-    return [replace(log, source=files.taken(path)) for path, log in read]
+    return _readings(files, options, rest_log)
 
 
 def _imu_yaml() -> Kind:
@@ -90,7 +97,7 @@ class IntrinsicsOptions(LogOptions):
 
     accel: Path | None = option(None, "Instead of LOG: lines of t x y z, may be gzipped.")
     gyro: Path | None = option(None, "The gyroscope's file beside --accel.")
-    gravity: float = option(9.80665, "Gravity where the log was taken, m/s^2.")
+    gravity: float = option(GRAVITY_MPS2, "Gravity where the log was taken, m/s^2.")
     planar: bool = option(False, "Calibrate ax, ay and gz alone, from tilts about z.")
 
 
@@ -161,6 +168,7 @@ class TuneOptions(LogOptions):
 def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
     from calib.io.logs import read_log
     from calib.stages.imu.read import Reading, sensor_noise, tune_log
+    from calib.stages.imu.sampling import check_rate
     from calib.stages.imu.tuning import TuneInputs
 
     how = Reading(options.rate == "up", options.reference)
@@ -176,12 +184,7 @@ def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
         name = files.taken(path)
         # What is written to the rig's file does not depend on the folder.
         logs.append(replace(log, source=name, pieces=tuple(replace(p, source=name) for p in log.pieces)))
-        first = logs[0].sampling.rate_hz
-        if abs(log.sampling.rate_hz / first - 1.0) > _SAME_RATE:
-            raise BadInputError(
-                f"{shown(path)}: is sampled at {log.sampling.rate_hz:.4g} Hz, expected {first:.4g} Hz as in "
-                f"{logs[0].source}"
-            )
+        check_rate(log.sampling, shown(path), logs[0].sampling, logs[0].source)
     files.hashes |= rig.identities("imu")
     if any(log.reference == "camera" for log in logs):
         files.hashes |= rig.identities("camera", "plane")
@@ -234,15 +237,13 @@ class DriftOptions(LogOptions):
 
 
 def _read_drift(files: Files, rig: Rig, options: DriftOptions) -> DriftInputs:
-    from calib.io.logs import read_log
     from calib.stages.imu.drift import DriftInputs
     from calib.stages.imu.levelling import Levelling
     from calib.stages.imu.mahony import Mahony
     from calib.stages.imu.read import drift_log
     from calib.stages.imu.tracks import Tuned
 
-    read = [(path, drift_log(read_log(path, options, files.remarks))) for path in files.paths]
-    logs = [replace(log, source=files.taken(path)) for path, log in read]
+    logs = _readings(files, options, drift_log)
     tuned, section = None, rig.orientation_filter
     if section is not None:
         gains: AngleFilter = Mahony(section.Kp_per_s, section.Ki_per_s2)

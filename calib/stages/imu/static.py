@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from scipy.special import stdtrit
 
 from calib.core.arrays import BoolArray, FloatArray
 from calib.core.errors import BadInputError
 from calib.core.result import degrees_or_none, finite_or_none, judged
 from calib.core.verdict import Finding, Severity, Verdict
 from calib.solve.clock import Part
-from calib.stages.imu.allan import LEAST_SAMPLES, Allan, analyse, model_variance
+from calib.stages.imu.allan import KINDS, LEAST_SAMPLES, Allan, analyse, model_variance
 from calib.stages.imu.sampling import (
     Motion,
     Readings,
     Sampling,
+    blocks,
+    check_rate,
     regular_parts,
     rest_parts,
     sampled,
@@ -38,8 +40,7 @@ from calib.stages.imu.section import Imu, ImuLog
 #     sigma^2 = N^2 / T + 2 ln 2 / pi B^2 + K^2 T / 3.
 #
 # Where the log is too short to show a walk, K^2 is what it cannot exclude, so that a short log does not
-# look better than it is. With several logs the spread of their means counts, where it is larger, by
-# Student's distribution.
+# look better than it is. With several logs the spread of their means counts, where it is larger.
 #
 # The drift of the angle phi is the slope of -gz integrated, minus the mean of gz, and that of the angle
 # that the chip itself reports (Fig. 2.4). The latter's deviation follows from the slopes of eight
@@ -52,7 +53,6 @@ from calib.stages.imu.section import Imu, ImuLog
 # differences of that log over as long, so that noise, flicker and a random walk, whatever their size, are
 # none; and it matters to an angle.
 
-_SAME_RATE = 0.02
 _STRETCHES = 8
 _MEAN_FLICKER = 2.0 * math.log(2.0) / math.pi
 
@@ -111,19 +111,13 @@ class AxisNoise:
     Attributes
     ----------
     bias : mean over the logs, for an accelerometer with gravity in it.
-    sigma_mean : deviation of the mean from white noise alone.
-    sigma, low, high : deviation and 95 % interval of the bias that is met after the logs.
-    spread : standard deviation from log to log, NaN for one log.
+    sigma : deviation of the bias that is met after the logs, NaN where the axis never changes.
     allan : None where the axis never changes.
     """
 
     axis: str
     bias: float
-    sigma_mean: float
     sigma: float
-    low: float
-    high: float
-    spread: float
     allan: Allan | None
 
 
@@ -192,14 +186,13 @@ def bias_steps(parts: Sequence[Part], period_s: float, gyro: BoolArray) -> tuple
     stretches: list[tuple[list[FloatArray], list[FloatArray]]] = []
     end_s = -math.inf
     for part in parts:
-        count = len(part.values) // size
-        if count == 0:
+        if len(part.values) < size:
             continue
         if part.t_s[0] - end_s > _TOGETHER_S:
             stretches.append(([], []))
         end_s = float(part.t_s[-1])
-        stretches[-1][0].append(part.t_s[: count * size : size])
-        stretches[-1][1].append(part.values[: count * size].reshape(count, size, -1).mean(axis=1))
+        stretches[-1][0].append(blocks(part.t_s, size)[:, 0])
+        stretches[-1][1].append(blocks(part.values, size).mean(axis=1))
     found: list[BiasStep] = []
     for around in _AROUND:
         for times, values in stretches:
@@ -246,28 +239,16 @@ def _axis_noise(axis: str, k: int, logs: Sequence[StaticLog], period_s: float) -
     columns = [np.ascontiguousarray(part.values[:, k]) for log in logs for part in log.parts]
     means = np.array([log.mean[k] for log in logs])
     bias = float(means.mean())
-    spread = float(means.std(ddof=1)) if len(logs) > 1 else math.nan
     if all(float(np.ptp(column)) == 0.0 for column in columns):
-        nan = math.nan
-        return AxisNoise(axis, bias, nan, nan, nan, nan, spread, None)
+        return AxisNoise(axis, bias, math.nan, None)
     allan = analyse(columns, period_s)
     rest = np.array([log.rest_s for log in logs])
-    span = np.array([_span_s(log, period_s) for log in logs])
-    white = allan.theta[0] / rest
-    after = white + _MEAN_FLICKER * allan.theta[1] + allan.walk_within * span / 3.0
-    sigma_mean = math.sqrt(float(white.sum())) / len(logs)
+    span = np.array([log.parts[-1].t_s[-1] - log.parts[0].t_s[0] + period_s for log in logs])
+    after = allan.theta[0] / rest + _MEAN_FLICKER * allan.theta[1] + allan.walk_within * span / 3.0
     sigma = math.sqrt(float(after.sum())) / len(logs)
-    half = 1.959963984540054 * sigma
     if len(logs) > 1:
-        between = spread / math.sqrt(len(logs))
-        half = max(half, float(stdtrit(len(logs) - 1, 0.975)) * between)
-        sigma = max(sigma, between)
-    return AxisNoise(axis, bias, sigma_mean, sigma, bias - half, bias + half, spread, allan)
-
-
-def _span_s(log: StaticLog, period_s: float) -> float:
-    last = log.parts[-1]
-    return float(last.t_s[-1] - log.parts[0].t_s[0]) + period_s
+        sigma = max(sigma, float(means.std(ddof=1)) / math.sqrt(len(logs)))
+    return AxisNoise(axis, bias, sigma, allan)
 
 
 def analyse_static(logs: Sequence[Readings]) -> Static:
@@ -287,14 +268,9 @@ def analyse_static(logs: Sequence[Readings]) -> Static:
                 f"{logs[0].source}"
             )
     found = [_rest_of(log) for log in logs]
-    rates = [log.sampling.rate_hz for log in found]
-    for one, rate in zip(found, rates, strict=True):
-        if abs(rate / rates[0] - 1.0) > _SAME_RATE:
-            raise BadInputError(
-                f"{one.source}: is sampled at {rate:.4g} Hz, expected {rates[0]:.4g} Hz as in "
-                f"{found[0].source}"
-            )
-    rate_hz = float(np.mean(rates))
+    for one in found:
+        check_rate(one.sampling, one.source, found[0].sampling, found[0].source)
+    rate_hz = float(np.mean([log.sampling.rate_hz for log in found]))
     noise = tuple(_axis_noise(axis, k, found, 1.0 / rate_hz) for k, axis in enumerate(axes))
     return Static(axes, rate_hz, tuple(_with_gyro_drift(log, axes, noise) for log in found), noise)
 
@@ -322,21 +298,19 @@ _SHOWN_MOTIONS = 3
 def _of_log(log: StaticLog, axes: tuple[str, ...]) -> Iterator[Finding]:
     """Findings on motion and on how a log was sampled."""
     again = "log again with the rig untouched, on a table that does not shake"
+    moved = log.moved_share > _MOVED_SHARE
+    severity: Severity = "poor" if moved else "remark"
     for motion in log.motions[:_SHOWN_MOTIONS]:
         text = f"{log.source}: moves from {motion.from_s:.1f} to {motion.to_s:.1f} s, seen most in "
         text += f"{axes[motion.axis]}; that stretch is left out"
-        if log.moved_share > _MOVED_SHARE:
-            yield Finding("poor", text, advice=again)
-        else:
-            yield Finding("remark", text)
+        yield Finding(severity, text, again if moved else "")
     more = len(log.motions) - _SHOWN_MOTIONS
     if more > 0:
-        severity: Severity = "poor" if log.moved_share > _MOVED_SHARE else "remark"
         yield Finding(severity, f"{log.source}: moves {more} more times")
-    if log.motions and (turned := _turned_rad(log, axes)) > _TILTED_RAD:
+    columns = [k for k, axis in enumerate(axes) if axis.startswith("a")]
+    if log.motions and (turned := _turned_rad(log, columns)) > _TILTED_RAD:
         text = f"{log.source}: lies {math.degrees(turned):.2g} deg otherwise after it has moved; the mean of "
         yield Finding("poor", f"{text}the accelerometer is that of no pose", advice=again)
-    columns = [k for k, axis in enumerate(axes) if axis.startswith("a")]
     force = float(np.median([np.linalg.norm(part.values[:, columns].mean(axis=0)) for part in log.parts]))
     if len(columns) == 3 and abs(force / _GRAVITY_MPS2 - 1.0) > _MOST_OFF_GRAVITY:
         yield Finding(
@@ -348,9 +322,8 @@ def _of_log(log: StaticLog, axes: tuple[str, ...]) -> Iterator[Finding]:
     yield from sampling_findings(log.sampling, axes, log.source, _MOST_REPEATED)
 
 
-def _turned_rad(log: StaticLog, axes: tuple[str, ...]) -> float:
+def _turned_rad(log: StaticLog, columns: list[int]) -> float:
     """Largest angle between the mean specific forces of the stretches at rest."""
-    columns = [k for k, axis in enumerate(axes) if axis.startswith("a")]
     long = [part.values[:, columns] for part in log.parts if len(part.values) * log.sampling.period_s > 1.0]
     if len(columns) < 2 or len(long) < 2:
         return 0.0
@@ -374,10 +347,8 @@ def _of_steps(log: StaticLog, noise: Sequence[AxisNoise]) -> Iterator[Finding]:
             advice = "see whether the rig was touched then"
         text = f"{log.source}: the mean of {one.axis} steps by {size} at {step.at_s:.0f} s; {effect}"
         # A step within the stated deviation of the bias is a part of that.
-        if abs(step.size) > 3.0 * one.sigma:
-            yield Finding("poor", text, advice=advice)
-        else:
-            yield Finding("remark", text)
+        poor = abs(step.size) > 3.0 * one.sigma
+        yield Finding("poor" if poor else "remark", text, advice if poor else "")
     if len(log.steps) > _SHOWN_MOTIONS:
         yield Finding("remark", f"{log.source}: {len(log.steps) - _SHOWN_MOTIONS} more steps of a mean")
 
@@ -411,10 +382,9 @@ def _of_axis(noise: AxisNoise) -> Iterator[Finding]:
         text += "noise, flicker and a random walk explain"
         if off > _COLOURED:
             yield Finding("poor", f"{text}; N, B and K do not describe it")
-        elif off > 1.0:
-            yield Finding("remark", f"{text}; an estimator trusts it by as much too far there")
         else:
-            yield Finding("remark", f"{text}; an estimator trusts it by as much too little there")
+            trusts = "far" if off > 1.0 else "little"
+            yield Finding("remark", f"{text}; an estimator trusts it by as much too {trusts} there")
     elif allan.fit_s[0] > 1.5 * float(allan.tau_s[0]):
         yield Finding(
             "remark",
@@ -469,21 +439,17 @@ def judge(result: Static) -> Verdict:
 # ----------------------------------------------------------------------
 # The section.
 
-_SENSORS = (
-    (
-        "g",
-        "gyro_bias_radps",
-        ("gyro_noise_radps_per_sqrt_Hz", "gyro_instability_radps", "gyro_walk_radps2_per_sqrt_Hz"),
-        "gyro_step_radps",
+_SENSORS = {
+    "g": (
+        "gyro_bias_radps", "gyro_step_radps",
+        "gyro_noise_radps_per_sqrt_Hz", "gyro_instability_radps", "gyro_walk_radps2_per_sqrt_Hz",
     ),
-    (
-        "a",
-        "accel_mean_mps2",
-        ("accel_noise_mps2_per_sqrt_Hz", "accel_instability_mps2", "accel_walk_mps3_per_sqrt_Hz"),
-        "accel_step_mps2",
+    "a": (
+        "accel_mean_mps2", "accel_step_mps2",
+        "accel_noise_mps2_per_sqrt_Hz", "accel_instability_mps2", "accel_walk_mps3_per_sqrt_Hz",
     ),
-)
-"""First letter of a sensor's axes, and its keys: mean, then N, B and K, then the step."""
+}  # fmt: skip
+"""Keys by the first letter of a sensor's axes: mean, step, then those of `KINDS`."""
 
 
 def solve_static(logs: Sequence[Readings]) -> Imu:
@@ -494,34 +460,24 @@ def solve_static(logs: Sequence[Readings]) -> Imu:
     steps = dict(zip(result.axes, np.nanmin(every, axis=0).tolist(), strict=True))
     noise = {one.axis: one for one in result.noise}
 
-    def triple(kind: str, value: Callable[[AxisNoise], float]) -> list[float | None]:
-        axes = [noise.get(kind + letter) for letter in "xyz"]
-        return [None if one is None else finite_or_none(value(one)) for one in axes]
-
-    def term(index: int, name: str) -> Callable[[AxisNoise], float]:
-        def value(one: AxisNoise) -> float:
-            allan = one.allan
-            return math.nan if allan is None else float(getattr((allan.N, allan.B, allan.K)[index], name))
-
-        return value
+    def triple(of: Mapping[str, Any], letter: str, name: str) -> list[float | None]:
+        """An attribute of x, y and z, null where there is none or it is not known."""
+        axes = [of.get(letter + axis) for axis in "xyz"]
+        return [None if one is None else finite_or_none(getattr(one, name)) for one in axes]
 
     values: dict[str, list[float | None]] = {}
     sigma: dict[str, list[float | None]] = {}
     below: dict[str, list[float | None]] = {}
-    for kind, mean, densities, step in _SENSORS:
-        values[mean] = triple(kind, lambda one: one.bias)
-        sigma[mean] = triple(kind, lambda one: one.sigma)
-        for index, key in enumerate(densities):
-            values[key] = triple(kind, term(index, "value"))
-            sigma[key] = triple(kind, term(index, "sigma"))
-            below[key] = triple(kind, term(index, "below"))
-        values[step] = [finite_or_none(steps.get(kind + letter, math.nan)) for letter in "xyz"]
+    for letter, (mean, step, *densities) in _SENSORS.items():
+        values[mean], sigma[mean] = triple(noise, letter, "bias"), triple(noise, letter, "sigma")
+        values[step] = [finite_or_none(steps.get(letter + axis, math.nan)) for axis in "xyz"]
+        for kind, key in zip(KINDS, densities, strict=True):
+            terms = {axis: one.allan and getattr(one.allan, kind) for axis, one in noise.items()}
+            for into, name in ((values, "value"), (sigma, "sigma"), (below, "below")):
+                into[key] = triple(terms, letter, name)
     drift = {
-        name: [math.degrees(one.slope_radps) for one in slopes if one is not None]
-        for name, slopes in (
-            ("gyro", [log.gyro for log in result.logs]),
-            ("onchip", [log.onchip for log in result.logs]),
-        )
+        name: [math.degrees(one.slope_radps) for log in result.logs if (one := getattr(log, name))]
+        for name in ("gyro", "onchip")
     }
     return Imu.model_validate(
         {

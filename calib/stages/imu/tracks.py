@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import pip_install
+from calib.core.units import GRAVITY_MPS2
 from calib.solve.clock import Part
 from calib.stages.imu.levelling import Levelling, level_three
-from calib.stages.imu.mahony import Mahony, MahonyState, accelerometer_angles, filter_log
+from calib.stages.imu.mahony import Mahony, MahonyState, accelerometer_angles, filter_log, mean_angle
 from calib.stages.imu.sampling import AXES, Readings
 from calib.stages.imu.tuning import AngleFilter
 
@@ -85,20 +86,13 @@ def angle_of(part: Part, axes: tuple[str, ...]) -> FloatArray:
 # points up. All run with their authors' defaults and without a magnetometer. None is needed by anything
 # else here; what is not installed is named by `missing`.
 
-_G = 9.80665
-
 MOST_SAMPLES = {"Mahony": 300_000, "Madgwick": 300_000, "imufusion": 10_000_000}
 """Longest logs for peers whose loop is in Python; the first two take a minute for that."""
 
 
-def _mahony(gyro: FloatArray, force: FloatArray, period_s: float) -> FloatArray:
-    filters: Any = importlib.import_module("ahrs.filters")
-    return np.asarray(filters.Mahony(gyr=gyro, acc=force, frequency=1.0 / period_s, k_P=1.0, k_I=0.3).Q)
-
-
-def _madgwick(gyro: FloatArray, force: FloatArray, period_s: float) -> FloatArray:
-    filters: Any = importlib.import_module("ahrs.filters")
-    return np.asarray(filters.Madgwick(gyr=gyro, acc=force, frequency=1.0 / period_s).Q)
+def _ahrs(name: str, gyro: FloatArray, force: FloatArray, period_s: float, **gains: float) -> FloatArray:
+    peer: Any = getattr(importlib.import_module("ahrs.filters"), name)
+    return np.asarray(peer(gyr=gyro, acc=force, frequency=1.0 / period_s, **gains).Q)
 
 
 def _imufusion(gyro: FloatArray, force: FloatArray, period_s: float) -> FloatArray:
@@ -108,7 +102,7 @@ def _imufusion(gyro: FloatArray, force: FloatArray, period_s: float) -> FloatArr
     settings.convention = fusion.CONVENTION_ENU
     filter_ = fusion.Ahrs()
     filter_.set_settings(settings)
-    degps, g = np.degrees(gyro), force / _G
+    degps, g = np.degrees(gyro), force / GRAVITY_MPS2
     out = np.empty((len(gyro), 4))
     for k in range(len(gyro)):
         filter_.update_no_magnetometer(degps[k], g[k])
@@ -122,8 +116,8 @@ def _vqf(gyro: FloatArray, force: FloatArray, period_s: float) -> FloatArray:
 
 
 _RUNS: dict[str, tuple[str, Callable[[FloatArray, FloatArray, float], FloatArray]]] = {
-    "Mahony": ("ahrs", _mahony),
-    "Madgwick": ("ahrs", _madgwick),
+    "Mahony": ("ahrs", partial(_ahrs, "Mahony", k_P=1.0, k_I=0.3)),
+    "Madgwick": ("ahrs", partial(_ahrs, "Madgwick")),
     "imufusion": ("imufusion", _imufusion),
     "VQF": ("vqf", _vqf),
 }
@@ -177,11 +171,6 @@ class Tuned:
     up_vector: bool = False
 
 
-def mean_angle(angles: FloatArray) -> float:
-    """Direction of the mean of unit vectors at the angles (n,) [rad]."""
-    return math.atan2(float(np.sin(angles).mean()), float(np.cos(angles).mean()))
-
-
 def _start(phi_acc: FloatArray, rate_radps: FloatArray, period_s: float) -> float:
     """Angle at the first sample, by the accelerometer over half a second less what it turned since."""
     size = max(round(_START_S / period_s), 1)
@@ -216,9 +205,9 @@ def tracks_of(
     log: Readings,
     parts: Sequence[Part],
     period_s: float,
-    tuned: Tuned | None = None,
-    peers: bool = True,
-    told: Callable[[str], None] = lambda sentence: None,
+    tuned: Tuned | None,
+    peers: bool,
+    told: Callable[[str], None],
 ) -> tuple[list[Track], list[str]]:
     """The methods' angles on one log, and sentences about methods that were left out.
 
@@ -261,7 +250,7 @@ def tracks_of(
     add("accelerometer alone", lambda part: np.unwrap(phi_acc[id(part)]))
     add("MM 3/3", filtered(Mahony()))
     add("levelling", filtered(Levelling()))
-    lacking = ", ".join(axis for axis in AXES if axis not in axes)
+    lacking = ", ".join(log.lacks())
     if tuned is None:
         skipped.append("tuned: the rig's file has no section orientation_filter")
     elif tuned.up_vector and lacking:

@@ -15,10 +15,11 @@ from calib.core.arrays import FloatArray, IntArray
 from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
 from calib.core.result import degrees_or_none, finite_or_none, judged
+from calib.core.units import GRAVITY_MPS2
 from calib.core.verdict import Finding, Severity, Verdict
 from calib.stages.imu.levelling import Levelling
 from calib.stages.imu.levelling import system as levelling_system
-from calib.stages.imu.mahony import Mahony, filter_log, wrapped
+from calib.stages.imu.mahony import Mahony, filter_log, mean_angle, wrapped
 from calib.stages.imu.sampling import Sampling, sensor_findings
 from calib.stages.imu.section import FilterCandidate, FilterLog, OrientationFilter
 
@@ -69,8 +70,8 @@ class Noise:
     accel: float
 
     def __post_init__(self) -> None:
-        for name, value, least in (("gyro", self.gyro, 0.0), ("accel", self.accel, 0.0)):
-            if not least < value < math.inf:
+        for name, value in (("gyro", self.gyro), ("accel", self.accel)):
+            if not 0.0 < value < math.inf:
                 raise BadInputError(f"density {name}: found {value:g}, expected more than zero")
         if not 0.0 <= self.walk < math.inf:
             raise BadInputError(f"density walk: found {self.walk:g}, expected zero or more")
@@ -333,7 +334,6 @@ def compared(rows: Sequence[Row], dt_s: float) -> tuple[tuple[Candidate, ...], f
 # half a second. What the accelerometer feels stays bounded and what the gyroscope gathers does not, by which
 # the two are told apart.
 
-_G = 9.80665
 BLOCK_S = 0.05
 _COARSE_S = 0.5
 SHORTEST_S = 4.0
@@ -359,7 +359,7 @@ class Smoothed:
     sigma_rad : its standard deviation, root of the mean square over the log.
     gyro_noise : density of the rate's error [rad/s/sqrt(Hz)], at least that of the sensor.
     accel_noise : density of the accelerometer's angle at low frequencies, motion included [rad/sqrt(Hz)].
-    bias_radps, scale : of the rate, at the end of the log.
+    bias_radps : of the rate, at the end of the log.
     lever_m : (2,) from the centre of rotation to the sensor, in its axes.
     """
 
@@ -368,7 +368,6 @@ class Smoothed:
     gyro_noise: float
     accel_noise: float
     bias_radps: float
-    scale: float
     lever_m: FloatArray
 
 
@@ -489,7 +488,7 @@ def _blocks(
     c, s, rate = (_means(values, starts, counts) for values in (np.cos(phi_acc), np.sin(phi_acc), w))
     dt = np.diff(tb, prepend=tb[0] - size_s)
     alpha = -np.gradient(rate, tb) if len(tb) > 2 else np.zeros(len(tb))
-    X = np.stack([alpha * c + rate**2 * s, alpha * s - rate**2 * c], axis=1) / _G
+    X = np.stack([alpha * c + rate**2 * s, alpha * s - rate**2 * c], axis=1) / GRAVITY_MPS2
     return _Blocks(tb, db, X, dt, np.diff(th, prepend=th[0]))
 
 
@@ -570,7 +569,7 @@ def smooth_log(
     phi = theta + offset + np.interp(t, fine.t_s, xs[:, 0])
     # What lasts for tau counts at low frequencies with its size times the time that it lasts.
     slow = math.sqrt(r + 2.0 * c * c * tau)
-    return Smoothed(phi, math.sqrt(variance), math.sqrt(q), slow, -float(last[1]), -float(last[2]), last[3:5])
+    return Smoothed(phi, math.sqrt(variance), math.sqrt(q), slow, -float(last[1]), last[3:5])
 
 
 def damped(Kp: float, damping: float) -> Mahony:
@@ -578,8 +577,8 @@ def damped(Kp: float, damping: float) -> Mahony:
     return Mahony(Kp, Kp * Kp / (4.0 * damping * damping))
 
 
-def gain_grid(dt_s: float, kp: int = 25, dampings: int = 17) -> tuple[FloatArray, FloatArray]:
-    """Values of Kp (kp,) and of the damping (dampings,), evenly spaced in their logarithms.
+def gain_grid(dt_s: float) -> tuple[FloatArray, FloatArray]:
+    """Values of Kp (25,) and of the damping (17,), evenly spaced in their logarithms.
 
     From what a minute of data can tell to what the step allows. Raises `BadInputError` for steps of more
     than a second or none.
@@ -588,8 +587,8 @@ def gain_grid(dt_s: float, kp: int = 25, dampings: int = 17) -> tuple[FloatArray
         raise BadInputError(f"step: found {dt_s:g} s, expected 0 to 1 s")
     highest = min(_HIGHEST_KP, 0.5 / dt_s)
     return (
-        np.geomspace(min(_LOWEST_KP, 0.1 * highest), highest, kp),
-        np.geomspace(_LOWEST_DAMPING, _HIGHEST_DAMPING, dampings),
+        np.geomspace(min(_LOWEST_KP, 0.1 * highest), highest, 25),
+        np.geomspace(_LOWEST_DAMPING, _HIGHEST_DAMPING, 17),
     )
 
 
@@ -804,7 +803,7 @@ def _offset(piece: Piece, smoothed: Smoothed | None) -> float:
     own = piece.phi_acc_rad if smoothed is None else smoothed.phi_rad
     apart = own - piece.reference_rad
     known = apart[np.isfinite(apart)]
-    middle = math.atan2(float(np.sin(known).mean()), float(np.cos(known).mean()))
+    middle = mean_angle(known)
     return middle + float(wrapped(known - middle).mean())
 
 
