@@ -294,7 +294,7 @@ _POSITION: dict[str, tuple[Pid, bool]] = {
 
 
 def _limited(pid: Pid, u1: float, u2: float) -> Pair:
-    return saturate(u1, low=pid.low, high=pid.high), saturate(u2, low=pid.low, high=pid.high)
+    return saturate(u1, pid.low, pid.high), saturate(u2, pid.low, pid.high)
 
 
 def angle_law(pid: Pid, wanted_rad: FloatArray, sign: int = 1) -> Law:

@@ -101,7 +101,7 @@ def test_every_controller_on_every_reference(name: str, reference: str) -> None:
     pwm = outcome.run.pwm
     assert pwm.shape == (90, 2) and np.array_equal(pwm, np.round(pwm))
     assert pwm.min() >= 5.0 and pwm.max() <= 240.0
-    assert (outcome.estimate_m is not None) == (name == "torque")
+    assert (outcome.limited is not None) == (name == "torque")
 
 
 def test_the_same_seed_the_same_run() -> None:

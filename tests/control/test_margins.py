@@ -19,6 +19,7 @@ from calib.stages.control.section import ControllerCriterion
 from calib.stages.control.tuning import (
     System,
     Tuned,
+    both_channels,
     break_at,
     closed_loop,
     delay,
@@ -181,7 +182,10 @@ def test_the_gain_margin_by_brute_force(model: object, phi: float, gains: tuple[
 )
 @pytest.mark.parametrize("sensing", [False, True])
 def test_each_channel_of_the_position_loop_by_brute_force(q: tuple[float, float], sensing: bool) -> None:
-    loop = position_loop(NOMINAL, Pid(18000.0, 0.0, 180.0), q, sensing)
+    pid = Pid(18000.0, 0.0, 180.0)
+    loop = position_loop(NOMINAL, pid, q)
+    if not sensing:
+        loop = series(both_channels(pid), rig_system(NOMINAL, np.array(q)))
     for i, found in enumerate(loop_margins(loop)):
         assert found.stable
         assert found.gain == pytest.approx(gain_to_instability(loop, i), rel=1e-3)

@@ -26,7 +26,15 @@ from calib.stages.actuator.kinematics import (
     marker_from_head,
 )
 from calib.stages.actuator.parameters import Plant
-from calib.stages.actuator.pump import PWM_MAX, Orifice, Pump, advance_pump, pump_coefficients, static_force_N
+from calib.stages.actuator.pump import (
+    PWM_MAX,
+    TICK_S,
+    Orifice,
+    Pump,
+    advance_pump,
+    pump_coefficients,
+    static_force_N,
+)
 from calib.stages.actuator.simulate import derivative, largest_step_s
 
 # ----------------------------------------------------------------------
@@ -57,9 +65,6 @@ from calib.stages.actuator.simulate import derivative, largest_step_s
 
 PWM_MIN = 0.0
 """Limits of what the microcontroller can put out, 0 V to 12 V, with `PWM_MAX`."""
-
-TICK_S = 1.0 / 60.0
-"""Period of the controller (4.1)."""
 
 
 @dataclass(frozen=True)
@@ -106,10 +111,9 @@ class Channel:
         return u + more
 
 
-def saturate(u: float, whole: bool = True, low: float = PWM_MIN, high: float = PWM_MAX) -> float:
+def saturate(u: float, low: float = PWM_MIN, high: float = PWM_MAX) -> float:
     """What reaches the motor [PWM]: limited, and a whole number as the PWM register holds one."""
-    limited = min(max(u, low), high)
-    return math.floor(limited + 0.5) if whole else limited
+    return math.floor(min(max(u, low), high) + 0.5)
 
 
 # ----------------------------------------------------------------------
@@ -460,7 +464,7 @@ class BackOrientation:
             step_back(channel, e, least, high, self.tracking_s)
             for channel, e, least in zip(self.channels, (error, -error), low, strict=True)
         )
-        pwm = (saturate(u1, True, model.low_pwm, high), saturate(u2, True, model.low_pwm, high))
+        pwm = saturate(u1, model.low_pwm, high), saturate(u2, model.low_pwm, high)
         self.pumps = push(model, self.pumps, pwm)
         return pwm
 
@@ -760,5 +764,5 @@ def computed_torque_step(
         | (force < lowest - 1e-3)
         | (force > largest_force_N(model))
     )
-    u1, u2 = (saturate(u, True, model.low_pwm, model.high_pwm) for u in pwm.tolist())
+    u1, u2 = (saturate(u, model.low_pwm, model.high_pwm) for u in pwm.tolist())
     return (u1, u2), bool(limited.any())

@@ -104,42 +104,16 @@ def read_reference(path: Path, model: Model) -> Reference:
     return from_lengths(model, source, ticks)
 
 
-def reference_of(text: str, model: Model, duration_s: float | None = None) -> Reference:
-    """A built-in reference by its name, or the one in a file.
-
-    Raises `BadInputError`, also where a file is given a duration.
-    """
-    if text in BUILT_IN:
-        return built_in(model, text, duration_s)
-    path = Path(text)
-    if not path.exists():
-        raise BadInputError(
-            f"{shown(text)}: is no such file and none of the references {', '.join(BUILT_IN)}"
-        )
-    if duration_s is not None:
-        raise BadInputError(
-            f"{shown(text)}: a file has its own duration, --duration is for {', '.join(BUILT_IN)}"
-        )
-    return read_reference(path, model)
-
-
 _HEAD = ("t_s", "q1_m", "q2_m", "phi_rad")
 REFERENCE = Kind("a reference", (".csv",), lambda path: column_names(path) == _HEAD)
 
 
-def reference_text(reference: Reference) -> str:
-    """CSV with time and lengths."""
-    rows = [",".join(_HEAD)]
-    for t, (q1, q2), phi in zip(
-        reference.t_s.tolist(), reference.q_m.tolist(), reference.phi_rad.tolist(), strict=True
-    ):
-        rows.append(f"{t:.6f},{q1:.9f},{q2:.9f},{phi:.9f}")
-    return "\n".join(rows) + "\n"
-
-
 def write_reference(path: Path, reference: Reference) -> None:
-    """Write a reference atomically. Raises `BadInputError` where the place cannot be written."""
-    write_atomically(path, reference_text(reference), REFERENCE)
+    """Write time, lengths and angle. Raises `BadInputError` where the place cannot be written."""
+    rows = [",".join(_HEAD)]
+    for t, q1, q2, phi in np.column_stack([reference.t_s, reference.q_m, reference.phi_rad]).tolist():
+        rows.append(f"{t:.6f},{q1:.9f},{q2:.9f},{phi:.9f}")
+    write_atomically(path, "\n".join(rows) + "\n", REFERENCE)
 
 
 # ----------------------------------------------------------------------
@@ -148,7 +122,6 @@ def write_reference(path: Path, reference: Reference) -> None:
 # The estimator is the kinematic one: the commands in the log are those of another controller.
 
 _OWN = ("q1_m", "true_q1_m", "x_m", "phi_rad")
-_CONTROLREFERENCE_FEWEST = 3
 
 
 def is_recorded(path: Path) -> bool:
@@ -167,7 +140,7 @@ def recorded_reference(path: Path, rig: Rig, rig_path: Path, model: Model) -> Re
     rows = smoothed_rows(opened(path, rig, rig_path), math.inf)
     rows = rows[np.isfinite(rows[:, :3]).all(axis=1)]
     rows = rows[np.concatenate([[True], np.diff(rows[:, 0]) > 0.0])] if len(rows) else rows
-    if len(rows) < _CONTROLREFERENCE_FEWEST:
+    if len(rows) < _FEWEST:
         raise BadInputError(f"{shown(path)}: shows no lengths to follow, expected camera and IMU in motion")
     return from_lengths(model, shown(path), resampled(rows[:, 0], rows[:, 1:3], model.tick_s))
 
@@ -175,8 +148,21 @@ def recorded_reference(path: Path, rig: Rig, rig_path: Path, model: Model) -> Re
 def wanted_reference(
     text: str, model: Model, duration_s: float | None, rig: Rig, rig_path: Path
 ) -> Reference:
-    """A reference by name, from a table, or from a recorded log. Raises `BadInputError`."""
+    """A reference by name, from a table, or from a recorded log.
+
+    Raises `BadInputError`, also where a file is given a duration.
+    """
+    if text in BUILT_IN:
+        return built_in(model, text, duration_s)
     path = Path(text)
-    if duration_s is None and path.is_file() and is_recorded(path):
+    if not path.exists():
+        raise BadInputError(
+            f"{shown(text)}: is no such file and none of the references {', '.join(BUILT_IN)}"
+        )
+    if duration_s is not None:
+        raise BadInputError(
+            f"{shown(text)}: a file has its own duration, --duration is for {', '.join(BUILT_IN)}"
+        )
+    if path.is_file() and is_recorded(path):
         return recorded_reference(path, rig, rig_path, model)
-    return reference_of(text, model, duration_s)
+    return read_reference(path, model)

@@ -40,8 +40,14 @@ _REFERENCE = (
     "elongation, step, jump, ellipse, a CSV with t_s and q1_m, q2_m, or x_m, y_m, or phi_rad, "
     "or a recorded log."
 )
-_LIMITS = "PWM values between which commands stay, as 0,255."
-_DURATION = "Length of a reference by name, such as 30s."
+_limits = partial(option, None, "PWM values between which commands stay, as 0,255.", parse=parse_pwm_limits)
+_duration = partial(
+    option,
+    None,
+    "Length of a reference by name, such as 30s.",
+    flag="duration",
+    parse=partial(parse_duration_s, what="--duration"),
+)
 
 
 def _wanted(
@@ -82,10 +88,8 @@ class RunOptions:
         "sensors", "What controllers get: sensors, simulated with their noise, or truth."
     )
     seed: int = option(0, "Seed of the sensors' noise.", least=0)
-    duration_s: float | None = option(
-        None, _DURATION, flag="duration", parse=partial(parse_duration_s, what="--duration")
-    )
-    pwm_limits: tuple[float, float] | None = option(None, _LIMITS, parse=parse_pwm_limits)
+    duration_s: float | None = _duration()
+    pwm_limits: tuple[float, float] | None = _limits()
     plant: Path | None = option(
         None, "Another rig's file, whose actuator and pumps are driven; controllers know those of --rig."
     )
@@ -245,10 +249,8 @@ run = Stage(
 class CheckOptions:
     """What is checked."""
 
-    duration_s: float | None = option(
-        None, _DURATION, flag="duration", parse=partial(parse_duration_s, what="--duration")
-    )
-    pwm_limits: tuple[float, float] | None = option(None, _LIMITS, parse=parse_pwm_limits)
+    duration_s: float | None = _duration()
+    pwm_limits: tuple[float, float] | None = _limits()
 
 
 @dataclass(frozen=True)
@@ -407,7 +409,7 @@ class TuneOptions:
         parse=partial(parse_angle_rad, what="--phase-margin"),
     )
     sensitivity: float = option(2.0, "Greatest peak of the sensitivity.")
-    pwm_limits: tuple[float, float] | None = option(None, _LIMITS, parse=parse_pwm_limits)
+    pwm_limits: tuple[float, float] | None = _limits()
 
 
 @dataclass(frozen=True)
@@ -516,23 +518,17 @@ def _judge(clamped: AntiWindup, back: AntiWindup, tick_s: float) -> Verdict:
 
 
 def _margins(loop: Literal["orientation", "position"], points: Sequence[Point]) -> list[ControllerMargins]:
-    """Margins at operating points for the file."""
-    from calib.core.result import finite_or_none
+    """Margins at operating points for the file, null where nothing limits them."""
     from calib.stages.control.section import ControllerMargins
 
-    return [
-        ControllerMargins(
-            loop=loop,
-            q_m=[float(f"{q:.6g}") for q in point.q_m],
-            stable=bool(point.margins.stable),
-            gain=finite_or_none(point.margins.gain),
-            phase_rad=finite_or_none(point.margins.phase_rad),
-            delay_s=finite_or_none(point.margins.delay_s),
-            crossover_hz=float(point.margins.crossover_hz),
-            sensitivity=float(point.margins.sensitivity),
-        )
-        for point in points
-    ]
+    rows = []
+    for point in points:
+        known: dict[str, Any] = {
+            name: value if math.isfinite(value) else None for name, value in vars(point.margins).items()
+        }
+        del known["gain_down"]
+        rows.append(ControllerMargins(loop=loop, q_m=[float(f"{q:.6g}") for q in point.q_m], **known))
+    return rows
 
 
 _MAP_ROWS = 41

@@ -16,12 +16,12 @@ lengths has an angle.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
-from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.core.rig import Rig
 from calib.stages.camera.model import undistort
@@ -30,6 +30,7 @@ from calib.stages.control.laws import (
     ComputedTorque,
     FeedForward,
     Model,
+    Pair,
     Pid,
     computed_torque_step,
     design_observer,
@@ -43,8 +44,6 @@ from calib.stages.control.tuning import Tracking, tracking
 from calib.twin.rig import SimulatedRig, rig_from_file
 from calib.twin.scenarios import angle_law, at_rest, length_law
 from calib.twin.simulate import Law, Run, Seen, simulate
-
-Pair = tuple[float, float]
 
 CONTROLLERS = (
     "p", "pid", "clamping", "back", "pd", "pd+ff", "pd+map", "torque", "tuned-pid", "tuned-pd",
@@ -67,14 +66,12 @@ class Outcome:
     controller : its name.
     run : the simulated run.
     figures : errors and all that.
-    estimate_m : (n, 2) lengths by the observer, None without one.
     limited : share of the ticks in which the pumps could not give what was wanted, None where unknown.
     """
 
     controller: str
     run: Run
     figures: Tracking
-    estimate_m: FloatArray | None
     limited: float | None
 
 
@@ -137,7 +134,7 @@ def _position(model: Model, reference: Reference, pid: Pid, extra: str) -> Law:
 
 
 class _Torque:
-    """Computed torque with its observer; keeps what it believed for the figures."""
+    """Computed torque with its observer."""
 
     def __init__(
         self, rig: SimulatedRig, model: Model, reference: Reference, control: ComputedTorque, sensors: bool
@@ -151,7 +148,6 @@ class _Torque:
         self.camera = view.camera
         A = view.camera.K @ np.column_stack([view.R_CW[:, :2], view.t_CW_m])
         self.to_plane = np.linalg.inv(A) @ view.camera.K
-        self.estimates: list[FloatArray] = []
         self.limited = 0
 
     def _marker(self, seen: Seen) -> Pair:
@@ -167,7 +163,6 @@ class _Torque:
             self.observer.correct(self._marker(seen), rate)
         else:
             self.observer.y[:2] = seen.q_m
-        self.estimates.append(self.observer.y[:2].copy())
         pwm, limited = computed_torque_step(self.control, self.observer, self.wanted, k)
         self.limited += limited
         self.observer.predict(pwm)
@@ -240,13 +235,18 @@ def run_controller(
     if name not in CONTROLLERS:
         raise BadInputError(f"controller: found {name!r}, expected one of {', '.join(CONTROLLERS)}")
     law = _law(name, rig, model, reference, section, feedback == "sensors")
+    run, figures = _tried(rig, model, reference, law, seed, feedback)
+    return Outcome(name, run, figures, law.limited / len(run.pwm) if isinstance(law, _Torque) else None)
+
+
+def _tried(
+    rig: SimulatedRig, model: Model, reference: Reference, law: Law, seed: int, feedback: str
+) -> tuple[Run, Tracking]:
+    """A run from rest, and how well it follows the reference."""
     run = simulate(rig, at_rest(rig), law, len(reference.q_m), seed, feedback)
-    figures = tracking(
+    return run, tracking(
         reference, run.states[:, :2], run.pwm, rig.plant.bellows_radius_m, model.low_pwm, model.high_pwm
     )
-    if isinstance(law, _Torque):
-        return Outcome(name, run, figures, np.array(law.estimates), law.limited / len(run.pwm))
-    return Outcome(name, run, figures, None, None)
 
 
 _TIMES_S = (0.5, 1.0, 2.0, 4.0)
@@ -254,7 +254,7 @@ _SHARES = (0.25, 0.4, 0.7)
 
 
 def tune_back_calculation(
-    rig: SimulatedRig, model: Model, pid: Pid, progress: Callable[[int, int], None] = lambda done, total: None
+    rig: SimulatedRig, model: Model, pid: Pid, progress: Callable[[int, int], None]
 ) -> tuple[float, float, dict[str, dict[str, float]]]:
     """Time and share of the falling rate with the least overshoot after the jump, and what each does.
 
@@ -264,26 +264,22 @@ def tune_back_calculation(
     reference = built_in(model, "jump")
     clamped = _jump(rig, model, reference, _orientation(model, reference, replace(pid, clamping=True)))
     plain = _jump(rig, model, reference, _orientation(model, reference, pid))
-    best: tuple[tuple[float, float], float, float, dict[str, float]] | None = None
-    trials: Sequence[Pair] = [(T, share) for T in _TIMES_S for share in _SHARES]
-    for done, (T, share) in enumerate(trials):
-        progress(done, len(trials))
-        found = _jump(rig, model, reference, _back(reference, _back_of(model, pid, T, share)))
-        late = max(found["rise_s"] - clamped["rise_s"] - model.tick_s, 0.0)
-        merit = (round(late, 6), found["overshoot_after_jump_rad"])
-        if best is None or merit < best[0]:
-            best = merit, T, share, found
-    assert best is not None
-    return best[1], best[2], {"pid": plain, "clamping": clamped, "back_calculation": best[3]}
+    found: dict[Pair, dict[str, float]] = {}
+    for T, share in product(_TIMES_S, _SHARES):
+        progress(len(found), len(_TIMES_S) * len(_SHARES))
+        found[T, share] = _jump(rig, model, reference, _back(reference, _back_of(model, pid, T, share)))
+
+    def merit(setting: Pair) -> Pair:
+        late = max(found[setting]["rise_s"] - clamped["rise_s"] - model.tick_s, 0.0)
+        return round(late, 6), found[setting]["overshoot_after_jump_rad"]
+
+    best = min(found, key=merit)
+    return *best, {"pid": plain, "clamping": clamped, "back_calculation": found[best]}
 
 
 def _jump(rig: SimulatedRig, model: Model, reference: Reference, law: Law) -> dict[str, float]:
-    run = simulate(rig, at_rest(rig), law, len(reference.q_m), 0, "truth")
-    figures = tracking(
-        reference, run.states[:, :2], run.pwm, rig.plant.bellows_radius_m, model.low_pwm, model.high_pwm
-    )
-    never = reference.duration_s
+    _, figures = _tried(rig, model, reference, law, 0, "truth")
     return {
         "overshoot_after_jump_rad": figures.jump_overshoot_rad or 0.0,
-        "rise_s": never if figures.rise_s is None else figures.rise_s,
+        "rise_s": reference.duration_s if figures.rise_s is None else figures.rise_s,
     }

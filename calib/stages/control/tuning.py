@@ -43,6 +43,10 @@ from calib.stages.control.section import ControllerCriterion
 # frequency response.
 
 
+_CUTOFF_HZ, _LATENCY_S = 1.0, 0.025
+"""Of the firmware's low-pass, and of the camera."""
+
+
 @dataclass(frozen=True)
 class System:
     """A discrete linear system with matrices A (n, n), B (n, m), C (p, n), D (p, m)."""
@@ -150,16 +154,16 @@ def rig_system(model: Model, q_m: FloatArray) -> System:
     return series(side_by_side(late, late), System(held[:8, :8], held[:8, 8:], C, np.zeros((2, 2)), h))
 
 
-def firmware_sensing(model: Model, cutoff_hz: float = 1.0, latency_s: float = 0.025) -> System:
+def firmware_sensing(model: Model) -> System:
     """Lengths (2,) as the firmware sees them: their mean late and low-passed, their difference at once."""
     from scipy.signal import butter
 
     h = model.tick_s
-    b, a = butter(1, cutoff_hz, fs=1.0 / h)
+    b, a = butter(1, _CUTOFF_HZ, fs=1.0 / h)
     low = System(
         np.array([[-a[1]]]), np.array([[1.0]]), np.array([[b[1] - b[0] * a[1]]]), np.array([[b[0]]]), h
     )
-    length = series(delay(math.ceil(latency_s / h - 1e-9), h), low)
+    length = series(delay(math.ceil(_LATENCY_S / h - 1e-9), h), low)
     apart = gain(np.array([[0.5, 0.5], [0.5, -0.5]]), h)
     together = gain(np.array([[1.0, 1.0], [1.0, -1.0]]), h)
     return series(series(apart, side_by_side(length, gain(np.eye(1), h))), together)
@@ -214,20 +218,16 @@ def frequencies(tick_s: float, count: int = 2000) -> FloatArray:
 
 def margins_of_response(omega: FloatArray, L: ComplexArray, stable: bool) -> Margins:
     """Margins of a loop's frequency response (k,) at rising angular frequencies (k,) [rad/s]."""
-    up, down = math.inf, 0.0
+    crossed = []
     for i in np.flatnonzero(np.diff(np.signbit(L.imag))):
         a, b = L[i], L[i + 1]
-        real = a.real + (b.real - a.real) * (a.imag / (a.imag - b.imag))
-        if real < -1e-300:
-            factor = float(-1.0 / real)
-            if factor >= 1.0:
-                up = min(up, factor)
-            else:
-                down = max(down, factor)
+        crossed.append(a.real + (b.real - a.real) * (a.imag / (a.imag - b.imag)))
     # At half the rate L is real by itself.
-    if L[-1].real < 0.0 and abs(L[-1].imag) < 1e-9 * abs(L[-1]):
-        factor = -1.0 / float(L[-1].real)
-        up, down = (min(up, factor), down) if factor >= 1.0 else (up, max(down, factor))
+    if abs(L[-1].imag) < 1e-9 * abs(L[-1]):
+        crossed.append(L[-1].real)
+    factors = [float(-1.0 / real) for real in crossed if real < -1e-300]
+    up = min((factor for factor in factors if factor >= 1.0), default=math.inf)
+    down = max((factor for factor in factors if factor < 1.0), default=0.0)
     phase, late, crossover = math.inf, math.inf, 0.0
     size = np.log(np.maximum(np.abs(L), 1e-300))
     for i in np.flatnonzero(np.diff(np.signbit(size))):
@@ -686,25 +686,27 @@ def operating_lengths(model: Model) -> tuple[tuple[float, float], ...]:
 
 def orientation_loop(model: Model, pid: Pid, q_m: tuple[float, float]) -> System:
     """Loop of (4.1) about a rest: error of the angle, both controllers, rig, angle."""
-    h = model.tick_s
-    return series(pid_system(pid), _angle_rig(model, q_m, h))
+    return series(pid_system(pid), _angle_rig(model, q_m))
 
 
-def _angle_rig(model: Model, q_m: tuple[float, float], h: float) -> System:
-    half = 0.5 / model.plant.bellows_radius_m
+def _angle_rig(model: Model, q_m: tuple[float, float]) -> System:
+    half, h = 0.5 / model.plant.bellows_radius_m, model.tick_s
     rig = rig_system(model, np.array(q_m))
     return series(gain(np.array([[1.0], [-1.0]]), h), series(rig, gain(np.array([[half, -half]]), h)))
 
 
-def _position_rig(model: Model, q_m: tuple[float, float], sensing: bool) -> System:
-    rig = rig_system(model, np.array(q_m))
-    return series(rig, firmware_sensing(model)) if sensing else rig
-
-
-def position_loop(model: Model, pid: Pid, q_m: tuple[float, float], sensing: bool = True) -> System:
+def position_loop(model: Model, pid: Pid, q_m: tuple[float, float]) -> System:
     """Loop of (4.5) about a rest: errors of the lengths, both controllers, rig, lengths as seen."""
-    both = side_by_side(pid_system(pid), pid_system(pid))
-    return series(both, _position_rig(model, q_m, sensing))
+    return series(both_channels(pid), _position_rig(model, q_m))
+
+
+def both_channels(pid: Pid) -> System:
+    """A controller for each bellows."""
+    return side_by_side(pid_system(pid), pid_system(pid))
+
+
+def _position_rig(model: Model, q_m: tuple[float, float]) -> System:
+    return series(rig_system(model, np.array(q_m)), firmware_sensing(model))
 
 
 def holds(criterion: ControllerCriterion, margins: Margins) -> bool:
@@ -728,13 +730,6 @@ def _worst(margins: Sequence[Margins]) -> Margins:
         max(m.crossover_hz for m in margins),
         max(m.sensitivity for m in margins),
     )
-
-
-def points_of(
-    loop: Callable[[tuple[float, float]], System], at: Sequence[tuple[float, float]]
-) -> tuple[Point, ...]:
-    """Margins of a loop at operating points, the least of its channels at each."""
-    return tuple(Point(q, _worst(loop_margins(loop(q)))) for q in at)
 
 
 def _strongest(
@@ -774,12 +769,13 @@ def _tuning_rounded(value: float) -> float:
 def _searched(
     model: Model,
     criterion: ControllerCriterion,
+    at: Sequence[tuple[float, float]],
     rigs: Sequence[System],
+    controllers: Callable[[Pid], System],
     integrals_s: Sequence[float],
     most: float,
     merit: Callable[[Pid], float],
-    loop: Callable[[Pid, int], System],
-) -> Pid:
+) -> Tuned:
     omega = frequencies(model.tick_s, 400)
     seen = [response(rig, omega) for rig in rigs]
     best: list[Pid] = []
@@ -791,12 +787,10 @@ def _searched(
                 Kp = _tuning_rounded(Kp)
                 gains = (_tuning_rounded(Kp * unit.Ki), _tuning_rounded(Kp * Td))
                 best.append(Pid(Kp, *gains, tick_s=model.tick_s))
-    best.sort(key=merit, reverse=True)
-    for pid in best:
-        if all(spectral_radius(closed_loop(loop(pid, i))) < 1.0 for i in range(len(rigs))):
-            worst = [_worst(loop_margins(loop(pid, i))) for i in range(len(rigs))]
-            if all(holds(_slack(criterion), one) for one in worst):
-                return pid
+    for pid in sorted(best, key=merit, reverse=True):
+        worst = [_worst(loop_margins(series(controllers(pid), rig))) for rig in rigs]
+        if all(holds(_slack(criterion), one) for one in worst):
+            return Tuned(pid, tuple(map(Point, at, worst)))
     raise BadInputError(
         f"controller: no gains reach a gain margin of {criterion.gain_margin:g} and a phase margin of "
         f"{math.degrees(criterion.phase_margin_rad):.3g} deg at every operating point, expected a lower "
@@ -818,13 +812,9 @@ def tune_orientation(model: Model, criterion: ControllerCriterion) -> Tuned:
 
     Raises `BadInputError` where no gains hold the margins.
     """
-    points = operating_angles(model)
-    rigs = [_angle_rig(model, q, model.tick_s) for q in points]
-    pid = _searched(
-        model, criterion, rigs, _INTEGRAL_S.tolist(), 2e4, lambda p: p.Ki,
-        lambda p, i: series(pid_system(p), rigs[i]),
-    )  # fmt: skip
-    return Tuned(pid, points_of(lambda q: orientation_loop(model, pid, q), points))
+    at = operating_angles(model)
+    rigs = [_angle_rig(model, q) for q in at]
+    return _searched(model, criterion, at, rigs, pid_system, _INTEGRAL_S.tolist(), 2e4, lambda pid: pid.Ki)
 
 
 def tune_position(model: Model, criterion: ControllerCriterion) -> Tuned:
@@ -832,10 +822,6 @@ def tune_position(model: Model, criterion: ControllerCriterion) -> Tuned:
 
     Raises `BadInputError` where no gains hold the margins.
     """
-    points = operating_lengths(model)
-    rigs = [_position_rig(model, q, True) for q in points]
-    pid = _searched(
-        model, criterion, rigs, [math.inf], 4e5, lambda p: p.Kp,
-        lambda p, i: series(side_by_side(pid_system(p), pid_system(p)), rigs[i]),
-    )  # fmt: skip
-    return Tuned(pid, points_of(lambda q: position_loop(model, pid, q), points))
+    at = operating_lengths(model)
+    rigs = [_position_rig(model, q) for q in at]
+    return _searched(model, criterion, at, rigs, both_channels, [math.inf], 4e5, lambda pid: pid.Kp)
