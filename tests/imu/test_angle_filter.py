@@ -44,9 +44,9 @@ from calib.stages.imu.tracks import PEERS, missing, planar_rate, run_peer
 from calib.stages.imu.tuning import (
     DATA_SHEET,
     THREE,
+    Candidate,
     Noise,
     Piece,
-    Row,
     compared,
     contradictions,
     gain_facts,
@@ -531,8 +531,8 @@ def _coloured(rng: np.random.Generator, n: int, scale: float, kept: float = 0.98
     return scale * out
 
 
-def _rows(errors: list[list[np.ndarray]]) -> list[Row]:
-    return [Row(f"{k}", Mahony(), e, rms(e)) for k, e in enumerate(errors)]
+def _compared(errors: list[list[np.ndarray]]) -> tuple[Candidate, ...]:
+    return compared([Candidate(f"{k}", Mahony(), rms(e)) for k, e in enumerate(errors)], errors, 0.01)[0]
 
 
 def test_equal_filters_win_as_rarely_as_they_should() -> None:
@@ -540,7 +540,7 @@ def test_equal_filters_win_as_rarely_as_they_should() -> None:
     for seed in range(100):
         rng = np.random.default_rng(seed)
         pair = [[_coloured(rng, 3000, 1.0)] for _ in range(2)]
-        wins += compared(_rows(pair), 0.01)[0][1].wins
+        wins += _compared(pair)[1].wins
     # 5 % nominally; more than 10 of 100 come in one of a hundred such tests.
     assert wins <= 10
 
@@ -549,7 +549,7 @@ def test_interval_covers_the_error() -> None:
     inside = 0
     for seed in range(120):
         errors = [_coloured(np.random.default_rng(seed), 3000, 2.0, 0.9)]
-        one = compared(_rows([errors]), 0.01)[0][0]
+        one = _compared([errors])[0]
         inside += one.low_rad < 2.0 < one.high_rad
     # 95 % nominally; of ten runs of a coloured log it is about 92 %.
     assert inside >= 106

@@ -124,6 +124,11 @@ class Identification:
     coverage: float
     prospects: Mapping[str, Mapping[str, float]]
 
+    @property
+    def models(self) -> dict[str, Mapping[str, Errors]]:
+        """Held errors of the assembly and of what it is compared with, by name and trial."""
+        return {"assembly": self.held, **self.others}
+
 
 def _bent(trial: Trial, values: Mapping[str, float], pressure_kpa: FloatArray) -> dict[str, FloatArray]:
     if not (len(trial.angle_rad) and len(pressure_kpa)):

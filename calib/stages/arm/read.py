@@ -9,7 +9,7 @@ base to tip.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -103,11 +103,10 @@ def _poses(log: Log) -> tuple[FloatArray, FloatArray]:
     return turned, apart
 
 
-def _frozen(log: Log, name: str, names: Sequence[str], driven: int) -> list[Finding]:
-    constant = [n for k, n in enumerate(names) if k != driven and n in log.columns and not _varies(log, n)]
-    if not constant:
-        return []
-    return [Finding("remark", f"{name}: {', '.join(constant)} never change: frozen, not used")]
+def _frozen(log: Log, name: str, driven: int) -> Iterator[Finding]:
+    others = [n for k, n in enumerate(PRESSURES) if k != driven and n in log.columns]
+    if constant := [n for n in others if not _varies(log, n)]:
+        yield Finding("remark", f"{name}: {', '.join(constant)} never change: frozen, not used")
 
 
 def _varies(log: Log, name: str) -> bool:
@@ -141,7 +140,7 @@ def recording_of(log: Log, name: str) -> Recording:
     if len(t) < 2 or t[-1] - t[0] < _FEWEST_S:
         raise BadInputError(f"{log.source}: is shorter than {_FEWEST_S:g} s, expected a whole trial")
     driven = _driven(log)
-    findings = [*_frozen(log, name, PRESSURES, driven)]
+    findings = [*_frozen(log, name, driven)]
     turned = chord = planar = None
     if all(one in log.columns for one in (*POSITION, *QUATERNION)):
         turned, chord = _poses(log)
@@ -185,18 +184,15 @@ def _in_units(recording: Recording) -> list[Finding]:
     return []
 
 
-def _jumps(log: Log, name: str, turned: FloatArray) -> list[Finding]:
+def _jumps(log: Log, name: str, turned: FloatArray) -> Iterator[Finding]:
     step = np.linalg.norm(np.diff(turned, axis=0), axis=1)
     far = np.nonzero(step > _JUMP_RAD)[0]
-    if not len(far):
-        return []
-    return [
-        Finding(
+    if len(far):
+        yield Finding(
             "remark",
             f"{name}, line {log.lines[far[0] + 1]}: motion capture jumps by "
             f"{math.degrees(step[far[0]]):.1f} deg from one sample to the next; {len(far)} such jumps in all",
         )
-    ]
 
 
 def frame_of(recordings: Sequence[Recording]) -> Frame:
@@ -240,44 +236,33 @@ def frame_of(recordings: Sequence[Recording]) -> Frame:
     return Frame(axis, conjugated, abs(float(leans)), planar, straight / np.linalg.norm(straight))
 
 
-def frame_findings(frame: Frame) -> list[Finding]:
+def frame_findings(frame: Frame) -> Iterator[Finding]:
     """What the poses show of the arm and of the motion capture, in sentences."""
     if frame.axis is None or frame.direction is None:
-        return []
+        return
     x, y, z = frame.axis
     u, v, w = frame.direction
-    said = [
-        Finding(
-            "remark",
-            f"bends about ({x:z.2f}, {y:z.2f}, {z:z.2f}) of the base, straight it points along "
-            f"({u:z.2f}, {v:z.2f}, {w:z.2f}); the chord turns by {frame.leans:.2f} of the tip's angle",
-        )
-    ]
+    yield Finding(
+        "remark",
+        f"bends about ({x:z.2f}, {y:z.2f}, {z:z.2f}) of the base, straight it points along "
+        f"({u:z.2f}, {v:z.2f}, {w:z.2f}); the chord turns by {frame.leans:.2f} of the tip's angle",
+    )
+    stands = f"the axis of bending stands {frame.planar_deg:.0f} deg off the normal of the tip's path"
     if math.radians(frame.planar_deg) > _NO_PLANE_RAD:
-        said.append(
-            Finding(
-                "inconsistent",
-                f"the axis of bending stands {frame.planar_deg:.0f} deg off the normal of the tip's path",
-                "look at the order of the quaternions, w first, and at the axes of base and tip",
-            )
-        )
+        advice = "look at the order of the quaternions, w first, and at the axes of base and tip"
+        yield Finding("inconsistent", stands, advice)
     elif math.radians(frame.planar_deg) > _TILTED_RAD:
-        said.append(
-            Finding(
-                "remark",
-                f"the axis of bending stands {frame.planar_deg:.0f} deg off the normal of the tip's path: "
-                "the tip's marker twists or base and world are tilted; the angle is the part about the axis",
-            )
+        yield Finding(
+            "remark",
+            f"{stands}: the tip's marker twists or base and world are tilted; the angle is the part about "
+            "the axis",
         )
     if frame.conjugated:
-        said.append(
-            Finding(
-                "remark",
-                "the tip turns against its chord: quaternions look conjugated (world to body); the angle is "
-                "counted as it grows with bending",
-            )
+        yield Finding(
+            "remark",
+            "the tip turns against its chord: quaternions look conjugated (world to body); the angle is "
+            "counted as it grows with bending",
         )
-    return said
 
 
 def trial_of(recording: Recording, frame: Frame, day: str, load_kg: float) -> Trial:

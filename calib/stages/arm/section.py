@@ -7,7 +7,7 @@ from typing import Any, Literal
 from pydantic import model_validator
 
 from calib.core.result import NotNegative, Number, Positive, Result, Row3, Section, Sigma, quantity
-from calib.stages.arm.model import DAILY, PARAMETERS, PARTS, Assembly, values_on
+from calib.stages.arm.model import DAILY, DRIVES, PARAMETERS, PARTS, Assembly, values_on
 
 _AT_ONCE_S = 1e-4
 """Input of a valve in files of earlier versions, which knew none."""
@@ -75,9 +75,8 @@ class Arm(Result):
         needed = [part.name for part in PARTS if not part.off and not part.drives]
         if any(one not in known for one in self.parts) or any(one not in self.parts for one in needed):
             raise ValueError(f"expected parts of {', '.join(known)}, with {', '.join(needed)}")
-        drives = [part.name for part in PARTS if part.drives]
-        if sum(one in drives for one in self.parts) != 1:
-            raise ValueError(f"expected one part of {' and '.join(drives)}")
+        if sum(one in DRIVES for one in self.parts) != 1:
+            raise ValueError(f"expected one part of {' and '.join(DRIVES)}")
         if set(self.parameters) != set(self.assembly.names):
             raise ValueError("expected the parameters of its parts, all of them")
         strange = {name for day in self.days.values() for name in day} - set(DAILY)

@@ -197,13 +197,14 @@ def _far(found: Identification) -> Iterator[Finding]:
     errors = {name: one["angle_rad"] for name, one in found.held.items()}
     for name, error in errors.items():
         others = sorted(x for n, x in errors.items() if n != name and math.isfinite(x))
-        if len(others) < _FEWEST - 1 or error - others[len(others) // 2] < _LEAST_RAD:
+        if len(others) < _FEWEST - 1:
             continue
-        if error > _FAR * others[len(others) // 2]:
+        usual = others[len(others) // 2]
+        if error - usual >= _LEAST_RAD and error > _FAR * usual:
             yield Finding(
                 "poor",
                 f"{name} is predicted to {math.degrees(error):.1f} deg from the others, which reach "
-                f"{math.degrees(others[len(others) // 2]):.1f} deg: it alone holds its day, load or range",
+                f"{math.degrees(usual):.1f} deg: it alone holds its day, load or range",
                 f"record another trial like {name}",
             )
 
@@ -265,16 +266,15 @@ def _words(arm: Arm) -> list[Block]:
     def cell(error: float) -> str:
         return BLANK if math.isnan(error) else f"{error:.2f}"
 
-    models = {"assembly": found.held, **found.others} if found.held else {}
     for name, of in QUANTITIES.items():
-        if models and math.isfinite(mean_of(found.held, name)):
+        if math.isfinite(mean_of(found.held, name)):
             table = [
                 (
                     model,
                     *(cell(of.scale * one[name]) for one in errors.values()),
                     cell(of.scale * mean_of(errors, name)),
                 )
-                for model, errors in models.items()
+                for model, errors in found.models.items()
             ]
             title = f"held trials, {of.title} RMS"
             blocks.append(Table(("model", *found.held, "mean"), tuple(table), title))
@@ -292,7 +292,7 @@ def _document(arm: Arm) -> dict[str, Any]:
                 trial: {name: finite_or_none(one[name]) for name in QUANTITIES}
                 for trial, one in errors.items()
             }
-            for model, errors in {"assembly": found.held, **found.others}.items()
+            for model, errors in found.models.items()
         },
         "next": {kind: dict(left) for kind, left in found.prospects.items()},
     }

@@ -177,18 +177,21 @@ class Reference:
             x, y = a * P, b * P
         return x, y
 
+    def on_plane(self, u: float, v: float) -> tuple[float, float, float]:
+        """X W, Y W and W [1/m] of a pixel's place in the plane (2.11)."""
+        stem, c = "PLANE_RAW", self.c
+        if self.undistort:
+            stem, (u, v) = "PLANE_NORMALISED", self.undistorted(u, v)
+        X, Y, W = (c[f"{stem}_{i}1"] * u + c[f"{stem}_{i}2"] * v + c[f"{stem}_{i}3"] for i in (1, 2, 3))
+        return X, Y, W
+
     def _marker(self, given: Inputs) -> tuple[int, bool]:
         c, m, flags = self.c, self.memory, MARKER_HELD
         u, v = given.u_px, given.v_px
         inside = c["HAS_PLANE"] and -0.5 <= u <= c["CAMERA_GREATEST_U_PX"]
         if given.marker_seen and inside and -0.5 <= v <= c["CAMERA_GREATEST_V_PX"]:
-            stem, least = ("PLANE_NORMALISED", "PLANE_LEAST_PER_M")
-            if self.undistort:
-                x, y = self.undistorted(u, v)
-            else:
-                stem, least, x, y = "PLANE_RAW", "PLANE_RAW_LEAST_PER_M", u, v
-            X, Y, W = (c[f"{stem}_{i}1"] * x + c[f"{stem}_{i}2"] * y + c[f"{stem}_{i}3"] for i in (1, 2, 3))
-            if c[least] < W:
+            X, Y, W = self.on_plane(u, v)
+            if c["PLANE_LEAST_PER_M" if self.undistort else "PLANE_RAW_LEAST_PER_M"] < W:
                 m.marker, flags = (X / W, Y / W), 0
             else:
                 flags = MARKER_HELD | HORIZON
@@ -364,7 +367,8 @@ class _Fused:
         self.chord += more
 
 
-def _sinc(h: float) -> float:
+def sinc(h: float) -> float:
+    """sin h / h, the chord over the arc at twice the angle."""
     return math.sin(h) / h if h else 1.0
 
 
@@ -426,7 +430,7 @@ class FusedReference(Reference):
         X, Y = m.marker
         across, along = X * ch - (Y + d) * sh, X * sh + (Y - d) * ch
         if afresh or f.rejected >= c["FUSED_PATIENCE"]:
-            f.chord, f.length, f.rate, f.slow, f.rejected = along, along / _sinc(0.5 * then), 0.0, 0.0, 0
+            f.chord, f.length, f.rate, f.slow, f.rejected = along, along / sinc(0.5 * then), 0.0, 0.0, 0
             f.boost, f.moving = int(c["FUSED_BOOST_TICKS"]), int(c["FUSED_MOVING_TICKS"])
         e = along - f.chord
         if f.boost:
@@ -476,7 +480,7 @@ class FusedReference(Reference):
             pull = B * math.cos(then) - A * math.sin(then) - whole * (m.phi - then)
             correction = clip(pull, whole)
         f.length += f.rate
-        f.chord = _sinc(0.5 * then) * (f.length - c["FUSED_DELAY_TICKS"] * f.rate)
+        f.chord = sinc(0.5 * then) * (f.length - c["FUSED_DELAY_TICKS"] * f.rate)
         if flags & MARKER_HELD:
             f.rate *= c["FUSED_RATE_DECAY"]
         else:

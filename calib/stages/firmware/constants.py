@@ -34,6 +34,7 @@ from calib.stages.estimator.constant_gain import (
     design,
 )
 from calib.stages.estimator.section import EstimatorGain
+from calib.stages.estimator.sensors import GRAVITY_MPS2
 from calib.stages.firmware.section import Envelope
 from calib.stages.imu.levelling import Levelling, settled
 from calib.stages.imu.levelling import gains as gains_of
@@ -171,11 +172,8 @@ def plane_constants(rig: Rig, source: str) -> PlaneConstants | None:
         error = float(np.abs(back[:, :2] / back[:, 2:] - grid[inside]).max())
     right = np.eye(3)
     if rig.align is not None:
-        shrink, (x, y), (across, along) = (
-            1.0 / (1.0 + rig.align.plane_stretch),
-            MIDDLE_M,
-            rig.align.plane_shift_m,
-        )
+        shrink, (across, along) = 1.0 / (1.0 + rig.align.plane_stretch), rig.align.plane_shift_m
+        x, y = MIDDLE_M
         right[:2] = [[shrink, 0.0, x - shrink * (x + across)], [0.0, shrink, y - shrink * (y + along)]]
     return PlaneConstants(
         right @ ideal,
@@ -409,7 +407,6 @@ def _envelope(
 # of a picture in ticks.
 
 _WEAK_MPS2 = 1.0
-_GRAVITY_MPS2 = 9.81
 
 
 def _designed(lookup: Lookup, rate_hz: float, delay: float, plane: PlaneConstants, rest: float) -> Gains:
@@ -425,7 +422,7 @@ def _designed(lookup: Lookup, rate_hz: float, delay: float, plane: PlaneConstant
     reach = 0.5 * rest + lookup.number("align.imu_lever_m", 0.0)
     shaken = math.hypot(lookup.number("align.accel_noise_mps2.0", 0.0), SHAKING_RADPS2 * reach)
     gyro = lookup.number("align.gyro_noise_radps", 0.0)
-    noise = TickNoise(float(across) / lever, float(along), gyro, shaken / _GRAVITY_MPS2)
+    noise = TickNoise(float(across) / lever, float(along), gyro, shaken / GRAVITY_MPS2)
     return design(noise, rate_hz, delay / rate_hz, lever)
 
 
@@ -453,7 +450,7 @@ def _fused(
         gain, source = _designed(lookup, rate_hz, delay, plane, rest), "Gains for the noise in align."
         if tuned is not None:
             source += " Those of estimator.constant_gain are for another tick."
-    k = gain.accel_phi / _GRAVITY_MPS2
+    k = gain.accel_phi / GRAVITY_MPS2
     ca, sa = k * math.cos(imu["mount"]), k * math.sin(imu["mount"])
     rows = np.array([[ca, sa], [-sa, ca]]) / imu["scales"]
     return {

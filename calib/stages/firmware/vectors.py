@@ -11,7 +11,8 @@ import numpy as np
 
 from calib.core.errors import BadInputError
 from calib.io.serial import MODE_OFF, MODE_ORIENTATION, MODE_POSITION, Inputs, Outputs
-from calib.stages.firmware.conformance import MARKER_HELD, Reference, binary32, reference_of
+from calib.stages.estimator.sensors import GRAVITY_MPS2
+from calib.stages.firmware.conformance import MARKER_HELD, Reference, binary32, reference_of, sinc
 
 # ----------------------------------------------------------------------
 # Golden vectors: a short run that drives every constant, with what the reference makes of it.
@@ -68,8 +69,8 @@ def directed(constants: Mapping[str, float], ticks: int) -> list[Inputs]:
         given = Inputs(
             u_px=0.5 * width * (1.0 + 0.8 * math.cos(2.0 * turn)),
             v_px=0.5 * height * (1.0 + 0.8 * math.sin(3.0 * turn)),
-            ax_mps2=9.81 * math.cos(felt + mount) + 0.8 * math.sin(11.0 * turn),
-            ay_mps2=9.81 * math.sin(felt + mount) + 0.8 * math.cos(13.0 * turn),
+            ax_mps2=GRAVITY_MPS2 * math.cos(felt + mount) + 0.8 * math.sin(11.0 * turn),
+            ay_mps2=GRAVITY_MPS2 * math.sin(felt + mount) + 0.8 * math.cos(13.0 * turn),
             gz_radps=bias + 2.5 * math.sin(7.0 * turn),
             reference=reference,
             mode=mode,
@@ -240,10 +241,7 @@ def pixel_of(
     c = reference.c
 
     def place(u: float, v: float) -> np.ndarray:
-        stem, (x, y) = ("PLANE_RAW", (u, v))
-        if reference.undistort:
-            stem, (x, y) = "PLANE_NORMALISED", reference.undistorted(u, v)
-        a, b, w = (c[f"{stem}_{i}1"] * x + c[f"{stem}_{i}2"] * y + c[f"{stem}_{i}3"] for i in (1, 2, 3))
+        a, b, w = reference.on_plane(u, v)
         return np.array([a / w - X, b / w - Y])
 
     u, v = near or (0.5 * c["CAMERA_GREATEST_U_PX"], 0.5 * c["CAMERA_GREATEST_V_PX"])
@@ -312,7 +310,7 @@ def coherent(
     last: tuple[float, float] | None = None
     for k in range(ticks):
         phi, length = motion.at(k - c["FUSED_DELAY_TICKS"])
-        chord = length * (math.sin(0.5 * phi) / (0.5 * phi) if phi else 1.0)
+        chord = length * sinc(0.5 * phi)
         X = chord * math.sin(0.5 * phi) + d * math.sin(phi)
         Y = chord * math.cos(0.5 * phi) + d * math.cos(phi)
         u, v = last = pixel_of(reference, X, Y, last)

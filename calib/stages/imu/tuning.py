@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -215,14 +216,16 @@ class Candidate:
     ----------
     name : "3/3", "tuned", "riccati" or "levelling".
     gains : those that would be used.
-    rmse_rad, low_rad, high_rad : held-out error and its 95 % interval.
-    less_rad, less_low_rad, less_high_rad : error less that of 3/3, and its 95 % interval.
-    confidence : share of the resamples in which it is less, NaN where nothing was judged.
     whole_rad : error of `gains` on the whole logs, which for "tuned" they were tuned on.
+    rmse_rad, low_rad, high_rad : held-out error and its 95 % interval; this and the rest are NaN where
+        nothing was judged.
+    less_rad, less_low_rad, less_high_rad : error less that of 3/3, and its 95 % interval.
+    confidence : share of the resamples in which it is less.
     """
 
     name: str
     gains: AngleFilter
+    whole_rad: float = math.nan
     rmse_rad: float = math.nan
     low_rad: float = math.nan
     high_rad: float = math.nan
@@ -230,22 +233,11 @@ class Candidate:
     less_low_rad: float = math.nan
     less_high_rad: float = math.nan
     confidence: float = math.nan
-    whole_rad: float = math.nan
 
     @property
     def wins(self) -> bool:
         """Whether its error is less than that of 3/3 with 95 %."""
         return self.confidence >= CONFIDENCE
-
-
-@dataclass(frozen=True)
-class Row:
-    """A filter's held-out errors (n_i,) in each log, NaN where not judged, and its error on the whole."""
-
-    name: str
-    gains: AngleFilter
-    errors_rad: Sequence[FloatArray]
-    whole_rad: float
 
 
 def _block_sums(errors: Sequence[FloatArray], size: int) -> tuple[FloatArray, FloatArray]:
@@ -280,37 +272,36 @@ def rms(errors: Sequence[FloatArray]) -> float:
     return math.sqrt(float(np.nanmean(whole**2)))
 
 
-def compared(rows: Sequence[Row], dt_s: float) -> tuple[tuple[Candidate, ...], float]:
-    """Candidates of held-out errors, and the length of the bootstrap's blocks [s]; 3/3 comes first.
+def compared(
+    candidates: Sequence[Candidate], errors_rad: Sequence[Sequence[FloatArray]], dt_s: float
+) -> tuple[tuple[Candidate, ...], float]:
+    """Candidates with their held-out errors, and the length of the bootstrap's blocks [s].
 
     Parameters
     ----------
-    rows : all with errors of the same samples.
+    candidates : 3/3 first.
+    errors_rad : of each candidate those (n_i,) in each log, NaN where not judged, all of the same samples.
     """
-    judged_s = dt_s * sum(int(np.isfinite(errors).sum()) for errors in rows[0].errors_rad)
+    judged_s = dt_s * sum(int(np.isfinite(errors).sum()) for errors in errors_rad[0])
     size = max(round(max(_FINEST_S, judged_s / _MOST_BLOCKS) / dt_s), 1)
     block_s = min(max(judged_s / 10.0, 2.0), 60.0)
-    tables = [_block_sums(row.errors_rad, size) for row in rows]
+    tables = [_block_sums(errors, size) for errors in errors_rad]
     length = min(max(round(block_s / (size * dt_s)), 1), len(tables[0][0]))
     at = _resampled(len(tables[0][0]), length)
     drawn = [
         np.sqrt(total[at].sum(axis=1) / np.maximum(count[at].sum(axis=1), 1.0)) for total, count in tables
     ]
-    base, wide = rms(rows[0].errors_rad), _widening(len(tables[0][0]) / length)
+    base, wide = rms(errors_rad[0]), _widening(len(tables[0][0]) / length)
     out = []
-    for row, draws in zip(rows, drawn, strict=True):
-        rmse = rms(row.errors_rad)
+    for one, errors, draws in zip(candidates, errors_rad, drawn, strict=True):
+        rmse = rms(errors)
         off = wide * (np.log(np.maximum(draws, 1e-300)) - math.log(max(rmse, 1e-300)))
         high, low = (rmse * np.exp(-np.quantile(off, [0.025, 0.975]))).tolist()
         less = rmse - base
         apart = less + wide * (draws - drawn[0] - less)
-        less_low, less_high = np.quantile(apart, [0.025, 0.975]).tolist()
-        confidence = float((apart < 0.0).mean())
-        out.append(
-            Candidate(
-                row.name, row.gains, rmse, low, high, less, less_low, less_high, confidence, row.whole_rad
-            )
-        )
+        less_interval = np.quantile(apart, [0.025, 0.975]).tolist()
+        judged = (rmse, low, high, less, *less_interval, float((apart < 0.0).mean()))
+        out.append(Candidate(one.name, one.gains, one.whole_rad, *judged))
     return tuple(out), block_s
 
 
@@ -763,9 +754,8 @@ def _search(judged: Sequence[_Judged], dt_s: float, parts: int) -> tuple[Mahony,
                 float(np.clip(at.Kp * step_k**i, K[0], K[-1])),
                 float(np.clip(zeta * step_z**j, Z[0], Z[-1])),
             )
-            for i in (-1, 0, 1)
-            for j in (-1, 0, 1)
-            if (i, j) != (0, 0)
+            for i, j in product((-1, 0, 1), repeat=2)
+            if i or j
         ]
         tried += more
         sums = np.concatenate([sums, _sums(judged, more, parts)])
@@ -776,13 +766,10 @@ def _crossed(judged: Sequence[_Judged], filters: Sequence[AngleFilter]) -> list[
     """Errors of each log, in each part those of the filter that has not seen it."""
     out = []
     for one in judged:
-        runs = {filters[k]: one.errors(filters[k]) for k in np.unique(one.part).tolist()}
-        out.append(
-            np.select(
-                [one.part == k for k in range(len(filters)) if filters[k] in runs],
-                [runs[f] for f in filters if f in runs],
-            )
-        )
+        errors = np.empty(len(one.part))
+        for k in np.unique(one.part).tolist():
+            errors[one.part == k] = one.errors(filters[k])[one.part == k]
+        out.append(errors)
     return out
 
 
@@ -868,17 +855,17 @@ def tune(pieces: Sequence[Piece], sensor: Noise) -> Tuning:
         tried = [Levelling(tau, v) for tau in _TAU_S if tau >= 2.0 * dt_s for v in _VELOCITY_MPS]
         levelling, levelling_held_out = _best(tried, _sums(judged, tried, parts), _least)
 
-        def row(name: str, gains: AngleFilter, held_out: Sequence[AngleFilter] = ()) -> Row:
-            errors = [one.errors(gains) for one in judged]
-            return Row(name, gains, _crossed(judged, held_out) if held_out else errors, rms(errors))
-
-        rows = [
-            row("3/3", THREE),
-            row("tuned", tuned, held_out),
-            row("riccati", settled),
-            row("levelling", levelling, levelling_held_out),
-        ]
-        candidates, block_s = compared(rows, dt_s)
+        rivals, errors = [], []
+        for name, gains, crossed in (
+            ("3/3", THREE, ()),
+            ("tuned", tuned, held_out),
+            ("riccati", settled, ()),
+            ("levelling", levelling, levelling_held_out),
+        ):
+            whole = [one.errors(gains) for one in judged]
+            rivals.append(Candidate(name, gains, rms(whole)))
+            errors.append(_crossed(judged, crossed) if crossed else whole)
+        candidates, block_s = compared(rivals, errors, dt_s)
         recommended, why = _recommended(candidates, judge)
     return Tuning(
         judge, candidates, recommended, (*reasons, *why), held_out, surface, smoothed, noise, tuple(offsets),
@@ -1200,8 +1187,7 @@ def _filter_log(log: TuneLog, result: Tuning, first: int) -> FilterLog:
 
 def _of_tuning(result: Tuning, logs: Sequence[TuneLog], tilted: bool) -> Iterator[Finding]:
     """What is to be known of the gains, and of the logs that they are from."""
-    pieces = [piece for log in logs for piece in log.pieces]
-    yield from contradictions(pieces, result)
+    yield from contradictions([piece for log in logs for piece in log.pieces], result)
     gains, base = result.recommended.gains, result.candidates[0]
     if isinstance(gains, Mahony) and gains.Kp < 2.0 * _RINGS * math.sqrt(gains.Ki):
         yield Finding(

@@ -816,7 +816,7 @@ class Positions:
     Attributes
     ----------
     source : name for messages.
-    unit : "m" on the plane where the rig has one, "px" otherwise.
+    unit : "m" on the plane where the rig has one, "px" otherwise. scale : to that of the file, mm or px.
     names : of the two coordinates.
     rate_hz : of the log.
     ticks : the coordinates (n, 2).
@@ -831,3 +831,8 @@ class Positions:
     ticks: Ticks
     pixels: Ticks
     spectra: tuple[Spectrum, Spectrum]
+
+    @property
+    def scale(self) -> float:
+        """See above."""
+        return 1e3 if self.unit == "m" else 1.0

@@ -102,8 +102,8 @@ def _on_log(filter_: Filter, section: LowPass, positions: Positions, design: str
         f"{number(section.dc_delay_s, 's')} late and starts without a transient."
     )
     piece = positions.ticks.longest
-    scale = 1e3 if positions.unit == "m" else 1.0
-    window = log_window(piece.t_s, piece.values)
+    scale = positions.scale
+    window = _window(piece.t_s, piece.values)
     t, before = piece.t_s[window], scale * piece.values[window]
     after = scale * filter_signal(filter_.sections, piece.values)[window]
     panels = []
@@ -117,11 +117,11 @@ def _on_log(filter_: Filter, section: LowPass, positions: Positions, design: str
     return Figure(title, note, panels, 6.2, section.verdict.word, columns=2, widths=(1.75, 1.0))
 
 
-def log_window(t_s: FloatArray, values: FloatArray, length_s: float = _WINDOW_S) -> slice:
-    """The window of a length [s] in which coordinates (n, 2) reach farthest, in half-window steps."""
-    if t_s[-1] - t_s[0] <= 1.25 * length_s:
+def _window(t_s: FloatArray, values: FloatArray) -> slice:
+    """The window in which coordinates (n, 2) reach farthest, in half-window steps."""
+    if t_s[-1] - t_s[0] <= 1.25 * _WINDOW_S:
         return slice(0, len(t_s))
-    count = int(np.searchsorted(t_s, t_s[0] + length_s))
+    count = int(np.searchsorted(t_s, t_s[0] + _WINDOW_S))
     starts = range(0, len(t_s) - count + 1, max(1, count // 2))
     best = max(starts, key=lambda i: float(np.ptp(values[i : i + count], axis=0).max()))
     return slice(best, best + count)
@@ -142,8 +142,6 @@ def _spectrum(of: Spectrum, filter_: Filter, scale: float, name: str, unit: str)
     ]
     if of.motion_hz > 0.0:
         marks.append(Rule("x", of.motion_hz, "ink", "dotted"))
-    title, limits = (
-        "Spectrum; green: jitter's floor",
-        (max(1e-3 * float(np.median(whole)), 1e-7 * top), 2.0 * top),
-    )
-    return Plot("frequency (Hz)", f"{unit} per root Hz", marks, title, y_limits=limits, log="xy")
+    x, y, title = "frequency (Hz)", f"{unit} per root Hz", "Spectrum; green: jitter's floor"
+    limits = max(1e-3 * float(np.median(whole)), 1e-7 * top), 2.0 * top
+    return Plot(x, y, marks, title, y_limits=limits, log="xy")

@@ -224,7 +224,10 @@ def solve(inputs: Inputs) -> LowPass:
     band = np.linspace(0.0, design.cutoff_hz, 201)
     largest = max(abs(value) for value in inputs.workspace_m)
     float_mm = 1e3 * largest * filters.rest_error_binary32(made)
-    verdict = Verdict.of([*_of_rounding(made, rounded, float_mm), *_of_log(made, positions)])
+    log = None if positions is None else _log_section(made, positions)
+    findings = [*_of_rounding(made, rounded, float_mm)]
+    if positions is not None and log is not None:
+        findings += _of_log(log, positions)
     return LowPass(
         family=cast("Family", design.family),
         order=design.order,
@@ -240,15 +243,10 @@ def solve(inputs: Inputs) -> LowPass:
         attenuation_db={f"{c:.4g}Hz": gain for c, gain in zip(f, gains.tolist(), strict=True)},
         noise_gain=filters.noise_gain(sections),
         dead_band_mm={"float": float_mm},
-        wanted_jitter=wanted if wanted is None or _scale(positions) == 1.0 else 1e3 * wanted,
-        log=None if positions is None else _log_section(made, positions),
-        **judged(verdict),
+        wanted_jitter=wanted if wanted is None or positions is None else positions.scale * wanted,
+        log=log,
+        **judged(Verdict.of(findings)),
     ).with_evidence(Evidence(made, positions, choice))
-
-
-def _scale(positions: Positions | None) -> float:
-    """What the positions' unit is multiplied by for the file's."""
-    return 1.0 if positions is None or positions.unit == "px" else 1e3
 
 
 def _log_section(made: Filter, positions: Positions) -> LowPassLog:
@@ -257,7 +255,7 @@ def _log_section(made: Filter, positions: Positions) -> LowPassLog:
     from calib.stages.lowpass import filters
     from calib.stages.lowpass.section import LowPassAxis, LowPassLog
 
-    scale, ticks = _scale(positions), positions.ticks
+    scale, ticks = positions.scale, positions.ticks
     delay_s = filters.dc_delay_s(made.sections, ticks.rate_hz)
     axes = {}
     for i, (name, of) in enumerate(zip(positions.names, positions.spectra, strict=True)):
@@ -300,41 +298,34 @@ def _of_rounding(made: Filter, rounded_hz: float, float_mm: float) -> Iterator[F
         yield Finding("poor", f"In single precision the output comes to rest up to {float_mm:.2g} mm away.")
 
 
-def _of_log(made: Filter, positions: Positions | None) -> Iterator[Finding]:
+def _of_log(log: LowPassLog, positions: Positions) -> Iterator[Finding]:
     """Findings on what the filter does to a log."""
-    from calib.stages.lowpass.filters import dc_delay_s, motion_lost
-
-    if positions is None:
-        return
-    spectra, ticks = positions.spectra, positions.ticks
-    unsure = [name for name, of in zip(positions.names, spectra, strict=True) if not of.flat]
+    unsure = [name for name, of in zip(positions.names, positions.spectra, strict=True) if not of.flat]
     if unsure:
         yield Finding(
             "poor",
             f"The spectrum of {' and '.join(unsure)} does not fall to a floor: motion and jitter cannot "
             "be told apart; use a log at rest.",
         )
-    delay_s = dc_delay_s(made.sections, made.design.rate_hz)
-    changed = max(motion_lost(of, made.sections, delay_s) for of in spectra)
+    changed = max(axis.motion_changed for axis in log.axes.values())
     if changed > _TOO_MUCH_CHANGED:
         yield Finding(
             "remark",
             f"{changed:.0%} of this log's motion does not come through unchanged; it reaches "
-            f"{max(of.motion_hz for of in spectra):.3g} Hz.",
+            f"{max(axis.motion_hz for axis in log.axes.values()):.3g} Hz.",
         )
-    outliers = max(of.outliers for of in spectra)
+    outliers = max(of.outliers for of in positions.spectra)
     if outliers:
         yield Finding(
             "remark",
             f"{outliers} outliers are not counted as jitter; the filter passes them on, smeared out.",
         )
-    total = sum(len(piece.t_s) for piece in ticks.pieces)
-    if ticks.held > 0.05 * total:
+    if log.held > 0.05 * log.ticks:
         yield Finding(
-            "remark", f"{ticks.held} of {total} ticks have no sample of their own and hold the one before."
+            "remark", f"{log.held} of {log.ticks} ticks have no sample of their own and hold the one before."
         )
-    if len(ticks.pieces) > 1:
-        yield Finding("remark", f"Gaps split the log into {len(ticks.pieces)} pieces; the longest was used.")
+    if log.pieces > 1:
+        yield Finding("remark", f"Gaps split the log into {log.pieces} pieces; the longest was used.")
 
 
 def _words(result: LowPass) -> list[Block]:
