@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.core.errors import BadInputError
-from calib.core.rig import Geometry, Rig
+from calib.core.rig import Rig
 from calib.io.logs import Log
 from calib.stages.align.solve import AlignLog, Settings
 from calib.stages.estimator.noise import grid_px
@@ -93,7 +93,7 @@ def settings_from_rig(
     plane = rig.current_plane(path)
     assert rig.camera is not None
     assert plane is not None
-    x0, y0, x1, y1 = (rig.geometry or Geometry()).workspace_m
+    x0, y0, x1, y1 = rig.workspace_m
     view = view_coefficients(
         rig.camera.optics,
         np.array(plane.R_CW),

@@ -323,7 +323,6 @@ class PlaneEvidence:
 
 def _read_plane(files: Files, rig: Rig, options: NoOptions) -> PlaneInputs:
     from calib.core.files import shown
-    from calib.core.rig import Geometry
     from calib.io.pictures import list_pictures
     from calib.stages.camera.model import View
     from calib.stages.camera.plane import settle_orientation, world_points_m
@@ -367,7 +366,7 @@ def _read_plane(files: Files, rig: Rig, options: NoOptions) -> PlaneInputs:
         kept = slice(None) if view.measured is None else placed.reordered(view.measured, search.board)
         views.append(View(view.name, world_m[kept], placed.pixels[kept]))
         orientation.append(f"{view.name}: {placed.how}")
-    x0, y0, x1, y1 = (rig.geometry or Geometry()).workspace_m
+    x0, y0, x1, y1 = rig.workspace_m
     files.hashes |= {**search.hashes, **board_hash, **rig.identities("camera")}
     return PlaneInputs(
         rig.camera, views, (x0, y0, x1, y1), tuple(orientation), search.left_out, stated.simulated
@@ -509,7 +508,6 @@ class LensInputs:
 def _read_lens(files: Files, rig: Rig, options: LensOptions) -> LensInputs:
     import numpy as np
 
-    from calib.core.rig import Geometry
     from calib.stages.camera.lens import PlaneView
 
     assert rig.camera is not None
@@ -517,7 +515,7 @@ def _read_lens(files: Files, rig: Rig, options: LensOptions) -> LensInputs:
     view = None
     current = rig.current_plane(files.rig_path)
     if current is not None:
-        x0, y0, x1, y1 = (rig.geometry or Geometry()).workspace_m
+        x0, y0, x1, y1 = rig.workspace_m
         sigma_mm = current.sigma_marker_mm.get("calibration_max")
         view = PlaneView(np.array(current.R_CW), np.array(current.t_CW_m), (x0, y0, x1, y1), sigma_mm)
     if not rig.camera.verdict.ok:

@@ -58,15 +58,14 @@ def _wanted(
     plant: Path | None = None,
 ) -> tuple[SimulatedRig, Model, Reference]:
     """The machine, what controllers know of it, and the reference that was named."""
-    from calib.core.rig import Geometry, Rig
+    from calib.core.rig import Rig
     from calib.stages.control.read import wanted_reference
     from calib.stages.control.references import check_workspace
     from calib.stages.control.trial import controlled
 
     machine, model = controlled(rig, limits, None if plant is None else Rig.load(plant))
     wanted = wanted_reference(str(files.paths[0]), model, duration_s, rig, files.rig_path)
-    x0, y0, x1, y1 = (rig.geometry or Geometry()).workspace_m
-    check_workspace(model, wanted, (x0, y0, x1, y1))
+    check_workspace(model, wanted, rig.workspace_m)
     return machine, model, wanted
 
 

@@ -14,7 +14,7 @@ from calib.core.errors import BadInputError
 from calib.core.files import shown
 from calib.core.options import LogOptions
 from calib.core.result import CovarianceTable
-from calib.core.rig import Geometry, Rig
+from calib.core.rig import Rig
 from calib.io.logs import Log, iter_log, refuse_counts
 from calib.solve.clock import time_axis
 from calib.stages.actuator.section import Standing
@@ -321,7 +321,7 @@ def setup_from_rig(rig: Rig, path: Path, found: Periods) -> tuple[Setup, list[st
     """
     source = shown(path)
     said: list[str] = []
-    workspace = (rig.geometry or Geometry()).workspace_m
+    workspace = rig.workspace_m
     view = np.zeros(25)
     if found.camera:
         plane = rig.current_plane(str(path))
@@ -354,7 +354,7 @@ def baseline_setup(setup: Setup, rig: Rig, path: Path, found: Periods) -> Baseli
     """The source's pipeline for the same rig, without what it does not know of."""
     if rig.camera is None or not found.camera:
         raise BadInputError(f"{shown(path)}: the baseline needs a camera, a plane, and pictures in the log")
-    x0, y0, x1, y1 = (rig.geometry or Geometry()).workspace_m
+    x0, y0, x1, y1 = rig.workspace_m
     width, height = rig.camera.image_size_px
     return BaselineSetup(
         undistorting_nothing(setup.view, (x0, y0, x1, y1), (width, height)),

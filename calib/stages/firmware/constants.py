@@ -142,13 +142,12 @@ def plane_constants(rig: Rig, source: str) -> PlaneConstants | None:
 
     Raises `BadInputError` for a workspace behind the camera.
     """
-    from calib.core.rig import Geometry
 
     known = rig.current_plane(source)
     if known is None or rig.camera is None:
         return None
     camera, R, t = rig.camera.optics, np.array(known.R_CW), np.array(known.t_CW_m)
-    x0, y0, x1, y1 = (rig.geometry or Geometry()).workspace_m
+    x0, y0, x1, y1 = rig.workspace_m
     grid = np.stack(np.meshgrid(np.linspace(x0, x1, 9), np.linspace(y0, y1, 7)), axis=-1).reshape(-1, 2)
     # The denominator is the reciprocal depth when A's depth is in metres.
     A_inverse = np.array(known.A_inverse)

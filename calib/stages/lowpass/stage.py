@@ -146,7 +146,6 @@ def positions_from_log(
 
 
 def _read(files: Files, rig: Rig, options: Options) -> Inputs:
-    from calib.core.rig import Geometry
     from calib.io.logs import read_log
     from calib.stages.lowpass.filters import Design, design_lowpass
 
@@ -183,7 +182,7 @@ def _read(files: Files, rig: Rig, options: Options) -> Inputs:
         raise UsageError(f"--jitter: {asked!r} does not fit positions in {has}")
     return Inputs(
         made,
-        (rig.geometry or Geometry()).workspace_m,
+        rig.workspace_m,
         suggest if options.log in (None, options.suggest) else positions(options.log),
         suggest,
         wanted,
