@@ -35,6 +35,8 @@ from calib.stages.estimator.driven import (
     Drive,
     DrivenFilter,
     Handover,
+    Model,
+    Switches,
     accelerations,
     blended,
     carry,
@@ -160,13 +162,15 @@ def test_two_wrong_samples_of_the_gyroscope_are_no_hand() -> None:
 
 
 def test_the_transition_over_a_release_is_that_of_the_whole_step() -> None:
-    plant, switches = Drive().numbers(), (np.array([-np.inf]), np.array([[1.5, 0.2]]))
+    switches = Switches(np.array([-np.inf]), np.array([[1.5, 0.2, 0.0, 0.0]]))
     x, x0, P0 = some_state(2), np.zeros(len(DRIVEN)), np.diag(np.full(len(DRIVEN), 1e-4))
+    model = Drive().model(setup_for(varied_drive(1)))
+    model = model._replace(x0=x0, P0=P0, walk=np.zeros(len(DRIVEN) + 1))
     x[10:12] = 0.3, -0.2
 
     def passed(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         y, P, F = x.copy(), P0.copy(), np.zeros((DYNAMIC, INVOLVED))
-        pass_on(y, P, 0.0, 0.01, 0.004, x0, P0, plant, np.zeros(len(DRIVEN)), *switches, 0, F, np.zeros(WORK))
+        pass_on(y, P, 0.0, 0.01, 0.004, model, switches, 0, F, np.zeros(WORK))
         return y, P, F
 
     y, P, F = passed(x)
@@ -358,43 +362,43 @@ def test_a_bias_of_the_innovations_takes_the_word_away_and_it_comes_back() -> No
     np.testing.assert_array_equal(halves, weight)
 
 
-def some(seed: int = 0) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """State, covariance, plant, view and noise."""
+def some(seed: int = 0) -> tuple[FloatArray, FloatArray, Model]:
+    """State, covariance, and what does not change."""
     setup, drive = setup_for(varied_drive(1)), Drive()
     x, P = drive.start(setup)
     rng = np.random.default_rng(seed)
     x[:4] = 0.3, 0.07, 2.0, 0.02
     x[4:12] = rng.uniform(0.0, 0.1, 8)
     P[:4, :4] = np.diag([1e-2, 1e-3, 1e-2, 1e-3]) ** 2
-    return x, P, drive.numbers(), setup.view, setup.noise
+    return x, P, drive.model(setup)
 
 
 @pytest.mark.parametrize("kind", [CAMERA, IMU])
 def test_gradients_agree_with_differences(kind: int) -> None:
-    x, P, plant, view, noise = some()
+    x, P, model = some()
     n, count = len(DRIVEN), 2 if kind == CAMERA else 3
     H, spare, out, work = np.zeros((3, n)), np.zeros((3, n)), np.zeros(n), np.zeros(WORK)
-    measure(kind, x, P, plant, view, noise, 0.0, H, out, work)
+    measure(kind, x, P, model, 0.0, H, out, work)
     for k in range(n):
         h = 1e-7 if DRIVEN[k].endswith("_m") else 1e-5
         above, below = np.zeros(n), np.zeros(n)
         for sign, to in ((1.0, above), (-1.0, below)):
             near = x.copy()
             near[k] += sign * h
-            measure(kind, near, P, plant, view, noise, 0.0, spare, to, work)
+            measure(kind, near, P, model, 0.0, spare, to, work)
         slope = (above[:count] - below[:count]) / (2.0 * h)
         np.testing.assert_allclose(H[:count, k], slope, rtol=2e-3, atol=2e-3)
 
 
 @pytest.mark.parametrize("kind", [CAMERA, IMU])
 def test_what_is_considered_stays_and_the_rest_learns(kind: int) -> None:
-    x, P, plant, view, noise = some()
+    x, P, model = some()
     before_x, before_P = x.copy(), P.copy()
     n = len(DRIVEN)
     out, H, work, report, gated = np.zeros(n), np.zeros((3, n)), np.zeros(WORK), np.empty(12), np.zeros(4)
-    measure(kind, x, P, plant, view, noise, 0.0, H, out, work)
+    measure(kind, x, P, model, 0.0, H, out, work)
     z = np.array([out[0] + 0.5, out[1] - 0.4, out[2] + 0.002, 0.0])
-    driven_event(x, P, kind, z, plant, view, noise, work, False, report, gated, np.empty((0, TRACE)))
+    driven_event(x, P, kind, z, model, work, False, report, gated, np.empty((0, TRACE)))
     held = [28, 29, 31, 32, 33]
     np.testing.assert_array_equal(x[held], before_x[held])
     np.testing.assert_array_equal(P[np.ix_(held, held)], before_P[np.ix_(held, held)])

@@ -564,13 +564,53 @@ class Drive:
         x[at], sigma[at] = 0.5 * apart, math.hypot(0.5 * apart, self.sigma[1])
         x[INVOLVED:] = begin.sensor
         # Pictures are put at their exposure, so that what is left of the offset is zero.
-        x[INVOLVED + 7] -= max(float(begin.sensor[7]), 0.0)
+        x[INVOLVED + 7] -= setup.delay_s
         P = np.diag(sigma**2)
         if self.covariance is not None:
             P[DYNAMIC:INVOLVED, DYNAMIC:INVOLVED] = self.covariance
             P[at, at] = sigma[at] ** 2
         P[INVOLVED:, INVOLVED:] = begin.covariance()[6:, 6:]
         return x, P
+
+    def model(self, setup: Setup) -> Model:
+        """All of it for the compiled functions."""
+        return Model(
+            *self.start(setup), self.numbers(), self.walk(setup), setup.view, self.noise(setup),
+            setup.bellows_radius_m, setup.delay_s, self.pump.delay_ticks * self.pump.tick_s,
+            setup.command_period_s, self.sigma[1],
+        )  # fmt: skip
+
+
+class Switches(NamedTuple):
+    """Times (n,) at which commands take effect, a ring, and what holds from each on (n, 4).
+
+    That are the static forces of both pumps and the squared densities of the walks of their lags.
+    """
+
+    t: FloatArray
+    g: FloatArray
+
+
+class Model(NamedTuple):
+    """What does not change: start (36,), (36, 36), plant (21,), walk, the camera's view, noise, and numbers.
+
+    Attributes
+    ----------
+    delay : of pictures [s]. action : how long after its tick a command acts [s]. period : as in `give`.
+    hoses_sigma : deviation of the logarithm of the damping once the hoses are on. radius : of a bellows [m].
+    """
+
+    x0: FloatArray
+    P0: FloatArray
+    plant: FloatArray
+    walk: FloatArray
+    camera: FloatArray
+    noise: FloatArray
+    radius: float
+    delay: float
+    action: float
+    period: float
+    hoses_sigma: float
 
 
 def commands(drive: Drive, pwm: FloatArray, held: FloatArray | None = None) -> FloatArray:
@@ -598,7 +638,8 @@ LONGEST_S = 0.02
 """Longer steps are taken in parts."""
 
 WORK = (26 + DYNAMIC + max(FLOW, CARRY) // SIZE_D, SIZE_D)
-"""Shape of the scratch: p, x0, gradients, terms, segments, accelerations, F P, what is learnt, and F."""
+"""Shape of the scratch: p, x0, gradients, terms, segments, accelerations, F P, a smoother's report and gates,
+what is learnt, and F."""
 
 TRACE = 2 * SIZE_D + 2
 """Length of what a reading leaves; the last number is 0 where there was none."""
@@ -640,9 +681,8 @@ def _consider(x: FloatArray, P: FloatArray, learnt: FloatArray) -> None:
 
 @kernel(arrays=False)
 def give(
-    switch_t: FloatArray, switch_g: FloatArray, last: int, when: float, force1: float, force2: float,
-    period: float, lag_s: float,
-) -> int:  # fmt: skip
+    switches: Switches, last: int, when: float, force1: float, force2: float, period: float, lag_s: float
+) -> int:
     """Let a command take effect after the newest in the ring; returns its place, where all before it holds.
 
     Where commands are missing between the two, as of rows that were dropped, any of those may have been the
@@ -651,9 +691,10 @@ def give(
 
     Parameters
     ----------
-    switch_t, switch_g : as in `cut`. when, force1, force2 : its time [s] and static forces [N].
+    when, force1, force2 : its time [s] and static forces [N].
     period : T [s] of commands, NaN where each holds until the next. lag_s : of the pumps.
     """
+    switch_t, switch_g = switches
     size, step = switch_t.shape[0], when - switch_t[last]
     missing = math.floor(step / period + 0.5) - 1.0 if period > 0.0 and step < LONGEST_GAP_S else 0.0
     if missing > 0.0:
@@ -672,20 +713,16 @@ def give(
 
 
 @kernel(arrays=False)
-def cut(
-    begin: float, end: float, switch_t: FloatArray, switch_g: FloatArray, last: int, segments: FloatArray
-) -> int:
+def cut(begin: float, end: float, switches: Switches, last: int, segments: FloatArray) -> int:
     """Segments of constant command between two times; returns their number.
 
     Parameters
     ----------
-    switch_t, switch_g : ring of the times at which commands take effect, and of their static forces with the
-        squared densities of the walks of both pumps' lags from then on.
-    segments : (`_MOST_SEGMENTS`, 5) durations, and what `switch_g` has.
+    segments : (`_MOST_SEGMENTS`, 5) durations, and what holds for so long.
     last : place of the newest. Before the oldest one the oldest holds.
     """
-    size = switch_t.shape[0]
-    back = 0
+    switch_t, switch_g = switches
+    size, back = switch_t.shape[0], 0
     while back < size - 1 and switch_t[(last - back) % size] > begin:
         back += 1
     count, now = 0, begin
@@ -707,8 +744,8 @@ def cut(
 
 @kernel(arrays=False)
 def predict_driven(
-    x: FloatArray, P: FloatArray, begin: float, end: float, plant: FloatArray, walk: FloatArray,
-    switch_t: FloatArray, switch_g: FloatArray, last: int, F: FloatArray, work: FloatArray,
+    x: FloatArray, P: FloatArray, begin: float, end: float, model: Model, switches: Switches, last: int,
+    F: FloatArray, work: FloatArray,
 ) -> None:  # fmt: skip
     """Carry a state on from one time to another, in place; F (12, 23) is that of the last part."""
     if not end > begin:
@@ -716,9 +753,9 @@ def predict_driven(
     parts = max(math.ceil((end - begin) / LONGEST_S - 1e-9), 1)
     h = (end - begin) / parts
     segments, moved = work[8:12].reshape(-1)[: 5 * _MOST_SEGMENTS].reshape(_MOST_SEGMENTS, 5), work[6]
-    flow = work[37:].reshape(-1)
+    plant, walk, flow = model.plant, model.walk, work[37:].reshape(-1)
     for k in range(parts):
-        count = cut(begin + k * h, begin + (k + 1) * h, switch_t, switch_g, last, segments)
+        count = cut(begin + k * h, begin + (k + 1) * h, switches, last, segments)
         jacobian(plant, x, segments, count, longest_step_s(plant, x), moved, F, flow)
         carry(P, F, walk, h, flow)
         for i in range(count):
@@ -744,26 +781,26 @@ def _spread_out(h: FloatArray, H: FloatArray) -> None:
 
 @kernel(arrays=False)
 def measure(
-    kind: int, x: FloatArray, P: FloatArray, plant: FloatArray, view: FloatArray, noise: FloatArray,
-    stamp: float, H: FloatArray, out: FloatArray, work: FloatArray,
+    kind: int, x: FloatArray, P: FloatArray, model: Model, stamp: float, H: FloatArray, out: FloatArray,
+    work: FloatArray,
 ) -> None:  # fmt: skip
     """Predicted readings out[0:3] and variances of their noise out[3:6]; H (3, 36) gets the gradients.
 
     `stamp` is the variance [s^2] of the event's time: what moves fast is not read where it was.
     """
-    state = work[0, :SIZE]
+    state, noise = work[0, :SIZE], model.noise
     state[0], state[1], state[2], state[3], state[4], state[5] = x[0], x[1], x[2], x[3], 0.0, 0.0
     for k in range(6, SIZE):
         state[k] = x[k + _SHIFT]
     h = work[6:8, :SIZE]
     h0, h1 = h[0], h[1]
     if kind == CAMERA:
-        camera_terms(view, noise, stamp, state, P, h, out)
+        camera_terms(model.camera, noise, stamp, state, P, h, out)
         _spread_out(h0, H[0])
         _spread_out(h1, H[1])
         return
     by_phi, by_length = work[8], work[9]
-    state[4], state[5] = accelerations(plant, x, by_phi, by_length, work[1])
+    state[4], state[5] = accelerations(model.plant, x, by_phi, by_length, work[1])
     out[0], out[1] = accelerometer(state, h0, h1)
     tilt = x[0] + x[26]
     moved_x = out[0] - x[24] - GRAVITY_MPS2 * math.cos(tilt)
@@ -786,9 +823,8 @@ def measure(
 
 @kernel(arrays=False)
 def driven_event(
-    x: FloatArray, P: FloatArray, kind: int, z: FloatArray, plant: FloatArray, view: FloatArray,
-    noise: FloatArray, work: FloatArray, again: bool, report: FloatArray,
-    gated: FloatArray, trace: FloatArray,
+    x: FloatArray, P: FloatArray, kind: int, z: FloatArray, model: Model, work: FloatArray, again: bool,
+    report: FloatArray, gated: FloatArray, trace: FloatArray,
 ) -> None:  # fmt: skip
     """Update a predicted state by an event, in place.
 
@@ -796,7 +832,6 @@ def driven_event(
     ----------
     kind, z : `CAMERA`, `IMU` or `HOSES` and (4,) its readings, NaN where missing, and the variance of its
         time [s^2]; of `HOSES` the deviation that the damping then has.
-    plant : (21,). view, noise : as in `kinematic.bank_event`.
     work : scratch of the shape `WORK`. report : (12,) of `event.REPORT`, written to.
     again : whether the event is done once more; then `gated` (3,) holds.
     trace : (3, `TRACE`) what each reading did, for the smoother; (0, `TRACE`) for nothing.
@@ -806,7 +841,7 @@ def driven_event(
     if not again:
         for k in range(report.shape[0]):
             report[k] = math.nan
-    log_l = 0.0
+    log_l, noise = 0.0, model.noise
     stamp = max(noise[6 if kind == CAMERA else 7] ** 2, z[3])
     H, p, out, e = work[2:5], work[0], work[5], work[10]
     learnt = work[24]
@@ -820,7 +855,7 @@ def driven_event(
         update(x, P, y, S, p, learnt)
         leave(trace, 0, H[0], p, y, S)
     else:
-        measure(kind, x, P, plant, view, noise, stamp, H, out, work)
+        measure(kind, x, P, model, stamp, H, out, work)
         told = work[11:12]
         chi_squares(kind, P, H, z, out, noise, e, work[12:15], work[15:18], told[0], int(SIZE_D))
         if not again:
@@ -881,21 +916,21 @@ def write_row(x: FloatArray, P: FloatArray, dt: float, radius: float, out: Float
 
 @kernel(arrays=False)
 def begin_again(
-    x: FloatArray, P: FloatArray, x0: FloatArray, P0: FloatArray, view: FloatArray, u: float, v: float,
-    again: bool, driven: bool, g1: float, g2: float,
-) -> bool:  # fmt: skip
-    """Start a state (36,) from its prior and a picture; what has been learnt may be wrong and goes.
+    x: FloatArray, P: FloatArray, model: Model, z: FloatArray, again: bool, driven: bool, g: FloatArray
+) -> bool:
+    """Start a state (36,) from its prior and a picture z; what has been learnt may be wrong and goes.
 
     A log begins at rest. In its middle, `again`, the forces may be anything: those of the pumps, most likely
-    the static ones of the last command, g1 and g2 [N], or where nothing was `driven` yet those of a hand.
+    the static ones of the last command, g (4,), or where nothing was `driven` yet those of a hand.
     """
-    phi, length, found = invert_marker(view, x0[INVOLVED:], u, v, 0.0, x0[1])
+    x0, P0 = model.x0, model.P0
+    phi, length, found = invert_marker(model.camera, x0[INVOLVED:], z[0], z[1], 0.0, x0[1])
     if not (found and 0.2 * x0[1] < length < 3.0 * x0[1]):
         return False
     copy_state(x, P, x0, P0)
     x[0], x[1] = phi, length
     if again:
-        x[6], x[7], x[8], x[9] = g1, g2, g1, g2
+        x[6], x[7], x[8], x[9] = g[0], g[1], g[0], g[1]
         for i in range(4, 10 if driven else 4):
             P[i, i] = _LOST_N * _LOST_N
         if not driven:
@@ -927,20 +962,19 @@ def let_go_time(
 
 @kernel(arrays=False)
 def pass_on(
-    x: FloatArray, P: FloatArray, begin: float, end: float, let_go_s: float, x0: FloatArray, P0: FloatArray,
-    plant: FloatArray, walk: FloatArray, switch_t: FloatArray, switch_g: FloatArray, last: int,
-    F: FloatArray, work: FloatArray,
+    x: FloatArray, P: FloatArray, begin: float, end: float, let_go_s: float, model: Model,
+    switches: Switches, last: int, F: FloatArray, work: FloatArray,
 ) -> None:  # fmt: skip
     """`predict_driven` for a head that is let go at a time between, or NaN; F (12, 23) is that of the whole.
 
     What held it were the disturbance forces. They are as at the beginning of a log from then on.
     """
     if math.isnan(let_go_s):
-        predict_driven(x, P, begin, end, plant, walk, switch_t, switch_g, last, F, work)
+        predict_driven(x, P, begin, end, model, switches, last, F, work)
         return
     held, row = work[25:], work[0]
     _stand(F)
-    predict_driven(x, P, begin, let_go_s, plant, walk, switch_t, switch_g, last, F, work)
+    predict_driven(x, P, begin, let_go_s, model, switches, last, F, work)
     for i in range(DYNAMIC):
         for j in range(INVOLVED):
             held[i, j] = F[i, j] if i < 10 else 0.0
@@ -948,10 +982,10 @@ def pass_on(
         for j in range(x.shape[0]):
             P[i, j], P[j, i] = 0.0, 0.0
     for i in range(10, DYNAMIC):
-        x[i], P[i, i] = x0[i], P0[i, i]
+        x[i], P[i, i] = model.x0[i], model.P0[i, i]
     P[2, 2] += _LET_GO_RADPS * _LET_GO_RADPS
     _stand(F)
-    predict_driven(x, P, let_go_s, end, plant, walk, switch_t, switch_g, last, F, work)
+    predict_driven(x, P, let_go_s, end, model, switches, last, F, work)
     for i in range(DYNAMIC):
         for j in range(INVOLVED):
             row[j] = F[i, j] if j >= DYNAMIC else 0.0
@@ -986,7 +1020,7 @@ class Memory(NamedTuple):
     ----------
     x, P : (size, 36), (size, 36, 36) states after the last events.
     whole, real : (6,) `NEWEST`, `COUNT`, and from `_STARTED` on; (5,) from `_LAST` on.
-    switch_t, switch_g : ring of commands as in `cut`, the newest at `whole[_SWITCH]`.
+    switches : of commands, the newest at `whole[_SWITCH]`.
     camera_clock, imu_clock : of `kinematic.new_clock`.
     """
 
@@ -994,32 +1028,9 @@ class Memory(NamedTuple):
     P: FloatArray
     whole: IntArray
     real: FloatArray
-    switch_t: FloatArray
-    switch_g: FloatArray
+    switches: Switches
     camera_clock: FloatArray
     imu_clock: FloatArray
-
-
-class Model(NamedTuple):
-    """What does not change: start (36,), (36, 36), plant (21,), walk, the camera's view, noise, and numbers.
-
-    Attributes
-    ----------
-    delay : of pictures [s]. action : how long after its tick a command acts [s]. period : as in `give`.
-    hoses_sigma : deviation of the logarithm of the damping once the hoses are on. radius : of a bellows [m].
-    """
-
-    x0: FloatArray
-    P0: FloatArray
-    plant: FloatArray
-    walk: FloatArray
-    camera: FloatArray
-    noise: FloatArray
-    radius: float
-    delay: float
-    action: float
-    period: float
-    hoses_sigma: float
 
 
 class Room(NamedTuple):
@@ -1082,8 +1093,7 @@ def _do_again(
     own : place of the event that is new, which `begin` says the filter may begin at.
     afresh : whether those that were done before are gated anew.
     """
-    x0, P0, plant, whole, real = model.x0, model.P0, model.plant, memory.whole, memory.real
-    switch_t, switch_g = memory.switch_t, memory.switch_g
+    whole, real, switches = memory.whole, memory.real, memory.switches
     size, flags = events.t.shape[0], 0
     for i in range(first + 1):
         now = (whole[NEWEST] + 1 - first + i) % size
@@ -1092,18 +1102,17 @@ def _do_again(
         copy_state(x, P, memory.x[before], memory.P[before])
         if whole[_STARTED] == 1:
             pass_on(
-                x, P, events.t[before], events.t[now], events.let_go[now], x0, P0, plant, model.walk,
-                switch_t, switch_g, whole[_SWITCH], room.F, room.work,
+                x, P, events.t[before], events.t[now], events.let_go[now], model, switches, whole[_SWITCH],
+                room.F, room.work,
             )  # fmt: skip
-        if now == own and begin and begin_again(
-            x, P, x0, P0, model.camera, z[0], z[1], not math.isnan(real[_BEGUN]), whole[_HOSES] == 1,
-            switch_g[whole[_SWITCH], 0], switch_g[whole[_SWITCH], 1],
-        ):  # fmt: skip
+        again, driven = not math.isnan(real[_BEGUN]), whole[_HOSES] == 1
+        if (now == own and begin
+                and begin_again(x, P, model, z, again, driven, switches.g[whole[_SWITCH]])):  # fmt: skip
             if whole[_STARTED] == 1:
                 flags |= 1
             whole[_STARTED], whole[_PENDING] = 1, 0
             real[_BEGUN] = events.t[now]
-            if whole[_HOSES] == 1:
+            if driven:
                 x[13], P[13, 13] = 0.0, model.hoses_sigma * model.hoses_sigma
         if events.kind[now] == IMU and events.t[now] < real[_BEGUN] + SETTLING_S:
             z[0], z[1], gated[1] = math.nan, math.nan, 1.0
@@ -1114,11 +1123,11 @@ def _do_again(
                 gated[k] = 1.0
             continue
         driven_event(
-            x, P, events.kind[now], z, plant, model.camera, model.noise, room.work,
-            not (afresh or now == own), room.report if now == own else room.spare, gated, room.untraced,
+            x, P, events.kind[now], z, model, room.work, not (afresh or now == own),
+            room.report if now == own else room.spare, gated, room.untraced,
         )  # fmt: skip
         if not sound(x, P, model.radius):
-            copy_state(x, P, x0, P0)
+            copy_state(x, P, model.x0, model.P0)
             whole[_PENDING] = 1
             flags |= 1
     return flags
@@ -1186,16 +1195,15 @@ def run_driven(
 
     `driven` says whether a row's command drives the pumps.
     """
-    whole, real, size = memory.whole, memory.real, events.t.shape[0]
-    switch_t, switch_g = memory.switch_t, memory.switch_g
+    whole, real, size, switches = memory.whole, memory.real, events.t.shape[0], memory.switches
     for row in range(len(t)):
         stamp, flags = t[row], 0
         if begin_row(stamp, real[_LAST], memory.camera_clock, memory.imu_clock, out, row):
             whole[COUNT], whole[_STARTED], whole[_PENDING] = 0, 0, 0
-            for k in range(len(switch_t)):
-                switch_t[k] = -math.inf
+            for k in range(len(switches.t)):
+                switches.t[k] = -math.inf
                 for i in range(2):
-                    switch_g[k, i], switch_g[k, 2 + i] = switch_g[whole[_SWITCH], i], 0.0
+                    switches.g[k, i], switches.g[k, 2 + i] = switches.g[whole[_SWITCH], i], 0.0
             real[_REJECTED], real[_REJECTED_IMU], real[_FIRST] = 0.0, 0.0, stamp
             flags |= 32
         elif math.isnan(real[_LAST]):
@@ -1204,8 +1212,8 @@ def run_driven(
         tick = advance(memory.camera_clock, stamp) if kinds[row] & 1 else stamp
         if not math.isnan(forces[row, 0]):
             whole[_SWITCH] = give(
-                switch_t, switch_g, whole[_SWITCH], tick + model.action, forces[row, 0], forces[row, 1],
-                model.period, model.plant[17],
+                switches, whole[_SWITCH], tick + model.action, forces[row, 0], forces[row, 1], model.period,
+                model.plant[17],
             )  # fmt: skip
         for turn in range(4):
             kind, when = _due(
@@ -1253,9 +1261,8 @@ def run_driven(
         if ahead > 1e-3 and whole[_STARTED] == 1:
             copy_state(room.x, room.P, memory.x[here], memory.P[here])
             predict_driven(
-                room.x, room.P, events.t[here], stamp, model.plant, model.walk, switch_t, switch_g,
-                whole[_SWITCH], room.F, room.work,
-            )  # fmt: skip
+                room.x, room.P, events.t[here], stamp, model, switches, whole[_SWITCH], room.F, room.work
+            )
             if not sound(room.x, room.P, model.radius):
                 copy_state(room.x, room.P, model.x0, model.P0)
             write_row(room.x, room.P, 0.0, model.radius, out, row)
@@ -1270,23 +1277,16 @@ class DrivenFilter:
 
     def __init__(self, setup: Setup, drive: Drive) -> None:
         self.setup, self.drive = setup, drive
-        delay = max(float(setup.start.sensor[7]), 0.0)
-        imu_s = setup.imu_period_s if setup.imu_period_s > 0.0 else 0.002
         self._held = np.zeros((2, 2))
-        size, n = min(max(16, math.ceil(2.0 * (delay + 0.02) / imu_s) + 8), 512), len(DRIVEN)
+        size, n = setup.ring, len(DRIVEN)
         self._events = no_events(size, 4, np.full(size, np.nan))
         self._memory = Memory(
             np.zeros((size, n)), np.zeros((size, n, n)), np.zeros(6, dtype=np.int64), np.full(5, np.nan),
-            np.full(_SWITCHES, -np.inf), np.zeros((_SWITCHES, 4)), new_clock(setup.camera_period_s),
-            new_clock(setup.imu_period_s),
+            Switches(np.full(_SWITCHES, -np.inf), np.zeros((_SWITCHES, 4))),
+            new_clock(setup.camera_period_s), new_clock(setup.imu_period_s),
         )  # fmt: skip
-        start = drive.start(setup)
-        self._memory.x[0], self._memory.P[0] = start
-        self._model = Model(
-            *start, drive.numbers(), drive.walk(setup), setup.view, drive.noise(setup),
-            setup.bellows_radius_m, delay, drive.pump.delay_ticks * drive.pump.tick_s,
-            setup.command_period_s, drive.sigma[1],
-        )  # fmt: skip
+        self._model = drive.model(setup)
+        self._memory.x[0], self._memory.P[0] = self._model.x0, self._model.P0
         self._room = Room(
             np.empty(4), np.empty(12), np.empty(12), np.empty(n), np.empty((n, n)),
             np.zeros((DYNAMIC, INVOLVED)), np.zeros(WORK), np.empty((0, TRACE)),
@@ -1339,35 +1339,22 @@ _SHOWN = np.array([0, 1, 2, 3, INVOLVED])
 
 
 @kernel(arrays=False)
-def _copy_marked(
-    to_x: FloatArray, to_P: FloatArray, to_marks: FloatArray, x: FloatArray, P: FloatArray, marks: FloatArray
-) -> None:
-    copy_state(to_x, to_P, x, P)
-    for i in range(len(marks)):
-        to_marks[i] = marks[i]
-
-
-@kernel()
 def _forward(
     t: FloatArray, before_s: float, first_s: float, kinds: IntArray, readings: FloatArray, x: FloatArray,
-    P: FloatArray, marks: FloatArray, switch_t: FloatArray, switch_g: FloatArray,
-    x0: FloatArray, P0: FloatArray, plant: FloatArray, walk: FloatArray, view: FloatArray,
-    noise: FloatArray, kept_x: FloatArray, kept_P: FloatArray, trace: FloatArray,
-    F: FloatArray, chained: BoolArray, alive: BoolArray, let_go_s: FloatArray, keep: int,
-    hoses_sigma: float, radius: float,
+    P: FloatArray, marks: FloatArray, switches: Switches, model: Model, kept_x: FloatArray,
+    kept_P: FloatArray, trace: FloatArray, F: FloatArray, chained: BoolArray, alive: BoolArray,
+    let_go_s: FloatArray, work: FloatArray,
 ) -> None:  # fmt: skip
-    """The filter over events, keeping what is shown; state and counters after the event `keep` are left.
+    """The filter over events, keeping what is shown; state and counters are those after the last one.
 
     `let_go_s` (n,) has the time of a release in the event whose step it is in.
     """
-    work, report, gated = np.zeros(WORK), np.empty(12), np.zeros(3)
-    own_x, own_P, own_marks = x.copy(), P.copy(), marks.copy()
-    last = 0
+    report, gated, last = work[18, :12], work[19, :3], 0
     for k in range(len(t)):
         begin = t[k - 1] if k else before_s
-        while last < len(switch_t) - 1 and switch_t[last + 1] <= t[k]:
+        while last < len(switches.t) - 1 and switches.t[last + 1] <= t[k]:
             last += 1
-        while last > 0 and switch_t[last] > t[k]:
+        while last > 0 and switches.t[last] > t[k]:
             last -= 1
         kind, z = kinds[k], readings[k]
         chained[k] = False
@@ -1378,31 +1365,30 @@ def _forward(
             marks[0], marks[1] = 0.0, 0.0
         if marks[_SMOOTHER_STARTED] == 1:
             _stand(F[k])
-            pass_on(x, P, begin, t[k], let_go_s[k], x0, P0, plant, walk, switch_t, switch_g, last, F[k], work)
+            pass_on(x, P, begin, t[k], let_go_s[k], model, switches, last, F[k], work)
             chained[k] = True
         if kind == HOSES:
             marks[_SMOOTHER_HOSES] = 1
         waits = marks[_SMOOTHER_STARTED] == 0 or marks[_SMOOTHER_PENDING] == 1
-        if waits and kind == CAMERA and t[k] > first_s + _BEFORE_S and begin_again(
-            x, P, x0, P0, view, z[0], z[1], not math.isnan(marks[_SMOOTHER_BEGUN]),
-            marks[_SMOOTHER_HOSES] == 1, switch_g[last, 0], switch_g[last, 1],
-        ):  # fmt: skip
+        again, driven = not math.isnan(marks[_SMOOTHER_BEGUN]), marks[_SMOOTHER_HOSES] == 1
+        if (waits and kind == CAMERA and t[k] > first_s + _BEFORE_S
+                and begin_again(x, P, model, z, again, driven, switches.g[last])):  # fmt: skip
             marks[_SMOOTHER_STARTED], marks[_SMOOTHER_PENDING] = 1, 0
             chained[k] = False
             marks[_SMOOTHER_BEGUN] = t[k]
-            if marks[_SMOOTHER_HOSES] == 1:
-                x[13], P[13, 13] = 0.0, hoses_sigma * hoses_sigma
+            if driven:
+                x[13], P[13, 13] = 0.0, model.hoses_sigma * model.hoses_sigma
         if kind == IMU and t[k] < marks[_SMOOTHER_BEGUN] + SETTLING_S:
             z[0], z[1] = math.nan, math.nan
         if marks[_SMOOTHER_STARTED] == 1.0 and kind != 0:
-            driven_event(x, P, kind, z, plant, view, noise, work, False, report, gated, trace[k])
+            driven_event(x, P, kind, z, model, work, False, report, gated, trace[k])
             for i in range(3):
                 if report[8 + i] == 1.0:
                     marks[min(i, 1)] += 1.0
                 elif report[8 + i] == 0.0:
                     marks[min(i, 1)] *= 0.7
-            if not sound(x, P, radius):
-                copy_state(x, P, x0, P0)
+            if not sound(x, P, model.radius):
+                copy_state(x, P, model.x0, model.P0)
                 chained[k] = False
                 marks[_SMOOTHER_PENDING] = 1
             elif marks[0] > _LOCKED_OUT or marks[1] > 2.0 * _LOCKED_OUT:
@@ -1413,9 +1399,6 @@ def _forward(
             for j in range(len(x)):
                 kept_P[k, i, j] = P[_SHOWN[i], j]
         alive[k] = marks[_SMOOTHER_STARTED] == 1
-        if k == keep:
-            _copy_marked(own_x, own_P, own_marks, x, P, marks)
-    _copy_marked(x, P, marks, own_x, own_P, own_marks)
 
 
 @kernel(arrays=False)
@@ -1470,19 +1453,17 @@ def _backward(
 
 
 @kernel()
-def _switches(
-    t: FloatArray, forces: FloatArray, period: float, lag_s: float
-) -> tuple[FloatArray, FloatArray]:
+def _switches(t: FloatArray, forces: FloatArray, period: float, lag_s: float) -> Switches:
     """All that `give` makes of commands with static forces (n, 2) that take effect at the times t (n,)."""
-    switch_t, switch_g, last = np.full(2 * len(t) + 1, -np.inf), np.zeros((2 * len(t) + 1, 4)), 0
+    made, last = Switches(np.full(2 * len(t) + 1, -np.inf), np.zeros((2 * len(t) + 1, 4))), 0
     for k in range(len(t)):
-        last = give(switch_t, switch_g, last, t[k], forces[k, 0], forces[k, 1], period, lag_s)
-    return switch_t[: last + 1], switch_g[: last + 1]
+        last = give(made, last, t[k], forces[k, 0], forces[k, 1], period, lag_s)
+    return Switches(made.t[: last + 1], made.g[: last + 1])
 
 
 def _timeline(
     setup: Setup, drive: Drive, rows: Rows, pwm: FloatArray
-) -> tuple[FloatArray, IntArray, FloatArray, IntArray, FloatArray, FloatArray]:
+) -> tuple[FloatArray, IntArray, FloatArray, IntArray, Switches]:
     """Times, kinds, readings (n, 4) and rows of all events, and when commands act with their forces."""
     events = events_of(setup, rows)
     forces = commands(drive, pwm)
@@ -1491,9 +1472,7 @@ def _timeline(
     ticks[camera] = even_times(new_clock(setup.camera_period_s), rows.t_s[camera])[0]
     given = np.isfinite(forces[:, 0])
     action = drive.pump.delay_ticks * drive.pump.tick_s
-    switch_t, switch_g = _switches(
-        ticks[given] + action, forces[given], setup.command_period_s, drive.pump.lag_s
-    )
+    switches = _switches(ticks[given] + action, forces[given], setup.command_period_s, drive.pump.lag_s)
     t, kinds, at, readings = events.t_s, events.kinds, events.rows, events.readings
     extra_t, extra_kind = [np.zeros(0)], [np.zeros(0, dtype=np.int64)]
     driven = np.nonzero(np.nan_to_num(pwm).max(axis=1, initial=0.0) > 0.0)[0]
@@ -1514,7 +1493,7 @@ def _timeline(
     readings = np.concatenate([readings, more])[order]
     kinds = np.concatenate([kinds, more_kind])[order]
     at = np.concatenate([at, np.full(len(more_t), -1)])[order]
-    return np.concatenate([t, more_t])[order], kinds, readings, at, switch_t, switch_g
+    return np.concatenate([t, more_t])[order], kinds, readings, at, switches
 
 
 def smooth_driven(setup: Setup, drive: Drive, rows: Rows, pwm: FloatArray, outputs: FloatArray) -> FloatArray:
@@ -1526,18 +1505,17 @@ def smooth_driven(setup: Setup, drive: Drive, rows: Rows, pwm: FloatArray, outpu
     outputs : (n, len(OUT)) of the driven filter; what it says of innovations and flags is kept, and where it
         says that the head was let go, it was.
     """
-    t, kinds, readings, at, switch_t, switch_g = _timeline(setup, drive, rows, pwm)
-    x, P = drive.start(setup)
-    x0, P0 = x.copy(), P.copy()
+    t, kinds, readings, at, switches = _timeline(setup, drive, rows, pwm)
+    model = drive.model(setup)
+    x, P = model.x0.copy(), model.P0.copy()
     marks = np.array([0.0, 0.0, np.nan, 0.0, 0.0, 0.0])
-    plant, walk, noise = drive.numbers(), drive.walk(setup), drive.noise(setup)
     out = outputs.copy()
     out[:, 1:13] = np.nan
-    n, size, shown = len(t), len(DRIVEN), len(_SHOWN)
+    n, size, shown, work = len(t), len(DRIVEN), len(_SHOWN), np.zeros(WORK)
     let_go_s, told = np.full(n + 1, np.nan), outputs[np.isfinite(outputs[:, _LET_GO]), _LET_GO]
     let_go_s[np.searchsorted(t, told, side="right")] = told
     begin, before = 0, float(t[0]) if n else 0.0
-    first = float(rows.t_s[0]) - max(float(setup.start.sensor[7]), 0.0) if n else 0.0
+    begins_s = float(rows.t_s[0]) - setup.delay_s if n else 0.0
     while begin < n:
         end = min(begin + WINDOW, n)
         stop = min(end + OVERLAP, n)
@@ -1545,17 +1523,20 @@ def smooth_driven(setup: Setup, drive: Drive, rows: Rows, pwm: FloatArray, outpu
         kept_x, kept_P = np.empty((count, shown)), np.empty((count, shown, size))
         trace, F = np.empty((count, 3, TRACE)), np.empty((count, DYNAMIC, INVOLVED))
         chained, alive = np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
-        _forward(
-            t[part], before, first, kinds[part], readings[part], x, P, marks, switch_t, switch_g,
-            x0, P0, plant, walk, setup.view, noise, kept_x, kept_P, trace, F, chained,
-            alive, let_go_s[part], end - begin - 1, drive.sigma[1], setup.bellows_radius_m,
-        )  # fmt: skip
+        state = x, P, marks
+        for first, behind in ((begin, end), (end, stop)):
+            of, to = slice(first, behind), slice(first - begin, behind - begin)
+            _forward(
+                t[of], before, begins_s, kinds[of], readings[of], *state, switches, model, kept_x[to],
+                kept_P[to], trace[to], F[to], chained[to], alive[to], let_go_s[of], work,
+            )  # fmt: skip
+            # The next window begins with the state at `end`; what is beyond only looks back.
+            before, state = float(t[end - 1]), (x.copy(), P.copy(), marks.copy())
         wanted = np.where(alive & (kinds[part] == 0), at[part], -1)
         wanted[end - begin :] = -1
         _backward(t[part], F, trace, chained, wanted, kept_x, kept_P)
         some = np.nonzero(wanted >= 0)[0]
         write_columns(kept_x[some], kept_P[some], shown - 1, wanted[some], setup.bellows_radius_m, out)
-        before = float(t[end - 1])
         begin = end
     # As in `smooth`: readings that lie carry it away, and there the kinematic model speaks.
     out[~(np.abs(out[:, 3:5]) < FASTEST_MPS).all(axis=1), 1:13] = np.nan

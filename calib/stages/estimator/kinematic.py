@@ -563,6 +563,17 @@ class Setup:
     imu_period_s: float = math.nan
     command_period_s: float = math.nan
 
+    @property
+    def delay_s(self) -> float:
+        """Delay of the pictures, which come from no future."""
+        return max(float(self.start.sensor[7]), 0.0)
+
+    @property
+    def ring(self) -> int:
+        """How many of the last events a filter keeps: those since the exposure of a late picture."""
+        period = self.imu_period_s if self.imu_period_s > 0.0 else 0.002
+        return min(max(16, math.ceil(2.0 * (self.delay_s + 0.02) / period) + 8), 512)
+
 
 @dataclass(frozen=True)
 class Rows:
@@ -1041,7 +1052,7 @@ def starting_state(setup: Setup, rows: Rows | None = None) -> tuple[FloatArray, 
     start, count = setup.start, len(setup.process.levels)
     mean = np.concatenate([start.head, start.sensor])
     # Pictures are put at their exposure, so that what is left of the offset is zero.
-    mean[13] -= max(float(start.sensor[7]), 0.0)
+    mean[13] -= setup.delay_s
     if rows is not None:
         for u, v in rows.readings[np.isfinite(rows.readings[:, :2]).all(axis=1)][:20, :2].tolist():
             phi, length, found = invert_marker(setup.view, mean[6:], u, v, 0.0, float(start.head[1]))
@@ -1057,9 +1068,7 @@ class Filter:
     def __init__(self, setup: Setup) -> None:
         self.setup = setup
         levels, walk = setup.process.arrays()
-        start, delay = setup.start, max(float(setup.start.sensor[7]), 0.0)
-        period = setup.imu_period_s if setup.imu_period_s > 0.0 else 0.002
-        size = min(max(16, math.ceil(2.0 * (delay + 0.02) / period) + 8), 512)
+        start, size = setup.start, setup.ring
         # One slot more than the ring has, for what is only looked ahead.
         self._bank = Bank(*banked(*starting_state(setup), size + 1))
         self._events = no_events(size, 3, np.empty(0))
@@ -1069,7 +1078,7 @@ class Filter:
         )  # fmt: skip
         self._model = _Model(
             setup.process.switch_hz, levels, walk, setup.view, setup.noise, start.head, start.head_sigma,
-            setup.bellows_radius_m, delay,
+            setup.bellows_radius_m, setup.delay_s,
         )  # fmt: skip
         self._room = _Room(
             np.empty((len(levels), *WORK)), np.zeros((len(levels), 7)), np.empty(len(REPORT)),

@@ -84,7 +84,7 @@ def events_of(setup: Setup, rows: Rows, outputs: bool = True) -> Events:
     """
     camera, imu = np.nonzero(rows.kinds & 1)[0], np.nonzero(rows.kinds & 2)[0]
     exposed, camera_s2 = even_times(new_clock(setup.camera_period_s), rows.t_s[camera])
-    exposed = exposed - max(float(setup.start.sensor[7]), 0.0)
+    exposed = exposed - setup.delay_s
     taken, imu_s2 = even_times(new_clock(setup.imu_period_s), rows.t_s[imu])
     seen = np.isfinite(rows.readings[camera, :2]).all(axis=1)
     camera, exposed = camera[seen], exposed[seen]

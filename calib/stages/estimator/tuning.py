@@ -32,11 +32,10 @@ _TICK_HZ = 60.0
 
 def gain_section(setup: Setup, rate_hz: float) -> EstimatorGain | None:
     """Constant gains at a rate of ticks; None without pictures, or where they are more than 8 ticks late."""
-    delay_s = max(float(setup.start.sensor[7]), 0.0)
-    if delay_s * rate_hz > MOST_DELAY_TICKS or not setup.view.any():
+    if setup.delay_s * rate_hz > MOST_DELAY_TICKS or not setup.view.any():
         return None
     lever_m = 0.5 * float(setup.start.head[1]) + float(setup.start.sensor[6])
-    return EstimatorGain(**asdict(design(tick_noise(setup), rate_hz, delay_s, lever_m)))
+    return EstimatorGain(**asdict(design(tick_noise(setup), rate_hz, setup.delay_s, lever_m)))
 
 
 def _driven_section(
