@@ -61,10 +61,6 @@ TARGET_MM = {"static": 0.04, "swing": 0.11, "ellipse": 0.05, "step": 0.06, "elon
 """Means over the seeds below; an alignment as in `estimatorlogs.SIGMA` alone leaves 0.03 mm."""
 
 
-def part(rows: Rows, which: slice | FloatArray) -> Rows:
-    return Rows(rows.t_s[which], rows.readings[which], rows.kinds[which])
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TARGET_MM)
 def test_it_reaches_its_accuracy_on_rigs_that_differ(name: str) -> None:
@@ -103,9 +99,9 @@ def test_blocks_make_no_difference_and_the_future_has_no_say() -> None:
     whole = DrivenFilter(setup, Drive()).run(rows, pwm)
     blocks = DrivenFilter(setup, Drive())
     cut = [0, 1, 300, 301, 900, len(rows)]
-    parts = [blocks.run(part(rows, slice(a, b)), pwm[a:b]) for a, b in pairwise(cut)]
+    parts = [blocks.run(rows[a:b], pwm[a:b]) for a, b in pairwise(cut)]
     np.testing.assert_array_equal(np.concatenate(parts), whole)
-    head = DrivenFilter(setup, Drive()).run(part(rows, slice(0, 700)), pwm[:700])
+    head = DrivenFilter(setup, Drive()).run(rows[:700], pwm[:700])
     np.testing.assert_array_equal(head, whole[:700])
     _, P = blocks.state
     np.testing.assert_array_equal(P, P.T)
@@ -536,7 +532,7 @@ _ROWS = 600
 def _short(name: str, seed: int) -> tuple[Setup, tuple[Rows, FloatArray]]:
     rig, log = driven_log(name, seed)
     rows = rows_from(log)
-    part = Rows(rows.t_s[:_ROWS], rows.readings[:_ROWS], rows.kinds[:_ROWS])
+    part = rows[:_ROWS]
     return setup_for(rig, seed), (part, commands_of(log)[:_ROWS])
 
 
@@ -545,12 +541,11 @@ def test_a_walk_that_is_far_too_loud_is_mended_and_none_is_taken_for_nothing() -
     nominal = Drive()
     loud = scaled(nominal, "rates", 30.0)
     steps: list[int] = []
-    found = tune_driven(setup, loud, [log], lambda done, total: steps.append(total - done))
-    assert found.after > found.before + 10.0
-    assert found.after == pytest.approx(driven_likelihood(setup, found.drive, [log]))
-    assert found.factors["rates"].value == 0.5
-    assert all(found.factors[walk].value >= 0.5 for walk in WALKS)
-    assert steps == [3, 2, 1] and found.rows == _ROWS
+    found, factors = tune_driven(setup, loud, [log], lambda done, total: steps.append(total - done))
+    assert driven_likelihood(setup, found, [log]) > driven_likelihood(setup, loud, [log]) + 10.0
+    assert factors["rates"].value == 0.5
+    assert all(factors[walk].value >= 0.5 for walk in WALKS)
+    assert steps == [3, 2, 1]
 
 
 def test_a_plant_that_is_pushed_about_asks_for_a_disturbance() -> None:
@@ -558,9 +553,9 @@ def test_a_plant_that_is_pushed_about_asks_for_a_disturbance() -> None:
     setup, (rows, pwm) = _short("step", 2)
     blind = pwm.copy()
     blind[rows.t_s > 2.0] *= 0.99
-    told = tune_driven(setup, Drive(), [(rows, pwm)])
-    fooled = tune_driven(setup, Drive(), [(rows, blind)])
-    assert fooled.factors["disturbance"].value > 2.0 * told.factors["disturbance"].value
+    _, told = tune_driven(setup, Drive(), [(rows, pwm)])
+    _, fooled = tune_driven(setup, Drive(), [(rows, blind)])
+    assert fooled["disturbance"].value > 2.0 * told["disturbance"].value
 
 
 def test_what_was_identified_together_starts_together() -> None:
@@ -618,7 +613,7 @@ def test_after_a_gap_the_forces_are_not_taken_as_none() -> None:
     rig, log = driven_log("elongation", 1)
     rows, pwm, setup = rows_from(log), commands_of(log), setup_for(rig, 1)
     some = (log.t_s < 4.0) | (log.t_s > 7.0)
-    rows, pwm, true = part(rows, some), pwm[some], truth(log)[some]
+    rows, pwm, true = rows[some], pwm[some], truth(log)[some]
     filtered = DrivenFilter(setup, Drive()).run(rows, pwm)
     smoothed = driven_smoother.smooth_driven(setup, Drive(), rows, pwm, filtered)
     late = rows.t_s > 7.5

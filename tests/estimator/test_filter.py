@@ -232,12 +232,12 @@ def test_jumps_of_the_time_start_the_filter_again(jump: float) -> None:
 def test_small_disorder_and_repeated_rows_do_little() -> None:
     setup, rows, true = nominal()
     order = np.argsort(rows.t_s + np.random.default_rng(1).uniform(0.0, 0.012, len(rows)), kind="stable")
-    out = Filter(setup).run(Rows(rows.t_s[order], rows.readings[order], rows.kinds[order]))
+    out = Filter(setup).run(rows[order])
     sane(out)
     late = out[:, 0] > 2.0
     assert 1e3 * np.sqrt(np.mean((out[late, 1] - true[order][late, 0]) ** 2)) < 0.35
     twice = np.sort(np.concatenate([np.arange(len(rows)), np.arange(100, len(rows), 50)]))
-    out = Filter(setup).run(Rows(rows.t_s[twice], rows.readings[twice], rows.kinds[twice]))
+    out = Filter(setup).run(rows[twice])
     sane(out)
     late = out[:, 0] > 2.0
     assert 1e3 * np.sqrt(np.mean((out[late, 1] - true[twice][late, 0]) ** 2)) < 0.35
@@ -459,7 +459,7 @@ def test_tuning_mends_a_level_that_is_far_too_loud() -> None:
     loud = replace(levels[3], accel_phi_radps2=levels[3].accel_phi_radps2 * 8.0)
     setup = setup_for(rig, 1, Kinematic((levels[0], loud)))
     rows = rows_from(log)
-    short = Rows(rows.t_s[:500], rows.readings[:500], rows.kinds[:500])
+    short = rows[:500]
     steps: list[int] = []
     found = tune(setup, [short], lambda done, total: steps.append(done))
     assert found.after > found.before

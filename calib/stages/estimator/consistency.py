@@ -23,7 +23,6 @@ from calib.stages.estimator.section import SensorCheck
 SENSORS = {"camera": 2, "accel": 2, "gyro": 1}
 """Readings of each sensor at a time."""
 
-_NIS = {"camera": "nis_camera", "accel": "nis_accel", "gyro": "nis_gyro"}
 _INNOVATIONS = {"camera": ("e_u", "e_v"), "accel": ("e_ax", "e_ay"), "gyro": ("e_gz",)}
 _SETTLED_S = 2.0
 
@@ -66,7 +65,6 @@ class Tally:
     rows: int = 0
     start_s: float = math.nan
     end_s: float = math.nan
-    settled_rows: int = 0
     scored: int = 0
     log_likelihood: float = 0.0
     sensors: dict[str, FloatArray] = field(
@@ -88,7 +86,6 @@ class Tally:
             self.flags[bit] = self.flags.get(bit, 0) + int(np.count_nonzero(flags & bit))
         self.log_likelihood += float(np.nansum(out[:, OUT.index("log_likelihood")]))
         late = out[:, 0] >= self.start_s + _SETTLED_S
-        self.settled_rows += int(late.sum())
         for name in SENSORS:
             self._add_sensor(name, out[late])
         if truth is not None:
@@ -99,7 +96,7 @@ class Tally:
         used = gated == 0.0
         sums, last = self.sensors[name], self.sensors["last"]
         sums[1] += int(np.count_nonzero(gated == 1.0))
-        nis = out[used, OUT.index(_NIS[name])]
+        nis = out[used, OUT.index(f"nis_{name}")]
         if len(nis) == 0:
             return
         low, high = chi_square_band(SENSORS[name], 1)

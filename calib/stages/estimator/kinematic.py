@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calib.core.arrays import FloatArray, IntArray
+from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.core.compilation import kernel
 from calib.stages.estimator.event import (
     CAMERA,
@@ -335,12 +335,10 @@ def advance(clock: FloatArray, stamp: float) -> float:
     if not nominal > 0.0:
         return float(stamp)
     if clock[0] == 0.0:
-        clock[0], clock[1], clock[7] = 1.0, stamp, 0.0
         if clock[9] == 0.0:
             clock[2] = nominal
-        clock[3], clock[4], clock[5] = clock[6], 0.0, (1e-3 * nominal) ** 2
         clock[9] += 1.0
-        return float(stamp)
+        return float(advance_again(clock, stamp))
     T = clock[2]
     time = clock[1] + T
     steps = 1.0
@@ -349,7 +347,6 @@ def advance(clock: FloatArray, stamp: float) -> float:
         missed = math.floor(error / T + 0.5)
         # A period is not known well enough to count over a long gap.
         if missed * math.sqrt(clock[5]) > 0.1 * T:
-            clock[0] = 0.0
             return float(advance_again(clock, stamp))
         # Only where the stamp then fits: a sample that waited half a period is late, none is missing.
         if abs(error - missed * T) < _GATE * math.sqrt(clock[3] + clock[6]) + 0.01 * T:
@@ -366,7 +363,6 @@ def advance(clock: FloatArray, stamp: float) -> float:
     if abs(error) > min(limit, 0.45 * nominal):
         clock[7] += 1.0
         if clock[7] >= _MOST_MISTRUST:
-            clock[0] = 0.0
             return float(advance_again(clock, stamp))
         return float(time)
     clock[7] = 0.0
@@ -592,6 +588,9 @@ class Rows:
 
     def __len__(self) -> int:
         return len(self.t_s)
+
+    def __getitem__(self, part: slice | BoolArray | IntArray) -> Rows:
+        return Rows(self.t_s[part], self.readings[part], self.kinds[part])
 
 
 # ----------------------------------------------------------------------

@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+from typing import Any
 
 import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.stages.estimator.driven import Drive, DrivenFilter
-from calib.stages.estimator.kinematic import OUT, Filter, Kinematic, Level, Rows, Setup
+from calib.stages.estimator.kinematic import OUT, Filter, Rows, Setup
 
 # ----------------------------------------------------------------------
 # Noise that a log itself tells: the tracker's jitter, and levels of process noise.
@@ -26,6 +29,8 @@ _FACTORS = np.array([0.5, 1.0, 2.0])
 GATED = 12.0
 """What a gated sensor costs."""
 _DEFAULT_JITTER_PX = 0.4
+_ACCELERATIONS = {"phi": "accel_phi_radps2", "length": "accel_length_mps2"}
+"""What is tuned of a level, by axis."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +108,8 @@ def best(values: FloatArray, likelihood: Callable[[float], float]) -> tuple[Esti
     return Estimate(value, math.sqrt(-0.5 / a)), at_top
 
 
-def _with_jitter(setup: Setup, jitter: float) -> Setup:
+def with_jitter(setup: Setup, jitter: float) -> Setup:
+    """A set-up with another jitter of the tracker [px]."""
     noise = setup.noise.copy()
     noise[0] = jitter
     return replace(setup, noise=noise)
@@ -116,18 +122,15 @@ def jitter_px(setup: Setup, logs: Sequence[Rows]) -> Estimate:
     """
     if not any(np.isfinite(rows.readings[:, 0]).any() for rows in logs):
         return Estimate(_DEFAULT_JITTER_PX, None)
-    return best(_JITTERS_PX, lambda value: log_likelihood(_with_jitter(setup, value), logs))[0]
+    return best(_JITTERS_PX, lambda value: log_likelihood(with_jitter(setup, value), logs))[0]
 
 
-def _scaled(process: Kinematic, index: int, axis: str, factor: float) -> Kinematic:
-    level = process.levels[index]
-    if axis == "phi":
-        made = replace(level, accel_phi_radps2=level.accel_phi_radps2 * factor)
-    else:
-        made = replace(level, accel_length_mps2=level.accel_length_mps2 * factor)
-    levels: list[Level] = list(process.levels)
-    levels[index] = made
-    return replace(process, levels=tuple(levels))
+def _scaled(setup: Setup, index: int, axis: str, factor: float) -> Setup:
+    """A set-up with the accelerations of a level along an axis scaled."""
+    levels, name = list(setup.process.levels), _ACCELERATIONS[axis]
+    changed: dict[str, Any] = {name: factor * getattr(levels[index], name)}
+    levels[index] = replace(levels[index], **changed)
+    return replace(setup, process=replace(setup.process, levels=tuple(levels)))
 
 
 def tune(setup: Setup, logs: Sequence[Rows], progress: Callable[[int, int], None] | None = None) -> Tuning:
@@ -136,26 +139,24 @@ def tune(setup: Setup, logs: Sequence[Rows], progress: Callable[[int, int], None
     A factor of a level is at most two either way: logs without its motion say little about it.
     """
     before = log_likelihood(setup, logs)
-    steps = 1 + 2 * len(setup.process.levels)
     jitter = jitter_px(setup, logs)
-    setup = _with_jitter(setup, jitter.value)
+    setup = with_jitter(setup, jitter.value)
     factors: dict[str, Estimate] = {}
     after = log_likelihood(setup, logs)
-    done = 1
-    for index, level in enumerate(setup.process.levels):
-        for axis in ("phi", "length"):
-            if progress is not None:
-                progress(done, steps)
-            done += 1
+    tuned = list(product(range(len(setup.process.levels)), _ACCELERATIONS))
+    for done, (index, axis) in enumerate(tuned, start=1):
+        if progress is not None:
+            progress(done, 1 + len(tuned))
 
-            def likelihood(factor: float, index: int = index, axis: str = axis, now: Setup = setup) -> float:
-                return log_likelihood(replace(now, process=_scaled(now.process, index, axis, factor)), logs)
+        made = partial(_scaled, setup, index, axis)
 
-            found, reached = best(_FACTORS, likelihood)
-            factors[f"{level.name}_{axis}"] = found
-            if reached > after:
-                after = reached
-                setup = replace(setup, process=_scaled(setup.process, index, axis, found.value))
+        def likelihood(factor: float, made: Callable[[float], Setup] = made) -> float:
+            return log_likelihood(made(factor), logs)
+
+        found, reached = best(_FACTORS, likelihood)
+        factors[f"{setup.process.levels[index].name}_{axis}"] = found
+        if reached > after:
+            after, setup = reached, made(found.value)
     return Tuning(setup, jitter, factors, before, after, sum(len(rows) for rows in logs))
 
 
@@ -177,31 +178,13 @@ Log = tuple[Rows, FloatArray]
 """Rows and their commands (n, 2)."""
 
 
-@dataclass(frozen=True)
-class DriveTuning:
-    """What tuning has found.
-
-    Attributes
-    ----------
-    drive : with the tuned walks. factors : by walk, against those before.
-    before, after : log likelihood of all logs. rows : of all logs.
-    """
-
-    drive: Drive
-    factors: dict[str, Estimate]
-    before: float
-    after: float
-    rows: int
-
-
 def scaled(drive: Drive, walk: str, factor: float) -> Drive:
     """A drive with one of `WALKS` scaled."""
-    if walk == "disturbance":
-        return replace(drive, walk_disturbance=factor * drive.walk_disturbance)
-    if walk == "rates":
-        phi, length = drive.walk_rates
-        return replace(drive, walk_rates=(factor * phi, factor * length))
-    return replace(drive, walk_forces=factor * drive.walk_forces)
+    name = f"walk_{walk}"
+    value = getattr(drive, name)
+    both = isinstance(value, tuple)
+    changed: dict[str, Any] = {name: tuple(factor * one for one in value) if both else factor * value}
+    return replace(drive, **changed)
 
 
 def driven_likelihood(setup: Setup, drive: Drive, logs: Sequence[Log]) -> float:
@@ -211,13 +194,11 @@ def driven_likelihood(setup: Setup, drive: Drive, logs: Sequence[Log]) -> float:
 
 def tune_driven(
     setup: Setup, drive: Drive, logs: Sequence[Log], progress: Callable[[int, int], None] | None = None
-) -> DriveTuning:
-    """The walks that the log with the greatest need of each asks for."""
-    before = driven_likelihood(setup, drive, logs)
+) -> tuple[Drive, dict[str, Estimate]]:
+    """The drive with the walks that the log with the greatest need of each asks for, and their factors."""
     factors: dict[str, Estimate] = {}
     steps, done = len(WALKS) * len(logs), 0
     for walk in WALKS:
-        chosen = Estimate(1.0, None)
         asked: list[Estimate] = []
         for log in logs:
             if progress is not None:
@@ -231,9 +212,6 @@ def tune_driven(
             if reached - likelihood(1.0) < _CONVINCING:
                 found = Estimate(1.0, found.sigma)
             asked.append(found)
-        if asked:
-            chosen = max(asked, key=lambda one: one.value)
-        factors[walk] = chosen
-        drive = scaled(drive, walk, chosen.value)
-    after = driven_likelihood(setup, drive, logs)
-    return DriveTuning(drive, factors, before, after, sum(len(rows) for rows, _ in logs))
+        factors[walk] = max(asked, key=lambda one: one.value)
+        drive = scaled(drive, walk, factors[walk].value)
+    return drive, factors

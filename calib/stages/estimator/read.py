@@ -386,8 +386,7 @@ def has_commands(log: Log) -> bool:
 
 def pwm_of(log: Log) -> FloatArray:
     """Commands (n, 2) of a block, NaN in rows without."""
-    missing = np.full(len(log), np.nan)
-    return np.stack([log.columns.get(name, missing) for name in ("pwm1", "pwm2")], axis=1)
+    return np.stack([_column(log, name) for name in ("pwm1", "pwm2")], axis=1)
 
 
 _SIGMA = {

@@ -46,7 +46,7 @@ from calib.stages.estimator.driven import (
 )
 from calib.stages.estimator.event import NOISE
 from calib.stages.estimator.kinematic import FLAGS, OUT, Filter, Rows, Setup, Start, starting_state
-from calib.stages.estimator.noise import jitter_px
+from calib.stages.estimator.noise import jitter_px, with_jitter
 from calib.stages.estimator.read import (
     READINGS,
     Periods,
@@ -218,11 +218,8 @@ def opened(path: Path, rig: Rig, rig_path: Path, options: LogOptions = NOTHING_S
         remarks.append(first.map.narration)
     stated = rig.estimator is not None or (rig.align is not None and rig.align.jitter_px > 0.0)
     if found.camera and not stated:
-        rows = rows_of(first, found.ticks)
-        part = Rows(rows.t_s[:_JITTER_ROWS], rows.readings[:_JITTER_ROWS], rows.kinds[:_JITTER_ROWS])
-        noise = setup.noise.copy()
-        noise[0] = jitter_px(setup, [part]).value
-        setup = replace(setup, noise=noise)
+        part = rows_of(first, found.ticks)[:_JITTER_ROWS]
+        setup = with_jitter(setup, jitter_px(setup, [part]).value)
     return OpenLog(path, setup, found, first, _noted(chain([first], stream), remarks), remarks)
 
 
@@ -302,7 +299,7 @@ def smoothed_rows(log: OpenLog, until_s: float) -> FloatArray:
     for block in log.stream:
         rows = rows_of(block, log.periods.ticks)
         some = rows.t_s <= until_s
-        parts.append(Rows(rows.t_s[some], rows.readings[some], rows.kinds[some]))
+        parts.append(rows[some])
         if not some.all():
             break
     whole = joined(parts)
@@ -589,8 +586,7 @@ def _moving(rows: Rows) -> Rows:
     turned = np.cumsum(np.nan_to_num(rows.readings[:, 4]) ** 2)
     spans = turned[_SEARCHED_ROWS:] - turned[:-_SEARCHED_ROWS]
     first = int(np.argmax(spans)) if len(spans) else 0
-    part = slice(first, first + _SEARCHED_ROWS)
-    return Rows(rows.t_s[part], rows.readings[part], rows.kinds[part])
+    return rows[first : first + _SEARCHED_ROWS]
 
 
 def untimely(setup: Setup, rows: Rows) -> Iterator[Finding]:

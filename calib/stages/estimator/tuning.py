@@ -47,20 +47,16 @@ def _driven_section(
     known = [(rows, pwm) for rows, pwm in logs if np.isfinite(pwm).all(axis=1).any()]
     if not known:
         return None, {}
-    short = [
-        (Rows(rows.t_s[:n], rows.readings[:n], rows.kinds[:n]), pwm[:n])
-        for rows, pwm in known
-        for n in [min(len(rows), _MOST_DRIVEN_ROWS)]
-    ]
-    found = tune_driven(setup, drive, short, progress)
-    turning, growing = found.drive.walk_rates
+    short = [(rows[:_MOST_DRIVEN_ROWS], pwm[:_MOST_DRIVEN_ROWS]) for rows, pwm in known]
+    found, factors = tune_driven(setup, drive, short, progress)
+    turning, growing = found.walk_rates
     section = EstimatorDriven(
-        walk_disturbance_N_per_sqrt_s=found.drive.walk_disturbance,
+        walk_disturbance_N_per_sqrt_s=found.walk_disturbance,
         walk_turning_radps_per_sqrt_s=turning,
         walk_growing_mps_per_sqrt_s=growing,
-        walk_forces_N_per_sqrt_s=found.drive.walk_forces,
+        walk_forces_N_per_sqrt_s=found.walk_forces,
     )
-    return section, {f"driven_{name}": factor.sigma for name, factor in found.factors.items()}
+    return section, {f"driven_{name}": factor.sigma for name, factor in factors.items()}
 
 
 def tuned_section(
