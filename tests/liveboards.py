@@ -36,7 +36,8 @@ class Person:
         """The pose that the true camera shows at the ghost, a few degrees and percent off, wholly inside."""
         target = self.board.points_m()
         grid = np.stack(ghost.lines_px[: self.board.rows])
-        R, t = poses_with_camera(self.camera, pack([View("", target, grid.reshape(-1, 2))]))
+        seen = poses_with_camera(self.camera, pack([View("", target, grid.reshape(-1, 2))]))
+        R, t = seen.R_CT, seen.t_CT_m
         turn = rotation_exp(np.radians(3.0 * self.sloppy) * self.rng.standard_normal((1, 3)))[0]
         middle = R[0] @ np.append(0.5 * target.max(axis=0), 0.0) + t[0]
         for nearer in np.linspace(1.0, 2.0, 21):

@@ -341,8 +341,8 @@ class Session:
         """Rotation and the position of the board's middle."""
         target = self._board().points_m()
         target = target - 0.5 * target.max(axis=0)
-        R, t = poses_with_camera(self._nominal(), pack([View("", target, grid.reshape(-1, 2))]))
-        return (R[0], t[0]) if np.isfinite(R).all() and np.isfinite(t).all() else None
+        seen = poses_with_camera(self._nominal(), pack([View("", target, grid.reshape(-1, 2))]))
+        return (seen.R_CT[0], seen.t_CT_m[0]) if seen.posed.all() else None
 
     def _near(self, grid: FloatArray, ghost: Ghost) -> float:
         """Distance of the outer corners from the ghost's, over the picture's diagonal, whatever end is up."""

@@ -18,9 +18,9 @@ from calib.stages.camera.model import (
     camera_from_vector,
     free_intrinsics,
     jacobian,
+    point_derivatives,
     rays,
     undistort,
-    vector_from_camera,
 )
 
 # ----------------------------------------------------------------------
@@ -42,8 +42,6 @@ from calib.stages.camera.model import (
 # direction of the parameter space, flat or steep. A limit on iterations is a failure, and named so.
 #
 # A robust loss is minimised by the same iteration with the weights rho'(r^2) of its points.
-
-LOSSES = ("none", "huber", "cauchy")
 
 TOLERANCE = 1e-5
 """Newton decrement that ends the search, in standard deviations."""
@@ -348,8 +346,8 @@ def poses_from_homographies(K: FloatArray, H: FloatArray) -> tuple[FloatArray, F
     return np.stack([r1, r2, r3], axis=2), t / scale[:, None]
 
 
-def poses_with_camera(camera: Camera, observations: Observations) -> tuple[FloatArray, FloatArray]:
-    """Poses of the views seen by a known camera, linear; NaN where the lens cannot show such pixels."""
+def poses_with_camera(camera: Camera, observations: Observations) -> Block:
+    """A known camera with the poses of the views, linear; NaN where the lens cannot show such pixels."""
     ideal = undistort(camera, observations.pixels)
     usable = np.isfinite(ideal).all(axis=2) & observations.present
     enough = usable.sum(axis=1) >= 4
@@ -360,7 +358,7 @@ def poses_with_camera(camera: Camera, observations: Observations) -> tuple[Float
     with np.errstate(all="ignore"):
         R_CT, t_CT_m = poses_from_homographies(np.eye(3), homographies(seen))
     R_CT[~enough], t_CT_m[~enough] = np.nan, np.nan
-    return R_CT, t_CT_m
+    return Block.of(camera, R_CT, t_CT_m)
 
 
 def _mismatch(K: FloatArray, H: FloatArray) -> float:
@@ -400,7 +398,7 @@ def initial_guess(observations: Observations, image_size_px: tuple[int, int], sk
     R_CT, t_CT_m = poses_from_homographies(K, H)
     intrinsics = np.zeros(len(INTRINSICS))
     intrinsics[:5] = K[0, 0], K[1, 1], K[0, 2], K[1, 2], K[0, 1]
-    return Block(intrinsics, R_CT, t_CT_m, np.zeros(0))
+    return Block(intrinsics, R_CT, t_CT_m)
 
 
 def _plausible(K: FloatArray, longest: float, centre: FloatArray) -> bool:
@@ -461,6 +459,12 @@ class Calibration:
     def free_names(self) -> tuple[str, ...]:
         """Names of the estimated intrinsics."""
         return tuple(INTRINSICS[i] for i in self.free)
+
+    def shaped(self, observations: Observations) -> Observations:
+        """Views of the target in the shape that was found for it."""
+        if self.basis is None:
+            return observations
+        return observations.displaced(np.tensordot(self.block.deformation, self.basis, axes=1).T)
 
     @property
     def weights(self) -> FloatArray:
@@ -547,7 +551,6 @@ def equidistant_start(
     image_size_px: tuple[int, int],
     focal_px: float,
     model: str = "rational8",
-    centre_px: tuple[float, float] | None = None,
 ) -> Block:
     """A lens that shows angles as lengths, as wide ones nearly do, and the poses of the views it then has.
 
@@ -556,24 +559,21 @@ def equidistant_start(
     Parameters
     ----------
     model : "rational8" or "fisheye4".
-    centre_px : principal point, the picture's centre by default.
     """
     width, height = image_size_px
     intrinsics = np.zeros(len(INTRINSICS))
     intrinsics[:2] = focal_px
-    intrinsics[2:4] = centre_px or (0.5 * (width - 1), 0.5 * (height - 1))
+    intrinsics[2:4] = 0.5 * (width - 1), 0.5 * (height - 1)
     for name, value in _ANGLES_AS_LENGTHS[model].items():
         intrinsics[INTRINSICS.index(name)] = value
-    camera = camera_from_vector(model, image_size_px, intrinsics)
-    R_CT, t_CT_m = poses_with_camera(camera, observations)
-    return Block(intrinsics, R_CT, t_CT_m, np.zeros(0), camera.fisheye)
+    return poses_with_camera(camera_from_vector(model, image_size_px, intrinsics), observations)
 
 
 def _fisheye_start(observations: Observations, image_size_px: tuple[int, int], free: IntArray) -> Block:
     """A start for a fisheye lens: the best of several focal lengths after a few steps."""
     size = max(image_size_px)
     starts = [equidistant_start(observations, image_size_px, share * size, FISHEYE) for share in _WIDE_STARTS]
-    starts = [start for start in starts if np.all(np.isfinite(start.t_CT_m))]
+    starts = [start for start in starts if start.posed.all()]
     tried = [minimise(start, observations, free, max_iterations=_TRIED_ITERATIONS) for start in starts]
     if not any(np.isfinite(one.cost) for one in tried):
         return replace(starting_block(observations, image_size_px, skew=False), fisheye=True)
@@ -601,7 +601,7 @@ def calibrate(
     skew : whether the skew is estimated; otherwise it is zero.
     fixed : names of intrinsics held at the start's values.
     basis : (K, 3, M) deformation of the target, which then has to be the same in all views.
-    loss : one of `levenberg.LOSSES`; its scale is the median of the plain fit's residuals.
+    loss : "none", "huber" or "cauchy"; its scale is the median of the plain fit's residuals.
     start : where to start; Zhang's closed form by default, for a fisheye lens the best of several focal
         lengths. The start of another kind of lens is not used.
     tolerance : see `minimise`.
@@ -670,8 +670,7 @@ def refitted(
     """
     camera, block, observations = calibration.camera, calibration.block, calibration.observations
     if index is not None:
-        observations = observations.select(index)
-        block = replace(block, R_CT=block.R_CT[index], t_CT_m=block.t_CT_m[index])
+        observations, block = observations.select(index), block.part(index)
     same = {"basis": calibration.basis, "loss": calibration.loss, "fixed": held(calibration)}
     return calibrate(
         changes.pop("observations", observations),
@@ -695,22 +694,12 @@ def refit_poses(calibration: Calibration, observations: Observations) -> FloatAr
     NaN throughout a view that cannot be fitted.
     """
     residuals = np.full(observations.pixels.shape, np.nan)
-    R_CT, t_CT_m = poses_with_camera(calibration.camera, observations)
-    usable = np.flatnonzero(np.isfinite(R_CT).all(axis=(1, 2)) & np.isfinite(t_CT_m).all(axis=1))
+    start = poses_with_camera(calibration.camera, observations)
+    usable = np.flatnonzero(start.posed)
     if len(usable) == 0:
         return residuals
-    seen = observations.select(usable)
-    if calibration.basis is not None:
-        shape = np.tensordot(calibration.block.deformation, calibration.basis, axes=1)
-        seen = seen.displaced(shape.T)
-    start = Block(
-        vector_from_camera(calibration.camera),
-        R_CT[usable],
-        t_CT_m[usable],
-        np.zeros(0),
-        calibration.camera.fisheye,
-    )
-    found = minimise(start, seen, np.zeros(0, dtype=np.int64), tolerance=ENOUGH)
+    seen = calibration.shaped(observations.select(usable))
+    found = minimise(start.part(usable), seen, np.zeros(0, dtype=np.int64), tolerance=ENOUGH)
     if found.at is not None:
         residuals[usable] = np.where(seen.present[..., None], found.at.residuals.transpose(0, 2, 1), np.nan)
     return residuals
@@ -824,31 +813,16 @@ def covariance(calibration: Calibration, variance_px2: float | None = None) -> C
 
 def joint_jacobian(calibration: Calibration, points_C: FloatArray) -> FloatArray:
     """Derivative (n, 2, P + 6) of the pixels of points (n, 3) by the intrinsics and the common motion g."""
-    n = len(points_C)
-    one = Observations(
-        names=("",), target_m=points_C[None], pixels=np.zeros((1, n, 2)), present=np.ones((1, n), np.bool_)
-    )
-    here = replace(calibration.block, R_CT=np.eye(3)[None], t_CT_m=np.zeros((1, 3)), deformation=np.zeros(0))
-    J = jacobian(here, one, calibration.free, None)
-    if J is None:
-        return np.full((n, 2, len(calibration.free) + 6), np.nan)
-    return J[0, :-1].reshape(-1, 2, n).transpose(2, 1, 0)
+    return point_derivatives(calibration.camera, points_C, calibration.free)[..., :-1]
 
 
-def projection_sigma_px(
-    calibration: Calibration, found: Covariance, pixels: FloatArray, distance_m: float | None = None
-) -> FloatArray:
+def projection_sigma_px(calibration: Calibration, found: Covariance, pixels: FloatArray) -> FloatArray:
     """Standard deviation of projection at these pixels (n, 2), in pixels, shape (n,).
 
-    The root of the larger eigenvalue of the 2 x 2 covariance: the worst direction. NaN where the
-    lens cannot show the pixel.
-
-    Parameters
-    ----------
-    distance_m : distance of the point that is looked at; the targets' median by default.
+    Of points at the targets' median distance. The root of the larger eigenvalue of the 2 x 2 covariance:
+    the worst direction. NaN where the lens cannot show the pixel.
     """
-    distance = found.distance_m if distance_m is None else distance_m
-    points = distance * rays(calibration.camera, pixels)
+    points = found.distance_m * rays(calibration.camera, pixels)
     seen = np.isfinite(points).all(axis=1)
     sigma = np.full(len(pixels), np.nan)
     if not np.all(np.isfinite(found.joint)):

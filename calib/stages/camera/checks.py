@@ -362,11 +362,8 @@ def evidence(
     ------
     ValueError : the calibration has points behind the camera.
     """
-    block, observations = calibration.block, calibration.observations
-    if calibration.basis is not None:
-        shape = np.tensordot(block.deformation, calibration.basis, axes=1)
-        observations = observations.displaced(shape.T)
-    at_rest = replace(block, deformation=np.zeros(0 if basis is None else basis.shape[-3]))
+    observations = calibration.shaped(calibration.observations)
+    at_rest = replace(calibration.block, deformation=np.zeros(0 if basis is None else basis.shape[-3]))
     at = linearise(at_rest, observations, calibration.free, basis, calibration.loss, calibration.scale_px)
     if at is None:
         raise ValueError("the calibration has points behind the camera")
@@ -591,41 +588,33 @@ def conditioned(calibration: Calibration) -> Calibration:
     return replace(calibration, free=calibration.free[kept], normal=normal)
 
 
-def other_starts(calibration: Calibration, seed: int = 0) -> list[tuple[float, Minimum]]:
+def other_starts(calibration: Calibration) -> list[tuple[float, Minimum]]:
     """Focal lengths of starts, and where they ended.
 
     They go from 0.4 to 4 image widths, of a fisheye lens from 0.2 to 0.8, with principal points about the
     centre.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     observations, camera = calibration.observations, calibration.camera
     width, height = camera.image_size_px
     H = homographies(observations)
-    free = calibration.free
+    free, begun = calibration.free, np.zeros(len(INTRINSICS))
     ends = []
     for share in FISHEYE_STARTS if camera.fisheye else FOCAL_STARTS:
         focal = share * max(width, height)
         jitter = rng.uniform(-0.08, 0.08, 2) * (width, height)
+        begun[:4] = focal, focal, 0.5 * (width - 1) + jitter[0], 0.5 * (height - 1) + jitter[1]
         guess = calibration.block.intrinsics.copy()
-        guess[calibration.free] = 0.0
-        for name, value in zip(
-            ("fx_px", "fy_px", "cx_px", "cy_px"),
-            (focal, focal, 0.5 * (width - 1) + jitter[0], 0.5 * (height - 1) + jitter[1]),
-            strict=True,
-        ):
-            index = INTRINSICS.index(name)
-            if index in free:
-                guess[index] = value
+        guess[free] = begun[free]
         begin = camera_from_vector(camera.model, camera.image_size_px, guess)
-        R_CT, t_CT_m = (
-            poses_with_camera(begin, observations) if camera.fisheye else poses_from_homographies(begin.K, H)
-        )
-        if not (np.all(np.isfinite(R_CT)) and np.all(np.isfinite(t_CT_m))):
-            continue
-        start = Block(guess, R_CT, t_CT_m, np.zeros(0), camera.fisheye)
-        found = minimise(start, observations, free, max_iterations=_MAX_ITERATIONS)
-        if found.at is not None:
-            ends.append((focal, found))
+        if camera.fisheye:
+            start = poses_with_camera(begin, observations)
+        else:
+            start = Block.of(begin, *poses_from_homographies(begin.K, H))
+        if start.posed.all():
+            found = minimise(start, observations, free, max_iterations=_MAX_ITERATIONS)
+            if found.at is not None:
+                ends.append((focal, found))
     return ends
 
 
@@ -641,7 +630,13 @@ def best_of_starts(calibration: Calibration) -> Calibration:
     chance = _CHI2_95 * calibration.sigma_px**2
     if views > _MAX_VIEWS:
         index = np.unique(np.linspace(0, views - 1, _MAX_VIEWS).astype(np.int64))
-        some = _part(calibration, index)
+        some = replace(
+            calibration,
+            observations=calibration.observations.select(index),
+            block=calibration.block.part(index),
+            residuals_px=calibration.residuals_px[index],
+            normal=calibration.normal[index],
+        )
         # On a sample the fit to all views is not the best, by about its number of parameters.
         chance *= len(calibration.free)
     ends = other_starts(some)
@@ -653,24 +648,11 @@ def best_of_starts(calibration: Calibration) -> Calibration:
     camera, start = calibration.camera, best.block
     if some is not calibration:
         found = camera_from_vector(camera.model, camera.image_size_px, start.intrinsics)
-        R_CT, t_CT_m = poses_with_camera(found, calibration.observations)
-        if not (np.all(np.isfinite(R_CT)) and np.all(np.isfinite(t_CT_m))):
+        start = poses_with_camera(found, calibration.observations)
+        if not start.posed.all():
             return calibration
-        start = replace(start, R_CT=R_CT, t_CT_m=t_CT_m, deformation=np.zeros(0))
     better = refitted(calibration, start=start)
     return better if _cost(better) < _cost(calibration) - _CHI2_95 * better.sigma_px**2 else calibration
-
-
-def _part(calibration: Calibration, index: IntArray) -> Calibration:
-    """Some views of a calibration as they are, not fitted anew."""
-    block = calibration.block
-    return replace(
-        calibration,
-        observations=calibration.observations.select(index),
-        block=replace(block, R_CT=block.R_CT[index], t_CT_m=block.t_CT_m[index]),
-        residuals_px=calibration.residuals_px[index],
-        normal=calibration.normal[index],
-    )
 
 
 def _cost(calibration: Calibration) -> float:
@@ -937,17 +919,16 @@ def _without(problem: _Problem, odd: IntArray) -> _Problem:
     return _Problem(S, b - S @ (inverse @ whole), cost, problem.freedom)
 
 
-def best_split(calibration: Calibration, seed: int = 0) -> Split | None:
+def best_split(calibration: Calibration) -> Split | None:
     """The two groups of views that differ most, or None below eight views.
 
     Parameters
     ----------
     calibration : best `widened` and `straightened`, without robust loss.
-    seed : of the random starts and the replicates.
     """
     if calibration.observations.views < _LEAST_IN_ALL:
         return None
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     problem, scale = _problem(evidence(calibration), calibration)
 
     def search(made: _Problem, starts: int, least: int) -> tuple[list[BoolArray], FloatArray]:
@@ -1143,10 +1124,9 @@ def _information(
     calibration: Calibration, target: FloatArray, R: FloatArray, t: FloatArray
 ) -> FloatArray | None:
     """Information (n, G, G) of made-up views of the target about the intrinsics."""
-    n, M = len(R), len(target)
-    made = Observations(("",) * n, target[None], np.zeros((n, M, 2)), np.ones((n, M), dtype=np.bool_))
-    block = replace(calibration.block, R_CT=R, t_CT_m=t, deformation=np.zeros(0))
-    at = linearise(block, made, calibration.free, None)
+    M = len(target)
+    made = Observations.of(target, np.zeros((len(R), M, 2)))
+    at = linearise(Block.of(calibration.camera, R, t), made, calibration.free, None)
     if at is None:
         return None
     # As many points as the target has in a view, spread as they are.

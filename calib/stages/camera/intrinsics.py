@@ -332,7 +332,7 @@ def _sturdier(fit: Calibration, simpler: Sequence[Calibration]) -> Calibration:
     observations, size = fit.observations, fit.camera.image_size_px
     fitted = partial(refitted, fit, max_iterations=_MAX_ITERATIONS, tolerance=_ENOUGH)
     starts = [equidistant_start(observations, size, share * max(size)) for share in _EQUIDISTANT]
-    starts = [start for start in starts if np.all(np.isfinite(start.t_CT_m))]
+    starts = [start for start in starts if start.posed.all()]
     if simpler:
         starts.append(fitted(start=simpler[-1].block, fixed=("k6",)).block)
     fits = [fit, *(fitted(start=start) for start in starts)]
@@ -445,8 +445,8 @@ class Choices:
     ----------
     model : a key of `model.MODELS`, or "auto" for the choice by views held back.
     skew : estimate the skew; None where views held back may choose it with the model.
-    loss : one of `levenberg.LOSSES`.
-    board : one of `selection.BOARDS`, or "auto" for the choice by views held back.
+    loss : "none", "huber" or "cauchy".
+    board : one of `BOARDS`, or "auto" for the choice by views held back.
     keep_all : use views and points that do not agree with the others as well; they are named all the same.
     """
 

@@ -115,6 +115,12 @@ class Observations:
     pixels: FloatArray
     present: BoolArray
 
+    @staticmethod
+    def of(target_m: FloatArray, pixels: FloatArray) -> Observations:
+        """Nameless views (N, M, 2) of points (M, 3), which all of them show."""
+        present = np.ones(pixels.shape[:2], dtype=np.bool_)
+        return Observations(("",) * len(pixels), target_m[None], pixels, present)
+
     @property
     def views(self) -> int:
         """Number of views N."""
@@ -508,17 +514,28 @@ class Block:
     ----------
     intrinsics : (13,) in the order of `INTRINSICS`.
     R_CT, t_CT_m : (N, 3, 3) and (N, 3), pose of the target in the camera's frame.
-    deformation : (K,) weights of the target's deformation, metres.
+    deformation : (K,) weights of the target's deformation, metres; none of a rigid one.
     fisheye : `Camera.fisheye`.
     """
 
     intrinsics: FloatArray
     R_CT: FloatArray
     t_CT_m: FloatArray
-    deformation: FloatArray
+    deformation: FloatArray = field(default_factory=lambda: np.zeros(0))
     fisheye: bool = False
 
-    def part(self, views: slice) -> Block:
+    @staticmethod
+    def of(camera: Camera, R_CT: FloatArray, t_CT_m: FloatArray) -> Block:
+        """A camera before a rigid target with these poses."""
+        return Block(vector_from_camera(camera), R_CT, t_CT_m, fisheye=camera.fisheye)
+
+    @property
+    def posed(self) -> BoolArray:
+        """Which views (N,) have a pose."""
+        known = np.isfinite(self.R_CT).all(axis=(1, 2)) & np.isfinite(self.t_CT_m).all(axis=1)
+        return np.asarray(known)
+
+    def part(self, views: slice | IntArray | Sequence[int]) -> Block:
         """The same with the poses of some views only."""
         return replace(self, R_CT=self.R_CT[views], t_CT_m=self.t_CT_m[views])
 
@@ -714,3 +731,16 @@ def jacobian(
     if not observations.complete:
         out *= observations.present[:, None, None, :]
     return out.reshape(observations.views, shared + 7, 2 * points)
+
+
+def point_derivatives(camera: Camera, points_C: FloatArray, free: IntArray) -> FloatArray:
+    """Derivatives of the pixels of points (n, 3) in the camera's frame, and last the pixels, (n, 2, P + 7).
+
+    By the P intrinsics `free`, a small rotation and a translation; all NaN where one is behind the camera.
+    """
+    n = len(points_C)
+    here = Block.of(camera, np.eye(3)[None], np.zeros((1, 3)))
+    rows = jacobian(here, Observations.of(points_C, np.zeros((1, n, 2))), free, None) if n else None
+    if rows is None:
+        return np.full((n, 2, len(free) + 7), np.nan)
+    return np.asarray(rows[0].reshape(-1, 2, n).transpose(2, 1, 0))

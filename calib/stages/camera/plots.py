@@ -251,13 +251,12 @@ def _mean(size: Size, means: Means) -> Plot:
 
 def _poses(fit: Calibration) -> Figure:
     """A histogram of the boards' tilts, and the directions they lean to."""
-    R, t = fit.block.R_CT, fit.block.t_CT_m
-    usable = np.flatnonzero(np.isfinite(R).all(axis=(1, 2)) & np.isfinite(t).all(axis=1))
+    usable = np.flatnonzero(fit.block.posed)
     note = (
         "Boards that stand parallel to each other say the same about the camera. A good set leans to all "
         "sides, by 20 to 50 degrees, and so fills the panel at the right."
     )
-    normals = R[usable, :, 2]
+    normals = fit.block.R_CT[usable, :, 2]
     normals = normals * np.where(normals[:, 2:] < 0.0, -1.0, 1.0)
     colours = spaced(fit.observations.views)[usable]
     title = "How the boards leaned before the camera"

@@ -21,15 +21,7 @@ from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
 from calib.core.geometry import apply_homography, fit_homography, grouped_variance
 from calib.stages.camera.bundle import linearise, minimise
-from calib.stages.camera.model import (
-    INTRINSICS,
-    Block,
-    Camera,
-    Observations,
-    jacobian,
-    undistort,
-    vector_from_camera,
-)
+from calib.stages.camera.model import INTRINSICS, Block, Camera, Observations, point_derivatives, undistort
 
 _EVERY_INTRINSIC = np.arange(len(INTRINSICS))
 _TOLERANCE = 1e-9
@@ -72,15 +64,6 @@ class Pose:
         return float(np.sqrt(self.cost_px2 / len(self.residuals_px)))
 
 
-def _block(camera: Camera, R: FloatArray, t_m: FloatArray) -> Block:
-    return Block(vector_from_camera(camera), R[None], t_m[None], np.zeros(0), camera.fisheye)
-
-
-def _seen(points_m: FloatArray, pixels: FloatArray) -> Observations:
-    """One view of points (M, 3)."""
-    return Observations(("",), points_m[None], pixels[None], np.ones((1, len(pixels)), dtype=np.bool_))
-
-
 def projection_with_derivatives(
     camera: Camera, points_C: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -95,15 +78,8 @@ def projection_with_derivatives(
     Pixels (M, 2), derivatives by the point (M, 2, 3), and by the intrinsics (M, 2, 13) in the order
     of `model.INTRINSICS`; all NaN where a point is behind the camera.
     """
-    M, count = len(points_C), len(INTRINSICS)
-    here = _block(camera, np.eye(3), np.zeros(3))
-    rows = jacobian(here, _seen(points_C, np.zeros((M, 2))), _EVERY_INTRINSIC, None) if M else None
-    if rows is None:
-        nothing = np.full((M, 2, count), np.nan)
-        return nothing[..., 0], nothing[..., :3], nothing
-    # Intrinsics, rotation, translation, and last the pixels themselves.
-    by = rows[0].reshape(-1, 2, M).transpose(2, 1, 0)
-    return by[..., -1], by[..., count + 3 : count + 6], by[..., :count]
+    by = point_derivatives(camera, points_C, _EVERY_INTRINSIC)
+    return by[..., -1], by[..., -4:-1], by[..., : len(INTRINSICS)]
 
 
 def pose_derivatives(
@@ -136,9 +112,10 @@ def fit_pose(camera: Camera, world_m: FloatArray, pixels: FloatArray, groups: In
         plane is mirrored, which would put the camera behind it.
     """
     starts = _starts(camera, world_m, pixels)
-    view = _seen(np.column_stack([world_m, np.zeros(len(world_m))]), pixels)
+    view = Observations.of(np.column_stack([world_m, np.zeros(len(world_m))]), pixels[None])
     none = np.zeros(0, dtype=np.int64)
-    fits = [minimise(_block(camera, R, t), view, none, tolerance=_TOLERANCE) for R, t in starts]
+    blocks = (Block.of(camera, R[None], t[None]) for R, t in starts)
+    fits = [minimise(block, view, none, tolerance=_TOLERANCE) for block in blocks]
     found = sorted(
         ((fit.at.cost, fit.block.R_CT[0], fit.block.t_CT_m[0], fit) for fit in fits if fit.at is not None),
         key=lambda one: one[0],

@@ -37,7 +37,7 @@ from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.solve.chance import tail_of_f
 from calib.stages.camera.bundle import Calibration, joint_jacobian, minimise, poses_with_camera, refitted
 from calib.stages.camera.checks import Evidence, apart_px, evidence, overdispersion, points_C, scaled_inverse
-from calib.stages.camera.model import LeftOut, Observations, project
+from calib.stages.camera.model import Block, LeftOut, Observations, project
 from calib.stages.camera.verdict import listed
 
 _LEAST_VIEWS = 5
@@ -453,7 +453,7 @@ def _settled(calibration: Calibration, robust: bool) -> Triage:
             part = replace(
                 whole,
                 observations=whole.observations.select(usable),
-                block=replace(whole.block, R_CT=whole.block.R_CT[usable], t_CT_m=whole.block.t_CT_m[usable]),
+                block=whole.block.part(usable),
             )
             asked = agreement(part, None if robust and turn < 2 else kept[usable])
             scale_px = asked.scale_px
@@ -492,18 +492,17 @@ def _with_all(
     seen = kept.copy()
     others = np.flatnonzero(~kept)
     if len(others):
-        R, t = poses_with_camera(fit.camera, near.select(others))
-        usable = np.isfinite(R).all(axis=(1, 2)) & np.isfinite(t).all(axis=1)
-        for i, R_start, t_start in zip(others[usable], R[usable], t[usable], strict=True):
+        starts = poses_with_camera(fit.camera, near.select(others))
+        for k in np.flatnonzero(starts.posed):
             # One by one: a view that ends behind the camera must not stop the others.
-            start = replace(fit.block, R_CT=R_start[None], t_CT_m=t_start[None], deformation=np.zeros(0))
-            found = minimise(start, near.select([i]), np.zeros(0, dtype=np.int64))
+            i = others[k]
+            found = minimise(starts.part([int(k)]), near.select([i]), np.zeros(0, dtype=np.int64))
             seen[i] = found.at is not None
             R_CT[i], t_CT_m[i] = found.block.R_CT[0], found.block.t_CT_m[0]
     points = everything.target_m @ R_CT.transpose(0, 2, 1) + t_CT_m[:, None]
     residuals = project(fit.camera, points) - everything.pixels
     residuals[~everything.present | ~seen[:, None]] = np.nan
-    block = replace(fit.block, R_CT=R_CT, t_CT_m=t_CT_m, deformation=np.zeros(0))
+    block = Block.of(fit.camera, R_CT, t_CT_m)
     return replace(fit, observations=near, block=block, residuals_px=residuals), seen
 
 

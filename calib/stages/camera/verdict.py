@@ -783,13 +783,9 @@ def _plain(calibration: Calibration) -> Calibration:
         observations = observations.without(calibration.weights < _LEFT_OUT_WEIGHT)
         kept = np.flatnonzero(observations.present.sum(axis=1) >= 4)
         observations = observations.select(kept)
-    if calibration.basis is not None:
-        observations = observations.displaced(
-            np.tensordot(calibration.block.deformation, calibration.basis, axes=1).T
-        )
-    block = calibration.block
-    start = replace(block, R_CT=block.R_CT[kept], t_CT_m=block.t_CT_m[kept], deformation=np.zeros(0))
-    return refitted(calibration, observations=observations, start=start, basis=None, loss="none")
+    start = replace(calibration.block.part(kept), deformation=np.zeros(0))
+    shaped = calibration.shaped(observations)
+    return refitted(calibration, observations=shaped, start=start, basis=None, loss="none")
 
 
 def _focal_share(fit: Calibration, known: Covariance) -> float:
